@@ -1,0 +1,14 @@
+//! The far side of the cable.
+//!
+//! Wire formats (bit-plane link, DLPC900, NatNet, VRPN, serial poses) as `no_std` code that firmware can reuse, and behind the
+//! features `usb`, `serial` and `net` the transports, projectors and trackers that speak them.
+//!
+//! Reading order: [`time`] and [`pose`] and [`planes`] are the vocabulary; [`tracker`] is where motion comes in.
+//! **Only this crate knows bytes on a wire.** Nothing here knows about scenes, rendering or the GPU.
+#![cfg_attr(not(feature = "std"), no_std)]
+
+pub mod planes;
+pub mod pose;
+pub mod time;
+#[cfg(feature = "std")]
+pub mod tracker;

@@ -1,0 +1,159 @@
+//! Bit planes: the binary images that a DMD shows one after the other, and the order they come in.
+//!
+//! Layout of one plane, everywhere in this project: rows top to bottom, each row padded to whole bytes, **bit 7 of a byte is the
+//! leftmost of its eight mirrors**; padding bits are 0.
+
+/// Size of a projector's mirror array in pixels. Both sides are 1 to [`Raster::MAX_SIDE`].
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Hash)]
+pub struct Raster {
+    width: u32,
+    height: u32,
+}
+
+impl Raster {
+    /// Largest accepted side in pixels.
+    pub const MAX_SIDE: u32 = 8192;
+
+    /// `None` when a side is 0 or above [`Raster::MAX_SIDE`].
+    pub const fn new(width: u32, height: u32) -> Option<Self> {
+        if width == 0 || height == 0 || width > Self::MAX_SIDE || height > Self::MAX_SIDE {
+            None
+        } else {
+            Some(Self { width, height })
+        }
+    }
+
+    /// Pixels in a row.
+    pub const fn width(self) -> u32 {
+        self.width
+    }
+
+    /// Rows.
+    pub const fn height(self) -> u32 {
+        self.height
+    }
+
+    /// Number of pixels.
+    pub const fn pixel_count(self) -> usize {
+        self.width as usize * self.height as usize
+    }
+
+    /// Bytes of one row of a plane.
+    pub const fn row_bytes(self) -> usize {
+        (self.width as usize).div_ceil(8)
+    }
+
+    /// Bytes of one plane.
+    pub const fn plane_bytes(self) -> usize {
+        self.row_bytes() * self.height as usize
+    }
+}
+
+/// The LED that is lit while a plane is shown.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Hash)]
+#[repr(u8)]
+pub enum Channel {
+    /// Red LED.
+    Red = 0,
+    /// Green LED.
+    Green = 1,
+    /// Blue LED.
+    Blue = 2,
+    /// All LEDs together (monochrome rigs). Planes of this channel carry the bits of the green code value.
+    White = 3,
+}
+
+/// One plane of a frame: which bit of which channel it shows. Its LED intensity is `2^bit / 255` of full.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct PlaneSpec {
+    /// LED lit.
+    pub channel: Channel,
+    /// Bit of the 8-bit code value, 0 = least significant.
+    pub bit: u8,
+}
+
+impl PlaneSpec {
+    /// The byte that stands for this plane's light on the wire: channel in bits 4..5, bit number in bits 0..2.
+    pub const fn led_code(self) -> u8 {
+        ((self.channel as u8) << 4) | self.bit
+    }
+
+    /// Inverse of [`PlaneSpec::led_code`]; `None` for a code that no plane has.
+    pub const fn from_led_code(code: u8) -> Option<Self> {
+        let channel = match code >> 4 {
+            0 => Channel::Red,
+            1 => Channel::Green,
+            2 => Channel::Blue,
+            3 => Channel::White,
+            _ => return None,
+        };
+        let bit = code & 0x0f;
+        if bit < 8 {
+            Some(Self { channel, bit })
+        } else {
+            None
+        }
+    }
+}
+
+/// Most planes a frame may have.
+pub const MAX_PLANES: usize = 32;
+
+/// The planes of a frame in the order they are shown. All planes share one slot length; grey comes from LED intensity.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct PlaneSchedule {
+    planes: [PlaneSpec; MAX_PLANES],
+    len: u8,
+}
+
+impl PlaneSchedule {
+    /// Planes in the order given; `None` when empty, longer than [`MAX_PLANES`], or a (channel, bit) pair stands twice.
+    pub fn new(planes: &[PlaneSpec]) -> Option<Self> {
+        if planes.is_empty() || planes.len() > MAX_PLANES {
+            return None;
+        }
+        for (i, p) in planes.iter().enumerate() {
+            if p.bit > 7 || planes[..i].contains(p) {
+                return None;
+            }
+        }
+        let mut all = [PlaneSpec { channel: Channel::White, bit: 0 }; MAX_PLANES];
+        all[..planes.len()].copy_from_slice(planes);
+        Some(Self { planes: all, len: planes.len() as u8 })
+    }
+
+    /// 24 planes: for each bit from 7 down to 0 red, green, blue. Interleaving the colours keeps the
+    /// colour fields of a moving edge one plane slot (44 us) apart instead of a third of a frame.
+    pub fn rgb24() -> Self {
+        let mut planes = [PlaneSpec { channel: Channel::Red, bit: 0 }; 24];
+        for (i, p) in planes.iter_mut().enumerate() {
+            p.bit = 7 - (i / 3) as u8;
+            p.channel = [Channel::Red, Channel::Green, Channel::Blue][i % 3];
+        }
+        Self::new(&planes).expect("24 distinct planes")
+    }
+
+    /// 8 planes of one white channel, bit 7 first.
+    pub fn mono8() -> Self {
+        let mut planes = [PlaneSpec { channel: Channel::White, bit: 0 }; 8];
+        for (i, p) in planes.iter_mut().enumerate() {
+            p.bit = 7 - i as u8;
+        }
+        Self::new(&planes).expect("8 distinct planes")
+    }
+
+    /// The planes in order.
+    pub fn planes(&self) -> &[PlaneSpec] {
+        &self.planes[..self.len as usize]
+    }
+
+    /// Number of planes.
+    pub const fn len(&self) -> usize {
+        self.len as usize
+    }
+
+    /// Never true: a schedule has at least one plane.
+    pub const fn is_empty(&self) -> bool {
+        self.len == 0
+    }
+}

@@ -1,0 +1,59 @@
+//! Trackers: sources of rigid-body poses with the instant at which the light for them was captured.
+
+use crate::pose::Pose;
+use crate::time::HostTime;
+
+/// Index of a tracked body in the order the rig file names them.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Hash)]
+pub struct BodyIndex(pub u16);
+
+/// One pose of one body as a tracker reported it.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct TrackerSample {
+    /// Which body.
+    pub body: BodyIndex,
+    /// world-from-body.
+    pub pose: Pose,
+    /// The tracker's own word that it sees the body; when false the pose means nothing.
+    pub tracked: bool,
+    /// The tracker's mean marker error, metres; 0 when it gives none.
+    pub mean_error_m: f32,
+    /// The tracker's frame number (wraps as the protocol does).
+    pub sequence: u32,
+    /// Mid-exposure, mapped to the host's clock.
+    pub captured_at: HostTime,
+    /// When the packet reached this process, host's clock.
+    pub received_at: HostTime,
+}
+
+/// Why a tracker cannot deliver.
+#[derive(Debug, thiserror::Error)]
+pub enum TrackerError {
+    /// The operating system refused; the text names the object and the remedy.
+    #[error("{context}: {source}")]
+    Io {
+        /// What was being done, on which object, and what to try.
+        context: String,
+        /// The operating system's error.
+        source: std::io::Error,
+    },
+    /// The other side speaks something else.
+    #[error("{0}")]
+    Protocol(String),
+}
+
+/// A source of poses. Implementations MUST return within a bounded time, never block for data, never allocate without bound
+/// on what arrives, and deliver samples of one body in the order of `captured_at`.
+pub trait Tracker: Send {
+    /// Hands every sample that has arrived by `now` to `sink`, oldest first; returns how many. `now` is the host's clock:
+    /// network trackers use it to stamp arrivals, simulated trackers to know how far to advance.
+    fn poll(&mut self, now: HostTime, sink: &mut dyn FnMut(&TrackerSample)) -> Result<usize, TrackerError>;
+
+    /// What the tracker calls itself, for reports.
+    fn name(&self) -> &str;
+
+    /// Counters and the reason for silence in one line, for `dpm doctor` and reports.
+    fn status(&self) -> String {
+        String::new()
+    }
+}

@@ -1,0 +1,5 @@
+//! dpm: the rig controller. **Follow one frame**: tracking, plan, render, pack, link, light.
+//!
+//! See `docs/ARCHITECTURE.md` for the picture and one invariant per folder.
+
+pub mod scene;
