@@ -3,7 +3,14 @@
 //! Lengths in metres, Y up, right-handed, linear Rec. 709 colour. Radiance is in scene units: a unit of radiance is what
 //! `projector.white_radiance` in the rig file relates to the projector's brightest light.
 
+pub mod builtin;
+pub mod mesh;
+pub mod polygonise;
+mod procedural;
+
 use glam::{DAffine3, Vec2, Vec3, Vec4};
+
+pub use builtin::builtin;
 
 /// Everything that light meets. Immutable once loaded; bodies move by poses that are kept elsewhere.
 #[derive(Clone, Debug, Default)]
