@@ -1,0 +1,667 @@
+//! The plug between a USB device model and its front ends: queues requests per endpoint, answers the standard requests, keeps halts, and
+//! injects faults by endpoint and transfer number.
+//!
+//! One worker thread per endpoint runs that endpoint's transfers in order, so a busy bulk endpoint never delays control. A
+//! transfer that the device refuses for now (NAK) waits until the model moves again, is cancelled or the plug is pulled. Pulling
+//! is atomic: new requests are refused, queued ones fail, running ones finish, and only then is the disconnect signalled.
+
+use std::collections::{BTreeMap, VecDeque};
+use std::sync::{Arc, Condvar, Mutex, MutexGuard, PoisonError};
+use std::time::{Duration, Instant};
+
+use dpm_device::time::HostTime;
+
+use crate::usb_model::{string_descriptor, Progress, Setup, Then, UsbDeviceModel};
+
+/// The host's clock as the front ends read it.
+pub type Clock = Arc<dyn Fn() -> HostTime + Send + Sync>;
+
+/// Nanoseconds since this call on the monotonic clock.
+pub fn monotonic_clock() -> Clock {
+    let start = Instant::now();
+    Arc::new(move || HostTime(start.elapsed().as_nanos() as i64))
+}
+
+/// One transfer that a host asks for.
+pub struct Request {
+    /// Names the transfer for [`UsbPlug::cancel`]; unique among those not completed yet.
+    pub id: u64,
+    /// Address with the direction in bit 7; 0 for control.
+    pub endpoint: u8,
+    /// The setup packet of a control transfer.
+    pub setup: Option<Setup>,
+    /// OUT: what to send. IN: its length is how much is asked for.
+    pub buffer: Vec<u8>,
+    /// Called exactly once, from a worker thread or from the call that ends the transfer.
+    pub done: Box<dyn FnOnce(Completed) + Send>,
+}
+
+/// How a transfer ended.
+pub struct Completed {
+    /// The request's name.
+    pub id: u64,
+    /// Outcome.
+    pub status: Status,
+    /// Bytes moved, on every status.
+    pub actual: usize,
+    /// The request's buffer; for IN its first `actual` bytes are the device's.
+    pub buffer: Vec<u8>,
+}
+
+/// Outcome of a transfer, with the kernel's error number for it.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Status {
+    /// Ended by itself; `actual` may be short.
+    Ok,
+    /// The endpoint is halted (EPIPE).
+    Stall,
+    /// Damaged on the cable (EPROTO).
+    BusError,
+    /// The device sent too much (EOVERFLOW).
+    Babble,
+    /// The host took it back (ECONNRESET).
+    Cancelled,
+    /// The device is gone (ESHUTDOWN).
+    Gone,
+}
+
+impl Status {
+    /// 0 or the negative Linux error number that usbfs and USB/IP report.
+    pub const fn errno(self) -> i32 {
+        match self {
+            Self::Ok => 0,
+            Self::Stall => -32,
+            Self::BusError => -71,
+            Self::Babble => -75,
+            Self::Cancelled => -104,
+            Self::Gone => -108,
+        }
+    }
+}
+
+/// A fault of the cable or the device, for one transfer.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Fault {
+    /// Halt the endpoint (refuse the request on control) instead of serving the transfer.
+    Stall,
+    /// Damage the transfer.
+    BusError,
+    /// Answer an IN transfer with more than was asked for.
+    Babble,
+    /// Refuse the transfer for this long before serving it (`i64::MAX`: until it is cancelled).
+    NakNs(i64),
+    /// End an IN transfer after at most this many bytes (the rest is lost); take only this many of an OUT transfer.
+    Short(usize),
+    /// Pull the plug after this many bytes of an OUT transfer, or before answering an IN one.
+    Unplug(usize),
+}
+
+/// The plug of one device. Cloning gives another handle on the same plug; dropping the last one pulls it.
+#[derive(Clone)]
+pub struct UsbPlug {
+    shared: Arc<Shared>,
+    _last_handle: Arc<LastHandle>,
+}
+
+/// Dropped with the last handle on a plug: pulls it, which ends the workers.
+struct LastHandle(Arc<Shared>);
+
+impl Drop for LastHandle {
+    fn drop(&mut self) {
+        self.0.pull();
+    }
+}
+
+struct Shared {
+    model: Arc<Mutex<dyn UsbDeviceModel>>,
+    clock: Clock,
+    state: Mutex<State>,
+    /// Signalled when anything changed that a worker may wait for.
+    changed: Condvar,
+}
+
+#[derive(Default)]
+struct State {
+    queues: BTreeMap<u8, Queue>,
+    faults: Vec<(u8, u64, Fault)>,
+    pulled: bool,
+    signalled: bool,
+    configuration: u8,
+    listeners: Vec<Box<dyn FnOnce() + Send>>,
+    /// Counts steps in which bytes moved; a refused transfer is retried when it changes.
+    moves: u64,
+}
+
+#[derive(Default)]
+struct Queue {
+    pending: VecDeque<Request>,
+    running: Option<u64>,
+    cancel_running: bool,
+    halted: bool,
+    started: u64,
+}
+
+/// How long a refused transfer waits before it asks the model again though nothing else moved (the model's own time may have).
+const RETRY: Duration = Duration::from_micros(500);
+
+fn lock<T: ?Sized>(m: &Mutex<T>) -> MutexGuard<'_, T> {
+    // A panicking model must not take the front ends with it: its state is still the best there is.
+    m.lock().unwrap_or_else(PoisonError::into_inner)
+}
+
+impl UsbPlug {
+    /// Plugs `model` in. The caller may keep its own handle on the model to look inside.
+    pub fn new(model: Arc<Mutex<dyn UsbDeviceModel>>, clock: Clock) -> Self {
+        let shared = Arc::new(Shared { model, clock, state: Mutex::default(), changed: Condvar::new() });
+        Self { _last_handle: Arc::new(LastHandle(shared.clone())), shared }
+    }
+
+    /// Runs `f` on the model, between two steps of any transfer.
+    pub fn with_model<R>(&self, f: impl FnOnce(&mut dyn UsbDeviceModel) -> R) -> R {
+        f(&mut *lock(&self.shared.model))
+    }
+
+    /// Plans `fault` for the `nth` transfer (0 = the next one) on `endpoint` from now on.
+    pub fn inject(&self, endpoint: u8, nth: u64, fault: Fault) {
+        let mut s = lock(&self.shared.state);
+        let base = s.queues.get(&endpoint).map_or(0, |q| q.started + q.pending.len() as u64);
+        s.faults.push((endpoint, base + nth, fault));
+    }
+
+    /// Queues a transfer. Gives it back when the plug is pulled.
+    pub fn submit(&self, request: Request) -> Result<(), Request> {
+        let mut s = lock(&self.shared.state);
+        if s.pulled {
+            return Err(request);
+        }
+        let endpoint = request.endpoint;
+        let first = !s.queues.contains_key(&endpoint);
+        s.queues.entry(endpoint).or_default().pending.push_back(request);
+        self.shared.changed.notify_all();
+        if first {
+            let shared = self.shared.clone();
+            std::thread::spawn(move || shared.work(endpoint));
+        }
+        Ok(())
+    }
+
+    /// Takes a transfer back. True when it had not ended: its completion, with [`Status::Cancelled`] or with what it reached
+    /// in the meantime, follows or has just been made.
+    pub fn cancel(&self, id: u64) -> bool {
+        let mut s = lock(&self.shared.state);
+        let mut cancelled = None;
+        for q in s.queues.values_mut() {
+            if q.running == Some(id) {
+                q.cancel_running = true;
+                self.shared.changed.notify_all();
+                return true;
+            }
+            if let Some(at) = q.pending.iter().position(|r| r.id == id) {
+                cancelled = q.pending.remove(at);
+                break;
+            }
+        }
+        drop(s);
+        match cancelled {
+            Some(r) => {
+                finish(r, Status::Cancelled, 0);
+                true
+            }
+            None => false,
+        }
+    }
+
+    /// Takes every transfer of `endpoint` back.
+    pub fn cancel_endpoint(&self, endpoint: u8) {
+        let mut s = lock(&self.shared.state);
+        let Some(q) = s.queues.get_mut(&endpoint) else { return };
+        q.cancel_running = q.running.is_some();
+        let all: Vec<_> = q.pending.drain(..).collect();
+        self.shared.changed.notify_all();
+        drop(s);
+        all.into_iter().for_each(|r| finish(r, Status::Cancelled, 0));
+    }
+
+    /// Ends the halt of `endpoint` as CLEAR_FEATURE does.
+    pub fn clear_halt(&self, endpoint: u8) {
+        if let Some(q) = lock(&self.shared.state).queues.get_mut(&endpoint) {
+            q.halted = false;
+        }
+        lock(&self.shared.model).halt_cleared(endpoint);
+    }
+
+    /// Resets the bus: halts end, the device is unconfigured.
+    pub fn reset(&self) {
+        let mut s = lock(&self.shared.state);
+        s.queues.values_mut().for_each(|q| q.halted = false);
+        s.configuration = 0;
+        drop(s);
+        lock(&self.shared.model).bus_reset((self.shared.clock)());
+    }
+
+    /// Selects a configuration as SET_CONFIGURATION does; halts end.
+    pub fn set_configuration(&self, value: u8) {
+        let mut s = lock(&self.shared.state);
+        s.queues.values_mut().for_each(|q| q.halted = false);
+        s.configuration = value;
+    }
+
+    /// The selected configuration, 0 for none.
+    pub fn configuration(&self) -> u8 {
+        lock(&self.shared.state).configuration
+    }
+
+    /// True until the plug is pulled.
+    pub fn is_plugged(&self) -> bool {
+        !lock(&self.shared.state).pulled
+    }
+
+    /// Transfers queued or running.
+    pub fn in_flight(&self) -> usize {
+        let s = lock(&self.shared.state);
+        s.queues.values().map(|q| q.pending.len() + usize::from(q.running.is_some())).sum()
+    }
+
+    /// Calls `f` once the plug is pulled and every transfer has ended; at once when that is already so.
+    pub fn on_unplug(&self, f: Box<dyn FnOnce() + Send>) {
+        let mut s = lock(&self.shared.state);
+        if s.signalled {
+            drop(s);
+            f();
+        } else {
+            s.listeners.push(f);
+        }
+    }
+
+    /// Pulls the plug: every transfer ends with [`Status::Gone`], then the listeners run. Plug the model in again with a new [`UsbPlug`].
+    pub fn unplug(&self) {
+        self.shared.pull();
+    }
+}
+
+fn finish(request: Request, status: Status, actual: usize) {
+    (request.done)(Completed { id: request.id, status, actual, buffer: request.buffer });
+}
+
+impl Shared {
+    fn pull(&self) {
+        let mut s = lock(&self.state);
+        s.pulled = true;
+        let all: Vec<_> = s.queues.values_mut().flat_map(|q| q.pending.drain(..)).collect();
+        self.changed.notify_all();
+        drop(s);
+        all.into_iter().for_each(|r| finish(r, Status::Gone, 0));
+        self.signal_when_quiet();
+    }
+
+    fn signal_when_quiet(&self) {
+        let mut s = lock(&self.state);
+        if !s.pulled || s.signalled || s.queues.values().any(|q| q.running.is_some()) {
+            return;
+        }
+        s.signalled = true;
+        let listeners = std::mem::take(&mut s.listeners);
+        drop(s);
+        listeners.into_iter().for_each(|f| f());
+    }
+
+    /// A worker's life: runs the transfers of one endpoint in order until the plug is pulled.
+    fn work(self: Arc<Self>, endpoint: u8) {
+        loop {
+            let mut s = lock(&self.state);
+            let (mut request, fault, halted) = loop {
+                if s.pulled {
+                    return;
+                }
+                let State { queues, faults, .. } = &mut *s;
+                let q = queues.entry(endpoint).or_default();
+                if let Some(r) = q.pending.pop_front() {
+                    let n = q.started;
+                    q.started += 1;
+                    q.running = Some(r.id);
+                    q.cancel_running = false;
+                    let at = faults.iter().position(|f| f.0 == endpoint && f.1 == n);
+                    break (r, at.map(|i| faults.swap_remove(i).2), q.halted);
+                }
+                s = self.changed.wait(s).unwrap_or_else(PoisonError::into_inner);
+            };
+            drop(s);
+            let (status, actual) =
+                if halted { (Status::Stall, 0) } else { self.run(endpoint, &mut request, fault) };
+            let mut s = lock(&self.state);
+            if let Some(q) = s.queues.get_mut(&endpoint) {
+                q.running = None;
+                q.halted |= status == Status::Stall && endpoint != 0;
+            }
+            s.moves += 1;
+            self.changed.notify_all();
+            drop(s);
+            finish(request, status, actual);
+            self.signal_when_quiet();
+        }
+    }
+
+    /// Runs one transfer to its end.
+    fn run(&self, endpoint: u8, r: &mut Request, fault: Option<Fault>) -> (Status, usize) {
+        let is_in = r.setup.map_or(endpoint & 0x80 != 0, |s| s.is_in());
+        let mut limit = r.buffer.len();
+        let mut refuse_until = None;
+        match fault {
+            Some(Fault::Stall) => return (Status::Stall, 0),
+            Some(Fault::BusError) => return (Status::BusError, 0),
+            Some(Fault::Babble) => return (Status::Babble, r.buffer.len()),
+            Some(Fault::NakNs(ns)) => refuse_until = Some((self.clock)().plus_ns(ns)),
+            Some(Fault::Short(n)) if !is_in => limit = limit.min(n),
+            Some(Fault::Unplug(n)) => limit = if is_in { 0 } else { limit.min(n) },
+            _ => {}
+        }
+        let mut moved = 0;
+        loop {
+            let now = (self.clock)();
+            let refused = refuse_until.is_some_and(|t| now < t);
+            let skip = matches!(fault, Some(Fault::Unplug(_))) && limit == 0;
+            let (seen, step) = {
+                let s = lock(&self.state);
+                let seen = s.moves;
+                let cancelled = s.queues.get(&endpoint).is_some_and(|q| q.cancel_running);
+                if cancelled || s.pulled {
+                    return (if cancelled { Status::Cancelled } else { Status::Gone }, moved);
+                }
+                let step = if refused || skip {
+                    Progress { bytes: 0, then: if skip { Then::Complete } else { Then::Nak } }
+                } else if let Some(setup) = r.setup {
+                    drop(s);
+                    self.control(now, &setup, &mut r.buffer)
+                } else {
+                    drop(s);
+                    let mut model = lock(&self.model);
+                    if is_in {
+                        model.transfer_in(now, endpoint, &mut r.buffer[moved..])
+                    } else {
+                        model.transfer_out(now, endpoint, &r.buffer[moved..limit])
+                    }
+                };
+                (seen, step)
+            };
+            // A model that claims more than it was given is cut: the host never sees bytes that nobody wrote.
+            moved = (moved + step.bytes).min(r.buffer.len());
+            if step.bytes > 0 {
+                lock(&self.state).moves += 1;
+                self.changed.notify_all();
+            }
+            let status = match step.then {
+                Then::Complete => Status::Ok,
+                Then::Stall => Status::Stall,
+                Then::BusError => Status::BusError,
+                Then::Babble => Status::Babble,
+                Then::Disconnect => {
+                    self.pull();
+                    Status::Gone
+                }
+                Then::Nak => {
+                    let mut s = lock(&self.state);
+                    if s.moves == seen + u64::from(step.bytes > 0) {
+                        let waited = self.changed.wait_timeout(s, RETRY);
+                        s = waited.unwrap_or_else(PoisonError::into_inner).0;
+                    }
+                    drop(s);
+                    continue;
+                }
+            };
+            return match fault {
+                Some(Fault::Unplug(_)) => {
+                    self.pull();
+                    (Status::Gone, moved)
+                }
+                Some(Fault::Short(n)) if is_in => (status, moved.min(n)),
+                _ => (status, moved),
+            };
+        }
+    }
+
+    /// A control transfer: the standard requests here, the others by the model.
+    fn control(&self, now: HostTime, setup: &Setup, data: &mut [u8]) -> Progress {
+        if !setup.is_standard() {
+            return lock(&self.model).control(now, setup, data);
+        }
+        let mut give = |bytes: &[u8]| {
+            let n = bytes.len().min(data.len());
+            data[..n].copy_from_slice(&bytes[..n]);
+            Progress::complete(n)
+        };
+        let recipient = setup.request_type & 0x1f;
+        match (setup.request_type, setup.request) {
+            // GET_DESCRIPTOR, of the device or of an interface (HID report).
+            (0x80 | 0x81, 6) => {
+                let model = lock(&self.model);
+                let (kind, index) = ((setup.value >> 8) as u8, setup.value as u8);
+                match kind {
+                    1 => give(model.device_descriptor()),
+                    2 if index == 0 => give(model.configuration_descriptor()),
+                    3 if index == 0 => give(&[4, 3, 0x09, 0x04]),
+                    3 => match model.string(index) {
+                        Some(text) => give(&string_descriptor(text)),
+                        None => Progress::stall(0),
+                    },
+                    _ => match model.other_descriptor(kind, index, setup.index) {
+                        Some(bytes) => give(bytes),
+                        None => Progress::stall(0),
+                    },
+                }
+            }
+            // GET_STATUS: bus powered, no remote wake-up; an endpoint says whether it is halted.
+            (0x80..=0x82, 0) => {
+                let endpoint = setup.index as u8;
+                let halted =
+                    recipient == 2 && lock(&self.state).queues.get(&endpoint).is_some_and(|q| q.halted);
+                give(&[u8::from(halted), 0])
+            }
+            // CLEAR_FEATURE and SET_FEATURE(ENDPOINT_HALT).
+            (0x02, 1 | 3) if setup.value == 0 => {
+                let endpoint = setup.index as u8;
+                let halt = setup.request == 3 && endpoint & 0x7f != 0;
+                if let Some(q) = lock(&self.state).queues.get_mut(&endpoint) {
+                    q.halted = halt;
+                }
+                if !halt {
+                    lock(&self.model).halt_cleared(endpoint);
+                }
+                Progress::complete(0)
+            }
+            // Features of the device and interface (remote wake-up, U1/U2), SET_ADDRESS, SET_SEL, SET_ISOCH_DELAY, SET_INTERFACE 0.
+            (0x00 | 0x01, 1 | 3) | (0x00, 5 | 0x31) => Progress::complete(0),
+            (0x00, 0x30) => Progress::complete(data.len()),
+            (0x01, 11) if setup.value == 0 => Progress::complete(0),
+            (0x81, 10) => give(&[0]),
+            (0x80, 8) => give(&[lock(&self.state).configuration]),
+            (0x00, 9) => {
+                let value = setup.value as u8;
+                let known = lock(&self.model).configuration_descriptor().get(5) == Some(&value) || value == 0;
+                if !known {
+                    return Progress::stall(0);
+                }
+                let mut s = lock(&self.state);
+                s.configuration = value;
+                s.queues.values_mut().for_each(|q| q.halted = false);
+                Progress::complete(0)
+            }
+            _ => Progress::stall(0),
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::usb_model::Speed;
+    use std::sync::mpsc::{channel, Receiver};
+
+    /// Endpoint 0x01 stores, 0x81 gives back what was stored and refuses while empty.
+    #[derive(Default)]
+    struct Loopback {
+        stored: VecDeque<u8>,
+        cleared: Vec<u8>,
+    }
+
+    impl UsbDeviceModel for Loopback {
+        fn speed(&self) -> Speed {
+            Speed::High
+        }
+        fn device_descriptor(&self) -> &[u8] {
+            &[18, 1, 0, 2, 0, 0, 0, 64, 0x34, 0x12, 0x78, 0x56, 0, 1, 0, 1, 0, 1]
+        }
+        fn configuration_descriptor(&self) -> &[u8] {
+            &[9, 2, 9, 0, 0, 1, 0, 0x80, 50]
+        }
+        fn string(&self, index: u8) -> Option<&str> {
+            (index == 1).then_some("loop")
+        }
+        fn control(&mut self, now: HostTime, setup: &Setup, data: &mut [u8]) -> Progress {
+            if setup.request != 7 {
+                return Progress::stall(0);
+            }
+            data.fill(now.0 as u8);
+            Progress::complete(data.len())
+        }
+        fn transfer_out(&mut self, _: HostTime, _: u8, data: &[u8]) -> Progress {
+            self.stored.extend(data);
+            Progress::complete(data.len())
+        }
+        fn transfer_in(&mut self, _: HostTime, _: u8, buffer: &mut [u8]) -> Progress {
+            if self.stored.is_empty() {
+                return Progress::nak(0);
+            }
+            let n = buffer.len().min(self.stored.len());
+            buffer.iter_mut().zip(self.stored.drain(..n)).for_each(|(b, v)| *b = v);
+            Progress::complete(n)
+        }
+        fn halt_cleared(&mut self, endpoint: u8) {
+            self.cleared.push(endpoint);
+        }
+    }
+
+    struct Bench {
+        plug: UsbPlug,
+        model: Arc<Mutex<Loopback>>,
+        next: u64,
+    }
+
+    type Ended = Receiver<(Status, usize, Vec<u8>)>;
+
+    impl Bench {
+        fn new() -> Self {
+            let model = Arc::new(Mutex::new(Loopback::default()));
+            Self { plug: UsbPlug::new(model.clone(), monotonic_clock()), model, next: 0 }
+        }
+
+        fn send(&mut self, endpoint: u8, setup: Option<Setup>, buffer: Vec<u8>) -> (u64, Ended) {
+            let (tx, rx) = channel();
+            self.next += 1;
+            let done = Box::new(move |c: Completed| tx.send((c.status, c.actual, c.buffer)).unwrap());
+            let sent = self.plug.submit(Request { id: self.next, endpoint, setup, buffer, done });
+            assert!(sent.is_ok());
+            (self.next, rx)
+        }
+
+        fn control(&mut self, bytes: [u8; 8]) -> (Status, Vec<u8>) {
+            let setup = Setup::from_bytes(bytes);
+            let (_, rx) = self.send(0, Some(setup), vec![0; usize::from(setup.length)]);
+            let (status, n, data) = wait(&rx);
+            (status, data[..n].to_vec())
+        }
+    }
+
+    fn wait(rx: &Ended) -> (Status, usize, Vec<u8>) {
+        rx.recv_timeout(Duration::from_secs(5)).expect("the transfer ends")
+    }
+
+    #[test]
+    fn a_refused_read_waits_for_data_or_is_taken_back() {
+        let mut b = Bench::new();
+        let (_, read) = b.send(0x81, None, vec![0; 8]);
+        assert!(read.recv_timeout(Duration::from_millis(20)).is_err());
+        let (_, write) = b.send(0x01, None, vec![1, 2, 3]);
+        assert_eq!(wait(&write), (Status::Ok, 3, vec![1, 2, 3]));
+        assert_eq!(wait(&read), (Status::Ok, 3, vec![1, 2, 3, 0, 0, 0, 0, 0]));
+        let (first, r1) = b.send(0x81, None, vec![0; 8]);
+        let (second, r2) = b.send(0x81, None, vec![0; 8]);
+        assert!(b.plug.cancel(second) && b.plug.cancel(first));
+        assert_eq!((wait(&r1).0, wait(&r2).0), (Status::Cancelled, Status::Cancelled));
+        assert!(!b.plug.cancel(first), "an ended transfer cannot be taken back");
+        assert_eq!(b.plug.in_flight(), 0);
+    }
+
+    #[test]
+    fn a_stall_lasts_until_the_halt_is_cleared() {
+        let mut b = Bench::new();
+        b.plug.inject(0x01, 1, Fault::Stall);
+        let ended: Vec<_> = (0..3).map(|i| b.send(0x01, None, vec![i]).1).collect();
+        let status: Vec<_> = ended.iter().map(|e| wait(e).0).collect();
+        assert_eq!(status, [Status::Ok, Status::Stall, Status::Stall]);
+        assert_eq!(b.control([0x82, 0, 0, 0, 1, 0, 2, 0]), (Status::Ok, vec![1, 0]));
+        assert_eq!(b.control([0x02, 1, 0, 0, 1, 0, 0, 0]).0, Status::Ok);
+        assert_eq!(b.control([0x82, 0, 0, 0, 1, 0, 2, 0]), (Status::Ok, vec![0, 0]));
+        let (_, again) = b.send(0x01, None, vec![9]);
+        assert_eq!(wait(&again).0, Status::Ok);
+        let model = b.model.lock().unwrap();
+        assert_eq!((Vec::from(model.stored.clone()), &model.cleared), (vec![0, 9], &vec![1]));
+    }
+
+    #[test]
+    fn standard_requests_are_answered_and_unknown_ones_refused() {
+        let mut b = Bench::new();
+        assert_eq!(b.control([0x80, 6, 0, 1, 0, 0, 8, 0]), (Status::Ok, vec![18, 1, 0, 2, 0, 0, 0, 64]));
+        assert_eq!(b.control([0x80, 6, 0, 2, 0, 0, 255, 0]).1, [9, 2, 9, 0, 0, 1, 0, 0x80, 50]);
+        assert_eq!(b.control([0x80, 6, 0, 3, 0, 0, 255, 0]).1, [4, 3, 9, 4]);
+        assert_eq!(b.control([0x80, 6, 1, 3, 9, 4, 255, 0]).1, [10, 3, b'l', 0, b'o', 0, b'o', 0, b'p', 0]);
+        assert_eq!(b.control([0x80, 6, 2, 3, 9, 4, 255, 0]).0, Status::Stall);
+        assert_eq!(b.control([0x80, 8, 0, 0, 0, 0, 1, 0]).1, [0]);
+        assert_eq!(b.control([0x00, 9, 1, 0, 0, 0, 0, 0]).0, Status::Ok);
+        assert_eq!(b.control([0x80, 8, 0, 0, 0, 0, 1, 0]).1, [1]);
+        assert_eq!(b.control([0x00, 9, 2, 0, 0, 0, 0, 0]).0, Status::Stall);
+        assert_eq!(b.control([0xc0, 7, 0, 0, 0, 0, 3, 0]).1.len(), 3);
+        assert_eq!(b.control([0xc0, 8, 0, 0, 0, 0, 3, 0]).0, Status::Stall);
+    }
+
+    #[test]
+    fn pulling_the_plug_ends_everything_before_it_is_signalled() {
+        let mut b = Bench::new();
+        let reads: Vec<_> = (0..5).map(|_| b.send(0x81, None, vec![0; 4]).1).collect();
+        let (tx, gone) = channel();
+        let plug = b.plug.clone();
+        b.plug.on_unplug(Box::new(move || tx.send(plug.in_flight()).unwrap()));
+        b.plug.inject(0x01, 0, Fault::Unplug(2));
+        let (_, write) = b.send(0x01, None, vec![1, 2, 3, 4]);
+        assert_eq!(wait(&write).0, Status::Gone);
+        assert_eq!(gone.recv_timeout(Duration::from_secs(5)).unwrap(), 0);
+        // The two bytes that crossed may have reached the first waiting read; no other read can have ended well.
+        let ok = reads.iter().map(wait).filter(|r| r.0 == Status::Ok).count();
+        assert!(ok <= 1);
+        let refused = b.plug.submit(Request {
+            id: 99,
+            endpoint: 1,
+            setup: None,
+            buffer: vec![],
+            done: Box::new(|_| panic!("a refused request never ends")),
+        });
+        assert!(refused.is_err() && !b.plug.is_plugged());
+    }
+
+    #[test]
+    fn faults_hit_the_transfer_they_are_planned_for() {
+        let mut b = Bench::new();
+        b.plug.inject(0x01, 0, Fault::Short(1));
+        b.plug.inject(0x01, 1, Fault::BusError);
+        b.plug.inject(0x81, 0, Fault::Babble);
+        b.plug.inject(0x81, 1, Fault::NakNs(30_000_000));
+        let (_, w0) = b.send(0x01, None, vec![5, 6]);
+        let (_, w1) = b.send(0x01, None, vec![7]);
+        assert_eq!((wait(&w0).1, wait(&w1).0), (1, Status::BusError));
+        let (_, r0) = b.send(0x81, None, vec![0; 4]);
+        let start = Instant::now();
+        let (_, r1) = b.send(0x81, None, vec![0; 4]);
+        assert_eq!(wait(&r0).0, Status::Babble);
+        assert_eq!(wait(&r1), (Status::Ok, 1, vec![5, 0, 0, 0]));
+        assert!(start.elapsed() >= Duration::from_millis(30));
+    }
+}
