@@ -2,4 +2,5 @@
 //!
 //! See `docs/ARCHITECTURE.md` for the picture and one invariant per folder.
 
+pub mod config;
 pub mod scene;

@@ -1,0 +1,167 @@
+//! A rig file, the environment and `--set` flags into a checked [`RigConfig`].
+//!
+//! Defaults < file < environment (`DPM_SET_PROJECTOR__WIDTH=640`) < `--set projector.width=640`. All mistakes are
+//! reported at once, each with file, line and column. The keys are listed in `docs/CONFIG.md`, which is made from their
+//! declarations here.
+
+mod check;
+mod error;
+mod projector;
+mod read;
+mod run;
+mod source;
+mod world;
+
+#[cfg(test)]
+mod tests;
+
+pub use error::{ConfigError, ConfigErrors, Origin};
+pub use projector::*;
+pub use read::KeyDoc;
+pub use run::*;
+pub use source::VARIABLE_PREFIX;
+pub use world::*;
+
+use read::{section, Any, ConfigValue, Reader};
+use std::path::Path;
+
+/// Largest accepted rig file in bytes.
+pub const MAX_FILE_BYTES: u64 = 1 << 20;
+
+/// The rig file that `dpm demo` runs.
+pub const DEMO_RIG: &str = include_str!("../../../rigs/demo.toml");
+
+section! {
+    /// A whole rig. Every value is in its range and no two contradict each other.
+    pub struct RigConfig {
+        /// What the light comes out of.
+        projector: ProjectorConfig = ProjectorConfig::default(), "", Any;
+        /// Where poses come from.
+        tracker: TrackerConfig = TrackerConfig::default(), "", Any;
+        /// The eye for which the picture is right.
+        observer: ObserverConfig = ObserverConfig::default(), "", Any;
+        /// What is to be seen.
+        scene: SceneConfig = SceneConfig::default(), "", Any;
+        /// How radiance is found.
+        render: RenderConfig = RenderConfig::default(), "", Any;
+        /// From samples to the pose at the time of light.
+        prediction: PredictionConfig = PredictionConfig::default(), "", Any;
+        /// Time and the operating system.
+        real_time: RealTimeConfig = RealTimeConfig::default(), "", Any;
+        /// How long to run.
+        run: RunConfig = RunConfig::default(), "", Any;
+        /// What is written.
+        output: OutputConfig = OutputConfig::default(), "", Any;
+        /// What happens when something fails.
+        safety: SafetyConfig = SafetyConfig::default(), "", Any;
+    }
+}
+
+/// Settings from outside the file.
+#[derive(Clone, Debug, Default)]
+pub struct Overrides {
+    /// Environment variables, name and value; those without [`VARIABLE_PREFIX`] are ignored.
+    pub variables: Vec<(String, String)>,
+    /// Texts `a.b=c` in the order given; later ones win.
+    pub flags: Vec<String>,
+}
+
+impl Overrides {
+    /// The process's environment together with `flags`.
+    pub fn from_environment(flags: Vec<String>) -> Self {
+        let mut variables: Vec<_> = std::env::vars_os()
+            .filter_map(|(k, v)| Some((k.into_string().ok()?, v.to_string_lossy().into_owned())))
+            .filter(|(k, _)| k.starts_with(VARIABLE_PREFIX))
+            .collect();
+        variables.sort();
+        Self { variables, flags }
+    }
+
+    fn apply(&self, root: &mut source::Node, errors: &mut Vec<ConfigError>) {
+        for (name, value) in &self.variables {
+            if let Some(path) = source::variable_path(name) {
+                source::set(root, &path, value, &Origin::Variable(name.clone()), errors);
+            }
+        }
+        for flag in &self.flags {
+            let origin = Origin::Flag(flag.clone());
+            match flag.split_once('=') {
+                Some((key, value)) => {
+                    let path: Vec<String> = key.trim().split('.').map(|p| p.trim().to_string()).collect();
+                    source::set(root, &path, value.trim(), &origin, errors);
+                }
+                None => errors.push(ConfigError {
+                    origin,
+                    key: String::new(),
+                    problem: "has no `=`".into(),
+                    remedy: "write for example `render.spp=4`".into(),
+                }),
+            }
+        }
+    }
+}
+
+impl RigConfig {
+    /// Reads a rig file of at most [`MAX_FILE_BYTES`].
+    ///
+    /// # Errors
+    /// Every mistake at once: unreadable file, syntax, unknown keys, wrong types, values out of range, contradictions,
+    /// input files that are not there.
+    pub fn load(path: &Path, overrides: &Overrides) -> Result<Self, ConfigErrors> {
+        let unreadable = |e: std::io::Error| {
+            let remedy = "give the path of a rig file, for example rigs/demo.toml";
+            ConfigErrors::unreadable(path, format!("cannot read the rig file: {e}"), remedy)
+        };
+        let file = std::fs::File::open(path).map_err(unreadable)?;
+        let mut text = String::new();
+        std::io::Read::read_to_string(&mut std::io::Read::take(file, MAX_FILE_BYTES + 1), &mut text)
+            .map_err(unreadable)?;
+        if text.len() as u64 > MAX_FILE_BYTES {
+            let problem = format!("the rig file has more than {MAX_FILE_BYTES} bytes");
+            return Err(ConfigErrors::unreadable(path, problem, "is it a scene? give that by --scene"));
+        }
+        let base = path.parent().unwrap_or(Path::new(""));
+        Self::parse(&path.display().to_string(), &text, base, overrides)
+    }
+
+    /// The rig that `dpm demo` runs.
+    ///
+    /// # Errors
+    /// Mistakes in `overrides`, all at once.
+    pub fn demo(overrides: &Overrides) -> Result<Self, ConfigErrors> {
+        Self::parse("rigs/demo.toml", DEMO_RIG, Path::new(""), overrides)
+    }
+
+    /// Reads a rig file's text. `name` stands in messages; input files are relative to `base`.
+    ///
+    /// # Errors
+    /// As [`RigConfig::load`].
+    pub fn parse(name: &str, text: &str, base: &Path, overrides: &Overrides) -> Result<Self, ConfigErrors> {
+        let mut reader = Reader::default();
+        let mut root = source::parse(name, text, &mut reader.errors);
+        if !reader.errors.is_empty() {
+            // A half-read file would only add errors that are none.
+            return Err(ConfigErrors(reader.errors));
+        }
+        overrides.apply(&mut root, &mut reader.errors);
+        let rig = <Self as ConfigValue>::read(&root, &mut reader, "");
+        let mut rig = rig.unwrap_or_default();
+        // What is wrong by itself would be reported again as a contradiction.
+        if reader.errors.is_empty() {
+            check::check(&rig, &mut reader);
+            check::resolve_files(&mut rig, base, &mut reader);
+        }
+        if reader.errors.is_empty() {
+            Ok(rig)
+        } else {
+            Err(ConfigErrors(reader.errors))
+        }
+    }
+
+    /// Every key of the rig file, for the manual.
+    pub fn key_docs() -> Vec<KeyDoc> {
+        let mut out = Vec::new();
+        Self::document("", &mut out);
+        out
+    }
+}

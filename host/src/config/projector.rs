@@ -1,0 +1,208 @@
+//! `[projector]`: what the light comes out of, where it stands, and how the program reaches it.
+
+use super::read::{kinds, section, words, Any, ConfigValue, Limit, NotEmpty, Reader, Within};
+use super::source::{Node, Value};
+use dpm_device::planes::{PlaneSchedule, Raster};
+use dpm_device::time::FrameRate;
+use std::path::PathBuf;
+
+section! {
+    /// The projector. Pixel (0, 0) is the upper left mirror as the projector throws it.
+    pub struct ProjectorConfig {
+        /// Mirrors in a row. Change it to the panel's size; every size from 1 on works.
+        width: u32 = 1024, "px", Within(1, Raster::MAX_SIDE);
+        /// Rows of mirrors.
+        height: u32 = 768, "px", Within(1, Raster::MAX_SIDE);
+        /// Frames a second, a whole number or a fraction written as a string, for example "60000/1001". Change it to what the
+        /// projector is driven at.
+        frame_rate: FrameRate = FrameRate::new(947, 1).expect("not zero"), "frames/s", Within(Rate(1, 1), Rate(100_000, 1));
+        /// Bit planes in a frame: 24 is eight bits of red, green and blue, 8 is eight bits of one white channel. Eight planes
+        /// leave a monochrome rig three times the frame rate.
+        planes: u32 = 24, "", OneOf(&[8, 24]);
+        /// Where the projector's lens stands in the world. Measure it, or give `calibration` instead.
+        position: [f64; 3] = [0.0, 0.35, 1.1], "m", Within(-1e6, 1e6);
+        /// The point in the world that the raster's centre shows.
+        look_at: [f64; 3] = [0.0, 0.1, 0.0], "m", Within(-1e6, 1e6);
+        /// The direction in the world that is up in the picture; need not be perpendicular to the view.
+        up: [f64; 3] = [0.0, 1.0, 0.0], "", Within(-1e6, 1e6);
+        /// Full angle of view across the raster's width. Change it to the lens.
+        horizontal_fov_deg: f64 = 30.0, "deg", Within(0.1, 170.0);
+        /// A calibration file (OpenCV FileStorage XML or YAML) that takes the place of `position`, `look_at`, `up` and
+        /// `horizontal_fov_deg`. Use it for every real rig.
+        calibration: Option<PathBuf> = None, "", NotEmpty;
+        /// Radiant intensity of one pixel at full drive, in scene units: the scene's radiance 1 needs `pi * d^2 / albedo` at
+        /// distance d. Raise it when the report says that light is clipped, lower it when the picture uses few of its levels.
+        max_intensity: f64 = 8.0, "scene units/sr", Within(1e-6, 1e12);
+        /// Bit planes that the panel can show in a second; `frame_rate * planes` beyond it is refused. The default is a
+        /// 1024 x 768 panel at 44.0 us a plane, which is 947 frames of 24 planes.
+        max_planes_per_second: u32 = 22_728, "planes/s", Within(1, 10_000_000);
+        /// How the program reaches the projector.
+        backend: ProjectorBackend = ProjectorBackend::default(), "", Any;
+    }
+}
+
+impl ProjectorConfig {
+    /// The mirror array; sides are in range once the configuration is accepted.
+    pub fn raster(&self) -> Raster {
+        Raster::new(self.width, self.height).expect("sides were checked when the configuration was read")
+    }
+
+    /// The planes of a frame in the order they are shown.
+    pub fn schedule(&self) -> PlaneSchedule {
+        if self.planes == 8 {
+            PlaneSchedule::mono8()
+        } else {
+            PlaneSchedule::rgb24()
+        }
+    }
+}
+
+kinds! {
+    /// The ways to a projector.
+    pub enum ProjectorBackend {
+        /// a projector made of software in this process.
+        Mock(MockProjectorConfig) = "mock",
+        /// a bit-plane projector on USB.
+        Usb(UsbProjectorConfig) = "usb",
+        /// a bit-plane projector on a serial port.
+        Serial(SerialProjectorConfig) = "serial",
+        /// a TI DLPC900 evaluation module, driven by its USB HID commands.
+        Dlpc900(Dlpc900Config) = "dlpc900",
+    }
+    default Mock
+}
+
+section! {
+    /// The embedded mock projector.
+    pub struct MockProjectorConfig {
+        /// How much faster than the host's its clock runs. Change it to see clock mapping at work.
+        clock_ppm: f64 = 0.0, "ppm", Within(-1000.0, 1000.0);
+        /// Frames it can hold before one is shown.
+        buffer_frames: u32 = 3, "frames", Within(2, 64);
+        /// Faults to inject, in the mock's own notation; empty for none.
+        faults: String = String::new(), "", Any;
+    }
+}
+
+section! {
+    /// A bit-plane projector on USB.
+    pub struct UsbProjectorConfig {
+        /// USB vendor id.
+        vendor_id: u16 = 0x1209, "", Any;
+        /// USB product id.
+        product_id: u16 = 0x0947, "", Any;
+        /// Serial number of the device; needed when several are plugged in.
+        serial_number: Option<String> = None, "", NotEmpty;
+        /// Transfers queued at once. More bridge longer pauses of the host; together they must fit into the kernel's
+        /// `usbfs_memory_mb`.
+        transfers_in_flight: u32 = 6, "", Within(1, 64);
+    }
+}
+
+section! {
+    /// A bit-plane projector on a serial port: small rasters and tests.
+    pub struct SerialProjectorConfig {
+        /// Device file of the port.
+        port: String = "/dev/ttyUSB0".into(), "", NotEmpty;
+        /// Bits a second on the wire.
+        baud: u32 = 921_600, "bit/s", Within(300, 20_000_000);
+    }
+}
+
+section! {
+    /// A TI DLPC900 evaluation module (LightCrafter 6500 and 9000).
+    pub struct Dlpc900Config {
+        /// The panel behind the controller; decides raster and shortest exposures.
+        panel: Dlpc900Panel = Dlpc900Panel::Dlp6500, "", Any;
+        /// Serial number of the device; needed when several are plugged in.
+        serial_number: Option<String> = None, "", NotEmpty;
+        /// Light of each bit-1 pattern.
+        exposure_us: u32 = 105, "us", Within(62, 2_000_000);
+    }
+}
+
+words! {
+    /// Panels of a DLPC900.
+    pub enum Dlpc900Panel {
+        /// 1920 x 1080.
+        Dlp6500 = "dlp6500",
+        /// 2560 x 1600.
+        Dlp9000 = "dlp9000",
+        /// 2716 x 1600.
+        Dlp670s = "dlp670s",
+        /// 2048 x 1200.
+        Dlp500yx = "dlp500yx",
+    }
+}
+
+/// A bound on [`FrameRate`]: numerator and denominator.
+#[derive(Clone, Copy)]
+struct Rate(u32, u32);
+
+impl Limit<FrameRate> for Within<Rate> {
+    fn allows(&self, rate: &FrameRate) -> bool {
+        let at_least =
+            |a: (u32, u32), b: (u32, u32)| u64::from(a.0) * u64::from(b.1) >= u64::from(b.0) * u64::from(a.1);
+        let rate = (rate.num(), rate.den());
+        at_least(rate, (self.0 .0, self.0 .1)) && at_least((self.1 .0, self.1 .1), rate)
+    }
+    fn describe(&self) -> String {
+        format!("{} to {}", self.0 .0, self.1 .0)
+    }
+}
+
+/// One of a few numbers.
+pub(super) struct OneOf(pub &'static [u32]);
+
+impl Limit<u32> for OneOf {
+    fn allows(&self, value: &u32) -> bool {
+        self.0.contains(value)
+    }
+    fn describe(&self) -> String {
+        self.0.iter().map(u32::to_string).collect::<Vec<_>>().join(" or ")
+    }
+}
+
+impl ConfigValue for FrameRate {
+    fn kind() -> String {
+        "a whole number or a fraction in quotes".into()
+    }
+
+    fn read(node: &Node, reader: &mut Reader, key: &str) -> Option<Self> {
+        let parsed = match &node.value {
+            Value::Integer(i) => u32::try_from(*i).ok().and_then(|n| FrameRate::new(n, 1)),
+            Value::String(s) => {
+                let (num, den) = s.split_once('/').unwrap_or((s, "1"));
+                match (num.trim().parse(), den.trim().parse()) {
+                    (Ok(num), Ok(den)) => FrameRate::new(num, den),
+                    _ => None,
+                }
+            }
+            Value::Float(_) => {
+                let problem = "is a number with a decimal point, which no clock can keep exactly";
+                let remedy = "write a fraction, for example \"60000/1001\" for 59.94";
+                reader.refuse(&node.origin, key, problem, remedy);
+                return None;
+            }
+            _ => None,
+        };
+        if parsed.is_none() {
+            let shown = match &node.value {
+                Value::String(s) => format!("{s:?}"),
+                Value::Integer(i) => i.to_string(),
+                other => other.kind().into(),
+            };
+            let remedy = "write 947 or a fraction of two whole numbers above 0 such as \"60000/1001\"";
+            reader.refuse(&node.origin, key, format!("is {shown}, must be {}", Self::kind()), remedy);
+        }
+        parsed
+    }
+
+    fn show(&self) -> String {
+        if self.den() == 1 {
+            format!("\"{}\"", self.num())
+        } else {
+            format!("\"{}/{}\"", self.num(), self.den())
+        }
+    }
+}

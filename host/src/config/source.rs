@@ -1,0 +1,223 @@
+//! TOML text, environment variables and `--set` flags into one tree of values that know where they were written.
+
+use super::error::{ConfigError, Origin};
+use std::collections::BTreeMap;
+use std::sync::Arc;
+use toml::de::{DeTable, DeValue};
+
+/// Prefix of environment variables that set a key: `DPM_SET_PROJECTOR__WIDTH=640` sets `projector.width`.
+pub const VARIABLE_PREFIX: &str = "DPM_SET_";
+
+/// A value and where it was written.
+#[derive(Clone, Debug)]
+pub(super) struct Node {
+    pub value: Value,
+    pub origin: Origin,
+}
+
+/// What TOML can say, as far as a rig file needs it.
+#[derive(Clone, Debug)]
+pub(super) enum Value {
+    Bool(bool),
+    Integer(i64),
+    Float(f64),
+    String(String),
+    Array(Vec<Node>),
+    Table(BTreeMap<String, Entry>),
+    /// Dates and integers beyond 64 bits: no key takes them.
+    Other(&'static str),
+}
+
+/// A key's value and where the key itself stands.
+#[derive(Clone, Debug)]
+pub(super) struct Entry {
+    pub key_origin: Origin,
+    pub node: Node,
+}
+
+impl Value {
+    /// The kind, as messages name it.
+    pub fn kind(&self) -> &'static str {
+        match self {
+            Self::Bool(_) => "a boolean",
+            Self::Integer(_) => "an integer",
+            Self::Float(_) => "a number with a decimal point",
+            Self::String(_) => "a string",
+            Self::Array(_) => "an array",
+            Self::Table(_) => "a table",
+            Self::Other(kind) => kind,
+        }
+    }
+}
+
+/// Finds lines and columns in a text.
+struct Lines<'a> {
+    file: Arc<str>,
+    text: &'a str,
+    starts: Vec<usize>,
+}
+
+impl<'a> Lines<'a> {
+    fn new(file: &str, text: &'a str) -> Self {
+        let starts = std::iter::once(0).chain(text.match_indices('\n').map(|(i, _)| i + 1)).collect();
+        Self { file: file.into(), text, starts }
+    }
+
+    fn origin(&self, offset: usize) -> Origin {
+        let line = self.starts.partition_point(|&s| s <= offset);
+        let start = self.starts[line - 1];
+        let upto = self.text.get(start..offset.min(self.text.len())).unwrap_or("");
+        Origin::File { file: self.file.clone(), line, column: upto.chars().count() + 1 }
+    }
+}
+
+/// Parses TOML; every syntax error becomes one entry of `errors`, and what could be read is returned all the same.
+pub(super) fn parse(file: &str, text: &str, errors: &mut Vec<ConfigError>) -> Node {
+    let lines = Lines::new(file, text);
+    let (table, problems) = DeTable::parse_recoverable(text);
+    for problem in problems {
+        errors.push(ConfigError {
+            origin: lines.origin(problem.span().map_or(0, |s| s.start)),
+            key: String::new(),
+            problem: format!("not valid TOML: {}", problem.message().replace('\n', ", ")),
+            remedy: String::new(),
+        });
+    }
+    Node { value: table_value(table.get_ref(), &lines), origin: lines.origin(0) }
+}
+
+fn table_value(table: &DeTable<'_>, lines: &Lines<'_>) -> Value {
+    let mut out = BTreeMap::new();
+    for (key, value) in table {
+        let node = Node { value: value_of(value.get_ref(), lines), origin: lines.origin(value.span().start) };
+        let entry = Entry { key_origin: lines.origin(key.span().start), node };
+        out.insert(key.get_ref().to_string(), entry);
+    }
+    Value::Table(out)
+}
+
+fn value_of(value: &DeValue<'_>, lines: &Lines<'_>) -> Value {
+    match value {
+        DeValue::Boolean(b) => Value::Bool(*b),
+        DeValue::Integer(i) => i64::from_str_radix(i.as_str(), i.radix())
+            .map_or(Value::Other("an integer beyond 64 bits"), Value::Integer),
+        DeValue::Float(f) => f.as_str().parse().map_or(Value::Other("an unreadable number"), Value::Float),
+        DeValue::String(s) => Value::String(s.to_string()),
+        DeValue::Datetime(_) => Value::Other("a date"),
+        DeValue::Array(items) => Value::Array(
+            items
+                .iter()
+                .map(|v| Node { value: value_of(v.get_ref(), lines), origin: lines.origin(v.span().start) })
+                .collect(),
+        ),
+        DeValue::Table(table) => table_value(table, lines),
+    }
+}
+
+/// Sets one key of the tree. `path` holds the parts of the dotted key; a part that is a number steps into an array.
+/// A text that is no TOML value is taken as a string, so that `render.method=paper` needs no quotes.
+pub(super) fn set(
+    root: &mut Node,
+    path: &[String],
+    text: &str,
+    origin: &Origin,
+    errors: &mut Vec<ConfigError>,
+) {
+    let mut refuse = |problem: String, remedy: &str| {
+        errors.push(ConfigError {
+            origin: origin.clone(),
+            key: path.join("."),
+            problem,
+            remedy: remedy.into(),
+        });
+    };
+    if path.is_empty() || path.iter().any(String::is_empty) {
+        return refuse("no key before the `=`".into(), "write for example `render.spp=4`");
+    }
+    let mut at = root;
+    for (depth, part) in path.iter().enumerate() {
+        let here = path[..depth].join(".");
+        at = match &mut at.value {
+            Value::Table(table) => {
+                let fresh = || Entry {
+                    key_origin: origin.clone(),
+                    node: Node { value: Value::Table(BTreeMap::new()), origin: origin.clone() },
+                };
+                &mut table.entry(part.clone()).or_insert_with(fresh).node
+            }
+            Value::Array(items) => {
+                let len = items.len();
+                match part.parse::<usize>().ok().filter(|&i| i < len) {
+                    Some(i) => &mut items[i],
+                    None => {
+                        return refuse(
+                            format!("`{here}` has {len} elements; `{part}` is none of them"),
+                            "count from 0",
+                        )
+                    }
+                }
+            }
+            other => {
+                let kind = other.kind();
+                return refuse(format!("`{here}` is {kind}, not a table"), "set the key itself");
+            }
+        };
+    }
+    *at = Node { value: value_from_flag(text, origin), origin: origin.clone() };
+}
+
+fn value_from_flag(text: &str, origin: &Origin) -> Value {
+    let line = format!("v = {text}");
+    let mut problems = Vec::new();
+    let mut node = parse("", &line, &mut problems);
+    let parsed = match &mut node.value {
+        Value::Table(table) if problems.is_empty() && table.len() == 1 => table.remove("v"),
+        _ => None,
+    };
+    match parsed {
+        Some(mut entry) => {
+            stamp(&mut entry.node, origin);
+            entry.node.value
+        }
+        None => Value::String(text.to_string()),
+    }
+}
+
+/// Everything under a flag's value stands where the flag stands.
+fn stamp(node: &mut Node, origin: &Origin) {
+    node.origin = origin.clone();
+    match &mut node.value {
+        Value::Array(items) => items.iter_mut().for_each(|n| stamp(n, origin)),
+        Value::Table(table) => table.values_mut().for_each(|e| {
+            e.key_origin = origin.clone();
+            stamp(&mut e.node, origin);
+        }),
+        _ => {}
+    }
+}
+
+/// The dotted key that an environment variable sets; `None` when it is not one of ours.
+/// Two underscores part the levels, because keys contain single ones.
+pub(super) fn variable_path(name: &str) -> Option<Vec<String>> {
+    let rest = name.strip_prefix(VARIABLE_PREFIX)?;
+    Some(rest.split("__").map(str::to_lowercase).collect())
+}
+
+impl Node {
+    /// The same value in the `toml` crate's own type; `None` for what no key takes.
+    pub fn to_toml(&self) -> Option<toml::Value> {
+        Some(match &self.value {
+            Value::Bool(b) => toml::Value::Boolean(*b),
+            Value::Integer(i) => toml::Value::Integer(*i),
+            Value::Float(f) => toml::Value::Float(*f),
+            Value::String(s) => toml::Value::String(s.clone()),
+            Value::Array(items) => {
+                toml::Value::Array(items.iter().map(Self::to_toml).collect::<Option<_>>()?)
+            }
+            Value::Table(table) => toml::Value::Table(
+                table.iter().map(|(k, e)| Some((k.clone(), e.node.to_toml()?))).collect::<Option<_>>()?,
+            ),
+            Value::Other(_) => return None,
+        })
+    }
+}
