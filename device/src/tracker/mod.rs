@@ -1,5 +1,9 @@
 //! Trackers: sources of rigid-body poses with the instant at which the light for them was captured.
 
+mod gate;
+
+pub use gate::{PacketCounters, SampleCounters, SampleGate, TrackerCounters};
+
 use crate::pose::Pose;
 use crate::time::HostTime;
 

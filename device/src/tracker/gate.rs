@@ -1,0 +1,432 @@
+//! Samples as decoded into samples that may be used: finite, rigid, in capture order, each one once; the rest counted by reason.
+//!
+//! Every [`super::Tracker`] of this project ends in one gate, so that the promises of the trait and the law
+//! *received = used + dropped by reason* have one home.
+
+use super::{BodyIndex, TrackerSample};
+use crate::pose::Pose;
+use crate::time::HostTime;
+
+/// Datagrams or stream messages by what became of them.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub struct PacketCounters {
+    /// All that arrived.
+    pub received: u64,
+    /// Understood and acted upon.
+    pub used: u64,
+    /// Not from the configured address.
+    pub foreign_source: u64,
+    /// Contradicting themselves: lengths, counts, checksums, terminators.
+    pub malformed: u64,
+    /// Of a version or kind that this client does not speak or did not ask for.
+    pub unsupported: u64,
+}
+
+impl PacketCounters {
+    /// Sum of all reasons for not using a packet.
+    pub const fn dropped(&self) -> u64 {
+        self.foreign_source + self.malformed + self.unsupported
+    }
+}
+
+/// Samples of single bodies by what became of them.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub struct SampleCounters {
+    /// All that were decoded.
+    pub received: u64,
+    /// Handed on (those marked as not tracked included).
+    pub used: u64,
+    /// Of a body that the rig does not know.
+    pub unknown_body: u64,
+    /// Already seen: same sequence number and capture instant.
+    pub duplicate: u64,
+    /// Captured before one that was already handed on.
+    pub late: u64,
+    /// With NaN or infinite numbers.
+    pub not_finite: u64,
+    /// Farther than [`SampleGate::REACH_M`] from the origin.
+    pub out_of_reach: u64,
+    /// With a quaternion whose norm is not within [`SampleGate::NORM_TOLERANCE`] of 1.
+    pub bad_rotation: u64,
+}
+
+impl SampleCounters {
+    /// Sum of all reasons for not using a sample.
+    pub const fn dropped(&self) -> u64 {
+        self.unknown_body
+            + self.duplicate
+            + self.late
+            + self.not_finite
+            + self.out_of_reach
+            + self.bad_rotation
+    }
+}
+
+/// What a tracker counted since it was made. Counters only grow.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub struct TrackerCounters {
+    /// Packets; all zero for trackers without packets.
+    pub packets: PacketCounters,
+    /// Samples of single bodies.
+    pub samples: SampleCounters,
+    /// Of the used samples, those that the tracker marked as not seen.
+    pub untracked: u64,
+    /// Samples missing by their sequence numbers (gaps up to [`SampleGate::MAX_GAP`]).
+    pub lost: u64,
+    /// Sequence or clock of a body started anew.
+    pub restarts: u64,
+    /// Episodes in which a body that had moved repeated the same pose bit for bit.
+    pub stuck: u64,
+}
+
+impl TrackerCounters {
+    /// The conservation law: received = used + dropped by reason, for packets and for samples.
+    pub const fn is_conserved(&self) -> bool {
+        self.packets.received == self.packets.used + self.packets.dropped()
+            && self.samples.received == self.samples.used + self.samples.dropped()
+    }
+}
+
+impl core::fmt::Display for TrackerCounters {
+    fn fmt(&self, f: &mut core::fmt::Formatter<'_>) -> core::fmt::Result {
+        let (p, s) = (&self.packets, &self.samples);
+        write!(f, "samples {} used of {}", s.used, s.received)?;
+        let reasons = [
+            ("packets received", p.received),
+            ("from elsewhere", p.foreign_source),
+            ("malformed", p.malformed),
+            ("unsupported", p.unsupported),
+            ("unknown body", s.unknown_body),
+            ("duplicate", s.duplicate),
+            ("late", s.late),
+            ("not finite", s.not_finite),
+            ("out of reach", s.out_of_reach),
+            ("bad rotation", s.bad_rotation),
+            ("not tracked", self.untracked),
+            ("lost", self.lost),
+            ("restarts", self.restarts),
+            ("stuck", self.stuck),
+        ];
+        for (name, count) in reasons {
+            if count > 0 {
+                write!(f, ", {name} {count}")?;
+            }
+        }
+        Ok(())
+    }
+}
+
+#[derive(Clone, Copy)]
+struct BodyState {
+    last: Option<TrackerSample>,
+    /// Samples in a row captured before `last`, and the newest of them: a clock that was set back looks like this.
+    late_run: u32,
+    late_newest: HostTime,
+    /// Equal poses in a row, and whether the pose changed before them.
+    equal_run: u32,
+    was_moving: bool,
+}
+
+/// The gate for a fixed set of bodies. Allocates when made, never afterwards.
+pub struct SampleGate {
+    bodies: Vec<BodyState>,
+    counters: TrackerCounters,
+}
+
+impl SampleGate {
+    /// Largest accepted distance from the origin, metres: a tracking volume is smaller than a kilometre.
+    pub const REACH_M: f64 = 1000.0;
+    /// Largest deviation of a quaternion's norm from 1; smaller ones are normalised away.
+    pub const NORM_TOLERANCE: f64 = 1e-3;
+    /// Largest gap in sequence numbers that counts as loss; a larger one counts as a restart.
+    pub const MAX_GAP: u32 = 1000;
+    /// Late samples in a row, each newer than the one before, that reveal a clock set back ...
+    pub const RESTART_RUN: u32 = 5;
+    /// ... when nothing else arrived for this long, nanoseconds: a burst of overtaken packets is over sooner.
+    pub const RESTART_QUIET_NS: i64 = 20_000_000;
+    /// Equal poses in a row that are called stuck.
+    pub const STUCK_RUN: u32 = 10;
+
+    /// A gate for bodies `0..bodies`.
+    pub fn new(bodies: usize) -> Self {
+        let fresh = BodyState {
+            last: None,
+            late_run: 0,
+            late_newest: HostTime(i64::MIN),
+            equal_run: 0,
+            was_moving: false,
+        };
+        Self { bodies: vec![fresh; bodies], counters: TrackerCounters::default() }
+    }
+
+    /// The counters so far.
+    pub fn counters(&self) -> &TrackerCounters {
+        &self.counters
+    }
+
+    /// The packet counters, for the client in front of this gate.
+    pub fn packets_mut(&mut self) -> &mut PacketCounters {
+        &mut self.counters.packets
+    }
+
+    /// Counts a sample whose body the rig does not know.
+    pub fn count_unknown(&mut self) {
+        self.counters.samples.received += 1;
+        self.counters.samples.unknown_body += 1;
+    }
+
+    /// The last sample handed on for `body`.
+    pub fn last(&self, body: BodyIndex) -> Option<&TrackerSample> {
+        self.bodies.get(usize::from(body.0))?.last.as_ref()
+    }
+
+    /// True while `body`, having moved, repeats one pose bit for bit ([`SampleGate::STUCK_RUN`] times or more).
+    pub fn is_stuck(&self, body: BodyIndex) -> bool {
+        self.bodies.get(usize::from(body.0)).is_some_and(|b| b.was_moving && b.equal_run >= Self::STUCK_RUN)
+    }
+
+    /// Forgets order and sequence (the source was reconnected); counters stay.
+    pub fn reconnect(&mut self) {
+        for body in &mut self.bodies {
+            *body = BodyState { last: None, late_run: 0, equal_run: 0, was_moving: false, ..*body };
+        }
+    }
+
+    /// The sample to hand on, or `None` when it must not be used; either way it is counted. A handed-on quaternion is of unit
+    /// length; the pose of a sample marked as not tracked is replaced by the last good one, so nobody can act on it by mistake.
+    pub fn admit(&mut self, sample: &TrackerSample) -> Option<TrackerSample> {
+        self.counters.samples.received += 1;
+        let counters = &mut self.counters;
+        let Some(state) = self.bodies.get_mut(usize::from(sample.body.0)) else {
+            counters.samples.unknown_body += 1;
+            return None;
+        };
+        let mut sample = *sample;
+        if sample.tracked {
+            if let Err(reason) = check_pose(&mut sample.pose) {
+                match reason {
+                    Reason::NotFinite => counters.samples.not_finite += 1,
+                    Reason::OutOfReach => counters.samples.out_of_reach += 1,
+                    Reason::BadRotation => counters.samples.bad_rotation += 1,
+                }
+                return None;
+            }
+        } else {
+            sample.pose = state.last.map_or(Pose::IDENTITY, |l| l.pose);
+        }
+        if !sample.mean_error_m.is_finite() || sample.mean_error_m < 0.0 {
+            sample.mean_error_m = 0.0;
+        }
+        if let Some(last) = state.last {
+            if sample.captured_at <= last.captured_at {
+                if sample.sequence == last.sequence && sample.captured_at == last.captured_at {
+                    counters.samples.duplicate += 1;
+                    return None;
+                }
+                state.late_run = if sample.captured_at > state.late_newest { state.late_run + 1 } else { 1 };
+                state.late_newest = sample.captured_at;
+                let quiet_ns = sample.received_at.ns_since(last.received_at);
+                if state.late_run < Self::RESTART_RUN || quiet_ns < Self::RESTART_QUIET_NS {
+                    counters.samples.late += 1;
+                    return None;
+                }
+                counters.restarts += 1;
+            } else {
+                match sample.sequence.wrapping_sub(last.sequence) {
+                    // Equal numbers with a newer capture: a source that does not count (VRPN) or restarted on the spot.
+                    0 | 1 => {}
+                    gap if gap - 1 <= Self::MAX_GAP => counters.lost += u64::from(gap - 1),
+                    _ => counters.restarts += 1,
+                }
+            }
+            note_stuck(state, &last, &sample, counters);
+        }
+        state.late_run = 0;
+        state.late_newest = HostTime(i64::MIN);
+        state.last = Some(sample);
+        counters.samples.used += 1;
+        counters.untracked += u64::from(!sample.tracked);
+        Some(sample)
+    }
+}
+
+fn note_stuck(
+    state: &mut BodyState,
+    last: &TrackerSample,
+    sample: &TrackerSample,
+    counters: &mut TrackerCounters,
+) {
+    if !sample.tracked || !last.tracked {
+        state.equal_run = 0;
+        state.was_moving = false;
+    } else if sample.pose == last.pose {
+        state.equal_run = state.equal_run.saturating_add(1);
+        if state.was_moving && state.equal_run == SampleGate::STUCK_RUN {
+            counters.stuck += 1;
+        }
+    } else {
+        state.equal_run = 0;
+        state.was_moving = true;
+    }
+}
+
+enum Reason {
+    NotFinite,
+    OutOfReach,
+    BadRotation,
+}
+
+/// Refuses poses that are no rigid motion within reach, and makes the quaternion's length 1.
+fn check_pose(pose: &mut Pose) -> Result<(), Reason> {
+    if pose.position_m.iter().chain(&pose.rotation_xyzw).any(|c| !c.is_finite()) {
+        return Err(Reason::NotFinite);
+    }
+    if pose.position_m.iter().any(|c| c.abs() > SampleGate::REACH_M) {
+        return Err(Reason::OutOfReach);
+    }
+    let norm = pose.rotation_xyzw.iter().map(|c| c * c).sum::<f64>().sqrt();
+    // A huge component makes the norm infinite, which fails the comparison as it should.
+    if (norm - 1.0).abs() <= SampleGate::NORM_TOLERANCE {
+        pose.rotation_xyzw = pose.rotation_xyzw.map(|c| c / norm);
+        Ok(())
+    } else {
+        Err(Reason::BadRotation)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn sample(k: i64) -> TrackerSample {
+        TrackerSample {
+            body: BodyIndex(0),
+            pose: Pose { position_m: [k as f64 * 1e-3, 0.0, 0.0], ..Pose::IDENTITY },
+            tracked: true,
+            mean_error_m: 0.0,
+            sequence: k as u32,
+            captured_at: HostTime(k * 2_000_000),
+            received_at: HostTime(k * 2_000_000 + 1_000_000),
+        }
+    }
+
+    fn feed(gate: &mut SampleGate, samples: impl IntoIterator<Item = TrackerSample>) -> Vec<u32> {
+        samples.into_iter().filter_map(|s| gate.admit(&s)).map(|s| s.sequence).collect()
+    }
+
+    #[test]
+    fn each_reason_is_counted_once_and_nothing_is_lost() {
+        let mut gate = SampleGate::new(1);
+        let with = |k: i64, change: &dyn Fn(&mut TrackerSample)| {
+            let mut s = sample(k);
+            change(&mut s);
+            s
+        };
+        let used = feed(
+            &mut gate,
+            [
+                sample(10),
+                sample(10),
+                sample(9),
+                with(11, &|s| s.pose.position_m[1] = f64::NAN),
+                with(11, &|s| s.pose.rotation_xyzw[2] = f64::INFINITY),
+                with(11, &|s| s.pose.position_m[2] = 1e38),
+                with(11, &|s| s.pose.rotation_xyzw = [0.0; 4]),
+                with(11, &|s| s.pose.rotation_xyzw = [0.0, 0.0, 0.0, 0.5]),
+                with(11, &|s| s.pose.rotation_xyzw = [0.0, 0.0, 1e-20, 0.0]),
+                with(11, &|s| s.pose.rotation_xyzw = [1e300, 1e300, 0.0, 0.0]),
+                with(11, &|s| s.body = BodyIndex(7)),
+                with(12, &|s| s.pose.position_m[0] = 1e-310),
+                sample(15),
+            ],
+        );
+        assert_eq!(used, [10, 12, 15]);
+        let c = gate.counters();
+        let s = c.samples;
+        assert_eq!((s.received, s.used, s.duplicate, s.late, s.not_finite), (13, 3, 1, 1, 2));
+        assert_eq!((s.out_of_reach, s.bad_rotation, s.unknown_body, c.lost), (1, 4, 1, 3));
+        assert!(c.is_conserved());
+    }
+
+    #[test]
+    fn slightly_long_quaternions_are_normalised_and_signs_kept() {
+        let mut gate = SampleGate::new(1);
+        let mut s = sample(0);
+        s.pose.rotation_xyzw = [0.0, 0.0, 0.0, -1.0009];
+        assert_eq!(gate.admit(&s).unwrap().pose.rotation_xyzw, [0.0, 0.0, 0.0, -1.0]);
+        s.sequence = 1;
+        s.captured_at = HostTime(1);
+        s.pose.rotation_xyzw = [0.0, 0.0, 0.0, -1.0011];
+        assert!(gate.admit(&s).is_none());
+    }
+
+    #[test]
+    fn unseen_bodies_keep_their_last_good_pose() {
+        let mut gate = SampleGate::new(1);
+        let good = gate.admit(&sample(1)).unwrap();
+        let mut hidden = sample(2);
+        hidden.tracked = false;
+        hidden.pose = Pose { position_m: [f64::NAN; 3], rotation_xyzw: [0.0; 4] };
+        let out = gate.admit(&hidden).unwrap();
+        assert!(!out.tracked);
+        assert_eq!(out.pose, good.pose);
+        assert_eq!(gate.counters().untracked, 1);
+    }
+
+    #[test]
+    fn sequence_wrap_restart_and_leap() {
+        let mut gate = SampleGate::new(1);
+        let at = |k: i64, sequence: u32| TrackerSample { sequence, ..sample(k) };
+        // Wrap: no loss, no restart.
+        feed(&mut gate, [at(1, u32::MAX - 1), at(2, u32::MAX), at(3, 0), at(4, 1)]);
+        assert_eq!((gate.counters().lost, gate.counters().restarts), (0, 0));
+        // Counter back to 0 while time goes on (server restarted): used at once, one restart.
+        assert_eq!(feed(&mut gate, [at(5, 0), at(6, 1)]).len(), 2);
+        assert_eq!(gate.counters().restarts, 1);
+        // Leap by a million: no loss of a million samples reported.
+        assert_eq!(feed(&mut gate, [at(7, 1_000_001)]).len(), 1);
+        assert_eq!((gate.counters().lost, gate.counters().restarts), (0, 2));
+    }
+
+    #[test]
+    fn a_clock_set_back_is_followed_within_50_ms_but_a_late_burst_is_not() {
+        let mut gate = SampleGate::new(1);
+        feed(&mut gate, (1000..1010).map(sample));
+        // 40 overtaken samples in one burst: all late, none used.
+        let burst = (900..940).map(|k| TrackerSample { received_at: sample(1010).received_at, ..sample(k) });
+        assert_eq!(feed(&mut gate, burst), [] as [u32; 0]);
+        feed(&mut gate, [sample(1011)]);
+        assert_eq!(gate.counters().restarts, 0);
+        // The clock leaps back one second; arrivals go on at 500 Hz.
+        let back = |k: i64| TrackerSample {
+            captured_at: HostTime(sample(k).captured_at.0 - 1_000_000_000),
+            ..sample(k)
+        };
+        let mut first = None;
+        for k in 1012..1100 {
+            if gate.admit(&back(k)).is_some() && first.is_none() {
+                first = Some((k - 1011) * 2);
+            }
+        }
+        assert!(first.unwrap() <= 50, "{first:?} ms");
+        assert_eq!(gate.counters().restarts, 1);
+        assert!(gate.counters().is_conserved());
+    }
+
+    #[test]
+    fn stuck_is_flagged_only_after_motion() {
+        let mut gate = SampleGate::new(1);
+        let frozen = |k: i64, at: i64| TrackerSample { pose: sample(at).pose, ..sample(k) };
+        feed(&mut gate, (0..100).map(|k| frozen(k, 0)));
+        assert!(!gate.is_stuck(BodyIndex(0)), "a body that never moved is at rest, not stuck");
+        feed(&mut gate, (100..110).map(sample));
+        feed(&mut gate, (110..119).map(|k| frozen(k, 109)));
+        assert!(!gate.is_stuck(BodyIndex(0)));
+        feed(&mut gate, (119..150).map(|k| frozen(k, 109)));
+        assert!(gate.is_stuck(BodyIndex(0)));
+        assert_eq!(gate.counters().stuck, 1);
+        feed(&mut gate, [sample(150)]);
+        assert!(!gate.is_stuck(BodyIndex(0)));
+        assert_eq!(gate.counters().samples.used, 151);
+    }
+}

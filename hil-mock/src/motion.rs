@@ -1,0 +1,471 @@
+//! A time into the true pose: closed forms of the motions that the mock tracker reports and the mock projector lights.
+//!
+//! Every motion is periodic with a period of whole nanoseconds, and time is reduced to the period as an integer before any
+//! floating point: a body is as exactly placed after 400 days as in the first second.
+
+use dpm_device::pose::Pose;
+use serde::{Deserialize, Serialize};
+
+/// A motion as the rig file writes it (`{ kind = "translate", speed_m_s = 1.0 }`). World axes, relative to the rest pose.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(tag = "kind", rename_all = "kebab-case", deny_unknown_fields)]
+pub enum MotionSpec {
+    /// The body stays at its rest pose.
+    Still,
+    /// Back and forth on a line: stretches of constant speed joined by turns of constant acceleration. At time 0 the body is at
+    /// rest position and moves at full speed in `direction`.
+    Translate {
+        /// Any non-zero vector; its length does not matter. Default: to the left, -x.
+        #[serde(default = "left")]
+        direction: [f64; 3],
+        /// Speed on the stretches, metres per second, above 0. Default 1.
+        #[serde(default = "one")]
+        speed_m_s: f64,
+        /// Largest distance from the rest position, metres; at least `speed^2 / (2 acceleration)`. Default 0.15.
+        #[serde(default = "amplitude")]
+        amplitude_m: f64,
+        /// Acceleration in the turns, m/s^2, above 0. Default 20.
+        #[serde(default = "acceleration")]
+        acceleration_m_s2: f64,
+    },
+    /// `amplitude * sin(w t)` along `direction`, given by its peaks: amplitude = speed^2 / acceleration, w = acceleration / speed.
+    Sinusoid {
+        /// Any non-zero vector. Default: to the left, -x.
+        #[serde(default = "left")]
+        direction: [f64; 3],
+        /// Speed when passing the rest position, metres per second, above 0.
+        peak_speed_m_s: f64,
+        /// Acceleration at the turning points, m/s^2, above 0.
+        peak_acceleration_m_s2: f64,
+    },
+    /// Steady rotation about an axis.
+    Rotate {
+        /// Any non-zero vector, right-handed. Default: +y.
+        #[serde(default = "up")]
+        axis: [f64; 3],
+        /// Radians per second; negative turns the other way, 0 does not turn. Default 1 turn in 2 s.
+        #[serde(default = "half_turn")]
+        rate_rad_s: f64,
+        /// A point of the axis, metres from the rest position. Default 0: in place.
+        #[serde(default)]
+        pivot_offset_m: [f64; 3],
+    },
+    /// Rotation to and fro about an axis through the body's origin: `amplitude * sin(w t)`, by its peaks as in `Sinusoid`.
+    Sway {
+        /// Any non-zero vector, right-handed. Default: +y.
+        #[serde(default = "up")]
+        axis: [f64; 3],
+        /// Angular speed when passing the rest orientation, rad/s, above 0.
+        peak_rate_rad_s: f64,
+        /// Angular acceleration at the turning points, rad/s^2, above 0.
+        peak_acceleration_rad_s2: f64,
+    },
+    /// Rotation about an axis through the body's origin while going back and forth along it.
+    Screw {
+        /// Any non-zero vector, right-handed.
+        axis: [f64; 3],
+        /// Radians per second.
+        rate_rad_s: f64,
+        /// Speed along the axis, as in `Translate`.
+        speed_m_s: f64,
+        /// As in `Translate`. Default 0.15.
+        #[serde(default = "amplitude")]
+        amplitude_m: f64,
+        /// As in `Translate`. Default 20.
+        #[serde(default = "acceleration")]
+        acceleration_m_s2: f64,
+    },
+    /// Several motions applied to the rest pose one after the other, first to last (at most [`MotionSpec::MAX_PARTS`]).
+    Together {
+        /// The motions; none may be `together` itself.
+        parts: Vec<MotionSpec>,
+    },
+}
+
+fn left() -> [f64; 3] {
+    [-1.0, 0.0, 0.0]
+}
+fn up() -> [f64; 3] {
+    [0.0, 1.0, 0.0]
+}
+fn one() -> f64 {
+    1.0
+}
+fn amplitude() -> f64 {
+    0.15
+}
+fn acceleration() -> f64 {
+    20.0
+}
+fn half_turn() -> f64 {
+    core::f64::consts::PI
+}
+
+impl MotionSpec {
+    /// Most parts of [`MotionSpec::Together`].
+    pub const MAX_PARTS: usize = 8;
+
+    /// The motion of the paper's experiment: 1 m/s to the left and back, all other values default.
+    pub fn paper_translation() -> Self {
+        Self::Translate {
+            direction: left(),
+            speed_m_s: one(),
+            amplitude_m: amplitude(),
+            acceleration_m_s2: acceleration(),
+        }
+    }
+}
+
+/// Why a [`MotionSpec`] describes no motion.
+#[derive(Clone, Debug, PartialEq, thiserror::Error)]
+pub enum MotionError {
+    /// A number outside its range.
+    #[error("motion: `{field}` is {value}; it must be {rule}")]
+    OutOfRange {
+        /// Name of the field in the rig file.
+        field: &'static str,
+        /// The value given.
+        value: f64,
+        /// The range.
+        rule: &'static str,
+    },
+    /// A vector without direction.
+    #[error("motion: `{field}` is {value:?}; it must be finite and not zero")]
+    NoDirection {
+        /// Name of the field in the rig file.
+        field: &'static str,
+        /// The value given.
+        value: [f64; 3],
+    },
+    /// The turn takes more room than there is.
+    #[error(
+        "motion: turning round at {speed_m_s} m/s with {acceleration_m_s2} m/s^2 takes {needed_m} m, more than \
+         `amplitude_m` = {amplitude_m}; raise `amplitude_m` or `acceleration_m_s2`"
+    )]
+    NoRoomToTurn {
+        /// Speed, m/s.
+        speed_m_s: f64,
+        /// Acceleration, m/s^2.
+        acceleration_m_s2: f64,
+        /// Given amplitude, m.
+        amplitude_m: f64,
+        /// Least amplitude, m.
+        needed_m: f64,
+    },
+    /// One cycle is shorter than a microsecond or longer than a year.
+    #[error("motion: one cycle takes {seconds} s; it must be between 1e-6 s and 3.2e7 s")]
+    Period {
+        /// Length of the cycle, s.
+        seconds: f64,
+    },
+    /// `together` with 0, too many or nested parts.
+    #[error("motion: `parts` must hold 1 to 8 motions, none of them `together`")]
+    Parts,
+    /// The rest pose has a non-finite number or a quaternion that is not of unit length.
+    #[error("motion: the rest pose {0:?} is not a rigid pose")]
+    RestPose(Pose),
+}
+
+/// Velocity of a body in world axes.
+#[derive(Clone, Copy, Debug, Default, PartialEq)]
+pub struct Twist {
+    /// Velocity of the body's origin, metres per second.
+    pub linear_m_s: [f64; 3],
+    /// Angular velocity, radians per second, right-handed.
+    pub angular_rad_s: [f64; 3],
+}
+
+/// A checked motion of one body about its rest pose: time in, truth out.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Motion {
+    rest: Pose,
+    parts: Vec<Part>,
+}
+
+/// One elementary motion with its period in whole nanoseconds.
+#[derive(Clone, Copy, Debug, PartialEq)]
+enum Part {
+    /// Two stretches of twice `half_stretch_ns` joined by turns of `turn_ns`.
+    Line { direction: [f64; 3], speed: f64, half_stretch_ns: i64, turn_ns: i64 },
+    /// `amplitude * sin(2 pi t / period)`.
+    Wave { direction: [f64; 3], amplitude: f64, period_ns: i64 },
+    /// `2 pi t / period` about an axis through `pivot`; `sense` is 1 or -1.
+    Turn { axis: [f64; 3], sense: f64, pivot: [f64; 3], period_ns: i64 },
+    /// `amplitude * sin(2 pi t / period)` about an axis through `pivot`.
+    Sway { axis: [f64; 3], amplitude: f64, pivot: [f64; 3], period_ns: i64 },
+}
+
+impl Motion {
+    /// Checks `spec` and fixes it to `rest`, the pose that the motion is relative to.
+    pub fn new(spec: &MotionSpec, rest: Pose) -> Result<Self, MotionError> {
+        if !rest.is_valid(1e-6) {
+            return Err(MotionError::RestPose(rest));
+        }
+        let rest = Pose { rotation_xyzw: normalize4(rest.rotation_xyzw), ..rest };
+        let mut parts = Vec::new();
+        match spec {
+            MotionSpec::Together { parts: specs } => {
+                let nested = specs.iter().any(|s| matches!(s, MotionSpec::Together { .. }));
+                if specs.is_empty() || specs.len() > MotionSpec::MAX_PARTS || nested {
+                    return Err(MotionError::Parts);
+                }
+                for spec in specs {
+                    add_part(spec, &rest, &mut parts)?;
+                }
+            }
+            spec => add_part(spec, &rest, &mut parts)?,
+        }
+        Ok(Self { rest, parts })
+    }
+
+    /// A body that stays where it is. Panics never: an invalid pose is returned as the error.
+    pub fn still(rest: Pose) -> Result<Self, MotionError> {
+        Self::new(&MotionSpec::Still, rest)
+    }
+
+    /// The pose that the motion is relative to.
+    pub fn rest(&self) -> Pose {
+        self.rest
+    }
+
+    /// World-from-body at `t_ns` nanoseconds after the motion's start (any value, negative too). The quaternion is of unit
+    /// length within 4e-16.
+    pub fn pose_at(&self, t_ns: i64) -> Pose {
+        self.state_at(t_ns).0
+    }
+
+    /// Velocity at `t_ns`: the exact derivative of [`Motion::pose_at`].
+    pub fn twist_at(&self, t_ns: i64) -> Twist {
+        self.state_at(t_ns).1
+    }
+
+    /// Pose and velocity at `t_ns`.
+    pub fn state_at(&self, t_ns: i64) -> (Pose, Twist) {
+        let mut pose = self.rest;
+        let mut twist = Twist::default();
+        for part in &self.parts {
+            part.apply(t_ns, &mut pose, &mut twist);
+        }
+        pose.rotation_xyzw = normalize4(pose.rotation_xyzw);
+        (pose, twist)
+    }
+}
+
+fn add_part(spec: &MotionSpec, rest: &Pose, parts: &mut Vec<Part>) -> Result<(), MotionError> {
+    match *spec {
+        MotionSpec::Still => {}
+        MotionSpec::Translate { direction, speed_m_s, amplitude_m, acceleration_m_s2 } => {
+            parts.push(line(direction, speed_m_s, amplitude_m, acceleration_m_s2, "direction")?);
+        }
+        MotionSpec::Sinusoid { direction, peak_speed_m_s, peak_acceleration_m_s2 } => {
+            let direction = unit3("direction", direction)?;
+            let speed = positive("peak_speed_m_s", peak_speed_m_s)?;
+            let acceleration = positive("peak_acceleration_m_s2", peak_acceleration_m_s2)?;
+            let period_ns = whole_period(core::f64::consts::TAU * speed / acceleration)?;
+            parts.push(Part::Wave { direction, amplitude: speed * speed / acceleration, period_ns });
+        }
+        MotionSpec::Rotate { axis, rate_rad_s, pivot_offset_m } => {
+            if pivot_offset_m.iter().any(|c| !c.is_finite()) {
+                return Err(MotionError::NoDirection { field: "pivot_offset_m", value: pivot_offset_m });
+            }
+            turn(axis, rate_rad_s, add(rest.position_m, pivot_offset_m), parts)?;
+        }
+        MotionSpec::Sway { axis, peak_rate_rad_s, peak_acceleration_rad_s2 } => {
+            let axis = unit3("axis", axis)?;
+            let rate = positive("peak_rate_rad_s", peak_rate_rad_s)?;
+            let acceleration = positive("peak_acceleration_rad_s2", peak_acceleration_rad_s2)?;
+            let period_ns = whole_period(core::f64::consts::TAU * rate / acceleration)?;
+            let amplitude = rate * rate / acceleration;
+            parts.push(Part::Sway { axis, amplitude, pivot: rest.position_m, period_ns });
+        }
+        MotionSpec::Screw { axis, rate_rad_s, speed_m_s, amplitude_m, acceleration_m_s2 } => {
+            turn(axis, rate_rad_s, rest.position_m, parts)?;
+            parts.push(line(axis, speed_m_s, amplitude_m, acceleration_m_s2, "axis")?);
+        }
+        MotionSpec::Together { .. } => return Err(MotionError::Parts),
+    }
+    Ok(())
+}
+
+fn line(
+    direction: [f64; 3],
+    speed: f64,
+    amplitude: f64,
+    acceleration: f64,
+    field: &'static str,
+) -> Result<Part, MotionError> {
+    let direction = unit3(field, direction)?;
+    let speed = positive("speed_m_s", speed)?;
+    let amplitude = positive("amplitude_m", amplitude)?;
+    let acceleration = positive("acceleration_m_s2", acceleration)?;
+    // Half of a turn slows from full speed to zero: distance speed^2 / (2 acceleration) beyond the stretch's end.
+    let turn_depth = speed * speed / (2.0 * acceleration);
+    if turn_depth > amplitude {
+        return Err(MotionError::NoRoomToTurn {
+            speed_m_s: speed,
+            acceleration_m_s2: acceleration,
+            amplitude_m: amplitude,
+            needed_m: turn_depth,
+        });
+    }
+    let stretch_s = 2.0 * (amplitude - turn_depth) / speed;
+    let turn_s = 2.0 * speed / acceleration;
+    whole_period(2.0 * (stretch_s + turn_s))?;
+    // Whole nanoseconds for each piece keep position and speed continuous for ever; the amplitude moves by less than 1 nm per m/s.
+    let turn_ns = ((turn_s * 1e9).round() as i64).max(2);
+    Ok(Part::Line { direction, speed, half_stretch_ns: (stretch_s * 0.5e9).round() as i64, turn_ns })
+}
+
+fn turn(axis: [f64; 3], rate: f64, pivot: [f64; 3], parts: &mut Vec<Part>) -> Result<(), MotionError> {
+    let axis = unit3("axis", axis)?;
+    if !rate.is_finite() || rate.abs() > 1e5 {
+        return Err(MotionError::OutOfRange { field: "rate_rad_s", value: rate, rule: "within +-1e5" });
+    }
+    if rate != 0.0 {
+        let period_ns = whole_period(core::f64::consts::TAU / rate.abs())?;
+        parts.push(Part::Turn { axis, sense: rate.signum(), pivot, period_ns });
+    }
+    Ok(())
+}
+
+impl Part {
+    /// Moves `pose` and `twist`, the state after the parts before this one.
+    fn apply(&self, t_ns: i64, pose: &mut Pose, twist: &mut Twist) {
+        match *self {
+            Part::Line { direction, speed, half_stretch_ns, turn_ns } => {
+                let (s, v) = line_at(t_ns, speed, half_stretch_ns, turn_ns);
+                pose.position_m = add(pose.position_m, scale(direction, s));
+                twist.linear_m_s = add(twist.linear_m_s, scale(direction, v));
+            }
+            Part::Wave { direction, amplitude, period_ns } => {
+                let (sin, cos, omega) = phase(t_ns, period_ns);
+                pose.position_m = add(pose.position_m, scale(direction, amplitude * sin));
+                twist.linear_m_s = add(twist.linear_m_s, scale(direction, amplitude * omega * cos));
+            }
+            Part::Turn { axis, sense, pivot, period_ns } => {
+                let fraction = t_ns.rem_euclid(period_ns) as f64 / period_ns as f64;
+                let omega = core::f64::consts::TAU / (period_ns as f64 * 1e-9);
+                rotate_about(
+                    axis,
+                    sense * core::f64::consts::TAU * fraction,
+                    sense * omega,
+                    pivot,
+                    pose,
+                    twist,
+                );
+            }
+            Part::Sway { axis, amplitude, pivot, period_ns } => {
+                let (sin, cos, omega) = phase(t_ns, period_ns);
+                rotate_about(axis, amplitude * sin, amplitude * omega * cos, pivot, pose, twist);
+            }
+        }
+    }
+}
+
+/// Sine and cosine of `2 pi t / period`, and the angular frequency in rad/s.
+fn phase(t_ns: i64, period_ns: i64) -> (f64, f64, f64) {
+    let angle = core::f64::consts::TAU * (t_ns.rem_euclid(period_ns) as f64 / period_ns as f64);
+    (angle.sin(), angle.cos(), core::f64::consts::TAU / (period_ns as f64 * 1e-9))
+}
+
+/// Position and speed on the line. One cycle from its middle: half a stretch, a turn, a stretch back, a turn, half a stretch.
+fn line_at(t_ns: i64, speed: f64, half_stretch_ns: i64, turn_ns: i64) -> (f64, f64) {
+    let half_cycle = 2 * half_stretch_ns + turn_ns;
+    let t = (t_ns.rem_euclid(2 * half_cycle) + half_stretch_ns) % (2 * half_cycle);
+    // The second half of the cycle mirrors the first: s(t + half_cycle) = -s(t).
+    let (t, sign) = if t < half_cycle { (t, 1.0) } else { (t - half_cycle, -1.0) };
+    let u = t - half_stretch_ns;
+    if u <= half_stretch_ns {
+        (sign * speed * u as f64 * 1e-9, sign * speed)
+    } else {
+        let x = (u - half_stretch_ns) as f64 * 1e-9;
+        let turn_s = turn_ns as f64 * 1e-9;
+        let s = speed * half_stretch_ns as f64 * 1e-9 + speed * x * (1.0 - x / turn_s);
+        (sign * s, sign * speed * (1.0 - 2.0 * x / turn_s))
+    }
+}
+
+fn rotate_about(axis: [f64; 3], angle: f64, rate: f64, pivot: [f64; 3], pose: &mut Pose, twist: &mut Twist) {
+    let (sin, cos) = (0.5 * angle).sin_cos();
+    let q = [axis[0] * sin, axis[1] * sin, axis[2] * sin, cos];
+    let arm = rotate(q, sub(pose.position_m, pivot));
+    let omega = scale(axis, rate);
+    pose.position_m = add(pivot, arm);
+    pose.rotation_xyzw = multiply(q, pose.rotation_xyzw);
+    twist.linear_m_s = add(rotate(q, twist.linear_m_s), cross(omega, arm));
+    twist.angular_rad_s = add(rotate(q, twist.angular_rad_s), omega);
+}
+
+fn positive(field: &'static str, value: f64) -> Result<f64, MotionError> {
+    if value.is_finite() && value > 0.0 && value <= 1e6 {
+        Ok(value)
+    } else {
+        Err(MotionError::OutOfRange { field, value, rule: "above 0 and at most 1e6" })
+    }
+}
+
+fn whole_period(seconds: f64) -> Result<i64, MotionError> {
+    if (1e-6..=3.2e7).contains(&seconds) {
+        Ok((seconds * 1e9).round() as i64)
+    } else {
+        Err(MotionError::Period { seconds })
+    }
+}
+
+fn unit3(field: &'static str, value: [f64; 3]) -> Result<[f64; 3], MotionError> {
+    // Scaling by the largest component first keeps 1e-200 and 1e200 from under- and overflowing.
+    let largest = value.iter().fold(0.0f64, |m, c| m.max(c.abs()));
+    if value.iter().any(|c| !c.is_finite()) || largest == 0.0 {
+        return Err(MotionError::NoDirection { field, value });
+    }
+    let v = [value[0] / largest, value[1] / largest, value[2] / largest];
+    let norm = (v[0] * v[0] + v[1] * v[1] + v[2] * v[2]).sqrt();
+    Ok([v[0] / norm, v[1] / norm, v[2] / norm])
+}
+
+pub(crate) fn add(a: [f64; 3], b: [f64; 3]) -> [f64; 3] {
+    [a[0] + b[0], a[1] + b[1], a[2] + b[2]]
+}
+fn sub(a: [f64; 3], b: [f64; 3]) -> [f64; 3] {
+    [a[0] - b[0], a[1] - b[1], a[2] - b[2]]
+}
+pub(crate) fn scale(a: [f64; 3], s: f64) -> [f64; 3] {
+    [a[0] * s, a[1] * s, a[2] * s]
+}
+fn cross(a: [f64; 3], b: [f64; 3]) -> [f64; 3] {
+    [a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]]
+}
+
+pub(crate) fn normalize4(q: [f64; 4]) -> [f64; 4] {
+    let norm = q.iter().map(|c| c * c).sum::<f64>().sqrt();
+    q.map(|c| c / norm)
+}
+
+/// Hamilton product: the rotation `b` followed by `a`.
+pub(crate) fn multiply(a: [f64; 4], b: [f64; 4]) -> [f64; 4] {
+    let ([ax, ay, az, aw], [bx, by, bz, bw]) = (a, b);
+    [
+        aw * bx + ax * bw + ay * bz - az * by,
+        aw * by - ax * bz + ay * bw + az * bx,
+        aw * bz + ax * by - ay * bx + az * bw,
+        aw * bw - ax * bx - ay * by - az * bz,
+    ]
+}
+
+/// `v` rotated by the unit quaternion `q`.
+fn rotate(q: [f64; 4], v: [f64; 3]) -> [f64; 3] {
+    let u = [q[0], q[1], q[2]];
+    let t = scale(cross(u, v), 2.0);
+    add(v, add(scale(t, q[3]), cross(u, t)))
+}
+
+/// The quaternion of the rotation by the vector `r` (axis times angle, radians), exact at 0 too.
+pub(crate) fn from_rotation_vector(r: [f64; 3]) -> [f64; 4] {
+    let angle = (r[0] * r[0] + r[1] * r[1] + r[2] * r[2]).sqrt();
+    let k = if angle > 1e-9 { (0.5 * angle).sin() / angle } else { 0.5 };
+    [r[0] * k, r[1] * k, r[2] * k, (0.5 * angle).cos()]
+}
+
+#[cfg(test)]
+#[path = "motion_tests.rs"]
+mod tests;
