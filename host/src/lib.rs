@@ -3,4 +3,6 @@
 //! See `docs/ARCHITECTURE.md` for the picture and one invariant per folder.
 
 pub mod config;
+pub mod geometry;
 pub mod scene;
+pub mod tracking;

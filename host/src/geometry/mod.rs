@@ -1,0 +1,3 @@
+//! Rigid motions and cameras in f64.
+
+pub mod se3;

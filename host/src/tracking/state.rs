@@ -1,0 +1,75 @@
+//! The filter's belief as plain data: small enough for a latest-wins slot, and enough to predict without the filter.
+
+use super::imm::{Kinematics, Rotations, Translations};
+use dpm_device::pose::Pose;
+use dpm_device::time::HostTime;
+use glam::{DQuat, DVec3};
+
+/// How much a predicted pose is worth.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Freshness {
+    /// Samples arrive as they should.
+    Tracked,
+    /// Samples are missing; the last motion is carried on.
+    Predicted,
+    /// Nothing recent is known: no light should fall on this body.
+    Lost,
+}
+
+/// A body at the instant its light will fall.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct PosePrediction {
+    /// world-from-body.
+    pub pose: Pose,
+    /// World frame, m/s.
+    pub linear_velocity_m_s: [f64; 3],
+    /// World frame, rad/s.
+    pub angular_velocity_rad_s: [f64; 3],
+    /// From the capture of the newest accepted sample to the instant asked for, before clamping; may be negative.
+    pub horizon_ns: i64,
+    /// Standard deviation of the position along one axis, by the filter's own account, metres.
+    pub position_sigma_m: f64,
+    /// Whether to show the body.
+    pub freshness: Freshness,
+}
+
+/// The state of one track at the capture of its newest accepted sample. `Copy`: travels by value from the tracker's thread.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct TrackState {
+    /// Capture of the newest accepted sample.
+    pub captured_at: HostTime,
+    /// Position, m.
+    pub position: Kinematics<DVec3>,
+    /// Rotation, rad.
+    pub rotation: Kinematics<DQuat>,
+    /// Horizons up to this are normal operation.
+    pub tracked_for_ns: i64,
+    /// Beyond this horizon the track is lost, and motion is carried no further.
+    pub lost_after_ns: i64,
+}
+
+impl TrackState {
+    /// The body at `at`. Constant acceleration, exact for constant velocity and constant angular velocity; the horizon is
+    /// clamped to plus or minus `lost_after_ns`, so that no old velocity carries a body out of the room.
+    pub fn predict(&self, at: HostTime) -> PosePrediction {
+        let horizon_ns = at.ns_since(self.captured_at);
+        let h = horizon_ns.clamp(-self.lost_after_ns, self.lost_after_ns) as f64 * 1e-9;
+        let position = self.position.point_at::<Translations>(h);
+        let rotation = self.rotation.point_at::<Rotations>(h);
+        let freshness = if horizon_ns > self.lost_after_ns {
+            Freshness::Lost
+        } else if horizon_ns > self.tracked_for_ns {
+            Freshness::Predicted
+        } else {
+            Freshness::Tracked
+        };
+        PosePrediction {
+            pose: Pose { position_m: position.to_array(), rotation_xyzw: rotation.to_array() },
+            linear_velocity_m_s: (self.position.velocity + self.position.acceleration * h).to_array(),
+            angular_velocity_rad_s: (self.rotation.velocity + self.rotation.acceleration * h).to_array(),
+            horizon_ns,
+            position_sigma_m: self.position.covariance.position_variance_at(h).max(0.0).sqrt(),
+            freshness,
+        }
+    }
+}
