@@ -299,12 +299,11 @@ impl<C: Chart> Imm<C> {
         let mut moved = self.modes;
         let mut foretold = [0.0; MODES];
         for j in 0..MODES {
-            let mut weight = [0.0; MODES];
-            for i in 0..MODES {
+            let mut weight: [f64; MODES] = std::array::from_fn(|i| {
                 let stays = (-h / config.dwell_s[i]).exp();
                 let share = if i == j { stays } else { (1.0 - stays) * config.leave_to[i][j] };
-                weight[i] = share * self.probability[i];
-            }
+                share * self.probability[i]
+            });
             foretold[j] = weight.iter().sum();
             let mut sources = self.modes;
             if config.models[j].accelerates {
