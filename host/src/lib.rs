@@ -4,5 +4,7 @@
 
 pub mod config;
 pub mod geometry;
+pub mod reference;
+pub mod render;
 pub mod scene;
 pub mod tracking;

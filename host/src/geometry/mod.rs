@@ -1,3 +1,4 @@
-//! Rigid motions and cameras in f64.
+//! Space in f64: rigid motions (SE(3)) and cameras.
 
+pub mod projector;
 pub mod se3;

@@ -1,0 +1,310 @@
+//! An index of refraction into the directional albedo of its rough dielectric reflection: the share of light that the coat
+//! reflects and that the diffuse base therefore does not get. The GPU and the f64 reference read the same table.
+//!
+//! ```text
+//!     E(mu, alpha) = integral over the hemisphere of f_spec(v, l) (n.l) dl,  mu = n.v
+//!     nodes        mu_i = (i / 31)^2, alpha_j = (j / 31)^2, i, j = 0..31     row j holds all mu of one alpha
+//!     lookup       x = 31 sqrt(mu), y = 31 sqrt(alpha), bilinear between the nodes (y is 31 * perceptual roughness)
+//!     average      E_avg_j = 4 integral_0^1 E(s^2) s^3 ds of the piecewise linear row itself, so that
+//!                  2 integral E_table mu dmu = E_avg exactly and the diffuse base keeps all that the coat lets in
+//! ```
+//!
+//! Row 0 is the Fresnel reflectance of a smooth surface. With `ior` 1 every entry is exactly 0.
+
+use crate::reference::microfacet::{fresnel_dielectric, smith_g2_over_g1};
+use glam::DVec3;
+use std::f64::consts::PI;
+
+/// Nodes along each axis.
+pub const ALBEDO_NODES: usize = 32;
+
+/// The table of one index of refraction.
+#[derive(Clone, Debug, PartialEq)]
+pub struct AlbedoTable {
+    /// Index of refraction it was made for.
+    pub ior: f32,
+    /// `directional[j * ALBEDO_NODES + i]`, node `i` of mu and `j` of alpha; 0..1.
+    pub directional: Vec<f32>,
+    /// Cosine-weighted average over mu per alpha node; 0..1.
+    pub average: Vec<f32>,
+}
+
+impl AlbedoTable {
+    /// Integrates the table, a few hundredths of a second. `ior` below 1 or not finite is taken as 1.
+    pub fn new(ior: f32) -> Self {
+        let n = ALBEDO_NODES;
+        let ior = if ior.is_finite() { ior.max(1.0) } else { 1.0 };
+        let mut directional = vec![0.0; n * n];
+        if ior > 1.0 {
+            let rule = Quadrature::new(20, 10);
+            for j in 0..n {
+                for i in 0..n {
+                    let (mu, alpha) = (node(i), node(j));
+                    directional[j * n + i] = directional_albedo(f64::from(ior), mu, alpha, &rule) as f32;
+                }
+            }
+        }
+        let average = directional.chunks_exact(n).map(|row| row_average(row) as f32).collect();
+        Self { ior, directional, average }
+    }
+
+    /// `E(mu, alpha)` in f64; arguments are clamped to 0..1.
+    pub fn directional(&self, mu: f64, alpha: f64) -> f64 {
+        let n = ALBEDO_NODES;
+        let (i, s) = cell(mu.clamp(0.0, 1.0).sqrt());
+        let (j, t) = cell(alpha.clamp(0.0, 1.0).sqrt());
+        let at = |i: usize, j: usize| f64::from(self.directional[j * n + i]);
+        let low = at(i, j) * (1.0 - s) + at(i + 1, j) * s;
+        let high = at(i, j + 1) * (1.0 - s) + at(i + 1, j + 1) * s;
+        low * (1.0 - t) + high * t
+    }
+
+    /// `E_avg(alpha)` in f64.
+    pub fn average(&self, alpha: f64) -> f64 {
+        let (j, t) = cell(alpha.clamp(0.0, 1.0).sqrt());
+        f64::from(self.average[j]) * (1.0 - t) + f64::from(self.average[j + 1]) * t
+    }
+
+    /// `E(mu, alpha)` in f32 with the operations of the shader.
+    pub fn directional_f32(&self, mu: f32, alpha: f32) -> f32 {
+        let n = ALBEDO_NODES;
+        let (i, s) = cell_f32(mu);
+        let (j, t) = cell_f32(alpha);
+        let at = |i: usize, j: usize| self.directional[j * n + i];
+        let low = at(i, j) * (1.0 - s) + at(i + 1, j) * s;
+        let high = at(i, j + 1) * (1.0 - s) + at(i + 1, j + 1) * s;
+        low * (1.0 - t) + high * t
+    }
+
+    /// `E_avg(alpha)` in f32 with the operations of the shader.
+    pub fn average_f32(&self, alpha: f32) -> f32 {
+        let (j, t) = cell_f32(alpha);
+        self.average[j] * (1.0 - t) + self.average[j + 1] * t
+    }
+}
+
+fn node(i: usize) -> f64 {
+    let s = i as f64 / (ALBEDO_NODES - 1) as f64;
+    s * s
+}
+
+/// Lower node (at most the last but one) and the weight of the upper.
+fn cell(s: f64) -> (usize, f64) {
+    let x = s * (ALBEDO_NODES - 1) as f64;
+    let i = (x as usize).min(ALBEDO_NODES - 2);
+    (i, x - i as f64)
+}
+
+fn cell_f32(v: f32) -> (usize, f32) {
+    let x = v.clamp(0.0, 1.0).sqrt() * (ALBEDO_NODES - 1) as f32;
+    let i = (x as usize).min(ALBEDO_NODES - 2);
+    (i, x - i as f32)
+}
+
+/// `4 integral_0^1 E(s) s^3 ds` of a row that is linear in `s = sqrt(mu)` between its nodes, in closed form.
+fn row_average(row: &[f32]) -> f64 {
+    let h = 1.0 / (ALBEDO_NODES - 1) as f64;
+    row.windows(2)
+        .enumerate()
+        .map(|(i, e)| {
+            let (a, b) = (i as f64 * h, (i + 1) as f64 * h);
+            let (ea, eb) = (f64::from(e[0]), f64::from(e[1]));
+            let slope = (eb - ea) / h;
+            // E(s) = ea + slope (s - a)
+            (ea - slope * a) * (b.powi(4) - a.powi(4)) + slope * 0.8 * (b.powi(5) - a.powi(5))
+        })
+        .sum()
+}
+
+/// `E` by quadrature over the visible normals: with `h` drawn from their density the integrand is `F G2 / G1`.
+///
+/// In the stretched space of [Dupuy23] where visible normals are uniform over a spherical cap, `h` is given by its angle `beta` from
+/// the stretched `v` and its azimuth `psi` about it: there the integrand has neither cone nor root inside. The azimuth ends where
+/// the reflected direction sinks below the surface; the outer integral is split where that begins and ends where no azimuth is left,
+/// with sin^2 as its variable in between because the end of the azimuth behaves like a square root at both.
+fn directional_albedo(ior: f64, mu: f64, alpha: f64, rule: &Quadrature) -> f64 {
+    if alpha == 0.0 {
+        return fresnel_dielectric(ior, mu);
+    }
+    let mu = mu.max(1e-9);
+    let v = DVec3::new((1.0 - mu * mu).max(0.0).sqrt(), 0.0, mu);
+    let v_std = DVec3::new(v.x * alpha, 0.0, v.z).normalize();
+    let upward = DVec3::new(-v_std.z, 0.0, v_std.x);
+    // Cosines of (v, h) and (n, l).
+    let at = |beta: f64, psi: f64| {
+        let (sin, cos) = beta.sin_cos();
+        let h = v_std * cos + upward * (sin * psi.cos()) + DVec3::Y * (sin * psi.sin());
+        let h = DVec3::new(h.x * alpha, h.y * alpha, h.z).normalize();
+        let vh = v.dot(h).clamp(0.0, 1.0);
+        (vh, 2.0 * vh * h.z - v.z)
+    };
+    let split = root(0.0, 0.5 * PI, |beta| at(beta, PI).1).unwrap_or(0.0);
+    let last = root(split, 0.5 * PI, |beta| at(beta, 0.0).1).unwrap_or(0.5 * PI);
+    let ring = |beta: f64| {
+        let end = root(0.0, PI, |psi| at(beta, psi).1).unwrap_or(PI);
+        let mut sum = 0.0;
+        for &(x, w) in &rule.azimuth {
+            let (vh, l_z) = at(beta, end * x);
+            if l_z > 0.0 {
+                sum += w * fresnel_dielectric(ior, vh) * smith_g2_over_g1(v.z, l_z, alpha);
+            }
+        }
+        // Area of the cap swept: 4 sin cos dbeta dpsi of 2 pi (1 + v.z), both halves of the azimuth.
+        sum * end * 4.0 * beta.sin() * beta.cos() / (PI * (1.0 + v_std.z))
+    };
+    let mut sum = 0.0;
+    for &(x, w) in &rule.tilt {
+        let rest = last - split;
+        let turn = 0.5 * PI * x;
+        sum += w * split * ring(split * x);
+        sum += w * PI * turn.sin() * turn.cos() * rest * ring(split + rest * turn.sin().powi(2));
+    }
+    sum
+}
+
+/// Where a continuous function changes sign between `a` and `b`, by bisection; `None` when its ends have one sign.
+fn root(mut a: f64, mut b: f64, f: impl Fn(f64) -> f64) -> Option<f64> {
+    let sign = f(a) > 0.0;
+    if (f(b) > 0.0) == sign {
+        return None;
+    }
+    for _ in 0..26 {
+        let middle = 0.5 * (a + b);
+        if (f(middle) > 0.0) == sign {
+            a = middle
+        } else {
+            b = middle
+        }
+    }
+    Some(0.5 * (a + b))
+}
+
+/// Gauss-Legendre nodes and weights on 0..1 for both variables.
+struct Quadrature {
+    azimuth: Vec<(f64, f64)>,
+    tilt: Vec<(f64, f64)>,
+}
+
+impl Quadrature {
+    fn new(azimuths: usize, points: usize) -> Self {
+        Self { azimuth: gauss_legendre(azimuths), tilt: gauss_legendre(points) }
+    }
+}
+
+/// Nodes and weights of Gauss-Legendre quadrature on 0..1: Newton's method on the Legendre polynomial from Chebyshev's guess.
+fn gauss_legendre(points: usize) -> Vec<(f64, f64)> {
+    let n = points as f64;
+    (0..points)
+        .map(|k| {
+            let mut x = (PI * (k as f64 + 0.75) / (n + 0.5)).cos();
+            let mut slope = 1.0;
+            for _ in 0..8 {
+                let (mut p0, mut p1) = (1.0, x);
+                for j in 2..=points {
+                    let j = j as f64;
+                    (p0, p1) = (p1, ((2.0 * j - 1.0) * x * p1 - (j - 1.0) * p0) / j);
+                }
+                slope = n * (x * p1 - p0) / (x * x - 1.0);
+                x -= p1 / slope;
+            }
+            (0.5 * (1.0 + x), 1.0 / ((1.0 - x * x) * slope * slope))
+        })
+        .collect()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::reference::microfacet::{ggx_d, smith_g2};
+
+    #[test]
+    fn ior_1_has_no_coat_at_all() {
+        let t = AlbedoTable::new(1.0);
+        assert!(t.directional.iter().chain(&t.average).all(|e| *e == 0.0));
+        assert_eq!(AlbedoTable::new(f32::NAN), t);
+    }
+
+    #[test]
+    fn quadrature_has_converged() {
+        let (used, fine) = (Quadrature::new(20, 10), Quadrature::new(48, 32));
+        for ior in [1.1, 1.5, 2.5] {
+            for j in (0..ALBEDO_NODES).step_by(3) {
+                for i in (0..ALBEDO_NODES).step_by(2) {
+                    let (mu, alpha) = (node(i), node(j));
+                    let (a, b) = (
+                        directional_albedo(ior, mu, alpha, &used),
+                        directional_albedo(ior, mu, alpha, &fine),
+                    );
+                    assert!((a - b).abs() < 1.5e-4, "ior {ior} mu {mu} alpha {alpha}: {a} {b}");
+                    assert!((0.0..=1.0).contains(&a));
+                }
+            }
+        }
+    }
+
+    /// The definition itself, `integral f_spec cos`, on a fine grid of directions: an integral in another variable.
+    #[test]
+    fn agrees_with_the_integral_over_outgoing_directions() {
+        let (ior, n) = (1.5, 400);
+        let rule = Quadrature::new(20, 10);
+        for (mu, alpha) in [(1.0, 0.5), (0.5, 0.5), (0.1, 0.5), (0.3, 1.0), (0.8, 0.2)] {
+            let v = DVec3::new((1.0f64 - mu * mu).sqrt(), 0.0, mu);
+            let mut sum = 0.0;
+            for a in 0..n {
+                for b in 0..n {
+                    let z = (b as f64 + 0.5) / n as f64;
+                    let phi = PI * (a as f64 + 0.5) / n as f64;
+                    let sin = (1.0 - z * z).sqrt();
+                    let l = DVec3::new(sin * phi.cos(), sin * phi.sin(), z);
+                    let h = (v + l).normalize();
+                    sum += ggx_d(h, alpha) * smith_g2(v.z, z, alpha) * fresnel_dielectric(ior, v.dot(h))
+                        / (4.0 * mu);
+                }
+            }
+            let direct = sum * 2.0 * PI / (n * n) as f64;
+            let e = directional_albedo(ior, mu, alpha, &rule);
+            assert!((direct - e).abs() < 2e-4, "mu {mu} alpha {alpha}: {direct} {e}");
+        }
+    }
+
+    #[test]
+    fn smooth_row_is_fresnel_and_the_average_is_that_of_the_row() {
+        let t = AlbedoTable::new(1.5);
+        assert!((t.directional(1.0, 0.0) - 0.04).abs() < 1e-6);
+        assert_eq!(t.directional(0.0, 0.0), 1.0);
+        for alpha in [0.0, 0.003, 0.1, 0.37, 1.0] {
+            let n = 20_000;
+            let sum: f64 = (0..n)
+                .map(|i| {
+                    let mu = (f64::from(i) + 0.5) / f64::from(n);
+                    2.0 * t.directional(mu, alpha) * mu / f64::from(n)
+                })
+                .sum();
+            assert!((sum - t.average(alpha)).abs() < 1e-6, "{alpha}: {sum} {}", t.average(alpha));
+        }
+        // Hemispherical reflectance of a smooth dielectric of index 1.5: 0.0918 [Duntley42].
+        assert!((t.average(0.0) - 0.0918).abs() < 3e-4, "{}", t.average(0.0));
+    }
+
+    #[test]
+    fn interpolation_error_is_bounded() {
+        let rule = Quadrature::new(20, 10);
+        let t = AlbedoTable::new(1.5);
+        // Toward grazing E depends on mu / alpha alone and no grid follows it; but the light that arrives there goes with mu.
+        let (mut worst, mut weighed): (f64, f64) = (0.0, 0.0);
+        for j in 0..40 {
+            for i in 0..40 {
+                let (mu, alpha) = ((f64::from(i) / 39.0).powi(3), (f64::from(j) / 39.0).powi(3).max(1e-4));
+                let e = (t.directional(mu, alpha) - directional_albedo(1.5, mu, alpha, &rule)).abs();
+                weighed = weighed.max(e * mu);
+                if mu > 0.1 {
+                    worst = worst.max(e);
+                }
+                let f32_form = t.directional_f32(mu as f32, alpha as f32);
+                assert!((f64::from(f32_form) - t.directional(mu, alpha)).abs() < 2e-6);
+                assert!((f64::from(t.average_f32(alpha as f32)) - t.average(alpha)).abs() < 2e-6);
+            }
+        }
+        assert!(worst < 2e-3 && weighed < 3e-4, "{worst} {weighed}");
+    }
+}
