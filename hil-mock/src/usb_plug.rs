@@ -128,6 +128,8 @@ struct State {
     signalled: bool,
     configuration: u8,
     listeners: Vec<Box<dyn FnOnce() + Send>>,
+    /// Transfers that have ended but whose completion has not returned yet.
+    finishing: usize,
     /// Counts steps in which bytes moved; a refused transfer is retried when it changes.
     moves: u64,
 }
@@ -279,6 +281,59 @@ impl UsbPlug {
     }
 }
 
+/// A device as a front end sees it: the local plug, or one at the far end of USB/IP.
+pub trait UsbCable: Send + Sync {
+    /// Device descriptor followed by the configuration descriptor, as sysfs shows them.
+    fn descriptors(&self) -> Vec<u8>;
+    /// Speed of the cable.
+    fn speed(&self) -> crate::usb_model::Speed;
+    /// Queues a transfer; gives it back when the device is gone.
+    fn submit(&self, request: Request) -> Result<(), Request>;
+    /// Takes a transfer back; true when it had not ended.
+    fn cancel(&self, id: u64) -> bool;
+    /// Ends the halt of an endpoint.
+    fn clear_halt(&self, endpoint: u8);
+    /// Resets the bus and selects `configuration` again.
+    fn reset(&self, configuration: u8);
+    /// Selects a configuration.
+    fn set_configuration(&self, value: u8);
+    /// Calls `f` once when the device is gone and every transfer has ended.
+    fn on_unplug(&self, f: Box<dyn FnOnce() + Send>);
+    /// Pulls the plug.
+    fn unplug(&self);
+}
+
+impl UsbCable for UsbPlug {
+    fn descriptors(&self) -> Vec<u8> {
+        self.with_model(|m| [m.device_descriptor(), m.configuration_descriptor()].concat())
+    }
+    fn speed(&self) -> crate::usb_model::Speed {
+        self.with_model(|m| m.speed())
+    }
+    fn submit(&self, request: Request) -> Result<(), Request> {
+        Self::submit(self, request)
+    }
+    fn cancel(&self, id: u64) -> bool {
+        Self::cancel(self, id)
+    }
+    fn clear_halt(&self, endpoint: u8) {
+        Self::clear_halt(self, endpoint);
+    }
+    fn reset(&self, configuration: u8) {
+        Self::reset(self);
+        Self::set_configuration(self, configuration);
+    }
+    fn set_configuration(&self, value: u8) {
+        Self::set_configuration(self, value);
+    }
+    fn on_unplug(&self, f: Box<dyn FnOnce() + Send>) {
+        Self::on_unplug(self, f);
+    }
+    fn unplug(&self) {
+        Self::unplug(self);
+    }
+}
+
 fn finish(request: Request, status: Status, actual: usize) {
     (request.done)(Completed { id: request.id, status, actual, buffer: request.buffer });
 }
@@ -288,15 +343,19 @@ impl Shared {
         let mut s = lock(&self.state);
         s.pulled = true;
         let all: Vec<_> = s.queues.values_mut().flat_map(|q| q.pending.drain(..)).collect();
+        s.finishing += all.len();
         self.changed.notify_all();
         drop(s);
-        all.into_iter().for_each(|r| finish(r, Status::Gone, 0));
+        for r in all {
+            finish(r, Status::Gone, 0);
+            lock(&self.state).finishing -= 1;
+        }
         self.signal_when_quiet();
     }
 
     fn signal_when_quiet(&self) {
         let mut s = lock(&self.state);
-        if !s.pulled || s.signalled || s.queues.values().any(|q| q.running.is_some()) {
+        if !s.pulled || s.signalled || s.finishing > 0 || s.queues.values().any(|q| q.running.is_some()) {
             return;
         }
         s.signalled = true;
@@ -334,9 +393,11 @@ impl Shared {
                 q.halted |= status == Status::Stall && endpoint != 0;
             }
             s.moves += 1;
+            s.finishing += 1;
             self.changed.notify_all();
             drop(s);
             finish(request, status, actual);
+            lock(&self.state).finishing -= 1;
             self.signal_when_quiet();
         }
     }
