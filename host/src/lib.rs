@@ -2,9 +2,13 @@
 //!
 //! See `docs/ARCHITECTURE.md` for the picture and one invariant per folder.
 
+pub mod cli;
 pub mod config;
+pub mod failure;
+pub mod files;
 pub mod geometry;
 pub mod reference;
 pub mod render;
 pub mod scene;
+pub mod telemetry;
 pub mod tracking;

@@ -1,0 +1,171 @@
+//! A running pipeline into a progress bar on a terminal, or one JSON line a second on anything else.
+
+use super::signals;
+use crate::config::{OutputConfig, ProjectorBackend, RigConfig};
+use crate::failure::{Failure, FailureKind};
+use crate::files::{InstanceLock, LockError};
+use crate::telemetry::monitor::{RunCounts, RunMonitor};
+use crate::telemetry::report::Report;
+use indicatif::{ProgressBar, ProgressDrawTarget, ProgressStyle};
+use std::io::{IsTerminal, Write};
+use std::path::PathBuf;
+use std::sync::mpsc::{channel, RecvTimeoutError};
+use std::sync::Arc;
+use std::time::{Duration, Instant};
+
+/// How often signals are looked at and the bar is drawn.
+const TICK: Duration = Duration::from_millis(50);
+
+/// Runs `run` while its progress is shown on the standard error stream and signals become an ordered stop; then prints the
+/// report to the standard output, as JSON or as a table. The run itself has a thread of its own, so that this one stays
+/// free to watch.
+///
+/// # Errors
+/// What `run` returns; a device or output folder that another instance uses; a panic in the run.
+pub fn run_and_report(
+    rig: RigConfig,
+    json: bool,
+    run: impl FnOnce(&RigConfig, &Arc<RunMonitor>) -> Result<Report, Failure> + Send + 'static,
+) -> Result<(), Failure> {
+    let _locks = take_locks(&rig)?;
+    signals::install().map_err(|e| Failure::new(FailureKind::Device, format!("cannot handle signals: {e}")))?;
+    let monitor = Arc::new(RunMonitor::default());
+    let (done, finished) = channel();
+    let frames = rig.run.frames;
+    let worker = {
+        let monitor = Arc::clone(&monitor);
+        std::thread::Builder::new()
+            .name("dpm-run".into())
+            .spawn(move || {
+                let result = run(&rig, &monitor);
+                // The watcher is gone only when it panicked; then nobody wants the result.
+                let _ = done.send(result);
+            })
+            .map_err(|e| Failure::new(FailureKind::Device, format!("cannot start a thread: {e}")))?
+    };
+    let mut progress = Progress::new(frames);
+    let result = loop {
+        match finished.recv_timeout(TICK) {
+            Ok(result) => break result,
+            Err(RecvTimeoutError::Timeout) => {
+                if let Some(signal) = signals::received() {
+                    if !monitor.stop_requested() {
+                        progress.note(&format!("{signal}: stopping"));
+                        monitor.request_stop();
+                    }
+                }
+                progress.tick(monitor.counts());
+            }
+            Err(RecvTimeoutError::Disconnected) => {
+                break Err(Failure::new(FailureKind::Device, "the run ended by a panic (see above)"))
+            }
+        }
+    };
+    // A panic was already turned into the error above.
+    let _ = worker.join();
+    progress.finish(monitor.counts());
+    let report = result?;
+    print(&if json { report.to_json() + "\n" } else { report.to_table() });
+    Ok(())
+}
+
+/// Writes to the standard output; a reader that has gone away (`dpm ... | head`) is no error.
+pub fn print(text: &str) {
+    let mut out = std::io::stdout().lock();
+    let _ = out.write_all(text.as_bytes()).and_then(|()| out.flush());
+}
+
+/// One lock for the projector and one for the folder that is written to.
+fn take_locks(rig: &RigConfig) -> Result<Vec<InstanceLock>, Failure> {
+    let failure = |e: LockError| Failure::new(FailureKind::Device, e);
+    let mut locks = Vec::new();
+    let serial = |s: &Option<String>| s.clone().unwrap_or_else(|| "any".into());
+    let device = match &rig.projector.backend {
+        ProjectorBackend::Mock(_) => None,
+        ProjectorBackend::Usb(usb) => {
+            Some(format!("USB projector {:04x}:{:04x} {}", usb.vendor_id, usb.product_id, serial(&usb.serial_number)))
+        }
+        ProjectorBackend::Serial(port) => Some(format!("projector on {}", port.port)),
+        ProjectorBackend::Dlpc900(dlpc) => Some(format!("DLPC900 {}", serial(&dlpc.serial_number))),
+    };
+    if let Some(what) = device {
+        let name: String = what.chars().map(|c| if c.is_ascii_alphanumeric() { c } else { '-' }).collect();
+        locks.push(InstanceLock::take(&runtime_folder().join(format!("{name}.lock")), &what).map_err(failure)?);
+    }
+    let OutputConfig { dir, images, trace, .. } = &rig.output;
+    if *images || *trace {
+        let what = format!("output folder {}", dir.display());
+        locks.push(InstanceLock::take(&dir.join(".dpm.lock"), &what).map_err(failure)?);
+    }
+    Ok(locks)
+}
+
+/// Where lock files of devices live: one place per machine and user.
+fn runtime_folder() -> PathBuf {
+    match std::env::var_os("XDG_RUNTIME_DIR") {
+        Some(dir) if !dir.is_empty() => PathBuf::from(dir).join("dpm"),
+        _ => std::env::temp_dir().join("dpm-locks"),
+    }
+}
+
+enum Progress {
+    Bar(ProgressBar),
+    Lines { started: Instant, next: Duration, total: u64 },
+}
+
+impl Progress {
+    fn new(total: u64) -> Self {
+        if !std::io::stderr().is_terminal() {
+            return Self::Lines { started: Instant::now(), next: Duration::from_secs(1), total };
+        }
+        let bar = if total > 0 { ProgressBar::new(total) } else { ProgressBar::no_length() };
+        bar.set_draw_target(ProgressDrawTarget::stderr());
+        let template = match total {
+            0 => "{spinner} {pos} frames lit, {per_sec}, {msg}",
+            _ => "{bar:40} {pos}/{len} frames lit, {per_sec}, {eta} left, {msg}",
+        };
+        bar.set_style(ProgressStyle::with_template(template).expect("the template is a constant"));
+        Self::Bar(bar)
+    }
+
+    fn note(&self, text: &str) {
+        match self {
+            Self::Bar(bar) => bar.println(text),
+            Self::Lines { .. } => {
+                let _ = writeln!(std::io::stderr(), "{}", serde_json::json!({ "note": text }));
+            }
+        }
+    }
+
+    fn tick(&mut self, counts: RunCounts) {
+        match self {
+            Self::Bar(bar) => {
+                bar.set_position(counts.frames_lit);
+                bar.set_message(format!("{} dropped, {} late", counts.frames_dropped, counts.frames_late));
+                bar.tick();
+            }
+            Self::Lines { started, next, total } => {
+                let elapsed = started.elapsed();
+                if elapsed >= *next {
+                    // After a pause of this thread the next line comes a second later, not a burst of lines at once.
+                    *next = elapsed + Duration::from_secs(1);
+                    let line = serde_json::json!({
+                        "elapsed_s": (elapsed.as_secs_f64() * 1e3).round() / 1e3,
+                        "frames_total": total,
+                        "frames_lit": counts.frames_lit,
+                        "frames_dropped": counts.frames_dropped,
+                        "frames_late": counts.frames_late,
+                    });
+                    let _ = writeln!(std::io::stderr(), "{line}");
+                }
+            }
+        }
+    }
+
+    fn finish(mut self, counts: RunCounts) {
+        self.tick(counts);
+        if let Self::Bar(bar) = self {
+            bar.finish_and_clear();
+        }
+    }
+}

@@ -1,0 +1,58 @@
+//! Why a command ends: a kind that the caller can act on, its exit code, and a message for the operator.
+
+use std::fmt;
+
+/// What an operator can do about a failure.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum FailureKind {
+    /// The command ran and what it checks does not hold.
+    CheckFailed,
+    /// A file, flag or setting is wrong.
+    BadInput,
+    /// A projector, tracker or the operating system refused.
+    Device,
+    /// No usable Vulkan device.
+    NoGpu,
+}
+
+impl FailureKind {
+    /// The process's exit code: 1 check failed, 2 usage or bad input, 3 device, 4 no GPU. (0 is success.)
+    pub const fn exit_code(self) -> u8 {
+        match self {
+            Self::CheckFailed => 1,
+            Self::BadInput => 2,
+            Self::Device => 3,
+            Self::NoGpu => 4,
+        }
+    }
+}
+
+/// The end of a command that did not do what it was asked to.
+#[derive(Debug)]
+pub struct Failure {
+    /// What can be done about it.
+    pub kind: FailureKind,
+    /// What failed, on which object, and the next step; may have several lines.
+    pub message: String,
+}
+
+impl Failure {
+    /// A failure of `kind`.
+    pub fn new(kind: FailureKind, message: impl fmt::Display) -> Self {
+        Self { kind, message: message.to_string() }
+    }
+}
+
+impl fmt::Display for Failure {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.write_str(&self.message)
+    }
+}
+
+impl std::error::Error for Failure {}
+
+impl From<crate::config::ConfigErrors> for Failure {
+    fn from(errors: crate::config::ConfigErrors) -> Self {
+        Self::new(FailureKind::BadInput, errors)
+    }
+}

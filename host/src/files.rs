@@ -1,0 +1,156 @@
+//! Bytes into files that are either the old ones or the new ones, whenever the power goes.
+
+use std::fs::{self, File};
+use std::io::{self, BufWriter, Write};
+use std::path::{Path, PathBuf};
+
+/// Replaces `path` by what `write` writes: into a temporary file beside it, flushed to the disk, renamed over it, and the
+/// folder flushed too. A reader sees the old or the new content, never a part. Missing folders are made.
+///
+/// # Errors
+/// Those of the file system or of `write`, with the path in the message; the old file then stands untouched.
+pub fn write_atomically(
+    path: &Path,
+    write: impl FnOnce(&mut BufWriter<&File>) -> io::Result<()>,
+) -> io::Result<()> {
+    let named = |e: io::Error| io::Error::new(e.kind(), format!("cannot write {}: {e}", path.display()));
+    let folder = match path.parent() {
+        Some(p) if !p.as_os_str().is_empty() => p,
+        _ => Path::new("."),
+    };
+    let Some(name) = path.file_name() else {
+        return Err(named(io::Error::new(io::ErrorKind::InvalidInput, "not the name of a file")));
+    };
+    fs::create_dir_all(folder).map_err(named)?;
+    let temporary = folder.join(format!(".{}.{}", name.to_string_lossy(), std::process::id()));
+    let result = write_and_rename(&temporary, path, folder, write);
+    if result.is_err() {
+        // Nothing more can be done about a temporary file that cannot be removed.
+        let _ = fs::remove_file(&temporary);
+    }
+    result.map_err(named)
+}
+
+fn write_and_rename(
+    temporary: &Path,
+    path: &Path,
+    folder: &Path,
+    write: impl FnOnce(&mut BufWriter<&File>) -> io::Result<()>,
+) -> io::Result<()> {
+    let file = File::create(temporary)?;
+    let mut buffered = BufWriter::new(&file);
+    write(&mut buffered)?;
+    buffered.flush()?;
+    drop(buffered);
+    file.sync_all()?;
+    fs::rename(temporary, path)?;
+    File::open(folder)?.sync_all()
+}
+
+/// Why a lock could not be had.
+#[derive(Debug, thiserror::Error)]
+pub enum LockError {
+    /// Somebody else holds it.
+    #[error("{what} is in use by another dpm{}; stop that one first (lock file {})", .holder.map_or(String::new(), |p| format!(" (process {p})")), .path.display())]
+    Held {
+        /// What the lock protects.
+        what: String,
+        /// The lock file.
+        path: PathBuf,
+        /// Process that holds it, where it said so.
+        holder: Option<u32>,
+    },
+    /// The lock file cannot be made.
+    #[error("cannot lock {what}: {source}")]
+    Io {
+        /// What the lock protects.
+        what: String,
+        /// Why.
+        source: io::Error,
+    },
+}
+
+/// The right to use something alone, given back when dropped or when the process ends in whatever way.
+#[derive(Debug)]
+pub struct InstanceLock {
+    _file: File,
+}
+
+impl InstanceLock {
+    /// Takes the lock file `path` for `what` (as messages name it); never waits.
+    ///
+    /// # Errors
+    /// [`LockError::Held`] when another process, or another lock in this one, has it.
+    pub fn take(path: &Path, what: &str) -> Result<Self, LockError> {
+        let io = |source| LockError::Io { what: what.into(), source };
+        if let Some(folder) = path.parent() {
+            fs::create_dir_all(folder).map_err(io)?;
+        }
+        let mut file =
+            File::options().read(true).write(true).create(true).truncate(false).open(path).map_err(io)?;
+        match file.try_lock() {
+            Ok(()) => {}
+            Err(fs::TryLockError::WouldBlock) => {
+                let holder = fs::read_to_string(path).ok().and_then(|s| s.trim().parse().ok());
+                return Err(LockError::Held { what: what.into(), path: path.into(), holder });
+            }
+            Err(fs::TryLockError::Error(e)) => return Err(io(e)),
+        }
+        file.set_len(0).and_then(|()| writeln!(file, "{}", std::process::id())).map_err(io)?;
+        Ok(Self { _file: file })
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn folder(name: &str) -> PathBuf {
+        let path = std::env::temp_dir().join(format!("dpm-files-{}-{name}", std::process::id()));
+        let _ = fs::remove_dir_all(&path);
+        path
+    }
+
+    #[test]
+    fn a_failed_write_leaves_the_old_file_and_nothing_else() {
+        let dir = folder("failed");
+        let path = dir.join("deep/report.json");
+        write_atomically(&path, |w| w.write_all(b"old")).unwrap();
+        let error = write_atomically(&path, |w| {
+            w.write_all(&[b'x'; 100_000])?;
+            Err(io::Error::other("disk full"))
+        })
+        .unwrap_err();
+        assert!(error.to_string().contains("report.json: disk full"), "{error}");
+        assert_eq!(fs::read(&path).unwrap(), b"old");
+        assert_eq!(fs::read_dir(path.parent().unwrap()).unwrap().count(), 1);
+        write_atomically(&path, |w| w.write_all(b"new")).unwrap();
+        assert_eq!(fs::read(&path).unwrap(), b"new");
+        fs::remove_dir_all(dir).unwrap();
+    }
+
+    #[test]
+    fn a_folder_that_is_a_file_is_named() {
+        let dir = folder("file");
+        fs::create_dir_all(&dir).unwrap();
+        fs::write(dir.join("out"), b"").unwrap();
+        let error = write_atomically(&dir.join("out/light.png"), |_| Ok(())).unwrap_err();
+        assert!(error.to_string().contains("out/light.png"), "{error}");
+        assert!(write_atomically(Path::new(".."), |_| Ok(())).is_err());
+        fs::remove_dir_all(dir).unwrap();
+    }
+
+    #[test]
+    fn a_lock_is_exclusive_until_dropped() {
+        let dir = folder("lock");
+        let path = dir.join("a.lock");
+        let first = InstanceLock::take(&path, "projector X").unwrap();
+        let error = InstanceLock::take(&path, "projector X").unwrap_err();
+        let told = error.to_string();
+        assert!(told.contains("projector X is in use by another dpm"), "{told}");
+        assert!(told.contains(&format!("process {}", std::process::id())), "{told}");
+        drop(first);
+        InstanceLock::take(&path, "projector X").unwrap();
+        fs::remove_dir_all(dir).unwrap();
+    }
+}
