@@ -142,7 +142,8 @@ mod tests {
             failure.message
         };
         assert!(told(|a| a.raster = Some("640".into())).contains("for example 640x480"));
-        assert!(told(|a| a.raster = Some("0x480".into())).contains("`projector.width`: is 0, must be 1 to 8192 px"));
+        assert!(told(|a| a.raster = Some("0x480".into()))
+            .contains("`projector.width`: is 0, must be 1 to 8192 px"));
         assert!(told(|a| a.raster = Some("99999x480".into())).contains("must be 1 to 8192"));
         assert!(told(|a| a.seconds = Some(f64::NAN)).contains("--seconds NaN"));
         assert!(told(|a| a.seconds = Some(-1.0)).contains("above 0"));

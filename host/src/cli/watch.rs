@@ -28,7 +28,8 @@ pub fn run_and_report(
     run: impl FnOnce(&RigConfig, &Arc<RunMonitor>) -> Result<Report, Failure> + Send + 'static,
 ) -> Result<(), Failure> {
     let _locks = take_locks(&rig)?;
-    signals::install().map_err(|e| Failure::new(FailureKind::Device, format!("cannot handle signals: {e}")))?;
+    signals::install()
+        .map_err(|e| Failure::new(FailureKind::Device, format!("cannot handle signals: {e}")))?;
     let monitor = Arc::new(RunMonitor::default());
     let (done, finished) = channel();
     let frames = rig.run.frames;
@@ -82,15 +83,20 @@ fn take_locks(rig: &RigConfig) -> Result<Vec<InstanceLock>, Failure> {
     let serial = |s: &Option<String>| s.clone().unwrap_or_else(|| "any".into());
     let device = match &rig.projector.backend {
         ProjectorBackend::Mock(_) => None,
-        ProjectorBackend::Usb(usb) => {
-            Some(format!("USB projector {:04x}:{:04x} {}", usb.vendor_id, usb.product_id, serial(&usb.serial_number)))
-        }
+        ProjectorBackend::Usb(usb) => Some(format!(
+            "USB projector {:04x}:{:04x} {}",
+            usb.vendor_id,
+            usb.product_id,
+            serial(&usb.serial_number)
+        )),
         ProjectorBackend::Serial(port) => Some(format!("projector on {}", port.port)),
         ProjectorBackend::Dlpc900(dlpc) => Some(format!("DLPC900 {}", serial(&dlpc.serial_number))),
     };
     if let Some(what) = device {
         let name: String = what.chars().map(|c| if c.is_ascii_alphanumeric() { c } else { '-' }).collect();
-        locks.push(InstanceLock::take(&runtime_folder().join(format!("{name}.lock")), &what).map_err(failure)?);
+        locks.push(
+            InstanceLock::take(&runtime_folder().join(format!("{name}.lock")), &what).map_err(failure)?,
+        );
     }
     let OutputConfig { dir, images, trace, .. } = &rig.output;
     if *images || *trace {

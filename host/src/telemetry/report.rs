@@ -185,7 +185,10 @@ impl Report {
             row("motion to light", format!("{} ms", percentiles(latency)));
         }
         for stage in &self.stages_ms {
-            row(&format!("  {}", stage.stage), format!("p50 {:.3}  p99 {:.3} ms", stage.ms.p50, stage.ms.p99));
+            row(
+                &format!("  {}", stage.stage),
+                format!("p50 {:.3}  p99 {:.3} ms", stage.ms.p50, stage.ms.p99),
+            );
         }
         row("wall time", format!("{:.2} s, {:.1} frames/s", self.wall_s, self.frames_per_wall_second));
         if let Some(rays) = self.mrays_per_s {
@@ -250,7 +253,9 @@ mod tests {
             h.record(i * 1_000_000).unwrap();
         }
         let spread = Spread::ms_of_ns(&h).unwrap();
-        for (got, want) in [(spread.p50, 500.0), (spread.p99, 990.0), (spread.p999, 999.0), (spread.max, 1000.0)] {
+        for (got, want) in
+            [(spread.p50, 500.0), (spread.p99, 990.0), (spread.p999, 999.0), (spread.max, 1000.0)]
+        {
             assert!((got / want - 1.0).abs() < 2e-3, "{got} {want}");
         }
     }
