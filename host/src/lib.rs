@@ -7,6 +7,7 @@ pub mod config;
 pub mod failure;
 pub mod files;
 pub mod geometry;
+pub mod gpu;
 pub mod reference;
 pub mod render;
 pub mod scene;

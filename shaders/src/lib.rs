@@ -1,1 +1,37 @@
-//! placeholder
+//! GLSL sources, committed SPIR-V, and the one definition of every struct and constant shared with the GPU.
+//!
+//! `glsl/generated.glsl` is written from [`structs`] by `cargo run -p dpm-shaders --bin build-shaders`, which also runs `glslc`;
+//! tests fail when either is stale, so users need no shader compiler.
+
+pub mod generate;
+pub mod structs;
+
+/// A compute shader as SPIR-V, with the name of its source for messages.
+#[derive(Clone, Copy, Debug)]
+pub struct Shader {
+    /// Stem of the source file, e.g. `primary`.
+    pub name: &'static str,
+    /// Little-endian SPIR-V words as bytes.
+    pub spirv: &'static [u8],
+}
+
+macro_rules! shaders {
+    ($($(#[$doc:meta])* $konst:ident = $name:literal;)*) => {
+        $($(#[$doc])* pub const $konst: Shader = Shader { name: $name, spirv: include_bytes!(concat!("../spv/", $name, ".spv")) };)*
+        /// Every shader in the crate.
+        pub const ALL: &[Shader] = &[$($konst),*];
+    };
+}
+
+shaders! {
+    /// Primary visibility, BVH through texel buffers (software Vulkan).
+    PRIMARY_TEXEL = "primary.texel";
+    /// Primary visibility, BVH through storage buffers (GPUs).
+    PRIMARY_STORAGE = "primary.storage";
+    /// Path tracing, BVH through texel buffers.
+    TRACE_TEXEL = "trace.texel";
+    /// Path tracing, BVH through storage buffers.
+    TRACE_STORAGE = "trace.storage";
+    /// Compensation for distance, angle and albedo, then quantisation to code values.
+    COMPENSATE = "compensate";
+}

@@ -1,0 +1,230 @@
+//! Buffers: memory for shaders, mapped for the host where asked.
+
+use super::context::Gpu;
+use super::error::{Context as _, GpuError};
+use ash::vk;
+use bytemuck::Pod;
+use std::ptr::NonNull;
+use std::sync::Arc;
+
+/// Where a buffer lives and who touches it.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum MemoryKind {
+    /// Read and written by shaders only; filled once at creation.
+    Device,
+    /// Written by the host every frame, read by shaders; mapped for its whole life.
+    Upload,
+    /// Written by shaders, read by the host; mapped, cached where possible.
+    Readback,
+}
+
+/// A buffer with its own memory. Mapped kinds are coherent: no flushes.
+pub struct Buffer {
+    pub(super) handle: vk::Buffer,
+    pub(super) view: Option<vk::BufferView>,
+    memory: vk::DeviceMemory,
+    mapped: Option<NonNull<u8>>,
+    len_bytes: usize,
+    gpu: Arc<Gpu>,
+}
+
+// SAFETY: the mapped pointer is owned by this buffer; Vulkan handles may move between threads. Access goes through &self / &mut self.
+unsafe impl Send for Buffer {}
+// SAFETY: shared access only reads.
+unsafe impl Sync for Buffer {}
+
+impl std::fmt::Debug for Buffer {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        write!(f, "Buffer({} bytes)", self.len_bytes)
+    }
+}
+
+impl Buffer {
+    /// An uninitialised buffer of at least one byte. `what` names it in errors.
+    ///
+    /// # Errors
+    /// Out of memory, or larger than the device allows.
+    pub fn new(gpu: &Arc<Gpu>, what: &str, len_bytes: usize, kind: MemoryKind) -> Result<Self, GpuError> {
+        Self::with_usage(gpu, what, len_bytes, kind, vk::BufferUsageFlags::empty())
+    }
+
+    /// A device buffer filled with `data`.
+    ///
+    /// # Errors
+    /// As [`Buffer::new`].
+    pub fn from_slice<T: Pod>(gpu: &Arc<Gpu>, what: &str, data: &[T]) -> Result<Self, GpuError> {
+        Self::filled(gpu, what, bytemuck::cast_slice(data), vk::BufferUsageFlags::empty())
+    }
+
+    /// A device buffer of 16-byte texels that shaders read as a uniform texel buffer (`float`: RGBA32F, else RGBA32UI).
+    ///
+    /// # Errors
+    /// As [`Buffer::new`]; [`GpuError::Limit`] when there are more texels than the device's texel buffers hold.
+    pub fn texels(gpu: &Arc<Gpu>, what: &str, data: &[[u32; 4]], float: bool) -> Result<Self, GpuError> {
+        let limit = gpu.max_texel_elements();
+        if data.len() as u64 > limit {
+            return Err(GpuError::Limit { what: what.to_owned(), needed: data.len() as u64, limit });
+        }
+        let mut buffer =
+            Self::filled(gpu, what, bytemuck::cast_slice(data), vk::BufferUsageFlags::UNIFORM_TEXEL_BUFFER)?;
+        let format = if float { vk::Format::R32G32B32A32_SFLOAT } else { vk::Format::R32G32B32A32_UINT };
+        let info = vk::BufferViewCreateInfo::default().buffer(buffer.handle).format(format).range(vk::WHOLE_SIZE);
+        // SAFETY: the buffer was created with texel usage and is alive.
+        buffer.view =
+            Some(unsafe { gpu.device.create_buffer_view(&info, None) }.context("creating a texel-buffer view")?);
+        Ok(buffer)
+    }
+
+    fn filled(
+        gpu: &Arc<Gpu>,
+        what: &str,
+        bytes: &[u8],
+        usage: vk::BufferUsageFlags,
+    ) -> Result<Self, GpuError> {
+        let buffer = Self::with_usage(gpu, what, bytes.len().max(16), MemoryKind::Device, usage)?;
+        if !bytes.is_empty() {
+            let mut staging = Self::new(gpu, "staging", bytes.len(), MemoryKind::Upload)?;
+            staging.bytes_mut()[..bytes.len()].copy_from_slice(bytes);
+            super::commands::copy_now(gpu, &staging, &buffer, bytes.len())?;
+        }
+        Ok(buffer)
+    }
+
+    fn with_usage(
+        gpu: &Arc<Gpu>,
+        what: &str,
+        len_bytes: usize,
+        kind: MemoryKind,
+        extra: vk::BufferUsageFlags,
+    ) -> Result<Self, GpuError> {
+        let len_bytes = len_bytes.max(16);
+        let limit = u64::from(gpu.limits.max_storage_buffer_range);
+        if len_bytes as u64 > limit && !extra.contains(vk::BufferUsageFlags::UNIFORM_TEXEL_BUFFER) {
+            return Err(GpuError::Limit { what: format!("{what} (bytes)"), needed: len_bytes as u64, limit });
+        }
+        let usage = vk::BufferUsageFlags::STORAGE_BUFFER
+            | vk::BufferUsageFlags::UNIFORM_BUFFER
+            | vk::BufferUsageFlags::INDIRECT_BUFFER
+            | vk::BufferUsageFlags::TRANSFER_SRC
+            | vk::BufferUsageFlags::TRANSFER_DST
+            | extra;
+        let info = vk::BufferCreateInfo::default().size(len_bytes as u64).usage(usage);
+        // SAFETY: valid create info; every handle made here is destroyed in Drop or on the error path below.
+        unsafe {
+            let handle = gpu.device.create_buffer(&info, None).context("creating a buffer")?;
+            let needs = gpu.device.get_buffer_memory_requirements(handle);
+            let memory = match Self::allocate(gpu, what, needs, kind) {
+                Ok(memory) => memory,
+                Err(e) => {
+                    gpu.device.destroy_buffer(handle, None);
+                    return Err(e);
+                }
+            };
+            let mut buffer =
+                Self { handle, view: None, memory, mapped: None, len_bytes, gpu: gpu.clone() };
+            gpu.device.bind_buffer_memory(handle, memory, 0).context("binding buffer memory")?;
+            if kind != MemoryKind::Device {
+                let pointer = gpu
+                    .device
+                    .map_memory(memory, 0, vk::WHOLE_SIZE, vk::MemoryMapFlags::empty())
+                    .context("mapping a buffer")?;
+                buffer.mapped = NonNull::new(pointer.cast());
+                buffer.bytes_mut().fill(0);
+            }
+            Ok(buffer)
+        }
+    }
+
+    fn allocate(
+        gpu: &Gpu,
+        what: &str,
+        needs: vk::MemoryRequirements,
+        kind: MemoryKind,
+    ) -> Result<vk::DeviceMemory, GpuError> {
+        use vk::MemoryPropertyFlags as P;
+        let coherent = P::HOST_VISIBLE | P::HOST_COHERENT;
+        let wishes: &[P] = match kind {
+            MemoryKind::Device => &[P::DEVICE_LOCAL, P::empty()],
+            // Host memory that the GPU reads across the bus: the newest pose is a few hundred bytes.
+            MemoryKind::Upload => &[coherent],
+            MemoryKind::Readback => &[
+                P::from_raw(P::HOST_VISIBLE.as_raw() | P::HOST_COHERENT.as_raw() | P::HOST_CACHED.as_raw()),
+                coherent,
+            ],
+        };
+        let types = &gpu.memory.memory_types[..gpu.memory.memory_type_count as usize];
+        let mut last = vk::Result::ERROR_OUT_OF_DEVICE_MEMORY;
+        for &wish in wishes {
+            for (i, t) in types.iter().enumerate() {
+                if needs.memory_type_bits & (1 << i) == 0 || !t.property_flags.contains(wish) {
+                    continue;
+                }
+                let info =
+                    vk::MemoryAllocateInfo::default().allocation_size(needs.size).memory_type_index(i as u32);
+                // SAFETY: valid allocate info; freed in Buffer's Drop.
+                match unsafe { gpu.device.allocate_memory(&info, None) } {
+                    Ok(memory) => return Ok(memory),
+                    Err(e) => last = e,
+                }
+            }
+        }
+        if matches!(last, vk::Result::ERROR_OUT_OF_DEVICE_MEMORY | vk::Result::ERROR_OUT_OF_HOST_MEMORY) {
+            let heaps = &gpu.memory.memory_heaps[..gpu.memory.memory_heap_count as usize];
+            return Err(GpuError::OutOfMemory {
+                what: what.to_owned(),
+                needed_mib: needs.size.div_ceil(1 << 20),
+                heap_mib: heaps.iter().map(|h| h.size >> 20).max().unwrap_or(0),
+            });
+        }
+        Err(last).context("allocating GPU memory")
+    }
+
+    /// Size in bytes (at least 16).
+    pub fn len_bytes(&self) -> usize {
+        self.len_bytes
+    }
+
+    /// The mapped bytes. The GPU must not be writing them: wait for the frame's fence first.
+    ///
+    /// # Panics
+    /// For [`MemoryKind::Device`] buffers, which are never mapped.
+    pub fn bytes(&self) -> &[u8] {
+        let pointer = self.mapped.expect("a mapped kind of buffer");
+        // SAFETY: mapped for `len_bytes` for the life of the buffer.
+        unsafe { std::slice::from_raw_parts(pointer.as_ptr(), self.len_bytes) }
+    }
+
+    /// The mapped bytes for writing. The GPU must not be using them.
+    ///
+    /// # Panics
+    /// For [`MemoryKind::Device`] buffers.
+    pub fn bytes_mut(&mut self) -> &mut [u8] {
+        let pointer = self.mapped.expect("a mapped kind of buffer");
+        // SAFETY: as above, and &mut self excludes other access by the host.
+        unsafe { std::slice::from_raw_parts_mut(pointer.as_ptr(), self.len_bytes) }
+    }
+
+    /// The first `count` elements.
+    pub fn read<T: Pod>(&self, count: usize) -> &[T] {
+        bytemuck::cast_slice(&self.bytes()[..count * std::mem::size_of::<T>()])
+    }
+
+    /// Copies `data` to the start.
+    pub fn write<T: Pod>(&mut self, data: &[T]) {
+        let bytes: &[u8] = bytemuck::cast_slice(data);
+        self.bytes_mut()[..bytes.len()].copy_from_slice(bytes);
+    }
+}
+
+impl Drop for Buffer {
+    fn drop(&mut self) {
+        // SAFETY: owners wait for the GPU before dropping (FrameFence and Gpu do in their Drop); handles are ours alone.
+        unsafe {
+            if let Some(view) = self.view {
+                self.gpu.device.destroy_buffer_view(view, None);
+            }
+            self.gpu.device.destroy_buffer(self.handle, None);
+            self.gpu.device.free_memory(self.memory, None);
+        }
+    }
+}

@@ -1,0 +1,276 @@
+//! Command lists recorded once and submitted every frame, with time stamps between passes.
+
+use super::buffer::Buffer;
+use super::context::Gpu;
+use super::error::{Context as _, GpuError};
+use super::pipeline::{BindingSet, ComputePipeline};
+use ash::vk;
+use std::sync::Arc;
+
+/// A list of passes that the GPU runs in order. Recorded once; each submission runs it again.
+pub struct CommandList {
+    buffer: vk::CommandBuffer,
+    pool: vk::CommandPool,
+    queries: Option<vk::QueryPool>,
+    stamps: u32,
+    max_stamps: u32,
+    gpu: Arc<Gpu>,
+}
+
+impl CommandList {
+    /// Records what `record` asks for; at most `max_stamps` time stamps.
+    ///
+    /// # Errors
+    /// Vulkan's.
+    pub fn record(
+        gpu: &Arc<Gpu>,
+        max_stamps: u32,
+        record: impl FnOnce(&mut Recorder<'_>),
+    ) -> Result<Self, GpuError> {
+        let d = &gpu.device;
+        let info = vk::CommandPoolCreateInfo::default().queue_family_index(gpu.queue_family);
+        // SAFETY: valid create infos; everything is destroyed in Drop.
+        unsafe {
+            let pool = d.create_command_pool(&info, None).context("creating a command pool")?;
+            let info = vk::CommandBufferAllocateInfo::default().command_pool(pool).command_buffer_count(1);
+            let buffer = d.allocate_command_buffers(&info).context("allocating a command buffer")?[0];
+            let queries = if max_stamps > 0 && gpu.summary().timestamp_period_ns > 0.0 {
+                let info = vk::QueryPoolCreateInfo::default()
+                    .query_type(vk::QueryType::TIMESTAMP)
+                    .query_count(max_stamps);
+                Some(d.create_query_pool(&info, None).context("creating time stamps")?)
+            } else {
+                None
+            };
+            let mut list = Self { buffer, pool, queries, stamps: 0, max_stamps, gpu: gpu.clone() };
+            let begin = vk::CommandBufferBeginInfo::default();
+            d.begin_command_buffer(buffer, &begin).context("beginning a command buffer")?;
+            if let Some(q) = queries {
+                d.cmd_reset_query_pool(buffer, q, 0, max_stamps);
+            }
+            record(&mut Recorder { list: &mut list });
+            d.end_command_buffer(buffer).context("ending a command buffer")?;
+            Ok(list)
+        }
+    }
+
+    /// Time stamps of the last finished run, in nanoseconds since the first of them; fills and returns how many there are.
+    /// Allocates nothing.
+    pub fn stamps_ns(&self, out: &mut [u64]) -> usize {
+        let Some(queries) = self.queries else { return 0 };
+        let n = (self.stamps as usize).min(out.len());
+        // SAFETY: the queries were written by the last submission, whose fence the caller waited for.
+        let ok = unsafe {
+            self.gpu.device.get_query_pool_results(queries, 0, &mut out[..n], vk::QueryResultFlags::TYPE_64)
+        };
+        if ok.is_err() || n == 0 {
+            return 0;
+        }
+        let first = out[0];
+        let period = f64::from(self.gpu.summary().timestamp_period_ns);
+        for stamp in &mut out[..n] {
+            *stamp = (stamp.wrapping_sub(first) as f64 * period) as u64;
+        }
+        n
+    }
+
+    /// Runs the list; `fence` is signalled when it is done.
+    ///
+    /// # Errors
+    /// Device lost, or out of memory in the driver.
+    pub fn submit(&self, fence: &mut FrameFence) -> Result<(), GpuError> {
+        let buffers = [self.buffer];
+        let info = [vk::SubmitInfo::default().command_buffers(&buffers)];
+        // Only the render thread submits on the frame path, so this lock is never contended there.
+        let queue = self.gpu.queue.lock().map_err(|_| GpuError::DeviceLost("submitting"))?;
+        // SAFETY: the fence is unsignalled and unused: `wait` consumed its last run.
+        unsafe {
+            self.gpu.device.reset_fences(&[fence.fence]).context("resetting a fence")?;
+            self.gpu.device.queue_submit(*queue, &info, fence.fence).context("submitting a frame")?;
+        }
+        fence.pending = true;
+        Ok(())
+    }
+}
+
+impl Drop for CommandList {
+    fn drop(&mut self) {
+        // SAFETY: owners wait for the fence first; waiting for idle covers the rest.
+        unsafe {
+            if let Some(q) = self.queries {
+                self.gpu.device.destroy_query_pool(q, None);
+            }
+            self.gpu.device.destroy_command_pool(self.pool, None);
+        }
+    }
+}
+
+/// Records passes.
+pub struct Recorder<'a> {
+    list: &'a mut CommandList,
+}
+
+impl Recorder<'_> {
+    /// Runs `pipeline` over as many workgroups as `arguments` holds at `offset` (three u32) when the list runs.
+    pub fn dispatch_indirect(
+        &mut self,
+        pipeline: &ComputePipeline,
+        set: &BindingSet,
+        arguments: &Buffer,
+        offset: u64,
+    ) {
+        self.bind(pipeline, set);
+        // SAFETY: recording; the argument buffer is kept alive by the owner of the list.
+        unsafe { self.list.gpu.device.cmd_dispatch_indirect(self.list.buffer, arguments.handle, offset) }
+    }
+
+    /// Runs `pipeline` over a fixed number of workgroups.
+    pub fn dispatch(&mut self, pipeline: &ComputePipeline, set: &BindingSet, groups: [u32; 3]) {
+        self.bind(pipeline, set);
+        // SAFETY: recording.
+        unsafe { self.list.gpu.device.cmd_dispatch(self.list.buffer, groups[0], groups[1], groups[2]) }
+    }
+
+    fn bind(&mut self, pipeline: &ComputePipeline, set: &BindingSet) {
+        let d = &self.list.gpu.device;
+        // SAFETY: recording; pipeline and set are kept alive by the owner of the list.
+        unsafe {
+            d.cmd_bind_pipeline(self.list.buffer, vk::PipelineBindPoint::COMPUTE, pipeline.pipeline);
+            d.cmd_bind_descriptor_sets(
+                self.list.buffer,
+                vk::PipelineBindPoint::COMPUTE,
+                pipeline.layout,
+                0,
+                &[set.set],
+                &[],
+            );
+        }
+    }
+
+    /// What was written so far is seen by all that follows (shaders, indirect arguments, copies).
+    pub fn barrier(&mut self) {
+        use vk::{AccessFlags as A, PipelineStageFlags as S};
+        let barrier = vk::MemoryBarrier::default()
+            .src_access_mask(A::SHADER_WRITE | A::TRANSFER_WRITE)
+            .dst_access_mask(
+                A::SHADER_READ | A::SHADER_WRITE | A::UNIFORM_READ | A::TRANSFER_READ | A::TRANSFER_WRITE | A::INDIRECT_COMMAND_READ,
+            );
+        let stages = S::COMPUTE_SHADER | S::TRANSFER;
+        self.pipeline_barrier(stages, stages | S::DRAW_INDIRECT, barrier);
+    }
+
+    /// What was written is seen by the host after the fence.
+    pub fn barrier_to_host(&mut self) {
+        use vk::{AccessFlags as A, PipelineStageFlags as S};
+        let barrier = vk::MemoryBarrier::default()
+            .src_access_mask(A::SHADER_WRITE | A::TRANSFER_WRITE)
+            .dst_access_mask(A::HOST_READ);
+        self.pipeline_barrier(S::COMPUTE_SHADER | S::TRANSFER, S::HOST, barrier);
+    }
+
+    fn pipeline_barrier(
+        &mut self,
+        from: vk::PipelineStageFlags,
+        to: vk::PipelineStageFlags,
+        barrier: vk::MemoryBarrier<'_>,
+    ) {
+        // SAFETY: recording.
+        unsafe {
+            self.list.gpu.device.cmd_pipeline_barrier(
+                self.list.buffer,
+                from,
+                to,
+                vk::DependencyFlags::empty(),
+                &[barrier],
+                &[],
+                &[],
+            );
+        }
+    }
+
+    /// Copies the first `bytes` of one buffer to another.
+    pub fn copy(&mut self, from: &Buffer, to: &Buffer, bytes: usize) {
+        let region = [vk::BufferCopy { src_offset: 0, dst_offset: 0, size: bytes as u64 }];
+        // SAFETY: recording; both buffers have transfer usage and are kept alive by the owner.
+        unsafe { self.list.gpu.device.cmd_copy_buffer(self.list.buffer, from.handle, to.handle, &region) }
+    }
+
+    /// Fills a buffer with zeros.
+    pub fn clear(&mut self, buffer: &Buffer) {
+        // SAFETY: recording; the buffer has transfer usage.
+        unsafe { self.list.gpu.device.cmd_fill_buffer(self.list.buffer, buffer.handle, 0, vk::WHOLE_SIZE, 0) }
+    }
+
+    /// A time stamp after all passes so far. Stamps beyond the list's maximum are left out.
+    pub fn stamp(&mut self) {
+        if let Some(queries) = self.list.queries {
+            if self.list.stamps < self.list.max_stamps {
+                // SAFETY: recording; the index is below the pool's size.
+                unsafe {
+                    self.list.gpu.device.cmd_write_timestamp(
+                        self.list.buffer,
+                        vk::PipelineStageFlags::BOTTOM_OF_PIPE,
+                        queries,
+                        self.list.stamps,
+                    );
+                }
+                self.list.stamps += 1;
+            }
+        }
+    }
+}
+
+/// Tells when a submission is done.
+pub struct FrameFence {
+    fence: vk::Fence,
+    pending: bool,
+    gpu: Arc<Gpu>,
+}
+
+impl FrameFence {
+    /// # Errors
+    /// Vulkan's.
+    pub fn new(gpu: &Arc<Gpu>) -> Result<Self, GpuError> {
+        // SAFETY: valid create info; destroyed in Drop.
+        let fence = unsafe { gpu.device.create_fence(&vk::FenceCreateInfo::default(), None) }.context("creating a fence")?;
+        Ok(Self { fence, pending: false, gpu: gpu.clone() })
+    }
+
+    /// Waits at most `timeout_ns` for the last submission; returns at once when there is none.
+    ///
+    /// # Errors
+    /// [`GpuError::Timeout`] (the submission is still pending) or device lost.
+    pub fn wait(&mut self, timeout_ns: u64) -> Result<(), GpuError> {
+        if !self.pending {
+            return Ok(());
+        }
+        // SAFETY: the fence is alive.
+        match unsafe { self.gpu.device.wait_for_fences(&[self.fence], true, timeout_ns) } {
+            Ok(()) => {
+                self.pending = false;
+                Ok(())
+            }
+            Err(vk::Result::TIMEOUT) => Err(GpuError::Timeout(timeout_ns / 1_000_000)),
+            Err(e) => {
+                self.pending = false;
+                Err(e).context("waiting for a frame")
+            }
+        }
+    }
+}
+
+impl Drop for FrameFence {
+    fn drop(&mut self) {
+        let _ = self.wait(5_000_000_000);
+        // SAFETY: not pending any more, or the device is beyond help.
+        unsafe { self.gpu.device.destroy_fence(self.fence, None) }
+    }
+}
+
+/// Copies now and waits: for loading, never on the frame path.
+pub(super) fn copy_now(gpu: &Arc<Gpu>, from: &Buffer, to: &Buffer, bytes: usize) -> Result<(), GpuError> {
+    let list = CommandList::record(gpu, 0, |r| r.copy(from, to, bytes))?;
+    let mut fence = FrameFence::new(gpu)?;
+    list.submit(&mut fence)?;
+    fence.wait(60_000_000_000)
+}

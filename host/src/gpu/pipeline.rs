@@ -1,0 +1,188 @@
+//! Compute pipelines and the one table of bindings that all shaders share.
+
+use super::buffer::Buffer;
+use super::context::Gpu;
+use super::error::{Context as _, GpuError};
+use ash::vk;
+use dpm_shaders::Shader;
+use std::sync::Arc;
+
+/// What a binding holds.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum BindingKind {
+    /// Uniform block.
+    Uniform,
+    /// Storage buffer.
+    Storage,
+    /// Uniform texel buffer.
+    Texel,
+}
+
+impl BindingKind {
+    fn vulkan(self) -> vk::DescriptorType {
+        match self {
+            Self::Uniform => vk::DescriptorType::UNIFORM_BUFFER,
+            Self::Storage => vk::DescriptorType::STORAGE_BUFFER,
+            Self::Texel => vk::DescriptorType::UNIFORM_TEXEL_BUFFER,
+        }
+    }
+}
+
+/// The layout of set 0: which binding is of which kind.
+pub struct BindingTable {
+    layout: vk::DescriptorSetLayout,
+    pipeline_layout: vk::PipelineLayout,
+    bindings: Vec<(u32, BindingKind)>,
+    gpu: Arc<Gpu>,
+}
+
+impl BindingTable {
+    /// # Errors
+    /// Vulkan's.
+    pub fn new(gpu: &Arc<Gpu>, bindings: &[(u32, BindingKind)]) -> Result<Arc<Self>, GpuError> {
+        let entries: Vec<_> = bindings
+            .iter()
+            .map(|&(binding, kind)| {
+                vk::DescriptorSetLayoutBinding::default()
+                    .binding(binding)
+                    .descriptor_type(kind.vulkan())
+                    .descriptor_count(1)
+                    .stage_flags(vk::ShaderStageFlags::COMPUTE)
+            })
+            .collect();
+        let info = vk::DescriptorSetLayoutCreateInfo::default().bindings(&entries);
+        // SAFETY: valid create infos; destroyed in Drop.
+        unsafe {
+            let layout =
+                gpu.device.create_descriptor_set_layout(&info, None).context("creating a descriptor layout")?;
+            let layouts = [layout];
+            let info = vk::PipelineLayoutCreateInfo::default().set_layouts(&layouts);
+            let pipeline_layout =
+                gpu.device.create_pipeline_layout(&info, None).context("creating a pipeline layout")?;
+            Ok(Arc::new(Self { layout, pipeline_layout, bindings: bindings.to_vec(), gpu: gpu.clone() }))
+        }
+    }
+}
+
+impl Drop for BindingTable {
+    fn drop(&mut self) {
+        // SAFETY: pipelines and sets that use these hold an Arc to this.
+        unsafe {
+            self.gpu.device.destroy_pipeline_layout(self.pipeline_layout, None);
+            self.gpu.device.destroy_descriptor_set_layout(self.layout, None);
+        }
+    }
+}
+
+/// Buffers bound to a table. Holds no buffer: the owner keeps them alive as long as the GPU may use them.
+pub struct BindingSet {
+    pub(super) set: vk::DescriptorSet,
+    pool: vk::DescriptorPool,
+    table: Arc<BindingTable>,
+}
+
+impl BindingSet {
+    /// Binds every entry of the table.
+    ///
+    /// # Errors
+    /// Vulkan's.
+    ///
+    /// # Panics
+    /// When an entry of the table is missing from `buffers`: a programmer's mistake.
+    pub fn new(table: &Arc<BindingTable>, buffers: &[(u32, &Buffer)]) -> Result<Self, GpuError> {
+        let gpu = &table.gpu;
+        let count = |kind| table.bindings.iter().filter(|b| b.1 == kind).count() as u32;
+        let sizes: Vec<_> = [BindingKind::Uniform, BindingKind::Storage, BindingKind::Texel]
+            .iter()
+            .map(|&k| vk::DescriptorPoolSize { ty: k.vulkan(), descriptor_count: count(k) })
+            .filter(|s| s.descriptor_count > 0)
+            .collect();
+        let info = vk::DescriptorPoolCreateInfo::default().max_sets(1).pool_sizes(&sizes);
+        // SAFETY: valid create infos; the pool is destroyed in Drop and frees the set.
+        unsafe {
+            let pool = gpu.device.create_descriptor_pool(&info, None).context("creating a descriptor pool")?;
+            let layouts = [table.layout];
+            let info = vk::DescriptorSetAllocateInfo::default().descriptor_pool(pool).set_layouts(&layouts);
+            let set = gpu.device.allocate_descriptor_sets(&info).context("allocating a descriptor set")?[0];
+            for &(binding, kind) in &table.bindings {
+                let buffer = buffers
+                    .iter()
+                    .find(|b| b.0 == binding)
+                    .unwrap_or_else(|| panic!("binding {binding} has no buffer"))
+                    .1;
+                let infos =
+                    [vk::DescriptorBufferInfo { buffer: buffer.handle, offset: 0, range: vk::WHOLE_SIZE }];
+                let views = [buffer.view.unwrap_or_default()];
+                let write = vk::WriteDescriptorSet::default()
+                    .dst_set(set)
+                    .dst_binding(binding)
+                    .descriptor_count(1)
+                    .descriptor_type(kind.vulkan());
+                let write = match kind {
+                    BindingKind::Texel => write.texel_buffer_view(&views),
+                    _ => write.buffer_info(&infos),
+                };
+                gpu.device.update_descriptor_sets(&[write], &[]);
+            }
+            Ok(Self { set, pool, table: table.clone() })
+        }
+    }
+}
+
+impl Drop for BindingSet {
+    fn drop(&mut self) {
+        // SAFETY: owners wait for the GPU before dropping.
+        unsafe { self.table.gpu.device.destroy_descriptor_pool(self.pool, None) }
+    }
+}
+
+/// A compiled shader with its specialization constants.
+pub struct ComputePipeline {
+    pub(super) pipeline: vk::Pipeline,
+    pub(super) layout: vk::PipelineLayout,
+    table: Arc<BindingTable>,
+}
+
+impl ComputePipeline {
+    /// Compiles `shader` with constants `(id, value as 32 bits)`; booleans are 0 and 1.
+    ///
+    /// # Errors
+    /// Vulkan's.
+    pub fn new(table: &Arc<BindingTable>, shader: Shader, constants: &[(u32, u32)]) -> Result<Self, GpuError> {
+        let gpu = &table.gpu;
+        let words: Vec<u32> =
+            shader.spirv.chunks_exact(4).map(|c| u32::from_le_bytes([c[0], c[1], c[2], c[3]])).collect();
+        let module_info = vk::ShaderModuleCreateInfo::default().code(&words);
+        let entries: Vec<_> = constants
+            .iter()
+            .enumerate()
+            .map(|(i, &(constant_id, _))| vk::SpecializationMapEntry { constant_id, offset: i as u32 * 4, size: 4 })
+            .collect();
+        let values: Vec<u32> = constants.iter().map(|c| c.1).collect();
+        let data = bytemuck::cast_slice(&values);
+        let specialization = vk::SpecializationInfo::default().map_entries(&entries).data(data);
+        // SAFETY: the SPIR-V is ours, checked by tests; module and pipeline are destroyed here and in Drop.
+        unsafe {
+            let module =
+                gpu.device.create_shader_module(&module_info, None).context("creating a shader module")?;
+            let name = Gpu::name("main");
+            let stage = vk::PipelineShaderStageCreateInfo::default()
+                .stage(vk::ShaderStageFlags::COMPUTE)
+                .module(module)
+                .name(&name)
+                .specialization_info(&specialization);
+            let info = [vk::ComputePipelineCreateInfo::default().stage(stage).layout(table.pipeline_layout)];
+            let result = gpu.device.create_compute_pipelines(vk::PipelineCache::null(), &info, None);
+            gpu.device.destroy_shader_module(module, None);
+            let pipeline = result.map_err(|(_, e)| e).context("compiling a compute pipeline")?[0];
+            Ok(Self { pipeline, layout: table.pipeline_layout, table: table.clone() })
+        }
+    }
+}
+
+impl Drop for ComputePipeline {
+    fn drop(&mut self) {
+        // SAFETY: owners wait for the GPU before dropping.
+        unsafe { self.table.gpu.device.destroy_pipeline(self.pipeline, None) }
+    }
+}

@@ -1,0 +1,95 @@
+// One path: from a surface point toward the eye, backwards through the scene. Depth and weights as docs/RENDERING.md says.
+#include "scene.glsl"
+#define ALPHA_TEST
+#include "bvh.glsl"
+#include "shading.glsl"
+#include "bsdf.glsl"
+#include "light.glsl"
+#include "sampler.glsl"
+
+vec3 limit_indirect(vec3 contribution, uint vertex) {
+    if (!HAS_CLAMP || vertex < 2u) return contribution;
+    float l = luminance(contribution);
+    if (l > frame.clamp_indirect) {
+        atomicAdd(counters.clamped_samples, 1u);
+        return contribution * (frame.clamp_indirect / l);
+    }
+    return contribution;
+}
+
+// Balance heuristic without overflow; 0 when both are 0.
+float balance(float a, float b) {
+    if (!(a > 0.0)) return 0.0;
+    return finite(a) ? a / (a + b) : 1.0;
+}
+
+struct RayCount {
+    uint closest;
+    uint shadow;
+};
+
+vec3 trace_path(Point s, inout Sampler rng, inout RayCount rays) {
+    vec3 throughput = vec3(1.0);
+    vec3 radiance = s.emitted;
+    for (uint vertex = 1u; vertex < frame.depth; vertex++) {
+        // A single-sided opaque surface seen from behind is black.
+        if (!s.front && (s.flags & (MATERIAL_DOUBLE_SIDED | MATERIAL_TRANSMISSIVE)) == 0u) break;
+        Lobes lobes = lobes_of(s);
+        bool only_delta = mirror_like(s) && lobes.diffuse <= 0.0;
+        float u_pick = sample_1d(rng);
+        vec2 u_light = sample_2d(rng);
+        float u_lobe = sample_1d(rng);
+        vec2 u_bsdf = sample_2d(rng);
+        float u_roulette = sample_1d(rng);
+        if (!only_delta) {
+            LightSample light = sample_light(s.p, s.n, u_pick, u_light);
+            if (light.valid) {
+                vec3 direction = normalize(light.to_light);
+                vec3 value;
+                float pdf;
+                evaluate(s, lobes, direction, value, pdf);
+                if (luminance(value) > 0.0) {
+                    float side = dot(direction, s.g) > 0.0 ? 1.0 : -1.0;
+                    vec3 origin = s.p + s.g * (side * s.offset);
+                    vec3 to_light = light.finite_distance ? light.to_light - s.g * (side * s.offset) : direction;
+                    Hit blocker;
+                    blocker.t = light.finite_distance ? 1.0 : INFINITY;
+                    rays.shadow++;
+                    if (!trace_ray(origin, to_light, 0u, true, blocker)) {
+                        float weight = light.pdf > 0.0 ? balance(light.pdf, pdf) : 1.0;
+                        radiance += limit_indirect(throughput * value * light.radiance * weight, vertex);
+                    }
+                }
+            }
+        }
+        BsdfSample next = sample_bsdf(s, lobes, u_lobe, u_bsdf);
+        if (!next.valid) break;
+        throughput *= next.weight;
+        float survival = 1.0;
+        if (vertex >= 3u) {
+            survival = min(0.95, max(throughput.x, max(throughput.y, throughput.z)));
+            if (!(u_roulette < survival)) break;
+            throughput /= survival;
+        }
+        vec3 origin = s.p + s.g * (next.below ? -s.offset : s.offset);
+        Hit hit;
+        hit.t = INFINITY;
+        rays.closest++;
+        if (!trace_ray(origin, next.direction, 0u, false, hit)) {
+            if (ENVIRONMENT_KIND != 0u) {
+                float light_pdf = next.delta ? 0.0 : environment_pdf(next.direction, s.n) * frame.environment_select;
+                float weight = next.delta ? 1.0 : balance(next.pdf, light_pdf);
+                radiance += limit_indirect(throughput * environment_radiance(next.direction) * weight, vertex);
+            }
+            break;
+        }
+        vec3 from = s.p;
+        s = shading_point(hit, -normalize(next.direction));
+        if (HAS_EMISSIVE && s.light != NO_LIGHT && luminance(s.emitted) > 0.0) {
+            float light_pdf = next.delta ? 0.0 : emissive_pdf(s.light, hit.instance, hit.triangle, from, s.p, s.g);
+            float weight = next.delta ? 1.0 : balance(next.pdf, light_pdf);
+            radiance += limit_indirect(throughput * s.emitted * weight, vertex);
+        }
+    }
+    return radiance;
+}

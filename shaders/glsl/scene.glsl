@@ -1,0 +1,46 @@
+// Bindings and small helpers that every tracing shader uses.
+#extension GL_EXT_scalar_block_layout : require
+#extension GL_GOOGLE_include_directive : require
+#include "generated.glsl"
+
+// What the scene needs; the host sets these before the first frame so that the rest is compiled away.
+layout(constant_id = 0) const bool HAS_TEXTURES = true;
+layout(constant_id = 1) const bool HAS_NORMAL_MAPS = true;
+layout(constant_id = 2) const bool HAS_ALPHA_MASK = true;
+layout(constant_id = 3) const bool HAS_TRANSMISSION = true;
+layout(constant_id = 4) const bool HAS_SPECULAR = true;
+layout(constant_id = 5) const bool HAS_EMISSIVE = true;
+layout(constant_id = 6) const bool HAS_PUNCTUAL = true;
+layout(constant_id = 7) const uint ENVIRONMENT_KIND = 2u; // 0 none, 1 constant, 2 map
+layout(constant_id = 8) const bool HAS_CLAMP = true;
+layout(constant_id = 9) const bool HAS_DIFFUSE = true;
+
+layout(set = 0, binding = B_FRAME, scalar) uniform FrameBlock { Frame frame; };
+layout(set = 0, binding = B_INSTANCES, scalar) readonly buffer Instances { Instance instances[]; };
+layout(set = 0, binding = B_COUNTERS, scalar) buffer CountersBlock { Counters counters; };
+
+const float PI = 3.14159265358979;
+const float INFINITY = 3.0e38;
+
+vec3 transform_point(vec4 rows[3], vec3 p) {
+    return vec3(dot(rows[0], vec4(p, 1.0)), dot(rows[1], vec4(p, 1.0)), dot(rows[2], vec4(p, 1.0)));
+}
+
+vec3 transform_vector(vec4 rows[3], vec3 v) {
+    return vec3(dot(rows[0].xyz, v), dot(rows[1].xyz, v), dot(rows[2].xyz, v));
+}
+
+// For rigid transforms the inverse transpose of the linear part is itself.
+vec3 transform_normal(vec4 rows[3], vec3 n) { return normalize(transform_vector(rows, n)); }
+
+float luminance(vec3 c) { return dot(c, vec3(0.2126, 0.7152, 0.0722)); }
+
+// min/max/clamp with NaN are undefined in GLSL, so finiteness is tested by bits.
+bool finite(float x) { return (floatBitsToUint(x) & 0x7f800000u) != 0x7f800000u; }
+bool finite3(vec3 v) { return finite(v.x) && finite(v.y) && finite(v.z); }
+
+// World direction of the unit ray through a raster position (pixel centres at half integers).
+vec3 projector_direction(vec2 raster) {
+    vec3 d = vec3((raster.x - frame.intrinsics.z) / frame.intrinsics.x, -(raster.y - frame.intrinsics.w) / frame.intrinsics.y, -1.0);
+    return normalize(transform_vector(frame.world_from_projector, d));
+}

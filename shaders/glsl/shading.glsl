@@ -1,0 +1,166 @@
+// A hit into a shading point: position, normals, material at that point.
+
+layout(set = 0, binding = B_TRIANGLE_REFS, scalar) readonly buffer TriangleRefs { TriangleRef triangle_refs[]; };
+layout(set = 0, binding = B_VERTICES, scalar) readonly buffer Vertices { Vertex vertices[]; };
+layout(set = 0, binding = B_MATERIALS, scalar) readonly buffer Materials { Material materials[]; };
+layout(set = 0, binding = B_TEXTURES, scalar) readonly buffer Textures { TextureInfo textures[]; };
+layout(set = 0, binding = B_TEXELS, scalar) readonly buffer Texels { uvec2 texels[]; };
+layout(set = 0, binding = B_ALBEDO, scalar) readonly buffer Albedo { float albedo_table[]; };
+
+struct Point {
+    vec3 p;         // world
+    vec3 g;         // geometric normal on the side of v
+    vec3 n;         // shading normal on the side of v
+    vec3 v;         // unit, toward where we look from
+    bool front;     // v is on the outside
+    vec3 base;
+    float metallic;
+    float alpha;    // GGX
+    float ior;
+    float transmission;
+    vec3 emitted;   // radiance toward v
+    uint flags;
+    uint table;
+    uint light;     // index in the light table
+    float offset;   // safe distance to leave the surface
+};
+
+uint wrap_texel(int x, uint size, uint mode) {
+    int n = int(size);
+    if (mode == 1u) return uint(clamp(x, 0, n - 1));
+    int period = mode == 2u ? 2 * n : n;
+    int m = x - int(floor(float(x) / float(period))) * period;
+    m = clamp(m, 0, period - 1);
+    return uint(m >= n ? 2 * n - 1 - m : m);
+}
+
+vec4 texel(TextureInfo info, int x, int y) {
+    uvec2 w = texels[info.offset + wrap_texel(y, info.height, (info.flags >> 2u) & 3u) * info.width + wrap_texel(x, info.width, info.flags & 3u)];
+    return vec4(unpackUnorm2x16(w.x), unpackUnorm2x16(w.y));
+}
+
+vec4 sample_texture(TextureUse use, vec2 uv) {
+    TextureInfo info = textures[use.texture];
+    vec2 st = vec2(dot(use.row_u, vec3(uv, 1.0)), dot(use.row_v, vec3(uv, 1.0))) * vec2(info.width, info.height);
+    // Coordinates far outside (or not finite) must not overflow the integer conversion.
+    st = clamp(st, vec2(-1.0e6), vec2(1.0e6));
+    if ((info.flags & 32u) != 0u) return texel(info, int(floor(st.x)), int(floor(st.y)));
+    st -= 0.5;
+    vec2 base = floor(st);
+    vec2 f = st - base;
+    int x = int(base.x), y = int(base.y);
+    return mix(mix(texel(info, x, y), texel(info, x + 1, y), f.x), mix(texel(info, x, y + 1), texel(info, x + 1, y + 1), f.x), f.y);
+}
+
+vec2 interpolate_uv(TriangleRef ref, vec2 b) {
+    return vertices[ref.vertices.x].uv * (1.0 - b.x - b.y) + vertices[ref.vertices.y].uv * b.x + vertices[ref.vertices.z].uv * b.y;
+}
+
+bool alpha_present(uint instance, uint triangle, vec2 barycentric) {
+    TriangleRef ref = triangle_refs[instances[instance].triangle_offset + triangle];
+    float cutoff = materials[ref.material].alpha_cutoff;
+    if (cutoff < 0.0) return true;
+    float a = materials[ref.material].alpha;
+    if (HAS_TEXTURES && materials[ref.material].base_color_texture.texture != NO_TEXTURE)
+        a *= sample_texture(materials[ref.material].base_color_texture, interpolate_uv(ref, barycentric)).a;
+    return a >= cutoff;
+}
+
+// Position of a hit in the body's space.
+vec3 object_position(uint instance, uint triangle, vec2 b) {
+    uint row = (instances[instance].triangle_offset + triangle) * 3u;
+    vec3 p0 = TRI(row).xyz;
+    return p0 + b.x * (TRI(row + 1u).xyz - p0) + b.y * (TRI(row + 2u).xyz - p0);
+}
+
+vec3 object_normal(uint instance, uint triangle) {
+    uint row = (instances[instance].triangle_offset + triangle) * 3u;
+    vec3 p0 = TRI(row).xyz;
+    return normalize(cross(TRI(row + 1u).xyz - p0, TRI(row + 2u).xyz - p0));
+}
+
+// A distance that clears the rounding of the hit position and of the transforms into and out of the body's space.
+float surface_offset(vec3 p, uint instance) {
+    return 1.9e-6 * (max(abs(p.x), max(abs(p.y), abs(p.z))) + instances[instance].extent);
+}
+
+// E of docs/RENDERING.md: rows alpha, columns mu, at i / (N - 1) of sqrt(alpha) and of mu; the row past the last holds E_avg by alpha.
+float table_alpha_position(float alpha) { return sqrt(alpha) * float(ALBEDO_TABLE_SIZE - 1u); }
+
+float directional_albedo(uint table, float alpha, float mu) {
+    float y = clamp(table_alpha_position(alpha), 0.0, float(ALBEDO_TABLE_SIZE - 1u));
+    float x = clamp(mu, 0.0, 1.0) * float(ALBEDO_TABLE_SIZE - 1u);
+    uint y0 = min(uint(y), ALBEDO_TABLE_SIZE - 2u), x0 = min(uint(x), ALBEDO_TABLE_SIZE - 2u);
+    uint i = table * ALBEDO_TABLE_SIZE * (ALBEDO_TABLE_SIZE + 1u) + y0 * ALBEDO_TABLE_SIZE + x0;
+    float fx = x - float(x0), fy = y - float(y0);
+    return mix(mix(albedo_table[i], albedo_table[i + 1u], fx), mix(albedo_table[i + ALBEDO_TABLE_SIZE], albedo_table[i + ALBEDO_TABLE_SIZE + 1u], fx), fy);
+}
+
+float average_albedo(uint table, float alpha) {
+    float y = clamp(table_alpha_position(alpha), 0.0, float(ALBEDO_TABLE_SIZE - 1u));
+    uint y0 = min(uint(y), ALBEDO_TABLE_SIZE - 2u);
+    uint i = (table * (ALBEDO_TABLE_SIZE + 1u) + ALBEDO_TABLE_SIZE) * ALBEDO_TABLE_SIZE + y0;
+    return mix(albedo_table[i], albedo_table[i + 1u], y - float(y0));
+}
+
+Point shading_point(Hit hit, vec3 v) {
+    Point s;
+    TriangleRef ref = triangle_refs[instances[hit.instance].triangle_offset + hit.triangle];
+    uint m = ref.material;
+    vec2 b = hit.barycentric;
+    s.p = transform_point(instances[hit.instance].world_from_object, object_position(hit.instance, hit.triangle, b));
+    s.g = transform_normal(instances[hit.instance].world_from_object, object_normal(hit.instance, hit.triangle));
+    s.v = v;
+    s.flags = materials[m].flags;
+    s.table = materials[m].albedo_table;
+    s.light = ref.light;
+    s.offset = surface_offset(s.p, hit.instance);
+    s.front = dot(s.g, v) > 0.0;
+    vec3 n = vertices[ref.vertices.x].normal * (1.0 - b.x - b.y) + vertices[ref.vertices.y].normal * b.x + vertices[ref.vertices.z].normal * b.y;
+    n = dot(n, n) > 1e-12 ? transform_normal(instances[hit.instance].world_from_object, n) : s.g;
+    vec2 uv = HAS_TEXTURES ? interpolate_uv(ref, b) : vec2(0.0);
+    if (HAS_NORMAL_MAPS && materials[m].normal_texture.texture != NO_TEXTURE) {
+        vec4 t4 = vertices[ref.vertices.x].tangent * (1.0 - b.x - b.y) + vertices[ref.vertices.y].tangent * b.x + vertices[ref.vertices.z].tangent * b.y;
+        vec3 t = transform_vector(instances[hit.instance].world_from_object, t4.xyz);
+        t -= n * dot(n, t);
+        if (dot(t, t) > 1e-12) {
+            t = normalize(t);
+            vec3 bitangent = cross(n, t) * (t4.w < 0.0 ? -1.0 : 1.0);
+            vec3 c = sample_texture(materials[m].normal_texture, uv).xyz * 2.0 - 1.0;
+            c.xy *= materials[m].normal_scale;
+            vec3 mapped = t * c.x + bitangent * c.y + n * c.z;
+            if (dot(mapped, mapped) > 1e-12) n = normalize(mapped);
+        }
+    }
+    if (!s.front) {
+        s.g = -s.g;
+        n = -n;
+    }
+    float nv = dot(n, v);
+    if (nv < 1e-3) {
+        // Bent to the nearest direction that v is just above.
+        vec3 across = n - nv * v;
+        float l2 = dot(across, across);
+        n = l2 > 1e-12 ? across * (sqrt(1.0 - 1e-6) * inversesqrt(l2)) + 1e-3 * v : s.g;
+    }
+    s.n = n;
+    s.base = materials[m].base_color;
+    s.metallic = materials[m].metallic;
+    float roughness = materials[m].roughness;
+    s.transmission = HAS_TRANSMISSION ? materials[m].transmission : 0.0;
+    s.emitted = HAS_EMISSIVE && (s.front || (s.flags & MATERIAL_DOUBLE_SIDED) != 0u) ? materials[m].emissive : vec3(0.0);
+    s.ior = materials[m].ior;
+    if (HAS_TEXTURES) {
+        if (materials[m].base_color_texture.texture != NO_TEXTURE) s.base *= sample_texture(materials[m].base_color_texture, uv).rgb;
+        if (materials[m].metallic_roughness_texture.texture != NO_TEXTURE) {
+            vec4 mr = sample_texture(materials[m].metallic_roughness_texture, uv);
+            roughness *= mr.g;
+            s.metallic *= mr.b;
+        }
+        if (HAS_EMISSIVE && materials[m].emissive_texture.texture != NO_TEXTURE) s.emitted *= sample_texture(materials[m].emissive_texture, uv).rgb;
+        if (HAS_TRANSMISSION && materials[m].transmission_texture.texture != NO_TEXTURE)
+            s.transmission *= sample_texture(materials[m].transmission_texture, uv).r;
+    }
+    s.alpha = max(roughness * roughness, 1e-4);
+    return s;
+}

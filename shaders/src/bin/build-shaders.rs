@@ -1,0 +1,48 @@
+//! Writes `glsl/generated.glsl`, compiles every shader with `glslc`, and records the hash of the sources.
+//!
+//! Run as `cargo run -p dpm-shaders --bin build-shaders` after any change under `shaders/`.
+
+use std::path::Path;
+use std::process::{Command, ExitCode};
+
+/// Output stem, source, extra defines.
+const VARIANTS: &[(&str, &str, &[&str])] = &[
+    ("primary.texel", "primary.comp", &["-DBVH_TEXEL"]),
+    ("primary.storage", "primary.comp", &[]),
+    ("trace.texel", "trace.comp", &["-DBVH_TEXEL"]),
+    ("trace.storage", "trace.comp", &[]),
+    ("compensate", "compensate.comp", &[]),
+];
+
+fn main() -> ExitCode {
+    let root = Path::new(env!("CARGO_MANIFEST_DIR"));
+    let glsl = root.join("glsl");
+    let spv = root.join("spv");
+    std::fs::write(glsl.join("generated.glsl"), dpm_shaders::generate::generated_glsl()).expect("write generated.glsl");
+    std::fs::create_dir_all(&spv).expect("create spv");
+    for (stem, source, defines) in VARIANTS {
+        let output = spv.join(format!("{stem}.spv"));
+        let status = Command::new("glslc")
+            .args(["--target-env=vulkan1.1", "-O", "-Werror", "-I"])
+            .arg(&glsl)
+            .args(*defines)
+            .arg(glsl.join(source))
+            .arg("-o")
+            .arg(&output)
+            .status();
+        match status {
+            Ok(s) if s.success() => println!("{stem}.spv {} bytes", std::fs::metadata(&output).map_or(0, |m| m.len())),
+            Ok(s) => {
+                eprintln!("glslc failed on {source}: {s}");
+                return ExitCode::FAILURE;
+            }
+            Err(e) => {
+                eprintln!("cannot run glslc ({e}); install it: apt-get install glslc");
+                return ExitCode::FAILURE;
+            }
+        }
+    }
+    let hash = dpm_shaders::generate::hash_directory(&glsl).expect("read glsl");
+    std::fs::write(spv.join("sources.hash"), format!("{hash:016x}\n")).expect("write hash");
+    ExitCode::SUCCESS
+}

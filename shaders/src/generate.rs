@@ -1,0 +1,89 @@
+//! Rust types into GLSL text, and a hash that tells whether committed SPIR-V belongs to the sources.
+
+use crate::structs;
+
+/// A type that can be a member of a shared struct.
+pub trait GlslType {
+    /// The member's declaration, with indentation and line end.
+    fn member(name: &str) -> String;
+}
+
+macro_rules! glsl_types {
+    ($($rust:ty => $glsl:literal;)*) => {$(
+        impl GlslType for $rust {
+            fn member(name: &str) -> String {
+                format!("    {} {name};\n", $glsl)
+            }
+        }
+    )*};
+}
+
+glsl_types! {
+    f32 => "float";
+    u32 => "uint";
+    [f32; 2] => "vec2";
+    [f32; 3] => "vec3";
+    [f32; 4] => "vec4";
+    [u32; 3] => "uvec3";
+    [u32; 4] => "uvec4";
+    structs::TextureUse => "TextureUse";
+}
+
+impl GlslType for structs::Rows {
+    fn member(name: &str) -> String {
+        format!("    vec4 {name}[3];\n")
+    }
+}
+
+/// The text of `glsl/generated.glsl`.
+pub fn generated_glsl() -> String {
+    let mut out = String::from("// Written by build-shaders from shaders/src/structs.rs. Do not edit.\n\n");
+    for (name, value) in structs::CONSTANTS.iter().chain(structs::BINDINGS) {
+        out.push_str(&format!("#define {name} {value}u\n"));
+    }
+    out.push('\n');
+    out.push_str(&structs::glsl());
+    out
+}
+
+/// FNV-1a over names and contents of all sources, in the order given: stands in `spv/sources.hash`.
+pub fn source_hash<'a>(sources: impl Iterator<Item = (&'a str, &'a [u8])>) -> u64 {
+    let mut hash = 0xcbf2_9ce4_8422_2325u64;
+    for (name, text) in sources {
+        for &byte in name.as_bytes().iter().chain(&[0]).chain(text).chain(&[0]) {
+            hash = (hash ^ u64::from(byte)).wrapping_mul(0x0000_0100_0000_01b3);
+        }
+    }
+    hash
+}
+
+/// [`source_hash`] of all files in a folder, by name.
+///
+/// # Errors
+/// The operating system's, when the folder cannot be read.
+pub fn hash_directory(folder: &std::path::Path) -> std::io::Result<u64> {
+    let mut files = Vec::new();
+    for entry in std::fs::read_dir(folder)? {
+        let path = entry?.path();
+        let name = path.file_name().map(|n| n.to_string_lossy().into_owned()).unwrap_or_default();
+        files.push((name, std::fs::read(&path)?));
+    }
+    files.sort();
+    Ok(source_hash(files.iter().map(|(name, text)| (name.as_str(), text.as_slice()))))
+}
+
+#[cfg(test)]
+mod tests {
+    use std::path::Path;
+
+    #[test]
+    fn committed_spirv_belongs_to_the_sources() {
+        let root = Path::new(env!("CARGO_MANIFEST_DIR"));
+        let committed = std::fs::read_to_string(root.join("glsl/generated.glsl")).unwrap();
+        let remedy = "run: cargo run -p dpm-shaders --bin build-shaders";
+        assert_eq!(committed, super::generated_glsl(), "glsl/generated.glsl is stale; {remedy}");
+        let hash = super::hash_directory(&root.join("glsl")).unwrap();
+        let recorded = std::fs::read_to_string(root.join("spv/sources.hash")).unwrap();
+        assert_eq!(recorded.trim(), format!("{hash:016x}"), "spv/ is stale; {remedy}");
+    }
+}

@@ -1,0 +1,322 @@
+//! Every struct that host and GPU share, scalar block layout. Defined here once; the GLSL is generated.
+//!
+//! Affine transforms are three rows: `p' = (dot(row0, (p, 1)), dot(row1, (p, 1)), dot(row2, (p, 1)))`.
+
+use crate::generate::GlslType;
+use bytemuck::{Pod, Zeroable};
+
+/// Three rows of an affine transform.
+pub type Rows = [[f32; 4]; 3];
+
+macro_rules! gpu_structs {
+    ($($(#[$doc:meta])* struct $name:ident { $($(#[$fdoc:meta])* $field:ident : $ty:ty,)* })*) => {
+        $(
+            $(#[$doc])*
+            #[repr(C)]
+            #[derive(Clone, Copy, Debug, PartialEq, Pod, Zeroable)]
+            pub struct $name { $($(#[$fdoc])* pub $field: $ty,)* }
+        )*
+        /// The GLSL of every struct, in order.
+        pub fn glsl() -> String {
+            let mut out = String::new();
+            $(
+                out.push_str(concat!("struct ", stringify!($name), " {\n"));
+                $( out.push_str(&<$ty as GlslType>::member(stringify!($field))); )*
+                out.push_str("};\n\n");
+            )*
+            out
+        }
+        /// Name and byte offset of every member of every struct: what the SPIR-V must agree with.
+        pub fn layout() -> Vec<(&'static str, &'static str, usize)> {
+            vec![$($((stringify!($name), stringify!($field), core::mem::offset_of!($name, $field)),)*)*]
+        }
+    };
+}
+
+gpu_structs! {
+    /// One frame's uniforms. Written by the host as late as possible.
+    struct Frame {
+        /// Projector centre, world.
+        projector_position: [f32; 3],
+        /// Seed of the run.
+        seed: u32,
+        /// world direction = (x' , y', z') of these rows applied to ((px - cx) / fx, -(py - cy) / fy, -1).
+        world_from_projector: Rows,
+        /// fx, fy, cx, cy in pixels of this raster.
+        intrinsics: [f32; 4],
+        /// Eye, world.
+        eye_position: [f32; 3],
+        /// Frame number, wraps.
+        frame: u32,
+        /// Gaze point, world.
+        gaze_point: [f32; 3],
+        /// Bodies in the instance table.
+        instance_count: u32,
+        /// Raster width, pixels.
+        width: u32,
+        /// Raster height, pixels.
+        height: u32,
+        /// Samples per traced pixel.
+        spp: u32,
+        /// At most this many closest-hit rays a path.
+        depth: u32,
+        /// Tiles in the tile list.
+        tile_count: u32,
+        /// 16-pixel tiles in a row.
+        tiles_x: u32,
+        /// Limit on the luminance of indirect contributions; infinite: off.
+        clamp_indirect: f32,
+        /// drive = radiance * this * l_P^2 / (albedo * cos): pi * exposure / max_intensity.
+        drive_scale: f32,
+        /// Ambient radiance that the surface already shows, subtracted before compensation.
+        ambient: [f32; 3],
+        /// 1 / albedo of the real surface.
+        inverse_albedo: f32,
+        /// Lights in the alias table.
+        light_count: u32,
+        /// Bits: see `FRAME_*`.
+        flags: u32,
+        /// Constant environment radiance, or scale of the map.
+        environment: [f32; 3],
+        /// Map width in texels.
+        environment_width: u32,
+        /// Map height in texels.
+        environment_height: u32,
+        /// Rotation about +Y, radians.
+        environment_rotation: f32,
+        /// Probability that a light sample goes to the environment.
+        environment_select: f32,
+        /// Radius of a sphere about the origin that holds the scene.
+        scene_radius: f32,
+    }
+
+    /// One rigid body in the top level.
+    struct Instance {
+        /// world-from-object.
+        world_from_object: Rows,
+        /// object-from-world.
+        object_from_world: Rows,
+        /// World bounds, lower corner.
+        bounds_min: [f32; 3],
+        /// First node of the body's BVH.
+        node_offset: u32,
+        /// World bounds, upper corner.
+        bounds_max: [f32; 3],
+        /// First triangle of the body, in BVH order.
+        triangle_offset: u32,
+        /// world-from-object of the previous frame.
+        previous_world_from_object: Rows,
+        /// Bits: see `INSTANCE_*`.
+        flags: u32,
+        /// Index of the body in the scene.
+        body: u32,
+        /// Largest magnitude among object coordinates, for ray offsets.
+        extent: f32,
+    }
+
+    /// Attributes of one vertex.
+    struct Vertex {
+        /// Unit shading normal, object space.
+        normal: [f32; 3],
+        /// Texture coordinates.
+        uv: [f32; 2],
+        /// Unit tangent and sign of the bitangent.
+        tangent: [f32; 4],
+    }
+
+    /// Indices and material of one triangle, in BVH order.
+    struct TriangleRef {
+        /// Vertex indices.
+        vertices: [u32; 3],
+        /// Material.
+        material: u32,
+        /// Index into the light table; `NO_LIGHT`: does not emit.
+        light: u32,
+    }
+
+    /// Use of a texture; `texture == NO_TEXTURE`: none. The two rows map uv.
+    struct TextureUse {
+        /// Index into the texture table.
+        texture: u32,
+        /// u' = dot(row, (u, v, 1)).
+        row_u: [f32; 3],
+        /// v' likewise.
+        row_v: [f32; 3],
+    }
+
+    /// A material as in docs/RENDERING.md.
+    struct Material {
+        /// Linear base colour.
+        base_color: [f32; 3],
+        /// Alpha factor.
+        alpha: f32,
+        /// Emitted radiance.
+        emissive: [f32; 3],
+        /// Below this alpha nothing is there; negative: opaque.
+        alpha_cutoff: f32,
+        /// 0..1.
+        metallic: f32,
+        /// Perceptual.
+        roughness: f32,
+        /// Index of refraction.
+        ior: f32,
+        /// 0..1.
+        transmission: f32,
+        /// Strength of the normal map.
+        normal_scale: f32,
+        /// Bits: see `MATERIAL_*`.
+        flags: u32,
+        /// Which albedo table.
+        albedo_table: u32,
+        /// Base colour.
+        base_color_texture: TextureUse,
+        /// Metallic and roughness.
+        metallic_roughness_texture: TextureUse,
+        /// Normals.
+        normal_texture: TextureUse,
+        /// Emission.
+        emissive_texture: TextureUse,
+        /// Transmission.
+        transmission_texture: TextureUse,
+    }
+
+    /// Where a texture's texels are.
+    struct TextureInfo {
+        /// First texel.
+        offset: u32,
+        /// Texels in a row.
+        width: u32,
+        /// Rows.
+        height: u32,
+        /// Bits 0..1 wrap u, 2..3 wrap v, 4 sRGB, 5 nearest.
+        flags: u32,
+    }
+
+    /// One entry of the light table: an alias-table slot and the light itself.
+    struct Light {
+        /// `LIGHT_*`.
+        kind: u32,
+        /// Instance that carries it; `NO_INSTANCE`: world.
+        instance: u32,
+        /// Triangle in BVH order (emissive triangles).
+        triangle: u32,
+        /// Probability of this light among all.
+        select: f32,
+        /// Alias table: keep probability of this slot.
+        alias_keep: f32,
+        /// Alias table: the other light of this slot.
+        alias_other: u32,
+        /// Position, carrier space.
+        position: [f32; 3],
+        /// Where it shines, carrier space.
+        direction: [f32; 3],
+        /// Radiant intensity or irradiance.
+        intensity: [f32; 3],
+        /// Spot: scale of the cosine.
+        cone_scale: f32,
+        /// Spot: offset of the cosine.
+        cone_offset: f32,
+        /// Range, metres.
+        range: f32,
+    }
+
+    /// What the projector ray of a pixel met.
+    struct Surface {
+        /// Instance in the high 8 bits, triangle of the body in BVH order in the low 24; `NO_HIT`: nothing.
+        id: u32,
+        /// Barycentric weights of vertices 1 and 2.
+        barycentric: [f32; 2],
+        /// Distance from the projector along the unit ray; negative: not lit (the eye cannot see it).
+        distance: f32,
+    }
+
+    /// What one frame counted. Zeroed by the host before the frame.
+    struct Counters {
+        /// Closest-hit rays.
+        closest_rays: u32,
+        /// Shadow rays.
+        shadow_rays: u32,
+        /// Paths.
+        samples: u32,
+        /// Samples dropped because they were not finite.
+        invalid_samples: u32,
+        /// Pixels that are lit.
+        lit_pixels: u32,
+        /// Code values clamped at the top.
+        clipped_values: u32,
+        /// Drive values that were NaN.
+        nan_values: u32,
+        /// Contributions limited by the firefly clamp.
+        clamped_samples: u32,
+    }
+}
+
+/// Integer constants shared with GLSL.
+pub const CONSTANTS: &[(&str, u32)] = &[
+    ("NO_HIT", NO_HIT),
+    ("NO_TEXTURE", NO_TEXTURE),
+    ("NO_INSTANCE", NO_INSTANCE),
+    ("NO_LIGHT", NO_LIGHT),
+    ("INSTANCE_PROJECTED", INSTANCE_PROJECTED),
+    ("INSTANCE_EMPTY", INSTANCE_EMPTY),
+    ("MATERIAL_DOUBLE_SIDED", MATERIAL_DOUBLE_SIDED),
+    ("MATERIAL_THIN", MATERIAL_THIN),
+    ("MATERIAL_TRANSMISSIVE", MATERIAL_TRANSMISSIVE),
+    ("LIGHT_TRIANGLE", LIGHT_TRIANGLE),
+    ("LIGHT_POINT", LIGHT_POINT),
+    ("LIGHT_SPOT", LIGHT_SPOT),
+    ("LIGHT_DIRECTIONAL", LIGHT_DIRECTIONAL),
+    ("FRAME_CAMERA_IS_EYE", FRAME_CAMERA_IS_EYE),
+    ("ALBEDO_TABLE_SIZE", ALBEDO_TABLE_SIZE),
+];
+/// A pixel that met nothing.
+pub const NO_HIT: u32 = u32::MAX;
+/// No texture.
+pub const NO_TEXTURE: u32 = u32::MAX;
+/// Not a light.
+pub const NO_LIGHT: u32 = u32::MAX;
+/// Not carried by a body.
+pub const NO_INSTANCE: u32 = u32::MAX;
+/// The projector's light falls on it.
+pub const INSTANCE_PROJECTED: u32 = 1;
+/// It has no triangles.
+pub const INSTANCE_EMPTY: u32 = 2;
+/// Back faces are shaded.
+pub const MATERIAL_DOUBLE_SIDED: u32 = 1;
+/// Transmission goes straight.
+pub const MATERIAL_THIN: u32 = 2;
+/// Transmission can be above zero.
+pub const MATERIAL_TRANSMISSIVE: u32 = 4;
+/// Emissive triangle.
+pub const LIGHT_TRIANGLE: u32 = 0;
+/// Point light.
+pub const LIGHT_POINT: u32 = 1;
+/// Spot light.
+pub const LIGHT_SPOT: u32 = 2;
+/// Directional light.
+pub const LIGHT_DIRECTIONAL: u32 = 3;
+/// Ordinary camera: radiance goes back along the primary ray, everything hit is lit (tests).
+pub const FRAME_CAMERA_IS_EYE: u32 = 1;
+/// Side of the directional-albedo table.
+pub const ALBEDO_TABLE_SIZE: u32 = 32;
+
+/// Descriptor bindings of set 0, the same in every shader.
+pub const BINDINGS: &[(&str, u32)] = &[
+    ("B_FRAME", 0),
+    ("B_INSTANCES", 1),
+    ("B_NODES", 2),
+    ("B_TRIANGLES", 3),
+    ("B_TRIANGLE_REFS", 4),
+    ("B_VERTICES", 5),
+    ("B_MATERIALS", 6),
+    ("B_TEXTURES", 7),
+    ("B_TEXELS", 8),
+    ("B_LIGHTS", 9),
+    ("B_ENVIRONMENT", 10),
+    ("B_ALBEDO", 11),
+    ("B_TILES", 12),
+    ("B_SURFACES", 13),
+    ("B_RADIANCE", 14),
+    ("B_CODES", 15),
+    ("B_COUNTERS", 16),
+];
