@@ -84,12 +84,12 @@ float surface_offset(vec3 p, uint instance) {
     return 1.9e-6 * (max(abs(p.x), max(abs(p.y), abs(p.z))) + instances[instance].extent);
 }
 
-// E of docs/RENDERING.md: rows alpha, columns mu, at i / (N - 1) of sqrt(alpha) and of mu; the row past the last holds E_avg by alpha.
+// E of docs/RENDERING.md: rows alpha, columns mu, nodes at (i / 31)^2 of both; the row past the last holds E_avg by alpha.
 float table_alpha_position(float alpha) { return sqrt(alpha) * float(ALBEDO_TABLE_SIZE - 1u); }
 
 float directional_albedo(uint table, float alpha, float mu) {
     float y = clamp(table_alpha_position(alpha), 0.0, float(ALBEDO_TABLE_SIZE - 1u));
-    float x = clamp(mu, 0.0, 1.0) * float(ALBEDO_TABLE_SIZE - 1u);
+    float x = sqrt(clamp(mu, 0.0, 1.0)) * float(ALBEDO_TABLE_SIZE - 1u);
     uint y0 = min(uint(y), ALBEDO_TABLE_SIZE - 2u), x0 = min(uint(x), ALBEDO_TABLE_SIZE - 2u);
     uint i = table * ALBEDO_TABLE_SIZE * (ALBEDO_TABLE_SIZE + 1u) + y0 * ALBEDO_TABLE_SIZE + x0;
     float fx = x - float(x0), fy = y - float(y0);
