@@ -4,9 +4,8 @@
 #extension GL_EXT_scalar_block_layout : require
 #include "scene.glsl"
 
-layout(local_size_x = 64) in;
+layout(local_size_x = 8, local_size_y = 8) in;
 
-layout(set = 0, binding = B_TRIANGLES, scalar) readonly buffer TriangleBlock { vec4 triangle_rows[]; };
 layout(set = 0, binding = B_SURFACES, scalar) readonly buffer Surfaces { Surface surfaces[]; };
 layout(set = 0, binding = B_RADIANCE, scalar) readonly buffer Radiance { vec4 radiance_in[]; };
 layout(set = 0, binding = B_CODES, scalar) writeonly buffer Codes { uint codes[]; };
@@ -28,26 +27,32 @@ uint quantise(float v, inout uint nans, inout uint clipped) {
     return uint(shifted);
 }
 
+layout(set = 0, binding = B_TRIANGLE_REFS, scalar) readonly buffer TriangleRefs { TriangleRef triangle_refs[]; };
+layout(set = 0, binding = B_VERTICES, scalar) readonly buffer Vertices { Vertex vertices[]; };
+layout(set = 0, binding = B_TILES, scalar) readonly buffer Tiles { uint tiles[]; };
+
 void main() {
-    uint index = gl_GlobalInvocationID.x;
-    if (index >= frame.width * frame.height) return;
+    uint tile = tiles[gl_WorkGroupID.x >> 2u];
+    uvec2 pixel = uvec2(tile % frame.tiles_x, tile / frame.tiles_x) * 16u + uvec2(gl_WorkGroupID.x & 1u, (gl_WorkGroupID.x >> 1u) & 1u) * 8u + gl_LocalInvocationID.xy;
+    if (pixel.x >= frame.width || pixel.y >= frame.height) return;
+    uint index = pixel.y * frame.width + pixel.x;
     Surface surface = surfaces[index];
-    if (surface.id == NO_HIT || surface.distance < 0.0) {
-        codes[index] = 0u;
-        return;
+    uint nans = 0u, clipped = 0u, lit = 0u, code = 0u;
+    if (surface.id != NO_HIT && surface.distance > 0.0) {
+        uint instance = surface.id >> 24u;
+        TriangleRef ref = triangle_refs[instances[instance].triangle_offset + (surface.id & 0xffffffu)];
+        vec2 b = surface.barycentric;
+        // The real surface is smooth: its normal is the interpolated one, without the look's normal map.
+        vec3 n = vertices[ref.vertices.x].normal * (1.0 - b.x - b.y) + vertices[ref.vertices.y].normal * b.x + vertices[ref.vertices.z].normal * b.y;
+        float cosine = abs(dot(transform_normal(instances[instance].world_from_object, n), projector_direction(vec2(pixel) + 0.5)));
+        vec3 target = radiance_in[index].rgb - frame.ambient;
+        float geometry = surface.distance * surface.distance / max(cosine, 1e-3);
+        vec3 drive = target * (frame.drive_gain * geometry);
+        code = quantise(drive.r, nans, clipped) | (quantise(drive.g, nans, clipped) << 8u) | (quantise(drive.b, nans, clipped) << 16u);
+        lit = 1u;
     }
-    uint instance = surface.id >> 24u;
-    uint row = (instances[instance].triangle_offset + (surface.id & 0xffffffu)) * 3u;
-    vec3 p0 = triangle_rows[row].xyz;
-    vec3 g = transform_normal(instances[instance].world_from_object, cross(triangle_rows[row + 1u].xyz - p0, triangle_rows[row + 2u].xyz - p0));
-    uvec2 pixel = uvec2(index % frame.width, index / frame.width);
-    float cosine = abs(dot(g, projector_direction(vec2(pixel) + 0.5)));
-    vec3 target = max(radiance_in[index].rgb - frame.ambient, vec3(0.0));
-    float gain = frame.drive_scale * frame.inverse_albedo * surface.distance * surface.distance / max(cosine, 1e-3);
-    vec3 drive = radiance_in[index].rgb == radiance_in[index].rgb ? target * gain : radiance_in[index].rgb;
-    uint nans = 0u, clipped = 0u;
-    codes[index] = quantise(drive.r, nans, clipped) | (quantise(drive.g, nans, clipped) << 8u) | (quantise(drive.b, nans, clipped) << 16u);
-    atomicAdd(counters.lit_pixels, 1u);
-    if (nans > 0u) atomicAdd(counters.nan_values, nans);
-    if (clipped > 0u) atomicAdd(counters.clipped_values, clipped);
+    codes[index] = code;
+    COUNT(lit_pixels, lit)
+    COUNT(nan_values, nans)
+    COUNT(clipped_values, clipped)
 }

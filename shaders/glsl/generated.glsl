@@ -49,9 +49,8 @@ struct Frame {
     uint tile_count;
     uint tiles_x;
     float clamp_indirect;
-    float drive_scale;
+    float drive_gain;
     vec3 ambient;
-    float inverse_albedo;
     uint light_count;
     uint flags;
     vec3 environment;
@@ -59,7 +58,7 @@ struct Frame {
     uint environment_height;
     float environment_rotation;
     float environment_select;
-    float scene_radius;
+    vec3 world_origin;
 };
 
 struct Instance {

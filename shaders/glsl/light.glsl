@@ -149,6 +149,8 @@ LightSample sample_light(vec3 p, vec3 n, float u_pick, vec2 u) {
         if (carrier != NO_INSTANCE) {
             position = transform_point(instances[carrier].world_from_object, position);
             direction = transform_vector(instances[carrier].world_from_object, direction);
+        } else {
+            position -= frame.world_origin;
         }
         if (kind == LIGHT_DIRECTIONAL) {
             r.to_light = -direction;

@@ -22,7 +22,7 @@ void main() {
     uint mask = camera_is_eye ? 0u : INSTANCE_PROJECTED;
     Hit hit;
     hit.t = INFINITY;
-    uint closest = 1u, shadow = 0u;
+    uint shadow = 0u;
     if (trace_ray(frame.projector_position, direction, mask, false, hit)) {
         surface.id = (hit.instance << 24u) | hit.triangle;
         surface.barycentric = hit.barycentric;
@@ -45,6 +45,6 @@ void main() {
         }
     }
     surfaces[pixel.y * frame.width + pixel.x] = surface;
-    atomicAdd(counters.closest_rays, closest);
-    if (shadow > 0u) atomicAdd(counters.shadow_rays, shadow);
+    COUNT(closest_rays, 1u)
+    COUNT(shadow_rays, shadow)
 }

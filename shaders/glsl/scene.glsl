@@ -1,6 +1,8 @@
 // Bindings and small helpers that every tracing shader uses.
 #extension GL_EXT_scalar_block_layout : require
 #extension GL_GOOGLE_include_directive : require
+#extension GL_KHR_shader_subgroup_basic : require
+#extension GL_KHR_shader_subgroup_arithmetic : require
 #include "generated.glsl"
 
 // What the scene needs; the host sets these before the first frame so that the rest is compiled away.
@@ -38,6 +40,9 @@ float luminance(vec3 c) { return dot(c, vec3(0.2126, 0.7152, 0.0722)); }
 // min/max/clamp with NaN are undefined in GLSL, so finiteness is tested by bits.
 bool finite(float x) { return (floatBitsToUint(x) & 0x7f800000u) != 0x7f800000u; }
 bool finite3(vec3 v) { return finite(v.x) && finite(v.y) && finite(v.z); }
+
+// Adds a lane's count to a counter with one atomic per subgroup.
+#define COUNT(counter, value) { uint total_ = subgroupAdd(value); if (subgroupElect() && total_ != 0u) atomicAdd(counters.counter, total_); }
 
 // World direction of the unit ray through a raster position (pixel centres at half integers).
 vec3 projector_direction(vec2 raster) {

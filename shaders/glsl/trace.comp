@@ -45,8 +45,8 @@ void main() {
         }
     }
     radiance_out[index] = vec4(count > 0u ? sum / float(count) : vec3(0.0), float(count));
-    atomicAdd(counters.closest_rays, rays.closest);
-    atomicAdd(counters.shadow_rays, rays.shadow);
-    atomicAdd(counters.samples, frame.spp);
-    if (invalid > 0u) atomicAdd(counters.invalid_samples, invalid);
+    COUNT(closest_rays, rays.closest)
+    COUNT(shadow_rays, rays.shadow)
+    COUNT(samples, frame.spp)
+    COUNT(invalid_samples, invalid)
 }

@@ -66,12 +66,10 @@ gpu_structs! {
         tiles_x: u32,
         /// Limit on the luminance of indirect contributions; infinite: off.
         clamp_indirect: f32,
-        /// drive = radiance * this * l_P^2 / (albedo * cos): pi * exposure / max_intensity.
-        drive_scale: f32,
+        /// drive = radiance * this * l_P^2 / cos: pi * exposure / (albedo * max_intensity).
+        drive_gain: f32,
         /// Ambient radiance that the surface already shows, subtracted before compensation.
         ambient: [f32; 3],
-        /// 1 / albedo of the real surface.
-        inverse_albedo: f32,
         /// Lights in the alias table.
         light_count: u32,
         /// Bits: see `FRAME_*`.
@@ -86,8 +84,8 @@ gpu_structs! {
         environment_rotation: f32,
         /// Probability that a light sample goes to the environment.
         environment_select: f32,
-        /// Radius of a sphere about the origin that holds the scene.
-        scene_radius: f32,
+        /// World position that all coordinates here are relative to.
+        world_origin: [f32; 3],
     }
 
     /// One rigid body in the top level.

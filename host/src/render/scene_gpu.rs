@@ -1,0 +1,51 @@
+//! A scene's flat arrays into GPU buffers.
+
+use super::scene_data::SceneData;
+use crate::gpu::{Buffer, Gpu, GpuError};
+use std::sync::Arc;
+
+/// The buffers of one scene; immutable after creation.
+pub struct SceneGpu {
+    pub(super) nodes: Buffer,
+    pub(super) triangles: Buffer,
+    pub(super) refs: Buffer,
+    pub(super) vertices: Buffer,
+    pub(super) materials: Buffer,
+    pub(super) textures: Buffer,
+    pub(super) texels: Buffer,
+    pub(super) lights: Buffer,
+    pub(super) environment: Buffer,
+    pub(super) albedo: Buffer,
+}
+
+impl SceneGpu {
+    /// Uploads `data`. `texel_bvh`: nodes and triangles through texel buffers.
+    ///
+    /// # Errors
+    /// Out of memory or beyond the device's limits.
+    pub fn new(gpu: &Arc<Gpu>, data: &SceneData, texel_bvh: bool) -> Result<Self, GpuError> {
+        // Buffers cannot be empty; one element of padding is never read.
+        let empty = [[0u32; 4]; 5];
+        let nodes = if data.nodes.is_empty() { &empty[..] } else { &data.nodes };
+        let triangles = if data.triangles.is_empty() { &empty[..] } else { &data.triangles };
+        let bvh = |what, words: &[[u32; 4]], float| {
+            if texel_bvh {
+                Buffer::texels(gpu, what, words, float)
+            } else {
+                Buffer::from_slice(gpu, what, words)
+            }
+        };
+        Ok(Self {
+            nodes: bvh("BVH nodes", nodes, false)?,
+            triangles: bvh("triangles", triangles, true)?,
+            refs: Buffer::from_slice(gpu, "triangle indices", &data.refs)?,
+            vertices: Buffer::from_slice(gpu, "vertices", &data.vertices)?,
+            materials: Buffer::from_slice(gpu, "materials", &data.materials)?,
+            textures: Buffer::from_slice(gpu, "texture table", &data.textures)?,
+            texels: Buffer::from_slice(gpu, "textures", &data.texels)?,
+            lights: Buffer::from_slice(gpu, "lights", &data.lights)?,
+            environment: Buffer::from_slice(gpu, "environment map", &data.environment)?,
+            albedo: Buffer::from_slice(gpu, "albedo tables", &data.albedo)?,
+        })
+    }
+}
