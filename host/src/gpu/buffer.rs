@@ -68,10 +68,12 @@ impl Buffer {
         let mut buffer =
             Self::filled(gpu, what, bytemuck::cast_slice(data), vk::BufferUsageFlags::UNIFORM_TEXEL_BUFFER)?;
         let format = if float { vk::Format::R32G32B32A32_SFLOAT } else { vk::Format::R32G32B32A32_UINT };
-        let info = vk::BufferViewCreateInfo::default().buffer(buffer.handle).format(format).range(vk::WHOLE_SIZE);
+        let info =
+            vk::BufferViewCreateInfo::default().buffer(buffer.handle).format(format).range(vk::WHOLE_SIZE);
         // SAFETY: the buffer was created with texel usage and is alive.
-        buffer.view =
-            Some(unsafe { gpu.device.create_buffer_view(&info, None) }.context("creating a texel-buffer view")?);
+        buffer.view = Some(
+            unsafe { gpu.device.create_buffer_view(&info, None) }.context("creating a texel-buffer view")?,
+        );
         Ok(buffer)
     }
 
@@ -120,8 +122,7 @@ impl Buffer {
                     return Err(e);
                 }
             };
-            let mut buffer =
-                Self { handle, view: None, memory, mapped: None, len_bytes, gpu: gpu.clone() };
+            let mut buffer = Self { handle, view: None, memory, mapped: None, len_bytes, gpu: gpu.clone() };
             gpu.device.bind_buffer_memory(handle, memory, 0).context("binding buffer memory")?;
             if kind != MemoryKind::Device {
                 let pointer = gpu

@@ -153,7 +153,12 @@ impl Recorder<'_> {
         let barrier = vk::MemoryBarrier::default()
             .src_access_mask(A::SHADER_WRITE | A::TRANSFER_WRITE)
             .dst_access_mask(
-                A::SHADER_READ | A::SHADER_WRITE | A::UNIFORM_READ | A::TRANSFER_READ | A::TRANSFER_WRITE | A::INDIRECT_COMMAND_READ,
+                A::SHADER_READ
+                    | A::SHADER_WRITE
+                    | A::UNIFORM_READ
+                    | A::TRANSFER_READ
+                    | A::TRANSFER_WRITE
+                    | A::INDIRECT_COMMAND_READ,
             );
         let stages = S::COMPUTE_SHADER | S::TRANSFER;
         self.pipeline_barrier(stages, stages | S::DRAW_INDIRECT, barrier);
@@ -232,7 +237,8 @@ impl FrameFence {
     /// Vulkan's.
     pub fn new(gpu: &Arc<Gpu>) -> Result<Self, GpuError> {
         // SAFETY: valid create info; destroyed in Drop.
-        let fence = unsafe { gpu.device.create_fence(&vk::FenceCreateInfo::default(), None) }.context("creating a fence")?;
+        let fence = unsafe { gpu.device.create_fence(&vk::FenceCreateInfo::default(), None) }
+            .context("creating a fence")?;
         Ok(Self { fence, pending: false, gpu: gpu.clone() })
     }
 

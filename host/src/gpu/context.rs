@@ -57,7 +57,9 @@ unsafe extern "system" fn on_message(
 ) -> vk::Bool32 {
     // SAFETY: the layer passes a valid structure; the message may be null.
     let text = unsafe {
-        data.as_ref().filter(|d| !d.p_message.is_null()).map(|d| CStr::from_ptr(d.p_message).to_string_lossy().into_owned())
+        data.as_ref()
+            .filter(|d| !d.p_message.is_null())
+            .map(|d| CStr::from_ptr(d.p_message).to_string_lossy().into_owned())
     };
     if let Some(text) = text {
         if VALIDATION_COUNT.fetch_add(1, Ordering::Relaxed) < 16 {
@@ -101,14 +103,17 @@ fn create_instance(
     entry: &ash::Entry,
     validation: bool,
 ) -> Result<(ash::Instance, Option<(ext::debug_utils::Instance, vk::DebugUtilsMessengerEXT)>), GpuError> {
-    let application = vk::ApplicationInfo::default().application_name(c"dpm").api_version(vk::make_api_version(0, 1, 2, 0));
+    let application =
+        vk::ApplicationInfo::default().application_name(c"dpm").api_version(vk::make_api_version(0, 1, 2, 0));
     let layer = c"VK_LAYER_KHRONOS_validation";
     // SAFETY: plain enumeration.
     let layers = unsafe { entry.enumerate_instance_layer_properties() }.unwrap_or_default();
     let have_layer = layers.iter().any(|l| l.layer_name_as_c_str() == Ok(layer));
     let validate = validation && have_layer;
     if validation && !have_layer {
-        tracing::warn!("validation asked for, but the layer is not installed (apt-get install vulkan-validationlayers)");
+        tracing::warn!(
+            "validation asked for, but the layer is not installed (apt-get install vulkan-validationlayers)"
+        );
     }
     let layer_names = if validate { vec![layer.as_ptr()] } else { vec![] };
     let extensions = if validate { vec![ext::debug_utils::NAME.as_ptr()] } else { vec![] };
@@ -133,12 +138,13 @@ fn create_instance(
                 vk::DebugUtilsMessageSeverityFlagsEXT::ERROR | vk::DebugUtilsMessageSeverityFlagsEXT::WARNING,
             )
             .message_type(
-                vk::DebugUtilsMessageTypeFlagsEXT::VALIDATION | vk::DebugUtilsMessageTypeFlagsEXT::PERFORMANCE,
+                vk::DebugUtilsMessageTypeFlagsEXT::VALIDATION
+                    | vk::DebugUtilsMessageTypeFlagsEXT::PERFORMANCE,
             )
             .pfn_user_callback(Some(on_message));
         // SAFETY: the callback is a plain function that outlives the instance.
-        let messenger =
-            unsafe { loader.create_debug_utils_messenger(&info, None) }.context("creating the debug messenger")?;
+        let messenger = unsafe { loader.create_debug_utils_messenger(&info, None) }
+            .context("creating the debug messenger")?;
         Some((loader, messenger))
     } else {
         None
@@ -174,7 +180,9 @@ fn compute_family(instance: &ash::Instance, physical: vk::PhysicalDevice) -> Opt
     // A family without graphics is not disturbed by a desktop.
     families
         .iter()
-        .position(|f| compute(f) && !f.queue_flags.contains(vk::QueueFlags::GRAPHICS) && f.timestamp_valid_bits > 0)
+        .position(|f| {
+            compute(f) && !f.queue_flags.contains(vk::QueueFlags::GRAPHICS) && f.timestamp_valid_bits > 0
+        })
         .or_else(|| families.iter().position(compute))
         .map(|i| i as u32)
 }
@@ -254,7 +262,10 @@ impl Gpu {
         }
         candidates.retain(|(_, s)| {
             s.refused.is_none()
-                && options.device.as_ref().is_none_or(|want| s.name.to_lowercase().contains(&want.to_lowercase()))
+                && options
+                    .device
+                    .as_ref()
+                    .is_none_or(|want| s.name.to_lowercase().contains(&want.to_lowercase()))
         });
         let rank = |p: vk::PhysicalDevice| {
             // SAFETY: plain query.
@@ -267,18 +278,26 @@ impl Gpu {
         };
         candidates.sort_by_key(|&(p, _)| rank(p));
         let Some((physical, summary)) = candidates.into_iter().next() else {
-            let name = options.device.as_ref().map_or(String::new(), |d| format!(" and a name that contains \"{d}\""));
-            return Err(GpuError::NoDevice { found, needed: format!("Vulkan 1.2 with scalarBlockLayout{name}") });
+            let name = options
+                .device
+                .as_ref()
+                .map_or(String::new(), |d| format!(" and a name that contains \"{d}\""));
+            return Err(GpuError::NoDevice {
+                found,
+                needed: format!("Vulkan 1.2 with scalarBlockLayout{name}"),
+            });
         };
         let queue_family = compute_family(&instance, physical)
             .ok_or_else(|| GpuError::NoDevice { found, needed: "a compute queue".into() })?;
         let priorities = [1.0];
-        let queues =
-            [vk::DeviceQueueCreateInfo::default().queue_family_index(queue_family).queue_priorities(&priorities)];
+        let queues = [vk::DeviceQueueCreateInfo::default()
+            .queue_family_index(queue_family)
+            .queue_priorities(&priorities)];
         let mut vulkan12 = vk::PhysicalDeviceVulkan12Features::default().scalar_block_layout(true);
         let info = vk::DeviceCreateInfo::default().queue_create_infos(&queues).push_next(&mut vulkan12);
         // SAFETY: `info` and what it points to live until the call returns.
-        let device = unsafe { instance.create_device(physical, &info, None) }.context("opening the Vulkan device")?;
+        let device =
+            unsafe { instance.create_device(physical, &info, None) }.context("opening the Vulkan device")?;
         // SAFETY: family and index were asked for above.
         let queue = unsafe { device.get_device_queue(queue_family, 0) };
         // SAFETY: plain queries.

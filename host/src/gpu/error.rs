@@ -6,7 +6,9 @@ use ash::vk;
 #[derive(Debug, thiserror::Error)]
 pub enum GpuError {
     /// libvulkan is not installed.
-    #[error("no Vulkan loader: {0}. Install it (Debian, Ubuntu: apt-get install libvulkan1 mesa-vulkan-drivers)")]
+    #[error(
+        "no Vulkan loader: {0}. Install it (Debian, Ubuntu: apt-get install libvulkan1 mesa-vulkan-drivers)"
+    )]
     NoLoader(String),
     /// The loader found no driver.
     #[error(

@@ -53,8 +53,10 @@ impl BindingTable {
         let info = vk::DescriptorSetLayoutCreateInfo::default().bindings(&entries);
         // SAFETY: valid create infos; destroyed in Drop.
         unsafe {
-            let layout =
-                gpu.device.create_descriptor_set_layout(&info, None).context("creating a descriptor layout")?;
+            let layout = gpu
+                .device
+                .create_descriptor_set_layout(&info, None)
+                .context("creating a descriptor layout")?;
             let layouts = [layout];
             let info = vk::PipelineLayoutCreateInfo::default().set_layouts(&layouts);
             let pipeline_layout =
@@ -100,7 +102,8 @@ impl BindingSet {
         let info = vk::DescriptorPoolCreateInfo::default().max_sets(1).pool_sizes(&sizes);
         // SAFETY: valid create infos; the pool is destroyed in Drop and frees the set.
         unsafe {
-            let pool = gpu.device.create_descriptor_pool(&info, None).context("creating a descriptor pool")?;
+            let pool =
+                gpu.device.create_descriptor_pool(&info, None).context("creating a descriptor pool")?;
             let layouts = [table.layout];
             let info = vk::DescriptorSetAllocateInfo::default().descriptor_pool(pool).set_layouts(&layouts);
             let set = gpu.device.allocate_descriptor_sets(&info).context("allocating a descriptor set")?[0];
@@ -148,7 +151,11 @@ impl ComputePipeline {
     ///
     /// # Errors
     /// Vulkan's.
-    pub fn new(table: &Arc<BindingTable>, shader: Shader, constants: &[(u32, u32)]) -> Result<Self, GpuError> {
+    pub fn new(
+        table: &Arc<BindingTable>,
+        shader: Shader,
+        constants: &[(u32, u32)],
+    ) -> Result<Self, GpuError> {
         let gpu = &table.gpu;
         let words: Vec<u32> =
             shader.spirv.chunks_exact(4).map(|c| u32::from_le_bytes([c[0], c[1], c[2], c[3]])).collect();
@@ -156,7 +163,11 @@ impl ComputePipeline {
         let entries: Vec<_> = constants
             .iter()
             .enumerate()
-            .map(|(i, &(constant_id, _))| vk::SpecializationMapEntry { constant_id, offset: i as u32 * 4, size: 4 })
+            .map(|(i, &(constant_id, _))| vk::SpecializationMapEntry {
+                constant_id,
+                offset: i as u32 * 4,
+                size: 4,
+            })
             .collect();
         let values: Vec<u32> = constants.iter().map(|c| c.1).collect();
         let data = bytemuck::cast_slice(&values);

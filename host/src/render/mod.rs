@@ -9,6 +9,4 @@ pub mod scene_data;
 mod scene_gpu;
 pub mod tiles;
 
-pub use renderer::{
-    FrameCost, FrameInputs, FrameSlot, RenderError, Renderer, RendererSettings, PASSES,
-};
+pub use renderer::{FrameCost, FrameInputs, FrameSlot, RenderError, Renderer, RendererSettings, PASSES};

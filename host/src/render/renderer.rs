@@ -109,7 +109,10 @@ impl FrameSlot {
     /// Timeout (still running) or device lost.
     pub fn wait(&mut self, timeout_ns: u64) -> Result<FrameCost, GpuError> {
         self.fence.wait(timeout_ns)?;
-        let mut cost = FrameCost { counters: bytemuck::cast(self.counters_host.read::<Counters>(1)[0]), ..FrameCost::default() };
+        let mut cost = FrameCost {
+            counters: bytemuck::cast(self.counters_host.read::<Counters>(1)[0]),
+            ..FrameCost::default()
+        };
         let n = self.list.stamps_ns(&mut self.stamps);
         if n == self.stamps.len() {
             for (i, pass) in cost.pass_ns.iter_mut().enumerate() {
@@ -194,10 +197,23 @@ impl Renderer {
             pick(dpm_shaders::PRIMARY_TEXEL, dpm_shaders::PRIMARY_STORAGE),
             &constants,
         )?;
-        let trace =
-            ComputePipeline::new(&table, pick(dpm_shaders::TRACE_TEXEL, dpm_shaders::TRACE_STORAGE), &constants)?;
+        let trace = ComputePipeline::new(
+            &table,
+            pick(dpm_shaders::TRACE_TEXEL, dpm_shaders::TRACE_STORAGE),
+            &constants,
+        )?;
         let compensate = ComputePipeline::new(&table, dpm_shaders::COMPENSATE, &constants)?;
-        Ok(Self { primary, trace, compensate, table, scene: scene_gpu, data, settings, needs, gpu: gpu.clone() })
+        Ok(Self {
+            primary,
+            trace,
+            compensate,
+            table,
+            scene: scene_gpu,
+            data,
+            settings,
+            needs,
+            gpu: gpu.clone(),
+        })
     }
 
     /// What the scene needs of the tracer.
@@ -222,8 +238,7 @@ impl Renderer {
         use MemoryKind::{Device, Readback, Upload};
         let tile_list = TileList::new(raster.width(), raster.height());
         let frame = size("frame uniforms", size_of::<Frame>(), Upload)?;
-        let instances =
-            size("instances", size_of::<Instance>() * self.data.bodies.len().max(1), Upload)?;
+        let instances = size("instances", size_of::<Instance>() * self.data.bodies.len().max(1), Upload)?;
         let arguments = size("dispatch arguments", 16, Upload)?;
         let tiles = size("tile list", tile_list.len() * 4, Upload)?;
         let counters = size("counters", size_of::<Counters>(), Device)?;

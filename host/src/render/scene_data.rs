@@ -197,9 +197,16 @@ impl SceneData {
                     | (u32::from(t.srgb) << 4)
                     | (u32::from(t.nearest) << 5),
             });
-            let linear: Vec<u32> = (0..=255u8)
-                .map(|v| if t.srgb { (srgb_to_linear(v) * 65535.0).round() as u32 } else { u32::from(v) * 257 })
-                .collect();
+            let linear: Vec<u32> =
+                (0..=255u8)
+                    .map(|v| {
+                        if t.srgb {
+                            (srgb_to_linear(v) * 65535.0).round() as u32
+                        } else {
+                            u32::from(v) * 257
+                        }
+                    })
+                    .collect();
             self.texels.extend(t.texels.iter().map(|p| {
                 let c = |i: usize| linear[p[i] as usize];
                 [c(0) | (c(1) << 16), c(2) | ((u32::from(p[3]) * 257) << 16)]
@@ -351,7 +358,9 @@ impl SceneData {
                     let scale = 1.0 / (inner.cos() - outer.cos()).max(0.001);
                     (gpu::LIGHT_SPOT, 2.0 * PI * (1.0 - outer.cos()) * intensity, scale, -outer.cos() * scale)
                 }
-                PunctualKind::Directional => (gpu::LIGHT_DIRECTIONAL, PI * radius * radius * intensity, 0.0, 0.0),
+                PunctualKind::Directional => {
+                    (gpu::LIGHT_DIRECTIONAL, PI * radius * radius * intensity, 0.0, 0.0)
+                }
             };
             if power.is_nan() || power <= 0.0 {
                 continue;

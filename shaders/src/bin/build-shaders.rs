@@ -18,7 +18,8 @@ fn main() -> ExitCode {
     let root = Path::new(env!("CARGO_MANIFEST_DIR"));
     let glsl = root.join("glsl");
     let spv = root.join("spv");
-    std::fs::write(glsl.join("generated.glsl"), dpm_shaders::generate::generated_glsl()).expect("write generated.glsl");
+    std::fs::write(glsl.join("generated.glsl"), dpm_shaders::generate::generated_glsl())
+        .expect("write generated.glsl");
     std::fs::create_dir_all(&spv).expect("create spv");
     for (stem, source, defines) in VARIANTS {
         let output = spv.join(format!("{stem}.spv"));
@@ -31,7 +32,9 @@ fn main() -> ExitCode {
             .arg(&output)
             .status();
         match status {
-            Ok(s) if s.success() => println!("{stem}.spv {} bytes", std::fs::metadata(&output).map_or(0, |m| m.len())),
+            Ok(s) if s.success() => {
+                println!("{stem}.spv {} bytes", std::fs::metadata(&output).map_or(0, |m| m.len()))
+            }
             Ok(s) => {
                 eprintln!("glslc failed on {source}: {s}");
                 return ExitCode::FAILURE;
