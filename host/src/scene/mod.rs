@@ -4,6 +4,10 @@
 //! `projector.white_radiance` in the rig file relates to the projector's brightest light.
 
 pub mod builtin;
+mod error;
+mod gltf_file;
+mod limits;
+mod load;
 pub mod mesh;
 pub mod polygonise;
 mod procedural;
@@ -11,6 +15,9 @@ mod procedural;
 use glam::{DAffine3, Vec2, Vec3, Vec4};
 
 pub use builtin::builtin;
+pub use error::SceneError;
+pub use limits::Limits;
+pub use load::{load, load_bytes, BodySelector, LoadOptions};
 
 /// Everything that light meets. Immutable once loaded; bodies move by poses that are kept elsewhere.
 #[derive(Clone, Debug, Default)]
@@ -32,7 +39,7 @@ pub struct Scene {
 /// A rigid set of triangles with one pose.
 #[derive(Clone, Debug)]
 pub struct Body {
-    /// Name of the glTF node, or "static" for all that no rigid body of the rig file claims.
+    /// Name of the rigid body (without a rig file, of the glTF node); "static" and "virtual" for all that none claims.
     pub name: String,
     /// Index into the rig file's tracked bodies; `None` for what never moves.
     pub tracked: Option<u16>,
@@ -67,12 +74,21 @@ pub struct TriangleMesh {
 pub struct TextureRef {
     /// Index into [`Scene::textures`].
     pub texture: u32,
-    /// `uv' = offset + rotate(rotation) * scale * uv`.
+    /// Shift after rotation and scale; the whole map is [`TextureRef::apply`].
     pub offset: Vec2,
-    /// Radians, counter-clockwise as the extension defines it.
+    /// Radians; turns the coordinates counter-clockwise as seen on the image, whose v points down.
     pub rotation: f32,
     /// Scale of the coordinates.
     pub scale: Vec2,
+}
+
+impl TextureRef {
+    /// The transform of the coordinates: `offset + R * (scale * uv)` with `R = [cos sin; -sin cos]` (v points down).
+    pub fn apply(&self, uv: Vec2) -> Vec2 {
+        let (sin, cos) = self.rotation.sin_cos();
+        let s = self.scale * uv;
+        self.offset + Vec2::new(cos * s.x + sin * s.y, cos * s.y - sin * s.x)
+    }
 }
 
 /// The look to be reached: glTF 2.0 metallic-roughness with emissive strength, ior and transmission.

@@ -1,0 +1,314 @@
+//! A `.glb` or `.gltf` file into its JSON tree and its buffers; the only place that follows a URI.
+
+use std::io::Read;
+use std::path::{Component, Path, PathBuf};
+
+use serde_json::Value;
+
+use super::super::{Limits, SceneError};
+use super::json::{parse, shorten, Item};
+
+const JSON_CHUNK: u32 = 0x4E4F_534A;
+const BIN_CHUNK: u32 = 0x004E_4942;
+
+/// The two halves of a file.
+#[derive(Debug)]
+pub struct Container {
+    /// The document.
+    pub root: Value,
+    /// The binary chunk of a `.glb`.
+    pub binary: Option<Vec<u8>>,
+}
+
+/// Reads a whole regular file of at most `limit` bytes.
+pub fn read_file(path: &Path, limit: u64) -> Result<Vec<u8>, SceneError> {
+    // Asked before opening: opening a pipe would wait for its writer.
+    let metadata = std::fs::metadata(path).map_err(SceneError::Read)?;
+    if !metadata.is_file() {
+        return Err(SceneError::NotAFile);
+    }
+    let check = |size| SceneError::check_limit("the file's size in bytes", size, limit, "simplify the file");
+    check(metadata.len())?;
+    let mut bytes = Vec::with_capacity(metadata.len() as usize);
+    let file = std::fs::File::open(path).map_err(SceneError::Read)?;
+    file.take(limit + 1).read_to_end(&mut bytes).map_err(SceneError::Read)?;
+    check(bytes.len() as u64)?;
+    Ok(bytes)
+}
+
+/// Splits a file into JSON and binary chunk.
+pub fn split(bytes: &[u8], limits: &Limits) -> Result<Container, SceneError> {
+    let (text, binary) = if bytes.starts_with(b"glTF") { split_glb(bytes)? } else { (bytes, None) };
+    if text.is_empty() {
+        return Err(SceneError::broken("file", "is empty: no glTF document in it"));
+    }
+    if bytes.starts_with(b"PK") || bytes.starts_with(&[0x1f, 0x8b]) {
+        return Err(SceneError::unsupported(
+            "a compressed archive",
+            "unpack it and give the .glb or .gltf inside",
+        ));
+    }
+    SceneError::check_limit(
+        "the JSON text in bytes",
+        text.len() as u64,
+        limits.json_bytes,
+        "keep bulk data in buffers",
+    )?;
+    let root = parse(text, limits.json_values)?;
+    Ok(Container { root, binary: binary.map(<[u8]>::to_vec) })
+}
+
+fn word(bytes: &[u8], at: usize) -> Option<u32> {
+    Some(u32::from_le_bytes(bytes.get(at..at.checked_add(4)?)?.try_into().ok()?))
+}
+
+type Chunks<'a> = (&'a [u8], Option<&'a [u8]>);
+
+fn split_glb(bytes: &[u8]) -> Result<Chunks<'_>, SceneError> {
+    let header = |problem: String| SceneError::broken("GLB header", problem);
+    let (Some(version), Some(length)) = (word(bytes, 4), word(bytes, 8)) else {
+        return Err(header(format!("needs 12 bytes, the file has {}: it is cut off", bytes.len())));
+    };
+    if version != 2 {
+        return Err(header(format!("is of version {version}; re-export as glTF 2.0")));
+    }
+    if length as usize != bytes.len() {
+        return Err(header(format!(
+            "promises {length} bytes, the file has {}: it is cut off or damaged",
+            bytes.len()
+        )));
+    }
+    let (mut text, mut binary) = (None, None);
+    let (mut at, mut index) = (12usize, 0);
+    while at < bytes.len() {
+        let name = format!("GLB chunk {index}");
+        let (Some(size), Some(kind)) = (word(bytes, at), word(bytes, at + 4)) else {
+            return Err(SceneError::broken(name, "has no room for its header"));
+        };
+        let left = bytes.len() - at - 8;
+        let Some(content) = bytes[at + 8..].get(..size as usize) else {
+            return Err(SceneError::broken(name, format!("promises {size} bytes, the file has {left} left")));
+        };
+        match (index, kind) {
+            (0, JSON_CHUNK) => text = Some(content),
+            (0, _) => return Err(SceneError::broken(name, "must be the JSON chunk")),
+            (1, BIN_CHUNK) => binary = Some(content),
+            (_, JSON_CHUNK | BIN_CHUNK) => {
+                return Err(SceneError::broken(name, "is a second JSON or binary chunk, or out of order"))
+            }
+            _ => {} // other chunks are for other programs, as the format says
+        }
+        at += 8 + size as usize;
+        index += 1;
+    }
+    let Some(text) = text else { return Err(SceneError::broken("GLB", "has no JSON chunk")) };
+    let end = text.iter().rposition(|&b| b != 0).map_or(0, |i| i + 1); // some writers pad with zeros
+    Ok((&text[..end], binary))
+}
+
+/// Where side files may lie.
+#[derive(Clone, Debug)]
+pub struct Folder(PathBuf);
+
+impl Folder {
+    /// The folder that holds `file`.
+    pub fn of(file: &Path) -> Result<Self, SceneError> {
+        let parent = file.parent().filter(|p| !p.as_os_str().is_empty()).unwrap_or(Path::new("."));
+        parent.canonicalize().map(Self).map_err(SceneError::Read)
+    }
+
+    fn read(&self, uri: &str, limit: u64) -> Result<Vec<u8>, SceneError> {
+        let name = percent_decode(uri)?;
+        let path = Path::new(&name);
+        let plain = !name.is_empty()
+            && !name.contains(['\\', '\0', ':'])
+            && path
+                .components()
+                .all(|c| matches!(c, Component::Normal(part) if !is_device_name(&part.to_string_lossy())));
+        if !plain {
+            return Err(refused_uri(uri));
+        }
+        let resolved = self.0.join(path).canonicalize().map_err(SceneError::Read)?;
+        if !resolved.starts_with(&self.0) {
+            return Err(refused_uri(uri));
+        }
+        read_file(&resolved, limit)
+    }
+}
+
+fn refused_uri(uri: &str) -> SceneError {
+    SceneError::unsupported(
+        format!("the URI '{}'", shorten(uri)),
+        "only plain relative paths to files in the scene's folder, or below it, are followed",
+    )
+}
+
+/// Names that Windows takes for devices whatever follows the dot.
+fn is_device_name(part: &str) -> bool {
+    let stem = part.split('.').next().unwrap_or("").trim_end().to_ascii_uppercase();
+    let numbered = |prefix| {
+        stem.strip_prefix(prefix).is_some_and(|n: &str| n.len() == 1 && n.as_bytes()[0].is_ascii_digit())
+    };
+    matches!(stem.as_str(), "CON" | "PRN" | "AUX" | "NUL") || numbered("COM") || numbered("LPT")
+}
+
+fn percent_decode(uri: &str) -> Result<String, SceneError> {
+    let bytes = uri.as_bytes();
+    let mut out = Vec::with_capacity(bytes.len());
+    let mut i = 0;
+    while i < bytes.len() {
+        let hex = |k: usize| bytes.get(i + k).and_then(|b| (*b as char).to_digit(16));
+        match (bytes[i], hex(1), hex(2)) {
+            (b'%', Some(high), Some(low)) => {
+                out.push((high * 16 + low) as u8);
+                i += 3;
+            }
+            (b'%', ..) => return Err(refused_uri(uri)),
+            (b, ..) => {
+                out.push(b);
+                i += 1;
+            }
+        }
+    }
+    String::from_utf8(out).map_err(|_| refused_uri(uri))
+}
+
+/// The bytes behind a URI: `data:` with base64, or a file in `folder`.
+pub fn fetch(uri: &str, folder: Option<&Folder>, limit: u64) -> Result<Vec<u8>, SceneError> {
+    if let Some(rest) = uri.strip_prefix("data:") {
+        let Some((head, payload)) = rest.split_once(',') else {
+            return Err(SceneError::broken("data URI", "has no comma before its content"));
+        };
+        if !head.ends_with(";base64") {
+            return Err(SceneError::unsupported("a data URI that is not base64", "re-export as .glb"));
+        }
+        SceneError::check_limit(
+            "a data URI in bytes",
+            payload.len() as u64 / 4 * 3,
+            limit,
+            "simplify the file",
+        )?;
+        return base64(payload.as_bytes());
+    }
+    match folder {
+        Some(folder) => folder.read(uri, limit),
+        None => Err(refused_uri(uri)),
+    }
+}
+
+/// Decodes base64 of the standard alphabet, padded or not.
+fn base64(text: &[u8]) -> Result<Vec<u8>, SceneError> {
+    let end = text.iter().rposition(|&b| b != b'=').map_or(0, |i| i + 1);
+    if text.len() - end > 2 || end % 4 == 1 {
+        return Err(SceneError::broken("data URI", "is not base64: its length is wrong"));
+    }
+    let mut out = Vec::with_capacity(end / 4 * 3 + 2);
+    for group in text[..end].chunks(4) {
+        let mut bits = 0u32;
+        for (k, &b) in group.iter().enumerate() {
+            let digit = match b {
+                b'A'..=b'Z' => b - b'A',
+                b'a'..=b'z' => b - b'a' + 26,
+                b'0'..=b'9' => b - b'0' + 52,
+                b'+' => 62,
+                b'/' => 63,
+                _ => {
+                    return Err(SceneError::broken(
+                        "data URI",
+                        "is not base64: it holds a character of another alphabet",
+                    ))
+                }
+            };
+            bits |= u32::from(digit) << (18 - 6 * k);
+        }
+        out.extend_from_slice(&bits.to_be_bytes()[1..group.len()]);
+    }
+    Ok(out)
+}
+
+/// Loads every buffer of the document, each cut to its declared length; together at most `limits.bytes`.
+pub fn load_buffers(
+    root: &Item,
+    binary: Option<Vec<u8>>,
+    folder: Option<&Folder>,
+    limits: &Limits,
+) -> Result<Vec<Vec<u8>>, SceneError> {
+    let mut binary = binary;
+    let mut total = 0u64;
+    let mut out = vec![];
+    for (i, buffer) in root.list("buffers", "buffer", limits.objects)?.iter().enumerate() {
+        let promised = buffer.whole("byteLength")?.ok_or_else(|| buffer.error("has no 'byteLength'"))?;
+        total = total.saturating_add(promised);
+        SceneError::check_limit(
+            "the size of all buffers in bytes",
+            total,
+            limits.bytes,
+            "simplify the scene",
+        )?;
+        let mut bytes = match buffer.text("uri")? {
+            Some(uri) => fetch(uri, folder, limits.bytes).map_err(|e| buffer.error(e.to_string()))?,
+            None if i == 0 && binary.is_some() => binary.take().unwrap_or_default(),
+            None => return Err(buffer.error("has neither a 'uri' nor a binary chunk in this file")),
+        };
+        if (bytes.len() as u64) < promised {
+            return Err(buffer.error(format!(
+                "promises {promised} bytes, but {} are there: the data is cut off",
+                bytes.len()
+            )));
+        }
+        bytes.truncate(promised as usize);
+        out.push(bytes);
+    }
+    Ok(out)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn base64_gives_the_vectors_of_rfc_4648() {
+        for (text, bytes) in [
+            ("", ""),
+            ("Zg==", "f"),
+            ("Zm8=", "fo"),
+            ("Zm9v", "foo"),
+            ("Zm9vYg==", "foob"),
+            ("Zm9vYmE", "fooba"),
+            ("Zm9vYmFy", "foobar"),
+        ] {
+            assert_eq!(base64(text.as_bytes()).unwrap(), bytes.as_bytes());
+        }
+        for bad in ["Z", "Zg===", "Zm9v!", "Zm 9v", "Z=9v"] {
+            assert!(base64(bad.as_bytes()).is_err(), "{bad}");
+        }
+    }
+
+    #[test]
+    fn uris_stay_inside_the_folder() {
+        let folder = Folder::of(Path::new("Cargo.toml")).unwrap();
+        for uri in [
+            "../Cargo.toml",
+            "/etc/passwd",
+            "file:///etc/passwd",
+            "http://a/b",
+            "src/../../x",
+            "%2e%2e/Cargo.toml",
+            "a%00b",
+            "C:\\x",
+            "..\\x",
+            "",
+            "src/NUL.txt",
+            "com1",
+            "%zz",
+            "./x:y",
+        ] {
+            let e = fetch(uri, Some(&folder), 1 << 20).unwrap_err().to_string();
+            assert!(e.contains("plain relative"), "{uri}: {e}");
+        }
+        assert!(fetch("Cargo.toml", Some(&folder), 1 << 20).is_ok());
+        assert!(fetch("src%2Flib.rs", Some(&folder), 1 << 20).is_ok());
+        assert!(matches!(fetch("src", Some(&folder), 1 << 20), Err(SceneError::NotAFile)));
+        assert!(matches!(fetch("Cargo.toml", Some(&folder), 10), Err(SceneError::TooLarge { .. })));
+    }
+}

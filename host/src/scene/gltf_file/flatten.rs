@@ -1,0 +1,339 @@
+//! The node tree into rigid bodies: what a body of the rig file claims moves with it, everything else stands still.
+
+use std::collections::BTreeMap;
+
+use glam::{DAffine3, DMat3, DMat4, DVec3, Vec3};
+
+use super::super::limits::Cancel;
+use super::super::mesh::Dropped;
+use super::super::{Body, BodySelector, LoadOptions, PunctualKind, PunctualLight, SceneError, TriangleMesh};
+use super::accessor::Data;
+use super::look::Look;
+use super::primitive::read_primitive;
+
+/// Bodies that [`choose_bodies`] makes movable when the rig file names none.
+const AUTO_BODIES: usize = 2;
+
+/// Which body a node belongs to: (index of the selector or none, exists only in the virtual world).
+type Group = (Option<usize>, bool);
+
+/// Part of the tree still to be walked.
+struct Step {
+    node: usize,
+    world: DAffine3,
+    claim: Option<usize>,
+    is_virtual: bool,
+}
+
+/// What [`flatten`] gives.
+pub struct Flat {
+    /// In the order of the selectors, fixed things last.
+    pub bodies: Vec<Body>,
+    /// All of the file's lights that a scene uses.
+    pub lights: Vec<PunctualLight>,
+}
+
+/// Nodes claimed by rigid bodies and nodes that are virtual.
+pub struct Claims {
+    /// In the order of the rig file.
+    bodies: Vec<Claim>,
+    virtual_nodes: Vec<usize>,
+}
+
+struct Claim {
+    name: String,
+    node: usize,
+    projected: bool,
+}
+
+/// Roots of the scene to show: the default scene, else the first, else every node without a parent.
+pub fn roots(document: &gltf::Document) -> Vec<usize> {
+    match document.default_scene().or_else(|| document.scenes().next()) {
+        Some(scene) => scene.nodes().map(|n| n.index()).collect(),
+        None => {
+            let mut is_child = vec![false; document.nodes().len()];
+            for child in document.nodes().flat_map(|n| n.children()) {
+                is_child[child.index()] = true;
+            }
+            (0..is_child.len()).filter(|&i| !is_child[i]).collect()
+        }
+    }
+}
+
+/// Nodes of the scene from the roots down, parents before children.
+fn descendants(document: &gltf::Document, roots: &[usize]) -> Vec<usize> {
+    let mut order = roots.to_vec();
+    let mut next = 0;
+    while next < order.len() {
+        if let Some(node) = document.nodes().nth(order[next]) {
+            order.extend(node.children().map(|c| c.index()));
+        }
+        next += 1;
+    }
+    order
+}
+
+/// Resolves the names of the rig file; without selectors the first two objects of the scene become movable.
+pub fn choose_bodies(
+    document: &gltf::Document,
+    options: &LoadOptions,
+    warnings: &mut Vec<String>,
+) -> Result<Claims, SceneError> {
+    let roots = roots(document);
+    let present = descendants(document, &roots);
+    let find = |name: &str| find_node(document, &present, name);
+    let mut virtual_nodes = options.virtual_nodes.iter().map(|n| find(n)).collect::<Result<Vec<_>, _>>()?;
+    if options.bodies.is_empty() {
+        return Ok(choose_automatically(document, roots, virtual_nodes, warnings));
+    }
+    let mut bodies: Vec<Claim> = vec![];
+    for BodySelector { name, node, projected } in &options.bodies {
+        let index = find(node)?;
+        if let Some(other) = bodies.iter().find(|b| b.node == index) {
+            return Err(SceneError::broken(
+                format!("body '{name}'"),
+                format!("claims node '{node}', which body '{}' claims already", other.name),
+            ));
+        }
+        bodies.push(Claim { name: name.clone(), node: index, projected: *projected });
+    }
+    virtual_nodes.sort_unstable();
+    Ok(Claims { bodies, virtual_nodes })
+}
+
+fn find_node(document: &gltf::Document, present: &[usize], name: &str) -> Result<usize, SceneError> {
+    let name_of = |&i: &usize| document.nodes().nth(i).and_then(|n| n.name().map(str::to_owned));
+    let matching: Vec<usize> =
+        present.iter().copied().filter(|i| name_of(i).as_deref() == Some(name)).collect();
+    if let [one] = matching[..] {
+        return Ok(one);
+    }
+    let known: Vec<String> =
+        present.iter().filter_map(name_of).take(30).map(|n| super::json::shorten(&n)).collect();
+    let problem = match matching.len() {
+        0 => format!("the scene has no node '{name}'"),
+        n => format!(
+            "the scene has {n} nodes named '{name}', so which one is meant cannot be told: rename them"
+        ),
+    };
+    Err(SceneError::Node { problem, known: if known.is_empty() { "none".into() } else { known.join(", ") } })
+}
+
+/// The first objects of the scene with a mesh become movable bodies; lamps (all materials emit) become virtual.
+fn choose_automatically(
+    document: &gltf::Document,
+    mut roots: Vec<usize>,
+    mut virtual_nodes: Vec<usize>,
+    warnings: &mut Vec<String>,
+) -> Claims {
+    // Exporters like to wrap everything in one node: look inside it.
+    while let [only] = roots[..] {
+        let Some(node) = document.nodes().nth(only) else { break };
+        let below: Vec<usize> = node.children().map(|c| c.index()).collect();
+        if node.mesh().is_some() || below.is_empty() {
+            break;
+        }
+        roots = below;
+    }
+    let mut bodies = vec![];
+    for root in roots {
+        let materials: Vec<bool> = descendants(document, &[root])
+            .into_iter()
+            .filter_map(|i| document.nodes().nth(i)?.mesh())
+            .flat_map(|mesh| mesh.primitives())
+            .map(|p| {
+                Vec3::from(p.material().emissive_factor()).max_element() > 0.0
+                    && p.material().emissive_texture().is_none()
+            })
+            .collect();
+        let name = document
+            .nodes()
+            .nth(root)
+            .and_then(|n| n.name())
+            .map_or_else(|| format!("node {root}"), str::to_owned);
+        if materials.is_empty() || virtual_nodes.contains(&root) {
+            continue;
+        }
+        if materials.iter().all(|&emits| emits) {
+            warnings.push(format!("'{name}' emits light everywhere: taken for a lamp of the virtual world, nothing is projected on it"));
+            virtual_nodes.push(root);
+        } else if bodies.len() < AUTO_BODIES {
+            bodies.push(Claim { name, node: root, projected: true });
+        }
+    }
+    virtual_nodes.sort_unstable();
+    Claims { bodies, virtual_nodes }
+}
+
+/// Walks the tree and gathers geometry and lights by body.
+pub fn flatten(
+    document: &gltf::Document,
+    data: &Data,
+    look: &Look,
+    claims: &Claims,
+    options: &LoadOptions,
+    cancel: &Cancel,
+    warnings: &mut Vec<String>,
+) -> Result<Flat, SceneError> {
+    let default_material = look.materials.len() - 1;
+    let mut rest = vec![DAffine3::IDENTITY; claims.bodies.len()];
+    let mut meshes: BTreeMap<Group, TriangleMesh> = BTreeMap::new();
+    let mut lights: Vec<(Option<usize>, PunctualLight)> = vec![];
+    let mut dropped = Dropped::default();
+    let mut walk: Vec<Step> = roots(document)
+        .into_iter()
+        .rev()
+        .map(|node| Step { node, world: DAffine3::IDENTITY, claim: None, is_virtual: false })
+        .collect();
+    while let Some(step) = walk.pop() {
+        cancel.check(&options.limits)?;
+        let Some(node) = document.nodes().nth(step.node) else { continue };
+        let world = step.world * local_transform(&node);
+        let claimed_here = claims.bodies.iter().position(|b| b.node == step.node);
+        let claim = claimed_here.or(step.claim);
+        let is_virtual = match claimed_here {
+            Some(c) => !claims.bodies[c].projected,
+            None => step.is_virtual,
+        } || claims.virtual_nodes.binary_search(&step.node).is_ok();
+        if let Some(c) = claimed_here {
+            rest[c] = rigid_part(&world).ok_or_else(|| {
+                SceneError::broken(
+                    format!("body '{}'", claims.bodies[c].name),
+                    "its node has a scale of zero or a position beyond any room",
+                )
+            })?;
+        }
+        let body_from_node = claim.map_or(world, |c| rest[c].inverse() * world);
+        if let Some(mesh) = node.mesh() {
+            if is_invertible(&body_from_node) {
+                let into = meshes.entry((claim, is_virtual)).or_default();
+                for primitive in &document.as_json().meshes[mesh.index()].primitives {
+                    cancel.check(&options.limits)?;
+                    let material = primitive.material.map_or(default_material, |m| m.value());
+                    if let Some((part, lost)) =
+                        read_primitive(primitive, data, material as u32, look.uv_sets[material])?
+                    {
+                        dropped.add(lost);
+                        into.append_transformed(&part, &body_from_node);
+                    }
+                }
+            } else {
+                warnings.push(format!(
+                    "node {} '{}' is scaled to nothing and is left out",
+                    step.node,
+                    node.name().unwrap_or("")
+                ));
+            }
+        }
+        if let Some(light) = node.light() {
+            lights.extend(place_light(&light, &body_from_node).map(|l| (claim, l)));
+        }
+        walk.extend(node.children().map(|c| Step { node: c.index(), world, claim, is_virtual }));
+    }
+
+    let mut bodies = vec![];
+    let mut body_of_claim = vec![None; claims.bodies.len()];
+    // The map puts None first; fixed things shall come last, after the bodies in the order of the rig file.
+    let (fixed, moving): (Vec<_>, Vec<_>) = meshes.into_iter().partition(|((claim, _), _)| claim.is_none());
+    for ((claim, is_virtual), mut mesh) in moving.into_iter().chain(fixed) {
+        dropped.add(mesh.drop_unusable());
+        if mesh.triangles.is_empty() {
+            continue;
+        }
+        let name = match (claim, is_virtual) {
+            (Some(c), _) => claims.bodies[c].name.clone(),
+            (None, false) => "static".into(),
+            (None, true) => "virtual".into(),
+        };
+        if let Some(c) = claim {
+            body_of_claim[c].get_or_insert(bodies.len() as u32);
+        }
+        let world_from_body_rest = claim.map_or(DAffine3::IDENTITY, |c| rest[c]);
+        bodies.push(Body {
+            name,
+            tracked: claim.map(|c| c as u16),
+            projected: !is_virtual,
+            world_from_body_rest,
+            mesh,
+        });
+    }
+    if dropped.not_finite > 0 {
+        warnings.push(format!(
+            "{} triangles have corners that are not finite or beyond 1000 km and are left out",
+            dropped.not_finite
+        ));
+    }
+    if dropped.degenerate > 0 {
+        warnings.push(format!("{} triangles without area are left out", dropped.degenerate));
+    }
+    if bodies.is_empty() {
+        return Err(SceneError::broken("scene", "holds no usable triangle"));
+    }
+    if let Some((claim, _)) = claims.bodies.iter().zip(&body_of_claim).find(|(_, b)| b.is_none()) {
+        return Err(SceneError::broken(
+            format!("body '{}'", claim.name),
+            "its node holds no usable triangle",
+        ));
+    }
+    let lights = lights
+        .into_iter()
+        .map(|(claim, light)| PunctualLight { body: claim.and_then(|c| body_of_claim[c]), ..light })
+        .collect();
+    Ok(Flat { bodies, lights })
+}
+
+fn local_transform(node: &gltf::Node) -> DAffine3 {
+    match node.transform() {
+        gltf::scene::Transform::Matrix { matrix } => {
+            DAffine3::from_mat4(DMat4::from_cols_array_2d(&matrix.map(|c| c.map(f64::from))))
+        }
+        gltf::scene::Transform::Decomposed { translation, rotation, scale } => {
+            let vector = |v: [f32; 3]| DVec3::from_array(v.map(f64::from));
+            let rotation = glam::DQuat::from_array(rotation.map(f64::from)).normalize();
+            DAffine3::from_scale_rotation_translation(vector(scale), rotation, vector(translation))
+        }
+    }
+}
+
+fn is_invertible(map: &DAffine3) -> bool {
+    let m = map.matrix3;
+    let size = m.x_axis.length() * m.y_axis.length() * m.z_axis.length();
+    map.is_finite() && m.determinant().abs() > 1e-12 * size && size > 1e-30
+}
+
+/// The rotation and translation of an affine map (columns made orthonormal from x on; a mirroring stays with the geometry).
+fn rigid_part(map: &DAffine3) -> Option<DAffine3> {
+    if !is_invertible(map) {
+        return None;
+    }
+    let x = map.matrix3.x_axis.normalize();
+    let y = (map.matrix3.y_axis - x * x.dot(map.matrix3.y_axis)).normalize();
+    let rotation = DMat3::from_cols(x, y, x.cross(y));
+    let rigid = DAffine3 { matrix3: rotation, translation: map.translation };
+    (rigid.is_finite()
+        && map.translation.abs().max_element() < f64::from(super::super::mesh::MAX_COORDINATE_M))
+    .then_some(rigid)
+}
+
+/// A light in the space of its body; `None` where its place is not finite.
+fn place_light(light: &gltf::khr_lights_punctual::Light, body_from_node: &DAffine3) -> Option<PunctualLight> {
+    use gltf::khr_lights_punctual::Kind;
+    let kind = match light.kind() {
+        Kind::Directional => PunctualKind::Directional,
+        Kind::Point => PunctualKind::Point,
+        Kind::Spot { inner_cone_angle, outer_cone_angle } => PunctualKind::Spot {
+            inner: inner_cone_angle,
+            outer: outer_cone_angle.min(std::f32::consts::FRAC_PI_2),
+        },
+    };
+    let direction = (body_from_node.matrix3 * DVec3::NEG_Z).try_normalize()?.as_vec3();
+    let position = body_from_node.translation.as_vec3();
+    position.is_finite().then(|| PunctualLight {
+        kind,
+        intensity: Vec3::from(light.color()) * light.intensity(),
+        body: None,
+        position,
+        direction,
+        range: light.range().unwrap_or(f32::INFINITY),
+    })
+}

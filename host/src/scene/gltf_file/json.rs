@@ -1,0 +1,274 @@
+//! JSON text into a tree of bounded size and depth, and typed access to that tree with messages that name the place.
+
+use std::cell::Cell;
+
+use serde::de::{DeserializeSeed, Error as _, MapAccess, SeqAccess, Visitor};
+use serde_json::{Map, Value};
+
+use super::super::SceneError;
+
+/// Parses `text`. Refused: more than `max_values` values, nesting beyond 128 levels, a key twice in one object, text after the end.
+pub fn parse(text: &[u8], max_values: u64) -> Result<Value, SceneError> {
+    let text = text.strip_prefix(b"\xef\xbb\xbf").unwrap_or(text);
+    let left = Cell::new(max_values);
+    let mut parser = serde_json::Deserializer::from_slice(text);
+    let value = Tree { left: &left }.deserialize(&mut parser).and_then(|v| parser.end().map(|()| v));
+    value.map_err(|e| {
+        if left.get() == 0 {
+            return SceneError::TooLarge {
+                what: "the number of JSON values".into(),
+                found: max_values + 1,
+                limit: max_values,
+                remedy: "keep bulk data in buffers",
+            };
+        }
+        let text = e.to_string();
+        if text.starts_with("recursion limit") {
+            SceneError::broken("JSON", format!("nested deeper than 128 levels ({text})"))
+        } else {
+            SceneError::broken("JSON", text)
+        }
+    })
+}
+
+struct Tree<'a> {
+    left: &'a Cell<u64>,
+}
+
+impl<'de> DeserializeSeed<'de> for Tree<'_> {
+    type Value = Value;
+    fn deserialize<D: serde::Deserializer<'de>>(self, parser: D) -> Result<Value, D::Error> {
+        let left = self.left.get();
+        if left == 0 {
+            return Err(D::Error::custom("too many values"));
+        }
+        self.left.set(left - 1);
+        parser.deserialize_any(self)
+    }
+}
+
+impl<'de> Visitor<'de> for Tree<'_> {
+    type Value = Value;
+    fn expecting(&self, f: &mut std::fmt::Formatter) -> std::fmt::Result {
+        f.write_str("JSON")
+    }
+    fn visit_unit<E>(self) -> Result<Value, E> {
+        Ok(Value::Null)
+    }
+    fn visit_bool<E>(self, v: bool) -> Result<Value, E> {
+        Ok(v.into())
+    }
+    fn visit_u64<E>(self, v: u64) -> Result<Value, E> {
+        Ok(v.into())
+    }
+    fn visit_i64<E>(self, v: i64) -> Result<Value, E> {
+        Ok(v.into())
+    }
+    fn visit_f64<E>(self, v: f64) -> Result<Value, E> {
+        Ok(v.into())
+    }
+    fn visit_str<E>(self, v: &str) -> Result<Value, E> {
+        Ok(v.into())
+    }
+    fn visit_string<E>(self, v: String) -> Result<Value, E> {
+        Ok(v.into())
+    }
+    fn visit_seq<A: SeqAccess<'de>>(self, mut list: A) -> Result<Value, A::Error> {
+        let mut out = vec![];
+        while let Some(v) = list.next_element_seed(Tree { left: self.left })? {
+            out.push(v);
+        }
+        Ok(Value::Array(out))
+    }
+    fn visit_map<A: MapAccess<'de>>(self, mut object: A) -> Result<Value, A::Error> {
+        let mut out = Map::new();
+        while let Some(key) = object.next_key::<String>()? {
+            let value = object.next_value_seed(Tree { left: self.left })?;
+            if out.contains_key(&key) {
+                return Err(A::Error::custom(format!("the key '{key}' appears twice in one object")));
+            }
+            out.insert(key, value);
+        }
+        Ok(Value::Object(out))
+    }
+}
+
+/// A JSON object with the words by which messages name it: "accessor 3", "material 1 'glass'".
+#[derive(Clone)]
+pub struct Item<'a> {
+    map: &'a Map<String, Value>,
+    /// Name for messages.
+    pub name: String,
+}
+
+impl<'a> Item<'a> {
+    /// Takes `value` as an object called `name`.
+    pub fn new(value: &'a Value, name: String) -> Result<Self, SceneError> {
+        match value {
+            Value::Object(map) => Ok(Self { map, name }),
+            _ => Err(SceneError::broken(name, "must be a JSON object")),
+        }
+    }
+
+    /// An error at this object.
+    pub fn error(&self, problem: impl Into<String>) -> SceneError {
+        SceneError::broken(self.name.clone(), problem)
+    }
+
+    /// The raw value, where present.
+    pub fn get(&self, key: &str) -> Option<&'a Value> {
+        self.map.get(key)
+    }
+
+    /// Keys of the object.
+    pub fn keys(&self) -> impl Iterator<Item = &'a String> {
+        self.map.keys()
+    }
+
+    /// A nested object.
+    pub fn object(&self, key: &str) -> Result<Option<Item<'a>>, SceneError> {
+        self.get(key).map(|v| Item::new(v, format!("{}, {key}", self.name))).transpose()
+    }
+
+    /// A nested object inside `extensions`.
+    pub fn extension(&self, key: &str) -> Result<Option<Item<'a>>, SceneError> {
+        match self.object("extensions")? {
+            Some(all) => all.get(key).map(|v| Item::new(v, format!("{}, {key}", self.name))).transpose(),
+            None => Ok(None),
+        }
+    }
+
+    /// The objects of a list; none where the key is absent. Each is called `kind` and its index, with its "name" if it has one.
+    pub fn list(&self, key: &str, kind: &str, limit: u64) -> Result<Vec<Item<'a>>, SceneError> {
+        let Some(value) = self.get(key) else { return Ok(vec![]) };
+        let Value::Array(values) = value else { return Err(self.error(format!("'{key}' must be a list"))) };
+        SceneError::check_limit(
+            &format!("the number of {key}"),
+            values.len() as u64,
+            limit,
+            "split or simplify the scene",
+        )?;
+        values
+            .iter()
+            .enumerate()
+            .map(|(i, v)| {
+                let label = v
+                    .get("name")
+                    .and_then(Value::as_str)
+                    .map_or(String::new(), |n| format!(" '{}'", shorten(n)));
+                Item::new(v, format!("{kind} {i}{label}"))
+            })
+            .collect()
+    }
+
+    /// A whole number from 0.
+    pub fn whole(&self, key: &str) -> Result<Option<u64>, SceneError> {
+        self.get(key)
+            .map(|v| {
+                v.as_u64().ok_or_else(|| {
+                    self.error(format!("'{key}' is {}, not a whole number from 0", shorten(&v.to_string())))
+                })
+            })
+            .transpose()
+    }
+
+    /// An index that must point into a list of `count` things called `kind`.
+    pub fn index(&self, key: &str, count: usize, kind: &str) -> Result<Option<usize>, SceneError> {
+        match self.whole(key)? {
+            Some(i) if i >= count as u64 => {
+                Err(self.error(format!("'{key}' points at {kind} {i}, but the file has {count}")))
+            }
+            other => Ok(other.map(|i| i as usize)),
+        }
+    }
+
+    /// Indices, each of which must point into a list of `count` things called `kind`.
+    pub fn indices(&self, key: &str, count: usize, kind: &str) -> Result<Vec<usize>, SceneError> {
+        let Some(value) = self.get(key) else { return Ok(vec![]) };
+        let Value::Array(values) = value else { return Err(self.error(format!("'{key}' must be a list"))) };
+        let check = |v: &Value| match v.as_u64() {
+            Some(i) if i < count as u64 => Ok(i as usize),
+            _ => Err(self.error(format!(
+                "'{key}' points at {kind} {}, but the file has {count}",
+                shorten(&v.to_string())
+            ))),
+        };
+        values.iter().map(check).collect()
+    }
+
+    /// A number that stays finite in f32.
+    pub fn number(&self, key: &str) -> Result<Option<f32>, SceneError> {
+        self.get(key).map(|v| self.finite(key, v)).transpose()
+    }
+
+    /// Exactly `N` numbers that stay finite in f32.
+    pub fn numbers<const N: usize>(&self, key: &str) -> Result<Option<[f32; N]>, SceneError> {
+        let Some(value) = self.get(key) else { return Ok(None) };
+        let list = value.as_array().map_or(&[][..], |v| v);
+        let Ok(values) = <&[Value; N]>::try_from(list) else {
+            return Err(self.error(format!("'{key}' must be a list of {N} numbers")));
+        };
+        let mut out = [0.0; N];
+        for (o, v) in out.iter_mut().zip(values) {
+            *o = self.finite(key, v)?;
+        }
+        Ok(Some(out))
+    }
+
+    fn finite(&self, key: &str, v: &Value) -> Result<f32, SceneError> {
+        let number = v.as_f64().map(|x| x as f32).filter(|x| x.is_finite());
+        number.ok_or_else(|| {
+            self.error(format!("'{key}' holds {}, not a finite 32-bit number", shorten(&v.to_string())))
+        })
+    }
+
+    /// A string.
+    pub fn text(&self, key: &str) -> Result<Option<&'a str>, SceneError> {
+        self.get(key)
+            .map(|v| v.as_str().ok_or_else(|| self.error(format!("'{key}' must be a string"))))
+            .transpose()
+    }
+
+    /// True or false.
+    pub fn flag(&self, key: &str) -> Result<bool, SceneError> {
+        self.get(key).map_or(Ok(false), |v| {
+            v.as_bool().ok_or_else(|| self.error(format!("'{key}' must be true or false")))
+        })
+    }
+}
+
+/// Text from a file, made fit for a message: one line, not long.
+pub fn shorten(text: &str) -> String {
+    let mut out: String = text.chars().take(60).map(|c| if c.is_control() { '?' } else { c }).collect();
+    if text.chars().nth(60).is_some() {
+        out.push_str("...");
+    }
+    out
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn nesting_size_and_repeated_keys_are_bounded() {
+        let deep = "[".repeat(100_000);
+        assert!(parse(deep.as_bytes(), 1000).unwrap_err().to_string().contains("128 levels"));
+        let wide = format!("[{}1]", "1,".repeat(1000));
+        assert!(parse(wide.as_bytes(), 1000).unwrap_err().to_string().contains("JSON values"));
+        assert!(parse(wide.as_bytes(), 1002).is_ok());
+        assert!(parse(br#"{"a":1,"b":{"c":1,"c":2}}"#, 10)
+            .unwrap_err()
+            .to_string()
+            .contains("'c' appears twice"));
+        assert!(parse(b"{\"a\":\"\xff\"}", 10).is_err());
+        assert!(parse(b"{} x", 10).is_err());
+        assert!(parse(b"[1e400]", 10).is_err());
+    }
+
+    #[test]
+    fn parsing_agrees_with_serde_json() {
+        let text = br#"{"a":[1,-2,3.5,null,true,"x"],"b":{"c":{}}}"#;
+        assert_eq!(parse(text, 100).unwrap(), serde_json::from_slice::<Value>(text).unwrap());
+    }
+}

@@ -1,0 +1,313 @@
+//! Checked glTF materials, textures and images into [`Material`] and [`Texture`].
+
+use std::collections::HashMap;
+use std::io::Cursor;
+
+use glam::{Vec2, Vec3};
+use image::{ImageFormat, ImageReader};
+
+use super::super::limits::Cancel;
+use super::super::{Limits, Material, SceneError, Texture, TextureRef, Wrap};
+use super::accessor::Data;
+use super::container::{fetch, Folder};
+use super::json::Item;
+
+/// What [`read_look`] gives.
+pub struct Look {
+    /// One for each material of the file, and glTF's default material after them.
+    pub materials: Vec<Material>,
+    /// Set of texture coordinates that each material needs.
+    pub uv_sets: Vec<u32>,
+    /// Decoded images.
+    pub textures: Vec<Texture>,
+}
+
+/// Reads all materials of a checked document and decodes the images they use.
+pub fn read_look(
+    document: &gltf::Document,
+    root: &Item,
+    data: &Data,
+    folder: Option<&Folder>,
+    limits: &Limits,
+    cancel: &Cancel,
+    warnings: &mut Vec<String>,
+) -> Result<Look, SceneError> {
+    let mut reader = Reader {
+        document,
+        root,
+        data,
+        folder,
+        limits,
+        cancel,
+        images: HashMap::new(),
+        known: HashMap::new(),
+        textures: vec![],
+        texels: 0,
+    };
+    let raw = root.list("materials", "material", limits.objects)?;
+    let (mut materials, mut uv_sets) = (vec![], vec![]);
+    for (material, raw) in document.materials().zip(&raw) {
+        let (look, uv_set) = reader.material(&material, raw, warnings)?;
+        materials.push(look);
+        uv_sets.push(uv_set);
+    }
+    materials.push(Material::default());
+    uv_sets.push(0);
+    Ok(Look { materials, uv_sets, textures: reader.textures })
+}
+
+struct Reader<'a> {
+    document: &'a gltf::Document,
+    root: &'a Item<'a>,
+    data: &'a Data,
+    folder: Option<&'a Folder>,
+    limits: &'a Limits,
+    cancel: &'a Cancel,
+    /// Decoded images: side lengths and texels.
+    images: HashMap<usize, (u32, u32, Vec<[u8; 4]>)>,
+    /// (glTF texture, sRGB) to index in `textures`.
+    known: HashMap<(usize, bool), u32>,
+    textures: Vec<Texture>,
+    texels: u64,
+}
+
+/// A texture reference of a material before its image is decoded.
+struct Use {
+    slot: &'static str,
+    texture: usize,
+    uv_set: u32,
+    offset: [f32; 2],
+    rotation: f32,
+    scale: [f32; 2],
+    srgb: bool,
+}
+
+impl Reader<'_> {
+    fn material(
+        &mut self,
+        m: &gltf::Material,
+        raw: &Item,
+        warnings: &mut Vec<String>,
+    ) -> Result<(Material, u32), SceneError> {
+        let pbr = m.pbr_metallic_roughness();
+        let [r, g, b, alpha] = pbr.base_color_factor().map(|x| x.clamp(0.0, 1.0));
+        let alpha_cutoff = match m.alpha_mode() {
+            gltf::material::AlphaMode::Opaque => None,
+            gltf::material::AlphaMode::Mask => Some(m.alpha_cutoff().unwrap_or(0.5)),
+            gltf::material::AlphaMode::Blend => Some(0.5),
+        };
+        let strength = m.emissive_strength().unwrap_or(1.0);
+        // 0 is the extension's word for "reflects everything"; it comes from converted files and is not physical.
+        let ior = m.ior().filter(|&i| i >= 1.0).unwrap_or(1.5);
+        if m.ior() == Some(0.0) {
+            warnings.push(format!("{}: ior 0 is read as 1.5", raw.name));
+        }
+        let mut out = Material {
+            name: m.name().map_or_else(|| raw.name.clone(), str::to_owned),
+            base_color: Vec3::new(r, g, b),
+            alpha_cutoff,
+            alpha,
+            metallic: pbr.metallic_factor().clamp(0.0, 1.0),
+            roughness: pbr.roughness_factor().clamp(0.0, 1.0),
+            emissive: Vec3::from(m.emissive_factor()) * strength,
+            ior,
+            transmission: m.transmission().map_or(0.0, |t| t.transmission_factor().clamp(0.0, 1.0)),
+            thin_walled: m.volume().is_none_or(|v| v.thickness_factor() <= 0.0),
+            double_sided: m.double_sided(),
+            normal_scale: m.normal_texture().map_or(1.0, |n| n.scale()),
+            ..Material::default()
+        };
+        let uses = [
+            pbr.base_color_texture().map(|i| plain_use("base colour", &i, true)),
+            pbr.metallic_roughness_texture().map(|i| plain_use("metallic-roughness", &i, false)),
+            match m.normal_texture() {
+                Some(n) => Some(normal_use(&n, raw)?),
+                None => None,
+            },
+            m.emissive_texture().map(|i| plain_use("emissive", &i, true)),
+            m.transmission()
+                .and_then(|t| t.transmission_texture())
+                .map(|i| plain_use("transmission", &i, false)),
+        ];
+        let uv_set = uses.iter().flatten().next().map_or(0, |u| u.uv_set);
+        for u in uses.iter().flatten().filter(|u| u.uv_set != uv_set) {
+            warnings.push(format!(
+                "{}: the {} texture uses coordinate set {}, but set {uv_set} is read for the whole material: it will look wrong",
+                raw.name, u.slot, u.uv_set
+            ));
+        }
+        let mut references = [None; 5];
+        for (reference, u) in references.iter_mut().zip(&uses) {
+            if let Some(u) = u {
+                *reference = Some(self.reference(u)?);
+            }
+        }
+        [
+            out.base_color_texture,
+            out.metallic_roughness_texture,
+            out.normal_texture,
+            out.emissive_texture,
+            out.transmission_texture,
+        ] = references;
+        Ok((out, uv_set))
+    }
+
+    fn reference(&mut self, u: &Use) -> Result<TextureRef, SceneError> {
+        let texture = match self.known.get(&(u.texture, u.srgb)) {
+            Some(&known) => known,
+            None => {
+                let made = self.texture(u)?;
+                self.textures.push(made);
+                let index = self.textures.len() as u32 - 1;
+                self.known.insert((u.texture, u.srgb), index);
+                index
+            }
+        };
+        Ok(TextureRef {
+            texture,
+            offset: Vec2::from(u.offset),
+            rotation: u.rotation,
+            scale: Vec2::from(u.scale),
+        })
+    }
+
+    fn texture(&mut self, u: &Use) -> Result<Texture, SceneError> {
+        let json = &self.document.as_json().textures[u.texture];
+        let image = json.source.value();
+        if !self.images.contains_key(&image) {
+            self.cancel.check(self.limits)?;
+            let decoded = self.decode(image)?;
+            self.images.insert(image, decoded);
+        }
+        let (width, height, ref texels) = self.images[&image];
+        self.texels += u64::from(width) * u64::from(height);
+        SceneError::check_limit(
+            "the number of texels in all textures",
+            self.texels,
+            self.limits.texels,
+            "use smaller textures",
+        )?;
+        let texture = self.document.textures().nth(u.texture);
+        let sampler = texture.as_ref().map(|t| t.sampler());
+        let wrap = |mode: gltf::texture::WrappingMode| match mode {
+            gltf::texture::WrappingMode::Repeat => Wrap::Repeat,
+            gltf::texture::WrappingMode::ClampToEdge => Wrap::Clamp,
+            gltf::texture::WrappingMode::MirroredRepeat => Wrap::Mirror,
+        };
+        Ok(Texture {
+            width,
+            height,
+            texels: texels.clone(),
+            srgb: u.srgb,
+            wrap_u: sampler.as_ref().map_or(Wrap::Repeat, |s| wrap(s.wrap_s())),
+            wrap_v: sampler.as_ref().map_or(Wrap::Repeat, |s| wrap(s.wrap_t())),
+            nearest: sampler
+                .as_ref()
+                .is_some_and(|s| s.mag_filter() == Some(gltf::texture::MagFilter::Nearest)),
+        })
+    }
+
+    fn decode(&self, index: usize) -> Result<(u32, u32, Vec<[u8; 4]>), SceneError> {
+        let raw = self.root.list("images", "image", self.limits.objects)?;
+        let Some(item) = raw.get(index) else { return Err(self.root.error(format!("has no image {index}"))) };
+        let fetched;
+        let bytes = match (item.text("uri")?, item.whole("bufferView")?) {
+            (Some(uri), _) => {
+                fetched =
+                    fetch(uri, self.folder, self.limits.bytes).map_err(|e| item.error(e.to_string()))?;
+                fetched.as_slice()
+            }
+            (None, Some(view)) => self.data.view_bytes(view as usize).ok_or_else(|| {
+                item.error(format!("'bufferView' points at bufferView {view}, which is not there"))
+            })?,
+            (None, None) => return Err(item.error("has no data")),
+        };
+        decode_image(item, bytes, self.texels, self.limits)
+    }
+}
+
+/// Decodes PNG or JPEG to 8-bit RGBA; its size is checked before anything is decoded.
+fn decode_image(
+    item: &Item,
+    bytes: &[u8],
+    texels_so_far: u64,
+    limits: &Limits,
+) -> Result<(u32, u32, Vec<[u8; 4]>), SceneError> {
+    let format = match image::guess_format(bytes) {
+        Ok(format @ (ImageFormat::Png | ImageFormat::Jpeg)) => format,
+        Ok(other) => {
+            return Err(SceneError::unsupported(
+                format!("{}: an image of format {other:?}", item.name),
+                "re-export with PNG or JPEG textures",
+            ))
+        }
+        Err(_) => return Err(item.error("is neither PNG nor JPEG: re-export with PNG or JPEG textures")),
+    };
+    let reader = || ImageReader::with_format(Cursor::new(bytes), format);
+    let failed = |e: image::ImageError| item.error(format!("cannot be decoded: {e}"));
+    let (width, height) = reader().into_dimensions().map_err(failed)?;
+    if width == 0 || height == 0 {
+        return Err(item.error("has no texels"));
+    }
+    let side = u64::from(width.max(height));
+    SceneError::check_limit(
+        &format!("the longer side of {}", item.name),
+        side,
+        limits.texture_side.into(),
+        "use a smaller texture",
+    )?;
+    let texels = texels_so_far + u64::from(width) * u64::from(height);
+    SceneError::check_limit(
+        "the number of texels in all textures",
+        texels,
+        limits.texels,
+        "use smaller textures",
+    )?;
+    let mut bounded = reader();
+    let mut memory = image::Limits::default();
+    memory.max_image_width = Some(width);
+    memory.max_image_height = Some(height);
+    // 16-bit RGBA is the widest that is decoded; the rest is room for the decoder's own tables.
+    memory.max_alloc = Some(u64::from(width) * u64::from(height) * 8 + (16 << 20));
+    bounded.limits(memory);
+    let rgba = bounded.decode().map_err(failed)?.into_rgba8();
+    let texels = rgba.as_raw().chunks_exact(4).map(|c| [c[0], c[1], c[2], c[3]]).collect();
+    Ok((width, height, texels))
+}
+
+fn plain_use(slot: &'static str, info: &gltf::texture::Info, srgb: bool) -> Use {
+    let transform = info.texture_transform();
+    Use {
+        slot,
+        texture: info.texture().index(),
+        uv_set: transform.as_ref().and_then(|t| t.tex_coord()).unwrap_or(info.tex_coord()),
+        offset: transform.as_ref().map_or([0.0; 2], |t| t.offset()),
+        rotation: transform.as_ref().map_or(0.0, |t| t.rotation()),
+        scale: transform.as_ref().map_or([1.0; 2], |t| t.scale()),
+        srgb,
+    }
+}
+
+/// The crate does not give the transform of a normal texture, so it is read from the JSON.
+fn normal_use(normal: &gltf::material::NormalTexture, material: &Item) -> Result<Use, SceneError> {
+    let transform = match material.object("normalTexture")? {
+        Some(info) => info.extension("KHR_texture_transform")?,
+        None => None,
+    };
+    let mut out = Use {
+        slot: "normal",
+        texture: normal.texture().index(),
+        uv_set: normal.tex_coord(),
+        offset: [0.0; 2],
+        rotation: 0.0,
+        scale: [1.0; 2],
+        srgb: false,
+    };
+    if let Some(t) = transform {
+        out.offset = t.numbers("offset")?.unwrap_or(out.offset);
+        out.scale = t.numbers("scale")?.unwrap_or(out.scale);
+        out.rotation = t.number("rotation")?.unwrap_or(0.0);
+        out.uv_set = t.whole("texCoord")?.map_or(out.uv_set, |s| s as u32);
+    }
+    Ok(out)
+}

@@ -1,0 +1,105 @@
+//! A glTF file into a [`Scene`]: container, check, then the `gltf` crate's typed view of what passed, look and geometry.
+
+mod accessor;
+mod check;
+mod check_look;
+mod container;
+mod flatten;
+mod json;
+mod look;
+mod primitive;
+
+use std::path::Path;
+
+use serde_json::Value;
+
+use super::limits::Cancel;
+use super::{Environment, LoadOptions, Scene, SceneError};
+use container::Folder;
+use json::Item;
+
+pub(super) use container::read_file;
+
+/// Warnings of one kind of trouble in a hostile file are cut off at this many lines.
+const MAX_WARNINGS: usize = 100;
+
+/// Reads `bytes`, the content of a `.glb` or `.gltf` file; side files are looked for in the folder of `beside`.
+pub(super) fn read(
+    bytes: &[u8],
+    beside: Option<&Path>,
+    options: &LoadOptions,
+    cancel: &Cancel,
+) -> Result<Scene, SceneError> {
+    let limits = &options.limits;
+    let folder = beside.map(Folder::of).transpose()?;
+    let container::Container { root: tree, binary } = container::split(bytes, limits)?;
+    let root = Item::new(&tree, "document".into())?;
+    check::check_asset(&root)?;
+    let buffers = container::load_buffers(&root, binary, folder.as_ref(), limits)?;
+    let data = accessor::Data::new(&root, buffers, limits)?;
+    let mut warnings = check::check(&root, &data, limits)?;
+    cancel.check(limits)?;
+
+    let typed: gltf::json::Root =
+        serde_json::from_value(reduced(&tree)).map_err(|e| SceneError::broken("JSON", e.to_string()))?;
+    let document = gltf::Document::from_json_without_validation(typed);
+    let claims = flatten::choose_bodies(&document, options, &mut warnings)?;
+    let look = look::read_look(&document, &root, &data, folder.as_ref(), limits, cancel, &mut warnings)?;
+    let flat = flatten::flatten(&document, &data, &look, &claims, options, cancel, &mut warnings)?;
+    if warnings.len() > MAX_WARNINGS {
+        let more = warnings.len() - MAX_WARNINGS;
+        warnings.truncate(MAX_WARNINGS);
+        warnings.push(format!("and {more} more"));
+    }
+    Ok(Scene {
+        bodies: flat.bodies,
+        materials: look.materials,
+        textures: look.textures,
+        lights: flat.lights,
+        environment: Environment::default(),
+        warnings,
+    })
+}
+
+/// The document without the parts that are read elsewhere or not at all, so that the crate never meets them.
+fn reduced(tree: &Value) -> Value {
+    let mut out = tree.clone();
+    let Some(top) = out.as_object_mut() else { return out };
+    let kept = [
+        "asset",
+        "scene",
+        "scenes",
+        "nodes",
+        "meshes",
+        "materials",
+        "textures",
+        "images",
+        "samplers",
+        "extensions",
+    ];
+    top.retain(|key, _| kept.contains(&key.as_str()));
+    let strip = |object: &mut Value, keys: &[&str]| {
+        if let Some(object) = object.as_object_mut() {
+            object.retain(|key, _| !keys.contains(&key.as_str()));
+        }
+    };
+    let lists = |top: &mut serde_json::Map<String, Value>, list: &str, each: &mut dyn FnMut(&mut Value)| {
+        top.get_mut(list).and_then(Value::as_array_mut).into_iter().flatten().for_each(each);
+    };
+    lists(top, "nodes", &mut |node| strip(node, &["camera", "skin", "weights", "extras"]));
+    lists(top, "meshes", &mut |mesh| {
+        strip(mesh, &["weights", "extras", "extensions"]);
+        let primitives = mesh.get_mut("primitives").and_then(Value::as_array_mut).into_iter().flatten();
+        primitives.for_each(|p| strip(p, &["targets", "extras", "extensions"]));
+    });
+    // Only which image is meant matters to the crate; the bytes are fetched here.
+    lists(top, "images", &mut |image| *image = serde_json::json!({}));
+    for list in ["scenes", "materials", "textures", "samplers"] {
+        lists(top, list, &mut |object| strip(object, &["extras"]));
+    }
+    lists(top, "textures", &mut |texture| strip(texture, &["extensions"]));
+    if let Some(extensions) = top.get_mut("extensions").and_then(Value::as_object_mut) {
+        extensions.retain(|key, _| key == "KHR_lights_punctual");
+    }
+    out
+}

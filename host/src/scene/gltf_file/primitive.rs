@@ -1,0 +1,102 @@
+//! One checked primitive of a mesh into a [`TriangleMesh`] in the mesh's own space.
+
+use std::collections::HashMap;
+
+use glam::{Vec2, Vec3, Vec4};
+use gltf::json::mesh::{Mode, Primitive, Semantic};
+use gltf::json::validation::Checked;
+
+use super::super::mesh::Dropped;
+use super::super::{SceneError, TriangleMesh};
+use super::accessor::{Accessor, Data};
+
+/// Reads a primitive's triangles with their material; only vertices that a triangle uses are decoded. `None` where there is nothing
+/// to see (points, lines, no positions), about which the check has warned.
+pub fn read_primitive(
+    primitive: &Primitive,
+    data: &Data,
+    material: u32,
+    uv_set: u32,
+) -> Result<Option<(TriangleMesh, Dropped)>, SceneError> {
+    let attribute = |semantic: Semantic| {
+        primitive.attributes.get(&Checked::Valid(semantic)).map(|i| &data.accessors[i.value()])
+    };
+    let Some(positions) = attribute(Semantic::Positions) else { return Ok(None) };
+    let corners = corners(primitive, data, positions.count)?;
+    let faces: Vec<[u64; 3]> = match primitive.mode {
+        Checked::Valid(Mode::Triangles) => corners.chunks_exact(3).map(|c| [c[0], c[1], c[2]]).collect(),
+        Checked::Valid(Mode::TriangleStrip) => {
+            // Every other face of a strip is turned, so that all face the same way.
+            let face =
+                |(i, c): (usize, &[u64])| if i % 2 == 0 { [c[0], c[1], c[2]] } else { [c[1], c[0], c[2]] };
+            corners.windows(3).enumerate().map(face).collect()
+        }
+        Checked::Valid(Mode::TriangleFan) => {
+            corners[1..].windows(2).map(|c| [c[0], c[1], corners[0]]).collect()
+        }
+        _ => return Ok(None),
+    };
+
+    let mut used = vec![];
+    let mut new_index = HashMap::new();
+    let triangles: Vec<[u32; 3]> = faces
+        .iter()
+        .map(|face| {
+            face.map(|i| {
+                *new_index.entry(i).or_insert_with(|| {
+                    used.push(i);
+                    used.len() as u32 - 1
+                })
+            })
+        })
+        .collect();
+    let floats3 = |a: &Accessor| used.iter().map(|&i| Vec3::from(data.floats::<3>(a, i))).collect::<Vec<_>>();
+    let uvs = match attribute(Semantic::TexCoords(uv_set)) {
+        // A coordinate that is not a number would spoil whole pixels; zero spoils only the texture.
+        Some(a) => used
+            .iter()
+            .map(|&i| Vec2::from(data.floats::<2>(a, i).map(|x| if x.is_finite() { x } else { 0.0 })))
+            .collect(),
+        None => vec![Vec2::ZERO; used.len()],
+    };
+    let normals = attribute(Semantic::Normals).map(floats3);
+    let has_normals = normals.is_some();
+    let mut mesh = TriangleMesh {
+        positions: floats3(positions),
+        normals: normals.unwrap_or_else(|| vec![Vec3::ZERO; used.len()]),
+        // Tangents without normals mean nothing, as the format says.
+        tangents: match attribute(Semantic::Tangents).filter(|_| has_normals) {
+            Some(a) => used.iter().map(|&i| Vec4::from(data.floats::<4>(a, i))).collect(),
+            None => vec![],
+        },
+        uvs,
+        materials: vec![material; triangles.len()],
+        triangles,
+    };
+    let dropped = mesh.drop_unusable();
+    if has_normals {
+        mesh.repair_normals();
+    } else {
+        mesh.split_into_flat_faces();
+    }
+    if mesh.tangents.is_empty() {
+        mesh.generate_tangents();
+    } else {
+        mesh.repair_tangents();
+    }
+    Ok(Some((mesh, dropped)))
+}
+
+/// Vertex numbers in the order of the file, each below `vertices`.
+fn corners(primitive: &Primitive, data: &Data, vertices: u64) -> Result<Vec<u64>, SceneError> {
+    let Some(indices) = &primitive.indices else { return Ok((0..vertices).collect()) };
+    let accessor = &data.accessors[indices.value()];
+    let read = |k| match data.index(accessor, k) {
+        i if i < vertices => Ok(i),
+        i => Err(SceneError::broken(
+            &accessor.name,
+            format!("index {k} points at vertex {i}, but there are {vertices}"),
+        )),
+    };
+    (0..accessor.count).map(read).collect()
+}

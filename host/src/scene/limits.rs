@@ -1,0 +1,68 @@
+//! The bounds on what a file may ask for, checked before anything of that size is allocated, and the flag that stops a load.
+
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::sync::Arc;
+use std::time::Duration;
+
+use super::SceneError;
+
+/// Bounds on one scene file. The defaults fit the largest scenes a projector raster can make use of.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Limits {
+    /// Bytes of any one file, and of all buffers together.
+    pub bytes: u64,
+    /// Bytes of JSON text.
+    pub json_bytes: u64,
+    /// JSON values (numbers, strings, lists, objects): each costs some tens of bytes of memory.
+    pub json_values: u64,
+    /// Nodes, meshes, materials, accessors and so on: entries in any one list at the top of the file.
+    pub objects: u64,
+    /// Triangles after every instance of a mesh is written out.
+    pub triangles: u64,
+    /// Texels of all decoded textures together.
+    pub texels: u64,
+    /// Texels along one side of a texture.
+    pub texture_side: u32,
+    /// Levels of the node tree.
+    pub node_depth: u32,
+    /// Punctual lights after instancing.
+    pub lights: u64,
+    /// Time that loading may take.
+    pub time: Duration,
+}
+
+impl Default for Limits {
+    fn default() -> Self {
+        Self {
+            bytes: 1 << 30,
+            json_bytes: 32 << 20,
+            json_values: 4_000_000,
+            objects: 1_000_000,
+            triangles: 20_000_000,
+            texels: 64_000_000,
+            texture_side: 16_384,
+            node_depth: 256,
+            lights: 1024,
+            time: Duration::from_secs(30),
+        }
+    }
+}
+
+/// Tells a running load to stop. The thread that ran out of time looks at it between pieces of work, so it ends soon after.
+#[derive(Clone, Debug, Default)]
+pub(crate) struct Cancel(Arc<AtomicBool>);
+
+impl Cancel {
+    /// Asks the load to stop.
+    pub(crate) fn cancel(&self) {
+        self.0.store(true, Ordering::Relaxed);
+    }
+
+    /// An error once asked to stop.
+    pub(crate) fn check(&self, limits: &Limits) -> Result<(), SceneError> {
+        if self.0.load(Ordering::Relaxed) {
+            return Err(SceneError::TimedOut(limits.time));
+        }
+        Ok(())
+    }
+}

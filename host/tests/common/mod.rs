@@ -1,0 +1,130 @@
+//! Builds small glTF files in memory, good and bad.
+#![allow(dead_code)]
+
+use serde_json::{json, Value};
+
+/// A document and its binary chunk.
+#[derive(Clone)]
+pub struct Glb {
+    /// The JSON part.
+    pub json: Value,
+    /// The binary part.
+    pub bin: Vec<u8>,
+}
+
+/// The corners of a tetrahedron with its faces counter-clockwise from outside.
+pub const TETRAHEDRON: ([[f32; 3]; 4], [u16; 12]) = (
+    [[0.0, 0.0, 0.0], [0.1, 0.0, 0.0], [0.0, 0.1, 0.0], [0.0, 0.0, 0.1]],
+    [0, 2, 1, 0, 1, 3, 0, 3, 2, 1, 2, 3],
+);
+
+/// Two nodes, "left" and "right", with one tetrahedron mesh: positions (accessor 0), texture coordinates (1), indices (2).
+pub fn tetrahedra() -> Glb {
+    let mut bin = vec![];
+    let (corners, indices) = TETRAHEDRON;
+    corners.iter().flatten().for_each(|x| bin.extend(x.to_le_bytes()));
+    corners.iter().for_each(|c| bin.extend([c[0] * 10.0, c[1] * 10.0].map(f32::to_le_bytes).concat()));
+    indices.iter().for_each(|i| bin.extend(i.to_le_bytes()));
+    let json = json!({
+        "asset": {"version": "2.0"},
+        "scene": 0,
+        "scenes": [{"nodes": [0, 1]}],
+        "nodes": [
+            {"name": "left", "mesh": 0, "translation": [-0.2, 0.0, 0.0]},
+            {"name": "right", "mesh": 0, "translation": [0.2, 0.0, 0.0]}],
+        "meshes": [{"name": "tetrahedron", "primitives": [{"attributes": {"POSITION": 0, "TEXCOORD_0": 1}, "indices": 2, "material": 0}]}],
+        "materials": [{"name": "paint", "pbrMetallicRoughness": {"baseColorFactor": [0.8, 0.4, 0.2, 1.0], "metallicFactor": 0.0, "roughnessFactor": 0.5}}],
+        "accessors": [
+            {"bufferView": 0, "componentType": 5126, "type": "VEC3", "count": 4, "min": [0, 0, 0], "max": [0.1, 0.1, 0.1]},
+            {"bufferView": 1, "componentType": 5126, "type": "VEC2", "count": 4},
+            {"bufferView": 2, "componentType": 5123, "type": "SCALAR", "count": 12}],
+        "bufferViews": [
+            {"buffer": 0, "byteOffset": 0, "byteLength": 48},
+            {"buffer": 0, "byteOffset": 48, "byteLength": 32},
+            {"buffer": 0, "byteOffset": 80, "byteLength": 24}],
+        "buffers": [{"byteLength": 104}]
+    });
+    Glb { json, bin }
+}
+
+impl Glb {
+    /// The file's bytes.
+    pub fn bytes(&self) -> Vec<u8> {
+        let mut text = serde_json::to_vec(&self.json).unwrap();
+        text.resize(text.len().next_multiple_of(4), b' ');
+        glb(&text, Some(&self.bin))
+    }
+
+    /// Sets the value at a JSON pointer; the last step may be new.
+    pub fn set(mut self, pointer: &str, value: Value) -> Self {
+        let (parent, key) = pointer.rsplit_once('/').unwrap();
+        let parent = self.json.pointer_mut(parent).unwrap_or_else(|| panic!("{pointer}: no such place"));
+        match parent {
+            Value::Array(list) => {
+                let i: usize = key.parse().unwrap();
+                if i == list.len() {
+                    list.push(value);
+                } else {
+                    list[i] = value;
+                }
+            }
+            other => other[key] = value,
+        }
+        self
+    }
+
+    /// Appends bytes to the binary part as a new buffer view and returns its index.
+    pub fn push_view(&mut self, bytes: &[u8]) -> usize {
+        let start = self.bin.len().next_multiple_of(4);
+        self.bin.resize(start, 0);
+        self.bin.extend(bytes);
+        self.json["buffers"][0]["byteLength"] = json!(self.bin.len());
+        let views = self.json["bufferViews"].as_array_mut().unwrap();
+        views.push(json!({"buffer": 0, "byteOffset": start, "byteLength": bytes.len()}));
+        views.len() - 1
+    }
+}
+
+/// Wraps JSON text and a binary part without looking at them.
+pub fn glb(text: &[u8], bin: Option<&[u8]>) -> Vec<u8> {
+    let mut chunks = vec![];
+    for (kind, content) in [(b"JSON", Some(text)), (b"BIN\0", bin)] {
+        if let Some(content) = content {
+            chunks.extend((content.len() as u32).to_le_bytes());
+            chunks.extend(kind);
+            chunks.extend(content);
+        }
+    }
+    let mut out = b"glTF".to_vec();
+    out.extend(2u32.to_le_bytes());
+    out.extend((12 + chunks.len() as u32).to_le_bytes());
+    out.extend(chunks);
+    out
+}
+
+/// A PNG of the given texels.
+pub fn png(width: u32, height: u32, texels: &[[u8; 4]]) -> Vec<u8> {
+    let mut out = std::io::Cursor::new(vec![]);
+    image::RgbaImage::from_raw(width, height, texels.concat())
+        .unwrap()
+        .write_to(&mut out, image::ImageFormat::Png)
+        .unwrap();
+    out.into_inner()
+}
+
+/// Base64 with padding.
+pub fn base64(bytes: &[u8]) -> String {
+    const ALPHABET: &[u8; 64] = b"ABCDEFGHIJKLMNOPQRSTUVWXYZabcdefghijklmnopqrstuvwxyz0123456789+/";
+    let mut out = String::new();
+    for group in bytes.chunks(3) {
+        let bits = group.iter().enumerate().fold(0u32, |b, (k, &x)| b | u32::from(x) << (16 - 8 * k));
+        for k in 0..4 {
+            out.push(if k <= group.len() {
+                ALPHABET[(bits >> (18 - 6 * k) & 63) as usize] as char
+            } else {
+                '='
+            });
+        }
+    }
+    out
+}
