@@ -7,8 +7,11 @@
 //! **Only this crate knows bytes on a wire.** Nothing here knows about scenes, rendering or the GPU.
 #![cfg_attr(not(feature = "std"), no_std)]
 
+pub mod link;
 pub mod planes;
 pub mod pose;
 pub mod time;
 #[cfg(feature = "std")]
 pub mod tracker;
+#[cfg(feature = "std")]
+pub mod transport;

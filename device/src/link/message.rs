@@ -1,0 +1,692 @@
+//! Payloads of the control messages into values and back. PLANE payloads are bits and have no structure of their own.
+//!
+//! Every payload has one fixed length (CONFIG grows with its planes); another length is an error, so a wrong build of one side
+//! is noticed at the first message. docs/PROTOCOL.md lists the bytes.
+
+use super::header::{u16_at, u32_at, u64_at, Header, MessageType};
+use crate::planes::{PlaneSchedule, PlaneSpec, Raster, MAX_PLANES};
+use crate::time::{DeviceTicks, FrameRate};
+
+/// Longest payload of any message except PLANE.
+pub const MAX_CONTROL_BYTES: usize = 96;
+/// Longest watchdog a host may ask for, microseconds.
+pub const MAX_WATCHDOG_US: u32 = 10_000_000;
+
+/// Faults as bits of a mask. A latched fault keeps the device dark until an ARM acknowledges it.
+pub mod faults {
+    /// The host was silent for longer than the configured watchdog.
+    pub const WATCHDOG: u32 = 1 << 0;
+    /// Temperature out of range.
+    pub const OVER_TEMPERATURE: u32 = 1 << 1;
+    /// Lamp or LED driver failed.
+    pub const LAMP: u32 = 1 << 2;
+    /// The host sent SAFE.
+    pub const HOST_SAFE: u32 = 1 << 3;
+    /// Too many damaged packets in a short time.
+    pub const CHECKSUM_STORM: u32 = 1 << 4;
+    /// Emergency-stop input.
+    pub const EMERGENCY_STOP: u32 = 1 << 5;
+
+    /// Names of the faults in `mask`, for messages: `"watchdog, lamp"`; `"none"` when empty.
+    #[cfg(feature = "std")]
+    pub fn names(mask: u32) -> String {
+        const NAMES: [&str; 6] =
+            ["watchdog", "over-temperature", "lamp", "host safe", "checksum storm", "emergency stop"];
+        let mut all: Vec<String> = NAMES
+            .iter()
+            .enumerate()
+            .filter(|(i, _)| mask >> i & 1 == 1)
+            .map(|(_, n)| n.to_string())
+            .collect();
+        if mask >> NAMES.len() != 0 {
+            all.push(format!("unknown {:#x}", mask >> NAMES.len() << NAMES.len()));
+        }
+        if all.is_empty() {
+            "none".into()
+        } else {
+            all.join(", ")
+        }
+    }
+}
+
+/// Why a payload cannot be read.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum PayloadError {
+    /// The payload is not as long as its type demands.
+    Length {
+        /// Type of the message.
+        kind: MessageType,
+        /// Bytes demanded (CONFIG: by its own plane count).
+        expected: usize,
+        /// Bytes received.
+        got: usize,
+    },
+    /// A field has a value that it must not have.
+    Field {
+        /// Type of the message.
+        kind: MessageType,
+        /// Which field, as docs/PROTOCOL.md names it.
+        field: &'static str,
+    },
+    /// This side never receives that type.
+    Direction(MessageType),
+}
+
+impl core::fmt::Display for PayloadError {
+    fn fmt(&self, f: &mut core::fmt::Formatter<'_>) -> core::fmt::Result {
+        match self {
+            Self::Length { kind, expected, got } => {
+                write!(f, "{kind:?} payload has {got} bytes, must have {expected}")
+            }
+            Self::Field { kind, field } => write!(f, "{kind:?} payload: `{field}` out of range"),
+            Self::Direction(kind) => write!(f, "{kind:?} travels the other way"),
+        }
+    }
+}
+
+impl core::error::Error for PayloadError {}
+
+/// HELLO from the host. The header's session is the one to open (not 0).
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct HostHello {
+    /// Lowest protocol version that the host speaks.
+    pub version_min: u16,
+    /// Highest protocol version that the host speaks.
+    pub version_max: u16,
+    /// Codecs that the host may send, bits [`super::Codec::mask`].
+    pub codecs: u32,
+}
+
+/// HELLO from the device: what it is.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct DeviceHello {
+    /// Protocol version the device will use; when it is outside the host's range, the session did not open.
+    pub version: u16,
+    /// Firmware version: major * 256 + minor.
+    pub firmware: u16,
+    /// Codecs that the device can read, bits [`super::Codec::mask`].
+    pub codecs: u32,
+    /// Mirrors.
+    pub raster: Raster,
+    /// Most planes a frame may have.
+    pub max_planes: u8,
+    /// Whole frames that can wait to be lit.
+    pub frame_buffers: u8,
+    /// Nominal ticks a second of the device's clock.
+    pub tick_hz: u32,
+    /// Shortest time one plane can be shown, nanoseconds.
+    pub min_plane_ns: u32,
+    /// Serial number.
+    pub serial: u64,
+    /// The device's clock when it answered.
+    pub now: DeviceTicks,
+}
+
+/// What to light in a slot for which no new frame is whole.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+#[repr(u8)]
+pub enum Underrun {
+    /// The frame before again.
+    Repeat = 0,
+    /// Nothing.
+    Blank = 1,
+}
+
+/// CONFIG from the host.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct Config {
+    /// Must equal the device's raster.
+    pub raster: Raster,
+    /// Planes of a frame in the order shown.
+    pub schedule: PlaneSchedule,
+    /// Frames a second.
+    pub rate: FrameRate,
+    /// Silence after which the device goes dark and latches, microseconds, 1 to [`MAX_WATCHDOG_US`].
+    pub watchdog_us: u32,
+    /// What to light without a new frame.
+    pub underrun: Underrun,
+    /// Slots by which a whole frame may miss its target and still be lit; 0 drops late frames.
+    pub late_slots: u8,
+    /// Start of slot 0 on the device's clock.
+    pub epoch: DeviceTicks,
+}
+
+/// FRAME_COMMIT: the end of a frame and how it is composed.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct Commit {
+    /// Bit k set: plane k was sent with this frame.
+    pub sent: u32,
+    /// Bit k set: plane k equals plane k of `base_frame` and was not sent. `sent` and `kept` share no bit.
+    pub kept: u32,
+    /// The frame that kept and XOR planes refer to: the frame sent just before.
+    pub base_frame: u32,
+    /// Frames sent in this session, this one included.
+    pub frames_sent: u32,
+}
+
+/// State of the device as STATUS reports it.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+#[repr(u8)]
+pub enum DeviceState {
+    /// No session. Dark.
+    Idle = 0,
+    /// Session open, not configured. Dark.
+    Greeted = 1,
+    /// Configured, not armed. Dark.
+    Configured = 2,
+    /// May make light.
+    Armed = 3,
+    /// Armed and told to be dark.
+    Black = 4,
+    /// Armed and holding the frame that is lit.
+    Frozen = 5,
+    /// Faults are latched. Dark.
+    Faulted = 6,
+}
+
+impl DeviceState {
+    const fn from_code(code: u8) -> Option<Self> {
+        Some(match code {
+            0 => Self::Idle,
+            1 => Self::Greeted,
+            2 => Self::Configured,
+            3 => Self::Armed,
+            4 => Self::Black,
+            5 => Self::Frozen,
+            6 => Self::Faulted,
+            _ => return None,
+        })
+    }
+}
+
+/// STATUS: counters are absolute since the session opened and wrap at 2^32, so a lost STATUS costs nothing.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct Status {
+    /// State.
+    pub state: DeviceState,
+    /// Light is on now.
+    pub lit: bool,
+    /// Plane that arrived last intact.
+    pub last_plane: u8,
+    /// Frame buffers that are free now.
+    pub buffers_free: u8,
+    /// Latched faults, bits of [`faults`].
+    pub faults: u32,
+    /// Credit: frames that the host may have sent in this session, in all.
+    pub frame_limit: u32,
+    /// Frames of this session that the device knows to have been sent.
+    pub frames_accounted: u32,
+    /// Newest frame that arrived whole; meaningless while none has.
+    pub last_whole_frame: u32,
+    /// Newest frame lit; meaningless while `frames_lit` is 0.
+    pub last_lit_frame: u32,
+    /// When it was lit first, device's clock.
+    pub last_lit_at: DeviceTicks,
+    /// The device's clock when this was written.
+    pub now: DeviceTicks,
+    /// Slots that began while armed: `frames_lit + slots_repeated + slots_blank`.
+    pub slots: u32,
+    /// Frames of which anything arrived: `frames_lit + frames_incomplete + frames_late + frames_superseded + frames_refused` and
+    /// those still on their way to the light.
+    pub frames_seen: u32,
+    /// Frames lit.
+    pub frames_lit: u32,
+    /// Slots that lit the frame before again.
+    pub slots_repeated: u32,
+    /// Dark slots.
+    pub slots_blank: u32,
+    /// Frames dropped because a plane or the base frame was missing or damaged.
+    pub frames_incomplete: u32,
+    /// Whole frames dropped because their slot was over.
+    pub frames_late: u32,
+    /// Whole frames dropped because a newer one was due too.
+    pub frames_superseded: u32,
+    /// Frames dropped because of the device's state, of credit, or of a target out of reach.
+    pub frames_refused: u32,
+    /// Packets with a right header.
+    pub packets: u32,
+    /// Damaged headers.
+    pub header_errors: u32,
+    /// Damaged payloads.
+    pub payload_errors: u32,
+    /// Intact packets without effect: other session, older frame, duplicate, wrong field.
+    pub packets_ignored: u32,
+    /// Bytes that belonged to no packet.
+    pub bytes_skipped: u32,
+}
+
+/// ECHO. The host writes `host_sent_ns` and zeros; the device fills the rest in.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct Echo {
+    /// Host's clock when the request left, nanoseconds; the device returns it unread.
+    pub host_sent_ns: u64,
+    /// Device's clock when the request arrived.
+    pub device_received: DeviceTicks,
+    /// Device's clock when the answer left.
+    pub device_sent: DeviceTicks,
+}
+
+/// What a FAULT message is about.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+#[repr(u16)]
+pub enum FaultCode {
+    /// The mask of latched faults grew.
+    Latched = 0,
+    /// No common protocol version; detail = the device's version.
+    Version = 1,
+    /// CONFIG refused; detail = [`ConfigRefusal`].
+    Config = 2,
+    /// ARM refused: faults not acknowledged, or a cause is still there, or not configured.
+    Arm = 3,
+}
+
+/// Why a device refuses a CONFIG.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+#[repr(u16)]
+pub enum ConfigRefusal {
+    /// The raster is not the device's.
+    Raster = 1,
+    /// More planes than the device can show.
+    Planes = 2,
+    /// Frame rate x planes is faster than the mirrors.
+    Rate = 3,
+    /// The payload breaks a rule of the format.
+    Format = 4,
+}
+
+impl ConfigRefusal {
+    /// The refusal with this number, or `None`.
+    pub const fn from_code(code: u16) -> Option<Self> {
+        Some(match code {
+            1 => Self::Raster,
+            2 => Self::Planes,
+            3 => Self::Rate,
+            4 => Self::Format,
+            _ => return None,
+        })
+    }
+}
+
+/// FAULT from the device.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct Fault {
+    /// All faults latched now, bits of [`faults`].
+    pub latched: u32,
+    /// What this is about.
+    pub code: FaultCode,
+    /// Depends on the code.
+    pub detail: u16,
+    /// When it happened.
+    pub at: DeviceTicks,
+}
+
+/// A control message as a device receives it.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+#[allow(missing_docs, clippy::large_enum_variant)] // Named after the types they carry; there is one at a time, on the stack.
+pub enum HostMessage {
+    Hello(HostHello),
+    Config(Config),
+    /// The faults acknowledged, bits of [`faults`].
+    Arm(u32),
+    Commit(Commit),
+    /// Frames sent in this session.
+    Sync(u32),
+    Echo(Echo),
+    Stop,
+    Black,
+    Freeze,
+    Safe,
+}
+
+/// A message as a host receives it.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+#[allow(missing_docs, clippy::large_enum_variant)] // As above.
+pub enum DeviceMessage {
+    Hello(DeviceHello),
+    Status(Status),
+    Echo(Echo),
+    Fault(Fault),
+}
+
+/// A payload under construction.
+struct Writer<'a> {
+    out: &'a mut [u8; MAX_CONTROL_BYTES],
+    len: usize,
+}
+
+impl Writer<'_> {
+    fn bytes(&mut self, b: &[u8]) -> &mut Self {
+        self.out[self.len..self.len + b.len()].copy_from_slice(b);
+        self.len += b.len();
+        self
+    }
+    fn u8(&mut self, v: u8) -> &mut Self {
+        self.bytes(&[v])
+    }
+    fn u16(&mut self, v: u16) -> &mut Self {
+        self.bytes(&v.to_le_bytes())
+    }
+    fn u32(&mut self, v: u32) -> &mut Self {
+        self.bytes(&v.to_le_bytes())
+    }
+    fn u64(&mut self, v: u64) -> &mut Self {
+        self.bytes(&v.to_le_bytes())
+    }
+}
+
+fn expect_len(kind: MessageType, payload: &[u8], expected: usize) -> Result<(), PayloadError> {
+    if payload.len() == expected {
+        Ok(())
+    } else {
+        Err(PayloadError::Length { kind, expected, got: payload.len() })
+    }
+}
+
+fn raster(kind: MessageType, p: &[u8], at: usize) -> Result<Raster, PayloadError> {
+    Raster::new(u32::from(u16_at(p, at)), u32::from(u16_at(p, at + 2)))
+        .ok_or(PayloadError::Field { kind, field: "raster" })
+}
+
+fn echo(p: &[u8]) -> Result<Echo, PayloadError> {
+    expect_len(MessageType::Echo, p, 24)?;
+    Ok(Echo {
+        host_sent_ns: u64_at(p, 0),
+        device_received: DeviceTicks(u64_at(p, 8)),
+        device_sent: DeviceTicks(u64_at(p, 16)),
+    })
+}
+
+fn write_echo(w: &mut Writer<'_>, e: &Echo) {
+    w.u64(e.host_sent_ns).u64(e.device_received.0).u64(e.device_sent.0);
+}
+
+impl Config {
+    fn parse(p: &[u8]) -> Result<Self, PayloadError> {
+        let kind = MessageType::Config;
+        if p.len() < 32 {
+            return Err(PayloadError::Length { kind, expected: 33, got: p.len() });
+        }
+        let count = p[16] as usize;
+        let field = |field| PayloadError::Field { kind, field };
+        if count == 0 || count > MAX_PLANES {
+            return Err(field("planes"));
+        }
+        expect_len(kind, p, 32 + count)?;
+        let mut specs = [PlaneSpec::from_led_code(0).expect("code 0 is red bit 0"); MAX_PLANES];
+        for (spec, &code) in specs.iter_mut().zip(&p[32..]) {
+            *spec = PlaneSpec::from_led_code(code).ok_or(field("led codes"))?;
+        }
+        let watchdog_us = u32_at(p, 12);
+        if watchdog_us == 0 || watchdog_us > MAX_WATCHDOG_US {
+            return Err(field("watchdog"));
+        }
+        Ok(Self {
+            raster: raster(kind, p, 0)?,
+            schedule: PlaneSchedule::new(&specs[..count]).ok_or(field("led codes"))?,
+            rate: FrameRate::new(u32_at(p, 4), u32_at(p, 8)).ok_or(field("frame rate"))?,
+            watchdog_us,
+            underrun: match p[17] {
+                0 => Underrun::Repeat,
+                1 => Underrun::Blank,
+                _ => return Err(field("underrun")),
+            },
+            late_slots: p[18],
+            epoch: DeviceTicks(u64_at(p, 24)),
+        })
+    }
+
+    fn write(&self, w: &mut Writer<'_>) {
+        w.u16(self.raster.width() as u16).u16(self.raster.height() as u16);
+        w.u32(self.rate.num()).u32(self.rate.den()).u32(self.watchdog_us);
+        w.u8(self.schedule.len() as u8).u8(self.underrun as u8).u8(self.late_slots).u8(0).u32(0);
+        w.u64(self.epoch.0);
+        for plane in self.schedule.planes() {
+            w.u8(plane.led_code());
+        }
+    }
+}
+
+impl HostMessage {
+    /// Reads a payload that a device received.
+    pub fn parse(kind: MessageType, p: &[u8]) -> Result<Self, PayloadError> {
+        let field = |field| PayloadError::Field { kind, field };
+        Ok(match kind {
+            MessageType::Hello => {
+                expect_len(kind, p, 8)?;
+                Self::Hello(HostHello {
+                    version_min: u16_at(p, 0),
+                    version_max: u16_at(p, 2),
+                    codecs: u32_at(p, 4),
+                })
+            }
+            MessageType::Config => Self::Config(Config::parse(p)?),
+            MessageType::Arm => {
+                expect_len(kind, p, 4)?;
+                Self::Arm(u32_at(p, 0))
+            }
+            MessageType::FrameCommit => {
+                expect_len(kind, p, 16)?;
+                let commit = Commit {
+                    sent: u32_at(p, 0),
+                    kept: u32_at(p, 4),
+                    base_frame: u32_at(p, 8),
+                    frames_sent: u32_at(p, 12),
+                };
+                if commit.sent & commit.kept != 0 {
+                    return Err(field("kept"));
+                }
+                Self::Commit(commit)
+            }
+            MessageType::Sync => {
+                expect_len(kind, p, 4)?;
+                Self::Sync(u32_at(p, 0))
+            }
+            MessageType::Echo => Self::Echo(echo(p)?),
+            MessageType::Stop | MessageType::Black | MessageType::Freeze | MessageType::Safe => {
+                expect_len(kind, p, 0)?;
+                match kind {
+                    MessageType::Stop => Self::Stop,
+                    MessageType::Black => Self::Black,
+                    MessageType::Freeze => Self::Freeze,
+                    _ => Self::Safe,
+                }
+            }
+            MessageType::Plane | MessageType::Status | MessageType::Fault => {
+                return Err(PayloadError::Direction(kind))
+            }
+        })
+    }
+
+    /// Writes the payload into `out`; returns the type and the length.
+    pub fn write(&self, out: &mut [u8; MAX_CONTROL_BYTES]) -> (MessageType, usize) {
+        let mut w = Writer { out, len: 0 };
+        let kind = match self {
+            Self::Hello(h) => {
+                w.u16(h.version_min).u16(h.version_max).u32(h.codecs);
+                MessageType::Hello
+            }
+            Self::Config(c) => {
+                c.write(&mut w);
+                MessageType::Config
+            }
+            Self::Arm(acknowledged) => {
+                w.u32(*acknowledged);
+                MessageType::Arm
+            }
+            Self::Commit(c) => {
+                w.u32(c.sent).u32(c.kept).u32(c.base_frame).u32(c.frames_sent);
+                MessageType::FrameCommit
+            }
+            Self::Sync(frames_sent) => {
+                w.u32(*frames_sent);
+                MessageType::Sync
+            }
+            Self::Echo(e) => {
+                write_echo(&mut w, e);
+                MessageType::Echo
+            }
+            Self::Stop => MessageType::Stop,
+            Self::Black => MessageType::Black,
+            Self::Freeze => MessageType::Freeze,
+            Self::Safe => MessageType::Safe,
+        };
+        (kind, w.len)
+    }
+}
+
+impl DeviceMessage {
+    /// Reads a payload that a host received.
+    pub fn parse(kind: MessageType, p: &[u8]) -> Result<Self, PayloadError> {
+        let field = |field| PayloadError::Field { kind, field };
+        Ok(match kind {
+            MessageType::Hello => {
+                expect_len(kind, p, 40)?;
+                Self::Hello(DeviceHello {
+                    version: u16_at(p, 0),
+                    firmware: u16_at(p, 2),
+                    codecs: u32_at(p, 4),
+                    raster: raster(kind, p, 8)?,
+                    max_planes: p[12],
+                    frame_buffers: p[13],
+                    tick_hz: u32_at(p, 16),
+                    min_plane_ns: u32_at(p, 20),
+                    serial: u64_at(p, 24),
+                    now: DeviceTicks(u64_at(p, 32)),
+                })
+            }
+            MessageType::Status => {
+                expect_len(kind, p, 96)?;
+                Self::Status(Status {
+                    state: DeviceState::from_code(p[0]).ok_or(field("state"))?,
+                    lit: p[1] & 1 != 0,
+                    last_plane: p[2],
+                    buffers_free: p[3],
+                    faults: u32_at(p, 4),
+                    frame_limit: u32_at(p, 8),
+                    frames_accounted: u32_at(p, 12),
+                    last_whole_frame: u32_at(p, 16),
+                    last_lit_frame: u32_at(p, 20),
+                    last_lit_at: DeviceTicks(u64_at(p, 24)),
+                    now: DeviceTicks(u64_at(p, 32)),
+                    slots: u32_at(p, 40),
+                    frames_seen: u32_at(p, 44),
+                    frames_lit: u32_at(p, 48),
+                    slots_repeated: u32_at(p, 52),
+                    slots_blank: u32_at(p, 56),
+                    frames_incomplete: u32_at(p, 60),
+                    frames_late: u32_at(p, 64),
+                    frames_superseded: u32_at(p, 68),
+                    frames_refused: u32_at(p, 72),
+                    packets: u32_at(p, 76),
+                    header_errors: u32_at(p, 80),
+                    payload_errors: u32_at(p, 84),
+                    packets_ignored: u32_at(p, 88),
+                    bytes_skipped: u32_at(p, 92),
+                })
+            }
+            MessageType::Echo => Self::Echo(echo(p)?),
+            MessageType::Fault => {
+                expect_len(kind, p, 16)?;
+                Self::Fault(Fault {
+                    latched: u32_at(p, 0),
+                    code: match u16_at(p, 4) {
+                        0 => FaultCode::Latched,
+                        1 => FaultCode::Version,
+                        2 => FaultCode::Config,
+                        3 => FaultCode::Arm,
+                        _ => return Err(field("code")),
+                    },
+                    detail: u16_at(p, 6),
+                    at: DeviceTicks(u64_at(p, 8)),
+                })
+            }
+            _ => return Err(PayloadError::Direction(kind)),
+        })
+    }
+
+    /// Writes the payload into `out`; returns the type and the length.
+    pub fn write(&self, out: &mut [u8; MAX_CONTROL_BYTES]) -> (MessageType, usize) {
+        let mut w = Writer { out, len: 0 };
+        let kind = match self {
+            Self::Hello(h) => {
+                w.u16(h.version).u16(h.firmware).u32(h.codecs);
+                w.u16(h.raster.width() as u16).u16(h.raster.height() as u16);
+                w.u8(h.max_planes).u8(h.frame_buffers).u16(0);
+                w.u32(h.tick_hz).u32(h.min_plane_ns).u64(h.serial).u64(h.now.0);
+                MessageType::Hello
+            }
+            Self::Status(s) => {
+                w.u8(s.state as u8).u8(u8::from(s.lit)).u8(s.last_plane).u8(s.buffers_free);
+                w.u32(s.faults).u32(s.frame_limit).u32(s.frames_accounted);
+                w.u32(s.last_whole_frame).u32(s.last_lit_frame).u64(s.last_lit_at.0).u64(s.now.0);
+                for v in [
+                    s.slots,
+                    s.frames_seen,
+                    s.frames_lit,
+                    s.slots_repeated,
+                    s.slots_blank,
+                    s.frames_incomplete,
+                    s.frames_late,
+                    s.frames_superseded,
+                    s.frames_refused,
+                    s.packets,
+                    s.header_errors,
+                    s.payload_errors,
+                    s.packets_ignored,
+                    s.bytes_skipped,
+                ] {
+                    w.u32(v);
+                }
+                MessageType::Status
+            }
+            Self::Echo(e) => {
+                write_echo(&mut w, e);
+                MessageType::Echo
+            }
+            Self::Fault(f) => {
+                w.u32(f.latched).u16(f.code as u16).u16(f.detail).u64(f.at.0);
+                MessageType::Fault
+            }
+        };
+        (kind, w.len)
+    }
+}
+
+/// Collects the payload of a control message while it arrives in pieces.
+#[derive(Clone, Debug)]
+pub struct Assembly {
+    header: Header,
+    bytes: [u8; MAX_CONTROL_BYTES],
+    len: usize,
+}
+
+impl Assembly {
+    /// For the message that `header` begins; `None` when it claims more than any control message has.
+    pub fn new(header: &Header) -> Option<Self> {
+        if header.payload_bytes as usize > MAX_CONTROL_BYTES {
+            return None;
+        }
+        Some(Self { header: *header, bytes: [0; MAX_CONTROL_BYTES], len: 0 })
+    }
+
+    /// The next bytes; what would not fit is ignored (a [`super::Decoder`] never delivers more than the header claimed).
+    pub fn push(&mut self, bytes: &[u8]) {
+        let n = bytes.len().min(MAX_CONTROL_BYTES - self.len);
+        self.bytes[self.len..self.len + n].copy_from_slice(&bytes[..n]);
+        self.len += n;
+    }
+
+    /// The header given.
+    pub fn header(&self) -> &Header {
+        &self.header
+    }
+
+    /// The bytes collected.
+    pub fn payload(&self) -> &[u8] {
+        &self.bytes[..self.len]
+    }
+}
+
+#[cfg(test)]
+#[path = "message_tests.rs"]
+mod tests;

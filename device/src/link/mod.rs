@@ -1,0 +1,31 @@
+//! The bit-plane link: planes into packets and back, and the state both sides keep.
+//!
+//! Reading order: [`header`](Header) is one packet, [`Decoder`] finds packets in a stream, [`HostMessage`] and
+//! [`DeviceMessage`] are what they say, [`SlotClock`] is when frames are lit; [`HostLink`] is the host's half of the
+//! conversation. Everything but [`HostLink`] is `no_std` without allocation and is meant to be reused by firmware:
+//! docs/PROTOCOL.md is the specification.
+
+mod crc;
+mod decoder;
+mod header;
+#[cfg(feature = "std")]
+mod host;
+mod message;
+mod slots;
+
+pub use crc::{crc32c, crc32c_append, crc32c_append_table};
+pub use decoder::{Decoder, DecoderCounters, PacketSink};
+pub use header::{
+    frame_newer, packet_bytes, trailer_bytes, Codec, Header, HeaderError, MessageType, Packet, HEADER_BYTES,
+    MAGIC, MAX_PAYLOAD_BYTES, VERSION,
+};
+#[cfg(feature = "std")]
+pub use host::{
+    DropReason, EchoSample, Epoch, HostLink, LinkCounters, LinkError, LinkSettings, LinkState, SendOutcome,
+    Verb,
+};
+pub use message::{
+    faults, Assembly, Commit, Config, ConfigRefusal, DeviceHello, DeviceMessage, DeviceState, Echo, Fault,
+    FaultCode, HostHello, HostMessage, PayloadError, Status, Underrun, MAX_CONTROL_BYTES, MAX_WATCHDOG_US,
+};
+pub use slots::SlotClock;

@@ -1,0 +1,92 @@
+//! A frame rate into the device's slots: when, in device ticks, each frame time begins.
+
+use crate::time::{DeviceTicks, FrameRate};
+
+/// The slots of a configured device. Slot `k` begins at `epoch + floor(k * tick_hz * den / num)`: never more than a tick from
+/// the exact rational instant, with no accumulated drift.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct SlotClock {
+    epoch: DeviceTicks,
+    tick_hz: u32,
+    rate: FrameRate,
+}
+
+impl SlotClock {
+    /// Slots of `rate` on a clock of `tick_hz` ticks a second, slot 0 at `epoch`. `None` when `tick_hz` is 0 or a slot would
+    /// be shorter than one tick.
+    pub const fn new(epoch: DeviceTicks, tick_hz: u32, rate: FrameRate) -> Option<Self> {
+        if (tick_hz as u64) * (rate.den() as u64) < rate.num() as u64 {
+            return None;
+        }
+        Some(Self { epoch, tick_hz, rate })
+    }
+
+    /// Start of slot `slot`; saturates at the end of the counter.
+    pub const fn start(&self, slot: u64) -> DeviceTicks {
+        // At most 2^64 * 2^32 * 2^32: fits 128 bits exactly once; the division brings it back.
+        let ticks = (slot as u128).saturating_mul(self.tick_hz as u128 * self.rate.den() as u128)
+            / self.rate.num() as u128;
+        let at = ticks + self.epoch.0 as u128;
+        DeviceTicks(if at > u64::MAX as u128 { u64::MAX } else { at as u64 })
+    }
+
+    /// The slot that contains the instant `at`; `None` before slot 0.
+    pub const fn slot_at(&self, at: DeviceTicks) -> Option<u64> {
+        if at.0 < self.epoch.0 {
+            return None;
+        }
+        // The largest k with floor(k * hz * den / num) <= d, that is k * hz * den < (d + 1) * num.
+        let d = (at.0 - self.epoch.0) as u128;
+        let k = ((d + 1) * self.rate.num() as u128 - 1) / (self.tick_hz as u128 * self.rate.den() as u128);
+        Some(k as u64)
+    }
+
+    /// Start of slot 0.
+    pub const fn epoch(&self) -> DeviceTicks {
+        self.epoch
+    }
+
+    /// Nominal ticks a second of the device's clock.
+    pub const fn tick_hz(&self) -> u32 {
+        self.tick_hz
+    }
+
+    /// Frames a second.
+    pub const fn rate(&self) -> FrameRate {
+        self.rate
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn slot_at_inverts_start_for_odd_rates_and_clocks() {
+        for (hz, num, den) in
+            [(1_000_000_000, 947, 1), (27_000_000, 60_000, 1001), (1_000_003, 947, 1), (947, 947, 1)]
+        {
+            let clock = SlotClock::new(DeviceTicks(12_345), hz, FrameRate::new(num, den).unwrap()).unwrap();
+            assert_eq!(clock.slot_at(DeviceTicks(12_344)), None);
+            for slot in (0..20_000_000_000u64).step_by(123_456_789).chain(0..50) {
+                let start = clock.start(slot);
+                assert_eq!(clock.slot_at(start), Some(slot), "{hz} Hz, {num}/{den}, slot {slot}");
+                if slot > 0 {
+                    assert_eq!(clock.slot_at(DeviceTicks(start.0 - 1)), Some(slot - 1));
+                }
+            }
+        }
+        // A day of 947 fps on a nanosecond clock is a day.
+        let clock = SlotClock::new(DeviceTicks(7), 1_000_000_000, FrameRate::new(947, 1).unwrap()).unwrap();
+        assert_eq!(clock.start(947 * 86_400).0, 86_400_000_000_007);
+    }
+
+    #[test]
+    fn slots_shorter_than_a_tick_are_refused_and_ends_saturate() {
+        assert!(SlotClock::new(DeviceTicks(0), 946, FrameRate::new(947, 1).unwrap()).is_none());
+        assert!(SlotClock::new(DeviceTicks(0), 0, FrameRate::new(1, 1).unwrap()).is_none());
+        let clock = SlotClock::new(DeviceTicks(5), u32::MAX, FrameRate::new(1, u32::MAX).unwrap()).unwrap();
+        assert_eq!(clock.start(u64::MAX).0, u64::MAX);
+        assert_eq!(clock.slot_at(DeviceTicks(u64::MAX)), Some(1));
+    }
+}

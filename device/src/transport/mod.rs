@@ -1,0 +1,88 @@
+//! Packets into bytes on a medium and back: what the link needs from USB, a serial port, or a device in the same process.
+
+pub mod inproc;
+
+use crate::link::Packet;
+use crate::time::HostTime;
+
+/// The two independent streams of a link. Control never waits behind data.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Hash)]
+#[repr(u8)]
+pub enum Lane {
+    /// PLANE, FRAME_COMMIT and SYNC.
+    Data = 0,
+    /// Everything else.
+    Control = 1,
+}
+
+/// Why a medium stopped carrying bytes.
+#[derive(Debug, thiserror::Error)]
+#[non_exhaustive]
+pub enum TransportError {
+    /// The device is gone; opening again may succeed.
+    #[error("{device}: unplugged")]
+    Unplugged {
+        /// Which device.
+        device: String,
+    },
+    /// The operating system refused; the text names the object and the remedy.
+    #[error("{context}: {source}")]
+    Io {
+        /// What was being done, on which object, and what to try.
+        context: String,
+        /// The operating system's error.
+        source: std::io::Error,
+    },
+}
+
+/// Why [`Transport::send`] took nothing.
+#[derive(Debug, thiserror::Error)]
+pub enum SendError {
+    /// No room now. Nothing was sent; later, or with newer content, it may fit.
+    #[error("no room on the link")]
+    Busy,
+    /// The medium is gone.
+    #[error(transparent)]
+    Failed(#[from] TransportError),
+}
+
+/// A medium. Implementations MUST return within a bounded time, allocate nothing after construction, and take a call's
+/// packets **whole or not at all**: a frame is one call, so no medium ever carries part of a frame by choice.
+pub trait Transport: Send {
+    /// Queues `packets` on `lane`, in order. The slices are not used after the call returns.
+    fn send(&mut self, now: HostTime, lane: Lane, packets: &[Packet<'_>]) -> Result<(), SendError>;
+
+    /// Hands bytes that have arrived to `sink`, in order within a lane, without waiting for more.
+    fn receive(&mut self, now: HostTime, sink: &mut dyn FnMut(Lane, &[u8])) -> Result<(), TransportError>;
+
+    /// What to call this medium in messages.
+    fn name(&self) -> &str;
+}
+
+impl<T: Transport + ?Sized> Transport for &mut T {
+    fn send(&mut self, now: HostTime, lane: Lane, packets: &[Packet<'_>]) -> Result<(), SendError> {
+        (**self).send(now, lane, packets)
+    }
+    fn receive(&mut self, now: HostTime, sink: &mut dyn FnMut(Lane, &[u8])) -> Result<(), TransportError> {
+        (**self).receive(now, sink)
+    }
+    fn name(&self) -> &str {
+        (**self).name()
+    }
+}
+
+/// A device that lives in this process: a state machine without I/O. `now` is the true time of the rig, from which the device
+/// derives its own clock; it never decreases.
+pub trait LinkDevice: Send {
+    /// Bytes arrive. The device first lives up to `now`.
+    fn receive(&mut self, now: HostTime, lane: Lane, bytes: &[u8]);
+
+    /// The medium says that the bytes received so far on `lane` end a transfer, and that the next ones begin another.
+    fn end_of_transfer(&mut self, now: HostTime, lane: Lane);
+
+    /// Lets the device live up to `now`: light, watchdog.
+    fn advance_to(&mut self, now: HostTime);
+
+    /// Takes everything the device has to say, as whole packets.
+    fn replies(&mut self, now: HostTime, sink: &mut dyn FnMut(Lane, &[u8]));
+}

@@ -1,0 +1,557 @@
+//! Packets into light: the device's half of the bit-plane link as a state machine without I/O.
+//!
+//! Everything is driven by [`LinkDevice::receive`] and [`LinkDevice::advance_to`] with the true time as an argument; the device's
+//! own clock is derived from it ([`DeviceClock`]). It starts dark, makes light only after HELLO, CONFIG and ARM, goes dark and
+//! latches when the host falls silent, and lights a frame only when every bit of it has arrived.
+
+mod clock;
+mod frames;
+mod light;
+mod receive;
+
+use std::collections::VecDeque;
+
+use dpm_device::link::{
+    faults, Codec, Config, ConfigRefusal, Decoder, DeviceHello, DeviceMessage, DeviceState, Echo, Fault,
+    FaultCode, Header, Packet, SlotClock, Status, Underrun, MAX_CONTROL_BYTES, VERSION,
+};
+use dpm_device::planes::{Raster, MAX_PLANES};
+use dpm_device::time::{DeviceTicks, HostTime};
+use dpm_device::transport::{Lane, LinkDevice};
+
+pub use clock::DeviceClock;
+use frames::{FrameStore, Held};
+pub use light::{light_of_planes, Exposure};
+
+/// Echo answers that may wait to be fetched; later requests are dropped, as a busy device would.
+const ECHOES_KEPT: usize = 16;
+/// A target further ahead than this is refused, seconds: it would hold a buffer for good.
+const MAX_LEAD_S: u64 = 2;
+
+/// What kind of projector the mock is.
+#[derive(Clone, Copy, Debug)]
+pub struct MockConfig {
+    /// Mirrors.
+    pub raster: Raster,
+    /// Most planes of a frame, 1 to [`MAX_PLANES`].
+    pub max_planes: u8,
+    /// Whole frames that can wait, 1 to 64.
+    pub frame_buffers: u8,
+    /// Its clock.
+    pub clock: DeviceClock,
+    /// Shortest time a plane can be shown, nanoseconds.
+    pub min_plane_ns: u32,
+    /// From the start of a slot to the first photon (load and mirror settling), nanoseconds.
+    pub settle_ns: u32,
+    /// Serial number.
+    pub serial: u64,
+    /// Firmware version that it claims.
+    pub firmware: u16,
+    /// Protocol version that it claims; another than [`VERSION`] makes it refuse every session.
+    pub version: u16,
+    /// Light events kept for [`MockProjector::next_light`]; when full the oldest go and are counted.
+    pub events_kept: usize,
+}
+
+impl MockConfig {
+    /// A panel of `raster` with 24-plane memory for four waiting frames, an ideal clock, and mirrors that show a plane in
+    /// 43.22 us (32,552 loads a second and 12.5 us of reset, as a DLP7000 does).
+    pub fn new(raster: Raster) -> Self {
+        Self {
+            raster,
+            max_planes: 24,
+            frame_buffers: 4,
+            clock: DeviceClock::IDEAL,
+            min_plane_ns: 43_220,
+            settle_ns: 0,
+            serial: 1,
+            firmware: 0x0100,
+            version: u16::from(VERSION),
+            events_kept: 4096,
+        }
+    }
+}
+
+/// What the mirrors did in one slot.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum LightKind {
+    /// A frame for the first time.
+    Lit,
+    /// The frame before again.
+    Repeated,
+    /// Nothing.
+    Blank,
+}
+
+/// One slot of an armed projector.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct LightEvent {
+    /// Which slot.
+    pub slot: u64,
+    /// The frame on the mirrors (low 32 bits of its number); `None` when dark.
+    pub frame: Option<u32>,
+    /// What was lit.
+    pub kind: LightKind,
+    /// Start of the slot on the device's clock.
+    pub lit_at: DeviceTicks,
+    /// True time of the first photon; of a blank slot, of its beginning.
+    pub first_photon_at: HostTime,
+    /// True time of the last photon; of a blank slot, of its end.
+    pub last_photon_at: HostTime,
+}
+
+/// Armed or not, and how.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+enum Mode {
+    Disarmed,
+    Normal,
+    Black,
+    Frozen,
+}
+
+/// A projector. See the module's documentation.
+#[derive(Debug)]
+pub struct MockProjector {
+    decoders: [Decoder; 2],
+    core: Core,
+}
+
+/// Everything but the decoders, so that packets found by a decoder can act on it.
+#[derive(Debug)]
+struct Core {
+    setup: MockConfig,
+    now: HostTime,
+    session: u32,
+    config: Option<(Config, SlotClock)>,
+    mode: Mode,
+    latched: u32,
+    /// Causes of faults that are present now; cannot be acknowledged away.
+    present: u32,
+    last_heard: DeviceTicks,
+    next_slot: u64,
+    store: FrameStore,
+    lit_now: bool,
+    last_seen_frame: Option<u32>,
+    status: Status,
+    credit_violations: u64,
+    incoming: [receive::Incoming; 2],
+    events: VecDeque<LightEvent>,
+    events_lost: u64,
+    light: Vec<[u8; 3]>,
+    light_is_of: Option<u64>,
+    /// Counts lit frames over all sessions.
+    generation: u64,
+    hello_due: bool,
+    fault_due: Option<Fault>,
+    echoes: VecDeque<Echo>,
+    status_due: bool,
+}
+
+const NO_STATUS: Status = Status {
+    state: DeviceState::Idle,
+    lit: false,
+    last_plane: 0,
+    buffers_free: 0,
+    faults: 0,
+    frame_limit: 0,
+    frames_accounted: 0,
+    last_whole_frame: 0,
+    last_lit_frame: 0,
+    last_lit_at: DeviceTicks(0),
+    now: DeviceTicks(0),
+    slots: 0,
+    frames_seen: 0,
+    frames_lit: 0,
+    slots_repeated: 0,
+    slots_blank: 0,
+    frames_incomplete: 0,
+    frames_late: 0,
+    frames_superseded: 0,
+    frames_refused: 0,
+    packets: 0,
+    header_errors: 0,
+    payload_errors: 0,
+    packets_ignored: 0,
+    bytes_skipped: 0,
+};
+
+impl MockProjector {
+    /// A projector that was just powered on. Its buffers are all it will ever allocate.
+    ///
+    /// # Panics
+    /// When a field of `setup` is outside its documented range.
+    pub fn new(setup: MockConfig) -> Self {
+        assert!((1..=MAX_PLANES).contains(&(setup.max_planes as usize)), "max_planes {}", setup.max_planes);
+        assert!((1..=64).contains(&setup.frame_buffers), "frame_buffers {}", setup.frame_buffers);
+        assert!(setup.clock.tick_hz > 0, "tick_hz 0");
+        let frame_bytes = setup.raster.plane_bytes() * setup.max_planes as usize;
+        Self {
+            decoders: [Decoder::new(), Decoder::new()],
+            core: Core {
+                setup,
+                now: HostTime(i64::MIN),
+                session: 0,
+                config: None,
+                mode: Mode::Disarmed,
+                latched: 0,
+                present: 0,
+                last_heard: DeviceTicks(0),
+                next_slot: 0,
+                store: FrameStore::new(setup.frame_buffers as usize, frame_bytes),
+                lit_now: false,
+                last_seen_frame: None,
+                status: NO_STATUS,
+                credit_violations: 0,
+                incoming: Default::default(),
+                events: VecDeque::with_capacity(setup.events_kept),
+                events_lost: 0,
+                light: Vec::new(),
+                light_is_of: None,
+                generation: 0,
+                hello_due: false,
+                fault_due: None,
+                echoes: VecDeque::with_capacity(ECHOES_KEPT),
+                status_due: false,
+            },
+        }
+    }
+
+    /// The oldest light event not yet taken.
+    pub fn next_light(&mut self) -> Option<LightEvent> {
+        self.core.events.pop_front()
+    }
+
+    /// Light events that were pushed out by newer ones before anybody took them.
+    pub fn light_events_lost(&self) -> u64 {
+        self.core.events_lost
+    }
+
+    /// True when light is on.
+    pub fn is_lit(&self) -> bool {
+        self.core.lit_now
+    }
+
+    /// The frame whose planes are on the mirrors (lit or held dark), low 32 bits of its number.
+    pub fn lit_frame(&self) -> Option<u32> {
+        self.core.store.lit.map(|h| h.frame)
+    }
+
+    /// The planes on the mirrors, one after the other in the configured order.
+    pub fn lit_planes(&self) -> Option<&[u8]> {
+        let held = self.core.store.lit?;
+        let (config, _) = self.core.config.as_ref()?;
+        Some(&self.core.store.bytes(held.buffer)[..config.raster.plane_bytes() * config.schedule.len()])
+    }
+
+    /// Light of the frame on the mirrors as code values, rows top to bottom; computed when asked for, once a frame. `None` while
+    /// no frame is on the mirrors. The first call allocates.
+    pub fn light_of_frame(&mut self) -> Option<&[[u8; 3]]> {
+        let core = &mut self.core;
+        let held = core.store.lit?;
+        let (config, _) = core.config.as_ref()?;
+        if core.light_is_of != Some(core.generation) {
+            core.light.resize(config.raster.pixel_count(), [0; 3]);
+            let bytes = config.raster.plane_bytes() * config.schedule.len();
+            let planes = &core.store.bytes(held.buffer)[..bytes];
+            light_of_planes(config.raster, &config.schedule, planes, &mut core.light);
+            core.light_is_of = Some(core.generation);
+        }
+        Some(&core.light)
+    }
+
+    /// What STATUS would say now.
+    pub fn status(&self) -> Status {
+        self.core.status_now(&self.decoders)
+    }
+
+    /// Frames that arrived without credit: a host that counts right never causes one.
+    pub fn credit_violations(&self) -> u64 {
+        self.core.credit_violations
+    }
+
+    /// The projector's clock.
+    pub fn clock(&self) -> DeviceClock {
+        self.core.setup.clock
+    }
+
+    /// True time of the next thing that happens by itself (a slot or the watchdog); `None` while disarmed.
+    pub fn next_due(&self) -> Option<HostTime> {
+        let (config, slots) = self.core.config.as_ref()?;
+        if self.core.mode == Mode::Disarmed {
+            return None;
+        }
+        let due = slots.start(self.core.next_slot).min(self.core.bite_at(config));
+        Some(self.core.setup.clock.instant_of(due))
+    }
+
+    /// Sets which causes of faults are present (bits of [`faults`]): a hot lamp, a pressed button. New ones latch at once.
+    pub fn set_faults(&mut self, now: HostTime, present: u32) {
+        self.advance_to(now);
+        let new = present & !self.core.present;
+        self.core.present = present;
+        if new != 0 {
+            self.core.latch(new);
+        }
+    }
+
+    /// Power fails and comes back: dark, no session, no memory, the clock starts again.
+    pub fn power_cycle(&mut self, now: HostTime) {
+        self.advance_to(now);
+        let present = self.core.present;
+        let setup = MockConfig { clock: DeviceClock { power_on_at: now, ..self.core.setup.clock }, ..self.core.setup };
+        *self = Self::new(setup);
+        self.core.present = present;
+        self.core.latched = present;
+    }
+}
+
+impl LinkDevice for MockProjector {
+    fn receive(&mut self, now: HostTime, lane: Lane, bytes: &[u8]) {
+        self.core.advance(now);
+        let mut sink = receive::LaneSink { core: &mut self.core, lane };
+        self.decoders[lane as usize].push(bytes, &mut sink);
+    }
+
+    fn end_of_transfer(&mut self, now: HostTime, lane: Lane) {
+        self.core.advance(now);
+        let mut sink = receive::LaneSink { core: &mut self.core, lane };
+        self.decoders[lane as usize].reset(&mut sink);
+    }
+
+    fn advance_to(&mut self, now: HostTime) {
+        self.core.advance(now);
+    }
+
+    fn replies(&mut self, now: HostTime, sink: &mut dyn FnMut(Lane, &[u8])) {
+        self.core.advance(now);
+        let now_ticks = self.core.ticks();
+        let mut send = |session: u32, message: &DeviceMessage| {
+            let mut payload = [0u8; MAX_CONTROL_BYTES];
+            let (kind, n) = message.write(&mut payload);
+            let packet = Packet::new(Header::control(kind, session, 0), &payload[..n]);
+            let mut wire = [0u8; 160];
+            let mut at = 0;
+            for part in packet.parts() {
+                wire[at..at + part.len()].copy_from_slice(part);
+                at += part.len();
+            }
+            sink(Lane::Control, &wire[..at]);
+        };
+        let session = self.core.session;
+        if std::mem::take(&mut self.core.hello_due) {
+            send(session, &DeviceMessage::Hello(self.core.hello(now_ticks)));
+        }
+        if let Some(fault) = self.core.fault_due.take() {
+            send(session, &DeviceMessage::Fault(fault));
+        }
+        while let Some(echo) = self.core.echoes.pop_front() {
+            send(session, &DeviceMessage::Echo(Echo { device_sent: now_ticks, ..echo }));
+        }
+        if std::mem::take(&mut self.core.status_due) {
+            let status = self.core.status_now(&self.decoders);
+            send(session, &DeviceMessage::Status(status));
+        }
+    }
+}
+
+impl Core {
+    fn ticks(&self) -> DeviceTicks {
+        self.setup.clock.ticks_at(self.now)
+    }
+
+    fn hello(&self, now: DeviceTicks) -> DeviceHello {
+        DeviceHello {
+            version: self.setup.version,
+            firmware: self.setup.firmware,
+            codecs: Codec::Raw.mask(),
+            raster: self.setup.raster,
+            max_planes: self.setup.max_planes,
+            frame_buffers: self.setup.frame_buffers,
+            tick_hz: self.setup.clock.tick_hz,
+            min_plane_ns: self.setup.min_plane_ns,
+            serial: self.setup.serial,
+            now,
+        }
+    }
+
+    fn state(&self) -> DeviceState {
+        match (self.session, &self.config, self.mode) {
+            _ if self.latched != 0 => DeviceState::Faulted,
+            (0, ..) => DeviceState::Idle,
+            (_, None, _) => DeviceState::Greeted,
+            (_, _, Mode::Disarmed) => DeviceState::Configured,
+            (_, _, Mode::Normal) => DeviceState::Armed,
+            (_, _, Mode::Black) => DeviceState::Black,
+            (_, _, Mode::Frozen) => DeviceState::Frozen,
+        }
+    }
+
+    fn status_now(&self, decoders: &[Decoder; 2]) -> Status {
+        let [a, b] = decoders.each_ref().map(Decoder::counters);
+        Status {
+            state: self.state(),
+            lit: self.lit_now,
+            buffers_free: self.store.free() as u8,
+            faults: self.latched,
+            frame_limit: self.frame_limit(),
+            now: self.ticks(),
+            packets: a.packets.wrapping_add(b.packets),
+            header_errors: a.header_errors.wrapping_add(b.header_errors),
+            payload_errors: a.payload_errors.wrapping_add(b.payload_errors),
+            packets_ignored: self.status.packets_ignored.wrapping_add(a.foreign).wrapping_add(b.foreign),
+            bytes_skipped: a.bytes_skipped.wrapping_add(b.bytes_skipped),
+            ..self.status
+        }
+    }
+
+    fn frame_limit(&self) -> u32 {
+        if self.mode == Mode::Disarmed {
+            // No credit while frames would be refused.
+            return self.status.frames_accounted;
+        }
+        self.status.frames_accounted.wrapping_add(self.store.free() as u32)
+    }
+
+    /// When the watchdog bites if nothing more is heard.
+    fn bite_at(&self, config: &Config) -> DeviceTicks {
+        let ticks = u64::from(config.watchdog_us) * u64::from(self.setup.clock.tick_hz) / 1_000_000;
+        DeviceTicks(self.last_heard.0.saturating_add(ticks.max(1)))
+    }
+
+    /// Slots and the watchdog up to `now`, in the order of time. Bounded: the watchdog ends it.
+    fn advance(&mut self, now: HostTime) {
+        self.now = self.now.max(now);
+        let ticks = self.ticks();
+        while self.mode != Mode::Disarmed {
+            let Some((config, slots)) = self.config else { break };
+            let (start, bite) = (slots.start(self.next_slot), self.bite_at(&config));
+            if start.min(bite) > ticks {
+                break;
+            }
+            if bite <= start {
+                self.latch(faults::WATCHDOG);
+                break;
+            }
+            self.slot(&config, &slots, start);
+        }
+    }
+
+    /// One slot begins.
+    fn slot(&mut self, config: &Config, slots: &SlotClock, start: DeviceTicks) {
+        let slot = self.next_slot;
+        self.next_slot += 1;
+        self.status.slots = self.status.slots.wrapping_add(1);
+        self.status_due = true;
+        let due = self.store.take_due(slot);
+        let kind = match (self.mode, due) {
+            (Mode::Normal, Some((frame, superseded))) => {
+                self.status.frames_superseded = self.status.frames_superseded.wrapping_add(superseded);
+                self.status.frames_lit = self.status.frames_lit.wrapping_add(1);
+                self.status.last_lit_frame = frame.frame;
+                self.status.last_lit_at = start;
+                self.store.lit = Some(Held { frame: frame.frame, buffer: frame.buffer });
+                self.generation += 1;
+                LightKind::Lit
+            }
+            (mode, due) => {
+                // Told to be dark or to hold: frames are used up so that the stream goes on.
+                let refused = due.map_or(0, |(_, superseded)| superseded + 1);
+                self.status.frames_refused = self.status.frames_refused.wrapping_add(refused);
+                let again = self.store.lit.is_some()
+                    && (mode == Mode::Frozen || mode == Mode::Normal && config.underrun == Underrun::Repeat);
+                if again {
+                    self.status.slots_repeated = self.status.slots_repeated.wrapping_add(1);
+                    LightKind::Repeated
+                } else {
+                    self.status.slots_blank = self.status.slots_blank.wrapping_add(1);
+                    LightKind::Blank
+                }
+            }
+        };
+        self.lit_now = kind != LightKind::Blank;
+        let clock = &self.setup.clock;
+        let settle = if self.lit_now { i64::from(self.setup.settle_ns) } else { 0 };
+        let event = LightEvent {
+            slot,
+            frame: self.store.lit.filter(|_| self.lit_now).map(|h| h.frame),
+            kind,
+            lit_at: start,
+            first_photon_at: clock.instant_of(start).plus_ns(settle),
+            last_photon_at: clock.instant_of(slots.start(slot + 1)),
+        };
+        if self.events.len() >= self.setup.events_kept {
+            self.events.pop_front();
+            self.events_lost += 1;
+        }
+        if self.setup.events_kept > 0 {
+            self.events.push_back(event);
+        }
+    }
+
+    /// Goes dark and forgets every frame on its way.
+    fn disarm(&mut self) {
+        self.mode = Mode::Disarmed;
+        self.lit_now = false;
+        let thrown = self.store.clear();
+        self.status.frames_refused = self.status.frames_refused.wrapping_add(thrown);
+        self.status_due = true;
+    }
+
+    fn latch(&mut self, faults: u32) {
+        self.disarm();
+        self.latched |= faults;
+        self.report(FaultCode::Latched, 0);
+    }
+
+    fn report(&mut self, code: FaultCode, detail: u16) {
+        self.fault_due = Some(Fault { latched: self.latched, code, detail, at: self.ticks() });
+        self.status_due = true;
+    }
+
+    fn open_session(&mut self, session: u32) {
+        self.disarm();
+        self.session = session;
+        self.config = None;
+        self.last_seen_frame = None;
+        self.status = NO_STATUS;
+    }
+
+    fn configure(&mut self, config: Config) -> Result<(), ConfigRefusal> {
+        if config.raster != self.setup.raster {
+            return Err(ConfigRefusal::Raster);
+        }
+        if config.schedule.len() > self.setup.max_planes as usize {
+            return Err(ConfigRefusal::Planes);
+        }
+        let slots = SlotClock::new(config.epoch, self.setup.clock.tick_hz, config.rate)
+            .ok_or(ConfigRefusal::Rate)?;
+        let plane_ns = 1_000_000_000 * u64::from(config.rate.den())
+            / (u64::from(config.rate.num()) * config.schedule.len() as u64);
+        if plane_ns < u64::from(self.setup.min_plane_ns) {
+            return Err(ConfigRefusal::Rate);
+        }
+        self.disarm();
+        self.config = Some((config, slots));
+        Ok(())
+    }
+
+    fn arm(&mut self, acknowledged: u32) {
+        let Some((_, slots)) = self.config else {
+            return self.report(FaultCode::Arm, 1);
+        };
+        if self.present != 0 || self.latched & !acknowledged != 0 {
+            return self.report(FaultCode::Arm, 2);
+        }
+        self.latched = 0;
+        if self.mode == Mode::Disarmed {
+            let now = self.ticks();
+            self.next_slot = slots.slot_at(now).map_or(0, |k| k + 1);
+        }
+        self.mode = Mode::Normal;
+        self.status_due = true;
+    }
+}
+
+#[cfg(test)]
+#[path = "projector/tests.rs"]
+mod tests;

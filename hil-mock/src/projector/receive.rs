@@ -1,0 +1,292 @@
+//! Packets into changes of the projector's state: every check that stands between a byte and light.
+
+use dpm_device::link::{
+    frame_newer, Assembly, Codec, Commit, ConfigRefusal, Echo, FaultCode, Header, HostMessage, MessageType,
+    PacketSink,
+};
+use dpm_device::time::DeviceTicks;
+use dpm_device::transport::Lane;
+
+use super::frames::{Assembling, Held, Pending};
+use super::{Core, Mode, ECHOES_KEPT, MAX_LEAD_S};
+
+/// The packet that is arriving on a lane.
+#[derive(Debug, Default)]
+pub(super) enum Incoming {
+    #[default]
+    Nothing,
+    Control(Assembly),
+    /// A plane on its way into a frame buffer.
+    Plane {
+        plane: u8,
+        buffer: usize,
+        at: usize,
+    },
+}
+
+pub(super) struct LaneSink<'a> {
+    pub core: &'a mut Core,
+    pub lane: Lane,
+}
+
+impl PacketSink for LaneSink<'_> {
+    fn begin(&mut self, header: &Header) -> bool {
+        let incoming = self.core.begin(header);
+        let wanted = !matches!(incoming, Incoming::Nothing);
+        self.core.incoming[self.lane as usize] = incoming;
+        wanted
+    }
+
+    fn payload(&mut self, bytes: &[u8]) {
+        match &mut self.core.incoming[self.lane as usize] {
+            Incoming::Control(assembly) => assembly.push(bytes),
+            Incoming::Plane { buffer, at, .. } => {
+                let to = *at;
+                *at += bytes.len();
+                // The frame may have been given up while the plane was arriving; the buffer still exists and is not lit.
+                self.core.store.bytes_mut(*buffer)[to..to + bytes.len()].copy_from_slice(bytes);
+            }
+            Incoming::Nothing => {}
+        }
+    }
+
+    fn end(&mut self, intact: bool) {
+        match std::mem::take(&mut self.core.incoming[self.lane as usize]) {
+            Incoming::Control(assembly) if intact => self.core.control(&assembly),
+            Incoming::Plane { plane, buffer, .. } if intact => self.core.plane_arrived(plane, buffer),
+            _ => {}
+        }
+    }
+}
+
+impl Core {
+    fn begin(&mut self, header: &Header) -> Incoming {
+        if header.kind == MessageType::Plane {
+            return self.begin_plane(header);
+        }
+        match Assembly::new(header) {
+            Some(assembly) => Incoming::Control(assembly),
+            None => self.ignore(),
+        }
+    }
+
+    fn ignore(&mut self) -> Incoming {
+        self.status.packets_ignored = self.status.packets_ignored.wrapping_add(1);
+        Incoming::Nothing
+    }
+
+    /// True when a packet of `session` is of the open one; otherwise counts it, and lets the host know when there is none.
+    fn heard(&mut self, session: u32) -> bool {
+        if self.session == 0 {
+            self.status_due = true;
+        }
+        if self.session == 0 || session != self.session {
+            self.ignore();
+            return false;
+        }
+        self.last_heard = self.ticks();
+        true
+    }
+
+    fn begin_plane(&mut self, header: &Header) -> Incoming {
+        if !self.heard(header.session) {
+            return Incoming::Nothing;
+        }
+        let Some((config, _)) = self.config else { return self.ignore() };
+        let plane_bytes = config.raster.plane_bytes();
+        let spec = config.schedule.planes().get(header.plane as usize);
+        let fits = spec.is_some_and(|s| s.led_code() == header.led_code)
+            && header.codec == Codec::Raw
+            && header.payload_bytes as usize == plane_bytes;
+        if !fits || !self.enter_frame(header) {
+            return self.ignore();
+        }
+        let Some(frame) = self.store.assembling else { return self.ignore() };
+        // A plane that is already there is not written again: a damaged copy would spoil it.
+        match frame.buffer {
+            Some(buffer) if frame.received >> header.plane & 1 == 0 => {
+                Incoming::Plane { plane: header.plane, buffer, at: header.plane as usize * plane_bytes }
+            }
+            _ => self.ignore(),
+        }
+    }
+
+    /// Makes the packet's frame the one being assembled. `false` for a frame that is over, or a packet that contradicts it.
+    fn enter_frame(&mut self, header: &Header) -> bool {
+        if let Some(current) = self.store.assembling {
+            if current.frame == header.frame {
+                return current.target_at == header.target_at;
+            }
+        }
+        if self.last_seen_frame.is_some_and(|last| !frame_newer(header.frame, last)) {
+            return false;
+        }
+        self.give_up_frame();
+        self.last_seen_frame = Some(header.frame);
+        self.status.frames_seen = self.status.frames_seen.wrapping_add(1);
+        let refused = self.mode == Mode::Disarmed;
+        if refused {
+            self.refuse();
+        }
+        self.store.assembling = Some(Assembling {
+            frame: header.frame,
+            target_at: header.target_at,
+            received: 0,
+            buffer: if refused { None } else { Some(self.store.free_buffer()) },
+        });
+        true
+    }
+
+    fn refuse(&mut self) {
+        self.status.frames_refused = self.status.frames_refused.wrapping_add(1);
+    }
+
+    /// Nothing more will come of the frame being assembled.
+    fn give_up_frame(&mut self) {
+        if self.store.assembling.take().is_some_and(|f| f.buffer.is_some()) {
+            self.status.frames_incomplete = self.status.frames_incomplete.wrapping_add(1);
+        }
+    }
+
+    fn plane_arrived(&mut self, plane: u8, buffer: usize) {
+        self.status.last_plane = plane;
+        // Only the frame that the bytes were written for: another may have begun on the other lane, or light may have ended.
+        if let Some(frame) = self.store.assembling.as_mut().filter(|f| f.buffer == Some(buffer)) {
+            frame.received |= 1 << plane;
+        }
+    }
+
+    fn control(&mut self, assembly: &Assembly) {
+        let header = assembly.header();
+        let session = header.session;
+        let message = match HostMessage::parse(header.kind, assembly.payload()) {
+            Ok(message) => message,
+            Err(_) => {
+                self.ignore();
+                if header.kind == MessageType::Config && session == self.session && session != 0 {
+                    self.report(FaultCode::Config, ConfigRefusal::Format as u16);
+                }
+                return;
+            }
+        };
+        // To go dark, any session will do.
+        match message {
+            HostMessage::Hello(hello) => {
+                let version = self.setup.version;
+                if session == 0 {
+                    self.ignore();
+                } else if !(hello.version_min..=hello.version_max).contains(&version) {
+                    self.report(FaultCode::Version, version);
+                    self.hello_due = true;
+                } else {
+                    if session != self.session {
+                        self.open_session(session);
+                    }
+                    self.last_heard = self.ticks();
+                    self.hello_due = true;
+                    self.status_due = true;
+                }
+                return;
+            }
+            HostMessage::Stop => return self.disarm(),
+            HostMessage::Safe => return self.latch(dpm_device::link::faults::HOST_SAFE),
+            HostMessage::Black if self.mode != Mode::Disarmed => {
+                self.mode = Mode::Black;
+                self.lit_now = false;
+                self.status_due = true;
+                self.heard(session);
+                return;
+            }
+            _ => {}
+        }
+        if !self.heard(session) {
+            return;
+        }
+        match message {
+            HostMessage::Config(config) => match self.configure(config) {
+                Ok(()) => self.status_due = true,
+                Err(refusal) => self.report(FaultCode::Config, refusal as u16),
+            },
+            HostMessage::Arm(acknowledged) => self.arm(acknowledged),
+            HostMessage::Freeze if self.mode == Mode::Normal => {
+                self.mode = Mode::Frozen;
+                self.status_due = true;
+            }
+            HostMessage::Echo(echo) => {
+                if self.echoes.len() < ECHOES_KEPT {
+                    self.echoes.push_back(Echo { device_received: self.ticks(), ..echo });
+                }
+            }
+            HostMessage::Sync(frames_sent) => {
+                self.give_up_frame();
+                self.account(frames_sent);
+            }
+            HostMessage::Commit(commit) => self.commit(header, &commit),
+            _ => {}
+        }
+    }
+
+    /// The host says how many frames it has sent: those not seen were lost on the way and hold no buffer.
+    fn account(&mut self, frames_sent: u32) {
+        if frame_newer(frames_sent, self.status.frames_accounted) {
+            self.status.frames_accounted = frames_sent;
+        }
+        self.status_due = true;
+    }
+
+    fn commit(&mut self, header: &Header, commit: &Commit) {
+        if self.config.is_none() || !self.enter_frame(header) {
+            self.ignore();
+            return;
+        }
+        let over_limit = frame_newer(commit.frames_sent, self.frame_limit());
+        self.account(commit.frames_sent);
+        let Some(frame) = self.store.assembling.take() else { return };
+        let Some(buffer) = frame.buffer else { return };
+        if over_limit || self.store.free() == 0 {
+            self.credit_violations += 1;
+            return self.refuse();
+        }
+        if !self.complete(&frame, buffer, commit) {
+            self.status.frames_incomplete = self.status.frames_incomplete.wrapping_add(1);
+            return;
+        }
+        self.status.last_whole_frame = frame.frame;
+        self.store.base = Some(Held { frame: frame.frame, buffer });
+        self.schedule(&frame, buffer);
+    }
+
+    /// True when every plane of the frame is in `buffer`, those that did not change copied from the base frame.
+    fn complete(&mut self, frame: &Assembling, buffer: usize, commit: &Commit) -> bool {
+        let Some((config, _)) = self.config else { return false };
+        let all = u32::MAX >> (32 - config.schedule.len());
+        if commit.sent | commit.kept != all || frame.received != commit.sent {
+            return false;
+        }
+        if commit.kept == 0 {
+            return true;
+        }
+        let Some(base) = self.store.base.filter(|b| b.frame == commit.base_frame) else { return false };
+        let plane_bytes = config.raster.plane_bytes();
+        for plane in (0..config.schedule.len()).filter(|p| commit.kept >> p & 1 == 1) {
+            self.store.copy(base.buffer, buffer, plane * plane_bytes, plane_bytes);
+        }
+        true
+    }
+
+    /// A whole frame gets its slot, or is too late or too early.
+    fn schedule(&mut self, frame: &Assembling, buffer: usize) {
+        let Some((config, slots)) = self.config else { return };
+        let lead = u64::from(self.setup.clock.tick_hz).saturating_mul(MAX_LEAD_S);
+        if frame.target_at > DeviceTicks(self.ticks().0.saturating_add(lead)) {
+            return self.refuse();
+        }
+        let target = slots.slot_at(frame.target_at).unwrap_or(0);
+        let late = self.next_slot.saturating_sub(target);
+        if late > u64::from(config.late_slots) {
+            self.status.frames_late = self.status.frames_late.wrapping_add(1);
+            return;
+        }
+        self.store.push(Pending { frame: frame.frame, slot: target, buffer });
+    }
+}
