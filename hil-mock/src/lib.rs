@@ -1,10 +1,11 @@
 //! A projector and a tracker made of software: the same mock in-process, over USB/IP, pseudo-terminals and UDP.
 //!
 //! Reading order: [`motion`] is what truly happens, [`faults`] the one vocabulary of what goes wrong, [`tracker`] what a tracker
-//! would report. All randomness comes from [`rng`], keyed by a seed; time is always an argument.
+//! would report, [`projector`] what a projector makes of the packets it gets. All randomness comes from [`rng`], keyed by a seed; time is always an argument.
 
 pub mod faults;
 pub mod motion;
+pub mod projector;
 pub mod rng;
 pub mod tracker;
 pub mod usb_model;

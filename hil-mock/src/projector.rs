@@ -141,7 +141,8 @@ struct Core {
     light_is_of: Option<u64>,
     /// Counts lit frames over all sessions.
     generation: u64,
-    hello_due: bool,
+    /// Session whose HELLO waits for an answer.
+    hello_due: Option<u32>,
     fault_due: Option<Fault>,
     echoes: VecDeque<Echo>,
     status_due: bool,
@@ -208,7 +209,7 @@ impl MockProjector {
                 light: Vec::new(),
                 light_is_of: None,
                 generation: 0,
-                hello_due: false,
+                hello_due: None,
                 fault_due: None,
                 echoes: VecDeque::with_capacity(ECHOES_KEPT),
                 status_due: false,
@@ -298,7 +299,10 @@ impl MockProjector {
     pub fn power_cycle(&mut self, now: HostTime) {
         self.advance_to(now);
         let present = self.core.present;
-        let setup = MockConfig { clock: DeviceClock { power_on_at: now, ..self.core.setup.clock }, ..self.core.setup };
+        let setup = MockConfig {
+            clock: DeviceClock { power_on_at: now, ..self.core.setup.clock },
+            ..self.core.setup
+        };
         *self = Self::new(setup);
         self.core.present = present;
         self.core.latched = present;
@@ -338,8 +342,8 @@ impl LinkDevice for MockProjector {
             sink(Lane::Control, &wire[..at]);
         };
         let session = self.core.session;
-        if std::mem::take(&mut self.core.hello_due) {
-            send(session, &DeviceMessage::Hello(self.core.hello(now_ticks)));
+        if let Some(asked) = self.core.hello_due.take() {
+            send(asked, &DeviceMessage::Hello(self.core.hello(now_ticks)));
         }
         if let Some(fault) = self.core.fault_due.take() {
             send(session, &DeviceMessage::Fault(fault));
@@ -523,8 +527,8 @@ impl Core {
         if config.schedule.len() > self.setup.max_planes as usize {
             return Err(ConfigRefusal::Planes);
         }
-        let slots = SlotClock::new(config.epoch, self.setup.clock.tick_hz, config.rate)
-            .ok_or(ConfigRefusal::Rate)?;
+        let slots =
+            SlotClock::new(config.epoch, self.setup.clock.tick_hz, config.rate).ok_or(ConfigRefusal::Rate)?;
         let plane_ns = 1_000_000_000 * u64::from(config.rate.den())
             / (u64::from(config.rate.num()) * config.schedule.len() as u64);
         if plane_ns < u64::from(self.setup.min_plane_ns) {

@@ -266,7 +266,7 @@ impl PacketSink for Inbox {
         match DeviceMessage::parse(header.kind, assembly.payload()) {
             Ok(message) if header.session == self.session => self.apply(&message),
             // The device lost its power or its memory: it answers, but knows nothing of this session.
-            Ok(DeviceMessage::Status(s)) if header.session == 0 && s.state == DeviceState::Idle => {
+            Ok(DeviceMessage::Status(_)) if header.session == 0 => {
                 self.device_forgot = true;
             }
             _ => self.ignored += 1,
@@ -399,7 +399,7 @@ impl HostLink {
         }
     }
 
-    /// Sends `verb` now and with every poll after [`RETRY_NS`] until the device confirms it.
+    /// Sends `verb` now and again every 20 ms until the device confirms it.
     pub fn command(
         &mut self,
         now: HostTime,
@@ -421,7 +421,7 @@ impl HostLink {
         if self.state == LinkState::Closed {
             return Ok(self.state);
         }
-        if self.inbox.device_forgot {
+        if std::mem::take(&mut self.inbox.device_forgot) && self.state != LinkState::Greeting {
             // Only HELLO helps; the caller decides about light again.
             self.connect();
         }

@@ -20,7 +20,7 @@ impl DeviceClock {
     pub const IDEAL: Self =
         Self { tick_hz: 1_000_000_000, skew_ppb: 0, start_ticks: 0, power_on_at: HostTime(0) };
 
-    /// Ticks in 10^18 seconds... of 10^-9: the exact rational rate is this / 10^18 ticks a nanosecond.
+    /// The exact rate is this many ticks in 10^18 nanoseconds.
     const fn rate(&self) -> u128 {
         self.tick_hz as u128 * (1_000_000_000 + self.skew_ppb as i64) as u128
     }
@@ -48,8 +48,18 @@ mod tests {
     fn instant_of_is_the_first_nanosecond_of_a_tick() {
         for clock in [
             DeviceClock::IDEAL,
-            DeviceClock { tick_hz: 27_000_000, skew_ppb: 37_000, start_ticks: u64::from(u32::MAX) - 5, power_on_at: HostTime(-77) },
-            DeviceClock { tick_hz: 1_000_000, skew_ppb: -100_000, start_ticks: 9, power_on_at: HostTime(1_000) },
+            DeviceClock {
+                tick_hz: 27_000_000,
+                skew_ppb: 37_000,
+                start_ticks: u64::from(u32::MAX) - 5,
+                power_on_at: HostTime(-77),
+            },
+            DeviceClock {
+                tick_hz: 1_000_000,
+                skew_ppb: -100_000,
+                start_ticks: 9,
+                power_on_at: HostTime(1_000),
+            },
         ] {
             for d in (0..100_000_000_000_000u64).step_by(7_777_777_777_777).chain(0..40) {
                 let t = DeviceTicks(clock.start_ticks + d);

@@ -79,11 +79,11 @@ impl FrameStore {
             return;
         }
         let (low, high) = self.buffers.split_at_mut(from.max(to));
-        let (source, target) =
-            if from < to { (&low[from], &mut high[0]) } else { (&high[0], &mut low[to]) };
+        let (source, target) = if from < to { (&low[from], &mut high[0]) } else { (&high[0], &mut low[to]) };
         target[at..at + len].copy_from_slice(&source[at..at + len]);
     }
 
+    #[cfg(test)]
     pub fn waiting(&self) -> usize {
         self.pending.len()
     }
@@ -108,8 +108,8 @@ impl FrameStore {
 
     /// Dark: nothing waits, nothing is lit, nothing can be referred to. Returns how many frames were thrown away.
     pub fn clear(&mut self) -> u32 {
-        let thrown = self.pending.len() as u32
-            + u32::from(self.assembling.is_some_and(|a| a.buffer.is_some()));
+        let thrown =
+            self.pending.len() as u32 + u32::from(self.assembling.is_some_and(|a| a.buffer.is_some()));
         self.assembling = None;
         self.pending.clear();
         self.lit = None;

@@ -19,6 +19,7 @@ pub(super) enum Incoming {
     /// A plane on its way into a frame buffer.
     Plane {
         plane: u8,
+        frame: u32,
         buffer: usize,
         at: usize,
     },
@@ -31,7 +32,7 @@ pub(super) struct LaneSink<'a> {
 
 impl PacketSink for LaneSink<'_> {
     fn begin(&mut self, header: &Header) -> bool {
-        let incoming = self.core.begin(header);
+        let incoming = self.core.begin(header, self.lane);
         let wanted = !matches!(incoming, Incoming::Nothing);
         self.core.incoming[self.lane as usize] = incoming;
         wanted
@@ -40,11 +41,13 @@ impl PacketSink for LaneSink<'_> {
     fn payload(&mut self, bytes: &[u8]) {
         match &mut self.core.incoming[self.lane as usize] {
             Incoming::Control(assembly) => assembly.push(bytes),
-            Incoming::Plane { buffer, at, .. } => {
-                let to = *at;
+            Incoming::Plane { frame, buffer, at, .. } => {
+                let (frame, buffer, to) = (*frame, *buffer, *at);
                 *at += bytes.len();
-                // The frame may have been given up while the plane was arriving; the buffer still exists and is not lit.
-                self.core.store.bytes_mut(*buffer)[to..to + bytes.len()].copy_from_slice(bytes);
+                // Light may have ended while the plane was arriving: then the buffer is another frame's by now.
+                if self.core.is_assembling(frame, buffer) {
+                    self.core.store.bytes_mut(buffer)[to..to + bytes.len()].copy_from_slice(bytes);
+                }
             }
             Incoming::Nothing => {}
         }
@@ -53,15 +56,22 @@ impl PacketSink for LaneSink<'_> {
     fn end(&mut self, intact: bool) {
         match std::mem::take(&mut self.core.incoming[self.lane as usize]) {
             Incoming::Control(assembly) if intact => self.core.control(&assembly),
-            Incoming::Plane { plane, buffer, .. } if intact => self.core.plane_arrived(plane, buffer),
+            Incoming::Plane { plane, frame, buffer, .. } if intact => {
+                self.core.plane_arrived(plane, frame, buffer);
+            }
             _ => {}
         }
     }
 }
 
 impl Core {
-    fn begin(&mut self, header: &Header) -> Incoming {
-        if header.kind == MessageType::Plane {
+    fn begin(&mut self, header: &Header, lane: Lane) -> Incoming {
+        use MessageType::{FrameCommit, Plane, Sync};
+        if matches!(header.kind, Plane | FrameCommit | Sync) && lane != Lane::Data {
+            // On another lane they could overtake the planes they speak of.
+            return self.ignore();
+        }
+        if header.kind == Plane {
             return self.begin_plane(header);
         }
         match Assembly::new(header) {
@@ -105,7 +115,8 @@ impl Core {
         // A plane that is already there is not written again: a damaged copy would spoil it.
         match frame.buffer {
             Some(buffer) if frame.received >> header.plane & 1 == 0 => {
-                Incoming::Plane { plane: header.plane, buffer, at: header.plane as usize * plane_bytes }
+                let at = header.plane as usize * plane_bytes;
+                Incoming::Plane { plane: header.plane, frame: header.frame, buffer, at }
             }
             _ => self.ignore(),
         }
@@ -148,11 +159,16 @@ impl Core {
         }
     }
 
-    fn plane_arrived(&mut self, plane: u8, buffer: usize) {
+    fn is_assembling(&self, frame: u32, buffer: usize) -> bool {
+        self.store.assembling.is_some_and(|a| a.frame == frame && a.buffer == Some(buffer))
+    }
+
+    fn plane_arrived(&mut self, plane: u8, frame: u32, buffer: usize) {
         self.status.last_plane = plane;
-        // Only the frame that the bytes were written for: another may have begun on the other lane, or light may have ended.
-        if let Some(frame) = self.store.assembling.as_mut().filter(|f| f.buffer == Some(buffer)) {
-            frame.received |= 1 << plane;
+        if self.is_assembling(frame, buffer) {
+            if let Some(frame) = &mut self.store.assembling {
+                frame.received |= 1 << plane;
+            }
         }
     }
 
@@ -177,13 +193,13 @@ impl Core {
                     self.ignore();
                 } else if !(hello.version_min..=hello.version_max).contains(&version) {
                     self.report(FaultCode::Version, version);
-                    self.hello_due = true;
+                    self.hello_due = Some(session);
                 } else {
                     if session != self.session {
                         self.open_session(session);
                     }
                     self.last_heard = self.ticks();
-                    self.hello_due = true;
+                    self.hello_due = Some(session);
                     self.status_due = true;
                 }
                 return;
@@ -212,10 +228,8 @@ impl Core {
                 self.mode = Mode::Frozen;
                 self.status_due = true;
             }
-            HostMessage::Echo(echo) => {
-                if self.echoes.len() < ECHOES_KEPT {
-                    self.echoes.push_back(Echo { device_received: self.ticks(), ..echo });
-                }
+            HostMessage::Echo(echo) if self.echoes.len() < ECHOES_KEPT => {
+                self.echoes.push_back(Echo { device_received: self.ticks(), ..echo });
             }
             HostMessage::Sync(frames_sent) => {
                 self.give_up_frame();
