@@ -8,6 +8,7 @@
 #![cfg_attr(not(feature = "std"), no_std)]
 
 pub mod link;
+pub mod dlpc900;
 pub mod planes;
 pub mod pose;
 pub mod time;

@@ -294,7 +294,7 @@ pub extern "C" fn recvmsg(fd: c_int, message: *mut libc::msghdr, flags: c_int) -
         }
         let header = libc::CMSG_FIRSTHDR(m);
         let space = libc::CMSG_SPACE(size_of::<libc::ucred>() as u32) as usize;
-        if !header.is_null() && m.msg_controllen as usize >= space {
+        if !header.is_null() && m.msg_controllen >= space {
             (*header).cmsg_len = libc::CMSG_LEN(size_of::<libc::ucred>() as u32) as _;
             (*header).cmsg_level = libc::SOL_SOCKET;
             (*header).cmsg_type = libc::SCM_CREDENTIALS;
