@@ -7,8 +7,8 @@
 //! **Only this crate knows bytes on a wire.** Nothing here knows about scenes, rendering or the GPU.
 #![cfg_attr(not(feature = "std"), no_std)]
 
-pub mod link;
 pub mod dlpc900;
+pub mod link;
 pub mod planes;
 pub mod pose;
 pub mod time;
