@@ -9,6 +9,7 @@
 
 pub mod dlpc900;
 pub mod link;
+pub mod clock_map;
 pub mod planes;
 pub mod pose;
 pub mod time;

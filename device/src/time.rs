@@ -18,6 +18,18 @@ impl HostTime {
     }
 }
 
+/// Where "now" comes from: the monotonic clock in a deployed rig, a counter in a test. Any `Fn() -> HostTime` is one.
+pub trait HostClock: Send + Sync {
+    /// The present instant; never earlier than the answer before.
+    fn now(&self) -> HostTime;
+}
+
+impl<F: Fn() -> HostTime + Send + Sync> HostClock for F {
+    fn now(&self) -> HostTime {
+        self()
+    }
+}
+
 /// An instant on a device's own clock, in that device's ticks. Mapped to [`HostTime`] by echo exchanges, never compared directly.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, PartialOrd, Ord, Hash)]
 pub struct DeviceTicks(pub u64);

@@ -1,6 +1,9 @@
 //! Trackers: sources of rigid-body poses with the instant at which the light for them was captured.
 
 mod gate;
+pub mod natnet;
+#[cfg(feature = "net")]
+mod udp;
 
 pub use gate::{PacketCounters, SampleCounters, SampleGate, TrackerCounters};
 
@@ -10,6 +13,15 @@ use crate::time::HostTime;
 /// Index of a tracked body in the order the rig file names them.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Hash)]
 pub struct BodyIndex(pub u16);
+
+/// How the rig file names a body to a tracker; a body's index is its place in the list of keys.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct BodyKey {
+    /// Name in the tracking software; used where the tracker tells names.
+    pub name: String,
+    /// Number in the tracking software; used where it does not.
+    pub id: Option<i64>,
+}
 
 /// One pose of one body as a tracker reported it.
 #[derive(Clone, Copy, Debug, PartialEq)]

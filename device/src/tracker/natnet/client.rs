@@ -1,0 +1,648 @@
+//! The conversation with a NatNet server: connecting, names, clock, frames in and samples out, all inside [`Tracker::poll`].
+//!
+//! Nothing here waits: a poll reads at most [`NatNetClient::MAX_DATAGRAMS_PER_POLL`] datagrams and sends what is due.
+
+use super::frame::{decode_frame, FrameInfo, RigidBody};
+use super::messages as msg;
+use super::models::{decode_models, BodyModel};
+use super::wire::{id, split, Version, MAX_DATAGRAM};
+use crate::clock_map::{ClockMap, ExchangeOutcome};
+use crate::pose::Pose;
+use crate::time::{DeviceTicks, HostClock, HostTime};
+use crate::tracker::udp::{realtime_ns, Arrival, UdpPort};
+use crate::tracker::{BodyIndex, BodyKey, SampleGate, Tracker, TrackerCounters, TrackerError, TrackerSample};
+use std::net::{Ipv4Addr, SocketAddrV4};
+use std::sync::Arc;
+
+const MS: i64 = 1_000_000;
+/// Between two attempts to connect.
+const CONNECT_EVERY_NS: i64 = 250 * MS;
+/// Between two keep-alive messages (unicast servers stop after some seconds without).
+const KEEP_ALIVE_EVERY_NS: i64 = 250 * MS;
+/// Between two requests for model definitions, while names are missing.
+const MODELS_EVERY_NS: i64 = 1_000 * MS;
+/// A server that was silent for this long is connected to anew.
+const SILENCE_NS: i64 = 2_000 * MS;
+/// Echo probes: this many quickly, the rest slowly.
+const QUICK_PROBES: u32 = 20;
+const QUICK_PROBE_EVERY_NS: i64 = 5 * MS;
+const PROBE_EVERY_NS: i64 = 100 * MS;
+/// A transmission that seems to have taken longer than this means that the server's clock stepped.
+const WORST_TRANSPORT_NS: i64 = 500 * MS;
+/// Distinct unknown body numbers remembered for the report.
+const MAX_STRANGERS: usize = 16;
+
+/// How to reach a NatNet server.
+#[derive(Clone, Debug)]
+pub struct NatNetConfig {
+    /// Address of the server; datagrams from elsewhere are dropped.
+    pub server: Ipv4Addr,
+    /// Address of the interface to use; unspecified lets the system choose.
+    pub local: Ipv4Addr,
+    /// Group for multicast; `None` for unicast.
+    pub multicast: Option<Ipv4Addr>,
+    /// Port for commands, 1510 by convention.
+    pub command_port: u16,
+    /// Port for frames, 1511 by convention.
+    pub data_port: u16,
+    /// Bit stream to ask for; `None` takes what the server speaks. Unicast only, servers from 4.0.
+    pub bitstream: Option<Version>,
+    /// The rig's bodies.
+    pub bodies: Vec<BodyKey>,
+}
+
+impl NatNetConfig {
+    /// Unicast from `server` on the conventional ports.
+    pub fn unicast(server: Ipv4Addr, bodies: Vec<BodyKey>) -> Self {
+        Self {
+            server,
+            local: Ipv4Addr::UNSPECIFIED,
+            multicast: None,
+            command_port: 1510,
+            data_port: 1511,
+            bitstream: None,
+            bodies,
+        }
+    }
+}
+
+/// Why no pose comes.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub enum Silence {
+    /// The server never answered.
+    NoAnswer,
+    /// The server speaks a version that this client does not.
+    Version(Version),
+    /// The server answered once and then fell silent.
+    WentSilent,
+    /// The server answers but no frame has come.
+    NoFrames,
+    /// Frames come but none can be read.
+    Unreadable,
+    /// Frames come without any of the rig's bodies.
+    NoKnownBody,
+    /// The bodies come, marked as not tracked.
+    NotTracked,
+}
+
+/// A NatNet client for a fixed set of bodies.
+pub struct NatNetClient {
+    config: NatNetConfig,
+    clock: Arc<dyn HostClock>,
+    command: UdpPort,
+    /// Group socket, or the conventional unicast data port where it could be bound.
+    data: Option<UdpPort>,
+    data_problem: Option<String>,
+    gate: SampleGate,
+    server: Option<msg::ServerInfo>,
+    version: Version,
+    models: Vec<BodyModel>,
+    /// Streaming number to body, sorted by number.
+    lookup: Vec<(i32, BodyIndex)>,
+    strangers: Vec<i32>,
+    frame: Vec<RigidBody>,
+    buffer: Vec<u8>,
+    out: Vec<u8>,
+    map: Option<ClockMap>,
+    probes: Probes,
+    due: Due,
+    heard_at: Option<HostTime>,
+    frames: u64,
+    connects_sent: u64,
+    version_changes: u64,
+    clock_doubts: u64,
+    is_filtered: bool,
+    refused: Option<Version>,
+}
+
+/// Echo requests under way.
+#[derive(Default)]
+struct Probes {
+    under_way: [Option<i64>; 8],
+    next: usize,
+    sent: u32,
+    answered: u64,
+}
+
+/// When to send what next.
+#[derive(Clone, Copy)]
+struct Due {
+    connect: HostTime,
+    keep_alive: HostTime,
+    models: HostTime,
+    probe: HostTime,
+}
+
+impl NatNetClient {
+    /// Most datagrams read in one poll; more wait for the next.
+    pub const MAX_DATAGRAMS_PER_POLL: usize = 64;
+
+    /// Opens the sockets; the server is looked for by polling. `clock` is the host's clock, the one `poll` is called with.
+    pub fn open(config: NatNetConfig, clock: Arc<dyn HostClock>) -> Result<Self, TrackerError> {
+        let failed = |context: String| move |source| TrackerError::Io { context, source };
+        let local = SocketAddrV4::new(config.local, 0);
+        let command = UdpPort::bind(local, false).map_err(failed(format!(
+            "NatNet: cannot open a UDP socket on {}; `local` must be the address of an interface of this machine",
+            config.local
+        )))?;
+        let mut data_problem = None;
+        let data = match config.multicast {
+            Some(group) => {
+                if !group.is_multicast() {
+                    return Err(TrackerError::Protocol(format!(
+                        "NatNet: {group} is not a multicast group (224.0.0.0 to 239.255.255.255)"
+                    )));
+                }
+                let address = SocketAddrV4::new(group, config.data_port);
+                let port = UdpPort::bind(address, true)
+                    .map_err(failed(format!("NatNet: cannot bind {address} for frames")))?;
+                port.join(group, Some(config.server), config.local).map_err(failed(format!(
+                    "NatNet: cannot join {group} on interface {}; set `local` to the address of the interface \
+                     that the tracker is connected to",
+                    config.local
+                )))?;
+                Some(port)
+            }
+            // Servers differ in where they send unicast frames: to the socket that connected, or to the data port. Both are heard.
+            None => match UdpPort::bind(SocketAddrV4::new(config.local, config.data_port), false) {
+                Ok(port) => Some(port),
+                Err(e) => {
+                    data_problem = Some(format!("port {} not heard ({e})", config.data_port));
+                    None
+                }
+            },
+        };
+        let now = clock.now();
+        let mut lookup: Vec<(i32, BodyIndex)> = Vec::with_capacity(config.bodies.len());
+        for (i, body) in config.bodies.iter().enumerate() {
+            if let Some(id) = body.id.and_then(|id| i32::try_from(id).ok()) {
+                lookup.push((id, BodyIndex(i as u16)));
+            }
+        }
+        lookup.sort_unstable_by_key(|(id, _)| *id);
+        Ok(Self {
+            gate: SampleGate::new(config.bodies.len()),
+            config,
+            clock,
+            command,
+            data,
+            data_problem,
+            server: None,
+            version: Version::V3_0,
+            models: Vec::new(),
+            lookup,
+            strangers: Vec::with_capacity(MAX_STRANGERS),
+            frame: Vec::with_capacity(MAX_DATAGRAM / RigidBody::BYTES + 1),
+            buffer: vec![0; MAX_DATAGRAM],
+            out: Vec::with_capacity(1024),
+            map: None,
+            probes: Probes::default(),
+            due: Due { connect: now, keep_alive: now, models: now, probe: now },
+            heard_at: None,
+            frames: 0,
+            connects_sent: 0,
+            version_changes: 0,
+            clock_doubts: 0,
+            is_filtered: false,
+            refused: None,
+        })
+    }
+
+    /// What became of all that arrived.
+    pub fn counters(&self) -> &TrackerCounters {
+        self.gate.counters()
+    }
+
+    /// What the server said of itself, once it has.
+    pub fn server(&self) -> Option<&msg::ServerInfo> {
+        self.server.as_ref()
+    }
+
+    /// Version that frames are read as.
+    pub fn version(&self) -> Version {
+        self.version
+    }
+
+    /// Rigid bodies by the server's names.
+    pub fn models(&self) -> &[BodyModel] {
+        &self.models
+    }
+
+    /// The map of the server's clock, once an echo was answered.
+    pub fn clock_map(&self) -> Option<&ClockMap> {
+        self.map.as_ref().filter(|m| m.is_ready())
+    }
+
+    /// Local port of the command socket.
+    pub fn command_port(&self) -> u16 {
+        self.command.local().map_or(0, |a| a.port())
+    }
+
+    /// Why no pose comes; `None` while poses come.
+    pub fn silence(&self) -> Option<Silence> {
+        let c = self.gate.counters();
+        let quiet = self.heard_at.is_some_and(|h| self.clock.now().ns_since(h) > SILENCE_NS);
+        if let (None, Some(version)) = (&self.server, self.refused) {
+            return Some(Silence::Version(version));
+        }
+        if self.server.is_none() && self.connects_sent > 0 && self.frames == 0 {
+            return Some(if self.heard_at.is_some() && quiet {
+                Silence::WentSilent
+            } else {
+                Silence::NoAnswer
+            });
+        }
+        if quiet {
+            return Some(Silence::WentSilent);
+        }
+        if self.frames == 0 {
+            let unreadable = c.packets.malformed > 0;
+            return Some(if unreadable { Silence::Unreadable } else { Silence::NoFrames });
+        }
+        if c.samples.used == 0 {
+            return Some(Silence::NoKnownBody);
+        }
+        (c.untracked == c.samples.used).then_some(Silence::NotTracked)
+    }
+
+    fn send(&mut self, to_port: u16) {
+        let to = SocketAddrV4::new(self.config.server, to_port);
+        // A failed send shows as silence, with its reason in `status`; the next one is at most a second away.
+        let _ = self.command.send(&self.out, to);
+    }
+
+    fn housekeeping(&mut self, now: HostTime) {
+        let port = self.config.command_port;
+        if self.heard_at.is_some_and(|h| now.ns_since(h) > SILENCE_NS) && self.server.is_some() {
+            self.forget_server(now);
+        }
+        if now >= self.due.connect && self.server.is_none() {
+            self.connect(now);
+        }
+        if self.server.is_none() {
+            return;
+        }
+        if now >= self.due.models && self.is_name_missing() {
+            self.due.models = now.plus_ns(MODELS_EVERY_NS);
+            msg::encode_empty(&mut self.out, id::REQUEST_MODEL_DEF);
+            self.send(port);
+        }
+        if now >= self.due.keep_alive && self.config.multicast.is_none() {
+            self.due.keep_alive = now.plus_ns(KEEP_ALIVE_EVERY_NS);
+            msg::encode_empty(&mut self.out, id::KEEP_ALIVE);
+            self.send(port);
+        }
+        if now >= self.due.probe && self.map.is_some() {
+            let quick = self.probes.sent < QUICK_PROBES;
+            self.due.probe = now.plus_ns(if quick { QUICK_PROBE_EVERY_NS } else { PROBE_EVERY_NS });
+            self.probes.sent = self.probes.sent.saturating_add(1);
+            // The stamp is taken as late as possible: what lies between it and the wire counts as round trip.
+            let t1 = self.clock.now().0;
+            self.probes.under_way[self.probes.next] = Some(t1);
+            self.probes.next = (self.probes.next + 1) % self.probes.under_way.len();
+            msg::encode_echo_request(&mut self.out, t1 as u64);
+            self.send(port);
+        }
+    }
+
+    fn connect(&mut self, now: HostTime) {
+        self.due.connect = now.plus_ns(CONNECT_EVERY_NS);
+        self.connects_sent += 1;
+        let bitstream = self.config.bitstream;
+        msg::Connect { name: "dpm".into(), bitstream }.encode(&mut self.out);
+        self.send(self.config.command_port);
+    }
+
+    fn forget_server(&mut self, now: HostTime) {
+        self.server = None;
+        self.map = None;
+        self.probes = Probes::default();
+        self.due = Due { connect: now, keep_alive: now, models: now, probe: now };
+    }
+
+    /// True while the server has not told its names.
+    fn is_name_missing(&self) -> bool {
+        self.models.is_empty()
+    }
+
+    /// Bodies by the server's names where it knows them, by the rig file's numbers otherwise.
+    fn rebuild_lookup(&mut self) {
+        self.lookup.clear();
+        for (i, body) in self.config.bodies.iter().enumerate() {
+            let named = self.models.iter().find(|m| m.name == body.name).map(|m| m.id);
+            let given = body.id.and_then(|id| i32::try_from(id).ok());
+            if let Some(id) = named.or(given) {
+                self.lookup.push((id, BodyIndex(i as u16)));
+            }
+        }
+        self.lookup.sort_unstable_by_key(|(id, _)| *id);
+        self.strangers.clear();
+    }
+
+    /// Handles the datagram of `arrival` in the buffer; returns how many samples went to `sink`.
+    fn take_in(&mut self, arrival: Arrival, at: HostTime, sink: &mut dyn FnMut(&TrackerSample)) -> usize {
+        let packets = self.gate.packets_mut();
+        packets.received += 1;
+        if *arrival.from.ip() != self.config.server {
+            packets.foreign_source += 1;
+            return 0;
+        }
+        self.heard_at = Some(at);
+        // The buffer is lent out while the datagram in it is read.
+        let buffer = std::mem::take(&mut self.buffer);
+        let result =
+            if arrival.cut { Verdict::Malformed } else { self.handle(&buffer[..arrival.len], at, sink) };
+        self.buffer = buffer;
+        let packets = self.gate.packets_mut();
+        match result {
+            Verdict::Used(samples) => {
+                packets.used += 1;
+                return samples;
+            }
+            Verdict::Malformed => packets.malformed += 1,
+            Verdict::Unsupported => packets.unsupported += 1,
+        }
+        0
+    }
+
+    fn handle(&mut self, datagram: &[u8], at: HostTime, sink: &mut dyn FnMut(&TrackerSample)) -> Verdict {
+        let Ok((message, payload)) = split(datagram) else {
+            return Verdict::Malformed;
+        };
+        match message {
+            id::FRAME => self.on_frame(payload, at, sink),
+            id::SERVER_INFO => self.on_server_info(payload, at),
+            id::MODEL_DEF => match decode_models(payload, self.version) {
+                Ok(models) => {
+                    self.models = models;
+                    self.rebuild_lookup();
+                    Verdict::Used(0)
+                }
+                Err(_) => Verdict::Malformed,
+            },
+            id::ECHO_RESPONSE => self.on_echo(payload, at),
+            id::RESPONSE | id::MESSAGE_STRING | id::UNRECOGNIZED => Verdict::Used(0),
+            id::DISCONNECT | id::DISCONNECT_BY_TIMEOUT => {
+                self.forget_server(at);
+                Verdict::Used(0)
+            }
+            _ => Verdict::Unsupported,
+        }
+    }
+
+    fn on_server_info(&mut self, payload: &[u8], at: HostTime) -> Verdict {
+        let info = match msg::ServerInfo::decode(payload) {
+            Ok(info) => info,
+            Err(super::WireError::Version(version)) => {
+                self.refused = Some(version);
+                return Verdict::Unsupported;
+            }
+            Err(_) => return Verdict::Malformed,
+        };
+        if self.server.as_ref().is_some_and(|s| s.version() != info.version()) {
+            self.version_changes += 1;
+        }
+        self.version = info.version();
+        let same_clock = self.server.as_ref().is_some_and(|s| s.clock_hz == info.clock_hz);
+        if !same_clock || self.map.is_none() {
+            self.map = ClockMap::new(info.clock_hz).ok();
+            self.probes = Probes::default();
+            self.due.probe = at;
+        }
+        if let (Some(wanted), None) = (self.config.bitstream, self.config.multicast) {
+            if wanted != info.version() && info.version() >= Version::V4_0 {
+                msg::encode_request(&mut self.out, &format!("Bitstream,{wanted}"));
+                self.send(self.config.command_port);
+            }
+        }
+        self.server = Some(info);
+        Verdict::Used(0)
+    }
+
+    fn on_echo(&mut self, payload: &[u8], at: HostTime) -> Verdict {
+        let Ok((stamp, ticks)) = msg::decode_echo_response(payload) else {
+            return Verdict::Malformed;
+        };
+        let t1 = stamp as i64;
+        // Only answers to questions of ours, each once: an old or invented answer must not move the clock.
+        let Some(slot) = self.probes.under_way.iter_mut().find(|s| **s == Some(t1)) else {
+            return Verdict::Unsupported;
+        };
+        *slot = None;
+        self.probes.answered += 1;
+        if let Some(map) = &mut self.map {
+            let ticks = DeviceTicks(ticks);
+            let outcome = map.add_exchange(HostTime(t1), ticks, ticks, at);
+            if matches!(outcome, ExchangeOutcome::Contradicting | ExchangeOutcome::Stepped) {
+                // Find out quickly whether the clock stepped, and fill the new window quickly.
+                self.probes.sent = 0;
+                self.due.probe = at;
+            }
+        }
+        Verdict::Used(0)
+    }
+
+    fn on_frame(&mut self, payload: &[u8], at: HostTime, sink: &mut dyn FnMut(&TrackerSample)) -> Verdict {
+        let mut bodies = std::mem::take(&mut self.frame);
+        let mut info = decode_frame(payload, self.version, &mut bodies);
+        if info.is_err() {
+            // Frames have two layouts, with and without section sizes. If the other one fits, the stream was switched under us.
+            let other = if self.version.has_section_sizes() { Version::V4_0 } else { Version::V4_1 };
+            info = decode_frame(payload, other, &mut bodies);
+            if info.is_ok() {
+                self.version = other;
+                self.version_changes += u64::from(self.server.is_some());
+                self.connect(at);
+            }
+        }
+        let verdict = match info {
+            Ok(info) => {
+                self.frames += 1;
+                self.heed(&info, at);
+                Verdict::Used(self.deliver(&info, &bodies, at, sink))
+            }
+            Err(_) => Verdict::Malformed,
+        };
+        self.frame = bodies;
+        verdict
+    }
+
+    /// What a frame says besides poses.
+    fn heed(&mut self, info: &FrameInfo, at: HostTime) {
+        if info.params & FrameInfo::MODELS_CHANGED != 0 && at >= self.due.models {
+            self.due.models = at.plus_ns(MODELS_EVERY_NS);
+            msg::encode_empty(&mut self.out, id::REQUEST_MODEL_DEF);
+            self.send(self.config.command_port);
+        }
+        if info.params & FrameInfo::BITSTREAM_CHANGED != 0 && at >= self.due.connect {
+            self.connect(at);
+        }
+    }
+
+    fn deliver(
+        &mut self,
+        info: &FrameInfo,
+        bodies: &[RigidBody],
+        at: HostTime,
+        sink: &mut dyn FnMut(&TrackerSample),
+    ) -> usize {
+        let captured_at = self.captured_at(info, at);
+        let mut delivered = 0;
+        for body in bodies {
+            let Ok(found) = self.lookup.binary_search_by_key(&body.id, |(id, _)| *id) else {
+                self.gate.count_unknown();
+                if self.strangers.len() < MAX_STRANGERS && !self.strangers.contains(&body.id) {
+                    self.strangers.push(body.id);
+                }
+                continue;
+            };
+            let sample = TrackerSample {
+                body: self.lookup[found].1,
+                pose: Pose {
+                    position_m: body.position.map(f64::from),
+                    rotation_xyzw: body.rotation_xyzw.map(f64::from),
+                },
+                tracked: body.is_tracked(),
+                mean_error_m: body.mean_error,
+                sequence: info.number as u32,
+                captured_at,
+                received_at: at,
+            };
+            if let Some(sample) = self.gate.admit(&sample) {
+                sink(&sample);
+                delivered += 1;
+            }
+        }
+        delivered
+    }
+
+    /// Middle of the exposure on the host's clock: through the map where there is one, otherwise arrival less the server's own
+    /// latency, which leaves out only the way through the network.
+    fn captured_at(&mut self, info: &FrameInfo, at: HostTime) -> HostTime {
+        let hz = self.server.as_ref().map_or(0, |s| s.clock_hz);
+        let latency_ticks = info.transmit.wrapping_sub(info.mid_exposure);
+        let has_stamps = info.mid_exposure != 0 && info.transmit >= info.mid_exposure && hz > 0;
+        let latency_ns = if has_stamps {
+            i64::try_from(u128::from(latency_ticks) * 1_000_000_000 / u128::from(hz)).unwrap_or(i64::MAX)
+        } else {
+            0
+        };
+        let plain = if latency_ns <= 1_000 * MS { at.plus_ns(-latency_ns) } else { at };
+        let Some(map) = self.map.as_mut().filter(|m| m.is_ready() && has_stamps) else {
+            return plain;
+        };
+        let (Some(sent), Some(mapped)) =
+            (map.to_host(DeviceTicks(info.transmit)), map.to_host(DeviceTicks(info.mid_exposure)))
+        else {
+            return plain;
+        };
+        // Sent after it arrived, or half a second under way: the server's clock is not what it was. Start its map anew.
+        let transport_ns = at.ns_since(sent.at);
+        if transport_ns < -sent.uncertainty_ns - MS || transport_ns > WORST_TRANSPORT_NS {
+            self.clock_doubts += 1;
+            self.map = ClockMap::new(hz).ok();
+            self.probes = Probes::default();
+            self.due.probe = at;
+            return plain;
+        }
+        mapped.at.min(at)
+    }
+
+    /// Difference from the kernel's stamp clock to the host's clock, by the tightest of three readings.
+    fn realtime_offset(&self) -> i64 {
+        let mut best = (i64::MAX, 0);
+        for _ in 0..3 {
+            let before = self.clock.now().0;
+            let real = realtime_ns();
+            let after = self.clock.now().0;
+            let width = after.saturating_sub(before);
+            if width < best.0 {
+                best = (width, before + width / 2 - real);
+            }
+            if width < 5_000 {
+                break;
+            }
+        }
+        best.1
+    }
+}
+
+enum Verdict {
+    Used(usize),
+    Malformed,
+    Unsupported,
+}
+
+impl Tracker for NatNetClient {
+    fn poll(&mut self, now: HostTime, sink: &mut dyn FnMut(&TrackerSample)) -> Result<usize, TrackerError> {
+        self.housekeeping(now);
+        let foreign_before = self.gate.counters().packets.foreign_source;
+        let (mut delivered, mut budget, mut offset) = (0, Self::MAX_DATAGRAMS_PER_POLL, None);
+        // Commands first: names and clock before the frames that need them. They are few; frames get the rest of the budget.
+        for is_data in [false, true] {
+            let mut share = if is_data { budget } else { Self::MAX_DATAGRAMS_PER_POLL / 2 };
+            while share > 0 && budget > 0 {
+                let port = if is_data { self.data.as_ref() } else { Some(&self.command) };
+                let Some(port) = port else { break };
+                let arrival = port.receive(&mut self.buffer).map_err(|source| TrackerError::Io {
+                    context: "NatNet: receiving failed; is the network interface still up?".into(),
+                    source,
+                })?;
+                let Some(arrival) = arrival else { break };
+                share -= 1;
+                budget -= 1;
+                let here = self.clock.now();
+                let offset = *offset.get_or_insert_with(|| self.realtime_offset());
+                // A stamp from the future or from long ago is a stepped wall clock, not an arrival.
+                let stamped = arrival.kernel_ns.map(|ns| HostTime(ns.saturating_add(offset)));
+                let at = stamped.map_or(here, |s| s.min(here));
+                let at = if here.ns_since(at) > 10_000 * MS { here } else { at };
+                delivered += self.take_in(arrival, at, sink);
+            }
+        }
+        let foreign = self.gate.counters().packets.foreign_source - foreign_before;
+        if budget == 0 && foreign > 0 && !self.is_filtered {
+            // Strangers fill the queue: let the kernel throw them away from now on, uncounted.
+            self.is_filtered = true;
+            for port in std::iter::once(&self.command).chain(&self.data) {
+                let _ = port.keep_only(self.config.server);
+            }
+        }
+        Ok(delivered)
+    }
+
+    fn name(&self) -> &str {
+        "natnet"
+    }
+
+    fn status(&self) -> String {
+        super::report::status(self)
+    }
+}
+
+/// What [`super::report`] needs to know and nobody else.
+pub(super) struct Inside<'a> {
+    pub config: &'a NatNetConfig,
+    pub strangers: &'a [i32],
+    pub connects_sent: u64,
+    pub version_changes: u64,
+    pub clock_doubts: u64,
+    pub echoes: u64,
+    pub is_filtered: bool,
+    pub data_problem: Option<&'a str>,
+}
+
+impl NatNetClient {
+    pub(super) fn inside(&self) -> Inside<'_> {
+        Inside {
+            config: &self.config,
+            strangers: &self.strangers,
+            connects_sent: self.connects_sent,
+            version_changes: self.version_changes,
+            clock_doubts: self.clock_doubts,
+            echoes: self.probes.answered,
+            is_filtered: self.is_filtered,
+            data_problem: self.data_problem.as_deref(),
+        }
+    }
+}

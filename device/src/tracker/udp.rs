@@ -1,0 +1,194 @@
+//! A UDP socket with what trackers need and the standard library lacks: options before binding, multicast by source, the kernel's
+//! own arrival stamps, and a filter by source address inside the kernel.
+#![allow(unsafe_code)]
+
+use std::io;
+use std::mem::{size_of, zeroed};
+use std::net::{Ipv4Addr, SocketAddrV4, UdpSocket};
+use std::os::fd::{AsRawFd, FromRawFd};
+
+/// A received datagram; the bytes lie in the caller's buffer.
+#[derive(Clone, Copy, Debug)]
+pub(crate) struct Arrival {
+    /// Bytes stored.
+    pub len: usize,
+    /// Sender.
+    pub from: SocketAddrV4,
+    /// When the kernel took it in, nanoseconds of `CLOCK_REALTIME`; `None` when the kernel gave no stamp.
+    pub kernel_ns: Option<i64>,
+    /// True when the datagram was longer than the buffer.
+    pub cut: bool,
+}
+
+/// A non-blocking IPv4 UDP socket.
+pub(crate) struct UdpPort {
+    socket: UdpSocket,
+}
+
+/// Receive buffer asked for: a tenth of a second of the largest frames at 500 Hz; the kernel may grant less.
+const RECEIVE_BUFFER_BYTES: libc::c_int = 4 << 20;
+
+impl UdpPort {
+    /// Binds `local`. `shared` allows other programs on the same address and port, as several clients of one group need.
+    pub fn bind(local: SocketAddrV4, shared: bool) -> io::Result<Self> {
+        // SAFETY: plain system call; the descriptor, if not negative, is new and owned by nobody else.
+        let fd = unsafe {
+            libc::socket(libc::AF_INET, libc::SOCK_DGRAM | libc::SOCK_NONBLOCK | libc::SOCK_CLOEXEC, 0)
+        };
+        if fd < 0 {
+            return Err(io::Error::last_os_error());
+        }
+        // SAFETY: `fd` was just created above and is handed over whole; the socket closes it on every path from here on.
+        let port = Self { socket: unsafe { UdpSocket::from_raw_fd(fd) } };
+        if shared {
+            port.set(libc::SOL_SOCKET, libc::SO_REUSEADDR, &1i32)?;
+        }
+        // Arrival stamps and a larger buffer are improvements, not conditions.
+        let _ = port.set(libc::SOL_SOCKET, libc::SO_TIMESTAMPNS, &1i32);
+        let _ = port.set(libc::SOL_SOCKET, libc::SO_RCVBUF, &RECEIVE_BUFFER_BYTES);
+        // Only groups joined by this very socket, not those of other programs on this machine.
+        let _ = port.set(libc::IPPROTO_IP, libc::IP_MULTICAST_ALL, &0i32);
+        let address = raw_address(local);
+        // SAFETY: `address` is a whole `sockaddr_in` that lives across the call, and its true size is given.
+        let rc = unsafe {
+            let pointer = std::ptr::from_ref(&address).cast::<libc::sockaddr>();
+            libc::bind(port.socket.as_raw_fd(), pointer, size_of::<libc::sockaddr_in>() as libc::socklen_t)
+        };
+        if rc < 0 {
+            return Err(io::Error::last_os_error());
+        }
+        Ok(port)
+    }
+
+    /// Joins `group` on the interface with address `interface`. Given a `source`, only its datagrams come through.
+    pub fn join(&self, group: Ipv4Addr, source: Option<Ipv4Addr>, interface: Ipv4Addr) -> io::Result<()> {
+        let raw = |a: Ipv4Addr| libc::in_addr { s_addr: u32::from(a).to_be() };
+        match source {
+            Some(source) => {
+                let request = libc::ip_mreq_source {
+                    imr_multiaddr: raw(group),
+                    imr_interface: raw(interface),
+                    imr_sourceaddr: raw(source),
+                };
+                self.set(libc::IPPROTO_IP, libc::IP_ADD_SOURCE_MEMBERSHIP, &request)
+            }
+            None => self.socket.join_multicast_v4(&group, &interface),
+        }
+    }
+
+    /// Lets the kernel drop, before they are queued, all datagrams that are not from `source`.
+    pub fn keep_only(&self, source: Ipv4Addr) -> io::Result<()> {
+        // Classic BPF. SKF_NET_OFF (-0x100000) addresses the IP header; the source address is its word at 12.
+        const NET_HEADER: u32 = (-0x10_0000i32) as u32;
+        let op = |code, jt, jf, k| libc::sock_filter { code, jt, jf, k };
+        let mut program = [
+            op((libc::BPF_LD | libc::BPF_W | libc::BPF_ABS) as u16, 0, 0, NET_HEADER + 12),
+            op((libc::BPF_JMP | libc::BPF_JEQ | libc::BPF_K) as u16, 0, 1, u32::from(source)),
+            op((libc::BPF_RET | libc::BPF_K) as u16, 0, 0, u32::MAX),
+            op((libc::BPF_RET | libc::BPF_K) as u16, 0, 0, 0),
+        ];
+        let filter = libc::sock_fprog { len: program.len() as u16, filter: program.as_mut_ptr() };
+        self.set(libc::SOL_SOCKET, libc::SO_ATTACH_FILTER, &filter)
+    }
+
+    /// The next datagram waiting, `None` when there is none. Never waits.
+    pub fn receive(&self, buffer: &mut [u8]) -> io::Result<Option<Arrival>> {
+        let mut control = [0u64; 8];
+        let mut from: libc::sockaddr_in = unset();
+        let mut piece = libc::iovec { iov_base: buffer.as_mut_ptr().cast(), iov_len: buffer.len() };
+        let mut message: libc::msghdr = unset();
+        message.msg_name = std::ptr::from_mut(&mut from).cast();
+        message.msg_namelen = size_of::<libc::sockaddr_in>() as libc::socklen_t;
+        message.msg_iov = &mut piece;
+        message.msg_iovlen = 1;
+        message.msg_control = control.as_mut_ptr().cast();
+        message.msg_controllen = size_of::<[u64; 8]>() as _;
+        // SAFETY: every pointer in `message` refers to a live local or to `buffer`, each with its true length, and the kernel
+        // keeps none of them beyond the call.
+        let n = unsafe { libc::recvmsg(self.socket.as_raw_fd(), &mut message, libc::MSG_DONTWAIT) };
+        if n < 0 {
+            let error = io::Error::last_os_error();
+            return match error.kind() {
+                // ConnectionRefused reports an earlier send that found no listener; the conversation's timeouts deal with that.
+                io::ErrorKind::WouldBlock | io::ErrorKind::Interrupted | io::ErrorKind::ConnectionRefused => {
+                    Ok(None)
+                }
+                _ => Err(error),
+            };
+        }
+        let address = Ipv4Addr::from(u32::from_be(from.sin_addr.s_addr));
+        Ok(Some(Arrival {
+            len: n as usize,
+            from: SocketAddrV4::new(address, u16::from_be(from.sin_port)),
+            kernel_ns: kernel_stamp(&message),
+            cut: message.msg_flags & libc::MSG_TRUNC != 0,
+        }))
+    }
+
+    /// Sends one datagram; a full buffer or an unreachable peer is an error, not a wait.
+    pub fn send(&self, bytes: &[u8], to: SocketAddrV4) -> io::Result<()> {
+        self.socket.send_to(bytes, to).map(drop)
+    }
+
+    /// The address bound.
+    pub fn local(&self) -> io::Result<SocketAddrV4> {
+        match self.socket.local_addr()? {
+            std::net::SocketAddr::V4(a) => Ok(a),
+            std::net::SocketAddr::V6(_) => Err(io::ErrorKind::Unsupported.into()),
+        }
+    }
+
+    fn set<T>(&self, level: libc::c_int, name: libc::c_int, value: &T) -> io::Result<()> {
+        let size = size_of::<T>() as libc::socklen_t;
+        // SAFETY: `value` is a live, initialised plain-data struct of the type that option `name` takes (see the callers), and its
+        // true size is given; the kernel copies it before the call returns.
+        let rc = unsafe {
+            libc::setsockopt(self.socket.as_raw_fd(), level, name, std::ptr::from_ref(value).cast(), size)
+        };
+        if rc < 0 {
+            Err(io::Error::last_os_error())
+        } else {
+            Ok(())
+        }
+    }
+}
+
+/// `CLOCK_REALTIME` now, nanoseconds: the clock of the kernel's stamps.
+pub(crate) fn realtime_ns() -> i64 {
+    let mut t: libc::timespec = unset();
+    // SAFETY: `t` is a live timespec; CLOCK_REALTIME exists on every Linux.
+    unsafe { libc::clock_gettime(libc::CLOCK_REALTIME, &mut t) };
+    t.tv_sec * 1_000_000_000 + t.tv_nsec
+}
+
+/// A C struct of all zeros.
+fn unset<T: Copy>() -> T {
+    // SAFETY: used in this file for `sockaddr_in`, `msghdr` and `timespec` only, plain C structs of integers and pointers for which
+    // all-zero bytes are a value.
+    unsafe { zeroed() }
+}
+
+fn raw_address(a: SocketAddrV4) -> libc::sockaddr_in {
+    let mut raw: libc::sockaddr_in = unset();
+    raw.sin_family = libc::AF_INET as libc::sa_family_t;
+    raw.sin_port = a.port().to_be();
+    raw.sin_addr.s_addr = u32::from(*a.ip()).to_be();
+    raw
+}
+
+/// The arrival stamp among the control messages.
+fn kernel_stamp(message: &libc::msghdr) -> Option<i64> {
+    // SAFETY: the CMSG functions walk inside `msg_control`, whose length the kernel has just set, and return null at its end; a
+    // header they return is whole, and SCM_TIMESTAMPNS carries one timespec, read unaligned.
+    unsafe {
+        let mut header = libc::CMSG_FIRSTHDR(message);
+        while !header.is_null() {
+            if (*header).cmsg_level == libc::SOL_SOCKET && (*header).cmsg_type == libc::SCM_TIMESTAMPNS {
+                let t = std::ptr::read_unaligned(libc::CMSG_DATA(header).cast::<libc::timespec>());
+                return Some(t.tv_sec * 1_000_000_000 + t.tv_nsec);
+            }
+            header = libc::CMSG_NXTHDR(message, header);
+        }
+    }
+    None
+}
