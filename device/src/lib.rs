@@ -7,9 +7,9 @@
 //! **Only this crate knows bytes on a wire.** Nothing here knows about scenes, rendering or the GPU.
 #![cfg_attr(not(feature = "std"), no_std)]
 
+pub mod clock_map;
 pub mod dlpc900;
 pub mod link;
-pub mod clock_map;
 pub mod planes;
 pub mod pose;
 pub mod time;
