@@ -3,6 +3,7 @@
 //! See `docs/ARCHITECTURE.md` for the picture and one invariant per folder.
 
 pub mod cli;
+pub mod clock;
 pub mod config;
 pub mod failure;
 pub mod files;

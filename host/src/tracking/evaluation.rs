@@ -237,6 +237,11 @@ mod tests {
             ("0.5 m/s, 5 m/s2, 0.8 s", s(0.5, 5.0, 0.8)),
             ("1 m/s, 50 m/s2, 0.3 s", s(1.0, 50.0, 0.3)),
             ("1 m/s, 50 m/s2, 0.5 s", s(1.0, 50.0, 0.5)),
+            ("sine 0.5 m/s 5 m/s2", TestMotion::Harmonic(DVec3::X * 0.05, 10.0 / std::f64::consts::TAU)),
+            (
+                "sine 0.5 m/s 5 m/s2 diag",
+                TestMotion::Harmonic(DVec3::ONE.normalize() * 0.05, 10.0 / std::f64::consts::TAU),
+            ),
             ("harmonic 0.1 m 1 Hz", TestMotion::Harmonic(DVec3::X * 0.1, 1.0)),
             ("harmonic 0.1 m 3 Hz", TestMotion::Harmonic(DVec3::X * 0.1, 3.0)),
             ("circle 0.1 m 6 rad/s", TestMotion::Circle(0.1, 6.0)),

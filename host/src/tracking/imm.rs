@@ -4,8 +4,8 @@
 //! needs one that models acceleration and forgets fast. No single process noise serves both, so several filters run side by
 //! side and are weighed by how well each foretold the last samples (interacting multiple models, Blom and Bar-Shalom 1988).
 //!
-//! Noise is taken as isotropic, so one 3x3 covariance (position, velocity, acceleration) serves all three axes. The same
-//! code follows translations and, by way of [`Chart`], rotations.
+//! Every axis of the tangent space has a bank of its own: a body that shuttles along x stays calm in y and z. The same code
+//! follows translations and, by way of [`Chart`], rotations.
 
 use crate::geometry::se3::{so3_between, so3_exp};
 use glam::{DQuat, DVec3};
@@ -48,7 +48,7 @@ impl Chart for Rotations {
     }
 }
 
-/// Symmetric covariance of position p, velocity v and acceleration a, the same on every axis. SI units.
+/// Symmetric covariance of position p, velocity v and acceleration a along one axis. SI units.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 #[allow(missing_docs)] // the names are the entries
 pub struct Covariance {
@@ -69,19 +69,25 @@ impl Covariance {
             + half * (2.0 * self.pa + 2.0 * h * self.va + half * self.aa)
     }
 
-    /// F P F^T for `h` seconds of constant acceleration.
-    fn propagated(&self, h: f64) -> Self {
-        let half = 0.5 * h * h;
-        let pv = self.pv + h * self.vv + half * self.va;
-        let pa = self.pa + h * self.va + half * self.aa;
-        let va = self.va + h * self.aa;
+    /// F P F^T for the transition matrix F.
+    fn propagated(&self, f: &Transition) -> Self {
+        // M = F P, row by row; then M F^T.
+        let row = |r: [f64; 3]| {
+            [
+                r[0] * self.pp + r[1] * self.pv + r[2] * self.pa,
+                r[0] * self.pv + r[1] * self.vv + r[2] * self.va,
+                r[0] * self.pa + r[1] * self.va + r[2] * self.aa,
+            ]
+        };
+        let dot = |a: [f64; 3], b: [f64; 3]| a[0] * b[0] + a[1] * b[1] + a[2] * b[2];
+        let (m0, m1, m2) = (row(f.p), row(f.v), row(f.a));
         Self {
-            pp: self.position_variance_at(h),
-            pv: pv + h * pa,
-            pa,
-            vv: self.vv + h * (self.va + va),
-            va,
-            aa: self.aa,
+            pp: dot(m0, f.p),
+            pv: dot(m0, f.v),
+            pa: dot(m0, f.a),
+            vv: dot(m1, f.v),
+            va: dot(m1, f.a),
+            aa: dot(m2, f.a),
         }
     }
 
@@ -114,20 +120,19 @@ impl Covariance {
         self.aa += w * o.aa;
     }
 
-    /// Spread of the means in a mixture. One direction usually carries all of it (a turn-round), so the squared length is
-    /// taken instead of the mean over axes: the motion's own axis is not understated.
-    fn add_spread(&mut self, dp: DVec3, dv: DVec3, da: DVec3, w: f64) {
-        self.pp += w * dp.length_squared();
-        self.pv += w * dp.dot(dv);
-        self.pa += w * dp.dot(da);
-        self.vv += w * dv.length_squared();
-        self.va += w * dv.dot(da);
-        self.aa += w * da.length_squared();
+    /// Spread of the means in a mixture.
+    fn add_spread(&mut self, dp: f64, dv: f64, da: f64, w: f64) {
+        self.pp += w * dp * dp;
+        self.pv += w * dp * dv;
+        self.pa += w * dp * da;
+        self.vv += w * dv * dv;
+        self.va += w * dv * da;
+        self.aa += w * da * da;
     }
 
     /// Smallest eigenvalue of the symmetric matrix (closed form), for tests and reports.
     pub fn min_eigenvalue(&self) -> f64 {
-        let q = (self.pp + self.vv + self.aa) / 3.0;
+        let q = self.trace() / 3.0;
         let (a, b, c) = (self.pp - q, self.vv - q, self.aa - q);
         let off = self.pv * self.pv + self.pa * self.pa + self.va * self.va;
         let p = ((a * a + b * b + c * c + 2.0 * off) / 6.0).sqrt();
@@ -146,17 +151,45 @@ impl Covariance {
     }
 }
 
-/// How a body is assumed to move between two samples. `noise` drives it: the density of white acceleration (m^2/s^3) for
-/// constant velocity, of white jerk (m^2/s^5) for constant acceleration.
+/// Rows of the matrix that moves (p, v, a) on.
+struct Transition {
+    p: [f64; 3],
+    v: [f64; 3],
+    a: [f64; 3],
+}
+
+/// How a body is assumed to move along one axis between two samples.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct MotionModel {
     /// False: acceleration is zero. True: it is a state.
     pub accelerates: bool,
-    /// Power spectral density of the driving noise.
+    /// Jerk is `-w^2` times velocity: a swing about any centre at this angular frequency, rad/s; 0 is constant acceleration.
+    /// Only where `accelerates`.
+    pub swing_rad_s: f64,
+    /// Power spectral density of the driving noise: white acceleration (m^2/s^3) where the model does not accelerate, else
+    /// white jerk (m^2/s^5).
     pub noise: f64,
 }
 
 impl MotionModel {
+    fn transition(&self, h: f64) -> Transition {
+        if !self.accelerates {
+            return Transition { p: [1.0, h, 0.0], v: [0.0, 1.0, 0.0], a: [0.0; 3] };
+        }
+        let w = self.swing_rad_s;
+        let x = w * h;
+        let (sin, cos) = x.sin_cos();
+        // (1 - cos x) / w^2 by the half angle: no cancellation; both quotients have their limits at w = 0.
+        let (first, second) = if x.abs() < 1e-8 {
+            (h, 0.5 * h * h)
+        } else {
+            let half = (0.5 * x).sin();
+            (sin / w, 2.0 * half * half / (w * w))
+        };
+        Transition { p: [1.0, first, second], v: [0.0, cos, first], a: [0.0, -w * sin, cos] }
+    }
+
+    /// The noise collected in `h` seconds; the swing's feedback changes it by O((w h)^2) and is left out.
     fn process_noise(&self, h: f64) -> Covariance {
         let q = self.noise;
         let (h2, h3) = (h * h, h * h * h);
@@ -184,14 +217,14 @@ pub struct Kinematics<P> {
     pub velocity: DVec3,
     /// Per second squared, world frame.
     pub acceleration: DVec3,
-    /// Of the three.
-    pub covariance: Covariance,
+    /// Of the three, along x, y and z.
+    pub covariance: [Covariance; 3],
 }
 
 impl<P: Copy> Kinematics<P> {
     /// A point that stands still, known to `variance` per axis.
     pub fn held(point: P, variance: f64) -> Self {
-        let covariance = Covariance { pp: variance, ..Covariance::default() };
+        let covariance = [Covariance { pp: variance, ..Covariance::default() }; 3];
         Self { point, velocity: DVec3::ZERO, acceleration: DVec3::ZERO, covariance }
     }
 
@@ -199,22 +232,15 @@ impl<P: Copy> Kinematics<P> {
     pub fn point_at<C: Chart<Point = P>>(&self, h: f64) -> P {
         C::moved(self.point, (self.velocity + self.acceleration * (0.5 * h)) * h)
     }
-
-    fn advance<C: Chart<Point = P>>(&mut self, model: &MotionModel, h: f64) {
-        self.point = self.point_at::<C>(h);
-        self.velocity += self.acceleration * h;
-        self.covariance = self.covariance.propagated(h);
-        self.covariance.add_scaled(&model.process_noise(h), 1.0);
-    }
 }
 
-/// Number of filters in the bank.
-pub const MODES: usize = 3;
+/// Number of filters in a bank.
+pub const MODES: usize = 4;
 
-/// What the bank assumes of motion in general.
+/// What a bank assumes of motion in general.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct ImmConfig {
-    /// The models, calmest first.
+    /// The models.
     pub models: [MotionModel; MODES],
     /// Mean time a mode lasts, seconds: the chance to leave it within `h` is 1 - exp(-h / dwell).
     pub dwell_s: [f64; MODES],
@@ -226,20 +252,25 @@ pub struct ImmConfig {
     pub initial_velocity: f64,
 }
 
-/// The bank of filters at the instant of the last sample.
+/// One filter on one axis. Its position is an offset from the bank's common base point.
+#[derive(Clone, Copy, Debug, Default)]
+struct AxisMode {
+    offset: f64,
+    velocity: f64,
+    acceleration: f64,
+    covariance: Covariance,
+}
+
+/// The filters of one axis.
 #[derive(Clone, Copy, Debug)]
-pub struct Imm<C: Chart> {
-    modes: [Kinematics<C::Point>; MODES],
+struct AxisBank {
+    modes: [AxisMode; MODES],
     probability: [f64; MODES],
 }
 
-impl<C: Chart> Imm<C> {
-    /// Starts at a measured point of variance `r` with unknown velocity.
-    pub fn new(config: &ImmConfig, z: C::Point, r: f64) -> Self {
-        let modes = config.models.map(|model| Kinematics {
-            point: z,
-            velocity: DVec3::ZERO,
-            acceleration: DVec3::ZERO,
+impl AxisBank {
+    fn new(config: &ImmConfig, r: f64) -> Self {
+        let modes = config.models.map(|model| AxisMode {
             covariance: Covariance {
                 pp: r,
                 vv: config.initial_velocity * config.initial_velocity,
@@ -250,111 +281,73 @@ impl<C: Chart> Imm<C> {
                 },
                 ..Covariance::default()
             },
+            ..AxisMode::default()
         });
         Self { modes, probability: [1.0 / MODES as f64; MODES] }
     }
 
-    /// Weight of each model, calmest first; sums to 1.
-    pub fn probability(&self) -> [f64; MODES] {
-        self.probability
-    }
-
-    /// Moment-matched mean and covariance of the bank.
-    pub fn combined(&self) -> Kinematics<C::Point> {
-        Self::mixture(&self.modes, &self.probability, self.likeliest())
-    }
-
-    /// The covariance of each mode, for invariants in tests.
-    pub fn covariances(&self) -> [Covariance; MODES] {
-        self.modes.map(|m| m.covariance)
-    }
-
-    fn likeliest(&self) -> usize {
-        (0..MODES).fold(0, |best, i| if self.probability[i] > self.probability[best] { i } else { best })
-    }
-
-    fn mixture(
-        modes: &[Kinematics<C::Point>; MODES],
-        weight: &[f64; MODES],
-        base: usize,
-    ) -> Kinematics<C::Point> {
-        let origin = modes[base].point;
-        let offset = modes.map(|m| C::between(origin, m.point));
-        let (mut p, mut v, mut a) = (DVec3::ZERO, DVec3::ZERO, DVec3::ZERO);
-        for i in 0..MODES {
-            p += offset[i] * weight[i];
-            v += modes[i].velocity * weight[i];
-            a += modes[i].acceleration * weight[i];
+    /// Moment-matched mean and covariance of weighted modes.
+    fn mixture(modes: &[AxisMode; MODES], weight: &[f64; MODES]) -> AxisMode {
+        let mut mean = AxisMode::default();
+        for (m, &w) in modes.iter().zip(weight) {
+            mean.offset += m.offset * w;
+            mean.velocity += m.velocity * w;
+            mean.acceleration += m.acceleration * w;
         }
-        let mut covariance = Covariance::default();
-        for i in 0..MODES {
-            covariance.add_scaled(&modes[i].covariance, weight[i]);
-            covariance.add_spread(offset[i] - p, modes[i].velocity - v, modes[i].acceleration - a, weight[i]);
+        for (m, &w) in modes.iter().zip(weight) {
+            mean.covariance.add_scaled(&m.covariance, w);
+            let (dp, dv, da) =
+                (m.offset - mean.offset, m.velocity - mean.velocity, m.acceleration - mean.acceleration);
+            mean.covariance.add_spread(dp, dv, da, w);
         }
-        Kinematics { point: C::moved(origin, p), velocity: v, acceleration: a, covariance }
+        mean
     }
 
     /// Mixes the modes and moves all of them `h` >= 0 seconds on.
-    pub fn advance(&mut self, config: &ImmConfig, h: f64) {
+    fn advance(&mut self, config: &ImmConfig, h: f64) {
         let mut moved = self.modes;
         let mut foretold = [0.0; MODES];
-        for j in 0..MODES {
+        // A coasting mode knows nothing of the acceleration that a turn starts with; its zero is not knowledge.
+        let mut open = self.modes;
+        for (source, model) in open.iter_mut().zip(&config.models) {
+            if !model.accelerates {
+                source.covariance.aa = config.onset_acceleration * config.onset_acceleration;
+            }
+        }
+        for (j, model) in config.models.iter().enumerate() {
             let mut weight: [f64; MODES] = std::array::from_fn(|i| {
                 let stays = (-h / config.dwell_s[i]).exp();
                 let share = if i == j { stays } else { (1.0 - stays) * config.leave_to[i][j] };
                 share * self.probability[i]
             });
             foretold[j] = weight.iter().sum();
-            let mut sources = self.modes;
-            if config.models[j].accelerates {
-                // A coasting mode knows nothing of the acceleration that a turn starts with; its zero is not knowledge.
-                for (source, model) in sources.iter_mut().zip(&config.models) {
-                    if !model.accelerates {
-                        source.covariance.aa = config.onset_acceleration * config.onset_acceleration;
-                    }
-                }
-            }
+            let mode = &mut moved[j];
             if foretold[j] > 0.0 {
                 weight.iter_mut().for_each(|w| *w /= foretold[j]);
-                moved[j] = Self::mixture(&sources, &weight, j);
+                *mode = Self::mixture(if model.accelerates { &open } else { &self.modes }, &weight);
             }
-            if !config.models[j].accelerates {
-                moved[j].acceleration = DVec3::ZERO;
-                let c = &mut moved[j].covariance;
-                (c.pa, c.va, c.aa) = (0.0, 0.0, 0.0);
-            }
-            moved[j].advance::<C>(&config.models[j], h);
+            let f = model.transition(h);
+            let (v, a) = (mode.velocity, mode.acceleration);
+            mode.offset += f.p[1] * v + f.p[2] * a;
+            mode.velocity = f.v[1] * v + f.v[2] * a;
+            mode.acceleration = f.a[1] * v + f.a[2] * a;
+            mode.covariance = mode.covariance.propagated(&f);
+            mode.covariance.add_scaled(&model.process_noise(h), 1.0);
         }
         self.modes = moved;
         self.probability = foretold;
     }
 
-    /// Squared Mahalanobis distance of a measurement of variance `r` (after [`Imm::advance`]), by the most generous mode,
-    /// with `slack` metres or rad of standard deviation added for what no mode expects.
-    pub fn distance_squared(&self, z: C::Point, r: f64, slack: f64) -> f64 {
-        self.modes
-            .iter()
-            .map(|m| {
-                C::between(m.point, z).length_squared()
-                    / (m.covariance.pp + r + slack * slack).max(f64::MIN_POSITIVE)
-            })
-            .fold(f64::INFINITY, f64::min)
-    }
-
-    /// Takes in a measurement of variance `r` >= 0 per axis at the instant that [`Imm::advance`] moved to. Returns the
-    /// normalised innovation squared of the mixture (3 degrees of freedom).
-    pub fn update(&mut self, z: C::Point, r: f64) -> f64 {
-        let before = self.combined();
-        let nis =
-            C::between(before.point, z).length_squared() / (before.covariance.pp + r).max(f64::MIN_POSITIVE);
+    /// Takes in a measured offset of variance `r`.
+    fn update(&mut self, z: f64, r: f64) {
         let mut log_likelihood = [0.0; MODES];
         for (mode, log_l) in self.modes.iter_mut().zip(&mut log_likelihood) {
-            let innovation = C::between(mode.point, z);
+            let innovation = z - mode.offset;
             let s = (mode.covariance.pp + r).max(f64::MIN_POSITIVE);
-            *log_l = -0.5 * innovation.length_squared() / s - 1.5 * s.ln();
+            *log_l = -0.5 * (innovation * innovation / s + s.ln());
             let (covariance, [kp, kv, ka]) = mode.covariance.updated(r);
             mode.covariance = covariance;
-            mode.point = C::moved(mode.point, innovation * kp);
+            mode.offset += innovation * kp;
             mode.velocity += innovation * kv;
             mode.acceleration += innovation * ka;
         }
@@ -369,6 +362,85 @@ impl<C: Chart> Imm<C> {
         } else {
             self.probability = [1.0 / MODES as f64; MODES];
         }
+    }
+}
+
+/// The banks of all three axes at the instant of the last sample.
+#[derive(Clone, Copy, Debug)]
+pub struct Imm<C: Chart> {
+    base: C::Point,
+    axes: [AxisBank; 3],
+}
+
+impl<C: Chart> Imm<C> {
+    /// Starts at a measured point of variance `r` with unknown velocity.
+    pub fn new(config: &ImmConfig, z: C::Point, r: f64) -> Self {
+        Self { base: z, axes: [AxisBank::new(config, r); 3] }
+    }
+
+    /// Weight of each model on each axis; each row sums to 1.
+    pub fn probability(&self) -> [[f64; MODES]; 3] {
+        self.axes.map(|axis| axis.probability)
+    }
+
+    /// The covariance of each mode on each axis, for invariants in tests.
+    pub fn covariances(&self) -> [[Covariance; MODES]; 3] {
+        self.axes.map(|axis| axis.modes.map(|m| m.covariance))
+    }
+
+    /// Moment-matched mean and covariance of the banks.
+    pub fn combined(&self) -> Kinematics<C::Point> {
+        let mean = self.axes.map(|axis| AxisBank::mixture(&axis.modes, &axis.probability));
+        Kinematics {
+            point: C::moved(self.base, DVec3::from_array(mean.map(|m| m.offset))),
+            velocity: DVec3::from_array(mean.map(|m| m.velocity)),
+            acceleration: DVec3::from_array(mean.map(|m| m.acceleration)),
+            covariance: mean.map(|m| m.covariance),
+        }
+    }
+
+    /// Moves the base point into the middle of the modes, so that offsets stay small against the chart's curvature.
+    fn rebase(&mut self) {
+        let mut mean = [0.0; 3];
+        for (axis, mean) in self.axes.iter_mut().zip(&mut mean) {
+            *mean = axis.modes.iter().zip(axis.probability).map(|(m, p)| m.offset * p).sum();
+            axis.modes.iter_mut().for_each(|m| m.offset -= *mean);
+        }
+        self.base = C::moved(self.base, DVec3::from_array(mean));
+    }
+
+    /// Mixes the modes and moves all of them `h` >= 0 seconds on.
+    pub fn advance(&mut self, config: &ImmConfig, h: f64) {
+        self.axes.iter_mut().for_each(|axis| axis.advance(config, h));
+        self.rebase();
+    }
+
+    /// Squared Mahalanobis distance of a measurement of variance `r` (after [`Imm::advance`]): each axis by its most generous
+    /// mode, with `slack` metres or rad of standard deviation added for what no mode expects.
+    pub fn distance_squared(&self, z: C::Point, r: f64, slack: f64) -> f64 {
+        let z = C::between(self.base, z).to_array();
+        let axis = |(bank, z): (&AxisBank, f64)| {
+            let distance = |m: &AxisMode| {
+                let d = z - m.offset;
+                d * d / (m.covariance.pp + r + slack * slack).max(f64::MIN_POSITIVE)
+            };
+            bank.modes.iter().map(distance).fold(f64::INFINITY, f64::min)
+        };
+        self.axes.iter().zip(z).map(axis).sum()
+    }
+
+    /// Takes in a measurement of variance `r` >= 0 per axis at the instant that [`Imm::advance`] moved to. Returns the
+    /// normalised innovation squared of the mixture (3 degrees of freedom).
+    pub fn update(&mut self, z: C::Point, r: f64) -> f64 {
+        let z = C::between(self.base, z).to_array();
+        let mut nis = 0.0;
+        for (axis, z) in self.axes.iter_mut().zip(z) {
+            let before = AxisBank::mixture(&axis.modes, &axis.probability);
+            let d = z - before.offset;
+            nis += d * d / (before.covariance.pp + r).max(f64::MIN_POSITIVE);
+            axis.update(z, r);
+        }
+        self.rebase();
         nis
     }
 }

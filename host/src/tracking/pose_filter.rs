@@ -63,34 +63,13 @@ pub struct PoseFilterConfig {
 
 impl Default for PoseFilterConfig {
     fn default() -> Self {
-        let leave_to = [[0.0, 0.5, 0.5], [0.5, 0.0, 0.5], [0.5, 0.5, 0.0]];
         Self {
             prediction: Prediction::On,
             position_noise_m: 1e-4,
             rotation_noise_rad: 1e-3,
             measure_noise: true,
-            position_models: ImmConfig {
-                models: [
-                    MotionModel { accelerates: false, noise: 1e-6 },
-                    MotionModel { accelerates: true, noise: 1.0 },
-                    MotionModel { accelerates: true, noise: 3e4 },
-                ],
-                dwell_s: [0.3, 0.3, 0.02],
-                leave_to,
-                onset_acceleration: 10.0,
-                initial_velocity: 20.0,
-            },
-            rotation_models: ImmConfig {
-                models: [
-                    MotionModel { accelerates: false, noise: 1e-4 },
-                    MotionModel { accelerates: true, noise: 1e2 },
-                    MotionModel { accelerates: true, noise: 3e6 },
-                ],
-                dwell_s: [0.3, 0.3, 0.02],
-                leave_to,
-                onset_acceleration: 100.0,
-                initial_velocity: 200.0,
-            },
+            position_models: models(1.0),
+            rotation_models: models(10.0),
             gate_sigmas: 6.0,
             max_speed_m_s: 20.0,
             max_acceleration_m_s2: 500.0,
@@ -99,6 +78,30 @@ impl Default for PoseFilterConfig {
             lost_after_ns: 20_000_000,
             stuck_after: 5,
         }
+    }
+}
+
+/// The models of hand-held and motor-driven objects, in units of `scale` metres: 1 for positions, 10 rad/m for rotations
+/// (what a point 0.1 m from the axis does).
+fn models(scale: f64) -> ImmConfig {
+    let s2 = scale * scale;
+    let third = 1.0 / 3.0;
+    ImmConfig {
+        models: [
+            MotionModel { accelerates: false, swing_rad_s: 0.0, noise: 1e-6 * s2 },
+            MotionModel { accelerates: true, swing_rad_s: 0.0, noise: 1.0 * s2 },
+            MotionModel { accelerates: true, swing_rad_s: 10.0, noise: 1.0 * s2 },
+            MotionModel { accelerates: true, swing_rad_s: 0.0, noise: 3e4 * s2 },
+        ],
+        dwell_s: [0.3, 0.3, 0.3, 0.02],
+        leave_to: [
+            [0.0, third, third, third],
+            [third, 0.0, third, third],
+            [third, third, 0.0, third],
+            [third, third, third, 0.0],
+        ],
+        onset_acceleration: 10.0 * scale,
+        initial_velocity: 20.0 * scale,
     }
 }
 

@@ -27,7 +27,7 @@ pub struct PosePrediction {
     pub angular_velocity_rad_s: [f64; 3],
     /// From the capture of the newest accepted sample to the instant asked for, before clamping; may be negative.
     pub horizon_ns: i64,
-    /// Standard deviation of the position along one axis, by the filter's own account, metres.
+    /// Standard deviation of the position along the worst axis, by the filter's own account, metres.
     pub position_sigma_m: f64,
     /// Whether to show the body.
     pub freshness: Freshness,
@@ -68,7 +68,13 @@ impl TrackState {
             linear_velocity_m_s: (self.position.velocity + self.position.acceleration * h).to_array(),
             angular_velocity_rad_s: (self.rotation.velocity + self.rotation.acceleration * h).to_array(),
             horizon_ns,
-            position_sigma_m: self.position.covariance.position_variance_at(h).max(0.0).sqrt(),
+            position_sigma_m: self
+                .position
+                .covariance
+                .iter()
+                .map(|c| c.position_variance_at(h))
+                .fold(0.0, f64::max)
+                .sqrt(),
             freshness,
         }
     }
