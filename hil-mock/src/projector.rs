@@ -8,6 +8,7 @@ mod clock;
 mod frames;
 mod light;
 mod receive;
+mod thread;
 
 use std::collections::VecDeque;
 
@@ -22,6 +23,7 @@ use dpm_device::transport::{Lane, LinkDevice};
 pub use clock::DeviceClock;
 use frames::{FrameStore, Held};
 pub use light::{light_of_planes, Exposure};
+pub use thread::ProjectorThread;
 
 /// Echo answers that may wait to be fetched; later requests are dropped, as a busy device would.
 const ECHOES_KEPT: usize = 16;

@@ -112,12 +112,12 @@ fn laws(s: &Status, waiting: u32) {
 
 impl MockProjector {
     /// Frames on their way to the light.
-    fn waiting(&self) -> u32 {
+    pub(super) fn waiting(&self) -> u32 {
         let assembling = self.core.store.assembling.is_some_and(|a| a.buffer.is_some());
         self.core.store.waiting() as u32 + u32::from(assembling)
     }
 
-    fn check_laws(&self) {
+    pub(super) fn check_laws(&self) {
         laws(&self.status(), self.waiting());
     }
 }
@@ -147,14 +147,14 @@ fn light_is_the_code_values_of_the_frame_at_its_slot() {
             let bits = planes(id);
             for (p, pixel) in light.iter().enumerate() {
                 let (x, y) = (p % 20, p / 20);
-                for c in 0..3 {
+                for (c, &lit) in pixel.iter().enumerate() {
                     let code: u32 = (0..8)
                         .map(|k| {
                             let plane = k * 3 + c; // rgb24: bit 7 first, red green blue
                             u32::from(bits[plane * 9 + y * 3 + x / 8] >> (7 - x % 8) & 1) << (7 - k)
                         })
                         .sum();
-                    assert_eq!(u32::from(pixel[c]), code, "frame {id} pixel {x},{y} channel {c}");
+                    assert_eq!(u32::from(lit), code, "frame {id} pixel {x},{y} channel {c}");
                 }
             }
             lit += 1;
@@ -581,4 +581,38 @@ proptest! {
             prop_assert!(mock.lit_frame().is_none(), "no whole frame was ever sent");
         }
     }
+}
+
+/// The packets printed in docs/PROTOCOL.md, byte for byte: the example makes the light that the document promises.
+#[test]
+fn the_documents_example_makes_light() {
+    let text = include_str!("../../../docs/PROTOCOL.md");
+    let packets: Vec<Vec<u8>> = text
+        .split("```hex")
+        .skip(1)
+        .map(|block| {
+            let hex = block.split("```").next().unwrap();
+            hex.split_whitespace().map(|b| u8::from_str_radix(b, 16).unwrap()).collect()
+        })
+        .collect();
+    let [hello, config, arm, plane, commit, stop] = &packets[..] else { panic!("{} packets", packets.len()) };
+    let mut mock = MockProjector::new(MockConfig::new(Raster::new(16, 1).unwrap()));
+    let mut states = Vec::new();
+    for control in [hello, config, arm] {
+        mock.receive(HostTime(0), Lane::Control, control);
+        states.push(mock.status().state);
+    }
+    assert_eq!(states, [DeviceState::Greeted, DeviceState::Configured, DeviceState::Armed]);
+    mock.receive(HostTime(1), Lane::Data, plane);
+    mock.receive(HostTime(2), Lane::Data, commit);
+    mock.advance_to(HostTime(1_055_965));
+    assert!(!mock.is_lit());
+    mock.advance_to(HostTime(1_055_966));
+    let light = mock.light_of_frame().expect("frame 1").to_vec();
+    let expected: Vec<[u8; 3]> =
+        (0..16).map(|x| if (4..12).contains(&x) { [0; 3] } else { [128, 0, 0] }).collect();
+    assert_eq!(light, expected);
+    mock.receive(HostTime(1_100_000), Lane::Control, stop);
+    assert!(!mock.is_lit());
+    assert_eq!(mock.status().frames_lit, 1);
 }
