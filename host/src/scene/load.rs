@@ -52,7 +52,7 @@ pub fn load_bytes(bytes: &[u8], options: &LoadOptions) -> Result<Scene, SceneErr
 }
 
 /// Runs `work` in a helper thread for at most `limits.time`.
-fn contained<T: Send + 'static>(
+pub(super) fn contained<T: Send + 'static>(
     limits: &Limits,
     work: impl FnOnce(&Cancel) -> Result<T, SceneError> + Send + 'static,
 ) -> Result<T, SceneError> {

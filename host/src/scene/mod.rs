@@ -4,6 +4,7 @@
 //! `projector.white_radiance` in the rig file relates to the projector's brightest light.
 
 pub mod builtin;
+mod environment;
 mod error;
 mod gltf_file;
 mod limits;
@@ -11,13 +12,18 @@ mod load;
 pub mod mesh;
 pub mod polygonise;
 mod procedural;
+mod stats;
+mod surface;
 
 use glam::{DAffine3, Vec2, Vec3, Vec4};
 
 pub use builtin::builtin;
+pub use environment::load_environment;
 pub use error::SceneError;
 pub use limits::Limits;
 pub use load::{load, load_bytes, BodySelector, LoadOptions};
+pub use stats::{EnvironmentFeature, SceneFeatures};
+pub use surface::sample_points;
 
 /// Everything that light meets. Immutable once loaded; bodies move by poses that are kept elsewhere.
 #[derive(Clone, Debug, Default)]

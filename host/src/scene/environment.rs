@@ -1,0 +1,393 @@
+//! A latitude-longitude image file (PFM, Radiance RGBE, PNG, JPEG) into an [`Environment`].
+
+use std::path::Path;
+
+use glam::Vec3;
+use image::{ImageFormat, ImageReader};
+
+use super::gltf_file::read_file;
+use super::limits::Limits;
+use super::load::contained;
+use super::{Environment, SceneError};
+
+/// Most texels of an environment: 8192 x 4096.
+const MAX_TEXELS: u64 = 1 << 25;
+
+/// Radiance beyond this is taken for damage; the sun's disc is near 10^5 times the sky.
+const MAX_RADIANCE: f32 = 1.0e9;
+
+/// Reads an environment image: `.pfm` (linear, "PF" or "Pf"), Radiance `.hdr` (linear), PNG or JPEG (sRGB, decoded to linear), told apart by
+/// their first bytes. Row 0 is up; the middle column looks along -Z turned by `rotation_rad` about +Y. Texels are multiplied by `scale`.
+///
+/// # Errors
+/// [`SceneError::InFile`] for what cannot be read, is beyond 8192 x 4096 texels, or holds a value that is negative, not finite or
+/// beyond 10^9.
+pub fn load_environment(path: &Path, rotation_rad: f32, scale: f32) -> Result<Environment, SceneError> {
+    let limits = Limits::default();
+    let owned = path.to_path_buf();
+    let work = move |_: &_| {
+        let bytes = read_file(&owned, MAX_TEXELS * 16)?;
+        decode_environment(&bytes, rotation_rad, scale)
+    };
+    contained(&limits, work).map_err(|e| e.in_file(path))
+}
+
+fn decode_environment(bytes: &[u8], rotation_rad: f32, scale: f32) -> Result<Environment, SceneError> {
+    if !(rotation_rad.is_finite() && scale.is_finite() && scale >= 0.0) {
+        return Err(SceneError::broken(
+            "environment",
+            format!("rotation {rotation_rad} and scale {scale} must be finite, the scale not negative"),
+        ));
+    }
+    let (width, height, mut texels) = match bytes {
+        [b'P', b'F' | b'f', ..] => read_pfm(bytes)?,
+        [b'#', b'?', ..] => read_rgbe(bytes)?,
+        [0x89, b'P', b'N', b'G', ..] => read_srgb(bytes, ImageFormat::Png)?,
+        [0xff, 0xd8, ..] => read_srgb(bytes, ImageFormat::Jpeg)?,
+        _ => {
+            return Err(SceneError::unsupported(
+                "this image format",
+                "give a .pfm, a Radiance .hdr, a .png or a .jpg",
+            ))
+        }
+    };
+    for (i, texel) in texels.iter_mut().enumerate() {
+        if !(texel.is_finite()
+            && texel.min_element() >= 0.0
+            && (*texel * scale).max_element() <= MAX_RADIANCE)
+        {
+            let (x, y) = (i % width as usize, i / width as usize);
+            let problem = format!(
+                "is {:?}; radiance must be finite, not negative and at most {MAX_RADIANCE:e} after scaling",
+                texel.to_array()
+            );
+            return Err(SceneError::broken(format!("texel {x}, {y}"), problem));
+        }
+        *texel *= scale;
+    }
+    Ok(Environment::Equirect { width, height, texels, rotation_rad })
+}
+
+type Pixels = (u32, u32, Vec<Vec3>);
+
+/// Checks the sides before anything is allocated; returns the number of texels.
+fn check_size(width: u32, height: u32) -> Result<usize, SceneError> {
+    let texels = u64::from(width) * u64::from(height);
+    if texels == 0 {
+        return Err(SceneError::broken(
+            "image header",
+            format!("gives {width} x {height} texels; both sides must be at least 1"),
+        ));
+    }
+    SceneError::check_limit(
+        "the number of texels of the environment",
+        texels,
+        MAX_TEXELS,
+        "scale it down to 8192 x 4096 or less",
+    )?;
+    Ok(texels as usize)
+}
+
+fn header(problem: &str) -> SceneError {
+    SceneError::broken("image header", problem)
+}
+
+/// Takes a line (without its end) off the front of `rest`; lines of a header are short.
+fn line<'a>(rest: &mut &'a [u8]) -> Result<&'a str, SceneError> {
+    let end = rest
+        .iter()
+        .take(1000)
+        .position(|&b| b == b'\n')
+        .ok_or_else(|| header("is cut off or has a line without end"))?;
+    let text = std::str::from_utf8(&rest[..end]).map_err(|_| header("is not text"))?;
+    *rest = &rest[end + 1..];
+    Ok(text.trim_end_matches('\r'))
+}
+
+fn read_pfm(bytes: &[u8]) -> Result<Pixels, SceneError> {
+    let mut rest = bytes;
+    let channels = if line(&mut rest)?.trim_end() == "PF" { 3 } else { 1 };
+    let size = line(&mut rest)?;
+    let sides: Vec<u32> = size.split_ascii_whitespace().map_while(|s| s.parse().ok()).collect();
+    let [width, height] = sides[..] else {
+        return Err(header("needs the width and the height on its second line"));
+    };
+    let scale: f32 =
+        line(&mut rest)?.trim().parse().map_err(|_| header("needs a number on its third line"))?;
+    let texels = check_size(width, height)?;
+    let needed = texels * channels * 4;
+    if rest.len() < needed {
+        return Err(SceneError::broken(
+            "image",
+            format!("needs {needed} bytes of texels, {} are there: it is cut off", rest.len()),
+        ));
+    }
+    let float = |i: usize| {
+        let four = [rest[4 * i], rest[4 * i + 1], rest[4 * i + 2], rest[4 * i + 3]];
+        // The sign of the scale tells the order of the bytes; its size has no agreed meaning.
+        if scale < 0.0 {
+            f32::from_le_bytes(four)
+        } else {
+            f32::from_be_bytes(four)
+        }
+    };
+    let (w, h) = (width as usize, height as usize);
+    let texel = |i: usize| {
+        let stored = (h - 1 - i / w) * w + i % w; // the first row stored is the lowest
+        if channels == 3 {
+            Vec3::new(float(3 * stored), float(3 * stored + 1), float(3 * stored + 2))
+        } else {
+            Vec3::splat(float(stored))
+        }
+    };
+    Ok((width, height, (0..texels).map(texel).collect()))
+}
+
+/// Radiance pictures [Ward91]: rows from the top, plain or run-length coded a component at a time.
+fn read_rgbe(bytes: &[u8]) -> Result<Pixels, SceneError> {
+    let mut rest = bytes;
+    let mut exposure = 1.0f32;
+    line(&mut rest)?;
+    let mut lines = 0;
+    loop {
+        let text = line(&mut rest)?;
+        lines += 1;
+        if text.is_empty() {
+            break;
+        }
+        if lines > 1000 {
+            return Err(header("has more than 1000 lines"));
+        }
+        if let Some(format) = text.strip_prefix("FORMAT=") {
+            if format.trim() != "32-bit_rle_rgbe" {
+                return Err(SceneError::unsupported(
+                    format!("the pixel format {}", format.trim()),
+                    "save it as RGBE",
+                ));
+            }
+        }
+        if let Some(value) = text.strip_prefix("EXPOSURE=") {
+            exposure *=
+                value.trim().parse::<f32>().map_err(|_| header("has an EXPOSURE that is not a number"))?;
+        }
+    }
+    let size = line(&mut rest)?;
+    let words: Vec<&str> = size.split_ascii_whitespace().collect();
+    let ["-Y", height, "+X", width] = words[..] else {
+        return Err(header("must give the size as '-Y height +X width': rows from the top, left to right"));
+    };
+    let side = |s: &str| s.parse::<u32>().map_err(|_| header("gives a size that is not a number"));
+    let (width, height) = (side(width)?, side(height)?);
+    check_size(width, height)?;
+    // No coding of a row is shorter than one texel.
+    if (rest.len() as u64) < 4 * u64::from(height) {
+        return Err(SceneError::broken("image", "has fewer bytes than its size needs: it is cut off"));
+    }
+    let mut texels = vec![];
+    let mut row = vec![[0u8; 4]; width as usize];
+    for y in 0..height {
+        let cut = || SceneError::broken(format!("row {y}"), "is cut off or damaged");
+        read_rgbe_row(&mut rest, &mut row).ok_or_else(cut)?;
+        texels.extend(row.iter().map(|&[r, g, b, e]| {
+            let unit = if e == 0 { 0.0 } else { (f64::from(e) - 136.0).exp2() / f64::from(exposure) };
+            Vec3::new(
+                (f64::from(r) * unit) as f32,
+                (f64::from(g) * unit) as f32,
+                (f64::from(b) * unit) as f32,
+            )
+        }));
+    }
+    Ok((width, height, texels))
+}
+
+/// Reads one row in whichever of the three codings it is.
+fn read_rgbe_row(rest: &mut &[u8], row: &mut [[u8; 4]]) -> Option<()> {
+    let take = |rest: &mut &[u8], n: usize| -> Option<Vec<u8>> {
+        let (head, tail) = rest.split_at_checked(n)?;
+        *rest = tail;
+        Some(head.to_vec())
+    };
+    let width = row.len();
+    let by_component = (8..32768).contains(&width)
+        && matches!(**rest, [2, 2, high, low, ..] if usize::from(high) << 8 | usize::from(low) == width);
+    if by_component {
+        *rest = &rest[4..];
+        for component in [0, 1, 2, 3] {
+            let mut x = 0;
+            while x < width {
+                let code = usize::from(take(rest, 1)?[0]);
+                let run = code > 128;
+                let n = if run { code - 128 } else { code };
+                if n == 0 || x + n > width {
+                    return None;
+                }
+                let values = take(rest, if run { 1 } else { n })?;
+                for k in 0..n {
+                    row[x + k][component] = values[if run { 0 } else { k }];
+                }
+                x += n;
+            }
+        }
+        return Some(());
+    }
+    // Plain texels; (1, 1, 1, n) repeats the texel before n times, each directly following one eight bits further up.
+    let (mut x, mut shift) = (0, 0);
+    while x < width {
+        let texel: [u8; 4] = take(rest, 4)?.try_into().ok()?;
+        if texel[..3] == [1, 1, 1] {
+            let n = usize::from(texel[3]).checked_shl(shift).filter(|_| shift <= 16)?;
+            let before = row[x.checked_sub(1)?];
+            row.get_mut(x..x.checked_add(n)?)?.fill(before);
+            x += n;
+            shift += 8;
+        } else {
+            row[x] = texel;
+            x += 1;
+            shift = 0;
+        }
+    }
+    Some(())
+}
+
+fn read_srgb(bytes: &[u8], format: ImageFormat) -> Result<Pixels, SceneError> {
+    let reader = || ImageReader::with_format(std::io::Cursor::new(bytes), format);
+    let failed = |e: image::ImageError| SceneError::broken("image", format!("cannot be decoded: {e}"));
+    let (width, height) = reader().into_dimensions().map_err(failed)?;
+    let texels = check_size(width, height)?;
+    let mut bounded = reader();
+    let mut memory = image::Limits::default();
+    memory.max_image_width = Some(width);
+    memory.max_image_height = Some(height);
+    memory.max_alloc = Some(texels as u64 * 8 + (16 << 20));
+    bounded.limits(memory);
+    let rgb = bounded.decode().map_err(failed)?.into_rgb16();
+    let linear = |x: u16| {
+        let x = f32::from(x) / 65535.0;
+        if x <= 0.04045 {
+            x / 12.92
+        } else {
+            ((x + 0.055) / 1.055).powf(2.4)
+        }
+    };
+    Ok((
+        width,
+        height,
+        rgb.as_raw().chunks_exact(3).map(|c| Vec3::new(linear(c[0]), linear(c[1]), linear(c[2]))).collect(),
+    ))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn texels(bytes: &[u8]) -> Pixels {
+        match decode_environment(bytes, 0.0, 1.0).unwrap() {
+            Environment::Equirect { width, height, texels, .. } => (width, height, texels),
+            Environment::Constant(_) => unreachable!("an image never decodes to a constant"),
+        }
+    }
+
+    fn refused(bytes: &[u8]) -> String {
+        decode_environment(bytes, 0.0, 1.0).unwrap_err().to_string()
+    }
+
+    fn pfm(size: &str, scale: &str, values: &[[u8; 4]]) -> Vec<u8> {
+        [format!("PF\n{size}\n{scale}\n").as_bytes(), &values.concat()].concat()
+    }
+
+    #[test]
+    fn pfm_rows_run_upwards_in_either_byte_order() {
+        let values = [1.0f32, 2.0, 3.0, 4.0, 5.0, 6.0];
+        let little = pfm("1 2", "-1.0", &values.map(f32::to_le_bytes));
+        let big = pfm("1 2", "1.0", &values.map(f32::to_be_bytes));
+        let expected = (1, 2, vec![Vec3::new(4.0, 5.0, 6.0), Vec3::new(1.0, 2.0, 3.0)]);
+        assert_eq!(texels(&little), expected);
+        assert_eq!(texels(&big), expected);
+        let gray = [b"Pf\n2 1\n-1\n".as_slice(), &[0.25f32, 0.5].map(f32::to_le_bytes).concat()].concat();
+        assert_eq!(texels(&gray).2, [Vec3::splat(0.25), Vec3::splat(0.5)]);
+    }
+
+    #[test]
+    fn rgbe_golden_bytes_in_all_three_codings() {
+        let head = |width| format!("#?RADIANCE\nFORMAT=32-bit_rle_rgbe\n\n-Y 1 +X {width}\n").into_bytes();
+        // 128 * 2^(129 - 136) = 1; 64 gives a half.
+        let plain = [head(3), vec![128, 64, 0, 129, 1, 1, 1, 2]].concat();
+        assert_eq!(texels(&plain).2, [Vec3::new(1.0, 0.5, 0.0); 3]);
+        let mut coded = head(8);
+        coded.extend([2, 2, 0, 8]);
+        coded.extend([128 + 8, 128]); // red: a run of 8
+        coded.extend([8, 64, 64, 64, 64, 128, 128, 128, 128]); // green: 8 values
+        coded.extend([128 + 5, 0, 3, 32, 32, 32]); // blue: both
+        coded.extend([128 + 8, 129]);
+        let (_, _, t) = texels(&coded);
+        assert_eq!(
+            (t[0], t[4], t[7]),
+            (Vec3::new(1.0, 0.5, 0.0), Vec3::new(1.0, 1.0, 0.0), Vec3::new(1.0, 1.0, 0.25))
+        );
+        let dark = [head(1), vec![255, 255, 255, 0]].concat();
+        assert_eq!(texels(&dark).2, [Vec3::ZERO]);
+        let exposed =
+            [b"#?RGBE\nEXPOSURE=2\nEXPOSURE=2\n\n-Y 1 +X 1\n".to_vec(), vec![128, 128, 128, 129]].concat();
+        assert_eq!(texels(&exposed).2, [Vec3::splat(0.25)]);
+    }
+
+    #[test]
+    fn png_is_decoded_from_srgb() {
+        let mut png = std::io::Cursor::new(vec![]);
+        image::RgbImage::from_raw(2, 1, vec![0, 128, 255, 255, 0, 0])
+            .unwrap()
+            .write_to(&mut png, ImageFormat::Png)
+            .unwrap();
+        let (w, h, t) = texels(png.get_ref());
+        assert_eq!((w, h), (2, 1));
+        assert!(t[0].distance(Vec3::new(0.0, 0.215_86, 1.0)) < 1e-4 && t[1] == Vec3::X);
+    }
+
+    #[test]
+    fn hostile_images_are_refused_with_reasons() {
+        let nan = pfm("1 1", "-1", &[1.0, f32::NAN, 1.0].map(f32::to_le_bytes));
+        let negative = pfm("1 1", "-1", &[1.0, -0.5, 1.0].map(f32::to_le_bytes));
+        let huge = pfm("1 1", "-1", &[1.0, 1e30, 1.0].map(f32::to_le_bytes));
+        assert!(
+            refused(&nan).contains("texel 0, 0")
+                && refused(&negative).contains("negative")
+                && refused(&huge).contains("1e9")
+        );
+        assert!(refused(&pfm("65535 65535", "-1", &[])).contains("limit"));
+        assert!(refused(&pfm("4 4", "-1", &[])).contains("cut off"));
+        assert!(refused(&pfm("0 4", "-1", &[])).contains("at least 1"));
+        assert!(refused(&pfm("-4 4", "-1", &[])).contains("width"));
+        assert!(refused(b"PF\n1 1").contains("cut off"));
+        assert!(refused(b"#?RADIANCE\n\n-Y 70000 +X 70000\n").contains("limit"));
+        assert!(refused(b"#?RADIANCE\n\n-Y 4000 +X 4000\n\x02\x02").contains("cut off"));
+        assert!(refused(b"#?RADIANCE\n\n+Y 2 +X 2\n").contains("-Y height"));
+        assert!(refused(b"#?RADIANCE\nFORMAT=32-bit_rle_xyze\n\n-Y 2 +X 2\n").contains("xyze"));
+        assert!(refused(b"#?RADIANCE\n\n-Y 1 +X 8\n\x02\x02\x00\x08\xff\x01").contains("row 0"));
+        assert!(refused(b"#?RADIANCE\n\n-Y 1 +X 2\n\x01\x01\x01\x01").contains("row 0"));
+        assert!(refused(b"GIF89a").contains("format") && refused(b"").contains("format"));
+        assert!(decode_environment(b"", f32::NAN, 1.0).unwrap_err().to_string().contains("rotation"));
+        assert!(load_environment(Path::new("/nonexistent/sky.pfm"), 0.0, 1.0)
+            .unwrap_err()
+            .to_string()
+            .contains("sky.pfm"));
+    }
+
+    #[test]
+    fn scale_multiplies_and_rotation_is_kept() {
+        let bytes = pfm("1 1", "-1", &[1.0f32, 2.0, 3.0].map(f32::to_le_bytes));
+        let Environment::Equirect { texels, rotation_rad, .. } =
+            decode_environment(&bytes, 0.5, 2.0).unwrap()
+        else {
+            panic!()
+        };
+        assert_eq!((texels[0], rotation_rad), (Vec3::new(2.0, 4.0, 6.0), 0.5));
+    }
+
+    proptest::proptest! {
+        #[test]
+        fn no_bytes_make_it_panic(kind in 0usize..3, tail in proptest::collection::vec(proptest::prelude::any::<u8>(), 0..200)) {
+            let head: &[u8] = [b"PF\n3 2\n-1\n".as_slice(), b"#?RADIANCE\n\n-Y 2 +X 9\n", b"\x89PNG\r\n\x1a\n"][kind];
+            let _ = decode_environment(&[head, &tail].concat(), 0.0, 1.0);
+        }
+    }
+}
