@@ -9,6 +9,7 @@ pub mod failure;
 pub mod files;
 pub mod geometry;
 pub mod gpu;
+pub mod pack;
 pub mod reference;
 pub mod render;
 pub mod scene;

@@ -1,0 +1,170 @@
+//! Linear drive into code values, and code values into the bit planes that a DMD shows.
+//!
+//! Every kernel gives the same bytes as [`scalar`], whatever the raster. The GPU's packer is held to the same bytes.
+
+mod frame;
+mod quantise;
+mod scalar;
+#[cfg(target_arch = "x86_64")]
+mod simd;
+
+pub use frame::BitPlaneFrame;
+pub use quantise::{quantise, QuantiseCounts};
+
+use dpm_device::planes::{Channel, PlaneSpec};
+
+/// Pixels that a kernel packs at once.
+const BLOCK_PIXELS: usize = 512;
+/// Bytes of a block in each plane: a whole cache line.
+const BLOCK_BYTES: usize = BLOCK_PIXELS / 8;
+/// Bytes of a batch in each plane. Planes of 1024 x 768 lie exactly 24 x 4 KiB apart, so lines at the same place of all
+/// planes compete for one set of the first-level cache: several neighbours written in a row spread over as many sets.
+const BATCH_BYTES: usize = 8 * BLOCK_BYTES;
+/// Bit planes that code values hold: 8 bits of red, green and blue.
+const CODE_BITS: usize = 24;
+
+/// A batch's bits: for each bit of the code value a stretch of its plane.
+#[repr(align(64))]
+struct Batch([[u8; BATCH_BYTES]; CODE_BITS]);
+
+/// A way to pack, chosen by what the CPU can do.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, serde::Serialize)]
+#[serde(rename_all = "lowercase")]
+pub enum Kernel {
+    /// Plain Rust: the reference, runs everywhere.
+    Scalar,
+    /// x86-64 with AVX2.
+    Avx2,
+    /// x86-64 with AVX-512 F, BW, VBMI and GFNI.
+    Avx512,
+}
+
+impl Kernel {
+    /// The kernels that this CPU can run, slowest first.
+    pub fn available() -> &'static [Self] {
+        #[cfg(target_arch = "x86_64")]
+        {
+            if simd::has_avx512() && simd::has_avx2() {
+                return &[Self::Scalar, Self::Avx2, Self::Avx512];
+            }
+            if simd::has_avx2() {
+                return &[Self::Scalar, Self::Avx2];
+            }
+        }
+        &[Self::Scalar]
+    }
+
+    /// The fastest kernel that this CPU can run.
+    pub fn best() -> Self {
+        Self::available().last().copied().unwrap_or(Self::Scalar)
+    }
+
+    /// Name for reports.
+    pub const fn name(self) -> &'static str {
+        match self {
+            Self::Scalar => "scalar",
+            Self::Avx2 => "AVX2",
+            Self::Avx512 => "AVX-512 with GFNI",
+        }
+    }
+}
+
+/// The bit of a code value `0x00BBGGRR` that a plane shows. A white plane shows the green bit.
+pub const fn source_bit(plane: PlaneSpec) -> u32 {
+    let channel = match plane.channel {
+        Channel::Red => 0,
+        Channel::Green | Channel::White => 8,
+        Channel::Blue => 16,
+    };
+    channel + plane.bit as u32
+}
+
+/// Code values `0x00BBGGRR`, row after row, into the planes of `frame`; bits 24 to 31 are ignored, padding bits become 0.
+/// A `kernel` that this CPU cannot run is replaced by [`Kernel::best`].
+///
+/// # Panics
+/// When `codes` does not hold exactly one value per pixel of the frame's raster.
+pub fn pack(kernel: Kernel, codes: &[u32], frame: &mut BitPlaneFrame) {
+    let raster = frame.raster();
+    assert_eq!(codes.len(), raster.pixel_count(), "code values for a raster of {raster:?}");
+    let kernel = if Kernel::available().contains(&kernel) { kernel } else { Kernel::best() };
+    match kernel {
+        Kernel::Scalar => scalar::pack(codes, frame),
+        #[cfg(target_arch = "x86_64")]
+        Kernel::Avx2 => simd::pack_avx2(codes, frame),
+        #[cfg(target_arch = "x86_64")]
+        Kernel::Avx512 => simd::pack_avx512(codes, frame),
+        #[cfg(not(target_arch = "x86_64"))]
+        _ => scalar::pack(codes, frame),
+    }
+}
+
+/// The planes of `frame` back into code values. Bits that no plane shows are 0; a white plane gives the green bit.
+///
+/// # Panics
+/// When `codes` does not hold exactly one value per pixel of the frame's raster.
+pub fn unpack(frame: &BitPlaneFrame, codes: &mut [u32]) {
+    let raster = frame.raster();
+    assert_eq!(codes.len(), raster.pixel_count(), "code values for a raster of {raster:?}");
+    codes.fill(0);
+    for (i, &spec) in frame.schedule().planes().iter().enumerate() {
+        let bit = source_bit(spec);
+        let rows = frame.plane(i).chunks_exact(raster.row_bytes());
+        for (row, pixels) in rows.zip(codes.chunks_exact_mut(raster.width() as usize)) {
+            for (byte, eight) in row.iter().zip(pixels.chunks_mut(8)) {
+                for (x, code) in eight.iter_mut().enumerate() {
+                    *code |= u32::from(byte >> (7 - x) & 1) << bit;
+                }
+            }
+        }
+    }
+}
+
+/// Packs runs of pixels by `kernel`. Rows that end on a byte are one long run; other rows are a run each.
+///
+/// A batch of blocks is packed into a buffer that stays in the first-level cache, then each plane gets its part of the
+/// batch in one piece.
+#[inline(always)]
+fn pack_blocks(
+    codes: &[u32],
+    frame: &mut BitPlaneFrame,
+    kernel: impl Fn(&[u32; BLOCK_PIXELS], &mut Batch, usize),
+) {
+    let raster = frame.raster();
+    let width = raster.width() as usize;
+    let (run_pixels, run_bytes) = if width.is_multiple_of(8) {
+        (codes.len(), raster.plane_bytes())
+    } else {
+        (width, raster.row_bytes())
+    };
+    let (bits, plane_bytes) = (frame.source_bits(), raster.plane_bytes());
+    let bits = &bits[..frame.schedule().len()];
+    let bytes = frame.bytes_mut();
+    let mut batch = Batch([[0; BATCH_BYTES]; CODE_BITS]);
+    for (run, pixels) in codes.chunks_exact(run_pixels).enumerate() {
+        for (i, pixels) in pixels.chunks(8 * BATCH_BYTES).enumerate() {
+            let (whole, rest) = pixels.as_chunks::<BLOCK_PIXELS>();
+            for (block, pixels) in whole.iter().enumerate() {
+                kernel(pixels, &mut batch, BLOCK_BYTES * block);
+            }
+            if !rest.is_empty() {
+                let mut padded = [0; BLOCK_PIXELS];
+                padded[..rest.len()].copy_from_slice(rest);
+                kernel(&padded, &mut batch, BLOCK_BYTES * whole.len());
+            }
+            let at = run * run_bytes + i * BATCH_BYTES;
+            let count = pixels.len().div_ceil(8);
+            for (plane, &bit) in bytes.chunks_exact_mut(plane_bytes).zip(bits) {
+                let target = &mut plane[at..at + count];
+                match <&mut [u8; BATCH_BYTES]>::try_from(&mut *target) {
+                    // A copy of known length is a few instructions.
+                    Ok(whole) => *whole = batch.0[bit as usize],
+                    Err(_) => target.copy_from_slice(&batch.0[bit as usize][..count]),
+                }
+            }
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests;

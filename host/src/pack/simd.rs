@@ -1,0 +1,256 @@
+//! The packer for x86-64: blocks of 512 pixels, a whole cache line of every plane at once.
+#![allow(unsafe_code)]
+
+use super::quantise::{quantise_scalar, QuantiseCounts, ROUND};
+use super::{pack_blocks, Batch, BitPlaneFrame, BLOCK_BYTES, BLOCK_PIXELS, CODE_BITS};
+use std::arch::x86_64::*;
+
+pub(super) fn has_avx2() -> bool {
+    is_x86_feature_detected!("avx2")
+}
+
+pub(super) fn has_avx512() -> bool {
+    is_x86_feature_detected!("avx512f")
+        && is_x86_feature_detected!("avx512bw")
+        && is_x86_feature_detected!("avx512vbmi")
+        && is_x86_feature_detected!("gfni")
+}
+
+/// Packs with AVX2; falls back to the scalar packer where there is none.
+pub(super) fn pack_avx2(codes: &[u32], frame: &mut BitPlaneFrame) {
+    if !has_avx2() {
+        return super::scalar::pack(codes, frame);
+    }
+    // SAFETY: the CPU has AVX2, as just checked.
+    unsafe { pack_with_avx2(codes, frame) }
+}
+
+/// Packs with AVX-512 and GFNI; falls back to the scalar packer where there is none.
+pub(super) fn pack_avx512(codes: &[u32], frame: &mut BitPlaneFrame) {
+    if !has_avx512() {
+        return super::scalar::pack(codes, frame);
+    }
+    // SAFETY: the CPU has all four features, as just checked.
+    unsafe { pack_with_avx512(codes, frame) }
+}
+
+#[target_feature(enable = "avx2")]
+fn pack_with_avx2(codes: &[u32], frame: &mut BitPlaneFrame) {
+    pack_blocks(codes, frame, |pixels, batch, at| block_avx2(pixels, batch, at));
+}
+
+#[target_feature(enable = "avx512f,avx512bw,avx512vbmi,gfni")]
+fn pack_with_avx512(codes: &[u32], frame: &mut BitPlaneFrame) {
+    pack_blocks(codes, frame, |pixels, batch, at| block_avx512(pixels, batch, at));
+}
+
+/// 32 pixels at a time: bytes of one channel into one register, then the sign bit of every byte is the plane's bit.
+#[inline]
+#[target_feature(enable = "avx2")]
+fn block_avx2(pixels: &[u32; BLOCK_PIXELS], batch: &mut Batch, at: usize) {
+    // Four pixels of a lane by channel, each channel's pixels from right to left: bit 7 of a plane's byte is the leftmost.
+    let by_channel =
+        _mm256_broadcastsi128_si256(_mm_setr_epi8(12, 8, 4, 0, 13, 9, 5, 1, 14, 10, 6, 2, 15, 11, 7, 3));
+    // Lane 0 holds pixels 0..4 of the four registers, lane 1 pixels 4..8: interleave them, the right half first.
+    let in_order = _mm256_setr_epi32(4, 0, 5, 1, 6, 2, 7, 3);
+    for (group, pixels) in pixels.as_chunks::<32>().0.iter().enumerate() {
+        let load = |i: usize| {
+            // SAFETY: pixels 8 i to 8 i + 8 of an array of 32; the load needs no alignment.
+            let v = unsafe { _mm256_loadu_si256(pixels.as_ptr().add(8 * i).cast()) };
+            _mm256_shuffle_epi8(v, by_channel)
+        };
+        let (a, b, c, d) = (load(0), load(1), load(2), load(3));
+        let (ab_rg, ab_b) = (_mm256_unpacklo_epi32(a, b), _mm256_unpackhi_epi32(a, b));
+        let (cd_rg, cd_b) = (_mm256_unpacklo_epi32(c, d), _mm256_unpackhi_epi32(c, d));
+        let channels = [
+            _mm256_unpacklo_epi64(ab_rg, cd_rg),
+            _mm256_unpackhi_epi64(ab_rg, cd_rg),
+            _mm256_unpacklo_epi64(ab_b, cd_b),
+        ];
+        for (channel, bytes) in channels.into_iter().enumerate() {
+            let mut bytes = _mm256_permutevar8x32_epi32(bytes, in_order);
+            for bit in (0..8).rev() {
+                let plane = &mut batch.0[8 * channel + bit][at..at + BLOCK_BYTES];
+                plane[4 * group..4 * group + 4].copy_from_slice(&_mm256_movemask_epi8(bytes).to_le_bytes());
+                bytes = _mm256_add_epi8(bytes, bytes);
+            }
+        }
+    }
+}
+
+/// Indices into two registers of 16 pixels: byte `first` of each of the 32 pixels, then byte `second`.
+const fn bytes_of_channels(first: u8, second: u8) -> [u8; 64] {
+    let mut out = [0; 64];
+    let mut i = 0;
+    while i < 32 {
+        out[i] = 4 * i as u8 + first;
+        out[i + 32] = 4 * i as u8 + second;
+        i += 1;
+    }
+    out
+}
+
+/// Indices that transpose a register of 8 x 8 bytes.
+const fn transposed_bytes() -> [u8; 64] {
+    let mut out = [0; 64];
+    let mut i = 0;
+    while i < 64 {
+        out[i] = (8 * (i % 8) + i / 8) as u8;
+        i += 1;
+    }
+    out
+}
+
+static RED_GREEN: [u8; 64] = bytes_of_channels(0, 1);
+static BLUE_TWICE: [u8; 64] = bytes_of_channels(2, 2);
+static TRANSPOSE_BYTES: [u8; 64] = transposed_bytes();
+
+/// 64 pixels at a time: bytes of one channel into one register, 8 x 8 bits transposed by the affine instruction, 8 x 8 bytes
+/// by a permutation; after eight such steps 8 x 8 quadwords, which makes a whole line of each plane.
+#[inline]
+#[target_feature(enable = "avx512f,avx512bw,avx512vbmi,gfni")]
+fn block_avx512(pixels: &[u32; BLOCK_PIXELS], batch: &mut Batch, at: usize) {
+    let (red_green, blue_twice) = (load_bytes(&RED_GREEN), load_bytes(&BLUE_TWICE));
+    let transpose = load_bytes(&TRANSPOSE_BYTES);
+    // Byte i of the affine product takes bit i of every byte of the matrix, the matrix's first byte into bit 7.
+    let unit = _mm512_set1_epi64(0x8040_2010_0804_0201_u64 as i64);
+
+    let mut rows = [[_mm512_setzero_si512(); 8]; CODE_BITS / 8];
+    for (step, pixels) in pixels.as_chunks::<64>().0.iter().enumerate() {
+        let load = |i: usize| {
+            // SAFETY: pixels 16 i to 16 i + 16 of an array of 64; the load needs no alignment.
+            unsafe { _mm512_loadu_si512(pixels.as_ptr().add(16 * i).cast()) }
+        };
+        let (a, b, c, d) = (load(0), load(1), load(2), load(3));
+        let ab = _mm512_permutex2var_epi8(a, red_green, b);
+        let cd = _mm512_permutex2var_epi8(c, red_green, d);
+        let blue_ab = _mm512_permutex2var_epi8(a, blue_twice, b);
+        let blue_cd = _mm512_permutex2var_epi8(c, blue_twice, d);
+        let channels = [
+            _mm512_shuffle_i64x2::<0x44>(ab, cd),
+            _mm512_shuffle_i64x2::<0xee>(ab, cd),
+            _mm512_mask_blend_epi64(0xf0, blue_ab, blue_cd),
+        ];
+        for (channel, bytes) in channels.into_iter().enumerate() {
+            let bits = _mm512_gf2p8affine_epi64_epi8::<0>(unit, bytes);
+            rows[channel][step] = _mm512_permutexvar_epi8(transpose, bits);
+        }
+    }
+    for (channel, rows) in rows.iter().enumerate() {
+        let columns = transpose_quadwords(rows);
+        for (bit, line) in columns.into_iter().enumerate() {
+            let plane = &mut batch.0[8 * channel + bit][at..at + BLOCK_BYTES];
+            // SAFETY: the slice has 64 bytes; the store needs no alignment.
+            unsafe { _mm512_storeu_si512(plane.as_mut_ptr().cast(), line) };
+        }
+    }
+}
+
+#[inline]
+#[target_feature(enable = "avx512f")]
+fn load_bytes(bytes: &[u8; 64]) -> __m512i {
+    // SAFETY: 64 readable bytes; the load needs no alignment.
+    unsafe { _mm512_loadu_si512(bytes.as_ptr().cast()) }
+}
+
+/// An 8 x 8 matrix of quadwords, transposed.
+#[inline]
+#[target_feature(enable = "avx512f")]
+fn transpose_quadwords(rows: &[__m512i; 8]) -> [__m512i; 8] {
+    let r = rows;
+    // Pairs of rows, then pairs of pairs, then halves.
+    let lo = |i: usize| _mm512_unpacklo_epi64(r[i], r[i + 1]);
+    let hi = |i: usize| _mm512_unpackhi_epi64(r[i], r[i + 1]);
+    let even = [lo(0), lo(2), lo(4), lo(6)];
+    let odd = [hi(0), hi(2), hi(4), hi(6)];
+    let four = |v: &[__m512i; 4]| {
+        [
+            _mm512_shuffle_i64x2::<0x88>(v[0], v[1]),
+            _mm512_shuffle_i64x2::<0xdd>(v[0], v[1]),
+            _mm512_shuffle_i64x2::<0x88>(v[2], v[3]),
+            _mm512_shuffle_i64x2::<0xdd>(v[2], v[3]),
+        ]
+    };
+    let (e, o) = (four(&even), four(&odd));
+    let column = |v: &[__m512i; 4]| {
+        [
+            _mm512_shuffle_i64x2::<0x88>(v[0], v[2]),
+            _mm512_shuffle_i64x2::<0x88>(v[1], v[3]),
+            _mm512_shuffle_i64x2::<0xdd>(v[0], v[2]),
+            _mm512_shuffle_i64x2::<0xdd>(v[1], v[3]),
+        ]
+    };
+    let (e, o) = (column(&e), column(&o));
+    [e[0], o[0], e[1], o[1], e[2], o[2], e[3], o[3]]
+}
+
+/// [`super::quantise`] with AVX2, eight pixels at a time; falls back to the scalar one where there is none.
+pub(super) fn quantise_avx2(
+    drive: &[[f32; 4]],
+    offsets: Option<&[f32]>,
+    codes: &mut [u32],
+) -> QuantiseCounts {
+    if !has_avx2() {
+        return quantise_scalar(drive, offsets, codes);
+    }
+    let (whole, rest) = drive.as_chunks::<8>();
+    let (out, out_rest) = codes.as_chunks_mut::<8>();
+    let (whole_offsets, rest_offsets) = match offsets {
+        Some(o) => {
+            let (whole, rest) = o.as_chunks::<8>();
+            (Some(whole), Some(rest))
+        }
+        None => (None, None),
+    };
+    // SAFETY: the CPU has AVX2, as just checked.
+    let mut counts = unsafe { quantise_eights(whole, whole_offsets, out) };
+    let tail = quantise_scalar(rest, rest_offsets, out_rest);
+    counts.nan_pixels += tail.nan_pixels;
+    counts.clipped += tail.clipped;
+    counts
+}
+
+#[target_feature(enable = "avx2")]
+fn quantise_eights(
+    drive: &[[[f32; 4]; 8]],
+    offsets: Option<&[[f32; 8]]>,
+    codes: &mut [[u32; 8]],
+) -> QuantiseCounts {
+    let (zero, one) = (_mm256_setzero_ps(), _mm256_set1_ps(1.0));
+    let full = _mm256_set1_ps(255.0);
+    let mut counts = QuantiseCounts::default();
+    // The fourth value of a pixel counts for nothing and becomes 0.
+    const COLOUR: i32 = 0b0111_0111;
+    for (i, (pixels, codes)) in drive.iter().zip(codes).enumerate() {
+        let mut levels = [_mm256_setzero_si256(); 4];
+        for (pair, level) in levels.iter_mut().enumerate() {
+            // SAFETY: pixels 2 `pair` and 2 `pair` + 1 of eight, eight floats; the load needs no alignment.
+            let v = unsafe { _mm256_loadu_ps(pixels.as_ptr().add(2 * pair).cast()) };
+            let offset = match offsets {
+                Some(o) => {
+                    let (left, right) = (o[i][2 * pair], o[i][2 * pair + 1]);
+                    _mm256_set_m128(_mm_set1_ps(right), _mm_set1_ps(left))
+                }
+                None => _mm256_set1_ps(ROUND),
+            };
+            let number = _mm256_cmp_ps::<_CMP_ORD_Q>(v, v);
+            let nan = !_mm256_movemask_ps(number) & COLOUR;
+            if nan != 0 {
+                counts.nan_pixels += u64::from(nan & 0x0f != 0) + u64::from(nan & 0xf0 != 0);
+            }
+            let above = _mm256_movemask_ps(_mm256_cmp_ps::<_CMP_GT_OQ>(v, one)) & COLOUR;
+            counts.clipped += u64::from(above.count_ones());
+            let v = _mm256_min_ps(_mm256_max_ps(_mm256_and_ps(v, number), zero), one);
+            let scaled = _mm256_add_ps(_mm256_mul_ps(v, full), offset);
+            *level = _mm256_cvttps_epi32(scaled);
+        }
+        // 32 bits to 8, with saturation to 0..255; the lanes end up as pixels 0 2 4 6 | 1 3 5 7.
+        let halves = |a, b| _mm256_packs_epi32(a, b);
+        let bytes = _mm256_packus_epi16(halves(levels[0], levels[1]), halves(levels[2], levels[3]));
+        let ordered = _mm256_permutevar8x32_epi32(bytes, _mm256_setr_epi32(0, 4, 1, 5, 2, 6, 3, 7));
+        let colour = _mm256_and_si256(ordered, _mm256_set1_epi32(0x00ff_ffff));
+        // SAFETY: eight writable code values; the store needs no alignment.
+        unsafe { _mm256_storeu_si256(codes.as_mut_ptr().cast(), colour) };
+    }
+    counts
+}
