@@ -155,37 +155,20 @@ pub struct SkyImage {
 }
 
 impl SkyImage {
-    /// Tables for an image of `width * height` texels.
+    /// Tables for an image of `width * height` texels, each of even radiance.
     pub fn new(width: usize, height: usize, texels: Vec<Vec3>, rotation: f64) -> Self {
-        // The look-up is bilinear: a texel's weight covers its neighbours, so that no direction with light has density 0.
-        let at = |x: usize, y: usize| brightness(texels[y * width + x].as_dvec3());
-        let blurred = |x: usize, y: usize| {
-            let xs = [(x + width - 1) % width, x, (x + 1) % width];
-            let ys = [y.saturating_sub(1), y, (y + 1).min(height - 1)];
-            let mut sum = 0.0;
-            for (j, wy) in ys.into_iter().zip([0.25, 0.5, 0.25]) {
-                for (i, wx) in xs.into_iter().zip([0.25, 0.5, 0.25]) {
-                    sum += wx * wy * at(i, j);
-                }
-            }
-            sum
-        };
-        let columns: Vec<Choice> =
-            (0..height).map(|y| Choice::new((0..width).map(|x| blurred(x, y)))).collect();
+        let columns: Vec<Choice> = texels
+            .chunks_exact(width)
+            .map(|row| Choice::new(row.iter().map(|t| brightness(t.as_dvec3()))))
+            .collect();
         let rows = Choice::new((0..height).map(|y| columns[y].total() * band(y, height)));
         Self { width, height, texels, rotation, rows, columns }
     }
 
     /// Radiance from a direction (unit, world).
     pub fn radiance(&self, direction: DVec3) -> DVec3 {
-        let (u, v) = self.to_image(direction);
-        let (x, y) = (u * self.width as f64 - 0.5, v * self.height as f64 - 0.5);
-        let (fx, fy) = (x - x.floor(), y - y.floor());
-        let column = |i: f64| (i as i64).rem_euclid(self.width as i64) as usize;
-        let row = |j: f64| j.clamp(0.0, (self.height - 1) as f64) as usize;
-        let at = |i: f64, j: f64| self.texels[row(j) * self.width + column(i)].as_dvec3();
-        let (x, y) = (x.floor(), y.floor());
-        at(x, y).lerp(at(x + 1.0, y), fx).lerp(at(x, y + 1.0).lerp(at(x + 1.0, y + 1.0), fx), fy)
+        let (x, y) = self.texel(direction);
+        self.texels[y * self.width + x].as_dvec3()
     }
 
     /// A direction by brightness and its density per steradian; `None` for a black sky.
@@ -205,9 +188,7 @@ impl SkyImage {
 
     /// Density of [`Self::sample`], per steradian.
     pub fn pdf(&self, direction: DVec3) -> f64 {
-        let (u, v) = self.to_image(direction);
-        let x = ((u * self.width as f64) as usize).min(self.width - 1);
-        let y = ((v * self.height as f64) as usize).min(self.height - 1);
+        let (x, y) = self.texel(direction);
         self.texel_pdf(x, y)
     }
 
@@ -216,11 +197,13 @@ impl SkyImage {
         self.rows.probability(y) * self.columns[y].probability(x) / solid_angle
     }
 
-    /// Image coordinates 0..1, u to the right, v down.
-    fn to_image(&self, direction: DVec3) -> (f64, f64) {
+    /// Column and row of a direction.
+    fn texel(&self, direction: DVec3) -> (usize, usize) {
         let d = glam::DQuat::from_rotation_y(-self.rotation) * direction;
         let u = 0.5 + d.x.atan2(-d.z) / (2.0 * PI);
-        (u, d.x.hypot(d.z).atan2(d.y) / PI)
+        let v = d.x.hypot(d.z).atan2(d.y) / PI;
+        let index = |x: f64, n: usize| ((x * n as f64) as usize).min(n - 1);
+        (index(u, self.width), index(v, self.height))
     }
 }
 
@@ -292,7 +275,7 @@ impl Lights {
                 if w == 0 || h == 0 || texels.len() < w * h {
                     Sky::Constant(DVec3::ZERO)
                 } else {
-                    Sky::Image(SkyImage::new(w, h, texels.clone(), f64::from(*rotation_rad)))
+                    Sky::Image(SkyImage::new(w, h, texels[..w * h].to_vec(), f64::from(*rotation_rad)))
                 }
             }
         };

@@ -1,24 +1,29 @@
 //! Wanted radiance into projector drive: the CPU twin of the compensation shader.
 //!
-//! `drive = pi L l^2 / (rho cos I_max)`, clamped to 0..1, per channel: linear in light, no display gamma (`docs/RENDERING.md`).
-//! The f32 form performs the shader's operations in the shader's order, so that the two may be compared bit for bit where the
-//! device divides exactly; the f64 form is its oracle.
+//! `drive = pi (L - L_amb) l^2 / (rho max(cos, 1e-3) I_max)`, clamped to 0..1, per channel: linear in light, no display gamma
+//! (`docs/RENDERING.md`). The f32 form performs the shader's operations in the shader's order; the f64 form is its oracle.
+
+/// Smallest cosine between surface and projector that is still compensated: beyond it the drive would be full anyway.
+pub const LEAST_COS: f64 = 1e-3;
 
 /// What the light falls on and what the projector can give. Fixed for a rig.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Compensation {
     /// `pi / (rho * I_max)` per channel, rounded once from f64.
     pub gain: [f32; 3],
+    /// Radiance that the surface shows without the projector.
+    pub ambient: [f32; 3],
 }
 
 impl Compensation {
     /// `albedo`: diffuse reflectance of the real surface, above 0 to 1. `max_intensity`: the projector's greatest radiant intensity
-    /// in scene units per steradian, above 0. `None` where one of them is out of range.
-    pub fn new(albedo: [f64; 3], max_intensity: [f64; 3]) -> Option<Self> {
+    /// in scene units per steradian, above 0. `ambient`: radiance the surface shows without the projector, not negative.
+    /// `None` where one of them is out of range.
+    pub fn new(albedo: [f64; 3], max_intensity: [f64; 3], ambient: [f64; 3]) -> Option<Self> {
         let mut gain = [0.0; 3];
         for c in 0..3 {
-            let (rho, i) = (albedo[c], max_intensity[c]);
-            if !(rho > 0.0 && rho <= 1.0 && i > 0.0 && i.is_finite()) {
+            let (rho, i, a) = (albedo[c], max_intensity[c], ambient[c]);
+            if !(rho > 0.0 && rho <= 1.0 && i > 0.0 && i.is_finite() && a >= 0.0 && a.is_finite()) {
                 return None;
             }
             gain[c] = (std::f64::consts::PI / (rho * i)) as f32;
@@ -26,27 +31,28 @@ impl Compensation {
                 return None;
             }
         }
-        Some(Self { gain })
+        Some(Self { gain, ambient: ambient.map(|a| a as f32) })
     }
 
     /// Drive 0..1 per channel for the radiance wanted toward the eye. `distance`: projector to surface, metres. `cos`: between the
-    /// surface normal and the direction to the projector. An unlit geometry (`cos <= 0`) and a NaN give 0.
+    /// smooth normal and the direction to the projector, either sign. NaN gives 0.
     pub fn drive(&self, radiance: [f32; 3], distance: f32, cos: f32) -> [f32; 3] {
-        if cos.is_nan() || cos <= 0.0 {
-            return [0.0; 3];
-        }
-        let geometry = distance * distance / cos;
-        std::array::from_fn(|c| clamp01(radiance[c] * (self.gain[c] * geometry)))
+        let geometry = distance * distance / cos.abs().max(LEAST_COS as f32);
+        std::array::from_fn(|c| {
+            let v = (radiance[c] - self.ambient[c]) * (self.gain[c] * geometry);
+            if v.is_nan() {
+                0.0
+            } else {
+                v.clamp(0.0, 1.0)
+            }
+        })
     }
 
     /// The same in f64.
     pub fn drive_f64(&self, radiance: [f64; 3], distance: f64, cos: f64) -> [f64; 3] {
-        if cos.is_nan() || cos <= 0.0 {
-            return [0.0; 3];
-        }
-        let geometry = distance * distance / cos;
+        let geometry = distance * distance / cos.abs().max(LEAST_COS);
         std::array::from_fn(|c| {
-            let v = radiance[c] * (f64::from(self.gain[c]) * geometry);
+            let v = (radiance[c] - f64::from(self.ambient[c])) * (f64::from(self.gain[c]) * geometry);
             if v.is_nan() {
                 0.0
             } else {
@@ -57,16 +63,10 @@ impl Compensation {
 
     /// Radiance toward the eye that a drive produces on the real surface: the inverse, for judging.
     pub fn radiance(&self, drive: [f64; 3], distance: f64, cos: f64) -> [f64; 3] {
-        std::array::from_fn(|c| drive[c] * cos.max(0.0) / (f64::from(self.gain[c]) * distance * distance))
-    }
-}
-
-/// 0..1; NaN becomes 0, as the shader tests by bits.
-fn clamp01(v: f32) -> f32 {
-    if v.is_nan() {
-        0.0
-    } else {
-        v.clamp(0.0, 1.0)
+        std::array::from_fn(|c| {
+            drive[c] * cos.abs() / (f64::from(self.gain[c]) * distance * distance)
+                + f64::from(self.ambient[c])
+        })
     }
 }
 
@@ -77,12 +77,12 @@ mod tests {
     #[test]
     fn a_white_lambertian_surface_returns_the_wanted_radiance() {
         // Intensity J on a surface of albedo rho at distance l, angle th: E = J cos / l^2, L = rho E / pi.
-        let k = Compensation::new([0.8; 3], [10.0, 20.0, 40.0]).unwrap();
+        let k = Compensation::new([0.8; 3], [10.0, 20.0, 40.0], [0.05, 0.0, 0.0]).unwrap();
         let (wanted, l, cos) = ([0.3, 0.2, 0.1], 1.7, 0.6);
         let drive = k.drive_f64(wanted, l, cos);
         for c in 0..3 {
             let intensity = drive[c] * [10.0, 20.0, 40.0][c];
-            let seen = 0.8 / std::f64::consts::PI * intensity * cos / (l * l);
+            let seen = 0.8 / std::f64::consts::PI * intensity * cos / (l * l) + [0.05, 0.0, 0.0][c];
             assert!((seen - wanted[c]).abs() < 1e-7, "{seen} {}", wanted[c]);
         }
         let back = k.radiance(drive, l, cos);
@@ -91,7 +91,7 @@ mod tests {
 
     #[test]
     fn f32_follows_f64_over_the_range() {
-        let k = Compensation::new([0.8, 0.5, 1.0], [10.0, 200.0, 1e4]).unwrap();
+        let k = Compensation::new([0.8, 0.5, 1.0], [10.0, 200.0, 1e4], [0.0; 3]).unwrap();
         for i in 0..2000 {
             let t = f64::from(i) / 2000.0;
             let (l, cos) = (1e-3 + 50.0 * t, 1.0 - 0.999 * t);
@@ -106,20 +106,20 @@ mod tests {
 
     #[test]
     fn out_of_range_is_black_or_full_and_never_nan() {
-        let k = Compensation::new([0.8; 3], [1.0; 3]).unwrap();
+        let k = Compensation::new([0.8; 3], [1.0; 3], [0.0; 3]).unwrap();
         for (radiance, l, cos, want) in [
             (f32::NAN, 1.0, 1.0, 0.0),
             (-1.0, 1.0, 1.0, 0.0),
             (f32::INFINITY, 1.0, 1.0, 1.0),
-            (1.0, 1.0, 0.0, 0.0),
-            (1.0, 1.0, -0.5, 0.0),
-            (1.0, 1.0, f32::NAN, 0.0),
-            (0.0, f32::INFINITY, 1.0, 0.0),
+            (1.0, 1.0, 0.0, 1.0),
+            (1.0, f32::NAN, 1.0, 0.0),
+            (0.0, 1e30, 1.0, 0.0),
             (1.0, 1.0, 1e-38, 1.0),
+            (0.0, 1.0, 1.0, 0.0),
         ] {
             assert_eq!(k.drive([radiance; 3], l, cos), [want; 3], "{radiance} {l} {cos}");
         }
-        assert_eq!(Compensation::new([0.0; 3], [1.0; 3]), None);
-        assert_eq!(Compensation::new([0.8; 3], [f64::NAN; 3]), None);
+        assert_eq!(Compensation::new([0.0; 3], [1.0; 3], [0.0; 3]), None);
+        assert_eq!(Compensation::new([0.8; 3], [f64::NAN; 3], [0.0; 3]), None);
     }
 }

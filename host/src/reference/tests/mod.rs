@@ -1,6 +1,10 @@
 //! Laws that the reference must obey: closed forms, conservation, reciprocity, statistics, invariance.
 
+mod bsdf_laws;
 mod furnace;
+mod intersection;
+mod lighting;
+mod materials;
 
 use crate::geometry::projector::ProjectorCamera;
 use crate::scene::{Body, Environment, Material, Scene, TriangleMesh};
@@ -109,7 +113,6 @@ fn diffuse(albedo: Vec3) -> Material {
     Material { base_color: albedo, metallic: 0.0, ior: 1.0, ..Material::default() }
 }
 
-#[allow(dead_code)]
 fn emitter(radiance: Vec3) -> Material {
     Material { emissive: radiance, ..diffuse(Vec3::ZERO) }
 }

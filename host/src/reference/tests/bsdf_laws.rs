@@ -1,0 +1,319 @@
+//! Scattering functions against Fresnel's equations, reciprocity, and the statistics of their samplers.
+
+use super::*;
+use crate::reference::bsdf::Bsdf;
+use crate::reference::microfacet::*;
+use crate::reference::{Reference, Sampler, SurfacePoint};
+use crate::render::albedo_table::AlbedoTable;
+use std::f64::consts::PI;
+
+/// Fresnel's equations with Snell's law, as in any textbook.
+fn fresnel_textbook(eta: f64, cos_i: f64) -> f64 {
+    let sin_t2 = (1.0 - cos_i * cos_i) / (eta * eta);
+    if sin_t2 >= 1.0 {
+        return 1.0;
+    }
+    let cos_t = (1.0 - sin_t2).sqrt();
+    let s = (cos_i - eta * cos_t) / (cos_i + eta * cos_t);
+    let p = (eta * cos_i - cos_t) / (eta * cos_i + cos_t);
+    0.5 * (s * s + p * p)
+}
+
+#[test]
+fn fresnel_equals_the_closed_form_and_is_continuous() {
+    for eta in [1.1, 1.5, 2.4, 1.0 / 1.5, 1.0 / 1.1, 0.2] {
+        for i in 0..=1000 {
+            let c = f64::from(i) / 1000.0;
+            let (f, want) = (fresnel_dielectric(eta, c), fresnel_textbook(eta, c));
+            assert!((f - want).abs() < 1e-12, "eta {eta} cos {c}: {f} {want}");
+        }
+    }
+    assert!((fresnel_dielectric(1.5, 1.0) - 0.04).abs() < 1e-15);
+    for c in [0.0, 1e-9, 0.3, 1.0] {
+        assert_eq!(fresnel_dielectric(1.0, c), 0.0);
+    }
+    // eta = 1 + d at normal incidence: d^2 / 4, to full precision although the textbook form has lost half its digits.
+    let d = 1e-7;
+    let f = fresnel_dielectric(1.0 + d, 1.0);
+    let exact = ((1.0 + d) - 1.0f64).powi(2) / (2.0 + d).powi(2);
+    assert!((f / exact - 1.0).abs() < 1e-9, "{f} {exact}");
+    // The edge of total reflection at sin = 1 / 1.5 is approached like a square root, without a step.
+    let edge = (1.0 - 1.0 / (1.5f64 * 1.5)).sqrt();
+    for d in [1e-4, 1e-8, 1e-12] {
+        let f = fresnel_dielectric(1.0 / 1.5, edge + d);
+        assert!(f < 1.0 && 1.0 - f < 20.0 * d.sqrt(), "{d}: {f}");
+        assert_eq!(fresnel_dielectric(1.0 / 1.5, edge - d), 1.0);
+    }
+    assert_eq!(fresnel_dielectric(1.5, 1.0 + 1e-9), fresnel_dielectric(1.5, 1.0));
+}
+
+#[test]
+fn refraction_obeys_snell() {
+    for eta in [1.5, 1.0 / 1.5, 1.0] {
+        let v = DVec3::new(0.4, -0.3, 0.8).normalize();
+        let h = DVec3::new(0.1, 0.2, 0.9).normalize();
+        let l = refract(v, h, eta).unwrap();
+        assert!((l.length() - 1.0).abs() < 1e-14);
+        // Tangential parts: sin_i = eta sin_t, and all three in one plane.
+        let (tv, tl) = (v - h * v.dot(h), l - h * l.dot(h));
+        assert!((tv + tl * eta).length() < 1e-14 && l.dot(h) < 0.0);
+    }
+    assert_eq!(refract(DVec3::new(0.9, 0.0, 0.19f64.sqrt()).normalize(), DVec3::Z, 1.0 / 1.5), None);
+}
+
+#[test]
+fn ggx_is_a_density_of_projected_normals() {
+    // integral D(h) (n.h) dh = 1 and integral D_v(h) dh = 1 for every v.
+    for alpha in [0.05, 0.3, 1.0] {
+        let n = 2000;
+        let (mut projected, mut visible) = (0.0, 0.0);
+        let v = DVec3::new(0.6, 0.0, 0.8);
+        for i in 0..n {
+            // tan(theta) = alpha t / (1 - t): even coverage of the peak.
+            let t = (f64::from(i) + 0.5) / f64::from(n);
+            let tan = alpha * t / (1.0 - t);
+            let cos = 1.0 / (1.0 + tan * tan).sqrt();
+            let dtheta = alpha / ((1.0 - t) * (1.0 - t)) * cos * cos;
+            let sin = tan * cos;
+            let m = 200;
+            let mut ring = 0.0;
+            for j in 0..m {
+                let phi = 2.0 * PI * f64::from(j) / f64::from(m);
+                let h = DVec3::new(sin * phi.cos(), sin * phi.sin(), cos);
+                ring += visible_normal_pdf(v, h, alpha) * 2.0 * PI / f64::from(m);
+            }
+            projected +=
+                ggx_d(DVec3::new(sin, 0.0, cos), alpha) * cos * 2.0 * PI * sin * dtheta / f64::from(n);
+            visible += ring * sin * dtheta / f64::from(n);
+        }
+        assert!((projected - 1.0).abs() < 1e-4, "{alpha}: {projected}");
+        assert!((visible - 1.0).abs() < 1e-3, "{alpha}: {visible}");
+    }
+    assert_eq!(sample_visible_normal(-DVec3::Z, 1.0, [0.0, 0.0]).map(|h| h.is_finite()), None);
+}
+
+fn patch(material: &Material) -> (Scene, SurfacePoint) {
+    let s = scene(floor(1.0), material.clone());
+    let r = Reference::new(&s, &[]);
+    let p = r.trace(DVec3::new(0.1, 1.0, 0.2), -DVec3::Y, 9.0, false).unwrap();
+    drop(r);
+    (s, p)
+}
+
+fn direction(u: [f64; 2], up: f64) -> DVec3 {
+    let (y, phi) = (0.02 + 0.98 * u[0], 2.0 * PI * u[1]);
+    let r = (1.0 - y * y).sqrt();
+    DVec3::new(r * phi.cos(), y * up, r * phi.sin())
+}
+
+#[test]
+fn scattering_is_reciprocal() {
+    let mut sampler = Sampler::new(3, 0);
+    for roughness in [0.1, 0.4, 1.0] {
+        for (metallic, transmission, thin_walled) in
+            [(0.0, 0.0, true), (1.0, 0.0, true), (0.4, 0.5, false), (0.0, 1.0, false)]
+        {
+            let m = Material {
+                base_color: Vec3::new(0.9, 0.5, 0.1),
+                roughness,
+                metallic,
+                transmission,
+                thin_walled,
+                ..Material::default()
+            };
+            let (_s, p) = patch(&m);
+            let table = AlbedoTable::new(m.ior);
+            for _ in 0..200 {
+                let (a, b) = (direction(sampler.uniform2(), 1.0), direction(sampler.uniform2(), 1.0));
+                let f = |v: DVec3, l: DVec3| Bsdf::new(&p, &table, v).unwrap().evaluate(l).f_cos / l.y.abs();
+                let (ab, ba) = (f(a, b), f(b, a));
+                assert!((ab - ba).abs().max_element() <= 1e-10 * ab.max_element(), "{ab} {ba}");
+                if transmission == 0.0 {
+                    continue;
+                }
+                // Refraction: f(a, b) n_b^2 = f(b, a) n_a^2, radiance over the square of the index being what travels.
+                let c = direction(sampler.uniform2(), -1.0);
+                let (ac, ca) = (f(a, c) * f64::from(m.ior).powi(2), f(c, a));
+                assert!((ac - ca).abs().max_element() <= 1e-9 * ac.max_element(), "{ac} {ca}");
+            }
+        }
+    }
+}
+
+/// Survival function of chi^2 by the normal approximation of its cube root [Wilson31].
+fn chi2_p_value(chi2: f64, freedom: f64) -> f64 {
+    let z = ((chi2 / freedom).cbrt() - (1.0 - 2.0 / (9.0 * freedom))) / (2.0 / (9.0 * freedom)).sqrt();
+    // Upper tail of the normal by the continued form of [Abramowitz64] 7.1.26, enough for a threshold at 1e-3.
+    let t = 1.0 / (1.0 + 0.3275911 * z.abs() / std::f64::consts::SQRT_2);
+    let poly =
+        t * (0.254829592 + t * (-0.284496736 + t * (1.421413741 + t * (-1.453152027 + t * 1.061405429))));
+    let tail = 0.5 * poly * (-0.5 * z * z).exp();
+    if z > 0.0 {
+        tail
+    } else {
+        1.0 - tail
+    }
+}
+
+/// Histogram of sampled directions against the density integrated over each cell of (y, azimuth); the density must integrate to the
+/// share of samples that are not absorbed.
+fn chi_square(
+    name: &str,
+    samples: u32,
+    sample: &mut dyn FnMut() -> Option<DVec3>,
+    pdf: &dyn Fn(DVec3) -> f64,
+) {
+    const ROWS: usize = 40;
+    const COLUMNS: usize = 40;
+    let mut count = vec![0.0; ROWS * COLUMNS];
+    let mut kept = 0.0;
+    for _ in 0..samples {
+        let Some(d) = sample() else { continue };
+        let row = ((0.5 - 0.5 * d.y) * ROWS as f64) as usize;
+        let column = ((0.5 + d.z.atan2(d.x) / (2.0 * PI)) * COLUMNS as f64) as usize;
+        count[row.min(ROWS - 1) * COLUMNS + column.min(COLUMNS - 1)] += 1.0;
+        kept += 1.0;
+    }
+    let mut expected = vec![0.0; ROWS * COLUMNS];
+    const SUB: usize = 14;
+    for (cell, e) in expected.iter_mut().enumerate() {
+        let (row, column) = (cell / COLUMNS, cell % COLUMNS);
+        let mut sum = 0.0;
+        for i in 0..SUB {
+            for j in 0..SUB {
+                let y = 1.0 - 2.0 * (row as f64 + (i as f64 + 0.5) / SUB as f64) / ROWS as f64;
+                let phi = (2.0 * (column as f64 + (j as f64 + 0.5) / SUB as f64) / COLUMNS as f64 - 1.0) * PI;
+                let r = (1.0 - y * y).sqrt();
+                sum += pdf(DVec3::new(r * phi.cos(), y, r * phi.sin()));
+            }
+        }
+        *e = sum / (SUB * SUB) as f64 * 4.0 * PI / (ROWS * COLUMNS) as f64 * f64::from(samples);
+    }
+    let integral = expected.iter().sum::<f64>() / f64::from(samples);
+    let share = kept / f64::from(samples);
+    assert!((integral - share).abs() < 6e-3, "{name}: density integrates to {integral}, kept {share}");
+    let (mut chi2, mut freedom, mut few) = (0.0, -1.0, (0.0, 0.0));
+    for (c, e) in count.iter().zip(&expected) {
+        if *e < 10.0 {
+            few = (few.0 + c, few.1 + e);
+        } else {
+            chi2 += (c - e) * (c - e) / e;
+            freedom += 1.0;
+        }
+    }
+    if few.1 > 10.0 {
+        chi2 += (few.0 - few.1) * (few.0 - few.1) / few.1;
+    }
+    let p = chi2_p_value(chi2, freedom);
+    assert!(p > 1e-3, "{name}: chi2 {chi2} of {freedom}, p {p}");
+}
+
+#[test]
+fn a_wrong_density_is_caught() {
+    let mut sampler = Sampler::new(5, 5);
+    let caught = std::panic::catch_unwind(move || {
+        // Cosine samples judged by a density of 2% stronger contrast.
+        let mut draw = || {
+            let u = sampler.uniform2();
+            let (r, phi) = (u[0].sqrt(), 2.0 * PI * u[1]);
+            Some(DVec3::new(r * phi.cos(), (1.0 - u[0]).sqrt(), r * phi.sin()))
+        };
+        chi_square("wrong", 150_000, &mut draw, &|d| {
+            if d.y > 0.0 {
+                1.04 / 2.0 / PI * 2.0 * d.y.powf(1.08)
+            } else {
+                0.0
+            }
+        });
+    });
+    assert!(caught.is_err());
+}
+
+#[test]
+fn every_bsdf_sampler_draws_from_its_density() {
+    for (roughness, metallic, transmission, thin_walled, v_y) in [
+        (0.5f32, 1.0f32, 0.0f32, true, 0.9f64),
+        (0.7, 1.0, 0.0, true, 0.15),
+        (1.0, 1.0, 0.0, true, 0.5),
+        (0.6, 0.0, 0.0, true, 0.6),
+        (0.7, 0.0, 1.0, false, 0.7),
+        (0.8, 0.3, 0.6, false, -0.6),
+        (0.0, 0.0, 0.0, true, 0.5),
+    ] {
+        let m = Material {
+            roughness,
+            metallic,
+            transmission,
+            thin_walled,
+            base_color: Vec3::splat(0.8),
+            ..Material::default()
+        };
+        let (_s, p) = patch(&m);
+        let table = AlbedoTable::new(m.ior);
+        let v = DVec3::new((1.0 - v_y * v_y).sqrt(), v_y, 0.0);
+        let bsdf = Bsdf::new(&p, &table, v).unwrap();
+        let mut sampler = Sampler::new(11, 0);
+        let mut draw = || {
+            let s = bsdf.sample(sampler.uniform(), sampler.uniform2(), sampler.uniform())?;
+            let pdf = s.pdf?;
+            let value = bsdf.evaluate(s.l);
+            assert!((value.pdf - pdf).abs() <= 1e-7 * pdf, "{} {pdf}", value.pdf);
+            assert!((value.f_cos - s.weight * pdf).abs().max_element() <= 1e-7 * value.f_cos.max_element());
+            Some(s.l)
+        };
+        chi_square(&format!("{m:?}"), 150_000, &mut draw, &|l| bsdf.evaluate(l).pdf);
+    }
+}
+
+#[test]
+fn the_sky_sampler_draws_from_its_density() {
+    let (w, h) = (20usize, 10usize);
+    let texels: Vec<Vec3> =
+        (0..w * h).map(|i| Vec3::splat(if i % 7 == 0 { 0.0 } else { (i % 11) as f32 })).collect();
+    let image = crate::reference::light::SkyImage::new(w, h, texels, 0.0);
+    let mut sampler = Sampler::new(2, 0);
+    let mut draw = || {
+        let (d, pdf) = image.sample(sampler.uniform2())?;
+        assert!((image.pdf(d) - pdf).abs() <= 1e-9 * pdf);
+        Some(d)
+    };
+    // Rows of the image are even in angle, cells of the histogram in cosine: the density is a step function within cells.
+    chi_square("sky", 40_000, &mut draw, &|d| image.pdf(d));
+}
+
+#[test]
+fn extreme_directions_stay_finite() {
+    for roughness in [0.0, 0.032, 0.5, 1.0] {
+        for transmission in [0.0, 1.0] {
+            let m = Material {
+                roughness,
+                transmission,
+                thin_walled: false,
+                metallic: 0.2,
+                ..Material::default()
+            };
+            let (_s, p) = patch(&m);
+            let table = AlbedoTable::new(m.ior);
+            let mut sampler = Sampler::new(1, 1);
+            for v in
+                [DVec3::Y, DVec3::X, DVec3::new(1.0, 1e-12, 0.0), DVec3::new(1.0, -1e-300, 0.0), -DVec3::Y]
+            {
+                let Some(bsdf) = Bsdf::new(&p, &table, v.normalize()) else { continue };
+                for u in [0.0, 1e-300, 0.5, 1.0 - f64::EPSILON / 2.0] {
+                    for choose in [0.0, 0.3, 0.999999] {
+                        if let Some(s) = bsdf.sample(choose, [u, sampler.uniform()], u) {
+                            assert!(
+                                s.weight.is_finite() && s.l.is_normalized() && s.weight.min_element() >= 0.0
+                            );
+                            assert!(s.pdf.is_none_or(|p| p.is_finite() && p > 0.0));
+                        }
+                    }
+                }
+                for l in [DVec3::X, -DVec3::X, v, -v, DVec3::Y, -DVec3::Y, DVec3::new(0.0, 1e-200, 1.0)] {
+                    let value = bsdf.evaluate(l);
+                    assert!(value.f_cos.is_finite() && value.pdf.is_finite(), "{v} {l} {value:?}");
+                }
+            }
+        }
+    }
+}
