@@ -5,6 +5,8 @@
 
 pub mod faults;
 pub mod motion;
+pub mod natnet_host;
+pub mod natnet_server;
 pub mod projector;
 pub mod rng;
 pub mod tracker;

@@ -453,7 +453,7 @@ pub(crate) fn multiply(a: [f64; 4], b: [f64; 4]) -> [f64; 4] {
 }
 
 /// `v` rotated by the unit quaternion `q`.
-fn rotate(q: [f64; 4], v: [f64; 3]) -> [f64; 3] {
+pub(crate) fn rotate(q: [f64; 4], v: [f64; 3]) -> [f64; 3] {
     let u = [q[0], q[1], q[2]];
     let t = scale(cross(u, v), 2.0);
     add(v, add(scale(t, q[3]), cross(u, t)))

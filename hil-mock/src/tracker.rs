@@ -74,7 +74,7 @@ pub enum MockTrackerError {
 }
 
 /// The faults that a stream of samples (not of bytes) can have.
-pub const SAMPLE_FAULTS: [FaultKind; 12] = [
+pub const TRACKER_FAULTS: [FaultKind; 13] = [
     FaultKind::Loss,
     FaultKind::Duplicate,
     FaultKind::Reorder,
@@ -87,18 +87,8 @@ pub const SAMPLE_FAULTS: [FaultKind; 12] = [
     FaultKind::Jump,
     FaultKind::Stall,
     FaultKind::Slow,
+    FaultKind::Reset,
 ];
-
-/// [`SAMPLE_FAULTS`] and the restart of the sample counter.
-const TRACKER_FAULTS: [FaultKind; 13] = {
-    let mut all = [FaultKind::Reset; 13];
-    let mut i = 0;
-    while i < 12 {
-        all[i] = SAMPLE_FAULTS[i];
-        i += 1;
-    }
-    all
-};
 
 /// The samples of a set of bodies as pure functions of their number: shared by [`MockTracker`] and the network servers.
 #[derive(Clone, Debug)]
@@ -108,11 +98,11 @@ pub struct SampleSource {
     draws: Draws,
 }
 
-/// What the tracker captured at one instant, and what becomes of the report on its way.
-#[derive(Clone, Copy, Debug, PartialEq)]
-pub struct Report {
-    /// The sample; `received_at` is its arrival.
-    pub sample: TrackerSample,
+/// The way of one report from the tracker to its consumer.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct Passage {
+    /// When it arrives.
+    pub arrives_at: HostTime,
     /// When a second copy arrives, if one does.
     pub copy_at: Option<HostTime>,
 }
@@ -145,7 +135,6 @@ impl SampleSource {
                 return wrong(field, value as f64, "0 to 1e9 (one second)");
             }
         }
-        config.faults.check_supported(&TRACKER_FAULTS, "the mock tracker")?;
         let draws = Draws::new(config.seed).stream(0x7261_636b);
         Ok(Self { config, bodies, draws })
     }
@@ -175,16 +164,13 @@ impl SampleSource {
         Some(self.bodies.get(usize::from(body.0))?.twist_at(t_ns))
     }
 
-    /// What becomes of sample `k` of `body`: `None` when it is lost or was never taken.
-    pub fn report(&self, body: BodyIndex, k: u64) -> Option<Report> {
+    /// Sample `k` of `body` as the tracker sees it, before anything happens to it on its way; `received_at` is the capture. `None`
+    /// for a body that is not there.
+    pub fn sample(&self, body: BodyIndex, k: u64) -> Option<TrackerSample> {
         let faults = &self.config.faults;
         let draws = self.draws.stream(u64::from(body.0));
-        let t = self.captured_ns(k);
-        let before = if k == 0 { i64::MIN } else { self.captured_ns(k - 1) };
+        let (before, t) = self.instants(k);
         let strikes = |kind| faults.strikes(kind, draws, k, before, t);
-        if faults.is_on(FaultKind::Dropout, t) || strikes(FaultKind::Loss) {
-            return None;
-        }
         // A stuck tracker repeats the last sample from before it stuck, or its first one.
         let seen = match faults.window_start(FaultKind::Stuck, t) {
             Some(since) => self.number_before(since),
@@ -210,21 +196,46 @@ impl SampleSource {
                 i => pose.rotation_xyzw[i - 3] = value,
             }
         }
-        let arrival = self.arrival_ns(draws, k, before, t);
-        let copy_at =
-            strikes(FaultKind::Duplicate).then(|| self.at(arrival + self.config.rate.slot_len_ns(k) / 4));
         let first_since_reset =
             faults.last_start(FaultKind::Reset, t).map_or(0, |r| self.number_before(r).saturating_add(1));
-        let sample = TrackerSample {
+        Some(TrackerSample {
             body,
             pose,
             tracked: !strikes(FaultKind::Invalid),
             mean_error_m: self.config.position_noise_m as f32,
             sequence: k.saturating_sub(first_since_reset) as u32,
             captured_at: self.at(t),
-            received_at: self.at(arrival),
-        };
-        Some(Report { sample, copy_at })
+            received_at: self.at(t),
+        })
+    }
+
+    /// What becomes of report `k` on its way: when it arrives, and when a second copy does. `None` when it is lost. `stream` is
+    /// the body's number where each body travels alone, and 0 where one packet carries all.
+    pub fn passage(&self, stream: u64, k: u64) -> Option<Passage> {
+        let faults = &self.config.faults;
+        let draws = self.draws.stream(stream);
+        let (before, t) = self.instants(k);
+        let strikes = |kind| faults.strikes(kind, draws, k, before, t);
+        if faults.is_on(FaultKind::Dropout, t) || strikes(FaultKind::Loss) {
+            return None;
+        }
+        let arrival = self.arrival_ns(draws, k, before, t);
+        let copy_at =
+            strikes(FaultKind::Duplicate).then(|| self.at(arrival + self.config.rate.slot_len_ns(k) / 4));
+        Some(Passage { arrives_at: self.at(arrival), copy_at })
+    }
+
+    /// Whether report `k` of `stream` suffers a fault of its bytes (`corrupt`, `truncate`), and if so 64 bits to do it with.
+    pub fn byte_fault(&self, kind: FaultKind, stream: u64, k: u64) -> Option<u64> {
+        let (before, t) = self.instants(k);
+        let draws = self.draws.stream(stream);
+        let strikes = self.config.faults.strikes(kind, draws, k, before, t);
+        strikes.then(|| draws.stream(6 + kind as u64).bits(k))
+    }
+
+    /// Capture of the report before `k`, and of `k`, nanoseconds after the start.
+    fn instants(&self, k: u64) -> (i64, i64) {
+        (if k == 0 { i64::MIN } else { self.captured_ns(k - 1) }, self.captured_ns(k))
     }
 
     /// Longest time from capture to arrival of any copy, nanoseconds: what a queue must be able to hold.
@@ -305,6 +316,7 @@ impl MockTracker {
 
     /// A tracker that reports `bodies`: body `i` of the rig is `bodies[i]`.
     pub fn new(config: MockTrackerConfig, bodies: Vec<Motion>) -> Result<Self, MockTrackerError> {
+        config.faults.check_supported(&TRACKER_FAULTS, "the mock tracker")?;
         let gate = SampleGate::new(bodies.len());
         let source = SampleSource::new(config, bodies)?;
         let captures = source.longest_delay_ns() / source.config.rate.slot_len_ns(0).max(1) + 4;
@@ -358,11 +370,14 @@ impl MockTracker {
 
     fn capture(&mut self, k: u64) {
         for body in 0..self.source.bodies.len() {
-            if let Some(report) = self.source.report(BodyIndex(body as u16), k) {
-                self.enqueue(report.sample);
-                if let Some(received_at) = report.copy_at {
-                    self.enqueue(TrackerSample { received_at, ..report.sample });
-                }
+            let (Some(passage), Some(sample)) =
+                (self.source.passage(body as u64, k), self.source.sample(BodyIndex(body as u16), k))
+            else {
+                continue;
+            };
+            self.enqueue(TrackerSample { received_at: passage.arrives_at, ..sample });
+            if let Some(received_at) = passage.copy_at {
+                self.enqueue(TrackerSample { received_at, ..sample });
             }
         }
     }

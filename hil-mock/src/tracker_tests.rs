@@ -145,7 +145,7 @@ fn windows_strike_exactly_the_samples_inside() {
     // T6: one sample 3 m off.
     let t = tracker("jump=3@1.0001s", |_| {});
     let off = |k: u64| {
-        let s = t.source.report(BodyIndex(0), k).unwrap().sample;
+        let s = t.source.sample(BodyIndex(0), k).unwrap();
         let p = t.true_pose(BodyIndex(0), s.captured_at.0).unwrap().position_m;
         (0..3).map(|i| (s.pose.position_m[i] - p[i]).powi(2)).sum::<f64>().sqrt()
     };

@@ -3,7 +3,7 @@
 mod gate;
 pub mod natnet;
 #[cfg(feature = "net")]
-mod udp;
+pub mod udp;
 
 pub use gate::{PacketCounters, SampleCounters, SampleGate, TrackerCounters};
 

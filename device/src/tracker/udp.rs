@@ -9,7 +9,7 @@ use std::os::fd::{AsRawFd, FromRawFd};
 
 /// A received datagram; the bytes lie in the caller's buffer.
 #[derive(Clone, Copy, Debug)]
-pub(crate) struct Arrival {
+pub struct Arrival {
     /// Bytes stored.
     pub len: usize,
     /// Sender.
@@ -21,7 +21,7 @@ pub(crate) struct Arrival {
 }
 
 /// A non-blocking IPv4 UDP socket.
-pub(crate) struct UdpPort {
+pub struct UdpPort {
     socket: UdpSocket,
 }
 
@@ -73,6 +73,30 @@ impl UdpPort {
                 self.set(libc::IPPROTO_IP, libc::IP_ADD_SOURCE_MEMBERSHIP, &request)
             }
             None => self.socket.join_multicast_v4(&group, &interface),
+        }
+    }
+
+    /// Sends multicast through the interface with address `interface`, at most `hops` routers far, heard on this machine too.
+    pub fn multicast_from(&self, interface: Ipv4Addr, hops: u8) -> io::Result<()> {
+        let raw = libc::in_addr { s_addr: u32::from(interface).to_be() };
+        self.set(libc::IPPROTO_IP, libc::IP_MULTICAST_IF, &raw)?;
+        self.socket.set_multicast_ttl_v4(u32::from(hops))?;
+        self.socket.set_multicast_loop_v4(true)
+    }
+
+    /// Waits until a datagram is there or `timeout` is over; true when one is there.
+    pub fn wait(&self, timeout: std::time::Duration) -> io::Result<bool> {
+        let mut waiting = libc::pollfd { fd: self.socket.as_raw_fd(), events: libc::POLLIN, revents: 0 };
+        let limit = libc::timespec {
+            tv_sec: timeout.as_secs().min(3600) as libc::time_t,
+            tv_nsec: i64::from(timeout.subsec_nanos()),
+        };
+        // SAFETY: one live pollfd and its count, a live timespec, and no signal mask.
+        let n = unsafe { libc::ppoll(&mut waiting, 1, &limit, std::ptr::null()) };
+        match n {
+            0.. => Ok(n > 0),
+            _ if io::Error::last_os_error().kind() == io::ErrorKind::Interrupted => Ok(false),
+            _ => Err(io::Error::last_os_error()),
         }
     }
 
@@ -154,7 +178,7 @@ impl UdpPort {
 }
 
 /// `CLOCK_REALTIME` now, nanoseconds: the clock of the kernel's stamps.
-pub(crate) fn realtime_ns() -> i64 {
+pub fn realtime_ns() -> i64 {
     let mut t: libc::timespec = unset();
     // SAFETY: `t` is a live timespec; CLOCK_REALTIME exists on every Linux.
     unsafe { libc::clock_gettime(libc::CLOCK_REALTIME, &mut t) };

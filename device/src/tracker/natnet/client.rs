@@ -23,6 +23,8 @@ const KEEP_ALIVE_EVERY_NS: i64 = 250 * MS;
 const MODELS_EVERY_NS: i64 = 1_000 * MS;
 /// A server that was silent for this long is connected to anew.
 const SILENCE_NS: i64 = 2_000 * MS;
+/// A server that answers but sent no frame for this long is connected to anew as well.
+const STARVED_NS: i64 = 1_000 * MS;
 /// Echo probes: this many quickly, the rest slowly.
 const QUICK_PROBES: u32 = 20;
 const QUICK_PROBE_EVERY_NS: i64 = 5 * MS;
@@ -107,6 +109,8 @@ pub struct NatNetClient {
     probes: Probes,
     due: Due,
     heard_at: Option<HostTime>,
+    /// Last frame, or last connection where none came since.
+    frame_at: HostTime,
     frames: u64,
     connects_sent: u64,
     version_changes: u64,
@@ -199,6 +203,7 @@ impl NatNetClient {
             probes: Probes::default(),
             due: Due { connect: now, keep_alive: now, models: now, probe: now },
             heard_at: None,
+            frame_at: now,
             frames: 0,
             connects_sent: 0,
             version_changes: 0,
@@ -276,7 +281,10 @@ impl NatNetClient {
         if self.heard_at.is_some_and(|h| now.ns_since(h) > SILENCE_NS) && self.server.is_some() {
             self.forget_server(now);
         }
-        if now >= self.due.connect && self.server.is_none() {
+        // A server that answers but sends no frames may have been restarted and forgotten this client.
+        let starved = now.ns_since(self.frame_at) > STARVED_NS;
+        if now >= self.due.connect && (self.server.is_none() || starved) {
+            self.frame_at = now;
             self.connect(now);
         }
         if self.server.is_none() {
@@ -458,6 +466,7 @@ impl NatNetClient {
         let verdict = match info {
             Ok(info) => {
                 self.frames += 1;
+                self.frame_at = at;
                 self.heed(&info, at);
                 Verdict::Used(self.deliver(&info, &bodies, at, sink))
             }
@@ -578,9 +587,11 @@ impl Tracker for NatNetClient {
         self.housekeeping(now);
         let foreign_before = self.gate.counters().packets.foreign_source;
         let (mut delivered, mut budget, mut offset) = (0, Self::MAX_DATAGRAMS_PER_POLL, None);
+        let mut is_crowded = false;
         // Commands first: names and clock before the frames that need them. They are few; frames get the rest of the budget.
         for is_data in [false, true] {
-            let mut share = if is_data { budget } else { Self::MAX_DATAGRAMS_PER_POLL / 2 };
+            let alone = is_data || self.data.is_none();
+            let mut share = if alone { budget } else { Self::MAX_DATAGRAMS_PER_POLL / 2 };
             while share > 0 && budget > 0 {
                 let port = if is_data { self.data.as_ref() } else { Some(&self.command) };
                 let Some(port) = port else { break };
@@ -590,6 +601,7 @@ impl Tracker for NatNetClient {
                 })?;
                 let Some(arrival) = arrival else { break };
                 share -= 1;
+                is_crowded |= share == 0;
                 budget -= 1;
                 let here = self.clock.now();
                 let offset = *offset.get_or_insert_with(|| self.realtime_offset());
@@ -597,11 +609,16 @@ impl Tracker for NatNetClient {
                 let stamped = arrival.kernel_ns.map(|ns| HostTime(ns.saturating_add(offset)));
                 let at = stamped.map_or(here, |s| s.min(here));
                 let at = if here.ns_since(at) > 10_000 * MS { here } else { at };
+                let frames = self.frames;
                 delivered += self.take_in(arrival, at, sink);
+                if !is_data && self.frames > frames {
+                    // This server streams to the command socket; what it may also send to the data port would only be copies.
+                    self.data = None;
+                }
             }
         }
         let foreign = self.gate.counters().packets.foreign_source - foreign_before;
-        if budget == 0 && foreign > 0 && !self.is_filtered {
+        if is_crowded && foreign > 0 && !self.is_filtered {
             // Strangers fill the queue: let the kernel throw them away from now on, uncounted.
             self.is_filtered = true;
             for port in std::iter::once(&self.command).chain(&self.data) {

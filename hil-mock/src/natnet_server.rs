@@ -1,0 +1,499 @@
+//! True poses into NatNet datagrams: the server's conversation as a state machine without sockets or threads.
+//!
+//! It answers every way of connecting seen in the wild, streams to a multicast group or to each client (at the address that
+//! connected, at the conventional data port of its host, or both), and tells its names before it streams to an endpoint: some
+//! clients take whatever comes next for the answer to their question.
+
+use crate::faults::{FaultError, FaultKind};
+use crate::tracker::SampleSource;
+use dpm_device::time::HostTime;
+use dpm_device::tracker::natnet::frame::{encode_frame, FrameContent, FrameInfo, LabeledMarker, RigidBody};
+use dpm_device::tracker::natnet::messages as msg;
+use dpm_device::tracker::natnet::models::{encode_models, BodyDefinition};
+use dpm_device::tracker::natnet::wire::{begin, finish, id, split, Version, WireError};
+use dpm_device::tracker::BodyIndex;
+use std::net::{Ipv4Addr, SocketAddrV4};
+
+/// Where unicast frames go.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum UnicastTo {
+    /// To the address that connected (OptiTrack's own library).
+    CommandSocket,
+    /// To the data port of the client's host (older clients).
+    DataPort,
+    /// To both.
+    Both,
+}
+
+/// How frames travel.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Streaming {
+    /// To a group, for everyone.
+    Multicast(Ipv4Addr),
+    /// To each client that connected.
+    Unicast(UnicastTo),
+}
+
+/// How the server presents itself.
+#[derive(Clone, Debug)]
+pub struct NatNetServerConfig {
+    /// Newest and default version of the bit stream, 3.0 to 4.2.
+    pub version: Version,
+    /// How frames travel.
+    pub streaming: Streaming,
+    /// Port announced for frames.
+    pub data_port: u16,
+    /// Names and streaming numbers of the bodies, in the order of the source's.
+    pub bodies: Vec<(String, i32)>,
+    /// Rate of the server's clock, ticks per second, 1 to 1e12.
+    pub clock_hz: u64,
+    /// What the clock shows at time 0, ticks.
+    pub clock_start: u64,
+    /// How much faster than the host's clock it runs, parts per billion, within 1e6.
+    pub clock_skew_ppb: i64,
+}
+
+impl NatNetServerConfig {
+    /// A 4.1 unicast server like Motive's: 10 MHz clock, bodies numbered from 1.
+    pub fn new(names: &[&str]) -> Self {
+        Self {
+            version: Version::V4_1,
+            streaming: Streaming::Unicast(UnicastTo::Both),
+            data_port: 1511,
+            bodies: names.iter().zip(1..).map(|(n, id)| ((*n).to_owned(), id)).collect(),
+            clock_hz: 10_000_000,
+            clock_start: 1_000_000_000_000,
+            clock_skew_ppb: 0,
+        }
+    }
+}
+
+/// Why a server cannot be made.
+#[derive(Debug, thiserror::Error)]
+pub enum NatNetServerError {
+    /// A version that is not spoken.
+    #[error("NatNet server: version {0} is not among 3.0, 3.1, 4.0, 4.1, 4.2")]
+    Version(Version),
+    /// Clock rate or skew out of range.
+    #[error("NatNet server: a clock of {hz} Hz, {skew_ppb} ppb fast; 1 to 1e12 Hz and within 1e6 ppb are possible")]
+    Clock {
+        /// Ticks per second.
+        hz: u64,
+        /// Parts per billion.
+        skew_ppb: i64,
+    },
+    /// Names do not match bodies.
+    #[error("NatNet server: {names} names for {bodies} bodies; names must be 1 to 200 bytes without zero, numbers distinct")]
+    Names {
+        /// Names given.
+        names: usize,
+        /// Bodies given.
+        bodies: usize,
+    },
+    /// More bodies than a datagram holds.
+    #[error("NatNet server: {0} bodies do not fit one datagram")]
+    TooMany(usize),
+    /// A fault that this server cannot commit.
+    #[error(transparent)]
+    Fault(#[from] FaultError),
+}
+
+/// All that a NatNet server can do wrong.
+pub const NATNET_FAULTS: [FaultKind; 16] = FaultKind::ALL;
+
+#[derive(Clone, Copy)]
+struct Client {
+    address: SocketAddrV4,
+    version: Version,
+    connected_at: HostTime,
+    heard_at: HostTime,
+    /// Names were told, so frames may follow.
+    is_told: bool,
+}
+
+/// One report on its way out.
+#[derive(Clone, Copy)]
+struct Outgoing {
+    k: u64,
+    due: HostTime,
+}
+
+/// The server. Time is the argument of each call: the host time of the sample source.
+pub struct NatNetServer {
+    config: NatNetServerConfig,
+    source: SampleSource,
+    markers: [[f32; 3]; 4],
+    clients: Vec<Client>,
+    next: u64,
+    outgoing: Vec<Outgoing>,
+    bodies: Vec<RigidBody>,
+    labeled: Vec<LabeledMarker>,
+    body_markers: Vec<[f32; 3]>,
+    datagram: Vec<u8>,
+    frames_sent: u64,
+}
+
+impl NatNetServer {
+    /// Most clients served at a time; more are answered but get no frames.
+    pub const MAX_CLIENTS: usize = 64;
+    /// A unicast client that said nothing for this long is dropped.
+    pub const CLIENT_TIMEOUT_NS: i64 = 5_000_000_000;
+    /// A client that never asked for names gets frames after this long.
+    pub const GRACE_NS: i64 = 300_000_000;
+    /// Most captures caught up with in one call.
+    const MAX_CATCH_UP: u64 = 256;
+
+    /// A server for the bodies of `source`.
+    pub fn new(config: NatNetServerConfig, source: SampleSource) -> Result<Self, NatNetServerError> {
+        if !config.version.is_spoken() || config.version > Version::V4_2 {
+            return Err(NatNetServerError::Version(config.version));
+        }
+        let (hz, skew_ppb) = (config.clock_hz, config.clock_skew_ppb);
+        if hz == 0 || hz > 1_000_000_000_000 || skew_ppb.abs() > 1_000_000 {
+            return Err(NatNetServerError::Clock { hz, skew_ppb });
+        }
+        let bad_name = |n: &str| n.is_empty() || n.len() > 200 || n.contains('\0');
+        let repeated =
+            config.bodies.iter().enumerate().any(|(i, b)| config.bodies[..i].iter().any(|c| c.1 == b.1));
+        if config.bodies.len() != source.body_count()
+            || config.bodies.iter().any(|b| bad_name(&b.0))
+            || repeated
+        {
+            return Err(NatNetServerError::Names { names: config.bodies.len(), bodies: source.body_count() });
+        }
+        source.config().faults.check_supported(&NATNET_FAULTS, "the NatNet server")?;
+        let mut server = Self {
+            config,
+            source,
+            markers: [[0.05, 0.0, 0.0], [-0.05, 0.0, 0.0], [0.0, 0.06, 0.0], [0.0, 0.0, 0.07]],
+            clients: Vec::with_capacity(Self::MAX_CLIENTS),
+            next: 0,
+            outgoing: Vec::with_capacity(64),
+            bodies: Vec::new(),
+            labeled: Vec::new(),
+            body_markers: Vec::new(),
+            datagram: Vec::with_capacity(4096),
+            frames_sent: 0,
+        };
+        let count = server.config.bodies.len();
+        server.fill(0);
+        let frame = server.encode(Version::V4_2, 0, HostTime(0));
+        if frame.and_then(|()| server.encode_model_definitions(Version::V4_2)).is_err() {
+            return Err(NatNetServerError::TooMany(count));
+        }
+        Ok(server)
+    }
+
+    /// Clients that get frames.
+    pub fn client_count(&self) -> usize {
+        self.clients.len()
+    }
+
+    /// Reports sent (each counted once, however many clients got it).
+    pub fn frames_sent(&self) -> u64 {
+        self.frames_sent
+    }
+
+    /// The source of the poses.
+    pub fn source(&self) -> &SampleSource {
+        &self.source
+    }
+
+    /// What the server's clock shows at `now`.
+    pub fn ticks_at(&self, now: HostTime) -> u64 {
+        let t = i128::from(now.ns_since(self.source.config().start));
+        // A restarted server's clock starts anew.
+        let faults = &self.source.config().faults;
+        let t = match faults.last_start(FaultKind::Reset, t as i64) {
+            Some(reset) => t - i128::from(reset),
+            None => t,
+        };
+        let skewed = t + t * i128::from(self.config.clock_skew_ppb) / 1_000_000_000;
+        let ticks = skewed * i128::from(self.config.clock_hz) / 1_000_000_000;
+        (i128::from(self.config.clock_start) + ticks) as u64
+    }
+
+    fn is_away(&self, now: HostTime) -> bool {
+        let t = now.ns_since(self.source.config().start);
+        self.source.config().faults.is_on(FaultKind::Unplug, t)
+    }
+
+    /// Answers one datagram on the command port through `send`. Nonsense is ignored, or answered as unrecognized.
+    pub fn on_datagram(
+        &mut self,
+        datagram: &[u8],
+        from: SocketAddrV4,
+        now: HostTime,
+        send: &mut dyn FnMut(&[u8], SocketAddrV4),
+    ) {
+        if self.is_away(now) {
+            return;
+        }
+        // Some clients announce a wrong length (the text without its zero): the number alone decides.
+        let (message, payload) = match split(datagram) {
+            Ok(parts) => parts,
+            Err(WireError::Length { .. }) => (u16::from_le_bytes([datagram[0], datagram[1]]), &datagram[4..]),
+            Err(_) => return,
+        };
+        let known = self.clients.iter().position(|c| c.address == from);
+        if let Some(i) = known {
+            self.clients[i].heard_at = now;
+        }
+        let version = known.map_or(self.config.version, |i| self.clients[i].version);
+        match message {
+            id::CONNECT | id::DISCOVERY => {
+                let wanted = msg::Connect::decode(payload).bitstream.filter(|v| *v <= self.config.version);
+                let version = if message == id::CONNECT { self.connect(from, wanted, now) } else { version };
+                self.encode_server_info(version);
+            }
+            id::REQUEST_MODEL_DEF => {
+                if self.encode_model_definitions(version).is_err() {
+                    return;
+                }
+                if let Some(i) = known {
+                    self.clients[i].is_told = true;
+                }
+            }
+            id::REQUEST_FRAME => {
+                let Some(k) = self.next.checked_sub(1) else { return };
+                self.fill(k);
+                if self.encode(version, k, now).is_err() {
+                    return;
+                }
+            }
+            id::REQUEST => self.answer_request(msg::request_text(payload).unwrap_or(""), known),
+            id::ECHO_REQUEST => match msg::decode_echo_request(payload) {
+                Ok(stamp) => {
+                    let ticks = self.ticks_at(now);
+                    msg::encode_echo_response(&mut self.datagram, stamp, ticks);
+                }
+                Err(_) => return,
+            },
+            id::KEEP_ALIVE => return,
+            id::DISCONNECT => {
+                self.clients.retain(|c| c.address != from);
+                return;
+            }
+            _ => msg::encode_empty(&mut self.datagram, id::UNRECOGNIZED),
+        }
+        send(&self.datagram, from);
+    }
+
+    fn connect(&mut self, address: SocketAddrV4, wanted: Option<Version>, now: HostTime) -> Version {
+        let unicast = matches!(self.config.streaming, Streaming::Unicast(_));
+        // A group has one bit stream for all.
+        let version = if unicast { wanted.unwrap_or(self.config.version) } else { self.config.version };
+        if let Some(client) = self.clients.iter_mut().find(|c| c.address == address) {
+            client.version = version;
+        } else if self.clients.len() < Self::MAX_CLIENTS {
+            self.clients.push(Client { address, version, connected_at: now, heard_at: now, is_told: false });
+        }
+        version
+    }
+
+    fn answer_request(&mut self, text: &str, known: Option<usize>) {
+        let (word, argument) = text.split_once(',').unwrap_or((text, ""));
+        let answer = match word {
+            "FrameRate" => (self.source.config().rate.hz() as f32).to_le_bytes(),
+            "UnitsToMillimeters" => 1000f32.to_le_bytes(),
+            "Bitstream" => {
+                let unicast = matches!(self.config.streaming, Streaming::Unicast(_));
+                let wanted = parse_version(argument).filter(|v| *v <= self.config.version && unicast);
+                match (wanted, known) {
+                    (Some(version), Some(i)) => {
+                        self.clients[i].version = version;
+                        0i32.to_le_bytes()
+                    }
+                    _ => 1i32.to_le_bytes(),
+                }
+            }
+            "SubscribeToData"
+            | "SubscribeByID"
+            | "SubscribedDataOnly"
+            | "TimelinePlay"
+            | "TimelineStop"
+            | "LiveMode"
+            | "EditMode"
+            | "SetPlaybackCurrentFrame"
+            | "StartRecording"
+            | "StopRecording" => 0i32.to_le_bytes(),
+            _ => return msg::encode_empty(&mut self.datagram, id::UNRECOGNIZED),
+        };
+        begin(&mut self.datagram, id::RESPONSE);
+        self.datagram.extend_from_slice(&answer);
+        finish(&mut self.datagram).expect("four bytes");
+    }
+
+    fn encode_server_info(&mut self, version: Version) {
+        let group = match self.config.streaming {
+            Streaming::Multicast(group) => Some(group.octets()),
+            Streaming::Unicast(_) => None,
+        };
+        let info = msg::ServerInfo {
+            name: "hil-mock".into(),
+            app_version: [3, 1, 0, 0],
+            natnet_version: [version.major, version.minor, 0, 0],
+            clock_hz: self.config.clock_hz,
+            data_port: self.config.data_port,
+            multicast: group,
+        };
+        info.encode(&mut self.datagram);
+    }
+
+    fn encode_model_definitions(&mut self, version: Version) -> Result<(), WireError> {
+        let markers = &self.markers;
+        let definitions: Vec<BodyDefinition<'_>> =
+            self.config.bodies.iter().map(|(name, id)| BodyDefinition { name, id: *id, markers }).collect();
+        encode_models(&mut self.datagram, version, &definitions)
+    }
+
+    /// Instant at which the next report is due: when to call [`NatNetServer::stream`] again, at the latest.
+    pub fn next_due(&self) -> HostTime {
+        let capture = self.source.config().start.plus_ns(self.source.captured_ns(self.next));
+        self.outgoing.iter().map(|o| o.due).min().map_or(capture, |due| due.min(capture))
+    }
+
+    /// Sends all reports due by `now` through `send`.
+    pub fn stream(&mut self, now: HostTime, send: &mut dyn FnMut(&[u8], SocketAddrV4)) {
+        let started = now.ns_since(self.source.config().start) - self.source.config().phase_ns;
+        if started < 0 {
+            return;
+        }
+        let newest = self.source.config().rate.slot_at_ns(started);
+        self.next = self.next.max((newest + 1).saturating_sub(Self::MAX_CATCH_UP));
+        while self.next <= newest {
+            if let Some(passage) = self.source.passage(0, self.next) {
+                for due in std::iter::once(passage.arrives_at).chain(passage.copy_at) {
+                    // Bounded whatever latency the configuration asks for.
+                    if self.outgoing.len() < 4096 {
+                        self.outgoing.push(Outgoing { k: self.next, due });
+                    }
+                }
+            }
+            self.next += 1;
+        }
+        self.outgoing.sort_by_key(|o| o.due);
+        let due = self.outgoing.partition_point(|o| o.due <= now);
+        let unicast = matches!(self.config.streaming, Streaming::Unicast(_));
+        self.clients.retain(|c| !unicast || now.ns_since(c.heard_at) < Self::CLIENT_TIMEOUT_NS);
+        for i in 0..due {
+            let k = self.outgoing[i].k;
+            if !self.is_away(now) {
+                self.send_report(k, now, send);
+            }
+        }
+        self.outgoing.drain(..due);
+    }
+
+    fn send_report(&mut self, k: u64, now: HostTime, send: &mut dyn FnMut(&[u8], SocketAddrV4)) {
+        self.frames_sent += 1;
+        self.fill(k);
+        match self.config.streaming {
+            Streaming::Multicast(group) => {
+                if self.encode(self.config.version, k, now).is_ok() {
+                    self.spoil(k);
+                    send(&self.datagram, SocketAddrV4::new(group, self.config.data_port));
+                }
+            }
+            Streaming::Unicast(to) => {
+                for i in 0..self.clients.len() {
+                    let client = self.clients[i];
+                    if !client.is_told && now.ns_since(client.connected_at) < Self::GRACE_NS {
+                        continue;
+                    }
+                    if self.encode(client.version, k, now).is_err() {
+                        continue;
+                    }
+                    self.spoil(k);
+                    if to != UnicastTo::DataPort {
+                        send(&self.datagram, client.address);
+                    }
+                    let data = SocketAddrV4::new(*client.address.ip(), self.config.data_port);
+                    // Once for each host, however many of its programs connected.
+                    let is_first = !self.clients[..i].iter().any(|c| c.address.ip() == client.address.ip());
+                    if to != UnicastTo::CommandSocket && is_first && data != client.address {
+                        send(&self.datagram, data);
+                    }
+                }
+            }
+        }
+    }
+
+    /// Poses and markers of capture `k`.
+    fn fill(&mut self, k: u64) {
+        self.bodies.clear();
+        self.labeled.clear();
+        self.body_markers.clear();
+        for (i, (_, id)) in self.config.bodies.iter().enumerate() {
+            let Some(sample) = self.source.sample(BodyIndex(i as u16), k) else { continue };
+            let position = sample.pose.position_m.map(|c| c as f32);
+            self.bodies.push(RigidBody {
+                id: *id,
+                position,
+                rotation_xyzw: sample.pose.rotation_xyzw.map(|c| c as f32),
+                mean_error: sample.mean_error_m,
+                params: u16::from(sample.tracked),
+            });
+            for (j, marker) in self.markers.iter().enumerate() {
+                let r = crate::motion::rotate(sample.pose.rotation_xyzw, marker.map(f64::from));
+                let at = [0, 1, 2].map(|c| (sample.pose.position_m[c] + r[c]) as f32);
+                self.body_markers.push(at);
+                self.labeled.push(LabeledMarker {
+                    id: (id << 16) | (j as i32 + 1),
+                    position: at,
+                    size: 0.014,
+                    params: 0b1010,
+                    residual: 0.0,
+                });
+            }
+        }
+    }
+
+    fn encode(&mut self, version: Version, k: u64, now: HostTime) -> Result<(), WireError> {
+        let captured_ns = self.source.captured_ns(k);
+        let captured = self.source.config().start.plus_ns(captured_ns);
+        let number = self.source.sample(BodyIndex(0), k).map_or(0, |s| s.sequence);
+        let info = FrameInfo {
+            number: number as i32,
+            timecode: [0; 2],
+            timestamp_s: captured_ns as f64 * 1e-9,
+            mid_exposure: self.ticks_at(captured),
+            data_received: self.ticks_at(captured.plus_ns(500_000).min(now)),
+            transmit: self.ticks_at(now),
+            precision: [0; 2],
+            params: FrameInfo::LIVE,
+        };
+        let per_body = self.markers.len();
+        let sets: Vec<(&str, &[[f32; 3]])> = self
+            .config
+            .bodies
+            .iter()
+            .zip(self.body_markers.chunks(per_body))
+            .map(|((name, _), markers)| (name.as_str(), markers))
+            .collect();
+        let content = FrameContent {
+            marker_sets: &sets,
+            other_markers: &[],
+            bodies: &self.bodies,
+            labeled: &self.labeled,
+        };
+        encode_frame(&mut self.datagram, version, &info, &content)
+    }
+
+    /// Damages the datagram where the plan says so.
+    fn spoil(&mut self, k: u64) {
+        if let Some(bits) = self.source.byte_fault(FaultKind::Corrupt, 0, k) {
+            let at = bits as usize % self.datagram.len();
+            self.datagram[at] ^= ((bits >> 32) as u8).max(1);
+        }
+        if let Some(bits) = self.source.byte_fault(FaultKind::Truncate, 0, k) {
+            self.datagram.truncate(bits as usize % self.datagram.len());
+        }
+    }
+}
+
+fn parse_version(text: &str) -> Option<Version> {
+    let (major, minor) = text.trim().split_once('.')?;
+    let version = Version::new(major.parse().ok()?, minor.split('.').next()?.parse().ok()?);
+    version.is_spoken().then_some(version)
+}

@@ -1,0 +1,485 @@
+//! The NatNet client against the NatNet server over real loopback sockets: in virtual time, step by step, and once in real time.
+
+use dpm_device::pose::Pose;
+use dpm_device::time::{HostClock, HostTime};
+use dpm_device::tracker::natnet::client::{NatNetClient, NatNetConfig, Silence};
+use dpm_device::tracker::natnet::frame::{encode_frame, FrameContent, FrameInfo, RigidBody};
+use dpm_device::tracker::natnet::messages::ServerInfo;
+use dpm_device::tracker::natnet::Version;
+use dpm_device::tracker::udp::UdpPort;
+use dpm_device::tracker::{BodyIndex, BodyKey, Tracker, TrackerSample};
+use hil_mock::motion::{Motion, MotionSpec};
+use hil_mock::natnet_host::NatNetHost;
+use hil_mock::natnet_server::{NatNetServer, NatNetServerConfig, Streaming, UnicastTo};
+use hil_mock::tracker::{MockTrackerConfig, SampleSource};
+use std::net::{Ipv4Addr, SocketAddrV4};
+use std::sync::atomic::{AtomicI64, Ordering};
+use std::sync::Arc;
+use std::time::{Duration, Instant};
+
+const MS: i64 = 1_000_000;
+const S: i64 = 1_000 * MS;
+const LOCALHOST: Ipv4Addr = Ipv4Addr::LOCALHOST;
+
+fn keys(names: &[&str]) -> Vec<BodyKey> {
+    names.iter().map(|n| BodyKey { name: (*n).to_owned(), id: None }).collect()
+}
+
+fn source(faults: &str, latency_ns: i64) -> SampleSource {
+    let rest = Pose { position_m: [0.1, 0.2, 1.5], ..Pose::IDENTITY };
+    let rotate = MotionSpec::Rotate { axis: [0.0, 1.0, 0.0], rate_rad_s: 3.0, pivot_offset_m: [0.0; 3] };
+    let motions = vec![
+        Motion::new(&MotionSpec::paper_translation(), rest).unwrap(),
+        Motion::new(&rotate, rest).unwrap(),
+    ];
+    let config = MockTrackerConfig { faults: faults.parse().unwrap(), latency_ns, ..Default::default() };
+    SampleSource::new(config, motions).unwrap()
+}
+
+/// Client and server on loopback with one virtual clock: a datagram sent is there at once, so nothing depends on the machine.
+struct Bench {
+    clock: Arc<AtomicI64>,
+    server: NatNetServer,
+    socket: UdpPort,
+    client: NatNetClient,
+    samples: Vec<TrackerSample>,
+    buffer: Vec<u8>,
+}
+
+fn clock_of(cell: &Arc<AtomicI64>) -> Arc<dyn HostClock> {
+    let cell = cell.clone();
+    Arc::new(move || HostTime(cell.load(Ordering::Relaxed)))
+}
+
+impl Bench {
+    fn new(
+        faults: &str,
+        server: impl FnOnce(&mut NatNetServerConfig),
+        client: impl FnOnce(&mut NatNetConfig),
+    ) -> Self {
+        let clock = Arc::new(AtomicI64::new(0));
+        let socket = UdpPort::bind(SocketAddrV4::new(LOCALHOST, 0), false).unwrap();
+        let spare = UdpPort::bind(SocketAddrV4::new(LOCALHOST, 0), false).unwrap();
+        let data_port = spare.local().unwrap().port();
+        drop(spare);
+        let mut config = NatNetServerConfig::new(&["Hare", "Bust"]);
+        config.data_port = data_port;
+        server(&mut config);
+        if let Streaming::Multicast(_) = config.streaming {
+            socket.multicast_from(LOCALHOST, 0).unwrap();
+        }
+        let mut wanted = NatNetConfig::unicast(LOCALHOST, keys(&["Hare", "Bust"]));
+        wanted.local = LOCALHOST;
+        wanted.command_port = socket.local().unwrap().port();
+        wanted.data_port = data_port;
+        client(&mut wanted);
+        Self {
+            server: NatNetServer::new(config, source(faults, 2 * MS)).unwrap(),
+            client: NatNetClient::open(wanted, clock_of(&clock)).unwrap(),
+            clock,
+            socket,
+            samples: Vec::new(),
+            buffer: vec![0; 65_536],
+        }
+    }
+
+    fn now(&self) -> HostTime {
+        HostTime(self.clock.load(Ordering::Relaxed))
+    }
+
+    /// The server's turn.
+    fn serve(&mut self) {
+        let now = self.now();
+        let socket = &self.socket;
+        let mut send = |bytes: &[u8], to: SocketAddrV4| drop(socket.send(bytes, to));
+        while let Some(a) = self.socket.receive(&mut self.buffer).unwrap() {
+            self.server.on_datagram(&self.buffer[..a.len], a.from, now, &mut send);
+        }
+        self.server.stream(now, &mut send);
+    }
+
+    /// The client's turn.
+    fn poll(&mut self) -> usize {
+        let samples = &mut self.samples;
+        let n = self
+            .client
+            .poll(HostTime(self.clock.load(Ordering::Relaxed)), &mut |s| samples.push(*s))
+            .unwrap();
+        assert!(self.client.counters().is_conserved(), "{}", self.client.counters());
+        n
+    }
+
+    /// Both in turns of `step` until `until`.
+    fn run(&mut self, step: i64, until: i64) {
+        while self.now().0 < until {
+            self.clock.fetch_add(step, Ordering::Relaxed);
+            self.serve();
+            self.poll();
+        }
+    }
+
+    /// Largest difference between reported and true positions of all samples, metres.
+    fn worst_error(&self) -> f64 {
+        let error = |s: &TrackerSample| {
+            let truth = self.server.source().true_pose(s.body, s.captured_at.0).unwrap();
+            let d = |i: usize| s.pose.position_m[i] - truth.position_m[i];
+            (d(0).powi(2) + d(1).powi(2) + d(2).powi(2)).sqrt()
+        };
+        self.samples.iter().map(error).fold(0.0, f64::max)
+    }
+}
+
+#[test]
+fn poses_names_and_times_come_through_in_every_version() {
+    for version in [Version::V3_0, Version::new(3, 1), Version::V4_0, Version::V4_1, Version::V4_2] {
+        let mut bench = Bench::new("", |s| s.version = version, |c| c.bodies.swap(0, 1));
+        bench.run(MS / 2, 2 * S);
+        assert_eq!(bench.client.version(), version);
+        assert_eq!(bench.client.server().unwrap().name, "hil-mock");
+        assert_eq!(bench.client.models().len(), 2);
+        assert_eq!(bench.client.silence(), None, "{}", bench.client.status());
+        // The rig names the bodies in the other order: index 1 is the hare, which moves in x.
+        let hare: Vec<_> = bench.samples.iter().filter(|s| s.body == BodyIndex(1)).collect();
+        assert!(hare.len() > 800, "{version}: {}", hare.len());
+        assert!(hare.iter().any(|s| (s.pose.position_m[0] - 0.1).abs() > 0.1));
+        // Captured when the tracker says: to half a microsecond through the echo map.
+        let settled = hare.iter().filter(|s| s.captured_at.0 > S);
+        let worst = settled.map(|s| (s.captured_at.0 + MS) % (2 * MS) - MS).map(i64::abs).max().unwrap();
+        assert!(worst < 500_000, "{version}: {worst}");
+        assert!(bench.client.clock_map().unwrap().min_round_trip_ns().unwrap() >= 0);
+    }
+}
+
+#[test]
+fn capture_times_follow_a_skewed_clock() {
+    let mut bench = Bench::new(
+        "",
+        |s| {
+            s.clock_skew_ppb = 200_000;
+            s.clock_hz = 3_000_001;
+        },
+        |_| {},
+    );
+    // Fine steps so that the virtual round trip, one step, says something.
+    bench.run(50_000, 3 * S);
+    let hare: Vec<_> =
+        bench.samples.iter().filter(|s| s.body == BodyIndex(0) && s.captured_at.0 > S).collect();
+    let worst = hare.iter().map(|s| ((s.captured_at.0 + MS).rem_euclid(2 * MS) - MS).abs()).max().unwrap();
+    let bound = bench
+        .client
+        .clock_map()
+        .unwrap()
+        .to_host(dpm_device::time::DeviceTicks(bench.server.ticks_at(bench.now())));
+    assert!(worst <= 50_000, "{worst} ns");
+    assert!(worst <= bound.unwrap().uncertainty_ns + 2 * 50_000);
+    // Half a step of time at 1 m/s is 25 um, and f32 metres add 1e-7.
+    assert!(bench.worst_error() < 1e-4, "{}", bench.worst_error());
+}
+
+#[test]
+fn both_unicast_conventions_and_multicast_are_understood() {
+    let group = Ipv4Addr::new(239, 255, 42, 99);
+    for streaming in [
+        Streaming::Unicast(UnicastTo::CommandSocket),
+        Streaming::Unicast(UnicastTo::DataPort),
+        Streaming::Unicast(UnicastTo::Both),
+        Streaming::Multicast(group),
+    ] {
+        let mut bench = Bench::new(
+            "",
+            |s| s.streaming = streaming,
+            |c| {
+                if let Streaming::Multicast(group) = streaming {
+                    c.multicast = Some(group);
+                }
+            },
+        );
+        bench.run(MS, S);
+        let frames = bench.samples.iter().filter(|s| s.body == BodyIndex(0)).count();
+        assert!(frames > 300, "{streaming:?}: {frames}, {}", bench.client.status());
+        assert!(bench.client.counters().samples.duplicate <= 4, "{streaming:?}: {}", bench.client.status());
+    }
+}
+
+#[test]
+fn silence_has_a_reason() {
+    // Nobody there.
+    let mut bench = Bench::new("", |_| {}, |c| c.command_port = 9);
+    bench.run(10 * MS, S);
+    assert_eq!(bench.client.silence(), Some(Silence::NoAnswer));
+    assert!(bench.client.status().contains("127.0.0.1:9"), "{}", bench.client.status());
+    // The server streams to a group, the client asked for unicast.
+    let group = Ipv4Addr::new(239, 255, 42, 98);
+    let mut bench = Bench::new("", |s| s.streaming = Streaming::Multicast(group), |_| {});
+    bench.run(10 * MS, S);
+    assert_eq!(bench.client.silence(), Some(Silence::NoFrames));
+    assert!(bench.client.status().contains("multicast = \"239.255.42.98\""), "{}", bench.client.status());
+    // The bodies are called otherwise (T12): names and numbers of what is there are told.
+    let mut bench = Bench::new("", |_| {}, |c| c.bodies = keys(&["Hare "]));
+    bench.run(MS, S);
+    assert_eq!(bench.client.silence(), Some(Silence::NoKnownBody));
+    let status = bench.client.status();
+    assert!(
+        status.contains("\"Hare\" = 1") && status.contains("\"Hare \"") && status.contains("[1, 2]"),
+        "{status}"
+    );
+    assert_eq!(bench.client.counters().samples.unknown_body, bench.client.counters().samples.received);
+    // Seen by nobody.
+    let mut bench = Bench::new("invalid", |_| {}, |_| {});
+    bench.run(MS, S);
+    assert_eq!(bench.client.silence(), Some(Silence::NotTracked));
+    // The server goes away, and comes back: found again within a second of its return.
+    let mut bench = Bench::new("unplug@1s+4s", |_| {}, |_| {});
+    bench.run(MS, 4 * S);
+    assert_eq!(bench.client.silence(), Some(Silence::WentSilent));
+    bench.samples.clear();
+    bench.run(MS, 6 * S);
+    assert_eq!(bench.client.silence(), None, "{}", bench.client.status());
+    assert!(bench.samples[0].received_at.0 < 5 * S + 500 * MS, "{:?}", bench.samples[0]);
+}
+
+#[test]
+fn numbers_work_where_names_are_unknown() {
+    let bodies = vec![BodyKey { name: "anything".into(), id: Some(2) }];
+    let mut bench = Bench::new("", |_| {}, |c| c.bodies = bodies);
+    bench.run(MS, S);
+    // Number 2 rotates in place.
+    assert!(bench.samples.len() > 300);
+    assert!(bench.samples.iter().all(|s| (s.pose.position_m[0] - 0.1).abs() < 1e-6));
+}
+
+#[test]
+fn faults_on_the_wire_are_counted_and_change_nothing_else() {
+    let faults = "loss=0.05,duplicate=0.1,reorder=0.1,corrupt=0.1,truncate=0.05,nan=0.02,norm=0.02,flip=0.3";
+    for version in [Version::V3_0, Version::V4_1] {
+        let mut bench = Bench::new(faults, |s| s.version = version, |_| {});
+        bench.run(MS / 2, 20 * S);
+        let c = *bench.client.counters();
+        // 10,000 frames: each fault shows, the bounds are wide because faults hide each other.
+        assert!((200..2000).contains(&c.packets.malformed), "{c}");
+        assert!(c.samples.late > 500 && c.samples.duplicate > 500 && c.lost > 500, "{c}");
+        assert!(c.samples.not_finite + c.samples.out_of_reach > 100 && c.samples.bad_rotation > 100, "{c}");
+        assert!(c.samples.used > 14_000, "{c}");
+        // Capture order and rigidity are kept. A corrupted float may be a plausible pose: NatNet has no checksum.
+        for body in [BodyIndex(0), BodyIndex(1)] {
+            let of_body: Vec<_> = bench.samples.iter().filter(|s| s.body == body).collect();
+            assert!(of_body.windows(2).all(|w| w[0].captured_at < w[1].captured_at));
+        }
+        assert!(bench.samples.iter().all(|s| s.pose.is_valid(1e-9)));
+    }
+}
+
+#[test]
+fn a_restarted_server_is_followed_within_50_ms() {
+    // T11: frame numbers and ticks start anew.
+    let mut bench = Bench::new("reset@3s", |_| {}, |_| {});
+    bench.run(MS / 2, 5 * S);
+    let after: Vec<_> =
+        bench.samples.iter().filter(|s| s.received_at.0 > 3 * S + 2 * MS && s.body == BodyIndex(0)).collect();
+    assert!(after[0].received_at.0 < 3 * S + 50 * MS, "{:?}", after[0]);
+    assert!(after[0].sequence < 30);
+    assert_eq!(bench.client.counters().restarts, 2, "one for each body: {}", bench.client.status());
+    // No sample is more than a few milliseconds off, not even while the map is being renewed.
+    for s in &bench.samples {
+        let age = s.received_at.0 - s.captured_at.0;
+        assert!((0..=6 * MS).contains(&age), "{age} ns old at {}", s.received_at.0);
+    }
+    assert!(bench.worst_error() < 3e-3, "{}", bench.worst_error());
+}
+
+#[test]
+fn the_bit_stream_may_change_under_way() {
+    // T14: another server with another version takes over the same address.
+    let mut bench = Bench::new("", |s| s.version = Version::V3_0, |_| {});
+    bench.run(MS, S);
+    assert_eq!(bench.client.version(), Version::V3_0);
+    let mut config = NatNetServerConfig::new(&["Hare", "Bust"]);
+    config.version = Version::V4_2;
+    config.streaming = Streaming::Unicast(UnicastTo::CommandSocket);
+    bench.server = NatNetServer::new(config, source("", 2 * MS)).unwrap();
+    // It answers echoes but knows no client: the client connects anew when frames stay away.
+    bench.samples.clear();
+    bench.run(MS, 5 * S);
+    assert_eq!(bench.client.version(), Version::V4_2, "{}", bench.client.status());
+    assert!(bench.samples.len() > 1000);
+    // And asked for: a 4.0 stream from a 4.2 server.
+    let mut bench = Bench::new("", |s| s.version = Version::V4_2, |c| c.bitstream = Some(Version::V4_0));
+    bench.run(MS, S);
+    assert_eq!(bench.client.version(), Version::V4_0);
+    assert!(bench.samples.len() > 600);
+}
+
+/// A socket that plays a server by hand.
+struct ByHand {
+    clock: Arc<AtomicI64>,
+    socket: UdpPort,
+    client: NatNetClient,
+    client_address: SocketAddrV4,
+    out: Vec<u8>,
+}
+
+impl ByHand {
+    /// A client that has connected to a 4.1 server without a clock.
+    fn new(local: Ipv4Addr) -> Self {
+        let clock = Arc::new(AtomicI64::new(0));
+        let socket = UdpPort::bind(SocketAddrV4::new(local, 0), false).unwrap();
+        let mut config = NatNetConfig::unicast(local, vec![BodyKey { name: "a".into(), id: Some(1) }]);
+        config.command_port = socket.local().unwrap().port();
+        config.data_port = config.command_port;
+        let mut client = NatNetClient::open(config, clock_of(&clock)).unwrap();
+        client.poll(HostTime(0), &mut |_| {}).unwrap();
+        let client_address = socket.receive(&mut [0; 2048]).unwrap().unwrap().from;
+        let info = ServerInfo {
+            name: "by hand".into(),
+            app_version: [0; 4],
+            natnet_version: [4, 1, 0, 0],
+            clock_hz: 0,
+            data_port: 0,
+            multicast: None,
+        };
+        let mut out = Vec::new();
+        info.encode(&mut out);
+        socket.send(&out, client_address).unwrap();
+        client.poll(HostTime(0), &mut |_| {}).unwrap();
+        assert_eq!(client.version(), Version::V4_1);
+        Self { clock, socket, client, client_address, out }
+    }
+
+    fn frame(&mut self, number: i32) -> Vec<u8> {
+        let body = RigidBody {
+            id: 1,
+            position: [number as f32 * 1e-3, 0.0, 0.0],
+            rotation_xyzw: [0.0, 0.0, 0.0, 1.0],
+            mean_error: 0.0,
+            params: 1,
+        };
+        let content = FrameContent { bodies: &[body], ..Default::default() };
+        let info = FrameInfo { number, ..Default::default() };
+        encode_frame(&mut self.out, Version::V4_1, &info, &content).unwrap();
+        self.out.clone()
+    }
+
+    fn poll(&mut self) -> Vec<u32> {
+        let mut sequence = Vec::new();
+        let now = HostTime(self.clock.fetch_add(MS, Ordering::Relaxed));
+        self.client.poll(now, &mut |s| sequence.push(s.sequence)).unwrap();
+        assert!(self.client.counters().is_conserved());
+        sequence
+    }
+}
+
+#[test]
+fn only_the_configured_source_is_heard_and_work_is_bounded() {
+    // T16, N1, N7: another address of the same machine floods the client's port.
+    let mut hand = ByHand::new(LOCALHOST);
+    let stranger = UdpPort::bind(SocketAddrV4::new(Ipv4Addr::new(127, 0, 0, 2), 0), false).unwrap();
+    let forged = hand.frame(7);
+    for _ in 0..150 {
+        stranger.send(&forged, hand.client_address).unwrap();
+    }
+    let before = hand.client.counters().packets.received;
+    assert_eq!(hand.poll(), [] as [u32; 0]);
+    let read = hand.client.counters().packets.received - before;
+    assert!(read as usize <= NatNetClient::MAX_DATAGRAMS_PER_POLL);
+    assert_eq!(hand.client.counters().packets.foreign_source, read);
+    while hand.client.counters().packets.foreign_source < 150 {
+        hand.poll();
+    }
+    // From now on the kernel sorts strangers out; the server is still heard.
+    for _ in 0..100 {
+        stranger.send(&forged, hand.client_address).unwrap();
+    }
+    let honest = hand.frame(8);
+    hand.socket.send(&honest, hand.client_address).unwrap();
+    hand.clock.fetch_add(MS, Ordering::Relaxed);
+    assert_eq!(hand.poll(), [8], "{}", hand.client.status());
+    assert_eq!(hand.client.counters().packets.foreign_source, 150);
+    assert!(hand.client.status().contains("flooded"), "{}", hand.client.status());
+}
+
+#[test]
+fn bursts_are_drained_to_the_newest_within_a_few_polls() {
+    // T15: fifty frames at once, and a backlog of seconds.
+    let mut hand = ByHand::new(LOCALHOST);
+    for n in 1..=50 {
+        let bytes = hand.frame(n);
+        hand.socket.send(&bytes, hand.client_address).unwrap();
+    }
+    let got = hand.poll();
+    // Without a clock each frame of a burst carries its own arrival; all arrive in this one virtual instant, so one is used and
+    // the rest count as late. The backlog is gone either way.
+    assert!(!got.is_empty());
+    let c = hand.client.counters().packets;
+    assert!(c.used >= 20);
+    let mut polls = 1;
+    while hand.client.counters().packets.used < 51 {
+        hand.poll();
+        polls += 1;
+        assert!(polls < 10);
+    }
+}
+
+#[test]
+fn garbage_of_every_length_is_survived() {
+    // T13, N2: random bytes behind a frame header, and datagrams as long as they come.
+    let mut hand = ByHand::new(LOCALHOST);
+    let mut state = 1u64;
+    for n in 0..400usize {
+        let len = if n % 100 == 99 { 65_507 } else { n * 7 % 1500 };
+        let mut bytes: Vec<u8> = (0..len)
+            .map(|_| {
+                state = state.wrapping_mul(6_364_136_223_846_793_005).wrapping_add(1);
+                (state >> 56) as u8
+            })
+            .collect();
+        if len >= 4 {
+            bytes[..2].copy_from_slice(&[[7, 5, 1, 13][n % 4], 0]);
+            bytes[2..4].copy_from_slice(&((len - 4) as u16).to_le_bytes());
+        }
+        hand.socket.send(&bytes, hand.client_address).unwrap();
+        hand.poll();
+    }
+    let c = *hand.client.counters();
+    assert!(c.packets.malformed + c.packets.unsupported > 350, "{c}");
+    let honest = hand.frame(3);
+    hand.socket.send(&honest, hand.client_address).unwrap();
+    hand.poll();
+    hand.poll();
+    assert_eq!(hand.client.counters().samples.used, 1, "{}", hand.client.status());
+}
+
+#[test]
+fn real_time_on_loopback_maps_the_clock_within_10_us() {
+    let epoch = Instant::now();
+    let clock: Arc<dyn HostClock> = Arc::new(move || HostTime(epoch.elapsed().as_nanos() as i64));
+    let mut config = NatNetServerConfig::new(&["Hare", "Bust"]);
+    config.streaming = Streaming::Unicast(UnicastTo::CommandSocket);
+    config.clock_skew_ppb = 40_000;
+    let server = NatNetServer::new(config, source("", 0)).unwrap();
+    let streaming = Streaming::Unicast(UnicastTo::CommandSocket);
+    let host = NatNetHost::start(server, streaming, SocketAddrV4::new(LOCALHOST, 0), clock.clone()).unwrap();
+    let mut wanted = NatNetConfig::unicast(LOCALHOST, keys(&["Hare", "Bust"]));
+    wanted.command_port = host.address().port();
+    wanted.data_port = host.address().port();
+    let mut client = NatNetClient::open(wanted, clock.clone()).unwrap();
+    let mut samples = Vec::new();
+    while epoch.elapsed() < Duration::from_millis(2500) {
+        client.poll(clock.now(), &mut |s| samples.push(*s)).unwrap();
+        std::thread::sleep(Duration::from_micros(300));
+    }
+    assert!(host.is_running() && host.frames_sent() > 500);
+    // The truth: captures stand at whole multiples of 2 ms.
+    let errors: Vec<i64> = samples
+        .iter()
+        .filter(|s| s.body == BodyIndex(0) && s.captured_at.0 > S)
+        .map(|s| ((s.captured_at.0 + MS).rem_euclid(2 * MS) - MS).abs())
+        .collect();
+    assert!(errors.len() > 500, "{} samples, {}", errors.len(), client.status());
+    let mut sorted = errors;
+    sorted.sort_unstable();
+    let p99 = sorted[sorted.len() * 99 / 100];
+    println!("clock map on loopback: p50 {} ns, p99 {p99} ns", sorted[sorted.len() / 2]);
+    // 25 us is the judged figure with skew; a loaded machine doubles round trips, hence the slack.
+    assert!(p99 < 50_000, "p99 {p99} ns: {}", client.status());
+    assert!(client.counters().is_conserved());
+}
