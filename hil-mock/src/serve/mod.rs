@@ -1,0 +1,21 @@
+//! The devices that `hil-mock serve` offers: one module each.
+
+mod bodies;
+mod natnet;
+
+use clap::Subcommand;
+use std::error::Error;
+
+/// A mock device.
+#[derive(Subcommand)]
+pub enum Device {
+    /// OptiTrack NatNet server: poses over UDP
+    Natnet(natnet::NatNetArguments),
+}
+
+/// Runs `device` until it is stopped or fails.
+pub fn run(device: Device) -> Result<(), Box<dyn Error>> {
+    match device {
+        Device::Natnet(arguments) => natnet::run(&arguments),
+    }
+}
