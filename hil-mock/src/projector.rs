@@ -45,6 +45,8 @@ pub struct MockConfig {
     pub min_plane_ns: u32,
     /// From the start of a slot to the first photon (load and mirror settling), nanoseconds.
     pub settle_ns: u32,
+    /// Codecs that it reads, bits [`Codec::mask`]; raw always.
+    pub codecs: u32,
     /// Serial number.
     pub serial: u64,
     /// Firmware version that it claims.
@@ -66,6 +68,7 @@ impl MockConfig {
             clock: DeviceClock::IDEAL,
             min_plane_ns: 43_220,
             settle_ns: 0,
+            codecs: Codec::ALL,
             serial: 1,
             firmware: 0x0100,
             version: u16::from(VERSION),
@@ -132,6 +135,8 @@ struct Core {
     last_heard: DeviceTicks,
     next_slot: u64,
     store: FrameStore,
+    /// An LZ4 block while it arrives.
+    staging: Vec<u8>,
     lit_now: bool,
     last_seen_frame: Option<u32>,
     status: Status,
@@ -183,7 +188,8 @@ impl MockProjector {
     ///
     /// # Panics
     /// When a field of `setup` is outside its documented range.
-    pub fn new(setup: MockConfig) -> Self {
+    pub fn new(mut setup: MockConfig) -> Self {
+        setup.codecs |= Codec::Raw.mask();
         assert!((1..=MAX_PLANES).contains(&(setup.max_planes as usize)), "max_planes {}", setup.max_planes);
         assert!((1..=64).contains(&setup.frame_buffers), "frame_buffers {}", setup.frame_buffers);
         assert!(setup.clock.tick_hz > 0, "tick_hz 0");
@@ -201,6 +207,7 @@ impl MockProjector {
                 last_heard: DeviceTicks(0),
                 next_slot: 0,
                 store: FrameStore::new(setup.frame_buffers as usize, frame_bytes),
+                staging: vec![0; setup.raster.plane_bytes()],
                 lit_now: false,
                 last_seen_frame: None,
                 status: NO_STATUS,
@@ -369,7 +376,7 @@ impl Core {
         DeviceHello {
             version: self.setup.version,
             firmware: self.setup.firmware,
-            codecs: Codec::Raw.mask(),
+            codecs: self.setup.codecs,
             raster: self.setup.raster,
             max_planes: self.setup.max_planes,
             frame_buffers: self.setup.frame_buffers,

@@ -93,6 +93,9 @@ impl Codec {
         })
     }
 
+    /// All codecs, as a mask.
+    pub const ALL: u32 = 0b1111;
+
     /// This codec's bit in the masks that HELLO exchanges.
     pub const fn mask(self) -> u32 {
         1 << self as u8

@@ -3,16 +3,24 @@
 //! [`HostLink::poll`] moves it along: HELLO, CONFIG, and after an explicit [`HostLink::arm`] ARM, each repeated until the device
 //! confirms. It never waits; time is an argument. Nothing is allocated after [`HostLink::new`].
 
-use super::decoder::{Decoder, PacketSink};
-use super::header::{frame_newer, Codec, Header, MessageType, Packet, VERSION};
+mod frames;
+mod inbox;
+mod types;
+
+use super::compact::Compactor;
+use super::decoder::Decoder;
+use super::header::{Codec, Header, Packet, VERSION};
 use super::message::{
-    Assembly, Commit, Config, ConfigRefusal, DeviceHello, DeviceMessage, DeviceState, Echo, Fault, FaultCode,
-    HostHello, HostMessage, Status, Underrun, MAX_CONTROL_BYTES,
+    Config, ConfigRefusal, DeviceHello, DeviceState, Echo, Fault, FaultCode, HostHello, HostMessage, Status,
+    MAX_CONTROL_BYTES,
 };
 use super::slots::SlotClock;
-use crate::planes::{PlaneSchedule, Raster, MAX_PLANES};
-use crate::time::{DeviceTicks, FrameRate, HostTime};
+use crate::time::{DeviceTicks, HostTime};
 use crate::transport::{Lane, SendError, Transport, TransportError};
+use inbox::{Inbox, ECHOES_KEPT};
+pub use types::{
+    DropReason, EchoSample, Epoch, LinkCounters, LinkError, LinkSettings, LinkState, SendOutcome, Verb,
+};
 
 /// An unanswered request is repeated after this long.
 const RETRY_NS: i64 = 20_000_000;
@@ -20,291 +28,6 @@ const RETRY_NS: i64 = 20_000_000;
 const FAST_ECHO_NS: i64 = 2_000_000;
 /// Number of fast echoes.
 const FAST_ECHOES: u32 = 16;
-/// Echo answers kept for the caller.
-const ECHOES_KEPT: usize = 16;
-
-/// Where slot 0 lies on the device's clock.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum Epoch {
-    /// At this instant of the device's clock.
-    At(DeviceTicks),
-    /// This many nanoseconds (nominal) after the instant that the device's HELLO reports.
-    AfterHello(u64),
-}
-
-/// What a host asks of a device.
-#[derive(Clone, Debug)]
-pub struct LinkSettings {
-    /// Must be the device's raster.
-    pub raster: Raster,
-    /// Planes of a frame in the order shown.
-    pub schedule: PlaneSchedule,
-    /// Frames a second.
-    pub rate: FrameRate,
-    /// Silence after which the device goes dark, microseconds, 1 to [`super::MAX_WATCHDOG_US`].
-    pub watchdog_us: u32,
-    /// What to light without a new frame.
-    pub underrun: Underrun,
-    /// Slots by which a frame may miss its target and still be lit.
-    pub late_slots: u8,
-    /// Where slot 0 lies.
-    pub epoch: Epoch,
-    /// Seed of the session numbers; two hosts should not use the same.
-    pub session_seed: u32,
-}
-
-/// Progress of a [`HostLink`].
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum LinkState {
-    /// Not connecting. [`HostLink::connect`] starts.
-    Closed,
-    /// HELLO is under way.
-    Greeting,
-    /// CONFIG is under way.
-    Configuring,
-    /// Configured and dark; waits for [`HostLink::arm`].
-    Ready,
-    /// ARM is under way.
-    Arming,
-    /// Frames are taken.
-    Streaming,
-    /// The device latched faults and is dark; [`HostLink::arm`] acknowledges.
-    Faulted,
-}
-
-/// Why the link cannot be brought up.
-#[derive(Debug, thiserror::Error)]
-pub enum LinkError {
-    /// No common version.
-    #[error("{device}: the device speaks link protocol version {theirs}, this program {VERSION}; update the older of the two")]
-    Version {
-        /// Name of the transport.
-        device: String,
-        /// The device's version.
-        theirs: u16,
-    },
-    /// The device is another panel.
-    #[error("{device}: the panel has {}x{} mirrors, the rig is configured for {}x{}", .theirs.width(), .theirs.height(), .ours.width(), .ours.height())]
-    Raster {
-        /// Name of the transport.
-        device: String,
-        /// The device's raster.
-        theirs: Raster,
-        /// The configured raster.
-        ours: Raster,
-    },
-    /// The device cannot show that many planes that fast.
-    #[error("{device}: {planes} planes at {rate_hz:.3} Hz leave {plane_ns} ns for a plane, the mirrors need {min_plane_ns} ns and take at most {max_planes} planes; lower the frame rate or the plane count")]
-    TooFast {
-        /// Name of the transport.
-        device: String,
-        /// Planes asked for.
-        planes: usize,
-        /// Frame rate asked for.
-        rate_hz: f64,
-        /// Time that leaves for a plane.
-        plane_ns: u64,
-        /// Time the device needs.
-        min_plane_ns: u32,
-        /// Planes the device takes.
-        max_planes: u8,
-    },
-    /// The device refused CONFIG for a reason that HELLO did not show.
-    #[error("{device}: configuration refused: {reason:?}")]
-    ConfigRefused {
-        /// Name of the transport.
-        device: String,
-        /// The device's reason.
-        reason: Option<ConfigRefusal>,
-    },
-    /// The device refused ARM.
-    #[error("{device}: not armed, latched faults: {}; remove the cause and acknowledge them", super::message::faults::names(*.faults))]
-    ArmRefused {
-        /// Name of the transport.
-        device: String,
-        /// Faults that stand in the way.
-        faults: u32,
-    },
-    /// The medium failed.
-    #[error(transparent)]
-    Transport(#[from] TransportError),
-}
-
-/// Why a frame was not sent.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum DropReason {
-    /// The link is not streaming.
-    NotStreaming,
-    /// The device has no free buffer.
-    NoCredit,
-    /// The medium has no room.
-    LinkBusy,
-    /// The medium failed.
-    LinkLost,
-    /// The frame number does not follow the one sent before.
-    NotNewer,
-}
-
-/// Fate of a frame handed to [`HostLink::send_frame`].
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum SendOutcome {
-    /// All of it is on its way.
-    Sent,
-    /// None of it was sent.
-    Dropped {
-        /// Why.
-        reason: DropReason,
-    },
-}
-
-/// Counters since [`HostLink::new`]: `frames_offered = frames_sent + not_streaming + no_credit + link_busy + link_lost + not_newer`.
-#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
-#[allow(missing_docs)] // Named after `DropReason`.
-pub struct LinkCounters {
-    pub frames_offered: u64,
-    pub frames_sent: u64,
-    pub not_streaming: u64,
-    pub no_credit: u64,
-    pub link_busy: u64,
-    pub link_lost: u64,
-    pub not_newer: u64,
-    /// Bytes handed to the medium.
-    pub bytes_sent: u64,
-    /// Intact packets from the device without effect: other session, out of order, malformed.
-    pub packets_ignored: u64,
-    /// Damaged packets from the device.
-    pub packets_damaged: u64,
-    /// Sessions opened.
-    pub sessions: u64,
-}
-
-/// One clock exchange, for the clock map: host sent, device received, device sent, host received.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub struct EchoSample {
-    /// Request left, host's clock.
-    pub host_sent_at: HostTime,
-    /// Request arrived, device's clock.
-    pub device_received_at: DeviceTicks,
-    /// Answer left, device's clock.
-    pub device_sent_at: DeviceTicks,
-    /// Answer arrived, host's clock.
-    pub host_received_at: HostTime,
-}
-
-/// What a device in trouble or an operator can ask for at any time.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum Verb {
-    /// Dark and no longer armed.
-    Stop,
-    /// Dark, still armed; [`HostLink::arm`] shows the picture again.
-    Black,
-    /// Hold the frame that is lit; [`HostLink::arm`] lets it move again.
-    Freeze,
-    /// Dark and latched.
-    Safe,
-}
-
-impl Verb {
-    fn message(self) -> HostMessage {
-        match self {
-            Self::Stop => HostMessage::Stop,
-            Self::Black => HostMessage::Black,
-            Self::Freeze => HostMessage::Freeze,
-            Self::Safe => HostMessage::Safe,
-        }
-    }
-
-    fn confirmed_by(self, state: DeviceState) -> bool {
-        use DeviceState::{Armed, Black, Faulted, Frozen};
-        match self {
-            Self::Stop => !matches!(state, Armed | Black | Frozen),
-            Self::Black => state != Armed && state != Frozen,
-            Self::Freeze => state != Armed,
-            Self::Safe => state == Faulted || state == DeviceState::Idle,
-        }
-    }
-}
-
-/// Everything that arrives.
-#[derive(Debug)]
-struct Inbox {
-    now: HostTime,
-    session: u32,
-    assembly: Option<Assembly>,
-    hello: Option<DeviceHello>,
-    status: Option<Status>,
-    fault: Option<Fault>,
-    device_forgot: bool,
-    echoes: [Option<EchoSample>; ECHOES_KEPT],
-    next_echo: usize,
-    ignored: u64,
-    damaged: u64,
-}
-
-impl PacketSink for Inbox {
-    fn begin(&mut self, header: &Header) -> bool {
-        self.assembly = Assembly::new(header);
-        if self.assembly.is_none() {
-            self.ignored += 1;
-        }
-        self.assembly.is_some()
-    }
-
-    fn payload(&mut self, bytes: &[u8]) {
-        if let Some(a) = &mut self.assembly {
-            a.push(bytes);
-        }
-    }
-
-    fn end(&mut self, intact: bool) {
-        let Some(assembly) = self.assembly.take() else { return };
-        if !intact {
-            self.damaged += 1;
-            return;
-        }
-        let header = *assembly.header();
-        match DeviceMessage::parse(header.kind, assembly.payload()) {
-            Ok(message) if header.session == self.session => self.apply(&message),
-            // The device lost its power or its memory: it answers, but knows nothing of this session.
-            Ok(DeviceMessage::Status(_)) if header.session == 0 => {
-                self.device_forgot = true;
-            }
-            _ => self.ignored += 1,
-        }
-    }
-}
-
-impl Inbox {
-    fn apply(&mut self, message: &DeviceMessage) {
-        match message {
-            DeviceMessage::Hello(h) => self.hello = Some(*h),
-            DeviceMessage::Status(s) => {
-                // An older one that came late would take credit back.
-                if self.status.is_some_and(|last| last.now > s.now) {
-                    self.ignored += 1;
-                } else {
-                    self.status = Some(*s);
-                }
-            }
-            DeviceMessage::Echo(e) => {
-                let sent_at = HostTime(e.host_sent_ns as i64);
-                if sent_at > self.now || e.device_sent < e.device_received {
-                    self.ignored += 1;
-                    return;
-                }
-                self.echoes[self.next_echo % ECHOES_KEPT] = Some(EchoSample {
-                    host_sent_at: sent_at,
-                    device_received_at: e.device_received,
-                    device_sent_at: e.device_sent,
-                    host_received_at: self.now,
-                });
-                self.next_echo += 1;
-            }
-            DeviceMessage::Fault(f) => self.fault = Some(*f),
-        }
-    }
-}
-
 /// The host's side of one link.
 #[derive(Debug)]
 pub struct HostLink {
@@ -322,6 +45,12 @@ pub struct HostLink {
     echoes_sent: u32,
     frames_sent: u32,
     last_frame: Option<u32>,
+    /// `None` when only raw planes are sent.
+    compactor: Option<Compactor>,
+    /// The next frame must not refer to another.
+    key_due: bool,
+    /// Frames that the device had lost when a key frame was last asked for.
+    losses: u32,
     counters: LinkCounters,
 }
 
@@ -331,22 +60,12 @@ const NEVER: HostTime = HostTime(i64::MIN);
 impl HostLink {
     /// A closed link. Its buffers are all it will ever allocate.
     pub fn new(settings: LinkSettings) -> Self {
+        let compactor = (settings.codecs & !Codec::Raw.mask() != 0)
+            .then(|| Compactor::new(settings.raster, settings.schedule.len(), settings.codecs));
         Self {
             settings,
             state: LinkState::Closed,
-            inbox: Inbox {
-                now: NEVER,
-                session: 0,
-                assembly: None,
-                hello: None,
-                status: None,
-                fault: None,
-                device_forgot: false,
-                echoes: [None; ECHOES_KEPT],
-                next_echo: 0,
-                ignored: 0,
-                damaged: 0,
-            },
+            inbox: Inbox::new(),
             decoders: [Decoder::new(), Decoder::new()],
             slots: None,
             acknowledge: 0,
@@ -358,6 +77,9 @@ impl HostLink {
             echoes_sent: 0,
             frames_sent: 0,
             last_frame: None,
+            compactor,
+            key_due: true,
+            losses: 0,
             counters: LinkCounters::default(),
         }
     }
@@ -369,13 +91,7 @@ impl HostLink {
         let n = (self.counters.sessions as u32)
             .wrapping_mul(0x9e37_79b1)
             .wrapping_add(self.settings.session_seed);
-        self.inbox.session = n.max(1);
-        self.inbox.assembly = None;
-        self.inbox.hello = None;
-        self.inbox.status = None;
-        self.inbox.fault = None;
-        self.inbox.device_forgot = false;
-        self.inbox.echoes = [None; ECHOES_KEPT];
+        self.inbox.open(n.max(1));
         self.decoders = [Decoder::new(), Decoder::new()];
         self.state = LinkState::Greeting;
         self.slots = None;
@@ -385,6 +101,8 @@ impl HostLink {
         self.echoes_sent = 0;
         self.frames_sent = 0;
         self.last_frame = None;
+        self.key_due = true;
+        self.losses = 0;
     }
 
     /// Permits light once the device is configured, shows the picture again after BLACK or FREEZE, or acknowledges latched
@@ -396,6 +114,8 @@ impl HostLink {
         if matches!(self.state, LinkState::Ready | LinkState::Faulted | LinkState::Streaming) {
             self.inbox.fault = None;
             self.state = LinkState::Arming;
+            // Disarming made the device forget what frames could refer to.
+            self.key_due = true;
         }
     }
 
@@ -457,6 +177,9 @@ impl HostLink {
                     DeviceTicks(hello.now.0.saturating_add(u64::try_from(ticks).unwrap_or(u64::MAX)))
                 }
             };
+            if let Some(compactor) = &mut self.compactor {
+                compactor.restrict(hello.codecs);
+            }
             self.slots = SlotClock::new(epoch, hello.tick_hz, self.settings.rate);
             self.state = LinkState::Configuring;
             self.requested_at = NEVER;
@@ -464,6 +187,11 @@ impl HostLink {
         let Some(status) = self.inbox.status else { return Ok(()) };
         use DeviceState as D;
         use LinkState as L;
+        let losses = status.frames_incomplete.wrapping_add(status.frames_refused);
+        if losses != self.losses {
+            self.losses = losses;
+            self.key_due = true;
+        }
         if self.verb.is_some_and(|v| v.confirmed_by(status.state)) {
             self.verb = None;
         }
@@ -538,7 +266,7 @@ impl HostLink {
                 LinkState::Greeting => Some(HostMessage::Hello(HostHello {
                     version_min: u16::from(VERSION),
                     version_max: u16::from(VERSION),
-                    codecs: Codec::Raw.mask(),
+                    codecs: self.settings.codecs | Codec::Raw.mask(),
                 })),
                 LinkState::Configuring => Some(HostMessage::Config(self.config())),
                 LinkState::Arming => Some(HostMessage::Arm(self.acknowledge)),
@@ -586,90 +314,6 @@ impl HostLink {
             underrun: s.underrun,
             late_slots: s.late_slots,
             epoch: self.slots.map_or(DeviceTicks(0), |c| c.epoch()),
-        }
-    }
-
-    /// Hands one frame to the medium, all of it or nothing. `planes` are the frame's planes one after the other in the
-    /// configured order, each [`Raster::plane_bytes`] long; they go out as they lie, without a copy on this side. `frame_id`
-    /// must grow from frame to frame; the wire carries its low 32 bits. `target_at` is the instant of light on the device's
-    /// clock, usually [`SlotClock::start`] of the slot.
-    ///
-    /// # Panics
-    /// When `planes` has not the configured size.
-    pub fn send_frame(
-        &mut self,
-        now: HostTime,
-        frame_id: u64,
-        target_at: DeviceTicks,
-        planes: &[u8],
-        transport: &mut dyn Transport,
-    ) -> SendOutcome {
-        self.counters.frames_offered += 1;
-        match self.try_send_frame(now, frame_id as u32, target_at, planes, transport) {
-            Ok(()) => {
-                self.counters.frames_sent += 1;
-                SendOutcome::Sent
-            }
-            Err(reason) => {
-                *match reason {
-                    DropReason::NotStreaming => &mut self.counters.not_streaming,
-                    DropReason::NoCredit => &mut self.counters.no_credit,
-                    DropReason::LinkBusy => &mut self.counters.link_busy,
-                    DropReason::LinkLost => &mut self.counters.link_lost,
-                    DropReason::NotNewer => &mut self.counters.not_newer,
-                } += 1;
-                SendOutcome::Dropped { reason }
-            }
-        }
-    }
-
-    fn try_send_frame(
-        &mut self,
-        now: HostTime,
-        frame: u32,
-        target_at: DeviceTicks,
-        planes: &[u8],
-        transport: &mut dyn Transport,
-    ) -> Result<(), DropReason> {
-        let schedule = self.settings.schedule;
-        let plane_bytes = self.settings.raster.plane_bytes();
-        let expected = plane_bytes * schedule.len();
-        assert!(planes.len() == expected, "frame of {} bytes, configured {expected}", planes.len());
-        if self.state != LinkState::Streaming {
-            return Err(DropReason::NotStreaming);
-        }
-        if self.last_frame.is_some_and(|last| !frame_newer(frame, last)) {
-            return Err(DropReason::NotNewer);
-        }
-        if self.credit() == 0 {
-            return Err(DropReason::NoCredit);
-        }
-        let header =
-            Header { frame, target_at, ..Header::control(MessageType::Plane, self.inbox.session, 0) };
-        let mut payload = [0u8; MAX_CONTROL_BYTES];
-        let commit = HostMessage::Commit(Commit {
-            sent: mask(schedule.len()),
-            kept: 0,
-            base_frame: 0,
-            frames_sent: self.frames_sent.wrapping_add(1),
-        });
-        let (kind, n) = commit.write(&mut payload);
-        let mut packets = [Packet::new(Header { kind, ..header }, &payload[..n]); MAX_PLANES + 1];
-        packets[schedule.len()] = packets[0];
-        for (i, (spec, bits)) in schedule.planes().iter().zip(planes.chunks_exact(plane_bytes)).enumerate() {
-            packets[i] = Packet::new(Header { plane: i as u8, led_code: spec.led_code(), ..header }, bits);
-        }
-        let packets = &packets[..=schedule.len()];
-        match transport.send(now, Lane::Data, packets) {
-            Ok(()) => {
-                self.frames_sent = self.frames_sent.wrapping_add(1);
-                self.last_frame = Some(frame);
-                self.data_sent_at = now;
-                self.counters.bytes_sent += packets.iter().map(|p| p.wire_bytes() as u64).sum::<u64>();
-                Ok(())
-            }
-            Err(SendError::Busy) => Err(DropReason::LinkBusy),
-            Err(SendError::Failed(_)) => Err(DropReason::LinkLost),
         }
     }
 
@@ -748,11 +392,6 @@ impl HostLink {
         self.counters.bytes_sent += packet.wire_bytes() as u64;
         Ok(())
     }
-}
-
-/// A mask of the lowest `n` bits, `n` from 1 to 32.
-const fn mask(n: usize) -> u32 {
-    u32::MAX >> (32 - n)
 }
 
 /// A busy medium is asked again later; a lost one is an error.

@@ -3,52 +3,18 @@
 //! Every payload has one fixed length (CONFIG grows with its planes); another length is an error, so a wrong build of one side
 //! is noticed at the first message. docs/PROTOCOL.md lists the bytes.
 
+mod types;
+
 use super::header::{u16_at, u32_at, u64_at, Header, MessageType};
 use crate::planes::{PlaneSchedule, PlaneSpec, Raster, MAX_PLANES};
 use crate::time::{DeviceTicks, FrameRate};
+pub use types::{
+    faults, Commit, Config, ConfigRefusal, DeviceHello, DeviceState, Echo, Fault, FaultCode, HostHello,
+    Status, Underrun, MAX_WATCHDOG_US,
+};
 
 /// Longest payload of any message except PLANE.
 pub const MAX_CONTROL_BYTES: usize = 96;
-/// Longest watchdog a host may ask for, microseconds.
-pub const MAX_WATCHDOG_US: u32 = 10_000_000;
-
-/// Faults as bits of a mask. A latched fault keeps the device dark until an ARM acknowledges it.
-pub mod faults {
-    /// The host was silent for longer than the configured watchdog.
-    pub const WATCHDOG: u32 = 1 << 0;
-    /// Temperature out of range.
-    pub const OVER_TEMPERATURE: u32 = 1 << 1;
-    /// Lamp or LED driver failed.
-    pub const LAMP: u32 = 1 << 2;
-    /// The host sent SAFE.
-    pub const HOST_SAFE: u32 = 1 << 3;
-    /// Too many damaged packets in a short time.
-    pub const CHECKSUM_STORM: u32 = 1 << 4;
-    /// Emergency-stop input.
-    pub const EMERGENCY_STOP: u32 = 1 << 5;
-
-    /// Names of the faults in `mask`, for messages: `"watchdog, lamp"`; `"none"` when empty.
-    #[cfg(feature = "std")]
-    pub fn names(mask: u32) -> String {
-        const NAMES: [&str; 6] =
-            ["watchdog", "over-temperature", "lamp", "host safe", "checksum storm", "emergency stop"];
-        let mut all: Vec<String> = NAMES
-            .iter()
-            .enumerate()
-            .filter(|(i, _)| mask >> i & 1 == 1)
-            .map(|(_, n)| n.to_string())
-            .collect();
-        if mask >> NAMES.len() != 0 {
-            all.push(format!("unknown {:#x}", mask >> NAMES.len() << NAMES.len()));
-        }
-        if all.is_empty() {
-            "none".into()
-        } else {
-            all.join(", ")
-        }
-    }
-}
-
 /// Why a payload cannot be read.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum PayloadError {
@@ -85,240 +51,6 @@ impl core::fmt::Display for PayloadError {
 }
 
 impl core::error::Error for PayloadError {}
-
-/// HELLO from the host. The header's session is the one to open (not 0).
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub struct HostHello {
-    /// Lowest protocol version that the host speaks.
-    pub version_min: u16,
-    /// Highest protocol version that the host speaks.
-    pub version_max: u16,
-    /// Codecs that the host may send, bits [`super::Codec::mask`].
-    pub codecs: u32,
-}
-
-/// HELLO from the device: what it is.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub struct DeviceHello {
-    /// Protocol version the device will use; when it is outside the host's range, the session did not open.
-    pub version: u16,
-    /// Firmware version: major * 256 + minor.
-    pub firmware: u16,
-    /// Codecs that the device can read, bits [`super::Codec::mask`].
-    pub codecs: u32,
-    /// Mirrors.
-    pub raster: Raster,
-    /// Most planes a frame may have.
-    pub max_planes: u8,
-    /// Whole frames that can wait to be lit.
-    pub frame_buffers: u8,
-    /// Nominal ticks a second of the device's clock.
-    pub tick_hz: u32,
-    /// Shortest time one plane can be shown, nanoseconds.
-    pub min_plane_ns: u32,
-    /// Serial number.
-    pub serial: u64,
-    /// The device's clock when it answered.
-    pub now: DeviceTicks,
-}
-
-/// What to light in a slot for which no new frame is whole.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-#[repr(u8)]
-pub enum Underrun {
-    /// The frame before again.
-    Repeat = 0,
-    /// Nothing.
-    Blank = 1,
-}
-
-/// CONFIG from the host.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub struct Config {
-    /// Must equal the device's raster.
-    pub raster: Raster,
-    /// Planes of a frame in the order shown.
-    pub schedule: PlaneSchedule,
-    /// Frames a second.
-    pub rate: FrameRate,
-    /// Silence after which the device goes dark and latches, microseconds, 1 to [`MAX_WATCHDOG_US`].
-    pub watchdog_us: u32,
-    /// What to light without a new frame.
-    pub underrun: Underrun,
-    /// Slots by which a whole frame may miss its target and still be lit; 0 drops late frames.
-    pub late_slots: u8,
-    /// Start of slot 0 on the device's clock.
-    pub epoch: DeviceTicks,
-}
-
-/// FRAME_COMMIT: the end of a frame and how it is composed.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub struct Commit {
-    /// Bit k set: plane k was sent with this frame.
-    pub sent: u32,
-    /// Bit k set: plane k equals plane k of `base_frame` and was not sent. `sent` and `kept` share no bit.
-    pub kept: u32,
-    /// The frame that kept and XOR planes refer to: the frame sent just before.
-    pub base_frame: u32,
-    /// Frames sent in this session, this one included.
-    pub frames_sent: u32,
-}
-
-/// State of the device as STATUS reports it.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-#[repr(u8)]
-pub enum DeviceState {
-    /// No session. Dark.
-    Idle = 0,
-    /// Session open, not configured. Dark.
-    Greeted = 1,
-    /// Configured, not armed. Dark.
-    Configured = 2,
-    /// May make light.
-    Armed = 3,
-    /// Armed and told to be dark.
-    Black = 4,
-    /// Armed and holding the frame that is lit.
-    Frozen = 5,
-    /// Faults are latched. Dark.
-    Faulted = 6,
-}
-
-impl DeviceState {
-    const fn from_code(code: u8) -> Option<Self> {
-        Some(match code {
-            0 => Self::Idle,
-            1 => Self::Greeted,
-            2 => Self::Configured,
-            3 => Self::Armed,
-            4 => Self::Black,
-            5 => Self::Frozen,
-            6 => Self::Faulted,
-            _ => return None,
-        })
-    }
-}
-
-/// STATUS: counters are absolute since the session opened and wrap at 2^32, so a lost STATUS costs nothing.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub struct Status {
-    /// State.
-    pub state: DeviceState,
-    /// Light is on now.
-    pub lit: bool,
-    /// Plane that arrived last intact.
-    pub last_plane: u8,
-    /// Frame buffers that are free now.
-    pub buffers_free: u8,
-    /// Latched faults, bits of [`faults`].
-    pub faults: u32,
-    /// Credit: frames that the host may have sent in this session, in all.
-    pub frame_limit: u32,
-    /// Frames of this session that the device knows to have been sent.
-    pub frames_accounted: u32,
-    /// Newest frame that arrived whole; meaningless while none has.
-    pub last_whole_frame: u32,
-    /// Newest frame lit; meaningless while `frames_lit` is 0.
-    pub last_lit_frame: u32,
-    /// When it was lit first, device's clock.
-    pub last_lit_at: DeviceTicks,
-    /// The device's clock when this was written.
-    pub now: DeviceTicks,
-    /// Slots that began while armed: `frames_lit + slots_repeated + slots_blank`.
-    pub slots: u32,
-    /// Frames of which anything arrived: `frames_lit + frames_incomplete + frames_late + frames_superseded + frames_refused` and
-    /// those still on their way to the light.
-    pub frames_seen: u32,
-    /// Frames lit.
-    pub frames_lit: u32,
-    /// Slots that lit the frame before again.
-    pub slots_repeated: u32,
-    /// Dark slots.
-    pub slots_blank: u32,
-    /// Frames dropped because a plane or the base frame was missing or damaged.
-    pub frames_incomplete: u32,
-    /// Whole frames dropped because their slot was over.
-    pub frames_late: u32,
-    /// Whole frames dropped because a newer one was due too.
-    pub frames_superseded: u32,
-    /// Frames dropped because of the device's state, of credit, or of a target out of reach.
-    pub frames_refused: u32,
-    /// Packets with a right header.
-    pub packets: u32,
-    /// Damaged headers.
-    pub header_errors: u32,
-    /// Damaged payloads.
-    pub payload_errors: u32,
-    /// Intact packets without effect: other session, older frame, duplicate, wrong field.
-    pub packets_ignored: u32,
-    /// Bytes that belonged to no packet.
-    pub bytes_skipped: u32,
-}
-
-/// ECHO. The host writes `host_sent_ns` and zeros; the device fills the rest in.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub struct Echo {
-    /// Host's clock when the request left, nanoseconds; the device returns it unread.
-    pub host_sent_ns: u64,
-    /// Device's clock when the request arrived.
-    pub device_received: DeviceTicks,
-    /// Device's clock when the answer left.
-    pub device_sent: DeviceTicks,
-}
-
-/// What a FAULT message is about.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-#[repr(u16)]
-pub enum FaultCode {
-    /// The mask of latched faults grew.
-    Latched = 0,
-    /// No common protocol version; detail = the device's version.
-    Version = 1,
-    /// CONFIG refused; detail = [`ConfigRefusal`].
-    Config = 2,
-    /// ARM refused: faults not acknowledged, or a cause is still there, or not configured.
-    Arm = 3,
-}
-
-/// Why a device refuses a CONFIG.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-#[repr(u16)]
-pub enum ConfigRefusal {
-    /// The raster is not the device's.
-    Raster = 1,
-    /// More planes than the device can show.
-    Planes = 2,
-    /// Frame rate x planes is faster than the mirrors.
-    Rate = 3,
-    /// The payload breaks a rule of the format.
-    Format = 4,
-}
-
-impl ConfigRefusal {
-    /// The refusal with this number, or `None`.
-    pub const fn from_code(code: u16) -> Option<Self> {
-        Some(match code {
-            1 => Self::Raster,
-            2 => Self::Planes,
-            3 => Self::Rate,
-            4 => Self::Format,
-            _ => return None,
-        })
-    }
-}
-
-/// FAULT from the device.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub struct Fault {
-    /// All faults latched now, bits of [`faults`].
-    pub latched: u32,
-    /// What this is about.
-    pub code: FaultCode,
-    /// Depends on the code.
-    pub detail: u16,
-    /// When it happened.
-    pub at: DeviceTicks,
-}
 
 /// A control message as a device receives it.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -688,5 +420,4 @@ impl Assembly {
 }
 
 #[cfg(test)]
-#[path = "message_tests.rs"]
 mod tests;

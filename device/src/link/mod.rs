@@ -5,6 +5,9 @@
 //! conversation. Everything but [`HostLink`] is `no_std` without allocation and is meant to be reused by firmware:
 //! docs/PROTOCOL.md is the specification.
 
+mod codec;
+#[cfg(feature = "std")]
+mod compact;
 mod crc;
 mod decoder;
 mod header;
@@ -13,6 +16,7 @@ mod host;
 mod message;
 mod slots;
 
+pub use codec::{rle_encode, CodecError, RleDecoder};
 pub use crc::{crc32c, crc32c_append, crc32c_append_table};
 pub use decoder::{Decoder, DecoderCounters, PacketSink};
 pub use header::{

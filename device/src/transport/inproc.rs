@@ -164,6 +164,13 @@ impl Transport for HostEnd {
         }
     }
 
+    fn has_room(&mut self, lane: Lane) -> bool {
+        match lane {
+            Lane::Data => !self.0.empty.is_empty(),
+            Lane::Control => !self.0.control.is_full(),
+        }
+    }
+
     fn receive(&mut self, _now: HostTime, sink: &mut dyn FnMut(Lane, &[u8])) -> Result<(), TransportError> {
         // As many as the ring holds: a device that talks without end cannot keep this call from returning.
         for _ in 0..SMALL_DEPTH {

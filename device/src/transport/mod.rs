@@ -52,6 +52,12 @@ pub trait Transport: Send {
     /// Queues `packets` on `lane`, in order. The slices are not used after the call returns.
     fn send(&mut self, now: HostTime, lane: Lane, packets: &[Packet<'_>]) -> Result<(), SendError>;
 
+    /// False when [`Transport::send`] would certainly answer [`SendError::Busy`] on `lane`: spares the work of preparing a frame.
+    fn has_room(&mut self, lane: Lane) -> bool {
+        let _ = lane;
+        true
+    }
+
     /// Hands bytes that have arrived to `sink`, in order within a lane, without waiting for more.
     fn receive(&mut self, now: HostTime, sink: &mut dyn FnMut(Lane, &[u8])) -> Result<(), TransportError>;
 
@@ -62,6 +68,9 @@ pub trait Transport: Send {
 impl<T: Transport + ?Sized> Transport for &mut T {
     fn send(&mut self, now: HostTime, lane: Lane, packets: &[Packet<'_>]) -> Result<(), SendError> {
         (**self).send(now, lane, packets)
+    }
+    fn has_room(&mut self, lane: Lane) -> bool {
+        (**self).has_room(lane)
     }
     fn receive(&mut self, now: HostTime, sink: &mut dyn FnMut(Lane, &[u8])) -> Result<(), TransportError> {
         (**self).receive(now, sink)

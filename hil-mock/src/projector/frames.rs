@@ -9,6 +9,8 @@ pub(super) struct Assembling {
     pub target_at: DeviceTicks,
     /// Bit k: plane k arrived intact.
     pub received: u32,
+    /// A plane was decoded against the base frame.
+    pub uses_base: bool,
     /// Buffer it is written to; `None` when the frame is refused and its planes are passed over.
     pub buffer: Option<usize>,
 }

@@ -2,7 +2,7 @@
 
 use dpm_device::link::{
     frame_newer, Assembly, Codec, Commit, ConfigRefusal, Echo, FaultCode, Header, HostMessage, MessageType,
-    PacketSink,
+    PacketSink, RleDecoder,
 };
 use dpm_device::time::DeviceTicks;
 use dpm_device::transport::Lane;
@@ -21,8 +21,19 @@ pub(super) enum Incoming {
         plane: u8,
         frame: u32,
         buffer: usize,
-        at: usize,
+        form: Form,
     },
+}
+
+/// How the bytes of a plane become its bits.
+#[derive(Debug)]
+pub(super) enum Form {
+    /// They are the bits; the number counts those written.
+    Raw { filled: usize },
+    /// Tokens, decoded as they come.
+    Rle { decoder: RleDecoder, failed: bool },
+    /// One block, decoded when it is complete and intact; the number counts the bytes staged.
+    Lz4 { staged: usize },
 }
 
 pub(super) struct LaneSink<'a> {
@@ -39,25 +50,23 @@ impl PacketSink for LaneSink<'_> {
     }
 
     fn payload(&mut self, bytes: &[u8]) {
-        match &mut self.core.incoming[self.lane as usize] {
+        // Taken out while it is worked on: it acts on the rest of the core.
+        let mut incoming = std::mem::take(&mut self.core.incoming[self.lane as usize]);
+        match &mut incoming {
             Incoming::Control(assembly) => assembly.push(bytes),
-            Incoming::Plane { frame, buffer, at, .. } => {
-                let (frame, buffer, to) = (*frame, *buffer, *at);
-                *at += bytes.len();
-                // Light may have ended while the plane was arriving: then the buffer is another frame's by now.
-                if self.core.is_assembling(frame, buffer) {
-                    self.core.store.bytes_mut(buffer)[to..to + bytes.len()].copy_from_slice(bytes);
-                }
+            Incoming::Plane { plane, frame, buffer, form } => {
+                self.core.plane_bytes_arrived(*plane, *frame, *buffer, form, bytes);
             }
             Incoming::Nothing => {}
         }
+        self.core.incoming[self.lane as usize] = incoming;
     }
 
     fn end(&mut self, intact: bool) {
         match std::mem::take(&mut self.core.incoming[self.lane as usize]) {
             Incoming::Control(assembly) if intact => self.core.control(&assembly),
-            Incoming::Plane { plane, frame, buffer, .. } if intact => {
-                self.core.plane_arrived(plane, frame, buffer);
+            Incoming::Plane { plane, frame, buffer, form } if intact => {
+                self.core.plane_arrived(plane, frame, buffer, &form);
             }
             _ => {}
         }
@@ -105,20 +114,62 @@ impl Core {
         let Some((config, _)) = self.config else { return self.ignore() };
         let plane_bytes = config.raster.plane_bytes();
         let spec = config.schedule.planes().get(header.plane as usize);
+        let n = header.payload_bytes as usize;
         let fits = spec.is_some_and(|s| s.led_code() == header.led_code)
-            && header.codec == Codec::Raw
-            && header.payload_bytes as usize == plane_bytes;
+            && header.codec.mask() & self.setup.codecs != 0
+            && if header.codec == Codec::Raw { n == plane_bytes } else { n < plane_bytes };
         if !fits || !self.enter_frame(header) {
             return self.ignore();
         }
         let Some(frame) = self.store.assembling else { return self.ignore() };
         // A plane that is already there is not written again: a damaged copy would spoil it.
-        match frame.buffer {
-            Some(buffer) if frame.received >> header.plane & 1 == 0 => {
-                let at = header.plane as usize * plane_bytes;
-                Incoming::Plane { plane: header.plane, frame: header.frame, buffer, at }
+        let Some(buffer) = frame.buffer.filter(|_| frame.received >> header.plane & 1 == 0) else {
+            return self.ignore();
+        };
+        let form = match header.codec {
+            Codec::Raw => Form::Raw { filled: 0 },
+            Codec::Rle => Form::Rle { decoder: RleDecoder::new(), failed: false },
+            Codec::Lz4 => Form::Lz4 { staged: 0 },
+            Codec::XorRle => {
+                let Some(base) = self.store.base else { return self.ignore() };
+                self.store.copy(base.buffer, buffer, header.plane as usize * plane_bytes, plane_bytes);
+                if let Some(frame) = &mut self.store.assembling {
+                    frame.uses_base = true;
+                }
+                Form::Rle { decoder: RleDecoder::new_xor(), failed: false }
             }
-            _ => self.ignore(),
+        };
+        Incoming::Plane { plane: header.plane, frame: header.frame, buffer, form }
+    }
+
+    /// The plane's share of a buffer.
+    fn share(&mut self, plane: u8, buffer: usize) -> Option<&mut [u8]> {
+        let plane_bytes = self.config.as_ref()?.0.raster.plane_bytes();
+        self.store.bytes_mut(buffer).get_mut(plane as usize * plane_bytes..)?.get_mut(..plane_bytes)
+    }
+
+    fn plane_bytes_arrived(&mut self, plane: u8, frame: u32, buffer: usize, form: &mut Form, bytes: &[u8]) {
+        // Light may have ended while the plane was arriving: then the buffer is another frame's by now.
+        if !self.is_assembling(frame, buffer) {
+            return;
+        }
+        if let Form::Lz4 { staged } = form {
+            if let Some(to) = self.staging.get_mut(*staged..*staged + bytes.len()) {
+                to.copy_from_slice(bytes);
+                *staged += bytes.len();
+            }
+            return;
+        }
+        let Some(share) = self.share(plane, buffer) else { return };
+        match form {
+            Form::Raw { filled } => {
+                if let Some(to) = share.get_mut(*filled..*filled + bytes.len()) {
+                    to.copy_from_slice(bytes);
+                    *filled += bytes.len();
+                }
+            }
+            Form::Rle { decoder, failed } => *failed |= !*failed && decoder.push(bytes, share).is_err(),
+            Form::Lz4 { .. } => {}
         }
     }
 
@@ -143,6 +194,7 @@ impl Core {
             frame: header.frame,
             target_at: header.target_at,
             received: 0,
+            uses_base: false,
             buffer: if refused { None } else { Some(self.store.free_buffer()) },
         });
         true
@@ -163,12 +215,26 @@ impl Core {
         self.store.assembling.is_some_and(|a| a.frame == frame && a.buffer == Some(buffer))
     }
 
-    fn plane_arrived(&mut self, plane: u8, frame: u32, buffer: usize) {
-        self.status.last_plane = plane;
-        if self.is_assembling(frame, buffer) {
-            if let Some(frame) = &mut self.store.assembling {
-                frame.received |= 1 << plane;
+    fn plane_arrived(&mut self, plane: u8, frame: u32, buffer: usize, form: &Form) {
+        if !self.is_assembling(frame, buffer) {
+            return;
+        }
+        let staging = std::mem::take(&mut self.staging);
+        let whole = self.share(plane, buffer).is_some_and(|share| match form {
+            Form::Raw { filled } => *filled == share.len(),
+            Form::Rle { decoder, failed } => !failed && decoder.finish(share.len()).is_ok(),
+            Form::Lz4 { staged } => {
+                lz4_flex::block::decompress_into(&staging[..*staged], share).is_ok_and(|n| n == share.len())
             }
+        });
+        self.staging = staging;
+        if !whole {
+            self.ignore();
+            return;
+        }
+        self.status.last_plane = plane;
+        if let Some(frame) = &mut self.store.assembling {
+            frame.received |= 1 << plane;
         }
     }
 
@@ -277,7 +343,7 @@ impl Core {
         if commit.sent | commit.kept != all || frame.received != commit.sent {
             return false;
         }
-        if commit.kept == 0 {
+        if commit.kept == 0 && !frame.uses_base {
             return true;
         }
         let Some(base) = self.store.base.filter(|b| b.frame == commit.base_frame) else { return false };

@@ -26,17 +26,41 @@ fn settings() -> LinkSettings {
         underrun: Underrun::Repeat,
         late_slots: 0,
         epoch: Epoch::At(DeviceTicks(0)),
+        codecs: 0,
         session_seed: 7,
     }
 }
 
 /// Planes of frame `id`: any bits, a function of `id`, padding bits 0.
 fn planes(id: u64) -> Vec<u8> {
-    let r = raster();
+    planes_of(raster(), id)
+}
+
+/// Planes of any raster: noise, planes that never change, planes that change in one byte a frame, and planes of short patterns.
+fn structured(r: Raster, id: u64) -> Vec<u8> {
+    let n = r.plane_bytes();
+    let mut all = planes_of(r, id);
+    let still = planes_of(r, 999_999);
+    for (k, plane) in all.chunks_mut(n).enumerate() {
+        match k % 4 {
+            0 => {}
+            1 => plane.copy_from_slice(&still[k * n..(k + 1) * n]),
+            2 => {
+                plane.copy_from_slice(&still[k * n..(k + 1) * n]);
+                plane[id as usize % n] = id as u8;
+            }
+            _ => plane.iter_mut().enumerate().for_each(|(i, b)| *b = ((i + id as usize) % 5 * 50) as u8),
+        }
+    }
+    all
+}
+
+fn planes_of(r: Raster, id: u64) -> Vec<u8> {
     let draws = Draws::new(id);
     let mut all: Vec<u8> = (0..r.plane_bytes() * 24).map(|i| draws.bits(i as u64) as u8).collect();
+    let padding = (r.row_bytes() * 8) as u32 - r.width();
     for row in all.chunks_mut(r.row_bytes()) {
-        row[r.row_bytes() - 1] &= 0xf0; // 20 mirrors: 4 of the third byte's 8
+        row[r.row_bytes() - 1] &= 0xff << padding;
     }
     all
 }
@@ -84,11 +108,15 @@ impl<T: Transport> Rig<T> {
 
     /// One slot of the host: to its start, poll, and a frame for the slot after next.
     fn step(&mut self, id: u64) -> SendOutcome {
+        self.step_with(id, &planes(id))
+    }
+
+    fn step_with(&mut self, id: u64, planes: &[u8]) -> SendOutcome {
         self.slot += 1;
         self.now = HostTime(self.link.settings().rate.slot_start_ns(self.slot));
         self.poll().expect("poll");
         let target = self.link.slots().unwrap().start(self.slot + 2);
-        self.link.send_frame(self.now, id, target, &planes(id), &mut self.cable)
+        self.link.send_frame(self.now, id, target, planes, &mut self.cable)
     }
 
     fn idle(&mut self, slots: u64) {
@@ -512,17 +540,18 @@ proptest! {
 
     /// Whatever the cable does: what is lit is a frame that was sent, bit for bit; laws and credits hold; light returns.
     #[test]
-    fn a_bad_cable_never_lights_a_wrong_frame(seed in any::<u64>(), per_mille in 0u64..200) {
-        let mock = MockProjector::new(MockConfig::new(raster()));
+    fn a_bad_cable_never_lights_a_wrong_frame(seed in any::<u64>(), per_mille in 0u64..200, codecs in 0u32..16) {
+        let r = Raster::new(64, 16).unwrap();
+        let mock = MockProjector::new(MockConfig::new(r));
         let cable =
             BadCable { inner: Direct::new(mock), draws: Draws::new(seed), sent: 0, per_mille: 0, held: None };
-        let s = LinkSettings { late_slots: 2, ..settings() };
+        let s = LinkSettings { raster: r, codecs, late_slots: 2, ..settings() };
         let mut rig = Rig { link: HostLink::new(s), cable, now: HostTime(0), slot: 0 };
         rig.stream();
         rig.cable.per_mille = per_mille;
         let mut last_lit = None;
         for id in 0..60u64 {
-            rig.step(id);
+            rig.step_with(id, &structured(r, id));
             let mock = rig.cable.inner.device_mut();
             mock.check_laws();
             prop_assert_eq!(mock.credit_violations(), 0);
@@ -534,18 +563,18 @@ proptest! {
                 }
             }
             if let Some(id) = mock.lit_frame() {
-                let expected = planes(u64::from(id));
+                let expected = structured(r, u64::from(id));
                 prop_assert_eq!(mock.lit_planes().unwrap(), &expected[..]);
             }
         }
         // The cable heals: within 40 slots (credit repair included) every frame is lit again.
         rig.cable.per_mille = 0;
         for id in 60..100 {
-            rig.step(id);
+            rig.step_with(id, &structured(r, id));
         }
         let before = rig.cable.inner.device().status().frames_lit;
         for id in 100..110 {
-            prop_assert_eq!(rig.step(id), SendOutcome::Sent);
+            prop_assert_eq!(rig.step_with(id, &structured(r, id)), SendOutcome::Sent);
         }
         prop_assert_eq!(rig.cable.inner.device().status().frames_lit, before + 10);
     }
@@ -570,7 +599,8 @@ proptest! {
             mock.end_of_transfer(now, if *data { Lane::Data } else { Lane::Control });
             if let Some((kind, frame, payload, control)) = messages.get(i) {
                 let kind = MessageType::from_code(*kind).unwrap();
-                let header = Header { frame: *frame, plane: *frame as u8 % 30, led_code: 7, ..Header::control(kind, session, 0) };
+                let codec = Codec::from_code((*frame >> 8) as u8 % 4).unwrap();
+                let header = Header { frame: *frame, codec, plane: *frame as u8 % 30, led_code: 7, ..Header::control(kind, session, 0) };
                 let packet = Packet::new(header, payload).parts().concat();
                 mock.receive(now, if *control { Lane::Control } else { Lane::Data }, &packet);
             }
@@ -615,4 +645,69 @@ fn the_documents_example_makes_light() {
     mock.receive(HostTime(1_100_000), Lane::Control, stop);
     assert!(!mock.is_lit());
     assert_eq!(mock.status().frames_lit, 1);
+}
+
+#[test]
+fn every_codec_saves_and_lights_the_same_frame() {
+    let r = Raster::new(64, 16).unwrap();
+    let raw_frame = (24 * (32 + r.plane_bytes() + 4) + 32 + 16 + 4) as u64;
+    for codecs in [0, Codec::Rle.mask(), Codec::XorRle.mask(), Codec::Lz4.mask(), Codec::ALL] {
+        let mut rig = clean(LinkSettings { raster: r, codecs, ..settings() }, MockConfig::new(r));
+        rig.stream();
+        let before = rig.link.counters().bytes_sent;
+        for id in 0..40 {
+            assert_eq!(rig.step_with(id, &structured(r, id)), SendOutcome::Sent);
+            if let Some(lit) = rig.cable.device().lit_frame() {
+                assert_eq!(rig.cable.device().lit_planes().unwrap(), structured(r, u64::from(lit)));
+            }
+        }
+        let c = rig.link.counters();
+        let s = rig.cable.device().status();
+        assert_eq!((s.frames_incomplete, s.packets_ignored, s.frames_lit), (0, 0, 38), "{codecs:#b} {s:?}");
+        let bytes = c.bytes_sent - before;
+        if codecs == 0 {
+            assert_eq!((c.planes_raw, c.planes_coded, c.planes_kept), (40 * 24, 0, 0));
+            assert!((40 * raw_frame..40 * raw_frame + 5000).contains(&bytes), "{bytes}");
+            continue;
+        }
+        // A quarter of the planes never changes: sent once each. A quarter is noise and stays raw.
+        assert_eq!(c.planes_kept, 39 * 6);
+        assert!(c.planes_raw >= 40 * 6);
+        assert_eq!(c.key_frames, 1);
+        if codecs != Codec::Rle.mask() {
+            assert!(c.planes_coded > 39 * 6 / 2, "{codecs:#b}: {c:?}");
+        }
+        assert!(bytes < 40 * raw_frame * 3 / 4 + 5000, "{codecs:#b}: {bytes} of {}", 40 * raw_frame);
+        if codecs == Codec::ALL {
+            assert!(bytes < 40 * raw_frame * 45 / 100, "{bytes} of {}", 40 * raw_frame);
+            // A frame like the one before is a FRAME_COMMIT and nothing else.
+            let planes = structured(r, 39);
+            rig.step_with(40, &planes);
+            let at = rig.link.counters().bytes_sent;
+            rig.poll().unwrap();
+            let target = rig.link.slots().unwrap().start(rig.slot + 3);
+            rig.link.send_frame(rig.now, 41, target, &planes, &mut rig.cable);
+            assert_eq!(rig.link.counters().bytes_sent - at, 32 + 16 + 4);
+            rig.idle(4);
+            assert_eq!(rig.cable.device().lit_frame(), Some(41));
+            assert_eq!(rig.cable.device().lit_planes().unwrap(), planes);
+        }
+    }
+}
+
+/// A device that reads nothing but raw planes gets nothing else.
+#[test]
+fn codecs_are_what_both_sides_know() {
+    let r = Raster::new(64, 16).unwrap();
+    let mut rig = clean(
+        LinkSettings { raster: r, codecs: Codec::ALL, ..settings() },
+        MockConfig { codecs: 0, ..MockConfig::new(r) },
+    );
+    rig.stream();
+    for id in 0..20 {
+        rig.step_with(id, &structured(r, id));
+    }
+    assert_eq!(rig.link.counters().planes_coded, 0);
+    assert!(rig.link.counters().planes_kept > 0, "keeping a plane needs no codec");
+    assert_eq!(rig.cable.device().status().packets_ignored, 0);
 }

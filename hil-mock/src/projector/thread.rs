@@ -118,6 +118,7 @@ mod tests {
             underrun: Underrun::Repeat,
             late_slots: 100,
             epoch: Epoch::At(DeviceTicks(0)),
+            codecs: 0,
             session_seed: 3,
         });
         link.connect();

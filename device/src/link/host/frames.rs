@@ -1,0 +1,137 @@
+//! One frame's planes into packets: whole or not at all.
+
+use super::{DropReason, HostLink, LinkState, SendOutcome};
+use crate::link::compact::PlaneForm;
+use crate::link::header::{frame_newer, Codec, Header, MessageType, Packet};
+use crate::link::message::{Commit, HostMessage, MAX_CONTROL_BYTES};
+use crate::planes::MAX_PLANES;
+use crate::time::{DeviceTicks, HostTime};
+use crate::transport::{Lane, SendError, Transport};
+
+impl HostLink {
+    /// Hands one frame to the medium, all of it or nothing. `planes` are the frame's planes one after the other in the
+    /// configured order, each [`crate::planes::Raster::plane_bytes`] long; raw planes go out as they lie, without a copy on this side. `frame_id`
+    /// must grow from frame to frame; the wire carries its low 32 bits. `target_at` is the instant of light on the device's
+    /// clock, usually [`SlotClock::start`] of the slot.
+    ///
+    /// # Panics
+    /// When `planes` has not the configured size.
+    pub fn send_frame(
+        &mut self,
+        now: HostTime,
+        frame_id: u64,
+        target_at: DeviceTicks,
+        planes: &[u8],
+        transport: &mut dyn Transport,
+    ) -> SendOutcome {
+        self.counters.frames_offered += 1;
+        match self.try_send_frame(now, frame_id as u32, target_at, planes, transport) {
+            Ok(()) => {
+                self.counters.frames_sent += 1;
+                SendOutcome::Sent
+            }
+            Err(reason) => {
+                *match reason {
+                    DropReason::NotStreaming => &mut self.counters.not_streaming,
+                    DropReason::NoCredit => &mut self.counters.no_credit,
+                    DropReason::LinkBusy => &mut self.counters.link_busy,
+                    DropReason::LinkLost => &mut self.counters.link_lost,
+                    DropReason::NotNewer => &mut self.counters.not_newer,
+                } += 1;
+                SendOutcome::Dropped { reason }
+            }
+        }
+    }
+
+    fn try_send_frame(
+        &mut self,
+        now: HostTime,
+        frame: u32,
+        target_at: DeviceTicks,
+        planes: &[u8],
+        transport: &mut dyn Transport,
+    ) -> Result<(), DropReason> {
+        let schedule = self.settings.schedule;
+        let plane_bytes = self.settings.raster.plane_bytes();
+        let expected = plane_bytes * schedule.len();
+        assert!(planes.len() == expected, "frame of {} bytes, configured {expected}", planes.len());
+        if self.state != LinkState::Streaming {
+            return Err(DropReason::NotStreaming);
+        }
+        if self.last_frame.is_some_and(|last| !frame_newer(frame, last)) {
+            return Err(DropReason::NotNewer);
+        }
+        if self.credit() == 0 {
+            return Err(DropReason::NoCredit);
+        }
+        if !transport.has_room(Lane::Data) {
+            return Err(DropReason::LinkBusy);
+        }
+        let has_base = !self.key_due && self.last_frame.is_some();
+        let forms = match &mut self.compactor {
+            Some(compactor) => compactor.compact(planes, has_base),
+            None => [PlaneForm::Raw; MAX_PLANES],
+        };
+        let forms = &forms[..schedule.len()];
+        let kept =
+            forms.iter().enumerate().fold(
+                0u32,
+                |mask, (k, form)| {
+                    if *form == PlaneForm::Kept {
+                        mask | 1 << k
+                    } else {
+                        mask
+                    }
+                },
+            );
+        let is_key = !forms.iter().any(|f| matches!(f, PlaneForm::Kept | PlaneForm::Coded(Codec::XorRle, _)));
+        let commit = HostMessage::Commit(Commit {
+            sent: u32::MAX >> (32 - schedule.len()) & !kept,
+            kept,
+            base_frame: if is_key { 0 } else { self.last_frame.unwrap_or(0) },
+            frames_sent: self.frames_sent.wrapping_add(1),
+        });
+        let header =
+            Header { frame, target_at, ..Header::control(MessageType::Plane, self.inbox.session, 0) };
+        let mut payload = [0u8; MAX_CONTROL_BYTES];
+        let (kind, n) = commit.write(&mut payload);
+        let last = Packet::new(Header { kind, ..header }, &payload[..n]);
+        let mut packets = [last; MAX_PLANES + 1];
+        let mut count = 0;
+        for (k, (spec, form)) in schedule.planes().iter().zip(forms).enumerate() {
+            let (codec, bytes) = match (form, &self.compactor) {
+                (PlaneForm::Kept, _) => continue,
+                (PlaneForm::Coded(codec, n), Some(compactor)) => (*codec, compactor.coded(k, *n)),
+                _ => (Codec::Raw, &planes[k * plane_bytes..(k + 1) * plane_bytes]),
+            };
+            let header = Header { codec, plane: k as u8, led_code: spec.led_code(), ..header };
+            packets[count] = Packet::new(header, bytes);
+            count += 1;
+        }
+        packets[count] = last;
+        let packets = &packets[..=count];
+        match transport.send(now, Lane::Data, packets) {
+            Ok(()) => {}
+            Err(SendError::Busy) => return Err(DropReason::LinkBusy),
+            Err(SendError::Failed(_)) => return Err(DropReason::LinkLost),
+        }
+        let c = &mut self.counters;
+        c.bytes_sent += packets.iter().map(|p| p.wire_bytes() as u64).sum::<u64>();
+        for form in forms {
+            *match form {
+                PlaneForm::Kept => &mut c.planes_kept,
+                PlaneForm::Raw => &mut c.planes_raw,
+                PlaneForm::Coded(..) => &mut c.planes_coded,
+            } += 1;
+        }
+        c.key_frames += u64::from(is_key);
+        self.key_due = false;
+        if let Some(compactor) = &mut self.compactor {
+            compactor.sent(planes);
+        }
+        self.frames_sent = self.frames_sent.wrapping_add(1);
+        self.last_frame = Some(frame);
+        self.data_sent_at = now;
+        Ok(())
+    }
+}

@@ -1,0 +1,112 @@
+//! Packets from the device into the newest of everything it says.
+
+use super::types::EchoSample;
+use crate::link::decoder::PacketSink;
+use crate::link::header::Header;
+use crate::link::message::{Assembly, DeviceHello, DeviceMessage, Fault, Status};
+use crate::time::HostTime;
+
+/// Echo answers kept for the caller.
+pub(super) const ECHOES_KEPT: usize = 16;
+
+/// Everything that arrives.
+#[derive(Debug)]
+pub(super) struct Inbox {
+    pub now: HostTime,
+    pub session: u32,
+    pub assembly: Option<Assembly>,
+    pub hello: Option<DeviceHello>,
+    pub status: Option<Status>,
+    pub fault: Option<Fault>,
+    pub device_forgot: bool,
+    pub echoes: [Option<EchoSample>; ECHOES_KEPT],
+    pub next_echo: usize,
+    pub ignored: u64,
+    pub damaged: u64,
+}
+
+impl PacketSink for Inbox {
+    fn begin(&mut self, header: &Header) -> bool {
+        self.assembly = Assembly::new(header);
+        if self.assembly.is_none() {
+            self.ignored += 1;
+        }
+        self.assembly.is_some()
+    }
+
+    fn payload(&mut self, bytes: &[u8]) {
+        if let Some(a) = &mut self.assembly {
+            a.push(bytes);
+        }
+    }
+
+    fn end(&mut self, intact: bool) {
+        let Some(assembly) = self.assembly.take() else { return };
+        if !intact {
+            self.damaged += 1;
+            return;
+        }
+        let header = *assembly.header();
+        match DeviceMessage::parse(header.kind, assembly.payload()) {
+            Ok(message) if header.session == self.session => self.apply(&message),
+            // The device lost its power or its memory: it answers, but knows nothing of this session.
+            Ok(DeviceMessage::Status(_)) if header.session == 0 => {
+                self.device_forgot = true;
+            }
+            _ => self.ignored += 1,
+        }
+    }
+}
+
+impl Inbox {
+    pub const fn new() -> Self {
+        Self {
+            now: HostTime(i64::MIN),
+            session: 0,
+            assembly: None,
+            hello: None,
+            status: None,
+            fault: None,
+            device_forgot: false,
+            echoes: [None; ECHOES_KEPT],
+            next_echo: 0,
+            ignored: 0,
+            damaged: 0,
+        }
+    }
+
+    /// Forgets the old session and listens to `session`.
+    pub fn open(&mut self, session: u32) {
+        let (ignored, damaged, now) = (self.ignored, self.damaged, self.now);
+        *self = Self { session, ignored, damaged, now, ..Self::new() };
+    }
+
+    fn apply(&mut self, message: &DeviceMessage) {
+        match message {
+            DeviceMessage::Hello(h) => self.hello = Some(*h),
+            DeviceMessage::Status(s) => {
+                // An older one that came late would take credit back.
+                if self.status.is_some_and(|last| last.now > s.now) {
+                    self.ignored += 1;
+                } else {
+                    self.status = Some(*s);
+                }
+            }
+            DeviceMessage::Echo(e) => {
+                let sent_at = HostTime(e.host_sent_ns as i64);
+                if sent_at > self.now || e.device_sent < e.device_received {
+                    self.ignored += 1;
+                    return;
+                }
+                self.echoes[self.next_echo % ECHOES_KEPT] = Some(EchoSample {
+                    host_sent_at: sent_at,
+                    device_received_at: e.device_received,
+                    device_sent_at: e.device_sent,
+                    host_received_at: self.now,
+                });
+                self.next_echo += 1;
+            }
+            DeviceMessage::Fault(f) => self.fault = Some(*f),
+        }
+    }
+}

@@ -1,0 +1,220 @@
+//! What a host asks of a link, and what it hears from it: settings, states, errors, outcomes, counters.
+
+use crate::link::header::VERSION;
+use crate::link::message::{ConfigRefusal, DeviceState, HostMessage, Underrun};
+use crate::planes::{PlaneSchedule, Raster};
+use crate::time::{DeviceTicks, FrameRate, HostTime};
+use crate::transport::TransportError;
+
+/// Where slot 0 lies on the device's clock.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Epoch {
+    /// At this instant of the device's clock.
+    At(DeviceTicks),
+    /// This many nanoseconds (nominal) after the instant that the device's HELLO reports.
+    AfterHello(u64),
+}
+
+/// What a host asks of a device.
+#[derive(Clone, Debug)]
+pub struct LinkSettings {
+    /// Must be the device's raster.
+    pub raster: Raster,
+    /// Planes of a frame in the order shown.
+    pub schedule: PlaneSchedule,
+    /// Frames a second.
+    pub rate: FrameRate,
+    /// Silence after which the device goes dark, microseconds, 1 to [`crate::link::MAX_WATCHDOG_US`].
+    pub watchdog_us: u32,
+    /// What to light without a new frame.
+    pub underrun: Underrun,
+    /// Slots by which a frame may miss its target and still be lit.
+    pub late_slots: u8,
+    /// Where slot 0 lies.
+    pub epoch: Epoch,
+    /// Codecs that may be used, bits [`crate::link::Codec::mask`]; raw always is. With others, planes that do not change are not sent
+    /// and the host spends time to save bytes on the link.
+    pub codecs: u32,
+    /// Seed of the session numbers; two hosts should not use the same.
+    pub session_seed: u32,
+}
+
+/// Progress of a [`HostLink`].
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum LinkState {
+    /// Not connecting. [`super::HostLink::connect`] starts.
+    Closed,
+    /// HELLO is under way.
+    Greeting,
+    /// CONFIG is under way.
+    Configuring,
+    /// Configured and dark; waits for [`super::HostLink::arm`].
+    Ready,
+    /// ARM is under way.
+    Arming,
+    /// Frames are taken.
+    Streaming,
+    /// The device latched faults and is dark; [`super::HostLink::arm`] acknowledges.
+    Faulted,
+}
+
+/// Why the link cannot be brought up.
+#[derive(Debug, thiserror::Error)]
+pub enum LinkError {
+    /// No common version.
+    #[error("{device}: the device speaks link protocol version {theirs}, this program {VERSION}; update the older of the two")]
+    Version {
+        /// Name of the transport.
+        device: String,
+        /// The device's version.
+        theirs: u16,
+    },
+    /// The device is another panel.
+    #[error("{device}: the panel has {}x{} mirrors, the rig is configured for {}x{}", .theirs.width(), .theirs.height(), .ours.width(), .ours.height())]
+    Raster {
+        /// Name of the transport.
+        device: String,
+        /// The device's raster.
+        theirs: Raster,
+        /// The configured raster.
+        ours: Raster,
+    },
+    /// The device cannot show that many planes that fast.
+    #[error("{device}: {planes} planes at {rate_hz:.3} Hz leave {plane_ns} ns for a plane, the mirrors need {min_plane_ns} ns and take at most {max_planes} planes; lower the frame rate or the plane count")]
+    TooFast {
+        /// Name of the transport.
+        device: String,
+        /// Planes asked for.
+        planes: usize,
+        /// Frame rate asked for.
+        rate_hz: f64,
+        /// Time that leaves for a plane.
+        plane_ns: u64,
+        /// Time the device needs.
+        min_plane_ns: u32,
+        /// Planes the device takes.
+        max_planes: u8,
+    },
+    /// The device refused CONFIG for a reason that HELLO did not show.
+    #[error("{device}: configuration refused: {reason:?}")]
+    ConfigRefused {
+        /// Name of the transport.
+        device: String,
+        /// The device's reason.
+        reason: Option<ConfigRefusal>,
+    },
+    /// The device refused ARM.
+    #[error("{device}: not armed, latched faults: {}; remove the cause and acknowledge them", crate::link::faults::names(*.faults))]
+    ArmRefused {
+        /// Name of the transport.
+        device: String,
+        /// Faults that stand in the way.
+        faults: u32,
+    },
+    /// The medium failed.
+    #[error(transparent)]
+    Transport(#[from] TransportError),
+}
+
+/// Why a frame was not sent.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum DropReason {
+    /// The link is not streaming.
+    NotStreaming,
+    /// The device has no free buffer.
+    NoCredit,
+    /// The medium has no room.
+    LinkBusy,
+    /// The medium failed.
+    LinkLost,
+    /// The frame number does not follow the one sent before.
+    NotNewer,
+}
+
+/// Fate of a frame handed to [`super::HostLink::send_frame`].
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum SendOutcome {
+    /// All of it is on its way.
+    Sent,
+    /// None of it was sent.
+    Dropped {
+        /// Why.
+        reason: DropReason,
+    },
+}
+
+/// Counters since [`super::HostLink::new`]: `frames_offered = frames_sent + not_streaming + no_credit + link_busy + link_lost + not_newer`.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+#[allow(missing_docs)] // Named after `DropReason`.
+pub struct LinkCounters {
+    pub frames_offered: u64,
+    pub frames_sent: u64,
+    pub not_streaming: u64,
+    pub no_credit: u64,
+    pub link_busy: u64,
+    pub link_lost: u64,
+    pub not_newer: u64,
+    /// Bytes handed to the medium.
+    pub bytes_sent: u64,
+    /// Planes sent as they are.
+    pub planes_raw: u64,
+    /// Planes sent by a codec.
+    pub planes_coded: u64,
+    /// Planes not sent because they had not changed.
+    pub planes_kept: u64,
+    /// Frames sent without reference to another.
+    pub key_frames: u64,
+    /// Intact packets from the device without effect: other session, out of order, malformed.
+    pub packets_ignored: u64,
+    /// Damaged packets from the device.
+    pub packets_damaged: u64,
+    /// Sessions opened.
+    pub sessions: u64,
+}
+
+/// One clock exchange, for the clock map: host sent, device received, device sent, host received.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct EchoSample {
+    /// Request left, host's clock.
+    pub host_sent_at: HostTime,
+    /// Request arrived, device's clock.
+    pub device_received_at: DeviceTicks,
+    /// Answer left, device's clock.
+    pub device_sent_at: DeviceTicks,
+    /// Answer arrived, host's clock.
+    pub host_received_at: HostTime,
+}
+
+/// What a device in trouble or an operator can ask for at any time.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Verb {
+    /// Dark and no longer armed.
+    Stop,
+    /// Dark, still armed; [`super::HostLink::arm`] shows the picture again.
+    Black,
+    /// Hold the frame that is lit; [`super::HostLink::arm`] lets it move again.
+    Freeze,
+    /// Dark and latched.
+    Safe,
+}
+
+impl Verb {
+    pub(super) fn message(self) -> HostMessage {
+        match self {
+            Self::Stop => HostMessage::Stop,
+            Self::Black => HostMessage::Black,
+            Self::Freeze => HostMessage::Freeze,
+            Self::Safe => HostMessage::Safe,
+        }
+    }
+
+    pub(super) fn confirmed_by(self, state: DeviceState) -> bool {
+        use DeviceState::{Armed, Black, Faulted, Frozen};
+        match self {
+            Self::Stop => !matches!(state, Armed | Black | Frozen),
+            Self::Black => state != Armed && state != Frozen,
+            Self::Freeze => state != Armed,
+            Self::Safe => state == Faulted || state == DeviceState::Idle,
+        }
+    }
+}
