@@ -1,5 +1,58 @@
 //! Words into calls: the command line of `dpm`. One file per command, no logic of its own.
 
+pub mod doctor;
+pub mod os;
 pub mod rig_args;
 pub mod signals;
 pub mod watch;
+
+use crate::failure::Failure;
+use clap::{ColorChoice, CommandFactory, FromArgMatches, Parser, Subcommand};
+use std::io::Write;
+use std::process::ExitCode;
+
+/// Rig controller for path-traced dynamic projection mapping.
+#[derive(Debug, Parser)]
+#[command(name = "dpm", version, about, after_help = AFTER_HELP)]
+struct Cli {
+    #[command(subcommand)]
+    command: Command,
+}
+
+const AFTER_HELP: &str = "Exit codes: 0 ok, 1 a check failed, 2 usage or bad input, 3 device, 4 no GPU.
+Every key of the rig file can be set by --set a.b=c or by the environment variable DPM_SET_A__B=c.";
+
+#[derive(Debug, Subcommand)]
+enum Command {
+    /// Say what this machine can do, and what to do about what is missing
+    Doctor(doctor::DoctorArgs),
+}
+
+/// Runs the program with the process's arguments.
+pub fn main() -> ExitCode {
+    // https://no-color.org: set and not empty.
+    let plain = std::env::var_os("NO_COLOR").is_some_and(|v| !v.is_empty());
+    let command = Cli::command().color(if plain { ColorChoice::Never } else { ColorChoice::Auto });
+    let parsed = command.try_get_matches().and_then(|m| Cli::from_arg_matches(&m));
+    let cli = match parsed {
+        Ok(cli) => cli,
+        Err(e) => {
+            // Help and version are such "errors" too, with exit code 0.
+            let _ = e.print();
+            return ExitCode::from(u8::try_from(e.exit_code()).unwrap_or(2));
+        }
+    };
+    match dispatch(&cli.command) {
+        Ok(()) => ExitCode::SUCCESS,
+        Err(failure) => {
+            let _ = writeln!(std::io::stderr(), "error: {failure}");
+            ExitCode::from(failure.kind.exit_code())
+        }
+    }
+}
+
+fn dispatch(command: &Command) -> Result<(), Failure> {
+    match command {
+        Command::Doctor(args) => doctor::execute(args),
+    }
+}

@@ -164,4 +164,49 @@ impl RigConfig {
         Self::document("", &mut out);
         out
     }
+
+    /// The manual `docs/CONFIG.md`.
+    pub fn manual() -> String {
+        let mut out = String::from(MANUAL_HEAD);
+        let mut section = String::new();
+        for key in Self::key_docs() {
+            let (table, name) = key.key.rsplit_once('.').unwrap_or(("", &key.key));
+            if table != section {
+                section = table.to_string();
+                out += &format!(
+                    "\n## {}\n\n| key | type | default | allowed | what it does |\n|---|---|---|---|---|\n",
+                    heading(table)
+                );
+            }
+            let cell = |text: &str| text.replace('|', "\\|");
+            let allowed = [key.range.as_str(), key.unit].join(" ");
+            out += &format!(
+                "| `{name}` | {} | `{}` | {} | {} |\n",
+                cell(&key.kind),
+                cell(&key.default),
+                cell(allowed.trim()),
+                cell(&key.doc)
+            );
+        }
+        out
+    }
+}
+
+const MANUAL_HEAD: &str = "# The rig file
+
+Made from the declarations in `host/src/config/`; `DPM_UPDATE_MANUAL=1 cargo test -p dpm-host --lib manual` writes it anew.
+
+A rig file is TOML. What it leaves out has the default. Over the file come environment variables
+(`DPM_SET_PROJECTOR__WIDTH=640` sets `projector.width`; two underscores part the levels) and over those the flag
+`--set projector.width=640`, which may stand several times; a number steps into a list (`--set scene.bodies.0.node=Hare`).
+All mistakes of a file are reported at once, each with line and column. Paths in a rig file are relative to its folder.
+";
+
+/// `projector.backend(usb)` into `[projector.backend]` with `kind = "usb"`; `scene.bodies[]` into `[[scene.bodies]]`.
+fn heading(table: &str) -> String {
+    match (table.strip_suffix(')').and_then(|t| t.split_once('(')), table.strip_suffix("[]")) {
+        (Some((table, kind)), _) => format!("`[{table}]` with `kind = \"{kind}\"`"),
+        (_, Some(list)) => format!("`[[{list}]]`"),
+        _ => format!("`[{table}]`"),
+    }
 }

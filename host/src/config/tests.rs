@@ -333,3 +333,17 @@ fn effects_follow_the_method_unless_switched() {
     let full = on(&["render.method=full", "render.effects.blue_noise=true"]);
     assert!(full.blue_noise && !full.checkerboard && !full.temporal_filter);
 }
+
+#[test]
+fn the_manual_is_up_to_date() {
+    let path = Path::new(env!("CARGO_MANIFEST_DIR")).join("../docs/CONFIG.md");
+    let manual = RigConfig::manual();
+    if std::env::var_os("DPM_UPDATE_MANUAL").is_some() {
+        std::fs::write(&path, &manual).unwrap();
+    }
+    let written = std::fs::read_to_string(&path).unwrap();
+    assert!(
+        written == manual,
+        "docs/CONFIG.md is stale: DPM_UPDATE_MANUAL=1 cargo test -p dpm-host --lib manual"
+    );
+}

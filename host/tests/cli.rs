@@ -1,0 +1,100 @@
+//! The program as its users meet it: exit codes, where output goes, what errors say.
+
+use std::process::{Command, Output};
+
+/// Runs the program in an environment that does not depend on the caller's.
+fn dpm(args: &[&str], variables: &[(&str, &str)]) -> Output {
+    let mut command = Command::new(env!("CARGO_BIN_EXE_dpm"));
+    command.args(args).env_remove("NO_COLOR");
+    for (name, _) in std::env::vars_os() {
+        if name.to_string_lossy().starts_with("DPM_SET_") {
+            command.env_remove(name);
+        }
+    }
+    command.envs(variables.iter().copied());
+    command.output().expect("the program starts")
+}
+
+fn code(output: &Output) -> i32 {
+    output.status.code().expect("not ended by a signal")
+}
+
+fn out(output: &Output) -> String {
+    String::from_utf8_lossy(&output.stdout).into_owned()
+}
+
+fn err(output: &Output) -> String {
+    String::from_utf8_lossy(&output.stderr).into_owned()
+}
+
+/// No Vulkan driver, whatever the machine has.
+const NO_DRIVER: [(&str, &str); 2] =
+    [("VK_ICD_FILENAMES", "/nonexistent.json"), ("VK_DRIVER_FILES", "/nonexistent.json")];
+
+#[test]
+fn version_and_help_go_to_standard_output() {
+    let version = dpm(&["--version"], &[]);
+    assert_eq!((code(&version), out(&version)), (0, format!("dpm {}\n", env!("CARGO_PKG_VERSION"))));
+    let help = dpm(&["--help"], &[]);
+    assert_eq!(code(&help), 0);
+    for word in ["doctor", "Exit codes", "--set a.b=c"] {
+        assert!(out(&help).contains(word), "{word} in {}", out(&help));
+    }
+}
+
+#[test]
+fn bad_usage_ends_with_2() {
+    for args in [&["frobnicate"][..], &["doctor", "--frob"], &["doctor", "surplus"], &[]] {
+        let output = dpm(args, &[]);
+        assert_eq!(code(&output), 2, "{args:?}: {}", err(&output));
+        assert!(err(&output).contains("Usage"), "{args:?}: {}", err(&output));
+        assert_eq!(out(&output), "", "{args:?}");
+    }
+}
+
+#[test]
+fn no_colour_is_honoured_and_a_pipe_gets_none() {
+    for variables in [&[][..], &[("NO_COLOR", "1")]] {
+        let output = dpm(&["frobnicate"], variables);
+        assert!(!err(&output).contains('\u{1b}'), "{:?}", err(&output));
+    }
+}
+
+#[test]
+fn doctor_reports_on_every_topic_and_ends_with_4_without_a_gpu() {
+    let output = dpm(&["doctor", "--json"], &NO_DRIVER);
+    assert_eq!(code(&output), 4, "{}", err(&output));
+    let json: serde_json::Value = serde_json::from_str(&out(&output)).expect("one JSON object");
+    assert_eq!(json["can_render"], false);
+    let findings = json["findings"].as_array().expect("a list");
+    let named = |name: &str| findings.iter().find(|f| f["name"] == name);
+    for name in
+        ["Vulkan", "cores", "bit-plane packing", "real-time priority", "locked memory", "serial ports"]
+    {
+        assert!(named(name).is_some(), "{name} in {json}");
+    }
+    assert_eq!(named("Vulkan").expect("just looked")["state"], "missing");
+    for finding in findings.iter().filter(|f| f["state"] == "warning") {
+        assert_ne!(finding["remedy"], "", "a warning without advice: {finding}");
+    }
+    let table = dpm(&["doctor"], &NO_DRIVER);
+    assert_eq!(code(&table), 4);
+    assert!(out(&table).contains("mesa-vulkan-drivers"), "{}", out(&table));
+    assert!(err(&table).starts_with("error: no usable Vulkan device"), "{}", err(&table));
+}
+
+#[test]
+fn a_reader_that_goes_away_is_no_error() {
+    use std::process::Stdio;
+    let mut child = Command::new(env!("CARGO_BIN_EXE_dpm"))
+        .args(["doctor", "--json"])
+        .envs(NO_DRIVER)
+        .stdout(Stdio::piped())
+        .stderr(Stdio::piped())
+        .spawn()
+        .expect("the program starts");
+    drop(child.stdout.take());
+    let output = child.wait_with_output().expect("it ends");
+    assert_eq!(output.status.code(), Some(4), "{}", err(&output));
+    assert!(!err(&output).contains("panicked"), "{}", err(&output));
+}
