@@ -3,6 +3,8 @@
 use super::read::Reader;
 use super::world::{EnvironmentConfig, GazeConfig, TrackerConfig};
 use super::{Pace, ProjectorBackend, RigConfig};
+use hil_mock::faults::FaultPlan;
+use hil_mock::tracker::TRACKER_FAULTS;
 use std::path::{Path, PathBuf};
 
 /// Refuses at the first of `keys` that somebody wrote.
@@ -17,6 +19,22 @@ pub(super) fn check(rig: &RigConfig, reader: &mut Reader) {
     bodies(rig, reader);
     render(rig, reader);
     time(rig, reader);
+    faults(rig, reader);
+}
+
+fn faults(rig: &RigConfig, reader: &mut Reader) {
+    if let TrackerConfig::Mock(mock) = &rig.tracker {
+        let plan = mock.faults.parse::<FaultPlan>();
+        let known = plan.and_then(|plan| plan.check_supported(&TRACKER_FAULTS, "the mock tracker"));
+        if let Err(e) = known {
+            refuse(
+                reader,
+                &["tracker.faults"],
+                e.to_string(),
+                "for example \"loss=0.01,dropout@1.5s+20ms\"".into(),
+            );
+        }
+    }
 }
 
 fn projector(rig: &RigConfig, reader: &mut Reader) {

@@ -108,6 +108,33 @@ const BAD: &[(&str, usize, usize, &str, &str)] = &[
     ("[safety]\nwatchdog_ms = 0", 2, 15, "safety.watchdog_ms", "must be 1 to 10000 ms"),
     ("[output]\nlight_window_ms = 0", 2, 19, "output.light_window_ms", "ms"),
     ("[prediction]\ngate_sigma = 0.5", 2, 14, "prediction.gate_sigma", "must be 1 to 100"),
+    // Motions and faults, as the mock understands them.
+    (
+        "[[scene.bodies]]\nname = \"a\"\nmotion = { kind = \"fly\" }",
+        3,
+        10,
+        "scene.bodies.0.motion",
+        "unknown variant `fly`",
+    ),
+    ("[[scene.bodies]]\nname = \"a\"\nmotion = { speed_m_s = 1 }", 3, 10, "scene.bodies.0.motion", "kind"),
+    ("[[scene.bodies]]\nname = \"a\"\nmotion = \"still\"", 3, 10, "scene.bodies.0.motion", "must be a table"),
+    (
+        "[[scene.bodies]]\nname = \"a\"\n[scene.bodies.motion]\nkind = \"rotate\"\nspin = 1",
+        5,
+        1,
+        "scene.bodies.0.motion.spin",
+        "unknown field",
+    ),
+    (
+        "[[scene.bodies]]\nname = \"a\"\nmotion.kind = \"translate\"\nmotion.speed_m_s = 0",
+        4,
+        8,
+        "scene.bodies.0.motion.speed_m_s",
+        "speed_m_s",
+    ),
+    ("[tracker]\nfaults = \"gremlins\"", 2, 10, "tracker.faults", "unknown fault `gremlins`"),
+    ("[tracker]\nfaults = \"loss=2\"", 2, 10, "tracker.faults", "0 to 1"),
+    ("[tracker]\nfaults = \"unplug@1s+2s\"", 2, 10, "tracker.faults", "means nothing to the mock tracker"),
     // Contradictions.
     ("[projector]\nframe_rate = 948", 2, 14, "projector.frame_rate", "at most 947 frames/s of 24 planes"),
     ("[projector]\nmax_planes_per_second = 9523", 2, 25, "projector.max_planes_per_second", "at most 396"),

@@ -1,6 +1,9 @@
 //! `[tracker]`, `[observer]`, `[scene]` and `[prediction]`: what moves, who looks, and what is to be seen.
 
-use super::read::{kinds, section, words, Any, NotEmpty, Within};
+use super::read::{kinds, section, words, Any, ConfigValue, NotEmpty, Reader, Within};
+use super::source::Node;
+use dpm_device::pose::Pose;
+use hil_mock::motion::{Motion, MotionSpec};
 use std::path::PathBuf;
 
 kinds! {
@@ -222,7 +225,9 @@ section! {
         id: Option<i64> = None, "", Within(0, i64::from(i32::MAX));
         /// glTF node that it moves, with everything below; the body's name when left out.
         node: Option<String> = None, "", NotEmpty;
-        /// How it moves when the tracker is the mock.
+        /// How it moves when the tracker is the mock: `kind` is `still`, `translate`, `sinusoid`, `rotate`, `sway`, `screw` or
+        /// `together`, for example `{ kind = "translate", speed_m_s = 1.0 }`. Left out, the first body goes to and fro at 1 m/s,
+        /// the second turns in place and others stand still.
         motion: MotionValue = MotionValue::default(), "", Any;
     }
 }
@@ -234,23 +239,40 @@ impl BodyConfig {
     }
 }
 
-/// The table that says how a body moves, handed to the mock as it stands.
+/// The table that says how a body moves: a checked `hil_mock::motion::MotionSpec`; `None` when the rig file says nothing.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct MotionValue(pub Option<toml::Table>);
 
-impl super::read::ConfigValue for MotionValue {
+impl ConfigValue for MotionValue {
     fn kind() -> String {
         "a table".into()
     }
-    fn read(node: &super::source::Node, reader: &mut super::read::Reader, key: &str) -> Option<Self> {
-        reader.table(node, key)?;
-        match node.to_toml() {
-            Some(toml::Value::Table(table)) => Some(Self(Some(table))),
-            _ => None,
-        }
+
+    fn read(node: &Node, reader: &mut Reader, key: &str) -> Option<Self> {
+        let entries = reader.table(node, key)?;
+        let Some(toml::Value::Table(table)) = node.to_toml() else {
+            reader.refuse(&node.origin, key, "holds a date or an integer beyond 64 bits", "");
+            return None;
+        };
+        let problem = match toml::Value::Table(table.clone()).try_into::<MotionSpec>() {
+            Ok(spec) => match Motion::new(&spec, Pose::IDENTITY) {
+                Ok(_) => return Some(Self(Some(table))),
+                Err(e) => e.to_string(),
+            },
+            Err(e) => e.message().replace('\n', ", "),
+        };
+        // The message names the field in backquotes; the error then stands where that field is written.
+        let field = problem.split('`').skip(1).step_by(2).find_map(|name| Some((name, entries.get(name)?)));
+        let (origin, key) = match field {
+            Some((name, entry)) => (&entry.key_origin, format!("{key}.{name}")),
+            None => (&node.origin, key.to_string()),
+        };
+        reader.refuse(origin, &key, problem, "");
+        None
     }
+
     fn show(&self) -> String {
-        "{ kind = \"still\" }".into()
+        "none".into()
     }
 }
 
