@@ -3,6 +3,7 @@
 //! Reading order: [`motion`] is what truly happens, [`faults`] the one vocabulary of what goes wrong, [`tracker`] what a tracker
 //! would report, [`projector`] what a projector makes of the packets it gets. All randomness comes from [`rng`], keyed by a seed; time is always an argument.
 
+pub mod dlpc900;
 pub mod faults;
 pub mod motion;
 pub mod natnet_host;

@@ -6,5 +6,11 @@
 
 pub mod command;
 #[cfg(feature = "std")]
+pub mod driver;
+#[cfg(feature = "std")]
 pub mod image;
 pub mod lut;
+#[cfg(feature = "std")]
+pub mod sequence;
+#[cfg(feature = "usb")]
+pub mod usb;

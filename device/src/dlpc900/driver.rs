@@ -1,0 +1,563 @@
+//! Calls of a program into commands to a DLPC900, and its answers into values and errors that say what to do.
+
+use std::time::Duration;
+
+use super::command::{
+    Command, Malformed, Opcode, ReplyAssembler, TooLong, MAX_BMP_BYTES, MAX_REPLY_DATA, REPORT_BYTES,
+};
+use super::lut::{DisplayMode, Dmd};
+use super::sequence::{self, LedSetup, PatternSequence, SequenceError, Step, Version, VideoPatterns};
+
+/// How long one report may take to go out, and one reply to come in. The controller answers within a few milliseconds; while
+/// it takes an image it may refuse data for some time.
+const TIMEOUT: Duration = Duration::from_millis(1000);
+/// Replies to other commands that are dropped before a reply counts as missing (another program's, or one never read).
+const MOST_STALE: usize = 8;
+/// Pause between two looks at the status while waiting.
+const POLL: Duration = Duration::from_millis(20);
+
+/// The cable: sends and receives reports of 64 bytes. Every wait MUST end within the time given.
+pub trait HidPort {
+    /// Sends one report.
+    fn write_report(&mut self, report: &[u8; REPORT_BYTES], timeout: Duration) -> Result<(), PortError>;
+
+    /// Receives one report.
+    fn read_report(&mut self, report: &mut [u8; REPORT_BYTES], timeout: Duration) -> Result<(), PortError>;
+
+    /// Lets time pass. Simulated ports let theirs.
+    fn pause(&mut self, time: Duration) {
+        std::thread::sleep(time);
+    }
+}
+
+/// What a cable can say.
+#[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
+pub enum PortError {
+    /// Nothing within the time given.
+    #[error("no answer in time")]
+    Timeout,
+    /// The device has gone.
+    #[error("the device was unplugged or has lost power")]
+    Gone,
+    /// No such device.
+    #[error("no DLPC900 (USB 0451:c900) is plugged in: check cable and power")]
+    NotFound,
+    /// The operating system denies access; the text is the remedy.
+    #[error("no permission to open the device: {0}")]
+    Denied(String),
+    /// Somebody else holds the device.
+    #[error("another program holds the device: close it (TI's own, or a second dpm)")]
+    Busy,
+    /// Anything else.
+    #[error("{0}")]
+    Other(String),
+}
+
+/// Why something was not done.
+#[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
+pub enum Dlpc900Error {
+    /// The cable failed.
+    #[error("{doing}: {source}")]
+    Port {
+        /// During which command.
+        doing: String,
+        /// How.
+        source: PortError,
+    },
+    /// The controller refused a command.
+    #[error("{doing}: the controller refuses (error {code}, \"{text}\"): {}", remedy(*.code))]
+    Refused {
+        /// Which command, with the entry or image it was about.
+        doing: String,
+        /// The controller's error code.
+        code: u8,
+        /// The controller's own words.
+        text: String,
+    },
+    /// The controller answered something that makes no sense.
+    #[error("{doing}: the answer makes no sense ({what})")]
+    Protocol {
+        /// Which command.
+        doing: String,
+        /// What is wrong with it.
+        what: String,
+    },
+    /// A sequence that the controller cannot show.
+    #[error(transparent)]
+    Sequence(#[from] SequenceError),
+    /// The controller says that hardware is wrong.
+    #[error("the controller reports {0}: check DMD, cable and power, then reset")]
+    Hardware(String),
+    /// No video signal.
+    #[error("the video source did not lock within {0:?}: check cable, resolution and that the graphics card sends a picture")]
+    NotLocked(Duration),
+    /// An unknown DMD.
+    #[error("the controller drives a DMD with unknown number {0}: update this program or the controller's firmware")]
+    UnknownDmd(u8),
+}
+
+/// What the controller's error code means.
+pub const fn error_meaning(code: u8) -> &'static str {
+    match code {
+        0 => "no error",
+        1 => "batch file checksum error",
+        2 => "device failure",
+        3 => "invalid command number",
+        4 => "incompatible controller and DMD",
+        5 => "command not allowed in current mode",
+        6 => "invalid command parameter",
+        7 => "item referred by the parameter is not present",
+        8 => "out of resource (RAM or flash)",
+        9 => "invalid BMP compression type",
+        10 => "pattern bit number out of range",
+        11 => "pattern BMP not present in flash",
+        12 => "pattern dark time is out of range",
+        13 => "signal delay parameter is out of range",
+        14 => "pattern exposure time is out of range",
+        15 => "pattern number is out of range",
+        16 => "invalid pattern definition",
+        17 => "pattern image memory address is out of range",
+        255 => "internal error",
+        _ => "unknown error",
+    }
+}
+
+/// What to do about an error code.
+pub const fn remedy(code: u8) -> &'static str {
+    match code {
+        1 | 7 | 11 => "what the command names is not in the controller's flash; load it there or upload it over USB",
+        2 | 4 | 255 => "power the projector off and on; if it stays, DMD and controller do not fit or are damaged",
+        3 => "the firmware does not know this command; update it",
+        5 => "stop the sequence and select the right display mode first",
+        6 => "a number in the command is outside its range",
+        8 => "fewer or smaller images",
+        9 => "the image stream is damaged; upload again, without other programs on the cable",
+        10 => "bit position plus depth must stay within 24 planes",
+        12 => "a shorter dark time",
+        13 => "trigger delays lie between -20 and 20000 us",
+        14 => "a longer exposure or fewer bits; the least exposure grows with the depth",
+        15 => "fewer patterns in the table",
+        16 => "number the entries 0, 1, 2, ... and clear the mirrors after each pattern that waits for no trigger",
+        17 => "image numbers must be below the number of images uploaded",
+        _ => "look the code up in the programmer's guide (DLPU018, command 0x0100)",
+    }
+}
+
+/// Everything that one look at the controller tells.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct Status {
+    /// Firmware.
+    pub firmware: Version,
+    /// DMD.
+    pub dmd: Dmd,
+    /// The firmware's tag, such as `DLPR900PROM-6500`.
+    pub tag: String,
+    /// Display mode; `None` for a byte without a meaning.
+    pub mode: Option<DisplayMode>,
+    /// Hardware status byte (0x1A0A).
+    pub hardware: u8,
+    /// System status byte (0x1A0B).
+    pub system: u8,
+    /// Main status byte (0x1A0C).
+    pub main: u8,
+}
+
+impl Status {
+    /// Mirrors parked.
+    pub const fn is_parked(&self) -> bool {
+        self.main & 1 != 0
+    }
+    /// A sequence runs.
+    pub const fn is_running(&self) -> bool {
+        self.main & 2 != 0
+    }
+    /// The video source is locked.
+    pub const fn is_locked(&self) -> bool {
+        self.main & 8 != 0
+    }
+
+    /// What the hardware bits complain about, if anything.
+    pub fn complaint(&self) -> Option<String> {
+        let bits = [
+            (self.hardware & 0x01 == 0, "initialisation failed"),
+            (self.hardware & 0x02 != 0, "an incompatible DMD"),
+            (self.hardware & 0x04 != 0, "a DMD reset controller error"),
+            (self.hardware & 0x08 != 0, "a forced buffer swap"),
+            (self.hardware & 0x40 != 0, "a sequencer abort"),
+            (self.hardware & 0x80 != 0, "a sequencer error"),
+            (self.system & 0x01 == 0, "a failed memory test"),
+        ];
+        let found: Vec<_> = bits.iter().filter(|b| b.0).map(|b| b.1).collect();
+        (!found.is_empty()).then(|| found.join(", "))
+    }
+}
+
+/// How far an upload has come.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct UploadProgress {
+    /// Image bytes sent.
+    pub sent: usize,
+    /// Image bytes of the whole upload.
+    pub total: usize,
+}
+
+/// Counters of one connection.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub struct Counters {
+    /// Commands sent.
+    pub commands: u64,
+    /// Replies used.
+    pub replies: u64,
+    /// Reports dropped because they answered another command or made no sense.
+    pub stale: u64,
+}
+
+/// A DLPC900 behind a cable.
+#[derive(Debug)]
+pub struct Dlpc900<P> {
+    port: P,
+    sequence: u8,
+    firmware: Version,
+    dmd: Dmd,
+    tag: String,
+    counters: Counters,
+}
+
+impl<P: HidPort> Dlpc900<P> {
+    /// Greets the controller: reads its firmware and DMD.
+    pub fn new(port: P) -> Result<Self, Dlpc900Error> {
+        let firmware = Version { major: 0, minor: 0, patch: 0 };
+        let (dmd, tag, counters) = (Dmd::Dlp6500, String::new(), Counters::default());
+        let mut this = Self { port, sequence: 0, firmware, dmd, tag, counters };
+        let version = this.read(Opcode::VERSION, &[])?;
+        let bytes = version.first_chunk::<4>().ok_or_else(|| short(Opcode::VERSION, &version, 4))?;
+        this.firmware = Version::from_bytes(*bytes);
+        let hardware = this.read(Opcode::HARDWARE_ID, &[])?;
+        let (id, tag) = hardware.split_first().ok_or_else(|| short(Opcode::HARDWARE_ID, &hardware, 1))?;
+        this.dmd = Dmd::from_hardware_id(*id).ok_or(Dlpc900Error::UnknownDmd(*id))?;
+        let text = tag.split(|b| *b == 0).next().unwrap_or_default();
+        this.tag = text.iter().map(|b| if b.is_ascii_graphic() { char::from(*b) } else { '?' }).collect();
+        Ok(this)
+    }
+
+    /// The DMD found.
+    pub fn dmd(&self) -> Dmd {
+        self.dmd
+    }
+
+    /// The firmware found.
+    pub fn firmware(&self) -> Version {
+        self.firmware
+    }
+
+    /// Counters since the connection was made.
+    pub fn counters(&self) -> Counters {
+        self.counters
+    }
+
+    /// The cable, for tests and for closing it.
+    pub fn into_port(self) -> P {
+        self.port
+    }
+
+    /// Reads a command's data.
+    pub fn read(&mut self, opcode: Opcode, parameters: &[u8]) -> Result<Vec<u8>, Dlpc900Error> {
+        let doing = opcode.to_string();
+        self.send(opcode, parameters, true, true, &doing)?;
+        self.receive(&doing, true)
+    }
+
+    /// Writes a command's data and waits for the acknowledgement.
+    pub fn write(&mut self, opcode: Opcode, data: &[u8]) -> Result<(), Dlpc900Error> {
+        self.write_about(opcode, data, opcode.to_string())
+    }
+
+    fn write_about(&mut self, opcode: Opcode, data: &[u8], doing: String) -> Result<(), Dlpc900Error> {
+        self.send(opcode, data, false, true, &doing)?;
+        self.receive(&doing, true).map(|_| ())
+    }
+
+    fn send(
+        &mut self,
+        opcode: Opcode,
+        data: &[u8],
+        read: bool,
+        reply: bool,
+        doing: &str,
+    ) -> Result<(), Dlpc900Error> {
+        self.sequence = self.sequence.wrapping_add(1);
+        let command = if read {
+            Command::read(self.sequence, opcode, data)
+        } else {
+            Command::write(self.sequence, opcode, data, reply)
+        };
+        let reports = command.reports().map_err(|e: TooLong| protocol(doing, e))?;
+        for report in reports {
+            self.port.write_report(&report, TIMEOUT).map_err(|source| port(doing, source))?;
+        }
+        self.counters.commands += 1;
+        Ok(())
+    }
+
+    /// Waits for the reply to the last command. `explain` asks the controller why, when it refused.
+    fn receive(&mut self, doing: &str, explain: bool) -> Result<Vec<u8>, Dlpc900Error> {
+        let mut assembler = ReplyAssembler::default();
+        let mut report = [0; REPORT_BYTES];
+        let mut stale = 0;
+        // A reply has at most this many reports, and so many strays may come before it: the loop ends.
+        for _ in 0..MOST_STALE * MAX_REPLY_DATA.div_ceil(REPORT_BYTES) {
+            self.port.read_report(&mut report, TIMEOUT).map_err(|source| port(doing, source))?;
+            match assembler.push(&report) {
+                Ok(None) => {}
+                Ok(Some(reply)) if reply.sequence == self.sequence => {
+                    let (refused, data) = (reply.is_refused(), reply.data.to_vec());
+                    self.counters.replies += 1;
+                    return if refused && explain { Err(self.why_refused(doing)) } else { Ok(data) };
+                }
+                Ok(Some(_)) | Err(Malformed::Short(_) | Malformed::Length(_)) => {
+                    stale += 1;
+                    self.counters.stale += 1;
+                    if stale > MOST_STALE {
+                        break;
+                    }
+                }
+            }
+        }
+        Err(protocol(doing, format!("{stale} replies to other commands and none to this one")))
+    }
+
+    /// Asks for the last error's code and text.
+    fn why_refused(&mut self, doing: &str) -> Dlpc900Error {
+        match self.error_code() {
+            Ok(code) => self.refused(doing, code),
+            Err(e) => e,
+        }
+    }
+
+    fn refused(&mut self, doing: &str, code: u8) -> Dlpc900Error {
+        let text = self.error_text().unwrap_or_default();
+        let text = if text.is_empty() { error_meaning(code).to_owned() } else { text };
+        Dlpc900Error::Refused { doing: doing.to_owned(), code, text }
+    }
+
+    fn ask(&mut self, opcode: Opcode) -> Result<Vec<u8>, Dlpc900Error> {
+        let doing = opcode.to_string();
+        self.send(opcode, &[], true, true, &doing)?;
+        // No explanation: asking why the question about errors was refused would not end.
+        self.receive(&doing, false)
+    }
+
+    /// The code of the last error, 0 for none.
+    pub fn error_code(&mut self) -> Result<u8, Dlpc900Error> {
+        let data = self.ask(Opcode::ERROR_CODE)?;
+        data.first().copied().ok_or_else(|| short(Opcode::ERROR_CODE, &data, 1))
+    }
+
+    /// The last error in the controller's words.
+    pub fn error_text(&mut self) -> Result<String, Dlpc900Error> {
+        let data = self.ask(Opcode::ERROR_TEXT)?;
+        let text = data.split(|b| *b == 0).next().unwrap_or_default();
+        Ok(text.iter().filter(|b| b.is_ascii() && !b.is_ascii_control()).map(|b| char::from(*b)).collect())
+    }
+
+    fn byte(&mut self, opcode: Opcode) -> Result<u8, Dlpc900Error> {
+        let data = self.read(opcode, &[])?;
+        data.first().copied().ok_or_else(|| short(opcode, &data, 1))
+    }
+
+    /// One look at everything.
+    pub fn status(&mut self) -> Result<Status, Dlpc900Error> {
+        Ok(Status {
+            firmware: self.firmware,
+            dmd: self.dmd,
+            tag: self.tag.clone(),
+            mode: DisplayMode::from_byte(self.byte(Opcode::DISPLAY_MODE)?),
+            hardware: self.byte(Opcode::HARDWARE_STATUS)?,
+            system: self.byte(Opcode::SYSTEM_STATUS)?,
+            main: self.byte(Opcode::MAIN_STATUS)?,
+        })
+    }
+
+    /// Does `steps` in order and stops at the first that fails.
+    pub fn run(
+        &mut self,
+        steps: &[Step<'_>],
+        progress: &mut dyn FnMut(UploadProgress),
+    ) -> Result<(), Dlpc900Error> {
+        let size = |s: &Step<'_>| if let Step::Image { bytes, .. } = s { bytes.len() } else { 0 };
+        let total = steps.iter().map(size).sum();
+        let (mut sent, mut entry) = (0, 0);
+        for step in steps {
+            match step {
+                Step::Write(opcode, data) => {
+                    let mut doing = opcode.to_string();
+                    if *opcode == Opcode::LUT_DEFINITION {
+                        doing = format!("LUT entry {entry}: {doing}");
+                        entry += 1;
+                    }
+                    self.write_about(*opcode, data, doing)?;
+                }
+                Step::Image { secondary, index, bytes } => {
+                    self.image(*secondary, *index, bytes, &mut |n| {
+                        sent += n;
+                        progress(UploadProgress { sent, total });
+                    })?;
+                }
+                Step::Pause(time) => self.port.pause(*time),
+                Step::WaitLocked(time) => {
+                    if !self.wait(*time, |d| Ok(d.byte(Opcode::MAIN_STATUS)? & 8 != 0))? {
+                        return Err(Dlpc900Error::NotLocked(*time));
+                    }
+                }
+                Step::WaitReady(time) => {
+                    // While it wakes it may not answer at all.
+                    let ready =
+                        self.wait(*time, |d| Ok(d.byte(Opcode::HARDWARE_STATUS).is_ok_and(|s| s & 1 != 0)))?;
+                    if !ready {
+                        return Err(Dlpc900Error::Hardware(format!("nothing within {time:?} of waking")));
+                    }
+                }
+            }
+        }
+        Ok(())
+    }
+
+    /// Looks until `done` or until `most` has passed.
+    fn wait(
+        &mut self,
+        most: Duration,
+        done: impl Fn(&mut Self) -> Result<bool, Dlpc900Error>,
+    ) -> Result<bool, Dlpc900Error> {
+        let mut waited = Duration::ZERO;
+        loop {
+            if done(self)? {
+                return Ok(true);
+            }
+            if waited >= most {
+                return Ok(false);
+            }
+            self.port.pause(POLL);
+            waited += POLL;
+        }
+    }
+
+    fn image(
+        &mut self,
+        secondary: bool,
+        index: u16,
+        bytes: &[u8],
+        sent: &mut dyn FnMut(usize),
+    ) -> Result<(), Dlpc900Error> {
+        let (init, load) = if secondary {
+            (Opcode::BMP_INIT_SECONDARY, Opcode::BMP_DATA_SECONDARY)
+        } else {
+            (Opcode::BMP_INIT_PRIMARY, Opcode::BMP_DATA_PRIMARY)
+        };
+        let doing = format!("image {index}: {init}");
+        let (i, n) = (index.to_le_bytes(), (bytes.len() as u32).to_le_bytes());
+        self.write_about(init, &[i[0], i[1], n[0], n[1], n[2], n[3]], doing)?;
+        let doing = format!("image {index}: {load}");
+        let mut data = Vec::with_capacity(2 + MAX_BMP_BYTES);
+        for chunk in bytes.chunks(MAX_BMP_BYTES) {
+            data.clear();
+            data.extend_from_slice(&(chunk.len() as u16).to_le_bytes());
+            data.extend_from_slice(chunk);
+            // No acknowledgement: asking for one was seen to corrupt the decompression. The cable's own flow control paces us.
+            self.send(load, &data, false, false, &doing)?;
+            sent(chunk.len());
+        }
+        // The data were not acknowledged, so ask once how they were taken.
+        match self.error_code()? {
+            0 => Ok(()),
+            code => Err(self.refused(&doing, code)),
+        }
+    }
+
+    /// Uploads a sequence; it is then loaded and stopped.
+    pub fn upload(
+        &mut self,
+        sequence: &PatternSequence,
+        leds: LedSetup,
+        progress: &mut dyn FnMut(UploadProgress),
+    ) -> Result<(), Dlpc900Error> {
+        if sequence.dmd() != self.dmd {
+            let (made_for, found) = (sequence.dmd().name(), self.dmd.name());
+            return Err(SequenceError::OtherDmd { made_for, found }.into());
+        }
+        self.run(&sequence.upload(leds, self.firmware), progress)
+    }
+
+    /// Sets video patterns up and starts them.
+    pub fn start_video_patterns(&mut self, video: &VideoPatterns) -> Result<(), Dlpc900Error> {
+        let steps = video.steps(self.firmware).map_err(SequenceError::from)?;
+        self.run(&steps, &mut |_| ())?;
+        self.check_running()
+    }
+
+    /// Starts the loaded sequence and makes sure that it runs.
+    pub fn start(&mut self) -> Result<(), Dlpc900Error> {
+        self.run(&sequence::start(), &mut |_| ())?;
+        self.check_running()
+    }
+
+    fn check_running(&mut self) -> Result<(), Dlpc900Error> {
+        match self.status()?.complaint() {
+            Some(what) => Err(Dlpc900Error::Hardware(what)),
+            None => Ok(()),
+        }
+    }
+
+    /// Stops the sequence.
+    pub fn stop(&mut self) -> Result<(), Dlpc900Error> {
+        self.run(&sequence::stop(), &mut |_| ())
+    }
+
+    /// Pauses the sequence.
+    pub fn pause(&mut self) -> Result<(), Dlpc900Error> {
+        self.run(&sequence::pause(), &mut |_| ())
+    }
+
+    /// Mirrors into the 50/50 exercise, LEDs off.
+    pub fn idle(&mut self) -> Result<(), Dlpc900Error> {
+        let mode = DisplayMode::from_byte(self.byte(Opcode::DISPLAY_MODE)?).unwrap_or(DisplayMode::Video);
+        self.run(&sequence::idle(mode, self.firmware), &mut |_| ())
+    }
+
+    /// Out of the exercise after at least three seconds of it.
+    pub fn leave_idle(&mut self) -> Result<(), Dlpc900Error> {
+        // When it began is not known here: wait as if it were now.
+        self.run(&sequence::leave_idle(Duration::ZERO), &mut |_| ())
+    }
+
+    /// Parks the mirrors, LEDs off.
+    pub fn park(&mut self) -> Result<(), Dlpc900Error> {
+        self.run(&sequence::park(), &mut |_| ())
+    }
+
+    /// Frees the mirrors; the sequence must be uploaded again.
+    pub fn unpark(&mut self) -> Result<(), Dlpc900Error> {
+        self.run(&sequence::unpark(), &mut |_| ())
+    }
+
+    /// Into standby, as must happen before power is cut.
+    pub fn standby(&mut self) -> Result<(), Dlpc900Error> {
+        self.run(&sequence::standby(), &mut |_| ())
+    }
+
+    /// Out of standby.
+    pub fn wake(&mut self) -> Result<(), Dlpc900Error> {
+        self.run(&sequence::wake(self.firmware), &mut |_| ())
+    }
+}
+
+fn port(doing: &str, source: PortError) -> Dlpc900Error {
+    Dlpc900Error::Port { doing: doing.to_owned(), source }
+}
+
+fn protocol(doing: &str, what: impl ToString) -> Dlpc900Error {
+    Dlpc900Error::Protocol { doing: doing.to_owned(), what: what.to_string() }
+}
+
+fn short(opcode: Opcode, data: &[u8], wanted: usize) -> Dlpc900Error {
+    protocol(&opcode.to_string(), format!("{} bytes instead of at least {wanted}", data.len()))
+}

@@ -1,0 +1,163 @@
+//! The cable of a DLPC900: HID reports as interrupt transfers of libusb.
+
+use std::time::{Duration, Instant};
+
+use rusb::{Context, Device, DeviceHandle, Direction, TransferType, UsbContext};
+
+use super::command::REPORT_BYTES;
+use super::driver::{HidPort, PortError};
+
+/// USB vendor, Texas Instruments.
+pub const VENDOR: u16 = 0x0451;
+/// USB product, DLPC900.
+pub const PRODUCT: u16 = 0xc900;
+/// The udev rule that lets the user at the seat open the device.
+pub const UDEV_RULE: &str =
+    r#"SUBSYSTEM=="usb", ATTR{idVendor}=="0451", ATTR{idProduct}=="c900", TAG+="uaccess""#;
+/// Right after plugging in, the kernel may not be done with the interface.
+const CLAIM_PATIENCE: Duration = Duration::from_millis(500);
+
+/// Which of several controllers is meant: bus and address as `lsusb` prints them.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct UsbPlace {
+    /// Bus number.
+    pub bus: u8,
+    /// Device address.
+    pub address: u8,
+}
+
+/// An open DLPC900. Dropping it gives the interface back to the kernel's driver.
+pub struct UsbHid {
+    handle: DeviceHandle<Context>,
+    interface: u8,
+    endpoint_out: u8,
+    endpoint_in: u8,
+}
+
+impl std::fmt::Debug for UsbHid {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        f.debug_struct("UsbHid").field("interface", &self.interface).finish_non_exhaustive()
+    }
+}
+
+fn error(e: rusb::Error) -> PortError {
+    match e {
+        rusb::Error::Timeout => PortError::Timeout,
+        rusb::Error::NoDevice => PortError::Gone,
+        rusb::Error::NotFound => PortError::NotFound,
+        rusb::Error::Busy => PortError::Busy,
+        rusb::Error::Access => PortError::Denied(format!(
+            "put the line {UDEV_RULE} into /etc/udev/rules.d/70-dlpc900.rules, run `udevadm control --reload` and plug the device in again"
+        )),
+        other => PortError::Other(other.to_string()),
+    }
+}
+
+/// Where every DLPC900 is plugged in.
+pub fn list() -> Result<Vec<UsbPlace>, PortError> {
+    // Without any USB there is no context, and certainly no device.
+    let Ok(context) = Context::new() else { return Ok(Vec::new()) };
+    let devices = context.devices().map_err(error)?;
+    Ok(devices
+        .iter()
+        .filter(is_dlpc900)
+        .map(|d| UsbPlace { bus: d.bus_number(), address: d.address() })
+        .collect())
+}
+
+fn is_dlpc900(d: &Device<Context>) -> bool {
+    d.device_descriptor().is_ok_and(|d| (d.vendor_id(), d.product_id()) == (VENDOR, PRODUCT))
+}
+
+/// The interface to use with its endpoints: of the HID interfaces the one with the lowest number that has both.
+fn pick(device: &Device<Context>) -> Result<(u8, u8, u8), PortError> {
+    let configuration =
+        device.active_config_descriptor().or_else(|_| device.config_descriptor(0)).map_err(error)?;
+    let mut found: Option<(u8, u8, u8)> = None;
+    for interface in configuration.interfaces() {
+        for setting in interface.descriptors().filter(|s| s.class_code() == 3 && s.setting_number() == 0) {
+            let endpoint = |direction| {
+                let mut all = setting.endpoint_descriptors();
+                all.find(|e| e.transfer_type() == TransferType::Interrupt && e.direction() == direction)
+                    .map(|e| e.address())
+            };
+            if let (Some(o), Some(i)) = (endpoint(Direction::Out), endpoint(Direction::In)) {
+                if found.is_none_or(|f| interface.number() < f.0) {
+                    found = Some((interface.number(), o, i));
+                }
+            }
+        }
+    }
+    found.ok_or_else(|| {
+        PortError::Other("the device has no HID interface with two interrupt endpoints".into())
+    })
+}
+
+impl UsbHid {
+    /// Opens the DLPC900 at `place`, or the first one found. The kernel's HID driver is detached while it is open.
+    pub fn open(place: Option<UsbPlace>) -> Result<Self, PortError> {
+        let Ok(context) = Context::new() else { return Err(PortError::NotFound) };
+        let devices = context.devices().map_err(error)?;
+        let here =
+            |d: &Device<Context>| place.is_none_or(|p| (d.bus_number(), d.address()) == (p.bus, p.address));
+        let device = devices.iter().find(|d| is_dlpc900(d) && here(d)).ok_or(PortError::NotFound)?;
+        let (interface, endpoint_out, endpoint_in) = pick(&device)?;
+        let handle = device.open().map_err(error)?;
+        match handle.set_auto_detach_kernel_driver(true) {
+            // Systems without kernel drivers to detach need none detached.
+            Ok(()) | Err(rusb::Error::NotSupported) => {}
+            Err(e) => return Err(error(e)),
+        }
+        let start = Instant::now();
+        loop {
+            match handle.claim_interface(interface) {
+                Ok(()) => break,
+                Err(rusb::Error::NotFound) if start.elapsed() < CLAIM_PATIENCE => {
+                    std::thread::sleep(Duration::from_millis(10));
+                }
+                Err(e) => return Err(error(e)),
+            }
+        }
+        Ok(Self { handle, interface, endpoint_out, endpoint_in })
+    }
+}
+
+impl HidPort for UsbHid {
+    fn write_report(&mut self, report: &[u8; REPORT_BYTES], timeout: Duration) -> Result<(), PortError> {
+        let write = |h: &DeviceHandle<Context>, e| h.write_interrupt(e, report, timeout);
+        let sent = match write(&self.handle, self.endpoint_out) {
+            // A halted endpoint took nothing: clear it once and send again.
+            Err(rusb::Error::Pipe) => {
+                self.handle.clear_halt(self.endpoint_out).map_err(error)?;
+                write(&self.handle, self.endpoint_out)
+            }
+            other => other,
+        };
+        match sent.map_err(error)? {
+            REPORT_BYTES => Ok(()),
+            n => Err(PortError::Other(format!("only {n} of {REPORT_BYTES} bytes were taken"))),
+        }
+    }
+
+    fn read_report(&mut self, report: &mut [u8; REPORT_BYTES], timeout: Duration) -> Result<(), PortError> {
+        report.fill(0);
+        let n = match self.handle.read_interrupt(self.endpoint_in, report, timeout) {
+            Err(rusb::Error::Pipe) => {
+                self.handle.clear_halt(self.endpoint_in).map_err(error)?;
+                self.handle.read_interrupt(self.endpoint_in, report, timeout)
+            }
+            other => other,
+        };
+        match n.map_err(error)? {
+            0 => Err(PortError::Other("an empty report came in".into())),
+            _ => Ok(()),
+        }
+    }
+}
+
+impl Drop for UsbHid {
+    fn drop(&mut self) {
+        // Gives the interface back; a device that has gone has nothing to give back to.
+        let _ = self.handle.release_interface(self.interface);
+    }
+}
