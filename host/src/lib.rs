@@ -10,6 +10,7 @@ pub mod files;
 pub mod geometry;
 pub mod gpu;
 pub mod pack;
+pub mod realtime;
 pub mod reference;
 pub mod render;
 pub mod scene;

@@ -15,8 +15,9 @@ pub use bank::PoseFilterBank;
 pub use pose_filter::{PoseFilter, PoseFilterConfig, PoseFilterCounters, Prediction, Verdict};
 pub use state::{Freshness, PosePrediction, TrackState};
 
-/// Seeded normal deviates for tests and evaluations.
-pub mod testing {
+/// Seeded normal deviates for tests.
+#[cfg(test)]
+mod testing {
     use glam::DVec3;
 
     /// Normal deviates by Box and Muller over splitmix64.

@@ -7,6 +7,7 @@
 use super::imm::{Imm, ImmConfig, Kinematics, MotionModel, Rotations, Translations};
 use super::noise::NoiseEstimator;
 use super::state::{Freshness, PosePrediction, TrackState};
+use crate::config::PredictionConfig;
 use crate::geometry::se3::so3_between;
 use dpm_device::time::HostTime;
 use dpm_device::tracker::TrackerSample;
@@ -68,8 +69,8 @@ impl Default for PoseFilterConfig {
             position_noise_m: 1e-4,
             rotation_noise_rad: 1e-3,
             measure_noise: true,
-            position_models: models(1.0),
-            rotation_models: models(10.0),
+            position_models: models_for(5.0),
+            rotation_models: models_for(20.0),
             gate_sigmas: 6.0,
             max_speed_m_s: 20.0,
             max_acceleration_m_s2: 500.0,
@@ -81,27 +82,51 @@ impl Default for PoseFilterConfig {
     }
 }
 
-/// The models of hand-held and motor-driven objects, in units of `scale` metres: 1 for positions, 10 rad/m for rotations
-/// (what a point 0.1 m from the axis does).
-fn models(scale: f64) -> ImmConfig {
-    let s2 = scale * scale;
-    let third = 1.0 / 3.0;
+/// Models for bodies whose turns take about `acceleration` (m/s^2 or rad/s^2) and whose velocity changes in a good part of a
+/// second: coasting; steady acceleration; swinging at a hand's or a rocker's pace; and a sharp manoeuvre, which bridges
+/// the onset of a turn. The numbers were found by a random search over shuttles and swings of 1 to 3 Hz with 0.1 mm of noise at 500 Hz
+/// (the table in `docs/LATENCY.md`); densities scale with the square of the acceleration.
+pub fn models_for(acceleration: f64) -> ImmConfig {
+    let a2 = acceleration * acceleration;
+    let model = |accelerates, swing_rad_s, noise| MotionModel { accelerates, swing_rad_s, noise };
     ImmConfig {
         models: [
-            MotionModel { accelerates: false, swing_rad_s: 0.0, noise: 1e-6 * s2 },
-            MotionModel { accelerates: true, swing_rad_s: 0.0, noise: 1.0 * s2 },
-            MotionModel { accelerates: true, swing_rad_s: 10.0, noise: 1.0 * s2 },
-            MotionModel { accelerates: true, swing_rad_s: 0.0, noise: 3e4 * s2 },
+            model(false, 0.0, 1e-7 * a2),
+            model(true, 0.0, 0.012 * a2),
+            model(true, 10.0, 0.0017 * a2),
+            model(true, 0.0, 28.0 * a2),
         ],
-        dwell_s: [0.3, 0.3, 0.3, 0.02],
+        dwell_s: [1.0, 0.07, 1.0, 0.03],
         leave_to: [
-            [0.0, third, third, third],
-            [third, 0.0, third, third],
-            [third, third, 0.0, third],
-            [third, third, third, 0.0],
+            [0.0, 0.02, 0.94, 0.04],
+            [0.54, 0.0, 0.01, 0.45],
+            [0.24, 0.01, 0.0, 0.75],
+            [0.05, 0.8, 0.15, 0.0],
         ],
-        onset_acceleration: 10.0 * scale,
-        initial_velocity: 20.0 * scale,
+        onset_acceleration: 0.83 * acceleration,
+        initial_velocity: 4.0 * acceleration,
+    }
+}
+
+impl PoseFilterConfig {
+    /// The settings of a rig file: `[prediction]`, and `safety.predict_ms` as the time after which a body is lost.
+    pub fn from_rig(prediction: &PredictionConfig, predict_ms: u32) -> Self {
+        let lost_after_ns = i64::from(predict_ms) * 1_000_000;
+        let defaults = Self::default();
+        Self {
+            prediction: if prediction.on { Prediction::On } else { Prediction::Off },
+            position_noise_m: prediction.noise_m,
+            rotation_noise_rad: prediction.noise_rad,
+            position_models: models_for(prediction.acceleration),
+            rotation_models: models_for(prediction.angular_acceleration),
+            gate_sigmas: prediction.gate_sigma,
+            max_acceleration_m_s2: (100.0 * prediction.acceleration).max(defaults.max_acceleration_m_s2),
+            max_angular_acceleration_rad_s2: (100.0 * prediction.angular_acceleration)
+                .max(defaults.max_angular_acceleration_rad_s2),
+            tracked_for_ns: lost_after_ns / 2,
+            lost_after_ns,
+            ..defaults
+        }
     }
 }
 
@@ -424,3 +449,7 @@ fn check(sample: &TrackerSample) -> Result<Measured, Verdict> {
         rotation: DQuat::from_array(sample.pose.rotation_xyzw).normalize(),
     })
 }
+
+#[cfg(test)]
+#[path = "pose_filter_tests.rs"]
+mod tests;

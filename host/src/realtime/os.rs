@@ -1,0 +1,250 @@
+//! The system calls behind [`super`]: Linux only; elsewhere every right is refused with a reason.
+#![allow(unsafe_code)]
+
+use super::Refusal;
+
+/// Lines for `/etc/security/limits.d`, as shipped in `packaging/99-dpm-limits.conf`.
+const LIMITS_FILE: &str = "/etc/security/limits.d/99-dpm-limits.conf";
+
+#[cfg(target_os = "linux")]
+fn refusal(what: String, remedy: String) -> Refusal {
+    Refusal { what, reason: std::io::Error::last_os_error().to_string(), remedy }
+}
+
+#[cfg(target_os = "linux")]
+fn user() -> String {
+    std::env::var("USER").ok().filter(|u| !u.is_empty()).unwrap_or_else(|| "@dpm".into())
+}
+
+/// Cores this process may run on (taskset and container limits count), at least 1.
+pub fn usable_cores() -> usize {
+    std::thread::available_parallelism().map_or(1, usize::from)
+}
+
+/// Puts the calling thread under SCHED_FIFO with a priority from 1 to 99. Threads it makes later start under the normal
+/// scheduler, so that helpers do not inherit real-time rights by accident.
+#[cfg(target_os = "linux")]
+pub fn set_fifo_priority(priority: u32) -> Result<(), Refusal> {
+    let wanted = priority.clamp(1, 99);
+    // SAFETY: sched_param is plain integers, for which all zero bits are valid (musl has more fields than glibc).
+    let mut param: libc::sched_param = unsafe { std::mem::zeroed() };
+    param.sched_priority = wanted as libc::c_int;
+    // SAFETY: pid 0 is the calling thread; `param` outlives the call.
+    let rc = unsafe { libc::sched_setscheduler(0, libc::SCHED_FIFO | libc::SCHED_RESET_ON_FORK, &param) };
+    if rc == 0 {
+        return Ok(());
+    }
+    Err(refusal(
+        format!("SCHED_FIFO priority {wanted}"),
+        format!(
+            "put \"{} - rtprio {wanted}\" into {LIMITS_FILE} and log in again, or set LimitRTPRIO={wanted} in dpm.service",
+            user()
+        ),
+    ))
+}
+
+/// The SCHED_FIFO or SCHED_RR priority of the calling thread; 0 under the normal scheduler.
+#[cfg(target_os = "linux")]
+pub fn real_time_priority() -> u32 {
+    // SAFETY: as in `set_fifo_priority`.
+    let mut param: libc::sched_param = unsafe { std::mem::zeroed() };
+    // SAFETY: pid 0 is the calling thread; `param` is written during the call only.
+    let (policy, rc) = unsafe { (libc::sched_getscheduler(0), libc::sched_getparam(0, &mut param)) };
+    let real_time = [libc::SCHED_FIFO, libc::SCHED_RR].contains(&(policy & !libc::SCHED_RESET_ON_FORK));
+    if rc == 0 && real_time {
+        param.sched_priority.unsigned_abs()
+    } else {
+        0
+    }
+}
+
+/// Binds the calling thread to one core.
+#[cfg(target_os = "linux")]
+pub fn pin_to_core(core: u32) -> Result<(), Refusal> {
+    let what = format!("core {core}");
+    let limit = libc::CPU_SETSIZE as u32;
+    if core >= limit {
+        return Err(Refusal {
+            what,
+            reason: format!("the kernel's set holds {limit} cores"),
+            remedy: "set real_time.affinity to cores that exist".into(),
+        });
+    }
+    // SAFETY: cpu_set_t is a bit array, for which all zero bits are valid; `core` is inside it.
+    let rc = unsafe {
+        let mut set: libc::cpu_set_t = std::mem::zeroed();
+        libc::CPU_SET(core as usize, &mut set);
+        libc::sched_setaffinity(0, std::mem::size_of_val(&set), &set)
+    };
+    if rc == 0 {
+        return Ok(());
+    }
+    Err(refusal(
+        what,
+        format!(
+            "set real_time.affinity to cores among those in /proc/thread-self/status, Cpus_allowed_list ({})",
+            allowed_cores()
+        ),
+    ))
+}
+
+#[cfg(target_os = "linux")]
+fn allowed_cores() -> String {
+    let status = std::fs::read_to_string("/proc/thread-self/status").unwrap_or_default();
+    let line = status.lines().find_map(|l| l.strip_prefix("Cpus_allowed_list:"));
+    line.map_or_else(|| "unknown".into(), |l| l.trim().to_owned())
+}
+
+/// Keeps all pages of the process resident, those mapped later included, so that no page fault delays a frame.
+#[cfg(target_os = "linux")]
+pub fn lock_memory() -> Result<(), Refusal> {
+    // With a finite limit MCL_FUTURE would make later allocations fail instead of this call, far from the cause.
+    // SAFETY: `limit` is two integers and written during the call only.
+    let limit = unsafe {
+        let mut limit: libc::rlimit = std::mem::zeroed();
+        libc::getrlimit(libc::RLIMIT_MEMLOCK, &mut limit);
+        limit.rlim_cur
+    };
+    let remedy = || {
+        format!("put \"{} - memlock unlimited\" into {LIMITS_FILE} and log in again, or set LimitMEMLOCK=infinity in dpm.service", user())
+    };
+    // SAFETY: takes no pointers.
+    if limit != libc::RLIM_INFINITY && unsafe { libc::geteuid() } != 0 {
+        return Err(Refusal {
+            what: "locking memory".into(),
+            reason: format!("the limit is {} KiB", limit / 1024),
+            remedy: remedy(),
+        });
+    }
+    // SAFETY: takes no pointers; only changes residency.
+    if unsafe { libc::mlockall(libc::MCL_CURRENT | libc::MCL_FUTURE) } == 0 {
+        return Ok(());
+    }
+    Err(refusal("locking memory".into(), remedy()))
+}
+
+/// Undoes [`lock_memory`].
+#[cfg(target_os = "linux")]
+pub fn unlock_memory() {
+    // SAFETY: takes no pointers; only changes residency.
+    unsafe { libc::munlockall() };
+}
+
+/// Lets sleeps of the calling thread end this many nanoseconds late at most, as far as the kernel batches timers.
+#[cfg(target_os = "linux")]
+pub fn set_timer_slack_ns(slack_ns: u64) -> Result<(), Refusal> {
+    // SAFETY: PR_SET_TIMERSLACK takes one integer.
+    if unsafe { libc::prctl(libc::PR_SET_TIMERSLACK, slack_ns as libc::c_ulong, 0, 0, 0) } == 0 {
+        return Ok(());
+    }
+    Err(refusal(
+        "a shorter timer slack".into(),
+        "sleeps may end 50 us late; allow prctl in the sandbox".into(),
+    ))
+}
+
+/// Nanoseconds of processor time the calling thread has used.
+#[cfg(target_os = "linux")]
+pub fn thread_cpu_ns() -> i64 {
+    let mut t = libc::timespec { tv_sec: 0, tv_nsec: 0 };
+    // SAFETY: `t` is written during the call only.
+    unsafe { libc::clock_gettime(libc::CLOCK_THREAD_CPUTIME_ID, &mut t) };
+    #[allow(clippy::unnecessary_cast)] // 32 bits on some targets
+    let ns = t.tv_sec as i64 * 1_000_000_000 + t.tv_nsec as i64;
+    ns
+}
+
+#[cfg(not(target_os = "linux"))]
+mod elsewhere {
+    use super::Refusal;
+
+    fn not_here(what: &str) -> Refusal {
+        Refusal {
+            what: what.into(),
+            reason: "not implemented for this system".into(),
+            remedy: "run on Linux, or set it to off in [real_time]".into(),
+        }
+    }
+
+    /// Refused.
+    pub fn set_fifo_priority(_priority: u32) -> Result<(), Refusal> {
+        Err(not_here("real-time priority"))
+    }
+    /// Always the normal scheduler.
+    pub fn real_time_priority() -> u32 {
+        0
+    }
+    /// Refused.
+    pub fn pin_to_core(_core: u32) -> Result<(), Refusal> {
+        Err(not_here("binding to a core"))
+    }
+    /// Refused.
+    pub fn lock_memory() -> Result<(), Refusal> {
+        Err(not_here("locking memory"))
+    }
+    /// Nothing to undo.
+    pub fn unlock_memory() {}
+    /// Refused.
+    pub fn set_timer_slack_ns(_slack_ns: u64) -> Result<(), Refusal> {
+        Err(not_here("a shorter timer slack"))
+    }
+    /// Unknown.
+    pub fn thread_cpu_ns() -> i64 {
+        0
+    }
+}
+#[cfg(not(target_os = "linux"))]
+pub use elsewhere::*;
+
+#[cfg(all(test, target_os = "linux"))]
+mod tests {
+    use super::*;
+
+    /// On a thread of its own: rights stay with the thread.
+    fn apart<R: Send + 'static>(f: impl FnOnce() -> R + Send + 'static) -> R {
+        std::thread::spawn(f).join().unwrap()
+    }
+
+    #[test]
+    fn priority_is_granted_or_refused_with_the_limit_to_set() {
+        apart(|| match set_fifo_priority(10) {
+            Ok(()) => assert_eq!(real_time_priority(), 10),
+            Err(refusal) => {
+                assert_eq!(real_time_priority(), 0);
+                let text = refusal.to_string();
+                assert!(text.contains("rtprio 10") && text.contains("LimitRTPRIO=10"), "{text}");
+            }
+        });
+    }
+
+    #[test]
+    fn pinning_works_for_an_allowed_core_and_names_the_allowed_ones() {
+        apart(|| {
+            let allowed = allowed_cores();
+            let first: u32 = allowed.split(['-', ',']).next().unwrap().parse().unwrap();
+            pin_to_core(first).unwrap();
+            assert_eq!(allowed_cores(), first.to_string());
+            assert_eq!(usable_cores(), 1);
+            let absent = pin_to_core(1023).unwrap_err().to_string();
+            assert!(absent.contains("core 1023") && absent.contains("real_time.affinity"), "{absent}");
+            assert!(pin_to_core(1 << 20).is_err());
+        });
+    }
+
+    #[test]
+    fn slack_shortens_sleeps_and_cpu_time_counts_work_only() {
+        apart(|| {
+            set_timer_slack_ns(1).unwrap();
+            let before = thread_cpu_ns();
+            std::thread::sleep(std::time::Duration::from_millis(20));
+            let slept = thread_cpu_ns() - before;
+            assert!(slept < 10_000_000, "sleeping used {slept} ns of processor time");
+            let mut x = 1u64;
+            let before = thread_cpu_ns();
+            while thread_cpu_ns() - before < 2_000_000 {
+                x = std::hint::black_box(x.wrapping_mul(3));
+            }
+            assert_ne!(x, 0);
+        });
+    }
+}
