@@ -190,8 +190,8 @@ pub fn prediction_cases() -> Vec<PredictionCase> {
         turn(
             "100 rad/s",
             MotionSpec::Rotate { axis: up, rate_rad_s: 100.0, pivot_offset_m: [0.0; 3] },
-            1.2,
-            1e-4,
+            1.6,
+            1e-3,
         ),
         turn(
             "sway, 3 rad/s and 20 rad/s2 at its peaks",
