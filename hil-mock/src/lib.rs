@@ -13,3 +13,5 @@ pub mod rng;
 pub mod tracker;
 pub mod usb_model;
 pub mod usb_plug;
+pub mod vrpn_host;
+pub mod vrpn_server;

@@ -4,6 +4,7 @@ mod gate;
 pub mod natnet;
 #[cfg(feature = "net")]
 pub mod udp;
+pub mod vrpn;
 
 pub use gate::{PacketCounters, SampleCounters, SampleGate, TrackerCounters};
 

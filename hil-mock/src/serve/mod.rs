@@ -2,6 +2,7 @@
 
 mod bodies;
 mod natnet;
+mod vrpn;
 
 use clap::Subcommand;
 use std::error::Error;
@@ -11,11 +12,14 @@ use std::error::Error;
 pub enum Device {
     /// OptiTrack NatNet server: poses over UDP
     Natnet(natnet::NatNetArguments),
+    /// VRPN server: poses over TCP
+    Vrpn(vrpn::VrpnArguments),
 }
 
 /// Runs `device` until it is stopped or fails.
 pub fn run(device: Device) -> Result<(), Box<dyn Error>> {
     match device {
         Device::Natnet(arguments) => natnet::run(&arguments),
+        Device::Vrpn(arguments) => vrpn::run(&arguments),
     }
 }

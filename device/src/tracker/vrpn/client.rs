@@ -1,0 +1,522 @@
+//! The conversation with a VRPN server: connecting, descriptions, clock by ping, poses into samples, all inside
+//! [`Tracker::poll`], which never waits.
+
+use super::wire::{self, system, type_name, Message, COOKIE, COOKIE_BYTES};
+use crate::clock_map::{ClockMap, ExchangeOutcome};
+use crate::time::{DeviceTicks, HostClock, HostTime};
+use crate::tracker::{BodyIndex, BodyKey, SampleGate, Tracker, TrackerCounters, TrackerError, TrackerSample};
+use std::io::{ErrorKind, Read, Write};
+use std::net::{SocketAddr, TcpStream, ToSocketAddrs};
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::sync::mpsc::{Receiver, TryRecvError};
+use std::sync::Arc;
+use std::time::Duration;
+
+const MS: i64 = 1_000_000;
+/// Bytes read in one poll, and room for what is not a whole message yet.
+const BUFFER_BYTES: usize = 64 * 1024;
+/// Between two attempts to connect.
+const RETRY_EVERY_NS: i64 = 500 * MS;
+/// An attempt to connect takes no longer than this.
+const CONNECT_TIMEOUT: Duration = Duration::from_millis(1000);
+/// A server from which nothing came for this long, pings unanswered, is left and connected to anew.
+const SILENCE_NS: i64 = 3_000 * MS;
+/// Pings: this many quickly, the rest slowly.
+const QUICK_PINGS: u32 = 20;
+const QUICK_PING_EVERY_NS: i64 = 10 * MS;
+const PING_EVERY_NS: i64 = 200 * MS;
+/// Senders and types remembered; numbers above are ignored.
+const MAX_NUMBERS: usize = 256;
+/// Without pongs: length of the buckets in which the shortest delay is sought.
+const ONE_WAY_BUCKET_NS: i64 = 2_000 * MS;
+
+/// How to reach a VRPN server.
+#[derive(Clone, Debug)]
+pub struct VrpnConfig {
+    /// `host` or `host:port`; the port is 3883 by convention.
+    pub server: String,
+    /// Name of a tracker whose sensors are the rig's bodies: a body's `id` is its sensor, its place in `bodies` where it has none.
+    /// Trackers named like a body are understood as well, as Motive and Vicon name them.
+    pub tracker: String,
+    /// The rig's bodies.
+    pub bodies: Vec<BodyKey>,
+}
+
+/// What a sender's number stands for.
+#[derive(Clone, Copy, PartialEq)]
+enum Sender {
+    Unknown,
+    /// The configured tracker: sensors are bodies.
+    Tracker,
+    /// A tracker named like this body.
+    Body(BodyIndex),
+}
+
+/// What a type's number stands for.
+#[derive(Clone, Copy, PartialEq)]
+enum Kind {
+    Unknown,
+    PosQuat,
+    Pong,
+}
+
+enum State {
+    /// Waiting for the next attempt.
+    Idle { retry_at: HostTime },
+    /// A helper thread connects.
+    Connecting(Receiver<std::io::Result<TcpStream>>),
+    /// Connected; the cookie may still be missing.
+    Open { stream: TcpStream, greeted: bool, heard_at: HostTime },
+}
+
+/// A VRPN client for a fixed set of bodies.
+pub struct VrpnClient {
+    config: VrpnConfig,
+    clock: Arc<dyn HostClock>,
+    state: State,
+    abandoned: Arc<AtomicBool>,
+    gate: SampleGate,
+    senders: Vec<Sender>,
+    kinds: Vec<Kind>,
+    names_seen: Vec<String>,
+    buffer: Vec<u8>,
+    filled: usize,
+    out: Vec<u8>,
+    map: ClockMap,
+    one_way: OneWay,
+    /// Our number of a name that the server has.
+    ping_as: Option<i32>,
+    ping_sent: Option<HostTime>,
+    ping_due: HostTime,
+    pings: u32,
+    pongs: u64,
+    problem: Option<String>,
+    connections: u64,
+}
+
+/// The shortest arrival delay of the last seconds: what is left when nobody answers pings.
+#[derive(Clone, Copy)]
+struct OneWay {
+    bucket_ends: HostTime,
+    this: i64,
+    before: i64,
+}
+
+impl OneWay {
+    const EMPTY: Self = Self { bucket_ends: HostTime(i64::MIN), this: i64::MAX, before: i64::MAX };
+
+    /// Host minus device time, ns, too large by the shortest way through the network.
+    fn note(&mut self, at: HostTime, device_ns: i64) -> i64 {
+        if at >= self.bucket_ends {
+            self.before = if self.bucket_ends == HostTime(i64::MIN) { i64::MAX } else { self.this };
+            self.this = i64::MAX;
+            self.bucket_ends = at.plus_ns(ONE_WAY_BUCKET_NS);
+        }
+        self.this = self.this.min(at.0.saturating_sub(device_ns));
+        self.this.min(self.before)
+    }
+}
+
+impl VrpnClient {
+    /// A client that connects when polled. `clock` is the host's clock, the one `poll` is called with.
+    pub fn open(config: VrpnConfig, clock: Arc<dyn HostClock>) -> Result<Self, TrackerError> {
+        if config.server.is_empty() {
+            return Err(TrackerError::Protocol("VRPN: the server's address is empty".into()));
+        }
+        Ok(Self {
+            gate: SampleGate::new(config.bodies.len()),
+            config,
+            clock,
+            state: State::Idle { retry_at: HostTime(i64::MIN) },
+            abandoned: Arc::new(AtomicBool::new(false)),
+            senders: vec![Sender::Unknown; MAX_NUMBERS],
+            kinds: vec![Kind::Unknown; MAX_NUMBERS],
+            names_seen: Vec::new(),
+            buffer: vec![0; BUFFER_BYTES],
+            filled: 0,
+            out: Vec::with_capacity(1024),
+            map: ClockMap::new(1_000_000).expect("a microsecond clock"),
+            one_way: OneWay::EMPTY,
+            ping_as: None,
+            ping_sent: None,
+            ping_due: HostTime(i64::MIN),
+            pings: 0,
+            pongs: 0,
+            problem: None,
+            connections: 0,
+        })
+    }
+
+    /// What became of all that arrived.
+    pub fn counters(&self) -> &TrackerCounters {
+        self.gate.counters()
+    }
+
+    /// True while a greeted connection stands.
+    pub fn is_connected(&self) -> bool {
+        matches!(self.state, State::Open { greeted: true, .. })
+    }
+
+    /// The map of the server's clock, once a ping was answered.
+    pub fn clock_map(&self) -> Option<&ClockMap> {
+        self.map.is_ready().then_some(&self.map)
+    }
+
+    fn start_connecting(&self) -> State {
+        let (send, receive) = std::sync::mpsc::sync_channel(1);
+        let server = self.config.server.clone();
+        let abandoned = self.abandoned.clone();
+        // Name look-up and connecting wait without bound on their own terms, so they do it elsewhere; one attempt at a time.
+        let spawned = std::thread::Builder::new().name("vrpn-connect".into()).spawn(move || {
+            let result = connect(&server);
+            if !abandoned.load(Ordering::Relaxed) {
+                let _ = send.send(result);
+            }
+        });
+        match spawned {
+            Ok(_) => State::Connecting(receive),
+            Err(_) => State::Idle { retry_at: self.clock.now().plus_ns(RETRY_EVERY_NS) },
+        }
+    }
+
+    fn begin(&mut self, stream: TcpStream, now: HostTime) -> std::io::Result<()> {
+        stream.set_nonblocking(true)?;
+        stream.set_nodelay(true)?;
+        self.filled = 0;
+        self.senders.fill(Sender::Unknown);
+        self.kinds.fill(Kind::Unknown);
+        self.names_seen.clear();
+        self.map = ClockMap::new(1_000_000).expect("a microsecond clock");
+        self.one_way = OneWay::EMPTY;
+        self.ping_as = None;
+        (self.ping_sent, self.ping_due, self.pings) = (None, now, 0);
+        self.connections += 1;
+        self.out.clear();
+        self.out.extend_from_slice(&COOKIE);
+        // Our numbers: sender 0 is the tracker, 1 and on the bodies, type 0 the ping. A server answers pings to a name it has.
+        let bodies = self.config.bodies.iter().map(|b| b.name.as_str()).take(MAX_NUMBERS - 1);
+        for (number, name) in (0..).zip(std::iter::once(self.config.tracker.as_str()).chain(bodies)) {
+            wire::put_description(&mut self.out, system::SENDER, number, name);
+        }
+        wire::put_description(&mut self.out, system::TYPE, 0, type_name::PING);
+        (&stream).write_all(&self.out)?;
+        self.state = State::Open { stream, greeted: false, heard_at: now };
+        Ok(())
+    }
+
+    fn lose(&mut self, now: HostTime, why: String) {
+        self.problem = Some(why);
+        self.state = State::Idle { retry_at: now.plus_ns(RETRY_EVERY_NS) };
+    }
+
+    fn ping(&mut self, now: HostTime) -> std::io::Result<()> {
+        let (State::Open { stream, greeted: true, .. }, Some(sender)) = (&self.state, self.ping_as) else {
+            return Ok(());
+        };
+        // One at a time, so that each pong is the answer to one ping; a lost one is given up after a second.
+        let waiting = self.ping_sent.is_some_and(|t| now.ns_since(t) < 1_000 * MS);
+        if waiting || now < self.ping_due {
+            return Ok(());
+        }
+        let quick = self.pings < QUICK_PINGS;
+        self.ping_due = now.plus_ns(if quick { QUICK_PING_EVERY_NS } else { PING_EVERY_NS });
+        self.pings = self.pings.saturating_add(1);
+        self.out.clear();
+        let message =
+            Message { seconds: 0, microseconds: 0, sender, kind: 0, sequence: self.pings, payload: &[] };
+        wire::put(&mut self.out, &message);
+        let mut stream = stream;
+        self.ping_sent = Some(self.clock.now());
+        stream.write_all(&self.out)
+    }
+
+    /// Reads what is there, at most one buffer full; returns whether the other side is still there.
+    fn fill(&mut self, now: HostTime) -> std::io::Result<bool> {
+        let State::Open { stream, heard_at, .. } = &mut self.state else { return Ok(true) };
+        while self.filled < self.buffer.len() {
+            match stream.read(&mut self.buffer[self.filled..]) {
+                Ok(0) => return Ok(false),
+                Ok(n) => {
+                    self.filled += n;
+                    *heard_at = now;
+                }
+                Err(e) if e.kind() == ErrorKind::WouldBlock => break,
+                Err(e) if e.kind() == ErrorKind::Interrupted => {}
+                Err(e) => return Err(e),
+            }
+        }
+        Ok(true)
+    }
+
+    /// Handles all whole messages of the buffer.
+    fn digest(
+        &mut self,
+        at: HostTime,
+        sink: &mut dyn FnMut(&TrackerSample),
+    ) -> Result<usize, wire::VrpnError> {
+        let mut start = 0;
+        if let State::Open { greeted: greeted @ false, .. } = &mut self.state {
+            let Some(cookie) = self.buffer[..self.filled].first_chunk::<COOKIE_BYTES>() else { return Ok(0) };
+            wire::check_cookie(cookie)?;
+            *greeted = true;
+            self.problem = None;
+            start = COOKIE_BYTES;
+        }
+        let buffer = std::mem::take(&mut self.buffer);
+        let mut delivered = 0;
+        let result = loop {
+            match wire::split(&buffer[start..self.filled]) {
+                Ok(Some((message, used))) => {
+                    delivered += self.handle(&message, at, sink);
+                    start += used;
+                }
+                Ok(None) => break Ok(()),
+                Err(error) => {
+                    let packets = self.gate.packets_mut();
+                    packets.received += 1;
+                    packets.malformed += 1;
+                    break Err(error);
+                }
+            }
+        };
+        self.buffer = buffer;
+        self.buffer.copy_within(start..self.filled, 0);
+        self.filled -= start;
+        result.map(|()| delivered)
+    }
+
+    fn handle(&mut self, message: &Message<'_>, at: HostTime, sink: &mut dyn FnMut(&TrackerSample)) -> usize {
+        self.gate.packets_mut().received += 1;
+        let mut delivered = 0;
+        let used = match message.kind {
+            system::SENDER | system::TYPE => self.learn(message),
+            system::UDP | system::LOG | system::DISCONNECT => Ok(true),
+            kind => match usize::try_from(kind).ok().and_then(|k| self.kinds.get(k)).copied() {
+                Some(Kind::PosQuat) => match wire::decode_pos_quat(message.payload) {
+                    Ok((sensor, pose)) => {
+                        let captured_at = self.captured_at(message, at);
+                        let sample = TrackerSample {
+                            body: BodyIndex(u16::MAX),
+                            pose,
+                            tracked: true,
+                            mean_error_m: 0.0,
+                            // VRPN does not number the samples of a sensor.
+                            sequence: 0,
+                            captured_at,
+                            received_at: at,
+                        };
+                        delivered = self.deliver(message.sender, sensor, sample, sink);
+                        Ok(true)
+                    }
+                    Err(e) => Err(e),
+                },
+                Some(Kind::Pong) => {
+                    self.on_pong(message, at);
+                    Ok(true)
+                }
+                _ => Ok(false),
+            },
+        };
+        let packets = self.gate.packets_mut();
+        match used {
+            Ok(true) => packets.used += 1,
+            Ok(false) => packets.unsupported += 1,
+            Err(_) => packets.malformed += 1,
+        }
+        delivered
+    }
+
+    fn deliver(
+        &mut self,
+        sender: i32,
+        sensor: i32,
+        sample: TrackerSample,
+        sink: &mut dyn FnMut(&TrackerSample),
+    ) -> usize {
+        let sender = usize::try_from(sender).ok().and_then(|s| self.senders.get(s)).copied();
+        let body = match sender {
+            Some(Sender::Body(body)) => Some(body),
+            Some(Sender::Tracker) => {
+                let by_place = |i: usize, b: &BodyKey| b.id.unwrap_or(i as i64) == i64::from(sensor);
+                let place = self.config.bodies.iter().enumerate().position(|(i, b)| by_place(i, b));
+                place.map(|i| BodyIndex(i as u16))
+            }
+            _ => None,
+        };
+        let Some(body) = body else {
+            self.gate.count_unknown();
+            return 0;
+        };
+        match self.gate.admit(&TrackerSample { body, ..sample }) {
+            Some(sample) => {
+                sink(&sample);
+                1
+            }
+            None => 0,
+        }
+    }
+
+    /// Takes in a description.
+    fn learn(&mut self, message: &Message<'_>) -> Result<bool, wire::VrpnError> {
+        let name = wire::described_name(message.payload)?;
+        let Some(number) = usize::try_from(message.sender).ok().filter(|n| *n < MAX_NUMBERS) else {
+            return Ok(false);
+        };
+        if message.kind == system::TYPE {
+            self.kinds[number] = match name {
+                n if n == type_name::POS_QUAT.as_bytes() => Kind::PosQuat,
+                n if n == type_name::PONG.as_bytes() => Kind::Pong,
+                _ => Kind::Unknown,
+            };
+            return Ok(true);
+        }
+        let body = self.config.bodies.iter().position(|b| b.name.as_bytes() == name);
+        self.senders[number] = match body {
+            _ if name == self.config.tracker.as_bytes() => Sender::Tracker,
+            Some(i) => Sender::Body(BodyIndex(i as u16)),
+            None => Sender::Unknown,
+        };
+        match self.senders[number] {
+            Sender::Tracker => self.ping_as = Some(0),
+            Sender::Body(body) if self.ping_as.is_none() => self.ping_as = Some(i32::from(body.0) + 1),
+            _ => {}
+        }
+        if self.names_seen.len() < 32 {
+            self.names_seen.push(String::from_utf8_lossy(name).into_owned());
+        }
+        Ok(true)
+    }
+
+    fn on_pong(&mut self, message: &Message<'_>, at: HostTime) {
+        let Some(t1) = self.ping_sent.take() else { return };
+        self.pongs += 1;
+        // A server that does not stamp its pongs cannot be timed by them.
+        if message.stamp_us() == 0 {
+            return;
+        }
+        let ticks = DeviceTicks(message.stamp_us());
+        if matches!(
+            self.map.add_exchange(t1, ticks, ticks, at),
+            ExchangeOutcome::Stepped | ExchangeOutcome::Contradicting
+        ) {
+            (self.pings, self.ping_due) = (0, at);
+        }
+    }
+
+    /// The server's stamp on the host's clock: by pongs where it answers them, otherwise by the shortest delay seen.
+    fn captured_at(&mut self, message: &Message<'_>, at: HostTime) -> HostTime {
+        let stamp = message.stamp_us();
+        if stamp == 0 {
+            return at;
+        }
+        if let Some(mapped) = self.map.to_host(DeviceTicks(stamp)) {
+            if at.ns_since(mapped.at) < 1_000 * MS {
+                return mapped.at.min(at);
+            }
+        }
+        let device_ns = i64::try_from(stamp.saturating_mul(1000)).unwrap_or(i64::MAX);
+        let offset = self.one_way.note(at, device_ns);
+        HostTime(device_ns.saturating_add(offset)).min(at)
+    }
+
+    fn converse(&mut self, now: HostTime, sink: &mut dyn FnMut(&TrackerSample)) -> usize {
+        let State::Open { heard_at, .. } = &self.state else { return 0 };
+        if now.ns_since(*heard_at) > SILENCE_NS {
+            self.lose(now, "the server fell silent".into());
+            return 0;
+        }
+        let alive = self.fill(now);
+        let at = self.clock.now();
+        let delivered = match self.digest(at, sink) {
+            Ok(n) => n,
+            Err(error) => {
+                self.lose(now, error.to_string());
+                return 0;
+            }
+        };
+        let pinged = self.ping(at);
+        match alive.and_then(|alive| pinged.map(|()| alive)) {
+            Ok(true) => {}
+            Ok(false) => self.lose(now, "the server closed the connection".into()),
+            Err(error) => self.lose(now, error.to_string()),
+        }
+        delivered
+    }
+}
+
+fn connect(server: &str) -> std::io::Result<TcpStream> {
+    let text = server.trim_start_matches("tcp://");
+    let addresses: Vec<SocketAddr> = match text.to_socket_addrs() {
+        Ok(found) => found.collect(),
+        Err(_) => (text, wire::PORT).to_socket_addrs()?.collect(),
+    };
+    let mut last = std::io::Error::new(ErrorKind::NotFound, "no address");
+    for address in addresses.iter().take(4) {
+        match TcpStream::connect_timeout(address, CONNECT_TIMEOUT) {
+            Ok(stream) => return Ok(stream),
+            Err(e) => last = e,
+        }
+    }
+    Err(last)
+}
+
+impl Tracker for VrpnClient {
+    fn poll(&mut self, now: HostTime, sink: &mut dyn FnMut(&TrackerSample)) -> Result<usize, TrackerError> {
+        match &self.state {
+            State::Idle { retry_at } if now >= *retry_at => self.state = self.start_connecting(),
+            State::Idle { .. } => {}
+            State::Connecting(result) => match result.try_recv() {
+                Ok(Ok(stream)) => {
+                    if let Err(error) = self.begin(stream, now) {
+                        self.lose(now, error.to_string());
+                    }
+                }
+                Ok(Err(error)) => {
+                    self.lose(now, format!("cannot connect to {}: {error}", self.config.server))
+                }
+                Err(TryRecvError::Empty) => {}
+                Err(TryRecvError::Disconnected) => self.lose(now, "the connecting thread ended".into()),
+            },
+            State::Open { .. } => return Ok(self.converse(now, sink)),
+        }
+        Ok(0)
+    }
+
+    fn name(&self) -> &str {
+        "vrpn"
+    }
+
+    fn status(&self) -> String {
+        let c = self.gate.counters();
+        let mut text = match &self.state {
+            State::Open { greeted: true, .. } => format!("connected to {}", self.config.server),
+            State::Open { .. } => {
+                format!("{} accepted but did not greet: is it a VRPN server?", self.config.server)
+            }
+            _ => format!("not connected to {}", self.config.server),
+        };
+        if let Some(problem) = &self.problem {
+            text.push_str(&format!("; {problem}"));
+        }
+        if self.is_connected() && c.samples.used == 0 {
+            let wanted = &self.config.tracker;
+            text.push_str(&format!(
+                "; no pose for tracker {wanted:?} or the rig's bodies; the server's devices are {:?}",
+                self.names_seen
+            ));
+        }
+        text.push_str(match (self.map.is_ready(), self.is_connected()) {
+            (true, _) => "; clock by pings",
+            (false, true) => "; pings unanswered: clock by the shortest delay seen",
+            _ => "",
+        });
+        text.push_str(&format!("; connections {}, pongs {}, {c}", self.connections, self.pongs));
+        text
+    }
+}
+
+impl Drop for VrpnClient {
+    fn drop(&mut self) {
+        self.abandoned.store(true, Ordering::Relaxed);
+    }
+}
