@@ -1,4 +1,12 @@
-//! Space in f64: rigid motions (SE(3)) and cameras.
+//! Space in f64: rigid motions (SE(3)), cameras and their calibration.
 
+pub mod calibration;
+pub mod distortion;
+pub mod opencv;
 pub mod projector;
+mod refine;
 pub mod se3;
+mod svd;
+
+#[cfg(test)]
+mod calibration_tests;
