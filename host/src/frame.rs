@@ -1,0 +1,60 @@
+//! A frame's identity and the stamps that travel with it from motion to light.
+//!
+//! At real pace the stamps are readings of the host's clock. At virtual pace they are the rig's clock, advanced by the modelled cost
+//! of each stage, so that a run repeats bit for bit; what the stages really took is kept apart in [`FrameTimeline::wall_ns`].
+
+use dpm_device::time::HostTime;
+
+/// Number of a frame since the start of the run. Never reused; the link carries the low 32 bits.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, PartialOrd, Ord, Hash)]
+pub struct FrameId(pub u64);
+
+/// The stages whose wall time is kept, in the order in which a frame passes them.
+pub const STAGES: [&str; 5] = ["plan", "render", "pack", "link", "light"];
+/// Index of a stage in [`STAGES`].
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+#[repr(usize)]
+pub enum Stage {
+    /// Poses latched and predicted, uniforms written.
+    Plan = 0,
+    /// Submission to the fence.
+    Render = 1,
+    /// Code values to bit planes.
+    Pack = 2,
+    /// Bit planes to the transport.
+    Link = 3,
+    /// The mock projector's own work (receiving, checking, integrating); not part of a real rig.
+    Light = 4,
+}
+
+/// One stamp per boundary, host's clock, in the order in which they happen.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub struct FrameTimeline {
+    /// Mid-exposure of the newest tracker sample that the frame used; the oldest among its bodies.
+    pub captured_at: HostTime,
+    /// When that sample reached the process.
+    pub received_at: HostTime,
+    /// When the poses were latched.
+    pub latched_at: HostTime,
+    /// When the GPU was started.
+    pub submitted_at: HostTime,
+    /// When the code values were there.
+    pub rendered_at: HostTime,
+    /// When the bit planes were there.
+    pub packed_at: HostTime,
+    /// When the transport had taken them.
+    pub sent_at: HostTime,
+    /// When the frame's slot was due to start.
+    pub due_at: HostTime,
+    /// First photon, as the device reports it; `None` until lit.
+    pub lit_at: Option<HostTime>,
+    /// Wall time of each of [`STAGES`], nanoseconds.
+    pub wall_ns: [u64; STAGES.len()],
+}
+
+impl FrameTimeline {
+    /// Mid-exposure of the tracker to first light, nanoseconds; `None` when the frame was not lit.
+    pub fn motion_to_light_ns(&self) -> Option<i64> {
+        self.lit_at.map(|lit| lit.ns_since(self.captured_at))
+    }
+}
