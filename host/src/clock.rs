@@ -99,6 +99,47 @@ impl Clock for ManualClock {
     }
 }
 
+/// A stopwatch on wall time, for what a stage really took; at virtual pace too.
+#[derive(Clone, Copy, Debug)]
+pub struct Stopwatch(Instant);
+
+impl Stopwatch {
+    /// Starts now.
+    pub fn start() -> Self {
+        Self(Instant::now())
+    }
+
+    /// Nanoseconds since the start.
+    pub fn elapsed_ns(self) -> u64 {
+        u64::try_from(self.0.elapsed().as_nanos()).unwrap_or(u64::MAX)
+    }
+}
+
+/// The clock of a run: the wall's, or one that the planning stage moves.
+#[derive(Debug)]
+pub enum RunClock {
+    /// Real pace.
+    Real(MonotonicClock),
+    /// Virtual pace.
+    Virtual(ManualClock),
+}
+
+impl Clock for RunClock {
+    fn now(&self) -> HostTime {
+        match self {
+            Self::Real(clock) => clock.now(),
+            Self::Virtual(clock) => clock.now(),
+        }
+    }
+
+    fn wait_until(&self, at: HostTime) -> HostTime {
+        match self {
+            Self::Real(clock) => clock.wait_until(at),
+            Self::Virtual(clock) => clock.wait_until(at),
+        }
+    }
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;

@@ -5,12 +5,14 @@
 pub mod cli;
 pub mod clock;
 pub mod config;
+pub mod experiments;
 pub mod failure;
 pub mod files;
 pub mod frame;
 pub mod geometry;
 pub mod gpu;
 pub mod pack;
+pub mod pipeline;
 pub mod realtime;
 pub mod reference;
 pub mod render;

@@ -12,7 +12,7 @@ use crate::scene::Scene;
 use bytemuck::Zeroable;
 use dpm_device::planes::Raster;
 use dpm_shaders::structs::{self as gpu_structs, Counters, Frame, Instance, Rows, Surface};
-use glam::{DAffine3, DVec3};
+use glam::{DAffine3, DVec3, Vec3};
 use std::sync::Arc;
 
 /// What does not change while a renderer lives.
@@ -51,6 +51,8 @@ pub struct FrameInputs<'a> {
     pub gaze: DVec3,
     /// world-from-body of every body of the scene, at the time of light.
     pub poses: &'a [DAffine3],
+    /// Per tracked body: lost, no light falls on it. Bodies beyond the end are not lost.
+    pub lost: &'a [bool],
 }
 
 /// Why a renderer cannot be built.
@@ -149,6 +151,8 @@ pub struct Renderer {
     data: SceneData,
     settings: RendererSettings,
     needs: SceneNeeds,
+    /// Per body of the scene: which tracked body carries it.
+    tracked: Vec<Option<u16>>,
     gpu: Arc<Gpu>,
 }
 
@@ -203,6 +207,7 @@ impl Renderer {
             &constants,
         )?;
         let compensate = ComputePipeline::new(&table, dpm_shaders::COMPENSATE, &constants)?;
+        let tracked = scene.bodies.iter().map(|b| b.tracked).collect();
         Ok(Self {
             primary,
             trace,
@@ -212,8 +217,13 @@ impl Renderer {
             data,
             settings,
             needs,
+            tracked,
             gpu: gpu.clone(),
         })
+    }
+
+    fn is_lost(&self, body: usize, lost: &[bool]) -> bool {
+        self.tracked[body].is_some_and(|t| lost.get(usize::from(t)).copied().unwrap_or(false))
     }
 
     /// What the scene needs of the tracer.
@@ -224,6 +234,15 @@ impl Renderer {
     /// Bodies of the scene, in order.
     pub fn body_count(&self) -> usize {
         self.data.bodies.len()
+    }
+
+    /// Interpolated normal of a surface in its body's space, without the normal map.
+    pub fn shading_normal(&self, surface: &Surface) -> Vec3 {
+        let body = &self.data.bodies[(surface.id >> 24) as usize];
+        let reference = &self.data.refs[(body.triangle_offset + (surface.id & 0x00ff_ffff)) as usize];
+        let [u, v] = surface.barycentric;
+        let n = reference.vertices.map(|i| Vec3::from_array(self.data.vertices[i as usize].normal));
+        (n[0] * (1.0 - u - v) + n[1] * u + n[2] * v).normalize_or_zero()
     }
 
     /// Memory and commands for one frame in flight. `debug` also brings radiance and surfaces to the host.
@@ -361,7 +380,12 @@ impl Renderer {
                 bounds_max: (upper + slack).as_vec3().into(),
                 triangle_offset: body.triangle_offset,
                 previous_world_from_object: rows(&world_from_object),
-                flags: body.flags,
+                // What is lost still casts virtual shadows where it was last, but gets no light.
+                flags: if self.is_lost(i, inputs.lost) {
+                    body.flags & !gpu_structs::INSTANCE_PROJECTED
+                } else {
+                    body.flags
+                },
                 body: i as u32,
                 extent: body.extent,
             };

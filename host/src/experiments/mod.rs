@@ -1,0 +1,4 @@
+//! Runs that answer a question: each is a command and a test.
+
+pub mod pictures;
+pub mod run_rig;

@@ -1,0 +1,285 @@
+//! Finished frames and light into a report. Runs on its own thread, off the frame path: it may allocate.
+
+use super::handoff::Ring;
+use super::job::FrameJob;
+use super::light::LightNote;
+use crate::frame::{FrameId, FrameTimeline, Stage, STAGES};
+use crate::render::PASSES;
+use crate::rig::Rig;
+use crate::telemetry::monitor::RunMonitor;
+use crate::telemetry::report::{Report, Spread, StageTime};
+use dpm_device::link::SendOutcome;
+use glam::{DAffine3, DVec3};
+use hdrhistogram::Histogram;
+use hil_mock::projector::LightKind;
+use std::collections::VecDeque;
+use std::sync::Arc;
+use std::time::Duration;
+
+/// Points on each body at which registration is measured.
+const POINTS_PER_BODY: usize = 48;
+/// Sent frames that may wait for their light; beyond this they count as never lit.
+const MAX_PENDING: usize = 256;
+
+/// What is kept of one lit frame for pictures.
+#[derive(Clone, Debug)]
+pub struct FrameRecord {
+    /// Which frame.
+    pub id: FrameId,
+    /// Its slot.
+    pub slot: u64,
+    /// Its stamps.
+    pub timeline: FrameTimeline,
+    /// world-from-body of the tracked bodies that it was drawn for.
+    pub tracked_poses: Vec<DAffine3>,
+    /// The same without prediction.
+    pub sampled_poses: Vec<DAffine3>,
+    /// Eye, world.
+    pub eye: DVec3,
+    /// Hash of its code values.
+    pub code_hash: u64,
+}
+
+/// Counts and distributions of a run.
+pub struct Collector {
+    rig: Arc<Rig>,
+    points: Vec<Vec<DVec3>>,
+    pending: VecDeque<FrameRecord>,
+    /// The last lit frames, oldest first.
+    pub recent: VecDeque<FrameRecord>,
+    keep: usize,
+    verify: bool,
+    lit: u64,
+    dropped: u64,
+    late: u64,
+    repeated: u64,
+    /// Lit frames whose light was not what was rendered.
+    pub light_mismatches: u64,
+    registration: Histogram<u64>,
+    unpredicted: Histogram<u64>,
+    motion_to_light: Histogram<u64>,
+    stages: Vec<Histogram<u64>>,
+    passes: Vec<Histogram<u64>>,
+    rays: u64,
+    samples: u64,
+    gpu_ns: u64,
+    lit_values: u64,
+    clipped_values: u64,
+    nan_values: u64,
+    invalid_samples: u64,
+}
+
+/// Registration is counted in millionths of a pixel.
+const PER_PIXEL: f64 = 1e6;
+
+fn histogram() -> Histogram<u64> {
+    Histogram::new_with_bounds(1, 1_000_000_000_000, 3).expect("bounds and digits are in range")
+}
+
+impl Collector {
+    /// Keeps the last `keep` lit frames; `verify`: compares hashes of code values and light.
+    pub fn new(rig: Arc<Rig>, keep: usize, verify: bool) -> Self {
+        let points = (0..rig.bodies.len()).map(|i| registration_points(&rig, i)).collect();
+        Self {
+            rig,
+            points,
+            pending: VecDeque::new(),
+            recent: VecDeque::new(),
+            keep,
+            verify,
+            lit: 0,
+            dropped: 0,
+            late: 0,
+            repeated: 0,
+            light_mismatches: 0,
+            registration: histogram(),
+            unpredicted: histogram(),
+            motion_to_light: histogram(),
+            stages: STAGES.iter().map(|_| histogram()).collect(),
+            passes: PASSES.iter().map(|_| histogram()).collect(),
+            rays: 0,
+            samples: 0,
+            gpu_ns: 0,
+            lit_values: 0,
+            clipped_values: 0,
+            nan_values: 0,
+            invalid_samples: 0,
+        }
+    }
+
+    /// Takes finished jobs and light until both rings are closed and empty; gives the jobs back to `free`.
+    pub fn run(
+        &mut self,
+        done: &Ring<Box<FrameJob>>,
+        free: &Ring<Box<FrameJob>>,
+        lights: &Ring<LightNote>,
+        monitor: &RunMonitor,
+    ) {
+        loop {
+            let job = done.pop(Duration::from_millis(2));
+            let idle = job.is_none();
+            if let Some(job) = job {
+                self.finished(&job, monitor);
+                let _ = free.push(job);
+            }
+            while let Some(note) = lights.try_pop() {
+                self.light(&note, monitor);
+            }
+            if idle && done.is_closed() && lights.is_closed() && done.is_empty() && lights.is_empty() {
+                break;
+            }
+        }
+        // What was sent and never lit is dropped.
+        for _ in 0..self.pending.len() {
+            self.drop_oldest(monitor);
+        }
+    }
+
+    fn drop_oldest(&mut self, monitor: &RunMonitor) {
+        if self.pending.pop_front().is_some() {
+            self.dropped += 1;
+            monitor.count_dropped();
+        }
+    }
+
+    fn finished(&mut self, job: &FrameJob, monitor: &RunMonitor) {
+        let c = job.cost.counters();
+        self.rays += u64::from(c.closest_rays) + u64::from(c.shadow_rays);
+        self.samples += u64::from(c.samples);
+        self.gpu_ns += job.cost.pass_ns.iter().sum::<u64>();
+        self.lit_values += 3 * u64::from(c.lit_pixels);
+        self.clipped_values += u64::from(c.clipped_values);
+        self.nan_values += u64::from(c.nan_values);
+        self.invalid_samples += u64::from(c.invalid_samples);
+        for (histogram, &ns) in self.passes.iter_mut().zip(&job.cost.pass_ns) {
+            histogram.saturating_record(ns.max(1));
+        }
+        for stage in [Stage::Plan, Stage::Render, Stage::Pack, Stage::Link] {
+            self.stages[stage as usize].saturating_record(job.timeline.wall_ns[stage as usize].max(1));
+        }
+        if job.outcome == Some(SendOutcome::Sent) {
+            if self.pending.len() >= MAX_PENDING {
+                self.drop_oldest(monitor);
+            }
+            self.pending.push_back(FrameRecord {
+                id: job.id,
+                slot: job.slot,
+                timeline: job.timeline,
+                tracked_poses: job.tracked_poses.clone(),
+                sampled_poses: job.sampled_poses.clone(),
+                eye: job.eye,
+                code_hash: job.code_hash,
+            });
+        } else {
+            self.dropped += 1;
+            monitor.count_dropped();
+        }
+    }
+
+    fn light(&mut self, note: &LightNote, monitor: &RunMonitor) {
+        self.stages[Stage::Light as usize].saturating_record(note.wall_ns.max(1));
+        match note.event.kind {
+            LightKind::Repeated => self.repeated += 1,
+            LightKind::Blank => {}
+            LightKind::Lit => {
+                let Some(frame) = note.event.frame else { return };
+                let Some(at) = self.pending.iter().position(|r| r.id.0 as u32 == frame) else { return };
+                // Frames before it were overtaken and will never be lit.
+                for _ in 0..at {
+                    self.drop_oldest(monitor);
+                }
+                let Some(mut record) = self.pending.pop_front() else { return };
+                record.timeline.lit_at = Some(note.event.first_photon_at);
+                let late = note.event.slot > record.slot;
+                self.lit += 1;
+                self.late += u64::from(late);
+                monitor.count_lit(late);
+                if self.verify && note.hash != record.code_hash {
+                    self.light_mismatches += 1;
+                }
+                if let Some(ns) = record.timeline.motion_to_light_ns() {
+                    self.motion_to_light.saturating_record(ns.max(1) as u64);
+                }
+                self.measure_registration(note, &record);
+                if self.keep > 0 {
+                    if self.recent.len() >= self.keep {
+                        self.recent.pop_front();
+                    }
+                    self.recent.push_back(record);
+                }
+            }
+        }
+    }
+
+    /// Where the light of each point fell against where the point was at the middle of the exposure.
+    fn measure_registration(&mut self, note: &LightNote, record: &FrameRecord) {
+        let (first, last) = (note.event.first_photon_at, note.event.last_photon_at);
+        let middle = first.plus_ns(last.ns_since(first) / 2);
+        let Some(truth) = self.rig.true_poses(middle.0) else { return };
+        for (i, points) in self.points.iter().enumerate() {
+            for p in points {
+                let at = |m: &DAffine3| self.rig.camera.project(m.transform_point3(*p));
+                let Some(real) = at(&truth[i]) else { continue };
+                if let Some(used) = at(&record.tracked_poses[i]) {
+                    self.registration.saturating_record(((used - real).length() * PER_PIXEL) as u64 + 1);
+                }
+                if let Some(held) = at(&record.sampled_poses[i]) {
+                    self.unpredicted.saturating_record(((held - real).length() * PER_PIXEL) as u64 + 1);
+                }
+            }
+        }
+    }
+
+    /// Fills what the run measured into a report.
+    pub fn fill(&self, report: &mut Report) {
+        let spread = |h: &Histogram<u64>, unit: f64| {
+            (!h.is_empty()).then(|| Spread {
+                p50: h.value_at_quantile(0.5) as f64 / unit,
+                p99: h.value_at_quantile(0.99) as f64 / unit,
+                p999: h.value_at_quantile(0.999) as f64 / unit,
+                max: h.max() as f64 / unit,
+            })
+        };
+        report.frames_lit = self.lit;
+        report.frames_dropped = self.dropped;
+        report.frames_late = self.late;
+        report.frames_repeated = self.repeated;
+        report.registration_error_px = spread(&self.registration, PER_PIXEL);
+        report.registration_error_unpredicted_px = spread(&self.unpredicted, PER_PIXEL);
+        report.motion_to_light_ms = spread(&self.motion_to_light, 1e6);
+        let stages = STAGES.iter().map(|s| (*s).to_owned()).zip(&self.stages);
+        let passes = PASSES.iter().map(|p| format!("gpu {p}")).zip(&self.passes);
+        report.stages_ms = stages
+            .chain(passes)
+            .filter_map(|(stage, h)| spread(h, 1e6).map(|ms| StageTime { stage, ms }))
+            .collect();
+        report.mrays_per_s = (self.gpu_ns > 0).then(|| self.rays as f64 / self.gpu_ns as f64 * 1e3);
+        report.clipped = if self.lit_values > 0 { self.clipped_values as f64 / self.lit_values as f64 } else { 0.0 };
+        report.nan_pixels = self.nan_values;
+        if self.invalid_samples > 0 {
+            report.warnings.push(format!(
+                "{} samples of {} were not finite and were left out",
+                self.invalid_samples, self.samples
+            ));
+        }
+        if self.light_mismatches > 0 {
+            report.warnings.push(format!(
+                "{} frames of light differ from what was rendered",
+                self.light_mismatches
+            ));
+        }
+    }
+}
+
+/// Points spread over the vertices of a tracked body.
+fn registration_points(rig: &Rig, tracked: usize) -> Vec<DVec3> {
+    let all: Vec<DVec3> = rig
+        .scene
+        .bodies
+        .iter()
+        .filter(|b| b.tracked == Some(tracked as u16) && b.projected)
+        .flat_map(|b| b.mesh.positions.iter().map(|p| p.as_dvec3()))
+        .collect();
+    let n = all.len().min(POINTS_PER_BODY);
+    (0..n).map(|i| all[i * all.len() / n]).collect()
+}

@@ -1,0 +1,104 @@
+//! Light events of the mock projector into notes for the telemetry, and the last frames of light for pictures.
+//!
+//! Runs where the mock runs: in the link thread at virtual pace, in the mock's own thread at real pace.
+
+use super::handoff::Ring;
+use super::job::hash_codes;
+use crate::clock::Stopwatch;
+use dpm_device::time::HostTime;
+use hil_mock::projector::{LightEvent, LightKind, MockProjector};
+use std::collections::VecDeque;
+use std::sync::Arc;
+
+/// What the projector did in one slot.
+#[derive(Clone, Copy, Debug)]
+pub struct LightNote {
+    /// The event.
+    pub event: LightEvent,
+    /// Hash of the light as code values; 0 when not asked for.
+    pub hash: u64,
+    /// Wall time that the mock took for it, nanoseconds.
+    pub wall_ns: u64,
+}
+
+/// One frame of light as it fell.
+#[derive(Clone, Debug)]
+pub struct LightFrame {
+    /// Low 32 bits of the frame's number.
+    pub frame: u32,
+    /// True time of its first photon.
+    pub first_photon_at: HostTime,
+    /// Red, green, blue code values, rows top to bottom.
+    pub codes: Vec<[u8; 3]>,
+}
+
+/// Watches a mock projector.
+pub struct LightRecorder {
+    notes: Arc<Ring<LightNote>>,
+    /// Notes that found no room.
+    pub notes_lost: u64,
+    keep: usize,
+    hash: bool,
+    frames: VecDeque<LightFrame>,
+    /// Hash over all light in order.
+    pub light_hash: u64,
+}
+
+impl LightRecorder {
+    /// Notes go to `notes`; the last `keep` frames of light stay; `hash`: hash every frame of light.
+    pub fn new(notes: Arc<Ring<LightNote>>, keep: usize, hash: bool) -> Self {
+        Self { notes, notes_lost: 0, keep, hash, frames: VecDeque::with_capacity(keep + 1), light_hash: 0 }
+    }
+
+    /// Lets the mock live up to `now`, one slot at a time, and notes all light.
+    pub fn advance(&mut self, mock: &mut MockProjector, now: HostTime) {
+        use dpm_device::transport::LinkDevice;
+        while let Some(due) = mock.next_due().filter(|&due| due <= now) {
+            let watch = Stopwatch::start();
+            mock.advance_to(due);
+            self.drain(mock, watch);
+        }
+        let watch = Stopwatch::start();
+        mock.advance_to(now);
+        self.drain(mock, watch);
+    }
+
+    fn drain(&mut self, mock: &mut MockProjector, watch: Stopwatch) {
+        while let Some(event) = mock.next_light() {
+            let mut hash = 0;
+            if event.kind == LightKind::Lit && (self.hash || self.keep > 0) {
+                if let Some(light) = mock.light_of_frame() {
+                    if self.hash {
+                        hash = hash_codes(light.iter().map(|c| u32::from_le_bytes([c[0], c[1], c[2], 0])));
+                        self.light_hash = (self.light_hash ^ hash).wrapping_mul(0x9e37_79b9_7f4a_7c15).rotate_left(23);
+                    }
+                    keep(&mut self.frames, self.keep, &event, light);
+                }
+            }
+            let note = LightNote { event, hash, wall_ns: watch.elapsed_ns() };
+            if self.notes.push(note).is_err() {
+                self.notes_lost += 1;
+            }
+        }
+    }
+
+    /// The last frames of light, oldest first.
+    pub fn into_frames(self) -> Vec<LightFrame> {
+        self.frames.into()
+    }
+}
+
+/// Keeps a copy of `light`; the oldest frame's memory is used again when `limit` are kept.
+fn keep(frames: &mut VecDeque<LightFrame>, limit: usize, event: &LightEvent, light: &[[u8; 3]]) {
+    if limit == 0 {
+        return;
+    }
+    let mut codes = if frames.len() >= limit { frames.pop_front().map_or(Vec::new(), |f| f.codes) } else { Vec::new() };
+    codes.clear();
+    codes.extend_from_slice(light);
+    frames.push_back(LightFrame {
+        frame: event.frame.unwrap_or(0),
+        first_photon_at: event.first_photon_at,
+        codes,
+    });
+}

@@ -1,0 +1,22 @@
+//! The threads and their hand-offs: tracking, plan and render, pack, link, and beside the frame path the collector.
+//!
+//! ```text
+//!  tracking --[latest]--> plan+render --[ring]--> pack --[ring]--> link --[ring]--> collector
+//!                              ^                                                        |
+//!                              +------------------[free ring: recycled jobs]------------+
+//! ```
+//!
+//! One frame is one [`job::FrameJob`], boxed once and recycled. In the steady state no stage allocates, locks or logs, and every
+//! wait is bounded.
+
+mod collect;
+mod connect;
+pub mod handoff;
+pub mod job;
+pub mod light;
+mod run;
+pub mod stages;
+
+pub use collect::FrameRecord;
+pub use connect::ConnectError;
+pub use run::{on_frame_path, renderer_settings, run, PipelineError, RunOptions, RunOutcome};

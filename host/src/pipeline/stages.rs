@@ -1,0 +1,210 @@
+//! What each stage does to one frame. No threads here: `run.rs` decides who calls what.
+
+use super::job::{hash_codes, FrameJob};
+use crate::clock::Stopwatch;
+use crate::config::RigConfig;
+use crate::frame::{FrameId, Stage};
+use crate::gpu::GpuError;
+use crate::pack::{self, Kernel};
+use crate::render::{FrameInputs, Renderer};
+use crate::rig::{affine, Rig};
+use crate::tracking::{Freshness, PoseFilterBank, PoseFilterConfig, Prediction, TrackState};
+use dpm_device::link::SlotClock;
+use dpm_device::time::HostTime;
+use dpm_device::tracker::{BodyIndex, Tracker, TrackerError};
+use dpm_handoff::latest::Publisher;
+
+/// Most bodies that a rig tracks.
+pub const MAX_TRACKED: usize = 32;
+
+/// What the tracking stage knows: plain data for the latest-wins slot.
+#[derive(Clone, Copy, Debug)]
+pub struct TrackSnapshot {
+    /// Everything that arrived up to here is in.
+    pub through: HostTime,
+    /// Per body: its track and when the newest sample arrived.
+    pub tracks: [Option<(TrackState, HostTime)>; MAX_TRACKED],
+}
+
+impl TrackSnapshot {
+    /// Nothing known.
+    pub const EMPTY: Self = Self { through: HostTime(i64::MIN), tracks: [None; MAX_TRACKED] };
+}
+
+/// Samples into tracks.
+pub struct TrackingStage {
+    tracker: Box<dyn Tracker>,
+    bank: PoseFilterBank,
+    received_at: [HostTime; MAX_TRACKED],
+    bodies: usize,
+}
+
+impl TrackingStage {
+    /// A stage for the rig's bodies.
+    pub fn new(rig: &Rig, tracker: Box<dyn Tracker>) -> Self {
+        let config = filter_config(&rig.config);
+        let bodies = rig.bodies.len().min(MAX_TRACKED);
+        Self { tracker, bank: PoseFilterBank::new(&vec![config; bodies]), received_at: [HostTime(0); MAX_TRACKED], bodies }
+    }
+
+    /// Takes what has arrived by `now` and publishes the tracks.
+    ///
+    /// # Errors
+    /// The tracker is gone; what is known stays published.
+    pub fn step(&mut self, now: HostTime, latest: &mut Publisher<TrackSnapshot>) -> Result<(), TrackerError> {
+        let Self { tracker, bank, received_at, bodies } = self;
+        let result = tracker.poll(now, &mut |sample| {
+            if let Some(verdict) = bank.update(sample) {
+                if verdict.is_accepted() {
+                    if let Some(at) = received_at.get_mut(usize::from(sample.body.0)) {
+                        *at = sample.received_at;
+                    }
+                }
+            }
+        });
+        let mut snapshot = TrackSnapshot { through: now, ..TrackSnapshot::EMPTY };
+        for (i, track) in snapshot.tracks.iter_mut().enumerate().take(*bodies) {
+            *track = bank.state(BodyIndex(i as u16)).map(|s| (s, received_at[i]));
+        }
+        latest.publish(snapshot);
+        result.map(|_| ())
+    }
+
+    /// Counters of filters and tracker in words.
+    pub fn status(&self) -> String {
+        self.tracker.status()
+    }
+}
+
+fn filter_config(config: &RigConfig) -> PoseFilterConfig {
+    let p = &config.prediction;
+    PoseFilterConfig {
+        prediction: if p.on { Prediction::On } else { Prediction::Off },
+        position_noise_m: p.noise_m,
+        rotation_noise_rad: p.noise_rad,
+        gate_sigmas: p.gate_sigma,
+        lost_after_ns: (i64::from(config.safety.predict_ms) * 1_000_000).max(1_000_000),
+        ..PoseFilterConfig::default()
+    }
+}
+
+/// Fills a job for slot `slot`: poses at the middle of its exposure, eye, gaze. `snapshot` is the newest there is.
+pub fn plan(job: &mut FrameJob, rig: &Rig, snapshot: &TrackSnapshot, slots: &LinkTime, id: u64, slot: u64) {
+    let watch = Stopwatch::start();
+    job.id = FrameId(id);
+    job.slot = slot;
+    job.outcome = None;
+    job.target_at = slots.clock.start(slot);
+    let due = slots.host_of_slot(slot);
+    let middle = due.plus_ns(slots.host_of_slot(slot + 1).ns_since(due) / 2);
+    let timeline = &mut job.timeline;
+    *timeline = Default::default();
+    timeline.due_at = due;
+    let predict = rig.config.prediction.on;
+    job.tracked_poses.clear();
+    job.sampled_poses.clear();
+    job.lost.clear();
+    let mut oldest: Option<(HostTime, HostTime)> = None;
+    for (i, body) in rig.bodies.iter().enumerate() {
+        let track = snapshot.tracks.get(i).copied().flatten();
+        let (pose, sampled, lost) = match track {
+            Some((state, received_at)) => {
+                let sampled = state.predict(state.captured_at);
+                let used = state.predict(middle);
+                if oldest.is_none_or(|(captured, _)| state.captured_at < captured) {
+                    oldest = Some((state.captured_at, received_at));
+                }
+                let pose = if predict { used.pose } else { sampled.pose };
+                (affine(&pose), affine(&sampled.pose), used.freshness == Freshness::Lost)
+            }
+            // Never seen: nothing may be lit.
+            None => (affine(&body.rest), affine(&body.rest), true),
+        };
+        job.tracked_poses.push(pose);
+        job.sampled_poses.push(sampled);
+        job.lost.push(lost);
+    }
+    let (captured_at, received_at) = oldest.unwrap_or((due, due));
+    timeline.captured_at = captured_at;
+    timeline.received_at = received_at;
+    rig.scene_poses(&job.tracked_poses, &mut job.scene_poses);
+    (job.eye, job.gaze) = rig.observer.eye_and_gaze(&job.tracked_poses);
+    timeline.wall_ns[Stage::Plan as usize] = watch.elapsed_ns();
+}
+
+/// Starts the GPU on a planned job.
+///
+/// # Errors
+/// Device lost.
+pub fn submit(job: &mut FrameJob, rig: &Rig, renderer: &Renderer) -> Result<(), GpuError> {
+    let Some(slot) = job.gpu.as_mut() else { return Ok(()) };
+    renderer.submit(
+        slot,
+        &FrameInputs {
+            frame: job.id.0 as u32,
+            spp: rig.config.render.spp,
+            camera: &rig.camera,
+            eye: job.eye,
+            gaze: job.gaze,
+            poses: &job.scene_poses,
+            lost: &job.lost,
+        },
+    )
+}
+
+/// Waits for the GPU and packs its code values into planes.
+///
+/// # Errors
+/// The GPU did not finish within `timeout_ns`, or was lost.
+pub fn finish_and_pack(job: &mut FrameJob, kernel: Kernel, verify: bool, timeout_ns: u64) -> Result<(), GpuError> {
+    let Some(slot) = job.gpu.as_mut() else { return Ok(()) };
+    let watch = Stopwatch::start();
+    job.cost = slot.wait(timeout_ns)?;
+    let gpu: u64 = job.cost.pass_ns.iter().sum();
+    // The fence's wait overlaps other frames; the GPU's own time is the stage's cost where it is known.
+    job.timeline.wall_ns[Stage::Render as usize] = if gpu > 0 { gpu } else { watch.elapsed_ns() };
+    let watch = Stopwatch::start();
+    let codes = slot.codes();
+    pack::pack(kernel, codes, &mut job.planes);
+    job.timeline.wall_ns[Stage::Pack as usize] = watch.elapsed_ns();
+    if verify {
+        job.code_hash = hash_codes(codes.iter().map(|c| c & 0x00ff_ffff));
+    }
+    Ok(())
+}
+
+/// The projector's slots on the host's clock.
+#[derive(Clone, Copy, Debug)]
+pub struct LinkTime {
+    /// Slots on the device's clock.
+    pub clock: SlotClock,
+    /// An instant of the device's clock, and the host's reading then.
+    pub anchor: (dpm_device::time::DeviceTicks, HostTime),
+}
+
+impl LinkTime {
+    /// Start of a slot on the host's clock.
+    pub fn host_of_slot(&self, slot: u64) -> HostTime {
+        self.host_of(self.clock.start(slot))
+    }
+
+    /// A reading of the device's clock on the host's, at the nominal rate.
+    pub fn host_of(&self, ticks: dpm_device::time::DeviceTicks) -> HostTime {
+        let delta = i128::from(ticks.0) - i128::from(self.anchor.0 .0);
+        let ns = delta * 1_000_000_000 / i128::from(self.clock.tick_hz());
+        self.anchor.1.plus_ns(i64::try_from(ns).unwrap_or(if ns > 0 { i64::MAX } else { i64::MIN }))
+    }
+
+    /// The first slot that starts at or after `at`.
+    pub fn slot_after(&self, at: HostTime) -> u64 {
+        let since = at.ns_since(self.host_of_slot(0));
+        if since <= 0 {
+            return 0;
+        }
+        let mut slot = self.clock.rate().slot_at_ns(since);
+        while self.host_of_slot(slot) < at {
+            slot += 1;
+        }
+        slot
+    }
+}
