@@ -123,6 +123,11 @@ impl Collector {
                 let _ = free.push(job);
             }
             while let Some(note) = lights.try_pop() {
+                // A frame is handed over before its light is noted, so its job is in the ring by now.
+                while let Some(job) = done.try_pop() {
+                    self.finished(&job, monitor);
+                    let _ = free.push(job);
+                }
                 self.light(&note, monitor);
             }
             if idle && done.is_closed() && lights.is_closed() && done.is_empty() && lights.is_empty() {

@@ -562,7 +562,7 @@ fn link_thread(shared: &Shared<'_>, mut link: HostLink, mut cable: Cable) -> Cab
     enter_frame_path(false);
     // The last frames' light, then dark.
     let end = if shared.is_virtual() {
-        last.plus_ns(8 * shared.rig.rate().slot_len_ns(0))
+        last.plus_ns(2 * shared.rig.rate().slot_len_ns(0))
     } else {
         shared.clock.wait_until(shared.clock.now().plus_ns(10_000_000))
     };
