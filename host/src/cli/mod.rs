@@ -3,6 +3,7 @@
 pub mod doctor;
 pub mod os;
 pub mod rig_args;
+pub mod run;
 pub mod signals;
 pub mod watch;
 
@@ -24,6 +25,10 @@ Every key of the rig file can be set by --set a.b=c or by the environment variab
 
 #[derive(Debug, Subcommand)]
 enum Command {
+    /// Run the built-in scene of two moving objects against the embedded mock projector and tracker
+    Demo(run::DemoArgs),
+    /// Run a rig file
+    Run(run::RunArgs),
     /// Say what this machine can do, and what to do about what is missing
     Doctor(doctor::DoctorArgs),
 }
@@ -53,6 +58,8 @@ pub fn main() -> ExitCode {
 
 fn dispatch(command: &Command) -> Result<(), Failure> {
     match command {
+        Command::Demo(args) => run::execute_demo(args),
+        Command::Run(args) => run::execute(args),
         Command::Doctor(args) => doctor::execute(args),
     }
 }

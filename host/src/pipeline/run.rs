@@ -15,7 +15,7 @@ use crate::render::{FrameCost, RenderError, Renderer, RendererSettings};
 use crate::rig::{Rig, RigError};
 use crate::telemetry::monitor::RunMonitor;
 use crate::telemetry::report::Report;
-use dpm_device::link::{packet_bytes, Epoch, HostLink, LinkSettings, SendOutcome, Underrun, Verb};
+use dpm_device::link::{packet_bytes, Codec, Epoch, HostLink, LinkSettings, SendOutcome, Underrun, Verb};
 use dpm_device::time::{DeviceTicks, HostTime};
 use dpm_device::transport::inproc::{threaded, DeviceEnd, Direct, HostEnd};
 use dpm_device::transport::Transport;
@@ -245,6 +245,7 @@ pub fn run(
         late_slots: if is_virtual { 0 } else { 255 },
         epoch: Epoch::AfterHello(EPOCH_NS),
         session_seed: config.render.seed as u32 | 1,
+        codecs: Codec::Raw.mask(),
     });
 
     let device_over = AtomicBool::new(false);
