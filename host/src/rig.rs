@@ -176,7 +176,8 @@ impl Rig {
                 let faults: FaultPlan = text.parse()?;
                 let config = MockTrackerConfig {
                     seed: c.seed,
-                    rate: FrameRate::new(c.rate_hz, 1).expect("rate was checked when the configuration was read"),
+                    rate: FrameRate::new(c.rate_hz, 1)
+                        .expect("rate was checked when the configuration was read"),
                     position_noise_m: c.noise_m,
                     rotation_noise_rad: c.noise_rad,
                     latency_ns: i64::from(c.latency_us) * 1000,
@@ -187,7 +188,9 @@ impl Rig {
                 let motions = self.bodies.iter().filter_map(|b| b.motion.clone()).collect();
                 Ok(Box::new(MockTracker::new(config, motions)?))
             }
-            other => Err(RigError::Unsupported(format!("tracker.kind: {other:?} is not driven by `dpm run` yet"))),
+            other => {
+                Err(RigError::Unsupported(format!("tracker.kind: {other:?} is not driven by `dpm run` yet")))
+            }
         }
     }
 
@@ -208,7 +211,8 @@ impl Rig {
     /// `pi * exposure / (albedo * max_intensity)`.
     pub fn drive_gain(&self) -> f32 {
         let c = &self.config;
-        (std::f64::consts::PI * c.render.exposure / (c.scene.surface_albedo * c.projector.max_intensity)) as f32
+        (std::f64::consts::PI * c.render.exposure / (c.scene.surface_albedo * c.projector.max_intensity))
+            as f32
     }
 }
 
@@ -235,10 +239,9 @@ fn environment(config: &RigConfig) -> Result<Option<Environment>, RigError> {
             let radiance = Vec3::new(c.radiance[0] as f32, c.radiance[1] as f32, c.radiance[2] as f32);
             Ok((!own).then_some(Environment::Constant(radiance)))
         }
-        EnvironmentConfig::Image(c) => Err(RigError::Unsupported(format!(
-            "scene.environment: {} cannot be read yet",
-            c.file.display()
-        ))),
+        EnvironmentConfig::Image(c) => {
+            Err(RigError::Unsupported(format!("scene.environment: {} cannot be read yet", c.file.display())))
+        }
     }
 }
 
@@ -272,16 +275,21 @@ fn rig_bodies(config: &RigConfig, scene: &Scene) -> Result<Vec<RigBody>, RigErro
         .map(|i| {
             let first = scene.bodies.iter().find(|b| b.tracked == Some(i as u16));
             let rest = first.map_or(Pose::IDENTITY, |b| pose_of(&b.world_from_body_rest));
-            let name = named.get(i).map(|b| b.name.clone()).or_else(|| first.map(|b| b.name.clone())).unwrap_or_default();
+            let name = named
+                .get(i)
+                .map(|b| b.name.clone())
+                .or_else(|| first.map(|b| b.name.clone()))
+                .unwrap_or_default();
             let spec = match named.get(i) {
                 Some(body) => motion_spec(i, body)?,
                 None => default_motion(i),
             };
             let motion = if mock {
-                Some(
-                    Motion::new(&spec, rest)
-                        .map_err(|source| RigError::Motion { index: i, name: name.clone(), source })?,
-                )
+                Some(Motion::new(&spec, rest).map_err(|source| RigError::Motion {
+                    index: i,
+                    name: name.clone(),
+                    source,
+                })?)
             } else {
                 None
             };

@@ -34,7 +34,9 @@ pub fn pictures(rig: &Rig, renderer: &Renderer, light: &[LightFrame]) -> Result<
         .iter()
         .map(|f| rig.true_poses(f.first_photon_at.plus_ns(half_slot).0).map(|poses| (f, poses)))
         .collect();
-    let Some(window) = frames.filter(|f| !f.is_empty()).map(|frames| Window { frames }) else { return Ok(None) };
+    let Some(window) = frames.filter(|f| !f.is_empty()).map(|frames| Window { frames }) else {
+        return Ok(None);
+    };
     let now = &window.frames[window.frames.len() - 1].1;
     let (eye, _) = rig.observer.eye_and_gaze(now);
     let light = integrate(rig, renderer, &rig.camera, eye, now, &window, |_, drive| drive)?;
@@ -117,7 +119,8 @@ fn integrate(
         let ray = camera.ray(pixel);
         let position = ray.origin + ray.direction * f64::from(surface.distance);
         let in_body = poses[body].inverse().transform_point3(position);
-        let normal = poses[body].transform_vector3(renderer.shading_normal(surface).as_dvec3()).normalize_or_zero();
+        let normal =
+            poses[body].transform_vector3(renderer.shading_normal(surface).as_dvec3()).normalize_or_zero();
         let seen = Seen { position, normal };
         let mut sum = Vec3::ZERO;
         for ((frame, _), all) in window.frames.iter().zip(&window_poses) {

@@ -39,8 +39,10 @@ pub fn run_rig(config: &RigConfig, monitor: &Arc<RunMonitor>) -> Result<Report, 
         ));
     }
     if keep_frames > 0 {
-        let renderer = Renderer::new(&gpu, &rig.scene, pipeline::renderer_settings(&rig)).map_err(PipelineError::from)?;
-        let made = pictures(&rig, &renderer, &outcome.light).map_err(|e| Failure::from(PipelineError::Render(e.into())))?;
+        let renderer = Renderer::new(&gpu, &rig.scene, pipeline::renderer_settings(&rig))
+            .map_err(PipelineError::from)?;
+        let made = pictures(&rig, &renderer, &outcome.light)
+            .map_err(|e| Failure::from(PipelineError::Render(e.into())))?;
         if let Some(made) = made {
             let white = made.viewer.iter().fold(0.0f32, |m, v| m.max(v.max_element())).max(1e-9);
             report.files.push(save(&output.dir, "light.png", &rig, &made.light, 1.0)?);
@@ -50,7 +52,8 @@ pub fn run_rig(config: &RigConfig, monitor: &Arc<RunMonitor>) -> Result<Report, 
     let path = output.dir.join("report.json");
     report.files.push(path.clone());
     std::fs::create_dir_all(&output.dir).map_err(|e| cannot_write(&output.dir, &e))?;
-    write_atomically(&path, |out| std::io::Write::write_all(out, report.to_json().as_bytes())).map_err(|e| cannot_write(&path, &e))?;
+    write_atomically(&path, |out| std::io::Write::write_all(out, report.to_json().as_bytes()))
+        .map_err(|e| cannot_write(&path, &e))?;
     Ok(report)
 }
 
@@ -59,8 +62,10 @@ pub fn run_rig(config: &RigConfig, monitor: &Arc<RunMonitor>) -> Result<Report, 
 /// # Errors
 /// Exit code 4 with what to install.
 pub fn open_gpu(config: &RigConfig) -> Result<Arc<Gpu>, Failure> {
-    let options =
-        GpuOptions { validation: std::env::var_os("DPM_VALIDATION").is_some(), device: config.render.gpu.clone() };
+    let options = GpuOptions {
+        validation: std::env::var_os("DPM_VALIDATION").is_some(),
+        device: config.render.gpu.clone(),
+    };
     Gpu::open(&options).map_err(|e| Failure::new(FailureKind::NoGpu, e))
 }
 
@@ -85,13 +90,22 @@ fn save(dir: &Path, name: &str, rig: &Rig, linear: &[Vec3], scale: f32) -> Resul
     let path = dir.join(name);
     let raster = rig.camera.raster;
     std::fs::create_dir_all(dir).map_err(|e| cannot_write(dir, &e))?;
-    image::save_buffer(&path, &to_srgb(linear, scale), raster.width(), raster.height(), image::ColorType::Rgb8)
-        .map_err(|e| cannot_write(&path, &e))?;
+    image::save_buffer(
+        &path,
+        &to_srgb(linear, scale),
+        raster.width(),
+        raster.height(),
+        image::ColorType::Rgb8,
+    )
+    .map_err(|e| cannot_write(&path, &e))?;
     Ok(path)
 }
 
 fn cannot_write(path: &Path, error: &dyn std::fmt::Display) -> Failure {
-    Failure::new(FailureKind::BadInput, format!("cannot write {}: {error}; choose another folder with --out", path.display()))
+    Failure::new(
+        FailureKind::BadInput,
+        format!("cannot write {}: {error}; choose another folder with --out", path.display()),
+    )
 }
 
 impl From<RigError> for Failure {
@@ -107,9 +121,9 @@ impl From<RigError> for Failure {
 impl From<PipelineError> for Failure {
     fn from(error: PipelineError) -> Self {
         let kind = match &error {
-            PipelineError::Rig(RigError::Tracker(_)) | PipelineError::Connect(_) | PipelineError::Thread { .. } => {
-                FailureKind::Device
-            }
+            PipelineError::Rig(RigError::Tracker(_))
+            | PipelineError::Connect(_)
+            | PipelineError::Thread { .. } => FailureKind::Device,
             PipelineError::Rig(_) | PipelineError::Render(RenderError::Scene(_)) => FailureKind::BadInput,
             PipelineError::Render(RenderError::Gpu(e)) | PipelineError::Gpu { source: e, .. } => match e {
                 GpuError::OutOfMemory { .. } | GpuError::Limit { .. } => FailureKind::BadInput,

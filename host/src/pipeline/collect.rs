@@ -259,7 +259,8 @@ impl Collector {
             .filter_map(|(stage, h)| spread(h, 1e6).map(|ms| StageTime { stage, ms }))
             .collect();
         report.mrays_per_s = (self.gpu_ns > 0).then(|| self.rays as f64 / self.gpu_ns as f64 * 1e3);
-        report.clipped = if self.lit_values > 0 { self.clipped_values as f64 / self.lit_values as f64 } else { 0.0 };
+        report.clipped =
+            if self.lit_values > 0 { self.clipped_values as f64 / self.lit_values as f64 } else { 0.0 };
         report.nan_pixels = self.nan_values;
         if self.invalid_samples > 0 {
             report.warnings.push(format!(
@@ -268,10 +269,9 @@ impl Collector {
             ));
         }
         if self.light_mismatches > 0 {
-            report.warnings.push(format!(
-                "{} frames of light differ from what was rendered",
-                self.light_mismatches
-            ));
+            report
+                .warnings
+                .push(format!("{} frames of light differ from what was rendered", self.light_mismatches));
         }
     }
 }

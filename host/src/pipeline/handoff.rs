@@ -22,7 +22,11 @@ pub struct Ring<T> {
 impl<T> Ring<T> {
     /// Room for `capacity` items, at least 1.
     pub fn new(capacity: usize) -> Self {
-        Self { queue: ArrayQueue::new(capacity.max(1)), consumer: OnceLock::new(), closed: AtomicBool::new(false) }
+        Self {
+            queue: ArrayQueue::new(capacity.max(1)),
+            consumer: OnceLock::new(),
+            closed: AtomicBool::new(false),
+        }
     }
 
     /// Hands `item` over and wakes the consumer; gives it back when the ring is full.

@@ -70,7 +70,8 @@ impl LightRecorder {
                 if let Some(light) = mock.light_of_frame() {
                     if self.hash {
                         hash = hash_codes(light.iter().map(|c| u32::from_le_bytes([c[0], c[1], c[2], 0])));
-                        self.light_hash = (self.light_hash ^ hash).wrapping_mul(0x9e37_79b9_7f4a_7c15).rotate_left(23);
+                        self.light_hash =
+                            (self.light_hash ^ hash).wrapping_mul(0x9e37_79b9_7f4a_7c15).rotate_left(23);
                     }
                     keep(&mut self.frames, self.keep, &event, light);
                 }
@@ -93,7 +94,8 @@ fn keep(frames: &mut VecDeque<LightFrame>, limit: usize, event: &LightEvent, lig
     if limit == 0 {
         return;
     }
-    let mut codes = if frames.len() >= limit { frames.pop_front().map_or(Vec::new(), |f| f.codes) } else { Vec::new() };
+    let mut codes =
+        if frames.len() >= limit { frames.pop_front().map_or(Vec::new(), |f| f.codes) } else { Vec::new() };
     codes.clear();
     codes.extend_from_slice(light);
     frames.push_back(LightFrame {

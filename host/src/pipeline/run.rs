@@ -450,7 +450,8 @@ fn plan_thread(shared: &Shared<'_>, renderer: &Renderer, mut latest: Reader<Trac
     let costs = shared.costs();
     let modelled = costs.iter().sum::<i64>() + MARGIN_NS;
     let begin = shared.clock.now();
-    let mut next_slot = shared.time.slot_after(begin.plus_ns(modelled + if shared.is_virtual() { 0 } else { LISTEN_NS }));
+    let mut next_slot =
+        shared.time.slot_after(begin.plus_ns(modelled + if shared.is_virtual() { 0 } else { LISTEN_NS }));
     let mut id = 0u64;
     while !shared.monitor.stop_requested() && (shared.options.frames == 0 || id < shared.options.frames) {
         enter_frame_path(id >= WARM_UP_FRAMES);

@@ -44,7 +44,12 @@ impl TrackingStage {
     pub fn new(rig: &Rig, tracker: Box<dyn Tracker>) -> Self {
         let config = filter_config(&rig.config);
         let bodies = rig.bodies.len().min(MAX_TRACKED);
-        Self { tracker, bank: PoseFilterBank::new(&vec![config; bodies]), received_at: [HostTime(0); MAX_TRACKED], bodies }
+        Self {
+            tracker,
+            bank: PoseFilterBank::new(&vec![config; bodies]),
+            received_at: [HostTime(0); MAX_TRACKED],
+            bodies,
+        }
     }
 
     /// Takes what has arrived by `now` and publishes the tracks.
@@ -156,7 +161,12 @@ pub fn submit(job: &mut FrameJob, rig: &Rig, renderer: &Renderer) -> Result<(), 
 ///
 /// # Errors
 /// The GPU did not finish within `timeout_ns`, or was lost.
-pub fn finish_and_pack(job: &mut FrameJob, kernel: Kernel, verify: bool, timeout_ns: u64) -> Result<(), GpuError> {
+pub fn finish_and_pack(
+    job: &mut FrameJob,
+    kernel: Kernel,
+    verify: bool,
+    timeout_ns: u64,
+) -> Result<(), GpuError> {
     let Some(slot) = job.gpu.as_mut() else { return Ok(()) };
     let watch = Stopwatch::start();
     job.cost = slot.wait(timeout_ns)?;
