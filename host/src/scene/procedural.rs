@@ -67,12 +67,16 @@ fn srgb_image(linear: impl Fn(Vec2) -> Vec3) -> Texture {
 
 /// Tangent-space normals of a height field given in tiles; green points up in the image.
 fn normal_map(height: impl Fn(Vec2) -> f32) -> Texture {
-    let step = 1.0 / SIZE as f32;
+    let n = SIZE as usize;
+    let at_centre = |i: usize| height((Vec2::new((i % n) as f32, (i / n) as f32) + 0.5) / SIZE as f32);
+    let heights: Vec<f32> = (0..n * n).map(at_centre).collect();
     image(false, |p| {
-        let across = height(p + Vec2::new(step, 0.0)) - height(p - Vec2::new(step, 0.0));
-        let up = height(p - Vec2::new(0.0, step)) - height(p + Vec2::new(0.0, step));
-        let n = Vec3::new(-across / (2.0 * step), -up / (2.0 * step), 1.0).normalize();
-        0.5 * (n + 1.0)
+        let (x, y) = ((p.x * SIZE as f32) as usize, (p.y * SIZE as f32) as usize);
+        let at = |x: usize, y: usize| heights[(y % n) * n + x % n];
+        let across = at(x + 1, y) - at(x + n - 1, y);
+        let up = at(x, y + n - 1) - at(x, y + 1);
+        let normal = Vec3::new(-across, -up, 2.0 / SIZE as f32).normalize();
+        0.5 * (normal + 1.0)
     })
 }
 
@@ -120,8 +124,8 @@ fn cells(p: Vec2, period: i32, seed: u32) -> Cells {
     let q = p * period as f32;
     let base = q.floor();
     let (mut first, mut second) = (f32::MAX, f32::MAX);
-    for dy in -2..=2 {
-        for dx in -2..=2 {
+    for dy in -1..=1 {
+        for dx in -1..=1 {
             let (x, y) = (base.x as i32 + dx, base.y as i32 + dy);
             let jitter = Vec2::new(lattice(x, y, period, seed), lattice(x, y, period, seed + 1));
             let d = q.distance(Vec2::new(x as f32, y as f32) + 0.15 + 0.7 * jitter);
