@@ -1,12 +1,14 @@
 //! A `FramePlan` into radiance: what the shaders compute, and the tables and CPU twins they share.
 
 pub mod albedo_table;
+pub mod blue_noise;
 mod body_bvh;
 pub mod compensation;
 mod fill;
 mod renderer;
 pub mod scene_data;
 mod scene_gpu;
+pub mod sobol;
 pub mod tiles;
 
 pub use renderer::{FrameCost, FrameInputs, FrameSlot, RenderError, Renderer, RendererSettings, PASSES};
