@@ -13,6 +13,7 @@ pub mod geometry;
 pub mod gpu;
 pub mod pack;
 pub mod pipeline;
+pub mod plan;
 pub mod realtime;
 pub mod reference;
 pub mod render;
