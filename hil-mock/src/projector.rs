@@ -9,6 +9,7 @@ mod frames;
 mod light;
 mod receive;
 mod thread;
+pub mod usb;
 
 use std::collections::VecDeque;
 
@@ -302,6 +303,14 @@ impl MockProjector {
         if new != 0 {
             self.core.latch(new);
         }
+    }
+
+    /// The bus was reset, or the cable pulled: the session and its light end at once. What it is, and its latched faults, stay.
+    pub fn bus_reset(&mut self, now: HostTime) {
+        self.advance_to(now);
+        self.core.open_session(0);
+        self.core.incoming = Default::default();
+        self.decoders = [Decoder::new(), Decoder::new()];
     }
 
     /// Power fails and comes back: dark, no session, no memory, the clock starts again.

@@ -24,6 +24,8 @@ pub use types::{
 
 /// An unanswered request is repeated after this long.
 const RETRY_NS: i64 = 20_000_000;
+/// A lost medium is tried this often.
+const REOPEN_NS: i64 = 100_000_000;
 /// Echoes of the first second of a session come this fast, to learn the clock soon.
 const FAST_ECHO_NS: i64 = 2_000_000;
 /// Number of fast echoes.
@@ -135,8 +137,29 @@ impl HostLink {
     }
 
     /// Receives what has arrived, takes the next step of the handshake, keeps the device's watchdog fed. Call at least once a
-    /// frame slot. On an error of the handshake the link is [`LinkState::Closed`] (ARM refused: [`LinkState::Faulted`]).
+    /// frame slot. On an error of the handshake the link is [`LinkState::Closed`] (ARM refused: [`LinkState::Faulted`]); when the medium fails, the error is
+    /// returned once and the link is [`LinkState::Lost`] until it is back.
     pub fn poll(&mut self, now: HostTime, transport: &mut dyn Transport) -> Result<LinkState, LinkError> {
+        let result = self.step(now, transport);
+        if matches!(result, Err(LinkError::Transport(_))) && self.state != LinkState::Closed {
+            self.state = LinkState::Lost;
+            self.requested_at = now;
+        }
+        result
+    }
+
+    fn step(&mut self, now: HostTime, transport: &mut dyn Transport) -> Result<LinkState, LinkError> {
+        if self.state == LinkState::Lost {
+            if now.ns_since(self.requested_at) < REOPEN_NS {
+                return Ok(self.state);
+            }
+            self.requested_at = now;
+            if transport.reopen().is_err() {
+                return Ok(self.state);
+            }
+            // A new session: the picture comes back when the caller arms, after the dark.
+            self.connect();
+        }
         self.receive(now, transport)?;
         if self.state == LinkState::Closed {
             return Ok(self.state);

@@ -1,6 +1,8 @@
 //! Packets into bytes on a medium and back: what the link needs from USB, a serial port, or a device in the same process.
 
 pub mod inproc;
+#[cfg(feature = "usb")]
+pub mod usb;
 
 use crate::link::Packet;
 use crate::time::HostTime;
@@ -24,6 +26,39 @@ pub enum TransportError {
     Unplugged {
         /// Which device.
         device: String,
+    },
+    /// No such device.
+    #[error(
+        "{device}: not found; is it plugged in and switched on? `lsusb` or `dpm doctor` list what is there"
+    )]
+    NotFound {
+        /// Which device.
+        device: String,
+    },
+    /// The operating system does not let this user open the device.
+    #[error("{device}: permission denied; {remedy}")]
+    PermissionDenied {
+        /// Which device.
+        device: String,
+        /// What to do.
+        remedy: String,
+    },
+    /// Another program has the device.
+    #[error("{device}: in use by another program; end it first (two hosts cannot drive one projector)")]
+    InUse {
+        /// Which device.
+        device: String,
+    },
+    /// libusb reports an error.
+    #[cfg(feature = "usb")]
+    #[error("cannot {doing} {device}: {source}")]
+    Usb {
+        /// What was being done.
+        doing: &'static str,
+        /// On which device.
+        device: String,
+        /// libusb's error.
+        source: rusb::Error,
     },
     /// The operating system refused; the text names the object and the remedy.
     #[error("{context}: {source}")]
@@ -61,6 +96,14 @@ pub trait Transport: Send {
     /// Hands bytes that have arrived to `sink`, in order within a lane, without waiting for more.
     fn receive(&mut self, now: HostTime, sink: &mut dyn FnMut(Lane, &[u8])) -> Result<(), TransportError>;
 
+    /// Gets the medium back after it was lost. May take some milliseconds, unlike all else here: the rig is dark anyway.
+    ///
+    /// # Errors
+    /// While it is still gone, or cannot be had.
+    fn reopen(&mut self) -> Result<(), TransportError> {
+        Ok(())
+    }
+
     /// What to call this medium in messages.
     fn name(&self) -> &str;
 }
@@ -74,6 +117,9 @@ impl<T: Transport + ?Sized> Transport for &mut T {
     }
     fn receive(&mut self, now: HostTime, sink: &mut dyn FnMut(Lane, &[u8])) -> Result<(), TransportError> {
         (**self).receive(now, sink)
+    }
+    fn reopen(&mut self) -> Result<(), TransportError> {
+        (**self).reopen()
     }
     fn name(&self) -> &str {
         (**self).name()

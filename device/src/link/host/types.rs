@@ -44,6 +44,8 @@ pub struct LinkSettings {
 pub enum LinkState {
     /// Not connecting. [`super::HostLink::connect`] starts.
     Closed,
+    /// The medium is gone. Polling tries to get it back ten times a second; then a new session begins.
+    Lost,
     /// HELLO is under way.
     Greeting,
     /// CONFIG is under way.

@@ -1,0 +1,445 @@
+//! Packets into queued USB bulk transfers: several frames in flight, one transfer a frame, nothing ever waits.
+//!
+//! Everything happens on the thread that calls: `send` and `receive` submit, and let libusb deliver what has completed. When an
+//! endpoint fails its transfers are taken back, then its halt is cleared, then the newest frame alone is sent again from its start;
+//! an endpoint that fails three times within a second costs the device a reset.
+
+mod open;
+mod ring;
+
+use std::sync::Arc;
+
+use rusb::{Context, DeviceHandle};
+
+use super::{Lane, SendError, Transport, TransportError};
+use crate::link::Packet;
+use crate::time::HostTime;
+pub use open::{memory_limit_mb, UsbSettings, UDEV_RULE};
+use ring::{pump, Ring, Status};
+
+/// Vendor number of the reference device: the test numbers of pid.codes, free for anybody, never to be sold.
+pub const VENDOR_ID: u16 = 0x1209;
+/// Product number of the reference device.
+pub const PRODUCT_ID: u16 = 0x000d;
+/// Bulk OUT endpoint of the data lane.
+pub const DATA_OUT: u8 = 0x01;
+/// Bulk OUT endpoint of the control lane.
+pub const CONTROL_OUT: u8 = 0x02;
+/// Bulk IN endpoint of the replies.
+pub const REPLIES_IN: u8 = 0x82;
+
+/// Control messages that may be in flight.
+const CONTROL_DEPTH: usize = 16;
+/// Bytes of a control transfer.
+const CONTROL_BYTES: usize = 512;
+/// Transfers that wait for replies.
+const REPLY_DEPTH: usize = 8;
+/// Bytes of a reply transfer: a multiple of every packet size.
+const REPLY_BYTES: usize = 4096;
+/// Failures of an endpoint within [`STORM_NS`] that cost the device a reset.
+const STORM: usize = 3;
+const STORM_NS: i64 = 1_000_000_000;
+
+/// What has happened on the cable.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub struct UsbCounters {
+    /// Data transfers that arrived whole.
+    pub frames_carried: u64,
+    /// Data transfers that did not, and were not sent again because a newer one was waiting or their medium was gone.
+    pub frames_lost: u64,
+    /// Data transfers that were sent again from their start.
+    pub frames_resent: u64,
+    /// Halted endpoints.
+    pub stalls: u64,
+    /// Transfers of which the device took only a part.
+    pub short_writes: u64,
+    /// Replies longer than asked for.
+    pub babbles: u64,
+    /// Transfers damaged on the cable.
+    pub bus_errors: u64,
+    /// Endpoints that moved nothing for too long.
+    pub stuck: u64,
+    /// Resets of the device.
+    pub resets: u64,
+    /// Submissions refused for want of usbfs memory.
+    pub out_of_memory: u64,
+    /// Times that the device was opened.
+    pub opened: u64,
+}
+
+/// One outgoing endpoint and its troubles.
+struct Outgoing {
+    ring: Ring,
+    endpoint: u8,
+    /// Length of what each slot carries, for sending it again.
+    lengths: Vec<usize>,
+    /// Slot submitted last.
+    newest: Option<usize>,
+    /// When the oldest transfer in flight became the oldest.
+    progress_at: HostTime,
+    recovering: bool,
+    failures: [HostTime; STORM],
+}
+
+/// Long before any instant that a caller may pass.
+const NEVER: HostTime = HostTime(i64::MIN);
+
+impl Outgoing {
+    fn new(
+        handle: &Arc<DeviceHandle<Context>>,
+        endpoint: u8,
+        count: usize,
+        bytes: usize,
+    ) -> Result<Self, rusb::Error> {
+        Ok(Self {
+            ring: Ring::new(handle.clone(), endpoint, count, bytes)?,
+            endpoint,
+            lengths: vec![0; count],
+            newest: None,
+            progress_at: NEVER,
+            recovering: false,
+            failures: [NEVER; STORM],
+        })
+    }
+
+    fn has_room(&self) -> bool {
+        !self.recovering && self.ring.idle_slot().is_some()
+    }
+
+    fn send(&mut self, now: HostTime, packets: &[Packet<'_>]) -> Result<(), rusb::Error> {
+        let slot = self.ring.idle_slot().filter(|_| !self.recovering).ok_or(rusb::Error::Busy)?;
+        let buffer = self.ring.buffer(slot);
+        let bytes: usize = packets.iter().map(Packet::wire_bytes).sum();
+        assert!(
+            bytes <= buffer.len(),
+            "{bytes} bytes for endpoint {:#04x}, transfers of {}",
+            self.endpoint,
+            buffer.len()
+        );
+        let mut at = 0;
+        for packet in packets {
+            for part in packet.parts() {
+                buffer[at..at + part.len()].copy_from_slice(part);
+                at += part.len();
+            }
+        }
+        if self.ring.in_flight() == 0 {
+            self.progress_at = now;
+        }
+        self.ring.submit(slot, at)?;
+        self.lengths[slot] = at;
+        self.newest = Some(slot);
+        Ok(())
+    }
+
+    /// Notes a failure and begins recovery; `true` when there were too many of late.
+    fn fail(&mut self, now: HostTime) -> bool {
+        if self.recovering {
+            return false;
+        }
+        self.recovering = true;
+        self.ring.cancel_all();
+        self.failures.rotate_left(1);
+        self.failures[STORM - 1] = now;
+        self.failures[0] != NEVER && now.ns_since(self.failures[0]) < STORM_NS
+    }
+}
+
+/// An open device.
+struct Open {
+    // Order matters: rings give their transfers back before the handle closes.
+    data: Outgoing,
+    control: Outgoing,
+    replies: Ring,
+    replies_recovering: bool,
+    handle: Arc<DeviceHandle<Context>>,
+}
+
+/// The link over USB.
+pub struct UsbTransport {
+    settings: UsbSettings,
+    context: Context,
+    device: Option<Open>,
+    name: String,
+    counters: UsbCounters,
+    reset_due: bool,
+}
+
+impl std::fmt::Debug for UsbTransport {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        f.debug_struct("UsbTransport").field("name", &self.name).field("counters", &self.counters).finish()
+    }
+}
+
+impl UsbTransport {
+    /// Finds the device, claims its interface and allocates everything.
+    ///
+    /// # Errors
+    /// Not found; no permission (with the udev rule to install); in use by another program; usbfs too small for one frame (with the
+    /// setting to change).
+    pub fn open(settings: UsbSettings) -> Result<Self, TransportError> {
+        let context = open::context()?;
+        let name = settings.describe();
+        let mut transport = Self {
+            settings,
+            context,
+            device: None,
+            name,
+            counters: UsbCounters::default(),
+            reset_due: false,
+        };
+        transport.reopen()?;
+        Ok(transport)
+    }
+
+    /// True while the device is open.
+    pub fn is_open(&self) -> bool {
+        self.device.is_some()
+    }
+
+    /// What has happened so far.
+    pub fn counters(&self) -> UsbCounters {
+        self.counters
+    }
+
+    /// Transfers of any kind that the kernel holds.
+    pub fn in_flight(&self) -> usize {
+        self.device
+            .as_ref()
+            .map_or(0, |d| d.data.ring.in_flight() + d.control.ring.in_flight() + d.replies.in_flight())
+    }
+
+    /// Frames that may be in flight: fewer than asked for when usbfs has too little memory.
+    pub fn depth(&self) -> usize {
+        self.device.as_ref().map_or(0, |d| d.data.lengths.len())
+    }
+
+    fn gone(&mut self) -> TransportError {
+        if let Some(device) = self.device.take() {
+            self.counters.frames_lost += device.data.ring.in_flight() as u64;
+        }
+        TransportError::Unplugged { device: self.name.clone() }
+    }
+
+    /// Lets libusb deliver, and repairs what has failed.
+    fn service(&mut self, now: HostTime) -> Result<(), TransportError> {
+        if self.device.is_none() {
+            return Err(TransportError::Unplugged { device: self.name.clone() });
+        }
+        if let Err(rusb::Error::NoDevice) = pump(&self.context) {
+            return Err(self.gone());
+        }
+        let Some(device) = &mut self.device else { return Ok(()) };
+        let stuck_after = self.settings.stuck_after_ns;
+        let (counters, reset_due) = (&mut self.counters, &mut self.reset_due);
+        let data =
+            Self::repair(&mut device.data, true, &device.handle, now, stuck_after, counters, reset_due);
+        let control =
+            Self::repair(&mut device.control, false, &device.handle, now, stuck_after, counters, reset_due);
+        if data.is_err() || control.is_err() {
+            return Err(self.gone());
+        }
+        if self.reset_due {
+            return self.reset();
+        }
+        Ok(())
+    }
+
+    /// Takes ended transfers of one endpoint and moves its recovery along. An error means that the device is gone.
+    fn repair(
+        out: &mut Outgoing,
+        is_data: bool,
+        handle: &DeviceHandle<Context>,
+        now: HostTime,
+        stuck_after: i64,
+        counters: &mut UsbCounters,
+        reset_due: &mut bool,
+    ) -> Result<(), rusb::Error> {
+        while let Some(ended) = out.ring.take_ended() {
+            out.progress_at = now;
+            let whole = ended.status == Status::Completed && ended.actual == out.lengths[ended.slot];
+            if whole {
+                counters.frames_carried += u64::from(is_data);
+                if out.newest == Some(ended.slot) {
+                    out.newest = None;
+                }
+                continue;
+            }
+            counters.frames_lost += u64::from(is_data);
+            match ended.status {
+                Status::NoDevice => return Err(rusb::Error::NoDevice),
+                Status::Cancelled => {}
+                Status::Completed => counters.short_writes += 1,
+                Status::Stall => counters.stalls += 1,
+                Status::Overflow | Status::Error => counters.bus_errors += 1,
+            }
+            *reset_due |= ended.status != Status::Cancelled && out.fail(now);
+        }
+        let waiting = out.ring.in_flight() > 0 && out.progress_at != NEVER;
+        if waiting && !out.recovering && now.ns_since(out.progress_at) > stuck_after {
+            counters.stuck += 1;
+            *reset_due |= out.fail(now);
+        }
+        if out.recovering && out.ring.in_flight() == 0 && !*reset_due {
+            // An endpoint that cannot be cleared will fail again, and again is a reset.
+            if handle.clear_halt(out.endpoint) == Err(rusb::Error::NoDevice) {
+                return Err(rusb::Error::NoDevice);
+            }
+            out.recovering = false;
+            out.progress_at = now;
+            if let Some(slot) = out.newest.filter(|_| is_data) {
+                // The newest frame again, from its start; what it holds is known to be unsent.
+                if out.ring.submit(slot, out.lengths[slot]).is_ok() {
+                    counters.frames_resent += 1;
+                    counters.frames_lost -= 1;
+                }
+            }
+        }
+        Ok(())
+    }
+
+    /// Resets the device: everything it knew of the link is lost, and the link greets it again.
+    fn reset(&mut self) -> Result<(), TransportError> {
+        let Some(device) = &mut self.device else { return Ok(()) };
+        device.data.ring.cancel_all();
+        device.control.ring.cancel_all();
+        device.replies.cancel_all();
+        let busy =
+            device.data.ring.in_flight() + device.control.ring.in_flight() + device.replies.in_flight();
+        if busy > 0 {
+            // Replies end here; the others were counted by `repair`.
+            while device.replies.take_ended().is_some() {}
+            return Ok(());
+        }
+        self.reset_due = false;
+        self.counters.resets += 1;
+        let reset = device.handle.reset();
+        match reset {
+            Ok(()) => {
+                for out in [&mut device.data, &mut device.control] {
+                    out.recovering = false;
+                    out.newest = None;
+                    out.failures = [NEVER; STORM];
+                }
+                for slot in 0..REPLY_DEPTH {
+                    if device.replies.submit(slot, REPLY_BYTES).is_err() {
+                        return Err(self.gone());
+                    }
+                }
+                Ok(())
+            }
+            // It came back as another device, or not at all: to be opened anew.
+            Err(_) => Err(self.gone()),
+        }
+    }
+
+    /// Hands replies on, oldest first, and asks for more.
+    fn replies(&mut self, sink: &mut dyn FnMut(Lane, &[u8])) -> Result<(), TransportError> {
+        let Some(device) = &mut self.device else { return Ok(()) };
+        let mut gone = false;
+        // At most one round: a device that talks without end cannot keep this call from returning.
+        for _ in 0..REPLY_DEPTH {
+            let Some(ended) = device.replies.take_ended() else { break };
+            if ended.actual > 0 {
+                sink(Lane::Control, &device.replies.buffer(ended.slot)[..ended.actual]);
+            }
+            match ended.status {
+                Status::NoDevice => gone = true,
+                Status::Stall => {
+                    self.counters.stalls += 1;
+                    device.replies_recovering = true;
+                }
+                Status::Overflow => self.counters.babbles += 1,
+                Status::Error => self.counters.bus_errors += 1,
+                Status::Completed | Status::Cancelled => {}
+            }
+            if device.replies_recovering && !gone {
+                device.replies.cancel_all();
+            } else if !gone && !self.reset_due {
+                gone = device.replies.submit(ended.slot, REPLY_BYTES).is_err();
+            }
+        }
+        if device.replies_recovering && device.replies.in_flight() == 0 && !gone {
+            device.replies_recovering = false;
+            gone = device.handle.clear_halt(REPLIES_IN) == Err(rusb::Error::NoDevice);
+            for slot in 0..REPLY_DEPTH {
+                gone = gone || device.replies.submit(slot, REPLY_BYTES).is_err();
+            }
+        }
+        if gone {
+            Err(self.gone())
+        } else {
+            Ok(())
+        }
+    }
+}
+
+impl Transport for UsbTransport {
+    fn send(&mut self, now: HostTime, lane: Lane, packets: &[Packet<'_>]) -> Result<(), SendError> {
+        self.service(now)?;
+        let Some(device) = &mut self.device else { return Err(SendError::Busy) };
+        let out = match lane {
+            Lane::Data => &mut device.data,
+            Lane::Control => &mut device.control,
+        };
+        if self.reset_due {
+            return Err(SendError::Busy);
+        }
+        match out.send(now, packets) {
+            Ok(()) => Ok(()),
+            Err(rusb::Error::Busy) => Err(SendError::Busy),
+            Err(rusb::Error::NoMem) => {
+                self.counters.out_of_memory += 1;
+                Err(SendError::Busy)
+            }
+            Err(rusb::Error::NoDevice) => Err(self.gone().into()),
+            Err(e) => Err(open::error("send to", &self.name, e).into()),
+        }
+    }
+
+    fn has_room(&mut self, lane: Lane) -> bool {
+        !self.reset_due
+            && self.device.as_ref().is_some_and(|d| match lane {
+                Lane::Data => d.data.has_room(),
+                Lane::Control => d.control.has_room(),
+            })
+    }
+
+    fn receive(&mut self, now: HostTime, sink: &mut dyn FnMut(Lane, &[u8])) -> Result<(), TransportError> {
+        self.service(now)?;
+        self.replies(sink)
+    }
+
+    fn reopen(&mut self) -> Result<(), TransportError> {
+        self.device = None;
+        self.reset_due = false;
+        let handle = Arc::new(self.settings.open_handle(&self.context)?);
+        let failed = |e| open::error("allocate transfers of", &self.name, e);
+        let depth = self.settings.depth_within_limit();
+        let mut device = Open {
+            data: Outgoing::new(&handle, DATA_OUT, depth, self.settings.frame_bytes).map_err(failed)?,
+            control: Outgoing::new(&handle, CONTROL_OUT, CONTROL_DEPTH, CONTROL_BYTES).map_err(failed)?,
+            replies: Ring::new(handle.clone(), REPLIES_IN, REPLY_DEPTH, REPLY_BYTES).map_err(failed)?,
+            replies_recovering: false,
+            handle,
+        };
+        // A host that was killed may have left half a packet in the device.
+        for endpoint in [DATA_OUT, CONTROL_OUT] {
+            device
+                .handle
+                .clear_halt(endpoint)
+                .map_err(|e| open::error("clear the endpoints of", &self.name, e))?;
+        }
+        for slot in 0..REPLY_DEPTH {
+            device.replies.submit(slot, REPLY_BYTES).map_err(|e| open::error("read from", &self.name, e))?;
+        }
+        device.data.progress_at = NEVER;
+        self.device = Some(device);
+        self.counters.opened += 1;
+        Ok(())
+    }
+
+    fn name(&self) -> &str {
+        &self.name
+    }
+}

@@ -1,0 +1,164 @@
+//! A vendor, product and serial number into an open device, with reasons that say what to do when it cannot be had.
+
+use std::time::{Duration, Instant};
+
+use rusb::{Context, Device, DeviceHandle, UsbContext};
+
+use super::{CONTROL_BYTES, CONTROL_DEPTH, PRODUCT_ID, REPLY_BYTES, REPLY_DEPTH, VENDOR_ID};
+use crate::transport::TransportError;
+
+/// The rule that lets the user at the machine open the reference device; `packaging/60-dpm.rules` has it with others.
+pub const UDEV_RULE: &str =
+    r#"SUBSYSTEM=="usb", ATTR{idVendor}=="1209", ATTR{idProduct}=="000d", MODE="0660", TAG+="uaccess""#;
+
+/// Right after hot-plug a device may not be ready to be claimed; it is for this long that claiming is tried.
+const CLAIM_PATIENCE: Duration = Duration::from_millis(200);
+
+/// Which device, and how it is used.
+#[derive(Clone, Debug)]
+pub struct UsbSettings {
+    /// Vendor number.
+    pub vendor_id: u16,
+    /// Product number.
+    pub product_id: u16,
+    /// Serial number text; `None` takes the first device found.
+    pub serial: Option<String>,
+    /// Bytes of the largest frame on the wire, see [`crate::link::packet_bytes`].
+    pub frame_bytes: usize,
+    /// Frames in flight, at least 1. One is on the cable while the others wait, so each more adds a frame of latency on a
+    /// link that is full.
+    pub depth: usize,
+    /// An endpoint that moves nothing for this long, though it has something to carry, is cleared, nanoseconds.
+    pub stuck_after_ns: i64,
+}
+
+impl UsbSettings {
+    /// The reference device, two frames of `frame_bytes` in flight, one second of patience.
+    pub fn new(frame_bytes: usize) -> Self {
+        Self {
+            vendor_id: VENDOR_ID,
+            product_id: PRODUCT_ID,
+            serial: None,
+            frame_bytes,
+            depth: 2,
+            stuck_after_ns: 1_000_000_000,
+        }
+    }
+
+    pub(super) fn describe(&self) -> String {
+        let serial = self.serial.as_ref().map(|s| format!(" serial {s}")).unwrap_or_default();
+        format!("USB projector {:04x}:{:04x}{serial}", self.vendor_id, self.product_id)
+    }
+
+    /// Frames in flight that usbfs has memory for, at least 1.
+    pub(super) fn depth_within_limit(&self) -> usize {
+        let others = CONTROL_DEPTH * CONTROL_BYTES + REPLY_DEPTH * REPLY_BYTES;
+        match memory_limit_mb() {
+            None | Some(0) => self.depth.max(1),
+            // The limit is for all devices of the machine: half of it is what one may count on.
+            Some(mb) => {
+                let bytes = ((mb as usize) << 20) / 2;
+                self.depth.clamp(1, (bytes.saturating_sub(others) / self.frame_bytes.max(1)).max(1))
+            }
+        }
+    }
+
+    /// What to set when usbfs cannot hold the frames asked for; `None` when it can.
+    pub fn memory_advice(&self) -> Option<String> {
+        let limit = memory_limit_mb().filter(|mb| *mb > 0)?;
+        if self.depth_within_limit() >= self.depth {
+            return None;
+        }
+        let needed = (2 * self.depth * self.frame_bytes).div_ceil(1 << 20) + 1;
+        Some(format!(
+            "{} frames of {} bytes need more than usbfs may hold ({limit} MB): \
+             echo {needed} | sudo tee /sys/module/usbcore/parameters/usbfs_memory_mb, \
+             or usbcore.usbfs_memory_mb={needed} on the kernel's command line",
+            self.depth, self.frame_bytes
+        ))
+    }
+
+    pub(super) fn open_handle(&self, context: &Context) -> Result<DeviceHandle<Context>, TransportError> {
+        let name = self.describe();
+        let devices = context.devices().map_err(|e| error("list devices for", &name, e))?;
+        let mut refused = None;
+        for device in devices.iter() {
+            let Ok(d) = device.device_descriptor() else { continue };
+            if (d.vendor_id(), d.product_id()) != (self.vendor_id, self.product_id) {
+                continue;
+            }
+            match self.try_open(&device) {
+                Ok(Some(handle)) => return claim(handle, &name, &device),
+                Ok(None) => {}
+                Err(e) => refused = Some(at(&name, &device, e)),
+            }
+        }
+        Err(refused.unwrap_or(TransportError::NotFound { device: name }))
+    }
+
+    /// `None` when it is another device of the same kind.
+    fn try_open(&self, device: &Device<Context>) -> Result<Option<DeviceHandle<Context>>, rusb::Error> {
+        let handle = device.open()?;
+        if let Some(serial) = &self.serial {
+            let d = device.device_descriptor()?;
+            if handle.read_serial_number_string_ascii(&d)? != *serial {
+                return Ok(None);
+            }
+        }
+        Ok(Some(handle))
+    }
+}
+
+fn claim(
+    handle: DeviceHandle<Context>,
+    name: &str,
+    device: &Device<Context>,
+) -> Result<DeviceHandle<Context>, TransportError> {
+    match handle.set_auto_detach_kernel_driver(true) {
+        Ok(()) | Err(rusb::Error::NotSupported) => {}
+        Err(e) => return Err(at(name, device, e)),
+    }
+    let start = Instant::now();
+    loop {
+        match handle.claim_interface(0) {
+            Ok(()) => return Ok(handle),
+            Err(rusb::Error::NotFound) if start.elapsed() < CLAIM_PATIENCE => {
+                std::thread::sleep(Duration::from_millis(10));
+            }
+            Err(e) => return Err(at(name, device, e)),
+        }
+    }
+}
+
+/// An error of opening `device`, with what to do about it.
+fn at(name: &str, device: &Device<Context>, e: rusb::Error) -> TransportError {
+    let node = format!("/dev/bus/usb/{:03}/{:03}", device.bus_number(), device.address());
+    match e {
+        rusb::Error::Access => TransportError::PermissionDenied {
+            device: format!("{name} at {node}"),
+            remedy: format!(
+                "copy packaging/60-dpm.rules to /etc/udev/rules.d/ and plug it in again, or write there: {UDEV_RULE}"
+            ),
+        },
+        rusb::Error::Busy => TransportError::InUse { device: format!("{name} at {node}") },
+        rusb::Error::NoDevice => TransportError::Unplugged { device: name.to_string() },
+        e => error("open", &format!("{name} at {node}"), e),
+    }
+}
+
+pub(super) fn error(doing: &'static str, name: &str, e: rusb::Error) -> TransportError {
+    if e == rusb::Error::NoDevice {
+        return TransportError::Unplugged { device: name.to_string() };
+    }
+    TransportError::Usb { doing, device: name.to_string(), source: e }
+}
+
+pub(super) fn context() -> Result<Context, TransportError> {
+    Context::new().map_err(|e| error("use libusb for", "USB", e))
+}
+
+/// Megabytes of transfers that the kernel allows in flight on all devices together; 0 means no limit. `None` where the kernel
+/// does not say.
+pub fn memory_limit_mb() -> Option<u32> {
+    std::fs::read_to_string("/sys/module/usbcore/parameters/usbfs_memory_mb").ok()?.trim().parse().ok()
+}

@@ -1,0 +1,490 @@
+//! The bit-plane link over real libusb against the mock projector: streaming, and rows U1 to U15 of the failures that a cable can have.
+
+use std::sync::{Arc, Mutex};
+use std::time::{Duration, Instant};
+
+use dpm_device::link::{
+    faults, packet_bytes, Codec, DeviceState, Epoch, HostLink, LinkError, LinkSettings, LinkState,
+    SendOutcome, Underrun,
+};
+use dpm_device::planes::{PlaneSchedule, Raster};
+use dpm_device::time::{DeviceTicks, FrameRate, HostTime};
+use dpm_device::transport::usb::{UsbSettings, UsbTransport, CONTROL_OUT, DATA_OUT, REPLIES_IN};
+use dpm_device::transport::{Lane, Transport, TransportError};
+use hil_mock::projector::usb::UsbProjector;
+use hil_mock::projector::{MockConfig, MockProjector};
+use hil_mock::usb_model::Speed;
+use hil_mock::usb_plug::{monotonic_clock, Clock, Fault, UsbPlug};
+use usbfs_fake::{plug_in, Options, Socket};
+
+fn raster() -> Raster {
+    Raster::new(128, 32).unwrap()
+}
+
+const PLANES: usize = 24;
+const FPS: u32 = 200;
+/// Of the test that plugs a thousand times.
+const FAST_FPS: u32 = 4000;
+
+fn planes(id: u64) -> Vec<u8> {
+    let n = raster().plane_bytes() * PLANES;
+    (0..n as u64).map(|i| ((i + 1).wrapping_mul(0x9e37_79b9_7f4a_7c15 ^ (id << 20)) >> 40) as u8).collect()
+}
+
+fn frame_bytes() -> usize {
+    packet_bytes(raster().plane_bytes()) * PLANES + packet_bytes(16)
+}
+
+/// A projector of its own serial number, on the bus.
+struct Device {
+    model: Arc<Mutex<UsbProjector>>,
+    plug: UsbPlug,
+    socket: Option<Socket>,
+    clock: Clock,
+    serial: u64,
+}
+
+impl Device {
+    fn new(serial: u64, options: Options) -> Self {
+        let clock = monotonic_clock();
+        let setup = MockConfig { serial, min_plane_ns: 5_000, ..MockConfig::new(raster()) };
+        let mock = MockProjector::new(setup);
+        let model = Arc::new(Mutex::new(UsbProjector::new(mock, Speed::Super, None)));
+        let plug = UsbPlug::new(model.clone(), clock.clone());
+        let socket = plug_in(Arc::new(plug.clone()), options);
+        Self { model, plug, socket: Some(socket), clock, serial }
+    }
+
+    fn unplug(&mut self) {
+        self.socket = None;
+    }
+
+    fn plug_in_again(&mut self) {
+        self.plug = UsbPlug::new(self.model.clone(), self.clock.clone());
+        self.socket = Some(plug_in(Arc::new(self.plug.clone()), Options::default()));
+    }
+
+    fn now(&self) -> HostTime {
+        (self.clock)()
+    }
+
+    fn mock<R>(&self, f: impl FnOnce(&mut MockProjector) -> R) -> R {
+        let now = self.now();
+        let mut model = self.model.lock().unwrap();
+        let mock = model.projector();
+        dpm_device::transport::LinkDevice::advance_to(mock, now);
+        f(mock)
+    }
+
+    fn settings(&self) -> UsbSettings {
+        UsbSettings {
+            serial: Some(format!("{:016x}", self.serial)),
+            stuck_after_ns: 150_000_000,
+            ..UsbSettings::new(frame_bytes())
+        }
+    }
+}
+
+/// A host at the other end.
+struct Host {
+    link: HostLink,
+    usb: UsbTransport,
+    next_id: u64,
+}
+
+impl Host {
+    fn new(device: &Device, watchdog_us: u32, fps: u32) -> Self {
+        let link = HostLink::new(LinkSettings {
+            raster: raster(),
+            schedule: PlaneSchedule::rgb24(),
+            rate: FrameRate::new(fps, 1).unwrap(),
+            watchdog_us,
+            underrun: Underrun::Repeat,
+            late_slots: 20,
+            epoch: Epoch::At(DeviceTicks(0)),
+            codecs: Codec::Raw.mask(),
+            session_seed: 1,
+        });
+        let usb = UsbTransport::open(device.settings()).expect("the device opens");
+        Self { link, usb, next_id: 1 }
+    }
+
+    fn connected(device: &Device) -> Self {
+        let mut host = Self::new(device, 2_000_000, FPS);
+        host.link.connect();
+        host.arm(device);
+        host
+    }
+
+    fn until(&mut self, device: &Device, limit_ms: u64, mut done: impl FnMut(&mut Self) -> bool) -> Duration {
+        let start = Instant::now();
+        loop {
+            let _ = self.link.poll(device.now(), &mut self.usb);
+            if done(self) {
+                return start.elapsed();
+            }
+            assert!(
+                start.elapsed() < Duration::from_millis(limit_ms),
+                "after {limit_ms} ms: {:?} {:?} {:?} {:?}",
+                self.link.state(),
+                self.link.status(),
+                self.usb.counters(),
+                device.mock(|m| m.status())
+            );
+            std::thread::sleep(Duration::from_micros(300));
+        }
+    }
+
+    fn arm(&mut self, device: &Device) {
+        self.until(device, 5000, |h| h.link.state() == LinkState::Ready);
+        self.link.arm(0);
+        self.until(device, 5000, |h| h.link.state() == LinkState::Streaming);
+    }
+
+    /// Offers a new frame for the next slot.
+    fn offer(&mut self, device: &Device) -> SendOutcome {
+        let now = device.now();
+        let slots = self.link.slots().unwrap();
+        let slot = slots.slot_at(DeviceTicks(now.0 as u64)).unwrap() + 1;
+        let id = self.next_id;
+        let outcome = self.link.send_frame(now, id, slots.start(slot), &planes(id), &mut self.usb);
+        if outcome == SendOutcome::Sent {
+            self.next_id += 1;
+        }
+        outcome
+    }
+
+    /// Streams until `done`, a frame as often as one is taken.
+    fn stream(
+        &mut self,
+        device: &Device,
+        limit_ms: u64,
+        mut done: impl FnMut(&mut Self) -> bool,
+    ) -> Duration {
+        self.until(device, limit_ms, |h| {
+            if h.link.state() == LinkState::Streaming {
+                h.offer(device);
+            }
+            done(h)
+        })
+    }
+}
+
+/// What must hold at the end of every test: the lit frame is one that was sent, bit for bit, and every frame is accounted for.
+fn check(device: &Device) {
+    device.mock(|m| {
+        if let Some(id) = m.lit_frame() {
+            assert_eq!(m.lit_planes().unwrap(), planes(u64::from(id)), "frame {id}");
+        }
+        let s = m.status();
+        assert_eq!(s.slots, s.frames_lit + s.slots_repeated + s.slots_blank);
+        let ended =
+            s.frames_lit + s.frames_incomplete + s.frames_late + s.frames_superseded + s.frames_refused;
+        assert!((ended..=ended + 5).contains(&s.frames_seen), "{s:?}");
+        assert_eq!(m.credit_violations(), 0);
+    });
+}
+
+fn lit(device: &Device) -> u32 {
+    device.mock(|m| m.status().frames_lit)
+}
+
+fn open_files() -> usize {
+    std::fs::read_dir("/proc/self/fd").unwrap().count()
+}
+
+#[test]
+fn frames_cross_real_libusb_bit_for_bit() {
+    let device = Device::new(1, Options { kernel_driver: Some("usbhid".into()), ..Options::default() });
+    let mut host = Host::connected(&device);
+    let mut seen = 0;
+    host.stream(&device, 20_000, |_| {
+        device.mock(|m| {
+            if let Some(id) = m.lit_frame() {
+                assert_eq!(m.lit_planes().unwrap(), planes(u64::from(id)));
+                seen = seen.max(m.status().frames_lit);
+            }
+        });
+        seen >= 40
+    });
+    check(&device);
+    let (c, s) = (host.usb.counters(), device.mock(|m| m.status()));
+    assert_eq!((c.frames_lost, c.stalls, c.bus_errors, c.resets), (0, 0, 0, 0));
+    assert_eq!((s.header_errors, s.payload_errors, s.frames_incomplete, s.bytes_skipped), (0, 0, 0, 0));
+    let mut echoes = 0;
+    host.link.take_echoes(|e| {
+        echoes += 1;
+        assert!(e.host_sent_at <= e.host_received_at && e.device_received_at <= e.device_sent_at);
+        // One clock stands behind both: the device's stamps lie between the host's.
+        assert!(e.host_sent_at.0 as u64 <= e.device_received_at.0);
+        assert!(e.device_sent_at.0 <= e.host_received_at.0 as u64);
+    });
+    assert!(echoes > 0);
+}
+
+#[test]
+fn u1_u2_unplug_is_noticed_reaped_and_survived() {
+    let mut device = Device::new(2, Options::default());
+    let mut host = Host::connected(&device);
+    host.stream(&device, 5000, |_| lit(&device) >= 5);
+    // With a frame stuck on the cable and the next one queued.
+    device.plug.inject(DATA_OUT, 0, Fault::NakNs(i64::MAX));
+    host.stream(&device, 5000, |h| h.usb.in_flight() > 9);
+    device.unplug();
+    let noticed = host.until(&device, 1000, |h| h.link.state() == LinkState::Lost);
+    assert!(noticed < Duration::from_millis(100), "{noticed:?}");
+    assert_eq!(host.usb.in_flight(), 0);
+    let c = host.usb.counters();
+    let sent = host.link.counters().frames_sent;
+    assert_eq!(c.frames_carried + c.frames_lost, sent, "every frame is accounted for: {c:?}");
+    // Rendering goes on into nothing.
+    assert!(matches!(host.offer(&device), SendOutcome::Dropped { .. }));
+    let before = lit(&device);
+    device.plug_in_again();
+    let back = host.until(&device, 5000, |h| h.link.state() == LinkState::Ready);
+    assert!(back < Duration::from_secs(1), "{back:?}");
+    assert!(!device.mock(|m| m.is_lit()), "dark until armed again");
+    assert!(before >= 5);
+    host.arm(&device);
+    host.stream(&device, 5000, |_| lit(&device) >= 5);
+    check(&device);
+}
+
+#[test]
+fn u3_a_stall_costs_at_most_a_frame_and_three_a_reset() {
+    let device = Device::new(3, Options::default());
+    let mut host = Host::connected(&device);
+    host.stream(&device, 5000, |_| lit(&device) >= 5);
+    device.plug.inject(DATA_OUT, 0, Fault::Stall);
+    let from = lit(&device);
+    host.stream(&device, 5000, |h| h.usb.counters().stalls == 1 && h.usb.counters().frames_resent == 1);
+    host.stream(&device, 5000, |_| lit(&device) >= from + 5);
+    assert_eq!(host.link.state(), LinkState::Streaming, "the session survived");
+    // Three within a second: the device is reset, greets again, and is dark until armed.
+    for n in 2..=4 {
+        device.plug.inject(DATA_OUT, 0, Fault::Stall);
+        host.stream(&device, 5000, |h| h.usb.counters().stalls == n || h.usb.counters().resets == 1);
+    }
+    host.until(&device, 5000, |h| h.usb.counters().resets == 1 && h.link.state() == LinkState::Ready);
+    assert!(!device.mock(|m| m.is_lit()));
+    host.arm(&device);
+    host.stream(&device, 5000, |_| lit(&device) >= 5);
+    check(&device);
+}
+
+#[test]
+fn u4_a_slow_device_gets_whole_frames_newest_first() {
+    let device = Device::new(4, Options::default());
+    let mut host = Host::connected(&device);
+    host.stream(&device, 5000, |_| lit(&device) >= 3);
+    for tenths in [5, 1] {
+        // Of the rate that 200 frames a second need.
+        let rate = frame_bytes() as u64 * u64::from(FPS) * tenths / 10;
+        device.model.lock().unwrap().set_bytes_per_second(Some(rate));
+        let (from, start) = (lit(&device), Instant::now());
+        let mut oldest = Duration::ZERO;
+        let mut shown = None;
+        let mut offered: Vec<(u64, Instant)> = Vec::new();
+        host.stream(&device, 20_000, |h| {
+            if offered.last().is_none_or(|o| o.0 + 1 < h.next_id) {
+                offered.push((h.next_id - 1, Instant::now()));
+            }
+            let now_lit = device.mock(|m| m.lit_frame());
+            if now_lit != shown {
+                shown = now_lit;
+                let sent = offered.iter().find(|o| Some(o.0 as u32) == shown);
+                oldest = oldest.max(sent.map_or(Duration::ZERO, |o| o.1.elapsed()));
+            }
+            lit(&device) >= from + 8
+        });
+        // Two frames in flight and one slot: no backlog builds up, however slow the cable.
+        let frame_time = Duration::from_secs_f64(frame_bytes() as f64 / rate as f64);
+        let bound = frame_time * 3 + Duration::from_millis(10 + 100);
+        assert!(oldest < bound, "{oldest:?} at {tenths}/10, {bound:?} allowed, {:?}", start.elapsed());
+    }
+    let (c, s) = (host.link.counters(), device.mock(|m| m.status()));
+    assert_eq!((s.frames_incomplete, s.payload_errors), (0, 0), "never a partial frame");
+    assert!(c.link_busy + c.no_credit > 0);
+    assert_eq!(c.frames_offered, c.frames_sent + c.link_busy + c.no_credit + c.not_streaming + c.not_newer);
+    check(&device);
+}
+
+#[test]
+fn u4_a_device_that_never_takes_anything_is_cleared() {
+    let device = Device::new(5, Options::default());
+    let mut host = Host::connected(&device);
+    host.stream(&device, 5000, |_| lit(&device) >= 3);
+    device.plug.inject(DATA_OUT, 0, Fault::NakNs(i64::MAX));
+    host.stream(&device, 5000, |h| h.usb.counters().stuck == 1);
+    let from = lit(&device);
+    host.stream(&device, 5000, |_| lit(&device) >= from + 5);
+    assert_eq!(host.link.state(), LinkState::Streaming, "control went on, the watchdog was fed");
+    check(&device);
+}
+
+#[test]
+fn u5_a_short_write_restarts_the_frame() {
+    let device = Device::new(6, Options::default());
+    let mut host = Host::connected(&device);
+    host.stream(&device, 5000, |_| lit(&device) >= 3);
+    for bytes in [0, 1, 700, frame_bytes() - 1] {
+        device.plug.inject(DATA_OUT, 0, Fault::Short(bytes));
+        let (from, short) = (lit(&device), host.usb.counters().short_writes);
+        host.stream(&device, 5000, |h| h.usb.counters().short_writes == short + 1);
+        host.stream(&device, 5000, |_| lit(&device) >= from + 5);
+        // Out of the storm's second, so that four of them are not a reset.
+        host.stream(&device, 5000, |_| lit(&device) >= from + 110);
+    }
+    check(&device);
+}
+
+#[test]
+fn u6_babble_and_bus_errors_on_replies_are_survived() {
+    let device = Device::new(7, Options::default());
+    let mut host = Host::connected(&device);
+    host.stream(&device, 5000, |_| lit(&device) >= 3);
+    device.plug.inject(REPLIES_IN, 1, Fault::Babble);
+    device.plug.inject(REPLIES_IN, 3, Fault::BusError);
+    device.plug.inject(REPLIES_IN, 5, Fault::Short(7));
+    let from = lit(&device);
+    host.stream(&device, 5000, |_| lit(&device) >= from + 20);
+    let c = host.usb.counters();
+    assert_eq!((c.babbles, c.bus_errors), (1, 1));
+    // A halted reply endpoint is cleared.
+    device.plug.inject(REPLIES_IN, 0, Fault::Stall);
+    let from = lit(&device);
+    host.stream(&device, 5000, |h| lit(&device) >= from + 20 && h.usb.counters().stalls > 0);
+    check(&device);
+}
+
+#[test]
+fn u8_a_device_that_forgot_everything_is_greeted_within_half_a_second() {
+    let device = Device::new(8, Options::default());
+    let mut host = Host::connected(&device);
+    host.stream(&device, 5000, |_| lit(&device) >= 3);
+    let now = device.now();
+    // In the middle of a frame.
+    host.offer(&device);
+    device.model.lock().unwrap().projector().power_cycle(now);
+    let back = host.stream(&device, 5000, |h| h.link.state() == LinkState::Ready);
+    assert!(back < Duration::from_millis(500), "{back:?}");
+    host.arm(&device);
+    host.stream(&device, 5000, |_| lit(&device) >= 3);
+    check(&device);
+}
+
+#[test]
+fn u12_a_hot_device_is_dark_until_acknowledged() {
+    let device = Device::new(9, Options::default());
+    let mut host = Host::connected(&device);
+    host.stream(&device, 5000, |_| lit(&device) >= 3);
+    let now = device.now();
+    device.mock(|m| m.set_faults(now, faults::OVER_TEMPERATURE));
+    host.until(&device, 5000, |h| h.link.state() == LinkState::Faulted);
+    assert!(!device.mock(|m| m.is_lit()));
+    let now = device.now();
+    device.mock(|m| m.set_faults(now, 0));
+    host.link.arm(faults::OVER_TEMPERATURE);
+    host.until(&device, 5000, |h| h.link.state() == LinkState::Streaming);
+}
+
+#[test]
+fn u13_a_second_host_is_refused() {
+    let device = Device::new(10, Options::default());
+    let _host = Host::connected(&device);
+    let second = UsbTransport::open(device.settings()).unwrap_err();
+    assert!(matches!(second, TransportError::InUse { .. }), "{second}");
+    assert!(second.to_string().contains("in use by another program"), "{second}");
+}
+
+#[test]
+fn u14_denied_names_the_rule_and_absent_names_the_device() {
+    let device = Device::new(11, Options { denied: true, ..Options::default() });
+    let settings = UsbSettings { serial: None, ..device.settings() };
+    // Other tests' devices are on the bus too: by serial number only the denied one is asked for, which cannot be read.
+    let refused = UsbTransport::open(UsbSettings { serial: Some("none".into()), ..settings }).unwrap_err();
+    let text = refused.to_string();
+    assert!(text.contains("permission denied") && text.contains("packaging/60-dpm.rules"), "{text}");
+    assert!(text.contains(r#"ATTR{idVendor}=="1209""#), "{text}");
+    let rules = include_str!("../../../packaging/60-dpm.rules");
+    assert!(
+        rules.contains(dpm_device::transport::usb::UDEV_RULE),
+        "the rule in the error is the rule in the file"
+    );
+    let absent = UsbTransport::open(UsbSettings { product_id: 0x0bad, ..device.settings() }).unwrap_err();
+    assert!(matches!(absent, TransportError::NotFound { .. }), "{absent}");
+}
+
+#[test]
+fn u15_a_killed_host_leaves_darkness() {
+    let device = Device::new(12, Options::default());
+    let mut host = Host::new(&device, 200_000, FPS);
+    host.link.connect();
+    host.arm(&device);
+    host.stream(&device, 5000, |_| lit(&device) >= 3);
+    assert!(device.mock(|m| m.is_lit()));
+    // SIGKILL: no STOP, no farewell.
+    std::mem::forget(host);
+    let start = Instant::now();
+    while device.mock(|m| m.is_lit()) {
+        assert!(start.elapsed() < Duration::from_millis(250), "lit {:?} after the kill", start.elapsed());
+        std::thread::sleep(Duration::from_millis(1));
+    }
+    assert_eq!(device.mock(|m| m.status().faults), faults::WATCHDOG);
+}
+
+#[test]
+fn the_lanes_are_independent_and_stop_overtakes_planes() {
+    let device = Device::new(13, Options::default());
+    let mut host = Host::connected(&device);
+    host.stream(&device, 5000, |_| lit(&device) >= 3);
+    device.plug.inject(DATA_OUT, 0, Fault::NakNs(i64::MAX));
+    host.offer(&device);
+    let now = device.now();
+    host.link.command(now, dpm_device::link::Verb::Stop, &mut host.usb).unwrap();
+    let start = Instant::now();
+    while device.mock(|m| m.status().state) != DeviceState::Configured {
+        assert!(start.elapsed() < Duration::from_millis(50));
+        std::thread::sleep(Duration::from_micros(200));
+    }
+    assert!(!device.mock(|m| m.is_lit()));
+    assert!(host.usb.has_room(Lane::Control));
+    device.plug.inject(CONTROL_OUT, 0, Fault::Stall);
+    host.until(&device, 5000, |h| h.usb.counters().stalls == 1);
+    host.until(&device, 5000, |h| h.link.state() == LinkState::Ready);
+}
+
+/// Unplug and re-plug, again and again, each time with transfers in flight: nothing is leaked, the picture comes back.
+#[test]
+fn a_thousand_plugs_leak_nothing() {
+    let mut device = Device::new(14, Options::default());
+    let mut host = Host::new(&device, 2_000_000, FAST_FPS);
+    host.link.connect();
+    host.arm(&device);
+    let mut files = 0;
+    for cycle in 0..1000 {
+        host.stream(&device, 5000, |_| lit(&device) >= 1);
+        device.unplug();
+        // Without waiting for the tenth of a second at which the link would try by itself.
+        let error = loop {
+            match host.link.poll(device.now(), &mut host.usb) {
+                Err(e) => break e,
+                Ok(state) => assert_eq!(state, LinkState::Streaming),
+            }
+        };
+        assert!(matches!(error, LinkError::Transport(TransportError::Unplugged { .. })), "{error}");
+        assert_eq!(host.usb.in_flight(), 0);
+        device.plug_in_again();
+        while host.usb.reopen().is_err() {
+            std::thread::sleep(Duration::from_micros(200));
+        }
+        host.link.connect();
+        host.arm(&device);
+        if cycle == 10 {
+            files = open_files();
+        }
+    }
+    // Other tests open and close files meanwhile: a leak would be one or more for each of 990 cycles.
+    assert!(open_files() < files + 300, "{} files, {files} after the tenth cycle", open_files());
+    assert_eq!(host.usb.counters().opened, 1001);
+}
