@@ -15,3 +15,4 @@ pub mod usb_model;
 pub mod usb_plug;
 pub mod vrpn_host;
 pub mod vrpn_server;
+pub mod usbip;
