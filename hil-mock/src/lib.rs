@@ -13,6 +13,6 @@ pub mod rng;
 pub mod tracker;
 pub mod usb_model;
 pub mod usb_plug;
+pub mod usbip;
 pub mod vrpn_host;
 pub mod vrpn_server;
-pub mod usbip;

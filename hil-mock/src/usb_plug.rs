@@ -127,6 +127,10 @@ struct State {
     pulled: bool,
     signalled: bool,
     configuration: u8,
+    /// Nothing moves before this instant.
+    held_until: Option<HostTime>,
+    /// Every transfer starts this much later.
+    delay_ns: i64,
     listeners: Vec<Box<dyn FnOnce() + Send>>,
     /// Transfers that have ended but whose completion has not returned yet.
     finishing: usize,
@@ -168,6 +172,16 @@ impl UsbPlug {
         let mut s = lock(&self.shared.state);
         let base = s.queues.get(&endpoint).map_or(0, |q| q.started + q.pending.len() as u64);
         s.faults.push((endpoint, base + nth, fault));
+    }
+
+    /// Lets nothing move before `until`: a device that is busy, as the host sees it.
+    pub fn hold_until(&self, until: HostTime) {
+        lock(&self.shared.state).held_until = Some(until);
+    }
+
+    /// Delays every transfer by `ns` from now on.
+    pub fn set_delay_ns(&self, ns: i64) {
+        lock(&self.shared.state).delay_ns = ns;
     }
 
     /// Queues a transfer. Gives it back when the plug is pulled.
@@ -416,14 +430,20 @@ impl Shared {
             Some(Fault::Unplug(n)) => limit = if is_in { 0 } else { limit.min(n) },
             _ => {}
         }
+        let delay_ns = lock(&self.state).delay_ns;
+        if delay_ns > 0 {
+            let start = (self.clock)().plus_ns(delay_ns);
+            refuse_until = refuse_until.max(Some(start));
+        }
         let mut moved = 0;
         loop {
             let now = (self.clock)();
-            let refused = refuse_until.is_some_and(|t| now < t);
+            let mut refused = refuse_until.is_some_and(|t| now < t);
             let skip = matches!(fault, Some(Fault::Unplug(_))) && limit == 0;
             let (seen, step) = {
                 let s = lock(&self.state);
                 let seen = s.moves;
+                refused |= s.held_until.is_some_and(|t| now < t);
                 let cancelled = s.queues.get(&endpoint).is_some_and(|q| q.cancel_running);
                 if cancelled || s.pulled {
                     return (if cancelled { Status::Cancelled } else { Status::Gone }, moved);
@@ -724,5 +744,9 @@ mod tests {
         assert_eq!(wait(&r0).0, Status::Babble);
         assert_eq!(wait(&r1), (Status::Ok, 1, vec![5, 0, 0, 0]));
         assert!(start.elapsed() >= Duration::from_millis(30));
+        let start = Instant::now();
+        b.plug.set_delay_ns(20_000_000);
+        wait(&b.send(0x01, None, vec![1]).1);
+        assert!(start.elapsed() >= Duration::from_millis(20));
     }
 }

@@ -1,7 +1,9 @@
 //! The devices that `hil-mock serve` offers: one module each.
 
 mod bodies;
+mod dlpc900;
 mod natnet;
+mod usb;
 mod vrpn;
 
 use clap::Subcommand;
@@ -10,6 +12,8 @@ use std::error::Error;
 /// A mock device.
 #[derive(Subcommand)]
 pub enum Device {
+    /// DLPC900 projector controller (LightCrafter 6500 / 9000): a USB HID device over USB/IP
+    Dlpc900(dlpc900::Dlpc900Arguments),
     /// OptiTrack NatNet server: poses over UDP
     Natnet(natnet::NatNetArguments),
     /// VRPN server: poses over TCP
@@ -19,6 +23,7 @@ pub enum Device {
 /// Runs `device` until it is stopped or fails.
 pub fn run(device: Device) -> Result<(), Box<dyn Error>> {
     match device {
+        Device::Dlpc900(arguments) => dlpc900::run(&arguments),
         Device::Natnet(arguments) => natnet::run(&arguments),
         Device::Vrpn(arguments) => vrpn::run(&arguments),
     }

@@ -4,7 +4,7 @@ use std::collections::BTreeMap;
 use std::io::{self, Read, Write};
 use std::net::{Shutdown, SocketAddr, TcpListener, TcpStream, ToSocketAddrs};
 use std::os::unix::net::UnixStream;
-use std::sync::atomic::{AtomicBool, Ordering};
+use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::time::Duration;
 
@@ -16,8 +16,9 @@ const SHORT_NOT_OK: u32 = 1;
 const ZERO_PACKET: u32 = 0x40;
 const EREMOTEIO: i32 = -121;
 const EINVAL: i32 = -22;
-/// Names of zero-length packets, beyond those of transfers (u32).
-const ZERO_PACKET_IDS: u64 = 1 << 32;
+/// Set in the names of zero-length packets; transfers' names are a session number and a u32.
+const ZERO_PACKET_IDS: u64 = 1 << 63;
+static SESSIONS: AtomicU64 = AtomicU64::new(0);
 
 /// A device on offer.
 #[derive(Clone)]
@@ -90,6 +91,7 @@ impl Link for UnixStream {
 pub struct Server {
     address: SocketAddr,
     stop: Arc<AtomicBool>,
+    exports: Arc<Mutex<Vec<Export>>>,
 }
 
 impl Server {
@@ -97,14 +99,15 @@ impl Server {
     pub fn start(address: impl ToSocketAddrs, exports: Vec<Export>) -> io::Result<Self> {
         let listener = TcpListener::bind(address)?;
         let (address, stop) = (listener.local_addr()?, Arc::new(AtomicBool::new(false)));
-        let stopped = stop.clone();
+        let exports = Arc::new(Mutex::new(exports));
+        let (stopped, offered) = (stop.clone(), exports.clone());
         std::thread::spawn(move || {
             for stream in listener.incoming() {
                 if stopped.load(Ordering::Acquire) {
                     return;
                 }
                 let Ok(stream) = stream else { continue };
-                let exports = exports.clone();
+                let exports = offered.lock().unwrap_or_else(PoisonError::into_inner).clone();
                 std::thread::spawn(move || {
                     // Small messages must not wait for each other; a client that does not read is given up.
                     let _ = stream.set_nodelay(true);
@@ -114,7 +117,12 @@ impl Server {
                 });
             }
         });
-        Ok(Self { address, stop })
+        Ok(Self { address, stop, exports })
+    }
+
+    /// Offers other devices from now on (after an unplug: the same model on a new plug). Connections that exist go on.
+    pub fn set_exports(&self, exports: Vec<Export>) {
+        *self.exports.lock().unwrap_or_else(PoisonError::into_inner) = exports;
     }
 
     /// Where it listens.
@@ -157,6 +165,7 @@ pub fn serve<L: Link>(mut link: L, exports: &[Export]) -> io::Result<()> {
 
 /// One imported device.
 struct Session<L> {
+    number: u64,
     state: Mutex<State<L>>,
 }
 
@@ -167,6 +176,11 @@ struct State<L> {
 }
 
 impl<L: Link> Session<L> {
+    /// Name of a transfer on the plug, which outlives the session.
+    fn id(&self, seqnum: u32) -> u64 {
+        (self.number & 0x3fff_ffff) << 32 | u64::from(seqnum)
+    }
+
     fn lock(&self) -> MutexGuard<'_, State<L>> {
         self.state.lock().unwrap_or_else(PoisonError::into_inner)
     }
@@ -174,13 +188,16 @@ impl<L: Link> Session<L> {
     /// Serves URBs on `link` until either side goes.
     pub fn run(mut link: L, cable: Arc<dyn UsbCable>) -> io::Result<()> {
         let state = Mutex::new(State { out: link.another()?, pending: BTreeMap::new() });
-        let session = Arc::new(Self { state });
+        let number = SESSIONS.fetch_add(1, Ordering::Relaxed);
+        let session = Arc::new(Self { number, state });
         let on_gone = link.another()?;
         cable.on_unplug(Box::new(move || on_gone.cut()));
         let result = session.serve(&mut link, &cable);
         // The client has gone: what it asked for is taken back.
         let left: Vec<_> = session.lock().pending.keys().copied().collect();
-        left.into_iter().for_each(|s| drop(cable.cancel(u64::from(s))));
+        for seqnum in left {
+            cable.cancel(session.id(seqnum));
+        }
         link.cut();
         result
     }
@@ -214,7 +231,7 @@ impl<L: Link> Session<L> {
                     });
                     let bytes = buffer.len();
                     let setup = control.then_some(setup);
-                    let request = Request { id: u64::from(seqnum), endpoint, setup, buffer, done };
+                    let request = Request { id: self.id(seqnum), endpoint, setup, buffer, done };
                     if cable.submit(request).is_err() {
                         return Ok(());
                     }
@@ -226,7 +243,7 @@ impl<L: Link> Session<L> {
                     if flags & ZERO_PACKET != 0 && !is_in && !control && bytes > 0 {
                         let packet = packet();
                         if packet > 0 && bytes.is_multiple_of(packet) {
-                            let id = ZERO_PACKET_IDS + u64::from(seqnum);
+                            let id = ZERO_PACKET_IDS | self.id(seqnum);
                             let zero = Request {
                                 id,
                                 endpoint,
@@ -246,7 +263,7 @@ impl<L: Link> Session<L> {
                             *asked = Some(seqnum);
                             drop(s);
                             // Its completion, whichever it is, answers the unlink too.
-                            cable.cancel(u64::from(victim));
+                            cable.cancel(self.id(victim));
                         }
                         None => s.out.write_all(&Urb::Unlinked { seqnum, status: 0 }.encode())?,
                     }

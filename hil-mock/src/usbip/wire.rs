@@ -132,8 +132,11 @@ fn bad(what: String) -> io::Error {
     io::Error::new(io::ErrorKind::InvalidData, what)
 }
 
+/// Class, subclass and protocol of an interface.
+pub type InterfaceClass = (u8, u8, u8);
+
 /// The reply to [`Operation::List`]: every device with its interfaces' (class, subclass, protocol).
-pub fn list_reply(devices: &[(DeviceRecord, Vec<(u8, u8, u8)>)]) -> Vec<u8> {
+pub fn list_reply(devices: &[(DeviceRecord, Vec<InterfaceClass>)]) -> Vec<u8> {
     let mut out = operation(REPLY_LIST, 0);
     out.extend_from_slice(&(devices.len() as u32).to_be_bytes());
     for (record, interfaces) in devices {
