@@ -2,6 +2,7 @@
 
 mod gate;
 pub mod natnet;
+pub mod record;
 #[cfg(feature = "net")]
 pub mod udp;
 pub mod vrpn;
