@@ -11,6 +11,7 @@ pub mod files;
 pub mod frame;
 pub mod geometry;
 pub mod gpu;
+pub mod metrics;
 pub mod pack;
 pub mod pipeline;
 pub mod plan;
