@@ -8,6 +8,7 @@
 #![cfg_attr(not(feature = "std"), no_std)]
 
 pub mod clock_map;
+pub mod cobs;
 pub mod dlpc900;
 pub mod link;
 pub mod planes;

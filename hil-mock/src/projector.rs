@@ -8,6 +8,7 @@ mod clock;
 mod frames;
 mod light;
 mod receive;
+pub mod serial;
 mod thread;
 pub mod usb;
 

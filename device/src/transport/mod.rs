@@ -1,6 +1,8 @@
 //! Packets into bytes on a medium and back: what the link needs from USB, a serial port, or a device in the same process.
 
 pub mod inproc;
+#[cfg(feature = "serial")]
+pub mod serial;
 #[cfg(feature = "usb")]
 pub mod usb;
 

@@ -1,0 +1,277 @@
+//! Packets into COBS frames on a serial line: for control, slow panels and trigger boards.
+//!
+//! One stream carries both lanes, a packet a frame. Control messages overtake planes that still wait, so they are late by at most
+//! one packet and what the driver has buffered. Nothing waits: bytes that the line does not take now are kept, and while a frame
+//! is kept no other is taken.
+
+use std::io::{ErrorKind, Read, Write};
+use std::time::Duration;
+
+use serialport::SerialPort;
+
+use super::{Lane, SendError, Transport, TransportError};
+use crate::cobs::{encode, encoded_bytes, Deframer};
+use crate::link::{packet_bytes, Packet, MAX_CONTROL_BYTES};
+use crate::planes::MAX_PLANES;
+use crate::time::HostTime;
+
+/// Bytes of control messages that may wait.
+const CONTROL_WAITING: usize = 4096;
+/// Bytes read in one call at most: bounds the time of `receive`.
+const READ_AT_ONCE: usize = 16 * 1024;
+
+/// Which port, and how it is used.
+#[derive(Clone, Debug)]
+pub struct SerialSettings {
+    /// Device file: `/dev/ttyUSB0`, `/dev/serial/by-id/...`.
+    pub path: String,
+    /// Bits per second; 8 data bits, no parity, one stop bit.
+    pub baud: u32,
+    /// Bytes of the largest frame on the wire, see [`packet_bytes`].
+    pub frame_bytes: usize,
+}
+
+/// What has happened on the line.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub struct SerialCounters {
+    /// Bytes that the line took.
+    pub bytes_out: u64,
+    /// Bytes received.
+    pub bytes_in: u64,
+    /// Times that the port was opened.
+    pub opened: u64,
+}
+
+/// The link over a serial port.
+pub struct SerialTransport {
+    settings: SerialSettings,
+    port: Option<Box<dyn SerialPort>>,
+    deframer: Deframer<[u8; DEFRAMED]>,
+    /// Encoded packets of the frame that is going out, and where each ends.
+    data: Vec<u8>,
+    ends: [usize; MAX_PLANES + 1],
+    packets: usize,
+    next_packet: usize,
+    control: Vec<u8>,
+    /// Encoded bytes of the packet that has begun, from `control` or `data`, and how many are out.
+    going: Option<(Lane, usize, usize)>,
+    counters: SerialCounters,
+}
+
+const DEFRAMED: usize = packet_bytes(MAX_CONTROL_BYTES);
+
+impl SerialTransport {
+    /// Opens the port for this program alone.
+    ///
+    /// # Errors
+    /// Not found; no permission (with the group to join); in use by another program.
+    pub fn open(settings: SerialSettings) -> Result<Self, TransportError> {
+        let mut serial = Self::closed(settings);
+        serial.reopen()?;
+        Ok(serial)
+    }
+
+    /// On a port that is open already (a pseudo-terminal).
+    pub fn with_port(settings: SerialSettings, port: Box<dyn SerialPort>) -> Self {
+        let mut serial = Self::closed(settings);
+        serial.port = Some(port);
+        serial
+    }
+
+    fn closed(settings: SerialSettings) -> Self {
+        let room = encoded_bytes(settings.frame_bytes) + 2 * (MAX_PLANES + 1);
+        Self {
+            settings,
+            port: None,
+            deframer: Deframer::new([0; DEFRAMED]),
+            data: vec![0; room],
+            ends: [0; MAX_PLANES + 1],
+            packets: 0,
+            next_packet: 0,
+            control: Vec::with_capacity(CONTROL_WAITING),
+            going: None,
+            counters: SerialCounters::default(),
+        }
+    }
+
+    /// What has happened so far.
+    pub fn counters(&self) -> SerialCounters {
+        self.counters
+    }
+
+    /// Encoded bytes that the line has not taken yet.
+    pub fn waiting(&self) -> usize {
+        let data = if self.packets == 0 { 0 } else { self.ends[self.packets - 1] - self.data_at() };
+        data + self.control.len()
+    }
+
+    fn data_at(&self) -> usize {
+        match self.going {
+            Some((Lane::Data, at, _)) => at,
+            _ if self.next_packet == 0 => 0,
+            _ => self.ends[self.next_packet - 1],
+        }
+    }
+
+    fn gone(&mut self) -> TransportError {
+        self.port = None;
+        TransportError::Unplugged { device: self.settings.path.clone() }
+    }
+
+    /// Writes what the line takes now.
+    fn flush(&mut self) -> Result<(), TransportError> {
+        loop {
+            let (lane, at, end) = match self.going {
+                Some(going) => going,
+                None if !self.control.is_empty() => (Lane::Control, 0, self.control.len()),
+                None if self.next_packet < self.packets => {
+                    let at = self.data_at();
+                    self.next_packet += 1;
+                    (Lane::Data, at, self.ends[self.next_packet - 1])
+                }
+                None => return Ok(()),
+            };
+            self.going = Some((lane, at, end));
+            let Some(port) = &mut self.port else { return Err(self.gone()) };
+            let bytes = match lane {
+                Lane::Control => &self.control[at..end],
+                Lane::Data => &self.data[at..end],
+            };
+            match port.write(bytes) {
+                Ok(0) => return Ok(()),
+                Ok(n) => {
+                    self.counters.bytes_out += n as u64;
+                    self.going = Some((lane, at + n, end));
+                    if at + n < end {
+                        continue;
+                    }
+                    self.going = None;
+                    match lane {
+                        // Messages that came while these were going out wait behind them.
+                        Lane::Control => drop(self.control.drain(..end)),
+                        Lane::Data if self.next_packet == self.packets => {
+                            (self.packets, self.next_packet) = (0, 0);
+                        }
+                        Lane::Data => {}
+                    }
+                }
+                Err(e) => match e.kind() {
+                    ErrorKind::WouldBlock | ErrorKind::TimedOut | ErrorKind::Interrupted => return Ok(()),
+                    _ => return Err(self.gone()),
+                },
+            }
+        }
+    }
+}
+
+impl std::fmt::Debug for SerialTransport {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        f.debug_struct("SerialTransport")
+            .field("settings", &self.settings)
+            .field("counters", &self.counters)
+            .finish()
+    }
+}
+
+impl Transport for SerialTransport {
+    fn send(&mut self, _now: HostTime, lane: Lane, packets: &[Packet<'_>]) -> Result<(), SendError> {
+        self.flush()?;
+        match lane {
+            Lane::Control => {
+                for packet in packets {
+                    let from = self.control.len();
+                    let room = encoded_bytes(packet.wire_bytes());
+                    if from + room > CONTROL_WAITING {
+                        return Err(SendError::Busy);
+                    }
+                    self.control.resize(from + room, 0);
+                    let n = encode(&packet.parts(), &mut self.control[from..]).unwrap_or(0);
+                    self.control.truncate(from + n);
+                }
+            }
+            Lane::Data => {
+                if self.packets > 0 {
+                    return Err(SendError::Busy);
+                }
+                let mut at = 0;
+                for (packet, end) in packets.iter().zip(&mut self.ends) {
+                    let n = encode(&packet.parts(), &mut self.data[at..]);
+                    at += n.unwrap_or_else(|| {
+                        panic!("frame longer than the {} bytes agreed", self.settings.frame_bytes)
+                    });
+                    *end = at;
+                }
+                (self.packets, self.next_packet) = (packets.len(), 0);
+            }
+        }
+        Ok(self.flush()?)
+    }
+
+    fn has_room(&mut self, lane: Lane) -> bool {
+        match lane {
+            Lane::Control => self.control.len() + encoded_bytes(DEFRAMED) <= CONTROL_WAITING,
+            Lane::Data => self.packets == 0,
+        }
+    }
+
+    fn receive(&mut self, _now: HostTime, sink: &mut dyn FnMut(Lane, &[u8])) -> Result<(), TransportError> {
+        self.flush()?;
+        let mut bytes = [0u8; 2048];
+        let mut left = READ_AT_ONCE;
+        while left > 0 {
+            let Some(port) = &mut self.port else { return Err(self.gone()) };
+            match port.read(&mut bytes) {
+                // End of file: the other end of a pseudo-terminal is closed, or the adapter is gone.
+                Ok(0) => return Err(self.gone()),
+                Ok(n) => {
+                    self.counters.bytes_in += n as u64;
+                    left = left.saturating_sub(n);
+                    self.deframer.push(&bytes[..n], &mut |frame| sink(Lane::Control, frame));
+                }
+                Err(e) => match e.kind() {
+                    ErrorKind::WouldBlock | ErrorKind::TimedOut | ErrorKind::Interrupted => break,
+                    _ => return Err(self.gone()),
+                },
+            }
+        }
+        Ok(())
+    }
+
+    fn reopen(&mut self) -> Result<(), TransportError> {
+        self.port = None;
+        let path = &self.settings.path;
+        let builder = serialport::new(path, self.settings.baud).timeout(Duration::ZERO);
+        // Exclusive by lock and by TIOCEXCL; the library's default, said here because it is a promise.
+        let port = builder.exclusive(true).open().map_err(|e| open_error(path, e))?;
+        self.port = Some(port);
+        self.deframer.reset();
+        self.control.clear();
+        (self.packets, self.next_packet, self.going) = (0, 0, None);
+        self.counters.opened += 1;
+        Ok(())
+    }
+
+    fn name(&self) -> &str {
+        &self.settings.path
+    }
+}
+
+fn open_error(path: &str, e: serialport::Error) -> TransportError {
+    let device = format!("serial port {path}");
+    // The library folds several system errors into "no device"; only its text tells them apart.
+    let text = e.description.to_lowercase();
+    if text.contains("busy") || text.contains("lock") || text.contains("temporarily unavailable") {
+        return TransportError::InUse { device };
+    }
+    if text.contains("permission denied") {
+        let remedy =
+            "add this user to the group that owns it (`sudo usermod -aG dialout $USER`, then log in again)";
+        return TransportError::PermissionDenied { device, remedy: remedy.into() };
+    }
+    match e.kind() {
+        serialport::ErrorKind::NoDevice | serialport::ErrorKind::Io(ErrorKind::NotFound) => {
+            TransportError::NotFound { device }
+        }
+        _ => TransportError::Io { context: format!("cannot open {device}"), source: e.into() },
+    }
+}

@@ -1,0 +1,232 @@
+//! The bit-plane link over a pseudo-terminal: real serialport, real kernel line, mock projector at the far end.
+
+use std::io::Write;
+use std::path::Path;
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::sync::{Arc, Mutex};
+use std::thread::JoinHandle;
+use std::time::{Duration, Instant};
+
+use dpm_device::link::{
+    packet_bytes, Codec, Epoch, HostLink, LinkSettings, LinkState, SendOutcome, Underrun,
+};
+use dpm_device::planes::{PlaneSchedule, Raster};
+use dpm_device::time::{DeviceTicks, FrameRate, HostTime};
+use dpm_device::transport::serial::{SerialSettings, SerialTransport};
+use dpm_device::transport::{Transport, TransportError};
+use hil_mock::projector::serial::SerialProjector;
+use hil_mock::projector::{MockConfig, MockProjector};
+use serialport::{SerialPort, TTYPort};
+
+fn raster() -> Raster {
+    Raster::new(64, 32).unwrap()
+}
+
+fn planes(id: u64) -> Vec<u8> {
+    // Mostly still, with zeros and runs: what COBS and the codecs have to cope with.
+    let n = raster().plane_bytes() * 8;
+    let moving = |i: u64| (i / 256).is_multiple_of(2) && i % 97 == id % 97;
+    (0..n as u64).map(|i| if moving(i) { id as u8 } else { (i / 64) as u8 }).collect()
+}
+
+/// A projector on the master end of a pseudo-terminal, served by a thread.
+struct Far {
+    mock: Arc<Mutex<SerialProjector>>,
+    stop: Arc<AtomicBool>,
+    thread: Option<JoinHandle<()>>,
+    start: Instant,
+    garbage: Arc<Mutex<Vec<u8>>>,
+}
+
+fn pair() -> (TTYPort, TTYPort) {
+    let (mut master, mut slave) = TTYPort::pair().expect("a pseudo-terminal");
+    master.set_timeout(Duration::ZERO).unwrap();
+    slave.set_timeout(Duration::ZERO).unwrap();
+    (master, slave)
+}
+
+impl Far {
+    fn new(mut master: TTYPort, mock: Arc<Mutex<SerialProjector>>, start: Instant) -> Self {
+        let stop = Arc::new(AtomicBool::new(false));
+        let garbage = Arc::new(Mutex::new(Vec::new()));
+        let (stopped, served, noise) = (stop.clone(), mock.clone(), garbage.clone());
+        let thread = std::thread::spawn(move || {
+            while !stopped.load(Ordering::Relaxed) {
+                let now = HostTime(start.elapsed().as_nanos() as i64);
+                let mut mock = served.lock().unwrap();
+                let noise: Vec<u8> = std::mem::take(&mut *noise.lock().unwrap());
+                if !noise.is_empty() {
+                    // Both ways: a glitch on the line, as far as this end can make one.
+                    mock.receive(now, &noise);
+                    let _ = master.write(&noise);
+                }
+                match mock.serve(now, &mut master) {
+                    Ok(true) => {}
+                    Ok(false) => break,
+                    Err(e) => panic!("{e}"),
+                }
+                drop(mock);
+                std::thread::sleep(Duration::from_micros(300));
+            }
+        });
+        Self { mock, stop, thread: Some(thread), start, garbage }
+    }
+
+    fn now(&self) -> HostTime {
+        HostTime(self.start.elapsed().as_nanos() as i64)
+    }
+
+    fn with<R>(&self, f: impl FnOnce(&mut MockProjector) -> R) -> R {
+        f(self.mock.lock().unwrap().projector())
+    }
+
+    fn hang_up(&mut self) {
+        self.stop.store(true, Ordering::Relaxed);
+        if let Some(thread) = self.thread.take() {
+            thread.join().unwrap();
+        }
+    }
+}
+
+impl Drop for Far {
+    fn drop(&mut self) {
+        self.hang_up();
+    }
+}
+
+struct Near {
+    link: HostLink,
+    line: SerialTransport,
+    next_id: u64,
+}
+
+fn settings(path: &str) -> SerialSettings {
+    let frame_bytes = packet_bytes(raster().plane_bytes()) * 8 + packet_bytes(16);
+    SerialSettings { path: path.into(), baud: 3_000_000, frame_bytes }
+}
+
+impl Near {
+    fn new(line: SerialTransport, codecs: u32) -> Self {
+        let link = HostLink::new(LinkSettings {
+            raster: raster(),
+            schedule: PlaneSchedule::mono8(),
+            rate: FrameRate::new(100, 1).unwrap(),
+            watchdog_us: 2_000_000,
+            underrun: Underrun::Repeat,
+            late_slots: 100,
+            epoch: Epoch::At(DeviceTicks(0)),
+            codecs,
+            session_seed: 5,
+        });
+        Self { link, line, next_id: 1 }
+    }
+
+    fn until(&mut self, far: &Far, limit: Duration, mut done: impl FnMut(&mut Self) -> bool) -> Duration {
+        let start = Instant::now();
+        loop {
+            let _ = self.link.poll(far.now(), &mut self.line);
+            if self.link.state() == LinkState::Ready {
+                self.link.arm(0);
+            }
+            if self.link.state() == LinkState::Streaming {
+                let now = far.now();
+                let slots = self.link.slots().unwrap();
+                let slot = slots.slot_at(DeviceTicks(now.0 as u64)).unwrap() + 1;
+                let (id, target) = (self.next_id, slots.start(slot));
+                if self.link.send_frame(now, id, target, &planes(id), &mut self.line) == SendOutcome::Sent {
+                    self.next_id += 1;
+                }
+            }
+            if done(self) {
+                return start.elapsed();
+            }
+            let status = far.with(|m| m.status());
+            assert!(start.elapsed() < limit, "{:?} {status:?} {:?}", self.link.state(), self.line);
+            std::thread::sleep(Duration::from_micros(300));
+        }
+    }
+}
+
+fn check_lit(far: &Far) {
+    far.with(|m| {
+        let id = m.lit_frame().expect("a frame is lit");
+        assert_eq!(m.lit_planes().unwrap(), planes(u64::from(id)));
+    });
+}
+
+const LONG: Duration = Duration::from_secs(10);
+
+fn setup() -> Arc<Mutex<SerialProjector>> {
+    Arc::new(Mutex::new(SerialProjector::new(MockProjector::new(MockConfig::new(raster())))))
+}
+
+#[test]
+fn frames_cross_a_serial_line_and_noise_costs_frames_not_the_link() {
+    for codecs in [Codec::Raw.mask(), Codec::ALL] {
+        let (master, slave) = pair();
+        let far = Far::new(master, setup(), Instant::now());
+        let mut near = Near::new(SerialTransport::with_port(settings("pty"), Box::new(slave)), codecs);
+        near.link.connect();
+        near.until(&far, LONG, |_| far.with(|m| m.status().frames_lit) >= 10);
+        check_lit(&far);
+        let clean = far.with(|m| m.status());
+        assert_eq!((clean.frames_incomplete, clean.header_errors, clean.payload_errors), (0, 0, 0));
+        // Noise in the middle of whatever is going on, delimiters and half packets included.
+        for noise in [&b"\x00"[..], b"\x05DPML\x00", b"junk without an end", &[0xff; 300], &[0; 5]] {
+            far.garbage.lock().unwrap().extend_from_slice(noise);
+            let from = far.with(|m| m.status().frames_lit);
+            near.until(&far, LONG, |_| far.with(|m| m.status().frames_lit) >= from + 5);
+            check_lit(&far);
+        }
+        assert_eq!(near.link.counters().sessions, 1, "the session survived");
+        if codecs == Codec::ALL {
+            let c = near.link.counters();
+            assert!(c.planes_kept > c.planes_raw, "still planes are not sent: {c:?}");
+        }
+    }
+}
+
+/// A new pseudo-terminal behind `path`, as an adapter that is plugged in: its far end.
+fn plug(path: &Path) -> TTYPort {
+    let (master, slave) = pair();
+    let _ = std::fs::remove_file(path);
+    std::os::unix::fs::symlink(slave.name().unwrap(), path).unwrap();
+    master
+}
+
+#[test]
+fn a_line_that_is_cut_is_noticed_and_taken_up_again() {
+    let folder = std::env::temp_dir().join(format!("dpm-serial-{}", std::process::id()));
+    std::fs::create_dir_all(&folder).unwrap();
+    let path = folder.join("port");
+    let (start, mock) = (Instant::now(), setup());
+    // The near end first: a far end without a near one reads as hung up.
+    let master = plug(&path);
+    let line = SerialTransport::open(settings(path.to_str().unwrap())).unwrap();
+    let mut far = Far::new(master, mock.clone(), start);
+    let second = SerialTransport::open(settings(line.name())).unwrap_err();
+    assert!(matches!(second, TransportError::InUse { .. }), "exclusive: {second}");
+    let mut near = Near::new(line, Codec::Raw.mask());
+    near.link.connect();
+    near.until(&far, LONG, |_| far.with(|m| m.status().frames_lit) >= 5);
+    far.hang_up();
+    let noticed = near.until(&far, LONG, |n| n.link.state() == LinkState::Lost);
+    assert!(noticed < Duration::from_millis(100), "{noticed:?}");
+    let master = plug(&path);
+    let replug = Instant::now();
+    near.until(&far, LONG, |n| n.link.state() == LinkState::Greeting);
+    let far = Far::new(master, mock, start);
+    near.until(&far, LONG, |n| n.link.state() == LinkState::Streaming);
+    assert!(replug.elapsed() < Duration::from_secs(1), "{:?}", replug.elapsed());
+    near.until(&far, LONG, |_| far.with(|m| m.status().frames_lit) >= 5);
+    check_lit(&far);
+    assert_eq!(near.line.counters().opened, 2);
+    let _ = std::fs::remove_dir_all(&folder);
+}
+
+#[test]
+fn an_absent_port_is_named() {
+    let error = SerialTransport::open(settings("/dev/no-such-port")).unwrap_err();
+    assert!(matches!(error, TransportError::NotFound { .. }), "{error}");
+    assert!(error.to_string().contains("/dev/no-such-port"));
+}
