@@ -334,6 +334,34 @@ fn damaged_vertices_are_dropped_and_counted() {
 }
 
 #[test]
+fn what_is_not_reproduced_is_said() {
+    let glb = tetrahedra()
+        .set("/meshes/0/primitives/0/attributes/COLOR_0", json!(0))
+        .set("/materials/0/alphaMode", json!("BLEND"))
+        .set("/materials/0/extensions", json!({"KHR_materials_sheen": {}, "KHR_materials_unlit": {}}))
+        .set("/animations", json!([{"channels": [], "samplers": []}]));
+    let warnings = load(&glb).warnings.join("\n");
+    for words in [
+        "primitive 0: vertex colours",
+        "alphaMode BLEND",
+        "KHR_materials_sheen",
+        "KHR_materials_unlit",
+        "animations",
+    ] {
+        assert!(warnings.contains(words), "{words} is missing in\n{warnings}");
+    }
+}
+
+#[test]
+fn a_body_may_be_tracked_without_being_projected_on() {
+    let mut options = select(&[("a", "left"), ("b", "right")]);
+    options.bodies[0].projected = false;
+    let scene = load_with(&tetrahedra(), &options);
+    let seen: Vec<_> = scene.bodies.iter().map(|b| (b.name.as_str(), b.tracked, b.projected)).collect();
+    assert_eq!(seen, [("a", Some(0), false), ("b", Some(1), true)]);
+}
+
+#[test]
 fn a_lamp_is_not_projected_on_when_nobody_says_what_is() {
     let glb = tetrahedra()
         .set("/materials/1", json!({"emissiveFactor": [1.0, 1.0, 1.0]}))

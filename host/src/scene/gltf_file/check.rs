@@ -149,6 +149,10 @@ fn check_mesh(
         let attributes =
             primitive.object("attributes")?.ok_or_else(|| primitive.error("has no 'attributes'"))?;
         let vertices = check_attributes(&primitive, &attributes, data, quantized)?;
+        if attributes.keys().any(|k| k.starts_with("COLOR_")) {
+            warnings
+                .push(format!("{}: vertex colours are ignored: bake them into a texture", primitive.name));
+        }
         let corners = match primitive.index("indices", data.accessors.len(), "accessor")? {
             Some(i) => {
                 let a = &data.accessors[i];

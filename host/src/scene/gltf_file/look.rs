@@ -34,7 +34,7 @@ pub fn read_look(
 ) -> Result<Look, SceneError> {
     let mut reader = Reader {
         document,
-        root,
+        image_items: root.list("images", "image", limits.objects)?,
         data,
         folder,
         limits,
@@ -58,7 +58,7 @@ pub fn read_look(
 
 struct Reader<'a> {
     document: &'a gltf::Document,
-    root: &'a Item<'a>,
+    image_items: Vec<Item<'a>>,
     data: &'a Data,
     folder: Option<&'a Folder>,
     limits: &'a Limits,
@@ -208,8 +208,9 @@ impl Reader<'_> {
     }
 
     fn decode(&self, index: usize) -> Result<(u32, u32, Vec<[u8; 4]>), SceneError> {
-        let raw = self.root.list("images", "image", self.limits.objects)?;
-        let Some(item) = raw.get(index) else { return Err(self.root.error(format!("has no image {index}"))) };
+        let Some(item) = self.image_items.get(index) else {
+            return Err(SceneError::broken("textures", format!("name image {index}, which is not there")));
+        };
         let fetched;
         let bytes = match (item.text("uri")?, item.whole("bufferView")?) {
             (Some(uri), _) => {

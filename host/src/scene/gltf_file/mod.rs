@@ -63,8 +63,6 @@ pub(super) fn read(
 
 /// The document without the parts that are read elsewhere or not at all, so that the crate never meets them.
 fn reduced(tree: &Value) -> Value {
-    let mut out = tree.clone();
-    let Some(top) = out.as_object_mut() else { return out };
     let kept = [
         "asset",
         "scene",
@@ -77,7 +75,8 @@ fn reduced(tree: &Value) -> Value {
         "samplers",
         "extensions",
     ];
-    top.retain(|key, _| kept.contains(&key.as_str()));
+    let mut top: serde_json::Map<String, Value> =
+        kept.iter().filter_map(|key| Some(((*key).to_owned(), tree.get(key)?.clone()))).collect();
     let strip = |object: &mut Value, keys: &[&str]| {
         if let Some(object) = object.as_object_mut() {
             object.retain(|key, _| !keys.contains(&key.as_str()));
@@ -86,20 +85,20 @@ fn reduced(tree: &Value) -> Value {
     let lists = |top: &mut serde_json::Map<String, Value>, list: &str, each: &mut dyn FnMut(&mut Value)| {
         top.get_mut(list).and_then(Value::as_array_mut).into_iter().flatten().for_each(each);
     };
-    lists(top, "nodes", &mut |node| strip(node, &["camera", "skin", "weights", "extras"]));
-    lists(top, "meshes", &mut |mesh| {
+    lists(&mut top, "nodes", &mut |node| strip(node, &["camera", "skin", "weights", "extras"]));
+    lists(&mut top, "meshes", &mut |mesh| {
         strip(mesh, &["weights", "extras", "extensions"]);
         let primitives = mesh.get_mut("primitives").and_then(Value::as_array_mut).into_iter().flatten();
         primitives.for_each(|p| strip(p, &["targets", "extras", "extensions"]));
     });
     // Only which image is meant matters to the crate; the bytes are fetched here.
-    lists(top, "images", &mut |image| *image = serde_json::json!({}));
+    lists(&mut top, "images", &mut |image| *image = serde_json::json!({}));
     for list in ["scenes", "materials", "textures", "samplers"] {
-        lists(top, list, &mut |object| strip(object, &["extras"]));
+        lists(&mut top, list, &mut |object| strip(object, &["extras"]));
     }
-    lists(top, "textures", &mut |texture| strip(texture, &["extensions"]));
+    lists(&mut top, "textures", &mut |texture| strip(texture, &["extensions"]));
     if let Some(extensions) = top.get_mut("extensions").and_then(Value::as_object_mut) {
         extensions.retain(|key, _| key == "KHR_lights_punctual");
     }
-    out
+    Value::Object(top)
 }
