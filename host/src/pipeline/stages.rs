@@ -2,13 +2,12 @@
 
 use super::job::{hash_codes, FrameJob};
 use crate::clock::Stopwatch;
-use crate::config::RigConfig;
 use crate::frame::{FrameId, Stage};
 use crate::gpu::GpuError;
 use crate::pack::{self, Kernel};
 use crate::render::{FrameInputs, Renderer};
 use crate::rig::{affine, Rig};
-use crate::tracking::{Freshness, PoseFilterBank, PoseFilterConfig, Prediction, TrackState};
+use crate::tracking::{Freshness, PoseFilterBank, PoseFilterConfig, TrackState};
 use dpm_device::link::SlotClock;
 use dpm_device::time::HostTime;
 use dpm_device::tracker::{BodyIndex, Tracker, TrackerError};
@@ -42,7 +41,7 @@ pub struct TrackingStage {
 impl TrackingStage {
     /// A stage for the rig's bodies.
     pub fn new(rig: &Rig, tracker: Box<dyn Tracker>) -> Self {
-        let config = filter_config(&rig.config);
+        let config = PoseFilterConfig::from_rig(&rig.config.prediction, rig.config.safety.predict_ms);
         let bodies = rig.bodies.len().min(MAX_TRACKED);
         Self {
             tracker,
@@ -78,18 +77,6 @@ impl TrackingStage {
     /// Counters of filters and tracker in words.
     pub fn status(&self) -> String {
         self.tracker.status()
-    }
-}
-
-fn filter_config(config: &RigConfig) -> PoseFilterConfig {
-    let p = &config.prediction;
-    PoseFilterConfig {
-        prediction: if p.on { Prediction::On } else { Prediction::Off },
-        position_noise_m: p.noise_m,
-        rotation_noise_rad: p.noise_rad,
-        gate_sigmas: p.gate_sigma,
-        lost_after_ns: (i64::from(config.safety.predict_ms) * 1_000_000).max(1_000_000),
-        ..PoseFilterConfig::default()
     }
 }
 

@@ -111,7 +111,7 @@ pub fn models_for(acceleration: f64) -> ImmConfig {
 impl PoseFilterConfig {
     /// The settings of a rig file: `[prediction]`, and `safety.predict_ms` as the time after which a body is lost.
     pub fn from_rig(prediction: &PredictionConfig, predict_ms: u32) -> Self {
-        let lost_after_ns = i64::from(predict_ms) * 1_000_000;
+        let lost_after_ns = i64::from(predict_ms.max(1)) * 1_000_000;
         let defaults = Self::default();
         Self {
             prediction: if prediction.on { Prediction::On } else { Prediction::Off },

@@ -1,0 +1,80 @@
+//! Histograms into an HdrHistogram log, version 2 encoding: what the HdrHistogram tools of every language read.
+
+use super::interval::Interval;
+use super::profile::Profiler;
+use hdrhistogram::serialization::interval_log::{IntervalLogWriterBuilder, Tag};
+use hdrhistogram::serialization::V2DeflateSerializer;
+use std::io::{Error, Write};
+use std::time::Duration;
+
+/// Writes one line per interval, tagged with its name, all covering `length` from the start of the run; values in nanoseconds,
+/// the column of largest values in milliseconds.
+pub fn write_v2_log(writer: &mut impl Write, profiler: &Profiler, length: Duration) -> Result<(), Error> {
+    let mut serializer = V2DeflateSerializer::new();
+    let mut builder = IntervalLogWriterBuilder::new();
+    builder
+        .add_comment("dpm profile: values in nanoseconds, one tag per interval of docs/LATENCY.md")
+        .with_max_value_divisor(1e6);
+    let mut log = builder.begin_log_with(writer, &mut serializer)?;
+    for interval in Interval::ALL {
+        let tag = Tag::new(interval.name());
+        log.write_histogram(profiler.histogram(interval), Duration::ZERO, length, tag)
+            .map_err(|e| Error::other(format!("histogram {}: {e:?}", interval.name())))?;
+    }
+    Ok(())
+}
+
+#[cfg(test)]
+mod tests {
+    use super::super::interval::tests::frame;
+    use super::*;
+    use dpm_device::time::FrameRate;
+    use hdrhistogram::serialization::interval_log::{IntervalLogIterator, LogEntry};
+    use hdrhistogram::serialization::Deserializer;
+
+    #[test]
+    fn a_log_reads_back_as_the_same_histograms() {
+        let mut profiler = Profiler::new(FrameRate::new(947, 1).unwrap(), true, 100);
+        for k in 1..=500 {
+            profiler.lit(&frame(k, k * 1000), k as u64, false, false);
+        }
+        let mut bytes = Vec::new();
+        write_v2_log(&mut bytes, &profiler, Duration::from_secs(2)).unwrap();
+        let mut read = 0;
+        for entry in IntervalLogIterator::new(&bytes) {
+            if let LogEntry::Interval(line) = entry.unwrap() {
+                let encoded = base64_decoded(line.encoded_histogram());
+                let histogram: hdrhistogram::Histogram<u64> =
+                    Deserializer::new().deserialize(&mut encoded.as_slice()).unwrap();
+                let interval = Interval::ALL[read];
+                assert_eq!(line.tag().unwrap().as_str(), interval.name());
+                assert_eq!(&histogram, profiler.histogram(interval));
+                read += 1;
+            }
+        }
+        assert_eq!(read, Interval::ALL.len());
+    }
+
+    /// RFC 4648, the standard alphabet.
+    fn base64_decoded(text: &str) -> Vec<u8> {
+        let value = |c: u8| match c {
+            b'A'..=b'Z' => c - b'A',
+            b'a'..=b'z' => c - b'a' + 26,
+            b'0'..=b'9' => c - b'0' + 52,
+            b'+' => 62,
+            b'/' => 63,
+            _ => panic!("{c} is not in the alphabet"),
+        };
+        let mut out = Vec::new();
+        let (mut bits, mut n) = (0u32, 0);
+        for c in text.bytes().filter(|c| *c != b'=') {
+            bits = bits << 6 | u32::from(value(c));
+            n += 6;
+            if n >= 8 {
+                n -= 8;
+                out.push((bits >> n) as u8);
+            }
+        }
+        out
+    }
+}
