@@ -3,6 +3,7 @@
 use super::os;
 use super::watch::print;
 use crate::failure::{Failure, FailureKind};
+use crate::realtime::{self, Refusal};
 use crate::telemetry::report::to_json;
 use std::fs;
 use std::path::PathBuf;
@@ -67,8 +68,9 @@ pub fn execute(args: &DoctorArgs) -> Result<(), Failure> {
     let can_render = vulkan(&mut findings);
     findings.push(cores(std::thread::available_parallelism().map_or(1, usize::from)));
     findings.push(simd());
-    findings.push(real_time_right(os::try_real_time(), os::real_time_limit()));
-    findings.push(memory_lock_right(os::try_lock_memory(LOCKED_BYTES), os::locked_memory_limit()));
+    let fifo = briefly(|| realtime::os::set_fifo_priority(FRAME_PATH_PRIORITY));
+    findings.push(right("real-time priority", "SCHED_FIFO granted", fifo));
+    findings.push(right("locked memory", "granted", briefly(lock_and_unlock)));
     findings.extend(system.throttling());
     findings.extend(system.governor());
     findings.extend(system.clock());
@@ -86,8 +88,8 @@ pub fn execute(args: &DoctorArgs) -> Result<(), Failure> {
     }
 }
 
-/// What a rig of default size keeps resident.
-const LOCKED_BYTES: usize = 256 << 20;
+/// What `packaging/99-dpm-limits.conf` grants.
+const FRAME_PATH_PRIORITY: u32 = 80;
 
 fn vulkan(findings: &mut Vec<Finding>) -> bool {
     let devices = match crate::gpu::Gpu::list() {
@@ -145,34 +147,28 @@ fn simd() -> Finding {
     Finding::new("bit-plane packing", state, kernel.name(), remedy)
 }
 
-fn real_time_right(tried: std::io::Result<()>, limit: Option<u64>) -> Finding {
+/// A right that was tried, on a thread that ended at once.
+fn right(name: &str, granted: &str, tried: Result<(), Refusal>) -> Finding {
     match tried {
-        Ok(()) => {
-            let most = limit.map_or("unlimited".into(), |l| l.to_string());
-            Finding::new("real-time priority", State::Ok, format!("SCHED_FIFO granted (rtprio limit {most})"), "")
+        Ok(()) => Finding::new(name, State::Ok, granted, ""),
+        Err(r) => {
+            Finding::new(name, State::Warning, format!("{} was refused ({})", r.what, r.reason), r.remedy)
         }
-        Err(e) => Finding::new(
-            "real-time priority",
-            State::Warning,
-            format!("SCHED_FIFO refused: {e}"),
-            "put `@realtime - rtprio 80` into /etc/security/limits.d/dpm.conf, join the group realtime and log in again",
-        ),
     }
 }
 
-fn memory_lock_right(tried: std::io::Result<()>, limit: Option<u64>) -> Finding {
-    let limit = limit.map_or("unlimited".into(), |l| format!("{} MiB", l >> 20));
-    match tried {
-        Ok(()) => {
-            Finding::new("locked memory", State::Ok, format!("{} MiB granted (limit {limit})", LOCKED_BYTES >> 20), "")
-        }
-        Err(e) => Finding::new(
-            "locked memory",
-            State::Warning,
-            format!("{} MiB refused (limit {limit}): {e}", LOCKED_BYTES >> 20),
-            "put `@realtime - memlock unlimited` into /etc/security/limits.d/dpm.conf, join the group realtime and log in again",
-        ),
-    }
+/// Runs `ask` on a thread that ends at once, so that this one keeps nothing.
+fn briefly(ask: fn() -> Result<(), Refusal>) -> Result<(), Refusal> {
+    std::thread::spawn(ask).join().unwrap_or_else(|_| {
+        let reason = "the thread that asked panicked".to_string();
+        Err(Refusal { what: "a right".into(), reason, remedy: String::new() })
+    })
+}
+
+fn lock_and_unlock() -> Result<(), Refusal> {
+    realtime::os::lock_memory()?;
+    realtime::os::unlock_memory();
+    Ok(())
 }
 
 /// The kernel's files under `/proc`, `/sys` and `/dev`, below a root that tests can replace.
@@ -436,16 +432,17 @@ mod tests {
     }
 
     #[test]
-    fn refused_rights_name_the_limit_to_set() {
-        let refused = || Err(std::io::Error::from_raw_os_error(libc::EPERM));
-        let priority = real_time_right(refused(), Some(0));
-        assert!(priority.found.contains("Operation not permitted") && priority.remedy.contains("rtprio 80"));
-        let memory = memory_lock_right(refused(), Some(8 << 20));
-        assert!(
-            memory.found.contains("256 MiB refused (limit 8 MiB)")
-                && memory.remedy.contains("memlock unlimited")
-        );
-        assert_eq!(memory_lock_right(Ok(()), None).state, State::Ok);
+    fn a_refused_right_says_what_to_set() {
+        let refusal = Refusal {
+            what: "SCHED_FIFO priority 80".into(),
+            reason: "Operation not permitted".into(),
+            remedy: "set rtprio".into(),
+        };
+        let finding = right("real-time priority", "granted", Err(refusal));
+        assert_eq!(finding.state, State::Warning);
+        assert!(finding.found.contains("priority 80 was refused (Operation not permitted)"));
+        assert_eq!(finding.remedy, "set rtprio");
+        assert_eq!(right("x", "granted", Ok(())).state, State::Ok);
     }
 
     #[test]
