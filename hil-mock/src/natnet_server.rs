@@ -5,6 +5,7 @@
 //! clients take whatever comes next for the answer to their question.
 
 use crate::faults::{FaultError, FaultKind};
+use crate::report_queue::ReportQueue;
 use crate::tracker::SampleSource;
 use dpm_device::time::HostTime;
 use dpm_device::tracker::natnet::frame::{encode_frame, FrameContent, FrameInfo, LabeledMarker, RigidBody};
@@ -111,21 +112,14 @@ struct Client {
     is_told: bool,
 }
 
-/// One report on its way out.
-#[derive(Clone, Copy)]
-struct Outgoing {
-    k: u64,
-    due: HostTime,
-}
-
 /// The server. Time is the argument of each call: the host time of the sample source.
 pub struct NatNetServer {
     config: NatNetServerConfig,
     source: SampleSource,
     markers: [[f32; 3]; 4],
     clients: Vec<Client>,
-    next: u64,
-    outgoing: Vec<Outgoing>,
+    queue: ReportQueue,
+    due: Vec<u64>,
     bodies: Vec<RigidBody>,
     labeled: Vec<LabeledMarker>,
     body_markers: Vec<[f32; 3]>,
@@ -140,8 +134,6 @@ impl NatNetServer {
     pub const CLIENT_TIMEOUT_NS: i64 = 5_000_000_000;
     /// A client that never asked for names gets frames after this long.
     pub const GRACE_NS: i64 = 300_000_000;
-    /// Most captures caught up with in one call.
-    const MAX_CATCH_UP: u64 = 256;
 
     /// A server for the bodies of `source`.
     pub fn new(config: NatNetServerConfig, source: SampleSource) -> Result<Self, NatNetServerError> {
@@ -167,8 +159,8 @@ impl NatNetServer {
             source,
             markers: [[0.05, 0.0, 0.0], [-0.05, 0.0, 0.0], [0.0, 0.06, 0.0], [0.0, 0.0, 0.07]],
             clients: Vec::with_capacity(Self::MAX_CLIENTS),
-            next: 0,
-            outgoing: Vec::with_capacity(64),
+            queue: ReportQueue::new(),
+            due: Vec::with_capacity(64),
             bodies: Vec::new(),
             labeled: Vec::new(),
             body_markers: Vec::new(),
@@ -255,7 +247,7 @@ impl NatNetServer {
                 }
             }
             id::REQUEST_FRAME => {
-                let Some(k) = self.next.checked_sub(1) else { return };
+                let Some(k) = self.queue.newest() else { return };
                 self.fill(k);
                 if self.encode(version, k, now).is_err() {
                     return;
@@ -349,40 +341,20 @@ impl NatNetServer {
 
     /// Instant at which the next report is due: when to call [`NatNetServer::stream`] again, at the latest.
     pub fn next_due(&self) -> HostTime {
-        let capture = self.source.config().start.plus_ns(self.source.captured_ns(self.next));
-        self.outgoing.iter().map(|o| o.due).min().map_or(capture, |due| due.min(capture))
+        self.queue.next_due(&self.source)
     }
 
     /// Sends all reports due by `now` through `send`.
     pub fn stream(&mut self, now: HostTime, send: &mut dyn FnMut(&[u8], SocketAddrV4)) {
-        let started = now.ns_since(self.source.config().start) - self.source.config().phase_ns;
-        if started < 0 {
-            return;
-        }
-        let newest = self.source.config().rate.slot_at_ns(started);
-        self.next = self.next.max((newest + 1).saturating_sub(Self::MAX_CATCH_UP));
-        while self.next <= newest {
-            if let Some(passage) = self.source.passage(0, self.next) {
-                for due in std::iter::once(passage.arrives_at).chain(passage.copy_at) {
-                    // Bounded whatever latency the configuration asks for.
-                    if self.outgoing.len() < 4096 {
-                        self.outgoing.push(Outgoing { k: self.next, due });
-                    }
-                }
-            }
-            self.next += 1;
-        }
-        self.outgoing.sort_by_key(|o| o.due);
-        let due = self.outgoing.partition_point(|o| o.due <= now);
         let unicast = matches!(self.config.streaming, Streaming::Unicast(_));
         self.clients.retain(|c| !unicast || now.ns_since(c.heard_at) < Self::CLIENT_TIMEOUT_NS);
-        for i in 0..due {
-            let k = self.outgoing[i].k;
+        self.due.clear();
+        self.due.extend_from_slice(self.queue.take_due(&self.source, now));
+        for i in 0..self.due.len() {
             if !self.is_away(now) {
-                self.send_report(k, now, send);
+                self.send_report(self.due[i], now, send);
             }
         }
-        self.outgoing.drain(..due);
     }
 
     fn send_report(&mut self, k: u64, now: HostTime, send: &mut dyn FnMut(&[u8], SocketAddrV4)) {

@@ -1,29 +1,14 @@
 //! True poses into VRPN messages: the server's side of one connection as a state machine, and the samples all connections get.
 
 use crate::faults::{FaultError, FaultKind};
+use crate::report_queue::ReportQueue;
 use crate::tracker::SampleSource;
 use dpm_device::time::HostTime;
 use dpm_device::tracker::vrpn::wire::{self, system, type_name, Message, COOKIE, COOKIE_BYTES};
 use dpm_device::tracker::BodyIndex;
 
 /// What a VRPN server can do wrong. A stream loses no bytes, so a lost or overtaken report is one that was not sent, or late.
-pub const VRPN_FAULTS: [FaultKind; 15] = [
-    FaultKind::Loss,
-    FaultKind::Corrupt,
-    FaultKind::Truncate,
-    FaultKind::Duplicate,
-    FaultKind::Reorder,
-    FaultKind::Nan,
-    FaultKind::Norm,
-    FaultKind::Flip,
-    FaultKind::Dropout,
-    FaultKind::Stuck,
-    FaultKind::Jump,
-    FaultKind::Stall,
-    FaultKind::Slow,
-    FaultKind::Unplug,
-    FaultKind::Reset,
-];
+pub const VRPN_FAULTS: [FaultKind; 16] = FaultKind::ALL;
 
 /// Number of the pose type on our side; ping and pong follow.
 const POS_QUAT: i32 = 0;
@@ -176,19 +161,14 @@ fn senders(names: &VrpnNames) -> impl Iterator<Item = &str> {
 /// The reports of all bodies as they become due.
 pub struct VrpnReports {
     source: SampleSource,
-    next: u64,
-    outgoing: Vec<(u64, HostTime)>,
+    queue: ReportQueue,
 }
 
 impl VrpnReports {
-    /// Most captures caught up with in one call.
-    const MAX_CATCH_UP: u64 = 256;
-
     /// Reports of `source`. Bodies that the source marks as not tracked are not reported, as VRPN servers do.
     pub fn new(source: SampleSource) -> Result<Self, FaultError> {
-        let known = [&VRPN_FAULTS[..], &[FaultKind::Invalid]].concat();
-        source.config().faults.check_supported(&known, "the VRPN server")?;
-        Ok(Self { source, next: 0, outgoing: Vec::with_capacity(64) })
+        source.config().faults.check_supported(&VRPN_FAULTS, "the VRPN server")?;
+        Ok(Self { source, queue: ReportQueue::new() })
     }
 
     /// The source of the poses.
@@ -198,31 +178,12 @@ impl VrpnReports {
 
     /// When the next report is due, at the latest.
     pub fn next_due(&self) -> HostTime {
-        let capture = self.source.config().start.plus_ns(self.source.captured_ns(self.next));
-        self.outgoing.iter().map(|o| o.1).min().map_or(capture, |due| due.min(capture))
+        self.queue.next_due(&self.source)
     }
 
-    /// Numbers of the reports due by `now`, in order; the list is emptied by the call.
+    /// Numbers of the reports due by `now`, in order; each is handed out once.
     pub fn take_due(&mut self, now: HostTime) -> Vec<u64> {
-        let since = now.ns_since(self.source.config().start) - self.source.config().phase_ns;
-        if since < 0 {
-            return Vec::new();
-        }
-        let newest = self.source.config().rate.slot_at_ns(since);
-        self.next = self.next.max((newest + 1).saturating_sub(Self::MAX_CATCH_UP));
-        while self.next <= newest {
-            if let Some(passage) = self.source.passage(0, self.next) {
-                for due in std::iter::once(passage.arrives_at).chain(passage.copy_at) {
-                    if self.outgoing.len() < 4096 {
-                        self.outgoing.push((self.next, due));
-                    }
-                }
-            }
-            self.next += 1;
-        }
-        self.outgoing.sort_by_key(|o| o.1);
-        let due = self.outgoing.partition_point(|o| o.1 <= now);
-        self.outgoing.drain(..due).map(|o| o.0).collect()
+        self.queue.take_due(&self.source, now).to_vec()
     }
 
     /// Appends report `k` to `out` for `connection`. `wall_us_at` turns a host time into the server's clock, microseconds. False:

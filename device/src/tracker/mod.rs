@@ -3,6 +3,7 @@
 mod gate;
 pub mod natnet;
 pub mod record;
+pub mod serial;
 #[cfg(feature = "net")]
 pub mod udp;
 pub mod vrpn;

@@ -3,6 +3,7 @@
 mod bodies;
 mod dlpc900;
 mod natnet;
+mod serial;
 mod usb;
 mod vrpn;
 
@@ -16,6 +17,8 @@ pub enum Device {
     Dlpc900(dlpc900::Dlpc900Arguments),
     /// OptiTrack NatNet server: poses over UDP
     Natnet(natnet::NatNetArguments),
+    /// Serial pose stream on a port or a pseudo-terminal
+    Serial(serial::SerialArguments),
     /// VRPN server: poses over TCP
     Vrpn(vrpn::VrpnArguments),
 }
@@ -25,6 +28,7 @@ pub fn run(device: Device) -> Result<(), Box<dyn Error>> {
     match device {
         Device::Dlpc900(arguments) => dlpc900::run(&arguments),
         Device::Natnet(arguments) => natnet::run(&arguments),
+        Device::Serial(arguments) => serial::run(&arguments),
         Device::Vrpn(arguments) => vrpn::run(&arguments),
     }
 }

@@ -1,0 +1,147 @@
+//! The serial tracker against the mock device through pseudo-terminals: the kernel's own tty layer in between.
+
+use dpm_device::pose::Pose;
+use dpm_device::time::{HostClock, HostTime};
+use dpm_device::tracker::serial::client::{SerialTracker, SerialTrackerConfig};
+use dpm_device::tracker::serial::wire::SerialMessage;
+use dpm_device::tracker::{BodyIndex, BodyKey, Tracker, TrackerSample};
+use hil_mock::motion::{Motion, MotionSpec};
+use hil_mock::serial_server::{pseudo_terminal, SerialPoseDevice, SerialPoseHost};
+use hil_mock::tracker::{MockTrackerConfig, SampleSource};
+use std::io::Write;
+use std::path::PathBuf;
+use std::sync::Arc;
+use std::time::{Duration, Instant};
+
+const MS: i64 = 1_000_000;
+
+fn clock() -> Arc<dyn HostClock> {
+    let epoch = Instant::now();
+    Arc::new(move || HostTime(epoch.elapsed().as_nanos() as i64))
+}
+
+fn device(faults: &str) -> SerialPoseDevice {
+    let motions = vec![
+        Motion::new(&MotionSpec::paper_translation(), Pose::IDENTITY).unwrap(),
+        Motion::new(&MotionSpec::Still, Pose::IDENTITY).unwrap(),
+    ];
+    let config = MockTrackerConfig { faults: faults.parse().unwrap(), latency_ns: MS, ..Default::default() };
+    SerialPoseDevice::new(SampleSource::new(config, motions).unwrap()).unwrap()
+}
+
+fn tracker(port: &str, clock: &Arc<dyn HostClock>) -> SerialTracker {
+    let bodies = ["a", "b"].map(|n| BodyKey { name: n.into(), id: None }).to_vec();
+    let config = SerialTrackerConfig { port: port.into(), baud: 921_600, bodies };
+    SerialTracker::open(config, clock.clone()).unwrap()
+}
+
+fn run(tracker: &mut SerialTracker, clock: &Arc<dyn HostClock>, ms: u64) -> Vec<TrackerSample> {
+    let mut samples = Vec::new();
+    let end = Instant::now() + Duration::from_millis(ms);
+    while Instant::now() < end {
+        tracker.poll(clock.now(), &mut |s| samples.push(*s)).unwrap();
+        assert!(tracker.counters().is_conserved());
+        std::thread::sleep(Duration::from_micros(300));
+    }
+    samples
+}
+
+#[test]
+fn poses_and_times_come_through_a_noisy_line() {
+    let clock = clock();
+    let (ours, path, _held) = pseudo_terminal().unwrap();
+    let noisy = device("corrupt=0.05,truncate=0.05,loss=0.02");
+    let truth = device("");
+    let host = SerialPoseHost::start(noisy, ours, clock.clone()).unwrap();
+    let mut tracker = tracker(&path, &clock);
+    let samples = run(&mut tracker, &clock, 1500);
+    let c = *tracker.counters();
+    assert!(host.is_running() && c.samples.used > 900, "{}", tracker.status());
+    // T18: noise costs at most the packet it hits and the next one.
+    assert!(c.packets.malformed > 10, "{c}");
+    assert!(c.lost < 3 * c.packets.malformed + 100, "{c}");
+    assert!(tracker.clock_map().is_some(), "{}", tracker.status());
+    let moving: Vec<_> = samples.iter().filter(|s| s.body == BodyIndex(0)).skip(200).collect();
+    let mut errors: Vec<f64> = moving
+        .iter()
+        .map(|s| {
+            let p = truth.source().true_pose(BodyIndex(0), s.captured_at.0).unwrap().position_m;
+            (p[0] - s.pose.position_m[0]).abs()
+        })
+        .collect();
+    errors.sort_by(f64::total_cmp);
+    // At 1 m/s: half of the stamps within 0.3 ms, on a machine shared with other tests.
+    assert!(errors[errors.len() / 2] < 3e-4, "{}", errors[errors.len() / 2]);
+}
+
+#[test]
+fn an_unplugged_port_is_opened_again_within_a_second() {
+    let clock = clock();
+    let link = std::env::temp_dir().join(format!("dpm-tty-{}", std::process::id()));
+    let plug = |link: &PathBuf| {
+        let (ours, path, held) = pseudo_terminal().unwrap();
+        let _ = std::fs::remove_file(link);
+        std::os::unix::fs::symlink(path, link).unwrap();
+        (SerialPoseHost::start(device(""), ours, clock.clone()).unwrap(), held)
+    };
+    let plugged = plug(&link);
+    let mut tracker = tracker(link.to_str().unwrap(), &clock);
+    let samples = run(&mut tracker, &clock, 400);
+    assert!(!samples.is_empty() && tracker.is_open(), "{}", tracker.status());
+    drop(plugged);
+    run(&mut tracker, &clock, 400);
+    assert!(!tracker.is_open(), "{}", tracker.status());
+    let plugged = plug(&link);
+    let back = clock.now();
+    let samples = run(&mut tracker, &clock, 1200);
+    assert!(tracker.is_open(), "{}", tracker.status());
+    let first = samples.first().expect("samples again").received_at.ns_since(back);
+    assert!(first < 1_000 * MS, "{first}");
+    drop(plugged);
+    let _ = std::fs::remove_file(&link);
+}
+
+#[test]
+fn half_lines_and_other_baud_rates_do_no_harm() {
+    let clock = clock();
+    let (mut ours, path, _held) = pseudo_terminal().unwrap();
+    let mut tracker = tracker(&path, &clock);
+    run(&mut tracker, &clock, 60);
+    assert!(tracker.is_open() && tracker.status().contains("nothing has been heard"), "{}", tracker.status());
+    let pose = |sequence: u32| {
+        let mut out = Vec::new();
+        let message = SerialMessage::Pose {
+            body: 0,
+            tracked: true,
+            sequence,
+            captured: 0,
+            position: [0.1, 0.2, 0.3],
+            rotation_xyzw: [0.0, 0.0, 0.0, 1.0],
+            mean_error: 0.0,
+        };
+        message.encode(&mut out);
+        out
+    };
+    // Joined in the middle of a packet: the rest of it is lost, the next one is not.
+    ours.write_all(&pose(1)[20..]).unwrap();
+    ours.write_all(&pose(2)).unwrap();
+    let samples = run(&mut tracker, &clock, 60);
+    assert_eq!(samples.iter().map(|s| s.sequence).collect::<Vec<_>>(), [2]);
+    assert_eq!(tracker.counters().packets.malformed, 1);
+    // A kilobyte without a zero (framing errors at the wrong rate), then a good packet.
+    ours.write_all(&[0x55; 1024]).unwrap();
+    ours.write_all(&[0]).unwrap();
+    ours.write_all(&pose(3)).unwrap();
+    let samples = run(&mut tracker, &clock, 60);
+    assert_eq!(samples.iter().map(|s| s.sequence).collect::<Vec<_>>(), [3]);
+    assert_eq!(tracker.counters().packets.malformed, 2);
+}
+
+#[test]
+fn a_missing_port_is_named() {
+    let clock = clock();
+    let mut tracker = tracker("/dev/dpm-no-such-port", &clock);
+    run(&mut tracker, &clock, 50);
+    assert!(!tracker.is_open());
+    assert!(tracker.status().contains("cannot open /dev/dpm-no-such-port"), "{}", tracker.status());
+}
