@@ -20,50 +20,16 @@ const TILES_AROUND: f32 = 3.0;
 
 /// The built-in scene. Takes a fraction of a second; the same on every call.
 pub fn builtin() -> Scene {
+    // The figures are most of the work: one in a thread of its own, so that the demo starts sooner.
+    let (hare, bust) = std::thread::scope(|scope| {
+        let other = scope.spawn(hare_body);
+        let bust = bust_body();
+        (other.join().unwrap_or_else(|panic| std::panic::resume_unwind(panic)), bust)
+    });
     let [glaze_color, glaze_normal] = glaze_textures();
     let [bronze_color, bronze_surface] = bronze_textures();
     Scene {
-        bodies: vec![
-            Body {
-                name: "bunny".into(),
-                tracked: Some(0),
-                projected: true,
-                world_from_body_rest: DAffine3::from_translation(DVec3::new(-0.10, 0.0, 0.0)),
-                mesh: textured_mesh(
-                    surface_nets(
-                        &hare,
-                        Vec3::new(-0.085, -0.106, -0.085),
-                        Vec3::new(0.085, 0.106, 0.1),
-                        0.0019,
-                    ),
-                    0.17,
-                    |_| GLAZE,
-                ),
-            },
-            Body {
-                name: "venus".into(),
-                tracked: Some(1),
-                projected: true,
-                world_from_body_rest: DAffine3::from_translation(DVec3::new(0.13, 0.03, -0.18)),
-                mesh: textured_mesh(
-                    surface_nets(
-                        &bust,
-                        Vec3::new(-0.115, -0.156, -0.1),
-                        Vec3::new(0.115, 0.156, 0.1),
-                        0.0024,
-                    ),
-                    0.2,
-                    |p| {
-                        if p.y < PLINTH_TOP_M + 0.0015 {
-                            PLINTH
-                        } else {
-                            BRONZE
-                        }
-                    },
-                ),
-            },
-            lamp(),
-        ],
+        bodies: vec![hare, bust, lamp()],
         materials: vec![
             Material {
                 name: "glaze".into(),
@@ -102,6 +68,29 @@ pub fn builtin() -> Scene {
         lights: vec![],
         environment: Environment::Constant(Vec3::new(0.30, 0.34, 0.40)),
         warnings: vec![],
+    }
+}
+
+fn hare_body() -> Body {
+    let surface =
+        surface_nets(&hare, Vec3::new(-0.085, -0.106, -0.085), Vec3::new(0.085, 0.106, 0.1), 0.0019);
+    Body {
+        name: "bunny".into(),
+        tracked: Some(0),
+        projected: true,
+        world_from_body_rest: DAffine3::from_translation(DVec3::new(-0.10, 0.0, 0.0)),
+        mesh: textured_mesh(surface, 0.17, |_| GLAZE),
+    }
+}
+
+fn bust_body() -> Body {
+    let surface = surface_nets(&bust, Vec3::new(-0.115, -0.156, -0.1), Vec3::new(0.115, 0.156, 0.1), 0.0024);
+    Body {
+        name: "venus".into(),
+        tracked: Some(1),
+        projected: true,
+        world_from_body_rest: DAffine3::from_translation(DVec3::new(0.13, 0.03, -0.18)),
+        mesh: textured_mesh(surface, 0.2, |p| if p.y < PLINTH_TOP_M + 0.0015 { PLINTH } else { BRONZE }),
     }
 }
 
@@ -281,13 +270,17 @@ fn bust(p: Vec3) -> f32 {
     d.min(plinth)
 }
 
+/// Made once for all tests that look at it.
+#[cfg(test)]
+pub(crate) static SHARED: std::sync::LazyLock<Scene> = std::sync::LazyLock::new(builtin);
+
 #[cfg(test)]
 mod tests {
     use super::*;
 
     #[test]
     fn both_figures_keep_every_promise_of_a_mesh_and_stand_in_their_box() {
-        let scene = builtin();
+        let scene = &*SHARED;
         let height = |b: &Body| {
             let y = b.mesh.positions.iter().map(|p| p.y);
             y.clone().fold(f32::MIN, f32::max) - y.fold(f32::MAX, f32::min)
@@ -345,7 +338,7 @@ mod tests {
         let right = forward.cross(DVec3::Y).normalize();
         let up = right.cross(forward);
         let half_width = 15f64.to_radians().tan();
-        for body in &builtin().bodies[..2] {
+        for body in &SHARED.bodies[..2] {
             for p in &body.mesh.positions {
                 let d = body.world_from_body_rest.transform_point3(p.as_dvec3()) - eye;
                 let (x, y) = (d.dot(right) / d.dot(forward), d.dot(up) / d.dot(forward));

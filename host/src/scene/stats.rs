@@ -2,7 +2,7 @@
 
 use glam::Vec3;
 
-use super::{Environment, Scene};
+use super::{Environment, Scene, TextureRef};
 
 /// What the tracer has to be able to do for a scene. Materials that no triangle has do not count.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
@@ -89,38 +89,57 @@ impl SceneFeatures {
             out.masks |= m.alpha_cutoff.is_some_and(|c| m.base_color_texture.is_some() || m.alpha < c);
             out.transmission |= transmits;
             out.solid_transmission |= transmits && !m.thin_walled;
-            out.metals_only &= m.metallic == 1.0 && m.metallic_roughness_texture.is_none();
-            // A thin wall lets light straight through whatever its roughness; a texture can only make a surface smoother.
-            out.delta_lobes |= m.roughness < DELTA_ROUGHNESS
-                || m.metallic_roughness_texture.is_some()
-                || (transmits && m.thin_walled);
+            let [least_roughness, least_metallic] =
+                least_surface_factors(scene, m.metallic_roughness_texture);
+            out.metals_only &= m.metallic * least_metallic == 1.0;
+            // A thin wall lets light straight through whatever its roughness.
+            out.delta_lobes |=
+                m.roughness * least_roughness < DELTA_ROUGHNESS || (transmits && m.thin_walled);
             out.double_sided |= m.double_sided;
         }
         out
     }
 }
 
+/// Least factors of roughness and metallic anywhere in a texture; interpolation never goes below the least texel.
+fn least_surface_factors(scene: &Scene, texture: Option<TextureRef>) -> [f32; 2] {
+    let Some(t) = texture else { return [1.0; 2] };
+    let least = scene.textures[t.texture as usize]
+        .texels
+        .iter()
+        .fold([255u8; 2], |[g, b], t| [g.min(t[1]), b.min(t[2])]);
+    least.map(|x| f32::from(x) / 255.0)
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::scene::{builtin, Material};
+    use crate::scene::builtin::SHARED;
+    use crate::scene::Material;
 
     #[test]
     fn the_built_in_scene_has_what_it_is_made_of() {
-        let scene = builtin();
-        let f = SceneFeatures::of(&scene);
+        let scene = &*SHARED;
+        let f = SceneFeatures::of(scene);
         assert_eq!(f.triangles, scene.bodies.iter().map(|b| b.mesh.triangles.len()).sum::<usize>());
         assert_eq!(
             (f.emissive_triangles, f.punctual_lights, f.environment),
             (2, 0, EnvironmentFeature::Constant)
         );
         assert!(f.textures && f.normal_maps && f.virtual_bodies);
-        assert!(!(f.masks || f.transmission || f.solid_transmission || f.metals_only || f.double_sided));
+        assert!(
+            !(f.delta_lobes
+                || f.masks
+                || f.transmission
+                || f.solid_transmission
+                || f.metals_only
+                || f.double_sided)
+        );
     }
 
     #[test]
     fn each_feature_follows_its_cause_and_unused_materials_do_not_count() {
-        let mut scene = builtin();
+        let mut scene = SHARED.clone();
         scene.bodies.truncate(1);
         scene.materials = vec![Material::default(); 2];
         scene.bodies[0].mesh.materials.fill(0);
@@ -146,6 +165,12 @@ mod tests {
         );
         scene.materials[1].thin_walled = false;
         assert!(SceneFeatures::of(&scene).solid_transmission && !SceneFeatures::of(&scene).delta_lobes);
+        scene.materials[0].metallic_roughness_texture = SHARED.materials[1].metallic_roughness_texture;
+        assert!(!SceneFeatures::of(&scene).delta_lobes);
+        let texture = scene.materials[0].metallic_roughness_texture.unwrap().texture as usize;
+        scene.textures[texture].texels[77][1] = 3;
+        assert!(SceneFeatures::of(&scene).delta_lobes, "one smooth texel is enough");
+        scene.textures[texture].texels[77][1] = 255;
         scene.materials[0].roughness = 0.03;
         assert!(SceneFeatures::of(&scene).delta_lobes);
         scene.materials[0].alpha_cutoff = Some(0.5);

@@ -35,10 +35,16 @@ pub fn sample_points(body: &Body, n: usize, seed: u64) -> Vec<Vec3> {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::scene::{builtin, TriangleMesh};
+    use crate::scene::TriangleMesh;
 
     fn body(mesh: TriangleMesh) -> Body {
-        Body { mesh, ..builtin().bodies[2].clone() }
+        Body {
+            name: "test".into(),
+            tracked: None,
+            projected: true,
+            world_from_body_rest: glam::DAffine3::IDENTITY,
+            mesh,
+        }
     }
 
     /// Two right triangles in the planes z = 0 and z = 1 with areas 1/2 and 3/2.
