@@ -137,7 +137,7 @@ pub const fn remedy(code: u8) -> &'static str {
         13 => "trigger delays lie between -20 and 20000 us",
         14 => "a longer exposure or fewer bits; the least exposure grows with the depth",
         15 => "fewer patterns in the table",
-        16 => "number the entries 0, 1, 2, ... and clear the mirrors after each pattern that waits for no trigger",
+        16 => "number the entries 0, 1, 2, ... without gaps and define each before the configuration",
         17 => "image numbers must be below the number of images uploaded",
         _ => "look the code up in the programmer's guide (DLPU018, command 0x0100)",
     }

@@ -192,7 +192,7 @@ pub struct LutEntry {
     pub depth: u8,
     /// LEDs lit, see [`led`]; 0 is none.
     pub leds: u8,
-    /// Mirrors go off after the exposure (only 1-bit patterns with an external trigger may keep them).
+    /// Mirrors go off after the exposure. Heeded for 1-bit patterns with an external trigger only; others always go off.
     pub clear_after: bool,
     /// Starts only at a TRIG_IN1 edge.
     pub wait_trigger: bool,
@@ -308,8 +308,6 @@ pub enum Rule {
         /// Most it holds.
         most: u32,
     },
-    /// Mirrors may stay on after the exposure only for 1-bit patterns that wait for a trigger.
-    ClearAfter,
     /// In video-pattern mode the patterns must fit a video frame.
     FrameTooShort {
         /// Exposure and dark times up to and including this entry, microseconds.
@@ -324,7 +322,7 @@ impl Rule {
     pub const fn error_code(self) -> u8 {
         match self {
             Self::Empty | Self::TooManyEntries { .. } | Self::Memory { .. } => 15,
-            Self::Index { .. } | Self::ClearAfter => 16,
+            Self::Index { .. } => 16,
             Self::Depth { .. } | Self::BitPosition { .. } => 10,
             Self::ExposureTooShort { .. } | Self::FrameTooShort { .. } => 14,
             Self::TimeTooLong { .. } => 12,
@@ -359,9 +357,6 @@ impl core::fmt::Display for Rule {
             }
             Self::Memory { planes, most } => {
                 write!(f, "the sequence needs {planes} planes up to here, the memory holds {most}: split the sequence")
-            }
-            Self::ClearAfter => {
-                write!(f, "mirrors may stay on after the exposure only for a 1-bit pattern that waits for a trigger")
             }
             Self::FrameTooShort { sum_us, frame_us } => write!(
                 f,
@@ -425,9 +420,6 @@ pub fn check_entry(place: usize, e: &LutEntry, limits: &Limits) -> Result<(), Ru
     }
     if usize::from(e.image) >= limits.images {
         return Err(Rule::Image { image: e.image, images: limits.images });
-    }
-    if !e.clear_after && (e.depth != 1 || !e.wait_trigger) {
-        return Err(Rule::ClearAfter);
     }
     Ok(())
 }
@@ -506,7 +498,7 @@ mod tests {
     fn every_rule_is_named_with_its_entry() {
         let good: Vec<_> = (0..3).map(|i| LutEntry::one_bit(i, 0, i as u8, 105)).collect();
         type Spoil = fn(&mut LutEntry);
-        let cases: [(Spoil, Rule, u8); 9] = [
+        let cases: [(Spoil, Rule, u8); 8] = [
             (|e| e.index = 7, Rule::Index { found: 7 }, 16),
             (|e| e.depth = 9, Rule::Depth { depth: 9 }, 10),
             (
@@ -522,7 +514,6 @@ mod tests {
             (|e| e.dark_us = 1 << 24, Rule::TimeTooLong { time_us: 1 << 24 }, 12),
             (|e| e.bit = 24, Rule::BitPosition { bit: 24, depth: 1 }, 10),
             (|e| e.image = 2, Rule::Image { image: 2, images: 2 }, 17),
-            (|e| e.clear_after = false, Rule::ClearAfter, 16),
             (
                 |e| (e.bit, e.depth, e.exposure_us) = (23, 2, 9999),
                 Rule::BitPosition { bit: 23, depth: 2 },

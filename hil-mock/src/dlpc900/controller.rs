@@ -84,10 +84,10 @@ impl Controller {
     /// Does one command: the data of its reply (empty for a write), and whether it was refused.
     pub fn execute(&mut self, now: HostTime, c: &Command<'_>) -> (Vec<u8>, bool) {
         self.settle(now);
-        // The two questions about the last error leave it as it is.
+        // The two questions about the last error leave it as it is. Some programs ask them with the write flag.
         match c.opcode {
-            Opcode::ERROR_CODE if c.is_read() => return (vec![self.error], false),
-            Opcode::ERROR_TEXT if c.is_read() => {
+            Opcode::ERROR_CODE => return (vec![self.error], false),
+            Opcode::ERROR_TEXT => {
                 let mut text = self.error_text.clone().into_bytes();
                 text.resize(128, 0);
                 text[127] = 0;
