@@ -125,8 +125,12 @@ pub const fn error_meaning(code: u8) -> &'static str {
 /// What to do about an error code.
 pub const fn remedy(code: u8) -> &'static str {
     match code {
-        1 | 7 | 11 => "what the command names is not in the controller's flash; load it there or upload it over USB",
-        2 | 4 | 255 => "power the projector off and on; if it stays, DMD and controller do not fit or are damaged",
+        1 | 7 | 11 => {
+            "what the command names is not in the controller's flash; load it there or upload it over USB"
+        }
+        2 | 4 | 255 => {
+            "power the projector off and on; if it stays, DMD and controller do not fit or are damaged"
+        }
         3 => "the firmware does not know this command; update it",
         5 => "stop the sequence and select the right display mode first",
         6 => "a number in the command is outside its range",

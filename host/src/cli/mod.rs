@@ -1,5 +1,6 @@
 //! Words into calls: the command line of `dpm`. One file per command, no logic of its own.
 
+pub mod dlpc900;
 pub mod doctor;
 pub mod os;
 pub mod rig_args;
@@ -31,6 +32,8 @@ enum Command {
     Run(run::RunArgs),
     /// Say what this machine can do, and what to do about what is missing
     Doctor(doctor::DoctorArgs),
+    /// Control a DLPC900 projector (LightCrafter 6500 / 9000): status, patterns, rest
+    Dlpc900(dlpc900::Dlpc900Args),
 }
 
 /// Runs the program with the process's arguments.
@@ -61,5 +64,6 @@ fn dispatch(command: &Command) -> Result<(), Failure> {
         Command::Demo(args) => run::execute_demo(args),
         Command::Run(args) => run::execute(args),
         Command::Doctor(args) => doctor::execute(args),
+        Command::Dlpc900(args) => dlpc900::execute(args),
     }
 }

@@ -1,0 +1,276 @@
+//! `dpm dlpc900`: words into calls of the DLPC900 driver.
+
+use super::watch::print;
+use crate::dlpc900::{sequence_of, status_text, PatternFileError, ShowAs};
+use crate::failure::{Failure, FailureKind};
+use clap::ValueEnum;
+use dpm_device::dlpc900::driver::{Dlpc900, Dlpc900Error, UploadProgress};
+use dpm_device::dlpc900::image::{Compression, PlaneOrder};
+use dpm_device::dlpc900::lut::{led, LutEntry};
+use dpm_device::dlpc900::sequence::{LedSetup, Receiver, Repeat, VideoPatterns};
+use dpm_device::dlpc900::usb::{list, UsbHid, UsbPlace};
+use std::path::PathBuf;
+
+/// Flags of `dpm dlpc900`.
+#[derive(clap::Args, Clone, Debug)]
+pub struct Dlpc900Args {
+    /// Which controller, as BUS:ADDRESS of lsusb; needed when several are plugged in
+    #[arg(long, value_name = "BUS:ADDRESS", value_parser = place, global = true)]
+    device: Option<UsbPlace>,
+    #[command(subcommand)]
+    action: Action,
+}
+
+#[derive(clap::Subcommand, Clone, Debug)]
+enum Action {
+    /// Say what the controller is and does
+    Status,
+    /// Upload pictures as a pattern sequence (loaded and stopped; see --start)
+    Upload(UploadArgs),
+    /// Set up patterns cut out of the video signal, and start them
+    VideoPattern(VideoArgs),
+    /// Start the loaded sequence
+    Start,
+    /// Pause the sequence; start goes on from there
+    Pause,
+    /// Stop the sequence
+    Stop,
+    /// Exercise the mirrors 50/50 with the LEDs off, as they should be whenever nothing is shown
+    Idle,
+    /// Leave the exercise (takes 3 s)
+    LeaveIdle,
+    /// Park the mirrors with the LEDs off
+    Park,
+    /// Free the mirrors again; upload again afterwards
+    Unpark,
+    /// Go to standby, two minutes before power is cut
+    Standby,
+    /// Come back from standby
+    Wake,
+}
+
+#[derive(clap::Args, Clone, Debug)]
+struct UploadArgs {
+    /// PNG or JPEG pictures of the DMD's size, one pattern each, in order
+    #[arg(required = true)]
+    files: Vec<PathBuf>,
+    /// Bits per pattern
+    #[arg(long, default_value_t = 1, value_parser = clap::value_parser!(u8).range(1..=8))]
+    depth: u8,
+    /// Time lit, microseconds; the shortest possible when not given
+    #[arg(long)]
+    exposure_us: Option<u32>,
+    /// Time black after each pattern, microseconds
+    #[arg(long, default_value_t = 0)]
+    dark_us: u32,
+    /// LEDs lit
+    #[arg(long, value_enum, default_value_t = Leds::White)]
+    leds: Leds,
+    /// LED currents as the driver board counts them, 0 to 255 each
+    #[arg(long, value_name = "R,G,B", value_parser = three)]
+    led_current: Option<[u8; 3]>,
+    /// Each pattern waits for an edge at TRIG_IN1
+    #[arg(long)]
+    wait_trigger: bool,
+    /// Show the sequence this many times; for ever when not given
+    #[arg(long)]
+    repeat: Option<u32>,
+    /// Which bytes of a pixel hold planes 0-7, 8-15, 16-23; matters for more than 8 planes an image
+    #[arg(long, value_enum, default_value_t = Order::Descending)]
+    plane_order: Order,
+    /// How images are coded
+    #[arg(long, value_enum, default_value_t = Coding::Smallest)]
+    compression: Coding,
+    /// Start at once
+    #[arg(long)]
+    start: bool,
+}
+
+#[derive(clap::Args, Clone, Debug)]
+struct VideoArgs {
+    /// Video input
+    #[arg(long, value_enum, default_value_t = Input::Hdmi)]
+    input: Input,
+    /// Frames per second of the video
+    #[arg(long, default_value_t = 60, value_parser = clap::value_parser!(u32).range(1..=120))]
+    frame_hz: u32,
+    /// Patterns per frame, 1 bit each
+    #[arg(long, default_value_t = 24, value_parser = clap::value_parser!(u8).range(1..=24))]
+    patterns: u8,
+    /// Time lit, microseconds; the frame is shared out evenly when not given
+    #[arg(long)]
+    exposure_us: Option<u32>,
+    /// LEDs lit
+    #[arg(long, value_enum, default_value_t = Leds::White)]
+    leds: Leds,
+}
+
+#[derive(Clone, Copy, Debug, ValueEnum)]
+enum Leds {
+    White,
+    Red,
+    Green,
+    Blue,
+}
+
+impl Leds {
+    const fn bits(self) -> u8 {
+        match self {
+            Self::White => led::WHITE,
+            Self::Red => led::RED,
+            Self::Green => led::GREEN,
+            Self::Blue => led::BLUE,
+        }
+    }
+}
+
+#[derive(Clone, Copy, Debug, ValueEnum)]
+enum Order {
+    /// 16-23, 8-15, 0-7, as common open programs write them
+    Descending,
+    /// 16-23, 0-7, 8-15, as TI's program writes them
+    BlueGreenRed,
+}
+
+#[derive(Clone, Copy, Debug, ValueEnum)]
+enum Coding {
+    Smallest,
+    Raw,
+    Rle,
+    Erle,
+}
+
+#[derive(Clone, Copy, Debug, ValueEnum)]
+enum Input {
+    Parallel,
+    Hdmi,
+    DisplayPort,
+}
+
+fn place(text: &str) -> Result<UsbPlace, String> {
+    let parts = text.split_once(':').and_then(|(b, a)| Some((b.parse().ok()?, a.parse().ok()?)));
+    let (bus, address) = parts.ok_or("write it as BUS:ADDRESS, such as 3:12")?;
+    Ok(UsbPlace { bus, address })
+}
+
+fn three(text: &str) -> Result<[u8; 3], String> {
+    let numbers: Result<Vec<u8>, _> = text.split(',').map(|n| n.trim().parse()).collect();
+    let numbers = numbers.ok().and_then(|n| <[u8; 3]>::try_from(n).ok());
+    numbers.ok_or_else(|| "write three numbers from 0 to 255, such as 80,80,80".to_owned())
+}
+
+impl From<Dlpc900Error> for Failure {
+    fn from(e: Dlpc900Error) -> Self {
+        let kind = match e {
+            Dlpc900Error::Sequence(_) => FailureKind::BadInput,
+            _ => FailureKind::Device,
+        };
+        Self::new(kind, e)
+    }
+}
+
+impl From<PatternFileError> for Failure {
+    fn from(e: PatternFileError) -> Self {
+        Self::new(FailureKind::BadInput, e)
+    }
+}
+
+fn open(args: &Dlpc900Args) -> Result<Dlpc900<UsbHid>, Failure> {
+    let device = |e| Failure::new(FailureKind::Device, e);
+    let mut place = args.device;
+    if place.is_none() {
+        let all = list().map_err(device)?;
+        if all.len() > 1 {
+            let names: Vec<_> = all.iter().map(|p| format!("{}:{}", p.bus, p.address)).collect();
+            let text = format!(
+                "{} controllers are plugged in; name one by --device: {}",
+                all.len(),
+                names.join(", ")
+            );
+            return Err(Failure::new(FailureKind::BadInput, text));
+        }
+        place = all.first().copied();
+    }
+    Ok(Dlpc900::new(UsbHid::open(place).map_err(device)?)?)
+}
+
+/// Runs the command.
+///
+/// # Errors
+/// [`FailureKind::Device`] when the controller cannot be reached or refuses; [`FailureKind::BadInput`] when pictures or times
+/// break a rule, with the LUT entry and the rule.
+pub fn execute(args: &Dlpc900Args) -> Result<(), Failure> {
+    let mut d = open(args)?;
+    match &args.action {
+        Action::Status => print(&status_text(&d.status()?)),
+        Action::Upload(upload) => execute_upload(&mut d, upload)?,
+        Action::VideoPattern(video) => execute_video(&mut d, video)?,
+        Action::Start => d.start()?,
+        Action::Pause => d.pause()?,
+        Action::Stop => d.stop()?,
+        Action::Idle => d.idle()?,
+        Action::LeaveIdle => d.leave_idle()?,
+        Action::Park => d.park()?,
+        Action::Unpark => d.unpark()?,
+        Action::Standby => {
+            d.standby()?;
+            print("in standby; the mirrors are safe for a loss of power in 123 s\n");
+        }
+        Action::Wake => d.wake()?,
+    }
+    Ok(())
+}
+
+fn execute_upload(d: &mut Dlpc900<UsbHid>, u: &UploadArgs) -> Result<(), Failure> {
+    let show = ShowAs {
+        depth: u.depth,
+        exposure_us: u.exposure_us,
+        dark_us: u.dark_us,
+        leds: u.leds.bits(),
+        wait_trigger: u.wait_trigger,
+        repeat: u.repeat.map_or(Repeat::Forever, Repeat::Passes),
+        order: match u.plane_order {
+            Order::Descending => PlaneOrder::Descending,
+            Order::BlueGreenRed => PlaneOrder::BlueGreenRed,
+        },
+        compression: match u.compression {
+            Coding::Smallest => None,
+            Coding::Raw => Some(Compression::Raw),
+            Coding::Rle => Some(Compression::Rle),
+            Coding::Erle => Some(Compression::Erle),
+        },
+    };
+    let sequence = sequence_of(&u.files, d.dmd(), &show)?;
+    let bar = indicatif::ProgressBar::new(sequence.image_bytes() as u64);
+    let leds = LedSetup { current: u.led_current, polarity: None };
+    d.upload(&sequence, leds, &mut |p: UploadProgress| bar.set_position(p.sent as u64))?;
+    bar.finish_and_clear();
+    if u.start {
+        d.start()?;
+    }
+    let (patterns, images, bytes) =
+        (sequence.entries().len(), sequence.images().len(), sequence.image_bytes());
+    print(&format!("{patterns} patterns in {images} images, {bytes} bytes\n"));
+    Ok(())
+}
+
+fn execute_video(d: &mut Dlpc900<UsbHid>, v: &VideoArgs) -> Result<(), Failure> {
+    let exposure_us = v.exposure_us.unwrap_or(1_000_000 / v.frame_hz / u32::from(v.patterns));
+    let entry = |i: u8| LutEntry { leds: v.leds.bits(), ..LutEntry::one_bit(i.into(), 0, i, exposure_us) };
+    d.start_video_patterns(&VideoPatterns {
+        dmd: d.dmd(),
+        receiver: match v.input {
+            Input::Parallel => Receiver::None,
+            Input::Hdmi => Receiver::Hdmi,
+            Input::DisplayPort => Receiver::DisplayPort,
+        },
+        frame_hz: v.frame_hz,
+        entries: (0..v.patterns).map(entry).collect(),
+        leds: LedSetup::default(),
+    })?;
+    print(&format!(
+        "{} patterns of {exposure_us} us in each of {} video frames per second\n",
+        v.patterns, v.frame_hz
+    ));
+    Ok(())
+}

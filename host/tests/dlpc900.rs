@@ -1,0 +1,145 @@
+//! The program `dpm dlpc900` over its own libusb, preloaded with an in-process usbfs, against the emulator over USB/IP.
+
+use dpm_device::dlpc900::lut::{DisplayMode, Dmd};
+use dpm_device::time::HostTime;
+use hil_mock::dlpc900::{Dlpc900Model, Options, Sequencer};
+use hil_mock::usb_plug::{monotonic_clock, UsbPlug};
+use hil_mock::usbip::{Export, Server};
+use std::path::PathBuf;
+use std::process::{Command, Output};
+use std::sync::{Arc, Mutex};
+
+struct Bench {
+    model: Arc<Mutex<Dlpc900Model>>,
+    server: Server,
+    folder: PathBuf,
+}
+
+impl Bench {
+    fn new(name: &str, devices: usize) -> Self {
+        let folder = std::env::temp_dir().join(format!("dpm-cli-dlpc900-{name}-{}", std::process::id()));
+        std::fs::create_dir_all(&folder).unwrap();
+        let options = Options { dmd: Dmd::Dlp5500, strict: true, ..Options::default() };
+        let models: Vec<_> =
+            (0..devices).map(|_| Arc::new(Mutex::new(Dlpc900Model::new(options.clone())))).collect();
+        let export = |(i, m): (usize, &Arc<Mutex<Dlpc900Model>>)| {
+            Export::new(format!("1-{}", i + 1), Arc::new(UsbPlug::new(m.clone(), monotonic_clock())))
+        };
+        let server = Server::start("127.0.0.1:0", models.iter().enumerate().map(export).collect()).unwrap();
+        Self { model: models[0].clone(), server, folder }
+    }
+
+    /// Runs `dpm dlpc900` on the emulated bus.
+    fn dpm(&self, words: &[&str]) -> Output {
+        let deps = std::env::current_exe().unwrap().parent().unwrap().to_owned();
+        let library = deps.join("libusbfs_fake.so");
+        assert!(library.exists(), "{} is built with the tests", library.display());
+        let mut command = Command::new(env!("CARGO_BIN_EXE_dpm"));
+        command.arg("dlpc900").args(words).current_dir(&self.folder);
+        command.env("LD_PRELOAD", library).env("USBFS_FAKE_USBIP", self.server.address().to_string());
+        command.env("USBFS_FAKE_DRIVER", "usbhid");
+        command.output().unwrap()
+    }
+
+    fn ok(&self, words: &[&str]) -> String {
+        // The server frees the device a moment after the program before has ended.
+        let until = std::time::Instant::now() + std::time::Duration::from_secs(5);
+        loop {
+            let o = self.dpm(words);
+            let (out, err) = (text(&o.stdout), text(&o.stderr));
+            if o.status.success() {
+                return out;
+            }
+            assert!(err.contains("in use") && std::time::Instant::now() < until, "{words:?}: {out}{err}");
+        }
+    }
+}
+
+impl Drop for Bench {
+    fn drop(&mut self) {
+        let _ = std::fs::remove_dir_all(&self.folder);
+    }
+}
+
+fn text(bytes: &[u8]) -> String {
+    String::from_utf8_lossy(bytes).into_owned()
+}
+
+#[test]
+fn pictures_are_uploaded_started_stopped_and_put_to_rest() {
+    let b = Bench::new("life", 1);
+    let status = b.ok(&["status"]);
+    assert!(
+        status.contains("DLP5500 (1024 x 768)") && status.contains("6.0.1 (DLPR900PROM-5500)"),
+        "{status}"
+    );
+    let pictures: Vec<image::GrayImage> = (0..3u32)
+        .map(|i| image::GrayImage::from_fn(1024, 768, |x, y| image::Luma([((x * (i + 1)) ^ (y / 3)) as u8])))
+        .collect();
+    for (i, p) in pictures.iter().enumerate() {
+        p.save(b.folder.join(format!("{i}.png"))).unwrap();
+    }
+    let out =
+        b.ok(&["upload", "0.png", "1.png", "2.png", "--depth", "8", "--exposure-us", "9000", "--start"]);
+    assert!(out.starts_with("3 patterns in 1 images, "), "{out}");
+    {
+        let mut m = b.model.lock().unwrap();
+        assert_eq!(m.mode(), DisplayMode::OnTheFly);
+        assert!(matches!(m.sequencer(HostTime(0)), Sequencer::Running(..)));
+        for (i, p) in pictures.iter().enumerate() {
+            assert!(m.projected_grey(i).unwrap() == *p.as_raw(), "picture {i}");
+        }
+        assert_eq!(m.warnings(), [] as [String; 0]);
+    }
+    b.ok(&["stop"]);
+    assert_eq!(b.model.lock().unwrap().dark_because(), Some("sequencer stopped"));
+    b.ok(&["start"]);
+    b.ok(&["idle"]);
+    assert_eq!(b.model.lock().unwrap().dark_because(), Some("mirrors exercised"));
+    b.ok(&["leave-idle"]);
+    b.ok(&["park"]);
+    assert!(b.ok(&["status"]).contains("parked       yes"));
+    b.ok(&["unpark"]);
+    b.ok(&["standby"]);
+    assert_eq!(b.model.lock().unwrap().dark_because(), Some("standby"));
+    b.ok(&["wake"]);
+    b.ok(&["video-pattern", "--frame-hz", "60", "--patterns", "8"]);
+    assert_eq!(b.model.lock().unwrap().mode(), DisplayMode::VideoPattern);
+}
+
+#[test]
+fn mistakes_are_named_with_their_exit_codes() {
+    let b = Bench::new("mistakes", 2);
+    let several = b.dpm(&["status"]);
+    let err = text(&several.stderr);
+    assert!(several.status.code() == Some(2) && err.contains("2 controllers are plugged in"), "{err}");
+    let absent = b.dpm(&["status", "--device", "9:99"]);
+    let err = text(&absent.stderr);
+    assert!(
+        absent.status.code() == Some(3) && err.contains("no DLPC900 (USB 0451:c900) is plugged in"),
+        "{err}"
+    );
+    let b = Bench::new("rules", 1);
+    image::GrayImage::new(1024, 768).save(b.folder.join("a.png")).unwrap();
+    image::GrayImage::new(64, 48).save(b.folder.join("b.png")).unwrap();
+    let wrong = |words: &[&str], says: &str| {
+        let until = std::time::Instant::now() + std::time::Duration::from_secs(5);
+        loop {
+            let o = b.dpm(words);
+            let err = text(&o.stderr);
+            if err.contains("in use") && std::time::Instant::now() < until {
+                continue;
+            }
+            assert!(o.status.code() == Some(2) && err.contains(says), "{err}");
+            return;
+        }
+    };
+    wrong(&["upload", "b.png"], "b.png: 64 x 48 pixels, the DLP5500 has 1024 x 768");
+    wrong(&["upload", "c.png"], "c.png: ");
+    wrong(&["upload", "a.png", "--exposure-us", "0"], "LUT entry 0: exposure 0 us is below");
+    wrong(&["video-pattern", "--exposure-us", "9000"], "LUT entry 1: patterns up to here take 18000 us");
+    assert!(
+        b.model.lock().unwrap().executed().iter().all(|e| e.error == 0 && e.flags & 0x80 != 0),
+        "nothing was written"
+    );
+}
