@@ -64,21 +64,27 @@ struct Lobes {
     float dielectric;
 };
 
+bool mirror_like(Point s) { return s.alpha < DELTA_ALPHA; }
+
+// Where the coat's albedo is looked up: a mirror reflects by Fresnel's law, which is row 0 of the table.
+float coat_alpha(Point s) { return mirror_like(s) ? 0.0 : s.alpha; }
+
 Lobes lobes_of(Point s) {
     Lobes l;
     float nv = dot(s.n, s.v);
-    bool inside = !s.front && (s.flags & MATERIAL_THIN) == 0u && (s.flags & MATERIAL_TRANSMISSIVE) != 0u;
+    bool inside = !s.front && (s.flags & MATERIAL_THIN) == 0u && s.transmission > 0.0;
     l.eta = inside ? 1.0 / s.ior : s.ior;
     l.dielectric = 1.0 - s.metallic;
     l.albedo_v = 0.0;
     float specular = 0.0, diffuse = 0.0, transmit = 0.0;
     if (inside) {
-        float f = clamp(fresnel_dielectric(l.eta, nv), 0.05, 1.0);
+        // Facets of a rough surface may transmit where the mean surface reflects totally.
+        float f = clamp(fresnel_dielectric(l.eta, nv), 0.05, mirror_like(s) ? 1.0 : 0.95);
         specular = f * l.dielectric + s.metallic;
         transmit = (1.0 - f) * l.dielectric * s.transmission;
     } else {
         if (HAS_SPECULAR) {
-            l.albedo_v = l.dielectric > 0.0 ? directional_albedo(s.table, s.alpha, nv) : 0.0;
+            l.albedo_v = l.dielectric > 0.0 ? directional_albedo(s.table, coat_alpha(s), nv) : 0.0;
             specular = l.dielectric * l.albedo_v + (s.metallic > 0.0 ? s.metallic * luminance(fresnel_schlick(s.base, nv)) : 0.0);
         }
         float rest = l.dielectric * (1.0 - l.albedo_v) * luminance(s.base);
@@ -94,8 +100,6 @@ Lobes lobes_of(Point s) {
     l.transmit = transmit * scale;
     return l;
 }
-
-bool mirror_like(Point s) { return s.alpha < DELTA_ALPHA; }
 
 // Value times |n.l| and pdf of the non-delta lobes for direction l.
 void evaluate(Point s, Lobes q, vec3 l, out vec3 value, out float pdf) {
@@ -117,13 +121,13 @@ void evaluate(Point s, Lobes q, vec3 l, out vec3 value, out float pdf) {
         if (HAS_DIFFUSE && q.diffuse > 0.0) {
             float k = q.dielectric * (1.0 - s.transmission);
             if (HAS_SPECULAR) {
-                float e_avg = average_albedo(s.table, s.alpha);
-                k *= (1.0 - q.albedo_v) * (1.0 - directional_albedo(s.table, s.alpha, nl)) / max(1.0 - e_avg, 1e-4);
+                float e_avg = average_albedo(s.table, coat_alpha(s));
+                k *= (1.0 - q.albedo_v) * (1.0 - directional_albedo(s.table, coat_alpha(s), nl)) / max(1.0 - e_avg, 1e-4);
             }
             value += s.base * (k * nl / PI);
             pdf += q.diffuse * nl / PI;
         }
-    } else if (HAS_TRANSMISSION && nl < 0.0 && gl < 0.0 && q.transmit > 0.0 && !mirror_like(s) && (s.flags & MATERIAL_THIN) == 0u && q.eta != 1.0) {
+    } else if (HAS_TRANSMISSION && nl < 0.0 && gl < 0.0 && q.transmit > 0.0 && !mirror_like(s) && (s.flags & MATERIAL_THIN) == 0u) {
         // [Walter07] eq. 21, with the half vector on the side of v.
         vec3 h = normalize(s.v + l * q.eta);
         if (dot(h, s.n) < 0.0) h = -h;
@@ -180,7 +184,7 @@ BsdfSample sample_bsdf(Point s, Lobes q, float u_lobe, vec2 u) {
         r.direction = to_world * vec3(radius * cos(phi), radius * sin(phi), sqrt(max(1.0 - u.x, 0.0)));
     } else {
         r.below = true;
-        if ((s.flags & MATERIAL_THIN) != 0u || q.eta == 1.0) {
+        if ((s.flags & MATERIAL_THIN) != 0u) {
             r.direction = -s.v;
             r.weight = s.base * (q.dielectric * s.transmission * (1.0 - q.albedo_v) / q.transmit);
             r.delta = true;

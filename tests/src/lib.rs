@@ -1,1 +1,5 @@
-//! placeholder
+//! What the end-to-end tests share: small scenes made by code, and frames drawn by the GPU under validation.
+
+pub mod gpu;
+pub mod scenes;
+pub mod statistics;

@@ -10,6 +10,9 @@ use glam::{DAffine3, Vec3};
 /// Most bodies a scene may have: the instance shares a word with the triangle.
 pub const MAX_BODIES: usize = 64;
 
+/// A solid with a smaller index is drawn as a thin wall: its refraction would be a spike that f32 cannot carry.
+const STRAIGHT_BELOW_IOR: f32 = 1.001;
+
 /// Where one body's data lie, and its bounds in body space.
 #[derive(Clone, Debug)]
 pub struct BodyData {
@@ -237,7 +240,7 @@ impl SceneData {
             if m.double_sided {
                 flags |= gpu::MATERIAL_DOUBLE_SIDED;
             }
-            if m.thin_walled {
+            if m.thin_walled || ior < STRAIGHT_BELOW_IOR {
                 flags |= gpu::MATERIAL_THIN;
             }
             if transmissive {
