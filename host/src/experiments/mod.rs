@@ -2,3 +2,4 @@
 
 pub mod pictures;
 pub mod run_rig;
+pub mod stability;

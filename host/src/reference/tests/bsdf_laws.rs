@@ -1,6 +1,7 @@
 //! Scattering functions against Fresnel's equations, reciprocity, and the statistics of their samplers.
 
 use super::*;
+use crate::experiments::stability::statistics::test_directions;
 use crate::reference::bsdf::Bsdf;
 use crate::reference::microfacet::*;
 use crate::reference::{Reference, Sampler, SurfacePoint};
@@ -140,93 +141,14 @@ fn scattering_is_reciprocal() {
     }
 }
 
-/// Survival function of chi^2 by the normal approximation of its cube root [Wilson31].
-fn chi2_p_value(chi2: f64, freedom: f64) -> f64 {
-    let z = ((chi2 / freedom).cbrt() - (1.0 - 2.0 / (9.0 * freedom))) / (2.0 / (9.0 * freedom)).sqrt();
-    // Upper tail of the normal by the continued form of [Abramowitz64] 7.1.26, enough for a threshold at 1e-3.
-    let t = 1.0 / (1.0 + 0.3275911 * z.abs() / std::f64::consts::SQRT_2);
-    let poly =
-        t * (0.254829592 + t * (-0.284496736 + t * (1.421413741 + t * (-1.453152027 + t * 1.061405429))));
-    let tail = 0.5 * poly * (-0.5 * z * z).exp();
-    if z > 0.0 {
-        tail
-    } else {
-        1.0 - tail
-    }
-}
-
-/// Histogram of sampled directions against the density integrated over each cell of (y, azimuth); the density must integrate to the
-/// share of samples that are not absorbed.
 fn chi_square(
     name: &str,
     samples: u32,
     sample: &mut dyn FnMut() -> Option<DVec3>,
     pdf: &dyn Fn(DVec3) -> f64,
 ) {
-    const ROWS: usize = 40;
-    const COLUMNS: usize = 40;
-    let mut count = vec![0.0; ROWS * COLUMNS];
-    let mut kept = 0.0;
-    for _ in 0..samples {
-        let Some(d) = sample() else { continue };
-        let row = ((0.5 - 0.5 * d.y) * ROWS as f64) as usize;
-        let column = ((0.5 + d.z.atan2(d.x) / (2.0 * PI)) * COLUMNS as f64) as usize;
-        count[row.min(ROWS - 1) * COLUMNS + column.min(COLUMNS - 1)] += 1.0;
-        kept += 1.0;
-    }
-    let mut expected = vec![0.0; ROWS * COLUMNS];
-    const SUB: usize = 14;
-    for (cell, e) in expected.iter_mut().enumerate() {
-        let (row, column) = (cell / COLUMNS, cell % COLUMNS);
-        let mut sum = 0.0;
-        for i in 0..SUB {
-            for j in 0..SUB {
-                let y = 1.0 - 2.0 * (row as f64 + (i as f64 + 0.5) / SUB as f64) / ROWS as f64;
-                let phi = (2.0 * (column as f64 + (j as f64 + 0.5) / SUB as f64) / COLUMNS as f64 - 1.0) * PI;
-                let r = (1.0 - y * y).sqrt();
-                sum += pdf(DVec3::new(r * phi.cos(), y, r * phi.sin()));
-            }
-        }
-        *e = sum / (SUB * SUB) as f64 * 4.0 * PI / (ROWS * COLUMNS) as f64 * f64::from(samples);
-    }
-    let integral = expected.iter().sum::<f64>() / f64::from(samples);
-    let share = kept / f64::from(samples);
-    assert!((integral - share).abs() < 6e-3, "{name}: density integrates to {integral}, kept {share}");
-    let (mut chi2, mut freedom, mut few) = (0.0, -1.0, (0.0, 0.0));
-    for (c, e) in count.iter().zip(&expected) {
-        if *e < 10.0 {
-            few = (few.0 + c, few.1 + e);
-        } else {
-            chi2 += (c - e) * (c - e) / e;
-            freedom += 1.0;
-        }
-    }
-    if few.1 > 10.0 {
-        chi2 += (few.0 - few.1) * (few.0 - few.1) / few.1;
-    }
-    let p = chi2_p_value(chi2, freedom);
-    assert!(p > 1e-3, "{name}: chi2 {chi2} of {freedom}, p {p}");
-}
-
-#[test]
-fn a_wrong_density_is_caught() {
-    let mut sampler = Sampler::new(5, 5);
-    let caught = std::panic::catch_unwind(move || {
-        // Cosine samples judged by a density of 2% stronger contrast.
-        let mut draw = || {
-            let u = sampler.uniform2();
-            let (r, phi) = (u[0].sqrt(), 2.0 * PI * u[1]);
-            Some(DVec3::new(r * phi.cos(), (1.0 - u[0]).sqrt(), r * phi.sin()))
-        };
-        chi_square("wrong", 150_000, &mut draw, &|d| {
-            if d.y > 0.0 {
-                1.04 / 2.0 / PI * 2.0 * d.y.powf(1.08)
-            } else {
-                0.0
-            }
-        });
-    });
-    assert!(caught.is_err());
+    let test = test_directions(samples, sample, pdf);
+    assert!(test.integral_error.abs() < 6e-3 && test.p_value > 1e-3, "{name}: {test:?}");
 }
 
 #[test]

@@ -1,0 +1,129 @@
+//! Plain shapes and materials into small scenes: what the stability cases and the tests of the reference look at.
+
+use crate::geometry::projector::ProjectorCamera;
+use crate::scene::{Body, Environment, Material, Scene, TriangleMesh};
+use dpm_device::planes::Raster;
+use glam::{DAffine3, DVec3, Vec2, Vec3, Vec4};
+use std::collections::HashMap;
+
+/// A scene of one body with one material.
+pub fn scene(mesh: TriangleMesh, material: Material) -> Scene {
+    let mut s = Scene::default();
+    add(&mut s, mesh, material);
+    s
+}
+
+/// Adds a body at the identity pose.
+pub fn add(scene: &mut Scene, mut mesh: TriangleMesh, material: Material) {
+    mesh.materials = vec![scene.materials.len() as u32; mesh.triangles.len()];
+    scene.materials.push(material);
+    scene.bodies.push(Body {
+        name: format!("body {}", scene.bodies.len()),
+        tracked: None,
+        projected: true,
+        world_from_body_rest: DAffine3::IDENTITY,
+        mesh,
+    });
+}
+
+/// Indexed triangles with plain tangents and no texture coordinates.
+pub fn mesh(positions: Vec<Vec3>, normals: Vec<Vec3>, triangles: Vec<[u32; 3]>) -> TriangleMesh {
+    let n = positions.len();
+    TriangleMesh {
+        tangents: normals.iter().map(|n| n.any_orthonormal_vector().extend(1.0)).collect::<Vec<Vec4>>(),
+        uvs: vec![Vec2::ZERO; n],
+        materials: vec![0; triangles.len()],
+        positions,
+        normals,
+        triangles,
+    }
+}
+
+/// A closed sphere of 20 * 4^level triangles with the normals of its faces (so that shading and geometry agree) or of the sphere.
+pub fn sphere(centre: Vec3, radius: f32, level: u32, smooth: bool) -> TriangleMesh {
+    let g = (1.0 + 5f32.sqrt()) / 2.0;
+    let mut p: Vec<Vec3> = Vec::new();
+    for (a, b) in [(1.0, g), (-1.0, g), (1.0, -g), (-1.0, -g)] {
+        p.extend([Vec3::new(0.0, a, b), Vec3::new(a, b, 0.0), Vec3::new(b, 0.0, a)]);
+    }
+    p.iter_mut().for_each(|v| *v = v.normalize());
+    let edge = p.iter().skip(1).map(|v| v.distance(p[0])).fold(f32::MAX, f32::min) * 1.01;
+    let mut t = Vec::new();
+    for i in 0..12u32 {
+        for j in i + 1..12 {
+            for k in j + 1..12 {
+                let (a, b, c) = (p[i as usize], p[j as usize], p[k as usize]);
+                if a.distance(b) < edge && b.distance(c) < edge && c.distance(a) < edge {
+                    let outward = (b - a).cross(c - a).dot(a) > 0.0;
+                    t.push(if outward { [i, j, k] } else { [i, k, j] });
+                }
+            }
+        }
+    }
+    for _ in 0..level {
+        let mut middle: HashMap<(u32, u32), u32> = HashMap::new();
+        let mut half = |a: u32, b: u32| {
+            *middle.entry((a.min(b), a.max(b))).or_insert_with(|| {
+                p.push(((p[a as usize] + p[b as usize]) * 0.5).normalize());
+                p.len() as u32 - 1
+            })
+        };
+        let mut finer = Vec::new();
+        for [a, b, c] in t {
+            let (ab, bc, ca) = (half(a, b), half(b, c), half(c, a));
+            finer.extend([[a, ab, ca], [b, bc, ab], [c, ca, bc], [ab, bc, ca]]);
+        }
+        t = finer;
+    }
+    let at = |v: Vec3| centre + v * radius;
+    if smooth {
+        return mesh(p.iter().map(|v| at(*v)).collect(), p, t);
+    }
+    let (mut positions, mut normals, mut triangles) = (vec![], vec![], vec![]);
+    for [a, b, c] in t.into_iter().map(|t| t.map(|i| p[i as usize])) {
+        let n = positions.len() as u32;
+        triangles.push([n, n + 1, n + 2]);
+        positions.extend([a, b, c].map(at));
+        normals.extend([(b - a).cross(c - a).normalize(); 3]);
+    }
+    mesh(positions, normals, triangles)
+}
+
+/// A parallelogram facing `u x v`.
+pub fn quad(corner: Vec3, u: Vec3, v: Vec3) -> TriangleMesh {
+    let n = u.cross(v).normalize();
+    let mut m =
+        mesh(vec![corner, corner + u, corner + u + v, corner + v], vec![n; 4], vec![[0, 1, 2], [0, 2, 3]]);
+    m.uvs = vec![Vec2::new(0.0, 1.0), Vec2::ONE, Vec2::new(1.0, 0.0), Vec2::ZERO];
+    m.tangents = vec![u.normalize().extend(1.0); 4];
+    m
+}
+
+/// A floor in y = 0 facing up, `2 * half` on a side.
+pub fn floor(half: f32) -> TriangleMesh {
+    quad(Vec3::new(-half, 0.0, half), Vec3::X * 2.0 * half, Vec3::NEG_Z * 2.0 * half)
+}
+
+/// Lambertian.
+pub fn diffuse(albedo: Vec3) -> Material {
+    Material { base_color: albedo, metallic: 0.0, ior: 1.0, ..Material::default() }
+}
+
+/// Black and glowing on its front.
+pub fn emitter(radiance: Vec3) -> Material {
+    Material { emissive: radiance, ..diffuse(Vec3::ZERO) }
+}
+
+/// Even light from everywhere.
+pub fn sky(l: f32) -> Environment {
+    Environment::Constant(Vec3::splat(l))
+}
+
+/// A projector of 0.6 rad horizontal field of view.
+///
+/// # Panics
+/// When the raster is empty or the two points coincide.
+pub fn camera(w: u32, h: u32, position: DVec3, look_at: DVec3) -> ProjectorCamera {
+    let up = if (look_at - position).cross(DVec3::Y).length() < 1e-6 { DVec3::NEG_Z } else { DVec3::Y };
+    ProjectorCamera::look_at(Raster::new(w, h).unwrap(), position, look_at, up, 0.6).unwrap()
+}

@@ -1,0 +1,714 @@
+//! Hard cases of light transport and geometry, on the f64 reference and on what it shares with the GPU (the albedo table, compensation).
+
+use super::shapes::*;
+use super::statistics::{test_directions, Mean};
+use super::Case;
+use crate::reference::bsdf::Bsdf;
+use crate::reference::bvh::{Bvh, Triangle};
+use crate::reference::microfacet::fresnel_dielectric;
+use crate::reference::{offset, Reference, ReferenceImage, RenderSettings, Sampler, SurfacePoint};
+use crate::render::albedo_table::AlbedoTable;
+use crate::render::compensation::Compensation;
+use crate::scene::{Environment, Material, PunctualKind, PunctualLight, Scene};
+use glam::{DAffine3, DVec3, Vec3};
+use std::f64::consts::PI;
+
+/// The cases.
+pub fn cases() -> Vec<Case> {
+    vec![
+        Case::new("tracer-furnace-convex", "white Lambertian sphere in even light, 64 bounces", "closed form: 1 in every sample", "radiance", 1e-12, furnace_convex),
+        Case::new("tracer-furnace-concave", "corner of three white walls in even light, 64 bounces", "closed form: mean 1", "sigma", 4.0, furnace_concave),
+        Case::new("tracer-furnace-closed-sphere", "closed sphere, albedo and emission 1/2", "closed form: 1 = sum of 2^-k", "sigma", 4.0, furnace_closed),
+        Case::new("tracer-energy-of-every-lobe", "roughness 0, 1e-4, 1e-3, 0.5, 1; ior 1 to 2.4; metal, coat, thin, solid; down to grazing 89.99 deg", "albedo at most 1", "excess", 1e-2, energy),
+        Case::new("tracer-single-scatter-loss", "white rough metal, alpha 0.25, 0.5, 1", "directional albedo 0.882, 0.700, 0.409 on average", "albedo", 3e-3, single_scatter),
+        Case::new("tracer-coated-diffuse-conserves", "white base under coats of ior 1 to 2.4", "closed form: albedo 1", "albedo", 5e-3, coated),
+        Case::new("tracer-reciprocity", "random pairs of directions, reflection and refraction", "f(a, b) = f(b, a), with the square of the index where refracted", "relative", 1e-9, reciprocity),
+        Case::new("tracer-samplers-chi-square", "all lobes, 150,000 samples each", "probability that chance fits worse: 1e-3 / p", "ratio", 1.0, chi_square),
+        Case::new("tracer-density-integrates-to-one", "all lobes", "integral of the density = share not absorbed", "share", 6e-3, density_integral),
+        Case::new("tracer-sphere-light-form-factor", "sphere light over a floor", "closed form: E = pi L (r / h)^2", "relative", 1.5e-2, form_factor),
+        Case::new("tracer-scale-invariance", "a scene at 1e-6 to 1e6 of its size", "same image", "relative", 1e-6, scale),
+        Case::new("tracer-far-from-origin", "bodies moved 1e5 m by their pose", "same image", "relative", 1e-6, far_from_origin),
+        Case::new("tracer-self-hits-and-leaks", "spheres of radius 1e-6 to 1e6 m at up to 1e5 m, new rays on both sides", "no ray hits what it leaves, none gets out", "share", 0.0, self_hits),
+        Case::new("tracer-watertight", "closed mesh, rays at corners and edges from inside", "no ray escapes", "share", 0.0, watertight),
+        Case::new("tracer-needles-and-zero-areas", "NaN corner, equal corners, collinear corners, needle of 1e30, duplicates in a closed mesh", "dropped or harmless: no leak, all finite", "faults", 0.0, degenerate),
+        Case::new("tracer-axis-parallel-rays", "rays along axes through corners, edges and planes, with +0 and -0", "brute force", "mismatches", 0.0, axis_parallel),
+        Case::new("tracer-hierarchy-sizes", "0, 1, 2, 3, 1,000, 100,000 triangles; all centroids equal; coordinates doubling 900 times", "brute force", "mismatches", 0.0, hierarchy),
+        Case::new("tracer-invalid-rays", "origin or direction NaN, infinite or zero", "no hit, no hang", "hits", 0.0, invalid_rays),
+        Case::new("tracer-lamp-at-a-micrometre", "even lamp 1e-6 m over a floor, a sun 1e8 times as bright behind it", "closed form: albedo * L", "relative", 1e-4, lamp_at_a_micrometre),
+        Case::new("tracer-no-light", "no light, black lights, black sky, empty scene", "all 0", "radiance", 0.0, no_light),
+        Case::new("tracer-many-lights", "100,000 point lights, a fifth of them black", "closed form: sum", "sigma", 4.0, many_lights),
+        Case::new("tracer-fresnel", "ior 0.2 to 2.4, 1, 1 + 1e-7, edge of total reflection", "Fresnel's equations", "reflectance", 1e-12, fresnel),
+        Case::new("tracer-grazing-and-zero-vectors", "directions at 90 deg, denormal cosines, u = 0 and 1 - 2^-53", "finite, not negative", "faults", 0.0, grazing),
+        Case::new("tracer-random-streams", "seed 0, neighbouring pixels, 2^32nd frame", "correlation of neighbours and lags", "sigma", 5.0, streams),
+        Case::new("tracer-same-seed-same-image", "1 and 3 threads", "bit for bit", "pixels", 0.0, same_seed),
+        Case::new("albedo-table-f32", "0..1 in both, ior 1.0001 to 3", "f64 look-up", "albedo", 2e-6, albedo_f32),
+        Case::new("compensation-extremes", "cos 0 and 1e-38, distance 0 and 1e18, radiance NaN, infinite, negative, denormal", "0..1, never NaN; NaN becomes black", "faults", 0.0, compensation_extremes),
+        Case::new("compensation-f32", "distance 1 mm to 50 m, cos 1 to 1e-3", "f64", "relative", 6e-7, compensation_f32),
+    ]
+}
+
+/// Mean over all pixels of the first channel, and its standard error.
+fn overall(image: &ReferenceImage) -> (f64, f64) {
+    let n = image.mean.len() as f64;
+    let mean = image.mean.iter().map(|p| p[0]).sum::<f64>() / n;
+    (mean, image.variance.iter().map(|v| v[0]).sum::<f64>().sqrt() / n)
+}
+
+fn settings(spp: u32, depth: u32, seed: u64) -> RenderSettings {
+    RenderSettings { spp, depth, seed, ..Default::default() }
+}
+
+fn on_sphere(s: &mut Sampler) -> DVec3 {
+    let z = 2.0 * s.uniform() - 1.0;
+    let phi = std::f64::consts::TAU * s.uniform();
+    let r = (1.0 - z * z).sqrt();
+    DVec3::new(r * phi.cos(), r * phi.sin(), z)
+}
+
+fn furnace_convex(seed: u64) -> f64 {
+    let mut s = scene(sphere(Vec3::ZERO, 1.0, 2, false), diffuse(Vec3::ONE));
+    s.environment = sky(1.0);
+    let c = camera(24, 24, DVec3::new(0.0, 0.0, 5.0), DVec3::ZERO);
+    let image = Reference::new(&s, &[]).render_camera(&c, &settings(4, 64, seed));
+    image.mean.iter().flatten().map(|p| (p - 1.0).abs()).fold(0.0, f64::max)
+}
+
+fn furnace_concave(seed: u64) -> f64 {
+    let mut s = scene(floor(1.0), diffuse(Vec3::ONE));
+    add(&mut s, quad(Vec3::new(-1.0, 0.0, -1.0), Vec3::X * 2.0, Vec3::Y * 2.0), diffuse(Vec3::ONE));
+    add(&mut s, quad(Vec3::new(-1.0, 0.0, 1.0), Vec3::NEG_Z * 2.0, Vec3::Y * 2.0), diffuse(Vec3::ONE));
+    s.environment = sky(1.0);
+    let c = camera(12, 12, DVec3::new(4.0, 5.0, 6.0), DVec3::new(-0.5, 0.5, -0.5));
+    let (mean, sigma) = overall(&Reference::new(&s, &[]).render_camera(&c, &settings(200, 64, seed)));
+    (mean - 1.0).abs() / sigma.max(1e-9)
+}
+
+fn furnace_closed(seed: u64) -> f64 {
+    let material = Material { emissive: Vec3::splat(0.5), double_sided: true, ..diffuse(Vec3::splat(0.5)) };
+    let s = scene(sphere(Vec3::new(0.3, -0.2, 0.1), 2.0, 1, false), material);
+    let c = camera(16, 16, DVec3::ZERO, DVec3::NEG_Z);
+    let (mean, sigma) = overall(&Reference::new(&s, &[]).render_camera(&c, &settings(100, 64, seed)));
+    (mean - 1.0).abs() / sigma
+}
+
+/// The point in the middle of a patch of the material and the scene that owns it.
+fn patch(material: &Material) -> SurfacePoint {
+    let s = scene(floor(1.0), material.clone());
+    let point = Reference::new(&s, &[]).trace(DVec3::new(0.1, 1.0, 0.2), -DVec3::Y, 9.0, false);
+    point.expect("the patch lies below")
+}
+
+fn viewing(mu: f64) -> DVec3 {
+    DVec3::new((1.0 - mu * mu).max(0.0).sqrt(), mu, 0.0)
+}
+
+fn albedo_of(material: &Material, table: &AlbedoTable, mu: f64, n: u32, seed: u64) -> Mean {
+    let point = patch(material);
+    let mut mean = Mean::default();
+    let Some(bsdf) = Bsdf::new(&point, table, viewing(mu)) else { return mean };
+    let mut s = Sampler::new(seed, 0);
+    for _ in 0..n {
+        let sample = bsdf.sample(s.uniform(), s.uniform2(), s.uniform());
+        mean.push(sample.map_or(0.0, |s| s.weight.max_element()));
+    }
+    mean
+}
+
+const LOOKS: [(f32, f32, bool); 6] = [
+    (0.0, 0.0, true),
+    (1.0, 0.0, true),
+    (0.0, 1.0, true),
+    (0.0, 1.0, false),
+    (0.5, 0.5, false),
+    (0.3, 0.5, true),
+];
+
+fn energy(seed: u64) -> f64 {
+    let mut worst: f64 = 0.0;
+    for ior in [1.0, 1.0 + 1e-7, 1.0011, 1.5, 2.4] {
+        let table = AlbedoTable::new(ior);
+        for roughness in [0.0, 1e-4, 1e-3, 0.0317, 0.5, 1.0] {
+            for (metallic, transmission, thin_walled) in LOOKS {
+                let m =
+                    Material { roughness, ior, metallic, transmission, thin_walled, ..Material::default() };
+                for mu in [1.0, 0.3, 1.745e-4] {
+                    let a = albedo_of(&m, &table, mu, 300, seed);
+                    if a.mean() < 0.0 {
+                        return f64::INFINITY;
+                    }
+                    worst = worst.max(a.mean() - 5.0 * a.standard_error() - 1.0);
+                }
+            }
+        }
+    }
+    worst
+}
+
+fn single_scatter(seed: u64) -> f64 {
+    let table = AlbedoTable::new(1.5);
+    let mut worst: f64 = 0.0;
+    for (alpha, expected) in [(0.25f32, 0.882), (0.5, 0.700), (1.0, 0.409)] {
+        let m = Material { roughness: alpha.sqrt(), ..Material::default() };
+        let n = 40;
+        let sum: f64 = (0..n)
+            .map(|i| {
+                let mu = (f64::from(i) + 0.5) / f64::from(n);
+                2.0 * mu * albedo_of(&m, &table, mu, 3000, seed + i as u64).mean() / f64::from(n)
+            })
+            .sum();
+        worst = worst.max((sum - expected).abs());
+    }
+    worst
+}
+
+fn coated(seed: u64) -> f64 {
+    let mut worst: f64 = 0.0;
+    for ior in [1.0, 1.1, 1.5, 2.4] {
+        let table = AlbedoTable::new(ior);
+        for roughness in [0.0, 0.1, 0.5, 1.0] {
+            let m = Material { ior, roughness, ..diffuse(Vec3::ONE) };
+            for mu in [1.0, 0.6, 0.2, 0.05] {
+                let a = albedo_of(&m, &table, mu, 2000, seed);
+                worst = worst.max((a.mean() - 1.0).abs() - 5.0 * a.standard_error());
+            }
+        }
+    }
+    worst.max(0.0)
+}
+
+fn direction(u: [f64; 2], up: f64) -> DVec3 {
+    let (y, phi) = (0.02 + 0.98 * u[0], 2.0 * PI * u[1]);
+    let r = (1.0 - y * y).sqrt();
+    DVec3::new(r * phi.cos(), y * up, r * phi.sin())
+}
+
+fn reciprocity(seed: u64) -> f64 {
+    let mut s = Sampler::new(seed, 0);
+    let mut worst: f64 = 0.0;
+    for roughness in [0.1, 0.4, 1.0] {
+        for (metallic, transmission, thin_walled) in LOOKS {
+            let base_color = Vec3::new(0.9, 0.5, 0.1);
+            let m = Material {
+                base_color,
+                roughness,
+                metallic,
+                transmission,
+                thin_walled,
+                ..Material::default()
+            };
+            let (p, table) = (patch(&m), AlbedoTable::new(m.ior));
+            let f = |v: DVec3, l: DVec3| {
+                Bsdf::new(&p, &table, v).map_or(DVec3::ZERO, |b| b.evaluate(l).f_cos / l.y.abs())
+            };
+            let mut compare = |a: DVec3, b: DVec3| {
+                let size = a.max_element().max(b.max_element());
+                if size > 0.0 {
+                    worst = worst.max((a - b).abs().max_element() / size);
+                }
+            };
+            for _ in 0..100 {
+                let (a, b) = (direction(s.uniform2(), 1.0), direction(s.uniform2(), 1.0));
+                compare(f(a, b), f(b, a));
+                let below = direction(s.uniform2(), -1.0);
+                if transmission > 0.0 {
+                    compare(f(a, below) * f64::from(m.ior).powi(2), f(below, a));
+                }
+            }
+        }
+    }
+    worst
+}
+
+/// Significance and integral error of every lobe's sampler.
+fn direction_tests(seed: u64, samples: u32) -> Vec<super::statistics::DirectionTest> {
+    let looks = [
+        (0.5f32, 1.0f32, 0.0f32, true, 0.9f64),
+        (0.7, 1.0, 0.0, true, 0.15),
+        (0.6, 0.0, 0.0, true, 0.6),
+        (0.7, 0.0, 1.0, false, 0.7),
+        (0.8, 0.3, 0.6, false, -0.6),
+    ];
+    looks
+        .into_iter()
+        .map(|(roughness, metallic, transmission, thin_walled, mu)| {
+            let base_color = Vec3::splat(0.8);
+            let m = Material {
+                base_color,
+                roughness,
+                metallic,
+                transmission,
+                thin_walled,
+                ..Material::default()
+            };
+            let (p, table) = (patch(&m), AlbedoTable::new(m.ior));
+            let bsdf = Bsdf::new(&p, &table, viewing(mu)).expect("front, or both sides");
+            let mut s = Sampler::new(seed, 1);
+            let mut draw = || Some(bsdf.sample(s.uniform(), s.uniform2(), s.uniform())?.l);
+            test_directions(samples, &mut draw, &|l| bsdf.evaluate(l).pdf)
+        })
+        .collect()
+}
+
+fn chi_square(seed: u64) -> f64 {
+    direction_tests(seed, 150_000).iter().map(|t| 1e-3 / t.p_value.max(1e-300)).fold(0.0, f64::max)
+}
+
+fn density_integral(seed: u64) -> f64 {
+    direction_tests(seed, 60_000).iter().map(|t| t.integral_error.abs()).fold(0.0, f64::max)
+}
+
+fn form_factor(seed: u64) -> f64 {
+    let (radius, height, albedo) = (0.5f32, 1.5f32, 0.5f32);
+    let mut s = scene(floor(4.0), diffuse(Vec3::splat(albedo)));
+    add(&mut s, sphere(Vec3::new(0.0, height, 0.0), radius, 3, true), emitter(Vec3::splat(2.0)));
+    let mut c = camera(6, 6, DVec3::new(3.0, 0.6, 0.0), DVec3::ZERO);
+    (c.fx, c.fy) = (1e6, 1e6);
+    let (mean, _) = overall(&Reference::new(&s, &[]).render_camera(&c, &settings(1500, 2, seed)));
+    (mean / (f64::from(albedo) * 2.0 * f64::from(radius / height).powi(2)) - 1.0).abs()
+}
+
+fn small_scene(scale: f32) -> Scene {
+    let at = |mut m: crate::scene::TriangleMesh| {
+        m.positions.iter_mut().for_each(|p| *p *= scale);
+        m
+    };
+    let mut s = scene(at(floor(2.0)), diffuse(Vec3::new(0.8, 0.5, 0.3)));
+    let glossy = Material { roughness: 0.4, base_color: Vec3::new(0.9, 0.8, 0.4), ..Material::default() };
+    add(&mut s, at(sphere(Vec3::new(0.0, 0.5, 0.0), 0.5, 2, true)), glossy);
+    add(&mut s, at(quad(Vec3::new(-0.5, 2.0, -0.5), Vec3::X, Vec3::Z)), emitter(Vec3::splat(4.0)));
+    s
+}
+
+fn view_of(scale: f64, shift: DVec3, seed: u64) -> ReferenceImage {
+    let s = small_scene(scale as f32);
+    let c =
+        camera(16, 16, DVec3::new(0.5, 3.0, 1.5) * scale + shift, DVec3::new(0.0, 0.3, 0.0) * scale + shift);
+    let eye = DVec3::new(2.0, 2.3, 1.0) * scale + shift;
+    Reference::new(&s, &[DAffine3::from_translation(shift); 3]).render(&c, eye, &settings(24, 3, seed))
+}
+
+fn difference(a: &ReferenceImage, b: &ReferenceImage) -> f64 {
+    let (a, b) = (a.mean_lit()[0], b.mean_lit()[0]);
+    (a / b - 1.0).abs()
+}
+
+fn scale(seed: u64) -> f64 {
+    let base = view_of(1.0, DVec3::ZERO, seed);
+    [1e-6, 1e-4, 1e5, 1e6]
+        .into_iter()
+        .map(|s| difference(&view_of(s, DVec3::ZERO, seed), &base))
+        .fold(0.0, f64::max)
+}
+
+fn far_from_origin(seed: u64) -> f64 {
+    let base = view_of(1.0, DVec3::ZERO, seed);
+    difference(&view_of(1.0, DVec3::new(1e5, -3e4, 7e4), seed), &base)
+}
+
+fn self_hits(seed: u64) -> f64 {
+    let (mut faults, mut all) = (0u32, 0u32);
+    for (radius, distance) in [(1e-6f32, 0.0), (1e-3, 0.0), (1e-3, 1e4), (1.0, 1e5), (1e4, 1e4), (1e6, 0.0)] {
+        let c = DVec3::new(0.36, 0.48, 0.8) * distance;
+        let s = scene(sphere(Vec3::ZERO, radius, 3, false), diffuse(Vec3::ONE));
+        let r = Reference::new(&s, &[DAffine3::from_translation(c)]);
+        let mut sampler = Sampler::new(seed, 0);
+        for _ in 0..3000 {
+            all += 1;
+            let d = on_sphere(&mut sampler);
+            let far = 3.0 * f64::from(radius);
+            let Some(hit) = r.trace(c + d * far, -d, f64::INFINITY, false) else {
+                faults += 1;
+                continue;
+            };
+            let w = on_sphere(&mut sampler);
+            let out = w * w.dot(hit.geometric).signum();
+            let start = |d: DVec3| offset(hit.position, hit.geometric, d, hit.scale);
+            faults += u32::from(r.occluded(start(out), out, f64::INFINITY, false));
+            faults += u32::from(!r.occluded(start(-out), -out, f64::INFINITY, false));
+        }
+    }
+    f64::from(faults) / f64::from(all)
+}
+
+fn triangles_of(mesh: &crate::scene::TriangleMesh) -> Vec<Triangle> {
+    (mesh.triangles.iter().enumerate())
+        .map(|(i, t)| Triangle {
+            p: t.map(|v| mesh.positions[v as usize].as_dvec3()),
+            body: 0,
+            index: i as u32,
+        })
+        .collect()
+}
+
+fn watertight(seed: u64) -> f64 {
+    let ball = sphere(Vec3::new(40.0, -70.0, 12.0), 1.0, 3, true);
+    let corners: Vec<DVec3> = ball.positions.iter().map(|p| p.as_dvec3()).collect();
+    let bvh = Bvh::new(triangles_of(&ball));
+    let mut s = Sampler::new(seed, 0);
+    let n = 100_000usize;
+    let mut leaks = 0;
+    for i in 0..n {
+        let from = DVec3::new(40.0, -70.0, 12.0) + on_sphere(&mut s) * 0.7 * s.uniform();
+        let to = match i % 3 {
+            0 => corners[i % corners.len()],
+            1 => {
+                let t = ball.triangles[i % ball.triangles.len()];
+                corners[t[0] as usize].lerp(corners[t[1] as usize], s.uniform())
+            }
+            _ => from + on_sphere(&mut s),
+        };
+        leaks += usize::from(!bvh.any(from, (to - from).normalize(), f64::INFINITY, |_| true));
+    }
+    leaks as f64 / n as f64
+}
+
+fn degenerate(seed: u64) -> f64 {
+    let mut m = sphere(Vec3::ZERO, 1.0, 1, true);
+    let n = m.positions.len() as u32;
+    m.positions.extend([
+        Vec3::splat(f32::NAN),
+        Vec3::X * 1e-3,
+        Vec3::X * 1e-3,
+        Vec3::new(0.0, 1e-30, 0.0),
+        Vec3::X,
+    ]);
+    m.normals.extend([Vec3::ZERO; 5]);
+    m.tangents.extend([glam::Vec4::ZERO; 5]);
+    m.uvs.extend([glam::Vec2::ZERO; 5]);
+    m.triangles.extend([
+        [n, 0, 1],
+        [n + 1, n + 2, 0],
+        [n + 1, n + 1, n + 1],
+        [n + 1, n + 2, n + 4],
+        [n + 1, n + 3, n + 4],
+    ]);
+    let twice = m.triangles[0];
+    m.triangles.push(twice);
+    let s = scene(m, diffuse(Vec3::splat(0.5)));
+    let r = Reference::new(&s, &[]);
+    let mut faults = u32::from(r.dropped_triangles != 4);
+    let mut sampler = Sampler::new(seed, 0);
+    for _ in 0..5000 {
+        let d = on_sphere(&mut sampler);
+        let sound = r.trace(d * 3.0, -d, f64::INFINITY, false).is_some_and(|h| {
+            h.position.is_finite() && h.geometric.is_normalized() && h.shading.is_normalized()
+        });
+        faults += u32::from(!sound);
+    }
+    f64::from(faults)
+}
+
+fn mismatch(bvh: &Bvh, origin: DVec3, direction: DVec3) -> u32 {
+    let a = bvh.closest(origin, direction, f64::INFINITY, |_| true).map(|h| h.t);
+    let b = bvh.closest_brute_force(origin, direction, f64::INFINITY).map(|h| h.t);
+    u32::from(a != b)
+}
+
+fn axis_parallel(_: u64) -> f64 {
+    let mut soup = Vec::new();
+    for i in 0..4u8 {
+        for j in 0..4u8 {
+            for k in 0..2u8 {
+                let corner = Vec3::new(f32::from(i), f32::from(k), f32::from(j));
+                soup.extend(triangles_of(&quad(corner, Vec3::Z, Vec3::X)));
+            }
+        }
+    }
+    let bvh = Bvh::new(soup);
+    let values = [-1.0, -0.0, 0.0, 0.25, 1.0, 2.0, 4.0];
+    let mut wrong = 0;
+    for axis in 0..3 {
+        for (sign, zero) in [(1.0, 0.0), (1.0, -0.0), (-1.0, 0.0), (-1.0, -0.0)] {
+            let mut d = DVec3::splat(zero);
+            d[axis] = sign;
+            for x in values {
+                for y in values {
+                    wrong += values.iter().map(|z| mismatch(&bvh, DVec3::new(x, y, *z), d)).sum::<u32>();
+                }
+            }
+        }
+    }
+    // The grid is closed downward: nothing falls through its edges and corners.
+    for x in [0.0, 1.0, 2.5, 3.0, 4.0] {
+        wrong += u32::from(!bvh.any(DVec3::new(x, 3.0, 2.0), -DVec3::Y, 9.0, |_| true));
+    }
+    f64::from(wrong)
+}
+
+fn hierarchy(seed: u64) -> f64 {
+    let mut wrong = 0;
+    let mut s = Sampler::new(seed, 0);
+    for (n, size, rays) in [
+        (0usize, 0.5, 10),
+        (1, 0.5, 200),
+        (2, 0.5, 200),
+        (3, 0.5, 200),
+        (1000, 0.1, 300),
+        (100_000, 0.01, 20),
+    ] {
+        let soup = (0..n)
+            .map(|i| {
+                let c = on_sphere(&mut s) * s.uniform();
+                let p = std::array::from_fn(|_| c + on_sphere(&mut s) * size);
+                Triangle { p, body: 0, index: i as u32 }
+            })
+            .collect();
+        let bvh = Bvh::new(soup);
+        for _ in 0..rays {
+            let o = on_sphere(&mut s) * 1.5 * s.uniform();
+            wrong += mismatch(&bvh, o, on_sphere(&mut s));
+        }
+    }
+    let one = Triangle { p: [DVec3::X, DVec3::Y, DVec3::Z], body: 0, index: 0 };
+    let equal = Bvh::new(vec![one; 20_000]);
+    wrong += mismatch(&equal, DVec3::ZERO, DVec3::ONE);
+    let doubling = (0..900)
+        .map(|i| {
+            let x = 2f64.powi(i - 450);
+            Triangle {
+                p: [DVec3::X * x, DVec3::new(x, 1.0, 0.0), DVec3::new(x, 0.0, 1.0)],
+                body: 0,
+                index: i as u32,
+            }
+        })
+        .collect();
+    let doubling = Bvh::new(doubling);
+    for i in [0, 1, 450, 700] {
+        wrong += mismatch(&doubling, DVec3::new(0.75 * 2f64.powi(i - 450), 0.25, 0.25), DVec3::X);
+    }
+    f64::from(wrong)
+}
+
+fn invalid_rays(_: u64) -> f64 {
+    let bvh = Bvh::new(triangles_of(&sphere(Vec3::ZERO, 1.0, 2, true)));
+    let bad = [
+        (DVec3::NAN, DVec3::X),
+        (DVec3::ZERO, DVec3::NAN),
+        (DVec3::ZERO, DVec3::ZERO),
+        (DVec3::ZERO, DVec3::new(0.0, f64::NAN, 1.0)),
+        (DVec3::new(f64::INFINITY, 0.0, 0.0), -DVec3::X),
+        (DVec3::ZERO, DVec3::new(f64::INFINITY, 0.0, 0.0)),
+    ];
+    bad.iter().filter(|(o, d)| bvh.any(*o, *d, f64::INFINITY, |_| true)).count() as f64
+}
+
+fn light(kind: PunctualKind, position: Vec3, direction: Vec3, intensity: f32) -> PunctualLight {
+    PunctualLight {
+        kind,
+        intensity: Vec3::splat(intensity),
+        body: None,
+        position,
+        direction,
+        range: f32::INFINITY,
+    }
+}
+
+fn lamp_at_a_micrometre(seed: u64) -> f64 {
+    let mut s = scene(floor(2.0), diffuse(Vec3::splat(0.5)));
+    add(&mut s, quad(Vec3::new(-1.0, 1e-6, -1.0), Vec3::X * 2.0, Vec3::Z * 2.0), emitter(Vec3::splat(1e-3)));
+    s.lights.push(light(PunctualKind::Directional, Vec3::ZERO, Vec3::NEG_Y, 1e5));
+    let r = Reference::new(&s, &[]);
+    let Some(point) = r.trace(DVec3::new(0.1, 5e-7, 0.1), -DVec3::Y, 1.0, false) else { return f64::NAN };
+    let mut sampler = Sampler::new(seed, 3);
+    let mut mean = Mean::default();
+    (0..5000).for_each(|_| mean.push(r.radiance(&point, DVec3::Y, 2, &mut sampler).x));
+    (mean.mean() / 0.5e-3 - 1.0).abs()
+}
+
+fn down(w: u32) -> crate::geometry::projector::ProjectorCamera {
+    let mut c = camera(w, w, DVec3::new(0.0, 4.0, 0.0), DVec3::ZERO);
+    (c.fx, c.fy) = (1e6, 1e6);
+    c
+}
+
+fn no_light(seed: u64) -> f64 {
+    let mut s = scene(floor(2.0), diffuse(Vec3::ONE));
+    let render = |s: &Scene| {
+        let image = Reference::new(s, &[]).render_camera(&down(2), &settings(3, 4, seed));
+        image.mean.iter().flatten().sum::<f64>() + image.dropped_samples as f64
+    };
+    let dark = render(&s);
+    s.environment =
+        Environment::Equirect { width: 4, height: 2, texels: vec![Vec3::ZERO; 8], rotation_rad: 0.0 };
+    s.lights.push(light(PunctualKind::Point, Vec3::Y, Vec3::Y, 0.0));
+    s.lights.push(light(PunctualKind::Point, Vec3::ZERO, Vec3::Y, 1e30));
+    dark + render(&s) + render(&Scene::default())
+}
+
+fn many_lights(seed: u64) -> f64 {
+    let mut s = scene(floor(3.0), diffuse(Vec3::ONE));
+    let mut sampler = Sampler::new(seed, 4);
+    let mut want = 0.0;
+    for i in 0..100_000u32 {
+        let mut u = || sampler.uniform() as f32;
+        let p = Vec3::new(u(), 1.0 + u(), u());
+        let intensity = if i % 5 == 0 { 0.0 } else { 1e-5 * (1 + i % 3) as f32 };
+        s.lights.push(light(PunctualKind::Point, p, Vec3::Y, intensity));
+        want += f64::from(intensity) * f64::from(p.y) / f64::from(p.length_squared()).powf(1.5) / PI;
+    }
+    let (mean, sigma) = overall(&Reference::new(&s, &[]).render_camera(&down(8), &settings(100, 2, seed)));
+    (mean - want).abs() / sigma
+}
+
+fn fresnel(_: u64) -> f64 {
+    let textbook = |eta: f64, c: f64| {
+        let sin2 = (1.0 - c * c) / (eta * eta);
+        if sin2 >= 1.0 {
+            return 1.0;
+        }
+        let t = (1.0 - sin2).sqrt();
+        let (s, p) = ((c - eta * t) / (c + eta * t), (eta * c - t) / (eta * c + t));
+        0.5 * (s * s + p * p)
+    };
+    let mut worst: f64 = 0.0;
+    for eta in [1.1, 1.5, 2.4, 1.0 / 1.5, 0.2] {
+        for i in 0..=2000 {
+            let c = f64::from(i) / 2000.0;
+            worst = worst.max((fresnel_dielectric(eta, c) - textbook(eta, c)).abs());
+        }
+    }
+    for c in [0.0, 1e-9, 0.3, 1.0] {
+        worst = worst.max(fresnel_dielectric(1.0, c));
+    }
+    // 1 + 1e-7 at normal incidence: ((n - 1) / (n + 1))^2, relative.
+    let n: f64 = 1.0 + 1e-7;
+    let exact = ((n - 1.0) / (n + 1.0)).powi(2);
+    worst.max(1e-6 * (fresnel_dielectric(n, 1.0) / exact - 1.0).abs())
+}
+
+fn grazing(seed: u64) -> f64 {
+    let mut faults = 0u32;
+    let mut s = Sampler::new(seed, 1);
+    let table = AlbedoTable::new(1.5);
+    for roughness in [0.0, 0.032, 0.5, 1.0] {
+        for transmission in [0.0, 1.0] {
+            let m = Material {
+                roughness,
+                transmission,
+                thin_walled: false,
+                metallic: 0.2,
+                ..Material::default()
+            };
+            let p = patch(&m);
+            for v in
+                [DVec3::Y, DVec3::X, DVec3::new(1.0, 1e-12, 0.0), DVec3::new(1.0, -1e-300, 0.0), -DVec3::Y]
+            {
+                let Some(bsdf) = Bsdf::new(&p, &table, v.normalize()) else { continue };
+                for u in [0.0, 1e-300, 0.5, 1.0 - f64::EPSILON / 2.0] {
+                    for choose in [0.0, 0.3, 1.0 - f64::EPSILON / 2.0] {
+                        let Some(x) = bsdf.sample(choose, [u, s.uniform()], u) else { continue };
+                        let sound =
+                            x.weight.is_finite() && x.weight.min_element() >= 0.0 && x.l.is_normalized();
+                        faults += u32::from(!sound || x.pdf.is_some_and(|p| !(p.is_finite() && p > 0.0)));
+                    }
+                }
+                for l in [DVec3::X, -DVec3::X, v, -v, DVec3::Y, -DVec3::Y, DVec3::new(0.0, 1e-200, 1.0)] {
+                    let value = bsdf.evaluate(l);
+                    faults +=
+                        u32::from(!(value.f_cos.is_finite() && value.pdf.is_finite() && value.pdf >= 0.0));
+                }
+            }
+        }
+    }
+    f64::from(faults)
+}
+
+fn streams(_: u64) -> f64 {
+    let n = 100_000u64;
+    let correlation = |a: &mut dyn FnMut(u64) -> f64, b: &mut dyn FnMut(u64) -> f64| {
+        let sum: f64 = (0..n).map(|i| (a(i) - 0.5) * (b(i) - 0.5)).sum();
+        (sum / n as f64 * 12.0 * (n as f64).sqrt()).abs()
+    };
+    let first = |seed: u64, stream: u64| Sampler::new(seed, stream).uniform();
+    let mut worst: f64 = 0.0;
+    for seed in [0, 1, 1 << 32, u64::MAX] {
+        // Neighbouring pixels, rows of a 1024 raster, and neighbouring seeds.
+        worst = worst.max(correlation(&mut |i| first(seed, i), &mut |i| first(seed, i + 1)));
+        worst = worst.max(correlation(&mut |i| first(seed, i), &mut |i| first(seed, i + 1024)));
+        worst = worst.max(correlation(&mut |i| first(seed, i), &mut |i| first(seed.wrapping_add(1), i)));
+        let (mut a, mut b) = (Sampler::new(seed, 0), Sampler::new(seed, 0));
+        b.uniform();
+        worst = worst.max(correlation(&mut |_| a.uniform(), &mut |_| b.uniform()));
+    }
+    worst
+}
+
+fn same_seed(seed: u64) -> f64 {
+    let s = small_scene(1.0);
+    let r = Reference::new(&s, &[]);
+    let c = camera(16, 12, DVec3::new(0.5, 3.0, 1.5), DVec3::ZERO);
+    let render = |threads| {
+        r.render(
+            &c,
+            DVec3::new(2.0, 2.3, 1.0),
+            &RenderSettings { threads, jitter: true, ..settings(4, 4, seed) },
+        )
+    };
+    let (a, b) = (render(1), render(3));
+    a.mean.iter().zip(&b.mean).filter(|(a, b)| a != b).count() as f64
+}
+
+fn albedo_f32(_: u64) -> f64 {
+    let mut worst: f64 = 0.0;
+    for ior in [1.0001, 1.1, 1.5, 3.0] {
+        let t = AlbedoTable::new(ior);
+        for i in 0..=60 {
+            for j in 0..=60 {
+                let (mu, alpha) = ((f64::from(i) / 60.0).powi(4), (f64::from(j) / 60.0).powi(4));
+                let e = t.directional(mu, alpha) - f64::from(t.directional_f32(mu as f32, alpha as f32));
+                let a = t.average(alpha) - f64::from(t.average_f32(alpha as f32));
+                worst = worst.max(e.abs()).max(a.abs());
+            }
+        }
+    }
+    worst
+}
+
+fn compensation_extremes(_: u64) -> f64 {
+    let Some(k) = Compensation::new([0.8, 0.5, 1e-3], [1.0, 1e4, 1e-3], [0.0, 0.1, 0.0]) else {
+        return f64::NAN;
+    };
+    let values = [
+        f32::NAN,
+        f32::INFINITY,
+        f32::NEG_INFINITY,
+        0.0,
+        -0.0,
+        -1.0,
+        1e-45,
+        1e-38,
+        1e-3,
+        1.0,
+        1e18,
+        f32::MAX,
+    ];
+    let mut faults = 0u32;
+    for l in values {
+        for distance in values {
+            for cos in values {
+                let d = k.drive([l; 3], distance, cos);
+                faults += u32::from(d.iter().any(|d| !(0.0..=1.0).contains(d)));
+                faults += u32::from(l.is_nan() && d != [0.0; 3]);
+            }
+        }
+    }
+    f64::from(faults)
+}
+
+fn compensation_f32(_: u64) -> f64 {
+    let Some(k) = Compensation::new([0.8, 0.5, 1.0], [10.0, 200.0, 1e4], [0.0; 3]) else { return f64::NAN };
+    let mut worst: f64 = 0.0;
+    for i in 0..4000 {
+        let t = f64::from(i) / 4000.0;
+        let (distance, cos) = (1e-3 + 50.0 * t, 1.0 - 0.999 * t);
+        let radiance = [0.3 * t, 1e-4 + t, 3.0 * t];
+        let a = k.drive(radiance.map(|x| x as f32), distance as f32, cos as f32);
+        let b = k.drive_f64(radiance, distance, cos);
+        for c in 0..3 {
+            if b[c] > 0.0 {
+                worst = worst.max((f64::from(a[c]) / b[c] - 1.0).abs());
+            }
+        }
+    }
+    worst
+}
