@@ -15,8 +15,9 @@ pub mod usb;
 use std::collections::VecDeque;
 
 use dpm_device::link::{
-    faults, Codec, Config, ConfigRefusal, Decoder, DeviceHello, DeviceMessage, DeviceState, Echo, Fault,
-    FaultCode, Header, Packet, SlotClock, Status, Underrun, MAX_CONTROL_BYTES, VERSION,
+    faults, mean_luminance, Codec, Config, ConfigRefusal, Decoder, DeviceHello, DeviceMessage, DeviceState,
+    Echo, Fault, FaultCode, FlashLimiter, Header, Packet, SlotClock, Status, Underrun, MAX_CONTROL_BYTES,
+    MAX_FLASHES_PER_S, REST_US, VERSION,
 };
 use dpm_device::planes::{Raster, MAX_PLANES};
 use dpm_device::time::{DeviceTicks, HostTime};
@@ -29,6 +30,8 @@ pub use thread::ProjectorThread;
 
 /// Echo answers that may wait to be fetched; later requests are dropped, as a busy device would.
 const ECHOES_KEPT: usize = 16;
+/// Damaged packets without one whole frame among them that end the light.
+const CHECKSUM_STORM: u32 = 1000;
 /// A target further ahead than this is refused, seconds: it would hold a buffer for good.
 const MAX_LEAD_S: u64 = 2;
 
@@ -55,6 +58,8 @@ pub struct MockConfig {
     pub firmware: u16,
     /// Protocol version that it claims; another than [`VERSION`] makes it refuse every session.
     pub version: u16,
+    /// Flashes of the whole field a second above which it goes dark and latches; `None` switches the limiter off.
+    pub flash_limit: Option<u8>,
     /// Light events kept for [`MockProjector::next_light`]; when full the oldest go and are counted.
     pub events_kept: usize,
 }
@@ -74,6 +79,7 @@ impl MockConfig {
             serial: 1,
             firmware: 0x0100,
             version: u16::from(VERSION),
+            flash_limit: Some(MAX_FLASHES_PER_S),
             events_kept: 4096,
         }
     }
@@ -136,6 +142,14 @@ struct Core {
     present: u32,
     last_heard: DeviceTicks,
     next_slot: u64,
+    flash: Option<FlashLimiter>,
+    /// Luminance of the frame on the mirrors.
+    luminance: u32,
+    /// No ARM before this, while light rests after too many flashes.
+    rest_until: DeviceTicks,
+    /// Damaged packets when a frame was whole last.
+    damaged_at_whole: u32,
+    whole_since: bool,
     store: FrameStore,
     /// An LZ4 block while it arrives.
     staging: Vec<u8>,
@@ -208,6 +222,11 @@ impl MockProjector {
                 present: 0,
                 last_heard: DeviceTicks(0),
                 next_slot: 0,
+                flash: None,
+                luminance: 0,
+                rest_until: DeviceTicks(0),
+                damaged_at_whole: 0,
+                whole_since: false,
                 store: FrameStore::new(setup.frame_buffers as usize, frame_bytes),
                 staging: vec![0; setup.raster.plane_bytes()],
                 lit_now: false,
@@ -333,6 +352,9 @@ impl LinkDevice for MockProjector {
         self.core.advance(now);
         let mut sink = receive::LaneSink { core: &mut self.core, lane };
         self.decoders[lane as usize].push(bytes, &mut sink);
+        let [a, b] = self.decoders.each_ref().map(Decoder::counters);
+        let damaged = [a.header_errors, a.payload_errors, b.header_errors, b.payload_errors];
+        self.core.damaged(damaged.iter().fold(0, |sum, n| sum.wrapping_add(*n)));
     }
 
     fn end_of_transfer(&mut self, now: HostTime, lane: Lane) {
@@ -474,6 +496,11 @@ impl Core {
                 self.status.last_lit_at = start;
                 self.store.lit = Some(Held { frame: frame.frame, buffer: frame.buffer });
                 self.generation += 1;
+                if self.flash.is_some() {
+                    let bytes = config.raster.plane_bytes() * config.schedule.len();
+                    let planes = &self.store.bytes(frame.buffer)[..bytes];
+                    self.luminance = mean_luminance(config.raster, &config.schedule, planes);
+                }
                 LightKind::Lit
             }
             (mode, due) => {
@@ -509,6 +536,12 @@ impl Core {
         if self.setup.events_kept > 0 {
             self.events.push_back(event);
         }
+        let luminance = if self.lit_now { self.luminance } else { 0 };
+        if self.flash.as_mut().is_some_and(|f| f.observe(luminance)) {
+            let rest = u64::from(REST_US) * u64::from(self.setup.clock.tick_hz) / 1_000_000;
+            self.rest_until = DeviceTicks(start.0.saturating_add(rest));
+            self.latch(faults::FLASH_LIMIT);
+        }
     }
 
     /// Goes dark and forgets every frame on its way.
@@ -518,6 +551,17 @@ impl Core {
         let thrown = self.store.clear();
         self.status.frames_refused = self.status.frames_refused.wrapping_add(thrown);
         self.status_due = true;
+    }
+
+    /// Notes how many packets were damaged so far; too many since a frame was whole, and light ends.
+    fn damaged(&mut self, total: u32) {
+        if std::mem::take(&mut self.whole_since) || self.mode == Mode::Disarmed {
+            self.damaged_at_whole = total;
+        }
+        if total.wrapping_sub(self.damaged_at_whole) >= CHECKSUM_STORM {
+            self.damaged_at_whole = total;
+            self.latch(faults::CHECKSUM_STORM);
+        }
     }
 
     fn latch(&mut self, faults: u32) {
@@ -555,6 +599,7 @@ impl Core {
         }
         self.disarm();
         self.config = Some((config, slots));
+        self.flash = self.setup.flash_limit.map(|limit| FlashLimiter::backstop(config.rate, limit));
         Ok(())
     }
 
@@ -564,6 +609,14 @@ impl Core {
         };
         if self.present != 0 || self.latched & !acknowledged != 0 {
             return self.report(FaultCode::Arm, 2);
+        }
+        if self.ticks() < self.rest_until {
+            return self.report(FaultCode::Arm, 3);
+        }
+        if self.latched & faults::FLASH_LIMIT != 0 {
+            if let Some(flash) = &mut self.flash {
+                flash.reset();
+            }
         }
         self.latched = 0;
         if self.mode == Mode::Disarmed {

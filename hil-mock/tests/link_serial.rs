@@ -116,6 +116,7 @@ impl Near {
             late_slots: 100,
             epoch: Epoch::At(DeviceTicks(0)),
             codecs,
+            flash_limit: None,
             session_seed: 5,
         });
         Self { link, line, next_id: 1 }

@@ -9,6 +9,7 @@ mod types;
 
 use super::compact::Compactor;
 use super::decoder::Decoder;
+use super::flash::FlashLimiter;
 use super::header::{Codec, Header, Packet, VERSION};
 use super::message::{
     Config, ConfigRefusal, DeviceHello, DeviceState, Echo, Fault, FaultCode, HostHello, HostMessage, Status,
@@ -47,6 +48,9 @@ pub struct HostLink {
     echoes_sent: u32,
     frames_sent: u32,
     last_frame: Option<u32>,
+    flash: Option<FlashLimiter>,
+    /// While light rests after too many flashes: when it ends.
+    rest_until: Option<HostTime>,
     /// `None` when only raw planes are sent.
     compactor: Option<Compactor>,
     /// The next frame must not refer to another.
@@ -64,6 +68,7 @@ impl HostLink {
     pub fn new(settings: LinkSettings) -> Self {
         let compactor = (settings.codecs & !Codec::Raw.mask() != 0)
             .then(|| Compactor::new(settings.raster, settings.schedule.len(), settings.codecs));
+        let flash = settings.flash_limit.map(|limit| FlashLimiter::new(settings.rate, limit));
         Self {
             settings,
             state: LinkState::Closed,
@@ -79,6 +84,8 @@ impl HostLink {
             echoes_sent: 0,
             frames_sent: 0,
             last_frame: None,
+            flash,
+            rest_until: None,
             compactor,
             key_due: true,
             losses: 0,
@@ -105,6 +112,7 @@ impl HostLink {
         self.last_frame = None;
         self.key_due = true;
         self.losses = 0;
+        self.rest_until = None;
     }
 
     /// Permits light once the device is configured, shows the picture again after BLACK or FREEZE, or acknowledges latched
@@ -112,6 +120,7 @@ impl HostLink {
     pub fn arm(&mut self, acknowledge: u32) {
         self.acknowledge = acknowledge;
         self.verb = None;
+        self.rest_until = None;
         self.requested_at = NEVER;
         if matches!(self.state, LinkState::Ready | LinkState::Faulted | LinkState::Streaming) {
             self.inbox.fault = None;
@@ -130,6 +139,8 @@ impl HostLink {
     ) -> Result<(), SendError> {
         self.verb = Some(verb);
         self.verb_sent_at = now;
+        // Whoever asked for dark or stillness decides when it ends.
+        self.rest_until = None;
         if self.state == LinkState::Arming {
             self.state = LinkState::Ready;
         }
@@ -167,6 +178,9 @@ impl HostLink {
         if std::mem::take(&mut self.inbox.device_forgot) && self.state != LinkState::Greeting {
             // Only HELLO helps; the caller decides about light again.
             self.connect();
+        }
+        if self.rest_until.is_some_and(|end| now >= end) && self.state == LinkState::Streaming {
+            self.arm(0);
         }
         self.advance(transport)?;
         self.request(now, transport)?;

@@ -10,6 +10,7 @@ mod codec;
 mod compact;
 mod crc;
 mod decoder;
+mod flash;
 mod header;
 #[cfg(feature = "std")]
 mod host;
@@ -19,6 +20,7 @@ mod slots;
 pub use codec::{rle_encode, CodecError, RleDecoder};
 pub use crc::{crc32c, crc32c_append, crc32c_append_table};
 pub use decoder::{Decoder, DecoderCounters, PacketSink};
+pub use flash::{mean_luminance, FlashLimiter, FULL_LUMINANCE, HIGHEST_LIMIT, MAX_FLASHES_PER_S, REST_US};
 pub use header::{
     frame_newer, packet_bytes, trailer_bytes, Codec, Header, HeaderError, MessageType, Packet, HEADER_BYTES,
     MAGIC, MAX_PAYLOAD_BYTES, VERSION,

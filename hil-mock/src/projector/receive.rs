@@ -332,6 +332,7 @@ impl Core {
             return;
         }
         self.status.last_whole_frame = frame.frame;
+        self.whole_since = true;
         self.store.base = Some(Held { frame: frame.frame, buffer });
         self.schedule(&frame, buffer);
     }

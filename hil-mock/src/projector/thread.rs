@@ -119,6 +119,7 @@ mod tests {
             late_slots: 100,
             epoch: Epoch::At(DeviceTicks(0)),
             codecs: 0,
+            flash_limit: None,
             session_seed: 3,
         });
         link.connect();

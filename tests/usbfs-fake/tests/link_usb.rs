@@ -103,6 +103,7 @@ impl Host {
             late_slots: 20,
             epoch: Epoch::At(DeviceTicks(0)),
             codecs: Codec::Raw.mask(),
+            flash_limit: None,
             session_seed: 1,
         });
         let usb = UsbTransport::open(device.settings()).expect("the device opens");

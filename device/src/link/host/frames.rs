@@ -1,7 +1,8 @@
 //! One frame's planes into packets: whole or not at all.
 
-use super::{DropReason, HostLink, LinkState, SendOutcome};
+use super::{DropReason, HostLink, LinkState, SendOutcome, Verb};
 use crate::link::compact::PlaneForm;
+use crate::link::flash::{mean_luminance, REST_US};
 use crate::link::header::{frame_newer, Codec, Header, MessageType, Packet};
 use crate::link::message::{Commit, HostMessage, MAX_CONTROL_BYTES};
 use crate::planes::MAX_PLANES;
@@ -37,6 +38,7 @@ impl HostLink {
                     DropReason::LinkBusy => &mut self.counters.link_busy,
                     DropReason::LinkLost => &mut self.counters.link_lost,
                     DropReason::NotNewer => &mut self.counters.not_newer,
+                    DropReason::FlashLimit => &mut self.counters.flash_limit,
                 } += 1;
                 SendOutcome::Dropped { reason }
             }
@@ -60,6 +62,9 @@ impl HostLink {
         }
         if self.last_frame.is_some_and(|last| !frame_newer(frame, last)) {
             return Err(DropReason::NotNewer);
+        }
+        if self.rests(now, planes, transport) {
+            return Err(DropReason::FlashLimit);
         }
         if self.credit() == 0 {
             return Err(DropReason::NoCredit);
@@ -133,5 +138,22 @@ impl HostLink {
         self.last_frame = Some(frame);
         self.data_sent_at = now;
         Ok(())
+    }
+
+    /// Feeds the flash limiter with a frame that is about to be shown. True while light rests.
+    fn rests(&mut self, now: HostTime, planes: &[u8], transport: &mut dyn Transport) -> bool {
+        if self.rest_until.is_some() {
+            return true;
+        }
+        let Some(limiter) = &mut self.flash else { return false };
+        let light = mean_luminance(self.settings.raster, &self.settings.schedule, planes);
+        if !limiter.observe(light) {
+            return false;
+        }
+        limiter.reset();
+        // Repeated by `poll` until the device confirms it, should it not get through now.
+        let _ = self.command(now, Verb::Black, transport);
+        self.rest_until = Some(now.plus_ns(i64::from(REST_US) * 1000));
+        true
     }
 }

@@ -35,6 +35,9 @@ pub struct LinkSettings {
     /// Codecs that may be used, bits [`crate::link::Codec::mask`]; raw always is. With others, planes that do not change are not sent
     /// and the host spends time to save bytes on the link.
     pub codecs: u32,
+    /// Flashes of the whole field a second above which the host darkens the projector for two seconds; `None` switches
+    /// the limiter off.
+    pub flash_limit: Option<u8>,
     /// Seed of the session numbers; two hosts should not use the same.
     pub session_seed: u32,
 }
@@ -106,7 +109,7 @@ pub enum LinkError {
         reason: Option<ConfigRefusal>,
     },
     /// The device refused ARM.
-    #[error("{device}: not armed, latched faults: {}; remove the cause and acknowledge them", crate::link::faults::names(*.faults))]
+    #[error("{device}: not armed, latched faults: {}; remove the cause and acknowledge them (after too many flashes light rests two seconds)", crate::link::faults::names(*.faults))]
     ArmRefused {
         /// Name of the transport.
         device: String,
@@ -131,6 +134,8 @@ pub enum DropReason {
     LinkLost,
     /// The frame number does not follow the one sent before.
     NotNewer,
+    /// The picture flashed too much; the projector rests in the dark.
+    FlashLimit,
 }
 
 /// Fate of a frame handed to [`super::HostLink::send_frame`].
@@ -145,7 +150,8 @@ pub enum SendOutcome {
     },
 }
 
-/// Counters since [`super::HostLink::new`]: `frames_offered = frames_sent + not_streaming + no_credit + link_busy + link_lost + not_newer`.
+/// Counters since [`super::HostLink::new`]: `frames_offered = frames_sent + not_streaming + no_credit + link_busy + link_lost +
+/// not_newer + flash_limit`.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 #[allow(missing_docs)] // Named after `DropReason`.
 pub struct LinkCounters {
@@ -156,6 +162,7 @@ pub struct LinkCounters {
     pub link_busy: u64,
     pub link_lost: u64,
     pub not_newer: u64,
+    pub flash_limit: u64,
     /// Bytes handed to the medium.
     pub bytes_sent: u64,
     /// Planes sent as they are.

@@ -21,11 +21,21 @@ pub mod faults {
     /// Emergency-stop input.
     pub const EMERGENCY_STOP: u32 = 1 << 5;
 
+    /// The light flashed more than eyes should bear.
+    pub const FLASH_LIMIT: u32 = 1 << 6;
+
     /// Names of the faults in `mask`, for messages: `"watchdog, lamp"`; `"none"` when empty.
     #[cfg(feature = "std")]
     pub fn names(mask: u32) -> String {
-        const NAMES: [&str; 6] =
-            ["watchdog", "over-temperature", "lamp", "host safe", "checksum storm", "emergency stop"];
+        const NAMES: [&str; 7] = [
+            "watchdog",
+            "over-temperature",
+            "lamp",
+            "host safe",
+            "checksum storm",
+            "emergency stop",
+            "flash limit",
+        ];
         let mut all: Vec<String> = NAMES
             .iter()
             .enumerate()

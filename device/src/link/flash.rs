@@ -1,0 +1,234 @@
+//! Mean light of the whole field, slot by slot, into the decision whether it flashes more than eyes and brains should bear.
+//!
+//! A flash is a pair of opposing changes of the field's luminance by a tenth of full or more, the darker below 0.8 of full; more than
+//! three in a second can cause seizures [WCAG22] 2.3.1, [BT1702]. What changes faster than the eye follows does not count: luminance is
+//! averaged over a sixtieth of a second first, so alternating frames at 947 Hz are steady light and a beat at 10 Hz is not.
+//! Both ends of the link run the same limiter.
+
+use crate::planes::{Channel, PlaneSchedule, Raster};
+use crate::time::FrameRate;
+
+/// Full light of all three channels.
+pub const FULL_LUMINANCE: u32 = 65_535;
+/// A change that counts: a tenth of full.
+const STEP: u32 = FULL_LUMINANCE / 10;
+/// The darker side of a flash is below this.
+const DARK_SIDE: u32 = FULL_LUMINANCE * 8 / 10;
+/// Most flashes a second that the standards allow.
+pub const MAX_FLASHES_PER_S: u8 = 3;
+/// Most flashes a second that a limiter can be told to allow.
+pub const HIGHEST_LIMIT: u8 = 16;
+/// After it struck, light stays off for this long: the dark itself must not become a flash.
+pub const REST_US: u32 = 2_000_000;
+/// Rows of a plane that are counted; more do not change a mean that matters.
+const ROWS: u32 = 32;
+
+/// Mean luminance of a frame, 0 to [`FULL_LUMINANCE`], from evenly spaced rows of its planes. Channel weights are those of Rec. 709.
+///
+/// # Panics
+/// When `planes` has not the size that raster and schedule demand.
+pub fn mean_luminance(raster: Raster, schedule: &PlaneSchedule, planes: &[u8]) -> u32 {
+    let (plane_bytes, row_bytes) = (raster.plane_bytes(), raster.row_bytes());
+    assert!(planes.len() == plane_bytes * schedule.len(), "bytes of planes");
+    let rows = raster.height().min(ROWS);
+    let mut light = 0u64;
+    for (spec, plane) in schedule.planes().iter().zip(planes.chunks_exact(plane_bytes)) {
+        let mut lit = 0u64;
+        for i in 0..rows {
+            // The middle row of each of `rows` equal bands.
+            let y = ((2 * i + 1) * raster.height() / (2 * rows)) as usize;
+            let row = &plane[y * row_bytes..][..row_bytes];
+            let (words, rest) = row.as_chunks::<8>();
+            lit += words.iter().map(|w| u64::from(u64::from_le_bytes(*w).count_ones())).sum::<u64>();
+            lit += rest.iter().map(|b| u64::from(b.count_ones())).sum::<u64>();
+        }
+        let weight = match spec.channel {
+            Channel::Red => 2126,
+            Channel::Green => 7152,
+            Channel::Blue => 722,
+            Channel::White => 10_000,
+        };
+        light += lit * (weight << spec.bit);
+    }
+    let full = u64::from(rows) * u64::from(raster.width()) * 255 * 10_000;
+    (light * u64::from(FULL_LUMINANCE) / full).min(u64::from(FULL_LUMINANCE)) as u32
+}
+
+/// Counts flashes. Feed it every slot once, in order.
+#[derive(Clone, Debug)]
+pub struct FlashLimiter {
+    slots_per_window: u32,
+    windows_per_s: u32,
+    /// Opposing changes within a second that are still allowed: two a flash.
+    allowed: usize,
+    sum: u64,
+    in_window: u32,
+    window: u32,
+    /// Lowest or highest window mean since the last change, and where the next change leads.
+    extreme: u32,
+    rising: Option<bool>,
+    /// Windows of the last changes, oldest overwritten.
+    changes: [u32; 2 * HIGHEST_LIMIT as usize + 1],
+    count: usize,
+}
+
+impl FlashLimiter {
+    /// For slots of `rate`; `limit` flashes a second, 1 to [`HIGHEST_LIMIT`] (clamped), are allowed.
+    pub fn new(rate: FrameRate, limit: u8) -> Self {
+        // Even, so that a light that alternates from slot to slot averages out exactly.
+        let slots = rate.num() / rate.den().saturating_mul(60).max(1);
+        let slots_per_window = if slots > 1 { slots & !1 } else { 1 };
+        let per_s = rate.num().div_ceil(rate.den()).div_ceil(slots_per_window).max(1);
+        Self {
+            slots_per_window,
+            windows_per_s: per_s,
+            allowed: 2 * limit.clamp(1, HIGHEST_LIMIT) as usize,
+            sum: 0,
+            in_window: 0,
+            window: 0,
+            extreme: 0,
+            rising: None,
+            changes: [0; 2 * HIGHEST_LIMIT as usize + 1],
+            count: 0,
+        }
+    }
+
+    /// As [`FlashLimiter::new`], with a flash of margin: for a device behind a host that limits, too. The host is the first to strike,
+    /// and the darkness that it orders is a change more.
+    pub fn backstop(rate: FrameRate, limit: u8) -> Self {
+        let limiter = Self::new(rate, limit);
+        Self { allowed: (limiter.allowed + 2).min(limiter.changes.len() - 1), ..limiter }
+    }
+
+    /// The light of the next slot (0 when dark). `true` when with it there were more flashes in the last second than allowed: the
+    /// light must go off and stay off for [`REST_US`].
+    pub fn observe(&mut self, luminance: u32) -> bool {
+        self.sum += u64::from(luminance.min(FULL_LUMINANCE));
+        self.in_window += 1;
+        if self.in_window < self.slots_per_window {
+            return false;
+        }
+        let mean = (self.sum / u64::from(self.in_window)) as u32;
+        (self.sum, self.in_window) = (0, 0);
+        self.window = self.window.wrapping_add(1);
+        self.changed(mean) && self.too_many()
+    }
+
+    /// Starts anew after a rest, from the dark.
+    pub fn reset(&mut self) {
+        (self.sum, self.in_window, self.extreme, self.count) = (0, 0, 0, 0);
+        self.rising = None;
+    }
+
+    /// True when `mean` completes a change that opposes the one before.
+    fn changed(&mut self, mean: u32) -> bool {
+        let up = mean >= self.extreme.saturating_add(STEP) && self.extreme < DARK_SIDE;
+        let down = self.extreme >= mean.saturating_add(STEP) && mean < DARK_SIDE;
+        match self.rising {
+            // In the direction of the last change the extreme moves along.
+            Some(true) if mean > self.extreme => self.extreme = mean,
+            Some(false) if mean < self.extreme => self.extreme = mean,
+            Some(true) if down => return self.note(mean, false),
+            Some(false) if up => return self.note(mean, true),
+            None if up => return self.note(mean, true),
+            None if down => return self.note(mean, false),
+            _ => {}
+        }
+        false
+    }
+
+    fn note(&mut self, mean: u32, rising: bool) -> bool {
+        (self.extreme, self.rising) = (mean, Some(rising));
+        let n = self.changes.len();
+        self.changes[self.count % n] = self.window;
+        self.count += 1;
+        true
+    }
+
+    /// More than the allowed changes lie within the last second.
+    fn too_many(&self) -> bool {
+        let n = self.changes.len();
+        self.count > self.allowed && {
+            let oldest = self.changes[(self.count - 1 - self.allowed) % n];
+            self.window.wrapping_sub(oldest) < self.windows_per_s
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn rate() -> FrameRate {
+        FrameRate::new(947, 1).unwrap()
+    }
+
+    /// Slots until the limiter strikes within `seconds` of a light that follows `f` (time in seconds to luminance 0..1).
+    fn strikes(seconds: f64, f: impl Fn(f64) -> f64) -> Option<f64> {
+        let mut limiter = FlashLimiter::new(rate(), MAX_FLASHES_PER_S);
+        (0..(seconds * 947.0) as u64)
+            .map(|slot| (slot as f64 + 0.25) / 947.0)
+            .find(|t| limiter.observe((f(*t) * f64::from(FULL_LUMINANCE)) as u32))
+    }
+
+    fn square(hz: f64, low: f64, high: f64) -> impl Fn(f64) -> f64 {
+        move |t| if (t * hz).fract() < 0.5 { high } else { low }
+    }
+
+    #[test]
+    fn four_flashes_a_second_and_more_strike_three_do_not() {
+        for hz in [1.0, 2.0, 2.9] {
+            assert_eq!(strikes(20.0, square(hz, 0.0, 1.0)), None, "{hz} Hz");
+        }
+        for hz in [4.0, 8.0, 15.0, 25.0] {
+            let at = strikes(20.0, square(hz, 0.0, 1.0)).unwrap_or_else(|| panic!("{hz} Hz"));
+            // The seventh change, the first being that from the dark: after three periods and a window.
+            assert!(at <= 3.5 / hz + 0.04, "{hz} Hz: {at} s");
+            assert!(strikes(20.0, square(hz, 0.3, 0.45)).is_some(), "{hz} Hz, a seventh of full");
+        }
+    }
+
+    #[test]
+    fn what_is_no_flash_does_not_strike() {
+        assert_eq!(strikes(5.0, square(473.5, 0.0, 1.0)), None, "every other frame dark: too fast for eyes");
+        assert_eq!(strikes(5.0, square(10.0, 0.5, 0.58)), None, "less than a tenth");
+        assert_eq!(strikes(5.0, square(10.0, 0.85, 1.0)), None, "the darker side is bright");
+        assert_eq!(strikes(5.0, |t| (t * 0.4).fract()), None, "slow ramps that fall at 0.4 Hz");
+        assert_eq!(strikes(60.0, |_| 1.0), None);
+        assert_eq!(strikes(5.0, |t| 0.5 + 0.04 * (t * 50.0).sin()), None);
+    }
+
+    #[test]
+    fn luminance_is_that_of_the_code_values() {
+        let raster = Raster::new(72, 40).unwrap();
+        let schedule = PlaneSchedule::rgb24();
+        let n = raster.plane_bytes();
+        let frame = |code: [u8; 3]| -> Vec<u8> {
+            schedule
+                .planes()
+                .iter()
+                .flat_map(|p| {
+                    let bit = code[p.channel as usize] >> p.bit & 1;
+                    std::iter::repeat_n(if bit == 1 { 0xff } else { 0 }, n)
+                })
+                .collect()
+        };
+        for (code, expected) in [
+            ([255, 255, 255], 1.0),
+            ([0, 0, 0], 0.0),
+            ([128, 0, 0], 0.2126 * 128.0 / 255.0),
+            ([0, 77, 200], (0.7152 * 77.0 + 0.0722 * 200.0) / 255.0),
+        ] {
+            let got = f64::from(mean_luminance(raster, &schedule, &frame(code))) / f64::from(FULL_LUMINANCE);
+            assert!((got - expected).abs() < 2e-5, "{code:?}: {got}, {expected}");
+        }
+        // A picture that is bright in its left half only.
+        let mut half = frame([255; 3]);
+        for row in half.chunks_mut(9) {
+            row[4] = 0xf0;
+            row[5..].fill(0);
+        }
+        let got = mean_luminance(raster, &schedule, &half);
+        assert!(got.abs_diff(FULL_LUMINANCE / 2) <= 1, "{got}");
+    }
+}
