@@ -16,8 +16,8 @@ const STEP: u32 = FULL_LUMINANCE / 10;
 const DARK_SIDE: u32 = FULL_LUMINANCE * 8 / 10;
 /// Most flashes a second that the standards allow.
 pub const MAX_FLASHES_PER_S: u8 = 3;
-/// Most flashes a second that a limiter can be told to allow.
-pub const HIGHEST_LIMIT: u8 = 16;
+/// Most flashes a second that there can be at all in averages over a sixtieth of a second.
+pub const HIGHEST_LIMIT: u8 = 30;
 /// After it struck, light stays off for this long: the dark itself must not become a flash.
 pub const REST_US: u32 = 2_000_000;
 /// Rows of a plane that are counted; more do not change a mean that matters.

@@ -207,7 +207,7 @@ section! {
         watchdog_ms: u32 = 50, "ms", Within(1, 10_000);
         /// A body that is not heard of is carried on by prediction for this long, then its light goes off.
         predict_ms: u32 = 20, "ms", Within(0, 1_000);
-        /// General flashes of the whole picture in a second; beyond it the picture is dimmed. WCAG 2.3.1 allows 3; 0 is off.
+        /// General flashes of the whole picture in a second; beyond it the projector rests in the dark for two seconds. WCAG 2.3.1 allows 3; 0 is off.
         flashes_per_second: u32 = 3, "1/s", Within(0, 1_000);
     }
 }

@@ -233,6 +233,11 @@ pub fn run(
     let mut setup = MockConfig::new(raster);
     setup.frame_buffers = mock_config.buffer_frames.min(64) as u8;
     setup.clock = DeviceClock { skew_ppb: (mock_config.clock_ppm * 1000.0) as i32, ..DeviceClock::IDEAL };
+    let flash_limit = match config.safety.flashes_per_second {
+        0 => None,
+        n => Some(n.min(255) as u8),
+    };
+    setup.flash_limit = flash_limit;
     let mock = MockProjector::new(setup);
     let lights = Arc::new(Ring::new(8192));
     let recorder = LightRecorder::new(lights.clone(), options.keep_frames, verify);
@@ -246,6 +251,7 @@ pub fn run(
         epoch: Epoch::AfterHello(EPOCH_NS),
         session_seed: config.render.seed as u32 | 1,
         codecs: Codec::Raw.mask(),
+        flash_limit,
     });
 
     let device_over = AtomicBool::new(false);
