@@ -70,6 +70,7 @@ impl Bench {
         }
         let mut wanted = NatNetConfig::unicast(LOCALHOST, keys(&["Hare", "Bust"]));
         wanted.local = LOCALHOST;
+        wanted.kernel_stamps = false;
         wanted.command_port = socket.local().unwrap().port();
         wanted.data_port = data_port;
         client(&mut wanted);
@@ -324,6 +325,7 @@ impl ByHand {
         let clock = Arc::new(AtomicI64::new(0));
         let socket = UdpPort::bind(SocketAddrV4::new(local, 0), false).unwrap();
         let mut config = NatNetConfig::unicast(local, vec![BodyKey { name: "a".into(), id: Some(1) }]);
+        config.kernel_stamps = false;
         config.command_port = socket.local().unwrap().port();
         config.data_port = config.command_port;
         let mut client = NatNetClient::open(config, clock_of(&clock)).unwrap();
@@ -416,6 +418,40 @@ fn bursts_are_drained_to_the_newest_within_a_few_polls() {
         hand.poll();
         polls += 1;
         assert!(polls < 10);
+    }
+}
+
+#[test]
+fn rates_may_change_under_way() {
+    // T15: 500, 100, 2,000 Hz; the client is told nothing.
+    let mut bench = Bench::new("", |s| s.streaming = Streaming::Unicast(UnicastTo::CommandSocket), |_| {});
+    bench.run(MS, S);
+    for (hz, sequence) in [(100, 1u64), (2000, 2)] {
+        bench.samples.clear();
+        let from = bench.now();
+        let config = MockTrackerConfig {
+            rate: dpm_device::time::FrameRate::new(hz, 1).unwrap(),
+            start: from,
+            seed: sequence,
+            ..Default::default()
+        };
+        let motions = vec![
+            Motion::new(&MotionSpec::paper_translation(), Pose::IDENTITY).unwrap(),
+            Motion::new(&MotionSpec::Still, Pose::IDENTITY).unwrap(),
+        ];
+        let mut server = NatNetServerConfig::new(&["Hare", "Bust"]);
+        server.streaming = Streaming::Unicast(UnicastTo::CommandSocket);
+        bench.server = NatNetServer::new(server, SampleSource::new(config, motions).unwrap()).unwrap();
+        bench.run(MS / 4, from.0 + 4 * S);
+        // Connected anew within a second or so, then every sample, each once, in order, none older than its latency.
+        let last_second: Vec<_> = bench
+            .samples
+            .iter()
+            .filter(|s| s.body == BodyIndex(0) && s.received_at.0 > from.0 + 3 * S)
+            .collect();
+        let n = last_second.len() as i64;
+        assert!((n - i64::from(hz)).abs() <= 2, "{n} at {hz} Hz: {}", bench.client.status());
+        assert!(last_second.iter().all(|s| s.received_at.0 - s.captured_at.0 < 4 * MS));
     }
 }
 

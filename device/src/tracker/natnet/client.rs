@@ -49,6 +49,9 @@ pub struct NatNetConfig {
     pub data_port: u16,
     /// Bit stream to ask for; `None` takes what the server speaks. Unicast only, servers from 4.0.
     pub bitstream: Option<Version>,
+    /// Take arrival times from the kernel's stamps. Off when the host's clock is not this machine's (a virtual clock), whose
+    /// relation to the stamps means nothing; arrival is then the time of the poll.
+    pub kernel_stamps: bool,
     /// The rig's bodies.
     pub bodies: Vec<BodyKey>,
 }
@@ -63,6 +66,7 @@ impl NatNetConfig {
             command_port: 1510,
             data_port: 1511,
             bitstream: None,
+            kernel_stamps: true,
             bodies,
         }
     }
@@ -604,11 +608,19 @@ impl Tracker for NatNetClient {
                 is_crowded |= share == 0;
                 budget -= 1;
                 let here = self.clock.now();
-                let offset = *offset.get_or_insert_with(|| self.realtime_offset());
-                // A stamp from the future or from long ago is a stepped wall clock, not an arrival.
-                let stamped = arrival.kernel_ns.map(|ns| HostTime(ns.saturating_add(offset)));
-                let at = stamped.map_or(here, |s| s.min(here));
-                let at = if here.ns_since(at) > 10_000 * MS { here } else { at };
+                let at = match arrival.kernel_ns.filter(|_| self.config.kernel_stamps) {
+                    Some(stamp) => {
+                        let offset = *offset.get_or_insert_with(|| self.realtime_offset());
+                        let stamped = HostTime(stamp.saturating_add(offset)).min(here);
+                        // A stamp from long ago is a stepped wall clock, not an arrival.
+                        if here.ns_since(stamped) > 10_000 * MS {
+                            here
+                        } else {
+                            stamped
+                        }
+                    }
+                    None => here,
+                };
                 let frames = self.frames;
                 delivered += self.take_in(arrival, at, sink);
                 if !is_data && self.frames > frames {
