@@ -4,6 +4,7 @@
 //! the rig runs on. [`os`] asks, [`throttle`] keeps a spinning real-time thread out of the kernel's throttling, [`standstill`]
 //! measures when the machine itself stood still.
 
+pub mod handoff_cost;
 pub mod os;
 pub mod standstill;
 pub mod throttle;
