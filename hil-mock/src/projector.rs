@@ -5,6 +5,7 @@
 //! latches when the host falls silent, and lights a frame only when every bit of it has arrived.
 
 mod clock;
+mod faulty;
 mod frames;
 mod light;
 mod receive;
@@ -24,6 +25,7 @@ use dpm_device::time::{DeviceTicks, HostTime};
 use dpm_device::transport::{Lane, LinkDevice};
 
 pub use clock::DeviceClock;
+pub use faulty::FaultyProjector;
 use frames::{FrameStore, Held};
 pub use light::{light_of_planes, Exposure};
 pub use thread::ProjectorThread;

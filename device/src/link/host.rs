@@ -400,6 +400,11 @@ impl HostLink {
         }
     }
 
+    /// A frame number that follows those sent in this session.
+    pub fn next_frame_id(&self) -> u64 {
+        self.last_frame.map_or(1, |last| u64::from(last) + 1)
+    }
+
     /// The full number of the frame whose low 32 bits the device reports, given that it is one of the last 2^31 before
     /// `newest`.
     pub const fn full_frame_id(newest: u64, low: u32) -> u64 {

@@ -14,6 +14,8 @@ mod flash;
 mod header;
 #[cfg(feature = "std")]
 mod host;
+#[cfg(feature = "std")]
+mod measure;
 mod message;
 mod slots;
 
@@ -30,6 +32,8 @@ pub use host::{
     DropReason, EchoSample, Epoch, HostLink, LinkCounters, LinkError, LinkSettings, LinkState, SendOutcome,
     Verb,
 };
+#[cfg(feature = "std")]
+pub use measure::{measure, LinkMeasurement};
 pub use message::{
     faults, Assembly, Commit, Config, ConfigRefusal, DeviceHello, DeviceMessage, DeviceState, Echo, Fault,
     FaultCode, HostHello, HostMessage, PayloadError, Status, Underrun, MAX_CONTROL_BYTES, MAX_WATCHDOG_US,

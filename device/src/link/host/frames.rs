@@ -121,7 +121,9 @@ impl HostLink {
             Err(SendError::Failed(_)) => return Err(DropReason::LinkLost),
         }
         let c = &mut self.counters;
-        c.bytes_sent += packets.iter().map(|p| p.wire_bytes() as u64).sum::<u64>();
+        let bytes = packets.iter().map(|p| p.wire_bytes() as u64).sum::<u64>();
+        c.bytes_sent += bytes;
+        c.frame_bytes_sent += bytes;
         for form in forms {
             *match form {
                 PlaneForm::Kept => &mut c.planes_kept,

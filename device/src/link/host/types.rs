@@ -165,6 +165,8 @@ pub struct LinkCounters {
     pub flash_limit: u64,
     /// Bytes handed to the medium.
     pub bytes_sent: u64,
+    /// Of these, bytes of frames.
+    pub frame_bytes_sent: u64,
     /// Planes sent as they are.
     pub planes_raw: u64,
     /// Planes sent by a codec.
