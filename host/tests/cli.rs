@@ -1,35 +1,9 @@
 //! The program as its users meet it: exit codes, where output goes, what errors say.
 
-use std::process::{Command, Output};
+mod cli_common;
 
-/// Runs the program in an environment that does not depend on the caller's.
-fn dpm(args: &[&str], variables: &[(&str, &str)]) -> Output {
-    let mut command = Command::new(env!("CARGO_BIN_EXE_dpm"));
-    command.args(args).env_remove("NO_COLOR");
-    for (name, _) in std::env::vars_os() {
-        if name.to_string_lossy().starts_with("DPM_SET_") {
-            command.env_remove(name);
-        }
-    }
-    command.envs(variables.iter().copied());
-    command.output().expect("the program starts")
-}
-
-fn code(output: &Output) -> i32 {
-    output.status.code().expect("not ended by a signal")
-}
-
-fn out(output: &Output) -> String {
-    String::from_utf8_lossy(&output.stdout).into_owned()
-}
-
-fn err(output: &Output) -> String {
-    String::from_utf8_lossy(&output.stderr).into_owned()
-}
-
-/// No Vulkan driver, whatever the machine has.
-const NO_DRIVER: [(&str, &str); 2] =
-    [("VK_ICD_FILENAMES", "/nonexistent.json"), ("VK_DRIVER_FILES", "/nonexistent.json")];
+use cli_common::{code, dpm, err, out, NO_DRIVER};
+use std::process::Command;
 
 #[test]
 fn version_and_help_go_to_standard_output() {

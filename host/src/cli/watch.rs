@@ -78,7 +78,11 @@ pub fn print(text: &str) {
 
 /// One lock for the projector and one for the folder that is written to.
 fn take_locks(rig: &RigConfig) -> Result<Vec<InstanceLock>, Failure> {
-    let failure = |e: LockError| Failure::new(FailureKind::Device, e);
+    let failure = |e: LockError| {
+        let kind =
+            if matches!(e, LockError::Held { .. }) { FailureKind::Device } else { FailureKind::BadInput };
+        Failure::new(kind, e)
+    };
     let mut locks = Vec::new();
     let serial = |s: &Option<String>| s.clone().unwrap_or_else(|| "any".into());
     let device = match &rig.projector.backend {

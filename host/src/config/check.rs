@@ -270,7 +270,9 @@ pub(super) fn resolve_files(rig: &mut RigConfig, base: &Path, reader: &mut Reade
             Ok(_) => format!("{} is not a file", path.display()),
             Err(e) => format!("{}: {e}", path.display()),
         };
-        refuse(reader, &[key], problem, "paths in a rig file are relative to its folder".into());
+        let in_file = matches!(reader.origin_of(key), super::Origin::File { .. });
+        let remedy = if in_file { "paths in a rig file are relative to its folder" } else { "" };
+        refuse(reader, &[key], problem, remedy.into());
     };
     if let Some(file) = &mut rig.scene.file {
         input(file, "scene.file");

@@ -9,7 +9,7 @@ use std::sync::Arc;
 pub enum Origin {
     /// Nobody wrote it: the default holds.
     Default,
-    /// A place in a file; line and column count from 1, the column in characters.
+    /// A place in a file; line and column count from 1, the column in characters. Line 0 is the file as a whole.
     File {
         /// Name of the file as the user gave it.
         file: Arc<str>,
@@ -28,6 +28,7 @@ impl fmt::Display for Origin {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         match self {
             Self::Default => f.write_str("(default)"),
+            Self::File { file, line: 0, .. } => f.write_str(file),
             Self::File { file, line, column } => write!(f, "{file}:{line}:{column}"),
             Self::Variable(name) => write!(f, "environment variable {name}"),
             Self::Flag(text) => write!(f, "--set {text}"),
@@ -73,7 +74,7 @@ impl ConfigErrors {
     /// The one error that a file which cannot be read gives.
     pub(super) fn unreadable(path: &Path, problem: String, remedy: &str) -> Self {
         Self(vec![ConfigError {
-            origin: Origin::File { file: path.display().to_string().into(), line: 1, column: 1 },
+            origin: Origin::File { file: path.display().to_string().into(), line: 0, column: 0 },
             key: String::new(),
             problem,
             remedy: remedy.into(),

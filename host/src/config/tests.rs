@@ -329,8 +329,9 @@ fn columns_count_characters() {
 #[test]
 fn an_unreadable_or_huge_file_is_one_error() {
     let load = |path: &Path| RigConfig::load(path, &Overrides::default()).unwrap_err().to_string();
-    assert!(load(Path::new("/nonexistent/rig.toml"))
-        .contains("/nonexistent/rig.toml:1:1: cannot read the rig file"));
+    assert!(
+        load(Path::new("/nonexistent/rig.toml")).contains("/nonexistent/rig.toml: cannot read the rig file")
+    );
     assert!(load(Path::new("/")).contains("cannot read"));
     let huge = std::env::temp_dir().join(format!("dpm-huge-{}.toml", std::process::id()));
     std::fs::write(&huge, vec![b'#'; MAX_FILE_BYTES as usize + 1]).unwrap();

@@ -1,0 +1,144 @@
+//! The program in a process of its own, for the tests of the command line.
+#![allow(dead_code)]
+
+use std::io::{BufRead, BufReader, Read};
+use std::path::PathBuf;
+use std::process::{Child, Command, ExitStatus, Output, Stdio};
+use std::sync::mpsc::{channel, Receiver};
+use std::time::{Duration, Instant};
+
+/// No Vulkan driver, whatever the machine has.
+pub const NO_DRIVER: [(&str, &str); 2] =
+    [("VK_ICD_FILENAMES", "/nonexistent.json"), ("VK_DRIVER_FILES", "/nonexistent.json")];
+
+/// The program with arguments, in an environment without settings of ours.
+fn command(args: &[&str]) -> Command {
+    let mut command = Command::new(env!("CARGO_BIN_EXE_dpm"));
+    command.args(args).env_remove("NO_COLOR").stdin(Stdio::null());
+    for (name, _) in std::env::vars_os() {
+        if name.to_string_lossy().starts_with("DPM_SET_") {
+            command.env_remove(name);
+        }
+    }
+    command
+}
+
+/// Runs the program to its end.
+pub fn dpm(args: &[&str], variables: &[(&str, &str)]) -> Output {
+    command(args).envs(variables.iter().copied()).output().expect("the program starts")
+}
+
+/// Its exit code.
+pub fn code(output: &Output) -> i32 {
+    output.status.code().expect("not ended by a signal")
+}
+
+/// Its standard output.
+pub fn out(output: &Output) -> String {
+    String::from_utf8_lossy(&output.stdout).into_owned()
+}
+
+/// Its standard error stream.
+pub fn err(output: &Output) -> String {
+    String::from_utf8_lossy(&output.stderr).into_owned()
+}
+
+/// A program that runs beside the test; killed when the test ends early.
+pub struct Running {
+    child: Child,
+    lines: Receiver<String>,
+}
+
+/// Starts the program and goes on.
+pub fn start(args: &[&str]) -> Running {
+    let mut child =
+        command(args).stdout(Stdio::piped()).stderr(Stdio::piped()).spawn().expect("the program starts");
+    let (sender, lines) = channel();
+    let stderr = BufReader::new(child.stderr.take().expect("piped"));
+    std::thread::spawn(move || {
+        for line in stderr.lines().map_while(Result::ok) {
+            if sender.send(line).is_err() {
+                break;
+            }
+        }
+    });
+    Running { child, lines }
+}
+
+impl Running {
+    /// Process number.
+    pub fn id(&self) -> u32 {
+        self.child.id()
+    }
+
+    /// Reads the standard error stream until a line is `wanted`.
+    pub fn wait_for_line(&mut self, limit: Duration, wanted: impl Fn(&str) -> bool) {
+        let end = Instant::now() + limit;
+        loop {
+            let left = end.saturating_duration_since(Instant::now());
+            match self.lines.recv_timeout(left) {
+                Ok(line) if wanted(&line) => return,
+                Ok(_) => {}
+                Err(e) => panic!("no such line within {limit:?}: {e}"),
+            }
+        }
+    }
+
+    /// Sends a signal by its name.
+    pub fn signal(&self, name: &str) {
+        let status = Command::new("kill").args(["-s", name, &self.id().to_string()]).status();
+        assert!(status.expect("kill starts").success());
+    }
+
+    /// Waits for the end; gives status and standard output.
+    pub fn finish(mut self) -> (ExitStatus, String) {
+        let mut text = String::new();
+        let mut stdout = self.child.stdout.take().expect("piped");
+        stdout.read_to_string(&mut text).expect("UTF-8");
+        (self.child.wait().expect("it ends"), text)
+    }
+}
+
+impl Drop for Running {
+    fn drop(&mut self) {
+        let _ = self.child.kill();
+        let _ = self.child.wait();
+    }
+}
+
+/// A folder that goes when the test is over.
+pub struct Folder(PathBuf, String);
+
+impl Folder {
+    /// An empty folder.
+    pub fn new(name: &str) -> Self {
+        let path = std::env::temp_dir().join(format!("dpm-cli-{}-{name}", std::process::id()));
+        let _ = std::fs::remove_dir_all(&path);
+        std::fs::create_dir_all(&path).expect("the temporary folder can be written");
+        let text = path.display().to_string();
+        Self(path, text)
+    }
+
+    /// Its path, for an argument.
+    pub fn text(&self) -> &str {
+        &self.1
+    }
+
+    /// A path in it.
+    pub fn path(&self, name: &str) -> PathBuf {
+        self.0.join(name)
+    }
+
+    /// Writes a file; gives its path.
+    pub fn write(&self, name: &str, text: &str) -> String {
+        let path = self.path(name);
+        std::fs::write(&path, text).expect("the temporary folder can be written");
+        path.display().to_string()
+    }
+}
+
+impl Drop for Folder {
+    fn drop(&mut self) {
+        let _ = std::fs::remove_dir_all(&self.0);
+    }
+}

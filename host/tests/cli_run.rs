@@ -1,0 +1,162 @@
+//! `dpm demo` and `dpm run` as their users meet them: report, files, hash of the light, bad input, signals, two at once.
+//!
+//! Everything runs at a raster of 48 x 32, where software Vulkan takes milliseconds for a frame.
+
+mod cli_common;
+
+use cli_common::{code, dpm, err, out, start, Folder, NO_DRIVER};
+use std::time::{Duration, Instant};
+
+const SMALL: [&str; 5] = ["--json", "--raster", "48x32", "--frames", "6"];
+
+/// Runs a command at the small raster with its output in `folder`; gives the report.
+fn report(command: &[&str], folder: &Folder, more: &[&str]) -> serde_json::Value {
+    let args = [command, &SMALL, &["--out", folder.text()], more].concat();
+    let output = dpm(&args, &[]);
+    assert_eq!(code(&output), 0, "{args:?}: {}", err(&output));
+    serde_json::from_str(&out(&output)).unwrap_or_else(|e| panic!("one JSON object: {e} in {}", out(&output)))
+}
+
+#[test]
+fn the_demo_prints_one_object_with_the_agreed_keys_and_leaves_its_files() {
+    let folder = Folder::new("demo");
+    let json = report(&["demo"], &folder, &[]);
+    for key in
+        ["frames_lit", "frames_dropped", "frames_late", "raster", "frame_rate_hz", "pace", "gpu", "wall_s"]
+    {
+        assert!(!json[key].is_null(), "{key} in {json}");
+    }
+    assert_eq!((&json["frames_lit"], &json["frames_dropped"]), (&6.into(), &0.into()));
+    assert_eq!((&json["raster"], &json["pace"]), (&serde_json::json!([48, 32]), &"virtual".into()));
+    assert_eq!(json["frame_rate_hz"], 947.0);
+    for key in ["p50", "p99", "max"] {
+        assert!(json["registration_error_px"][key].is_f64(), "{key} in {json}");
+        assert!(json["motion_to_light_ms"][key].is_f64(), "{key} in {json}");
+    }
+    assert!(json["motion_to_light_ms"]["p999"].is_f64());
+    let stages = json["stages_ms"].as_object().expect("a map");
+    assert!(
+        stages.len() >= 4 && stages.values().all(|s| s["p50"].is_f64() && s["p99"].is_f64()),
+        "{stages:?}"
+    );
+    for name in ["light.png", "viewer.png"] {
+        let picture = image::open(folder.path(name)).unwrap_or_else(|e| panic!("{name}: {e}")).to_rgb8();
+        assert_eq!(picture.dimensions(), (48, 32), "{name}");
+        assert!(picture.pixels().any(|p| p.0 != [0; 3]), "{name} is black");
+    }
+    let kept = std::fs::read_to_string(folder.path("report.json")).expect("report.json");
+    let kept: serde_json::Value = serde_json::from_str(&kept).expect("JSON");
+    assert_eq!(kept["light_hash"], json["light_hash"]);
+}
+
+#[test]
+fn the_rig_file_is_the_demo_and_the_same_seed_gives_the_same_light() {
+    let folder = Folder::new("hash");
+    let rig = concat!(env!("CARGO_MANIFEST_DIR"), "/../rigs/demo.toml");
+    let no_pictures = ["--set", "output.images=false"];
+    let demo = report(&["demo"], &folder, &no_pictures);
+    let run = report(&["run", rig], &folder, &no_pictures);
+    let other = report(&["demo"], &folder, &["--set", "output.images=false", "--set", "render.seed=2"]);
+    assert_eq!(demo["light_hash"], run["light_hash"]);
+    assert_ne!(demo["light_hash"], other["light_hash"]);
+}
+
+#[test]
+fn bad_input_ends_with_2_and_names_the_place() {
+    let folder = Folder::new("bad");
+    let rig = folder.write("rig.toml", "[projector]\nwidth = 64\n\n[render]\n  smaples = 4\nspp = 0\n");
+    let cut = folder.write("cut.glb", "glTF\u{2}\0\0\0");
+    let in_the_way = folder.write("file", "");
+    let cases: [(&[&str], &[&str]); 9] = [
+        (
+            &["run", &rig],
+            &[
+                "rig.toml:5:3: `render.smaples`: unknown key",
+                "rig.toml:6:7: `render.spp`: is 0, must be 1 to 4096",
+            ],
+        ),
+        (&["run", "/nonexistent/rig.toml"], &["/nonexistent/rig.toml: cannot read the rig file"]),
+        (&["demo", "--raster", "0x32"], &["`projector.width`: is 0, must be 1 to 8192 px"]),
+        (&["demo", "--raster", "100000x100000"], &["is 100000, must be 1 to 8192 px"]),
+        (&["demo", "--scene", "/nonexistent/hare.glb"], &["/nonexistent/hare.glb: No such file"]),
+        (&["demo", "--scene", &cut], &["cut.glb", "cut off"]),
+        (
+            &["demo", "--set", "projector.frame_rate=1200"],
+            &["28800 planes/s", "at most 947 frames/s of 24 planes"],
+        ),
+        (&["demo", "--frames", "1", "--seconds", "1"], &["cannot be used with"]),
+        (&["demo", "--out", &in_the_way], &["cannot lock output folder"]),
+    ];
+    for (args, parts) in cases {
+        let output = dpm(args, &[]);
+        assert_eq!(code(&output), 2, "{args:?}: {}", err(&output));
+        assert_eq!(out(&output), "", "{args:?}");
+        for part in parts {
+            assert!(err(&output).contains(part), "{args:?}: {part:?} in {}", err(&output));
+        }
+    }
+}
+
+#[test]
+fn a_raster_beyond_the_machine_is_refused_not_attempted() {
+    let folder = Folder::new("huge");
+    let output = dpm(&["demo", "--raster", "8192x8192", "--frames", "1", "--out", folder.text()], &[]);
+    // A big GPU may be able to do it; software Vulkan is not.
+    if code(&output) != 0 {
+        assert_eq!(code(&output), 2, "{}", err(&output));
+        assert!(err(&output).contains("limit") || err(&output).contains("memory"), "{}", err(&output));
+    }
+}
+
+#[test]
+fn without_a_driver_the_demo_ends_with_4_and_says_what_to_install() {
+    let folder = Folder::new("driver");
+    let output = dpm(&["demo", "--json", "--out", folder.text()], &NO_DRIVER);
+    assert_eq!((code(&output), out(&output).as_str()), (4, ""));
+    assert!(
+        err(&output).contains("mesa-vulkan-drivers") && err(&output).contains("VK_ICD_FILENAMES"),
+        "{}",
+        err(&output)
+    );
+}
+
+#[test]
+fn a_setting_in_the_environment_reaches_the_run() {
+    let folder = Folder::new("variable");
+    let output = dpm(&["demo", "--out", folder.text()], &[("DPM_SET_RENDER__SPP", "none")]);
+    assert_eq!(code(&output), 2);
+    assert!(
+        err(&output).contains("environment variable DPM_SET_RENDER__SPP: `render.spp`"),
+        "{}",
+        err(&output)
+    );
+}
+
+/// A run that would take hours is asked to stop: it reports on what it did and ends with 0. Meanwhile a second one is refused.
+#[test]
+fn signals_end_a_run_in_order_and_two_runs_do_not_share_a_folder() {
+    let folder = Folder::new("signal");
+    let args = ["demo", "--json", "--raster", "48x32", "--frames", "10000000", "--out", folder.text()];
+    let mut running = start(&args);
+    running.wait_for_line(Duration::from_secs(60), |line| {
+        let progress: serde_json::Value = serde_json::from_str(line).expect("each line of progress is JSON");
+        progress["frames_lit"].as_u64() > Some(0)
+    });
+    let second = dpm(&args, &[]);
+    assert_eq!(code(&second), 3, "{}", err(&second));
+    let holder = format!("in use by another dpm (process {})", running.id());
+    assert!(err(&second).contains(&holder), "{}", err(&second));
+    let asked = Instant::now();
+    // Supervisors send two signals, too: the second must not cut the orderly end short.
+    running.signal("TERM");
+    running.signal("HUP");
+    let (status, report) = running.finish();
+    let took = asked.elapsed();
+    assert_eq!(status.code(), Some(0), "ended with {status}");
+    let report: serde_json::Value = serde_json::from_str(&report).expect("the report of what was done");
+    let lit = report["frames_lit"].as_u64().expect("a count");
+    assert!(lit > 0 && lit < 10_000_000, "{lit} frames");
+    // The rule is 500 ms until dark; the rest is pictures, report and the other tests on this machine.
+    assert!(took < Duration::from_secs(20), "took {took:?}");
+    assert!(folder.path("report.json").exists());
+}
