@@ -5,6 +5,7 @@ use dpm_device::time::{HostClock, HostTime};
 use dpm_device::tracker::natnet::client::{NatNetClient, NatNetConfig, Silence};
 use dpm_device::tracker::natnet::frame::{encode_frame, FrameContent, FrameInfo, RigidBody};
 use dpm_device::tracker::natnet::messages::ServerInfo;
+use dpm_device::tracker::natnet::models::{encode_models, BodyDefinition};
 use dpm_device::tracker::natnet::Version;
 use dpm_device::tracker::udp::UdpPort;
 use dpm_device::tracker::{BodyIndex, BodyKey, Tracker, TrackerSample};
@@ -368,6 +369,53 @@ impl ByHand {
         assert!(self.client.counters().is_conserved());
         sequence
     }
+}
+
+#[test]
+fn a_bit_stream_asked_for_by_request_is_read_once_it_is_granted() {
+    // A server that heeds the request text only, as Motive does: 4.2 definitions have a rotation that 4.0 ones lack.
+    let clock = Arc::new(AtomicI64::new(0));
+    let socket = UdpPort::bind(SocketAddrV4::new(LOCALHOST, 0), false).unwrap();
+    let mut config = NatNetConfig::unicast(LOCALHOST, keys(&["a"]));
+    config.kernel_stamps = false;
+    config.bitstream = Some(Version::V4_0);
+    config.command_port = socket.local().unwrap().port();
+    config.data_port = config.command_port;
+    let mut client = NatNetClient::open(config, clock_of(&clock)).unwrap();
+    let (mut buffer, mut out, mut granted) = (vec![0; 2048], Vec::new(), false);
+    for ms in 0..50 {
+        clock.store(ms * MS, Ordering::Relaxed);
+        client.poll(HostTime(ms * MS), &mut |_| {}).unwrap();
+        while let Some(a) = socket.receive(&mut buffer).unwrap() {
+            let version = if granted { Version::V4_0 } else { Version::V4_2 };
+            match buffer[0] {
+                0 => ServerInfo {
+                    name: "by hand".into(),
+                    app_version: [0; 4],
+                    natnet_version: [4, 2, 0, 0],
+                    clock_hz: 0,
+                    data_port: 0,
+                    multicast: None,
+                }
+                .encode(&mut out),
+                2 => {
+                    assert_eq!(&buffer[4..a.len], b"Bitstream,4.0\0");
+                    granted = true;
+                    out = vec![3, 0, 4, 0, 0, 0, 0, 0];
+                }
+                4 => {
+                    let definition = BodyDefinition { name: "a", id: 9, markers: &[[0.0; 3]] };
+                    encode_models(&mut out, version, &[definition]).unwrap();
+                }
+                _ => continue,
+            }
+            socket.send(&out, a.from).unwrap();
+        }
+    }
+    assert!(granted);
+    assert_eq!(client.version(), Version::V4_0);
+    assert_eq!(client.models().iter().map(|m| m.id).collect::<Vec<_>>(), [9]);
+    assert_eq!(client.counters().packets.malformed, 0, "{}", client.status());
 }
 
 #[test]

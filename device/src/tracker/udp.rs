@@ -2,6 +2,7 @@
 //! own arrival stamps, and a filter by source address inside the kernel.
 #![allow(unsafe_code)]
 
+use crate::time::HostClock;
 use std::io;
 use std::mem::{size_of, zeroed};
 use std::net::{Ipv4Addr, SocketAddrV4, UdpSocket};
@@ -183,6 +184,23 @@ pub fn realtime_ns() -> i64 {
     // SAFETY: `t` is a live timespec; CLOCK_REALTIME exists on every Linux.
     unsafe { libc::clock_gettime(libc::CLOCK_REALTIME, &mut t) };
     t.tv_sec * 1_000_000_000 + t.tv_nsec
+}
+
+/// `clock` minus the clock of the kernel's stamps, nanoseconds, by the tightest of three readings.
+pub fn realtime_offset_ns(clock: &dyn HostClock) -> i64 {
+    let mut best = (i64::MAX, 0);
+    for _ in 0..3 {
+        let before = clock.now().0;
+        let real = realtime_ns();
+        let width = clock.now().0.saturating_sub(before);
+        if width < best.0 {
+            best = (width, before + width / 2 - real);
+        }
+        if width < 5_000 {
+            break;
+        }
+    }
+    best.1
 }
 
 /// A C struct of all zeros.

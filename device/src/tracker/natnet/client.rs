@@ -2,14 +2,15 @@
 //!
 //! Nothing here waits: a poll reads at most [`NatNetClient::MAX_DATAGRAMS_PER_POLL`] datagrams and sends what is due.
 
+use super::clock::ServerClock;
 use super::frame::{decode_frame, FrameInfo, RigidBody};
 use super::messages as msg;
 use super::models::{decode_models, BodyModel};
 use super::wire::{id, split, Version, MAX_DATAGRAM};
-use crate::clock_map::{ClockMap, ExchangeOutcome};
+use crate::clock_map::ClockMap;
 use crate::pose::Pose;
-use crate::time::{DeviceTicks, HostClock, HostTime};
-use crate::tracker::udp::{realtime_ns, Arrival, UdpPort};
+use crate::time::{HostClock, HostTime};
+use crate::tracker::udp::{realtime_offset_ns, Arrival, UdpPort};
 use crate::tracker::{BodyIndex, BodyKey, SampleGate, Tracker, TrackerCounters, TrackerError, TrackerSample};
 use std::net::{Ipv4Addr, SocketAddrV4};
 use std::sync::Arc;
@@ -25,12 +26,6 @@ const MODELS_EVERY_NS: i64 = 1_000 * MS;
 const SILENCE_NS: i64 = 2_000 * MS;
 /// A server that answers but sent no frame for this long is connected to anew as well.
 const STARVED_NS: i64 = 1_000 * MS;
-/// Echo probes: this many quickly, the rest slowly.
-const QUICK_PROBES: u32 = 20;
-const QUICK_PROBE_EVERY_NS: i64 = 5 * MS;
-const PROBE_EVERY_NS: i64 = 100 * MS;
-/// A transmission that seems to have taken longer than this means that the server's clock stepped.
-const WORST_TRANSPORT_NS: i64 = 500 * MS;
 /// Distinct unknown body numbers remembered for the report.
 const MAX_STRANGERS: usize = 16;
 
@@ -109,8 +104,7 @@ pub struct NatNetClient {
     frame: Vec<RigidBody>,
     buffer: Vec<u8>,
     out: Vec<u8>,
-    map: Option<ClockMap>,
-    probes: Probes,
+    server_clock: ServerClock,
     due: Due,
     heard_at: Option<HostTime>,
     /// Last frame, or last connection where none came since.
@@ -118,18 +112,10 @@ pub struct NatNetClient {
     frames: u64,
     connects_sent: u64,
     version_changes: u64,
-    clock_doubts: u64,
     is_filtered: bool,
+    /// Bit stream asked for and not answered yet.
+    asked: Option<Version>,
     refused: Option<Version>,
-}
-
-/// Echo requests under way.
-#[derive(Default)]
-struct Probes {
-    under_way: [Option<i64>; 8],
-    next: usize,
-    sent: u32,
-    answered: u64,
 }
 
 /// When to send what next.
@@ -138,7 +124,6 @@ struct Due {
     connect: HostTime,
     keep_alive: HostTime,
     models: HostTime,
-    probe: HostTime,
 }
 
 impl NatNetClient {
@@ -203,15 +188,14 @@ impl NatNetClient {
             frame: Vec::with_capacity(MAX_DATAGRAM / RigidBody::BYTES + 1),
             buffer: vec![0; MAX_DATAGRAM],
             out: Vec::with_capacity(1024),
-            map: None,
-            probes: Probes::default(),
-            due: Due { connect: now, keep_alive: now, models: now, probe: now },
+            server_clock: ServerClock::new(),
+            due: Due { connect: now, keep_alive: now, models: now },
             heard_at: None,
             frame_at: now,
             frames: 0,
             connects_sent: 0,
             version_changes: 0,
-            clock_doubts: 0,
+            asked: None,
             is_filtered: false,
             refused: None,
         })
@@ -239,7 +223,7 @@ impl NatNetClient {
 
     /// The map of the server's clock, once an echo was answered.
     pub fn clock_map(&self) -> Option<&ClockMap> {
-        self.map.as_ref().filter(|m| m.is_ready())
+        self.server_clock.map()
     }
 
     /// Local port of the command socket.
@@ -304,15 +288,11 @@ impl NatNetClient {
             msg::encode_empty(&mut self.out, id::KEEP_ALIVE);
             self.send(port);
         }
-        if now >= self.due.probe && self.map.is_some() {
-            let quick = self.probes.sent < QUICK_PROBES;
-            self.due.probe = now.plus_ns(if quick { QUICK_PROBE_EVERY_NS } else { PROBE_EVERY_NS });
-            self.probes.sent = self.probes.sent.saturating_add(1);
+        if self.server_clock.is_due(now) {
             // The stamp is taken as late as possible: what lies between it and the wire counts as round trip.
-            let t1 = self.clock.now().0;
-            self.probes.under_way[self.probes.next] = Some(t1);
-            self.probes.next = (self.probes.next + 1) % self.probes.under_way.len();
-            msg::encode_echo_request(&mut self.out, t1 as u64);
+            let t1 = self.clock.now();
+            self.server_clock.note_sent(t1);
+            msg::encode_echo_request(&mut self.out, t1.0 as u64);
             self.send(port);
         }
     }
@@ -327,9 +307,9 @@ impl NatNetClient {
 
     fn forget_server(&mut self, now: HostTime) {
         self.server = None;
-        self.map = None;
-        self.probes = Probes::default();
-        self.due = Due { connect: now, keep_alive: now, models: now, probe: now };
+        self.server_clock.forget();
+        self.asked = None;
+        self.due = Due { connect: now, keep_alive: now, models: now };
     }
 
     /// True while the server has not told its names.
@@ -393,7 +373,8 @@ impl NatNetClient {
                 Err(_) => Verdict::Malformed,
             },
             id::ECHO_RESPONSE => self.on_echo(payload, at),
-            id::RESPONSE | id::MESSAGE_STRING | id::UNRECOGNIZED => Verdict::Used(0),
+            id::RESPONSE => self.on_response(payload, at),
+            id::MESSAGE_STRING | id::UNRECOGNIZED => Verdict::Used(0),
             id::DISCONNECT | id::DISCONNECT_BY_TIMEOUT => {
                 self.forget_server(at);
                 Verdict::Used(0)
@@ -415,14 +396,10 @@ impl NatNetClient {
             self.version_changes += 1;
         }
         self.version = info.version();
-        let same_clock = self.server.as_ref().is_some_and(|s| s.clock_hz == info.clock_hz);
-        if !same_clock || self.map.is_none() {
-            self.map = ClockMap::new(info.clock_hz).ok();
-            self.probes = Probes::default();
-            self.due.probe = at;
-        }
+        self.server_clock.set_rate(info.clock_hz, at);
         if let (Some(wanted), None) = (self.config.bitstream, self.config.multicast) {
             if wanted != info.version() && info.version() >= Version::V4_0 {
+                self.asked = Some(wanted);
                 msg::encode_request(&mut self.out, &format!("Bitstream,{wanted}"));
                 self.send(self.config.command_port);
             }
@@ -432,24 +409,19 @@ impl NatNetClient {
     }
 
     fn on_echo(&mut self, payload: &[u8], at: HostTime) -> Verdict {
-        let Ok((stamp, ticks)) = msg::decode_echo_response(payload) else {
-            return Verdict::Malformed;
-        };
-        let t1 = stamp as i64;
-        // Only answers to questions of ours, each once: an old or invented answer must not move the clock.
-        let Some(slot) = self.probes.under_way.iter_mut().find(|s| **s == Some(t1)) else {
-            return Verdict::Unsupported;
-        };
-        *slot = None;
-        self.probes.answered += 1;
-        if let Some(map) = &mut self.map {
-            let ticks = DeviceTicks(ticks);
-            let outcome = map.add_exchange(HostTime(t1), ticks, ticks, at);
-            if matches!(outcome, ExchangeOutcome::Contradicting | ExchangeOutcome::Stepped) {
-                // Find out quickly whether the clock stepped, and fill the new window quickly.
-                self.probes.sent = 0;
-                self.due.probe = at;
-            }
+        match msg::decode_echo_response(payload) {
+            Ok((stamp, ticks)) if self.server_clock.on_echo(stamp, ticks, at) => Verdict::Used(0),
+            Ok(_) => Verdict::Unsupported,
+            Err(_) => Verdict::Malformed,
+        }
+    }
+
+    /// The answer to a request; 0 means that the bit stream asked for comes from now on.
+    fn on_response(&mut self, payload: &[u8], at: HostTime) -> Verdict {
+        if let (Some(version), [0, 0, 0, 0]) = (self.asked.take(), payload) {
+            self.version = version;
+            self.models.clear();
+            self.due.models = at;
         }
         Verdict::Used(0)
     }
@@ -499,7 +471,7 @@ impl NatNetClient {
         at: HostTime,
         sink: &mut dyn FnMut(&TrackerSample),
     ) -> usize {
-        let captured_at = self.captured_at(info, at);
+        let captured_at = self.server_clock.captured_at(info, at);
         let mut delivered = 0;
         for body in bodies {
             let Ok(found) = self.lookup.binary_search_by_key(&body.id, |(id, _)| *id) else {
@@ -527,56 +499,6 @@ impl NatNetClient {
             }
         }
         delivered
-    }
-
-    /// Middle of the exposure on the host's clock: through the map where there is one, otherwise arrival less the server's own
-    /// latency, which leaves out only the way through the network.
-    fn captured_at(&mut self, info: &FrameInfo, at: HostTime) -> HostTime {
-        let hz = self.server.as_ref().map_or(0, |s| s.clock_hz);
-        let latency_ticks = info.transmit.wrapping_sub(info.mid_exposure);
-        let has_stamps = info.mid_exposure != 0 && info.transmit >= info.mid_exposure && hz > 0;
-        let latency_ns = if has_stamps {
-            i64::try_from(u128::from(latency_ticks) * 1_000_000_000 / u128::from(hz)).unwrap_or(i64::MAX)
-        } else {
-            0
-        };
-        let plain = if latency_ns <= 1_000 * MS { at.plus_ns(-latency_ns) } else { at };
-        let Some(map) = self.map.as_mut().filter(|m| m.is_ready() && has_stamps) else {
-            return plain;
-        };
-        let (Some(sent), Some(mapped)) =
-            (map.to_host(DeviceTicks(info.transmit)), map.to_host(DeviceTicks(info.mid_exposure)))
-        else {
-            return plain;
-        };
-        // Sent after it arrived, or half a second under way: the server's clock is not what it was. Start its map anew.
-        let transport_ns = at.ns_since(sent.at);
-        if transport_ns < -sent.uncertainty_ns - MS || transport_ns > WORST_TRANSPORT_NS {
-            self.clock_doubts += 1;
-            self.map = ClockMap::new(hz).ok();
-            self.probes = Probes::default();
-            self.due.probe = at;
-            return plain;
-        }
-        mapped.at.min(at)
-    }
-
-    /// Difference from the kernel's stamp clock to the host's clock, by the tightest of three readings.
-    fn realtime_offset(&self) -> i64 {
-        let mut best = (i64::MAX, 0);
-        for _ in 0..3 {
-            let before = self.clock.now().0;
-            let real = realtime_ns();
-            let after = self.clock.now().0;
-            let width = after.saturating_sub(before);
-            if width < best.0 {
-                best = (width, before + width / 2 - real);
-            }
-            if width < 5_000 {
-                break;
-            }
-        }
-        best.1
     }
 }
 
@@ -610,7 +532,7 @@ impl Tracker for NatNetClient {
                 let here = self.clock.now();
                 let at = match arrival.kernel_ns.filter(|_| self.config.kernel_stamps) {
                     Some(stamp) => {
-                        let offset = *offset.get_or_insert_with(|| self.realtime_offset());
+                        let offset = *offset.get_or_insert_with(|| realtime_offset_ns(&*self.clock));
                         let stamped = HostTime(stamp.saturating_add(offset)).min(here);
                         // A stamp from long ago is a stepped wall clock, not an arrival.
                         if here.ns_since(stamped) > 10_000 * MS {
@@ -668,8 +590,8 @@ impl NatNetClient {
             strangers: &self.strangers,
             connects_sent: self.connects_sent,
             version_changes: self.version_changes,
-            clock_doubts: self.clock_doubts,
-            echoes: self.probes.answered,
+            clock_doubts: self.server_clock.doubts(),
+            echoes: self.server_clock.answered(),
             is_filtered: self.is_filtered,
             data_problem: self.data_problem.as_deref(),
         }

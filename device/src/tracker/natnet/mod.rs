@@ -12,6 +12,8 @@ pub mod wire;
 #[cfg(feature = "net")]
 pub mod client;
 #[cfg(feature = "net")]
+mod clock;
+#[cfg(feature = "net")]
 mod report;
 
 pub use wire::{Version, WireError};
