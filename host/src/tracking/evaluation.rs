@@ -186,7 +186,7 @@ pub fn prediction_cases() -> Vec<PredictionCase> {
             "half a turn a second",
             MotionSpec::Rotate { axis: up, rate_rad_s: std::f64::consts::PI, pivot_offset_m: [0.0; 3] },
             1.2,
-            1e-6,
+            1e-4,
         ),
         turn(
             "100 rad/s",
