@@ -7,7 +7,7 @@ mod server;
 pub mod wire;
 
 pub use client::{list, RemoteCable};
-pub use server::{serve, Export, Link, Server};
+pub use server::{serve, serve_imported, Export, Link, Server};
 
 #[cfg(test)]
 mod tests;

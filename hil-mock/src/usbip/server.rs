@@ -163,6 +163,11 @@ pub fn serve<L: Link>(mut link: L, exports: &[Export]) -> io::Result<()> {
     }
 }
 
+/// Serves URBs of an import that was made elsewhere, to the end: for a socket that is handed to `vhci_hcd` directly.
+pub fn serve_imported<L: Link>(link: L, cable: Arc<dyn UsbCable>) -> io::Result<()> {
+    Session::run(link, cable)
+}
+
 /// One imported device.
 struct Session<L> {
     number: u64,
