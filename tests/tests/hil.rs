@@ -144,6 +144,7 @@ impl Rig {
             late_slots: 50,
             epoch: Epoch::At(DeviceTicks(0)),
             codecs: Codec::Raw.mask(),
+            flash_limit: None,
             session_seed: 1,
         });
         let frame_bytes = packet_bytes(raster.plane_bytes()) * PLANES + packet_bytes(16);
