@@ -3,6 +3,7 @@
 mod bodies;
 mod dlpc900;
 mod natnet;
+mod projector;
 mod serial;
 mod usb;
 mod vrpn;
@@ -17,6 +18,8 @@ pub enum Device {
     Dlpc900(dlpc900::Dlpc900Arguments),
     /// OptiTrack NatNet server: poses over UDP
     Natnet(natnet::NatNetArguments),
+    /// Bit-plane projector: a USB device over USB/IP, or on a serial port or pseudo-terminal
+    Projector(projector::ProjectorArguments),
     /// Serial pose stream on a port or a pseudo-terminal
     Serial(serial::SerialArguments),
     /// VRPN server: poses over TCP
@@ -28,6 +31,7 @@ pub fn run(device: Device) -> Result<(), Box<dyn Error>> {
     match device {
         Device::Dlpc900(arguments) => dlpc900::run(&arguments),
         Device::Natnet(arguments) => natnet::run(&arguments),
+        Device::Projector(arguments) => projector::run(&arguments),
         Device::Serial(arguments) => serial::run(&arguments),
         Device::Vrpn(arguments) => vrpn::run(&arguments),
     }

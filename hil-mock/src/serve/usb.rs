@@ -18,7 +18,7 @@ pub struct UsbArguments {
     usbip: SocketAddr,
     /// Stop after this many seconds
     #[arg(long)]
-    seconds: Option<f64>,
+    pub(super) seconds: Option<f64>,
     /// Faults of the cable: unplug and stall with a window, slow with a duration, such as `unplug@5s+1s,slow=2ms`
     #[arg(long, value_name = "PLAN", default_value = "")]
     faults: FaultPlan,

@@ -15,6 +15,7 @@ use hil_mock::projector::usb::UsbProjector;
 use hil_mock::projector::{MockConfig, MockProjector};
 use hil_mock::usb_model::Speed;
 use hil_mock::usb_plug::{monotonic_clock, Clock, Fault, UsbPlug};
+use hil_mock::usbip::{Export, RemoteCable, Server};
 use usbfs_fake::{plug_in, Options, Socket};
 
 fn raster() -> Raster {
@@ -488,4 +489,27 @@ fn a_thousand_plugs_leak_nothing() {
     // Other tests open and close files meanwhile: a leak would be one or more for each of 990 cycles.
     assert!(open_files() < files + 300, "{} files, {files} after the tenth cycle", open_files());
     assert_eq!(host.usb.counters().opened, 1001);
+}
+
+/// The whole way: libusb, the usbfs calls, USB/IP over TCP, the projector at the far end.
+#[test]
+fn frames_cross_usbip_bit_for_bit() {
+    let clock = monotonic_clock();
+    let setup = MockConfig { serial: 15, ..MockConfig::new(raster()) };
+    let model = Arc::new(Mutex::new(UsbProjector::new(MockProjector::new(setup), Speed::Super, None)));
+    let plug = UsbPlug::new(model.clone(), clock.clone());
+    let exports = vec![Export::new("1-1", Arc::new(plug.clone()))];
+    let server = Server::start("127.0.0.1:0", exports).unwrap();
+    let cable = RemoteCable::import(server.address(), "1-1").unwrap();
+    let socket = Some(plug_in(Arc::new(cable), Options::default()));
+    let device = Device { model, plug, socket, clock, serial: 15 };
+    let mut host = Host::connected(&device);
+    host.stream(&device, 10_000, |_| lit(&device) >= 20);
+    check(&device);
+    let s = device.mock(|m| m.status());
+    assert_eq!((s.header_errors, s.payload_errors, s.frames_incomplete), (0, 0, 0));
+    device.plug.unplug();
+    let noticed = host.until(&device, 5000, |h| h.link.state() == LinkState::Lost);
+    assert!(noticed < Duration::from_millis(100), "{noticed:?}");
+    assert_eq!(host.usb.in_flight(), 0);
 }

@@ -1,0 +1,85 @@
+//! What kind of projector the mock is, and what it tells about its light.
+
+use dpm_device::link::{Codec, MAX_FLASHES_PER_S, VERSION};
+use dpm_device::planes::Raster;
+use dpm_device::time::{DeviceTicks, HostTime};
+
+use super::DeviceClock;
+
+/// What kind of projector the mock is.
+#[derive(Clone, Copy, Debug)]
+pub struct MockConfig {
+    /// Mirrors.
+    pub raster: Raster,
+    /// Most planes of a frame, 1 to [`dpm_device::planes::MAX_PLANES`].
+    pub max_planes: u8,
+    /// Whole frames that can wait, 1 to 64.
+    pub frame_buffers: u8,
+    /// Its clock.
+    pub clock: DeviceClock,
+    /// Shortest time a plane can be shown, nanoseconds.
+    pub min_plane_ns: u32,
+    /// From the start of a slot to the first photon (load and mirror settling), nanoseconds.
+    pub settle_ns: u32,
+    /// Codecs that it reads, bits [`Codec::mask`]; raw always.
+    pub codecs: u32,
+    /// Serial number.
+    pub serial: u64,
+    /// Firmware version that it claims.
+    pub firmware: u16,
+    /// Protocol version that it claims; another than [`VERSION`] makes it refuse every session.
+    pub version: u16,
+    /// Flashes of the whole field a second above which it goes dark and latches; `None` switches the limiter off.
+    pub flash_limit: Option<u8>,
+    /// Light events kept for [`super::MockProjector::next_light`]; when full the oldest go and are counted.
+    pub events_kept: usize,
+}
+
+impl MockConfig {
+    /// A panel of `raster` with 24-plane memory for four waiting frames, an ideal clock, and mirrors that show a plane in
+    /// 43.22 us (32,552 loads a second and 12.5 us of reset, as a DLP7000 does).
+    pub fn new(raster: Raster) -> Self {
+        Self {
+            raster,
+            max_planes: 24,
+            frame_buffers: 4,
+            clock: DeviceClock::IDEAL,
+            min_plane_ns: 43_220,
+            settle_ns: 0,
+            codecs: Codec::ALL,
+            serial: 1,
+            firmware: 0x0100,
+            version: u16::from(VERSION),
+            flash_limit: Some(MAX_FLASHES_PER_S),
+            events_kept: 4096,
+        }
+    }
+}
+
+/// What the mirrors did in one slot.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum LightKind {
+    /// A frame for the first time.
+    Lit,
+    /// The frame before again.
+    Repeated,
+    /// Nothing.
+    Blank,
+}
+
+/// One slot of an armed projector.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct LightEvent {
+    /// Which slot.
+    pub slot: u64,
+    /// The frame on the mirrors (low 32 bits of its number); `None` when dark.
+    pub frame: Option<u32>,
+    /// What was lit.
+    pub kind: LightKind,
+    /// Start of the slot on the device's clock.
+    pub lit_at: DeviceTicks,
+    /// True time of the first photon; of a blank slot, of its beginning.
+    pub first_photon_at: HostTime,
+    /// True time of the last photon; of a blank slot, of its end.
+    pub last_photon_at: HostTime,
+}
