@@ -223,7 +223,7 @@ fn load_scene(config: &RigConfig) -> Result<Scene, SceneError> {
         bodies: c
             .bodies
             .iter()
-            .map(|b| BodySelector { name: b.name.clone(), node: b.node_name().to_owned(), projected: true })
+            .map(|b| BodySelector { name: b.name.clone(), node: b.node.clone(), projected: true })
             .collect(),
         virtual_nodes: c.virtual_nodes.clone(),
         ..LoadOptions::default()
@@ -240,7 +240,8 @@ fn environment(config: &RigConfig) -> Result<Option<Environment>, RigError> {
             Ok((!own).then_some(Environment::Constant(radiance)))
         }
         EnvironmentConfig::Image(c) => {
-            Err(RigError::Unsupported(format!("scene.environment: {} cannot be read yet", c.file.display())))
+            let rotation = (c.rotation_deg as f32).to_radians();
+            Ok(Some(scene::load_environment(&c.file, rotation, c.scale as f32)?))
         }
     }
 }

@@ -20,7 +20,7 @@ fn load_with(glb: &Glb, options: &LoadOptions) -> Scene {
 fn select(list: &[(&str, &str)]) -> LoadOptions {
     let bodies = list.iter().map(|(name, node)| BodySelector {
         name: (*name).into(),
-        node: (*node).into(),
+        node: Some((*node).into()),
         projected: true,
     });
     LoadOptions { bodies: bodies.collect(), ..LoadOptions::default() }
@@ -98,6 +98,27 @@ fn selectors_order_bodies_and_leave_the_rest_static() {
         centre.distance(Vec3::new(-0.2 + 0.025, 0.025, 0.025)) < 1e-6,
         "static geometry is in world space: {centre}"
     );
+}
+
+#[test]
+fn bodies_of_another_rig_stand_for_the_first_objects() {
+    let body = |name: &str| BodySelector { name: name.into(), node: None, projected: true };
+    let options = |names: &[&str]| LoadOptions {
+        bodies: names.iter().map(|n| body(n)).collect(),
+        ..LoadOptions::default()
+    };
+    let names = |scene: &Scene| scene.bodies.iter().map(|b| (b.name.clone(), b.tracked)).collect::<Vec<_>>();
+    let both = load_with(&tetrahedra(), &options(&["bunny", "venus", "third"]));
+    assert_eq!(names(&both), [("bunny".into(), Some(0)), ("venus".into(), Some(1))]);
+    let told = both.warnings.join("\n");
+    assert!(told.contains("'bunny' stands for 'left'") && told.contains("'third' has nothing"), "{told}");
+    // A name that fits is taken by name, and then one that does not is a mistake.
+    let by_name = load_with(&tetrahedra(), &options(&["right", "left"]));
+    assert_eq!(names(&by_name), [("right".into(), Some(0)), ("left".into(), Some(1))]);
+    assert!(by_name.warnings.is_empty());
+    let message =
+        scene::load_bytes(&tetrahedra().bytes(), &options(&["right", "lefft"])).unwrap_err().to_string();
+    assert!(message.contains("no node 'lefft'"), "{message}");
 }
 
 #[test]

@@ -511,7 +511,7 @@ fn paths_from_hostile_files_stay_in_the_folder() {
 #[test]
 fn names_of_the_rig_file_that_the_scene_does_not_have() {
     let select = |node: &str| LoadOptions {
-        bodies: vec![BodySelector { name: "a".into(), node: node.into(), projected: true }],
+        bodies: vec![BodySelector { name: "a".into(), node: Some(node.into()), projected: true }],
         ..LoadOptions::default()
     };
     let message = refusal_with("missing node", &tetrahedra().bytes(), &select("centre"));
@@ -519,7 +519,7 @@ fn names_of_the_rig_file_that_the_scene_does_not_have() {
     let message = refusal_with("two of a name", &set("/nodes/1/name", json!("left")), &select("left"));
     assert!(message.contains("2 nodes named 'left'") && message.contains("rename"), "{message}");
     let mut twice = select("left");
-    twice.bodies.push(BodySelector { name: "b".into(), node: "left".into(), projected: true });
+    twice.bodies.push(BodySelector { name: "b".into(), node: Some("left".into()), projected: true });
     let message = refusal_with("one node for two bodies", &tetrahedra().bytes(), &twice);
     assert!(message.contains("body 'b'") && message.contains("body 'a'"), "{message}");
     let message =

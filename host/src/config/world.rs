@@ -207,7 +207,7 @@ section! {
 section! {
     /// Light from a picture.
     pub struct ImageEnvironmentConfig {
-        /// PFM (linear) or PNG / JPEG (sRGB).
+        /// PFM or Radiance .hdr (linear), PNG or JPEG (sRGB).
         file: PathBuf = PathBuf::new(), "", NotEmpty;
         /// Turn about the world's Y axis, counter-clockwise from above.
         rotation_deg: f64 = 0.0, "deg", Within(-360.0, 360.0);

@@ -11,8 +11,9 @@ use super::{gltf_file, Scene, SceneError};
 pub struct BodySelector {
     /// Name of the rigid body.
     pub name: String,
-    /// Name of the glTF node; must occur once.
-    pub node: String,
+    /// Name of the glTF node; must occur once. `None`: the node of the body's own name. When no body states its node and the file has
+    /// none of their names, the bodies stand for the first objects of the scene in order, and a warning says which for which.
+    pub node: Option<String>,
     /// False: nothing is projected on it, it is only seen in reflections and casts virtual shadows.
     pub projected: bool,
 }

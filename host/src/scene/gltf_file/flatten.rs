@@ -83,11 +83,14 @@ pub fn choose_bodies(
     let present = descendants(document, &roots);
     let find = |name: &str| find_node(document, &present, name);
     let mut virtual_nodes = options.virtual_nodes.iter().map(|n| find(n)).collect::<Result<Vec<_>, _>>()?;
-    if options.bodies.is_empty() {
-        return Ok(choose_automatically(document, roots, virtual_nodes, warnings));
+    let named =
+        |name: &str| present.iter().any(|&i| document.nodes().nth(i).is_some_and(|n| n.name() == Some(name)));
+    if options.bodies.iter().all(|b| b.node.is_none() && !named(&b.name)) {
+        return Ok(choose_automatically(document, roots, virtual_nodes, &options.bodies, warnings));
     }
     let mut bodies: Vec<Claim> = vec![];
     for BodySelector { name, node, projected } in &options.bodies {
+        let node = node.as_ref().unwrap_or(name);
         let index = find(node)?;
         if let Some(other) = bodies.iter().find(|b| b.node == index) {
             return Err(SceneError::broken(
@@ -119,11 +122,13 @@ fn find_node(document: &gltf::Document, present: &[usize], name: &str) -> Result
     Err(SceneError::Node { problem, known: if known.is_empty() { "none".into() } else { known.join(", ") } })
 }
 
-/// The first objects of the scene with a mesh become movable bodies; lamps (all materials emit) become virtual.
+/// The first objects of the scene with a mesh become movable bodies, the given ones or, without any, two with the names of their nodes;
+/// lamps (all materials emit) become virtual.
 fn choose_automatically(
     document: &gltf::Document,
     mut roots: Vec<usize>,
     mut virtual_nodes: Vec<usize>,
+    given: &[BodySelector],
     warnings: &mut Vec<String>,
 ) -> Claims {
     // Exporters like to wrap everything in one node: look inside it.
@@ -135,6 +140,7 @@ fn choose_automatically(
         }
         roots = below;
     }
+    let wanted = if given.is_empty() { AUTO_BODIES } else { given.len() };
     let mut bodies = vec![];
     for root in roots {
         let materials: Vec<bool> = descendants(document, &[root])
@@ -157,9 +163,27 @@ fn choose_automatically(
         if materials.iter().all(|&emits| emits) {
             warnings.push(format!("'{name}' emits light everywhere: taken for a lamp of the virtual world, nothing is projected on it"));
             virtual_nodes.push(root);
-        } else if bodies.len() < AUTO_BODIES {
-            bodies.push(Claim { name, node: root, projected: true });
+        } else if bodies.len() < wanted {
+            let body = given.get(bodies.len());
+            if let Some(body) = body {
+                warnings.push(format!(
+                    "body '{}' stands for '{name}': the scene has no node of its name",
+                    body.name
+                ));
+            }
+            bodies.push(Claim {
+                name: body.map_or(name, |b| b.name.clone()),
+                node: root,
+                projected: body.is_none_or(|b| b.projected),
+            });
         }
+    }
+    for body in given.iter().skip(bodies.len()) {
+        warnings.push(format!(
+            "body '{}' has nothing to show: the scene has only {} objects",
+            body.name,
+            bodies.len()
+        ));
     }
     virtual_nodes.sort_unstable();
     Claims { bodies, virtual_nodes }
