@@ -422,3 +422,89 @@ const OPCODES: [u16; 22] = [
     0x0100, 0x0101, 0x0200, 0x0201, 0x0205, 0x0206, 0x0609, 0x1100, 0x1a00, 0x1a07, 0x1a0c, 0x1a1b, 0x1a1d,
     0x1a24, 0x1a2a, 0x1a2b, 0x1a2c, 0x1a30, 0x1a31, 0x1a32, 0x1a34, 0xbeef,
 ];
+
+/// Sends a command as its reports and gives the first report of the reply.
+fn talk(m: &mut Dlpc900Model, flags: u8, sequence: u8, opcode: u16, data: &[u8]) -> Option<[u8; 64]> {
+    for r in (Command { flags, sequence, opcode: Opcode(opcode), data }).reports().unwrap() {
+        m.interrupt_out(T0, 0x01, &r);
+    }
+    m.interrupt_in(0x81)
+}
+
+/// The dialogue of the pyusb programs: every write wants a reply and is followed by a question for the error code, image data too;
+/// sequence numbers are constants; an image that is a multiple of 504 bytes ends in an empty data command; the header counts itself.
+#[test]
+fn programs_that_ask_after_every_command_are_served() {
+    let mut m = Dlpc900Model::new(small());
+    let mut ask = |opcode: u16, data: &[u8]| {
+        let sequence = if opcode == 0x1a2b { 0x11 } else { 0x00 };
+        let reply = talk(&mut m, 0x40, sequence, opcode, data).expect("a reply to every write");
+        assert_eq!(reply[..4], [0x40, sequence, 0, 0], "{opcode:#06x}");
+        let error = talk(&mut m, 0xc0, 0x22, 0x0100, &[]).expect("an error code");
+        assert_eq!(error[..8], [0xc0, 0x22, 1, 0, 0, 0, 0, 0], "{opcode:#06x}");
+    };
+    ask(0x1a24, &[0]);
+    ask(0x1a1b, &[3]);
+    for i in 0..3u8 {
+        // LEDs 7, 1 bit, clear; TRIG_OUT2 disabled.
+        ask(0x1a34, &[i, 0, 0x40, 0x42, 0x0f, 0x71, 0, 0, 0, 1, 0, i << 3]);
+    }
+    ask(0x1a31, &[3, 0, 0, 0, 0, 0]);
+    let planes = planes(Dmd::Dlp5500, 3);
+    let views: Vec<&[u8]> = planes.iter().map(|p| &p[..]).collect();
+    let mut bytes =
+        encode(&views, Dmd::Dlp5500.raster(), 0..1024, PlaneOrder::Descending, Some(Compression::Erle))
+            .unwrap()
+            .bytes;
+    bytes.resize(bytes.len().next_multiple_of(504), 0);
+    let size = (bytes.len() as u32).to_le_bytes();
+    bytes[8..12].copy_from_slice(&size);
+    ask(0x1a2a, &[0, 0, size[0], size[1], size[2], size[3]]);
+    for chunk in bytes.chunks(504) {
+        ask(0x1a2b, &[&(chunk.len() as u16).to_le_bytes()[..], chunk].concat());
+    }
+    ask(0x1a2b, &[0, 0]);
+    ask(0x1a24, &[2]);
+    for (i, p) in planes.iter().enumerate() {
+        assert!(m.projected_plane(i).unwrap() == *p);
+    }
+    assert_eq!(m.warnings().len(), 1, "only that image data should not be acknowledged: {:?}", m.warnings());
+    assert_eq!(m.unread_replies(), 0);
+}
+
+/// The dialogue of the HID-library programs: image data without reply, patterns that are not cleared, the error code asked for by a
+/// write, stop sent twice, a second table configuration after the images, replies that nobody reads, and a header with the pixel
+/// format byte set.
+#[test]
+fn programs_that_never_read_and_configure_twice_are_served() {
+    let mut m = Dlpc900Model::new(small());
+    let ok = |r: Option<[u8; 64]>| assert_eq!(r.expect("a reply")[0] & flag::NACK, 0);
+    assert_eq!(talk(&mut m, 0x00, 0x05, 0x1a24, &[0]), None);
+    ok(talk(&mut m, 0x40, 0, 0x1a1b, &[3]));
+    assert_eq!(talk(&mut m, 0x00, 0x05, 0x1a24, &[0]), None);
+    ok(talk(&mut m, 0x40, 0, 0x1a34, &[0, 0, 0x69, 0, 0, 0x10, 0, 0, 0, 0, 0, 0]));
+    ok(talk(&mut m, 0x40, 0, 0x1a31, &[1, 0, 0, 0, 0, 0]));
+    let planes = planes(Dmd::Dlp5500, 1);
+    let mut bytes =
+        encode(&[&planes[0]], Dmd::Dlp5500.raster(), 0..1024, PlaneOrder::Descending, Some(Compression::Rle))
+            .unwrap()
+            .bytes;
+    (bytes[24], bytes[29]) = (1, 1);
+    let size = (bytes.len() as u32).to_le_bytes();
+    ok(talk(&mut m, 0x40, 0, 0x1a2a, &[0, 0, size[0], size[1], size[2], size[3]]));
+    for chunk in bytes.chunks(504) {
+        let data = [&(chunk.len() as u16).to_le_bytes()[..], chunk].concat();
+        assert_eq!(talk(&mut m, 0x00, 0, 0x1a2b, &data), None);
+    }
+    ok(talk(&mut m, 0x40, 0, 0x1a31, &[1, 0, 0, 0, 0, 0]));
+    // Three writes whose replies stay unread, then a question: its answer comes, nothing older.
+    for _ in 0..3 {
+        let wanted = Command { flags: 0x40, sequence: 9, opcode: Opcode::LED_ENABLE, data: &[8] };
+        wanted.reports().unwrap().for_each(|r| m.interrupt_out(T0, 0x01, &r));
+    }
+    assert_eq!(talk(&mut m, 0x40, 7, 0x0100, &[]).unwrap()[..5], [0x40, 7, 1, 0, 0]);
+    assert_eq!(talk(&mut m, 0x00, 0x08, 0x1a24, &[2]), None);
+    assert!(m.projected_plane(0).unwrap() == planes[0]);
+    assert!(m.showing(T0.plus_ns(1)).is_some());
+    assert_eq!(m.warnings(), [] as [String; 0]);
+}
