@@ -443,3 +443,6 @@ fn lost(sent: Result<(), SendError>) -> Result<(), LinkError> {
         Ok(()) | Err(SendError::Busy) => Ok(()),
     }
 }
+
+#[cfg(test)]
+mod tests;

@@ -1,0 +1,191 @@
+//! A device that says what it should not: answers to other sessions, old answers, answers never asked for.
+
+use super::*;
+use crate::link::{Codec, DeviceMessage, Fault, MessageType, Underrun};
+use crate::planes::{PlaneSchedule, Raster};
+use crate::time::FrameRate;
+use proptest::prelude::*;
+
+/// Hands out prepared bytes and remembers the types of what was sent.
+#[derive(Default)]
+struct Script {
+    inbound: Vec<u8>,
+    sent: Vec<MessageType>,
+    session: u32,
+}
+
+impl Script {
+    fn say(&mut self, session: u32, message: &DeviceMessage) {
+        let mut payload = [0; MAX_CONTROL_BYTES];
+        let (kind, n) = message.write(&mut payload);
+        let packet = Packet::new(Header::control(kind, session, 0), &payload[..n]);
+        self.inbound.extend(packet.parts().concat());
+    }
+}
+
+impl Transport for Script {
+    fn send(&mut self, _: HostTime, _: Lane, packets: &[Packet<'_>]) -> Result<(), SendError> {
+        for packet in packets {
+            let header = Header::decode(packet.parts()[0].try_into().unwrap()).unwrap();
+            self.session = header.session;
+            self.sent.push(header.kind);
+        }
+        Ok(())
+    }
+    fn receive(&mut self, _: HostTime, sink: &mut dyn FnMut(Lane, &[u8])) -> Result<(), TransportError> {
+        sink(Lane::Control, &std::mem::take(&mut self.inbound));
+        Ok(())
+    }
+    fn name(&self) -> &str {
+        "script"
+    }
+}
+
+fn raster() -> Raster {
+    Raster::new(8, 2).unwrap()
+}
+
+fn link() -> HostLink {
+    HostLink::new(LinkSettings {
+        raster: raster(),
+        schedule: PlaneSchedule::mono8(),
+        rate: FrameRate::new(100, 1).unwrap(),
+        watchdog_us: 50_000,
+        underrun: Underrun::Repeat,
+        late_slots: 0,
+        epoch: Epoch::At(DeviceTicks(0)),
+        codecs: Codec::Raw.mask(),
+        flash_limit: None,
+        session_seed: 1,
+    })
+}
+
+fn hello() -> DeviceMessage {
+    DeviceMessage::Hello(DeviceHello {
+        version: 1,
+        firmware: 0,
+        codecs: 1,
+        raster: raster(),
+        max_planes: 8,
+        frame_buffers: 2,
+        tick_hz: 1_000_000,
+        min_plane_ns: 1000,
+        serial: 0,
+        now: DeviceTicks(1),
+    })
+}
+
+fn status(state: DeviceState, now: u64, frame_limit: u32) -> Status {
+    let bytes = [0u8; 96];
+    let DeviceMessage::Status(blank) = DeviceMessage::parse(MessageType::Status, &bytes).unwrap() else {
+        unreachable!()
+    };
+    Status { state, now: DeviceTicks(now), frame_limit, ..blank }
+}
+
+/// Brings a link to streaming against the script.
+fn streaming() -> (HostLink, Script) {
+    let (mut link, mut script) = (link(), Script::default());
+    link.connect();
+    link.poll(HostTime(0), &mut script).unwrap();
+    script.say(script.session, &hello());
+    script.say(script.session, &DeviceMessage::Status(status(DeviceState::Greeted, 2, 0)));
+    assert_eq!(link.poll(HostTime(1), &mut script).unwrap(), LinkState::Configuring);
+    script.say(script.session, &DeviceMessage::Status(status(DeviceState::Configured, 3, 0)));
+    assert_eq!(link.poll(HostTime(2), &mut script).unwrap(), LinkState::Ready);
+    assert!(!script.sent.contains(&MessageType::Arm), "never armed of its own accord");
+    link.arm(0);
+    link.poll(HostTime(3), &mut script).unwrap();
+    script.say(script.session, &DeviceMessage::Status(status(DeviceState::Armed, 4, 2)));
+    assert_eq!(link.poll(HostTime(4), &mut script).unwrap(), LinkState::Streaming);
+    assert_eq!(script.sent[0], MessageType::Hello);
+    assert_eq!(script.sent.iter().filter(|t| **t == MessageType::Config).count(), 1);
+    (link, script)
+}
+
+#[test]
+fn u10_answers_to_others_old_answers_and_answers_never_asked_for_change_nothing() {
+    let (mut link, mut script) = streaming();
+    let session = script.session;
+    let ignored = link.counters().packets_ignored;
+    // Another session's wealth of credit, an older state, an echo from the future, a fault of an ARM that was not sent.
+    script.say(session ^ 1, &DeviceMessage::Status(status(DeviceState::Armed, 50, 1000)));
+    script.say(session, &DeviceMessage::Status(status(DeviceState::Configured, 3, 0)));
+    let echo = Echo { host_sent_ns: 1 << 40, device_received: DeviceTicks(1), device_sent: DeviceTicks(2) };
+    script.say(session, &DeviceMessage::Echo(echo));
+    let fault = Fault { latched: 0, code: FaultCode::Arm, detail: 0, at: DeviceTicks(0) };
+    script.say(session, &DeviceMessage::Fault(fault));
+    // A PLANE and a HELLO of a host come back: a cable that echoes.
+    let looped = Packet::new(Header::control(MessageType::Plane, session, 0), &[0; 200]).parts().concat();
+    script.inbound.extend(looped);
+    assert_eq!(link.poll(HostTime(5), &mut script).unwrap(), LinkState::Streaming);
+    assert_eq!(link.credit(), 2);
+    assert_eq!(link.counters().packets_ignored - ignored, 4);
+    let mut echoes = 0;
+    link.take_echoes(|_| echoes += 1);
+    assert_eq!(echoes, 0);
+    // The same answer twice is one answer.
+    for _ in 0..2 {
+        script.say(session, &DeviceMessage::Status(status(DeviceState::Armed, 60, 3)));
+    }
+    link.poll(HostTime(6), &mut script).unwrap();
+    assert_eq!(link.credit(), 3);
+}
+
+#[test]
+fn credit_wraps_and_never_goes_below_zero() {
+    let (mut link, mut script) = streaming();
+    let planes = [0u8; 16];
+    for (id, expected) in [(1, SendOutcome::Sent), (2, SendOutcome::Sent)] {
+        assert_eq!(link.send_frame(HostTime(10), id, DeviceTicks(0), &planes, &mut script), expected);
+    }
+    let none = SendOutcome::Dropped { reason: DropReason::NoCredit };
+    assert_eq!(link.send_frame(HostTime(10), 3, DeviceTicks(0), &planes, &mut script), none);
+    // A device that takes credit back below what was sent.
+    script.say(script.session, &DeviceMessage::Status(status(DeviceState::Armed, 90, 1)));
+    link.poll(HostTime(11), &mut script).unwrap();
+    assert_eq!(link.credit(), 0);
+    // Starved for four slots: the count is repaired on the data lane.
+    script.sent.clear();
+    link.poll(HostTime(60_000_000), &mut script).unwrap();
+    assert!(script.sent.contains(&MessageType::Sync));
+    link.frames_sent = u32::MAX;
+    script.say(script.session, &DeviceMessage::Status(status(DeviceState::Armed, 91, 1)));
+    link.poll(HostTime(60_000_001), &mut script).unwrap();
+    assert_eq!(link.credit(), 2, "from 2^32 - 1 to 1");
+    let older = link.send_frame(HostTime(60_000_002), 2, DeviceTicks(0), &planes, &mut script);
+    assert_eq!(older, SendOutcome::Dropped { reason: DropReason::NotNewer });
+}
+
+#[test]
+fn full_frame_numbers_come_back_from_their_low_half() {
+    for newest in [5u64, 1 << 32, (7 << 32) + 3] {
+        for back in 0..5u64.min(newest) {
+            let id = newest - back;
+            assert_eq!(HostLink::full_frame_id(newest, id as u32), id);
+        }
+    }
+}
+
+proptest! {
+    /// Whatever a device sends, in whatever state: no panic, no credit beyond what it granted, no light asked for.
+    #[test]
+    fn any_bytes_from_a_device_are_survived(
+        pieces in prop::collection::vec((any::<bool>(), 1u8..14, prop::collection::vec(any::<u8>(), 0..120)), 0..40),
+    ) {
+        let (mut link, mut script) = streaming();
+        script.sent.clear();
+        for (i, (framed, kind, bytes)) in pieces.iter().enumerate() {
+            if *framed {
+                let kind = MessageType::from_code(*kind).unwrap();
+                let packet = Packet::new(Header::control(kind, script.session, 0), bytes).parts().concat();
+                script.inbound.extend(packet);
+            } else {
+                script.inbound.extend(bytes);
+            }
+            let _ = link.poll(HostTime(1000 + i as i64 * 3_000_000), &mut script);
+        }
+        prop_assert!(!script.sent.contains(&MessageType::Arm));
+        prop_assert!(link.credit() <= i32::MAX as u32);
+    }
+}
