@@ -37,6 +37,13 @@ impl MonotonicClock {
     }
 }
 
+impl MonotonicClock {
+    /// The same clock for a thread that must not spin.
+    pub fn sleeping(self) -> Self {
+        Self { spin_ns: 0, ..self }
+    }
+}
+
 impl Clock for MonotonicClock {
     fn now(&self) -> HostTime {
         // 292 years until this saturates.

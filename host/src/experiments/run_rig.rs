@@ -10,6 +10,7 @@ use crate::render::{RenderError, Renderer};
 use crate::rig::{Rig, RigError};
 use crate::telemetry::monitor::RunMonitor;
 use crate::telemetry::report::Report;
+use crate::telemetry::trace::write_trace;
 use dpm_device::planes::Raster;
 use glam::Vec3;
 use std::path::{Path, PathBuf};
@@ -48,6 +49,13 @@ pub fn run_rig(config: &RigConfig, monitor: &Arc<RunMonitor>) -> Result<Report, 
             report.files.push(save(&output.dir, "light.png", &rig, &made.light, 1.0)?);
             report.files.push(save(&output.dir, "viewer.png", &rig, &made.viewer, (1.0 / white).min(1.0))?);
         }
+    }
+    if output.trace {
+        std::fs::create_dir_all(&output.dir).map_err(|e| cannot_write(&output.dir, &e))?;
+        let path = output.dir.join("trace.json");
+        write_atomically(&path, |out| write_trace(out, &outcome.traced, &outcome.standstills))
+            .map_err(|e| cannot_write(&path, &e))?;
+        report.files.push(path);
     }
     let path = output.dir.join("report.json");
     report.files.push(path.clone());

@@ -3,11 +3,14 @@
 use super::handoff::Ring;
 use super::job::FrameJob;
 use super::light::LightNote;
+use crate::config::Pace;
 use crate::frame::{FrameId, FrameTimeline, Stage, STAGES};
 use crate::render::PASSES;
 use crate::rig::Rig;
 use crate::telemetry::monitor::RunMonitor;
+use crate::telemetry::profile::Profiler;
 use crate::telemetry::report::{Report, Spread, StageTime};
+use crate::telemetry::trace::TracedFrame;
 use dpm_device::link::SendOutcome;
 use glam::{DAffine3, DVec3};
 use hdrhistogram::Histogram;
@@ -38,6 +41,8 @@ pub struct FrameRecord {
     pub eye: DVec3,
     /// Hash of its code values.
     pub code_hash: u64,
+    /// GPU time of each pass, nanoseconds.
+    pub pass_ns: [u64; PASSES.len()],
 }
 
 /// Counts and distributions of a run.
@@ -55,6 +60,11 @@ pub struct Collector {
     repeated: u64,
     /// Lit frames whose light was not what was rendered.
     pub light_mismatches: u64,
+    /// Intervals of every lit frame.
+    pub profiler: Profiler,
+    /// The first lit frames, for a trace.
+    pub traced: Vec<TracedFrame>,
+    trace_frames: usize,
     registration: Histogram<u64>,
     unpredicted: Histogram<u64>,
     motion_to_light: Histogram<u64>,
@@ -69,6 +79,9 @@ pub struct Collector {
     invalid_samples: u64,
 }
 
+/// Frames in a trace: half a minute at 947 fps, some 60 MB; viewers do not like more.
+const MAX_TRACED: usize = 30_000;
+
 /// Registration is counted in millionths of a pixel.
 const PER_PIXEL: f64 = 1e6;
 
@@ -80,6 +93,11 @@ impl Collector {
     /// Keeps the last `keep` lit frames; `verify`: compares hashes of code values and light.
     pub fn new(rig: Arc<Rig>, keep: usize, verify: bool) -> Self {
         let points = (0..rig.bodies.len()).map(|i| registration_points(&rig, i)).collect();
+        let measured = rig.config.real_time.pace == Pace::Real;
+        // A tenth of a known run, but enough frames for a 99th percentile.
+        let batch_frames = (rig.config.run.frames / 10).clamp(100, 10_000);
+        let profiler = Profiler::new(rig.rate(), measured, batch_frames);
+        let trace_frames = if rig.config.output.trace { MAX_TRACED } else { 0 };
         Self {
             rig,
             points,
@@ -92,6 +110,9 @@ impl Collector {
             late: 0,
             repeated: 0,
             light_mismatches: 0,
+            profiler,
+            traced: Vec::new(),
+            trace_frames,
             registration: histogram(),
             unpredicted: histogram(),
             motion_to_light: histogram(),
@@ -174,6 +195,7 @@ impl Collector {
                 sampled_poses: job.sampled_poses.clone(),
                 eye: job.eye,
                 code_hash: job.code_hash,
+                pass_ns: job.cost.pass_ns,
             });
         } else {
             self.dropped += 1;
@@ -206,6 +228,16 @@ impl Collector {
                     self.motion_to_light.saturating_record(ns.max(1) as u64);
                 }
                 self.measure_registration(note, &record);
+                self.profiler.lit(&record.timeline, note.event.slot, late);
+                if self.traced.len() < self.trace_frames {
+                    self.traced.push(TracedFrame {
+                        id: record.id,
+                        slot: note.event.slot,
+                        timeline: record.timeline,
+                        last_photon_at: note.event.last_photon_at,
+                        pass_ns: record.pass_ns,
+                    });
+                }
                 if self.keep > 0 {
                     if self.recent.len() >= self.keep {
                         self.recent.pop_front();

@@ -14,9 +14,12 @@ mod connect;
 pub mod handoff;
 pub mod job;
 pub mod light;
+mod outcome;
+mod rights;
 mod run;
 pub mod stages;
 
 pub use collect::FrameRecord;
 pub use connect::ConnectError;
-pub use run::{on_frame_path, renderer_settings, run, PipelineError, RunOptions, RunOutcome};
+pub use outcome::{PipelineError, RunOptions, RunOutcome};
+pub use run::{on_frame_path, renderer_settings, run};

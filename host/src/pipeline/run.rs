@@ -1,16 +1,19 @@
 //! Threads, paces and shutdown.
 
-use super::collect::{Collector, FrameRecord};
-use super::connect::{connect, ConnectError};
+use super::collect::Collector;
+use super::connect::connect;
 use super::handoff::Ring;
 use super::job::FrameJob;
-use super::light::{LightFrame, LightNote, LightRecorder};
+use super::light::{LightNote, LightRecorder};
+use super::outcome::{PipelineError, RunOptions, RunOutcome};
+use super::rights::Rights;
 use super::stages::{self, LinkTime, TrackSnapshot, TrackingStage};
 use crate::clock::{Clock, ManualClock, MonotonicClock, RunClock, Stopwatch};
 use crate::config::{Pace, ProjectorBackend};
 use crate::frame::Stage;
-use crate::gpu::{Gpu, GpuError};
+use crate::gpu::Gpu;
 use crate::pack::{BitPlaneFrame, Kernel};
+use crate::realtime::standstill::StandstillMonitor;
 use crate::render::{FrameCost, RenderError, Renderer, RendererSettings};
 use crate::rig::{Rig, RigError};
 use crate::telemetry::monitor::RunMonitor;
@@ -26,70 +29,6 @@ use std::cell::Cell;
 use std::sync::atomic::{AtomicBool, AtomicI64, Ordering};
 use std::sync::{Arc, Mutex};
 use std::time::Duration;
-
-/// How a run differs from what the rig file says.
-#[derive(Clone, Copy, Debug)]
-pub struct RunOptions {
-    /// Frames to plan; 0: until asked to stop.
-    pub frames: u64,
-    /// Frames of light (and their records) kept for pictures.
-    pub keep_frames: usize,
-    /// Compare the light with what was rendered, frame by frame.
-    pub verify: bool,
-    /// Frames under way at once.
-    pub in_flight: usize,
-}
-
-impl Default for RunOptions {
-    fn default() -> Self {
-        Self { frames: 0, keep_frames: 0, verify: true, in_flight: 4 }
-    }
-}
-
-/// What a run leaves behind.
-pub struct RunOutcome {
-    /// Measurements.
-    pub report: Report,
-    /// The last lit frames, oldest first.
-    pub recent: Vec<FrameRecord>,
-    /// Their light, oldest first.
-    pub light: Vec<LightFrame>,
-    /// Lit frames whose light was not what was rendered.
-    pub light_mismatches: u64,
-}
-
-/// Why a run ended early or never began.
-#[derive(Debug, thiserror::Error)]
-pub enum PipelineError {
-    /// The rig.
-    #[error(transparent)]
-    Rig(#[from] RigError),
-    /// The renderer.
-    #[error(transparent)]
-    Render(#[from] RenderError),
-    /// The GPU, while running.
-    #[error("frame {frame}: {source}")]
-    Gpu {
-        /// Which frame.
-        frame: u64,
-        /// What happened.
-        source: GpuError,
-    },
-    /// The projector.
-    #[error(transparent)]
-    Connect(#[from] ConnectError),
-    /// A stage panicked: a programmer's mistake. The projector was told to go dark.
-    #[error("the {0} stage stopped with a panic; this is a bug, please report it with the rig file")]
-    Panicked(&'static str),
-    /// The system gave no thread.
-    #[error("cannot start the {stage} thread: {source}")]
-    Thread {
-        /// Which stage.
-        stage: &'static str,
-        /// Why.
-        source: std::io::Error,
-    },
-}
 
 thread_local! {
     static ON_FRAME_PATH: Cell<bool> = const { Cell::new(false) };
@@ -112,6 +51,8 @@ const LISTEN_NS: i64 = 150_000_000;
 const EPOCH_NS: u64 = 5_000_000;
 /// Time between the last byte of a frame and its slot, for jitter of the hand-offs.
 const MARGIN_NS: i64 = 50_000;
+/// A step of the control thread that ends this late is a standstill of the machine.
+const STANDSTILL_NS: i64 = 1_000_000;
 /// A frame that the GPU has not finished by then is given up, and the run with it.
 const GPU_TIMEOUT_NS: u64 = 20_000_000_000;
 
@@ -134,6 +75,7 @@ struct Shared<'a> {
     monitor: &'a RunMonitor,
     options: RunOptions,
     verify: bool,
+    rights: &'a Rights,
 }
 
 impl Shared<'_> {
@@ -254,6 +196,14 @@ pub fn run(
         flash_limit,
     });
 
+    let rights = Rights::new(&config.real_time);
+    let standstill = match &clock {
+        // Without the control thread late frames are all counted as the rig's.
+        RunClock::Real(c) => {
+            StandstillMonitor::start(Arc::new(c.sleeping()), STANDSTILL_NS, config.real_time.priority).ok()
+        }
+        RunClock::Virtual(_) => None,
+    };
     let device_over = AtomicBool::new(false);
     let kernel = Kernel::best();
     let watch = Stopwatch::start();
@@ -296,6 +246,7 @@ pub fn run(
             monitor,
             options,
             verify,
+            rights: &rights,
         };
         let tracking = TrackingStage::new(&rig, tracker);
         let mut collector = Collector::new(rig.clone(), options.keep_frames, verify);
@@ -314,6 +265,7 @@ pub fn run(
         }
     })?;
     let wall_s = watch.elapsed_ns() as f64 * 1e-9;
+    let standstills = standstill.map(StandstillMonitor::finish).unwrap_or_default();
 
     let mut report = Report {
         raster: [raster.width(), raster.height()],
@@ -330,12 +282,16 @@ pub fn run(
     };
     collector.fill(&mut report);
     report.frames_per_wall_second = report.frames_lit as f64 / wall_s.max(1e-9);
+    report.warnings.extend(rights.warnings());
     report.warnings.extend(rig.scene.warnings.iter().cloned());
     Ok(RunOutcome {
         report,
         recent: std::mem::take(&mut collector.recent).into(),
         light: recorder.into_frames(),
         light_mismatches: collector.light_mismatches,
+        traced: std::mem::take(&mut collector.traced),
+        profiler: collector.profiler,
+        standstills,
     })
 }
 
@@ -431,6 +387,7 @@ impl<F: FnMut()> Drop for OnExit<F> {
 }
 
 fn tracking_thread(shared: &Shared<'_>, mut stage: TrackingStage, mut latest: Publisher<TrackSnapshot>) {
+    shared.rights.enter(0);
     let mut heard_to = i64::MIN;
     while !shared.tracking_over.load(Ordering::Acquire) {
         let now = if shared.is_virtual() {
@@ -453,6 +410,7 @@ fn tracking_thread(shared: &Shared<'_>, mut stage: TrackingStage, mut latest: Pu
 }
 
 fn plan_thread(shared: &Shared<'_>, renderer: &Renderer, mut latest: Reader<TrackSnapshot>) {
+    shared.rights.enter(1);
     let costs = shared.costs();
     let modelled = costs.iter().sum::<i64>() + MARGIN_NS;
     let begin = shared.clock.now();
@@ -504,6 +462,7 @@ fn plan_thread(shared: &Shared<'_>, renderer: &Renderer, mut latest: Reader<Trac
 }
 
 fn pack_thread(shared: &Shared<'_>, kernel: Kernel) {
+    shared.rights.enter(2);
     while let Some(mut job) = next(&shared.to_pack) {
         enter_frame_path(job.id.0 >= WARM_UP_FRAMES);
         if let Err(source) = stages::finish_and_pack(&mut job, kernel, shared.verify, GPU_TIMEOUT_NS) {
@@ -535,6 +494,7 @@ fn next(ring: &Ring<Box<FrameJob>>) -> Option<Box<FrameJob>> {
 }
 
 fn link_thread(shared: &Shared<'_>, mut link: HostLink, mut cable: Cable) -> Cable {
+    shared.rights.enter(3);
     let mut last = shared.clock.now();
     loop {
         let job = shared.to_link.pop(Duration::from_millis(1));

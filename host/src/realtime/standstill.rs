@@ -34,7 +34,7 @@ pub struct Standstills {
 
 impl Standstills {
     /// Notes a step that should have ended at `due` and ended at `woke`.
-    fn note(&mut self, due: HostTime, woke: HostTime, threshold_ns: i64) {
+    pub(crate) fn note(&mut self, due: HostTime, woke: HostTime, threshold_ns: i64) {
         if woke.ns_since(due) <= threshold_ns {
             return;
         }

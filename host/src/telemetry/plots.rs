@@ -132,7 +132,7 @@ mod tests {
     fn percentile_curves_rise() {
         let mut profiler = Profiler::new(FrameRate::new(947, 1).unwrap(), true, 100);
         for k in 1..=2000 {
-            profiler.lit(&frame(k, k * 1000), k as u64, false, false);
+            profiler.lit(&frame(k, k * 1000), k as u64, false);
         }
         let svg = percentiles(&profiler, IntervalKind::Work).unwrap();
         assert!(

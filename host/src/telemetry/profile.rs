@@ -5,6 +5,7 @@
 use super::interval::{Interval, IntervalKind};
 use crate::frame::FrameTimeline;
 use crate::plan::slots::MissCause;
+use crate::realtime::standstill::Standstills;
 use dpm_device::time::{FrameRate, HostTime};
 use hdrhistogram::Histogram;
 use serde::{Deserialize, Serialize};
@@ -16,6 +17,8 @@ const LONGEST_NS: u64 = 10_000_000_000;
 const DIGITS: u8 = 3;
 /// Batches kept; a longer run's later batches only count in the whole.
 const MAX_BATCHES: usize = 1024;
+/// Late frames that can be excused by a standstill; more than this and the run is beyond excuse.
+const MAX_LATE_SPANS: usize = 1 << 14;
 
 /// One interval's distribution. Negative times count as 0 and are counted.
 #[derive(Clone, Debug)]
@@ -152,7 +155,8 @@ pub struct Profiler {
     last_lit: Option<(u64, HostTime)>,
     frames_lit: u64,
     frames_late: u64,
-    frames_late_standstill: u64,
+    /// From latch to light of the late frames, to be held against the standstills at the end.
+    late_spans: Vec<(HostTime, HostTime)>,
     missed: [u64; MissCause::ALL.len()],
 }
 
@@ -170,17 +174,20 @@ impl Profiler {
             last_lit: None,
             frames_lit: 0,
             frames_late: 0,
-            frames_late_standstill: 0,
+            late_spans: Vec::with_capacity(MAX_LATE_SPANS),
             missed: [0; MissCause::ALL.len()],
         }
     }
 
-    /// Takes in a frame that was lit in `slot`. `late`: it was planned for an earlier one; `stood_still`: the machine did, while
-    /// the frame was under way.
-    pub fn lit(&mut self, timeline: &FrameTimeline, slot: u64, late: bool, stood_still: bool) {
+    /// Takes in a frame that was lit in `slot`. `late`: it was planned for an earlier one.
+    pub fn lit(&mut self, timeline: &FrameTimeline, slot: u64, late: bool) {
         self.frames_lit += 1;
-        self.frames_late += u64::from(late && !stood_still);
-        self.frames_late_standstill += u64::from(late && stood_still);
+        if late {
+            self.frames_late += 1;
+            if let (Some(lit_at), true) = (timeline.lit_at, self.late_spans.len() < MAX_LATE_SPANS) {
+                self.late_spans.push((timeline.latched_at, lit_at));
+            }
+        }
         for (interval, track) in Interval::ALL.into_iter().zip(&mut self.tracks) {
             if let Some(ns) = interval.of(timeline, self.measured) {
                 track.record(ns);
@@ -210,14 +217,18 @@ impl Profiler {
         &self.tracks[interval as usize].whole
     }
 
-    /// The report so far. Setup, clock and standstills are the caller's to fill.
-    pub fn report(&self) -> ProfileReport {
+    /// The report so far, with late frames that were under way while the machine stood still told apart. Setup and clock are
+    /// the caller's to fill.
+    pub fn report(&self, standstills: &Standstills) -> ProfileReport {
+        let excused =
+            self.late_spans.iter().filter(|(from, to)| standstills.touches(*from, *to)).count() as u64;
         let tracks = Interval::ALL.into_iter().zip(&self.tracks);
         ProfileReport {
             frame_rate_hz: self.rate.hz(),
             frames_lit: self.frames_lit,
-            frames_late: self.frames_late,
-            frames_late_standstill: self.frames_late_standstill,
+            frames_late: self.frames_late - excused,
+            frames_late_standstill: excused,
+            standstill_ns: (standstills.total_ns(), standstills.longest_ns()),
             missed: MissCause::ALL.iter().map(|c| (c.name().to_owned(), self.missed[*c as usize])).collect(),
             jitter_ms: self.jitter.distribution(IntervalKind::Total),
             intervals_ms: tracks.map(|(i, t)| (i.name().to_owned(), t.distribution(i.kind()))).collect(),
@@ -241,9 +252,13 @@ mod tests {
         for k in 0..1000i64 {
             // Steps of 1 us to 1 ms, in a scrambled order.
             let step = 1_000 * (1 + k * 387 % 1000);
-            profiler.lit(&frame(k * 1_000_000, step), k as u64, k % 100 == 0, k % 200 == 0);
+            profiler.lit(&frame(k * 1_000_000, step), k as u64, k % 100 == 0);
         }
-        let report = profiler.report();
+        // The machine stood still around the frames 0 and 500, of the ten late ones.
+        let mut standstills = Standstills::default();
+        standstills.note(HostTime(0), HostTime(2_000_000), 1_000_000);
+        standstills.note(HostTime(500_000_000), HostTime(502_000_000), 1_000_000);
+        let report = profiler.report(&standstills);
         let tracker = &report.intervals_ms["tracker"];
         assert_eq!((tracker.count, tracker.kind.as_str()), (1000, "work"));
         for (found, exact) in [
@@ -258,7 +273,8 @@ mod tests {
         assert!((tracker.mean - 0.5005).abs() < 1e-3);
         assert_eq!(tracker.batch_p50.len(), 10);
         assert!((report.intervals_ms["motion_to_light"].p50 - 4.0).abs() < 0.01);
-        assert_eq!((report.frames_lit, report.frames_late, report.frames_late_standstill), (1000, 5, 5));
+        assert_eq!((report.frames_lit, report.frames_late, report.frames_late_standstill), (1000, 8, 2));
+        assert_eq!(report.standstill_ns, (4_000_000, 2_000_000));
         // Light came 8 steps after the slot's start, so jitter is the change of 8 steps.
         assert!(report.jitter_ms.max > 1.0 && report.jitter_ms.count == 999);
     }
@@ -266,10 +282,10 @@ mod tests {
     #[test]
     fn what_does_not_fit_is_counted() {
         let mut profiler = profiler();
-        profiler.lit(&frame(0, -5), 0, false, false);
-        profiler.lit(&frame(0, 3_000_000_000), 1, false, false);
+        profiler.lit(&frame(0, -5), 0, false);
+        profiler.lit(&frame(0, 3_000_000_000), 1, false);
         profiler.missed(MissCause::Link, 3);
-        let report = profiler.report();
+        let report = profiler.report(&Standstills::default());
         let m2l = &report.intervals_ms["motion_to_light"];
         assert_eq!((m2l.count, m2l.negative, m2l.saturated), (2, 1, 1));
         assert!((m2l.max / 10_000.0 - 1.0).abs() < 2e-3);

@@ -5,6 +5,8 @@
 //! nest or follow each other, so frames in flight together are spread over lanes.
 
 use crate::frame::{FrameId, FrameTimeline, Stage};
+use crate::realtime::standstill::Standstills;
+use crate::render::PASSES;
 use dpm_device::time::HostTime;
 use std::io::{Error, Write};
 
@@ -50,6 +52,43 @@ pub struct FrameTrace<'a> {
     pub last_photon_at: Option<HostTime>,
     /// Name and length of each GPU pass, ns, in order; may be empty.
     pub passes: &'a [(&'a str, u64)],
+}
+
+/// A frame kept for a trace.
+#[derive(Clone, Debug)]
+pub struct TracedFrame {
+    /// Which frame.
+    pub id: FrameId,
+    /// Which slot it was lit in.
+    pub slot: u64,
+    /// Stamps.
+    pub timeline: FrameTimeline,
+    /// Last photon.
+    pub last_photon_at: HostTime,
+    /// GPU time of each of [`PASSES`], ns; 0 where the device does not say.
+    pub pass_ns: [u64; PASSES.len()],
+}
+
+/// Writes a trace of frames, and marks each standstill of the machine.
+pub fn write_trace(out: impl Write, frames: &[TracedFrame], standstills: &Standstills) -> Result<(), Error> {
+    let mut trace = TraceWriter::new(out)?;
+    for frame in frames {
+        let mut passes = [("", 0); PASSES.len()];
+        for (pass, (name, ns)) in passes.iter_mut().zip(PASSES.iter().zip(frame.pass_ns)) {
+            *pass = (*name, ns);
+        }
+        trace.frame(&FrameTrace {
+            id: frame.id,
+            slot: frame.slot,
+            timeline: &frame.timeline,
+            last_photon_at: Some(frame.last_photon_at),
+            passes: &passes,
+        })?;
+    }
+    for gap in standstills.gaps() {
+        trace.mark("the machine stood still from here", gap.from)?;
+    }
+    trace.finish().map(|_| ())
 }
 
 /// Writes a trace event by event. Call [`TraceWriter::finish`]; a trace cut off before still opens, as the format allows.

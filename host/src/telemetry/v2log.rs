@@ -36,7 +36,7 @@ mod tests {
     fn a_log_reads_back_as_the_same_histograms() {
         let mut profiler = Profiler::new(FrameRate::new(947, 1).unwrap(), true, 100);
         for k in 1..=500 {
-            profiler.lit(&frame(k, k * 1000), k as u64, false, false);
+            profiler.lit(&frame(k, k * 1000), k as u64, false);
         }
         let mut bytes = Vec::new();
         write_v2_log(&mut bytes, &profiler, Duration::from_secs(2)).unwrap();

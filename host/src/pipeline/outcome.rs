@@ -1,0 +1,82 @@
+//! How a run may differ from its rig file, what it leaves behind, and why it may end early.
+
+use super::collect::FrameRecord;
+use super::connect::ConnectError;
+use super::light::LightFrame;
+use crate::gpu::GpuError;
+use crate::realtime::standstill::Standstills;
+use crate::render::RenderError;
+use crate::rig::RigError;
+use crate::telemetry::profile::Profiler;
+use crate::telemetry::report::Report;
+use crate::telemetry::trace::TracedFrame;
+
+/// How a run differs from what the rig file says.
+#[derive(Clone, Copy, Debug)]
+pub struct RunOptions {
+    /// Frames to plan; 0: until asked to stop.
+    pub frames: u64,
+    /// Frames of light (and their records) kept for pictures.
+    pub keep_frames: usize,
+    /// Compare the light with what was rendered, frame by frame.
+    pub verify: bool,
+    /// Frames under way at once.
+    pub in_flight: usize,
+}
+
+impl Default for RunOptions {
+    fn default() -> Self {
+        Self { frames: 0, keep_frames: 0, verify: true, in_flight: 4 }
+    }
+}
+
+/// What a run leaves behind.
+pub struct RunOutcome {
+    /// Measurements.
+    pub report: Report,
+    /// The last lit frames, oldest first.
+    pub recent: Vec<FrameRecord>,
+    /// Their light, oldest first.
+    pub light: Vec<LightFrame>,
+    /// Lit frames whose light was not what was rendered.
+    pub light_mismatches: u64,
+    /// Distributions of every interval.
+    pub profiler: Profiler,
+    /// When the machine itself stood still (real pace).
+    pub standstills: Standstills,
+    /// Frames for a trace, where the rig file asks for one.
+    pub traced: Vec<TracedFrame>,
+}
+
+/// Why a run ended early or never began.
+#[derive(Debug, thiserror::Error)]
+pub enum PipelineError {
+    /// The rig.
+    #[error(transparent)]
+    Rig(#[from] RigError),
+    /// The renderer.
+    #[error(transparent)]
+    Render(#[from] RenderError),
+    /// The GPU, while running.
+    #[error("frame {frame}: {source}")]
+    Gpu {
+        /// Which frame.
+        frame: u64,
+        /// What happened.
+        source: GpuError,
+    },
+    /// The projector.
+    #[error(transparent)]
+    Connect(#[from] ConnectError),
+    /// A stage panicked: a programmer's mistake. The projector was told to go dark.
+    #[error("the {0} stage stopped with a panic; this is a bug, please report it with the rig file")]
+    Panicked(&'static str),
+    /// The system gave no thread.
+    #[error("cannot start the {stage} thread: {source}")]
+    Thread {
+        /// Which stage.
+        stage: &'static str,
+        /// Why.
+        source: std::io::Error,
+    },
+}

@@ -1,0 +1,88 @@
+//! What each stage asks of the operating system, from the rig file into granted rights and warnings, each once.
+
+use crate::config::{Pace, RealTimeConfig};
+use crate::realtime::{enter_frame_path, os, Refusal, ThreadRights};
+use std::sync::Mutex;
+
+/// Rights of a run's threads. Locked memory is given back at the end.
+pub(super) struct Rights {
+    priority: u32,
+    cores: Vec<u32>,
+    wanted: bool,
+    locked: bool,
+    refusals: Mutex<Vec<Refusal>>,
+}
+
+impl Rights {
+    /// Reads `[real_time]` and locks memory if it says so. At virtual pace nothing is asked for: there are no deadlines.
+    pub(super) fn new(config: &RealTimeConfig) -> Self {
+        let wanted = config.pace == Pace::Real;
+        let mut refusals = Vec::new();
+        let mut locked = false;
+        if wanted && config.lock_memory {
+            match os::lock_memory() {
+                Ok(()) => locked = true,
+                Err(refusal) => refusals.push(refusal),
+            }
+        }
+        Self {
+            priority: config.priority,
+            cores: config.affinity.clone(),
+            wanted,
+            locked,
+            refusals: Mutex::new(refusals),
+        }
+    }
+
+    /// Asks for the rights of the calling thread, the `stage`th of the frame path. Call before its first frame.
+    pub(super) fn enter(&self, stage: usize) {
+        if !self.wanted {
+            return;
+        }
+        let granted =
+            enter_frame_path(ThreadRights { priority: self.priority, core: self.cores.get(stage).copied() });
+        if let Ok(mut refusals) = self.refusals.lock() {
+            for refusal in granted.refusals {
+                if !refusals.contains(&refusal) {
+                    refusals.push(refusal);
+                }
+            }
+        }
+    }
+
+    /// What was refused, in words.
+    pub(super) fn warnings(&self) -> Vec<String> {
+        self.refusals.lock().map(|r| r.iter().map(Refusal::to_string).collect()).unwrap_or_default()
+    }
+}
+
+impl Drop for Rights {
+    fn drop(&mut self) {
+        if self.locked {
+            os::unlock_memory();
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_right_refused_to_every_stage_is_one_warning() {
+        let config = RealTimeConfig { affinity: vec![1023, 1023, 1023], ..RealTimeConfig::default() };
+        let rights = Rights::new(&config);
+        std::thread::scope(|scope| {
+            for stage in 0..3 {
+                let rights = &rights;
+                scope.spawn(move || rights.enter(stage));
+            }
+        });
+        let warnings = rights.warnings();
+        assert_eq!(warnings.len(), 1, "{warnings:?}");
+        assert!(warnings[0].contains("core 1023"));
+        let virtual_pace = Rights::new(&RealTimeConfig { pace: Pace::Virtual, ..config });
+        virtual_pace.enter(0);
+        assert!(virtual_pace.warnings().is_empty());
+    }
+}
