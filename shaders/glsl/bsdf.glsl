@@ -203,6 +203,8 @@ BsdfSample sample_bsdf(Point s, Lobes q, float u_lobe, vec2 u) {
             return r;
         }
     }
+    // A facet may send light to the wrong side: that is lost, and is no sample of the lobe on that side.
+    if ((dot(r.direction, s.n) < 0.0) != r.below) return r;
     vec3 value;
     evaluate(s, q, r.direction, value, r.pdf);
     r.valid = r.pdf > 1e-12;

@@ -2,7 +2,8 @@
 
 use dpm_device::planes::Raster;
 use dpm_host::geometry::projector::ProjectorCamera;
-use dpm_host::scene::{Body, Environment, Material, Scene, TriangleMesh};
+use dpm_host::reference::Sampler;
+use dpm_host::scene::{Body, Environment, Material, Scene, Texture, TextureRef, TriangleMesh, Wrap};
 use glam::{DAffine3, DVec3, Vec2, Vec3};
 use std::collections::HashMap;
 
@@ -146,4 +147,46 @@ pub fn camera(width: u32, height: u32, position: DVec3, look_at: DVec3) -> Proje
         DVec3::Y
     };
     ProjectorCamera::look_at(raster, position, look_at, up, 0.6).expect("a camera that looks somewhere")
+}
+
+/// A small picture of smooth random colours between `low` and `high`, the same for the same seed.
+pub fn noise_texture(size: u32, seed: u64, low: u8, high: u8, srgb: bool) -> Texture {
+    let mut random = Sampler::new(seed, 0);
+    let mut value = || low + (random.uniform() * f64::from(high - low)) as u8;
+    let texels = (0..size * size).map(|_| [value(), value(), value(), 255]).collect();
+    Texture {
+        width: size,
+        height: size,
+        texels,
+        srgb,
+        wrap_u: Wrap::Repeat,
+        wrap_v: Wrap::Mirror,
+        nearest: false,
+    }
+}
+
+/// Adds a texture and refers to it, stretched and turned so that every part of the transform matters.
+pub fn use_texture(scene: &mut Scene, texture: Texture) -> Option<TextureRef> {
+    scene.textures.push(texture);
+    Some(TextureRef {
+        texture: scene.textures.len() as u32 - 1,
+        offset: Vec2::new(0.13, -0.31),
+        rotation: 0.4,
+        scale: Vec2::new(1.7, 2.3),
+    })
+}
+
+/// A sky with a bright patch, turned about the vertical.
+pub fn image_sky(radiance: f32) -> Environment {
+    let (width, height) = (16, 8);
+    let texels = (0..width * height)
+        .map(|i| {
+            let (x, y) = ((i % width) as f32, (i / width) as f32);
+            let patch =
+                if (9..12).contains(&(i % width)) && (1..3).contains(&(i / width)) { 12.0 } else { 0.0 };
+            Vec3::new(0.2 + 0.03 * x, 0.4 + 0.05 * y, 0.7 - 0.02 * x) * radiance
+                + Vec3::splat(patch * radiance)
+        })
+        .collect();
+    Environment::Equirect { width, height, texels, rotation_rad: 0.7 }
 }

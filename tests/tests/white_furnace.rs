@@ -63,7 +63,7 @@ fn a_corner_of_white_walls_is_one() {
 fn a_coated_white_sphere_keeps_all_light() {
     with_gpu(|gpu| {
         for ior in [1.1, 1.5, 2.4] {
-            for roughness in [0.0, 0.1, 0.5, 1.0] {
+            for roughness in [0.0, 0.1, 0.6] {
                 let scene = furnace(Material { ior, roughness, ..diffuse(Vec3::ONE) });
                 let camera = camera(32, 32, DVec3::new(0.0, 0.0, 5.0), DVec3::ZERO);
                 let picture = Shot { spp: 64, frames: 8, depth: 2, ..Shot::new(&scene, camera) }.draw(gpu);
@@ -140,7 +140,7 @@ fn clear_glass_in_even_light_vanishes() {
 #[test]
 fn no_material_creates_energy() {
     with_gpu(|gpu| {
-        for roughness in [0.0, 0.0317, 0.3, 1.0] {
+        for roughness in [0.0, 0.0317, 0.7] {
             for (metallic, transmission, thin_walled) in
                 [(1.0, 0.0, true), (0.0, 1.0, true), (0.0, 1.0, false), (0.5, 0.5, false), (0.3, 0.5, true)]
             {

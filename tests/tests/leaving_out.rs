@@ -1,0 +1,94 @@
+//! What a scene does not need is compiled away. That may cost speed only: every pixel stays the same, bit for bit.
+
+use dpm_host::scene::{Material, PunctualKind, PunctualLight, Scene};
+use dpm_tests::gpu::{with_gpu, Shot};
+use dpm_tests::scenes::*;
+use glam::{DVec3, Vec3};
+
+/// One scene per thing that can be left out.
+fn scenes() -> Vec<(&'static str, Scene)> {
+    let room = |material: Material| {
+        let mut scene = scene_of(floor(1.0, 0.0), diffuse(Vec3::splat(0.7)));
+        let mut ball = sphere(0.4, 2, true);
+        ball.positions.iter_mut().for_each(|p| p.y += 0.5);
+        add(&mut scene, ball, material);
+        scene.environment = sky(0.8);
+        scene
+    };
+    let mut out = vec![
+        ("diffuse", room(diffuse(Vec3::new(0.8, 0.5, 0.3)))),
+        ("coated", room(Material { roughness: 0.3, ..diffuse(Vec3::splat(0.5)) }.tap(|m| m.ior = 1.5))),
+        ("metal", room(Material { roughness: 0.4, ..Material::default() })),
+        (
+            "glass",
+            room(Material {
+                metallic: 0.0,
+                roughness: 0.2,
+                transmission: 1.0,
+                thin_walled: false,
+                ..Material::default()
+            }),
+        ),
+        ("emissive", room(emitter(Vec3::splat(2.0)))),
+    ];
+    let mut metal_only = scene_of(sphere(0.5, 2, true), Material { roughness: 0.5, ..Material::default() });
+    metal_only.environment = image_sky(1.0);
+    out.push(("nothing diffuse", metal_only));
+    let mut dark = room(diffuse(Vec3::ONE));
+    dark.environment = sky(0.0);
+    dark.lights.push(PunctualLight {
+        kind: PunctualKind::Point,
+        intensity: Vec3::splat(3.0),
+        body: None,
+        position: Vec3::new(1.0, 2.0, 1.0),
+        direction: Vec3::NEG_Y,
+        range: f32::INFINITY,
+    });
+    out.push(("one point light", dark));
+    let mut textured = room(diffuse(Vec3::ONE));
+    textured.materials[0].base_color_texture = use_texture(&mut textured, noise_texture(4, 1, 0, 255, true));
+    out.push(("one texture", textured.clone()));
+    textured.materials[0].alpha_cutoff = Some(0.5);
+    out.push(("a mask without holes", textured));
+    out
+}
+
+/// Changes a value in place and returns it.
+trait Tap: Sized {
+    fn tap(mut self, change: impl FnOnce(&mut Self)) -> Self {
+        change(&mut self);
+        self
+    }
+}
+
+impl Tap for Material {}
+
+#[test]
+fn leaving_out_changes_no_bit() {
+    with_gpu(|gpu| {
+        for (name, scene) in scenes() {
+            let camera = camera(40, 30, DVec3::new(0.3, 1.4, 2.4), DVec3::new(0.0, 0.3, 0.0));
+            let shot = Shot {
+                eye: Some(DVec3::new(-0.6, 1.5, 2.2)),
+                spp: 4,
+                depth: 4,
+                drive_gain: 0.2,
+                ..Shot::new(&scene, camera)
+            };
+            let lean = shot.draw(gpu);
+            let full = Shot { leave_nothing_out: true, ..shot }.draw(gpu);
+            let bits = |p: &dpm_tests::gpu::Picture| -> Vec<[u32; 4]> {
+                p.radiance.iter().map(|r| r.map(f32::to_bits)).collect()
+            };
+            let lit = lean.lit_estimates().count();
+            assert!(lit > 200, "{name}: {lit}");
+            assert!(lean.radiance.iter().any(|r| r[0] > 0.0), "{name} is black");
+            assert_eq!(lean.surfaces, full.surfaces, "{name}");
+            let (a, b) = (bits(&lean), bits(&full));
+            let different = a.iter().zip(&b).filter(|(a, b)| a != b).count();
+            assert_eq!(different, 0, "{name}: pixels that differ");
+            assert_eq!(lean.codes, full.codes, "{name}");
+            assert_eq!(lean.counters, full.counters, "{name}");
+        }
+    });
+}
