@@ -1,16 +1,19 @@
 //! A checked configuration into the parts of a rig: scene, projector, bodies with their motions, tracker.
 
-use crate::config::{BodyConfig, EnvironmentConfig, GazeConfig, RigConfig, TrackerConfig};
+use crate::config::{BodyConfig, CalibrationUnit, EnvironmentConfig, GazeConfig, RigConfig, TrackerConfig};
+use crate::geometry::distortion::Distortion;
+use crate::geometry::opencv::{self, LengthUnit};
 use crate::geometry::projector::{ProjectorCamera, ProjectorError};
 use crate::scene::{self, BodySelector, Environment, LoadOptions, Scene, SceneError};
+use crate::tracking::source::{self, SourceError};
 use dpm_device::planes::Raster;
 use dpm_device::pose::Pose;
-use dpm_device::time::FrameRate;
-use dpm_device::tracker::{Tracker, TrackerError};
+use dpm_device::time::{FrameRate, HostClock, HostTime};
+use dpm_device::tracker::{BodyKey, Tracker};
 use glam::{DAffine3, DQuat, DVec3, Vec3};
-use hil_mock::faults::{FaultError, FaultPlan};
 use hil_mock::motion::{Motion, MotionError, MotionSpec};
-use hil_mock::tracker::{MockTracker, MockTrackerConfig, MockTrackerError};
+use std::io::Read;
+use std::sync::Arc;
 
 /// Why a rig cannot be built from a configuration that is valid by itself.
 #[derive(Debug, thiserror::Error)]
@@ -41,15 +44,17 @@ pub enum RigError {
         /// What is wrong.
         message: String,
     },
-    /// The mock tracker.
-    #[error("tracker: {0}")]
-    MockTracker(#[from] MockTrackerError),
-    /// The mock tracker's faults.
-    #[error("tracker.faults: {0}")]
-    Faults(#[from] FaultError),
     /// The tracker.
-    #[error("tracker: {0}")]
-    Tracker(#[from] TrackerError),
+    #[error(transparent)]
+    Tracker(#[from] SourceError),
+    /// The calibration file.
+    #[error("projector.calibration: {path}: {message}")]
+    Calibration {
+        /// Which file.
+        path: String,
+        /// What is wrong.
+        message: String,
+    },
     /// A name that no body has.
     #[error("{key}: no body is named \"{name}\"; bodies: {known}")]
     UnknownBody {
@@ -142,15 +147,8 @@ impl Rig {
     pub fn build(config: &RigConfig, raster: Option<Raster>) -> Result<Self, RigError> {
         let mut scene = load_scene(config)?;
         scene.environment = environment(config)?.unwrap_or(scene.environment);
-        let p = &config.projector;
-        let raster = raster.unwrap_or_else(|| p.raster());
-        let camera = ProjectorCamera::look_at(
-            raster,
-            DVec3::from_array(p.position),
-            DVec3::from_array(p.look_at),
-            DVec3::from_array(p.up),
-            p.horizontal_fov_deg.to_radians(),
-        )?;
+        let raster = raster.unwrap_or_else(|| config.projector.raster());
+        let camera = camera(config, raster, &mut scene.warnings)?;
         let bodies = rig_bodies(config, &scene)?;
         let observer = observer(config, &bodies)?;
         Ok(Self { config: config.clone(), scene, camera, bodies, observer })
@@ -161,37 +159,20 @@ impl Rig {
         self.config.projector.frame_rate
     }
 
-    /// The tracker that the configuration asks for. Time 0 of the mock's motions is instant 0 of the host's clock.
+    /// The tracker that the configuration asks for. Time 0 of the mock's motions is instant 0 of the host's clock; a recording
+    /// starts at `start`.
     ///
     /// # Errors
-    /// Its address or its numbers are wrong.
-    pub fn tracker(&self) -> Result<Box<dyn Tracker>, RigError> {
-        match &self.config.tracker {
-            TrackerConfig::Mock(c) => {
-                let mut text = c.faults.clone();
-                if c.drop_out > 0.0 {
-                    let separator = if text.trim().is_empty() { "" } else { "," };
-                    text.push_str(&format!("{separator}loss={}", c.drop_out));
-                }
-                let faults: FaultPlan = text.parse()?;
-                let config = MockTrackerConfig {
-                    seed: c.seed,
-                    rate: FrameRate::new(c.rate_hz, 1)
-                        .expect("rate was checked when the configuration was read"),
-                    position_noise_m: c.noise_m,
-                    rotation_noise_rad: c.noise_rad,
-                    latency_ns: i64::from(c.latency_us) * 1000,
-                    latency_jitter_ns: i64::from(c.jitter_us) * 1000,
-                    faults,
-                    ..MockTrackerConfig::default()
-                };
-                let motions = self.bodies.iter().filter_map(|b| b.motion.clone()).collect();
-                Ok(Box::new(MockTracker::new(config, motions)?))
-            }
-            other => {
-                Err(RigError::Unsupported(format!("tracker.kind: {other:?} is not driven by `dpm run` yet")))
-            }
-        }
+    /// Its address, file or numbers are wrong.
+    pub fn tracker(&self, clock: Arc<dyn HostClock>, start: HostTime) -> Result<Box<dyn Tracker>, RigError> {
+        let named = &self.config.scene.bodies;
+        let keys = self
+            .bodies
+            .iter()
+            .enumerate()
+            .map(|(i, b)| BodyKey { name: b.name.clone(), id: named.get(i).and_then(|c| c.id) });
+        let motions = self.bodies.iter().filter_map(|b| b.motion.clone()).collect();
+        Ok(source::open(&self.config.tracker, keys.collect(), motions, clock, start)?)
     }
 
     /// True world-from-body of every tracked body at an instant; `None` unless the tracker is the mock.
@@ -231,19 +212,67 @@ fn load_scene(config: &RigConfig) -> Result<Scene, SceneError> {
     scene::load(file, &options)
 }
 
+/// Radiance from all around for files, which bring no environment of their own.
+const FILE_SCENE_RADIANCE: f32 = 0.25;
+
 /// The environment of the rig file; `None` keeps the scene's own (the built-in scene brings one).
 fn environment(config: &RigConfig) -> Result<Option<Environment>, RigError> {
-    match &config.scene.environment {
-        EnvironmentConfig::Constant(c) => {
-            let own = config.scene.file.is_none() && *c == Default::default();
-            let radiance = Vec3::new(c.radiance[0] as f32, c.radiance[1] as f32, c.radiance[2] as f32);
-            Ok((!own).then_some(Environment::Constant(radiance)))
-        }
+    let even = |[r, g, b]: [f64; 3]| Environment::Constant(Vec3::new(r as f32, g as f32, b as f32));
+    Ok(match &config.scene.environment {
+        EnvironmentConfig::Auto(_) if config.scene.file.is_none() => None,
+        EnvironmentConfig::Auto(_) => Some(Environment::Constant(Vec3::splat(FILE_SCENE_RADIANCE))),
+        EnvironmentConfig::Constant(c) => Some(even(c.radiance)),
         EnvironmentConfig::Image(c) => {
-            let rotation = (c.rotation_deg as f32).to_radians();
-            Ok(Some(scene::load_environment(&c.file, rotation, c.scale as f32)?))
+            Some(scene::load_environment(&c.file, c.rotation_deg.to_radians() as f32, c.scale as f32)?)
         }
+    })
+}
+
+/// The projector's camera at `raster`, from its calibration or from position and direction; what is not reproduced goes to
+/// `warnings`.
+fn camera(
+    config: &RigConfig,
+    raster: Raster,
+    warnings: &mut Vec<String>,
+) -> Result<ProjectorCamera, RigError> {
+    let p = &config.projector;
+    let Some(path) = &p.calibration else {
+        return Ok(ProjectorCamera::look_at(
+            raster,
+            DVec3::from_array(p.position),
+            DVec3::from_array(p.look_at),
+            DVec3::from_array(p.up),
+            p.horizontal_fov_deg.to_radians(),
+        )?);
+    };
+    let wrong = |message: String| RigError::Calibration { path: path.display().to_string(), message };
+    let unit = match p.calibration_unit {
+        Some(CalibrationUnit::Metre) => LengthUnit::Metre,
+        Some(CalibrationUnit::Millimetre) => LengthUnit::Millimetre,
+        None => return Err(wrong("projector.calibration_unit is missing".into())),
+    };
+    let mut text = String::new();
+    std::fs::File::open(path)
+        .and_then(|f| f.take(opencv::MAX_BYTES as u64 + 1).read_to_string(&mut text))
+        .map_err(|e| wrong(e.to_string()))?;
+    let stored = opencv::read(&text, p.raster(), unit).map_err(|e| wrong(e.to_string()))?;
+    if stored.distortion != Distortion::default() {
+        warnings.push(format!(
+            "projector.calibration: {}: its lens distortion is not compensated; light is off by as much as the lens bends",
+            path.display()
+        ));
     }
+    let c = stored.camera;
+    let scale_x = f64::from(raster.width()) / f64::from(p.width);
+    let scale_y = f64::from(raster.height()) / f64::from(p.height);
+    Ok(ProjectorCamera::new(
+        raster,
+        c.world_from_projector,
+        c.fx * scale_x,
+        c.fy * scale_y,
+        c.cx * scale_x,
+        c.cy * scale_y,
+    )?)
 }
 
 fn motion_spec(index: usize, body: &BodyConfig) -> Result<MotionSpec, RigError> {

@@ -20,6 +20,35 @@ pub(super) fn check(rig: &RigConfig, reader: &mut Reader) {
     render(rig, reader);
     time(rig, reader);
     faults(rig, reader);
+    addresses(rig, reader);
+}
+
+fn addresses(rig: &RigConfig, reader: &mut Reader) {
+    let TrackerConfig::Natnet(natnet) = &rig.tracker else { return };
+    let multicast = natnet.multicast.as_deref();
+    let named =
+        [("server", Some(&*natnet.server)), ("local", Some(&*natnet.local)), ("multicast", multicast)];
+    for (key, text) in named {
+        let Some(text) = text else { continue };
+        let parsed = text.trim().parse::<std::net::Ipv4Addr>();
+        let key = format!("tracker.{key}");
+        match parsed {
+            Err(_) => {
+                let problem = format!("{text:?} is not an IPv4 address");
+                refuse(reader, &[&key], problem, "write for example \"192.168.1.10\"".into());
+            }
+            Ok(group) if key == "tracker.multicast" && !group.is_multicast() => {
+                let problem = format!("{text} is not a multicast group");
+                refuse(
+                    reader,
+                    &[&key],
+                    problem,
+                    "groups are 224.0.0.0 to 239.255.255.255; Motive's is 239.255.42.99".into(),
+                );
+            }
+            Ok(_) => {}
+        }
+    }
 }
 
 fn faults(rig: &RigConfig, reader: &mut Reader) {
@@ -53,6 +82,14 @@ fn projector(rig: &RigConfig, reader: &mut Reader) {
                 p.max_planes_per_second
             ),
             format!("at most {most} frames/s of {} planes", p.planes),
+        );
+    }
+    if p.calibration.is_some() && p.calibration_unit.is_none() {
+        refuse(
+            reader,
+            &["projector.calibration"],
+            "the unit of its lengths is not told by the file".into(),
+            "set projector.calibration_unit to \"metre\" or \"millimetre\"".into(),
         );
     }
     if p.calibration.is_some() {

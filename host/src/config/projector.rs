@@ -30,6 +30,8 @@ section! {
         /// A calibration file (OpenCV FileStorage XML or YAML) that takes the place of `position`, `look_at`, `up` and
         /// `horizontal_fov_deg`. Use it for every real rig.
         calibration: Option<PathBuf> = None, "", NotEmpty;
+        /// Unit of the lengths in the calibration file, which cannot be told from its numbers; required with `calibration`.
+        calibration_unit: Option<CalibrationUnit> = None, "", Any;
         /// Radiant intensity of one pixel at full drive, in scene units: the scene's radiance 1 needs `pi * d^2 / albedo` at
         /// distance d. Raise it when the report says that light is clipped, lower it when the picture uses few of its levels.
         max_intensity: f64 = 8.0, "scene units/sr", Within(1e-6, 1e12);
@@ -118,6 +120,16 @@ section! {
         serial_number: Option<String> = None, "", NotEmpty;
         /// Light of each bit-1 pattern.
         exposure_us: u32 = 105, "us", Within(62, 2_000_000);
+    }
+}
+
+words! {
+    /// Units of length.
+    pub enum CalibrationUnit {
+        /// 1 m.
+        Metre = "metre",
+        /// 0.001 m.
+        Millimetre = "millimetre",
     }
 }
 

@@ -205,7 +205,35 @@ const BAD: &[(&str, usize, usize, &str, &str)] = &[
     ("[output]\nlight_window_ms = 1", 2, 19, "output.light_window_ms", "shorter than one frame"),
     // Files.
     ("[scene]\nfile = \"none.glb\"", 2, 8, "scene.file", "/nonexistent/none.glb"),
-    ("[projector]\ncalibration = \"cal.xml\"", 2, 15, "projector.calibration", "No such file"),
+    (
+        "[projector]\ncalibration = \"cal.xml\"\ncalibration_unit = \"metre\"",
+        2,
+        15,
+        "projector.calibration",
+        "No such file",
+    ),
+    (
+        "[projector]\ncalibration = \"cal.xml\"",
+        2,
+        15,
+        "projector.calibration",
+        "set projector.calibration_unit",
+    ),
+    (
+        "[projector]\ncalibration_unit = \"inch\"",
+        2,
+        20,
+        "projector.calibration_unit",
+        "\"metre\" | \"millimetre\"",
+    ),
+    ("[tracker]\nkind = \"natnet\"\nserver = \"motive.lab\"", 3, 10, "tracker.server", "not an IPv4 address"),
+    (
+        "[tracker]\nkind = \"natnet\"\nmulticast = \"10.0.0.1\"",
+        3,
+        13,
+        "tracker.multicast",
+        "not a multicast group",
+    ),
     ("[scene.environment]\nkind = \"image\"\nfile = \"sky.pfm\"", 3, 8, "scene.environment.file", "sky.pfm"),
     ("[tracker]\nkind = \"replay\"\nfile = \"run.log\"", 3, 8, "tracker.file", "run.log"),
 ];

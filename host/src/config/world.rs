@@ -188,12 +188,19 @@ words! {
 kinds! {
     /// Light from infinitely far away.
     pub enum EnvironmentConfig {
+        /// what the built-in scene brings; for files, which bring none, even light of 0.25.
+        Auto(AutoEnvironmentConfig) = "auto",
         /// the same radiance from everywhere.
         Constant(ConstantEnvironmentConfig) = "constant",
         /// a latitude-longitude picture.
         Image(ImageEnvironmentConfig) = "image",
     }
-    default Constant
+    default Auto
+}
+
+section! {
+    /// The scene's own light.
+    pub struct AutoEnvironmentConfig {}
 }
 
 section! {

@@ -11,6 +11,7 @@ use crate::rig::{Rig, RigError};
 use crate::telemetry::monitor::RunMonitor;
 use crate::telemetry::report::Report;
 use crate::telemetry::trace::write_trace;
+use crate::tracking::source::SourceError;
 use dpm_device::planes::Raster;
 use glam::Vec3;
 use std::path::{Path, PathBuf};
@@ -119,7 +120,7 @@ fn cannot_write(path: &Path, error: &dyn std::fmt::Display) -> Failure {
 impl From<RigError> for Failure {
     fn from(error: RigError) -> Self {
         let kind = match error {
-            RigError::Tracker(_) => FailureKind::Device,
+            RigError::Tracker(SourceError::Tracker(_)) => FailureKind::Device,
             _ => FailureKind::BadInput,
         };
         Self::new(kind, error)
@@ -129,7 +130,7 @@ impl From<RigError> for Failure {
 impl From<PipelineError> for Failure {
     fn from(error: PipelineError) -> Self {
         let kind = match &error {
-            PipelineError::Rig(RigError::Tracker(_))
+            PipelineError::Rig(RigError::Tracker(SourceError::Tracker(_)))
             | PipelineError::Connect(_)
             | PipelineError::Thread { .. } => FailureKind::Device,
             PipelineError::Rig(_) | PipelineError::Render(RenderError::Scene(_)) => FailureKind::BadInput,

@@ -19,7 +19,7 @@ use crate::rig::{Rig, RigError};
 use crate::telemetry::monitor::RunMonitor;
 use crate::telemetry::report::Report;
 use dpm_device::link::{packet_bytes, Codec, Epoch, HostLink, LinkSettings, SendOutcome, Underrun, Verb};
-use dpm_device::time::{DeviceTicks, HostTime};
+use dpm_device::time::{DeviceTicks, HostClock, HostTime};
 use dpm_device::transport::inproc::{threaded, DeviceEnd, Direct, HostEnd};
 use dpm_device::transport::Transport;
 use dpm_handoff::latest::{latest, Publisher, Reader};
@@ -130,7 +130,6 @@ pub fn run(
 ) -> Result<RunOutcome, PipelineError> {
     let config = &rig.config;
     let renderer = Renderer::new(gpu, &rig.scene, renderer_settings(&rig))?;
-    let tracker = rig.tracker()?;
     let is_virtual = config.real_time.pace == Pace::Virtual;
     let clock = if is_virtual {
         // The link comes up just before the first frame, so that nobody waits for the filters.
@@ -138,6 +137,15 @@ pub fn run(
     } else {
         RunClock::Real(MonotonicClock::new(50_000))
     };
+    let tracker_clock: Arc<dyn HostClock> = match &clock {
+        RunClock::Real(clock) => Arc::new({
+            let clock = *clock;
+            move || clock.now()
+        }),
+        // The configuration allows only trackers without a clock of their own at virtual pace.
+        RunClock::Virtual(_) => Arc::new(|| HostTime(0)),
+    };
+    let tracker = rig.tracker(tracker_clock, HostTime(0))?;
     let raster = rig.camera.raster;
     let schedule = config.projector.schedule();
     // Hashing every frame costs a millisecond at full size: affordable unless the wall clock rules.

@@ -9,6 +9,7 @@ pub mod evaluation;
 pub mod imm;
 pub mod noise;
 pub mod pose_filter;
+pub mod source;
 pub mod state;
 
 pub use bank::PoseFilterBank;

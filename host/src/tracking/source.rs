@@ -1,0 +1,172 @@
+//! `[tracker]` of the rig file into the tracker itself, ready to be polled.
+
+use crate::config::{MockTrackerConfig as MockKeys, TrackerConfig};
+use dpm_device::time::{FrameRate, HostClock, HostTime};
+use dpm_device::tracker::natnet::client::{NatNetClient, NatNetConfig};
+use dpm_device::tracker::record::{RecordError, Replay};
+use dpm_device::tracker::serial::client::{SerialTracker, SerialTrackerConfig};
+use dpm_device::tracker::vrpn::client::{VrpnClient, VrpnConfig};
+use dpm_device::tracker::{BodyKey, Tracker, TrackerError};
+use hil_mock::faults::{FaultError, FaultPlan};
+use hil_mock::motion::Motion;
+use hil_mock::tracker::{MockTracker, MockTrackerConfig, MockTrackerError};
+use std::net::Ipv4Addr;
+use std::sync::Arc;
+
+/// Why there is no tracker.
+#[derive(Debug, thiserror::Error)]
+pub enum SourceError {
+    /// The mock's numbers.
+    #[error("tracker: {0}")]
+    Mock(#[from] MockTrackerError),
+    /// The mock's faults.
+    #[error("tracker.faults: {0}")]
+    Faults(#[from] FaultError),
+    /// An address that is none. The configuration's check finds it first.
+    #[error("{key}: {text:?} is not an IPv4 address such as 192.168.1.10")]
+    Address {
+        /// Key of the rig file.
+        key: &'static str,
+        /// What stands there.
+        text: String,
+    },
+    /// The recording.
+    #[error("tracker.file: {0}")]
+    Recording(#[from] RecordError),
+    /// The device or the network.
+    #[error("tracker: {0}")]
+    Tracker(#[from] TrackerError),
+}
+
+/// Opens the tracker. `bodies` are the rig's in their order; `motions` are how they truly move, which only the mock needs; `clock` is the
+/// clock that polls are stamped with; a recording starts at `start`. Network and serial trackers connect while they are
+/// polled, and again after every loss: that nobody answers yet is no error.
+///
+/// # Errors
+/// Numbers, addresses or files that cannot be used; a socket that the system refuses.
+pub fn open(
+    config: &TrackerConfig,
+    bodies: Vec<BodyKey>,
+    motions: Vec<Motion>,
+    clock: Arc<dyn HostClock>,
+    start: HostTime,
+) -> Result<Box<dyn Tracker>, SourceError> {
+    Ok(match config {
+        TrackerConfig::Mock(c) => Box::new(MockTracker::new(mock(c)?, motions)?),
+        TrackerConfig::Natnet(c) => {
+            let config = NatNetConfig {
+                server: address("tracker.server", &c.server)?,
+                local: address("tracker.local", &c.local)?,
+                multicast: c.multicast.as_deref().map(|m| address("tracker.multicast", m)).transpose()?,
+                command_port: c.command_port,
+                data_port: c.data_port,
+                bitstream: None,
+                kernel_stamps: true,
+                bodies,
+            };
+            Box::new(NatNetClient::open(config, clock)?)
+        }
+        TrackerConfig::Vrpn(c) => {
+            let config = VrpnConfig { server: c.server.clone(), tracker: c.tracker.clone(), bodies };
+            Box::new(VrpnClient::open(config, clock)?)
+        }
+        TrackerConfig::Serial(c) => {
+            let config = SerialTrackerConfig { port: c.port.clone(), baud: c.baud, bodies };
+            Box::new(SerialTracker::open(config, clock)?)
+        }
+        TrackerConfig::Replay(c) => Box::new(Replay::open(&c.file, &bodies, start)?),
+    })
+}
+
+/// The mock's settings; `drop_out` is one more fault.
+fn mock(c: &MockKeys) -> Result<MockTrackerConfig, SourceError> {
+    let mut faults = c.faults.clone();
+    if c.drop_out > 0.0 {
+        let separator = if faults.trim().is_empty() { "" } else { "," };
+        faults.push_str(&format!("{separator}loss={}", c.drop_out));
+    }
+    Ok(MockTrackerConfig {
+        seed: c.seed,
+        rate: FrameRate::new(c.rate_hz, 1).expect("the rate was checked when the configuration was read"),
+        position_noise_m: c.noise_m,
+        rotation_noise_rad: c.noise_rad,
+        latency_ns: i64::from(c.latency_us) * 1000,
+        latency_jitter_ns: i64::from(c.jitter_us) * 1000,
+        faults: faults.parse::<FaultPlan>()?,
+        ..MockTrackerConfig::default()
+    })
+}
+
+fn address(key: &'static str, text: &str) -> Result<Ipv4Addr, SourceError> {
+    text.trim().parse().map_err(|_| SourceError::Address { key, text: text.into() })
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::config::{NatnetConfig, Overrides, ReplayConfig, RigConfig};
+    use hil_mock::motion::MotionSpec;
+    use std::path::Path;
+
+    fn bodies() -> Vec<BodyKey> {
+        vec![BodyKey { name: "hare".into(), id: Some(3) }]
+    }
+
+    fn config(text: &str) -> TrackerConfig {
+        RigConfig::parse("rig.toml", text, Path::new(""), &Overrides::default()).expect("valid").tracker
+    }
+
+    fn clock() -> Arc<dyn HostClock> {
+        Arc::new(|| HostTime(0))
+    }
+
+    #[test]
+    fn the_mock_has_the_rigs_rate_and_latency_and_loses_what_it_was_told_to() {
+        let keys = "[tracker]\nrate_hz = 250\nlatency_us = 3000\n";
+        let count = |more: &str| {
+            let motion = Motion::new(&MotionSpec::Still, dpm_device::pose::Pose::IDENTITY).expect("still");
+            let mut tracker =
+                open(&config(&format!("{keys}{more}")), bodies(), vec![motion], clock(), HostTime(0))
+                    .expect("opens");
+            let (mut samples, mut delays) = (0, 0);
+            for ms in 0..=4000 {
+                let mut sink = |s: &dpm_device::tracker::TrackerSample| {
+                    samples += 1;
+                    delays += s.received_at.ns_since(s.captured_at);
+                };
+                tracker.poll(HostTime(ms * 1_000_000), &mut sink).expect("polls");
+            }
+            (samples, delays / samples.max(1))
+        };
+        let (all, delay) = count("");
+        assert!((998..=1001).contains(&all), "{all} samples in 4 s at 250 Hz");
+        assert!((3_000_000..4_000_000).contains(&delay), "{delay} ns");
+        let (half, _) = count("drop_out = 0.5\n");
+        assert!((430..570).contains(&half), "{half} of 1000 at a loss of one half");
+    }
+
+    #[test]
+    fn network_and_serial_trackers_open_before_anybody_answers() {
+        for text in [
+            "[tracker]\nkind = \"natnet\"\nserver = \"127.0.0.1\"\nlocal = \"127.0.0.1\"",
+            "[tracker]\nkind = \"vrpn\"\nserver = \"127.0.0.1:1\"",
+            "[tracker]\nkind = \"serial\"\nport = \"/nonexistent/tty\"",
+        ] {
+            let mut tracker = open(&config(text), bodies(), Vec::new(), clock(), HostTime(0)).expect(text);
+            assert_eq!(tracker.poll(HostTime(1), &mut |_| panic!("a sample from nowhere")).expect(text), 0);
+        }
+    }
+
+    #[test]
+    fn what_cannot_be_opened_is_named() {
+        let told = |c: TrackerConfig| match open(&c, bodies(), Vec::new(), clock(), HostTime(0)) {
+            Ok(_) => panic!("opened"),
+            Err(e) => e.to_string(),
+        };
+        let server = NatnetConfig { server: "motive.lab".into(), ..NatnetConfig::default() };
+        assert!(told(TrackerConfig::Natnet(server))
+            .contains("tracker.server: \"motive.lab\" is not an IPv4 address"));
+        let missing = ReplayConfig { file: "/nonexistent/run.dpmt".into() };
+        assert!(told(TrackerConfig::Replay(missing)).contains("/nonexistent/run.dpmt"));
+    }
+}
