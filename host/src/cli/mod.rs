@@ -6,6 +6,7 @@ pub mod os;
 pub mod rig_args;
 pub mod run;
 pub mod signals;
+pub mod stability;
 pub mod watch;
 
 use crate::failure::Failure;
@@ -32,6 +33,8 @@ enum Command {
     Run(run::RunArgs),
     /// Say what this machine can do, and what to do about what is missing
     Doctor(doctor::DoctorArgs),
+    /// Run stiff and extreme cases: measured error against bound, with the oracle of each
+    Stability(stability::StabilityArgs),
     /// Control a DLPC900 projector (LightCrafter 6500 / 9000): status, patterns, rest
     Dlpc900(dlpc900::Dlpc900Args),
 }
@@ -64,6 +67,7 @@ fn dispatch(command: &Command) -> Result<(), Failure> {
         Command::Demo(args) => run::execute_demo(args),
         Command::Run(args) => run::execute(args),
         Command::Doctor(args) => doctor::execute(args),
+        Command::Stability(args) => stability::execute(args),
         Command::Dlpc900(args) => dlpc900::execute(args),
     }
 }

@@ -1,0 +1,59 @@
+//! `dpm stability`: hard cases with their errors and bounds.
+
+use super::watch::print;
+use crate::experiments::stability::{cases, CaseResult, CaseVerdict, StabilityReport, SEED};
+use crate::failure::{Failure, FailureKind};
+use crate::telemetry::report::to_json;
+
+/// Flags of `dpm stability`.
+#[derive(clap::Args, Clone, Debug)]
+pub struct StabilityArgs {
+    /// Only cases whose name contains this
+    #[arg(long, value_name = "NAME")]
+    only: Option<String>,
+    /// Seed of the random inputs; a failing case prints the one that replays it
+    #[arg(long, default_value_t = SEED)]
+    seed: u64,
+    /// Print one JSON object
+    #[arg(long)]
+    json: bool,
+}
+
+fn line(c: &CaseResult) -> String {
+    let error = c.error.map_or("-".into(), |e| format!("{e:.2e}"));
+    let verdict = if c.verdict == CaseVerdict::Pass { "pass" } else { "FAIL" };
+    format!("{verdict}  {:<36} {error:>9} <= {:<6.0e} {:<11} {}\n", c.name, c.bound, c.unit, c.oracle)
+}
+
+/// Runs the cases; a failed one makes the command fail.
+pub fn execute(args: &StabilityArgs) -> Result<(), Failure> {
+    let all = cases();
+    let only = args.only.as_deref();
+    if let Some(name) = only.filter(|o| !all.iter().any(|c| c.name.contains(o))) {
+        let names: Vec<&str> = all.iter().map(|c| c.name).collect();
+        let message = format!("no stability case is called {name:?}; there are: {}", names.join(", "));
+        return Err(Failure::new(FailureKind::BadInput, message));
+    }
+    let mut report = StabilityReport::default();
+    report.run_cases(&all, only, args.seed, |c| {
+        if !args.json {
+            print(&line(c));
+        }
+    });
+    if args.json {
+        print(&(to_json(&report) + "\n"));
+    } else {
+        print(&format!("{} of {} cases pass\n", report.passed, report.cases.len()));
+    }
+    if report.failed == 0 {
+        return Ok(());
+    }
+    let failed: Vec<String> = (report.cases.iter())
+        .filter(|c| c.verdict == CaseVerdict::Fail)
+        .map(|c| {
+            let note = c.note.as_ref().map_or(String::new(), |n| format!(" ({n})"));
+            format!("{}{note}: replay with dpm stability --only {} --seed {}", c.name, c.name, c.seed)
+        })
+        .collect();
+    Err(Failure::new(FailureKind::CheckFailed, format!("stability: {}", failed.join("\n  "))))
+}
