@@ -227,7 +227,7 @@ fn monotone(seed: u64) -> f64 {
             device.step_ns = 40_000_000;
         }
         line.exchange(&device, &mut map, i * PERIOD_NS);
-        for k in 1..25 {
+        for k in 1..50 {
             let Some(m) = map.map_forward(device.ticks(i * PERIOD_NS + k * 2_000_000)) else { continue };
             violations += u32::from(m.at < last);
             last = m.at;

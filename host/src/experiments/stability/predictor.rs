@@ -250,7 +250,7 @@ fn half_turns(seed: u64) -> f64 {
     use std::f64::consts::PI;
     let mut s = Sampler::new(seed, 0);
     let mut worst: f64 = 0.0;
-    for angle in [0.0, 1e-300, 1e-12, 1e-9, 3e-4, 1.0, PI - 1e-9, PI, PI + 1e-9, 2.0 * PI - 1e-9] {
+    for angle in [0.0, 1e-300, 1e-12, 1e-9, 3e-4, 1.0, PI - 1e-9, PI, PI + 1e-9, 4.5, 6.0, 2.0 * PI - 1e-9] {
         for _ in 0..50 {
             let axis = DVec3::new(s.uniform() - 0.5, s.uniform() - 0.5, s.uniform() - 0.5).normalize();
             let q = so3_exp(axis * angle);
