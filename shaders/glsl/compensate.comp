@@ -7,7 +7,7 @@
 layout(local_size_x = 8, local_size_y = 8) in;
 
 layout(set = 0, binding = B_SURFACES, scalar) readonly buffer Surfaces { Surface surfaces[]; };
-layout(set = 0, binding = B_RADIANCE, scalar) readonly buffer Radiance { vec4 radiance_in[]; };
+layout(set = 0, binding = B_SHOWN, scalar) readonly buffer Shown { vec4 shown[]; };
 layout(set = 0, binding = B_CODES, scalar) writeonly buffer Codes { uint codes[]; };
 
 // floor(255 v + 0.5) in f32 without contraction: bit for bit the CPU's `quantise`.
@@ -32,9 +32,8 @@ layout(set = 0, binding = B_VERTICES, scalar) readonly buffer Vertices { Vertex 
 layout(set = 0, binding = B_TILES, scalar) readonly buffer Tiles { uint tiles[]; };
 
 void main() {
-    uint tile = tiles[gl_WorkGroupID.x >> 2u];
-    uvec2 pixel = uvec2(tile % frame.tiles_x, tile / frame.tiles_x) * 16u + uvec2(gl_WorkGroupID.x & 1u, (gl_WorkGroupID.x >> 1u) & 1u) * 8u + gl_LocalInvocationID.xy;
-    if (pixel.x >= frame.width || pixel.y >= frame.height) return;
+    uvec2 pixel;
+    if (!tile_pixel(tiles[gl_WorkGroupID.x >> 2u], pixel)) return;
     uint index = pixel.y * frame.width + pixel.x;
     Surface surface = surfaces[index];
     uint nans = 0u, clipped = 0u, lit = 0u, code = 0u;
@@ -45,7 +44,7 @@ void main() {
         // The real surface is smooth: its normal is the interpolated one, without the look's normal map.
         vec3 n = vertices[ref.vertices.x].normal * (1.0 - b.x - b.y) + vertices[ref.vertices.y].normal * b.x + vertices[ref.vertices.z].normal * b.y;
         float cosine = abs(dot(transform_normal(instances[instance].world_from_object, n), projector_direction(vec2(pixel) + 0.5)));
-        vec3 target = radiance_in[index].rgb - frame.ambient;
+        vec3 target = shown[index].rgb - frame.ambient;
         float geometry = surface.distance * surface.distance / max(cosine, 1e-3);
         vec3 drive = target * (frame.drive_gain * geometry);
         code = quantise(drive.r, nans, clipped) | (quantise(drive.g, nans, clipped) << 8u) | (quantise(drive.b, nans, clipped) << 16u);

@@ -28,7 +28,7 @@ struct RayCount {
     uint shadow;
 };
 
-vec3 trace_path(Point s, inout Sampler rng, inout RayCount rays) {
+vec3 trace_path(Point s, Sampler rng, inout RayCount rays) {
     vec3 throughput = vec3(1.0);
     vec3 radiance = s.emitted;
     for (uint vertex = 1u; vertex < frame.depth; vertex++) {
@@ -36,11 +36,11 @@ vec3 trace_path(Point s, inout Sampler rng, inout RayCount rays) {
         if (!s.front && (s.flags & (MATERIAL_DOUBLE_SIDED | MATERIAL_TRANSMISSIVE)) == 0u) break;
         Lobes lobes = lobes_of(s);
         bool only_delta = mirror_like(s) && lobes.diffuse <= 0.0;
-        float u_pick = sample_1d(rng);
-        vec2 u_light = sample_2d(rng);
-        float u_lobe = sample_1d(rng);
-        vec2 u_bsdf = sample_2d(rng);
-        float u_roulette = sample_1d(rng);
+        // Where the light and the next direction are chosen matters most: they share a group of four.
+        vec4 u_direction = sample_4d(rng, vertex * 2u - 2u);
+        vec4 u_choice = sample_4d(rng, vertex * 2u - 1u);
+        vec2 u_light = u_direction.xy, u_bsdf = u_direction.zw;
+        float u_pick = u_choice.x, u_lobe = u_choice.y, u_roulette = u_choice.z;
         if (!only_delta) {
             LightSample light = sample_light(s.p, s.n, u_pick, u_light);
             if (light.valid) {

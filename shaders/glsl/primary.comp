@@ -1,4 +1,4 @@
-// Tiles into surfaces: what each projector pixel's ray meets, and whether the eye sees that point.
+// Tiles into surfaces and guides: what each projector pixel's ray meets, whether the eye sees that point, how it moves and how large it looks.
 #version 460
 #extension GL_GOOGLE_include_directive : require
 #include "scene.glsl"
@@ -10,12 +10,35 @@ layout(local_size_x = 8, local_size_y = 8) in;
 
 layout(set = 0, binding = B_TILES, scalar) readonly buffer Tiles { uint tiles[]; };
 layout(set = 0, binding = B_SURFACES, scalar) writeonly buffer Surfaces { Surface surfaces[]; };
+layout(set = 0, binding = B_GUIDES, scalar) writeonly buffer Guides { Guide guides[]; };
+
+// What the passes between tracing and light need; 0: they are not recorded.
+layout(constant_id = 11) const bool HAS_GUIDES = true;
+// Radiance is filtered without the surface's albedo.
+layout(constant_id = 12) const bool HAS_DEMODULATION = true;
+
+// Raster position of a point; the projector is the origin.
+vec2 project(vec3 p) {
+    vec3 q = vec3(dot(vec3(frame.world_from_projector[0].x, frame.world_from_projector[1].x, frame.world_from_projector[2].x), p),
+                  dot(vec3(frame.world_from_projector[0].y, frame.world_from_projector[1].y, frame.world_from_projector[2].y), p),
+                  dot(vec3(frame.world_from_projector[0].z, frame.world_from_projector[1].z, frame.world_from_projector[2].z), p));
+    float depth = max(-q.z, 1e-9);
+    return vec2(frame.intrinsics.z + frame.intrinsics.x * q.x / depth, frame.intrinsics.w - frame.intrinsics.y * q.y / depth);
+}
+
+// Reflectance of the look for white light from everywhere, roughly: what varies over a texture but not over the light.
+vec3 demodulation(Hit hit, vec3 toward) {
+    Point s = shading_point(hit, toward);
+    float nv = dot(s.n, s.v);
+    float e = HAS_SPECULAR ? directional_albedo(s.table, s.alpha, nv) : 0.0;
+    float m = pow(clamp(1.0 - nv, 0.0, 1.0), 5.0);
+    vec3 metal = s.base + (1.0 - s.base) * m;
+    return clamp(mix(e + (1.0 - e) * s.base, metal, s.metallic), 0.02, 1.0);
+}
 
 void main() {
-    // Four workgroups a tile.
-    uint tile = tiles[gl_WorkGroupID.x >> 2u];
-    uvec2 pixel = uvec2(tile % frame.tiles_x, tile / frame.tiles_x) * 16u + uvec2(gl_WorkGroupID.x & 1u, (gl_WorkGroupID.x >> 1u) & 1u) * 8u + gl_LocalInvocationID.xy;
-    if (pixel.x >= frame.width || pixel.y >= frame.height) return;
+    uvec2 pixel;
+    if (!tile_pixel(tiles[gl_WorkGroupID.x >> 2u], pixel)) return;
     Surface surface = Surface(NO_HIT, vec2(0.0), 0.0);
     vec3 direction = projector_direction(vec2(pixel) + 0.5);
     bool camera_is_eye = (frame.flags & FRAME_CAMERA_IS_EYE) != 0u;
@@ -42,6 +65,23 @@ void main() {
                 lit = !trace_ray(p + offset, to_eye - offset, INSTANCE_PROJECTED, true, blocker);
             }
             if (!lit) surface.distance = -hit.t;
+            if (HAS_GUIDES && lit) {
+                Guide guide;
+                vec3 o = object_position(hit.instance, hit.triangle, hit.barycentric);
+                vec2 before = project(transform_point(instances[hit.instance].previous_world_from_object, o));
+                guide.motion = vec2(pixel) + 0.5 - before;
+                vec3 to_projector = -p;
+                float l_p = length(to_projector), l_e = length(to_eye);
+                // [paper] eq. 3; capped where the light grazes.
+                guide.size = min((abs(eye_side) / max(l_e * l_e, 1e-12)) * (l_p * l_p / max(abs(dot(g, to_projector)), 1e-6)), 1e3);
+                vec3 to_gaze = frame.gaze_point - frame.eye_position;
+                float c = dot(-to_eye, to_gaze) / max(l_e * length(to_gaze), 1e-12);
+                guide.angle = degrees(acos(clamp(c, -1.0, 1.0)));
+                vec3 albedo = HAS_DEMODULATION ? demodulation(hit, to_eye / max(l_e, 1e-12)) : vec3(1.0);
+                guide.albedo_rg = packHalf2x16(albedo.rg);
+                guide.albedo_b = packHalf2x16(vec2(albedo.b, 0.0));
+                guides[pixel.y * frame.width + pixel.x] = guide;
+            }
         }
     }
     surfaces[pixel.y * frame.width + pixel.x] = surface;

@@ -1,36 +1,77 @@
-// Random numbers: one stream per path, addressed by (pixel, frame, sample, seed), so a run replays.
+// Random numbers in groups of four. Which sequence: a specialization constant.
+#include "noise.glsl"
+
+layout(constant_id = 10) const uint SAMPLER = 0u; // 0 independent, 1 one point set a frame shifted by blue noise, 2 one sequence a surface point
 
 struct Sampler {
-    uint state;
+    uint seed;  // of the path's sequence
+    uint index; // in the sequence
+    uvec2 pixel;
 };
-
-uint hash_u32(uint x) {
-    // A full-avalanche 32-bit mix.
-    x ^= x >> 16u;
-    x *= 0x21f0aaadu;
-    x ^= x >> 15u;
-    x *= 0x735a2d97u;
-    x ^= x >> 15u;
-    return x;
-}
-
-Sampler start_sampler(uint pixel, uint frame_number, uint sample_index, uint seed) {
-    Sampler s;
-    s.state = hash_u32(pixel + hash_u32(frame_number + hash_u32(sample_index + hash_u32(seed + 0x9e3779b9u))));
-    return s;
-}
 
 // [0, 1) always: 24 bits, so rounding never gives 1.
 float to_unit(uint x) { return float(x >> 8u) * (1.0 / 16777216.0); }
 
-float sample_1d(inout Sampler s) {
-    // PCG output permutation over a linear congruential state.
-    s.state = s.state * 747796405u + 2891336453u;
-    uint word = ((s.state >> ((s.state >> 28u) + 4u)) ^ s.state) * 277803737u;
-    return to_unit((word >> 22u) ^ word);
+// The twin of render/sobol.rs, bit for bit.
+const uint SOBOL_1[32] = uint[](SOBOL_ROW_1);
+const uint SOBOL_2[32] = uint[](SOBOL_ROW_2);
+const uint SOBOL_3[32] = uint[](SOBOL_ROW_3);
+
+uint owen_scramble(uint x, uint seed) {
+    x = bitfieldReverse(x);
+    x += seed;
+    x ^= x * 0x641ca70eu;
+    x *= (seed >> 16u) | 1u;
+    x ^= x * 0x6f9e06c2u;
+    x ^= x * 0xb0cfba9cu;
+    return bitfieldReverse(x);
 }
 
-vec2 sample_2d(inout Sampler s) {
-    float x = sample_1d(s);
-    return vec2(x, sample_1d(s));
+uint mix_seed(uint seed, uint value) {
+    uint x = seed ^ (value * 0x9e3779b9u + 0x7f4a7c15u);
+    x = (x ^ (x >> 16u)) * 0x85ebca6bu;
+    x = (x ^ (x >> 13u)) * 0xc2b2ae35u;
+    x = (x ^ (x >> 16u)) + value;
+    x = (x ^ (x >> 15u)) * 0x2c1b3c6du;
+    return x ^ (x >> 14u);
+}
+
+uvec4 sobol_4d(uint index, uint group, uint seed) {
+    uint key = mix_seed(seed, group);
+    uint shuffled = owen_scramble(index, key);
+    uvec4 x = uvec4(bitfieldReverse(shuffled), 0u, 0u, 0u);
+    for (uint rest = shuffled; rest != 0u; rest &= rest - 1u) {
+        int bit = findLSB(rest);
+        x.y ^= SOBOL_1[bit];
+        x.z ^= SOBOL_2[bit];
+        x.w ^= SOBOL_3[bit];
+    }
+    return uvec4(owen_scramble(x.x, mix_seed(key, 1u)), owen_scramble(x.y, mix_seed(key, 2u)),
+                 owen_scramble(x.z, mix_seed(key, 3u)), owen_scramble(x.w, mix_seed(key, 4u)));
+}
+
+// Four numbers of dimension group `group` of this path.
+vec4 sample_4d(Sampler s, uint group) {
+    if (SAMPLER == 0u) {
+        uint state = hash_u32(s.seed + hash_u32(s.index + hash_u32(group + 0x9e3779b9u)));
+        uvec4 x;
+        for (int i = 0; i < 4; i++) {
+            // PCG output permutation over a linear congruential state.
+            state = state * 747796405u + 2891336453u;
+            uint word = ((state >> ((state >> 28u) + 4u)) ^ state) * 277803737u;
+            x[i] = (word >> 22u) ^ word;
+        }
+        return vec4(to_unit(x.x), to_unit(x.y), to_unit(x.z), to_unit(x.w));
+    }
+    uvec4 x = sobol_4d(s.index, group, s.seed);
+    vec4 u = vec4(to_unit(x.x), to_unit(x.y), to_unit(x.z), to_unit(x.w));
+    if (SAMPLER == 1u) {
+        // Every dimension reads the mask at an offset of its own, so that dimensions are independent.
+        for (int i = 0; i < 4; i++) {
+            uint h = hash_u32(group * 4u + uint(i) + 1u);
+            u[i] += blue_noise(s.pixel + uvec2(h & 63u, (h >> 6u) & 63u), frame.frame + ((h >> 12u) & 31u), uint(i));
+            u[i] = min(u[i] - floor(u[i]), 0.99999994);
+        }
+    }
+    return u;
 }

@@ -49,3 +49,38 @@ vec3 projector_direction(vec2 raster) {
     vec3 d = vec3((raster.x - frame.intrinsics.z) / frame.intrinsics.x, -(raster.y - frame.intrinsics.w) / frame.intrinsics.y, -1.0);
     return normalize(transform_vector(frame.world_from_projector, d));
 }
+
+// The pixel of this invocation: four 8 x 8 workgroups a tile of the list. False outside the raster.
+bool tile_pixel(uint tile, out uvec2 pixel) {
+    pixel = uvec2(tile % frame.tiles_x, tile / frame.tiles_x) * 16u + uvec2(gl_WorkGroupID.x & 1u, (gl_WorkGroupID.x >> 1u) & 1u) * 8u + gl_LocalInvocationID.xy;
+    return pixel.x < frame.width && pixel.y < frame.height;
+}
+
+bool is_lit(Surface s) { return s.id != NO_HIT && s.distance > 0.0; }
+
+// Unit vector to 2 x 16 bits on the octahedron and back.
+uint encode_normal(vec3 n) {
+    n /= max(abs(n.x) + abs(n.y) + abs(n.z), 1e-12);
+    vec2 e = n.z >= 0.0 ? n.xy : (1.0 - abs(n.yx)) * vec2(n.x >= 0.0 ? 1.0 : -1.0, n.y >= 0.0 ? 1.0 : -1.0);
+    return packSnorm2x16(e);
+}
+
+vec3 decode_normal(uint bits) {
+    vec2 e = unpackSnorm2x16(bits);
+    vec3 n = vec3(e, 1.0 - abs(e.x) - abs(e.y));
+    if (n.z < 0.0) n.xy = (1.0 - abs(n.yx)) * vec2(n.x >= 0.0 ? 1.0 : -1.0, n.y >= 0.0 ? 1.0 : -1.0);
+    return normalize(n);
+}
+
+uint hash_u32(uint x) {
+    // A full-avalanche 32-bit mix.
+    x ^= x >> 16u;
+    x *= 0x21f0aaadu;
+    x ^= x >> 15u;
+    x *= 0x735a2d97u;
+    x ^= x >> 15u;
+    return x;
+}
+
+// Which zone of [paper] table 1 an angle lies in.
+uint zone_of(float degrees_) { return degrees_ <= frame.zone_degrees.x ? 0u : degrees_ <= frame.zone_degrees.y ? 1u : 2u; }

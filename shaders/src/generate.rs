@@ -21,11 +21,13 @@ macro_rules! glsl_types {
 glsl_types! {
     f32 => "float";
     u32 => "uint";
+    i32 => "int";
     [f32; 2] => "vec2";
     [f32; 3] => "vec3";
     [f32; 4] => "vec4";
     [u32; 3] => "uvec3";
     [u32; 4] => "uvec4";
+    [u32; 2] => "uvec2";
     structs::TextureUse => "TextureUse";
 }
 
@@ -41,9 +43,34 @@ pub fn generated_glsl() -> String {
     for (name, value) in structs::CONSTANTS.iter().chain(structs::BINDINGS) {
         out.push_str(&format!("#define {name} {value}u\n"));
     }
+    for (i, row) in sobol_rows().iter().enumerate() {
+        let words: Vec<_> = row.iter().map(|v| format!("{v}u")).collect();
+        out.push_str(&format!("#define SOBOL_ROW_{} {}\n", i + 1, words.join(", ")));
+    }
     out.push('\n');
     out.push_str(&structs::glsl());
     out
+}
+
+/// Direction numbers of Sobol dimensions 1 to 3 ([JoeKuo08]; dimension 0 is the bit reversal): polynomial and first numbers into 32 words.
+pub fn sobol_rows() -> [[u32; 32]; 3] {
+    // Degree, inner coefficients of the primitive polynomial, initial m.
+    let rows: [(usize, u32, &[u32]); 3] = [(1, 0, &[1]), (2, 1, &[1, 3]), (3, 1, &[1, 3, 1])];
+    rows.map(|(degree, inner, initial)| {
+        let mut v = [0u32; 32];
+        for (i, m) in initial.iter().enumerate() {
+            v[i] = m << (31 - i);
+        }
+        for i in degree..32 {
+            v[i] = v[i - degree] ^ (v[i - degree] >> degree);
+            for k in 1..degree {
+                if inner >> (degree - 1 - k) & 1 == 1 {
+                    v[i] ^= v[i - k];
+                }
+            }
+        }
+        v
+    })
 }
 
 /// FNV-1a over names and contents of all sources, in the order given: stands in `spv/sources.hash`.

@@ -32,6 +32,16 @@ shaders! {
     TRACE_TEXEL = "trace.texel";
     /// Path tracing, BVH through storage buffers.
     TRACE_STORAGE = "trace.storage";
+    /// History carried to where its surface point is now.
+    REPROJECT = "reproject";
+    /// Shading rates per tile.
+    RATE_MAP = "rate_map";
+    /// Which pixels are traced, with how many samples.
+    SCHEDULE = "schedule";
+    /// New samples into the history.
+    ACCUMULATE = "accumulate";
+    /// Spatial filter of the picture.
+    SPATIAL = "spatial";
     /// Compensation for distance, angle and albedo, then quantisation to code values.
     COMPENSATE = "compensate";
 }

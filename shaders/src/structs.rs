@@ -86,6 +86,102 @@ gpu_structs! {
         environment_select: f32,
         /// World position that all coordinates here are relative to.
         world_origin: [f32; 3],
+        /// Which half of the history is written by this frame, 0 or 1.
+        parity: u32,
+        /// The same for the last frame that the history holds: its stamp.
+        history_frame: u32,
+        /// Samples per lit pixel that the frame may spend on average (method dpm).
+        budget_spp: f32,
+        /// Most frames' worth of samples that the history may weigh (method dpm).
+        history_cap: f32,
+        /// Samples per traced pixel inside the inner angle, between, and outside ([paper] table 1).
+        zone_spp: [u32; 3],
+        /// Weight of the new frame in the same zones.
+        zone_alpha: [f32; 3],
+        /// Inner and outer angle at the eye, degrees ([paper] eq. 4).
+        zone_degrees: [f32; 2],
+        /// The spatial filter blends in between these angles, degrees.
+        filter_degrees: [f32; 2],
+        /// t of [paper] eq. 2.
+        rate_t: f32,
+        /// l of [paper] eq. 2.
+        rate_l: f32,
+        /// Pixels per unit of tangent times 1: the size of a pixel at distance 1, metres.
+        pixel_size: f32,
+    }
+
+    /// What is known of a pixel without noise.
+    struct Guide {
+        /// Pixels per frame that the surface point moved on the raster.
+        motion: [f32; 2],
+        /// Apparent pixel size, [paper] eq. 3.
+        size: f32,
+        /// Angle at the eye between the gaze point and this point, degrees.
+        angle: f32,
+        /// Reflectance by which radiance is divided before it is filtered: red and green as halves.
+        albedo_rg: u32,
+        /// Blue, as a half.
+        albedo_b: u32,
+    }
+
+    /// What former frames say about the surface point that a pixel shows now.
+    struct History {
+        /// Mean radiance, divided by the albedo where the method does so.
+        mean: [f32; 3],
+        /// Frames (paper) or samples (dpm) that the mean stands on; 0: none.
+        weight: f32,
+        /// The surface point, body space.
+        position: [f32; 3],
+        /// Its normal, body space, octahedral.
+        normal: u32,
+        /// Luminance of the last few frames.
+        fast: f32,
+        /// Variance of one sample's luminance.
+        variance: f32,
+        /// Luminance of the last traced frame alone; negative: none.
+        last: f32,
+        /// Variance of one frame's luminance, from differences between frames that follow each other.
+        noise: f32,
+        /// Seed of the point's sample sequence.
+        seed: u32,
+        /// Samples of it already used.
+        index: u32,
+        /// Body.
+        instance: u32,
+        /// Frame that wrote it.
+        frame: u32,
+    }
+
+    /// How long a tile's history may be, and what its pixels said about that (method dpm). Sums in units of 2^-16.
+    struct TileState {
+        /// Frames' worth of samples that the history may weigh.
+        cap: f32,
+        /// Sum of the squared lag of the history behind the last few frames, relative, noise subtracted.
+        lag: i32,
+        /// Sum of the variance of single frames, relative.
+        noise: i32,
+        /// Pixels that were added.
+        count: u32,
+    }
+
+    /// A pixel to be traced.
+    struct WorkItem {
+        /// Pixel index.
+        pixel: u32,
+        /// Samples.
+        spp: u32,
+    }
+
+    /// Sizes that one pass leaves for the next.
+    struct Schedule {
+        /// Workgroups of the tracing pass.
+        groups: [u32; 3],
+        /// Work items.
+        items: u32,
+        /// Sum of all pixels' importance, in units of 1 / 64.
+        importance: u32,
+        /// Lit pixels.
+        lit: u32,
     }
 
     /// One rigid body in the top level.
@@ -265,6 +361,16 @@ pub const CONSTANTS: &[(&str, u32)] = &[
     ("LIGHT_SPOT", LIGHT_SPOT),
     ("LIGHT_DIRECTIONAL", LIGHT_DIRECTIONAL),
     ("FRAME_CAMERA_IS_EYE", FRAME_CAMERA_IS_EYE),
+    ("FRAME_RATE_MAP", FRAME_RATE_MAP),
+    ("FRAME_CHECKERBOARD", FRAME_CHECKERBOARD),
+    ("FRAME_SPP_BY_ANGLE", FRAME_SPP_BY_ANGLE),
+    ("FRAME_TEMPORAL", FRAME_TEMPORAL),
+    ("FRAME_DPM", FRAME_DPM),
+    ("FRAME_ALLOCATE", FRAME_ALLOCATE),
+    ("RATE_TABLE_OCTAVE", RATE_TABLE_OCTAVE),
+    ("RATE_TABLE_OCTAVES", RATE_TABLE_OCTAVES),
+    ("NOISE_SIZE", NOISE_SIZE),
+    ("NOISE_FRAMES", NOISE_FRAMES),
     ("ALBEDO_TABLE_SIZE", ALBEDO_TABLE_SIZE),
 ];
 /// A pixel that met nothing.
@@ -295,6 +401,26 @@ pub const LIGHT_SPOT: u32 = 2;
 pub const LIGHT_DIRECTIONAL: u32 = 3;
 /// Ordinary camera: radiance goes back along the primary ray, everything hit is lit (tests).
 pub const FRAME_CAMERA_IS_EYE: u32 = 1;
+/// Rates are decided per tile ([paper] section 2.2 and 2.3).
+pub const FRAME_RATE_MAP: u32 = 2;
+/// Half of the coarse pixels in each frame.
+pub const FRAME_CHECKERBOARD: u32 = 4;
+/// Samples by visual angle.
+pub const FRAME_SPP_BY_ANGLE: u32 = 8;
+/// Former frames are blended in; without it a traced pixel shows its own samples only.
+pub const FRAME_TEMPORAL: u32 = 16;
+/// Method dpm: every sample counts once in the history, radiance is filtered without its albedo.
+pub const FRAME_DPM: u32 = 32;
+/// Method dpm: samples go where they lower the error most.
+pub const FRAME_ALLOCATE: u32 = 64;
+/// Entries of the table of [Yang19]'s b functions per octave of velocity.
+pub const RATE_TABLE_OCTAVE: u32 = 1024;
+/// Octaves of that table, from 2^-6 pixels per frame.
+pub const RATE_TABLE_OCTAVES: u32 = 40;
+/// Side of the blue-noise masks.
+pub const NOISE_SIZE: u32 = 64;
+/// Slices of the blue-noise masks.
+pub const NOISE_FRAMES: u32 = 32;
 /// Side of the directional-albedo table.
 pub const ALBEDO_TABLE_SIZE: u32 = 32;
 
@@ -317,4 +443,14 @@ pub const BINDINGS: &[(&str, u32)] = &[
     ("B_RADIANCE", 14),
     ("B_CODES", 15),
     ("B_COUNTERS", 16),
+    ("B_GUIDES", 17),
+    ("B_HISTORY", 18),
+    ("B_RATES", 19),
+    ("B_RATE_TABLE", 20),
+    ("B_SCHEDULE", 21),
+    ("B_WORK", 22),
+    ("B_NOISE", 23),
+    ("B_FILTERED", 24),
+    ("B_SHOWN", 25),
+    ("B_TILE_STATES", 26),
 ];

@@ -3,6 +3,7 @@
 use crate::statistics::Estimate;
 use dpm_host::geometry::projector::ProjectorCamera;
 use dpm_host::gpu::{validation_messages, Gpu, GpuOptions};
+use dpm_host::render::method::Method;
 use dpm_host::render::{FrameInputs, Renderer, RendererSettings};
 use dpm_host::scene::Scene;
 use dpm_shaders::structs::{Counters, Surface, NO_HIT};
@@ -96,12 +97,13 @@ impl<'a> Shot<'a> {
             ambient: self.ambient,
             camera_is_eye: self.eye.is_none(),
             leave_nothing_out: self.leave_nothing_out,
+            method: Method::full(self.spp),
         }
     }
 
     /// Draws it.
     pub fn draw(&self, gpu: &Arc<Gpu>) -> Picture {
-        let renderer = Renderer::new(gpu, self.scene, self.settings()).expect("the scene fits the GPU");
+        let mut renderer = Renderer::new(gpu, self.scene, self.settings()).expect("the scene fits the GPU");
         let mut slot = renderer.create_slot(true).expect("memory for a small frame");
         let poses = self.world_from_body();
         let eye = self.eye.unwrap_or(self.camera.position());
@@ -110,6 +112,7 @@ impl<'a> Shot<'a> {
             let inputs = FrameInputs {
                 frame,
                 spp: self.spp,
+                budget_spp: self.spp as f32,
                 camera: &self.camera,
                 eye,
                 gaze: eye,

@@ -3,3 +3,4 @@
 pub mod pictures;
 pub mod run_rig;
 pub mod stability;
+pub mod sequence;

@@ -6,7 +6,8 @@ use crate::failure::{Failure, FailureKind};
 use crate::files::write_atomically;
 use crate::gpu::{Gpu, GpuError, GpuOptions};
 use crate::pipeline::{self, PipelineError, RunOptions};
-use crate::render::{RenderError, Renderer};
+use crate::render::method::Method;
+use crate::render::{RenderError, Renderer, RendererSettings};
 use crate::rig::{Rig, RigError};
 use crate::telemetry::monitor::RunMonitor;
 use crate::telemetry::report::Report;
@@ -41,9 +42,10 @@ pub fn run_rig(config: &RigConfig, monitor: &Arc<RunMonitor>) -> Result<Report, 
         ));
     }
     if keep_frames > 0 {
-        let renderer = Renderer::new(&gpu, &rig.scene, pipeline::renderer_settings(&rig))
-            .map_err(PipelineError::from)?;
-        let made = pictures(&rig, &renderer, &outcome.light)
+        // Only surfaces are asked of it, so the simplest method will do.
+        let settings = RendererSettings { method: Method::full(1), ..pipeline::renderer_settings(&rig) };
+        let mut renderer = Renderer::new(&gpu, &rig.scene, settings).map_err(PipelineError::from)?;
+        let made = pictures(&rig, &mut renderer, &outcome.light)
             .map_err(|e| Failure::from(PipelineError::Render(e.into())))?;
         if let Some(made) = made {
             let white = made.viewer.iter().fold(0.0f32, |m, v| m.max(v.max_element())).max(1e-9);

@@ -10,7 +10,7 @@ mod error;
 mod pipeline;
 
 pub use buffer::{Buffer, MemoryKind};
-pub use commands::{CommandList, FrameFence};
+pub use commands::{CommandList, FrameFence, Recorder};
 pub use context::{validation_messages, DeviceSummary, Gpu, GpuOptions};
 pub use error::GpuError;
 pub use pipeline::{BindingKind, BindingSet, BindingTable, ComputePipeline};

@@ -14,6 +14,7 @@ use crate::frame::Stage;
 use crate::gpu::Gpu;
 use crate::pack::{BitPlaneFrame, Kernel};
 use crate::realtime::standstill::StandstillMonitor;
+use crate::render::method::Method;
 use crate::render::{FrameCost, RenderError, Renderer, RendererSettings};
 use crate::rig::{Rig, RigError};
 use crate::telemetry::monitor::RunMonitor;
@@ -129,7 +130,7 @@ pub fn run(
     monitor: &RunMonitor,
 ) -> Result<RunOutcome, PipelineError> {
     let config = &rig.config;
-    let renderer = Renderer::new(gpu, &rig.scene, renderer_settings(&rig))?;
+    let mut renderer = Renderer::new(gpu, &rig.scene, renderer_settings(&rig))?;
     let is_virtual = config.real_time.pace == Pace::Virtual;
     let clock = if is_virtual {
         // The link comes up just before the first frame, so that nobody waits for the filters.
@@ -258,7 +259,7 @@ pub fn run(
         };
         let tracking = TrackingStage::new(&rig, tracker);
         let mut collector = Collector::new(rig.clone(), options.keep_frames, verify);
-        let cable = run_threads(&shared, tracking, &renderer, kernel, link, cable, &mut collector)?;
+        let cable = run_threads(&shared, tracking, &mut renderer, kernel, link, cable, &mut collector)?;
         device_over.store(true, Ordering::Release);
         let recorder = match (cable, device) {
             (Cable::Direct(_, recorder), _) => recorder,
@@ -325,6 +326,7 @@ pub fn renderer_settings(rig: &Rig) -> RendererSettings {
         ambient: rig.config.scene.ambient.map(|v| v as f32),
         camera_is_eye: false,
         leave_nothing_out: false,
+        method: Method::from_config(r),
     }
 }
 
@@ -332,7 +334,7 @@ pub fn renderer_settings(rig: &Rig) -> RendererSettings {
 fn run_threads(
     shared: &Shared<'_>,
     tracking: TrackingStage,
-    renderer: &Renderer,
+    renderer: &mut Renderer,
     kernel: Kernel,
     link: HostLink,
     cable: Cable,
@@ -417,7 +419,7 @@ fn tracking_thread(shared: &Shared<'_>, mut stage: TrackingStage, mut latest: Pu
     }
 }
 
-fn plan_thread(shared: &Shared<'_>, renderer: &Renderer, mut latest: Reader<TrackSnapshot>) {
+fn plan_thread(shared: &Shared<'_>, renderer: &mut Renderer, mut latest: Reader<TrackSnapshot>) {
     shared.rights.enter(1);
     let costs = shared.costs();
     let modelled = costs.iter().sum::<i64>() + MARGIN_NS;

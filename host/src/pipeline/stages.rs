@@ -128,13 +128,14 @@ pub fn plan(job: &mut FrameJob, rig: &Rig, snapshot: &TrackSnapshot, slots: &Lin
 ///
 /// # Errors
 /// Device lost.
-pub fn submit(job: &mut FrameJob, rig: &Rig, renderer: &Renderer) -> Result<(), GpuError> {
+pub fn submit(job: &mut FrameJob, rig: &Rig, renderer: &mut Renderer) -> Result<(), GpuError> {
     let Some(slot) = job.gpu.as_mut() else { return Ok(()) };
     renderer.submit(
         slot,
         &FrameInputs {
             frame: job.id.0 as u32,
             spp: rig.config.render.spp,
+            budget_spp: rig.config.render.spp as f32,
             camera: &rig.camera,
             eye: job.eye,
             gaze: job.gaze,

@@ -5,6 +5,8 @@ pub mod blue_noise;
 mod body_bvh;
 pub mod compensation;
 mod fill;
+pub mod method;
+pub mod rate_map;
 mod renderer;
 pub mod scene_data;
 mod scene_gpu;

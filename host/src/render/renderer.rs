@@ -1,17 +1,22 @@
 //! One frame on the GPU: surfaces, radiance, code values. Reads top to bottom in `Renderer::record`.
 
+use super::blue_noise;
+use super::method::Method;
+use super::rate_map;
 use super::scene_data::{world_bounds, SceneData, SceneDataError, SceneNeeds};
 use super::scene_gpu::SceneGpu;
-use super::tiles::TileList;
+use super::tiles::{TileList, TILE};
 use crate::geometry::projector::ProjectorCamera;
 use crate::gpu::{
     BindingKind, BindingSet, BindingTable, Buffer, CommandList, ComputePipeline, FrameFence, Gpu, GpuError,
-    MemoryKind,
+    MemoryKind, Recorder,
 };
 use crate::scene::Scene;
 use bytemuck::Zeroable;
 use dpm_device::planes::Raster;
-use dpm_shaders::structs::{self as gpu_structs, Counters, Frame, Instance, Rows, Surface};
+use dpm_shaders::structs::{
+    self as gpu_structs, Counters, Frame, Guide, History, Instance, Rows, Schedule, Surface, WorkItem,
+};
 use glam::{DAffine3, DVec3, Vec3};
 use std::sync::Arc;
 
@@ -34,6 +39,8 @@ pub struct RendererSettings {
     pub camera_is_eye: bool,
     /// Compile in what the scene does not need (tests).
     pub leave_nothing_out: bool,
+    /// How rays are spent.
+    pub method: Method,
 }
 
 /// What changes from frame to frame. Small: it is written just before the GPU starts.
@@ -41,8 +48,10 @@ pub struct RendererSettings {
 pub struct FrameInputs<'a> {
     /// Number of the frame.
     pub frame: u32,
-    /// Samples per pixel.
+    /// Samples per traced pixel where neither angle nor budget decides.
     pub spp: u32,
+    /// Samples per lit pixel on average (method dpm).
+    pub budget_spp: f32,
     /// Projector.
     pub camera: &'a ProjectorCamera,
     /// Eye, world.
@@ -67,7 +76,14 @@ pub enum RenderError {
 }
 
 /// Names of the passes whose ends are stamped, in order.
-pub const PASSES: &[&str] = &["primary", "trace", "compensate", "readback"];
+pub const PASSES: &[&str] =
+    &["primary", "reproject", "rate map", "schedule", "trace", "accumulate", "spatial", "compensate", "readback"];
+
+/// No frame has this number: what the history holds before the first.
+const NEVER: u32 = u32::MAX;
+/// Byte offsets in the dispatch arguments: four workgroups a tile, and one a tile in frames that decide rates.
+const PER_TILE_QUARTER: u64 = 0;
+const PER_TILE_RATES: u64 = 16;
 
 /// What a frame cost.
 #[derive(Clone, Copy, Debug, Default)]
@@ -97,11 +113,23 @@ pub struct FrameSlot {
     tiles: Buffer,
     counters_host: Buffer,
     codes_host: Buffer,
-    _device_only: [Buffer; 4],
-    debug_host: Option<[Buffer; 2]>,
+    _device_only: Vec<Buffer>,
+    debug_host: Option<DebugBuffers>,
     tile_list: TileList,
     raster: Raster,
+    parity: u32,
     stamps: [u64; PASSES.len() + 1],
+}
+
+/// Copies for looking at.
+struct DebugBuffers {
+    shown: Buffer,
+    surfaces: Buffer,
+    guides: Buffer,
+    history: Buffer,
+    prior: Buffer,
+    traced: Buffer,
+    rates: Buffer,
 }
 
 impl FrameSlot {
@@ -131,29 +159,104 @@ impl FrameSlot {
 
     /// Mean radiance and sample count of every pixel; only with `debug` at creation.
     pub fn radiance(&self) -> Option<&[[f32; 4]]> {
-        self.debug_host.as_ref().map(|d| d[0].read(self.raster.pixel_count()))
+        self.debug_host.as_ref().map(|d| d.shown.read(self.raster.pixel_count()))
     }
 
     /// What each pixel's ray met; only with `debug` at creation.
     pub fn surfaces(&self) -> Option<&[Surface]> {
-        self.debug_host.as_ref().map(|d| d[1].read(self.raster.pixel_count()))
+        self.debug_host.as_ref().map(|d| d.surfaces.read(self.raster.pixel_count()))
+    }
+
+    /// Noise-free facts of each lit pixel; only with `debug` at creation.
+    pub fn guides(&self) -> Option<&[Guide]> {
+        self.debug_host.as_ref().map(|d| d.guides.read(self.raster.pixel_count()))
+    }
+
+    /// History after this frame; only with `debug` at creation.
+    pub fn history(&self) -> Option<&[History]> {
+        self.debug_host.as_ref().map(|d| {
+            let n = self.raster.pixel_count();
+            let at = self.parity as usize * n;
+            &d.history.read::<History>(2 * n)[at..at + n]
+        })
+    }
+
+    /// Luminance that each pixel's history had before this frame's samples, -1 where none; only with `debug` at creation.
+    pub fn prior_luminance(&self) -> Option<Vec<f32>> {
+        self.debug_host.as_ref().map(|d| {
+            let n = self.raster.pixel_count();
+            let at = self.parity as usize * n;
+            let known = |h: &History| {
+                let [r, g, b] = h.mean;
+                if h.weight > 0.0 {
+                    r * 0.2126 + g * 0.7152 + b * 0.0722
+                } else {
+                    -1.0
+                }
+            };
+            d.prior.read::<History>(2 * n)[at..at + n].iter().map(known).collect()
+        })
+    }
+
+    /// Samples taken at each pixel this frame, w of the radiance; only with `debug` at creation.
+    pub fn traced(&self) -> Option<&[[f32; 4]]> {
+        self.debug_host.as_ref().map(|d| d.traced.read(self.raster.pixel_count()))
+    }
+
+    /// Shading rate of every tile, log2 of the coarse pixel's sides in bits 0..1 and 2..3; only with `debug` at creation.
+    pub fn rates(&self) -> Option<&[u32]> {
+        self.debug_host.as_ref().map(|d| d.rates.read(self.tile_list.len()))
     }
 }
 
 /// Draws frames of one scene.
 pub struct Renderer {
     // Dropped before the buffers they use.
-    primary: ComputePipeline,
-    trace: ComputePipeline,
-    compensate: ComputePipeline,
+    pipelines: Pipelines,
     table: Arc<BindingTable>,
+    shared: SharedBuffers,
     scene: SceneGpu,
     data: SceneData,
     settings: RendererSettings,
     needs: SceneNeeds,
     /// Per body of the scene: which tracked body carries it.
     tracked: Vec<Option<u16>>,
+    /// What the history holds: the last frame submitted and its poses.
+    last: Last,
     gpu: Arc<Gpu>,
+}
+
+/// One pipeline a pass; `None`: the method does not need it and it is not recorded.
+struct Pipelines {
+    primary: ComputePipeline,
+    reproject: Option<ComputePipeline>,
+    rate_map: Option<ComputePipeline>,
+    schedule: ComputePipeline,
+    trace: ComputePipeline,
+    accumulate: Option<ComputePipeline>,
+    spatial: Option<ComputePipeline>,
+    compensate: ComputePipeline,
+}
+
+/// Memory that outlives a frame.
+struct SharedBuffers {
+    history: Buffer,
+    rates: Buffer,
+    rate_table: Buffer,
+    noise: Buffer,
+    tile_states: Buffer,
+    /// What the schedule starts from.
+    schedule_start: Buffer,
+}
+
+/// The frame that the history holds.
+struct Last {
+    frame: u32,
+    parity: u32,
+    poses: Vec<DAffine3>,
+    origin: DVec3,
+    /// Frames submitted so far: rates are decided in every second one.
+    count: u64,
 }
 
 fn rows(m: &DAffine3) -> Rows {
@@ -194,32 +297,50 @@ impl Renderer {
             })
             .collect();
         let table = BindingTable::new(gpu, &kinds)?;
-        let constants = needs.constants();
+        let method = &settings.method;
+        let mut constants = needs.constants().to_vec();
+        constants.extend([
+            (10, method.sampler as u32),
+            (11, u32::from(method.needs_history() || method.needs_spatial() || method.spp_by_angle)),
+            (12, u32::from(method.dpm)),
+            (13, u32::from(method.spatial)),
+        ]);
+        let pipeline = |shader| ComputePipeline::new(&table, shader, &constants);
         let pick = |t, s| if texel { t } else { s };
-        let primary = ComputePipeline::new(
-            &table,
-            pick(dpm_shaders::PRIMARY_TEXEL, dpm_shaders::PRIMARY_STORAGE),
-            &constants,
-        )?;
-        let trace = ComputePipeline::new(
-            &table,
-            pick(dpm_shaders::TRACE_TEXEL, dpm_shaders::TRACE_STORAGE),
-            &constants,
-        )?;
-        let compensate = ComputePipeline::new(&table, dpm_shaders::COMPENSATE, &constants)?;
+        let only = |wanted: bool, shader| wanted.then(|| pipeline(shader)).transpose();
+        let pipelines = Pipelines {
+            primary: pipeline(pick(dpm_shaders::PRIMARY_TEXEL, dpm_shaders::PRIMARY_STORAGE))?,
+            reproject: only(method.needs_history(), dpm_shaders::REPROJECT)?,
+            rate_map: only(method.needs_rates(), dpm_shaders::RATE_MAP)?,
+            schedule: pipeline(dpm_shaders::SCHEDULE)?,
+            trace: pipeline(pick(dpm_shaders::TRACE_TEXEL, dpm_shaders::TRACE_STORAGE))?,
+            accumulate: only(method.needs_history(), dpm_shaders::ACCUMULATE)?,
+            spatial: only(method.needs_spatial(), dpm_shaders::SPATIAL)?,
+            compensate: pipeline(dpm_shaders::COMPENSATE)?,
+        };
+        let pixels = if method.needs_history() { settings.raster.pixel_count() } else { 1 };
+        let tiles = settings.raster.width().div_ceil(TILE) * settings.raster.height().div_ceil(TILE);
+        let shared = SharedBuffers {
+            history: Buffer::new(gpu, "history", 2 * pixels * size_of::<History>(), MemoryKind::Device)?,
+            rates: Buffer::from_slice(gpu, "shading rates", &vec![0u32; tiles as usize])?,
+            rate_table: Buffer::from_slice(gpu, "rate table", &rate_map::rate_table())?,
+            noise: Buffer::from_slice(gpu, "blue noise", blue_noise::MASK)?,
+            tile_states: Buffer::from_slice(
+                gpu,
+                "tile states",
+                &vec![gpu_structs::TileState::zeroed(); tiles as usize],
+            )?,
+            schedule_start: Buffer::from_slice(
+                gpu,
+                "schedule",
+                &[Schedule { groups: [0, 1, 1], ..Schedule::zeroed() }],
+            )?,
+        };
+        super::fill::fill(gpu, &shared.history, &History { frame: NEVER, ..History::zeroed() }, 2 * pixels)?;
         let tracked = scene.bodies.iter().map(|b| b.tracked).collect();
-        Ok(Self {
-            primary,
-            trace,
-            compensate,
-            table,
-            scene: scene_gpu,
-            data,
-            settings,
-            needs,
-            tracked,
-            gpu: gpu.clone(),
-        })
+        let poses = Vec::with_capacity(scene.bodies.len());
+        let last = Last { frame: NEVER, parity: 0, poses, origin: DVec3::ZERO, count: 0 };
+        Ok(Self { pipelines, table, shared, scene: scene_gpu, data, settings, needs, tracked, last, gpu: gpu.clone() })
     }
 
     fn is_lost(&self, body: usize, lost: &[bool]) -> bool {
@@ -258,7 +379,7 @@ impl Renderer {
         let tile_list = TileList::new(raster.width(), raster.height());
         let frame = size("frame uniforms", size_of::<Frame>(), Upload)?;
         let instances = size("instances", size_of::<Instance>() * self.data.bodies.len().max(1), Upload)?;
-        let arguments = size("dispatch arguments", 16, Upload)?;
+        let arguments = size("dispatch arguments", 32, Upload)?;
         let tiles = size("tile list", tile_list.len() * 4, Upload)?;
         let counters = size("counters", size_of::<Counters>(), Device)?;
         let counters_host = size("counters", size_of::<Counters>(), Readback)?;
@@ -266,13 +387,34 @@ impl Renderer {
         let radiance = size("radiance", pixels * 16, Device)?;
         let codes = size("code values", pixels * 4, Device)?;
         let codes_host = size("code values", pixels * 4, Readback)?;
+        let method = &self.settings.method;
+        let with = |wanted: bool, what, bytes, kind| size(what, if wanted { bytes } else { 16 }, kind);
+        let history_bytes = self.shared.history.len_bytes();
+        let guides = size("guides", pixels * size_of::<Guide>(), Device)?;
+        let schedule = size("schedule", size_of::<Schedule>(), Device)?;
+        let work = size("work items", pixels * size_of::<WorkItem>(), Device)?;
+        let filtered = with(method.needs_history(), "filtered radiance", pixels * 16, Device)?;
+        let filtered_shown = with(method.needs_spatial(), "shown radiance", pixels * 16, Device)?;
         let debug_host = if debug {
-            Some([
-                size("radiance", pixels * 16, Readback)?,
-                size("surfaces", pixels * size_of::<Surface>(), Readback)?,
-            ])
+            Some(DebugBuffers {
+                shown: size("shown radiance", pixels * 16, Readback)?,
+                surfaces: size("surfaces", pixels * size_of::<Surface>(), Readback)?,
+                guides: size("guides", pixels * size_of::<Guide>(), Readback)?,
+                history: size("history", history_bytes.max(2 * pixels * size_of::<History>()), Readback)?,
+                prior: size("prior history", history_bytes.max(2 * pixels * size_of::<History>()), Readback)?,
+                traced: size("radiance", pixels * 16, Readback)?,
+                rates: size("shading rates", tile_list.len() * 4, Readback)?,
+            })
         } else {
             None
+        };
+        // The last pass that ran before compensation is what is shown.
+        let shown = if method.needs_spatial() {
+            &filtered_shown
+        } else if method.needs_history() {
+            &filtered
+        } else {
+            &radiance
         };
         let s = &self.scene;
         let buffer_of = |name: &str| match name {
@@ -293,6 +435,16 @@ impl Renderer {
             "B_RADIANCE" => &radiance,
             "B_CODES" => &codes,
             "B_COUNTERS" => &counters,
+            "B_GUIDES" => &guides,
+            "B_HISTORY" => &self.shared.history,
+            "B_RATES" => &self.shared.rates,
+            "B_RATE_TABLE" => &self.shared.rate_table,
+            "B_SCHEDULE" => &schedule,
+            "B_WORK" => &work,
+            "B_NOISE" => &self.shared.noise,
+            "B_FILTERED" => &filtered,
+            "B_SHOWN" => shown,
+            "B_TILE_STATES" => &self.shared.tile_states,
             other => unreachable!("binding {other} has no buffer"),
         };
         let bindings: Vec<_> = gpu_structs::BINDINGS.iter().map(|&(n, b)| (b, buffer_of(n))).collect();
@@ -302,24 +454,45 @@ impl Renderer {
         super::fill::fill(gpu, &surfaces, &nothing, pixels)?;
         super::fill::fill(gpu, &codes, &0u32, pixels)?;
         super::fill::fill(gpu, &radiance, &[0f32; 4], pixels)?;
+        super::fill::fill(gpu, &guides, &Guide::zeroed(), pixels)?;
+        super::fill::fill(gpu, shown, &[0f32; 4], pixels)?;
+        let p = &self.pipelines;
         let list = CommandList::record(gpu, PASSES.len() as u32 + 1, |r| {
+            // The frame, in order. A pass that the method does not need is not recorded; its stamp is.
+            let tiled = |r: &mut Recorder<'_>, pass: Option<&ComputePipeline>, offset: u64| {
+                if let Some(pass) = pass {
+                    r.dispatch_indirect(pass, &set, &arguments, offset);
+                    r.barrier();
+                }
+                r.stamp();
+            };
             r.clear(&counters);
+            r.copy(&self.shared.schedule_start, &schedule, size_of::<Schedule>());
             r.barrier();
             r.stamp();
-            r.dispatch_indirect(&self.primary, &set, &arguments, 0);
+            tiled(r, Some(&p.primary), PER_TILE_QUARTER);
+            tiled(r, p.reproject.as_ref(), PER_TILE_QUARTER);
+            if let Some(d) = &debug_host {
+                r.copy(&self.shared.history, &d.prior, history_bytes);
+                r.barrier();
+            }
+            tiled(r, p.rate_map.as_ref(), PER_TILE_RATES);
+            tiled(r, Some(&p.schedule), PER_TILE_QUARTER);
+            r.dispatch_indirect(&p.trace, &set, &schedule, 0);
             r.barrier();
             r.stamp();
-            r.dispatch_indirect(&self.trace, &set, &arguments, 0);
-            r.barrier();
-            r.stamp();
-            r.dispatch_indirect(&self.compensate, &set, &arguments, 0);
-            r.barrier();
-            r.stamp();
+            tiled(r, p.accumulate.as_ref(), PER_TILE_QUARTER);
+            tiled(r, p.spatial.as_ref(), PER_TILE_QUARTER);
+            tiled(r, Some(&p.compensate), PER_TILE_QUARTER);
             r.copy(&codes, &codes_host, pixels * 4);
             r.copy(&counters, &counters_host, size_of::<Counters>());
-            if let Some([radiance_host, surfaces_host]) = &debug_host {
-                r.copy(&radiance, radiance_host, pixels * 16);
-                r.copy(&surfaces, surfaces_host, pixels * size_of::<Surface>());
+            if let Some(d) = &debug_host {
+                r.copy(shown, &d.shown, pixels * 16);
+                r.copy(&surfaces, &d.surfaces, pixels * size_of::<Surface>());
+                r.copy(&guides, &d.guides, pixels * size_of::<Guide>());
+                r.copy(&self.shared.history, &d.history, history_bytes);
+                r.copy(&radiance, &d.traced, pixels * 16);
+                r.copy(&self.shared.rates, &d.rates, tile_list.len() * 4);
             }
             r.barrier_to_host();
             r.stamp();
@@ -334,10 +507,13 @@ impl Renderer {
             tiles,
             counters_host,
             codes_host,
-            _device_only: [counters, surfaces, radiance, codes],
+            _device_only: vec![
+                counters, surfaces, radiance, codes, guides, schedule, work, filtered, filtered_shown,
+            ],
             debug_host,
             tile_list,
             raster,
+            parity: 0,
             stamps: [0; PASSES.len() + 1],
         })
     }
@@ -349,7 +525,7 @@ impl Renderer {
     ///
     /// # Panics
     /// When there are fewer poses than bodies: a programmer's mistake.
-    pub fn submit(&self, slot: &mut FrameSlot, inputs: &FrameInputs<'_>) -> Result<(), GpuError> {
+    pub fn submit(&mut self, slot: &mut FrameSlot, inputs: &FrameInputs<'_>) -> Result<(), GpuError> {
         assert_eq!(inputs.poses.len(), self.data.bodies.len(), "one pose per body");
         if self.settings.camera_is_eye {
             slot.tile_list.fill();
@@ -362,13 +538,16 @@ impl Renderer {
             );
         }
         let tile_count = slot.tile_list.write(bytemuck::cast_slice_mut(slot.tiles.bytes_mut()));
-        // Four 8 x 8 workgroups a tile.
-        slot.arguments.write(&[[tile_count * 4, 1u32, 1]]);
+        // Four 8 x 8 workgroups a tile; rates are decided in every second frame, one workgroup a tile.
+        let rate_tiles = if self.last.count.is_multiple_of(2) { tile_count } else { 0 };
+        slot.arguments.write(&[[tile_count * 4, 1u32, 1, 0], [rate_tiles, 1, 1, 0]]);
         // The projector is the origin: f32 is finest where the rays start.
         let origin = inputs.camera.position();
         let shift = DAffine3::from_translation(-origin);
         for (i, (body, pose)) in self.data.bodies.iter().zip(inputs.poses).enumerate() {
             let world_from_object = shift * *pose;
+            let before = self.last.poses.get(i).copied().unwrap_or(*pose);
+            let previous = DAffine3::from_translation(-self.last.origin) * before;
             let (lower, upper) = world_bounds(&world_from_object, body.bounds_min, body.bounds_max);
             // Bounds grow by the rounding of the transforms.
             let slack = (lower.abs().max(upper.abs()).max_element() + f64::from(body.extent)) * 1e-6;
@@ -379,7 +558,7 @@ impl Renderer {
                 node_offset: body.node_offset,
                 bounds_max: (upper + slack).as_vec3().into(),
                 triangle_offset: body.triangle_offset,
-                previous_world_from_object: rows(&world_from_object),
+                previous_world_from_object: rows(if self.last.frame == NEVER { &world_from_object } else { &previous }),
                 // What is lost still casts virtual shadows where it was last, but gets no light.
                 flags: if self.is_lost(i, inputs.lost) {
                     body.flags & !gpu_structs::INSTANCE_PROJECTED
@@ -394,6 +573,7 @@ impl Renderer {
                 .copy_from_slice(bytemuck::bytes_of(&instance));
         }
         let raster = self.settings.raster;
+        let method = &self.settings.method;
         let c = inputs.camera;
         let frame = Frame {
             projector_position: [0.0; 3],
@@ -414,15 +594,35 @@ impl Renderer {
             drive_gain: self.settings.drive_gain,
             ambient: self.settings.ambient,
             light_count: self.data.lights.len() as u32,
-            flags: if self.settings.camera_is_eye { gpu_structs::FRAME_CAMERA_IS_EYE } else { 0 },
+            flags: method.flags()
+                | if self.settings.camera_is_eye { gpu_structs::FRAME_CAMERA_IS_EYE } else { 0 },
             environment: self.data.environment_constant.into(),
             environment_width: self.data.environment_size[0],
             environment_height: self.data.environment_size[1],
             environment_rotation: self.data.environment_rotation,
             environment_select: self.data.environment_select,
             world_origin: origin.as_vec3().into(),
+            parity: 1 - self.last.parity,
+            history_frame: self.last.frame,
+            budget_spp: inputs.budget_spp,
+            history_cap: method.history_cap,
+            zone_spp: method.paper.zone_spp,
+            zone_alpha: method.paper.temporal_alpha.map(|a| a as f32),
+            zone_degrees: [method.paper.phi_h_deg as f32, method.paper.phi_q_deg as f32],
+            filter_degrees: [method.paper.filter_from_deg as f32, method.paper.filter_to_deg as f32],
+            rate_t: method.paper.t as f32,
+            rate_l: method.paper.l as f32,
+            pixel_size: (1.0 / c.fx) as f32,
         };
         slot.frame.write(&[frame]);
-        slot.list.submit(&mut slot.fence)
+        slot.parity = frame.parity;
+        slot.list.submit(&mut slot.fence)?;
+        self.last.frame = inputs.frame;
+        self.last.parity = frame.parity;
+        self.last.count += 1;
+        self.last.origin = origin;
+        self.last.poses.clear();
+        self.last.poses.extend_from_slice(inputs.poses);
+        Ok(())
     }
 }

@@ -11,6 +11,11 @@ const VARIANTS: &[(&str, &str, &[&str])] = &[
     ("primary.storage", "primary.comp", &[]),
     ("trace.texel", "trace.comp", &["-DBVH_TEXEL"]),
     ("trace.storage", "trace.comp", &[]),
+    ("reproject", "reproject.comp", &[]),
+    ("rate_map", "rate_map.comp", &[]),
+    ("schedule", "schedule.comp", &[]),
+    ("accumulate", "accumulate.comp", &[]),
+    ("spatial", "spatial.comp", &[]),
     ("compensate", "compensate.comp", &[]),
 ];
 

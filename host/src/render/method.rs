@@ -1,0 +1,111 @@
+//! How a frame spends its rays: a method of the rig file with its switches, as the renderer needs it.
+
+use crate::config::{PaperConfig, RenderConfig, RenderMethod};
+use dpm_shaders::structs as gpu;
+
+/// Where random numbers come from.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+#[repr(u32)]
+pub enum SamplerKind {
+    /// Independent for every path.
+    Independent = 0,
+    /// One point set a frame, shifted at every pixel by blue noise.
+    BlueNoise = 1,
+    /// One low-discrepancy sequence a surface point, continued over frames.
+    Continued = 2,
+}
+
+/// A method with all switches resolved.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Method {
+    /// This program's own method (history counts samples, demodulated) instead of the paper's.
+    pub dpm: bool,
+    /// Rays by importance (dpm) or shading rates per tile (paper).
+    pub rate_map: bool,
+    /// Half of the coarse pixels a frame (not dpm).
+    pub checkerboard: bool,
+    /// Random numbers.
+    pub sampler: SamplerKind,
+    /// Former frames are blended in.
+    pub temporal: bool,
+    /// The picture is filtered in space.
+    pub spatial: bool,
+    /// Samples by visual angle (not dpm).
+    pub spp_by_angle: bool,
+    /// Samples per lit pixel and frame that dpm may spend; also the count where no other rule applies.
+    pub budget_spp: f32,
+    /// Frames' worth of samples that dpm's history may weigh.
+    pub history_cap: f32,
+    /// The paper's constants.
+    pub paper: PaperConfig,
+}
+
+/// Frames' worth of samples in dpm's history: long enough that the eye's own 31 frames are not the limit, short enough that light that
+/// changes in 0.1 s is followed.
+pub const HISTORY_CAP: f32 = 96.0;
+
+impl Method {
+    /// The paper's predecessor [Nomoto20]: every pixel, independent samples, nothing kept.
+    pub fn full(spp: u32) -> Self {
+        Self {
+            dpm: false,
+            rate_map: false,
+            checkerboard: false,
+            sampler: SamplerKind::Independent,
+            temporal: false,
+            spatial: false,
+            spp_by_angle: false,
+            budget_spp: spp as f32,
+            history_cap: 0.0,
+            paper: PaperConfig::default(),
+        }
+    }
+
+    /// What the rig file asks for.
+    pub fn from_config(config: &RenderConfig) -> Self {
+        let effects = config.effects_on();
+        let dpm = config.method == RenderMethod::Dpm;
+        Self {
+            dpm,
+            rate_map: effects.rate_map,
+            checkerboard: effects.checkerboard && !dpm,
+            sampler: match (effects.blue_noise, dpm) {
+                (false, _) => SamplerKind::Independent,
+                (true, false) => SamplerKind::BlueNoise,
+                (true, true) => SamplerKind::Continued,
+            },
+            temporal: effects.temporal_filter,
+            spatial: effects.spatial_filter,
+            spp_by_angle: effects.spp_by_angle && !dpm,
+            budget_spp: config.spp as f32,
+            history_cap: if effects.temporal_filter { HISTORY_CAP } else { 0.0 },
+            paper: config.paper.clone(),
+        }
+    }
+
+    /// A history is kept: for blending, or because not every pixel is traced in every frame.
+    pub fn needs_history(&self) -> bool {
+        self.dpm || self.temporal || self.rate_map || self.checkerboard
+    }
+
+    /// The pass `rate_map` is recorded.
+    pub fn needs_rates(&self) -> bool {
+        self.rate_map && !self.dpm
+    }
+
+    /// The pass `spatial` is recorded.
+    pub fn needs_spatial(&self) -> bool {
+        self.dpm || self.spatial
+    }
+
+    /// `FRAME_*` bits.
+    pub fn flags(&self) -> u32 {
+        let bit = |on: bool, flag: u32| if on { flag } else { 0 };
+        bit(self.needs_rates(), gpu::FRAME_RATE_MAP)
+            | bit(self.checkerboard, gpu::FRAME_CHECKERBOARD)
+            | bit(self.spp_by_angle, gpu::FRAME_SPP_BY_ANGLE)
+            | bit(self.temporal, gpu::FRAME_TEMPORAL)
+            | bit(self.dpm, gpu::FRAME_DPM)
+            | bit(self.dpm && self.rate_map, gpu::FRAME_ALLOCATE)
+    }
+}

@@ -1,0 +1,104 @@
+// New samples into the history, and the history into the picture.
+//
+// [paper]: weight of the new frame by angle, 1 / (n + 1) after a disocclusion. Method dpm: every sample counts once, up to a cap that
+// shrinks where the last few frames say something else than the history.
+#version 460
+#extension GL_GOOGLE_include_directive : require
+#include "scene.glsl"
+#include "coarse.glsl"
+
+layout(local_size_x = 8, local_size_y = 8) in;
+
+layout(set = 0, binding = B_TILES, scalar) readonly buffer Tiles { uint tiles[]; };
+layout(set = 0, binding = B_GUIDES, scalar) readonly buffer Guides { Guide guides[]; };
+layout(set = 0, binding = B_RADIANCE, scalar) readonly buffer Radiance { vec4 radiance_in[]; };
+layout(set = 0, binding = B_HISTORY, scalar) buffer Histories { History histories[]; };
+layout(set = 0, binding = B_TILE_STATES, scalar) buffer TileStates { TileState tile_states[]; };
+layout(set = 0, binding = B_FILTERED, scalar) buffer Filtered { vec4 filtered[]; };
+
+vec3 albedo_of(uint at) { return vec3(unpackHalf2x16(guides[at].albedo_rg), unpackHalf2x16(guides[at].albedo_b).x); }
+
+void main() {
+    uvec2 pixel;
+    if (!tile_pixel(tiles[gl_WorkGroupID.x >> 2u], pixel)) return;
+    uint at = pixel.y * frame.width + pixel.x;
+    if (!is_lit(surfaces[at])) {
+        filtered[at] = vec4(0.0);
+        return;
+    }
+    History h = histories[frame.parity * frame.width * frame.height + at];
+    if ((frame.flags & FRAME_DPM) != 0u) {
+        vec4 traced = radiance_in[at];
+        vec3 albedo = albedo_of(at);
+        if (traced.w > 0.0) {
+            vec3 fresh = traced.rgb / albedo;
+            float y = luminance(traced.rgb);
+            h.index += uint(traced.w);
+            // Variance of one sample about the mean of history and frame, averaged over the samples the history holds.
+            float second = filtered[at].x / traced.w;
+            float known = luminance(h.mean * albedo);
+            float about = h.weight > 0.0 ? mix(y, known, h.weight / (h.weight + traced.w)) : y;
+            float variance = max(second - 2.0 * about * y + about * about, 0.0);
+            float v_weight = clamp(traced.w / (min(h.weight, 32.0) + traced.w), 0.0, 1.0);
+            h.variance = h.weight > 0.0 ? mix(h.variance, variance, v_weight) : max(variance, 0.25 * y * y);
+            // Noise of single frames from their differences, which a slow change does not enter.
+            float n_weight = 0.1;
+            if (h.last >= 0.0) h.noise = mix(h.noise, 0.5 * (y - h.last) * (y - h.last), h.noise > 0.0 ? n_weight : 1.0);
+            h.last = y;
+            // The last few frames against the history: where they disagree by more than noise the history is old.
+            h.fast = h.weight > 0.0 ? mix(h.fast, y, 0.25) : y;
+            float per_frame = max(frame.budget_spp, 0.5);
+            float frames = max(h.weight / per_frame, 1.0);
+            float cap = tile_states[(pixel.y >> 4u) * frame.tiles_x + (pixel.x >> 4u)].cap * per_frame;
+            float drift = h.fast - known;
+            // A mean of weight 1/4 has 1/7 of a frame's variance; the history shares its samples.
+            float noise2 = h.noise * max(1.0 / 7.0 - 1.0 / frames, 0.0);
+            if (frames > 7.0 && h.noise > 0.0) {
+                float scale = 65536.0 / (known * known + 0.01);
+                int lag = int(clamp((drift * drift - noise2) * scale, -65536.0, 65536.0));
+                int noise = int(clamp(h.noise * scale, 0.0, 65536.0));
+                uint tile = (pixel.y >> 4u) * frame.tiles_x + (pixel.x >> 4u);
+                atomicAdd(tile_states[tile].lag, lag);
+                atomicAdd(tile_states[tile].noise, noise);
+                atomicAdd(tile_states[tile].count, 1u);
+            }
+            // A jump (a shadow's edge, a light switched on) is not waited for.
+            float jump = drift * drift / max(noise2 + h.noise / 7.0 + 1e-6 * known * known, 1e-12);
+            if (h.weight > 0.0 && jump > 25.0) h.weight *= clamp(25.0 / jump, 0.25, 1.0);
+            h.weight = min(h.weight, cap);
+            // Every traced frame weighs the same, whatever its samples: their number follows from former samples, and weighing by it
+            // would dilute every bright sample by the many that it calls for.
+            h.mean = h.weight > 0.0 ? mix(h.mean, fresh, per_frame / (h.weight + per_frame)) : fresh;
+            h.weight += per_frame;
+        }
+        filtered[at] = vec4(h.mean, h.weight > 0.0 ? h.variance / h.weight : 0.0);
+    } else {
+        uvec2 size = block_size(pixel);
+        uvec2 source = traced_pixel(pixel, size);
+        uint from = source.y * frame.width + source.x;
+        vec4 traced = is_traced_block(pixel, size) ? radiance_in[from] : vec4(0.0);
+        if (traced.w > 0.0) {
+            float floor_ = (frame.flags & FRAME_TEMPORAL) != 0u ? frame.zone_alpha[zone_of(guides[at].angle)] : 1.0;
+            float alpha = max(1.0 / (h.weight + 1.0), floor_);
+            h.mean = mix(h.mean, traced.rgb, alpha);
+            h.weight = min(h.weight + 1.0, 4096.0);
+        } else if (!(h.weight > 0.0)) {
+            // Nothing known and not traced: the nearest of the four coarse neighbours that was.
+            const ivec2 beside[4] = ivec2[](ivec2(-1, 0), ivec2(1, 0), ivec2(0, -1), ivec2(0, 1));
+            for (int i = 0; i < 4; i++) {
+                ivec2 q = ivec2(pixel) + beside[i] * ivec2(size);
+                if (any(lessThan(q, ivec2(0))) || any(greaterThanEqual(q, ivec2(frame.width, frame.height)))) continue;
+                uvec2 other_size = block_size(uvec2(q));
+                if (!is_lit(surfaces[uint(q.y) * frame.width + uint(q.x)]) || !is_traced_block(uvec2(q), other_size)) continue;
+                uvec2 other = traced_pixel(uvec2(q), other_size);
+                vec4 r = radiance_in[other.y * frame.width + other.x];
+                if (r.w > 0.0) {
+                    h.mean = r.rgb;
+                    break;
+                }
+            }
+        }
+        filtered[at] = vec4(h.mean, 1.0);
+    }
+    histories[frame.parity * frame.width * frame.height + at] = h;
+}
