@@ -2,5 +2,5 @@
 
 pub mod pictures;
 pub mod run_rig;
-pub mod stability;
 pub mod sequence;
+pub mod stability;

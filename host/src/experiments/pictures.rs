@@ -28,7 +28,11 @@ struct Window<'a> {
 ///
 /// # Errors
 /// The GPU's.
-pub fn pictures(rig: &Rig, renderer: &mut Renderer, light: &[LightFrame]) -> Result<Option<Pictures>, GpuError> {
+pub fn pictures(
+    rig: &Rig,
+    renderer: &mut Renderer,
+    light: &[LightFrame],
+) -> Result<Option<Pictures>, GpuError> {
     let half_slot = rig.rate().slot_len_ns(0) / 2;
     let frames: Option<Vec<_>> = light
         .iter()
@@ -98,7 +102,16 @@ fn integrate(
     let mut poses = Vec::new();
     rig.scene_poses(tracked, &mut poses);
     let mut slot = renderer.create_slot(true)?;
-    let inputs = FrameInputs { frame: 0, spp: 1, budget_spp: 1.0, camera, eye: other, gaze: other, poses: &poses, lost: &[] };
+    let inputs = FrameInputs {
+        frame: 0,
+        spp: 1,
+        budget_spp: 1.0,
+        camera,
+        eye: other,
+        gaze: other,
+        poses: &poses,
+        lost: &[],
+    };
     renderer.submit(&mut slot, &inputs)?;
     slot.wait(60_000_000_000)?;
     let surfaces = slot.surfaces().unwrap_or(&[]);

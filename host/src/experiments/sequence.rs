@@ -61,9 +61,8 @@ fn spp_of_frame(spp: f32, frame: u32) -> u32 {
 pub fn poses_at(rig: &Rig, slot: u64) -> Vec<DAffine3> {
     let rate = rig.rate();
     let t = rate.slot_start_ns(slot) + rate.slot_len_ns(slot) / 2;
-    let tracked = rig
-        .true_poses(t)
-        .unwrap_or_else(|| rig.bodies.iter().map(|b| crate::rig::affine(&b.rest)).collect());
+    let tracked =
+        rig.true_poses(t).unwrap_or_else(|| rig.bodies.iter().map(|b| crate::rig::affine(&b.rest)).collect());
     let mut out = Vec::new();
     rig.scene_poses(&tracked, &mut out);
     out
@@ -103,7 +102,12 @@ impl Theatre {
                 let at = DVec2::new(f64::from(i as u32 % width) + 0.5, f64::from(i as u32 / width) + 0.5);
                 let ray = rig.camera.ray(at);
                 let world = ray.origin + ray.direction * f64::from(s.distance);
-                Probe { body, point: poses[body].inverse().transform_point3(world), pixel: i as u32, angle: g.angle }
+                Probe {
+                    body,
+                    point: poses[body].inverse().transform_point3(world),
+                    pixel: i as u32,
+                    angle: g.angle,
+                }
             })
             .collect();
         Ok(Self { rig, gpu, span, probes })
@@ -152,7 +156,11 @@ impl Theatre {
                 seen.samples += u64::from(c.samples);
                 seen.gpu_ns += cost.pass_ns.iter().sum::<u64>();
                 seen.costs.push(cost);
-                seen.frames.push(self.look(&poses, slot.radiance().unwrap_or(&[]), slot.surfaces().unwrap_or(&[])));
+                seen.frames.push(self.look(
+                    &poses,
+                    slot.radiance().unwrap_or(&[]),
+                    slot.surfaces().unwrap_or(&[]),
+                ));
             }
         }
         Ok(seen)

@@ -225,7 +225,12 @@ mod tests {
 
     const PAPER: RateConstants = RateConstants { t: 0.0762, l: 0.363, degrees: [15.0, 30.0] };
 
-    fn tile(f: impl Fn(usize, usize) -> f32, motion: [f32; 2], size: f32, angle: f32) -> [Option<PixelGuide>; 256] {
+    fn tile(
+        f: impl Fn(usize, usize) -> f32,
+        motion: [f32; 2],
+        size: f32,
+        angle: f32,
+    ) -> [Option<PixelGuide>; 256] {
         std::array::from_fn(|i| Some(PixelGuide { luminance: Some(f(i % 16, i / 16)), motion, size, angle }))
     }
 
@@ -233,7 +238,8 @@ mod tests {
     fn table_follows_the_fits() {
         let table = rate_table();
         assert_eq!(blur(&table, 0.0), [1.0, 2.13]);
-        for (v, h, q) in [(0.5, 0.956, 2.085), (1.0, 0.763, 1.919), (4.0, 0.210, 0.784), (16.0, 0.047, 0.163)] {
+        for (v, h, q) in [(0.5, 0.956, 2.085), (1.0, 0.763, 1.919), (4.0, 0.210, 0.784), (16.0, 0.047, 0.163)]
+        {
             let b = blur(&table, v);
             assert!((b[0] - h).abs() < 1e-3 && (b[1] - q).abs() < 1e-3, "{v}: {b:?}");
         }
@@ -269,7 +275,8 @@ mod tests {
                         continue;
                     }
                     if let (Some(a), Some(b)) = (at(x, y), at(px, py)) {
-                        sum += ((f64::from(a.luminance.unwrap()) - f64::from(b.luminance.unwrap())) / 2.0).powi(2);
+                        sum += ((f64::from(a.luminance.unwrap()) - f64::from(b.luminance.unwrap())) / 2.0)
+                            .powi(2);
                         n += 1.0;
                     }
                 }
@@ -307,8 +314,22 @@ mod tests {
             if ratio.iter().any(|r| (r - 1.0).abs() < 1e-4) {
                 continue;
             }
-            let axis = |h: f64, q: f64| if h >= 1.0 { 0 } else if q < 1.0 { 2 } else { 1u32 };
-            let by_angle = if angle <= 15.0 { 0 } else if angle > 30.0 { 2 } else { 1 };
+            let axis = |h: f64, q: f64| {
+                if h >= 1.0 {
+                    0
+                } else if q < 1.0 {
+                    2
+                } else {
+                    1u32
+                }
+            };
+            let by_angle = if angle <= 15.0 {
+                0
+            } else if angle > 30.0 {
+                2
+            } else {
+                1
+            };
             let x = axis(ratio[0], ratio[1]).max(by_angle);
             let y = axis(ratio[2], ratio[3]).max(by_angle);
             let rate = decide(&tile, &table, &PAPER);
@@ -330,7 +351,8 @@ mod tests {
         let weaker = tile(|x, _| if x % 2 == 0 { 0.75 } else { 1.249_999 }, [0.0; 2], 1.0, 0.0);
         assert_eq!(decide(&weaker, &table, &exact).x, 1);
         // phi = phi_H is Full, above is Half; phi = phi_Q is Half, above is Quarter.
-        let flat = |angle| decide(&tile(|x, y| ((x + y) % 2) as f32 * 9.0, [0.0; 2], 9.0, angle), &table, &PAPER);
+        let flat =
+            |angle| decide(&tile(|x, y| ((x + y) % 2) as f32 * 9.0, [0.0; 2], 9.0, angle), &table, &PAPER);
         assert_eq!(flat(15.0), Rate { x: 0, y: 0 });
         assert_eq!(flat(15.000_001), Rate { x: 1, y: 1 });
         assert_eq!(flat(30.0), Rate { x: 1, y: 1 });

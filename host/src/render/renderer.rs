@@ -76,8 +76,17 @@ pub enum RenderError {
 }
 
 /// Names of the passes whose ends are stamped, in order.
-pub const PASSES: &[&str] =
-    &["primary", "reproject", "rate map", "schedule", "trace", "accumulate", "spatial", "compensate", "readback"];
+pub const PASSES: &[&str] = &[
+    "primary",
+    "reproject",
+    "rate map",
+    "schedule",
+    "trace",
+    "accumulate",
+    "spatial",
+    "compensate",
+    "readback",
+];
 
 /// No frame has this number: what the history holds before the first.
 const NEVER: u32 = u32::MAX;
@@ -340,7 +349,18 @@ impl Renderer {
         let tracked = scene.bodies.iter().map(|b| b.tracked).collect();
         let poses = Vec::with_capacity(scene.bodies.len());
         let last = Last { frame: NEVER, parity: 0, poses, origin: DVec3::ZERO, count: 0 };
-        Ok(Self { pipelines, table, shared, scene: scene_gpu, data, settings, needs, tracked, last, gpu: gpu.clone() })
+        Ok(Self {
+            pipelines,
+            table,
+            shared,
+            scene: scene_gpu,
+            data,
+            settings,
+            needs,
+            tracked,
+            last,
+            gpu: gpu.clone(),
+        })
     }
 
     fn is_lost(&self, body: usize, lost: &[bool]) -> bool {
@@ -508,7 +528,15 @@ impl Renderer {
             counters_host,
             codes_host,
             _device_only: vec![
-                counters, surfaces, radiance, codes, guides, schedule, work, filtered, filtered_shown,
+                counters,
+                surfaces,
+                radiance,
+                codes,
+                guides,
+                schedule,
+                work,
+                filtered,
+                filtered_shown,
             ],
             debug_host,
             tile_list,
@@ -558,7 +586,11 @@ impl Renderer {
                 node_offset: body.node_offset,
                 bounds_max: (upper + slack).as_vec3().into(),
                 triangle_offset: body.triangle_offset,
-                previous_world_from_object: rows(if self.last.frame == NEVER { &world_from_object } else { &previous }),
+                previous_world_from_object: rows(if self.last.frame == NEVER {
+                    &world_from_object
+                } else {
+                    &previous
+                }),
                 // What is lost still casts virtual shadows where it was last, but gets no light.
                 flags: if self.is_lost(i, inputs.lost) {
                     body.flags & !gpu_structs::INSTANCE_PROJECTED
