@@ -27,6 +27,27 @@ uint quantise(float v, inout uint nans, inout uint clipped) {
     return uint(shifted);
 }
 
+// |cos| between the smooth normal and the pixel's ray, without contraction and with no quotient but 1/x: bit for bit the CPU's `real_cosine`.
+float real_cosine(vec4 rows[3], vec3 n0, vec3 n1, vec3 n2, vec2 b, vec2 raster) {
+    precise float w = (1.0 - b.x) - b.y;
+    precise vec3 n = (n0 * w + n1 * b.x) + n2 * b.y;
+    // The ray times fx fy: its length is divided out below.
+    precise vec3 d = vec3((raster.x - frame.intrinsics.z) * frame.intrinsics.y, (frame.intrinsics.w - raster.y) * frame.intrinsics.x, -(frame.intrinsics.x * frame.intrinsics.y));
+    precise float dot_ = 0.0, nn = 0.0, dd = 0.0;
+    for (int i = 0; i < 3; i++) {
+        precise float ni = (rows[i].x * n.x + rows[i].y * n.y) + rows[i].z * n.z;
+        precise float di = (frame.world_from_projector[i].x * d.x + frame.world_from_projector[i].y * d.y) + frame.world_from_projector[i].z * d.z;
+        dot_ = dot_ + ni * di;
+        nn = nn + ni * ni;
+        dd = dd + di * di;
+    }
+    precise float squared = nn * dd;
+    if (!(squared > 0.0)) return 0.0; // opposite normals that cancel
+    precise float inverse = 1.0 / sqrt(squared);
+    precise float cosine = abs(dot_) * inverse;
+    return cosine;
+}
+
 layout(set = 0, binding = B_TRIANGLE_REFS, scalar) readonly buffer TriangleRefs { TriangleRef triangle_refs[]; };
 layout(set = 0, binding = B_VERTICES, scalar) readonly buffer Vertices { Vertex vertices[]; };
 layout(set = 0, binding = B_TILES, scalar) readonly buffer Tiles { uint tiles[]; };
@@ -42,11 +63,10 @@ void main() {
         TriangleRef ref = triangle_refs[instances[instance].triangle_offset + (surface.id & 0xffffffu)];
         vec2 b = surface.barycentric;
         // The real surface is smooth: its normal is the interpolated one, without the look's normal map.
-        vec3 n = vertices[ref.vertices.x].normal * (1.0 - b.x - b.y) + vertices[ref.vertices.y].normal * b.x + vertices[ref.vertices.z].normal * b.y;
-        float cosine = abs(dot(transform_normal(instances[instance].world_from_object, n), projector_direction(vec2(pixel) + 0.5)));
-        vec3 target = shown[index].rgb - frame.ambient;
-        float geometry = surface.distance * surface.distance / max(cosine, 1e-3);
-        vec3 drive = target * (frame.drive_gain * geometry);
+        float cosine = real_cosine(instances[instance].world_from_object, vertices[ref.vertices.x].normal, vertices[ref.vertices.y].normal,
+                                   vertices[ref.vertices.z].normal, b, vec2(pixel) + 0.5);
+        precise float geometry = (surface.distance * surface.distance) * (1.0 / max(cosine, 1e-3));
+        precise vec3 drive = (shown[index].rgb - frame.ambient) * (frame.drive_gain * geometry);
         code = quantise(drive.r, nans, clipped) | (quantise(drive.g, nans, clipped) << 8u) | (quantise(drive.b, nans, clipped) << 16u);
         lit = 1u;
     }

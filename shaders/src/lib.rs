@@ -4,6 +4,8 @@
 //! tests fail when either is stale, so users need no shader compiler.
 
 pub mod generate;
+#[cfg(test)]
+mod spirv_layout_tests;
 pub mod structs;
 
 /// A compute shader as SPIR-V, with the name of its source for messages.

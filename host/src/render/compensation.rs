@@ -3,6 +3,8 @@
 //! `drive = pi (L - L_amb) l^2 / (rho max(cos, 1e-3) I_max)`, clamped to 0..1, per channel: linear in light, no display gamma
 //! (`docs/RENDERING.md`). The f32 form performs the shader's operations in the shader's order; the f64 form is its oracle.
 
+use dpm_shaders::structs::{Frame, Rows};
+
 /// Smallest cosine between surface and projector that is still compensated: beyond it the drive would be full anyway.
 pub const LEAST_COS: f64 = 1e-3;
 
@@ -37,15 +39,14 @@ impl Compensation {
     /// Drive 0..1 per channel for the radiance wanted toward the eye. `distance`: projector to surface, metres. `cos`: between the
     /// smooth normal and the direction to the projector, either sign. NaN gives 0.
     pub fn drive(&self, radiance: [f32; 3], distance: f32, cos: f32) -> [f32; 3] {
-        let geometry = distance * distance / cos.abs().max(LEAST_COS as f32);
-        std::array::from_fn(|c| {
-            let v = (radiance[c] - self.ambient[c]) * (self.gain[c] * geometry);
-            if v.is_nan() {
-                0.0
-            } else {
-                v.clamp(0.0, 1.0)
-            }
-        })
+        self.unlimited_drive(radiance, distance, cos)
+            .map(|v| if v.is_nan() { 0.0 } else { v.clamp(0.0, 1.0) })
+    }
+
+    /// [`Self::drive`] before clamping, NaN included: what the shader hands to its quantiser.
+    pub fn unlimited_drive(&self, radiance: [f32; 3], distance: f32, cos: f32) -> [f32; 3] {
+        let geometry = (distance * distance) * (1.0 / cos.abs().max(LEAST_COS as f32));
+        std::array::from_fn(|c| (radiance[c] - self.ambient[c]) * (self.gain[c] * geometry))
     }
 
     /// The same in f64.
@@ -68,6 +69,35 @@ impl Compensation {
                 + f64::from(self.ambient[c])
         })
     }
+}
+
+/// `|cos|` between the smooth normal of a surface and the ray of a pixel, in the shader's operations and order. `rows`: the body's
+/// world-from-object; `normals`: of the triangle's corners; `raster`: pixel centre. 0 where the normals cancel.
+pub fn real_cosine(
+    rows: &Rows,
+    normals: [[f32; 3]; 3],
+    barycentric: [f32; 2],
+    frame: &Frame,
+    raster: [f32; 2],
+) -> f32 {
+    let [b1, b2] = barycentric;
+    let w = (1.0 - b1) - b2;
+    let n: [f32; 3] = std::array::from_fn(|k| (normals[0][k] * w + normals[1][k] * b1) + normals[2][k] * b2);
+    let [fx, fy, cx, cy] = frame.intrinsics;
+    let d = [(raster[0] - cx) * fy, (cy - raster[1]) * fx, -(fx * fy)];
+    let turn = |row: &[f32; 4], v: [f32; 3]| (row[0] * v[0] + row[1] * v[1]) + row[2] * v[2];
+    let (mut dot, mut nn, mut dd) = (0.0f32, 0.0f32, 0.0f32);
+    for (row, projector_row) in rows.iter().zip(&frame.world_from_projector) {
+        let (ni, di) = (turn(row, n), turn(projector_row, d));
+        dot += ni * di;
+        nn += ni * ni;
+        dd += di * di;
+    }
+    let squared = nn * dd;
+    if squared.is_nan() || squared <= 0.0 {
+        return 0.0;
+    }
+    dot.abs() * (1.0 / squared.sqrt())
 }
 
 #[cfg(test)]

@@ -1,0 +1,133 @@
+//! Offsets and strides that the committed SPIR-V uses against those of the Rust structs.
+//!
+//! Optimised SPIR-V has no names, so blocks are found by their bindings: each holds an array of one shared struct, or one struct.
+
+use crate::structs::{self, layout, BINDINGS};
+use std::collections::{BTreeSet, HashMap};
+
+/// The instructions that say how blocks lie in memory.
+#[derive(Default)]
+struct Module {
+    /// Variable to binding.
+    bindings: HashMap<u32, u32>,
+    /// Variable to pointer type.
+    variables: HashMap<u32, u32>,
+    /// Pointer type to what it points at.
+    pointers: HashMap<u32, u32>,
+    /// Struct type to its members' types.
+    structs: HashMap<u32, Vec<u32>>,
+    /// Array type to its element's type.
+    arrays: HashMap<u32, u32>,
+    /// Array type to its stride.
+    strides: HashMap<u32, u32>,
+    /// Struct type and member to the offset.
+    offsets: HashMap<(u32, u32), u32>,
+}
+
+/// Reads a module; only the instructions needed here, by their numbers in the SPIR-V specification.
+fn parse(spirv: &[u8]) -> Module {
+    let words: Vec<u32> =
+        spirv.chunks_exact(4).map(|b| u32::from_le_bytes([b[0], b[1], b[2], b[3]])).collect();
+    assert_eq!(words[0], 0x0723_0203, "SPIR-V's magic number");
+    let mut module = Module::default();
+    let mut at = 5;
+    while at < words.len() {
+        let (count, opcode) = ((words[at] >> 16) as usize, words[at] & 0xffff);
+        assert!(count > 0, "an instruction without length");
+        let w = &words[at + 1..at + count];
+        match opcode {
+            28 | 29 => drop(module.arrays.insert(w[0], w[1])),
+            30 => drop(module.structs.insert(w[0], w[1..].to_vec())),
+            32 => drop(module.pointers.insert(w[0], w[2])),
+            59 => drop(module.variables.insert(w[1], w[0])),
+            71 if w[1] == 6 => drop(module.strides.insert(w[0], w[2])),
+            71 if w[1] == 33 => drop(module.bindings.insert(w[0], w[2])),
+            72 if w[2] == 35 => drop(module.offsets.insert((w[0], w[1]), w[3])),
+            _ => {}
+        }
+        at += count;
+    }
+    module
+}
+
+/// The Rust struct behind each binding that holds one, and its size.
+const BLOCKS: &[(&str, &str, usize)] = &[
+    ("B_FRAME", "Frame", size_of::<structs::Frame>()),
+    ("B_INSTANCES", "Instance", size_of::<structs::Instance>()),
+    ("B_TRIANGLE_REFS", "TriangleRef", size_of::<structs::TriangleRef>()),
+    ("B_VERTICES", "Vertex", size_of::<structs::Vertex>()),
+    ("B_MATERIALS", "Material", size_of::<structs::Material>()),
+    ("B_TEXTURES", "TextureInfo", size_of::<structs::TextureInfo>()),
+    ("B_LIGHTS", "Light", size_of::<structs::Light>()),
+    ("B_SURFACES", "Surface", size_of::<structs::Surface>()),
+    ("B_COUNTERS", "Counters", size_of::<structs::Counters>()),
+    ("B_GUIDES", "Guide", size_of::<structs::Guide>()),
+    ("B_HISTORY", "History", size_of::<structs::History>()),
+    ("B_SCHEDULE", "Schedule", size_of::<structs::Schedule>()),
+    ("B_WORK", "WorkItem", size_of::<structs::WorkItem>()),
+    ("B_TILE_STATES", "TileState", size_of::<structs::TileState>()),
+];
+
+fn offsets_of(name: &str) -> Vec<usize> {
+    layout().iter().filter(|(s, _, _)| *s == name).map(|(_, _, offset)| *offset).collect()
+}
+
+fn assert_struct(module: &Module, what: &str, id: u32, name: &str) {
+    let expected = offsets_of(name);
+    let found: Vec<usize> = (0..module.structs[&id].len() as u32)
+        .map(|m| module.offsets.get(&(id, m)).map_or(usize::MAX, |o| *o as usize))
+        .collect();
+    assert_eq!(found, expected, "{what}: members of {name}");
+}
+
+#[test]
+fn offsets_and_strides_are_those_of_the_rust_structs() {
+    let mut seen = BTreeSet::new();
+    for shader in crate::ALL {
+        let module = parse(shader.spirv);
+        assert!(!module.bindings.is_empty(), "{}", shader.name);
+        for (variable, binding) in &module.bindings {
+            let (binding_name, _) = (BINDINGS.iter())
+                .find(|(_, b)| b == binding)
+                .unwrap_or_else(|| panic!("{}: binding {binding} is not in BINDINGS", shader.name));
+            let Some(&(_, name, size)) = BLOCKS.iter().find(|(b, _, _)| b == binding_name) else { continue };
+            let what = format!("{} {binding_name}", shader.name);
+            // variable -> pointer -> block -> struct, or -> runtime array -> struct
+            let block = module.pointers[&module.variables[variable]];
+            let member = module.structs[&block][0];
+            assert_eq!(module.offsets[&(block, 0)], 0, "{what}");
+            let id = match module.arrays.get(&member) {
+                Some(&element) => {
+                    assert_eq!(module.strides[&member] as usize, size, "{what}: stride");
+                    element
+                }
+                None => member,
+            };
+            assert_struct(&module, &what, id, name);
+            seen.insert(name);
+            if name == "Material" {
+                // The last members are structs themselves.
+                let texture_use = module.structs[&id][module.structs[&id].len() - 1];
+                assert_struct(&module, &what, texture_use, "TextureUse");
+                seen.insert("TextureUse");
+            }
+        }
+    }
+    let all: BTreeSet<_> = layout().iter().map(|(name, _, _)| *name).collect();
+    let unseen: Vec<_> = all.difference(&seen).collect();
+    assert!(unseen.is_empty(), "no shader was checked for {unseen:?}: add its binding to BLOCKS");
+}
+
+#[test]
+fn a_wrong_offset_is_found() {
+    // The test above must be able to fail: move one member of one struct in a copy of a shader.
+    let mut words: Vec<u8> = crate::COMPENSATE.spirv.to_vec();
+    let module = parse(&words);
+    let (&(id, member), &offset) =
+        module.offsets.iter().filter(|(_, o)| **o > 0).min_by_key(|(k, _)| **k).expect("members");
+    let pattern: Vec<u8> =
+        [5 << 16 | 72, id, member, 35, offset].iter().flat_map(|w: &u32| w.to_le_bytes()).collect();
+    let at = words.windows(pattern.len()).position(|w| w == pattern).expect("the decoration is there");
+    words[at + 16] ^= 4;
+    assert_eq!(parse(&words).offsets[&(id, member)], offset ^ 4);
+}

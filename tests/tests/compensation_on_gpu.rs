@@ -1,0 +1,278 @@
+//! The compensation shader against its CPU twin, bit for bit, on radiance and surfaces that no scene would give it.
+
+use bytemuck::Zeroable;
+use dpm_host::gpu::{
+    BindingKind, BindingSet, BindingTable, Buffer, CommandList, ComputePipeline, FrameFence, Gpu, MemoryKind,
+};
+use dpm_host::pack::{quantise, QuantiseCounts};
+use dpm_host::reference::Sampler;
+use dpm_host::render::compensation::{real_cosine, Compensation};
+use dpm_host::render::scene_data::SceneNeeds;
+use dpm_shaders::structs::{Counters, Frame, Instance, Rows, Surface, TriangleRef, Vertex, BINDINGS, NO_HIT};
+use dpm_tests::gpu::with_gpu;
+use std::mem::size_of;
+use std::sync::Arc;
+
+const WIDTH: u32 = 48;
+const HEIGHT: u32 = 32;
+const PIXELS: usize = (WIDTH * HEIGHT) as usize;
+
+/// All that the shader reads.
+struct Input {
+    frame: Frame,
+    instances: Vec<Instance>,
+    refs: Vec<TriangleRef>,
+    vertices: Vec<Vertex>,
+    surfaces: Vec<Surface>,
+    radiance: Vec<[f32; 4]>,
+}
+
+/// Runs the shader alone.
+fn on_gpu(gpu: &Arc<Gpu>, input: &Input) -> (Vec<u32>, Counters) {
+    let uploaded = |what: &str, bytes: &[u8]| {
+        let mut buffer = Buffer::new(gpu, what, bytes.len(), MemoryKind::Upload).unwrap();
+        buffer.bytes_mut()[..bytes.len()].copy_from_slice(bytes);
+        buffer
+    };
+    let tiles: Vec<u32> = (0..WIDTH.div_ceil(16) * HEIGHT.div_ceil(16)).collect();
+    let device = |what, bytes| Buffer::new(gpu, what, bytes, MemoryKind::Device).unwrap();
+    let host = |what, bytes| Buffer::new(gpu, what, bytes, MemoryKind::Readback).unwrap();
+    let unused = uploaded("unused", &[0; 16]);
+    let frame = uploaded("frame", bytemuck::bytes_of(&input.frame));
+    let instances = uploaded("instances", bytemuck::cast_slice(&input.instances));
+    let refs = uploaded("refs", bytemuck::cast_slice(&input.refs));
+    let vertices = uploaded("vertices", bytemuck::cast_slice(&input.vertices));
+    let surfaces = uploaded("surfaces", bytemuck::cast_slice(&input.surfaces));
+    let radiance = uploaded("radiance", bytemuck::cast_slice(&input.radiance));
+    let tile_list = uploaded("tiles", bytemuck::cast_slice(&tiles));
+    let codes = device("codes", PIXELS * 4);
+    let counters = device("counters", size_of::<Counters>());
+    let codes_host = host("codes", PIXELS * 4);
+    let counters_host = host("counters", size_of::<Counters>());
+    let kind = |name: &str| if name == "B_FRAME" { BindingKind::Uniform } else { BindingKind::Storage };
+    let kinds: Vec<_> = BINDINGS.iter().map(|&(name, binding)| (binding, kind(name))).collect();
+    let table = BindingTable::new(gpu, &kinds).unwrap();
+    let constants = SceneNeeds::default().everything().constants();
+    let pipeline = ComputePipeline::new(&table, dpm_shaders::COMPENSATE, &constants).unwrap();
+    let buffers: Vec<(u32, &Buffer)> = BINDINGS
+        .iter()
+        .map(|&(name, binding)| {
+            let buffer = match name {
+                "B_FRAME" => &frame,
+                "B_INSTANCES" => &instances,
+                "B_TRIANGLE_REFS" => &refs,
+                "B_VERTICES" => &vertices,
+                "B_TILES" => &tile_list,
+                "B_SURFACES" => &surfaces,
+                "B_SHOWN" => &radiance,
+                "B_CODES" => &codes,
+                "B_COUNTERS" => &counters,
+                _ => &unused,
+            };
+            (binding, buffer)
+        })
+        .collect();
+    let set = BindingSet::new(&table, &buffers).unwrap();
+    let list = CommandList::record(gpu, 0, |r| {
+        r.clear(&counters);
+        r.barrier();
+        r.dispatch(&pipeline, &set, [tiles.len() as u32 * 4, 1, 1]);
+        r.barrier();
+        r.copy(&codes, &codes_host, PIXELS * 4);
+        r.copy(&counters, &counters_host, size_of::<Counters>());
+        r.barrier_to_host();
+    })
+    .unwrap();
+    let mut fence = FrameFence::new(gpu).unwrap();
+    list.submit(&mut fence).unwrap();
+    fence.wait(60_000_000_000).unwrap();
+    (codes_host.read(PIXELS).to_vec(), counters_host.read::<Counters>(1)[0])
+}
+
+/// The same on the CPU.
+fn twin(input: &Input) -> (Vec<u32>, QuantiseCounts, u32) {
+    let k = Compensation { gain: [input.frame.drive_gain; 3], ambient: input.frame.ambient };
+    let mut lit = 0;
+    let drive: Vec<[f32; 4]> = (0..PIXELS)
+        .map(|i| {
+            let s = &input.surfaces[i];
+            if s.id == NO_HIT || s.distance.is_nan() || s.distance <= 0.0 {
+                return [0.0; 4];
+            }
+            lit += 1;
+            let instance = &input.instances[(s.id >> 24) as usize];
+            let corners = input.refs[(instance.triangle_offset + (s.id & 0xff_ffff)) as usize].vertices;
+            let normals = corners.map(|v| input.vertices[v as usize].normal);
+            let at = [(i as u32 % WIDTH) as f32 + 0.5, (i as u32 / WIDTH) as f32 + 0.5];
+            let cos = real_cosine(&instance.world_from_object, normals, s.barycentric, &input.frame, at);
+            let [r, g, b, _] = input.radiance[i];
+            let [r, g, b] = k.unlimited_drive([r, g, b], s.distance, cos);
+            [r, g, b, 0.0]
+        })
+        .collect();
+    let mut codes = vec![0; PIXELS];
+    let counts = quantise(&drive, None, &mut codes);
+    (codes, counts, lit)
+}
+
+/// A turn about an axis as rows, with a shift that must not matter.
+fn rows(random: &mut Sampler) -> Rows {
+    let mut u = || random.uniform() as f32 * 2.0 - 1.0;
+    let q = glam::Quat::from_xyzw(u(), u(), u(), u()).normalize();
+    let m = glam::Mat3::from_quat(q).transpose().to_cols_array_2d();
+    std::array::from_fn(|i| [m[i][0], m[i][1], m[i][2], u()])
+}
+
+fn random_input(seed: u64) -> Input {
+    let mut random = Sampler::new(seed, 0);
+    let world_from_projector = rows(&mut random);
+    let instances: Vec<Instance> = (0..4)
+        .map(|i| Instance {
+            world_from_object: rows(&mut random),
+            triangle_offset: i * 8,
+            ..Zeroable::zeroed()
+        })
+        .collect();
+    let mut u = || random.uniform() as f32;
+    let vertices: Vec<Vertex> = (0..96)
+        .map(|_| {
+            let n = glam::Vec3::new(u() - 0.5, u() - 0.5, u() - 0.5).normalize();
+            Vertex { normal: n.into(), ..Zeroable::zeroed() }
+        })
+        .collect();
+    let refs = (0..32u32)
+        .map(|t| TriangleRef { vertices: [3 * t, 3 * t + 1, 3 * t + 2], ..Zeroable::zeroed() })
+        .collect();
+    let surfaces = (0..PIXELS)
+        .map(|_| {
+            let id = if u() < 0.1 { NO_HIT } else { ((u() * 4.0) as u32) << 24 | (u() * 8.0) as u32 };
+            let (a, b) = (u(), u());
+            let sign = if u() < 0.1 { -1.0 } else { 1.0 };
+            Surface { id, barycentric: [a * (1.0 - b), b], distance: sign * (0.1 + 3.0 * u()) }
+        })
+        .collect();
+    let radiance = (0..PIXELS).map(|_| [u(), u(), u() * 0.1, 1.0]).collect();
+    let frame = Frame {
+        world_from_projector,
+        intrinsics: [61.3, 60.7, 23.1, 17.9],
+        width: WIDTH,
+        height: HEIGHT,
+        tiles_x: WIDTH.div_ceil(16),
+        drive_gain: 0.3,
+        ambient: [0.05, 0.0, 0.01],
+        ..Zeroable::zeroed()
+    };
+    Input { frame, instances, refs, vertices, surfaces, radiance }
+}
+
+fn assert_same(gpu: &Arc<Gpu>, input: &Input) -> Counters {
+    let (codes, counters) = on_gpu(gpu, input);
+    let (expected, counts, lit) = twin(input);
+    let different: Vec<_> =
+        (0..PIXELS).filter(|&i| codes[i] != expected[i]).map(|i| (i, codes[i], expected[i])).collect();
+    if gpu.summary().software {
+        assert!(
+            different.is_empty(),
+            "{} codes differ: {:x?}",
+            different.len(),
+            &different[..different.len().min(5)]
+        );
+        assert_eq!(u64::from(counters.clipped_values), counts.clipped);
+    } else {
+        // Real GPUs may round 1/x and the square root by an ulp or two: then a code may be the neighbour, rarely.
+        let near = |a: u32, b: u32| (0..3).all(|c| (a >> (8 * c) & 255).abs_diff(b >> (8 * c) & 255) <= 1);
+        assert!(different.iter().all(|&(_, a, b)| near(a, b)) && different.len() < PIXELS / 100);
+    }
+    assert_eq!(counters.lit_pixels, lit);
+    counters
+}
+
+#[test]
+fn codes_equal_the_twin_bit_for_bit() {
+    with_gpu(|gpu| {
+        for seed in 0..8 {
+            let input = random_input(seed);
+            let (codes, _, lit) = twin(&input);
+            // The comparison is worth something: most lit pixels are neither black nor full.
+            let between = codes.iter().filter(|&&c| c & 255 > 0 && c & 255 < 255).count();
+            assert!(lit > 1000 && between > 500, "{lit} {between}");
+            assert_same(gpu, &input);
+        }
+    });
+}
+
+#[test]
+fn what_is_no_number_is_black_and_counted() {
+    with_gpu(|gpu| {
+        let mut input = random_input(3);
+        for (i, r) in input.radiance.iter_mut().enumerate() {
+            match i % 11 {
+                0 => r[0] = f32::NAN,
+                1 => r[1] = f32::INFINITY,
+                2 => r[2] = f32::NEG_INFINITY,
+                3 => r[0] = -1.0,
+                4 => *r = [f32::from_bits(0xffc0_1234); 4],
+                5 => *r = [1e38; 4],
+                6 => *r = [1e-42; 4],
+                _ => {}
+            }
+        }
+        let counters = assert_same(gpu, &input);
+        let lit = |i: &usize| input.surfaces[*i].id != NO_HIT && input.surfaces[*i].distance > 0.0;
+        let count = |m: usize| (0..PIXELS).filter(|i| i % 11 == m).filter(lit).count() as u32;
+        assert_eq!(counters.nan_values, count(0) + 3 * count(4));
+        assert!(counters.nan_values > 300 && counters.clipped_values >= count(1) + 3 * count(5));
+        let (codes, _) = on_gpu(gpu, &input);
+        for i in (0..PIXELS).filter(lit) {
+            match i % 11 {
+                0 | 3 => assert_eq!(codes[i] & 0xff, 0),
+                1 => assert_eq!(codes[i] >> 8 & 0xff, 255),
+                2 => assert_eq!(codes[i] >> 16 & 0xff, 0),
+                4 => assert_eq!(codes[i], 0),
+                5 => assert_eq!(codes[i], 0xff_ffff),
+                _ => {}
+            }
+        }
+    });
+}
+
+#[test]
+fn extreme_geometry_stays_defined() {
+    with_gpu(|gpu| {
+        let mut input = random_input(5);
+        // Normals that cancel, grazing light, huge and tiny distances.
+        for v in 0..6 {
+            input.vertices[v].normal = if v % 2 == 0 { [0.0, 0.0, 1.0] } else { [0.0, 0.0, -1.0] };
+        }
+        input.vertices[9].normal = [0.0; 3];
+        input.vertices[10].normal = [0.0; 3];
+        input.vertices[11].normal = [0.0; 3];
+        for (i, s) in input.surfaces.iter_mut().enumerate() {
+            match i % 5 {
+                0 => *s = Surface { id: i as u32 % 4, barycentric: [0.5, 0.0], distance: 1.0 },
+                1 => s.distance *= 1e12,
+                2 => s.distance *= 1e-12,
+                _ => {}
+            }
+        }
+        let counters = assert_same(gpu, &input);
+        assert_eq!(counters.nan_values, 0);
+    });
+}
+
+#[test]
+fn ambient_is_taken_off_in_f32_and_never_below_zero() {
+    with_gpu(|gpu| {
+        let mut input = random_input(7);
+        input.frame.ambient = [0.3, 0.5, 0.7];
+        for (i, r) in input.radiance.iter_mut().enumerate() {
+            // Equal to the ambient light, an ulp above and below.
+            let ulp = |x: f32, k: i32| f32::from_bits((x.to_bits() as i32 + k) as u32);
+            let k = i as i32 % 3 - 1;
+            *r = [ulp(0.3, k), ulp(0.5, k), ulp(0.7, 1000 * k), 1.0];
+        }
+        assert_same(gpu, &input);
+        let (codes, _) = on_gpu(gpu, &input);
+        assert!((0..PIXELS).filter(|i| i % 3 < 2).all(|i| codes[i] == 0));
+    });
+}
