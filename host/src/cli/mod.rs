@@ -6,6 +6,7 @@ pub mod os;
 pub mod rig_args;
 pub mod run;
 pub mod signals;
+pub mod snapshot;
 pub mod stability;
 pub mod watch;
 
@@ -35,6 +36,8 @@ enum Command {
     Doctor(doctor::DoctorArgs),
     /// Run stiff and extreme cases: measured error against bound, with the oracle of each
     Stability(stability::StabilityArgs),
+    /// Write everything that one frame was made from as pictures: rates, errors, samples, history, motion, light
+    Snapshot(snapshot::SnapshotArgs),
     /// Control a DLPC900 projector (LightCrafter 6500 / 9000): status, patterns, rest
     Dlpc900(dlpc900::Dlpc900Args),
 }
@@ -68,6 +71,7 @@ fn dispatch(command: &Command) -> Result<(), Failure> {
         Command::Run(args) => run::execute(args),
         Command::Doctor(args) => doctor::execute(args),
         Command::Stability(args) => stability::execute(args),
+        Command::Snapshot(args) => snapshot::execute(args),
         Command::Dlpc900(args) => dlpc900::execute(args),
     }
 }

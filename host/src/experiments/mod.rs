@@ -3,4 +3,5 @@
 pub mod pictures;
 pub mod run_rig;
 pub mod sequence;
+pub mod snapshot;
 pub mod stability;

@@ -203,7 +203,11 @@ impl Theatre {
     }
 }
 
-fn draw(
+/// Draws one frame of poses and waits for it, at most two minutes.
+///
+/// # Errors
+/// The GPU's.
+pub fn draw(
     rig: &Rig,
     renderer: &mut Renderer,
     slot: &mut FrameSlot,

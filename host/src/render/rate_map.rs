@@ -119,8 +119,28 @@ fn full_half_quarter(b: [f32; 2], square: f32, pairs: f32, size: f32, tau: f32, 
     }
 }
 
-/// The rate of a tile of 16 x 16 pixels, row by row; `None` is a pixel that is not lit or lies outside the raster.
-pub fn decide(tile: &[Option<PixelGuide>; 256], table: &[[f32; 2]], constants: &RateConstants) -> Rate {
+/// [paper] eq. 1 and 2 of a tile, for looking at; the decision itself needs neither root nor division.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct TileError {
+    /// Error estimate along x and y, scene units.
+    pub error: [f32; 2],
+    /// Threshold tau that it is held against, scene units.
+    pub threshold: f32,
+}
+
+/// Error estimate and threshold of a tile; `None` where nothing is lit or some lit pixel has no history.
+pub fn estimate(tile: &[Option<PixelGuide>; 256], constants: &RateConstants) -> Option<TileError> {
+    let t = gather(tile);
+    if t.lit == 0 || t.odd > 0 {
+        return None;
+    }
+    let error = |axis: usize| t.size * (t.square[axis] / t.pairs[axis].max(1) as f32).sqrt();
+    let threshold = constants.t * (t.luminance / t.lit as f32 + constants.l);
+    Some(TileError { error: [error(0), error(1)], threshold })
+}
+
+/// Sums and extremes over a tile in the shader's order.
+fn gather(tile: &[Option<PixelGuide>; 256]) -> Row {
     // The shader's stand-in for "nothing known".
     let known = |g: &PixelGuide| g.luminance.unwrap_or(-1.0);
     let mut rows = [EMPTY_ROW; 16];
@@ -178,6 +198,12 @@ pub fn decide(tile: &[Option<PixelGuide>; 256], table: &[[f32; 2]], constants: &
             t.angle = o.angle;
         }
     }
+    t
+}
+
+/// The rate of a tile of 16 x 16 pixels, row by row; `None` is a pixel that is not lit or lies outside the raster.
+pub fn decide(tile: &[Option<PixelGuide>; 256], table: &[[f32; 2]], constants: &RateConstants) -> Rate {
+    let t = gather(tile);
     if t.lit == 0 {
         return Rate::default();
     }
@@ -374,5 +400,30 @@ mod tests {
         }
         let fast = decide(&tile(|x, _| (x % 2) as f32, [1e12, 1e12], 1.0, 0.0), &table, &PAPER);
         assert_eq!(fast.x.max(fast.y), 2);
+    }
+
+    #[test]
+    fn estimate_and_decision_agree_away_from_the_threshold() {
+        let table = rate_table();
+        for (contrast, speed, size) in [
+            (0.05, 0.0, 1.0),
+            (0.4, 0.0, 1.0),
+            (0.1, 1.3, 0.7),
+            (0.1, 9.0, 2.0),
+            (1.0, 4.0, 1.0),
+            (0.06, 0.3, 1.0),
+        ] {
+            let tile = tile(|x, _| if x % 2 == 0 { 0.5 } else { 0.5 + contrast }, [speed, 0.0], size, 3.0);
+            let e = estimate(&tile, &PAPER).unwrap();
+            // By hand: half differences of contrast / 2 everywhere along x, none along y.
+            assert!((e.error[0] - size * contrast / 2.0).abs() < 1e-6 && e.error[1] == 0.0, "{e:?}");
+            assert!((e.threshold - 0.0762 * (0.5 + contrast / 2.0 + 0.363)).abs() < 1e-6, "{e:?}");
+            let [half, quarter] = blur(&table, speed).map(|b| b * e.error[0]);
+            let expected = if half >= e.threshold { 0 } else { 1 + u32::from(quarter < e.threshold) };
+            // Alone along x a quarter is not among the allowed rates unless y is coarse too.
+            let rate = decide(&tile, &table, &PAPER);
+            assert_eq!(rate.x, expected.min(rate.y.max(1)).min(expected), "{contrast} {speed}: {rate:?}");
+        }
+        assert_eq!(estimate(&[None; 256], &PAPER), None);
     }
 }
