@@ -12,9 +12,12 @@ const SMALL: [&str; 5] = ["--json", "--raster", "48x32", "--frames", "6"];
 /// Runs a command at the small raster with its output in `folder`; gives the report.
 fn report(command: &[&str], folder: &Folder, more: &[&str]) -> serde_json::Value {
     let args = [command, &SMALL, &["--out", folder.text()], more].concat();
-    let output = dpm(&args, &[]);
+    let output = dpm(&args, &[("DPM_VALIDATION", "1")]);
     assert_eq!(code(&output), 0, "{args:?}: {}", err(&output));
-    serde_json::from_str(&out(&output)).unwrap_or_else(|e| panic!("one JSON object: {e} in {}", out(&output)))
+    let json: serde_json::Value = serde_json::from_str(&out(&output))
+        .unwrap_or_else(|e| panic!("one JSON object: {e} in {}", out(&output)));
+    assert!(!json["warnings"].to_string().contains("validation"), "{}", json["warnings"]);
+    json
 }
 
 #[test]

@@ -4,7 +4,7 @@ use super::pictures::{pictures, to_srgb};
 use crate::config::{RigConfig, TrackerConfig};
 use crate::failure::{Failure, FailureKind};
 use crate::files::write_atomically;
-use crate::gpu::{Gpu, GpuError, GpuOptions};
+use crate::gpu::{validation_messages, Gpu, GpuError, GpuOptions};
 use crate::pipeline::{self, PipelineError, RunOptions};
 use crate::render::method::Method;
 use crate::render::{RenderError, Renderer, RendererSettings};
@@ -59,6 +59,10 @@ pub fn run_rig(config: &RigConfig, monitor: &Arc<RunMonitor>) -> Result<Report, 
         write_atomically(&path, |out| write_trace(out, &outcome.traced, &outcome.standstills))
             .map_err(|e| cannot_write(&path, &e))?;
         report.files.push(path);
+    }
+    let (count, texts) = validation_messages();
+    if let Some(first) = texts.first() {
+        report.warnings.push(format!("{count} messages of the Vulkan validation layer, the first: {first}"));
     }
     let path = output.dir.join("report.json");
     report.files.push(path.clone());
