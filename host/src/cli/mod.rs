@@ -3,6 +3,7 @@
 pub mod dlpc900;
 pub mod doctor;
 pub mod os;
+pub mod profile;
 pub mod rig_args;
 pub mod run;
 pub mod signals;
@@ -32,6 +33,8 @@ enum Command {
     Demo(run::DemoArgs),
     /// Run a rig file
     Run(run::RunArgs),
+    /// Measure where the time between motion and light goes
+    Profile(profile::ProfileArgs),
     /// Say what this machine can do, and what to do about what is missing
     Doctor(doctor::DoctorArgs),
     /// Run stiff and extreme cases: measured error against bound, with the oracle of each
@@ -69,6 +72,7 @@ fn dispatch(command: &Command) -> Result<(), Failure> {
     match command {
         Command::Demo(args) => run::execute_demo(args),
         Command::Run(args) => run::execute(args),
+        Command::Profile(args) => profile::execute(args),
         Command::Doctor(args) => doctor::execute(args),
         Command::Stability(args) => stability::execute(args),
         Command::Snapshot(args) => snapshot::execute(args),

@@ -16,17 +16,30 @@ use std::time::{Duration, Instant};
 /// How often signals are looked at and the bar is drawn.
 const TICK: Duration = Duration::from_millis(50);
 
-/// Runs `run` while its progress is shown on the standard error stream and signals become an ordered stop; then prints the
-/// report to the standard output, as JSON or as a table. The run itself has a thread of its own, so that this one stays
-/// free to watch.
+/// Watches `run` (see [`watch`]), then prints the report to the standard output, as JSON or as a table.
 ///
 /// # Errors
-/// What `run` returns; a device or output folder that another instance uses; a panic in the run.
+/// As [`watch`].
 pub fn run_and_report(
     rig: RigConfig,
     json: bool,
     run: impl FnOnce(&RigConfig, &Arc<RunMonitor>) -> Result<Report, Failure> + Send + 'static,
 ) -> Result<(), Failure> {
+    let report = watch(rig, |_| {}, run)?;
+    print(&if json { report.to_json() + "\n" } else { report.to_table() });
+    Ok(())
+}
+
+/// Runs `run` while its progress is shown on the standard error stream, given to `show`, and signals become an ordered stop. The
+/// run itself has a thread of its own, so that this one stays free to watch.
+///
+/// # Errors
+/// What `run` returns; a device or output folder that another instance uses; a panic in the run.
+pub fn watch<T: Send + 'static>(
+    rig: RigConfig,
+    show: impl Fn(&RunCounts),
+    run: impl FnOnce(&RigConfig, &Arc<RunMonitor>) -> Result<T, Failure> + Send + 'static,
+) -> Result<T, Failure> {
     let _locks = take_locks(&rig)?;
     signals::install()
         .map_err(|e| Failure::new(FailureKind::Device, format!("cannot handle signals: {e}")))?;
@@ -56,6 +69,7 @@ pub fn run_and_report(
                     }
                 }
                 progress.tick(monitor.counts());
+                show(&monitor.counts());
             }
             Err(RecvTimeoutError::Disconnected) => {
                 break Err(Failure::new(FailureKind::Device, "the run ended by a panic (see above)"))
@@ -65,9 +79,7 @@ pub fn run_and_report(
     // A panic was already turned into the error above.
     let _ = worker.join();
     progress.finish(monitor.counts());
-    let report = result?;
-    print(&if json { report.to_json() + "\n" } else { report.to_table() });
-    Ok(())
+    result
 }
 
 /// Writes to the standard output; a reader that has gone away (`dpm ... | head`) is no error.

@@ -178,6 +178,13 @@ section! {
     }
 }
 
+impl StageCostsConfig {
+    /// All stages from plan to send together, us: what a frame needs from latch to light.
+    pub fn total(&self) -> u32 {
+        self.plan + self.render + self.pack + self.send
+    }
+}
+
 section! {
     /// How long to run.
     pub struct RunConfig {

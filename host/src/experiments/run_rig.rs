@@ -116,7 +116,7 @@ fn save(dir: &Path, name: &str, rig: &Rig, linear: &[Vec3], scale: f32) -> Resul
     Ok(path)
 }
 
-fn cannot_write(path: &Path, error: &dyn std::fmt::Display) -> Failure {
+pub(super) fn cannot_write(path: &Path, error: &dyn std::fmt::Display) -> Failure {
     Failure::new(
         FailureKind::BadInput,
         format!("cannot write {}: {error}; choose another folder with --out", path.display()),

@@ -10,8 +10,9 @@ use crate::rig::Rig;
 use crate::telemetry::monitor::RunMonitor;
 use crate::telemetry::profile::Profiler;
 use crate::telemetry::report::{Report, Spread, StageTime};
+use crate::telemetry::slots::SlotLedger;
 use crate::telemetry::trace::TracedFrame;
-use dpm_device::link::SendOutcome;
+use dpm_device::link::{frame_newer, SendOutcome};
 use glam::{DAffine3, DVec3};
 use hdrhistogram::Histogram;
 use hil_mock::projector::LightKind;
@@ -58,6 +59,15 @@ pub struct Collector {
     dropped: u64,
     late: u64,
     repeated: u64,
+    /// Slots without a frame of their own.
+    pub slots: SlotLedger,
+    /// Lit frames with parts of another (looked for in prepared frames only).
+    pub torn: u64,
+    /// Frames lit after a newer one, or twice.
+    pub reordered: u64,
+    last_lit: Option<u32>,
+    /// Slots in which the frame before was shown again, until the last planned one is known to be later.
+    repeats: VecDeque<u64>,
     /// Lit frames whose light was not what was rendered.
     pub light_mismatches: u64,
     /// Intervals of every lit frame.
@@ -109,6 +119,11 @@ impl Collector {
             dropped: 0,
             late: 0,
             repeated: 0,
+            slots: SlotLedger::default(),
+            torn: 0,
+            reordered: 0,
+            last_lit: None,
+            repeats: VecDeque::new(),
             light_mismatches: 0,
             profiler,
             traced: Vec::new(),
@@ -178,12 +193,20 @@ impl Collector {
         self.nan_values += u64::from(c.nan_values);
         self.invalid_samples += u64::from(c.invalid_samples);
         for (histogram, &ns) in self.passes.iter_mut().zip(&job.cost.pass_ns) {
-            histogram.saturating_record(ns.max(1));
+            if job.gpu.is_some() {
+                histogram.saturating_record(ns.max(1));
+            }
         }
         for stage in [Stage::Plan, Stage::Render, Stage::Pack, Stage::Link] {
             self.stages[stage as usize].saturating_record(job.timeline.wall_ns[stage as usize].max(1));
         }
-        if job.outcome == Some(SendOutcome::Sent) {
+        let sent = job.outcome == Some(SendOutcome::Sent);
+        self.slots.planned(job.slot, &job.timeline, sent, job.waited_for_memory);
+        while self.repeats.front().is_some_and(|&slot| slot < job.slot) {
+            self.repeats.pop_front();
+            self.repeated += 1;
+        }
+        if sent {
             if self.pending.len() >= MAX_PENDING {
                 self.drop_oldest(monitor);
             }
@@ -206,10 +229,19 @@ impl Collector {
     fn light(&mut self, note: &LightNote, monitor: &RunMonitor) {
         self.stages[Stage::Light as usize].saturating_record(note.wall_ns.max(1));
         match note.event.kind {
-            LightKind::Repeated => self.repeated += 1,
-            LightKind::Blank => {}
+            LightKind::Repeated => {
+                self.slots.nothing_new(note.event.slot, note.event.first_photon_at);
+                // After the last frame the projector repeats it until it is told to stop: no fault.
+                if self.repeats.len() < MAX_PENDING {
+                    self.repeats.push_back(note.event.slot);
+                }
+            }
+            LightKind::Blank => self.slots.nothing_new(note.event.slot, note.event.first_photon_at),
             LightKind::Lit => {
                 let Some(frame) = note.event.frame else { return };
+                self.torn += u64::from(note.torn);
+                self.reordered += u64::from(self.last_lit.is_some_and(|last| !frame_newer(frame, last)));
+                self.last_lit = Some(frame);
                 let Some(at) = self.pending.iter().position(|r| r.id.0 as u32 == frame) else { return };
                 // Frames before it were overtaken and will never be lit.
                 for _ in 0..at {
@@ -219,6 +251,11 @@ impl Collector {
                 record.timeline.lit_at = Some(note.event.first_photon_at);
                 let late = note.event.slot > record.slot;
                 self.lit += 1;
+                if late {
+                    self.slots.nothing_new(note.event.slot, note.event.first_photon_at);
+                } else {
+                    self.slots.lit(note.event.slot);
+                }
                 self.late += u64::from(late);
                 monitor.count_lit(late);
                 if self.verify && note.hash != record.code_hash {

@@ -3,14 +3,12 @@
 //! It stands on crossbeam's `ArrayQueue`: lock-free and without allocation, but not wait-free (a thread paused inside a push can make
 //! the other back off for that long). What is handed over is recycled, never freed, on the frame path.
 
+use crate::clock::Stopwatch;
 use crossbeam::queue::ArrayQueue;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::OnceLock;
 use std::thread::Thread;
 use std::time::Duration;
-
-/// Longest time that a consumer sleeps without looking: bounds the cost of a wake-up that was missed.
-const PARK: Duration = Duration::from_micros(500);
 
 /// A bounded first-in first-out hand-off between threads.
 pub struct Ring<T> {
@@ -48,13 +46,13 @@ impl<T> Ring<T> {
     /// waits is the one that is woken.
     pub fn pop(&self, limit: Duration) -> Option<T> {
         self.consumer.get_or_init(std::thread::current);
-        let mut left = limit;
         for _ in 0..64 {
             if let Some(item) = self.queue.pop() {
                 return Some(item);
             }
             std::hint::spin_loop();
         }
+        let watch = Stopwatch::start();
         loop {
             if let Some(item) = self.queue.pop() {
                 return Some(item);
@@ -63,12 +61,12 @@ impl<T> Ring<T> {
                 // An item pushed just before the close must not be lost.
                 return self.queue.pop();
             }
+            let left = limit.saturating_sub(Duration::from_nanos(watch.elapsed_ns()));
             if left.is_zero() {
                 return None;
             }
-            let step = left.min(PARK);
-            std::thread::park_timeout(step);
-            left -= step;
+            // A wake-up between the look above and here is not lost: the token makes the park return at once.
+            std::thread::park_timeout(left);
         }
     }
 

@@ -15,6 +15,8 @@ pub struct FrameJob {
     pub slot: u64,
     /// Start of that slot on the projector's clock.
     pub target_at: DeviceTicks,
+    /// Planning waited for this job's memory: a later stage held all of it.
+    pub waited_for_memory: bool,
     /// Stamps.
     pub timeline: FrameTimeline,
     /// Predicted world-from-body of the tracked bodies.

@@ -4,7 +4,9 @@
 
 use super::handoff::Ring;
 use super::job::hash_codes;
+use super::prepared::is_whole;
 use crate::clock::Stopwatch;
+use dpm_device::planes::PlaneSchedule;
 use dpm_device::time::HostTime;
 use hil_mock::projector::{LightEvent, LightKind, MockProjector};
 use std::collections::VecDeque;
@@ -17,6 +19,8 @@ pub struct LightNote {
     pub event: LightEvent,
     /// Hash of the light as code values; 0 when not asked for.
     pub hash: u64,
+    /// Parts of it are of another frame (prepared frames only).
+    pub torn: bool,
     /// Wall time that the mock took for it, nanoseconds.
     pub wall_ns: u64,
 }
@@ -39,15 +43,26 @@ pub struct LightRecorder {
     pub notes_lost: u64,
     keep: usize,
     hash: bool,
+    /// Lit planes carry marks in this schedule.
+    marks: Option<PlaneSchedule>,
     frames: VecDeque<LightFrame>,
     /// Hash over all light in order.
     pub light_hash: u64,
 }
 
 impl LightRecorder {
-    /// Notes go to `notes`; the last `keep` frames of light stay; `hash`: hash every frame of light.
-    pub fn new(notes: Arc<Ring<LightNote>>, keep: usize, hash: bool) -> Self {
-        Self { notes, notes_lost: 0, keep, hash, frames: VecDeque::with_capacity(keep + 1), light_hash: 0 }
+    /// Notes go to `notes`; the last `keep` frames of light stay; `hash`: hash every frame of light; `marks`: the
+    /// planes, in this order, are of [`super::prepared`] and are looked at for parts of other frames.
+    pub fn new(notes: Arc<Ring<LightNote>>, keep: usize, hash: bool, marks: Option<PlaneSchedule>) -> Self {
+        Self {
+            notes,
+            notes_lost: 0,
+            keep,
+            hash,
+            marks,
+            frames: VecDeque::with_capacity(keep + 1),
+            light_hash: 0,
+        }
     }
 
     /// Lets the mock live up to `now`, one slot at a time, and notes all light.
@@ -76,10 +91,18 @@ impl LightRecorder {
                     keep(&mut self.frames, self.keep, &event, light);
                 }
             }
-            let note = LightNote { event, hash, wall_ns: watch.elapsed_ns() };
+            let torn = event.kind == LightKind::Lit && self.is_torn(mock, event.frame);
+            let note = LightNote { event, hash, torn, wall_ns: watch.elapsed_ns() };
             if self.notes.push(note).is_err() {
                 self.notes_lost += 1;
             }
+        }
+    }
+
+    fn is_torn(&self, mock: &MockProjector, frame: Option<u32>) -> bool {
+        match (&self.marks, mock.lit_planes(), frame) {
+            (Some(schedule), Some(planes), Some(id)) => !is_whole(mock.raster(), schedule, planes, id),
+            _ => false,
         }
     }
 

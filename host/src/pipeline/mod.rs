@@ -15,11 +15,14 @@ pub mod handoff;
 pub mod job;
 pub mod light;
 mod outcome;
+pub mod prepared;
 mod rights;
 mod run;
 pub mod stages;
+mod threads;
 
 pub use collect::FrameRecord;
 pub use connect::ConnectError;
 pub use outcome::{PipelineError, RunOptions, RunOutcome};
-pub use run::{on_frame_path, renderer_settings, run};
+pub use run::{renderer_settings, run, run_prepared};
+pub use threads::on_frame_path;

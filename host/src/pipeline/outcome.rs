@@ -9,6 +9,7 @@ use crate::render::RenderError;
 use crate::rig::RigError;
 use crate::telemetry::profile::Profiler;
 use crate::telemetry::report::Report;
+use crate::telemetry::slots::SlotCounts;
 use crate::telemetry::trace::TracedFrame;
 
 /// How a run differs from what the rig file says.
@@ -16,6 +17,8 @@ use crate::telemetry::trace::TracedFrame;
 pub struct RunOptions {
     /// Frames to plan; 0: until asked to stop.
     pub frames: u64,
+    /// Slots to plan for, whether frames make it into them or not; 0: no limit.
+    pub slots: u64,
     /// Frames of light (and their records) kept for pictures.
     pub keep_frames: usize,
     /// Compare the light with what was rendered, frame by frame.
@@ -26,7 +29,7 @@ pub struct RunOptions {
 
 impl Default for RunOptions {
     fn default() -> Self {
-        Self { frames: 0, keep_frames: 0, verify: true, in_flight: 4 }
+        Self { frames: 0, slots: 0, keep_frames: 0, verify: true, in_flight: 4 }
     }
 }
 
@@ -42,6 +45,12 @@ pub struct RunOutcome {
     pub light_mismatches: u64,
     /// Distributions of every interval.
     pub profiler: Profiler,
+    /// Slots without a frame of their own, by cause.
+    pub slots: SlotCounts,
+    /// Lit frames with parts of another frame (looked for in prepared frames only).
+    pub frames_torn: u64,
+    /// Frames lit after a newer one, or twice.
+    pub frames_reordered: u64,
     /// When the machine itself stood still (real pace).
     pub standstills: Standstills,
     /// Frames for a trace, where the rig file asks for one.

@@ -4,120 +4,38 @@ use super::collect::Collector;
 use super::connect::connect;
 use super::handoff::Ring;
 use super::job::FrameJob;
-use super::light::{LightNote, LightRecorder};
+use super::light::LightRecorder;
 use super::outcome::{PipelineError, RunOptions, RunOutcome};
+use super::prepared::PreparedFrames;
 use super::rights::Rights;
-use super::stages::{self, LinkTime, TrackSnapshot, TrackingStage};
+use super::stages::TrackingStage;
+use super::threads::{device_thread, run_threads, Cable, Shared, LISTEN_NS};
 use crate::clock::{Clock, ManualClock, MonotonicClock, RunClock, Stopwatch};
 use crate::config::{Pace, ProjectorBackend};
-use crate::frame::Stage;
 use crate::gpu::Gpu;
 use crate::pack::{BitPlaneFrame, Kernel};
+use crate::plan::slots::MissCause;
+use crate::realtime::os::usable_cores;
 use crate::realtime::standstill::StandstillMonitor;
 use crate::render::method::Method;
 use crate::render::{FrameCost, RenderError, Renderer, RendererSettings};
 use crate::rig::{Rig, RigError};
 use crate::telemetry::monitor::RunMonitor;
 use crate::telemetry::report::Report;
-use dpm_device::link::{packet_bytes, Codec, Epoch, HostLink, LinkSettings, SendOutcome, Underrun, Verb};
+use dpm_device::link::{packet_bytes, Codec, Epoch, HostLink, LinkSettings, Underrun};
 use dpm_device::time::{DeviceTicks, HostClock, HostTime};
-use dpm_device::transport::inproc::{threaded, DeviceEnd, Direct, HostEnd};
-use dpm_device::transport::Transport;
-use dpm_handoff::latest::{latest, Publisher, Reader};
+use dpm_device::transport::inproc::{threaded, Direct};
 use glam::DVec3;
 use hil_mock::projector::{DeviceClock, MockConfig, MockProjector};
-use std::cell::Cell;
 use std::sync::atomic::{AtomicBool, AtomicI64, Ordering};
 use std::sync::{Arc, Mutex};
-use std::time::Duration;
 
-thread_local! {
-    static ON_FRAME_PATH: Cell<bool> = const { Cell::new(false) };
-}
-
-/// True while the calling thread works on frames in the steady state: a counting allocator may demand that nothing is allocated.
-pub fn on_frame_path() -> bool {
-    ON_FRAME_PATH.with(Cell::get)
-}
-
-fn enter_frame_path(inside: bool) {
-    ON_FRAME_PATH.with(|c| c.set(inside));
-}
-
-/// Frames until the steady state, in which nothing is allocated any more.
-const WARM_UP_FRAMES: u64 = 16;
-/// Time for which trackers are listened to before the first frame, so that the filters know the motion.
-const LISTEN_NS: i64 = 150_000_000;
+/// Tracking, plan, pack, link, and the mock projector.
+const STAGE_THREADS: usize = 5;
 /// From the handshake to slot 0.
 const EPOCH_NS: u64 = 5_000_000;
-/// Time between the last byte of a frame and its slot, for jitter of the hand-offs.
-const MARGIN_NS: i64 = 50_000;
 /// A step of the control thread that ends this late is a standstill of the machine.
 const STANDSTILL_NS: i64 = 1_000_000;
-/// A frame that the GPU has not finished by then is given up, and the run with it.
-const GPU_TIMEOUT_NS: u64 = 20_000_000_000;
-
-/// Everything that the threads share.
-struct Shared<'a> {
-    rig: Arc<Rig>,
-    clock: &'a RunClock,
-    time: LinkTime,
-    /// Virtual pace: samples up to here are wanted.
-    listen_to: AtomicI64,
-    /// Measured time from latch to sent, nanoseconds (real pace).
-    lead_ns: AtomicI64,
-    free: Ring<Box<FrameJob>>,
-    to_pack: Ring<Box<FrameJob>>,
-    to_link: Ring<Box<FrameJob>>,
-    done: Ring<Box<FrameJob>>,
-    lights: Arc<Ring<LightNote>>,
-    tracking_over: AtomicBool,
-    error: Mutex<Option<PipelineError>>,
-    monitor: &'a RunMonitor,
-    options: RunOptions,
-    verify: bool,
-    rights: &'a Rights,
-}
-
-impl Shared<'_> {
-    fn fail(&self, error: PipelineError) {
-        if let Ok(mut first) = self.error.lock() {
-            first.get_or_insert(error);
-        }
-        self.monitor.request_stop();
-    }
-
-    fn is_virtual(&self) -> bool {
-        self.rig.config.real_time.pace == Pace::Virtual
-    }
-
-    fn costs(&self) -> [i64; 4] {
-        let c = &self.rig.config.real_time.stage_costs_us;
-        [c.plan, c.render, c.pack, c.send].map(|us| i64::from(us) * 1000)
-    }
-}
-
-/// The link's medium.
-enum Cable {
-    Direct(Box<Direct<MockProjector>>, LightRecorder),
-    Threaded(HostEnd),
-}
-
-impl Cable {
-    fn transport(&mut self) -> &mut dyn Transport {
-        match self {
-            Self::Direct(direct, _) => direct.as_mut(),
-            Self::Threaded(end) => end,
-        }
-    }
-
-    /// Lets the projector live up to `now` where it has no thread of its own.
-    fn live(&mut self, now: HostTime) {
-        if let Self::Direct(direct, recorder) = self {
-            recorder.advance(direct.device_mut(), now);
-        }
-    }
-}
 
 /// Runs the rig until `options.frames` are planned or `monitor` asks to stop. The projector ends dark.
 ///
@@ -129,14 +47,41 @@ pub fn run(
     options: RunOptions,
     monitor: &RunMonitor,
 ) -> Result<RunOutcome, PipelineError> {
+    run_from(rig, Some(gpu), options, monitor)
+}
+
+/// Like [`run`] with prepared frames in place of rendered ones: no GPU takes part. Every frame that is lit is looked at for parts
+/// of another frame.
+///
+/// # Errors
+/// As [`run`], without those of the GPU.
+pub fn run_prepared(
+    rig: Arc<Rig>,
+    options: RunOptions,
+    monitor: &RunMonitor,
+) -> Result<RunOutcome, PipelineError> {
+    run_from(rig, None, RunOptions { verify: false, ..options }, monitor)
+}
+
+fn run_from(
+    rig: Arc<Rig>,
+    gpu: Option<&Arc<Gpu>>,
+    options: RunOptions,
+    monitor: &RunMonitor,
+) -> Result<RunOutcome, PipelineError> {
     let config = &rig.config;
-    let mut renderer = Renderer::new(gpu, &rig.scene, renderer_settings(&rig))?;
+    let mut renderer = match gpu {
+        Some(gpu) => Some(Renderer::new(gpu, &rig.scene, renderer_settings(&rig))?),
+        None => None,
+    };
     let is_virtual = config.real_time.pace == Pace::Virtual;
     let clock = if is_virtual {
         // The link comes up just before the first frame, so that nobody waits for the filters.
         RunClock::Virtual(ManualClock::new(HostTime(LISTEN_NS)))
     } else {
-        RunClock::Real(MonotonicClock::new(50_000))
+        // A spinning thread on a machine with fewer cores than stages delays the very stages it waits for.
+        let spin_ns = if usable_cores() > STAGE_THREADS { 50_000 } else { 0 };
+        RunClock::Real(MonotonicClock::new(spin_ns))
     };
     let tracker_clock: Arc<dyn HostClock> = match &clock {
         RunClock::Real(clock) => Arc::new({
@@ -158,6 +103,7 @@ pub fn run(
             id: Default::default(),
             slot: 0,
             target_at: DeviceTicks(0),
+            waited_for_memory: false,
             timeline: Default::default(),
             tracked_poses: Vec::with_capacity(rig.bodies.len()),
             sampled_poses: Vec::with_capacity(rig.bodies.len()),
@@ -165,7 +111,10 @@ pub fn run(
             scene_poses: Vec::with_capacity(rig.scene.bodies.len()),
             eye: DVec3::ZERO,
             gaze: DVec3::ZERO,
-            gpu: Some(renderer.create_slot(false).map_err(RenderError::from)?),
+            gpu: match &mut renderer {
+                Some(renderer) => Some(renderer.create_slot(false).map_err(RenderError::from)?),
+                None => None,
+            },
             cost: FrameCost::default(),
             code_hash: 0,
             planes: BitPlaneFrame::new(raster, schedule),
@@ -191,7 +140,9 @@ pub fn run(
     setup.flash_limit = flash_limit;
     let mock = MockProjector::new(setup);
     let lights = Arc::new(Ring::new(8192));
-    let recorder = LightRecorder::new(lights.clone(), options.keep_frames, verify);
+    let prepared = gpu.is_none().then(|| PreparedFrames::new(raster));
+    let marks = prepared.is_some().then_some(schedule);
+    let recorder = LightRecorder::new(lights.clone(), options.keep_frames, verify, marks);
     let mut link = HostLink::new(LinkSettings {
         raster,
         schedule,
@@ -259,7 +210,8 @@ pub fn run(
         };
         let tracking = TrackingStage::new(&rig, tracker);
         let mut collector = Collector::new(rig.clone(), options.keep_frames, verify);
-        let cable = run_threads(&shared, tracking, &mut renderer, kernel, link, cable, &mut collector)?;
+        let cable =
+            run_threads(&shared, tracking, renderer.as_mut(), prepared, kernel, link, cable, &mut collector)?;
         device_over.store(true, Ordering::Release);
         let recorder = match (cable, device) {
             (Cable::Direct(_, recorder), _) => recorder,
@@ -281,9 +233,9 @@ pub fn run(
         planes: schedule.len() as u32,
         frame_rate_hz: rig.rate().hz(),
         pace: if is_virtual { "virtual" } else { "real" },
-        gpu: gpu.summary().name.clone(),
-        software_gpu: gpu.summary().software,
-        method: method_name(&rig),
+        gpu: gpu.map_or_else(|| "none".into(), |gpu| gpu.summary().name.clone()),
+        software_gpu: gpu.is_some_and(|gpu| gpu.summary().software),
+        method: if gpu.is_some() { method_name(&rig) } else { "prepared" },
         prediction: config.prediction.on,
         light_hash: format!("{:016x}", recorder.light_hash),
         wall_s,
@@ -293,12 +245,20 @@ pub fn run(
     report.frames_per_wall_second = report.frames_lit as f64 / wall_s.max(1e-9);
     report.warnings.extend(rights.warnings());
     report.warnings.extend(rig.scene.warnings.iter().cloned());
+    let lead_ns = i64::from(config.real_time.stage_costs_us.total()) * 1000;
+    let slots = collector.slots.counts(&standstills, lead_ns);
+    for cause in MissCause::ALL {
+        collector.profiler.missed(cause, slots.missed[cause as usize]);
+    }
     Ok(RunOutcome {
         report,
         recent: std::mem::take(&mut collector.recent).into(),
         light: recorder.into_frames(),
         light_mismatches: collector.light_mismatches,
         traced: std::mem::take(&mut collector.traced),
+        slots,
+        frames_torn: collector.torn,
+        frames_reordered: collector.reordered,
         profiler: collector.profiler,
         standstills,
     })
@@ -328,259 +288,4 @@ pub fn renderer_settings(rig: &Rig) -> RendererSettings {
         leave_nothing_out: false,
         method: Method::from_config(r),
     }
-}
-
-/// Starts the stages, waits for all of them, and returns the cable.
-fn run_threads(
-    shared: &Shared<'_>,
-    tracking: TrackingStage,
-    renderer: &mut Renderer,
-    kernel: Kernel,
-    link: HostLink,
-    cable: Cable,
-    collector: &mut Collector,
-) -> Result<Cable, PipelineError> {
-    std::thread::scope(|scope| {
-        let (publisher, reader) = latest(TrackSnapshot::EMPTY);
-        let named = |name: &'static str| std::thread::Builder::new().name(format!("dpm-{name}"));
-        let refused = |stage| move |source| PipelineError::Thread { stage, source };
-        // Each guard closes what the next stage reads, whether the stage returns or panics: nobody waits for ever.
-        let tracking = named("tracking")
-            .spawn_scoped(scope, move || tracking_thread(shared, tracking, publisher))
-            .map_err(refused("tracking"))?;
-        let plan = named("plan")
-            .spawn_scoped(scope, move || {
-                let _close = OnExit(|| {
-                    shared.to_pack.close();
-                    shared.tracking_over.store(true, Ordering::Release);
-                });
-                plan_thread(shared, renderer, reader);
-            })
-            .map_err(refused("plan"))?;
-        let pack = named("pack")
-            .spawn_scoped(scope, move || {
-                let _close = OnExit(|| {
-                    shared.monitor.request_stop();
-                    shared.to_link.close();
-                });
-                pack_thread(shared, kernel);
-            })
-            .map_err(refused("pack"))?;
-        let link = named("link")
-            .spawn_scoped(scope, move || {
-                let _close = OnExit(|| {
-                    shared.monitor.request_stop();
-                    shared.done.close();
-                    shared.lights.close();
-                });
-                link_thread(shared, link, cable)
-            })
-            .map_err(refused("link"))?;
-        collector.run(&shared.done, &shared.free, &shared.lights, shared.monitor);
-        let cable = link.join();
-        for (name, thread) in [("pack", pack), ("plan", plan), ("tracking", tracking)] {
-            if thread.join().is_err() {
-                shared.fail(PipelineError::Panicked(name));
-            }
-        }
-        cable.map_err(|_| PipelineError::Panicked("link"))
-    })
-}
-
-/// Calls its function when dropped, during a panic too.
-struct OnExit<F: FnMut()>(F);
-
-impl<F: FnMut()> Drop for OnExit<F> {
-    fn drop(&mut self) {
-        (self.0)();
-    }
-}
-
-fn tracking_thread(shared: &Shared<'_>, mut stage: TrackingStage, mut latest: Publisher<TrackSnapshot>) {
-    shared.rights.enter(0);
-    let mut heard_to = i64::MIN;
-    while !shared.tracking_over.load(Ordering::Acquire) {
-        let now = if shared.is_virtual() {
-            let wanted = shared.listen_to.load(Ordering::Acquire);
-            if wanted == heard_to {
-                std::thread::yield_now();
-                continue;
-            }
-            heard_to = wanted;
-            HostTime(wanted)
-        } else {
-            shared.clock.now()
-        };
-        // A tracker that fails is told by the freshness of its tracks: light goes off by itself.
-        let _ = stage.step(now, &mut latest);
-        if !shared.is_virtual() {
-            std::thread::sleep(Duration::from_micros(200));
-        }
-    }
-}
-
-fn plan_thread(shared: &Shared<'_>, renderer: &mut Renderer, mut latest: Reader<TrackSnapshot>) {
-    shared.rights.enter(1);
-    let costs = shared.costs();
-    let modelled = costs.iter().sum::<i64>() + MARGIN_NS;
-    let begin = shared.clock.now();
-    let mut next_slot =
-        shared.time.slot_after(begin.plus_ns(modelled + if shared.is_virtual() { 0 } else { LISTEN_NS }));
-    let mut id = 0u64;
-    while !shared.monitor.stop_requested() && (shared.options.frames == 0 || id < shared.options.frames) {
-        enter_frame_path(id >= WARM_UP_FRAMES);
-        let Some(mut job) = shared.free.pop(Duration::from_millis(100)) else { continue };
-        let lead = modelled.max(shared.lead_ns.load(Ordering::Relaxed));
-        if !shared.is_virtual() {
-            next_slot = next_slot.max(shared.time.slot_after(shared.clock.now().plus_ns(lead)));
-        }
-        let latch_at = shared.time.host_of_slot(next_slot).plus_ns(-lead);
-        shared.clock.wait_until(latch_at);
-        if shared.is_virtual() {
-            shared.listen_to.store(latch_at.0, Ordering::Release);
-            while latest.latest().0.through < latch_at && !shared.monitor.stop_requested() {
-                std::thread::yield_now();
-            }
-        }
-        stages::plan(&mut job, &shared.rig, latest.latest().0, &shared.time, id, next_slot);
-        let t = &mut job.timeline;
-        if shared.is_virtual() {
-            t.latched_at = latch_at;
-            t.submitted_at = t.latched_at.plus_ns(costs[0]);
-            t.rendered_at = t.submitted_at.plus_ns(costs[1]);
-            t.packed_at = t.rendered_at.plus_ns(costs[2]);
-            t.sent_at = t.packed_at.plus_ns(costs[3]);
-        } else {
-            t.latched_at = shared.clock.now();
-        }
-        if let Err(source) = stages::submit(&mut job, &shared.rig, renderer) {
-            shared.fail(PipelineError::Gpu { frame: id, source });
-            break;
-        }
-        if !shared.is_virtual() {
-            job.timeline.submitted_at = shared.clock.now();
-        }
-        shared.monitor.count_planned();
-        id += 1;
-        next_slot += 1;
-        // There is room for every job there is.
-        if shared.to_pack.push(job).is_err() {
-            break;
-        }
-    }
-    enter_frame_path(false);
-}
-
-fn pack_thread(shared: &Shared<'_>, kernel: Kernel) {
-    shared.rights.enter(2);
-    while let Some(mut job) = next(&shared.to_pack) {
-        enter_frame_path(job.id.0 >= WARM_UP_FRAMES);
-        if let Err(source) = stages::finish_and_pack(&mut job, kernel, shared.verify, GPU_TIMEOUT_NS) {
-            shared.fail(PipelineError::Gpu { frame: job.id.0, source });
-            break;
-        }
-        if !shared.is_virtual() {
-            let now = shared.clock.now();
-            job.timeline.rendered_at = now.plus_ns(-(job.timeline.wall_ns[Stage::Pack as usize] as i64));
-            job.timeline.packed_at = now;
-        }
-        if shared.to_link.push(job).is_err() {
-            break;
-        }
-    }
-    enter_frame_path(false);
-}
-
-/// The next job, or `None` when the ring is closed and empty.
-fn next(ring: &Ring<Box<FrameJob>>) -> Option<Box<FrameJob>> {
-    loop {
-        if let Some(job) = ring.pop(Duration::from_millis(5)) {
-            return Some(job);
-        }
-        if ring.is_closed() && ring.is_empty() {
-            return None;
-        }
-    }
-}
-
-fn link_thread(shared: &Shared<'_>, mut link: HostLink, mut cable: Cable) -> Cable {
-    shared.rights.enter(3);
-    let mut last = shared.clock.now();
-    loop {
-        let job = shared.to_link.pop(Duration::from_millis(1));
-        let Some(mut job) = job else {
-            if shared.to_link.is_closed() && shared.to_link.is_empty() {
-                break;
-            }
-            if !shared.is_virtual() {
-                // Feeds the device's watchdog while nothing is to be sent.
-                let _ = link.poll(shared.clock.now(), cable.transport());
-            }
-            continue;
-        };
-        enter_frame_path(job.id.0 >= WARM_UP_FRAMES);
-        let now = if shared.is_virtual() { job.timeline.sent_at } else { shared.clock.now() };
-        cable.live(now);
-        let watch = Stopwatch::start();
-        let _ = link.poll(now, cable.transport());
-        let outcome = link.send_frame(now, job.id.0, job.target_at, job.planes.bytes(), cable.transport());
-        job.outcome = Some(outcome);
-        job.timeline.wall_ns[Stage::Link as usize] = watch.elapsed_ns();
-        last = now;
-        if !shared.is_virtual() {
-            job.timeline.sent_at = shared.clock.now();
-            if outcome == SendOutcome::Sent {
-                follow_lead(&shared.lead_ns, job.timeline.sent_at.ns_since(job.timeline.latched_at));
-            }
-        }
-        if shared.done.push(job).is_err() {
-            break;
-        }
-    }
-    enter_frame_path(false);
-    // The last frames' light, then dark.
-    let end = if shared.is_virtual() {
-        last.plus_ns(2 * shared.rig.rate().slot_len_ns(0))
-    } else {
-        shared.clock.wait_until(shared.clock.now().plus_ns(10_000_000))
-    };
-    cable.live(end);
-    let _ = link.command(end, Verb::Stop, cable.transport());
-    for i in 1..=4 {
-        let now = if shared.is_virtual() {
-            end.plus_ns(i * 1_000_000)
-        } else {
-            shared.clock.wait_until(shared.clock.now().plus_ns(1_000_000))
-        };
-        let _ = link.poll(now, cable.transport());
-        cable.live(now);
-    }
-    cable
-}
-
-/// A running estimate of the time from latch to sent: follows rises at once, falls slowly.
-fn follow_lead(lead: &AtomicI64, measured: i64) {
-    let wanted = measured + measured / 8 + MARGIN_NS;
-    let old = lead.load(Ordering::Relaxed);
-    let new = if wanted > old { wanted } else { old - (old - wanted) / 32 };
-    lead.store(new, Ordering::Relaxed);
-}
-
-/// The mock projector at real pace: serves the cable until told to stop, then a little longer so that the last words arrive.
-fn device_thread(
-    mut end: DeviceEnd,
-    mut mock: MockProjector,
-    mut recorder: LightRecorder,
-    clock: &RunClock,
-    over: &AtomicBool,
-) -> LightRecorder {
-    while !over.load(Ordering::Acquire) {
-        let now = clock.now();
-        recorder.advance(&mut mock, now);
-        if !end.serve(now, &mut mock) {
-            std::thread::sleep(Duration::from_micros(50));
-        }
-    }
-    recorder.advance(&mut mock, clock.now());
-    recorder
 }

@@ -1,6 +1,7 @@
 //! What each stage does to one frame. No threads here: `run.rs` decides who calls what.
 
 use super::job::{hash_codes, FrameJob};
+use super::prepared::PreparedFrames;
 use crate::clock::Stopwatch;
 use crate::frame::{FrameId, Stage};
 use crate::gpu::GpuError;
@@ -145,7 +146,7 @@ pub fn submit(job: &mut FrameJob, rig: &Rig, renderer: &mut Renderer) -> Result<
     )
 }
 
-/// Waits for the GPU and packs its code values into planes.
+/// Waits for the GPU and packs its code values into planes; a job without GPU takes its code values from `prepared`.
 ///
 /// # Errors
 /// The GPU did not finish within `timeout_ns`, or was lost.
@@ -154,8 +155,16 @@ pub fn finish_and_pack(
     kernel: Kernel,
     verify: bool,
     timeout_ns: u64,
+    prepared: &mut Option<PreparedFrames>,
 ) -> Result<(), GpuError> {
-    let Some(slot) = job.gpu.as_mut() else { return Ok(()) };
+    let Some(slot) = job.gpu.as_mut() else {
+        if let Some(prepared) = prepared {
+            let watch = Stopwatch::start();
+            prepared.pack(kernel, job.id.0, &mut job.planes);
+            job.timeline.wall_ns[Stage::Pack as usize] = watch.elapsed_ns();
+        }
+        return Ok(());
+    };
     let watch = Stopwatch::start();
     job.cost = slot.wait(timeout_ns)?;
     let gpu: u64 = job.cost.pass_ns.iter().sum();

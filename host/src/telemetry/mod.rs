@@ -7,5 +7,6 @@ pub mod plots;
 pub mod profile;
 pub mod prometheus;
 pub mod report;
+pub mod slots;
 pub mod trace;
 pub mod v2log;

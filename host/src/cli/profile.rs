@@ -1,0 +1,103 @@
+//! `dpm profile`: where the time between motion and light goes, and whether it got better.
+
+use super::rig_args::RigArgs;
+use super::watch::{print, watch};
+use crate::experiments::profile::profile_rig;
+use crate::failure::{Failure, FailureKind};
+use crate::telemetry::compare::{compare, to_table};
+use crate::telemetry::monitor::RunCounts;
+use crate::telemetry::profile::ProfileReport;
+use crate::telemetry::prometheus::{page, PageServer};
+use std::path::{Path, PathBuf};
+
+/// Length of a profile without `--seconds` or `--frames`, s.
+const SECONDS: f64 = 10.0;
+
+/// Flags of `dpm profile`.
+#[derive(clap::Args, Clone, Debug)]
+pub struct ProfileArgs {
+    /// The rig file; the demo's rig without one
+    #[arg(value_name = "RIG.toml")]
+    rig: Option<PathBuf>,
+    #[command(flatten)]
+    flags: RigArgs,
+    /// Frames prepared ahead in place of rendered ones: hand-offs, packing and link at the true rate, without a GPU
+    #[arg(long)]
+    no_render: bool,
+    /// Print the report as one JSON object
+    #[arg(long)]
+    json: bool,
+    /// Serve the figures for Prometheus while running, for example on 127.0.0.1:9473
+    #[arg(long, value_name = "ADDR")]
+    prometheus: Option<String>,
+    /// Compare two profile.json instead of running: what got better or worse, and whether beyond noise
+    #[arg(long, num_args = 2, value_names = ["A.json", "B.json"], conflicts_with_all = ["rig", "no_render", "prometheus"])]
+    compare: Vec<PathBuf>,
+}
+
+/// Profiles a rig, or compares two profiles.
+///
+/// # Errors
+/// Bad rig file, scene, address or profile; a device that fails.
+pub fn execute(args: &ProfileArgs) -> Result<(), Failure> {
+    if let [before, after] = args.compare.as_slice() {
+        let (rows, notes) = compare(&read(before)?, &read(after)?);
+        print(&to_table(&rows, &notes));
+        return Ok(());
+    }
+    let mut flags = args.flags.clone();
+    // In front, so that an explicit --set wins.
+    let pace = "real_time.pace=\"real\"".to_owned();
+    flags.set.splice(0..0, [pace, "output.images=false".into(), "output.trace=true".into()]);
+    flags.out.get_or_insert_with(|| "out/profile".into());
+    if flags.frames.is_none() {
+        flags.seconds.get_or_insert(SECONDS);
+    }
+    let rig = flags.rig(args.rig.as_deref())?;
+    let server = match &args.prometheus {
+        Some(address) => Some(PageServer::start(address.as_str()).map_err(|e| {
+            Failure::new(FailureKind::BadInput, format!("--prometheus {address}: cannot listen there: {e}"))
+        })?),
+        None => None,
+    };
+    let prepared = args.no_render;
+    let profile = watch(
+        rig,
+        |counts| {
+            if let Some(server) = &server {
+                server.show(page(counts, None));
+            }
+        },
+        move |rig, monitor| profile_rig(rig, prepared, monitor),
+    )?;
+    if let Some(server) = &server {
+        let counts = RunCounts {
+            frames_planned: profile.report.frames_lit + profile.report.frames_dropped,
+            frames_lit: profile.report.frames_lit,
+            frames_dropped: profile.report.frames_dropped,
+            frames_late: profile.report.frames_late,
+        };
+        server.show(page(&counts, Some(&profile.profile)));
+    }
+    print(&if args.json { profile.to_json() + "\n" } else { profile.to_table() });
+    if profile.frames_torn.unwrap_or(0) + profile.frames_reordered > 0 {
+        let told = format!(
+            "{} lit frames held parts of another and {} came out of order",
+            profile.frames_torn.unwrap_or(0),
+            profile.frames_reordered
+        );
+        return Err(Failure::new(FailureKind::CheckFailed, told));
+    }
+    Ok(())
+}
+
+fn read(path: &Path) -> Result<ProfileReport, Failure> {
+    let refuse = |e: &dyn std::fmt::Display| {
+        Failure::new(
+            FailureKind::BadInput,
+            format!("{}: not a profile.json of dpm profile: {e}", path.display()),
+        )
+    };
+    let text = std::fs::read_to_string(path).map_err(|e| refuse(&e))?;
+    serde_json::from_str(&text).map_err(|e| refuse(&e))
+}

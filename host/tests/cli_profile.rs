@@ -1,0 +1,66 @@
+//! `dpm profile` as its users meet it: without a GPU at the true rate, its files, and two profiles compared.
+
+mod cli_common;
+
+use cli_common::{code, dpm, err, out, Folder, NO_DRIVER};
+
+/// One second at the full rate and raster, without any Vulkan driver. Lateness is the machine's affair here (other tests run beside this
+/// one); what must hold on any machine is that everything is accounted for and no frame is torn, shown twice or out of order.
+#[test]
+fn without_rendering_every_slot_is_accounted_for_and_no_frame_is_torn() {
+    let folder = Folder::new("profile");
+    let args = ["profile", "--no-render", "--seconds", "1", "--json", "--out", folder.text()];
+    let output = dpm(&args, &NO_DRIVER);
+    assert_eq!(code(&output), 0, "{}", err(&output));
+    let json: serde_json::Value = serde_json::from_str(&out(&output)).expect("one JSON object");
+    for key in
+        ["frames_lit", "frames_dropped", "frames_late", "raster", "frame_rate_hz", "pace", "gpu", "wall_s"]
+    {
+        assert!(!json[key].is_null(), "{key} in {json}");
+    }
+    assert_eq!((&json["raster"], &json["planes"]), (&serde_json::json!([1024, 768]), &24.into()));
+    assert_eq!(
+        (&json["pace"], &json["gpu"], &json["method"]),
+        (&"real".into(), &"none".into(), &"prepared".into())
+    );
+    assert_eq!((&json["frames_torn"], &json["frames_reordered"]), (&0.into(), &0.into()));
+    let count = |v: &serde_json::Value| v.as_u64().unwrap_or_else(|| panic!("a count: {v}"));
+    let (lit, slots) = (count(&json["frames_lit"]), count(&json["slots"]));
+    assert!(lit > 0 && lit + count(&json["frames_dropped"]) <= 947, "{lit} lit in a second");
+    assert!(slots <= 947, "{slots} slots in a second");
+    let missed = json["profile"]["missed"].as_object().expect("misses by cause");
+    let missed_of = |cause: &str| count(&missed[cause]);
+    let all: u64 = missed.values().map(count).sum();
+    assert_eq!(count(&json["late_slots"]), all - missed_of("standstill"));
+    // Every slot showed its own frame, or was missed.
+    assert_eq!(lit - count(&json["frames_late"]) + all, slots, "{missed:?}");
+    for stage in ["plan", "pack", "link"] {
+        assert!(json["stages_ms"][stage]["p999"].is_f64(), "{stage} in {json}");
+        assert_eq!(json["profile"]["intervals_ms"][stage]["count"], lit, "{stage}");
+    }
+    for name in ["profile.json", "profile.hlog", "trace.json", "work.svg", "waits.svg", "latency.svg"] {
+        assert!(std::fs::metadata(folder.path(name)).is_ok_and(|m| m.len() > 0), "{name}");
+    }
+    let trace = std::fs::read_to_string(folder.path("trace.json")).expect("trace.json");
+    serde_json::from_str::<serde_json::Value>(&trace).expect("the trace is JSON");
+
+    // Nothing differs from itself.
+    let kept = folder.path("profile.json").display().to_string();
+    let output = dpm(&["profile", "--compare", &kept, &kept], &[]);
+    assert_eq!(code(&output), 0, "{}", err(&output));
+    let table = out(&output);
+    assert!(table.contains("motion_to_light") && !table.contains("worse"), "{table}");
+}
+
+#[test]
+fn what_is_no_profile_is_refused_with_its_name() {
+    let folder = Folder::new("noprofile");
+    let text = folder.write("a.json", "{\"setup\": 3}");
+    let output = dpm(&["profile", "--compare", &text, "/nonexistent/b.json"], &[]);
+    assert_eq!((code(&output), out(&output).as_str()), (2, ""));
+    assert!(err(&output).contains("a.json: not a profile.json of dpm profile"), "{}", err(&output));
+    let output =
+        dpm(&["profile", "--no-render", "--prometheus", "nowhere", "--out", folder.text()], &NO_DRIVER);
+    assert_eq!(code(&output), 2);
+    assert!(err(&output).contains("--prometheus nowhere"), "{}", err(&output));
+}
