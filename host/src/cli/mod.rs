@@ -1,7 +1,9 @@
 //! Words into calls: the command line of `dpm`. One file per command, no logic of its own.
 
+pub mod bench;
 pub mod dlpc900;
 pub mod doctor;
+pub mod error;
 pub mod os;
 pub mod profile;
 pub mod rig_args;
@@ -41,6 +43,10 @@ enum Command {
     Stability(stability::StabilityArgs),
     /// Write everything that one frame was made from as pictures: rates, errors, samples, history, motion, light
     Snapshot(snapshot::SnapshotArgs),
+    /// Measure rays, samples and milliseconds by pass of every method on this device
+    Bench(bench::BenchArgs),
+    /// Measure error against cost of every method: perceived error, bias, noise and flicker at equal rays
+    Error(error::ErrorArgs),
     /// Control a DLPC900 projector (LightCrafter 6500 / 9000): status, patterns, rest
     Dlpc900(dlpc900::Dlpc900Args),
 }
@@ -76,6 +82,8 @@ fn dispatch(command: &Command) -> Result<(), Failure> {
         Command::Doctor(args) => doctor::execute(args),
         Command::Stability(args) => stability::execute(args),
         Command::Snapshot(args) => snapshot::execute(args),
+        Command::Bench(args) => bench::execute(args),
+        Command::Error(args) => error::execute(args),
         Command::Dlpc900(args) => dlpc900::execute(args),
     }
 }

@@ -1,8 +1,13 @@
 //! Runs that answer a question: each is a command and a test.
 
+pub mod bench;
+pub mod error_plan;
+pub mod error_report;
+pub mod error_runs;
 pub mod pictures;
 pub mod profile;
 pub mod run_rig;
 pub mod sequence;
 pub mod snapshot;
 pub mod stability;
+pub mod stamp;

@@ -49,6 +49,8 @@ pub struct Seen {
     pub gpu_ns: u64,
     /// Cost of every kept frame.
     pub costs: Vec<FrameCost>,
+    /// From recording to the end of waiting of every kept frame, nanoseconds.
+    pub wall_ns: Vec<u64>,
 }
 
 /// Samples a pixel as a rational stream: a fraction becomes frames of either neighbour.
@@ -74,6 +76,7 @@ pub struct Theatre {
     gpu: Arc<Gpu>,
     span: Span,
     probes: Vec<Probe>,
+    frozen: bool,
 }
 
 impl Theatre {
@@ -82,6 +85,18 @@ impl Theatre {
     /// # Errors
     /// The renderer's.
     pub fn new(rig: Arc<Rig>, gpu: Arc<Gpu>, span: Span) -> Result<Self, RenderError> {
+        Self::build(rig, gpu, span, false)
+    }
+
+    /// The same with all bodies standing where the span's last frame has them: the probes are those of [`Theatre::new`].
+    ///
+    /// # Errors
+    /// The renderer's.
+    pub fn frozen(rig: Arc<Rig>, gpu: Arc<Gpu>, span: Span) -> Result<Self, RenderError> {
+        Self::build(rig, gpu, span, true)
+    }
+
+    fn build(rig: Arc<Rig>, gpu: Arc<Gpu>, span: Span, frozen: bool) -> Result<Self, RenderError> {
         let settings = RendererSettings {
             method: Method { temporal: true, ..Method::full(1) },
             ..renderer_settings(&rig)
@@ -110,7 +125,7 @@ impl Theatre {
                 }
             })
             .collect();
-        Ok(Self { rig, gpu, span, probes })
+        Ok(Self { rig, gpu, span, probes, frozen })
     }
 
     /// The probes, in raster order.
@@ -143,12 +158,22 @@ impl Theatre {
         let settings = RendererSettings { method: method.clone(), seed, ..renderer_settings(rig) };
         let mut renderer = Renderer::new(&self.gpu, &rig.scene, settings)?;
         let mut slot = renderer.create_slot(true)?;
-        let mut seen = Seen { frames: Vec::new(), rays: 0, samples: 0, gpu_ns: 0, costs: Vec::new() };
+        let mut seen = Seen {
+            frames: Vec::new(),
+            rays: 0,
+            samples: 0,
+            gpu_ns: 0,
+            costs: Vec::new(),
+            wall_ns: Vec::new(),
+        };
         let total = self.span.warm_up + self.span.kept;
         let first = (self.span.last_slot + 1).saturating_sub(u64::from(total));
         for k in 0..total {
-            let poses = poses_at(rig, first + u64::from(k));
+            let at = if self.frozen { self.span.last_slot } else { first + u64::from(k) };
+            let poses = poses_at(rig, at);
+            let started = std::time::Instant::now();
             let cost = draw(rig, &mut renderer, &mut slot, &poses, k, spp_of_frame(spp, k), spp)?;
+            let wall_ns = started.elapsed().as_nanos() as u64;
             each(k, &slot);
             if k >= self.span.warm_up {
                 let c = cost.counters();
@@ -156,6 +181,7 @@ impl Theatre {
                 seen.samples += u64::from(c.samples);
                 seen.gpu_ns += cost.pass_ns.iter().sum::<u64>();
                 seen.costs.push(cost);
+                seen.wall_ns.push(wall_ns);
                 seen.frames.push(self.look(
                     &poses,
                     slot.radiance().unwrap_or(&[]),

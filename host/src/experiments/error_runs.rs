@@ -1,0 +1,465 @@
+//! A rig into the error of every method at equal rays, against a reference that tells its own error.
+//!
+//! Every method is drawn twice with different seeds. What the two runs share is bias, what they do not is noise; half of the power of
+//! their difference is the flicker of one of them, without any reference. The reference comes in two independent halves for the same
+//! reason: half of their difference is its own error, and its power is taken off what is measured against it.
+
+use super::error_plan::{contenders, paper_at, Contender, Group};
+use super::sequence::{eye_mean, rmse, Seen, Span, Theatre};
+use super::stamp::{Fnv, Stamp};
+use crate::files::write_atomically;
+use crate::gpu::Gpu;
+use crate::metrics::error::compare;
+use crate::metrics::flicker::TileSeries;
+use crate::metrics::flip::{mean_flip, DEFAULT_PIXELS_PER_DEGREE};
+use crate::metrics::{luminance, MetricError, Picture};
+use crate::render::method::{Method, SamplerKind};
+use crate::render::RenderError;
+use crate::rig::Rig;
+use glam::Vec3;
+use serde::{Deserialize, Serialize};
+use std::fmt::Write as _;
+use std::io::Write as _;
+use std::path::{Path, PathBuf};
+use std::sync::Arc;
+
+/// How much is drawn.
+#[derive(Clone, Debug)]
+pub struct ErrorOptions {
+    /// Frames before those that count.
+    pub warm_up: u32,
+    /// Frames that count: flicker is measured over all of them, the eye over the last [`EYE_FRAMES`].
+    pub kept: u32,
+    /// Samples a pixel and frame of the reference, both halves together.
+    pub reference_spp: u32,
+    /// Dpm with each part off in turn is measured too.
+    pub ablation: bool,
+    /// Folder for references.
+    pub cache: PathBuf,
+}
+
+/// Frames over which the eye takes the mean: 33 ms at 947 fps.
+pub const EYE_FRAMES: usize = 31;
+/// Rays count as equal within this share.
+const EQUAL_RAYS: f64 = 0.02;
+/// Fewer probes in the periphery than this share of all do not tell its flicker.
+const LEAST_PERIPHERY: f64 = 0.01;
+
+/// One method at one budget. Errors are in the scene's unit of radiance.
+#[derive(Clone, Debug, Serialize, Deserialize)]
+pub struct ErrorRow {
+    /// Method.
+    pub method: String,
+    /// Bodies move.
+    pub moving: bool,
+    /// The group's budget: samples a pixel of `paper` where the eye looks.
+    pub budget: u32,
+    /// Samples a lit pixel and frame asked of this method.
+    pub spp: f64,
+    /// Rays of a frame.
+    pub rays: f64,
+    /// Rays by those of `paper`.
+    pub rays_to_paper: f64,
+    /// Samples of a frame.
+    pub samples: f64,
+    /// GPU time of a frame, median, ms; 0 without time stamps.
+    pub gpu_ms: f64,
+    /// Time of a frame until its light is known, median, ms.
+    pub wall_ms: f64,
+    /// RMSE of the last frame alone.
+    pub single_rmse: f64,
+    /// Relative MSE of the last frame alone [Rousselle11].
+    pub single_rel_mse: f64,
+    /// RMSE of what the eye sees, the reference's own error taken off.
+    pub perceived_rmse: f64,
+    /// The same as measured.
+    pub perceived_rmse_raw: f64,
+    /// The same within 15 deg of the gaze (the paper's inner zone), and outside; `None` where too little is lit.
+    pub perceived_fovea: Option<f64>,
+    /// See `perceived_fovea`.
+    pub perceived_periphery: Option<f64>,
+    /// RMS over probes of what both runs have in common against the reference: lag, smear, filtering.
+    pub bias: f64,
+    /// RMS of the eye's noise.
+    pub noise: f64,
+    /// Mean of the picture against the reference's, minus 1.
+    pub mean_shift: f64,
+    /// FLIP of what the eye sees, at 67 pixels a degree.
+    pub flip: f64,
+    /// RMS flicker of tiles from 1 to 60 Hz, everywhere.
+    pub flicker: f64,
+    /// The same in tiles beyond 15 deg; `None` where too little is lit.
+    pub flicker_periphery: Option<f64>,
+    /// `perceived_rmse` by that of `paper`.
+    pub ratio_to_paper: f64,
+}
+
+/// A measured group, as it is kept in its file.
+#[derive(Clone, Debug, Serialize, Deserialize)]
+pub struct GroupResult {
+    /// With what.
+    pub stamp: Stamp,
+    /// Hash of all that the result depends on.
+    pub key: String,
+    /// Probes: lit surface points that the eye follows.
+    pub probes: usize,
+    /// Their mean radiance.
+    pub mean: f64,
+    /// RMS error of the reference as the eye sees it, from its two halves.
+    pub reference_error: f64,
+    /// One a method, `paper` first.
+    pub rows: Vec<ErrorRow>,
+}
+
+/// Why a group could not be measured.
+#[derive(Debug, thiserror::Error)]
+pub enum ErrorRunError {
+    /// The renderer's.
+    #[error(transparent)]
+    Render(#[from] RenderError),
+    /// Pictures that cannot be compared.
+    #[error("cannot compare with the reference: {0}")]
+    Metric(#[from] MetricError),
+    /// Nothing to look at.
+    #[error("the projector lights nothing at the end of the sequence: check projector.position and look_at, and scene.bodies")]
+    NothingLit,
+    /// The cache.
+    #[error(transparent)]
+    Io(#[from] std::io::Error),
+}
+
+/// Two independent halves, and their mean.
+struct Reference {
+    halves: [Vec<Vec3>; 2],
+    eye: Vec<Vec3>,
+    last: Vec<Vec3>,
+    error: f64,
+}
+
+/// Draws and compares the groups of one rig.
+pub struct ErrorRuns {
+    rig: Arc<Rig>,
+    gpu: Arc<Gpu>,
+    options: ErrorOptions,
+    stamp: Stamp,
+}
+
+impl ErrorRuns {
+    /// Ready to measure `rig` on `gpu`.
+    pub fn new(rig: Arc<Rig>, gpu: Arc<Gpu>, options: ErrorOptions) -> Self {
+        let stamp = Stamp::new(&rig, gpu.summary());
+        Self { rig, gpu, options, stamp }
+    }
+
+    /// The stamp of all groups.
+    pub fn stamp(&self) -> &Stamp {
+        &self.stamp
+    }
+
+    /// Names all that a group's result depends on.
+    pub fn key(&self, group: Group) -> String {
+        let (o, mut hash) = (&self.options, Fnv::default());
+        // Writing into a hash cannot fail.
+        let _ =
+            write!(hash, "{:?}{group:?}{}{}{}{}", self.stamp, o.warm_up, o.kept, o.reference_spp, o.ablation);
+        hash.text()
+    }
+
+    fn last_slot(&self) -> u64 {
+        u64::from(self.options.warm_up + self.options.kept) + 50
+    }
+
+    fn theatre(&self, group: Group, warm_up: u32, kept: u32) -> Result<Theatre, RenderError> {
+        let span = Span { last_slot: self.last_slot(), warm_up, kept };
+        let make = if group.moving { Theatre::new } else { Theatre::frozen };
+        make(self.rig.clone(), self.gpu.clone(), span)
+    }
+
+    /// Measures all methods of a group at the rays of `paper`. `each` is called before every sequence with its name.
+    ///
+    /// # Errors
+    /// The renderer's; nothing lit; the cache cannot be written.
+    pub fn measure(&self, group: Group, each: &mut dyn FnMut(&str)) -> Result<GroupResult, ErrorRunError> {
+        let o = &self.options;
+        let theatre = self.theatre(group, o.warm_up, o.kept)?;
+        if theatre.probes().is_empty() {
+            return Err(ErrorRunError::NothingLit);
+        }
+        let reference = self.reference(group, each)?;
+        let mean = mean_of(&reference.eye);
+        let mut rows: Vec<ErrorRow> = Vec::new();
+        for contender in contenders(&self.rig.config.render, o.ablation) {
+            let paper_rays = rows.first().map(|paper| paper.rays);
+            let (contender, spp) = match paper_rays {
+                None => {
+                    let method = paper_at(&contender.method, group.budget);
+                    (Contender { method, ..contender }, group.budget as f32)
+                }
+                Some(rays) => {
+                    let spp = self.spp_for(group, &contender.method, rays)?;
+                    (contender, spp)
+                }
+            };
+            let mut row = self.row(&theatre, group, &contender, spp, paper_rays, &reference, each)?;
+            row.rays_to_paper = row.rays / paper_rays.unwrap_or(row.rays);
+            row.ratio_to_paper =
+                row.perceived_rmse / rows.first().map_or(row.perceived_rmse, |paper| paper.perceived_rmse);
+            rows.push(row);
+        }
+        Ok(GroupResult {
+            stamp: self.stamp.clone(),
+            key: self.key(group),
+            probes: theatre.probes().len(),
+            mean,
+            reference_error: reference.error,
+            rows,
+        })
+    }
+
+    /// Samples with which a method takes `rays` a frame: a frame without samples tells the fixed part, a short sequence the rest.
+    fn spp_for(&self, group: Group, method: &Method, rays: f64) -> Result<f32, RenderError> {
+        const TRIAL: f32 = 4.0;
+        let short = self.theatre(group, 6, 6)?;
+        let of = |spp| Ok::<f64, RenderError>(short.play(method, spp, 77, &mut |_, _| ())?.rays as f64 / 6.0);
+        let (base, trial) = (of(0.0)?, of(TRIAL)?);
+        Ok(corrected(TRIAL, base, trial, rays))
+    }
+
+    #[allow(clippy::too_many_arguments)]
+    fn row(
+        &self,
+        theatre: &Theatre,
+        group: Group,
+        contender: &Contender,
+        mut spp: f32,
+        wanted: Option<f64>,
+        reference: &Reference,
+        each: &mut dyn FnMut(&str),
+    ) -> Result<ErrorRow, ErrorRunError> {
+        let seed = self.rig.config.render.seed as u32;
+        let mut play = |spp: f32, seed: u32| {
+            each(contender.name);
+            theatre.play(&contender.method, spp, seed, &mut |_, _| ())
+        };
+        let frames = f64::from(self.options.kept);
+        let mut a = play(spp, seed)?;
+        if let Some(wanted) = wanted.filter(|w| (a.rays as f64 / frames / w - 1.0).abs() > EQUAL_RAYS) {
+            let rays = a.rays as f64 / frames;
+            let per_sample = 4.0f64.min(rays * frames / (a.samples as f64).max(1.0));
+            let base = rays - per_sample * a.samples as f64 / frames;
+            spp = corrected(spp, base, rays, wanted);
+            a = play(spp, seed)?;
+        }
+        let b = play(spp, seed.wrapping_add(1_000_003))?;
+        self.compare(theatre, group, contender, spp, [a, b], reference)
+    }
+
+    fn compare(
+        &self,
+        theatre: &Theatre,
+        group: Group,
+        contender: &Contender,
+        spp: f32,
+        runs: [Seen; 2],
+        reference: &Reference,
+    ) -> Result<ErrorRow, ErrorRunError> {
+        let frames = f64::from(self.options.kept);
+        let eyes = [0, 1].map(|i| eye_mean(&runs[i].frames, EYE_FRAMES));
+        let inner = self.rig.config.render.paper.phi_h_deg as f32;
+        let angle = |i: usize| theatre.probes()[i].angle;
+        let outside = theatre.probes().iter().filter(|p| p.angle >= inner).count() as f64;
+        let share = outside / theatre.probes().len() as f64;
+        let zone = |enough: bool, keep: &dyn Fn(usize) -> bool| {
+            enough.then(|| perceived(&eyes, reference, keep)).map(|(_, clean)| clean)
+        };
+        let (raw, clean) = perceived(&eyes, reference, &|_| true);
+        let [a, b] = &runs;
+        let (flicker, flicker_periphery) = self.flicker(theatre, a, b, inner)?;
+        let single = |seen: &Seen| {
+            let last = seen.frames.last().map_or(&[][..], Vec::as_slice);
+            let (test, truth) =
+                (Picture::new(last.len(), 1, last)?, Picture::new(last.len(), 1, &reference.last)?);
+            compare(&test, &truth, None, 1.0)
+        };
+        let (first, second) = (single(a)?, single(b)?);
+        let [gpu_ms, wall_ms] = [0, 1].map(|which| {
+            let mut all: Vec<u64> = match which {
+                0 => runs.iter().flat_map(|r| &r.costs).map(|c| c.pass_ns.iter().sum()).collect(),
+                _ => runs.iter().flat_map(|r| &r.wall_ns).copied().collect(),
+            };
+            all.sort_unstable();
+            all.get(all.len() / 2).map_or(0.0, |&ns| ns as f64 * 1e-6)
+        });
+        let both = |of: &dyn Fn(&Seen) -> u64| 0.5 * (of(a) + of(b)) as f64 / frames;
+        Ok(ErrorRow {
+            method: contender.name.to_owned(),
+            moving: group.moving,
+            budget: group.budget,
+            spp: f64::from(spp),
+            rays: both(&|s| s.rays),
+            rays_to_paper: 1.0,
+            samples: both(&|s| s.samples),
+            gpu_ms,
+            wall_ms,
+            single_rmse: (0.5 * (first.rmse.powi(2) + second.rmse.powi(2))).sqrt(),
+            single_rel_mse: 0.5 * (first.rel_mse + second.rel_mse),
+            perceived_rmse: clean,
+            perceived_rmse_raw: raw,
+            perceived_fovea: zone(1.0 - share >= LEAST_PERIPHERY, &|i| angle(i) < inner),
+            perceived_periphery: zone(share >= LEAST_PERIPHERY, &|i| angle(i) >= inner),
+            bias: common(&eyes, &reference.halves).max(0.0).sqrt(),
+            noise: rmse(&eyes[0], &eyes[1], |_| true) / std::f64::consts::SQRT_2,
+            mean_shift: 0.5 * (mean_of(&eyes[0]) + mean_of(&eyes[1])) / mean_of(&reference.eye) - 1.0,
+            flip: self.flip(theatre, &eyes[0], &reference.eye)?,
+            flicker,
+            flicker_periphery: flicker_periphery.filter(|_| share >= LEAST_PERIPHERY),
+            ratio_to_paper: 1.0,
+        })
+    }
+
+    /// RMS flicker everywhere and beyond `inner` degrees: half of the power of two runs' difference.
+    fn flicker(
+        &self,
+        theatre: &Theatre,
+        a: &Seen,
+        b: &Seen,
+        inner: f32,
+    ) -> Result<(f64, Option<f64>), MetricError> {
+        let raster = theatre.raster();
+        let (width, height) = (raster.width() as usize, raster.height() as usize);
+        // About the paper's tiles (16 px of 1024) on every raster.
+        let tile = (width / 64).max(1);
+        let rate = self.rig.rate();
+        let mut series = TileSeries::new(width, height, tile, rate.slot_len_ns(0).max(1) as u64)?;
+        let mut picture = vec![0.0f32; raster.pixel_count()];
+        for (a, b) in a.frames.iter().zip(&b.frames) {
+            picture.fill(0.0);
+            for ((probe, a), b) in theatre.probes().iter().zip(a).zip(b) {
+                let d = luminance(*a - *b);
+                if d.is_finite() {
+                    picture[probe.pixel as usize] = d;
+                }
+            }
+            series.add(&picture)?;
+        }
+        let power = series.power()?;
+        let across = series.tiles().0;
+        let mean = |keep: &dyn Fn(f32) -> bool| {
+            let mut wanted = vec![false; power.len()];
+            for p in theatre.probes().iter().filter(|p| keep(p.angle)) {
+                wanted[p.pixel as usize / width / tile * across + p.pixel as usize % width / tile] = true;
+            }
+            let chosen: Vec<f64> =
+                power.iter().zip(&wanted).filter(|(_, &w)| w).map(|(p, _)| 0.5 * p).collect();
+            (!chosen.is_empty()).then(|| (chosen.iter().sum::<f64>() / chosen.len() as f64).sqrt())
+        };
+        Ok((mean(&|_| true).unwrap_or(0.0), mean(&|angle| angle >= inner)))
+    }
+
+    /// FLIP over the lit pixels; white is the reference's brightest hundredth.
+    fn flip(&self, theatre: &Theatre, test: &[Vec3], truth: &[Vec3]) -> Result<f64, MetricError> {
+        let raster = theatre.raster();
+        let (width, height) = (raster.width() as usize, raster.height() as usize);
+        let mut all: Vec<f32> = truth.iter().filter(|v| v.is_finite()).map(|v| v.max_element()).collect();
+        all.sort_by(f32::total_cmp);
+        let white = all.get(all.len() * 99 / 100).copied().unwrap_or(1.0).max(1e-6);
+        let paint = |values: &[Vec3]| {
+            let mut out = vec![Vec3::ZERO; raster.pixel_count()];
+            for (probe, v) in theatre.probes().iter().zip(values) {
+                out[probe.pixel as usize] = if v.is_finite() { *v / white } else { Vec3::ZERO };
+            }
+            out
+        };
+        let (test, truth) = (paint(test), paint(truth));
+        let (test, truth) = (Picture::new(width, height, &test)?, Picture::new(width, height, &truth)?);
+        let over_all = mean_flip(&test, &truth, DEFAULT_PIXELS_PER_DEGREE)?;
+        Ok(over_all * raster.pixel_count() as f64 / theatre.probes().len() as f64)
+    }
+
+    fn reference(&self, group: Group, each: &mut dyn FnMut(&str)) -> Result<Reference, ErrorRunError> {
+        let theatre = self.theatre(group, 0, EYE_FRAMES as u32)?;
+        let spp = self.options.reference_spp.div_ceil(2);
+        let method = Method { sampler: SamplerKind::BlueNoise, ..Method::full(spp) };
+        // What the picture converges to depends neither on the methods' seed nor on how long the methods run.
+        let mut hash = Fnv::default();
+        let _ = write!(hash, "{}{}{}{spp}", self.stamp.config_hash, group.moving, self.last_slot());
+        let n = theatre.probes().len();
+        let mut halves = Vec::new();
+        for half in 0..2u32 {
+            let path = self.options.cache.join(format!("reference-{}-{half}.f32", hash.text()));
+            let frames = match read_frames(&path, n) {
+                Some(frames) => frames,
+                None => {
+                    each("reference");
+                    let seen = theatre.play(&method, spp as f32, 0x9e37_0000 + half, &mut |_, _| ())?;
+                    write_frames(&path, &seen.frames)?;
+                    seen.frames
+                }
+            };
+            halves.push(frames);
+        }
+        let mean = |a: &[Vec3], b: &[Vec3]| a.iter().zip(b).map(|(a, b)| 0.5 * (*a + *b)).collect::<Vec<_>>();
+        let last = mean(&halves[0][EYE_FRAMES - 1], &halves[1][EYE_FRAMES - 1]);
+        let halves = [0, 1].map(|i: usize| eye_mean(&halves[i], EYE_FRAMES));
+        let eye = mean(&halves[0], &halves[1]);
+        let error = 0.5 * rmse(&halves[0], &halves[1], |_| true);
+        Ok(Reference { halves, eye, last, error })
+    }
+}
+
+/// Samples for `wanted` rays when `base` are fixed and `spp` samples gave `rays`.
+fn corrected(spp: f32, base: f64, rays: f64, wanted: f64) -> f32 {
+    let slope = (rays - base) / f64::from(spp);
+    if slope > 0.0 {
+        ((wanted - base) / slope).max(0.02) as f32
+    } else {
+        spp
+    }
+}
+
+/// Root of the mean square error of both runs against the reference: as measured, and without the reference's own.
+fn perceived(eyes: &[Vec<Vec3>; 2], reference: &Reference, keep: &dyn Fn(usize) -> bool) -> (f64, f64) {
+    let square = |e: &Vec<Vec3>| rmse(e, &reference.eye, keep).powi(2);
+    let raw = 0.5 * (square(&eyes[0]) + square(&eyes[1]));
+    let own = 0.25 * rmse(&reference.halves[0], &reference.halves[1], keep).powi(2);
+    (raw.sqrt(), (raw - own).max(0.0).sqrt())
+}
+
+/// Mean product of the two runs' differences from two independent halves of the reference: no noise of either is in it, so its
+/// expectation is the squared bias.
+fn common(eyes: &[Vec<Vec3>; 2], halves: &[Vec<Vec3>; 2]) -> f64 {
+    let (mut sum, mut n) = (0.0f64, 0u64);
+    for (((a, b), r), s) in eyes[0].iter().zip(&eyes[1]).zip(&halves[0]).zip(&halves[1]) {
+        let product = ((*a - *r) * (*b - *s)).as_dvec3().element_sum();
+        if product.is_finite() {
+            sum += product;
+            n += 3;
+        }
+    }
+    sum / n.max(1) as f64
+}
+
+fn mean_of(values: &[Vec3]) -> f64 {
+    let finite = || values.iter().filter(|v| v.is_finite());
+    finite().map(|v| v.as_dvec3().element_sum()).sum::<f64>() / (3 * finite().count()).max(1) as f64
+}
+
+/// Frames of `probes` values from the cache; `None` when there are none or they do not fit.
+fn read_frames(path: &Path, probes: usize) -> Option<Vec<Vec<Vec3>>> {
+    let bytes = std::fs::read(path).ok()?;
+    if bytes.len() != EYE_FRAMES * probes * 12 {
+        return None;
+    }
+    let value = |c: &[u8]| f32::from_le_bytes([c[0], c[1], c[2], c[3]]);
+    let point = |c: &[u8]| Vec3::new(value(&c[..4]), value(&c[4..8]), value(&c[8..]));
+    Some(bytes.chunks_exact(12 * probes).map(|f| f.chunks_exact(12).map(point).collect()).collect())
+}
+
+fn write_frames(path: &Path, frames: &[Vec<Vec3>]) -> std::io::Result<()> {
+    write_atomically(path, |out| {
+        for v in frames.iter().flatten().flat_map(|v| v.to_array()) {
+            out.write_all(&v.to_le_bytes())?;
+        }
+        Ok(())
+    })
+}
