@@ -1,5 +1,11 @@
 //! What a scene does not need is compiled away. That may cost speed only: every pixel stays the same, bit for bit.
 
+use dpm_host::config::{Overrides, RenderMethod, RigConfig};
+use dpm_host::experiments::sequence::{draw, poses_at};
+use dpm_host::pipeline::renderer_settings;
+use dpm_host::render::method::Method;
+use dpm_host::render::{Renderer, RendererSettings};
+use dpm_host::rig::Rig;
 use dpm_host::scene::{Material, PunctualKind, PunctualLight, Scene};
 use dpm_tests::gpu::{with_gpu, Shot};
 use dpm_tests::scenes::*;
@@ -89,6 +95,46 @@ fn leaving_out_changes_no_bit() {
             assert_eq!(different, 0, "{name}: pixels that differ");
             assert_eq!(lean.codes, full.codes, "{name}");
             assert_eq!(lean.counters, full.counters, "{name}");
+        }
+    });
+}
+
+#[test]
+fn leaving_out_changes_no_bit_of_either_method_with_histories() {
+    let flags = vec!["render.software_raster=[64,48]".to_owned()];
+    let config = RigConfig::demo(&Overrides { variables: vec![], flags }).unwrap_or_else(|e| panic!("{e}"));
+    let rig = Rig::build(&config, dpm_device::planes::Raster::new(64, 48)).unwrap_or_else(|e| panic!("{e}"));
+    with_gpu(|gpu| {
+        for which in [RenderMethod::Paper, RenderMethod::Dpm] {
+            let mut render = rig.config.render.clone();
+            render.method = which;
+            render.paper.zone_spp = [2, 2, 1];
+            let shown = |leave_nothing_out: bool| {
+                let settings = RendererSettings {
+                    method: Method::from_config(&render),
+                    leave_nothing_out,
+                    ..renderer_settings(&rig)
+                };
+                let mut renderer = Renderer::new(gpu, &rig.scene, settings).expect("the demo fits the GPU");
+                let mut slot = renderer.create_slot(true).expect("memory for a small frame");
+                let mut frames = Vec::new();
+                for frame in 0..6 {
+                    let poses = poses_at(&rig, u64::from(frame));
+                    draw(&rig, &mut renderer, &mut slot, &poses, frame, 2, 2.0).expect("the frame ends");
+                    let bits = |r: &[f32; 4]| r.map(f32::to_bits);
+                    let radiance: Vec<_> = slot.radiance().expect("a debug slot").iter().map(bits).collect();
+                    frames.push((radiance, slot.codes().to_vec()));
+                }
+                frames
+            };
+            let (lean, full) = (shown(false), shown(true));
+            for (frame, (lean, full)) in lean.iter().zip(&full).enumerate() {
+                let lit = lean.1.iter().filter(|c| **c != 0).count();
+                assert!(lit > 50, "{which:?}, frame {frame}: {lit} pixels are lit");
+                let different = lean.0.iter().zip(&full.0).filter(|(a, b)| a != b).count();
+                assert_eq!(different, 0, "{which:?}, frame {frame}: pixels that differ");
+                assert_eq!(lean.1, full.1, "{which:?}, frame {frame}");
+            }
         }
     });
 }

@@ -6,6 +6,7 @@ pub mod doctor;
 pub mod error;
 pub mod os;
 pub mod profile;
+pub mod plan;
 pub mod rig_args;
 pub mod run;
 pub mod signals;
@@ -47,6 +48,8 @@ enum Command {
     Bench(bench::BenchArgs),
     /// Measure error against cost of every method: perceived error, bias, noise and flicker at equal rays
     Error(error::ErrorArgs),
+    /// Say what a rig needs of the renderer, what is left out, why, how, and with --measure what that saves
+    Plan(plan::PlanArgs),
     /// Control a DLPC900 projector (LightCrafter 6500 / 9000): status, patterns, rest
     Dlpc900(dlpc900::Dlpc900Args),
 }
@@ -84,6 +87,7 @@ fn dispatch(command: &Command) -> Result<(), Failure> {
         Command::Snapshot(args) => snapshot::execute(args),
         Command::Bench(args) => bench::execute(args),
         Command::Error(args) => error::execute(args),
+        Command::Plan(args) => plan::execute(args),
         Command::Dlpc900(args) => dlpc900::execute(args),
     }
 }

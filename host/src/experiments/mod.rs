@@ -7,6 +7,7 @@ pub mod error_runs;
 pub mod pictures;
 pub mod profile;
 pub mod run_rig;
+pub mod scene_plan;
 pub mod sequence;
 pub mod snapshot;
 pub mod stability;

@@ -284,11 +284,24 @@ impl Renderer {
     /// # Errors
     /// The scene is too large, or the GPU's own.
     pub fn new(gpu: &Arc<Gpu>, scene: &Scene, settings: RendererSettings) -> Result<Self, RenderError> {
+        Self::keeping(gpu, scene, settings, SceneNeeds::default())
+    }
+
+    /// The same with `keep` compiled in whether the scene needs it or not: for measuring what leaving it out saves.
+    ///
+    /// # Errors
+    /// As [`Renderer::new`].
+    pub fn keeping(
+        gpu: &Arc<Gpu>,
+        scene: &Scene,
+        settings: RendererSettings,
+        keep: SceneNeeds,
+    ) -> Result<Self, RenderError> {
         let data = SceneData::build(scene)?;
         let texel = gpu.summary().software;
         let scene_gpu = SceneGpu::new(gpu, &data, texel)?;
-        let mut needs = data.needs;
-        needs.clamp = settings.clamp_indirect.is_some();
+        let mut needs = data.needs.with(keep);
+        needs.clamp |= settings.clamp_indirect.is_some();
         if settings.leave_nothing_out {
             needs = needs.everything();
         }

@@ -93,6 +93,22 @@ pub struct SceneNeeds {
 }
 
 impl SceneNeeds {
+    /// What either of both needs. The kind of environment stays this scene's: another kind reads tables that it does not have.
+    pub fn with(self, other: Self) -> Self {
+        Self {
+            textures: self.textures || other.textures,
+            normal_maps: self.normal_maps || other.normal_maps,
+            alpha_mask: self.alpha_mask || other.alpha_mask,
+            transmission: self.transmission || other.transmission,
+            specular: self.specular || other.specular,
+            diffuse: self.diffuse || other.diffuse,
+            emissive: self.emissive || other.emissive,
+            punctual: self.punctual || other.punctual,
+            environment_kind: self.environment_kind,
+            clamp: self.clamp || other.clamp,
+        }
+    }
+
     /// Everything in: for proving that leaving out changes nothing.
     pub fn everything(self) -> Self {
         Self {

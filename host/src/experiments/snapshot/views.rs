@@ -92,7 +92,7 @@ impl Views<'_> {
             I::Rate => {
                 paint::kinds(raster, &self.rates(), &RATES, "rate of a tile\n(pixels x, y\nshare a ray)")
             }
-            I::Error => quantity(self.errors(), Scale::FromZero, "e of eq. 1\n(scene units)"),
+            I::Error => quantity(self.errors(), Scale::FromZero, "e of eq. 1\n(scene units)\npink: unknown"),
             I::Size => quantity(
                 self.guide(|g| g.size),
                 Scale::Span,
@@ -111,11 +111,9 @@ impl Views<'_> {
                 let title = if self.method.dpm { "history\n(samples/px)" } else { "history\n(frames)" };
                 quantity(self.history(|h| h.weight), Scale::FromZero, title)
             }
-            I::Variance => quantity(
-                self.history(|h| h.variance),
-                Scale::Log,
-                "variance of a\nsample's\nluminance\n(units squared)",
-            ),
+            I::Variance => {
+                quantity(self.history(|h| h.variance), Scale::Log, "variance of\none sample\nluminance")
+            }
             I::Albedo => paint::colours(raster, &self.guide(albedo_of)),
             I::Normal => {
                 let normal = |s: &Surface| {
@@ -157,7 +155,8 @@ impl Views<'_> {
 
     fn errors(&self) -> Vec<Option<f32>> {
         let surfaces = self.slot.surfaces().unwrap_or(&[]);
-        let tile = |i: usize| self.tile_errors.get(self.tile_of(i)).copied().flatten();
+        // Some pixel of the tile had no history: there is no estimate.
+        let tile = |i: usize| self.tile_errors.get(self.tile_of(i)).copied().flatten().or(Some(f32::NAN));
         surfaces.iter().enumerate().map(|(i, s)| if is_lit(s) { tile(i) } else { None }).collect()
     }
 }

@@ -1,0 +1,60 @@
+//! `dpm plan RIG.toml`: what a rig needs, what is left out, why, how, and what it saves.
+
+use super::rig_args::RigArgs;
+use super::watch::print;
+use crate::experiments::scene_plan::{scene_plan, Saving};
+use crate::failure::Failure;
+use crate::telemetry::report::to_json;
+use std::path::PathBuf;
+
+/// Flags of `dpm plan`.
+#[derive(clap::Args, Clone, Debug)]
+pub struct PlanArgs {
+    /// The rig file; the built-in demo when left out
+    #[arg(value_name = "RIG.toml")]
+    rig: Option<PathBuf>,
+    #[command(flatten)]
+    flags: RigArgs,
+    /// Time frames with and without each part of the scene that is left out, and compare their pixels
+    #[arg(long)]
+    measure: bool,
+    /// Print one JSON object
+    #[arg(long)]
+    json: bool,
+}
+
+fn saved(s: &Saving) -> String {
+    let same = if s.pixels_identical { "same pixels" } else { "PIXELS DIFFER" };
+    format!("{:.2} ms instead of {:.2} ms, {same}", s.without_ms, s.with_ms)
+}
+
+/// Prints the plan.
+///
+/// # Errors
+/// Bad rig file or scene; with `--measure` no GPU, or pixels that differ.
+pub fn execute(args: &PlanArgs) -> Result<(), Failure> {
+    let rig = args.flags.rig(args.rig.as_deref())?;
+    let report = scene_plan(&rig, args.measure)?;
+    if args.json {
+        print(&(to_json(&report) + "\n"));
+        return Ok(());
+    }
+    let mut text = String::new();
+    report.warnings.iter().for_each(|w| text += &format!("note: {w}\n"));
+    for e in &report.entries {
+        let state = match (e.needed, e.left_out) {
+            (true, _) => "needed",
+            (false, true) => "left out",
+            (false, false) => "kept",
+        };
+        text += &format!("{state:<9} {:<25} {} [{}]\n", e.feature, e.why, e.how);
+        if let Some(s) = &e.saving {
+            text += &format!("{:35} {}\n", "", saved(s));
+        }
+    }
+    if let Some(s) = &report.together {
+        text += &format!("all parts of the scene that are left out: {}\n", saved(s));
+    }
+    print(&text);
+    Ok(())
+}
