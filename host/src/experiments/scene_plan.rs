@@ -154,7 +154,7 @@ pub fn scene_entries(scene: &Scene, needs: &SceneNeeds, clamp: f64) -> Vec<PlanE
 /// Parts that depend on the method and its switches.
 pub fn method_entries(method: &Method, word: &str) -> Vec<PlanEntry> {
     let by = |on: bool, key: &str| on.then(|| format!("method {word}, {key} on"));
-    let or = |key: &str| format!("method {word} with this {key}");
+    let or = |key: &str| format!("method {word} does without, by itself or by {key}");
     let part = |feature, on: bool, key: &str, how| entry(feature, by(on, key), &or(key), how);
     let switch = "a bit of the frame's flags, tested per pixel";
     vec![

@@ -95,7 +95,7 @@ impl Views<'_> {
             I::Error => quantity(self.errors(), Scale::FromZero, "e of eq. 1\n(scene units)\npink: unknown"),
             I::Size => quantity(
                 self.guide(|g| g.size),
-                Scale::Span,
+                Scale::Log,
                 "d of eq. 3\n(pixel size as\nthe eye sees\nit, relative)",
             ),
             I::Angle => {
