@@ -93,13 +93,13 @@ pub fn markdown(groups: &[GroupResult]) -> String {
         let (Some(dpm), Some(best)) = (dpm_of(g), best_other(g)) else { continue };
         let _ = writeln!(
             text,
-            "{}, budget {}: dpm has {:.2} of the perceived RMSE and {:.2} of the flicker of the best other ({}); \
+            "{}, budget {}: dpm has {:.2} of the perceived RMSE of the best other ({}) and {:.2} of the least flicker of the others; \
              reference error {:.5}, mean radiance {:.4}, {} probes.",
             if dpm.moving { "moving" } else { "still" },
             dpm.budget,
             dpm.perceived_rmse / best.perceived_rmse,
-            dpm.flicker / least_flicker(g),
             best.method,
+            dpm.flicker / least_flicker(g),
             g.reference_error,
             g.mean,
             g.probes
