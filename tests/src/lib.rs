@@ -2,5 +2,6 @@
 
 pub mod compare;
 pub mod gpu;
+pub mod rigs;
 pub mod scenes;
 pub mod statistics;

@@ -1,0 +1,31 @@
+//! The demo rig made small, run through the whole pipeline.
+
+use dpm_device::planes::Raster;
+use dpm_host::config::{Overrides, RigConfig};
+use dpm_host::gpu::Gpu;
+use dpm_host::pipeline::{self, RunOptions, RunOutcome};
+use dpm_host::rig::Rig;
+use dpm_host::telemetry::monitor::RunMonitor;
+use std::sync::Arc;
+
+/// The demo rig at `width` x `height` with settings `a.b=c` over it.
+///
+/// # Panics
+/// When a setting is refused.
+pub fn demo_rig(width: u32, height: u32, settings: &[&str]) -> Arc<Rig> {
+    let flags = settings.iter().map(|s| (*s).to_owned()).collect();
+    let config = RigConfig::demo(&Overrides { variables: vec![], flags }).unwrap_or_else(|e| panic!("{e}"));
+    let raster = Raster::new(width, height).expect("a small raster");
+    Arc::new(Rig::build(&config, Some(raster)).unwrap_or_else(|e| panic!("{e}")))
+}
+
+/// Runs it for `frames` frames and keeps the last `keep` of them.
+///
+/// # Panics
+/// When the run fails.
+pub fn run(gpu: &Arc<Gpu>, rig: &Arc<Rig>, frames: u64, keep: usize) -> (RunOutcome, RunMonitor) {
+    let monitor = RunMonitor::default();
+    let options = RunOptions { frames, keep_frames: keep, ..RunOptions::default() };
+    let outcome = pipeline::run(rig.clone(), gpu, options, &monitor).unwrap_or_else(|e| panic!("{e}"));
+    (outcome, monitor)
+}

@@ -1,0 +1,186 @@
+//! The whole rig against the mock projector and tracker: what was rendered is what falls, where the object is, when it is there.
+
+use dpm_device::time::HostTime;
+use dpm_host::pipeline::{self, renderer_settings, RunOptions};
+use dpm_host::render::{FrameInputs, Renderer};
+use dpm_host::telemetry::monitor::RunMonitor;
+use dpm_tests::gpu::with_gpu;
+use dpm_tests::rigs::{demo_rig, run};
+use std::time::{Duration, Instant};
+
+/// Every frame by itself: no picture depends on former ones, so that a single one can be drawn again.
+const FULL: &str = "render.method=\"full\"";
+const REAL: &str = "real_time.pace=\"real\"";
+
+#[test]
+fn the_light_is_the_rendered_picture_in_all_24_planes() {
+    with_gpu(|gpu| {
+        let rig = demo_rig(64, 48, &[FULL]);
+        let (outcome, monitor) = run(gpu, &rig, 40, 12);
+        assert_eq!(outcome.light_mismatches, 0);
+        let r = &outcome.report;
+        assert_eq!((r.frames_lit, r.frames_dropped, r.frames_late, r.planes), (40, 0, 0, 24));
+        assert_eq!(monitor.counts().frames_planned, 40);
+
+        // Beside the pipeline's own comparison: the kept frames drawn again, one by one, with a renderer of their own.
+        let mut renderer = Renderer::new(gpu, &rig.scene, renderer_settings(&rig)).unwrap();
+        let mut slot = renderer.create_slot(false).unwrap();
+        assert_eq!((outcome.light.len(), outcome.recent.len()), (12, 12));
+        let mut poses = Vec::new();
+        let (mut lit_pixels, mut levels) = (0, [[false; 256]; 3]);
+        for (light, record) in outcome.light.iter().zip(&outcome.recent) {
+            assert_eq!(light.frame, record.id.0 as u32);
+            rig.scene_poses(&record.tracked_poses, &mut poses);
+            let (eye, gaze) = rig.observer.eye_and_gaze(&record.tracked_poses);
+            assert_eq!(eye, record.eye);
+            let inputs = FrameInputs {
+                frame: record.id.0 as u32,
+                spp: rig.config.render.spp,
+                budget_spp: rig.config.render.spp as f32,
+                camera: &rig.camera,
+                eye,
+                gaze,
+                poses: &poses,
+                lost: &[],
+            };
+            renderer.submit(&mut slot, &inputs).unwrap();
+            slot.wait(60_000_000_000).unwrap();
+            for (i, (code, fell)) in slot.codes().iter().zip(&light.codes).enumerate() {
+                let rendered = [*code as u8, (*code >> 8) as u8, (*code >> 16) as u8];
+                assert_eq!(rendered, *fell, "frame {} pixel {i}", light.frame);
+                lit_pixels += usize::from(*fell != [0; 3]);
+                (0..3).for_each(|c| levels[c][usize::from(fell[c])] = true);
+            }
+        }
+        // The comparison is worth something: there is light, in many levels, so every plane of every colour carries bits.
+        assert!(lit_pixels > 12 * 64 * 48 / 20, "{lit_pixels}");
+        for (channel, seen) in levels.iter().enumerate() {
+            for bit in 0..8 {
+                let used = (0..256).any(|v| seen[v] && v >> bit & 1 == 1);
+                assert!(used, "channel {channel} bit {bit} never lit");
+            }
+        }
+    });
+}
+
+#[test]
+fn a_run_repeats_to_the_bit() {
+    with_gpu(|gpu| {
+        for method in ["dpm", "paper", "full"] {
+            let method = format!("render.method=\"{method}\"");
+            let hash = |seed: &str| {
+                let rig = demo_rig(48, 36, &[&method, seed, "tracker.noise_m=0.0002"]);
+                let (outcome, _) = run(gpu, &rig, 40, 0);
+                assert_eq!((outcome.light_mismatches, outcome.report.frames_lit), (0, 40), "{method}");
+                outcome.report.light_hash
+            };
+            let first = hash("render.seed=7");
+            assert_eq!(first, hash("render.seed=7"), "{method}");
+            assert_ne!(first, hash("render.seed=8"), "{method}: the seed has no effect");
+            assert_ne!(first, "0000000000000000");
+        }
+    });
+}
+
+#[test]
+fn light_falls_where_the_object_is() {
+    with_gpu(|gpu| {
+        // A quarter of a second at 1 m/s holds a whole crossing and a reversal at 8 m/s^2.
+        let rig = demo_rig(32, 24, &["render.spp=1"]);
+        let (outcome, _) = run(gpu, &rig, 260, 0);
+        let full_size = 1024.0 / 32.0;
+        let error = outcome.report.registration_error_px.expect("the mock tells the truth");
+        let held = outcome.report.registration_error_unpredicted_px.expect("the same without prediction");
+        let (p99, held_p99) = (error.p99 * full_size, held.p99 * full_size);
+        assert!(p99 < 0.25, "99 % within {p99} px at 1024 x 768");
+        assert!(held_p99 > 2.0 && held_p99 > 10.0 * p99, "without prediction {held_p99} px, with {p99} px");
+        // Switched off, the light itself is late, not only the report's second line.
+        let off = demo_rig(32, 24, &["render.spp=1", "prediction.on=false"]);
+        let (outcome, _) = run(gpu, &off, 260, 0);
+        let error = outcome.report.registration_error_px.expect("the mock tells the truth");
+        assert!(!outcome.report.prediction && error.p99 * full_size > 2.0, "{}", error.p99 * full_size);
+    });
+}
+
+#[test]
+fn a_lost_body_goes_dark_and_comes_back() {
+    with_gpu(|gpu| {
+        let (gone_at, back_at) = (HostTime(250_000_000), HostTime(310_000_000));
+        let rig = demo_rig(32, 24, &["tracker.faults=\"dropout@250ms+60ms\"", "render.spp=1", FULL]);
+        let (outcome, _) = run(gpu, &rig, 220, 220);
+        assert_eq!(outcome.light_mismatches, 0);
+        let frame_ns = rig.rate().slot_len_ns(0);
+        let dark_from = gone_at.plus_ns(20_000_000 + frame_ns);
+        let lit_from = back_at.plus_ns(10_000_000);
+        let mut seen = [0; 3];
+        for light in &outcome.light {
+            let at = light.first_photon_at;
+            let lit = light.codes.iter().filter(|c| **c != [0; 3]).count();
+            if at < gone_at {
+                seen[0] += 1;
+                assert!(lit > 20, "{lit} pixels at {at:?}, before the tracker fell silent");
+            } else if at > dark_from && at < back_at {
+                seen[1] += 1;
+                assert_eq!(lit, 0, "{at:?}: {} ns after the last sample", at.ns_since(gone_at));
+            } else if at > lit_from {
+                seen[2] += 1;
+                assert!(lit > 20, "{lit} pixels at {at:?}, after the tracker came back");
+            }
+        }
+        assert!(seen.iter().all(|n| *n > 20), "{seen:?}");
+    });
+}
+
+#[test]
+fn a_fifth_of_the_samples_lost_costs_little() {
+    with_gpu(|gpu| {
+        let rig = demo_rig(32, 24, &["tracker.drop_out=0.2", "render.spp=1"]);
+        let (outcome, _) = run(gpu, &rig, 200, 0);
+        assert_eq!((outcome.light_mismatches, outcome.report.frames_lit), (0, 200));
+        let error = outcome.report.registration_error_px.expect("the mock tells the truth");
+        assert!(error.p99 * 32.0 < 1.0, "{} px at 1024 x 768", error.p99 * 32.0);
+    });
+}
+
+#[test]
+fn at_real_pace_every_planned_frame_is_accounted_for() {
+    with_gpu(|gpu| {
+        let rig = demo_rig(32, 24, &[REAL, "render.spp=1", "projector.frame_rate=\"100\""]);
+        let (outcome, monitor) = run(gpu, &rig, 60, 4);
+        let counts = monitor.counts();
+        assert_eq!(counts.frames_planned, 60);
+        assert_eq!(counts.frames_planned, counts.frames_lit + counts.frames_dropped);
+        let r = &outcome.report;
+        assert_eq!((r.frames_lit, r.frames_dropped), (counts.frames_lit, counts.frames_dropped));
+        assert_eq!(r.pace, "real");
+        assert!(r.frames_lit > 0, "not one frame in time at 100 Hz");
+        assert!(r.motion_to_light_ms.as_ref().is_some_and(|m| m.p50 > 2.0), "the tracker alone takes 2 ms");
+    });
+}
+
+#[test]
+fn a_stop_request_ends_the_run_at_once() {
+    with_gpu(|gpu| {
+        for pace in [REAL, "real_time.pace=\"virtual\""] {
+            let rig = demo_rig(32, 24, &[pace, "render.spp=1"]);
+            let monitor = RunMonitor::default();
+            let options = RunOptions::default();
+            let took = std::thread::scope(|scope| {
+                let stopper = scope.spawn(|| {
+                    let limit = Instant::now() + Duration::from_secs(60);
+                    while monitor.counts().frames_planned < 20 && Instant::now() < limit {
+                        std::thread::sleep(Duration::from_millis(1));
+                    }
+                    monitor.request_stop();
+                    Instant::now()
+                });
+                let outcome = pipeline::run(rig.clone(), gpu, options, &monitor).unwrap();
+                assert!(outcome.report.frames_lit + outcome.report.frames_dropped >= 20);
+                Instant::now().duration_since(stopper.join().unwrap())
+            });
+            assert!(took < Duration::from_millis(500), "{pace}: {took:?}");
+            let counts = monitor.counts();
+            assert_eq!(counts.frames_planned, counts.frames_lit + counts.frames_dropped, "{pace}");
+        }
+    });
+}

@@ -1,0 +1,85 @@
+//! The steady state allocates nothing: a counting allocator watches every thread of the frame path.
+#![allow(unsafe_code)]
+
+use dpm_host::pipeline::on_frame_path;
+use dpm_tests::gpu::with_gpu;
+use dpm_tests::rigs::{demo_rig, run};
+use std::alloc::{GlobalAlloc, Layout, System};
+use std::cell::Cell;
+use std::sync::atomic::{AtomicU64, Ordering};
+
+/// Allocations and releases on the frame path so far.
+static COUNTED: AtomicU64 = AtomicU64::new(0);
+/// Allocations anywhere: proof that the counter is in use.
+static ALL: AtomicU64 = AtomicU64::new(0);
+/// Print where the first few happened.
+static SHOWN: AtomicU64 = AtomicU64::new(0);
+
+thread_local! {
+    static SHOWING: Cell<bool> = const { Cell::new(false) };
+}
+
+struct Counting;
+
+impl Counting {
+    fn count(&self, what: &str, size: usize) {
+        ALL.fetch_add(1, Ordering::Relaxed);
+        if on_frame_path() && !SHOWING.get() {
+            COUNTED.fetch_add(1, Ordering::Relaxed);
+            if SHOWN.fetch_add(1, Ordering::Relaxed) < 3 {
+                SHOWING.set(true);
+                let trace = std::backtrace::Backtrace::force_capture();
+                eprintln!("{what} of {size} bytes on the frame path:\n{trace}");
+                SHOWING.set(false);
+            }
+        }
+    }
+}
+
+// SAFETY: every call goes to the system's allocator with the caller's arguments unchanged; counting touches atomics and
+// thread-locals without destructors only (the trace is taken with counting switched off).
+unsafe impl GlobalAlloc for Counting {
+    unsafe fn alloc(&self, layout: Layout) -> *mut u8 {
+        self.count("allocation", layout.size());
+        // SAFETY: the caller's duty, passed on.
+        unsafe { System.alloc(layout) }
+    }
+
+    unsafe fn dealloc(&self, ptr: *mut u8, layout: Layout) {
+        self.count("release", layout.size());
+        // SAFETY: the caller's duty, passed on.
+        unsafe { System.dealloc(ptr, layout) }
+    }
+
+    unsafe fn realloc(&self, ptr: *mut u8, layout: Layout, size: usize) -> *mut u8 {
+        self.count("reallocation", size);
+        // SAFETY: the caller's duty, passed on.
+        unsafe { System.realloc(ptr, layout, size) }
+    }
+}
+
+#[global_allocator]
+static ALLOCATOR: Counting = Counting;
+
+#[test]
+fn the_steady_state_allocates_nothing() {
+    with_gpu(|gpu| {
+        for settings in [
+            &["real_time.pace=\"virtual\""][..],
+            &["real_time.pace=\"virtual\"", "render.method=\"paper\""],
+            &["real_time.pace=\"real\"", "projector.frame_rate=\"200\""],
+        ] {
+            let rig = demo_rig(32, 24, settings);
+            let (before, all) = (COUNTED.load(Ordering::Relaxed), ALL.load(Ordering::Relaxed));
+            let (outcome, monitor) = run(gpu, &rig, 220, 0);
+            let counts = monitor.counts();
+            assert_eq!(counts.frames_planned, 220);
+            assert!(outcome.report.frames_lit + outcome.report.frames_dropped == 220);
+            let during = COUNTED.load(Ordering::Relaxed) - before;
+            assert_eq!(during, 0, "{settings:?}: allocations and releases on the frame path");
+            assert!(ALL.load(Ordering::Relaxed) > all, "the allocator is not the one in use");
+        }
+        // The probe itself: a box made here is not on the frame path.
+        assert!(!on_frame_path());
+    });
+}
