@@ -66,19 +66,19 @@ fn the_light_is_the_rendered_picture_in_all_24_planes() {
 #[test]
 fn a_run_repeats_to_the_bit() {
     with_gpu(|gpu| {
-        for method in ["dpm", "paper", "full"] {
-            let method = format!("render.method=\"{method}\"");
-            let hash = |seed: &str| {
-                let rig = demo_rig(48, 36, &[&method, seed, "tracker.noise_m=0.0002"]);
-                let (outcome, _) = run(gpu, &rig, 40, 0);
-                assert_eq!((outcome.light_mismatches, outcome.report.frames_lit), (0, 40), "{method}");
-                outcome.report.light_hash
-            };
-            let first = hash("render.seed=7");
-            assert_eq!(first, hash("render.seed=7"), "{method}");
-            assert_ne!(first, hash("render.seed=8"), "{method}: the seed has no effect");
-            assert_ne!(first, "0000000000000000");
-        }
+        let hash = |method: &str, seed: &str| {
+            let rig = demo_rig(32, 24, &[method, seed, "tracker.noise_m=0.0002"]);
+            let (outcome, _) = run(gpu, &rig, 24, 0);
+            assert_eq!((outcome.light_mismatches, outcome.report.frames_lit), (0, 24), "{method}");
+            outcome.report.light_hash
+        };
+        // Both methods keep histories, which is where a race would show.
+        let (dpm, paper) = ("render.method=\"dpm\"", "render.method=\"paper\"");
+        let first = hash(dpm, "render.seed=7");
+        assert_ne!(first, "0000000000000000");
+        assert_eq!(first, hash(dpm, "render.seed=7"));
+        assert_ne!(first, hash(dpm, "render.seed=8"), "the seed has no effect");
+        assert_eq!(hash(paper, "render.seed=7"), hash(paper, "render.seed=7"));
     });
 }
 
@@ -96,7 +96,7 @@ fn light_falls_where_the_object_is() {
         assert!(held_p99 > 2.0 && held_p99 > 10.0 * p99, "without prediction {held_p99} px, with {p99} px");
         // Switched off, the light itself is late, not only the report's second line.
         let off = demo_rig(32, 24, &["render.spp=1", "prediction.on=false"]);
-        let (outcome, _) = run(gpu, &off, 260, 0);
+        let (outcome, _) = run(gpu, &off, 100, 0);
         let error = outcome.report.registration_error_px.expect("the mock tells the truth");
         assert!(!outcome.report.prediction && error.p99 * full_size > 2.0, "{}", error.p99 * full_size);
     });
@@ -135,8 +135,8 @@ fn a_lost_body_goes_dark_and_comes_back() {
 fn a_fifth_of_the_samples_lost_costs_little() {
     with_gpu(|gpu| {
         let rig = demo_rig(32, 24, &["tracker.drop_out=0.2", "render.spp=1"]);
-        let (outcome, _) = run(gpu, &rig, 200, 0);
-        assert_eq!((outcome.light_mismatches, outcome.report.frames_lit), (0, 200));
+        let (outcome, _) = run(gpu, &rig, 150, 0);
+        assert_eq!((outcome.light_mismatches, outcome.report.frames_lit), (0, 150));
         let error = outcome.report.registration_error_px.expect("the mock tells the truth");
         assert!(error.p99 * 32.0 < 1.0, "{} px at 1024 x 768", error.p99 * 32.0);
     });
