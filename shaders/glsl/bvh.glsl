@@ -32,17 +32,16 @@ vec4 unpack_bytes(uint x) {
 }
 
 // Hit mask of four children of a node, as [Ylitie17] lays it out: internal children in the top byte by octant order, triangles in the low 24 bits.
-uint half_node_hits(uint meta, uint octant4, vec3 step_inverse, vec3 base, float t_max,
+uint half_node_hits(uint meta, uint octant4, vec3 step_inverse, vec3 base_near, vec3 base_far, float t_max,
                     uint near_x, uint far_x, uint near_y, uint far_y, uint near_z, uint far_z) {
     uint is_inner = (meta & (meta << 1u)) & 0x10101010u;
     uint inner_mask = (is_inner >> 4u) * 0xffu;
     uint bit_index = (meta ^ (octant4 & inner_mask)) & 0x1f1f1f1fu;
     uint child_bits = (meta >> 5u) & 0x07070707u;
-    vec4 enter = max(max(unpack_bytes(near_x) * step_inverse.x + base.x, unpack_bytes(near_y) * step_inverse.y + base.y),
-                     max(unpack_bytes(near_z) * step_inverse.z + base.z, vec4(0.0)));
-    // The exit is widened by a few ulps so that rounding never loses a child.
-    vec4 leave = min(min(unpack_bytes(far_x) * step_inverse.x + base.x, unpack_bytes(far_y) * step_inverse.y + base.y),
-                     min(unpack_bytes(far_z) * step_inverse.z + base.z, vec4(t_max))) * 1.0000004;
+    vec4 enter = max(max(unpack_bytes(near_x) * step_inverse.x + base_near.x, unpack_bytes(near_y) * step_inverse.y + base_near.y),
+                     max(unpack_bytes(near_z) * step_inverse.z + base_near.z, vec4(0.0)));
+    vec4 leave = min(min(unpack_bytes(far_x) * step_inverse.x + base_far.x, unpack_bytes(far_y) * step_inverse.y + base_far.y),
+                     min(unpack_bytes(far_z) * step_inverse.z + base_far.z, vec4(t_max)));
     bvec4 inside = lessThanEqual(enter, leave);
     uint hits = inside.x ? (child_bits & 255u) << (bit_index & 31u) : 0u;
     hits |= inside.y ? ((child_bits >> 8u) & 255u) << ((bit_index >> 8u) & 31u) : 0u;
@@ -59,11 +58,14 @@ uint node_hits(vec3 origin, vec3 inverse, bvec3 negative, uint octant4, float t_
     vec3 scale = vec3(uintBitsToFloat((n0.w & 255u) << 23u), uintBitsToFloat(((n0.w >> 8u) & 255u) << 23u), uintBitsToFloat(((n0.w >> 16u) & 255u) << 23u));
     vec3 step_inverse = scale * inverse;
     vec3 base = (uintBitsToFloat(n0.xyz) - origin) * inverse;
+    // Planes move apart by their rounding, so that a ray that runs in the plane between two children enters both.
+    vec3 slack = (abs(base) + 255.0 * abs(step_inverse)) * 3.0e-7;
+    vec3 base_near = base - slack, base_far = base + slack;
     uvec2 near_x = negative.x ? nx.zw : nx.xy, far_x = negative.x ? nx.xy : nx.zw;
     uvec2 near_y = negative.y ? ny.zw : ny.xy, far_y = negative.y ? ny.xy : ny.zw;
     uvec2 near_z = negative.z ? nz.zw : nz.xy, far_z = negative.z ? nz.xy : nz.zw;
-    return half_node_hits(n1.z, octant4, step_inverse, base, t_max, near_x.x, far_x.x, near_y.x, far_y.x, near_z.x, far_z.x)
-         | half_node_hits(n1.w, octant4, step_inverse, base, t_max, near_x.y, far_x.y, near_y.y, far_y.y, near_z.y, far_z.y);
+    return half_node_hits(n1.z, octant4, step_inverse, base_near, base_far, t_max, near_x.x, far_x.x, near_y.x, far_y.x, near_z.x, far_z.x)
+         | half_node_hits(n1.w, octant4, step_inverse, base_near, base_far, t_max, near_x.y, far_x.y, near_y.y, far_y.y, near_z.y, far_z.y);
 }
 
 // Rays in the space of one body, with a basis perpendicular to the direction for the triangle test.

@@ -49,8 +49,7 @@ fn on_gpu(gpu: &Arc<Gpu>, input: &Input) -> (Vec<u32>, Counters) {
     let counters = device("counters", size_of::<Counters>());
     let codes_host = host("codes", PIXELS * 4);
     let counters_host = host("counters", size_of::<Counters>());
-    let kind = |name: &str| if name == "B_FRAME" { BindingKind::Uniform } else { BindingKind::Storage };
-    let kinds: Vec<_> = BINDINGS.iter().map(|&(name, binding)| (binding, kind(name))).collect();
+    let kinds: Vec<_> = BINDINGS.iter().map(|&(_, binding)| (binding, BindingKind::Storage)).collect();
     let table = BindingTable::new(gpu, &kinds).unwrap();
     let constants = SceneNeeds::default().everything().constants();
     let pipeline = ComputePipeline::new(&table, dpm_shaders::COMPENSATE, &constants).unwrap();

@@ -305,13 +305,12 @@ impl Renderer {
         if settings.leave_nothing_out {
             needs = needs.everything();
         }
-        use BindingKind::{Storage, Texel, Uniform};
+        use BindingKind::{Storage, Texel};
         let bvh = if texel { Texel } else { Storage };
         let kinds: Vec<_> = gpu_structs::BINDINGS
             .iter()
             .map(|&(name, binding)| {
                 let kind = match name {
-                    "B_FRAME" => Uniform,
                     "B_NODES" | "B_TRIANGLES" => bvh,
                     _ => Storage,
                 };
