@@ -5,6 +5,7 @@
 //! declarations here.
 
 mod check;
+mod declare;
 mod error;
 mod projector;
 mod read;
@@ -22,7 +23,8 @@ pub use run::*;
 pub use source::VARIABLE_PREFIX;
 pub use world::*;
 
-use read::{section, Any, ConfigValue, Reader};
+use declare::section;
+use read::{Any, ConfigValue, Reader};
 use std::path::Path;
 
 /// Largest accepted rig file in bytes.

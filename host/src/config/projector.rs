@@ -1,6 +1,7 @@
 //! `[projector]`: what the light comes out of, where it stands, and how the program reaches it.
 
-use super::read::{kinds, section, words, Any, ConfigValue, Limit, NotEmpty, Reader, Within};
+use super::declare::{kinds, section, words};
+use super::read::{Any, ConfigValue, Limit, NotEmpty, Reader, Within};
 use super::source::{Node, Value};
 use dpm_device::planes::{PlaneSchedule, Raster};
 use dpm_device::time::FrameRate;

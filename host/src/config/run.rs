@@ -1,6 +1,7 @@
 //! `[render]`, `[real_time]`, `[run]`, `[output]` and `[safety]`: how the picture is made and how the program behaves.
 
-use super::read::{section, words, Any, NotEmpty, Within};
+use super::declare::{section, words};
+use super::read::{Any, NotEmpty, Within};
 use dpm_device::planes::Raster;
 use std::path::PathBuf;
 

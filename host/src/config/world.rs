@@ -1,6 +1,7 @@
 //! `[tracker]`, `[observer]`, `[scene]` and `[prediction]`: what moves, who looks, and what is to be seen.
 
-use super::read::{kinds, section, words, Any, ConfigValue, NotEmpty, Reader, Within};
+use super::declare::{kinds, section, words};
+use super::read::{Any, ConfigValue, NotEmpty, Reader, Within};
 use super::source::Node;
 use dpm_device::pose::Pose;
 use hil_mock::motion::{Motion, MotionSpec};
