@@ -28,7 +28,7 @@ use dpm_device::transport::inproc::{threaded, Direct};
 use glam::DVec3;
 use hil_mock::projector::{DeviceClock, MockConfig, MockProjector};
 use std::sync::atomic::{AtomicBool, AtomicI64, Ordering};
-use std::sync::{Arc, Mutex};
+use std::sync::{Arc, Mutex, OnceLock};
 
 /// Tracking, plan, pack, link, and the mock projector.
 const STAGE_THREADS: usize = 5;
@@ -195,6 +195,7 @@ fn run_from(
             clock: &clock,
             time,
             listen_to: AtomicI64::new(0),
+            tracking: OnceLock::new(),
             lead_ns: AtomicI64::new(0),
             free,
             to_pack: Ring::new(options.in_flight + 2),

@@ -23,7 +23,7 @@ use dpm_handoff::latest::{latest, Publisher, Reader};
 use hil_mock::projector::MockProjector;
 use std::cell::Cell;
 use std::sync::atomic::{AtomicBool, AtomicI64, Ordering};
-use std::sync::{Arc, Mutex};
+use std::sync::{Arc, Mutex, OnceLock};
 use std::time::Duration;
 
 thread_local! {
@@ -41,6 +41,8 @@ fn enter_frame_path(inside: bool) {
 
 /// Frames until the steady state, in which nothing is allocated any more.
 const WARM_UP_FRAMES: u64 = 16;
+/// Reads of the tracker until its buffers have grown.
+const WARM_UP_STEPS: u32 = 64;
 /// Time between the last byte of a frame and its slot, for jitter of the hand-offs.
 const MARGIN_NS: i64 = 50_000;
 /// How often a link without credit looks for some.
@@ -57,6 +59,8 @@ pub(super) struct Shared<'a> {
     pub(super) time: LinkTime,
     /// Virtual pace: samples up to here are wanted.
     pub(super) listen_to: AtomicI64,
+    /// Virtual pace: who to wake when more is wanted.
+    pub(super) tracking: OnceLock<std::thread::Thread>,
     /// Measured time from latch to sent, nanoseconds (real pace).
     pub(super) lead_ns: AtomicI64,
     pub(super) free: Ring<Box<FrameJob>>,
@@ -181,12 +185,15 @@ impl<F: FnMut()> Drop for OnExit<F> {
 
 fn tracking_thread(shared: &Shared<'_>, mut stage: TrackingStage, mut latest: Publisher<TrackSnapshot>) {
     shared.rights.enter(0);
+    let _ = shared.tracking.set(std::thread::current());
     let mut heard_to = i64::MIN;
+    let mut steps = 0u32;
     while !shared.tracking_over.load(Ordering::Acquire) {
         let now = if shared.is_virtual() {
             let wanted = shared.listen_to.load(Ordering::Acquire);
             if wanted == heard_to {
-                std::thread::yield_now();
+                // Not spinning: software Vulkan needs every core.
+                std::thread::park_timeout(Duration::from_millis(1));
                 continue;
             }
             heard_to = wanted;
@@ -194,12 +201,15 @@ fn tracking_thread(shared: &Shared<'_>, mut stage: TrackingStage, mut latest: Pu
         } else {
             shared.clock.now()
         };
+        steps = steps.saturating_add(1);
+        enter_frame_path(steps >= WARM_UP_STEPS);
         // A tracker that fails is told by the freshness of its tracks: light goes off by itself.
         let _ = stage.step(now, &mut latest);
         if !shared.is_virtual() {
             std::thread::sleep(Duration::from_micros(200));
         }
     }
+    enter_frame_path(false);
 }
 
 fn plan_thread(shared: &Shared<'_>, mut renderer: Option<&mut Renderer>, mut latest: Reader<TrackSnapshot>) {
@@ -226,6 +236,9 @@ fn plan_thread(shared: &Shared<'_>, mut renderer: Option<&mut Renderer>, mut lat
         shared.clock.wait_until(latch_at);
         if shared.is_virtual() {
             shared.listen_to.store(latch_at.0, Ordering::Release);
+            if let Some(tracking) = shared.tracking.get() {
+                tracking.unpark();
+            }
             while latest.latest().0.through < latch_at && !shared.monitor.stop_requested() {
                 std::thread::yield_now();
             }
