@@ -13,10 +13,6 @@ struct Sampler {
 float to_unit(uint x) { return float(x >> 8u) * (1.0 / 16777216.0); }
 
 // The twin of render/sobol.rs, bit for bit.
-const uint SOBOL_1[32] = uint[](SOBOL_ROW_1);
-const uint SOBOL_2[32] = uint[](SOBOL_ROW_2);
-const uint SOBOL_3[32] = uint[](SOBOL_ROW_3);
-
 uint owen_scramble(uint x, uint seed) {
     x = bitfieldReverse(x);
     x += seed;
@@ -38,14 +34,8 @@ uint mix_seed(uint seed, uint value) {
 
 uvec4 sobol_4d(uint index, uint group, uint seed) {
     uint key = mix_seed(seed, group);
-    uint shuffled = owen_scramble(index, key);
-    uvec4 x = uvec4(bitfieldReverse(shuffled), 0u, 0u, 0u);
-    for (uint rest = shuffled; rest != 0u; rest &= rest - 1u) {
-        int bit = findLSB(rest);
-        x.y ^= SOBOL_1[bit];
-        x.z ^= SOBOL_2[bit];
-        x.w ^= SOBOL_3[bit];
-    }
+    uint shuffled = owen_scramble(index, key) & 0xffffu;
+    uvec4 x = uvec4(bitfieldReverse(shuffled), SOBOL_123(shuffled));
     return uvec4(owen_scramble(x.x, mix_seed(key, 1u)), owen_scramble(x.y, mix_seed(key, 2u)),
                  owen_scramble(x.z, mix_seed(key, 3u)), owen_scramble(x.w, mix_seed(key, 4u)));
 }

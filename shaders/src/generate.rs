@@ -37,16 +37,23 @@ impl GlslType for structs::Rows {
     }
 }
 
+/// Bits of the shuffled index that reach the Sobol matrices: a sequence repeats its points, in another order, after 2^16 samples.
+pub const SOBOL_BITS: usize = 16;
+
 /// The text of `glsl/generated.glsl`.
 pub fn generated_glsl() -> String {
     let mut out = String::from("// Written by build-shaders from shaders/src/structs.rs. Do not edit.\n\n");
     for (name, value) in structs::CONSTANTS.iter().chain(structs::BINDINGS) {
         out.push_str(&format!("#define {name} {value}u\n"));
     }
-    for (i, row) in sobol_rows().iter().enumerate() {
-        let words: Vec<_> = row.iter().map(|v| format!("{v}u")).collect();
-        out.push_str(&format!("#define SOBOL_ROW_{} {}\n", i + 1, words.join(", ")));
-    }
+    out.push_str(&format!("// Sobol dimensions 1 to 3 of the lowest {SOBOL_BITS} bits of an index, without branch or table look-up.\n"));
+    out.push_str("#define SOBOL_123(i) uvec3(");
+    let dimension = |row: &[u32; 32]| -> String {
+        let terms = row[..SOBOL_BITS].iter().enumerate();
+        terms.map(|(b, v)| format!("(uint(bitfieldExtract(int(i), {b}, 1)) & {v}u)")).collect::<Vec<_>>().join(" ^ ")
+    };
+    out.push_str(&sobol_rows().each_ref().map(dimension).join(", "));
+    out.push_str(")\n");
     out.push('\n');
     out.push_str(&structs::glsl());
     out

@@ -138,7 +138,8 @@ pub fn mix(seed: u32, value: u32) -> u32 {
 /// Four dimensions of sample `index`: group 0 holds dimensions 0 to 3 of the integrand, group 1 the next four, and so on without end.
 pub fn sample4(index: u32, group: u32, seed: u32) -> [u32; 4] {
     let key = mix(seed, group);
-    let shuffled = owen_scramble(index, key);
+    // Indices below 2^16 share all higher bits, so leaving those out moves every point by the same scramble.
+    let shuffled = owen_scramble(index, key) & 0xffff;
     [0, 1, 2, 3].map(|d| owen_scramble(sobol(shuffled, d), mix(key, d as u32 + 1)))
 }
 
