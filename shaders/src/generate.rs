@@ -50,7 +50,10 @@ pub fn generated_glsl() -> String {
     out.push_str("#define SOBOL_123(i) uvec3(");
     let dimension = |row: &[u32; 32]| -> String {
         let terms = row[..SOBOL_BITS].iter().enumerate();
-        terms.map(|(b, v)| format!("(uint(bitfieldExtract(int(i), {b}, 1)) & {v}u)")).collect::<Vec<_>>().join(" ^ ")
+        terms
+            .map(|(b, v)| format!("(uint(bitfieldExtract(int(i), {b}, 1)) & {v}u)"))
+            .collect::<Vec<_>>()
+            .join(" ^ ")
     };
     out.push_str(&sobol_rows().each_ref().map(dimension).join(", "));
     out.push_str(")\n");
