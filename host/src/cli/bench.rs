@@ -2,7 +2,7 @@
 
 use super::rig_args::RigArgs;
 use super::watch::print;
-use crate::experiments::bench::{bench, MethodCost};
+use crate::experiments::bench::{bench, MethodCost, METHODS};
 use crate::experiments::run_rig::open_gpu;
 use crate::failure::Failure;
 use crate::pipeline::PipelineError;
@@ -21,6 +21,9 @@ pub struct BenchArgs {
     /// Frames measured a method; fewer when they take longer than 20 s
     #[arg(long, value_name = "N", default_value_t = 20, value_parser = clap::value_parser!(u32).range(3..=100_000))]
     count: u32,
+    /// Only this method; may be given several times
+    #[arg(long, value_name = "NAME", value_parser = METHODS.map(|(name, _)| name))]
+    method: Vec<String>,
     /// Print one JSON object
     #[arg(long)]
     json: bool,
@@ -66,7 +69,7 @@ pub fn execute(args: &BenchArgs) -> Result<(), Failure> {
         ));
         print("method      Mrays/s Msamples/s  rays/frame  samples/fr     GPU ms    wall ms\n");
     }
-    let report = bench(&rig, &gpu, args.count, &mut |cost| {
+    let report = bench(&rig, &gpu, args.count, &args.method, &mut |cost| {
         if !args.json {
             print(&lines(cost));
         }

@@ -1,6 +1,6 @@
 //! A rig into what each method costs on this device: rays, samples, and milliseconds of every pass.
 
-use super::error_plan::method_of;
+use super::error_plan::switched_method_of;
 use super::sequence::{draw, poses_at};
 use super::stamp::Stamp;
 use crate::config::RenderMethod;
@@ -81,7 +81,8 @@ fn median(mut values: Vec<f64>) -> f64 {
     0.5 * (values[(n - 1) / 2] + values[n / 2])
 }
 
-/// Draws up to `frames` frames with every method. `each` is told about a method as soon as it is measured.
+/// Draws up to `frames` frames with every method of `only` (all when it is empty), with the switches of the rig file. `each` is told about
+/// a method as soon as it is measured.
 ///
 /// # Errors
 /// The renderer's.
@@ -89,10 +90,11 @@ pub fn bench(
     rig: &Rig,
     gpu: &Arc<Gpu>,
     frames: u32,
+    only: &[String],
     each: &mut dyn FnMut(&MethodCost),
 ) -> Result<BenchReport, RenderError> {
     let mut methods = Vec::new();
-    for (name, which) in METHODS {
+    for (name, which) in METHODS.into_iter().filter(|(name, _)| only.is_empty() || only.iter().any(|o| o == name)) {
         let cost = measure(rig, gpu, frames, name, which)?;
         each(&cost);
         methods.push(cost);
@@ -108,7 +110,7 @@ fn measure(
     which: RenderMethod,
 ) -> Result<MethodCost, RenderError> {
     let spp = rig.config.render.spp;
-    let method = method_of(&rig.config.render, which);
+    let method = switched_method_of(&rig.config.render, which);
     let settings = RendererSettings { method, ..renderer_settings(rig) };
     let mut renderer = Renderer::new(gpu, &rig.scene, settings)?;
     let mut slot = renderer.create_slot(false)?;

@@ -14,11 +14,17 @@ pub struct Contender {
 
 /// A method as its authors have it: the rig's constants, but none of the rig's switches.
 pub fn method_of(render: &RenderConfig, which: RenderMethod) -> Method {
+    switched_method_of(&RenderConfig { effects: EffectsConfig::default(), ..render.clone() }, which)
+}
+
+/// A method with the switches that the rig file sets.
+pub fn switched_method_of(render: &RenderConfig, which: RenderMethod) -> Method {
     let mut own = render.clone();
     own.method = which;
-    // Table 1 of the paper sets samples by angle; its predecessor has one count everywhere.
-    let spp_by_angle = (which == RenderMethod::Miyamoto).then_some(false);
-    own.effects = EffectsConfig { spp_by_angle, ..EffectsConfig::default() };
+    if which == RenderMethod::Miyamoto {
+        // Table 1 of the paper sets samples by angle; its predecessor has one count everywhere.
+        own.effects.spp_by_angle = own.effects.spp_by_angle.or(Some(false));
+    }
     Method::from_config(&own)
 }
 
