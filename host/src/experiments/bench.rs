@@ -94,7 +94,9 @@ pub fn bench(
     each: &mut dyn FnMut(&MethodCost),
 ) -> Result<BenchReport, RenderError> {
     let mut methods = Vec::new();
-    for (name, which) in METHODS.into_iter().filter(|(name, _)| only.is_empty() || only.iter().any(|o| o == name)) {
+    for (name, which) in
+        METHODS.into_iter().filter(|(name, _)| only.is_empty() || only.iter().any(|o| o == name))
+    {
         let cost = measure(rig, gpu, frames, name, which)?;
         each(&cost);
         methods.push(cost);
