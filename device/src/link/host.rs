@@ -31,6 +31,9 @@ const REOPEN_NS: i64 = 100_000_000;
 const FAST_ECHO_NS: i64 = 2_000_000;
 /// Number of fast echoes.
 const FAST_ECHOES: u32 = 16;
+/// Detail of a refused ARM: CONFIG has not arrived.
+const ARM_BEFORE_CONFIG: u16 = 1;
+
 /// The host's side of one link.
 #[derive(Debug)]
 pub struct HostLink {
@@ -236,7 +239,8 @@ impl HostLink {
             (L::Configuring, D::Configured | D::Armed) => L::Ready,
             (L::Arming, D::Armed) => L::Streaming,
             (L::Streaming | L::Ready, D::Faulted) => L::Faulted,
-            (L::Configuring, D::Faulted) => L::Faulted,
+            // Latched faults hide whether it is configured: CONFIG must be under way before an ARM can follow it.
+            (L::Configuring, D::Faulted) if self.requested_at != NEVER => L::Faulted,
             (L::Streaming | L::Faulted, D::Configured) => L::Ready,
             (state, _) => state,
         };
@@ -254,6 +258,11 @@ impl HostLink {
                 self.state = LinkState::Closed;
                 let reason = ConfigRefusal::from_code(fault.detail);
                 Err(LinkError::ConfigRefused { device: device(), reason })
+            }
+            (FaultCode::Arm, LinkState::Arming) if fault.detail == ARM_BEFORE_CONFIG => {
+                self.state = LinkState::Configuring;
+                self.requested_at = NEVER;
+                Ok(())
             }
             (FaultCode::Arm, LinkState::Arming) => {
                 self.state = LinkState::Faulted;

@@ -4,7 +4,7 @@ use super::signals;
 use crate::config::{OutputConfig, ProjectorBackend, RigConfig};
 use crate::failure::{Failure, FailureKind};
 use crate::files::{InstanceLock, LockError};
-use crate::telemetry::monitor::{RunCounts, RunMonitor};
+use crate::telemetry::monitor::{ProjectorHealth, RunCounts, RunMonitor};
 use crate::telemetry::report::Report;
 use indicatif::{ProgressBar, ProgressDrawTarget, ProgressStyle};
 use std::io::{IsTerminal, Write};
@@ -58,6 +58,7 @@ pub fn watch<T: Send + 'static>(
             .map_err(|e| Failure::new(FailureKind::Device, format!("cannot start a thread: {e}")))?
     };
     let mut progress = Progress::new(frames);
+    let mut health = ProjectorHealth::Connecting;
     let result = loop {
         match finished.recv_timeout(TICK) {
             Ok(result) => break result,
@@ -67,6 +68,10 @@ pub fn watch<T: Send + 'static>(
                         progress.note(&format!("{signal}: stopping"));
                         monitor.request_stop();
                     }
+                }
+                let now = monitor.projector();
+                if std::mem::replace(&mut health, now) != now {
+                    progress.note(&format!("projector: {now}"));
                 }
                 progress.tick(monitor.counts());
                 show(&monitor.counts());

@@ -3,6 +3,7 @@
 use super::declare::{kinds, section, words};
 use super::read::{Any, ConfigValue, Limit, NotEmpty, Reader, Within};
 use super::source::{Node, Value};
+use dpm_device::link::Codec;
 use dpm_device::planes::{PlaneSchedule, Raster};
 use dpm_device::time::FrameRate;
 use std::path::PathBuf;
@@ -84,6 +85,8 @@ section! {
         buffer_frames: u32 = 3, "frames", Within(2, 64);
         /// Faults to inject, in the mock's own notation; empty for none.
         faults: String = String::new(), "", Any;
+        /// How planes are compacted. Raw is fastest to a projector in this process.
+        compaction: Compaction = Compaction::RAW, "", Any;
     }
 }
 
@@ -93,12 +96,16 @@ section! {
         /// USB vendor id.
         vendor_id: u16 = 0x1209, "", Any;
         /// USB product id.
-        product_id: u16 = 0x0947, "", Any;
+        product_id: u16 = 0x000d, "", Any;
         /// Serial number of the device; needed when several are plugged in.
         serial_number: Option<String> = None, "", NotEmpty;
-        /// Transfers queued at once. More bridge longer pauses of the host; together they must fit into the kernel's
-        /// `usbfs_memory_mb`.
-        transfers_in_flight: u32 = 6, "", Within(1, 64);
+        /// Frames queued at once. More bridge longer pauses of the host, and each adds a frame of latency to a link that is full;
+        /// together they must fit into the kernel's `usbfs_memory_mb`.
+        transfers_in_flight: u32 = 2, "frames", Within(1, 64);
+        /// How planes are compacted: "auto" takes for each plane what saves most of raw, RLE, XOR with the frame before + RLE and
+        /// LZ4, and does not send planes that did not change; a list allows only those. "raw" saves the host's time on a link that
+        /// carries every frame (`dpm link-test` says).
+        compaction: Compaction = Compaction::Auto, "", Any;
     }
 }
 
@@ -109,6 +116,8 @@ section! {
         port: String = "/dev/ttyUSB0".into(), "", NotEmpty;
         /// Bits a second on the wire.
         baud: u32 = 921_600, "bit/s", Within(300, 20_000_000);
+        /// How planes are compacted, as for kind = "usb".
+        compaction: Compaction = Compaction::Auto, "", Any;
     }
 }
 
@@ -121,6 +130,59 @@ section! {
         serial_number: Option<String> = None, "", NotEmpty;
         /// Light of each bit-1 pattern.
         exposure_us: u32 = 105, "us", Within(62, 2_000_000);
+    }
+}
+
+/// Which codecs a link may use.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Compaction {
+    /// All that both sides know.
+    Auto,
+    /// Those of this mask, bits [`Codec::mask`], and raw; only raw sends every plane of every frame.
+    Only(u32),
+}
+
+impl Compaction {
+    /// Every plane as it is.
+    pub const RAW: Self = Self::Only(0);
+    /// Words for the codecs, as lists have them.
+    const WORDS: [(&'static str, Codec); 4] =
+        [("raw", Codec::Raw), ("rle", Codec::Rle), ("xor-rle", Codec::XorRle), ("lz4", Codec::Lz4)];
+}
+
+impl ConfigValue for Compaction {
+    fn kind() -> String {
+        r#""auto" | "raw" | a list of "rle", "xor-rle", "lz4""#.into()
+    }
+
+    fn read(node: &Node, reader: &mut Reader, key: &str) -> Option<Self> {
+        let word = |node: &Node| match &node.value {
+            Value::String(s) => Self::WORDS.iter().find(|(word, _)| word == s).map(|(_, codec)| codec.mask()),
+            _ => None,
+        };
+        let mask = match &node.value {
+            Value::String(s) if s == "auto" => return Some(Self::Auto),
+            Value::Array(list) => list.iter().map(word).try_fold(0, |mask, one| Some(mask | one?)),
+            _ => word(node),
+        };
+        match mask {
+            Some(mask) => Some(Self::Only(mask & !Codec::Raw.mask())),
+            None => {
+                reader.refuse(&node.origin, key, format!("must be {}", Self::kind()), "");
+                None
+            }
+        }
+    }
+
+    fn show(&self) -> String {
+        match self {
+            Self::Auto => "\"auto\"".into(),
+            Self::Only(0) => "\"raw\"".into(),
+            Self::Only(mask) => {
+                let words = Self::WORDS.iter().filter(|(_, codec)| mask & codec.mask() != 0);
+                format!("[{}]", words.map(|(word, _)| format!("{word:?}")).collect::<Vec<_>>().join(", "))
+            }
+        }
     }
 }
 

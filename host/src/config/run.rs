@@ -217,5 +217,8 @@ section! {
         predict_ms: u32 = 20, "ms", Within(0, 1_000);
         /// General flashes of the whole picture in a second; beyond it the projector rests in the dark for two seconds. WCAG 2.3.1 allows 3; 0 is off.
         flashes_per_second: u32 = 3, "1/s", Within(0, 1_000);
+        /// The start of a run acknowledges heat, lamp, emergency stop and flashes that the projector has latched, too; else it refuses
+        /// to start and names them. Set it once, on the command line, when the cause is gone.
+        acknowledge_faults: bool = false, "", Any;
     }
 }

@@ -1,7 +1,7 @@
 //! `dpm run` and `dpm demo`: a rig from its configuration to its report and pictures.
 
 use super::pictures::{pictures, to_srgb};
-use crate::config::{RigConfig, TrackerConfig};
+use crate::config::{ProjectorBackend, RigConfig, TrackerConfig};
 use crate::failure::{Failure, FailureKind};
 use crate::files::write_atomically;
 use crate::gpu::{validation_messages, Gpu, GpuError, GpuOptions};
@@ -28,9 +28,16 @@ pub fn run_rig(config: &RigConfig, monitor: &Arc<RunMonitor>) -> Result<Report, 
     let raster = traced_raster(config, &gpu, &mut notes);
     let rig = Arc::new(Rig::build(config, raster)?);
     let output = &config.output;
+    // Pictures are made of the light itself, which only the mock sees.
     let has_truth = matches!(config.tracker, TrackerConfig::Mock(_));
+    let has_light = matches!(config.projector.backend, ProjectorBackend::Mock(_));
+    if output.images && !has_light {
+        notes.push(
+            "output.images: the light of a projector outside is not seen, no pictures are written".into(),
+        );
+    }
     let window = (output.light_window_ms * 1e-3 * rig.rate().hz()).round().max(1.0) as usize;
-    let keep_frames = if output.images && has_truth { window } else { 0 };
+    let keep_frames = if output.images && has_truth && has_light { window } else { 0 };
     let options = RunOptions { frames: config.run.frames, keep_frames, ..RunOptions::default() };
     let outcome = pipeline::run(rig.clone(), &gpu, options, monitor)?;
     let mut report = outcome.report;
@@ -90,6 +97,16 @@ pub fn traced_raster(config: &RigConfig, gpu: &Gpu, notes: &mut Vec<String>) -> 
     let small = Raster::new(width, height)?;
     let full = config.projector.raster();
     if !gpu.summary().software || small.pixel_count() >= full.pixel_count() {
+        return None;
+    }
+    if !matches!(config.projector.backend, ProjectorBackend::Mock(_)) {
+        // A real panel has the mirrors that it has.
+        notes.push(format!(
+            "no GPU: software Vulkan ({}) traces all {} x {} mirrors of the projector, which is slow",
+            gpu.summary().name,
+            full.width(),
+            full.height()
+        ));
         return None;
     }
     notes.push(format!(

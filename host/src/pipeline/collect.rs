@@ -227,7 +227,9 @@ impl Collector {
     }
 
     fn light(&mut self, note: &LightNote, monitor: &RunMonitor) {
-        self.stages[Stage::Light as usize].saturating_record(note.wall_ns.max(1));
+        if note.wall_ns > 0 {
+            self.stages[Stage::Light as usize].saturating_record(note.wall_ns);
+        }
         match note.event.kind {
             LightKind::Repeated => {
                 self.slots.nothing_new(note.event.slot, note.event.first_photon_at);
@@ -243,9 +245,15 @@ impl Collector {
                 self.reordered += u64::from(self.last_lit.is_some_and(|last| !frame_newer(frame, last)));
                 self.last_lit = Some(frame);
                 let Some(at) = self.pending.iter().position(|r| r.id.0 as u32 == frame) else { return };
-                // Frames before it were overtaken and will never be lit.
-                for _ in 0..at {
-                    self.drop_oldest(monitor);
+                // Frames before it were lit without being told one by one, or overtaken and will never be lit.
+                for k in 0..at {
+                    if k < note.unseen as usize {
+                        self.pending.pop_front();
+                        self.lit += 1;
+                        monitor.count_lit(false);
+                    } else {
+                        self.drop_oldest(monitor);
+                    }
                 }
                 let Some(mut record) = self.pending.pop_front() else { return };
                 record.timeline.lit_at = Some(note.event.first_photon_at);

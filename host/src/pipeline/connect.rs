@@ -1,7 +1,7 @@
 //! Brings the link up: handshake, configuration, clock, ARM. Before the first frame, so it may wait (bounded).
 
 use super::stages::LinkTime;
-use dpm_device::link::{HostLink, LinkError, LinkState};
+use dpm_device::link::{faults, HostLink, LinkError, LinkState};
 use dpm_device::time::HostTime;
 use dpm_device::transport::Transport;
 
@@ -24,13 +24,18 @@ pub enum ConnectError {
     },
 }
 
-/// Connects and arms. `now` reads the clock and lets a little time pass with every call.
+/// Latched faults that say something about a host or a cable of the past. Starting a run acknowledges them; heat, lamp, emergency
+/// stop and flashes want the operator's word.
+pub const ENDED_WITH_THE_LAST_RUN: u32 = faults::WATCHDOG | faults::CHECKSUM_STORM | faults::HOST_SAFE;
+
+/// Connects and arms; latched faults in the mask `acknowledged` stand not in the way. `now` reads the clock and lets a little time pass with every call.
 ///
 /// # Errors
-/// The device is missing, refuses, or is silent.
+/// The device is missing, refuses, has latched other faults, or is silent.
 pub fn connect(
     link: &mut HostLink,
     transport: &mut dyn Transport,
+    acknowledged: u32,
     now: &mut dyn FnMut() -> HostTime,
 ) -> Result<LinkTime, ConnectError> {
     link.connect();
@@ -47,14 +52,21 @@ pub fn connect(
                 best = Some((round_trip, e));
             }
         });
-        if state == LinkState::Ready {
-            link.arm(0);
+        let latched = link.status().map_or(0, |s| s.faults);
+        match state {
+            LinkState::Ready => link.arm(0),
+            LinkState::Faulted if latched & !acknowledged == 0 => link.arm(latched),
+            LinkState::Faulted => {
+                let device = transport.name().to_owned();
+                return Err(LinkError::ArmRefused { device, faults: latched }.into());
+            }
+            _ => {}
         }
         if let (LinkState::Streaming, Some((round_trip, echo)), Some(clock)) = (state, best, link.slots()) {
             if echoes >= ECHOES {
                 // The device's stamp lies in the middle of the shortest exchange.
                 let middle = echo.host_sent_at.plus_ns(round_trip / 2);
-                return Ok(LinkTime { clock, anchor: (echo.device_received_at, middle) });
+                return Ok(LinkTime { clock, first: 0, anchor: (echo.device_received_at, middle) });
             }
         }
         if t.ns_since(begin) > LIMIT_NS {

@@ -21,8 +21,10 @@ pub struct LightNote {
     pub hash: u64,
     /// Parts of it are of another frame (prepared frames only).
     pub torn: bool,
-    /// Wall time that the mock took for it, nanoseconds.
+    /// Wall time that the mock took for it, nanoseconds; 0 for a projector outside this process.
     pub wall_ns: u64,
+    /// Frames lit since the note before of which only the number is known.
+    pub unseen: u32,
 }
 
 /// One frame of light as it fell.
@@ -92,7 +94,7 @@ impl LightRecorder {
                 }
             }
             let torn = event.kind == LightKind::Lit && self.is_torn(mock, event.frame);
-            let note = LightNote { event, hash, torn, wall_ns: watch.elapsed_ns() };
+            let note = LightNote { event, hash, torn, wall_ns: watch.elapsed_ns(), unseen: 0 };
             if self.notes.push(note).is_err() {
                 self.notes_lost += 1;
             }

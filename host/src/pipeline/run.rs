@@ -1,12 +1,13 @@
 //! Threads, paces and shutdown.
 
 use super::collect::Collector;
-use super::connect::connect;
+use super::connect::{connect, ENDED_WITH_THE_LAST_RUN};
 use super::handoff::Ring;
 use super::job::FrameJob;
 use super::light::LightRecorder;
 use super::outcome::{PipelineError, RunOptions, RunOutcome};
 use super::prepared::PreparedFrames;
+use super::projector;
 use super::rights::Rights;
 use super::stages::TrackingStage;
 use super::threads::{device_thread, run_threads, Cable, Shared, LISTEN_NS};
@@ -22,9 +23,10 @@ use crate::render::{FrameCost, RenderError, Renderer, RendererSettings};
 use crate::rig::{Rig, RigError};
 use crate::telemetry::monitor::RunMonitor;
 use crate::telemetry::report::Report;
-use dpm_device::link::{packet_bytes, Codec, Epoch, HostLink, LinkSettings, Underrun};
+use dpm_device::link::HostLink;
 use dpm_device::time::{DeviceTicks, HostClock, HostTime};
 use dpm_device::transport::inproc::{threaded, Direct};
+use dpm_device::transport::Transport;
 use glam::DVec3;
 use hil_mock::projector::{DeviceClock, MockConfig, MockProjector};
 use std::sync::atomic::{AtomicBool, AtomicI64, Ordering};
@@ -32,8 +34,6 @@ use std::sync::{Arc, Mutex, OnceLock};
 
 /// Tracking, plan, pack, link, and the mock projector.
 const STAGE_THREADS: usize = 5;
-/// From the handshake to slot 0.
-const EPOCH_NS: u64 = 5_000_000;
 /// A step of the control thread that ends this late is a standstill of the machine.
 const STANDSTILL_NS: i64 = 1_000_000;
 
@@ -61,6 +61,14 @@ pub fn run_prepared(
     monitor: &RunMonitor,
 ) -> Result<RunOutcome, PipelineError> {
     run_from(rig, None, RunOptions { verify: false, ..options }, monitor)
+}
+
+/// The other end of the cable.
+enum Far {
+    /// The mock, who watches its light, and the frames that its cable holds.
+    Mock(Box<MockProjector>, LightRecorder, usize),
+    /// A projector outside this process.
+    Outside(Box<dyn Transport>),
 }
 
 fn run_from(
@@ -123,38 +131,34 @@ fn run_from(
         let _ = free.push(Box::new(job));
     }
 
-    let ProjectorBackend::Mock(mock_config) = &config.projector.backend else {
-        return Err(RigError::Unsupported(format!(
-            "projector.backend: {:?} is not driven by `dpm run` yet",
-            config.projector.backend
-        ))
-        .into());
-    };
-    let mut setup = MockConfig::new(raster);
-    setup.frame_buffers = mock_config.buffer_frames.min(64) as u8;
-    setup.clock = DeviceClock { skew_ppb: (mock_config.clock_ppm * 1000.0) as i32, ..DeviceClock::IDEAL };
-    let flash_limit = match config.safety.flashes_per_second {
-        0 => None,
-        n => Some(n.min(255) as u8),
-    };
-    setup.flash_limit = flash_limit;
-    let mock = MockProjector::new(setup);
+    let frame_bytes = projector::frame_bytes(raster, schedule.len());
     let lights = Arc::new(Ring::new(8192));
     let prepared = gpu.is_none().then(|| PreparedFrames::new(raster));
-    let marks = prepared.is_some().then_some(schedule);
-    let recorder = LightRecorder::new(lights.clone(), options.keep_frames, verify, marks);
-    let mut link = HostLink::new(LinkSettings {
-        raster,
-        schedule,
-        rate: rig.rate(),
-        watchdog_us: config.safety.watchdog_ms * 1000,
-        underrun: Underrun::Repeat,
-        late_slots: if is_virtual { 0 } else { 255 },
-        epoch: Epoch::AfterHello(EPOCH_NS),
-        session_seed: config.render.seed as u32 | 1,
-        codecs: Codec::Raw.mask(),
-        flash_limit,
-    });
+    let mut warnings = Vec::new();
+    let far = match &config.projector.backend {
+        ProjectorBackend::Mock(mock_config) => {
+            let mut setup = MockConfig::new(raster);
+            setup.frame_buffers = mock_config.buffer_frames.min(64) as u8;
+            setup.clock =
+                DeviceClock { skew_ppb: (mock_config.clock_ppm * 1000.0) as i32, ..DeviceClock::IDEAL };
+            setup.flash_limit = projector::flash_limit(config);
+            let marks = prepared.is_some().then_some(schedule);
+            let recorder = LightRecorder::new(lights.clone(), options.keep_frames, verify, marks);
+            Far::Mock(Box::new(MockProjector::new(setup)), recorder, usize::from(setup.frame_buffers) + 1)
+        }
+        backend => {
+            let medium = projector::open(config, raster)?.ok_or_else(|| {
+                RigError::Unsupported(format!(
+                    "projector.backend.kind = {:?} takes no frames over a link",
+                    backend.word()
+                ))
+            })?;
+            warnings.extend(medium.warnings);
+            Far::Outside(medium.transport)
+        }
+    };
+    let mut link = HostLink::new(projector::link_settings(config, raster));
+    let acknowledged = if config.safety.acknowledge_faults { u32::MAX } else { ENDED_WITH_THE_LAST_RUN };
 
     let rights = Rights::new(&config.real_time);
     let standstill = match &clock {
@@ -167,20 +171,23 @@ fn run_from(
     let device_over = AtomicBool::new(false);
     let kernel = Kernel::best();
     let watch = Stopwatch::start();
-    let (mut collector, recorder) = std::thread::scope(|scope| -> Result<_, PipelineError> {
-        let (mut cable, device) = if is_virtual {
-            (Cable::Direct(Box::new(Direct::new(mock)), recorder), None)
-        } else {
-            let frame_bytes = packet_bytes(raster.plane_bytes()) * schedule.len() + 256;
-            let (host_end, device_end) = threaded(frame_bytes, setup.frame_buffers as usize + 1);
-            let (clock, over) = (&clock, &device_over);
-            let thread = std::thread::Builder::new()
-                .name("dpm-mock".into())
-                .spawn_scoped(scope, move || device_thread(device_end, mock, recorder, clock, over))
-                .map_err(|source| PipelineError::Thread { stage: "mock projector", source })?;
-            (Cable::Threaded(host_end), Some(thread))
+    let (mut collector, recorder, carried) = std::thread::scope(|scope| -> Result<_, PipelineError> {
+        let (mut cable, device) = match far {
+            Far::Outside(medium) => (Cable::Outside(medium), None),
+            Far::Mock(mock, recorder, _) if is_virtual => {
+                (Cable::Direct(Box::new(Direct::new(*mock)), recorder), None)
+            }
+            Far::Mock(mock, recorder, buffers) => {
+                let (host_end, device_end) = threaded(frame_bytes, buffers);
+                let (clock, over) = (&clock, &device_over);
+                let thread = std::thread::Builder::new()
+                    .name("dpm-mock".into())
+                    .spawn_scoped(scope, move || device_thread(device_end, *mock, recorder, clock, over))
+                    .map_err(|source| PipelineError::Thread { stage: "mock projector", source })?;
+                (Cable::Threaded(host_end), Some(thread))
+            }
         };
-        let connected = connect(&mut link, cable.transport(), &mut || {
+        let connected = connect(&mut link, cable.transport(), acknowledged, &mut || {
             clock.wait_until(clock.now().plus_ns(if is_virtual { 50_000 } else { 200_000 }))
         });
         let time = match connected {
@@ -197,6 +204,7 @@ fn run_from(
             listen_to: AtomicI64::new(0),
             tracking: OnceLock::new(),
             lead_ns: AtomicI64::new(0),
+            travel_ns: AtomicI64::new(0),
             free,
             to_pack: Ring::new(options.in_flight + 2),
             to_link: Ring::new(options.in_flight + 2),
@@ -211,19 +219,19 @@ fn run_from(
         };
         let tracking = TrackingStage::new(&rig, tracker);
         let mut collector = Collector::new(rig.clone(), options.keep_frames, verify);
-        let cable =
+        let (cable, carried) =
             run_threads(&shared, tracking, renderer.as_mut(), prepared, kernel, link, cable, &mut collector)?;
         device_over.store(true, Ordering::Release);
         let recorder = match (cable, device) {
-            (Cable::Direct(_, recorder), _) => recorder,
+            (Cable::Direct(_, recorder), _) => Some(recorder),
             (Cable::Threaded(_), Some(thread)) => {
-                thread.join().map_err(|_| PipelineError::Panicked("mock projector"))?
+                Some(thread.join().map_err(|_| PipelineError::Panicked("mock projector"))?)
             }
-            (Cable::Threaded(_), None) => unreachable!("a threaded cable has a device thread"),
+            (Cable::Threaded(_) | Cable::Outside(_), _) => None,
         };
         match shared.error.into_inner().ok().flatten() {
             Some(e) => Err(e),
-            None => Ok((collector, recorder)),
+            None => Ok((collector, recorder, carried)),
         }
     })?;
     let wall_s = watch.elapsed_ns() as f64 * 1e-9;
@@ -238,12 +246,14 @@ fn run_from(
         software_gpu: gpu.is_some_and(|gpu| gpu.summary().software),
         method: if gpu.is_some() { method_name(&rig) } else { "prepared" },
         prediction: config.prediction.on,
-        light_hash: format!("{:016x}", recorder.light_hash),
+        light_hash: recorder.as_ref().map_or_else(String::new, |r| format!("{:016x}", r.light_hash)),
+        projector: Some(carried),
         wall_s,
         ..Report::default()
     };
     collector.fill(&mut report);
     report.frames_per_wall_second = report.frames_lit as f64 / wall_s.max(1e-9);
+    report.warnings.extend(warnings);
     report.warnings.extend(rights.warnings());
     report.warnings.extend(rig.scene.warnings.iter().cloned());
     let lead_ns = i64::from(config.real_time.stage_costs_us.total()) * 1000;
@@ -254,7 +264,7 @@ fn run_from(
     Ok(RunOutcome {
         report,
         recent: std::mem::take(&mut collector.recent).into(),
-        light: recorder.into_frames(),
+        light: recorder.map_or_else(Vec::new, LightRecorder::into_frames),
         light_mismatches: collector.light_mismatches,
         traced: std::mem::take(&mut collector.traced),
         slots,

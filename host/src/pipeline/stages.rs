@@ -10,7 +10,7 @@ use crate::render::{FrameInputs, Renderer};
 use crate::rig::{affine, Rig};
 use crate::tracking::{Freshness, PoseFilterBank, PoseFilterConfig, TrackState};
 use dpm_device::link::SlotClock;
-use dpm_device::time::HostTime;
+use dpm_device::time::{DeviceTicks, HostTime};
 use dpm_device::tracker::{BodyIndex, Tracker, TrackerError};
 use dpm_handoff::latest::Publisher;
 
@@ -87,7 +87,7 @@ pub fn plan(job: &mut FrameJob, rig: &Rig, snapshot: &TrackSnapshot, slots: &Lin
     job.id = FrameId(id);
     job.slot = slot;
     job.outcome = None;
-    job.target_at = slots.clock.start(slot);
+    job.target_at = slots.start(slot);
     let due = slots.host_of_slot(slot);
     let middle = due.plus_ns(slots.host_of_slot(slot + 1).ns_since(due) / 2);
     let timeline = &mut job.timeline;
@@ -185,18 +185,30 @@ pub fn finish_and_pack(
 pub struct LinkTime {
     /// Slots on the device's clock.
     pub clock: SlotClock,
+    /// Number in the run of the clock's slot 0: a device that comes back begins a new clock, the run goes on counting.
+    pub first: u64,
     /// An instant of the device's clock, and the host's reading then.
-    pub anchor: (dpm_device::time::DeviceTicks, HostTime),
+    pub anchor: (DeviceTicks, HostTime),
 }
 
 impl LinkTime {
+    /// Start of a slot on the device's clock; of the clock's first slot for those before it.
+    pub fn start(&self, slot: u64) -> DeviceTicks {
+        self.clock.start(slot.saturating_sub(self.first))
+    }
+
+    /// The slot that contains an instant of the device's clock; `None` before the clock's first slot.
+    pub fn slot_at(&self, ticks: DeviceTicks) -> Option<u64> {
+        self.clock.slot_at(ticks).map(|k| self.first.saturating_add(k))
+    }
+
     /// Start of a slot on the host's clock.
     pub fn host_of_slot(&self, slot: u64) -> HostTime {
-        self.host_of(self.clock.start(slot))
+        self.host_of(self.start(slot))
     }
 
     /// A reading of the device's clock on the host's, at the nominal rate.
-    pub fn host_of(&self, ticks: dpm_device::time::DeviceTicks) -> HostTime {
+    pub fn host_of(&self, ticks: DeviceTicks) -> HostTime {
         let delta = i128::from(ticks.0) - i128::from(self.anchor.0 .0);
         let ns = delta * 1_000_000_000 / i128::from(self.clock.tick_hz());
         self.anchor.1.plus_ns(i64::try_from(ns).unwrap_or(if ns > 0 { i64::MAX } else { i64::MIN }))
@@ -204,11 +216,11 @@ impl LinkTime {
 
     /// The first slot that starts at or after `at`.
     pub fn slot_after(&self, at: HostTime) -> u64 {
-        let since = at.ns_since(self.host_of_slot(0));
+        let since = at.ns_since(self.host_of_slot(self.first));
         if since <= 0 {
-            return 0;
+            return self.first;
         }
-        let mut slot = self.clock.rate().slot_at_ns(since);
+        let mut slot = self.first.saturating_add(self.clock.rate().slot_at_ns(since));
         while self.host_of_slot(slot) < at {
             slot += 1;
         }

@@ -3,6 +3,7 @@
 use super::collect::Collector;
 use super::handoff::Ring;
 use super::job::FrameJob;
+use super::keeper::{is_dark, LinkKeeper, ProjectorReport};
 use super::light::{LightNote, LightRecorder};
 use super::outcome::{PipelineError, RunOptions};
 use super::prepared::PreparedFrames;
@@ -15,7 +16,7 @@ use crate::pack::Kernel;
 use crate::render::Renderer;
 use crate::rig::Rig;
 use crate::telemetry::monitor::RunMonitor;
-use dpm_device::link::{HostLink, LinkState, SendOutcome, Verb};
+use dpm_device::link::{HostLink, LinkState, SendOutcome};
 use dpm_device::time::HostTime;
 use dpm_device::transport::inproc::{DeviceEnd, Direct, HostEnd};
 use dpm_device::transport::Transport;
@@ -49,6 +50,8 @@ const MARGIN_NS: i64 = 50_000;
 const CREDIT_STEP_NS: i64 = 50_000;
 /// A frame that the GPU has not finished by then is given up, and the run with it.
 const GPU_TIMEOUT_NS: u64 = 20_000_000_000;
+/// A projector outside is told to stop for at most this long; its watchdog does the rest.
+const DARK_WITHIN_MS: u32 = 300;
 /// Time for which trackers are listened to before the first frame, so that the filters know the motion.
 pub(super) const LISTEN_NS: i64 = 150_000_000;
 
@@ -63,6 +66,8 @@ pub(super) struct Shared<'a> {
     pub(super) tracking: OnceLock<std::thread::Thread>,
     /// Measured time from latch to sent, nanoseconds (real pace).
     pub(super) lead_ns: AtomicI64,
+    /// Learned time from sent to light, nanoseconds (projectors outside).
+    pub(super) travel_ns: AtomicI64,
     pub(super) free: Ring<Box<FrameJob>>,
     pub(super) to_pack: Ring<Box<FrameJob>>,
     pub(super) to_link: Ring<Box<FrameJob>>,
@@ -98,6 +103,8 @@ impl Shared<'_> {
 pub(super) enum Cable {
     Direct(Box<Direct<MockProjector>>, LightRecorder),
     Threaded(HostEnd),
+    /// A projector outside this process.
+    Outside(Box<dyn Transport>),
 }
 
 impl Cable {
@@ -105,6 +112,7 @@ impl Cable {
         match self {
             Self::Direct(direct, _) => direct.as_mut(),
             Self::Threaded(end) => end,
+            Self::Outside(medium) => medium.as_mut(),
         }
     }
 
@@ -116,7 +124,7 @@ impl Cable {
     }
 }
 
-/// Starts the stages, waits for all of them, and returns the cable.
+/// Starts the stages, waits for all of them, and returns the cable with what it carried.
 pub(super) fn run_threads(
     shared: &Shared<'_>,
     tracking: TrackingStage,
@@ -126,9 +134,10 @@ pub(super) fn run_threads(
     link: HostLink,
     cable: Cable,
     collector: &mut Collector,
-) -> Result<Cable, PipelineError> {
+) -> Result<(Cable, ProjectorReport), PipelineError> {
     std::thread::scope(|scope| {
         let (publisher, reader) = latest(TrackSnapshot::EMPTY);
+        let (times, time) = latest(shared.time);
         let named = |name: &'static str| std::thread::Builder::new().name(format!("dpm-{name}"));
         let refused = |stage| move |source| PipelineError::Thread { stage, source };
         // Each guard closes what the next stage reads, whether the stage returns or panics: nobody waits for ever.
@@ -141,7 +150,7 @@ pub(super) fn run_threads(
                     shared.to_pack.close();
                     shared.tracking_over.store(true, Ordering::Release);
                 });
-                plan_thread(shared, renderer, reader);
+                plan_thread(shared, renderer, reader, time);
             })
             .map_err(refused("plan"))?;
         let pack = named("pack")
@@ -160,7 +169,9 @@ pub(super) fn run_threads(
                     shared.done.close();
                     shared.lights.close();
                 });
-                link_thread(shared, link, cable)
+                let outside = matches!(cable, Cable::Outside(_));
+                let keeper = LinkKeeper::new(shared.time, times, &link, outside);
+                link_thread(shared, link, cable, keeper)
             })
             .map_err(refused("link"))?;
         collector.run(&shared.done, &shared.free, &shared.lights, shared.monitor);
@@ -212,7 +223,12 @@ fn tracking_thread(shared: &Shared<'_>, mut stage: TrackingStage, mut latest: Pu
     enter_frame_path(false);
 }
 
-fn plan_thread(shared: &Shared<'_>, mut renderer: Option<&mut Renderer>, mut latest: Reader<TrackSnapshot>) {
+fn plan_thread(
+    shared: &Shared<'_>,
+    mut renderer: Option<&mut Renderer>,
+    mut latest: Reader<TrackSnapshot>,
+    mut time: Reader<LinkTime>,
+) {
     shared.rights.enter(1);
     let costs = shared.costs();
     let modelled = costs.iter().sum::<i64>() + MARGIN_NS;
@@ -228,11 +244,13 @@ fn plan_thread(shared: &Shared<'_>, mut renderer: Option<&mut Renderer>, mut lat
         let waited = at_hand.is_none();
         let Some(mut job) = at_hand.or_else(|| shared.free.pop(Duration::from_millis(100))) else { continue };
         job.waited_for_memory = waited;
-        let lead = modelled.max(shared.lead_ns.load(Ordering::Relaxed));
+        let lead =
+            modelled.max(shared.lead_ns.load(Ordering::Relaxed)) + shared.travel_ns.load(Ordering::Relaxed);
+        let time = *time.latest().0;
         if !shared.is_virtual() {
-            next_slot = next_slot.max(shared.time.slot_after(shared.clock.now().plus_ns(lead)));
+            next_slot = next_slot.max(time.slot_after(shared.clock.now().plus_ns(lead)));
         }
-        let latch_at = shared.time.host_of_slot(next_slot).plus_ns(-lead);
+        let latch_at = time.host_of_slot(next_slot).plus_ns(-lead);
         shared.clock.wait_until(latch_at);
         if shared.is_virtual() {
             shared.listen_to.store(latch_at.0, Ordering::Release);
@@ -243,7 +261,7 @@ fn plan_thread(shared: &Shared<'_>, mut renderer: Option<&mut Renderer>, mut lat
                 std::thread::yield_now();
             }
         }
-        stages::plan(&mut job, &shared.rig, latest.latest().0, &shared.time, id, next_slot);
+        stages::plan(&mut job, &shared.rig, latest.latest().0, &time, id, next_slot);
         let t = &mut job.timeline;
         if shared.is_virtual() {
             t.latched_at = latch_at;
@@ -310,7 +328,12 @@ fn next(ring: &Ring<Box<FrameJob>>) -> Option<Box<FrameJob>> {
     }
 }
 
-fn link_thread(shared: &Shared<'_>, mut link: HostLink, mut cable: Cable) -> Cable {
+fn link_thread(
+    shared: &Shared<'_>,
+    mut link: HostLink,
+    mut cable: Cable,
+    mut keeper: LinkKeeper,
+) -> (Cable, ProjectorReport) {
     shared.rights.enter(3);
     let mut last = shared.clock.now();
     loop {
@@ -321,20 +344,28 @@ fn link_thread(shared: &Shared<'_>, mut link: HostLink, mut cable: Cable) -> Cab
             }
             if !shared.is_virtual() {
                 // Feeds the device's watchdog while nothing is to be sent.
-                let _ = link.poll(shared.clock.now(), cable.transport());
+                poll(shared, &mut link, &mut cable, &mut keeper, shared.clock.now());
             }
             continue;
         };
-        enter_frame_path(job.id.0 >= WARM_UP_FRAMES);
+        // Getting a lost medium back allocates; the rig is dark then.
+        enter_frame_path(job.id.0 >= WARM_UP_FRAMES && link.state() == LinkState::Streaming);
         let now = if shared.is_virtual() { job.timeline.sent_at } else { shared.clock.now() };
         cable.live(now);
         let ready_at = now;
         let watch = Stopwatch::start();
-        let _ = link.poll(now, cable.transport());
-        let now = if shared.is_virtual() { now } else { await_credit(shared, &mut link, &mut cable, &job) };
+        poll(shared, &mut link, &mut cable, &mut keeper, now);
+        let now = if shared.is_virtual() {
+            now
+        } else {
+            await_credit(shared, &mut link, &mut cable, &mut keeper, &job)
+        };
         let waited_ns = now.ns_since(ready_at);
         let outcome = link.send_frame(now, job.id.0, job.target_at, job.planes.bytes(), cable.transport());
         job.outcome = Some(outcome);
+        if outcome == SendOutcome::Sent {
+            keeper.sent(&job);
+        }
         job.timeline.wall_ns[Stage::Link as usize] = watch.elapsed_ns();
         last = now;
         if !shared.is_virtual() {
@@ -351,31 +382,58 @@ fn link_thread(shared: &Shared<'_>, mut link: HostLink, mut cable: Cable) -> Cab
     }
     enter_frame_path(false);
     // The last frames' light, then dark.
-    let end = if shared.is_virtual() {
+    let mut now = if shared.is_virtual() {
         last.plus_ns(2 * shared.rig.rate().slot_len_ns(0))
     } else {
-        shared.clock.wait_until(shared.clock.now().plus_ns(10_000_000))
+        let end = shared.clock.now().plus_ns(10_000_000 + keeper.travel_ns());
+        while shared.clock.now() < end {
+            poll(shared, &mut link, &mut cable, &mut keeper, shared.clock.now());
+            shared.clock.wait_until(shared.clock.now().plus_ns(1_000_000));
+        }
+        end
     };
-    cable.live(end);
-    let _ = link.command(end, Verb::Stop, cable.transport());
-    for i in 1..=4 {
-        let now = if shared.is_virtual() {
-            end.plus_ns(i * 1_000_000)
+    cable.live(now);
+    keeper.stop(now, &mut link, cable.transport());
+    // A line may still be busy with a frame: STOP is repeated until the projector says that it is dark.
+    let steps = if matches!(cable, Cable::Outside(_)) { DARK_WITHIN_MS } else { 4 };
+    for i in 1..=steps {
+        now = if shared.is_virtual() {
+            now.plus_ns(1_000_000)
         } else {
             shared.clock.wait_until(shared.clock.now().plus_ns(1_000_000))
         };
-        let _ = link.poll(now, cable.transport());
+        poll(shared, &mut link, &mut cable, &mut keeper, now);
         cable.live(now);
+        if i >= 4 && is_dark(&link) {
+            break;
+        }
     }
-    cable
+    let report = keeper.report(&link, cable.transport().name());
+    (cable, report)
+}
+
+/// Moves the link along and does what is due beside frames.
+fn poll(shared: &Shared<'_>, link: &mut HostLink, cable: &mut Cable, keeper: &mut LinkKeeper, now: HostTime) {
+    let steady = shared.is_virtual();
+    let result = keeper.poll(now, link, cable.transport(), steady, &shared.lights, shared.monitor);
+    shared.travel_ns.store(keeper.travel_ns(), Ordering::Relaxed);
+    if let Err(e) = result {
+        shared.fail(e.into());
+    }
 }
 
 /// Waits until the device has room for the frame, at most until the frame's slot begins; returns the time.
-fn await_credit(shared: &Shared<'_>, link: &mut HostLink, cable: &mut Cable, job: &FrameJob) -> HostTime {
+fn await_credit(
+    shared: &Shared<'_>,
+    link: &mut HostLink,
+    cable: &mut Cable,
+    keeper: &mut LinkKeeper,
+    job: &FrameJob,
+) -> HostTime {
     let mut now = shared.clock.now();
     while link.state() == LinkState::Streaming && link.credit() == 0 && now < job.timeline.due_at {
         now = shared.clock.wait_until(now.plus_ns(CREDIT_STEP_NS));
-        let _ = link.poll(now, cable.transport());
+        poll(shared, link, cable, keeper, now);
     }
     now
 }

@@ -1,12 +1,110 @@
-//! Counters that a running pipeline keeps and a watching thread reads, and the flag that asks it to stop.
+//! Counters that a running pipeline keeps and a watching thread reads, and the operator's wishes the other way: stop, and the verbs of
+//! a projector.
 
-use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
+use dpm_device::link::faults;
+use std::fmt;
+use std::sync::atomic::{AtomicBool, AtomicU64, AtomicU8, Ordering};
+
+/// What an operator can ask of the projector of a running rig.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+#[repr(u8)]
+pub enum Order {
+    /// Dark at once; frames go on being made.
+    Black = 1,
+    /// Hold the frame that is lit.
+    Freeze = 2,
+    /// Dark and latched.
+    Safe = 3,
+    /// Light again, after any of these or after a fault.
+    Arm = 4,
+}
+
+impl Order {
+    /// Every order with the word for it.
+    pub const ALL: [(Self, &'static str); 4] =
+        [(Self::Black, "black"), (Self::Freeze, "freeze"), (Self::Safe, "safe"), (Self::Arm, "arm")];
+
+    /// The word for it.
+    pub fn word(self) -> &'static str {
+        Self::ALL.iter().find(|(order, _)| *order == self).map_or("", |(_, word)| word)
+    }
+
+    /// The order with this word.
+    pub fn from_word(word: &str) -> Option<Self> {
+        Self::ALL.iter().find(|(_, w)| *w == word).map(|(order, _)| *order)
+    }
+}
+
+/// How the projector is, as the link knows it.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub enum ProjectorHealth {
+    /// Handshake under way.
+    #[default]
+    Connecting,
+    /// It takes frames.
+    Up,
+    /// The medium is gone; it is tried again ten times a second.
+    Lost,
+    /// Dark; these faults (bits of [`faults`]) are latched.
+    Faulted(u32),
+    /// Dark because the operator said so.
+    Black,
+    /// Holds a frame because the operator said so.
+    Frozen,
+    /// Dark at the end of the run.
+    Stopped,
+}
+
+impl ProjectorHealth {
+    const fn encode(self) -> u64 {
+        match self {
+            Self::Connecting => 0,
+            Self::Up => 1,
+            Self::Lost => 2,
+            Self::Black => 3,
+            Self::Frozen => 4,
+            Self::Stopped => 5,
+            Self::Faulted(mask) => 6 | (mask as u64) << 8,
+        }
+    }
+
+    const fn decode(code: u64) -> Self {
+        match code & 0xff {
+            1 => Self::Up,
+            2 => Self::Lost,
+            3 => Self::Black,
+            4 => Self::Frozen,
+            5 => Self::Stopped,
+            6 => Self::Faulted((code >> 8) as u32),
+            _ => Self::Connecting,
+        }
+    }
+}
+
+impl fmt::Display for ProjectorHealth {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        match self {
+            Self::Connecting => write!(f, "connecting"),
+            Self::Up => write!(f, "up"),
+            Self::Lost => write!(f, "lost, dark; plug it in again and the run goes on"),
+            Self::Faulted(mask) => {
+                write!(f, "dark, latched faults: {}; `dpm arm` acknowledges them", faults::names(*mask))
+            }
+            Self::Black => write!(f, "black; `dpm arm` shows the picture again"),
+            Self::Frozen => write!(f, "frozen; `dpm arm` lets the picture move again"),
+            Self::Stopped => write!(f, "dark"),
+        }
+    }
+}
 
 /// Shared between a run and whoever watches it. All accesses are relaxed: the numbers are for display, and the stop flag
 /// guards no data.
 #[derive(Debug, Default)]
 pub struct RunMonitor {
     stop: AtomicBool,
+    /// The newest order not yet taken; 0 for none.
+    order: AtomicU8,
+    projector: AtomicU64,
     frames_planned: AtomicU64,
     frames_lit: AtomicU64,
     frames_dropped: AtomicU64,
@@ -37,6 +135,32 @@ impl RunMonitor {
         self.stop.load(Ordering::Relaxed)
     }
 
+    /// Gives the projector an order; one that was not yet taken is replaced. SAFE is never replaced but by ARM.
+    pub fn give_order(&self, order: Order) {
+        let _ = self.order.fetch_update(Ordering::Relaxed, Ordering::Relaxed, |waiting| {
+            (waiting != Order::Safe as u8 || order == Order::Arm).then_some(order as u8)
+        });
+    }
+
+    /// The newest order, once. The link thread asks with every poll.
+    pub fn take_order(&self) -> Option<Order> {
+        if self.order.load(Ordering::Relaxed) == 0 {
+            return None;
+        }
+        let code = self.order.swap(0, Ordering::Relaxed);
+        Order::ALL.iter().map(|(order, _)| *order).find(|order| *order as u8 == code)
+    }
+
+    /// Says how the projector is.
+    pub fn set_projector(&self, health: ProjectorHealth) {
+        self.projector.store(health.encode(), Ordering::Relaxed);
+    }
+
+    /// How the projector is.
+    pub fn projector(&self) -> ProjectorHealth {
+        ProjectorHealth::decode(self.projector.load(Ordering::Relaxed))
+    }
+
     /// Counts a planned frame.
     pub fn count_planned(&self) {
         self.frames_planned.fetch_add(1, Ordering::Relaxed);
@@ -63,5 +187,51 @@ impl RunMonitor {
             frames_dropped: self.frames_dropped.load(Ordering::Relaxed),
             frames_late: self.frames_late.load(Ordering::Relaxed),
         }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn an_order_is_taken_once_the_newest_wins_and_nothing_but_arm_takes_safe_back() {
+        let monitor = RunMonitor::default();
+        assert_eq!(monitor.take_order(), None);
+        for (order, word) in Order::ALL {
+            assert_eq!((Order::from_word(word), order.word()), (Some(order), word));
+            monitor.give_order(order);
+            assert_eq!((monitor.take_order(), monitor.take_order()), (Some(order), None));
+        }
+        monitor.give_order(Order::Black);
+        monitor.give_order(Order::Freeze);
+        assert_eq!(monitor.take_order(), Some(Order::Freeze));
+        monitor.give_order(Order::Safe);
+        monitor.give_order(Order::Black);
+        assert_eq!(monitor.take_order(), Some(Order::Safe));
+        monitor.give_order(Order::Safe);
+        monitor.give_order(Order::Arm);
+        assert_eq!(monitor.take_order(), Some(Order::Arm));
+    }
+
+    #[test]
+    fn the_projectors_health_crosses_the_atomic_whole() {
+        use ProjectorHealth as H;
+        let all = [
+            H::Connecting,
+            H::Up,
+            H::Lost,
+            H::Black,
+            H::Frozen,
+            H::Stopped,
+            H::Faulted(0),
+            H::Faulted(u32::MAX),
+        ];
+        let monitor = RunMonitor::default();
+        for health in all {
+            monitor.set_projector(health);
+            assert_eq!(monitor.projector(), health);
+        }
+        assert!(H::Faulted(faults::LAMP).to_string().contains("lamp"));
     }
 }

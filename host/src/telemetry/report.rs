@@ -1,5 +1,6 @@
 //! What a run was like: one JSON object for programs, one short table for people.
 
+use crate::pipeline::ProjectorReport;
 use serde::ser::{Serialize, SerializeMap, Serializer};
 use std::fmt::Write;
 use std::path::PathBuf;
@@ -96,8 +97,11 @@ pub struct Report {
     pub clipped: f64,
     /// Pixels that were not a number and became black.
     pub nan_pixels: u64,
-    /// Hash of all light; the same for the same seed at virtual pace.
+    /// Hash of all light; the same for the same seed at virtual pace. Absent where nobody saw the light.
+    #[serde(skip_serializing_if = "String::is_empty")]
     pub light_hash: String,
+    /// What the link to the projector carried, and what the projector said.
+    pub projector: Option<ProjectorReport>,
     /// What the operator should know.
     pub warnings: Vec<String>,
     /// Files written.
@@ -140,6 +144,7 @@ impl Default for Report {
             clipped: 0.0,
             nan_pixels: 0,
             light_hash: String::new(),
+            projector: None,
             warnings: Vec::new(),
             files: Vec::new(),
             wall_s: 0.0,
@@ -191,6 +196,36 @@ impl Report {
             );
         }
         row("wall time", format!("{:.2} s, {:.1} frames/s", self.wall_s, self.frames_per_wall_second));
+        if let Some(p) = &self.projector {
+            let [raw, coded, kept] = p.planes;
+            row("projector", format!("{}, {:.1} MB sent", p.name, p.sent_mb));
+            if coded + kept > 0 {
+                row("  planes", format!("{raw} raw, {coded} coded, {kept} unchanged and not sent"));
+            }
+            if let Some(d) = p.device {
+                let dropped = format!(
+                    "{} incomplete, {} too late, {} superseded, {} refused",
+                    d.incomplete, d.too_late, d.superseded, d.refused
+                );
+                row(
+                    "  its report",
+                    format!(
+                        "{} lit, {} repeated, {} blank slots; dropped {dropped}",
+                        d.lit, d.repeated, d.blank
+                    ),
+                );
+            }
+            if p.sessions > 1 || p.rearmed > 0 {
+                row(
+                    "  came back",
+                    format!(
+                        "{} times, armed again {} times after a fault",
+                        p.sessions.saturating_sub(1),
+                        p.rearmed
+                    ),
+                );
+            }
+        }
         if let Some(rays) = self.mrays_per_s {
             row("rays", format!("{rays:.2} million/s"));
         }

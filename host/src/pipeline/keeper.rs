@@ -1,0 +1,239 @@
+//! What the link thread does beside frames: the operator's orders, arming again after the dark, the projector's clock, its reports.
+//!
+//! Light after a dark that nobody ordered comes back by itself only where the reason was the cable or the host: a new session after
+//! unplugging or a reset, the watchdog, damaged packets. Heat, lamp, emergency stop, flashes and SAFE wait for an ARM of the operator.
+
+use super::connect::ConnectError;
+use super::handoff::Ring;
+use super::job::FrameJob;
+use super::light::LightNote;
+use super::stages::LinkTime;
+use super::status_light::{DeviceCounts, StatusLight};
+use crate::telemetry::monitor::{Order, ProjectorHealth, RunMonitor};
+use dpm_device::clock_map::ClockMap;
+use dpm_device::link::{faults, DeviceState, HostLink, LinkError, LinkState, Verb};
+use dpm_device::time::HostTime;
+use dpm_device::transport::Transport;
+use dpm_handoff::latest::Publisher;
+
+/// Faults after which light comes back without the operator.
+const PASSING: u32 = faults::WATCHDOG | faults::CHECKSUM_STORM;
+/// Shortest time between two such returns: a projector that faults again and again stays mostly dark.
+const REARM_NS: i64 = 1_000_000_000;
+/// How often the planning thread learns the projector's clock anew.
+const RETIME_NS: i64 = 100_000_000;
+/// Exchanges that beat those of the handshake.
+const EXCHANGES: usize = 8;
+
+/// What the link carried in a run, for its report.
+#[derive(Clone, Debug, PartialEq, serde::Serialize)]
+pub struct ProjectorReport {
+    /// Name of the medium.
+    pub name: String,
+    /// Sessions opened: 1 and one for every time that the projector came back.
+    pub sessions: u64,
+    /// Times that light came back after the watchdog or damaged packets.
+    pub rearmed: u64,
+    /// Megabytes handed to the medium, 10^6 bytes each.
+    pub sent_mb: f64,
+    /// Planes sent as they are, by a codec, and not at all because they had not changed.
+    pub planes: [u64; 3],
+    /// Frames not sent: link not up, no buffer in the projector, no room on the medium, medium lost, flashes.
+    pub not_sent: [u64; 5],
+    /// What the projector reported; null for the mock in this process, whose light is seen itself.
+    pub device: Option<DeviceCounts>,
+    /// From sent to light in time, as learned from the reports, milliseconds; null for the mock in this process.
+    pub travel_ms: Option<f64>,
+}
+
+/// See the module's documentation.
+pub(super) struct LinkKeeper {
+    time: LinkTime,
+    times: Publisher<LinkTime>,
+    retimed_at: HostTime,
+    map: Option<ClockMap>,
+    session: u64,
+    /// `time` is of this session.
+    is_timed: bool,
+    reports: Option<StatusLight>,
+    /// What the operator ordered last and did not take back.
+    standing: Option<Verb>,
+    rearmed_at: HostTime,
+    rearmed: u64,
+}
+
+impl LinkKeeper {
+    /// For a link that has just come up with `time`. `outside`: the projector's reports are all that is known of its light.
+    pub(super) fn new(time: LinkTime, times: Publisher<LinkTime>, link: &HostLink, outside: bool) -> Self {
+        Self {
+            time,
+            times,
+            retimed_at: HostTime(i64::MIN),
+            map: None,
+            session: link.counters().sessions,
+            is_timed: true,
+            reports: outside.then(StatusLight::new),
+            standing: None,
+            rearmed_at: HostTime(i64::MIN),
+            rearmed: 0,
+        }
+    }
+
+    /// Polls the link and does what is due. At virtual pace (`steady`) the projector's clock stays as the handshake found it.
+    ///
+    /// # Errors
+    /// The link cannot come up again: another projector was plugged in, or it refuses. While the medium is gone, or the projector
+    /// refuses to be armed, there is no error: the run goes on in the dark.
+    pub(super) fn poll(
+        &mut self,
+        now: HostTime,
+        link: &mut HostLink,
+        transport: &mut dyn Transport,
+        steady: bool,
+        lights: &Ring<LightNote>,
+        monitor: &RunMonitor,
+    ) -> Result<(), ConnectError> {
+        let result = match link.poll(now, transport) {
+            Ok(_) | Err(LinkError::Transport(_) | LinkError::ArmRefused { .. }) => Ok(()),
+            Err(e) => Err(e.into()),
+        };
+        if link.counters().sessions != self.session {
+            self.session = link.counters().sessions;
+            (self.is_timed, self.map) = (false, None);
+            if let Some(reports) = &mut self.reports {
+                reports.new_session();
+            }
+        }
+        if !steady {
+            self.keep_time(now, link);
+        }
+        if let Some(order) = monitor.take_order() {
+            self.obey(now, order, link, transport);
+        }
+        self.arm_again(now, link, steady);
+        if let (Some(reports), Some(status)) = (&mut self.reports, link.status().filter(|_| self.is_timed)) {
+            reports.observe(status, &self.time, lights);
+        }
+        monitor.set_projector(health(link, self.standing));
+        result
+    }
+
+    /// The frame is on its way.
+    pub(super) fn sent(&mut self, job: &FrameJob) {
+        if let Some(reports) = &mut self.reports {
+            reports.sent(job.id.0 as u32, job.slot);
+        }
+    }
+
+    /// How much earlier frames must leave than the host's own stages need, nanoseconds.
+    pub(super) fn travel_ns(&self) -> i64 {
+        self.reports.as_ref().map_or(0, StatusLight::travel_ns)
+    }
+
+    /// Ends the light; nothing brings it back.
+    pub(super) fn stop(&mut self, now: HostTime, link: &mut HostLink, transport: &mut dyn Transport) {
+        self.standing = Some(Verb::Stop);
+        let _ = link.command(now, Verb::Stop, transport);
+    }
+
+    /// What was carried.
+    pub(super) fn report(&self, link: &HostLink, name: &str) -> ProjectorReport {
+        let c = link.counters();
+        ProjectorReport {
+            name: name.to_owned(),
+            sessions: c.sessions,
+            rearmed: self.rearmed,
+            sent_mb: c.bytes_sent as f64 / 1e6,
+            planes: [c.planes_raw, c.planes_coded, c.planes_kept],
+            not_sent: [c.not_streaming, c.no_credit, c.link_busy, c.link_lost, c.flash_limit],
+            device: self.reports.as_ref().map(StatusLight::counts),
+            travel_ms: self.reports.as_ref().map(|r| r.travel_ns() as f64 / 1e6),
+        }
+    }
+
+    fn obey(&mut self, now: HostTime, order: Order, link: &mut HostLink, transport: &mut dyn Transport) {
+        let verb = match order {
+            Order::Black => Verb::Black,
+            Order::Freeze => Verb::Freeze,
+            Order::Safe => Verb::Safe,
+            Order::Arm => {
+                self.standing = None;
+                return link.arm(link.status().map_or(0, |s| s.faults));
+            }
+        };
+        self.standing = Some(verb);
+        // What does not get through now is repeated by the link; a medium that is gone is dark anyway.
+        let _ = link.command(now, verb, transport);
+    }
+
+    /// A projector that came back, or stopped for a reason that has passed, is armed unless the operator wants it dark.
+    fn arm_again(&mut self, now: HostTime, link: &mut HostLink, steady: bool) {
+        if self.standing.is_some() {
+            return;
+        }
+        match link.state() {
+            LinkState::Ready if self.is_timed || steady => link.arm(0),
+            LinkState::Faulted => {
+                let latched = link.status().map_or(0, |s| s.faults);
+                let rested = self.rearmed_at.0 == i64::MIN || now.ns_since(self.rearmed_at) >= REARM_NS;
+                if latched != 0 && latched & !PASSING == 0 && rested {
+                    self.rearmed_at = now;
+                    self.rearmed += 1;
+                    link.arm(latched);
+                }
+            }
+            _ => {}
+        }
+    }
+
+    /// Maps the projector's clock and tells the planning thread.
+    fn keep_time(&mut self, now: HostTime, link: &mut HostLink) {
+        let Some(hello) = link.device() else { return };
+        if self.map.is_none() {
+            self.map = ClockMap::new(u64::from(hello.tick_hz)).ok();
+        }
+        let Some(map) = &mut self.map else { return };
+        let mut newest = None;
+        link.take_echoes(|e| {
+            map.add_exchange(e.host_sent_at, e.device_received_at, e.device_sent_at, e.host_received_at);
+            newest = Some(e.device_sent_at);
+        });
+        let (Some(ticks), Some(clock)) = (newest, link.slots()) else { return };
+        let Some(mapped) = map.to_host(ticks) else { return };
+        if self.is_timed {
+            let due = self.retimed_at.0 == i64::MIN || now.ns_since(self.retimed_at) >= RETIME_NS;
+            if !due || map.exchanges() < EXCHANGES {
+                return;
+            }
+            self.time.anchor = (ticks, mapped.at);
+        } else {
+            let mut time = LinkTime { clock, first: 0, anchor: (ticks, mapped.at) };
+            // The run goes on counting its slots.
+            time.first = self.time.slot_after(time.host_of_slot(0));
+            (self.time, self.is_timed) = (time, true);
+        }
+        self.retimed_at = now;
+        self.times.publish(self.time);
+    }
+}
+
+/// True when the device says that it is dark and will stay so, or cannot be asked.
+pub(super) fn is_dark(link: &HostLink) -> bool {
+    matches!(link.state(), LinkState::Lost | LinkState::Closed)
+        || link.status().is_some_and(|s| {
+            !s.lit && !matches!(s.state, DeviceState::Armed | DeviceState::Black | DeviceState::Frozen)
+        })
+}
+
+fn health(link: &HostLink, standing: Option<Verb>) -> ProjectorHealth {
+    match (link.state(), standing) {
+        (LinkState::Lost | LinkState::Closed, _) => ProjectorHealth::Lost,
+        (LinkState::Faulted, _) => ProjectorHealth::Faulted(link.status().map_or(0, |s| s.faults)),
+        (_, Some(Verb::Black)) => ProjectorHealth::Black,
+        (_, Some(Verb::Freeze)) => ProjectorHealth::Frozen,
+        (_, Some(Verb::Safe)) => ProjectorHealth::Faulted(faults::HOST_SAFE),
+        (_, Some(Verb::Stop)) => ProjectorHealth::Stopped,
+        (LinkState::Streaming, None) => ProjectorHealth::Up,
+        (_, None) => ProjectorHealth::Connecting,
+    }
+}

@@ -1,0 +1,255 @@
+//! STATUS reports of a projector outside this process into the light notes that a mock would have made, as far as they tell it.
+//!
+//! Counters are absolute and reports may be merged or lost. A report that follows after one slot tells everything about it. One that
+//! covers several slots tells how many were lit, repeated and dark, and the frame lit last: the others are handed on as numbers.
+
+use super::handoff::Ring;
+use super::light::LightNote;
+use super::stages::LinkTime;
+use dpm_device::link::Status;
+use hil_mock::projector::{LightEvent, LightKind};
+
+/// Slots of one report that are told one by one: a second of silence at 1 kHz.
+const MOST_SLOTS: u32 = 1024;
+/// Frames whose slot is remembered until their light is reported.
+const REMEMBERED: usize = 64;
+/// Longest travel of a frame that is believed, nanoseconds.
+const LONGEST_TRAVEL_NS: i64 = 500_000_000;
+
+/// What the projector counted over all sessions of a run.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, serde::Serialize)]
+pub struct DeviceCounts {
+    /// Frames lit.
+    pub lit: u64,
+    /// Of these, frames whose report was merged into a later one: whether they were late is not known.
+    pub lit_unseen: u64,
+    /// Slots that showed the frame before again, those after the last frame included.
+    pub repeated: u64,
+    /// Dark slots while armed.
+    pub blank: u64,
+    /// Frames dropped because a part was missing or damaged.
+    pub incomplete: u64,
+    /// Whole frames dropped because their slot was over.
+    pub too_late: u64,
+    /// Whole frames dropped because a newer one was due too.
+    pub superseded: u64,
+    /// Frames refused: the projector was told to be dark, was ahead of its memory, or did not believe the target.
+    pub refused: u64,
+    /// Damaged packets that it received.
+    pub damaged_packets: u64,
+}
+
+/// Reads one session's reports after the other.
+#[derive(Debug)]
+pub(super) struct StatusLight {
+    before: Option<Status>,
+    counts: DeviceCounts,
+    planned: [(u32, u64); REMEMBERED],
+    next: usize,
+    travel_ns: i64,
+}
+
+impl StatusLight {
+    pub(super) const fn new() -> Self {
+        let counts = DeviceCounts {
+            lit: 0,
+            lit_unseen: 0,
+            repeated: 0,
+            blank: 0,
+            incomplete: 0,
+            too_late: 0,
+            superseded: 0,
+            refused: 0,
+            damaged_packets: 0,
+        };
+        Self { before: None, counts, planned: [(0, u64::MAX); REMEMBERED], next: 0, travel_ns: 0 }
+    }
+
+    /// What was counted so far.
+    pub(super) fn counts(&self) -> DeviceCounts {
+        self.counts
+    }
+
+    /// A new session counts from zero again.
+    pub(super) fn new_session(&mut self) {
+        self.before = None;
+    }
+
+    /// Frame number `frame` is on its way to `slot`.
+    pub(super) fn sent(&mut self, frame: u32, slot: u64) {
+        self.planned[self.next % REMEMBERED] = (frame, slot);
+        self.next = (self.next + 1) % REMEMBERED;
+    }
+
+    /// How much earlier than the host believed a frame must be sent to be lit in its slot, nanoseconds: rises at once when frames
+    /// are lit late, falls slowly while they are not.
+    pub(super) fn travel_ns(&self) -> i64 {
+        self.travel_ns
+    }
+
+    /// Takes in a report. `time` tells slots and instants. Notes that find no room are lost, as a mock's are.
+    pub(super) fn observe(&mut self, status: &Status, time: &LinkTime, notes: &Ring<LightNote>) {
+        let before = self.before.replace(*status);
+        if before == Some(*status) {
+            return;
+        }
+        let since = |now: u32, before: Option<u32>| now.wrapping_sub(before.unwrap_or(0));
+        let of = |field: fn(&Status) -> u32| since(field(status), before.as_ref().map(field));
+        let slots = of(|s| s.slots);
+        let (lit, repeated, blank) = (of(|s| s.frames_lit), of(|s| s.slots_repeated), of(|s| s.slots_blank));
+        let c = &mut self.counts;
+        c.lit += u64::from(lit);
+        c.lit_unseen += u64::from(lit.saturating_sub(1));
+        c.repeated += u64::from(repeated);
+        c.blank += u64::from(blank);
+        c.incomplete += u64::from(of(|s| s.frames_incomplete));
+        c.too_late += u64::from(of(|s| s.frames_late));
+        c.superseded += u64::from(of(|s| s.frames_superseded));
+        c.refused += u64::from(of(|s| s.frames_refused));
+        c.damaged_packets += u64::from(of(|s| s.header_errors)) + u64::from(of(|s| s.payload_errors));
+        let Some(newest) = time.slot_at(status.now) else { return };
+        if lit > 0 {
+            if let Some(slot) = time.slot_at(status.last_lit_at) {
+                self.follow(status.last_lit_frame, slot, time);
+            }
+        }
+        self.notes(status, newest, [slots, lit, repeated], time, notes);
+    }
+
+    /// One note for each slot of the report whose fate is known, in order.
+    fn notes(
+        &self,
+        status: &Status,
+        newest: u64,
+        [slots, lit, repeated]: [u32; 3],
+        time: &LinkTime,
+        notes: &Ring<LightNote>,
+    ) {
+        let lit_slot = if lit > 0 { time.slot_at(status.last_lit_at) } else { None };
+        let first = (newest + 1).saturating_sub(u64::from(slots.min(MOST_SLOTS)));
+        let mut unseen = lit.saturating_sub(1);
+        let mut repeated = repeated;
+        for slot in first..=newest {
+            let (kind, frame, told) = if Some(slot) == lit_slot {
+                (LightKind::Lit, Some(status.last_lit_frame), lit - 1)
+            } else if unseen > 0 && lit_slot.is_some_and(|l| slot < l) {
+                unseen -= 1;
+                continue;
+            } else if repeated > 0 {
+                repeated -= 1;
+                (LightKind::Repeated, None, 0)
+            } else {
+                (LightKind::Blank, None, 0)
+            };
+            let start = time.start(slot);
+            let event = LightEvent {
+                slot,
+                frame,
+                kind,
+                lit_at: start,
+                first_photon_at: time.host_of(start),
+                last_photon_at: time.host_of(time.start(slot + 1)),
+            };
+            let _ = notes.push(LightNote { event, hash: 0, torn: false, wall_ns: 0, unseen: told });
+        }
+    }
+
+    fn follow(&mut self, frame: u32, lit_slot: u64, time: &LinkTime) {
+        let Some(&(_, planned)) = self.planned.iter().find(|p| p.0 == frame && p.1 != u64::MAX) else {
+            return;
+        };
+        let late_ns = time.host_of_slot(lit_slot).ns_since(time.host_of_slot(planned)).max(0);
+        self.travel_ns = if late_ns > 0 {
+            // Half of it: frames that are on their way already are late by as much.
+            (self.travel_ns + late_ns / 2).min(LONGEST_TRAVEL_NS)
+        } else {
+            self.travel_ns - self.travel_ns / 1024
+        };
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use dpm_device::link::{DeviceMessage, MessageType, SlotClock};
+    use dpm_device::time::{DeviceTicks, FrameRate, HostTime};
+
+    /// Slots of a millisecond on a microsecond clock that began with the host's; the run's slot 100 is the clock's slot 0.
+    fn time() -> LinkTime {
+        let rate = FrameRate::new(1000, 1).unwrap();
+        let clock = SlotClock::new(DeviceTicks(0), 1_000_000, rate).unwrap();
+        LinkTime { clock, first: 100, anchor: (DeviceTicks(0), HostTime(0)) }
+    }
+
+    fn status(now: u64, [lit, repeated, blank]: [u32; 3], last: (u32, u64)) -> Status {
+        let parsed = DeviceMessage::parse(MessageType::Status, &[0; 96]).unwrap();
+        let DeviceMessage::Status(zero) = parsed else { panic!("a STATUS of zeros") };
+        Status {
+            now: DeviceTicks(now),
+            slots: lit + repeated + blank,
+            frames_lit: lit,
+            slots_repeated: repeated,
+            slots_blank: blank,
+            last_lit_frame: last.0,
+            last_lit_at: DeviceTicks(last.1),
+            ..zero
+        }
+    }
+
+    fn told(light: &mut StatusLight, s: &Status) -> Vec<(u64, LightKind, Option<u32>, u32)> {
+        let ring = Ring::new(4096);
+        light.observe(s, &time(), &ring);
+        std::iter::from_fn(|| ring.try_pop())
+            .map(|n| (n.event.slot, n.event.kind, n.event.frame, n.unseen))
+            .collect()
+    }
+
+    #[test]
+    fn a_report_a_slot_tells_everything() {
+        use LightKind::{Blank, Lit, Repeated};
+        let mut light = StatusLight::new();
+        assert_eq!(told(&mut light, &status(5_100, [1, 0, 0], (7, 5_000))), [(105, Lit, Some(7), 0)]);
+        assert_eq!(told(&mut light, &status(6_100, [1, 1, 0], (7, 5_000))), [(106, Repeated, None, 0)]);
+        assert_eq!(told(&mut light, &status(7_100, [1, 1, 1], (7, 5_000))), [(107, Blank, None, 0)]);
+        // The same report again says nothing new.
+        assert_eq!(told(&mut light, &status(7_100, [1, 1, 1], (7, 5_000))), []);
+        let ring = Ring::new(4);
+        light.observe(&status(8_100, [2, 1, 1], (9, 8_000)), &time(), &ring);
+        let event = ring.try_pop().unwrap().event;
+        assert_eq!((event.first_photon_at, event.last_photon_at), (HostTime(8_000_000), HostTime(9_000_000)));
+    }
+
+    #[test]
+    fn a_merged_report_is_told_as_far_as_it_goes() {
+        use LightKind::{Lit, Repeated};
+        let mut light = StatusLight::new();
+        // Slots 1 to 5: three lit, the last of them in slot 4, and two repeated.
+        let notes = told(&mut light, &status(5_900, [3, 2, 0], (12, 4_000)));
+        assert_eq!(notes.iter().filter(|n| n.1 == Lit).collect::<Vec<_>>(), [&(104, Lit, Some(12), 2)]);
+        assert_eq!(notes.iter().filter(|n| n.1 == Repeated).count(), 2);
+        assert_eq!((light.counts().lit, light.counts().lit_unseen, light.counts().repeated), (3, 2, 2));
+        // A new session begins at zero.
+        light.new_session();
+        told(&mut light, &status(1_100, [1, 0, 0], (13, 1_000)));
+        assert_eq!((light.counts().lit, light.counts().lit_unseen), (4, 2));
+        // Counters that wrapped, and a silence of a day: bounded work.
+        told(&mut light, &status(86_400_000_000, [u32::MAX, 0, 0], (14, 86_400_000_000)));
+        assert_eq!(light.counts().lit, 4 + u64::from(u32::MAX - 1));
+    }
+
+    #[test]
+    fn travel_follows_late_frames_and_forgets_slowly() {
+        let mut light = StatusLight::new();
+        light.sent(7, 101);
+        told(&mut light, &status(5_100, [1, 0, 0], (7, 5_000)));
+        assert_eq!(light.travel_ns(), 2_000_000, "half of four slots");
+        light.sent(8, 106);
+        told(&mut light, &status(6_100, [2, 0, 0], (8, 6_000)));
+        assert_eq!(light.travel_ns(), 2_000_000 - 2_000_000 / 1024);
+        for k in 0..2000u32 {
+            light.sent(9 + k, 0);
+            told(&mut light, &status(7_100 + u64::from(k), [3 + k, 0, 0], (9 + k, 7_000)));
+        }
+        assert_eq!(light.travel_ns(), LONGEST_TRAVEL_NS);
+    }
+}
