@@ -1,7 +1,5 @@
-//! What the end-to-end tests share: small scenes made by code, and frames drawn by the GPU under validation.
+//! What the end-to-end tests share: the GPU under validation, demands on pictures, rigs.
 
 pub mod compare;
 pub mod gpu;
 pub mod rigs;
-pub mod scenes;
-pub mod statistics;

@@ -3,9 +3,10 @@
 //! A path of depth d sees the first d terms of `sum 0.5^k`, so its mean is `1 - 0.5^d`: from every position, at every size.
 
 use dpm_host::scene::{Material, Scene};
-use dpm_tests::gpu::{with_gpu, Picture, Shot};
-use dpm_tests::scenes::*;
-use dpm_tests::statistics::pooled;
+use dpm_host::experiments::stability::gpu_shot::{Picture, Shot};
+use dpm_tests::gpu::with_gpu;
+use dpm_host::experiments::stability::shapes::*;
+use dpm_host::experiments::stability::estimate::pooled;
 use glam::{DAffine3, DQuat, DVec3, Vec3};
 
 fn lamp(double_sided: bool) -> Material {
@@ -29,7 +30,7 @@ fn assert_closed(what: &str, picture: &Picture, depth: u32) {
 #[test]
 fn depth_d_keeps_the_first_d_terms() {
     with_gpu(|gpu| {
-        let scene = scene_of(sphere(2.0, 1, false), lamp(true));
+        let scene = scene_of(sphere(Vec3::ZERO, 2.0, 1, false), lamp(true));
         let camera = camera(32, 24, DVec3::new(0.3, -0.2, 0.1), DVec3::NEG_Z);
         for depth in [1, 2, 3, 12] {
             let picture = Shot { spp: 16, frames: 8, depth, ..Shot::new(&scene, camera) }.draw(gpu);
@@ -46,7 +47,7 @@ fn no_size_and_no_place_leaks() {
     with_gpu(|gpu| {
         for radius in [1e-3f32, 1.0, 1e4] {
             // Baked at the origin; moved and turned by its pose, as the tracker does.
-            let scene = scene_of(sphere(radius, 2, true), lamp(true));
+            let scene = scene_of(sphere(Vec3::ZERO, radius, 2, true), lamp(true));
             for distance in [0.0, 1.0, 1e4] {
                 let centre = DVec3::new(0.6, -0.48, 0.64) * distance;
                 let turn = DQuat::from_euler(glam::EulerRot::XYZ, 0.3, 1.1, -0.7);
@@ -70,8 +71,8 @@ fn seen_from_outside_a_sphere_does_not_shine_through_itself() {
     // Single-sided and lit from inside only: from outside it is black, however far it is. An inner lamp must not leak out.
     with_gpu(|gpu| {
         for (radius, distance) in [(1e-3f32, 1.0f64), (1.0, 1e3), (1e4, 1e5)] {
-            let mut scene = scene_of(sphere(radius, 2, false), diffuse(Vec3::splat(0.5)));
-            add(&mut scene, sphere(radius * 0.9, 2, false), emitter(Vec3::splat(1e3)));
+            let mut scene = scene_of(sphere(Vec3::ZERO, radius, 2, false), diffuse(Vec3::splat(0.5)));
+            add(&mut scene, sphere(Vec3::ZERO, radius * 0.9, 2, false), emitter(Vec3::splat(1e3)));
             let mut camera = camera(32, 32, DVec3::new(0.0, 0.6, 0.8) * distance, DVec3::ZERO);
             let pixels = 14.0 * distance / f64::from(radius);
             (camera.fx, camera.fy) = (pixels, pixels);
@@ -89,7 +90,7 @@ fn seen_from_outside_a_sphere_does_not_shine_through_itself() {
 fn a_room_of_many_bodies_is_closed_too() {
     // The same sphere cut into four bodies whose seams meet only in world space.
     with_gpu(|gpu| {
-        let whole = sphere(1.0, 2, true);
+        let whole = sphere(Vec3::ZERO, 1.0, 2, true);
         let mut scene = Scene::default();
         for part in 0..4 {
             let mut mesh = whole.clone();

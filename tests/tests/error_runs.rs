@@ -45,9 +45,9 @@ fn a_group_is_measured_at_equal_rays_and_tells_bias_from_noise() {
     let options =
         ErrorOptions { warm_up: 8, kept: 48, reference_spp: 16, ablation: false, cache: cache.clone() };
     let runs = ErrorRuns::new(rig, gpu, options);
-    let group = Group { moving: false, budget: 4 };
+    let group = Group { moving: false, budget: 4.0 };
     let mut drawn = Vec::new();
-    let result = runs.measure(group, &mut |what| drawn.push(what.to_owned())).unwrap();
+    let result = runs.measure(group, &mut |what| drawn.push(what.to_owned())).unwrap().result;
     assert_eq!(drawn.iter().filter(|d| *d == "reference").count(), 2);
     for r in &result.rows {
         assert!((r.rays_to_paper - 1.0).abs() < 0.05, "{}: {} of paper's rays", r.method, r.rays_to_paper);
@@ -64,7 +64,7 @@ fn a_group_is_measured_at_equal_rays_and_tells_bias_from_noise() {
     assert!(full.bias < 0.5 * full.noise, "full is unbiased: {} beside {}", full.bias, full.noise);
     // The second time the reference comes from the cache and the numbers are the same.
     drawn.clear();
-    let again = runs.measure(group, &mut |what| drawn.push(what.to_owned())).unwrap();
+    let again = runs.measure(group, &mut |what| drawn.push(what.to_owned())).unwrap().result;
     assert!(!drawn.iter().any(|d| d == "reference"));
     assert_eq!(again.rows[1].perceived_rmse, full.perceived_rmse);
     std::fs::remove_dir_all(cache).unwrap();

@@ -3,9 +3,10 @@
 use dpm_host::gpu::Gpu;
 use dpm_host::reference::Sampler;
 use dpm_host::scene::{Material, PunctualKind, PunctualLight, Scene};
-use dpm_tests::compare::compare;
-use dpm_tests::gpu::{with_gpu, Shot};
-use dpm_tests::scenes::*;
+use dpm_tests::compare::{compare, Demands};
+use dpm_host::experiments::stability::gpu_shot::Shot;
+use dpm_tests::gpu::with_gpu;
+use dpm_host::experiments::stability::shapes::*;
 use glam::{DAffine3, DQuat, DVec3, Vec3};
 use proptest::prelude::*;
 use std::sync::Arc;
@@ -39,7 +40,7 @@ fn diffuse_with_an_area_light_and_textures() {
         let texture = use_texture(&mut scene, noise_texture(8, 3, 30, 250, true));
         let textured = Material { base_color_texture: texture, ..diffuse(Vec3::new(0.9, 0.8, 0.7)) };
         add(&mut scene, floor(1.2, 0.0), textured.clone());
-        add(&mut scene, sphere(0.35, 3, true), Material { base_color_texture: None, ..textured });
+        add(&mut scene, sphere(Vec3::ZERO, 0.35, 3, true), Material { base_color_texture: None, ..textured });
         let glow = use_texture(&mut scene, noise_texture(4, 5, 60, 255, true));
         let lamp = quad(Vec3::new(0.1, 1.5, -0.6), Vec3::new(0.5, 0.0, 0.0), Vec3::new(0.0, 0.1, 0.5));
         add(&mut scene, lamp, Material { emissive_texture: glow, ..emitter(Vec3::new(6.0, 5.0, 4.0)) });
@@ -65,7 +66,7 @@ fn glossy_with_a_normal_map_and_punctual_lights() {
         };
         add(&mut scene, floor(1.2, 0.0), metal);
         let coated = Material { roughness: 0.35, ior: 1.5, ..diffuse(Vec3::new(0.2, 0.4, 0.8)) };
-        add(&mut scene, sphere(0.35, 3, true), coated);
+        add(&mut scene, sphere(Vec3::ZERO, 0.35, 3, true), coated);
         let light = |kind, intensity, position: Vec3, direction: Vec3| PunctualLight {
             kind,
             intensity,
@@ -102,12 +103,12 @@ fn transmissive_solid_and_thin_under_an_environment_map() {
         let glass = Material { metallic: 0.0, transmission: 1.0, thin_walled: false, ..Material::default() };
         add(
             &mut scene,
-            sphere(0.3, 3, true),
+            sphere(Vec3::ZERO, 0.3, 3, true),
             Material { roughness: 0.0, base_color: Vec3::new(0.9, 1.0, 0.9), ..glass.clone() },
         );
         add(
             &mut scene,
-            sphere(0.3, 3, true),
+            sphere(Vec3::ZERO, 0.3, 3, true),
             Material { roughness: 0.55, transmission: 0.8, ..glass.clone() },
         );
         let stained = use_texture(&mut scene, noise_texture(4, 9, 60, 220, false));
@@ -157,7 +158,7 @@ fn holes_sides_and_a_thousand_lamps() {
         // 20,480 emissive triangles; the alias table must know them all.
         add(
             &mut scene,
-            sphere(0.25, 5, true),
+            sphere(Vec3::ZERO, 0.25, 5, true),
             Material { double_sided: true, ..emitter(Vec3::new(3.0, 3.5, 4.0)) },
         );
         let mut poses = vec![DAffine3::IDENTITY; 5];
@@ -190,7 +191,7 @@ fn random_scene(seed: u64) -> (Scene, Vec<DAffine3>) {
         let place = DVec3::new(f64::from(u()) - 0.5, 0.1 + 0.6 * f64::from(u()), f64::from(u()) - 0.5) * 1.6;
         let turn = DQuat::from_euler(glam::EulerRot::XYZ, f64::from(6.0 * u()), f64::from(6.0 * u()), 0.4);
         let mesh = if k % 2 == 0 {
-            sphere(size, 2, u() < 0.5)
+            sphere(Vec3::ZERO, size, 2, u() < 0.5)
         } else {
             quad(Vec3::new(-size, 0.0, size), Vec3::X * 2.0 * size, Vec3::NEG_Z * 2.0 * size)
         };

@@ -7,15 +7,16 @@ use dpm_host::render::method::Method;
 use dpm_host::render::{Renderer, RendererSettings};
 use dpm_host::rig::Rig;
 use dpm_host::scene::{Material, PunctualKind, PunctualLight, Scene};
-use dpm_tests::gpu::{with_gpu, Shot};
-use dpm_tests::scenes::*;
+use dpm_host::experiments::stability::gpu_shot::Shot;
+use dpm_tests::gpu::with_gpu;
+use dpm_host::experiments::stability::shapes::*;
 use glam::{DVec3, Vec3};
 
 /// One scene per thing that can be left out.
 fn scenes() -> Vec<(&'static str, Scene)> {
     let room = |material: Material| {
         let mut scene = scene_of(floor(1.0, 0.0), diffuse(Vec3::splat(0.7)));
-        let mut ball = sphere(0.4, 2, true);
+        let mut ball = sphere(Vec3::ZERO, 0.4, 2, true);
         ball.positions.iter_mut().for_each(|p| p.y += 0.5);
         add(&mut scene, ball, material);
         scene.environment = sky(0.8);
@@ -37,7 +38,7 @@ fn scenes() -> Vec<(&'static str, Scene)> {
         ),
         ("emissive", room(emitter(Vec3::splat(2.0)))),
     ];
-    let mut metal_only = scene_of(sphere(0.5, 2, true), Material { roughness: 0.5, ..Material::default() });
+    let mut metal_only = scene_of(sphere(Vec3::ZERO, 0.5, 2, true), Material { roughness: 0.5, ..Material::default() });
     metal_only.environment = image_sky(1.0);
     out.push(("nothing diffuse", metal_only));
     let mut dark = room(diffuse(Vec3::ONE));
@@ -83,7 +84,7 @@ fn leaving_out_changes_no_bit() {
             };
             let lean = shot.draw(gpu);
             let full = Shot { leave_nothing_out: true, ..shot }.draw(gpu);
-            let bits = |p: &dpm_tests::gpu::Picture| -> Vec<[u32; 4]> {
+            let bits = |p: &dpm_host::experiments::stability::gpu_shot::Picture| -> Vec<[u32; 4]> {
                 p.radiance.iter().map(|r| r.map(f32::to_bits)).collect()
             };
             let lit = lean.lit_estimates().count();

@@ -1,10 +1,11 @@
 //! Rays, shapes and lights at the edge of what numbers can hold.
 
 use dpm_host::scene::{Material, PunctualKind, PunctualLight, Scene, TriangleMesh};
-use dpm_tests::compare::compare;
-use dpm_tests::gpu::{with_gpu, Shot};
-use dpm_tests::scenes::*;
-use dpm_tests::statistics::pooled;
+use dpm_tests::compare::{compare, Demands};
+use dpm_host::experiments::stability::gpu_shot::Shot;
+use dpm_tests::gpu::with_gpu;
+use dpm_host::experiments::stability::shapes::*;
+use dpm_host::experiments::stability::estimate::pooled;
 use glam::{DAffine3, DMat3, DVec3, Vec3};
 
 /// A floor of `n` x `n` squares of side `side` whose seams lie on round numbers, about the origin.
@@ -52,7 +53,7 @@ fn rays_along_axes_and_seams_find_the_surface() {
 #[test]
 fn slivers_points_lines_and_twins_change_nothing() {
     with_gpu(|gpu| {
-        let plain = sphere(0.5, 2, true);
+        let plain = sphere(Vec3::ZERO, 0.5, 2, true);
         let mut odd = plain.clone();
         let corners = plain.triangles[7].map(|i| plain.positions[i as usize]);
         let extra = [
@@ -90,7 +91,7 @@ fn slivers_points_lines_and_twins_change_nothing() {
 /// A table with a ball, a lamp and a light, all lengths times `scale`, at `offset`.
 fn still_life(scale: f32) -> Scene {
     let mut scene = scene_of(floor(scale, 0.0), diffuse(Vec3::new(0.7, 0.5, 0.4)));
-    let mut ball = sphere(0.4 * scale, 2, true);
+    let mut ball = sphere(Vec3::ZERO, 0.4 * scale, 2, true);
     ball.positions.iter_mut().for_each(|p| p.y += 0.45 * scale);
     add(&mut scene, ball, Material { roughness: 0.4, ..diffuse(Vec3::new(0.3, 0.5, 0.8)) });
     let lamp = quad(Vec3::new(-0.2, 1.5, -0.2) * scale, Vec3::X * 0.4 * scale, Vec3::Z * 0.4 * scale);
@@ -188,7 +189,7 @@ fn a_lost_body_gets_no_light_but_its_reflection_stays() {
             floor(1.0, 0.0),
             Material { roughness: 0.0, base_color: Vec3::splat(0.9), ..Material::default() },
         );
-        let mut ball = sphere(0.3, 2, true);
+        let mut ball = sphere(Vec3::ZERO, 0.3, 2, true);
         ball.positions.iter_mut().for_each(|p| p.y += 0.5);
         let body =
             add(&mut scene, ball, Material { double_sided: true, ..emitter(Vec3::new(1.0, 0.0, 0.0)) });
@@ -198,7 +199,7 @@ fn a_lost_body_gets_no_light_but_its_reflection_stays() {
         let shot = Shot { eye: Some(eye), spp: 4, ..Shot::new(&scene, camera) };
         let there = shot.draw(gpu);
         let lost = Shot { lost: vec![true], ..shot }.draw(gpu);
-        let on_ball = |p: &dpm_tests::gpu::Picture| {
+        let on_ball = |p: &dpm_host::experiments::stability::gpu_shot::Picture| {
             (0..p.surfaces.len()).filter(|&i| p.hit(i) && p.surfaces[i].id >> 24 == body as u32).count()
         };
         assert!(on_ball(&there) > 50);
@@ -227,7 +228,7 @@ fn the_firefly_limit_removes_counts_and_never_adds() {
         assert_eq!(free.radiance, loose.radiance, "a limit that nothing reaches changes nothing");
         assert_eq!((free.counters[0].clamped_samples, loose.counters[0].clamped_samples), (0, 0));
         assert!(tight.counters[0].clamped_samples > 100, "{}", tight.counters[0].clamped_samples);
-        let sum = |p: &dpm_tests::gpu::Picture| p.estimates.iter().map(|e| e.mean[1]).sum::<f64>();
+        let sum = |p: &dpm_host::experiments::stability::gpu_shot::Picture| p.estimates.iter().map(|e| e.mean[1]).sum::<f64>();
         assert!(sum(&tight) < 0.99 * sum(&free));
         for (i, (a, b)) in tight.estimates.iter().zip(&free.estimates).enumerate() {
             assert!(a.mean[1] <= b.mean[1] + 1e-6, "pixel {i}: {} above {}", a.mean[1], b.mean[1]);

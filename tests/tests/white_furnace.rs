@@ -1,14 +1,15 @@
 //! Everything in even light, on the GPU: no surface may create energy, and those that lose none must vanish.
 
 use dpm_host::scene::{Material, Scene};
-use dpm_tests::gpu::{with_gpu, Shot};
-use dpm_tests::scenes::*;
-use dpm_tests::statistics::pooled;
+use dpm_host::experiments::stability::gpu_shot::Shot;
+use dpm_tests::gpu::with_gpu;
+use dpm_host::experiments::stability::shapes::*;
+use dpm_host::experiments::stability::estimate::pooled;
 use glam::{DVec3, Vec3};
 
 /// A faceted sphere of radius 1 under a sky of radiance 1.
 fn furnace(material: Material) -> Scene {
-    let mut scene = scene_of(sphere(1.0, 2, false), material);
+    let mut scene = scene_of(sphere(Vec3::ZERO, 1.0, 2, false), material);
     scene.environment = sky(1.0);
     scene
 }
@@ -87,7 +88,7 @@ fn single_scattering_metal_keeps_what_theory_says() {
     with_gpu(|gpu| {
         for (alpha, expected) in [(0.25f32, 0.882), (0.5, 0.700), (1.0, 0.409)] {
             let metal = Material { roughness: alpha.sqrt(), ..Material::default() };
-            let mut scene = scene_of(sphere(1.0, 4, false), metal);
+            let mut scene = scene_of(sphere(Vec3::ZERO, 1.0, 4, false), metal);
             scene.environment = sky(1.0);
             let mut camera = camera(48, 48, DVec3::new(0.0, 0.0, 2000.0), DVec3::ZERO);
             (camera.fx, camera.fy) = (2000.0 * 22.0, 2000.0 * 22.0);

@@ -3,9 +3,12 @@
 use super::rig_args::RigArgs;
 use super::watch::print;
 use crate::experiments::error_plan::{groups, Group};
-use crate::experiments::error_report::{csv, curves, markdown, Cost};
+use crate::experiments::error_plot::{curves, Cost};
+use crate::experiments::error_report::{csv, markdown};
 use crate::experiments::error_runs::{ErrorOptions, ErrorRunError, ErrorRuns, GroupResult};
+use crate::experiments::error_sheet::{stack, strip};
 use crate::experiments::run_rig::open_gpu;
+use crate::experiments::snapshot::paint::Canvas;
 use crate::failure::{Failure, FailureKind};
 use crate::files::write_atomically;
 use crate::pipeline::PipelineError;
@@ -34,9 +37,10 @@ pub struct ErrorArgs {
     /// Also measure dpm with each of its parts off in turn
     #[arg(long)]
     ablation: bool,
-    /// Samples a pixel of the paper's method where the eye looks, one a group: all methods get its rays
-    #[arg(long, value_name = "SPP,...", value_delimiter = ',', value_parser = clap::value_parser!(u32).range(1..=4096))]
-    budgets: Vec<u32>,
+    /// Samples a pixel of the paper's method where the eye looks, 1/64 to 4096, one a group: all methods get its rays; below 1, that
+    /// share of the rays of 1
+    #[arg(long, value_name = "SPP,...", value_delimiter = ',', value_parser = budget)]
+    budgets: Vec<f64>,
     /// Samples a pixel of the reference
     #[arg(long, value_name = "SPP", value_parser = clap::value_parser!(u32).range(2..=65536))]
     reference_spp: Option<u32>,
@@ -49,6 +53,16 @@ pub struct ErrorArgs {
     /// Print one JSON object
     #[arg(long)]
     json: bool,
+}
+
+fn budget(text: &str) -> Result<f64, String> {
+    let value = match text.split_once('/') {
+        Some((a, b)) => a.parse::<f64>().ok().zip(b.parse::<f64>().ok()).map(|(a, b)| a / b),
+        None => text.parse().ok(),
+    };
+    value
+        .filter(|v| (1.0 / 64.0..=4096.0).contains(v))
+        .ok_or_else(|| "write samples a pixel from 1/64 to 4096, for example 18 or 1/4".to_owned())
 }
 
 /// What else `dpm error` does.
@@ -75,8 +89,8 @@ pub fn execute(args: &ErrorArgs) -> Result<(), Failure> {
         return report(out, &found, *json);
     }
     let budgets = match (&args.budgets[..], args.quick) {
-        ([], true) => vec![2, 6, 18],
-        ([], false) => vec![1, 2, 4, 9, 18, 36, 64],
+        ([], true) => vec![2.0, 6.0, 18.0],
+        ([], false) => vec![0.25, 0.5, 1.0, 2.0, 4.0, 9.0, 18.0, 36.0, 64.0],
         (given, _) => given.to_vec(),
     };
     let all = groups(&budgets);
@@ -107,12 +121,12 @@ fn prepare(args: &ErrorArgs, out: &Path) -> Result<ErrorRuns, Failure> {
     let config = args.flags.rig(args.rig.as_deref())?;
     let gpu = open_gpu(&config)?;
     let small = args.flags.raster.is_none() && (args.quick || gpu.summary().software);
-    let raster = if small { Raster::new(96, 72) } else { None };
+    let raster = if small { Raster::new(80, 60) } else { None };
     let rig = Arc::new(Rig::build(&config, raster)?);
     let options = ErrorOptions {
         warm_up: if args.quick { 48 } else { 96 },
-        // At least 33 ms for the eye and 100 ms for flicker; the long run has 250 ms at 947 fps.
-        kept: if args.quick { 95 } else { 237 },
+        // 250 ms at 947 fps: 33 ms for the eye at the end, flicker down to 4 Hz.
+        kept: 237,
         reference_spp: args.reference_spp.unwrap_or(if args.quick { 128 } else { 1000 }),
         ablation: args.ablation,
         cache: out.join("cache"),
@@ -142,9 +156,10 @@ fn measure(
                     bar.set_message(format!("{} {what}", group.name()));
                     bar.inc(1);
                 });
-                let result = measured.map_err(failure)?;
-                write(&path, &to_json(&result))?;
-                result
+                let measured = measured.map_err(failure)?;
+                save(&path.with_extension("png"), &strip(&measured, &group.name()))?;
+                write(&path, &to_json(&measured.result))?;
+                measured.result
             }
         };
         results.push(result);
@@ -190,7 +205,11 @@ fn read_groups(out: &Path) -> Result<Vec<GroupResult>, Failure> {
     if found.is_empty() {
         return Err(nothing());
     }
-    found.sort_by_key(|g| g.rows.first().map(|r| (r.moving, r.budget)));
+    let place = |g: &GroupResult| g.rows.first().map_or((false, 0.0), |r| (r.moving, r.budget));
+    found.sort_by(|a, b| {
+        let ((am, ab), (bm, bb)) = (place(a), place(b));
+        am.cmp(&bm).then(ab.total_cmp(&bb))
+    });
     Ok(found)
 }
 
@@ -206,8 +225,24 @@ fn report(out: &Path, groups: &[GroupResult], json: bool) -> Result<(), Failure>
             write(&out.join(format!("error-{motion}-{name}.svg")), &svg)?;
         }
     }
+    let sheets: Vec<Canvas> = groups.iter().filter_map(|g| Canvas::load(&sheet_path(out, g))).collect();
+    if !sheets.is_empty() {
+        save(&out.join("error.png"), &stack(&sheets))?;
+    }
     print(&if json { object + "\n" } else { table });
     Ok(())
+}
+
+/// Where the contact sheet of a measured group lies: beside its numbers.
+fn sheet_path(out: &Path, g: &GroupResult) -> PathBuf {
+    let name = g.rows.first().map_or(String::new(), |r| Group { moving: r.moving, budget: r.budget }.name());
+    out.join(format!("group-{name}-{}.png", g.key))
+}
+
+fn save(path: &Path, canvas: &Canvas) -> Result<(), Failure> {
+    canvas
+        .save(path)
+        .map_err(|e| Failure::new(FailureKind::BadInput, format!("{e}; choose another folder with --out")))
 }
 
 fn write(path: &Path, text: &str) -> Result<(), Failure> {

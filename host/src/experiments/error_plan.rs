@@ -50,22 +50,22 @@ pub fn contenders(render: &RenderConfig, ablation: bool) -> Vec<Contender> {
 }
 
 /// `paper` at a budget: its table 1 (18, 18, 2) scaled to `budget` in the middle of the view, never below 1.
-pub fn paper_at(method: &Method, budget: u32) -> Method {
+pub fn paper_at(method: &Method, budget: f64) -> Method {
     let mut scaled = method.clone();
     let of = &method.paper.zone_spp;
     let most = of.iter().copied().max().unwrap_or(1).max(1);
     scaled.paper.zone_spp =
-        of.map(|spp| (f64::from(spp) * f64::from(budget) / f64::from(most)).round().max(1.0) as u32);
+        of.map(|spp| (f64::from(spp) * budget / f64::from(most)).round().max(1.0) as u32);
     scaled
 }
 
 /// One group: all methods at the rays that `paper` takes.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+#[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Group {
     /// Bodies move as the rig file says; else they stand where the last frame has them.
     pub moving: bool,
-    /// Samples of a pixel of `paper` where the eye looks.
-    pub budget: u32,
+    /// Samples of a pixel of `paper` where the eye looks; below 1: that share of the rays that 1 takes.
+    pub budget: f64,
 }
 
 impl Group {
@@ -76,7 +76,7 @@ impl Group {
 }
 
 /// All groups in the order of their numbers: standing ones first.
-pub fn groups(budgets: &[u32]) -> Vec<Group> {
+pub fn groups(budgets: &[f64]) -> Vec<Group> {
     let of = |moving| budgets.iter().map(move |&budget| Group { moving, budget });
     of(false).chain(of(true)).collect()
 }
@@ -88,10 +88,10 @@ mod tests {
     #[test]
     fn the_papers_zones_scale_together_and_never_vanish() {
         let paper = method_of(&RenderConfig::default(), RenderMethod::Paper);
-        assert_eq!(paper_at(&paper, 18).paper.zone_spp, [18, 18, 2]);
-        assert_eq!(paper_at(&paper, 9).paper.zone_spp, [9, 9, 1]);
-        assert_eq!(paper_at(&paper, 2).paper.zone_spp, [2, 2, 1]);
-        assert_eq!(paper_at(&paper, 36).paper.zone_spp, [36, 36, 4]);
+        assert_eq!(paper_at(&paper, 18.0).paper.zone_spp, [18, 18, 2]);
+        assert_eq!(paper_at(&paper, 9.0).paper.zone_spp, [9, 9, 1]);
+        assert_eq!(paper_at(&paper, 2.0).paper.zone_spp, [2, 2, 1]);
+        assert_eq!(paper_at(&paper, 36.0).paper.zone_spp, [36, 36, 4]);
     }
 
     #[test]

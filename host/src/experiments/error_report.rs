@@ -1,11 +1,7 @@
-//! Measured groups into what people read: CSV, a Markdown table, and curves with the Pareto front.
+//! Measured groups into what people read: CSV, and Markdown tables at equal rays, at equal time and at equal error.
 
 use super::error_runs::{ErrorRow, GroupResult};
-use plotters::prelude::*;
 use std::fmt::Write;
-
-/// One frame at 947 fps, ms: what the rig allows.
-pub const FRAME_MS: f64 = 1.056;
 
 fn optional(v: Option<f64>) -> String {
     v.map_or(String::new(), |v| format!("{v:.6e}"))
@@ -14,7 +10,7 @@ fn optional(v: Option<f64>) -> String {
 /// All rows as CSV with a head line. Columns are the fields of [`ErrorRow`], preceded by device and configuration hash.
 pub fn csv(groups: &[GroupResult]) -> String {
     let mut text = String::from(
-        "device,config,seed,motion,budget,method,spp,rays,rays_to_paper,samples,gpu_ms,wall_ms,single_rmse,single_rel_mse,\
+        "device,driver,commit,config,seed,motion,budget,method,spp,rays,rays_to_paper,samples,gpu_ms,wall_ms,single_rmse,single_rel_mse,\
          perceived_rmse,perceived_rmse_raw,perceived_fovea,perceived_periphery,bias,noise,mean_shift,flip,flicker,\
          flicker_periphery,ratio_to_paper,reference_error\n",
     );
@@ -23,10 +19,8 @@ pub fn csv(groups: &[GroupResult]) -> String {
             // Writing into a string cannot fail.
             let _ = writeln!(
                 text,
-                "\"{}\",{},{},{},{},\"{}\",{:.4},{:.1},{:.5},{:.1},{:.6},{:.6},{:.6e},{:.6e},{:.6e},{:.6e},{},{},{:.6e},{:.6e},{:.6e},{:.6e},{:.6e},{},{:.5},{:.6e}",
-                g.stamp.device.replace('"', "'"),
-                g.stamp.config_hash,
-                g.stamp.seed,
+                "{},{},{},\"{}\",{:.4},{:.1},{:.5},{:.1},{:.6},{:.6},{:.6e},{:.6e},{:.6e},{:.6e},{},{},{:.6e},{:.6e},{:.6e},{:.6e},{:.6e},{},{:.5},{:.6e}",
+                g.stamp.csv(),
                 if r.moving { "moving" } else { "still" },
                 r.budget,
                 r.method,
@@ -60,12 +54,7 @@ pub fn csv(groups: &[GroupResult]) -> String {
 pub fn markdown(groups: &[GroupResult]) -> String {
     let mut text = String::new();
     if let Some(g) = groups.first() {
-        let s = &g.stamp;
-        let _ = writeln!(
-            text,
-            "{} ({}), {} x {}, dpm {}, configuration {}, seed {}\n",
-            s.device, s.driver, s.raster[0], s.raster[1], s.version, s.config_hash, s.seed
-        );
+        text += &g.stamp.line();
     }
     text += "| motion | budget | method | rays/frame | rays / paper | GPU ms | single RMSE | perceived RMSE | bias | noise | FLIP | flicker | perceived / paper |\n";
     text += "|---|---:|---|---:|---:|---:|---:|---:|---:|---:|---:|---:|---:|\n";
@@ -89,6 +78,8 @@ pub fn markdown(groups: &[GroupResult]) -> String {
         );
     }
     text.push('\n');
+    text += &equal_cost(groups);
+    text.push('\n');
     for g in groups {
         let (Some(dpm), Some(best)) = (dpm_of(g), best_other(g)) else { continue };
         let _ = writeln!(
@@ -104,6 +95,101 @@ pub fn markdown(groups: &[GroupResult]) -> String {
             g.mean,
             g.probes
         );
+    }
+    text
+}
+
+/// Time of a frame, ms: the GPU's, or until its light is known where the device has no time stamps.
+pub fn time_ms(r: &ErrorRow) -> f64 {
+    if r.gpu_ms > 0.0 {
+        r.gpu_ms
+    } else {
+        r.wall_ms
+    }
+}
+
+/// What a curve says at a place.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub enum Reading {
+    /// Between two measured points.
+    Within(f64),
+    /// Beyond an end by at most [`REACH`], along the last line.
+    Beyond(f64),
+}
+
+/// How far beyond its measured points a curve is read, as a factor.
+pub const REACH: f64 = 4.0;
+
+/// `y` where `x` is on a curve of straight lines between the logarithms of points. `None` farther beyond its ends than [`REACH`], and where
+/// it passes `x` more than once: then no one value is right.
+pub fn on_curve(points: &[(f64, f64)], x: f64) -> Option<Reading> {
+    let at = |a: (f64, f64), b: (f64, f64)| {
+        let t = (x / a.0).ln() / (b.0 / a.0).ln();
+        (a.1.ln() + t * (b.1 / a.1).ln()).exp()
+    };
+    let mut found: Option<f64> = None;
+    for pair in points.windows(2) {
+        let [a, b] = [pair[0], pair[1]];
+        if !(a.0.min(b.0)..=a.0.max(b.0)).contains(&x) || a.0 == b.0 {
+            continue;
+        }
+        let y = at(a, b);
+        match found {
+            Some(before) if (before / y - 1.0).abs() > 1e-9 => return None,
+            _ => found = Some(y),
+        }
+    }
+    if let Some(y) = found {
+        return y.is_finite().then_some(Reading::Within(y));
+    }
+    let by_x = |a: &&(f64, f64), b: &&(f64, f64)| a.0.total_cmp(&b.0);
+    let (low, high) = (points.iter().min_by(by_x)?, points.iter().max_by(by_x)?);
+    let end = if x < low.0 { low } else { high };
+    let next = if points.first() == Some(end) { points.get(1)? } else { points.get(points.len().checked_sub(2)?)? };
+    let is_end = points.first() == Some(end) || points.last() == Some(end);
+    let reach = (end.0 / x).max(x / end.0);
+    let y = at(*next, *end);
+    (is_end && next.0 != end.0 && reach <= REACH && y.is_finite()).then_some(Reading::Beyond(y))
+}
+
+/// Every method against every point of `paper`: its error at paper's time, and its time at paper's error, read off its curve.
+fn equal_cost(groups: &[GroupResult]) -> String {
+    let rows = || groups.iter().flat_map(|g| &g.rows);
+    let mut text = String::from(
+        "| motion | budget of paper | method | error / paper at equal time | time / paper at equal error |\n|---|---:|---|---:|---:|\n",
+    );
+    let mut names: Vec<&str> = Vec::new();
+    rows().for_each(|r| {
+        if r.method != "paper" && !names.contains(&r.method.as_str()) {
+            names.push(&r.method);
+        }
+    });
+    let mut missing = false;
+    for paper in rows().filter(|r| r.method == "paper") {
+        for name in &names {
+            let mut own: Vec<&ErrorRow> =
+                rows().filter(|r| r.method == *name && r.moving == paper.moving).collect();
+            own.sort_by(|a, b| a.budget.total_cmp(&b.budget));
+            let by_time: Vec<(f64, f64)> = own.iter().map(|r| (time_ms(r), r.perceived_rmse)).collect();
+            let by_error: Vec<(f64, f64)> = by_time.iter().map(|&(t, e)| (e, t)).collect();
+            let mut told = |found: Option<Reading>, paper: f64| match found {
+                Some(Reading::Within(v)) => format!("{:.2}", v / paper),
+                Some(Reading::Beyond(v)) => format!("~{:.2}", v / paper),
+                None => {
+                    missing = true;
+                    "-".to_owned()
+                }
+            };
+            let error = told(on_curve(&by_time, time_ms(paper)), paper.perceived_rmse);
+            let time = told(on_curve(&by_error, paper.perceived_rmse), time_ms(paper));
+            let motion = if paper.moving { "moving" } else { "still" };
+            // Writing into a string cannot fail.
+            let _ = writeln!(text, "| {motion} | {} | {name} | {error} | {time} |", paper.budget);
+        }
+    }
+    text += "\n~: read along the curve's last line, beyond its measured points.\n";
+    if missing {
+        text += "-: no measured budget of the method reaches so far, or its curve is not monotone there; more --budgets fill it in.\n";
     }
     text
 }
@@ -124,127 +210,29 @@ fn least_flicker(g: &GroupResult) -> f64 {
     others(g).map(|r| r.flicker).fold(f64::INFINITY, f64::min)
 }
 
-/// What the horizontal axis shows.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum Cost {
-    /// Rays of a frame.
-    Rays,
-    /// GPU time of a frame, ms.
-    GpuMs,
-}
-
-/// Points that no other point beats in both cost and error, by rising cost.
-pub fn pareto(points: &[(f64, f64)]) -> Vec<(f64, f64)> {
-    let mut sorted = points.to_vec();
-    sorted.sort_by(|a, b| a.0.total_cmp(&b.0).then(a.1.total_cmp(&b.1)));
-    let mut least = f64::INFINITY;
-    sorted.retain(|&(_, error)| {
-        let better = error < least;
-        least = least.min(error);
-        better
-    });
-    sorted
-}
-
-/// Perceived error against cost, both axes logarithmic, a curve a method, the Pareto front in grey, and for times one frame's 1.056 ms.
-///
-/// # Errors
-/// What the drawing library says.
-pub fn curves(groups: &[GroupResult], moving: bool, cost: Cost) -> Result<String, String> {
-    let point = |r: &ErrorRow| (if cost == Cost::Rays { r.rays } else { r.gpu_ms }, r.perceived_rmse);
-    let rows: Vec<&ErrorRow> = groups
-        .iter()
-        .flat_map(|g| &g.rows)
-        .filter(|r| r.moving == moving && point(r).0 > 0.0 && point(r).1 > 0.0)
-        .collect();
-    let mut names: Vec<&str> = Vec::new();
-    for r in &rows {
-        if !names.contains(&r.method.as_str()) {
-            names.push(&r.method);
-        }
-    }
-    let all: Vec<(f64, f64)> = rows.iter().map(|r| point(r)).collect();
-    let range = |of: &dyn Fn(&(f64, f64)) -> f64| {
-        let (low, high) = all.iter().map(of).fold((f64::INFINITY, 0.0f64), |(a, b), v| (a.min(v), b.max(v)));
-        if low < high {
-            (0.8 * low, 1.25 * high)
-        } else {
-            (0.1, 10.0)
-        }
-    };
-    let (mut x, y) = (range(&|p| p.0), range(&|p| p.1));
-    if cost == Cost::GpuMs {
-        x = (x.0.min(0.8 * FRAME_MS), x.1.max(1.25 * FRAME_MS));
-    }
-    let mut text = String::new();
-    draw(&mut text, &rows, &names, &pareto(&all), (x, y), cost, &point).map_err(|e| e.to_string())?;
-    Ok(text)
-}
-
-type Ranges = ((f64, f64), (f64, f64));
-
-fn draw(
-    text: &mut String,
-    rows: &[&ErrorRow],
-    names: &[&str],
-    front: &[(f64, f64)],
-    (x, y): Ranges,
-    cost: Cost,
-    point: &dyn Fn(&ErrorRow) -> (f64, f64),
-) -> Result<(), Box<dyn std::error::Error>> {
-    // Okabe and Ito's colours, told apart by all kinds of eyes.
-    let colors = [
-        (0, 114, 178),
-        (230, 159, 0),
-        (0, 158, 115),
-        (213, 94, 0),
-        (204, 121, 167),
-        (86, 180, 233),
-        (0, 0, 0),
-    ]
-    .map(|(r, g, b)| RGBColor(r, g, b));
-    let root = SVGBackend::with_string(text, (960, 540)).into_drawing_area();
-    root.fill(&WHITE)?;
-    let mut chart = ChartBuilder::on(&root)
-        .margin(16)
-        .x_label_area_size(40)
-        .y_label_area_size(80)
-        .build_cartesian_2d((x.0..x.1).log_scale(), (y.0..y.1).log_scale())?;
-    let x_name = if cost == Cost::Rays { "rays a frame" } else { "GPU time of a frame, ms" };
-    chart.configure_mesh().x_desc(x_name).y_desc("perceived RMSE").light_line_style(WHITE).draw()?;
-    chart
-        .draw_series(LineSeries::new(front.iter().copied(), RGBColor(190, 190, 190).stroke_width(6)))?
-        .label("Pareto front")
-        .legend(|(x, y)| PathElement::new([(x, y), (x + 16, y)], RGBColor(190, 190, 190).stroke_width(6)));
-    for (i, name) in names.iter().enumerate() {
-        let color = colors[i % colors.len()];
-        let mut points: Vec<(f64, f64)> =
-            rows.iter().filter(|r| r.method == *name).map(|r| point(r)).collect();
-        points.sort_by(|a, b| a.0.total_cmp(&b.0));
-        chart
-            .draw_series(LineSeries::new(points, color.stroke_width(2)).point_size(4))?
-            .label(*name)
-            .legend(move |(x, y)| PathElement::new([(x, y), (x + 16, y)], color.stroke_width(2)));
-    }
-    if cost == Cost::GpuMs {
-        chart
-            .draw_series(LineSeries::new([(FRAME_MS, y.0), (FRAME_MS, y.1)], BLACK.stroke_width(1)))?
-            .label("1.056 ms")
-            .legend(|(x, y)| PathElement::new([(x, y), (x + 16, y)], BLACK.stroke_width(1)));
-    }
-    chart.configure_series_labels().background_style(WHITE).border_style(BLACK).draw()?;
-    root.present()?;
-    Ok(())
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;
 
     #[test]
-    fn the_front_holds_what_nothing_beats() {
-        let front = pareto(&[(4.0, 1.0), (1.0, 4.0), (2.0, 4.5), (2.0, 2.0), (3.0, 2.0)]);
-        assert_eq!(front, [(1.0, 4.0), (2.0, 2.0), (4.0, 1.0)]);
-        assert!(pareto(&[]).is_empty());
+    fn a_power_law_is_read_off_exactly_and_not_far_beyond_its_ends() {
+        let points: Vec<(f64, f64)> = [1.0f64, 4.0, 64.0].iter().map(|x| (*x, 3.0 / x.sqrt())).collect();
+        for x in [1.0f64, 2.5, 4.0, 20.0, 64.0, 0.3, 250.0] {
+            let (y, within) = match on_curve(&points, x).unwrap() {
+                Reading::Within(y) => (y, true),
+                Reading::Beyond(y) => (y, false),
+            };
+            assert!((y * x.sqrt() / 3.0 - 1.0).abs() < 1e-12, "{x}: {y}");
+            assert_eq!(within, (1.0..=64.0).contains(&x));
+        }
+        assert_eq!(on_curve(&points, 0.24), None);
+        assert_eq!(on_curve(&points, 257.0), None);
+        assert_eq!(on_curve(&points[..1], 1.0), None);
+        assert_eq!(on_curve(&[], 1.0), None);
+        // Up and down again: two answers are none, and no end to go on from.
+        let bent = [(1.0, 1.0), (3.0, 2.0), (1.5, 4.0)];
+        assert_eq!(on_curve(&bent, 2.0), None);
+        assert_eq!(on_curve(&bent, 4.0), None);
+        assert_eq!(on_curve(&[(1.0, 0.0), (2.0, 1.0)], 1.5), None);
     }
 }

@@ -5,22 +5,22 @@
 //! reason: half of their difference is its own error, and its power is taken off what is measured against it.
 
 use super::error_plan::{contenders, paper_at, Contender, Group};
+use super::error_reference::{mean_of, Reference};
 use super::sequence::{eye_mean, rmse, Seen, Span, Theatre};
 use super::stamp::{Fnv, Stamp};
-use crate::files::write_atomically;
 use crate::gpu::Gpu;
 use crate::metrics::error::compare;
 use crate::metrics::flicker::TileSeries;
 use crate::metrics::flip::{mean_flip, DEFAULT_PIXELS_PER_DEGREE};
 use crate::metrics::{luminance, MetricError, Picture};
-use crate::render::method::{Method, SamplerKind};
+use crate::render::method::Method;
 use crate::render::RenderError;
 use crate::rig::Rig;
+use dpm_device::planes::Raster;
 use glam::Vec3;
 use serde::{Deserialize, Serialize};
 use std::fmt::Write as _;
-use std::io::Write as _;
-use std::path::{Path, PathBuf};
+use std::path::PathBuf;
 use std::sync::Arc;
 
 /// How much is drawn.
@@ -52,13 +52,13 @@ pub struct ErrorRow {
     pub method: String,
     /// Bodies move.
     pub moving: bool,
-    /// The group's budget: samples a pixel of `paper` where the eye looks.
-    pub budget: u32,
-    /// Samples a lit pixel and frame asked of this method.
+    /// The group's budget: samples a pixel of `paper` where the eye looks. Below 1 it is that share of the rays of 1.
+    pub budget: f64,
+    /// Samples a lit pixel and frame asked of this method; at least 1 where nothing is kept.
     pub spp: f64,
     /// Rays of a frame.
     pub rays: f64,
-    /// Rays by those of `paper`.
+    /// Rays by those of the group's budget: those of `paper`, or less below 1. Above 1 for a method that cannot take so few.
     pub rays_to_paper: f64,
     /// Samples of a frame.
     pub samples: f64,
@@ -111,6 +111,34 @@ pub struct GroupResult {
     pub rows: Vec<ErrorRow>,
 }
 
+/// A group with what the eye saw, for a picture of it.
+pub struct Measured {
+    /// The numbers.
+    pub result: GroupResult,
+    /// Raster of the pictures.
+    pub raster: Raster,
+    /// Pixel of every probe.
+    pub pixels: Vec<u32>,
+    /// What the eye should have seen at every probe.
+    pub reference: Vec<Vec3>,
+    /// By method, in the order of the rows: what it saw in the first run.
+    pub eyes: Vec<(&'static str, Vec<Vec3>)>,
+}
+
+impl ErrorOptions {
+    /// Slot of the last frame of every sequence.
+    pub fn last_slot(&self) -> u64 {
+        u64::from(self.warm_up + self.kept) + 50
+    }
+}
+
+/// Median of nanoseconds, as milliseconds; 0 of none.
+pub fn median_ms(ns: impl Iterator<Item = u64>) -> f64 {
+    let mut all: Vec<u64> = ns.collect();
+    all.sort_unstable();
+    all.get(all.len() / 2).map_or(0.0, |&ns| ns as f64 * 1e-6)
+}
+
 /// Why a group could not be measured.
 #[derive(Debug, thiserror::Error)]
 pub enum ErrorRunError {
@@ -126,14 +154,6 @@ pub enum ErrorRunError {
     /// The cache.
     #[error(transparent)]
     Io(#[from] std::io::Error),
-}
-
-/// Two independent halves, and their mean.
-struct Reference {
-    halves: [Vec<Vec3>; 2],
-    eye: Vec<Vec3>,
-    last: Vec<Vec3>,
-    error: f64,
 }
 
 /// Draws and compares the groups of one rig.
@@ -165,12 +185,8 @@ impl ErrorRuns {
         hash.text()
     }
 
-    fn last_slot(&self) -> u64 {
-        u64::from(self.options.warm_up + self.options.kept) + 50
-    }
-
     fn theatre(&self, group: Group, warm_up: u32, kept: u32) -> Result<Theatre, RenderError> {
-        let span = Span { last_slot: self.last_slot(), warm_up, kept };
+        let span = Span { last_slot: self.options.last_slot(), warm_up, kept };
         let make = if group.moving { Theatre::new } else { Theatre::frozen };
         make(self.rig.clone(), self.gpu.clone(), span)
     }
@@ -179,50 +195,73 @@ impl ErrorRuns {
     ///
     /// # Errors
     /// The renderer's; nothing lit; the cache cannot be written.
-    pub fn measure(&self, group: Group, each: &mut dyn FnMut(&str)) -> Result<GroupResult, ErrorRunError> {
+    pub fn measure(&self, group: Group, each: &mut dyn FnMut(&str)) -> Result<Measured, ErrorRunError> {
         let o = &self.options;
         let theatre = self.theatre(group, o.warm_up, o.kept)?;
         if theatre.probes().is_empty() {
             return Err(ErrorRunError::NothingLit);
         }
-        let reference = self.reference(group, each)?;
-        let mean = mean_of(&reference.eye);
+        // What the picture converges to depends neither on the methods' seed nor on how long the methods run.
+        let stamp = &self.stamp;
+        let what = format!("{}{:?}{}{}", stamp.config_hash, stamp.raster, group.moving, self.options.last_slot());
+        let short = self.theatre(group, 0, EYE_FRAMES as u32)?;
+        let reference = Reference::new(&short, o.reference_spp, &what, &o.cache, each)?;
         let mut rows: Vec<ErrorRow> = Vec::new();
+        let mut eyes = Vec::new();
+        let mut wanted = None;
         for contender in contenders(&self.rig.config.render, o.ablation) {
-            let paper_rays = rows.first().map(|paper| paper.rays);
-            let (contender, spp) = match paper_rays {
+            let (contender, spp) = match wanted {
                 None => {
-                    let method = paper_at(&contender.method, group.budget);
-                    (Contender { method, ..contender }, group.budget as f32)
+                    let budget = group.budget.max(1.0);
+                    let method = paper_at(&contender.method, budget);
+                    (Contender { method, ..contender }, budget as f32)
                 }
                 Some(rays) => {
                     let spp = self.spp_for(group, &contender.method, rays)?;
                     (contender, spp)
                 }
             };
-            let mut row = self.row(&theatre, group, &contender, spp, paper_rays, &reference, each)?;
-            row.rays_to_paper = row.rays / paper_rays.unwrap_or(row.rays);
+            let (mut row, eye) = self.row(&theatre, group, &contender, spp, wanted, &reference, each)?;
+            let rays = match wanted {
+                Some(rays) => rays,
+                // `paper` takes no less than one sample a coarse pixel: a smaller budget is a share of what that takes.
+                None if group.budget < 1.0 => {
+                    let base = self.rays_at(group, &Method::full(1), 0.0)?;
+                    base + group.budget * (row.rays - base)
+                }
+                None => row.rays,
+            };
+            wanted = Some(rays);
+            row.rays_to_paper = row.rays / rays;
             row.ratio_to_paper =
                 row.perceived_rmse / rows.first().map_or(row.perceived_rmse, |paper| paper.perceived_rmse);
             rows.push(row);
+            eyes.push((contender.name, eye));
         }
-        Ok(GroupResult {
+        let result = GroupResult {
             stamp: self.stamp.clone(),
             key: self.key(group),
             probes: theatre.probes().len(),
-            mean,
+            mean: mean_of(&reference.eye),
             reference_error: reference.error,
             rows,
-        })
+        };
+        let pixels = theatre.probes().iter().map(|p| p.pixel).collect();
+        Ok(Measured { result, raster: theatre.raster(), pixels, reference: reference.eye, eyes })
+    }
+
+    /// Rays of a frame with so many samples, from a short sequence.
+    fn rays_at(&self, group: Group, method: &Method, spp: f32) -> Result<f64, RenderError> {
+        const FRAMES: u32 = 6;
+        let short = self.theatre(group, FRAMES, FRAMES)?;
+        Ok(short.play(method, spp, 77, &mut |_, _| ())?.rays as f64 / f64::from(FRAMES))
     }
 
     /// Samples with which a method takes `rays` a frame: a frame without samples tells the fixed part, a short sequence the rest.
     fn spp_for(&self, group: Group, method: &Method, rays: f64) -> Result<f32, RenderError> {
         const TRIAL: f32 = 4.0;
-        let short = self.theatre(group, 6, 6)?;
-        let of = |spp| Ok::<f64, RenderError>(short.play(method, spp, 77, &mut |_, _| ())?.rays as f64 / 6.0);
-        let (base, trial) = (of(0.0)?, of(TRIAL)?);
-        Ok(corrected(TRIAL, base, trial, rays))
+        let (base, trial) = (self.rays_at(group, method, 0.0)?, self.rays_at(group, method, TRIAL)?);
+        Ok(corrected(TRIAL, base, trial, rays).max(least_spp(method)))
     }
 
     #[allow(clippy::too_many_arguments)]
@@ -235,7 +274,7 @@ impl ErrorRuns {
         wanted: Option<f64>,
         reference: &Reference,
         each: &mut dyn FnMut(&str),
-    ) -> Result<ErrorRow, ErrorRunError> {
+    ) -> Result<(ErrorRow, Vec<Vec3>), ErrorRunError> {
         let seed = self.rig.config.render.seed as u32;
         let mut play = |spp: f32, seed: u32| {
             each(contender.name);
@@ -247,8 +286,11 @@ impl ErrorRuns {
             let rays = a.rays as f64 / frames;
             let per_sample = 4.0f64.min(rays * frames / (a.samples as f64).max(1.0));
             let base = rays - per_sample * a.samples as f64 / frames;
-            spp = corrected(spp, base, rays, wanted);
-            a = play(spp, seed)?;
+            let better = corrected(spp, base, rays, wanted).max(least_spp(&contender.method));
+            if better != spp {
+                spp = better;
+                a = play(spp, seed)?;
+            }
         }
         let b = play(spp, seed.wrapping_add(1_000_003))?;
         self.compare(theatre, group, contender, spp, [a, b], reference)
@@ -262,7 +304,7 @@ impl ErrorRuns {
         spp: f32,
         runs: [Seen; 2],
         reference: &Reference,
-    ) -> Result<ErrorRow, ErrorRunError> {
+    ) -> Result<(ErrorRow, Vec<Vec3>), ErrorRunError> {
         let frames = f64::from(self.options.kept);
         let eyes = [0, 1].map(|i| eye_mean(&runs[i].frames, EYE_FRAMES));
         let inner = self.rig.config.render.paper.phi_h_deg as f32;
@@ -270,9 +312,9 @@ impl ErrorRuns {
         let outside = theatre.probes().iter().filter(|p| p.angle >= inner).count() as f64;
         let share = outside / theatre.probes().len() as f64;
         let zone = |enough: bool, keep: &dyn Fn(usize) -> bool| {
-            enough.then(|| perceived(&eyes, reference, keep)).map(|(_, clean)| clean)
+            enough.then(|| reference.perceived(&eyes, keep)).map(|(_, clean)| clean)
         };
-        let (raw, clean) = perceived(&eyes, reference, &|_| true);
+        let (raw, clean) = reference.perceived(&eyes, &|_| true);
         let [a, b] = &runs;
         let (flicker, flicker_periphery) = self.flicker(theatre, a, b, inner)?;
         let single = |seen: &Seen| {
@@ -282,16 +324,10 @@ impl ErrorRuns {
             compare(&test, &truth, None, 1.0)
         };
         let (first, second) = (single(a)?, single(b)?);
-        let [gpu_ms, wall_ms] = [0, 1].map(|which| {
-            let mut all: Vec<u64> = match which {
-                0 => runs.iter().flat_map(|r| &r.costs).map(|c| c.pass_ns.iter().sum()).collect(),
-                _ => runs.iter().flat_map(|r| &r.wall_ns).copied().collect(),
-            };
-            all.sort_unstable();
-            all.get(all.len() / 2).map_or(0.0, |&ns| ns as f64 * 1e-6)
-        });
+        let gpu_ms = median_ms(runs.iter().flat_map(|r| &r.costs).map(|c| c.pass_ns.iter().sum()));
+        let wall_ms = median_ms(runs.iter().flat_map(|r| &r.wall_ns).copied());
         let both = |of: &dyn Fn(&Seen) -> u64| 0.5 * (of(a) + of(b)) as f64 / frames;
-        Ok(ErrorRow {
+        let row = ErrorRow {
             method: contender.name.to_owned(),
             moving: group.moving,
             budget: group.budget,
@@ -307,14 +343,16 @@ impl ErrorRuns {
             perceived_rmse_raw: raw,
             perceived_fovea: zone(1.0 - share >= LEAST_PERIPHERY, &|i| angle(i) < inner),
             perceived_periphery: zone(share >= LEAST_PERIPHERY, &|i| angle(i) >= inner),
-            bias: common(&eyes, &reference.halves).max(0.0).sqrt(),
+            bias: reference.bias(&eyes),
             noise: rmse(&eyes[0], &eyes[1], |_| true) / std::f64::consts::SQRT_2,
             mean_shift: 0.5 * (mean_of(&eyes[0]) + mean_of(&eyes[1])) / mean_of(&reference.eye) - 1.0,
             flip: self.flip(theatre, &eyes[0], &reference.eye)?,
             flicker,
             flicker_periphery: flicker_periphery.filter(|_| share >= LEAST_PERIPHERY),
             ratio_to_paper: 1.0,
-        })
+        };
+        let [eye, _] = eyes;
+        Ok((row, eye))
     }
 
     /// RMS flicker everywhere and beyond `inner` degrees: half of the power of two runs' difference.
@@ -375,35 +413,14 @@ impl ErrorRuns {
         let over_all = mean_flip(&test, &truth, DEFAULT_PIXELS_PER_DEGREE)?;
         Ok(over_all * raster.pixel_count() as f64 / theatre.probes().len() as f64)
     }
+}
 
-    fn reference(&self, group: Group, each: &mut dyn FnMut(&str)) -> Result<Reference, ErrorRunError> {
-        let theatre = self.theatre(group, 0, EYE_FRAMES as u32)?;
-        let spp = self.options.reference_spp.div_ceil(2);
-        let method = Method { sampler: SamplerKind::BlueNoise, ..Method::full(spp) };
-        // What the picture converges to depends neither on the methods' seed nor on how long the methods run.
-        let mut hash = Fnv::default();
-        let _ = write!(hash, "{}{}{}{spp}", self.stamp.config_hash, group.moving, self.last_slot());
-        let n = theatre.probes().len();
-        let mut halves = Vec::new();
-        for half in 0..2u32 {
-            let path = self.options.cache.join(format!("reference-{}-{half}.f32", hash.text()));
-            let frames = match read_frames(&path, n) {
-                Some(frames) => frames,
-                None => {
-                    each("reference");
-                    let seen = theatre.play(&method, spp as f32, 0x9e37_0000 + half, &mut |_, _| ())?;
-                    write_frames(&path, &seen.frames)?;
-                    seen.frames
-                }
-            };
-            halves.push(frames);
-        }
-        let mean = |a: &[Vec3], b: &[Vec3]| a.iter().zip(b).map(|(a, b)| 0.5 * (*a + *b)).collect::<Vec<_>>();
-        let last = mean(&halves[0][EYE_FRAMES - 1], &halves[1][EYE_FRAMES - 1]);
-        let halves = [0, 1].map(|i: usize| eye_mean(&halves[i], EYE_FRAMES));
-        let eye = mean(&halves[0], &halves[1]);
-        let error = 0.5 * rmse(&halves[0], &halves[1], |_| true);
-        Ok(Reference { halves, eye, last, error })
+/// A method that keeps nothing shows a pixel without samples black: it takes at least one. With a history a frame may pass.
+fn least_spp(method: &Method) -> f32 {
+    if method.needs_history() {
+        0.02
+    } else {
+        1.0
     }
 }
 
@@ -415,51 +432,4 @@ fn corrected(spp: f32, base: f64, rays: f64, wanted: f64) -> f32 {
     } else {
         spp
     }
-}
-
-/// Root of the mean square error of both runs against the reference: as measured, and without the reference's own.
-fn perceived(eyes: &[Vec<Vec3>; 2], reference: &Reference, keep: &dyn Fn(usize) -> bool) -> (f64, f64) {
-    let square = |e: &Vec<Vec3>| rmse(e, &reference.eye, keep).powi(2);
-    let raw = 0.5 * (square(&eyes[0]) + square(&eyes[1]));
-    let own = 0.25 * rmse(&reference.halves[0], &reference.halves[1], keep).powi(2);
-    (raw.sqrt(), (raw - own).max(0.0).sqrt())
-}
-
-/// Mean product of the two runs' differences from two independent halves of the reference: no noise of either is in it, so its
-/// expectation is the squared bias.
-fn common(eyes: &[Vec<Vec3>; 2], halves: &[Vec<Vec3>; 2]) -> f64 {
-    let (mut sum, mut n) = (0.0f64, 0u64);
-    for (((a, b), r), s) in eyes[0].iter().zip(&eyes[1]).zip(&halves[0]).zip(&halves[1]) {
-        let product = ((*a - *r) * (*b - *s)).as_dvec3().element_sum();
-        if product.is_finite() {
-            sum += product;
-            n += 3;
-        }
-    }
-    sum / n.max(1) as f64
-}
-
-fn mean_of(values: &[Vec3]) -> f64 {
-    let finite = || values.iter().filter(|v| v.is_finite());
-    finite().map(|v| v.as_dvec3().element_sum()).sum::<f64>() / (3 * finite().count()).max(1) as f64
-}
-
-/// Frames of `probes` values from the cache; `None` when there are none or they do not fit.
-fn read_frames(path: &Path, probes: usize) -> Option<Vec<Vec<Vec3>>> {
-    let bytes = std::fs::read(path).ok()?;
-    if bytes.len() != EYE_FRAMES * probes * 12 {
-        return None;
-    }
-    let value = |c: &[u8]| f32::from_le_bytes([c[0], c[1], c[2], c[3]]);
-    let point = |c: &[u8]| Vec3::new(value(&c[..4]), value(&c[4..8]), value(&c[8..]));
-    Some(bytes.chunks_exact(12 * probes).map(|f| f.chunks_exact(12).map(point).collect()).collect())
-}
-
-fn write_frames(path: &Path, frames: &[Vec<Vec3>]) -> std::io::Result<()> {
-    write_atomically(path, |out| {
-        for v in frames.iter().flatten().flat_map(|v| v.to_array()) {
-            out.write_all(&v.to_le_bytes())?;
-        }
-        Ok(())
-    })
 }

@@ -1,9 +1,13 @@
 //! Runs that answer a question: each is a command and a test.
 
 pub mod bench;
+pub mod error_figure3;
 pub mod error_plan;
+pub mod error_plot;
+pub mod error_reference;
 pub mod error_report;
 pub mod error_runs;
+pub mod error_sheet;
 pub mod pictures;
 pub mod profile;
 pub mod run_rig;

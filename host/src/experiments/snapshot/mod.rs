@@ -2,7 +2,7 @@
 //!
 //! True poses, no tracker and no link: frame N is drawn after the N frames before it, so histories are what they are in a run.
 
-mod glyphs;
+pub mod glyphs;
 pub mod paint;
 pub mod views;
 
@@ -227,24 +227,10 @@ fn viewer(
 }
 
 fn save_png(path: &Path, canvas: &Canvas) -> Result<PathBuf, Failure> {
-    let cannot = |e: &dyn std::fmt::Display| {
-        Failure::new(
-            FailureKind::BadInput,
-            format!("{}: {e}; choose another folder with --out", path.display()),
-        )
+    let cannot = |e: std::io::Error| {
+        Failure::new(FailureKind::BadInput, format!("{e}; choose another folder with --out"))
     };
-    let mut bytes = std::io::Cursor::new(Vec::new());
-    let (width, height) = (canvas.width as u32, canvas.height as u32);
-    image::write_buffer_with_format(
-        &mut bytes,
-        &canvas.rgb,
-        width,
-        height,
-        image::ExtendedColorType::Rgb8,
-        image::ImageFormat::Png,
-    )
-    .map_err(|e| cannot(&e))?;
-    write_atomically(path, |out| out.write_all(bytes.get_ref())).map_err(|e| cannot(&e))?;
+    canvas.save(path).map_err(cannot)?;
     Ok(path.to_owned())
 }
 

@@ -1,7 +1,10 @@
 //! Numbers per pixel into pictures with a legend beside them.
 
 use super::glyphs::{for_each_dot, ADVANCE, LINE};
+use crate::files::write_atomically;
 use dpm_device::planes::Raster;
+use std::io::{self, Write};
+use std::path::Path;
 
 /// An RGB picture of 8 bits a channel, rows top to bottom.
 #[derive(Clone, Debug, PartialEq, Eq)]
@@ -24,7 +27,7 @@ const INK: [u8; 3] = [20, 20, 20];
 /// Pictures are enlarged by a whole factor until they have this many rows.
 const LEAST_ROWS: usize = 480;
 /// Pixels of a dot of text.
-const DOT: usize = 3;
+pub const DOT: usize = 3;
 const LEGEND_COLUMNS: usize = 15 * ADVANCE * DOT + 2 * MARGIN;
 const MARGIN: usize = 12;
 const BAR: usize = 28;
@@ -41,7 +44,8 @@ pub enum Scale {
 }
 
 impl Canvas {
-    fn new(width: usize, height: usize) -> Self {
+    /// Empty paper.
+    pub fn new(width: usize, height: usize) -> Self {
         Self { width, height, rgb: PAPER.repeat(width * height) }
     }
 
@@ -51,7 +55,8 @@ impl Canvas {
         }
     }
 
-    fn block(&mut self, x: usize, y: usize, width: usize, height: usize, colour: [u8; 3]) {
+    /// Fills a rectangle; what lies outside is cut off.
+    pub fn block(&mut self, x: usize, y: usize, width: usize, height: usize, colour: [u8; 3]) {
         for j in y..y + height {
             for i in x..x + width {
                 self.put(i, j, colour);
@@ -59,8 +64,44 @@ impl Canvas {
         }
     }
 
-    fn text(&mut self, x: usize, y: usize, text: &str) {
+    /// Writes text, three pixels a dot.
+    pub fn text(&mut self, x: usize, y: usize, text: &str) {
         for_each_dot(text, |dx, dy| self.block(x + dx * DOT, y + dy * DOT, DOT, DOT, INK));
+    }
+
+    /// Copies a picture in, every pixel as a square of `m`; what lies outside is cut off.
+    pub fn paste(&mut self, x: usize, y: usize, m: usize, other: &Canvas) {
+        for j in 0..other.height {
+            for i in 0..other.width {
+                self.block(x + i * m, y + j * m, m, m, other.at(i, j));
+            }
+        }
+    }
+
+    /// Writes a PNG, all of it or nothing.
+    ///
+    /// # Errors
+    /// The file cannot be written; the message names it.
+    pub fn save(&self, path: &Path) -> io::Result<()> {
+        let mut bytes = io::Cursor::new(Vec::new());
+        let (width, height) = (self.width as u32, self.height as u32);
+        image::write_buffer_with_format(
+            &mut bytes,
+            &self.rgb,
+            width,
+            height,
+            image::ExtendedColorType::Rgb8,
+            image::ImageFormat::Png,
+        )
+        .map_err(|e| io::Error::other(format!("{}: {e}", path.display())))?;
+        write_atomically(path, |out| out.write_all(bytes.get_ref()))
+    }
+
+    /// Reads a PNG. `None`: there is none that can be read.
+    pub fn load(path: &Path) -> Option<Self> {
+        let picture = image::open(path).ok()?.to_rgb8();
+        let (width, height) = (picture.width() as usize, picture.height() as usize);
+        Some(Self { width, height, rgb: picture.into_raw() })
     }
 
     /// The colour of a pixel.

@@ -6,6 +6,9 @@
 
 pub mod calibration;
 pub mod clocks;
+pub mod estimate;
+pub mod gpu_compare;
+pub mod gpu_shot;
 pub mod planes;
 pub mod predictor;
 pub mod shapes;

@@ -1,20 +1,21 @@
-//! Plain shapes and materials into small scenes: what the stability cases and the tests of the reference look at.
+//! Plain shapes and materials into small scenes: what the stability cases, the tests of the reference and the tests on the GPU look at.
 
 use crate::geometry::projector::ProjectorCamera;
-use crate::scene::{Body, Environment, Material, Scene, TriangleMesh};
+use crate::reference::Sampler;
+use crate::scene::{Body, Environment, Material, Scene, Texture, TextureRef, TriangleMesh, Wrap};
 use dpm_device::planes::Raster;
 use glam::{DAffine3, DVec3, Vec2, Vec3, Vec4};
 use std::collections::HashMap;
 
 /// A scene of one body with one material.
-pub fn scene(mesh: TriangleMesh, material: Material) -> Scene {
+pub fn scene_of(mesh: TriangleMesh, material: Material) -> Scene {
     let mut s = Scene::default();
     add(&mut s, mesh, material);
     s
 }
 
-/// Adds a body at the identity pose.
-pub fn add(scene: &mut Scene, mut mesh: TriangleMesh, material: Material) {
+/// Adds a body at rest at the identity pose with a material of its own; returns its index.
+pub fn add(scene: &mut Scene, mut mesh: TriangleMesh, material: Material) -> usize {
     mesh.materials = vec![scene.materials.len() as u32; mesh.triangles.len()];
     scene.materials.push(material);
     scene.bodies.push(Body {
@@ -24,6 +25,7 @@ pub fn add(scene: &mut Scene, mut mesh: TriangleMesh, material: Material) {
         world_from_body_rest: DAffine3::IDENTITY,
         mesh,
     });
+    scene.bodies.len() - 1
 }
 
 /// Indexed triangles with plain tangents and no texture coordinates.
@@ -37,6 +39,21 @@ pub fn mesh(positions: Vec<Vec3>, normals: Vec<Vec3>, triangles: Vec<[u32; 3]>) 
         normals,
         triangles,
     }
+}
+
+/// Joins meshes that share one material.
+pub fn join(parts: impl IntoIterator<Item = TriangleMesh>) -> TriangleMesh {
+    let mut all = TriangleMesh::default();
+    for part in parts {
+        let base = all.positions.len() as u32;
+        all.triangles.extend(part.triangles.iter().map(|t| t.map(|i| i + base)));
+        all.positions.extend(part.positions);
+        all.normals.extend(part.normals);
+        all.tangents.extend(part.tangents);
+        all.uvs.extend(part.uvs);
+        all.materials.extend(part.materials);
+    }
+    all
 }
 
 /// A closed sphere of 20 * 4^level triangles with the normals of its faces (so that shading and geometry agree) or of the sphere.
@@ -89,6 +106,12 @@ pub fn sphere(centre: Vec3, radius: f32, level: u32, smooth: bool) -> TriangleMe
     mesh(positions, normals, triangles)
 }
 
+/// One triangle with its face normal (any normal when it has no area).
+pub fn triangle([a, b, c]: [Vec3; 3]) -> TriangleMesh {
+    let n = (b - a).as_dvec3().cross((c - a).as_dvec3()).normalize_or(DVec3::Y).as_vec3();
+    mesh(vec![a, b, c], vec![n; 3], vec![[0, 1, 2]])
+}
+
 /// A parallelogram facing `u x v`.
 pub fn quad(corner: Vec3, u: Vec3, v: Vec3) -> TriangleMesh {
     let n = u.cross(v).normalize();
@@ -99,9 +122,9 @@ pub fn quad(corner: Vec3, u: Vec3, v: Vec3) -> TriangleMesh {
     m
 }
 
-/// A floor in y = 0 facing up, `2 * half` on a side.
-pub fn floor(half: f32) -> TriangleMesh {
-    quad(Vec3::new(-half, 0.0, half), Vec3::X * 2.0 * half, Vec3::NEG_Z * 2.0 * half)
+/// A floor in the plane `y = height` that faces up, `2 * half` on a side.
+pub fn floor(half: f32, height: f32) -> TriangleMesh {
+    quad(Vec3::new(-half, height, half), Vec3::X * 2.0 * half, Vec3::NEG_Z * 2.0 * half)
 }
 
 /// Lambertian.
@@ -126,4 +149,46 @@ pub fn sky(l: f32) -> Environment {
 pub fn camera(w: u32, h: u32, position: DVec3, look_at: DVec3) -> ProjectorCamera {
     let up = if (look_at - position).cross(DVec3::Y).length() < 1e-6 { DVec3::NEG_Z } else { DVec3::Y };
     ProjectorCamera::look_at(Raster::new(w, h).unwrap(), position, look_at, up, 0.6).unwrap()
+}
+
+/// A small picture of smooth random colours between `low` and `high`, the same for the same seed.
+pub fn noise_texture(size: u32, seed: u64, low: u8, high: u8, srgb: bool) -> Texture {
+    let mut random = Sampler::new(seed, 0);
+    let mut value = || low + (random.uniform() * f64::from(high - low)) as u8;
+    let texels = (0..size * size).map(|_| [value(), value(), value(), 255]).collect();
+    Texture {
+        width: size,
+        height: size,
+        texels,
+        srgb,
+        wrap_u: Wrap::Repeat,
+        wrap_v: Wrap::Mirror,
+        nearest: false,
+    }
+}
+
+/// Adds a texture and refers to it, stretched and turned so that every part of the transform matters.
+pub fn use_texture(scene: &mut Scene, texture: Texture) -> Option<TextureRef> {
+    scene.textures.push(texture);
+    Some(TextureRef {
+        texture: scene.textures.len() as u32 - 1,
+        offset: Vec2::new(0.13, -0.31),
+        rotation: 0.4,
+        scale: Vec2::new(1.7, 2.3),
+    })
+}
+
+/// A sky with a bright patch, turned about the vertical.
+pub fn image_sky(radiance: f32) -> Environment {
+    let (width, height) = (16, 8);
+    let texels = (0..width * height)
+        .map(|i| {
+            let (x, y) = ((i % width) as f32, (i / width) as f32);
+            let patch =
+                if (9..12).contains(&(i % width)) && (1..3).contains(&(i / width)) { 12.0 } else { 0.0 };
+            Vec3::new(0.2 + 0.03 * x, 0.4 + 0.05 * y, 0.7 - 0.02 * x) * radiance
+                + Vec3::splat(patch * radiance)
+        })
+        .collect();
+    Environment::Equirect { width, height, texels, rotation_rad: 0.7 }
 }

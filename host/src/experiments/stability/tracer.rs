@@ -66,7 +66,7 @@ fn on_sphere(s: &mut Sampler) -> DVec3 {
 }
 
 fn furnace_convex(seed: u64) -> f64 {
-    let mut s = scene(sphere(Vec3::ZERO, 1.0, 2, false), diffuse(Vec3::ONE));
+    let mut s = scene_of(sphere(Vec3::ZERO, 1.0, 2, false), diffuse(Vec3::ONE));
     s.environment = sky(1.0);
     let c = camera(24, 24, DVec3::new(0.0, 0.0, 5.0), DVec3::ZERO);
     let image = Reference::new(&s, &[]).render_camera(&c, &settings(4, 64, seed));
@@ -74,7 +74,7 @@ fn furnace_convex(seed: u64) -> f64 {
 }
 
 fn furnace_concave(seed: u64) -> f64 {
-    let mut s = scene(floor(1.0), diffuse(Vec3::ONE));
+    let mut s = scene_of(floor(1.0, 0.0), diffuse(Vec3::ONE));
     add(&mut s, quad(Vec3::new(-1.0, 0.0, -1.0), Vec3::X * 2.0, Vec3::Y * 2.0), diffuse(Vec3::ONE));
     add(&mut s, quad(Vec3::new(-1.0, 0.0, 1.0), Vec3::NEG_Z * 2.0, Vec3::Y * 2.0), diffuse(Vec3::ONE));
     s.environment = sky(1.0);
@@ -85,7 +85,7 @@ fn furnace_concave(seed: u64) -> f64 {
 
 fn furnace_closed(seed: u64) -> f64 {
     let material = Material { emissive: Vec3::splat(0.5), double_sided: true, ..diffuse(Vec3::splat(0.5)) };
-    let s = scene(sphere(Vec3::new(0.3, -0.2, 0.1), 2.0, 1, false), material);
+    let s = scene_of(sphere(Vec3::new(0.3, -0.2, 0.1), 2.0, 1, false), material);
     let c = camera(16, 16, DVec3::ZERO, DVec3::NEG_Z);
     let (mean, sigma) = overall(&Reference::new(&s, &[]).render_camera(&c, &settings(100, 64, seed)));
     (mean - 1.0).abs() / sigma
@@ -93,7 +93,7 @@ fn furnace_closed(seed: u64) -> f64 {
 
 /// The point in the middle of a patch of the material and the scene that owns it.
 fn patch(material: &Material) -> SurfacePoint {
-    let s = scene(floor(1.0), material.clone());
+    let s = scene_of(floor(1.0, 0.0), material.clone());
     let point = Reference::new(&s, &[]).trace(DVec3::new(0.1, 1.0, 0.2), -DVec3::Y, 9.0, false);
     point.expect("the patch lies below")
 }
@@ -259,7 +259,7 @@ fn density_integral(seed: u64) -> f64 {
 
 fn form_factor(seed: u64) -> f64 {
     let (radius, height, albedo) = (0.5f32, 1.5f32, 0.5f32);
-    let mut s = scene(floor(4.0), diffuse(Vec3::splat(albedo)));
+    let mut s = scene_of(floor(4.0, 0.0), diffuse(Vec3::splat(albedo)));
     add(&mut s, sphere(Vec3::new(0.0, height, 0.0), radius, 3, true), emitter(Vec3::splat(2.0)));
     let mut c = camera(6, 6, DVec3::new(3.0, 0.6, 0.0), DVec3::ZERO);
     (c.fx, c.fy) = (1e6, 1e6);
@@ -272,7 +272,7 @@ fn small_scene(scale: f32) -> Scene {
         m.positions.iter_mut().for_each(|p| *p *= scale);
         m
     };
-    let mut s = scene(at(floor(2.0)), diffuse(Vec3::new(0.8, 0.5, 0.3)));
+    let mut s = scene_of(at(floor(2.0, 0.0)), diffuse(Vec3::new(0.8, 0.5, 0.3)));
     let glossy = Material { roughness: 0.4, base_color: Vec3::new(0.9, 0.8, 0.4), ..Material::default() };
     add(&mut s, at(sphere(Vec3::new(0.0, 0.5, 0.0), 0.5, 2, true)), glossy);
     add(&mut s, at(quad(Vec3::new(-0.5, 2.0, -0.5), Vec3::X, Vec3::Z)), emitter(Vec3::splat(4.0)));
@@ -309,7 +309,7 @@ fn self_hits(seed: u64) -> f64 {
     let (mut faults, mut all) = (0u32, 0u32);
     for (radius, distance) in [(1e-6f32, 0.0), (1e-3, 0.0), (1e-3, 1e4), (1.0, 1e5), (1e4, 1e4), (1e6, 0.0)] {
         let c = DVec3::new(0.36, 0.48, 0.8) * distance;
-        let s = scene(sphere(Vec3::ZERO, radius, 3, false), diffuse(Vec3::ONE));
+        let s = scene_of(sphere(Vec3::ZERO, radius, 3, false), diffuse(Vec3::ONE));
         let r = Reference::new(&s, &[DAffine3::from_translation(c)]);
         let mut sampler = Sampler::new(seed, 0);
         for _ in 0..3000 {
@@ -384,7 +384,7 @@ fn degenerate(seed: u64) -> f64 {
     ]);
     let twice = m.triangles[0];
     m.triangles.push(twice);
-    let s = scene(m, diffuse(Vec3::splat(0.5)));
+    let s = scene_of(m, diffuse(Vec3::splat(0.5)));
     let r = Reference::new(&s, &[]);
     let mut faults = u32::from(r.dropped_triangles != 4);
     let mut sampler = Sampler::new(seed, 0);
@@ -504,7 +504,7 @@ fn light(kind: PunctualKind, position: Vec3, direction: Vec3, intensity: f32) ->
 }
 
 fn lamp_at_a_micrometre(seed: u64) -> f64 {
-    let mut s = scene(floor(2.0), diffuse(Vec3::splat(0.5)));
+    let mut s = scene_of(floor(2.0, 0.0), diffuse(Vec3::splat(0.5)));
     add(&mut s, quad(Vec3::new(-1.0, 1e-6, -1.0), Vec3::X * 2.0, Vec3::Z * 2.0), emitter(Vec3::splat(1e-3)));
     s.lights.push(light(PunctualKind::Directional, Vec3::ZERO, Vec3::NEG_Y, 1e5));
     let r = Reference::new(&s, &[]);
@@ -522,7 +522,7 @@ fn down(w: u32) -> crate::geometry::projector::ProjectorCamera {
 }
 
 fn no_light(seed: u64) -> f64 {
-    let mut s = scene(floor(2.0), diffuse(Vec3::ONE));
+    let mut s = scene_of(floor(2.0, 0.0), diffuse(Vec3::ONE));
     let render = |s: &Scene| {
         let image = Reference::new(s, &[]).render_camera(&down(2), &settings(3, 4, seed));
         image.mean.iter().flatten().sum::<f64>() + image.dropped_samples as f64
@@ -536,7 +536,7 @@ fn no_light(seed: u64) -> f64 {
 }
 
 fn many_lights(seed: u64) -> f64 {
-    let mut s = scene(floor(3.0), diffuse(Vec3::ONE));
+    let mut s = scene_of(floor(3.0, 0.0), diffuse(Vec3::ONE));
     let mut sampler = Sampler::new(seed, 4);
     let mut want = 0.0;
     for i in 0..100_000u32 {

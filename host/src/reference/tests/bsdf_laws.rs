@@ -94,7 +94,7 @@ fn ggx_is_a_density_of_projected_normals() {
 }
 
 fn patch(material: &Material) -> (Scene, SurfacePoint) {
-    let s = scene(floor(1.0), material.clone());
+    let s = scene_of(floor(1.0, 0.0), material.clone());
     let r = Reference::new(&s, &[]);
     let p = r.trace(DVec3::new(0.1, 1.0, 0.2), -DVec3::Y, 9.0, false).unwrap();
     drop(r);

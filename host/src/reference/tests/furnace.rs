@@ -13,7 +13,7 @@ fn directional_albedo(
     n: u32,
     from_behind: bool,
 ) -> (f64, f64) {
-    let s = scene(floor(1.0), material.clone());
+    let s = scene_of(floor(1.0, 0.0), material.clone());
     let r = Reference::new(&s, &[]);
     let v = DVec3::new((1.0 - mu * mu).sqrt(), if from_behind { -mu } else { mu }, 0.0);
     let point = r.trace(v * 2.0, -v, 10.0, false).expect("the patch lies at the origin");
@@ -32,7 +32,7 @@ fn directional_albedo(
 
 #[test]
 fn a_white_lambertian_sphere_vanishes_exactly() {
-    let mut s = scene(sphere(Vec3::ZERO, 1.0, 2, false), diffuse(Vec3::ONE));
+    let mut s = scene_of(sphere(Vec3::ZERO, 1.0, 2, false), diffuse(Vec3::ONE));
     s.environment = sky(1.0);
     let c = camera(24, 24, DVec3::new(0.0, 0.0, 5.0), DVec3::ZERO);
     let settings = RenderSettings { spp: 4, depth: 64, ..Default::default() };
@@ -53,7 +53,7 @@ fn a_white_lambertian_sphere_vanishes_exactly() {
 #[test]
 fn a_concave_white_room_in_even_light_is_one() {
     // A corner of three white walls: paths bounce many times before they leave.
-    let mut s = scene(floor(1.0), diffuse(Vec3::ONE));
+    let mut s = scene_of(floor(1.0, 0.0), diffuse(Vec3::ONE));
     add(&mut s, quad(Vec3::new(-1.0, 0.0, -1.0), Vec3::X * 2.0, Vec3::Y * 2.0), diffuse(Vec3::ONE));
     add(&mut s, quad(Vec3::new(-1.0, 0.0, 1.0), Vec3::NEG_Z * 2.0, Vec3::Y * 2.0), diffuse(Vec3::ONE));
     s.environment = sky(1.0);
@@ -69,7 +69,7 @@ fn a_concave_white_room_in_even_light_is_one() {
 #[test]
 fn closed_sphere_of_albedo_and_emission_one_half_is_one() {
     let material = Material { emissive: Vec3::splat(0.5), double_sided: true, ..diffuse(Vec3::splat(0.5)) };
-    let s = scene(sphere(Vec3::new(0.3, -0.2, 0.1), 2.0, 1, false), material);
+    let s = scene_of(sphere(Vec3::new(0.3, -0.2, 0.1), 2.0, 1, false), material);
     let r = Reference::new(&s, &[]);
     let c = camera(16, 16, DVec3::ZERO, DVec3::NEG_Z);
     let image =
@@ -168,7 +168,7 @@ fn clear_glass_in_even_light_vanishes() {
         ..Material::default()
     };
     for (thin_walled, ior) in [(false, 1.5), (false, 2.4), (true, 1.5), (false, 1.0005)] {
-        let mut s = scene(sphere(Vec3::ZERO, 1.0, 1, false), Material { thin_walled, ior, ..glass.clone() });
+        let mut s = scene_of(sphere(Vec3::ZERO, 1.0, 1, false), Material { thin_walled, ior, ..glass.clone() });
         s.environment = sky(1.0);
         let c = camera(12, 12, DVec3::new(0.0, 0.0, 4.0), DVec3::ZERO);
         let image = Reference::new(&s, &[])

@@ -139,7 +139,7 @@ fn no_ray_leaves_a_closed_mesh() {
 fn new_rays_do_not_hit_the_surface_they_leave() {
     for (radius, distance) in [(1e-6f32, 0.0), (1e-3, 0.0), (1e-3, 1e4), (1.0, 1e5), (1e4, 1e4), (1e6, 0.0)] {
         let c = DVec3::new(0.36, 0.48, 0.8) * distance;
-        let s = scene(sphere(Vec3::ZERO, radius, 3, false), diffuse(Vec3::ONE));
+        let s = scene_of(sphere(Vec3::ZERO, radius, 3, false), diffuse(Vec3::ONE));
         let r = Reference::new(&s, &[DAffine3::from_translation(c)]);
         let mut sampler = Sampler::new(6, 0);
         for _ in 0..3000 {
@@ -182,7 +182,7 @@ fn degenerate_triangles_are_dropped_and_needles_do_no_harm() {
         [n + 1, n + 2, n + 4],
         [n + 1, n + 3, n + 4],
     ]);
-    let s = scene(m, diffuse(Vec3::splat(0.5)));
+    let s = scene_of(m, diffuse(Vec3::splat(0.5)));
     let r = Reference::new(&s, &[]);
     assert_eq!(r.dropped_triangles, 4);
     assert_eq!(r.bvh().triangles().len(), good + 1);

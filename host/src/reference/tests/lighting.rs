@@ -61,7 +61,7 @@ fn punctual_lights_give_their_closed_form() {
         (light(PunctualKind::Point, Vec3::ZERO, Vec3::Y, 5.0, f32::INFINITY), 0.0),
     ];
     for (l, irradiance) in cases {
-        let mut s = scene(floor(2.0), diffuse(Vec3::splat(albedo as f32)));
+        let mut s = scene_of(floor(2.0, 0.0), diffuse(Vec3::splat(albedo as f32)));
         s.lights = vec![l];
         let image = Reference::new(&s, &[])
             .render_camera(&down(3), &RenderSettings { spp: 2, depth: 2, ..Default::default() });
@@ -77,7 +77,7 @@ fn punctual_lights_give_their_closed_form() {
 
 #[test]
 fn many_lights_are_sampled_without_bias() {
-    let mut s = scene(floor(3.0), diffuse(Vec3::ONE));
+    let mut s = scene_of(floor(3.0, 0.0), diffuse(Vec3::ONE));
     let mut sampler = Sampler::new(4, 4);
     let mut want = 0.0;
     for i in 0..3000 {
@@ -98,7 +98,7 @@ fn a_sphere_light_has_its_form_factor() {
     // Irradiance under a sphere of radiance L, radius r, at height h above: pi L (r / h)^2, if the sphere is above the horizon.
     // The icosphere's area is a little smaller; its own projected solid angle is what a pyramid of its silhouette covers: 1%.
     let (radius, height, albedo) = (0.5f32, 1.5f32, 0.5f32);
-    let mut s = scene(floor(4.0), diffuse(Vec3::splat(albedo)));
+    let mut s = scene_of(floor(4.0, 0.0), diffuse(Vec3::splat(albedo)));
     add(&mut s, sphere(Vec3::new(0.0, height, 0.0), radius, 3, true), emitter(Vec3::splat(2.0)));
     let r = Reference::new(&s, &[]);
     let eye = DVec3::new(3.0, 0.6, 0.0);
@@ -123,7 +123,7 @@ fn light_sampling_and_scattering_agree_on_a_glossy_floor() {
         quad(Vec3::new(-0.5, 1.0, -0.5), Vec3::X, Vec3::Z),
         Material { roughness: 0.35, metallic: 1.0, base_color: Vec3::splat(0.9), ..Material::default() },
     );
-    let mut s = scene(floor(3.0), floor_material.clone());
+    let mut s = scene_of(floor(3.0, 0.0), floor_material.clone());
     add(&mut s, lamp, emitter(Vec3::ONE));
     let r = Reference::new(&s, &[]);
     let mut c = camera(8, 8, DVec3::new(1.0, 1.2, 0.0), DVec3::ZERO);
@@ -170,7 +170,7 @@ fn gradient_sky(rotation_rad: f32) -> Environment {
 
 #[test]
 fn sky_importance_sampling_is_unbiased() {
-    let mut s = scene(floor(2.0), diffuse(Vec3::ONE));
+    let mut s = scene_of(floor(2.0, 0.0), diffuse(Vec3::ONE));
     s.environment = gradient_sky(0.4);
     let r = Reference::new(&s, &[]);
     let image = r.render_camera(&down(8), &RenderSettings { spp: 300, depth: 2, ..Default::default() });
@@ -218,7 +218,7 @@ fn the_sky_is_the_right_way_round() {
 
 #[test]
 fn no_light_and_black_everything_is_black_and_finite() {
-    let mut s = scene(floor(2.0), diffuse(Vec3::ONE));
+    let mut s = scene_of(floor(2.0, 0.0), diffuse(Vec3::ONE));
     let image = Reference::new(&s, &[])
         .render_camera(&down(2), &RenderSettings { spp: 2, depth: 4, ..Default::default() });
     assert!(image.mean.iter().all(|p| *p == [0.0; 3]) && image.dropped_samples == 0);
@@ -236,7 +236,7 @@ fn no_light_and_black_everything_is_black_and_finite() {
 #[test]
 fn lamp_a_micrometre_from_the_surface_and_a_sun_beside_it() {
     // Under a large even lamp the irradiance is pi L wherever it hangs.
-    let mut s = scene(floor(2.0), diffuse(Vec3::splat(0.5)));
+    let mut s = scene_of(floor(2.0, 0.0), diffuse(Vec3::splat(0.5)));
     add(&mut s, quad(Vec3::new(-1.0, 1e-6, -1.0), Vec3::X * 2.0, Vec3::Z * 2.0), emitter(Vec3::splat(1e-3)));
     s.lights.push(light(
         PunctualKind::Directional,

@@ -74,8 +74,8 @@ fn texture_transform_follows_the_extension() {
 #[test]
 fn a_texture_lies_on_the_surface_the_right_way() {
     // Floor seen from above with -Z up in the picture: u runs right, v = 0 is the far edge.
-    let mut s = scene(
-        floor(1.0),
+    let mut s = scene_of(
+        floor(1.0, 0.0),
         Material { emissive: Vec3::ONE, emissive_texture: Some(use_of(0)), ..diffuse(Vec3::ZERO) },
     );
     let mut t = image(2, 2, vec![[255, 0, 0, 255], [0, 255, 0, 255], [0, 0, 255, 255], [255, 255, 255, 255]]);
@@ -91,7 +91,7 @@ fn a_texture_lies_on_the_surface_the_right_way() {
 
 #[test]
 fn a_normal_map_tilts_along_the_tangent_and_turns_with_the_body() {
-    let mut s = scene(floor(1.0), Material { normal_texture: Some(use_of(0)), ..diffuse(Vec3::ONE) });
+    let mut s = scene_of(floor(1.0, 0.0), Material { normal_texture: Some(use_of(0)), ..diffuse(Vec3::ONE) });
     // x = 0.6, y = 0, z = 0.8 of the map: (0.6 + 1) / 2 * 255 = 204, 127.5, 229.5
     s.textures.push(image(1, 1, vec![[204, 128, 230, 255]]));
     let normal = |pose: DAffine3, strength: f32| {
@@ -115,8 +115,8 @@ fn a_normal_map_tilts_along_the_tangent_and_turns_with_the_body() {
 fn cut_out_texels_are_not_there_for_any_ray() {
     let leaf =
         Material { alpha_cutoff: Some(0.5), base_color_texture: Some(use_of(0)), ..diffuse(Vec3::ONE) };
-    let mut s = scene(quad(Vec3::new(-1.0, 1.0, 1.0), Vec3::X * 2.0, Vec3::NEG_Z * 2.0), leaf);
-    add(&mut s, floor(1.0), diffuse(Vec3::ONE));
+    let mut s = scene_of(quad(Vec3::new(-1.0, 1.0, 1.0), Vec3::X * 2.0, Vec3::NEG_Z * 2.0), leaf);
+    add(&mut s, floor(1.0, 0.0), diffuse(Vec3::ONE));
     let mut t = image(2, 1, vec![[255, 255, 255, 0], [255, 255, 255, 255]]);
     t.nearest = true;
     s.textures.push(t);
@@ -129,7 +129,7 @@ fn cut_out_texels_are_not_there_for_any_ray() {
 
 #[test]
 fn backs_of_single_sided_surfaces_are_black_and_block() {
-    let mut s = scene(floor(1.0), diffuse(Vec3::ONE));
+    let mut s = scene_of(floor(1.0, 0.0), diffuse(Vec3::ONE));
     s.environment = sky(1.0);
     let from_below = camera(2, 2, DVec3::new(0.0, -2.0, 0.0), DVec3::ZERO);
     let settings = RenderSettings { spp: 1, depth: 3, ..Default::default() };
@@ -146,7 +146,7 @@ fn backs_of_single_sided_surfaces_are_black_and_block() {
 #[test]
 fn the_rig_lights_only_what_projector_and_eye_see() {
     // A floor, a real post, and a virtual wall between projector and floor that real light does not meet.
-    let mut s = scene(floor(2.0), diffuse(Vec3::ONE));
+    let mut s = scene_of(floor(2.0, 0.0), diffuse(Vec3::ONE));
     add(&mut s, sphere(Vec3::new(0.0, 0.5, 0.0), 0.3, 2, true), diffuse(Vec3::ONE));
     add(&mut s, quad(Vec3::new(-5.0, 1.5, 5.0), Vec3::X * 10.0, Vec3::NEG_Z * 10.0), diffuse(Vec3::ONE));
     s.bodies[2].projected = false;
@@ -185,7 +185,7 @@ fn small_scene(scale: f32, offset: Vec3) -> Scene {
         m.positions.iter_mut().for_each(|p| *p = *p * scale + offset);
         m
     };
-    let mut s = scene(at(floor(2.0)), diffuse(Vec3::new(0.8, 0.5, 0.3)));
+    let mut s = scene_of(at(floor(2.0, 0.0)), diffuse(Vec3::new(0.8, 0.5, 0.3)));
     let glossy = Material { roughness: 0.4, base_color: Vec3::new(0.9, 0.8, 0.4), ..Material::default() };
     add(&mut s, at(sphere(Vec3::new(0.0, 0.5, 0.0), 0.5, 2, true)), glossy);
     add(&mut s, at(quad(Vec3::new(-0.5, 2.0, -0.5), Vec3::X, Vec3::Z)), emitter(Vec3::splat(4.0)));

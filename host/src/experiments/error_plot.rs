@@ -1,0 +1,194 @@
+//! Measured groups into curves: error against cost, both logarithmic, with the Pareto front.
+
+use super::error_figure3::{looks, Figure3Group, Figure3Row};
+use super::error_runs::{ErrorRow, GroupResult};
+use plotters::element::DashedPathElement;
+use plotters::prelude::*;
+
+/// One frame at 947 fps, ms: what the rig allows.
+pub const FRAME_MS: f64 = 1.056;
+
+/// Okabe and Ito's colours, told apart by all kinds of eyes.
+const COLORS: [RGBColor; 7] = [
+    RGBColor(0, 114, 178),
+    RGBColor(230, 159, 0),
+    RGBColor(0, 158, 115),
+    RGBColor(213, 94, 0),
+    RGBColor(204, 121, 167),
+    RGBColor(86, 180, 233),
+    RGBColor(0, 0, 0),
+];
+
+/// What the horizontal axis shows.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Cost {
+    /// Rays of a frame.
+    Rays,
+    /// GPU time of a frame, ms.
+    GpuMs,
+}
+
+/// Points that no other point beats in both cost and error, by rising cost.
+pub fn pareto(points: &[(f64, f64)]) -> Vec<(f64, f64)> {
+    let mut sorted = points.to_vec();
+    sorted.sort_by(|a, b| a.0.total_cmp(&b.0).then(a.1.total_cmp(&b.1)));
+    let mut least = f64::INFINITY;
+    sorted.retain(|&(_, error)| {
+        let better = error < least;
+        least = least.min(error);
+        better
+    });
+    sorted
+}
+
+/// Perceived error against cost, both axes logarithmic, a curve a method, the Pareto front in grey, and for times one frame's 1.056 ms.
+///
+/// # Errors
+/// What the drawing library says.
+pub fn curves(groups: &[GroupResult], moving: bool, cost: Cost) -> Result<String, String> {
+    let point = |r: &ErrorRow| (if cost == Cost::Rays { r.rays } else { r.gpu_ms }, r.perceived_rmse);
+    let rows: Vec<&ErrorRow> = groups
+        .iter()
+        .flat_map(|g| &g.rows)
+        .filter(|r| r.moving == moving && point(r).0 > 0.0 && point(r).1 > 0.0)
+        .collect();
+    let mut names: Vec<&str> = Vec::new();
+    for r in &rows {
+        if !names.contains(&r.method.as_str()) {
+            names.push(&r.method);
+        }
+    }
+    let all: Vec<(f64, f64)> = rows.iter().map(|r| point(r)).collect();
+    let range = |of: &dyn Fn(&(f64, f64)) -> f64| {
+        let (low, high) = all.iter().map(of).fold((f64::INFINITY, 0.0f64), |(a, b), v| (a.min(v), b.max(v)));
+        if low < high {
+            (0.8 * low, 1.25 * high)
+        } else {
+            (0.1, 10.0)
+        }
+    };
+    let (mut x, y) = (range(&|p| p.0), range(&|p| p.1));
+    if cost == Cost::GpuMs {
+        x = (x.0.min(0.8 * FRAME_MS), x.1.max(1.25 * FRAME_MS));
+    }
+    let mut text = String::new();
+    draw(&mut text, &rows, &names, &pareto(&all), (x, y), cost, &point).map_err(|e| e.to_string())?;
+    Ok(text)
+}
+
+type Ranges = ((f64, f64), (f64, f64));
+
+/// Perceived error by mean radiance against samples a pixel, both logarithmic: a colour a material, dashed when standing.
+///
+/// # Errors
+/// What the drawing library says.
+pub fn figure3(groups: &[Figure3Group]) -> Result<String, String> {
+    let rows = || groups.iter().flat_map(|g| &g.rows).filter(|r| r.perceived > 0.0);
+    let range = |of: &dyn Fn(&Figure3Row) -> f64| {
+        let (low, high) = rows().map(of).fold((f64::INFINITY, 0.0f64), |(a, b), v| (a.min(v), b.max(v)));
+        if low <= high {
+            0.8 * low..1.25 * high
+        } else {
+            0.1..10.0
+        }
+    };
+    let (x, y) = (range(&|r| f64::from(r.spp)), range(&|r| r.perceived));
+    let mut text = String::new();
+    let drawn = || -> Result<(), Box<dyn std::error::Error>> {
+        let root = SVGBackend::with_string(&mut text, (960, 540)).into_drawing_area();
+        root.fill(&WHITE)?;
+        let mut chart = ChartBuilder::on(&root)
+            .margin(16)
+            .x_label_area_size(40)
+            .y_label_area_size(80)
+            .build_cartesian_2d(x.log_scale(), y.log_scale())?;
+        chart
+            .configure_mesh()
+            .x_desc("samples a pixel and frame")
+            .y_desc("perceived RMSE / mean radiance")
+            .light_line_style(WHITE)
+            .draw()?;
+        for (i, look) in looks().iter().enumerate() {
+            for moving in [false, true] {
+                let mut points: Vec<(f64, f64)> = rows()
+                    .filter(|r| r.material == look.name && r.moving == moving)
+                    .map(|r| (f64::from(r.spp), r.perceived))
+                    .collect();
+                points.sort_by(|a, b| a.0.total_cmp(&b.0));
+                let style = COLORS[i].stroke_width(2);
+                let key = move |(x, y): (i32, i32)| -> Vec<(i32, i32)> { vec![(x, y), (x + 16, y)] };
+                if moving {
+                    chart
+                        .draw_series(LineSeries::new(points, style).point_size(4))?
+                        .label(format!("{}, moving", look.name))
+                        .legend(move |at| PathElement::new(key(at), style));
+                } else {
+                    chart
+                        .draw_series(DashedLineSeries::new(points, 6, 4, style))?
+                        .label(format!("{}, still", look.name))
+                        .legend(move |(x, y)| DashedPathElement::new([(x, y), (x + 16, y)], 4, 3, style));
+                }
+            }
+        }
+        chart.configure_series_labels().background_style(WHITE).border_style(BLACK).draw()?;
+        root.present()?;
+        Ok(())
+    };
+    drawn().map_err(|e| e.to_string())?;
+    Ok(text)
+}
+
+fn draw(
+    text: &mut String,
+    rows: &[&ErrorRow],
+    names: &[&str],
+    front: &[(f64, f64)],
+    (x, y): Ranges,
+    cost: Cost,
+    point: &dyn Fn(&ErrorRow) -> (f64, f64),
+) -> Result<(), Box<dyn std::error::Error>> {
+    let root = SVGBackend::with_string(text, (960, 540)).into_drawing_area();
+    root.fill(&WHITE)?;
+    let mut chart = ChartBuilder::on(&root)
+        .margin(16)
+        .x_label_area_size(40)
+        .y_label_area_size(80)
+        .build_cartesian_2d((x.0..x.1).log_scale(), (y.0..y.1).log_scale())?;
+    let x_name = if cost == Cost::Rays { "rays a frame" } else { "GPU time of a frame, ms" };
+    chart.configure_mesh().x_desc(x_name).y_desc("perceived RMSE").light_line_style(WHITE).draw()?;
+    chart
+        .draw_series(LineSeries::new(front.iter().copied(), RGBColor(190, 190, 190).stroke_width(6)))?
+        .label("Pareto front")
+        .legend(|(x, y)| PathElement::new([(x, y), (x + 16, y)], RGBColor(190, 190, 190).stroke_width(6)));
+    for (i, name) in names.iter().enumerate() {
+        let color = COLORS[i % COLORS.len()];
+        let mut points: Vec<(f64, f64)> =
+            rows.iter().filter(|r| r.method == *name).map(|r| point(r)).collect();
+        points.sort_by(|a, b| a.0.total_cmp(&b.0));
+        chart
+            .draw_series(LineSeries::new(points, color.stroke_width(2)).point_size(4))?
+            .label(*name)
+            .legend(move |(x, y)| PathElement::new([(x, y), (x + 16, y)], color.stroke_width(2)));
+    }
+    if cost == Cost::GpuMs {
+        chart
+            .draw_series(LineSeries::new([(FRAME_MS, y.0), (FRAME_MS, y.1)], BLACK.stroke_width(1)))?
+            .label("1.056 ms")
+            .legend(|(x, y)| PathElement::new([(x, y), (x + 16, y)], BLACK.stroke_width(1)));
+    }
+    chart.configure_series_labels().background_style(WHITE).border_style(BLACK).draw()?;
+    root.present()?;
+    Ok(())
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_front_holds_what_nothing_beats() {
+        let front = pareto(&[(4.0, 1.0), (1.0, 4.0), (2.0, 4.5), (2.0, 2.0), (3.0, 2.0)]);
+        assert_eq!(front, [(1.0, 4.0), (2.0, 2.0), (4.0, 1.0)]);
+        assert!(pareto(&[]).is_empty());
+    }
+}
