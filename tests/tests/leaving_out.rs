@@ -2,14 +2,14 @@
 
 use dpm_host::config::{Overrides, RenderMethod, RigConfig};
 use dpm_host::experiments::sequence::{draw, poses_at};
+use dpm_host::experiments::stability::gpu_shot::Shot;
+use dpm_host::experiments::stability::shapes::*;
 use dpm_host::pipeline::renderer_settings;
 use dpm_host::render::method::Method;
 use dpm_host::render::{Renderer, RendererSettings};
 use dpm_host::rig::Rig;
 use dpm_host::scene::{Material, PunctualKind, PunctualLight, Scene};
-use dpm_host::experiments::stability::gpu_shot::Shot;
 use dpm_tests::gpu::with_gpu;
-use dpm_host::experiments::stability::shapes::*;
 use glam::{DVec3, Vec3};
 
 /// One scene per thing that can be left out.
@@ -38,7 +38,8 @@ fn scenes() -> Vec<(&'static str, Scene)> {
         ),
         ("emissive", room(emitter(Vec3::splat(2.0)))),
     ];
-    let mut metal_only = scene_of(sphere(Vec3::ZERO, 0.5, 2, true), Material { roughness: 0.5, ..Material::default() });
+    let mut metal_only =
+        scene_of(sphere(Vec3::ZERO, 0.5, 2, true), Material { roughness: 0.5, ..Material::default() });
     metal_only.environment = image_sky(1.0);
     out.push(("nothing diffuse", metal_only));
     let mut dark = room(diffuse(Vec3::ONE));

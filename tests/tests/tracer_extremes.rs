@@ -1,11 +1,11 @@
 //! Rays, shapes and lights at the edge of what numbers can hold.
 
+use dpm_host::experiments::stability::estimate::pooled;
+use dpm_host::experiments::stability::gpu_shot::Shot;
+use dpm_host::experiments::stability::shapes::*;
 use dpm_host::scene::{Material, PunctualKind, PunctualLight, Scene, TriangleMesh};
 use dpm_tests::compare::{compare, Demands};
-use dpm_host::experiments::stability::gpu_shot::Shot;
 use dpm_tests::gpu::with_gpu;
-use dpm_host::experiments::stability::shapes::*;
-use dpm_host::experiments::stability::estimate::pooled;
 use glam::{DAffine3, DMat3, DVec3, Vec3};
 
 /// A floor of `n` x `n` squares of side `side` whose seams lie on round numbers, about the origin.
@@ -228,7 +228,9 @@ fn the_firefly_limit_removes_counts_and_never_adds() {
         assert_eq!(free.radiance, loose.radiance, "a limit that nothing reaches changes nothing");
         assert_eq!((free.counters[0].clamped_samples, loose.counters[0].clamped_samples), (0, 0));
         assert!(tight.counters[0].clamped_samples > 100, "{}", tight.counters[0].clamped_samples);
-        let sum = |p: &dpm_host::experiments::stability::gpu_shot::Picture| p.estimates.iter().map(|e| e.mean[1]).sum::<f64>();
+        let sum = |p: &dpm_host::experiments::stability::gpu_shot::Picture| {
+            p.estimates.iter().map(|e| e.mean[1]).sum::<f64>()
+        };
         assert!(sum(&tight) < 0.99 * sum(&free));
         for (i, (a, b)) in tight.estimates.iter().zip(&free.estimates).enumerate() {
             assert!(a.mean[1] <= b.mean[1] + 1e-6, "pixel {i}: {} above {}", a.mean[1], b.mean[1]);

@@ -313,12 +313,16 @@ mod tests {
         assert!((f.diffuse_to_specular - 0.3 / 0.15).abs() < 1e-12);
         assert!(markdown(&groups).contains("in 3 of 4 conditions"));
         assert_eq!(csv(&groups).lines().count(), 9);
-        assert!(csv(&groups).lines().nth(1).is_some_and(|l| l.starts_with("\"a 'device'\",\"d\",c,h,1,diffuse,still,5,")));
+        assert!(csv(&groups)
+            .lines()
+            .nth(1)
+            .is_some_and(|l| l.starts_with("\"a 'device'\",\"d\",c,h,1,diffuse,still,5,")));
     }
 
     #[test]
     fn settings_have_names_of_their_own() {
-        let names: std::collections::BTreeSet<String> = Setting::all().into_iter().map(Setting::name).collect();
+        let names: std::collections::BTreeSet<String> =
+            Setting::all().into_iter().map(Setting::name).collect();
         assert_eq!(names.len(), 8);
     }
 }

@@ -54,8 +54,7 @@ pub fn paper_at(method: &Method, budget: f64) -> Method {
     let mut scaled = method.clone();
     let of = &method.paper.zone_spp;
     let most = of.iter().copied().max().unwrap_or(1).max(1);
-    scaled.paper.zone_spp =
-        of.map(|spp| (f64::from(spp) * budget / f64::from(most)).round().max(1.0) as u32);
+    scaled.paper.zone_spp = of.map(|spp| (f64::from(spp) * budget / f64::from(most)).round().max(1.0) as u32);
     scaled
 }
 

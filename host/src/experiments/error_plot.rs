@@ -2,6 +2,7 @@
 
 use super::error_figure3::{looks, Figure3Group, Figure3Row};
 use super::error_runs::{ErrorRow, GroupResult};
+use plotters::coord::combinators::{LogCoord, WithKeyPoints};
 use plotters::element::DashedPathElement;
 use plotters::prelude::*;
 
@@ -39,6 +40,30 @@ pub fn pareto(points: &[(f64, f64)]) -> Vec<(f64, f64)> {
         better
     });
     sorted
+}
+
+/// Places for labels on a logarithmic axis: 1, 2, 3, 5 and 7 of every decade, or 1, 2, 5, or 1, whichever leaves the most of at most ten.
+fn ticks(low: f64, high: f64) -> Vec<f64> {
+    let of = |steps: &[f64]| -> Vec<f64> {
+        let decades = low.log10().floor() as i32..=high.log10().ceil() as i32;
+        decades
+            .flat_map(|d| steps.iter().map(move |s| s * 10f64.powi(d)))
+            .filter(|t| (low..=high).contains(t))
+            .collect()
+    };
+    let choices = [of(&[1.0, 2.0, 3.0, 5.0, 7.0]), of(&[1.0, 2.0, 5.0]), of(&[1.0])];
+    choices.into_iter().find(|t| t.len() <= 10).unwrap_or_default()
+}
+
+/// A label of a tick: no more digits than it has.
+fn label(v: &f64) -> String {
+    let digits = (-v.log10().floor()).clamp(0.0, 12.0) as usize;
+    format!("{v:.digits$}")
+}
+
+/// A logarithmic axis with its labels.
+fn axis((low, high): (f64, f64)) -> WithKeyPoints<LogCoord<f64>> {
+    (low..high).log_scale().with_key_points(ticks(low, high))
 }
 
 /// Perceived error against cost, both axes logarithmic, a curve a method, the Pareto front in grey, and for times one frame's 1.056 ms.
@@ -87,25 +112,27 @@ pub fn figure3(groups: &[Figure3Group]) -> Result<String, String> {
     let range = |of: &dyn Fn(&Figure3Row) -> f64| {
         let (low, high) = rows().map(of).fold((f64::INFINITY, 0.0f64), |(a, b), v| (a.min(v), b.max(v)));
         if low <= high {
-            0.8 * low..1.25 * high
+            (0.8 * low, 1.25 * high)
         } else {
-            0.1..10.0
+            (0.1, 10.0)
         }
     };
     let (x, y) = (range(&|r| f64::from(r.spp)), range(&|r| r.perceived));
     let mut text = String::new();
-    let drawn = || -> Result<(), Box<dyn std::error::Error>> {
+    let mut drawn = || -> Result<(), Box<dyn std::error::Error>> {
         let root = SVGBackend::with_string(&mut text, (960, 540)).into_drawing_area();
         root.fill(&WHITE)?;
         let mut chart = ChartBuilder::on(&root)
             .margin(16)
             .x_label_area_size(40)
             .y_label_area_size(80)
-            .build_cartesian_2d(x.log_scale(), y.log_scale())?;
+            .build_cartesian_2d(axis(x), axis(y))?;
         chart
             .configure_mesh()
             .x_desc("samples a pixel and frame")
             .y_desc("perceived RMSE / mean radiance")
+            .x_label_formatter(&label)
+            .y_label_formatter(&label)
             .light_line_style(WHITE)
             .draw()?;
         for (i, look) in looks().iter().enumerate() {
@@ -130,7 +157,12 @@ pub fn figure3(groups: &[Figure3Group]) -> Result<String, String> {
                 }
             }
         }
-        chart.configure_series_labels().background_style(WHITE).border_style(BLACK).draw()?;
+        chart
+            .configure_series_labels()
+            .position(SeriesLabelPosition::UpperRight)
+            .background_style(WHITE)
+            .border_style(BLACK)
+            .draw()?;
         root.present()?;
         Ok(())
     };
@@ -153,9 +185,16 @@ fn draw(
         .margin(16)
         .x_label_area_size(40)
         .y_label_area_size(80)
-        .build_cartesian_2d((x.0..x.1).log_scale(), (y.0..y.1).log_scale())?;
+        .build_cartesian_2d(axis(x), axis(y))?;
     let x_name = if cost == Cost::Rays { "rays a frame" } else { "GPU time of a frame, ms" };
-    chart.configure_mesh().x_desc(x_name).y_desc("perceived RMSE").light_line_style(WHITE).draw()?;
+    chart
+        .configure_mesh()
+        .x_desc(x_name)
+        .y_desc("perceived RMSE")
+        .x_label_formatter(&label)
+        .y_label_formatter(&label)
+        .light_line_style(WHITE)
+        .draw()?;
     chart
         .draw_series(LineSeries::new(front.iter().copied(), RGBColor(190, 190, 190).stroke_width(6)))?
         .label("Pareto front")
@@ -176,7 +215,12 @@ fn draw(
             .label("1.056 ms")
             .legend(|(x, y)| PathElement::new([(x, y), (x + 16, y)], BLACK.stroke_width(1)));
     }
-    chart.configure_series_labels().background_style(WHITE).border_style(BLACK).draw()?;
+    chart
+        .configure_series_labels()
+        .position(SeriesLabelPosition::UpperRight)
+        .background_style(WHITE)
+        .border_style(BLACK)
+        .draw()?;
     root.present()?;
     Ok(())
 }
@@ -184,6 +228,19 @@ fn draw(
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn every_axis_has_labels_and_they_say_what_they_stand_for() {
+        for (low, high) in [(0.012, 0.05), (0.8, 80.0), (4800.0, 19_000.0), (1e-4, 1e3), (1.1, 1.9)] {
+            let all = ticks(low, high);
+            assert!((1..=10).contains(&all.len()) || high / low < 2.0, "{low}..{high}: {all:?}");
+            for t in all {
+                let read: f64 = label(&t).parse().unwrap();
+                assert!((read / t - 1.0).abs() < 1e-9 && (low..=high).contains(&t), "{t}: {}", label(&t));
+            }
+        }
+        assert_eq!([label(&0.02), label(&5.0), label(&3000.0)], ["0.02", "5", "3000"]);
+    }
 
     #[test]
     fn the_front_holds_what_nothing_beats() {

@@ -145,7 +145,11 @@ pub fn on_curve(points: &[(f64, f64)], x: f64) -> Option<Reading> {
     let by_x = |a: &&(f64, f64), b: &&(f64, f64)| a.0.total_cmp(&b.0);
     let (low, high) = (points.iter().min_by(by_x)?, points.iter().max_by(by_x)?);
     let end = if x < low.0 { low } else { high };
-    let next = if points.first() == Some(end) { points.get(1)? } else { points.get(points.len().checked_sub(2)?)? };
+    let next = if points.first() == Some(end) {
+        points.get(1)?
+    } else {
+        points.get(points.len().checked_sub(2)?)?
+    };
     let is_end = points.first() == Some(end) || points.last() == Some(end);
     let reach = (end.0 / x).max(x / end.0);
     let y = at(*next, *end);

@@ -203,7 +203,8 @@ impl ErrorRuns {
         }
         // What the picture converges to depends neither on the methods' seed nor on how long the methods run.
         let stamp = &self.stamp;
-        let what = format!("{}{:?}{}{}", stamp.config_hash, stamp.raster, group.moving, self.options.last_slot());
+        let what =
+            format!("{}{:?}{}{}", stamp.config_hash, stamp.raster, group.moving, self.options.last_slot());
         let short = self.theatre(group, 0, EYE_FRAMES as u32)?;
         let reference = Reference::new(&short, o.reference_spp, &what, &o.cache, each)?;
         let mut rows: Vec<ErrorRow> = Vec::new();

@@ -124,7 +124,8 @@ fn commit_around(place: &Path) -> Option<String> {
         None => head,
         Some(name) => {
             // Branches live in the common folder, loose or packed.
-            let common = std::fs::read_to_string(dir.join("commondir")).map_or(dir.clone(), |c| dir.join(c.trim()));
+            let common =
+                std::fs::read_to_string(dir.join("commondir")).map_or(dir.clone(), |c| dir.join(c.trim()));
             let packed = || {
                 let all = std::fs::read_to_string(common.join("packed-refs")).ok()?;
                 Some(all.lines().find(|l| l.ends_with(&format!(" {}", name.trim())))?.to_owned())

@@ -101,8 +101,8 @@ impl Comparison {
         for &i in &self.common {
             gpu += self.picture.estimates[i].mean[channel] / n;
             truth += self.reference.mean[i][channel] / n;
-            variance += (self.picture.estimates[i].variance(channel) + self.reference.variance[i][channel])
-                / (n * n);
+            variance +=
+                (self.picture.estimates[i].variance(channel) + self.reference.variance[i][channel]) / (n * n);
         }
         MeanGap { gpu, truth, sigma: variance.sqrt() }
     }

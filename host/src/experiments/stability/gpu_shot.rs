@@ -100,12 +100,17 @@ impl<'a> Shot<'a> {
         let mut renderer = Renderer::new(gpu, self.scene, self.settings()).expect("the scene fits the GPU");
         let poses = self.world_from_body();
         let mut picture = Picture::default();
-        self.play(&mut renderer, 0..self.frames, |_| poses.clone(), |frame, slot, counters| {
-            picture.add(slot, counters);
-            if frame + 1 == self.frames {
-                picture.keep(slot);
-            }
-        });
+        self.play(
+            &mut renderer,
+            0..self.frames,
+            |_| poses.clone(),
+            |frame, slot, counters| {
+                picture.add(slot, counters);
+                if frame + 1 == self.frames {
+                    picture.keep(slot);
+                }
+            },
+        );
         picture
     }
 

@@ -168,7 +168,8 @@ fn clear_glass_in_even_light_vanishes() {
         ..Material::default()
     };
     for (thin_walled, ior) in [(false, 1.5), (false, 2.4), (true, 1.5), (false, 1.0005)] {
-        let mut s = scene_of(sphere(Vec3::ZERO, 1.0, 1, false), Material { thin_walled, ior, ..glass.clone() });
+        let mut s =
+            scene_of(sphere(Vec3::ZERO, 1.0, 1, false), Material { thin_walled, ior, ..glass.clone() });
         s.environment = sky(1.0);
         let c = camera(12, 12, DVec3::new(0.0, 0.0, 4.0), DVec3::ZERO);
         let image = Reference::new(&s, &[])
