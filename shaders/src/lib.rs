@@ -46,4 +46,6 @@ shaders! {
     SPATIAL = "spatial";
     /// Compensation for distance, angle and albedo, then quantisation to code values.
     COMPENSATE = "compensate";
+    /// Code values into bit planes.
+    PACK = "pack";
 }

@@ -453,4 +453,5 @@ pub const BINDINGS: &[(&str, u32)] = &[
     ("B_FILTERED", 24),
     ("B_SHOWN", 25),
     ("B_TILE_STATES", 26),
+    ("B_PLANES", 27),
 ];

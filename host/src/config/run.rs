@@ -25,6 +25,8 @@ section! {
         clamp_indirect: f64 = 0.0, "scene units", Within(0.0, 1e9);
         /// The Vulkan device: its number in `dpm doctor` or a part of its name; the fastest kind when left out.
         gpu: Option<String> = None, "", NotEmpty;
+        /// Who cuts the picture into bit planes.
+        packer: Packer = Packer::Auto, "", Any;
         /// Constants of the paper.
         paper: PaperConfig = PaperConfig::default(), "", Any;
         /// Parts of the method, each as the method has it when left out.
@@ -120,6 +122,18 @@ impl RenderConfig {
             spatial_filter: e.spatial_filter.unwrap_or(own),
             spp_by_angle: e.spp_by_angle.unwrap_or(shared),
         }
+    }
+}
+
+words! {
+    /// Who cuts the picture into bit planes; the bytes are the same.
+    pub enum Packer {
+        /// The GPU, or the CPU where Vulkan is software.
+        Auto = "auto",
+        /// The GPU, software or not.
+        Gpu = "gpu",
+        /// The CPU's vector units.
+        Cpu = "cpu",
     }
 }
 

@@ -5,7 +5,7 @@ use super::sequence::{draw, poses_at};
 use super::stamp::Stamp;
 use crate::config::RenderMethod;
 use crate::gpu::Gpu;
-use crate::pipeline::renderer_settings;
+use crate::pipeline::{output, renderer_settings};
 use crate::render::{FrameCost, RenderError, Renderer, RendererSettings, PASSES};
 use crate::rig::Rig;
 use serde::Serialize;
@@ -113,7 +113,7 @@ fn measure(
 ) -> Result<MethodCost, RenderError> {
     let spp = rig.config.render.spp;
     let method = switched_method_of(&rig.config.render, which);
-    let settings = RendererSettings { method, ..renderer_settings(rig) };
+    let settings = RendererSettings { method, output: output(rig, gpu, false), ..renderer_settings(rig) };
     let mut renderer = Renderer::new(gpu, &rig.scene, settings)?;
     let mut slot = renderer.create_slot(false)?;
     let (mut costs, mut walls): (Vec<FrameCost>, Vec<f64>) = (Vec::new(), Vec::new());

@@ -3,6 +3,7 @@
 //! Every kernel gives the same bytes as [`scalar`], whatever the raster. The GPU's packer is held to the same bytes.
 
 mod frame;
+pub mod gpu;
 mod quantise;
 mod scalar;
 #[cfg(target_arch = "x86_64")]

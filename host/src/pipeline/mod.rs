@@ -28,6 +28,6 @@ pub use collect::FrameRecord;
 pub use connect::{connect, ConnectError, ENDED_WITH_THE_LAST_RUN};
 pub use keeper::ProjectorReport;
 pub use outcome::{PipelineError, RunOptions, RunOutcome};
-pub use run::{renderer_settings, run, run_prepared};
+pub use run::{output, renderer_settings, run, run_prepared};
 pub use status_light::DeviceCounts;
 pub use threads::on_frame_path;

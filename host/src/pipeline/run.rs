@@ -12,14 +12,14 @@ use super::rights::Rights;
 use super::stages::TrackingStage;
 use super::threads::{device_thread, run_threads, Cable, Shared, LISTEN_NS};
 use crate::clock::{Clock, ManualClock, MonotonicClock, RunClock, Stopwatch};
-use crate::config::{Pace, ProjectorBackend};
+use crate::config::{Pace, Packer, ProjectorBackend};
 use crate::gpu::Gpu;
 use crate::pack::{BitPlaneFrame, Kernel};
 use crate::plan::slots::MissCause;
 use crate::realtime::os::usable_cores;
 use crate::realtime::standstill::StandstillMonitor;
 use crate::render::method::Method;
-use crate::render::{FrameCost, RenderError, Renderer, RendererSettings};
+use crate::render::{FrameCost, Output, RenderError, Renderer, RendererSettings};
 use crate::rig::{Rig, RigError};
 use crate::telemetry::monitor::RunMonitor;
 use crate::telemetry::report::Report;
@@ -79,7 +79,11 @@ fn run_from(
 ) -> Result<RunOutcome, PipelineError> {
     let config = &rig.config;
     let mut renderer = match gpu {
-        Some(gpu) => Some(Renderer::new(gpu, &rig.scene, renderer_settings(&rig))?),
+        Some(gpu) => {
+            let check = options.verify && config.real_time.pace == Pace::Virtual;
+            let settings = RendererSettings { output: output(&rig, gpu, check), ..renderer_settings(&rig) };
+            Some(Renderer::new(gpu, &rig.scene, settings)?)
+        }
         None => None,
     };
     let is_virtual = config.real_time.pace == Pace::Virtual;
@@ -298,5 +302,21 @@ pub fn renderer_settings(rig: &Rig) -> RendererSettings {
         camera_is_eye: false,
         leave_nothing_out: false,
         method: Method::from_config(r),
+        output: Output::Codes,
+    }
+}
+
+/// What the rig file wants back from `gpu`; with `check` the code values in any case.
+pub fn output(rig: &Rig, gpu: &Gpu, check: bool) -> Output {
+    let packs = match rig.config.render.packer {
+        Packer::Auto => !gpu.summary().software,
+        Packer::Gpu => true,
+        Packer::Cpu => false,
+    };
+    let schedule = rig.config.projector.schedule();
+    match (packs, check) {
+        (false, _) => Output::Codes,
+        (true, false) => Output::Planes(schedule),
+        (true, true) => Output::Both(schedule),
     }
 }

@@ -172,7 +172,10 @@ pub fn finish_and_pack(
     job.timeline.wall_ns[Stage::Render as usize] = if gpu > 0 { gpu } else { watch.elapsed_ns() };
     let watch = Stopwatch::start();
     let codes = slot.codes();
-    pack::pack(kernel, codes, &mut job.planes);
+    match slot.planes() {
+        Some(planes) => pack::gpu::take(planes, &mut job.planes),
+        None => pack::pack(kernel, codes, &mut job.planes),
+    }
     job.timeline.wall_ns[Stage::Pack as usize] = watch.elapsed_ns();
     if verify {
         job.code_hash = hash_codes(codes.iter().map(|c| c & 0x00ff_ffff));

@@ -10,7 +10,9 @@ pub mod rate_map;
 mod renderer;
 pub mod scene_data;
 mod scene_gpu;
+mod slot;
 pub mod sobol;
 pub mod tiles;
 
-pub use renderer::{FrameCost, FrameInputs, FrameSlot, RenderError, Renderer, RendererSettings, PASSES};
+pub use renderer::{FrameInputs, Output, RenderError, Renderer, RendererSettings};
+pub use slot::{FrameCost, FrameSlot, PASSES};

@@ -5,15 +5,17 @@ use super::method::Method;
 use super::rate_map;
 use super::scene_data::{world_bounds, SceneData, SceneDataError, SceneNeeds};
 use super::scene_gpu::SceneGpu;
+use super::slot::{DebugBuffers, FrameSlot, PASSES};
 use super::tiles::{TileList, TILE};
 use crate::geometry::projector::ProjectorCamera;
 use crate::gpu::{
     BindingKind, BindingSet, BindingTable, Buffer, CommandList, ComputePipeline, FrameFence, Gpu, GpuError,
     MemoryKind, Recorder,
 };
+use crate::pack;
 use crate::scene::Scene;
 use bytemuck::Zeroable;
-use dpm_device::planes::Raster;
+use dpm_device::planes::{PlaneSchedule, Raster};
 use dpm_shaders::structs::{
     self as gpu_structs, Counters, Frame, Guide, History, Instance, Rows, Schedule, Surface, WorkItem,
 };
@@ -41,6 +43,29 @@ pub struct RendererSettings {
     pub leave_nothing_out: bool,
     /// How rays are spent.
     pub method: Method,
+    /// What comes back.
+    pub output: Output,
+}
+
+/// What a frame brings to the host.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Output {
+    /// Code values, to be packed there.
+    Codes,
+    /// Bit planes, packed by the GPU.
+    Planes(PlaneSchedule),
+    /// Both: planes to be sent, code values to check the light against.
+    Both(PlaneSchedule),
+}
+
+impl Output {
+    /// The planes that the GPU packs.
+    pub fn schedule(&self) -> Option<&PlaneSchedule> {
+        match self {
+            Self::Codes => None,
+            Self::Planes(schedule) | Self::Both(schedule) => Some(schedule),
+        }
+    }
 }
 
 /// What changes from frame to frame. Small: it is written just before the GPU starts.
@@ -75,148 +100,11 @@ pub enum RenderError {
     Scene(#[from] SceneDataError),
 }
 
-/// Names of the passes whose ends are stamped, in order.
-pub const PASSES: &[&str] = &[
-    "primary",
-    "reproject",
-    "rate map",
-    "schedule",
-    "trace",
-    "accumulate",
-    "spatial",
-    "compensate",
-    "readback",
-];
-
 /// No frame has this number: what the history holds before the first.
 const NEVER: u32 = u32::MAX;
 /// Byte offsets in the dispatch arguments: four workgroups a tile, and one a tile in frames that decide rates.
 const PER_TILE_QUARTER: u64 = 0;
 const PER_TILE_RATES: u64 = 16;
-
-/// What a frame cost.
-#[derive(Clone, Copy, Debug, Default)]
-pub struct FrameCost {
-    /// Rays, samples and mishaps.
-    pub counters: [u32; 8],
-    /// GPU time of each pass of [`PASSES`], nanoseconds; 0 where the device has no time stamps.
-    pub pass_ns: [u64; PASSES.len()],
-}
-
-impl FrameCost {
-    /// The counters by name.
-    pub fn counters(&self) -> Counters {
-        bytemuck::cast(self.counters)
-    }
-}
-
-/// The memory of one frame in flight. Moves between threads: the render thread fills and submits it, the pack thread waits and reads.
-pub struct FrameSlot {
-    // Dropped first: it waits until the GPU no longer uses the rest.
-    fence: FrameFence,
-    list: CommandList,
-    _set: BindingSet,
-    frame: Buffer,
-    instances: Buffer,
-    arguments: Buffer,
-    tiles: Buffer,
-    counters_host: Buffer,
-    codes_host: Buffer,
-    _device_only: Vec<Buffer>,
-    debug_host: Option<DebugBuffers>,
-    tile_list: TileList,
-    raster: Raster,
-    parity: u32,
-    stamps: [u64; PASSES.len() + 1],
-}
-
-/// Copies for looking at.
-struct DebugBuffers {
-    shown: Buffer,
-    surfaces: Buffer,
-    guides: Buffer,
-    history: Buffer,
-    prior: Buffer,
-    traced: Buffer,
-    rates: Buffer,
-}
-
-impl FrameSlot {
-    /// Waits at most `timeout_ns` for the frame, then tells what it cost. Allocates nothing.
-    ///
-    /// # Errors
-    /// Timeout (still running) or device lost.
-    pub fn wait(&mut self, timeout_ns: u64) -> Result<FrameCost, GpuError> {
-        self.fence.wait(timeout_ns)?;
-        let mut cost = FrameCost {
-            counters: bytemuck::cast(self.counters_host.read::<Counters>(1)[0]),
-            ..FrameCost::default()
-        };
-        let n = self.list.stamps_ns(&mut self.stamps);
-        if n == self.stamps.len() {
-            for (i, pass) in cost.pass_ns.iter_mut().enumerate() {
-                *pass = self.stamps[i + 1].saturating_sub(self.stamps[i]);
-            }
-        }
-        Ok(cost)
-    }
-
-    /// Code values 0x00BBGGRR, row by row. Valid after [`FrameSlot::wait`].
-    pub fn codes(&self) -> &[u32] {
-        self.codes_host.read(self.raster.pixel_count())
-    }
-
-    /// Mean radiance and sample count of every pixel; only with `debug` at creation.
-    pub fn radiance(&self) -> Option<&[[f32; 4]]> {
-        self.debug_host.as_ref().map(|d| d.shown.read(self.raster.pixel_count()))
-    }
-
-    /// What each pixel's ray met; only with `debug` at creation.
-    pub fn surfaces(&self) -> Option<&[Surface]> {
-        self.debug_host.as_ref().map(|d| d.surfaces.read(self.raster.pixel_count()))
-    }
-
-    /// Noise-free facts of each lit pixel; only with `debug` at creation.
-    pub fn guides(&self) -> Option<&[Guide]> {
-        self.debug_host.as_ref().map(|d| d.guides.read(self.raster.pixel_count()))
-    }
-
-    /// History after this frame; only with `debug` at creation.
-    pub fn history(&self) -> Option<&[History]> {
-        self.debug_host.as_ref().map(|d| {
-            let n = self.raster.pixel_count();
-            let at = self.parity as usize * n;
-            &d.history.read::<History>(2 * n)[at..at + n]
-        })
-    }
-
-    /// Luminance that each pixel's history had before this frame's samples, -1 where none; only with `debug` at creation.
-    pub fn prior_luminance(&self) -> Option<Vec<f32>> {
-        self.debug_host.as_ref().map(|d| {
-            let n = self.raster.pixel_count();
-            let at = self.parity as usize * n;
-            let known = |h: &History| {
-                let [r, g, b] = h.mean;
-                if h.weight > 0.0 {
-                    r * 0.2126 + g * 0.7152 + b * 0.0722
-                } else {
-                    -1.0
-                }
-            };
-            d.prior.read::<History>(2 * n)[at..at + n].iter().map(known).collect()
-        })
-    }
-
-    /// Samples taken at each pixel this frame, w of the radiance; only with `debug` at creation.
-    pub fn traced(&self) -> Option<&[[f32; 4]]> {
-        self.debug_host.as_ref().map(|d| d.traced.read(self.raster.pixel_count()))
-    }
-
-    /// Shading rate of every tile, log2 of the coarse pixel's sides in bits 0..1 and 2..3; only with `debug` at creation.
-    pub fn rates(&self) -> Option<&[u32]> {
-        self.debug_host.as_ref().map(|d| d.rates.read(self.tile_list.len()))
-    }
-}
 
 /// Draws frames of one scene.
 pub struct Renderer {
@@ -245,6 +133,7 @@ struct Pipelines {
     accumulate: Option<ComputePipeline>,
     spatial: Option<ComputePipeline>,
     compensate: ComputePipeline,
+    pack: Option<ComputePipeline>,
 }
 
 /// Memory that outlives a frame.
@@ -338,6 +227,12 @@ impl Renderer {
             accumulate: only(method.needs_history(), dpm_shaders::ACCUMULATE)?,
             spatial: only(method.needs_spatial(), dpm_shaders::SPATIAL)?,
             compensate: pipeline(dpm_shaders::COMPENSATE)?,
+            pack: (settings.output.schedule())
+                .map(|schedule| {
+                    let constants = pack::gpu::constants(settings.raster, schedule);
+                    ComputePipeline::new(&table, dpm_shaders::PACK, &constants)
+                })
+                .transpose()?,
         };
         let pixels = if method.needs_history() { settings.raster.pixel_count() } else { 1 };
         let tiles = settings.raster.width().div_ceil(TILE) * settings.raster.height().div_ceil(TILE);
@@ -418,7 +313,14 @@ impl Renderer {
         let surfaces = size("surfaces", pixels * size_of::<Surface>(), Device)?;
         let radiance = size("radiance", pixels * 16, Device)?;
         let codes = size("code values", pixels * 4, Device)?;
-        let codes_host = size("code values", pixels * 4, Readback)?;
+        let schedule_packed = self.settings.output.schedule();
+        let codes_host = match self.settings.output {
+            Output::Planes(_) => None,
+            Output::Codes | Output::Both(_) => Some(size("code values", pixels * 4, Readback)?),
+        };
+        let plane_bytes = schedule_packed.map_or(4, |schedule| pack::gpu::len_bytes(raster, schedule));
+        let planes = size("bit planes", plane_bytes, Device)?;
+        let planes_host = schedule_packed.map(|_| size("bit planes", plane_bytes, Readback)).transpose()?;
         let method = &self.settings.method;
         let with = |wanted: bool, what, bytes, kind| size(what, if wanted { bytes } else { 16 }, kind);
         let history_bytes = self.shared.history.len_bytes();
@@ -477,6 +379,7 @@ impl Renderer {
             "B_FILTERED" => &filtered,
             "B_SHOWN" => shown,
             "B_TILE_STATES" => &self.shared.tile_states,
+            "B_PLANES" => &planes,
             other => unreachable!("binding {other} has no buffer"),
         };
         let bindings: Vec<_> = gpu_structs::BINDINGS.iter().map(|&(n, b)| (b, buffer_of(n))).collect();
@@ -516,7 +419,17 @@ impl Renderer {
             tiled(r, p.accumulate.as_ref(), PER_TILE_QUARTER);
             tiled(r, p.spatial.as_ref(), PER_TILE_QUARTER);
             tiled(r, Some(&p.compensate), PER_TILE_QUARTER);
-            r.copy(&codes, &codes_host, pixels * 4);
+            if let Some(pass) = &p.pack {
+                r.dispatch(pass, &set, pack::gpu::workgroups(raster));
+                r.barrier();
+            }
+            r.stamp();
+            if let Some(planes_host) = &planes_host {
+                r.copy(&planes, planes_host, plane_bytes);
+            }
+            if let Some(codes_host) = &codes_host {
+                r.copy(&codes, codes_host, pixels * 4);
+            }
             r.copy(&counters, &counters_host, size_of::<Counters>());
             if let Some(d) = &debug_host {
                 r.copy(shown, &d.shown, pixels * 16);
@@ -539,11 +452,14 @@ impl Renderer {
             tiles,
             counters_host,
             codes_host,
+            planes_host,
+            plane_bytes,
             _device_only: vec![
                 counters,
                 surfaces,
                 radiance,
                 codes,
+                planes,
                 guides,
                 schedule,
                 work,

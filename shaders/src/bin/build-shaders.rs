@@ -17,6 +17,7 @@ const VARIANTS: &[(&str, &str, &[&str])] = &[
     ("accumulate", "accumulate.comp", &[]),
     ("spatial", "spatial.comp", &[]),
     ("compensate", "compensate.comp", &[]),
+    ("pack", "pack.comp", &[]),
 ];
 
 fn main() -> ExitCode {

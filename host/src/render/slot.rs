@@ -1,0 +1,154 @@
+//! One frame in flight: its memory on both sides, what it cost, and what can be read back.
+
+use super::tiles::TileList;
+use crate::gpu::{BindingSet, Buffer, CommandList, FrameFence, GpuError};
+use dpm_device::planes::Raster;
+use dpm_shaders::structs::{Counters, Guide, History, Surface};
+
+/// Names of the passes whose ends are stamped, in order.
+pub const PASSES: &[&str] = &[
+    "primary",
+    "reproject",
+    "rate map",
+    "schedule",
+    "trace",
+    "accumulate",
+    "spatial",
+    "compensate",
+    "pack",
+    "readback",
+];
+
+/// What a frame cost.
+#[derive(Clone, Copy, Debug, Default)]
+pub struct FrameCost {
+    /// Rays, samples and mishaps.
+    pub counters: [u32; 8],
+    /// GPU time of each pass of [`PASSES`], nanoseconds; 0 where the device has no time stamps.
+    pub pass_ns: [u64; PASSES.len()],
+}
+
+impl FrameCost {
+    /// The counters by name.
+    pub fn counters(&self) -> Counters {
+        bytemuck::cast(self.counters)
+    }
+}
+
+/// The memory of one frame in flight. Moves between threads: the render thread fills and submits it, the pack thread waits and reads.
+pub struct FrameSlot {
+    // Dropped first: it waits until the GPU no longer uses the rest.
+    pub(super) fence: FrameFence,
+    pub(super) list: CommandList,
+    pub(super) _set: BindingSet,
+    pub(super) frame: Buffer,
+    pub(super) instances: Buffer,
+    pub(super) arguments: Buffer,
+    pub(super) tiles: Buffer,
+    pub(super) counters_host: Buffer,
+    /// `None`: only the planes come back.
+    pub(super) codes_host: Option<Buffer>,
+    /// `None`: only the code values come back.
+    pub(super) planes_host: Option<Buffer>,
+    /// Bytes of all planes.
+    pub(super) plane_bytes: usize,
+    pub(super) _device_only: Vec<Buffer>,
+    pub(super) debug_host: Option<DebugBuffers>,
+    pub(super) tile_list: TileList,
+    pub(super) raster: Raster,
+    pub(super) parity: u32,
+    pub(super) stamps: [u64; PASSES.len() + 1],
+}
+
+/// Copies for looking at.
+pub(super) struct DebugBuffers {
+    pub(super) shown: Buffer,
+    pub(super) surfaces: Buffer,
+    pub(super) guides: Buffer,
+    pub(super) history: Buffer,
+    pub(super) prior: Buffer,
+    pub(super) traced: Buffer,
+    pub(super) rates: Buffer,
+}
+
+impl FrameSlot {
+    /// Waits at most `timeout_ns` for the frame, then tells what it cost. Allocates nothing.
+    ///
+    /// # Errors
+    /// Timeout (still running) or device lost.
+    pub fn wait(&mut self, timeout_ns: u64) -> Result<FrameCost, GpuError> {
+        self.fence.wait(timeout_ns)?;
+        let mut cost = FrameCost {
+            counters: bytemuck::cast(self.counters_host.read::<Counters>(1)[0]),
+            ..FrameCost::default()
+        };
+        let n = self.list.stamps_ns(&mut self.stamps);
+        if n == self.stamps.len() {
+            for (i, pass) in cost.pass_ns.iter_mut().enumerate() {
+                *pass = self.stamps[i + 1].saturating_sub(self.stamps[i]);
+            }
+        }
+        Ok(cost)
+    }
+
+    /// Code values 0x00BBGGRR, row by row; empty when the renderer's output is planes alone. Valid after [`FrameSlot::wait`].
+    pub fn codes(&self) -> &[u32] {
+        self.codes_host.as_ref().map_or(&[], |codes| codes.read(self.raster.pixel_count()))
+    }
+
+    /// Bit planes as [`crate::pack::gpu`] lays them out; `None` unless the renderer packs. Valid after [`FrameSlot::wait`].
+    pub fn planes(&self) -> Option<&[u8]> {
+        self.planes_host.as_ref().map(|planes| planes.read(self.plane_bytes))
+    }
+
+    /// Mean radiance and sample count of every pixel; only with `debug` at creation.
+    pub fn radiance(&self) -> Option<&[[f32; 4]]> {
+        self.debug_host.as_ref().map(|d| d.shown.read(self.raster.pixel_count()))
+    }
+
+    /// What each pixel's ray met; only with `debug` at creation.
+    pub fn surfaces(&self) -> Option<&[Surface]> {
+        self.debug_host.as_ref().map(|d| d.surfaces.read(self.raster.pixel_count()))
+    }
+
+    /// Noise-free facts of each lit pixel; only with `debug` at creation.
+    pub fn guides(&self) -> Option<&[Guide]> {
+        self.debug_host.as_ref().map(|d| d.guides.read(self.raster.pixel_count()))
+    }
+
+    /// History after this frame; only with `debug` at creation.
+    pub fn history(&self) -> Option<&[History]> {
+        self.debug_host.as_ref().map(|d| {
+            let n = self.raster.pixel_count();
+            let at = self.parity as usize * n;
+            &d.history.read::<History>(2 * n)[at..at + n]
+        })
+    }
+
+    /// Luminance that each pixel's history had before this frame's samples, -1 where none; only with `debug` at creation.
+    pub fn prior_luminance(&self) -> Option<Vec<f32>> {
+        self.debug_host.as_ref().map(|d| {
+            let n = self.raster.pixel_count();
+            let at = self.parity as usize * n;
+            let known = |h: &History| {
+                let [r, g, b] = h.mean;
+                if h.weight > 0.0 {
+                    r * 0.2126 + g * 0.7152 + b * 0.0722
+                } else {
+                    -1.0
+                }
+            };
+            d.prior.read::<History>(2 * n)[at..at + n].iter().map(known).collect()
+        })
+    }
+
+    /// Samples taken at each pixel this frame, w of the radiance; only with `debug` at creation.
+    pub fn traced(&self) -> Option<&[[f32; 4]]> {
+        self.debug_host.as_ref().map(|d| d.traced.read(self.raster.pixel_count()))
+    }
+
+    /// Shading rate of every tile, log2 of the coarse pixel's sides in bits 0..1 and 2..3; only with `debug` at creation.
+    pub fn rates(&self) -> Option<&[u32]> {
+        self.debug_host.as_ref().map(|d| d.rates.read(self.tile_list.len()))
+    }
+}
