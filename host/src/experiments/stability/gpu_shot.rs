@@ -4,7 +4,7 @@ use super::estimate::Estimate;
 use crate::geometry::projector::ProjectorCamera;
 use crate::gpu::Gpu;
 use crate::render::method::Method;
-use crate::render::{FrameInputs, FrameSlot, Renderer, RendererSettings};
+use crate::render::{FrameInputs, FrameSlot, Output, Renderer, RendererSettings};
 use crate::scene::Scene;
 use dpm_shaders::structs::{Counters, Surface, NO_HIT};
 use glam::{DAffine3, DVec3};
@@ -89,6 +89,7 @@ impl<'a> Shot<'a> {
             camera_is_eye: self.eye.is_none(),
             leave_nothing_out: self.leave_nothing_out,
             method: self.method.clone().unwrap_or_else(|| Method::full(self.spp)),
+            output: Output::Codes,
         }
     }
 
