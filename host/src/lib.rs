@@ -5,6 +5,7 @@
 pub mod cli;
 pub mod clock;
 pub mod config;
+pub mod control;
 pub mod dlpc900;
 pub mod experiments;
 pub mod failure;

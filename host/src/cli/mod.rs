@@ -4,6 +4,8 @@ pub mod bench;
 pub mod dlpc900;
 pub mod doctor;
 pub mod error;
+pub mod keys;
+pub mod order;
 pub mod os;
 pub mod plan;
 pub mod profile;
@@ -15,6 +17,7 @@ pub mod stability;
 pub mod watch;
 
 use crate::failure::Failure;
+use crate::telemetry::monitor::Order;
 use clap::{ColorChoice, CommandFactory, FromArgMatches, Parser, Subcommand};
 use std::io::Write;
 use std::process::ExitCode;
@@ -36,6 +39,15 @@ enum Command {
     Demo(run::DemoArgs),
     /// Run a rig file
     Run(run::RunArgs),
+    /// Make the projector of a running rig dark; the rig goes on
+    Black(order::OrderArgs),
+    /// Hold the frame that the projector of a running rig shows
+    Freeze(order::OrderArgs),
+    /// Make the projector of a running rig dark and latch it
+    Safe(order::OrderArgs),
+    /// Let light through again after black, freeze, safe or a fault, which this acknowledges
+    #[command(visible_alias = "resume")]
+    Arm(order::OrderArgs),
     /// Measure where the time between motion and light goes
     Profile(profile::ProfileArgs),
     /// Say what this machine can do, and what to do about what is missing
@@ -81,6 +93,10 @@ fn dispatch(command: &Command) -> Result<(), Failure> {
     match command {
         Command::Demo(args) => run::execute_demo(args),
         Command::Run(args) => run::execute(args),
+        Command::Black(args) => order::execute(args, Order::Black),
+        Command::Freeze(args) => order::execute(args, Order::Freeze),
+        Command::Safe(args) => order::execute(args, Order::Safe),
+        Command::Arm(args) => order::execute(args, Order::Arm),
         Command::Profile(args) => profile::execute(args),
         Command::Doctor(args) => doctor::execute(args),
         Command::Stability(args) => stability::execute(args),

@@ -1,14 +1,15 @@
 //! A running pipeline into a progress bar on a terminal, or one JSON line a second on anything else.
 
+use super::keys::Keys;
 use super::signals;
 use crate::config::{OutputConfig, ProjectorBackend, RigConfig};
+use crate::control::{runtime_folder, ControlSocket};
 use crate::failure::{Failure, FailureKind};
 use crate::files::{InstanceLock, LockError};
 use crate::telemetry::monitor::{ProjectorHealth, RunCounts, RunMonitor};
 use crate::telemetry::report::Report;
 use indicatif::{ProgressBar, ProgressDrawTarget, ProgressStyle};
 use std::io::{IsTerminal, Write};
-use std::path::PathBuf;
 use std::sync::mpsc::{channel, RecvTimeoutError};
 use std::sync::Arc;
 use std::time::{Duration, Instant};
@@ -59,6 +60,19 @@ pub fn watch<T: Send + 'static>(
     };
     let mut progress = Progress::new(frames);
     let mut health = ProjectorHealth::Connecting;
+    let mut keys = Keys::new();
+    let keys_told = if keys.is_some() { "; keys b, f, s, a" } else { "" };
+    let control = ControlSocket::serve(&runtime_folder(), Arc::clone(&monitor));
+    match &control {
+        Ok(socket) => progress.note(&format!(
+            "control: dpm black | freeze | safe | arm --pid {}{keys_told}; socket {}",
+            std::process::id(),
+            socket.path().display()
+        )),
+        Err(e) => {
+            progress.note(&format!("no control socket in {}: {e}{keys_told}", runtime_folder().display()))
+        }
+    }
     let result = loop {
         match finished.recv_timeout(TICK) {
             Ok(result) => break result,
@@ -68,6 +82,10 @@ pub fn watch<T: Send + 'static>(
                         progress.note(&format!("{signal}: stopping"));
                         monitor.request_stop();
                     }
+                }
+                for order in keys.iter_mut().flat_map(Keys::pressed) {
+                    progress.note(&format!("key: {}", order.word()));
+                    monitor.give_order(order);
                 }
                 let now = monitor.projector();
                 if std::mem::replace(&mut health, now) != now {
@@ -125,14 +143,6 @@ fn take_locks(rig: &RigConfig) -> Result<Vec<InstanceLock>, Failure> {
         locks.push(InstanceLock::take(&dir.join(".dpm.lock"), &what).map_err(failure)?);
     }
     Ok(locks)
-}
-
-/// Where lock files of devices live: one place per machine and user.
-fn runtime_folder() -> PathBuf {
-    match std::env::var_os("XDG_RUNTIME_DIR") {
-        Some(dir) if !dir.is_empty() => PathBuf::from(dir).join("dpm"),
-        _ => std::env::temp_dir().join("dpm-locks"),
-    }
 }
 
 enum Progress {

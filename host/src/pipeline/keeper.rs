@@ -226,14 +226,16 @@ pub(super) fn is_dark(link: &HostLink) -> bool {
 }
 
 fn health(link: &HostLink, standing: Option<Verb>) -> ProjectorHealth {
+    use DeviceState as D;
+    let state = link.status().map_or(D::Idle, |s| s.state);
     match (link.state(), standing) {
         (LinkState::Lost | LinkState::Closed, _) => ProjectorHealth::Lost,
         (LinkState::Faulted, _) => ProjectorHealth::Faulted(link.status().map_or(0, |s| s.faults)),
-        (_, Some(Verb::Black)) => ProjectorHealth::Black,
-        (_, Some(Verb::Freeze)) => ProjectorHealth::Frozen,
-        (_, Some(Verb::Safe)) => ProjectorHealth::Faulted(faults::HOST_SAFE),
-        (_, Some(Verb::Stop)) => ProjectorHealth::Stopped,
-        (LinkState::Streaming, None) => ProjectorHealth::Up,
-        (_, None) => ProjectorHealth::Connecting,
+        // Not before the projector says so.
+        (_, Some(Verb::Black)) if !matches!(state, D::Armed | D::Frozen) => ProjectorHealth::Black,
+        (_, Some(Verb::Freeze)) if state != D::Armed => ProjectorHealth::Frozen,
+        (_, Some(Verb::Stop)) if is_dark(link) => ProjectorHealth::Stopped,
+        (LinkState::Streaming, _) => ProjectorHealth::Up,
+        _ => ProjectorHealth::Connecting,
     }
 }

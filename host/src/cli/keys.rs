@@ -1,0 +1,68 @@
+//! Keys pressed on the terminal of a run into orders: b black, f freeze, s safe, a arm.
+#![allow(unsafe_code)]
+
+use crate::telemetry::monitor::Order;
+
+/// What a key means.
+pub fn order_of(key: u8) -> Option<Order> {
+    match key.to_ascii_lowercase() {
+        b'b' => Some(Order::Black),
+        b'f' => Some(Order::Freeze),
+        b's' => Some(Order::Safe),
+        b'a' => Some(Order::Arm),
+        _ => None,
+    }
+}
+
+/// The terminal at the standard input, reading single keys without echo; as it was before when dropped. Signals stay signals.
+pub struct Keys {
+    before: libc::termios,
+}
+
+/// True when this process is in the terminal's foreground: from the background, reading or setting it would stop the process.
+fn is_in_foreground() -> bool {
+    // SAFETY: both calls take plain numbers and fail with -1.
+    unsafe { libc::tcgetpgrp(libc::STDIN_FILENO) == libc::getpgrp() }
+}
+
+impl Keys {
+    /// `None` when the standard input is no terminal, or not this process's.
+    pub fn new() -> Option<Self> {
+        if !is_in_foreground() {
+            return None;
+        }
+        // SAFETY: a zeroed termios is a valid place to write to; the calls check the descriptor.
+        unsafe {
+            let mut before: libc::termios = std::mem::zeroed();
+            if libc::tcgetattr(libc::STDIN_FILENO, &mut before) != 0 {
+                return None;
+            }
+            let mut raw = before;
+            raw.c_lflag &= !(libc::ICANON | libc::ECHO);
+            raw.c_cc[libc::VMIN] = 0;
+            raw.c_cc[libc::VTIME] = 0;
+            (libc::tcsetattr(libc::STDIN_FILENO, libc::TCSANOW, &raw) == 0).then_some(Self { before })
+        }
+    }
+
+    /// The orders of the keys pressed since the last call, at most 16 keys; never waits.
+    pub fn pressed(&mut self) -> impl Iterator<Item = Order> {
+        let mut keys = [0u8; 16];
+        let mut n = 0;
+        if is_in_foreground() {
+            // SAFETY: the buffer is as long as said. With VMIN and VTIME zero the call returns at once.
+            let got = unsafe { libc::read(libc::STDIN_FILENO, keys.as_mut_ptr().cast(), keys.len()) };
+            n = usize::try_from(got).unwrap_or(0);
+        }
+        keys.into_iter().take(n).filter_map(order_of)
+    }
+}
+
+impl Drop for Keys {
+    fn drop(&mut self) {
+        if is_in_foreground() {
+            // SAFETY: `before` came from tcgetattr.
+            unsafe { libc::tcsetattr(libc::STDIN_FILENO, libc::TCSANOW, &self.before) };
+        }
+    }
+}
