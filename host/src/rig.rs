@@ -4,7 +4,7 @@ use crate::config::{BodyConfig, CalibrationUnit, EnvironmentConfig, GazeConfig, 
 use crate::geometry::distortion::Distortion;
 use crate::geometry::opencv::{self, LengthUnit};
 use crate::geometry::projector::{ProjectorCamera, ProjectorError};
-use crate::scene::{self, BodySelector, Environment, LoadOptions, Scene, SceneError};
+use crate::scene::{self, BodySelector, Environment, LoadOptions, Scene, SceneError, SceneFeatures};
 use crate::tracking::source::{self, SourceError};
 use dpm_device::planes::Raster;
 use dpm_device::pose::Pose;
@@ -146,7 +146,9 @@ impl Rig {
     /// Whatever part cannot be built, with its key.
     pub fn build(config: &RigConfig, raster: Option<Raster>) -> Result<Self, RigError> {
         let mut scene = load_scene(config)?;
-        scene.environment = environment(config)?.unwrap_or(scene.environment);
+        let features = SceneFeatures::of(&scene);
+        let has_lights = features.emissive_triangles + features.punctual_lights > 0;
+        scene.environment = environment(config, has_lights)?.unwrap_or(scene.environment);
         let raster = raster.unwrap_or_else(|| config.projector.raster());
         let camera = camera(config, raster, &mut scene.warnings)?;
         let bodies = rig_bodies(config, &scene)?;
@@ -212,14 +214,16 @@ fn load_scene(config: &RigConfig) -> Result<Scene, SceneError> {
     scene::load(file, &options)
 }
 
-/// Radiance from all around for files, which bring no environment of their own.
+/// Radiance from all around for files with lamps; files bring no environment of their own.
 const FILE_SCENE_RADIANCE: f32 = 0.25;
 
-/// The environment of the rig file; `None` keeps the scene's own (the built-in scene brings one).
-fn environment(config: &RigConfig) -> Result<Option<Environment>, RigError> {
+/// The environment of the rig file, for a scene that has lights or has none; `None` keeps the scene's own (the built-in scene brings one).
+fn environment(config: &RigConfig, has_lights: bool) -> Result<Option<Environment>, RigError> {
     let even = |[r, g, b]: [f64; 3]| Environment::Constant(Vec3::new(r as f32, g as f32, b as f32));
     Ok(match &config.scene.environment {
         EnvironmentConfig::Auto(_) if config.scene.file.is_none() => None,
+        EnvironmentConfig::Auto(_) if !has_lights => Some(scene::studio()),
+        EnvironmentConfig::Studio(_) => Some(scene::studio()),
         EnvironmentConfig::Auto(_) => Some(Environment::Constant(Vec3::splat(FILE_SCENE_RADIANCE))),
         EnvironmentConfig::Constant(c) => Some(even(c.radiance)),
         EnvironmentConfig::Image(c) => {

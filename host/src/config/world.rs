@@ -189,8 +189,11 @@ words! {
 kinds! {
     /// Light from infinitely far away.
     pub enum EnvironmentConfig {
-        /// what the built-in scene brings; for files, which bring none, even light of 0.25.
+        /// what the built-in scene brings; for files, which bring none, a studio with soft boxes, or even light of 0.25 where the file
+        /// has lamps or emissive surfaces.
         Auto(AutoEnvironmentConfig) = "auto",
+        /// soft boxes in a dim room, 0.25 in the mean.
+        Studio(StudioEnvironmentConfig) = "studio",
         /// the same radiance from everywhere.
         Constant(ConstantEnvironmentConfig) = "constant",
         /// a latitude-longitude picture.
@@ -202,6 +205,11 @@ kinds! {
 section! {
     /// The scene's own light.
     pub struct AutoEnvironmentConfig {}
+}
+
+section! {
+    /// Soft boxes: key from the right in front (+X, +Y, +Z), fill from the left, rim from behind.
+    pub struct StudioEnvironmentConfig {}
 }
 
 section! {

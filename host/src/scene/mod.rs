@@ -13,6 +13,7 @@ pub mod mesh;
 pub mod polygonise;
 mod procedural;
 mod stats;
+mod studio;
 mod surface;
 
 use glam::{DAffine3, Vec2, Vec3, Vec4};
@@ -23,6 +24,7 @@ pub use error::SceneError;
 pub use limits::Limits;
 pub use load::{load, load_bytes, BodySelector, LoadOptions};
 pub use stats::{EnvironmentFeature, SceneFeatures};
+pub use studio::studio;
 pub use surface::sample_points;
 
 /// Everything that light meets. Immutable once loaded; bodies move by poses that are kept elsewhere.
