@@ -26,7 +26,11 @@ const CEILING: Vec3 = Vec3::new(0.10, 0.12, 0.15);
 /// Key from the upper right in front, fill from the left, rim from behind above.
 const BOXES: [SoftBox; 3] = [
     SoftBox { toward: Vec3::new(0.7, 0.8, 0.9), half: [0.38, 0.28], radiance: Vec3::new(2.5, 2.35, 2.15) },
-    SoftBox { toward: Vec3::new(-1.0, 0.25, 0.55), half: [0.25, 0.55], radiance: Vec3::new(0.56, 0.68, 0.82) },
+    SoftBox {
+        toward: Vec3::new(-1.0, 0.25, 0.55),
+        half: [0.25, 0.55],
+        radiance: Vec3::new(0.56, 0.68, 0.82),
+    },
     SoftBox { toward: Vec3::new(-0.4, 0.9, -1.0), half: [0.45, 0.2], radiance: Vec3::new(1.5, 1.55, 1.7) },
 ];
 
