@@ -30,7 +30,7 @@ pub use config::{LightEvent, LightKind, MockConfig};
 pub use faulty::FaultyProjector;
 use frames::{FrameStore, Held};
 pub use light::{light_of_planes, Exposure};
-pub use thread::ProjectorThread;
+pub use thread::serve_cable;
 
 /// Echo answers that may wait to be fetched; later requests are dropped, as a busy device would.
 const ECHOES_KEPT: usize = 16;

@@ -12,6 +12,7 @@ use super::decoder::Decoder;
 use super::flash::FlashLimiter;
 use super::header::{Codec, Header, Packet, VERSION};
 use super::message::{
+
     Config, ConfigRefusal, DeviceHello, DeviceState, Echo, Fault, FaultCode, HostHello, HostMessage, Status,
     MAX_CONTROL_BYTES,
 };
@@ -119,7 +120,7 @@ impl HostLink {
     }
 
     /// Permits light once the device is configured, shows the picture again after BLACK or FREEZE, or acknowledges latched
-    /// faults (bits of [`super::faults`]) after a fault. Never called by the link itself.
+    /// faults (bits of [`super::faults`]) after a fault.
     pub fn arm(&mut self, acknowledge: u32) {
         self.acknowledge = acknowledge;
         self.verb = None;
@@ -131,6 +132,11 @@ impl HostLink {
             // Disarming made the device forget what frames could refer to.
             self.key_due = true;
         }
+    }
+
+    /// True while light rests after too many flashes.
+    pub fn is_resting(&self, now: HostTime) -> bool {
+        self.rest_until.is_some_and(|end| now < end)
     }
 
     /// Sends `verb` now and again every 20 ms until the device confirms it.

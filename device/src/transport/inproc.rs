@@ -4,7 +4,8 @@
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::Arc;
 
-use crossbeam::queue::ArrayQueue;
+use dpm_handoff::ring::{exchange, ring, Consumer, Drainer, Filler, Producer};
+use dpm_handoff::wake::{WaitPolicy, Waiter, Waker};
 
 use super::{Lane, LinkDevice, SendError, Transport, TransportError};
 use crate::link::Packet;
@@ -74,45 +75,46 @@ struct Small {
     bytes: [u8; SMALL_BYTES],
 }
 
+/// A frame on the wire.
 struct Large {
     len: usize,
     bytes: Box<[u8]>,
 }
 
-struct Shared {
-    /// Filled buffers on their way to the device; one is one call of `send`.
-    filled: ArrayQueue<Large>,
-    /// Empty buffers on their way back.
-    empty: ArrayQueue<Large>,
-    control: ArrayQueue<Small>,
-    replies: ArrayQueue<Small>,
-    unplugged: AtomicBool,
+/// The host's end of a threaded in-process cable.
+pub struct HostEnd {
+    frames: Filler<Large>,
+    control: Producer<Small>,
+    replies: Consumer<Small>,
+    device: Waker,
+    unplugged: Arc<AtomicBool>,
 }
 
-/// The host's end of a threaded in-process cable.
-pub struct HostEnd(Arc<Shared>);
-
 /// The device's end of a threaded in-process cable.
-pub struct DeviceEnd(Arc<Shared>);
+pub struct DeviceEnd {
+    frames: Drainer<Large>,
+    control: Consumer<Small>,
+    replies: Producer<Small>,
+    waiter: Waiter,
+    unplugged: Arc<AtomicBool>,
+}
 
-/// A cable between two threads with `depth` recycled buffers of `frame_bytes` each: neither end locks, waits or allocates.
-/// `frame_bytes` is the size of the largest frame on the wire, see [`crate::link::packet_bytes`].
-///
-/// The rings are lock-free but not wait-free: a thread suspended inside a push can make the other back off for that long.
-pub fn threaded(frame_bytes: usize, depth: usize) -> (HostEnd, DeviceEnd) {
-    let depth = depth.max(1);
-    let shared = Arc::new(Shared {
-        filled: ArrayQueue::new(depth),
-        empty: ArrayQueue::new(depth),
-        control: ArrayQueue::new(SMALL_DEPTH),
-        replies: ArrayQueue::new(SMALL_DEPTH),
-        unplugged: AtomicBool::new(false),
-    });
-    for _ in 0..depth {
-        let fresh = Large { len: 0, bytes: vec![0; frame_bytes].into_boxed_slice() };
-        assert!(shared.empty.push(fresh).is_ok(), "a ring of {depth} holds {depth} buffers");
-    }
-    (HostEnd(shared.clone()), DeviceEnd(shared))
+/// A cable between two threads with `depth` recycled buffers of `frame_bytes` each: neither end locks, waits or allocates, and the device's
+/// thread, which rests by `policy` in [`DeviceEnd::rest`], is woken by whatever arrives. `frame_bytes` is the size of the largest frame
+/// on the wire, see [`crate::link::packet_bytes`]. Two buffers keep both ends busy; more only leave the caches colder.
+pub fn threaded(frame_bytes: usize, depth: usize, policy: WaitPolicy) -> (HostEnd, DeviceEnd) {
+    // Written once, so that the memory is there before the first frame.
+    let buffers = (0..depth.max(1)).map(|_| Large { len: 0, bytes: vec![0x5a; frame_bytes].into_boxed_slice() });
+    let (filler, drainer) = exchange(buffers.collect());
+    let (control_in, control_out) = ring(SMALL_DEPTH);
+    let (replies_in, replies_out) = ring(SMALL_DEPTH);
+    let waiter = Waiter::new(policy);
+    let unplugged = Arc::new(AtomicBool::new(false));
+    let device = waiter.waker();
+    (
+        HostEnd { frames: filler, control: control_in, replies: replies_out, device, unplugged: unplugged.clone() },
+        DeviceEnd { frames: drainer, control: control_out, replies: replies_in, waiter, unplugged },
+    )
 }
 
 fn gather(out: &mut [u8], packets: &[Packet<'_>]) -> usize {
@@ -128,7 +130,7 @@ fn gather(out: &mut [u8], packets: &[Packet<'_>]) -> usize {
 
 impl HostEnd {
     fn gone(&self) -> Result<(), TransportError> {
-        if self.0.unplugged.load(Ordering::Acquire) {
+        if self.unplugged.load(Ordering::Acquire) {
             Err(TransportError::Unplugged { device: self.name().into() })
         } else {
             Ok(())
@@ -148,10 +150,10 @@ impl Transport for HostEnd {
                 );
                 let mut small = Small { lane, len: bytes as u8, bytes: [0; SMALL_BYTES] };
                 gather(&mut small.bytes, packets);
-                self.0.control.push(small).map_err(|_| SendError::Busy)
+                self.control.push(small).map_err(|_| SendError::Busy)?;
             }
             Lane::Data => {
-                let mut large = self.0.empty.pop().ok_or(SendError::Busy)?;
+                let mut large = self.frames.take_free().ok_or(SendError::Busy)?;
                 assert!(
                     bytes <= large.bytes.len(),
                     "frame of {bytes} bytes, buffers of {}",
@@ -159,22 +161,24 @@ impl Transport for HostEnd {
                 );
                 large.len = gather(&mut large.bytes, packets);
                 // Never full: there are as many places as buffers.
-                self.0.filled.push(large).map_err(|_| SendError::Busy)
+                self.frames.send(large).map_err(|_| SendError::Busy)?;
             }
         }
+        self.device.wake();
+        Ok(())
     }
 
     fn has_room(&mut self, lane: Lane) -> bool {
         match lane {
-            Lane::Data => !self.0.empty.is_empty(),
-            Lane::Control => !self.0.control.is_full(),
+            Lane::Data => self.frames.has_free(),
+            Lane::Control => self.control.len() < SMALL_DEPTH,
         }
     }
 
     fn receive(&mut self, _now: HostTime, sink: &mut dyn FnMut(Lane, &[u8])) -> Result<(), TransportError> {
         // As many as the ring holds: a device that talks without end cannot keep this call from returning.
         for _ in 0..SMALL_DEPTH {
-            let Some(small) = self.0.replies.pop() else { break };
+            let Some(small) = self.replies.pop() else { break };
             sink(small.lane, &small.bytes[..small.len as usize]);
         }
         self.gone()
@@ -187,7 +191,8 @@ impl Transport for HostEnd {
 
 impl Drop for HostEnd {
     fn drop(&mut self) {
-        self.0.unplugged.store(true, Ordering::Release);
+        self.unplugged.store(true, Ordering::Release);
+        self.device.wake();
     }
 }
 
@@ -196,33 +201,50 @@ impl DeviceEnd {
     /// when the host's end is gone. Replies that find no room are lost, as on a cable nobody reads.
     pub fn serve(&mut self, now: HostTime, device: &mut dyn LinkDevice) -> bool {
         for _ in 0..SMALL_DEPTH {
-            let Some(small) = self.0.control.pop() else { break };
+            let Some(small) = self.control.pop() else { break };
             device.receive(now, small.lane, &small.bytes[..small.len as usize]);
         }
-        if let Some(large) = self.0.filled.pop() {
+        if let Some(large) = self.frames.receive() {
             device.receive(now, Lane::Data, &large.bytes[..large.len]);
-            let returned = self.0.empty.push(large);
+            let returned = self.frames.give_back(large);
             debug_assert!(returned.is_ok(), "as many places as buffers");
         }
         device.advance_to(now);
+        let replies = &mut self.replies;
         device.replies(now, &mut |lane, bytes| {
             if bytes.len() <= SMALL_BYTES {
                 let mut small = Small { lane, len: bytes.len() as u8, bytes: [0; SMALL_BYTES] };
                 small.bytes[..bytes.len()].copy_from_slice(bytes);
-                let _ = self.0.replies.push(small);
+                let _ = replies.push(small);
             }
         });
-        !self.0.unplugged.load(Ordering::Acquire)
+        !self.unplugged.load(Ordering::Acquire)
+    }
+
+    /// Rests until something arrives, the host's end goes, or the clock `now` reaches `until` (the device's next own event); returns
+    /// at once when there is something to be served.
+    pub fn rest(&mut self, until: HostTime, now: impl Fn() -> HostTime) {
+        let Self { frames, control, unplugged, waiter, .. } = self;
+        waiter.wait(
+            until.0,
+            || now().0,
+            || !control.is_empty() || frames.has_filled() || unplugged.load(Ordering::Acquire),
+        );
     }
 
     /// True when nothing waits to be served.
     pub fn is_idle(&self) -> bool {
-        self.0.control.is_empty() && self.0.filled.is_empty()
+        self.control.is_empty() && !self.frames.has_filled()
+    }
+
+    /// Wakes the thread that rests, for whoever wants to end it.
+    pub fn waker(&self) -> Waker {
+        self.waiter.waker()
     }
 }
 
 impl Drop for DeviceEnd {
     fn drop(&mut self) {
-        self.0.unplugged.store(true, Ordering::Release);
+        self.unplugged.store(true, Ordering::Release);
     }
 }

@@ -1,92 +1,34 @@
-//! A projector on a thread of its own, for rigs that run at the pace of the wall clock.
+//! A projector at the end of a cable between threads, for rigs that run at the pace of the wall clock.
 //!
 //! The thread never decides *when* light falls: it asks the clock it is given and lets the state machine catch up, so an event's
 //! times are exact however late the thread runs; only packets that wait for it arrive late.
 
-use std::sync::atomic::{AtomicBool, Ordering};
-use std::sync::Arc;
-use std::thread::JoinHandle;
-use std::time::Duration;
-
-use crossbeam::queue::ArrayQueue;
 use dpm_device::time::HostTime;
 use dpm_device::transport::inproc::DeviceEnd;
 
-use super::{LightEvent, MockProjector};
+use super::MockProjector;
 
-/// Longest rest of an idle thread: how late a packet may be served when nothing else is due.
-const REST: Duration = Duration::from_micros(100);
-/// Light events that may wait to be taken.
-const EVENTS: usize = 4096;
+/// Longest rest of a thread for whose projector nothing is due.
+const REST_NS: i64 = 1_000_000_000;
 
-/// A running projector. Dropping it stops the thread.
-pub struct ProjectorThread {
-    thread: Option<JoinHandle<MockProjector>>,
-    stop: Arc<AtomicBool>,
-    events: Arc<ArrayQueue<LightEvent>>,
-}
-
-impl ProjectorThread {
-    /// Starts a thread that serves `cable` with `projector` until stopped or until the host's end is gone. `clock` gives the
-    /// rig's time.
-    ///
-    /// # Errors
-    /// When the system gives no thread.
-    pub fn start(
-        mut projector: MockProjector,
-        mut cable: DeviceEnd,
-        clock: impl Fn() -> HostTime + Send + 'static,
-    ) -> std::io::Result<Self> {
-        let stop = Arc::new(AtomicBool::new(false));
-        let events = Arc::new(ArrayQueue::new(EVENTS));
-        let (stopped, sink) = (stop.clone(), events.clone());
-        let thread = std::thread::Builder::new().name("mock-projector".into()).spawn(move || {
-            let mut plugged = true;
-            while plugged && !stopped.load(Ordering::Acquire) {
-                plugged = cable.serve(clock(), &mut projector);
-                while let Some(event) = projector.next_light() {
-                    // Newest matter most: the oldest makes room.
-                    let _ = sink.force_push(event);
-                }
-                if cable.is_idle() {
-                    let due = projector.next_due().map_or(i64::MAX, |at| at.ns_since(clock()));
-                    let rest = REST.min(Duration::from_nanos(due.max(0) as u64));
-                    if !rest.is_zero() {
-                        std::thread::park_timeout(rest);
-                    }
-                }
-            }
-            projector
-        })?;
-        Ok(Self { thread: Some(thread), stop, events })
-    }
-
-    /// The oldest light event not yet taken; takes no lock.
-    pub fn next_light(&self) -> Option<LightEvent> {
-        self.events.pop()
-    }
-
-    /// Ends the thread and returns the projector.
-    ///
-    /// # Panics
-    /// When the thread panicked.
-    pub fn stop(mut self) -> MockProjector {
-        self.stop.store(true, Ordering::Release);
-        let thread = self.thread.take().expect("taken only here and in drop");
-        thread.thread().unpark();
-        thread.join().expect("the mock projector's thread panicked")
-    }
-}
-
-impl Drop for ProjectorThread {
-    fn drop(&mut self) {
-        self.stop.store(true, Ordering::Release);
-        if let Some(thread) = self.thread.take() {
-            thread.thread().unpark();
-            // A panic there has been reported on standard error; dropping must not panic again.
-            let _ = thread.join();
+/// Serves `cable` with `projector` until the host's end is gone. Sleeps between what arrives and what is due. `clock` gives the rig's
+/// time; `witness` is called with it before anything that arrived is delivered, to let the projector live up to then and take its light.
+pub fn serve_cable(
+    projector: &mut MockProjector,
+    mut cable: DeviceEnd,
+    clock: impl Fn() -> HostTime,
+    mut witness: impl FnMut(&mut MockProjector, HostTime),
+) {
+    loop {
+        let now = clock();
+        witness(projector, now);
+        if !cable.serve(now, projector) {
+            break;
         }
+        let limit = now.plus_ns(REST_NS);
+        cable.rest(projector.next_due().map_or(limit, |due| due.min(limit)), &clock);
     }
+    witness(projector, clock());
 }
 
 #[cfg(test)]
@@ -97,7 +39,9 @@ mod tests {
     use dpm_device::planes::{PlaneSchedule, Raster};
     use dpm_device::time::{DeviceTicks, FrameRate};
     use dpm_device::transport::inproc::threaded;
-    use std::time::Instant;
+    use dpm_device::transport::LinkDevice;
+    use dpm_handoff::wake::WaitPolicy;
+    use std::time::{Duration, Instant};
 
     /// At the pace of the wall clock, over the rings: whatever the scheduler does, what is lit was sent and nothing is lost
     /// without a reason.
@@ -105,11 +49,22 @@ mod tests {
     fn frames_cross_between_threads() {
         let raster = Raster::new(64, 16).unwrap();
         let frame_bytes = packet_bytes(raster.plane_bytes()) * 24 + packet_bytes(16);
-        let (mut host, device) = threaded(frame_bytes, 4);
+        let (mut host, device) = threaded(frame_bytes, 4, WaitPolicy::Park);
         let start = Instant::now();
         let clock = move || HostTime(start.elapsed().as_nanos() as i64);
-        let mock =
-            ProjectorThread::start(MockProjector::new(MockConfig::new(raster)), device, clock).unwrap();
+        let thread = std::thread::spawn(move || {
+            let mut mock = MockProjector::new(MockConfig::new(raster));
+            let mut lit = Vec::new();
+            serve_cable(&mut mock, device, clock, |mock, now| {
+                mock.advance_to(now);
+                while let Some(e) = mock.next_light() {
+                    if e.kind == LightKind::Lit {
+                        lit.push(e.frame.unwrap());
+                    }
+                }
+            });
+            (mock, lit)
+        });
         let mut link = HostLink::new(LinkSettings {
             raster,
             schedule: PlaneSchedule::rgb24(),
@@ -144,13 +99,8 @@ mod tests {
         }
         assert_eq!(sent, 40, "streaming within 20 s");
         std::thread::sleep(Duration::from_millis(50));
-        let mut lit = Vec::new();
-        while let Some(e) = mock.next_light() {
-            if e.kind == LightKind::Lit {
-                lit.push(e.frame.unwrap());
-            }
-        }
-        let mut mock = mock.stop();
+        drop(host);
+        let (mut mock, lit) = thread.join().unwrap();
         mock.check_laws();
         let s = mock.status();
         assert_eq!(lit.len() as u32, s.frames_lit);
@@ -165,14 +115,49 @@ mod tests {
     #[test]
     fn the_thread_ends_with_the_cable() {
         let raster = Raster::new(8, 8).unwrap();
-        let (host, device) = threaded(1000, 2);
-        let mock = MockProjector::new(MockConfig::new(raster));
-        let thread = ProjectorThread::start(mock, device, || HostTime(0)).unwrap();
+        let (host, device) = threaded(1000, 2, WaitPolicy::Park);
+        let start = Instant::now();
+        let clock = move || HostTime(start.elapsed().as_nanos() as i64);
+        let thread = std::thread::spawn(move || {
+            let mut mock = MockProjector::new(MockConfig::new(raster));
+            serve_cable(&mut mock, device, clock, |mock, now| mock.advance_to(now));
+        });
+        // Asleep for a second by itself, in which it is woken.
+        std::thread::sleep(Duration::from_millis(20));
         drop(host);
         let deadline = Instant::now() + Duration::from_secs(10);
-        while !thread.thread.as_ref().unwrap().is_finished() {
+        while !thread.is_finished() {
             assert!(Instant::now() < deadline, "still running without a cable");
             std::thread::sleep(Duration::from_millis(1));
         }
+    }
+
+    /// What the thread costs while nothing happens: it sleeps, it does not look.
+    #[cfg(target_os = "linux")]
+    #[test]
+    fn an_idle_projector_uses_no_processor() {
+        let ticks = |id: &str| -> u64 {
+            let stat = std::fs::read_to_string(format!("/proc/self/task/{id}/stat")).unwrap();
+            let fields: Vec<&str> = stat.rsplit(')').next().unwrap().split_whitespace().collect();
+            fields[11].parse::<u64>().unwrap() + fields[12].parse::<u64>().unwrap()
+        };
+        let raster = Raster::new(8, 8).unwrap();
+        let (host, device) = threaded(1000, 2, WaitPolicy::Park);
+        let start = Instant::now();
+        let clock = move || HostTime(start.elapsed().as_nanos() as i64);
+        let (give, take) = std::sync::mpsc::channel();
+        let thread = std::thread::spawn(move || {
+            let id = std::fs::read_link("/proc/thread-self").unwrap();
+            give.send(id.file_name().unwrap().to_str().unwrap().to_owned()).unwrap();
+            let mut mock = MockProjector::new(MockConfig::new(raster));
+            serve_cable(&mut mock, device, clock, |mock, now| mock.advance_to(now));
+        });
+        let id = take.recv().unwrap();
+        let before = ticks(&id);
+        std::thread::sleep(Duration::from_millis(300));
+        // In hundredths of a second, of thirty.
+        assert!(ticks(&id) - before <= 3);
+        drop(host);
+        thread.join().unwrap();
     }
 }

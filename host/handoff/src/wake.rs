@@ -4,6 +4,8 @@
 //! itself, so a wake-up is only ever a hint and a spurious one is harmless.
 
 use crate::sync::{fence, thread, Arc, AtomicBool, Ordering};
+// Of the standard library under the model checker, too: it only hands over who waits, and what it promises is not in question.
+use std::sync::OnceLock;
 #[cfg(not(loom))]
 use std::time::Duration;
 
@@ -36,41 +38,43 @@ impl WaitPolicy {
 struct Shared {
     /// The waiting thread is about to park or has parked.
     parked: AtomicBool,
+    /// Who waits: the first thread that did.
+    thread: OnceLock<thread::Thread>,
 }
 
 /// Wakes one waiting thread. Any number of clones.
 #[derive(Clone, Debug)]
 pub struct Waker {
     shared: Arc<Shared>,
-    thread: thread::Thread,
 }
 
-/// The waiting side. Stays on the thread that made it.
+/// The waiting side. May be made anywhere and moved to the thread that waits; from its first wait on it belongs there.
 #[derive(Debug)]
 pub struct Waiter {
     shared: Arc<Shared>,
     policy: WaitPolicy,
-    /// `park` wakes the thread that made the waiter, so the waiter must not move to another.
-    _not_send: std::marker::PhantomData<*const ()>,
+    /// One thread waits: not shared between several.
+    _not_sync: std::marker::PhantomData<std::cell::Cell<()>>,
 }
 
 impl Waiter {
-    /// A waiter for the current thread; hand [`Waiter::waker`] to whoever feeds it.
+    /// A waiter that nobody uses yet; hand [`Waiter::waker`] to whoever feeds it.
     pub fn new(policy: WaitPolicy) -> Self {
         Self {
-            shared: Arc::new(Shared { parked: AtomicBool::new(false) }),
+            shared: Arc::new(Shared { parked: AtomicBool::new(false), thread: OnceLock::new() }),
             policy,
-            _not_send: std::marker::PhantomData,
+            _not_sync: std::marker::PhantomData,
         }
     }
 
-    /// A waker for this thread.
+    /// A waker for the thread that waits.
     pub fn waker(&self) -> Waker {
-        Waker { shared: self.shared.clone(), thread: thread::current() }
+        Waker { shared: self.shared.clone() }
     }
 
     /// Waits until `ready` says true or the clock `now_ns` reaches `deadline_ns`; returns what `ready` said last. `ready` is
-    /// asked at least once, even when the deadline has passed.
+    /// asked at least once, even when the deadline has passed. A thread other than the first one that waited is woken by its
+    /// deadline only.
     pub fn wait(
         &self,
         deadline_ns: i64,
@@ -95,12 +99,14 @@ impl Waiter {
                 }
             }
         }
+        self.shared.thread.get_or_init(thread::current);
         loop {
             let left_ns = deadline_ns.saturating_sub(now_ns());
             if left_ns <= 0 {
                 return ready();
             }
-            self.shared.parked.store(true, Ordering::Relaxed);
+            // Release: whoever sees the announcement sees who waits.
+            self.shared.parked.store(true, Ordering::Release);
             // Announce before looking; the waker publishes before it looks for the announcement. The two fences are in one
             // total order, so at least one of the two sees the other and no wake-up is lost (Dekker).
             fence(Ordering::SeqCst);
@@ -126,10 +132,12 @@ impl Waker {
     pub fn wake(&self) {
         // Pairs with the fence in `wait`.
         fence(Ordering::SeqCst);
-        // Relaxed: `unpark` and `park` synchronise by themselves; a stale true costs one needless unpark. The swap lets one of
-        // several wakers do the work.
-        if self.shared.parked.load(Ordering::Relaxed) && self.shared.parked.swap(false, Ordering::Relaxed) {
-            self.thread.unpark();
+        // Only the waiter writes the flag: a true that is left standing costs a needless unpark, which is no system call unless
+        // the thread sleeps. Acquire: see who waits; `unpark` and `park` synchronise the rest by themselves.
+        if self.shared.parked.load(Ordering::Acquire) {
+            if let Some(thread) = self.shared.thread.get() {
+                thread.unpark();
+            }
         }
     }
 }
@@ -210,13 +218,13 @@ mod loom_tests {
             let (mut publisher, mut reader) = latest(0u32);
             let waiter = Waiter::new(WaitPolicy::Park);
             let waker = waiter.waker();
-            let writer = loom::thread::spawn(move || {
+            // Not joined: loom takes an `unpark` that comes late for the end of the join.
+            loom::thread::spawn(move || {
                 publisher.publish(1);
                 waker.wake();
             });
             assert!(waiter.wait(i64::MAX, || 0, || reader.latest().1));
             assert_eq!(reader.latest().0, &1);
-            writer.join().unwrap();
         });
     }
 }

@@ -1,7 +1,6 @@
 //! Finished frames and light into a report. Runs on its own thread, off the frame path: it may allocate.
 
-use super::handoff::Ring;
-use super::job::FrameJob;
+use super::job::{Fate, FrameNote};
 use super::light::LightNote;
 use crate::config::Pace;
 use crate::frame::{FrameId, FrameTimeline, Stage, STAGES};
@@ -12,7 +11,8 @@ use crate::telemetry::profile::Profiler;
 use crate::telemetry::report::{Report, Spread, StageTime};
 use crate::telemetry::slots::SlotLedger;
 use crate::telemetry::trace::TracedFrame;
-use dpm_device::link::{frame_newer, SendOutcome};
+use dpm_device::link::frame_newer;
+use dpm_handoff::channel::{Receiver, Sender};
 use glam::{DAffine3, DVec3};
 use hdrhistogram::Histogram;
 use hil_mock::projector::LightKind;
@@ -24,6 +24,9 @@ use std::time::Duration;
 const POINTS_PER_BODY: usize = 48;
 /// Sent frames that may wait for their light; beyond this they count as never lit.
 const MAX_PENDING: usize = 256;
+
+/// Time between two looks at what is finished.
+const REST: Duration = Duration::from_millis(2);
 
 /// What is kept of one lit frame for pictures.
 #[derive(Clone, Debug)]
@@ -66,6 +69,8 @@ pub struct Collector {
     /// Frames lit after a newer one, or twice.
     pub reordered: u64,
     last_lit: Option<u32>,
+    /// The newest frame that the link is done with, low 32 bits.
+    newest: Option<u32>,
     /// Slots in which the frame before was shown again, until the last planned one is known to be later.
     repeats: VecDeque<u64>,
     /// Lit frames whose light was not what was rendered.
@@ -123,6 +128,7 @@ impl Collector {
             torn: 0,
             reordered: 0,
             last_lit: None,
+            newest: None,
             repeats: VecDeque::new(),
             light_mismatches: 0,
             profiler,
@@ -143,36 +149,50 @@ impl Collector {
         }
     }
 
-    /// Takes finished jobs and light until both rings are closed and empty; gives the jobs back to `free`.
+    /// Takes finished frames and light until both are over; gives the notes back to `free`.
     pub fn run(
         &mut self,
-        done: &Ring<Box<FrameJob>>,
-        free: &Ring<Box<FrameJob>>,
-        lights: &Ring<LightNote>,
+        mut done: Receiver<Box<FrameNote>>,
+        mut free: Sender<Box<FrameNote>>,
+        mut lights: Receiver<LightNote>,
         monitor: &RunMonitor,
     ) {
+        let mut held = None;
         loop {
-            let job = done.pop(Duration::from_millis(2));
-            let idle = job.is_none();
-            if let Some(job) = job {
-                self.finished(&job, monitor);
-                let _ = free.push(job);
-            }
-            while let Some(note) = lights.try_pop() {
-                // A frame is handed over before its light is noted, so its job is in the ring by now.
-                while let Some(job) = done.try_pop() {
-                    self.finished(&job, monitor);
-                    let _ = free.push(job);
+            // Asked before looking: what came before the end is taken first.
+            let over = done.is_finished() && lights.is_finished();
+            self.take_finished(&mut done, &mut free, monitor);
+            while let Some(note) = held.take().or_else(|| lights.try_pop()) {
+                self.take_finished(&mut done, &mut free, monitor);
+                // Lit before the link's thread came to say that it was sent.
+                let unknown = note.event.frame.is_some_and(|f| self.newest.is_none_or(|n| frame_newer(f, n)));
+                if unknown && !over {
+                    held = Some(note);
+                    break;
                 }
                 self.light(&note, monitor);
             }
-            if idle && done.is_closed() && lights.is_closed() && done.is_empty() && lights.is_empty() {
+            if over {
                 break;
             }
+            // Not woken for every frame: that would cost the frame path two system calls a frame. There are notes for longer.
+            std::thread::sleep(REST);
         }
         // What was sent and never lit is dropped.
         for _ in 0..self.pending.len() {
             self.drop_oldest(monitor);
+        }
+    }
+
+    fn take_finished(
+        &mut self,
+        done: &mut Receiver<Box<FrameNote>>,
+        free: &mut Sender<Box<FrameNote>>,
+        monitor: &RunMonitor,
+    ) {
+        while let Some(note) = done.try_pop() {
+            self.finished(&note, monitor);
+            let _ = free.push(note);
         }
     }
 
@@ -183,25 +203,28 @@ impl Collector {
         }
     }
 
-    fn finished(&mut self, job: &FrameJob, monitor: &RunMonitor) {
-        let c = job.cost.counters();
+    fn finished(&mut self, job: &FrameNote, monitor: &RunMonitor) {
+        self.newest = Some(job.id.0 as u32);
+        let cost = job.cost.unwrap_or_default();
+        let c = cost.counters();
         self.rays += u64::from(c.closest_rays) + u64::from(c.shadow_rays);
         self.samples += u64::from(c.samples);
-        self.gpu_ns += job.cost.pass_ns.iter().sum::<u64>();
+        self.gpu_ns += cost.pass_ns.iter().sum::<u64>();
         self.lit_values += 3 * u64::from(c.lit_pixels);
         self.clipped_values += u64::from(c.clipped_values);
         self.nan_values += u64::from(c.nan_values);
         self.invalid_samples += u64::from(c.invalid_samples);
-        for (histogram, &ns) in self.passes.iter_mut().zip(&job.cost.pass_ns) {
-            if job.gpu.is_some() {
+        for (histogram, &ns) in self.passes.iter_mut().zip(&cost.pass_ns) {
+            if job.cost.is_some() {
                 histogram.saturating_record(ns.max(1));
             }
         }
         for stage in [Stage::Plan, Stage::Render, Stage::Pack, Stage::Link] {
             self.stages[stage as usize].saturating_record(job.timeline.wall_ns[stage as usize].max(1));
         }
-        let sent = job.outcome == Some(SendOutcome::Sent);
-        self.slots.planned(job.slot, &job.timeline, sent, job.waited_for_memory);
+        let sent = job.is_sent();
+        let refused = !sent && job.fate != Fate::Overtaken;
+        self.slots.planned(job.slot, &job.timeline, refused, job.waited_for_memory);
         while self.repeats.front().is_some_and(|&slot| slot < job.slot) {
             self.repeats.pop_front();
             self.repeated += 1;
@@ -218,7 +241,7 @@ impl Collector {
                 sampled_poses: job.sampled_poses.clone(),
                 eye: job.eye,
                 code_hash: job.code_hash,
-                pass_ns: job.cost.pass_ns,
+                pass_ns: cost.pass_ns,
             });
         } else {
             self.dropped += 1;

@@ -1,46 +1,100 @@
-//! One frame on its way: everything that travels from thread to thread. Boxed once, recycled for ever.
+//! One frame on its way: what travels from thread to thread. Boxed once, recycled for ever.
+//!
+//! A frame is a big piece of memory and a small note. The memory goes straight back to planning when the link is done with it, so that few
+//! of them go round and stay in the caches; the note goes on to the collector, which may be slow.
 
 use crate::frame::{FrameId, FrameTimeline};
 use crate::pack::BitPlaneFrame;
 use crate::render::{FrameCost, FrameSlot};
 use dpm_device::link::SendOutcome;
-use dpm_device::time::DeviceTicks;
+use dpm_device::time::{DeviceTicks, HostTime};
 use glam::{DAffine3, DVec3};
 
-/// A frame and its memory.
-pub struct FrameJob {
+/// What became of a frame on the host.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub enum Fate {
+    /// Still under way.
+    #[default]
+    UnderWay,
+    /// Its slot had begun and a newer frame was waiting behind it: left out, so that nothing queues up after a stall.
+    Overtaken,
+    /// The link took it or did not.
+    Offered(SendOutcome),
+}
+
+/// A frame without its memory: who it is and what happened to it.
+pub struct FrameNote {
     /// Which frame.
     pub id: FrameId,
     /// Which slot of the projector it is for.
     pub slot: u64,
     /// Start of that slot on the projector's clock.
     pub target_at: DeviceTicks,
-    /// Planning waited for this job's memory: a later stage held all of it.
+    /// Planning waited for memory: a later stage held all of it.
     pub waited_for_memory: bool,
+    /// When it should have been latched.
+    pub latch_due_at: HostTime,
     /// Stamps.
     pub timeline: FrameTimeline,
     /// Predicted world-from-body of the tracked bodies.
     pub tracked_poses: Vec<DAffine3>,
     /// The same without prediction: where the newest sample put them.
     pub sampled_poses: Vec<DAffine3>,
+    /// Eye, world.
+    pub eye: DVec3,
+    /// What the GPU said about it; `None` when frames are prepared instead of rendered.
+    pub cost: Option<FrameCost>,
+    /// Hash of the code values, to be compared with the light.
+    pub code_hash: u64,
+    /// What became of it.
+    pub fate: Fate,
+}
+
+impl FrameNote {
+    /// An empty note with room for `bodies` tracked bodies.
+    pub fn new(bodies: usize) -> Self {
+        Self {
+            id: FrameId::default(),
+            slot: 0,
+            target_at: DeviceTicks(0),
+            waited_for_memory: false,
+            latch_due_at: HostTime(0),
+            timeline: FrameTimeline::default(),
+            tracked_poses: Vec::with_capacity(bodies),
+            sampled_poses: Vec::with_capacity(bodies),
+            eye: DVec3::ZERO,
+            cost: None,
+            code_hash: 0,
+            fate: Fate::UnderWay,
+        }
+    }
+
+    /// True when the link took it.
+    pub fn is_sent(&self) -> bool {
+        self.fate == Fate::Offered(SendOutcome::Sent)
+    }
+}
+
+/// The memory of a frame.
+pub struct FrameMemory {
     /// Bodies that are lost: no light falls on them.
     pub lost: Vec<bool>,
     /// world-from-body of every body of the scene.
     pub scene_poses: Vec<DAffine3>,
-    /// Eye, world.
-    pub eye: DVec3,
     /// Gaze point, world.
     pub gaze: DVec3,
     /// The GPU's part; `None` when frames are prepared instead of rendered.
     pub gpu: Option<FrameSlot>,
-    /// What the GPU said about it.
-    pub cost: FrameCost,
-    /// Hash of the code values, to be compared with the light.
-    pub code_hash: u64,
     /// Bit planes.
     pub planes: BitPlaneFrame,
-    /// Fate on the link; `None` before it got there.
-    pub outcome: Option<SendOutcome>,
+}
+
+/// A frame and its memory.
+pub struct FrameJob {
+    /// Who it is.
+    pub note: Box<FrameNote>,
+    /// Where it is.
+    pub memory: Box<FrameMemory>,
 }
 
 /// A hash of a frame's code values that is cheap enough for every frame.

@@ -4,8 +4,7 @@
 //! unplugging or a reset, the watchdog, damaged packets. Heat, lamp, emergency stop, flashes and SAFE wait for an ARM of the operator.
 
 use super::connect::ConnectError;
-use super::handoff::Ring;
-use super::job::FrameJob;
+use super::job::FrameNote;
 use super::light::LightNote;
 use super::stages::LinkTime;
 use super::status_light::{DeviceCounts, StatusLight};
@@ -14,6 +13,7 @@ use dpm_device::clock_map::ClockMap;
 use dpm_device::link::{faults, DeviceState, HostLink, LinkError, LinkState, Verb};
 use dpm_device::time::HostTime;
 use dpm_device::transport::Transport;
+use dpm_handoff::channel::Sender;
 use dpm_handoff::latest::Publisher;
 
 /// Faults after which light comes back without the operator.
@@ -63,8 +63,14 @@ pub(super) struct LinkKeeper {
 }
 
 impl LinkKeeper {
-    /// For a link that has just come up with `time`. `outside`: the projector's reports are all that is known of its light.
-    pub(super) fn new(time: LinkTime, times: Publisher<LinkTime>, link: &HostLink, outside: bool) -> Self {
+    /// For a link that has just come up with `time`. `lights`: where the projector's reports are all that is known of its light,
+    /// notes of it go there.
+    pub(super) fn new(
+        time: LinkTime,
+        times: Publisher<LinkTime>,
+        link: &HostLink,
+        lights: Option<Sender<LightNote>>,
+    ) -> Self {
         Self {
             time,
             times,
@@ -72,7 +78,7 @@ impl LinkKeeper {
             map: None,
             session: link.counters().sessions,
             is_timed: true,
-            reports: outside.then(StatusLight::new),
+            reports: lights.map(StatusLight::new),
             standing: None,
             rearmed_at: HostTime(i64::MIN),
             rearmed: 0,
@@ -90,7 +96,6 @@ impl LinkKeeper {
         link: &mut HostLink,
         transport: &mut dyn Transport,
         steady: bool,
-        lights: &Ring<LightNote>,
         monitor: &RunMonitor,
     ) -> Result<(), ConnectError> {
         let result = match link.poll(now, transport) {
@@ -112,16 +117,16 @@ impl LinkKeeper {
         }
         self.arm_again(now, link, steady);
         if let (Some(reports), Some(status)) = (&mut self.reports, link.status().filter(|_| self.is_timed)) {
-            reports.observe(status, &self.time, lights);
+            reports.observe(status, &self.time);
         }
         monitor.set_projector(health(link, self.standing));
         result
     }
 
     /// The frame is on its way.
-    pub(super) fn sent(&mut self, job: &FrameJob) {
+    pub(super) fn sent(&mut self, note: &FrameNote) {
         if let Some(reports) = &mut self.reports {
-            reports.sent(job.id.0 as u32, job.slot);
+            reports.sent(note.id.0 as u32, note.slot);
         }
     }
 
@@ -168,7 +173,8 @@ impl LinkKeeper {
 
     /// A projector that came back, or stopped for a reason that has passed, is armed unless the operator wants it dark.
     fn arm_again(&mut self, now: HostTime, link: &mut HostLink, steady: bool) {
-        if self.standing.is_some() {
+        // A rest after flashes ends by itself, and only by itself.
+        if self.standing.is_some() || link.is_resting(now) {
             return;
         }
         match link.state() {

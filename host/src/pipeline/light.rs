@@ -2,15 +2,14 @@
 //!
 //! Runs where the mock runs: in the link thread at virtual pace, in the mock's own thread at real pace.
 
-use super::handoff::Ring;
 use super::job::hash_codes;
 use super::prepared::is_whole;
 use crate::clock::Stopwatch;
 use dpm_device::planes::PlaneSchedule;
 use dpm_device::time::HostTime;
+use dpm_handoff::channel::Sender;
 use hil_mock::projector::{LightEvent, LightKind, MockProjector};
 use std::collections::VecDeque;
-use std::sync::Arc;
 
 /// What the projector did in one slot.
 #[derive(Clone, Copy, Debug)]
@@ -40,7 +39,8 @@ pub struct LightFrame {
 
 /// Watches a mock projector.
 pub struct LightRecorder {
-    notes: Arc<Ring<LightNote>>,
+    /// `None` after [`LightRecorder::close`].
+    notes: Option<Sender<LightNote>>,
     /// Notes that found no room.
     pub notes_lost: u64,
     keep: usize,
@@ -55,9 +55,9 @@ pub struct LightRecorder {
 impl LightRecorder {
     /// Notes go to `notes`; the last `keep` frames of light stay; `hash`: hash every frame of light; `marks`: the
     /// planes, in this order, are of [`super::prepared`] and are looked at for parts of other frames.
-    pub fn new(notes: Arc<Ring<LightNote>>, keep: usize, hash: bool, marks: Option<PlaneSchedule>) -> Self {
+    pub fn new(notes: Sender<LightNote>, keep: usize, hash: bool, marks: Option<PlaneSchedule>) -> Self {
         Self {
-            notes,
+            notes: Some(notes),
             notes_lost: 0,
             keep,
             hash,
@@ -95,10 +95,15 @@ impl LightRecorder {
             }
             let torn = event.kind == LightKind::Lit && self.is_torn(mock, event.frame);
             let note = LightNote { event, hash, torn, wall_ns: watch.elapsed_ns(), unseen: 0 };
-            if self.notes.push(note).is_err() {
+            if self.notes.as_mut().is_none_or(|notes| notes.push(note).is_err()) {
                 self.notes_lost += 1;
             }
         }
+    }
+
+    /// No more light will be noted: whoever takes the notes comes to their end.
+    pub fn close(&mut self) {
+        self.notes = None;
     }
 
     fn is_torn(&self, mock: &MockProjector, frame: Option<u32>) -> bool {

@@ -1,20 +1,21 @@
 //! The threads and their hand-offs: tracking, plan and render, pack, link, and beside the frame path the collector.
 //!
 //! ```text
-//!  tracking --[latest]--> plan+render --[ring]--> pack --[ring]--> link --[ring]--> collector
-//!                              ^                                                        |
-//!                              +------------------[free ring: recycled jobs]------------+
+//!  tracking --[latest]--> plan+render --[channel]--> pack --[channel]--> link --[notes]--> collector
+//!                            ^  ^                                         |                  |  ^
+//!                            |  +----------------[memory]-----------------+                  |  +--[light]-- projector
+//!                            +---------------------------------[notes]-----------------------+
 //! ```
 //!
-//! One frame is one [`job::FrameJob`], boxed once and recycled. In the steady state no stage allocates, locks or logs, and every
-//! wait is bounded.
+//! One frame is one [`job::FrameJob`]: memory and a note, boxed once and recycled. In the steady state no stage allocates, locks or
+//! logs, and every wait is bounded. All hand-offs are those of `dpm_handoff`.
 
 mod collect;
 mod connect;
-pub mod handoff;
 pub mod job;
 mod keeper;
 pub mod light;
+mod link;
 mod outcome;
 pub mod prepared;
 pub mod projector;

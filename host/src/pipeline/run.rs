@@ -2,38 +2,43 @@
 
 use super::collect::Collector;
 use super::connect::{connect, ENDED_WITH_THE_LAST_RUN};
-use super::handoff::Ring;
-use super::job::FrameJob;
-use super::light::LightRecorder;
+use super::job::FrameMemory;
+use super::light::{LightNote, LightRecorder};
+use super::link::{device_thread, Cable};
 use super::outcome::{PipelineError, RunOptions, RunOutcome};
 use super::prepared::PreparedFrames;
 use super::projector;
 use super::rights::Rights;
 use super::stages::TrackingStage;
-use super::threads::{device_thread, run_threads, Cable, Shared, LISTEN_NS};
+use super::threads::{policy, run_threads, Shared, LISTEN_NS, STAGE_THREADS};
 use crate::clock::{Clock, ManualClock, MonotonicClock, RunClock, Stopwatch};
 use crate::config::{Pace, Packer, ProjectorBackend};
 use crate::gpu::Gpu;
 use crate::pack::{BitPlaneFrame, Kernel};
+use crate::plan::lead::LeadEstimator;
 use crate::plan::slots::MissCause;
 use crate::realtime::os::usable_cores;
 use crate::realtime::standstill::StandstillMonitor;
 use crate::render::method::Method;
-use crate::render::{FrameCost, Output, RenderError, Renderer, RendererSettings};
+use crate::render::{Output, RenderError, Renderer, RendererSettings};
 use crate::rig::{Rig, RigError};
 use crate::telemetry::monitor::RunMonitor;
 use crate::telemetry::report::Report;
 use dpm_device::link::HostLink;
-use dpm_device::time::{DeviceTicks, HostClock, HostTime};
+use dpm_device::time::{HostClock, HostTime};
 use dpm_device::transport::inproc::{threaded, Direct};
 use dpm_device::transport::Transport;
+use dpm_handoff::channel::{channel, Sender};
+use dpm_handoff::wake::WaitPolicy;
 use glam::DVec3;
 use hil_mock::projector::{DeviceClock, MockConfig, MockProjector};
-use std::sync::atomic::{AtomicBool, AtomicI64, Ordering};
+use std::sync::atomic::{AtomicBool, AtomicI64};
 use std::sync::{Arc, Mutex, OnceLock};
 
-/// Tracking, plan, pack, link, and the mock projector.
-const STAGE_THREADS: usize = 5;
+/// Light events between the projector and the collector: eight seconds at 947 Hz.
+const LIGHTS: usize = 8192;
+/// Buffers of the cable to a projector in this process: one is filled while the other is read.
+const CABLE_BUFFERS: usize = 2;
 /// A step of the control thread that ends this late is a standstill of the machine.
 const STANDSTILL_NS: i64 = 1_000_000;
 
@@ -65,10 +70,10 @@ pub fn run_prepared(
 
 /// The other end of the cable.
 enum Far {
-    /// The mock, who watches its light, and the frames that its cable holds.
-    Mock(Box<MockProjector>, LightRecorder, usize),
-    /// A projector outside this process.
-    Outside(Box<dyn Transport>),
+    /// The mock, and who watches its light.
+    Mock(Box<MockProjector>, LightRecorder),
+    /// A projector outside this process, and where notes of its light go.
+    Outside(Box<dyn Transport>, Sender<LightNote>),
 }
 
 fn run_from(
@@ -109,34 +114,22 @@ fn run_from(
     // Hashing every frame costs a millisecond at full size: affordable unless the wall clock rules.
     let verify = options.verify && is_virtual;
 
-    let free = Ring::new(options.in_flight.max(2));
+    let mut memory = Vec::with_capacity(options.in_flight.max(2));
     for _ in 0..options.in_flight.max(2) {
-        let job = FrameJob {
-            id: Default::default(),
-            slot: 0,
-            target_at: DeviceTicks(0),
-            waited_for_memory: false,
-            timeline: Default::default(),
-            tracked_poses: Vec::with_capacity(rig.bodies.len()),
-            sampled_poses: Vec::with_capacity(rig.bodies.len()),
+        memory.push(FrameMemory {
             lost: Vec::with_capacity(rig.bodies.len()),
             scene_poses: Vec::with_capacity(rig.scene.bodies.len()),
-            eye: DVec3::ZERO,
             gaze: DVec3::ZERO,
             gpu: match &mut renderer {
                 Some(renderer) => Some(renderer.create_slot(false).map_err(RenderError::from)?),
                 None => None,
             },
-            cost: FrameCost::default(),
-            code_hash: 0,
             planes: BitPlaneFrame::new(raster, schedule),
-            outcome: None,
-        };
-        let _ = free.push(Box::new(job));
+        });
     }
 
     let frame_bytes = projector::frame_bytes(raster, schedule.len());
-    let lights = Arc::new(Ring::new(8192));
+    let (lights_in, lights) = channel(LIGHTS, WaitPolicy::Park);
     let prepared = gpu.is_none().then(|| PreparedFrames::new(raster));
     let mut warnings = Vec::new();
     let far = match &config.projector.backend {
@@ -147,8 +140,8 @@ fn run_from(
                 DeviceClock { skew_ppb: (mock_config.clock_ppm * 1000.0) as i32, ..DeviceClock::IDEAL };
             setup.flash_limit = projector::flash_limit(config);
             let marks = prepared.is_some().then_some(schedule);
-            let recorder = LightRecorder::new(lights.clone(), options.keep_frames, verify, marks);
-            Far::Mock(Box::new(MockProjector::new(setup)), recorder, usize::from(setup.frame_buffers) + 1)
+            let recorder = LightRecorder::new(lights_in, options.keep_frames, verify, marks);
+            Far::Mock(Box::new(MockProjector::new(setup)), recorder)
         }
         backend => {
             let medium = projector::open(config, raster)?.ok_or_else(|| {
@@ -158,7 +151,7 @@ fn run_from(
                 ))
             })?;
             warnings.extend(medium.warnings);
-            Far::Outside(medium.transport)
+            Far::Outside(medium.transport, lights_in)
         }
     };
     let mut link = HostLink::new(projector::link_settings(config, raster));
@@ -172,48 +165,41 @@ fn run_from(
         }
         RunClock::Virtual(_) => None,
     };
-    let device_over = AtomicBool::new(false);
     let kernel = Kernel::best();
     let watch = Stopwatch::start();
     let (mut collector, recorder, carried) = std::thread::scope(|scope| -> Result<_, PipelineError> {
-        let (mut cable, device) = match far {
-            Far::Outside(medium) => (Cable::Outside(medium), None),
-            Far::Mock(mock, recorder, _) if is_virtual => {
-                (Cable::Direct(Box::new(Direct::new(*mock)), recorder), None)
+        let (mut cable, device, seen) = match far {
+            Far::Outside(medium, lights) => (Cable::Outside(medium), None, Some(lights)),
+            Far::Mock(mock, recorder) if is_virtual => {
+                (Cable::Direct(Box::new(Direct::new(*mock)), recorder), None, None)
             }
-            Far::Mock(mock, recorder, buffers) => {
-                let (host_end, device_end) = threaded(frame_bytes, buffers);
-                let (clock, over) = (&clock, &device_over);
+            Far::Mock(mock, recorder) => {
+                let (host_end, device_end) = threaded(frame_bytes, CABLE_BUFFERS, policy(&rig));
+                let clock = &clock;
                 let thread = std::thread::Builder::new()
                     .name("dpm-mock".into())
-                    .spawn_scoped(scope, move || device_thread(device_end, *mock, recorder, clock, over))
+                    .spawn_scoped(scope, move || device_thread(device_end, *mock, recorder, clock))
                     .map_err(|source| PipelineError::Thread { stage: "mock projector", source })?;
-                (Cable::Threaded(host_end), Some(thread))
+                (Cable::Threaded(host_end), Some(thread), None)
             }
         };
-        let connected = connect(&mut link, cable.transport(), acknowledged, &mut || {
+        let time = connect(&mut link, cable.transport(), acknowledged, &mut || {
             clock.wait_until(clock.now().plus_ns(if is_virtual { 50_000 } else { 200_000 }))
-        });
-        let time = match connected {
-            Ok(time) => time,
-            Err(e) => {
-                device_over.store(true, Ordering::Release);
-                return Err(e.into());
-            }
-        };
+        })?;
+        let slot_ns = rig.rate().slot_len_ns(0);
+        let first_guess_ns = i64::from(config.real_time.stage_costs_us.total()) * 1000;
+        // Sent earlier, a frame would find no room in the device.
+        let held = link.device().map_or(1, |hello| i64::from(hello.frame_buffers));
+        let lead = LeadEstimator::new(slot_ns, first_guess_ns, held * slot_ns);
         let shared = Shared {
             rig: rig.clone(),
             clock: &clock,
             time,
             listen_to: AtomicI64::new(0),
             tracking: OnceLock::new(),
-            lead_ns: AtomicI64::new(0),
+            lead_ns: AtomicI64::new(lead.lead_ns()),
+            typical_ns: AtomicI64::new(lead.typical_ns()),
             travel_ns: AtomicI64::new(0),
-            free,
-            to_pack: Ring::new(options.in_flight + 2),
-            to_link: Ring::new(options.in_flight + 2),
-            done: Ring::new(options.in_flight + 2),
-            lights: lights.clone(),
             tracking_over: AtomicBool::new(false),
             error: Mutex::new(None),
             monitor,
@@ -223,15 +209,22 @@ fn run_from(
         };
         let tracking = TrackingStage::new(&rig, tracker);
         let mut collector = Collector::new(rig.clone(), options.keep_frames, verify);
-        let (cable, carried) =
-            run_threads(&shared, tracking, renderer.as_mut(), prepared, kernel, link, cable, &mut collector)?;
-        device_over.store(true, Ordering::Release);
-        let recorder = match (cable, device) {
-            (Cable::Direct(_, recorder), _) => Some(recorder),
-            (Cable::Threaded(_), Some(thread)) => {
-                Some(thread.join().map_err(|_| PipelineError::Panicked("mock projector"))?)
-            }
-            (Cable::Threaded(_) | Cable::Outside(_), _) => None,
+        let (recorder, carried) = run_threads(
+            &shared,
+            tracking,
+            renderer.as_mut(),
+            prepared,
+            kernel,
+            link,
+            cable,
+            memory,
+            (seen, lights),
+            lead,
+            &mut collector,
+        )?;
+        let recorder = match device {
+            Some(thread) => Some(thread.join().map_err(|_| PipelineError::Panicked("mock projector"))?),
+            None => recorder,
         };
         match shared.error.into_inner().ok().flatten() {
             Some(e) => Err(e),

@@ -1,6 +1,6 @@
 //! What each stage does to one frame. No threads here: `run.rs` decides who calls what.
 
-use super::job::{hash_codes, FrameJob};
+use super::job::{hash_codes, Fate, FrameJob};
 use super::prepared::PreparedFrames;
 use crate::clock::Stopwatch;
 use crate::frame::{FrameId, Stage};
@@ -84,19 +84,20 @@ impl TrackingStage {
 /// Fills a job for slot `slot`: poses at the middle of its exposure, eye, gaze. `snapshot` is the newest there is.
 pub fn plan(job: &mut FrameJob, rig: &Rig, snapshot: &TrackSnapshot, slots: &LinkTime, id: u64, slot: u64) {
     let watch = Stopwatch::start();
-    job.id = FrameId(id);
-    job.slot = slot;
-    job.outcome = None;
-    job.target_at = slots.start(slot);
+    let FrameJob { note, memory } = job;
+    note.id = FrameId(id);
+    note.slot = slot;
+    note.fate = Fate::UnderWay;
+    note.target_at = slots.start(slot);
     let due = slots.host_of_slot(slot);
     let middle = due.plus_ns(slots.host_of_slot(slot + 1).ns_since(due) / 2);
-    let timeline = &mut job.timeline;
+    let timeline = &mut note.timeline;
     *timeline = Default::default();
     timeline.due_at = due;
     let predict = rig.config.prediction.on;
-    job.tracked_poses.clear();
-    job.sampled_poses.clear();
-    job.lost.clear();
+    note.tracked_poses.clear();
+    note.sampled_poses.clear();
+    memory.lost.clear();
     let mut oldest: Option<(HostTime, HostTime)> = None;
     for (i, body) in rig.bodies.iter().enumerate() {
         let track = snapshot.tracks.get(i).copied().flatten();
@@ -113,15 +114,15 @@ pub fn plan(job: &mut FrameJob, rig: &Rig, snapshot: &TrackSnapshot, slots: &Lin
             // Never seen: nothing may be lit.
             None => (affine(&body.rest), affine(&body.rest), true),
         };
-        job.tracked_poses.push(pose);
-        job.sampled_poses.push(sampled);
-        job.lost.push(lost);
+        note.tracked_poses.push(pose);
+        note.sampled_poses.push(sampled);
+        memory.lost.push(lost);
     }
     let (captured_at, received_at) = oldest.unwrap_or((due, due));
     timeline.captured_at = captured_at;
     timeline.received_at = received_at;
-    rig.scene_poses(&job.tracked_poses, &mut job.scene_poses);
-    (job.eye, job.gaze) = rig.observer.eye_and_gaze(&job.tracked_poses);
+    rig.scene_poses(&note.tracked_poses, &mut memory.scene_poses);
+    (note.eye, memory.gaze) = rig.observer.eye_and_gaze(&note.tracked_poses);
     timeline.wall_ns[Stage::Plan as usize] = watch.elapsed_ns();
 }
 
@@ -130,57 +131,56 @@ pub fn plan(job: &mut FrameJob, rig: &Rig, snapshot: &TrackSnapshot, slots: &Lin
 /// # Errors
 /// Device lost.
 pub fn submit(job: &mut FrameJob, rig: &Rig, renderer: &mut Renderer) -> Result<(), GpuError> {
-    let Some(slot) = job.gpu.as_mut() else { return Ok(()) };
+    let FrameJob { note, memory } = job;
+    let Some(slot) = memory.gpu.as_mut() else { return Ok(()) };
     renderer.submit(
         slot,
         &FrameInputs {
-            frame: job.id.0 as u32,
+            frame: note.id.0 as u32,
             spp: rig.config.render.spp,
             budget_spp: rig.config.render.spp as f32,
             camera: &rig.camera,
-            eye: job.eye,
-            gaze: job.gaze,
-            poses: &job.scene_poses,
-            lost: &job.lost,
+            eye: note.eye,
+            gaze: memory.gaze,
+            poses: &memory.scene_poses,
+            lost: &memory.lost,
         },
     )
 }
 
-/// Waits for the GPU and packs its code values into planes; a job without GPU takes its code values from `prepared`.
+/// Waits for the GPU, if the job has one.
 ///
 /// # Errors
 /// The GPU did not finish within `timeout_ns`, or was lost.
-pub fn finish_and_pack(
-    job: &mut FrameJob,
-    kernel: Kernel,
-    verify: bool,
-    timeout_ns: u64,
-    prepared: &mut Option<PreparedFrames>,
-) -> Result<(), GpuError> {
-    let Some(slot) = job.gpu.as_mut() else {
-        if let Some(prepared) = prepared {
-            let watch = Stopwatch::start();
-            prepared.pack(kernel, job.id.0, &mut job.planes);
-            job.timeline.wall_ns[Stage::Pack as usize] = watch.elapsed_ns();
-        }
-        return Ok(());
-    };
+pub fn finish(job: &mut FrameJob, timeout_ns: u64) -> Result<(), GpuError> {
+    let Some(slot) = job.memory.gpu.as_mut() else { return Ok(()) };
     let watch = Stopwatch::start();
-    job.cost = slot.wait(timeout_ns)?;
-    let gpu: u64 = job.cost.pass_ns.iter().sum();
+    let cost = slot.wait(timeout_ns)?;
+    let gpu: u64 = cost.pass_ns.iter().sum();
+    job.note.cost = Some(cost);
     // The fence's wait overlaps other frames; the GPU's own time is the stage's cost where it is known.
-    job.timeline.wall_ns[Stage::Render as usize] = if gpu > 0 { gpu } else { watch.elapsed_ns() };
-    let watch = Stopwatch::start();
-    let codes = slot.codes();
-    match slot.planes() {
-        Some(planes) => pack::gpu::take(planes, &mut job.planes),
-        None => pack::pack(kernel, codes, &mut job.planes),
-    }
-    job.timeline.wall_ns[Stage::Pack as usize] = watch.elapsed_ns();
-    if verify {
-        job.code_hash = hash_codes(codes.iter().map(|c| c & 0x00ff_ffff));
-    }
+    job.note.timeline.wall_ns[Stage::Render as usize] = if gpu > 0 { gpu } else { watch.elapsed_ns() };
     Ok(())
+}
+
+/// Packs the finished GPU's code values into planes; a job without GPU takes its code values from `prepared`.
+pub fn pack(job: &mut FrameJob, kernel: Kernel, verify: bool, prepared: &mut Option<PreparedFrames>) {
+    let FrameJob { note, memory } = job;
+    let watch = Stopwatch::start();
+    if let Some(slot) = &memory.gpu {
+        let codes = slot.codes();
+        match slot.planes() {
+            Some(planes) => pack::gpu::take(planes, &mut memory.planes),
+            None => pack::pack(kernel, codes, &mut memory.planes),
+        }
+        note.timeline.wall_ns[Stage::Pack as usize] = watch.elapsed_ns();
+        if verify {
+            note.code_hash = hash_codes(codes.iter().map(|c| c & 0x00ff_ffff));
+        }
+    } else if let Some(prepared) = prepared {
+        prepared.pack(kernel, note.id.0, &mut memory.planes);
+        note.timeline.wall_ns[Stage::Pack as usize] = watch.elapsed_ns();
+    }
 }
 
 /// The projector's slots on the host's clock.

@@ -3,10 +3,10 @@
 //! Counters are absolute and reports may be merged or lost. A report that follows after one slot tells everything about it. One that
 //! covers several slots tells how many were lit, repeated and dark, and the frame lit last: the others are handed on as numbers.
 
-use super::handoff::Ring;
 use super::light::LightNote;
 use super::stages::LinkTime;
 use dpm_device::link::Status;
+use dpm_handoff::channel::Sender;
 use hil_mock::projector::{LightEvent, LightKind};
 
 /// Slots of one report that are told one by one: a second of silence at 1 kHz.
@@ -42,6 +42,7 @@ pub struct DeviceCounts {
 /// Reads one session's reports after the other.
 #[derive(Debug)]
 pub(super) struct StatusLight {
+    lights: Sender<LightNote>,
     before: Option<Status>,
     counts: DeviceCounts,
     planned: [(u32, u64); REMEMBERED],
@@ -50,7 +51,8 @@ pub(super) struct StatusLight {
 }
 
 impl StatusLight {
-    pub(super) const fn new() -> Self {
+    /// Notes go to `lights`; those that find no room are lost, as a mock's are.
+    pub(super) fn new(lights: Sender<LightNote>) -> Self {
         let counts = DeviceCounts {
             lit: 0,
             lit_unseen: 0,
@@ -62,7 +64,7 @@ impl StatusLight {
             refused: 0,
             damaged_packets: 0,
         };
-        Self { before: None, counts, planned: [(0, u64::MAX); REMEMBERED], next: 0, travel_ns: 0 }
+        Self { lights, before: None, counts, planned: [(0, u64::MAX); REMEMBERED], next: 0, travel_ns: 0 }
     }
 
     /// What was counted so far.
@@ -87,8 +89,8 @@ impl StatusLight {
         self.travel_ns
     }
 
-    /// Takes in a report. `time` tells slots and instants. Notes that find no room are lost, as a mock's are.
-    pub(super) fn observe(&mut self, status: &Status, time: &LinkTime, notes: &Ring<LightNote>) {
+    /// Takes in a report. `time` tells slots and instants.
+    pub(super) fn observe(&mut self, status: &Status, time: &LinkTime) {
         let before = self.before.replace(*status);
         if before == Some(*status) {
             return;
@@ -113,17 +115,16 @@ impl StatusLight {
                 self.follow(status.last_lit_frame, slot, time);
             }
         }
-        self.notes(status, newest, [slots, lit, repeated], time, notes);
+        self.notes(status, newest, [slots, lit, repeated], time);
     }
 
     /// One note for each slot of the report whose fate is known, in order.
     fn notes(
-        &self,
+        &mut self,
         status: &Status,
         newest: u64,
         [slots, lit, repeated]: [u32; 3],
         time: &LinkTime,
-        notes: &Ring<LightNote>,
     ) {
         let lit_slot = if lit > 0 { time.slot_at(status.last_lit_at) } else { None };
         let first = (newest + 1).saturating_sub(u64::from(slots.min(MOST_SLOTS)));
@@ -150,7 +151,7 @@ impl StatusLight {
                 first_photon_at: time.host_of(start),
                 last_photon_at: time.host_of(time.start(slot + 1)),
             };
-            let _ = notes.push(LightNote { event, hash: 0, torn: false, wall_ns: 0, unseen: told });
+            let _ = self.lights.push(LightNote { event, hash: 0, torn: false, wall_ns: 0, unseen: told });
         }
     }
 
@@ -173,6 +174,8 @@ mod tests {
     use super::*;
     use dpm_device::link::{DeviceMessage, MessageType, SlotClock};
     use dpm_device::time::{DeviceTicks, FrameRate, HostTime};
+    use dpm_handoff::channel::{channel, Receiver};
+    use dpm_handoff::wake::WaitPolicy;
 
     /// Slots of a millisecond on a microsecond clock that began with the host's; the run's slot 100 is the clock's slot 0.
     fn time() -> LinkTime {
@@ -196,10 +199,17 @@ mod tests {
         }
     }
 
-    fn told(light: &mut StatusLight, s: &Status) -> Vec<(u64, LightKind, Option<u32>, u32)> {
-        let ring = Ring::new(4096);
-        light.observe(s, &time(), &ring);
-        std::iter::from_fn(|| ring.try_pop())
+    /// A reader of reports, and where its notes arrive.
+    struct Reader(StatusLight, Receiver<LightNote>);
+
+    fn reader() -> Reader {
+        let (lights, notes) = channel(4096, WaitPolicy::Park);
+        Reader(StatusLight::new(lights), notes)
+    }
+
+    fn told(Reader(light, notes): &mut Reader, s: &Status) -> Vec<(u64, LightKind, Option<u32>, u32)> {
+        light.observe(s, &time());
+        std::iter::from_fn(|| notes.try_pop())
             .map(|n| (n.event.slot, n.event.kind, n.event.frame, n.unseen))
             .collect()
     }
@@ -207,49 +217,48 @@ mod tests {
     #[test]
     fn a_report_a_slot_tells_everything() {
         use LightKind::{Blank, Lit, Repeated};
-        let mut light = StatusLight::new();
+        let mut light = reader();
         assert_eq!(told(&mut light, &status(5_100, [1, 0, 0], (7, 5_000))), [(105, Lit, Some(7), 0)]);
         assert_eq!(told(&mut light, &status(6_100, [1, 1, 0], (7, 5_000))), [(106, Repeated, None, 0)]);
         assert_eq!(told(&mut light, &status(7_100, [1, 1, 1], (7, 5_000))), [(107, Blank, None, 0)]);
         // The same report again says nothing new.
         assert_eq!(told(&mut light, &status(7_100, [1, 1, 1], (7, 5_000))), []);
-        let ring = Ring::new(4);
-        light.observe(&status(8_100, [2, 1, 1], (9, 8_000)), &time(), &ring);
-        let event = ring.try_pop().unwrap().event;
+        light.0.observe(&status(8_100, [2, 1, 1], (9, 8_000)), &time());
+        let event = light.1.try_pop().unwrap().event;
         assert_eq!((event.first_photon_at, event.last_photon_at), (HostTime(8_000_000), HostTime(9_000_000)));
     }
 
     #[test]
     fn a_merged_report_is_told_as_far_as_it_goes() {
         use LightKind::{Lit, Repeated};
-        let mut light = StatusLight::new();
+        let mut light = reader();
         // Slots 1 to 5: three lit, the last of them in slot 4, and two repeated.
         let notes = told(&mut light, &status(5_900, [3, 2, 0], (12, 4_000)));
         assert_eq!(notes.iter().filter(|n| n.1 == Lit).collect::<Vec<_>>(), [&(104, Lit, Some(12), 2)]);
         assert_eq!(notes.iter().filter(|n| n.1 == Repeated).count(), 2);
-        assert_eq!((light.counts().lit, light.counts().lit_unseen, light.counts().repeated), (3, 2, 2));
+        assert_eq!((light.0.counts().lit, light.0.counts().lit_unseen, light.0.counts().repeated), (3, 2, 2));
         // A new session begins at zero.
-        light.new_session();
+        light.0.new_session();
         told(&mut light, &status(1_100, [1, 0, 0], (13, 1_000)));
-        assert_eq!((light.counts().lit, light.counts().lit_unseen), (4, 2));
+        assert_eq!((light.0.counts().lit, light.0.counts().lit_unseen), (4, 2));
         // Counters that wrapped, and a silence of a day: bounded work.
         told(&mut light, &status(86_400_000_000, [u32::MAX, 0, 0], (14, 86_400_000_000)));
-        assert_eq!(light.counts().lit, 4 + u64::from(u32::MAX - 1));
+        assert_eq!(light.0.counts().lit, 4 + u64::from(u32::MAX - 1));
     }
 
     #[test]
     fn travel_follows_late_frames_and_forgets_slowly() {
-        let mut light = StatusLight::new();
-        light.sent(7, 101);
+        let mut light = reader();
+        light.0.sent(7, 101);
         told(&mut light, &status(5_100, [1, 0, 0], (7, 5_000)));
-        assert_eq!(light.travel_ns(), 2_000_000, "half of four slots");
-        light.sent(8, 106);
+        assert_eq!(light.0.travel_ns(), 2_000_000, "half of four slots");
+        light.0.sent(8, 106);
         told(&mut light, &status(6_100, [2, 0, 0], (8, 6_000)));
-        assert_eq!(light.travel_ns(), 2_000_000 - 2_000_000 / 1024);
+        assert_eq!(light.0.travel_ns(), 2_000_000 - 2_000_000 / 1024);
         for k in 0..2000u32 {
-            light.sent(9 + k, 0);
+            light.0.sent(9 + k, 0);
             told(&mut light, &status(7_100 + u64::from(k), [3 + k, 0, 0], (9 + k, 7_000)));
         }
-        assert_eq!(light.travel_ns(), LONGEST_TRAVEL_NS);
+        assert_eq!(light.0.travel_ns(), LONGEST_TRAVEL_NS);
     }
 }

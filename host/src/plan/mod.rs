@@ -1,4 +1,5 @@
 //! A slot and the newest poses into the plan of one frame: when its light is due and how many rays it may cost.
 
 pub mod budget;
+pub mod lead;
 pub mod slots;

@@ -34,16 +34,16 @@ pub struct SlotCounts {
 }
 
 impl SlotLedger {
-    /// A frame for `slot` came to the end of the host's part of its way. `sent`: the link took it. `waited_for_memory`: planning
-    /// could not begin earlier because a later stage held all buffers.
-    pub fn planned(&mut self, slot: u64, timeline: &FrameTimeline, sent: bool, waited_for_memory: bool) {
+    /// A frame for `slot` came to the end of the host's part of its way. `refused`: the link did not take
+    /// it. `waited_for_memory`: planning could not begin earlier because a later stage held all buffers.
+    pub fn planned(&mut self, slot: u64, timeline: &FrameTimeline, refused: bool, waited_for_memory: bool) {
         let skipped = self.last_planned.map_or(slot, |last| last + 1)..slot;
         let cause = if waited_for_memory { MissCause::Buffers } else { MissCause::Plan };
         for between in skipped.take(KEPT) {
             self.note(between, cause, timeline.latched_at);
         }
         self.last_planned = Some(self.last_planned.map_or(slot, |last| last.max(slot)));
-        if !sent {
+        if refused {
             self.note(slot, MissCause::Link, timeline.latched_at);
         } else if timeline.sent_at > timeline.due_at {
             self.note(slot, slowest(timeline), timeline.latched_at);
@@ -135,7 +135,7 @@ mod tests {
         ledger.nothing_new(9, HostTime(9 * SLOT));
         for slot in [10, 11, 13, 14, 15, 16, 17, 18, 19] {
             let after = if slot == 15 { 2 * SLOT } else { -100 };
-            ledger.planned(slot, &frame(slot, after), slot != 13, slot == 13);
+            ledger.planned(slot, &frame(slot, after), slot == 13, slot == 13);
         }
         for slot in 10..22 {
             match slot {

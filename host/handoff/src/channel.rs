@@ -1,0 +1,176 @@
+//! A bounded ring between two threads whose consumer can wait for the next value, and that ends when its producer does.
+//!
+//! [`crate::ring`] carries the values and [`crate::wake`] the waiting; what is added is the end: dropping the sender, in a panic
+//! too, closes the channel, so nobody waits for a stage that is gone.
+
+use crate::ring::{ring, Consumer, Producer};
+use crate::sync::{Arc, AtomicBool, Ordering};
+use crate::wake::{WaitPolicy, Waiter, Waker};
+
+/// The side that puts values in. Dropping it closes the channel; what is inside can still be taken.
+#[derive(Debug)]
+pub struct Sender<T> {
+    ring: Producer<T>,
+    waker: Waker,
+    closed: Arc<AtomicBool>,
+}
+
+/// The side that takes values out.
+#[derive(Debug)]
+pub struct Receiver<T> {
+    ring: Consumer<T>,
+    waiter: Waiter,
+    closed: Arc<AtomicBool>,
+}
+
+/// A channel for up to `capacity` values (at least 1) whose consumer waits by `policy`. All memory is taken now.
+pub fn channel<T: Send>(capacity: usize, policy: WaitPolicy) -> (Sender<T>, Receiver<T>) {
+    let (producer, consumer) = ring(capacity);
+    let waiter = Waiter::new(policy);
+    let closed = Arc::new(AtomicBool::new(false));
+    (
+        Sender { ring: producer, waker: waiter.waker(), closed: closed.clone() },
+        Receiver { ring: consumer, waiter, closed },
+    )
+}
+
+impl<T> Sender<T> {
+    /// Hands `value` over and wakes the consumer if it sleeps.
+    ///
+    /// # Errors
+    /// The value, when there is no room.
+    pub fn push(&mut self, value: T) -> Result<(), T> {
+        self.ring.push(value)?;
+        self.waker.wake();
+        Ok(())
+    }
+
+    /// Values put and not yet taken, at most.
+    pub fn len(&self) -> usize {
+        self.ring.len()
+    }
+
+    /// True when everything put has been taken.
+    pub fn is_empty(&self) -> bool {
+        self.ring.is_empty()
+    }
+}
+
+impl<T> Drop for Sender<T> {
+    fn drop(&mut self) {
+        // Release: whoever sees the end sees every value put before it. (The fence of the last wake-up would do, so the model checker
+        // does not miss it; a push without one would need it.)
+        self.closed.store(true, Ordering::Release);
+        self.waker.wake();
+    }
+}
+
+impl<T> Receiver<T> {
+    /// The oldest value, if there is one.
+    pub fn try_pop(&mut self) -> Option<T> {
+        self.ring.pop()
+    }
+
+    /// The oldest value; waits for one until the clock `now_ns` reaches `deadline_ns` or the channel is closed.
+    pub fn pop(&mut self, deadline_ns: i64, now_ns: impl FnMut() -> i64) -> Option<T> {
+        let Self { ring, waiter, closed } = self;
+        waiter.wait(deadline_ns, now_ns, || !ring.is_empty() || closed.load(Ordering::Acquire));
+        ring.pop()
+    }
+
+    /// Values waiting, at least.
+    pub fn len(&self) -> usize {
+        self.ring.len()
+    }
+
+    /// True when nothing waits.
+    pub fn is_empty(&self) -> bool {
+        self.ring.is_empty()
+    }
+
+    /// True when the sender is gone and nothing is left: no value will come any more.
+    pub fn is_finished(&self) -> bool {
+        // In this order: the last value was put before the end.
+        self.closed.load(Ordering::Acquire) && self.ring.is_empty()
+    }
+}
+
+#[cfg(all(test, not(loom)))]
+mod tests {
+    use super::*;
+    use std::time::Instant;
+
+    fn clock() -> impl Fn() -> i64 + Copy {
+        let start = Instant::now();
+        move || start.elapsed().as_nanos() as i64
+    }
+
+    const MINUTE_NS: i64 = 60_000_000_000;
+
+    #[test]
+    fn order_is_kept_and_nothing_is_lost_at_the_end() {
+        for policy in [WaitPolicy::Park, WaitPolicy::SpinThenPark { spin_ns: 5_000 }] {
+            let (mut sender, mut receiver) = channel(4, policy);
+            let now = clock();
+            let consumer = std::thread::spawn(move || {
+                let mut got = Vec::new();
+                while let Some(v) = receiver.pop(now() + MINUTE_NS, now) {
+                    got.push(v);
+                }
+                assert!(receiver.is_finished(), "ended by the sender's end, not by the clock");
+                got
+            });
+            for mut v in 0..10_000u32 {
+                while let Err(back) = sender.push(v) {
+                    v = back;
+                    std::thread::yield_now();
+                }
+            }
+            drop(sender);
+            assert_eq!(consumer.join().unwrap(), (0..10_000).collect::<Vec<_>>());
+            assert!(now() < MINUTE_NS, "woken by the deadline only");
+        }
+    }
+
+    #[test]
+    fn a_panic_of_the_sender_ends_the_wait() {
+        let (sender, mut receiver) = channel::<u8>(1, WaitPolicy::Park);
+        let now = clock();
+        let producer = std::thread::spawn(move || {
+            let _held = sender;
+            std::panic::resume_unwind(Box::new("a stage's mistake"));
+        });
+        assert_eq!(receiver.pop(MINUTE_NS, now), None);
+        assert!(receiver.is_finished() && now() < MINUTE_NS);
+        assert!(producer.join().is_err());
+    }
+
+    #[test]
+    fn a_full_channel_refuses_and_a_wait_ends_in_time() {
+        let (mut sender, mut receiver) = channel(2, WaitPolicy::Park);
+        assert_eq!((sender.push(1), sender.push(2), sender.push(3)), (Ok(()), Ok(()), Err(3)));
+        assert_eq!((sender.len(), receiver.len()), (2, 2));
+        assert_eq!((receiver.try_pop(), receiver.try_pop(), receiver.try_pop()), (Some(1), Some(2), None));
+        let now = clock();
+        assert_eq!(receiver.pop(2_000_000, now), None);
+        assert!(now() >= 2_000_000 && !receiver.is_finished());
+    }
+}
+
+#[cfg(all(test, loom))]
+mod loom_tests {
+    use super::*;
+
+    /// The end is seen after the last value, never before it, and ends a wait.
+    #[test]
+    fn loom_the_end_comes_after_the_last_value() {
+        loom::model(|| {
+            let (mut sender, mut receiver) = channel(2, WaitPolicy::Park);
+            // Not joined: loom takes an `unpark` that comes late for the end of the join.
+            loom::thread::spawn(move || sender.push(1u32).unwrap());
+            assert_eq!(receiver.pop(i64::MAX, || 0), Some(1));
+            assert_eq!(receiver.pop(i64::MAX, || 0), None);
+            assert!(receiver.is_finished());
+        });
+    }
+}
