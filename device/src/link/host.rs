@@ -12,7 +12,6 @@ use super::decoder::Decoder;
 use super::flash::FlashLimiter;
 use super::header::{Codec, Header, Packet, VERSION};
 use super::message::{
-
     Config, ConfigRefusal, DeviceHello, DeviceState, Echo, Fault, FaultCode, HostHello, HostMessage, Status,
     MAX_CONTROL_BYTES,
 };

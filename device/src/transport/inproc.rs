@@ -104,7 +104,8 @@ pub struct DeviceEnd {
 /// on the wire, see [`crate::link::packet_bytes`]. Two buffers keep both ends busy; more only leave the caches colder.
 pub fn threaded(frame_bytes: usize, depth: usize, policy: WaitPolicy) -> (HostEnd, DeviceEnd) {
     // Written once, so that the memory is there before the first frame.
-    let buffers = (0..depth.max(1)).map(|_| Large { len: 0, bytes: vec![0x5a; frame_bytes].into_boxed_slice() });
+    let buffers =
+        (0..depth.max(1)).map(|_| Large { len: 0, bytes: vec![0x5a; frame_bytes].into_boxed_slice() });
     let (filler, drainer) = exchange(buffers.collect());
     let (control_in, control_out) = ring(SMALL_DEPTH);
     let (replies_in, replies_out) = ring(SMALL_DEPTH);
@@ -112,7 +113,13 @@ pub fn threaded(frame_bytes: usize, depth: usize, policy: WaitPolicy) -> (HostEn
     let unplugged = Arc::new(AtomicBool::new(false));
     let device = waiter.waker();
     (
-        HostEnd { frames: filler, control: control_in, replies: replies_out, device, unplugged: unplugged.clone() },
+        HostEnd {
+            frames: filler,
+            control: control_in,
+            replies: replies_out,
+            device,
+            unplugged: unplugged.clone(),
+        },
         DeviceEnd { frames: drainer, control: control_out, replies: replies_in, waiter, unplugged },
     )
 }

@@ -128,7 +128,8 @@ impl Line {
         let now = if shared.is_virtual() { ready_at } else { self.await_credit(shared, note) };
         let waited_ns = now.ns_since(ready_at);
         let Self { link, cable, keeper, lead } = self;
-        let outcome = link.send_frame(now, note.id.0, note.target_at, memory.planes.bytes(), cable.transport());
+        let outcome =
+            link.send_frame(now, note.id.0, note.target_at, memory.planes.bytes(), cable.transport());
         note.fate = Fate::Offered(outcome);
         if outcome != SendOutcome::Sent {
             return;
@@ -146,7 +147,10 @@ impl Line {
     /// Waits until the device has room for the frame, at most until the frame's slot begins; returns the time.
     fn await_credit(&mut self, shared: &Shared<'_>, note: &FrameNote) -> HostTime {
         let mut now = shared.clock.now();
-        while self.link.state() == LinkState::Streaming && self.link.credit() == 0 && now < note.timeline.due_at {
+        while self.link.state() == LinkState::Streaming
+            && self.link.credit() == 0
+            && now < note.timeline.due_at
+        {
             now = shared.clock.wait_until(now.plus_ns(CREDIT_STEP_NS));
             self.poll(shared, now);
         }

@@ -119,13 +119,7 @@ impl StatusLight {
     }
 
     /// One note for each slot of the report whose fate is known, in order.
-    fn notes(
-        &mut self,
-        status: &Status,
-        newest: u64,
-        [slots, lit, repeated]: [u32; 3],
-        time: &LinkTime,
-    ) {
+    fn notes(&mut self, status: &Status, newest: u64, [slots, lit, repeated]: [u32; 3], time: &LinkTime) {
         let lit_slot = if lit > 0 { time.slot_at(status.last_lit_at) } else { None };
         let first = (newest + 1).saturating_sub(u64::from(slots.min(MOST_SLOTS)));
         let mut unseen = lit.saturating_sub(1);

@@ -2,8 +2,8 @@
 
 use super::collect::Collector;
 use super::job::{Fate, FrameJob, FrameMemory, FrameNote};
-use super::light::{LightNote, LightRecorder};
 use super::keeper::{LinkKeeper, ProjectorReport};
+use super::light::{LightNote, LightRecorder};
 use super::link::{link_thread, Cable, Line};
 use super::outcome::{PipelineError, RunOptions};
 use super::prepared::PreparedFrames;
@@ -14,10 +14,10 @@ use crate::config::{Pace, Wait};
 use crate::frame::Stage;
 use crate::pack::Kernel;
 use crate::plan::lead::LeadEstimator;
+use crate::realtime::wait_policy;
 use crate::render::Renderer;
 use crate::rig::Rig;
 use crate::telemetry::monitor::RunMonitor;
-use crate::realtime::wait_policy;
 use dpm_device::link::HostLink;
 use dpm_device::time::HostTime;
 use dpm_handoff::channel::{channel, Receiver, Sender};
@@ -257,7 +257,8 @@ fn plan_thread(
         let mut job = FrameJob { note, memory };
         job.note.waited_for_memory = waited;
         let travel = shared.travel_ns.load(Ordering::Relaxed);
-        let lead = travel + if shared.is_virtual() { modelled } else { shared.lead_ns.load(Ordering::Relaxed) };
+        let lead =
+            travel + if shared.is_virtual() { modelled } else { shared.lead_ns.load(Ordering::Relaxed) };
         let time = *time.latest().0;
         let now = shared.clock.now();
         if !shared.is_virtual() {
@@ -346,8 +347,10 @@ fn pack_thread(
 /// Leaves a frame out whose slot has begun while a newer one waits behind it: after a stall nothing queues up. At virtual pace
 /// nothing is ever late.
 pub(super) fn is_overtaken(shared: &Shared<'_>, note: &mut FrameNote, behind: &Receiver<FrameJob>) -> bool {
-    let overtaken =
-        note.fate == Fate::UnderWay && !shared.is_virtual() && !behind.is_empty() && shared.clock.now() >= note.timeline.due_at;
+    let overtaken = note.fate == Fate::UnderWay
+        && !shared.is_virtual()
+        && !behind.is_empty()
+        && shared.clock.now() >= note.timeline.due_at;
     if overtaken {
         note.fate = Fate::Overtaken;
     }
