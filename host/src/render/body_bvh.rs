@@ -4,10 +4,22 @@
 
 use crate::scene::TriangleMesh;
 use glam::Vec3A;
-use obvhs::cwbvh::builder::build_cwbvh_from_tris;
+use obvhs::aabb::Aabb;
+use obvhs::bvh2::node::Bvh2Node;
+use obvhs::bvh2::reinsertion::ReinsertionOptimizer;
+use obvhs::bvh2::Bvh2;
+use obvhs::cwbvh::bvh2_to_cwbvh::bvh2_to_cwbvh;
+use obvhs::cwbvh::CwBvh;
+use obvhs::ploc::PlocBuilder;
 use obvhs::triangle::Triangle;
 use obvhs::BvhBuildParams;
-use std::time::Duration;
+
+/// Entries of the traversal stack in `bvh.glsl`. A ray pushes at most one entry a level below the root, so a tree of one more level than
+/// this never overflows it.
+pub const TRAVERSAL_STACK: usize = 24;
+
+/// Most triangles of a leaf of the wide tree.
+const LEAF: u32 = 3;
 
 /// A BVH ready for upload.
 #[derive(Clone, Debug, Default)]
@@ -19,7 +31,8 @@ pub struct BodyBvh {
 }
 
 impl BodyBvh {
-    /// Builds the tree; an empty mesh gives an empty tree.
+    /// Builds the tree; an empty mesh gives an empty tree. Coordinates are finite and at most [`crate::scene::mesh::MAX_COORDINATE_M`]:
+    /// `scene_data` sees to it, and areas stay far below what f32 holds.
     pub fn build(mesh: &TriangleMesh) -> Self {
         if mesh.triangles.is_empty() {
             return Self::default();
@@ -30,10 +43,133 @@ impl BodyBvh {
             .iter()
             .map(|t| Triangle { v0: corner(t[0]), v1: corner(t[1]), v2: corner(t[2]) })
             .collect();
-        let mut parameters = BvhBuildParams::medium_build();
-        parameters.max_prims_per_leaf = 3;
-        let bvh = build_cwbvh_from_tris(&triangles, parameters, &mut Duration::default());
-        let nodes = bytemuck::cast_slice(&bvh.nodes).to_vec();
-        Self { nodes, order: bvh.primitive_indices }
+        let parameters = BvhBuildParams::medium_build();
+        let order = (0..triangles.len() as u32).collect();
+        let mut clustered = PlocBuilder::with_capacity(triangles.len()).build(
+            parameters.ploc_search_distance,
+            &triangles,
+            order,
+            parameters.sort_precision,
+            parameters.search_depth_threshold,
+        );
+        ReinsertionOptimizer::default().run(&mut clustered, parameters.reinsertion_batch_ratio, None);
+        let bvh = bvh2_to_cwbvh(&clustered, LEAF, true, false);
+        let built = Self::from(bvh);
+        if built.levels() <= TRAVERSAL_STACK + 1 {
+            return built;
+        }
+        // Clustering by area makes chains of triangles whose sizes grow geometrically. Halves by count never do.
+        Self::from(bvh2_to_cwbvh(&halves(&triangles), LEAF, true, false))
+    }
+
+    /// Levels of nodes, the root's included; 0 of an empty tree.
+    pub fn levels(&self) -> usize {
+        let mut level: Vec<u32> = if self.nodes.is_empty() { vec![] } else { vec![0] };
+        let mut levels = 0;
+        while !level.is_empty() {
+            levels += 1;
+            let children = |&node: &u32| {
+                let words = &self.nodes[node as usize * 5..];
+                let inner = (words[0][3] >> 24).count_ones();
+                (0..inner).map(|k| words[1][0] + k).collect::<Vec<_>>()
+            };
+            level = level.iter().flat_map(children).collect();
+        }
+        levels
+    }
+}
+
+impl From<CwBvh> for BodyBvh {
+    fn from(bvh: CwBvh) -> Self {
+        Self { nodes: bytemuck::cast_slice(&bvh.nodes).to_vec(), order: bvh.primitive_indices }
+    }
+}
+
+/// A binary tree that halves the triangles by their centres along the widest axis: at most `log2(n)`, rounded up, levels of inner nodes, 24
+/// for the 2^24 triangles that a body may have. A wide node replaces at least one of them, so the wide tree is no deeper.
+fn halves(triangles: &[Triangle]) -> Bvh2 {
+    let bounds: Vec<Aabb> = triangles.iter().map(|t| t.aabb()).collect();
+    let centre = |i: u32| bounds[i as usize].min * 0.5 + bounds[i as usize].max * 0.5;
+    let union = |of: &[u32]| {
+        of.iter().fold(Aabb::empty(), |mut all, &i| {
+            all.min = all.min.min(bounds[i as usize].min);
+            all.max = all.max.max(bounds[i as usize].max);
+            all
+        })
+    };
+    let mut order: Vec<u32> = (0..triangles.len() as u32).collect();
+    let mut nodes = vec![Bvh2Node::new(union(&order), 0, 0)];
+    let mut open = vec![(0usize, 0usize, order.len())];
+    while let Some((node, from, to)) = open.pop() {
+        let part = &mut order[from..to];
+        let bounds = union(part);
+        if part.len() <= 1 {
+            nodes[node] = Bvh2Node::new(bounds, part.len() as u32, from as u32);
+            continue;
+        }
+        let (low, high) = part.iter().fold((Vec3A::INFINITY, Vec3A::NEG_INFINITY), |(low, high), &i| {
+            (low.min(centre(i)), high.max(centre(i)))
+        });
+        let wide = high - low;
+        let axis = (0..3).max_by(|&a, &b| wide[a].total_cmp(&wide[b])).unwrap_or(0);
+        let middle = part.len() / 2;
+        part.select_nth_unstable_by(middle, |&a, &b| centre(a)[axis].total_cmp(&centre(b)[axis]));
+        let first = nodes.len();
+        nodes[node] = Bvh2Node::new(bounds, 0, first as u32);
+        nodes.extend([Bvh2Node::new(bounds, 0, 0); 2]);
+        open.push((first, from, from + middle));
+        open.push((first + 1, from + middle, to));
+    }
+    Bvh2 { nodes, primitive_indices: order, children_are_ordered_after_parents: true, ..Bvh2::default() }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::experiments::stability::shapes::{join, sphere, triangle};
+    use glam::Vec3;
+
+    /// Triangles at distances that double: whatever merges neighbours by area makes a chain of them.
+    fn doubling() -> TriangleMesh {
+        join((-110..19).map(|k| {
+            let x = 2f32.powi(k);
+            triangle([Vec3::new(x, 0.0, 0.0), Vec3::new(x, 0.5 * x, 0.0), Vec3::new(x, 0.0, 0.5 * x)])
+        }))
+    }
+
+    #[test]
+    fn the_shader_has_the_stack_that_is_counted_on() {
+        let text = include_str!("../../../shaders/glsl/bvh.glsl");
+        assert!(text.contains(&format!("const int STACK_SIZE = {TRAVERSAL_STACK};")));
+    }
+
+    #[test]
+    fn no_mesh_is_deeper_than_the_stack() {
+        let twins = join((0..3000).map(|_| triangle([Vec3::X, Vec3::Y, Vec3::Z])));
+        for (name, mesh) in
+            [("doubling", doubling()), ("twins", twins), ("sphere", sphere(Vec3::ZERO, 1.0, 4, true))]
+        {
+            let bvh = BodyBvh::build(&mesh);
+            println!("{name}: {} levels of {} triangles", bvh.levels(), mesh.triangles.len());
+            assert!(bvh.levels() <= TRAVERSAL_STACK + 1, "{name}: {}", bvh.levels());
+        }
+        assert_eq!(BodyBvh::default().levels(), 0);
+    }
+
+    #[test]
+    fn halving_keeps_every_triangle_and_few_levels() {
+        for n in [1usize, 2, 3, 4, 7, 1000, 20_000] {
+            let corners = |i: usize| {
+                let x = (i as f32).sqrt();
+                Triangle { v0: Vec3A::splat(x), v1: Vec3A::X * x, v2: Vec3A::Y }
+            };
+            let triangles: Vec<Triangle> = (0..n).map(corners).collect();
+            let bvh = BodyBvh::from(bvh2_to_cwbvh(&halves(&triangles), LEAF, true, false));
+            let mut all = bvh.order.clone();
+            all.sort_unstable();
+            assert!(all.iter().copied().eq(0..n as u32), "{n}");
+            let most = (n as f64).log2().ceil().max(1.0) as usize;
+            assert!(bvh.levels() <= most, "{n}: {} levels", bvh.levels());
+        }
     }
 }

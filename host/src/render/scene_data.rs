@@ -2,6 +2,7 @@
 
 use super::albedo_table::{AlbedoTable, ALBEDO_NODES};
 use super::body_bvh::BodyBvh;
+use crate::scene::mesh::MAX_COORDINATE_M;
 use crate::scene::{Environment, PunctualKind, Scene, TextureRef, Wrap};
 use bytemuck::Zeroable;
 use dpm_shaders::structs::{self as gpu, Light, Material, TextureInfo, TextureUse, TriangleRef, Vertex};
@@ -151,6 +152,9 @@ pub enum SceneDataError {
     /// A body too large for its index.
     #[error("body \"{0}\" has {1} triangles; at most 16 million fit. Simplify it")]
     TooManyTriangles(String, usize),
+    /// A corner that arithmetic cannot hold.
+    #[error("body \"{0}\" has a vertex at {1} m; coordinates are finite and at most {MAX_COORDINATE_M:e} m. Check the file's unit")]
+    TooFar(String, f32),
 }
 
 fn srgb_to_linear(v: u8) -> f32 {
@@ -291,6 +295,10 @@ impl SceneData {
         powers: &mut Vec<f32>,
     ) -> Result<(), SceneDataError> {
         let mesh = &body.mesh;
+        let far = mesh.positions.iter().flat_map(|p| p.to_array()).find(|v| !(v.abs() <= MAX_COORDINATE_M));
+        if let Some(far) = far {
+            return Err(SceneDataError::TooFar(body.name.clone(), far));
+        }
         let bvh = BodyBvh::build(mesh);
         if bvh.order.len() >= 1 << 24 {
             return Err(SceneDataError::TooManyTriangles(body.name.clone(), bvh.order.len()));
