@@ -1,8 +1,9 @@
 //! `dpm stability`: hard cases with their errors and bounds.
 
 use super::watch::print;
-use crate::experiments::stability::{cases, CaseResult, CaseVerdict, StabilityReport, SEED};
+use crate::experiments::stability::{cases, gpu, CaseResult, CaseVerdict, StabilityReport, SEED};
 use crate::failure::{Failure, FailureKind};
+use crate::gpu::validation_messages;
 use crate::telemetry::report::to_json;
 
 /// Flags of `dpm stability`.
@@ -21,13 +22,19 @@ pub struct StabilityArgs {
 
 fn line(c: &CaseResult) -> String {
     let error = c.error.map_or("-".into(), |e| format!("{e:.2e}"));
-    let verdict = if c.verdict == CaseVerdict::Pass { "pass" } else { "FAIL" };
+    let verdict = match c.verdict {
+        CaseVerdict::Pass => "pass",
+        CaseVerdict::Fail => "FAIL",
+        CaseVerdict::NotRun => "----",
+    };
     format!("{verdict}  {:<36} {error:>9} <= {:<6.0e} {:<11} {}\n", c.name, c.bound, c.unit, c.oracle)
 }
 
 /// Runs the cases; a failed one makes the command fail.
 pub fn execute(args: &StabilityArgs) -> Result<(), Failure> {
-    let all = cases();
+    let mut all = cases();
+    let device = gpu::open();
+    all.extend(gpu::cases(&device));
     let only = args.only.as_deref();
     if let Some(name) = only.filter(|o| !all.iter().any(|c| c.name.contains(o))) {
         let names: Vec<&str> = all.iter().map(|c| c.name).collect();
@@ -43,10 +50,22 @@ pub fn execute(args: &StabilityArgs) -> Result<(), Failure> {
     if args.json {
         print(&(to_json(&report) + "\n"));
     } else {
-        print(&format!("{} of {} cases pass\n", report.passed, report.cases.len()));
+        let not_run =
+            if report.not_run > 0 { format!(", {} not run", report.not_run) } else { String::new() };
+        print(&format!("{} of {} cases pass{not_run}\n", report.passed, report.cases.len()));
+    }
+    let (validation, texts) = validation_messages();
+    if validation > 0 {
+        let told = format!("Vulkan validation reported:\n  {}", texts.join("\n  "));
+        return Err(Failure::new(FailureKind::CheckFailed, told));
     }
     if report.failed == 0 {
-        return Ok(());
+        let Some(first) = report.cases.iter().find(|c| c.verdict == CaseVerdict::NotRun) else {
+            return Ok(());
+        };
+        let why = first.note.as_deref().unwrap_or("something is missing");
+        let told = format!("{} stability cases were not run: {why}", report.not_run);
+        return Err(Failure::new(FailureKind::NoGpu, told));
     }
     let failed: Vec<String> = (report.cases.iter())
         .filter(|c| c.verdict == CaseVerdict::Fail)

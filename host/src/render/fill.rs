@@ -1,8 +1,33 @@
-//! Fills a device buffer with copies of one value, at set-up time.
+//! Fills a device buffer with copies of one value, or changes some of its values; at set-up time and between frames of a check.
 
-use crate::gpu::{Buffer, CommandList, FrameFence, Gpu, GpuError, MemoryKind};
+use crate::gpu::{Buffer, CommandList, FrameFence, Gpu, GpuError, MemoryKind, Recorder};
 use bytemuck::Pod;
+use std::ops::Range;
 use std::sync::Arc;
+
+/// Changes a stretch of a buffer's values through the host and waits.
+pub(super) fn edit<T: Pod>(
+    gpu: &Arc<Gpu>,
+    buffer: &Buffer,
+    range: Range<usize>,
+    mut change: impl FnMut(&mut T),
+) -> Result<(), GpuError> {
+    let bytes = range.end * size_of::<T>();
+    let back = Buffer::new(gpu, "read back", bytes, MemoryKind::Readback)?;
+    run(gpu, |r| r.copy(buffer, &back, bytes))?;
+    let mut staging = Buffer::new(gpu, "staging", bytes, MemoryKind::Upload)?;
+    let mut values: Vec<T> = back.read::<T>(range.end).to_vec();
+    values[range].iter_mut().for_each(&mut change);
+    staging.bytes_mut()[..bytes].copy_from_slice(bytemuck::cast_slice(&values));
+    run(gpu, |r| r.copy(&staging, buffer, bytes))
+}
+
+fn run(gpu: &Arc<Gpu>, record: impl FnOnce(&mut Recorder)) -> Result<(), GpuError> {
+    let list = CommandList::record(gpu, 0, record)?;
+    let mut fence = FrameFence::new(gpu)?;
+    list.submit(&mut fence)?;
+    fence.wait(60_000_000_000)
+}
 
 /// Writes `count` copies of `value` and waits.
 pub(super) fn fill<T: Pod>(gpu: &Arc<Gpu>, buffer: &Buffer, value: &T, count: usize) -> Result<(), GpuError> {
@@ -11,8 +36,5 @@ pub(super) fn fill<T: Pod>(gpu: &Arc<Gpu>, buffer: &Buffer, value: &T, count: us
     for chunk in staging.bytes_mut()[..count * size_of::<T>()].chunks_exact_mut(bytes.len()) {
         chunk.copy_from_slice(bytes);
     }
-    let list = CommandList::record(gpu, 0, |r| r.copy(&staging, buffer, count * size_of::<T>()))?;
-    let mut fence = FrameFence::new(gpu)?;
-    list.submit(&mut fence)?;
-    fence.wait(60_000_000_000)
+    run(gpu, |r| r.copy(&staging, buffer, count * size_of::<T>()))
 }

@@ -20,6 +20,7 @@ use dpm_shaders::structs::{
     self as gpu_structs, Counters, Frame, Guide, History, Instance, Rows, Schedule, Surface, WorkItem,
 };
 use glam::{DAffine3, DVec3, Vec3};
+use std::ops::Range;
 use std::sync::Arc;
 
 /// What does not change while a renderer lives.
@@ -272,6 +273,25 @@ impl Renderer {
 
     fn is_lost(&self, body: usize, lost: &[bool]) -> bool {
         self.tracked[body].is_some_and(|t| lost.get(usize::from(t)).copied().unwrap_or(false))
+    }
+
+    /// Changes what is kept of past frames, two lists of one entry a pixel: for checks that something broken is forgotten. No frame may be
+    /// in flight.
+    ///
+    /// # Errors
+    /// Out of memory, device lost.
+    ///
+    /// # Panics
+    /// When the range lies beyond the history, but not for a method without any: then nothing happens.
+    pub fn edit_history(
+        &self,
+        range: Range<usize>,
+        change: impl FnMut(&mut History),
+    ) -> Result<(), GpuError> {
+        if !self.settings.method.needs_history() {
+            return Ok(());
+        }
+        super::fill::edit(&self.gpu, &self.shared.history, range, change)
     }
 
     /// What the scene needs of the tracer.

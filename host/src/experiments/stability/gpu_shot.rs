@@ -23,6 +23,8 @@ pub struct Shot<'a> {
     pub camera: ProjectorCamera,
     /// Where the light is wanted; `None`: back along the rays, everything is lit.
     pub eye: Option<DVec3>,
+    /// Where the eye looks; `None`: at itself, which is nowhere.
+    pub gaze: Option<DVec3>,
     /// Poses of the bodies; empty: at rest.
     pub poses: Vec<DAffine3>,
     /// Lost tracked bodies.
@@ -54,6 +56,7 @@ impl<'a> Shot<'a> {
             scene,
             camera,
             eye: None,
+            gaze: None,
             poses: Vec::new(),
             lost: Vec::new(),
             spp: 16,
@@ -136,7 +139,7 @@ impl<'a> Shot<'a> {
                 budget_spp: self.spp as f32,
                 camera: &self.camera,
                 eye,
-                gaze: eye,
+                gaze: self.gaze.unwrap_or(eye),
                 poses: &poses,
                 lost: &self.lost,
             };

@@ -7,8 +7,13 @@
 pub mod calibration;
 pub mod clocks;
 pub mod estimate;
+pub mod gpu;
+pub mod gpu_chain;
 pub mod gpu_compare;
+pub mod gpu_history;
 pub mod gpu_shot;
+pub mod gpu_tracer;
+pub mod gpu_traversal;
 pub mod planes;
 pub mod predictor;
 pub mod shapes;
@@ -33,6 +38,8 @@ pub struct Case {
     pub bound: f64,
     /// Error for a seed, not negative; NaN fails. Cases without randomness ignore the seed.
     pub measure: Box<dyn Fn(u64) -> f64 + Send + Sync>,
+    /// What is missing on this machine, so that the case cannot run; `None`: nothing.
+    pub missing: Option<String>,
 }
 
 impl Case {
@@ -45,7 +52,7 @@ impl Case {
         bound: f64,
         measure: impl Fn(u64) -> f64 + Send + Sync + 'static,
     ) -> Self {
-        Self { name, input, oracle, unit, bound, measure: Box::new(measure) }
+        Self { name, input, oracle, unit, bound, measure: Box::new(measure), missing: None }
     }
 }
 
@@ -57,6 +64,9 @@ pub enum CaseVerdict {
     Pass,
     /// It is not, or the case panicked, or its error is not a number.
     Fail,
+    /// Something that it needs is missing here: nothing is known.
+    #[serde(rename = "not run")]
+    NotRun,
 }
 
 /// What became of a case.
@@ -80,7 +90,7 @@ pub struct CaseResult {
     pub seed: u64,
     /// How long it took.
     pub wall_s: f64,
-    /// Why there is no error value.
+    /// Why there is no error value: a panic, a number that is none, or what is missing.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub note: Option<String>,
 }
@@ -94,6 +104,8 @@ pub struct StabilityReport {
     pub passed: usize,
     /// How many failed.
     pub failed: usize,
+    /// How many could not run here.
+    pub not_run: usize,
 }
 
 impl StabilityReport {
@@ -102,6 +114,7 @@ impl StabilityReport {
         match result.verdict {
             CaseVerdict::Pass => self.passed += 1,
             CaseVerdict::Fail => self.failed += 1,
+            CaseVerdict::NotRun => self.not_run += 1,
         }
         self.cases.push(result);
     }
@@ -145,6 +158,9 @@ pub fn run(only: Option<&str>) -> StabilityReport {
 /// Runs one case. A panic inside it is a failure of the case, not of the run.
 pub fn run_case(case: &Case, seed: u64) -> CaseResult {
     let start = Instant::now();
+    if let Some(missing) = &case.missing {
+        return result(case, seed, start, (None, Some(missing.clone())), CaseVerdict::NotRun);
+    }
     let outcome = catch_unwind(AssertUnwindSafe(|| (case.measure)(seed)));
     let (error, note) = match outcome {
         Ok(error) if error.is_finite() => (Some(error), None),
@@ -156,6 +172,16 @@ pub fn run_case(case: &Case, seed: u64) -> CaseResult {
         }
     };
     let pass = error.is_some_and(|e| e <= case.bound);
+    result(case, seed, start, (error, note), if pass { CaseVerdict::Pass } else { CaseVerdict::Fail })
+}
+
+fn result(
+    case: &Case,
+    seed: u64,
+    start: Instant,
+    (error, note): (Option<f64>, Option<String>),
+    verdict: CaseVerdict,
+) -> CaseResult {
     CaseResult {
         name: case.name,
         input: case.input,
@@ -163,7 +189,7 @@ pub fn run_case(case: &Case, seed: u64) -> CaseResult {
         unit: case.unit,
         error,
         bound: case.bound,
-        verdict: if pass { CaseVerdict::Pass } else { CaseVerdict::Fail },
+        verdict,
         seed,
         wall_s: start.elapsed().as_secs_f64(),
         note,
@@ -197,7 +223,8 @@ mod tests {
 
     #[test]
     fn names_are_unique_and_plain() {
-        let mut names: Vec<&str> = cases().iter().map(|c| c.name).collect();
+        let mut names: Vec<&str> =
+            cases().iter().chain(&gpu::cases(&Err("no".into()))).map(|c| c.name).collect();
         let n = names.len();
         assert!(names
             .iter()
@@ -205,6 +232,21 @@ mod tests {
         names.sort_unstable();
         names.dedup();
         assert_eq!(names.len(), n);
+    }
+
+    #[test]
+    fn without_a_device_its_cases_are_neither_passed_nor_failed() {
+        let mut report = StabilityReport::default();
+        let all = gpu::cases(&Err("no Vulkan here".into()));
+        report.run_cases(&all, None, SEED, |_| {});
+        assert!(all.len() >= 25, "{}", all.len());
+        assert_eq!((report.passed, report.failed, report.not_run), (0, 0, all.len()));
+        let json = serde_json::to_value(&report.cases[0]).unwrap();
+        assert_eq!(
+            (json["verdict"].as_str(), json["note"].as_str()),
+            (Some("not run"), Some("no Vulkan here"))
+        );
+        assert!(json["error"].is_null());
     }
 
     #[test]

@@ -1,0 +1,493 @@
+//! Histories, shading rates and filters on the GPU: what is constant stays, what changes is followed, what is broken is forgotten.
+
+use super::gpu::{on, Device};
+use super::gpu_shot::Shot;
+use super::gpu_tracer::still_life;
+use super::shapes::*;
+use super::Case;
+use crate::config::{RenderConfig, RenderMethod};
+use crate::experiments::bench::METHODS;
+use crate::experiments::error_plan::method_of;
+use crate::gpu::Gpu;
+use crate::render::method::Method;
+use crate::render::rate_map::{decide, rate_table, PixelGuide, RateConstants};
+use crate::render::{FrameSlot, Renderer};
+use crate::scene::{Environment, Material, PunctualKind, PunctualLight, Scene};
+use dpm_shaders::structs::{History, NO_HIT};
+use glam::{DAffine3, DVec3, Vec3};
+use std::sync::Arc;
+
+/// The cases.
+pub fn cases(device: &Device) -> Vec<Case> {
+    let case =
+        |name, input, oracle, unit, bound, measure| on(device, name, input, oracle, unit, bound, measure);
+    vec![
+        case(
+            "gpu-tiles-at-borders",
+            "rasters of 1 x 1 to 33 x 31, every method",
+            "closed form: 1 in every lit pixel",
+            "radiance",
+            1e-4,
+            borders,
+        ),
+        case(
+            "gpu-constant-input",
+            "600 frames of even light, every method",
+            "closed form: 1, no drift",
+            "radiance",
+            1e-4,
+            constant_input,
+        ),
+        case(
+            "gpu-step-input",
+            "a light that moves away at once, every method, a quarter of a second later",
+            "closed form, in steps of 8-bit codes",
+            "codes",
+            1.0,
+            step_input,
+        ),
+        case(
+            "gpu-step-follows-the-paper",
+            "the same step frame by frame, method paper",
+            "closed form: (1 - 0.2)^n",
+            "radiance by step",
+            1e-3,
+            step_paper,
+        ),
+        case(
+            "gpu-poisoned-history",
+            "NaN and infinity in all of the history or one pixel, every method",
+            "gone two frames later, neighbours clean",
+            "faults",
+            0.0,
+            poisoned,
+        ),
+        case(
+            "gpu-pose-jump",
+            "a body that jumps by its own width, every method",
+            "a picture that never saw the old place",
+            "radiance",
+            1e-4,
+            pose_jump,
+        ),
+        case(
+            "gpu-rate-map-equals-cpu",
+            "64 x 48 of moving surfaces, method paper",
+            "the CPU's decision, bit for bit",
+            "tiles",
+            0.0,
+            rate_map,
+        ),
+        case(
+            "gpu-nobody-waits",
+            "24 frames of method paper at mixed rates with checkerboard",
+            "every block is traced in every second frame",
+            "frames over 2",
+            0.0,
+            nobody_waits,
+        ),
+        case(
+            "gpu-rates-keep-energy",
+            "every method against all pixels traced, 48 frames",
+            "mean radiance",
+            "relative",
+            5e-3,
+            energy_kept,
+        ),
+    ]
+}
+
+/// Every method with its authors' constants.
+pub fn methods() -> Vec<Method> {
+    METHODS.into_iter().map(|(_, which)| method_of(&RenderConfig::default(), which)).collect()
+}
+
+/// A white Lambertian floor in even light: whatever is sampled, a lit pixel is 1.
+fn even() -> Scene {
+    let mut scene = scene_of(floor(20.0, 0.0), diffuse(Vec3::ONE));
+    scene.environment = sky(1.0);
+    scene
+}
+
+const ABOVE: DVec3 = DVec3::new(0.3, 3.0, 1.0);
+const BESIDE: DVec3 = DVec3::new(-0.5, 3.2, 0.8);
+
+/// Largest difference from 1 of what is shown at lit pixels; infinite when none is lit.
+fn from_one(slot: &FrameSlot) -> f64 {
+    let (shown, surfaces) = (slot.radiance().unwrap_or(&[]), slot.surfaces().unwrap_or(&[]));
+    let lit = shown.iter().zip(surfaces).filter(|(_, s)| s.id != NO_HIT && s.distance > 0.0);
+    let worst = lit.flat_map(|(r, _)| r[..3].iter()).map(|v| f64::from((v - 1.0).abs()));
+    worst.fold(-1.0, |a: f64, d| if d.is_nan() { f64::INFINITY } else { a.max(d) })
+}
+
+/// Plays frames of a shot with a renderer of its own and a pose list that may change.
+fn play(
+    gpu: &Arc<Gpu>,
+    shot: &Shot<'_>,
+    poses: impl Fn(u32) -> Vec<DAffine3>,
+    mut each: impl FnMut(u32, &FrameSlot),
+) {
+    let mut renderer = Renderer::new(gpu, shot.scene, shot.settings()).expect("the scene fits the GPU");
+    shot.play(&mut renderer, 0..shot.frames, poses, |frame, slot, _| each(frame, slot));
+}
+
+fn borders(gpu: &Arc<Gpu>, seed: u64) -> f64 {
+    let scene = even();
+    let mut worst: f64 = 0.0;
+    for method in methods() {
+        for (w, h) in [(1, 1), (1, 17), (15, 17), (16, 16), (33, 31)] {
+            let camera = camera(w, h, ABOVE, DVec3::ZERO);
+            let shot = Shot {
+                eye: Some(BESIDE),
+                gaze: Some(DVec3::new(5.0, 0.0, -5.0)),
+                spp: 2,
+                frames: 5,
+                seed: seed as u32,
+                method: Some(method.clone()),
+                ..Shot::new(&scene, camera)
+            };
+            play(
+                gpu,
+                &shot,
+                |_| shot.world_from_body(),
+                |frame, slot| {
+                    let off = from_one(slot);
+                    let dark = slot.surfaces().unwrap_or(&[]).iter().filter(|s| s.distance <= 0.0).count();
+                    worst = if off < 0.0 || dark > 0 {
+                        f64::INFINITY
+                    } else if frame >= 2 {
+                        worst.max(off)
+                    } else {
+                        worst
+                    };
+                },
+            );
+        }
+    }
+    worst
+}
+
+fn constant_input(gpu: &Arc<Gpu>, seed: u64) -> f64 {
+    let scene = even();
+    let camera = camera(16, 16, ABOVE, DVec3::ZERO);
+    let mut worst: f64 = 0.0;
+    for method in methods() {
+        let shot = Shot {
+            eye: Some(BESIDE),
+            spp: 1,
+            frames: 600,
+            seed: seed as u32,
+            method: Some(method),
+            ..Shot::new(&scene, camera)
+        };
+        play(
+            gpu,
+            &shot,
+            |_| shot.world_from_body(),
+            |frame, slot| {
+                if frame % 50 == 49 {
+                    let off = from_one(slot);
+                    worst = if off < 0.0 { f64::INFINITY } else { worst.max(off) };
+                }
+            },
+        );
+    }
+    worst
+}
+
+/// A floor under a point light that a second body carries: light without noise that a pose changes.
+fn carried_light() -> Scene {
+    let mut scene = scene_of(floor(20.0, 0.0), diffuse(Vec3::splat(0.8)));
+    let carrier = sphere(Vec3::ZERO, 0.01, 1, true);
+    add(&mut scene, carrier, diffuse(Vec3::ZERO));
+    scene.bodies[1].projected = false;
+    scene.environment = Environment::Constant(Vec3::ZERO);
+    scene.lights.push(PunctualLight {
+        kind: PunctualKind::Point,
+        intensity: Vec3::splat(4.0),
+        body: Some(1),
+        position: Vec3::new(0.0, 0.2, 0.0),
+        direction: Vec3::NEG_Y,
+        range: f32::INFINITY,
+    });
+    scene
+}
+
+fn light_at(height: f64) -> Vec<DAffine3> {
+    vec![DAffine3::IDENTITY, DAffine3::from_translation(DVec3::new(4.0, height - 0.2, 0.0))]
+}
+
+/// Radiance of the floor in the middle of the picture (the origin), light at a height.
+fn lit_by(height: f64) -> f64 {
+    let d2 = 16.0 + height * height;
+    0.8 / std::f64::consts::PI * 4.0 * height / d2.powf(1.5)
+}
+
+/// The middle pixel, frame by frame: the light comes down from 4 m to 2 m after frame `step`.
+fn stepped(gpu: &Arc<Gpu>, method: Method, seed: u64, step: u32, frames: u32) -> Vec<f64> {
+    let scene = carried_light();
+    let camera = camera(17, 17, DVec3::new(0.0, 3.0, 0.01), DVec3::ZERO);
+    let shot = Shot {
+        eye: Some(BESIDE),
+        gaze: Some(DVec3::ZERO),
+        spp: 4,
+        depth: 2,
+        frames,
+        seed: seed as u32,
+        method: Some(method),
+        ..Shot::new(&scene, camera)
+    };
+    let mut out = Vec::new();
+    play(
+        gpu,
+        &shot,
+        |frame| light_at(if frame <= step { 4.0 } else { 2.0 }),
+        |_, slot| {
+            out.push(slot.radiance().map_or(f64::NAN, |r| f64::from(r[8 * 17 + 8][1])));
+        },
+    );
+    out
+}
+
+fn step_input(gpu: &Arc<Gpu>, seed: u64) -> f64 {
+    let mut worst: f64 = 0.0;
+    for method in methods() {
+        let seen = stepped(gpu, method, seed, 120, 120 + 237);
+        let before = (seen[119] / lit_by(4.0) - 1.0).abs();
+        let after = (seen[seen.len() - 1] / lit_by(2.0) - 1.0).abs();
+        worst = worst.max(255.0 * before).max(255.0 * after);
+        if !worst.is_finite() {
+            return f64::NAN;
+        }
+    }
+    worst
+}
+
+fn step_paper(gpu: &Arc<Gpu>, seed: u64) -> f64 {
+    let mut method = method_of(&RenderConfig::default(), RenderMethod::Paper);
+    // Every pixel in every frame, so that the recursion alone is left.
+    (method.checkerboard, method.rate_map, method.spatial) = (false, false, false);
+    let alpha = method.paper.temporal_alpha[0];
+    let seen = stepped(gpu, method, seed, 40, 60);
+    let (from, to) = (lit_by(4.0), lit_by(2.0));
+    (1..19)
+        .map(|n| {
+            let wanted = to + (from - to) * (1.0 - alpha).powi(n);
+            ((seen[40 + n as usize] - wanted) / (to - from)).abs()
+        })
+        .fold(0.0, f64::max)
+}
+
+fn poisoned(gpu: &Arc<Gpu>, seed: u64) -> f64 {
+    let scene = even();
+    let camera = camera(33, 33, ABOVE, DVec3::ZERO);
+    let mut faults = 0u32;
+    for method in methods() {
+        let shot = Shot {
+            eye: Some(BESIDE),
+            spp: 2,
+            frames: 8,
+            seed: seed as u32,
+            method: Some(method),
+            ..Shot::new(&scene, camera)
+        };
+        for bad in [f32::NAN, f32::INFINITY, f32::NEG_INFINITY] {
+            for whole in [true, false] {
+                let mut renderer =
+                    Renderer::new(gpu, &scene, shot.settings()).expect("the scene fits the GPU");
+                let poses = shot.world_from_body();
+                shot.play(&mut renderer, 0..6, |_| poses.clone(), |_, _, _| ());
+                let pixels = 33 * 33;
+                let range = if whole { 0..2 * pixels } else { 544..545 };
+                // What was kept stays but for the numbers that a broken sample would leave.
+                renderer.edit_history(range.clone(), |h: &mut History| poison(h, bad)).expect("memory");
+                if !whole {
+                    let other = pixels + 544..pixels + 545;
+                    renderer.edit_history(other, |h: &mut History| poison(h, bad)).expect("memory");
+                }
+                shot.play(
+                    &mut renderer,
+                    6..12,
+                    |_| poses.clone(),
+                    |frame, slot, _| {
+                        let shown = slot.radiance().unwrap_or(&[]);
+                        let near = |i: usize| (i % 33).abs_diff(16).max((i / 33).abs_diff(16)) <= 2;
+                        for (i, v) in shown.iter().enumerate() {
+                            let right = v[..3].iter().all(|v| (v - 1.0).abs() < 1e-3);
+                            let excused = frame < 8 && (whole || near(i));
+                            faults +=
+                                u32::from(!right && !excused) + u32::from(v.iter().any(|v| !v.is_finite()));
+                        }
+                    },
+                );
+            }
+        }
+    }
+    f64::from(faults)
+}
+
+fn poison(h: &mut History, bad: f32) {
+    *h = History { mean: [bad; 3], fast: bad, variance: bad, last: bad, noise: bad, ..*h };
+}
+
+fn pose_jump(gpu: &Arc<Gpu>, seed: u64) -> f64 {
+    // A plate that shines by itself in two colours: no noise, so whatever is left of the old place shows.
+    let mut scene = Scene::default();
+    let half = |x: f32| quad(Vec3::new(x, 0.0, 0.5), Vec3::X, Vec3::NEG_Z);
+    let glow = |c: Vec3| Material { base_color: Vec3::splat(0.5), ..emitter(c) };
+    add(&mut scene, half(-1.0), glow(Vec3::new(1.0, 0.1, 0.0)));
+    add(&mut scene, half(0.0), glow(Vec3::new(0.0, 0.2, 1.0)));
+    scene.environment = Environment::Constant(Vec3::ZERO);
+    let camera = camera(40, 30, DVec3::new(0.0, 5.0, 1.5), DVec3::ZERO);
+    let at = |x: f64| vec![DAffine3::from_translation(DVec3::X * x); 2];
+    let mut worst: f64 = 0.0;
+    for method in methods() {
+        let shot = |frames| Shot {
+            eye: Some(DVec3::new(-0.4, 5.0, 1.2)),
+            gaze: Some(DVec3::ZERO),
+            depth: 1,
+            frames,
+            seed: seed as u32,
+            method: Some(method.clone()),
+            ..Shot::new(&scene, camera)
+        };
+        let settled = |first: f64, frames: u32| {
+            let shot = shot(frames);
+            let mut last = Vec::new();
+            play(
+                gpu,
+                &shot,
+                |frame| at(if frame < 12 { first } else { 0.3 }),
+                |_, slot| {
+                    last = slot.radiance().unwrap_or(&[]).to_vec();
+                },
+            );
+            last
+        };
+        // A checkerboard needs two frames to fill a new place.
+        for frames in [14, 16] {
+            let (jumped, fresh) = (settled(-0.7, frames), settled(0.3, frames));
+            for (a, b) in jumped.iter().zip(&fresh) {
+                let off = (0..3).map(|c| f64::from((a[c] - b[c]).abs())).fold(0.0, f64::max);
+                worst = if off.is_nan() { f64::INFINITY } else { worst.max(off) };
+            }
+        }
+    }
+    worst
+}
+
+/// The paper's method with angles that cut through a small picture.
+fn paper() -> Method {
+    let mut method = method_of(&RenderConfig::default(), RenderMethod::Paper);
+    method.paper.zone_spp = [4, 4, 2];
+    (method.paper.phi_h_deg, method.paper.phi_q_deg) = (5.0, 10.0);
+    (method.paper.filter_from_deg, method.paper.filter_to_deg) = (6.0, 8.0);
+    method
+}
+
+/// The still life at 64 x 48, its ball drifting by `speed` metres a frame.
+fn drift(
+    gpu: &Arc<Gpu>,
+    method: &Method,
+    seed: u64,
+    frames: u32,
+    speed: f64,
+    each: impl FnMut(u32, &FrameSlot),
+) {
+    let mut scene = still_life(1.0);
+    scene.environment = sky(0.2);
+    let camera = camera(64, 48, DVec3::new(0.3, 1.6, 2.4), DVec3::new(0.0, 0.2, 0.0));
+    let shot = Shot {
+        eye: Some(DVec3::new(-0.3, 1.5, 2.3)),
+        gaze: Some(DVec3::new(-0.4, 0.1, 0.2)),
+        spp: 4,
+        frames,
+        seed: seed as u32,
+        method: Some(method.clone()),
+        ..Shot::new(&scene, camera)
+    };
+    let ball = |frame: u32| DAffine3::from_translation(DVec3::X * speed * f64::from(frame));
+    play(gpu, &shot, |frame| vec![DAffine3::IDENTITY, ball(frame), DAffine3::IDENTITY], each);
+}
+
+fn rate_map(gpu: &Arc<Gpu>, seed: u64) -> f64 {
+    let paper = paper();
+    let constants = RateConstants {
+        t: paper.paper.t as f32,
+        l: paper.paper.l as f32,
+        degrees: [paper.paper.phi_h_deg as f32, paper.paper.phi_q_deg as f32],
+    };
+    let table = rate_table();
+    let (mut wrong, mut compared, mut coarse) = (0u32, 0u32, 0u32);
+    drift(gpu, &paper, seed, 10, 0.01, |frame, slot| {
+        if frame % 2 == 1 {
+            return;
+        }
+        let (surfaces, guides) = (slot.surfaces().unwrap_or(&[]), slot.guides().unwrap_or(&[]));
+        let prior = slot.prior_luminance().unwrap_or_default();
+        for (tile, &rate) in slot.rates().unwrap_or(&[]).iter().enumerate() {
+            let pixels: [Option<PixelGuide>; 256] = std::array::from_fn(|i| {
+                let at = (tile / 4 * 16 + i / 16) * 64 + tile % 4 * 16 + i % 16;
+                let s = surfaces.get(at)?;
+                (s.id != NO_HIT && s.distance > 0.0).then(|| PixelGuide {
+                    luminance: (prior[at] >= 0.0).then_some(prior[at]),
+                    motion: guides[at].motion,
+                    size: guides[at].size,
+                    angle: guides[at].angle,
+                })
+            });
+            if pixels.iter().any(Option::is_some) {
+                wrong += u32::from(rate != decide(&pixels, &table, &constants).code());
+                compared += 1;
+                coarse += u32::from(rate != 0);
+            }
+        }
+    });
+    if compared < 30 || coarse < 5 {
+        return f64::NAN;
+    }
+    f64::from(wrong)
+}
+
+fn nobody_waits(gpu: &Arc<Gpu>, seed: u64) -> f64 {
+    let mut waited = vec![0u32; 64 * 48];
+    let mut worst = 0;
+    drift(gpu, &paper(), seed, 24, 0.0, |_, slot| {
+        let (traced, rates) = (slot.traced().unwrap_or(&[]), slot.rates().unwrap_or(&[]));
+        for (i, s) in slot.surfaces().unwrap_or(&[]).iter().enumerate() {
+            if s.id == NO_HIT || s.distance <= 0.0 {
+                continue;
+            }
+            let (x, y) = (i % 64, i / 64);
+            let rate = rates[y / 16 * 4 + x / 16];
+            let (w, h) = (1usize << (rate & 3), 1usize << (rate >> 2 & 3));
+            let (bx, by) = (x / w * w, y / h * h);
+            let any = (0..w * h).any(|k| traced[(by + k / w) * 64 + bx + k % w][3] > 0.0);
+            waited[i] = if any { 0 } else { waited[i] + 1 };
+            worst = worst.max(waited[i]);
+        }
+    });
+    f64::from(worst.saturating_sub(2))
+}
+
+fn energy_kept(gpu: &Arc<Gpu>, seed: u64) -> f64 {
+    let total = |method: &Method, frames: u32, from: u32| {
+        let (mut sum, mut n) = (0.0f64, 0u32);
+        drift(gpu, method, seed, frames, 0.0, |frame, slot| {
+            if frame >= from {
+                sum +=
+                    slot.radiance().unwrap_or(&[]).iter().map(|r| f64::from(r[0] + r[1] + r[2])).sum::<f64>();
+                n += 1;
+            }
+        });
+        sum / f64::from(n)
+    };
+    let wanted = total(&Method::full(4), 160, 0);
+    let mut worst: f64 = 0.0;
+    for which in [RenderMethod::Paper, RenderMethod::Miyamoto, RenderMethod::Dpm] {
+        let mut method = method_of(&RenderConfig::default(), which);
+        method.paper.zone_spp = [8; 3];
+        worst = worst.max((total(&method, 112, 64) / wanted - 1.0).abs());
+    }
+    worst
+}
