@@ -179,6 +179,14 @@ fn texture_use(t: Option<TextureRef>) -> TextureUse {
     }
 }
 
+/// Largest radiance or intensity that is uploaded: its square times any count of samples is far below what f32 holds, and it is far above
+/// what any projector can show.
+const BRIGHTEST: f32 = 1e12;
+
+fn bounded(light: Vec3) -> Vec3 {
+    light.min(Vec3::splat(BRIGHTEST))
+}
+
 fn luminance(c: Vec3) -> f32 {
     c.dot(Vec3::new(0.2126, 0.7152, 0.0722))
 }
@@ -269,7 +277,7 @@ impl SceneData {
             self.materials.push(Material {
                 base_color: m.base_color.into(),
                 alpha: m.alpha,
-                emissive: m.emissive.into(),
+                emissive: bounded(m.emissive).into(),
                 alpha_cutoff: m.alpha_cutoff.unwrap_or(-1.0),
                 metallic: m.metallic,
                 roughness: m.roughness,
@@ -347,7 +355,7 @@ impl SceneData {
                 light = *emitter_of.entry(t).or_insert_with(|| {
                     let sides = if m.double_sided { 2.0 } else { 1.0 };
                     let area = 0.5 * (p[1] - p[0]).cross(p[2] - p[0]).length();
-                    powers.push(std::f32::consts::PI * area * sides * luminance(m.emissive));
+                    powers.push(std::f32::consts::PI * area * sides * luminance(bounded(m.emissive)));
                     self.lights.push(Light {
                         kind: gpu::LIGHT_TRIANGLE,
                         instance: index as u32,
@@ -377,7 +385,7 @@ impl SceneData {
     fn add_punctual(&mut self, scene: &Scene, radius: f32, powers: &mut Vec<f32>) {
         use std::f32::consts::PI;
         for l in &scene.lights {
-            let intensity = luminance(l.intensity);
+            let intensity = luminance(bounded(l.intensity));
             let (kind, power, scale, offset) = match l.kind {
                 PunctualKind::Point => (gpu::LIGHT_POINT, 4.0 * PI * intensity, 0.0, 0.0),
                 PunctualKind::Spot { inner, outer } => {
@@ -398,7 +406,7 @@ impl SceneData {
                 instance: l.body.unwrap_or(gpu::NO_INSTANCE),
                 position: l.position.into(),
                 direction: l.direction.into(),
-                intensity: l.intensity.into(),
+                intensity: bounded(l.intensity).into(),
                 cone_scale: scale,
                 cone_offset: offset,
                 range: if l.range.is_finite() { l.range } else { 3.0e38 },
@@ -411,9 +419,9 @@ impl SceneData {
     fn add_environment(&mut self, scene: &Scene, radius: f32, light_power: f32) {
         let mean = match &scene.environment {
             Environment::Constant(c) => {
-                self.environment_constant = *c;
+                self.environment_constant = bounded(*c);
                 self.needs.environment_kind = u32::from(c.max_element() > 0.0);
-                luminance(*c)
+                luminance(bounded(*c))
             }
             Environment::Equirect { width, height, texels, rotation_rad } => {
                 self.environment_size = [*width, *height];
@@ -438,12 +446,13 @@ impl SceneData {
         self.environment.clear();
         for y in 0..height {
             let row = &texels[y * width..(y + 1) * width];
-            let sum: f64 = row.iter().map(|t| f64::from(luminance(*t))).sum();
+            let sum: f64 = row.iter().map(|t| f64::from(luminance(bounded(*t)))).sum();
             let mut run = 0.0f64;
             for (x, t) in row.iter().enumerate() {
-                run += f64::from(luminance(*t));
+                run += f64::from(luminance(bounded(*t)));
                 let cdf = if sum > 0.0 { run / sum } else { (x + 1) as f64 / width as f64 };
                 let cdf = if x + 1 == width { 1.0 } else { cdf };
+                let t = bounded(*t);
                 self.environment.push([t.x, t.y, t.z, cdf as f32]);
             }
             let c = |k: usize| (std::f64::consts::PI * k as f64 / height as f64).cos();
