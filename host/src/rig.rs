@@ -88,6 +88,8 @@ pub struct Observer {
     carrier: Option<usize>,
     eye_offset: DVec3,
     gaze: Gaze,
+    gaze_hold_ns: i64,
+    gaze_widen_deg_per_s: f64,
 }
 
 #[derive(Clone, Debug)]
@@ -98,6 +100,21 @@ enum Gaze {
 }
 
 impl Observer {
+    /// The tracked body without which the gaze is not known; `None` for a gaze that does not depend on a tracker.
+    pub fn gaze_body(&self) -> Option<usize> {
+        match self.gaze {
+            Gaze::Point(_) => None,
+            Gaze::Body(i) => Some(i),
+            Gaze::Straight => self.carrier,
+        }
+    }
+
+    /// By how much all zones about the gaze grow when its body was last seen `unseen_ns` ago, degrees: 0 while it is held, 180 at most.
+    pub fn widening_deg(&self, unseen_ns: i64) -> f64 {
+        let beyond_s = unseen_ns.saturating_sub(self.gaze_hold_ns).max(0) as f64 * 1e-9;
+        (beyond_s * self.gaze_widen_deg_per_s).min(180.0)
+    }
+
     /// Eye and gaze point, world.
     pub fn eye_and_gaze(&self, world_from_body: &[DAffine3]) -> (DVec3, DVec3) {
         let carrier = self.carrier.and_then(|i| world_from_body.get(i));
@@ -350,5 +367,37 @@ fn observer(config: &RigConfig, bodies: &[RigBody]) -> Result<Observer, RigError
             GazeConfig::Tracked(t) => Gaze::Body(find("observer.gaze.target", &t.target)?),
             GazeConfig::Straight(_) => Gaze::Straight,
         },
+        gaze_hold_ns: i64::from(c.gaze_hold_ms) * 1_000_000,
+        gaze_widen_deg_per_s: c.gaze_widen_deg_per_s,
     })
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::config::Overrides;
+
+    fn observer(settings: &[&str]) -> Observer {
+        let flags = settings.iter().map(|s| (*s).to_owned()).collect();
+        let config = RigConfig::demo(&Overrides { variables: vec![], flags }).unwrap();
+        Rig::build(&config, Raster::new(8, 8)).unwrap().observer
+    }
+
+    #[test]
+    fn a_gaze_that_is_lost_is_held_and_then_its_zones_grow() {
+        let o = observer(&["observer.gaze={kind=\"tracked\",target=\"venus\"}", "observer.gaze_hold_ms=100"]);
+        assert_eq!(o.gaze_body(), Some(1));
+        let after = |ms: i64| o.widening_deg(ms * 1_000_000);
+        // 60 degrees a second from 100 ms on.
+        assert_eq!([after(-5), after(0), after(100), after(600)], [0.0, 0.0, 0.0, 30.0]);
+        assert_eq!(o.widening_deg(i64::MAX), 180.0);
+    }
+
+    #[test]
+    fn a_gaze_that_no_tracker_tells_is_never_lost() {
+        assert_eq!(observer(&[]).gaze_body(), None);
+        assert_eq!(observer(&["observer.gaze={kind=\"straight\"}"]).gaze_body(), None);
+        let carried = observer(&["observer.gaze={kind=\"straight\"}", "observer.body=\"bunny\""]);
+        assert_eq!(carried.gaze_body(), Some(0));
+    }
 }

@@ -40,6 +40,7 @@ fn the_light_is_the_rendered_picture_in_all_24_planes() {
                 camera: &rig.camera,
                 eye,
                 gaze,
+                widen_deg: 0.0,
                 poses: &poses,
                 lost: &[],
             };

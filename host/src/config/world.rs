@@ -120,6 +120,10 @@ section! {
         eye_offset: [f64; 3] = [0.0, 0.0, 0.0], "m", Within(-10.0, 10.0);
         /// Where the eye looks.
         gaze: GazeConfig = GazeConfig::default(), "", Any;
+        /// A gaze whose tracked body is no longer seen is held for so long where it was.
+        gaze_hold_ms: u32 = 200, "ms", Within(0, 60_000);
+        /// From then on the zones of full quality grow at this rate about it, until it is seen again.
+        gaze_widen_deg_per_s: f64 = 60.0, "deg/s", Within(0.0, 1e4);
     }
 }
 

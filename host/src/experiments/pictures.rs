@@ -109,6 +109,7 @@ fn integrate(
         camera,
         eye: other,
         gaze: other,
+        widen_deg: 0.0,
         poses: &poses,
         lost: &[],
     };

@@ -251,7 +251,17 @@ pub fn draw(
     let (eye, gaze) = rig.observer.eye_and_gaze(&tracked);
     renderer.submit(
         slot,
-        &FrameInputs { frame, spp, budget_spp, camera: &rig.camera, eye, gaze, poses, lost: &[] },
+        &FrameInputs {
+            frame,
+            spp,
+            budget_spp,
+            camera: &rig.camera,
+            eye,
+            gaze,
+            widen_deg: 0.0,
+            poses,
+            lost: &[],
+        },
     )?;
     slot.wait(120_000_000_000)
 }

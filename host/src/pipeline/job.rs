@@ -83,6 +83,8 @@ pub struct FrameMemory {
     pub scene_poses: Vec<DAffine3>,
     /// Gaze point, world.
     pub gaze: DVec3,
+    /// Degrees by which the zones about a gaze that is no longer tracked have grown.
+    pub widen_deg: f32,
     /// The GPU's part; `None` when frames are prepared instead of rendered.
     pub gpu: Option<FrameSlot>,
     /// Bit planes.

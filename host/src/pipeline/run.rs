@@ -120,6 +120,7 @@ fn run_from(
             lost: Vec::with_capacity(rig.bodies.len()),
             scene_poses: Vec::with_capacity(rig.scene.bodies.len()),
             gaze: DVec3::ZERO,
+            widen_deg: 0.0,
             gpu: match &mut renderer {
                 Some(renderer) => Some(renderer.create_slot(false).map_err(RenderError::from)?),
                 None => None,

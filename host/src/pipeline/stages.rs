@@ -123,6 +123,11 @@ pub fn plan(job: &mut FrameJob, rig: &Rig, snapshot: &TrackSnapshot, slots: &Lin
     timeline.received_at = received_at;
     rig.scene_poses(&note.tracked_poses, &mut memory.scene_poses);
     (note.eye, memory.gaze) = rig.observer.eye_and_gaze(&note.tracked_poses);
+    memory.widen_deg = rig.observer.gaze_body().map_or(0.0, |body| {
+        let track = snapshot.tracks.get(body).copied().flatten();
+        let unseen_ns = track.map_or(i64::MAX, |(state, _)| middle.ns_since(state.captured_at));
+        rig.observer.widening_deg(unseen_ns) as f32
+    });
     timeline.wall_ns[Stage::Plan as usize] = watch.elapsed_ns();
 }
 
@@ -142,6 +147,7 @@ pub fn submit(job: &mut FrameJob, rig: &Rig, renderer: &mut Renderer) -> Result<
             camera: &rig.camera,
             eye: note.eye,
             gaze: memory.gaze,
+            widen_deg: memory.widen_deg,
             poses: &memory.scene_poses,
             lost: &memory.lost,
         },

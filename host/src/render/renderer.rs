@@ -84,6 +84,8 @@ pub struct FrameInputs<'a> {
     pub eye: DVec3,
     /// Gaze point, world.
     pub gaze: DVec3,
+    /// Degrees by which all zones about the gaze grow: 0 while it is known.
+    pub widen_deg: f32,
     /// world-from-body of every body of the scene, at the time of light.
     pub poses: &'a [DAffine3],
     /// Per tracked body: lost, no light falls on it. Bodies beyond the end are not lost.
@@ -588,8 +590,10 @@ impl Renderer {
             history_cap: method.history_cap,
             zone_spp: method.paper.zone_spp,
             zone_alpha: method.paper.temporal_alpha.map(|a| a as f32),
-            zone_degrees: [method.paper.phi_h_deg as f32, method.paper.phi_q_deg as f32],
-            filter_degrees: [method.paper.filter_from_deg as f32, method.paper.filter_to_deg as f32],
+            zone_degrees: [method.paper.phi_h_deg, method.paper.phi_q_deg]
+                .map(|angle| angle as f32 + inputs.widen_deg),
+            filter_degrees: [method.paper.filter_from_deg, method.paper.filter_to_deg]
+                .map(|angle| angle as f32 + inputs.widen_deg),
             rate_t: method.paper.t as f32,
             rate_l: method.paper.l as f32,
             pixel_size: (1.0 / c.fx) as f32,

@@ -140,6 +140,7 @@ impl<'a> Shot<'a> {
                 camera: &self.camera,
                 eye,
                 gaze: self.gaze.unwrap_or(eye),
+                widen_deg: 0.0,
                 poses: &poses,
                 lost: &self.lost,
             };

@@ -1,0 +1,58 @@
+//! A gaze that the tracker no longer tells: held, then the zones of full quality grow until all of the picture is in them.
+
+use dpm_host::pipeline::renderer_settings;
+use dpm_host::render::{FrameInputs, Renderer, RendererSettings};
+use dpm_tests::gpu::with_gpu;
+use dpm_tests::rigs::demo_rig;
+
+#[test]
+fn wider_zones_are_the_zones_of_a_rig_file_with_wider_angles() {
+    with_gpu(|gpu| {
+        // Angles that cut through the small picture; no rate map and no checkerboard, so samples follow the zones alone.
+        let rig = demo_rig(
+            64,
+            48,
+            &[
+                "render.method=\"paper\"",
+                "render.effects.rate_map=false",
+                "render.effects.checkerboard=false",
+                "render.paper.phi_h_deg=4.0",
+                "render.paper.phi_q_deg=8.0",
+                "render.paper.zone_spp=[6,3,1]",
+                "observer.gaze={kind=\"point\",point=[-0.2,0.0,0.0]}",
+            ],
+        );
+        let samples = |widen_deg: f32, phi_deg: [f64; 2]| {
+            let mut settings: RendererSettings = renderer_settings(&rig);
+            [settings.method.paper.phi_h_deg, settings.method.paper.phi_q_deg] = phi_deg;
+            let mut renderer = Renderer::new(gpu, &rig.scene, settings).unwrap();
+            let mut slot = renderer.create_slot(false).unwrap();
+            let tracked: Vec<_> = rig.bodies.iter().map(|b| dpm_host::rig::affine(&b.rest)).collect();
+            let mut poses = Vec::new();
+            rig.scene_poses(&tracked, &mut poses);
+            let (eye, gaze) = rig.observer.eye_and_gaze(&tracked);
+            let inputs = FrameInputs {
+                frame: 0,
+                spp: 1,
+                budget_spp: 1.0,
+                camera: &rig.camera,
+                eye,
+                gaze,
+                widen_deg,
+                poses: &poses,
+                lost: &[],
+            };
+            renderer.submit(&mut slot, &inputs).unwrap();
+            let counters = slot.wait(60_000_000_000).unwrap().counters();
+            (counters.samples, counters.lit_pixels)
+        };
+        let (narrow, lit) = samples(0.0, [4.0, 8.0]);
+        let (wider, _) = samples(3.0, [4.0, 8.0]);
+        assert!(
+            lit < narrow && narrow < wider && wider < 6 * lit,
+            "{lit} pixels, {narrow} and {wider} samples"
+        );
+        assert_eq!(wider, samples(0.0, [7.0, 11.0]).0);
+        assert_eq!(samples(180.0, [4.0, 8.0]).0, 6 * lit, "everything is in the fovea");
+    });
+}
