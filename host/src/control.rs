@@ -204,8 +204,8 @@ fn ask(folder: &Path, id: u32, order: Order) -> io::Result<Answer> {
     let limit = Some(OBEYED_WITHIN + 2 * PATIENCE);
     stream.set_read_timeout(limit)?;
     stream.set_write_timeout(limit)?;
-    stream.write_all(order.word().as_bytes())?;
-    stream.write_all(b"\n")?;
+    // In one piece: whoever hears the word may hang up at once.
+    stream.write_all(format!("{}\n", order.word()).as_bytes())?;
     let mut text = String::new();
     stream.take(MAX_ANSWER).read_to_string(&mut text)?;
     let text = text.trim_end().to_owned();

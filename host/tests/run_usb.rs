@@ -5,7 +5,8 @@ mod link_common;
 use dpm_device::link::DeviceState;
 use dpm_device::transport::usb::DATA_OUT;
 use dpm_device::transport::LinkDevice;
-use dpm_host::pipeline::PipelineError;
+use dpm_host::experiments::link_test::{link_test, Content};
+use dpm_host::pipeline::{projector, PipelineError};
 use dpm_host::telemetry::monitor::{Order, ProjectorHealth};
 use hil_mock::projector::usb::UsbProjector;
 use hil_mock::projector::{MockConfig, MockProjector};
@@ -124,4 +125,33 @@ fn an_absent_a_denied_and_a_taken_projector_are_told_apart() {
     // A denied device does not tell its serial number: whoever asks for another one hears of it, too.
     let denied = told(r#"{ kind = "usb", serial_number = "none" }"#);
     assert!(denied.contains("permission denied") && denied.contains("60-dpm.rules"), "{denied}");
+}
+
+/// A cable that takes so many bytes a second carries so many frames, raw; the same frames compacted carry more.
+#[test]
+fn the_link_test_finds_the_rate_that_a_slow_cable_allows() {
+    let far = UsbBench::new(0xa3, Options::default());
+    let rig = rig(&far.backend(), &["projector.frame_rate=400"]);
+    let frame = projector::frame_bytes(raster(), 8) as u64;
+    far.model.lock().unwrap().set_bytes_per_second(Some(100 * frame));
+    let report = link_test(&rig, &Content::prepared(&rig, 4), 1.5).unwrap_or_else(|e| panic!("{e}"));
+    let [raw, auto] = &report.ways[..] else { panic!("{report:?}") };
+    assert!(raw.limited_by_link, "{raw:?}");
+    // Not faster than the cable, but for its FIFO of 64 KiB at the start; slower only by what a busy machine costs.
+    let fifo = 65_536.0 / frame as f64 / 1.5;
+    assert!(raw.frames_per_s < 1.05 * (100.0 + fifo), "{raw:?}");
+    assert!(raw.frames_per_s > 50.0, "{raw:?}");
+    assert_eq!(raw.bytes_per_frame, frame as f64);
+    assert_eq!((raw.planes[1], raw.planes[2]), (0, 0));
+    assert_eq!(raw.allows_hz, raw.frames_per_s.floor());
+    assert!(auto.bytes_per_frame < 0.8 * raw.bytes_per_frame, "{auto:?}");
+    assert!(auto.frames_per_s > raw.frames_per_s, "{auto:?}");
+    assert!(
+        report.to_table().contains("raw: the link allows projector.frame_rate = "),
+        "{}",
+        report.to_table()
+    );
+    let s = far.status();
+    assert!(!far.is_lit() && s.state == DeviceState::Configured, "{s:?}");
+    assert_eq!((s.frames_incomplete, s.payload_errors), (0, 0), "whole frames only");
 }

@@ -5,6 +5,7 @@ pub mod dlpc900;
 pub mod doctor;
 pub mod error;
 pub mod keys;
+pub mod link_test;
 pub mod order;
 pub mod os;
 pub mod plan;
@@ -39,6 +40,8 @@ enum Command {
     Demo(run::DemoArgs),
     /// Run a rig file
     Run(run::RunArgs),
+    /// Measure what the link to the projector carries of this rig's pictures, and the frame rate that allows
+    LinkTest(link_test::LinkTestArgs),
     /// Make the projector of a running rig dark; the rig goes on
     Black(order::OrderArgs),
     /// Hold the frame that the projector of a running rig shows
@@ -93,6 +96,7 @@ fn dispatch(command: &Command) -> Result<(), Failure> {
     match command {
         Command::Demo(args) => run::execute_demo(args),
         Command::Run(args) => run::execute(args),
+        Command::LinkTest(args) => link_test::execute(args),
         Command::Black(args) => order::execute(args, Order::Black),
         Command::Freeze(args) => order::execute(args, Order::Freeze),
         Command::Safe(args) => order::execute(args, Order::Safe),

@@ -112,7 +112,10 @@ pub fn print(text: &str) {
 }
 
 /// One lock for the projector and one for the folder that is written to.
-fn take_locks(rig: &RigConfig) -> Result<Vec<InstanceLock>, Failure> {
+///
+/// # Errors
+/// Another instance has one of them.
+pub(super) fn take_locks(rig: &RigConfig) -> Result<Vec<InstanceLock>, Failure> {
     let failure = |e: LockError| {
         let kind =
             if matches!(e, LockError::Held { .. }) { FailureKind::Device } else { FailureKind::BadInput };

@@ -1,0 +1,50 @@
+//! `dpm link-test RIG.toml`: what the link to the projector carries.
+
+use super::rig_args::RigArgs;
+use super::watch::{print, take_locks};
+use crate::experiments::link_test::{link_test, Content};
+use crate::experiments::run_rig::open_gpu;
+use crate::failure::Failure;
+use crate::rig::Rig;
+use crate::telemetry::report::to_json;
+use std::path::PathBuf;
+
+/// Flags of `dpm link-test`.
+#[derive(clap::Args, Clone, Debug)]
+pub struct LinkTestArgs {
+    /// The rig file
+    #[arg(value_name = "RIG.toml")]
+    rig: PathBuf,
+    #[command(flatten)]
+    flags: RigArgs,
+    /// Send a moving pattern instead of pictures of the rig's scene; needs no GPU
+    #[arg(long)]
+    prepared: bool,
+    /// Different frames to send
+    #[arg(long, value_name = "N", default_value_t = 8, value_parser = clap::value_parser!(u32).range(1..=64))]
+    count: u32,
+    /// Seconds for each way to send
+    #[arg(long = "for", value_name = "S", default_value_t = 2, value_parser = clap::value_parser!(u32).range(1..=600))]
+    seconds: u32,
+    /// Print one JSON object
+    #[arg(long)]
+    json: bool,
+}
+
+/// Measures and prints. The projector shows the frames meanwhile.
+///
+/// # Errors
+/// Bad rig or flags, no GPU, no projector.
+pub fn execute(args: &LinkTestArgs) -> Result<(), Failure> {
+    let config = args.flags.rig(Some(&args.rig))?;
+    let _locks = take_locks(&config)?;
+    let rig = Rig::build(&config, None)?;
+    let content = if args.prepared {
+        Content::prepared(&rig, args.count)
+    } else {
+        Content::rendered(&rig, &open_gpu(&config)?, args.count)?
+    };
+    let report = link_test(&rig, &content, f64::from(args.seconds))?;
+    print(&if args.json { to_json(&report) + "\n" } else { report.to_table() });
+    Ok(())
+}
