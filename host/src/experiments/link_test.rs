@@ -13,8 +13,9 @@ use crate::rig::Rig;
 use dpm_device::link::{measure, Codec, HostLink, LinkMeasurement, LinkSettings, LinkState, Verb};
 use dpm_device::time::HostTime;
 use dpm_device::transport::inproc::{threaded, HostEnd};
-use dpm_device::transport::Transport;
-use hil_mock::projector::{MockConfig, MockProjector, ProjectorThread};
+use dpm_device::transport::{LinkDevice, Transport};
+use dpm_handoff::wake::WaitPolicy;
+use hil_mock::projector::{serve_cable, MockConfig, MockProjector};
 use std::sync::Arc;
 use std::time::Duration;
 
@@ -110,8 +111,8 @@ impl Content {
 /// The rig's projector, to be measured.
 enum Far {
     Outside(Box<dyn Transport>),
-    /// The mock: the cable's end and the thread that serves the other, which ends with it.
-    Inside(HostEnd, #[allow(dead_code)] ProjectorThread),
+    /// The mock, on a thread that ends with this end of the cable.
+    Inside(HostEnd),
 }
 
 impl Far {
@@ -130,16 +131,21 @@ impl Far {
             ..MockConfig::new(rig.camera.raster)
         };
         let bytes = projector::frame_bytes(rig.camera.raster, rig.config.projector.schedule().len());
-        let (host, device) = threaded(bytes, usize::from(setup.frame_buffers) + 1);
-        let thread = ProjectorThread::start(MockProjector::new(setup), device, move || clock.now())
+        let (host, device) = threaded(bytes, usize::from(setup.frame_buffers) + 1, WaitPolicy::Park);
+        std::thread::Builder::new()
+            .name("dpm-mock".into())
+            .spawn(move || {
+                let mut mock = MockProjector::new(setup);
+                serve_cable(&mut mock, device, || clock.now(), |mock, now| mock.advance_to(now));
+            })
             .map_err(|e| Failure::new(FailureKind::Device, format!("cannot start a thread: {e}")))?;
-        Ok(Self::Inside(host, thread))
+        Ok(Self::Inside(host))
     }
 
     fn transport(&mut self) -> &mut dyn Transport {
         match self {
             Self::Outside(transport) => transport.as_mut(),
-            Self::Inside(host, _) => host,
+            Self::Inside(host) => host,
         }
     }
 }
