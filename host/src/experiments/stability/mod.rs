@@ -244,7 +244,7 @@ mod tests {
         let json = serde_json::to_value(&report.cases[0]).unwrap();
         assert_eq!(
             (json["verdict"].as_str(), json["note"].as_str()),
-            (Some("not run"), Some("no Vulkan here"))
+            (Some("not run"), Some("no Vulkan device: no Vulkan here"))
         );
         assert!(json["error"].is_null());
     }
