@@ -84,6 +84,8 @@ struct Large {
 /// The host's end of a threaded in-process cable.
 pub struct HostEnd {
     frames: Filler<Large>,
+    /// Buffers that came back, the last one on top: it is the warmest in the caches.
+    free: Vec<Large>,
     control: Producer<Small>,
     replies: Consumer<Small>,
     device: Waker,
@@ -115,6 +117,7 @@ pub fn threaded(frame_bytes: usize, depth: usize, policy: WaitPolicy) -> (HostEn
     (
         HostEnd {
             frames: filler,
+            free: Vec::with_capacity(depth.max(1)),
             control: control_in,
             replies: replies_out,
             device,
@@ -136,6 +139,12 @@ fn gather(out: &mut [u8], packets: &[Packet<'_>]) -> usize {
 }
 
 impl HostEnd {
+    fn fetch_free(&mut self) {
+        while let Some(large) = self.frames.take_free() {
+            self.free.push(large);
+        }
+    }
+
     fn gone(&self) -> Result<(), TransportError> {
         if self.unplugged.load(Ordering::Acquire) {
             Err(TransportError::Unplugged { device: self.name().into() })
@@ -160,7 +169,8 @@ impl Transport for HostEnd {
                 self.control.push(small).map_err(|_| SendError::Busy)?;
             }
             Lane::Data => {
-                let mut large = self.frames.take_free().ok_or(SendError::Busy)?;
+                self.fetch_free();
+                let mut large = self.free.pop().ok_or(SendError::Busy)?;
                 assert!(
                     bytes <= large.bytes.len(),
                     "frame of {bytes} bytes, buffers of {}",
@@ -177,7 +187,7 @@ impl Transport for HostEnd {
 
     fn has_room(&mut self, lane: Lane) -> bool {
         match lane {
-            Lane::Data => self.frames.has_free(),
+            Lane::Data => !self.free.is_empty() || self.frames.has_free(),
             Lane::Control => self.control.len() < SMALL_DEPTH,
         }
     }

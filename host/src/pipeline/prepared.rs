@@ -4,38 +4,44 @@
 use crate::pack::{self, BitPlaneFrame, Kernel};
 use dpm_device::planes::{Channel, PlaneSchedule, Raster};
 
-/// Frames prepared: enough that the packer's input does not stay in a core's own cache, as a renderer's would not.
-const FRAMES: usize = 4;
+/// Positions of the pattern.
+const POSITIONS: usize = 4;
+/// Pixels by which the pattern moves from frame to frame: whole bytes of a plane.
+const STEP: usize = 8;
 /// Every how many rows the first pixel carries the frame's number.
 const MARK_ROWS: usize = 16;
 /// Bits of a code value, and of the number in a mark.
 const MARK_BITS: u32 = 0x00ff_ffff;
 
-/// Code values `0x00BBGGRR` of a few frames.
+/// Code values `0x00BBGGRR` of a picture, and a little more of it: each frame is the picture from a pixel further on. One picture takes no more
+/// of the caches than a renderer's output does, and more than a core has for itself.
 #[derive(Clone, Debug)]
 pub struct PreparedFrames {
     raster: Raster,
-    frames: Vec<Vec<u32>>,
+    codes: Vec<u32>,
 }
 
 impl PreparedFrames {
-    /// A pattern of ramps that moves by 8 pixels a frame and always sends out the same light, so that it never flashes.
+    /// A pattern of ramps that moves by 8 pixels a frame and always sends out about the same light, so that it never flashes.
     pub fn new(raster: Raster) -> Self {
-        let (width, height) = (raster.width(), raster.height());
-        let frames = (0..FRAMES as u32).map(|k| {
-            let row = |y: u32| (0..width).map(move |x| pattern((x + 8 * k) % width, y));
-            (0..height).flat_map(row).collect()
-        });
-        Self { raster, frames: frames.collect() }
+        let width = raster.width();
+        let pixels = raster.pixel_count() + STEP * (POSITIONS - 1);
+        let codes = (0..pixels as u32).map(|i| pattern(i % width, i / width));
+        Self { raster, codes: codes.collect() }
+    }
+
+    /// The code values of frame `id`.
+    fn frame(&mut self, id: u64) -> &mut [u32] {
+        let from = STEP * (id % POSITIONS as u64) as usize;
+        &mut self.codes[from..from + self.raster.pixel_count()]
     }
 
     /// Marks the next frame with its number and packs it.
     pub fn pack(&mut self, kernel: Kernel, id: u64, planes: &mut BitPlaneFrame) {
-        let width = self.raster.width() as usize;
-        let codes = &mut self.frames[(id % FRAMES as u64) as usize];
-        for code in codes.iter_mut().step_by(MARK_ROWS * width) {
-            *code = id as u32 & MARK_BITS;
-        }
+        let rows = MARK_ROWS * self.raster.width() as usize;
+        let codes = self.frame(id);
+        // Marks of other positions stay where they are: lone pixels like any other.
+        codes.iter_mut().step_by(rows).for_each(|code| *code = id as u32 & MARK_BITS);
         pack::pack(kernel, codes, planes);
     }
 }
@@ -91,13 +97,24 @@ mod tests {
         }
     }
 
-    /// The same light in every frame: nothing that a limiter of flashes would stop.
+    /// About the same light in every frame: nothing that a limiter of flashes would stop.
     #[test]
     fn the_pattern_moves_and_sends_out_the_same_light() {
-        let prepared = PreparedFrames::new(Raster::new(64, 8).unwrap());
-        let light =
-            |frame: &[u32]| frame.iter().map(|c| (c & 0xff) + (c >> 8 & 0xff) + (c >> 16)).sum::<u32>();
-        assert!(prepared.frames.iter().all(|f| light(f) == light(&prepared.frames[0])));
-        assert!(prepared.frames.windows(2).all(|w| w[0] != w[1]));
+        let raster = Raster::new(1024, 768).unwrap();
+        let mut prepared = PreparedFrames::new(raster);
+        let light = |frame: &[u32]| -> u64 {
+            frame.iter().map(|c| u64::from((c & 0xff) + (c >> 8 & 0xff) + (c >> 16))).sum()
+        };
+        let first = prepared.frame(0).to_vec();
+        let mut before = first.clone();
+        for id in 1..POSITIONS as u64 {
+            let frame = prepared.frame(id);
+            assert_eq!(frame[..1000], before[STEP..1000 + STEP], "moved");
+            assert_ne!(frame, before);
+            // The smallest change that counts as half a flash is a tenth of full.
+            assert!(light(frame).abs_diff(light(&first)) * 1000 < light(&first));
+            before = frame.to_vec();
+        }
+        assert_eq!(prepared.frame(POSITIONS as u64), first);
     }
 }

@@ -243,17 +243,22 @@ fn plan_thread(
     let RunOptions { frames, slots, .. } = shared.options;
     let end = if slots == 0 { u64::MAX } else { next_slot.saturating_add(slots) };
     let mut id = 0u64;
-    let mut kept: Option<Box<FrameMemory>> = None;
+    let mut hottest = Vec::with_capacity(shared.options.in_flight.max(2));
     while !shared.monitor.stop_requested() && (frames == 0 || id < frames) && next_slot < end {
         enter_frame_path(id >= WARM_UP_FRAMES);
-        let at_hand = kept.take().or_else(|| free.try_pop());
-        let waited = at_hand.is_none();
-        kept = at_hand.or_else(|| pop_within(&mut free, WAIT_NS));
-        if kept.is_none() {
+        // What came back last is taken first: it is the warmest in the caches.
+        while let Some(memory) = free.try_pop() {
+            hottest.push(memory);
+        }
+        let waited = hottest.is_empty();
+        if waited {
+            hottest.extend(pop_within(&mut free, WAIT_NS));
+        }
+        if hottest.is_empty() {
             continue;
         }
         let Some(note) = pop_within(&mut notes, WAIT_NS) else { continue };
-        let Some(memory) = kept.take() else { continue };
+        let Some(memory) = hottest.pop() else { continue };
         let mut job = FrameJob { note, memory };
         job.note.waited_for_memory = waited;
         let travel = shared.travel_ns.load(Ordering::Relaxed);
