@@ -35,7 +35,11 @@ impl Bench {
         let library = deps.join("libusbfs_fake.so");
         assert!(library.exists(), "{} is built with the tests", library.display());
         let mut command = Command::new(env!("CARGO_BIN_EXE_dpm"));
-        command.arg("dlpc900").args(words).current_dir(&self.folder);
+        // `run` stands for itself, everything else is a word of `dpm dlpc900`.
+        if words[0] != "run" {
+            command.arg("dlpc900");
+        }
+        command.args(words).current_dir(&self.folder);
         command.env("LD_PRELOAD", library).env("USBFS_FAKE_USBIP", self.server.address().to_string());
         command.env("USBFS_FAKE_DRIVER", "usbhid");
         command.output().unwrap()
@@ -142,4 +146,35 @@ fn mistakes_are_named_with_their_exit_codes() {
         b.model.lock().unwrap().executed().iter().all(|e| e.error == 0 && e.flags & 0x80 != 0),
         "nothing was written"
     );
+}
+
+/// A rig on a DLPC900: rendered, loaded, shown, put to rest; and what cannot be is said before anything is rendered.
+#[test]
+fn a_rig_shows_its_first_frames_over_and_over_and_puts_the_controller_to_rest() {
+    let b = Bench::new("run", 1);
+    let rig = |panel: &str, more: &str| {
+        let text = format!(
+            "[projector]\nwidth = 1024\nheight = 768\nframe_rate = 30\nplanes = 8\n\
+             backend = {{ kind = \"dlpc900\", panel = \"{panel}\" {more} }}\n[render]\nspp = 1\ndepth = 2\n\
+             [output]\nlight_window_ms = 100\n[[scene.bodies]]\nname = \"bunny\"\n"
+        );
+        std::fs::write(b.folder.join("rig.toml"), text).unwrap();
+    };
+    rig("dlp6500", "");
+    let wrong = b.dpm(&["run", "rig.toml"]);
+    let told = text(&wrong.stderr);
+    assert!(wrong.status.code() == Some(2) && told.contains("a DLP6500 has 1920 x 1080 mirrors"), "{told}");
+    rig("dlp5500", ", device = \"9:99\"");
+    let absent = b.dpm(&["run", "rig.toml"]);
+    let told = text(&absent.stderr);
+    assert!(absent.status.code() == Some(3) && told.contains("no DLPC900"), "{told}");
+    rig("dlp5500", "");
+    let out = b.ok(&["run", "rig.toml", "--frames", "2", "--json"]);
+    let report: serde_json::Value = serde_json::from_str(&out).unwrap_or_else(|e| panic!("{e}: {out}"));
+    assert_eq!((&report["frames_loaded"], &report["patterns"]), (&2.into(), &2.into()));
+    assert!(report["warnings"].to_string().contains("no watchdog"), "{report}");
+    let m = b.model.lock().unwrap();
+    assert_eq!(m.dark_because(), Some("mirrors exercised"));
+    assert!(m.executed().iter().all(|e| e.error == 0), "no command was refused");
+    assert!(m.projected_grey(0).is_none_or(|g| g.iter().any(|v| *v > 0)), "a picture was loaded");
 }

@@ -26,6 +26,17 @@ pub struct UsbPlace {
     pub address: u8,
 }
 
+impl std::str::FromStr for UsbPlace {
+    type Err = &'static str;
+
+    /// Reads `BUS:ADDRESS`.
+    fn from_str(text: &str) -> Result<Self, Self::Err> {
+        let parts = text.split_once(':').and_then(|(b, a)| Some((b.parse().ok()?, a.parse().ok()?)));
+        let (bus, address) = parts.ok_or("write it as BUS:ADDRESS, such as 3:12")?;
+        Ok(Self { bus, address })
+    }
+}
+
 /// An open DLPC900. Dropping it gives the interface back to the kernel's driver.
 pub struct UsbHid {
     handle: DeviceHandle<Context>,

@@ -15,7 +15,7 @@ use std::path::PathBuf;
 #[derive(clap::Args, Clone, Debug)]
 pub struct Dlpc900Args {
     /// Which controller, as BUS:ADDRESS of lsusb; needed when several are plugged in
-    #[arg(long, value_name = "BUS:ADDRESS", value_parser = place, global = true)]
+    #[arg(long, value_name = "BUS:ADDRESS", global = true)]
     device: Option<UsbPlace>,
     #[command(subcommand)]
     action: Action,
@@ -145,12 +145,6 @@ enum Input {
     Parallel,
     Hdmi,
     DisplayPort,
-}
-
-fn place(text: &str) -> Result<UsbPlace, String> {
-    let parts = text.split_once(':').and_then(|(b, a)| Some((b.parse().ok()?, a.parse().ok()?)));
-    let (bus, address) = parts.ok_or("write it as BUS:ADDRESS, such as 3:12")?;
-    Ok(UsbPlace { bus, address })
 }
 
 fn three(text: &str) -> Result<[u8; 3], String> {

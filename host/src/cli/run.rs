@@ -1,9 +1,12 @@
 //! `dpm run RIG.toml` and `dpm demo`: the rig from its file to light.
 
 use super::rig_args::RigArgs;
-use super::watch::run_and_report;
+use super::watch::{print, run_and_report, watch};
+use crate::config::ProjectorBackend;
+use crate::experiments::run_dlpc900::run_dlpc900;
 use crate::experiments::run_rig::run_rig;
 use crate::failure::Failure;
+use crate::telemetry::report::to_json;
 use std::path::{Path, PathBuf};
 
 /// Flags of `dpm run`.
@@ -46,5 +49,11 @@ pub fn execute_demo(args: &DemoArgs) -> Result<(), Failure> {
 }
 
 fn start(path: Option<&Path>, flags: &RigArgs, json: bool) -> Result<(), Failure> {
-    run_and_report(flags.rig(path)?, json, run_rig)
+    let rig = flags.rig(path)?;
+    if matches!(rig.projector.backend, ProjectorBackend::Dlpc900(_)) {
+        let report = watch(rig, |_| {}, |rig, monitor| run_dlpc900(rig, monitor))?;
+        print(&if json { to_json(&report) + "\n" } else { report.to_table() });
+        return Ok(());
+    }
+    run_and_report(rig, json, run_rig)
 }

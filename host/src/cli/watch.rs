@@ -132,7 +132,7 @@ pub(super) fn take_locks(rig: &RigConfig) -> Result<Vec<InstanceLock>, Failure> 
             serial(&usb.serial_number)
         )),
         ProjectorBackend::Serial(port) => Some(format!("projector on {}", port.port)),
-        ProjectorBackend::Dlpc900(dlpc) => Some(format!("DLPC900 {}", serial(&dlpc.serial_number))),
+        ProjectorBackend::Dlpc900(dlpc) => Some(format!("DLPC900 {}", serial(&dlpc.device))),
     };
     if let Some(what) = device {
         let name: String = what.chars().map(|c| if c.is_ascii_alphanumeric() { c } else { '-' }).collect();

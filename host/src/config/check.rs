@@ -123,14 +123,29 @@ fn projector(rig: &RigConfig, reader: &mut Reader) {
             );
         }
     }
+    if let ProjectorBackend::Dlpc900(dlpc900) = &p.backend {
+        let panel = dlpc900.panel.dmd().raster();
+        if (p.width, p.height) != (panel.width(), panel.height()) {
+            refuse(
+                reader,
+                &["projector.width", "projector.height", "projector.backend.panel", "projector.backend.kind"],
+                format!(
+                    "{} x {}: a {} has {} x {} mirrors",
+                    p.width,
+                    p.height,
+                    dlpc900.panel.dmd().name(),
+                    panel.width(),
+                    panel.height()
+                ),
+                format!("set projector.width = {} and projector.height = {}", panel.width(), panel.height()),
+            );
+        }
+    }
     if matches!(p.backend, ProjectorBackend::Dlpc900(_)) && num > 120 * den {
         refuse(
             reader,
             &["projector.frame_rate", "projector.backend.kind"],
-            format!(
-                "{:.3} frames/s: a DLPC900 takes at most 120 frames/s over its video input",
-                p.frame_rate.hz()
-            ),
+            format!("{:.3} frames/s: a DLPC900 shows at most 120 frames/s of 24 planes", p.frame_rate.hz()),
             "lower `projector.frame_rate` to 120 or choose another backend".into(),
         );
     }
@@ -262,7 +277,9 @@ fn time(rig: &RigConfig, reader: &mut Reader) {
         refuse(reader, &["real_time.affinity"], problem, String::new());
     }
     let frame_ms = 1e3 / rig.projector.frame_rate.hz();
-    if f64::from(rig.safety.watchdog_ms) < 2.0 * frame_ms {
+    // A DLPC900 has no watchdog.
+    let has_watchdog = !matches!(rig.projector.backend, ProjectorBackend::Dlpc900(_));
+    if has_watchdog && f64::from(rig.safety.watchdog_ms) < 2.0 * frame_ms {
         refuse(
             reader,
             &["safety.watchdog_ms", "projector.frame_rate"],

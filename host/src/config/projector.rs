@@ -3,6 +3,7 @@
 use super::declare::{kinds, section, words};
 use super::read::{Any, ConfigValue, Limit, NotEmpty, Reader, Within};
 use super::source::{Node, Value};
+use dpm_device::dlpc900::lut::Dmd;
 use dpm_device::link::Codec;
 use dpm_device::planes::{PlaneSchedule, Raster};
 use dpm_device::time::FrameRate;
@@ -122,14 +123,18 @@ section! {
 }
 
 section! {
-    /// A TI DLPC900 evaluation module (LightCrafter 6500 and 9000).
+    /// A TI DLPC900 evaluation module (LightCrafter 6500 and 9000). docs/DLPC900.md says what a rig does with it.
     pub struct Dlpc900Config {
-        /// The panel behind the controller; decides raster and shortest exposures.
+        /// The panel behind the controller; must have the projector's width and height.
         panel: Dlpc900Panel = Dlpc900Panel::Dlp6500, "", Any;
-        /// Serial number of the device; needed when several are plugged in.
-        serial_number: Option<String> = None, "", NotEmpty;
-        /// Light of each bit-1 pattern.
-        exposure_us: u32 = 105, "us", Within(62, 2_000_000);
+        /// Where its patterns come from.
+        mode: Dlpc900Mode = Dlpc900Mode::Preloaded, "", Any;
+        /// Its video input in mode "video".
+        input: VideoInput = VideoInput::Hdmi, "", Any;
+        /// Which controller, as BUS:ADDRESS of `lsusb`; needed when several are plugged in.
+        device: Option<String> = None, "", NotEmpty;
+        /// Light of each pattern; its whole share of the frame when left out.
+        exposure_us: Option<u32> = None, "us", Within(24, 2_000_000);
     }
 }
 
@@ -207,6 +212,43 @@ words! {
         Dlp670s = "dlp670s",
         /// 2048 x 1200.
         Dlp500yx = "dlp500yx",
+        /// 1024 x 768.
+        Dlp5500 = "dlp5500",
+    }
+}
+
+impl Dlpc900Panel {
+    /// The panel as the driver knows it.
+    pub const fn dmd(self) -> Dmd {
+        match self {
+            Self::Dlp6500 => Dmd::Dlp6500,
+            Self::Dlp9000 => Dmd::Dlp9000,
+            Self::Dlp670s => Dmd::Dlp670s,
+            Self::Dlp500yx => Dmd::Dlp500yx,
+            Self::Dlp5500 => Dmd::Dlp5500,
+        }
+    }
+}
+
+words! {
+    /// Where a DLPC900's patterns come from.
+    pub enum Dlpc900Mode {
+        /// The first frames of the known motion, rendered and loaded before they are shown over and over.
+        Preloaded = "preloaded",
+        /// The 24 planes of a video signal that another program drives.
+        Video = "video",
+    }
+}
+
+words! {
+    /// Video inputs of a DLPC900.
+    pub enum VideoInput {
+        /// HDMI.
+        Hdmi = "hdmi",
+        /// DisplayPort.
+        DisplayPort = "displayport",
+        /// The parallel port.
+        Parallel = "parallel",
     }
 }
 

@@ -147,7 +147,27 @@ const BAD: &[(&str, usize, usize, &str, &str)] = &[
     ),
     ("[projector]\nup = [0, 0, 0]", 2, 6, "projector.up", "no upper side"),
     ("[projector]\nlook_at = [0, 0, 0]\nposition = [0, 2, 0]", 2, 11, "projector.look_at", "no upper side"),
-    ("[projector.backend]\nkind = \"dlpc900\"", 2, 8, "projector.backend.kind", "120 frames/s"),
+    (
+        "[projector]\nwidth = 1920\nheight = 1080\n[projector.backend]\nkind = \"dlpc900\"",
+        5,
+        8,
+        "projector.backend.kind",
+        "120 frames/s",
+    ),
+    (
+        "[projector]\nframe_rate = 60\n[projector.backend]\nkind = \"dlpc900\"",
+        4,
+        8,
+        "projector.backend.kind",
+        "DLP6500 has 1920 x 1080",
+    ),
+    (
+        "[projector.backend]\nkind = \"usb\"\ncompaction = \"zip\"",
+        3,
+        14,
+        "projector.backend.compaction",
+        "\"auto\" | \"raw\"",
+    ),
     ("[scene]\nbodies = [{ node = \"a\" }]", 2, 11, "scene.bodies.0", "has no `name`"),
     (
         "[[scene.bodies]]\nname = \"a\"\n[[scene.bodies]]\nname = \"a\"\nnode = \"b\"",

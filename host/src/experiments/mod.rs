@@ -11,6 +11,7 @@ pub mod error_sheet;
 pub mod link_test;
 pub mod pictures;
 pub mod profile;
+pub mod run_dlpc900;
 pub mod run_rig;
 pub mod scene_plan;
 pub mod sequence;
