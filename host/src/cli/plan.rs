@@ -15,7 +15,7 @@ pub struct PlanArgs {
     rig: Option<PathBuf>,
     #[command(flatten)]
     flags: RigArgs,
-    /// Time frames with and without each part of the scene that is left out, and compare their pixels
+    /// Time frames with and without each part that is left out and can be put back, and compare their pixels
     #[arg(long)]
     measure: bool,
     /// Print one JSON object
@@ -44,6 +44,7 @@ pub fn execute(args: &PlanArgs) -> Result<(), Failure> {
     for e in &report.entries {
         let state = match (e.needed, e.left_out) {
             (true, _) => "needed",
+            (false, true) if e.switched_off => "off",
             (false, true) => "left out",
             (false, false) => "kept",
         };
@@ -53,7 +54,7 @@ pub fn execute(args: &PlanArgs) -> Result<(), Failure> {
         }
     }
     if let Some(s) = &report.together {
-        text += &format!("all parts of the scene that are left out: {}\n", saved(s));
+        text += &format!("all that is left out and can be put back, together: {}\n", saved(s));
     }
     print(&text);
     Ok(())

@@ -3,12 +3,12 @@
 use super::run_rig::{open_gpu, traced_raster};
 use super::sequence::{draw, poses_at};
 use crate::clock::Stopwatch;
-use crate::config::RigConfig;
+use crate::config::{EffectsConfig, RenderConfig, RigConfig};
 use crate::failure::{Failure, FailureKind};
 use crate::pipeline::{renderer_settings, PipelineError};
 use crate::render::method::{Method, SamplerKind};
 use crate::render::scene_data::{SceneData, SceneNeeds};
-use crate::render::{FrameSlot, RenderError, Renderer};
+use crate::render::{FrameSlot, Keep, RenderError, Renderer};
 use crate::rig::Rig;
 use crate::scene::{Environment, Material, Scene};
 use serde::Serialize;
@@ -22,6 +22,8 @@ pub struct PlanEntry {
     pub needed: bool,
     /// It is left out of what runs. Never true of what is needed; false for what is not needed but kept.
     pub left_out: bool,
+    /// The rig file switched it off; the method would have it.
+    pub switched_off: bool,
     /// What calls for it: a material, a light, a key of the rig file; or that nothing does.
     pub why: String,
     /// How it is, or would be, left out.
@@ -63,17 +65,20 @@ const BY_PASS: &str = "pass not recorded";
 
 fn entry(feature: &'static str, why: Option<String>, or: &str, how: &'static str) -> PlanEntry {
     let needed = why.is_some();
-    PlanEntry { feature, needed, left_out: !needed, why: why.unwrap_or_else(|| or.into()), how, saving: None }
+    let why = why.unwrap_or_else(|| or.into());
+    PlanEntry { feature, needed, left_out: !needed, switched_off: false, why, how, saving: None }
 }
 
 /// A part that is always there, needed or not.
 fn kept(feature: &'static str, needed: bool, why: String) -> PlanEntry {
-    PlanEntry { feature, needed, left_out: false, why, how: "kept", saving: None }
+    PlanEntry { feature, needed, left_out: false, switched_off: false, why, how: "kept", saving: None }
 }
 
-/// The first material that calls for something.
+/// The first material on any triangle that calls for something.
 fn material(scene: &Scene, calls: impl Fn(&Material) -> bool) -> Option<String> {
-    scene.materials.iter().find(|m| calls(m)).map(|m| format!("material \"{}\"", m.name))
+    let used = scene.used_materials();
+    let mut found = scene.materials.iter().zip(used).filter(|(_, used)| *used).map(|(m, _)| m);
+    found.find(|m| calls(m)).map(|m| format!("material \"{}\"", m.name))
 }
 
 /// Parts that depend on the scene alone. `needs` is what the renderer decided; the scene only says why.
@@ -90,8 +95,8 @@ pub fn scene_entries(scene: &Scene, needs: &SceneNeeds, clamp: f64) -> Vec<PlanE
         part(
             "textures",
             needs.textures,
-            Some(format!("{} in the scene file", scene.textures.len())),
-            "no texture",
+            material(scene, |m| m.textures().any(|t| t.is_some())),
+            "no texture on any triangle",
         ),
         part(
             "normal maps",
@@ -151,28 +156,43 @@ pub fn scene_entries(scene: &Scene, needs: &SceneNeeds, clamp: f64) -> Vec<PlanE
     ]
 }
 
-/// Parts that depend on the method and its switches.
-pub fn method_entries(method: &Method, word: &str) -> Vec<PlanEntry> {
-    let by = |on: bool, key: &str| on.then(|| format!("method {word}, {key} on"));
-    let or = |key: &str| format!("method {word} does without, by itself or by {key}");
-    let part = |feature, on: bool, key: &str, how| entry(feature, by(on, key), &or(key), how);
+/// Parts that depend on the method and its switches. `full` is the method as it is without any switch of the rig file.
+pub fn method_entries(method: &Method, full: &Method, word: &str) -> Vec<PlanEntry> {
+    let part = |feature, of: &dyn Fn(&Method) -> bool, key: &str, how| {
+        let (on, would) = (of(method), of(full));
+        PlanEntry {
+            feature,
+            needed: on,
+            left_out: !on,
+            switched_off: would && !on,
+            why: match (on, would) {
+                (true, true) => format!("method {word}"),
+                (true, false) => format!("{key} on"),
+                (false, true) => format!("{key} off"),
+                (false, false) => format!("method {word} does without"),
+            },
+            how,
+            saving: None,
+        }
+    };
     let switch = "a bit of the frame's flags, tested per pixel";
+    let effects = "render.effects";
     vec![
-        part("history and reprojection", method.needs_history(), "effects", BY_PASS),
-        part("rate map", method.needs_rates(), "effects.rate_map", BY_PASS),
-        part("spatial pass", method.needs_spatial(), "effects.spatial_filter", BY_PASS),
-        part("spatial filter taps", method.spatial, "effects.spatial_filter", BY_CONSTANT),
-        part("demodulation by albedo", method.dpm, "render.method", BY_CONSTANT),
+        part("history and reprojection", &Method::needs_history, effects, BY_PASS),
+        part("rate map", &Method::needs_rates, "render.effects.rate_map", BY_PASS),
+        part("spatial pass", &Method::needs_spatial, "render.effects.spatial_filter", BY_PASS),
+        part("spatial filter taps", &|m| m.spatial, "render.effects.spatial_filter", BY_CONSTANT),
+        part("demodulation by albedo", &|m| m.dpm, "render.method", BY_CONSTANT),
         part(
             "blue noise and sequences",
-            method.sampler != SamplerKind::Independent,
-            "effects.blue_noise",
+            &|m| m.sampler != SamplerKind::Independent,
+            "render.effects.blue_noise",
             BY_CONSTANT,
         ),
-        part("temporal blending", method.temporal, "effects.temporal_filter", switch),
-        part("checkerboard", method.checkerboard, "effects.checkerboard", switch),
-        part("spp by angle", method.spp_by_angle, "effects.spp_by_angle", switch),
-        part("allocation by variance", method.dpm && method.rate_map, "effects.rate_map", switch),
+        part("temporal blending", &|m| m.temporal, "render.effects.temporal_filter", switch),
+        part("checkerboard", &|m| m.checkerboard, "render.effects.checkerboard", switch),
+        part("spp by angle", &|m| m.spp_by_angle, "render.effects.spp_by_angle", switch),
+        part("allocation by variance", &|m| m.dpm && m.rate_map, "render.effects.rate_map", switch),
     ]
 }
 
@@ -187,6 +207,7 @@ fn rig_entries(rig: &Rig) -> Vec<PlanEntry> {
             feature: "tiles without bodies",
             needed: false,
             left_out: true,
+            switched_off: false,
             why: "no ray of theirs can meet a body's bounds".into(),
             how: "tile not listed, decided per frame",
             saving: None,
@@ -229,20 +250,24 @@ pub fn scene_plan(config: &RigConfig, measure: bool) -> Result<PlanReport, Failu
     needs.clamp = config.render.clamp_indirect > 0.0;
     let word = config.render.method.word();
     let mut entries = scene_entries(&rig.scene, &needs, config.render.clamp_indirect);
-    entries.extend(method_entries(&method, word));
+    let unswitched = RenderConfig { effects: EffectsConfig::default(), ..config.render.clone() };
+    entries.extend(method_entries(&method, &Method::from_config(&unswitched), word));
     entries.extend(rig_entries(&rig));
     let mut report = PlanReport { method: word.to_owned(), entries, together: None, warnings };
     let Some(gpu) = gpu else { return Ok(report) };
-    let open = |keep: SceneNeeds| {
-        Renderer::keeping(&gpu, &rig.scene, renderer_settings(&rig), keep).map_err(gpu_failure)
-    };
-    let lean = SceneNeeds::default();
+    let open =
+        |keep: Keep| Renderer::keeping(&gpu, &rig.scene, renderer_settings(&rig), keep).map_err(gpu_failure);
+    let lean = Keep::default();
     for e in report.entries.iter_mut().filter(|e| e.left_out) {
-        if let Some(keep) = keeping(e.feature) {
+        if let Some(keep) = keeping(e.feature, &method) {
             e.saving = Some(compare(&rig, open(lean)?, open(keep)?)?);
         }
     }
-    let all = SceneNeeds::default().everything();
+    let all = Keep {
+        needs: SceneNeeds::default().everything(),
+        rate_map: method.needs_history(),
+        every_tile: true,
+    };
     let together = compare(&rig, open(lean)?, open(all)?)?;
     report.together = Some(together);
     let changed: Vec<&str> = (report.entries.iter())
@@ -256,19 +281,22 @@ pub fn scene_plan(config: &RigConfig, measure: bool) -> Result<PlanReport, Failu
     Err(Failure::new(FailureKind::CheckFailed, format!("leaving out changed pixels: {}", changed.join(", "))))
 }
 
-/// The constants that compile one part in. `None`: what leaves it out is no constant of the scene.
-fn keeping(feature: &str) -> Option<SceneNeeds> {
-    let mut keep = SceneNeeds::default();
+/// What puts one part back in. `None`: nothing can without changing what is drawn.
+fn keeping(feature: &str, method: &Method) -> Option<Keep> {
+    let mut keep = Keep::default();
     let flag = match feature {
-        "textures" => &mut keep.textures,
-        "normal maps" => &mut keep.normal_maps,
-        "alpha mask" => &mut keep.alpha_mask,
-        "transmission" => &mut keep.transmission,
-        "specular" => &mut keep.specular,
-        "diffuse" => &mut keep.diffuse,
-        "emissive" => &mut keep.emissive,
-        "punctual lights" => &mut keep.punctual,
-        "firefly clamp" => &mut keep.clamp,
+        "textures" => &mut keep.needs.textures,
+        "normal maps" => &mut keep.needs.normal_maps,
+        "alpha mask" => &mut keep.needs.alpha_mask,
+        "transmission" => &mut keep.needs.transmission,
+        "specular" => &mut keep.needs.specular,
+        "diffuse" => &mut keep.needs.diffuse,
+        "emissive" => &mut keep.needs.emissive,
+        "punctual lights" => &mut keep.needs.punctual,
+        "firefly clamp" => &mut keep.needs.clamp,
+        "tiles without bodies" => &mut keep.every_tile,
+        // Its decisions are read only where the frame's flag says so; without a history it has nothing to decide from.
+        "rate map" if method.needs_history() => &mut keep.rate_map,
         _ => return None,
     };
     *flag = true;
@@ -356,9 +384,49 @@ mod tests {
     }
 
     #[test]
+    fn what_the_rig_file_switches_off_is_told_apart_from_what_is_not_needed() {
+        let entry = |flags: &[&str], feature: &str| {
+            plan(flags)
+                .entries
+                .into_iter()
+                .find(|e| e.feature == feature)
+                .unwrap_or_else(|| panic!("{feature}"))
+        };
+        let off = entry(&["render.effects.spatial_filter=false"], "spatial filter taps");
+        assert!(
+            off.left_out && off.switched_off && off.why == "render.effects.spatial_filter off",
+            "{off:?}"
+        );
+        let never = entry(&["render.method=\"full\""], "spatial filter taps");
+        assert!(never.left_out && !never.switched_off && never.why.contains("does without"), "{never:?}");
+        let on = entry(
+            &["render.method=\"miyamoto\"", "render.effects.spatial_filter=true"],
+            "spatial filter taps",
+        );
+        assert!(on.needed && on.why == "render.effects.spatial_filter on", "{on:?}");
+        assert!(plan(&[]).entries.iter().all(|e| !e.switched_off));
+    }
+
+    #[test]
+    fn materials_that_no_triangle_has_need_nothing() {
+        let config = RigConfig::demo(&Overrides { variables: vec![], flags: vec![] }).unwrap();
+        let mut scene = Rig::build(&config, None).unwrap().scene;
+        let plain = SceneData::build(&scene).unwrap().needs;
+        scene.materials.push(Material { transmission: 1.0, alpha_cutoff: Some(0.5), ..Material::default() });
+        assert_eq!(SceneData::build(&scene).unwrap().needs, plain);
+        let last = scene.materials.len() as u32 - 1;
+        scene.bodies[0].mesh.materials[0] = last;
+        let needs = SceneData::build(&scene).unwrap().needs;
+        assert!(needs.transmission && needs.alpha_mask && !plain.transmission && !plain.alpha_mask);
+    }
+
+    #[test]
     fn each_part_that_can_be_put_back_is_a_part_of_the_plan() {
         let plan = plan(&[]);
-        let n = plan.entries.iter().filter(|e| keeping(e.feature).is_some()).count();
-        assert_eq!(n, 9, "one for every switch of SceneNeeds but the kind of environment");
+        let with =
+            |method: &Method| plan.entries.iter().filter(|e| keeping(e.feature, method).is_some()).count();
+        let history = Method { temporal: true, ..Method::full(1) };
+        assert_eq!(with(&history), 11, "the switches of SceneNeeds but the environment's, and those of Keep");
+        assert_eq!(with(&Method::full(1)), 10, "without a history there are no rates");
     }
 }

@@ -1,12 +1,35 @@
 //! Fills a device buffer with copies of one value, or changes some of its values; at set-up time and between frames of a check.
 
+use super::renderer::Renderer;
 use crate::gpu::{Buffer, CommandList, FrameFence, Gpu, GpuError, MemoryKind, Recorder};
 use bytemuck::Pod;
+use dpm_shaders::structs::History;
 use std::ops::Range;
 use std::sync::Arc;
 
+impl Renderer {
+    /// Changes what is kept of past frames, two lists of one entry a pixel: for checks that something broken is forgotten. No frame may be
+    /// in flight.
+    ///
+    /// # Errors
+    /// Out of memory, device lost.
+    ///
+    /// # Panics
+    /// When the range lies beyond the history, but not for a method without any: then nothing happens.
+    pub fn edit_history(
+        &self,
+        range: Range<usize>,
+        change: impl FnMut(&mut History),
+    ) -> Result<(), GpuError> {
+        if !self.settings.method.needs_history() {
+            return Ok(());
+        }
+        edit(&self.gpu, &self.shared.history, range, change)
+    }
+}
+
 /// Changes a stretch of a buffer's values through the host and waits.
-pub(super) fn edit<T: Pod>(
+fn edit<T: Pod>(
     gpu: &Arc<Gpu>,
     buffer: &Buffer,
     range: Range<usize>,

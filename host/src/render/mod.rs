@@ -15,4 +15,5 @@ pub mod sobol;
 pub mod tiles;
 
 pub use renderer::{FrameInputs, Output, RenderError, Renderer, RendererSettings};
+pub use scene_data::Keep;
 pub use slot::{FrameCost, FrameSlot, PASSES};

@@ -3,7 +3,7 @@
 use super::blue_noise;
 use super::method::Method;
 use super::rate_map;
-use super::scene_data::{world_bounds, SceneData, SceneDataError, SceneNeeds};
+use super::scene_data::{world_bounds, Keep, SceneData, SceneDataError, SceneNeeds};
 use super::scene_gpu::SceneGpu;
 use super::slot::{DebugBuffers, FrameSlot, PASSES};
 use super::tiles::{TileList, TILE};
@@ -20,7 +20,6 @@ use dpm_shaders::structs::{
     self as gpu_structs, Counters, Frame, Guide, History, Instance, Rows, Schedule, Surface, WorkItem,
 };
 use glam::{DAffine3, DVec3, Vec3};
-use std::ops::Range;
 use std::sync::Arc;
 
 /// What does not change while a renderer lives.
@@ -114,16 +113,17 @@ pub struct Renderer {
     // Dropped before the buffers they use.
     pipelines: Pipelines,
     table: Arc<BindingTable>,
-    shared: SharedBuffers,
+    pub(super) shared: SharedBuffers,
     scene: SceneGpu,
     data: SceneData,
-    settings: RendererSettings,
+    pub(super) settings: RendererSettings,
     needs: SceneNeeds,
+    every_tile: bool,
     /// Per body of the scene: which tracked body carries it.
     tracked: Vec<Option<u16>>,
     /// What the history holds: the last frame submitted and its poses.
     last: Last,
-    gpu: Arc<Gpu>,
+    pub(super) gpu: Arc<Gpu>,
 }
 
 /// One pipeline a pass; `None`: the method does not need it and it is not recorded.
@@ -140,8 +140,8 @@ struct Pipelines {
 }
 
 /// Memory that outlives a frame.
-struct SharedBuffers {
-    history: Buffer,
+pub(super) struct SharedBuffers {
+    pub(super) history: Buffer,
     rates: Buffer,
     rate_table: Buffer,
     noise: Buffer,
@@ -176,10 +176,10 @@ impl Renderer {
     /// # Errors
     /// The scene is too large, or the GPU's own.
     pub fn new(gpu: &Arc<Gpu>, scene: &Scene, settings: RendererSettings) -> Result<Self, RenderError> {
-        Self::keeping(gpu, scene, settings, SceneNeeds::default())
+        Self::keeping(gpu, scene, settings, Keep::default())
     }
 
-    /// The same with `keep` compiled in whether the scene needs it or not: for measuring what leaving it out saves.
+    /// The same with `keep` in whether the rig needs it or not: for measuring what leaving it out saves.
     ///
     /// # Errors
     /// As [`Renderer::new`].
@@ -187,12 +187,12 @@ impl Renderer {
         gpu: &Arc<Gpu>,
         scene: &Scene,
         settings: RendererSettings,
-        keep: SceneNeeds,
+        keep: Keep,
     ) -> Result<Self, RenderError> {
         let data = SceneData::build(scene)?;
         let texel = gpu.summary().software;
         let scene_gpu = SceneGpu::new(gpu, &data, texel)?;
-        let mut needs = data.needs.with(keep);
+        let mut needs = data.needs.with(keep.needs);
         needs.clamp |= settings.clamp_indirect.is_some();
         if settings.leave_nothing_out {
             needs = needs.everything();
@@ -224,7 +224,10 @@ impl Renderer {
         let pipelines = Pipelines {
             primary: pipeline(pick(dpm_shaders::PRIMARY_TEXEL, dpm_shaders::PRIMARY_STORAGE))?,
             reproject: only(method.needs_history(), dpm_shaders::REPROJECT)?,
-            rate_map: only(method.needs_rates(), dpm_shaders::RATE_MAP)?,
+            rate_map: only(
+                method.needs_rates() || keep.rate_map && method.needs_history(),
+                dpm_shaders::RATE_MAP,
+            )?,
             schedule: pipeline(dpm_shaders::SCHEDULE)?,
             trace: pipeline(pick(dpm_shaders::TRACE_TEXEL, dpm_shaders::TRACE_STORAGE))?,
             accumulate: only(method.needs_history(), dpm_shaders::ACCUMULATE)?,
@@ -267,6 +270,7 @@ impl Renderer {
             data,
             settings,
             needs,
+            every_tile: keep.every_tile,
             tracked,
             last,
             gpu: gpu.clone(),
@@ -275,25 +279,6 @@ impl Renderer {
 
     fn is_lost(&self, body: usize, lost: &[bool]) -> bool {
         self.tracked[body].is_some_and(|t| lost.get(usize::from(t)).copied().unwrap_or(false))
-    }
-
-    /// Changes what is kept of past frames, two lists of one entry a pixel: for checks that something broken is forgotten. No frame may be
-    /// in flight.
-    ///
-    /// # Errors
-    /// Out of memory, device lost.
-    ///
-    /// # Panics
-    /// When the range lies beyond the history, but not for a method without any: then nothing happens.
-    pub fn edit_history(
-        &self,
-        range: Range<usize>,
-        change: impl FnMut(&mut History),
-    ) -> Result<(), GpuError> {
-        if !self.settings.method.needs_history() {
-            return Ok(());
-        }
-        super::fill::edit(&self.gpu, &self.shared.history, range, change)
     }
 
     /// What the scene needs of the tracer.
@@ -505,7 +490,7 @@ impl Renderer {
     /// When there are fewer poses than bodies: a programmer's mistake.
     pub fn submit(&mut self, slot: &mut FrameSlot, inputs: &FrameInputs<'_>) -> Result<(), GpuError> {
         assert_eq!(inputs.poses.len(), self.data.bodies.len(), "one pose per body");
-        if self.settings.camera_is_eye {
+        if self.settings.camera_is_eye || self.every_tile {
             slot.tile_list.fill();
         } else {
             slot.tile_list.update(

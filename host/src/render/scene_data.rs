@@ -143,6 +143,17 @@ impl SceneNeeds {
     }
 }
 
+/// What stays in although nothing needs it: for measuring what leaving it out saves. No pixel may change.
+#[derive(Clone, Copy, Debug, Default)]
+pub struct Keep {
+    /// Code of the tracer.
+    pub needs: SceneNeeds,
+    /// The pass that decides shading rates, for methods with a history; nobody reads what it decides.
+    pub rate_map: bool,
+    /// Tiles that no body touches.
+    pub every_tile: bool,
+}
+
 /// Why a scene cannot be drawn.
 #[derive(Debug, thiserror::Error)]
 pub enum SceneDataError {
@@ -212,7 +223,6 @@ impl SceneData {
         let light_power: f32 = powers.iter().sum();
         data.add_environment(scene, radius, light_power);
         data.make_alias_table(&powers);
-        data.needs.textures = !scene.textures.is_empty();
         Ok(data)
     }
 
@@ -247,7 +257,8 @@ impl SceneData {
 
     fn add_materials(&mut self, scene: &Scene) {
         let mut iors: Vec<f32> = Vec::new();
-        for m in &scene.materials {
+        let used = scene.used_materials();
+        for (m, used) in scene.materials.iter().zip(used) {
             let ior = if m.ior.is_finite() { m.ior.max(1.0) } else { 1.0 };
             let table = iors.iter().position(|&i| i == ior).unwrap_or_else(|| {
                 iors.push(ior);
@@ -259,11 +270,15 @@ impl SceneData {
             });
             let transmissive = m.transmission > 0.0;
             let metal_everywhere = m.metallic >= 1.0 && m.metallic_roughness_texture.is_none();
-            self.needs.normal_maps |= m.normal_texture.is_some();
-            self.needs.alpha_mask |= m.alpha_cutoff.is_some();
-            self.needs.transmission |= transmissive;
-            self.needs.specular |= m.metallic > 0.0 || ior != 1.0;
-            self.needs.diffuse |= !metal_everywhere;
+            if used {
+                let needs = &mut self.needs;
+                needs.textures |= m.textures().any(|t| t.is_some());
+                needs.normal_maps |= m.normal_texture.is_some();
+                needs.alpha_mask |= m.alpha_cutoff.is_some();
+                needs.transmission |= transmissive;
+                needs.specular |= m.metallic > 0.0 || ior != 1.0;
+                needs.diffuse |= !metal_everywhere;
+            }
             let mut flags = 0;
             if m.double_sided {
                 flags |= gpu::MATERIAL_DOUBLE_SIDED;
@@ -303,7 +318,11 @@ impl SceneData {
         powers: &mut Vec<f32>,
     ) -> Result<(), SceneDataError> {
         let mesh = &body.mesh;
-        let far = mesh.positions.iter().flat_map(|p| p.to_array()).find(|v| !(v.abs() <= MAX_COORDINATE_M));
+        let far = mesh
+            .positions
+            .iter()
+            .flat_map(|p| p.to_array())
+            .find(|v| v.is_nan() || v.abs() > MAX_COORDINATE_M);
         if let Some(far) = far {
             return Err(SceneDataError::TooFar(body.name.clone(), far));
         }

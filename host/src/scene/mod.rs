@@ -140,6 +140,33 @@ pub struct Material {
     pub transmission_texture: Option<TextureRef>,
 }
 
+impl Material {
+    /// All textures that it may have.
+    pub fn textures(&self) -> impl Iterator<Item = Option<TextureRef>> {
+        [
+            self.base_color_texture,
+            self.metallic_roughness_texture,
+            self.normal_texture,
+            self.emissive_texture,
+            self.transmission_texture,
+        ]
+        .into_iter()
+    }
+}
+
+impl Scene {
+    /// Which materials any triangle of any body has, in the order of the materials.
+    pub fn used_materials(&self) -> Vec<bool> {
+        let mut used = vec![false; self.materials.len()];
+        for &m in self.bodies.iter().flat_map(|b| &b.mesh.materials) {
+            if let Some(u) = used.get_mut(m as usize) {
+                *u = true;
+            }
+        }
+        used
+    }
+}
+
 impl Default for Material {
     fn default() -> Self {
         Self {
