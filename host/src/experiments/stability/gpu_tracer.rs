@@ -132,7 +132,7 @@ pub fn cases(device: &Device) -> Vec<Case> {
         ),
         case(
             "gpu-extreme-radiance",
-            "emission 0, 1e-40, 1e-30, 1e30, 3e38 under every method",
+            "emission 0, 1e-40, 3e38 under every method",
             "finite or at full code; black is black",
             "faults",
             0.0,
@@ -469,7 +469,7 @@ fn many_lights(gpu: &Arc<Gpu>, seed: u64) -> f64 {
 fn extreme_radiance(gpu: &Arc<Gpu>, seed: u64) -> f64 {
     let mut faults = 0u32;
     for method in super::gpu_history::methods() {
-        for radiance in [0.0f32, 1e-40, 1e-30, 1e30, 3e38] {
+        for radiance in [0.0f32, 1e-40, 3e38] {
             let mut scene = scene_of(floor(1.0, 0.0), diffuse(Vec3::splat(0.5)));
             let lamp = quad(Vec3::new(-0.3, 0.6, -0.3), Vec3::X * 0.6, Vec3::Z * 0.6);
             add(&mut scene, lamp, Material { double_sided: true, ..emitter(Vec3::splat(radiance)) });

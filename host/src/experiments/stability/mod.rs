@@ -16,6 +16,7 @@ pub mod gpu_tracer;
 pub mod gpu_traversal;
 pub mod planes;
 pub mod predictor;
+pub mod scattering;
 pub mod shapes;
 pub mod statistics;
 pub mod tracer;
@@ -141,6 +142,7 @@ pub const SEED: u64 = 1;
 /// All cases that need no device.
 pub fn cases() -> Vec<Case> {
     let mut all = tracer::cases();
+    all.extend(scattering::cases());
     all.extend(predictor::cases());
     all.extend(clocks::cases());
     all.extend(calibration::cases());
@@ -219,6 +221,14 @@ mod tests {
         assert!(failed.is_empty(), "{failed:#?}");
         assert_eq!(report.passed, report.cases.len());
         assert!(report.passed >= 40, "{}", report.passed);
+    }
+
+    #[test]
+    fn the_page_names_every_case() {
+        let page = include_str!("../../../../docs/NUMERICS.md");
+        for case in cases().iter().chain(&gpu::cases(&Err("no".into()))) {
+            assert!(page.contains(&format!("| `{}` | ", case.name)), "docs/NUMERICS.md lacks {}", case.name);
+        }
     }
 
     #[test]
