@@ -18,3 +18,5 @@ pub mod time;
 pub mod tracker;
 #[cfg(feature = "std")]
 pub mod transport;
+#[cfg(feature = "serial")]
+pub mod tty;

@@ -7,6 +7,7 @@ use dpm_device::cobs::Deframer;
 use dpm_device::time::{HostClock, HostTime};
 use dpm_device::tracker::serial::wire::{SerialMessage, MAX_PACKET, VERSION};
 use dpm_device::tracker::BodyIndex;
+use dpm_device::tty::never_wait;
 use serialport::{SerialPort, TTYPort};
 use std::fs::{File, OpenOptions};
 use std::io::{self, ErrorKind, Read, Write};
@@ -139,13 +140,12 @@ pub struct SerialPoseHost {
 }
 
 impl SerialPoseHost {
-    /// Serves on `port`; its time-out is set to zero.
+    /// Serves on `port`, which must never wait (see [`dpm_device::tty`]): a line that nobody reads would hold the thread for ever.
     pub fn start(
         device: SerialPoseDevice,
-        mut port: Box<dyn SerialPort>,
+        port: Box<dyn SerialPort>,
         clock: Arc<dyn HostClock>,
     ) -> io::Result<Self> {
-        port.set_timeout(Duration::ZERO)?;
         let stop = Arc::new(AtomicBool::new(false));
         let thread = {
             let stop = stop.clone();
@@ -171,7 +171,7 @@ impl Drop for SerialPoseHost {
     }
 }
 
-/// A pseudo-terminal: the end to serve on, and the path that clients open. The last value holds the client's end open, without
+/// A pseudo-terminal: the end to serve on, which never waits, and the path that clients open. The last value holds the client's end open, without
 /// claiming it, so that the server's end does not hang up between clients.
 pub fn pseudo_terminal() -> serialport::Result<(Box<dyn SerialPort>, String, File)> {
     let (ours, theirs) = TTYPort::pair()?;
@@ -179,7 +179,7 @@ pub fn pseudo_terminal() -> serialport::Result<(Box<dyn SerialPort>, String, Fil
     let held = OpenOptions::new().read(true).write(true).custom_flags(libc::O_NOCTTY).open(&path)?;
     // Closing it gives up the lock that would keep clients out; the raw mode that it set stays while `held` is open.
     drop(theirs);
-    Ok((Box::new(ours), path, held))
+    Ok((never_wait(ours)?, path, held))
 }
 
 fn run(

@@ -8,12 +8,14 @@ use std::thread::JoinHandle;
 use std::time::{Duration, Instant};
 
 use dpm_device::link::{
-    packet_bytes, Codec, Epoch, HostLink, LinkSettings, LinkState, SendOutcome, Underrun,
+    packet_bytes, Codec, Epoch, Header, HostLink, LinkSettings, LinkState, MessageType, Packet, SendOutcome,
+    Underrun,
 };
 use dpm_device::planes::{PlaneSchedule, Raster};
 use dpm_device::time::{DeviceTicks, FrameRate, HostTime};
 use dpm_device::transport::serial::{SerialSettings, SerialTransport};
-use dpm_device::transport::{Transport, TransportError};
+use dpm_device::transport::{Lane, SendError, Transport, TransportError};
+use dpm_device::tty::never_wait;
 use hil_mock::projector::serial::SerialProjector;
 use hil_mock::projector::{MockConfig, MockProjector};
 use serialport::{SerialPort, TTYPort};
@@ -38,15 +40,13 @@ struct Far {
     garbage: Arc<Mutex<Vec<u8>>>,
 }
 
-fn pair() -> (TTYPort, TTYPort) {
-    let (mut master, mut slave) = TTYPort::pair().expect("a pseudo-terminal");
-    master.set_timeout(Duration::ZERO).unwrap();
-    slave.set_timeout(Duration::ZERO).unwrap();
-    (master, slave)
+fn pair() -> (Box<dyn SerialPort>, Box<dyn SerialPort>) {
+    let (master, slave) = TTYPort::pair().expect("a pseudo-terminal");
+    (never_wait(master).unwrap(), never_wait(slave).unwrap())
 }
 
 impl Far {
-    fn new(mut master: TTYPort, mock: Arc<Mutex<SerialProjector>>, start: Instant) -> Self {
+    fn new(mut master: Box<dyn SerialPort>, mock: Arc<Mutex<SerialProjector>>, start: Instant) -> Self {
         let stop = Arc::new(AtomicBool::new(false));
         let garbage = Arc::new(Mutex::new(Vec::new()));
         let (stopped, served, noise) = (stop.clone(), mock.clone(), garbage.clone());
@@ -166,7 +166,7 @@ fn frames_cross_a_serial_line_and_noise_costs_frames_not_the_link() {
     for codecs in [Codec::Raw.mask(), Codec::ALL] {
         let (master, slave) = pair();
         let far = Far::new(master, setup(), Instant::now());
-        let mut near = Near::new(SerialTransport::with_port(settings("pty"), Box::new(slave)), codecs);
+        let mut near = Near::new(SerialTransport::with_port(settings("pty"), slave), codecs);
         near.link.connect();
         near.until(&far, LONG, |_| far.with(|m| m.status().frames_lit) >= 10);
         check_lit(&far);
@@ -188,7 +188,7 @@ fn frames_cross_a_serial_line_and_noise_costs_frames_not_the_link() {
 }
 
 /// A new pseudo-terminal behind `path`, as an adapter that is plugged in: its far end.
-fn plug(path: &Path) -> TTYPort {
+fn plug(path: &Path) -> Box<dyn SerialPort> {
     let (master, slave) = pair();
     let _ = std::fs::remove_file(path);
     std::os::unix::fs::symlink(slave.name().unwrap(), path).unwrap();
@@ -230,4 +230,39 @@ fn an_absent_port_is_named() {
     let error = SerialTransport::open(settings("/dev/no-such-port")).unwrap_err();
     assert!(matches!(error, TransportError::NotFound { .. }), "{error}");
     assert!(error.to_string().contains("/dev/no-such-port"));
+}
+
+/// A line that takes nothing (nobody reads) holds nobody: neither the host who sends frames nor a device that answers.
+#[test]
+fn a_line_that_nobody_reads_never_holds_the_caller() {
+    let (sender, ended) = std::sync::mpsc::channel();
+    std::thread::spawn(move || {
+        let (_silent, slave) = pair();
+        let mut line = SerialTransport::with_port(settings("pty"), slave);
+        let bytes = vec![0x55; raster().plane_bytes()];
+        let header = Header { led_code: 0x27, ..Header::control(MessageType::Plane, 1, 0) };
+        let packets = vec![Packet::new(header, &bytes); 8];
+        // A kernel's line holds some thousand bytes: more than one frame, far fewer than these.
+        let mut taken = 0;
+        for _ in 0..200 {
+            match line.send(HostTime(0), Lane::Data, &packets) {
+                Ok(()) => taken += 1,
+                Err(SendError::Busy) => break,
+                Err(e) => panic!("{e}"),
+            }
+        }
+        assert!(taken < 200 && line.waiting() > 0, "the line is full");
+        // Going dark may still be asked for: it waits its turn without holding anybody.
+        line.send(HostTime(0), Lane::Control, &[Packet::new(Header::control(MessageType::Stop, 1, 0), &[])])
+            .unwrap();
+        let (mut answers, _silent) = pair();
+        let block = [0u8; 4096];
+        let full = (0..200).find_map(|_| answers.write(&block).err()).expect("room ends");
+        assert!(
+            matches!(full.kind(), std::io::ErrorKind::WouldBlock | std::io::ErrorKind::TimedOut),
+            "{full:?}"
+        );
+        sender.send(()).unwrap();
+    });
+    ended.recv_timeout(LONG).expect("nobody waits for a full line");
 }

@@ -5,7 +5,6 @@
 //! is kept no other is taken.
 
 use std::io::{ErrorKind, Read, Write};
-use std::time::Duration;
 
 use serialport::SerialPort;
 
@@ -14,6 +13,7 @@ use crate::cobs::{encode, encoded_bytes, Deframer};
 use crate::link::{packet_bytes, Packet, MAX_CONTROL_BYTES};
 use crate::planes::MAX_PLANES;
 use crate::time::HostTime;
+use crate::tty;
 
 /// Bytes of control messages that may wait.
 const CONTROL_WAITING: usize = 4096;
@@ -71,7 +71,7 @@ impl SerialTransport {
         Ok(serial)
     }
 
-    /// On a port that is open already (a pseudo-terminal).
+    /// On a port that is open already (a pseudo-terminal) and never waits, see [`tty::never_wait`].
     pub fn with_port(settings: SerialSettings, port: Box<dyn SerialPort>) -> Self {
         let mut serial = Self::closed(settings);
         serial.port = Some(port);
@@ -240,10 +240,7 @@ impl Transport for SerialTransport {
     fn reopen(&mut self) -> Result<(), TransportError> {
         self.port = None;
         let path = &self.settings.path;
-        let builder = serialport::new(path, self.settings.baud).timeout(Duration::ZERO);
-        // Exclusive by lock and by TIOCEXCL; the library's default, said here because it is a promise.
-        let port = builder.exclusive(true).open().map_err(|e| open_error(path, e))?;
-        self.port = Some(port);
+        self.port = Some(tty::open(path, self.settings.baud).map_err(|e| open_error(path, e))?);
         self.deframer.reset();
         self.control.clear();
         (self.packets, self.next_packet, self.going) = (0, 0, None);

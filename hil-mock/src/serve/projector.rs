@@ -93,10 +93,9 @@ fn serve_port(
         let (line, path, other_end) = pseudo_terminal()?;
         (line, path, Some(other_end))
     } else {
-        let line = serialport::new(port, arguments.baud).open();
+        let line = dpm_device::tty::open(port, arguments.baud);
         (line.map_err(|e| format!("cannot open {port}: {e}"))?, port.to_string(), None)
     };
-    line.set_timeout(Duration::ZERO)?;
     println!("bit-plane projector on {path}");
     let mut device = SerialProjector::new(projector);
     let start = Instant::now();

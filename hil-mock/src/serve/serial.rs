@@ -24,7 +24,7 @@ pub fn run(arguments: &SerialArguments) -> Result<(), Box<dyn Error>> {
     let (names, source) = arguments.tracker.source()?;
     let (port, path, _other_end) = match &arguments.port {
         Some(path) => {
-            let port = serialport::new(path, arguments.baud).open();
+            let port = dpm_device::tty::open(path, arguments.baud);
             (port.map_err(|e| format!("cannot open {path}: {e}"))?, path.clone(), None)
         }
         None => {

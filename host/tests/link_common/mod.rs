@@ -157,8 +157,8 @@ impl PtyProjector {
 
     /// Plugs it in again.
     pub fn plug_in(&self) {
-        let (mut master, slave) = TTYPort::pair().expect("a pseudo-terminal");
-        master.set_timeout(Duration::ZERO).unwrap();
+        let (master, slave) = TTYPort::pair().expect("a pseudo-terminal");
+        let mut master = dpm_device::tty::never_wait(master).unwrap();
         let theirs = slave.name().unwrap();
         // Holds the line open, and raw, between hosts; without the lock of the library's own handle.
         let held = std::fs::OpenOptions::new().read(true).write(true).open(&theirs).unwrap();

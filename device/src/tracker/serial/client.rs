@@ -11,7 +11,6 @@ use serialport::SerialPort;
 use std::io::ErrorKind;
 use std::sync::mpsc::{Receiver, TryRecvError};
 use std::sync::Arc;
-use std::time::Duration;
 
 const MS: i64 = 1_000_000;
 /// Between two attempts to open the port.
@@ -101,7 +100,7 @@ impl SerialTracker {
         let (port, baud) = (self.config.port.clone(), self.config.baud);
         // Opening a port can wait for its driver; one attempt at a time, elsewhere. Zero time-out: reads and writes never wait.
         let spawned = std::thread::Builder::new().name("serial-open".into()).spawn(move || {
-            let opened = serialport::new(port, baud).timeout(Duration::ZERO).open();
+            let opened = crate::tty::open(&port, baud);
             // Nobody waits any more when the tracker was dropped; the port closes again.
             let _ = send.send(opened);
         });
