@@ -10,7 +10,7 @@ use dpm_handoff::wake::{WaitPolicy, Waiter};
 use dpm_host::clock::{Clock, ManualClock};
 use dpm_host::frame::FrameTimeline;
 use dpm_host::plan::budget::{BudgetConfig, BudgetController};
-use dpm_host::plan::slots::{MissCause, SlotScheduler};
+use dpm_host::plan::lead::LeadEstimator;
 use dpm_host::telemetry::profile::Profiler;
 use dpm_host::tracking::{PoseFilterBank, PoseFilterConfig, TrackState};
 use std::alloc::{GlobalAlloc, Layout, System};
@@ -58,7 +58,7 @@ fn a_hundred_thousand_frames_allocate_nothing() {
     let (mut events_in, mut events_out) = ring::<u64>(16);
     let waiter = Waiter::new(WaitPolicy::SpinThenPark { spin_ns: 1_000 });
     let waker = waiter.waker();
-    let mut slots = SlotScheduler::new(rate, HostTime(0));
+    let mut lead = LeadEstimator::new(1_055_966, 2_000_000, 3_000_000);
     let mut budget = BudgetController::new(BudgetConfig {
         slot_ns: 1_055_966,
         aim: 0.8,
@@ -72,10 +72,12 @@ fn a_hundred_thousand_frames_allocate_nothing() {
     let mut predicted = 0u64;
     let before = ALLOCATIONS.with(Cell::get);
     for frame in 0..100_000u64 {
-        let slot = slots.take(clock.now(), MissCause::Plan);
-        clock.wait_until(slot.due);
+        let due = HostTime(rate.slot_start_ns(frame));
+        clock.wait_until(due);
+        lead.measured(300_000 + (frame % 1_000) as i64 * 5_000);
+        assert!(lead.typical_ns() <= lead.lead_ns());
         for body in 0..2 {
-            let captured_at = slot.due.plus_ns(-4_000_000);
+            let captured_at = due.plus_ns(-4_000_000);
             // A drop-out, an outlier and a duplicate now and then: the odd paths count too.
             let x = if frame % 1_000 == 7 { 50.0 } else { 1e-3 * (frame % 500) as f64 };
             let sample = TrackerSample {
@@ -92,9 +94,9 @@ fn a_hundred_thousand_frames_allocate_nothing() {
         }
         publisher.publish([bank.state(BodyIndex(0)), bank.state(BodyIndex(1))]);
         waker.wake();
-        assert!(waiter.wait(slot.ends.0, || clock.now().0, || reader.has_news()));
+        assert!(waiter.wait(rate.slot_start_ns(frame + 1), || clock.now().0, || reader.has_news()));
         for state in reader.latest().0.iter().flatten() {
-            predicted += u64::from(state.predict(slot.due).pose.is_valid(1e-9));
+            predicted += u64::from(state.predict(due).pose.is_valid(1e-9));
         }
         let mut buffer = filler.take_free().expect("one goes round");
         buffer[0] = frame as u8;
@@ -104,8 +106,8 @@ fn a_hundred_thousand_frames_allocate_nothing() {
         events_in.push(frame).expect("drained every frame");
         assert_eq!(events_out.pop(), Some(frame));
         budget.measured(budget.rays(), 800_000 + (frame % 300_000) as i64);
-        let timeline = FrameTimeline { lit_at: Some(slot.due), due_at: slot.due, ..FrameTimeline::default() };
-        profiler.lit(&timeline, slot.index, frame % 100 == 0);
+        let timeline = FrameTimeline { lit_at: Some(due), due_at: due, ..FrameTimeline::default() };
+        profiler.lit(&timeline, frame, frame % 100 == 0);
     }
     let allocated = ALLOCATIONS.with(Cell::get) - before;
     assert_eq!(allocated, 0, "{allocated} allocations in 100,000 frames");

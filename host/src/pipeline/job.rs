@@ -42,6 +42,8 @@ pub struct FrameNote {
     pub sampled_poses: Vec<DAffine3>,
     /// Eye, world.
     pub eye: DVec3,
+    /// Thousandths of a sample that a pixel gets on average.
+    pub budget_milli: u64,
     /// What the GPU said about it; `None` when frames are prepared instead of rendered.
     pub cost: Option<FrameCost>,
     /// Hash of the code values, to be compared with the light.
@@ -63,10 +65,17 @@ impl FrameNote {
             tracked_poses: Vec::with_capacity(bodies),
             sampled_poses: Vec::with_capacity(bodies),
             eye: DVec3::ZERO,
+            budget_milli: 0,
             cost: None,
             code_hash: 0,
             fate: Fate::UnderWay,
         }
+    }
+
+    /// Time that the GPU worked on it, nanoseconds; `None` where the device has no time stamps.
+    pub fn gpu_ns(&self) -> Option<i64> {
+        let ns: u64 = self.cost?.pass_ns.iter().sum();
+        i64::try_from(ns).ok().filter(|&ns| ns > 0)
     }
 
     /// True when the link took it.

@@ -88,6 +88,7 @@ pub(super) fn link_thread(
         };
         // Getting a lost medium back allocates; the rig is dark then.
         enter_frame_path(job.note.id.0 >= WARM_UP_FRAMES && line.link.state() == LinkState::Streaming);
+        shared.may_stall(Stage::Link, job.note.id.0);
         let now = if shared.is_virtual() { job.note.timeline.sent_at } else { shared.clock.now() };
         last = now;
         line.cable.live(now);

@@ -3,6 +3,7 @@
 use super::collect::FrameRecord;
 use super::connect::ConnectError;
 use super::light::LightFrame;
+use crate::frame::Stage;
 use crate::gpu::GpuError;
 use crate::realtime::standstill::Standstills;
 use crate::render::RenderError;
@@ -11,6 +12,17 @@ use crate::telemetry::profile::Profiler;
 use crate::telemetry::report::Report;
 use crate::telemetry::slots::SlotCounts;
 use crate::telemetry::trace::TracedFrame;
+
+/// A stage that stands still once: for tests of what is left afterwards.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct Stall {
+    /// Plan, pack or link.
+    pub stage: Stage,
+    /// Before it works on this frame.
+    pub frame: u64,
+    /// For this long.
+    pub length: std::time::Duration,
+}
 
 /// How a run differs from what the rig file says.
 #[derive(Clone, Copy, Debug)]
@@ -25,11 +37,13 @@ pub struct RunOptions {
     pub verify: bool,
     /// Frames under way at once.
     pub in_flight: usize,
+    /// A stage that stands still once.
+    pub stall: Option<Stall>,
 }
 
 impl Default for RunOptions {
     fn default() -> Self {
-        Self { frames: 0, slots: 0, keep_frames: 0, verify: true, in_flight: 4 }
+        Self { frames: 0, slots: 0, keep_frames: 0, verify: true, in_flight: 4, stall: None }
     }
 }
 

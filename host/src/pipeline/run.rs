@@ -9,12 +9,13 @@ use super::outcome::{PipelineError, RunOptions, RunOutcome};
 use super::prepared::PreparedFrames;
 use super::projector;
 use super::rights::Rights;
-use super::stages::TrackingStage;
-use super::threads::{policy, run_threads, Shared, LISTEN_NS, STAGE_THREADS};
+use super::stages::{self, TrackingStage};
+use super::threads::{policy, run_threads, Shared, GPU_TIMEOUT_NS, LISTEN_NS, STAGE_THREADS};
 use crate::clock::{Clock, ManualClock, MonotonicClock, RunClock, Stopwatch};
-use crate::config::{Pace, Packer, ProjectorBackend};
+use crate::config::{Pace, Packer, ProjectorBackend, RenderMethod};
 use crate::gpu::Gpu;
 use crate::pack::{BitPlaneFrame, Kernel};
+use crate::plan::budget::{BudgetConfig, BudgetController};
 use crate::plan::lead::LeadEstimator;
 use crate::plan::slots::MissCause;
 use crate::realtime::os::usable_cores;
@@ -32,7 +33,7 @@ use dpm_handoff::channel::{channel, Sender};
 use dpm_handoff::wake::WaitPolicy;
 use glam::DVec3;
 use hil_mock::projector::{DeviceClock, MockConfig, MockProjector};
-use std::sync::atomic::{AtomicBool, AtomicI64};
+use std::sync::atomic::{AtomicBool, AtomicI64, AtomicU64};
 use std::sync::{Arc, Mutex, OnceLock};
 
 /// Light events between the projector and the collector: eight seconds at 947 Hz.
@@ -129,6 +130,10 @@ fn run_from(
         });
     }
 
+    if let (Some(renderer), Some(first), false) = (&mut renderer, memory.first_mut(), is_virtual) {
+        stages::warm_up(first, &rig, renderer, GPU_TIMEOUT_NS).map_err(RenderError::from)?;
+    }
+
     let frame_bytes = projector::frame_bytes(raster, schedule.len());
     let (lights_in, lights) = channel(LIGHTS, WaitPolicy::Park);
     let prepared = gpu.is_none().then(|| PreparedFrames::new(raster));
@@ -192,6 +197,9 @@ fn run_from(
         // Sent earlier, a frame would find no room in the device.
         let held = link.device().map_or(1, |hello| i64::from(hello.frame_buffers));
         let lead = LeadEstimator::new(slot_ns, first_guess_ns, held * slot_ns);
+        // At virtual pace pictures must not depend on how fast the machine is.
+        let adapts = !is_virtual && renderer.is_some() && config.render.method == RenderMethod::Dpm;
+        let budget = if adapts { budget_controller(slot_ns, config.render.spp) } else { None };
         let shared = Shared {
             rig: rig.clone(),
             clock: &clock,
@@ -201,6 +209,7 @@ fn run_from(
             lead_ns: AtomicI64::new(lead.lead_ns()),
             typical_ns: AtomicI64::new(lead.typical_ns()),
             travel_ns: AtomicI64::new(0),
+            budget_milli: AtomicU64::new(u64::from(config.render.spp) * 1000),
             tracking_over: AtomicBool::new(false),
             error: Mutex::new(None),
             monitor,
@@ -219,6 +228,7 @@ fn run_from(
             link,
             cable,
             memory,
+            budget,
             (seen, lights),
             lead,
             &mut collector,
@@ -271,6 +281,21 @@ fn run_from(
         profiler: collector.profiler,
         standstills,
     })
+}
+
+/// Holds the GPU's time inside the slot by spending fewer samples: thousandths of a sample a pixel, from what the rig file asks for down
+/// to an eighth of it.
+fn budget_controller(slot_ns: i64, spp: u32) -> Option<BudgetController> {
+    let full = u64::from(spp) * 1000;
+    let config = BudgetConfig {
+        slot_ns,
+        aim: 0.8,
+        limit: 0.92,
+        min_rays: (full / 8).max(1),
+        max_rays: full.max(1),
+        initial_rays: full,
+    };
+    BudgetController::new(config).ok()
 }
 
 fn method_name(rig: &Rig) -> &'static str {

@@ -1,6 +1,6 @@
 //! What each stage does to one frame. No threads here: `run.rs` decides who calls what.
 
-use super::job::{hash_codes, Fate, FrameJob};
+use super::job::{hash_codes, Fate, FrameJob, FrameMemory};
 use super::prepared::PreparedFrames;
 use crate::clock::Stopwatch;
 use crate::frame::{FrameId, Stage};
@@ -143,7 +143,7 @@ pub fn submit(job: &mut FrameJob, rig: &Rig, renderer: &mut Renderer) -> Result<
         &FrameInputs {
             frame: note.id.0 as u32,
             spp: rig.config.render.spp,
-            budget_spp: rig.config.render.spp as f32,
+            budget_spp: note.budget_milli as f32 * 1e-3,
             camera: &rig.camera,
             eye: note.eye,
             gaze: memory.gaze,
@@ -152,6 +152,36 @@ pub fn submit(job: &mut FrameJob, rig: &Rig, renderer: &mut Renderer) -> Result<
             lost: &memory.lost,
         },
     )
+}
+
+/// Renders one frame that nobody sees: what drivers put off to the first one (translating shaders) is over before a slot waits for it.
+///
+/// # Errors
+/// The GPU did not finish within `timeout_ns`, or was lost.
+pub fn warm_up(
+    memory: &mut FrameMemory,
+    rig: &Rig,
+    renderer: &mut Renderer,
+    timeout_ns: u64,
+) -> Result<(), GpuError> {
+    let Some(slot) = memory.gpu.as_mut() else { return Ok(()) };
+    let rest: Vec<_> = rig.bodies.iter().map(|b| affine(&b.rest)).collect();
+    rig.scene_poses(&rest, &mut memory.scene_poses);
+    let (eye, gaze) = rig.observer.eye_and_gaze(&rest);
+    let spp = rig.config.render.spp;
+    let inputs = FrameInputs {
+        frame: 0,
+        spp,
+        budget_spp: spp as f32,
+        camera: &rig.camera,
+        eye,
+        gaze,
+        widen_deg: 0.0,
+        poses: &memory.scene_poses,
+        lost: &memory.lost,
+    };
+    renderer.submit(slot, &inputs)?;
+    slot.wait(timeout_ns).map(|_| ())
 }
 
 /// Waits for the GPU, if the job has one.

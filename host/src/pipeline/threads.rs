@@ -13,6 +13,7 @@ use crate::clock::{Clock, RunClock, Stopwatch};
 use crate::config::{Pace, Wait};
 use crate::frame::Stage;
 use crate::pack::Kernel;
+use crate::plan::budget::BudgetController;
 use crate::plan::lead::LeadEstimator;
 use crate::realtime::wait_policy;
 use crate::render::Renderer;
@@ -24,7 +25,7 @@ use dpm_handoff::channel::{channel, Receiver, Sender};
 use dpm_handoff::latest::{latest, Publisher, Reader};
 use dpm_handoff::wake::WaitPolicy;
 use std::cell::Cell;
-use std::sync::atomic::{AtomicBool, AtomicI64, Ordering};
+use std::sync::atomic::{AtomicBool, AtomicI64, AtomicU64, Ordering};
 use std::sync::{Arc, Mutex, OnceLock};
 use std::time::Duration;
 
@@ -54,7 +55,7 @@ pub(super) const STAGE_THREADS: usize = 5;
 /// Longest wait for another stage before it is looked whether the run goes on.
 const WAIT_NS: i64 = 100_000_000;
 /// A frame that the GPU has not finished by then is given up, and the run with it.
-const GPU_TIMEOUT_NS: u64 = 20_000_000_000;
+pub(super) const GPU_TIMEOUT_NS: u64 = 20_000_000_000;
 /// Time for which trackers are listened to before the first frame, so that the filters know the motion.
 pub(super) const LISTEN_NS: i64 = 150_000_000;
 
@@ -73,6 +74,8 @@ pub(super) struct Shared<'a> {
     pub(super) typical_ns: AtomicI64,
     /// Learned time from sent to light, nanoseconds (projectors outside).
     pub(super) travel_ns: AtomicI64,
+    /// Thousandths of a sample that a pixel gets on average.
+    pub(super) budget_milli: AtomicU64,
     pub(super) tracking_over: AtomicBool,
     pub(super) error: Mutex<Option<PipelineError>>,
     pub(super) monitor: &'a RunMonitor,
@@ -87,6 +90,13 @@ impl Shared<'_> {
             first.get_or_insert(error);
         }
         self.monitor.request_stop();
+    }
+
+    /// Stands still where the run's options say so.
+    pub(super) fn may_stall(&self, stage: Stage, frame: u64) {
+        if let Some(stall) = self.options.stall.filter(|s| (s.stage, s.frame) == (stage, frame)) {
+            std::thread::sleep(stall.length);
+        }
     }
 
     pub(super) fn is_virtual(&self) -> bool {
@@ -129,6 +139,7 @@ pub(super) fn run_threads(
     link: HostLink,
     cable: Cable,
     memory: Vec<FrameMemory>,
+    budget: Option<BudgetController>,
     (seen, lights): (Option<Sender<LightNote>>, Receiver<LightNote>),
     lead: LeadEstimator,
     collector: &mut Collector,
@@ -167,7 +178,7 @@ pub(super) fn run_threads(
         let pack = named("pack")
             .spawn_scoped(scope, move || {
                 let _close = OnExit(|| shared.monitor.request_stop());
-                pack_thread(shared, kernel, prepared, to_pack_out, to_link_in);
+                pack_thread(shared, kernel, prepared, budget, to_pack_out, to_link_in);
             })
             .map_err(refused("pack"))?;
         let link = named("link")
@@ -259,6 +270,7 @@ fn plan_thread(
         }
         let Some(note) = pop_within(&mut notes, WAIT_NS) else { continue };
         let Some(memory) = hottest.pop() else { continue };
+        shared.may_stall(Stage::Plan, id);
         let mut job = FrameJob { note, memory };
         job.note.waited_for_memory = waited;
         let travel = shared.travel_ns.load(Ordering::Relaxed);
@@ -286,6 +298,7 @@ fn plan_thread(
                 std::thread::yield_now();
             }
         }
+        job.note.budget_milli = shared.budget_milli.load(Ordering::Relaxed);
         stages::plan(&mut job, &shared.rig, latest.latest().0, &time, id, next_slot);
         let t = &mut job.note.timeline;
         if shared.is_virtual() {
@@ -322,6 +335,7 @@ fn pack_thread(
     shared: &Shared<'_>,
     kernel: Kernel,
     mut prepared: Option<PreparedFrames>,
+    mut budget: Option<BudgetController>,
     mut jobs: Receiver<FrameJob>,
     mut to_link: Sender<FrameJob>,
 ) {
@@ -329,9 +343,14 @@ fn pack_thread(
     while let Some(mut job) = next(&mut jobs) {
         let id = job.note.id.0;
         enter_frame_path(id >= WARM_UP_FRAMES);
+        shared.may_stall(Stage::Pack, id);
         if let Err(source) = stages::finish(&mut job, GPU_TIMEOUT_NS) {
             shared.fail(PipelineError::Gpu { frame: id, source });
             break;
+        }
+        if let (Some(controller), Some(gpu_ns)) = (&mut budget, job.note.gpu_ns()) {
+            controller.measured(job.note.budget_milli, gpu_ns);
+            shared.budget_milli.store(controller.rays(), Ordering::Relaxed);
         }
         if !is_overtaken(shared, &mut job.note, &jobs) {
             stages::pack(&mut job, kernel, shared.verify, &mut prepared);

@@ -1,13 +1,11 @@
 //! What the operating system grants a frame path: priority, cores, memory that stays, short sleeps; and how well it keeps its word.
 //!
 //! Every right is asked for, none is required. A refusal is one [`Refusal`] with the limit to set, for the caller to show once;
-//! the rig runs on. [`os`] asks, [`throttle`] keeps a spinning real-time thread out of the kernel's throttling, [`standstill`]
-//! measures when the machine itself stood still.
+//! the rig runs on. [`os`] asks, [`standstill`] measures when the machine itself stood still.
 
 pub mod handoff_cost;
 pub mod os;
 pub mod standstill;
-pub mod throttle;
 
 use dpm_handoff::wake::WaitPolicy;
 
