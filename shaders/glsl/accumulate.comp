@@ -1,7 +1,7 @@
 // New samples into the history, and the history into the picture.
 //
-// [paper]: weight of the new frame by angle, 1 / (n + 1) after a disocclusion. Method dpm: every sample counts once, up to a cap that
-// shrinks where the last few frames say something else than the history.
+// [paper]: weight of the new frame by angle, 1 / (n + 1) after a disocclusion. Method dpm: every sample counts once, up to a cap; how far the
+// history lags behind the last few frames is kept beside it, for the picture to make up for.
 #version 460
 #extension GL_GOOGLE_include_directive : require
 #include "scene.glsl"
@@ -13,8 +13,10 @@ layout(set = 0, binding = B_TILES, scalar) readonly buffer Tiles { uint tiles[];
 layout(set = 0, binding = B_GUIDES, scalar) readonly buffer Guides { Guide guides[]; };
 layout(set = 0, binding = B_RADIANCE, scalar) readonly buffer Radiance { vec4 radiance_in[]; };
 layout(set = 0, binding = B_HISTORY, scalar) buffer Histories { History histories[]; };
-layout(set = 0, binding = B_TILE_STATES, scalar) buffer TileStates { TileState tile_states[]; };
 layout(set = 0, binding = B_FILTERED, scalar) buffer Filtered { vec4 filtered[]; };
+
+// Method dpm: from the history's surface point to the pixel's.
+layout(set = 0, binding = B_SHOWN, scalar) readonly buffer Shown { vec4 shown[]; };
 
 vec3 albedo_of(uint at) { return vec3(unpackHalf2x16(guides[at].albedo_rg), unpackHalf2x16(guides[at].albedo_b).x); }
 
@@ -30,13 +32,14 @@ void main() {
     if ((frame.flags & FRAME_DPM) != 0u) {
         vec4 traced = radiance_in[at];
         vec3 albedo = albedo_of(at);
+        vec3 shift = shown[at].rgb;
         if (traced.w > 0.0) {
             vec3 fresh = traced.rgb / albedo;
             float y = luminance(traced.rgb);
             h.index += uint(traced.w);
             // Variance of one sample about the mean of history and frame, averaged over the samples the history holds.
             float second = filtered[at].x / traced.w;
-            float known = luminance(h.mean * albedo);
+            float known = luminance((h.mean + shift) * albedo);
             float about = h.weight > 0.0 ? mix(y, known, h.weight / (h.weight + traced.w)) : y;
             float variance = max(second - 2.0 * about * y + about * about, 0.0);
             float v_weight = clamp(traced.w / (min(h.weight, 32.0) + traced.w), 0.0, 1.0);
@@ -45,33 +48,21 @@ void main() {
             float n_weight = 0.1;
             if (h.last >= 0.0) h.noise = mix(h.noise, 0.5 * (y - h.last) * (y - h.last), h.noise > 0.0 ? n_weight : 1.0);
             h.last = y;
-            // The last few frames against the history: where they disagree by more than noise the history is old.
-            h.fast = h.weight > 0.0 ? mix(h.fast, y, 0.25) : y;
+            // Innovation: what the frame says beyond the history, as luminance without albedo. Its mean over the last few frames is the lag.
             float per_frame = max(frame.budget_spp, 0.5);
-            float frames = max(h.weight / per_frame, 1.0);
-            float cap = tile_states[(pixel.y >> 4u) * frame.tiles_x + (pixel.x >> 4u)].cap * per_frame;
-            float drift = h.fast - known;
-            // A mean of weight 1/4 has 1/7 of a frame's variance; the history shares its samples.
-            float noise2 = h.noise * max(1.0 / 7.0 - 1.0 / frames, 0.0);
-            if (frames > 7.0 && h.noise > 0.0) {
-                float scale = 65536.0 / (known * known + 0.01);
-                int lag = int(clamp((drift * drift - noise2) * scale, -65536.0, 65536.0));
-                int noise = int(clamp(h.noise * scale, 0.0, 65536.0));
-                uint tile = (pixel.y >> 4u) * frame.tiles_x + (pixel.x >> 4u);
-                atomicAdd(tile_states[tile].lag, lag);
-                atomicAdd(tile_states[tile].noise, noise);
-                atomicAdd(tile_states[tile].count, 1u);
-            }
-            // A jump (a shadow's edge, a light switched on) is not waited for.
-            float jump = drift * drift / max(noise2 + h.noise / 7.0 + 1e-6 * known * known, 1e-12);
-            if (h.weight > 0.0 && jump > 25.0) h.weight *= clamp(25.0 / jump, 0.25, 1.0);
-            h.weight = min(h.weight, cap);
-            // Every traced frame weighs the same, whatever its samples: their number follows from former samples, and weighing by it
-            // would dilute every bright sample by the many that it calls for.
-            h.mean = h.weight > 0.0 ? mix(h.mean, fresh, per_frame / (h.weight + per_frame)) : fresh;
-            h.weight += per_frame;
+            float innovation = luminance(fresh - h.mean - shift);
+            h.drift = h.weight > 0.0 ? mix(h.drift, innovation, 0.0625) : 0.0;
+            // A jump (a light switched on) is not waited for: a mean of weight 1/16 has 1/31 of a frame's variance.
+            float drift = h.drift * luminance(albedo);
+            float jump = drift * drift / max(h.noise / 31.0 + 1e-4 * known * known, 1e-12);
+            if (jump > 25.0) h.weight *= 0.7;
+            h.weight = min(h.weight, frame.history_cap * per_frame);
+            // Every sample counts once, so that the sequence's points keep their even spread; their number follows from the variance of long
+            // before, hardly from the sample that is weighed.
+            h.mean = h.weight > 0.0 ? mix(h.mean, fresh - shift, traced.w / (h.weight + traced.w)) : fresh - shift;
+            h.weight += traced.w;
         }
-        filtered[at] = vec4(h.mean, h.weight > 0.0 ? h.variance / h.weight : 0.0);
+        filtered[at] = vec4(max(h.mean + shift, vec3(0.0)), h.weight > 0.0 ? h.variance / h.weight : 0.0);
     } else {
         uvec2 size = block_size(pixel);
         uvec2 source = traced_pixel(pixel, size);

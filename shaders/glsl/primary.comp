@@ -17,15 +17,6 @@ layout(constant_id = 11) const bool HAS_GUIDES = true;
 // Radiance is filtered without the surface's albedo.
 layout(constant_id = 12) const bool HAS_DEMODULATION = true;
 
-// Raster position of a point; the projector is the origin.
-vec2 project(vec3 p) {
-    vec3 q = vec3(dot(vec3(frame.world_from_projector[0].x, frame.world_from_projector[1].x, frame.world_from_projector[2].x), p),
-                  dot(vec3(frame.world_from_projector[0].y, frame.world_from_projector[1].y, frame.world_from_projector[2].y), p),
-                  dot(vec3(frame.world_from_projector[0].z, frame.world_from_projector[1].z, frame.world_from_projector[2].z), p));
-    float depth = max(-q.z, 1e-9);
-    return vec2(frame.intrinsics.z + frame.intrinsics.x * q.x / depth, frame.intrinsics.w - frame.intrinsics.y * q.y / depth);
-}
-
 // Reflectance of the look for white light from everywhere, roughly: what varies over a texture but not over the light.
 vec3 demodulation(Hit hit, vec3 toward) {
     Point s = shading_point(hit, toward);
@@ -65,7 +56,7 @@ void main() {
                 lit = !trace_ray(p + offset, to_eye - offset, INSTANCE_PROJECTED, true, blocker);
             }
             if (!lit) surface.distance = -hit.t;
-            if (HAS_GUIDES && lit) {
+            if (HAS_GUIDES) {
                 Guide guide;
                 vec3 o = object_position(hit.instance, hit.triangle, hit.barycentric);
                 vec2 before = project(transform_point(instances[hit.instance].previous_world_from_object, o));

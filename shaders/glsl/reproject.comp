@@ -1,10 +1,11 @@
 // History of the last frame, carried to where each surface point is now. Writes the prior of every lit pixel.
 //
-// Validity: same body, the tap's own surface point close to ours and its normal alike, both in body space. Carried with a kernel that
-// reproduces quadratics (Catmull-Rom) where all taps are valid in method dpm: repeated bilinear fetches would blur by 1/6 px^2 a frame.
+// Validity: same body, the tap's own surface point close to ours and its normal alike, both in body space. Methods paper and miyamoto fetch
+// bilinearly, which blurs by up to 1/4 px^2 a frame. Method dpm resamples nothing: a history stays with one surface point.
 #version 460
 #extension GL_GOOGLE_include_directive : require
 #include "scene.glsl"
+#include "importance.glsl"
 
 layout(local_size_x = 8, local_size_y = 8) in;
 
@@ -12,56 +13,183 @@ layout(set = 0, binding = B_TILES, scalar) readonly buffer Tiles { uint tiles[];
 layout(set = 0, binding = B_SURFACES, scalar) readonly buffer Surfaces { Surface surfaces[]; };
 layout(set = 0, binding = B_GUIDES, scalar) readonly buffer Guides { Guide guides[]; };
 layout(set = 0, binding = B_HISTORY, scalar) buffer Histories { History histories[]; };
-layout(set = 0, binding = B_TILE_STATES, scalar) buffer TileStates { TileState tile_states[]; };
 layout(set = 0, binding = B_SCHEDULE, scalar) buffer ScheduleBlock { Schedule schedule; };
+// Method dpm: what leads from the history's surface point to the pixel's, added to its mean.
+layout(set = 0, binding = B_SHOWN, scalar) writeonly buffer Shown { vec4 shown[]; };
 layout(set = 0, binding = B_TRIANGLE_REFS, scalar) readonly buffer TriangleRefs { TriangleRef triangle_refs[]; };
 layout(set = 0, binding = B_VERTICES, scalar) readonly buffer Vertices { Vertex vertices[]; };
 
 struct Carried {
     vec3 mean;
-    float weight, fast, variance, last, noise;
+    float weight, drift, variance, last, noise;
     float total;
 };
 
-bool tap_valid(uint index, uint instance, vec3 position, vec3 normal, float footprint) {
+bool tap_valid(uint index, uint instance, vec3 position, vec3 normal, float footprint, float depth) {
     if (histories[index].frame != frame.history_frame || histories[index].instance != instance || !(histories[index].weight > 0.0)) return false;
     vec3 apart = histories[index].position - position;
     vec3 tap_normal = decode_normal(histories[index].normal);
-    return dot(tap_normal, normal) > 0.9 && abs(dot(apart, normal)) < 2.0 * footprint && dot(apart, apart) < 16.0 * footprint * footprint;
+    return dot(tap_normal, normal) > 0.9 && abs(dot(apart, normal)) < depth * footprint && dot(apart, apart) < 16.0 * footprint * footprint;
 }
 
 void add_tap(inout Carried c, uint index, float w) {
     c.mean += w * histories[index].mean;
     c.weight += w * histories[index].weight;
-    c.fast += w * histories[index].fast;
+    c.drift += w * histories[index].drift;
     c.variance += w * histories[index].variance;
     c.last += w * histories[index].last;
     c.noise += w * histories[index].noise;
     c.total += w;
 }
 
-float importance_of(History h, float degrees_) {
-    // Standard deviation of one sample, by [Neyman34] the density that lowers the summed variance most; a floor keeps every pixel alive.
-    float sigma = h.weight > 0.0 ? sqrt(max(h.variance, 0.0)) : 1.0;
-    return clamp(sigma, 0.02, 8.0);
+// Method dpm: every history belongs to one surface point for as long as it is seen. It goes to the pixel that the point is in now, so nothing is
+// ever resampled; the pixel's own point, at most half a pixel away, is reached by the gradient of the histories around.
+void carry_point(inout History h, vec3 normal, float footprint, uvec2 pixel, vec2 before) {
+    vec2 centre = vec2(pixel) + 0.5;
+    uint at = pixel.y * frame.width + pixel.x;
+    uint pixels = frame.width * frame.height, former = (1u - frame.parity) * pixels;
+    ivec2 corner = ivec2(floor(clamp(before, vec2(-4.0), vec2(frame.width, frame.height) + 4.0)));
+    vec3 sum = vec3(0.0), sum_x = vec3(0.0), sum_y = vec3(0.0), lower = vec3(INFINITY), upper = vec3(-INFINITY);
+    float squares = 0.0, total = 0.0, x = 0.0, y = 0.0, xx = 0.0, xy = 0.0, yy = 0.0, nearest = 1.5;
+    uint owner = NO_HIT, taps = 0u;
+    vec2 apart = vec2(0.0);
+    for (int i = 0; i < 9; i++) {
+        ivec2 q = corner + ivec2(i % 3, i / 3) - 1;
+        if (any(lessThan(q, ivec2(0))) || any(greaterThanEqual(q, ivec2(frame.width, frame.height)))) continue;
+        uint tap = former + uint(q.y) * frame.width + uint(q.x);
+        if (!tap_valid(tap, h.instance, h.position, normal, footprint, 0.5)) continue;
+        vec2 e = project(transform_point(instances[h.instance].world_from_object, histories[tap].position)) - centre;
+        vec3 m = histories[tap].mean;
+        float w = histories[tap].weight;
+        if (!finite3(m) || !finite(w) || !finite(e.x + e.y)) continue;
+        total += w;
+        taps++;
+        x += w * e.x;
+        y += w * e.y;
+        xx += w * e.x * e.x;
+        xy += w * e.x * e.y;
+        yy += w * e.y * e.y;
+        sum += w * m;
+        squares += w * luminance(m) * luminance(m);
+        sum_x += w * e.x * m;
+        sum_y += w * e.y * m;
+        lower = min(lower, m);
+        upper = max(upper, m);
+        float far = max(abs(e.x), abs(e.y));
+        if (far < nearest) {
+            nearest = far;
+            owner = tap;
+            apart = e;
+        }
+    }
+    vec3 shift = vec3(0.0), g_x = vec3(0.0), g_y = vec3(0.0);
+    if (owner != NO_HIT) {
+        History known = histories[owner];
+        float s = 1.0 / total;
+        x *= s;
+        y *= s;
+        xx = xx * s - x * x + 1e-3;
+        xy = xy * s - x * y;
+        yy = yy * s - y * y + 1e-3;
+        sum *= s;
+        sum_x = sum_x * s - x * sum;
+        sum_y = sum_y * s - y * sum;
+        float determinant = xx * yy - xy * xy;
+        if (determinant > 1e-3) {
+            g_x = (yy * sum_x - xy * sum_y) / determinant;
+            g_y = (xx * sum_y - xy * sum_x) / determinant;
+            shift = -(g_x * apart.x + g_y * apart.y);
+            shift = clamp(known.mean + shift, lower, upper) - known.mean;
+        }
+        known.frame = h.frame;
+        if (nearest <= 0.6) {
+            h = known;
+        } else {
+            // No history's point is in this pixel. A new one begins a whole number of pixels beside the nearest, so that the points stay a lattice.
+            vec2 e = apart - round(apart);
+            vec3 n = transform_vector(instances[h.instance].world_from_object, normal);
+            vec3 own = transform_point(instances[h.instance].world_from_object, h.position);
+            vec3 direction = projector_direction(centre + e);
+            float along = dot(n, direction);
+            if (abs(along) > 0.1) h.position = transform_point(instances[h.instance].object_from_world, direction * (dot(n, own) / along));
+            else e = vec2(0.0);
+            vec3 there = -(g_x * (apart.x - e.x) + g_y * (apart.y - e.y));
+            known.mean = clamp(known.mean + there, lower, upper);
+            shift = -(g_x * e.x + g_y * e.y);
+            shift = clamp(known.mean + shift, lower, upper) - known.mean;
+            known.position = h.position;
+            known.normal = h.normal;
+            known.seed = h.seed;
+            known.index = 0u;
+            // Known as well as the histories around it agree: their scatter about the plane, or about each other where they lie on one side.
+            vec3 albedo = vec3(unpackHalf2x16(guides[at].albedo_rg), unpackHalf2x16(guides[at].albedo_b).x);
+            float light = luminance(albedo), noise = max(known.noise, 1e-8), per_frame = max(frame.budget_spp, 0.5);
+            float expected = noise * per_frame / known.weight, rest;
+            if (taps < 8u) {
+                float range = luminance(upper - lower) * light;
+                rest = 0.5 * max(range * range - 4.0 * expected, 0.0);
+            } else {
+                float mean = luminance(sum), fit = luminance(g_x) * luminance(sum_x) + luminance(g_y) * luminance(sum_y);
+                rest = 2.0 * max((squares * s - mean * mean - fit) * light * light - expected, 0.0);
+            }
+            known.weight = 1.0 / (1.0 / known.weight + rest / (noise * per_frame));
+            h = known;
+        }
+    } else {
+        h.mean = vec3(0.0);
+        h.weight = 0.0;
+        h.drift = 0.0;
+        h.variance = 0.0;
+        h.last = -1.0;
+        h.noise = 0.0;
+        h.index = 0u;
+    }
+    shown[at] = vec4(shift, 0.0);
 }
 
-// Bias against variance: a history that lags behind by more than half of the noise that the eye would see is too long.
-void steer_history(uint tile) {
-    TileState t = tile_states[tile];
-    if (t.count > 0u) {
-        float lag = float(t.lag) / float(t.count), noise = float(t.noise) / float(t.count);
-        t.cap = clamp(lag > 0.5 * noise / (31.0 + t.cap) ? t.cap * 0.85 : t.cap * 1.05, min(2.0, frame.history_cap), frame.history_cap);
-    } else {
-        t.cap = min(16.0, frame.history_cap);
+// A pixel beside a body's edge keeps the history of a point that is in it although its own ray misses: the next frame may bring it back.
+void keep_hidden(uvec2 pixel, uint to) {
+    vec2 centre = vec2(pixel) + 0.5;
+    uint pixels = frame.width * frame.height, former = (1u - frame.parity) * pixels;
+    ivec2 size = ivec2(frame.width, frame.height);
+    uint instance = NO_HIT;
+    vec2 before = centre;
+    for (int i = 0; i < 8; i++) {
+        const ivec2 beside[8] = ivec2[](ivec2(-1, 0), ivec2(1, 0), ivec2(0, -1), ivec2(0, 1), ivec2(-1, -1), ivec2(1, -1), ivec2(-1, 1), ivec2(1, 1));
+        ivec2 q = ivec2(pixel) + beside[i];
+        if (any(lessThan(q, ivec2(0))) || any(greaterThanEqual(q, size))) continue;
+        uint other = uint(q.y) * frame.width + uint(q.x);
+        if (!is_lit(surfaces[other])) continue;
+        instance = surfaces[other].id >> 24u;
+        before = centre - guides[other].motion;
+        break;
     }
-    tile_states[tile] = TileState(t.cap, 0, 0, 0u);
+    if (instance == NO_HIT) return;
+    ivec2 corner = ivec2(floor(clamp(before, vec2(-4.0), vec2(size) + 4.0)));
+    float nearest = 0.5;
+    uint owner = NO_HIT;
+    for (int i = 0; i < 9; i++) {
+        ivec2 q = corner + ivec2(i % 3, i / 3) - 1;
+        if (any(lessThan(q, ivec2(0))) || any(greaterThanEqual(q, size))) continue;
+        uint tap = former + uint(q.y) * frame.width + uint(q.x);
+        if (histories[tap].frame != frame.history_frame || histories[tap].instance != instance || !(histories[tap].weight > 0.0)) continue;
+        vec3 p = transform_point(instances[instance].world_from_object, histories[tap].position);
+        vec2 e = project(p) - centre;
+        float far = max(abs(e.x), abs(e.y));
+        if (far < nearest && dot(transform_vector(instances[instance].world_from_object, decode_normal(histories[tap].normal)), p) < 0.0) {
+            nearest = far;
+            owner = tap;
+        }
+    }
+    if (owner == NO_HIT) return;
+    History h = histories[owner];
+    h.frame = frame.frame;
+    histories[to] = h;
 }
 
 void main() {
     uvec2 pixel;
     uint tile = tiles[gl_WorkGroupID.x >> 2u];
-    if ((gl_WorkGroupID.x & 3u) == 0u && gl_LocalInvocationIndex == 0u) steer_history(tile);
     if (!tile_pixel(tile, pixel)) return;
     uint at = pixel.y * frame.width + pixel.x;
     uint pixels = frame.width * frame.height;
@@ -90,7 +218,9 @@ void main() {
         h.seed = hash_u32(at + hash_u32(frame.frame + hash_u32(frame.seed)));
         h.index = 0u;
         bool inside = all(greaterThan(before, vec2(0.0))) && all(lessThan(before, vec2(frame.width, frame.height)));
-        if (inside) {
+        if ((frame.flags & FRAME_DPM) != 0u) {
+            carry_point(h, normal, footprint, pixel, before);
+        } else if (inside) {
             vec2 base = floor(before - 0.5);
             vec2 f = before - 0.5 - base;
             // What stands still is fetched exactly.
@@ -108,7 +238,7 @@ void main() {
                 float w = (o.x == 1 ? f.x : 1.0 - f.x) * (o.y == 1 ? f.y : 1.0 - f.y);
                 if (w <= 0.0 || any(lessThan(q, ivec2(0))) || any(greaterThan(q, limit))) continue;
                 uint tap = former + uint(q.y) * frame.width + uint(q.x);
-                if (!tap_valid(tap, instance, h.position, normal, footprint)) continue;
+                if (!tap_valid(tap, instance, h.position, normal, footprint, 2.0)) continue;
                 add_tap(c, tap, w);
                 if (w > best) {
                     // The sequence goes on where the nearest point left it.
@@ -117,44 +247,20 @@ void main() {
                     h.index = histories[tap].index;
                 }
             }
-            if ((frame.flags & FRAME_DPM) != 0u && c.total > 0.999 && (f.x > 0.0 || f.y > 0.0)) {
-                Carried k = Carried(vec3(0.0), 0.0, 0.0, 0.0, 0.0, 0.0, 0.0);
-                vec2 f2 = f * f, f3 = f2 * f;
-                vec4 wx = vec4(-0.5 * f3.x + f2.x - 0.5 * f.x, 1.5 * f3.x - 2.5 * f2.x + 1.0, -1.5 * f3.x + 2.0 * f2.x + 0.5 * f.x, 0.5 * f3.x - 0.5 * f2.x);
-                vec4 wy = vec4(-0.5 * f3.y + f2.y - 0.5 * f.y, 1.5 * f3.y - 2.5 * f2.y + 1.0, -1.5 * f3.y + 2.0 * f2.y + 0.5 * f.y, 0.5 * f3.y - 0.5 * f2.y);
-                bool all_valid = true;
-                vec3 lower = vec3(INFINITY), upper = vec3(-INFINITY);
-                for (int y = 0; y < 4 && all_valid; y++) {
-                    for (int x = 0; x < 4 && all_valid; x++) {
-                        float w = wx[x] * wy[y];
-                        if (w == 0.0) continue;
-                        ivec2 q = corner + ivec2(x - 1, y - 1);
-                        all_valid = !(any(lessThan(q, ivec2(0))) || any(greaterThan(q, limit)));
-                        if (!all_valid) break;
-                        uint tap = former + uint(q.y) * frame.width + uint(q.x);
-                        all_valid = tap_valid(tap, instance, h.position, normal, footprint * 2.0);
-                        if (!all_valid) break;
-                        k.mean += w * histories[tap].mean;
-                        lower = min(lower, histories[tap].mean);
-                        upper = max(upper, histories[tap].mean);
-                    }
-                }
-                // Overshoot beyond the taps is ringing.
-                if (all_valid) c.mean = clamp(k.mean, lower, upper) * c.total;
-            }
         }
-        if (c.total > 1e-3 && finite3(c.mean) && finite(c.weight)) {
+        if ((frame.flags & FRAME_DPM) != 0u) {
+        } else if (c.total > 1e-3 && finite3(c.mean) && finite(c.weight)) {
             float s = 1.0 / c.total;
             h.mean = c.mean * s;
             h.weight = c.weight * s;
-            h.fast = c.fast * s;
+            h.drift = c.drift * s;
             h.variance = c.variance * s;
             h.last = c.last * s;
             h.noise = c.noise * s;
         } else {
             h.mean = vec3(0.0);
             h.weight = 0.0;
-            h.fast = 0.0;
+            h.drift = 0.0;
             h.variance = 0.0;
             h.last = -1.0;
             h.noise = 0.0;
@@ -162,10 +268,11 @@ void main() {
             h.index = 0u;
         }
         histories[current + at] = h;
-        importance = uint(importance_of(h, guide.angle) * 64.0);
+        importance = uint(importance_of(h) * 256.0);
     } else {
         histories[current + at].weight = 0.0;
         histories[current + at].frame = frame.frame - 1u;
+        if ((frame.flags & FRAME_DPM) != 0u) keep_hidden(pixel, current + at);
     }
     uint total = subgroupAdd(importance);
     uint lit_total = subgroupAdd(lit);

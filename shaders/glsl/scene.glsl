@@ -25,6 +25,8 @@ layout(set = 0, binding = B_COUNTERS, scalar) buffer CountersBlock { Counters co
 
 const float PI = 3.14159265358979;
 const float INFINITY = 3.0e38;
+// Frames over which the eye takes the mean: 33 ms at 947 fps.
+const float EYE_FRAMES = 31.0;
 
 vec3 transform_point(vec4 rows[3], vec3 p) {
     return vec3(dot(rows[0], vec4(p, 1.0)), dot(rows[1], vec4(p, 1.0)), dot(rows[2], vec4(p, 1.0)));
@@ -50,6 +52,15 @@ bool finite3(vec3 v) { return finite(v.x) && finite(v.y) && finite(v.z); }
 vec3 projector_direction(vec2 raster) {
     vec3 d = vec3((raster.x - frame.intrinsics.z) / frame.intrinsics.x, -(raster.y - frame.intrinsics.w) / frame.intrinsics.y, -1.0);
     return normalize(transform_vector(frame.world_from_projector, d));
+}
+
+// Raster position of a point; the projector is the origin.
+vec2 project(vec3 p) {
+    vec3 q = vec3(dot(vec3(frame.world_from_projector[0].x, frame.world_from_projector[1].x, frame.world_from_projector[2].x), p),
+                  dot(vec3(frame.world_from_projector[0].y, frame.world_from_projector[1].y, frame.world_from_projector[2].y), p),
+                  dot(vec3(frame.world_from_projector[0].z, frame.world_from_projector[1].z, frame.world_from_projector[2].z), p));
+    float depth = max(-q.z, 1e-9);
+    return vec2(frame.intrinsics.z + frame.intrinsics.x * q.x / depth, frame.intrinsics.w - frame.intrinsics.y * q.y / depth);
 }
 
 // The pixel of this invocation: four 8 x 8 workgroups a tile of the list. False outside the raster.

@@ -7,6 +7,7 @@
 #include "scene.glsl"
 #include "noise.glsl"
 #include "coarse.glsl"
+#include "importance.glsl"
 #extension GL_KHR_shader_subgroup_ballot : require
 
 layout(local_size_x = 8, local_size_y = 8) in;
@@ -18,18 +19,13 @@ layout(set = 0, binding = B_RADIANCE, scalar) writeonly buffer Radiance { vec4 r
 layout(set = 0, binding = B_SCHEDULE, scalar) buffer ScheduleBlock { Schedule schedule; };
 layout(set = 0, binding = B_WORK, scalar) writeonly buffer Work { WorkItem work[]; };
 
-float importance_of(History h) {
-    float sigma = h.weight > 0.0 ? sqrt(max(h.variance, 0.0)) : 1.0;
-    return float(uint(clamp(sigma, 0.02, 8.0) * 64.0));
-}
-
 uint samples_of(uvec2 pixel, uint at) {
     if ((frame.flags & FRAME_CAMERA_IS_EYE) != 0u) return surfaces[at].id == NO_HIT ? 1u : frame.spp;
     if (!is_lit(surfaces[at])) return 0u;
     if ((frame.flags & FRAME_DPM) != 0u) {
         History h = histories[frame.parity * frame.width * frame.height + at];
         float share = frame.budget_spp;
-        if ((frame.flags & FRAME_ALLOCATE) != 0u) share *= importance_of(h) / max(float(schedule.importance), 1.0) * float(schedule.lit);
+        if ((frame.flags & FRAME_ALLOCATE) != 0u) share *= float(uint(importance_of(h) * 256.0)) / max(float(schedule.importance), 1.0) * float(schedule.lit);
         // A point never seen before starts with what an average pixel gets; nothing waits longer than two or three frames.
         share = clamp(share, min(0.5, 0.5 * frame.budget_spp), 16.0 * max(frame.budget_spp, 1.0));
         float whole = floor(share);

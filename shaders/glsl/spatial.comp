@@ -1,7 +1,7 @@
 // Spatial filter of the picture, never of the history.
 //
-// [paper]: Poisson-disk taps, only in the periphery, blended in between two angles. Method dpm: the radius grows with the standard error
-// that is left, so that what is known well is never blurred; radiance is filtered without its albedo and multiplied by it afterwards.
+// [paper]: Poisson-disk taps, only in the periphery, blended in between two angles. Method dpm: a plane through the neighbours, blended in where
+// what it misses is noise, and what the histories around lag behind; all without albedo, which is multiplied on afterwards.
 #version 460
 #extension GL_GOOGLE_include_directive : require
 #include "scene.glsl"
@@ -24,6 +24,112 @@ const vec2 DISK[12] = vec2[](vec2(0.03, -0.09), vec2(-0.51, 0.13), vec2(0.47, 0.
 
 vec3 albedo_of(uint at) { return vec3(unpackHalf2x16(guides[at].albedo_rg), unpackHalf2x16(guides[at].albedo_b).x); }
 
+// Share of independent samples' variance that is left by the sequence (measured).
+const float SEQUENCE_VARIANCE = 0.3;
+// Frames that the picture's own noise is taken to be seen over: what a filter gets wrong stays, noise goes.
+const float SEEN_FRAMES = 60.0;
+// Neighbours may differ by this share of their light beyond what the plane tells.
+const float TOLERANCE = 0.008;
+
+// Slope of the light at the surface over time, from how far the histories around lag behind, by their age; nothing where chance explains it.
+float lag_of(uvec2 pixel, uint at, uint history) {
+    uint instance = surfaces[at].id >> 24u;
+    vec3 normal = decode_normal(histories[history + at].normal);
+    float turn = blue_noise(pixel, frame.frame, 0u) * 2.0 * PI;
+    mat2 rotation = mat2(cos(turn), sin(turn), -sin(turn), cos(turn));
+    float per_frame = max(frame.budget_spp, 0.5);
+    float age = histories[history + at].weight / per_frame, drift = histories[history + at].drift;
+    float xx = age * age, xy = age * drift, yy = drift * drift, used = 1.0;
+    for (int i = 0; i < 12; i++) {
+        ivec2 q = ivec2(pixel) + ivec2(round(rotation * DISK[i] * 6.0));
+        if (any(lessThan(q, ivec2(0))) || any(greaterThanEqual(q, ivec2(frame.width, frame.height))) || q == ivec2(pixel)) continue;
+        uint tap = uint(q.y) * frame.width + uint(q.x);
+        if (!is_lit(surfaces[tap]) || surfaces[tap].id >> 24u != instance) continue;
+        float w = pow(max(dot(decode_normal(histories[history + tap].normal), normal), 0.0), 8.0);
+        float x = histories[history + tap].weight / per_frame, y = histories[history + tap].drift;
+        xx += w * x * x;
+        xy += w * x * y;
+        yy += w * y * y;
+        used += w;
+    }
+    float fit = xy * xy / max(xx, 1e-12);
+    float chance = max(yy - fit, 0.0) / max(used - 1.0, 1.0);
+    float trust = fit > 0.0 ? max(1.0 - 0.5 * chance / fit, 0.0) : 0.0;
+    return trust * xy / max(xx, 1e-12) * age;
+}
+
+// Local linear regression of the light at the surface on raster position and normal, blended in as far as what is left over is noise.
+vec3 regressed(uvec2 pixel, uint at, uint history, vec4 own) {
+    uint instance = surfaces[at].id >> 24u;
+    vec3 position = histories[history + at].position;
+    vec3 normal = decode_normal(histories[history + at].normal);
+    vec3 across = normalize(abs(normal.x) < 0.7 ? cross(normal, vec3(1.0, 0.0, 0.0)) : cross(normal, vec3(0.0, 1.0, 0.0)));
+    vec3 along = cross(normal, across);
+    float footprint = abs(surfaces[at].distance) * frame.pixel_size;
+    float own_light = luminance(albedo_of(at));
+    float level = max(luminance(own.rgb), 0.02);
+    float tolerated = TOLERANCE * TOLERANCE * level * level;
+    // Normal equations, lower triangle by rows: constant, x, y, two components of the normal.
+    float a[15];
+    vec3 b[5];
+    for (int i = 0; i < 15; i++) a[i] = 0.0;
+    for (int i = 0; i < 5; i++) b[i] = vec3(0.0);
+    float used = 0.0, noise_sum = 0.0, total = 0.0, power = 0.0;
+    for (int i = 0; i < 25; i++) {
+        ivec2 d = ivec2(i % 5, i / 5) - 2;
+        ivec2 q = ivec2(pixel) + d;
+        if (any(lessThan(q, ivec2(0))) || any(greaterThanEqual(q, ivec2(frame.width, frame.height)))) continue;
+        uint tap = uint(q.y) * frame.width + uint(q.x);
+        if (!is_lit(surfaces[tap]) || surfaces[tap].id >> 24u != instance) continue;
+        vec3 n = decode_normal(histories[history + tap].normal);
+        if (dot(n, normal) < 0.6 || abs(dot(histories[history + tap].position - position, normal)) > 3.0 * footprint) continue;
+        float light = luminance(albedo_of(tap));
+        float noise = filtered[tap].w * SEQUENCE_VARIANCE / (light * light);
+        float w = 1.0 / (noise + tolerated);
+        vec3 m = filtered[tap].rgb - own.rgb;
+        float v[5] = float[](1.0, float(d.x), float(d.y), dot(n, across), dot(n, along));
+        int k = 0;
+        for (int r = 0; r < 5; r++) {
+            for (int c = 0; c <= r; c++) a[k++] += w * v[r] * v[c];
+            b[r] += w * v[r] * m;
+        }
+        float y = luminance(m);
+        power += w * y * y;
+        total += w;
+        used += 1.0;
+        noise_sum += w * noise;
+    }
+    if (used < 4.0) return own.rgb;
+    // Slopes are not expected beyond 2 % a pixel and a third over the normal's whole range.
+    for (int r = 1; r < 5; r++) a[r * (r + 3) / 2] += 1.0 / ((r < 3 ? 4e-4 : 0.1) * level * level);
+    // Cholesky; the power of the half solution is what the fit explains.
+    float explained = 0.0;
+    for (int r = 0; r < 5; r++) {
+        for (int c = 0; c <= r; c++) {
+            float sum = a[r * (r + 1) / 2 + c];
+            for (int k = 0; k < c; k++) sum -= a[r * (r + 1) / 2 + k] * a[c * (c + 1) / 2 + k];
+            a[r * (r + 1) / 2 + c] = r == c ? sqrt(max(sum, 1e-12)) : sum / a[c * (c + 3) / 2];
+        }
+        for (int k = 0; k < r; k++) b[r] -= a[r * (r + 1) / 2 + k] * b[k];
+        b[r] /= a[r * (r + 3) / 2];
+        float e = luminance(b[r]);
+        explained += e * e;
+    }
+    for (int r = 4; r >= 0; r--) {
+        for (int k = r + 1; k < 5; k++) b[r] -= a[k * (k + 1) / 2 + r] * b[k];
+        b[r] /= a[r * (r + 3) / 2];
+    }
+    // Structure that the fit misses, around or at this very pixel, against the noise that the eye's mean leaves [Lee80].
+    float structure = max(max(power - explained, 0.0) / total * used / max(used - 4.0, 1.0) - noise_sum / total, 0.0);
+    float noise = own.w * SEQUENCE_VARIANCE / (own_light * own_light);
+    float apart = luminance(b[0]);
+    structure = max(structure, apart * apart - 2.0 * noise);
+    float held = histories[history + at].weight;
+    noise *= held / (held + SEEN_FRAMES * max(frame.budget_spp, 0.5));
+    vec3 result = own.rgb + b[0] * (noise / max(structure + noise, 1e-12));
+    return finite3(result) ? max(result, vec3(0.0)) : own.rgb;
+}
+
 void main() {
     uvec2 pixel;
     if (!tile_pixel(tiles[gl_WorkGroupID.x >> 2u], pixel)) return;
@@ -34,21 +140,21 @@ void main() {
     }
     bool dpm = (frame.flags & FRAME_DPM) != 0u;
     vec4 own = filtered[at];
-    float radius = 0.0, blend = 1.0;
     uint history = frame.parity * frame.width * frame.height;
-    float error = 0.0;
-    if (HAS_FILTER) {
-        if (dpm) {
-            // Standard error relative to the pixel's luminance (with the visibility floor of [paper] eq. 2).
-            error = sqrt(max(own.w, 0.0));
-            float y = luminance(own.rgb * albedo_of(at));
-            float relative = error / (y + 0.05);
-            radius = clamp(relative * 60.0, 0.0, 6.0);
-            if (radius < 0.75) radius = 0.0;
-        } else {
-            blend = clamp((guides[at].angle - frame.filter_degrees.x) / max(frame.filter_degrees.y - frame.filter_degrees.x, 1e-6), 0.0, 1.0);
-            radius = blend > 0.0 ? 4.0 : 0.0;
+    if (dpm) {
+        vec3 light = own.rgb;
+        if (HAS_FILTER) {
+            light = regressed(pixel, at, history, own);
+            float level = luminance(light);
+            light *= clamp((level + lag_of(pixel, at, history)) / max(level, 1e-6), 0.5, 2.0);
         }
+        shown[at] = vec4(light * albedo_of(at), 1.0);
+        return;
+    }
+    float radius = 0.0, blend = 1.0;
+    if (HAS_FILTER) {
+        blend = clamp((guides[at].angle - frame.filter_degrees.x) / max(frame.filter_degrees.y - frame.filter_degrees.x, 1e-6), 0.0, 1.0);
+        radius = blend > 0.0 ? 4.0 : 0.0;
     }
     vec3 result = own.rgb;
     if (radius > 0.0) {
@@ -68,16 +174,10 @@ void main() {
             vec3 apart = histories[history + tap].position - position;
             float w = max(dot(decode_normal(histories[history + tap].normal), normal), 0.0);
             w = pow(w, 32.0) * exp(-abs(dot(apart, normal)) / max(footprint, 1e-12));
-            if (dpm) {
-                // Neighbours that differ by more than the noise of both are something else.
-                float noise = error + sqrt(max(filtered[tap].w, 0.0)) + 1e-4;
-                float apart_l = luminance((filtered[tap].rgb - own.rgb) * albedo_of(at));
-                w *= exp(-0.5 * apart_l * apart_l / (noise * noise * 4.0));
-            }
             sum += w * filtered[tap].rgb;
             total += w;
         }
         result = mix(own.rgb, sum / total, blend);
     }
-    shown[at] = vec4(dpm ? result * albedo_of(at) : result, 1.0);
+    shown[at] = vec4(result, 1.0);
 }

@@ -65,7 +65,6 @@ const BLOCKS: &[(&str, &str, usize)] = &[
     ("B_HISTORY", "History", size_of::<structs::History>()),
     ("B_SCHEDULE", "Schedule", size_of::<structs::Schedule>()),
     ("B_WORK", "WorkItem", size_of::<structs::WorkItem>()),
-    ("B_TILE_STATES", "TileState", size_of::<structs::TileState>()),
 ];
 
 fn offsets_of(name: &str) -> Vec<usize> {

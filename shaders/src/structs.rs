@@ -130,12 +130,12 @@ gpu_structs! {
         mean: [f32; 3],
         /// Frames (paper) or samples (dpm) that the mean stands on; 0: none.
         weight: f32,
-        /// The surface point, body space.
+        /// The surface point, body space. Method dpm: the point that the history belongs to, at most about half a pixel from the pixel's own.
         position: [f32; 3],
         /// Its normal, body space, octahedral.
         normal: u32,
-        /// Luminance of the last few frames.
-        fast: f32,
+        /// What the last few frames say beyond the mean, as luminance without albedo: how far the mean lags behind (method dpm).
+        drift: f32,
         /// Variance of one sample's luminance.
         variance: f32,
         /// Luminance of the last traced frame alone; negative: none.
@@ -152,18 +152,6 @@ gpu_structs! {
         frame: u32,
     }
 
-    /// How long a tile's history may be, and what its pixels said about that (method dpm). Sums in units of 2^-16.
-    struct TileState {
-        /// Frames' worth of samples that the history may weigh.
-        cap: f32,
-        /// Sum of the squared lag of the history behind the last few frames, relative, noise subtracted.
-        lag: i32,
-        /// Sum of the variance of single frames, relative.
-        noise: i32,
-        /// Pixels that were added.
-        count: u32,
-    }
-
     /// A pixel to be traced.
     struct WorkItem {
         /// Pixel index.
@@ -178,7 +166,7 @@ gpu_structs! {
         groups: [u32; 3],
         /// Work items.
         items: u32,
-        /// Sum of all pixels' importance, in units of 1 / 64.
+        /// Sum of all pixels' importance, in units of 1 / 256.
         importance: u32,
         /// Lit pixels.
         lit: u32,
@@ -452,6 +440,5 @@ pub const BINDINGS: &[(&str, u32)] = &[
     ("B_NOISE", 23),
     ("B_FILTERED", 24),
     ("B_SHOWN", 25),
-    ("B_TILE_STATES", 26),
-    ("B_PLANES", 27),
+    ("B_PLANES", 26),
 ];

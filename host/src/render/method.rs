@@ -40,8 +40,8 @@ pub struct Method {
     pub paper: PaperConfig,
 }
 
-/// Frames' worth of samples in dpm's history: long enough that the eye's own 31 frames are not the limit, short enough that light that
-/// changes in 0.1 s is followed.
+/// Frames' worth of samples in dpm's history: long enough that the eye's own 31 frames are not the limit; what it lags behind when the
+/// light changes is measured and made up for.
 pub const HISTORY_CAP: f32 = 96.0;
 
 impl Method {

@@ -145,7 +145,6 @@ pub(super) struct SharedBuffers {
     rates: Buffer,
     rate_table: Buffer,
     noise: Buffer,
-    tile_states: Buffer,
     /// What the schedule starts from.
     schedule_start: Buffer,
 }
@@ -247,11 +246,6 @@ impl Renderer {
             rates: Buffer::from_slice(gpu, "shading rates", &vec![0u32; tiles as usize])?,
             rate_table: Buffer::from_slice(gpu, "rate table", &rate_map::rate_table())?,
             noise: Buffer::from_slice(gpu, "blue noise", blue_noise::MASK)?,
-            tile_states: Buffer::from_slice(
-                gpu,
-                "tile states",
-                &vec![gpu_structs::TileState::zeroed(); tiles as usize],
-            )?,
             schedule_start: Buffer::from_slice(
                 gpu,
                 "schedule",
@@ -385,7 +379,6 @@ impl Renderer {
             "B_NOISE" => &self.shared.noise,
             "B_FILTERED" => &filtered,
             "B_SHOWN" => shown,
-            "B_TILE_STATES" => &self.shared.tile_states,
             "B_PLANES" => &planes,
             other => unreachable!("binding {other} has no buffer"),
         };
@@ -567,7 +560,12 @@ impl Renderer {
             environment_width: self.data.environment_size[0],
             environment_height: self.data.environment_size[1],
             environment_rotation: self.data.environment_rotation,
-            environment_select: self.data.environment_select,
+            // An even sky is found as well by the directions that the surface's own reflection chooses: a ray to it tells nothing new.
+            environment_select: if method.dpm && self.data.environment_size == [0, 0] {
+                0.0
+            } else {
+                self.data.environment_select
+            },
             world_origin: origin.as_vec3().into(),
             parity: 1 - self.last.parity,
             history_frame: self.last.frame,
