@@ -61,7 +61,9 @@ void carry_point(inout History h, vec3 normal, float footprint, uvec2 pixel, vec
         vec2 e = project(transform_point(instances[h.instance].world_from_object, histories[tap].position)) - centre;
         vec3 m = histories[tap].mean;
         float w = histories[tap].weight;
-        if (!finite3(m) || !finite(w) || !finite(e.x + e.y)) continue;
+        // A broken history is as good as none.
+        bool sound = finite(histories[tap].drift) && finite(histories[tap].variance) && finite(histories[tap].last) && finite(histories[tap].noise);
+        if (!sound || !finite3(m) || !finite(w) || !finite(e.x + e.y)) continue;
         total += w;
         taps++;
         x += w * e.x;
