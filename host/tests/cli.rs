@@ -72,3 +72,37 @@ fn a_reader_that_goes_away_is_no_error() {
     assert_eq!(output.status.code(), Some(4), "{}", err(&output));
     assert!(!err(&output).contains("panicked"), "{}", err(&output));
 }
+
+#[test]
+fn stability_without_vulkan_runs_what_it_can_and_says_what_it_could_not() {
+    let output = dpm(&["stability", "--json", "--only", "gpu-no-light"], &NO_DRIVER);
+    assert_eq!(code(&output), 4, "{}", err(&output));
+    let json: serde_json::Value = serde_json::from_str(&out(&output)).expect("one JSON object");
+    assert_eq!((&json["passed"], &json["failed"], &json["not_run"]), (&0.into(), &0.into(), &1.into()));
+    assert_eq!((&json["cases"][0]["verdict"], &json["cases"][0]["error"]), (&"not run".into(), &().into()));
+    assert!(json["cases"][0]["note"].as_str().is_some_and(|n| n.contains("no Vulkan device")), "{json}");
+    assert!(err(&output).contains("1 stability cases were not run"), "{}", err(&output));
+    // What needs no device is judged as ever.
+    let output = dpm(&["stability", "--json", "--only", "quantiser-extremes"], &NO_DRIVER);
+    assert_eq!(code(&output), 0, "{}", err(&output));
+    let json: serde_json::Value = serde_json::from_str(&out(&output)).expect("one JSON object");
+    assert_eq!(json["cases"][0]["verdict"], "pass");
+}
+
+#[test]
+fn error_lists_its_groups_and_refuses_budgets_and_numbers_that_are_none() {
+    let rig = concat!(env!("CARGO_MANIFEST_DIR"), "/../rigs/demo.toml");
+    let list = dpm(&["error", rig, "--list", "--budgets", "1/4,18"], &[]);
+    assert_eq!(
+        (code(&list), out(&list)),
+        (0, "0 still-0.25\n1 still-18\n2 moving-0.25\n3 moving-18\n".into())
+    );
+    let figure = dpm(&["error", rig, "--list", "--preset", "figure3"], &[]);
+    assert_eq!(out(&figure).lines().count(), 8);
+    for bad in [&["--budgets", "0"][..], &["--budgets", "1/0"], &["--budgets", "nan"], &["--index", "99"]] {
+        let output = dpm(&[&["error", rig][..], bad].concat(), &[]);
+        assert_eq!(code(&output), 2, "{bad:?}: {}", err(&output));
+    }
+    let nothing = dpm(&["error", "merge", "--out", "/nonexistent"], &[]);
+    assert!(code(&nothing) == 2 && err(&nothing).contains("--index"), "{}", err(&nothing));
+}

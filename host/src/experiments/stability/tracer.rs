@@ -70,7 +70,7 @@ pub fn cases() -> Vec<Case> {
         ),
         Case::new(
             "tracer-watertight",
-            "closed mesh, rays at corners and edges from inside",
+            "closed meshes of 1 mm to 10 km, up to 10 km off the origin, rays at corners and edges from inside",
             "no ray escapes",
             "share",
             0.0,
@@ -272,25 +272,28 @@ fn triangles_of(mesh: &crate::scene::TriangleMesh) -> Vec<Triangle> {
 }
 
 fn watertight(seed: u64) -> f64 {
-    let ball = sphere(Vec3::new(40.0, -70.0, 12.0), 1.0, 3, true);
-    let corners: Vec<DVec3> = ball.positions.iter().map(|p| p.as_dvec3()).collect();
-    let bvh = Bvh::new(triangles_of(&ball));
+    let (mut leaks, mut all) = (0, 0);
     let mut s = Sampler::new(seed, 0);
-    let n = 100_000usize;
-    let mut leaks = 0;
-    for i in 0..n {
-        let from = DVec3::new(40.0, -70.0, 12.0) + on_sphere(&mut s) * 0.7 * s.uniform();
-        let to = match i % 3 {
-            0 => corners[i % corners.len()],
-            1 => {
-                let t = ball.triangles[i % ball.triangles.len()];
-                corners[t[0] as usize].lerp(corners[t[1] as usize], s.uniform())
-            }
-            _ => from + on_sphere(&mut s),
-        };
-        leaks += usize::from(!bvh.any(from, (to - from).normalize(), f64::INFINITY, |_| true));
+    for (radius, distance) in [(1.0f32, 0.0f32), (1e-3, 0.0), (1e4, 0.0), (1.0, 1e4), (1e-2, 1e3)] {
+        let centre = Vec3::new(0.6, -0.7, 0.4) * distance;
+        let ball = sphere(centre, radius, 3, true);
+        let corners: Vec<DVec3> = ball.positions.iter().map(|p| p.as_dvec3()).collect();
+        let bvh = Bvh::new(triangles_of(&ball));
+        for i in 0..20_000usize {
+            let from = centre.as_dvec3() + on_sphere(&mut s) * f64::from(radius) * 0.7 * s.uniform();
+            let to = match i % 3 {
+                0 => corners[i % corners.len()],
+                1 => {
+                    let t = ball.triangles[i % ball.triangles.len()];
+                    corners[t[0] as usize].lerp(corners[t[1] as usize], s.uniform())
+                }
+                _ => from + on_sphere(&mut s),
+            };
+            leaks += usize::from(!bvh.any(from, (to - from).normalize(), f64::INFINITY, |_| true));
+            all += 1;
+        }
     }
-    leaks as f64 / n as f64
+    leaks as f64 / all as f64
 }
 
 fn degenerate(seed: u64) -> f64 {
@@ -332,7 +335,8 @@ fn degenerate(seed: u64) -> f64 {
 fn mismatch(bvh: &Bvh, origin: DVec3, direction: DVec3) -> u32 {
     let a = bvh.closest(origin, direction, f64::INFINITY, |_| true).map(|h| h.t);
     let b = bvh.closest_brute_force(origin, direction, f64::INFINITY).map(|h| h.t);
-    u32::from(a != b)
+    let any = bvh.any(origin, direction, f64::INFINITY, |_| true);
+    u32::from(a != b || any != a.is_some())
 }
 
 fn axis_parallel(_: u64) -> f64 {
