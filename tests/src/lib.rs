@@ -1,5 +1,6 @@
 //! What the end-to-end tests share: the GPU under validation, demands on pictures, rigs.
 
 pub mod compare;
+pub mod decoders;
 pub mod gpu;
 pub mod rigs;

@@ -1,0 +1,185 @@
+//! Any bytes into every decoder that hears the outside: one entry for each, with the laws that hold whatever the bytes are. The fuzz
+//! targets in `fuzz/` and the test over the committed seeds call the same entries.
+
+use dpm_device::cobs::{encode, encoded_bytes, Deframer};
+use dpm_device::dlpc900::command::{CommandAssembler, ReplyAssembler, REPORT_BYTES};
+use dpm_device::dlpc900::image;
+use dpm_device::link::{
+    rle_encode, Assembly, Decoder, DeviceMessage, Header, HostMessage, PacketSink, RleDecoder,
+};
+use dpm_device::tracker::natnet::frame::{decode_frame, RigidBody};
+use dpm_device::tracker::natnet::messages::{
+    decode_echo_request, decode_echo_response, request_text, ServerInfo,
+};
+use dpm_device::tracker::natnet::models::decode_models;
+use dpm_device::tracker::natnet::wire::split;
+use dpm_device::tracker::natnet::Version;
+use dpm_device::tracker::serial::wire::SerialMessage;
+use dpm_device::tracker::vrpn::wire as vrpn;
+use dpm_host::config::{Overrides, RigConfig};
+use dpm_host::geometry::opencv;
+use std::path::Path;
+
+/// A decoder's entry.
+pub type Entry = fn(&[u8]);
+
+/// Every entry with the name of its fuzz target and of its folder of seeds.
+pub const ALL: [(&str, Entry); 9] = [
+    ("link_stream", link_stream),
+    ("link_rle", link_rle),
+    ("cobs_stream", cobs_stream),
+    ("dlpc900_reports", dlpc900_reports),
+    ("dlpc900_image", dlpc900_image),
+    ("natnet_datagram", natnet_datagram),
+    ("vrpn_stream", vrpn_stream),
+    ("serial_pose", serial_pose),
+    ("texts", texts),
+];
+
+#[derive(Default)]
+struct Heard {
+    assembly: Option<Assembly>,
+    packets: Vec<(Header, Option<Vec<u8>>, bool)>,
+}
+
+impl PacketSink for Heard {
+    fn begin(&mut self, header: &Header) -> bool {
+        self.assembly = Assembly::new(header);
+        if self.assembly.is_none() {
+            self.packets.push((*header, None, false));
+        }
+        self.assembly.is_some()
+    }
+
+    fn payload(&mut self, bytes: &[u8]) {
+        if let Some(a) = &mut self.assembly {
+            a.push(bytes);
+        }
+    }
+
+    fn end(&mut self, intact: bool) {
+        let Some(a) = self.assembly.take() else { return };
+        if intact {
+            let _ = HostMessage::parse(a.header().kind, a.payload());
+            let _ = DeviceMessage::parse(a.header().kind, a.payload());
+        }
+        self.packets.push((*a.header(), Some(a.payload().to_vec()), intact));
+    }
+}
+
+/// The bit-plane link's stream: what is found does not depend on how the stream is cut.
+pub fn link_stream(bytes: &[u8]) {
+    let (mut whole, mut cut) = (Heard::default(), Heard::default());
+    let (mut a, mut b) = (Decoder::new(), Decoder::new());
+    a.push(bytes, &mut whole);
+    bytes.chunks(7).for_each(|c| b.push(c, &mut cut));
+    assert_eq!(whole.packets, cut.packets);
+    assert_eq!(a.counters(), b.counters());
+}
+
+/// A plane of 64 bytes out of RLE: cut anywhere it decodes to the same, and what decodes can be coded again.
+pub fn link_rle(bytes: &[u8]) {
+    let (mut plane, mut again) = ([0u8; 64], [0u8; 64]);
+    let (mut whole, mut cut) = (RleDecoder::new(), RleDecoder::new());
+    let first = whole.push(bytes, &mut plane);
+    let second = bytes.chunks(3).try_for_each(|c| cut.push(c, &mut again));
+    assert_eq!(first.is_ok(), second.is_ok());
+    if first.is_ok() && whole.finish(plane.len()).is_ok() {
+        assert_eq!(plane, again);
+        let mut coded = [0u8; 256];
+        let n = rle_encode(&plane, &mut coded).expect("64 bytes always fit");
+        let (mut back, mut decoder) = ([0u8; 64], RleDecoder::new());
+        decoder.push(&coded[..n], &mut back).expect("own code");
+        assert!(decoder.finish(back.len()).is_ok() && back == plane);
+    }
+}
+
+/// COBS frames: cut anywhere the same, and each comes out of its own encoding.
+pub fn cobs_stream(bytes: &[u8]) {
+    let frames = |step: usize| {
+        let mut deframer = Deframer::new([0u8; 128]);
+        let mut all: Vec<Vec<u8>> = Vec::new();
+        bytes.chunks(step.max(1)).for_each(|c| deframer.push(c, &mut |f| all.push(f.to_vec())));
+        all
+    };
+    let whole = frames(bytes.len());
+    assert_eq!(whole, frames(1));
+    for frame in whole {
+        assert!(frame.len() <= 128);
+        let mut coded = vec![0; encoded_bytes(frame.len())];
+        let n = encode(&[&frame], &mut coded).expect("room as promised");
+        let mut deframer = Deframer::new([0u8; 128]);
+        let mut back = None;
+        deframer.push(&coded[..n], &mut |f| back = Some(f.to_vec()));
+        assert_eq!(back, Some(frame));
+    }
+}
+
+/// HID reports of a DLPC900, both ways.
+pub fn dlpc900_reports(bytes: &[u8]) {
+    let (mut commands, mut replies) = (CommandAssembler::default(), ReplyAssembler::default());
+    for report in bytes.chunks(REPORT_BYTES) {
+        let _ = commands.push(report);
+        let _ = replies.push(report);
+    }
+}
+
+/// A DLPC900 image of 8 x 4 pixels: what decodes has exactly their bytes.
+pub fn dlpc900_image(bytes: &[u8]) {
+    if let Ok(pixels) = image::decode(bytes, 8, 4) {
+        assert_eq!(pixels.len(), 8 * 4 * 3);
+    }
+}
+
+/// A NatNet datagram in every version.
+pub fn natnet_datagram(bytes: &[u8]) {
+    let Ok((_, payload)) = split(bytes) else { return };
+    let mut bodies: Vec<RigidBody> = Vec::new();
+    for version in [Version::V3_0, Version::new(3, 1), Version::V4_0, Version::V4_1, Version::V4_2] {
+        let ok = decode_frame(payload, version, &mut bodies).is_ok();
+        assert!(bodies.len() <= payload.len() / 38 && (ok || bodies.is_empty()));
+        if let Ok(models) = decode_models(payload, version) {
+            assert!(models.len() <= payload.len());
+        }
+    }
+    let _ = (ServerInfo::decode(payload), request_text(payload));
+    let _ = (decode_echo_request(payload), decode_echo_response(payload));
+}
+
+/// A VRPN stream: every message lies within it and comes out of its own encoding.
+pub fn vrpn_stream(mut bytes: &[u8]) {
+    while let Ok(Some((message, taken))) = vrpn::split(bytes) {
+        assert!(taken > 0 && taken <= bytes.len() && message.payload.len() <= taken);
+        let _ = (vrpn::described_name(message.payload), vrpn::decode_pos_quat(message.payload));
+        let mut out = Vec::new();
+        vrpn::put(&mut out, &message);
+        let (back, all) = vrpn::split(&out).expect("own encoding").expect("whole");
+        assert_eq!((back, all), (message, out.len()));
+        bytes = &bytes[taken..];
+    }
+}
+
+/// A packet of the serial pose stream: its own encoding is read as the same message again.
+pub fn serial_pose(bytes: &[u8]) {
+    let encoded = |bytes: &[u8]| {
+        let message = SerialMessage::decode(bytes).ok()?;
+        let mut out = Vec::new();
+        message.encode(&mut out);
+        Some(out)
+    };
+    let Some(first) = encoded(bytes) else { return };
+    let mut deframer = Deframer::new([0u8; 256]);
+    let mut frame = None;
+    deframer.push(&first, &mut |f| frame = Some(f.to_vec()));
+    assert_eq!(encoded(&frame.expect("one frame")), Some(first));
+}
+
+/// A rig file and a calibration file.
+pub fn texts(bytes: &[u8]) {
+    let Ok(text) = std::str::from_utf8(bytes) else { return };
+    if let Err(errors) = RigConfig::parse("seed.toml", text, Path::new("/nonexistent"), &Overrides::default())
+    {
+        assert!(!errors.to_string().is_empty());
+    }
+    let _ = opencv::matrices(text);
+}

@@ -1,0 +1,133 @@
+//! Every decoder over its committed seeds, over every beginning of each, and over each with bits flipped and bytes repeated.
+//!
+//! Seeds are what the encoders make (`DPM_UPDATE_SEEDS=1 cargo test -p dpm-tests --test corpora` writes them) and what was added by
+//! hand: anything that a fuzzer finds goes into the folder of its target.
+
+use dpm_device::cobs::{encode, encoded_bytes};
+use dpm_device::dlpc900::command::{Command, Opcode};
+use dpm_device::dlpc900::image::{self, Compression, PlaneOrder};
+use dpm_device::link::{rle_encode, Header, HostMessage, MessageType, Packet, MAX_CONTROL_BYTES};
+use dpm_device::planes::Raster;
+use dpm_device::tracker::natnet::frame::{encode_frame, FrameContent, FrameInfo, RigidBody};
+use dpm_device::tracker::natnet::messages::{encode_echo_response, encode_request};
+use dpm_device::tracker::natnet::Version;
+use dpm_device::tracker::serial::wire::SerialMessage;
+use dpm_device::tracker::vrpn::wire as vrpn;
+use dpm_tests::decoders::ALL;
+use std::path::PathBuf;
+
+fn folder(target: &str) -> PathBuf {
+    PathBuf::from(concat!(env!("CARGO_MANIFEST_DIR"), "/corpus")).join(target)
+}
+
+/// What the encoders make: target, name, bytes.
+fn made() -> Vec<(&'static str, &'static str, Vec<u8>)> {
+    let mut seeds = Vec::new();
+    let mut payload = [0; MAX_CONTROL_BYTES];
+    let mut stream = Vec::new();
+    for message in [HostMessage::Stop, HostMessage::Arm(3), HostMessage::Sync(7)] {
+        let (kind, n) = message.write(&mut payload);
+        stream.extend(Packet::new(Header::control(kind, 42, 0), &payload[..n]).parts().concat());
+    }
+    let plane = Header { led_code: 7, frame: 1, ..Header::control(MessageType::Plane, 42, 0) };
+    stream.extend(Packet::new(plane, &[0xf0, 0x0f, 0x80]).parts().concat());
+    seeds.push(("link_stream", "messages", stream.clone()));
+    let mut coded = vec![0; 256];
+    let mut bits = [0u8; 64];
+    bits[10..40].fill(0xff);
+    (50..60).for_each(|i| bits[i] = i as u8);
+    let n = rle_encode(&bits, &mut coded).expect("room");
+    seeds.push(("link_rle", "runs", coded[..n].to_vec()));
+    let mut cobs = vec![0; encoded_bytes(stream.len())];
+    let n = encode(&[&stream[..100]], &mut cobs).expect("room");
+    seeds.push(("cobs_stream", "packets", cobs[..n].to_vec()));
+    let command = Command { flags: 0x40, sequence: 5, opcode: Opcode::START_STOP, data: &[2] };
+    let reports: Vec<u8> = command.reports().expect("short").flatten().collect();
+    seeds.push(("dlpc900_reports", "start", reports));
+    let small = Raster::new(8, 4).expect("a raster");
+    let planes: Vec<Vec<u8>> =
+        (0..24u8).map(|k| (0..4).map(|y| k.wrapping_mul(31) ^ (y / 2)).collect()).collect();
+    let slices: Vec<&[u8]> = planes.iter().map(Vec::as_slice).collect();
+    for (name, how) in [("raw", Compression::Raw), ("rle", Compression::Rle), ("erle", Compression::Erle)] {
+        let image = image::encode(&slices, small, 0..8, PlaneOrder::default(), Some(how)).expect("an image").bytes;
+        seeds.push(("dlpc900_image", name, image));
+    }
+    let body = RigidBody {
+        id: 1,
+        position: [0.1, 0.2, 0.3],
+        rotation_xyzw: [0.0, 0.0, 0.0, 1.0],
+        mean_error: 0.001,
+        params: 1,
+    };
+    for (name, version) in [("v3_0", Version::V3_0), ("v4_1", Version::V4_1)] {
+        let mut out = Vec::new();
+        let content = FrameContent { bodies: &[body; 2], ..FrameContent::default() };
+        encode_frame(&mut out, version, &FrameInfo::default(), &content).expect("a frame");
+        seeds.push(("natnet_datagram", name, out));
+    }
+    let mut echo = Vec::new();
+    encode_echo_response(&mut echo, 1, 2);
+    seeds.push(("natnet_datagram", "echo", echo));
+    let mut request = Vec::new();
+    encode_request(&mut request, "Bitstream,4.1");
+    seeds.push(("natnet_datagram", "request", request));
+    let mut out = Vec::new();
+    vrpn::put_description(&mut out, -1, 0, "Tracker0");
+    let pose = vrpn::encode_pos_quat(0, &dpm_device::pose::Pose::IDENTITY);
+    let message =
+        vrpn::Message { seconds: 1, microseconds: 2, sender: 0, kind: 3, sequence: 4, payload: &pose };
+    vrpn::put(&mut out, &message);
+    seeds.push(("vrpn_stream", "described", out));
+    let mut out = Vec::new();
+    SerialMessage::Hello { version: 1, bodies: 2, ticks_per_second: 1_000_000 }.encode(&mut out);
+    let mut deframer = dpm_device::cobs::Deframer::new([0u8; 128]);
+    deframer.push(&out, &mut |f| seeds.push(("serial_pose", "hello", f.to_vec())));
+    let rig = b"[projector]\nframe_rate = \"60000/1001\"\n[[scene.bodies]]\nname = \"a\"\n".to_vec();
+    seeds.push(("texts", "rig.toml", rig));
+    seeds
+}
+
+#[test]
+fn no_seed_and_nothing_near_one_breaks_a_decoder() {
+    if std::env::var_os("DPM_UPDATE_SEEDS").is_some() {
+        for (target, name, bytes) in made() {
+            std::fs::create_dir_all(folder(target)).unwrap();
+            std::fs::write(folder(target).join(name), bytes).unwrap();
+        }
+    }
+    for (target, entry) in ALL {
+        let files = std::fs::read_dir(folder(target)).unwrap_or_else(|e| panic!("seeds of {target}: {e}"));
+        let mut seeds = 0;
+        for file in files {
+            let path = file.unwrap().path();
+            let seed = std::fs::read(&path).unwrap();
+            println!("{}", path.display());
+            entry(&seed);
+            for end in 0..seed.len() {
+                entry(&seed[..end]);
+            }
+            for at in 0..seed.len().min(400) {
+                for bit in [0, 3, 7] {
+                    let mut bad = seed.clone();
+                    bad[at] ^= 1 << bit;
+                    entry(&bad);
+                }
+                let mut longer = seed.clone();
+                longer.insert(at, seed[at]);
+                entry(&longer);
+            }
+            seeds += 1;
+        }
+        assert!(seeds > 0, "{target} has no seed");
+    }
+}
+
+/// The seeds reach the decoders' insides: what the encoders make today is what the files hold.
+#[test]
+fn the_seeds_are_what_the_encoders_make() {
+    for (target, name, bytes) in made() {
+        let kept =
+            std::fs::read(folder(target).join(name)).unwrap_or_else(|e| panic!("{target}/{name}: {e}"));
+        assert!(kept == bytes, "{target}/{name} is stale: DPM_UPDATE_SEEDS=1");
+    }
+}
