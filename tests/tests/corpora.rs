@@ -49,7 +49,8 @@ fn made() -> Vec<(&'static str, &'static str, Vec<u8>)> {
         (0..24u8).map(|k| (0..4).map(|y| k.wrapping_mul(31) ^ (y / 2)).collect()).collect();
     let slices: Vec<&[u8]> = planes.iter().map(Vec::as_slice).collect();
     for (name, how) in [("raw", Compression::Raw), ("rle", Compression::Rle), ("erle", Compression::Erle)] {
-        let image = image::encode(&slices, small, 0..8, PlaneOrder::default(), Some(how)).expect("an image").bytes;
+        let image =
+            image::encode(&slices, small, 0..8, PlaneOrder::default(), Some(how)).expect("an image").bytes;
         seeds.push(("dlpc900_image", name, image));
     }
     let body = RigidBody {
