@@ -91,3 +91,43 @@ fn dpm_lowers_the_perceived_error_of_independent_samples() {
     assert!(ours < 0.75 * full, "{ours} against {full}");
     no_validation_messages();
 }
+
+#[test]
+fn dpm_shows_a_body_at_one_metre_a_second_where_it_is() {
+    let (rig, _gpu, theatre) = stage(Span { last_slot: 150, warm_up: 64, kept: 31 }, true);
+    let centre = |slot| dpm_host::experiments::sequence::poses_at(&rig, slot)[0].translation;
+    let speed = (centre(150) - centre(119)).length() / 31.0 * rig.rate().hz();
+    assert!((0.9..1.1).contains(&speed), "the body moves at {speed} m/s while it is looked at");
+    let seen = |m: &Method, spp: f32| eye_mean(&theatre.play(m, spp, 1, &mut |_, _| ()).unwrap().frames, 31);
+    let blue = Method { sampler: SamplerKind::BlueNoise, ..Method::full(32) };
+    let truth = seen(&blue, 32.0);
+    let shown = seen(&method(&rig, RenderMethod::Dpm), 4.0);
+    let width = theatre.raster().width();
+    let probes = theatre.probes();
+    let at = |pixel: u32, body: usize| probes.iter().position(|p| p.pixel == pixel && p.body == body);
+    // [Lucas81]: the displacement along the motion that explains most of the difference, by the reference's own slopes.
+    let displacement = |picture: &[glam::Vec3]| {
+        let (mut product, mut square) = (0.0f64, 0.0f64);
+        for (i, p) in probes.iter().enumerate().filter(|(_, p)| p.body == 0 && p.pixel % width > 0) {
+            let (Some(left), Some(right)) = (at(p.pixel - 1, 0), at(p.pixel + 1, 0)) else { continue };
+            let slope = (0.5 * (truth[right] - truth[left])).as_dvec3();
+            let apart = (truth[i] - picture[i]).as_dvec3();
+            if slope.is_finite() && apart.is_finite() {
+                product += slope.dot(apart);
+                square += slope.length_squared();
+            }
+        }
+        assert!(square > 0.0, "the body has edges or highlights");
+        product / square
+    };
+    // The measure itself: the reference moved by one pixel is found one pixel away.
+    let moved: Vec<glam::Vec3> = probes
+        .iter()
+        .map(|p| at(p.pixel.wrapping_sub(1), p.body).map_or(glam::Vec3::NAN, |i| truth[i]))
+        .collect();
+    let (one, ours) = (displacement(&moved), displacement(&shown));
+    println!("moved by a pixel: {one:.3}, dpm {ours:+.3} px");
+    assert!((0.5..1.5).contains(&one), "the measure sees {one} px in place of 1");
+    assert!(ours.abs() < 0.25, "dpm is {ours:+.3} px from where the body is");
+    no_validation_messages();
+}
