@@ -44,38 +44,87 @@ fn pack_with_avx512(codes: &[u32], frame: &mut BitPlaneFrame) {
     pack_blocks(codes, frame, |pixels, batch, at| block_avx512(pixels, batch, at));
 }
 
-/// 32 pixels at a time: bytes of one channel into one register, then the sign bit of every byte is the plane's bit.
+/// 256 pixels at a time. Pixels whose numbers leave the same rest by 8 come into one register, a byte each, one set of eight
+/// registers for each channel; then bits and registers change places (8 x 8 bits across the registers, 32 of them side by side
+/// [HackersDelight] 7-3), and each register is 32 bytes of a plane. No `movemask`: it passes one register a cycle, shifts several.
 #[inline]
 #[target_feature(enable = "avx2")]
 fn block_avx2(pixels: &[u32; BLOCK_PIXELS], batch: &mut Batch, at: usize) {
-    // Four pixels of a lane by channel, each channel's pixels from right to left: bit 7 of a plane's byte is the leftmost.
-    let by_channel =
-        _mm256_broadcastsi128_si256(_mm_setr_epi8(12, 8, 4, 0, 13, 9, 5, 1, 14, 10, 6, 2, 15, 11, 7, 3));
-    // Lane 0 holds pixels 0..4 of the four registers, lane 1 pixels 4..8: interleave them, the right half first.
-    let in_order = _mm256_setr_epi32(4, 0, 5, 1, 6, 2, 7, 3);
-    for (group, pixels) in pixels.as_chunks::<32>().0.iter().enumerate() {
-        let load = |i: usize| {
-            // SAFETY: pixels 8 i to 8 i + 8 of an array of 32; the load needs no alignment.
-            let v = unsafe { _mm256_loadu_si256(pixels.as_ptr().add(8 * i).cast()) };
-            _mm256_shuffle_epi8(v, by_channel)
-        };
-        let (a, b, c, d) = (load(0), load(1), load(2), load(3));
-        let (ab_rg, ab_b) = (_mm256_unpacklo_epi32(a, b), _mm256_unpackhi_epi32(a, b));
-        let (cd_rg, cd_b) = (_mm256_unpacklo_epi32(c, d), _mm256_unpackhi_epi32(c, d));
-        let channels = [
-            _mm256_unpacklo_epi64(ab_rg, cd_rg),
-            _mm256_unpackhi_epi64(ab_rg, cd_rg),
-            _mm256_unpacklo_epi64(ab_b, cd_b),
-        ];
-        for (channel, bytes) in channels.into_iter().enumerate() {
-            let mut bytes = _mm256_permutevar8x32_epi32(bytes, in_order);
-            for bit in (0..8).rev() {
-                let plane = &mut batch.0[8 * channel + bit][at..at + BLOCK_BYTES];
-                plane[4 * group..4 * group + 4].copy_from_slice(&_mm256_movemask_epi8(bytes).to_le_bytes());
-                bytes = _mm256_add_epi8(bytes, bytes);
+    let odd_bytes = _mm256_set1_epi16(0xff00_u16 as i16);
+    for (part, pixels) in pixels.as_chunks::<256>().0.iter().enumerate() {
+        let mut channels = [[_mm256_setzero_si256(); 8]; CODE_BITS / 8];
+        for (group, pixels) in pixels.as_chunks::<32>().0.iter().enumerate() {
+            let load = |i: usize| {
+                // SAFETY: pixels 8 i to 8 i + 8 of an array of 32; the load needs no alignment.
+                unsafe { _mm256_loadu_si256(pixels.as_ptr().add(8 * i).cast()) }
+            };
+            // Double word k: what has the rest k. Bytes of two registers of each two channels, then of four registers of one.
+            let pair = |low: __m256i, high: __m256i| {
+                (
+                    _mm256_blendv_epi8(low, _mm256_slli_epi16::<8>(high), odd_bytes),
+                    _mm256_blendv_epi8(_mm256_srli_epi16::<8>(low), high, odd_bytes),
+                )
+            };
+            let ((rb, g), (rb_next, g_next)) = (pair(load(0), load(1)), pair(load(2), load(3)));
+            channels[0][group] = _mm256_blend_epi16::<0xaa>(rb, _mm256_slli_epi32::<16>(rb_next));
+            channels[1][group] = _mm256_blend_epi16::<0xaa>(g, _mm256_slli_epi32::<16>(g_next));
+            channels[2][group] = _mm256_blend_epi16::<0xaa>(_mm256_srli_epi32::<16>(rb), rb_next);
+        }
+        for (channel, groups) in channels.iter().enumerate() {
+            let planes = transpose_bits(transpose_doublewords(groups));
+            for (bit, bytes) in planes.into_iter().enumerate() {
+                let plane = &mut batch.0[8 * channel + bit][at + 32 * part..at + 32 * part + 32];
+                // SAFETY: the slice has 32 bytes; the store needs no alignment.
+                unsafe { _mm256_storeu_si256(plane.as_mut_ptr().cast(), bytes) };
             }
         }
     }
+}
+
+/// An 8 x 8 matrix of double words, transposed, the last row first: bit 7 of a plane's byte is the leftmost pixel.
+#[inline]
+#[target_feature(enable = "avx2")]
+fn transpose_doublewords(r: &[__m256i; 8]) -> [__m256i; 8] {
+    let lo = |i: usize, j: usize| _mm256_unpacklo_epi32(r[i], r[j]);
+    let hi = |i: usize, j: usize| _mm256_unpackhi_epi32(r[i], r[j]);
+    // Columns 0, 1 (and 4, 5 in the upper half), then 2, 3 (and 6, 7), of rows two by two.
+    let (a, b) = ([lo(0, 1), lo(2, 3), lo(4, 5), lo(6, 7)], [hi(0, 1), hi(2, 3), hi(4, 5), hi(6, 7)]);
+    let four = |v: &[__m256i; 4]| {
+        [
+            [_mm256_unpacklo_epi64(v[0], v[1]), _mm256_unpacklo_epi64(v[2], v[3])],
+            [_mm256_unpackhi_epi64(v[0], v[1]), _mm256_unpackhi_epi64(v[2], v[3])],
+        ]
+    };
+    let ([c0, c1], [c2, c3]) = (four(&a), four(&b));
+    let low = |c: [__m256i; 2]| _mm256_permute2x128_si256::<0x20>(c[0], c[1]);
+    let high = |c: [__m256i; 2]| _mm256_permute2x128_si256::<0x31>(c[0], c[1]);
+    [high(c3), high(c2), high(c1), high(c0), low(c3), low(c2), low(c1), low(c0)]
+}
+
+/// Bit `i` of every byte of register `j` becomes bit `j` of the same byte of register `i`.
+#[inline]
+#[target_feature(enable = "avx2")]
+fn transpose_bits(mut r: [__m256i; 8]) -> [__m256i; 8] {
+    let nibbles = _mm256_set1_epi8(0x0f);
+    for i in 0..4 {
+        let t = _mm256_and_si256(_mm256_xor_si256(_mm256_srli_epi16::<4>(r[i]), r[i + 4]), nibbles);
+        r[i + 4] = _mm256_xor_si256(r[i + 4], t);
+        r[i] = _mm256_xor_si256(r[i], _mm256_slli_epi16::<4>(t));
+    }
+    let pairs = _mm256_set1_epi8(0x33);
+    for i in [0, 1, 4, 5] {
+        let t = _mm256_and_si256(_mm256_xor_si256(_mm256_srli_epi16::<2>(r[i]), r[i + 2]), pairs);
+        r[i + 2] = _mm256_xor_si256(r[i + 2], t);
+        r[i] = _mm256_xor_si256(r[i], _mm256_slli_epi16::<2>(t));
+    }
+    let singles = _mm256_set1_epi8(0x55);
+    for i in [0, 2, 4, 6] {
+        let t = _mm256_and_si256(_mm256_xor_si256(_mm256_srli_epi16::<1>(r[i]), r[i + 1]), singles);
+        r[i + 1] = _mm256_xor_si256(r[i + 1], t);
+        // An addition is a shift by one.
+        r[i] = _mm256_xor_si256(r[i], _mm256_add_epi8(t, t));
+    }
+    r
 }
 
 /// Indices into two registers of 16 pixels: byte `first` of each of the 32 pixels, then byte `second`.

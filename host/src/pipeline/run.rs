@@ -194,9 +194,9 @@ fn run_from(
         })?;
         let slot_ns = rig.rate().slot_len_ns(0);
         let first_guess_ns = i64::from(config.real_time.stage_costs_us.total()) * 1000;
-        // Sent earlier, a frame would find no room in the device.
+        // Sent earlier, a frame would find no room in the device, whose word of a free buffer takes part of a slot.
         let held = link.device().map_or(1, |hello| i64::from(hello.frame_buffers));
-        let lead = LeadEstimator::new(slot_ns, first_guess_ns, held * slot_ns);
+        let lead = LeadEstimator::new(slot_ns, first_guess_ns, held * slot_ns - slot_ns / 2);
         // At virtual pace pictures must not depend on how fast the machine is.
         let adapts = !is_virtual && renderer.is_some() && config.render.method == RenderMethod::Dpm;
         let budget = if adapts { budget_controller(slot_ns, config.render.spp) } else { None };
