@@ -162,3 +162,15 @@ fn keys_on_its_terminal_are_orders() {
     assert_eq!(flags & (libc::ICANON | libc::ECHO), libc::ICANON | libc::ECHO);
     assert!(!far.is_lit());
 }
+
+#[test]
+fn the_link_test_prints_one_object_and_leaves_darkness() {
+    let (_folder, path, far) = rig("link-test");
+    let told = dpm(&["link-test", &path, "--prepared", "--for", "1", "--count", "3", "--json"], &[]);
+    assert_eq!(code(&told), 0, "{}{}", out(&told), err(&told));
+    let report: serde_json::Value = serde_json::from_str(&out(&told)).expect("one JSON object");
+    let ways = report["ways"].as_array().expect("ways to send");
+    assert_eq!(ways.len(), 2, "{report}");
+    assert!(ways.iter().all(|w| w["frames_per_s"].as_f64() > Some(5.0)), "{report}");
+    assert!(!far.is_lit() && far.status().frames_lit > 0);
+}

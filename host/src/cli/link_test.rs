@@ -25,7 +25,7 @@ pub struct LinkTestArgs {
     count: u32,
     /// Seconds for each way to send
     #[arg(long = "for", value_name = "S", default_value_t = 2, value_parser = clap::value_parser!(u32).range(1..=600))]
-    seconds: u32,
+    way_seconds: u32,
     /// Print one JSON object
     #[arg(long)]
     json: bool,
@@ -44,7 +44,7 @@ pub fn execute(args: &LinkTestArgs) -> Result<(), Failure> {
     } else {
         Content::rendered(&rig, &open_gpu(&config)?, args.count)?
     };
-    let report = link_test(&rig, &content, f64::from(args.seconds))?;
+    let report = link_test(&rig, &content, f64::from(args.way_seconds))?;
     print(&if args.json { to_json(&report) + "\n" } else { report.to_table() });
     Ok(())
 }
