@@ -10,7 +10,7 @@ use super::prepared::PreparedFrames;
 use super::projector;
 use super::rights::Rights;
 use super::stages::{self, TrackingStage};
-use super::threads::{policy, run_threads, Shared, GPU_TIMEOUT_NS, LISTEN_NS, STAGE_THREADS};
+use super::threads::{policy, run_threads, Shared, GPU_TIMEOUT_NS, LISTEN_NS, RECEIPT_NS, STAGE_THREADS};
 use crate::clock::{Clock, ManualClock, MonotonicClock, RunClock, Stopwatch};
 use crate::config::{Pace, Packer, ProjectorBackend, RenderMethod};
 use crate::gpu::Gpu;
@@ -196,7 +196,8 @@ fn run_from(
         let first_guess_ns = i64::from(config.real_time.stage_costs_us.total()) * 1000;
         // Sent earlier, a frame would find no room in the device, whose word of a free buffer takes part of a slot.
         let held = link.device().map_or(1, |hello| i64::from(hello.frame_buffers));
-        let lead = LeadEstimator::new(slot_ns, first_guess_ns, held * slot_ns - slot_ns / 2);
+        let lead =
+            LeadEstimator::new(slot_ns, first_guess_ns, (held * slot_ns - slot_ns / 2 - RECEIPT_NS).max(0));
         // At virtual pace pictures must not depend on how fast the machine is.
         let adapts = !is_virtual && renderer.is_some() && config.render.method == RenderMethod::Dpm;
         let budget = if adapts { budget_controller(slot_ns, config.render.spp) } else { None };

@@ -52,6 +52,8 @@ const MARGIN_NS: i64 = 50_000;
 const NOTES: usize = 256;
 /// Tracking, plan, pack, link, and the mock projector.
 pub(super) const STAGE_THREADS: usize = 5;
+/// Real pace: what a projector needs to take a frame in and check it once the medium has all of it. The host cannot measure it.
+pub(super) const RECEIPT_NS: i64 = 500_000;
 /// Longest wait for another stage before it is looked whether the run goes on.
 const WAIT_NS: i64 = 100_000_000;
 /// A frame that the GPU has not finished by then is given up, and the run with it.
@@ -273,7 +275,8 @@ fn plan_thread(
         shared.may_stall(Stage::Plan, id);
         let mut job = FrameJob { note, memory };
         job.note.waited_for_memory = waited;
-        let travel = shared.travel_ns.load(Ordering::Relaxed);
+        let travel =
+            shared.travel_ns.load(Ordering::Relaxed) + if shared.is_virtual() { 0 } else { RECEIPT_NS };
         let lead =
             travel + if shared.is_virtual() { modelled } else { shared.lead_ns.load(Ordering::Relaxed) };
         let time = *time.latest().0;
