@@ -136,7 +136,7 @@ fn the_link_test_finds_the_rate_that_a_slow_cable_allows() {
     far.model.lock().unwrap().set_bytes_per_second(Some(100 * frame));
     let report = link_test(&rig, &Content::prepared(&rig, 4), 1.5).unwrap_or_else(|e| panic!("{e}"));
     let [raw, auto] = &report.ways[..] else { panic!("{report:?}") };
-    assert!(raw.limited_by_link, "{raw:?}");
+    assert_eq!(raw.limited_by, "medium", "{raw:?}");
     // Not faster than the cable, but for its FIFO of 64 KiB at the start; slower only by what a busy machine costs.
     let fifo = 65_536.0 / frame as f64 / 1.5;
     assert!(raw.frames_per_s < 1.05 * (100.0 + fifo), "{raw:?}");

@@ -56,9 +56,9 @@ pub struct LinkWay {
     pub planes: [u64; 3],
     /// Shortest clock exchange, us.
     pub round_trip_us: Option<f64>,
-    /// Whether the link was the limit; otherwise it was the frame rate, and the link carries it.
-    pub limited_by_link: bool,
-    /// Frame rate to set: what was measured, in whole frames, where the link is the limit; the rig's otherwise.
+    /// "frame rate": the rig's rate is carried; "medium": the cable or the device took no more; "host": compacting took longer.
+    pub limited_by: &'static str,
+    /// Frame rate to set: the rig's where it is carried, else what was measured, in whole frames.
     pub allows_hz: f64,
 }
 
@@ -236,8 +236,13 @@ fn go_dark(link: &mut HostLink, transport: &mut dyn Transport, clock: MonotonicC
 }
 
 fn judge(compaction: String, rate_hz: f64, m: &LinkMeasurement, shortest_ns: Option<i64>) -> LinkWay {
-    // Where both refused, a rate within a twentieth of the rig's is the rig's.
-    let limited_by_link = m.link_limits() && m.frames_per_s < 0.95 * rate_hz;
+    // Within a twentieth of the rig's rate is the rig's rate.
+    let carried = m.frames_per_s >= 0.95 * rate_hz;
+    let limited_by = match (carried, m.link_busy + m.no_credit) {
+        (true, _) => "frame rate",
+        (false, 0) => "host",
+        (false, _) => "medium",
+    };
     LinkWay {
         compaction,
         frames_per_s: m.frames_per_s,
@@ -245,8 +250,8 @@ fn judge(compaction: String, rate_hz: f64, m: &LinkMeasurement, shortest_ns: Opt
         mb_per_s: m.bytes_per_frame * m.frames_per_s / 1e6,
         planes: m.planes,
         round_trip_us: shortest_ns.map(|ns| ns as f64 / 1e3),
-        limited_by_link,
-        allows_hz: if limited_by_link { m.frames_per_s.floor() } else { rate_hz },
+        limited_by,
+        allows_hz: if carried { rate_hz } else { m.frames_per_s.floor() },
     }
 }
 
@@ -266,7 +271,7 @@ impl LinkTestReport {
             );
         }
         for w in &self.ways {
-            let said = if !w.limited_by_link {
+            let said = if w.limited_by == "frame rate" {
                 format!("carries the rig's {:.3} frames/s", self.frame_rate_hz)
             } else if w.allows_hz >= 1.0 {
                 format!(
@@ -276,7 +281,8 @@ impl LinkTestReport {
             } else {
                 "carries less than a frame a second".into()
             };
-            out += &format!("{}: the link {said}\n", w.compaction);
+            let host = if w.limited_by == "host" { " (the host's compaction is the limit)" } else { "" };
+            out += &format!("{}: the link {said}{host}\n", w.compaction);
         }
         out
     }
@@ -302,10 +308,13 @@ mod tests {
     #[test]
     fn a_busy_medium_sets_the_rate_and_a_full_device_does_not() {
         let slow = judge("raw".into(), 947.0, &measured(151.7, 900, 3), Some(80_000));
-        assert_eq!((slow.limited_by_link, slow.allows_hz, slow.mb_per_s), (true, 151.0, 151.7));
+        assert_eq!((slow.limited_by, slow.allows_hz, slow.mb_per_s), ("medium", 151.0, 151.7));
         assert_eq!(slow.round_trip_us, Some(80.0));
         let fast = judge("auto".into(), 947.0, &measured(946.0, 2, 4000), None);
-        assert_eq!((fast.limited_by_link, fast.allows_hz), (false, 947.0));
+        assert_eq!((fast.limited_by, fast.allows_hz), ("frame rate", 947.0));
+        // Nothing refused and yet too slow: the time went into compacting.
+        let busy = judge("auto".into(), 947.0, &measured(666.6, 0, 0), None);
+        assert_eq!((busy.limited_by, busy.allows_hz), ("host", 666.0));
     }
 
     #[test]
