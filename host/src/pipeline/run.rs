@@ -38,8 +38,8 @@ use std::sync::{Arc, Mutex, OnceLock};
 
 /// Light events between the projector and the collector: eight seconds at 947 Hz.
 const LIGHTS: usize = 8192;
-/// Buffers of the cable to a projector in this process: one is filled while the other is read.
-const CABLE_BUFFERS: usize = 2;
+/// Buffers of the cable to a projector in this process: one is filled while another is read, and one for a projector that is late.
+const CABLE_BUFFERS: usize = 3;
 /// A step of the control thread that ends this late is a standstill of the machine.
 const STANDSTILL_NS: i64 = 1_000_000;
 
