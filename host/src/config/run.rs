@@ -165,7 +165,7 @@ section! {
         /// Real for rigs, virtual for results that repeat.
         pace: Pace = Pace::Real, "", Any;
         /// SCHED_FIFO priority of the frame path; 0 keeps the normal scheduler. Refused rights are one warning.
-        priority: u32 = 0, "", Within(0, 99);
+        priority: u32 = 50, "", Within(0, 99);
         /// Cores for the frame path's threads, in the order of the stages; empty leaves it to the kernel.
         affinity: Vec<u32> = Vec::new(), "", Any;
         /// Keep all memory resident, so that no page fault delays a frame.

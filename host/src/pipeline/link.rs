@@ -3,6 +3,7 @@
 use super::job::{Fate, FrameJob, FrameMemory, FrameNote};
 use super::keeper::{is_dark, LinkKeeper, ProjectorReport};
 use super::light::LightRecorder;
+use super::rights::Rights;
 use super::threads::{enter_frame_path, is_overtaken, pop_within, Shared, WARM_UP_FRAMES};
 use crate::clock::{Clock, RunClock, Stopwatch};
 use crate::frame::Stage;
@@ -198,8 +199,10 @@ pub(super) fn device_thread(
     mut mock: MockProjector,
     mut recorder: LightRecorder,
     clock: &RunClock,
+    rights: &Rights,
 ) -> LightRecorder {
     // A projector of glass and metal is not late; a refusal was told by the stages, which ask for the same.
+    rights.enter_projector();
     let _ = set_timer_slack_ns(1);
     serve_cable(&mut mock, end, || clock.now(), |mock, now| recorder.advance(mock, now));
     recorder.close();

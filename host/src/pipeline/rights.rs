@@ -4,6 +4,9 @@ use crate::config::{Pace, RealTimeConfig};
 use crate::realtime::{enter_frame_path, os, Refusal, ThreadRights};
 use std::sync::Mutex;
 
+/// The mock projector's place in the list of cores, behind the stages.
+const PROJECTOR: usize = 4;
+
 /// Rights of a run's threads. Locked memory is given back at the end.
 pub(super) struct Rights {
     priority: u32,
@@ -36,11 +39,20 @@ impl Rights {
 
     /// Asks for the rights of the calling thread, the `stage`th of the frame path. Call before its first frame.
     pub(super) fn enter(&self, stage: usize) {
+        self.ask(self.priority, stage);
+    }
+
+    /// The same for the mock projector's thread: it stands for a machine of its own, so no stage may hold it up.
+    pub(super) fn enter_projector(&self) {
+        let above = if self.priority > 0 { (self.priority + 1).min(99) } else { 0 };
+        self.ask(above, PROJECTOR);
+    }
+
+    fn ask(&self, priority: u32, stage: usize) {
         if !self.wanted {
             return;
         }
-        let granted =
-            enter_frame_path(ThreadRights { priority: self.priority, core: self.cores.get(stage).copied() });
+        let granted = enter_frame_path(ThreadRights { priority, core: self.cores.get(stage).copied() });
         if let Ok(mut refusals) = self.refusals.lock() {
             for refusal in granted.refusals {
                 if !refusals.contains(&refusal) {
@@ -70,7 +82,7 @@ mod tests {
 
     #[test]
     fn a_right_refused_to_every_stage_is_one_warning() {
-        let config = RealTimeConfig { affinity: vec![1023, 1023, 1023], ..RealTimeConfig::default() };
+        let config = RealTimeConfig { priority: 0, affinity: vec![1023; 3], ..RealTimeConfig::default() };
         let rights = Rights::new(&config);
         std::thread::scope(|scope| {
             for stage in 0..3 {

@@ -181,10 +181,10 @@ fn run_from(
             }
             Far::Mock(mock, recorder) => {
                 let (host_end, device_end) = threaded(frame_bytes, CABLE_BUFFERS, policy(&rig));
-                let clock = &clock;
+                let (clock, rights) = (&clock, &rights);
                 let thread = std::thread::Builder::new()
                     .name("dpm-mock".into())
-                    .spawn_scoped(scope, move || device_thread(device_end, *mock, recorder, clock))
+                    .spawn_scoped(scope, move || device_thread(device_end, *mock, recorder, clock, rights))
                     .map_err(|source| PipelineError::Thread { stage: "mock projector", source })?;
                 (Cable::Threaded(host_end), Some(thread), None)
             }
