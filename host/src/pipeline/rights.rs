@@ -39,26 +39,27 @@ impl Rights {
 
     /// Asks for the rights of the calling thread, the `stage`th of the frame path. Call before its first frame.
     pub(super) fn enter(&self, stage: usize) {
-        self.ask(self.priority, stage);
-    }
-
-    /// The same for the mock projector's thread: it stands for a machine of its own, so no stage may hold it up.
-    pub(super) fn enter_projector(&self) {
-        let above = if self.priority > 0 { (self.priority + 1).min(99) } else { 0 };
-        self.ask(above, PROJECTOR);
-    }
-
-    fn ask(&self, priority: u32, stage: usize) {
         if !self.wanted {
             return;
         }
-        let granted = enter_frame_path(ThreadRights { priority, core: self.cores.get(stage).copied() });
+        let core = self.cores.get(stage).copied();
+        let granted = enter_frame_path(ThreadRights { priority: self.priority, core });
         if let Ok(mut refusals) = self.refusals.lock() {
             for refusal in granted.refusals {
                 if !refusals.contains(&refusal) {
                     refusals.push(refusal);
                 }
             }
+        }
+    }
+
+    /// The same for the mock projector's thread: it stands for a machine of its own, so no stage may hold it up.
+    pub(super) fn enter_projector(&self) {
+        if self.wanted {
+            let above = if self.priority > 0 { (self.priority + 1).min(99) } else { 0 };
+            // A refusal is told by the stages, which ask for nearly the same.
+            let core = self.cores.get(PROJECTOR).copied();
+            let _ = enter_frame_path(ThreadRights { priority: above, core });
         }
     }
 
