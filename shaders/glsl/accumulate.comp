@@ -18,8 +18,6 @@ layout(set = 0, binding = B_FILTERED, scalar) buffer Filtered { vec4 filtered[];
 // Method dpm: from the history's surface point to the pixel's.
 layout(set = 0, binding = B_SHOWN, scalar) readonly buffer Shown { vec4 shown[]; };
 
-vec3 albedo_of(uint at) { return vec3(unpackHalf2x16(guides[at].albedo_rg), unpackHalf2x16(guides[at].albedo_b).x); }
-
 void main() {
     uvec2 pixel;
     if (!tile_pixel(tiles[gl_WorkGroupID.x >> 2u], pixel)) return;
@@ -31,7 +29,7 @@ void main() {
     History h = histories[frame.parity * frame.width * frame.height + at];
     if ((frame.flags & FRAME_DPM) != 0u) {
         vec4 traced = radiance_in[at];
-        vec3 albedo = albedo_of(at);
+        vec3 albedo = albedo_of(guides[at]);
         vec3 shift = shown[at].rgb;
         if (traced.w > 0.0) {
             vec3 fresh = traced.rgb / albedo;

@@ -42,6 +42,60 @@ void add_tap(inout Carried c, uint index, float w) {
     c.total += w;
 }
 
+// Nothing is known of the point; its sequence begins.
+void forget(inout History h, uint at) {
+    h.mean = vec3(0.0);
+    h.weight = 0.0;
+    h.drift = 0.0;
+    h.variance = 0.0;
+    h.last = -1.0;
+    h.noise = 0.0;
+    h.seed = hash_u32(at + hash_u32(frame.frame + hash_u32(frame.seed)));
+    h.index = 0u;
+}
+
+// Methods paper and miyamoto: what the four histories around say, weighted bilinearly. `h` stays as it is where none is valid.
+void carry_bilinear(inout History h, vec3 normal, float footprint, vec2 before) {
+    if (!all(greaterThan(before, vec2(0.0))) || !all(lessThan(before, vec2(frame.width, frame.height)))) return;
+    uint former = (1u - frame.parity) * frame.width * frame.height;
+    vec2 base = floor(before - 0.5);
+    vec2 f = before - 0.5 - base;
+    // What stands still is fetched exactly.
+    if (abs(f.x - round(f.x)) < 2e-3 && abs(f.y - round(f.y)) < 2e-3) {
+        base += round(f);
+        f = vec2(0.0);
+    }
+    ivec2 corner = ivec2(base);
+    ivec2 limit = ivec2(frame.width, frame.height) - 1;
+    Carried c = Carried(vec3(0.0), 0.0, 0.0, 0.0, 0.0, 0.0, 0.0);
+    uint nearest = 0u;
+    float best = 0.0;
+    for (int i = 0; i < 4; i++) {
+        ivec2 o = ivec2(i & 1, i >> 1);
+        ivec2 q = corner + o;
+        float w = (o.x == 1 ? f.x : 1.0 - f.x) * (o.y == 1 ? f.y : 1.0 - f.y);
+        if (w <= 0.0 || any(lessThan(q, ivec2(0))) || any(greaterThan(q, limit))) continue;
+        uint tap = former + uint(q.y) * frame.width + uint(q.x);
+        if (!tap_valid(tap, h.instance, h.position, normal, footprint, 2.0)) continue;
+        add_tap(c, tap, w);
+        if (w > best) {
+            best = w;
+            nearest = tap;
+        }
+    }
+    if (!(c.total > 1e-3) || !finite3(c.mean) || !finite(c.weight)) return;
+    float s = 1.0 / c.total;
+    h.mean = c.mean * s;
+    h.weight = c.weight * s;
+    h.drift = c.drift * s;
+    h.variance = c.variance * s;
+    h.last = c.last * s;
+    h.noise = c.noise * s;
+    // The sequence goes on where the nearest point left it.
+    h.seed = histories[nearest].seed;
+    h.index = histories[nearest].index;
+}
+
 // Method dpm: every history belongs to one surface point for as long as it is seen. It goes to the pixel that the point is in now, so nothing is
 // ever resampled; the pixel's own point, at most half a pixel away, is reached by the gradient of the histories around.
 void carry_point(inout History h, vec3 normal, float footprint, uvec2 pixel, vec2 before) {
@@ -124,8 +178,7 @@ void carry_point(inout History h, vec3 normal, float footprint, uvec2 pixel, vec
             known.seed = h.seed;
             known.index = 0u;
             // Known as well as the histories around it agree: their scatter about the plane, or about each other where they lie on one side.
-            vec3 albedo = vec3(unpackHalf2x16(guides[at].albedo_rg), unpackHalf2x16(guides[at].albedo_b).x);
-            float light = luminance(albedo), noise = max(known.noise, 1e-8), per_frame = max(frame.budget_spp, 0.5);
+            float light = luminance(albedo_of(guides[at])), noise = max(known.noise, 1e-8), per_frame = max(frame.budget_spp, 0.5);
             float expected = noise * per_frame / known.weight, rest;
             if (taps < 8u) {
                 float range = luminance(upper - lower) * light;
@@ -137,14 +190,6 @@ void carry_point(inout History h, vec3 normal, float footprint, uvec2 pixel, vec
             known.weight = 1.0 / (1.0 / known.weight + rest / (noise * per_frame));
             h = known;
         }
-    } else {
-        h.mean = vec3(0.0);
-        h.weight = 0.0;
-        h.drift = 0.0;
-        h.variance = 0.0;
-        h.last = -1.0;
-        h.noise = 0.0;
-        h.index = 0u;
     }
     shown[at] = vec4(shift, 0.0);
 }
@@ -195,7 +240,7 @@ void main() {
     if (!tile_pixel(tile, pixel)) return;
     uint at = pixel.y * frame.width + pixel.x;
     uint pixels = frame.width * frame.height;
-    uint current = frame.parity * pixels, former = (1u - frame.parity) * pixels;
+    uint current = frame.parity * pixels;
     Surface surface = surfaces[at];
     uint importance = 0u, lit = 0u;
     if (is_lit(surface)) {
@@ -214,63 +259,12 @@ void main() {
         h.normal = encode_normal(normal);
         float cosine = abs(dot(transform_vector(instances[instance].world_from_object, normal), normalize(world)));
         float footprint = surface.distance * frame.pixel_size / max(cosine, 0.2);
-        Guide guide = guides[at];
-        vec2 before = vec2(pixel) + 0.5 - guide.motion;
-        Carried c = Carried(vec3(0.0), 0.0, 0.0, 0.0, 0.0, 0.0, 0.0);
-        h.seed = hash_u32(at + hash_u32(frame.frame + hash_u32(frame.seed)));
-        h.index = 0u;
-        bool inside = all(greaterThan(before, vec2(0.0))) && all(lessThan(before, vec2(frame.width, frame.height)));
-        if ((frame.flags & FRAME_DPM) != 0u) {
-            carry_point(h, normal, footprint, pixel, before);
-        } else if (inside) {
-            vec2 base = floor(before - 0.5);
-            vec2 f = before - 0.5 - base;
-            // What stands still is fetched exactly.
-            if (abs(f.x - round(f.x)) < 2e-3 && abs(f.y - round(f.y)) < 2e-3) {
-                base += round(f);
-                f = vec2(0.0);
-            }
-            ivec2 corner = ivec2(base);
-            ivec2 limit = ivec2(frame.width, frame.height) - 1;
-            bool smooth_ = false;
-            float best = 0.0;
-            for (int i = 0; i < 4; i++) {
-                ivec2 o = ivec2(i & 1, i >> 1);
-                ivec2 q = corner + o;
-                float w = (o.x == 1 ? f.x : 1.0 - f.x) * (o.y == 1 ? f.y : 1.0 - f.y);
-                if (w <= 0.0 || any(lessThan(q, ivec2(0))) || any(greaterThan(q, limit))) continue;
-                uint tap = former + uint(q.y) * frame.width + uint(q.x);
-                if (!tap_valid(tap, instance, h.position, normal, footprint, 2.0)) continue;
-                add_tap(c, tap, w);
-                if (w > best) {
-                    // The sequence goes on where the nearest point left it.
-                    best = w;
-                    h.seed = histories[tap].seed;
-                    h.index = histories[tap].index;
-                }
-            }
-        }
-        if ((frame.flags & FRAME_DPM) != 0u) {
-        } else if (c.total > 1e-3 && finite3(c.mean) && finite(c.weight)) {
-            float s = 1.0 / c.total;
-            h.mean = c.mean * s;
-            h.weight = c.weight * s;
-            h.drift = c.drift * s;
-            h.variance = c.variance * s;
-            h.last = c.last * s;
-            h.noise = c.noise * s;
-        } else {
-            h.mean = vec3(0.0);
-            h.weight = 0.0;
-            h.drift = 0.0;
-            h.variance = 0.0;
-            h.last = -1.0;
-            h.noise = 0.0;
-            h.seed = hash_u32(at + hash_u32(frame.frame + hash_u32(frame.seed)));
-            h.index = 0u;
-        }
+        vec2 before = vec2(pixel) + 0.5 - guides[at].motion;
+        forget(h, at);
+        if ((frame.flags & FRAME_DPM) != 0u) carry_point(h, normal, footprint, pixel, before);
+        else carry_bilinear(h, normal, footprint, before);
         histories[current + at] = h;
-        importance = uint(importance_of(h) * 256.0);
+        importance = importance_of(h);
     } else {
         histories[current + at].weight = 0.0;
         histories[current + at].frame = frame.frame - 1u;

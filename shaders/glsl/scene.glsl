@@ -69,6 +69,9 @@ bool tile_pixel(uint tile, out uvec2 pixel) {
     return pixel.x < frame.width && pixel.y < frame.height;
 }
 
+// Reflectance of the surface itself, by which method dpm divides radiance.
+vec3 albedo_of(Guide g) { return vec3(unpackHalf2x16(g.albedo_rg), unpackHalf2x16(g.albedo_b).x); }
+
 bool is_lit(Surface s) { return s.id != NO_HIT && s.distance > 0.0; }
 
 // Unit vector to 2 x 16 bits on the octahedron and back.

@@ -25,7 +25,7 @@ uint samples_of(uvec2 pixel, uint at) {
     if ((frame.flags & FRAME_DPM) != 0u) {
         History h = histories[frame.parity * frame.width * frame.height + at];
         float share = frame.budget_spp;
-        if ((frame.flags & FRAME_ALLOCATE) != 0u) share *= float(uint(importance_of(h) * 256.0)) / max(float(schedule.importance), 1.0) * float(schedule.lit);
+        if ((frame.flags & FRAME_ALLOCATE) != 0u) share *= float(importance_of(h)) / max(float(schedule.importance), 1.0) * float(schedule.lit);
         // A point never seen before starts with what an average pixel gets; nothing waits longer than two or three frames.
         share = clamp(share, min(0.5, 0.5 * frame.budget_spp), 16.0 * max(frame.budget_spp, 1.0));
         float whole = floor(share);

@@ -22,8 +22,6 @@ layout(constant_id = 13) const bool HAS_FILTER = true;
 const vec2 DISK[12] = vec2[](vec2(0.03, -0.09), vec2(-0.51, 0.13), vec2(0.47, 0.22), vec2(-0.08, 0.53), vec2(0.12, -0.62), vec2(-0.46, -0.41),
                              vec2(0.62, -0.31), vec2(-0.94, -0.18), vec2(-0.58, 0.72), vec2(0.43, 0.83), vec2(0.96, 0.12), vec2(-0.31, -0.92));
 
-vec3 albedo_of(uint at) { return vec3(unpackHalf2x16(guides[at].albedo_rg), unpackHalf2x16(guides[at].albedo_b).x); }
-
 // Share of independent samples' variance that is left by the sequence (measured).
 const float SEQUENCE_VARIANCE = 0.3;
 // Frames that the picture's own noise is taken to be seen over: what a filter gets wrong stays, noise goes.
@@ -31,20 +29,32 @@ const float SEEN_FRAMES = 60.0;
 // Neighbours may differ by this share of their light beyond what the plane tells.
 const float TOLERANCE = 0.008;
 
+// The neighbour at raster position `q`, if it is lit and of the body `instance`.
+bool neighbour(ivec2 q, uint instance, out uint tap) {
+    tap = 0u;
+    if (any(lessThan(q, ivec2(0))) || any(greaterThanEqual(q, ivec2(frame.width, frame.height)))) return false;
+    tap = uint(q.y) * frame.width + uint(q.x);
+    return is_lit(surfaces[tap]) && surfaces[tap].id >> 24u == instance;
+}
+
+// The disk is turned anew in every pixel and frame.
+mat2 turn_of(uvec2 pixel, uint dimension) {
+    float turn = blue_noise(pixel, frame.frame, dimension) * 2.0 * PI;
+    return mat2(cos(turn), sin(turn), -sin(turn), cos(turn));
+}
+
 // Slope of the light at the surface over time, from how far the histories around lag behind, by their age; nothing where chance explains it.
 float lag_of(uvec2 pixel, uint at, uint history) {
     uint instance = surfaces[at].id >> 24u;
     vec3 normal = decode_normal(histories[history + at].normal);
-    float turn = blue_noise(pixel, frame.frame, 0u) * 2.0 * PI;
-    mat2 rotation = mat2(cos(turn), sin(turn), -sin(turn), cos(turn));
+    mat2 rotation = turn_of(pixel, 0u);
     float per_frame = max(frame.budget_spp, 0.5);
     float age = histories[history + at].weight / per_frame, drift = histories[history + at].drift;
     float xx = age * age, xy = age * drift, yy = drift * drift, used = 1.0;
     for (int i = 0; i < 12; i++) {
         ivec2 q = ivec2(pixel) + ivec2(round(rotation * DISK[i] * 6.0));
-        if (any(lessThan(q, ivec2(0))) || any(greaterThanEqual(q, ivec2(frame.width, frame.height))) || q == ivec2(pixel)) continue;
-        uint tap = uint(q.y) * frame.width + uint(q.x);
-        if (!is_lit(surfaces[tap]) || surfaces[tap].id >> 24u != instance) continue;
+        uint tap;
+        if (q == ivec2(pixel) || !neighbour(q, instance, tap)) continue;
         float w = pow(max(dot(decode_normal(histories[history + tap].normal), normal), 0.0), 8.0);
         float x = histories[history + tap].weight / per_frame, y = histories[history + tap].drift;
         xx += w * x * x;
@@ -66,7 +76,7 @@ vec3 regressed(uvec2 pixel, uint at, uint history, vec4 own) {
     vec3 across = normalize(abs(normal.x) < 0.7 ? cross(normal, vec3(1.0, 0.0, 0.0)) : cross(normal, vec3(0.0, 1.0, 0.0)));
     vec3 along = cross(normal, across);
     float footprint = abs(surfaces[at].distance) * frame.pixel_size;
-    float own_light = luminance(albedo_of(at));
+    float own_light = luminance(albedo_of(guides[at]));
     float level = max(luminance(own.rgb), 0.02);
     float tolerated = TOLERANCE * TOLERANCE * level * level;
     // Normal equations, lower triangle by rows: constant, x, y, two components of the normal.
@@ -77,13 +87,11 @@ vec3 regressed(uvec2 pixel, uint at, uint history, vec4 own) {
     float used = 0.0, noise_sum = 0.0, total = 0.0, power = 0.0;
     for (int i = 0; i < 25; i++) {
         ivec2 d = ivec2(i % 5, i / 5) - 2;
-        ivec2 q = ivec2(pixel) + d;
-        if (any(lessThan(q, ivec2(0))) || any(greaterThanEqual(q, ivec2(frame.width, frame.height)))) continue;
-        uint tap = uint(q.y) * frame.width + uint(q.x);
-        if (!is_lit(surfaces[tap]) || surfaces[tap].id >> 24u != instance) continue;
+        uint tap;
+        if (!neighbour(ivec2(pixel) + d, instance, tap)) continue;
         vec3 n = decode_normal(histories[history + tap].normal);
         if (dot(n, normal) < 0.6 || abs(dot(histories[history + tap].position - position, normal)) > 3.0 * footprint) continue;
-        float light = luminance(albedo_of(tap));
+        float light = luminance(albedo_of(guides[tap]));
         float noise = filtered[tap].w * SEQUENCE_VARIANCE / (light * light);
         float w = 1.0 / (noise + tolerated);
         vec3 m = filtered[tap].rgb - own.rgb;
@@ -130,6 +138,30 @@ vec3 regressed(uvec2 pixel, uint at, uint history, vec4 own) {
     return finite3(result) ? max(result, vec3(0.0)) : own.rgb;
 }
 
+// [paper]: mean over a Poisson disk, blended in between two angles.
+vec3 disk_mean(uvec2 pixel, uint at, uint history, vec4 own) {
+    float blend = clamp((guides[at].angle - frame.filter_degrees.x) / max(frame.filter_degrees.y - frame.filter_degrees.x, 1e-6), 0.0, 1.0);
+    if (!(blend > 0.0)) return own.rgb;
+    uint instance = surfaces[at].id >> 24u;
+    vec3 position = histories[history + at].position;
+    vec3 normal = decode_normal(histories[history + at].normal);
+    float footprint = abs(surfaces[at].distance) * frame.pixel_size;
+    mat2 rotation = turn_of(pixel, 1u);
+    vec3 sum = own.rgb;
+    float total = 1.0;
+    for (int i = 0; i < 12; i++) {
+        ivec2 q = ivec2(pixel) + ivec2(round(rotation * DISK[i] * 4.0));
+        uint tap;
+        if (q == ivec2(pixel) || !neighbour(q, instance, tap)) continue;
+        vec3 apart = histories[history + tap].position - position;
+        float w = max(dot(decode_normal(histories[history + tap].normal), normal), 0.0);
+        w = pow(w, 32.0) * exp(-abs(dot(apart, normal)) / max(footprint, 1e-12));
+        sum += w * filtered[tap].rgb;
+        total += w;
+    }
+    return mix(own.rgb, sum / total, blend);
+}
+
 void main() {
     uvec2 pixel;
     if (!tile_pixel(tiles[gl_WorkGroupID.x >> 2u], pixel)) return;
@@ -138,46 +170,17 @@ void main() {
         shown[at] = vec4(0.0);
         return;
     }
-    bool dpm = (frame.flags & FRAME_DPM) != 0u;
     vec4 own = filtered[at];
     uint history = frame.parity * frame.width * frame.height;
-    if (dpm) {
+    if ((frame.flags & FRAME_DPM) != 0u) {
         vec3 light = own.rgb;
         if (HAS_FILTER) {
             light = regressed(pixel, at, history, own);
             float level = luminance(light);
             light *= clamp((level + lag_of(pixel, at, history)) / max(level, 1e-6), 0.5, 2.0);
         }
-        shown[at] = vec4(light * albedo_of(at), 1.0);
+        shown[at] = vec4(light * albedo_of(guides[at]), 1.0);
         return;
     }
-    float radius = 0.0, blend = 1.0;
-    if (HAS_FILTER) {
-        blend = clamp((guides[at].angle - frame.filter_degrees.x) / max(frame.filter_degrees.y - frame.filter_degrees.x, 1e-6), 0.0, 1.0);
-        radius = blend > 0.0 ? 4.0 : 0.0;
-    }
-    vec3 result = own.rgb;
-    if (radius > 0.0) {
-        uint instance = surfaces[at].id >> 24u;
-        vec3 position = histories[history + at].position;
-        vec3 normal = decode_normal(histories[history + at].normal);
-        float footprint = abs(surfaces[at].distance) * frame.pixel_size;
-        float turn = blue_noise(pixel, frame.frame, 1u) * 2.0 * PI;
-        mat2 rotation = mat2(cos(turn), sin(turn), -sin(turn), cos(turn));
-        vec3 sum = own.rgb;
-        float total = 1.0;
-        for (int i = 0; i < 12; i++) {
-            ivec2 q = ivec2(pixel) + ivec2(round(rotation * DISK[i] * radius));
-            if (any(lessThan(q, ivec2(0))) || any(greaterThanEqual(q, ivec2(frame.width, frame.height))) || q == ivec2(pixel)) continue;
-            uint tap = uint(q.y) * frame.width + uint(q.x);
-            if (!is_lit(surfaces[tap]) || surfaces[tap].id >> 24u != instance) continue;
-            vec3 apart = histories[history + tap].position - position;
-            float w = max(dot(decode_normal(histories[history + tap].normal), normal), 0.0);
-            w = pow(w, 32.0) * exp(-abs(dot(apart, normal)) / max(footprint, 1e-12));
-            sum += w * filtered[tap].rgb;
-            total += w;
-        }
-        result = mix(own.rgb, sum / total, blend);
-    }
-    shown[at] = vec4(result, 1.0);
+    shown[at] = vec4(HAS_FILTER ? disk_mean(pixel, at, history, own) : own.rgb, 1.0);
 }

@@ -99,7 +99,7 @@ pub fn cases(device: &Device) -> Vec<Case> {
 
 /// Every method with its authors' constants.
 pub fn methods() -> Vec<Method> {
-    METHODS.into_iter().map(|(_, which)| method_of(&RenderConfig::default(), which)).collect()
+    METHODS.into_iter().map(|which| method_of(&RenderConfig::default(), which)).collect()
 }
 
 /// A white Lambertian floor in even light: whatever is sampled, a lit pixel is 1.
