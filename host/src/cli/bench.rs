@@ -2,6 +2,7 @@
 
 use super::rig_args::RigArgs;
 use super::watch::print;
+use crate::config::RenderMethod;
 use crate::experiments::bench::{bench, MethodCost, METHODS};
 use crate::experiments::run_rig::open_gpu;
 use crate::failure::Failure;
@@ -22,7 +23,7 @@ pub struct BenchArgs {
     #[arg(long, value_name = "N", default_value_t = 20, value_parser = clap::value_parser!(u32).range(3..=100_000))]
     count: u32,
     /// Only this method; may be given several times
-    #[arg(long, value_name = "NAME", value_parser = METHODS.map(|(name, _)| name))]
+    #[arg(long, value_name = "NAME", value_parser = METHODS.map(RenderMethod::word))]
     method: Vec<String>,
     /// Print one JSON object
     #[arg(long)]

@@ -13,12 +13,8 @@ use std::sync::Arc;
 use std::time::{Duration, Instant};
 
 /// The methods, in the order of the reports.
-pub const METHODS: [(&str, RenderMethod); 4] = [
-    ("full", RenderMethod::Full),
-    ("miyamoto", RenderMethod::Miyamoto),
-    ("paper", RenderMethod::Paper),
-    ("dpm", RenderMethod::Dpm),
-];
+pub const METHODS: [RenderMethod; 4] =
+    [RenderMethod::Full, RenderMethod::Miyamoto, RenderMethod::Paper, RenderMethod::Dpm];
 
 /// Frames drawn before those that count: histories fill, the driver settles.
 const WARM_UP: u32 = 4;
@@ -94,23 +90,15 @@ pub fn bench(
     each: &mut dyn FnMut(&MethodCost),
 ) -> Result<BenchReport, RenderError> {
     let mut methods = Vec::new();
-    for (name, which) in
-        METHODS.into_iter().filter(|(name, _)| only.is_empty() || only.iter().any(|o| o == name))
-    {
-        let cost = measure(rig, gpu, frames, name, which)?;
+    for which in METHODS.into_iter().filter(|m| only.is_empty() || only.iter().any(|o| o == m.word())) {
+        let cost = measure(rig, gpu, frames, which)?;
         each(&cost);
         methods.push(cost);
     }
     Ok(BenchReport { stamp: Stamp::new(rig, gpu.summary()), spp: rig.config.render.spp, methods })
 }
 
-fn measure(
-    rig: &Rig,
-    gpu: &Arc<Gpu>,
-    frames: u32,
-    name: &'static str,
-    which: RenderMethod,
-) -> Result<MethodCost, RenderError> {
+fn measure(rig: &Rig, gpu: &Arc<Gpu>, frames: u32, which: RenderMethod) -> Result<MethodCost, RenderError> {
     let spp = rig.config.render.spp;
     let method = switched_method_of(&rig.config.render, which);
     let settings = RendererSettings { method, output: output(rig, gpu, false), ..renderer_settings(rig) };
@@ -144,7 +132,7 @@ fn measure(
         ms: median(costs.iter().map(|c| c.pass_ns[i] as f64 * 1e-6).collect()),
     });
     Ok(MethodCost {
-        method: name,
+        method: which.word(),
         frames: costs.len(),
         rays_per_frame,
         samples_per_frame,

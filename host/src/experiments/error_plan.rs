@@ -30,13 +30,13 @@ pub fn switched_method_of(render: &RenderConfig, which: RenderMethod) -> Method 
 
 /// The four methods; with `ablation`, dpm with each part off in turn too. `paper` comes first: its rays are everybody's budget.
 pub fn contenders(render: &RenderConfig, ablation: bool) -> Vec<Contender> {
-    let of = |name, which| Contender { name, method: method_of(render, which) };
+    let of = |which: RenderMethod| Contender { name: which.word(), method: method_of(render, which) };
     let dpm = method_of(render, RenderMethod::Dpm);
     let mut all = vec![
-        of("paper", RenderMethod::Paper),
-        of("full", RenderMethod::Full),
-        of("miyamoto", RenderMethod::Miyamoto),
-        of("dpm", RenderMethod::Dpm),
+        of(RenderMethod::Paper),
+        of(RenderMethod::Full),
+        of(RenderMethod::Miyamoto),
+        of(RenderMethod::Dpm),
     ];
     if ablation {
         let but = |name, method| Contender { name, method };

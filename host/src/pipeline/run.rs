@@ -253,7 +253,7 @@ fn run_from(
         pace: if is_virtual { "virtual" } else { "real" },
         gpu: gpu.map_or_else(|| "none".into(), |gpu| gpu.summary().name.clone()),
         software_gpu: gpu.is_some_and(|gpu| gpu.summary().software),
-        method: if gpu.is_some() { method_name(&rig) } else { "prepared" },
+        method: if gpu.is_some() { config.render.method.word() } else { "prepared" },
         prediction: config.prediction.on,
         light_hash: recorder.as_ref().map_or_else(String::new, |r| format!("{:016x}", r.light_hash)),
         projector: Some(carried),
@@ -297,16 +297,6 @@ fn budget_controller(slot_ns: i64, spp: u32) -> Option<BudgetController> {
         initial_rays: full,
     };
     BudgetController::new(config).ok()
-}
-
-fn method_name(rig: &Rig) -> &'static str {
-    use crate::config::RenderMethod as M;
-    match rig.config.render.method {
-        M::Dpm => "dpm",
-        M::Paper => "paper",
-        M::Miyamoto => "miyamoto",
-        M::Full => "full",
-    }
 }
 
 /// The renderer's settings from the rig file.

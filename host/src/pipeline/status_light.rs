@@ -53,18 +53,14 @@ pub(super) struct StatusLight {
 impl StatusLight {
     /// Notes go to `lights`; those that find no room are lost, as a mock's are.
     pub(super) fn new(lights: Sender<LightNote>) -> Self {
-        let counts = DeviceCounts {
-            lit: 0,
-            lit_unseen: 0,
-            repeated: 0,
-            blank: 0,
-            incomplete: 0,
-            too_late: 0,
-            superseded: 0,
-            refused: 0,
-            damaged_packets: 0,
-        };
-        Self { lights, before: None, counts, planned: [(0, u64::MAX); REMEMBERED], next: 0, travel_ns: 0 }
+        Self {
+            lights,
+            before: None,
+            counts: DeviceCounts::default(),
+            planned: [(0, u64::MAX); REMEMBERED],
+            next: 0,
+            travel_ns: 0,
+        }
     }
 
     /// What was counted so far.
