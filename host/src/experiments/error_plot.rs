@@ -2,23 +2,13 @@
 
 use super::error_figure3::{looks, Figure3Group, Figure3Row};
 use super::error_runs::{ErrorRow, GroupResult};
+use crate::telemetry::plots::{color, SIZE};
 use plotters::coord::combinators::{LogCoord, WithKeyPoints};
 use plotters::element::DashedPathElement;
 use plotters::prelude::*;
 
 /// One frame at 947 fps, ms: what the rig allows.
 pub const FRAME_MS: f64 = 1.056;
-
-/// Okabe and Ito's colours, told apart by all kinds of eyes.
-const COLORS: [RGBColor; 7] = [
-    RGBColor(0, 114, 178),
-    RGBColor(230, 159, 0),
-    RGBColor(0, 158, 115),
-    RGBColor(213, 94, 0),
-    RGBColor(204, 121, 167),
-    RGBColor(86, 180, 233),
-    RGBColor(0, 0, 0),
-];
 
 /// What the horizontal axis shows.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -66,6 +56,35 @@ fn axis((low, high): (f64, f64)) -> WithKeyPoints<LogCoord<f64>> {
     (low..high).log_scale().with_key_points(ticks(low, high))
 }
 
+/// How a curve is drawn.
+#[derive(Clone, Copy)]
+enum Stroke {
+    /// Points joined by a line.
+    Measured,
+    /// The same, dashed and without points.
+    Dashed,
+    /// A plain line of this width.
+    Plain(u32),
+}
+
+/// A curve with its name in the key.
+struct Curve {
+    name: String,
+    points: Vec<(f64, f64)>,
+    color: RGBColor,
+    stroke: Stroke,
+}
+
+/// The points' range along one axis, a little wider.
+fn range(values: impl Iterator<Item = f64>) -> (f64, f64) {
+    let (low, high) = values.fold((f64::INFINITY, 0.0f64), |(a, b), v| (a.min(v), b.max(v)));
+    if low <= high {
+        (0.8 * low, 1.25 * high)
+    } else {
+        (0.1, 10.0)
+    }
+}
+
 /// Perceived error against cost, both axes logarithmic, a curve a method, the Pareto front in grey, and for times one frame's 1.056 ms.
 ///
 /// # Errors
@@ -84,24 +103,31 @@ pub fn curves(groups: &[GroupResult], moving: bool, cost: Cost) -> Result<String
         }
     }
     let all: Vec<(f64, f64)> = rows.iter().map(|r| point(r)).collect();
-    let range = |of: &dyn Fn(&(f64, f64)) -> f64| {
-        let (low, high) = all.iter().map(of).fold((f64::INFINITY, 0.0f64), |(a, b), v| (a.min(v), b.max(v)));
-        if low < high {
-            (0.8 * low, 1.25 * high)
-        } else {
-            (0.1, 10.0)
-        }
-    };
-    let (mut x, y) = (range(&|p| p.0), range(&|p| p.1));
+    let (mut x, y) = (range(all.iter().map(|p| p.0)), range(all.iter().map(|p| p.1)));
+    let mut drawn = vec![Curve {
+        name: "Pareto front".into(),
+        points: pareto(&all),
+        color: RGBColor(190, 190, 190),
+        stroke: Stroke::Plain(6),
+    }];
+    drawn.extend(names.iter().enumerate().map(|(i, name)| Curve {
+        name: (*name).to_owned(),
+        points: rows.iter().filter(|r| r.method == *name).map(|r| point(r)).collect(),
+        color: color(i),
+        stroke: Stroke::Measured,
+    }));
     if cost == Cost::GpuMs {
         x = (x.0.min(0.8 * FRAME_MS), x.1.max(1.25 * FRAME_MS));
+        drawn.push(Curve {
+            name: "1.056 ms".into(),
+            points: vec![(FRAME_MS, y.0), (FRAME_MS, y.1)],
+            color: BLACK,
+            stroke: Stroke::Plain(1),
+        });
     }
-    let mut text = String::new();
-    draw(&mut text, &rows, &names, &pareto(&all), (x, y), cost, &point).map_err(|e| e.to_string())?;
-    Ok(text)
+    let x_name = if cost == Cost::Rays { "rays a frame" } else { "GPU time of a frame, ms" };
+    draw([x_name, "perceived RMSE"], (x, y), drawn).map_err(|e| e.to_string())
 }
-
-type Ranges = ((f64, f64), (f64, f64));
 
 /// Perceived error by mean radiance against samples a pixel, both logarithmic: a colour a material, dashed when standing.
 ///
@@ -109,18 +135,30 @@ type Ranges = ((f64, f64), (f64, f64));
 /// What the drawing library says.
 pub fn figure3(groups: &[Figure3Group]) -> Result<String, String> {
     let rows = || groups.iter().flat_map(|g| &g.rows).filter(|r| r.perceived > 0.0);
-    let range = |of: &dyn Fn(&Figure3Row) -> f64| {
-        let (low, high) = rows().map(of).fold((f64::INFINITY, 0.0f64), |(a, b), v| (a.min(v), b.max(v)));
-        if low <= high {
-            (0.8 * low, 1.25 * high)
-        } else {
-            (0.1, 10.0)
-        }
-    };
-    let (x, y) = (range(&|r| f64::from(r.spp)), range(&|r| r.perceived));
+    let point = |r: &Figure3Row| (f64::from(r.spp), r.perceived);
+    let ranges = (range(rows().map(|r| point(r).0)), range(rows().map(|r| point(r).1)));
+    let looks = looks();
+    let drawn = looks.iter().enumerate().flat_map(|(i, look)| {
+        [false, true].map(|moving| Curve {
+            name: format!("{}, {}", look.name, if moving { "moving" } else { "still" }),
+            points: rows().filter(|r| r.material == look.name && r.moving == moving).map(point).collect(),
+            color: color(i),
+            stroke: if moving { Stroke::Measured } else { Stroke::Dashed },
+        })
+    });
+    let names = ["samples a pixel and frame", "perceived RMSE / mean radiance"];
+    draw(names, ranges, drawn.collect()).map_err(|e| e.to_string())
+}
+
+/// Curves over two logarithmic axes, with a key.
+fn draw(
+    [x_name, y_name]: [&str; 2],
+    (x, y): ((f64, f64), (f64, f64)),
+    curves: Vec<Curve>,
+) -> Result<String, Box<dyn std::error::Error>> {
     let mut text = String::new();
-    let mut drawn = || -> Result<(), Box<dyn std::error::Error>> {
-        let root = SVGBackend::with_string(&mut text, (960, 540)).into_drawing_area();
+    {
+        let root = SVGBackend::with_string(&mut text, SIZE).into_drawing_area();
         root.fill(&WHITE)?;
         let mut chart = ChartBuilder::on(&root)
             .margin(16)
@@ -129,31 +167,30 @@ pub fn figure3(groups: &[Figure3Group]) -> Result<String, String> {
             .build_cartesian_2d(axis(x), axis(y))?;
         chart
             .configure_mesh()
-            .x_desc("samples a pixel and frame")
-            .y_desc("perceived RMSE / mean radiance")
+            .x_desc(x_name)
+            .y_desc(y_name)
             .x_label_formatter(&label)
             .y_label_formatter(&label)
             .light_line_style(WHITE)
             .draw()?;
-        for (i, look) in looks().iter().enumerate() {
-            for moving in [false, true] {
-                let mut points: Vec<(f64, f64)> = rows()
-                    .filter(|r| r.material == look.name && r.moving == moving)
-                    .map(|r| (f64::from(r.spp), r.perceived))
-                    .collect();
-                points.sort_by(|a, b| a.0.total_cmp(&b.0));
-                let style = COLORS[i].stroke_width(2);
-                let key = move |(x, y): (i32, i32)| -> Vec<(i32, i32)> { vec![(x, y), (x + 16, y)] };
-                if moving {
+        for Curve { name, mut points, color, stroke } in curves {
+            points.sort_by(|a, b| a.0.total_cmp(&b.0));
+            let key = |(x, y): (i32, i32)| [(x, y), (x + 16, y)];
+            match stroke {
+                Stroke::Measured | Stroke::Plain(_) => {
+                    let (width, size) = if let Stroke::Plain(w) = stroke { (w, 0) } else { (2, 4) };
+                    let style = color.stroke_width(width);
                     chart
-                        .draw_series(LineSeries::new(points, style).point_size(4))?
-                        .label(format!("{}, moving", look.name))
+                        .draw_series(LineSeries::new(points, style).point_size(size))?
+                        .label(name)
                         .legend(move |at| PathElement::new(key(at), style));
-                } else {
+                }
+                Stroke::Dashed => {
+                    let style = color.stroke_width(2);
                     chart
                         .draw_series(DashedLineSeries::new(points, 6, 4, style))?
-                        .label(format!("{}, still", look.name))
-                        .legend(move |(x, y)| DashedPathElement::new([(x, y), (x + 16, y)], 4, 3, style));
+                        .label(name)
+                        .legend(move |at| DashedPathElement::new(key(at), 4, 3, style));
                 }
             }
         }
@@ -164,65 +201,8 @@ pub fn figure3(groups: &[Figure3Group]) -> Result<String, String> {
             .border_style(BLACK)
             .draw()?;
         root.present()?;
-        Ok(())
-    };
-    drawn().map_err(|e| e.to_string())?;
+    }
     Ok(text)
-}
-
-fn draw(
-    text: &mut String,
-    rows: &[&ErrorRow],
-    names: &[&str],
-    front: &[(f64, f64)],
-    (x, y): Ranges,
-    cost: Cost,
-    point: &dyn Fn(&ErrorRow) -> (f64, f64),
-) -> Result<(), Box<dyn std::error::Error>> {
-    let root = SVGBackend::with_string(text, (960, 540)).into_drawing_area();
-    root.fill(&WHITE)?;
-    let mut chart = ChartBuilder::on(&root)
-        .margin(16)
-        .x_label_area_size(40)
-        .y_label_area_size(80)
-        .build_cartesian_2d(axis(x), axis(y))?;
-    let x_name = if cost == Cost::Rays { "rays a frame" } else { "GPU time of a frame, ms" };
-    chart
-        .configure_mesh()
-        .x_desc(x_name)
-        .y_desc("perceived RMSE")
-        .x_label_formatter(&label)
-        .y_label_formatter(&label)
-        .light_line_style(WHITE)
-        .draw()?;
-    chart
-        .draw_series(LineSeries::new(front.iter().copied(), RGBColor(190, 190, 190).stroke_width(6)))?
-        .label("Pareto front")
-        .legend(|(x, y)| PathElement::new([(x, y), (x + 16, y)], RGBColor(190, 190, 190).stroke_width(6)));
-    for (i, name) in names.iter().enumerate() {
-        let color = COLORS[i % COLORS.len()];
-        let mut points: Vec<(f64, f64)> =
-            rows.iter().filter(|r| r.method == *name).map(|r| point(r)).collect();
-        points.sort_by(|a, b| a.0.total_cmp(&b.0));
-        chart
-            .draw_series(LineSeries::new(points, color.stroke_width(2)).point_size(4))?
-            .label(*name)
-            .legend(move |(x, y)| PathElement::new([(x, y), (x + 16, y)], color.stroke_width(2)));
-    }
-    if cost == Cost::GpuMs {
-        chart
-            .draw_series(LineSeries::new([(FRAME_MS, y.0), (FRAME_MS, y.1)], BLACK.stroke_width(1)))?
-            .label("1.056 ms")
-            .legend(|(x, y)| PathElement::new([(x, y), (x + 16, y)], BLACK.stroke_width(1)));
-    }
-    chart
-        .configure_series_labels()
-        .position(SeriesLabelPosition::UpperRight)
-        .background_style(WHITE)
-        .border_style(BLACK)
-        .draw()?;
-    root.present()?;
-    Ok(())
 }
 
 #[cfg(test)]

@@ -15,13 +15,15 @@ pub struct PlotError {
     pub reason: String,
 }
 
-const SIZE: (u32, u32) = (960, 540);
+/// Pixels of every plot.
+pub const SIZE: (u32, u32) = (960, 540);
 
 fn failed<E: std::fmt::Display>(what: &'static str) -> impl Fn(E) -> PlotError {
     move |e| PlotError { what, reason: e.to_string() }
 }
 
-fn color(i: usize) -> RGBColor {
+/// The `i`th curve's colour.
+pub fn color(i: usize) -> RGBColor {
     // Okabe and Ito's colours, told apart by all kinds of eyes.
     const COLORS: [RGBColor; 7] = [
         RGBColor(0, 114, 178),
