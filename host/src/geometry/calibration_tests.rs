@@ -2,52 +2,17 @@
 
 use super::calibration::*;
 use super::projector::ProjectorCamera;
+use crate::experiments::stability::calibration::{cloud, off, pairs, truth};
 use crate::reference::Sampler;
 use dpm_device::planes::Raster;
 use glam::{DVec2, DVec3};
-
-fn truth() -> ProjectorCamera {
-    let raster = Raster::new(1024, 768).unwrap();
-    let at = DVec3::new(0.4, 1.1, 2.2);
-    let mut c = ProjectorCamera::look_at(raster, at, DVec3::new(0.0, 0.2, 0.1), DVec3::Y, 0.6).unwrap();
-    c.fy *= 1.01;
-    c.cy = 900.0; // lens shift: the axis leaves below the raster
-    c
-}
-
-fn cloud(n: usize, seed: u64) -> Vec<DVec3> {
-    let mut s = Sampler::new(seed, 0);
-    (0..n).map(|_| DVec3::new(s.uniform() - 0.5, s.uniform() - 0.3, s.uniform() - 0.5)).collect()
-}
-
-fn pairs(c: &ProjectorCamera, points: &[DVec3], noise_px: f64, seed: u64) -> Vec<Pair> {
-    let mut s = Sampler::new(seed, 1);
-    let mut normal = || {
-        let (u, v) = (1.0 - s.uniform(), s.uniform());
-        (-2.0 * u.ln()).sqrt() * (std::f64::consts::TAU * v).cos()
-    };
-    (points.iter())
-        .map(|p| Pair {
-            world: *p,
-            pixel: c.project(*p).unwrap() + DVec2::new(normal(), normal()) * noise_px,
-        })
-        .collect()
-}
-
-fn distance(a: &ProjectorCamera, b: &ProjectorCamera) -> f64 {
-    let rotation = (a.world_from_projector.matrix3 - b.world_from_projector.matrix3).to_cols_array();
-    let rotation = rotation.iter().fold(0.0f64, |m, x| m.max(x.abs()));
-    let intrinsics = [(a.fx, b.fx), (a.fy, b.fy), (a.cx, b.cx), (a.cy, b.cy)];
-    let intrinsics = intrinsics.iter().fold(0.0f64, |m, (x, y)| m.max((x - y).abs() / b.fx));
-    rotation.max(intrinsics).max((a.position() - b.position()).length())
-}
 
 #[test]
 fn exact_data_give_the_projector_back() {
     for n in [6, 8, 40] {
         let c = truth();
         let got = calibrate(c.raster, &pairs(&c, &cloud(n, 3), 0.0, 0), &Default::default()).unwrap();
-        assert!(distance(&got.camera, &c) < 1e-9, "{n}: {:e}", distance(&got.camera, &c));
+        assert!(off(&got.camera, &c) < 1e-9, "{n}: {:e}", off(&got.camera, &c));
         assert!(got.rms_px < 1e-9 && got.condition.is_finite() && got.focal_uncertainty < 1e-9);
         assert!(got.warnings.iter().any(|w| w.contains("lens shift")), "{:?}", got.warnings);
     }
@@ -105,7 +70,7 @@ fn nearly_planar_points_with_noise_are_refused_or_marked() {
     }
     // Exact numbers of the same points do determine it.
     let got = calibrate(c.raster, &pairs(&c, &flat, 0.0, 3), &Default::default()).unwrap();
-    assert!(distance(&got.camera, &c) < 1e-5 && got.condition > 1e3, "{:e}", distance(&got.camera, &c));
+    assert!(off(&got.camera, &c) < 1e-5 && got.condition > 1e3, "{:e}", off(&got.camera, &c));
 }
 
 #[test]
@@ -213,7 +178,7 @@ fn wide_lenses_work_and_are_remarked() {
     let raster = Raster::new(800, 600).unwrap();
     let c = ProjectorCamera::look_at(raster, DVec3::new(0.0, 0.0, 0.6), DVec3::ZERO, DVec3::Y, 2.3).unwrap();
     let got = calibrate(raster, &pairs(&c, &cloud(30, 13), 0.0, 1), &Default::default()).unwrap();
-    assert!(distance(&got.camera, &c) < 1e-8);
+    assert!(off(&got.camera, &c) < 1e-8);
     assert!(got.warnings.iter().any(|w| w.contains("132 deg")), "{:?}", got.warnings);
     assert!(got.summary().iter().any(|l| l.starts_with("field of view 131.8 x")), "{:#?}", got.summary());
 }

@@ -25,7 +25,8 @@ pub fn cases() -> Vec<Case> {
     ]
 }
 
-fn truth() -> ProjectorCamera {
+/// A projector with lens shift: its axis leaves below the raster.
+pub(crate) fn truth() -> ProjectorCamera {
     let raster = Raster::new(1024, 768).expect("sides within 1..8192");
     let at = DVec3::new(0.4, 1.1, 2.2);
     let mut c = ProjectorCamera::look_at(raster, at, DVec3::new(0.0, 0.2, 0.1), DVec3::Y, 0.6)
@@ -35,12 +36,14 @@ fn truth() -> ProjectorCamera {
     c
 }
 
-fn cloud(n: usize, seed: u64) -> Vec<DVec3> {
+/// Points in a unit cube before it.
+pub(crate) fn cloud(n: usize, seed: u64) -> Vec<DVec3> {
     let mut s = Sampler::new(seed, 9);
     (0..n).map(|_| DVec3::new(s.uniform() - 0.5, s.uniform() - 0.3, s.uniform() - 0.5)).collect()
 }
 
-fn pairs(c: &ProjectorCamera, points: &[DVec3], noise_px: f64, seed: u64) -> Vec<Pair> {
+/// The points with their pixels, with normal noise.
+pub(crate) fn pairs(c: &ProjectorCamera, points: &[DVec3], noise_px: f64, seed: u64) -> Vec<Pair> {
     let mut s = Sampler::new(seed, 1);
     let mut normal = || {
         let (u, v) = (1.0 - s.uniform(), s.uniform());
@@ -53,7 +56,8 @@ fn pairs(c: &ProjectorCamera, points: &[DVec3], noise_px: f64, seed: u64) -> Vec
         .collect()
 }
 
-fn off(a: &ProjectorCamera, b: &ProjectorCamera) -> f64 {
+/// How far two projectors are apart: rotation, intrinsics by focal length, position.
+pub(crate) fn off(a: &ProjectorCamera, b: &ProjectorCamera) -> f64 {
     let rotation = (a.world_from_projector.matrix3 - b.world_from_projector.matrix3).to_cols_array();
     let rotation = rotation.iter().fold(0.0f64, |m, x| m.max(x.abs()));
     let intrinsics = [(a.fx, b.fx), (a.fy, b.fy), (a.cx, b.cx), (a.cy, b.cy)];

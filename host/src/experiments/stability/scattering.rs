@@ -30,11 +30,16 @@ pub fn cases() -> Vec<Case> {
     ]
 }
 
-/// The point in the middle of a patch of the material and the scene that owns it.
-fn patch(material: &Material) -> SurfacePoint {
+/// The point in the middle of a patch of the material.
+pub(crate) fn patch(material: &Material) -> SurfacePoint {
     let s = scene_of(floor(1.0, 0.0), material.clone());
     let point = Reference::new(&s, &[]).trace(DVec3::new(0.1, 1.0, 0.2), -DVec3::Y, 9.0, false);
     point.expect("the patch lies below")
+}
+
+/// A white material of every kind.
+pub(crate) fn look(roughness: f32, metallic: f32, transmission: f32, thin_walled: bool) -> Material {
+    Material { roughness, metallic, transmission, thin_walled, ..Material::default() }
 }
 
 fn viewing(mu: f64) -> DVec3 {
@@ -68,8 +73,7 @@ fn energy(seed: u64) -> f64 {
         let table = AlbedoTable::new(ior);
         for roughness in [0.0, 1e-4, 1e-3, 0.0317, 0.5, 1.0] {
             for (metallic, transmission, thin_walled) in LOOKS {
-                let m =
-                    Material { roughness, ior, metallic, transmission, thin_walled, ..Material::default() };
+                let m = Material { ior, ..look(roughness, metallic, transmission, thin_walled) };
                 for mu in [1.0, 0.3, 1.745e-4] {
                     let a = albedo_of(&m, &table, mu, 300, seed);
                     if a.mean() < 0.0 {
@@ -115,7 +119,8 @@ fn coated(seed: u64) -> f64 {
     worst.max(0.0)
 }
 
-fn direction(u: [f64; 2], up: f64) -> DVec3 {
+/// A direction not quite in the plane, on the side of `up`.
+pub(crate) fn direction(u: [f64; 2], up: f64) -> DVec3 {
     let (y, phi) = (0.02 + 0.98 * u[0], 2.0 * PI * u[1]);
     let r = (1.0 - y * y).sqrt();
     DVec3::new(r * phi.cos(), y * up, r * phi.sin())
@@ -127,14 +132,7 @@ fn reciprocity(seed: u64) -> f64 {
     for roughness in [0.1, 0.4, 1.0] {
         for (metallic, transmission, thin_walled) in LOOKS {
             let base_color = Vec3::new(0.9, 0.5, 0.1);
-            let m = Material {
-                base_color,
-                roughness,
-                metallic,
-                transmission,
-                thin_walled,
-                ..Material::default()
-            };
+            let m = Material { base_color, ..look(roughness, metallic, transmission, thin_walled) };
             let (p, table) = (patch(&m), AlbedoTable::new(m.ior));
             let f = |v: DVec3, l: DVec3| {
                 Bsdf::new(&p, &table, v).map_or(DVec3::ZERO, |b| b.evaluate(l).f_cos / l.y.abs())
@@ -171,14 +169,7 @@ fn direction_tests(seed: u64, samples: u32) -> Vec<super::statistics::DirectionT
         .into_iter()
         .map(|(roughness, metallic, transmission, thin_walled, mu)| {
             let base_color = Vec3::splat(0.8);
-            let m = Material {
-                base_color,
-                roughness,
-                metallic,
-                transmission,
-                thin_walled,
-                ..Material::default()
-            };
+            let m = Material { base_color, ..look(roughness, metallic, transmission, thin_walled) };
             let (p, table) = (patch(&m), AlbedoTable::new(m.ior));
             let bsdf = Bsdf::new(&p, &table, viewing(mu)).expect("front, or both sides");
             let mut s = Sampler::new(seed, 1);
@@ -233,20 +224,13 @@ fn grazing(seed: u64) -> f64 {
     let table = AlbedoTable::new(1.5);
     for roughness in [0.0, 0.032, 0.5, 1.0] {
         for transmission in [0.0, 1.0] {
-            let m = Material {
-                roughness,
-                transmission,
-                thin_walled: false,
-                metallic: 0.2,
-                ..Material::default()
-            };
-            let p = patch(&m);
+            let p = patch(&look(roughness, 0.2, transmission, false));
             for v in
                 [DVec3::Y, DVec3::X, DVec3::new(1.0, 1e-12, 0.0), DVec3::new(1.0, -1e-300, 0.0), -DVec3::Y]
             {
                 let Some(bsdf) = Bsdf::new(&p, &table, v.normalize()) else { continue };
                 for u in [0.0, 1e-300, 0.5, 1.0 - f64::EPSILON / 2.0] {
-                    for choose in [0.0, 0.3, 1.0 - f64::EPSILON / 2.0] {
+                    for choose in [0.0, 0.3, 0.999999, 1.0 - f64::EPSILON / 2.0] {
                         let Some(x) = bsdf.sample(choose, [u, s.uniform()], u) else { continue };
                         let sound =
                             x.weight.is_finite() && x.weight.min_element() >= 0.0 && x.l.is_normalized();
