@@ -10,7 +10,9 @@ use super::prepared::PreparedFrames;
 use super::projector;
 use super::rights::Rights;
 use super::stages::{self, TrackingStage};
-use super::threads::{policy, run_threads, Shared, GPU_TIMEOUT_NS, LISTEN_NS, RECEIPT_NS, STAGE_THREADS};
+use super::threads::{
+    policy, run_threads, Shared, Stages, GPU_TIMEOUT_NS, LISTEN_NS, RECEIPT_NS, STAGE_THREADS,
+};
 use crate::clock::{Clock, ManualClock, MonotonicClock, RunClock, Stopwatch};
 use crate::config::{Pace, Packer, ProjectorBackend, RenderMethod};
 use crate::gpu::Gpu;
@@ -69,14 +71,6 @@ pub fn run_prepared(
     run_from(rig, None, RunOptions { verify: false, ..options }, monitor)
 }
 
-/// The other end of the cable.
-enum Far {
-    /// The mock, and who watches its light.
-    Mock(Box<MockProjector>, LightRecorder),
-    /// A projector outside this process, and where notes of its light go.
-    Outside(Box<dyn Transport>, Sender<LightNote>),
-}
-
 fn run_from(
     rig: Arc<Rig>,
     gpu: Option<&Arc<Gpu>>,
@@ -84,84 +78,27 @@ fn run_from(
     monitor: &RunMonitor,
 ) -> Result<RunOutcome, PipelineError> {
     let config = &rig.config;
+    let is_virtual = config.real_time.pace == Pace::Virtual;
+    // Hashing every frame costs a millisecond at full size: affordable unless the wall clock rules.
+    let options = RunOptions { verify: options.verify && is_virtual, ..options };
     let mut renderer = match gpu {
         Some(gpu) => {
-            let check = options.verify && config.real_time.pace == Pace::Virtual;
-            let settings = RendererSettings { output: output(&rig, gpu, check), ..renderer_settings(&rig) };
+            let settings =
+                RendererSettings { output: output(&rig, gpu, options.verify), ..renderer_settings(&rig) };
             Some(Renderer::new(gpu, &rig.scene, settings)?)
         }
         None => None,
     };
-    let is_virtual = config.real_time.pace == Pace::Virtual;
-    let clock = if is_virtual {
-        // The link comes up just before the first frame, so that nobody waits for the filters.
-        RunClock::Virtual(ManualClock::new(HostTime(LISTEN_NS)))
-    } else {
-        // A spinning thread on a machine with fewer cores than stages delays the very stages it waits for.
-        let spin_ns = if usable_cores() > STAGE_THREADS { 50_000 } else { 0 };
-        RunClock::Real(MonotonicClock::new(spin_ns))
-    };
-    let tracker_clock: Arc<dyn HostClock> = match &clock {
-        RunClock::Real(clock) => Arc::new({
-            let clock = *clock;
-            move || clock.now()
-        }),
-        // The configuration allows only trackers without a clock of their own at virtual pace.
-        RunClock::Virtual(_) => Arc::new(|| HostTime(0)),
-    };
-    let tracker = rig.tracker(tracker_clock, HostTime(0))?;
-    let raster = rig.camera.raster;
-    let schedule = config.projector.schedule();
-    // Hashing every frame costs a millisecond at full size: affordable unless the wall clock rules.
-    let verify = options.verify && is_virtual;
-
-    let mut memory = Vec::with_capacity(options.in_flight.max(2));
-    for _ in 0..options.in_flight.max(2) {
-        memory.push(FrameMemory {
-            lost: Vec::with_capacity(rig.bodies.len()),
-            scene_poses: Vec::with_capacity(rig.scene.bodies.len()),
-            gaze: DVec3::ZERO,
-            widen_deg: 0.0,
-            gpu: match &mut renderer {
-                Some(renderer) => Some(renderer.create_slot(false).map_err(RenderError::from)?),
-                None => None,
-            },
-            planes: BitPlaneFrame::new(raster, schedule),
-        });
-    }
-
+    let clock = run_clock(is_virtual);
+    let tracker = rig.tracker(tracker_clock(&clock), HostTime(0))?;
+    let mut memory = frame_memory(&rig, renderer.as_mut(), options.in_flight.max(2))?;
     if let (Some(renderer), Some(first), false) = (&mut renderer, memory.first_mut(), is_virtual) {
         stages::warm_up(first, &rig, renderer, GPU_TIMEOUT_NS).map_err(RenderError::from)?;
     }
-
-    let frame_bytes = projector::frame_bytes(raster, schedule.len());
     let (lights_in, lights) = channel(LIGHTS, WaitPolicy::Park);
-    let prepared = gpu.is_none().then(|| PreparedFrames::new(raster));
-    let mut warnings = Vec::new();
-    let far = match &config.projector.backend {
-        ProjectorBackend::Mock(mock_config) => {
-            let mut setup = MockConfig::new(raster);
-            setup.frame_buffers = mock_config.buffer_frames.min(64) as u8;
-            setup.clock =
-                DeviceClock { skew_ppb: (mock_config.clock_ppm * 1000.0) as i32, ..DeviceClock::IDEAL };
-            setup.flash_limit = projector::flash_limit(config);
-            let marks = prepared.is_some().then_some(schedule);
-            let recorder = LightRecorder::new(lights_in, options.keep_frames, verify, marks);
-            Far::Mock(Box::new(MockProjector::new(setup)), recorder)
-        }
-        backend => {
-            let medium = projector::open(config, raster)?.ok_or_else(|| {
-                RigError::Unsupported(format!(
-                    "projector.backend.kind = {:?} takes no frames over a link",
-                    backend.word()
-                ))
-            })?;
-            warnings.extend(medium.warnings);
-            Far::Outside(medium.transport, lights_in)
-        }
-    };
-    let mut link = HostLink::new(projector::link_settings(config, raster));
-    let acknowledged = if config.safety.acknowledge_faults { u32::MAX } else { ENDED_WITH_THE_LAST_RUN };
+    let prepared = gpu.is_none().then(|| PreparedFrames::new(rig.camera.raster));
+    let (far, warnings) = far_end(&rig, lights_in, options, prepared.is_some())?;
+    let mut link = HostLink::new(projector::link_settings(config, rig.camera.raster));
 
     let rights = Rights::new(&config.real_time);
     let standstill = match &clock {
@@ -171,7 +108,6 @@ fn run_from(
         }
         RunClock::Virtual(_) => None,
     };
-    let kernel = Kernel::best();
     let watch = Stopwatch::start();
     let (mut collector, recorder, carried) = std::thread::scope(|scope| -> Result<_, PipelineError> {
         let (mut cable, device, seen) = match far {
@@ -180,6 +116,8 @@ fn run_from(
                 (Cable::Direct(Box::new(Direct::new(*mock)), recorder), None, None)
             }
             Far::Mock(mock, recorder) => {
+                let frame_bytes =
+                    projector::frame_bytes(rig.camera.raster, config.projector.schedule().len());
                 let (host_end, device_end) = threaded(frame_bytes, CABLE_BUFFERS, policy(&rig));
                 let (clock, rights) = (&clock, &rights);
                 let thread = std::thread::Builder::new()
@@ -189,18 +127,11 @@ fn run_from(
                 (Cable::Threaded(host_end), Some(thread), None)
             }
         };
+        let acknowledged = if config.safety.acknowledge_faults { u32::MAX } else { ENDED_WITH_THE_LAST_RUN };
         let time = connect(&mut link, cable.transport(), acknowledged, &mut || {
             clock.wait_until(clock.now().plus_ns(if is_virtual { 50_000 } else { 200_000 }))
         })?;
-        let slot_ns = rig.rate().slot_len_ns(0);
-        let first_guess_ns = i64::from(config.real_time.stage_costs_us.total()) * 1000;
-        // Sent earlier, a frame would find no room in the device, whose word of a free buffer takes part of a slot.
-        let held = link.device().map_or(1, |hello| i64::from(hello.frame_buffers));
-        let lead =
-            LeadEstimator::new(slot_ns, first_guess_ns, (held * slot_ns - slot_ns / 2 - RECEIPT_NS).max(0));
-        // At virtual pace pictures must not depend on how fast the machine is.
-        let adapts = !is_virtual && renderer.is_some() && config.render.method == RenderMethod::Dpm;
-        let budget = if adapts { budget_controller(slot_ns, config.render.spp) } else { None };
+        let lead = lead_estimator(&rig, &link);
         let shared = Shared {
             rig: rig.clone(),
             clock: &clock,
@@ -215,25 +146,25 @@ fn run_from(
             error: Mutex::new(None),
             monitor,
             options,
-            verify,
             rights: &rights,
         };
-        let tracking = TrackingStage::new(&rig, tracker);
-        let mut collector = Collector::new(rig.clone(), options.keep_frames, verify);
-        let (recorder, carried) = run_threads(
-            &shared,
-            tracking,
-            renderer.as_mut(),
+        // At virtual pace pictures must not depend on how fast the machine is.
+        let adapts = !is_virtual && renderer.is_some() && config.render.method == RenderMethod::Dpm;
+        let stages = Stages {
+            tracking: TrackingStage::new(&rig, tracker),
+            renderer: renderer.as_mut(),
             prepared,
-            kernel,
+            kernel: Kernel::best(),
+            budget: if adapts { budget_controller(&rig) } else { None },
             link,
             cable,
-            memory,
-            budget,
-            (seen, lights),
             lead,
-            &mut collector,
-        )?;
+            memory,
+            seen,
+            lights,
+        };
+        let mut collector = Collector::new(rig.clone(), options.keep_frames, options.verify);
+        let (recorder, carried) = run_threads(&shared, stages, &mut collector)?;
         let recorder = match device {
             Some(thread) => Some(thread.join().map_err(|_| PipelineError::Panicked("mock projector"))?),
             None => recorder,
@@ -247,8 +178,8 @@ fn run_from(
     let standstills = standstill.map(StandstillMonitor::finish).unwrap_or_default();
 
     let mut report = Report {
-        raster: [raster.width(), raster.height()],
-        planes: schedule.len() as u32,
+        raster: [rig.camera.raster.width(), rig.camera.raster.height()],
+        planes: config.projector.schedule().len() as u32,
         frame_rate_hz: rig.rate().hz(),
         pace: if is_virtual { "virtual" } else { "real" },
         gpu: gpu.map_or_else(|| "none".into(), |gpu| gpu.summary().name.clone()),
@@ -265,8 +196,7 @@ fn run_from(
     report.warnings.extend(warnings);
     report.warnings.extend(rights.warnings());
     report.warnings.extend(rig.scene.warnings.iter().cloned());
-    let lead_ns = i64::from(config.real_time.stage_costs_us.total()) * 1000;
-    let slots = collector.slots.counts(&standstills, lead_ns);
+    let slots = collector.slots.counts(&standstills, modelled_ns(&rig));
     for cause in MissCause::ALL {
         collector.profiler.missed(cause, slots.missed[cause as usize]);
     }
@@ -284,12 +214,106 @@ fn run_from(
     })
 }
 
+/// The clock of a run's pace.
+fn run_clock(is_virtual: bool) -> RunClock {
+    if is_virtual {
+        // The link comes up just before the first frame, so that nobody waits for the filters.
+        return RunClock::Virtual(ManualClock::new(HostTime(LISTEN_NS)));
+    }
+    // A spinning thread on a machine with fewer cores than stages delays the very stages it waits for.
+    let spin_ns = if usable_cores() > STAGE_THREADS { 50_000 } else { 0 };
+    RunClock::Real(MonotonicClock::new(spin_ns))
+}
+
+/// What trackers from outside stamp their packets with.
+fn tracker_clock(clock: &RunClock) -> Arc<dyn HostClock> {
+    match clock {
+        RunClock::Real(clock) => Arc::new({
+            let clock = *clock;
+            move || clock.now()
+        }),
+        // The configuration allows only trackers without a clock of their own at virtual pace.
+        RunClock::Virtual(_) => Arc::new(|| HostTime(0)),
+    }
+}
+
+/// Memory for `frames` frames in the making, with their slots on the GPU if one renders.
+fn frame_memory(
+    rig: &Rig,
+    mut renderer: Option<&mut Renderer>,
+    frames: usize,
+) -> Result<Vec<FrameMemory>, PipelineError> {
+    let one = |_| {
+        Ok(FrameMemory {
+            lost: Vec::with_capacity(rig.bodies.len()),
+            scene_poses: Vec::with_capacity(rig.scene.bodies.len()),
+            gaze: DVec3::ZERO,
+            widen_deg: 0.0,
+            gpu: match &mut renderer {
+                Some(renderer) => Some(renderer.create_slot(false).map_err(RenderError::from)?),
+                None => None,
+            },
+            planes: BitPlaneFrame::new(rig.camera.raster, rig.config.projector.schedule()),
+        })
+    };
+    (0..frames).map(one).collect()
+}
+
+/// The other end of the cable.
+enum Far {
+    /// The mock, and who watches its light.
+    Mock(Box<MockProjector>, LightRecorder),
+    /// A projector outside this process, and where notes of its light go.
+    Outside(Box<dyn Transport>, Sender<LightNote>),
+}
+
+/// The projector of the rig file, dark, and what the operator should know about its medium. `lights` is where its light is told;
+/// `marked` says that frames carry marks to be looked for.
+fn far_end(
+    rig: &Rig,
+    lights: Sender<LightNote>,
+    options: RunOptions,
+    marked: bool,
+) -> Result<(Far, Vec<String>), PipelineError> {
+    let (config, raster) = (&rig.config, rig.camera.raster);
+    let backend = &config.projector.backend;
+    if let ProjectorBackend::Mock(mock) = backend {
+        let mut setup = MockConfig::new(raster);
+        setup.frame_buffers = mock.buffer_frames.min(64) as u8;
+        setup.clock = DeviceClock { skew_ppb: (mock.clock_ppm * 1000.0) as i32, ..DeviceClock::IDEAL };
+        setup.flash_limit = projector::flash_limit(config);
+        let marks = marked.then(|| config.projector.schedule());
+        let recorder = LightRecorder::new(lights, options.keep_frames, options.verify, marks);
+        return Ok((Far::Mock(Box::new(MockProjector::new(setup)), recorder), Vec::new()));
+    }
+    let medium = projector::open(config, raster)?.ok_or_else(|| {
+        RigError::Unsupported(format!(
+            "projector.backend.kind = {:?} takes no frames over a link",
+            backend.word()
+        ))
+    })?;
+    Ok((Far::Outside(medium.transport, lights), medium.warnings))
+}
+
+/// The time from latch to sent that the rig file states, nanoseconds.
+fn modelled_ns(rig: &Rig) -> i64 {
+    i64::from(rig.config.real_time.stage_costs_us.total()) * 1000
+}
+
+/// How early frames are latched, learned from what the rig file states.
+fn lead_estimator(rig: &Rig, link: &HostLink) -> LeadEstimator {
+    let slot_ns = rig.rate().slot_len_ns(0);
+    // Sent earlier, a frame would find no room in the device, whose word of a free buffer takes part of a slot.
+    let held = link.device().map_or(1, |hello| i64::from(hello.frame_buffers));
+    LeadEstimator::new(slot_ns, modelled_ns(rig), (held * slot_ns - slot_ns / 2 - RECEIPT_NS).max(0))
+}
+
 /// Holds the GPU's time inside the slot by spending fewer samples: thousandths of a sample a pixel, from what the rig file asks for down
 /// to an eighth of it.
-fn budget_controller(slot_ns: i64, spp: u32) -> Option<BudgetController> {
-    let full = u64::from(spp) * 1000;
+fn budget_controller(rig: &Rig) -> Option<BudgetController> {
+    let full = u64::from(rig.config.render.spp) * 1000;
     let config = BudgetConfig {
-        slot_ns,
+        slot_ns: rig.rate().slot_len_ns(0),
         aim: 0.8,
         limit: 0.92,
         min_rays: (full / 8).max(1),

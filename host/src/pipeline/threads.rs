@@ -82,7 +82,6 @@ pub(super) struct Shared<'a> {
     pub(super) error: Mutex<Option<PipelineError>>,
     pub(super) monitor: &'a RunMonitor,
     pub(super) options: RunOptions,
-    pub(super) verify: bool,
     pub(super) rights: &'a Rights,
 }
 
@@ -129,23 +128,36 @@ pub(super) fn pop_within<T>(from: &mut Receiver<T>, limit_ns: i64) -> Option<T> 
     })
 }
 
+/// What the stages of a run work with.
+pub(super) struct Stages<'a> {
+    pub(super) tracking: TrackingStage,
+    /// `None` if frames are prepared.
+    pub(super) renderer: Option<&'a mut Renderer>,
+    pub(super) prepared: Option<PreparedFrames>,
+    /// How planes are packed if the GPU has not done it.
+    pub(super) kernel: Kernel,
+    /// `None` if every frame gets the rays that the rig file asks for.
+    pub(super) budget: Option<BudgetController>,
+    pub(super) link: HostLink,
+    pub(super) cable: Cable,
+    pub(super) lead: LeadEstimator,
+    /// What frames are made in.
+    pub(super) memory: Vec<FrameMemory>,
+    /// Where the link's thread tells of light that it has word of; `None` if somebody sees the light itself.
+    pub(super) seen: Option<Sender<LightNote>>,
+    /// Light, from either of them.
+    pub(super) lights: Receiver<LightNote>,
+}
+
 /// Starts the stages, waits for all of them, and returns the recorder of a projector without a thread of its own, and what was
-/// carried. `memory` is what frames are made in; `lights` comes from whoever sees the projector's light: the link's thread itself, if it
-/// has the other end.
+/// carried.
 pub(super) fn run_threads(
     shared: &Shared<'_>,
-    tracking: TrackingStage,
-    renderer: Option<&mut Renderer>,
-    prepared: Option<PreparedFrames>,
-    kernel: Kernel,
-    link: HostLink,
-    cable: Cable,
-    memory: Vec<FrameMemory>,
-    budget: Option<BudgetController>,
-    (seen, lights): (Option<Sender<LightNote>>, Receiver<LightNote>),
-    lead: LeadEstimator,
+    stages: Stages<'_>,
     collector: &mut Collector,
 ) -> Result<(Option<LightRecorder>, ProjectorReport), PipelineError> {
+    let Stages { tracking, renderer, prepared, kernel, budget, link, cable, lead, memory, seen, lights } =
+        stages;
     let policy = policy(&shared.rig);
     // Room for everything there is: no stage ever finds the next one's channel full.
     let jobs = memory.len();
@@ -356,7 +368,7 @@ fn pack_thread(
             shared.budget_milli.store(controller.rays(), Ordering::Relaxed);
         }
         if !is_overtaken(shared, &mut job.note, &jobs) {
-            stages::pack(&mut job, kernel, shared.verify, &mut prepared);
+            stages::pack(&mut job, kernel, shared.options.verify, &mut prepared);
         }
         if !shared.is_virtual() {
             let now = shared.clock.now();
