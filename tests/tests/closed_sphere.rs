@@ -71,11 +71,7 @@ fn seen_from_outside_a_sphere_does_not_shine_through_itself() {
     // Single-sided and lit from inside only: from outside it is black, however far it is. An inner lamp must not leak out.
     with_gpu(|gpu| {
         for (radius, distance) in [(1e-3f32, 1.0f64), (1.0, 1e3), (1e4, 1e5)] {
-            let mut scene = scene_of(sphere(Vec3::ZERO, radius, 2, false), diffuse(Vec3::splat(0.5)));
-            add(&mut scene, sphere(Vec3::ZERO, radius * 0.9, 2, false), emitter(Vec3::splat(1e3)));
-            let mut camera = camera(32, 32, DVec3::new(0.0, 0.6, 0.8) * distance, DVec3::ZERO);
-            let pixels = 14.0 * distance / f64::from(radius);
-            (camera.fx, camera.fy) = (pixels, pixels);
+            let (scene, camera) = lamp_in_a_sphere(radius, distance);
             let picture = Shot { depth: 6, ..Shot::new(&scene, camera) }.draw(gpu);
             let lit = picture.lit_estimates().count();
             assert!(lit > 300, "{lit}");

@@ -1,6 +1,7 @@
 //! A rig into what each method costs on this device: rays, samples, and milliseconds of every pass.
 
 use super::error_plan::switched_method_of;
+use super::median::{median, median_ms};
 use super::sequence::{draw, poses_at};
 use super::stamp::Stamp;
 use crate::config::RenderMethod;
@@ -68,15 +69,6 @@ pub struct BenchReport {
     pub methods: Vec<MethodCost>,
 }
 
-fn median(mut values: Vec<f64>) -> f64 {
-    values.sort_by(f64::total_cmp);
-    let n = values.len();
-    if n == 0 {
-        return 0.0;
-    }
-    0.5 * (values[(n - 1) / 2] + values[n / 2])
-}
-
 /// Draws up to `frames` frames with every method of `only` (all when it is empty), with the switches of the rig file. `each` is told about
 /// a method as soon as it is measured.
 ///
@@ -124,13 +116,13 @@ fn measure(rig: &Rig, gpu: &Arc<Gpu>, frames: u32, which: RenderMethod) -> Resul
         mean(&|c| u64::from(c.counters().closest_rays) + u64::from(c.counters().shadow_rays));
     let samples_per_frame = mean(&|c| u64::from(c.counters().samples));
     let wall_ms = median(walls);
-    let total = median(costs.iter().map(|c| c.pass_ns.iter().sum::<u64>() as f64 * 1e-6).collect());
+    let total = median_ms(costs.iter().map(|c| c.pass_ns.iter().sum()));
     let gpu_ms = (total > 0.0).then_some(total);
     let seconds = gpu_ms.unwrap_or(wall_ms) * 1e-3;
-    let passes = PASSES.iter().enumerate().map(|(i, &pass)| PassTime {
-        pass,
-        ms: median(costs.iter().map(|c| c.pass_ns[i] as f64 * 1e-6).collect()),
-    });
+    let passes = PASSES
+        .iter()
+        .enumerate()
+        .map(|(i, &pass)| PassTime { pass, ms: median_ms(costs.iter().map(|c| c.pass_ns[i])) });
     Ok(MethodCost {
         method: which.word(),
         frames: costs.len(),
@@ -143,16 +135,4 @@ fn measure(rig: &Rig, gpu: &Arc<Gpu>, frames: u32, which: RenderMethod) -> Resul
         samples_per_s: samples_per_frame / seconds,
         passes: if gpu_ms.is_some() { passes.collect() } else { Vec::new() },
     })
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    #[test]
-    fn the_median_of_an_even_count_is_the_mean_of_the_middle() {
-        assert_eq!(median(vec![4.0, 1.0, 9.0]), 4.0);
-        assert_eq!(median(vec![8.0, 1.0, 3.0, 4.0]), 3.5);
-        assert_eq!(median(vec![]), 0.0);
-    }
 }

@@ -5,7 +5,8 @@
 //! the noise is what two runs of independent samples do not share after 31 frames on every point of that body.
 
 use super::error_reference::{mean_of, Reference};
-use super::error_runs::{median_ms, ErrorOptions, ErrorRunError, EYE_FRAMES};
+use super::error_runs::{ErrorOptions, ErrorRunError, EYE_FRAMES};
+use super::median::median_ms;
 use super::sequence::{eye_mean, rmse, Span, Theatre};
 use super::stamp::{Fnv, Stamp};
 use crate::gpu::Gpu;

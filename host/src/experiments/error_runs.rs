@@ -6,6 +6,7 @@
 
 use super::error_plan::{contenders, paper_at, Contender, Group};
 use super::error_reference::{mean_of, Reference};
+use super::median::median_ms;
 use super::sequence::{eye_mean, rmse, Seen, Span, Theatre};
 use super::stamp::{Fnv, Stamp};
 use crate::gpu::Gpu;
@@ -130,13 +131,6 @@ impl ErrorOptions {
     pub fn last_slot(&self) -> u64 {
         u64::from(self.warm_up + self.kept) + 50
     }
-}
-
-/// Median of nanoseconds, as milliseconds; 0 of none.
-pub fn median_ms(ns: impl Iterator<Item = u64>) -> f64 {
-    let mut all: Vec<u64> = ns.collect();
-    all.sort_unstable();
-    all.get(all.len() / 2).map_or(0.0, |&ns| ns as f64 * 1e-6)
 }
 
 /// Why a group could not be measured.

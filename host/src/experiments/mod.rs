@@ -9,6 +9,7 @@ pub mod error_report;
 pub mod error_runs;
 pub mod error_sheet;
 pub mod link_test;
+pub mod median;
 pub mod pictures;
 pub mod profile;
 pub mod run_dlpc900;

@@ -1,5 +1,6 @@
 //! `dpm plan`: a rig into what its scene and method need of the renderer, what is left out of it and how, and what that saves.
 
+use super::median::median_ms;
 use super::run_rig::{open_gpu, traced_raster};
 use super::sequence::{draw, poses_at};
 use crate::clock::Stopwatch;
@@ -323,14 +324,8 @@ fn compare(rig: &Rig, mut lean: Renderer, mut full: Renderer) -> Result<Saving, 
         };
         pixels_identical &= slots[0].codes() == slots[1].codes() && bits(&slots[0]) == bits(&slots[1]);
     }
-    let [without_ms, with_ms] = times.map(|t| median_ms(&t[SETTLE..]));
+    let [without_ms, with_ms] = times.map(|t| median_ms(t.into_iter().skip(SETTLE)));
     Ok(Saving { without_ms, with_ms, pixels_identical })
-}
-
-fn median_ms(ns: &[u64]) -> f64 {
-    let mut sorted = ns.to_vec();
-    sorted.sort_unstable();
-    sorted.get(sorted.len() / 2).map_or(0.0, |&v| v as f64 * 1e-6)
 }
 
 #[cfg(test)]

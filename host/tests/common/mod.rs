@@ -112,6 +112,15 @@ pub fn png(width: u32, height: u32, texels: &[[u8; 4]]) -> Vec<u8> {
     out.into_inner()
 }
 
+/// A file whose only material shows the image with these bytes.
+pub fn with_image(bytes: &[u8]) -> Glb {
+    let mut file = tetrahedra();
+    let view = file.push_view(bytes);
+    file.set("/images", json!([{"bufferView": view}]))
+        .set("/textures", json!([{"source": 0}]))
+        .set("/materials/0/pbrMetallicRoughness/baseColorTexture", json!({"index": 0}))
+}
+
 /// Base64 with padding.
 pub fn base64(bytes: &[u8]) -> String {
     const ALPHABET: &[u8; 64] = b"ABCDEFGHIJKLMNOPQRSTUVWXYZabcdefghijklmnopqrstuvwxyz0123456789+/";

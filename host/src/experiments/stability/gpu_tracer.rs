@@ -8,7 +8,6 @@ use super::shapes::*;
 use super::Case;
 use crate::gpu::Gpu;
 use crate::reference::microfacet::fresnel_dielectric;
-use crate::reference::Sampler;
 use crate::scene::{Environment, Material, PunctualKind, PunctualLight, Scene};
 use glam::{DAffine3, DQuat, DVec2, DVec3, Vec3};
 use std::sync::Arc;
@@ -273,17 +272,7 @@ fn fresnel(gpu: &Arc<Gpu>, seed: u64) -> f64 {
 fn near_one(gpu: &Arc<Gpu>, seed: u64) -> f64 {
     let mut worst: f64 = 0.0;
     for ior in [1.0f32, 1.0 + 1e-7, 1.0005, 1.002] {
-        let glass = Material {
-            transmission: 1.0,
-            thin_walled: false,
-            roughness: 0.0,
-            ior,
-            metallic: 0.0,
-            ..Material::default()
-        };
-        let below = quad(Vec3::new(-50.0, -0.1, -50.0), Vec3::X * 100.0, Vec3::Z * 100.0);
-        let mut scene = scene_of(join([floor(50.0, 0.1), below]), glass);
-        scene.environment = sky(1.0);
+        let scene = clear_slab(ior, 0.0, false);
         let camera = camera(16, 16, DVec3::new(0.0, 3.0, 5.0), DVec3::ZERO);
         let shot = Shot { spp: 32, frames: 8, depth: 16, seed: seed as u32, ..Shot::new(&scene, camera) };
         let (mean, sigma) = pooled(shot.draw(gpu).lit_estimates().collect::<Vec<_>>(), 0);
@@ -317,17 +306,6 @@ pub fn still_life(scale: f32) -> Scene {
         ..point_light(Vec3::new(0.8, 1.0, 0.4) * scale, 0.6 * scale * scale)
     });
     scene
-}
-
-fn point_light(position: Vec3, intensity: f32) -> PunctualLight {
-    PunctualLight {
-        kind: PunctualKind::Point,
-        intensity: Vec3::splat(intensity),
-        body: None,
-        position,
-        direction: Vec3::NEG_Y,
-        range: f32::INFINITY,
-    }
 }
 
 /// Means of the still life's channels at a size and a place, and how many pixels are lit.
@@ -447,18 +425,7 @@ fn no_light(gpu: &Arc<Gpu>, seed: u64) -> f64 {
 }
 
 fn many_lights(gpu: &Arc<Gpu>, seed: u64) -> f64 {
-    let mut scene = scene_of(floor(3.0, 0.0), diffuse(Vec3::ONE));
-    let mut sampler = Sampler::new(seed, 4);
-    let mut want = 0.0;
-    for i in 0..100_000u32 {
-        let mut u = || sampler.uniform() as f32;
-        let p = Vec3::new(u(), 1.0 + u(), u());
-        let intensity = if i % 5 == 0 { 0.0 } else { 1e-5 * (1 + i % 3) as f32 };
-        scene.lights.push(point_light(p, intensity));
-        want += f64::from(intensity) * f64::from(p.y)
-            / f64::from(p.length_squared()).powf(1.5)
-            / std::f64::consts::PI;
-    }
+    let (scene, want) = floor_under_many_lights(seed);
     let mut c = camera(8, 8, DVec3::new(0.0, 4.0, 0.0), DVec3::ZERO);
     (c.fx, c.fy) = (1e6, 1e6);
     let shot = Shot { spp: 64, frames: 16, depth: 2, seed: seed as u32, ..Shot::new(&scene, c) };

@@ -2,7 +2,9 @@
 
 use crate::geometry::projector::ProjectorCamera;
 use crate::reference::Sampler;
-use crate::scene::{Body, Environment, Material, Scene, Texture, TextureRef, TriangleMesh, Wrap};
+use crate::scene::{
+    Body, Environment, Material, PunctualKind, PunctualLight, Scene, Texture, TextureRef, TriangleMesh, Wrap,
+};
 use dpm_device::planes::Raster;
 use glam::{DAffine3, DVec3, Vec2, Vec3, Vec4};
 use std::collections::HashMap;
@@ -135,6 +137,61 @@ pub fn diffuse(albedo: Vec3) -> Material {
 /// Black and glowing on its front.
 pub fn emitter(radiance: Vec3) -> Material {
     Material { emissive: radiance, ..diffuse(Vec3::ZERO) }
+}
+
+/// A light without a body and without an end to its range.
+pub fn light(kind: PunctualKind, position: Vec3, direction: Vec3, intensity: f32) -> PunctualLight {
+    PunctualLight {
+        kind,
+        intensity: Vec3::splat(intensity),
+        body: None,
+        position,
+        direction,
+        range: f32::INFINITY,
+    }
+}
+
+/// A light of no size.
+pub fn point_light(position: Vec3, intensity: f32) -> PunctualLight {
+    light(PunctualKind::Point, position, Vec3::NEG_Y, intensity)
+}
+
+/// A white floor under 100,000 point lights by chance, a fifth of them black; and its radiance at the origin: the sum of
+/// `I h / (pi r^3)` over all lights.
+pub fn floor_under_many_lights(seed: u64) -> (Scene, f64) {
+    let mut scene = scene_of(floor(3.0, 0.0), diffuse(Vec3::ONE));
+    let mut sampler = Sampler::new(seed, 4);
+    let mut radiance = 0.0;
+    for i in 0..100_000u32 {
+        let mut u = || sampler.uniform() as f32;
+        let p = Vec3::new(u(), 1.0 + u(), u());
+        let intensity = if i % 5 == 0 { 0.0 } else { 1e-5 * (1 + i % 3) as f32 };
+        scene.lights.push(point_light(p, intensity));
+        let r2 = f64::from(p.length_squared());
+        radiance += f64::from(intensity) * f64::from(p.y) / r2.powf(1.5) / std::f64::consts::PI;
+    }
+    (scene, radiance)
+}
+
+/// A bright lamp inside a closed sphere about the origin, and a camera at `distance` that sees 14 pixels of its radius.
+pub fn lamp_in_a_sphere(radius: f32, distance: f64) -> (Scene, ProjectorCamera) {
+    let mut scene = scene_of(sphere(Vec3::ZERO, radius, 2, false), diffuse(Vec3::splat(0.5)));
+    add(&mut scene, sphere(Vec3::ZERO, radius * 0.9, 2, false), emitter(Vec3::splat(1e3)));
+    let mut camera = camera(32, 32, DVec3::new(0.0, 0.6, 0.8) * distance, DVec3::ZERO);
+    let pixels = 14.0 * distance / f64::from(radius);
+    (camera.fx, camera.fy) = (pixels, pixels);
+    (scene, camera)
+}
+
+/// A wide slab of two faces, clear all through, in even light. What is reflected inside comes out at the next face, so few paths outlive
+/// their depth.
+pub fn clear_slab(ior: f32, roughness: f32, thin_walled: bool) -> Scene {
+    let glass =
+        Material { transmission: 1.0, thin_walled, roughness, ior, metallic: 0.0, ..Material::default() };
+    let below = quad(Vec3::new(-50.0, -0.1, -50.0), Vec3::X * 100.0, Vec3::Z * 100.0);
+    let mut scene = scene_of(join([floor(50.0, 0.1), below]), glass);
+    scene.environment = sky(1.0);
+    scene
 }
 
 /// Even light from everywhere.

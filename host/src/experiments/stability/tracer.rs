@@ -5,9 +5,8 @@ use super::statistics::Mean;
 use super::Case;
 use crate::reference::bvh::{Bvh, Triangle};
 use crate::reference::{offset, Reference, ReferenceImage, RenderSettings, Sampler};
-use crate::scene::{Environment, Material, PunctualKind, PunctualLight, Scene};
+use crate::scene::{Environment, Material, PunctualKind, Scene};
 use glam::{DAffine3, DVec3, Vec3};
-use std::f64::consts::PI;
 
 /// The cases.
 pub fn cases() -> Vec<Case> {
@@ -427,17 +426,6 @@ fn invalid_rays(_: u64) -> f64 {
     bad.iter().filter(|(o, d)| bvh.any(*o, *d, f64::INFINITY, |_| true)).count() as f64
 }
 
-fn light(kind: PunctualKind, position: Vec3, direction: Vec3, intensity: f32) -> PunctualLight {
-    PunctualLight {
-        kind,
-        intensity: Vec3::splat(intensity),
-        body: None,
-        position,
-        direction,
-        range: f32::INFINITY,
-    }
-}
-
 fn lamp_at_a_micrometre(seed: u64) -> f64 {
     let mut s = scene_of(floor(2.0, 0.0), diffuse(Vec3::splat(0.5)));
     add(&mut s, quad(Vec3::new(-1.0, 1e-6, -1.0), Vec3::X * 2.0, Vec3::Z * 2.0), emitter(Vec3::splat(1e-3)));
@@ -471,17 +459,9 @@ fn no_light(seed: u64) -> f64 {
 }
 
 fn many_lights(seed: u64) -> f64 {
-    let mut s = scene_of(floor(3.0, 0.0), diffuse(Vec3::ONE));
-    let mut sampler = Sampler::new(seed, 4);
-    let mut want = 0.0;
-    for i in 0..100_000u32 {
-        let mut u = || sampler.uniform() as f32;
-        let p = Vec3::new(u(), 1.0 + u(), u());
-        let intensity = if i % 5 == 0 { 0.0 } else { 1e-5 * (1 + i % 3) as f32 };
-        s.lights.push(light(PunctualKind::Point, p, Vec3::Y, intensity));
-        want += f64::from(intensity) * f64::from(p.y) / f64::from(p.length_squared()).powf(1.5) / PI;
-    }
-    let (mean, sigma) = overall(&Reference::new(&s, &[]).render_camera(&down(8), &settings(100, 2, seed)));
+    let (scene, want) = floor_under_many_lights(seed);
+    let (mean, sigma) =
+        overall(&Reference::new(&scene, &[]).render_camera(&down(8), &settings(100, 2, seed)));
     (mean - want).abs() / sigma
 }
 
