@@ -28,38 +28,80 @@ impl core::fmt::Display for CodecError {
 
 impl core::error::Error for CodecError {}
 
+/// Bytes that are looked at together. Runs shorter than this stay literal: one more token costs the decoder more time than its few bytes
+/// cost the cable.
+const WORD: usize = 8;
+/// Bytes that are copied at once where there is room for them, however few are meant.
+const BLOCK: usize = 16;
+
 /// Writes `plane` as RLE into `out`; the number of bytes, or `None` when they do not fit. Give `out` the length below which the
-/// result is worth having: the encoder stops as soon as it is exceeded.
+/// result is worth having: the encoder stops as soon as it is exceeded. Every run of 11 bytes is found, of the shorter ones those that fill a
+/// word of eight at a multiple of four from where the last one ended.
 pub fn rle_encode(plane: &[u8], out: &mut [u8]) -> Option<usize> {
     let mut at = 0;
     let mut literal_from = 0;
-    let mut i = 0;
-    while i < plane.len() {
-        let run = run_length(&plane[i..]);
-        // Breaking a literal costs two bytes of token and value and one to take it up again: from 4 on a run always pays.
-        if run >= 4 || (run >= 2 && literal_from == i) {
-            at = put_literal(&plane[literal_from..i], out, at)?;
-            at = put_token(run, 128, out, at)?;
-            *out.get_mut(at)? = plane[i];
+    while let Some(run) = next_run(plane, literal_from) {
+        at = put_literal(&plane[literal_from..], run.start - literal_from, out, at)?;
+        let value = plane[run.start];
+        literal_from = run.end;
+        let mut left = run.len();
+        while left > 0 {
+            let now = left.min(LONG);
+            at = put_token(now, 128, out, at)?;
+            *out.get_mut(at)? = value;
             at += 1;
-            i += run;
-            literal_from = i;
-        } else {
-            i += run;
+            left -= now;
         }
     }
-    put_literal(&plane[literal_from..], out, at)
+    put_literal(&plane[literal_from..], plane.len() - literal_from, out, at)
 }
 
-/// Number of bytes at the start of `bytes` that equal the first, at most [`LONG`]. `bytes` is not empty.
+/// The first run worth a token in `bytes` from `from` on.
+fn next_run(bytes: &[u8], from: usize) -> Option<core::ops::Range<usize>> {
+    let mut at = from;
+    // Noise has no runs: four words, two overlapping ones of each eight bytes, are judged before anything is decided.
+    while let Some(block) = bytes.get(at..at + 2 * WORD + 4) {
+        if uniform(block, 0) | uniform(block, 4) | uniform(block, 8) | uniform(block, 12) {
+            break;
+        }
+        at += 2 * WORD;
+    }
+    while at + WORD <= bytes.len() {
+        if uniform(bytes, at) {
+            let value = bytes[at];
+            let before = bytes[from..at].iter().rev().take_while(|&&b| b == value).count();
+            return Some(at - before..at + run_length(&bytes[at..]));
+        }
+        at += 4;
+    }
+    None
+}
+
+/// True when the eight bytes at `at` are equal.
+#[inline]
+fn uniform(bytes: &[u8], at: usize) -> bool {
+    let Some(word) = bytes.get(at..).and_then(|b| b.first_chunk::<WORD>()) else { return false };
+    let word = u64::from_ne_bytes(*word);
+    word == word.rotate_left(8)
+}
+
+/// Number of bytes at the start of `bytes` that equal the first. `bytes` is not empty.
 fn run_length(bytes: &[u8]) -> usize {
-    let bytes = &bytes[..bytes.len().min(LONG)];
     let value = bytes[0];
-    let word = [value; 8];
-    let mut n = 1;
-    // Eight at a time: dark planes are one long run.
-    while bytes.len() >= n + 8 && bytes[n..n + 8] == word {
-        n += 8;
+    let mut n = 0;
+    // Dark planes are one long run.
+    for block in bytes.as_chunks::<64>().0 {
+        if block.iter().fold(0, |differs, &b| differs | (b ^ value)) != 0 {
+            break;
+        }
+        n += 64;
+    }
+    for word in bytes[n..].as_chunks::<WORD>().0 {
+        let differs = u64::from_le_bytes(*word) ^ u64::from_ne_bytes([value; WORD]);
+        if differs != 0 {
+            return n + differs.trailing_zeros() as usize / 8;
+        }
+        n += WORD;
     }
     n + bytes[n..].iter().take_while(|&&b| b == value).count()
 }
@@ -76,13 +118,23 @@ fn put_token(n: usize, kind: u8, out: &mut [u8], at: usize) -> Option<usize> {
     }
 }
 
-fn put_literal(mut bytes: &[u8], out: &mut [u8], mut at: usize) -> Option<usize> {
-    while !bytes.is_empty() {
-        let (now, later) = bytes.split_at(bytes.len().min(LONG));
+/// Writes the first `len` of `bytes` as they are.
+fn put_literal(bytes: &[u8], len: usize, out: &mut [u8], mut at: usize) -> Option<usize> {
+    if let (1..=BLOCK, Some(block), Some(to)) =
+        (len, bytes.first_chunk::<BLOCK>(), out.get_mut(at..at + 1 + BLOCK))
+    {
+        // Most are short: one block is copied, and what is too much of it is written over by the next token.
+        to[0] = (len - 1) as u8;
+        to[1..].copy_from_slice(block);
+        return Some(at + 1 + len);
+    }
+    let mut left = &bytes[..len];
+    while !left.is_empty() {
+        let (now, later) = left.split_at(left.len().min(LONG));
         at = put_token(now.len(), 0, out, at)?;
         out.get_mut(at..at + now.len())?.copy_from_slice(now);
         at += now.len();
-        bytes = later;
+        left = later;
     }
     Some(at)
 }
@@ -120,6 +172,10 @@ impl RleDecoder {
     /// be fed.
     pub fn push(&mut self, mut bytes: &[u8], plane: &mut [u8]) -> Result<(), CodecError> {
         while let Some((&byte, rest)) = bytes.split_first() {
+            if let Some(used) = self.short(byte, rest, plane) {
+                bytes = &rest[used..];
+                continue;
+            }
             match self.expect {
                 Expect::Token => {
                     let (run, n) = (byte >= 128, (byte & 127) as usize + 1);
@@ -164,6 +220,28 @@ impl RleDecoder {
             }
         }
         Ok(())
+    }
+
+    /// Decodes a short token at once where payload and plane go on for a block behind it: the bytes used of `rest`. `None`: nothing
+    /// was done.
+    #[inline]
+    fn short(&mut self, token: u8, rest: &[u8], plane: &mut [u8]) -> Option<usize> {
+        if !matches!(self.expect, Expect::Token) {
+            return None;
+        }
+        let (run, n) = (token >= 128, (token & 127) as usize + 1);
+        let from = rest.first_chunk::<BLOCK>()?;
+        let to = plane.get_mut(self.at..)?.first_chunk_mut::<BLOCK>().filter(|_| n <= BLOCK)?;
+        let block = if run { [from[0]; BLOCK] } else { *from };
+        if self.xor {
+            let mask = u128::MAX >> (8 * (BLOCK - n));
+            *to = (u128::from_le_bytes(*to) ^ (u128::from_le_bytes(block) & mask)).to_le_bytes();
+        } else {
+            // What is too much of it is written over by the next token, or the plane is not full and not believed.
+            *to = block;
+        }
+        self.at += n;
+        Some(if run { 1 } else { n })
     }
 
     /// The payload is over: an error unless it described the whole plane of `plane_bytes`.
@@ -219,8 +297,17 @@ mod tests {
         plane.extend([0x77; 5]);
         plane.extend([0; 300]);
         let golden = [0x02, 1, 2, 3, 0x84, 0x77, 0xff, 0xac, 0x00, 0x00];
-        assert_eq!(encode(&plane), golden);
-        assert_eq!(decode(&golden, 1, plane.len()), Ok(plane));
+        assert_eq!(decode(&golden, 1, plane.len()), Ok(plane.clone()));
+        assert_eq!(decode(&golden, 10, plane.len()), Ok(plane.clone()));
+        // A run of five is not worth a token of its own.
+        assert_eq!(encode(&plane), [7, 1, 2, 3, 0x77, 0x77, 0x77, 0x77, 0x77, 0xff, 0xac, 0x00, 0x00]);
+        // One of eleven always is, wherever it lies, and the three tokens of any length around it.
+        for before in 0..40 {
+            let plane =
+                [vec![9; before], (0..before as u8).collect(), vec![0x77; 11], vec![1, 2, 3]].concat();
+            let coded = encode(&plane);
+            assert!(coded.windows(2).any(|w| w == [0x8a, 0x77]), "{before}: {coded:02x?}");
+        }
         // 130 literals are a long literal of 128 + 2.
         let plane: Vec<u8> = (0..130).map(|i| (i * 7) as u8).collect();
         let golden = [&[0x7f, 0x02, 0x00][..], &plane].concat();

@@ -2,7 +2,9 @@
 //! and LZ4.
 //!
 //! Trying every codec on every plane would cost more than it saves: each plane keeps the codec that won last time and the others
-//! are tried again every [`RETRIAL`] frames, staggered so that a frame's cost stays even.
+//! are tried again every [`RETRIAL`] frames, staggered so that a frame's cost stays even. A codec that takes the host longer has to save more.
+//! LZ4 takes several times longer than all else here, so it stands back until the medium refuses frames, and then serves the planes where it saves
+//! most, as many as half a frame's time allows: a cable that is fast enough is never slowed down by the processor.
 
 use lz4_flex::block::{compress_into_with_table, get_maximum_output_size, CompressTable};
 
@@ -12,6 +14,10 @@ use crate::planes::{Raster, MAX_PLANES};
 
 /// Frames between two trials of all codecs on a plane.
 const RETRIAL: u32 = 16;
+/// Frames for which a refusal of the medium is remembered.
+const REMEMBERED: u32 = 64;
+/// Time that LZ4 is supposed to take for a byte, nanoseconds; measured on noisy planes, 0.4 to 1 on one core of 2020.
+const LZ4_NS_PER_BYTE: i64 = 1;
 
 /// What to send of one plane.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -35,9 +41,17 @@ pub(super) struct Compactor {
     scratch: Vec<u8>,
     table: CompressTable,
     favourite: [Codec; MAX_PLANES],
+    /// Bytes that LZ4 saved over the next best when it was tried last.
+    lz4_saves: [usize; MAX_PLANES],
+    /// Planes of a frame that LZ4 has time for.
+    lz4_planes: usize,
+    /// Frames for which the medium still counts as the bottleneck.
+    pressed: u32,
     /// Bit k: plane k's favourite was chosen with a base frame at hand.
     tried_base: u32,
     frames: u32,
+    /// Bit k: plane k differs from the frame sent before.
+    changed: u32,
 }
 
 impl std::fmt::Debug for Compactor {
@@ -47,9 +61,10 @@ impl std::fmt::Debug for Compactor {
 }
 
 impl Compactor {
-    /// For frames of `planes` planes; `codecs` is the mask of those allowed.
-    pub fn new(raster: Raster, planes: usize, codecs: u32) -> Self {
+    /// For frames of `planes` planes every `frame_ns` nanoseconds; `codecs` is the mask of those allowed.
+    pub fn new(raster: Raster, planes: usize, frame_ns: i64, codecs: u32) -> Self {
         let plane_bytes = raster.plane_bytes();
+        let lz4_ns = LZ4_NS_PER_BYTE * plane_bytes as i64;
         Self {
             plane_bytes,
             codecs,
@@ -63,8 +78,12 @@ impl Compactor {
                 CompressTable::large()
             },
             favourite: [Codec::Raw; MAX_PLANES],
+            lz4_saves: [0; MAX_PLANES],
+            lz4_planes: usize::try_from(frame_ns / 2 / lz4_ns.max(1)).unwrap_or(0).clamp(1, MAX_PLANES),
+            pressed: 0,
             tried_base: 0,
             frames: 0,
+            changed: u32::MAX,
         }
     }
 
@@ -73,10 +92,17 @@ impl Compactor {
         self.codecs &= codecs | Codec::Raw.mask();
     }
 
+    /// The medium had no room for a frame: fewer bytes are worth more of the host's time.
+    pub fn refused(&mut self) {
+        self.pressed = REMEMBERED;
+    }
+
     /// Chooses the form of every plane of `planes`. Without `has_base` no plane refers to the frame before.
     pub fn compact(&mut self, planes: &[u8], has_base: bool) -> [PlaneForm; MAX_PLANES] {
         let mut forms = [PlaneForm::Raw; MAX_PLANES];
         self.frames = self.frames.wrapping_add(1);
+        self.pressed = self.pressed.saturating_sub(1);
+        self.changed = 0;
         for (k, plane) in planes.chunks_exact(self.plane_bytes).enumerate() {
             forms[k] = self.plane(k, plane, has_base);
         }
@@ -88,22 +114,28 @@ impl Compactor {
         if has_base && self.before[share.clone()] == *plane {
             return PlaneForm::Kept;
         }
+        self.changed |= 1 << k;
         let trial = self.frames.wrapping_add(k as u32).is_multiple_of(RETRIAL)
             || self.frames == 1
             || (has_base && self.tried_base >> k & 1 == 0);
         let favourite = self.favourite[k];
-        // Less than a 32nd saved is not worth the decoder's time.
-        let mut best = (Codec::Raw, self.plane_bytes - self.plane_bytes / 32);
-        for codec in [Codec::XorRle, Codec::Rle, Codec::Lz4] {
-            if self.codecs & codec.mask() == 0
-                || (codec == Codec::XorRle && !has_base)
-                || !(trial
-                    || codec == favourite
-                    || (favourite == Codec::XorRle && codec == Codec::Rle && !has_base))
-            {
+        let lz4 = self.has_time_for_lz4(k, trial);
+        let mut best = (Codec::Raw, self.plane_bytes);
+        for codec in [Codec::Rle, Codec::XorRle, Codec::Lz4] {
+            let usable = self.codecs & codec.mask() != 0
+                && match codec {
+                    Codec::XorRle => has_base && (trial || codec == favourite),
+                    Codec::Lz4 => lz4 && (trial || codec == favourite),
+                    // What a favourite that cannot be had now falls back on.
+                    _ => trial || codec == favourite || (codec_waits(favourite, has_base, lz4)),
+                };
+            let Some(below) = best.1.checked_sub(self.plane_bytes / worth(codec)).filter(|_| usable) else {
                 continue;
-            }
-            if let Some(n) = self.encode(codec, plane, share.clone(), best.1) {
+            };
+            if let Some(n) = self.encode(codec, plane, share.clone(), below) {
+                if codec == Codec::Lz4 {
+                    self.lz4_saves[k] = best.1 - n;
+                }
                 self.coded[share.start..share.start + n].copy_from_slice(&self.scratch[..n]);
                 best = (codec, n);
             }
@@ -117,6 +149,17 @@ impl Compactor {
         } else {
             PlaneForm::Coded(best.0, best.1)
         }
+    }
+
+    /// True when LZ4 may be used on plane `k`: it is all there is, or the medium is the bottleneck and the plane one of those where it saves
+    /// most.
+    fn has_time_for_lz4(&self, k: usize, trial: bool) -> bool {
+        if self.codecs & (Codec::Rle.mask() | Codec::XorRle.mask()) == 0 {
+            return true;
+        }
+        let saves = self.lz4_saves;
+        let ahead = (0..MAX_PLANES).filter(|&j| (saves[j], k) > (saves[k], j)).count();
+        self.pressed > 0 && (trial || ahead < self.lz4_planes)
     }
 
     /// Writes `plane` by `codec` into the scratch buffer if that takes fewer than `below` bytes.
@@ -149,8 +192,32 @@ impl Compactor {
         &self.coded[k * self.plane_bytes..][..n]
     }
 
-    /// The frame went out: it is what the next one refers to.
+    /// The frame that was compacted last went out: it is what the next one refers to.
     pub fn sent(&mut self, planes: &[u8]) {
-        self.before.copy_from_slice(planes);
+        let pairs = self.before.chunks_exact_mut(self.plane_bytes).zip(planes.chunks_exact(self.plane_bytes));
+        for (k, (before, plane)) in pairs.enumerate() {
+            if self.changed >> k & 1 == 1 {
+                before.copy_from_slice(plane);
+            }
+        }
     }
 }
+
+/// True when a plane that likes `favourite` cannot have it now.
+fn codec_waits(favourite: Codec, has_base: bool, lz4: bool) -> bool {
+    (favourite == Codec::XorRle && !has_base) || (favourite == Codec::Lz4 && !lz4)
+}
+
+/// A codec must save this part of a plane over what takes less time than it: over the plane itself, and each over the one before it.
+const fn worth(codec: Codec) -> usize {
+    match codec {
+        Codec::Raw | Codec::Rle => 32,
+        // A second pass over the plane, and for the device a copy of its base.
+        Codec::XorRle => 24,
+        Codec::Lz4 => 16,
+    }
+}
+
+#[cfg(test)]
+#[path = "compact_tests.rs"]
+mod tests;

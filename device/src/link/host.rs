@@ -69,8 +69,10 @@ const NEVER: HostTime = HostTime(i64::MIN);
 impl HostLink {
     /// A closed link. Its buffers are all it will ever allocate.
     pub fn new(settings: LinkSettings) -> Self {
-        let compactor = (settings.codecs & !Codec::Raw.mask() != 0)
-            .then(|| Compactor::new(settings.raster, settings.schedule.len(), settings.codecs));
+        let compactor = (settings.codecs & !Codec::Raw.mask() != 0).then(|| {
+            let frame_ns = settings.rate.slot_len_ns(0);
+            Compactor::new(settings.raster, settings.schedule.len(), frame_ns, settings.codecs)
+        });
         let flash = settings.flash_limit.map(|limit| FlashLimiter::new(settings.rate, limit));
         Self {
             settings,

@@ -100,7 +100,16 @@ impl Content {
         Self { name: "prepared", frames: frames.collect() }
     }
 
-    fn fill(&self, n: u64, planes: &mut [u8]) {
+    /// "rendered" or "prepared".
+    pub fn name(&self) -> &'static str {
+        self.name
+    }
+
+    /// Writes the planes of the `n`th frame to send.
+    ///
+    /// # Panics
+    /// When `planes` has not a frame's size.
+    pub fn fill(&self, n: u64, planes: &mut [u8]) {
         let last = self.frames.len() as u64 - 1;
         let at = if last == 0 { 0 } else { n % (2 * last) };
         let at = if at > last { 2 * last - at } else { at };

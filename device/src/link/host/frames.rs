@@ -70,6 +70,9 @@ impl HostLink {
             return Err(DropReason::NoCredit);
         }
         if !transport.has_room(Lane::Data) {
+            if let Some(compactor) = &mut self.compactor {
+                compactor.refused();
+            }
             return Err(DropReason::LinkBusy);
         }
         let has_base = !self.key_due && self.last_frame.is_some();

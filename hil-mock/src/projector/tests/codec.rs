@@ -34,7 +34,8 @@ fn every_codec_saves_and_lights_the_same_frame() {
         }
         assert!(bytes < 40 * raw_frame * 3 / 4 + 5000, "{codecs:#b}: {bytes} of {}", 40 * raw_frame);
         if codecs == Codec::ALL {
-            assert!(bytes < 40 * raw_frame * 45 / 100, "{bytes} of {}", 40 * raw_frame);
+            // A cable that always has room is not worth LZ4's time: the quarter that only it makes shorter stays raw, too.
+            assert!(bytes < 40 * raw_frame * 60 / 100, "{bytes} of {}", 40 * raw_frame);
             // A frame like the one before is a FRAME_COMMIT and nothing else.
             let planes = structured(r, 39);
             rig.step_with(40, &planes);
