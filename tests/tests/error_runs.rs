@@ -2,8 +2,9 @@
 
 use dpm_device::planes::Raster;
 use dpm_host::config::{Overrides, RigConfig};
+use dpm_host::experiments::error_export::FrameIndex;
 use dpm_host::experiments::error_plan::Group;
-use dpm_host::experiments::error_runs::{ErrorOptions, ErrorRuns};
+use dpm_host::experiments::error_runs::{ErrorOptions, ErrorRuns, Extent, EYE_FRAMES};
 use dpm_host::experiments::run_rig::open_gpu;
 use dpm_host::experiments::sequence::{rmse, Span, Theatre};
 use dpm_host::gpu::Gpu;
@@ -42,12 +43,13 @@ fn independent_samples_fall_by_half_an_order_an_order() {
 fn a_group_is_measured_at_equal_rays_and_tells_bias_from_noise() {
     let (rig, gpu) = stage();
     let cache = std::env::temp_dir().join(format!("dpm-error-{}", std::process::id()));
-    let options =
-        ErrorOptions { warm_up: 8, kept: 48, reference_spp: 16, ablation: false, cache: cache.clone() };
+    let extent = Extent { warm_up: 8, kept: 48, reference_spp: 16 };
+    let options = ErrorOptions { extent, ablation: false, cache: cache.clone() };
     let runs = ErrorRuns::new(rig, gpu, options);
     let group = Group { moving: false, budget: 4.0 };
     let mut drawn = Vec::new();
-    let result = runs.measure(group, &mut |what| drawn.push(what.to_owned())).unwrap().result;
+    let measured = runs.measure(group, &mut |what| drawn.push(what.to_owned())).unwrap();
+    let result = measured.result.clone();
     assert_eq!(drawn.iter().filter(|d| *d == "reference").count(), 2);
     for r in &result.rows {
         assert!((r.rays_to_paper - 1.0).abs() < 0.05, "{}: {} of paper's rays", r.method, r.rays_to_paper);
@@ -59,13 +61,52 @@ fn a_group_is_measured_at_equal_rays_and_tells_bias_from_noise() {
             r.perceived_rmse
         );
         assert!(r.perceived_rmse < r.single_rmse, "{}: the eye sees less noise than a frame has", r.method);
+        assert!(r.gpu_ms > 0.0 || r.wall_ms > 0.0);
     }
     let full = result.rows.iter().find(|r| r.method == "full").unwrap();
     assert!(full.bias < 0.5 * full.noise, "full is unbiased: {} beside {}", full.bias, full.noise);
-    // The second time the reference comes from the cache and the numbers are the same.
+    // Stopped before the group was kept: reference and methods come from the cache, only times are taken again.
     drawn.clear();
-    let again = runs.measure(group, &mut |what| drawn.push(what.to_owned())).unwrap().result;
-    assert!(!drawn.iter().any(|d| d == "reference"));
-    assert_eq!(again.rows[1].perceived_rmse, full.perceived_rmse);
+    let again = runs.measure(group, &mut |what| drawn.push(what.to_owned())).unwrap();
+    assert_eq!(drawn, ["times"]);
+    assert_eq!(again.result.rows[1].perceived_rmse, full.perceived_rmse);
+    // Once the group is kept as a whole, its parts are not.
+    let parts = || {
+        let entries = std::fs::read_dir(&cache).unwrap();
+        entries.filter(|e| e.as_ref().unwrap().file_name().to_string_lossy().starts_with("part-")).count()
+    };
+    assert_eq!(parts(), result.rows.len());
+    measured.is_kept();
+    assert_eq!(parts(), 0);
+    // The frames on disk are those that were measured: the mean of the last 31 of them is what the eye saw.
+    let dir = cache.join("frames");
+    runs.export(group, &result, &dir, &mut |_| ()).unwrap();
+    let index: FrameIndex =
+        serde_json::from_slice(&std::fs::read(dir.join("sequence.json")).unwrap()).unwrap();
+    assert!((index.frame_rate_hz - 947.0).abs() < 1.0 && index.frames == 48 && index.pixels_per_degree > 0.1);
+    let frame = |folder: &str, k: usize| -> Vec<f32> {
+        let bytes = std::fs::read(dir.join(folder).join(format!("{k:04}.pfm"))).unwrap();
+        let body = bytes.strip_prefix(b"PF\n40 30\n-1.0\n").unwrap();
+        body.chunks_exact(4).map(|c| f32::from_le_bytes(c.try_into().unwrap())).collect()
+    };
+    for (method, (name, eye)) in index.methods.iter().zip(&again.eyes) {
+        assert_eq!(method.method, *name);
+        let mut mean = vec![0.0f64; 40 * 30 * 3];
+        for k in 48 - EYE_FRAMES..48 {
+            mean.iter_mut()
+                .zip(frame(&method.folder, k))
+                .for_each(|(m, v)| *m += f64::from(v) / EYE_FRAMES as f64);
+        }
+        for (&pixel, v) in again.pixels.iter().zip(eye) {
+            // Rows of the file run from the bottom.
+            let (x, y) = (pixel as usize % 40, 29 - pixel as usize / 40);
+            let at = &mean[(y * 40 + x) * 3..][..3];
+            assert!(
+                v.to_array().iter().zip(at).all(|(a, b)| (f64::from(*a) - b).abs() < 1e-5),
+                "{name} {pixel}"
+            );
+        }
+    }
+    assert_eq!(frame("reference", 0), frame("reference", 47), "nothing moves");
     std::fs::remove_dir_all(cache).unwrap();
 }

@@ -1,26 +1,24 @@
 //! `dpm error`: error against cost of every method, as tables and curves.
 
+use super::error_files::{known, merge, report, report_figure3, save, write};
+use super::progress::Progress;
 use super::rig_args::RigArgs;
 use super::watch::print;
 use crate::experiments::error_figure3::{self, Figure3Group, Setting};
 use crate::experiments::error_plan::{groups, Group};
-use crate::experiments::error_plot::{self, curves, Cost};
-use crate::experiments::error_report::{csv, markdown};
-use crate::experiments::error_runs::{ErrorOptions, ErrorRunError, ErrorRuns, GroupResult};
-use crate::experiments::error_sheet::{stack, strip};
+use crate::experiments::error_report::markdown;
+use crate::experiments::error_runs::{
+    ErrorOptions, ErrorRunError, ErrorRuns, Extent, GroupResult, EYE_FRAMES,
+};
+use crate::experiments::error_sheet::strip;
 use crate::experiments::run_rig::open_gpu;
-use crate::experiments::snapshot::paint::Canvas;
 use crate::experiments::stamp::Stamp;
 use crate::failure::{Failure, FailureKind};
-use crate::files::write_atomically;
 use crate::gpu::Gpu;
 use crate::pipeline::PipelineError;
 use crate::rig::Rig;
 use crate::telemetry::report::to_json;
 use dpm_device::planes::Raster;
-use indicatif::{ProgressBar, ProgressStyle};
-use serde::de::DeserializeOwned;
-use std::io::Write;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
@@ -57,6 +55,9 @@ pub struct ErrorArgs {
     /// Measure this group only; `dpm error merge` joins them
     #[arg(long, value_name = "N")]
     index: Option<usize>,
+    /// Also write what the eye saw of every method and of the reference, frame by frame, for metrics of others: OUT/sequences
+    #[arg(long, conflicts_with = "preset")]
+    sequences: bool,
     /// Print one JSON object
     #[arg(long)]
     json: bool,
@@ -111,9 +112,7 @@ pub fn execute(args: &ErrorArgs) -> Result<(), Failure> {
     };
     let all = groups(&budgets);
     if args.list {
-        let lines: String = all.iter().enumerate().map(|(i, g)| format!("{i} {}\n", g.name())).collect();
-        print(&lines);
-        return Ok(());
+        return list(args, all.iter().map(Group::name));
     }
     let chosen = chosen(args, &all)?;
     let out = folder(args);
@@ -131,6 +130,14 @@ fn folder(args: &ErrorArgs) -> PathBuf {
     args.flags.out.clone().unwrap_or_else(|| own.into())
 }
 
+/// Names with their numbers. A rig file that cannot be run has no groups.
+fn list(args: &ErrorArgs, names: impl Iterator<Item = String>) -> Result<(), Failure> {
+    args.flags.rig(args.rig.as_deref())?;
+    let lines: String = names.enumerate().map(|(i, name)| format!("{i} {name}\n")).collect();
+    print(&lines);
+    Ok(())
+}
+
 /// What `--index` names, or all.
 fn chosen<T: Copy>(args: &ErrorArgs, all: &[T]) -> Result<Vec<T>, Failure> {
     match args.index {
@@ -145,10 +152,12 @@ fn chosen<T: Copy>(args: &ErrorArgs, all: &[T]) -> Result<Vec<T>, Failure> {
 
 fn options(args: &ErrorArgs, out: &Path) -> ErrorOptions {
     ErrorOptions {
-        warm_up: if args.quick { 48 } else { 96 },
-        // 250 ms at 947 fps: 33 ms for the eye at the end, flicker down to 4 Hz.
-        kept: 237,
-        reference_spp: args.reference_spp.unwrap_or(if args.quick { 128 } else { 1000 }),
+        extent: Extent {
+            warm_up: if args.quick { 48 } else { 96 },
+            // 250 ms at 947 fps: 33 ms for the eye at the end, flicker down to 4 Hz.
+            kept: 237,
+            reference_spp: args.reference_spp.unwrap_or(if args.quick { 128 } else { 1000 }),
+        },
         ablation: args.ablation,
         cache: out.join("cache"),
     }
@@ -168,35 +177,22 @@ fn prepare(args: &ErrorArgs, out: &Path) -> Result<ErrorRuns, Failure> {
     Ok(ErrorRuns::new(Arc::new(rig), gpu, options(args, out)))
 }
 
-fn progress(steps: usize) -> ProgressBar {
-    let bar = ProgressBar::new(steps as u64);
-    let style = ProgressStyle::with_template("{bar:30} {pos}/{len} {elapsed} (left {eta}) {msg}");
-    bar.set_style(style.expect("the template is right"));
-    bar
-}
-
-/// What an earlier run left in `path`, when it was made from the same.
-fn known<T: DeserializeOwned>(path: &Path, fits: impl Fn(&T) -> bool) -> Option<T> {
-    std::fs::read(path).ok().and_then(|b| serde_json::from_slice(&b).ok()).filter(fits)
-}
-
 fn figure3(args: &ErrorArgs) -> Result<(), Failure> {
     let all = Setting::all();
     if args.list {
-        let lines: String = all.iter().enumerate().map(|(i, s)| format!("{i} {}\n", s.name())).collect();
-        print(&lines);
-        return Ok(());
+        return list(args, all.iter().map(|s| s.name()));
     }
     let (out, chosen) = (folder(args), chosen(args, &all)?);
     let options = options(args, &out);
     let (gpu, rig) = stage(args)?;
     let raster = rig.camera.raster;
     let stamp = Stamp::new(&rig, gpu.summary());
-    let steps = 2 * error_figure3::SPP.len() + 2;
-    let bar = progress(steps * chosen.len());
+    let reference = EYE_FRAMES as u64 * u64::from(options.extent.reference_spp) / 2;
+    let sequence = |spp: u32| EYE_FRAMES as u64 * (u64::from(spp) + 3);
+    let whole = 2 * (reference + error_figure3::SPP.into_iter().map(sequence).sum::<u64>());
+    let mut progress = Progress::new(&vec![whole; chosen.len()]);
     let mut groups = Vec::new();
-    for (k, &setting) in chosen.iter().enumerate() {
-        bar.set_position((steps * k) as u64);
+    for &setting in &chosen {
         let key = error_figure3::key(&stamp, setting, &options, &error_figure3::SPP);
         let path = out.join(format!("figure3-{}-{key}.json", setting.name()));
         let group = match known(&path, |g: &Figure3Group| g.key == key) {
@@ -204,8 +200,8 @@ fn figure3(args: &ErrorArgs) -> Result<(), Failure> {
             None => {
                 let rig = Rig::build(&rig.config, Some(raster))?;
                 let mut each = |what: &str| {
-                    bar.set_message(format!("{} {what}", setting.name()));
-                    bar.inc(1);
+                    let spp = what.split(' ').next().and_then(|n| n.parse().ok());
+                    progress.step(&format!("{} {what}", setting.name()), spp.map_or(reference, sequence));
                 };
                 let measured =
                     error_figure3::measure(rig, &gpu, setting, &options, &error_figure3::SPP, &mut each)
@@ -214,9 +210,9 @@ fn figure3(args: &ErrorArgs) -> Result<(), Failure> {
                 measured
             }
         };
+        progress.end_of_part(&setting.name());
         groups.push(group);
     }
-    bar.finish_and_clear();
     if args.index.is_some() && !args.json {
         print(&error_figure3::markdown(&groups));
         return Ok(());
@@ -224,16 +220,17 @@ fn figure3(args: &ErrorArgs) -> Result<(), Failure> {
     report_figure3(&out, &groups, args.json)
 }
 
-fn report_figure3(out: &Path, groups: &[Figure3Group], json: bool) -> Result<(), Failure> {
-    let object = to_json(&serde_json::json!({ "groups": groups }));
-    let table = error_figure3::markdown(groups);
-    write(&out.join("figure3.json"), &object)?;
-    write(&out.join("figure3.csv"), &error_figure3::csv(groups))?;
-    write(&out.join("figure3.md"), &table)?;
-    let svg = error_plot::figure3(groups).map_err(|e| Failure::new(FailureKind::BadInput, e))?;
-    write(&out.join("figure3.svg"), &svg)?;
-    print(&if json { object + "\n" } else { table });
-    Ok(())
+/// What a sequence costs beside the others, for the time that is left: sample frames, and as much for each frame as 3 samples take.
+fn weight(what: &str, group: Group, extent: Extent, methods: usize) -> u64 {
+    let frames = f64::from(extent.warm_up + extent.kept);
+    let sequence = frames * (group.budget.max(1.0) + 3.0);
+    let of = match what {
+        "reference" => EYE_FRAMES as f64 * f64::from(extent.reference_spp) / 2.0,
+        "reference of every frame" => f64::from(extent.kept * extent.reference_spp),
+        "times" => 40.0 / frames * sequence * methods as f64,
+        _ => sequence,
+    };
+    of as u64
 }
 
 fn measure(
@@ -242,29 +239,45 @@ fn measure(
     args: &ErrorArgs,
     out: &Path,
 ) -> Result<Vec<GroupResult>, Failure> {
-    let per_group = if args.ablation { 8 } else { 4 } * 2;
-    let bar = progress(per_group * chosen.len());
+    let extent = options(args, out).extent;
+    let methods = if args.ablation { 8 } else { 4 };
+    let path = |group: Group| out.join(format!("group-{}-{}.json", group.name(), runs.key(group)));
+    let earlier = |group: Group| known(&path(group), |r: &GroupResult| r.key == runs.key(group));
+    let sequences = |group: Group| out.join("sequences").join(group.name());
+    let total = |group: Group, first: bool| {
+        let of = |what: &str| weight(what, group, extent, methods);
+        let reference = if first { 2 * of("reference") } else { 0 };
+        let every = if group.moving { of("reference of every frame") } else { 0 };
+        let measured =
+            if earlier(group).is_some() { 0 } else { 2 * methods as u64 * of("") + of("times") + reference };
+        measured + if args.sequences { methods as u64 * of("") + every } else { 0 }
+    };
+    let first = |k: usize| chosen[..k].iter().all(|g| g.moving != chosen[k].moving);
+    let totals: Vec<u64> = chosen.iter().enumerate().map(|(k, &g)| total(g, first(k))).collect();
+    let mut progress = Progress::new(&totals);
     let mut results = Vec::new();
-    for (k, &group) in chosen.iter().enumerate() {
-        bar.set_position((per_group * k) as u64);
-        let path = out.join(format!("group-{}-{}.json", group.name(), runs.key(group)));
-        let key = runs.key(group);
-        let result = match known(&path, |r: &GroupResult| r.key == key) {
+    for &group in chosen {
+        let name = group.name();
+        let mut each =
+            |what: &str| progress.step(&format!("{name} {what}"), weight(what, group, extent, methods));
+        let result = match earlier(group) {
             Some(known) => known,
             None => {
-                let measured = runs.measure(group, &mut |what| {
-                    bar.set_message(format!("{} {what}", group.name()));
-                    bar.inc(1);
-                });
-                let measured = measured.map_err(failure)?;
-                save(&path.with_extension("png"), &strip(&measured, &group.name()))?;
+                let measured = runs.measure(group, &mut each).map_err(failure)?;
+                let path = path(group);
+                save(&path.with_extension("png"), &strip(&measured, &name))?;
                 write(&path, &to_json(&measured.result))?;
-                measured.result
+                let result = measured.result.clone();
+                measured.is_kept();
+                result
             }
         };
+        if args.sequences {
+            runs.export(group, &result, &sequences(group), &mut each).map_err(failure)?;
+        }
+        progress.end_of_part(&name);
         results.push(result);
     }
-    bar.finish_and_clear();
     Ok(results)
 }
 
@@ -273,87 +286,4 @@ fn failure(error: ErrorRunError) -> Failure {
         ErrorRunError::Render(e) => PipelineError::from(e).into(),
         other => Failure::new(FailureKind::BadInput, other),
     }
-}
-
-/// Joins what lies in a folder: groups of methods, settings of figure 3, or both.
-fn merge(out: &Path, json: bool) -> Result<(), Failure> {
-    let mut groups: Vec<GroupResult> = read_all(out, "group-")?;
-    let place = |g: &GroupResult| g.rows.first().map_or((false, 0.0), |r| (r.moving, r.budget));
-    groups.sort_by(|a, b| {
-        let ((am, ab), (bm, bb)) = (place(a), place(b));
-        am.cmp(&bm).then(ab.total_cmp(&bb))
-    });
-    let settings: Vec<Figure3Group> = read_all(out, "figure3-")?;
-    if groups.is_empty() && settings.is_empty() {
-        let out = out.display();
-        let told = format!("{out}: no measured groups; run dpm error RIG.toml --index N --out {out} first");
-        return Err(Failure::new(FailureKind::BadInput, told));
-    }
-    if !settings.is_empty() {
-        report_figure3(out, &settings, json)?;
-    }
-    if groups.is_empty() {
-        return Ok(());
-    }
-    report(out, &groups, json)
-}
-
-/// Every measured file of a folder whose name begins like this, by name.
-fn read_all<T: DeserializeOwned>(out: &Path, prefix: &str) -> Result<Vec<T>, Failure> {
-    let Ok(entries) = std::fs::read_dir(out) else { return Ok(Vec::new()) };
-    let mut paths: Vec<PathBuf> = entries
-        .filter_map(|e| Some(e.ok()?.path()))
-        .filter(|p| {
-            let name = p.file_name().unwrap_or_default().to_string_lossy();
-            name.starts_with(prefix) && name.ends_with(".json")
-        })
-        .collect();
-    paths.sort();
-    let mut found = Vec::new();
-    for path in paths {
-        let bad = |e: &dyn std::fmt::Display| {
-            let told = format!("{}: {e}; delete it and measure the group again", path.display());
-            Failure::new(FailureKind::BadInput, told)
-        };
-        let bytes = std::fs::read(&path).map_err(|e| bad(&e))?;
-        found.push(serde_json::from_slice::<T>(&bytes).map_err(|e| bad(&e))?);
-    }
-    Ok(found)
-}
-
-fn report(out: &Path, groups: &[GroupResult], json: bool) -> Result<(), Failure> {
-    let object = to_json(&serde_json::json!({ "groups": groups }));
-    write(&out.join("error.json"), &object)?;
-    write(&out.join("error.csv"), &csv(groups))?;
-    let table = markdown(groups);
-    write(&out.join("error.md"), &table)?;
-    for (moving, motion) in [(false, "still"), (true, "moving")] {
-        for (cost, name) in [(Cost::Rays, "rays"), (Cost::GpuMs, "ms")] {
-            let svg = curves(groups, moving, cost).map_err(|e| Failure::new(FailureKind::BadInput, e))?;
-            write(&out.join(format!("error-{motion}-{name}.svg")), &svg)?;
-        }
-    }
-    let sheets: Vec<Canvas> = groups.iter().filter_map(|g| Canvas::load(&sheet_path(out, g))).collect();
-    if !sheets.is_empty() {
-        save(&out.join("error.png"), &stack(&sheets))?;
-    }
-    print(&if json { object + "\n" } else { table });
-    Ok(())
-}
-
-/// Where the contact sheet of a measured group lies: beside its numbers.
-fn sheet_path(out: &Path, g: &GroupResult) -> PathBuf {
-    let name = g.rows.first().map_or(String::new(), |r| Group { moving: r.moving, budget: r.budget }.name());
-    out.join(format!("group-{name}-{}.png", g.key))
-}
-
-fn save(path: &Path, canvas: &Canvas) -> Result<(), Failure> {
-    canvas
-        .save(path)
-        .map_err(|e| Failure::new(FailureKind::BadInput, format!("{e}; choose another folder with --out")))
-}
-
-fn write(path: &Path, text: &str) -> Result<(), Failure> {
-    write_atomically(path, |w| w.write_all(text.as_bytes()))
-        .map_err(|e| Failure::new(FailureKind::BadInput, format!("{e}; choose another folder with --out")))
 }

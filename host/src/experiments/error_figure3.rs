@@ -108,7 +108,7 @@ fn dressed(mut rig: Rig, look: usize) -> (Rig, usize) {
 pub fn key(stamp: &Stamp, setting: Setting, options: &ErrorOptions, spp: &[u32]) -> String {
     let mut hash = Fnv::default();
     // Writing into a hash cannot fail.
-    let _ = write!(hash, "figure 3 {stamp:?}{setting:?}{:?}{spp:?}{}", looks(), options.reference_spp);
+    let _ = write!(hash, "figure 3 {stamp:?}{setting:?}{:?}{spp:?}{}", looks(), options.extent.reference_spp);
     hash.text()
 }
 
@@ -127,7 +127,7 @@ pub fn measure(
     let stamp = Stamp::new(&rig, gpu.summary());
     let (rig, body) = dressed(rig, setting.look);
     let seed = rig.config.render.seed as u32;
-    let span = Span { last_slot: options.last_slot(), warm_up: 0, kept: EYE_FRAMES as u32 };
+    let span = Span { last_slot: options.extent.last_slot(), warm_up: 0, kept: EYE_FRAMES as u32 };
     let make = if setting.moving { Theatre::new } else { Theatre::frozen };
     let theatre = make(Arc::new(rig), gpu.clone(), span)?;
     let on_body = |i: usize| theatre.probes()[i].body == body;
@@ -143,7 +143,7 @@ pub fn measure(
         setting.moving,
         span.last_slot
     );
-    let reference = Reference::new(&theatre, options.reference_spp, &what, &options.cache, each)?;
+    let reference = Reference::new(&theatre, options.extent.reference_spp, &what, &options.cache, each)?;
     let seen: Vec<Vec3> =
         (0..theatre.probes().len()).filter(|&i| on_body(i)).map(|i| reference.eye[i]).collect();
     let mean = mean_of(&seen).max(f64::MIN_POSITIVE);

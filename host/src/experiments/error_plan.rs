@@ -58,6 +58,11 @@ pub fn paper_at(method: &Method, budget: f64) -> Method {
     scaled
 }
 
+/// A method's name as part of a file's.
+pub fn file_word(name: &str) -> String {
+    name.chars().map(|c| if c.is_ascii_alphanumeric() { c } else { '_' }).collect()
+}
+
 /// One group: all methods at the rays that `paper` takes.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Group {

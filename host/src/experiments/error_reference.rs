@@ -72,17 +72,23 @@ impl Reference {
     }
 
     /// RMS bias: the mean product of the two runs' differences from the two halves. No noise of any of the four is in it, so its
-    /// expectation is the squared bias; 0 where chance makes it negative.
-    pub fn bias(&self, eyes: &[Vec<Vec3>; 2]) -> f64 {
-        let (mut sum, mut n) = (0.0f64, 0u64);
+    /// expectation is the squared bias; 0 where chance makes it negative. Second: root of the standard error of that mean over the
+    /// probes, what chance leaves of a bias of 0.
+    pub fn bias(&self, eyes: &[Vec<Vec3>; 2]) -> (f64, f64) {
+        let (mut sum, mut squares, mut n) = (0.0f64, 0.0f64, 0u64);
         for (((a, b), r), s) in eyes[0].iter().zip(&eyes[1]).zip(&self.halves[0]).zip(&self.halves[1]) {
-            let product = ((*a - *r) * (*b - *s)).as_dvec3().element_sum();
+            // Mean over channels: they share their paths, so they do not count as three.
+            let product = ((*a - *r) * (*b - *s)).as_dvec3().element_sum() / 3.0;
             if product.is_finite() {
                 sum += product;
-                n += 3;
+                squares += product * product;
+                n += 1;
             }
         }
-        (sum / n.max(1) as f64).max(0.0).sqrt()
+        let n = n.max(1) as f64;
+        let (mean, mean_square) = (sum / n, squares / n);
+        let error = ((mean_square - mean * mean).max(0.0) / n).sqrt();
+        (mean.max(0.0).sqrt(), error.sqrt())
     }
 }
 
@@ -133,7 +139,12 @@ mod tests {
         let error = 0.5 * rmse(&halves[0], &halves[1], |_| true);
         let reference = Reference { halves, last: eye.clone(), eye, error };
         let eyes = [noisy(1.2, 0.3, 2), noisy(1.2, 0.3, 3)];
-        assert!((reference.bias(&eyes) - 0.2).abs() < 1e-4, "{}", reference.bias(&eyes));
+        let (bias, floor) = reference.bias(&eyes);
+        assert!((bias - 0.2).abs() < 1e-4, "{bias}");
+        // Deviations of 0.3 and 0.05 about 0.2: the product's variance is that of (0.2 + x - r)(0.2 + y - s), over 1024 probes.
+        let own = 0.3f64.powi(2) + 0.05f64.powi(2);
+        let wanted = ((own * own + 2.0 * 0.04 * own) / 1024.0).sqrt().sqrt();
+        assert!((floor / wanted - 1.0).abs() < 0.01, "{floor}, not {wanted}");
         let (raw, clean) = reference.perceived(&eyes, &|_| true);
         let wanted = (0.2f64.powi(2) + 0.3f64.powi(2)).sqrt();
         assert!((clean - wanted).abs() < 1e-4, "{clean}");

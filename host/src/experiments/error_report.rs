@@ -1,6 +1,7 @@
 //! Measured groups into what people read: CSV, and Markdown tables at equal rays, at equal time and at equal error.
 
 use super::error_runs::{ErrorRow, GroupResult};
+use super::stamp::Stamp;
 use std::fmt::Write;
 
 fn optional(v: Option<f64>) -> String {
@@ -11,7 +12,7 @@ fn optional(v: Option<f64>) -> String {
 pub fn csv(groups: &[GroupResult]) -> String {
     let mut text = String::from(
         "device,driver,commit,config,seed,motion,budget,method,spp,rays,rays_to_paper,samples,gpu_ms,wall_ms,single_rmse,single_rel_mse,\
-         perceived_rmse,perceived_rmse_raw,perceived_fovea,perceived_periphery,bias,noise,mean_shift,flip,flicker,\
+         perceived_rmse,perceived_rmse_raw,perceived_fovea,perceived_periphery,bias,bias_floor,noise,mean_shift,flip,flicker,\
          flicker_periphery,ratio_to_paper,reference_error\n",
     );
     for g in groups {
@@ -19,7 +20,7 @@ pub fn csv(groups: &[GroupResult]) -> String {
             // Writing into a string cannot fail.
             let _ = writeln!(
                 text,
-                "{},{},{},\"{}\",{:.4},{:.1},{:.5},{:.1},{:.6},{:.6},{:.6e},{:.6e},{:.6e},{:.6e},{},{},{:.6e},{:.6e},{:.6e},{:.6e},{:.6e},{},{:.5},{:.6e}",
+                "{},{},{},\"{}\",{:.4},{:.1},{:.5},{:.1},{:.6},{:.6},{:.6e},{:.6e},{:.6e},{:.6e},{},{},{:.6e},{:.6e},{:.6e},{:.6e},{:.6e},{:.6e},{},{:.5},{:.6e}",
                 g.stamp.csv(),
                 if r.moving { "moving" } else { "still" },
                 r.budget,
@@ -37,6 +38,7 @@ pub fn csv(groups: &[GroupResult]) -> String {
                 optional(r.perceived_fovea),
                 optional(r.perceived_periphery),
                 r.bias,
+                r.bias_floor,
                 r.noise,
                 r.mean_shift,
                 r.flip,
@@ -53,15 +55,22 @@ pub fn csv(groups: &[GroupResult]) -> String {
 /// All rows as a Markdown table, with the stamp above and the best of the others beside dpm below.
 pub fn markdown(groups: &[GroupResult]) -> String {
     let mut text = String::new();
-    if let Some(g) = groups.first() {
-        text += &g.stamp.line();
+    let mut stamps: Vec<&Stamp> = Vec::new();
+    for g in groups {
+        if !stamps.contains(&&g.stamp) {
+            stamps.push(&g.stamp);
+            text += &g.stamp.line();
+        }
     }
-    text += "| motion | budget | method | rays/frame | rays / paper | GPU ms | single RMSE | perceived RMSE | bias | noise | FLIP | flicker | perceived / paper |\n";
-    text += "|---|---:|---|---:|---:|---:|---:|---:|---:|---:|---:|---:|---:|\n";
+    if stamps.len() > 1 {
+        text += "Times of different devices, drivers or commits are in these tables: only rows of one group can be compared in time.\n\n";
+    }
+    text += "| motion | budget | method | rays/frame | rays / paper | GPU ms | single RMSE | perceived RMSE | bias | of chance | noise | FLIP | flicker | perceived / paper |\n";
+    text += "|---|---:|---|---:|---:|---:|---:|---:|---:|---:|---:|---:|---:|---:|\n";
     for r in groups.iter().flat_map(|g| &g.rows) {
         let _ = writeln!(
             text,
-            "| {} | {} | {} | {:.0} | {:.3} | {:.2} | {:.4} | {:.5} | {:.5} | {:.5} | {:.4} | {:.5} | {:.2} |",
+            "| {} | {} | {} | {:.0} | {:.3} | {:.2} | {:.4} | {:.5} | {:.5} | {:.5} | {:.5} | {:.4} | {:.5} | {:.2} |",
             if r.moving { "moving" } else { "still" },
             r.budget,
             r.method,
@@ -71,6 +80,7 @@ pub fn markdown(groups: &[GroupResult]) -> String {
             r.single_rmse,
             r.perceived_rmse,
             r.bias,
+            r.bias_floor,
             r.noise,
             r.flip,
             r.flicker,

@@ -4,16 +4,16 @@
 //! their difference is the flicker of one of them, without any reference. The reference comes in two independent halves for the same
 //! reason: half of their difference is its own error, and its power is taken off what is measured against it.
 
+use super::error_parts::Part;
 use super::error_plan::{contenders, paper_at, Contender, Group};
 use super::error_reference::{mean_of, Reference};
-use super::median::median_ms;
 use super::sequence::{eye_mean, rmse, Seen, Span, Theatre};
 use super::stamp::{Fnv, Stamp};
 use crate::gpu::Gpu;
 use crate::metrics::error::compare;
 use crate::metrics::flicker::TileSeries;
 use crate::metrics::flip::{mean_flip, DEFAULT_PIXELS_PER_DEGREE};
-use crate::metrics::{luminance, MetricError, Picture};
+use crate::metrics::{luminance, white_of, MetricError, Picture};
 use crate::render::method::Method;
 use crate::render::RenderError;
 use crate::rig::Rig;
@@ -24,18 +24,25 @@ use std::fmt::Write as _;
 use std::path::PathBuf;
 use std::sync::Arc;
 
-/// How much is drawn.
-#[derive(Clone, Debug)]
-pub struct ErrorOptions {
+/// How much is drawn of every sequence.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+pub struct Extent {
     /// Frames before those that count.
     pub warm_up: u32,
     /// Frames that count: flicker is measured over all of them, the eye over the last [`EYE_FRAMES`].
     pub kept: u32,
     /// Samples a pixel and frame of the reference, both halves together.
     pub reference_spp: u32,
+}
+
+/// What is drawn.
+#[derive(Clone, Debug)]
+pub struct ErrorOptions {
+    /// How much.
+    pub extent: Extent,
     /// Dpm with each part off in turn is measured too.
     pub ablation: bool,
-    /// Folder for references.
+    /// Folder for references, and for methods whose group is not complete yet.
     pub cache: PathBuf,
 }
 
@@ -63,9 +70,9 @@ pub struct ErrorRow {
     pub rays_to_paper: f64,
     /// Samples of a frame.
     pub samples: f64,
-    /// GPU time of a frame, median, ms; 0 without time stamps.
+    /// GPU time of a frame, ms, in turns with the other methods; 0 without time stamps.
     pub gpu_ms: f64,
-    /// Time of a frame until its light is known, median, ms.
+    /// Time of a frame until its light is known, ms.
     pub wall_ms: f64,
     /// RMSE of the last frame alone.
     pub single_rmse: f64,
@@ -81,6 +88,8 @@ pub struct ErrorRow {
     pub perceived_periphery: Option<f64>,
     /// RMS over probes of what both runs have in common against the reference: lag, smear, filtering.
     pub bias: f64,
+    /// What chance alone makes of `bias` in an unbiased method, one standard deviation: less than this is none that can be told.
+    pub bias_floor: f64,
     /// RMS of the eye's noise.
     pub noise: f64,
     /// Mean of the picture against the reference's, minus 1.
@@ -102,6 +111,8 @@ pub struct GroupResult {
     pub stamp: Stamp,
     /// Hash of all that the result depends on.
     pub key: String,
+    /// How much was drawn.
+    pub extent: Extent,
     /// Probes: lit surface points that the eye follows.
     pub probes: usize,
     /// Their mean radiance.
@@ -124,9 +135,17 @@ pub struct Measured {
     pub reference: Vec<Vec3>,
     /// By method, in the order of the rows: what it saw in the first run.
     pub eyes: Vec<(&'static str, Vec<Vec3>)>,
+    parts: Vec<Part>,
 }
 
-impl ErrorOptions {
+impl Measured {
+    /// The group is kept as a whole: what was kept of its methods one by one is not needed any more.
+    pub fn is_kept(self) {
+        self.parts.iter().for_each(Part::remove);
+    }
+}
+
+impl Extent {
     /// Slot of the last frame of every sequence.
     pub fn last_slot(&self) -> u64 {
         u64::from(self.warm_up + self.kept) + 50
@@ -152,10 +171,10 @@ pub enum ErrorRunError {
 
 /// Draws and compares the groups of one rig.
 pub struct ErrorRuns {
-    rig: Arc<Rig>,
+    pub(super) rig: Arc<Rig>,
     gpu: Arc<Gpu>,
-    options: ErrorOptions,
-    stamp: Stamp,
+    pub(super) options: ErrorOptions,
+    pub(super) stamp: Stamp,
 }
 
 impl ErrorRuns {
@@ -174,49 +193,66 @@ impl ErrorRuns {
     pub fn key(&self, group: Group) -> String {
         let (o, mut hash) = (&self.options, Fnv::default());
         // Writing into a hash cannot fail.
-        let _ =
-            write!(hash, "{:?}{group:?}{}{}{}{}", self.stamp, o.warm_up, o.kept, o.reference_spp, o.ablation);
+        let _ = write!(hash, "{:?}{group:?}{:?}{}", self.stamp, o.extent, o.ablation);
         hash.text()
     }
 
-    fn theatre(&self, group: Group, warm_up: u32, kept: u32) -> Result<Theatre, RenderError> {
-        let span = Span { last_slot: self.options.last_slot(), warm_up, kept };
+    /// The group's sequence: its last `warm_up` and `kept` frames.
+    pub(super) fn theatre(&self, group: Group, warm_up: u32, kept: u32) -> Result<Theatre, RenderError> {
+        let span = Span { last_slot: self.options.extent.last_slot(), warm_up, kept };
         let make = if group.moving { Theatre::new } else { Theatre::frozen };
         make(self.rig.clone(), self.gpu.clone(), span)
     }
 
-    /// Measures all methods of a group at the rays of `paper`. `each` is called before every sequence with its name.
+    /// The methods of a group; `paper` has the samples of the group's budget.
+    pub(super) fn contenders(&self, group: Group) -> Vec<Contender> {
+        let mut all = contenders(&self.rig.config.render, self.options.ablation);
+        all[0].method = paper_at(&all[0].method, group.budget.max(1.0));
+        all
+    }
+
+    /// The group's reference, from the cache where it lies there. What it converges to depends neither on the methods' seed nor on how
+    /// long the methods run.
+    pub(super) fn reference(
+        &self,
+        group: Group,
+        each: &mut dyn FnMut(&str),
+    ) -> Result<Reference, ErrorRunError> {
+        let (o, stamp) = (&self.options, &self.stamp);
+        let what = format!("{}{:?}{}{}", stamp.config_hash, stamp.raster, group.moving, o.extent.last_slot());
+        let short = self.theatre(group, 0, EYE_FRAMES as u32)?;
+        Reference::new(&short, o.extent.reference_spp, &what, &o.cache, each)
+    }
+
+    /// Measures all methods of a group at the rays of `paper`. `each` is called before every sequence with its name. Methods that an
+    /// earlier call has measured before it was stopped are not drawn again.
     ///
     /// # Errors
     /// The renderer's; nothing lit; the cache cannot be written.
     pub fn measure(&self, group: Group, each: &mut dyn FnMut(&str)) -> Result<Measured, ErrorRunError> {
-        let o = &self.options;
-        let theatre = self.theatre(group, o.warm_up, o.kept)?;
+        let (o, key) = (&self.options, self.key(group));
+        let theatre = self.theatre(group, o.extent.warm_up, o.extent.kept)?;
         if theatre.probes().is_empty() {
             return Err(ErrorRunError::NothingLit);
         }
-        // What the picture converges to depends neither on the methods' seed nor on how long the methods run.
-        let stamp = &self.stamp;
-        let what =
-            format!("{}{:?}{}{}", stamp.config_hash, stamp.raster, group.moving, self.options.last_slot());
-        let short = self.theatre(group, 0, EYE_FRAMES as u32)?;
-        let reference = Reference::new(&short, o.reference_spp, &what, &o.cache, each)?;
-        let mut rows: Vec<ErrorRow> = Vec::new();
-        let mut eyes = Vec::new();
+        let reference = self.reference(group, each)?;
+        let contenders = self.contenders(group);
+        let parts: Vec<Part> = (contenders.iter().map(|c| Part::new(&o.cache, &key, c.name))).collect();
+        let (mut rows, mut eyes): (Vec<ErrorRow>, Vec<_>) = (Vec::new(), Vec::new());
         let mut wanted = None;
-        for contender in contenders(&self.rig.config.render, o.ablation) {
-            let (contender, spp) = match wanted {
+        for (contender, part) in contenders.iter().zip(&parts) {
+            let (mut row, eye) = match part.read(theatre.probes().len()) {
+                Some(known) => known,
                 None => {
-                    let budget = group.budget.max(1.0);
-                    let method = paper_at(&contender.method, budget);
-                    (Contender { method, ..contender }, budget as f32)
-                }
-                Some(rays) => {
-                    let spp = self.spp_for(group, &contender.method, rays)?;
-                    (contender, spp)
+                    let spp = match wanted {
+                        None => group.budget.max(1.0) as f32,
+                        Some(rays) => self.spp_for(group, &contender.method, rays)?,
+                    };
+                    let measured = self.row(&theatre, group, contender, spp, wanted, &reference, each)?;
+                    part.write(&measured)?;
+                    measured
                 }
             };
-            let (mut row, eye) = self.row(&theatre, group, &contender, spp, wanted, &reference, each)?;
             let rays = match wanted {
                 Some(rays) => rays,
                 // `paper` takes no less than one sample a coarse pixel: a smaller budget is a share of what that takes.
@@ -233,16 +269,23 @@ impl ErrorRuns {
             rows.push(row);
             eyes.push((contender.name, eye));
         }
+        let runners: Vec<(Method, f32)> =
+            contenders.iter().zip(&rows).map(|(c, r)| (c.method.clone(), r.spp as f32)).collect();
+        each("times");
+        for (row, time) in rows.iter_mut().zip(theatre.race(&runners, self.stamp.seed as u32)?) {
+            (row.gpu_ms, row.wall_ms) = (time.gpu_ms, time.wall_ms);
+        }
         let result = GroupResult {
             stamp: self.stamp.clone(),
-            key: self.key(group),
+            key,
+            extent: o.extent,
             probes: theatre.probes().len(),
             mean: mean_of(&reference.eye),
             reference_error: reference.error,
             rows,
         };
         let pixels = theatre.probes().iter().map(|p| p.pixel).collect();
-        Ok(Measured { result, raster: theatre.raster(), pixels, reference: reference.eye, eyes })
+        Ok(Measured { result, raster: theatre.raster(), pixels, reference: reference.eye, eyes, parts })
     }
 
     /// Rays of a frame with so many samples, from a short sequence.
@@ -275,7 +318,7 @@ impl ErrorRuns {
             each(contender.name);
             theatre.play(&contender.method, spp, seed, &mut |_, _| ())
         };
-        let frames = f64::from(self.options.kept);
+        let frames = f64::from(self.options.extent.kept);
         let mut a = play(spp, seed)?;
         if let Some(wanted) = wanted.filter(|w| (a.rays as f64 / frames / w - 1.0).abs() > EQUAL_RAYS) {
             let rays = a.rays as f64 / frames;
@@ -300,7 +343,7 @@ impl ErrorRuns {
         runs: [Seen; 2],
         reference: &Reference,
     ) -> Result<(ErrorRow, Vec<Vec3>), ErrorRunError> {
-        let frames = f64::from(self.options.kept);
+        let frames = f64::from(self.options.extent.kept);
         let eyes = [0, 1].map(|i| eye_mean(&runs[i].frames, EYE_FRAMES));
         let inner = self.rig.config.render.paper.phi_h_deg as f32;
         let angle = |i: usize| theatre.probes()[i].angle;
@@ -319,8 +362,7 @@ impl ErrorRuns {
             compare(&test, &truth, None, 1.0)
         };
         let (first, second) = (single(a)?, single(b)?);
-        let gpu_ms = median_ms(runs.iter().flat_map(|r| &r.costs).map(|c| c.pass_ns.iter().sum()));
-        let wall_ms = median_ms(runs.iter().flat_map(|r| &r.wall_ns).copied());
+        let (bias, bias_floor) = reference.bias(&eyes);
         let both = |of: &dyn Fn(&Seen) -> u64| 0.5 * (of(a) + of(b)) as f64 / frames;
         let row = ErrorRow {
             method: contender.name.to_owned(),
@@ -330,15 +372,16 @@ impl ErrorRuns {
             rays: both(&|s| s.rays),
             rays_to_paper: 1.0,
             samples: both(&|s| s.samples),
-            gpu_ms,
-            wall_ms,
+            gpu_ms: 0.0,
+            wall_ms: 0.0,
             single_rmse: (0.5 * (first.rmse.powi(2) + second.rmse.powi(2))).sqrt(),
             single_rel_mse: 0.5 * (first.rel_mse + second.rel_mse),
             perceived_rmse: clean,
             perceived_rmse_raw: raw,
             perceived_fovea: zone(1.0 - share >= LEAST_PERIPHERY, &|i| angle(i) < inner),
             perceived_periphery: zone(share >= LEAST_PERIPHERY, &|i| angle(i) >= inner),
-            bias: reference.bias(&eyes),
+            bias,
+            bias_floor,
             noise: rmse(&eyes[0], &eyes[1], |_| true) / std::f64::consts::SQRT_2,
             mean_shift: 0.5 * (mean_of(&eyes[0]) + mean_of(&eyes[1])) / mean_of(&reference.eye) - 1.0,
             flip: self.flip(theatre, &eyes[0], &reference.eye)?,
@@ -393,9 +436,7 @@ impl ErrorRuns {
     fn flip(&self, theatre: &Theatre, test: &[Vec3], truth: &[Vec3]) -> Result<f64, MetricError> {
         let raster = theatre.raster();
         let (width, height) = (raster.width() as usize, raster.height() as usize);
-        let mut all: Vec<f32> = truth.iter().filter(|v| v.is_finite()).map(|v| v.max_element()).collect();
-        all.sort_by(f32::total_cmp);
-        let white = all.get(all.len() * 99 / 100).copied().unwrap_or(1.0).max(1e-6);
+        let white = white_of(truth);
         let paint = |values: &[Vec3]| {
             let mut out = vec![Vec3::ZERO; raster.pixel_count()];
             for (probe, v) in theatre.probes().iter().zip(values) {

@@ -4,6 +4,7 @@ use super::error_runs::Measured;
 use super::pictures::to_srgb;
 use super::snapshot::glyphs::{ADVANCE, LINE};
 use super::snapshot::paint::{Canvas, DOT, NOT_FINITE};
+use crate::metrics::white_of;
 use glam::Vec3;
 
 /// A picture has at least so many columns on the sheet.
@@ -35,10 +36,7 @@ pub fn strip(measured: &Measured, title: &str) -> Canvas {
     let head = LINES * LINE * DOT;
     let columns = measured.eyes.len() + 1;
     let mut sheet = Canvas::new(GAP + columns * cell, GAP + head + 2 * (h * m + GAP));
-    let mut bright: Vec<f32> =
-        measured.reference.iter().filter(|v| v.is_finite()).map(|v| v.max_element()).collect();
-    bright.sort_by(f32::total_cmp);
-    let white = bright.get(bright.len() * 99 / 100).copied().unwrap_or(1.0).max(1e-6);
+    let white = white_of(&measured.reference);
     let picture = |values: &dyn Fn(usize) -> Vec3, gain: f32| {
         let mut linear = vec![Vec3::ZERO; w * h];
         let mut lost = Vec::new();

@@ -15,6 +15,14 @@ pub fn median_ms(ns: impl IntoIterator<Item = u64>) -> f64 {
     1e-6 * median(ns.into_iter().map(|ns| ns as f64))
 }
 
+/// Mean without the stalls of the machine: what takes more than three times the median is left out; 0 of none. Unlike a median it
+/// tells the cost of frames that take turns between more and fewer samples.
+pub fn steady_mean(values: &[f64]) -> f64 {
+    let most = 3.0 * median(values.iter().copied());
+    let steady: Vec<f64> = values.iter().copied().filter(|v| *v <= most).collect();
+    steady.iter().sum::<f64>() / steady.len().max(1) as f64
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -25,5 +33,12 @@ mod tests {
         assert_eq!(median([8.0, 1.0, 3.0, 4.0]), 3.5);
         assert_eq!(median([]), 0.0);
         assert_eq!(median_ms([3_000_000, 1_000_000, 2_000_000]), 2.0);
+    }
+
+    #[test]
+    fn a_steady_mean_follows_turns_and_leaves_out_stalls() {
+        assert_eq!(steady_mean(&[1.0, 2.0, 1.0, 2.0]), 1.5);
+        assert_eq!(steady_mean(&[1.0, 2.0, 1.0, 2.0, 500.0]), 1.5);
+        assert_eq!(steady_mean(&[]), 0.0);
     }
 }

@@ -1,7 +1,9 @@
 //! Runs that answer a question: each is a command and a test.
 
 pub mod bench;
+pub mod error_export;
 pub mod error_figure3;
+pub mod error_parts;
 pub mod error_plan;
 pub mod error_plot;
 pub mod error_reference;

@@ -3,6 +3,8 @@
 //! No tracker, link or quantisation: true poses in, shown radiance out. The probes are the surface points that the projector lights at the
 //! last frame; each is carried back through the sequence with its body, so motion blur of a following eye, lag and smear are all in.
 
+use super::median::{median, steady_mean};
+use crate::clock::Stopwatch;
 use crate::gpu::{Gpu, GpuError};
 use crate::pipeline::renderer_settings;
 use crate::render::method::Method;
@@ -45,13 +47,23 @@ pub struct Seen {
     pub rays: u64,
     /// Samples of the kept frames.
     pub samples: u64,
-    /// GPU time of the kept frames, nanoseconds.
-    pub gpu_ns: u64,
     /// Cost of every kept frame.
     pub costs: Vec<FrameCost>,
-    /// From recording to the end of waiting of every kept frame, nanoseconds.
-    pub wall_ns: Vec<u64>,
 }
+
+/// What a frame of a method takes.
+#[derive(Clone, Copy, Debug)]
+pub struct FrameTime {
+    /// On the GPU, all passes, ms; 0 without time stamps.
+    pub gpu_ms: f64,
+    /// From recording to the end of waiting, ms.
+    pub wall_ms: f64,
+}
+
+/// Frames of [`Theatre::race`] before those that count: histories fill, the driver settles.
+const RACE_WARM_UP: u32 = 8;
+/// Those that count.
+const RACE_FRAMES: u32 = 32;
 
 /// Samples a pixel as a rational stream: a fraction becomes frames of either neighbour.
 fn spp_of_frame(spp: f32, frame: u32) -> u32 {
@@ -158,30 +170,17 @@ impl Theatre {
         let settings = RendererSettings { method: method.clone(), seed, ..renderer_settings(rig) };
         let mut renderer = Renderer::new(&self.gpu, &rig.scene, settings)?;
         let mut slot = renderer.create_slot(true)?;
-        let mut seen = Seen {
-            frames: Vec::new(),
-            rays: 0,
-            samples: 0,
-            gpu_ns: 0,
-            costs: Vec::new(),
-            wall_ns: Vec::new(),
-        };
+        let mut seen = Seen { frames: Vec::new(), rays: 0, samples: 0, costs: Vec::new() };
         let total = self.span.warm_up + self.span.kept;
-        let first = (self.span.last_slot + 1).saturating_sub(u64::from(total));
         for k in 0..total {
-            let at = if self.frozen { self.span.last_slot } else { first + u64::from(k) };
-            let poses = poses_at(rig, at);
-            let started = std::time::Instant::now();
+            let poses = self.poses(k, total);
             let cost = draw(rig, &mut renderer, &mut slot, &poses, k, spp_of_frame(spp, k), spp)?;
-            let wall_ns = started.elapsed().as_nanos() as u64;
             each(k, &slot);
             if k >= self.span.warm_up {
                 let c = cost.counters();
                 seen.rays += u64::from(c.closest_rays) + u64::from(c.shadow_rays);
                 seen.samples += u64::from(c.samples);
-                seen.gpu_ns += cost.pass_ns.iter().sum::<u64>();
                 seen.costs.push(cost);
-                seen.wall_ns.push(wall_ns);
                 seen.frames.push(self.look(
                     &poses,
                     slot.radiance().unwrap_or(&[]),
@@ -190,6 +189,60 @@ impl Theatre {
             }
         }
         Ok(seen)
+    }
+
+    /// Poses of frame `k` of `total`, the last of which is that of the span.
+    fn poses(&self, k: u32, total: u32) -> Vec<DAffine3> {
+        let before = if self.frozen { 0 } else { u64::from(total - 1 - k) };
+        poses_at(&self.rig, self.span.last_slot.saturating_sub(before))
+    }
+
+    /// What a frame of each of several methods takes at the end of the span. They are drawn in turns, so that all meet the same
+    /// disturbances of the machine: their ratios hold where the times themselves do not.
+    ///
+    /// # Errors
+    /// The renderer's.
+    pub fn race(&self, runners: &[(Method, f32)], seed: u32) -> Result<Vec<FrameTime>, RenderError> {
+        let rig = &self.rig;
+        let mut all = Vec::new();
+        for (method, spp) in runners {
+            let settings = RendererSettings { method: method.clone(), seed, ..renderer_settings(rig) };
+            let renderer = Renderer::new(&self.gpu, &rig.scene, settings)?;
+            let slot = renderer.create_slot(false)?;
+            all.push((renderer, slot, *spp, Vec::new(), Vec::new()));
+        }
+        let total = RACE_WARM_UP + RACE_FRAMES;
+        for k in 0..total {
+            let poses = self.poses(k, total);
+            for (renderer, slot, spp, gpu, wall) in &mut all {
+                let watch = Stopwatch::start();
+                let cost = draw(rig, renderer, slot, &poses, k, spp_of_frame(*spp, k), *spp)?;
+                if k >= RACE_WARM_UP {
+                    wall.push(watch.elapsed_ns() as f64 * 1e-6);
+                    gpu.push(cost.pass_ns.iter().sum::<u64>() as f64 * 1e-6);
+                }
+            }
+        }
+        let time = |(_, _, _, gpu, wall): &(_, _, _, Vec<f64>, Vec<f64>)| FrameTime {
+            gpu_ms: steady_mean(gpu),
+            wall_ms: steady_mean(wall),
+        };
+        Ok(all.iter().map(time).collect())
+    }
+
+    /// Pixels of the raster in a degree of the observer's view, where neighbouring pixels of one body lie: the median. `None` without any.
+    pub fn pixels_per_degree(&self) -> Option<f64> {
+        let poses = poses_at(&self.rig, self.span.last_slot);
+        let tracked: Vec<DAffine3> = tracked_poses(&self.rig, &poses);
+        let (eye, _) = self.rig.observer.eye_and_gaze(&tracked);
+        let toward = |p: &Probe| poses[p.body].transform_point3(p.point) - eye;
+        let neighbours =
+            self.probes.windows(2).filter(|p| p[0].body == p[1].body && p[0].pixel + 1 == p[1].pixel);
+        let degrees: Vec<f64> = neighbours
+            .map(|p| toward(&p[0]).angle_between(toward(&p[1])).to_degrees())
+            .filter(|d| *d > 0.0)
+            .collect();
+        (!degrees.is_empty()).then(|| 1.0 / median(degrees))
     }
 
     /// Shown radiance at every probe, bilinear over the pixels of its own body.
@@ -229,6 +282,12 @@ impl Theatre {
     }
 }
 
+/// Poses of the tracked bodies among those of the scene's bodies.
+fn tracked_poses(rig: &Rig, poses: &[DAffine3]) -> Vec<DAffine3> {
+    let carried = |i: usize| rig.scene.bodies.iter().position(|b| b.tracked == Some(i as u16));
+    (0..rig.bodies.len()).map(|i| carried(i).map_or(DAffine3::IDENTITY, |b| poses[b])).collect()
+}
+
 /// Draws one frame of poses and waits for it, at most two minutes.
 ///
 /// # Errors
@@ -242,12 +301,7 @@ pub fn draw(
     spp: u32,
     budget_spp: f32,
 ) -> Result<FrameCost, GpuError> {
-    let tracked: Vec<DAffine3> = (0..rig.bodies.len())
-        .map(|i| {
-            let carried = rig.scene.bodies.iter().position(|b| b.tracked == Some(i as u16));
-            carried.map_or(DAffine3::IDENTITY, |b| poses[b])
-        })
-        .collect();
+    let tracked = tracked_poses(rig, poses);
     let (eye, gaze) = rig.observer.eye_and_gaze(&tracked);
     renderer.submit(
         slot,

@@ -10,6 +10,13 @@ pub mod flip;
 
 use glam::Vec3;
 
+/// What a viewer takes for white: the brightest channel that all but a hundredth of the finite colours stay below; at least 1e-6.
+pub fn white_of(colours: &[Vec3]) -> f32 {
+    let mut all: Vec<f32> = colours.iter().filter(|v| v.is_finite()).map(|v| v.max_element()).collect();
+    all.sort_by(f32::total_cmp);
+    all.get(all.len() * 99 / 100).copied().unwrap_or(1.0).max(1e-6)
+}
+
 /// A picture in linear Rec. 709, rows from the top.
 #[derive(Clone, Copy, Debug)]
 pub struct Picture<'a> {

@@ -1,0 +1,66 @@
+//! Steps of known cost into a bar with the time that is left; where nobody watches a terminal, a line a part.
+
+use indicatif::{ProgressBar, ProgressStyle};
+use std::io::Write;
+use std::time::Instant;
+
+/// Work in parts (of which some may turn out to be done already), each of steps.
+pub(super) struct Progress {
+    bar: ProgressBar,
+    /// Position at the end of each part.
+    ends: Vec<u64>,
+    part: usize,
+    /// Cost of the step that runs.
+    running: u64,
+    started: Instant,
+}
+
+impl Progress {
+    /// Parts of these costs, in any unit.
+    pub(super) fn new(parts: &[u64]) -> Self {
+        let sum = |end: &mut u64, part: &u64| {
+            *end += part;
+            Some(*end)
+        };
+        let ends: Vec<u64> = parts.iter().scan(0, sum).collect();
+        let bar = ProgressBar::new(ends.last().copied().unwrap_or(0));
+        let style = ProgressStyle::with_template("{bar:30} {percent:>3} % {elapsed} (left {eta}) {msg}");
+        bar.set_style(style.expect("the template is right"));
+        Self { bar, ends, part: 0, running: 0, started: Instant::now() }
+    }
+
+    /// The step before is over, this one begins.
+    pub(super) fn step(&mut self, what: &str, cost: u64) {
+        let end = self.ends.get(self.part).copied().unwrap_or(0);
+        self.bar.set_position((self.bar.position() + self.running).min(end));
+        self.running = cost;
+        self.bar.set_message(what.to_owned());
+    }
+
+    /// A part is over, whatever its steps were thought to cost.
+    pub(super) fn end_of_part(&mut self, name: &str) {
+        let before = if self.part > 0 { self.ends[self.part - 1] } else { 0 };
+        let end = self.ends.get(self.part).copied().unwrap_or(before);
+        self.part += 1;
+        self.running = 0;
+        self.bar.set_position(end);
+        if self.bar.is_hidden() && end > before {
+            let total = self.ends.last().copied().unwrap_or(end);
+            let elapsed = self.started.elapsed().as_secs_f64();
+            let left = elapsed * (total - end) as f64 / end as f64;
+            // Nobody may be listening.
+            let _ = writeln!(
+                std::io::stderr(),
+                "{name} done, {} of {}, {elapsed:.0} s, about {left:.0} s left",
+                self.part,
+                self.ends.len()
+            );
+        }
+    }
+}
+
+impl Drop for Progress {
+    fn drop(&mut self) {
+        self.bar.finish_and_clear();
+    }
+}

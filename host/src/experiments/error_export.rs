@@ -1,0 +1,123 @@
+//! A measured group into frames on disk: what the eye saw of every method and what it should have seen, for metrics of others.
+//!
+//! The pictures are of the surfaces, not of the raster: every lit point stands at its place of the last frame, so an eye that follows the
+//! bodies sees them like this. What is not lit, in the sequence of a method and in the reference alike, is black.
+
+use super::error_plan::{file_word, Group};
+use super::error_runs::{ErrorRunError, ErrorRuns, GroupResult};
+use super::sequence::Theatre;
+use super::snapshot::pfm;
+use super::stamp::Stamp;
+use crate::files::write_atomically;
+use crate::metrics::white_of;
+use crate::render::method::{Method, SamplerKind};
+use glam::Vec3;
+use serde::{Deserialize, Serialize};
+use std::io::Write;
+use std::path::Path;
+
+/// The frames of one method.
+#[derive(Clone, Debug, Serialize, Deserialize)]
+pub struct MethodFrames {
+    /// Method.
+    pub method: String,
+    /// Its folder beside the index: `0000.pfm` is the first frame.
+    pub folder: String,
+    /// RMSE of what the eye sees, as measured from both runs; the first of them is what lies in the folder.
+    pub perceived_rmse: f64,
+}
+
+/// What `sequence.json` says about the frames beside it.
+#[derive(Clone, Debug, Serialize, Deserialize)]
+pub struct FrameIndex {
+    /// With what.
+    pub stamp: Stamp,
+    /// The group.
+    pub group: String,
+    /// Frames a second.
+    pub frame_rate_hz: f64,
+    /// Frames in each folder.
+    pub frames: u32,
+    /// Columns and rows.
+    pub raster: [u32; 2],
+    /// Pixels in a degree of the observer's view.
+    pub pixels_per_degree: f64,
+    /// Radiance in the frames' unit that a metric should take for white: the brightest hundredth of the reference begins there.
+    pub white: f64,
+    /// Folder of the reference.
+    pub reference: String,
+    /// One a method.
+    pub methods: Vec<MethodFrames>,
+}
+
+impl ErrorRuns {
+    /// Draws the first run of every method of a measured group again, and the reference of every frame, and writes them below `dir`. The
+    /// same seeds give the same frames as when they were measured. `each` is called before every sequence with its name.
+    ///
+    /// # Errors
+    /// The renderer's; `dir` cannot be written.
+    pub fn export(
+        &self,
+        group: Group,
+        result: &GroupResult,
+        dir: &Path,
+        each: &mut dyn FnMut(&str),
+    ) -> Result<(), ErrorRunError> {
+        let extent = self.options.extent;
+        let reference = self.reference(group, each)?;
+        let mut index = FrameIndex {
+            stamp: self.stamp.clone(),
+            group: group.name(),
+            frame_rate_hz: 1e9 / self.rig.rate().slot_len_ns(0).max(1) as f64,
+            frames: extent.kept,
+            raster: self.stamp.raster,
+            pixels_per_degree: 0.0,
+            white: f64::from(white_of(&reference.eye)),
+            reference: "reference".into(),
+            methods: Vec::new(),
+        };
+        let theatre = self.theatre(group, extent.warm_up, extent.kept)?;
+        index.pixels_per_degree = theatre.pixels_per_degree().unwrap_or(0.0);
+        if group.moving {
+            let truth = self.theatre(group, 0, extent.kept)?;
+            let method = Method { sampler: SamplerKind::BlueNoise, ..Method::full(extent.reference_spp) };
+            each("reference of every frame");
+            let seen = truth.play(&method, extent.reference_spp as f32, 0x9e37_0002, &mut |_, _| ())?;
+            write_frames(&dir.join(&index.reference), &truth, &seen.frames)?;
+        } else {
+            // Nothing moves: every frame should look as the last one does.
+            let frames = vec![reference.eye; extent.kept as usize];
+            write_frames(&dir.join(&index.reference), &theatre, &frames)?;
+        }
+        for (contender, row) in self.contenders(group).iter().zip(&result.rows) {
+            each(contender.name);
+            let seen =
+                theatre.play(&contender.method, row.spp as f32, self.stamp.seed as u32, &mut |_, _| ())?;
+            let folder = file_word(&row.method);
+            write_frames(&dir.join(&folder), &theatre, &seen.frames)?;
+            index.methods.push(MethodFrames {
+                method: row.method.clone(),
+                folder,
+                perceived_rmse: row.perceived_rmse,
+            });
+        }
+        let text = serde_json::to_vec_pretty(&index).map_err(std::io::Error::from)?;
+        Ok(write_atomically(&dir.join("sequence.json"), |out| out.write_all(&text))?)
+    }
+}
+
+/// Frames of probes as pictures of the raster.
+fn write_frames(dir: &Path, theatre: &Theatre, frames: &[Vec<Vec3>]) -> std::io::Result<()> {
+    let raster = theatre.raster();
+    std::fs::create_dir_all(dir)?;
+    for (k, frame) in frames.iter().enumerate() {
+        let mut picture = vec![Vec3::ZERO; raster.pixel_count()];
+        for (probe, v) in theatre.probes().iter().zip(frame).filter(|(_, v)| v.is_finite()) {
+            picture[probe.pixel as usize] = *v;
+        }
+        let bytes = pfm(&picture, raster.width() as usize);
+        // The index is written last: without it the frames count for nothing.
+        std::fs::write(dir.join(format!("{k:04}.pfm")), bytes)?;
+    }
+    Ok(())
+}
