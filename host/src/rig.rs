@@ -100,6 +100,11 @@ enum Gaze {
 }
 
 impl Observer {
+    /// The same eye, but looking at a fixed point of the world.
+    pub fn looking_at(self, point: DVec3) -> Self {
+        Self { gaze: Gaze::Point(point), ..self }
+    }
+
     /// The tracked body without which the gaze is not known; `None` for a gaze that does not depend on a tracker.
     pub fn gaze_body(&self) -> Option<usize> {
         match self.gaze {

@@ -18,6 +18,13 @@ layout(set = 0, binding = B_FILTERED, scalar) buffer Filtered { vec4 filtered[];
 // Method dpm: from the history's surface point to the pixel's.
 layout(set = 0, binding = B_SHOWN, scalar) readonly buffer Shown { vec4 shown[]; };
 
+// Share of the light by which a frame's noise may stray without a history against it.
+const float UNSEEN = 0.002;
+// A history is kept whole while frames stray from it with less than so many times the power of their noise ...
+const float SURPRISE = 3.0;
+// ... and of this share of the light.
+const float LEAST = 0.003;
+
 void main() {
     uvec2 pixel;
     if (!tile_pixel(tiles[gl_WorkGroupID.x >> 2u], pixel)) return;
@@ -35,26 +42,29 @@ void main() {
             vec3 fresh = traced.rgb / albedo;
             float y = luminance(traced.rgb);
             h.index += uint(traced.w);
-            // Variance of one sample about the mean of history and frame, averaged over the samples the history holds.
+            // Variance of one sample about its frame's mean, which no change of the light enters; of a single sample about the history.
             float second = filtered[at].x / traced.w;
             float known = luminance((h.mean + shift) * albedo);
             float about = h.weight > 0.0 ? mix(y, known, h.weight / (h.weight + traced.w)) : y;
-            float variance = max(second - 2.0 * about * y + about * about, 0.0);
+            float variance = traced.w > 1.5 ? max(second - y * y, 0.0) * traced.w / (traced.w - 1.0) : (y - about) * (y - about);
             float v_weight = clamp(traced.w / (min(h.weight, 32.0) + traced.w), 0.0, 1.0);
             h.variance = h.weight > 0.0 ? mix(h.variance, variance, v_weight) : max(variance, 0.25 * y * y);
-            // Noise of single frames from their differences, which a slow change does not enter.
-            float n_weight = 0.1;
-            if (h.last >= 0.0) h.noise = mix(h.noise, 0.5 * (y - h.last) * (y - h.last), h.noise > 0.0 ? n_weight : 1.0);
-            h.last = y;
+            // Power of what single frames say beyond the history: their noise, and what the history gets wrong.
+            if (h.weight > 0.0) h.surprise = mix(h.surprise, (y - known) * (y - known), h.surprise > 0.0 ? 0.1 : 1.0);
             // Innovation: what the frame says beyond the history, as luminance without albedo. Its mean over the last few frames is the lag.
             float per_frame = max(frame.budget_spp, 0.5);
             float innovation = luminance(fresh - h.mean - shift);
             h.drift = h.weight > 0.0 ? mix(h.drift, innovation, 0.0625) : 0.0;
             // A jump (a light switched on) is not waited for: a mean of weight 1/16 has 1/31 of a frame's variance.
             float drift = h.drift * luminance(albedo);
-            float jump = drift * drift / max(h.noise / 31.0 + 1e-4 * known * known, 1e-12);
+            float jump = drift * drift / max(h.surprise / 31.0 + 1e-4 * known * known, 1e-12);
             if (jump > 25.0) h.weight *= 0.7;
-            h.weight = min(h.weight, frame.history_cap * per_frame);
+            // No longer a history than noise calls for: where a frame has next to none (a mirror of an even sky), or where frames are farther from
+            // the history than their noise tells (a reflection that moves), the eye's own mean does better.
+            float level = known * known, of_frame = h.variance / per_frame;
+            float frames = min(frame.history_cap, of_frame / max(UNSEEN * UNSEEN * level, 1e-12));
+            frames = min(frames, frame.history_cap * SURPRISE * (of_frame + LEAST * LEAST * level) / max(h.surprise, 1e-12));
+            h.weight = min(h.weight, frames * per_frame);
             // Every sample counts once, so that the sequence's points keep their even spread; their number follows from the variance of long
             // before, hardly from the sample that is weighed.
             h.mean = h.weight > 0.0 ? mix(h.mean, fresh - shift, traced.w / (h.weight + traced.w)) : fresh - shift;

@@ -109,8 +109,7 @@ struct History {
     uint normal;
     float drift;
     float variance;
-    float last;
-    float noise;
+    float surprise;
     uint seed;
     uint index;
     uint instance;

@@ -36,11 +36,13 @@ vec3 trace_path(Point s, Sampler rng, inout RayCount rays) {
         if (!s.front && (s.flags & (MATERIAL_DOUBLE_SIDED | MATERIAL_TRANSMISSIVE)) == 0u) break;
         Lobes lobes = lobes_of(s);
         bool only_delta = mirror_like(s) && lobes.diffuse <= 0.0;
-        // Where the light and the next direction are chosen matters most: they share a group of four.
+        // Where the light and the next direction are chosen matters most: they share a group of four. Its first two dimensions are the most
+        // even; without light samples the next direction has them, and the choice of its lobe the third.
         vec4 u_direction = sample_4d(rng, vertex * 2u - 2u);
         vec4 u_choice = sample_4d(rng, vertex * 2u - 1u);
-        vec2 u_light = u_direction.xy, u_bsdf = u_direction.zw;
-        float u_pick = u_choice.x, u_lobe = u_choice.y, u_roulette = u_choice.z;
+        bool no_light = frame.environment_select == 0.0 && frame.light_count == 0u;
+        vec2 u_light = u_direction.xy, u_bsdf = no_light ? u_direction.xy : u_direction.zw;
+        float u_pick = u_choice.x, u_lobe = no_light ? u_direction.z : u_choice.y, u_roulette = u_choice.z;
         if (!only_delta) {
             LightSample light = sample_light(s.p, s.n, u_pick, u_light);
             if (light.valid) {

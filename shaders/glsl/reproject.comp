@@ -21,7 +21,7 @@ layout(set = 0, binding = B_VERTICES, scalar) readonly buffer Vertices { Vertex 
 
 struct Carried {
     vec3 mean;
-    float weight, drift, variance, last, noise;
+    float weight, drift, variance, surprise;
     float total;
 };
 
@@ -37,8 +37,7 @@ void add_tap(inout Carried c, uint index, float w) {
     c.weight += w * histories[index].weight;
     c.drift += w * histories[index].drift;
     c.variance += w * histories[index].variance;
-    c.last += w * histories[index].last;
-    c.noise += w * histories[index].noise;
+    c.surprise += w * histories[index].surprise;
     c.total += w;
 }
 
@@ -48,8 +47,7 @@ void forget(inout History h, uint at) {
     h.weight = 0.0;
     h.drift = 0.0;
     h.variance = 0.0;
-    h.last = -1.0;
-    h.noise = 0.0;
+    h.surprise = 0.0;
     h.seed = hash_u32(at + hash_u32(frame.frame + hash_u32(frame.seed)));
     h.index = 0u;
 }
@@ -67,7 +65,7 @@ void carry_bilinear(inout History h, vec3 normal, float footprint, vec2 before) 
     }
     ivec2 corner = ivec2(base);
     ivec2 limit = ivec2(frame.width, frame.height) - 1;
-    Carried c = Carried(vec3(0.0), 0.0, 0.0, 0.0, 0.0, 0.0, 0.0);
+    Carried c = Carried(vec3(0.0), 0.0, 0.0, 0.0, 0.0, 0.0);
     uint nearest = 0u;
     float best = 0.0;
     for (int i = 0; i < 4; i++) {
@@ -89,8 +87,7 @@ void carry_bilinear(inout History h, vec3 normal, float footprint, vec2 before) 
     h.weight = c.weight * s;
     h.drift = c.drift * s;
     h.variance = c.variance * s;
-    h.last = c.last * s;
-    h.noise = c.noise * s;
+    h.surprise = c.surprise * s;
     // The sequence goes on where the nearest point left it.
     h.seed = histories[nearest].seed;
     h.index = histories[nearest].index;
@@ -116,7 +113,7 @@ void carry_point(inout History h, vec3 normal, float footprint, uvec2 pixel, vec
         vec3 m = histories[tap].mean;
         float w = histories[tap].weight;
         // A broken history is as good as none.
-        bool sound = finite(histories[tap].drift) && finite(histories[tap].variance) && finite(histories[tap].last) && finite(histories[tap].noise);
+        bool sound = finite(histories[tap].drift) && finite(histories[tap].variance) && finite(histories[tap].surprise);
         if (!sound || !finite3(m) || !finite(w) || !finite(e.x + e.y)) continue;
         total += w;
         taps++;
@@ -178,7 +175,7 @@ void carry_point(inout History h, vec3 normal, float footprint, uvec2 pixel, vec
             known.seed = h.seed;
             known.index = 0u;
             // Known as well as the histories around it agree: their scatter about the plane, or about each other where they lie on one side.
-            float light = luminance(albedo_of(guides[at])), noise = max(known.noise, 1e-8), per_frame = max(frame.budget_spp, 0.5);
+            float light = luminance(albedo_of(guides[at])), noise = max(known.surprise, 1e-8), per_frame = max(frame.budget_spp, 0.5);
             float expected = noise * per_frame / known.weight, rest;
             if (taps < 8u) {
                 float range = luminance(upper - lower) * light;

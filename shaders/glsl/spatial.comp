@@ -23,9 +23,9 @@ const vec2 DISK[12] = vec2[](vec2(0.03, -0.09), vec2(-0.51, 0.13), vec2(0.47, 0.
                              vec2(0.62, -0.31), vec2(-0.94, -0.18), vec2(-0.58, 0.72), vec2(0.43, 0.83), vec2(0.96, 0.12), vec2(-0.31, -0.92));
 
 // Share of independent samples' variance that is left by the sequence (measured).
-const float SEQUENCE_VARIANCE = 0.3;
+const float SEQUENCE_VARIANCE = 0.5;
 // Frames that the picture's own noise is taken to be seen over: what a filter gets wrong stays, noise goes.
-const float SEEN_FRAMES = 60.0;
+const float SEEN_FRAMES = 20.0;
 // Neighbours may differ by this share of their light beyond what the plane tells.
 const float TOLERANCE = 0.008;
 
@@ -76,7 +76,6 @@ vec3 regressed(uvec2 pixel, uint at, uint history, vec4 own) {
     vec3 across = normalize(abs(normal.x) < 0.7 ? cross(normal, vec3(1.0, 0.0, 0.0)) : cross(normal, vec3(0.0, 1.0, 0.0)));
     vec3 along = cross(normal, across);
     float footprint = abs(surfaces[at].distance) * frame.pixel_size;
-    float own_light = luminance(albedo_of(guides[at]));
     float level = max(luminance(own.rgb), 0.02);
     float tolerated = TOLERANCE * TOLERANCE * level * level;
     // Normal equations, lower triangle by rows: constant, x, y, two components of the normal.
@@ -105,7 +104,7 @@ vec3 regressed(uvec2 pixel, uint at, uint history, vec4 own) {
         power += w * y * y;
         total += w;
         used += 1.0;
-        noise_sum += w * noise;
+        noise_sum += noise;
     }
     if (used < 4.0) return own.rgb;
     // Slopes are not expected beyond 2 % a pixel and a third over the normal's whole range.
@@ -128,10 +127,11 @@ vec3 regressed(uvec2 pixel, uint at, uint history, vec4 own) {
         b[r] /= a[r * (r + 3) / 2];
     }
     // Structure that the fit misses, around or at this very pixel, against the noise that the eye's mean leaves [Lee80].
-    float structure = max(max(power - explained, 0.0) / total * used / max(used - 4.0, 1.0) - noise_sum / total, 0.0);
-    float noise = own.w * SEQUENCE_VARIANCE / (own_light * own_light);
+    float structure = max(max(power - explained, 0.0) / total * used / max(used - 4.0, 1.0) - noise_sum / used, 0.0);
+    // Single pixels hardly know their own noise: it is that of all around.
+    float noise = noise_sum / used;
     float apart = luminance(b[0]);
-    structure = max(structure, apart * apart - 2.0 * noise);
+    structure = max(structure, apart * apart - 4.0 * noise);
     float held = histories[history + at].weight;
     noise *= held / (held + SEEN_FRAMES * max(frame.budget_spp, 0.5));
     vec3 result = own.rgb + b[0] * (noise / max(structure + noise, 1e-12));

@@ -138,10 +138,8 @@ gpu_structs! {
         drift: f32,
         /// Variance of one sample's luminance.
         variance: f32,
-        /// Luminance of the last traced frame alone; negative: none.
-        last: f32,
-        /// Variance of one frame's luminance, from differences between frames that follow each other.
-        noise: f32,
+        /// Mean square by which the luminance of a frame is beyond the history (method dpm): its noise, and what the history gets wrong.
+        surprise: f32,
         /// Seed of the point's sample sequence.
         seed: u32,
         /// Samples of it already used.

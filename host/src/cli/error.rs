@@ -51,16 +51,16 @@ pub struct ErrorArgs {
     preset: Option<Preset>,
     /// List the groups with their numbers and measure nothing
     #[arg(long)]
-    list: bool,
+    pub(super) list: bool,
     /// Measure this group only; `dpm error merge` joins them
     #[arg(long, value_name = "N")]
-    index: Option<usize>,
+    pub(super) index: Option<usize>,
     /// Also write what the eye saw of every method and of the reference, frame by frame, for metrics of others: OUT/sequences
     #[arg(long, conflicts_with = "preset")]
     sequences: bool,
     /// Print one JSON object
     #[arg(long)]
-    json: bool,
+    pub(super) json: bool,
 }
 
 /// Experiments of others.
@@ -68,6 +68,8 @@ pub struct ErrorArgs {
 enum Preset {
     /// Section 3 of the paper: one body in four materials, 5 to 30 samples a pixel, standing and moving
     Figure3,
+    /// Every method on one body in four materials, standing and moving, looked at and looked past
+    Table,
 }
 
 fn budget(text: &str) -> Result<f64, String> {
@@ -102,8 +104,10 @@ pub fn execute(args: &ErrorArgs) -> Result<(), Failure> {
     if let Some(ErrorCommand::Merge { out, json }) = &args.merge {
         return merge(out, *json);
     }
-    if let Some(Preset::Figure3) = args.preset {
-        return figure3(args);
+    match args.preset {
+        Some(Preset::Figure3) => return figure3(args),
+        Some(Preset::Table) => return super::error_table::table(args),
+        None => {}
     }
     let budgets = match (&args.budgets[..], args.quick) {
         ([], true) => vec![2.0, 6.0, 18.0],
@@ -125,13 +129,17 @@ pub fn execute(args: &ErrorArgs) -> Result<(), Failure> {
     report(&out, &results, args.json)
 }
 
-fn folder(args: &ErrorArgs) -> PathBuf {
-    let own = if args.preset.is_some() { "out/figure3" } else { "out/error" };
+pub(super) fn folder(args: &ErrorArgs) -> PathBuf {
+    let own = match args.preset {
+        Some(Preset::Figure3) => "out/figure3",
+        Some(Preset::Table) => "out/table",
+        None => "out/error",
+    };
     args.flags.out.clone().unwrap_or_else(|| own.into())
 }
 
 /// Names with their numbers. A rig file that cannot be run has no groups.
-fn list(args: &ErrorArgs, names: impl Iterator<Item = String>) -> Result<(), Failure> {
+pub(super) fn list(args: &ErrorArgs, names: impl Iterator<Item = String>) -> Result<(), Failure> {
     args.flags.rig(args.rig.as_deref())?;
     let lines: String = names.enumerate().map(|(i, name)| format!("{i} {name}\n")).collect();
     print(&lines);
@@ -139,7 +147,7 @@ fn list(args: &ErrorArgs, names: impl Iterator<Item = String>) -> Result<(), Fai
 }
 
 /// What `--index` names, or all.
-fn chosen<T: Copy>(args: &ErrorArgs, all: &[T]) -> Result<Vec<T>, Failure> {
+pub(super) fn chosen<T: Copy>(args: &ErrorArgs, all: &[T]) -> Result<Vec<T>, Failure> {
     match args.index {
         None => Ok(all.to_vec()),
         Some(i) if i < all.len() => Ok(vec![all[i]]),
@@ -150,7 +158,7 @@ fn chosen<T: Copy>(args: &ErrorArgs, all: &[T]) -> Result<Vec<T>, Failure> {
     }
 }
 
-fn options(args: &ErrorArgs, out: &Path) -> ErrorOptions {
+pub(super) fn options(args: &ErrorArgs, out: &Path) -> ErrorOptions {
     ErrorOptions {
         extent: Extent {
             warm_up: if args.quick { 48 } else { 96 },
@@ -164,7 +172,7 @@ fn options(args: &ErrorArgs, out: &Path) -> ErrorOptions {
 }
 
 /// The GPU, and the rig at the raster to measure at: small without a GPU or in a hurry.
-fn stage(args: &ErrorArgs) -> Result<(Arc<Gpu>, Rig), Failure> {
+pub(super) fn stage(args: &ErrorArgs) -> Result<(Arc<Gpu>, Rig), Failure> {
     let config = args.flags.rig(args.rig.as_deref())?;
     let gpu = open_gpu(&config)?;
     let small = args.flags.raster.is_none() && (args.quick || gpu.summary().software);
@@ -221,7 +229,7 @@ fn figure3(args: &ErrorArgs) -> Result<(), Failure> {
 }
 
 /// What a sequence costs beside the others, for the time that is left: sample frames, and as much for each frame as 3 samples take.
-fn weight(what: &str, group: Group, extent: Extent, methods: usize) -> u64 {
+pub(super) fn weight(what: &str, group: Group, extent: Extent, methods: usize) -> u64 {
     let frames = f64::from(extent.warm_up + extent.kept);
     let sequence = frames * (group.budget.max(1.0) + 3.0);
     let of = match what {
@@ -281,7 +289,7 @@ fn measure(
     Ok(results)
 }
 
-fn failure(error: ErrorRunError) -> Failure {
+pub(super) fn failure(error: ErrorRunError) -> Failure {
     match error {
         ErrorRunError::Render(e) => PipelineError::from(e).into(),
         other => Failure::new(FailureKind::BadInput, other),

@@ -7,6 +7,7 @@ use crate::experiments::error_plot::{self, curves, Cost};
 use crate::experiments::error_report::{csv, markdown};
 use crate::experiments::error_runs::GroupResult;
 use crate::experiments::error_sheet::stack;
+use crate::experiments::error_table::{self, TableGroup};
 use crate::experiments::snapshot::paint::Canvas;
 use crate::failure::{Failure, FailureKind};
 use crate::files::write_atomically;
@@ -33,7 +34,27 @@ pub(super) fn report_figure3(out: &Path, groups: &[Figure3Group], json: bool) ->
     Ok(())
 }
 
-/// Joins what lies in a folder: groups of methods, settings of figure 3, or both.
+/// Writes the table of all methods with its pictures, and prints the table or one JSON object.
+pub(super) fn report_table(out: &Path, groups: &[TableGroup], json: bool) -> Result<(), Failure> {
+    let object = to_json(&serde_json::json!({ "groups": groups }));
+    let table = error_table::markdown(groups);
+    write(&out.join("table.json"), &object)?;
+    write(&out.join("table.md"), &table)?;
+    let sheets: Vec<Canvas> =
+        groups.iter().filter_map(|g| Canvas::load(&table_path(out, g).with_extension("png"))).collect();
+    if !sheets.is_empty() {
+        save(&out.join("table.png"), &stack(&sheets))?;
+    }
+    print(&if json { object + "\n" } else { table });
+    Ok(())
+}
+
+/// Where the numbers of a setting of the table lie.
+pub(super) fn table_path(out: &Path, g: &TableGroup) -> PathBuf {
+    out.join(format!("table-{}-{}.json", g.name(), g.result.key))
+}
+
+/// Joins what lies in a folder: groups of methods, settings of figure 3 or of the table.
 pub(super) fn merge(out: &Path, json: bool) -> Result<(), Failure> {
     let mut groups: Vec<GroupResult> = read_all(out, "group-")?;
     groups.sort_by(|a, b| {
@@ -42,13 +63,18 @@ pub(super) fn merge(out: &Path, json: bool) -> Result<(), Failure> {
     });
     one_experiment(out, &groups)?;
     let settings: Vec<Figure3Group> = read_all(out, "figure3-")?;
-    if groups.is_empty() && settings.is_empty() {
+    let mut cells: Vec<TableGroup> = read_all(out, "table-")?;
+    cells.sort_by_key(|c| (c.aside, c.moving, c.place()));
+    if groups.is_empty() && settings.is_empty() && cells.is_empty() {
         let out = out.display();
         let told = format!("{out}: no measured groups; run dpm error RIG.toml --index N --out {out} first");
         return Err(Failure::new(FailureKind::BadInput, told));
     }
     if !settings.is_empty() {
         report_figure3(out, &settings, json)?;
+    }
+    if !cells.is_empty() {
+        report_table(out, &cells, json)?;
     }
     if groups.is_empty() {
         return Ok(());

@@ -5,6 +5,7 @@ pub mod dlpc900;
 pub mod doctor;
 pub mod error;
 mod error_files;
+mod error_table;
 pub mod keys;
 pub mod link_test;
 pub mod order;

@@ -94,7 +94,7 @@ pub struct Figure3Group {
 }
 
 /// A rig whose first tracked body is made of one of [`looks`].
-fn dressed(mut rig: Rig, look: usize) -> (Rig, usize) {
+pub(super) fn dressed(mut rig: Rig, look: usize) -> (Rig, usize) {
     let body = rig.scene.bodies.iter().position(|b| b.tracked == Some(0)).unwrap_or(0);
     let material = rig.scene.materials.len() as u32;
     rig.scene.materials.push(looks()[look].clone());

@@ -100,7 +100,7 @@ pub fn markdown(groups: &[GroupResult]) -> String {
             dpm.budget,
             dpm.perceived_rmse / best.perceived_rmse,
             best.method,
-            dpm.flicker / least_flicker(g),
+            dpm.flicker / least_flicker(g, |r| r.flicker),
             g.reference_error,
             g.mean,
             g.probes
@@ -208,7 +208,8 @@ fn equal_cost(groups: &[GroupResult]) -> String {
     text
 }
 
-fn dpm_of(g: &GroupResult) -> Option<&ErrorRow> {
+/// The row of this program's own method.
+pub(super) fn dpm_of(g: &GroupResult) -> Option<&ErrorRow> {
     g.rows.iter().find(|r| r.method == "dpm")
 }
 
@@ -216,12 +217,14 @@ fn others(g: &GroupResult) -> impl Iterator<Item = &ErrorRow> {
     g.rows.iter().filter(|r| !r.method.starts_with("dpm"))
 }
 
-fn best_other(g: &GroupResult) -> Option<&ErrorRow> {
+/// The least perceived error of the other methods.
+pub(super) fn best_other(g: &GroupResult) -> Option<&ErrorRow> {
     others(g).min_by(|a, b| a.perceived_rmse.total_cmp(&b.perceived_rmse))
 }
 
-fn least_flicker(g: &GroupResult) -> f64 {
-    others(g).map(|r| r.flicker).fold(f64::INFINITY, f64::min)
+/// The least of what `flicker` tells of the other methods.
+pub(super) fn least_flicker(g: &GroupResult, flicker: impl Fn(&ErrorRow) -> f64) -> f64 {
+    others(g).map(flicker).fold(f64::INFINITY, f64::min)
 }
 
 #[cfg(test)]

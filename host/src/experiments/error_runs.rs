@@ -49,7 +49,7 @@ pub struct ErrorOptions {
 /// Frames over which the eye takes the mean: 33 ms at 947 fps.
 pub const EYE_FRAMES: usize = 31;
 /// Rays count as equal within this share.
-const EQUAL_RAYS: f64 = 0.02;
+const EQUAL_RAYS: f64 = 0.01;
 /// Fewer probes in the periphery than this share of all do not tell its flicker.
 const LEAST_PERIPHERY: f64 = 0.01;
 
@@ -175,13 +175,29 @@ pub struct ErrorRuns {
     gpu: Arc<Gpu>,
     pub(super) options: ErrorOptions,
     pub(super) stamp: Stamp,
+    /// What was changed in the rig beside its file.
+    variant: String,
+    /// Names all of the rig that the reference depends on.
+    scene: String,
 }
 
 impl ErrorRuns {
     /// Ready to measure `rig` on `gpu`.
     pub fn new(rig: Arc<Rig>, gpu: Arc<Gpu>, options: ErrorOptions) -> Self {
+        let scene = Stamp::new(&rig, gpu.summary()).config_hash;
+        Self::variant(rig, gpu, options, String::new(), scene)
+    }
+
+    /// The same for a rig that was changed beside its file: `variant` says how, `scene` names all of it that the reference depends on.
+    pub fn variant(
+        rig: Arc<Rig>,
+        gpu: Arc<Gpu>,
+        options: ErrorOptions,
+        variant: String,
+        scene: String,
+    ) -> Self {
         let stamp = Stamp::new(&rig, gpu.summary());
-        Self { rig, gpu, options, stamp }
+        Self { rig, gpu, options, stamp, variant, scene }
     }
 
     /// The stamp of all groups.
@@ -193,7 +209,7 @@ impl ErrorRuns {
     pub fn key(&self, group: Group) -> String {
         let (o, mut hash) = (&self.options, Fnv::default());
         // Writing into a hash cannot fail.
-        let _ = write!(hash, "{:?}{group:?}{:?}{}", self.stamp, o.extent, o.ablation);
+        let _ = write!(hash, "{:?}{group:?}{:?}{}{}", self.stamp, o.extent, o.ablation, self.variant);
         hash.text()
     }
 
@@ -219,7 +235,7 @@ impl ErrorRuns {
         each: &mut dyn FnMut(&str),
     ) -> Result<Reference, ErrorRunError> {
         let (o, stamp) = (&self.options, &self.stamp);
-        let what = format!("{}{:?}{}{}", stamp.config_hash, stamp.raster, group.moving, o.extent.last_slot());
+        let what = format!("{}{:?}{}{}", self.scene, stamp.raster, group.moving, o.extent.last_slot());
         let short = self.theatre(group, 0, EYE_FRAMES as u32)?;
         Reference::new(&short, o.extent.reference_spp, &what, &o.cache, each)
     }
@@ -320,15 +336,26 @@ impl ErrorRuns {
         };
         let frames = f64::from(self.options.extent.kept);
         let mut a = play(spp, seed)?;
-        if let Some(wanted) = wanted.filter(|w| (a.rays as f64 / frames / w - 1.0).abs() > EQUAL_RAYS) {
-            let rays = a.rays as f64 / frames;
-            let per_sample = 4.0f64.min(rays * frames / (a.samples as f64).max(1.0));
-            let base = rays - per_sample * a.samples as f64 / frames;
-            let better = corrected(spp, base, rays, wanted).max(least_spp(&contender.method));
-            if better != spp {
-                spp = better;
-                a = play(spp, seed)?;
+        // A line through two trials meets the rays that are wanted; the first trial has only what a sample takes at most.
+        let (mut earlier, mut trials) = (None, 0);
+        while let Some(wanted) = wanted {
+            let (rays, samples) = (a.rays as f64 / frames, (a.samples as f64 / frames).max(1.0));
+            if (rays / wanted - 1.0).abs() <= EQUAL_RAYS || trials == 2 {
+                break;
             }
+            let base = match earlier {
+                Some((spp_before, rays_before)) => {
+                    rays - (rays - rays_before) / f64::from(spp - spp_before) * f64::from(spp)
+                }
+                None => rays - 4.0f64.min(rays / samples) * samples,
+            };
+            let better = corrected(spp, base, rays, wanted).max(least_spp(&contender.method));
+            if better == spp {
+                break;
+            }
+            (earlier, trials) = (Some((spp, rays)), trials + 1);
+            spp = better;
+            a = play(spp, seed)?;
         }
         let b = play(spp, seed.wrapping_add(1_000_003))?;
         self.compare(theatre, group, contender, spp, [a, b], reference)

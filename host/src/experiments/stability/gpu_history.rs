@@ -334,7 +334,7 @@ fn poisoned(gpu: &Arc<Gpu>, seed: u64) -> f64 {
 }
 
 fn poison(h: &mut History, bad: f32) {
-    *h = History { mean: [bad; 3], drift: bad, variance: bad, last: bad, noise: bad, ..*h };
+    *h = History { mean: [bad; 3], drift: bad, variance: bad, surprise: bad, ..*h };
 }
 
 fn pose_jump(gpu: &Arc<Gpu>, seed: u64) -> f64 {
