@@ -219,7 +219,10 @@ impl Buffer {
 
 impl Drop for Buffer {
     fn drop(&mut self) {
-        // SAFETY: owners wait for the GPU before dropping (FrameFence and Gpu do in their Drop); handles are ours alone.
+        if self.gpu.is_abandoned() {
+            return;
+        }
+        // SAFETY: owners wait for the GPU before dropping (FrameFence does in its Drop); handles are ours alone.
         unsafe {
             if let Some(view) = self.view {
                 self.gpu.device.destroy_buffer_view(view, None);

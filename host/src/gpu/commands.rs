@@ -95,7 +95,10 @@ impl CommandList {
 
 impl Drop for CommandList {
     fn drop(&mut self) {
-        // SAFETY: owners wait for the fence first; waiting for idle covers the rest.
+        if self.gpu.is_abandoned() {
+            return;
+        }
+        // SAFETY: owners wait for the fence first.
         unsafe {
             if let Some(q) = self.queries {
                 self.gpu.device.destroy_query_pool(q, None);
@@ -225,6 +228,9 @@ impl Recorder<'_> {
     }
 }
 
+/// How long the end of a submission is waited for when its memory is to be freed. After that the memory stays with the device.
+const LAST_WAIT_NS: u64 = 5_000_000_000;
+
 /// Tells when a submission is done.
 pub struct FrameFence {
     fence: vk::Fence,
@@ -267,8 +273,10 @@ impl FrameFence {
 
 impl Drop for FrameFence {
     fn drop(&mut self) {
-        let _ = self.wait(5_000_000_000);
-        // SAFETY: not pending any more, or the device is beyond help.
+        if self.gpu.is_abandoned() || matches!(self.wait(LAST_WAIT_NS), Err(GpuError::Timeout(_))) {
+            return self.gpu.abandon();
+        }
+        // SAFETY: not pending any more, or the device is lost.
         unsafe { self.gpu.device.destroy_fence(self.fence, None) }
     }
 }
@@ -279,4 +287,25 @@ pub(super) fn copy_now(gpu: &Arc<Gpu>, from: &Buffer, to: &Buffer, bytes: usize)
     let mut fence = FrameFence::new(gpu)?;
     list.submit(&mut fence)?;
     fence.wait(60_000_000_000)
+}
+
+#[cfg(test)]
+mod tests {
+    use crate::gpu::{Buffer, Gpu, GpuOptions, MemoryKind};
+
+    /// Large enough that its pages go back to the system when it is freed: reading them then would end this process.
+    const LEN: usize = 64 << 20;
+
+    #[test]
+    fn a_device_that_is_waited_for_no_longer_keeps_its_memory() {
+        let gpu = Gpu::open(&GpuOptions { validation: false, device: None }).expect("a Vulkan device");
+        let mut buffer = Buffer::new(&gpu, "kept", LEN, MemoryKind::Upload).expect("memory");
+        buffer.bytes_mut().fill(7);
+        let first = buffer.bytes_mut().as_ptr();
+        gpu.abandon();
+        drop((buffer, gpu));
+        // SAFETY: what an abandoned device holds is never freed.
+        let bytes = unsafe { std::slice::from_raw_parts(first, LEN) };
+        assert!(bytes.iter().step_by(4096).all(|b| *b == 7));
+    }
 }

@@ -3,7 +3,8 @@
 use super::error::{Context as _, GpuError};
 use ash::{ext, khr, vk};
 use std::ffi::{c_void, CStr, CString};
-use std::sync::atomic::{AtomicU64, Ordering};
+use std::mem::ManuallyDrop;
+use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
 use std::sync::{Arc, Mutex};
 
 /// How to open the GPU.
@@ -81,7 +82,9 @@ pub struct Gpu {
     summary: DeviceSummary,
     debug: Option<(ext::debug_utils::Instance, vk::DebugUtilsMessengerEXT)>,
     instance: ash::Instance,
-    _entry: ash::Entry,
+    entry: ManuallyDrop<ash::Entry>,
+    /// The device did not finish in time: it may use everything it was given for as long as it likes, so nothing is taken from it any more.
+    abandoned: AtomicBool,
 }
 
 impl std::fmt::Debug for Gpu {
@@ -316,7 +319,8 @@ impl Gpu {
             summary,
             debug,
             instance,
-            _entry: entry,
+            entry: ManuallyDrop::new(entry),
+            abandoned: AtomicBool::new(false),
         }))
     }
 
@@ -335,9 +339,24 @@ impl Gpu {
     }
 }
 
+impl Gpu {
+    /// Leaves the device what it holds: a submission is not over and nobody waits for it any longer.
+    pub(super) fn abandon(&self) {
+        self.abandoned.store(true, Ordering::Relaxed);
+    }
+
+    /// True when nothing of this device may be destroyed.
+    pub(super) fn is_abandoned(&self) -> bool {
+        self.abandoned.load(Ordering::Relaxed)
+    }
+}
+
 impl Drop for Gpu {
     fn drop(&mut self) {
-        // SAFETY: everything made from the device holds an Arc to this, so it is all gone.
+        if self.is_abandoned() {
+            return;
+        }
+        // SAFETY: everything made from the device holds an Arc to this, so it is all gone; the loader goes last.
         unsafe {
             let _ = self.device.device_wait_idle();
             self.device.destroy_device(None);
@@ -345,6 +364,7 @@ impl Drop for Gpu {
                 loader.destroy_debug_utils_messenger(*messenger, None);
             }
             self.instance.destroy_instance(None);
+            ManuallyDrop::drop(&mut self.entry);
         }
     }
 }

@@ -68,6 +68,9 @@ impl BindingTable {
 
 impl Drop for BindingTable {
     fn drop(&mut self) {
+        if self.gpu.is_abandoned() {
+            return;
+        }
         // SAFETY: pipelines and sets that use these hold an Arc to this.
         unsafe {
             self.gpu.device.destroy_pipeline_layout(self.pipeline_layout, None);
@@ -134,6 +137,9 @@ impl BindingSet {
 
 impl Drop for BindingSet {
     fn drop(&mut self) {
+        if self.table.gpu.is_abandoned() {
+            return;
+        }
         // SAFETY: owners wait for the GPU before dropping.
         unsafe { self.table.gpu.device.destroy_descriptor_pool(self.pool, None) }
     }
@@ -193,6 +199,9 @@ impl ComputePipeline {
 
 impl Drop for ComputePipeline {
     fn drop(&mut self) {
+        if self.table.gpu.is_abandoned() {
+            return;
+        }
         // SAFETY: owners wait for the GPU before dropping.
         unsafe { self.table.gpu.device.destroy_pipeline(self.pipeline, None) }
     }

@@ -11,7 +11,7 @@ use super::projector;
 use super::rights::Rights;
 use super::stages::{self, TrackingStage};
 use super::threads::{
-    policy, run_threads, Shared, Stages, GPU_TIMEOUT_NS, LISTEN_NS, RECEIPT_NS, STAGE_THREADS,
+    policy, run_threads, Shared, Stages, FIRST_FRAME_TIMEOUT_NS, LISTEN_NS, RECEIPT_NS, STAGE_THREADS,
 };
 use crate::clock::{Clock, ManualClock, MonotonicClock, RunClock, Stopwatch};
 use crate::config::{Pace, Packer, ProjectorBackend, RenderMethod};
@@ -93,7 +93,7 @@ fn run_from(
     let tracker = rig.tracker(tracker_clock(&clock), HostTime(0))?;
     let mut memory = frame_memory(&rig, renderer.as_mut(), options.in_flight.max(2))?;
     if let (Some(renderer), Some(first), false) = (&mut renderer, memory.first_mut(), is_virtual) {
-        stages::warm_up(first, &rig, renderer, GPU_TIMEOUT_NS).map_err(RenderError::from)?;
+        stages::warm_up(first, &rig, renderer, FIRST_FRAME_TIMEOUT_NS).map_err(RenderError::from)?;
     }
     let (lights_in, lights) = channel(LIGHTS, WaitPolicy::Park);
     let prepared = gpu.is_none().then(|| PreparedFrames::new(rig.camera.raster));

@@ -57,7 +57,9 @@ pub(super) const RECEIPT_NS: i64 = 500_000;
 /// Longest wait for another stage before it is looked whether the run goes on.
 const WAIT_NS: i64 = 100_000_000;
 /// A frame that the GPU has not finished by then is given up, and the run with it.
-pub(super) const GPU_TIMEOUT_NS: u64 = 20_000_000_000;
+const GPU_TIMEOUT_NS: u64 = 20_000_000_000;
+/// The same for the first one, for which drivers translate shaders: minutes on a slow machine that does other things too.
+pub(super) const FIRST_FRAME_TIMEOUT_NS: u64 = 180_000_000_000;
 /// Time for which trackers are listened to before the first frame, so that the filters know the motion.
 pub(super) const LISTEN_NS: i64 = 150_000_000;
 
@@ -359,7 +361,8 @@ fn pack_thread(
         let id = job.note.id.0;
         enter_frame_path(id >= WARM_UP_FRAMES);
         shared.may_stall(Stage::Pack, id);
-        if let Err(source) = stages::finish(&mut job, GPU_TIMEOUT_NS) {
+        let limit = if id == 0 { FIRST_FRAME_TIMEOUT_NS } else { GPU_TIMEOUT_NS };
+        if let Err(source) = stages::finish(&mut job, limit) {
             shared.fail(PipelineError::Gpu { frame: id, source });
             break;
         }
