@@ -38,10 +38,12 @@ uint half_node_hits(uint meta, uint octant4, vec3 step_inverse, vec3 base_near, 
     uint inner_mask = (is_inner >> 4u) * 0xffu;
     uint bit_index = (meta ^ (octant4 & inner_mask)) & 0x1f1f1f1fu;
     uint child_bits = (meta >> 5u) & 0x07070707u;
-    vec4 enter = max(max(unpack_bytes(near_x) * step_inverse.x + base_near.x, unpack_bytes(near_y) * step_inverse.y + base_near.y),
-                     max(unpack_bytes(near_z) * step_inverse.z + base_near.z, vec4(0.0)));
-    vec4 leave = min(min(unpack_bytes(far_x) * step_inverse.x + base_far.x, unpack_bytes(far_y) * step_inverse.y + base_far.y),
-                     min(unpack_bytes(far_z) * step_inverse.z + base_far.z, vec4(t_max)));
+    // Bit patterns of floats that are not negative have the order of the floats; a negative entry counts as 0, a negative exit as a miss. As
+    // integers minimum and maximum are one instruction each, where floats would need more for NaN.
+    ivec4 enter = max(max(floatBitsToInt(unpack_bytes(near_x) * step_inverse.x + base_near.x), floatBitsToInt(unpack_bytes(near_y) * step_inverse.y + base_near.y)),
+                      max(floatBitsToInt(unpack_bytes(near_z) * step_inverse.z + base_near.z), ivec4(0)));
+    ivec4 leave = min(min(floatBitsToInt(unpack_bytes(far_x) * step_inverse.x + base_far.x), floatBitsToInt(unpack_bytes(far_y) * step_inverse.y + base_far.y)),
+                      min(floatBitsToInt(unpack_bytes(far_z) * step_inverse.z + base_far.z), ivec4(floatBitsToInt(t_max))));
     bvec4 inside = lessThanEqual(enter, leave);
     uint hits = inside.x ? (child_bits & 255u) << (bit_index & 31u) : 0u;
     hits |= inside.y ? ((child_bits >> 8u) & 255u) << ((bit_index >> 8u) & 31u) : 0u;
@@ -77,15 +79,18 @@ struct LocalRay {
     vec3 v;
 };
 
+// A zero component would make 0 * inf in the slab test: a tiny one of the same sign gives the same hits.
+vec3 safe_direction(vec3 direction) {
+    return vec3(abs(direction.x) < 1e-18 ? (direction.x < 0.0 ? -1e-18 : 1e-18) : direction.x,
+                     abs(direction.y) < 1e-18 ? (direction.y < 0.0 ? -1e-18 : 1e-18) : direction.y,
+                     abs(direction.z) < 1e-18 ? (direction.z < 0.0 ? -1e-18 : 1e-18) : direction.z);
+}
+
 LocalRay local_ray(vec3 origin, vec3 direction) {
     LocalRay r;
     r.origin = origin;
     r.direction = direction;
-    // A zero component would make 0 * inf in the slab test: a tiny one of the same sign gives the same hits.
-    vec3 safe = vec3(abs(direction.x) < 1e-18 ? (direction.x < 0.0 ? -1e-18 : 1e-18) : direction.x,
-                     abs(direction.y) < 1e-18 ? (direction.y < 0.0 ? -1e-18 : 1e-18) : direction.y,
-                     abs(direction.z) < 1e-18 ? (direction.z < 0.0 ? -1e-18 : 1e-18) : direction.z);
-    r.inverse = 1.0 / safe;
+    r.inverse = 1.0 / safe_direction(direction);
     // [Duff17] branchless basis.
     vec3 d = normalize(direction);
     float s = d.z < 0.0 ? -1.0 : 1.0;
@@ -129,68 +134,143 @@ bool enters_bounds(vec3 origin, vec3 inverse, vec3 lower, vec3 upper, float t_ma
     return enter <= leave;
 }
 
+// The next body from `first` on, with any of `mask` bits (mask 0: all), whose bounds the ray enters before `t_max`; the number of bodies if none.
+uint next_body(uint first, vec3 origin, vec3 inverse, uint mask, float t_max) {
+    uint i = first;
+    bool enters = false;
+    do {
+        if (i < frame.instance_count) {
+            uint flags = instances[i].flags;
+            enters = (flags & INSTANCE_EMPTY) == 0u && (mask == 0u || (flags & mask) != 0u)
+                  && enters_bounds(origin, inverse, instances[i].bounds_min, instances[i].bounds_max, t_max);
+            i += enters ? 0u : 1u;
+        }
+    } while (!enters && i < frame.instance_count);
+    return i;
+}
+
+// A ray on its way through the bodies.
+struct Traversal {
+    vec3 origin;
+    vec3 direction;
+    vec3 inverse;
+    uint mask;     // bodies with any of these bits; 0: all
+    bool any_hit;  // stops at the first surface
+    bool found;
+    Hit hit;       // the nearest so far; `t` limits the ray
+    uint body;     // the one that is being traversed
+    uint next;     // the one after it; the number of bodies: there is none
+    bool inside;   // there is more to do in this body
+    LocalRay local;
+    uint node_base;
+    uint triangle_base;
+    uint octant;
+    int depth;
+    uvec2 group;
+    uvec2 triangles;
+};
+
+uvec2 traversal_stack[STACK_SIZE];
+
+void begin_ray(inout Traversal t, vec3 origin, vec3 direction, uint mask, bool any_hit, float t_max) {
+    t.origin = origin;
+    t.direction = direction;
+    t.inverse = 1.0 / safe_direction(direction);
+    t.mask = mask;
+    t.any_hit = any_hit;
+    t.found = false;
+    t.hit.t = t_max;
+    t.inside = false;
+    t.next = next_body(0u, origin, t.inverse, mask, t_max);
+}
+
+// No body is left.
+bool at_end(Traversal t) { return !t.inside && t.next >= frame.instance_count; }
+
+// Goes on to the next body. Not at the end.
+void enter_next_body(inout Traversal t) {
+    t.body = min(t.next, max(frame.instance_count, 1u) - 1u);
+    t.next = next_body(t.body + 1u, t.origin, t.inverse, t.mask, t.hit.t);
+    t.inside = true;
+    t.local = local_ray(transform_point(instances[t.body].object_from_world, t.origin),
+                        transform_vector(instances[t.body].object_from_world, t.direction));
+    t.node_base = instances[t.body].node_offset;
+    t.triangle_base = instances[t.body].triangle_offset;
+    bvec3 negative = lessThan(t.local.inverse, vec3(0.0));
+    t.octant = (negative.x ? 0u : 4u) | (negative.y ? 0u : 2u) | (negative.z ? 0u : 1u);
+    t.depth = 0;
+    t.group = uvec2(0u, 0x80000000u);
+    t.triangles = uvec2(0u);
+}
+
+bool at_triangles(Traversal t) { return t.triangles.y != 0u; }
+
+// Opens one node: its children and triangles that the ray meets come next.
+void open_node(inout Traversal t) {
+    uint child = uint(findMSB(t.group.y));
+    uint base = t.group.x;
+    uint mask_bits = t.group.y;
+    t.group.y &= ~(1u << child);
+    if ((t.group.y & 0xff000000u) != 0u && t.depth < STACK_SIZE) traversal_stack[t.depth++] = t.group;
+    uint slot = (child - 24u) ^ t.octant;
+    uint relative = uint(bitCount(mask_bits & ~(0xffffffffu << slot)));
+    uint node = (t.node_base + base + relative) * 5u;
+    uvec4 n0 = NODE(node);
+    uvec4 n1 = NODE(node + 1u);
+    uint hits = node_hits(t.local.origin, t.local.inverse, lessThan(t.local.inverse, vec3(0.0)), t.octant * 0x01010101u, t.hit.t, n0, n1, node);
+    t.group = uvec2(n1.x, (hits & 0xff000000u) | (n0.w >> 24u));
+    t.triangles = uvec2(n1.y, hits & 0x00ffffffu);
+    if ((t.group.y & 0xff000000u) == 0u) {
+        t.inside = t.depth > 0;
+        t.group.y = 0u;
+        if (t.inside) t.group = traversal_stack[--t.depth];
+    }
+    t.inside = t.inside || at_triangles(t);
+}
+
+// Tests one triangle.
+void test_triangle(inout Traversal t) {
+    uint bit = uint(findMSB(t.triangles.y));
+    t.triangles.y &= ~(1u << bit);
+    uint triangle = t.triangles.x + bit;
+    float distance_;
+    vec2 barycentric;
+    bool meets = intersect_triangle(t.local, (t.triangle_base + triangle) * 3u, 0.0, t.hit.t, distance_, barycentric);
+#ifdef ALPHA_TEST
+    if (HAS_ALPHA_MASK) meets = meets && alpha_present(t.body, triangle, barycentric);
+#endif
+    if (meets) {
+        t.hit.t = distance_;
+        t.hit.instance = t.body;
+        t.hit.triangle = triangle;
+        t.hit.barycentric = barycentric;
+        t.found = true;
+    }
+    bool over = meets && t.any_hit;
+    t.triangles.y = over ? 0u : t.triangles.y;
+    t.next = over ? frame.instance_count : t.next;
+    bool nodes = (t.group.y & 0xff000000u) != 0u;
+    t.inside = !over && (at_triangles(t) || nodes);
+}
+
 // Traces one ray through all bodies that have any of `mask` bits (mask 0: all). ANY_HIT: stops at the first surface.
 // Returns true on a hit; `hit.t` must hold the largest distance on entry.
+//
+// Every loop tests at its end: software Vulkan runs the body of a loop that tests at its start once more with no lane active.
 bool trace_ray(vec3 origin, vec3 direction, uint mask, bool any_hit, inout Hit hit) {
-    bool found = false;
-    vec3 world_inverse = local_ray(origin, direction).inverse;
-    for (uint i = 0u; i < frame.instance_count; i++) {
-        uint flags = instances[i].flags;
-        if ((flags & INSTANCE_EMPTY) != 0u || (mask != 0u && (flags & mask) == 0u)) continue;
-        if (!enters_bounds(origin, world_inverse, instances[i].bounds_min, instances[i].bounds_max, hit.t)) continue;
-        LocalRay r = local_ray(transform_point(instances[i].object_from_world, origin),
-                               transform_vector(instances[i].object_from_world, direction));
-        uint node_base = instances[i].node_offset;
-        uint triangle_base = instances[i].triangle_offset;
-        bvec3 negative = lessThan(r.inverse, vec3(0.0));
-        uint octant = (negative.x ? 0u : 4u) | (negative.y ? 0u : 2u) | (negative.z ? 0u : 1u);
-        uint octant4 = octant * 0x01010101u;
-        uvec2 stack[STACK_SIZE];
-        int depth = 0;
-        uvec2 group = uvec2(0u, 0x80000000u);
-        uvec2 triangles = uvec2(0u);
-        for (;;) {
-            if ((group.y & 0xff000000u) != 0u) {
-                uint child = uint(findMSB(group.y));
-                uint base = group.x;
-                uint mask_bits = group.y;
-                group.y &= ~(1u << child);
-                if ((group.y & 0xff000000u) != 0u && depth < STACK_SIZE) stack[depth++] = group;
-                uint slot = (child - 24u) ^ (octant & 255u);
-                uint relative = uint(bitCount(mask_bits & ~(0xffffffffu << slot)));
-                uint node = (node_base + base + relative) * 5u;
-                uvec4 n0 = NODE(node);
-                uvec4 n1 = NODE(node + 1u);
-                uint hits = node_hits(r.origin, r.inverse, negative, octant4, hit.t, n0, n1, node);
-                group = uvec2(n1.x, (hits & 0xff000000u) | (n0.w >> 24u));
-                triangles = uvec2(n1.y, hits & 0x00ffffffu);
-            } else {
-                triangles = uvec2(0u);
-                group = uvec2(0u);
-            }
-            while (triangles.y != 0u) {
-                uint bit = uint(findMSB(triangles.y));
-                triangles.y &= ~(1u << bit);
-                uint triangle = triangles.x + bit;
-                float t;
-                vec2 barycentric;
-                if (intersect_triangle(r, (triangle_base + triangle) * 3u, 0.0, hit.t, t, barycentric)) {
-#ifdef ALPHA_TEST
-                    if (HAS_ALPHA_MASK && !alpha_present(i, triangle, barycentric)) continue;
-#endif
-                    hit.t = t;
-                    hit.instance = i;
-                    hit.triangle = triangle;
-                    hit.barycentric = barycentric;
-                    found = true;
-                    if (any_hit) return true;
-                }
-            }
-            if ((group.y & 0xff000000u) == 0u) {
-                if (depth == 0) break;
-                group = stack[--depth];
-            }
-        }
-    }
-    return found;
+    Traversal t;
+    begin_ray(t, origin, direction, mask, any_hit, hit.t);
+    do {
+        if (!at_end(t)) enter_next_body(t);
+        do {
+            do {
+                if (t.inside && !at_triangles(t)) open_node(t);
+            } while (t.inside && !at_triangles(t));
+            do {
+                if (at_triangles(t)) test_triangle(t);
+            } while (at_triangles(t));
+        } while (t.inside);
+    } while (!at_end(t));
+    hit = t.hit;
+    return t.found;
 }

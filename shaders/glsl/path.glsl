@@ -28,70 +28,82 @@ struct RayCount {
     uint shadow;
 };
 
-vec3 trace_path(Point s, Sampler rng, inout RayCount rays) {
-    vec3 throughput = vec3(1.0);
-    vec3 radiance = s.emitted;
-    for (uint vertex = 1u; vertex < frame.depth; vertex++) {
-        // A single-sided opaque surface seen from behind is black.
-        if (!s.front && (s.flags & (MATERIAL_DOUBLE_SIDED | MATERIAL_TRANSMISSIVE)) == 0u) break;
-        Lobes lobes = lobes_of(s);
-        bool only_delta = mirror_like(s) && lobes.diffuse <= 0.0;
-        // Where the light and the next direction are chosen matters most: they share a group of four. Its first two dimensions are the most
-        // even; without light samples the next direction has them, and the choice of its lobe the third.
-        vec4 u_direction = sample_4d(rng, vertex * 2u - 2u);
-        vec4 u_choice = sample_4d(rng, vertex * 2u - 1u);
-        bool no_light = frame.environment_select == 0.0 && frame.light_count == 0u;
-        vec2 u_light = u_direction.xy, u_bsdf = no_light ? u_direction.xy : u_direction.zw;
-        float u_pick = u_choice.x, u_lobe = no_light ? u_direction.z : u_choice.y, u_roulette = u_choice.z;
-        if (!only_delta) {
-            LightSample light = sample_light(s.p, s.n, u_pick, u_light);
-            if (light.valid) {
-                vec3 direction = normalize(light.to_light);
-                vec3 value;
-                float pdf;
-                evaluate(s, lobes, direction, value, pdf);
-                if (luminance(value) > 0.0) {
-                    float side = dot(direction, s.g) > 0.0 ? 1.0 : -1.0;
-                    vec3 origin = s.p + s.g * (side * s.offset);
-                    vec3 to_light = light.finite_distance ? light.to_light - s.g * (side * s.offset) : direction;
-                    Hit blocker;
-                    blocker.t = light.finite_distance ? 1.0 : INFINITY;
-                    rays.shadow++;
-                    if (!trace_ray(origin, to_light, 0u, true, blocker)) {
-                        float weight = light.pdf > 0.0 ? balance(light.pdf, pdf) : 1.0;
-                        radiance += limit_indirect(throughput * value * light.radiance * weight, vertex);
-                    }
+// A path on its way.
+struct Path {
+    Point at;        // its newest vertex
+    uint vertex;     // 1 is the first surface point
+    vec3 throughput;
+    vec3 radiance;
+};
+
+Path begin_path(Point first) { return Path(first, 1u, vec3(1.0), first.emitted); }
+
+// Lights the newest vertex and goes on to the next one. False: the path is at its end, its radiance complete.
+bool advance_path(inout Path path, Sampler rng, inout RayCount rays) {
+    Point s = path.at;
+    uint vertex = path.vertex;
+    // A single-sided opaque surface seen from behind is black.
+    bool black = !s.front && (s.flags & (MATERIAL_DOUBLE_SIDED | MATERIAL_TRANSMISSIVE)) == 0u;
+    if (vertex >= frame.depth || black) return false;
+    Lobes lobes = lobes_of(s);
+    bool only_delta = mirror_like(s) && lobes.diffuse <= 0.0;
+    // Where the light and the next direction are chosen matters most: they share a group of four. Its first two dimensions are the most
+    // even; without light samples the next direction has them, and the choice of its lobe the third.
+    vec4 u_direction = sample_4d(rng, vertex * 2u - 2u);
+    vec4 u_choice = sample_4d(rng, vertex * 2u - 1u);
+    bool no_light = frame.environment_select == 0.0 && frame.light_count == 0u;
+    vec2 u_light = u_direction.xy, u_bsdf = no_light ? u_direction.xy : u_direction.zw;
+    float u_pick = u_choice.x, u_lobe = no_light ? u_direction.z : u_choice.y, u_roulette = u_choice.z;
+    if (!only_delta) {
+        LightSample light = sample_light(s.p, s.n, u_pick, u_light);
+        if (light.valid) {
+            vec3 direction = normalize(light.to_light);
+            vec3 value;
+            float pdf;
+            evaluate(s, lobes, direction, value, pdf);
+            if (luminance(value) > 0.0) {
+                float side = dot(direction, s.g) > 0.0 ? 1.0 : -1.0;
+                vec3 origin = s.p + s.g * (side * s.offset);
+                vec3 to_light = light.finite_distance ? light.to_light - s.g * (side * s.offset) : direction;
+                Hit blocker;
+                blocker.t = light.finite_distance ? 1.0 : INFINITY;
+                rays.shadow++;
+                if (!trace_ray(origin, to_light, 0u, true, blocker)) {
+                    float weight = light.pdf > 0.0 ? balance(light.pdf, pdf) : 1.0;
+                    path.radiance += limit_indirect(path.throughput * value * light.radiance * weight, vertex);
                 }
             }
         }
-        BsdfSample next = sample_bsdf(s, lobes, u_lobe, u_bsdf);
-        if (!next.valid) break;
-        throughput *= next.weight;
-        float survival = 1.0;
-        if (vertex >= 3u) {
-            survival = min(0.95, max(throughput.x, max(throughput.y, throughput.z)));
-            if (!(u_roulette < survival)) break;
-            throughput /= survival;
-        }
-        vec3 origin = s.p + s.g * (next.below ? -s.offset : s.offset);
-        Hit hit;
-        hit.t = INFINITY;
-        rays.closest++;
-        if (!trace_ray(origin, next.direction, 0u, false, hit)) {
-            if (ENVIRONMENT_KIND != 0u) {
-                float light_pdf = next.delta ? 0.0 : environment_pdf(next.direction, s.n) * frame.environment_select;
-                float weight = next.delta ? 1.0 : balance(next.pdf, light_pdf);
-                radiance += limit_indirect(throughput * environment_radiance(next.direction) * weight, vertex);
-            }
-            break;
-        }
-        vec3 from = s.p;
-        s = shading_point(hit, -normalize(next.direction));
-        if (HAS_EMISSIVE && s.light != NO_LIGHT && luminance(s.emitted) > 0.0) {
-            float light_pdf = next.delta ? 0.0 : emissive_pdf(s.light, hit.instance, hit.triangle, from, s.p, s.g);
-            float weight = next.delta ? 1.0 : balance(next.pdf, light_pdf);
-            radiance += limit_indirect(throughput * s.emitted * weight, vertex);
-        }
     }
-    return radiance;
+    BsdfSample next = sample_bsdf(s, lobes, u_lobe, u_bsdf);
+    if (!next.valid) return false;
+    path.throughput *= next.weight;
+    float survival = 1.0;
+    if (vertex >= 3u) {
+        survival = min(0.95, max(path.throughput.x, max(path.throughput.y, path.throughput.z)));
+        if (!(u_roulette < survival)) return false;
+        path.throughput /= survival;
+    }
+    vec3 origin = s.p + s.g * (next.below ? -s.offset : s.offset);
+    Hit hit;
+    hit.t = INFINITY;
+    rays.closest++;
+    if (!trace_ray(origin, next.direction, 0u, false, hit)) {
+        if (ENVIRONMENT_KIND != 0u) {
+            float light_pdf = next.delta ? 0.0 : environment_pdf(next.direction, s.n) * frame.environment_select;
+            float weight = next.delta ? 1.0 : balance(next.pdf, light_pdf);
+            path.radiance += limit_indirect(path.throughput * environment_radiance(next.direction) * weight, vertex);
+        }
+        return false;
+    }
+    vec3 from = s.p;
+    s = shading_point(hit, -normalize(next.direction));
+    path.at = s;
+    path.vertex++;
+    if (HAS_EMISSIVE && s.light != NO_LIGHT && luminance(s.emitted) > 0.0) {
+        float light_pdf = next.delta ? 0.0 : emissive_pdf(s.light, hit.instance, hit.triangle, from, s.p, s.g);
+        float weight = next.delta ? 1.0 : balance(next.pdf, light_pdf);
+        path.radiance += limit_indirect(path.throughput * s.emitted * weight, vertex);
+    }
+    return path.vertex < frame.depth;
 }

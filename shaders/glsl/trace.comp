@@ -47,19 +47,24 @@ void main() {
     float sum_squares = 0.0;
     uint count = 0u, invalid = 0u;
     RayCount rays = RayCount(0u, 0u);
-    for (uint i = 0u; i < item.spp; i++) {
-        vec3 l = trace_path(first, rng, rays);
-        rng.index++;
-        // A sample that is not finite counts as absent.
-        if (finite3(l)) {
-            sum += l;
+    // A lane whose path ends begins its next sample at once, while its neighbours are still on their way.
+    Path path = begin_path(first);
+    uint left = item.spp;
+    do {
+        if (!advance_path(path, rng, rays)) {
+            // A sample that is not finite counts as absent.
+            bool valid = finite3(path.radiance);
+            vec3 l = valid ? path.radiance : vec3(0.0);
             float y = luminance(l);
+            sum += l;
             sum_squares += y * y;
-            count++;
-        } else {
-            invalid++;
+            count += valid ? 1u : 0u;
+            invalid += valid ? 0u : 1u;
+            rng.index++;
+            left--;
+            path = begin_path(first);
         }
-    }
+    } while (left > 0u);
     radiance_out[item.pixel] = vec4(count > 0u ? sum / float(count) : vec3(0.0), float(count));
     if (SAMPLER == 2u) filtered[item.pixel] = vec4(sum_squares, 0.0, 0.0, 0.0);
     COUNT(closest_rays, rays.closest)
