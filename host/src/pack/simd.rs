@@ -50,29 +50,17 @@ fn pack_with_avx512(codes: &[u32], frame: &mut BitPlaneFrame) {
 #[inline]
 #[target_feature(enable = "avx2")]
 fn block_avx2(pixels: &[u32; BLOCK_PIXELS], batch: &mut Batch, at: usize) {
-    let odd_bytes = _mm256_set1_epi16(0xff00_u16 as i16);
     for (part, pixels) in pixels.as_chunks::<256>().0.iter().enumerate() {
-        let mut channels = [[_mm256_setzero_si256(); 8]; CODE_BITS / 8];
-        for (group, pixels) in pixels.as_chunks::<32>().0.iter().enumerate() {
-            let load = |i: usize| {
-                // SAFETY: pixels 8 i to 8 i + 8 of an array of 32; the load needs no alignment.
-                unsafe { _mm256_loadu_si256(pixels.as_ptr().add(8 * i).cast()) }
-            };
-            // Double word k: what has the rest k. Bytes of two registers of each two channels, then of four registers of one.
-            let pair = |low: __m256i, high: __m256i| {
-                (
-                    _mm256_blendv_epi8(low, _mm256_slli_epi16::<8>(high), odd_bytes),
-                    _mm256_blendv_epi8(_mm256_srli_epi16::<8>(low), high, odd_bytes),
-                )
-            };
-            let ((rb, g), (rb_next, g_next)) = (pair(load(0), load(1)), pair(load(2), load(3)));
-            channels[0][group] = _mm256_blend_epi16::<0xaa>(rb, _mm256_slli_epi32::<16>(rb_next));
-            channels[1][group] = _mm256_blend_epi16::<0xaa>(g, _mm256_slli_epi32::<16>(g_next));
-            channels[2][group] = _mm256_blend_epi16::<0xaa>(_mm256_srli_epi32::<16>(rb), rb_next);
-        }
-        for (channel, groups) in channels.iter().enumerate() {
-            let planes = transpose_bits(transpose_doublewords(groups));
-            for (bit, bytes) in planes.into_iter().enumerate() {
+        let (first, second) = pixels.split_at(128);
+        let (first, second) = (gather_rests(first), gather_rests(second));
+        for (channel, (first, second)) in first.iter().zip(&second).enumerate() {
+            let mut rests = [_mm256_setzero_si256(); 8];
+            for k in 0..4 {
+                // The last rest first: bit 7 of a plane's byte is the leftmost pixel.
+                rests[7 - k] = _mm256_permute2x128_si256::<0x20>(first[k], second[k]);
+                rests[3 - k] = _mm256_permute2x128_si256::<0x31>(first[k], second[k]);
+            }
+            for (bit, bytes) in transpose_bits(rests).into_iter().enumerate() {
                 let plane = &mut batch.0[8 * channel + bit][at + 32 * part..at + 32 * part + 32];
                 // SAFETY: the slice has 32 bytes; the store needs no alignment.
                 unsafe { _mm256_storeu_si256(plane.as_mut_ptr().cast(), bytes) };
@@ -81,24 +69,38 @@ fn block_avx2(pixels: &[u32; BLOCK_PIXELS], batch: &mut Batch, at: usize) {
     }
 }
 
-/// An 8 x 8 matrix of double words, transposed, the last row first: bit 7 of a plane's byte is the leftmost pixel.
+/// 128 pixels into four registers for each channel: register `k` holds the 16 bytes of the pixels with rest `k` by 8 in its
+/// lower half, those with rest `k + 4` in its upper half. Only interleavings, so that no shift and no mask is needed.
 #[inline]
 #[target_feature(enable = "avx2")]
-fn transpose_doublewords(r: &[__m256i; 8]) -> [__m256i; 8] {
-    let lo = |i: usize, j: usize| _mm256_unpacklo_epi32(r[i], r[j]);
-    let hi = |i: usize, j: usize| _mm256_unpackhi_epi32(r[i], r[j]);
-    // Columns 0, 1 (and 4, 5 in the upper half), then 2, 3 (and 6, 7), of rows two by two.
-    let (a, b) = ([lo(0, 1), lo(2, 3), lo(4, 5), lo(6, 7)], [hi(0, 1), hi(2, 3), hi(4, 5), hi(6, 7)]);
-    let four = |v: &[__m256i; 4]| {
-        [
-            [_mm256_unpacklo_epi64(v[0], v[1]), _mm256_unpacklo_epi64(v[2], v[3])],
-            [_mm256_unpackhi_epi64(v[0], v[1]), _mm256_unpackhi_epi64(v[2], v[3])],
-        ]
-    };
-    let ([c0, c1], [c2, c3]) = (four(&a), four(&b));
-    let low = |c: [__m256i; 2]| _mm256_permute2x128_si256::<0x20>(c[0], c[1]);
-    let high = |c: [__m256i; 2]| _mm256_permute2x128_si256::<0x31>(c[0], c[1]);
-    [high(c3), high(c2), high(c1), high(c0), low(c3), low(c2), low(c1), low(c0)]
+fn gather_rests(pixels: &[u32]) -> [[__m256i; 4]; CODE_BITS / 8] {
+    let mut fours = [[_mm256_setzero_si256(); 4]; 4];
+    for (four, pixels) in fours.iter_mut().zip(pixels.as_chunks::<32>().0) {
+        let load = |i: usize| {
+            // SAFETY: pixels 8 i to 8 i + 8 of an array of 32; the load needs no alignment.
+            unsafe { _mm256_loadu_si256(pixels.as_ptr().add(8 * i).cast()) }
+        };
+        let (a, b, c, d) = (load(0), load(1), load(2), load(3));
+        let (ab, ab_next) = (_mm256_unpacklo_epi8(a, b), _mm256_unpackhi_epi8(a, b));
+        let (cd, cd_next) = (_mm256_unpacklo_epi8(c, d), _mm256_unpackhi_epi8(c, d));
+        // Each half of register k: four bytes of red, of green, of blue, of nothing.
+        *four = [
+            _mm256_unpacklo_epi16(ab, cd),
+            _mm256_unpackhi_epi16(ab, cd),
+            _mm256_unpacklo_epi16(ab_next, cd_next),
+            _mm256_unpackhi_epi16(ab_next, cd_next),
+        ];
+    }
+    let mut channels = [[_mm256_setzero_si256(); 4]; CODE_BITS / 8];
+    for k in 0..4 {
+        let [a, b, c, d] = [fours[0][k], fours[1][k], fours[2][k], fours[3][k]];
+        let (rg, rg_next) = (_mm256_unpacklo_epi32(a, b), _mm256_unpacklo_epi32(c, d));
+        let (blue, blue_next) = (_mm256_unpackhi_epi32(a, b), _mm256_unpackhi_epi32(c, d));
+        channels[0][k] = _mm256_unpacklo_epi64(rg, rg_next);
+        channels[1][k] = _mm256_unpackhi_epi64(rg, rg_next);
+        channels[2][k] = _mm256_unpacklo_epi64(blue, blue_next);
+    }
+    channels
 }
 
 /// Bit `i` of every byte of register `j` becomes bit `j` of the same byte of register `i`.
