@@ -56,10 +56,19 @@ impl Rights {
     /// The same for the mock projector's thread: it stands for a machine of its own, so no stage may hold it up.
     pub(super) fn enter_projector(&self) {
         if self.wanted {
-            let above = if self.priority > 0 { (self.priority + 1).min(99) } else { 0 };
+            let above = self.highest_priority();
             // A refusal is told by the stages, which ask for nearly the same.
             let core = self.cores.get(PROJECTOR).copied();
             let _ = enter_frame_path(ThreadRights { priority: above, core });
+        }
+    }
+
+    /// The highest priority that any thread of the run asks for; 0 under the normal scheduler.
+    pub(super) fn highest_priority(&self) -> u32 {
+        if self.wanted && self.priority > 0 {
+            (self.priority + 1).min(99)
+        } else {
+            0
         }
     }
 

@@ -42,7 +42,7 @@ use std::sync::{Arc, Mutex, OnceLock};
 const LIGHTS: usize = 8192;
 /// Buffers of the cable to a projector in this process: one is filled while another is read, and one for a projector that is late.
 const CABLE_BUFFERS: usize = 3;
-/// A step of the control thread that ends this late is a standstill of the machine.
+/// A step of a control thread that ends this late is a standstill of the machine.
 const STANDSTILL_NS: i64 = 1_000_000;
 
 /// Runs the rig until `options.frames` are planned or `monitor` asks to stop. The projector ends dark.
@@ -102,9 +102,9 @@ fn run_from(
 
     let rights = Rights::new(&config.real_time);
     let standstill = match &clock {
-        // Without the control thread late frames are all counted as the rig's.
+        // Without control threads late frames are all counted as the rig's.
         RunClock::Real(c) => {
-            StandstillMonitor::start(Arc::new(c.sleeping()), STANDSTILL_NS, config.real_time.priority).ok()
+            StandstillMonitor::start(Arc::new(c.sleeping()), STANDSTILL_NS, rights.highest_priority()).ok()
         }
         RunClock::Virtual(_) => None,
     };
@@ -305,7 +305,9 @@ fn lead_estimator(rig: &Rig, link: &HostLink) -> LeadEstimator {
     let slot_ns = rig.rate().slot_len_ns(0);
     // Sent earlier, a frame would find no room in the device, whose word of a free buffer takes part of a slot.
     let held = link.device().map_or(1, |hello| i64::from(hello.frame_buffers));
-    LeadEstimator::new(slot_ns, modelled_ns(rig), (held * slot_ns - slot_ns / 2 - RECEIPT_NS).max(0))
+    let longest_ns = (held * slot_ns - slot_ns / 2 - RECEIPT_NS).max(0);
+    // Half a slot in reserve: what a core does beside frames, and lends to others, is mostly shorter.
+    LeadEstimator::new(slot_ns, modelled_ns(rig), slot_ns / 2, longest_ns)
 }
 
 /// Holds the GPU's time inside the slot by spending fewer samples: thousandths of a sample a pixel, from what the rig file asks for down

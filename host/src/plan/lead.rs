@@ -1,7 +1,8 @@
 //! Measured times from latch to sent into how early a frame must be begun, and when its slot must be given up.
 //!
 //! A histogram whose counts are halved now and then: quantiles over the last seconds. One long stall moves a quantile by one
-//! frame in thousands and is forgotten; a maximum, or a mean, would carry it into every frame after.
+//! frame in thousands and is forgotten; a maximum, or a mean, would carry it into every frame after. What comes less often than
+//! the histogram remembers (an interrupt, a core lent to another machine) is met by a reserve.
 
 /// Bins of the histogram, each a 32nd of a slot: times up to [`HORIZON_SLOTS`].
 const BINS: usize = 128;
@@ -24,17 +25,27 @@ pub struct LeadEstimator {
     since_halved: u32,
     bin_ns: i64,
     first_guess_ns: i64,
+    reserve_ns: i64,
     longest_ns: i64,
     stalls: u64,
 }
 
 impl LeadEstimator {
-    /// For slots of `slot_ns` > 0. `first_guess_ns` is the lead until enough frames are measured; no lead is above `longest_ns`: what is
-    /// sent earlier would find no room in the device.
-    pub fn new(slot_ns: i64, first_guess_ns: i64, longest_ns: i64) -> Self {
+    /// For slots of `slot_ns` > 0. `first_guess_ns` is the lead until enough frames are measured, `reserve_ns` >= 0 is added to what is
+    /// measured; no lead is above `longest_ns`: what is sent earlier would find no room in the device.
+    pub fn new(slot_ns: i64, first_guess_ns: i64, reserve_ns: i64, longest_ns: i64) -> Self {
         let bin_ns = (slot_ns.max(1) * HORIZON_SLOTS / BINS as i64).max(1);
         let first_guess_ns = first_guess_ns.clamp(0, longest_ns);
-        Self { bins: [0; BINS], total: 0, since_halved: 0, bin_ns, first_guess_ns, longest_ns, stalls: 0 }
+        Self {
+            bins: [0; BINS],
+            total: 0,
+            since_halved: 0,
+            bin_ns,
+            first_guess_ns,
+            reserve_ns: reserve_ns.max(0),
+            longest_ns,
+            stalls: 0,
+        }
     }
 
     /// Takes in what one frame needed from the instant at which it should have been latched until it was sent, nanoseconds.
@@ -56,7 +67,7 @@ impl LeadEstimator {
 
     /// How long before its slot a frame is latched so that nearly all are sent in time.
     pub fn lead_ns(&self) -> i64 {
-        let measured = self.quantile(IN_TIME) + self.bin_ns;
+        let measured = (self.quantile(IN_TIME) + self.bin_ns).saturating_add(self.reserve_ns);
         let lead = if self.total < FEW { measured.max(self.first_guess_ns) } else { measured };
         lead.min(self.longest_ns)
     }
@@ -93,7 +104,7 @@ mod tests {
     const SLOT: i64 = 1_055_966;
 
     fn estimator() -> LeadEstimator {
-        LeadEstimator::new(SLOT, 2 * SLOT, 3 * SLOT)
+        LeadEstimator::new(SLOT, 2 * SLOT, 0, 3 * SLOT)
     }
 
     /// A reproducible number from 0 to 1.
@@ -126,6 +137,24 @@ mod tests {
         assert!(lead < 800_000 + 3 * e.bin_ns, "{lead} ns for needs of at most 0.8 ms");
         let slow = (20_000..40_000).filter(|&i| needs(i) > e.typical_ns()).count();
         assert!(slow <= 2_200, "{slow} of 20000 beyond the typical {} ns", e.typical_ns());
+    }
+
+    #[test]
+    fn the_reserve_comes_on_top_of_what_is_measured_and_ends_at_the_longest() {
+        let (mut with, mut without) = (LeadEstimator::new(SLOT, 0, SLOT / 2, 2 * SLOT), estimator());
+        for (ns, expected) in [(400_000, 400_000), (1_900_000, 2 * SLOT - SLOT / 2)] {
+            for _ in 0..10_000 {
+                with.measured(ns);
+                without.measured(ns);
+            }
+            let (lead, bare) = (with.lead_ns(), without.lead_ns());
+            assert!(lead == (bare + SLOT / 2).min(2 * SLOT) && bare >= expected, "{lead}, {bare}");
+            assert_eq!(
+                with.typical_ns(),
+                without.typical_ns(),
+                "when a slot is given up is not what is kept in reserve"
+            );
+        }
     }
 
     #[test]

@@ -143,6 +143,72 @@ pub fn set_timer_slack_ns(slack_ns: u64) -> Result<(), Refusal> {
     ))
 }
 
+/// `struct sched_attr` of the kernel, first version.
+#[cfg(target_os = "linux")]
+#[repr(C)]
+#[derive(Default)]
+struct SchedAttr {
+    size: u32,
+    policy: u32,
+    flags: u64,
+    nice: i32,
+    priority: u32,
+    runtime: u64,
+    deadline: u64,
+    period: u64,
+}
+
+/// Asks the normal scheduler for time slices of `slice_ns` (0.1 to 100 ms) for the calling thread, which keeps its niceness: a thread that
+/// wants little at a time comes before others that want much. Needs no right. Kernels before 6.12 have one slice for all and say nothing.
+#[cfg(target_os = "linux")]
+pub fn set_slice_ns(slice_ns: u64) -> Result<(), Refusal> {
+    let size = std::mem::size_of::<SchedAttr>() as u32;
+    let mut attr = SchedAttr::default();
+    // SAFETY: pid 0 is the calling thread; `attr` has the `size` bytes that the kernel may write and outlives the calls.
+    let rc = unsafe {
+        if libc::syscall(libc::SYS_sched_getattr, 0, &raw mut attr, size, 0) == 0 {
+            attr.size = size;
+            attr.runtime = slice_ns.clamp(100_000, 100_000_000);
+            libc::syscall(libc::SYS_sched_setattr, 0, &raw const attr, 0)
+        } else {
+            -1
+        }
+    };
+    if rc == 0 {
+        return Ok(());
+    }
+    Err(refusal("a shorter time slice".into(), "allow sched_setattr in the sandbox".into()))
+}
+
+/// The time slice of the calling thread under the normal scheduler, ns; 0 where the kernel has one for all threads.
+#[cfg(target_os = "linux")]
+pub fn slice_ns() -> u64 {
+    let size = std::mem::size_of::<SchedAttr>() as u32;
+    let mut attr = SchedAttr::default();
+    // SAFETY: as in `set_slice_ns`.
+    let rc = unsafe { libc::syscall(libc::SYS_sched_getattr, 0, &raw mut attr, size, 0) };
+    if rc == 0 {
+        attr.runtime
+    } else {
+        0
+    }
+}
+
+/// The cores that the calling thread may run on, in order.
+#[cfg(target_os = "linux")]
+pub fn allowed_core_list() -> Vec<u32> {
+    // SAFETY: cpu_set_t is a bit array, for which all zero bits are valid and which is written during the call only.
+    let set = unsafe {
+        let mut set: libc::cpu_set_t = std::mem::zeroed();
+        if libc::sched_getaffinity(0, std::mem::size_of_val(&set), &mut set) != 0 {
+            return Vec::new();
+        }
+        set
+    };
+    // SAFETY: every core asked for is inside the set.
+    (0..libc::CPU_SETSIZE as u32).filter(|&core| unsafe { libc::CPU_ISSET(core as usize, &set) }).collect()
+}
+
 /// Nanoseconds of processor time the calling thread has used.
 #[cfg(target_os = "linux")]
 pub fn thread_cpu_ns() -> i64 {
@@ -188,6 +254,18 @@ mod elsewhere {
     pub fn set_timer_slack_ns(_slack_ns: u64) -> Result<(), Refusal> {
         Err(not_here("a shorter timer slack"))
     }
+    /// Refused.
+    pub fn set_slice_ns(_slice_ns: u64) -> Result<(), Refusal> {
+        Err(not_here("a shorter time slice"))
+    }
+    /// Unknown.
+    pub fn slice_ns() -> u64 {
+        0
+    }
+    /// Unknown.
+    pub fn allowed_core_list() -> Vec<u32> {
+        Vec::new()
+    }
     /// Unknown.
     pub fn thread_cpu_ns() -> i64 {
         0
@@ -228,6 +306,29 @@ mod tests {
             let absent = pin_to_core(1023).unwrap_err().to_string();
             assert!(absent.contains("core 1023") && absent.contains("real_time.affinity"), "{absent}");
             assert!(pin_to_core(1 << 20).is_err());
+        });
+    }
+
+    #[test]
+    fn a_short_slice_stays_with_its_thread_and_keeps_the_scheduler() {
+        let before = apart(slice_ns);
+        let after = apart(|| {
+            set_slice_ns(100_000).unwrap();
+            (slice_ns(), real_time_priority())
+        });
+        assert!(after == (100_000, 0) || (before == 0 && after.0 == 0), "{before}, then {after:?}");
+        assert_eq!(apart(slice_ns), before, "other threads keep theirs");
+    }
+
+    #[test]
+    fn the_list_of_cores_is_the_one_that_the_kernel_reports() {
+        apart(|| {
+            let cores = allowed_core_list();
+            assert_eq!(cores.len(), usable_cores());
+            let last = *cores.last().unwrap();
+            pin_to_core(last).unwrap();
+            assert_eq!(allowed_core_list(), [last]);
+            assert_eq!(allowed_cores(), last.to_string());
         });
     }
 

@@ -1,9 +1,14 @@
-//! A thread that does nothing but sleep and look at the clock, into the intervals in which the machine itself stood still.
+//! Threads that do nothing but sleep and look at the clock, into the intervals in which the machine itself stood still.
 //!
-//! On a shared or virtual machine every thread may stop for milliseconds through no fault of the program. Frames that were
-//! late in such an interval are reported apart. The control thread sleeps in short steps; a step that took longer than asked
+//! On a shared or virtual machine a core may stop for milliseconds through no fault of the program. Frames that were
+//! late in such an interval are reported apart. A control thread sleeps in short steps; a step that took longer than asked
 //! by more than a threshold is a gap.
+//!
+//! There is one on every core, above all stages: nothing but the kernel and what is below it can keep it from running, so that a
+//! gap is never the program's own work, and a core that stands still is found while the other ones run. Where that rank is refused
+//! there is one thread on whatever core is free: it finds less, and excuses no stage that only waited for another.
 
+use super::os;
 use crate::clock::Clock;
 use dpm_device::time::HostTime;
 use std::sync::atomic::{AtomicBool, Ordering};
@@ -45,6 +50,21 @@ impl Standstills {
         }
     }
 
+    /// The union of what several control threads saw.
+    fn merged(all: Vec<Self>) -> Self {
+        let not_kept = all.iter().map(|s| s.not_kept).sum();
+        let mut gaps: Vec<Gap> = all.into_iter().flat_map(|s| s.gaps).collect();
+        gaps.sort_unstable_by_key(|g| g.from);
+        gaps.dedup_by(|next, kept| {
+            let overlap = next.from <= kept.to;
+            if overlap {
+                kept.to = kept.to.max(next.to);
+            }
+            overlap
+        });
+        Self { gaps, not_kept }
+    }
+
     /// The gaps, in order.
     pub fn gaps(&self) -> &[Gap] {
         &self.gaps
@@ -73,40 +93,63 @@ impl Standstills {
     }
 }
 
-/// The running control thread.
+/// The running control threads.
 #[derive(Debug)]
 pub struct StandstillMonitor {
     stop: Arc<AtomicBool>,
-    thread: Option<JoinHandle<Standstills>>,
+    threads: Vec<JoinHandle<Standstills>>,
 }
 
 impl StandstillMonitor {
-    /// Starts the control thread. Steps late by more than `threshold_ns` count (1 ms is a frame's length). It runs at the normal
-    /// priority unless `priority` asks for SCHED_FIFO, as the frame path does: a thread of lower rank would take the frame
-    /// path's own work for a standstill.
-    pub fn start(clock: Arc<dyn Clock>, threshold_ns: i64, priority: u32) -> std::io::Result<Self> {
-        let stop = Arc::new(AtomicBool::new(false));
-        let seen = stop.clone();
-        let thread = std::thread::Builder::new().name("standstill".into()).spawn(move || {
-            // A refusal was already reported by the frame path, which asks for the same.
-            let _ = super::enter_frame_path(super::ThreadRights { priority, core: None });
-            let mut standstills = Standstills { gaps: Vec::with_capacity(KEPT), not_kept: 0 };
-            // Relaxed: a flag that guards no data.
-            while !seen.load(Ordering::Relaxed) {
-                let due = clock.now().plus_ns(STEP_NS);
-                let woke = clock.wait_until(due);
-                standstills.note(due, woke, threshold_ns);
-            }
-            standstills
-        })?;
-        Ok(Self { stop, thread: Some(thread) })
+    /// Starts the control threads. Steps late by more than `threshold_ns` count (1 ms is a frame's length). `above` is the highest
+    /// SCHED_FIFO priority of the frame path, 0 for the normal scheduler.
+    ///
+    /// # Errors
+    /// The system's, when it has no more threads.
+    pub fn start(clock: Arc<dyn Clock>, threshold_ns: i64, above: u32) -> std::io::Result<Self> {
+        let priority = if (1..99).contains(&above) && Self::is_granted(above + 1)? { above + 1 } else { 0 };
+        let cores: Vec<Option<u32>> =
+            if priority > 0 { os::allowed_core_list().into_iter().map(Some).collect() } else { Vec::new() };
+        let mut monitor = Self { stop: Arc::new(AtomicBool::new(false)), threads: Vec::new() };
+        for core in if cores.is_empty() { vec![None] } else { cores } {
+            let (stop, clock) = (monitor.stop.clone(), clock.clone());
+            let thread = std::thread::Builder::new().name("standstill".into()).spawn(move || {
+                let _ = super::enter_frame_path(super::ThreadRights { priority, core });
+                watch(clock.as_ref(), threshold_ns, &stop)
+            })?;
+            monitor.threads.push(thread);
+        }
+        Ok(monitor)
     }
 
-    /// Ends the thread (within a step) and returns what it saw.
+    /// Whether a thread of this process may have that priority. Asked apart from the control threads: without it they are other ones.
+    fn is_granted(priority: u32) -> std::io::Result<bool> {
+        let asked = std::thread::Builder::new().spawn(move || os::set_fifo_priority(priority).is_ok())?;
+        Ok(asked.join().unwrap_or(false))
+    }
+
+    /// Control threads that run.
+    pub fn threads(&self) -> usize {
+        self.threads.len()
+    }
+
+    /// Ends the threads (within a step) and returns what they saw.
     pub fn finish(mut self) -> Standstills {
         self.stop.store(true, Ordering::Relaxed);
-        self.thread.take().and_then(|t| t.join().ok()).unwrap_or_default()
+        Standstills::merged(self.threads.drain(..).filter_map(|t| t.join().ok()).collect())
     }
+}
+
+/// A control thread's life.
+fn watch(clock: &dyn Clock, threshold_ns: i64, stop: &AtomicBool) -> Standstills {
+    let mut standstills = Standstills { gaps: Vec::with_capacity(KEPT), not_kept: 0 };
+    // Relaxed: a flag that guards no data.
+    while !stop.load(Ordering::Relaxed) {
+        let due = clock.now().plus_ns(STEP_NS);
+        let woke = clock.wait_until(due);
+        standstills.note(due, woke, threshold_ns);
+    }
+    standstills
 }
 
 impl Drop for StandstillMonitor {
@@ -157,6 +200,51 @@ mod tests {
         assert!(seen.touches(gap.from.plus_ns(-5), gap.to.plus_ns(5)));
         assert!(!seen.touches(gap.to.plus_ns(1), gap.to.plus_ns(2)));
         assert!(!seen.touches(gap.from.plus_ns(-2), gap.from.plus_ns(-1)));
+    }
+
+    #[test]
+    fn what_any_core_saw_counts_once() {
+        let seen = |gaps: &[(i64, i64)]| {
+            let mut s = Standstills::default();
+            gaps.iter().for_each(|&(from, to)| s.note(HostTime(from), HostTime(to), 0));
+            s
+        };
+        let all = Standstills::merged(vec![
+            seen(&[(10, 20), (50, 60), (90, 95)]),
+            seen(&[(15, 30), (52, 55), (70, 80)]),
+            seen(&[(30, 31)]),
+        ]);
+        let gaps: Vec<(i64, i64)> = all.gaps().iter().map(|g| (g.from.0, g.to.0)).collect();
+        assert_eq!(gaps, [(10, 31), (50, 60), (70, 80), (90, 95)]);
+        assert_eq!((all.total_ns(), all.longest_ns()), (46, 21));
+        assert!(all.touches(HostTime(58), HostTime(59)) && !all.touches(HostTime(61), HostTime(69)));
+    }
+
+    /// A thread above the stages and below the control threads holds one core for 20 ms: only where there are such ranks.
+    #[cfg(target_os = "linux")]
+    #[test]
+    fn work_of_lower_rank_is_no_standstill() {
+        let clock = Arc::new(MonotonicClock::new(0));
+        let monitor = StandstillMonitor::start(clock, 5_000_000, 51).unwrap();
+        if monitor.threads() != os::usable_cores() {
+            // The right is refused here: one thread, of no rank.
+            assert_eq!(monitor.threads(), 1);
+            return;
+        }
+        let busy = std::thread::spawn(|| {
+            let core = os::allowed_core_list()[0];
+            os::pin_to_core(core).unwrap();
+            os::set_fifo_priority(51).unwrap();
+            let begin = MonotonicClock::new(0);
+            while begin.now().0 < 20_000_000 {
+                std::hint::spin_loop();
+            }
+            begin.now().0
+        });
+        let worked_ns = busy.join().unwrap();
+        let seen = monitor.finish();
+        // The machine may really have stood still meanwhile, but not for as long as the work took.
+        assert!(seen.longest_ns() < worked_ns / 2 || worked_ns > 40_000_000, "{seen:?}");
     }
 
     #[test]
