@@ -12,7 +12,7 @@ use dpm_device::dlpc900::lut::Dmd;
 use dpm_device::dlpc900::sequence::{LedSetup, Pattern, Repeat, SequenceBuilder};
 use dpm_device::dlpc900::usb::{list, UsbHid};
 use dpm_device::link::{
-    packet_bytes, Codec, Epoch, HostLink, LinkSettings, LinkState, SendOutcome, Underrun,
+    faults, packet_bytes, Codec, Epoch, HostLink, LinkSettings, LinkState, SendOutcome, Underrun,
 };
 use dpm_device::planes::{PlaneSchedule, Raster};
 use dpm_device::time::{DeviceTicks, FrameRate, HostTime};
@@ -174,6 +174,8 @@ impl Rig {
             let _ = self.link.poll(now, &mut self.usb);
             match self.link.state() {
                 LinkState::Ready => self.link.arm(0),
+                // An emulated kernel on a busy machine may pause for longer than the watchdog allows: going dark then is right.
+                LinkState::Faulted => self.link.arm(faults::WATCHDOG),
                 LinkState::Streaming => {
                     if let Some(slots) = self.link.slots() {
                         let slot = slots.slot_at(DeviceTicks(now.0 as u64)).unwrap_or(0) + 1;

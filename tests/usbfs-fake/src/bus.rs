@@ -163,6 +163,19 @@ pub fn plug_in(cable: Arc<dyn UsbCable>, options: Options) -> Socket {
     Socket { device }
 }
 
+/// Names of the devices on the bus, the root hub's among them, as sysfs has them.
+pub(crate) fn device_names() -> Vec<String> {
+    let folder = fs::read_dir(root().join("sys/bus/usb/devices"));
+    folder.into_iter().flatten().flatten().filter_map(|e| e.file_name().into_string().ok()).collect()
+}
+
+/// Bus and address of the device with this name.
+pub(crate) fn place_of(name: &str) -> Option<(u8, u8)> {
+    let folder = root().join("sys/bus/usb/devices").join(name);
+    let number = |file: &str| fs::read_to_string(folder.join(file)).ok()?.trim().parse().ok();
+    Some((number("busnum")?, number("devnum")?))
+}
+
 /// Sets the limit that usbfs puts on the memory of all transfers in flight, in MiB (0 = none), and what `usbfs_memory_mb` reads.
 pub fn set_memory_limit_mb(mb: u32) {
     LIMIT.store(u64::from(mb) << 20, Ordering::Relaxed);

@@ -115,6 +115,7 @@ pub(crate) fn keep_linked() {
         crate::remote::attach_from_environment as *const (),
     ];
     std::hint::black_box(names);
+    crate::udev::keep_linked();
 }
 
 enum Place {
