@@ -104,7 +104,7 @@ fn main() -> Result<(), Box<dyn std::error::Error>> {
     let raster = Raster::new(1024, 768).ok_or("raster")?;
     let rig = Rig::build(&config, Some(raster))?;
     let gpu = Gpu::open(&GpuOptions::default())?;
-    let contents = [Content::rendered(&rig, &gpu, 8)?, Content::prepared(&rig, 8)];
+    let contents = [Content::rendered(&rig, &gpu, 8, &|| false)?, Content::prepared(&rig, 8)];
     println!("content   codecs        host ms  least   device   bytes/frame");
     for content in &contents {
         for (name, codecs) in [

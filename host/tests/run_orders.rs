@@ -7,7 +7,7 @@ mod link_common;
 use cli_common::{code, dpm, err, out, start, Folder};
 use dpm_device::link::{faults, DeviceState};
 use hil_mock::projector::MockConfig;
-use link_common::{raster, Projector, PtyProjector};
+use link_common::{raster, served_time, Projector, PtyProjector};
 use std::io::Write;
 use std::os::fd::AsRawFd;
 use std::os::unix::process::CommandExt;
@@ -173,4 +173,25 @@ fn the_link_test_prints_one_object_and_leaves_darkness() {
     assert_eq!(ways.len(), 2, "{report}");
     assert!(ways.iter().all(|w| w["frames_per_s"].as_f64() > Some(5.0)), "{report}");
     assert!(!far.is_lit() && far.status().frames_lit > 0);
+}
+
+/// Asked to stop in the middle, it goes dark at once, tells what it found, and ends with 0.
+#[test]
+fn signals_end_the_link_test_in_the_dark() {
+    for signal in ["INT", "TERM"] {
+        let (_folder, path, far) = rig(&format!("link-test-{signal}"));
+        let run = start(&["link-test", &path, "--prepared", "--for", "600", "--count", "3", "--json"]);
+        far.until(LONG, "light", &mut |s| s.frames_lit >= 3 && s.lit);
+        run.signal(signal);
+        let dark = served_time("dark", || !far.is_lit());
+        assert!(dark < Duration::from_millis(500), "{dark:?}");
+        let (status, told) = run.finish();
+        assert_eq!(status.code(), Some(0), "{status}");
+        assert_eq!(far.status().state, DeviceState::Configured, "stopped in order, not by the watchdog");
+        let report: serde_json::Value = serde_json::from_str(&told).expect("one JSON object");
+        assert_eq!(
+            (report["stopped"].as_bool(), report["ways"].as_array().map(Vec::len)),
+            (Some(true), Some(1))
+        );
+    }
 }

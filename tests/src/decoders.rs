@@ -4,6 +4,7 @@
 use dpm_device::cobs::{encode, encoded_bytes, Deframer};
 use dpm_device::dlpc900::command::{CommandAssembler, ReplyAssembler, REPORT_BYTES};
 use dpm_device::dlpc900::image;
+use dpm_device::link::crc32c;
 use dpm_device::link::{
     rle_encode, Assembly, Decoder, DeviceMessage, Header, HostMessage, PacketSink, RleDecoder,
 };
@@ -14,17 +15,19 @@ use dpm_device::tracker::natnet::messages::{
 use dpm_device::tracker::natnet::models::decode_models;
 use dpm_device::tracker::natnet::wire::split;
 use dpm_device::tracker::natnet::Version;
+use dpm_device::tracker::record::{Recording, SAMPLE_BYTES};
 use dpm_device::tracker::serial::wire::SerialMessage;
 use dpm_device::tracker::vrpn::wire as vrpn;
 use dpm_host::config::{Overrides, RigConfig};
 use dpm_host::geometry::opencv;
+use hil_mock::usbip::wire as usbip;
 use std::path::Path;
 
 /// A decoder's entry.
 pub type Entry = fn(&[u8]);
 
 /// Every entry with the name of its fuzz target and of its folder of seeds.
-pub const ALL: [(&str, Entry); 9] = [
+pub const ALL: [(&str, Entry); 13] = [
     ("link_stream", link_stream),
     ("link_rle", link_rle),
     ("cobs_stream", cobs_stream),
@@ -34,6 +37,10 @@ pub const ALL: [(&str, Entry); 9] = [
     ("vrpn_stream", vrpn_stream),
     ("serial_pose", serial_pose),
     ("texts", texts),
+    ("recording", recording),
+    ("usbip_stream", usbip_stream),
+    ("projector", crate::conversations::projector),
+    ("host_link", crate::conversations::host_link),
 ];
 
 #[derive(Default)]
@@ -172,6 +179,48 @@ pub fn serial_pose(bytes: &[u8]) {
     let mut frame = None;
     deframer.push(&first, &mut |f| frame = Some(f.to_vec()));
     assert_eq!(encoded(&frame.expect("one frame")), Some(first));
+}
+
+/// A tracker's recording, as it is and with its frames' checksums put right: it holds no more samples than its bytes can, and a file that ends
+/// early gives the beginning of what the whole one gives.
+pub fn recording(bytes: &[u8]) {
+    let read = |bytes: &[u8]| Recording::read_from(&mut &bytes[..], bytes.len() as u64, Path::new("seed"));
+    let mut framed = b"dpm-track-0001\r\n".to_vec();
+    let mut rest = bytes;
+    while let Some((&[low, high], after)) = rest.split_first_chunk::<2>() {
+        let (payload, after) = after.split_at(usize::from(u16::from_le_bytes([low, high])).min(after.len()));
+        let from = framed.len();
+        framed.extend((payload.len() as u32).to_le_bytes());
+        framed.extend(payload);
+        let crc = crc32c(&framed[from..]);
+        framed.extend(crc.to_le_bytes());
+        rest = after;
+    }
+    for bytes in [bytes, &framed] {
+        let Ok(whole) = read(bytes) else { continue };
+        assert!(whole.samples.len() * SAMPLE_BYTES + whole.torn_bytes as usize <= bytes.len());
+        if let Ok(part) = read(&bytes[..bytes.len() * 2 / 3]) {
+            // By their bits: what lies in a file need not be a number.
+            let text = |r: &Recording, n: usize| format!("{:?}{:?}", r.bodies, &r.samples[..n]);
+            assert_eq!(text(&part, part.samples.len()), text(&whole, part.samples.len()));
+        }
+    }
+}
+
+/// USB/IP, both ends: what is read comes out of its own encoding.
+pub fn usbip_stream(bytes: &[u8]) {
+    if let Ok(operation) = usbip::Operation::read(&mut &bytes[..]) {
+        assert_eq!(usbip::Operation::read(&mut &operation.encode()[..]).ok(), Some(operation));
+    }
+    if let Ok(devices) = usbip::read_list_reply(&mut &bytes[..]) {
+        assert!(devices.len() * usbip::DEVICE_RECORD <= bytes.len());
+    }
+    let _ = usbip::read_import_reply(&mut &bytes[..]);
+    for header in bytes.as_chunks::<{ usbip::URB_HEADER }>().0 {
+        if let Ok(urb) = usbip::Urb::decode(header) {
+            assert_eq!(usbip::Urb::decode(&urb.encode()).ok(), Some(urb));
+        }
+    }
 }
 
 /// A rig file and a calibration file.

@@ -11,9 +11,11 @@ use dpm_device::planes::Raster;
 use dpm_device::tracker::natnet::frame::{encode_frame, FrameContent, FrameInfo, RigidBody};
 use dpm_device::tracker::natnet::messages::{encode_echo_response, encode_request};
 use dpm_device::tracker::natnet::Version;
+use dpm_device::tracker::record::SAMPLE_BYTES;
 use dpm_device::tracker::serial::wire::SerialMessage;
 use dpm_device::tracker::vrpn::wire as vrpn;
 use dpm_tests::decoders::ALL;
+use hil_mock::usbip::wire as usbip;
 use std::path::PathBuf;
 
 fn folder(target: &str) -> PathBuf {
@@ -83,6 +85,25 @@ fn made() -> Vec<(&'static str, &'static str, Vec<u8>)> {
     SerialMessage::Hello { version: 1, bodies: 2, ticks_per_second: 1_000_000 }.encode(&mut out);
     let mut deframer = dpm_device::cobs::Deframer::new([0u8; 128]);
     deframer.push(&out, &mut |f| seeds.push(("serial_pose", "hello", f.to_vec())));
+    // Frames of a recording without their checksums: a header with one body, a frame of one sample.
+    let header = [&7i64.to_le_bytes()[..], &1u16.to_le_bytes(), b"\x04hare"].concat();
+    let sample: Vec<u8> = (0..SAMPLE_BYTES as u8).collect();
+    let framed = |payload: &[u8]| [&(payload.len() as u16).to_le_bytes()[..], payload].concat();
+    seeds.push(("recording", "one_sample", [framed(&header), framed(&sample)].concat()));
+    seeds.push(("usbip_stream", "import", usbip::Operation::Import("1-1".into()).encode()));
+    let unlink = usbip::Urb::Unlink { seqnum: 3, devid: 0x0001_0001, victim: 2 };
+    let ended = usbip::Urb::Submitted { seqnum: 2, status: -104, actual: 7 };
+    seeds.push(("usbip_stream", "urbs", [unlink.encode(), ended.encode()].concat()));
+    // Kind, codec, plane, frame, target, how, wait, length: a raw plane, an RLE one, a STOP, an ARM; a STATUS and an ECHO for the host.
+    let script = |kind: MessageType, codec: u8, payload: &[u8]| {
+        [&[kind as u8, codec, 0, 9, 20, 0, 10, payload.len() as u8][..], payload].concat()
+    };
+    let plane = [script(MessageType::Plane, 0, &[1, 2, 3, 4]), script(MessageType::Plane, 1, &[0x83, 7])];
+    let lz4 = script(MessageType::Plane, 3, &[0x14, 5, 1, 0]);
+    let orders = [script(MessageType::Stop, 0, &[]), script(MessageType::Arm, 0, &[0; 4])].concat();
+    seeds.push(("projector", "planes_and_orders", [plane.concat(), lz4, orders].concat()));
+    let answers = [script(MessageType::Status, 0, &[3; 96]), script(MessageType::Echo, 0, &[1; 24])].concat();
+    seeds.push(("host_link", "answers", answers));
     let rig = b"[projector]\nframe_rate = \"60000/1001\"\n[[scene.bodies]]\nname = \"a\"\n".to_vec();
     seeds.push(("texts", "rig.toml", rig));
     seeds

@@ -38,8 +38,8 @@ fn whole(s: &Status) -> u32 {
 }
 
 /// Offers frames as fast as the link takes them for `duration_ns` and counts what arrives. `content` fills the planes of frame
-/// `n`; `clock` is the host's clock; `rest` is called when nothing can be done at once and should wait some ten microseconds. The link must be
-/// [`LinkState::Streaming`]; it is left so, unless the device ends it.
+/// `n`; `clock` is the host's clock; `rest` is called when nothing can be done at once and should wait some ten microseconds. `stop` ends the measurement early, with
+/// what there is. The link must be [`LinkState::Streaming`]; it is left so, unless the device ends it.
 ///
 /// # Errors
 /// The link's, from polling.
@@ -52,6 +52,7 @@ pub fn measure(
     clock: &dyn Fn() -> HostTime,
     rest: &mut dyn FnMut(),
     content: &mut dyn FnMut(u64, &mut [u8]),
+    stop: &dyn Fn() -> bool,
     duration_ns: i64,
 ) -> Result<LinkMeasurement, LinkError> {
     assert!(link.state() == LinkState::Streaming, "link is {:?}", link.state());
@@ -64,7 +65,7 @@ pub fn measure(
     content(next, &mut planes);
     loop {
         let now = clock();
-        if now.ns_since(start) >= duration_ns {
+        if now.ns_since(start) >= duration_ns || stop() {
             break;
         }
         link.poll(now, transport)?;

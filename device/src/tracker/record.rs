@@ -304,20 +304,28 @@ impl Recording {
     /// Reads `path` up to its end or to the first frame that is not whole.
     pub fn read(path: &Path) -> Result<Self, RecordError> {
         let failed = |source| RecordError::Io { path: path.to_owned(), source };
-        let not = |why| RecordError::NotARecording { path: path.to_owned(), why };
         let file = File::open(path).map_err(failed)?;
         let size = file.metadata().map_err(failed)?.len();
-        let mut reader = std::io::BufReader::with_capacity(1 << 16, file);
+        Self::read_from(&mut std::io::BufReader::with_capacity(1 << 16, file), size, path)
+    }
+
+    /// Reads a recording of `size` bytes that is called `path`. What it allocates is bounded by what it has read.
+    ///
+    /// # Errors
+    /// As [`Recording::read`].
+    pub fn read_from(reader: &mut impl Read, size: u64, path: &Path) -> Result<Self, RecordError> {
+        let failed = |source| RecordError::Io { path: path.to_owned(), source };
+        let not = |why| RecordError::NotARecording { path: path.to_owned(), why };
         let mut magic = [0; 16];
-        if read_up_to(&mut reader, &mut magic).map_err(failed)? < 16 || &magic != MAGIC {
+        if read_up_to(reader, &mut magic).map_err(failed)? < 16 || &magic != MAGIC {
             return Err(not("it does not begin as one"));
         }
         let mut payload = Vec::new();
         let mut good = 16;
-        good += read_frame(&mut reader, &mut payload).map_err(failed)?.ok_or(not("its header is damaged"))?;
+        good += read_frame(reader, &mut payload).map_err(failed)?.ok_or(not("its header is damaged"))?;
         let (start, bodies) = parse_header(&payload).ok_or(not("its header contradicts itself"))?;
         let mut samples = Vec::new();
-        while let Some(bytes) = read_frame(&mut reader, &mut payload).map_err(failed)? {
+        while let Some(bytes) = read_frame(reader, &mut payload).map_err(failed)? {
             let (whole, rest) = payload.as_chunks::<SAMPLE_BYTES>();
             if !rest.is_empty() {
                 break;

@@ -43,6 +43,8 @@ const STORM_NS: i64 = 1_000_000_000;
 /// What has happened on the cable.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub struct UsbCounters {
+    /// Data transfers taken from the link, frames and SYNCs: at all times those carried, those lost and those under way.
+    pub frames_taken: u64,
     /// Data transfers that arrived whole.
     pub frames_carried: u64,
     /// Data transfers that did not, and were not sent again because a newer one was waiting or their medium was gone.
@@ -386,7 +388,10 @@ impl Transport for UsbTransport {
             return Err(SendError::Busy);
         }
         match out.send(now, packets) {
-            Ok(()) => Ok(()),
+            Ok(()) => {
+                self.counters.frames_taken += u64::from(lane == Lane::Data);
+                Ok(())
+            }
             Err(rusb::Error::Busy) => Err(SendError::Busy),
             Err(rusb::Error::NoMem) => {
                 self.counters.out_of_memory += 1;

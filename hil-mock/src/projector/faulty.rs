@@ -355,6 +355,7 @@ mod tests {
             &clock,
             &mut || {},
             &mut |_, p| p.copy_from_slice(&still),
+            &|| false,
             1_000_000_000,
         )
         .unwrap();

@@ -1,10 +1,11 @@
 //! `dpm link-test RIG.toml`: what the link to the projector carries.
 
 use super::rig_args::RigArgs;
+use super::signals;
 use super::watch::{print, take_locks};
 use crate::experiments::link_test::{link_test, Content};
 use crate::experiments::run_rig::open_gpu;
-use crate::failure::Failure;
+use crate::failure::{Failure, FailureKind};
 use crate::rig::Rig;
 use crate::telemetry::report::to_json;
 use std::path::PathBuf;
@@ -31,20 +32,23 @@ pub struct LinkTestArgs {
     json: bool,
 }
 
-/// Measures and prints. The projector shows the frames meanwhile.
+/// Measures and prints. The projector shows the frames meanwhile; a signal ends that in order: dark, with a report of what there is.
 ///
 /// # Errors
 /// Bad rig or flags, no GPU, no projector.
 pub fn execute(args: &LinkTestArgs) -> Result<(), Failure> {
     let config = args.flags.rig(Some(&args.rig))?;
     let _locks = take_locks(&config)?;
+    signals::install()
+        .map_err(|e| Failure::new(FailureKind::Device, format!("cannot handle signals: {e}")))?;
+    let stop = || signals::received().is_some();
     let rig = Rig::build(&config, None)?;
     let content = if args.prepared {
         Content::prepared(&rig, args.count)
     } else {
-        Content::rendered(&rig, &open_gpu(&config)?, args.count)?
+        Content::rendered(&rig, &open_gpu(&config)?, args.count, &stop)?
     };
-    let report = link_test(&rig, &content, f64::from(args.way_seconds))?;
+    let report = link_test(&rig, &content, f64::from(args.way_seconds), &stop)?;
     print(&if args.json { to_json(&report) + "\n" } else { report.to_table() });
     Ok(())
 }

@@ -39,6 +39,8 @@ pub struct LinkTestReport {
     pub content: &'static str,
     /// Raw and, where the rig file allows codecs, compacted.
     pub ways: Vec<LinkWay>,
+    /// True when it was told to stop before its time: the last way is shorter, others may be missing.
+    pub stopped: bool,
 }
 
 /// One way to send.
@@ -69,11 +71,16 @@ pub struct Content {
 }
 
 impl Content {
-    /// `count` successive pictures of the rig's scene, at least one.
+    /// `count` successive pictures of the rig's scene, at least one; fewer when `stop` says so.
     ///
     /// # Errors
     /// The renderer's.
-    pub fn rendered(rig: &Rig, gpu: &Arc<Gpu>, count: u32) -> Result<Self, PipelineError> {
+    pub fn rendered(
+        rig: &Rig,
+        gpu: &Arc<Gpu>,
+        count: u32,
+        stop: &dyn Fn() -> bool,
+    ) -> Result<Self, PipelineError> {
         let mut renderer = Renderer::new(gpu, &rig.scene, renderer_settings(rig))?;
         let mut slot = renderer.create_slot(false).map_err(RenderError::from)?;
         let spp = rig.config.render.spp;
@@ -85,6 +92,9 @@ impl Content {
             let mut frame = BitPlaneFrame::new(rig.camera.raster, rig.config.projector.schedule());
             pack(kernel, slot.codes(), &mut frame);
             frames.push(frame);
+            if stop() {
+                break;
+            }
         }
         Ok(Self { name: "rendered", frames })
     }
@@ -159,11 +169,17 @@ impl Far {
     }
 }
 
-/// Measures the link of `rig` for `seconds` each way. The projector shows the frames meanwhile, and is dark afterwards.
+/// Measures the link of `rig` for `seconds` each way, less when `stop` says so. The projector shows the frames meanwhile, and is dark
+/// afterwards.
 ///
 /// # Errors
 /// The projector is missing, refuses or goes away.
-pub fn link_test(rig: &Rig, content: &Content, seconds: f64) -> Result<LinkTestReport, Failure> {
+pub fn link_test(
+    rig: &Rig,
+    content: &Content,
+    seconds: f64,
+    stop: &dyn Fn() -> bool,
+) -> Result<LinkTestReport, Failure> {
     let clock = MonotonicClock::new(0);
     let mut far = Far::open(rig, clock)?;
     let settings = projector::link_settings(&rig.config, rig.camera.raster);
@@ -187,13 +203,19 @@ pub fn link_test(rig: &Rig, content: &Content, seconds: f64) -> Result<LinkTestR
         frame_rate_hz: settings.rate.hz(),
         content: content.name,
         ways: Vec::new(),
+        stopped: false,
     };
     for (k, (compaction, codecs)) in ways.into_iter().enumerate() {
+        if stop() {
+            break;
+        }
         // Another seed, another session: an answer to the way before is not taken for one to this.
         let session_seed = settings.session_seed.wrapping_add(2 * k as u32);
         let settings = LinkSettings { codecs, session_seed, ..settings.clone() };
-        report.ways.push(way(settings, compaction, far.transport(), clock, content, seconds)?);
+        let way = way(settings, compaction, far.transport(), clock, content, seconds, stop)?;
+        report.ways.push(way);
     }
+    report.stopped = stop();
     Ok(report)
 }
 
@@ -204,6 +226,7 @@ fn way(
     clock: MonotonicClock,
     content: &Content,
     seconds: f64,
+    stop: &dyn Fn() -> bool,
 ) -> Result<LinkWay, Failure> {
     let rate_hz = settings.rate.hz();
     let mut link = HostLink::new(settings);
@@ -219,6 +242,7 @@ fn way(
         &|| clock.now(),
         &mut || std::thread::sleep(REST),
         &mut |n, planes| content.fill(n, planes),
+        stop,
         duration_ns,
     );
     let mut shortest = None;
@@ -292,6 +316,9 @@ impl LinkTestReport {
             };
             let host = if w.limited_by == "host" { " (the host's compaction is the limit)" } else { "" };
             out += &format!("{}: the link {said}{host}\n", w.compaction);
+        }
+        if self.stopped {
+            out += "stopped before its time: the last figures stand for less\n";
         }
         out
     }

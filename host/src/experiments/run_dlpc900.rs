@@ -380,7 +380,8 @@ fn watch_over<P: HidPort>(
         };
         match step {
             Ok(()) => {}
-            Err(e) if is_gone(&e) => {
+            // Right after it was plugged in it may still be without rights, in other hands, or silent.
+            Err(e) if is_gone(&e) || lost && matches!(e, Dlpc900Error::Port { .. }) => {
                 lost = true;
                 monitor.set_projector(ProjectorHealth::Lost);
             }
@@ -521,5 +522,90 @@ mod tests {
         assert!((report.frame_rate_hz - 30.0).abs() < 0.01, "{}", report.frame_rate_hz);
         assert_eq!(model.lock().unwrap().dark_because(), Some("mirrors exercised"));
         assert_eq!(monitor.projector(), ProjectorHealth::Stopped);
+    }
+
+    /// A cable that can be cut: what stands at its other end is looked up each time it is opened.
+    struct Cut {
+        hid: VirtualHid,
+        plugged: Arc<Mutex<Option<Arc<Mutex<Dlpc900Model>>>>>,
+    }
+
+    impl Cut {
+        fn is_whole(&self) -> Result<(), PortError> {
+            self.plugged.lock().unwrap().as_ref().map(|_| ()).ok_or(PortError::Gone)
+        }
+    }
+
+    impl HidPort for Cut {
+        fn write_report(&mut self, report: &[u8; 64], timeout: Duration) -> Result<(), PortError> {
+            self.is_whole()?;
+            self.hid.write_report(report, timeout)
+        }
+        fn read_report(&mut self, report: &mut [u8; 64], timeout: Duration) -> Result<(), PortError> {
+            self.is_whole()?;
+            self.hid.read_report(report, timeout)
+        }
+        fn pause(&mut self, time: Duration) {
+            self.hid.pause(time);
+        }
+    }
+
+    /// Unplugged it is lost within a look, plugged in again it is set up from nothing, and what the operator said last still holds.
+    #[test]
+    fn a_controller_that_was_unplugged_is_set_up_again_as_the_operator_left_it() {
+        let schedule = PlaneSchedule::mono8();
+        let frames = frames(schedule, 3);
+        let show = Show::Preloaded(preload(DMD, &schedule, &frames, 33_333, None).unwrap());
+        let plugged = Arc::new(Mutex::new(Some(model())));
+        let monitor = Arc::new(RunMonitor::default());
+        let (socket, watched) = (plugged.clone(), monitor.clone());
+        let observer = std::thread::spawn(move || {
+            let until = |what: &str, limit: Duration, wanted: &dyn Fn() -> bool| {
+                let (mut waited, step) = (Duration::ZERO, Duration::from_millis(2));
+                while !wanted() {
+                    assert!(waited < limit, "not {what} within {limit:?} of this machine's time");
+                    std::thread::sleep(step);
+                    waited += step;
+                }
+            };
+            let sequencer = || {
+                let model = socket.lock().unwrap().clone().expect("plugged in");
+                let state = model.lock().unwrap().sequencer(HostTime(0));
+                state
+            };
+            let long = Duration::from_secs(20);
+            until("running", long, &|| matches!(sequencer(), Sequencer::Running(..)));
+            for (order, stays_dark) in [(None, false), (Some(Order::Black), true)] {
+                *socket.lock().unwrap() = None;
+                // It is looked at five times a second.
+                let noticed = || watched.projector() == ProjectorHealth::Lost;
+                until("lost", Duration::from_millis(500), &noticed);
+                order.into_iter().for_each(|o| watched.give_order(o));
+                std::thread::sleep(Duration::from_millis(50));
+                // Another one, or the same without power meanwhile: it knows nothing.
+                *socket.lock().unwrap() = Some(model());
+                let wanted = if stays_dark { ProjectorHealth::Black } else { ProjectorHealth::Up };
+                until("taken up again", long, &|| watched.projector() == wanted);
+                assert_eq!(matches!(sequencer(), Sequencer::Running(..)), !stays_dark);
+                let model = socket.lock().unwrap().clone().expect("plugged in");
+                let m = model.lock().unwrap();
+                let mut codes = vec![0u32; DMD.raster().pixel_count()];
+                unpack(&frames[2], &mut codes);
+                let wanted = codes.iter().map(|c| *c as u8);
+                assert!(m.projected_grey(2).expect("a pattern").into_iter().eq(wanted), "loaded again");
+            }
+            watched.request_stop();
+        });
+        let mut open = || {
+            let there = plugged.lock().unwrap().clone();
+            let not_found = Dlpc900Error::Port { doing: "open".into(), source: PortError::NotFound };
+            let hid = VirtualHid::new(there.ok_or(not_found)?);
+            Dlpc900::new(Cut { hid, plugged: plugged.clone() })
+        };
+        let report = present(&mut open, &show, None, &monitor).unwrap();
+        observer.join().unwrap();
+        assert_eq!(report.came_back, 2);
+        let last = plugged.lock().unwrap().clone().expect("plugged in");
+        assert_eq!(last.lock().unwrap().dark_because(), Some("mirrors exercised"));
     }
 }

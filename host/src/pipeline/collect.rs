@@ -2,6 +2,7 @@
 
 use super::job::{Fate, FrameNote};
 use super::light::LightNote;
+use super::placement::Placement;
 use crate::config::Pace;
 use crate::frame::{FrameId, FrameTimeline, Stage, STAGES};
 use crate::render::PASSES;
@@ -53,6 +54,7 @@ pub struct FrameRecord {
 pub struct Collector {
     rig: Arc<Rig>,
     points: Vec<Vec<DVec3>>,
+    placement: Placement,
     pending: VecDeque<FrameRecord>,
     /// The last lit frames, oldest first.
     pub recent: VecDeque<FrameRecord>,
@@ -114,6 +116,7 @@ impl Collector {
         let profiler = Profiler::new(rig.rate(), measured, batch_frames);
         let trace_frames = if rig.config.output.trace { MAX_TRACED } else { 0 };
         Self {
+            placement: Placement::new(rig.bodies.len()),
             rig,
             points,
             pending: VecDeque::new(),
@@ -222,6 +225,7 @@ impl Collector {
         for stage in [Stage::Plan, Stage::Render, Stage::Pack, Stage::Link] {
             self.stages[stage as usize].saturating_record(job.timeline.wall_ns[stage as usize].max(1));
         }
+        self.placement.observe(&self.rig.camera, &job.tracked_poses, job.tracked, &self.points);
         let sent = job.is_sent();
         let refused = !sent && job.fate != Fate::Overtaken;
         self.slots.planned(job.slot, &job.timeline, refused, job.waited_for_memory);
@@ -368,6 +372,8 @@ impl Collector {
                 self.invalid_samples, self.samples
             ));
         }
+        let names: Vec<String> = self.rig.bodies.iter().map(|b| b.name.clone()).collect();
+        report.warnings.extend(self.placement.warnings(&names));
         if self.light_mismatches > 0 {
             report
                 .warnings

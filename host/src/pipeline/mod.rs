@@ -17,6 +17,7 @@ mod keeper;
 pub mod light;
 mod link;
 mod outcome;
+mod placement;
 pub mod prepared;
 pub mod projector;
 mod rights;

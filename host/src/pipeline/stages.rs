@@ -98,6 +98,7 @@ pub fn plan(job: &mut FrameJob, rig: &Rig, snapshot: &TrackSnapshot, slots: &Lin
     note.tracked_poses.clear();
     note.sampled_poses.clear();
     memory.lost.clear();
+    note.tracked = 0;
     let mut oldest: Option<(HostTime, HostTime)> = None;
     for (i, body) in rig.bodies.iter().enumerate() {
         let track = snapshot.tracks.get(i).copied().flatten();
@@ -117,6 +118,7 @@ pub fn plan(job: &mut FrameJob, rig: &Rig, snapshot: &TrackSnapshot, slots: &Lin
         note.tracked_poses.push(pose);
         note.sampled_poses.push(sampled);
         memory.lost.push(lost);
+        note.tracked |= u64::from(!lost && i < 64) << (i % 64);
     }
     let (captured_at, received_at) = oldest.unwrap_or((due, due));
     timeline.captured_at = captured_at;

@@ -38,6 +38,19 @@ pub fn rig(backend: &str, more: &[&str]) -> Arc<Rig> {
     Arc::new(Rig::build(&config, Some(raster())).unwrap_or_else(|e| panic!("{e}")))
 }
 
+/// Waits until `done`, at most 20 s, and gives the time that counts against a deadline: a sleep of a millisecond that took longer than two
+/// is time that a shared machine gave to others.
+pub fn served_time(what: &str, mut done: impl FnMut() -> bool) -> Duration {
+    let (start, mut counted) = (Instant::now(), Duration::ZERO);
+    while !done() {
+        assert!(start.elapsed() < Duration::from_secs(20), "{what}");
+        let step = Instant::now();
+        std::thread::sleep(Duration::from_millis(1));
+        counted += step.elapsed().min(Duration::from_millis(2));
+    }
+    counted
+}
+
 /// A projector that can be looked at while it works.
 pub trait Projector: Send + Sync {
     /// Lets it live up to now and looks at it.

@@ -276,9 +276,8 @@ pub unsafe extern "C" fn udev_monitor_get_fd(monitor: *mut Monitor) -> c_int {
 pub unsafe extern "C" fn udev_monitor_receive_device(monitor: *mut Monitor) -> *mut Device {
     let mut message = [0u8; 1024];
     // SAFETY: by contract; the buffer is as long as said.
-    let n = unsafe {
-        libc::recv((*monitor).fd, message.as_mut_ptr().cast(), message.len(), libc::MSG_DONTWAIT)
-    };
+    let n =
+        unsafe { libc::recv((*monitor).fd, message.as_mut_ptr().cast(), message.len(), libc::MSG_DONTWAIT) };
     let Ok(n) = usize::try_from(n) else { return null_mut() };
     let text = String::from_utf8_lossy(&message[..n]);
     let value = |key: &str| text.split('\0').find_map(|field| field.strip_prefix(key)?.strip_prefix('='));

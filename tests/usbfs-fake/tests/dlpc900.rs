@@ -112,6 +112,32 @@ fn stalls_are_cleared_and_silence_and_unplugging_end_in_time() {
     assert!(start.elapsed() < Duration::from_millis(500));
 }
 
+/// Pulled in the middle of an upload and plugged in again without what it knew: found, claimed and loaded anew, each time.
+#[test]
+fn a_controller_that_comes_back_is_loaded_again() {
+    let mut b = bench(projector(), Options { kernel_driver: Some("usbhid".into()), ..Options::default() });
+    let plane = vec![0xa5; Dmd::Dlp5500.raster().plane_bytes()];
+    let mut s = SequenceBuilder::new(Dmd::Dlp5500);
+    s.push(&Pattern::white(vec![&plane], 500));
+    let s = s.finish(Repeat::Forever, PlaneOrder::default(), None).unwrap();
+    for cycle in 0..10 {
+        let mut d = Dlpc900::new(b.open().unwrap()).unwrap();
+        b.plug.inject(0x01, 5 + cycle, Fault::Unplug(0));
+        let start = Instant::now();
+        let gone = d.upload(&s, LedSetup::default(), &mut |_| ()).unwrap_err();
+        assert!(matches!(gone, Dlpc900Error::Port { source: PortError::Gone, .. }), "{gone}");
+        assert!(start.elapsed() < Duration::from_secs(1), "{:?}", start.elapsed());
+        drop(d);
+        b = bench(projector(), Options { kernel_driver: Some("usbhid".into()), ..Options::default() });
+        let plugged = Instant::now();
+        let mut d = Dlpc900::new(b.open().unwrap()).unwrap();
+        assert!(plugged.elapsed() < Duration::from_secs(1), "{:?}", plugged.elapsed());
+        d.upload(&s, LedSetup::default(), &mut |_| ()).unwrap();
+        d.start().unwrap();
+        assert!(b.model.lock().unwrap().projected_plane(0).unwrap() == plane);
+    }
+}
+
 #[test]
 fn round_trips_are_quick_enough_for_uploads() {
     let b = bench(projector(), Options::default());

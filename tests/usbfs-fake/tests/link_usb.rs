@@ -1,199 +1,20 @@
 //! The bit-plane link over real libusb against the mock projector: streaming, and rows U1 to U15 of the failures that a cable can have.
 
+mod link_usb_common;
+
 use std::sync::{Arc, Mutex};
 use std::time::{Duration, Instant};
 
-use dpm_device::link::{
-    faults, packet_bytes, Codec, DeviceState, Epoch, HostLink, LinkError, LinkSettings, LinkState,
-    SendOutcome, Underrun,
-};
-use dpm_device::planes::{PlaneSchedule, Raster};
-use dpm_device::time::{DeviceTicks, FrameRate, HostTime};
+use dpm_device::link::{faults, DeviceState, LinkState, SendOutcome};
 use dpm_device::transport::usb::{UsbSettings, UsbTransport, CONTROL_OUT, DATA_OUT, REPLIES_IN};
 use dpm_device::transport::{Lane, Transport, TransportError};
 use hil_mock::projector::usb::UsbProjector;
 use hil_mock::projector::{MockConfig, MockProjector};
 use hil_mock::usb_model::Speed;
-use hil_mock::usb_plug::{monotonic_clock, Clock, Fault, UsbPlug};
+use hil_mock::usb_plug::{monotonic_clock, Fault, UsbPlug};
 use hil_mock::usbip::{Export, RemoteCable, Server};
-use usbfs_fake::{plug_in, Options, Socket};
-
-fn raster() -> Raster {
-    Raster::new(128, 32).unwrap()
-}
-
-const PLANES: usize = 24;
-const FPS: u32 = 200;
-/// Of the test that plugs a thousand times.
-const FAST_FPS: u32 = 4000;
-
-fn planes(id: u64) -> Vec<u8> {
-    let n = raster().plane_bytes() * PLANES;
-    (0..n as u64).map(|i| ((i + 1).wrapping_mul(0x9e37_79b9_7f4a_7c15 ^ (id << 20)) >> 40) as u8).collect()
-}
-
-fn frame_bytes() -> usize {
-    packet_bytes(raster().plane_bytes()) * PLANES + packet_bytes(16)
-}
-
-/// A projector of its own serial number, on the bus.
-struct Device {
-    model: Arc<Mutex<UsbProjector>>,
-    plug: UsbPlug,
-    socket: Option<Socket>,
-    clock: Clock,
-    serial: u64,
-}
-
-impl Device {
-    fn new(serial: u64, options: Options) -> Self {
-        let clock = monotonic_clock();
-        let setup = MockConfig { serial, min_plane_ns: 5_000, ..MockConfig::new(raster()) };
-        let mock = MockProjector::new(setup);
-        let model = Arc::new(Mutex::new(UsbProjector::new(mock, Speed::Super, None)));
-        let plug = UsbPlug::new(model.clone(), clock.clone());
-        let socket = plug_in(Arc::new(plug.clone()), options);
-        Self { model, plug, socket: Some(socket), clock, serial }
-    }
-
-    fn unplug(&mut self) {
-        self.socket = None;
-    }
-
-    fn plug_in_again(&mut self) {
-        self.plug = UsbPlug::new(self.model.clone(), self.clock.clone());
-        self.socket = Some(plug_in(Arc::new(self.plug.clone()), Options::default()));
-    }
-
-    fn now(&self) -> HostTime {
-        (self.clock)()
-    }
-
-    fn mock<R>(&self, f: impl FnOnce(&mut MockProjector) -> R) -> R {
-        let now = self.now();
-        let mut model = self.model.lock().unwrap();
-        let mock = model.projector();
-        dpm_device::transport::LinkDevice::advance_to(mock, now);
-        f(mock)
-    }
-
-    fn settings(&self) -> UsbSettings {
-        UsbSettings {
-            serial: Some(format!("{:016x}", self.serial)),
-            stuck_after_ns: 150_000_000,
-            ..UsbSettings::new(frame_bytes())
-        }
-    }
-}
-
-/// A host at the other end.
-struct Host {
-    link: HostLink,
-    usb: UsbTransport,
-    next_id: u64,
-}
-
-impl Host {
-    fn new(device: &Device, watchdog_us: u32, fps: u32) -> Self {
-        let link = HostLink::new(LinkSettings {
-            raster: raster(),
-            schedule: PlaneSchedule::rgb24(),
-            rate: FrameRate::new(fps, 1).unwrap(),
-            watchdog_us,
-            underrun: Underrun::Repeat,
-            late_slots: 20,
-            epoch: Epoch::At(DeviceTicks(0)),
-            codecs: Codec::Raw.mask(),
-            flash_limit: None,
-            session_seed: 1,
-        });
-        let usb = UsbTransport::open(device.settings()).expect("the device opens");
-        Self { link, usb, next_id: 1 }
-    }
-
-    fn connected(device: &Device) -> Self {
-        let mut host = Self::new(device, 2_000_000, FPS);
-        host.link.connect();
-        host.arm(device);
-        host
-    }
-
-    fn until(&mut self, device: &Device, limit_ms: u64, mut done: impl FnMut(&mut Self) -> bool) -> Duration {
-        let start = Instant::now();
-        loop {
-            let _ = self.link.poll(device.now(), &mut self.usb);
-            if done(self) {
-                return start.elapsed();
-            }
-            assert!(
-                start.elapsed() < Duration::from_millis(limit_ms),
-                "after {limit_ms} ms: {:?} {:?} {:?} {:?}",
-                self.link.state(),
-                self.link.status(),
-                self.usb.counters(),
-                device.mock(|m| m.status())
-            );
-            std::thread::sleep(Duration::from_micros(300));
-        }
-    }
-
-    fn arm(&mut self, device: &Device) {
-        self.until(device, 5000, |h| h.link.state() == LinkState::Ready);
-        self.link.arm(0);
-        self.until(device, 5000, |h| h.link.state() == LinkState::Streaming);
-    }
-
-    /// Offers a new frame for the next slot.
-    fn offer(&mut self, device: &Device) -> SendOutcome {
-        let now = device.now();
-        let slots = self.link.slots().unwrap();
-        let slot = slots.slot_at(DeviceTicks(now.0 as u64)).unwrap() + 1;
-        let id = self.next_id;
-        let outcome = self.link.send_frame(now, id, slots.start(slot), &planes(id), &mut self.usb);
-        if outcome == SendOutcome::Sent {
-            self.next_id += 1;
-        }
-        outcome
-    }
-
-    /// Streams until `done`, a frame as often as one is taken.
-    fn stream(
-        &mut self,
-        device: &Device,
-        limit_ms: u64,
-        mut done: impl FnMut(&mut Self) -> bool,
-    ) -> Duration {
-        self.until(device, limit_ms, |h| {
-            if h.link.state() == LinkState::Streaming {
-                h.offer(device);
-            }
-            done(h)
-        })
-    }
-}
-
-/// What must hold at the end of every test: the lit frame is one that was sent, bit for bit, and every frame is accounted for.
-fn check(device: &Device) {
-    device.mock(|m| {
-        if let Some(id) = m.lit_frame() {
-            assert_eq!(m.lit_planes().unwrap(), planes(u64::from(id)), "frame {id}");
-        }
-        let s = m.status();
-        assert_eq!(s.slots, s.frames_lit + s.slots_repeated + s.slots_blank);
-        let ended =
-            s.frames_lit + s.frames_incomplete + s.frames_late + s.frames_superseded + s.frames_refused;
-        assert!((ended..=ended + 5).contains(&s.frames_seen), "{s:?}");
-        assert_eq!(m.credit_violations(), 0);
-    });
-}
-
-fn lit(device: &Device) -> u32 {
-    device.mock(|m| m.status().frames_lit)
-}
-
-fn open_files() -> usize {
-    std::fs::read_dir("/proc/self/fd").unwrap().count()
-}
+use link_usb_common::{check, frame_bytes, lit, planes, raster, Device, Host, FPS};
+use usbfs_fake::{plug_in, Options};
 
 #[test]
 fn frames_cross_real_libusb_bit_for_bit() {
@@ -237,8 +58,8 @@ fn u1_u2_unplug_is_noticed_reaped_and_survived() {
     assert!(noticed < Duration::from_millis(100), "{noticed:?}");
     assert_eq!(host.usb.in_flight(), 0);
     let c = host.usb.counters();
-    let sent = host.link.counters().frames_sent;
-    assert_eq!(c.frames_carried + c.frames_lost, sent, "every frame is accounted for: {c:?}");
+    assert_eq!(c.frames_taken, c.frames_carried + c.frames_lost, "every frame is accounted for: {c:?}");
+    assert!(c.frames_taken >= host.link.counters().frames_sent, "{c:?}");
     // Rendering goes on into nothing.
     assert!(matches!(host.offer(&device), SendOutcome::Dropped { .. }));
     let before = lit(&device);
@@ -259,13 +80,28 @@ fn u3_a_stall_costs_at_most_a_frame_and_three_a_reset() {
     host.stream(&device, 5000, |_| lit(&device) >= 5);
     device.plug.inject(DATA_OUT, 0, Fault::Stall);
     let from = lit(&device);
-    host.stream(&device, 5000, |h| h.usb.counters().stalls == 1 && h.usb.counters().frames_resent == 1);
+    let mut stalled: Option<Instant> = None;
+    host.stream(&device, 5000, |h| {
+        let c = h.usb.counters();
+        if c.stalls >= 1 {
+            stalled.get_or_insert_with(Instant::now);
+        }
+        c.frames_resent == 1
+    });
+    // Two frames, and what a busy machine takes.
+    let repaired = stalled.expect("a stall").elapsed();
+    assert!(repaired < Duration::from_millis(1000 * 2 / u64::from(FPS) + 50), "{repaired:?}");
+    assert!(host.usb.counters().frames_lost <= 1, "{:?}", host.usb.counters());
     host.stream(&device, 5000, |_| lit(&device) >= from + 5);
     assert_eq!(host.link.state(), LinkState::Streaming, "the session survived");
     // Three within a second: the device is reset, greets again, and is dark until armed.
-    for n in 2..=4 {
+    for _ in 2..=4 {
+        let before = host.usb.counters();
         device.plug.inject(DATA_OUT, 0, Fault::Stall);
-        host.stream(&device, 5000, |h| h.usb.counters().stalls == n || h.usb.counters().resets == 1);
+        host.stream(&device, 5000, |h| {
+            let c = h.usb.counters();
+            c.frames_resent > before.frames_resent || c.resets == 1
+        });
     }
     host.until(&device, 5000, |h| h.usb.counters().resets == 1 && h.link.state() == LinkState::Ready);
     assert!(!device.mock(|m| m.is_lit()));
@@ -452,43 +288,9 @@ fn the_lanes_are_independent_and_stop_overtakes_planes() {
     assert!(!device.mock(|m| m.is_lit()));
     assert!(host.usb.has_room(Lane::Control));
     device.plug.inject(CONTROL_OUT, 0, Fault::Stall);
-    host.until(&device, 5000, |h| h.usb.counters().stalls == 1);
+    // Once for each transfer that the halt met.
+    host.until(&device, 5000, |h| h.usb.counters().stalls >= 1);
     host.until(&device, 5000, |h| h.link.state() == LinkState::Ready);
-}
-
-/// Unplug and re-plug, again and again, each time with transfers in flight: nothing is leaked, the picture comes back.
-#[test]
-fn a_thousand_plugs_leak_nothing() {
-    let mut device = Device::new(14, Options::default());
-    let mut host = Host::new(&device, 2_000_000, FAST_FPS);
-    host.link.connect();
-    host.arm(&device);
-    let mut files = 0;
-    for cycle in 0..1000 {
-        host.stream(&device, 5000, |_| lit(&device) >= 1);
-        device.unplug();
-        // Without waiting for the tenth of a second at which the link would try by itself.
-        let error = loop {
-            match host.link.poll(device.now(), &mut host.usb) {
-                Err(e) => break e,
-                Ok(state) => assert_eq!(state, LinkState::Streaming),
-            }
-        };
-        assert!(matches!(error, LinkError::Transport(TransportError::Unplugged { .. })), "{error}");
-        assert_eq!(host.usb.in_flight(), 0);
-        device.plug_in_again();
-        while host.usb.reopen().is_err() {
-            std::thread::sleep(Duration::from_micros(200));
-        }
-        host.link.connect();
-        host.arm(&device);
-        if cycle == 10 {
-            files = open_files();
-        }
-    }
-    // Other tests open and close files meanwhile: a leak would be one or more for each of 990 cycles.
-    assert!(open_files() < files + 300, "{} files, {files} after the tenth cycle", open_files());
-    assert_eq!(host.usb.counters().opened, 1001);
 }
 
 /// The whole way: libusb, the usbfs calls, USB/IP over TCP, the projector at the far end.
