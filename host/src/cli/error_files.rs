@@ -173,3 +173,74 @@ pub(super) fn write(path: &Path, text: &str) -> Result<(), Failure> {
     write_atomically(path, |w| w.write_all(text.as_bytes()))
         .map_err(|e| Failure::new(FailureKind::BadInput, format!("{e}; choose another folder with --out")))
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::experiments::error_runs::{ErrorRow, Extent};
+    use crate::experiments::stamp::Stamp;
+
+    fn group(moving: bool, budget: f64, change: impl FnOnce(&mut GroupResult)) -> GroupResult {
+        let row = ErrorRow {
+            method: "paper".into(),
+            moving,
+            budget,
+            spp: 1.0,
+            rays: 1.0,
+            rays_to_paper: 1.0,
+            samples: 1.0,
+            gpu_ms: 1.0,
+            wall_ms: 1.0,
+            single_rmse: 1.0,
+            single_rel_mse: 1.0,
+            perceived_rmse: 1.0,
+            perceived_rmse_raw: 1.0,
+            perceived_fovea: None,
+            perceived_periphery: None,
+            bias: 1.0,
+            bias_floor: 1.0,
+            noise: 1.0,
+            mean_shift: 0.0,
+            flip: 0.0,
+            flicker: 0.0,
+            flicker_periphery: None,
+            ratio_to_paper: 1.0,
+        };
+        let stamp = Stamp {
+            device: "a device".into(),
+            driver: "1".into(),
+            software: false,
+            version: "1".into(),
+            commit: "0".into(),
+            config_hash: "c".into(),
+            raster: [8, 6],
+            seed: 1,
+        };
+        let extent = Extent { warm_up: 1, kept: 2, reference_spp: 3 };
+        let key = format!("{moving}{budget}");
+        let mut made =
+            GroupResult { stamp, key, extent, probes: 1, mean: 1.0, reference_error: 0.0, rows: vec![row] };
+        change(&mut made);
+        made
+    }
+
+    #[test]
+    fn only_groups_of_one_experiment_are_joined() {
+        let first = || group(false, 2.0, |_| ());
+        let joined = |other: GroupResult| one_experiment(Path::new("out"), &[first(), other]);
+        assert!(joined(group(false, 4.0, |_| ())).is_ok());
+        assert!(joined(group(true, 2.0, |g| g.stamp.device = "another".into())).is_ok());
+        let changes: [fn(&mut GroupResult); 4] = [
+            |g| g.stamp.config_hash = "d".into(),
+            |g| g.stamp.raster = [9, 6],
+            |g| g.stamp.seed = 2,
+            |g| g.extent.reference_spp = 4,
+        ];
+        for change in changes {
+            let told = joined(group(true, 4.0, change)).unwrap_err().message;
+            assert!(told.contains("group-still-2-") && told.contains("different experiments"), "{told}");
+        }
+        let told = joined(group(false, 2.0, |g| g.key = "k".into())).unwrap_err().message;
+        assert!(told.contains("measured twice") && told.contains("group-still-2-k.json"), "{told}");
+    }
+}

@@ -5,7 +5,7 @@
 //! the noise is what two runs of independent samples do not share after 31 frames on every point of that body.
 
 use super::error_reference::{mean_of, Reference};
-use super::error_runs::{ErrorOptions, ErrorRunError, EYE_FRAMES};
+use super::error_runs::{ErrorOptions, ErrorRunError, EYE_FRAMES, LAST_SLOT};
 use super::median::median_ms;
 use super::sequence::{eye_mean, rmse, Span, Theatre};
 use super::stamp::{Fnv, Stamp};
@@ -127,7 +127,7 @@ pub fn measure(
     let stamp = Stamp::new(&rig, gpu.summary());
     let (rig, body) = dressed(rig, setting.look);
     let seed = rig.config.render.seed as u32;
-    let span = Span { last_slot: options.extent.last_slot(), warm_up: 0, kept: EYE_FRAMES as u32 };
+    let span = Span { last_slot: LAST_SLOT, warm_up: 0, kept: EYE_FRAMES as u32 };
     let make = if setting.moving { Theatre::new } else { Theatre::frozen };
     let theatre = make(Arc::new(rig), gpu.clone(), span)?;
     let on_body = |i: usize| theatre.probes()[i].body == body;

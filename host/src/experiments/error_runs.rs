@@ -46,6 +46,9 @@ pub struct ErrorOptions {
     pub cache: PathBuf,
 }
 
+/// Slot of the last frame of every sequence: the same however much is drawn before it, so that short runs and long ones judge one moment of
+/// the motions. Late enough for the longest warm-up and 250 ms at 947 fps.
+pub const LAST_SLOT: u64 = 383;
 /// Frames over which the eye takes the mean: 33 ms at 947 fps.
 pub const EYE_FRAMES: usize = 31;
 /// Rays count as equal within this share.
@@ -145,13 +148,6 @@ impl Measured {
     }
 }
 
-impl Extent {
-    /// Slot of the last frame of every sequence.
-    pub fn last_slot(&self) -> u64 {
-        u64::from(self.warm_up + self.kept) + 50
-    }
-}
-
 /// Why a group could not be measured.
 #[derive(Debug, thiserror::Error)]
 pub enum ErrorRunError {
@@ -215,7 +211,7 @@ impl ErrorRuns {
 
     /// The group's sequence: its last `warm_up` and `kept` frames.
     pub(super) fn theatre(&self, group: Group, warm_up: u32, kept: u32) -> Result<Theatre, RenderError> {
-        let span = Span { last_slot: self.options.extent.last_slot(), warm_up, kept };
+        let span = Span { last_slot: LAST_SLOT, warm_up, kept };
         let make = if group.moving { Theatre::new } else { Theatre::frozen };
         make(self.rig.clone(), self.gpu.clone(), span)
     }
@@ -235,7 +231,7 @@ impl ErrorRuns {
         each: &mut dyn FnMut(&str),
     ) -> Result<Reference, ErrorRunError> {
         let (o, stamp) = (&self.options, &self.stamp);
-        let what = format!("{}{:?}{}{}", self.scene, stamp.raster, group.moving, o.extent.last_slot());
+        let what = format!("{}{:?}{}{}", self.scene, stamp.raster, group.moving, LAST_SLOT);
         let short = self.theatre(group, 0, EYE_FRAMES as u32)?;
         Reference::new(&short, o.extent.reference_spp, &what, &o.cache, each)
     }

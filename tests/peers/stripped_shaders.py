@@ -1,0 +1,66 @@
+#!/usr/bin/env python3
+"""Is a rig that needs nothing optional as fast as the same program with that code deleted? Instructions of both, shader by shader.
+
+    tests/peers/stripped_shaders.py [--most 0.5]
+
+Specialised: the shader with everything in it, its constants set as for a rig that needs nothing (a diffuse scene in even light, method `full`),
+then folded as a driver does. Deleted: the sources with each of those constants written out, so that the compiler never emits the
+code. Needs glslc, spirv-opt and spirv-dis. Exit code 1 when the specialised shader has more than --most percent instructions too many.
+"""
+import argparse
+import pathlib
+import re
+import subprocess
+import sys
+import tempfile
+
+GLSL = pathlib.Path(__file__).resolve().parents[2] / "shaders/glsl"
+# constant_id: value for a rig that needs nothing. The environment is constant (1); something must light the scene.
+LEAN = {0: "false", 1: "false", 2: "false", 3: "false", 4: "false", 5: "false", 6: "false", 7: "1", 8: "false", 9: "true",
+        10: "0", 11: "true", 12: "false", 13: "false"}
+SHADERS = [("trace", ["-DBVH_TEXEL"]), ("trace", []), ("primary", ["-DBVH_TEXEL"]), ("primary", []),
+           ("reproject", []), ("accumulate", []), ("spatial", []), ("compensate", [])]
+CONSTANT = re.compile(r"layout\(constant_id = (\d+)\) const (\w+) (\w+) = \w+;")
+
+
+def delete(match):
+    if int(match[1]) not in LEAN:
+        return match[0]
+    return f"const {match[2]} {match[3]} = {LEAN[int(match[1])]}{'u' if match[2] == 'uint' else ''};"
+
+
+def instructions(module):
+    """Instructions of the functions: what runs, without declarations."""
+    text = subprocess.run(["spirv-dis", "--no-header", module], capture_output=True, text=True, check=True).stdout
+    return len(text[text.index("OpFunction "):].splitlines())
+
+
+def main():
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--most", type=float, default=0.5)
+    args = parser.parse_args()
+    worst = 0.0
+    with tempfile.TemporaryDirectory() as folder:
+        stripped = pathlib.Path(folder) / "glsl"
+        stripped.mkdir()
+        for source in GLSL.iterdir():
+            (stripped / source.name).write_text(CONSTANT.sub(delete, source.read_text()))
+        module = lambda name: str(pathlib.Path(folder) / name)
+        values = " ".join(f"{k}:{v}" for k, v in LEAN.items())
+        print("| shader | all in | specialised | deleted |\n|---|---:|---:|---:|")
+        for name, defines in SHADERS:
+            for glsl, out in ((GLSL, "all.spv"), (stripped, "deleted.spv")):
+                subprocess.run(["glslc", "--target-env=vulkan1.1", "-O", "-I", str(glsl), *defines, str(glsl / f"{name}.comp"),
+                                "-o", module(out)], check=True)
+            subprocess.run(["spirv-opt", f"--set-spec-const-default-value={values}", "--freeze-spec-const",
+                            "--fold-spec-const-op-composite", "-O", module("all.spv"), "-o", module("lean.spv")], check=True)
+            subprocess.run(["spirv-opt", "-O", module("deleted.spv"), "-o", module("deleted.spv")], check=True)
+            everything, lean, deleted = (instructions(module(m)) for m in ("all.spv", "lean.spv", "deleted.spv"))
+            print(f"| {name}{' (texel)' if defines else ''} | {everything} | {lean} | {deleted} |")
+            worst = max(worst, 100.0 * (lean / deleted - 1.0))
+    print(f"at most {worst:.2f} % more than with the code deleted", file=sys.stderr)
+    return 1 if worst > args.most else 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
