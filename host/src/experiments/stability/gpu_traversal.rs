@@ -25,7 +25,7 @@ pub fn cases(device: &Device) -> Vec<Case> {
         case("gpu-leaves-no-light-through", "a bright lamp inside a closed sphere of 1 mm to 10 km, seen from outside", "black", "radiance", 0.0, opaque),
         case("gpu-hierarchy-sizes", "0, 1, 2, 3, 1,000, 50,000 triangles; 3,000 of one centroid", "f64 reference: pixels that see something else", "share", 5e-3, hierarchy_sizes),
         case("gpu-hierarchy-depth", "129 triangles at distances that double: chains deeper than the traversal stack", "closed form distance of the one in front", "faults", 0.0, hierarchy_depth),
-        case("gpu-hierarchy-equal-boxes", "3,000 triangles of one bounding box, one of them across: a tree as deep as they are many, unless it is built again", "closed form: the one across is met, wherever it stands", "faults", 0.0, equal_boxes),
+        case("gpu-hierarchy-heaps", "140 heaps of 12 twins, each 1.3 times the one before: a heap waits on every level of a tree by area", "closed form: the one triangle that is not off the axis is met, in whichever heap", "faults", 0.0, heaps_in_a_chain),
         case("gpu-unusable-coordinates", "vertices at NaN, infinity and 1e7 m", "refused by name, nothing drawn", "faults", 0.0, unusable),
         case("gpu-random-streams", "neighbouring pixels, frames, seeds, and frames about 2^32", "correlation", "sigma", 5.0, streams),
         case("gpu-same-seed-same-bits", "every method twice, eight frames", "bit for bit", "values", 0.0, same_bits),
@@ -182,21 +182,22 @@ fn hierarchy_depth(gpu: &Arc<Gpu>, _: u64) -> f64 {
     f64::from(faults)
 }
 
-fn equal_boxes(gpu: &Arc<Gpu>, _: u64) -> f64 {
-    // Slivers along one diagonal of a square and one along the other: every ray into the square meets all boxes, and one triangle.
-    let sliver = |a: Vec3, b: Vec3| triangle([a, b, a.lerp(b, 0.5) + Vec3::X * 1e-3]);
-    let along = sliver(Vec3::ZERO, Vec3::new(1.0, 1.0, 0.0));
-    let across = sliver(Vec3::X, Vec3::Y);
-    let target = DVec3::new(0.2504, 0.75, 0.0);
-    let camera = camera(3, 3, target + DVec3::Z, target);
+fn heaps_in_a_chain(gpu: &Arc<Gpu>, _: u64) -> f64 {
+    // Heaps of twins across the X axis, each 1.3 times as large and as far as the one before: a tree by area is a chain with a heap on every
+    // level. All boxes hold the axis; a twin lies off it, so a ray along it meets nothing but the one triangle that lies on it.
+    let corner = |s: f32, y: f32, z: f32| Vec3::new(s, y * s, z * s);
+    let off = |s: f32| triangle([corner(s, 3.0, 3.0), corner(s, -1.0, 3.0), corner(s, 3.0, -1.0)]);
+    let on = |s: f32| triangle([corner(s, -1.0, -1.0), corner(s, 3.0, -1.0), corner(s, -1.0, 3.0)]);
+    let size = |k: i32| 1e5 / 1.3f32.powi(k);
+    let camera = camera(3, 3, DVec3::ZERO, DVec3::X);
     let mut faults = 0;
-    for place in [0usize, 1, 700, 1499, 2300, 2998, 2999] {
-        let soup = join((0..3000).map(|i| if i == place { across.clone() } else { along.clone() }));
-        let scene = scene_of(soup, Material { double_sided: true, ..diffuse(Vec3::ONE) });
-        let shot = Shot { spp: 1, depth: 2, ..Shot::new(&scene, camera) };
-        let picture = shot.draw(gpu);
+    for place in (0..140).step_by(10) {
+        let heaps = join((0..140).flat_map(|k| (0..12).map(move |_| off(size(k)))));
+        let scene =
+            scene_of(join([heaps, on(size(place))]), Material { double_sided: true, ..diffuse(Vec3::ONE) });
+        let picture = Shot { spp: 1, depth: 2, ..Shot::new(&scene, camera) }.draw(gpu);
         let distance = f64::from(picture.surfaces[4].distance);
-        faults += u32::from(!picture.hit(4) || (distance - 1.0).abs() > 1e-5);
+        faults += u32::from(!picture.hit(4) || (distance / f64::from(size(place)) - 1.0).abs() > 1e-5);
     }
     f64::from(faults)
 }
