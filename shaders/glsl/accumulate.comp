@@ -62,8 +62,10 @@ void main() {
             // No longer a history than noise calls for: where a frame has next to none (a mirror of an even sky), or where frames are farther from
             // the history than their noise tells (a reflection that moves), the eye's own mean does better.
             float level = known * known, of_frame = h.variance / per_frame;
-            float frames = min(frame.history_cap, of_frame / max(UNSEEN * UNSEEN * level, 1e-12));
-            frames = min(frames, frame.history_cap * SURPRISE * (of_frame + LEAST * LEAST * level) / max(h.surprise, 1e-12));
+            // In the periphery half as long again, against flicker.
+            float cap = (1.0 + 0.5 * periphery(guides[at].angle)) * frame.history_cap;
+            float frames = min(cap, of_frame / max(UNSEEN * UNSEEN * level, 1e-12));
+            frames = min(frames, cap * SURPRISE * (of_frame + LEAST * LEAST * level) / max(h.surprise, 1e-12));
             h.weight = min(h.weight, frames * per_frame);
             // Every sample counts once, so that the sequence's points keep their even spread; their number follows from the variance of long
             // before, hardly from the sample that is weighed.

@@ -100,3 +100,6 @@ uint hash_u32(uint x) {
 
 // Which zone of [paper] table 1 an angle lies in.
 uint zone_of(float degrees_) { return degrees_ <= frame.zone_degrees.x ? 0u : degrees_ <= frame.zone_degrees.y ? 1u : 2u; }
+
+// How far a point is in the periphery: 0 where the spatial filter of [paper] begins, 1 where it is whole.
+float periphery(float angle) { return clamp((angle - frame.filter_degrees.x) / max(frame.filter_degrees.y - frame.filter_degrees.x, 1e-6), 0.0, 1.0); }

@@ -23,7 +23,7 @@ const vec2 DISK[12] = vec2[](vec2(0.03, -0.09), vec2(-0.51, 0.13), vec2(0.47, 0.
                              vec2(0.62, -0.31), vec2(-0.94, -0.18), vec2(-0.58, 0.72), vec2(0.43, 0.83), vec2(0.96, 0.12), vec2(-0.31, -0.92));
 
 // Share of independent samples' variance that is left by the sequence (measured).
-const float SEQUENCE_VARIANCE = 0.5;
+const float SEQUENCE_VARIANCE = 0.3;
 // Frames that the picture's own noise is taken to be seen over: what a filter gets wrong stays, noise goes.
 const float SEEN_FRAMES = 20.0;
 // Neighbours may differ by this share of their light beyond what the plane tells.
@@ -64,7 +64,9 @@ float lag_of(uvec2 pixel, uint at, uint history) {
     }
     float fit = xy * xy / max(xx, 1e-12);
     float chance = max(yy - fit, 0.0) / max(used - 1.0, 1.0);
-    float trust = fit > 0.0 ? max(1.0 - 0.5 * chance / fit, 0.0) : 0.0;
+    // What the correction gets wrong changes from frame to frame: where the eye sees flicker best, only what is beyond doubt is corrected.
+    float doubt = mix(0.5, 3.0, periphery(guides[at].angle));
+    float trust = fit > 0.0 ? max(1.0 - doubt * chance / fit, 0.0) : 0.0;
     return trust * xy / max(xx, 1e-12) * age;
 }
 
@@ -131,16 +133,18 @@ vec3 regressed(uvec2 pixel, uint at, uint history, vec4 own) {
     // Single pixels hardly know their own noise: it is that of all around.
     float noise = noise_sum / used;
     float apart = luminance(b[0]);
-    structure = max(structure, apart * apart - 4.0 * noise);
+    // In the periphery blur is the lesser evil beside flicker.
+    float beyond = periphery(guides[at].angle);
+    structure = max(structure, apart * apart - mix(3.0, 16.0, beyond) * noise);
     float held = histories[history + at].weight;
-    noise *= held / (held + SEEN_FRAMES * max(frame.budget_spp, 0.5));
+    noise *= mix(1.0, 5.0, beyond) * held / (held + SEEN_FRAMES * max(frame.budget_spp, 0.5));
     vec3 result = own.rgb + b[0] * (noise / max(structure + noise, 1e-12));
     return finite3(result) ? max(result, vec3(0.0)) : own.rgb;
 }
 
 // [paper]: mean over a Poisson disk, blended in between two angles.
 vec3 disk_mean(uvec2 pixel, uint at, uint history, vec4 own) {
-    float blend = clamp((guides[at].angle - frame.filter_degrees.x) / max(frame.filter_degrees.y - frame.filter_degrees.x, 1e-6), 0.0, 1.0);
+    float blend = periphery(guides[at].angle);
     if (!(blend > 0.0)) return own.rgb;
     uint instance = surfaces[at].id >> 24u;
     vec3 position = histories[history + at].position;
