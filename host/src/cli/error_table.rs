@@ -44,7 +44,7 @@ pub(super) fn table(args: &ErrorArgs) -> Result<(), Failure> {
                 let mut each = |what: &str| progress.step(&format!("{name} {what}"), cost(what, setting));
                 let (group, measured) = error_table::measure(&runs, setting, &mut each).map_err(failure)?;
                 let path = table_path(&out, &group);
-                save(&path.with_extension("png"), &strip(&measured, &name))?;
+                save(&path.with_extension("png"), &strip(&measured, &name.replace('-', " ")))?;
                 write(&path, &to_json(&group))?;
                 measured.is_kept();
                 group
