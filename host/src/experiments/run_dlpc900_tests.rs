@@ -159,6 +159,8 @@ fn a_controller_that_was_unplugged_is_set_up_again_as_the_operator_left_it() {
             state
         };
         let long = Duration::from_secs(20);
+        // The sequencer runs before the set-up has had its last answer, and one that is unplugged before that ends the run.
+        until("set up", long, &|| watched.projector() == ProjectorHealth::Up);
         until("running", long, &|| matches!(sequencer(), Sequencer::Running(..)));
         for (order, stays_dark) in [(None, false), (Some(Order::Black), true)] {
             *socket.lock().unwrap() = None;
