@@ -210,8 +210,8 @@ pub fn recording(bytes: &[u8]) {
 /// USB/IP, both ends: what is read comes out of its own encoding.
 pub fn usbip_stream(bytes: &[u8]) {
     if let Ok(operation) = usbip::Operation::read(&mut &bytes[..]) {
-        // A name that is not text is read as if it were, and names no device.
-        let is_text = !matches!(&operation, usbip::Operation::Import(id) if !id.is_ascii());
+        // A name that is not text, or fills its 32 bytes without an end, is read as if it were one and names no device.
+        let is_text = !matches!(&operation, usbip::Operation::Import(id) if !id.is_ascii() || id.len() > 31);
         let again = usbip::Operation::read(&mut &operation.encode()[..]).ok();
         assert!(again == Some(operation) || !is_text);
     }
