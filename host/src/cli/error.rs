@@ -1,23 +1,21 @@
 //! `dpm error`: error against cost of every method, as tables and curves.
 
-use super::error_files::{known, merge, report, report_figure3, save, write};
+use super::error_files::{known, known_or, merge, report, show, Kept};
 use super::progress::Progress;
 use super::rig_args::RigArgs;
 use super::watch::print;
-use crate::experiments::error_figure3::{self, Figure3Group, Setting};
 use crate::experiments::error_plan::{groups, Group};
-use crate::experiments::error_report::markdown;
+use crate::experiments::error_plot::{curves, Cost};
+use crate::experiments::error_report::{csv, markdown};
 use crate::experiments::error_runs::{
     ErrorOptions, ErrorRunError, ErrorRuns, Extent, GroupResult, EYE_FRAMES,
 };
-use crate::experiments::error_sheet::strip;
 use crate::experiments::run_rig::open_gpu;
 use crate::experiments::stamp::Stamp;
 use crate::failure::{Failure, FailureKind};
 use crate::gpu::Gpu;
 use crate::pipeline::PipelineError;
 use crate::rig::Rig;
-use crate::telemetry::report::to_json;
 use dpm_device::planes::Raster;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
@@ -105,7 +103,7 @@ pub fn execute(args: &ErrorArgs) -> Result<(), Failure> {
         return merge(out, *json);
     }
     match args.preset {
-        Some(Preset::Figure3) => return figure3(args),
+        Some(Preset::Figure3) => return super::error_figure3::figure3(args),
         Some(Preset::Table) => return super::error_table::table(args),
         None => {}
     }
@@ -122,11 +120,57 @@ pub fn execute(args: &ErrorArgs) -> Result<(), Failure> {
     let out = folder(args);
     let runs = prepare(args, &out)?;
     let results = measure(&runs, &chosen, args, &out)?;
-    if args.index.is_some() && !args.json {
-        print(&markdown(&results));
+    end(args, &out, &results)
+}
+
+/// Reports the whole experiment, or shows the group that `--index` names.
+pub(super) fn end<T: Kept>(args: &ErrorArgs, out: &Path, groups: &[T]) -> Result<(), Failure> {
+    if args.index.is_some() {
+        // One group of many is no report: those of the whole come from `merge`.
+        show(groups, args.json);
         return Ok(());
     }
-    report(&out, &results, args.json)
+    report(out, groups, args.json)
+}
+
+impl Kept for GroupResult {
+    const PREFIX: &'static str = "group";
+    const REPORT: &'static str = "error";
+
+    fn name(&self) -> String {
+        self.group().name()
+    }
+
+    fn key(&self) -> &str {
+        &self.key
+    }
+
+    fn stamp(&self) -> &Stamp {
+        &self.stamp
+    }
+
+    fn extent(&self) -> Option<Extent> {
+        Some(self.extent)
+    }
+
+    fn order(&self) -> (bool, bool, f64) {
+        let group = self.group();
+        (false, group.moving, group.budget)
+    }
+
+    fn markdown(groups: &[Self]) -> String {
+        markdown(groups)
+    }
+
+    fn reports(groups: &[Self]) -> Result<Vec<(String, String)>, String> {
+        let mut all = vec![(".csv".to_owned(), csv(groups))];
+        for (moving, motion) in [(false, "still"), (true, "moving")] {
+            for (cost, name) in [(Cost::Rays, "rays"), (Cost::GpuMs, "ms")] {
+                all.push((format!("-{motion}-{name}.svg"), curves(groups, moving, cost)?));
+            }
+        }
+        Ok(all)
+    }
 }
 
 pub(super) fn folder(args: &ErrorArgs) -> PathBuf {
@@ -185,49 +229,6 @@ fn prepare(args: &ErrorArgs, out: &Path) -> Result<ErrorRuns, Failure> {
     Ok(ErrorRuns::new(Arc::new(rig), gpu, options(args, out)))
 }
 
-fn figure3(args: &ErrorArgs) -> Result<(), Failure> {
-    let all = Setting::all();
-    if args.list {
-        return list(args, all.iter().map(|s| s.name()));
-    }
-    let (out, chosen) = (folder(args), chosen(args, &all)?);
-    let options = options(args, &out);
-    let (gpu, rig) = stage(args)?;
-    let raster = rig.camera.raster;
-    let stamp = Stamp::new(&rig, gpu.summary());
-    let reference = EYE_FRAMES as u64 * u64::from(options.extent.reference_spp) / 2;
-    let sequence = |spp: u32| EYE_FRAMES as u64 * (u64::from(spp) + 3);
-    let whole = 2 * (reference + error_figure3::SPP.into_iter().map(sequence).sum::<u64>());
-    let mut progress = Progress::new(&vec![whole; chosen.len()]);
-    let mut groups = Vec::new();
-    for &setting in &chosen {
-        let key = error_figure3::key(&stamp, setting, &options, &error_figure3::SPP);
-        let path = out.join(format!("figure3-{}-{key}.json", setting.name()));
-        let group = match known(&path, |g: &Figure3Group| g.key == key) {
-            Some(group) => group,
-            None => {
-                let rig = Rig::build(&rig.config, Some(raster))?;
-                let mut each = |what: &str| {
-                    let spp = what.split(' ').next().and_then(|n| n.parse().ok());
-                    progress.step(&format!("{} {what}", setting.name()), spp.map_or(reference, sequence));
-                };
-                let measured =
-                    error_figure3::measure(rig, &gpu, setting, &options, &error_figure3::SPP, &mut each)
-                        .map_err(failure)?;
-                write(&path, &to_json(&measured))?;
-                measured
-            }
-        };
-        progress.end_of_part(&setting.name());
-        groups.push(group);
-    }
-    if args.index.is_some() && !args.json {
-        print(&error_figure3::markdown(&groups));
-        return Ok(());
-    }
-    report_figure3(&out, &groups, args.json)
-}
-
 /// What a sequence costs beside the others, for the time that is left: sample frames, and as much for each frame as 3 samples take.
 pub(super) fn weight(what: &str, group: Group, extent: Extent, methods: usize) -> u64 {
     let frames = f64::from(extent.warm_up + extent.kept);
@@ -248,16 +249,17 @@ fn measure(
     out: &Path,
 ) -> Result<Vec<GroupResult>, Failure> {
     let extent = options(args, out).extent;
-    let methods = if args.ablation { 8 } else { 4 };
-    let path = |group: Group| out.join(format!("group-{}-{}.json", group.name(), runs.key(group)));
-    let earlier = |group: Group| known(&path(group), |r: &GroupResult| r.key == runs.key(group));
+    let methods = runs.methods();
     let sequences = |group: Group| out.join("sequences").join(group.name());
     let total = |group: Group, first: bool| {
         let of = |what: &str| weight(what, group, extent, methods);
         let reference = if first { 2 * of("reference") } else { 0 };
         let every = if group.moving { of("reference of every frame") } else { 0 };
-        let measured =
-            if earlier(group).is_some() { 0 } else { 2 * methods as u64 * of("") + of("times") + reference };
+        let measured = if known::<GroupResult>(out, &group.name(), &runs.key(group)).is_some() {
+            0
+        } else {
+            2 * methods as u64 * of("") + of("times") + reference
+        };
         measured + if args.sequences { methods as u64 * of("") + every } else { 0 }
     };
     let first = |k: usize| chosen[..k].iter().all(|g| g.moving != chosen[k].moving);
@@ -268,18 +270,10 @@ fn measure(
         let name = group.name();
         let mut each =
             |what: &str| progress.step(&format!("{name} {what}"), weight(what, group, extent, methods));
-        let result = match earlier(group) {
-            Some(known) => known,
-            None => {
-                let measured = runs.measure(group, &mut each).map_err(failure)?;
-                let path = path(group);
-                save(&path.with_extension("png"), &strip(&measured, &name))?;
-                write(&path, &to_json(&measured.result))?;
-                let result = measured.result.clone();
-                measured.is_kept();
-                result
-            }
-        };
+        let result = known_or(out, &name, &runs.key(group), || {
+            let measured = runs.measure(group, &mut each).map_err(failure)?;
+            Ok((measured.result.clone(), Some(measured)))
+        })?;
         if args.sequences {
             runs.export(group, &result, &sequences(group), &mut each).map_err(failure)?;
         }

@@ -1,80 +1,119 @@
-//! Measured groups of `dpm error` in a folder: found again, joined, and written as tables, curves and pictures.
+//! Measured groups of `dpm error` in a folder: found again or measured and kept, joined, and reported.
 
 use super::watch::print;
-use crate::experiments::error_figure3::{self, Figure3Group};
-use crate::experiments::error_plan::Group;
-use crate::experiments::error_plot::{self, curves, Cost};
-use crate::experiments::error_report::{csv, markdown};
-use crate::experiments::error_runs::GroupResult;
-use crate::experiments::error_sheet::stack;
-use crate::experiments::error_table::{self, TableGroup};
+use crate::experiments::error_figure3::Figure3Group;
+use crate::experiments::error_runs::{Extent, GroupResult, Measured};
+use crate::experiments::error_sheet::{stack, strip};
+use crate::experiments::error_table::TableGroup;
 use crate::experiments::snapshot::paint::Canvas;
+use crate::experiments::stamp::Stamp;
 use crate::failure::{Failure, FailureKind};
 use crate::files::write_atomically;
 use crate::telemetry::report::to_json;
 use serde::de::DeserializeOwned;
+use serde::Serialize;
 use std::io::Write;
 use std::path::{Path, PathBuf};
 
-/// What an earlier run left in `path`, when it was made from the same.
-pub(super) fn known<T: DeserializeOwned>(path: &Path, fits: impl Fn(&T) -> bool) -> Option<T> {
-    std::fs::read(path).ok().and_then(|b| serde_json::from_slice(&b).ok()).filter(fits)
+/// A measured group of an experiment, as it lies in a folder.
+pub(super) trait Kept: Serialize + DeserializeOwned {
+    /// What the names of its files begin with.
+    const PREFIX: &'static str;
+    /// What the names of the experiment's reports begin with.
+    const REPORT: &'static str;
+
+    /// Its name among the groups of the experiment.
+    fn name(&self) -> String;
+    /// Hash of all that it depends on.
+    fn key(&self) -> &str;
+    /// With what it was measured.
+    fn stamp(&self) -> &Stamp;
+    /// How much was drawn of it, where a group tells.
+    fn extent(&self) -> Option<Extent>;
+    /// Groups are told in rising order of this.
+    fn order(&self) -> (bool, bool, f64);
+    /// The experiment's tables.
+    fn markdown(groups: &[Self]) -> String;
+    /// The experiment's other reports: name and text.
+    fn reports(groups: &[Self]) -> Result<Vec<(String, String)>, String>;
 }
 
-/// Writes table and plot of the settings of figure 3, and prints the table or one JSON object.
-pub(super) fn report_figure3(out: &Path, groups: &[Figure3Group], json: bool) -> Result<(), Failure> {
-    let object = to_json(&serde_json::json!({ "groups": groups }));
-    let table = error_figure3::markdown(groups);
-    write(&out.join("figure3.json"), &object)?;
-    write(&out.join("figure3.csv"), &error_figure3::csv(groups))?;
-    write(&out.join("figure3.md"), &table)?;
-    let svg = error_plot::figure3(groups).map_err(|e| Failure::new(FailureKind::BadInput, e))?;
-    write(&out.join("figure3.svg"), &svg)?;
-    print(&if json { object + "\n" } else { table });
-    Ok(())
+fn path<T: Kept>(out: &Path, name: &str, key: &str) -> PathBuf {
+    out.join(format!("{}-{name}-{key}.json", T::PREFIX))
 }
 
-/// Writes the table of all methods with its pictures, and prints the table or one JSON object.
-pub(super) fn report_table(out: &Path, groups: &[TableGroup], json: bool) -> Result<(), Failure> {
-    let object = to_json(&serde_json::json!({ "groups": groups }));
-    let table = error_table::markdown(groups);
-    write(&out.join("table.json"), &object)?;
-    write(&out.join("table.md"), &table)?;
-    let sheets: Vec<Canvas> =
-        groups.iter().filter_map(|g| Canvas::load(&table_path(out, g).with_extension("png"))).collect();
-    if !sheets.is_empty() {
-        save(&out.join("table.png"), &stack(&sheets))?;
+fn path_of<T: Kept>(out: &Path, group: &T) -> PathBuf {
+    path::<T>(out, &group.name(), group.key())
+}
+
+/// What an earlier run left of a group, when it was made from the same.
+pub(super) fn known<T: Kept>(out: &Path, name: &str, key: &str) -> Option<T> {
+    let bytes = std::fs::read(path::<T>(out, name, key)).ok()?;
+    serde_json::from_slice(&bytes).ok().filter(|group: &T| group.key() == key)
+}
+
+/// What an earlier run left of a group, else what `measure` makes of it now, kept with a picture of what the eye saw where there is one.
+pub(super) fn known_or<T: Kept>(
+    out: &Path,
+    name: &str,
+    key: &str,
+    measure: impl FnOnce() -> Result<(T, Option<Measured>), Failure>,
+) -> Result<T, Failure> {
+    if let Some(group) = known(out, name, key) {
+        return Ok(group);
     }
-    print(&if json { object + "\n" } else { table });
+    let (group, seen) = measure()?;
+    let path = path_of(out, &group);
+    if let Some(seen) = &seen {
+        save(&path.with_extension("png"), &strip(seen, &name.replace('-', " ")))?;
+    }
+    write(&path, &to_json(&group))?;
+    if let Some(seen) = seen {
+        seen.is_kept();
+    }
+    Ok(group)
+}
+
+/// Writes the tables, curves and pictures of an experiment, and prints the tables or one JSON object.
+pub(super) fn report<T: Kept>(out: &Path, groups: &[T], json: bool) -> Result<(), Failure> {
+    let file = |end: &str| out.join(format!("{}{end}", T::REPORT));
+    write(&file(".json"), &object(groups))?;
+    write(&file(".md"), &T::markdown(groups))?;
+    for (end, text) in T::reports(groups).map_err(|e| Failure::new(FailureKind::BadInput, e))? {
+        write(&file(&end), &text)?;
+    }
+    let sheets: Vec<Canvas> =
+        groups.iter().filter_map(|g| Canvas::load(&path_of(out, g).with_extension("png"))).collect();
+    if !sheets.is_empty() {
+        save(&file(".png"), &stack(&sheets))?;
+    }
+    show(groups, json);
     Ok(())
 }
 
-/// Where the numbers of a setting of the table lie.
-pub(super) fn table_path(out: &Path, g: &TableGroup) -> PathBuf {
-    out.join(format!("table-{}-{}.json", g.name(), g.result.key))
+/// Prints one JSON object or the tables.
+pub(super) fn show<T: Kept>(groups: &[T], json: bool) {
+    print(&if json { object(groups) + "\n" } else { T::markdown(groups) });
+}
+
+fn object<T: Kept>(groups: &[T]) -> String {
+    to_json(&serde_json::json!({ "groups": groups }))
 }
 
 /// Joins what lies in a folder: groups of methods, settings of figure 3 or of the table.
 pub(super) fn merge(out: &Path, json: bool) -> Result<(), Failure> {
-    let mut groups: Vec<GroupResult> = read_all(out, "group-")?;
-    groups.sort_by(|a, b| {
-        let ((am, ab), (bm, bb)) = (place(a), place(b));
-        am.cmp(&bm).then(ab.total_cmp(&bb))
-    });
-    one_experiment(out, &groups)?;
-    let settings: Vec<Figure3Group> = read_all(out, "figure3-")?;
-    let mut cells: Vec<TableGroup> = read_all(out, "table-")?;
-    cells.sort_by_key(|c| (c.aside, c.moving, c.place()));
+    let (groups, settings, cells) =
+        (joined::<GroupResult>(out)?, joined::<Figure3Group>(out)?, joined::<TableGroup>(out)?);
     if groups.is_empty() && settings.is_empty() && cells.is_empty() {
         let out = out.display();
         let told = format!("{out}: no measured groups; run dpm error RIG.toml --index N --out {out} first");
         return Err(Failure::new(FailureKind::BadInput, told));
     }
     if !settings.is_empty() {
-        report_figure3(out, &settings, json)?;
+        report(out, &settings, json)?;
     }
     if !cells.is_empty() {
-        report_table(out, &cells, json)?;
+        report(out, &cells, json)?;
     }
     if groups.is_empty() {
         return Ok(());
@@ -82,23 +121,23 @@ pub(super) fn merge(out: &Path, json: bool) -> Result<(), Failure> {
     report(out, &groups, json)
 }
 
-/// Motion and budget of a group.
-fn place(g: &GroupResult) -> (bool, f64) {
-    g.rows.first().map_or((false, 0.0), |r| (r.moving, r.budget))
-}
-
-/// Where the numbers of a group lie.
-fn group_path(out: &Path, g: &GroupResult) -> PathBuf {
-    let (moving, budget) = place(g);
-    out.join(format!("group-{}-{}.json", Group { moving, budget }.name(), g.key))
+/// All groups of an experiment in a folder, in their order.
+fn joined<T: Kept>(out: &Path) -> Result<Vec<T>, Failure> {
+    let mut groups = read_all::<T>(out)?;
+    groups.sort_by(|a, b| {
+        let ((a1, a2, a3), (b1, b2, b3)) = (a.order(), b.order());
+        (a1, a2).cmp(&(b1, b2)).then(a3.total_cmp(&b3))
+    });
+    one_experiment(out, &groups)?;
+    Ok(groups)
 }
 
 /// Groups of one configuration, raster, seed and extent, none of them twice: only those have curves in common. They may come from
 /// different devices and commits, which the tables tell.
-fn one_experiment(out: &Path, sorted: &[GroupResult]) -> Result<(), Failure> {
-    let what = |g: &GroupResult| (g.stamp.config_hash.clone(), g.stamp.raster, g.stamp.seed, g.extent);
-    let told = |why: &str, a: &GroupResult, b: &GroupResult| {
-        let (a, b) = (group_path(out, a), group_path(out, b));
+fn one_experiment<T: Kept>(out: &Path, sorted: &[T]) -> Result<(), Failure> {
+    let what = |g: &T| (g.stamp().config_hash.clone(), g.stamp().raster, g.stamp().seed, g.extent());
+    let told = |why: &str, a: &T, b: &T| {
+        let (a, b) = (path_of(out, a), path_of(out, b));
         let told = format!("{} and {} {why}; move one of them to another folder", a.display(), b.display());
         Err(Failure::new(FailureKind::BadInput, told))
     };
@@ -107,7 +146,7 @@ fn one_experiment(out: &Path, sorted: &[GroupResult]) -> Result<(), Failure> {
             let why = "are of different experiments (configuration, raster, seed, frames or samples of the reference)";
             return told(why, &pair[0], &pair[1]);
         }
-        if place(&pair[0]) == place(&pair[1]) {
+        if pair[0].name() == pair[1].name() {
             return told(
                 "are one group, measured twice (another device, commit or --ablation)",
                 &pair[0],
@@ -118,14 +157,14 @@ fn one_experiment(out: &Path, sorted: &[GroupResult]) -> Result<(), Failure> {
     Ok(())
 }
 
-/// Every measured file of a folder whose name begins like this, by name.
-fn read_all<T: DeserializeOwned>(out: &Path, prefix: &str) -> Result<Vec<T>, Failure> {
+/// Every measured file of an experiment in a folder, by name.
+fn read_all<T: Kept>(out: &Path) -> Result<Vec<T>, Failure> {
     let Ok(entries) = std::fs::read_dir(out) else { return Ok(Vec::new()) };
     let mut paths: Vec<PathBuf> = entries
         .filter_map(|e| Some(e.ok()?.path()))
         .filter(|p| {
             let name = p.file_name().unwrap_or_default().to_string_lossy();
-            name.starts_with(prefix) && name.ends_with(".json")
+            name.strip_prefix(T::PREFIX).is_some_and(|rest| rest.starts_with('-')) && name.ends_with(".json")
         })
         .collect();
     paths.sort();
@@ -141,35 +180,13 @@ fn read_all<T: DeserializeOwned>(out: &Path, prefix: &str) -> Result<Vec<T>, Fai
     Ok(found)
 }
 
-/// Writes the tables, curves and pictures of measured groups, and prints the tables or one JSON object.
-pub(super) fn report(out: &Path, groups: &[GroupResult], json: bool) -> Result<(), Failure> {
-    let object = to_json(&serde_json::json!({ "groups": groups }));
-    write(&out.join("error.json"), &object)?;
-    write(&out.join("error.csv"), &csv(groups))?;
-    let table = markdown(groups);
-    write(&out.join("error.md"), &table)?;
-    for (moving, motion) in [(false, "still"), (true, "moving")] {
-        for (cost, name) in [(Cost::Rays, "rays"), (Cost::GpuMs, "ms")] {
-            let svg = curves(groups, moving, cost).map_err(|e| Failure::new(FailureKind::BadInput, e))?;
-            write(&out.join(format!("error-{motion}-{name}.svg")), &svg)?;
-        }
-    }
-    let sheets: Vec<Canvas> =
-        groups.iter().filter_map(|g| Canvas::load(&group_path(out, g).with_extension("png"))).collect();
-    if !sheets.is_empty() {
-        save(&out.join("error.png"), &stack(&sheets))?;
-    }
-    print(&if json { object + "\n" } else { table });
-    Ok(())
-}
-
-pub(super) fn save(path: &Path, canvas: &Canvas) -> Result<(), Failure> {
+fn save(path: &Path, canvas: &Canvas) -> Result<(), Failure> {
     canvas
         .save(path)
         .map_err(|e| Failure::new(FailureKind::BadInput, format!("{e}; choose another folder with --out")))
 }
 
-pub(super) fn write(path: &Path, text: &str) -> Result<(), Failure> {
+fn write(path: &Path, text: &str) -> Result<(), Failure> {
     write_atomically(path, |w| w.write_all(text.as_bytes()))
         .map_err(|e| Failure::new(FailureKind::BadInput, format!("{e}; choose another folder with --out")))
 }
@@ -177,8 +194,7 @@ pub(super) fn write(path: &Path, text: &str) -> Result<(), Failure> {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::experiments::error_runs::{ErrorRow, Extent};
-    use crate::experiments::stamp::Stamp;
+    use crate::experiments::error_runs::ErrorRow;
 
     fn group(moving: bool, budget: f64, change: impl FnOnce(&mut GroupResult)) -> GroupResult {
         let row = ErrorRow {
@@ -224,23 +240,76 @@ mod tests {
         made
     }
 
+    /// What must be the same in groups that are joined.
+    const CHANGES: [fn(&mut GroupResult); 4] = [
+        |g| g.stamp.config_hash = "d".into(),
+        |g| g.stamp.raster = [9, 6],
+        |g| g.stamp.seed = 2,
+        |g| g.extent.reference_spp = 4,
+    ];
+
     #[test]
     fn only_groups_of_one_experiment_are_joined() {
         let first = || group(false, 2.0, |_| ());
         let joined = |other: GroupResult| one_experiment(Path::new("out"), &[first(), other]);
         assert!(joined(group(false, 4.0, |_| ())).is_ok());
         assert!(joined(group(true, 2.0, |g| g.stamp.device = "another".into())).is_ok());
-        let changes: [fn(&mut GroupResult); 4] = [
-            |g| g.stamp.config_hash = "d".into(),
-            |g| g.stamp.raster = [9, 6],
-            |g| g.stamp.seed = 2,
-            |g| g.extent.reference_spp = 4,
-        ];
-        for change in changes {
+        for change in CHANGES {
             let told = joined(group(true, 4.0, change)).unwrap_err().message;
             assert!(told.contains("group-still-2-") && told.contains("different experiments"), "{told}");
         }
         let told = joined(group(false, 2.0, |g| g.key = "k".into())).unwrap_err().message;
         assert!(told.contains("measured twice") && told.contains("group-still-2-k.json"), "{told}");
+    }
+
+    #[test]
+    fn only_settings_of_one_table_are_joined_and_all_their_stamps_are_told() {
+        let cell = |material: &str, change: fn(&mut GroupResult)| TableGroup {
+            material: material.into(),
+            moving: true,
+            aside: false,
+            result: group(true, 18.0, change),
+        };
+        let joined = |other: TableGroup| one_experiment(Path::new("out"), &[cell("diffuse", |_| ()), other]);
+        let elsewhere = cell("glossy", |g| g.stamp.device = "another".into());
+        assert!(joined(elsewhere.clone()).is_ok());
+        for change in CHANGES {
+            let told = joined(cell("mirror", change)).unwrap_err().message;
+            let names = told.contains("table-diffuse-moving-") && told.contains("table-mirror-moving-");
+            assert!(names && told.contains("different experiments"), "{told}");
+        }
+        let told = joined(cell("diffuse", |g| g.key = "k".into())).unwrap_err().message;
+        assert!(told.contains("measured twice") && told.contains("table-diffuse-moving-k.json"), "{told}");
+        let text = TableGroup::markdown(&[cell("diffuse", |_| ()), elsewhere, cell("mirror", |_| ())]);
+        assert_eq!((text.matches("a device (").count(), text.matches("another (").count()), (1, 1), "{text}");
+        assert!(text.contains("only rows of one group can be compared in time"));
+    }
+
+    #[test]
+    fn a_folder_gives_back_what_was_kept_in_order_and_measures_only_what_is_missing() {
+        let out = std::env::temp_dir().join(format!("dpm-error-files-{}", std::process::id()));
+        let keep = |moving, budget| {
+            let made = group(moving, budget, |_| ());
+            known_or(&out, &made.name(), &made.key.clone(), || Ok((made, None))).unwrap()
+        };
+        for (moving, budget) in [(true, 0.5), (false, 18.0), (false, 2.0), (true, 64.0)] {
+            keep(moving, budget);
+        }
+        let joined: Vec<String> = joined::<GroupResult>(&out).unwrap().iter().map(Kept::name).collect();
+        assert_eq!(joined, ["still-2", "still-18", "moving-0.5", "moving-64"]);
+        let again = known_or::<GroupResult>(&out, "still-2", "false2", || panic!("it lies there"));
+        assert_eq!(again.unwrap().group().budget, 2.0);
+        // Another key is another group, and so is what a file holds under a name that is not its own.
+        let mut measured = false;
+        let other = known_or(&out, "still-2", "another", || {
+            measured = true;
+            Ok((group(false, 2.0, |g| g.key = "another".into()), None))
+        });
+        assert!(measured && other.unwrap().key == "another");
+        std::fs::copy(out.join("group-still-2-false2.json"), out.join("group-still-2-forged.json")).unwrap();
+        assert!(known::<GroupResult>(&out, "still-2", "forged").is_none());
+        assert!(super::joined::<GroupResult>(&out).unwrap_err().message.contains("measured twice"));
+        assert!(super::joined::<TableGroup>(&out).unwrap().is_empty());
+        std::fs::remove_dir_all(out).unwrap();
     }
 }

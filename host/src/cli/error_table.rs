@@ -1,17 +1,47 @@
 //! `dpm error --preset table`: settings of the table that are not measured yet, then the whole table.
 
-use super::error::{chosen, failure, folder, list, options, stage, weight, ErrorArgs};
-use super::error_files::{known, report_table, save, table_path, write};
+use super::error::{chosen, end, failure, folder, list, options, stage, weight, ErrorArgs};
+use super::error_files::{known_or, Kept};
 use super::progress::Progress;
-use super::watch::print;
-use crate::experiments::error_sheet::strip;
+use crate::experiments::error_plan::contenders;
+use crate::experiments::error_runs::Extent;
 use crate::experiments::error_table::{self, TableGroup, TableSetting};
+use crate::experiments::stamp::Stamp;
 use crate::failure::Failure;
 use crate::rig::Rig;
-use crate::telemetry::report::to_json;
 
-/// Methods of the table.
-const METHODS: usize = 4;
+impl Kept for TableGroup {
+    const PREFIX: &'static str = "table";
+    const REPORT: &'static str = "table";
+
+    fn name(&self) -> String {
+        self.setting().name()
+    }
+
+    fn key(&self) -> &str {
+        &self.result.key
+    }
+
+    fn stamp(&self) -> &Stamp {
+        &self.result.stamp
+    }
+
+    fn extent(&self) -> Option<Extent> {
+        Some(self.result.extent)
+    }
+
+    fn order(&self) -> (bool, bool, f64) {
+        (self.aside, self.moving, self.setting().look as f64)
+    }
+
+    fn markdown(groups: &[Self]) -> String {
+        error_table::markdown(groups)
+    }
+
+    fn reports(_: &[Self]) -> Result<Vec<(String, String)>, String> {
+        Ok(Vec::new())
+    }
+}
 
 /// Measures what is not measured yet and writes the table.
 ///
@@ -26,36 +56,25 @@ pub(super) fn table(args: &ErrorArgs) -> Result<(), Failure> {
     let options = options(args, &out);
     let (gpu, rig) = stage(args)?;
     let raster = rig.camera.raster;
-    let cost = |what: &str, s: TableSetting| weight(what, s.group(), options.extent, METHODS);
+    let methods = contenders(&rig.config.render, options.ablation).len();
+    let cost = |what: &str, s: TableSetting| weight(what, s.group(), options.extent, methods);
     let totals: Vec<u64> = chosen
         .iter()
-        .map(|&s| 2 * METHODS as u64 * cost("", s) + cost("times", s) + 2 * cost("reference", s))
+        .map(|&s| 2 * methods as u64 * cost("", s) + cost("times", s) + 2 * cost("reference", s))
         .collect();
     let mut progress = Progress::new(&totals);
     let mut groups = Vec::new();
     for &setting in &chosen {
         let rig = Rig::build(&rig.config, Some(raster))?;
         let (runs, key) = error_table::runs(rig, &gpu, setting, &options);
-        let path = out.join(format!("table-{}-{key}.json", setting.name()));
-        let group = match known(&path, |g: &TableGroup| g.result.key == key) {
-            Some(group) => group,
-            None => {
-                let name = setting.name();
-                let mut each = |what: &str| progress.step(&format!("{name} {what}"), cost(what, setting));
-                let (group, measured) = error_table::measure(&runs, setting, &mut each).map_err(failure)?;
-                let path = table_path(&out, &group);
-                save(&path.with_extension("png"), &strip(&measured, &name.replace('-', " ")))?;
-                write(&path, &to_json(&group))?;
-                measured.is_kept();
-                group
-            }
-        };
-        progress.end_of_part(&setting.name());
+        let name = setting.name();
+        let group = known_or(&out, &name, &key, || {
+            let mut each = |what: &str| progress.step(&format!("{name} {what}"), cost(what, setting));
+            let (group, seen) = error_table::measure(&runs, setting, &mut each).map_err(failure)?;
+            Ok((group, Some(seen)))
+        })?;
+        progress.end_of_part(&name);
         groups.push(group);
     }
-    if args.index.is_some() && !args.json {
-        print(&error_table::markdown(&groups));
-        return Ok(());
-    }
-    report_table(&out, &groups, args.json)
+    end(args, &out, &groups)
 }

@@ -4,6 +4,7 @@ pub mod bench;
 pub mod dlpc900;
 pub mod doctor;
 pub mod error;
+mod error_figure3;
 mod error_files;
 mod error_table;
 pub mod keys;

@@ -5,6 +5,7 @@
 //! the noise is what two runs of independent samples do not share after 31 frames on every point of that body.
 
 use super::error_reference::{mean_of, Reference};
+use super::error_report::stamps;
 use super::error_runs::{ErrorOptions, ErrorRunError, EYE_FRAMES, LAST_SLOT};
 use super::median::median_ms;
 use super::sequence::{eye_mean, rmse, Span, Theatre};
@@ -91,6 +92,17 @@ pub struct Figure3Group {
     pub reference_error: f64,
     /// By rising samples.
     pub rows: Vec<Figure3Row>,
+}
+
+impl Figure3Group {
+    /// Its setting.
+    pub fn setting(&self) -> Setting {
+        let of = |r: &Figure3Row| {
+            let look = looks().iter().position(|l| l.name == r.material).unwrap_or(0);
+            Setting { look, moving: r.moving }
+        };
+        self.rows.first().map_or(Setting { look: 0, moving: false }, of)
+    }
 }
 
 /// A rig whose first tracked body is made of one of [`looks`].
@@ -218,10 +230,7 @@ pub fn findings(groups: &[Figure3Group]) -> Findings {
 
 /// A table of all conditions, and the findings beside those of [paper].
 pub fn markdown(groups: &[Figure3Group]) -> String {
-    let mut text = String::new();
-    if let Some(g) = groups.first() {
-        text += &g.stamp.line();
-    }
+    let mut text = stamps(groups.iter().map(|g| &g.stamp));
     text += "| material | motion | spp | perceived RMSE / mean | noise / mean | single RMSE / mean | GPU ms |\n|---|---|---:|---:|---:|---:|---:|\n";
     for r in groups.iter().flat_map(|g| &g.rows) {
         // Writing into a string cannot fail.

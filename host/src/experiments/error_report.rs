@@ -52,19 +52,25 @@ pub fn csv(groups: &[GroupResult]) -> String {
     text
 }
 
-/// All rows as a Markdown table, with the stamp above and the best of the others beside dpm below.
-pub fn markdown(groups: &[GroupResult]) -> String {
+/// What stands above tables: every stamp of their groups once, and what more than one of them means.
+pub(super) fn stamps<'a>(all: impl Iterator<Item = &'a Stamp>) -> String {
     let mut text = String::new();
-    let mut stamps: Vec<&Stamp> = Vec::new();
-    for g in groups {
-        if !stamps.contains(&&g.stamp) {
-            stamps.push(&g.stamp);
-            text += &g.stamp.line();
+    let mut told: Vec<&Stamp> = Vec::new();
+    for stamp in all {
+        if !told.contains(&stamp) {
+            told.push(stamp);
+            text += &stamp.line();
         }
     }
-    if stamps.len() > 1 {
+    if told.len() > 1 {
         text += "Times of different devices, drivers or commits are in these tables: only rows of one group can be compared in time.\n\n";
     }
+    text
+}
+
+/// All rows as a Markdown table, with the stamps above and the best of the others beside dpm below.
+pub fn markdown(groups: &[GroupResult]) -> String {
+    let mut text = stamps(groups.iter().map(|g| &g.stamp));
     text += "| motion | budget | method | rays/frame | rays / paper | GPU ms | single RMSE | perceived RMSE | bias | of chance | noise | FLIP | flicker | perceived / paper |\n";
     text += "|---|---:|---|---:|---:|---:|---:|---:|---:|---:|---:|---:|---:|---:|\n";
     for r in groups.iter().flat_map(|g| &g.rows) {

@@ -126,6 +126,14 @@ pub struct GroupResult {
     pub rows: Vec<ErrorRow>,
 }
 
+impl GroupResult {
+    /// What was measured.
+    pub fn group(&self) -> Group {
+        let (moving, budget) = self.rows.first().map_or((false, 0.0), |r| (r.moving, r.budget));
+        Group { moving, budget }
+    }
+}
+
 /// A group with what the eye saw, for a picture of it.
 pub struct Measured {
     /// The numbers.
@@ -199,6 +207,11 @@ impl ErrorRuns {
     /// The stamp of all groups.
     pub fn stamp(&self) -> &Stamp {
         &self.stamp
+    }
+
+    /// How many methods a group has.
+    pub fn methods(&self) -> usize {
+        contenders(&self.rig.config.render, self.options.ablation).len()
     }
 
     /// Names all that a group's result depends on.

@@ -5,7 +5,7 @@
 
 use super::error_figure3::{dressed, looks};
 use super::error_plan::Group;
-use super::error_report::{best_other, dpm_of, least_flicker};
+use super::error_report::{best_other, dpm_of, least_flicker, stamps};
 use super::error_runs::{ErrorOptions, ErrorRunError, ErrorRuns, GroupResult, Measured};
 use super::stamp::Stamp;
 use crate::gpu::Gpu;
@@ -67,14 +67,10 @@ pub struct TableGroup {
 }
 
 impl TableGroup {
-    /// Name of its setting.
-    pub fn name(&self) -> String {
-        TableSetting { look: self.place(), moving: self.moving, aside: self.aside }.name()
-    }
-
-    /// Place of its material in [`looks`].
-    pub fn place(&self) -> usize {
-        looks().iter().position(|l| l.name == self.material).unwrap_or(0)
+    /// Its setting.
+    pub fn setting(&self) -> TableSetting {
+        let look = looks().iter().position(|l| l.name == self.material).unwrap_or(0);
+        TableSetting { look, moving: self.moving, aside: self.aside }
     }
 }
 
@@ -127,9 +123,9 @@ fn flicker(group: &TableGroup, row: &super::error_runs::ErrorRow) -> f64 {
     }
 }
 
-/// All rows as a Markdown table with the stamp above, and dpm by the best of the others below.
+/// All rows as a Markdown table with the stamps above, and dpm by the best of the others below.
 pub fn markdown(groups: &[TableGroup]) -> String {
-    let mut text = groups.first().map_or(String::new(), |g| g.result.stamp.line());
+    let mut text = stamps(groups.iter().map(|g| &g.result.stamp));
     text += "| material | motion | eye | method | rays/frame | rays / paper | single RMSE | perceived RMSE | bias | noise | FLIP | flicker | perceived / best other | flicker / least other |\n";
     text += "|---|---|---|---|---:|---:|---:|---:|---:|---:|---:|---:|---:|---:|\n";
     for g in groups {
