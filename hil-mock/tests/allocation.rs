@@ -1,6 +1,6 @@
 //! Polling a tracker allocates nothing once it runs: a counting allocator around the mock, the recorder and the NatNet client.
-#![allow(unsafe_code)]
 
+use counting_allocator::{requests_in, Counting};
 use dpm_device::pose::Pose;
 use dpm_device::time::{HostClock, HostTime};
 use dpm_device::tracker::natnet::client::{NatNetClient, NatNetConfig};
@@ -10,43 +10,14 @@ use dpm_device::tracker::{BodyKey, Tracker};
 use hil_mock::motion::{Motion, MotionSpec};
 use hil_mock::natnet_server::{NatNetServer, NatNetServerConfig, Streaming, UnicastTo};
 use hil_mock::tracker::{MockTracker, MockTrackerConfig, SampleSource};
-use std::alloc::{GlobalAlloc, Layout, System};
-use std::cell::Cell;
 use std::net::{Ipv4Addr, SocketAddrV4};
 use std::sync::atomic::{AtomicI64, Ordering};
 use std::sync::Arc;
 
 const MS: i64 = 1_000_000;
 
-thread_local! {
-    static ALLOCATIONS: Cell<u64> = const { Cell::new(0) };
-}
-
-/// Counts the allocations of each thread.
-struct Counting;
-
-// SAFETY: every call is passed on to the system's allocator unchanged; counting touches a thread-local without a destructor and
-// allocates nothing itself.
-unsafe impl GlobalAlloc for Counting {
-    unsafe fn alloc(&self, layout: Layout) -> *mut u8 {
-        ALLOCATIONS.with(|n| n.set(n.get() + 1));
-        // SAFETY: the caller's promises are those of `System.alloc`.
-        unsafe { System.alloc(layout) }
-    }
-    unsafe fn dealloc(&self, pointer: *mut u8, layout: Layout) {
-        // SAFETY: `pointer` came from `System.alloc` with this layout.
-        unsafe { System.dealloc(pointer, layout) }
-    }
-}
-
 #[global_allocator]
-static COUNTING: Counting = Counting;
-
-fn allocations_in(work: impl FnOnce()) -> u64 {
-    let before = ALLOCATIONS.with(Cell::get);
-    work();
-    ALLOCATIONS.with(Cell::get) - before
-}
+static ALLOCATOR: Counting = Counting::BY_THREAD;
 
 fn motions() -> Vec<Motion> {
     let motion = Motion::new(&MotionSpec::paper_translation(), Pose::IDENTITY).unwrap();
@@ -57,7 +28,7 @@ const FAULTS: &str = "loss=0.05,duplicate=0.1,reorder=0.1,nan=0.05,invalid=0.05,
 
 #[test]
 fn the_counter_counts() {
-    assert!(allocations_in(|| drop(vec![0u8; 100])) > 0);
+    assert!(requests_in(|| drop(vec![0u8; 100])) > 0);
 }
 
 #[test]
@@ -77,7 +48,7 @@ fn mock_and_recorder_allocate_nothing() {
     };
     let mut now = 0;
     poll(2000 * MS, &mut now);
-    assert_eq!(allocations_in(|| poll(8000 * MS, &mut now)), 0);
+    assert_eq!(requests_in(|| poll(8000 * MS, &mut now)), 0);
     assert!(samples > 6000, "{samples}");
     drop(recorder);
     let _ = std::fs::remove_file(&path);
@@ -113,7 +84,7 @@ fn the_natnet_client_allocates_nothing_per_frame() {
             server.on_datagram(&buffer[..a.len], a.from, now, &mut send);
         }
         server.stream(now, &mut send);
-        let n = allocations_in(|| samples += client.poll(now, &mut |_| {}).unwrap());
+        let n = requests_in(|| samples += client.poll(now, &mut |_| {}).unwrap());
         // The first second is for names and the clock.
         counted += if k > 1000 { n } else { 0 };
     }

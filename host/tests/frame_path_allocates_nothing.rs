@@ -1,6 +1,6 @@
 //! The parts of the frame path that are not the GPU, under an allocator that counts: after construction nothing is allocated.
-#![allow(unsafe_code)]
 
+use counting_allocator::{requests_in, Counting};
 use dpm_device::pose::Pose;
 use dpm_device::time::{FrameRate, HostTime};
 use dpm_device::tracker::{BodyIndex, TrackerSample};
@@ -13,40 +13,9 @@ use dpm_host::plan::budget::{BudgetConfig, BudgetController};
 use dpm_host::plan::lead::LeadEstimator;
 use dpm_host::telemetry::profile::Profiler;
 use dpm_host::tracking::{PoseFilterBank, PoseFilterConfig, TrackState};
-use std::alloc::{GlobalAlloc, Layout, System};
-use std::cell::Cell;
-
-struct Counting;
-
-thread_local! {
-    static ALLOCATIONS: Cell<u64> = const { Cell::new(0) };
-}
-
-fn count() {
-    // During a thread's end there is no counter any more; nothing is measured then.
-    let _ = ALLOCATIONS.try_with(|n| n.set(n.get() + 1));
-}
-
-// SAFETY: every call goes to the system's allocator with the same arguments; counting touches no heap.
-unsafe impl GlobalAlloc for Counting {
-    unsafe fn alloc(&self, layout: Layout) -> *mut u8 {
-        count();
-        // SAFETY: the caller's promises are passed on.
-        unsafe { System.alloc(layout) }
-    }
-    unsafe fn dealloc(&self, pointer: *mut u8, layout: Layout) {
-        // SAFETY: the caller's promises are passed on.
-        unsafe { System.dealloc(pointer, layout) }
-    }
-    unsafe fn realloc(&self, pointer: *mut u8, layout: Layout, size: usize) -> *mut u8 {
-        count();
-        // SAFETY: the caller's promises are passed on.
-        unsafe { System.realloc(pointer, layout, size) }
-    }
-}
 
 #[global_allocator]
-static ALLOCATOR: Counting = Counting;
+static ALLOCATOR: Counting = Counting::BY_THREAD;
 
 #[test]
 fn a_hundred_thousand_frames_allocate_nothing() {
@@ -70,46 +39,46 @@ fn a_hundred_thousand_frames_allocate_nothing() {
     .unwrap();
     let mut profiler = Profiler::new(rate, true, 947);
     let mut predicted = 0u64;
-    let before = ALLOCATIONS.with(Cell::get);
-    for frame in 0..100_000u64 {
-        let due = HostTime(rate.slot_start_ns(frame));
-        clock.wait_until(due);
-        lead.measured(300_000 + (frame % 1_000) as i64 * 5_000);
-        assert!(lead.typical_ns() <= lead.lead_ns());
-        for body in 0..2 {
-            let captured_at = due.plus_ns(-4_000_000);
-            // A drop-out, an outlier and a duplicate now and then: the odd paths count too.
-            let x = if frame % 1_000 == 7 { 50.0 } else { 1e-3 * (frame % 500) as f64 };
-            let sample = TrackerSample {
-                body: BodyIndex(body),
-                pose: Pose { position_m: [x, 0.0, 0.0], ..Pose::IDENTITY },
-                tracked: frame % 5_000 > 40,
-                mean_error_m: 0.0,
-                sequence: frame as u32,
-                captured_at,
-                received_at: captured_at.plus_ns(2_000_000),
-            };
-            bank.update(&sample);
-            bank.update(&sample);
+    let allocated = requests_in(|| {
+        for frame in 0..100_000u64 {
+            let due = HostTime(rate.slot_start_ns(frame));
+            clock.wait_until(due);
+            lead.measured(300_000 + (frame % 1_000) as i64 * 5_000);
+            assert!(lead.typical_ns() <= lead.lead_ns());
+            for body in 0..2 {
+                let captured_at = due.plus_ns(-4_000_000);
+                // A drop-out, an outlier and a duplicate now and then: the odd paths count too.
+                let x = if frame % 1_000 == 7 { 50.0 } else { 1e-3 * (frame % 500) as f64 };
+                let sample = TrackerSample {
+                    body: BodyIndex(body),
+                    pose: Pose { position_m: [x, 0.0, 0.0], ..Pose::IDENTITY },
+                    tracked: frame % 5_000 > 40,
+                    mean_error_m: 0.0,
+                    sequence: frame as u32,
+                    captured_at,
+                    received_at: captured_at.plus_ns(2_000_000),
+                };
+                bank.update(&sample);
+                bank.update(&sample);
+            }
+            publisher.publish([bank.state(BodyIndex(0)), bank.state(BodyIndex(1))]);
+            waker.wake();
+            assert!(waiter.wait(rate.slot_start_ns(frame + 1), || clock.now().0, || reader.has_news()));
+            for state in reader.latest().0.iter().flatten() {
+                predicted += u64::from(state.predict(due).pose.is_valid(1e-9));
+            }
+            let mut buffer = filler.take_free().expect("one goes round");
+            buffer[0] = frame as u8;
+            filler.send(buffer).expect("it came from here");
+            let (buffer, _) = drainer.receive_newest().expect("just sent");
+            drainer.give_back(buffer).expect("it came from here");
+            events_in.push(frame).expect("drained every frame");
+            assert_eq!(events_out.pop(), Some(frame));
+            budget.measured(budget.rays(), 800_000 + (frame % 300_000) as i64);
+            let timeline = FrameTimeline { lit_at: Some(due), due_at: due, ..FrameTimeline::default() };
+            profiler.lit(&timeline, frame, frame % 100 == 0);
         }
-        publisher.publish([bank.state(BodyIndex(0)), bank.state(BodyIndex(1))]);
-        waker.wake();
-        assert!(waiter.wait(rate.slot_start_ns(frame + 1), || clock.now().0, || reader.has_news()));
-        for state in reader.latest().0.iter().flatten() {
-            predicted += u64::from(state.predict(due).pose.is_valid(1e-9));
-        }
-        let mut buffer = filler.take_free().expect("one goes round");
-        buffer[0] = frame as u8;
-        filler.send(buffer).expect("it came from here");
-        let (buffer, _) = drainer.receive_newest().expect("just sent");
-        drainer.give_back(buffer).expect("it came from here");
-        events_in.push(frame).expect("drained every frame");
-        assert_eq!(events_out.pop(), Some(frame));
-        budget.measured(budget.rays(), 800_000 + (frame % 300_000) as i64);
-        let timeline = FrameTimeline { lit_at: Some(due), due_at: due, ..FrameTimeline::default() };
-        profiler.lit(&timeline, frame, frame % 100 == 0);
-    }
-    let allocated = ALLOCATIONS.with(Cell::get) - before;
-    assert_eq!(allocated, 0, "{allocated} allocations in 100,000 frames");
+    });
+    assert_eq!(allocated, 0, "{allocated} allocations and releases in 100,000 frames");
     assert!(predicted > 190_000, "{predicted} poses: the loop did its work");
 }

@@ -1,10 +1,9 @@
 //! The steady state allocates nothing: a counting allocator watches every thread of the frame path.
-#![allow(unsafe_code)]
 
+use counting_allocator::{Counting, Request};
 use dpm_host::pipeline::on_frame_path;
 use dpm_tests::gpu::with_gpu;
 use dpm_tests::rigs::{demo_rig, run};
-use std::alloc::{GlobalAlloc, Layout, System};
 use std::cell::Cell;
 use std::sync::atomic::{AtomicU64, Ordering};
 
@@ -19,48 +18,23 @@ thread_local! {
     static SHOWING: Cell<bool> = const { Cell::new(false) };
 }
 
-struct Counting;
-
-impl Counting {
-    fn count(&self, what: &str, size: usize) {
-        ALL.fetch_add(1, Ordering::Relaxed);
-        if on_frame_path() && !SHOWING.get() {
-            COUNTED.fetch_add(1, Ordering::Relaxed);
-            if SHOWN.fetch_add(1, Ordering::Relaxed) < 3 {
-                SHOWING.set(true);
-                let trace = std::backtrace::Backtrace::force_capture();
-                eprintln!("{what} of {size} bytes on the frame path:\n{trace}");
-                drop(trace);
-                SHOWING.set(false);
-            }
+/// Touches atomics and thread-locals without destructors only; the trace is taken with counting switched off.
+fn watch(request: Request) {
+    ALL.fetch_add(1, Ordering::Relaxed);
+    if on_frame_path() && !SHOWING.get() {
+        COUNTED.fetch_add(1, Ordering::Relaxed);
+        if SHOWN.fetch_add(1, Ordering::Relaxed) < 3 {
+            SHOWING.set(true);
+            let trace = std::backtrace::Backtrace::force_capture();
+            eprintln!("{request:?} on the frame path:\n{trace}");
+            drop(trace);
+            SHOWING.set(false);
         }
     }
 }
 
-// SAFETY: every call goes to the system's allocator with the caller's arguments unchanged; counting touches atomics and
-// thread-locals without destructors only (the trace is taken with counting switched off).
-unsafe impl GlobalAlloc for Counting {
-    unsafe fn alloc(&self, layout: Layout) -> *mut u8 {
-        self.count("allocation", layout.size());
-        // SAFETY: the caller's duty, passed on.
-        unsafe { System.alloc(layout) }
-    }
-
-    unsafe fn dealloc(&self, ptr: *mut u8, layout: Layout) {
-        self.count("release", layout.size());
-        // SAFETY: the caller's duty, passed on.
-        unsafe { System.dealloc(ptr, layout) }
-    }
-
-    unsafe fn realloc(&self, ptr: *mut u8, layout: Layout, size: usize) -> *mut u8 {
-        self.count("reallocation", size);
-        // SAFETY: the caller's duty, passed on.
-        unsafe { System.realloc(ptr, layout, size) }
-    }
-}
-
 #[global_allocator]
-static ALLOCATOR: Counting = Counting;
+static ALLOCATOR: Counting = Counting::telling(watch);
 
 #[test]
 fn the_steady_state_allocates_nothing() {

@@ -6,10 +6,10 @@
 #![cfg(all(target_os = "linux", target_arch = "x86_64"))]
 #![allow(unsafe_code)]
 
+use counting_allocator::Counting;
 use dpm_host::pipeline::{on_frame_path, run_prepared, RunOptions};
 use dpm_host::telemetry::monitor::RunMonitor;
 use dpm_tests::rigs::demo_rig;
-use std::alloc::{GlobalAlloc, Layout, System};
 use std::sync::atomic::{AtomicI64, AtomicU64, Ordering};
 
 /// What a stage may ask of the kernel: to sleep, to be woken and to wake; the time, where it is not read without a call.
@@ -41,36 +41,12 @@ static FIRST: [AtomicI64; 8] = [const { AtomicI64::new(-1) }; 8];
 /// Allocations and releases on the frame path.
 static ALLOCATIONS: AtomicU64 = AtomicU64::new(0);
 
-struct Counting;
-
-fn count() {
+#[global_allocator]
+static ALLOCATOR: Counting = Counting::telling(|_| {
     if on_frame_path() {
         ALLOCATIONS.fetch_add(1, Ordering::Relaxed);
     }
-}
-
-// SAFETY: every call goes to the system's allocator with the caller's arguments unchanged; counting touches an atomic and a
-// thread-local without destructor only.
-unsafe impl GlobalAlloc for Counting {
-    unsafe fn alloc(&self, layout: Layout) -> *mut u8 {
-        count();
-        // SAFETY: the caller's duty, passed on.
-        unsafe { System.alloc(layout) }
-    }
-    unsafe fn dealloc(&self, pointer: *mut u8, layout: Layout) {
-        count();
-        // SAFETY: the caller's duty, passed on.
-        unsafe { System.dealloc(pointer, layout) }
-    }
-    unsafe fn realloc(&self, pointer: *mut u8, layout: Layout, size: usize) -> *mut u8 {
-        count();
-        // SAFETY: the caller's duty, passed on.
-        unsafe { System.realloc(pointer, layout, size) }
-    }
-}
-
-#[global_allocator]
-static ALLOCATOR: Counting = Counting;
+});
 
 // The one place from which the filter lets every call through: number and six arguments as a C function takes them.
 std::arch::global_asm!(
