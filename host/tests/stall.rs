@@ -2,8 +2,7 @@
 
 use dpm_device::planes::Raster;
 use dpm_host::config::{Overrides, RigConfig};
-use dpm_host::frame::Stage;
-use dpm_host::pipeline::{run_prepared, FrameRecord, RunOptions, Stall};
+use dpm_host::pipeline::{run_prepared, FrameRecord, RunOptions, Stall, StallIn};
 use dpm_host::rig::Rig;
 use dpm_host::telemetry::monitor::RunMonitor;
 use std::sync::Arc;
@@ -16,7 +15,7 @@ const SLOT_NS: i64 = 10_000_000;
 const STALL: Duration = Duration::from_millis(100);
 
 /// Frames lit after the stalled one, oldest first, and the stalled one's latch.
-fn run(stage: Stage, watchdog_ms: u32) -> Vec<FrameRecord> {
+fn run(stage: StallIn, watchdog_ms: u32) -> Vec<FrameRecord> {
     let set = |s: &str| s.to_owned();
     let flags = vec![
         set("real_time.pace=\"real\""),
@@ -56,7 +55,7 @@ fn holds(what: impl Fn() -> Result<(), String>) {
 
 #[test]
 fn a_stall_in_any_stage_leaves_no_backlog_two_frames_later() {
-    for stage in [Stage::Plan, Stage::Pack, Stage::Link] {
+    for stage in [StallIn::Plan, StallIn::Pack, StallIn::Link] {
         holds(|| {
             let after = run(stage, 1_000);
             let lost = FRAMES - STALLED - 1 - after.len() as u64;
@@ -74,11 +73,34 @@ fn a_stall_in_any_stage_leaves_no_backlog_two_frames_later() {
     }
 }
 
+/// Tracking stands still and the frames go on, each in its slot, with what is known. When it runs again, what the tracker has
+/// collected meanwhile is taken in at once: the next frame but one has a sample as new as ever.
+#[test]
+fn a_stall_of_tracking_delays_no_frame_and_leaves_no_old_sample_two_frames_later() {
+    holds(|| {
+        let after = run(StallIn::Tracking, 1_000);
+        if let Some(late) = after.iter().find(|r| !is_on_time(r)) {
+            return Err(format!("frame {} was delayed: {:?}", late.id.0, late.timeline));
+        }
+        let age = |r: &FrameRecord| r.timeline.latched_at.ns_since(r.timeline.captured_at);
+        let old: Vec<u64> = after.iter().filter(|r| age(r) > SLOT_NS).map(|r| r.id.0).collect();
+        // It begins within the frame after the one that sets it off, and lasts ten slots.
+        let (Some(&first), Some(&last)) = (old.first(), old.last()) else {
+            return Err("no frame was without new samples".to_owned());
+        };
+        let slots = STALL.as_nanos() as u64 / SLOT_NS as u64;
+        let bound = slots - 3..=slots + 1;
+        (first <= STALLED + 2 && bound.contains(&(last - first + 1)))
+            .then_some(())
+            .ok_or_else(|| format!("old samples in the frames {old:?}"))
+    });
+}
+
 /// The device's watchdog bites during the stall of the link: light comes back by itself, and stays in time.
 #[test]
 fn light_comes_back_after_a_silence_longer_than_the_watchdog() {
     holds(|| {
-        let after = run(Stage::Link, 50);
+        let after = run(StallIn::Link, 50);
         let on_time = after.iter().filter(|r| is_on_time(r)).count();
         // Arming takes a slot or two; half of what is left of the run is far more than that costs.
         let enough = on_time as u64 > (FRAMES - STALLED) / 2;

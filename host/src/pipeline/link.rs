@@ -3,6 +3,7 @@
 use super::job::{Fate, FrameJob, FrameMemory, FrameNote};
 use super::keeper::{is_dark, LinkKeeper, ProjectorReport};
 use super::light::LightRecorder;
+use super::outcome::StallIn;
 use super::rights::Rights;
 use super::threads::{enter_frame_path, is_overtaken, pop_within, Shared, WARM_UP_FRAMES};
 use crate::clock::{Clock, RunClock, Stopwatch};
@@ -89,7 +90,7 @@ pub(super) fn link_thread(
         };
         // Getting a lost medium back allocates; the rig is dark then.
         enter_frame_path(job.note.id.0 >= WARM_UP_FRAMES && line.link.state() == LinkState::Streaming);
-        shared.may_stall(Stage::Link, job.note.id.0);
+        shared.may_stall(StallIn::Link, job.note.id.0);
         let now = if shared.is_virtual() { job.note.timeline.sent_at } else { shared.clock.now() };
         last = now;
         line.cable.live(now);

@@ -29,7 +29,7 @@ mod threads;
 pub use collect::FrameRecord;
 pub use connect::{connect, ConnectError, ENDED_WITH_THE_LAST_RUN};
 pub use keeper::ProjectorReport;
-pub use outcome::{PipelineError, RunOptions, RunOutcome, Stall};
+pub use outcome::{PipelineError, RunOptions, RunOutcome, Stall, StallIn};
 pub use run::{output, renderer_settings, run, run_prepared};
 pub use status_light::DeviceCounts;
 pub use threads::on_frame_path;

@@ -3,7 +3,6 @@
 use super::collect::FrameRecord;
 use super::connect::ConnectError;
 use super::light::LightFrame;
-use crate::frame::Stage;
 use crate::gpu::GpuError;
 use crate::realtime::standstill::Standstills;
 use crate::render::RenderError;
@@ -13,12 +12,25 @@ use crate::telemetry::report::Report;
 use crate::telemetry::slots::SlotCounts;
 use crate::telemetry::trace::TracedFrame;
 
+/// A thread of the host that a test may let stand still.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum StallIn {
+    /// Samples into tracks.
+    Tracking,
+    /// Tracks into the poses of a frame.
+    Plan,
+    /// Code values into bit planes; where there is a GPU, waiting for it too.
+    Pack,
+    /// Bit planes to the transport.
+    Link,
+}
+
 /// A stage that stands still once: for tests of what is left afterwards.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Stall {
-    /// Plan, pack or link.
-    pub stage: Stage,
-    /// Before it works on this frame.
+    /// Where.
+    pub stage: StallIn,
+    /// Before it works on this frame; tracking, which knows no frames: as soon as this one is planned.
     pub frame: u64,
     /// For this long.
     pub length: std::time::Duration,

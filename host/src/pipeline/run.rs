@@ -142,6 +142,7 @@ fn run_from(
             typical_ns: AtomicI64::new(lead.typical_ns()),
             travel_ns: AtomicI64::new(0),
             budget_milli: AtomicU64::new(u64::from(config.render.spp) * 1000),
+            planning: AtomicU64::new(0),
             tracking_over: AtomicBool::new(false),
             error: Mutex::new(None),
             monitor,

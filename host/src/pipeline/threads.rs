@@ -5,7 +5,7 @@ use super::job::{Fate, FrameJob, FrameMemory, FrameNote};
 use super::keeper::{LinkKeeper, ProjectorReport};
 use super::light::{LightNote, LightRecorder};
 use super::link::{link_thread, Cable, Line};
-use super::outcome::{PipelineError, RunOptions};
+use super::outcome::{PipelineError, RunOptions, StallIn};
 use super::prepared::PreparedFrames;
 use super::rights::Rights;
 use super::stages::{self, LinkTime, TrackSnapshot, TrackingStage};
@@ -80,6 +80,8 @@ pub(super) struct Shared<'a> {
     pub(super) travel_ns: AtomicI64,
     /// Thousandths of a sample that a pixel gets on average.
     pub(super) budget_milli: AtomicU64,
+    /// The frame that is being planned.
+    pub(super) planning: AtomicU64,
     pub(super) tracking_over: AtomicBool,
     pub(super) error: Mutex<Option<PipelineError>>,
     pub(super) monitor: &'a RunMonitor,
@@ -96,7 +98,7 @@ impl Shared<'_> {
     }
 
     /// Stands still where the run's options say so.
-    pub(super) fn may_stall(&self, stage: Stage, frame: u64) {
+    pub(super) fn may_stall(&self, stage: StallIn, frame: u64) {
         if let Some(stall) = self.options.stall.filter(|s| (s.stage, s.frame) == (stage, frame)) {
             std::thread::sleep(stall.length);
         }
@@ -228,7 +230,14 @@ fn tracking_thread(shared: &Shared<'_>, mut stage: TrackingStage, mut latest: Pu
     let _ = shared.tracking.set(std::thread::current());
     let mut heard_to = i64::MIN;
     let mut steps = 0u32;
+    let mut planned = 0;
     while !shared.tracking_over.load(Ordering::Acquire) {
+        // Each frame once, also those that were planned while this thread slept.
+        let planning = shared.planning.load(Ordering::Relaxed);
+        while planned < planning {
+            planned += 1;
+            shared.may_stall(StallIn::Tracking, planned);
+        }
         let now = if shared.is_virtual() {
             let wanted = shared.listen_to.load(Ordering::Acquire);
             if wanted == heard_to {
@@ -286,7 +295,8 @@ fn plan_thread(
         }
         let Some(note) = pop_within(&mut notes, WAIT_NS) else { continue };
         let Some(memory) = hottest.pop() else { continue };
-        shared.may_stall(Stage::Plan, id);
+        shared.planning.store(id, Ordering::Relaxed);
+        shared.may_stall(StallIn::Plan, id);
         let mut job = FrameJob { note, memory };
         job.note.waited_for_memory = waited;
         let travel =
@@ -360,7 +370,7 @@ fn pack_thread(
     while let Some(mut job) = next(&mut jobs) {
         let id = job.note.id.0;
         enter_frame_path(id >= WARM_UP_FRAMES);
-        shared.may_stall(Stage::Pack, id);
+        shared.may_stall(StallIn::Pack, id);
         let limit = if id == 0 { FIRST_FRAME_TIMEOUT_NS } else { GPU_TIMEOUT_NS };
         if let Err(source) = stages::finish(&mut job, limit) {
             shared.fail(PipelineError::Gpu { frame: id, source });
