@@ -27,6 +27,9 @@ pub enum MotionSpec {
         /// Acceleration in the turns, m/s^2, above 0. Default 20.
         #[serde(default = "acceleration")]
         acceleration_m_s2: f64,
+        /// Time at rest in the middle of each turn, seconds, 0 or more. Default 0.
+        #[serde(default)]
+        rest_s: f64,
     },
     /// `amplitude * sin(w t)` along `direction`, given by its peaks: amplitude = speed^2 / acceleration, w = acceleration / speed.
     Sinusoid {
@@ -112,6 +115,7 @@ impl MotionSpec {
             speed_m_s: one(),
             amplitude_m: amplitude(),
             acceleration_m_s2: acceleration(),
+            rest_s: 0.0,
         }
     }
 }
@@ -185,8 +189,8 @@ pub struct Motion {
 /// One elementary motion with its period in whole nanoseconds.
 #[derive(Clone, Copy, Debug, PartialEq)]
 enum Part {
-    /// Two stretches of twice `half_stretch_ns` joined by turns of `turn_ns`.
-    Line { direction: [f64; 3], speed: f64, half_stretch_ns: i64, turn_ns: i64 },
+    /// Two stretches of twice `half_stretch_ns` joined by turns of `turn_ns`, at rest for `rest_ns` in the middle of each.
+    Line { direction: [f64; 3], speed: f64, half_stretch_ns: i64, turn_ns: i64, rest_ns: i64 },
     /// `amplitude * sin(2 pi t / period)`.
     Wave { direction: [f64; 3], amplitude: f64, period_ns: i64 },
     /// `2 pi t / period` about an axis through `pivot`; `sense` is 1 or -1.
@@ -254,8 +258,8 @@ impl Motion {
 fn add_part(spec: &MotionSpec, rest: &Pose, parts: &mut Vec<Part>) -> Result<(), MotionError> {
     match *spec {
         MotionSpec::Still => {}
-        MotionSpec::Translate { direction, speed_m_s, amplitude_m, acceleration_m_s2 } => {
-            parts.push(line(direction, speed_m_s, amplitude_m, acceleration_m_s2, "direction")?);
+        MotionSpec::Translate { direction, speed_m_s, amplitude_m, acceleration_m_s2, rest_s } => {
+            parts.push(line(direction, speed_m_s, amplitude_m, acceleration_m_s2, rest_s, "direction")?);
         }
         MotionSpec::Sinusoid { direction, peak_speed_m_s, peak_acceleration_m_s2 } => {
             let direction = unit3("direction", direction)?;
@@ -280,7 +284,7 @@ fn add_part(spec: &MotionSpec, rest: &Pose, parts: &mut Vec<Part>) -> Result<(),
         }
         MotionSpec::Screw { axis, rate_rad_s, speed_m_s, amplitude_m, acceleration_m_s2 } => {
             turn(axis, rate_rad_s, rest.position_m, parts)?;
-            parts.push(line(axis, speed_m_s, amplitude_m, acceleration_m_s2, "axis")?);
+            parts.push(line(axis, speed_m_s, amplitude_m, acceleration_m_s2, 0.0, "axis")?);
         }
         MotionSpec::Together { .. } => return Err(MotionError::Parts),
     }
@@ -292,12 +296,16 @@ fn line(
     speed: f64,
     amplitude: f64,
     acceleration: f64,
+    rest_s: f64,
     field: &'static str,
 ) -> Result<Part, MotionError> {
     let direction = unit3(field, direction)?;
     let speed = positive("speed_m_s", speed)?;
     let amplitude = positive("amplitude_m", amplitude)?;
     let acceleration = positive("acceleration_m_s2", acceleration)?;
+    if !(rest_s >= 0.0 && rest_s.is_finite()) {
+        return Err(MotionError::OutOfRange { field: "rest_s", value: rest_s, rule: "0 or more" });
+    }
     // Half of a turn slows from full speed to zero: distance speed^2 / (2 acceleration) beyond the stretch's end.
     let turn_depth = speed * speed / (2.0 * acceleration);
     if turn_depth > amplitude {
@@ -310,10 +318,11 @@ fn line(
     }
     let stretch_s = 2.0 * (amplitude - turn_depth) / speed;
     let turn_s = 2.0 * speed / acceleration;
-    whole_period(2.0 * (stretch_s + turn_s))?;
+    whole_period(2.0 * (stretch_s + turn_s + rest_s))?;
     // Whole nanoseconds for each piece keep position and speed continuous for ever; the amplitude moves by less than 1 nm per m/s.
     let turn_ns = ((turn_s * 1e9).round() as i64).max(2);
-    Ok(Part::Line { direction, speed, half_stretch_ns: (stretch_s * 0.5e9).round() as i64, turn_ns })
+    let half_stretch_ns = (stretch_s * 0.5e9).round() as i64;
+    Ok(Part::Line { direction, speed, half_stretch_ns, turn_ns, rest_ns: (rest_s * 1e9).round() as i64 })
 }
 
 fn turn(axis: [f64; 3], rate: f64, pivot: [f64; 3], parts: &mut Vec<Part>) -> Result<(), MotionError> {
@@ -332,8 +341,8 @@ impl Part {
     /// Moves `pose` and `twist`, the state after the parts before this one.
     fn apply(&self, t_ns: i64, pose: &mut Pose, twist: &mut Twist) {
         match *self {
-            Part::Line { direction, speed, half_stretch_ns, turn_ns } => {
-                let (s, v) = line_at(t_ns, speed, half_stretch_ns, turn_ns);
+            Part::Line { direction, speed, half_stretch_ns, turn_ns, rest_ns } => {
+                let (s, v) = line_at(t_ns, speed, half_stretch_ns, turn_ns, rest_ns);
                 pose.position_m = add(pose.position_m, scale(direction, s));
                 twist.linear_m_s = add(twist.linear_m_s, scale(direction, v));
             }
@@ -369,8 +378,8 @@ fn phase(t_ns: i64, period_ns: i64) -> (f64, f64, f64) {
 }
 
 /// Position and speed on the line. One cycle from its middle: half a stretch, a turn, a stretch back, a turn, half a stretch.
-fn line_at(t_ns: i64, speed: f64, half_stretch_ns: i64, turn_ns: i64) -> (f64, f64) {
-    let half_cycle = 2 * half_stretch_ns + turn_ns;
+fn line_at(t_ns: i64, speed: f64, half_stretch_ns: i64, turn_ns: i64, rest_ns: i64) -> (f64, f64) {
+    let half_cycle = 2 * half_stretch_ns + turn_ns + rest_ns;
     let t = (t_ns.rem_euclid(2 * half_cycle) + half_stretch_ns) % (2 * half_cycle);
     // The second half of the cycle mirrors the first: s(t + half_cycle) = -s(t).
     let (t, sign) = if t < half_cycle { (t, 1.0) } else { (t - half_cycle, -1.0) };
@@ -378,7 +387,14 @@ fn line_at(t_ns: i64, speed: f64, half_stretch_ns: i64, turn_ns: i64) -> (f64, f
     if u <= half_stretch_ns {
         (sign * speed * u as f64 * 1e-9, sign * speed)
     } else {
-        let x = (u - half_stretch_ns) as f64 * 1e-9;
+        // The rest takes no part in the turn: before it the first half, after it the second.
+        let turned_ns = u - half_stretch_ns;
+        let turned_ns = turned_ns.min((turn_ns / 2).max(turned_ns - rest_ns));
+        if rest_ns > 0 && turned_ns == turn_ns / 2 {
+            let s = speed * (half_stretch_ns as f64 + 0.25 * turn_ns as f64) * 1e-9;
+            return (sign * s, 0.0);
+        }
+        let x = turned_ns as f64 * 1e-9;
         let turn_s = turn_ns as f64 * 1e-9;
         let s = speed * half_stretch_ns as f64 * 1e-9 + speed * x * (1.0 - x / turn_s);
         (sign * s, sign * speed * (1.0 - 2.0 * x / turn_s))

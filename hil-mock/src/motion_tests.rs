@@ -158,6 +158,7 @@ fn nonsense_is_named() {
         speed_m_s,
         amplitude_m,
         acceleration_m_s2,
+        rest_s: 0.0,
     };
     assert!(bad(&translate(f64::NAN, 1.0, 1.0)).contains("speed_m_s"));
     assert!(bad(&translate(1.0, -1.0, 1.0)).contains("amplitude_m"));
@@ -174,6 +175,37 @@ fn nonsense_is_named() {
     assert!(bad(&nested).contains("parts"));
     let crooked = Pose { rotation_xyzw: [0.0, 0.0, 0.0, 2.0], ..Pose::IDENTITY };
     assert!(Motion::new(&MotionSpec::Still, crooked).is_err());
+}
+
+/// 0.5 m/s and 5 m/s^2 within 0.15 m of the centre, at rest for 0.3 s at either end: stretches of 0.4 s, braking of 0.1 s.
+#[test]
+fn a_turn_may_rest_in_its_middle() {
+    let spec = |rest_s| MotionSpec::Translate {
+        direction: [1.0, 0.0, 0.0],
+        speed_m_s: 0.5,
+        amplitude_m: 0.125,
+        acceleration_m_s2: 5.0,
+        rest_s,
+    };
+    let motion = Motion::new(&spec(0.3), Pose::IDENTITY).unwrap();
+    let x = |ms: i64| motion.pose_at(ms * 1_000_000).position_m[0];
+    let v = |ms: i64| motion.twist_at(ms * 1_000_000).linear_m_s[0];
+    for (at_ms, place, speed) in
+        [(0, 0.0, 0.5), (200, 0.1, 0.5), (300, 0.125, 0.0), (450, 0.125, 0.0), (600, 0.125, 0.0), (700, 0.1, -0.5)]
+    {
+        for (t, sign) in [(at_ms, 1.0), (at_ms + 900, -1.0), (at_ms + 1800, 1.0), (at_ms - 900, -1.0)] {
+            assert!((x(t) - sign * place).abs() < 1e-12, "{} at {t} ms", x(t));
+            assert!((v(t) - sign * speed).abs() < 1e-8, "{} at {t} ms", v(t));
+        }
+    }
+    assert!(x(650) < 0.125 && x(650) > 0.1 && v(650) < -0.2);
+    let without = Motion::new(&spec(0.0), Pose::IDENTITY).unwrap();
+    assert_eq!(without.pose_at(600_000_000).position_m[0], without.pose_at(0).position_m[0]);
+    assert!(matches!(
+        Motion::new(&spec(-1.0), Pose::IDENTITY),
+        Err(MotionError::OutOfRange { field: "rest_s", .. })
+    ));
+    assert!(Motion::new(&spec(f64::NAN), Pose::IDENTITY).is_err());
 }
 
 #[test]

@@ -135,6 +135,7 @@ fn main() -> Result<(), Box<dyn std::error::Error>> {
                 speed_m_s: SPEED,
                 amplitude_m: amplitude,
                 acceleration_m_s2: ACCELERATION,
+                rest_s: 0.0,
             },
             Pose::IDENTITY,
         )?;

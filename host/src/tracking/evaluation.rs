@@ -147,11 +147,20 @@ pub struct PredictionCase {
 
 /// The motions of the table.
 pub fn prediction_cases() -> Vec<PredictionCase> {
-    let shuttle = |speed_m_s, acceleration_m_s2, amplitude_m| MotionSpec::Translate {
+    let resting = |speed_m_s, acceleration_m_s2, amplitude_m, rest_s| MotionSpec::Translate {
         direction: [1.0, 0.0, 0.0],
         speed_m_s,
         amplitude_m,
         acceleration_m_s2,
+        rest_s,
+    };
+    let shuttle = |speed_m_s, acceleration_m_s2, amplitude_m| {
+        resting(speed_m_s, acceleration_m_s2, amplitude_m, 0.0)
+    };
+    let circle = |rate_rad_s, radius_m| MotionSpec::Rotate {
+        axis: [0.0, 1.0, 0.0],
+        rate_rad_s,
+        pivot_offset_m: [radius_m, 0.0, 0.0],
     };
     let sine = |direction, peak_speed_m_s, peak_acceleration_m_s2| MotionSpec::Sinusoid {
         direction,
@@ -174,14 +183,18 @@ pub fn prediction_cases() -> Vec<PredictionCase> {
     vec![
         case("at rest", MotionSpec::Still, 0.15, 1e-6),
         case("1 m/s, steady", shuttle(1.0, 20.0, 25.0), 0.15, 1e-4),
-        case("0.5 m/s there and back, 5 m/s2, 0.3 m", shuttle(0.5, 5.0, 0.15), 0.42, 0.03),
-        case("0.5 m/s there and back, 5 m/s2, 1 m", shuttle(0.5, 5.0, 0.5), 0.30, 0.02),
+        case("0.5 m/s there and back, 5 m/s2, 0.1 m", shuttle(0.5, 5.0, 0.05), 0.20, 0.04),
+        case("0.5 m/s there and back, 5 m/s2, 0.3 m", shuttle(0.5, 5.0, 0.15), 0.20, 0.02),
+        case("0.5 m/s there and back, 5 m/s2, 1 m", shuttle(0.5, 5.0, 0.5), 0.20, 0.01),
+        case("the same, 0.3 m, at rest for 0.2 s at each end", resting(0.5, 5.0, 0.15, 0.2), 0.25, 0.03),
+        case("circle, 0.5 m/s and 5 m/s2", circle(10.0, 0.05), 0.20, 0.005),
         case("sine, 0.5 m/s and 5 m/s2 at its peaks", sine([1.0, 0.0, 0.0], 0.5, 5.0), 0.20, 0.005),
-        case("the same along a diagonal", sine([1.0, 1.0, 1.0], 0.5, 5.0), 0.25, 0.005),
-        case("sine, 0.35 m/s and 5 m/s2", sine([1.0, 0.0, 0.0], 0.35, 5.0), 0.36, 0.03),
-        case("sine, 0.8 m/s and 5 m/s2", sine([1.0, 0.0, 0.0], 0.8, 5.0), 0.30, 0.01),
-        case("1 m/s there and back, 20 m/s2, 0.3 m (demo)", shuttle(1.0, 20.0, 0.15), 1.15, 0.36),
-        case("1 m/s there and back, 50 m/s2, 0.3 m", shuttle(1.0, 50.0, 0.15), 2.4, 0.8),
+        case("the same along a diagonal", sine([1.0, 1.0, 1.0], 0.5, 5.0), 0.20, 0.005),
+        case("sine, 0.35 m/s and 5 m/s2", sine([1.0, 0.0, 0.0], 0.35, 5.0), 0.20, 0.03),
+        case("sine, 0.8 m/s and 5 m/s2", sine([1.0, 0.0, 0.0], 0.8, 5.0), 0.20, 0.01),
+        case("1 m/s there and back, 8 m/s2, 0.26 m (demo)", shuttle(1.0, 8.0, 0.13), 0.25, 0.06),
+        case("1 m/s there and back, 20 m/s2, 0.3 m", shuttle(1.0, 20.0, 0.15), 0.40, 0.20),
+        case("1 m/s there and back, 50 m/s2, 0.3 m", shuttle(1.0, 50.0, 0.15), 0.45, 0.8),
         turn(
             "half a turn a second",
             MotionSpec::Rotate { axis: up, rate_rad_s: std::f64::consts::PI, pivot_offset_m: [0.0; 3] },
@@ -197,7 +210,7 @@ pub fn prediction_cases() -> Vec<PredictionCase> {
         turn(
             "sway, 3 rad/s and 20 rad/s2 at its peaks",
             MotionSpec::Sway { axis: up, peak_rate_rad_s: 3.0, peak_acceleration_rad_s2: 20.0 },
-            2.5,
+            1.7,
             0.03,
         ),
     ]

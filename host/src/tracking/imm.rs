@@ -14,6 +14,8 @@ use glam::{DQuat, DVec3};
 pub trait Chart {
     /// A point on it.
     type Point: Copy + std::fmt::Debug + PartialEq;
+    /// Tangents up to this length add up like vectors, nearly enough to fit curves to.
+    const FLAT: f64;
     /// The tangent that leads from `from` to `to`.
     fn between(from: Self::Point, to: Self::Point) -> DVec3;
     /// The point reached from `from` along a tangent.
@@ -26,6 +28,7 @@ pub struct Translations;
 
 impl Chart for Translations {
     type Point = DVec3;
+    const FLAT: f64 = f64::INFINITY;
     fn between(from: DVec3, to: DVec3) -> DVec3 {
         to - from
     }
@@ -40,6 +43,7 @@ pub struct Rotations;
 
 impl Chart for Rotations {
     type Point = DQuat;
+    const FLAT: f64 = 1.0;
     fn between(from: DQuat, to: DQuat) -> DVec3 {
         so3_between(from, to)
     }
@@ -238,8 +242,32 @@ impl<P: Copy> Kinematics<P> {
     }
 }
 
+/// What a body did the last time that it came by here, over one step ([`super::recall`]).
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Recalled {
+    /// Where it went beyond what its velocity at the step's begin makes, m or rad.
+    pub moved: DVec3,
+    /// How much faster it became, per second.
+    pub faster: DVec3,
+    /// Its mean acceleration over the horizon after the step, per second squared.
+    pub acceleration: DVec3,
+    /// Axes along which there is any acceleration near by. Along the others the models know better, without the past's noise.
+    pub matters: [bool; 3],
+}
+
+/// One axis of [`Recalled`].
+#[derive(Clone, Copy, Debug)]
+struct RecalledAxis {
+    moved: f64,
+    faster: f64,
+    acceleration: f64,
+}
+
 /// Number of filters in a bank.
-pub const MODES: usize = 4;
+pub const MODES: usize = 5;
+/// The filter that moves on as the body did the last time; its model says how exactly it repeats itself. It takes part only
+/// while something is recalled.
+pub const RECALLED: usize = 4;
 
 /// What a bank assumes of motion in general.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -250,6 +278,8 @@ pub struct ImmConfig {
     pub dwell_s: [f64; MODES],
     /// Of those who leave mode i, the share that goes to mode j; rows sum to 1, the diagonal is 0.
     pub leave_to: [[f64; MODES]; MODES],
+    /// While something is recalled: mean time after which any mode leaves for [`RECALLED`], seconds.
+    pub recall_after_s: f64,
     /// Standard deviation of the acceleration that a coasting body may start with, m/s^2 or rad/s^2.
     pub onset_acceleration: f64,
     /// Standard deviation of the velocity before anything is known, m/s or rad/s.
@@ -287,8 +317,15 @@ impl AxisBank {
             },
             ..AxisMode::default()
         });
-        Self { modes, probability: [1.0 / MODES as f64; MODES] }
+        Self { modes, probability: Self::UNKNOWN }
     }
+
+    /// The same for all but [`RECALLED`].
+    const UNKNOWN: [f64; MODES] = {
+        let mut all = [1.0 / (MODES - 1) as f64; MODES];
+        all[RECALLED] = 0.0;
+        all
+    };
 
     /// Moment-matched mean and covariance of weighted modes.
     fn mixture(modes: &[AxisMode; MODES], weight: &[f64; MODES]) -> AxisMode {
@@ -307,8 +344,22 @@ impl AxisBank {
         mean
     }
 
+    /// Share of mode `i` that is in mode `j` after `h` seconds.
+    fn share(config: &ImmConfig, h: f64, i: usize, j: usize, recalls: bool) -> f64 {
+        if i == RECALLED && !recalls {
+            return config.leave_to[i][j];
+        }
+        let stays = (-h / config.dwell_s[i]).exp();
+        let among = if i == j { stays } else { (1.0 - stays) * config.leave_to[i][j] };
+        match (recalls && i != RECALLED, (-h / config.recall_after_s).exp()) {
+            (true, stays) if j == RECALLED => 1.0 - stays,
+            (true, stays) => among * stays,
+            (false, _) => among,
+        }
+    }
+
     /// Mixes the modes and moves all of them `h` >= 0 seconds on.
-    fn advance(&mut self, config: &ImmConfig, h: f64) {
+    fn advance(&mut self, config: &ImmConfig, h: f64, recalled: Option<RecalledAxis>) {
         let mut moved = self.modes;
         let mut foretold = [0.0; MODES];
         // A coasting mode knows nothing of the acceleration that a turn starts with; its zero is not knowledge.
@@ -320,9 +371,7 @@ impl AxisBank {
         }
         for (j, model) in config.models.iter().enumerate() {
             let mut weight: [f64; MODES] = std::array::from_fn(|i| {
-                let stays = (-h / config.dwell_s[i]).exp();
-                let share = if i == j { stays } else { (1.0 - stays) * config.leave_to[i][j] };
-                share * self.probability[i]
+                Self::share(config, h, i, j, recalled.is_some()) * self.probability[i]
             });
             foretold[j] = weight.iter().sum();
             let mode = &mut moved[j];
@@ -335,6 +384,11 @@ impl AxisBank {
             mode.offset += f.p[1] * v + f.p[2] * a;
             mode.velocity = f.v[1] * v + f.v[2] * a;
             mode.acceleration = f.a[1] * v + f.a[2] * a;
+            if let (RECALLED, Some(recalled)) = (j, recalled) {
+                mode.offset += recalled.moved;
+                mode.velocity += recalled.faster;
+                mode.acceleration = recalled.acceleration;
+            }
             mode.covariance = mode.covariance.propagated(&f);
             mode.covariance.add_scaled(&model.process_noise(h), 1.0);
         }
@@ -355,16 +409,17 @@ impl AxisBank {
             mode.velocity += innovation * kv;
             mode.acceleration += innovation * ka;
         }
-        let best = log_likelihood.iter().copied().fold(f64::NEG_INFINITY, f64::max);
+        let possible = log_likelihood.iter().zip(&self.probability).filter(|(_, p)| **p > 0.0);
+        let best = possible.map(|(l, _)| *l).fold(f64::NEG_INFINITY, f64::max);
         let mut total = 0.0;
         for (p, log_l) in self.probability.iter_mut().zip(log_likelihood) {
-            *p *= (log_l - best).exp();
+            *p = if *p > 0.0 { *p * (log_l - best).exp() } else { 0.0 };
             total += *p;
         }
         if total > 0.0 && total.is_finite() {
             self.probability.iter_mut().for_each(|p| *p /= total);
         } else {
-            self.probability = [1.0 / MODES as f64; MODES];
+            self.probability = Self::UNKNOWN;
         }
     }
 }
@@ -413,9 +468,16 @@ impl<C: Chart> Imm<C> {
         self.base = C::moved(self.base, DVec3::from_array(mean));
     }
 
-    /// Mixes the modes and moves all of them `h` >= 0 seconds on.
-    pub fn advance(&mut self, config: &ImmConfig, h: f64) {
-        self.axes.iter_mut().for_each(|axis| axis.advance(config, h));
+    /// Mixes the modes and moves all of them `h` >= 0 seconds on, [`RECALLED`] as in `recalled`.
+    pub fn advance(&mut self, config: &ImmConfig, h: f64, recalled: Option<Recalled>) {
+        for (i, axis) in self.axes.iter_mut().enumerate() {
+            let along = recalled.filter(|r| r.matters[i]).map(|r| RecalledAxis {
+                moved: r.moved[i],
+                faster: r.faster[i],
+                acceleration: r.acceleration[i],
+            });
+            axis.advance(config, h, along);
+        }
         self.rebase();
     }
 
@@ -428,7 +490,8 @@ impl<C: Chart> Imm<C> {
                 let d = z - m.offset;
                 d * d / (m.covariance.pp + r + slack * slack).max(f64::MIN_POSITIVE)
             };
-            bank.modes.iter().map(distance).fold(f64::INFINITY, f64::min)
+            let possible = bank.modes.iter().zip(bank.probability).filter(|(_, p)| *p > 0.0);
+            possible.map(|(m, _)| distance(m)).fold(f64::INFINITY, f64::min)
         };
         self.axes.iter().zip(z).map(axis).sum()
     }

@@ -1,7 +1,7 @@
 //! Tracker samples into the pose of each body at the instant its light will fall.
 //!
 //! [`pose_filter`] judges and filters the samples of one body, [`state`] is its result as plain data and predicts,
-//! [`bank`] keeps one filter a body. [`imm`] and [`noise`] are the estimators inside. [`evaluation`] measures it all against
+//! [`bank`] keeps one filter a body. [`imm`], [`noise`] and [`recall`] (from smoothed samples) are the estimators inside. [`evaluation`] measures it all against
 //! closed-form motion. No sample is used before it arrived; everything is f64; time is integer nanoseconds.
 
 pub mod bank;
@@ -9,6 +9,8 @@ pub mod evaluation;
 pub mod imm;
 pub mod noise;
 pub mod pose_filter;
+pub mod recall;
+mod smooth;
 pub mod source;
 pub mod state;
 

@@ -6,6 +6,7 @@
 
 use super::imm::{Imm, ImmConfig, Kinematics, MotionModel, Rotations, Translations};
 use super::noise::NoiseEstimator;
+use super::recall::Recall;
 use super::state::{Freshness, PosePrediction, TrackState};
 use crate::config::PredictionConfig;
 use crate::geometry::se3::so3_between;
@@ -83,8 +84,8 @@ impl Default for PoseFilterConfig {
 }
 
 /// Models for bodies whose turns take about `acceleration` (m/s^2 or rad/s^2) and whose velocity changes in a good part of a
-/// second: coasting; steady acceleration; swinging at a hand's or a rocker's pace; and a sharp manoeuvre, which bridges
-/// the onset of a turn. The numbers were found by a random search over shuttles and swings of 1 to 3 Hz with 0.1 mm of noise at 500 Hz
+/// second: coasting; steady acceleration; swinging at a hand's or a rocker's pace; a sharp manoeuvre, which bridges
+/// the onset of a turn; and what the body did the last time. The numbers were found by a random search over shuttles and swings of 1 to 3 Hz with 0.1 mm of noise at 500 Hz
 /// (the table in `docs/LATENCY.md`); densities scale with the square of the acceleration.
 pub fn models_for(acceleration: f64) -> ImmConfig {
     let a2 = acceleration * acceleration;
@@ -95,14 +96,17 @@ pub fn models_for(acceleration: f64) -> ImmConfig {
             model(true, 0.0, 0.012 * a2),
             model(true, 10.0, 0.0017 * a2),
             model(true, 0.0, 28.0 * a2),
+            model(false, 0.0, 1e-5 * a2),
         ],
-        dwell_s: [1.0, 0.07, 1.0, 0.03],
+        dwell_s: [1.0, 0.07, 1.0, 0.03, 1.5],
         leave_to: [
-            [0.0, 0.02, 0.94, 0.04],
-            [0.54, 0.0, 0.01, 0.45],
-            [0.24, 0.01, 0.0, 0.75],
-            [0.05, 0.8, 0.15, 0.0],
+            [0.0, 0.02, 0.94, 0.04, 0.0],
+            [0.54, 0.0, 0.01, 0.45, 0.0],
+            [0.24, 0.01, 0.0, 0.75, 0.0],
+            [0.05, 0.8, 0.15, 0.0, 0.0],
+            [0.85, 0.05, 0.05, 0.05, 0.0],
         ],
+        recall_after_s: 0.03,
         onset_acceleration: 0.83 * acceleration,
         initial_velocity: 4.0 * acceleration,
     }
@@ -213,7 +217,7 @@ struct Track {
     moved_before_repeats: bool,
 }
 
-/// Follows one body. Neither allocates nor blocks; one update costs a few microseconds at most.
+/// Follows one body. Allocates once and never blocks; one update costs a few microseconds, with a new point of the past ten more.
 #[derive(Clone, Debug)]
 pub struct PoseFilter {
     config: PoseFilterConfig,
@@ -221,6 +225,8 @@ pub struct PoseFilter {
     candidates: [Option<Measured>; ACQUIRE_SAMPLES],
     position_noise: NoiseEstimator<Translations>,
     rotation_noise: NoiseEstimator<Rotations>,
+    position_recall: Recall<Translations>,
+    rotation_recall: Recall<Rotations>,
     counters: PoseFilterCounters,
     last_nis: Option<[f64; 2]>,
 }
@@ -234,6 +240,8 @@ impl PoseFilter {
             candidates: [None; ACQUIRE_SAMPLES],
             position_noise: NoiseEstimator::new(config.position_noise_m, 1e-6),
             rotation_noise: NoiseEstimator::new(config.rotation_noise_rad, 1e-6),
+            position_recall: Recall::new(),
+            rotation_recall: Recall::new(),
             counters: PoseFilterCounters::default(),
             last_nis: None,
         }
@@ -324,8 +332,9 @@ impl PoseFilter {
                 let h = gap_ns as f64 * 1e-9;
                 let mut position = track.position;
                 let mut rotation = track.rotation;
-                position.advance(&c.position_models, h);
-                rotation.advance(&c.rotation_models, h);
+                let (from_ns, to_ns) = (track.newest.at.0, z.at.0);
+                position.advance(&c.position_models, h, self.position_recall.between(from_ns, to_ns));
+                rotation.advance(&c.rotation_models, h, self.rotation_recall.between(from_ns, to_ns));
                 // What the strongest believable acceleration could do unseen counts as two standard deviations.
                 let slack = 0.25 * h * h;
                 let gate = c.gate_sigmas * c.gate_sigmas;
@@ -340,6 +349,9 @@ impl PoseFilter {
                     self.candidates = [None; ACQUIRE_SAMPLES];
                     self.position_noise.push(z.at.0, z.position);
                     self.rotation_noise.push(z.at.0, z.rotation);
+                    let (p, r) = (position.combined(), rotation.combined());
+                    self.position_recall.push(to_ns, z.position, p.point, p.velocity, rp.sqrt());
+                    self.rotation_recall.push(to_ns, z.rotation, r.point, r.velocity, rr.sqrt());
                     return track.accept(z, c.stuck_after);
                 }
             }
@@ -371,11 +383,13 @@ impl PoseFilter {
         let mut rotation = Imm::new(&c.rotation_models, first.rotation, rr);
         self.position_noise.break_track();
         self.rotation_noise.break_track();
+        self.position_recall.break_track();
+        self.rotation_recall.break_track();
         let mut before = first;
         for z in rest.into_iter().flatten() {
             let h = z.at.ns_since(before.at) as f64 * 1e-9;
-            position.advance(&c.position_models, h);
-            rotation.advance(&c.rotation_models, h);
+            position.advance(&c.position_models, h, None);
+            rotation.advance(&c.rotation_models, h, None);
             position.update(z.position, rp);
             rotation.update(z.rotation, rr);
             before = z;

@@ -317,7 +317,7 @@ fn covariances_stay_positive_for_stiff_numbers() {
         let mut bank = Imm::<Translations>::new(&models, DVec3::ZERO, r);
         let mut gauss = Gauss::new(9);
         for _ in 0..20_000 {
-            bank.advance(&models, 2e-3);
+            bank.advance(&models, 2e-3, None);
             bank.update(gauss.vector(1e-4), r);
             assert!(bank.combined().point.is_finite());
             for c in bank.covariances().into_iter().flatten() {
@@ -394,6 +394,7 @@ fn jitter_and_misplacement() {
         speed_m_s: 1.0,
         amplitude_m: 4.0,
         acceleration_m_s2: 20.0,
+        rest_s: 0.0,
     };
     let rig = EvaluationConfig { frames: 3 * 947, ..quiet };
     let coasting = evaluate(&coast, filter, &rig).unwrap();

@@ -348,14 +348,14 @@ fn covariance(seed: u64) -> f64 {
     for (first, r) in [(1e12, 1e-12), (1e12, 1e-24), (1e-12, 1e12), (1e24, 1e-24), (1e12, 0.0), (0.0, 0.0)] {
         let mut imm = Imm::<Translations>::new(&config, DVec3::ZERO, first);
         for i in 0..300 {
-            imm.advance(&config, [0.002, 0.0, 1e-9, 10.0][i % 4]);
+            imm.advance(&config, [0.002, 0.0, 1e-9, 10.0][i % 4], None);
             imm.update(DVec3::splat(1e-3 * s.uniform()), r);
             look(&imm);
         }
     }
     let mut imm = Imm::<Translations>::new(&config, DVec3::ZERO, 1e-8);
     for i in 0..100_000 {
-        imm.advance(&config, 0.002);
+        imm.advance(&config, 0.002, None);
         imm.update(DVec3::splat(1e-4 * s.uniform()), 1e-8);
         if i % 100 == 0 {
             look(&imm);
