@@ -190,9 +190,14 @@ fn a_turn_may_rest_in_its_middle() {
     let motion = Motion::new(&spec(0.3), Pose::IDENTITY).unwrap();
     let x = |ms: i64| motion.pose_at(ms * 1_000_000).position_m[0];
     let v = |ms: i64| motion.twist_at(ms * 1_000_000).linear_m_s[0];
-    for (at_ms, place, speed) in
-        [(0, 0.0, 0.5), (200, 0.1, 0.5), (300, 0.125, 0.0), (450, 0.125, 0.0), (600, 0.125, 0.0), (700, 0.1, -0.5)]
-    {
+    for (at_ms, place, speed) in [
+        (0, 0.0, 0.5),
+        (200, 0.1, 0.5),
+        (300, 0.125, 0.0),
+        (450, 0.125, 0.0),
+        (600, 0.125, 0.0),
+        (700, 0.1, -0.5),
+    ] {
         for (t, sign) in [(at_ms, 1.0), (at_ms + 900, -1.0), (at_ms + 1800, 1.0), (at_ms - 900, -1.0)] {
             assert!((x(t) - sign * place).abs() < 1e-12, "{} at {t} ms", x(t));
             assert!((v(t) - sign * speed).abs() < 1e-8, "{} at {t} ms", v(t));

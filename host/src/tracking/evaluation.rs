@@ -154,9 +154,8 @@ pub fn prediction_cases() -> Vec<PredictionCase> {
         acceleration_m_s2,
         rest_s,
     };
-    let shuttle = |speed_m_s, acceleration_m_s2, amplitude_m| {
-        resting(speed_m_s, acceleration_m_s2, amplitude_m, 0.0)
-    };
+    let shuttle =
+        |speed_m_s, acceleration_m_s2, amplitude_m| resting(speed_m_s, acceleration_m_s2, amplitude_m, 0.0);
     let circle = |rate_rad_s, radius_m| MotionSpec::Rotate {
         axis: [0.0, 1.0, 0.0],
         rate_rad_s,

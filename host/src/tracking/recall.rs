@@ -165,8 +165,7 @@ impl<C: Chart> Recall<C> {
         let w = (t_ns - a.at_ns) as f64 / gap as f64;
         let (from, to) = (&a.motion, &b.motion);
         let by_a = (from.velocity + from.acceleration * (0.5 * since)) * since;
-        let by_b =
-            C::between(from.point, to.point) - (to.velocity - to.acceleration * (0.5 * until)) * until;
+        let by_b = C::between(from.point, to.point) - (to.velocity - to.acceleration * (0.5 * until)) * until;
         Some(Point {
             at_ns: t_ns,
             motion: Smoothed {
@@ -234,7 +233,8 @@ impl<C: Chart> Recall<C> {
         *lag -= ((1.0 - (-since_s / FOLLOW_S).exp()) * later * 1e9) as i64;
         let shift = later / SHIFT_S;
         // Bounded, so that one wild sample is not enough.
-        self.misfit += (1.0 - (-since_s / MISFIT_S).exp()) * ((across + shift * shift).min(20.0) - self.misfit);
+        self.misfit +=
+            (1.0 - (-since_s / MISFIT_S).exp()) * ((across + shift * shift).min(20.0) - self.misfit);
         if self.misfit > 1.0 {
             self.lag_ns = None;
         }

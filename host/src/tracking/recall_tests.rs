@@ -194,7 +194,8 @@ fn with_and_without(path: &[f64]) -> [f64; 2] {
                 received_at: at,
             });
             if let (Some(predicted), true) = (filter.predict(at.plus_ns(6_000_000)), i > 5_000) {
-                errors.push((DVec3::from_array(predicted.pose.position_m) - DVec3::X * path[i + 60]).length());
+                errors
+                    .push((DVec3::from_array(predicted.pose.position_m) - DVec3::X * path[i + 60]).length());
             }
         }
         errors.sort_by(f64::total_cmp);
@@ -262,8 +263,11 @@ fn bodies_that_do_not_repeat_themselves_are_no_worse_off() {
 #[test]
 fn misplacement_at_half_a_metre_a_second() {
     let rig = EvaluationConfig::with_noise(SIGMA, 1e-3);
-    let circle = MotionSpec::Rotate { axis: [0.0, 0.0, 1.0], rate_rad_s: 10.0, pivot_offset_m: [0.05, 0.0, 0.0] };
-    for spec in [sine(), shuttle(0.05, 0.0), shuttle(0.15, 0.0), shuttle(0.5, 0.0), shuttle(0.15, 0.2), circle] {
+    let circle =
+        MotionSpec::Rotate { axis: [0.0, 0.0, 1.0], rate_rad_s: 10.0, pivot_offset_m: [0.05, 0.0, 0.0] };
+    for spec in
+        [sine(), shuttle(0.05, 0.0), shuttle(0.15, 0.0), shuttle(0.5, 0.0), shuttle(0.15, 0.2), circle]
+    {
         let e = evaluate(&spec, PoseFilterConfig::default(), &rig).unwrap();
         assert!(e.position_m.p99 <= 0.25e-3, "{spec:?}: {:?}", e.position_m);
     }

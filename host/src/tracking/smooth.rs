@@ -56,7 +56,9 @@ pub fn smoothed<C: Chart>(
 ) -> Option<(i64, Smoothed<C::Point>)> {
     let (at_ns, origin) = (*samples.get(middle)?)?;
     let around = samples.iter().flatten().filter(|(t, _)| t.abs_diff(at_ns) <= MARGIN_NS as u64);
-    if around.clone().count() < LEAST_AROUND || around.clone().any(|(_, z)| C::between(origin, *z).length() > C::FLAT) {
+    if around.clone().count() < LEAST_AROUND
+        || around.clone().any(|(_, z)| C::between(origin, *z).length() > C::FLAT)
+    {
         return None;
     }
     let mut chosen: [Option<Parabola>; 3] = [None; 3];
@@ -126,7 +128,8 @@ impl Parabola {
                 power *= t;
             }
         }
-        let inverse = DMat3::from_cols_array(&[s[0], s[1], s[2], s[1], s[2], s[3], s[2], s[3], s[4]]).inverse();
+        let inverse =
+            DMat3::from_cols_array(&[s[0], s[1], s[2], s[1], s[2], s[3], s[2], s[3], s[4]]).inverse();
         if n < LEAST_SAMPLES || !inverse.is_finite() {
             return None;
         }
@@ -153,7 +156,8 @@ mod tests {
     fn sampled<P>(path: impl Fn(f64) -> P) -> Vec<Option<(i64, P)>> {
         (0..97i64)
             .map(|i| {
-                let at_ns = (i - MIDDLE as i64) * 2_000_000 + if i == MIDDLE as i64 { 0 } else { i * 7919 % 800_000 };
+                let at_ns =
+                    (i - MIDDLE as i64) * 2_000_000 + if i == MIDDLE as i64 { 0 } else { i * 7919 % 800_000 };
                 Some((at_ns, path(at_ns as f64 * 1e-9)))
             })
             .collect()
@@ -202,8 +206,10 @@ mod tests {
             let mut mean = 0.0;
             for _ in 0..50 {
                 let samples = sampled(path);
-                let noisy: Vec<_> =
-                    samples.iter().map(|s| s.map(|(t, p): (i64, DVec3)| (t, p + gauss.vector(1e-4)))).collect();
+                let noisy: Vec<_> = samples
+                    .iter()
+                    .map(|s| s.map(|(t, p): (i64, DVec3)| (t, p + gauss.vector(1e-4))))
+                    .collect();
                 let (_, s) = smoothed::<Translations>(&noisy, MIDDLE, 1e-4).unwrap();
                 mean += s.acceleration.x / 50.0;
             }
