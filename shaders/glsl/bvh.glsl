@@ -1,4 +1,5 @@
-// Two-level ray traversal: a short list of rigid bodies, each with a compressed wide BVH ([Ylitie17], 80-byte nodes of eight children).
+// Two-level ray traversal: a short list of rigid bodies, each with a compressed wide BVH ([Ylitie17], 80-byte nodes of eight children;
+// render/body_bvh.rs says where children stand).
 //
 // Nodes and triangles are read through NODE and TRI: texel buffers on software Vulkan (twice as fast there), storage buffers on GPUs.
 #ifdef BVH_TEXEL
@@ -25,7 +26,7 @@ struct Hit {
     float t;
 };
 
-const int STACK_SIZE = 24; // one entry per level; an 8-wide tree of 2^24 triangles is at most about 20 deep
+const uint STACK_SIZE = 24u; // one entry per level; an 8-wide tree of 2^24 triangles is at most about 20 deep
 
 vec4 unpack_bytes(uint x) {
     return vec4(x & 255u, (x >> 8u) & 255u, (x >> 16u) & 255u, x >> 24u);
@@ -154,23 +155,25 @@ struct Traversal {
     vec3 origin;
     vec3 direction;
     vec3 inverse;
-    uint mask;     // bodies with any of these bits; 0: all
-    bool any_hit;  // stops at the first surface
+    uint mask;      // bodies with any of these bits; 0: all
+    bool any_hit;   // stops at the first surface
     bool found;
-    Hit hit;       // the nearest so far; `t` limits the ray
-    uint body;     // the one that is being traversed
-    uint next;     // the one after it; the number of bodies: there is none
-    bool inside;   // there is more to do in this body
+    Hit hit;        // the nearest so far; `t` limits the ray
+    uint body;      // the one that is being traversed
+    uint next;      // the one after it; the number of bodies: there is none
     LocalRay local;
     uint node_base;
     uint triangle_base;
     uint octant;
-    int depth;
-    uvec2 group;
+    uint group;     // children still to open: their block in the upper 24 bits, which of its slots in the lower 8, nearest first; 0: none
     uvec2 triangles;
+    uvec4 newest;   // groups that wait, newest first; software Vulkan writes an array of its own lane by lane, but these are registers
+    uvec4 older;
+    uint displaced; // a group for which they have no room: it goes to `traversal_stack` before another node is opened
+    uint depth;     // groups in `traversal_stack`
 };
 
-uvec2 traversal_stack[STACK_SIZE];
+uint traversal_stack[STACK_SIZE];
 
 void begin_ray(inout Traversal t, vec3 origin, vec3 direction, uint mask, bool any_hit, float t_max) {
     t.origin = origin;
@@ -180,52 +183,65 @@ void begin_ray(inout Traversal t, vec3 origin, vec3 direction, uint mask, bool a
     t.any_hit = any_hit;
     t.found = false;
     t.hit.t = t_max;
-    t.inside = false;
+    t.group = 0u;
+    t.triangles = uvec2(0u);
+    t.displaced = 0u;
+    t.depth = 0u;
     t.next = next_body(0u, origin, t.inverse, mask, t_max);
 }
 
-// No body is left.
-bool at_end(Traversal t) { return !t.inside && t.next >= frame.instance_count; }
-
-// Goes on to the next body. Not at the end.
+// Goes on to the next body. There must be one.
 void enter_next_body(inout Traversal t) {
     t.body = min(t.next, max(frame.instance_count, 1u) - 1u);
     t.next = next_body(t.body + 1u, t.origin, t.inverse, t.mask, t.hit.t);
-    t.inside = true;
     t.local = local_ray(transform_point(instances[t.body].object_from_world, t.origin),
                         transform_vector(instances[t.body].object_from_world, t.direction));
     t.node_base = instances[t.body].node_offset;
     t.triangle_base = instances[t.body].triangle_offset;
     bvec3 negative = lessThan(t.local.inverse, vec3(0.0));
     t.octant = (negative.x ? 0u : 4u) | (negative.y ? 0u : 2u) | (negative.z ? 0u : 1u);
-    t.depth = 0;
-    t.group = uvec2(0u, 0x80000000u);
-    t.triangles = uvec2(0u);
+    t.group = 1u << t.octant; // the root
+    t.newest = uvec4(0u);
+    t.older = uvec4(0u);
 }
 
 bool at_triangles(Traversal t) { return t.triangles.y != 0u; }
 
+bool at_node(Traversal t) { return t.group != 0u && t.displaced == 0u && !at_triangles(t); }
+
+// Neither this body nor another has anything left.
+bool at_end(Traversal t) { return t.group == 0u && t.depth == 0u && t.next >= frame.instance_count; }
+
+// What is needed once in many nodes: room in the registers, a group that waited longest, or the next body.
+void go_on(inout Traversal t) {
+    if (t.displaced != 0u) {
+        traversal_stack[min(t.depth++, STACK_SIZE - 1u)] = t.displaced;
+        t.displaced = 0u;
+    } else if (t.group == 0u && t.depth > 0u) {
+        t.group = traversal_stack[--t.depth];
+    } else if (!at_end(t)) {
+        enter_next_body(t);
+    }
+}
+
 // Opens one node: its children and triangles that the ray meets come next.
 void open_node(inout Traversal t) {
-    uint child = uint(findMSB(t.group.y));
-    uint base = t.group.x;
-    uint mask_bits = t.group.y;
-    t.group.y &= ~(1u << child);
-    if ((t.group.y & 0xff000000u) != 0u && t.depth < STACK_SIZE) traversal_stack[t.depth++] = t.group;
-    uint slot = (child - 24u) ^ t.octant;
-    uint relative = uint(bitCount(mask_bits & ~(0xffffffffu << slot)));
-    uint node = (t.node_base + base + relative) * 5u;
+    uint bit = uint(findMSB(t.group & 255u));
+    uint rest = t.group & ~(1u << bit);
+    uint slot = bit ^ t.octant;
+    uint node = (t.node_base + ((t.group >> 5u) & ~7u) + slot) * 5u;
     uvec4 n0 = NODE(node);
     uvec4 n1 = NODE(node + 1u);
     uint hits = node_hits(t.local.origin, t.local.inverse, lessThan(t.local.inverse, vec3(0.0)), t.octant * 0x01010101u, t.hit.t, n0, n1, node);
-    t.group = uvec2(n1.x, (hits & 0xff000000u) | (n0.w >> 24u));
     t.triangles = uvec2(n1.y, hits & 0x00ffffffu);
-    if ((t.group.y & 0xff000000u) == 0u) {
-        t.inside = t.depth > 0;
-        t.group.y = 0u;
-        if (t.inside) t.group = traversal_stack[--t.depth];
-    }
-    t.inside = t.inside || at_triangles(t);
+    uint children = hits >> 24u;
+    bool waits = (rest & 255u) != 0u, deeper = children != 0u;
+    bool push = waits && deeper, pop = !waits && !deeper;
+    t.group = deeper ? (n1.x << 8u) | children : waits ? rest : t.newest.x;
+    t.displaced = push ? t.older.w : 0u;
+    uvec4 newest = push ? uvec4(rest, t.newest.xyz) : pop ? uvec4(t.newest.yzw, t.older.x) : t.newest;
+    t.older = push ? uvec4(t.newest.w, t.older.xyz) : pop ? uvec4(t.older.yzw, 0u) : t.older;
+    t.newest = newest;
 }
 
 // Tests one triangle.
@@ -248,9 +264,10 @@ void test_triangle(inout Traversal t) {
     }
     bool over = meets && t.any_hit;
     t.triangles.y = over ? 0u : t.triangles.y;
+    t.group = over ? 0u : t.group;
+    t.displaced = over ? 0u : t.displaced;
+    t.depth = over ? 0u : t.depth;
     t.next = over ? frame.instance_count : t.next;
-    bool nodes = (t.group.y & 0xff000000u) != 0u;
-    t.inside = !over && (at_triangles(t) || nodes);
 }
 
 // Traces one ray through all bodies that have any of `mask` bits (mask 0: all). ANY_HIT: stops at the first surface.
@@ -261,15 +278,15 @@ bool trace_ray(vec3 origin, vec3 direction, uint mask, bool any_hit, inout Hit h
     Traversal t;
     begin_ray(t, origin, direction, mask, any_hit, hit.t);
     do {
-        if (!at_end(t)) enter_next_body(t);
+        go_on(t);
         do {
             do {
-                if (t.inside && !at_triangles(t)) open_node(t);
-            } while (t.inside && !at_triangles(t));
+                if (at_node(t)) open_node(t);
+            } while (at_node(t));
             do {
                 if (at_triangles(t)) test_triangle(t);
             } while (at_triangles(t));
-        } while (t.inside);
+        } while (at_node(t));
     } while (!at_end(t));
     hit = t.hit;
     return t.found;

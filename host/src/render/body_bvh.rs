@@ -14,17 +14,22 @@ use obvhs::ploc::PlocBuilder;
 use obvhs::triangle::Triangle;
 use obvhs::BvhBuildParams;
 
-/// Entries of the traversal stack in `bvh.glsl`. A ray pushes at most one entry a level below the root, so a tree of one more level than
+/// Entries of the traversal stack in `bvh.glsl`, besides eight in registers. A ray pushes at most one entry a level below the root, so a tree of one more level than
 /// this never overflows it.
 pub const TRAVERSAL_STACK: usize = 24;
 
 /// Most triangles of a leaf of the wide tree.
 const LEAF: u32 = 3;
 
+/// Words of four u32 in a node.
+const NODE_WORDS: usize = 5;
+
 /// A BVH ready for upload.
 #[derive(Clone, Debug, Default)]
 pub struct BodyBvh {
-    /// Five words of four u32 per node; node indices are relative to this body.
+    /// Five words of four u32 per node, as [Ylitie17] has them but for where children stand: the fifth u32 is a block, and the inner child in
+    /// slot s is node 8 * block + s of this body. So the walk need not count bits to find it, and one u32 is an entry of its stack. Places
+    /// whose slot holds triangles or nothing are zero. The root is node 0, in slot 0 of block 0.
     pub nodes: Vec<[u32; 4]>,
     /// Triangle of the mesh for each place in BVH order. A triangle may stand in several places.
     pub order: Vec<u32>,
@@ -78,9 +83,9 @@ impl BodyBvh {
         while !level.is_empty() {
             levels += 1;
             let children = |&node: &u32| {
-                let words = &self.nodes[node as usize * 5..];
-                let inner = (words[0][3] >> 24).count_ones();
-                (0..inner).map(|k| words[1][0] + k).collect::<Vec<_>>()
+                let words = &self.nodes[node as usize * NODE_WORDS..];
+                let (inner, block) = (words[0][3] >> 24, words[1][0]);
+                (0..8).filter(|slot| inner >> slot & 1 == 1).map(|slot| 8 * block + slot).collect::<Vec<_>>()
             };
             level = level.iter().flat_map(children).collect();
         }
@@ -90,7 +95,24 @@ impl BodyBvh {
 
 impl From<CwBvh> for BodyBvh {
     fn from(bvh: CwBvh) -> Self {
-        Self { nodes: bytemuck::cast_slice(&bvh.nodes).to_vec(), order: bvh.primitive_indices }
+        let packed: &[[u32; 4]] = bytemuck::cast_slice(&bvh.nodes);
+        let mut nodes = vec![[0; 4]; 8 * NODE_WORDS];
+        // Where a node stands in `packed`, and where it goes. Last in, first out: a subtree's blocks are neighbours in memory.
+        let mut open = vec![(0usize, 0usize)];
+        while let Some((from, to)) = open.pop() {
+            let mut words = [[0; 4]; NODE_WORDS];
+            words.copy_from_slice(&packed[from * NODE_WORDS..][..NODE_WORDS]);
+            let (inner, first) = (words[0][3] >> 24, words[1][0] as usize);
+            if inner != 0 {
+                let block = nodes.len() / (8 * NODE_WORDS);
+                nodes.resize(nodes.len() + 8 * NODE_WORDS, [0; 4]);
+                words[1][0] = block as u32;
+                let slots = (0..8).filter(|slot| inner >> slot & 1 == 1);
+                open.extend(slots.enumerate().map(|(rank, slot)| (first + rank, 8 * block + slot)));
+            }
+            nodes[to * NODE_WORDS..][..NODE_WORDS].copy_from_slice(&words);
+        }
+        Self { nodes, order: bvh.primitive_indices }
     }
 }
 
@@ -150,7 +172,7 @@ mod tests {
     #[test]
     fn the_shader_has_the_stack_that_is_counted_on() {
         let text = include_str!("../../../shaders/glsl/bvh.glsl");
-        assert!(text.contains(&format!("const int STACK_SIZE = {TRAVERSAL_STACK};")));
+        assert!(text.contains(&format!("const uint STACK_SIZE = {TRAVERSAL_STACK}u;")));
     }
 
     #[test]

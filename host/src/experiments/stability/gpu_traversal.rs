@@ -191,8 +191,12 @@ fn heaps_in_a_chain(gpu: &Arc<Gpu>, _: u64) -> f64 {
     let size = |k: i32| 1e5 / 1.3f32.powi(k);
     let camera = camera(3, 3, DVec3::ZERO, DVec3::X);
     let mut faults = 0;
-    for place in (0..140).step_by(10) {
-        let heaps = join((0..140).flat_map(|k| (0..12).map(move |_| off(size(k)))));
+    // With as many as 140 the tree by area would be deeper than the stack, and halves take its place; fewer fill what the stack has in
+    // registers and in memory.
+    for (count, place) in
+        [20, 40, 60, 140].into_iter().flat_map(|n| (0..n).step_by(n as usize / 10).map(move |p| (n, p)))
+    {
+        let heaps = join((0..count).flat_map(|k| (0..12).map(move |_| off(size(k)))));
         let scene =
             scene_of(join([heaps, on(size(place))]), Material { double_sided: true, ..diffuse(Vec3::ONE) });
         let picture = Shot { spp: 1, depth: 2, ..Shot::new(&scene, camera) }.draw(gpu);
