@@ -141,9 +141,9 @@ uint next_body(uint first, vec3 origin, vec3 inverse, uint mask, float t_max) {
     bool enters = false;
     do {
         if (i < frame.instance_count) {
-            uint flags = instances[i].flags;
+            uint flags = instance_at(i).flags;
             enters = (flags & INSTANCE_EMPTY) == 0u && (mask == 0u || (flags & mask) != 0u)
-                  && enters_bounds(origin, inverse, instances[i].bounds_min, instances[i].bounds_max, t_max);
+                  && enters_bounds(origin, inverse, instance_at(i).bounds_min, instance_at(i).bounds_max, t_max);
             i += enters ? 0u : 1u;
         }
     } while (!enters && i < frame.instance_count);
@@ -194,10 +194,10 @@ void begin_ray(inout Traversal t, vec3 origin, vec3 direction, uint mask, bool a
 void enter_next_body(inout Traversal t) {
     t.body = min(t.next, max(frame.instance_count, 1u) - 1u);
     t.next = next_body(t.body + 1u, t.origin, t.inverse, t.mask, t.hit.t);
-    t.local = local_ray(transform_point(instances[t.body].object_from_world, t.origin),
-                        transform_vector(instances[t.body].object_from_world, t.direction));
-    t.node_base = instances[t.body].node_offset;
-    t.triangle_base = instances[t.body].triangle_offset;
+    t.local = local_ray(transform_point(instance_at(t.body).object_from_world, t.origin),
+                        transform_vector(instance_at(t.body).object_from_world, t.direction));
+    t.node_base = instance_at(t.body).node_offset;
+    t.triangle_base = instance_at(t.body).triangle_offset;
     bvec3 negative = lessThan(t.local.inverse, vec3(0.0));
     t.octant = (negative.x ? 0u : 4u) | (negative.y ? 0u : 2u) | (negative.z ? 0u : 1u);
     t.group = 1u << t.octant; // the root

@@ -60,10 +60,10 @@ void main() {
     uint nans = 0u, clipped = 0u, lit = 0u, code = 0u;
     if (surface.id != NO_HIT && surface.distance > 0.0) {
         uint instance = surface.id >> 24u;
-        TriangleRef ref = triangle_refs[instances[instance].triangle_offset + (surface.id & 0xffffffu)];
+        TriangleRef ref = triangle_refs[instance_at(instance).triangle_offset + (surface.id & 0xffffffu)];
         vec2 b = surface.barycentric;
         // The real surface is smooth: its normal is the interpolated one, without the look's normal map.
-        float cosine = real_cosine(instances[instance].world_from_object, vertices[ref.vertices.x].normal, vertices[ref.vertices.y].normal,
+        float cosine = real_cosine(instance_at(instance).world_from_object, vertices[ref.vertices.x].normal, vertices[ref.vertices.y].normal,
                                    vertices[ref.vertices.z].normal, b, vec2(pixel) + 0.5);
         precise float geometry = (surface.distance * surface.distance) * (1.0 / max(cosine, 1e-3));
         precise vec3 drive = (shown[index].rgb - frame.ambient) * (frame.drive_gain * geometry);

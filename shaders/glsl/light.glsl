@@ -115,19 +115,19 @@ LightSample sample_light(vec3 p, vec3 n, float u_pick, vec2 u) {
     if (select <= 0.0) return r;
     uint carrier = lights[index].instance;
     if (HAS_EMISSIVE && kind == LIGHT_TRIANGLE) {
-        uint row = (instances[carrier].triangle_offset + lights[index].triangle) * 3u;
+        uint row = (instance_at(carrier).triangle_offset + lights[index].triangle) * 3u;
         vec3 p0 = TRI(row).xyz;
         vec3 e1 = TRI(row + 1u).xyz - p0, e2 = TRI(row + 2u).xyz - p0;
         float su = sqrt(u.x);
         vec2 b = vec2(su * (1.0 - u.y), u.y * su); // uniform over the triangle
-        vec3 q = transform_point(instances[carrier].world_from_object, p0 + b.x * e1 + b.y * e2);
-        vec3 scaled_normal = transform_vector(instances[carrier].world_from_object, cross(e1, e2));
+        vec3 q = transform_point(instance_at(carrier).world_from_object, p0 + b.x * e1 + b.y * e2);
+        vec3 scaled_normal = transform_vector(instance_at(carrier).world_from_object, cross(e1, e2));
         float area = 0.5 * length(scaled_normal);
         vec3 normal = scaled_normal / max(2.0 * area, 1e-30);
         vec3 d = q - p;
         float d2 = dot(d, d);
         float cosine = -dot(normal, d) * inversesqrt(max(d2, 1e-30));
-        TriangleRef ref = triangle_refs[instances[carrier].triangle_offset + lights[index].triangle];
+        TriangleRef ref = triangle_refs[instance_at(carrier).triangle_offset + lights[index].triangle];
         bool both = (materials[ref.material].flags & MATERIAL_DOUBLE_SIDED) != 0u;
         if (both) {
             normal = cosine < 0.0 ? -normal : normal;
@@ -147,8 +147,8 @@ LightSample sample_light(vec3 p, vec3 n, float u_pick, vec2 u) {
     if (HAS_PUNCTUAL && kind != LIGHT_TRIANGLE) {
         vec3 position = lights[index].position, direction = lights[index].direction;
         if (carrier != NO_INSTANCE) {
-            position = transform_point(instances[carrier].world_from_object, position);
-            direction = transform_vector(instances[carrier].world_from_object, direction);
+            position = transform_point(instance_at(carrier).world_from_object, position);
+            direction = transform_vector(instance_at(carrier).world_from_object, direction);
         } else {
             position -= frame.world_origin;
         }
@@ -183,7 +183,7 @@ LightSample sample_light(vec3 p, vec3 n, float u_pick, vec2 u) {
 
 // Solid-angle pdf with which sample_light would have found this emissive hit from p.
 float emissive_pdf(uint light, uint instance, uint triangle, vec3 p, vec3 q, vec3 g) {
-    uint row = (instances[instance].triangle_offset + triangle) * 3u;
+    uint row = (instance_at(instance).triangle_offset + triangle) * 3u;
     vec3 p0 = TRI(row).xyz;
     float area = 0.5 * length(cross(TRI(row + 1u).xyz - p0, TRI(row + 2u).xyz - p0));
     vec3 d = q - p;

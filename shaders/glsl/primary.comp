@@ -42,8 +42,8 @@ void main() {
         surface.barycentric = hit.barycentric;
         surface.distance = hit.t;
         if (!camera_is_eye) {
-            vec3 p = transform_point(instances[hit.instance].world_from_object, object_position(hit.instance, hit.triangle, hit.barycentric));
-            vec3 g = transform_normal(instances[hit.instance].world_from_object, object_normal(hit.instance, hit.triangle));
+            vec3 p = transform_point(instance_at(hit.instance).world_from_object, object_position(hit.instance, hit.triangle, hit.barycentric));
+            vec3 g = transform_normal(instance_at(hit.instance).world_from_object, object_normal(hit.instance, hit.triangle));
             vec3 to_eye = frame.eye_position - p;
             // The eye must be on the side that the projector lights.
             float projector_side = -dot(g, direction), eye_side = dot(g, to_eye);
@@ -59,7 +59,7 @@ void main() {
             if (HAS_GUIDES) {
                 Guide guide;
                 vec3 o = object_position(hit.instance, hit.triangle, hit.barycentric);
-                vec2 before = project(transform_point(instances[hit.instance].previous_world_from_object, o));
+                vec2 before = project(transform_point(instance_at(hit.instance).previous_world_from_object, o));
                 guide.motion = vec2(pixel) + 0.5 - before;
                 vec3 to_projector = -p;
                 float l_p = length(to_projector), l_e = length(to_eye);

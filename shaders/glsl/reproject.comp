@@ -109,7 +109,7 @@ void carry_point(inout History h, vec3 normal, float footprint, uvec2 pixel, vec
         if (any(lessThan(q, ivec2(0))) || any(greaterThanEqual(q, ivec2(frame.width, frame.height)))) continue;
         uint tap = former + uint(q.y) * frame.width + uint(q.x);
         if (!tap_valid(tap, h.instance, h.position, normal, footprint, 0.5)) continue;
-        vec2 e = project(transform_point(instances[h.instance].world_from_object, histories[tap].position)) - centre;
+        vec2 e = project(transform_point(instance_at(h.instance).world_from_object, histories[tap].position)) - centre;
         vec3 m = histories[tap].mean;
         float w = histories[tap].weight;
         // A broken history is as good as none.
@@ -160,11 +160,11 @@ void carry_point(inout History h, vec3 normal, float footprint, uvec2 pixel, vec
         } else {
             // No history's point is in this pixel. A new one begins a whole number of pixels beside the nearest, so that the points stay a lattice.
             vec2 e = apart - round(apart);
-            vec3 n = transform_vector(instances[h.instance].world_from_object, normal);
-            vec3 own = transform_point(instances[h.instance].world_from_object, h.position);
+            vec3 n = transform_vector(instance_at(h.instance).world_from_object, normal);
+            vec3 own = transform_point(instance_at(h.instance).world_from_object, h.position);
             vec3 direction = projector_direction(centre + e);
             float along = dot(n, direction);
-            if (abs(along) > 0.1) h.position = transform_point(instances[h.instance].object_from_world, direction * (dot(n, own) / along));
+            if (abs(along) > 0.1) h.position = transform_point(instance_at(h.instance).object_from_world, direction * (dot(n, own) / along));
             else e = vec2(0.0);
             vec3 there = -(g_x * (apart.x - e.x) + g_y * (apart.y - e.y));
             known.mean = clamp(known.mean + there, lower, upper);
@@ -217,10 +217,10 @@ void keep_hidden(uvec2 pixel, uint to) {
         if (any(lessThan(q, ivec2(0))) || any(greaterThanEqual(q, size))) continue;
         uint tap = former + uint(q.y) * frame.width + uint(q.x);
         if (histories[tap].frame != frame.history_frame || histories[tap].instance != instance || !(histories[tap].weight > 0.0)) continue;
-        vec3 p = transform_point(instances[instance].world_from_object, histories[tap].position);
+        vec3 p = transform_point(instance_at(instance).world_from_object, histories[tap].position);
         vec2 e = project(p) - centre;
         float far = max(abs(e.x), abs(e.y));
-        if (far < nearest && dot(transform_vector(instances[instance].world_from_object, decode_normal(histories[tap].normal)), p) < 0.0) {
+        if (far < nearest && dot(transform_vector(instance_at(instance).world_from_object, decode_normal(histories[tap].normal)), p) < 0.0) {
             nearest = far;
             owner = tap;
         }
@@ -244,17 +244,17 @@ void main() {
         lit = 1u;
         uint instance = surface.id >> 24u;
         uint triangle = surface.id & 0xffffffu;
-        TriangleRef ref = triangle_refs[instances[instance].triangle_offset + triangle];
+        TriangleRef ref = triangle_refs[instance_at(instance).triangle_offset + triangle];
         vec2 b = surface.barycentric;
         History h;
         h.instance = instance;
         h.frame = frame.frame;
         // Only rotations and translations lie between the spaces, so lengths are the same in both.
         vec3 world = projector_direction(vec2(pixel) + 0.5) * surface.distance;
-        h.position = transform_point(instances[instance].object_from_world, world);
+        h.position = transform_point(instance_at(instance).object_from_world, world);
         vec3 normal = normalize(vertices[ref.vertices.x].normal * (1.0 - b.x - b.y) + vertices[ref.vertices.y].normal * b.x + vertices[ref.vertices.z].normal * b.y);
         h.normal = encode_normal(normal);
-        float cosine = abs(dot(transform_vector(instances[instance].world_from_object, normal), normalize(world)));
+        float cosine = abs(dot(transform_vector(instance_at(instance).world_from_object, normal), normalize(world)));
         float footprint = surface.distance * frame.pixel_size / max(cosine, 0.2);
         vec2 before = vec2(pixel) + 0.5 - guides[at].motion;
         forget(h, at);

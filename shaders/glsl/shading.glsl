@@ -57,7 +57,7 @@ vec2 interpolate_uv(TriangleRef ref, vec2 b) {
 }
 
 bool alpha_present(uint instance, uint triangle, vec2 barycentric) {
-    TriangleRef ref = triangle_refs[instances[instance].triangle_offset + triangle];
+    TriangleRef ref = triangle_refs[instance_at(instance).triangle_offset + triangle];
     float cutoff = materials[ref.material].alpha_cutoff;
     if (cutoff < 0.0) return true;
     float a = materials[ref.material].alpha;
@@ -68,20 +68,20 @@ bool alpha_present(uint instance, uint triangle, vec2 barycentric) {
 
 // Position of a hit in the body's space.
 vec3 object_position(uint instance, uint triangle, vec2 b) {
-    uint row = (instances[instance].triangle_offset + triangle) * 3u;
+    uint row = (instance_at(instance).triangle_offset + triangle) * 3u;
     vec3 p0 = TRI(row).xyz;
     return p0 + b.x * (TRI(row + 1u).xyz - p0) + b.y * (TRI(row + 2u).xyz - p0);
 }
 
 vec3 object_normal(uint instance, uint triangle) {
-    uint row = (instances[instance].triangle_offset + triangle) * 3u;
+    uint row = (instance_at(instance).triangle_offset + triangle) * 3u;
     vec3 p0 = TRI(row).xyz;
     return normalize(cross(TRI(row + 1u).xyz - p0, TRI(row + 2u).xyz - p0));
 }
 
 // A distance that clears the rounding of the hit position and of the transforms into and out of the body's space.
 float surface_offset(vec3 p, uint instance) {
-    return 1.9e-6 * (max(abs(p.x), max(abs(p.y), abs(p.z))) + instances[instance].extent);
+    return 1.9e-6 * (max(abs(p.x), max(abs(p.y), abs(p.z))) + instance_at(instance).extent);
 }
 
 // E of docs/RENDERING.md: rows alpha, columns mu, nodes at (i / 31)^2 of both; the row past the last holds E_avg by alpha.
@@ -105,11 +105,11 @@ float average_albedo(uint table, float alpha) {
 
 Point shading_point(Hit hit, vec3 v) {
     Point s;
-    TriangleRef ref = triangle_refs[instances[hit.instance].triangle_offset + hit.triangle];
+    TriangleRef ref = triangle_refs[instance_at(hit.instance).triangle_offset + hit.triangle];
     uint m = ref.material;
     vec2 b = hit.barycentric;
-    s.p = transform_point(instances[hit.instance].world_from_object, object_position(hit.instance, hit.triangle, b));
-    s.g = transform_normal(instances[hit.instance].world_from_object, object_normal(hit.instance, hit.triangle));
+    s.p = transform_point(instance_at(hit.instance).world_from_object, object_position(hit.instance, hit.triangle, b));
+    s.g = transform_normal(instance_at(hit.instance).world_from_object, object_normal(hit.instance, hit.triangle));
     s.v = v;
     s.flags = materials[m].flags;
     s.table = materials[m].albedo_table;
@@ -117,11 +117,11 @@ Point shading_point(Hit hit, vec3 v) {
     s.offset = surface_offset(s.p, hit.instance);
     s.front = dot(s.g, v) > 0.0;
     vec3 n = vertices[ref.vertices.x].normal * (1.0 - b.x - b.y) + vertices[ref.vertices.y].normal * b.x + vertices[ref.vertices.z].normal * b.y;
-    n = dot(n, n) > 1e-12 ? transform_normal(instances[hit.instance].world_from_object, n) : s.g;
+    n = dot(n, n) > 1e-12 ? transform_normal(instance_at(hit.instance).world_from_object, n) : s.g;
     vec2 uv = HAS_TEXTURES ? interpolate_uv(ref, b) : vec2(0.0);
     if (HAS_NORMAL_MAPS && materials[m].normal_texture.texture != NO_TEXTURE) {
         vec4 t4 = vertices[ref.vertices.x].tangent * (1.0 - b.x - b.y) + vertices[ref.vertices.y].tangent * b.x + vertices[ref.vertices.z].tangent * b.y;
-        vec3 t = transform_vector(instances[hit.instance].world_from_object, t4.xyz);
+        vec3 t = transform_vector(instance_at(hit.instance).world_from_object, t4.xyz);
         t -= n * dot(n, t);
         if (dot(t, t) > 1e-12) {
             t = normalize(t);

@@ -30,7 +30,7 @@ void main() {
     hit.barycentric = surface.barycentric;
     hit.t = abs(surface.distance);
     bool camera_is_eye = (frame.flags & FRAME_CAMERA_IS_EYE) != 0u;
-    vec3 p = transform_point(instances[hit.instance].world_from_object, object_position(hit.instance, hit.triangle, hit.barycentric));
+    vec3 p = transform_point(instance_at(hit.instance).world_from_object, object_position(hit.instance, hit.triangle, hit.barycentric));
     vec3 toward = normalize((camera_is_eye ? frame.projector_position : frame.eye_position) - p);
     Point first = shading_point(hit, toward);
     Sampler rng = Sampler(frame.seed, 0u, pixel);

@@ -170,7 +170,8 @@ gpu_structs! {
         lit: u32,
     }
 
-    /// One rigid body in the top level.
+    /// One rigid body in the top level: twelve rows of four words, which `instance_at` of `scene.glsl` reads one by one where a texel buffer
+    /// holds them.
     struct Instance {
         /// world-from-object.
         world_from_object: Rows,
@@ -192,6 +193,8 @@ gpu_structs! {
         body: u32,
         /// Largest magnitude among object coordinates, for ray offsets.
         extent: f32,
+        /// 0.
+        reserved: u32,
     }
 
     /// Attributes of one vertex.
@@ -439,4 +442,5 @@ pub const BINDINGS: &[(&str, u32)] = &[
     ("B_FILTERED", 24),
     ("B_SHOWN", 25),
     ("B_PLANES", 26),
+    ("B_INSTANCE_TEXELS", 27),
 ];

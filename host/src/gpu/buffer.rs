@@ -61,20 +61,46 @@ impl Buffer {
     /// # Errors
     /// As [`Buffer::new`]; [`GpuError::Limit`] when there are more texels than the device's texel buffers hold.
     pub fn texels(gpu: &Arc<Gpu>, what: &str, data: &[[u32; 4]], float: bool) -> Result<Self, GpuError> {
+        Self::check_texels(gpu, what, data.len())?;
+        Self::filled(gpu, what, bytemuck::cast_slice(data), vk::BufferUsageFlags::UNIFORM_TEXEL_BUFFER)?
+            .viewed_as_texels(float)
+    }
+
+    /// An uninitialised buffer of at least one 16-byte texel, read as [`Buffer::texels`].
+    ///
+    /// # Errors
+    /// As [`Buffer::texels`].
+    pub fn new_texels(
+        gpu: &Arc<Gpu>,
+        what: &str,
+        texels: usize,
+        float: bool,
+        kind: MemoryKind,
+    ) -> Result<Self, GpuError> {
+        Self::check_texels(gpu, what, texels)?;
+        Self::with_usage(gpu, what, texels * 16, kind, vk::BufferUsageFlags::UNIFORM_TEXEL_BUFFER)?
+            .viewed_as_texels(float)
+    }
+
+    fn check_texels(gpu: &Arc<Gpu>, what: &str, texels: usize) -> Result<(), GpuError> {
         let limit = gpu.max_texel_elements();
-        if data.len() as u64 > limit {
-            return Err(GpuError::Limit { what: what.to_owned(), needed: data.len() as u64, limit });
+        if texels as u64 > limit {
+            return Err(GpuError::Limit { what: what.to_owned(), needed: texels as u64, limit });
         }
-        let mut buffer =
-            Self::filled(gpu, what, bytemuck::cast_slice(data), vk::BufferUsageFlags::UNIFORM_TEXEL_BUFFER)?;
+        Ok(())
+    }
+
+    /// With the view through which shaders read it. The buffer has texel usage.
+    fn viewed_as_texels(mut self, float: bool) -> Result<Self, GpuError> {
         let format = if float { vk::Format::R32G32B32A32_SFLOAT } else { vk::Format::R32G32B32A32_UINT };
         let info =
-            vk::BufferViewCreateInfo::default().buffer(buffer.handle).format(format).range(vk::WHOLE_SIZE);
+            vk::BufferViewCreateInfo::default().buffer(self.handle).format(format).range(vk::WHOLE_SIZE);
         // SAFETY: the buffer was created with texel usage and is alive.
-        buffer.view = Some(
-            unsafe { gpu.device.create_buffer_view(&info, None) }.context("creating a texel-buffer view")?,
+        self.view = Some(
+            unsafe { self.gpu.device.create_buffer_view(&info, None) }
+                .context("creating a texel-buffer view")?,
         );
-        Ok(buffer)
+        Ok(self)
     }
 
     fn filled(

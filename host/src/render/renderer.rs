@@ -202,7 +202,7 @@ impl Renderer {
             .iter()
             .map(|&(name, binding)| {
                 let kind = match name {
-                    "B_NODES" | "B_TRIANGLES" => bvh,
+                    "B_NODES" | "B_TRIANGLES" | "B_INSTANCE_TEXELS" => bvh,
                     _ => Storage,
                 };
                 (binding, kind)
@@ -306,7 +306,8 @@ impl Renderer {
         use MemoryKind::{Device, Readback, Upload};
         let tile_list = TileList::new(raster.width(), raster.height());
         let frame = size("frame uniforms", size_of::<Frame>(), Upload)?;
-        let instances = size("instances", size_of::<Instance>() * self.data.bodies.len().max(1), Upload)?;
+        let rows = size_of::<Instance>() / 16 * self.data.bodies.len().max(1);
+        let instances = Buffer::new_texels(gpu, "instances", rows, false, Upload)?;
         let arguments = size("dispatch arguments", 32, Upload)?;
         let tiles = size("tile list", tile_list.len() * 4, Upload)?;
         let counters = size("counters", size_of::<Counters>(), Device)?;
@@ -354,7 +355,7 @@ impl Renderer {
         let s = &self.scene;
         let buffer_of = |name: &str| match name {
             "B_FRAME" => &frame,
-            "B_INSTANCES" => &instances,
+            "B_INSTANCES" | "B_INSTANCE_TEXELS" => &instances,
             "B_NODES" => &s.nodes,
             "B_TRIANGLES" => &s.triangles,
             "B_TRIANGLE_REFS" => &s.refs,
@@ -527,6 +528,7 @@ impl Renderer {
                 },
                 body: i as u32,
                 extent: body.extent,
+                reserved: 0,
             };
             let at = i * size_of::<Instance>();
             slot.instances.bytes_mut()[at..at + size_of::<Instance>()]
