@@ -48,8 +48,6 @@ float real_cosine(vec4 rows[3], vec3 n0, vec3 n1, vec3 n2, vec2 b, vec2 raster) 
     return cosine;
 }
 
-layout(set = 0, binding = B_TRIANGLE_REFS, scalar) readonly buffer TriangleRefs { TriangleRef triangle_refs[]; };
-layout(set = 0, binding = B_VERTICES, scalar) readonly buffer Vertices { Vertex vertices[]; };
 layout(set = 0, binding = B_TILES, scalar) readonly buffer Tiles { uint tiles[]; };
 
 void main() {
@@ -60,11 +58,11 @@ void main() {
     uint nans = 0u, clipped = 0u, lit = 0u, code = 0u;
     if (surface.id != NO_HIT && surface.distance > 0.0) {
         uint instance = surface.id >> 24u;
-        TriangleRef ref = triangle_refs[instance_at(instance).triangle_offset + (surface.id & 0xffffffu)];
+        TriangleRef ref = triangle_ref_at(instance_at(instance).triangle_offset + (surface.id & 0xffffffu));
         vec2 b = surface.barycentric;
         // The real surface is smooth: its normal is the interpolated one, without the look's normal map.
-        float cosine = real_cosine(instance_at(instance).world_from_object, vertices[ref.vertices.x].normal, vertices[ref.vertices.y].normal,
-                                   vertices[ref.vertices.z].normal, b, vec2(pixel) + 0.5);
+        float cosine = real_cosine(instance_at(instance).world_from_object, vertex_at(ref.vertices.x).normal, vertex_at(ref.vertices.y).normal,
+                                   vertex_at(ref.vertices.z).normal, b, vec2(pixel) + 0.5);
         precise float geometry = (surface.distance * surface.distance) * (1.0 / max(cosine, 1e-3));
         precise vec3 drive = (shown[index].rgb - frame.ambient) * (frame.drive_gain * geometry);
         code = quantise(drive.r, nans, clipped) | (quantise(drive.g, nans, clipped) << 8u) | (quantise(drive.b, nans, clipped) << 16u);

@@ -127,16 +127,16 @@ LightSample sample_light(vec3 p, vec3 n, float u_pick, vec2 u) {
         vec3 d = q - p;
         float d2 = dot(d, d);
         float cosine = -dot(normal, d) * inversesqrt(max(d2, 1e-30));
-        TriangleRef ref = triangle_refs[instance_at(carrier).triangle_offset + lights[index].triangle];
-        bool both = (materials[ref.material].flags & MATERIAL_DOUBLE_SIDED) != 0u;
+        TriangleRef ref = triangle_ref_at(instance_at(carrier).triangle_offset + lights[index].triangle);
+        bool both = (material_at(ref.material).flags & MATERIAL_DOUBLE_SIDED) != 0u;
         if (both) {
             normal = cosine < 0.0 ? -normal : normal;
             cosine = abs(cosine);
         }
         if (cosine <= 1e-6 || area <= 0.0 || d2 <= 0.0) return r;
-        vec3 emitted = materials[ref.material].emissive;
-        if (HAS_TEXTURES && materials[ref.material].emissive_texture.texture != NO_TEXTURE)
-            emitted *= sample_texture(materials[ref.material].emissive_texture, interpolate_uv(ref, b)).rgb;
+        vec3 emitted = material_at(ref.material).emissive;
+        if (HAS_TEXTURES && material_at(ref.material).emissive_texture.texture != NO_TEXTURE)
+            emitted *= sample_texture(material_at(ref.material).emissive_texture, interpolate_uv(ref, b)).rgb;
         if (HAS_ALPHA_MASK && !alpha_present(carrier, lights[index].triangle, b)) return r;
         r.pdf = select * d2 / (cosine * area);
         r.radiance = emitted / r.pdf;

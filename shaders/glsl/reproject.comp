@@ -16,8 +16,6 @@ layout(set = 0, binding = B_HISTORY, scalar) buffer Histories { History historie
 layout(set = 0, binding = B_SCHEDULE, scalar) buffer ScheduleBlock { Schedule schedule; };
 // Method dpm: what leads from the history's surface point to the pixel's, added to its mean.
 layout(set = 0, binding = B_SHOWN, scalar) writeonly buffer Shown { vec4 shown[]; };
-layout(set = 0, binding = B_TRIANGLE_REFS, scalar) readonly buffer TriangleRefs { TriangleRef triangle_refs[]; };
-layout(set = 0, binding = B_VERTICES, scalar) readonly buffer Vertices { Vertex vertices[]; };
 
 struct Carried {
     vec3 mean;
@@ -244,7 +242,7 @@ void main() {
         lit = 1u;
         uint instance = surface.id >> 24u;
         uint triangle = surface.id & 0xffffffu;
-        TriangleRef ref = triangle_refs[instance_at(instance).triangle_offset + triangle];
+        TriangleRef ref = triangle_ref_at(instance_at(instance).triangle_offset + triangle);
         vec2 b = surface.barycentric;
         History h;
         h.instance = instance;
@@ -252,7 +250,7 @@ void main() {
         // Only rotations and translations lie between the spaces, so lengths are the same in both.
         vec3 world = projector_direction(vec2(pixel) + 0.5) * surface.distance;
         h.position = transform_point(instance_at(instance).object_from_world, world);
-        vec3 normal = normalize(vertices[ref.vertices.x].normal * (1.0 - b.x - b.y) + vertices[ref.vertices.y].normal * b.x + vertices[ref.vertices.z].normal * b.y);
+        vec3 normal = normalize(vertex_at(ref.vertices.x).normal * (1.0 - b.x - b.y) + vertex_at(ref.vertices.y).normal * b.x + vertex_at(ref.vertices.z).normal * b.y);
         h.normal = encode_normal(normal);
         float cosine = abs(dot(transform_vector(instance_at(instance).world_from_object, normal), normalize(world)));
         float footprint = surface.distance * frame.pixel_size / max(cosine, 0.2);

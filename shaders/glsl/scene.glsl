@@ -4,6 +4,7 @@
 #extension GL_KHR_shader_subgroup_basic : require
 #extension GL_KHR_shader_subgroup_arithmetic : require
 #include "generated.glsl"
+#include "scene_rows.glsl"
 
 // What the scene needs; the host sets these before the first frame so that the rest is compiled away.
 layout(constant_id = 0) const bool HAS_TEXTURES = true;
@@ -21,34 +22,6 @@ layout(constant_id = 9) const bool HAS_DIFFUSE = true;
 // or loop reads, which took 15 ms of every frame. Read once where every lane is active: elsewhere software Vulkan reads lane by lane.
 layout(set = 0, binding = B_FRAME, scalar) readonly buffer FrameBlock { Frame frame_block; };
 Frame frame = frame_block;
-
-// Bodies: storage on GPUs; rows of a texel buffer on software Vulkan, which reads storage lane by lane where lanes part. What is not used of
-// an instance is not read.
-#ifdef BVH_TEXEL
-layout(set = 0, binding = B_INSTANCE_TEXELS) uniform utextureBuffer instance_texels;
-Instance instance_at(uint i) {
-    uvec4 rows[12];
-    for (int k = 0; k < 12; k++) rows[k] = texelFetch(instance_texels, int(i) * 12 + k);
-    Instance s;
-    for (int k = 0; k < 3; k++) {
-        s.world_from_object[k] = uintBitsToFloat(rows[k]);
-        s.object_from_world[k] = uintBitsToFloat(rows[3 + k]);
-        s.previous_world_from_object[k] = uintBitsToFloat(rows[8 + k]);
-    }
-    s.bounds_min = uintBitsToFloat(rows[6].xyz);
-    s.node_offset = rows[6].w;
-    s.bounds_max = uintBitsToFloat(rows[7].xyz);
-    s.triangle_offset = rows[7].w;
-    s.flags = rows[11].x;
-    s.body = rows[11].y;
-    s.extent = uintBitsToFloat(rows[11].z);
-    s.reserved = rows[11].w;
-    return s;
-}
-#else
-layout(set = 0, binding = B_INSTANCES, scalar) readonly buffer Instances { Instance instances[]; };
-Instance instance_at(uint i) { return instances[i]; }
-#endif
 layout(set = 0, binding = B_COUNTERS, scalar) buffer CountersBlock { Counters counters; };
 
 const float PI = 3.14159265358979;

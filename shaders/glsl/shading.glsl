@@ -1,8 +1,5 @@
 // A hit into a shading point: position, normals, material at that point.
 
-layout(set = 0, binding = B_TRIANGLE_REFS, scalar) readonly buffer TriangleRefs { TriangleRef triangle_refs[]; };
-layout(set = 0, binding = B_VERTICES, scalar) readonly buffer Vertices { Vertex vertices[]; };
-layout(set = 0, binding = B_MATERIALS, scalar) readonly buffer Materials { Material materials[]; };
 layout(set = 0, binding = B_TEXTURES, scalar) readonly buffer Textures { TextureInfo textures[]; };
 layout(set = 0, binding = B_TEXELS, scalar) readonly buffer Texels { uvec2 texels[]; };
 layout(set = 0, binding = B_ALBEDO, scalar) readonly buffer Albedo { float albedo_table[]; };
@@ -53,16 +50,16 @@ vec4 sample_texture(TextureUse use, vec2 uv) {
 }
 
 vec2 interpolate_uv(TriangleRef ref, vec2 b) {
-    return vertices[ref.vertices.x].uv * (1.0 - b.x - b.y) + vertices[ref.vertices.y].uv * b.x + vertices[ref.vertices.z].uv * b.y;
+    return vertex_at(ref.vertices.x).uv * (1.0 - b.x - b.y) + vertex_at(ref.vertices.y).uv * b.x + vertex_at(ref.vertices.z).uv * b.y;
 }
 
 bool alpha_present(uint instance, uint triangle, vec2 barycentric) {
-    TriangleRef ref = triangle_refs[instance_at(instance).triangle_offset + triangle];
-    float cutoff = materials[ref.material].alpha_cutoff;
+    TriangleRef ref = triangle_ref_at(instance_at(instance).triangle_offset + triangle);
+    float cutoff = material_at(ref.material).alpha_cutoff;
     if (cutoff < 0.0) return true;
-    float a = materials[ref.material].alpha;
-    if (HAS_TEXTURES && materials[ref.material].base_color_texture.texture != NO_TEXTURE)
-        a *= sample_texture(materials[ref.material].base_color_texture, interpolate_uv(ref, barycentric)).a;
+    float a = material_at(ref.material).alpha;
+    if (HAS_TEXTURES && material_at(ref.material).base_color_texture.texture != NO_TEXTURE)
+        a *= sample_texture(material_at(ref.material).base_color_texture, interpolate_uv(ref, barycentric)).a;
     return a >= cutoff;
 }
 
@@ -105,29 +102,29 @@ float average_albedo(uint table, float alpha) {
 
 Point shading_point(Hit hit, vec3 v) {
     Point s;
-    TriangleRef ref = triangle_refs[instance_at(hit.instance).triangle_offset + hit.triangle];
+    TriangleRef ref = triangle_ref_at(instance_at(hit.instance).triangle_offset + hit.triangle);
     uint m = ref.material;
     vec2 b = hit.barycentric;
     s.p = transform_point(instance_at(hit.instance).world_from_object, object_position(hit.instance, hit.triangle, b));
     s.g = transform_normal(instance_at(hit.instance).world_from_object, object_normal(hit.instance, hit.triangle));
     s.v = v;
-    s.flags = materials[m].flags;
-    s.table = materials[m].albedo_table;
+    s.flags = material_at(m).flags;
+    s.table = material_at(m).albedo_table;
     s.light = ref.light;
     s.offset = surface_offset(s.p, hit.instance);
     s.front = dot(s.g, v) > 0.0;
-    vec3 n = vertices[ref.vertices.x].normal * (1.0 - b.x - b.y) + vertices[ref.vertices.y].normal * b.x + vertices[ref.vertices.z].normal * b.y;
+    vec3 n = vertex_at(ref.vertices.x).normal * (1.0 - b.x - b.y) + vertex_at(ref.vertices.y).normal * b.x + vertex_at(ref.vertices.z).normal * b.y;
     n = dot(n, n) > 1e-12 ? transform_normal(instance_at(hit.instance).world_from_object, n) : s.g;
     vec2 uv = HAS_TEXTURES ? interpolate_uv(ref, b) : vec2(0.0);
-    if (HAS_NORMAL_MAPS && materials[m].normal_texture.texture != NO_TEXTURE) {
-        vec4 t4 = vertices[ref.vertices.x].tangent * (1.0 - b.x - b.y) + vertices[ref.vertices.y].tangent * b.x + vertices[ref.vertices.z].tangent * b.y;
+    if (HAS_NORMAL_MAPS && material_at(m).normal_texture.texture != NO_TEXTURE) {
+        vec4 t4 = vertex_at(ref.vertices.x).tangent * (1.0 - b.x - b.y) + vertex_at(ref.vertices.y).tangent * b.x + vertex_at(ref.vertices.z).tangent * b.y;
         vec3 t = transform_vector(instance_at(hit.instance).world_from_object, t4.xyz);
         t -= n * dot(n, t);
         if (dot(t, t) > 1e-12) {
             t = normalize(t);
             vec3 bitangent = cross(n, t) * (t4.w < 0.0 ? -1.0 : 1.0);
-            vec3 c = sample_texture(materials[m].normal_texture, uv).xyz * 2.0 - 1.0;
-            c.xy *= materials[m].normal_scale;
+            vec3 c = sample_texture(material_at(m).normal_texture, uv).xyz * 2.0 - 1.0;
+            c.xy *= material_at(m).normal_scale;
             vec3 mapped = t * c.x + bitangent * c.y + n * c.z;
             if (dot(mapped, mapped) > 1e-12) n = normalize(mapped);
         }
@@ -144,22 +141,22 @@ Point shading_point(Hit hit, vec3 v) {
         n = l2 > 1e-12 ? across * (sqrt(1.0 - 1e-6) * inversesqrt(l2)) + 1e-3 * v : s.g;
     }
     s.n = n;
-    s.base = materials[m].base_color;
-    s.metallic = materials[m].metallic;
-    float roughness = materials[m].roughness;
-    s.transmission = HAS_TRANSMISSION ? materials[m].transmission : 0.0;
-    s.emitted = HAS_EMISSIVE && (s.front || (s.flags & MATERIAL_DOUBLE_SIDED) != 0u) ? materials[m].emissive : vec3(0.0);
-    s.ior = materials[m].ior;
+    s.base = material_at(m).base_color;
+    s.metallic = material_at(m).metallic;
+    float roughness = material_at(m).roughness;
+    s.transmission = HAS_TRANSMISSION ? material_at(m).transmission : 0.0;
+    s.emitted = HAS_EMISSIVE && (s.front || (s.flags & MATERIAL_DOUBLE_SIDED) != 0u) ? material_at(m).emissive : vec3(0.0);
+    s.ior = material_at(m).ior;
     if (HAS_TEXTURES) {
-        if (materials[m].base_color_texture.texture != NO_TEXTURE) s.base *= sample_texture(materials[m].base_color_texture, uv).rgb;
-        if (materials[m].metallic_roughness_texture.texture != NO_TEXTURE) {
-            vec4 mr = sample_texture(materials[m].metallic_roughness_texture, uv);
+        if (material_at(m).base_color_texture.texture != NO_TEXTURE) s.base *= sample_texture(material_at(m).base_color_texture, uv).rgb;
+        if (material_at(m).metallic_roughness_texture.texture != NO_TEXTURE) {
+            vec4 mr = sample_texture(material_at(m).metallic_roughness_texture, uv);
             roughness *= mr.g;
             s.metallic *= mr.b;
         }
-        if (HAS_EMISSIVE && materials[m].emissive_texture.texture != NO_TEXTURE) s.emitted *= sample_texture(materials[m].emissive_texture, uv).rgb;
-        if (HAS_TRANSMISSION && materials[m].transmission_texture.texture != NO_TEXTURE)
-            s.transmission *= sample_texture(materials[m].transmission_texture, uv).r;
+        if (HAS_EMISSIVE && material_at(m).emissive_texture.texture != NO_TEXTURE) s.emitted *= sample_texture(material_at(m).emissive_texture, uv).rgb;
+        if (HAS_TRANSMISSION && material_at(m).transmission_texture.texture != NO_TEXTURE)
+            s.transmission *= sample_texture(material_at(m).transmission_texture, uv).r;
     }
     s.alpha = max(roughness * roughness, 1e-4);
     return s;

@@ -6,34 +6,63 @@ use crate::structs;
 pub trait GlslType {
     /// The member's declaration, with indentation and line end.
     fn member(name: &str) -> String;
+    /// The value, from the words of the rows r0, r1, ... that begin with `word`, which moves past them.
+    fn read(word: &mut usize) -> String;
 }
 
 macro_rules! glsl_types {
-    ($($rust:ty => $glsl:literal;)*) => {$(
+    ($($rust:ty => $glsl:literal, $words:literal by $cast:literal;)*) => {$(
         impl GlslType for $rust {
             fn member(name: &str) -> String {
                 format!("    {} {name};\n", $glsl)
+            }
+            fn read(word: &mut usize) -> String {
+                let words: Vec<_> = (0..$words).map(|_| cast(word, $cast)).collect();
+                if words.len() == 1 { words[0].clone() } else { format!("{}({})", $glsl, words.join(", ")) }
             }
         }
     )*};
 }
 
+/// One word of the rows, as `by` makes it of a uint.
+fn cast(word: &mut usize, by: &str) -> String {
+    let (row, column) = (*word / 4, ["x", "y", "z", "w"][*word % 4]);
+    *word += 1;
+    if by.is_empty() {
+        format!("r{row}.{column}")
+    } else {
+        format!("{by}(r{row}.{column})")
+    }
+}
+
 glsl_types! {
-    f32 => "float";
-    u32 => "uint";
-    i32 => "int";
-    [f32; 2] => "vec2";
-    [f32; 3] => "vec3";
-    [f32; 4] => "vec4";
-    [u32; 3] => "uvec3";
-    [u32; 4] => "uvec4";
-    [u32; 2] => "uvec2";
-    structs::TextureUse => "TextureUse";
+    f32 => "float", 1 by "uintBitsToFloat";
+    u32 => "uint", 1 by "";
+    i32 => "int", 1 by "int";
+    [f32; 2] => "vec2", 2 by "uintBitsToFloat";
+    [f32; 3] => "vec3", 3 by "uintBitsToFloat";
+    [f32; 4] => "vec4", 4 by "uintBitsToFloat";
+    [u32; 3] => "uvec3", 3 by "";
+    [u32; 4] => "uvec4", 4 by "";
+    [u32; 2] => "uvec2", 2 by "";
+}
+
+impl GlslType for structs::TextureUse {
+    fn member(name: &str) -> String {
+        format!("    TextureUse {name};\n")
+    }
+    fn read(word: &mut usize) -> String {
+        Self::read_members(word)
+    }
 }
 
 impl GlslType for structs::Rows {
     fn member(name: &str) -> String {
         format!("    vec4 {name}[3];\n")
+    }
+    fn read(word: &mut usize) -> String {
+        let rows: Vec<_> = (0..3).map(|_| <[f32; 4]>::read(word)).collect();
+        format!("vec4[3]({})", rows.join(", "))
     }
 }
 
@@ -59,6 +88,33 @@ pub fn generated_glsl() -> String {
     out.push_str(")\n");
     out.push('\n');
     out.push_str(&structs::glsl());
+    out
+}
+
+/// The text of `glsl/scene_rows.glsl`: how the tables of a scene are read.
+pub fn scene_rows_glsl() -> String {
+    let mut out = String::from(
+        "// Written by build-shaders from shaders/src/structs.rs. Do not edit.\n//\n// Tables of the scene: storage on GPUs; rows of \
+         texel buffers on software Vulkan, which reads storage lane by lane where lanes\n// part. What is not used of an element is not read.\n",
+    );
+    for table in structs::scene_tables() {
+        let structs::SceneTable { name, binding, reader, bytes, read } = table;
+        let rows = bytes / 16;
+        out.push_str(&format!(
+            "\n#ifdef SCENE_TEXELS\nlayout(set = 0, binding = {binding}) uniform utextureBuffer {reader}_rows;\n"
+        ));
+        out.push_str(&format!("{name} {reader}_at(uint i) {{\n"));
+        for row in 0..rows {
+            out.push_str(&format!(
+                "    uvec4 r{row} = texelFetch({reader}_rows, int(i) * {rows} + {row});\n"
+            ));
+        }
+        out.push_str(&format!("    return {read};\n}}\n#else\n"));
+        out.push_str(&format!(
+            "layout(set = 0, binding = {binding}, scalar) readonly buffer {name}Table {{ {name} {reader}_table[]; }};\n"
+        ));
+        out.push_str(&format!("{name} {reader}_at(uint i) {{ return {reader}_table[i]; }}\n#endif\n"));
+    }
     out
 }
 
@@ -119,6 +175,8 @@ mod tests {
         let committed = std::fs::read_to_string(root.join("glsl/generated.glsl")).unwrap();
         let remedy = "run: cargo run -p dpm-shaders --bin build-shaders";
         assert_eq!(committed, super::generated_glsl(), "glsl/generated.glsl is stale; {remedy}");
+        let rows = std::fs::read_to_string(root.join("glsl/scene_rows.glsl")).unwrap();
+        assert_eq!(rows, super::scene_rows_glsl(), "glsl/scene_rows.glsl is stale; {remedy}");
         let hash = super::hash_directory(&root.join("glsl")).unwrap();
         let recorded = std::fs::read_to_string(root.join("spv/sources.hash")).unwrap();
         assert_eq!(recorded.trim(), format!("{hash:016x}"), "spv/ is stale; {remedy}");

@@ -26,16 +26,18 @@ macro_rules! shaders {
 }
 
 shaders! {
-    /// Primary visibility, BVH through texel buffers (software Vulkan).
+    /// Primary visibility. `TEXEL`, here and below: the scene through texel buffers (software Vulkan).
     PRIMARY_TEXEL = "primary.texel";
-    /// Primary visibility, BVH through storage buffers (GPUs).
+    /// Primary visibility. `STORAGE`, here and below: the scene through storage buffers (GPUs).
     PRIMARY_STORAGE = "primary.storage";
-    /// Path tracing, BVH through texel buffers.
+    /// Path tracing.
     TRACE_TEXEL = "trace.texel";
-    /// Path tracing, BVH through storage buffers.
+    /// Path tracing.
     TRACE_STORAGE = "trace.storage";
     /// History carried to where its surface point is now.
-    REPROJECT = "reproject";
+    REPROJECT_TEXEL = "reproject.texel";
+    /// History carried to where its surface point is now.
+    REPROJECT_STORAGE = "reproject.storage";
     /// Shading rates per tile.
     RATE_MAP = "rate_map";
     /// Which pixels are traced, with how many samples.
@@ -45,7 +47,9 @@ shaders! {
     /// Spatial filter of the picture.
     SPATIAL = "spatial";
     /// Compensation for distance, angle and albedo, then quantisation to code values.
-    COMPENSATE = "compensate";
+    COMPENSATE_TEXEL = "compensate.texel";
+    /// Compensation for distance, angle and albedo, then quantisation to code values.
+    COMPENSATE_STORAGE = "compensate.storage";
     /// Code values into bit planes.
     PACK = "pack";
 }

@@ -93,7 +93,15 @@ fn offsets_and_strides_are_those_of_the_rust_structs() {
             let what = format!("{} {binding_name}", shader.name);
             // variable -> pointer -> block -> struct, or -> runtime array -> struct
             let block = module.pointers[&module.variables[variable]];
-            let member = module.structs[&block][0];
+            let Some(members) = module.structs.get(&block) else {
+                // Rows of a texel buffer: `generate` reads them in the order of the Rust struct's members.
+                assert!(
+                    structs::SCENE_TABLES.contains(binding_name) && shader.name.ends_with(".texel"),
+                    "{what}"
+                );
+                continue;
+            };
+            let member = members[0];
             assert_eq!(module.offsets[&(block, 0)], 0, "{what}");
             let id = match module.arrays.get(&member) {
                 Some(&element) => {
@@ -105,8 +113,8 @@ fn offsets_and_strides_are_those_of_the_rust_structs() {
             assert_struct(&module, &what, id, name);
             seen.insert(name);
             if name == "Material" {
-                // The last members are structs themselves.
-                let texture_use = module.structs[&id][module.structs[&id].len() - 1];
+                // The last members before the padding are structs themselves.
+                let texture_use = module.structs[&id][module.structs[&id].len() - 2];
                 assert_struct(&module, &what, texture_use, "TextureUse");
                 seen.insert("TextureUse");
             }
@@ -120,7 +128,7 @@ fn offsets_and_strides_are_those_of_the_rust_structs() {
 #[test]
 fn a_wrong_offset_is_found() {
     // The test above must be able to fail: move one member of one struct in a copy of a shader.
-    let mut words: Vec<u8> = crate::COMPENSATE.spirv.to_vec();
+    let mut words: Vec<u8> = crate::COMPENSATE_STORAGE.spirv.to_vec();
     let module = parse(&words);
     let (&(id, member), &offset) =
         module.offsets.iter().filter(|(_, o)| **o > 0).min_by_key(|(k, _)| **k).expect("members");

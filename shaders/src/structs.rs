@@ -16,6 +16,15 @@ macro_rules! gpu_structs {
             #[derive(Clone, Copy, Debug, PartialEq, Pod, Zeroable)]
             pub struct $name { $($(#[$fdoc])* pub $field: $ty,)* }
         )*
+        $(
+            impl $name {
+                /// The GLSL that makes one of the words of the rows r0, r1, ... that begin with `word`.
+                pub fn read_members(word: &mut usize) -> String {
+                    let members = [$(<$ty as GlslType>::read(word)),*];
+                    format!("{}({})", stringify!($name), members.join(",\n        "))
+                }
+            }
+        )*
         /// The GLSL of every struct, in order.
         pub fn glsl() -> String {
             let mut out = String::new();
@@ -170,8 +179,7 @@ gpu_structs! {
         lit: u32,
     }
 
-    /// One rigid body in the top level: twelve rows of four words, which `instance_at` of `scene.glsl` reads one by one where a texel buffer
-    /// holds them.
+    /// One rigid body in the top level.
     struct Instance {
         /// world-from-object.
         world_from_object: Rows,
@@ -205,6 +213,8 @@ gpu_structs! {
         uv: [f32; 2],
         /// Unit tangent and sign of the bitangent.
         tangent: [f32; 4],
+        /// 0.
+        reserved: [u32; 3],
     }
 
     /// Indices and material of one triangle, in BVH order.
@@ -215,6 +225,8 @@ gpu_structs! {
         material: u32,
         /// Index into the light table; `NO_LIGHT`: does not emit.
         light: u32,
+        /// 0.
+        reserved: [u32; 3],
     }
 
     /// Use of a texture; `texture == NO_TEXTURE`: none. The two rows map uv.
@@ -261,6 +273,8 @@ gpu_structs! {
         emissive_texture: TextureUse,
         /// Transmission.
         transmission_texture: TextureUse,
+        /// 0.
+        reserved: [u32; 2],
     }
 
     /// Where a texture's texels are.
@@ -413,6 +427,41 @@ pub const NOISE_FRAMES: u32 = 32;
 /// Side of the directional-albedo table.
 pub const ALBEDO_TABLE_SIZE: u32 = 32;
 
+/// A table of the scene that shaders read by `{reader}_at(i)`: elements of whole rows of four words.
+pub(crate) struct SceneTable {
+    pub name: &'static str,
+    pub binding: &'static str,
+    pub reader: &'static str,
+    pub bytes: usize,
+    pub read: String,
+}
+
+macro_rules! scene_tables {
+    ($($name:ident, $binding:literal, $reader:literal;)*) => {
+        /// What `scene_rows.glsl` is written from.
+        pub(crate) fn scene_tables() -> Vec<SceneTable> {
+            $(const { assert!(size_of::<$name>() % 16 == 0) };)*
+            vec![$(SceneTable {
+                name: stringify!($name),
+                binding: $binding,
+                reader: $reader,
+                bytes: size_of::<$name>(),
+                read: $name::read_members(&mut 0),
+            }),*]
+        }
+
+        /// Bindings of those tables: texel buffers in the shaders that were built with them.
+        pub const SCENE_TABLES: &[&str] = &[$($binding),*];
+    };
+}
+
+scene_tables! {
+    Instance, "B_INSTANCES", "instance";
+    Vertex, "B_VERTICES", "vertex";
+    TriangleRef, "B_TRIANGLE_REFS", "triangle_ref";
+    Material, "B_MATERIALS", "material";
+}
+
 /// Descriptor bindings of set 0, the same in every shader.
 pub const BINDINGS: &[(&str, u32)] = &[
     ("B_FRAME", 0),
@@ -442,5 +491,4 @@ pub const BINDINGS: &[(&str, u32)] = &[
     ("B_FILTERED", 24),
     ("B_SHOWN", 25),
     ("B_PLANES", 26),
-    ("B_INSTANCE_TEXELS", 27),
 ];

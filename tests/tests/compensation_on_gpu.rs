@@ -8,7 +8,9 @@ use dpm_host::pack::{quantise, QuantiseCounts};
 use dpm_host::reference::Sampler;
 use dpm_host::render::compensation::{real_cosine, Compensation};
 use dpm_host::render::scene_data::SceneNeeds;
-use dpm_shaders::structs::{Counters, Frame, Instance, Rows, Surface, TriangleRef, Vertex, BINDINGS, NO_HIT};
+use dpm_shaders::structs::{
+    Counters, Frame, Instance, Rows, Surface, TriangleRef, Vertex, BINDINGS, NO_HIT, SCENE_TABLES,
+};
 use dpm_tests::gpu::with_gpu;
 use std::mem::size_of;
 use std::sync::Arc;
@@ -27,21 +29,34 @@ struct Input {
     radiance: Vec<[f32; 4]>,
 }
 
-/// Runs the shader alone.
+/// Runs the shader alone, both ways in which it reads the scene: they agree.
 fn on_gpu(gpu: &Arc<Gpu>, input: &Input) -> (Vec<u32>, Counters) {
+    let [storage, texel] = [false, true].map(|texel| on_gpu_through(gpu, input, texel));
+    assert!(storage.0 == texel.0, "codes depend on how the scene is read");
+    assert_eq!(storage.1, texel.1);
+    storage
+}
+
+/// Runs the shader alone. `texel`: the one that reads the scene through texel buffers.
+fn on_gpu_through(gpu: &Arc<Gpu>, input: &Input, texel: bool) -> (Vec<u32>, Counters) {
     let uploaded = |what: &str, bytes: &[u8]| {
         let mut buffer = Buffer::new(gpu, what, bytes.len(), MemoryKind::Upload).unwrap();
+        buffer.bytes_mut()[..bytes.len()].copy_from_slice(bytes);
+        buffer
+    };
+    let rows = |what: &str, bytes: &[u8]| {
+        let mut buffer = Buffer::new_texels(gpu, what, bytes.len() / 16, false, MemoryKind::Upload).unwrap();
         buffer.bytes_mut()[..bytes.len()].copy_from_slice(bytes);
         buffer
     };
     let tiles: Vec<u32> = (0..WIDTH.div_ceil(16) * HEIGHT.div_ceil(16)).collect();
     let device = |what, bytes| Buffer::new(gpu, what, bytes, MemoryKind::Device).unwrap();
     let host = |what, bytes| Buffer::new(gpu, what, bytes, MemoryKind::Readback).unwrap();
-    let unused = uploaded("unused", &[0; 16]);
+    let unused = rows("unused", &[0; 16]);
     let frame = uploaded("frame", bytemuck::bytes_of(&input.frame));
-    let instances = uploaded("instances", bytemuck::cast_slice(&input.instances));
-    let refs = uploaded("refs", bytemuck::cast_slice(&input.refs));
-    let vertices = uploaded("vertices", bytemuck::cast_slice(&input.vertices));
+    let instances = rows("instances", bytemuck::cast_slice(&input.instances));
+    let refs = rows("refs", bytemuck::cast_slice(&input.refs));
+    let vertices = rows("vertices", bytemuck::cast_slice(&input.vertices));
     let surfaces = uploaded("surfaces", bytemuck::cast_slice(&input.surfaces));
     let radiance = uploaded("radiance", bytemuck::cast_slice(&input.radiance));
     let tile_list = uploaded("tiles", bytemuck::cast_slice(&tiles));
@@ -49,10 +64,17 @@ fn on_gpu(gpu: &Arc<Gpu>, input: &Input) -> (Vec<u32>, Counters) {
     let counters = device("counters", size_of::<Counters>());
     let codes_host = host("codes", PIXELS * 4);
     let counters_host = host("counters", size_of::<Counters>());
-    let kinds: Vec<_> = BINDINGS.iter().map(|&(_, binding)| (binding, BindingKind::Storage)).collect();
+    let kinds: Vec<_> = BINDINGS
+        .iter()
+        .map(|&(name, binding)| {
+            let of_rows = texel && SCENE_TABLES.contains(&name);
+            (binding, if of_rows { BindingKind::Texel } else { BindingKind::Storage })
+        })
+        .collect();
     let table = BindingTable::new(gpu, &kinds).unwrap();
     let constants = SceneNeeds::default().everything().constants();
-    let pipeline = ComputePipeline::new(&table, dpm_shaders::COMPENSATE, &constants).unwrap();
+    let shader = if texel { dpm_shaders::COMPENSATE_TEXEL } else { dpm_shaders::COMPENSATE_STORAGE };
+    let pipeline = ComputePipeline::new(&table, shader, &constants).unwrap();
     let buffers: Vec<(u32, &Buffer)> = BINDINGS
         .iter()
         .map(|&(name, binding)| {

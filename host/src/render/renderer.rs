@@ -197,12 +197,13 @@ impl Renderer {
             needs = needs.everything();
         }
         use BindingKind::{Storage, Texel};
-        let bvh = if texel { Texel } else { Storage };
+        let scene_kind = if texel { Texel } else { Storage };
         let kinds: Vec<_> = gpu_structs::BINDINGS
             .iter()
             .map(|&(name, binding)| {
                 let kind = match name {
-                    "B_NODES" | "B_TRIANGLES" | "B_INSTANCE_TEXELS" => bvh,
+                    "B_NODES" | "B_TRIANGLES" => scene_kind,
+                    table if gpu_structs::SCENE_TABLES.contains(&table) => scene_kind,
                     _ => Storage,
                 };
                 (binding, kind)
@@ -222,7 +223,10 @@ impl Renderer {
         let only = |wanted: bool, shader| wanted.then(|| pipeline(shader)).transpose();
         let pipelines = Pipelines {
             primary: pipeline(pick(dpm_shaders::PRIMARY_TEXEL, dpm_shaders::PRIMARY_STORAGE))?,
-            reproject: only(method.needs_history(), dpm_shaders::REPROJECT)?,
+            reproject: only(
+                method.needs_history(),
+                pick(dpm_shaders::REPROJECT_TEXEL, dpm_shaders::REPROJECT_STORAGE),
+            )?,
             rate_map: only(
                 method.needs_rates() || keep.rate_map && method.needs_history(),
                 dpm_shaders::RATE_MAP,
@@ -231,7 +235,7 @@ impl Renderer {
             trace: pipeline(pick(dpm_shaders::TRACE_TEXEL, dpm_shaders::TRACE_STORAGE))?,
             accumulate: only(method.needs_history(), dpm_shaders::ACCUMULATE)?,
             spatial: only(method.needs_spatial(), dpm_shaders::SPATIAL)?,
-            compensate: pipeline(dpm_shaders::COMPENSATE)?,
+            compensate: pipeline(pick(dpm_shaders::COMPENSATE_TEXEL, dpm_shaders::COMPENSATE_STORAGE))?,
             pack: (settings.output.schedule())
                 .map(|schedule| {
                     let constants = pack::gpu::constants(settings.raster, schedule);
@@ -355,7 +359,7 @@ impl Renderer {
         let s = &self.scene;
         let buffer_of = |name: &str| match name {
             "B_FRAME" => &frame,
-            "B_INSTANCES" | "B_INSTANCE_TEXELS" => &instances,
+            "B_INSTANCES" => &instances,
             "B_NODES" => &s.nodes,
             "B_TRIANGLES" => &s.triangles,
             "B_TRIANGLE_REFS" => &s.refs,

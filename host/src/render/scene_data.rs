@@ -306,6 +306,7 @@ impl SceneData {
                 normal_texture: texture_use(m.normal_texture),
                 emissive_texture: texture_use(m.emissive_texture),
                 transmission_texture: texture_use(m.transmission_texture),
+                reserved: [0; 2],
             });
         }
     }
@@ -359,6 +360,7 @@ impl SceneData {
                 normal: mesh.normals[i].into(),
                 uv: mesh.uvs[i].into(),
                 tangent: mesh.tangents[i].into(),
+                reserved: [0; 3],
             });
         }
         let mut emitter_of = std::collections::HashMap::new();
@@ -385,7 +387,12 @@ impl SceneData {
                     (self.lights.len() - 1) as u32
                 });
             }
-            self.refs.push(TriangleRef { vertices: corners.map(|v| v + vertex_base), material, light });
+            self.refs.push(TriangleRef {
+                vertices: corners.map(|v| v + vertex_base),
+                material,
+                light,
+                reserved: [0; 3],
+            });
         }
         self.nodes.extend_from_slice(&bvh.nodes);
         Ok(())

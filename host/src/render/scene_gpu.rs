@@ -2,6 +2,7 @@
 
 use super::scene_data::SceneData;
 use crate::gpu::{Buffer, Gpu, GpuError};
+use bytemuck::cast_slice;
 use std::sync::Arc;
 
 /// The buffers of one scene; immutable after creation.
@@ -19,28 +20,28 @@ pub struct SceneGpu {
 }
 
 impl SceneGpu {
-    /// Uploads `data`. `texel_bvh`: nodes and triangles through texel buffers.
+    /// Uploads `data`. `texel`: geometry and materials through texel buffers.
     ///
     /// # Errors
     /// Out of memory or beyond the device's limits.
-    pub fn new(gpu: &Arc<Gpu>, data: &SceneData, texel_bvh: bool) -> Result<Self, GpuError> {
+    pub fn new(gpu: &Arc<Gpu>, data: &SceneData, texel: bool) -> Result<Self, GpuError> {
         // Buffers cannot be empty; one element of padding is never read.
         let empty = [[0u32; 4]; 5];
         let nodes = if data.nodes.is_empty() { &empty[..] } else { &data.nodes };
         let triangles = if data.triangles.is_empty() { &empty[..] } else { &data.triangles };
-        let bvh = |what, words: &[[u32; 4]], float| {
-            if texel_bvh {
+        let rows = |what, words: &[[u32; 4]], float| {
+            if texel {
                 Buffer::texels(gpu, what, words, float)
             } else {
                 Buffer::from_slice(gpu, what, words)
             }
         };
         Ok(Self {
-            nodes: bvh("BVH nodes", nodes, false)?,
-            triangles: bvh("triangles", triangles, true)?,
-            refs: Buffer::from_slice(gpu, "triangle indices", &data.refs)?,
-            vertices: Buffer::from_slice(gpu, "vertices", &data.vertices)?,
-            materials: Buffer::from_slice(gpu, "materials", &data.materials)?,
+            nodes: rows("BVH nodes", nodes, false)?,
+            triangles: rows("triangles", triangles, true)?,
+            refs: rows("triangle indices", cast_slice(&data.refs), false)?,
+            vertices: rows("vertices", cast_slice(&data.vertices), false)?,
+            materials: rows("materials", cast_slice(&data.materials), false)?,
             textures: Buffer::from_slice(gpu, "texture table", &data.textures)?,
             texels: Buffer::from_slice(gpu, "textures", &data.texels)?,
             lights: Buffer::from_slice(gpu, "lights", &data.lights)?,

@@ -1,4 +1,4 @@
-//! Writes `glsl/generated.glsl`, compiles every shader with `glslc`, and records the hash of the sources.
+//! Writes `glsl/generated.glsl` and `glsl/scene_rows.glsl`, compiles every shader with `glslc`, and records the hash of the sources.
 //!
 //! Run as `cargo run -p dpm-shaders --bin build-shaders` after any change under `shaders/`.
 
@@ -7,16 +7,18 @@ use std::process::{Command, ExitCode};
 
 /// Output stem, source, extra defines.
 const VARIANTS: &[(&str, &str, &[&str])] = &[
-    ("primary.texel", "primary.comp", &["-DBVH_TEXEL"]),
+    ("primary.texel", "primary.comp", &["-DSCENE_TEXELS"]),
     ("primary.storage", "primary.comp", &[]),
-    ("trace.texel", "trace.comp", &["-DBVH_TEXEL"]),
+    ("trace.texel", "trace.comp", &["-DSCENE_TEXELS"]),
     ("trace.storage", "trace.comp", &[]),
-    ("reproject", "reproject.comp", &[]),
+    ("reproject.texel", "reproject.comp", &["-DSCENE_TEXELS"]),
+    ("reproject.storage", "reproject.comp", &[]),
     ("rate_map", "rate_map.comp", &[]),
     ("schedule", "schedule.comp", &[]),
     ("accumulate", "accumulate.comp", &[]),
     ("spatial", "spatial.comp", &[]),
-    ("compensate", "compensate.comp", &[]),
+    ("compensate.texel", "compensate.comp", &["-DSCENE_TEXELS"]),
+    ("compensate.storage", "compensate.comp", &[]),
     ("pack", "pack.comp", &[]),
 ];
 
@@ -26,6 +28,8 @@ fn main() -> ExitCode {
     let spv = root.join("spv");
     std::fs::write(glsl.join("generated.glsl"), dpm_shaders::generate::generated_glsl())
         .expect("write generated.glsl");
+    std::fs::write(glsl.join("scene_rows.glsl"), dpm_shaders::generate::scene_rows_glsl())
+        .expect("write scene_rows.glsl");
     std::fs::create_dir_all(&spv).expect("create spv");
     for (stem, source, defines) in VARIANTS {
         let output = spv.join(format!("{stem}.spv"));
