@@ -19,7 +19,8 @@ const BLOCK_PIXELS: usize = 512;
 /// Bytes of a block in each plane: a whole cache line.
 const BLOCK_BYTES: usize = BLOCK_PIXELS / 8;
 /// Bytes of a batch in each plane. Planes of 1024 x 768 lie exactly 24 x 4 KiB apart, so lines at the same place of all
-/// planes compete for one set of the first-level cache: several neighbours written in a row spread over as many sets.
+/// planes compete for one set of the first-level cache, which holds eight or twelve of them: several neighbours written in a row
+/// spread over as many sets, and no more than eight planes are written in turn.
 const BATCH_BYTES: usize = 8 * BLOCK_BYTES;
 /// Bit planes that code values hold: 8 bits of red, green and blue.
 const CODE_BITS: usize = 24;
@@ -27,6 +28,18 @@ const CODE_BITS: usize = 24;
 /// A batch's bits: for each bit of the code value a stretch of its plane.
 #[repr(align(64))]
 struct Batch([[u8; BATCH_BYTES]; CODE_BITS]);
+
+/// Where a kernel puts the bits of a batch, for each bit of the code value: in a [`Batch`] or in the planes themselves.
+type Targets<'a> = [&'a mut [u8; BATCH_BYTES]; CODE_BITS];
+
+/// Where whole batches go.
+#[derive(Clone, Copy, PartialEq, Eq)]
+enum Way {
+    /// Into the planes at once: for kernels that write few planes in turn, a stretch of each.
+    Direct,
+    /// By way of a [`Batch`] in the first-level cache: for kernels that write a line of every plane.
+    Collected,
+}
 
 /// A way to pack, chosen by what the CPU can do.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, serde::Serialize)]
@@ -121,15 +134,14 @@ pub fn unpack(frame: &BitPlaneFrame, codes: &mut [u32]) {
     }
 }
 
-/// Packs runs of pixels by `kernel`. Rows that end on a byte are one long run; other rows are a run each.
-///
-/// A batch of blocks is packed into a buffer that stays in the first-level cache, then each plane gets its part of the
-/// batch in one piece.
+/// Packs runs of pixels by `kernel`, which takes blocks and puts their bits at an offset in the targets. Rows that end on a byte
+/// are one long run; other rows are a run each.
 #[inline(always)]
 fn pack_blocks(
     codes: &[u32],
     frame: &mut BitPlaneFrame,
-    kernel: impl Fn(&[u32; BLOCK_PIXELS], &mut Batch, usize),
+    way: Way,
+    mut kernel: impl FnMut(&[[u32; BLOCK_PIXELS]], &mut Targets<'_>, usize),
 ) {
     let raster = frame.raster();
     let width = raster.width() as usize;
@@ -140,27 +152,47 @@ fn pack_blocks(
     };
     let (bits, plane_bytes) = (frame.source_bits(), raster.plane_bytes());
     let bits = &bits[..frame.schedule().len()];
+    // Of several planes that show one bit, the others are copies of the first.
+    let first: [Option<usize>; CODE_BITS] =
+        std::array::from_fn(|bit| bits.iter().position(|&b| usize::from(b) == bit));
     let bytes = frame.bytes_mut();
     let mut batch = Batch([[0; BATCH_BYTES]; CODE_BITS]);
     for (run, pixels) in codes.chunks_exact(run_pixels).enumerate() {
         for (i, pixels) in pixels.chunks(8 * BATCH_BYTES).enumerate() {
-            let (whole, rest) = pixels.as_chunks::<BLOCK_PIXELS>();
-            for (block, pixels) in whole.iter().enumerate() {
-                kernel(pixels, &mut batch, BLOCK_BYTES * block);
+            let at = run * run_bytes + i * BATCH_BYTES;
+            let count = pixels.len().div_ceil(8);
+            let direct = way == Way::Direct && count == BATCH_BYTES;
+            let mut targets = batch.0.each_mut();
+            if direct {
+                for (p, plane) in bytes.chunks_exact_mut(plane_bytes).enumerate() {
+                    let bit = usize::from(bits[p]);
+                    if let (true, Ok(stretch)) =
+                        (first[bit] == Some(p), (&mut plane[at..at + count]).try_into())
+                    {
+                        targets[bit] = stretch;
+                    }
+                }
             }
+            let (whole, rest) = pixels.as_chunks::<BLOCK_PIXELS>();
+            kernel(whole, &mut targets, 0);
             if !rest.is_empty() {
                 let mut padded = [0; BLOCK_PIXELS];
                 padded[..rest.len()].copy_from_slice(rest);
-                kernel(&padded, &mut batch, BLOCK_BYTES * whole.len());
+                kernel(&[padded], &mut targets, BLOCK_BYTES * whole.len());
             }
-            let at = run * run_bytes + i * BATCH_BYTES;
-            let count = pixels.len().div_ceil(8);
-            for (plane, &bit) in bytes.chunks_exact_mut(plane_bytes).zip(bits) {
-                let target = &mut plane[at..at + count];
-                match <&mut [u8; BATCH_BYTES]>::try_from(&mut *target) {
-                    // A copy of known length is a few instructions.
-                    Ok(whole) => *whole = batch.0[bit as usize],
-                    Err(_) => target.copy_from_slice(&batch.0[bit as usize][..count]),
+            for (p, &bit) in bits.iter().enumerate() {
+                let bit = usize::from(bit);
+                let to = p * plane_bytes + at;
+                match first[bit] {
+                    Some(f) if direct && f == p => {}
+                    Some(f) if direct => {
+                        bytes.copy_within(f * plane_bytes + at..f * plane_bytes + at + count, to)
+                    }
+                    _ => match <&mut [u8; BATCH_BYTES]>::try_from(&mut bytes[to..to + count]) {
+                        // A copy of known length is a few instructions.
+                        Ok(whole) => *whole = batch.0[bit],
+                        Err(_) => bytes[to..to + count].copy_from_slice(&batch.0[bit][..count]),
+                    },
                 }
             }
         }

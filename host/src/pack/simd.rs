@@ -2,7 +2,7 @@
 #![allow(unsafe_code)]
 
 use super::quantise::{quantise_scalar, QuantiseCounts, ROUND};
-use super::{pack_blocks, Batch, BitPlaneFrame, BLOCK_BYTES, BLOCK_PIXELS, CODE_BITS};
+use super::{pack_blocks, BitPlaneFrame, Targets, Way, BATCH_BYTES, BLOCK_BYTES, BLOCK_PIXELS, CODE_BITS};
 use std::arch::x86_64::*;
 
 pub(super) fn has_avx2() -> bool {
@@ -36,34 +36,56 @@ pub(super) fn pack_avx512(codes: &[u32], frame: &mut BitPlaneFrame) {
 
 #[target_feature(enable = "avx2")]
 fn pack_with_avx2(codes: &[u32], frame: &mut BitPlaneFrame) {
-    pack_blocks(codes, frame, |pixels, batch, at| block_avx2(pixels, batch, at));
+    let mut rests = Rests([[[_mm256_setzero_si256(); 4]; GROUPS]; CODE_BITS / 8]);
+    pack_blocks(codes, frame, Way::Direct, |blocks, targets, at| {
+        blocks_avx2(blocks, &mut rests, targets, at)
+    });
 }
 
 #[target_feature(enable = "avx512f,avx512bw,avx512vbmi,gfni")]
 fn pack_with_avx512(codes: &[u32], frame: &mut BitPlaneFrame) {
-    pack_blocks(codes, frame, |pixels, batch, at| block_avx512(pixels, batch, at));
+    pack_blocks(codes, frame, Way::Collected, |blocks, targets, at| {
+        for (i, pixels) in blocks.iter().enumerate() {
+            block_avx512(pixels, targets, at + BLOCK_BYTES * i);
+        }
+    });
 }
 
-/// 256 pixels at a time. Pixels whose numbers leave the same rest by 8 come into one register, a byte each, one set of eight
-/// registers for each channel; then bits and registers change places (8 x 8 bits across the registers, 32 of them side by side
-/// [HackersDelight] 7-3), and each register is 32 bytes of a plane. No `movemask`: it passes one register a cycle, shifts several.
+/// Pixels that [`gather_rests`] takes.
+const GROUP_PIXELS: usize = 128;
+/// Such groups in a batch.
+const GROUPS: usize = 8 * BATCH_BYTES / GROUP_PIXELS;
+
+/// A batch's pixels, sorted: for each channel, group and rest by 4 the register of [`gather_rests`]. 12 KiB.
+struct Rests([[[__m256i; 4]; GROUPS]; CODE_BITS / 8]);
+
+/// Pixels whose numbers leave the same rest by 8 come into one register, a byte each, one set of eight registers for each channel;
+/// then bits and registers change places (8 x 8 bits across the registers, 32 of them side by side [HackersDelight] 7-3), and each
+/// register is 32 bytes of a plane. No `movemask`: it passes one register a cycle, shifts several. All pixels are sorted before
+/// the first bits move, since the registers do not hold both, and then only eight planes are written in turn.
 #[inline]
 #[target_feature(enable = "avx2")]
-fn block_avx2(pixels: &[u32; BLOCK_PIXELS], batch: &mut Batch, at: usize) {
-    for (part, pixels) in pixels.as_chunks::<256>().0.iter().enumerate() {
-        let (first, second) = pixels.split_at(128);
-        let (first, second) = (gather_rests(first), gather_rests(second));
-        for (channel, (first, second)) in first.iter().zip(&second).enumerate() {
-            let mut rests = [_mm256_setzero_si256(); 8];
+fn blocks_avx2(blocks: &[[u32; BLOCK_PIXELS]], rests: &mut Rests, targets: &mut Targets<'_>, at: usize) {
+    let pixels = blocks.as_flattened().as_chunks::<GROUP_PIXELS>().0;
+    for (group, pixels) in pixels.iter().enumerate() {
+        for (rests, registers) in rests.0.iter_mut().zip(gather_rests(pixels)) {
+            rests[group] = registers;
+        }
+    }
+    for (rests, targets) in rests.0.iter().zip(targets.as_chunks_mut::<8>().0) {
+        let pairs = rests[..pixels.len()].as_chunks::<2>().0;
+        for (pair, [first, second]) in pairs.iter().enumerate() {
+            let mut eight = [_mm256_setzero_si256(); 8];
             for k in 0..4 {
                 // The last rest first: bit 7 of a plane's byte is the leftmost pixel.
-                rests[7 - k] = _mm256_permute2x128_si256::<0x20>(first[k], second[k]);
-                rests[3 - k] = _mm256_permute2x128_si256::<0x31>(first[k], second[k]);
+                eight[7 - k] = _mm256_permute2x128_si256::<0x20>(first[k], second[k]);
+                eight[3 - k] = _mm256_permute2x128_si256::<0x31>(first[k], second[k]);
             }
-            for (bit, bytes) in transpose_bits(rests).into_iter().enumerate() {
-                let plane = &mut batch.0[8 * channel + bit][at + 32 * part..at + 32 * part + 32];
+            let at = at + 32 * pair;
+            for (target, bytes) in targets.iter_mut().zip(transpose_bits(eight)) {
+                let target = &mut target[at..at + 32];
                 // SAFETY: the slice has 32 bytes; the store needs no alignment.
-                unsafe { _mm256_storeu_si256(plane.as_mut_ptr().cast(), bytes) };
+                unsafe { _mm256_storeu_si256(target.as_mut_ptr().cast(), bytes) };
             }
         }
     }
@@ -73,7 +95,7 @@ fn block_avx2(pixels: &[u32; BLOCK_PIXELS], batch: &mut Batch, at: usize) {
 /// lower half, those with rest `k + 4` in its upper half. Only interleavings, so that no shift and no mask is needed.
 #[inline]
 #[target_feature(enable = "avx2")]
-fn gather_rests(pixels: &[u32]) -> [[__m256i; 4]; CODE_BITS / 8] {
+fn gather_rests(pixels: &[u32; GROUP_PIXELS]) -> [[__m256i; 4]; CODE_BITS / 8] {
     let mut fours = [[_mm256_setzero_si256(); 4]; 4];
     for (four, pixels) in fours.iter_mut().zip(pixels.as_chunks::<32>().0) {
         let load = |i: usize| {
@@ -160,7 +182,7 @@ static TRANSPOSE_BYTES: [u8; 64] = transposed_bytes();
 /// by a permutation; after eight such steps 8 x 8 quadwords, which makes a whole line of each plane.
 #[inline]
 #[target_feature(enable = "avx512f,avx512bw,avx512vbmi,gfni")]
-fn block_avx512(pixels: &[u32; BLOCK_PIXELS], batch: &mut Batch, at: usize) {
+fn block_avx512(pixels: &[u32; BLOCK_PIXELS], targets: &mut Targets<'_>, at: usize) {
     let (red_green, blue_twice) = (load_bytes(&RED_GREEN), load_bytes(&BLUE_TWICE));
     let transpose = load_bytes(&TRANSPOSE_BYTES);
     // Byte i of the affine product takes bit i of every byte of the matrix, the matrix's first byte into bit 7.
@@ -190,7 +212,7 @@ fn block_avx512(pixels: &[u32; BLOCK_PIXELS], batch: &mut Batch, at: usize) {
     for (channel, rows) in rows.iter().enumerate() {
         let columns = transpose_quadwords(rows);
         for (bit, line) in columns.into_iter().enumerate() {
-            let plane = &mut batch.0[8 * channel + bit][at..at + BLOCK_BYTES];
+            let plane = &mut targets[8 * channel + bit][at..at + BLOCK_BYTES];
             // SAFETY: the slice has 64 bytes; the store needs no alignment.
             unsafe { _mm512_storeu_si512(plane.as_mut_ptr().cast(), line) };
         }
