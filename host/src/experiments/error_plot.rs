@@ -2,9 +2,9 @@
 
 use super::error_figure3::{looks, Figure3Group, Figure3Row};
 use super::error_runs::{ErrorRow, GroupResult};
-use crate::telemetry::plots::{color, SIZE};
+use super::stamp::Stamp;
+use crate::telemetry::plots::{color, key, Stroke, SIZE};
 use plotters::coord::combinators::{LogCoord, WithKeyPoints};
-use plotters::element::DashedPathElement;
 use plotters::prelude::*;
 
 /// One frame at 947 fps, ms: what the rig allows.
@@ -56,17 +56,6 @@ fn axis((low, high): (f64, f64)) -> WithKeyPoints<LogCoord<f64>> {
     (low..high).log_scale().with_key_points(ticks(low, high))
 }
 
-/// How a curve is drawn.
-#[derive(Clone, Copy)]
-enum Stroke {
-    /// Points joined by a line.
-    Measured,
-    /// The same, dashed and without points.
-    Dashed,
-    /// A plain line of this width.
-    Plain(u32),
-}
-
 /// A curve with its name in the key.
 struct Curve {
     name: String,
@@ -83,6 +72,14 @@ fn range(values: impl Iterator<Item = f64>) -> (f64, f64) {
     } else {
         (0.1, 10.0)
     }
+}
+
+/// What a plot shows, on which devices and rasters.
+fn title<'a>(what: &str, stamps: impl Iterator<Item = &'a Stamp>) -> String {
+    let mut all: Vec<String> =
+        stamps.map(|s| format!("{}, {} x {}", s.device, s.raster[0], s.raster[1])).collect();
+    all.dedup();
+    format!("{what}: {}", all.join("; "))
 }
 
 /// Perceived error against cost, both axes logarithmic, a curve a method, the Pareto front in grey, and for times one frame's 1.056 ms.
@@ -114,7 +111,7 @@ pub fn curves(groups: &[GroupResult], moving: bool, cost: Cost) -> Result<String
         name: (*name).to_owned(),
         points: rows.iter().filter(|r| r.method == *name).map(|r| point(r)).collect(),
         color: color(i),
-        stroke: Stroke::Measured,
+        stroke: Stroke::Marked(2),
     }));
     if cost == Cost::GpuMs {
         x = (x.0.min(0.8 * FRAME_MS), x.1.max(1.25 * FRAME_MS));
@@ -126,7 +123,14 @@ pub fn curves(groups: &[GroupResult], moving: bool, cost: Cost) -> Result<String
         });
     }
     let x_name = if cost == Cost::Rays { "rays a frame" } else { "GPU time of a frame, ms" };
-    draw([x_name, "perceived RMSE"], (x, y), drawn).map_err(|e| e.to_string())
+    let motion = if moving { "moving" } else { "standing" };
+    draw(
+        &title(&format!("bodies {motion}"), groups.iter().map(|g| &g.stamp)),
+        [x_name, "perceived RMSE"],
+        (x, y),
+        drawn,
+    )
+    .map_err(|e| e.to_string())
 }
 
 /// Perceived error by mean radiance against samples a pixel, both logarithmic: a colour a material, dashed when standing.
@@ -143,15 +147,17 @@ pub fn figure3(groups: &[Figure3Group]) -> Result<String, String> {
             name: format!("{}, {}", look.name, if moving { "moving" } else { "still" }),
             points: rows().filter(|r| r.material == look.name && r.moving == moving).map(point).collect(),
             color: color(i),
-            stroke: if moving { Stroke::Measured } else { Stroke::Dashed },
+            stroke: if moving { Stroke::Marked(2) } else { Stroke::Dashed(2) },
         })
     });
     let names = ["samples a pixel and frame", "perceived RMSE / mean radiance"];
-    draw(names, ranges, drawn.collect()).map_err(|e| e.to_string())
+    let title = title("one body in four materials", groups.iter().map(|g| &g.stamp));
+    draw(&title, names, ranges, drawn.collect()).map_err(|e| e.to_string())
 }
 
-/// Curves over two logarithmic axes, with a key.
+/// Curves over two logarithmic axes, with a key beside them.
 fn draw(
+    title: &str,
     [x_name, y_name]: [&str; 2],
     (x, y): ((f64, f64), (f64, f64)),
     curves: Vec<Curve>,
@@ -160,8 +166,11 @@ fn draw(
     {
         let root = SVGBackend::with_string(&mut text, SIZE).into_drawing_area();
         root.fill(&WHITE)?;
-        let mut chart = ChartBuilder::on(&root)
+        let named: Vec<_> = curves.iter().map(|c| (c.name.as_str(), c.color, c.stroke)).collect();
+        let area = key(&root, &named)?;
+        let mut chart = ChartBuilder::on(&area)
             .margin(16)
+            .caption(title, ("sans-serif", 15))
             .x_label_area_size(40)
             .y_label_area_size(80)
             .build_cartesian_2d(axis(x), axis(y))?;
@@ -173,33 +182,18 @@ fn draw(
             .y_label_formatter(&label)
             .light_line_style(WHITE)
             .draw()?;
-        for Curve { name, mut points, color, stroke } in curves {
+        for Curve { mut points, color, stroke, .. } in curves {
             points.sort_by(|a, b| a.0.total_cmp(&b.0));
-            let key = |(x, y): (i32, i32)| [(x, y), (x + 16, y)];
             match stroke {
-                Stroke::Measured | Stroke::Plain(_) => {
-                    let (width, size) = if let Stroke::Plain(w) = stroke { (w, 0) } else { (2, 4) };
-                    let style = color.stroke_width(width);
-                    chart
-                        .draw_series(LineSeries::new(points, style).point_size(size))?
-                        .label(name)
-                        .legend(move |at| PathElement::new(key(at), style));
+                Stroke::Plain(w) | Stroke::Marked(w) => {
+                    let size = if stroke == Stroke::Marked(w) { 4 } else { 0 };
+                    chart.draw_series(LineSeries::new(points, color.stroke_width(w)).point_size(size))?;
                 }
-                Stroke::Dashed => {
-                    let style = color.stroke_width(2);
-                    chart
-                        .draw_series(DashedLineSeries::new(points, 6, 4, style))?
-                        .label(name)
-                        .legend(move |at| DashedPathElement::new(key(at), 4, 3, style));
+                Stroke::Dashed(w) => {
+                    chart.draw_series(DashedLineSeries::new(points, 6, 4, color.stroke_width(w)))?;
                 }
             }
         }
-        chart
-            .configure_series_labels()
-            .position(SeriesLabelPosition::UpperRight)
-            .background_style(WHITE)
-            .border_style(BLACK)
-            .draw()?;
         root.present()?;
     }
     Ok(text)

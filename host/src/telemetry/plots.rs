@@ -1,7 +1,9 @@
-//! Distributions and series into SVG plots.
+//! Distributions into SVG plots, and the key that every plot has.
 
 use super::interval::{Interval, IntervalKind};
 use super::profile::Profiler;
+use plotters::coord::Shift;
+use plotters::element::DashedPathElement;
 use plotters::prelude::*;
 use plotters::style::text_anchor::{HPos, Pos, VPos};
 
@@ -18,10 +20,6 @@ pub struct PlotError {
 /// Pixels of every plot.
 pub const SIZE: (u32, u32) = (960, 540);
 
-fn failed<E: std::fmt::Display>(what: &'static str) -> impl Fn(E) -> PlotError {
-    move |e| PlotError { what, reason: e.to_string() }
-}
-
 /// The `i`th curve's colour.
 pub fn color(i: usize) -> RGBColor {
     // Okabe and Ito's colours, told apart by all kinds of eyes.
@@ -37,12 +35,52 @@ pub fn color(i: usize) -> RGBColor {
     COLORS[i % COLORS.len()]
 }
 
-/// A curve with a name.
-type Curve = (String, Vec<(f64, f64)>);
+/// How a curve is drawn, on the chart and in its key.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Stroke {
+    /// A line of this width.
+    Plain(u32),
+    /// The same with its points marked.
+    Marked(u32),
+    /// Dashed.
+    Dashed(u32),
+}
+
+/// Room for the key beside a chart, pixels.
+const KEY_WIDTH: u32 = 190;
+
+/// Names of curves with a piece of each, below each other beside the chart, where they cover none of it. Returns what is left for the chart.
+///
+/// # Errors
+/// What the drawing library says.
+pub fn key<B: DrawingBackend>(
+    root: &DrawingArea<B, Shift>,
+    curves: &[(&str, RGBColor, Stroke)],
+) -> Result<DrawingArea<B, Shift>, DrawingAreaErrorKind<B::ErrorType>> {
+    let (chart, beside) = root.split_horizontally(SIZE.0 - KEY_WIDTH);
+    let font = ("sans-serif", 13).into_text_style(&beside).pos(Pos::new(HPos::Left, VPos::Center));
+    for (i, (name, color, stroke)) in curves.iter().enumerate() {
+        let y = 56 + 20 * i as i32;
+        let (from, to) = ((4, y), (28, y));
+        match *stroke {
+            Stroke::Plain(width) | Stroke::Marked(width) => {
+                beside.draw(&PathElement::new([from, to], color.stroke_width(width)))?;
+            }
+            Stroke::Dashed(width) => {
+                beside.draw(&DashedPathElement::new([from, to], 6, 4, color.stroke_width(width)))?;
+            }
+        }
+        beside.draw_text(name, &font, (36, y))?;
+    }
+    Ok(chart)
+}
 
 /// Latency against percentile for every interval of a kind, with the axis stretched towards the rare: one decade per nine.
+///
+/// # Errors
+/// What the drawing library says.
 pub fn percentiles(profiler: &Profiler, kind: IntervalKind) -> Result<String, PlotError> {
-    let curves: Vec<Curve> = Interval::ALL
+    let curves: Vec<(&str, Vec<(f64, f64)>)> = Interval::ALL
         .into_iter()
         .filter(|i| i.kind() == kind && !profiler.histogram(*i).is_empty())
         .map(|interval| {
@@ -51,59 +89,42 @@ pub fn percentiles(profiler: &Profiler, kind: IntervalKind) -> Result<String, Pl
                 let nines = f64::from(i) * 0.05;
                 (nines, h.value_at_quantile(1.0 - 10f64.powf(-nines)) as f64 * 1e-6)
             });
-            (interval.name().to_owned(), points.collect())
+            (interval.name(), points.collect())
         })
         .collect();
-    let nines = |x: &f64| format!("{} %", 100.0 - 100.0 * 10f64.powf(-x));
-    lines("percentiles", "share of frames", "ms", &curves, &nines)
+    draw(&curves).map_err(|e| PlotError { what: "percentiles", reason: e.to_string() })
 }
 
-/// Values over time (seconds): registration error, motion-to-light and the like.
-pub fn series(title: &'static str, unit: &str, curves: &[Curve]) -> Result<String, PlotError> {
-    lines(title, "s", unit, curves, &|x| format!("{x:.1}"))
-}
-
-fn lines(
-    what: &'static str,
-    x_name: &str,
-    y_name: &str,
-    curves: &[Curve],
-    x_label: &dyn Fn(&f64) -> String,
-) -> Result<String, PlotError> {
-    let all = || curves.iter().flat_map(|(_, points)| points).filter(|(x, y)| x.is_finite() && y.is_finite());
-    let x_range = all().fold((f64::INFINITY, f64::NEG_INFINITY), |(a, b), (x, _)| (a.min(*x), b.max(*x)));
-    let y_most = all().fold(0f64, |m, (_, y)| m.max(*y));
-    // Nothing to show is an empty frame, not an error.
-    let (x_from, x_to) = if x_range.0 < x_range.1 { x_range } else { (0.0, 1.0) };
-    let y_to = if y_most > 0.0 { 1.05 * y_most } else { 1.0 };
+fn draw(curves: &[(&str, Vec<(f64, f64)>)]) -> Result<String, Box<dyn std::error::Error>> {
+    let most = curves.iter().flat_map(|(_, points)| points).fold(0f64, |m, (_, y)| m.max(*y));
+    let top = if most > 0.0 { 1.05 * most } else { 1.0 };
     let mut text = String::new();
     {
         let root = SVGBackend::with_string(&mut text, SIZE).into_drawing_area();
-        root.fill(&WHITE).map_err(failed(what))?;
-        let mut chart = ChartBuilder::on(&root)
-            .margin(16)
-            .caption(what, ("sans-serif", 20))
+        root.fill(&WHITE)?;
+        let named: Vec<_> =
+            curves.iter().enumerate().map(|(i, (name, _))| (*name, color(i), Stroke::Plain(2))).collect();
+        let area = key(&root, &named)?;
+        let mut chart = ChartBuilder::on(&area)
+            .margin(24)
             .x_label_area_size(36)
             .y_label_area_size(64)
-            .build_cartesian_2d(x_from..x_to, 0.0..y_to)
-            .map_err(failed(what))?;
+            .build_cartesian_2d(0.0..5.0, 0.0..top)?;
         chart
             .configure_mesh()
-            .x_desc(x_name)
-            .y_desc(y_name)
-            .x_label_formatter(x_label)
+            .x_desc("share of frames that take no longer")
+            .y_desc("ms")
+            // At whole nines.
+            .x_labels(6)
+            .x_label_formatter(&|x: &f64| {
+                format!("{:.*} %", (*x - 2.0).max(0.0) as usize, 100.0 - 10f64.powf(2.0 - x))
+            })
             .light_line_style(WHITE)
-            .draw()
-            .map_err(failed(what))?;
-        for (i, (name, points)) in curves.iter().enumerate() {
-            let style = color(i);
-            let finite = points.iter().copied().filter(|(x, y)| x.is_finite() && y.is_finite());
-            chart.draw_series(LineSeries::new(finite, style.stroke_width(2))).map_err(failed(what))?;
-            let anchor = Pos::new(HPos::Left, VPos::Center);
-            let font = ("sans-serif", 14).into_text_style(&root).color(&style).pos(anchor);
-            root.draw_text(name, &font, (90, 56 + 18 * i as i32)).map_err(failed(what))?;
+            .draw()?;
+        for (i, (_, points)) in curves.iter().enumerate() {
+            chart.draw_series(LineSeries::new(points.iter().copied(), color(i).stroke_width(2)))?;
         }
-        root.present().map_err(failed(what))?;
+        root.present()?;
     }
     Ok(text)
 }
@@ -141,7 +162,8 @@ mod tests {
             svg.trim_end().ends_with("</svg>") && svg.contains("render") && svg.contains("99.9 %"),
             "{svg}"
         );
-        let curves = polylines(&svg);
+        let mut curves = polylines(&svg);
+        curves.retain(|c| c.len() > 2);
         assert_eq!(curves.len(), 5);
         for curve in curves {
             // Downwards on the page is less.
@@ -151,12 +173,27 @@ mod tests {
     }
 
     #[test]
-    fn empty_and_broken_series_are_drawn_without_fuss() {
-        assert!(series("registration error", "px", &[]).unwrap().contains("registration error"));
-        let curves =
-            vec![("a".to_owned(), vec![(0.0, f64::NAN), (1.0, 2.0), (2.0, 1.0), (f64::INFINITY, 3.0)])];
-        let svg = series("registration error", "px", &curves).unwrap();
-        assert_eq!(polylines(&svg)[0].len(), 2);
-        assert!(!svg.contains("NaN"));
+    fn nothing_is_an_empty_frame_and_labels_are_whole_nines() {
+        let svg = percentiles(&Profiler::new(FrameRate::new(947, 1).unwrap(), true, 100), IntervalKind::Work);
+        let svg = svg.unwrap();
+        assert!(polylines(&svg).is_empty() && !svg.contains("NaN"));
+        let labels: Vec<&str> =
+            svg.lines().map(str::trim).filter(|l| l.ends_with(" %") && !l.contains('<')).collect();
+        assert_eq!(labels, ["0 %", "90 %", "99 %", "99.9 %", "99.99 %", "99.999 %"]);
+    }
+
+    #[test]
+    fn names_stand_beside_the_chart() {
+        let mut profiler = Profiler::new(FrameRate::new(947, 1).unwrap(), true, 100);
+        (1..=20).for_each(|k| profiler.lit(&frame(k, k * 1000), k as u64, false));
+        let svg = percentiles(&profiler, IntervalKind::Work).unwrap();
+        let right = f64::from(SIZE.0 - KEY_WIDTH);
+        let (mut beside, mut on_chart) = (0, 0);
+        for curve in polylines(&svg) {
+            let on_key = curve.iter().all(|p| p.0 >= right);
+            assert!(on_key || curve.iter().all(|p| p.0 < right), "{curve:?}");
+            (beside, on_chart) = (beside + i32::from(on_key), on_chart + i32::from(!on_key));
+        }
+        assert_eq!((beside, on_chart), (5, 5));
     }
 }
