@@ -1,6 +1,7 @@
 //! What a scene does not need is compiled away. That may cost speed only: every pixel stays the same, bit for bit.
 
 use dpm_host::config::{Overrides, RenderMethod, RigConfig};
+use dpm_host::experiments::scene_plan::scene_plan;
 use dpm_host::experiments::sequence::{draw, poses_at};
 use dpm_host::experiments::stability::gpu_shot::Shot;
 use dpm_host::experiments::stability::shapes::*;
@@ -139,4 +140,45 @@ fn leaving_out_changes_no_bit_of_either_method_with_histories() {
             }
         }
     });
+}
+
+#[test]
+fn a_plan_tells_spare_code_from_parts_of_the_picture() {
+    for method in ["paper", "dpm"] {
+        let flags = ["render.software_raster=[48,36]", &format!("render.method=\"{method}\"")];
+        let overrides = Overrides { variables: vec![], flags: flags.map(str::to_owned).to_vec() };
+        let config = RigConfig::demo(&overrides).unwrap_or_else(|e| panic!("{e}"));
+        let plan = scene_plan(&config, true).unwrap_or_else(|e| panic!("{e}"));
+        let of = |feature: &str| {
+            let entry = plan.entries.iter().find(|e| e.feature == feature);
+            entry.and_then(|e| e.saving.clone()).unwrap_or_else(|| panic!("{feature} of {method}"))
+        };
+        for spare in
+            ["alpha mask", "transmission", "punctual lights", "firefly clamp", "tiles without bodies"]
+        {
+            let s = of(spare);
+            assert!(s.pixels_identical && !s.changes_pictures && s.difference == 0.0, "{spare}: {s:?}");
+            assert_eq!(s.without_rays, s.with_rays, "{spare} of {method}");
+        }
+        let parts: &[&str] = match method {
+            "dpm" => &["allocation by variance"],
+            _ => &["rate map", "checkerboard", "spp by angle", "history and reprojection"],
+        };
+        let common =
+            ["spatial filter taps", "blue noise and sequences", "temporal blending", "indirect light"];
+        for part in common.iter().chain(parts) {
+            let s = of(part);
+            assert!(s.changes_pictures && !s.pixels_identical && s.difference > 1e-4, "{part}: {s:?}");
+            assert!(s.without_ms > 0.0 && s.with_ms > 0.0 && !s.is_wrong(), "{part}: {s:?}");
+        }
+        // What traces fewer pixels traces fewer rays; filters trace none.
+        if method == "paper" {
+            assert!(of("checkerboard").with_rays < 0.8 * of("checkerboard").without_rays);
+            assert!(of("rate map").with_rays < of("rate map").without_rays);
+        }
+        assert!(of("indirect light").with_rays > of("indirect light").without_rays);
+        let taps = of("spatial filter taps");
+        assert!((taps.with_rays / taps.without_rays - 1.0).abs() < 0.02, "{taps:?}");
+        assert!(plan.together.is_some_and(|s| s.pixels_identical));
+    }
 }

@@ -2,7 +2,8 @@
 
 use super::rig_args::RigArgs;
 use super::watch::print;
-use crate::experiments::scene_plan::{scene_plan, Saving};
+use crate::experiments::plan_savings::Saving;
+use crate::experiments::scene_plan::scene_plan;
 use crate::failure::Failure;
 use crate::telemetry::report::to_json;
 use std::path::PathBuf;
@@ -15,7 +16,7 @@ pub struct PlanArgs {
     rig: Option<PathBuf>,
     #[command(flatten)]
     flags: RigArgs,
-    /// Time frames with and without each part that is left out and can be put back, and compare their pixels
+    /// Time frames with and without each part that can be put back or taken out, and compare their pixels
     #[arg(long)]
     measure: bool,
     /// Print one JSON object
@@ -24,6 +25,16 @@ pub struct PlanArgs {
 }
 
 fn saved(s: &Saving) -> String {
+    if s.changes_pictures {
+        return format!(
+            "{:.2} ms and {:.0} rays without, {:.2} ms and {:.0} rays with; pixels differ by {:.1} % RMS",
+            s.without_ms,
+            s.without_rays,
+            s.with_ms,
+            s.with_rays,
+            100.0 * s.difference
+        );
+    }
     let same = if s.pixels_identical { "same pixels" } else { "PIXELS DIFFER" };
     format!("{:.2} ms instead of {:.2} ms, {same}", s.without_ms, s.with_ms)
 }

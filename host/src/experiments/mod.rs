@@ -14,6 +14,7 @@ pub mod error_table;
 pub mod link_test;
 pub mod median;
 pub mod pictures;
+pub mod plan_savings;
 pub mod profile;
 pub mod run_dlpc900;
 pub mod run_rig;

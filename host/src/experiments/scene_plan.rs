@@ -1,15 +1,13 @@
 //! `dpm plan`: a rig into what its scene and method need of the renderer, what is left out of it and how, and what that saves.
 
-use super::median::median_ms;
+use super::plan_savings::{compare, flipped, keeping, Saving};
 use super::run_rig::{open_gpu, traced_raster};
-use super::sequence::{draw, poses_at};
-use crate::clock::Stopwatch;
 use crate::config::{EffectsConfig, RenderConfig, RigConfig};
 use crate::failure::{Failure, FailureKind};
 use crate::pipeline::{renderer_settings, PipelineError};
 use crate::render::method::{Method, SamplerKind};
 use crate::render::scene_data::{SceneData, SceneNeeds};
-use crate::render::{FrameSlot, Keep, RenderError, Renderer};
+use crate::render::{Keep, RenderError, RendererSettings};
 use crate::rig::Rig;
 use crate::scene::{Environment, Material, Scene};
 use serde::Serialize;
@@ -29,19 +27,8 @@ pub struct PlanEntry {
     pub why: String,
     /// How it is, or would be, left out.
     pub how: &'static str,
-    /// What leaving it out saved; only when measured.
+    /// What leaving it out saves or would save; only when measured.
     pub saving: Option<Saving>,
-}
-
-/// Two renderers side by side: as planned, and with one part compiled in although nothing needs it.
-#[derive(Clone, Debug, Serialize)]
-pub struct Saving {
-    /// Median time of a frame as planned, milliseconds.
-    pub without_ms: f64,
-    /// The same with the part in.
-    pub with_ms: f64,
-    /// Every code value and every bit of radiance is the same.
-    pub pixels_identical: bool,
 }
 
 /// The plan of a rig.
@@ -56,10 +43,6 @@ pub struct PlanReport {
     /// What differs from a run on the rig.
     pub warnings: Vec<String>,
 }
-
-/// Frames timed of each renderer, in turns so that both meet the same disturbances; the first two of each are not counted.
-const FRAMES: u32 = 10;
-const SETTLE: usize = 2;
 
 const BY_CONSTANT: &str = "specialization constant";
 const BY_PASS: &str = "pass not recorded";
@@ -237,7 +220,7 @@ fn gpu_failure(error: impl Into<RenderError>) -> Failure {
     PipelineError::Render(error.into()).into()
 }
 
-/// Plans the rig; `measure` opens the GPU and times each part of the scene that is left out.
+/// Plans the rig; `measure` opens the GPU and times frames with and without each part that can be put back or taken out.
 ///
 /// # Errors
 /// Bad scene or numbers (exit code 2), no GPU (4), leaving out changed a pixel (1).
@@ -256,76 +239,34 @@ pub fn scene_plan(config: &RigConfig, measure: bool) -> Result<PlanReport, Failu
     entries.extend(rig_entries(&rig));
     let mut report = PlanReport { method: word.to_owned(), entries, together: None, warnings };
     let Some(gpu) = gpu else { return Ok(report) };
-    let open =
-        |keep: Keep| Renderer::keeping(&gpu, &rig.scene, renderer_settings(&rig), keep).map_err(gpu_failure);
-    let lean = Keep::default();
-    for e in report.entries.iter_mut().filter(|e| e.left_out) {
-        if let Some(keep) = keeping(e.feature, &method) {
-            e.saving = Some(compare(&rig, open(lean)?, open(keep)?)?);
-        }
+    let (own, lean) = (renderer_settings(&rig), Keep::default());
+    let pair = |without: (&RendererSettings, Keep), with: (&RendererSettings, Keep)| {
+        compare(&rig, &gpu, without, with).map_err(gpu_failure)
+    };
+    for e in &mut report.entries {
+        let with_code = if e.left_out { keeping(e.feature, &method) } else { None };
+        e.saving = match (with_code, flipped(e.feature, &own)) {
+            (Some(keep), _) => Some(pair((&own, lean), (&own, keep))?),
+            (None, Some(other)) if e.left_out => Some(pair((&own, lean), (&other, lean))?.of_pictures()),
+            (None, Some(other)) => Some(pair((&other, lean), (&own, lean))?.of_pictures()),
+            (None, None) => None,
+        };
     }
     let all = Keep {
         needs: SceneNeeds::default().everything(),
-        rate_map: method.needs_history(),
+        rate_map: method.needs_history() && !method.needs_rates(),
         every_tile: true,
     };
-    let together = compare(&rig, open(lean)?, open(all)?)?;
-    report.together = Some(together);
+    report.together = Some(pair((&own, lean), (&own, all))?);
     let changed: Vec<&str> = (report.entries.iter())
-        .filter(|e| e.saving.as_ref().is_some_and(|s| !s.pixels_identical))
+        .filter(|e| e.saving.as_ref().is_some_and(Saving::is_wrong))
         .map(|e| e.feature)
-        .chain(report.together.iter().filter(|s| !s.pixels_identical).map(|_| "all together"))
+        .chain(report.together.iter().filter(|s| s.is_wrong()).map(|_| "all together"))
         .collect();
     if changed.is_empty() {
         return Ok(report);
     }
     Err(Failure::new(FailureKind::CheckFailed, format!("leaving out changed pixels: {}", changed.join(", "))))
-}
-
-/// What puts one part back in. `None`: nothing can without changing what is drawn.
-fn keeping(feature: &str, method: &Method) -> Option<Keep> {
-    let mut keep = Keep::default();
-    let flag = match feature {
-        "textures" => &mut keep.needs.textures,
-        "normal maps" => &mut keep.needs.normal_maps,
-        "alpha mask" => &mut keep.needs.alpha_mask,
-        "transmission" => &mut keep.needs.transmission,
-        "specular" => &mut keep.needs.specular,
-        "diffuse" => &mut keep.needs.diffuse,
-        "emissive" => &mut keep.needs.emissive,
-        "punctual lights" => &mut keep.needs.punctual,
-        "firefly clamp" => &mut keep.needs.clamp,
-        "tiles without bodies" => &mut keep.every_tile,
-        // Its decisions are read only where the frame's flag says so; without a history it has nothing to decide from.
-        "rate map" if method.needs_history() => &mut keep.rate_map,
-        _ => return None,
-    };
-    *flag = true;
-    Some(keep)
-}
-
-/// The same frames by both renderers in turns.
-fn compare(rig: &Rig, mut lean: Renderer, mut full: Renderer) -> Result<Saving, Failure> {
-    let mut slots: [FrameSlot; 2] =
-        [lean.create_slot(true).map_err(gpu_failure)?, full.create_slot(true).map_err(gpu_failure)?];
-    let mut times = [Vec::new(), Vec::new()];
-    let mut pixels_identical = true;
-    let spp = rig.config.render.spp;
-    for k in 0..FRAMES {
-        let poses = poses_at(rig, u64::from(k));
-        for (i, renderer) in [&mut lean, &mut full].into_iter().enumerate() {
-            let watch = Stopwatch::start();
-            let cost = draw(rig, renderer, &mut slots[i], &poses, k, spp, spp as f32).map_err(gpu_failure)?;
-            let gpu_ns: u64 = cost.pass_ns.iter().sum();
-            times[i].push(if gpu_ns > 0 { gpu_ns } else { watch.elapsed_ns() });
-        }
-        let bits = |s: &FrameSlot| -> Vec<[u32; 4]> {
-            s.radiance().unwrap_or(&[]).iter().map(|r| r.map(f32::to_bits)).collect()
-        };
-        pixels_identical &= slots[0].codes() == slots[1].codes() && bits(&slots[0]) == bits(&slots[1]);
-    }
-    let [without_ms, with_ms] = times.map(|t| median_ms(t.into_iter().skip(SETTLE)));
-    Ok(Saving { without_ms, with_ms, pixels_identical })
 }
 
 #[cfg(test)]
@@ -413,15 +354,5 @@ mod tests {
         scene.bodies[0].mesh.materials[0] = last;
         let needs = SceneData::build(&scene).unwrap().needs;
         assert!(needs.transmission && needs.alpha_mask && !plain.transmission && !plain.alpha_mask);
-    }
-
-    #[test]
-    fn each_part_that_can_be_put_back_is_a_part_of_the_plan() {
-        let plan = plan(&[]);
-        let with =
-            |method: &Method| plan.entries.iter().filter(|e| keeping(e.feature, method).is_some()).count();
-        let history = Method { temporal: true, ..Method::full(1) };
-        assert_eq!(with(&history), 11, "the switches of SceneNeeds but the environment's, and those of Keep");
-        assert_eq!(with(&Method::full(1)), 10, "without a history there are no rates");
     }
 }

@@ -1,0 +1,229 @@
+//! One part of a rig's plan, in and out, into what it costs: time and rays of a frame, and whether a pixel changes.
+
+use super::median::median_ms;
+use super::sequence::{draw, poses_at};
+use crate::clock::Stopwatch;
+use crate::gpu::Gpu;
+use crate::render::method::{Method, SamplerKind, HISTORY_CAP};
+use crate::render::{FrameSlot, Keep, RenderError, Renderer, RendererSettings};
+use crate::rig::Rig;
+use serde::Serialize;
+use std::sync::Arc;
+
+/// Two renderers side by side: without a part and with it.
+#[derive(Clone, Debug, Serialize)]
+pub struct Saving {
+    /// Median time of a frame without the part, milliseconds.
+    pub without_ms: f64,
+    /// The same with it.
+    pub with_ms: f64,
+    /// Rays of a frame without the part, on average.
+    pub without_rays: f64,
+    /// The same with it.
+    pub with_rays: f64,
+    /// Every code value and every bit of radiance is the same.
+    pub pixels_identical: bool,
+    /// RMS difference of the last frame's radiance by its mean.
+    pub difference: f64,
+    /// The part is there for the picture: with it another one is drawn. Else it is code that nothing calls for, and no pixel may change.
+    pub changes_pictures: bool,
+}
+
+impl Saving {
+    /// The same of a part that is there for the picture.
+    pub(super) fn of_pictures(self) -> Self {
+        Self { changes_pictures: true, ..self }
+    }
+
+    /// A pixel changed that must not.
+    pub fn is_wrong(&self) -> bool {
+        !self.changes_pictures && !self.pixels_identical
+    }
+}
+
+/// Frames timed of each renderer, in turns so that both meet the same disturbances; the first two of each are not counted.
+const FRAMES: u32 = 10;
+const SETTLE: usize = 2;
+
+/// What puts one part back in that nothing calls for. `None`: nothing can without changing what is drawn.
+pub(super) fn keeping(feature: &str, method: &Method) -> Option<Keep> {
+    let mut keep = Keep::default();
+    let flag = match feature {
+        "textures" => &mut keep.needs.textures,
+        "normal maps" => &mut keep.needs.normal_maps,
+        "alpha mask" => &mut keep.needs.alpha_mask,
+        "transmission" => &mut keep.needs.transmission,
+        "specular" => &mut keep.needs.specular,
+        "diffuse" => &mut keep.needs.diffuse,
+        "emissive" => &mut keep.needs.emissive,
+        "punctual lights" => &mut keep.needs.punctual,
+        "firefly clamp" => &mut keep.needs.clamp,
+        "tiles without bodies" => &mut keep.every_tile,
+        // Its decisions are read only where the frame's flag says so; without a history it has nothing to decide from.
+        "rate map" if method.needs_history() && !method.needs_rates() => &mut keep.rate_map,
+        _ => return None,
+    };
+    *flag = true;
+    Some(keep)
+}
+
+/// The settings with one part of the picture the other way round. `None`: the method is nothing without the part, or has no place for it.
+pub(super) fn flipped(feature: &str, settings: &RendererSettings) -> Option<RendererSettings> {
+    let mut all = settings.clone();
+    let (method, other) = (&settings.method, &mut all.method);
+    match feature {
+        "history and reprojection" if method.needs_history() && !method.dpm => {
+            (other.temporal, other.rate_map, other.checkerboard) = (false, false, false);
+        }
+        "rate map" if !method.dpm => other.rate_map ^= true,
+        "spatial filter taps" => other.spatial ^= true,
+        "blue noise and sequences" => {
+            other.sampler = match (method.sampler, method.dpm) {
+                (SamplerKind::Independent, true) => SamplerKind::Continued,
+                (SamplerKind::Independent, false) => SamplerKind::BlueNoise,
+                _ => SamplerKind::Independent,
+            };
+        }
+        "temporal blending" => {
+            other.temporal ^= true;
+            other.history_cap = if other.temporal { HISTORY_CAP } else { 0.0 };
+        }
+        "checkerboard" if !method.dpm => other.checkerboard ^= true,
+        "spp by angle" if !method.dpm => other.spp_by_angle ^= true,
+        "allocation by variance" if method.dpm => other.rate_map ^= true,
+        "indirect light" if settings.depth > 2 => all.depth = 2,
+        _ => return None,
+    }
+    Some(all)
+}
+
+/// The same frames by both renderers in turns.
+///
+/// # Errors
+/// The renderer's.
+pub fn compare(
+    rig: &Rig,
+    gpu: &Arc<Gpu>,
+    without: (&RendererSettings, Keep),
+    with: (&RendererSettings, Keep),
+) -> Result<Saving, RenderError> {
+    let open = |(settings, keep): (&RendererSettings, Keep)| {
+        Renderer::keeping(gpu, &rig.scene, settings.clone(), keep)
+    };
+    let mut renderers = [open(without)?, open(with)?];
+    let mut slots: [FrameSlot; 2] = [renderers[0].create_slot(true)?, renderers[1].create_slot(true)?];
+    let (mut times, mut rays) = ([Vec::new(), Vec::new()], [0.0f64; 2]);
+    let (mut pixels_identical, mut difference) = (true, 0.0);
+    let spp = rig.config.render.spp;
+    for k in 0..FRAMES {
+        let poses = poses_at(rig, u64::from(k));
+        for (i, renderer) in renderers.iter_mut().enumerate() {
+            let watch = Stopwatch::start();
+            let cost = draw(rig, renderer, &mut slots[i], &poses, k, spp, spp as f32)?;
+            let gpu_ns: u64 = cost.pass_ns.iter().sum();
+            times[i].push(if gpu_ns > 0 { gpu_ns } else { watch.elapsed_ns() });
+            let counters = cost.counters();
+            rays[i] +=
+                (f64::from(counters.closest_rays) + f64::from(counters.shadow_rays)) / f64::from(FRAMES);
+        }
+        let [a, b] = [0, 1].map(|i: usize| slots[i].radiance().unwrap_or(&[]));
+        let same = |(a, b): (&[f32; 4], &[f32; 4])| a.map(f32::to_bits) == b.map(f32::to_bits);
+        pixels_identical &= slots[0].codes() == slots[1].codes() && a.iter().zip(b).all(same);
+        difference = relative_rms(a, b);
+    }
+    let [without_ms, with_ms] = times.map(|t| median_ms(t.into_iter().skip(SETTLE)));
+    let [without_rays, with_rays] = rays;
+    Ok(Saving {
+        without_ms,
+        with_ms,
+        without_rays,
+        with_rays,
+        pixels_identical,
+        difference,
+        changes_pictures: false,
+    })
+}
+
+/// RMS difference of the pixels that either picture lights, by the mean of both; 0 of black ones.
+fn relative_rms(a: &[[f32; 4]], b: &[[f32; 4]]) -> f64 {
+    let (mut squares, mut sum, mut n) = (0.0f64, 0.0f64, 0u32);
+    for (a, b) in a.iter().zip(b) {
+        let lit = a[..3].iter().chain(&b[..3]).any(|v| *v > 0.0);
+        for (a, b) in a[..3].iter().zip(&b[..3]).filter(|_| lit) {
+            squares += f64::from(a - b).powi(2);
+            sum += 0.5 * f64::from(a + b);
+            n += 1;
+        }
+    }
+    if sum > 0.0 {
+        (squares * f64::from(n)).sqrt() / sum
+    } else {
+        0.0
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::config::{Overrides, RigConfig};
+    use crate::experiments::scene_plan::scene_plan;
+    use crate::pipeline::renderer_settings;
+
+    fn demo() -> (Vec<&'static str>, Rig) {
+        let config = RigConfig::demo(&Overrides { variables: vec![], flags: vec![] }).unwrap();
+        let plan = scene_plan(&config, false).unwrap();
+        (plan.entries.iter().map(|e| e.feature).collect(), Rig::build(&config, None).unwrap())
+    }
+
+    #[test]
+    fn each_part_that_can_be_put_back_is_a_part_of_the_plan() {
+        let (features, _) = demo();
+        let with = |method: &Method| features.iter().filter(|f| keeping(f, method).is_some()).count();
+        let history = Method { temporal: true, ..Method::full(1) };
+        assert_eq!(with(&history), 11, "the switches of SceneNeeds but the environment's, and those of Keep");
+        assert_eq!(with(&Method::full(1)), 10, "without a history there are no rates");
+        assert_eq!(with(&Method { rate_map: true, ..history }), 10, "rates that are read are no spare code");
+    }
+
+    #[test]
+    fn each_part_of_a_picture_flips_alone_and_back() {
+        let (features, rig) = demo();
+        let full = Method::full(1);
+        let paper =
+            Method { rate_map: true, temporal: true, spatial: true, checkerboard: true, ..full.clone() };
+        let dpm = Method {
+            dpm: true,
+            temporal: true,
+            history_cap: HISTORY_CAP,
+            sampler: SamplerKind::Continued,
+            ..full.clone()
+        };
+        for (method, parts) in [(full, 6), (paper, 7), (dpm, 4)] {
+            let settings = RendererSettings { method: method.clone(), depth: 3, ..renderer_settings(&rig) };
+            let flips: Vec<_> = features.iter().filter_map(|f| Some((f, flipped(f, &settings)?))).collect();
+            assert_eq!(flips.len(), parts + 1, "parts of the method, and indirect light");
+            for (i, (f, other)) in flips.iter().enumerate() {
+                assert_eq!((other.depth == 2, other.method == method), (i == parts, i == parts), "{f}");
+                assert!(flips[..i].iter().all(|(_, b)| (&b.method, b.depth) != (&other.method, other.depth)));
+                if other.depth == 2 {
+                    assert!(flipped(f, other).is_none(), "nothing is left to take out");
+                } else if **f != "history and reprojection" {
+                    let back = flipped(f, other).unwrap().method;
+                    let same = Method { sampler: method.sampler, history_cap: method.history_cap, ..back };
+                    assert_eq!(same, method, "{f}");
+                }
+            }
+        }
+    }
+
+    #[test]
+    fn pictures_differ_by_their_mean_light() {
+        let plain = |v: f32| vec![[v, v, v, 1.0]; 4];
+        assert_eq!(relative_rms(&plain(2.0), &plain(2.0)), 0.0);
+        assert!((relative_rms(&plain(1.0), &plain(3.0)) - 1.0).abs() < 1e-12, "2 by a mean of 2");
+        assert_eq!(relative_rms(&plain(0.0), &plain(0.0)), 0.0);
+        // Black pixels of both do not thin the difference out.
+        let some = |v: f32| [plain(v), plain(0.0)].concat();
+        assert!((relative_rms(&some(1.0), &some(3.0)) - 1.0).abs() < 1e-12);
+    }
+}
