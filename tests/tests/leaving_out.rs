@@ -158,14 +158,16 @@ fn a_plan_tells_spare_code_from_parts_of_the_picture() {
         {
             let s = of(spare);
             assert!(s.pixels_identical && !s.changes_pictures && s.difference == 0.0, "{spare}: {s:?}");
-            assert_eq!(s.without_rays, s.with_rays, "{spare} of {method}");
+            // Rays that meet nothing are rays.
+            let of_tiles = spare == "tiles without bodies" && s.without_rays < s.with_rays;
+            assert!(of_tiles || s.without_rays == s.with_rays, "{spare} of {method}: {s:?}");
         }
         let parts: &[&str] = match method {
-            "dpm" => &["allocation by variance"],
+            // The paper's filter begins beyond 15 degrees, where this picture is not.
+            "dpm" => &["allocation by variance", "spatial filter taps"],
             _ => &["rate map", "checkerboard", "spp by angle", "history and reprojection"],
         };
-        let common =
-            ["spatial filter taps", "blue noise and sequences", "temporal blending", "indirect light"];
+        let common = ["blue noise and sequences", "temporal blending", "indirect light"];
         for part in common.iter().chain(parts) {
             let s = of(part);
             assert!(s.changes_pictures && !s.pixels_identical && s.difference > 1e-4, "{part}: {s:?}");
@@ -175,6 +177,8 @@ fn a_plan_tells_spare_code_from_parts_of_the_picture() {
         if method == "paper" {
             assert!(of("checkerboard").with_rays < 0.8 * of("checkerboard").without_rays);
             assert!(of("rate map").with_rays < of("rate map").without_rays);
+            // The same light, noisier: a pass that read what nobody wrote would be farther off.
+            assert!(of("history and reprojection").difference < 0.6);
         }
         assert!(of("indirect light").with_rays > of("indirect light").without_rays);
         let taps = of("spatial filter taps");

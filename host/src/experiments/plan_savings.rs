@@ -73,7 +73,9 @@ pub(super) fn flipped(feature: &str, settings: &RendererSettings) -> Option<Rend
     let (method, other) = (&settings.method, &mut all.method);
     match feature {
         "history and reprojection" if method.needs_history() && !method.dpm => {
-            (other.temporal, other.rate_map, other.checkerboard) = (false, false, false);
+            // And all that reads it.
+            (other.temporal, other.rate_map, other.checkerboard, other.spatial) =
+                (false, false, false, false);
         }
         "rate map" if !method.dpm => other.rate_map ^= true,
         "spatial filter taps" => other.spatial ^= true,

@@ -83,9 +83,10 @@ impl Method {
         }
     }
 
-    /// A history is kept: for blending, or because not every pixel is traced in every frame.
+    /// A history is kept: for blending, because not every pixel is traced in every frame, or for the spatial pass, which reads what the
+    /// history shows.
     pub fn needs_history(&self) -> bool {
-        self.dpm || self.temporal || self.rate_map || self.checkerboard
+        self.dpm || self.temporal || self.rate_map || self.checkerboard || self.spatial
     }
 
     /// The pass `rate_map` is recorded.
