@@ -1,6 +1,8 @@
 //! `dpm profile` as its users meet it: without a GPU at the true rate, its files, and two profiles compared.
 
 mod cli_common;
+#[path = "cli_common/trace_check.rs"]
+mod trace_check;
 
 use cli_common::{code, dpm, err, out, Folder, NO_DRIVER};
 
@@ -42,7 +44,9 @@ fn without_rendering_every_slot_is_accounted_for_and_no_frame_is_torn() {
         assert!(std::fs::metadata(folder.path(name)).is_ok_and(|m| m.len() > 0), "{name}");
     }
     let trace = std::fs::read_to_string(folder.path("trace.json")).expect("trace.json");
-    serde_json::from_str::<serde_json::Value>(&trace).expect("the trace is JSON");
+    let journeys = trace_check::check(&trace);
+    trace_check::every_frame_can_be_followed(&journeys);
+    assert_eq!(journeys.len() as u64, lit, "every lit frame");
 
     // Nothing differs from itself.
     let kept = folder.path("profile.json").display().to_string();
@@ -50,6 +54,26 @@ fn without_rendering_every_slot_is_accounted_for_and_no_frame_is_torn() {
     assert_eq!(code(&output), 0, "{}", err(&output));
     let table = out(&output);
     assert!(table.contains("motion_to_light") && !table.contains("WORSE"), "{table}");
+}
+
+/// Software Vulkan at 947 fps: the GPU needs ten slots and more for a frame. Every frame comes late then, and is shown late, as fast
+/// as they come; and each can be followed through the GPU's passes to its light.
+#[test]
+fn a_gpu_too_slow_for_its_slots_shows_late_frames_not_none() {
+    let folder = Folder::new("slow");
+    let args = ["profile", "--seconds", "2", "--raster", "64x48", "--json", "--out", folder.text()];
+    let output = dpm(&args, &[]);
+    assert_eq!(code(&output), 0, "{}", err(&output));
+    let json: serde_json::Value = serde_json::from_str(&out(&output)).expect("one JSON object");
+    let count = |key: &str| json[key].as_u64().unwrap_or_else(|| panic!("{key} in {json}"));
+    let (lit, dropped) = (count("frames_lit"), count("frames_dropped"));
+    assert!(lit >= 3 && lit >= dropped, "{lit} lit, {dropped} not");
+    assert_eq!(count("frames_reordered"), 0);
+    let trace = std::fs::read_to_string(folder.path("trace.json")).expect("trace.json");
+    let journeys = trace_check::check(&trace);
+    trace_check::every_frame_can_be_followed(&journeys);
+    assert_eq!(journeys.len() as u64, lit, "every lit frame");
+    assert!(trace.contains(r#""name":"trace","cat":"gpu""#), "the GPU's passes lie in its slices");
 }
 
 #[test]

@@ -367,6 +367,7 @@ fn pack_thread(
     mut to_link: Sender<FrameJob>,
 ) {
     shared.rights.enter(2);
+    let mut late_in_a_row = 0;
     while let Some(mut job) = next(&mut jobs) {
         let id = job.note.id.0;
         enter_frame_path(id >= WARM_UP_FRAMES);
@@ -380,7 +381,12 @@ fn pack_thread(
             controller.measured(job.note.budget_milli, gpu_ns);
             shared.budget_milli.store(controller.rays(), Ordering::Relaxed);
         }
-        if !is_overtaken(shared, &mut job.note, &jobs) {
+        // What waits behind is still being rendered. More late frames than were under way are no stall: a GPU this slow has no
+        // newer frame that would be in time, and late frames are better than none.
+        let is_late = !shared.is_virtual() && shared.clock.now() >= job.note.timeline.due_at;
+        late_in_a_row = if is_late { late_in_a_row + 1 } else { 0 };
+        let is_slow = prepared.is_none() && late_in_a_row > shared.options.in_flight;
+        if is_slow || !is_overtaken(shared, &mut job.note, &jobs) {
             stages::pack(&mut job, kernel, shared.options.verify, &mut prepared);
         }
         if !shared.is_virtual() {

@@ -1,57 +1,11 @@
-//! A checker of the trace format, and traces of frames in flight together.
+//! Traces of frames in flight together against a checker of the format.
 
 use super::super::interval::tests::frame;
 use super::*;
-use serde_json::Value;
-use std::collections::BTreeMap;
+use trace_check::{check, every_frame_can_be_followed};
 
-/// Start, end, name.
-type Slice = (f64, f64, String);
-
-/// What the format and Perfetto's importer demand. Returns the points of each flow: (phase, names of the slices it lies in).
-fn check(text: &str) -> BTreeMap<u64, Vec<(String, String)>> {
-    let events: Vec<Value> = serde_json::from_str(text).expect("valid JSON");
-    let number = |e: &Value, key: &str| e[key].as_f64().unwrap_or_else(|| panic!("{key} missing in {e}"));
-    let mut slices: BTreeMap<(u64, u64), Vec<Slice>> = BTreeMap::new();
-    let mut named = Vec::new();
-    for e in &events {
-        let (pid, tid) = (number(e, "pid") as u64, number(e, "tid") as u64);
-        match e["ph"].as_str().expect("phase") {
-            "M" => named.push((pid, tid)),
-            "X" => {
-                let (ts, dur) = (number(e, "ts"), number(e, "dur"));
-                assert!(dur >= 0.0, "{e}");
-                let name = e["name"].as_str().unwrap().to_owned();
-                slices.entry((pid, tid)).or_default().push((ts, ts + dur, name));
-            }
-            "s" | "t" | "f" | "i" => {}
-            other => panic!("unknown phase {other}"),
-        }
-    }
-    for (track, list) in &mut slices {
-        assert!(named.contains(track), "track {track:?} has no name");
-        list.sort_by(|a, b| a.0.total_cmp(&b.0).then(b.1.total_cmp(&a.1)));
-        let mut open: Vec<f64> = Vec::new();
-        for (from, to, name) in list.iter() {
-            while open.last().is_some_and(|end| *end <= from + 1e-9) {
-                open.pop();
-            }
-            assert!(open.last().is_none_or(|end| *to <= end + 1e-9), "{name} at {from} crosses a neighbour");
-            open.push(*to);
-        }
-    }
-    let mut flows: BTreeMap<u64, Vec<(String, String)>> = BTreeMap::new();
-    for e in events.iter().filter(|e| matches!(e["ph"].as_str(), Some("s" | "t" | "f"))) {
-        let ts = number(e, "ts");
-        let track = &slices[&(number(e, "pid") as u64, number(e, "tid") as u64)];
-        let inside = track.iter().find(|(from, to, _)| *from <= ts + 1e-9 && ts <= *to + 1e-9);
-        let (_, _, name) = inside.unwrap_or_else(|| panic!("{e} lies in no slice"));
-        assert_eq!((e["cat"].as_str(), e["name"].as_str()), (Some("frame"), Some("frame")));
-        let flow = flows.entry(number(e, "id") as u64).or_default();
-        flow.push((e["ph"].as_str().unwrap().to_owned(), name.clone()));
-    }
-    flows
-}
+#[path = "../../tests/cli_common/trace_check.rs"]
+mod trace_check;
 
 fn trace(frames: &[(FrameTimeline, Vec<(&str, u64)>)]) -> String {
     let mut writer = TraceWriter::new(Vec::new()).unwrap();
@@ -81,14 +35,7 @@ fn every_lit_frame_can_be_followed_from_sample_to_light() {
         .collect();
     let flows = check(&trace(&frames));
     assert_eq!(flows.len(), 200);
-    for (id, points) in flows {
-        let phases: Vec<_> = points.iter().map(|(ph, _)| ph.as_str()).collect();
-        assert_eq!(phases, ["s", "t", "t", "t", "t", "f"], "frame {id}");
-        let names: Vec<_> = points.iter().map(|(_, name)| name.as_str()).collect();
-        assert_eq!(names[..2], ["sample", "latch and submit"]);
-        assert!(["render", "trace", "filter"].contains(&names[2]), "{names:?}");
-        assert_eq!(names[3..], ["pack", "send", "light"]);
-    }
+    every_frame_can_be_followed(&flows);
 }
 
 #[test]
@@ -99,7 +46,8 @@ fn odd_frames_still_make_a_valid_trace() {
     let mut frames = vec![(unlit, vec![]), (backwards, vec![("x", u64::MAX)]), (frame(1_000_000, 0), vec![])];
     frames.extend(crowded);
     let flows = check(&trace(&frames));
-    assert_eq!(flows[&0].last().unwrap(), &("f".to_owned(), "send".to_owned()));
+    let last = flows[&0].last().unwrap();
+    assert_eq!((last.phase.as_str(), last.slice.as_str()), ("f", "send"));
     assert_eq!(flows.len(), 23);
 }
 
