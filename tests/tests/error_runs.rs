@@ -4,44 +4,76 @@ use dpm_device::planes::Raster;
 use dpm_host::config::{Overrides, RigConfig};
 use dpm_host::experiments::error_export::FrameIndex;
 use dpm_host::experiments::error_plan::Group;
+use dpm_host::experiments::error_reference::Reference;
 use dpm_host::experiments::error_runs::{ErrorOptions, ErrorRuns, Extent, EYE_FRAMES};
 use dpm_host::experiments::run_rig::open_gpu;
-use dpm_host::experiments::sequence::{rmse, Span, Theatre};
+use dpm_host::experiments::sequence::{eye_mean, rmse, Span, Theatre};
 use dpm_host::gpu::Gpu;
 use dpm_host::render::method::Method;
 use dpm_host::rig::Rig;
+use glam::Vec3;
 use std::sync::Arc;
 
-fn stage() -> (Arc<Rig>, Arc<Gpu>) {
-    let flags = vec!["observer.gaze={kind=\"point\",point=[-0.1,0.0,0.0]}".to_owned()];
+fn stage(settings: &[&str]) -> (Arc<Rig>, Arc<Gpu>) {
+    let gaze = "observer.gaze={kind=\"point\",point=[-0.1,0.0,0.0]}";
+    let flags = [gaze].iter().chain(settings).map(|s| (*s).to_owned()).collect();
     let config = RigConfig::demo(&Overrides { variables: vec![], flags }).unwrap_or_else(|e| panic!("{e}"));
     let gpu = open_gpu(&config).unwrap_or_else(|e| panic!("{e}"));
     (Arc::new(Rig::build(&config, Raster::new(40, 30)).unwrap_or_else(|e| panic!("{e}"))), gpu)
 }
 
-/// RMS difference of two runs' single frames by the square root of two: the noise, without any reference.
-fn noise(theatre: &Theatre, spp: u32, seeds: [u32; 2]) -> f64 {
-    let [a, b] = seeds
-        .map(|s| theatre.play(&Method::full(spp), spp as f32, s, &mut |_, _| ()).unwrap().frames.concat());
-    rmse(&a, &b, |_| true) / 2f64.sqrt()
+/// RMS difference of two runs by the square root of two: the noise, without any reference. Of single frames, and of the mean of all.
+fn noise(theatre: &Theatre, method: &Method, seeds: [u32; 2]) -> (f64, f64) {
+    let [a, b] = seeds.map(|s| theatre.play(method, method.budget_spp, s, &mut |_, _| ()).unwrap().frames);
+    let apart = |a: &[Vec3], b: &[Vec3]| rmse(a, b, |_| true) / 2f64.sqrt();
+    (apart(&a.concat(), &b.concat()), apart(&eye_mean(&a, a.len()), &eye_mean(&b, b.len())))
 }
 
 #[test]
 fn independent_samples_fall_by_half_an_order_an_order() {
-    let (rig, gpu) = stage();
+    let (rig, gpu) = stage(&[]);
     let theatre = Theatre::frozen(rig, gpu, Span { last_slot: 60, warm_up: 0, kept: 12 }).unwrap();
-    let (few, many) = (noise(&theatre, 2, [1, 2]), noise(&theatre, 32, [3, 4]));
-    let slope = (many / few).ln() / 16f64.ln();
-    println!("noise {few:.5} at 2, {many:.5} at 32 samples: slope {slope:.3}");
-    assert!((slope + 0.5).abs() < 0.06, "slope {slope}");
+    let ((few, few_seen), (many, _)) =
+        (noise(&theatre, &Method::full(2), [1, 2]), noise(&theatre, &Method::full(32), [3, 4]));
+    let (slope, by_frames) = ((many / few).ln() / 16f64.ln(), (few_seen / few).ln() / 12f64.ln());
+    println!("noise {few:.5} at 2, {many:.5} at 32 samples: slope {slope:.3}; {few_seen:.5} in 12 frames: slope {by_frames:.3}");
+    // A sampler whose samples repeat within a frame, or from frame to frame, has no such slope: tests/mutations/run makes both.
+    assert!((slope + 0.5).abs() < 0.06, "slope {slope} in samples");
+    assert!((by_frames + 0.5).abs() < 0.06, "slope {by_frames} in frames");
     // A sampler that repeats itself has no noise between its runs; whoever takes that for convergence must see it here.
-    assert_eq!(noise(&theatre, 2, [5, 5]), 0.0);
-    assert!(noise(&theatre, 2, [5, 6]) > 0.5 * few);
+    assert_eq!(noise(&theatre, &Method::full(2), [5, 5]).0, 0.0);
+    assert!(noise(&theatre, &Method::full(2), [5, 6]).0 > 0.5 * few);
+}
+
+#[test]
+fn a_sampler_that_loses_light_is_told_from_one_that_does_not() {
+    let seen = |settings: &[&str], seed: u32| {
+        let (rig, gpu) = stage(settings);
+        let theatre =
+            Theatre::frozen(rig, gpu, Span { last_slot: 60, warm_up: 0, kept: EYE_FRAMES as u32 }).unwrap();
+        let cache = std::env::temp_dir().join(format!("dpm-bias-{}", std::process::id()));
+        let eyes = [seed, seed + 1].map(|s| {
+            let seen = theatre.play(&Method::full(32), 32.0, s, &mut |_, _| ()).unwrap();
+            eye_mean(&seen.frames, EYE_FRAMES)
+        });
+        // The reference of the rig as it is, under one name: the second time it is read.
+        let reference = Reference::new(&theatre, 128, "as it is", &cache, &mut |_| ()).unwrap();
+        (reference.bias(&eyes), reference.perceived(&eyes, &|_| true).1, cache)
+    };
+    let ((bias, chance), _, cache) = seen(&[], 1);
+    // Paths that end at the first surface lose what comes by way of others.
+    let ((biased, _), error, _) = seen(&["render.depth=2"], 3);
+    std::fs::remove_dir_all(cache).unwrap();
+    println!("bias {bias:.5} of chance {chance:.5}; with less light {biased:.5}");
+    // Squares are what is measured: twice what chance leaves of none are four of their standard deviations.
+    assert!(bias < 2.0 * chance, "independent samples have no bias: {bias}, chance {chance}");
+    assert!(biased > 2.0 * chance, "{biased}, chance {chance}");
+    assert!(biased > 0.5 * error, "what is lost is bias, not noise: {biased} of {error}");
 }
 
 #[test]
 fn a_group_is_measured_at_equal_rays_and_tells_bias_from_noise() {
-    let (rig, gpu) = stage();
+    let (rig, gpu) = stage(&[]);
     let cache = std::env::temp_dir().join(format!("dpm-error-{}", std::process::id()));
     let extent = Extent { warm_up: 8, kept: 48, reference_spp: 16 };
     let options = ErrorOptions { extent, ablation: false, cache: cache.clone() };

@@ -1,6 +1,6 @@
 //! A Vulkan device into the stability cases that need one: the shaders that run in the rig, on whichever device is here.
 
-use super::{gpu_chain, gpu_history, gpu_tracer, gpu_traversal, Case};
+use super::{gpu_chain, gpu_disocclusion, gpu_history, gpu_samplers, gpu_tracer, gpu_traversal, Case};
 use crate::gpu::{Gpu, GpuOptions};
 use std::sync::Arc;
 
@@ -18,6 +18,8 @@ pub fn cases(device: &Device) -> Vec<Case> {
     let mut all = gpu_tracer::cases(device);
     all.extend(gpu_traversal::cases(device));
     all.extend(gpu_history::cases(device));
+    all.extend(gpu_disocclusion::cases(device));
+    all.extend(gpu_samplers::cases(device));
     all.extend(gpu_chain::cases(device));
     all
 }

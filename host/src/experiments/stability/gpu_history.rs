@@ -12,7 +12,7 @@ use crate::gpu::Gpu;
 use crate::render::method::Method;
 use crate::render::rate_map::{decide, rate_table, PixelGuide, RateConstants};
 use crate::render::{FrameSlot, Renderer};
-use crate::scene::{Environment, Material, PunctualKind, PunctualLight, Scene};
+use crate::scene::{Environment, PunctualKind, PunctualLight, Scene};
 use dpm_shaders::structs::{History, NO_HIT};
 use glam::{DAffine3, DVec3, Vec3};
 use std::sync::Arc;
@@ -63,14 +63,6 @@ pub fn cases(device: &Device) -> Vec<Case> {
             poisoned,
         ),
         case(
-            "gpu-pose-jump",
-            "a body that jumps by its own width, every method",
-            "a picture that never saw the old place",
-            "radiance",
-            1e-4,
-            pose_jump,
-        ),
-        case(
             "gpu-rate-map-equals-cpu",
             "64 x 48 of moving surfaces, method paper",
             "the CPU's decision, bit for bit",
@@ -103,7 +95,7 @@ pub fn methods() -> Vec<Method> {
 }
 
 /// A white Lambertian floor in even light: whatever is sampled, a lit pixel is 1.
-fn even() -> Scene {
+pub(super) fn even() -> Scene {
     let mut scene = scene_of(floor(20.0, 0.0), diffuse(Vec3::ONE));
     scene.environment = sky(1.0);
     scene
@@ -113,7 +105,7 @@ const ABOVE: DVec3 = DVec3::new(0.3, 3.0, 1.0);
 const BESIDE: DVec3 = DVec3::new(-0.5, 3.2, 0.8);
 
 /// Largest difference from 1 of what is shown at lit pixels; infinite when none is lit.
-fn from_one(slot: &FrameSlot) -> f64 {
+pub(super) fn from_one(slot: &FrameSlot) -> f64 {
     let (shown, surfaces) = (slot.radiance().unwrap_or(&[]), slot.surfaces().unwrap_or(&[]));
     let lit = shown.iter().zip(surfaces).filter(|(_, s)| s.id != NO_HIT && s.distance > 0.0);
     let worst = lit.flat_map(|(r, _)| r[..3].iter()).map(|v| f64::from((v - 1.0).abs()));
@@ -121,7 +113,7 @@ fn from_one(slot: &FrameSlot) -> f64 {
 }
 
 /// Plays frames of a shot with a renderer of its own and a pose list that may change.
-fn play(
+pub(super) fn play(
     gpu: &Arc<Gpu>,
     shot: &Shot<'_>,
     poses: impl Fn(u32) -> Vec<DAffine3>,
@@ -337,60 +329,6 @@ fn poison(h: &mut History, bad: f32) {
     *h = History { mean: [bad; 3], drift: bad, variance: bad, surprise: bad, ..*h };
 }
 
-fn pose_jump(gpu: &Arc<Gpu>, seed: u64) -> f64 {
-    // A plate over a floor, both shine by themselves in their own colours: no noise, so whatever is left of the plate on the floor that it
-    // uncovers shows, and the other way round.
-    let mut scene = Scene::default();
-    let glow = |c: Vec3| Material { base_color: Vec3::splat(0.5), ..emitter(c) };
-    add(&mut scene, floor(4.0, 0.0), glow(Vec3::new(0.0, 0.2, 1.0)));
-    add(
-        &mut scene,
-        quad(Vec3::new(-0.4, 0.3, 0.5), Vec3::X * 0.8, Vec3::NEG_Z),
-        glow(Vec3::new(1.0, 0.1, 0.0)),
-    );
-    scene.environment = Environment::Constant(Vec3::ZERO);
-    let camera = camera(40, 30, DVec3::new(0.0, 5.0, 1.5), DVec3::ZERO);
-    let at = |x: f64| vec![DAffine3::IDENTITY, DAffine3::from_translation(DVec3::X * x)];
-    let mut worst: f64 = 0.0;
-    for mut method in methods() {
-        // A block of the paper's method shows one of its pixels, of either body.
-        method.rate_map &= method.dpm;
-        let settled = |before: f64, frames: u32| {
-            let shot = Shot {
-                eye: Some(DVec3::new(-0.4, 5.0, 1.2)),
-                gaze: Some(DVec3::ZERO),
-                depth: 1,
-                frames,
-                seed: seed as u32,
-                method: Some(method.clone()),
-                ..Shot::new(&scene, camera)
-            };
-            let mut last = Vec::new();
-            play(
-                gpu,
-                &shot,
-                |frame| at(if frame < 12 { before } else { 0.6 }),
-                |_, slot| {
-                    last = slot.radiance().unwrap_or(&[]).to_vec();
-                },
-            );
-            last
-        };
-        // A checkerboard needs two frames to fill a new place.
-        for frames in [14, 16] {
-            let (jumped, fresh) = (settled(-0.6, frames), settled(0.6, frames));
-            if fresh.iter().filter(|r| r[0] + r[2] > 0.5).count() < 100 {
-                return f64::NAN;
-            }
-            for (a, b) in jumped.iter().zip(&fresh) {
-                let off = (0..3).map(|c| f64::from((a[c] - b[c]).abs())).fold(0.0, f64::max);
-                worst = if off.is_nan() { f64::INFINITY } else { worst.max(off) };
-            }
-        }
-    }
-    worst
-}
-
 /// The paper's method with angles that cut through a small picture.
 fn paper() -> Method {
     let mut method = method_of(&RenderConfig::default(), RenderMethod::Paper);
@@ -503,6 +441,12 @@ fn energy_kept(gpu: &Arc<Gpu>, seed: u64) -> f64 {
         let mut method = method_of(&RenderConfig::default(), which);
         method.paper.zone_spp = [8; 3];
         worst = worst.max((total(&method, 112, 64) / wanted - 1.0).abs());
+        if !method.dpm {
+            // The spatial filter alone, on frames that nothing else has touched.
+            (method.temporal, method.rate_map, method.checkerboard, method.spatial) =
+                (false, false, false, true);
+            worst = worst.max((total(&method, 112, 64) / wanted - 1.0).abs());
+        }
     }
     worst
 }

@@ -1,0 +1,163 @@
+//! Bodies that jump and turn on the GPU: a surface takes up no history but its own.
+//!
+//! What is drawn has no noise, so a picture with a past that must not show agrees with one without.
+
+use super::gpu::{on, Device};
+use super::gpu_history::{even, from_one, methods, play};
+use super::gpu_shot::Shot;
+use super::shapes::*;
+use super::Case;
+use crate::gpu::Gpu;
+use crate::render::method::Method;
+use crate::render::Renderer;
+use crate::scene::{Environment, Material, Scene};
+use dpm_shaders::structs::History;
+use glam::{DAffine3, DQuat, DVec3, Vec3};
+use std::sync::Arc;
+
+/// The cases.
+pub fn cases(device: &Device) -> Vec<Case> {
+    let case = |name, input, measure| {
+        on(device, name, input, "a picture without the past", "radiance", 1e-4, measure)
+    };
+    vec![
+        case(
+            "gpu-pose-jump",
+            "a glowing plate over a glowing floor that jumps by its width, every method without shading rates",
+            pose_jump,
+        ),
+        case(
+            "gpu-uncovered-by-itself",
+            "a floor and a box on it, one body with three glows, that jumps and turns, every method without shading rates",
+            uncovered_by_itself,
+        ),
+        case(
+            "gpu-stale-history",
+            "histories of wrong light that are two frames old, every method",
+            stale_history,
+        ),
+    ]
+}
+
+fn glow(color: Vec3) -> Material {
+    Material { base_color: Vec3::splat(0.5), ..emitter(color) }
+}
+
+const BLUE: Vec3 = Vec3::new(0.0, 0.2, 1.0);
+const RED: Vec3 = Vec3::new(1.0, 0.1, 0.0);
+const GREEN: Vec3 = Vec3::new(0.1, 0.8, 0.1);
+
+/// Every method, each pixel for itself: a block of the paper's shading rates shows one of its pixels, of either surface.
+fn without_rates() -> impl Iterator<Item = Method> {
+    methods().into_iter().map(|mut method| {
+        method.rate_map &= method.dpm;
+        method
+    })
+}
+
+/// The last of so many frames of a shot.
+fn last(gpu: &Arc<Gpu>, shot: &Shot<'_>, poses: impl Fn(u32) -> Vec<DAffine3>) -> Vec<[f32; 4]> {
+    let mut last = Vec::new();
+    play(gpu, shot, poses, |_, slot| last = slot.radiance().unwrap_or(&[]).to_vec());
+    last
+}
+
+/// Largest difference of two pictures. `NaN`, which no bound holds, when fewer than a hundred pixels of the second show anything.
+fn apart(a: &[[f32; 4]], b: &[[f32; 4]]) -> f64 {
+    if b.iter().filter(|r| r[..3].iter().any(|v| *v > 0.0)).count() < 100 {
+        return f64::NAN;
+    }
+    let off = a.iter().zip(b).flat_map(|(a, b)| (0..3).map(|c| f64::from((a[c] - b[c]).abs())));
+    off.fold(0.0, |worst: f64, d| if d.is_nan() { f64::INFINITY } else { worst.max(d) })
+}
+
+fn worse(a: f64, b: f64) -> f64 {
+    if a.is_nan() || b.is_nan() {
+        f64::NAN
+    } else {
+        a.max(b)
+    }
+}
+
+/// Pictures after `poses` jumped from the first to the second in frame 12, against those that were at the second all the time.
+fn jump(gpu: &Arc<Gpu>, seed: u64, scene: &Scene, poses: [&[DAffine3]; 2]) -> f64 {
+    let mut worst: f64 = 0.0;
+    for method in without_rates() {
+        // A checkerboard needs two frames to fill a new place.
+        for frames in [14, 16] {
+            let shot = Shot {
+                eye: Some(DVec3::new(-0.4, 5.0, 1.2)),
+                gaze: Some(DVec3::ZERO),
+                depth: 1,
+                frames,
+                seed: seed as u32,
+                method: Some(method.clone()),
+                ..Shot::new(scene, camera(40, 30, DVec3::new(0.0, 5.0, 1.5), DVec3::ZERO))
+            };
+            let jumped = last(gpu, &shot, |frame| poses[usize::from(frame >= 12)].to_vec());
+            let fresh = last(gpu, &shot, |_| poses[1].to_vec());
+            worst = worse(worst, apart(&jumped, &fresh));
+        }
+    }
+    worst
+}
+
+fn pose_jump(gpu: &Arc<Gpu>, seed: u64) -> f64 {
+    let mut scene = Scene::default();
+    add(&mut scene, floor(4.0, 0.0), glow(BLUE));
+    // In its own coordinates the plate lies in the floor, over the place that it uncovers: only that they are two bodies tells them apart.
+    add(&mut scene, quad(Vec3::new(-0.4, 0.0, 0.5), Vec3::X * 0.8, Vec3::NEG_Z), glow(RED));
+    scene.environment = Environment::Constant(Vec3::ZERO);
+    let at = |x: f64| [DAffine3::IDENTITY, DAffine3::from_translation(DVec3::new(x, 0.3, 0.0))];
+    jump(gpu, seed, &scene, [&at(0.0), &at(0.9)])
+}
+
+fn uncovered_by_itself(gpu: &Arc<Gpu>, seed: u64) -> f64 {
+    // The lid covers other floor where it stands aslant from the projector, at its edges two faces meet that face differently.
+    let (half, high) = (0.5f32, 0.8f32);
+    let corner = |x: f32, z: f32| Vec3::new(x * half, 0.0, z * half);
+    let up = Vec3::Y * high;
+    let lid = quad(corner(-1.0, 1.0) + up, Vec3::X * 2.0 * half, Vec3::NEG_Z * 2.0 * half);
+    let walls =
+        [(-1.0, 1.0, Vec3::X), (1.0, 1.0, Vec3::NEG_Z), (1.0, -1.0, Vec3::NEG_X), (-1.0, -1.0, Vec3::Z)]
+            .map(|(x, z, along)| quad(corner(x, z), along * 2.0 * half, up));
+    let mut scene = scene_of(join([floor(6.0, 0.0), lid].into_iter().chain(walls)), glow(BLUE));
+    scene.materials.extend([glow(RED), glow(GREEN)]);
+    // Two triangles a face.
+    scene.bodies[0].mesh.materials = [&[0u32; 2][..], &[1; 2], &[2; 8]].concat();
+    scene.environment = Environment::Constant(Vec3::ZERO);
+    let at = |x: f64, turn: f64| {
+        [DAffine3::from_rotation_translation(DQuat::from_rotation_y(turn), DVec3::new(x, 0.0, 0.0))]
+    };
+    jump(gpu, seed, &scene, [&at(-0.7, 0.0), &at(0.6, 0.4)])
+}
+
+fn stale_history(gpu: &Arc<Gpu>, seed: u64) -> f64 {
+    // Tiles that no body touches keep what was in them. Nothing reaches it as tiles are listed today, so it is put where it would be met.
+    let scene = even();
+    let mut worst: f64 = 0.0;
+    for method in methods() {
+        let shot = Shot {
+            eye: Some(DVec3::new(-0.5, 3.2, 0.8)),
+            spp: 2,
+            seed: seed as u32,
+            method: Some(method),
+            ..Shot::new(&scene, camera(33, 33, DVec3::new(0.3, 3.0, 1.0), DVec3::ZERO))
+        };
+        let mut renderer = Renderer::new(gpu, &scene, shot.settings()).expect("the scene fits the GPU");
+        let poses = shot.world_from_body();
+        shot.play(&mut renderer, 0..6, |_| poses.clone(), |_, _, _| ());
+        let old = |h: &mut History| *h = History { mean: [5.0; 3], frame: h.frame.wrapping_sub(2), ..*h };
+        renderer.edit_history(0..2 * 33 * 33, old).expect("memory");
+        shot.play(
+            &mut renderer,
+            6..10,
+            |_| poses.clone(),
+            |_, slot, _| {
+                let off = from_one(slot);
+                worst = worse(worst, if off < 0.0 { f64::NAN } else { off });
+            },
+        );
+    }
+    worst
+}
