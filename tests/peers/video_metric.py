@@ -3,11 +3,12 @@
 
     dpm error RIG.toml --quick --sequences --out DIR
     pip install cvvdp                                  # and what it needs: torch, CPU is enough
-    tests/peers/video_metric.py DIR [--peak 200] [--frames 237] [--json FILE]
+    tests/peers/video_metric.py DIR [--peak 200] [--frames 237] [--window 1] [--methods full,paper] [--json FILE]
 
 Reads DIR/sequences/*/sequence.json. Every sequence is shown at the rig's own frame rate and angular size; white is --peak cd/m^2. Prints for
 each group the perceived RMSE of `dpm error` beside the JOD (10 is the reference itself, less is worse), Kendall's tau-b of the two orders,
-and how many of the pairs of methods that differ clearly in JOD (by 0.1 or more) both put in one order.
+and how many of the pairs of methods that differ clearly in JOD (by 0.1 or more) both put in one order. --window 31 shows the metric the mean of
+every 31 frames in place of each, as the eye of `dpm error` has it: whether the metric minds what changes faster.
 """
 import argparse
 import itertools
@@ -25,9 +26,11 @@ def read_pfm(path):
     return np.frombuffer(body, "<f4", width * height * 3).reshape(height, width, 3)[::-1]
 
 
-def read_sequence(folder, frames):
-    paths = sorted(folder.glob("*.pfm"))[-frames:]
-    return np.stack([read_pfm(p) for p in paths])
+def read_sequence(folder, frames, window=1):
+    paths = sorted(folder.glob("*.pfm"))[-(frames + window - 1):]
+    all_frames = np.stack([read_pfm(p) for p in paths]).astype(np.float64)
+    sums = np.cumsum(np.concatenate([np.zeros_like(all_frames[:1]), all_frames]), axis=0)
+    return (sums[window:] - sums[:-window]) / window
 
 
 def kendall(a, b):
@@ -41,6 +44,8 @@ def main():
     parser.add_argument("dir", type=pathlib.Path)
     parser.add_argument("--peak", type=float, default=200.0)
     parser.add_argument("--frames", type=int, default=10_000, help="only the last so many")
+    parser.add_argument("--window", type=int, default=1, help="each frame the mean of so many")
+    parser.add_argument("--methods", type=lambda text: text.split(","), help="only these")
     parser.add_argument("--json", type=pathlib.Path)
     args = parser.parse_args()
 
@@ -58,10 +63,10 @@ def main():
         metric = pycvvdp.cvvdp(
             display_photometry=photometry, display_geometry=geometry, device=torch.device("cpu"), quiet=True)
         show = lambda folder: np.ascontiguousarray(
-            read_sequence(path.parent / folder, args.frames) * (args.peak / index["white"]) + 0.2).astype(np.float32)
+            read_sequence(path.parent / folder, args.frames, args.window) * (args.peak / index["white"]) + 0.2).astype(np.float32)
         reference = show(index["reference"])
         rows = []
-        for method in index["methods"]:
+        for method in (m for m in index["methods"] if not args.methods or m["method"] in args.methods):
             jod, _ = metric.predict(
                 show(method["folder"]), reference, dim_order="FHWC", frames_per_second=index["frame_rate_hz"])
             rows.append({"method": method["method"], "perceived_rmse": method["perceived_rmse"], "jod": float(jod)})

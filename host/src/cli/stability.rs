@@ -27,7 +27,7 @@ fn line(c: &CaseResult) -> String {
         CaseVerdict::Fail => "FAIL",
         CaseVerdict::NotRun => "----",
     };
-    format!("{verdict}  {:<36} {error:>9} <= {:<6.0e} {:<11} {}\n", c.name, c.bound, c.unit, c.oracle)
+    format!("{verdict}  {:<36} {error:>9} <= {:<7e} {:<11} {}\n", c.name, c.bound, c.unit, c.oracle)
 }
 
 /// Runs the cases; a failed one makes the command fail.
