@@ -85,7 +85,7 @@ vec3 regressed(uvec2 pixel, uint at, uint history, vec4 own) {
     vec3 b[5];
     for (int i = 0; i < 15; i++) a[i] = 0.0;
     for (int i = 0; i < 5; i++) b[i] = vec3(0.0);
-    float used = 0.0, noise_sum = 0.0, total = 0.0, power = 0.0;
+    float used = 0.0, expected = 0.0, single = 0.0, total = 0.0, power = 0.0;
     for (int i = 0; i < 25; i++) {
         ivec2 d = ivec2(i % 5, i / 5) - 2;
         uint tap;
@@ -106,7 +106,8 @@ vec3 regressed(uvec2 pixel, uint at, uint history, vec4 own) {
         power += w * y * y;
         total += w;
         used += 1.0;
-        noise_sum += noise;
+        expected += w * noise;
+        single += noise * histories[history + tap].weight;
     }
     if (used < 4.0) return own.rgb;
     // Slopes are not expected beyond 2 % a pixel and a third over the normal's whole range.
@@ -129,14 +130,14 @@ vec3 regressed(uvec2 pixel, uint at, uint history, vec4 own) {
         b[r] /= a[r * (r + 3) / 2];
     }
     // Structure that the fit misses, around or at this very pixel, against the noise that the eye's mean leaves [Lee80].
-    float structure = max(max(power - explained, 0.0) / total * used / max(used - 4.0, 1.0) - noise_sum / used, 0.0);
-    // Single pixels hardly know their own noise: it is that of all around.
-    float noise = noise_sum / used;
+    float structure = max(max(power - explained, 0.0) / total * used / max(used - 4.0, 1.0) - expected / total, 0.0);
+    // Single pixels hardly know what a sample of theirs varies: it is that of all around. How many samples they stand on they know.
+    float held = histories[history + at].weight;
+    float noise = single / used / max(held, 1e-6);
     float apart = luminance(b[0]);
     // In the periphery blur is the lesser evil beside flicker.
     float beyond = periphery(guides[at].angle);
     structure = max(structure, apart * apart - mix(3.0, 16.0, beyond) * noise);
-    float held = histories[history + at].weight;
     noise *= mix(1.0, 5.0, beyond) * held / (held + SEEN_FRAMES * max(frame.budget_spp, 0.5));
     vec3 result = own.rgb + b[0] * (noise / max(structure + noise, 1e-12));
     return finite3(result) ? max(result, vec3(0.0)) : own.rgb;
