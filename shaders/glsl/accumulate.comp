@@ -10,10 +10,9 @@
 layout(local_size_x = 8, local_size_y = 8) in;
 
 layout(set = 0, binding = B_TILES, scalar) readonly buffer Tiles { uint tiles[]; };
-layout(set = 0, binding = B_GUIDES, scalar) readonly buffer Guides { Guide guides[]; };
 layout(set = 0, binding = B_RADIANCE, scalar) readonly buffer Radiance { vec4 radiance_in[]; };
 layout(set = 0, binding = B_HISTORY, scalar) buffer Histories { History histories[]; };
-layout(set = 0, binding = B_FILTERED, scalar) buffer Filtered { vec4 filtered[]; };
+layout(set = 0, binding = B_FILTERED, scalar) buffer FilteredBlock { Filtered filtered[]; };
 
 // Method dpm: from the history's surface point to the pixel's.
 layout(set = 0, binding = B_SHOWN, scalar) readonly buffer Shown { vec4 shown[]; };
@@ -29,21 +28,21 @@ void main() {
     uvec2 pixel;
     if (!tile_pixel(tiles[gl_WorkGroupID.x >> 2u], pixel)) return;
     uint at = pixel.y * frame.width + pixel.x;
-    if (!is_lit(surfaces[at])) {
-        filtered[at] = vec4(0.0);
+    if (!is_lit(surface_at(at))) {
+        filtered[at] = Filtered(vec3(0.0), 0.0);
         return;
     }
     History h = histories[frame.parity * frame.width * frame.height + at];
     if ((frame.flags & FRAME_DPM) != 0u) {
         vec4 traced = radiance_in[at];
-        vec3 albedo = albedo_of(guides[at]);
+        vec3 albedo = albedo_of(guide_at(at));
         vec3 shift = shown[at].rgb;
         if (traced.w > 0.0) {
             vec3 fresh = traced.rgb / albedo;
             float y = luminance(traced.rgb);
             h.index += uint(traced.w);
             // Variance of one sample about its frame's mean, which no change of the light enters; of a single sample about the history.
-            float second = filtered[at].x / traced.w;
+            float second = filtered[at].light.x / traced.w;
             float known = luminance((h.mean + shift) * albedo);
             float about = h.weight > 0.0 ? mix(y, known, h.weight / (h.weight + traced.w)) : y;
             float variance = traced.w > 1.5 ? max(second - y * y, 0.0) * traced.w / (traced.w - 1.0) : (y - about) * (y - about);
@@ -63,7 +62,7 @@ void main() {
             // the history than their noise tells (a reflection that moves), the eye's own mean does better.
             float level = known * known, of_frame = h.variance / per_frame;
             // In the periphery half as long again, against flicker.
-            float cap = (1.0 + 0.5 * periphery(guides[at].angle)) * frame.history_cap;
+            float cap = (1.0 + 0.5 * periphery(guide_at(at).angle)) * frame.history_cap;
             float frames = min(cap, of_frame / max(UNSEEN * UNSEEN * level, 1e-12));
             frames = min(frames, cap * SURPRISE * (of_frame + LEAST * LEAST * level) / max(h.surprise, 1e-12));
             h.weight = min(h.weight, frames * per_frame);
@@ -72,14 +71,14 @@ void main() {
             h.mean = h.weight > 0.0 ? mix(h.mean, fresh - shift, traced.w / (h.weight + traced.w)) : fresh - shift;
             h.weight += traced.w;
         }
-        filtered[at] = vec4(max(h.mean + shift, vec3(0.0)), h.weight > 0.0 ? h.variance / h.weight : 0.0);
+        filtered[at] = Filtered(max(h.mean + shift, vec3(0.0)), h.weight > 0.0 ? h.variance / h.weight : 0.0);
     } else {
         uvec2 size = block_size(pixel);
         uvec2 source = traced_pixel(pixel, size);
         uint from = source.y * frame.width + source.x;
         vec4 traced = is_traced_block(pixel, size) ? radiance_in[from] : vec4(0.0);
         if (traced.w > 0.0) {
-            float floor_ = (frame.flags & FRAME_TEMPORAL) != 0u ? frame.zone_alpha[zone_of(guides[at].angle)] : 1.0;
+            float floor_ = (frame.flags & FRAME_TEMPORAL) != 0u ? frame.zone_alpha[zone_of(guide_at(at).angle)] : 1.0;
             float alpha = max(1.0 / (h.weight + 1.0), floor_);
             h.mean = mix(h.mean, traced.rgb, alpha);
             h.weight = min(h.weight + 1.0, 4096.0);
@@ -90,7 +89,7 @@ void main() {
                 ivec2 q = ivec2(pixel) + beside[i] * ivec2(size);
                 if (any(lessThan(q, ivec2(0))) || any(greaterThanEqual(q, ivec2(frame.width, frame.height)))) continue;
                 uvec2 other_size = block_size(uvec2(q));
-                if (!is_lit(surfaces[uint(q.y) * frame.width + uint(q.x)]) || !is_traced_block(uvec2(q), other_size)) continue;
+                if (!is_lit(surface_at(uint(q.y) * frame.width + uint(q.x))) || !is_traced_block(uvec2(q), other_size)) continue;
                 uvec2 other = traced_pixel(uvec2(q), other_size);
                 vec4 r = radiance_in[other.y * frame.width + other.x];
                 if (r.w > 0.0) {
@@ -99,7 +98,7 @@ void main() {
                 }
             }
         }
-        filtered[at] = vec4(h.mean, 1.0);
+        filtered[at] = Filtered(h.mean, 1.0);
     }
     histories[frame.parity * frame.width * frame.height + at] = h;
 }

@@ -2,7 +2,7 @@
 // render/body_bvh.rs says where children stand).
 //
 // Nodes and triangles are read through NODE and TRI: texel buffers on software Vulkan (twice as fast there), storage buffers on GPUs.
-#ifdef SCENE_TEXELS
+#ifdef TEXEL_TABLES
 layout(set = 0, binding = B_NODES) uniform utextureBuffer node_texels;
 layout(set = 0, binding = B_TRIANGLES) uniform textureBuffer triangle_texels;
 #define NODE(i) texelFetch(node_texels, int(i))

@@ -1,5 +1,4 @@
 // Coarse pixels: which block a pixel belongs to, whether it is traced this frame, and through which of its pixels the ray goes.
-layout(set = 0, binding = B_SURFACES, scalar) readonly buffer Surfaces { Surface surfaces[]; };
 layout(set = 0, binding = B_RATES, scalar) readonly buffer Rates { uint rates[]; };
 
 // Pixels per coarse pixel, x and y: 1, 2 or 4. Tiles are multiples of it, so blocks never straddle tiles.
@@ -24,7 +23,7 @@ uvec2 traced_pixel(uvec2 pixel, uvec2 size) {
     for (uint k = 0u; k < n; k++) {
         uint i = (start + k) % n;
         uvec2 candidate = origin + uvec2(i % size.x, i / size.x);
-        if (candidate.x < frame.width && candidate.y < frame.height && is_lit(surfaces[candidate.y * frame.width + candidate.x])) return candidate;
+        if (candidate.x < frame.width && candidate.y < frame.height && is_lit(surface_at(candidate.y * frame.width + candidate.x))) return candidate;
     }
     return pixel;
 }

@@ -6,7 +6,6 @@
 
 layout(local_size_x = 8, local_size_y = 8) in;
 
-layout(set = 0, binding = B_SURFACES, scalar) readonly buffer Surfaces { Surface surfaces[]; };
 layout(set = 0, binding = B_SHOWN, scalar) readonly buffer Shown { vec4 shown[]; };
 layout(set = 0, binding = B_CODES, scalar) writeonly buffer Codes { uint codes[]; };
 
@@ -54,7 +53,7 @@ void main() {
     uvec2 pixel;
     if (!tile_pixel(tiles[gl_WorkGroupID.x >> 2u], pixel)) return;
     uint index = pixel.y * frame.width + pixel.x;
-    Surface surface = surfaces[index];
+    Surface surface = surface_at(index);
     uint nans = 0u, clipped = 0u, lit = 0u, code = 0u;
     if (surface.id != NO_HIT && surface.distance > 0.0) {
         uint instance = surface.id >> 24u;

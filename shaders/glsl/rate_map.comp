@@ -8,9 +8,6 @@
 layout(local_size_x = 16) in;
 
 layout(set = 0, binding = B_TILES, scalar) readonly buffer Tiles { uint tiles[]; };
-layout(set = 0, binding = B_SURFACES, scalar) readonly buffer Surfaces { Surface surfaces[]; };
-layout(set = 0, binding = B_GUIDES, scalar) readonly buffer Guides { Guide guides[]; };
-layout(set = 0, binding = B_HISTORY, scalar) readonly buffer Histories { History histories[]; };
 layout(set = 0, binding = B_RATES, scalar) writeonly buffer Rates { uint rates[]; };
 layout(set = 0, binding = B_RATE_TABLE, scalar) readonly buffer RateTable { vec2 rate_table[]; };
 
@@ -56,9 +53,9 @@ float known_luminance(uint x, uint y, out bool lit) {
     lit = false;
     if (x >= frame.width || y >= frame.height) return 0.0;
     uint at = y * frame.width + x;
-    lit = is_lit(surfaces[at]);
+    lit = is_lit(surface_at(at));
     if (!lit) return 0.0;
-    History h = histories[frame.parity * frame.width * frame.height + at];
+    History h = history_at(frame.parity * frame.width * frame.height + at);
     vec3 c = h.mean;
     precise float l = c.x * 0.2126 + c.y * 0.7152 + c.z * 0.0722;
     return h.weight > 0.0 ? l : -1.0;
@@ -80,7 +77,7 @@ void main() {
         r.luminance_sum = sum;
         r.lit++;
         uint at = y * frame.width + x;
-        Guide g = guides[at];
+        Guide g = guide_at(at);
         float vx = abs(g.motion.x), vy = abs(g.motion.y);
         if (!finite(vx) || !finite(vy) || !finite(g.size)) r.odd++;
         r.speed_x = vx < r.speed_x ? vx : r.speed_x;

@@ -10,9 +10,7 @@
 layout(local_size_x = 8, local_size_y = 8) in;
 
 layout(set = 0, binding = B_TILES, scalar) readonly buffer Tiles { uint tiles[]; };
-layout(set = 0, binding = B_SURFACES, scalar) readonly buffer Surfaces { Surface surfaces[]; };
-layout(set = 0, binding = B_GUIDES, scalar) readonly buffer Guides { Guide guides[]; };
-layout(set = 0, binding = B_HISTORY, scalar) buffer Histories { History histories[]; };
+layout(set = 0, binding = B_HISTORY, scalar) writeonly buffer Histories { History histories[]; };
 layout(set = 0, binding = B_SCHEDULE, scalar) buffer ScheduleBlock { Schedule schedule; };
 // Method dpm: what leads from the history's surface point to the pixel's, added to its mean.
 layout(set = 0, binding = B_SHOWN, scalar) writeonly buffer Shown { vec4 shown[]; };
@@ -30,18 +28,18 @@ struct Carried {
 };
 
 bool tap_valid(uint index, uint instance, vec3 position, vec3 normal, float footprint, float depth) {
-    if (histories[index].frame != frame.history_frame || histories[index].instance != instance || !(histories[index].weight > 0.0)) return false;
-    vec3 apart = histories[index].position - position;
-    vec3 tap_normal = decode_normal(histories[index].normal);
+    if (history_at(index).frame != frame.history_frame || history_at(index).instance != instance || !(history_at(index).weight > 0.0)) return false;
+    vec3 apart = history_at(index).position - position;
+    vec3 tap_normal = decode_normal(history_at(index).normal);
     return dot(tap_normal, normal) > 0.9 && abs(dot(apart, normal)) < depth * footprint && dot(apart, apart) < 16.0 * footprint * footprint;
 }
 
 void add_tap(inout Carried c, uint index, float w) {
-    c.mean += w * histories[index].mean;
-    c.weight += w * histories[index].weight;
-    c.drift += w * histories[index].drift;
-    c.variance += w * histories[index].variance;
-    c.surprise += w * histories[index].surprise;
+    c.mean += w * history_at(index).mean;
+    c.weight += w * history_at(index).weight;
+    c.drift += w * history_at(index).drift;
+    c.variance += w * history_at(index).variance;
+    c.surprise += w * history_at(index).surprise;
     c.total += w;
 }
 
@@ -93,8 +91,8 @@ void carry_bilinear(inout History h, vec3 normal, float footprint, vec2 before) 
     h.variance = c.variance * s;
     h.surprise = c.surprise * s;
     // The sequence goes on where the nearest point left it.
-    h.seed = histories[nearest].seed;
-    h.index = histories[nearest].index;
+    h.seed = history_at(nearest).seed;
+    h.index = history_at(nearest).index;
 }
 
 // Among nine histories at `offsets` from a pixel's centre, the nearest that has lost its own pixel to a nearer one; -1 where there is none.
@@ -138,11 +136,11 @@ void carry_point(inout History h, vec3 normal, float footprint, uvec2 pixel, vec
         if (any(lessThan(q, ivec2(0))) || any(greaterThanEqual(q, ivec2(frame.width, frame.height)))) continue;
         uint tap = former + uint(q.y) * frame.width + uint(q.x);
         if (!tap_valid(tap, h.instance, h.position, normal, footprint, 0.5)) continue;
-        vec2 e = project(transform_point(instance_at(h.instance).world_from_object, histories[tap].position)) - centre;
-        vec3 m = histories[tap].mean;
-        float w = histories[tap].weight;
+        vec2 e = project(transform_point(instance_at(h.instance).world_from_object, history_at(tap).position)) - centre;
+        vec3 m = history_at(tap).mean;
+        float w = history_at(tap).weight;
         // A broken history is as good as none.
-        bool sound = finite(histories[tap].drift) && finite(histories[tap].variance) && finite(histories[tap].surprise);
+        bool sound = finite(history_at(tap).drift) && finite(history_at(tap).variance) && finite(history_at(tap).surprise);
         if (!sound || !finite3(m) || !finite(w) || !finite(e.x + e.y)) continue;
         total += w;
         taps++;
@@ -176,7 +174,7 @@ void carry_point(inout History h, vec3 normal, float footprint, uvec2 pixel, vec
     }
     vec3 shift = vec3(0.0), g_x = vec3(0.0), g_y = vec3(0.0);
     if (owner != NO_HIT) {
-        History known = histories[owner];
+        History known = history_at(owner);
         float s = 1.0 / total;
         x *= s;
         y *= s;
@@ -214,7 +212,7 @@ void carry_point(inout History h, vec3 normal, float footprint, uvec2 pixel, vec
             known.seed = h.seed;
             known.index = 0u;
             // Known as well as the histories around it agree: their scatter about the plane, or about each other where they lie on one side.
-            float light = luminance(albedo_of(guides[at])), noise = max(known.surprise, 1e-8), per_frame = max(frame.budget_spp, 0.5);
+            float light = luminance(albedo_of(guide_at(at))), noise = max(known.surprise, 1e-8), per_frame = max(frame.budget_spp, 0.5);
             float expected = noise * per_frame / known.weight, rest;
             if (taps < 8u) {
                 float range = luminance(upper - lower) * light;
@@ -224,7 +222,7 @@ void carry_point(inout History h, vec3 normal, float footprint, uvec2 pixel, vec
                 rest = 2.0 * max((squares * s - mean * mean - fit) * light * light - expected, 0.0);
             }
             known.weight = 1.0 / (1.0 / known.weight + rest / (noise * per_frame));
-            known.weight = min(known.weight, mix(TAKEN_OVER, TAKEN_OVER_PERIPHERY, periphery(guides[at].angle)) * per_frame);
+            known.weight = min(known.weight, mix(TAKEN_OVER, TAKEN_OVER_PERIPHERY, periphery(guide_at(at).angle)) * per_frame);
             h = known;
         }
     }
@@ -243,9 +241,9 @@ void keep_hidden(uvec2 pixel, uint to) {
         ivec2 q = ivec2(pixel) + beside[i];
         if (any(lessThan(q, ivec2(0))) || any(greaterThanEqual(q, size))) continue;
         uint other = uint(q.y) * frame.width + uint(q.x);
-        if (!is_lit(surfaces[other])) continue;
-        instance = surfaces[other].id >> 24u;
-        before = centre - guides[other].motion;
+        if (!is_lit(surface_at(other))) continue;
+        instance = surface_at(other).id >> 24u;
+        before = centre - guide_at(other).motion;
         break;
     }
     if (instance == NO_HIT) return;
@@ -256,17 +254,17 @@ void keep_hidden(uvec2 pixel, uint to) {
         ivec2 q = corner + ivec2(i % 3, i / 3) - 1;
         if (any(lessThan(q, ivec2(0))) || any(greaterThanEqual(q, size))) continue;
         uint tap = former + uint(q.y) * frame.width + uint(q.x);
-        if (histories[tap].frame != frame.history_frame || histories[tap].instance != instance || !(histories[tap].weight > 0.0)) continue;
-        vec3 p = transform_point(instance_at(instance).world_from_object, histories[tap].position);
+        if (history_at(tap).frame != frame.history_frame || history_at(tap).instance != instance || !(history_at(tap).weight > 0.0)) continue;
+        vec3 p = transform_point(instance_at(instance).world_from_object, history_at(tap).position);
         vec2 e = project(p) - centre;
         float far = max(abs(e.x), abs(e.y));
-        if (far < nearest && dot(transform_vector(instance_at(instance).world_from_object, decode_normal(histories[tap].normal)), p) < 0.0) {
+        if (far < nearest && dot(transform_vector(instance_at(instance).world_from_object, decode_normal(history_at(tap).normal)), p) < 0.0) {
             nearest = far;
             owner = tap;
         }
     }
     if (owner == NO_HIT) return;
-    History h = histories[owner];
+    History h = history_at(owner);
     h.frame = frame.frame;
     histories[to] = h;
 }
@@ -278,7 +276,7 @@ void main() {
     uint at = pixel.y * frame.width + pixel.x;
     uint pixels = frame.width * frame.height;
     uint current = frame.parity * pixels;
-    Surface surface = surfaces[at];
+    Surface surface = surface_at(at);
     uint importance = 0u, lit = 0u;
     if (is_lit(surface)) {
         lit = 1u;
@@ -296,7 +294,7 @@ void main() {
         h.normal = encode_normal(normal);
         float cosine = abs(dot(transform_vector(instance_at(instance).world_from_object, normal), normalize(world)));
         float footprint = surface.distance * frame.pixel_size / max(cosine, 0.2);
-        vec2 before = vec2(pixel) + 0.5 - guides[at].motion;
+        vec2 before = vec2(pixel) + 0.5 - guide_at(at).motion;
         forget(h, at);
         if ((frame.flags & FRAME_DPM) != 0u) carry_point(h, normal, footprint, pixel, before);
         else carry_bilinear(h, normal, footprint, before);

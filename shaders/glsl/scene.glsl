@@ -4,7 +4,7 @@
 #extension GL_KHR_shader_subgroup_basic : require
 #extension GL_KHR_shader_subgroup_arithmetic : require
 #include "generated.glsl"
-#include "scene_rows.glsl"
+#include "tables.glsl"
 
 // What the scene needs; the host sets these before the first frame so that the rest is compiled away.
 layout(constant_id = 0) const bool HAS_TEXTURES = true;

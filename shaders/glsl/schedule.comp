@@ -13,17 +13,15 @@
 layout(local_size_x = 8, local_size_y = 8) in;
 
 layout(set = 0, binding = B_TILES, scalar) readonly buffer Tiles { uint tiles[]; };
-layout(set = 0, binding = B_GUIDES, scalar) readonly buffer Guides { Guide guides[]; };
-layout(set = 0, binding = B_HISTORY, scalar) readonly buffer Histories { History histories[]; };
 layout(set = 0, binding = B_RADIANCE, scalar) writeonly buffer Radiance { vec4 radiance_out[]; };
 layout(set = 0, binding = B_SCHEDULE, scalar) buffer ScheduleBlock { Schedule schedule; };
 layout(set = 0, binding = B_WORK, scalar) writeonly buffer Work { WorkItem work[]; };
 
 uint samples_of(uvec2 pixel, uint at) {
-    if ((frame.flags & FRAME_CAMERA_IS_EYE) != 0u) return surfaces[at].id == NO_HIT ? 1u : frame.spp;
-    if (!is_lit(surfaces[at])) return 0u;
+    if ((frame.flags & FRAME_CAMERA_IS_EYE) != 0u) return surface_at(at).id == NO_HIT ? 1u : frame.spp;
+    if (!is_lit(surface_at(at))) return 0u;
     if ((frame.flags & FRAME_DPM) != 0u) {
-        History h = histories[frame.parity * frame.width * frame.height + at];
+        History h = history_at(frame.parity * frame.width * frame.height + at);
         float share = frame.budget_spp;
         if ((frame.flags & FRAME_ALLOCATE) != 0u) share *= float(importance_of(h)) / max(float(schedule.importance), 1.0) * float(schedule.lit);
         // A point never seen before starts with what an average pixel gets; nothing waits longer than two or three frames.
@@ -34,7 +32,7 @@ uint samples_of(uvec2 pixel, uint at) {
     uvec2 size = block_size(pixel);
     if (!is_traced_block(pixel, size)) return 0u;
     if (traced_pixel(pixel, size) != pixel) return 0u;
-    return (frame.flags & FRAME_SPP_BY_ANGLE) != 0u ? frame.zone_spp[zone_of(guides[at].angle)] : frame.spp;
+    return (frame.flags & FRAME_SPP_BY_ANGLE) != 0u ? frame.zone_spp[zone_of(guide_at(at).angle)] : frame.spp;
 }
 
 void main() {

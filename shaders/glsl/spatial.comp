@@ -10,10 +10,6 @@
 layout(local_size_x = 8, local_size_y = 8) in;
 
 layout(set = 0, binding = B_TILES, scalar) readonly buffer Tiles { uint tiles[]; };
-layout(set = 0, binding = B_SURFACES, scalar) readonly buffer Surfaces { Surface surfaces[]; };
-layout(set = 0, binding = B_GUIDES, scalar) readonly buffer Guides { Guide guides[]; };
-layout(set = 0, binding = B_HISTORY, scalar) readonly buffer Histories { History histories[]; };
-layout(set = 0, binding = B_FILTERED, scalar) readonly buffer Filtered { vec4 filtered[]; };
 layout(set = 0, binding = B_SHOWN, scalar) writeonly buffer Shown { vec4 shown[]; };
 
 layout(constant_id = 13) const bool HAS_FILTER = true;
@@ -34,7 +30,7 @@ bool neighbour(ivec2 q, uint instance, out uint tap) {
     tap = 0u;
     if (any(lessThan(q, ivec2(0))) || any(greaterThanEqual(q, ivec2(frame.width, frame.height)))) return false;
     tap = uint(q.y) * frame.width + uint(q.x);
-    return is_lit(surfaces[tap]) && surfaces[tap].id >> 24u == instance;
+    return is_lit(surface_at(tap)) && surface_at(tap).id >> 24u == instance;
 }
 
 // The disk is turned anew in every pixel and frame.
@@ -45,18 +41,18 @@ mat2 turn_of(uvec2 pixel, uint dimension) {
 
 // Slope of the light at the surface over time, from how far the histories around lag behind, by their age; nothing where chance explains it.
 float lag_of(uvec2 pixel, uint at, uint history) {
-    uint instance = surfaces[at].id >> 24u;
-    vec3 normal = decode_normal(histories[history + at].normal);
+    uint instance = surface_at(at).id >> 24u;
+    vec3 normal = decode_normal(history_at(history + at).normal);
     mat2 rotation = turn_of(pixel, 0u);
     float per_frame = max(frame.budget_spp, 0.5);
-    float age = histories[history + at].weight / per_frame, drift = histories[history + at].drift;
+    float age = history_at(history + at).weight / per_frame, drift = history_at(history + at).drift;
     float xx = age * age, xy = age * drift, yy = drift * drift, used = 1.0;
     for (int i = 0; i < 12; i++) {
         ivec2 q = ivec2(pixel) + ivec2(round(rotation * DISK[i] * 6.0));
         uint tap;
         if (q == ivec2(pixel) || !neighbour(q, instance, tap)) continue;
-        float w = pow(max(dot(decode_normal(histories[history + tap].normal), normal), 0.0), 8.0);
-        float x = histories[history + tap].weight / per_frame, y = histories[history + tap].drift;
+        float w = pow(max(dot(decode_normal(history_at(history + tap).normal), normal), 0.0), 8.0);
+        float x = history_at(history + tap).weight / per_frame, y = history_at(history + tap).drift;
         xx += w * x * x;
         xy += w * x * y;
         yy += w * y * y;
@@ -65,20 +61,20 @@ float lag_of(uvec2 pixel, uint at, uint history) {
     float fit = xy * xy / max(xx, 1e-12);
     float chance = max(yy - fit, 0.0) / max(used - 1.0, 1.0);
     // What the correction gets wrong changes from frame to frame: where the eye sees flicker best, only what is beyond doubt is corrected.
-    float doubt = mix(0.5, 3.0, periphery(guides[at].angle));
+    float doubt = mix(0.5, 3.0, periphery(guide_at(at).angle));
     float trust = fit > 0.0 ? max(1.0 - doubt * chance / fit, 0.0) : 0.0;
     return trust * xy / max(xx, 1e-12) * age;
 }
 
 // Local linear regression of the light at the surface on raster position and normal, blended in as far as what is left over is noise.
-vec3 regressed(uvec2 pixel, uint at, uint history, vec4 own) {
-    uint instance = surfaces[at].id >> 24u;
-    vec3 position = histories[history + at].position;
-    vec3 normal = decode_normal(histories[history + at].normal);
+vec3 regressed(uvec2 pixel, uint at, uint history, vec3 own) {
+    uint instance = surface_at(at).id >> 24u;
+    vec3 position = history_at(history + at).position;
+    vec3 normal = decode_normal(history_at(history + at).normal);
     vec3 across = normalize(abs(normal.x) < 0.7 ? cross(normal, vec3(1.0, 0.0, 0.0)) : cross(normal, vec3(0.0, 1.0, 0.0)));
     vec3 along = cross(normal, across);
-    float footprint = abs(surfaces[at].distance) * frame.pixel_size;
-    float level = max(luminance(own.rgb), 0.02);
+    float footprint = abs(surface_at(at).distance) * frame.pixel_size;
+    float level = max(luminance(own), 0.02);
     float tolerated = TOLERANCE * TOLERANCE * level * level;
     // Normal equations, lower triangle by rows: constant, x, y, two components of the normal.
     float a[15];
@@ -90,12 +86,12 @@ vec3 regressed(uvec2 pixel, uint at, uint history, vec4 own) {
         ivec2 d = ivec2(i % 5, i / 5) - 2;
         uint tap;
         if (!neighbour(ivec2(pixel) + d, instance, tap)) continue;
-        vec3 n = decode_normal(histories[history + tap].normal);
-        if (dot(n, normal) < 0.6 || abs(dot(histories[history + tap].position - position, normal)) > 3.0 * footprint) continue;
-        float light = luminance(albedo_of(guides[tap]));
-        float noise = filtered[tap].w * SEQUENCE_VARIANCE / (light * light);
+        vec3 n = decode_normal(history_at(history + tap).normal);
+        if (dot(n, normal) < 0.6 || abs(dot(history_at(history + tap).position - position, normal)) > 3.0 * footprint) continue;
+        float light = luminance(albedo_of(guide_at(tap)));
+        float noise = filtered_at(tap).variance * SEQUENCE_VARIANCE / (light * light);
         float w = 1.0 / (noise + tolerated);
-        vec3 m = filtered[tap].rgb - own.rgb;
+        vec3 m = filtered_at(tap).light - own;
         float v[5] = float[](1.0, float(d.x), float(d.y), dot(n, across), dot(n, along));
         int k = 0;
         for (int r = 0; r < 5; r++) {
@@ -107,9 +103,9 @@ vec3 regressed(uvec2 pixel, uint at, uint history, vec4 own) {
         total += w;
         used += 1.0;
         expected += w * noise;
-        single += noise * histories[history + tap].weight;
+        single += noise * history_at(history + tap).weight;
     }
-    if (used < 4.0) return own.rgb;
+    if (used < 4.0) return own;
     // Slopes are not expected beyond 2 % a pixel and a third over the normal's whole range.
     for (int r = 1; r < 5; r++) a[r * (r + 3) / 2] += 1.0 / ((r < 3 ? 4e-4 : 0.1) * level * level);
     // Cholesky; the power of the half solution is what the fit explains.
@@ -132,60 +128,60 @@ vec3 regressed(uvec2 pixel, uint at, uint history, vec4 own) {
     // Structure that the fit misses, around or at this very pixel, against the noise that the eye's mean leaves [Lee80].
     float structure = max(max(power - explained, 0.0) / total * used / max(used - 4.0, 1.0) - expected / total, 0.0);
     // Single pixels hardly know what a sample of theirs varies: it is that of all around. How many samples they stand on they know.
-    float held = histories[history + at].weight;
+    float held = history_at(history + at).weight;
     float noise = single / used / max(held, 1e-6);
     float apart = luminance(b[0]);
     // In the periphery blur is the lesser evil beside flicker.
-    float beyond = periphery(guides[at].angle);
+    float beyond = periphery(guide_at(at).angle);
     structure = max(structure, apart * apart - mix(3.0, 16.0, beyond) * noise);
     noise *= mix(1.0, 5.0, beyond) * held / (held + SEEN_FRAMES * max(frame.budget_spp, 0.5));
-    vec3 result = own.rgb + b[0] * (noise / max(structure + noise, 1e-12));
-    return finite3(result) ? max(result, vec3(0.0)) : own.rgb;
+    vec3 result = own + b[0] * (noise / max(structure + noise, 1e-12));
+    return finite3(result) ? max(result, vec3(0.0)) : own;
 }
 
 // [paper]: mean over a Poisson disk, blended in between two angles.
-vec3 disk_mean(uvec2 pixel, uint at, uint history, vec4 own) {
-    float blend = periphery(guides[at].angle);
-    if (!(blend > 0.0)) return own.rgb;
-    uint instance = surfaces[at].id >> 24u;
-    vec3 position = histories[history + at].position;
-    vec3 normal = decode_normal(histories[history + at].normal);
-    float footprint = abs(surfaces[at].distance) * frame.pixel_size;
+vec3 disk_mean(uvec2 pixel, uint at, uint history, vec3 own) {
+    float blend = periphery(guide_at(at).angle);
+    if (!(blend > 0.0)) return own;
+    uint instance = surface_at(at).id >> 24u;
+    vec3 position = history_at(history + at).position;
+    vec3 normal = decode_normal(history_at(history + at).normal);
+    float footprint = abs(surface_at(at).distance) * frame.pixel_size;
     mat2 rotation = turn_of(pixel, 1u);
-    vec3 sum = own.rgb;
+    vec3 sum = own;
     float total = 1.0;
     for (int i = 0; i < 12; i++) {
         ivec2 q = ivec2(pixel) + ivec2(round(rotation * DISK[i] * 4.0));
         uint tap;
         if (q == ivec2(pixel) || !neighbour(q, instance, tap)) continue;
-        vec3 apart = histories[history + tap].position - position;
-        float w = max(dot(decode_normal(histories[history + tap].normal), normal), 0.0);
+        vec3 apart = history_at(history + tap).position - position;
+        float w = max(dot(decode_normal(history_at(history + tap).normal), normal), 0.0);
         w = pow(w, 32.0) * exp(-abs(dot(apart, normal)) / max(footprint, 1e-12));
-        sum += w * filtered[tap].rgb;
+        sum += w * filtered_at(tap).light;
         total += w;
     }
-    return mix(own.rgb, sum / total, blend);
+    return mix(own, sum / total, blend);
 }
 
 void main() {
     uvec2 pixel;
     if (!tile_pixel(tiles[gl_WorkGroupID.x >> 2u], pixel)) return;
     uint at = pixel.y * frame.width + pixel.x;
-    if (!is_lit(surfaces[at])) {
+    if (!is_lit(surface_at(at))) {
         shown[at] = vec4(0.0);
         return;
     }
-    vec4 own = filtered[at];
+    vec3 own = filtered_at(at).light;
     uint history = frame.parity * frame.width * frame.height;
     if ((frame.flags & FRAME_DPM) != 0u) {
-        vec3 light = own.rgb;
+        vec3 light = own;
         if (HAS_FILTER) {
             light = regressed(pixel, at, history, own);
             float level = luminance(light);
             light *= clamp((level + lag_of(pixel, at, history)) / max(level, 1e-6), 0.5, 2.0);
         }
-        shown[at] = vec4(light * albedo_of(guides[at]), 1.0);
+        shown[at] = vec4(light * albedo_of(guide_at(at)), 1.0);
         return;
     }
-    shown[at] = vec4(HAS_FILTER ? disk_mean(pixel, at, history, own) : own.rgb, 1.0);
+    shown[at] = vec4(HAS_FILTER ? disk_mean(pixel, at, history, own) : own, 1.0);
 }

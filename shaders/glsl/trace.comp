@@ -7,17 +7,15 @@ layout(local_size_x = 64) in;
 
 layout(set = 0, binding = B_SCHEDULE, scalar) readonly buffer ScheduleBlock { Schedule schedule; };
 layout(set = 0, binding = B_WORK, scalar) readonly buffer Work { WorkItem work[]; };
-layout(set = 0, binding = B_SURFACES, scalar) readonly buffer Surfaces { Surface surfaces[]; };
-layout(set = 0, binding = B_HISTORY, scalar) readonly buffer Histories { History histories[]; };
 // rgb mean of the samples, w their number.
 layout(set = 0, binding = B_RADIANCE, scalar) writeonly buffer Radiance { vec4 radiance_out[]; };
 // Sum of squared luminance of the samples, per pixel (method dpm).
-layout(set = 0, binding = B_FILTERED, scalar) writeonly buffer Filtered { vec4 filtered[]; };
+layout(set = 0, binding = B_FILTERED, scalar) writeonly buffer FilteredBlock { Filtered filtered[]; };
 
 void main() {
     if (gl_GlobalInvocationID.x >= schedule.items) return;
     WorkItem item = work[gl_GlobalInvocationID.x];
-    Surface surface = surfaces[item.pixel];
+    Surface surface = surface_at(item.pixel);
     uvec2 pixel = uvec2(item.pixel % frame.width, item.pixel / frame.width);
     if (surface.id == NO_HIT) {
         // Only an ordinary camera asks for the background.
@@ -39,7 +37,7 @@ void main() {
     } else if (SAMPLER == 1u) {
         rng.seed = hash_u32(frame.frame + hash_u32(frame.seed));
     } else {
-        History h = histories[frame.parity * frame.width * frame.height + item.pixel];
+        History h = history_at(frame.parity * frame.width * frame.height + item.pixel);
         rng.seed = h.seed;
         rng.index = h.index;
     }
@@ -66,7 +64,7 @@ void main() {
         }
     } while (left > 0u);
     radiance_out[item.pixel] = vec4(count > 0u ? sum / float(count) : vec3(0.0), float(count));
-    if (SAMPLER == 2u) filtered[item.pixel] = vec4(sum_squares, 0.0, 0.0, 0.0);
+    if (SAMPLER == 2u) filtered[item.pixel] = Filtered(vec3(sum_squares, 0.0, 0.0), 0.0);
     COUNT(closest_rays, rays.closest)
     COUNT(shadow_rays, rays.shadow)
     COUNT(samples, item.spp)

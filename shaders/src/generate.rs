@@ -91,29 +91,26 @@ pub fn generated_glsl() -> String {
     out
 }
 
-/// The text of `glsl/scene_rows.glsl`: how the tables of a scene are read.
-pub fn scene_rows_glsl() -> String {
+/// The text of `glsl/tables.glsl`: how tables are read.
+pub fn tables_glsl() -> String {
     let mut out = String::from(
-        "// Written by build-shaders from shaders/src/structs.rs. Do not edit.\n//\n// Tables of the scene: storage on GPUs; rows of \
-         texel buffers on software Vulkan, which reads storage lane by lane where lanes\n// part. What is not used of an element is not read.\n",
+        "// Written by build-shaders from shaders/src/structs.rs. Do not edit.\n//\n// Tables: storage on GPUs; rows of texel buffers on \
+         software Vulkan, which reads storage lane by lane where lanes part. What is\n// not used of an element is not read.\n",
     );
-    for table in structs::scene_tables() {
-        let structs::SceneTable { name, binding, reader, bytes, read } = table;
+    for structs::Table { name, reader, storage, texel, bytes, from_rows, from_storage } in structs::tables() {
         let rows = bytes / 16;
+        let fetches: String = (0..rows)
+            .map(|row| format!("    uvec4 r{row} = texelFetch({reader}_rows, int(i) * {rows} + {row});\n"))
+            .collect();
         out.push_str(&format!(
-            "\n#ifdef SCENE_TEXELS\nlayout(set = 0, binding = {binding}) uniform utextureBuffer {reader}_rows;\n"
+            "\n#ifdef TEXEL_TABLES\n\
+             layout(set = 0, binding = {texel}) uniform utextureBuffer {reader}_rows;\n\
+             {name} {reader}_at(uint i) {{\n{fetches}    return {from_rows};\n}}\n\
+             #else\n\
+             layout(set = 0, binding = {storage}, scalar) readonly buffer {name}Table {{ {name} {reader}_table[]; }};\n\
+             {name} {reader}_at(uint i) {{\n    return {from_storage};\n}}\n\
+             #endif\n"
         ));
-        out.push_str(&format!("{name} {reader}_at(uint i) {{\n"));
-        for row in 0..rows {
-            out.push_str(&format!(
-                "    uvec4 r{row} = texelFetch({reader}_rows, int(i) * {rows} + {row});\n"
-            ));
-        }
-        out.push_str(&format!("    return {read};\n}}\n#else\n"));
-        out.push_str(&format!(
-            "layout(set = 0, binding = {binding}, scalar) readonly buffer {name}Table {{ {name} {reader}_table[]; }};\n"
-        ));
-        out.push_str(&format!("{name} {reader}_at(uint i) {{ return {reader}_table[i]; }}\n#endif\n"));
     }
     out
 }
@@ -175,8 +172,8 @@ mod tests {
         let committed = std::fs::read_to_string(root.join("glsl/generated.glsl")).unwrap();
         let remedy = "run: cargo run -p dpm-shaders --bin build-shaders";
         assert_eq!(committed, super::generated_glsl(), "glsl/generated.glsl is stale; {remedy}");
-        let rows = std::fs::read_to_string(root.join("glsl/scene_rows.glsl")).unwrap();
-        assert_eq!(rows, super::scene_rows_glsl(), "glsl/scene_rows.glsl is stale; {remedy}");
+        let rows = std::fs::read_to_string(root.join("glsl/tables.glsl")).unwrap();
+        assert_eq!(rows, super::tables_glsl(), "glsl/tables.glsl is stale; {remedy}");
         let hash = super::hash_directory(&root.join("glsl")).unwrap();
         let recorded = std::fs::read_to_string(root.join("spv/sources.hash")).unwrap();
         assert_eq!(recorded.trim(), format!("{hash:016x}"), "spv/ is stale; {remedy}");

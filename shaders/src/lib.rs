@@ -1,6 +1,6 @@
 //! GLSL sources, committed SPIR-V, and the one definition of every struct and constant shared with the GPU.
 //!
-//! `glsl/generated.glsl` is written from [`structs`] by `cargo run -p dpm-shaders --bin build-shaders`, which also runs `glslc`;
+//! `glsl/generated.glsl` and `glsl/tables.glsl` are written from [`structs`] by `cargo run -p dpm-shaders --bin build-shaders`, which also runs `glslc`;
 //! tests fail when either is stale, so users need no shader compiler.
 
 pub mod generate;
@@ -17,27 +17,48 @@ pub struct Shader {
     pub spirv: &'static [u8],
 }
 
-macro_rules! shaders {
-    ($($(#[$doc:meta])* $konst:ident = $name:literal;)*) => {
-        $($(#[$doc])* pub const $konst: Shader = Shader { name: $name, spirv: include_bytes!(concat!("../spv/", $name, ".spv")) };)*
-        /// Every shader in the crate.
-        pub const ALL: &[Shader] = &[$($konst),*];
+/// A shader that reads tables, built for either way of reading them.
+#[derive(Clone, Copy, Debug)]
+pub struct TableShader {
+    /// Through texel buffers: software Vulkan.
+    pub texel: Shader,
+    /// Through storage buffers: GPUs.
+    pub storage: Shader,
+}
+
+impl TableShader {
+    /// The one that reads through texel buffers, or the other.
+    pub fn reading(&self, texel: bool) -> Shader {
+        if texel {
+            self.texel
+        } else {
+            self.storage
+        }
+    }
+}
+
+macro_rules! spirv {
+    ($name:expr) => {
+        Shader { name: $name, spirv: include_bytes!(concat!("../spv/", $name, ".spv")) }
     };
 }
 
-shaders! {
-    /// Primary visibility. `TEXEL`, here and below: the scene through texel buffers (software Vulkan).
-    PRIMARY_TEXEL = "primary.texel";
-    /// Primary visibility. `STORAGE`, here and below: the scene through storage buffers (GPUs).
-    PRIMARY_STORAGE = "primary.storage";
+macro_rules! table_shaders {
+    ($($(#[$doc:meta])* $konst:ident = $name:literal;)*) => {
+        $($(#[$doc])* pub const $konst: TableShader =
+            TableShader { texel: spirv!(concat!($name, ".texel")), storage: spirv!(concat!($name, ".storage")) };)*
+        /// Every shader in the crate.
+        pub const ALL: &[Shader] = &[$($konst.texel, $konst.storage,)* PACK];
+    };
+}
+
+table_shaders! {
+    /// Primary visibility.
+    PRIMARY = "primary";
     /// Path tracing.
-    TRACE_TEXEL = "trace.texel";
-    /// Path tracing.
-    TRACE_STORAGE = "trace.storage";
+    TRACE = "trace";
     /// History carried to where its surface point is now.
-    REPROJECT_TEXEL = "reproject.texel";
-    /// History carried to where its surface point is now.
-    REPROJECT_STORAGE = "reproject.storage";
+    REPROJECT = "reproject";
     /// Shading rates per tile.
     RATE_MAP = "rate_map";
     /// Which pixels are traced, with how many samples.
@@ -47,9 +68,8 @@ shaders! {
     /// Spatial filter of the picture.
     SPATIAL = "spatial";
     /// Compensation for distance, angle and albedo, then quantisation to code values.
-    COMPENSATE_TEXEL = "compensate.texel";
-    /// Compensation for distance, angle and albedo, then quantisation to code values.
-    COMPENSATE_STORAGE = "compensate.storage";
-    /// Code values into bit planes.
-    PACK = "pack";
+    COMPENSATE = "compensate";
 }
+
+/// Code values into bit planes.
+pub const PACK: Shader = spirv!("pack");

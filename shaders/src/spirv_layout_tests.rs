@@ -63,6 +63,7 @@ const BLOCKS: &[(&str, &str, usize)] = &[
     ("B_COUNTERS", "Counters", size_of::<structs::Counters>()),
     ("B_GUIDES", "Guide", size_of::<structs::Guide>()),
     ("B_HISTORY", "History", size_of::<structs::History>()),
+    ("B_FILTERED", "Filtered", size_of::<structs::Filtered>()),
     ("B_SCHEDULE", "Schedule", size_of::<structs::Schedule>()),
     ("B_WORK", "WorkItem", size_of::<structs::WorkItem>()),
 ];
@@ -96,7 +97,7 @@ fn offsets_and_strides_are_those_of_the_rust_structs() {
             let Some(members) = module.structs.get(&block) else {
                 // Rows of a texel buffer: `generate` reads them in the order of the Rust struct's members.
                 assert!(
-                    structs::SCENE_TABLES.contains(binding_name) && shader.name.ends_with(".texel"),
+                    structs::TEXEL_BINDINGS.contains(binding_name) && shader.name.ends_with(".texel"),
                     "{what}"
                 );
                 continue;
@@ -128,7 +129,7 @@ fn offsets_and_strides_are_those_of_the_rust_structs() {
 #[test]
 fn a_wrong_offset_is_found() {
     // The test above must be able to fail: move one member of one struct in a copy of a shader.
-    let mut words: Vec<u8> = crate::COMPENSATE_STORAGE.spirv.to_vec();
+    let mut words: Vec<u8> = crate::COMPENSATE.storage.spirv.to_vec();
     let module = parse(&words);
     let (&(id, member), &offset) =
         module.offsets.iter().filter(|(_, o)| **o > 0).min_by_key(|(k, _)| **k).expect("members");

@@ -23,6 +23,12 @@ macro_rules! gpu_structs {
                     let members = [$(<$ty as GlslType>::read(word)),*];
                     format!("{}({})", stringify!($name), members.join(",\n        "))
                 }
+
+                /// The GLSL that makes one of the members of `element`, so that what is not used of it is not loaded.
+                pub fn copy_members(element: &str) -> String {
+                    let members = [$(format!("{element}.{}", stringify!($field))),*];
+                    format!("{}({})", stringify!($name), members.join(",\n        "))
+                }
             }
         )*
         /// The GLSL of every struct, in order.
@@ -131,6 +137,8 @@ gpu_structs! {
         albedo_rg: u32,
         /// Blue, as a half.
         albedo_b: u32,
+        /// 0.
+        reserved: [u32; 2],
     }
 
     /// What former frames say about the surface point that a pixel shows now.
@@ -157,6 +165,8 @@ gpu_structs! {
         instance: u32,
         /// Frame that wrote it.
         frame: u32,
+        /// 0.
+        reserved: u32,
     }
 
     /// A pixel to be traced.
@@ -177,6 +187,14 @@ gpu_structs! {
         importance: u32,
         /// Lit pixels.
         lit: u32,
+    }
+
+    /// A pixel's light before the spatial filter.
+    struct Filtered {
+        /// Radiance, divided by the albedo where the method does so; right after tracing (method dpm): x is the sum of squared luminances.
+        light: [f32; 3],
+        /// Variance of its luminance.
+        variance: f32,
     }
 
     /// One rigid body in the top level.
@@ -427,39 +445,51 @@ pub const NOISE_FRAMES: u32 = 32;
 /// Side of the directional-albedo table.
 pub const ALBEDO_TABLE_SIZE: u32 = 32;
 
-/// A table of the scene that shaders read by `{reader}_at(i)`: elements of whole rows of four words.
-pub(crate) struct SceneTable {
+/// A table that shaders read by `{reader}_at(i)`: elements of whole rows of four words.
+pub(crate) struct Table {
     pub name: &'static str,
-    pub binding: &'static str,
     pub reader: &'static str,
+    /// Binding as storage.
+    pub storage: &'static str,
+    /// Binding as texels; another one where some shader writes the table.
+    pub texel: &'static str,
     pub bytes: usize,
-    pub read: String,
+    /// GLSL that makes an element of the rows r0, r1, ...
+    pub from_rows: String,
+    /// GLSL that makes it of the storage `{reader}_table[i]`.
+    pub from_storage: String,
 }
 
-macro_rules! scene_tables {
-    ($($name:ident, $binding:literal, $reader:literal;)*) => {
-        /// What `scene_rows.glsl` is written from.
-        pub(crate) fn scene_tables() -> Vec<SceneTable> {
+macro_rules! tables {
+    ($($name:ident $reader:literal, $storage:literal or $texel:literal;)*) => {
+        /// What `tables.glsl` is written from.
+        pub(crate) fn tables() -> Vec<Table> {
             $(const { assert!(size_of::<$name>() % 16 == 0) };)*
-            vec![$(SceneTable {
+            vec![$(Table {
                 name: stringify!($name),
-                binding: $binding,
                 reader: $reader,
+                storage: $storage,
+                texel: $texel,
                 bytes: size_of::<$name>(),
-                read: $name::read_members(&mut 0),
+                from_rows: $name::read_members(&mut 0),
+                from_storage: $name::copy_members(concat!($reader, "_table[i]")),
             }),*]
         }
 
-        /// Bindings of those tables: texel buffers in the shaders that were built with them.
-        pub const SCENE_TABLES: &[&str] = &[$($binding),*];
+        /// Bindings that are texel buffers in the shaders that read tables so.
+        pub const TEXEL_BINDINGS: &[&str] = &["B_NODES", "B_TRIANGLES", $($texel),*];
     };
 }
 
-scene_tables! {
-    Instance, "B_INSTANCES", "instance";
-    Vertex, "B_VERTICES", "vertex";
-    TriangleRef, "B_TRIANGLE_REFS", "triangle_ref";
-    Material, "B_MATERIALS", "material";
+tables! {
+    Instance "instance", "B_INSTANCES" or "B_INSTANCES";
+    Vertex "vertex", "B_VERTICES" or "B_VERTICES";
+    TriangleRef "triangle_ref", "B_TRIANGLE_REFS" or "B_TRIANGLE_REFS";
+    Material "material", "B_MATERIALS" or "B_MATERIALS";
+    Surface "surface", "B_SURFACES" or "B_SURFACE_ROWS";
+    Guide "guide", "B_GUIDES" or "B_GUIDE_ROWS";
+    History "history", "B_HISTORY" or "B_HISTORY_ROWS";
+    Filtered "filtered", "B_FILTERED" or "B_FILTERED_ROWS";
 }
 
 /// Descriptor bindings of set 0, the same in every shader.
@@ -491,4 +521,8 @@ pub const BINDINGS: &[(&str, u32)] = &[
     ("B_FILTERED", 24),
     ("B_SHOWN", 25),
     ("B_PLANES", 26),
+    ("B_SURFACE_ROWS", 27),
+    ("B_GUIDE_ROWS", 28),
+    ("B_HISTORY_ROWS", 29),
+    ("B_FILTERED_ROWS", 30),
 ];

@@ -18,7 +18,7 @@ GLSL = pathlib.Path(__file__).resolve().parents[2] / "shaders/glsl"
 # constant_id: value for a rig that needs nothing. The environment is constant (1); something must light the scene.
 LEAN = {0: "false", 1: "false", 2: "false", 3: "false", 4: "false", 5: "false", 6: "false", 7: "1", 8: "false", 9: "true",
         10: "0", 11: "true", 12: "false", 13: "false"}
-SHADERS = [("trace", ["-DSCENE_TEXELS"]), ("trace", []), ("primary", ["-DSCENE_TEXELS"]), ("primary", []),
+SHADERS = [("trace", ["-DTEXEL_TABLES"]), ("trace", []), ("primary", ["-DTEXEL_TABLES"]), ("primary", []),
            ("reproject", []), ("accumulate", []), ("spatial", []), ("compensate", [])]
 CONSTANT = re.compile(r"layout\(constant_id = (\d+)\) const (\w+) (\w+) = \w+;")
 

@@ -9,7 +9,7 @@ use dpm_host::reference::Sampler;
 use dpm_host::render::compensation::{real_cosine, Compensation};
 use dpm_host::render::scene_data::SceneNeeds;
 use dpm_shaders::structs::{
-    Counters, Frame, Instance, Rows, Surface, TriangleRef, Vertex, BINDINGS, NO_HIT, SCENE_TABLES,
+    Counters, Frame, Instance, Rows, Surface, TriangleRef, Vertex, BINDINGS, NO_HIT, TEXEL_BINDINGS,
 };
 use dpm_tests::gpu::with_gpu;
 use std::mem::size_of;
@@ -57,7 +57,7 @@ fn on_gpu_through(gpu: &Arc<Gpu>, input: &Input, texel: bool) -> (Vec<u32>, Coun
     let instances = rows("instances", bytemuck::cast_slice(&input.instances));
     let refs = rows("refs", bytemuck::cast_slice(&input.refs));
     let vertices = rows("vertices", bytemuck::cast_slice(&input.vertices));
-    let surfaces = uploaded("surfaces", bytemuck::cast_slice(&input.surfaces));
+    let surfaces = rows("surfaces", bytemuck::cast_slice(&input.surfaces));
     let radiance = uploaded("radiance", bytemuck::cast_slice(&input.radiance));
     let tile_list = uploaded("tiles", bytemuck::cast_slice(&tiles));
     let codes = device("codes", PIXELS * 4);
@@ -67,14 +67,13 @@ fn on_gpu_through(gpu: &Arc<Gpu>, input: &Input, texel: bool) -> (Vec<u32>, Coun
     let kinds: Vec<_> = BINDINGS
         .iter()
         .map(|&(name, binding)| {
-            let of_rows = texel && SCENE_TABLES.contains(&name);
+            let of_rows = texel && TEXEL_BINDINGS.contains(&name);
             (binding, if of_rows { BindingKind::Texel } else { BindingKind::Storage })
         })
         .collect();
     let table = BindingTable::new(gpu, &kinds).unwrap();
     let constants = SceneNeeds::default().everything().constants();
-    let shader = if texel { dpm_shaders::COMPENSATE_TEXEL } else { dpm_shaders::COMPENSATE_STORAGE };
-    let pipeline = ComputePipeline::new(&table, shader, &constants).unwrap();
+    let pipeline = ComputePipeline::new(&table, dpm_shaders::COMPENSATE.reading(texel), &constants).unwrap();
     let buffers: Vec<(u32, &Buffer)> = BINDINGS
         .iter()
         .map(|&(name, binding)| {
@@ -84,7 +83,7 @@ fn on_gpu_through(gpu: &Arc<Gpu>, input: &Input, texel: bool) -> (Vec<u32>, Coun
                 "B_TRIANGLE_REFS" => &refs,
                 "B_VERTICES" => &vertices,
                 "B_TILES" => &tile_list,
-                "B_SURFACES" => &surfaces,
+                "B_SURFACES" | "B_SURFACE_ROWS" => &surfaces,
                 "B_SHOWN" => &radiance,
                 "B_CODES" => &codes,
                 "B_COUNTERS" => &counters,

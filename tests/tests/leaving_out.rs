@@ -1,4 +1,5 @@
-//! What a scene does not need is compiled away. That may cost speed only: every pixel stays the same, bit for bit.
+//! What a scene does not need is compiled away, and tables are read as suits the device. That may cost speed only: every pixel stays the
+//! same, bit for bit.
 
 use dpm_host::config::{Overrides, RenderMethod, RigConfig};
 use dpm_host::experiments::scene_plan::scene_plan;
@@ -7,6 +8,7 @@ use dpm_host::experiments::stability::gpu_shot::Shot;
 use dpm_host::experiments::stability::shapes::*;
 use dpm_host::pipeline::renderer_settings;
 use dpm_host::render::method::Method;
+use dpm_host::render::scene_data::Keep;
 use dpm_host::render::{Renderer, RendererSettings};
 use dpm_host::rig::Rig;
 use dpm_host::scene::{Material, PunctualKind, PunctualLight, Scene};
@@ -85,7 +87,7 @@ fn leaving_out_changes_no_bit() {
                 ..Shot::new(&scene, camera)
             };
             let lean = shot.draw(gpu);
-            let full = Shot { leave_nothing_out: true, ..shot }.draw(gpu);
+            let full = Shot { leave_nothing_out: true, ..shot.clone() }.draw(gpu);
             let bits = |p: &dpm_host::experiments::stability::gpu_shot::Picture| -> Vec<[u32; 4]> {
                 p.radiance.iter().map(|r| r.map(f32::to_bits)).collect()
             };
@@ -98,12 +100,14 @@ fn leaving_out_changes_no_bit() {
             assert_eq!(different, 0, "{name}: pixels that differ");
             assert_eq!(lean.codes, full.codes, "{name}");
             assert_eq!(lean.counters, full.counters, "{name}");
+            let stored = shot.draw_keeping(gpu, Keep { storage_tables: true, ..Keep::default() });
+            assert_eq!((&a, &lean.codes), (&bits(&stored), &stored.codes), "{name}: tables in storage");
         }
     });
 }
 
 #[test]
-fn leaving_out_changes_no_bit_of_either_method_with_histories() {
+fn neither_changes_a_bit_of_a_method_with_histories() {
     let flags = vec!["render.software_raster=[64,48]".to_owned()];
     let config = RigConfig::demo(&Overrides { variables: vec![], flags }).unwrap_or_else(|e| panic!("{e}"));
     let rig = Rig::build(&config, dpm_device::planes::Raster::new(64, 48)).unwrap_or_else(|e| panic!("{e}"));
@@ -112,13 +116,15 @@ fn leaving_out_changes_no_bit_of_either_method_with_histories() {
             let mut render = rig.config.render.clone();
             render.method = which;
             render.paper.zone_spp = [2, 2, 1];
-            let shown = |leave_nothing_out: bool| {
+            let shown = |leave_nothing_out: bool, storage_tables: bool| {
                 let settings = RendererSettings {
                     method: Method::from_config(&render),
                     leave_nothing_out,
                     ..renderer_settings(&rig)
                 };
-                let mut renderer = Renderer::new(gpu, &rig.scene, settings).expect("the demo fits the GPU");
+                let keep = Keep { storage_tables, ..Keep::default() };
+                let mut renderer =
+                    Renderer::keeping(gpu, &rig.scene, settings, keep).expect("the demo fits the GPU");
                 let mut slot = renderer.create_slot(true).expect("memory for a small frame");
                 let mut frames = Vec::new();
                 for frame in 0..6 {
@@ -130,8 +136,10 @@ fn leaving_out_changes_no_bit_of_either_method_with_histories() {
                 }
                 frames
             };
-            let (lean, full) = (shown(false), shown(true));
+            let lean = shown(false, false);
+            let (full, stored) = (shown(true, false), shown(false, true));
             for (frame, (lean, full)) in lean.iter().zip(&full).enumerate() {
+                assert!(*lean == stored[frame], "{which:?}, frame {frame}: tables in storage");
                 let lit = lean.1.iter().filter(|c| **c != 0).count();
                 assert!(lit > 50, "{which:?}, frame {frame}: {lit} pixels are lit");
                 let different = lean.0.iter().zip(&full.0).filter(|(a, b)| a != b).count();

@@ -256,6 +256,7 @@ pub fn scene_plan(config: &RigConfig, measure: bool) -> Result<PlanReport, Failu
         needs: SceneNeeds::default().everything(),
         rate_map: method.needs_history() && !method.needs_rates(),
         every_tile: true,
+        storage_tables: false,
     };
     report.together = Some(pair((&own, lean), (&own, all))?);
     let changed: Vec<&str> = (report.entries.iter())

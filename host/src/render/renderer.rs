@@ -4,7 +4,7 @@ use super::blue_noise;
 use super::method::Method;
 use super::rate_map;
 use super::scene_data::{world_bounds, Keep, SceneData, SceneDataError, SceneNeeds};
-use super::scene_gpu::SceneGpu;
+use super::scene_gpu::{table_buffer, SceneGpu};
 use super::slot::{DebugBuffers, FrameSlot, PASSES};
 use super::tiles::{TileList, TILE};
 use crate::geometry::projector::ProjectorCamera;
@@ -19,6 +19,7 @@ use dpm_device::planes::{PlaneSchedule, Raster};
 use dpm_shaders::structs::{
     self as gpu_structs, Counters, Frame, Guide, History, Instance, Rows, Schedule, Surface, WorkItem,
 };
+use dpm_shaders::TableShader;
 use glam::{DAffine3, DVec3, Vec3};
 use std::sync::Arc;
 
@@ -189,7 +190,7 @@ impl Renderer {
         keep: Keep,
     ) -> Result<Self, RenderError> {
         let data = SceneData::build(scene)?;
-        let texel = gpu.summary().software;
+        let texel = gpu.summary().software && !keep.storage_tables;
         let scene_gpu = SceneGpu::new(gpu, &data, texel)?;
         let mut needs = data.needs.with(keep.needs);
         needs.clamp |= settings.clamp_indirect.is_some();
@@ -197,16 +198,11 @@ impl Renderer {
             needs = needs.everything();
         }
         use BindingKind::{Storage, Texel};
-        let scene_kind = if texel { Texel } else { Storage };
         let kinds: Vec<_> = gpu_structs::BINDINGS
             .iter()
             .map(|&(name, binding)| {
-                let kind = match name {
-                    "B_NODES" | "B_TRIANGLES" => scene_kind,
-                    table if gpu_structs::SCENE_TABLES.contains(&table) => scene_kind,
-                    _ => Storage,
-                };
-                (binding, kind)
+                let rows = texel && gpu_structs::TEXEL_BINDINGS.contains(&name);
+                (binding, if rows { Texel } else { Storage })
             })
             .collect();
         let table = BindingTable::new(gpu, &kinds)?;
@@ -218,24 +214,20 @@ impl Renderer {
             (12, u32::from(method.dpm)),
             (13, u32::from(method.spatial)),
         ]);
-        let pipeline = |shader| ComputePipeline::new(&table, shader, &constants);
-        let pick = |t, s| if texel { t } else { s };
+        let pipeline = |shader: TableShader| ComputePipeline::new(&table, shader.reading(texel), &constants);
         let only = |wanted: bool, shader| wanted.then(|| pipeline(shader)).transpose();
         let pipelines = Pipelines {
-            primary: pipeline(pick(dpm_shaders::PRIMARY_TEXEL, dpm_shaders::PRIMARY_STORAGE))?,
-            reproject: only(
-                method.needs_history(),
-                pick(dpm_shaders::REPROJECT_TEXEL, dpm_shaders::REPROJECT_STORAGE),
-            )?,
+            primary: pipeline(dpm_shaders::PRIMARY)?,
+            reproject: only(method.needs_history(), dpm_shaders::REPROJECT)?,
             rate_map: only(
                 method.needs_rates() || keep.rate_map && method.needs_history(),
                 dpm_shaders::RATE_MAP,
             )?,
             schedule: pipeline(dpm_shaders::SCHEDULE)?,
-            trace: pipeline(pick(dpm_shaders::TRACE_TEXEL, dpm_shaders::TRACE_STORAGE))?,
+            trace: pipeline(dpm_shaders::TRACE)?,
             accumulate: only(method.needs_history(), dpm_shaders::ACCUMULATE)?,
             spatial: only(method.needs_spatial(), dpm_shaders::SPATIAL)?,
-            compensate: pipeline(pick(dpm_shaders::COMPENSATE_TEXEL, dpm_shaders::COMPENSATE_STORAGE))?,
+            compensate: pipeline(dpm_shaders::COMPENSATE)?,
             pack: (settings.output.schedule())
                 .map(|schedule| {
                     let constants = pack::gpu::constants(settings.raster, schedule);
@@ -246,7 +238,7 @@ impl Renderer {
         let pixels = if method.needs_history() { settings.raster.pixel_count() } else { 1 };
         let tiles = settings.raster.width().div_ceil(TILE) * settings.raster.height().div_ceil(TILE);
         let shared = SharedBuffers {
-            history: Buffer::new(gpu, "history", 2 * pixels * size_of::<History>(), MemoryKind::Device)?,
+            history: table_buffer(gpu, "history", 2 * pixels * size_of::<History>(), MemoryKind::Device)?,
             rates: Buffer::from_slice(gpu, "shading rates", &vec![0u32; tiles as usize])?,
             rate_table: Buffer::from_slice(gpu, "rate table", &rate_map::rate_table())?,
             noise: Buffer::from_slice(gpu, "blue noise", blue_noise::MASK)?,
@@ -310,13 +302,13 @@ impl Renderer {
         use MemoryKind::{Device, Readback, Upload};
         let tile_list = TileList::new(raster.width(), raster.height());
         let frame = size("frame uniforms", size_of::<Frame>(), Upload)?;
-        let rows = size_of::<Instance>() / 16 * self.data.bodies.len().max(1);
-        let instances = Buffer::new_texels(gpu, "instances", rows, false, Upload)?;
+        let table = |what, bytes, kind| table_buffer(gpu, what, bytes, kind);
+        let instances = table("instances", size_of::<Instance>() * self.data.bodies.len().max(1), Upload)?;
         let arguments = size("dispatch arguments", 32, Upload)?;
         let tiles = size("tile list", tile_list.len() * 4, Upload)?;
         let counters = size("counters", size_of::<Counters>(), Device)?;
         let counters_host = size("counters", size_of::<Counters>(), Readback)?;
-        let surfaces = size("surfaces", pixels * size_of::<Surface>(), Device)?;
+        let surfaces = table("surfaces", pixels * size_of::<Surface>(), Device)?;
         let radiance = size("radiance", pixels * 16, Device)?;
         let codes = size("code values", pixels * 4, Device)?;
         let schedule_packed = self.settings.output.schedule();
@@ -328,9 +320,9 @@ impl Renderer {
         let planes = size("bit planes", plane_bytes, Device)?;
         let planes_host = schedule_packed.map(|_| size("bit planes", plane_bytes, Readback)).transpose()?;
         let method = &self.settings.method;
-        let with = |wanted: bool, what, bytes, kind| size(what, if wanted { bytes } else { 16 }, kind);
+        let with = |wanted: bool, what, bytes, kind| table(what, if wanted { bytes } else { 16 }, kind);
         let history_bytes = self.shared.history.len_bytes();
-        let guides = size("guides", pixels * size_of::<Guide>(), Device)?;
+        let guides = table("guides", pixels * size_of::<Guide>(), Device)?;
         let schedule = size("schedule", size_of::<Schedule>(), Device)?;
         let work = size("work items", pixels * size_of::<WorkItem>(), Device)?;
         let filtered = with(method.needs_history(), "filtered radiance", pixels * 16, Device)?;
@@ -371,18 +363,18 @@ impl Renderer {
             "B_ENVIRONMENT" => &s.environment,
             "B_ALBEDO" => &s.albedo,
             "B_TILES" => &tiles,
-            "B_SURFACES" => &surfaces,
+            "B_SURFACES" | "B_SURFACE_ROWS" => &surfaces,
             "B_RADIANCE" => &radiance,
             "B_CODES" => &codes,
             "B_COUNTERS" => &counters,
-            "B_GUIDES" => &guides,
-            "B_HISTORY" => &self.shared.history,
+            "B_GUIDES" | "B_GUIDE_ROWS" => &guides,
+            "B_HISTORY" | "B_HISTORY_ROWS" => &self.shared.history,
             "B_RATES" => &self.shared.rates,
             "B_RATE_TABLE" => &self.shared.rate_table,
             "B_SCHEDULE" => &schedule,
             "B_WORK" => &work,
             "B_NOISE" => &self.shared.noise,
-            "B_FILTERED" => &filtered,
+            "B_FILTERED" | "B_FILTERED_ROWS" => &filtered,
             "B_SHOWN" => shown,
             "B_PLANES" => &planes,
             other => unreachable!("binding {other} has no buffer"),

@@ -152,6 +152,8 @@ pub struct Keep {
     pub rate_map: bool,
     /// Tiles that no body touches.
     pub every_tile: bool,
+    /// Tables in storage, as on a GPU, where software Vulkan would read texel buffers.
+    pub storage_tables: bool,
 }
 
 /// Why a scene cannot be drawn.

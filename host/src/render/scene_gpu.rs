@@ -1,7 +1,7 @@
 //! A scene's flat arrays into GPU buffers.
 
 use super::scene_data::SceneData;
-use crate::gpu::{Buffer, Gpu, GpuError};
+use crate::gpu::{Buffer, Gpu, GpuError, MemoryKind};
 use bytemuck::cast_slice;
 use std::sync::Arc;
 
@@ -48,5 +48,19 @@ impl SceneGpu {
             environment: Buffer::from_slice(gpu, "environment map", &data.environment)?,
             albedo: Buffer::from_slice(gpu, "albedo tables", &data.albedo)?,
         })
+    }
+}
+
+/// A buffer of whole rows of four words, for either way of reading it.
+pub(super) fn table_buffer(
+    gpu: &Arc<Gpu>,
+    what: &str,
+    bytes: usize,
+    kind: MemoryKind,
+) -> Result<Buffer, GpuError> {
+    if gpu.summary().software {
+        Buffer::new_texels(gpu, what, bytes.div_ceil(16), false, kind)
+    } else {
+        Buffer::new(gpu, what, bytes, kind)
     }
 }

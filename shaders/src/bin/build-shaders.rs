@@ -1,26 +1,29 @@
-//! Writes `glsl/generated.glsl` and `glsl/scene_rows.glsl`, compiles every shader with `glslc`, and records the hash of the sources.
+//! Writes `glsl/generated.glsl` and `glsl/tables.glsl`, compiles every shader with `glslc`, and records the hash of the sources.
 //!
 //! Run as `cargo run -p dpm-shaders --bin build-shaders` after any change under `shaders/`.
 
 use std::path::Path;
 use std::process::{Command, ExitCode};
 
+/// Sources that read tables: each is built twice.
+const WITH_TABLES: &[&str] =
+    &["primary", "trace", "reproject", "rate_map", "schedule", "accumulate", "spatial", "compensate"];
+
 /// Output stem, source, extra defines.
-const VARIANTS: &[(&str, &str, &[&str])] = &[
-    ("primary.texel", "primary.comp", &["-DSCENE_TEXELS"]),
-    ("primary.storage", "primary.comp", &[]),
-    ("trace.texel", "trace.comp", &["-DSCENE_TEXELS"]),
-    ("trace.storage", "trace.comp", &[]),
-    ("reproject.texel", "reproject.comp", &["-DSCENE_TEXELS"]),
-    ("reproject.storage", "reproject.comp", &[]),
-    ("rate_map", "rate_map.comp", &[]),
-    ("schedule", "schedule.comp", &[]),
-    ("accumulate", "accumulate.comp", &[]),
-    ("spatial", "spatial.comp", &[]),
-    ("compensate.texel", "compensate.comp", &["-DSCENE_TEXELS"]),
-    ("compensate.storage", "compensate.comp", &[]),
-    ("pack", "pack.comp", &[]),
-];
+fn variants() -> Vec<(String, String, Option<&'static str>)> {
+    let source = |name: &str| format!("{name}.comp");
+    let mut all: Vec<_> = WITH_TABLES
+        .iter()
+        .flat_map(|name| {
+            [
+                (format!("{name}.texel"), source(name), Some("-DTEXEL_TABLES")),
+                (format!("{name}.storage"), source(name), None),
+            ]
+        })
+        .collect();
+    all.push(("pack".to_owned(), source("pack"), None));
+    all
+}
 
 fn main() -> ExitCode {
     let root = Path::new(env!("CARGO_MANIFEST_DIR"));
@@ -28,16 +31,16 @@ fn main() -> ExitCode {
     let spv = root.join("spv");
     std::fs::write(glsl.join("generated.glsl"), dpm_shaders::generate::generated_glsl())
         .expect("write generated.glsl");
-    std::fs::write(glsl.join("scene_rows.glsl"), dpm_shaders::generate::scene_rows_glsl())
-        .expect("write scene_rows.glsl");
+    std::fs::write(glsl.join("tables.glsl"), dpm_shaders::generate::tables_glsl())
+        .expect("write tables.glsl");
     std::fs::create_dir_all(&spv).expect("create spv");
-    for (stem, source, defines) in VARIANTS {
+    for (stem, source, define) in variants() {
         let output = spv.join(format!("{stem}.spv"));
         let status = Command::new("glslc")
             .args(["--target-env=vulkan1.1", "-O", "-Werror", "-I"])
             .arg(&glsl)
-            .args(*defines)
-            .arg(glsl.join(source))
+            .args(define)
+            .arg(glsl.join(&source))
             .arg("-o")
             .arg(&output)
             .status();

@@ -4,6 +4,7 @@ use super::estimate::Estimate;
 use crate::geometry::projector::ProjectorCamera;
 use crate::gpu::Gpu;
 use crate::render::method::Method;
+use crate::render::scene_data::Keep;
 use crate::render::{FrameInputs, FrameSlot, Output, Renderer, RendererSettings};
 use crate::scene::Scene;
 use dpm_shaders::structs::{Counters, Surface, NO_HIT};
@@ -101,7 +102,16 @@ impl<'a> Shot<'a> {
     /// # Panics
     /// When the scene does not fit the GPU or a frame does not end: a failure of whoever asked for it.
     pub fn draw(&self, gpu: &Arc<Gpu>) -> Picture {
-        let mut renderer = Renderer::new(gpu, self.scene, self.settings()).expect("the scene fits the GPU");
+        self.draw_keeping(gpu, Keep::default())
+    }
+
+    /// Draws it with `keep` in.
+    ///
+    /// # Panics
+    /// As [`Shot::draw`].
+    pub fn draw_keeping(&self, gpu: &Arc<Gpu>, keep: Keep) -> Picture {
+        let mut renderer =
+            Renderer::keeping(gpu, self.scene, self.settings(), keep).expect("the scene fits the GPU");
         let poses = self.world_from_body();
         let mut picture = Picture::default();
         self.play(

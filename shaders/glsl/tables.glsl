@@ -1,9 +1,9 @@
 // Written by build-shaders from shaders/src/structs.rs. Do not edit.
 //
-// Tables of the scene: storage on GPUs; rows of texel buffers on software Vulkan, which reads storage lane by lane where lanes
-// part. What is not used of an element is not read.
+// Tables: storage on GPUs; rows of texel buffers on software Vulkan, which reads storage lane by lane where lanes part. What is
+// not used of an element is not read.
 
-#ifdef SCENE_TEXELS
+#ifdef TEXEL_TABLES
 layout(set = 0, binding = B_INSTANCES) uniform utextureBuffer instance_rows;
 Instance instance_at(uint i) {
     uvec4 r0 = texelFetch(instance_rows, int(i) * 12 + 0);
@@ -32,10 +32,22 @@ Instance instance_at(uint i) {
 }
 #else
 layout(set = 0, binding = B_INSTANCES, scalar) readonly buffer InstanceTable { Instance instance_table[]; };
-Instance instance_at(uint i) { return instance_table[i]; }
+Instance instance_at(uint i) {
+    return Instance(instance_table[i].world_from_object,
+        instance_table[i].object_from_world,
+        instance_table[i].bounds_min,
+        instance_table[i].node_offset,
+        instance_table[i].bounds_max,
+        instance_table[i].triangle_offset,
+        instance_table[i].previous_world_from_object,
+        instance_table[i].flags,
+        instance_table[i].body,
+        instance_table[i].extent,
+        instance_table[i].reserved);
+}
 #endif
 
-#ifdef SCENE_TEXELS
+#ifdef TEXEL_TABLES
 layout(set = 0, binding = B_VERTICES) uniform utextureBuffer vertex_rows;
 Vertex vertex_at(uint i) {
     uvec4 r0 = texelFetch(vertex_rows, int(i) * 3 + 0);
@@ -48,10 +60,15 @@ Vertex vertex_at(uint i) {
 }
 #else
 layout(set = 0, binding = B_VERTICES, scalar) readonly buffer VertexTable { Vertex vertex_table[]; };
-Vertex vertex_at(uint i) { return vertex_table[i]; }
+Vertex vertex_at(uint i) {
+    return Vertex(vertex_table[i].normal,
+        vertex_table[i].uv,
+        vertex_table[i].tangent,
+        vertex_table[i].reserved);
+}
 #endif
 
-#ifdef SCENE_TEXELS
+#ifdef TEXEL_TABLES
 layout(set = 0, binding = B_TRIANGLE_REFS) uniform utextureBuffer triangle_ref_rows;
 TriangleRef triangle_ref_at(uint i) {
     uvec4 r0 = texelFetch(triangle_ref_rows, int(i) * 2 + 0);
@@ -63,10 +80,15 @@ TriangleRef triangle_ref_at(uint i) {
 }
 #else
 layout(set = 0, binding = B_TRIANGLE_REFS, scalar) readonly buffer TriangleRefTable { TriangleRef triangle_ref_table[]; };
-TriangleRef triangle_ref_at(uint i) { return triangle_ref_table[i]; }
+TriangleRef triangle_ref_at(uint i) {
+    return TriangleRef(triangle_ref_table[i].vertices,
+        triangle_ref_table[i].material,
+        triangle_ref_table[i].light,
+        triangle_ref_table[i].reserved);
+}
 #endif
 
-#ifdef SCENE_TEXELS
+#ifdef TEXEL_TABLES
 layout(set = 0, binding = B_MATERIALS) uniform utextureBuffer material_rows;
 Material material_at(uint i) {
     uvec4 r0 = texelFetch(material_rows, int(i) * 13 + 0);
@@ -112,5 +134,117 @@ Material material_at(uint i) {
 }
 #else
 layout(set = 0, binding = B_MATERIALS, scalar) readonly buffer MaterialTable { Material material_table[]; };
-Material material_at(uint i) { return material_table[i]; }
+Material material_at(uint i) {
+    return Material(material_table[i].base_color,
+        material_table[i].alpha,
+        material_table[i].emissive,
+        material_table[i].alpha_cutoff,
+        material_table[i].metallic,
+        material_table[i].roughness,
+        material_table[i].ior,
+        material_table[i].transmission,
+        material_table[i].normal_scale,
+        material_table[i].flags,
+        material_table[i].albedo_table,
+        material_table[i].base_color_texture,
+        material_table[i].metallic_roughness_texture,
+        material_table[i].normal_texture,
+        material_table[i].emissive_texture,
+        material_table[i].transmission_texture,
+        material_table[i].reserved);
+}
+#endif
+
+#ifdef TEXEL_TABLES
+layout(set = 0, binding = B_SURFACE_ROWS) uniform utextureBuffer surface_rows;
+Surface surface_at(uint i) {
+    uvec4 r0 = texelFetch(surface_rows, int(i) * 1 + 0);
+    return Surface(r0.x,
+        vec2(uintBitsToFloat(r0.y), uintBitsToFloat(r0.z)),
+        uintBitsToFloat(r0.w));
+}
+#else
+layout(set = 0, binding = B_SURFACES, scalar) readonly buffer SurfaceTable { Surface surface_table[]; };
+Surface surface_at(uint i) {
+    return Surface(surface_table[i].id,
+        surface_table[i].barycentric,
+        surface_table[i].distance);
+}
+#endif
+
+#ifdef TEXEL_TABLES
+layout(set = 0, binding = B_GUIDE_ROWS) uniform utextureBuffer guide_rows;
+Guide guide_at(uint i) {
+    uvec4 r0 = texelFetch(guide_rows, int(i) * 2 + 0);
+    uvec4 r1 = texelFetch(guide_rows, int(i) * 2 + 1);
+    return Guide(vec2(uintBitsToFloat(r0.x), uintBitsToFloat(r0.y)),
+        uintBitsToFloat(r0.z),
+        uintBitsToFloat(r0.w),
+        r1.x,
+        r1.y,
+        uvec2(r1.z, r1.w));
+}
+#else
+layout(set = 0, binding = B_GUIDES, scalar) readonly buffer GuideTable { Guide guide_table[]; };
+Guide guide_at(uint i) {
+    return Guide(guide_table[i].motion,
+        guide_table[i].size,
+        guide_table[i].angle,
+        guide_table[i].albedo_rg,
+        guide_table[i].albedo_b,
+        guide_table[i].reserved);
+}
+#endif
+
+#ifdef TEXEL_TABLES
+layout(set = 0, binding = B_HISTORY_ROWS) uniform utextureBuffer history_rows;
+History history_at(uint i) {
+    uvec4 r0 = texelFetch(history_rows, int(i) * 4 + 0);
+    uvec4 r1 = texelFetch(history_rows, int(i) * 4 + 1);
+    uvec4 r2 = texelFetch(history_rows, int(i) * 4 + 2);
+    uvec4 r3 = texelFetch(history_rows, int(i) * 4 + 3);
+    return History(vec3(uintBitsToFloat(r0.x), uintBitsToFloat(r0.y), uintBitsToFloat(r0.z)),
+        uintBitsToFloat(r0.w),
+        vec3(uintBitsToFloat(r1.x), uintBitsToFloat(r1.y), uintBitsToFloat(r1.z)),
+        r1.w,
+        uintBitsToFloat(r2.x),
+        uintBitsToFloat(r2.y),
+        uintBitsToFloat(r2.z),
+        r2.w,
+        r3.x,
+        r3.y,
+        r3.z,
+        r3.w);
+}
+#else
+layout(set = 0, binding = B_HISTORY, scalar) readonly buffer HistoryTable { History history_table[]; };
+History history_at(uint i) {
+    return History(history_table[i].mean,
+        history_table[i].weight,
+        history_table[i].position,
+        history_table[i].normal,
+        history_table[i].drift,
+        history_table[i].variance,
+        history_table[i].surprise,
+        history_table[i].seed,
+        history_table[i].index,
+        history_table[i].instance,
+        history_table[i].frame,
+        history_table[i].reserved);
+}
+#endif
+
+#ifdef TEXEL_TABLES
+layout(set = 0, binding = B_FILTERED_ROWS) uniform utextureBuffer filtered_rows;
+Filtered filtered_at(uint i) {
+    uvec4 r0 = texelFetch(filtered_rows, int(i) * 1 + 0);
+    return Filtered(vec3(uintBitsToFloat(r0.x), uintBitsToFloat(r0.y), uintBitsToFloat(r0.z)),
+        uintBitsToFloat(r0.w));
+}
+#else
+layout(set = 0, binding = B_FILTERED, scalar) readonly buffer FilteredTable { Filtered filtered_table[]; };
+Filtered filtered_at(uint i) {
+    return Filtered(filtered_table[i].light,
+        filtered_table[i].variance);
+}
 #endif
