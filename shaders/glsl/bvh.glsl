@@ -3,10 +3,10 @@
 //
 // Nodes and triangles are read through NODE and TRI: texel buffers on software Vulkan (twice as fast there), storage buffers on GPUs.
 #ifdef TEXEL_TABLES
-layout(set = 0, binding = B_NODES) uniform utextureBuffer node_texels;
-layout(set = 0, binding = B_TRIANGLES) uniform textureBuffer triangle_texels;
-#define NODE(i) texelFetch(node_texels, int(i))
-#define TRI(i) texelFetch(triangle_texels, int(i))
+layout(set = 0, binding = B_NODES, rgba32ui) uniform readonly uimageBuffer node_texels;
+layout(set = 0, binding = B_TRIANGLES, rgba32f) uniform readonly imageBuffer triangle_texels;
+#define NODE(i) imageLoad(node_texels, int(i))
+#define TRI(i) imageLoad(triangle_texels, int(i))
 #else
 layout(set = 0, binding = B_NODES, scalar) readonly buffer NodeBlock { uvec4 node_words[]; };
 layout(set = 0, binding = B_TRIANGLES, scalar) readonly buffer TriangleBlock { vec4 triangle_rows[]; };

@@ -69,6 +69,6 @@ void main() {
     }
     codes[index] = code;
     COUNT(lit_pixels, lit)
-    COUNT(nan_values, nans)
-    COUNT(clipped_values, clipped)
+    COUNT_RARE(nan_values, nans)
+    COUNT_RARE(clipped_values, clipped)
 }

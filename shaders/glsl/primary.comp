@@ -76,6 +76,10 @@ void main() {
         }
     }
     surfaces[pixel.y * frame.width + pixel.x] = surface;
-    COUNT(closest_rays, 1u)
-    COUNT(shadow_rays, shadow)
+    // Both counts in one sum: a subgroup has at most 128 lanes.
+    uint both = subgroupAdd(1u + (shadow << 16u));
+    if (subgroupElect()) {
+        atomicAdd(counters.closest_rays, both & 0xffffu);
+        atomicAdd(counters.shadow_rays, both >> 16u);
+    }
 }

@@ -40,7 +40,8 @@ void main() {
     bool inside = tile_pixel(tiles[gl_WorkGroupID.x >> 2u], pixel);
     uint at = pixel.y * frame.width + pixel.x;
     uint spp = inside ? samples_of(pixel, at) : 0u;
-    if (inside) radiance_out[at] = vec4(0.0);
+    // What is traced is written by the tracer.
+    if (inside && spp == 0u) radiance_out[at] = vec4(0.0);
     uvec4 ballot = subgroupBallot(spp > 0u);
     uint count = subgroupBallotBitCount(ballot);
     if (count == 0u) return;

@@ -4,20 +4,20 @@
 // not used of an element is not read.
 
 #ifdef TEXEL_TABLES
-layout(set = 0, binding = B_INSTANCES) uniform utextureBuffer instance_rows;
+layout(set = 0, binding = B_INSTANCES, rgba32ui) uniform readonly uimageBuffer instance_rows;
 Instance instance_at(uint i) {
-    uvec4 r0 = texelFetch(instance_rows, int(i) * 12 + 0);
-    uvec4 r1 = texelFetch(instance_rows, int(i) * 12 + 1);
-    uvec4 r2 = texelFetch(instance_rows, int(i) * 12 + 2);
-    uvec4 r3 = texelFetch(instance_rows, int(i) * 12 + 3);
-    uvec4 r4 = texelFetch(instance_rows, int(i) * 12 + 4);
-    uvec4 r5 = texelFetch(instance_rows, int(i) * 12 + 5);
-    uvec4 r6 = texelFetch(instance_rows, int(i) * 12 + 6);
-    uvec4 r7 = texelFetch(instance_rows, int(i) * 12 + 7);
-    uvec4 r8 = texelFetch(instance_rows, int(i) * 12 + 8);
-    uvec4 r9 = texelFetch(instance_rows, int(i) * 12 + 9);
-    uvec4 r10 = texelFetch(instance_rows, int(i) * 12 + 10);
-    uvec4 r11 = texelFetch(instance_rows, int(i) * 12 + 11);
+    uvec4 r0 = imageLoad(instance_rows, int(i) * 12 + 0);
+    uvec4 r1 = imageLoad(instance_rows, int(i) * 12 + 1);
+    uvec4 r2 = imageLoad(instance_rows, int(i) * 12 + 2);
+    uvec4 r3 = imageLoad(instance_rows, int(i) * 12 + 3);
+    uvec4 r4 = imageLoad(instance_rows, int(i) * 12 + 4);
+    uvec4 r5 = imageLoad(instance_rows, int(i) * 12 + 5);
+    uvec4 r6 = imageLoad(instance_rows, int(i) * 12 + 6);
+    uvec4 r7 = imageLoad(instance_rows, int(i) * 12 + 7);
+    uvec4 r8 = imageLoad(instance_rows, int(i) * 12 + 8);
+    uvec4 r9 = imageLoad(instance_rows, int(i) * 12 + 9);
+    uvec4 r10 = imageLoad(instance_rows, int(i) * 12 + 10);
+    uvec4 r11 = imageLoad(instance_rows, int(i) * 12 + 11);
     return Instance(vec4[3](vec4(uintBitsToFloat(r0.x), uintBitsToFloat(r0.y), uintBitsToFloat(r0.z), uintBitsToFloat(r0.w)), vec4(uintBitsToFloat(r1.x), uintBitsToFloat(r1.y), uintBitsToFloat(r1.z), uintBitsToFloat(r1.w)), vec4(uintBitsToFloat(r2.x), uintBitsToFloat(r2.y), uintBitsToFloat(r2.z), uintBitsToFloat(r2.w))),
         vec4[3](vec4(uintBitsToFloat(r3.x), uintBitsToFloat(r3.y), uintBitsToFloat(r3.z), uintBitsToFloat(r3.w)), vec4(uintBitsToFloat(r4.x), uintBitsToFloat(r4.y), uintBitsToFloat(r4.z), uintBitsToFloat(r4.w)), vec4(uintBitsToFloat(r5.x), uintBitsToFloat(r5.y), uintBitsToFloat(r5.z), uintBitsToFloat(r5.w))),
         vec3(uintBitsToFloat(r6.x), uintBitsToFloat(r6.y), uintBitsToFloat(r6.z)),
@@ -48,11 +48,11 @@ Instance instance_at(uint i) {
 #endif
 
 #ifdef TEXEL_TABLES
-layout(set = 0, binding = B_VERTICES) uniform utextureBuffer vertex_rows;
+layout(set = 0, binding = B_VERTICES, rgba32ui) uniform readonly uimageBuffer vertex_rows;
 Vertex vertex_at(uint i) {
-    uvec4 r0 = texelFetch(vertex_rows, int(i) * 3 + 0);
-    uvec4 r1 = texelFetch(vertex_rows, int(i) * 3 + 1);
-    uvec4 r2 = texelFetch(vertex_rows, int(i) * 3 + 2);
+    uvec4 r0 = imageLoad(vertex_rows, int(i) * 3 + 0);
+    uvec4 r1 = imageLoad(vertex_rows, int(i) * 3 + 1);
+    uvec4 r2 = imageLoad(vertex_rows, int(i) * 3 + 2);
     return Vertex(vec3(uintBitsToFloat(r0.x), uintBitsToFloat(r0.y), uintBitsToFloat(r0.z)),
         vec2(uintBitsToFloat(r0.w), uintBitsToFloat(r1.x)),
         vec4(uintBitsToFloat(r1.y), uintBitsToFloat(r1.z), uintBitsToFloat(r1.w), uintBitsToFloat(r2.x)),
@@ -69,10 +69,10 @@ Vertex vertex_at(uint i) {
 #endif
 
 #ifdef TEXEL_TABLES
-layout(set = 0, binding = B_TRIANGLE_REFS) uniform utextureBuffer triangle_ref_rows;
+layout(set = 0, binding = B_TRIANGLE_REFS, rgba32ui) uniform readonly uimageBuffer triangle_ref_rows;
 TriangleRef triangle_ref_at(uint i) {
-    uvec4 r0 = texelFetch(triangle_ref_rows, int(i) * 2 + 0);
-    uvec4 r1 = texelFetch(triangle_ref_rows, int(i) * 2 + 1);
+    uvec4 r0 = imageLoad(triangle_ref_rows, int(i) * 2 + 0);
+    uvec4 r1 = imageLoad(triangle_ref_rows, int(i) * 2 + 1);
     return TriangleRef(uvec3(r0.x, r0.y, r0.z),
         r0.w,
         r1.x,
@@ -89,21 +89,21 @@ TriangleRef triangle_ref_at(uint i) {
 #endif
 
 #ifdef TEXEL_TABLES
-layout(set = 0, binding = B_MATERIALS) uniform utextureBuffer material_rows;
+layout(set = 0, binding = B_MATERIALS, rgba32ui) uniform readonly uimageBuffer material_rows;
 Material material_at(uint i) {
-    uvec4 r0 = texelFetch(material_rows, int(i) * 13 + 0);
-    uvec4 r1 = texelFetch(material_rows, int(i) * 13 + 1);
-    uvec4 r2 = texelFetch(material_rows, int(i) * 13 + 2);
-    uvec4 r3 = texelFetch(material_rows, int(i) * 13 + 3);
-    uvec4 r4 = texelFetch(material_rows, int(i) * 13 + 4);
-    uvec4 r5 = texelFetch(material_rows, int(i) * 13 + 5);
-    uvec4 r6 = texelFetch(material_rows, int(i) * 13 + 6);
-    uvec4 r7 = texelFetch(material_rows, int(i) * 13 + 7);
-    uvec4 r8 = texelFetch(material_rows, int(i) * 13 + 8);
-    uvec4 r9 = texelFetch(material_rows, int(i) * 13 + 9);
-    uvec4 r10 = texelFetch(material_rows, int(i) * 13 + 10);
-    uvec4 r11 = texelFetch(material_rows, int(i) * 13 + 11);
-    uvec4 r12 = texelFetch(material_rows, int(i) * 13 + 12);
+    uvec4 r0 = imageLoad(material_rows, int(i) * 13 + 0);
+    uvec4 r1 = imageLoad(material_rows, int(i) * 13 + 1);
+    uvec4 r2 = imageLoad(material_rows, int(i) * 13 + 2);
+    uvec4 r3 = imageLoad(material_rows, int(i) * 13 + 3);
+    uvec4 r4 = imageLoad(material_rows, int(i) * 13 + 4);
+    uvec4 r5 = imageLoad(material_rows, int(i) * 13 + 5);
+    uvec4 r6 = imageLoad(material_rows, int(i) * 13 + 6);
+    uvec4 r7 = imageLoad(material_rows, int(i) * 13 + 7);
+    uvec4 r8 = imageLoad(material_rows, int(i) * 13 + 8);
+    uvec4 r9 = imageLoad(material_rows, int(i) * 13 + 9);
+    uvec4 r10 = imageLoad(material_rows, int(i) * 13 + 10);
+    uvec4 r11 = imageLoad(material_rows, int(i) * 13 + 11);
+    uvec4 r12 = imageLoad(material_rows, int(i) * 13 + 12);
     return Material(vec3(uintBitsToFloat(r0.x), uintBitsToFloat(r0.y), uintBitsToFloat(r0.z)),
         uintBitsToFloat(r0.w),
         vec3(uintBitsToFloat(r1.x), uintBitsToFloat(r1.y), uintBitsToFloat(r1.z)),
@@ -156,9 +156,9 @@ Material material_at(uint i) {
 #endif
 
 #ifdef TEXEL_TABLES
-layout(set = 0, binding = B_SURFACE_ROWS) uniform utextureBuffer surface_rows;
+layout(set = 0, binding = B_SURFACE_ROWS, rgba32ui) uniform readonly uimageBuffer surface_rows;
 Surface surface_at(uint i) {
-    uvec4 r0 = texelFetch(surface_rows, int(i) * 1 + 0);
+    uvec4 r0 = imageLoad(surface_rows, int(i) * 1 + 0);
     return Surface(r0.x,
         vec2(uintBitsToFloat(r0.y), uintBitsToFloat(r0.z)),
         uintBitsToFloat(r0.w));
@@ -173,10 +173,10 @@ Surface surface_at(uint i) {
 #endif
 
 #ifdef TEXEL_TABLES
-layout(set = 0, binding = B_GUIDE_ROWS) uniform utextureBuffer guide_rows;
+layout(set = 0, binding = B_GUIDE_ROWS, rgba32ui) uniform readonly uimageBuffer guide_rows;
 Guide guide_at(uint i) {
-    uvec4 r0 = texelFetch(guide_rows, int(i) * 2 + 0);
-    uvec4 r1 = texelFetch(guide_rows, int(i) * 2 + 1);
+    uvec4 r0 = imageLoad(guide_rows, int(i) * 2 + 0);
+    uvec4 r1 = imageLoad(guide_rows, int(i) * 2 + 1);
     return Guide(vec2(uintBitsToFloat(r0.x), uintBitsToFloat(r0.y)),
         uintBitsToFloat(r0.z),
         uintBitsToFloat(r0.w),
@@ -197,12 +197,12 @@ Guide guide_at(uint i) {
 #endif
 
 #ifdef TEXEL_TABLES
-layout(set = 0, binding = B_HISTORY_ROWS) uniform utextureBuffer history_rows;
+layout(set = 0, binding = B_HISTORY_ROWS, rgba32ui) uniform readonly uimageBuffer history_rows;
 History history_at(uint i) {
-    uvec4 r0 = texelFetch(history_rows, int(i) * 4 + 0);
-    uvec4 r1 = texelFetch(history_rows, int(i) * 4 + 1);
-    uvec4 r2 = texelFetch(history_rows, int(i) * 4 + 2);
-    uvec4 r3 = texelFetch(history_rows, int(i) * 4 + 3);
+    uvec4 r0 = imageLoad(history_rows, int(i) * 4 + 0);
+    uvec4 r1 = imageLoad(history_rows, int(i) * 4 + 1);
+    uvec4 r2 = imageLoad(history_rows, int(i) * 4 + 2);
+    uvec4 r3 = imageLoad(history_rows, int(i) * 4 + 3);
     return History(vec3(uintBitsToFloat(r0.x), uintBitsToFloat(r0.y), uintBitsToFloat(r0.z)),
         uintBitsToFloat(r0.w),
         vec3(uintBitsToFloat(r1.x), uintBitsToFloat(r1.y), uintBitsToFloat(r1.z)),
@@ -235,9 +235,9 @@ History history_at(uint i) {
 #endif
 
 #ifdef TEXEL_TABLES
-layout(set = 0, binding = B_FILTERED_ROWS) uniform utextureBuffer filtered_rows;
+layout(set = 0, binding = B_FILTERED_ROWS, rgba32ui) uniform readonly uimageBuffer filtered_rows;
 Filtered filtered_at(uint i) {
-    uvec4 r0 = texelFetch(filtered_rows, int(i) * 1 + 0);
+    uvec4 r0 = imageLoad(filtered_rows, int(i) * 1 + 0);
     return Filtered(vec3(uintBitsToFloat(r0.x), uintBitsToFloat(r0.y), uintBitsToFloat(r0.z)),
         uintBitsToFloat(r0.w));
 }

@@ -68,5 +68,5 @@ void main() {
     COUNT(closest_rays, rays.closest)
     COUNT(shadow_rays, rays.shadow)
     COUNT(samples, item.spp)
-    COUNT(invalid_samples, invalid)
+    COUNT_RARE(invalid_samples, invalid)
 }

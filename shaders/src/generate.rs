@@ -100,11 +100,11 @@ pub fn tables_glsl() -> String {
     for structs::Table { name, reader, storage, texel, bytes, from_rows, from_storage } in structs::tables() {
         let rows = bytes / 16;
         let fetches: String = (0..rows)
-            .map(|row| format!("    uvec4 r{row} = texelFetch({reader}_rows, int(i) * {rows} + {row});\n"))
+            .map(|row| format!("    uvec4 r{row} = imageLoad({reader}_rows, int(i) * {rows} + {row});\n"))
             .collect();
         out.push_str(&format!(
             "\n#ifdef TEXEL_TABLES\n\
-             layout(set = 0, binding = {texel}) uniform utextureBuffer {reader}_rows;\n\
+             layout(set = 0, binding = {texel}, rgba32ui) uniform readonly uimageBuffer {reader}_rows;\n\
              {name} {reader}_at(uint i) {{\n{fetches}    return {from_rows};\n}}\n\
              #else\n\
              layout(set = 0, binding = {storage}, scalar) readonly buffer {name}Table {{ {name} {reader}_table[]; }};\n\

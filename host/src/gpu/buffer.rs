@@ -56,13 +56,13 @@ impl Buffer {
         Self::filled(gpu, what, bytemuck::cast_slice(data), vk::BufferUsageFlags::empty())
     }
 
-    /// A device buffer of 16-byte texels that shaders read as a uniform texel buffer (`float`: RGBA32F, else RGBA32UI).
+    /// A device buffer of 16-byte texels that shaders read as a texel buffer (`float`: RGBA32F, else RGBA32UI).
     ///
     /// # Errors
     /// As [`Buffer::new`]; [`GpuError::Limit`] when there are more texels than the device's texel buffers hold.
     pub fn texels(gpu: &Arc<Gpu>, what: &str, data: &[[u32; 4]], float: bool) -> Result<Self, GpuError> {
         Self::check_texels(gpu, what, data.len())?;
-        Self::filled(gpu, what, bytemuck::cast_slice(data), vk::BufferUsageFlags::UNIFORM_TEXEL_BUFFER)?
+        Self::filled(gpu, what, bytemuck::cast_slice(data), vk::BufferUsageFlags::STORAGE_TEXEL_BUFFER)?
             .viewed_as_texels(float)
     }
 
@@ -78,7 +78,7 @@ impl Buffer {
         kind: MemoryKind,
     ) -> Result<Self, GpuError> {
         Self::check_texels(gpu, what, texels)?;
-        Self::with_usage(gpu, what, texels * 16, kind, vk::BufferUsageFlags::UNIFORM_TEXEL_BUFFER)?
+        Self::with_usage(gpu, what, texels * 16, kind, vk::BufferUsageFlags::STORAGE_TEXEL_BUFFER)?
             .viewed_as_texels(float)
     }
 
@@ -127,7 +127,7 @@ impl Buffer {
     ) -> Result<Self, GpuError> {
         let len_bytes = len_bytes.max(16);
         let limit = u64::from(gpu.limits.max_storage_buffer_range);
-        if len_bytes as u64 > limit && !extra.contains(vk::BufferUsageFlags::UNIFORM_TEXEL_BUFFER) {
+        if len_bytes as u64 > limit && !extra.contains(vk::BufferUsageFlags::STORAGE_TEXEL_BUFFER) {
             return Err(GpuError::Limit { what: format!("{what} (bytes)"), needed: len_bytes as u64, limit });
         }
         let usage = vk::BufferUsageFlags::STORAGE_BUFFER

@@ -14,7 +14,7 @@ pub enum BindingKind {
     Uniform,
     /// Storage buffer.
     Storage,
-    /// Uniform texel buffer.
+    /// Storage texel buffer: what the driver reads by image instructions.
     Texel,
 }
 
@@ -23,7 +23,7 @@ impl BindingKind {
         match self {
             Self::Uniform => vk::DescriptorType::UNIFORM_BUFFER,
             Self::Storage => vk::DescriptorType::STORAGE_BUFFER,
-            Self::Texel => vk::DescriptorType::UNIFORM_TEXEL_BUFFER,
+            Self::Texel => vk::DescriptorType::STORAGE_TEXEL_BUFFER,
         }
     }
 }
