@@ -18,8 +18,6 @@ layout(set = 0, binding = B_SHOWN, scalar) writeonly buffer Shown { vec4 shown[]
 // Frames' worth of samples that a new point takes over from those around, where the eye looks and in the periphery: what it takes is a guess
 // that stays as bias, and without it there is noise, which flickers.
 const float TAKEN_OVER = 6.0, TAKEN_OVER_PERIPHERY = 16.0;
-// A point whose pixel has a nearer one goes on in an empty pixel whose centre is no farther than this, in pixels.
-const float ADOPTED = 0.8;
 
 struct Carried {
     vec3 mean;
@@ -95,28 +93,6 @@ void carry_bilinear(inout History h, vec3 normal, float footprint, vec2 before) 
     h.index = history_at(nearest).index;
 }
 
-// Among nine histories at `offsets` from a pixel's centre, the nearest that has lost its own pixel to a nearer one; -1 where there is none.
-int homeless(vec2 offsets[9], uint taps[9]) {
-    int found = -1;
-    float best = ADOPTED;
-    for (int i = 0; i < 9; i++) {
-        float far = max(abs(offsets[i].x), abs(offsets[i].y));
-        if (taps[i] == NO_HIT || far >= best) continue;
-        vec2 home = round(offsets[i]), own = abs(offsets[i] - home);
-        bool lost = false;
-        for (int j = 0; j < 9; j++) {
-            if (j == i || taps[j] == NO_HIT || round(offsets[j]) != home) continue;
-            vec2 other = abs(offsets[j] - home);
-            lost = lost || max(other.x, other.y) < max(own.x, own.y);
-        }
-        if (lost) {
-            best = far;
-            found = i;
-        }
-    }
-    return found;
-}
-
 // Method dpm: every history belongs to one surface point for as long as it is seen. It goes to the pixel that the point is in now, so nothing is
 // ever resampled; the pixel's own point, at most half a pixel away, is reached by the gradient of the histories around.
 void carry_point(inout History h, vec3 normal, float footprint, uvec2 pixel, vec2 before) {
@@ -127,11 +103,8 @@ void carry_point(inout History h, vec3 normal, float footprint, uvec2 pixel, vec
     vec3 sum = vec3(0.0), sum_x = vec3(0.0), sum_y = vec3(0.0), lower = vec3(INFINITY), upper = vec3(-INFINITY);
     float squares = 0.0, total = 0.0, x = 0.0, y = 0.0, xx = 0.0, xy = 0.0, yy = 0.0, nearest = 1.5;
     uint owner = NO_HIT, taps = 0u;
-    vec2 apart = vec2(0.0), offsets[9];
-    uint known_at[9];
+    vec2 apart = vec2(0.0);
     for (int i = 0; i < 9; i++) {
-        known_at[i] = NO_HIT;
-        offsets[i] = vec2(0.0);
         ivec2 q = corner + ivec2(i % 3, i / 3) - 1;
         if (any(lessThan(q, ivec2(0))) || any(greaterThanEqual(q, ivec2(frame.width, frame.height)))) continue;
         uint tap = former + uint(q.y) * frame.width + uint(q.x);
@@ -144,8 +117,6 @@ void carry_point(inout History h, vec3 normal, float footprint, uvec2 pixel, vec
         if (!sound || !finite3(m) || !finite(w) || !finite(e.x + e.y)) continue;
         total += w;
         taps++;
-        known_at[i] = tap;
-        offsets[i] = e;
         x += w * e.x;
         y += w * e.y;
         xx += w * e.x * e.x;
@@ -162,14 +133,6 @@ void carry_point(inout History h, vec3 normal, float footprint, uvec2 pixel, vec
             nearest = far;
             owner = tap;
             apart = e;
-        }
-    }
-    if (owner != NO_HIT && nearest > 0.5) {
-        int adopted = homeless(offsets, known_at);
-        if (adopted >= 0) {
-            owner = known_at[adopted];
-            apart = offsets[adopted];
-            nearest = 0.5;
         }
     }
     vec3 shift = vec3(0.0), g_x = vec3(0.0), g_y = vec3(0.0);
