@@ -1,7 +1,7 @@
-//! The NatNet client against the NatNet server over real loopback sockets: in virtual time, step by step, and once in real time.
+//! The NatNet client against the NatNet server over real loopback sockets, in virtual time, step by step.
 
 use dpm_device::pose::Pose;
-use dpm_device::time::{DeviceTicks, HostClock, HostTime};
+use dpm_device::time::{HostClock, HostTime};
 use dpm_device::tracker::natnet::client::{NatNetClient, NatNetConfig, Silence};
 use dpm_device::tracker::natnet::frame::{encode_frame, FrameContent, FrameInfo, RigidBody};
 use dpm_device::tracker::natnet::messages::ServerInfo;
@@ -10,32 +10,14 @@ use dpm_device::tracker::natnet::Version;
 use dpm_device::tracker::udp::UdpPort;
 use dpm_device::tracker::{BodyIndex, BodyKey, Tracker, TrackerSample};
 use hil_mock::motion::{Motion, MotionSpec};
-use hil_mock::natnet_host::NatNetHost;
 use hil_mock::natnet_server::{NatNetServer, NatNetServerConfig, Streaming, UnicastTo};
 use hil_mock::tracker::{MockTrackerConfig, SampleSource};
 use std::net::{Ipv4Addr, SocketAddrV4};
 use std::sync::atomic::{AtomicI64, Ordering};
 use std::sync::Arc;
-use std::time::{Duration, Instant};
 
-const MS: i64 = 1_000_000;
-const S: i64 = 1_000 * MS;
-const LOCALHOST: Ipv4Addr = Ipv4Addr::LOCALHOST;
-
-fn keys(names: &[&str]) -> Vec<BodyKey> {
-    names.iter().map(|n| BodyKey { name: (*n).to_owned(), id: None }).collect()
-}
-
-fn source(faults: &str, latency_ns: i64) -> SampleSource {
-    let rest = Pose { position_m: [0.1, 0.2, 1.5], ..Pose::IDENTITY };
-    let rotate = MotionSpec::Rotate { axis: [0.0, 1.0, 0.0], rate_rad_s: 3.0, pivot_offset_m: [0.0; 3] };
-    let motions = vec![
-        Motion::new(&MotionSpec::paper_translation(), rest).unwrap(),
-        Motion::new(&rotate, rest).unwrap(),
-    ];
-    let config = MockTrackerConfig { faults: faults.parse().unwrap(), latency_ns, ..Default::default() };
-    SampleSource::new(config, motions).unwrap()
-}
+mod natnet_common;
+use natnet_common::{keys, source, LOCALHOST, MS, S};
 
 /// Client and server on loopback with one virtual clock: a datagram sent is there at once, so nothing depends on the machine.
 struct Bench {
@@ -530,121 +512,4 @@ fn garbage_of_every_length_is_survived() {
     hand.poll();
     hand.poll();
     assert_eq!(hand.client.counters().samples.used, 1, "{}", hand.client.status());
-}
-
-/// What a run in real time over loopback sockets found.
-struct Loopback {
-    /// Error of the map and of the samples, ns, sorted.
-    map_errors: Vec<i64>,
-    sample_errors: Vec<i64>,
-    /// Share of the map's errors inside its bound, and the widest bound, ns.
-    inside: f64,
-    widest_ns: i64,
-    /// The shortest round trip in the map's window at the end, ns.
-    round_trip_ns: i64,
-    /// Whether the machine kept this thread from running for a millisecond or more.
-    stood_still: bool,
-    status: String,
-}
-
-impl Loopback {
-    fn run(clock_skew_ppb: i64, stalls: bool) -> Self {
-        let epoch = Instant::now();
-        let clock: Arc<dyn HostClock> = Arc::new(move || HostTime(epoch.elapsed().as_nanos() as i64));
-        let mut config = NatNetServerConfig::new(&["Hare", "Bust"]);
-        config.streaming = Streaming::Unicast(UnicastTo::CommandSocket);
-        config.clock_skew_ppb = clock_skew_ppb;
-        let (hz, start) = (config.clock_hz, i128::from(config.clock_start));
-        // The server's counter, as its own documentation has it: host time at a rate of its own.
-        let ticks_at = |t: HostTime| {
-            let skewed = i128::from(t.0) + i128::from(t.0) * i128::from(clock_skew_ppb) / 1_000_000_000;
-            DeviceTicks((start + skewed * i128::from(hz) / 1_000_000_000) as u64)
-        };
-        let server = NatNetServer::new(config, source("", 0)).unwrap();
-        let streaming = Streaming::Unicast(UnicastTo::CommandSocket);
-        let host =
-            NatNetHost::start(server, streaming, SocketAddrV4::new(LOCALHOST, 0), clock.clone()).unwrap();
-        let mut wanted = NatNetConfig::unicast(LOCALHOST, keys(&["Hare", "Bust"]));
-        wanted.command_port = host.address().port();
-        wanted.data_port = host.address().port();
-        let mut client = NatNetClient::open(wanted, clock.clone()).unwrap();
-        let (mut samples, mut map_errors, mut inside, mut widest_ns) = (Vec::new(), Vec::new(), 0, 0);
-        let mut stood_still = false;
-        for i in 0u32.. {
-            let begin = clock.now();
-            if begin.0 > 2500 * MS {
-                break;
-            }
-            client.poll(begin, &mut |s| samples.push(*s)).unwrap();
-            // A client that is kept from its socket for 5 ms, now and then.
-            let sleep_ns = if stalls && i % 100 == 99 { 5 * MS } else { MS / 4 };
-            std::thread::sleep(Duration::from_nanos(sleep_ns as u64));
-            let now = clock.now();
-            stood_still |= now.ns_since(begin) > sleep_ns + MS;
-            if let (Some(map), true) = (client.clock_map(), now.0 > S) {
-                let mapped = map.to_host(ticks_at(now)).unwrap();
-                let error = mapped.at.ns_since(now).abs();
-                inside += usize::from(error <= mapped.uncertainty_ns);
-                widest_ns = widest_ns.max(mapped.uncertainty_ns);
-                map_errors.push(error);
-            }
-        }
-        assert!(host.is_running() && host.frames_sent() > 500);
-        assert!(client.counters().is_conserved());
-        // The truth: captures stand at whole multiples of 2 ms.
-        let mut sample_errors: Vec<i64> = samples
-            .iter()
-            .filter(|s| s.body == BodyIndex(0) && s.captured_at.0 > S)
-            .map(|s| ((s.captured_at.0 + MS).rem_euclid(2 * MS) - MS).abs())
-            .collect();
-        let status = client.status();
-        assert!(sample_errors.len() > 300 && map_errors.len() > 300, "{} samples, {status}", samples.len());
-        let inside = inside as f64 / map_errors.len() as f64;
-        map_errors.sort_unstable();
-        sample_errors.sort_unstable();
-        let round_trip_ns = client.clock_map().and_then(|m| m.min_round_trip_ns()).unwrap_or(i64::MAX);
-        Self { map_errors, sample_errors, inside, widest_ns, round_trip_ns, stood_still, status }
-    }
-}
-
-/// Real sockets, real clocks. The true error lies inside the reported bound whatever the machine does meanwhile. How small it is depends
-/// on the round trips: at half of one the way there and the way back cannot be told apart. So the judged figures (10 us; 25 us with
-/// skew and stalls) are asked of runs whose round trips leave room for them, and of the best of four; where the machine is too busy
-/// for such round trips, what a busy one must still do.
-#[test]
-fn real_time_on_loopback_maps_the_clock_within_10_us_and_inside_its_bound() {
-    for (skew_ppb, stalls, allowed_ns) in [(0, false, 10_000), (40_000, true, 25_000)] {
-        let mut busy_p99 = i64::MAX;
-        for attempt in 0..4 {
-            let run = Loopback::run(skew_ppb, stalls);
-            let at = |sorted: &[i64], p: usize| sorted[sorted.len() * p / 100];
-            let (map_p99, sample_p99) = (at(&run.map_errors, 99), at(&run.sample_errors, 99));
-            println!(
-                "loopback, {skew_ppb} ppb, stalls {stalls}, round trip {} ns: map p50 {} ns, p99 {map_p99} ns, bound up to {} ns, {:.4} inside; samples \
-                 p99 {sample_p99} ns; stood still: {}",
-                run.round_trip_ns,
-                at(&run.map_errors, 50),
-                run.widest_ns,
-                run.inside,
-                run.stood_still
-            );
-            assert!(run.inside >= 0.999, "{} inside the bound: {}", run.inside, run.status);
-            if map_p99 <= allowed_ns && sample_p99 <= allowed_ns {
-                break;
-            }
-            assert!(
-                run.stood_still || run.round_trip_ns / 3 > allowed_ns / 2 || attempt < 3,
-                "p99 {map_p99} ns, samples {sample_p99} ns: {}",
-                run.status
-            );
-            if !run.stood_still {
-                busy_p99 = busy_p99.min(sample_p99);
-            }
-            assert!(
-                attempt < 3 || busy_p99 < 50_000 || busy_p99 == i64::MAX,
-                "{busy_p99} ns at best: {}",
-                run.status
-            );
-        }
-    }
 }
