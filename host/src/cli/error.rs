@@ -1,6 +1,6 @@
 //! `dpm error`: error against cost of every method, as tables and curves.
 
-use super::error_files::{known, known_or, merge, report, show, Kept};
+use super::error_files::{known, known_or, merge, report, show, Kept, Origin};
 use super::progress::Progress;
 use super::rig_args::RigArgs;
 use super::watch::print;
@@ -11,7 +11,6 @@ use crate::experiments::error_runs::{
     ErrorOptions, ErrorRunError, ErrorRuns, Extent, GroupResult, EYE_FRAMES,
 };
 use crate::experiments::run_rig::open_gpu;
-use crate::experiments::stamp::Stamp;
 use crate::failure::{Failure, FailureKind};
 use crate::gpu::Gpu;
 use crate::pipeline::PipelineError;
@@ -141,16 +140,8 @@ impl Kept for GroupResult {
         self.group().name()
     }
 
-    fn key(&self) -> &str {
-        &self.key
-    }
-
-    fn stamp(&self) -> &Stamp {
-        &self.stamp
-    }
-
-    fn extent(&self) -> Option<Extent> {
-        Some(self.extent)
+    fn origin(&self) -> Origin<'_> {
+        Origin { key: &self.key, stamp: &self.stamp, extent: Some(self.extent) }
     }
 
     fn order(&self) -> (bool, bool, f64) {

@@ -1,11 +1,11 @@
 //! `dpm error --preset figure3`: settings of the experiment that are not measured yet, then its table and plot.
 
 use super::error::{chosen, end, failure, folder, list, options, stage, ErrorArgs};
-use super::error_files::{known_or, Kept};
+use super::error_files::{known_or, Kept, Origin};
 use super::progress::Progress;
 use crate::experiments::error_figure3::{self, Figure3Group, Setting, SPP};
 use crate::experiments::error_plot;
-use crate::experiments::error_runs::{Extent, EYE_FRAMES};
+use crate::experiments::error_runs::EYE_FRAMES;
 use crate::experiments::stamp::Stamp;
 use crate::failure::Failure;
 use crate::rig::Rig;
@@ -18,16 +18,8 @@ impl Kept for Figure3Group {
         self.setting().name()
     }
 
-    fn key(&self) -> &str {
-        &self.key
-    }
-
-    fn stamp(&self) -> &Stamp {
-        &self.stamp
-    }
-
-    fn extent(&self) -> Option<Extent> {
-        None
+    fn origin(&self) -> Origin<'_> {
+        Origin { key: &self.key, stamp: &self.stamp, extent: None }
     }
 
     fn order(&self) -> (bool, bool, f64) {

@@ -24,18 +24,26 @@ pub(super) trait Kept: Serialize + DeserializeOwned {
 
     /// Its name among the groups of the experiment.
     fn name(&self) -> String;
-    /// Hash of all that it depends on.
-    fn key(&self) -> &str;
-    /// With what it was measured.
-    fn stamp(&self) -> &Stamp;
-    /// How much was drawn of it, where a group tells.
-    fn extent(&self) -> Option<Extent>;
+    /// What it came from.
+    fn origin(&self) -> Origin<'_>;
     /// Groups are told in rising order of this.
     fn order(&self) -> (bool, bool, f64);
     /// The experiment's tables.
     fn markdown(groups: &[Self]) -> String;
     /// The experiment's other reports: name and text.
-    fn reports(groups: &[Self]) -> Result<Vec<(String, String)>, String>;
+    fn reports(_groups: &[Self]) -> Result<Vec<(String, String)>, String> {
+        Ok(Vec::new())
+    }
+}
+
+/// What a measured group came from.
+pub(super) struct Origin<'a> {
+    /// Hash of all that it depends on.
+    pub key: &'a str,
+    /// With what it was measured.
+    pub stamp: &'a Stamp,
+    /// How much was drawn of it, where a group tells.
+    pub extent: Option<Extent>,
 }
 
 fn path<T: Kept>(out: &Path, name: &str, key: &str) -> PathBuf {
@@ -43,13 +51,13 @@ fn path<T: Kept>(out: &Path, name: &str, key: &str) -> PathBuf {
 }
 
 fn path_of<T: Kept>(out: &Path, group: &T) -> PathBuf {
-    path::<T>(out, &group.name(), group.key())
+    path::<T>(out, &group.name(), group.origin().key)
 }
 
 /// What an earlier run left of a group, when it was made from the same.
 pub(super) fn known<T: Kept>(out: &Path, name: &str, key: &str) -> Option<T> {
     let bytes = std::fs::read(path::<T>(out, name, key)).ok()?;
-    serde_json::from_slice(&bytes).ok().filter(|group: &T| group.key() == key)
+    serde_json::from_slice(&bytes).ok().filter(|group: &T| group.origin().key == key)
 }
 
 /// What an earlier run left of a group, else what `measure` makes of it now, kept with a picture of what the eye saw where there is one.
@@ -135,7 +143,10 @@ fn joined<T: Kept>(out: &Path) -> Result<Vec<T>, Failure> {
 /// Groups of one configuration, raster, seed and extent, none of them twice: only those have curves in common. They may come from
 /// different devices and commits, which the tables tell.
 fn one_experiment<T: Kept>(out: &Path, sorted: &[T]) -> Result<(), Failure> {
-    let what = |g: &T| (g.stamp().config_hash.clone(), g.stamp().raster, g.stamp().seed, g.extent());
+    let what = |g: &T| {
+        let Origin { stamp, extent, .. } = g.origin();
+        (stamp.config_hash.clone(), stamp.raster, stamp.seed, extent)
+    };
     let told = |why: &str, a: &T, b: &T| {
         let (a, b) = (path_of(out, a), path_of(out, b));
         let told = format!("{} and {} {why}; move one of them to another folder", a.display(), b.display());

@@ -1,12 +1,10 @@
 //! `dpm error --preset table`: settings of the table that are not measured yet, then the whole table.
 
 use super::error::{chosen, end, failure, folder, list, options, stage, weight, ErrorArgs};
-use super::error_files::{known_or, Kept};
+use super::error_files::{known_or, Kept, Origin};
 use super::progress::Progress;
 use crate::experiments::error_plan::contenders;
-use crate::experiments::error_runs::Extent;
 use crate::experiments::error_table::{self, TableGroup, TableSetting};
-use crate::experiments::stamp::Stamp;
 use crate::failure::Failure;
 use crate::rig::Rig;
 
@@ -18,16 +16,8 @@ impl Kept for TableGroup {
         self.setting().name()
     }
 
-    fn key(&self) -> &str {
-        &self.result.key
-    }
-
-    fn stamp(&self) -> &Stamp {
-        &self.result.stamp
-    }
-
-    fn extent(&self) -> Option<Extent> {
-        Some(self.result.extent)
+    fn origin(&self) -> Origin<'_> {
+        self.result.origin()
     }
 
     fn order(&self) -> (bool, bool, f64) {
@@ -36,10 +26,6 @@ impl Kept for TableGroup {
 
     fn markdown(groups: &[Self]) -> String {
         error_table::markdown(groups)
-    }
-
-    fn reports(_: &[Self]) -> Result<Vec<(String, String)>, String> {
-        Ok(Vec::new())
     }
 }
 
