@@ -1,7 +1,7 @@
 //! Byte strings into frames on a serial line and back: consistent overhead byte stuffing, each frame ended by a zero byte.
 //!
 //! The zero byte occurs nowhere else, so a receiver that was cut in, or lost bytes, is back in step at the next frame
-//! [Cheshire99]. Overhead: one byte in 254, and the delimiter.
+//! \[Cheshire99\]. Overhead: one byte in 254, and the delimiter.
 
 /// Most bytes that [`encode`] writes for `n` bytes of content, delimiter included.
 pub const fn encoded_bytes(n: usize) -> usize {

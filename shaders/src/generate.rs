@@ -115,7 +115,7 @@ pub fn tables_glsl() -> String {
     out
 }
 
-/// Direction numbers of Sobol dimensions 1 to 3 ([JoeKuo08]; dimension 0 is the bit reversal): polynomial and first numbers into 32 words.
+/// Direction numbers of Sobol dimensions 1 to 3 (\[JoeKuo08\]; dimension 0 is the bit reversal): polynomial and first numbers into 32 words.
 pub fn sobol_rows() -> [[u32; 32]; 3] {
     // Degree, inner coefficients of the primitive polynomial, initial m.
     let rows: [(usize, u32, &[u32]); 3] = [(1, 0, &[1]), (2, 1, &[1, 3]), (3, 1, &[1, 3, 1])];

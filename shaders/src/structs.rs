@@ -109,17 +109,17 @@ gpu_structs! {
         budget_spp: f32,
         /// Most frames' worth of samples that the history may weigh (method dpm).
         history_cap: f32,
-        /// Samples per traced pixel inside the inner angle, between, and outside ([paper] table 1).
+        /// Samples per traced pixel inside the inner angle, between, and outside (\[paper\] table 1).
         zone_spp: [u32; 3],
         /// Weight of the new frame in the same zones.
         zone_alpha: [f32; 3],
-        /// Inner and outer angle at the eye, degrees ([paper] eq. 4).
+        /// Inner and outer angle at the eye, degrees (\[paper\] eq. 4).
         zone_degrees: [f32; 2],
         /// The spatial filter blends in between these angles, degrees.
         filter_degrees: [f32; 2],
-        /// t of [paper] eq. 2.
+        /// t of \[paper\] eq. 2.
         rate_t: f32,
-        /// l of [paper] eq. 2.
+        /// l of \[paper\] eq. 2.
         rate_l: f32,
         /// Pixels per unit of tangent times 1: the size of a pixel at distance 1, metres.
         pixel_size: f32,
@@ -129,7 +129,7 @@ gpu_structs! {
     struct Guide {
         /// Pixels per frame that the surface point moved on the raster.
         motion: [f32; 2],
-        /// Apparent pixel size, [paper] eq. 3.
+        /// Apparent pixel size, \[paper\] eq. 3.
         size: f32,
         /// Angle at the eye between the gaze point and this point, degrees.
         angle: f32,
@@ -422,7 +422,7 @@ pub const LIGHT_SPOT: u32 = 2;
 pub const LIGHT_DIRECTIONAL: u32 = 3;
 /// Ordinary camera: radiance goes back along the primary ray, everything hit is lit (tests).
 pub const FRAME_CAMERA_IS_EYE: u32 = 1;
-/// Rates are decided per tile ([paper] section 2.2 and 2.3).
+/// Rates are decided per tile (\[paper\] section 2.2 and 2.3).
 pub const FRAME_RATE_MAP: u32 = 2;
 /// Half of the coarse pixels in each frame.
 pub const FRAME_CHECKERBOARD: u32 = 4;
@@ -434,7 +434,7 @@ pub const FRAME_TEMPORAL: u32 = 16;
 pub const FRAME_DPM: u32 = 32;
 /// Method dpm: samples go where they lower the error most.
 pub const FRAME_ALLOCATE: u32 = 64;
-/// Entries of the table of [Yang19]'s b functions per octave of velocity.
+/// Entries of the table of \[Yang19\]'s b functions per octave of velocity.
 pub const RATE_TABLE_OCTAVE: u32 = 1024;
 /// Octaves of that table, from 2^-6 pixels per frame.
 pub const RATE_TABLE_OCTAVES: u32 = 40;

@@ -1,7 +1,7 @@
 //! Mean light of the whole field, slot by slot, into the decision whether it flashes more than eyes and brains should bear.
 //!
 //! A flash is a pair of opposing changes of the field's luminance by a tenth of full or more, the darker below 0.8 of full; more than
-//! three in a second can cause seizures [WCAG22] 2.3.1, [BT1702]. What changes faster than the eye follows does not count: luminance is
+//! three in a second can cause seizures \[WCAG22\] 2.3.1, \[BT1702\]. What changes faster than the eye follows does not count: luminance is
 //! averaged over a sixtieth of a second first, so alternating frames at 947 Hz are steady light and a beat at 10 Hz is not.
 //! Both ends of the link run the same limiter.
 

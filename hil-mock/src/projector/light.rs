@@ -6,7 +6,7 @@
 use dpm_device::planes::{Channel, PlaneSchedule, Raster};
 
 /// Eight rows of 64 bits, read as eight 8 x 8 bit matrices side by side, one in each byte: transposes all of them, so that bit `i` of
-/// byte `c` of row `j` becomes bit `j` of byte `c` of row `i` (block swaps of 4, 2 and 1 bits [HackersDelight] 7-3).
+/// byte `c` of row `j` becomes bit `j` of byte `c` of row `i` (block swaps of 4, 2 and 1 bits \[HackersDelight\] 7-3).
 fn transpose(rows: &mut [u64; 8]) {
     for (step, mask) in [(4, 0x0f0f_0f0f_0f0f_0f0f), (2, 0x3333_3333_3333_3333), (1, 0x5555_5555_5555_5555)] {
         for i in (0..8).filter(|i| i & step == 0) {

@@ -41,7 +41,7 @@ words! {
         Dpm = "dpm",
         /// The paper's.
         Paper = "paper",
-        /// Miyamoto et al. 2022, the paper's reference [2]: no shading rates, no spatial filter.
+        /// \[Miyamoto22\], the second reference of \[paper\]: no shading rates, no spatial filter.
         Miyamoto = "miyamoto",
         /// Every pixel in every frame, nothing reused.
         Full = "full",

@@ -1,7 +1,7 @@
-//! The preliminary experiment of [paper] section 3 with the eye model in the observer's place: one body in four materials, 5 to 30 samples
+//! The preliminary experiment of \[paper\] section 3 with the eye model in the observer's place: one body in four materials, 5 to 30 samples
 //! a pixel, standing and moving, each against 1,000 samples.
 //!
-//! [paper] asks whether an eye that follows a body at 947 fps still integrates frames: its author rated the noise of each condition. Here
+//! \[paper\] asks whether an eye that follows a body at 947 fps still integrates frames: its author rated the noise of each condition. Here
 //! the noise is what two runs of independent samples do not share after 31 frames on every point of that body.
 
 use super::error_reference::{mean_of, Reference};
@@ -19,10 +19,10 @@ use serde::{Deserialize, Serialize};
 use std::fmt::Write as _;
 use std::sync::Arc;
 
-/// Samples a pixel of [paper] section 3.
+/// Samples a pixel of \[paper\] section 3.
 pub const SPP: [u32; 5] = [5, 10, 15, 20, 30];
 
-/// The four reflections: names and looks, the diffuse ones first. [paper] gives no numbers; these are the scenes' that rebuild it.
+/// The four reflections: names and looks, the diffuse ones first. \[paper\] gives no numbers; these are the scenes' that rebuild it.
 pub fn looks() -> [Material; 4] {
     let of = |name: &str, color: [u8; 3], metallic, roughness| Material {
         name: name.into(),
@@ -189,7 +189,7 @@ pub fn measure(
     })
 }
 
-/// What the two findings of [paper] section 3 are here.
+/// What the two findings of \[paper\] section 3 are here.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Findings {
     /// Conditions measured both standing and moving.
@@ -228,7 +228,7 @@ pub fn findings(groups: &[Figure3Group]) -> Findings {
     }
 }
 
-/// A table of all conditions, and the findings beside those of [paper].
+/// A table of all conditions, and the findings beside those of \[paper\].
 pub fn markdown(groups: &[Figure3Group]) -> String {
     let mut text = stamps(groups.iter().map(|g| &g.stamp));
     text += "| material | motion | spp | perceived RMSE / mean | noise / mean | single RMSE / mean | GPU ms |\n|---|---|---:|---:|---:|---:|---:|\n";

@@ -79,7 +79,7 @@ pub struct ErrorRow {
     pub wall_ms: f64,
     /// RMSE of the last frame alone.
     pub single_rmse: f64,
-    /// Relative MSE of the last frame alone [Rousselle11].
+    /// Relative MSE of the last frame alone \[Rousselle11\].
     pub single_rel_mse: f64,
     /// RMSE of what the eye sees, the reference's own error taken off.
     pub perceived_rmse: f64,

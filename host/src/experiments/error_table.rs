@@ -1,6 +1,6 @@
 //! A rig into the whole comparison of the methods: one body in four materials, standing and moving, looked at and looked past.
 //!
-//! The materials are those of [paper] section 3 ([`looks`]). An eye that looks past has the whole picture beyond the paper's outer zone, where
+//! The materials are those of \[paper\] section 3 ([`looks`]). An eye that looks past has the whole picture beyond the paper's outer zone, where
 //! its filter is fully in: that is where flicker is judged. What the eye looks at does not change the reference, so both share one.
 
 use super::error_figure3::{dressed, looks};
@@ -15,7 +15,7 @@ use serde::{Deserialize, Serialize};
 use std::fmt::Write as _;
 use std::sync::Arc;
 
-/// Samples of [paper] table 1 where the eye looks.
+/// Samples of \[paper\] table 1 where the eye looks.
 pub const BUDGET: f64 = 18.0;
 /// Angle at the eye between the middle of the picture and the gaze that looks past it, degrees.
 pub const ASIDE_DEG: f64 = 27.0;

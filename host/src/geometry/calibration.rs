@@ -1,7 +1,7 @@
 //! Pairs of world points and projector pixels into a calibrated projector, or into the reason why they do not determine one.
 //!
-//! Direct linear transform with normalised coordinates ([Hartley97]), split into intrinsics and pose, then Levenberg-Marquardt on the
-//! reprojection error. With an inlier threshold, random samples of the pairs are tried first ([Fischler81]) so that wrong pairs are left
+//! Direct linear transform with normalised coordinates (\[Hartley97\]), split into intrinsics and pose, then Levenberg-Marquardt on the
+//! reprojection error. With an inlier threshold, random samples of the pairs are tried first (\[Fischler81\]) so that wrong pairs are left
 //! out. Everything is computed in coordinates centred on the points and scaled to their spread: metres or millimetres give the same pixels.
 
 use super::projector::ProjectorCamera;

@@ -1,4 +1,4 @@
-//! A roughly known pinhole and point pairs into the pinhole of least reprojection error: Levenberg-Marquardt ([Marquardt63]).
+//! A roughly known pinhole and point pairs into the pinhole of least reprojection error: Levenberg-Marquardt (\[Marquardt63\]).
 
 use super::calibration::Pair;
 use super::se3::{hat, so3_exp};

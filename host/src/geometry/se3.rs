@@ -1,7 +1,7 @@
 //! Rotation vectors into rotations and twists into rigid motions, and back, to rounding error everywhere.
 //!
 //! Conventions: world-from-body, and tangents on the left (in the world frame): `exp(w) * q` turns `q` by the world-space
-//! rotation vector `w`. Closed forms divide by the angle, so below [`SERIES_BELOW`] a Taylor series takes over; the
+//! rotation vector `w`. Closed forms divide by the angle, so below `SERIES_BELOW` a Taylor series takes over; the
 //! logarithm uses `2 atan2(|v|, |w|)`, which keeps full precision at angle 0 and at pi where acos loses half the digits.
 //! Formulas: Solà, Deray, Atchuthan, "A micro Lie theory for state estimation in robotics", section IV and appendix.
 
@@ -39,7 +39,7 @@ pub fn so3_between(from: DQuat, to: DQuat) -> DVec3 {
     so3_log(to * from.conjugate())
 }
 
-/// [w]x, the matrix with `hat(w) * v == w.cross(v)`.
+/// `[w]x`, the matrix with `hat(w) * v == w.cross(v)`.
 pub fn hat(w: DVec3) -> DMat3 {
     DMat3::from_cols(DVec3::new(0.0, w.z, -w.y), DVec3::new(-w.z, 0.0, w.x), DVec3::new(w.y, -w.x, 0.0))
 }

@@ -1,6 +1,6 @@
 //! Small dense matrices: singular values by one-sided Jacobi rotations, and symmetric positive definite systems by Cholesky.
 //!
-//! One-sided Jacobi ([Hestenes58]) works on the matrix itself and not on its square, so that singular values are found down to
+//! One-sided Jacobi (\[Hestenes58\]) works on the matrix itself and not on its square, so that singular values are found down to
 //! rounding error of the largest one; that is what telling a degenerate calibration from a poor one needs.
 
 /// Columns of a matrix, all of one length.

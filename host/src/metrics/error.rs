@@ -12,7 +12,7 @@ const REL_MSE_EPSILON: f64 = 0.01;
 pub struct PictureError {
     /// Root of the mean squared difference, in the pictures' unit.
     pub rmse: f64,
-    /// Mean of `(t - r)^2 / (r^2 + 0.01)` [Rousselle11].
+    /// Mean of `(t - r)^2 / (r^2 + 0.01)` \[Rousselle11\].
     pub rel_mse: f64,
     /// `10 log10(peak^2 / mse)`; infinite for equal pictures.
     pub psnr_db: f64,
@@ -75,7 +75,7 @@ pub fn compare(
     })
 }
 
-/// Eccentricity at which the eye resolves half of what it does in the fovea, degrees [GeislerPerry98].
+/// Eccentricity at which the eye resolves half of what it does in the fovea, degrees \[GeislerPerry98\].
 pub const HALF_RESOLUTION_DEG: f64 = 2.3;
 
 /// Weight of an error at `eccentricity_deg` from the gaze: the area that one resolved element has in the fovea over that here,

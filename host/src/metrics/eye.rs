@@ -63,7 +63,7 @@ impl WindowEye {
     }
 }
 
-/// Three equal first-order low-pass stages in a row, a common model of the retina's temporal response [Watson86].
+/// Three equal first-order low-pass stages in a row, a common model of the retina's temporal response \[Watson86\].
 #[derive(Clone, Debug)]
 pub struct LowPassEye {
     stages: Vec<[Vec3; 3]>,

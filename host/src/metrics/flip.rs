@@ -1,4 +1,4 @@
-//! Two pictures into the difference that a person sees when one alternates with the other: LDR FLIP [Andersson20].
+//! Two pictures into the difference that a person sees when one alternates with the other: LDR FLIP \[Andersson20\].
 //!
 //! Colours are blurred by what the eye resolves, compared in a perceptually even space, and the difference is raised where edges or points
 //! appear or go. Equation numbers are those of the paper; the constants are its own.

@@ -1,6 +1,6 @@
 //! Linear drive into code values, and code values into the bit planes that a DMD shows.
 //!
-//! Every kernel gives the same bytes as [`scalar`], whatever the raster. The GPU's packer is held to the same bytes.
+//! Every kernel gives the same bytes as `scalar`, whatever the raster. The GPU's packer is held to the same bytes.
 
 mod frame;
 pub mod gpu;

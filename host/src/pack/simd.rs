@@ -60,7 +60,7 @@ const GROUPS: usize = 8 * BATCH_BYTES / GROUP_PIXELS;
 struct Rests([[[__m256i; 4]; GROUPS]; CODE_BITS / 8]);
 
 /// Pixels whose numbers leave the same rest by 8 come into one register, a byte each, one set of eight registers for each channel;
-/// then bits and registers change places (8 x 8 bits across the registers, 32 of them side by side [HackersDelight] 7-3), and each
+/// then bits and registers change places (8 x 8 bits across the registers, 32 of them side by side \[HackersDelight\] 7-3), and each
 /// register is 32 bytes of a plane. No `movemask`: it passes one register a cycle, shifts several. All pixels are sorted before
 /// the first bits move, since the registers do not hold both, and then only eight planes are written in turn.
 #[inline]
@@ -257,7 +257,7 @@ fn transpose_quadwords(rows: &[__m512i; 8]) -> [__m512i; 8] {
     [e[0], o[0], e[1], o[1], e[2], o[2], e[3], o[3]]
 }
 
-/// [`super::quantise`] with AVX2, eight pixels at a time; falls back to the scalar one where there is none.
+/// [`super::quantise()`] with AVX2, eight pixels at a time; falls back to the scalar one where there is none.
 pub(super) fn quantise_avx2(
     drive: &[[f32; 4]],
     offsets: Option<&[f32]>,

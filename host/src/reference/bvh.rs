@@ -1,7 +1,7 @@
 //! Triangles and rays into hits: a binary bounding volume hierarchy in f64 over world space.
 //!
-//! The triangle test is the watertight one of [Woop13]: an edge that two triangles share is judged with the same numbers for both, so no
-//! ray passes between them. Boxes are tested with the margin of [Ize13]. Both run without a tolerance that depends on the scene.
+//! The triangle test is the watertight one of \[Woop13\]: an edge that two triangles share is judged with the same numbers for both, so no
+//! ray passes between them. Boxes are tested with the margin of \[Ize13\]. Both run without a tolerance that depends on the scene.
 
 use glam::DVec3;
 

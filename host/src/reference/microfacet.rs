@@ -1,7 +1,7 @@
 //! Fresnel reflectance and the GGX microfacet distribution in f64, in the local frame where the shading normal is +Z.
 //!
-//! `alpha` is the GGX width (perceptual roughness squared). Sources: [Walter07] (distribution, refraction), [Heitz14]
-//! (height-correlated shadowing), [Heitz18] and [Dupuy23] (sampling of visible normals by a spherical cap).
+//! `alpha` is the GGX width (perceptual roughness squared). Sources: \[Walter07\] (distribution, refraction), \[Heitz14\]
+//! (height-correlated shadowing), \[Heitz18\] and \[Dupuy23\] (sampling of visible normals by a spherical cap).
 
 use glam::DVec3;
 use std::f64::consts::PI;
@@ -9,7 +9,7 @@ use std::f64::consts::PI;
 /// Unpolarised reflectance of a dielectric interface. `eta`: index behind the surface over the index in front, above 0.
 /// `cos`: between the incident direction and the normal, 0..1. 1 under total reflection, exactly 0 for `eta` 1.
 ///
-/// [Walter07] eq. 22, with `g - c` written as `(eta^2 - 1) / (g + c)`: the difference cancels when `eta` is near 1.
+/// \[Walter07\] eq. 22, with `g - c` written as `(eta^2 - 1) / (g + c)`: the difference cancels when `eta` is near 1.
 pub fn fresnel_dielectric(eta: f64, cos: f64) -> f64 {
     let c = cos.clamp(0.0, 1.0);
     let contrast = (eta - 1.0) * (eta + 1.0);

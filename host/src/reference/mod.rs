@@ -6,7 +6,7 @@
 //! **Numbers.** Triangles are moved to world space in f64, so no ray is ever transformed. A hit point is the barycentric mean of its
 //! vertices: wrong by a few units in the last place of the largest coordinate. New rays start [`OFFSET`] times that coordinate away along
 //! the geometric normal, thousands of times the error and, in a scene of metres, a picometre: too little to see, so the bit patterns of
-//! [Waechter19], which single precision needs, would add nothing here.
+//! \[Waechter19\], which single precision needs, would add nothing here.
 
 pub mod bsdf;
 pub mod bvh;

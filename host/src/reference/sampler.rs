@@ -1,4 +1,4 @@
-//! A seed into uniform random numbers: xoshiro256++ of [Blackman21], seeded through splitmix64.
+//! A seed into uniform random numbers: xoshiro256++ of \[Blackman21\], seeded through splitmix64.
 //!
 //! Independent numbers, not a low-discrepancy sequence: the tests rely on the variance of a mean being sigma^2 / n.
 

@@ -118,7 +118,7 @@ fn row_average(row: &[f32]) -> f64 {
 
 /// `E` by quadrature over the visible normals: with `h` drawn from their density the integrand is `F G2 / G1`.
 ///
-/// In the stretched space of [Dupuy23] where visible normals are uniform over a spherical cap, `h` is given by its angle `beta` from
+/// In the stretched space of \[Dupuy23\] where visible normals are uniform over a spherical cap, `h` is given by its angle `beta` from
 /// the stretched `v` and its azimuth `psi` about it: there the integrand has neither cone nor root inside. The azimuth ends where
 /// the reflected direction sinks below the surface; the outer integral is split where that begins and ends where no azimuth is left,
 /// with sin^2 as its variable in between because the end of the azimuth behaves like a square root at both.

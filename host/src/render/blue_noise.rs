@@ -1,6 +1,6 @@
 //! Nothing but a seed into dither masks that are blue in space and in time, and the committed masks that the renderer reads.
 //!
-//! Void and cluster [Ulichney93] with the energy of [Wolfe22]: texels of one slice repel each other by a Gaussian of their distance in
+//! Void and cluster \[Ulichney93\] with the energy of \[Wolfe22\]: texels of one slice repel each other by a Gaussian of their distance in
 //! the image, texels of one pixel by a Gaussian of their distance in time, and others not at all. So every slice is blue noise, and the
 //! values that one pixel takes over the frames are too; both wrap around. Energies are integers, so every machine makes the same mask.
 

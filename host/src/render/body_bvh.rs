@@ -1,4 +1,4 @@
-//! A body's triangles into a compressed wide BVH ([Ylitie17]) in the layout that `bvh.glsl` walks.
+//! A body's triangles into a compressed wide BVH (\[Ylitie17\]) in the layout that `bvh.glsl` walks.
 //!
 //! The tree is built once in body space; a moving body changes only its entry in the top level.
 
@@ -31,7 +31,7 @@ const NODE_WORDS: usize = 5;
 /// A BVH ready for upload.
 #[derive(Clone, Debug, Default)]
 pub struct BodyBvh {
-    /// Five words of four u32 per node, as [Ylitie17] has them but for where children stand: the fifth u32 is a block, and the inner child in
+    /// Five words of four u32 per node, as \[Ylitie17\] has them but for where children stand: the fifth u32 is a block, and the inner child in
     /// slot s is node 8 * block + s of this body. So the walk need not count bits to find it, and one u32 is an entry of its stack. Places
     /// whose slot holds triangles or nothing are zero. The root is node 0, in slot 0 of block 0.
     pub nodes: Vec<[u32; 4]>,

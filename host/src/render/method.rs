@@ -45,7 +45,7 @@ pub struct Method {
 pub const HISTORY_CAP: f32 = 96.0;
 
 impl Method {
-    /// The paper's predecessor [Nomoto20]: every pixel, independent samples, nothing kept.
+    /// The paper's predecessor \[Nomoto20\]: every pixel, independent samples, nothing kept.
     pub fn full(spp: u32) -> Self {
         Self {
             dpm: false,

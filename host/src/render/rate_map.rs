@@ -1,16 +1,16 @@
-//! Tiles into shading rates, [paper] eq. 1 to 4: the table that the shader reads, and the shader's CPU twin, equal bit for bit.
+//! Tiles into shading rates, \[paper\] eq. 1 to 4: the table that the shader reads, and the shader's CPU twin, equal bit for bit.
 //!
-//! `b_H` and `b_Q` are [Yang19]'s fits to the blur of a moving eye. They are tabulated in f64 because `pow` differs between devices;
+//! `b_H` and `b_Q` are \[Yang19\]'s fits to the blur of a moving eye. They are tabulated in f64 because `pow` differs between devices;
 //! every comparison uses products of sums only, because division and root differ too.
 
 use dpm_shaders::structs::{RATE_TABLE_OCTAVE, RATE_TABLE_OCTAVES};
 
-/// [Yang19] `b_H`: 1 at rest, falls with `v` pixels per frame.
+/// \[Yang19\] `b_H`: 1 at rest, falls with `v` pixels per frame.
 pub fn blur_half(v: f64) -> f64 {
     (1.0 / (1.0 + (1.05 * v).powf(3.10))).powf(0.35)
 }
 
-/// [Yang19] `b_Q`: 2.13 at rest.
+/// \[Yang19\] `b_Q`: 2.13 at rest.
 pub fn blur_quarter(v: f64) -> f64 {
     2.13 * (1.0 / (1.0 + (0.55 * v).powf(2.41))).powf(0.49)
 }
@@ -51,7 +51,7 @@ pub struct PixelGuide {
     pub luminance: Option<f32>,
     /// Pixels per frame.
     pub motion: [f32; 2],
-    /// Apparent size, [paper] eq. 3.
+    /// Apparent size, \[paper\] eq. 3.
     pub size: f32,
     /// Visual angle from the gaze, degrees.
     pub angle: f32,
@@ -60,11 +60,11 @@ pub struct PixelGuide {
 /// Constants of the decision.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct RateConstants {
-    /// t of [paper] eq. 2.
+    /// t of \[paper\] eq. 2.
     pub t: f32,
-    /// l of [paper] eq. 2.
+    /// l of \[paper\] eq. 2.
     pub l: f32,
-    /// Inner and outer angle of [paper] eq. 4, degrees.
+    /// Inner and outer angle of \[paper\] eq. 4, degrees.
     pub degrees: [f32; 2],
 }
 
@@ -119,7 +119,7 @@ fn full_half_quarter(b: [f32; 2], square: f32, pairs: f32, size: f32, tau: f32, 
     }
 }
 
-/// [paper] eq. 1 and 2 of a tile, for looking at; the decision itself needs neither root nor division.
+/// \[paper\] eq. 1 and 2 of a tile, for looking at; the decision itself needs neither root nor division.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct TileError {
     /// Error estimate along x and y, scene units.
@@ -227,7 +227,7 @@ pub fn decide(tile: &[Option<PixelGuide>; 256], table: &[[f32; 2]], constants: &
     combine(rate.map(|r| r.max(by_angle)), t.square[0] * pairs[1] > t.square[1] * pairs[0])
 }
 
-/// The six allowed rates ([paper] section 2.1): 1x4 becomes 1x2, 4x1 becomes 2x1, 4x4 stays finer along the axis with the larger error.
+/// The six allowed rates (\[paper\] section 2.1): 1x4 becomes 1x2, 4x1 becomes 2x1, 4x4 stays finer along the axis with the larger error.
 fn combine([mut x, mut y]: [u32; 2], more_error_along_x: bool) -> Rate {
     if x == 2 && y == 0 {
         x = 1;

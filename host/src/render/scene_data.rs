@@ -497,7 +497,7 @@ impl SceneData {
         (total / 2.0) as f32
     }
 
-    /// [Vose91]: any light in constant time, with probability proportional to its power.
+    /// \[Vose91\]: any light in constant time, with probability proportional to its power.
     fn make_alias_table(&mut self, powers: &[f32]) {
         let n = powers.len();
         let total: f64 = powers.iter().map(|&p| f64::from(p)).sum();

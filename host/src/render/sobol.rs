@@ -1,6 +1,6 @@
 //! A sample's index and dimension into a number: Sobol points with Owen scrambling, in `u32` arithmetic that GLSL repeats bit for bit.
 //!
-//! Padding as in [Burley20]: dimensions come in groups of four; each group takes the first four Sobol dimensions at an index shuffled
+//! Padding as in \[Burley20\]: dimensions come in groups of four; each group takes the first four Sobol dimensions at an index shuffled
 //! by a seed of its own, and each dimension is scrambled by a seed of its own. So every group of four is a Sobol point set of every
 //! aligned power-of-two block of indices, its first two dimensions a (0, 2)-sequence, and groups are independent of each other.
 //! The sequence may be continued over frames: the error of the mean keeps falling faster than with fresh points every frame.
@@ -11,7 +11,7 @@ pub const DIMENSIONS: usize = 16;
 /// Direction numbers: bit `b` of the index adds (exclusive or) `DIRECTIONS[dimension][b]`. The first 4 rows are all that the shaders need.
 pub const DIRECTIONS: [[u32; 32]; DIMENSIONS] = directions();
 
-/// Initial direction numbers of dimensions 1 to 15, chosen by [JoeKuo08] for good projections on two dimensions (table 6.21201);
+/// Initial direction numbers of dimensions 1 to 15, chosen by \[JoeKuo08\] for good projections on two dimensions (table 6.21201);
 /// as many as the degree of the dimension's polynomial, the rest is zero.
 const INITIAL: [[u32; 6]; DIMENSIONS - 1] = [
     [1, 0, 0, 0, 0, 0],
@@ -68,7 +68,7 @@ const fn primitive_polynomials() -> [u32; DIMENSIONS - 1] {
     out
 }
 
-/// Runs the recurrence of [BratleyFox88] from the initial numbers.
+/// Runs the recurrence of \[BratleyFox88\] from the initial numbers.
 const fn directions() -> [[u32; 32]; DIMENSIONS] {
     let polynomials = primitive_polynomials();
     let mut out = [[0; 32]; DIMENSIONS];
@@ -113,7 +113,7 @@ pub fn sobol(index: u32, dimension: usize) -> u32 {
 /// Owen's nested uniform scrambling: whether a bit is flipped is decided by the bits above it and the seed, so every aligned
 /// power-of-two interval is carried onto one of its size. A permutation of `u32` for every seed.
 ///
-/// Works on the reversed bits with steps in which a bit can only reach higher ones, after [LaineKarras11]; the even constants come from
+/// Works on the reversed bits with steps in which a bit can only reach higher ones, after \[LaineKarras11\]; the even constants come from
 /// a search for the least avalanche bias.
 pub fn owen_scramble(x: u32, seed: u32) -> u32 {
     let mut x = x.reverse_bits();

@@ -5,7 +5,7 @@ use crate::geometry::projector::ProjectorCamera;
 use dpm_shaders::structs::INSTANCE_EMPTY;
 use glam::{DAffine3, DVec2, DVec3};
 
-/// Side of a tile in pixels ([paper] section 2.1).
+/// Side of a tile in pixels (\[paper\] section 2.1).
 pub const TILE: u32 = 16;
 
 /// The tiles of one raster, in the order in which they are traced, and which of them are active.

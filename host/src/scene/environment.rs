@@ -143,7 +143,7 @@ fn read_pfm(bytes: &[u8]) -> Result<Pixels, SceneError> {
     Ok((width, height, (0..texels).map(texel).collect()))
 }
 
-/// Radiance pictures [Ward91]: rows from the top, plain or run-length coded a component at a time.
+/// Radiance pictures \[Ward91\]: rows from the top, plain or run-length coded a component at a time.
 fn read_rgbe(bytes: &[u8]) -> Result<Pixels, SceneError> {
     let mut rest = bytes;
     let mut exposure = 1.0f32;

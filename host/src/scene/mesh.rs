@@ -138,7 +138,7 @@ impl TriangleMesh {
     }
 
     /// Computes tangents from the texture coordinates: the tangent follows +u, the bitangent `w * n x t` follows -v (up in the image),
-    /// as glTF's normal maps have it. Faces around a vertex count by their angle there, in the way of [Mikkelsen08]; a vertex that
+    /// as glTF's normal maps have it. Faces around a vertex count by their angle there, in the way of \[Mikkelsen08\]; a vertex that
     /// joins mirrored and unmirrored faces is split. Where the coordinates are degenerate, any unit vector across the normal is taken.
     pub fn generate_tangents(&mut self) {
         self.split_mirrored_vertices();

@@ -1,4 +1,4 @@
-//! A signed distance field into triangles: naive surface nets [Gibson98] with the vertices pulled onto the surface.
+//! A signed distance field into triangles: naive surface nets \[Gibson98\] with the vertices pulled onto the surface.
 
 use glam::{UVec3, Vec3};
 

@@ -13,7 +13,7 @@ impl HostLink {
     /// Hands one frame to the medium, all of it or nothing. `planes` are the frame's planes one after the other in the
     /// configured order, each [`crate::planes::Raster::plane_bytes`] long; raw planes go out as they lie, without a copy on this side. `frame_id`
     /// must grow from frame to frame; the wire carries its low 32 bits. `target_at` is the instant of light on the device's
-    /// clock, usually [`SlotClock::start`] of the slot.
+    /// clock, usually [`SlotClock::start`](crate::link::slots::SlotClock::start) of the slot.
     ///
     /// # Panics
     /// When `planes` has not the configured size.

@@ -42,7 +42,7 @@ pub struct LinkSettings {
     pub session_seed: u32,
 }
 
-/// Progress of a [`HostLink`].
+/// Progress of a [`HostLink`](super::HostLink).
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum LinkState {
     /// Not connecting. [`super::HostLink::connect`] starts.

@@ -184,7 +184,7 @@ fn kind_of(code: u32) -> usize {
     }
 }
 
-/// The larger of both axes' error of [paper] eq. 1 of every tile, from a slot that was made for debugging.
+/// The larger of both axes' error of \[paper\] eq. 1 of every tile, from a slot that was made for debugging.
 pub fn tile_errors(raster: Raster, method: &Method, slot: &FrameSlot) -> Vec<Option<f32>> {
     let (Some(surfaces), Some(guides), Some(prior)) =
         (slot.surfaces(), slot.guides(), slot.prior_luminance())

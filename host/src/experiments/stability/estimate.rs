@@ -1,6 +1,6 @@
 //! Means and variances of Monte Carlo estimates.
 
-/// Running mean and variance of the mean, per channel ([Welford62]).
+/// Running mean and variance of the mean, per channel (\[Welford62\]).
 #[derive(Clone, Copy, Debug, Default)]
 pub struct Estimate {
     /// Values taken so far.

@@ -12,7 +12,7 @@ pub struct DirectionTest {
     pub p_value: f64,
 }
 
-/// Upper tail of the chi-square distribution by the normal approximation of its cube root [Wilson31], tail by [Abramowitz64] 7.1.26:
+/// Upper tail of the chi-square distribution by the normal approximation of its cube root \[Wilson31\], tail by \[Abramowitz64\] 7.1.26:
 /// good to a few percent of p, enough for thresholds.
 pub fn chi2_p_value(chi2: f64, freedom: f64) -> f64 {
     let spread = 2.0 / (9.0 * freedom);
@@ -92,7 +92,7 @@ pub struct Mean {
 }
 
 impl Mean {
-    /// Adds a value ([Welford62]).
+    /// Adds a value (\[Welford62\]).
     pub fn push(&mut self, x: f64) {
         self.n += 1.0;
         let d = x - self.mean;
