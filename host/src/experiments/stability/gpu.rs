@@ -13,35 +13,54 @@ pub fn open() -> Device {
     Gpu::open(&options).map_err(|e| e.to_string())
 }
 
-/// All cases on the device; without one they say what is missing.
-pub fn cases(device: &Device) -> Vec<Case> {
-    let mut all = gpu_tracer::cases(device);
-    all.extend(gpu_traversal::cases(device));
-    all.extend(gpu_history::cases(device));
-    all.extend(gpu_disocclusion::cases(device));
-    all.extend(gpu_samplers::cases(device));
-    all.extend(gpu_chain::cases(device));
-    all
-}
-
-/// A case on the device from its parts, in the order of [`Case::new`].
-pub(super) fn on(
-    device: &Device,
+/// A case that needs a device.
+pub struct GpuCase {
     name: &'static str,
     input: &'static str,
     oracle: &'static str,
     unit: &'static str,
     bound: f64,
     measure: fn(&Arc<Gpu>, u64) -> f64,
-) -> Case {
-    match device {
-        Ok(gpu) => {
-            let gpu = gpu.clone();
-            Case::new(name, input, oracle, unit, bound, move |seed| measure(&gpu, seed))
-        }
-        Err(why) => {
-            let missing = Some(format!("no Vulkan device: {why}"));
-            Case { missing, ..Case::new(name, input, oracle, unit, bound, |_| f64::NAN) }
+}
+
+impl GpuCase {
+    /// A case from its parts, in the order of [`Case::new`].
+    pub const fn new(
+        name: &'static str,
+        input: &'static str,
+        oracle: &'static str,
+        unit: &'static str,
+        bound: f64,
+        measure: fn(&Arc<Gpu>, u64) -> f64,
+    ) -> Self {
+        Self { name, input, oracle, unit, bound, measure }
+    }
+
+    /// The case on a device; without one it says what is missing.
+    fn on(&self, device: &Device) -> Case {
+        let &Self { name, input, oracle, unit, bound, measure } = self;
+        match device {
+            Ok(gpu) => {
+                let gpu = gpu.clone();
+                Case::new(name, input, oracle, unit, bound, move |seed| measure(&gpu, seed))
+            }
+            Err(why) => {
+                let missing = Some(format!("no Vulkan device: {why}"));
+                Case { missing, ..Case::new(name, input, oracle, unit, bound, |_| f64::NAN) }
+            }
         }
     }
+}
+
+/// All cases on the device.
+pub fn cases(device: &Device) -> Vec<Case> {
+    let all = [
+        gpu_tracer::CASES,
+        gpu_traversal::CASES,
+        gpu_history::CASES,
+        gpu_disocclusion::CASES,
+        gpu_samplers::CASES,
+        gpu_chain::CASES,
+    ];
+    all.into_iter().flatten().map(|case| case.on(device)).collect()
 }

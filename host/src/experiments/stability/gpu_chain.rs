@@ -1,10 +1,9 @@
 //! The whole chain from scene to radiance on the GPU against the f64 tracer, on scenes drawn by chance.
 
-use super::gpu::{on, Device};
+use super::gpu::GpuCase;
 use super::gpu_compare::compare;
 use super::gpu_shot::Shot;
 use super::shapes::*;
-use super::Case;
 use crate::gpu::Gpu;
 use crate::reference::Sampler;
 use crate::scene::{Material, PunctualKind, PunctualLight, Scene};
@@ -15,36 +14,32 @@ use std::sync::Arc;
 const SCENES: u64 = 17;
 
 /// The cases.
-pub fn cases(device: &Device) -> Vec<Case> {
-    let case =
-        |name, input, oracle, unit, bound, measure| on(device, name, input, oracle, unit, bound, measure);
-    vec![
-        case(
-            "gpu-random-scenes-pixels",
-            "17 scenes by chance: shapes, poses, all materials, textures, lights, skies",
-            "f64 tracer: pixels beyond 4 sigma by those that chance allows",
-            "ratio",
-            1.0,
-            |gpu, seed| worst(gpu, seed).0,
-        ),
-        case(
-            "gpu-random-scenes-mean",
-            "the same",
-            "f64 tracer: mean radiance, by 4 sigma and 0.2 %",
-            "ratio",
-            1.0,
-            |gpu, seed| worst(gpu, seed).1,
-        ),
-        case(
-            "gpu-random-scenes-surfaces",
-            "the same",
-            "f64 tracer: pixels that see something else",
-            "share",
-            1e-2,
-            |gpu, seed| worst(gpu, seed).2,
-        ),
-    ]
-}
+pub const CASES: &[GpuCase] = &[
+    GpuCase::new(
+        "gpu-random-scenes-pixels",
+        "17 scenes by chance: shapes, poses, all materials, textures, lights, skies",
+        "f64 tracer: pixels beyond 4 sigma by those that chance allows",
+        "ratio",
+        1.0,
+        |gpu, seed| worst(gpu, seed).0,
+    ),
+    GpuCase::new(
+        "gpu-random-scenes-mean",
+        "the same",
+        "f64 tracer: mean radiance, by 4 sigma and 0.2 %",
+        "ratio",
+        1.0,
+        |gpu, seed| worst(gpu, seed).1,
+    ),
+    GpuCase::new(
+        "gpu-random-scenes-surfaces",
+        "the same",
+        "f64 tracer: pixels that see something else",
+        "share",
+        1e-2,
+        |gpu, seed| worst(gpu, seed).2,
+    ),
+];
 
 /// A scene of three bodies and lights, and their poses.
 fn by_chance(seed: u64) -> (Scene, Vec<DAffine3>) {

@@ -2,11 +2,10 @@
 //!
 //! What is drawn has no noise, so a picture with a past that must not show agrees with one without.
 
-use super::gpu::{on, Device};
+use super::gpu::GpuCase;
 use super::gpu_history::{even, from_one, methods, play};
 use super::gpu_shot::Shot;
 use super::shapes::*;
-use super::Case;
 use crate::gpu::Gpu;
 use crate::render::method::Method;
 use crate::render::Renderer;
@@ -15,29 +14,28 @@ use dpm_shaders::structs::History;
 use glam::{DAffine3, DQuat, DVec3, Vec3};
 use std::sync::Arc;
 
-/// The cases.
-pub fn cases(device: &Device) -> Vec<Case> {
-    let case = |name, input, measure| {
-        on(device, name, input, "a picture without the past", "radiance", 1e-4, measure)
-    };
-    vec![
-        case(
-            "gpu-pose-jump",
-            "a glowing plate over a glowing floor that jumps by its width, every method without shading rates",
-            pose_jump,
-        ),
-        case(
-            "gpu-uncovered-by-itself",
-            "a floor and a box on it, one body with three glows, that jumps and turns, every method without shading rates",
-            uncovered_by_itself,
-        ),
-        case(
-            "gpu-stale-history",
-            "histories of wrong light that are two frames old, every method",
-            stale_history,
-        ),
-    ]
+const fn case(name: &'static str, input: &'static str, measure: fn(&Arc<Gpu>, u64) -> f64) -> GpuCase {
+    GpuCase::new(name, input, "a picture without the past", "radiance", 1e-4, measure)
 }
+
+/// The cases.
+pub const CASES: &[GpuCase] = &[
+    case(
+        "gpu-pose-jump",
+        "a glowing plate over a glowing floor that jumps by its width, every method without shading rates",
+        pose_jump,
+    ),
+    case(
+        "gpu-uncovered-by-itself",
+        "a floor and a box on it, one body with three glows, that jumps and turns, every method without shading rates",
+        uncovered_by_itself,
+    ),
+    case(
+        "gpu-stale-history",
+        "histories of wrong light that are two frames old, every method",
+        stale_history,
+    ),
+];
 
 fn glow(color: Vec3) -> Material {
     Material { base_color: Vec3::splat(0.5), ..emitter(color) }

@@ -1,10 +1,9 @@
 //! Histories, shading rates and filters on the GPU: what is constant stays, what changes is followed, what is broken is forgotten.
 
-use super::gpu::{on, Device};
+use super::gpu::GpuCase;
 use super::gpu_shot::Shot;
 use super::gpu_tracer::still_life;
 use super::shapes::*;
-use super::Case;
 use crate::config::{RenderConfig, RenderMethod};
 use crate::experiments::bench::METHODS;
 use crate::experiments::error_plan::method_of;
@@ -18,76 +17,72 @@ use glam::{DAffine3, DVec3, Vec3};
 use std::sync::Arc;
 
 /// The cases.
-pub fn cases(device: &Device) -> Vec<Case> {
-    let case =
-        |name, input, oracle, unit, bound, measure| on(device, name, input, oracle, unit, bound, measure);
-    vec![
-        case(
-            "gpu-tiles-at-borders",
-            "rasters of 1 x 1 to 33 x 31, every method",
-            "closed form: 1 in every lit pixel",
-            "radiance",
-            1e-4,
-            borders,
-        ),
-        case(
-            "gpu-constant-input",
-            "300 frames of even light, every method",
-            "closed form: 1, no drift",
-            "radiance",
-            1e-4,
-            constant_input,
-        ),
-        case(
-            "gpu-step-input",
-            "a light that comes down at once by 3 m, every method without shading rates, a quarter of a second later",
-            "closed form, in steps of 8-bit codes",
-            "codes",
-            1.0,
-            step_input,
-        ),
-        case(
-            "gpu-step-follows-the-paper",
-            "the same step frame by frame, method paper",
-            "closed form: (1 - 0.2)^n",
-            "radiance by step",
-            1e-3,
-            step_paper,
-        ),
-        case(
-            "gpu-poisoned-history",
-            "NaN and infinity in all of the history or one pixel, every method",
-            "gone two frames later, neighbours clean",
-            "faults",
-            0.0,
-            poisoned,
-        ),
-        case(
-            "gpu-rate-map-equals-cpu",
-            "64 x 48 of moving surfaces, method paper",
-            "the CPU's decision, bit for bit",
-            "tiles",
-            0.0,
-            rate_map,
-        ),
-        case(
-            "gpu-nobody-waits",
-            "24 frames of method paper at mixed rates with checkerboard",
-            "every block is traced in every second frame",
-            "frames over 2",
-            0.0,
-            nobody_waits,
-        ),
-        case(
-            "gpu-rates-keep-energy",
-            "every method against all pixels traced, 48 frames",
-            "mean radiance",
-            "relative",
-            5e-3,
-            energy_kept,
-        ),
-    ]
-}
+pub const CASES: &[GpuCase] = &[
+    GpuCase::new(
+        "gpu-tiles-at-borders",
+        "rasters of 1 x 1 to 33 x 31, every method",
+        "closed form: 1 in every lit pixel",
+        "radiance",
+        1e-4,
+        borders,
+    ),
+    GpuCase::new(
+        "gpu-constant-input",
+        "300 frames of even light, every method",
+        "closed form: 1, no drift",
+        "radiance",
+        1e-4,
+        constant_input,
+    ),
+    GpuCase::new(
+        "gpu-step-input",
+        "a light that comes down at once by 3 m, every method without shading rates, a quarter of a second later",
+        "closed form, in steps of 8-bit codes",
+        "codes",
+        1.0,
+        step_input,
+    ),
+    GpuCase::new(
+        "gpu-step-follows-the-paper",
+        "the same step frame by frame, method paper",
+        "closed form: (1 - 0.2)^n",
+        "radiance by step",
+        1e-3,
+        step_paper,
+    ),
+    GpuCase::new(
+        "gpu-poisoned-history",
+        "NaN and infinity in all of the history or one pixel, every method",
+        "gone two frames later, neighbours clean",
+        "faults",
+        0.0,
+        poisoned,
+    ),
+    GpuCase::new(
+        "gpu-rate-map-equals-cpu",
+        "64 x 48 of moving surfaces, method paper",
+        "the CPU's decision, bit for bit",
+        "tiles",
+        0.0,
+        rate_map,
+    ),
+    GpuCase::new(
+        "gpu-nobody-waits",
+        "24 frames of method paper at mixed rates with checkerboard",
+        "every block is traced in every second frame",
+        "frames over 2",
+        0.0,
+        nobody_waits,
+    ),
+    GpuCase::new(
+        "gpu-rates-keep-energy",
+        "every method against all pixels traced, 48 frames",
+        "mean radiance",
+        "relative",
+        5e-3,
+        energy_kept,
+    ),
+];
 
 /// Every method with its authors' constants.
 pub fn methods() -> Vec<Method> {
@@ -123,6 +118,11 @@ pub(super) fn play(
     shot.play(&mut renderer, 0..shot.frames, poses, |frame, slot, _| each(frame, slot));
 }
 
+/// The same with the shot's own poses in every frame.
+pub(super) fn play_at_rest(gpu: &Arc<Gpu>, shot: &Shot<'_>, each: impl FnMut(u32, &FrameSlot)) {
+    play(gpu, shot, |_| shot.world_from_body(), each);
+}
+
 fn borders(gpu: &Arc<Gpu>, seed: u64) -> f64 {
     let scene = even();
     let mut worst: f64 = 0.0;
@@ -139,22 +139,17 @@ fn borders(gpu: &Arc<Gpu>, seed: u64) -> f64 {
                 method: Some(method.clone()),
                 ..Shot::new(&scene, camera)
             };
-            play(
-                gpu,
-                &shot,
-                |_| shot.world_from_body(),
-                |frame, slot| {
-                    let off = from_one(slot);
-                    let dark = slot.surfaces().unwrap_or(&[]).iter().filter(|s| s.distance <= 0.0).count();
-                    worst = if off < 0.0 || dark > 0 {
-                        f64::INFINITY
-                    } else if frame >= 2 {
-                        worst.max(off)
-                    } else {
-                        worst
-                    };
-                },
-            );
+            play_at_rest(gpu, &shot, |frame, slot| {
+                let off = from_one(slot);
+                let dark = slot.surfaces().unwrap_or(&[]).iter().filter(|s| s.distance <= 0.0).count();
+                worst = if off < 0.0 || dark > 0 {
+                    f64::INFINITY
+                } else if frame >= 2 {
+                    worst.max(off)
+                } else {
+                    worst
+                };
+            });
         }
     }
     worst
@@ -173,17 +168,12 @@ fn constant_input(gpu: &Arc<Gpu>, seed: u64) -> f64 {
             method: Some(method),
             ..Shot::new(&scene, camera)
         };
-        play(
-            gpu,
-            &shot,
-            |_| shot.world_from_body(),
-            |frame, slot| {
-                if frame % 50 == 49 {
-                    let off = from_one(slot);
-                    worst = if off < 0.0 { f64::INFINITY } else { worst.max(off) };
-                }
-            },
-        );
+        play_at_rest(gpu, &shot, |frame, slot| {
+            if frame % 50 == 49 {
+                let off = from_one(slot);
+                worst = if off < 0.0 { f64::INFINITY } else { worst.max(off) };
+            }
+        });
     }
     worst
 }

@@ -3,12 +3,11 @@
 //! A wrong sampler gives itself away by one of them: it favours some light (another mean), or repeats itself (noise that more samples or more
 //! frames do not take away). That the mean itself is right is judged against the f64 tracer, by cases of independent samples.
 
-use super::gpu::{on, Device};
-use super::gpu_history::play;
+use super::gpu::GpuCase;
+use super::gpu_history::play_at_rest;
 use super::gpu_shot::Shot;
 use super::gpu_tracer::still_life;
 use super::shapes::*;
-use super::Case;
 use crate::config::{RenderConfig, RenderMethod};
 use crate::experiments::error_plan::method_of;
 use crate::gpu::Gpu;
@@ -19,28 +18,24 @@ use glam::{DVec3, Vec3};
 use std::sync::Arc;
 
 /// The cases.
-pub fn cases(device: &Device) -> Vec<Case> {
-    let case =
-        |name, input, oracle, unit, bound, measure| on(device, name, input, oracle, unit, bound, measure);
-    vec![
-        case(
-            "gpu-noise-falls",
-            "independent samples, blue noise and sequences that go on: 1 and 16 samples a frame, 1 and 64 frames",
-            "closed form: by the root of their number, independent samples neither faster nor slower",
-            "ratio",
-            1.15,
-            noise_falls,
-        ),
-        case(
-            "gpu-samplers-agree",
-            "the same in 64 frames of 4 samples: means of pixels and of the picture",
-            "independent samples: difference by what chance allows",
-            "ratio",
-            1.0,
-            samplers_agree,
-        ),
-    ]
-}
+pub const CASES: &[GpuCase] = &[
+    GpuCase::new(
+        "gpu-noise-falls",
+        "independent samples, blue noise and sequences that go on: 1 and 16 samples a frame, 1 and 64 frames",
+        "closed form: by the root of their number, independent samples neither faster nor slower",
+        "ratio",
+        1.15,
+        noise_falls,
+    ),
+    GpuCase::new(
+        "gpu-samplers-agree",
+        "the same in 64 frames of 4 samples: means of pixels and of the picture",
+        "independent samples: difference by what chance allows",
+        "ratio",
+        1.0,
+        samplers_agree,
+    ),
+];
 
 /// Methods that trace every pixel alike, and whether their samples are independent of each other.
 fn samplers() -> [(Method, bool); 3] {
@@ -77,16 +72,11 @@ fn traced(gpu: &Arc<Gpu>, scene: &Scene, method: &Method, spp: u32, frames: u32,
         ..Shot::new(scene, camera(32, 24, DVec3::new(0.3, 1.6, 2.4), DVec3::ZERO))
     };
     let mut all = Vec::new();
-    play(
-        gpu,
-        &shot,
-        |_| shot.world_from_body(),
-        |_, slot| {
-            let (traced, surfaces) = (slot.traced().unwrap_or(&[]), slot.surfaces().unwrap_or(&[]));
-            let lit = traced.iter().zip(surfaces).filter(|(_, s)| s.id != NO_HIT && s.distance > 0.0);
-            all.push(lit.flat_map(|(r, _)| r[..3].iter().map(|v| f64::from(*v))).collect());
-        },
-    );
+    play_at_rest(gpu, &shot, |_, slot| {
+        let (traced, surfaces) = (slot.traced().unwrap_or(&[]), slot.surfaces().unwrap_or(&[]));
+        let lit = traced.iter().zip(surfaces).filter(|(_, s)| s.id != NO_HIT && s.distance > 0.0);
+        all.push(lit.flat_map(|(r, _)| r[..3].iter().map(|v| f64::from(*v))).collect());
+    });
     all
 }
 

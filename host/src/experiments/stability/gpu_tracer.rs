@@ -1,11 +1,10 @@
 //! Light transport on the GPU: closed forms, conservation, and lights and sizes at the edge of f32.
 
 use super::estimate::pooled;
-use super::gpu::{on, Device};
+use super::gpu::GpuCase;
 use super::gpu_compare::compare;
 use super::gpu_shot::Shot;
 use super::shapes::*;
-use super::Case;
 use crate::gpu::Gpu;
 use crate::reference::microfacet::fresnel_dielectric;
 use crate::scene::{Environment, Material, PunctualKind, PunctualLight, Scene};
@@ -13,140 +12,136 @@ use glam::{DAffine3, DQuat, DVec2, DVec3, Vec3};
 use std::sync::Arc;
 
 /// The cases.
-pub fn cases(device: &Device) -> Vec<Case> {
-    let case =
-        |name, input, oracle, unit, bound, measure| on(device, name, input, oracle, unit, bound, measure);
-    vec![
-        case(
-            "gpu-furnace-convex",
-            "white Lambertian sphere in even light, 64 bounces",
-            "closed form: 1 in every pixel",
-            "radiance",
-            2e-6,
-            furnace_convex,
-        ),
-        case(
-            "gpu-furnace-corner",
-            "corner of three white walls in even light, 64 bounces",
-            "closed form: mean 1",
-            "sigma",
-            4.0,
-            furnace_corner,
-        ),
-        case(
-            "gpu-closed-sphere",
-            "albedo and emission 1/2 inside spheres of 1 mm to 10 km, up to 10 km off the origin",
-            "closed form: 1 - 2^-depth, every ray hits",
-            "sigma",
-            4.0,
-            closed_sphere,
-        ),
-        case(
-            "gpu-energy-of-every-lobe",
-            "roughness 0 to 1; metal, coat, thin, solid; at all angles and at 89.99 deg",
-            "albedo at most 1",
-            "excess",
-            2e-3,
-            energy,
-        ),
-        case(
-            "gpu-single-scatter-loss",
-            "white rough metal, alpha 0.25, 0.5, 1",
-            "albedo 0.882, 0.700, 0.409 on average",
-            "albedo",
-            4e-3,
-            single_scatter,
-        ),
-        case(
-            "gpu-fresnel",
-            "mirror-like dielectric of index 1, 1 + 1e-7, 1.1, 1.5, 2.4 at 5 to 88 deg",
-            "Fresnel's equations",
-            "reflectance",
-            1e-3,
-            fresnel,
-        ),
-        case(
-            "gpu-index-near-one",
-            "clear slab of index 1, 1 + 1e-7, 1.0005, 1.002 in even light",
-            "closed form: 1, continuous",
-            "radiance",
-            2e-3,
-            near_one,
-        ),
-        case(
-            "gpu-sphere-light-form-factor",
-            "sphere light over a floor",
-            "closed form: E = pi L (r / h)^2",
-            "relative",
-            1.5e-2,
-            form_factor,
-        ),
-        case(
-            "gpu-scale-and-place",
-            "a scene at 2^-13 to 2^13 of its size, and 2.3 km off the origin, also at 1/1000 of its size",
-            "same image",
-            "relative",
-            1e-2,
-            scale_and_place,
-        ),
-        case(
-            "gpu-far-from-origin",
-            "bodies, projector and eye moved 1e5 m by their poses",
-            "same image",
-            "relative",
-            1e-2,
-            far_from_origin,
-        ),
-        case(
-            "gpu-lights-that-touch",
-            "lamp 1 mm over the surface, in the surface, point lights 0 and 10 um over it",
-            "f64 reference: pixels beyond 4 sigma by those allowed",
-            "ratio",
-            1.0,
-            touching_lights,
-        ),
-        case(
-            "gpu-sun-and-lamp",
-            "sun of 1e5, lamp of 1e-3 on one floor",
-            "closed form, sun alone and lamp alone",
-            "relative",
-            2e-2,
-            sun_and_lamp,
-        ),
-        case(
-            "gpu-no-light",
-            "no light, black lights, a black texture, a black sky",
-            "all 0",
-            "radiance",
-            0.0,
-            no_light,
-        ),
-        case(
-            "gpu-many-lights",
-            "100,000 point lights, a fifth of them black",
-            "closed form: sum",
-            "sigma",
-            4.0,
-            many_lights,
-        ),
-        case(
-            "gpu-extreme-radiance",
-            "emission 0, 1e-40, 3e38 under every method",
-            "finite or at full code; black is black",
-            "faults",
-            0.0,
-            extreme_radiance,
-        ),
-        case(
-            "gpu-firefly-limit",
-            "limits of 0.02 and 1e30",
-            "removes and counts, never adds; out of reach it changes nothing",
-            "faults",
-            0.0,
-            firefly_limit,
-        ),
-    ]
-}
+pub const CASES: &[GpuCase] = &[
+    GpuCase::new(
+        "gpu-furnace-convex",
+        "white Lambertian sphere in even light, 64 bounces",
+        "closed form: 1 in every pixel",
+        "radiance",
+        2e-6,
+        furnace_convex,
+    ),
+    GpuCase::new(
+        "gpu-furnace-corner",
+        "corner of three white walls in even light, 64 bounces",
+        "closed form: mean 1",
+        "sigma",
+        4.0,
+        furnace_corner,
+    ),
+    GpuCase::new(
+        "gpu-closed-sphere",
+        "albedo and emission 1/2 inside spheres of 1 mm to 10 km, up to 10 km off the origin",
+        "closed form: 1 - 2^-depth, every ray hits",
+        "sigma",
+        4.0,
+        closed_sphere,
+    ),
+    GpuCase::new(
+        "gpu-energy-of-every-lobe",
+        "roughness 0 to 1; metal, coat, thin, solid; at all angles and at 89.99 deg",
+        "albedo at most 1",
+        "excess",
+        2e-3,
+        energy,
+    ),
+    GpuCase::new(
+        "gpu-single-scatter-loss",
+        "white rough metal, alpha 0.25, 0.5, 1",
+        "albedo 0.882, 0.700, 0.409 on average",
+        "albedo",
+        4e-3,
+        single_scatter,
+    ),
+    GpuCase::new(
+        "gpu-fresnel",
+        "mirror-like dielectric of index 1, 1 + 1e-7, 1.1, 1.5, 2.4 at 5 to 88 deg",
+        "Fresnel's equations",
+        "reflectance",
+        1e-3,
+        fresnel,
+    ),
+    GpuCase::new(
+        "gpu-index-near-one",
+        "clear slab of index 1, 1 + 1e-7, 1.0005, 1.002 in even light",
+        "closed form: 1, continuous",
+        "radiance",
+        2e-3,
+        near_one,
+    ),
+    GpuCase::new(
+        "gpu-sphere-light-form-factor",
+        "sphere light over a floor",
+        "closed form: E = pi L (r / h)^2",
+        "relative",
+        1.5e-2,
+        form_factor,
+    ),
+    GpuCase::new(
+        "gpu-scale-and-place",
+        "a scene at 2^-13 to 2^13 of its size, and 2.3 km off the origin, also at 1/1000 of its size",
+        "same image",
+        "relative",
+        1e-2,
+        scale_and_place,
+    ),
+    GpuCase::new(
+        "gpu-far-from-origin",
+        "bodies, projector and eye moved 1e5 m by their poses",
+        "same image",
+        "relative",
+        1e-2,
+        far_from_origin,
+    ),
+    GpuCase::new(
+        "gpu-lights-that-touch",
+        "lamp 1 mm over the surface, in the surface, point lights 0 and 10 um over it",
+        "f64 reference: pixels beyond 4 sigma by those allowed",
+        "ratio",
+        1.0,
+        touching_lights,
+    ),
+    GpuCase::new(
+        "gpu-sun-and-lamp",
+        "sun of 1e5, lamp of 1e-3 on one floor",
+        "closed form, sun alone and lamp alone",
+        "relative",
+        2e-2,
+        sun_and_lamp,
+    ),
+    GpuCase::new(
+        "gpu-no-light",
+        "no light, black lights, a black texture, a black sky",
+        "all 0",
+        "radiance",
+        0.0,
+        no_light,
+    ),
+    GpuCase::new(
+        "gpu-many-lights",
+        "100,000 point lights, a fifth of them black",
+        "closed form: sum",
+        "sigma",
+        4.0,
+        many_lights,
+    ),
+    GpuCase::new(
+        "gpu-extreme-radiance",
+        "emission 0, 1e-40, 3e38 under every method",
+        "finite or at full code; black is black",
+        "faults",
+        0.0,
+        extreme_radiance,
+    ),
+    GpuCase::new(
+        "gpu-firefly-limit",
+        "limits of 0.02 and 1e30",
+        "removes and counts, never adds; out of reach it changes nothing",
+        "faults",
+        0.0,
+        firefly_limit,
+    ),
+];
 
 fn furnace(material: Material, level: u32) -> Scene {
     let mut scene = scene_of(sphere(Vec3::ZERO, 1.0, level, false), material);
