@@ -42,6 +42,8 @@ const SHIFT_S: f64 = 4e-3;
 const FOLLOW_S: f64 = 0.04;
 /// Time constant of the misfit's mean, s.
 const MISFIT_S: f64 = 0.02;
+/// No sample counts as a greater misfit: from its start at a half, one wild sample every 2 ms does not lift the mean above 1.
+const WORST_MISFIT: f64 = 5.0;
 
 /// A point of the past.
 #[derive(Clone, Copy, Debug)]
@@ -104,9 +106,10 @@ impl<C: Chart> Recall<C> {
     /// What the body did after `from_ns` and up to `to_ns` the last time.
     pub fn between(&self, from_ns: i64, to_ns: i64) -> Option<Recalled> {
         let lag = self.lag_ns?;
-        let from = self.at(from_ns - lag)?.motion;
-        let Point { motion: to, matters, exact, .. } = self.at(to_ns - lag)?;
-        let later = self.at(to_ns - lag + AHEAD_NS)?.motion;
+        let then_ns = to_ns.saturating_sub(lag);
+        let from = self.at(from_ns.saturating_sub(lag))?.motion;
+        let Point { motion: to, matters, exact, .. } = self.at(then_ns)?;
+        let later = self.at(then_ns.saturating_add(AHEAD_NS))?.motion;
         let (h, ahead) = ((to_ns - from_ns) as f64 * 1e-9, AHEAD_NS as f64 * 1e-9);
         let bent = C::between(to.point, later.point) - to.velocity * ahead;
         Some(Recalled {
@@ -129,7 +132,7 @@ impl<C: Chart> Recall<C> {
         let since_s = at_ns.saturating_sub(self.newest_ns).max(0) as f64 * 1e-9;
         self.newest_ns = at_ns;
         match self.lag_ns {
-            Some(lag) => self.follow(at_ns - lag, since_s, z, sigma),
+            Some(lag) => self.follow(at_ns.saturating_sub(lag), since_s, z, sigma),
             None => self.search(at_ns, point, velocity, sigma),
         }
     }
@@ -157,7 +160,7 @@ impl<C: Chart> Recall<C> {
             return None;
         }
         let (a, b) = (self.get(low)?, self.get(low + 1)?);
-        let gap = b.at_ns - a.at_ns;
+        let gap = b.at_ns.saturating_sub(a.at_ns);
         if gap > GAP_NS || t_ns < a.at_ns {
             return None;
         }
@@ -181,7 +184,10 @@ impl<C: Chart> Recall<C> {
     /// Adds the newest point that can be smoothed, unless the last one is too near.
     fn remember(&mut self, now_ns: i64, sigma: f64) {
         let last_ns = self.written.checked_sub(1).and_then(|i| self.get(i)).map(|p| p.at_ns);
-        let due = |t: i64| now_ns - t >= MARGIN_NS && last_ns.is_none_or(|last| t - last >= POINT_NS);
+        let due = |t: i64| {
+            now_ns.saturating_sub(t) >= MARGIN_NS
+                && last_ns.is_none_or(|last| t.saturating_sub(last) >= POINT_NS)
+        };
         let Some(middle) = self.samples.iter().rposition(|s| s.is_some_and(|(t, _)| due(t))) else { return };
         let Some((at_ns, motion)) = smoothed::<C>(&self.samples, middle, sigma) else { return };
         let mut new = Point { at_ns, motion, passes: 1.0, matters: [false; 3], exact: [true; 3] };
@@ -199,7 +205,7 @@ impl<C: Chart> Recall<C> {
             self.unfit[axis] = if motion.fits[axis] { 0 } else { self.unfit[axis].saturating_add(1) };
             new.exact[axis] = self.unfit[axis] <= UNFIT;
         }
-        if let Some(old) = self.lag_ns.and_then(|lag| self.at(at_ns - lag)) {
+        if let Some(old) = self.lag_ns.and_then(|lag| self.at(at_ns.saturating_sub(lag))) {
             new.passes = (old.passes + 1.0).min(PASSES);
             let w = 1.0 / new.passes;
             let (old, new) = (&old.motion, &mut new.motion);
@@ -230,11 +236,10 @@ impl<C: Chart> Recall<C> {
             return;
         };
         let (across, later) = Self::mismatch(&past.motion, z, sigma);
-        *lag -= ((1.0 - (-since_s / FOLLOW_S).exp()) * later * 1e9) as i64;
+        *lag = lag.saturating_sub(((1.0 - (-since_s / FOLLOW_S).exp()) * later * 1e9) as i64);
         let shift = later / SHIFT_S;
-        // Bounded, so that one wild sample is not enough.
-        self.misfit +=
-            (1.0 - (-since_s / MISFIT_S).exp()) * ((across + shift * shift).min(20.0) - self.misfit);
+        let misfit = (across + shift * shift).min(WORST_MISFIT);
+        self.misfit += (1.0 - (-since_s / MISFIT_S).exp()) * (misfit - self.misfit);
         if self.misfit > 1.0 {
             self.lag_ns = None;
         }
@@ -251,13 +256,13 @@ impl<C: Chart> Recall<C> {
         for _ in 0..SCAN.min(count) {
             self.scanned = (self.scanned + 1) % count;
             let Some(past) = self.get(self.oldest() + self.scanned) else { continue };
-            let age_ns = at_ns - past.at_ns;
+            let age_ns = at_ns.saturating_sub(past.at_ns);
             if age_ns < LEAST_LAG_NS || (past.motion.velocity - velocity).length() > 0.1 * speed {
                 continue;
             }
             let (across, later) = Self::mismatch(&past.motion, point, sigma);
             if later.abs() < SHIFT_S && across < best.map_or(1.0, |(least, _)| least) {
-                best = Some((across, age_ns - (later * 1e9) as i64));
+                best = Some((across, age_ns.saturating_sub((later * 1e9) as i64)));
             }
         }
         if let Some((_, lag)) = best.filter(|(_, lag)| self.came_the_same_way(at_ns, *lag, sigma)) {
@@ -268,8 +273,10 @@ impl<C: Chart> Recall<C> {
 
     fn came_the_same_way(&self, at_ns: i64, lag_ns: i64, sigma: f64) -> bool {
         (0..8).all(|i| {
-            let t = at_ns - MARGIN_NS - 2 * GAP_NS - i * 15_000_000;
-            let (Some(now), Some(then)) = (self.at(t), self.at(t - lag_ns)) else { return false };
+            let t = at_ns.saturating_sub(MARGIN_NS + 2 * GAP_NS + i * 15_000_000);
+            let (Some(now), Some(then)) = (self.at(t), self.at(t.saturating_sub(lag_ns))) else {
+                return false;
+            };
             let (across, later) = Self::mismatch(&then.motion, now.motion.point, sigma);
             across < 1.0 && later.abs() < SHIFT_S
         })

@@ -148,6 +148,43 @@ fn another_way_is_noticed() {
     }
 }
 
+/// A single sample that is 3 mm off, which the gate of a fast body lets pass, ends no recall; it is off along the motion, across it, or both.
+#[test]
+fn one_wild_sample_is_not_enough() {
+    let mut body = Follower::new(&sine());
+    let mut wild = 0;
+    for i in 0..4000 {
+        let t = i * STEP_NS;
+        if i % 100 != 99 || body.recall.lag_ns().is_none() {
+            body.see(t);
+            continue;
+        }
+        let (pose, twist) = body.motion.state_at(t);
+        let (p, v) = (DVec3::from_array(pose.position_m), DVec3::from_array(twist.linear_m_s));
+        let off = [DVec3::X, DVec3::Y, DVec3::ONE.normalize()][wild % 3] * 3e-3;
+        body.recall.push(t, p + off, p, v, SIGMA);
+        assert!(body.recall.lag_ns().is_some(), "given up at {t}");
+        wild += 1;
+    }
+    assert!(wild > 20, "{wild}");
+}
+
+/// Tracks at both ends of time, with what is left of the first one while the second goes on.
+#[test]
+fn no_instant_is_out_of_range() {
+    let mut recall = Recall::<Translations>::new();
+    let velocity = DVec3::new(0.5, 0.0, 0.0);
+    for begin in [i64::MIN, 0, i64::MAX - 600 * STEP_NS] {
+        for i in 0..600 {
+            let t = begin + i * STEP_NS;
+            let p = velocity * ((i % 200) as f64 * 2e-3);
+            recall.push(t, p, p, velocity, SIGMA);
+            let _ = recall.between(t, t.saturating_add(STEP_NS));
+        }
+        recall.break_track();
+    }
+}
+
 #[test]
 fn gaps_end_a_recall_and_are_never_recalled() {
     let mut body = Follower::new(&sine());
