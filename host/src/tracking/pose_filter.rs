@@ -85,8 +85,8 @@ impl Default for PoseFilterConfig {
 
 /// Models for bodies whose turns take about `acceleration` (m/s^2 or rad/s^2) and whose velocity changes in a good part of a
 /// second: coasting; steady acceleration; swinging at a hand's or a rocker's pace; a sharp manoeuvre, which bridges
-/// the onset of a turn; and what the body did the last time. The numbers were found by a random search over shuttles and swings of 1 to 3 Hz with 0.1 mm of noise at 500 Hz
-/// (the table in `docs/LATENCY.md`); densities scale with the square of the acceleration.
+/// the onset of a turn; and what the body did the last time. The numbers were found by a random search over shuttles and swings of
+/// 1 to 3 Hz with 0.1 mm of noise at 500 Hz (the table in `docs/LATENCY.md`); densities scale with the square of the acceleration.
 pub fn models_for(acceleration: f64) -> ImmConfig {
     let a2 = acceleration * acceleration;
     let model = |accelerates, swing_rad_s, noise| MotionModel { accelerates, swing_rad_s, noise };
@@ -113,6 +113,14 @@ pub fn models_for(acceleration: f64) -> ImmConfig {
 }
 
 impl PoseFilterConfig {
+    /// The same without what a body did the last time ([`super::recall`]): for comparison.
+    pub fn without_recall(mut self) -> Self {
+        // So long after that it never comes.
+        self.position_models.recall_after_s = f64::INFINITY;
+        self.rotation_models.recall_after_s = f64::INFINITY;
+        self
+    }
+
     /// The settings of a rig file: `[prediction]`, and `safety.predict_ms` as the time after which a body is lost.
     pub fn from_rig(prediction: &PredictionConfig, predict_ms: u32) -> Self {
         let lost_after_ns = i64::from(predict_ms.max(1)) * 1_000_000;
