@@ -181,6 +181,16 @@ fn a_plan_tells_spare_code_from_parts_of_the_picture() {
             assert!(s.changes_pictures && !s.pixels_identical && s.difference > 1e-4, "{part}: {s:?}");
             assert!(s.without_ms > 0.0 && s.with_ms > 0.0 && !s.is_wrong(), "{part}: {s:?}");
         }
+        // Parts that the scene calls for stand beside the scene without them.
+        for part in ["textures", "normal maps", "specular", "diffuse", "emissive", "environment"] {
+            let s = of(part);
+            assert!(s.changes_pictures && s.difference > 1e-4 && s.without_ms > 0.0, "{part}: {s:?}");
+        }
+        let image = of("environment image");
+        assert!(
+            image.changes_pictures && image.difference < 0.6,
+            "the same light by other samples: {image:?}"
+        );
         // What traces fewer pixels traces fewer rays; filters trace none.
         if method == "paper" {
             assert!(of("checkerboard").with_rays < 0.8 * of("checkerboard").without_rays);

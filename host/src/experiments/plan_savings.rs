@@ -7,6 +7,8 @@ use crate::gpu::Gpu;
 use crate::render::method::{Method, SamplerKind, HISTORY_CAP};
 use crate::render::{FrameSlot, Keep, RenderError, Renderer, RendererSettings};
 use crate::rig::Rig;
+use crate::scene::{Environment, Material, Scene};
+use glam::Vec3;
 use serde::Serialize;
 use std::sync::Arc;
 
@@ -99,19 +101,69 @@ pub(super) fn flipped(feature: &str, settings: &RendererSettings) -> Option<Rend
     Some(all)
 }
 
+/// The scene without a part that it has, or with an image in place of an even sky. `None`: it is no part of scenes, or this one has none of it.
+pub(super) fn changed(feature: &str, scene: &Scene) -> Option<Scene> {
+    let mut other = scene.clone();
+    let mut every = |change: &dyn Fn(&mut Material)| other.materials.iter_mut().for_each(change);
+    match feature {
+        "textures" => every(&|m| {
+            (m.base_color_texture, m.metallic_roughness_texture, m.normal_texture) = (None, None, None);
+            (m.emissive_texture, m.transmission_texture) = (None, None);
+        }),
+        "normal maps" => every(&|m| m.normal_texture = None),
+        "alpha mask" => every(&|m| m.alpha_cutoff = None),
+        "transmission" => every(&|m| (m.transmission, m.transmission_texture) = (0.0, None)),
+        "specular" => {
+            every(&|m| (m.ior, m.metallic, m.metallic_roughness_texture) = (1.0, 0.0, None));
+        }
+        "diffuse" => every(&|m| (m.metallic, m.metallic_roughness_texture) = (1.0, None)),
+        "emissive" => every(&|m| m.emissive = Vec3::ZERO),
+        "punctual lights" => other.lights.clear(),
+        "environment" => other.environment = Environment::Constant(Vec3::ZERO),
+        "environment image" => other.environment = other_sky(&scene.environment)?,
+        _ => return None,
+    }
+    Some(other)
+}
+
+/// An image of an even sky, or the even sky that gives a sphere as much light as an image. `None` without light.
+fn other_sky(sky: &Environment) -> Option<Environment> {
+    const ROWS: u32 = 32;
+    match sky {
+        Environment::Constant(light) => (light.max_element() > 0.0).then(|| Environment::Equirect {
+            width: 2 * ROWS,
+            height: ROWS,
+            texels: vec![*light; (2 * ROWS * ROWS) as usize],
+            rotation_rad: 0.0,
+        }),
+        Environment::Equirect { width, height, texels, .. } => {
+            let edge = |row: usize| (std::f64::consts::PI * row as f64 / f64::from(*height)).cos();
+            let rows = texels.chunks_exact((*width).max(1) as usize).enumerate();
+            let mean =
+                |row: &[Vec3]| row.iter().map(|t| t.as_dvec3()).sum::<glam::DVec3>() / row.len() as f64;
+            let light: glam::DVec3 = rows.map(|(y, row)| 0.5 * (edge(y) - edge(y + 1)) * mean(row)).sum();
+            Some(Environment::Constant(light.as_vec3()))
+        }
+    }
+}
+
+/// One of two renderers: its scene, its settings, and what stays in although nothing needs it.
+#[derive(Clone, Copy)]
+pub struct Side<'a> {
+    /// The rig's, or the rig's with a part changed; the bodies are the rig's.
+    pub scene: &'a Scene,
+    /// Method and numbers.
+    pub settings: &'a RendererSettings,
+    /// Spare code.
+    pub keep: Keep,
+}
+
 /// The same frames by both renderers in turns.
 ///
 /// # Errors
 /// The renderer's.
-pub fn compare(
-    rig: &Rig,
-    gpu: &Arc<Gpu>,
-    without: (&RendererSettings, Keep),
-    with: (&RendererSettings, Keep),
-) -> Result<Saving, RenderError> {
-    let open = |(settings, keep): (&RendererSettings, Keep)| {
-        Renderer::keeping(gpu, &rig.scene, settings.clone(), keep)
-    };
+pub fn compare(rig: &Rig, gpu: &Arc<Gpu>, without: Side<'_>, with: Side<'_>) -> Result<Saving, RenderError> {
+    let open = |side: Side<'_>| Renderer::keeping(gpu, side.scene, side.settings.clone(), side.keep);
     let mut renderers = [open(without)?, open(with)?];
     let mut slots: [FrameSlot; 2] = [renderers[0].create_slot(true)?, renderers[1].create_slot(true)?];
     let (mut times, mut rays) = ([Vec::new(), Vec::new()], [0.0f64; 2]);
@@ -170,6 +222,7 @@ mod tests {
     use crate::config::{Overrides, RigConfig};
     use crate::experiments::scene_plan::scene_plan;
     use crate::pipeline::renderer_settings;
+    use crate::render::scene_data::SceneData;
 
     fn demo() -> (Vec<&'static str>, Rig) {
         let config = RigConfig::demo(&Overrides { variables: vec![], flags: vec![] }).unwrap();
@@ -216,6 +269,51 @@ mod tests {
                 }
             }
         }
+    }
+
+    #[test]
+    fn each_part_of_a_scene_is_taken_out_and_nothing_else() {
+        let (features, rig) = demo();
+        let (scene, needs) = (&rig.scene, |s: &Scene| SceneData::build(s).unwrap().needs);
+        let own = needs(scene);
+        let changes: Vec<_> = features.iter().filter_map(|f| Some((*f, changed(f, scene)?))).collect();
+        assert_eq!(changes.len(), 11 - 1, "all parts of scenes but the clamp, which is a setting");
+        for (feature, other) in changes {
+            let other = needs(&other);
+            let gone = match feature {
+                "textures" => own.textures && !other.textures,
+                "normal maps" => own.normal_maps && !other.normal_maps && other.textures,
+                "specular" => own.specular && !other.specular && other.diffuse,
+                "diffuse" => own.diffuse && !other.diffuse && other.specular,
+                "emissive" => own.emissive && !other.emissive,
+                "environment" => own.environment_kind == 1 && other.environment_kind == 0,
+                "environment image" => other.environment_kind == 2,
+                _ => other == own,
+            };
+            assert!(gone, "{feature}: {own:?} becomes {other:?}");
+        }
+    }
+
+    #[test]
+    fn an_even_sky_becomes_an_image_of_as_much_light_and_back() {
+        let even = Environment::Constant(Vec3::new(0.2, 0.5, 1.0));
+        let image = other_sky(&even).unwrap();
+        let Environment::Constant(back) = other_sky(&image).unwrap() else { panic!("{image:?}") };
+        assert!((back - Vec3::new(0.2, 0.5, 1.0)).abs().max_element() < 1e-6, "{back}");
+        assert!(other_sky(&Environment::default()).is_none());
+        // Upper half 1, lower half 0; then only the row about the zenith: its cap's share of the sphere is (1 - cos 45 deg) / 2.
+        let light = |texels: &[f32]| {
+            let sky = Environment::Equirect {
+                width: 1,
+                height: texels.len() as u32,
+                texels: texels.iter().map(|t| Vec3::splat(*t)).collect(),
+                rotation_rad: 0.3,
+            };
+            let Some(Environment::Constant(c)) = other_sky(&sky) else { panic!("{sky:?}") };
+            f64::from(c.x)
+        };
+        assert!((light(&[1.0, 0.0]) - 0.5).abs() < 1e-7);
+        assert!((light(&[1.0, 0.0, 0.0, 0.0]) - 0.5 * (1.0 - 0.5f64.sqrt())).abs() < 1e-7);
     }
 
     #[test]

@@ -1,13 +1,13 @@
 //! `dpm plan`: a rig into what its scene and method need of the renderer, what is left out of it and how, and what that saves.
 
-use super::plan_savings::{compare, flipped, keeping, Saving};
+use super::plan_savings::{changed, compare, flipped, keeping, Saving, Side};
 use super::run_rig::{open_gpu, traced_raster};
 use crate::config::{EffectsConfig, RenderConfig, RigConfig};
 use crate::failure::{Failure, FailureKind};
 use crate::pipeline::{renderer_settings, PipelineError};
 use crate::render::method::{Method, SamplerKind};
 use crate::render::scene_data::{SceneData, SceneNeeds};
-use crate::render::{Keep, RenderError, RendererSettings};
+use crate::render::{Keep, RenderError};
 use crate::rig::Rig;
 use crate::scene::{Environment, Material, Scene};
 use serde::Serialize;
@@ -240,16 +240,25 @@ pub fn scene_plan(config: &RigConfig, measure: bool) -> Result<PlanReport, Failu
     let mut report = PlanReport { method: word.to_owned(), entries, together: None, warnings };
     let Some(gpu) = gpu else { return Ok(report) };
     let (own, lean) = (renderer_settings(&rig), Keep::default());
-    let pair = |without: (&RendererSettings, Keep), with: (&RendererSettings, Keep)| {
-        compare(&rig, &gpu, without, with).map_err(gpu_failure)
-    };
+    let mine = Side { scene: &rig.scene, settings: &own, keep: lean };
+    let pair = |without: Side<'_>, with: Side<'_>| compare(&rig, &gpu, without, with).map_err(gpu_failure);
     for e in &mut report.entries {
         let with_code = if e.left_out { keeping(e.feature, &method) } else { None };
-        e.saving = match (with_code, flipped(e.feature, &own)) {
-            (Some(keep), _) => Some(pair((&own, lean), (&own, keep))?),
-            (None, Some(other)) if e.left_out => Some(pair((&own, lean), (&other, lean))?.of_pictures()),
-            (None, Some(other)) => Some(pair((&other, lean), (&own, lean))?.of_pictures()),
-            (None, None) => None,
+        // What no scene of this kind can be drawn without has another scene beside it: of what it needs one without, else one with.
+        let scene = changed(e.feature, &rig.scene).filter(|_| e.needed || e.feature == "environment image");
+        e.saving = match (with_code, flipped(e.feature, &own), scene) {
+            (Some(keep), ..) => Some(pair(mine, Side { keep, ..mine })?),
+            (None, Some(other), _) => {
+                let other = Side { settings: &other, ..mine };
+                let (without, with) = if e.left_out { (mine, other) } else { (other, mine) };
+                Some(pair(without, with)?.of_pictures())
+            }
+            (None, None, Some(other)) => {
+                let other = Side { scene: &other, ..mine };
+                let (without, with) = if e.left_out { (mine, other) } else { (other, mine) };
+                Some(pair(without, with)?.of_pictures())
+            }
+            (None, None, None) => None,
         };
     }
     let all = Keep {
@@ -258,7 +267,7 @@ pub fn scene_plan(config: &RigConfig, measure: bool) -> Result<PlanReport, Failu
         every_tile: true,
         storage_tables: false,
     };
-    report.together = Some(pair((&own, lean), (&own, all))?);
+    report.together = Some(pair(mine, Side { keep: all, ..mine })?);
     let changed: Vec<&str> = (report.entries.iter())
         .filter(|e| e.saving.as_ref().is_some_and(Saving::is_wrong))
         .map(|e| e.feature)
