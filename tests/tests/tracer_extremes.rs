@@ -16,7 +16,7 @@ fn all_pass(names: &[&str]) {
         let chosen: Vec<_> =
             cases(&Ok(gpu.clone())).into_iter().filter(|c| names.contains(&c.name)).collect();
         assert_eq!(chosen.len(), names.len(), "a case has another name now");
-        report.run_cases(&chosen, None, SEED, |c| {
+        report.run_cases(&chosen, None, SEED..=SEED, |c| {
             println!("{:<28} {:?} <= {} {} {:.1} s", c.name, c.error, c.bound, c.unit, c.wall_s);
         });
         let failed: Vec<_> = report.cases.iter().filter(|c| c.verdict != CaseVerdict::Pass).collect();

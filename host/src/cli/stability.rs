@@ -15,6 +15,9 @@ pub struct StabilityArgs {
     /// Seed of the random inputs; a failing case prints the one that replays it
     #[arg(long, default_value_t = SEED)]
     seed: u64,
+    /// So many seeds in a row, for each case; the first that fails is told, else the largest error
+    #[arg(long, value_name = "N", default_value_t = 1, value_parser = clap::value_parser!(u64).range(1..=1_000_000))]
+    seeds: u64,
     /// Print one JSON object
     #[arg(long)]
     json: bool,
@@ -42,7 +45,7 @@ pub fn execute(args: &StabilityArgs) -> Result<(), Failure> {
         return Err(Failure::new(FailureKind::BadInput, message));
     }
     let mut report = StabilityReport::default();
-    report.run_cases(&all, only, args.seed, |c| {
+    report.run_cases(&all, only, args.seed..=args.seed.saturating_add(args.seeds - 1), |c| {
         if !args.json {
             print(&line(c));
         }
