@@ -313,7 +313,8 @@ fn wandering(seed: u64, [lasts, strength, damping, pull]: [f64; 4]) -> Vec<f64> 
 /// without. `cargo test -p dpm-host --lib bodies_that_do_not_repeat -- --nocapture` prints the table of `docs/LATENCY.md`.
 #[test]
 fn bodies_that_do_not_repeat_themselves_are_no_worse_off() {
-    let cases: [(&str, &dyn Fn(u64) -> Vec<f64>); 5] = [
+    type Draw = dyn Fn(u64) -> Vec<f64>;
+    let cases: [(&str, &Draw); 5] = [
         ("to and fro, each turn anywhere within 0.15 m", &|seed| turns(seed, 1.0)),
         ("to and fro, every other turn elsewhere", &|seed| turns(seed, 0.5)),
         ("start and stop at the same places, at rest for 0.1 to 0.5 s", &rests),
