@@ -6,6 +6,7 @@
 pub mod dlpc900;
 pub mod faults;
 pub mod motion;
+mod motion_spec;
 pub mod natnet_host;
 pub mod natnet_server;
 pub mod projector;

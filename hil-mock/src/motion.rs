@@ -4,121 +4,8 @@
 //! floating point: a body is as exactly placed after 400 days as in the first second.
 
 use dpm_device::pose::Pose;
-use serde::{Deserialize, Serialize};
 
-/// A motion as the rig file writes it (`{ kind = "translate", speed_m_s = 1.0 }`). World axes, relative to the rest pose.
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
-#[serde(tag = "kind", rename_all = "kebab-case", deny_unknown_fields)]
-pub enum MotionSpec {
-    /// The body stays at its rest pose.
-    Still,
-    /// Back and forth on a line: stretches of constant speed joined by turns of constant acceleration. At time 0 the body is at
-    /// rest position and moves at full speed in `direction`.
-    Translate {
-        /// Any non-zero vector; its length does not matter. Default: to the left, -x.
-        #[serde(default = "left")]
-        direction: [f64; 3],
-        /// Speed on the stretches, metres per second, above 0. Default 1.
-        #[serde(default = "one")]
-        speed_m_s: f64,
-        /// Largest distance from the rest position, metres; at least `speed^2 / (2 acceleration)`. Default 0.15.
-        #[serde(default = "amplitude")]
-        amplitude_m: f64,
-        /// Acceleration in the turns, m/s^2, above 0. Default 20.
-        #[serde(default = "acceleration")]
-        acceleration_m_s2: f64,
-        /// Time at rest in the middle of each turn, seconds, 0 or more. Default 0.
-        #[serde(default)]
-        rest_s: f64,
-    },
-    /// `amplitude * sin(w t)` along `direction`, given by its peaks: amplitude = speed^2 / acceleration, w = acceleration / speed.
-    Sinusoid {
-        /// Any non-zero vector. Default: to the left, -x.
-        #[serde(default = "left")]
-        direction: [f64; 3],
-        /// Speed when passing the rest position, metres per second, above 0.
-        peak_speed_m_s: f64,
-        /// Acceleration at the turning points, m/s^2, above 0.
-        peak_acceleration_m_s2: f64,
-    },
-    /// Steady rotation about an axis.
-    Rotate {
-        /// Any non-zero vector, right-handed. Default: +y.
-        #[serde(default = "up")]
-        axis: [f64; 3],
-        /// Radians per second; negative turns the other way, 0 does not turn. Default 1 turn in 2 s.
-        #[serde(default = "half_turn")]
-        rate_rad_s: f64,
-        /// A point of the axis, metres from the rest position. Default 0: in place.
-        #[serde(default)]
-        pivot_offset_m: [f64; 3],
-    },
-    /// Rotation to and fro about an axis through the body's origin: `amplitude * sin(w t)`, by its peaks as in `Sinusoid`.
-    Sway {
-        /// Any non-zero vector, right-handed. Default: +y.
-        #[serde(default = "up")]
-        axis: [f64; 3],
-        /// Angular speed when passing the rest orientation, rad/s, above 0.
-        peak_rate_rad_s: f64,
-        /// Angular acceleration at the turning points, rad/s^2, above 0.
-        peak_acceleration_rad_s2: f64,
-    },
-    /// Rotation about an axis through the body's origin while going back and forth along it.
-    Screw {
-        /// Any non-zero vector, right-handed.
-        axis: [f64; 3],
-        /// Radians per second.
-        rate_rad_s: f64,
-        /// Speed along the axis, as in `Translate`.
-        speed_m_s: f64,
-        /// As in `Translate`. Default 0.15.
-        #[serde(default = "amplitude")]
-        amplitude_m: f64,
-        /// As in `Translate`. Default 20.
-        #[serde(default = "acceleration")]
-        acceleration_m_s2: f64,
-    },
-    /// Several motions applied to the rest pose one after the other, first to last (at most [`MotionSpec::MAX_PARTS`]).
-    Together {
-        /// The motions; none may be `together` itself.
-        parts: Vec<MotionSpec>,
-    },
-}
-
-fn left() -> [f64; 3] {
-    [-1.0, 0.0, 0.0]
-}
-fn up() -> [f64; 3] {
-    [0.0, 1.0, 0.0]
-}
-fn one() -> f64 {
-    1.0
-}
-fn amplitude() -> f64 {
-    0.15
-}
-fn acceleration() -> f64 {
-    20.0
-}
-fn half_turn() -> f64 {
-    core::f64::consts::PI
-}
-
-impl MotionSpec {
-    /// Most parts of [`MotionSpec::Together`].
-    pub const MAX_PARTS: usize = 8;
-
-    /// The motion of the paper's experiment: 1 m/s to the left and back, all other values default.
-    pub fn paper_translation() -> Self {
-        Self::Translate {
-            direction: left(),
-            speed_m_s: one(),
-            amplitude_m: amplitude(),
-            acceleration_m_s2: acceleration(),
-            rest_s: 0.0,
-        }
-    }
-}
+pub use crate::motion_spec::{MotionKind, MotionSpec};
 
 /// Why a [`MotionSpec`] describes no motion.
 #[derive(Clone, Debug, PartialEq, thiserror::Error)]
@@ -224,7 +111,7 @@ impl Motion {
 
     /// A body that stays where it is. Panics never: an invalid pose is returned as the error.
     pub fn still(rest: Pose) -> Result<Self, MotionError> {
-        Self::new(&MotionSpec::Still, rest)
+        Self::new(&MotionSpec::Still {}, rest)
     }
 
     /// The pose that the motion is relative to.
@@ -257,7 +144,7 @@ impl Motion {
 
 fn add_part(spec: &MotionSpec, rest: &Pose, parts: &mut Vec<Part>) -> Result<(), MotionError> {
     match *spec {
-        MotionSpec::Still => {}
+        MotionSpec::Still {} => {}
         MotionSpec::Translate { direction, speed_m_s, amplitude_m, acceleration_m_s2, rest_s } => {
             parts.push(line(direction, speed_m_s, amplitude_m, acceleration_m_s2, rest_s, "direction")?);
         }

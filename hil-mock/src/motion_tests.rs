@@ -29,7 +29,7 @@ fn all_kinds() -> Vec<MotionSpec> {
     let together =
         MotionSpec::Together { parts: vec![rotate(2.0), sinusoid.clone(), sway.clone(), rotate(-7.0)] };
     vec![
-        MotionSpec::Still,
+        MotionSpec::Still {},
         MotionSpec::paper_translation(),
         sinusoid,
         rotate(3.0),
@@ -171,10 +171,10 @@ fn nonsense_is_named() {
     assert!(bad(&rotate([0.0, 1.0, 0.0], 1e-9)).contains("cycle"));
     assert!(bad(&MotionSpec::Together { parts: vec![] }).contains("parts"));
     let nested =
-        MotionSpec::Together { parts: vec![MotionSpec::Together { parts: vec![MotionSpec::Still] }] };
+        MotionSpec::Together { parts: vec![MotionSpec::Together { parts: vec![MotionSpec::Still {}] }] };
     assert!(bad(&nested).contains("parts"));
     let crooked = Pose { rotation_xyzw: [0.0, 0.0, 0.0, 2.0], ..Pose::IDENTITY };
-    assert!(Motion::new(&MotionSpec::Still, crooked).is_err());
+    assert!(Motion::new(&MotionSpec::Still {}, crooked).is_err());
 }
 
 /// 0.5 m/s and 5 m/s^2 within 0.15 m of the centre, at rest for 0.3 s at either end: stretches of 0.4 s, braking of 0.1 s.

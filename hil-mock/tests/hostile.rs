@@ -13,7 +13,7 @@ use proptest::prelude::*;
 use std::net::{Ipv4Addr, SocketAddrV4};
 
 fn source() -> SampleSource {
-    let motion = Motion::new(&MotionSpec::Still, Pose::IDENTITY).unwrap();
+    let motion = Motion::new(&MotionSpec::Still {}, Pose::IDENTITY).unwrap();
     SampleSource::new(MockTrackerConfig::default(), vec![motion]).unwrap()
 }
 

@@ -467,7 +467,7 @@ fn rates_may_change_under_way() {
         };
         let motions = vec![
             Motion::new(&MotionSpec::paper_translation(), Pose::IDENTITY).unwrap(),
-            Motion::new(&MotionSpec::Still, Pose::IDENTITY).unwrap(),
+            Motion::new(&MotionSpec::Still {}, Pose::IDENTITY).unwrap(),
         ];
         let mut server = NatNetServerConfig::new(&["Hare", "Bust"]);
         server.streaming = Streaming::Unicast(UnicastTo::CommandSocket);

@@ -23,7 +23,7 @@ fn clock() -> Arc<dyn HostClock> {
 fn device(faults: &str) -> SerialPoseDevice {
     let motions = vec![
         Motion::new(&MotionSpec::paper_translation(), Pose::IDENTITY).unwrap(),
-        Motion::new(&MotionSpec::Still, Pose::IDENTITY).unwrap(),
+        Motion::new(&MotionSpec::Still {}, Pose::IDENTITY).unwrap(),
     ];
     let config = MockTrackerConfig { faults: faults.parse().unwrap(), latency_ns: MS, ..Default::default() };
     SerialPoseDevice::new(SampleSource::new(config, motions).unwrap()).unwrap()
@@ -155,7 +155,7 @@ fn a_device_on_a_full_line_can_be_stopped() {
         rate: dpm_device::time::FrameRate::new(10_000, 1).unwrap(),
         ..Default::default()
     };
-    let still = vec![Motion::new(&MotionSpec::Still, Pose::IDENTITY).unwrap(); 32];
+    let still = vec![Motion::new(&MotionSpec::Still {}, Pose::IDENTITY).unwrap(); 32];
     let device = SerialPoseDevice::new(SampleSource::new(fast, still).unwrap()).unwrap();
     let host = SerialPoseHost::start(device, ours, clock()).unwrap();
     // 10,000 times 32 packets a second: a line of some thousand bytes is full at once.

@@ -26,7 +26,7 @@ fn source(faults: &str) -> SampleSource {
     let rest = Pose { position_m: [0.1, 0.2, 1.5], ..Pose::IDENTITY };
     let motions = vec![
         Motion::new(&MotionSpec::paper_translation(), rest).unwrap(),
-        Motion::new(&MotionSpec::Still, rest).unwrap(),
+        Motion::new(&MotionSpec::Still {}, rest).unwrap(),
     ];
     let config = MockTrackerConfig { faults: faults.parse().unwrap(), latency_ns: MS, ..Default::default() };
     SampleSource::new(config, motions).unwrap()

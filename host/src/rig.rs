@@ -319,7 +319,7 @@ fn default_motion(index: usize) -> MotionSpec {
             rate_rad_s: std::f64::consts::PI,
             pivot_offset_m: [0.0; 3],
         },
-        _ => MotionSpec::Still,
+        _ => MotionSpec::Still {},
     }
 }
 

@@ -24,6 +24,7 @@ pub use source::VARIABLE_PREFIX;
 pub use world::*;
 
 use declare::section;
+use hil_mock::motion::MotionSpec;
 use read::{Any, ConfigValue, Reader};
 use std::path::Path;
 
@@ -174,6 +175,9 @@ impl RigConfig {
         for key in Self::key_docs() {
             let (table, name) = key.key.rsplit_once('.').unwrap_or(("", &key.key));
             if table != section {
+                if section == "scene.bodies[]" {
+                    out += &motions();
+                }
                 section = table.to_string();
                 out += &format!(
                     "\n## {}\n\n| key | type | default | allowed | what it does |\n|---|---|---|---|---|\n",
@@ -203,6 +207,26 @@ A rig file is TOML. What it leaves out has the default. Over the file come envir
 `--set projector.width=640`, which may stand several times; a number steps into a list (`--set scene.bodies.0.node=Hare`).
 All mistakes of a file are reported at once, each with line and column. Paths in a rig file are relative to its folder.
 ";
+
+/// The manual's table of what `scene.bodies[].motion` may hold.
+fn motions() -> String {
+    let mut out =
+        "\n## `motion` of `[[scene.bodies]]`\n\n| `kind` | key | type | what it does |\n|---|---|---|---|\n"
+            .to_string();
+    let text = |lines: &[&str]| lines.iter().map(|l| l.trim()).collect::<Vec<_>>().join(" ");
+    for kind in MotionSpec::KINDS {
+        out += &format!("| `{}` | | | {} |\n", kind.name, text(kind.doc));
+        for (key, ty, doc) in kind.keys {
+            let ty = match *ty {
+                "f64" => f64::kind(),
+                "[f64; 3]" => <[f64; 3]>::kind(),
+                _ => "a list of motions".to_string(),
+            };
+            out += &format!("| | `{key}` | {ty} | {} |\n", text(doc));
+        }
+    }
+    out
+}
 
 /// `projector.backend(usb)` into `[projector.backend]` with `kind = "usb"`; `scene.bodies[]` into `[[scene.bodies]]`.
 fn heading(table: &str) -> String {

@@ -116,6 +116,13 @@ const BAD: &[(&str, usize, usize, &str, &str)] = &[
         "scene.bodies.0.motion",
         "unknown variant `fly`",
     ),
+    (
+        "[[scene.bodies]]\nname = \"a\"\nmotion = { kind = \"still\", speed_m_s = 1 }",
+        3,
+        28,
+        "scene.bodies.0.motion.speed_m_s",
+        "unknown field",
+    ),
     ("[[scene.bodies]]\nname = \"a\"\nmotion = { speed_m_s = 1 }", 3, 10, "scene.bodies.0.motion", "kind"),
     ("[[scene.bodies]]\nname = \"a\"\nmotion = \"still\"", 3, 10, "scene.bodies.0.motion", "must be a table"),
     (

@@ -245,9 +245,8 @@ section! {
         id: Option<i64> = None, "", Within(0, i64::from(i32::MAX));
         /// glTF node that it moves, with everything below; the body's name when left out.
         node: Option<String> = None, "", NotEmpty;
-        /// How it moves when the tracker is the mock: `kind` is `still`, `translate`, `sinusoid`, `rotate`, `sway`, `screw` or
-        /// `together`, for example `{ kind = "translate", speed_m_s = 1.0 }`. Left out, the first body goes to and fro at 1 m/s,
-        /// the second turns in place and others stand still.
+        /// How it moves when the tracker is the mock, for example `{ kind = "translate", speed_m_s = 1.0 }`; the kinds stand below.
+        /// Left out, the first body goes to and fro at 1 m/s, the second turns in place and others stand still.
         motion: MotionValue = MotionValue::default(), "", Any;
     }
 }

@@ -180,7 +180,7 @@ pub fn prediction_cases() -> Vec<PredictionCase> {
     };
     let up = [0.0, 1.0, 0.0];
     vec![
-        case("at rest", MotionSpec::Still, 0.15, 1e-6),
+        case("at rest", MotionSpec::Still {}, 0.15, 1e-6),
         case("1 m/s, steady", shuttle(1.0, 20.0, 25.0), 0.15, 1e-4),
         case("0.5 m/s there and back, 5 m/s2, 0.1 m", shuttle(0.5, 5.0, 0.05), 0.20, 0.04),
         case("0.5 m/s there and back, 5 m/s2, 0.3 m", shuttle(0.5, 5.0, 0.15), 0.20, 0.02),

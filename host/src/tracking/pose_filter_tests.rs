@@ -382,7 +382,7 @@ fn jitter_and_misplacement() {
     let (noisy, quiet) = (EvaluationConfig::with_noise(1e-4, 1e-3), EvaluationConfig::with_noise(0.0, 0.0));
     let filter = PoseFilterConfig::default();
     let input_rms = 3f64.sqrt() * 1e-4;
-    let still = evaluate(&MotionSpec::Still, filter, &noisy).unwrap();
+    let still = evaluate(&MotionSpec::Still {}, filter, &noisy).unwrap();
     assert!(still.position_m.rms < 0.5 * input_rms, "{:?}", still.position_m);
     let swing =
         MotionSpec::Sinusoid { direction: [1.0, 0.0, 0.0], peak_speed_m_s: 0.5, peak_acceleration_m_s2: 5.0 };

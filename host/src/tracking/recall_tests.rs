@@ -115,7 +115,7 @@ fn bodies_at_rest_in_steady_motion_or_with_a_long_period_are_left_alone() {
         rest_s: 0.0,
     };
     // 0.5 m/s over 1.5 m: a period of 6.2 s, of which five are kept.
-    for spec in [MotionSpec::Still, steady, shuttle(0.75, 0.0)] {
+    for spec in [MotionSpec::Still {}, steady, shuttle(0.75, 0.0)] {
         let mut body = Follower::new(&spec);
         for i in 0..7000 {
             body.see(i * STEP_NS);

@@ -124,7 +124,7 @@ mod tests {
     fn the_mock_has_the_rigs_rate_and_latency_and_loses_what_it_was_told_to() {
         let keys = "[tracker]\nrate_hz = 250\nlatency_us = 3000\n";
         let count = |more: &str| {
-            let motion = Motion::new(&MotionSpec::Still, dpm_device::pose::Pose::IDENTITY).expect("still");
+            let motion = Motion::new(&MotionSpec::Still {}, dpm_device::pose::Pose::IDENTITY).expect("still");
             let mut tracker =
                 open(&config(&format!("{keys}{more}")), bodies(), vec![motion], clock(), HostTime(0))
                     .expect("opens");
