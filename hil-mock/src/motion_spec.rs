@@ -160,6 +160,12 @@ impl MotionSpec {
     /// Most parts of [`MotionSpec::Together`].
     pub const MAX_PARTS: usize = 8;
 
+    /// Along x and back without a rest, as in `translate`: m/s, m, m/s^2.
+    pub fn shuttle(speed_m_s: f64, amplitude_m: f64, acceleration_m_s2: f64) -> Self {
+        let direction = [1.0, 0.0, 0.0];
+        Self::Translate { direction, speed_m_s, amplitude_m, acceleration_m_s2, rest_s: 0.0 }
+    }
+
     /// The motion of the paper's experiment: 1 m/s to the left and back, all other values default.
     pub fn paper_translation() -> Self {
         Self::Translate {

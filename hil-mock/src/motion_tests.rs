@@ -153,13 +153,7 @@ fn motions_repeat_and_stay_rigid_at_the_ends_of_time() {
 #[test]
 fn nonsense_is_named() {
     let bad = |spec: &MotionSpec| Motion::new(spec, Pose::IDENTITY).unwrap_err().to_string();
-    let translate = |speed_m_s, amplitude_m, acceleration_m_s2| MotionSpec::Translate {
-        direction: [1.0, 0.0, 0.0],
-        speed_m_s,
-        amplitude_m,
-        acceleration_m_s2,
-        rest_s: 0.0,
-    };
+    let translate = MotionSpec::shuttle;
     assert!(bad(&translate(f64::NAN, 1.0, 1.0)).contains("speed_m_s"));
     assert!(bad(&translate(1.0, -1.0, 1.0)).contains("amplitude_m"));
     assert!(bad(&translate(1.0, 1.0, f64::INFINITY)).contains("acceleration_m_s2"));

@@ -129,16 +129,7 @@ fn quantile_mm(errors: &mut [f64], q: f64) -> f64 {
 fn main() -> Result<(), Box<dyn std::error::Error>> {
     println!("path    predictor         p50      p99    above 0.25 mm");
     for amplitude in [0.15, 0.5] {
-        let motion = Motion::new(
-            &MotionSpec::Translate {
-                direction: [1.0, 0.0, 0.0],
-                speed_m_s: SPEED,
-                amplitude_m: amplitude,
-                acceleration_m_s2: ACCELERATION,
-                rest_s: 0.0,
-            },
-            Pose::IDENTITY,
-        )?;
+        let motion = Motion::new(&MotionSpec::shuttle(SPEED, amplitude, ACCELERATION), Pose::IDENTITY)?;
         let turn = 2.0 * SPEED / ACCELERATION;
         let stretch = (2.0 * amplitude - SPEED * SPEED / ACCELERATION) / SPEED;
         let config = MockTrackerConfig { position_noise_m: NOISE, ..MockTrackerConfig::default() };

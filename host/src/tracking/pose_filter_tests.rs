@@ -389,13 +389,7 @@ fn jitter_and_misplacement() {
     let swinging = evaluate(&swing, filter, &noisy).unwrap();
     assert!(swinging.position_m.p99 < 0.25e-3, "{:?}", swinging.position_m);
     // A stretch of 4 s at 1 m/s: no turn within the frames compared.
-    let coast = MotionSpec::Translate {
-        direction: [1.0, 0.0, 0.0],
-        speed_m_s: 1.0,
-        amplitude_m: 4.0,
-        acceleration_m_s2: 20.0,
-        rest_s: 0.0,
-    };
+    let coast = MotionSpec::shuttle(1.0, 4.0, 20.0);
     let rig = EvaluationConfig { frames: 3 * 947, ..quiet };
     let coasting = evaluate(&coast, filter, &rig).unwrap();
     assert!(coasting.position_m.max < 0.02e-3, "{:?}", coasting.position_m);

@@ -107,13 +107,7 @@ fn what_is_recalled_is_what_happens() {
 
 #[test]
 fn bodies_at_rest_in_steady_motion_or_with_a_long_period_are_left_alone() {
-    let steady = MotionSpec::Translate {
-        direction: [1.0, 0.0, 0.0],
-        speed_m_s: 1.0,
-        amplitude_m: 100.0,
-        acceleration_m_s2: 20.0,
-        rest_s: 0.0,
-    };
+    let steady = MotionSpec::shuttle(1.0, 100.0, 20.0);
     // 0.5 m/s over 1.5 m: a period of 6.2 s, of which five are kept.
     for spec in [MotionSpec::Still {}, steady, shuttle(0.75, 0.0)] {
         let mut body = Follower::new(&spec);
