@@ -76,6 +76,30 @@ fn a_gpu_too_slow_for_its_slots_shows_late_frames_not_none() {
     assert!(trace.contains(r#""name":"trace","cat":"gpu""#), "the GPU's passes lie in its slices");
 }
 
+/// A tracker that is not there leaves the rig dark, not the operator.
+#[test]
+fn bodies_that_were_never_seen_are_named_with_the_trackers_word_on_why() {
+    let folder = Folder::new("unseen");
+    let bodies = "[[scene.bodies]]\nname = \"bunny\"\n[[scene.bodies]]\nname = \"venus\"\n";
+    for (tracker, told) in
+        [("kind = \"mock\"", false), ("kind = \"serial\"\nport = \"/dev/nonexistent\"", true)]
+    {
+        let rig = folder.write("rig.toml", &format!("[tracker]\n{tracker}\n{bodies}"));
+        let args = ["profile", &rig, "--no-render", "--seconds", "1", "--raster", "64x48", "--json"];
+        let output = dpm(&[&args[..], &["--out", folder.text()]].concat(), &NO_DRIVER);
+        assert_eq!(code(&output), 0, "{}", err(&output));
+        let json: serde_json::Value = serde_json::from_str(&out(&output)).expect("one JSON object");
+        let warnings = json["warnings"].as_array().expect("warnings");
+        let unseen = warnings.iter().filter_map(|w| w.as_str()).find(|w| w.contains("never saw"));
+        assert_eq!(unseen.is_some(), told, "{tracker}: {warnings:?}");
+        let text = unseen.unwrap_or_default();
+        assert!(
+            !told || text.contains("\"bunny\", \"venus\"") && text.contains("/dev/nonexistent"),
+            "{text}"
+        );
+    }
+}
+
 #[test]
 fn what_is_no_profile_is_refused_with_its_name() {
     let folder = Folder::new("noprofile");

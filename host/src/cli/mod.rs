@@ -29,11 +29,14 @@ use std::process::ExitCode;
 
 /// Rig controller for path-traced dynamic projection mapping.
 #[derive(Debug, Parser)]
-#[command(name = "dpm", version, about, after_help = AFTER_HELP)]
+#[command(name = "dpm", version, about = ABOUT, after_help = AFTER_HELP)]
 struct Cli {
     #[command(subcommand)]
     command: Command,
 }
+
+const ABOUT: &str =
+    "Lights moving objects: from a tracker's samples through path tracing to a projector's bit planes.";
 
 const AFTER_HELP: &str = "Exit codes: 0 ok, 1 a check failed, 2 usage or bad input, 3 device, 4 no GPU.
 Every key of the rig file can be set by --set a.b=c or by the environment variable DPM_SET_A__B=c.";

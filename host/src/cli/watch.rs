@@ -116,10 +116,11 @@ pub fn print(text: &str) {
 /// # Errors
 /// Another instance has one of them.
 pub(super) fn take_locks(rig: &RigConfig) -> Result<Vec<InstanceLock>, Failure> {
-    let failure = |e: LockError| {
-        let kind =
-            if matches!(e, LockError::Held { .. }) { FailureKind::Device } else { FailureKind::BadInput };
-        Failure::new(kind, e)
+    let or = |advice: &'static str| {
+        move |e: LockError| match e {
+            LockError::Held { .. } => Failure::new(FailureKind::Device, e),
+            LockError::Io { .. } => Failure::new(FailureKind::BadInput, format!("{e}; {advice}")),
+        }
     };
     let mut locks = Vec::new();
     let serial = |s: &Option<String>| s.clone().unwrap_or_else(|| "any".into());
@@ -136,14 +137,16 @@ pub(super) fn take_locks(rig: &RigConfig) -> Result<Vec<InstanceLock>, Failure> 
     };
     if let Some(what) = device {
         let name: String = what.chars().map(|c| if c.is_ascii_alphanumeric() { c } else { '-' }).collect();
-        locks.push(
-            InstanceLock::take(&runtime_folder().join(format!("{name}.lock")), &what).map_err(failure)?,
-        );
+        let path = runtime_folder().join(format!("{name}.lock"));
+        locks.push(InstanceLock::take(&path, &what).map_err(or("name another folder by DPM_RUNTIME_DIR"))?);
     }
     let OutputConfig { dir, images, trace, .. } = &rig.output;
     if *images || *trace {
         let what = format!("output folder {}", dir.display());
-        locks.push(InstanceLock::take(&dir.join(".dpm.lock"), &what).map_err(failure)?);
+        locks.push(
+            InstanceLock::take(&dir.join(".dpm.lock"), &what)
+                .map_err(or("choose another folder with --out"))?,
+        );
     }
     Ok(locks)
 }

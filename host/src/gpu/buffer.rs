@@ -85,7 +85,7 @@ impl Buffer {
     fn check_texels(gpu: &Arc<Gpu>, what: &str, texels: usize) -> Result<(), GpuError> {
         let limit = gpu.max_texel_elements();
         if texels as u64 > limit {
-            return Err(GpuError::Limit { what: what.to_owned(), needed: texels as u64, limit });
+            return Err(GpuError::Limit { what: format!("{what} (texels)"), needed: texels as u64, limit });
         }
         Ok(())
     }

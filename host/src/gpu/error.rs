@@ -35,7 +35,9 @@ pub enum GpuError {
         heap_mib: u64,
     },
     /// A limit of the device is too small.
-    #[error("{what}: {needed} is beyond this device's limit of {limit}")]
+    #[error(
+        "{what}: {needed} is beyond this device's limit of {limit}; use a smaller scene or a smaller raster"
+    )]
     Limit {
         /// What is too large.
         what: String,

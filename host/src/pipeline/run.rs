@@ -11,7 +11,8 @@ use super::projector;
 use super::rights::Rights;
 use super::stages::{self, TrackingStage};
 use super::threads::{
-    policy, run_threads, Shared, Stages, FIRST_FRAME_TIMEOUT_NS, LISTEN_NS, RECEIPT_NS, STAGE_THREADS,
+    policy, run_threads, Leavings, Shared, Stages, FIRST_FRAME_TIMEOUT_NS, LISTEN_NS, RECEIPT_NS,
+    STAGE_THREADS,
 };
 use crate::clock::{Clock, ManualClock, MonotonicClock, RunClock, Stopwatch};
 use crate::config::{Pace, Packer, ProjectorBackend, RenderMethod};
@@ -109,72 +110,76 @@ fn run_from(
         RunClock::Virtual(_) => None,
     };
     let watch = Stopwatch::start();
-    let (mut collector, recorder, carried) = std::thread::scope(|scope| -> Result<_, PipelineError> {
-        let (mut cable, device, seen) = match far {
-            Far::Outside(medium, lights) => (Cable::Outside(medium), None, Some(lights)),
-            Far::Mock(mock, recorder) if is_virtual => {
-                (Cable::Direct(Box::new(Direct::new(*mock)), recorder), None, None)
+    let (mut collector, recorder, carried, unseen) =
+        std::thread::scope(|scope| -> Result<_, PipelineError> {
+            let (mut cable, device, seen) = match far {
+                Far::Outside(medium, lights) => (Cable::Outside(medium), None, Some(lights)),
+                Far::Mock(mock, recorder) if is_virtual => {
+                    (Cable::Direct(Box::new(Direct::new(*mock)), recorder), None, None)
+                }
+                Far::Mock(mock, recorder) => {
+                    let frame_bytes =
+                        projector::frame_bytes(rig.camera.raster, config.projector.schedule().len());
+                    let (host_end, device_end) = threaded(frame_bytes, CABLE_BUFFERS, policy(&rig));
+                    let (clock, rights) = (&clock, &rights);
+                    let thread = std::thread::Builder::new()
+                        .name("dpm-mock".into())
+                        .spawn_scoped(scope, move || {
+                            device_thread(device_end, *mock, recorder, clock, rights)
+                        })
+                        .map_err(|source| PipelineError::Thread { stage: "mock projector", source })?;
+                    (Cable::Threaded(host_end), Some(thread), None)
+                }
+            };
+            let acknowledged =
+                if config.safety.acknowledge_faults { u32::MAX } else { ENDED_WITH_THE_LAST_RUN };
+            let time = connect(&mut link, cable.transport(), acknowledged, &mut || {
+                clock.wait_until(clock.now().plus_ns(if is_virtual { 50_000 } else { 200_000 }))
+            })?;
+            let lead = lead_estimator(&rig, &link);
+            let shared = Shared {
+                rig: rig.clone(),
+                clock: &clock,
+                time,
+                listen_to: AtomicI64::new(0),
+                tracking: OnceLock::new(),
+                lead_ns: AtomicI64::new(lead.lead_ns()),
+                typical_ns: AtomicI64::new(lead.typical_ns()),
+                travel_ns: AtomicI64::new(0),
+                budget_milli: AtomicU64::new(u64::from(config.render.spp) * 1000),
+                planning: AtomicU64::new(0),
+                tracking_over: AtomicBool::new(false),
+                error: Mutex::new(None),
+                monitor,
+                options,
+                rights: &rights,
+            };
+            // At virtual pace pictures must not depend on how fast the machine is.
+            let adapts = !is_virtual && renderer.is_some() && config.render.method == RenderMethod::Dpm;
+            let stages = Stages {
+                tracking: TrackingStage::new(&rig, tracker),
+                renderer: renderer.as_mut(),
+                prepared,
+                kernel: Kernel::best(),
+                budget: if adapts { budget_controller(&rig) } else { None },
+                link,
+                cable,
+                lead,
+                memory,
+                seen,
+                lights,
+            };
+            let mut collector = Collector::new(rig.clone(), options.keep_frames, options.verify);
+            let Leavings { recorder, carried, unseen } = run_threads(&shared, stages, &mut collector)?;
+            let recorder = match device {
+                Some(thread) => Some(thread.join().map_err(|_| PipelineError::Panicked("mock projector"))?),
+                None => recorder,
+            };
+            match shared.error.into_inner().ok().flatten() {
+                Some(e) => Err(e),
+                None => Ok((collector, recorder, carried, unseen)),
             }
-            Far::Mock(mock, recorder) => {
-                let frame_bytes =
-                    projector::frame_bytes(rig.camera.raster, config.projector.schedule().len());
-                let (host_end, device_end) = threaded(frame_bytes, CABLE_BUFFERS, policy(&rig));
-                let (clock, rights) = (&clock, &rights);
-                let thread = std::thread::Builder::new()
-                    .name("dpm-mock".into())
-                    .spawn_scoped(scope, move || device_thread(device_end, *mock, recorder, clock, rights))
-                    .map_err(|source| PipelineError::Thread { stage: "mock projector", source })?;
-                (Cable::Threaded(host_end), Some(thread), None)
-            }
-        };
-        let acknowledged = if config.safety.acknowledge_faults { u32::MAX } else { ENDED_WITH_THE_LAST_RUN };
-        let time = connect(&mut link, cable.transport(), acknowledged, &mut || {
-            clock.wait_until(clock.now().plus_ns(if is_virtual { 50_000 } else { 200_000 }))
         })?;
-        let lead = lead_estimator(&rig, &link);
-        let shared = Shared {
-            rig: rig.clone(),
-            clock: &clock,
-            time,
-            listen_to: AtomicI64::new(0),
-            tracking: OnceLock::new(),
-            lead_ns: AtomicI64::new(lead.lead_ns()),
-            typical_ns: AtomicI64::new(lead.typical_ns()),
-            travel_ns: AtomicI64::new(0),
-            budget_milli: AtomicU64::new(u64::from(config.render.spp) * 1000),
-            planning: AtomicU64::new(0),
-            tracking_over: AtomicBool::new(false),
-            error: Mutex::new(None),
-            monitor,
-            options,
-            rights: &rights,
-        };
-        // At virtual pace pictures must not depend on how fast the machine is.
-        let adapts = !is_virtual && renderer.is_some() && config.render.method == RenderMethod::Dpm;
-        let stages = Stages {
-            tracking: TrackingStage::new(&rig, tracker),
-            renderer: renderer.as_mut(),
-            prepared,
-            kernel: Kernel::best(),
-            budget: if adapts { budget_controller(&rig) } else { None },
-            link,
-            cable,
-            lead,
-            memory,
-            seen,
-            lights,
-        };
-        let mut collector = Collector::new(rig.clone(), options.keep_frames, options.verify);
-        let (recorder, carried) = run_threads(&shared, stages, &mut collector)?;
-        let recorder = match device {
-            Some(thread) => Some(thread.join().map_err(|_| PipelineError::Panicked("mock projector"))?),
-            None => recorder,
-        };
-        match shared.error.into_inner().ok().flatten() {
-            Some(e) => Err(e),
-            None => Ok((collector, recorder, carried)),
-        }
-    })?;
     let wall_s = watch.elapsed_ns() as f64 * 1e-9;
     let standstills = standstill.map(StandstillMonitor::finish).unwrap_or_default();
 
@@ -194,6 +199,7 @@ fn run_from(
     };
     collector.fill(&mut report);
     report.frames_per_wall_second = report.frames_lit as f64 / wall_s.max(1e-9);
+    report.warnings.extend(unseen);
     report.warnings.extend(warnings);
     report.warnings.extend(rights.warnings());
     report.warnings.extend(rig.scene.warnings.iter().cloned());

@@ -75,9 +75,16 @@ impl TrackingStage {
         result.map(|_| ())
     }
 
-    /// Counters of filters and tracker in words.
-    pub fn status(&self) -> String {
-        self.tracker.status()
+    /// The bodies that were never seen, which stay dark, and the tracker's word on why; `None` when all of them were.
+    pub fn never_seen(&self, rig: &Rig) -> Option<String> {
+        let unseen = |i: usize| self.bank.state(BodyIndex(i as u16)).is_none();
+        let all = rig.bodies.iter().enumerate().take(self.bodies);
+        let names: Vec<_> =
+            all.filter(|(i, _)| unseen(*i)).map(|(_, body)| format!("{:?}", body.name)).collect();
+        let (tracker, status) = (self.tracker.name(), self.tracker.status());
+        (!names.is_empty()).then(|| {
+            format!("the {tracker} tracker never saw {}, so no light fell there: {status}", names.join(", "))
+        })
     }
 }
 

@@ -153,13 +153,22 @@ pub(super) struct Stages<'a> {
     pub(super) lights: Receiver<LightNote>,
 }
 
-/// Starts the stages, waits for all of them, and returns the recorder of a projector without a thread of its own, and what was
-/// carried.
+/// What the stages leave behind.
+pub(super) struct Leavings {
+    /// The recorder of a projector without a thread of its own.
+    pub(super) recorder: Option<LightRecorder>,
+    /// What was carried.
+    pub(super) carried: ProjectorReport,
+    /// Bodies that were never seen, and why.
+    pub(super) unseen: Option<String>,
+}
+
+/// Starts the stages and waits for all of them.
 pub(super) fn run_threads(
     shared: &Shared<'_>,
     stages: Stages<'_>,
     collector: &mut Collector,
-) -> Result<(Option<LightRecorder>, ProjectorReport), PipelineError> {
+) -> Result<Leavings, PipelineError> {
     let Stages { tracking, renderer, prepared, kernel, budget, link, cable, lead, memory, seen, lights } =
         stages;
     let policy = policy(&shared.rig);
@@ -206,13 +215,18 @@ pub(super) fn run_threads(
             })
             .map_err(refused("link"))?;
         collector.run(done_out, notes_in, lights, shared.monitor);
-        let recorder = link.join();
-        for (name, thread) in [("pack", pack), ("plan", plan), ("tracking", tracking)] {
+        let link = link.join();
+        for (name, thread) in [("pack", pack), ("plan", plan)] {
             if thread.join().is_err() {
                 shared.fail(PipelineError::Panicked(name));
             }
         }
-        recorder.map_err(|_| PipelineError::Panicked("link"))
+        let unseen = tracking.join().unwrap_or_else(|_| {
+            shared.fail(PipelineError::Panicked("tracking"));
+            None
+        });
+        let (recorder, carried) = link.map_err(|_| PipelineError::Panicked("link"))?;
+        Ok(Leavings { recorder, carried, unseen })
     })
 }
 
@@ -225,7 +239,12 @@ impl<F: FnMut()> Drop for OnExit<F> {
     }
 }
 
-fn tracking_thread(shared: &Shared<'_>, mut stage: TrackingStage, mut latest: Publisher<TrackSnapshot>) {
+/// Returns what is wrong with the tracker at the end.
+fn tracking_thread(
+    shared: &Shared<'_>,
+    mut stage: TrackingStage,
+    mut latest: Publisher<TrackSnapshot>,
+) -> Option<String> {
     shared.rights.enter(0);
     let _ = shared.tracking.set(std::thread::current());
     let mut heard_to = i64::MIN;
@@ -252,13 +271,14 @@ fn tracking_thread(shared: &Shared<'_>, mut stage: TrackingStage, mut latest: Pu
         };
         steps = steps.saturating_add(1);
         enter_frame_path(steps >= WARM_UP_STEPS);
-        // A tracker that fails is told by the freshness of its tracks: light goes off by itself.
+        // A tracker that fails is told by the freshness of its tracks: light goes off by itself, and the report says why.
         let _ = stage.step(now, &mut latest);
         if !shared.is_virtual() {
             std::thread::sleep(Duration::from_micros(200));
         }
     }
     enter_frame_path(false);
+    stage.never_seen(&shared.rig)
 }
 
 fn plan_thread(
