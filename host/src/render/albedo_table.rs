@@ -119,45 +119,69 @@ fn row_average(row: &[f32]) -> f64 {
 /// `E` by quadrature over the visible normals: with `h` drawn from their density the integrand is `F G2 / G1`.
 ///
 /// In the stretched space of \[Dupuy23\] where visible normals are uniform over a spherical cap, `h` is given by its angle `beta` from
-/// the stretched `v` and its azimuth `psi` about it: there the integrand has neither cone nor root inside. The azimuth ends where
-/// the reflected direction sinks below the surface; the outer integral is split where that begins and ends where no azimuth is left,
-/// with sin^2 as its variable in between because the end of the azimuth behaves like a square root at both.
+/// the stretched `v` and its azimuth `psi` about it: there the integrand has neither cone nor root inside. There `v.h` depends on `beta`
+/// alone, so that the reflected direction is above the surface where the height of `h` lies between two roots of a quadratic equation:
+/// lower facets send light down at once, and of facets seen nearly edge on the level ones do. So an azimuth begins and ends in closed form,
+/// and the outer integral is split where either begins to differ from a half turn's end, each part with sin^2 as its variable because
+/// ends of the azimuth behave like square roots there.
 fn directional_albedo(ior: f64, mu: f64, alpha: f64, rule: &Quadrature) -> f64 {
     if alpha == 0.0 {
         return fresnel_dielectric(ior, mu);
     }
     let mu = mu.max(1e-9);
     let v = DVec3::new((1.0 - mu * mu).max(0.0).sqrt(), 0.0, mu);
-    let v_std = DVec3::new(v.x * alpha, 0.0, v.z).normalize();
+    let stretched = DVec3::new(v.x * alpha, 0.0, v.z);
+    let (v_std, scale) = (stretched.normalize(), stretched.length());
     let upward = DVec3::new(-v_std.z, 0.0, v_std.x);
-    // Cosines of (v, h) and (n, l).
-    let at = |beta: f64, psi: f64| {
-        let (sin, cos) = beta.sin_cos();
-        let h = v_std * cos + upward * (sin * psi.cos()) + DVec3::Y * (sin * psi.sin());
-        let h = DVec3::new(h.x * alpha, h.y * alpha, h.z).normalize();
-        let vh = v.dot(h).clamp(0.0, 1.0);
-        (vh, 2.0 * vh * h.z - v.z)
+    // Heights of `h` on the ring at `beta`: middle and half of the range.
+    let heights = |beta: f64| (v_std.z * beta.cos(), v_std.x * beta.sin());
+    // Those between which the reflected direction is above the surface; NaN: none.
+    let allowed = |beta: f64| {
+        let half = scale * beta.cos();
+        let sum = half + (half * half - mu * mu * alpha * alpha * (1.0 - alpha * alpha)).sqrt();
+        (mu * alpha * alpha / sum, sum / (mu * (1.0 - alpha * alpha)))
     };
-    let split = root(0.0, 0.5 * PI, |beta| at(beta, PI).1).unwrap_or(0.0);
-    let last = root(split, 0.5 * PI, |beta| at(beta, 0.0).1).unwrap_or(0.5 * PI);
+    let above_lowest = |beta: f64| heights(beta).0 - heights(beta).1 - allowed(beta).0;
+    let below_highest = |beta: f64| allowed(beta).1 - heights(beta).0 - heights(beta).1;
+    let overlap = |beta: f64| {
+        let ((middle, half), (low, high)) = (heights(beta), allowed(beta));
+        (middle + half - low).min(high - middle + half)
+    };
+    let last = root(0.0, 0.5 * PI, overlap).unwrap_or(0.5 * PI);
     let ring = |beta: f64| {
-        let end = root(0.0, PI, |psi| at(beta, psi).1).unwrap_or(PI);
+        let ((middle, half), (low, high)) = (heights(beta), allowed(beta));
+        let azimuth = |height: f64| {
+            let cos = (height - middle) / half;
+            if cos.is_nan() { 0.0 } else { cos.clamp(-1.0, 1.0) }.acos()
+        };
+        // From straight above `v`, the highest, to below it. A ring all of one height is allowed as a whole.
+        let (from, to) = if half > 0.0 { (azimuth(high), azimuth(low)) } else { (0.0, PI) };
+        let (sin, cos) = beta.sin_cos();
         let mut sum = 0.0;
         for &(x, w) in &rule.azimuth {
-            let (vh, l_z) = at(beta, end * x);
+            let (sin_psi, cos_psi) = (from + (to - from) * x).sin_cos();
+            let h = v_std * cos + upward * (sin * cos_psi) + DVec3::Y * (sin * sin_psi);
+            let h = DVec3::new(h.x * alpha, h.y * alpha, h.z).normalize();
+            let vh = v.dot(h).clamp(0.0, 1.0);
+            let l_z = 2.0 * vh * h.z - v.z;
             if l_z > 0.0 {
                 sum += w * fresnel_dielectric(ior, vh) * smith_g2_over_g1(v.z, l_z, alpha);
             }
         }
         // Area of the cap swept: 4 sin cos dbeta dpsi of 2 pi (1 + v.z), both halves of the azimuth.
-        sum * end * 4.0 * beta.sin() * beta.cos() / (PI * (1.0 + v_std.z))
+        sum * (to - from) * 4.0 * sin * cos / (PI * (1.0 + v_std.z))
     };
+    let mut ends = [0.0, last, last, last];
+    ends[1] = root(0.0, last, above_lowest).unwrap_or(last);
+    ends[2] = root(0.0, last, below_highest).unwrap_or(last);
+    ends.sort_by(f64::total_cmp);
     let mut sum = 0.0;
-    for &(x, w) in &rule.tilt {
-        let rest = last - split;
-        let turn = 0.5 * PI * x;
-        sum += w * split * ring(split * x);
-        sum += w * PI * turn.sin() * turn.cos() * rest * ring(split + rest * turn.sin().powi(2));
+    for part in ends.windows(2) {
+        let length = part[1] - part[0];
+        for &(x, w) in &rule.tilt {
+            let (sin, cos) = (0.5 * PI * x).sin_cos();
+            sum += w * PI * sin * cos * length * ring(part[0] + length * sin * sin);
+        }
     }
     sum
 }
@@ -215,7 +239,7 @@ fn gauss_legendre(points: usize) -> Vec<(f64, f64)> {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::reference::microfacet::{ggx_d, smith_g2};
+    use crate::reference::microfacet::{ggx_d, sample_visible_normal, smith_g2};
 
     #[test]
     fn ior_1_has_no_coat_at_all() {
@@ -264,6 +288,37 @@ mod tests {
             let direct = sum * 2.0 * PI / (n * n) as f64;
             let e = directional_albedo(ior, mu, alpha, &rule);
             assert!((direct - e).abs() < 2e-4, "mu {mu} alpha {alpha}: {direct} {e}");
+        }
+    }
+
+    /// By chance, without rings and their ends: facets that are seen, drawn and looked at one by one. Narrow lobes at grazing angles too.
+    #[test]
+    fn agrees_with_facets_drawn_by_chance() {
+        let rule = Quadrature::new(20, 10);
+        for (k, (mu, alpha)) in
+            [(0.05, 0.01), (0.0375, 0.0094), (0.01, 0.03), (0.2, 0.01), (0.05, 0.25), (0.3, 1.0), (1.0, 0.3)]
+                .into_iter()
+                .enumerate()
+        {
+            let mut draws = crate::reference::Sampler::new(11, k as u64);
+            let v = DVec3::new((1.0f64 - mu * mu).sqrt(), 0.0, mu);
+            let (mut sum, mut squares, n) = (0.0, 0.0, 200_000);
+            for _ in 0..n {
+                let Some(h) = sample_visible_normal(v, alpha, draws.uniform2()) else { continue };
+                let vh = v.dot(h).clamp(0.0, 1.0);
+                let l_z = 2.0 * vh * h.z - mu;
+                if l_z > 0.0 {
+                    let x = fresnel_dielectric(1.5, vh) * smith_g2_over_g1(mu, l_z, alpha);
+                    (sum, squares) = (sum + x, squares + x * x);
+                }
+            }
+            let mean = sum / n as f64;
+            let sigma = ((squares / n as f64 - mean * mean) / n as f64).sqrt();
+            let e = directional_albedo(1.5, mu, alpha, &rule);
+            assert!(
+                (e - mean).abs() < 4.5 * sigma + 1e-5,
+                "mu {mu} alpha {alpha}: {e}, not {mean} +- {sigma}"
+            );
         }
     }
 

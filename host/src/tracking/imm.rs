@@ -126,8 +126,9 @@ impl Covariance {
         let conditional_v = self.vv - self.va * self.va * over_a;
         let link = self.pv - self.va * self.pa * over_a;
         if conditional_v <= 0.0 {
-            self.vv -= conditional_v;
-            self.pv -= link;
+            // Set anew, not by the difference: that has the rounding of what it is taken from, which may be far larger.
+            self.vv = self.va * self.va * over_a;
+            self.pv = self.va * self.pa * over_a;
         }
         let explained = if conditional_v > 0.0 { link * link / conditional_v } else { 0.0 };
         self.pp = self.pp.max(self.pa * self.pa * over_a + explained);

@@ -166,7 +166,7 @@ fn skew(seed: u64) -> f64 {
     let mut worst: f64 = 0.0;
     for (ppm, drift_ppm_s) in [(200.0, 0.0), (-200.0, 0.0), (200.0, -1.0), (-200.0, 1.0), (0.0, 1.0)] {
         let device = Device { ppm, drift_ppm_s, ..Device::new(1_000_000_000) };
-        worst = worst.max(track(&device, &mut Line::new(seed), 0, 300, 30, 0.0).0);
+        worst = worst.max(track(&device, &mut Line::new(seed), 0, 3000, 30, 0.0).0);
     }
     worst * 1e-3
 }
@@ -255,7 +255,7 @@ fn frequencies(seed: u64) -> f64 {
     }
     for hz in [1u64, 1000, 1_000_000, 10_000_000_000, 1_000_000_000_000] {
         let device = Device::new(hz);
-        let (error, beyond) = track(&device, &mut Line::new(seed), 0, 150, 50, 0.0);
+        let (error, beyond) = track(&device, &mut Line::new(seed), 0, 2000, 50, 0.0);
         faults += u32::from(beyond > 0.0 || error.is_nan() || error > 2e9 / hz as f64 + 10_000.0);
     }
     f64::from(faults)

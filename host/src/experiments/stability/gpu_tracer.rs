@@ -357,8 +357,8 @@ fn touching_lights(gpu: &Arc<Gpu>, seed: u64) -> f64 {
     scene.lights.extend([0.0, 1e-5].map(|height| point_light(Vec3::new(0.7, height, 0.5), 0.05)));
     scene.environment = sky(0.3);
     let camera = camera(32, 24, DVec3::new(0.9, 1.2, 1.9), DVec3::ZERO);
-    let shot = Shot { spp: 32, frames: 32, seed: seed as u32, ..Shot::new(&scene, camera) };
-    let c = compare(gpu, &shot, 512);
+    let shot = Shot { spp: 32, frames: 128, seed: seed as u32, ..Shot::new(&scene, camera) };
+    let c = compare(gpu, &shot, 2048);
     let e = c.explained();
     if c.picture.estimates.iter().any(|e| e.mean.iter().any(|m| !m.is_finite()))
         || c.reference.dropped_samples > 0
