@@ -66,10 +66,10 @@ impl Buffer {
             .viewed_as_texels(float)
     }
 
-    /// An uninitialised buffer of at least one 16-byte texel, read as [`Buffer::texels`].
+    /// An uninitialised buffer of at least one 16-byte texel, read as [`Buffer::texels`] and written as storage.
     ///
     /// # Errors
-    /// As [`Buffer::texels`].
+    /// As [`Buffer::texels`]; [`GpuError::Limit`] when it is longer than the device's storage buffers, too.
     pub fn new_texels(
         gpu: &Arc<Gpu>,
         what: &str,
@@ -78,6 +78,7 @@ impl Buffer {
         kind: MemoryKind,
     ) -> Result<Self, GpuError> {
         Self::check_texels(gpu, what, texels)?;
+        Self::check_storage(gpu, what, texels * 16)?;
         Self::with_usage(gpu, what, texels * 16, kind, vk::BufferUsageFlags::STORAGE_TEXEL_BUFFER)?
             .viewed_as_texels(float)
     }
@@ -86,6 +87,14 @@ impl Buffer {
         let limit = gpu.max_texel_elements();
         if texels as u64 > limit {
             return Err(GpuError::Limit { what: format!("{what} (texels)"), needed: texels as u64, limit });
+        }
+        Ok(())
+    }
+
+    fn check_storage(gpu: &Arc<Gpu>, what: &str, len_bytes: usize) -> Result<(), GpuError> {
+        let limit = u64::from(gpu.limits.max_storage_buffer_range);
+        if len_bytes as u64 > limit {
+            return Err(GpuError::Limit { what: format!("{what} (bytes)"), needed: len_bytes as u64, limit });
         }
         Ok(())
     }
@@ -126,9 +135,8 @@ impl Buffer {
         extra: vk::BufferUsageFlags,
     ) -> Result<Self, GpuError> {
         let len_bytes = len_bytes.max(16);
-        let limit = u64::from(gpu.limits.max_storage_buffer_range);
-        if len_bytes as u64 > limit && !extra.contains(vk::BufferUsageFlags::STORAGE_TEXEL_BUFFER) {
-            return Err(GpuError::Limit { what: format!("{what} (bytes)"), needed: len_bytes as u64, limit });
+        if !extra.contains(vk::BufferUsageFlags::STORAGE_TEXEL_BUFFER) {
+            Self::check_storage(gpu, what, len_bytes)?;
         }
         let usage = vk::BufferUsageFlags::STORAGE_BUFFER
             | vk::BufferUsageFlags::UNIFORM_BUFFER

@@ -119,6 +119,21 @@ fn bodies_at_rest_in_steady_motion_or_with_a_long_period_are_left_alone() {
     }
 }
 
+/// A turn of 0.2 s falls between the samples of a slow tracker: below 150 Hz nothing is recalled, above it is.
+#[test]
+fn slow_trackers_recall_nothing() {
+    for (step_ns, recalls) in [(10_000_000, false), (7_000_000, false), (6_000_000, true), (4_000_000, true)]
+    {
+        let mut body = Follower::new(&sine());
+        let mut found = false;
+        for i in 0..3_000_000_000 / step_ns {
+            body.see(i * step_ns);
+            found |= body.recall.lag_ns().is_some();
+        }
+        assert_eq!(found, recalls, "a sample every {step_ns} ns");
+    }
+}
+
 /// A body that turns where it always turned, until it goes straight on: the recall is given up before it has gone 3 cm further.
 #[test]
 fn another_way_is_noticed() {
