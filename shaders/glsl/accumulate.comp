@@ -42,12 +42,20 @@ void main() {
             float y = luminance(traced.rgb);
             h.index += uint(traced.w);
             // Variance of one sample about its frame's mean, which no change of the light enters; of a single sample about the history.
+            // Where chance has no part a frame tells all: nothing of before is kept, nor of a guess. What was so and is no longer is not known yet.
+            bool exact = filtered[at].light.y > 0.5;
+            if (exact || h.exact != 0u) {
+                h.weight = 0.0;
+                h.drift = 0.0;
+                h.surprise = 0.0;
+            }
+            h.exact = exact ? 1u : 0u;
             float second = filtered[at].light.x / traced.w;
             float known = luminance((h.mean + shift) * albedo);
             float about = h.weight > 0.0 ? mix(y, known, h.weight / (h.weight + traced.w)) : y;
             float variance = traced.w > 1.5 ? max(second - y * y, 0.0) * traced.w / (traced.w - 1.0) : (y - about) * (y - about);
             float v_weight = clamp(traced.w / (min(h.weight, 32.0) + traced.w), 0.0, 1.0);
-            h.variance = h.weight > 0.0 ? mix(h.variance, variance, v_weight) : max(variance, 0.25 * y * y);
+            h.variance = exact ? 0.0 : h.weight > 0.0 ? mix(h.variance, variance, v_weight) : max(variance, 0.25 * y * y);
             // Power of what single frames say beyond the history: their noise, and what the history gets wrong.
             if (h.weight > 0.0) h.surprise = mix(h.surprise, (y - known) * (y - known), h.surprise > 0.0 ? 0.1 : 1.0);
             // Innovation: what the frame says beyond the history, as luminance without albedo. Its mean over the last few frames is the lag.

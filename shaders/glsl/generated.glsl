@@ -119,7 +119,7 @@ struct History {
     uint index;
     uint instance;
     uint frame;
-    uint reserved;
+    uint exact;
 };
 
 struct WorkItem {

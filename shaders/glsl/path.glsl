@@ -34,9 +34,10 @@ struct Path {
     uint vertex;     // 1 is the first surface point
     vec3 throughput;
     vec3 radiance;
+    bool exact;      // chance has chosen nothing yet: every sample of the pixel is this one
 };
 
-Path begin_path(Point first) { return Path(first, 1u, vec3(1.0), first.emitted); }
+Path begin_path(Point first) { return Path(first, 1u, vec3(1.0), first.emitted, true); }
 
 // Lights the newest vertex and goes on to the next one. False: the path is at its end, its radiance complete.
 bool advance_path(inout Path path, Sampler rng, inout RayCount rays) {
@@ -47,6 +48,8 @@ bool advance_path(inout Path path, Sampler rng, inout RayCount rays) {
     if (vertex >= frame.depth || black) return false;
     Lobes lobes = lobes_of(s);
     bool only_delta = mirror_like(s) && lobes.diffuse <= 0.0;
+    // One way on only, and before roulette.
+    path.exact = path.exact && only_delta && lobes.transmit <= 0.0 && vertex < 3u;
     // Where the light and the next direction are chosen matters most: they share a group of four. Its first two dimensions are the most
     // even; without light samples the next direction has them, and the choice of its lobe the third.
     vec4 u_direction = sample_4d(rng, vertex * 2u - 2u);

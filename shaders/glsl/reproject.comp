@@ -50,6 +50,7 @@ void forget(inout History h, uint at) {
     h.surprise = 0.0;
     h.seed = hash_u32(at + hash_u32(frame.frame + hash_u32(frame.seed)));
     h.index = 0u;
+    h.exact = 0u;
 }
 
 // Methods paper and miyamoto: what the four histories around say, weighted bilinearly. `h` stays as it is where none is valid.

@@ -175,7 +175,7 @@ void main() {
     uint history = frame.parity * frame.width * frame.height;
     if ((frame.flags & FRAME_DPM) != 0u) {
         vec3 light = own;
-        if (HAS_FILTER) {
+        if (HAS_FILTER && history_at(history + at).exact == 0u) {
             light = regressed(pixel, at, history, own);
             float level = luminance(light);
             light *= clamp((level + lag_of(pixel, at, history)) / max(level, 1e-6), 0.5, 2.0);

@@ -9,7 +9,7 @@ layout(set = 0, binding = B_SCHEDULE, scalar) readonly buffer ScheduleBlock { Sc
 layout(set = 0, binding = B_WORK, scalar) readonly buffer Work { WorkItem work[]; };
 // rgb mean of the samples, w their number.
 layout(set = 0, binding = B_RADIANCE, scalar) writeonly buffer Radiance { vec4 radiance_out[]; };
-// Sum of squared luminance of the samples, per pixel (method dpm).
+// Per pixel (method dpm): sum of squared luminance of the samples; 1 where chance chose nothing, so that one sample tells all.
 layout(set = 0, binding = B_FILTERED, scalar) writeonly buffer FilteredBlock { Filtered filtered[]; };
 
 void main() {
@@ -44,6 +44,7 @@ void main() {
     vec3 sum = vec3(0.0);
     float sum_squares = 0.0;
     uint count = 0u, invalid = 0u;
+    bool dpm = (frame.flags & FRAME_DPM) != 0u, exact = false;
     RayCount rays = RayCount(0u, 0u);
     // A lane whose path ends begins its next sample at once, while its neighbours are still on their way.
     Path path = begin_path(first);
@@ -59,14 +60,15 @@ void main() {
             count += valid ? 1u : 0u;
             invalid += valid ? 0u : 1u;
             rng.index++;
-            left--;
+            exact = dpm && path.exact;
+            left = exact ? 0u : left - 1u;
             path = begin_path(first);
         }
     } while (left > 0u);
     radiance_out[item.pixel] = vec4(count > 0u ? sum / float(count) : vec3(0.0), float(count));
-    if (SAMPLER == 2u) filtered[item.pixel] = Filtered(vec3(sum_squares, 0.0, 0.0), 0.0);
+    if (dpm) filtered[item.pixel] = Filtered(vec3(sum_squares, exact ? 1.0 : 0.0, 0.0), 0.0);
     COUNT(closest_rays, rays.closest)
     COUNT(shadow_rays, rays.shadow)
-    COUNT(samples, item.spp)
+    COUNT(samples, count + invalid)
     COUNT_RARE(invalid_samples, invalid)
 }

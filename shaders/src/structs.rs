@@ -165,8 +165,8 @@ gpu_structs! {
         instance: u32,
         /// Frame that wrote it.
         frame: u32,
-        /// 0.
-        reserved: u32,
+        /// 1: chance had no part in the last frame's light (a mirror of the sky), so that one sample told all of it (method dpm).
+        exact: u32,
     }
 
     /// A pixel to be traced.

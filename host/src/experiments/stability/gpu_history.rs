@@ -11,7 +11,7 @@ use crate::gpu::Gpu;
 use crate::render::method::Method;
 use crate::render::rate_map::{decide, rate_table, PixelGuide, RateConstants};
 use crate::render::{FrameSlot, Renderer};
-use crate::scene::{Environment, PunctualKind, PunctualLight, Scene};
+use crate::scene::{Environment, Material, PunctualKind, PunctualLight, Scene};
 use dpm_shaders::structs::{History, NO_HIT};
 use glam::{DAffine3, DVec3, Vec3};
 use std::sync::Arc;
@@ -81,6 +81,14 @@ pub const CASES: &[GpuCase] = &[
         "relative",
         5e-3,
         energy_kept,
+    ),
+    GpuCase::new(
+        "gpu-noise-free-is-exact",
+        "a mirror ball that crosses the picture under an uneven sky, method dpm, one sample asked for and four",
+        "each frame as drawn without a history, one sample a lit pixel",
+        "radiance",
+        1e-5,
+        noise_free,
     ),
 ];
 
@@ -436,6 +444,42 @@ fn energy_kept(gpu: &Arc<Gpu>, seed: u64) -> f64 {
             (method.temporal, method.rate_map, method.checkerboard, method.spatial) =
                 (false, false, false, true);
             worst = worst.max((total(&method, 112, 64) / wanted - 1.0).abs());
+        }
+    }
+    worst
+}
+
+fn noise_free(gpu: &Arc<Gpu>, seed: u64) -> f64 {
+    let mirror = Material { metallic: 1.0, roughness: 0.0, ..diffuse(Vec3::new(0.9, 0.8, 0.7)) };
+    let mut scene = scene_of(sphere(Vec3::ZERO, 0.5, 3, true), mirror);
+    scene.environment = image_sky(1.0);
+    let eye = Some(DVec3::new(0.4, 0.5, 3.0));
+    // A pixel and a half a frame, over tiles and in from beyond the picture's edge.
+    let poses = |frame: u32| vec![DAffine3::from_translation(DVec3::X * (f64::from(frame) * 0.06 - 1.0))];
+    let mut worst: f64 = 0.0;
+    for spp in [1, 4] {
+        let shot = |method: Method| Shot {
+            eye,
+            spp,
+            frames: 30,
+            seed: seed as u32,
+            method: Some(method),
+            ..Shot::new(&scene, camera(48, 36, DVec3::new(0.0, 0.3, 3.0), DVec3::ZERO))
+        };
+        let (mut wanted, mut lit, mut traced) = (Vec::new(), 0u32, 0u32);
+        play(gpu, &shot(Method::full(1)), poses, |_, slot| {
+            wanted.push(slot.radiance().unwrap_or(&[]).to_vec());
+            let surfaces = slot.surfaces().unwrap_or(&[]).iter();
+            lit += surfaces.filter(|s| s.id != NO_HIT && s.distance > 0.0).count() as u32;
+        });
+        play(gpu, &shot(method_of(&RenderConfig::default(), RenderMethod::Dpm)), poses, |frame, slot| {
+            let shown = slot.radiance().unwrap_or(&[]).iter().zip(&wanted[frame as usize]);
+            let off = shown.flat_map(|(a, b)| (0..3).map(|c| f64::from((a[c] - b[c]).abs())));
+            worst = off.fold(worst, |w: f64, d| if d.is_nan() { f64::INFINITY } else { w.max(d) });
+            traced += slot.traced().unwrap_or(&[]).iter().map(|t| t[3] as u32).sum::<u32>();
+        });
+        if lit < 1000 || traced != lit {
+            return f64::INFINITY;
         }
     }
     worst
