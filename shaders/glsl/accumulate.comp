@@ -44,12 +44,12 @@ void main() {
             // Variance of one sample about its frame's mean, which no change of the light enters; of a single sample about the history.
             // Where chance has no part a frame tells all: nothing of before is kept, nor of a guess. What was so and is no longer is not known yet.
             bool exact = filtered[at].light.y > 0.5;
-            if (exact || h.exact != 0u) {
+            if (exact || (h.flags & HISTORY_EXACT) != 0u) {
                 h.weight = 0.0;
                 h.drift = 0.0;
                 h.surprise = 0.0;
             }
-            h.exact = exact ? 1u : 0u;
+            h.flags = exact ? HISTORY_EXACT : 0u;
             float second = filtered[at].light.x / traced.w;
             float known = luminance((h.mean + shift) * albedo);
             float about = h.weight > 0.0 ? mix(y, known, h.weight / (h.weight + traced.w)) : y;

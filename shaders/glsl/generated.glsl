@@ -19,6 +19,8 @@
 #define FRAME_SPP_BY_ANGLE 8u
 #define FRAME_TEMPORAL 16u
 #define FRAME_DPM 32u
+#define HISTORY_EXACT 1u
+#define HISTORY_HIDDEN 2u
 #define FRAME_ALLOCATE 64u
 #define RATE_TABLE_OCTAVE 1024u
 #define RATE_TABLE_OCTAVES 40u
@@ -119,7 +121,7 @@ struct History {
     uint index;
     uint instance;
     uint frame;
-    uint exact;
+    uint flags;
 };
 
 struct WorkItem {

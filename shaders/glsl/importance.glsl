@@ -4,7 +4,7 @@
 // has just come into view is behind the others. In units of 1 / 256; a floor keeps every pixel alive. Nothing where chance has
 // no part.
 uint importance_of(History h) {
-    if (h.exact != 0u) return 0u;
+    if ((h.flags & HISTORY_EXACT) != 0u) return 0u;
     float sigma = h.weight > 0.0 ? sqrt(max(h.variance, 0.0)) : 1.0;
     sigma /= 1.0 + max(h.weight / max(frame.budget_spp, 0.5), 1.0) / EYE_FRAMES;
     return uint(clamp(sigma, 0.004, 8.0) * 256.0);

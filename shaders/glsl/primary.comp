@@ -27,6 +27,26 @@ vec3 demodulation(Hit hit, vec3 toward) {
     return clamp(mix(e + (1.0 - e) * s.base, metal, s.metallic), 0.02, 1.0);
 }
 
+// Method dpm: the eye has seen this body here in the last frame, and all around; every fourth frame it is looked at again all the same. Light
+// that the eye does not see is no fault, so what comes between inside a surface may wait for that; at borders nothing waits.
+bool still_seen(uvec2 pixel, uint instance, vec2 before) {
+    if ((frame.flags & FRAME_DPM) == 0u || (((pixel.x >> 3u) + 2u * (pixel.y >> 3u) + frame.frame) & 3u) == 0u) return false;
+    // Whatever jumps may stand anywhere.
+    vec2 motion = abs(vec2(pixel) + 0.5 - before);
+    if (!(max(motion.x, motion.y) < 4.0)) return false;
+    ivec2 corner = ivec2(floor(clamp(before, vec2(-4.0), vec2(frame.width, frame.height) + 4.0)));
+    uint former = (1u - frame.parity) * frame.width * frame.height;
+    const ivec2 around[5] = ivec2[](ivec2(0), ivec2(-2, -2), ivec2(2, -2), ivec2(-2, 2), ivec2(2, 2));
+    bool seen = true;
+    for (int i = 0; i < 5; i++) {
+        ivec2 q = corner + around[i];
+        bool inside = all(greaterThanEqual(q, ivec2(0))) && all(lessThan(q, ivec2(frame.width, frame.height)));
+        History h = history_at(former + (inside ? uint(q.y) * frame.width + uint(q.x) : 0u));
+        seen = seen && inside && h.frame == frame.history_frame && h.instance == instance && h.weight > 0.0 && (h.flags & HISTORY_HIDDEN) == 0u;
+    }
+    return seen;
+}
+
 void main() {
     uvec2 pixel;
     if (!tile_pixel(tiles[gl_WorkGroupID.x >> 2u], pixel)) return;
@@ -42,13 +62,15 @@ void main() {
         surface.barycentric = hit.barycentric;
         surface.distance = hit.t;
         if (!camera_is_eye) {
-            vec3 p = transform_point(instance_at(hit.instance).world_from_object, object_position(hit.instance, hit.triangle, hit.barycentric));
+            vec3 o = object_position(hit.instance, hit.triangle, hit.barycentric);
+            vec3 p = transform_point(instance_at(hit.instance).world_from_object, o);
+            vec2 before = HAS_GUIDES ? project(transform_point(instance_at(hit.instance).previous_world_from_object, o)) : vec2(0.0);
             vec3 g = transform_normal(instance_at(hit.instance).world_from_object, object_normal(hit.instance, hit.triangle));
             vec3 to_eye = frame.eye_position - p;
             // The eye must be on the side that the projector lights.
             float projector_side = -dot(g, direction), eye_side = dot(g, to_eye);
             bool lit = projector_side * eye_side > 0.0;
-            if (lit) {
+            if (lit && !(HAS_GUIDES && still_seen(pixel, hit.instance, before))) {
                 vec3 offset = g * (sign(eye_side) * surface_offset(p, hit.instance));
                 Hit blocker;
                 blocker.t = 1.0;
@@ -58,8 +80,6 @@ void main() {
             if (!lit) surface.distance = -hit.t;
             if (HAS_GUIDES) {
                 Guide guide;
-                vec3 o = object_position(hit.instance, hit.triangle, hit.barycentric);
-                vec2 before = project(transform_point(instance_at(hit.instance).previous_world_from_object, o));
                 guide.motion = vec2(pixel) + 0.5 - before;
                 vec3 to_projector = -p;
                 float l_p = length(to_projector), l_e = length(to_eye);

@@ -17,7 +17,7 @@ layout(set = 0, binding = B_SHOWN, scalar) writeonly buffer Shown { vec4 shown[]
 
 // Frames' worth of samples that a new point takes over from those around, where the eye looks and in the periphery: what it takes is a guess
 // that stays as bias, and without it there is noise, which flickers.
-const float TAKEN_OVER = 6.0, TAKEN_OVER_PERIPHERY = 16.0;
+const float TAKEN_OVER = 6.0, TAKEN_OVER_PERIPHERY = 24.0;
 
 struct Carried {
     vec3 mean;
@@ -50,7 +50,7 @@ void forget(inout History h, uint at) {
     h.surprise = 0.0;
     h.seed = hash_u32(at + hash_u32(frame.frame + hash_u32(frame.seed)));
     h.index = 0u;
-    h.exact = 0u;
+    h.flags = 0u;
 }
 
 // Methods paper and miyamoto: what the four histories around say, weighted bilinearly. `h` stays as it is where none is valid.
@@ -230,6 +230,7 @@ void keep_hidden(uvec2 pixel, uint to) {
     if (owner == NO_HIT) return;
     History h = history_at(owner);
     h.frame = frame.frame;
+    h.flags |= HISTORY_HIDDEN;
     histories[to] = h;
 }
 
@@ -262,6 +263,7 @@ void main() {
         forget(h, at);
         if ((frame.flags & FRAME_DPM) != 0u) carry_point(h, normal, footprint, pixel, before);
         else carry_bilinear(h, normal, footprint, before);
+        h.flags &= ~HISTORY_HIDDEN;
         histories[current + at] = h;
         importance = importance_of(h);
     } else {

@@ -28,7 +28,7 @@ uint samples_of(uvec2 pixel, uint at) {
         share = clamp(share, min(0.5, 0.5 * frame.budget_spp), 16.0 * max(frame.budget_spp, 1.0));
         // One sample tells all where chance has no part, and a frame later it is another one; a new point's own light is better than a guess.
         float one = min(1.0, 2.0 * frame.budget_spp);
-        if (h.exact != 0u) share = one;
+        if ((h.flags & HISTORY_EXACT) != 0u) share = one;
         else if (h.index == 0u) share = max(share, one);
         float whole = floor(share);
         return uint(whole) + (blue_noise(pixel, frame.frame, 0u) < share - whole ? 1u : 0u);

@@ -61,7 +61,7 @@ float lag_of(uvec2 pixel, uint at, uint history) {
     float fit = xy * xy / max(xx, 1e-12);
     float chance = max(yy - fit, 0.0) / max(used - 1.0, 1.0);
     // What the correction gets wrong changes from frame to frame: where the eye sees flicker best, only what is beyond doubt is corrected.
-    float doubt = mix(0.5, 3.0, periphery(guide_at(at).angle));
+    float doubt = mix(0.5, 8.0, periphery(guide_at(at).angle));
     float trust = fit > 0.0 ? max(1.0 - doubt * chance / fit, 0.0) : 0.0;
     return trust * xy / max(xx, 1e-12) * age;
 }
@@ -175,7 +175,7 @@ void main() {
     uint history = frame.parity * frame.width * frame.height;
     if ((frame.flags & FRAME_DPM) != 0u) {
         vec3 light = own;
-        if (HAS_FILTER && history_at(history + at).exact == 0u) {
+        if (HAS_FILTER && (history_at(history + at).flags & HISTORY_EXACT) == 0u) {
             light = regressed(pixel, at, history, own);
             float level = luminance(light);
             light *= clamp((level + lag_of(pixel, at, history)) / max(level, 1e-6), 0.5, 2.0);

@@ -230,7 +230,7 @@ History history_at(uint i) {
         history_table[i].index,
         history_table[i].instance,
         history_table[i].frame,
-        history_table[i].exact);
+        history_table[i].flags);
 }
 #endif
 

@@ -165,8 +165,8 @@ gpu_structs! {
         instance: u32,
         /// Frame that wrote it.
         frame: u32,
-        /// 1: chance had no part in the last frame's light (a mirror of the sky), so that one sample told all of it (method dpm).
-        exact: u32,
+        /// Bits: see `HISTORY_*`.
+        flags: u32,
     }
 
     /// A pixel to be traced.
@@ -387,6 +387,8 @@ pub const CONSTANTS: &[(&str, u32)] = &[
     ("FRAME_SPP_BY_ANGLE", FRAME_SPP_BY_ANGLE),
     ("FRAME_TEMPORAL", FRAME_TEMPORAL),
     ("FRAME_DPM", FRAME_DPM),
+    ("HISTORY_EXACT", HISTORY_EXACT),
+    ("HISTORY_HIDDEN", HISTORY_HIDDEN),
     ("FRAME_ALLOCATE", FRAME_ALLOCATE),
     ("RATE_TABLE_OCTAVE", RATE_TABLE_OCTAVE),
     ("RATE_TABLE_OCTAVES", RATE_TABLE_OCTAVES),
@@ -432,6 +434,10 @@ pub const FRAME_SPP_BY_ANGLE: u32 = 8;
 pub const FRAME_TEMPORAL: u32 = 16;
 /// Method dpm: every sample counts once in the history, radiance is filtered without its albedo.
 pub const FRAME_DPM: u32 = 32;
+/// Chance had no part in the last frame's light (a mirror of the sky), so that one sample told all of it.
+pub const HISTORY_EXACT: u32 = 1;
+/// The pixel itself was not lit in the last frame: its history waits for a surface point that has just slipped out of it.
+pub const HISTORY_HIDDEN: u32 = 2;
 /// Method dpm: samples go where they lower the error most.
 pub const FRAME_ALLOCATE: u32 = 64;
 /// Entries of the table of \[Yang19\]'s b functions per octave of velocity.

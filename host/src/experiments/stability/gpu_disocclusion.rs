@@ -6,11 +6,13 @@ use super::gpu::GpuCase;
 use super::gpu_history::{even, from_one, methods, play};
 use super::gpu_shot::Shot;
 use super::shapes::*;
+use crate::config::{RenderConfig, RenderMethod};
+use crate::experiments::error_plan::method_of;
 use crate::gpu::Gpu;
 use crate::render::method::Method;
-use crate::render::Renderer;
+use crate::render::{FrameSlot, Renderer};
 use crate::scene::{Environment, Material, Scene};
-use dpm_shaders::structs::History;
+use dpm_shaders::structs::{History, NO_HIT};
 use glam::{DAffine3, DQuat, DVec3, Vec3};
 use std::sync::Arc;
 
@@ -34,6 +36,14 @@ pub const CASES: &[GpuCase] = &[
         "gpu-stale-history",
         "histories of wrong light that are two frames old, every method",
         stale_history,
+    ),
+    GpuCase::new(
+        "gpu-eye-looks-again",
+        "a plate that glides and jumps between the eye and a floor, out of the projector's light, method dpm",
+        "where every pixel asks the eye in every frame: nothing seen is dark, nothing hidden is lit for more than three frames",
+        "frames over 3",
+        0.0,
+        looks_again,
     ),
 ];
 
@@ -158,4 +168,46 @@ fn stale_history(gpu: &Arc<Gpu>, seed: u64) -> f64 {
         );
     }
     worst
+}
+
+fn looks_again(gpu: &Arc<Gpu>, seed: u64) -> f64 {
+    let mut scene = even();
+    add(&mut scene, quad(Vec3::new(-0.1, -0.1, 0.0), Vec3::X * 0.2, Vec3::Y * 0.2), glow(RED));
+    let eye = DVec3::new(0.0, 1.2, 3.0);
+    // Its shadow is three times as large and as fast: a pixel a frame, and at once elsewhere in every twelfth.
+    let poses = |frame: u32| {
+        let x = f64::from(frame % 12) * 0.01 + if frame / 12 % 2 == 0 { -0.2 } else { 0.1 };
+        vec![DAffine3::IDENTITY, DAffine3::from_translation(DVec3::new(x, 0.8, 2.0))]
+    };
+    let shot = |method: Method| Shot {
+        eye: Some(eye),
+        spp: 1,
+        frames: 48,
+        seed: seed as u32,
+        method: Some(method),
+        ..Shot::new(&scene, camera(48, 36, DVec3::new(0.0, 3.0, 0.3), DVec3::ZERO))
+    };
+    let lit = |slot: &FrameSlot| -> Vec<bool> {
+        slot.surfaces().unwrap_or(&[]).iter().map(|s| s.id != NO_HIT && s.distance > 0.0).collect()
+    };
+    let (mut wanted, mut hidden) = (Vec::new(), 0usize);
+    play(gpu, &shot(Method::full(1)), poses, |_, slot| {
+        wanted.push(lit(slot));
+        hidden += slot.surfaces().unwrap_or(&[]).iter().filter(|s| s.distance < 0.0).count();
+    });
+    let (mut waited, mut over) = (vec![0u32; wanted[0].len()], 0u32);
+    let dpm = method_of(&RenderConfig::default(), RenderMethod::Dpm);
+    play(gpu, &shot(dpm), poses, |frame, slot| {
+        for ((shown, seen), waited) in lit(slot).into_iter().zip(&wanted[frame as usize]).zip(&mut waited) {
+            *waited = if shown && !seen { *waited + 1 } else { 0 };
+            over = over.max(waited.saturating_sub(3));
+            if *seen && !shown {
+                over = u32::MAX;
+            }
+        }
+    });
+    if hidden < 1000 {
+        return f64::NAN;
+    }
+    f64::from(over)
 }
