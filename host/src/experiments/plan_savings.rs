@@ -235,6 +235,11 @@ mod tests {
         let (features, _) = demo();
         let with = |method: &Method| features.iter().filter(|f| keeping(f, method).is_some()).count();
         let history = Method { temporal: true, ..Method::full(1) };
+        let mut kept: Vec<_> =
+            features.iter().filter_map(|f| Some(format!("{:?}", keeping(f, &history)?))).collect();
+        kept.sort();
+        kept.dedup();
+        assert_eq!(kept.len(), 11, "each puts back another part: {kept:#?}");
         assert_eq!(with(&history), 11, "the switches of SceneNeeds but the environment's, and those of Keep");
         assert_eq!(with(&Method::full(1)), 10, "without a history there are no rates");
         assert_eq!(with(&Method { rate_map: true, ..history }), 10, "rates that are read are no spare code");

@@ -515,8 +515,21 @@ impl<C: Chart> Imm<C> {
 
 #[cfg(test)]
 mod tests {
+    use super::super::pose_filter::models_for;
     use super::*;
     use proptest::prelude::*;
+
+    /// Whatever leaves a mode arrives in another.
+    #[test]
+    fn shares_of_a_mode_sum_to_one() {
+        let config = models_for(5.0);
+        for (h, recalls) in [0.0, 0.002, 0.1, 10.0].into_iter().flat_map(|h| [(h, false), (h, true)]) {
+            for i in 0..MODES {
+                let sum: f64 = (0..MODES).map(|j| AxisBank::share(&config, h, i, j, recalls)).sum();
+                assert!((sum - 1.0).abs() < 1e-12, "{sum} of mode {i} after {h} s, recalled: {recalls}");
+            }
+        }
+    }
 
     proptest! {
         /// The gain lies in [0, 1], a measurement never makes the position less certain, and what is left is no more than the
