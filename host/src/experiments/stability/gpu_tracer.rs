@@ -3,7 +3,7 @@
 use super::estimate::pooled;
 use super::gpu::GpuCase;
 use super::gpu_compare::compare;
-use super::gpu_shot::Shot;
+use super::gpu_shot::{Picture, Shot};
 use super::shapes::*;
 use crate::gpu::Gpu;
 use crate::reference::microfacet::fresnel_dielectric;
@@ -135,8 +135,8 @@ pub const CASES: &[GpuCase] = &[
     ),
     GpuCase::new(
         "gpu-firefly-limit",
-        "limits of 0.02 and 1e30",
-        "removes and counts, never adds; out of reach it changes nothing",
+        "limits of 0.002, 0.02 and 1e30",
+        "what is left is below it; removes and counts, never adds; out of reach it changes nothing",
         "faults",
         0.0,
         firefly_limit,
@@ -474,6 +474,14 @@ fn firefly_limit(gpu: &Arc<Gpu>, seed: u64) -> f64 {
     let added =
         |(a, b): &(&super::estimate::Estimate, &super::estimate::Estimate)| a.mean[1] > b.mean[1] + 1e-6;
     faults += tight.estimates.iter().zip(&free.estimates).filter(added).count() as u32;
+    // Of paths that end at their third vertex a sample of a light and a hit are indirect, neither beyond the limit; without one some are.
+    let (two, three, beyond) = (draw(2, None), draw(3, Some(0.002)), draw(3, None));
+    let luminance = |m: &[f64; 3]| 0.2126 * m[0] + 0.7152 * m[1] + 0.0722 * m[2];
+    let over = |p: &Picture| {
+        let pairs = p.estimates.iter().zip(&two.estimates);
+        pairs.filter(|(a, b)| luminance(&a.mean) - luminance(&b.mean) > 2.0 * 0.002 + 1e-5).count() as u32
+    };
+    faults += over(&three) + u32::from(over(&beyond) < 10);
     // Direct light is never limited.
     let (direct, limited) = (draw(2, None), draw(2, Some(1e-6)));
     faults += direct.radiance.iter().zip(&limited.radiance).filter(|(a, b)| a != b).count() as u32;
