@@ -26,9 +26,10 @@ uint samples_of(uvec2 pixel, uint at) {
         if ((frame.flags & FRAME_ALLOCATE) != 0u) share *= float(importance_of(h)) / max(float(schedule.importance), 1.0) * float(schedule.lit);
         // A point never seen before starts with what an average pixel gets; nothing waits longer than two or three frames.
         share = clamp(share, min(0.5, 0.5 * frame.budget_spp), 16.0 * max(frame.budget_spp, 1.0));
-        // One sample tells all where chance has no part, and a frame later it is another one; a new point's own light is better than a guess.
+        // One sample tells all where chance has no part, and the tracer stops there: the others are for what has just stopped being so. A new
+        // point's own light is better than a guess.
         float one = min(1.0, 2.0 * frame.budget_spp);
-        if ((h.flags & HISTORY_EXACT) != 0u) share = one;
+        if ((h.flags & HISTORY_EXACT) != 0u) share = max(one, 2.0 * frame.budget_spp);
         else if (h.index == 0u) share = max(share, one);
         float whole = floor(share);
         return uint(whole) + (blue_noise(pixel, frame.frame, 0u) < share - whole ? 1u : 0u);
