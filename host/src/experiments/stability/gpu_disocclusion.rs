@@ -176,7 +176,7 @@ fn looks_again(gpu: &Arc<Gpu>, seed: u64) -> f64 {
     let eye = DVec3::new(0.0, 1.2, 3.0);
     // Its shadow is three times as large and as fast: a pixel a frame, and at once elsewhere in every twelfth.
     let poses = |frame: u32| {
-        let x = f64::from(frame % 12) * 0.01 + if frame / 12 % 2 == 0 { -0.2 } else { 0.1 };
+        let x = f64::from(frame % 12) * 0.01 + if (frame / 12).is_multiple_of(2) { -0.2 } else { 0.1 };
         vec![DAffine3::IDENTITY, DAffine3::from_translation(DVec3::new(x, 0.8, 2.0))]
     };
     let shot = |method: Method| Shot {
