@@ -30,7 +30,7 @@ vec3 demodulation(Hit hit, vec3 toward) {
 // Method dpm: the eye has seen this body here in the last frame, and all around; every fourth frame it is looked at again all the same. Light
 // that the eye does not see is no fault, so what comes between inside a surface may wait for that; at borders nothing waits.
 bool still_seen(uvec2 pixel, uint instance, vec2 before) {
-    if ((frame.flags & FRAME_DPM) == 0u || (((pixel.x >> 3u) + 2u * (pixel.y >> 3u) + frame.frame) & 3u) == 0u) return false;
+    if ((frame.flags & FRAME_DPM) == 0u || frame.history_frame == NO_FRAME || (((pixel.x >> 3u) + 2u * (pixel.y >> 3u) + frame.frame) & 3u) == 0u) return false;
     // Whatever jumps may stand anywhere.
     vec2 motion = abs(vec2(pixel) + 0.5 - before);
     if (!(max(motion.x, motion.y) < 4.0)) return false;
@@ -42,7 +42,7 @@ bool still_seen(uvec2 pixel, uint instance, vec2 before) {
         ivec2 q = corner + around[i];
         bool inside = all(greaterThanEqual(q, ivec2(0))) && all(lessThan(q, ivec2(frame.width, frame.height)));
         History h = history_at(former + (inside ? uint(q.y) * frame.width + uint(q.x) : 0u));
-        seen = seen && inside && h.frame == frame.history_frame && h.instance == instance && h.weight > 0.0 && (h.flags & HISTORY_HIDDEN) == 0u;
+        seen = seen && inside && h.frame == frame.history_frame && h.instance == instance && (h.flags & HISTORY_HIDDEN) == 0u;
     }
     return seen;
 }

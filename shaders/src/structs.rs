@@ -372,6 +372,7 @@ pub const CONSTANTS: &[(&str, u32)] = &[
     ("NO_TEXTURE", NO_TEXTURE),
     ("NO_INSTANCE", NO_INSTANCE),
     ("NO_LIGHT", NO_LIGHT),
+    ("NO_FRAME", NO_FRAME),
     ("INSTANCE_PROJECTED", INSTANCE_PROJECTED),
     ("INSTANCE_EMPTY", INSTANCE_EMPTY),
     ("MATERIAL_DOUBLE_SIDED", MATERIAL_DOUBLE_SIDED),
@@ -402,6 +403,8 @@ pub const NO_HIT: u32 = u32::MAX;
 pub const NO_TEXTURE: u32 = u32::MAX;
 /// Not a light.
 pub const NO_LIGHT: u32 = u32::MAX;
+/// No frame has this number: what the history holds before the first.
+pub const NO_FRAME: u32 = u32::MAX;
 /// Not carried by a body.
 pub const NO_INSTANCE: u32 = u32::MAX;
 /// The projector's light falls on it.

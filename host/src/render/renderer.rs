@@ -103,8 +103,6 @@ pub enum RenderError {
     Scene(#[from] SceneDataError),
 }
 
-/// No frame has this number: what the history holds before the first.
-const NEVER: u32 = u32::MAX;
 /// Byte offsets in the dispatch arguments: four workgroups a tile, and one a tile in frames that decide rates.
 const PER_TILE_QUARTER: u64 = 0;
 const PER_TILE_RATES: u64 = 16;
@@ -248,10 +246,15 @@ impl Renderer {
                 &[Schedule { groups: [0, 1, 1], ..Schedule::zeroed() }],
             )?,
         };
-        super::fill::fill(gpu, &shared.history, &History { frame: NEVER, ..History::zeroed() }, 2 * pixels)?;
+        super::fill::fill(
+            gpu,
+            &shared.history,
+            &History { frame: gpu_structs::NO_FRAME, ..History::zeroed() },
+            2 * pixels,
+        )?;
         let tracked = scene.bodies.iter().map(|b| b.tracked).collect();
         let poses = Vec::with_capacity(scene.bodies.len());
-        let last = Last { frame: NEVER, parity: 0, poses, origin: DVec3::ZERO, count: 0 };
+        let last = Last { frame: gpu_structs::NO_FRAME, parity: 0, poses, origin: DVec3::ZERO, count: 0 };
         Ok(Self {
             pipelines,
             table,
@@ -511,7 +514,7 @@ impl Renderer {
                 node_offset: body.node_offset,
                 bounds_max: (upper + slack).as_vec3().into(),
                 triangle_offset: body.triangle_offset,
-                previous_world_from_object: rows(if self.last.frame == NEVER {
+                previous_world_from_object: rows(if self.last.frame == gpu_structs::NO_FRAME {
                     &world_from_object
                 } else {
                     &previous
