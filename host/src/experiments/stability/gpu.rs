@@ -13,32 +13,20 @@ pub fn open() -> Device {
     Gpu::open(&options).map_err(|e| e.to_string())
 }
 
-/// A case that needs a device.
-pub struct GpuCase {
-    name: &'static str,
-    input: &'static str,
-    oracle: &'static str,
-    unit: &'static str,
-    bound: f64,
-    measure: fn(&Arc<Gpu>, u64) -> f64,
-}
+/// A case that needs a device: name, input, oracle, unit, bound and measure, as [`Case::new`] takes them.
+pub struct GpuCase(
+    pub &'static str,
+    pub &'static str,
+    pub &'static str,
+    pub &'static str,
+    pub f64,
+    pub fn(&Arc<Gpu>, u64) -> f64,
+);
 
 impl GpuCase {
-    /// A case from its parts, in the order of [`Case::new`].
-    pub const fn new(
-        name: &'static str,
-        input: &'static str,
-        oracle: &'static str,
-        unit: &'static str,
-        bound: f64,
-        measure: fn(&Arc<Gpu>, u64) -> f64,
-    ) -> Self {
-        Self { name, input, oracle, unit, bound, measure }
-    }
-
     /// The case on a device; without one it says what is missing.
     fn on(&self, device: &Device) -> Case {
-        let &Self { name, input, oracle, unit, bound, measure } = self;
+        let &Self(name, input, oracle, unit, bound, measure) = self;
         match device {
             Ok(gpu) => {
                 let gpu = gpu.clone();

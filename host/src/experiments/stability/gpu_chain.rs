@@ -15,7 +15,7 @@ const SCENES: u64 = 17;
 
 /// The cases.
 pub const CASES: &[GpuCase] = &[
-    GpuCase::new(
+    GpuCase(
         "gpu-random-scenes-pixels",
         "17 scenes by chance: shapes, poses, all materials, textures, lights, skies",
         "f64 tracer: pixels beyond 4 sigma by those that chance allows",
@@ -23,7 +23,7 @@ pub const CASES: &[GpuCase] = &[
         1.0,
         |gpu, seed| worst(gpu, seed).0,
     ),
-    GpuCase::new(
+    GpuCase(
         "gpu-random-scenes-mean",
         "the same",
         "f64 tracer: mean radiance, by 4 sigma and 0.2 %",
@@ -31,7 +31,7 @@ pub const CASES: &[GpuCase] = &[
         1.0,
         |gpu, seed| worst(gpu, seed).1,
     ),
-    GpuCase::new(
+    GpuCase(
         "gpu-random-scenes-surfaces",
         "the same",
         "f64 tracer: pixels that see something else",

@@ -17,7 +17,7 @@ use glam::{DAffine3, DQuat, DVec3, Vec3};
 use std::sync::Arc;
 
 const fn case(name: &'static str, input: &'static str, measure: fn(&Arc<Gpu>, u64) -> f64) -> GpuCase {
-    GpuCase::new(name, input, "a picture without the past", "radiance", 1e-4, measure)
+    GpuCase(name, input, "a picture without the past", "radiance", 1e-4, measure)
 }
 
 /// The cases.
@@ -37,7 +37,7 @@ pub const CASES: &[GpuCase] = &[
         "histories of wrong light that are two frames old, every method",
         stale_history,
     ),
-    GpuCase::new(
+    GpuCase(
         "gpu-eye-looks-again",
         "a plate that glides and jumps between the eye and a floor, out of the projector's light, method dpm",
         "where every pixel asks the eye in every frame: nothing seen is dark, nothing hidden is lit for more than three frames, nor at all where it glides",

@@ -18,7 +18,7 @@ use std::sync::Arc;
 
 /// The cases.
 pub const CASES: &[GpuCase] = &[
-    GpuCase::new(
+    GpuCase(
         "gpu-tiles-at-borders",
         "rasters of 1 x 1 to 33 x 31, every method",
         "closed form: 1 in every lit pixel",
@@ -26,7 +26,7 @@ pub const CASES: &[GpuCase] = &[
         1e-4,
         borders,
     ),
-    GpuCase::new(
+    GpuCase(
         "gpu-constant-input",
         "300 frames of even light, every method",
         "closed form: 1, no drift",
@@ -34,7 +34,7 @@ pub const CASES: &[GpuCase] = &[
         1e-4,
         constant_input,
     ),
-    GpuCase::new(
+    GpuCase(
         "gpu-step-input",
         "a light that comes down at once by 3 m, every method without shading rates, a quarter of a second later",
         "closed form, in steps of 8-bit codes",
@@ -42,7 +42,7 @@ pub const CASES: &[GpuCase] = &[
         1.0,
         step_input,
     ),
-    GpuCase::new(
+    GpuCase(
         "gpu-step-follows-the-paper",
         "the same step frame by frame, method paper",
         "closed form: (1 - 0.2)^n",
@@ -50,7 +50,7 @@ pub const CASES: &[GpuCase] = &[
         1e-3,
         step_paper,
     ),
-    GpuCase::new(
+    GpuCase(
         "gpu-poisoned-history",
         "NaN and infinity in all of the history or one pixel, every method",
         "gone two frames later, neighbours clean",
@@ -58,7 +58,7 @@ pub const CASES: &[GpuCase] = &[
         0.0,
         poisoned,
     ),
-    GpuCase::new(
+    GpuCase(
         "gpu-rate-map-equals-cpu",
         "64 x 48 of moving surfaces, method paper",
         "the CPU's decision, bit for bit",
@@ -66,7 +66,7 @@ pub const CASES: &[GpuCase] = &[
         0.0,
         rate_map,
     ),
-    GpuCase::new(
+    GpuCase(
         "gpu-nobody-waits",
         "24 frames of method paper at mixed rates with checkerboard",
         "every block is traced in every second frame",
@@ -74,7 +74,7 @@ pub const CASES: &[GpuCase] = &[
         0.0,
         nobody_waits,
     ),
-    GpuCase::new(
+    GpuCase(
         "gpu-rates-keep-energy",
         "every method against all pixels traced, 48 frames",
         "mean radiance",
@@ -82,7 +82,7 @@ pub const CASES: &[GpuCase] = &[
         5e-3,
         energy_kept,
     ),
-    GpuCase::new(
+    GpuCase(
         "gpu-noise-free-is-exact",
         "a mirror ball that crosses the picture under an uneven sky, method dpm, one sample asked for and four",
         "each frame as drawn without a history, one sample a lit pixel",

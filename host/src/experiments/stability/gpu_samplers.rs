@@ -19,7 +19,7 @@ use std::sync::Arc;
 
 /// The cases.
 pub const CASES: &[GpuCase] = &[
-    GpuCase::new(
+    GpuCase(
         "gpu-noise-falls",
         "independent samples, blue noise and sequences that go on: 1 and 16 samples a frame, 1 and 64 frames",
         "closed form: by the root of their number, independent samples neither faster nor slower",
@@ -27,7 +27,7 @@ pub const CASES: &[GpuCase] = &[
         1.15,
         noise_falls,
     ),
-    GpuCase::new(
+    GpuCase(
         "gpu-samplers-agree",
         "the same in 64 frames of 4 samples: means of pixels and of the picture",
         "independent samples: difference by what chance allows",

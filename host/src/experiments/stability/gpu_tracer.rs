@@ -13,7 +13,7 @@ use std::sync::Arc;
 
 /// The cases.
 pub const CASES: &[GpuCase] = &[
-    GpuCase::new(
+    GpuCase(
         "gpu-furnace-convex",
         "white Lambertian sphere in even light, 64 bounces",
         "closed form: 1 in every pixel",
@@ -21,7 +21,7 @@ pub const CASES: &[GpuCase] = &[
         2e-6,
         furnace_convex,
     ),
-    GpuCase::new(
+    GpuCase(
         "gpu-furnace-corner",
         "corner of three white walls in even light, 64 bounces",
         "closed form: mean 1",
@@ -29,7 +29,7 @@ pub const CASES: &[GpuCase] = &[
         4.0,
         furnace_corner,
     ),
-    GpuCase::new(
+    GpuCase(
         "gpu-closed-sphere",
         "albedo and emission 1/2 inside spheres of 1 mm to 10 km, up to 10 km off the origin",
         "closed form: 1 - 2^-depth, every ray hits",
@@ -37,7 +37,7 @@ pub const CASES: &[GpuCase] = &[
         4.0,
         closed_sphere,
     ),
-    GpuCase::new(
+    GpuCase(
         "gpu-energy-of-every-lobe",
         "roughness 0 to 1; metal, coat, thin, solid; at all angles and at 89.99 deg",
         "albedo at most 1",
@@ -45,7 +45,7 @@ pub const CASES: &[GpuCase] = &[
         2e-3,
         energy,
     ),
-    GpuCase::new(
+    GpuCase(
         "gpu-single-scatter-loss",
         "white rough metal, alpha 0.25, 0.5, 1",
         "albedo 0.882, 0.700, 0.409 on average",
@@ -53,7 +53,7 @@ pub const CASES: &[GpuCase] = &[
         4e-3,
         single_scatter,
     ),
-    GpuCase::new(
+    GpuCase(
         "gpu-fresnel",
         "mirror-like dielectric of index 1, 1 + 1e-7, 1.1, 1.5, 2.4 at 5 to 88 deg",
         "Fresnel's equations",
@@ -61,7 +61,7 @@ pub const CASES: &[GpuCase] = &[
         1e-3,
         fresnel,
     ),
-    GpuCase::new(
+    GpuCase(
         "gpu-index-near-one",
         "clear slab of index 1, 1 + 1e-7, 1.0005, 1.002 in even light",
         "closed form: 1, continuous",
@@ -69,7 +69,7 @@ pub const CASES: &[GpuCase] = &[
         2e-3,
         near_one,
     ),
-    GpuCase::new(
+    GpuCase(
         "gpu-sphere-light-form-factor",
         "sphere light over a floor",
         "closed form: E = pi L (r / h)^2",
@@ -77,7 +77,7 @@ pub const CASES: &[GpuCase] = &[
         1.5e-2,
         form_factor,
     ),
-    GpuCase::new(
+    GpuCase(
         "gpu-scale-and-place",
         "a scene at 2^-13 to 2^13 of its size, and 2.3 km off the origin, also at 1/1000 of its size",
         "same image",
@@ -85,7 +85,7 @@ pub const CASES: &[GpuCase] = &[
         1e-2,
         scale_and_place,
     ),
-    GpuCase::new(
+    GpuCase(
         "gpu-far-from-origin",
         "bodies, projector and eye moved 1e5 m by their poses",
         "same image",
@@ -93,7 +93,7 @@ pub const CASES: &[GpuCase] = &[
         1e-2,
         far_from_origin,
     ),
-    GpuCase::new(
+    GpuCase(
         "gpu-lights-that-touch",
         "lamp 1 mm over the surface, in the surface, point lights 0 and 10 um over it",
         "f64 reference: pixels beyond 4 sigma by those allowed",
@@ -101,7 +101,7 @@ pub const CASES: &[GpuCase] = &[
         1.0,
         touching_lights,
     ),
-    GpuCase::new(
+    GpuCase(
         "gpu-sun-and-lamp",
         "sun of 1e5, lamp of 1e-3 on one floor",
         "closed form, sun alone and lamp alone",
@@ -109,7 +109,7 @@ pub const CASES: &[GpuCase] = &[
         2e-2,
         sun_and_lamp,
     ),
-    GpuCase::new(
+    GpuCase(
         "gpu-no-light",
         "no light, black lights, a black texture, a black sky",
         "all 0",
@@ -117,7 +117,7 @@ pub const CASES: &[GpuCase] = &[
         0.0,
         no_light,
     ),
-    GpuCase::new(
+    GpuCase(
         "gpu-many-lights",
         "100,000 point lights, a fifth of them black",
         "closed form: sum",
@@ -125,7 +125,7 @@ pub const CASES: &[GpuCase] = &[
         4.0,
         many_lights,
     ),
-    GpuCase::new(
+    GpuCase(
         "gpu-extreme-radiance",
         "emission 0, 1e-40, 3e38 under every method",
         "finite or at full code; black is black",
@@ -133,7 +133,7 @@ pub const CASES: &[GpuCase] = &[
         0.0,
         extreme_radiance,
     ),
-    GpuCase::new(
+    GpuCase(
         "gpu-firefly-limit",
         "limits of 0.002, 0.02 and 1e30",
         "what is left is below it; removes and counts, never adds; out of reach it changes nothing",

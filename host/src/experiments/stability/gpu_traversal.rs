@@ -15,16 +15,16 @@ use std::sync::Arc;
 
 /// The cases.
 pub const CASES: &[GpuCase] = &[
-    GpuCase::new("gpu-axis-parallel-rays", "rays along all axes, in the planes of seams and through vertices, at distances that round differently", "every ray hits at its closed form", "faults", 0.0, axis_parallel),
-    GpuCase::new("gpu-needles-and-zero-areas", "points, lines, needles of 1e-20 and twins in a closed mesh", "the picture without them", "radiance", 1e-5, needles),
-    GpuCase::new("gpu-watertight", "a million rays inside a closed mesh 80 m off its origin under a bright sky", "none gets out", "share", 0.0, watertight),
-    GpuCase::new("gpu-leaves-no-light-through", "a bright lamp inside a closed sphere of 1 mm to 10 km, seen from outside", "black", "radiance", 0.0, opaque),
-    GpuCase::new("gpu-hierarchy-sizes", "0, 1, 2, 3, 1,000, 50,000 triangles; 3,000 of one centroid", "f64 reference: pixels that see something else", "share", 5e-3, hierarchy_sizes),
-    GpuCase::new("gpu-hierarchy-depth", "129 triangles at distances that double: chains deeper than the traversal stack", "closed form distance of the one in front", "faults", 0.0, hierarchy_depth),
-    GpuCase::new("gpu-hierarchy-heaps", "140 heaps of 12 twins, each 1.3 times the one before: a heap waits on every level of a tree by area", "closed form: the one triangle that is not off the axis is met, in whichever heap", "faults", 0.0, heaps_in_a_chain),
-    GpuCase::new("gpu-unusable-coordinates", "vertices at NaN, infinity and 1e7 m", "refused by name, nothing drawn", "faults", 0.0, unusable),
-    GpuCase::new("gpu-random-streams", "neighbouring pixels, frames, seeds, and frames about 2^32", "correlation", "sigma", 5.0, streams),
-    GpuCase::new("gpu-same-seed-same-bits", "every method twice, eight frames", "bit for bit", "values", 0.0, same_bits),
+    GpuCase("gpu-axis-parallel-rays", "rays along all axes, in the planes of seams and through vertices, at distances that round differently", "every ray hits at its closed form", "faults", 0.0, axis_parallel),
+    GpuCase("gpu-needles-and-zero-areas", "points, lines, needles of 1e-20 and twins in a closed mesh", "the picture without them", "radiance", 1e-5, needles),
+    GpuCase("gpu-watertight", "a million rays inside a closed mesh 80 m off its origin under a bright sky", "none gets out", "share", 0.0, watertight),
+    GpuCase("gpu-leaves-no-light-through", "a bright lamp inside a closed sphere of 1 mm to 10 km, seen from outside", "black", "radiance", 0.0, opaque),
+    GpuCase("gpu-hierarchy-sizes", "0, 1, 2, 3, 1,000, 50,000 triangles; 3,000 of one centroid", "f64 reference: pixels that see something else", "share", 5e-3, hierarchy_sizes),
+    GpuCase("gpu-hierarchy-depth", "129 triangles at distances that double: chains deeper than the traversal stack", "closed form distance of the one in front", "faults", 0.0, hierarchy_depth),
+    GpuCase("gpu-hierarchy-heaps", "140 heaps of 12 twins, each 1.3 times the one before: a heap waits on every level of a tree by area", "closed form: the one triangle that is not off the axis is met, in whichever heap", "faults", 0.0, heaps_in_a_chain),
+    GpuCase("gpu-unusable-coordinates", "vertices at NaN, infinity and 1e7 m", "refused by name, nothing drawn", "faults", 0.0, unusable),
+    GpuCase("gpu-random-streams", "neighbouring pixels, frames, seeds, and frames about 2^32", "correlation", "sigma", 5.0, streams),
+    GpuCase("gpu-same-seed-same-bits", "every method twice, eight frames", "bit for bit", "values", 0.0, same_bits),
 ];
 
 /// A floor of `n` x `n` squares of side `side` whose seams lie on round numbers, about the origin.
