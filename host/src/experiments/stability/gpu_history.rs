@@ -12,7 +12,7 @@ use crate::render::method::Method;
 use crate::render::rate_map::{decide, rate_table, PixelGuide, RateConstants};
 use crate::render::{FrameSlot, Renderer};
 use crate::scene::{Environment, Material, PunctualKind, PunctualLight, Scene};
-use dpm_shaders::structs::{History, NO_HIT};
+use dpm_shaders::structs::{History, Surface, HISTORY_EXACT, NO_HIT};
 use glam::{DAffine3, DVec3, Vec3};
 use std::sync::Arc;
 
@@ -89,6 +89,22 @@ pub const CASES: &[GpuCase] = &[
         "radiance",
         1e-5,
         noise_free,
+    ),
+    GpuCase(
+        "gpu-chance-comes-in",
+        "a matte ball that passes a standing mirror ball, method dpm, two samples asked for",
+        "a pixel that begins to mirror it takes four in that frame and counts none of before; one that ends is exact at once",
+        "faults",
+        0.0,
+        chance_comes_in,
+    ),
+    GpuCase(
+        "gpu-new-points-at-once",
+        "a matte ball that crosses the picture under an uneven sky, method dpm, one sample asked for",
+        "a point never seen before has a sample in its first frame, whatever the others' noise",
+        "faults",
+        0.0,
+        new_points,
     ),
 ];
 
@@ -449,11 +465,16 @@ fn energy_kept(gpu: &Arc<Gpu>, seed: u64) -> f64 {
     worst
 }
 
-fn noise_free(gpu: &Arc<Gpu>, seed: u64) -> f64 {
+/// Under an uneven sky.
+fn mirror_ball() -> Scene {
     let mirror = Material { metallic: 1.0, roughness: 0.0, ..diffuse(Vec3::new(0.9, 0.8, 0.7)) };
     let mut scene = scene_of(sphere(Vec3::ZERO, 0.5, 3, true), mirror);
     scene.environment = image_sky(1.0);
-    let eye = Some(DVec3::new(0.4, 0.5, 3.0));
+    scene
+}
+
+fn noise_free(gpu: &Arc<Gpu>, seed: u64) -> f64 {
+    let (scene, eye) = (mirror_ball(), Some(DVec3::new(0.4, 0.5, 3.0)));
     // A pixel and a half a frame, over tiles and in from beyond the picture's edge.
     let poses = |frame: u32| vec![DAffine3::from_translation(DVec3::X * (f64::from(frame) * 0.06 - 1.0))];
     let mut worst: f64 = 0.0;
@@ -464,7 +485,7 @@ fn noise_free(gpu: &Arc<Gpu>, seed: u64) -> f64 {
             frames: 30,
             seed: seed as u32,
             method: Some(method),
-            ..Shot::new(&scene, camera(48, 36, DVec3::new(0.0, 0.3, 3.0), DVec3::ZERO))
+            ..Shot::new(&scene, camera(64, 48, DVec3::new(0.0, 0.3, 3.0), DVec3::ZERO))
         };
         let (mut wanted, mut lit, mut traced) = (Vec::new(), 0u32, 0u32);
         play(gpu, &shot(Method::full(1)), poses, |_, slot| {
@@ -483,4 +504,79 @@ fn noise_free(gpu: &Arc<Gpu>, seed: u64) -> f64 {
         }
     }
     worst
+}
+
+fn chance_comes_in(gpu: &Arc<Gpu>, seed: u64) -> f64 {
+    let mut scene = mirror_ball();
+    add(&mut scene, sphere(Vec3::ZERO, 0.3, 2, true), diffuse(Vec3::splat(0.5)));
+    let poses = |frame: u32| {
+        [DVec3::ZERO, DVec3::new(1.0, 0.4, 1.2 - 0.05 * f64::from(frame))]
+            .map(DAffine3::from_translation)
+            .to_vec()
+    };
+    let shot = Shot {
+        eye: Some(DVec3::new(0.4, 0.5, 3.0)),
+        spp: 2,
+        frames: 48,
+        seed: seed as u32,
+        method: Some(method_of(&RenderConfig::default(), RenderMethod::Dpm)),
+        ..Shot::new(&scene, camera(64, 48, DVec3::new(0.0, 0.3, 3.0), DVec3::ZERO))
+    };
+    // Of the mirror's pixels, which stand: the flags of the frame before.
+    let (mut before, mut begun, mut ended, mut faults) = (Vec::new(), 0u32, 0u32, 0u32);
+    play(gpu, &shot, poses, |_, slot| {
+        let (history, traced) = (slot.history().unwrap_or(&[]), slot.traced().unwrap_or(&[]));
+        let mirrors = |s: &Surface| s.id != NO_HIT && s.distance > 0.0 && s.id >> 24 == 0;
+        let lit: Vec<bool> = slot.surfaces().unwrap_or(&[]).iter().map(mirrors).collect();
+        let exact: Vec<bool> = history.iter().map(|h| h.flags & HISTORY_EXACT != 0).collect();
+        for (i, was) in before.iter().enumerate().filter(|(i, _)| lit[*i]) {
+            match (*was, exact[i]) {
+                (true, false) => {
+                    begun += 1;
+                    faults += u32::from(traced[i][3] < 4.0 || history[i].weight != traced[i][3]);
+                }
+                (false, true) => {
+                    ended += 1;
+                    faults += u32::from(history[i].weight != 1.0 || history[i].variance != 0.0);
+                }
+                _ => {}
+            }
+        }
+        before = exact;
+    });
+    if begun < 30 || ended < 30 {
+        return f64::NAN;
+    }
+    f64::from(faults)
+}
+
+fn new_points(gpu: &Arc<Gpu>, seed: u64) -> f64 {
+    // Of an uneven sky: the budget goes to where the noise is.
+    let mut scene = scene_of(sphere(Vec3::ZERO, 0.5, 3, true), diffuse(Vec3::splat(0.7)));
+    scene.environment = image_sky(1.0);
+    let shot = Shot {
+        eye: Some(DVec3::new(0.4, 0.5, 3.0)),
+        spp: 1,
+        frames: 40,
+        seed: seed as u32,
+        method: Some(method_of(&RenderConfig::default(), RenderMethod::Dpm)),
+        ..Shot::new(&scene, camera(64, 48, DVec3::new(0.0, 0.0, 3.0), DVec3::ZERO))
+    };
+    let poses = |frame: u32| vec![DAffine3::from_translation(DVec3::X * (f64::from(frame) * 0.06 - 1.2))];
+    let (mut new, mut waits, mut faults) = (0u32, 0u32, 0u32);
+    play(gpu, &shot, poses, |_, slot| {
+        let (history, traced) = (slot.history().unwrap_or(&[]), slot.traced().unwrap_or(&[]));
+        let surfaces = slot.surfaces().unwrap_or(&[]);
+        let lit = |i: &usize| surfaces[*i].id != NO_HIT && surfaces[*i].distance > 0.0;
+        for i in (0..surfaces.len()).filter(lit) {
+            waits += u32::from(traced[i][3] == 0.0);
+            new += u32::from(traced[i][3] > 0.0 && history[i].index == traced[i][3] as u32);
+            faults += u32::from(history[i].index == 0);
+        }
+    });
+    // Some must be new, and some not be traced in every frame, or nothing is told.
+    if new < 200 || waits < 200 {
+        return f64::NAN;
+    }
+    f64::from(faults)
 }
