@@ -32,7 +32,7 @@ void main() {
         filtered[at] = Filtered(vec3(0.0), 0.0);
         return;
     }
-    History h = histories[frame.parity * frame.width * frame.height + at];
+    History h = histories[at];
     if ((frame.flags & FRAME_DPM) != 0u) {
         vec4 traced = radiance_in[at];
         vec3 albedo = albedo_of(guide_at(at));
@@ -108,5 +108,5 @@ void main() {
         }
         filtered[at] = Filtered(h.mean, 1.0);
     }
-    histories[frame.parity * frame.width * frame.height + at] = h;
+    histories[at] = h;
 }

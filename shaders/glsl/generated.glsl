@@ -59,6 +59,7 @@
 #define B_GUIDE_ROWS 28u
 #define B_HISTORY_ROWS 29u
 #define B_FILTERED_ROWS 30u
+#define B_FORMER 31u
 // Sobol dimensions 1 to 3 of the lowest 16 bits of an index, without branch or table look-up.
 #define SOBOL_123(i) uvec3((uint(bitfieldExtract(int(i), 0, 1)) & 2147483648u) ^ (uint(bitfieldExtract(int(i), 1, 1)) & 3221225472u) ^ (uint(bitfieldExtract(int(i), 2, 1)) & 2684354560u) ^ (uint(bitfieldExtract(int(i), 3, 1)) & 4026531840u) ^ (uint(bitfieldExtract(int(i), 4, 1)) & 2281701376u) ^ (uint(bitfieldExtract(int(i), 5, 1)) & 3422552064u) ^ (uint(bitfieldExtract(int(i), 6, 1)) & 2852126720u) ^ (uint(bitfieldExtract(int(i), 7, 1)) & 4278190080u) ^ (uint(bitfieldExtract(int(i), 8, 1)) & 2155872256u) ^ (uint(bitfieldExtract(int(i), 9, 1)) & 3233808384u) ^ (uint(bitfieldExtract(int(i), 10, 1)) & 2694840320u) ^ (uint(bitfieldExtract(int(i), 11, 1)) & 4042260480u) ^ (uint(bitfieldExtract(int(i), 12, 1)) & 2290614272u) ^ (uint(bitfieldExtract(int(i), 13, 1)) & 3435921408u) ^ (uint(bitfieldExtract(int(i), 14, 1)) & 2863267840u) ^ (uint(bitfieldExtract(int(i), 15, 1)) & 4294901760u), (uint(bitfieldExtract(int(i), 0, 1)) & 2147483648u) ^ (uint(bitfieldExtract(int(i), 1, 1)) & 3221225472u) ^ (uint(bitfieldExtract(int(i), 2, 1)) & 1610612736u) ^ (uint(bitfieldExtract(int(i), 3, 1)) & 2415919104u) ^ (uint(bitfieldExtract(int(i), 4, 1)) & 3892314112u) ^ (uint(bitfieldExtract(int(i), 5, 1)) & 1543503872u) ^ (uint(bitfieldExtract(int(i), 6, 1)) & 2382364672u) ^ (uint(bitfieldExtract(int(i), 7, 1)) & 3305111552u) ^ (uint(bitfieldExtract(int(i), 8, 1)) & 1753219072u) ^ (uint(bitfieldExtract(int(i), 9, 1)) & 2629828608u) ^ (uint(bitfieldExtract(int(i), 10, 1)) & 3999268864u) ^ (uint(bitfieldExtract(int(i), 11, 1)) & 1435500544u) ^ (uint(bitfieldExtract(int(i), 12, 1)) & 2154299392u) ^ (uint(bitfieldExtract(int(i), 13, 1)) & 3231449088u) ^ (uint(bitfieldExtract(int(i), 14, 1)) & 1626210304u) ^ (uint(bitfieldExtract(int(i), 15, 1)) & 2421489664u), (uint(bitfieldExtract(int(i), 0, 1)) & 2147483648u) ^ (uint(bitfieldExtract(int(i), 1, 1)) & 3221225472u) ^ (uint(bitfieldExtract(int(i), 2, 1)) & 536870912u) ^ (uint(bitfieldExtract(int(i), 3, 1)) & 1342177280u) ^ (uint(bitfieldExtract(int(i), 4, 1)) & 4160749568u) ^ (uint(bitfieldExtract(int(i), 5, 1)) & 1946157056u) ^ (uint(bitfieldExtract(int(i), 6, 1)) & 2717908992u) ^ (uint(bitfieldExtract(int(i), 7, 1)) & 2466250752u) ^ (uint(bitfieldExtract(int(i), 8, 1)) & 3632267264u) ^ (uint(bitfieldExtract(int(i), 9, 1)) & 624951296u) ^ (uint(bitfieldExtract(int(i), 10, 1)) & 1507852288u) ^ (uint(bitfieldExtract(int(i), 11, 1)) & 3872391168u) ^ (uint(bitfieldExtract(int(i), 12, 1)) & 2013790208u) ^ (uint(bitfieldExtract(int(i), 13, 1)) & 3020685312u) ^ (uint(bitfieldExtract(int(i), 14, 1)) & 2181169152u) ^ (uint(bitfieldExtract(int(i), 15, 1)) & 3271884800u))
 
@@ -88,7 +89,6 @@ struct Frame {
     float environment_rotation;
     float environment_select;
     vec3 world_origin;
-    uint parity;
     uint history_frame;
     float budget_spp;
     float history_cap;

@@ -35,13 +35,12 @@ bool still_seen(uvec2 pixel, uint instance, vec2 before) {
     vec2 motion = abs(vec2(pixel) + 0.5 - before);
     if (!(max(motion.x, motion.y) < 4.0)) return false;
     ivec2 corner = ivec2(floor(clamp(before, vec2(-4.0), vec2(frame.width, frame.height) + 4.0)));
-    uint former = (1u - frame.parity) * frame.width * frame.height;
     const ivec2 around[5] = ivec2[](ivec2(0), ivec2(-2, -2), ivec2(2, -2), ivec2(-2, 2), ivec2(2, 2));
     bool seen = true;
     for (int i = 0; i < 5; i++) {
         ivec2 q = corner + around[i];
         bool inside = all(greaterThanEqual(q, ivec2(0))) && all(lessThan(q, ivec2(frame.width, frame.height)));
-        History h = history_at(former + (inside ? uint(q.y) * frame.width + uint(q.x) : 0u));
+        History h = former_at(inside ? uint(q.y) * frame.width + uint(q.x) : 0u);
         seen = seen && inside && h.frame == frame.history_frame && h.instance == instance && (h.flags & HISTORY_HIDDEN) == 0u;
     }
     return seen;

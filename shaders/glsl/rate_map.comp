@@ -55,7 +55,7 @@ float known_luminance(uint x, uint y, out bool lit) {
     uint at = y * frame.width + x;
     lit = is_lit(surface_at(at));
     if (!lit) return 0.0;
-    History h = history_at(frame.parity * frame.width * frame.height + at);
+    History h = history_at(at);
     vec3 c = h.mean;
     precise float l = c.x * 0.2126 + c.y * 0.7152 + c.z * 0.0722;
     return h.weight > 0.0 ? l : -1.0;

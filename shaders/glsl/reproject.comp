@@ -26,18 +26,18 @@ struct Carried {
 };
 
 bool tap_valid(uint index, uint instance, vec3 position, vec3 normal, float footprint, float depth) {
-    if (history_at(index).frame != frame.history_frame || history_at(index).instance != instance || !(history_at(index).weight > 0.0)) return false;
-    vec3 apart = history_at(index).position - position;
-    vec3 tap_normal = decode_normal(history_at(index).normal);
+    if (former_at(index).frame != frame.history_frame || former_at(index).instance != instance || !(former_at(index).weight > 0.0)) return false;
+    vec3 apart = former_at(index).position - position;
+    vec3 tap_normal = decode_normal(former_at(index).normal);
     return dot(tap_normal, normal) > 0.9 && abs(dot(apart, normal)) < depth * footprint && dot(apart, apart) < 16.0 * footprint * footprint;
 }
 
 void add_tap(inout Carried c, uint index, float w) {
-    c.mean += w * history_at(index).mean;
-    c.weight += w * history_at(index).weight;
-    c.drift += w * history_at(index).drift;
-    c.variance += w * history_at(index).variance;
-    c.surprise += w * history_at(index).surprise;
+    c.mean += w * former_at(index).mean;
+    c.weight += w * former_at(index).weight;
+    c.drift += w * former_at(index).drift;
+    c.variance += w * former_at(index).variance;
+    c.surprise += w * former_at(index).surprise;
     c.total += w;
 }
 
@@ -56,7 +56,6 @@ void forget(inout History h, uint at) {
 // Methods paper and miyamoto: what the four histories around say, weighted bilinearly. `h` stays as it is where none is valid.
 void carry_bilinear(inout History h, vec3 normal, float footprint, vec2 before) {
     if (!all(greaterThan(before, vec2(0.0))) || !all(lessThan(before, vec2(frame.width, frame.height)))) return;
-    uint former = (1u - frame.parity) * frame.width * frame.height;
     vec2 base = floor(before - 0.5);
     vec2 f = before - 0.5 - base;
     // What stands still is fetched exactly.
@@ -74,7 +73,7 @@ void carry_bilinear(inout History h, vec3 normal, float footprint, vec2 before) 
         ivec2 q = corner + o;
         float w = (o.x == 1 ? f.x : 1.0 - f.x) * (o.y == 1 ? f.y : 1.0 - f.y);
         if (w <= 0.0 || any(lessThan(q, ivec2(0))) || any(greaterThan(q, limit))) continue;
-        uint tap = former + uint(q.y) * frame.width + uint(q.x);
+        uint tap = uint(q.y) * frame.width + uint(q.x);
         if (!tap_valid(tap, h.instance, h.position, normal, footprint, 2.0)) continue;
         add_tap(c, tap, w);
         if (w > best) {
@@ -90,8 +89,8 @@ void carry_bilinear(inout History h, vec3 normal, float footprint, vec2 before) 
     h.variance = c.variance * s;
     h.surprise = c.surprise * s;
     // The sequence goes on where the nearest point left it.
-    h.seed = history_at(nearest).seed;
-    h.index = history_at(nearest).index;
+    h.seed = former_at(nearest).seed;
+    h.index = former_at(nearest).index;
 }
 
 // Method dpm: every history belongs to one surface point for as long as it is seen. It goes to the pixel that the point is in now, so nothing is
@@ -99,7 +98,6 @@ void carry_bilinear(inout History h, vec3 normal, float footprint, vec2 before) 
 void carry_point(inout History h, vec3 normal, float footprint, uvec2 pixel, vec2 before) {
     vec2 centre = vec2(pixel) + 0.5;
     uint at = pixel.y * frame.width + pixel.x;
-    uint pixels = frame.width * frame.height, former = (1u - frame.parity) * pixels;
     ivec2 corner = ivec2(floor(clamp(before, vec2(-4.0), vec2(frame.width, frame.height) + 4.0)));
     vec3 sum = vec3(0.0), sum_x = vec3(0.0), sum_y = vec3(0.0), lower = vec3(INFINITY), upper = vec3(-INFINITY);
     float squares = 0.0, total = 0.0, x = 0.0, y = 0.0, xx = 0.0, xy = 0.0, yy = 0.0, nearest = 1.5;
@@ -108,13 +106,13 @@ void carry_point(inout History h, vec3 normal, float footprint, uvec2 pixel, vec
     for (int i = 0; i < 9; i++) {
         ivec2 q = corner + ivec2(i % 3, i / 3) - 1;
         if (any(lessThan(q, ivec2(0))) || any(greaterThanEqual(q, ivec2(frame.width, frame.height)))) continue;
-        uint tap = former + uint(q.y) * frame.width + uint(q.x);
+        uint tap = uint(q.y) * frame.width + uint(q.x);
         if (!tap_valid(tap, h.instance, h.position, normal, footprint, 0.5)) continue;
-        vec2 e = project(transform_point(instance_at(h.instance).world_from_object, history_at(tap).position)) - centre;
-        vec3 m = history_at(tap).mean;
-        float w = history_at(tap).weight;
+        vec2 e = project(transform_point(instance_at(h.instance).world_from_object, former_at(tap).position)) - centre;
+        vec3 m = former_at(tap).mean;
+        float w = former_at(tap).weight;
         // A broken history is as good as none.
-        bool sound = finite(history_at(tap).drift) && finite(history_at(tap).variance) && finite(history_at(tap).surprise);
+        bool sound = finite(former_at(tap).drift) && finite(former_at(tap).variance) && finite(former_at(tap).surprise);
         if (!sound || !finite3(m) || !finite(w) || !finite(e.x + e.y)) continue;
         total += w;
         taps++;
@@ -138,7 +136,7 @@ void carry_point(inout History h, vec3 normal, float footprint, uvec2 pixel, vec
     }
     vec3 shift = vec3(0.0), g_x = vec3(0.0), g_y = vec3(0.0);
     if (owner != NO_HIT) {
-        History known = history_at(owner);
+        History known = former_at(owner);
         float s = 1.0 / total;
         x *= s;
         y *= s;
@@ -194,9 +192,8 @@ void carry_point(inout History h, vec3 normal, float footprint, uvec2 pixel, vec
 }
 
 // A pixel beside a body's edge keeps the history of a point that is in it although its own ray misses: the next frame may bring it back.
-void keep_hidden(uvec2 pixel, uint to) {
+void keep_hidden(uvec2 pixel) {
     vec2 centre = vec2(pixel) + 0.5;
-    uint pixels = frame.width * frame.height, former = (1u - frame.parity) * pixels;
     ivec2 size = ivec2(frame.width, frame.height);
     uint instance = NO_HIT;
     vec2 before = centre;
@@ -217,21 +214,21 @@ void keep_hidden(uvec2 pixel, uint to) {
     for (int i = 0; i < 9; i++) {
         ivec2 q = corner + ivec2(i % 3, i / 3) - 1;
         if (any(lessThan(q, ivec2(0))) || any(greaterThanEqual(q, size))) continue;
-        uint tap = former + uint(q.y) * frame.width + uint(q.x);
-        if (history_at(tap).frame != frame.history_frame || history_at(tap).instance != instance || !(history_at(tap).weight > 0.0)) continue;
-        vec3 p = transform_point(instance_at(instance).world_from_object, history_at(tap).position);
+        uint tap = uint(q.y) * frame.width + uint(q.x);
+        if (former_at(tap).frame != frame.history_frame || former_at(tap).instance != instance || !(former_at(tap).weight > 0.0)) continue;
+        vec3 p = transform_point(instance_at(instance).world_from_object, former_at(tap).position);
         vec2 e = project(p) - centre;
         float far = max(abs(e.x), abs(e.y));
-        if (far < nearest && dot(transform_vector(instance_at(instance).world_from_object, decode_normal(history_at(tap).normal)), p) < 0.0) {
+        if (far < nearest && dot(transform_vector(instance_at(instance).world_from_object, decode_normal(former_at(tap).normal)), p) < 0.0) {
             nearest = far;
             owner = tap;
         }
     }
     if (owner == NO_HIT) return;
-    History h = history_at(owner);
+    History h = former_at(owner);
     h.frame = frame.frame;
     h.flags |= HISTORY_HIDDEN;
-    histories[to] = h;
+    histories[pixel.y * frame.width + pixel.x] = h;
 }
 
 void main() {
@@ -239,8 +236,6 @@ void main() {
     uint tile = tiles[gl_WorkGroupID.x >> 2u];
     if (!tile_pixel(tile, pixel)) return;
     uint at = pixel.y * frame.width + pixel.x;
-    uint pixels = frame.width * frame.height;
-    uint current = frame.parity * pixels;
     Surface surface = surface_at(at);
     uint importance = 0u, lit = 0u;
     if (is_lit(surface)) {
@@ -264,12 +259,12 @@ void main() {
         if ((frame.flags & FRAME_DPM) != 0u) carry_point(h, normal, footprint, pixel, before);
         else carry_bilinear(h, normal, footprint, before);
         h.flags &= ~HISTORY_HIDDEN;
-        histories[current + at] = h;
+        histories[at] = h;
         importance = importance_of(h);
     } else {
-        histories[current + at].weight = 0.0;
-        histories[current + at].frame = frame.frame - 1u;
-        if ((frame.flags & FRAME_DPM) != 0u) keep_hidden(pixel, current + at);
+        histories[at].weight = 0.0;
+        histories[at].frame = frame.frame - 1u;
+        if ((frame.flags & FRAME_DPM) != 0u) keep_hidden(pixel);
     }
     uint total = subgroupAdd(importance);
     uint lit_total = subgroupAdd(lit);

@@ -21,7 +21,7 @@ uint samples_of(uvec2 pixel, uint at) {
     if ((frame.flags & FRAME_CAMERA_IS_EYE) != 0u) return surface_at(at).id == NO_HIT ? 1u : frame.spp;
     if (!is_lit(surface_at(at))) return 0u;
     if ((frame.flags & FRAME_DPM) != 0u) {
-        History h = history_at(frame.parity * frame.width * frame.height + at);
+        History h = history_at(at);
         float share = frame.budget_spp;
         if ((frame.flags & FRAME_ALLOCATE) != 0u) share *= float(importance_of(h)) / max(float(schedule.importance), 1.0) * float(schedule.lit);
         // A point never seen before starts with what an average pixel gets; nothing waits longer than two or three frames.

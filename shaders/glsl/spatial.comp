@@ -40,19 +40,19 @@ mat2 turn_of(uvec2 pixel, uint dimension) {
 }
 
 // Slope of the light at the surface over time, from how far the histories around lag behind, by their age; nothing where chance explains it.
-float lag_of(uvec2 pixel, uint at, uint history) {
+float lag_of(uvec2 pixel, uint at) {
     uint instance = surface_at(at).id >> 24u;
-    vec3 normal = decode_normal(history_at(history + at).normal);
+    vec3 normal = decode_normal(history_at(at).normal);
     mat2 rotation = turn_of(pixel, 0u);
     float per_frame = max(frame.budget_spp, 0.5);
-    float age = history_at(history + at).weight / per_frame, drift = history_at(history + at).drift;
+    float age = history_at(at).weight / per_frame, drift = history_at(at).drift;
     float xx = age * age, xy = age * drift, yy = drift * drift, used = 1.0;
     for (int i = 0; i < 12; i++) {
         ivec2 q = ivec2(pixel) + ivec2(round(rotation * DISK[i] * 6.0));
         uint tap;
         if (q == ivec2(pixel) || !neighbour(q, instance, tap)) continue;
-        float w = pow(max(dot(decode_normal(history_at(history + tap).normal), normal), 0.0), 8.0);
-        float x = history_at(history + tap).weight / per_frame, y = history_at(history + tap).drift;
+        float w = pow(max(dot(decode_normal(history_at(tap).normal), normal), 0.0), 8.0);
+        float x = history_at(tap).weight / per_frame, y = history_at(tap).drift;
         xx += w * x * x;
         xy += w * x * y;
         yy += w * y * y;
@@ -67,10 +67,10 @@ float lag_of(uvec2 pixel, uint at, uint history) {
 }
 
 // Local linear regression of the light at the surface on raster position and normal, blended in as far as what is left over is noise.
-vec3 regressed(uvec2 pixel, uint at, uint history, vec3 own) {
+vec3 regressed(uvec2 pixel, uint at, vec3 own) {
     uint instance = surface_at(at).id >> 24u;
-    vec3 position = history_at(history + at).position;
-    vec3 normal = decode_normal(history_at(history + at).normal);
+    vec3 position = history_at(at).position;
+    vec3 normal = decode_normal(history_at(at).normal);
     vec3 across = normalize(abs(normal.x) < 0.7 ? cross(normal, vec3(1.0, 0.0, 0.0)) : cross(normal, vec3(0.0, 1.0, 0.0)));
     vec3 along = cross(normal, across);
     float footprint = abs(surface_at(at).distance) * frame.pixel_size;
@@ -86,8 +86,8 @@ vec3 regressed(uvec2 pixel, uint at, uint history, vec3 own) {
         ivec2 d = ivec2(i % 5, i / 5) - 2;
         uint tap;
         if (!neighbour(ivec2(pixel) + d, instance, tap)) continue;
-        vec3 n = decode_normal(history_at(history + tap).normal);
-        if (dot(n, normal) < 0.6 || abs(dot(history_at(history + tap).position - position, normal)) > 3.0 * footprint) continue;
+        vec3 n = decode_normal(history_at(tap).normal);
+        if (dot(n, normal) < 0.6 || abs(dot(history_at(tap).position - position, normal)) > 3.0 * footprint) continue;
         float light = luminance(albedo_of(guide_at(tap)));
         float noise = filtered_at(tap).variance * SEQUENCE_VARIANCE / (light * light);
         float w = 1.0 / (noise + tolerated);
@@ -103,7 +103,7 @@ vec3 regressed(uvec2 pixel, uint at, uint history, vec3 own) {
         total += w;
         used += 1.0;
         expected += w * noise;
-        single += noise * history_at(history + tap).weight;
+        single += noise * history_at(tap).weight;
     }
     if (used < 4.0) return own;
     // Slopes are not expected beyond 2 % a pixel and a third over the normal's whole range.
@@ -128,7 +128,7 @@ vec3 regressed(uvec2 pixel, uint at, uint history, vec3 own) {
     // Structure that the fit misses, around or at this very pixel, against the noise that the eye's mean leaves [Lee80].
     float structure = max(max(power - explained, 0.0) / total * used / max(used - 4.0, 1.0) - expected / total, 0.0);
     // Single pixels hardly know what a sample of theirs varies: it is that of all around. How many samples they stand on they know.
-    float held = history_at(history + at).weight;
+    float held = history_at(at).weight;
     float noise = single / used / max(held, 1e-6);
     float apart = luminance(b[0]);
     // In the periphery blur is the lesser evil beside flicker.
@@ -140,12 +140,12 @@ vec3 regressed(uvec2 pixel, uint at, uint history, vec3 own) {
 }
 
 // [paper]: mean over a Poisson disk, blended in between two angles.
-vec3 disk_mean(uvec2 pixel, uint at, uint history, vec3 own) {
+vec3 disk_mean(uvec2 pixel, uint at, vec3 own) {
     float blend = periphery(guide_at(at).angle);
     if (!(blend > 0.0)) return own;
     uint instance = surface_at(at).id >> 24u;
-    vec3 position = history_at(history + at).position;
-    vec3 normal = decode_normal(history_at(history + at).normal);
+    vec3 position = history_at(at).position;
+    vec3 normal = decode_normal(history_at(at).normal);
     float footprint = abs(surface_at(at).distance) * frame.pixel_size;
     mat2 rotation = turn_of(pixel, 1u);
     vec3 sum = own;
@@ -154,8 +154,8 @@ vec3 disk_mean(uvec2 pixel, uint at, uint history, vec3 own) {
         ivec2 q = ivec2(pixel) + ivec2(round(rotation * DISK[i] * 4.0));
         uint tap;
         if (q == ivec2(pixel) || !neighbour(q, instance, tap)) continue;
-        vec3 apart = history_at(history + tap).position - position;
-        float w = max(dot(decode_normal(history_at(history + tap).normal), normal), 0.0);
+        vec3 apart = history_at(tap).position - position;
+        float w = max(dot(decode_normal(history_at(tap).normal), normal), 0.0);
         w = pow(w, 32.0) * exp(-abs(dot(apart, normal)) / max(footprint, 1e-12));
         sum += w * filtered_at(tap).light;
         total += w;
@@ -172,16 +172,15 @@ void main() {
         return;
     }
     vec3 own = filtered_at(at).light;
-    uint history = frame.parity * frame.width * frame.height;
     if ((frame.flags & FRAME_DPM) != 0u) {
         vec3 light = own;
-        if (HAS_FILTER && (history_at(history + at).flags & HISTORY_EXACT) == 0u) {
-            light = regressed(pixel, at, history, own);
+        if (HAS_FILTER && (history_at(at).flags & HISTORY_EXACT) == 0u) {
+            light = regressed(pixel, at, own);
             float level = luminance(light);
-            light *= clamp((level + lag_of(pixel, at, history)) / max(level, 1e-6), 0.5, 2.0);
+            light *= clamp((level + lag_of(pixel, at)) / max(level, 1e-6), 0.5, 2.0);
         }
         shown[at] = vec4(light * albedo_of(guide_at(at)), 1.0);
         return;
     }
-    shown[at] = vec4(HAS_FILTER ? disk_mean(pixel, at, history, own) : own, 1.0);
+    shown[at] = vec4(HAS_FILTER ? disk_mean(pixel, at, own) : own, 1.0);
 }

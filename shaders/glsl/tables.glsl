@@ -31,7 +31,7 @@ Instance instance_at(uint i) {
         r11.w);
 }
 #else
-layout(set = 0, binding = B_INSTANCES, scalar) readonly buffer InstanceTable { Instance instance_table[]; };
+layout(set = 0, binding = B_INSTANCES, scalar) readonly buffer instance_block { Instance instance_table[]; };
 Instance instance_at(uint i) {
     return Instance(instance_table[i].world_from_object,
         instance_table[i].object_from_world,
@@ -59,7 +59,7 @@ Vertex vertex_at(uint i) {
         uvec3(r2.y, r2.z, r2.w));
 }
 #else
-layout(set = 0, binding = B_VERTICES, scalar) readonly buffer VertexTable { Vertex vertex_table[]; };
+layout(set = 0, binding = B_VERTICES, scalar) readonly buffer vertex_block { Vertex vertex_table[]; };
 Vertex vertex_at(uint i) {
     return Vertex(vertex_table[i].normal,
         vertex_table[i].uv,
@@ -79,7 +79,7 @@ TriangleRef triangle_ref_at(uint i) {
         uvec3(r1.y, r1.z, r1.w));
 }
 #else
-layout(set = 0, binding = B_TRIANGLE_REFS, scalar) readonly buffer TriangleRefTable { TriangleRef triangle_ref_table[]; };
+layout(set = 0, binding = B_TRIANGLE_REFS, scalar) readonly buffer triangle_ref_block { TriangleRef triangle_ref_table[]; };
 TriangleRef triangle_ref_at(uint i) {
     return TriangleRef(triangle_ref_table[i].vertices,
         triangle_ref_table[i].material,
@@ -133,7 +133,7 @@ Material material_at(uint i) {
         uvec2(r12.z, r12.w));
 }
 #else
-layout(set = 0, binding = B_MATERIALS, scalar) readonly buffer MaterialTable { Material material_table[]; };
+layout(set = 0, binding = B_MATERIALS, scalar) readonly buffer material_block { Material material_table[]; };
 Material material_at(uint i) {
     return Material(material_table[i].base_color,
         material_table[i].alpha,
@@ -164,7 +164,7 @@ Surface surface_at(uint i) {
         uintBitsToFloat(r0.w));
 }
 #else
-layout(set = 0, binding = B_SURFACES, scalar) readonly buffer SurfaceTable { Surface surface_table[]; };
+layout(set = 0, binding = B_SURFACES, scalar) readonly buffer surface_block { Surface surface_table[]; };
 Surface surface_at(uint i) {
     return Surface(surface_table[i].id,
         surface_table[i].barycentric,
@@ -185,7 +185,7 @@ Guide guide_at(uint i) {
         uvec2(r1.z, r1.w));
 }
 #else
-layout(set = 0, binding = B_GUIDES, scalar) readonly buffer GuideTable { Guide guide_table[]; };
+layout(set = 0, binding = B_GUIDES, scalar) readonly buffer guide_block { Guide guide_table[]; };
 Guide guide_at(uint i) {
     return Guide(guide_table[i].motion,
         guide_table[i].size,
@@ -217,7 +217,7 @@ History history_at(uint i) {
         r3.w);
 }
 #else
-layout(set = 0, binding = B_HISTORY, scalar) readonly buffer HistoryTable { History history_table[]; };
+layout(set = 0, binding = B_HISTORY, scalar) readonly buffer history_block { History history_table[]; };
 History history_at(uint i) {
     return History(history_table[i].mean,
         history_table[i].weight,
@@ -235,6 +235,44 @@ History history_at(uint i) {
 #endif
 
 #ifdef TEXEL_TABLES
+layout(set = 0, binding = B_FORMER, rgba32ui) uniform readonly uimageBuffer former_rows;
+History former_at(uint i) {
+    uvec4 r0 = imageLoad(former_rows, int(i) * 4 + 0);
+    uvec4 r1 = imageLoad(former_rows, int(i) * 4 + 1);
+    uvec4 r2 = imageLoad(former_rows, int(i) * 4 + 2);
+    uvec4 r3 = imageLoad(former_rows, int(i) * 4 + 3);
+    return History(vec3(uintBitsToFloat(r0.x), uintBitsToFloat(r0.y), uintBitsToFloat(r0.z)),
+        uintBitsToFloat(r0.w),
+        vec3(uintBitsToFloat(r1.x), uintBitsToFloat(r1.y), uintBitsToFloat(r1.z)),
+        r1.w,
+        uintBitsToFloat(r2.x),
+        uintBitsToFloat(r2.y),
+        uintBitsToFloat(r2.z),
+        r2.w,
+        r3.x,
+        r3.y,
+        r3.z,
+        r3.w);
+}
+#else
+layout(set = 0, binding = B_FORMER, scalar) readonly buffer former_block { History former_table[]; };
+History former_at(uint i) {
+    return History(former_table[i].mean,
+        former_table[i].weight,
+        former_table[i].position,
+        former_table[i].normal,
+        former_table[i].drift,
+        former_table[i].variance,
+        former_table[i].surprise,
+        former_table[i].seed,
+        former_table[i].index,
+        former_table[i].instance,
+        former_table[i].frame,
+        former_table[i].flags);
+}
+#endif
+
+#ifdef TEXEL_TABLES
 layout(set = 0, binding = B_FILTERED_ROWS, rgba32ui) uniform readonly uimageBuffer filtered_rows;
 Filtered filtered_at(uint i) {
     uvec4 r0 = imageLoad(filtered_rows, int(i) * 1 + 0);
@@ -242,7 +280,7 @@ Filtered filtered_at(uint i) {
         uintBitsToFloat(r0.w));
 }
 #else
-layout(set = 0, binding = B_FILTERED, scalar) readonly buffer FilteredTable { Filtered filtered_table[]; };
+layout(set = 0, binding = B_FILTERED, scalar) readonly buffer filtered_block { Filtered filtered_table[]; };
 Filtered filtered_at(uint i) {
     return Filtered(filtered_table[i].light,
         filtered_table[i].variance);

@@ -37,7 +37,7 @@ void main() {
     } else if (SAMPLER == 1u) {
         rng.seed = hash_u32(frame.frame + hash_u32(frame.seed));
     } else {
-        History h = history_at(frame.parity * frame.width * frame.height + item.pixel);
+        History h = history_at(item.pixel);
         rng.seed = h.seed;
         rng.index = h.index;
     }

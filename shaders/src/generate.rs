@@ -107,7 +107,7 @@ pub fn tables_glsl() -> String {
              layout(set = 0, binding = {texel}, rgba32ui) uniform readonly uimageBuffer {reader}_rows;\n\
              {name} {reader}_at(uint i) {{\n{fetches}    return {from_rows};\n}}\n\
              #else\n\
-             layout(set = 0, binding = {storage}, scalar) readonly buffer {name}Table {{ {name} {reader}_table[]; }};\n\
+             layout(set = 0, binding = {storage}, scalar) readonly buffer {reader}_block {{ {name} {reader}_table[]; }};\n\
              {name} {reader}_at(uint i) {{\n    return {from_storage};\n}}\n\
              #endif\n"
         ));

@@ -63,6 +63,7 @@ const BLOCKS: &[(&str, &str, usize)] = &[
     ("B_COUNTERS", "Counters", size_of::<structs::Counters>()),
     ("B_GUIDES", "Guide", size_of::<structs::Guide>()),
     ("B_HISTORY", "History", size_of::<structs::History>()),
+    ("B_FORMER", "History", size_of::<structs::History>()),
     ("B_FILTERED", "Filtered", size_of::<structs::Filtered>()),
     ("B_SCHEDULE", "Schedule", size_of::<structs::Schedule>()),
     ("B_WORK", "WorkItem", size_of::<structs::WorkItem>()),

@@ -101,9 +101,7 @@ gpu_structs! {
         environment_select: f32,
         /// World position that all coordinates here are relative to.
         world_origin: [f32; 3],
-        /// Which half of the history is written by this frame, 0 or 1.
-        parity: u32,
-        /// The same for the last frame that the history holds: its stamp.
+        /// Stamp of the last frame that the former history holds, `NO_FRAME` before the first.
         history_frame: u32,
         /// Samples per lit pixel that the frame may spend on average (method dpm).
         budget_spp: f32,
@@ -498,6 +496,7 @@ tables! {
     Surface "surface", "B_SURFACES" or "B_SURFACE_ROWS";
     Guide "guide", "B_GUIDES" or "B_GUIDE_ROWS";
     History "history", "B_HISTORY" or "B_HISTORY_ROWS";
+    History "former", "B_FORMER" or "B_FORMER";
     Filtered "filtered", "B_FILTERED" or "B_FILTERED_ROWS";
 }
 
@@ -534,4 +533,5 @@ pub const BINDINGS: &[(&str, u32)] = &[
     ("B_GUIDE_ROWS", 28),
     ("B_HISTORY_ROWS", 29),
     ("B_FILTERED_ROWS", 30),
+    ("B_FORMER", 31),
 ];

@@ -156,7 +156,9 @@ impl From<PipelineError> for Failure {
             PipelineError::Rig(RigError::Tracker(SourceError::Tracker(_)))
             | PipelineError::Connect(_)
             | PipelineError::Thread { .. } => FailureKind::Device,
-            PipelineError::Rig(_) | PipelineError::Render(RenderError::Scene(_)) => FailureKind::BadInput,
+            PipelineError::Rig(_) | PipelineError::Render(RenderError::Scene(_) | RenderError::Raster(_)) => {
+                FailureKind::BadInput
+            }
             PipelineError::Render(RenderError::Gpu(e)) | PipelineError::Gpu { source: e, .. } => match e {
                 GpuError::OutOfMemory { .. } | GpuError::Limit { .. } => FailureKind::BadInput,
                 _ => FailureKind::NoGpu,

@@ -334,6 +334,16 @@ impl Gpu {
         u64::from(self.limits.max_texel_buffer_elements)
     }
 
+    /// Largest buffer that shaders can be given whole, bytes: as storage, and on software Vulkan also as texels of 16 bytes.
+    pub fn max_buffer_bytes(&self) -> u64 {
+        let storage = u64::from(self.limits.max_storage_buffer_range);
+        if self.summary.software {
+            storage.min(self.max_texel_elements() * 16)
+        } else {
+            storage
+        }
+    }
+
     pub(super) fn name(text: &str) -> CString {
         CString::new(text).unwrap_or_default()
     }

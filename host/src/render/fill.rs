@@ -8,23 +8,24 @@ use std::ops::Range;
 use std::sync::Arc;
 
 impl Renderer {
-    /// Changes what is kept of past frames, two lists of one entry a pixel: for checks that something broken is forgotten. No frame may be
-    /// in flight.
+    /// Changes what is kept of past frames at a range of pixels, in both buffers: for checks that something broken is forgotten. No frame
+    /// may be in flight.
     ///
     /// # Errors
     /// Out of memory, device lost.
     ///
     /// # Panics
-    /// When the range lies beyond the history, but not for a method without any: then nothing happens.
+    /// When the range lies beyond the raster, but not for a method without any: then nothing happens.
     pub fn edit_history(
         &self,
         range: Range<usize>,
-        change: impl FnMut(&mut History),
+        mut change: impl FnMut(&mut History),
     ) -> Result<(), GpuError> {
         if !self.settings.method.needs_history() {
             return Ok(());
         }
-        edit(&self.gpu, &self.shared.history, range, change)
+        (self.shared.history.iter())
+            .try_for_each(|buffer| edit(&self.gpu, buffer, range.clone(), &mut change))
     }
 }
 

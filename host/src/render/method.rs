@@ -94,6 +94,11 @@ impl Method {
         self.rate_map && !self.dpm
     }
 
+    /// Motion, size, angle and albedo of every pixel are written: for the history, for the filters, or to choose samples.
+    pub fn needs_guides(&self) -> bool {
+        self.needs_history() || self.needs_spatial() || self.spp_by_angle
+    }
+
     /// The pass `spatial` is recorded.
     pub fn needs_spatial(&self) -> bool {
         self.dpm || self.spatial

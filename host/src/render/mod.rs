@@ -5,6 +5,7 @@ pub mod blue_noise;
 mod body_bvh;
 pub mod compensation;
 mod fill;
+mod memory;
 pub mod method;
 pub mod rate_map;
 mod renderer;
@@ -14,6 +15,7 @@ mod slot;
 pub mod sobol;
 pub mod tiles;
 
+pub use memory::RasterTooLarge;
 pub use renderer::{FrameInputs, Output, RenderError, Renderer, RendererSettings};
 pub use scene_data::Keep;
 pub use slot::{FrameCost, FrameSlot, PASSES};

@@ -1,12 +1,11 @@
 //! One frame on the GPU: surfaces, radiance, code values. Reads top to bottom in `Renderer::record`.
 
-use super::blue_noise;
+use super::memory::{BytesPerPixel, RasterTooLarge, SharedBuffers};
 use super::method::Method;
-use super::rate_map;
 use super::scene_data::{world_bounds, Keep, SceneData, SceneDataError, SceneNeeds};
 use super::scene_gpu::{table_buffer, SceneGpu};
 use super::slot::{DebugBuffers, FrameSlot, PASSES};
-use super::tiles::{TileList, TILE};
+use super::tiles::TileList;
 use crate::geometry::projector::ProjectorCamera;
 use crate::gpu::{
     BindingKind, BindingSet, BindingTable, Buffer, CommandList, ComputePipeline, FrameFence, Gpu, GpuError,
@@ -16,9 +15,7 @@ use crate::pack;
 use crate::scene::Scene;
 use bytemuck::Zeroable;
 use dpm_device::planes::{PlaneSchedule, Raster};
-use dpm_shaders::structs::{
-    self as gpu_structs, Counters, Frame, Guide, History, Instance, Rows, Schedule, Surface, WorkItem,
-};
+use dpm_shaders::structs::{self as gpu_structs, Counters, Frame, Guide, Instance, Rows, Schedule, Surface};
 use dpm_shaders::TableShader;
 use glam::{DAffine3, DVec3, Vec3};
 use std::sync::Arc;
@@ -101,6 +98,9 @@ pub enum RenderError {
     /// The scene's.
     #[error(transparent)]
     Scene(#[from] SceneDataError),
+    /// The raster's.
+    #[error(transparent)]
+    Raster(#[from] RasterTooLarge),
 }
 
 /// Byte offsets in the dispatch arguments: four workgroups a tile, and one a tile in frames that decide rates.
@@ -138,20 +138,11 @@ struct Pipelines {
     pack: Option<ComputePipeline>,
 }
 
-/// Memory that outlives a frame.
-pub(super) struct SharedBuffers {
-    pub(super) history: Buffer,
-    rates: Buffer,
-    rate_table: Buffer,
-    noise: Buffer,
-    /// What the schedule starts from.
-    schedule_start: Buffer,
-}
-
 /// The frame that the history holds.
 struct Last {
     frame: u32,
-    parity: u32,
+    /// Which of the two history buffers it wrote.
+    parity: usize,
     poses: Vec<DAffine3>,
     origin: DVec3,
     /// Frames submitted so far: rates are decided in every second one.
@@ -188,6 +179,7 @@ impl Renderer {
         keep: Keep,
     ) -> Result<Self, RenderError> {
         let data = SceneData::build(scene)?;
+        let shared = SharedBuffers::new(gpu, &settings)?;
         let texel = gpu.summary().software && !keep.storage_tables;
         let scene_gpu = SceneGpu::new(gpu, &data, texel)?;
         let mut needs = data.needs.with(keep.needs);
@@ -196,8 +188,10 @@ impl Renderer {
             needs = needs.everything();
         }
         use BindingKind::{Storage, Texel};
+        // Second bindings of one buffer, as texels, are for shaders that read tables so: devices bind a limited number.
         let kinds: Vec<_> = gpu_structs::BINDINGS
             .iter()
+            .filter(|(name, _)| texel || !name.ends_with("_ROWS"))
             .map(|&(name, binding)| {
                 let rows = texel && gpu_structs::TEXEL_BINDINGS.contains(&name);
                 (binding, if rows { Texel } else { Storage })
@@ -208,7 +202,7 @@ impl Renderer {
         let mut constants = needs.constants().to_vec();
         constants.extend([
             (10, method.sampler as u32),
-            (11, u32::from(method.needs_history() || method.needs_spatial() || method.spp_by_angle)),
+            (11, u32::from(method.needs_guides())),
             (12, u32::from(method.dpm)),
             (13, u32::from(method.spatial)),
         ]);
@@ -233,25 +227,6 @@ impl Renderer {
                 })
                 .transpose()?,
         };
-        let pixels = if method.needs_history() { settings.raster.pixel_count() } else { 1 };
-        let tiles = settings.raster.width().div_ceil(TILE) * settings.raster.height().div_ceil(TILE);
-        let shared = SharedBuffers {
-            history: table_buffer(gpu, "history", 2 * pixels * size_of::<History>(), MemoryKind::Device)?,
-            rates: Buffer::from_slice(gpu, "shading rates", &vec![0u32; tiles as usize])?,
-            rate_table: Buffer::from_slice(gpu, "rate table", &rate_map::rate_table())?,
-            noise: Buffer::from_slice(gpu, "blue noise", blue_noise::MASK)?,
-            schedule_start: Buffer::from_slice(
-                gpu,
-                "schedule",
-                &[Schedule { groups: [0, 1, 1], ..Schedule::zeroed() }],
-            )?,
-        };
-        super::fill::fill(
-            gpu,
-            &shared.history,
-            &History { frame: gpu_structs::NO_FRAME, ..History::zeroed() },
-            2 * pixels,
-        )?;
         let tracked = scene.bodies.iter().map(|b| b.tracked).collect();
         let poses = Vec::with_capacity(scene.bodies.len());
         let last = Last { frame: gpu_structs::NO_FRAME, parity: 0, poses, origin: DVec3::ZERO, count: 0 };
@@ -311,33 +286,35 @@ impl Renderer {
         let tiles = size("tile list", tile_list.len() * 4, Upload)?;
         let counters = size("counters", size_of::<Counters>(), Device)?;
         let counters_host = size("counters", size_of::<Counters>(), Readback)?;
-        let surfaces = table("surfaces", pixels * size_of::<Surface>(), Device)?;
-        let radiance = size("radiance", pixels * 16, Device)?;
-        let codes = size("code values", pixels * 4, Device)?;
+        let each = BytesPerPixel::of(&self.settings.method);
+        let surfaces = table("surfaces", pixels * each.surfaces, Device)?;
+        let radiance = size("radiance", pixels * each.radiance, Device)?;
+        let codes = size("code values", pixels * each.codes, Device)?;
         let schedule_packed = self.settings.output.schedule();
         let codes_host = match self.settings.output {
             Output::Planes(_) => None,
-            Output::Codes | Output::Both(_) => Some(size("code values", pixels * 4, Readback)?),
+            Output::Codes | Output::Both(_) => Some(size("code values", pixels * each.codes, Readback)?),
         };
         let plane_bytes = schedule_packed.map_or(4, |schedule| pack::gpu::len_bytes(raster, schedule));
         let planes = size("bit planes", plane_bytes, Device)?;
         let planes_host = schedule_packed.map(|_| size("bit planes", plane_bytes, Readback)).transpose()?;
         let method = &self.settings.method;
-        let with = |wanted: bool, what, bytes, kind| table(what, if wanted { bytes } else { 16 }, kind);
-        let history_bytes = self.shared.history.len_bytes();
-        let guides = table("guides", pixels * size_of::<Guide>(), Device)?;
+        // What the method does without is bound all the same, but as small as can be.
+        let with = |what, each: usize| table(what, (pixels * each).max(16), Device);
+        let guides = with("guides", each.guides)?;
         let schedule = size("schedule", size_of::<Schedule>(), Device)?;
-        let work = size("work items", pixels * size_of::<WorkItem>(), Device)?;
-        let filtered = with(method.needs_history(), "filtered radiance", pixels * 16, Device)?;
-        let filtered_shown = with(method.needs_spatial(), "shown radiance", pixels * 16, Device)?;
+        let work = size("work list", pixels * each.work, Device)?;
+        let filtered = with("filtered radiance", each.filtered)?;
+        let filtered_shown = with("shown radiance", each.shown)?;
+        let kept = |what, each: usize| (each > 0).then(|| size(what, pixels * each, Readback)).transpose();
         let debug_host = if debug {
             Some(DebugBuffers {
                 shown: size("shown radiance", pixels * 16, Readback)?,
-                surfaces: size("surfaces", pixels * size_of::<Surface>(), Readback)?,
-                guides: size("guides", pixels * size_of::<Guide>(), Readback)?,
-                history: size("history", history_bytes.max(2 * pixels * size_of::<History>()), Readback)?,
-                prior: size("prior history", history_bytes.max(2 * pixels * size_of::<History>()), Readback)?,
-                traced: size("radiance", pixels * 16, Readback)?,
+                surfaces: size("surfaces", pixels * each.surfaces, Readback)?,
+                guides: kept("guides", each.guides)?,
+                history: kept("history", each.history)?,
+                prior: kept("prior history", each.history)?,
+                traced: size("radiance", pixels * each.radiance, Readback)?,
                 rates: size("shading rates", tile_list.len() * 4, Readback)?,
             })
         } else {
@@ -352,7 +329,7 @@ impl Renderer {
             &radiance
         };
         let s = &self.scene;
-        let buffer_of = |name: &str| match name {
+        let buffer_of = |name: &str, parity: usize| match name {
             "B_FRAME" => &frame,
             "B_INSTANCES" => &instances,
             "B_NODES" => &s.nodes,
@@ -371,7 +348,8 @@ impl Renderer {
             "B_CODES" => &codes,
             "B_COUNTERS" => &counters,
             "B_GUIDES" | "B_GUIDE_ROWS" => &guides,
-            "B_HISTORY" | "B_HISTORY_ROWS" => &self.shared.history,
+            "B_HISTORY" | "B_HISTORY_ROWS" => &self.shared.history[parity],
+            "B_FORMER" => &self.shared.history[1 - parity],
             "B_RATES" => &self.shared.rates,
             "B_RATE_TABLE" => &self.shared.rate_table,
             "B_SCHEDULE" => &schedule,
@@ -382,21 +360,28 @@ impl Renderer {
             "B_PLANES" => &planes,
             other => unreachable!("binding {other} has no buffer"),
         };
-        let bindings: Vec<_> = gpu_structs::BINDINGS.iter().map(|&(n, b)| (b, buffer_of(n))).collect();
-        let set = BindingSet::new(&self.table, &bindings)?;
+        let set_of = |parity| {
+            let bindings: Vec<_> =
+                gpu_structs::BINDINGS.iter().map(|&(n, b)| (b, buffer_of(n, parity))).collect();
+            BindingSet::new(&self.table, &bindings)
+        };
+        let sets = [set_of(0)?, set_of(1)?];
         // Tiles that are never traced must read as nothing hit and black from the start.
         let nothing = Surface { id: gpu_structs::NO_HIT, ..Surface::zeroed() };
         super::fill::fill(gpu, &surfaces, &nothing, pixels)?;
         super::fill::fill(gpu, &codes, &0u32, pixels)?;
         super::fill::fill(gpu, &radiance, &[0f32; 4], pixels)?;
-        super::fill::fill(gpu, &guides, &Guide::zeroed(), pixels)?;
+        if each.guides > 0 {
+            super::fill::fill(gpu, &guides, &Guide::zeroed(), pixels)?;
+        }
         super::fill::fill(gpu, shown, &[0f32; 4], pixels)?;
         let p = &self.pipelines;
-        let list = CommandList::record(gpu, PASSES.len() as u32 + 1, |r| {
+        let record = |parity: usize, r: &mut Recorder<'_>| {
+            let (set, history) = (&sets[parity], &self.shared.history[parity]);
             // The frame, in order. A pass that the method does not need is not recorded; its stamp is.
             let tiled = |r: &mut Recorder<'_>, pass: Option<&ComputePipeline>, offset: u64| {
                 if let Some(pass) = pass {
-                    r.dispatch_indirect(pass, &set, &arguments, offset);
+                    r.dispatch_indirect(pass, set, &arguments, offset);
                     r.barrier();
                 }
                 r.stamp();
@@ -407,20 +392,20 @@ impl Renderer {
             r.stamp();
             tiled(r, Some(&p.primary), PER_TILE_QUARTER);
             tiled(r, p.reproject.as_ref(), PER_TILE_QUARTER);
-            if let Some(d) = &debug_host {
-                r.copy(&self.shared.history, &d.prior, history_bytes);
+            if let Some(prior) = debug_host.as_ref().and_then(|d| d.prior.as_ref()) {
+                r.copy(history, prior, pixels * each.history);
                 r.barrier();
             }
             tiled(r, p.rate_map.as_ref(), PER_TILE_RATES);
             tiled(r, Some(&p.schedule), PER_TILE_QUARTER);
-            r.dispatch_indirect(&p.trace, &set, &schedule, 0);
+            r.dispatch_indirect(&p.trace, set, &schedule, 0);
             r.barrier();
             r.stamp();
             tiled(r, p.accumulate.as_ref(), PER_TILE_QUARTER);
             tiled(r, p.spatial.as_ref(), PER_TILE_QUARTER);
             tiled(r, Some(&p.compensate), PER_TILE_QUARTER);
             if let Some(pass) = &p.pack {
-                r.dispatch(pass, &set, pack::gpu::workgroups(raster));
+                r.dispatch(pass, set, pack::gpu::workgroups(raster));
                 r.barrier();
             }
             r.stamp();
@@ -428,24 +413,30 @@ impl Renderer {
                 r.copy(&planes, planes_host, plane_bytes);
             }
             if let Some(codes_host) = &codes_host {
-                r.copy(&codes, codes_host, pixels * 4);
+                r.copy(&codes, codes_host, pixels * each.codes);
             }
             r.copy(&counters, &counters_host, size_of::<Counters>());
             if let Some(d) = &debug_host {
                 r.copy(shown, &d.shown, pixels * 16);
-                r.copy(&surfaces, &d.surfaces, pixels * size_of::<Surface>());
-                r.copy(&guides, &d.guides, pixels * size_of::<Guide>());
-                r.copy(&self.shared.history, &d.history, history_bytes);
-                r.copy(&radiance, &d.traced, pixels * 16);
+                r.copy(&surfaces, &d.surfaces, pixels * each.surfaces);
+                if let Some(to) = &d.guides {
+                    r.copy(&guides, to, pixels * each.guides);
+                }
+                if let Some(to) = &d.history {
+                    r.copy(history, to, pixels * each.history);
+                }
+                r.copy(&radiance, &d.traced, pixels * each.radiance);
                 r.copy(&self.shared.rates, &d.rates, tile_list.len() * 4);
             }
             r.barrier_to_host();
             r.stamp();
-        })?;
+        };
+        let list = |parity| CommandList::record(gpu, PASSES.len() as u32 + 1, |r| record(parity, r));
+        let lists = [list(0)?, list(1)?];
         Ok(FrameSlot {
             fence: FrameFence::new(gpu)?,
-            list,
-            _set: set,
+            lists,
+            _sets: sets,
             frame,
             instances,
             arguments,
@@ -568,7 +559,6 @@ impl Renderer {
                 self.data.environment_select
             },
             world_origin: origin.as_vec3().into(),
-            parity: 1 - self.last.parity,
             history_frame: self.last.frame,
             budget_spp: inputs.budget_spp,
             history_cap: method.history_cap,
@@ -583,10 +573,10 @@ impl Renderer {
             pixel_size: (1.0 / c.fx) as f32,
         };
         slot.frame.write(&[frame]);
-        slot.parity = frame.parity;
-        slot.list.submit(&mut slot.fence)?;
+        slot.parity = 1 - self.last.parity;
+        slot.lists[slot.parity].submit(&mut slot.fence)?;
         self.last.frame = inputs.frame;
-        self.last.parity = frame.parity;
+        self.last.parity = slot.parity;
         self.last.count += 1;
         self.last.origin = origin;
         self.last.poses.clear();

@@ -39,8 +39,9 @@ impl FrameCost {
 pub struct FrameSlot {
     // Dropped first: it waits until the GPU no longer uses the rest.
     pub(super) fence: FrameFence,
-    pub(super) list: CommandList,
-    pub(super) _set: BindingSet,
+    /// One for each of the two history buffers that a frame may write.
+    pub(super) lists: [CommandList; 2],
+    pub(super) _sets: [BindingSet; 2],
     pub(super) frame: Buffer,
     pub(super) instances: Buffer,
     pub(super) arguments: Buffer,
@@ -56,7 +57,8 @@ pub struct FrameSlot {
     pub(super) debug_host: Option<DebugBuffers>,
     pub(super) tile_list: TileList,
     pub(super) raster: Raster,
-    pub(super) parity: u32,
+    /// Which of the lists ran last.
+    pub(super) parity: usize,
     pub(super) stamps: [u64; PASSES.len() + 1],
 }
 
@@ -64,9 +66,10 @@ pub struct FrameSlot {
 pub(super) struct DebugBuffers {
     pub(super) shown: Buffer,
     pub(super) surfaces: Buffer,
-    pub(super) guides: Buffer,
-    pub(super) history: Buffer,
-    pub(super) prior: Buffer,
+    /// `None` for the methods that do without; so below.
+    pub(super) guides: Option<Buffer>,
+    pub(super) history: Option<Buffer>,
+    pub(super) prior: Option<Buffer>,
     pub(super) traced: Buffer,
     pub(super) rates: Buffer,
 }
@@ -82,7 +85,7 @@ impl FrameSlot {
             counters: bytemuck::cast(self.counters_host.read::<Counters>(1)[0]),
             ..FrameCost::default()
         };
-        let n = self.list.stamps_ns(&mut self.stamps);
+        let n = self.lists[self.parity].stamps_ns(&mut self.stamps);
         if n == self.stamps.len() {
             for (i, pass) in cost.pass_ns.iter_mut().enumerate() {
                 *pass = self.stamps[i + 1].saturating_sub(self.stamps[i]);
@@ -111,25 +114,22 @@ impl FrameSlot {
         self.debug_host.as_ref().map(|d| d.surfaces.read(self.raster.pixel_count()))
     }
 
-    /// Noise-free facts of each lit pixel; only with `debug` at creation.
+    /// Noise-free facts of each lit pixel; only with `debug` at creation and for methods that use them.
     pub fn guides(&self) -> Option<&[Guide]> {
-        self.debug_host.as_ref().map(|d| d.guides.read(self.raster.pixel_count()))
+        let guides = self.debug_host.as_ref()?.guides.as_ref()?;
+        Some(guides.read(self.raster.pixel_count()))
     }
 
-    /// History after this frame; only with `debug` at creation.
+    /// History after this frame; only with `debug` at creation and for methods that keep one.
     pub fn history(&self) -> Option<&[History]> {
-        self.debug_host.as_ref().map(|d| {
-            let n = self.raster.pixel_count();
-            let at = self.parity as usize * n;
-            &d.history.read::<History>(2 * n)[at..at + n]
-        })
+        let history = self.debug_host.as_ref()?.history.as_ref()?;
+        Some(history.read(self.raster.pixel_count()))
     }
 
-    /// Luminance that each pixel's history had before this frame's samples, -1 where none; only with `debug` at creation.
+    /// Luminance that each pixel's history had before this frame's samples, -1 where none; only with `debug` at creation and for methods
+    /// that keep a history.
     pub fn prior_luminance(&self) -> Option<Vec<f32>> {
-        self.debug_host.as_ref().map(|d| {
-            let n = self.raster.pixel_count();
-            let at = self.parity as usize * n;
+        self.debug_host.as_ref()?.prior.as_ref().map(|prior| {
             let known = |h: &History| {
                 let [r, g, b] = h.mean;
                 if h.weight > 0.0 {
@@ -138,7 +138,7 @@ impl FrameSlot {
                     -1.0
                 }
             };
-            d.prior.read::<History>(2 * n)[at..at + n].iter().map(known).collect()
+            prior.read::<History>(self.raster.pixel_count()).iter().map(known).collect()
         })
     }
 

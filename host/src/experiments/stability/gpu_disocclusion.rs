@@ -156,7 +156,7 @@ fn stale_history(gpu: &Arc<Gpu>, seed: u64) -> f64 {
         let poses = shot.world_from_body();
         shot.play(&mut renderer, 0..6, |_| poses.clone(), |_, _, _| ());
         let old = |h: &mut History| *h = History { mean: [5.0; 3], frame: h.frame.wrapping_sub(2), ..*h };
-        renderer.edit_history(0..2 * 33 * 33, old).expect("memory");
+        renderer.edit_history(0..33 * 33, old).expect("memory");
         shot.play(
             &mut renderer,
             6..10,
