@@ -97,6 +97,9 @@ fn error_lists_its_groups_and_refuses_budgets_and_numbers_that_are_none() {
         (code(&list), out(&list)),
         (0, "0 still-0.25\n1 still-18\n2 moving-0.25\n3 moving-18\n".into())
     );
+    let listed = dpm(&["error", rig, "--list", "--budgets", "1/4,18", "--json"], &[]);
+    let listed: serde_json::Value = serde_json::from_str(&out(&listed)).expect("one JSON object");
+    assert_eq!(listed["groups"], serde_json::json!(["still-0.25", "still-18", "moving-0.25", "moving-18"]));
     let figure = dpm(&["error", rig, "--list", "--preset", "figure3"], &[]);
     assert_eq!(out(&figure).lines().count(), 8);
     for bad in [&["--budgets", "0"][..], &["--budgets", "1/0"], &["--budgets", "nan"], &["--index", "99"]] {

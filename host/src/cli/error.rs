@@ -15,6 +15,7 @@ use crate::failure::{Failure, FailureKind};
 use crate::gpu::Gpu;
 use crate::pipeline::PipelineError;
 use crate::rig::Rig;
+use crate::telemetry::report::to_json;
 use dpm_device::planes::Raster;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
@@ -87,7 +88,7 @@ enum ErrorCommand {
         /// The folder
         #[arg(long, value_name = "DIR", default_value = "out/error")]
         out: PathBuf,
-        /// Print one JSON object
+        /// Print one JSON object: the groups of each experiment found, under the name of its report
         #[arg(long)]
         json: bool,
     },
@@ -176,6 +177,11 @@ pub(super) fn folder(args: &ErrorArgs) -> PathBuf {
 /// Names with their numbers. A rig file that cannot be run has no groups.
 pub(super) fn list(args: &ErrorArgs, names: impl Iterator<Item = String>) -> Result<(), Failure> {
     args.flags.rig(args.rig.as_deref())?;
+    if args.json {
+        let names: Vec<String> = names.collect();
+        print(&(to_json(&serde_json::json!({ "groups": names })) + "\n"));
+        return Ok(());
+    }
     let lines: String = names.enumerate().map(|(i, name)| format!("{i} {name}\n")).collect();
     print(&lines);
     Ok(())

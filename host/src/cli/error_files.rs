@@ -12,6 +12,7 @@ use crate::files::write_atomically;
 use crate::telemetry::report::to_json;
 use serde::de::DeserializeOwned;
 use serde::Serialize;
+use serde_json::Value;
 use std::io::Write;
 use std::path::{Path, PathBuf};
 
@@ -84,8 +85,14 @@ pub(super) fn known_or<T: Kept>(
 
 /// Writes the tables, curves and pictures of an experiment, and prints the tables or one JSON object.
 pub(super) fn report<T: Kept>(out: &Path, groups: &[T], json: bool) -> Result<(), Failure> {
+    write_reports(out, groups)?;
+    show(groups, json);
+    Ok(())
+}
+
+fn write_reports<T: Kept>(out: &Path, groups: &[T]) -> Result<(), Failure> {
     let file = |end: &str| out.join(format!("{}{end}", T::REPORT));
-    write(&file(".json"), &object(groups))?;
+    write(&file(".json"), &to_json(&object(groups)))?;
     write(&file(".md"), &T::markdown(groups))?;
     for (end, text) in T::reports(groups).map_err(|e| Failure::new(FailureKind::BadInput, e))? {
         write(&file(&end), &text)?;
@@ -95,38 +102,54 @@ pub(super) fn report<T: Kept>(out: &Path, groups: &[T], json: bool) -> Result<()
     if !sheets.is_empty() {
         save(&file(".png"), &stack(&sheets))?;
     }
-    show(groups, json);
     Ok(())
 }
 
 /// Prints one JSON object or the tables.
 pub(super) fn show<T: Kept>(groups: &[T], json: bool) {
-    print(&if json { object(groups) + "\n" } else { T::markdown(groups) });
+    print(&if json { to_json(&object(groups)) + "\n" } else { T::markdown(groups) });
 }
 
-fn object<T: Kept>(groups: &[T]) -> String {
-    to_json(&serde_json::json!({ "groups": groups }))
+fn object<T: Kept>(groups: &[T]) -> Value {
+    serde_json::json!({ "groups": groups })
 }
 
-/// Joins what lies in a folder: groups of methods, settings of figure 3 or of the table.
+/// Joins what lies in a folder: groups of methods, settings of figure 3, cells of the table. Prints the tables, or one JSON object that has
+/// each experiment's under the name of its report.
 pub(super) fn merge(out: &Path, json: bool) -> Result<(), Failure> {
+    print(&merged(out, json)?);
+    Ok(())
+}
+
+fn merged(out: &Path, json: bool) -> Result<String, Failure> {
     let (groups, settings, cells) =
         (joined::<GroupResult>(out)?, joined::<Figure3Group>(out)?, joined::<TableGroup>(out)?);
-    if groups.is_empty() && settings.is_empty() && cells.is_empty() {
+    let (mut objects, mut tables) = (serde_json::Map::new(), String::new());
+    add(out, &settings, &mut objects, &mut tables)?;
+    add(out, &cells, &mut objects, &mut tables)?;
+    add(out, &groups, &mut objects, &mut tables)?;
+    if objects.is_empty() {
         let out = out.display();
         let told = format!("{out}: no measured groups; run dpm error RIG.toml --index N --out {out} first");
         return Err(Failure::new(FailureKind::BadInput, told));
     }
-    if !settings.is_empty() {
-        report(out, &settings, json)?;
-    }
-    if !cells.is_empty() {
-        report(out, &cells, json)?;
-    }
+    Ok(if json { to_json(&Value::Object(objects)) + "\n" } else { tables })
+}
+
+/// Writes the reports of an experiment, if anything of it was measured, and adds it to what is printed.
+fn add<T: Kept>(
+    out: &Path,
+    groups: &[T],
+    objects: &mut serde_json::Map<String, Value>,
+    tables: &mut String,
+) -> Result<(), Failure> {
     if groups.is_empty() {
         return Ok(());
     }
-    report(out, &groups, json)
+    write_reports(out, groups)?;
+    objects.insert(T::REPORT.to_owned(), object(groups));
+    tables.push_str(&T::markdown(groups));
+    Ok(())
 }
 
 /// All groups of an experiment in a folder, in their order.
@@ -321,6 +344,36 @@ mod tests {
         assert!(known::<GroupResult>(&out, "still-2", "forged").is_none());
         assert!(super::joined::<GroupResult>(&out).unwrap_err().message.contains("measured twice"));
         assert!(super::joined::<TableGroup>(&out).unwrap().is_empty());
+        std::fs::remove_dir_all(out).unwrap();
+    }
+
+    #[test]
+    fn a_folder_of_several_experiments_is_one_json_object_with_what_each_report_holds() {
+        let out = std::env::temp_dir().join(format!("dpm-error-merged-{}", std::process::id()));
+        let made = group(false, 2.0, |_| ());
+        known_or(&out, &made.name(), &made.key.clone(), || Ok((made, None))).unwrap();
+        let alone: Value = serde_json::from_str(&merged(&out, true).unwrap()).unwrap();
+        assert_eq!(alone.as_object().unwrap().keys().collect::<Vec<_>>(), ["error"]);
+        let cell = TableGroup {
+            material: "glossy".into(),
+            moving: true,
+            aside: false,
+            result: group(true, 18.0, |_| ()),
+        };
+        known_or(&out, &cell.name(), &cell.result.key.clone(), || Ok((cell, None))).unwrap();
+        // The whole text is one value: from_str refuses anything after it.
+        let both: Value = serde_json::from_str(&merged(&out, true).unwrap()).unwrap();
+        assert_eq!(both.as_object().unwrap().len(), 2);
+        for name in ["error", "table"] {
+            let file = std::fs::read(out.join(name).with_extension("json")).unwrap();
+            assert_eq!(both[name], serde_json::from_slice::<Value>(&file).unwrap(), "{name}");
+            assert_eq!(both[name]["groups"].as_array().unwrap().len(), 1, "{name}");
+        }
+        let tables = merged(&out, false).unwrap();
+        for name in ["error", "table"] {
+            let part = std::fs::read_to_string(out.join(name).with_extension("md")).unwrap();
+            assert!(tables.contains(&part), "{name}");
+        }
         std::fs::remove_dir_all(out).unwrap();
     }
 }
