@@ -20,3 +20,5 @@ pub mod tracker;
 pub mod transport;
 #[cfg(feature = "serial")]
 pub mod tty;
+#[cfg(feature = "usb")]
+mod usb_help;

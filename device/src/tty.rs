@@ -20,6 +20,68 @@ pub fn open(path: &str, baud: u32) -> serialport::Result<Box<dyn SerialPort>> {
     Ok(never_wait(port)?)
 }
 
+/// Why a port cannot be opened, as far as the library tells.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Refusal {
+    /// There is no such device file.
+    Absent,
+    /// Another program has it.
+    InUse,
+    /// The operating system does not let this user open it.
+    Denied,
+    /// A file, a folder or a device of another kind.
+    NotAPort,
+    /// A device file with no hardware behind it.
+    NoHardware,
+    /// It does not do this rate.
+    Rate,
+    /// The library does not say.
+    Unknown,
+}
+
+impl Refusal {
+    /// What to do about it.
+    pub const fn remedy(self) -> &'static str {
+        match self {
+            Self::Absent => "is it plugged in? `dpm doctor` lists the ports that are there",
+            Self::InUse => "end the program that has it; `fuser -v` on the device file names it",
+            Self::Denied => {
+                "add this user to the group that owns it (`sudo usermod -aG dialout $USER`, then log in again)"
+            }
+            Self::NotAPort => "this is no serial port; `dpm doctor` lists those that are there",
+            Self::NoHardware => "no hardware is behind this port; `dpm doctor` lists the ports that are there",
+            Self::Rate => "the adapter does not do this rate; common ones are 115200, 921600 and 3000000 baud",
+            Self::Unknown => "check cable and adapter, plug it in again, and see `dmesg`",
+        }
+    }
+}
+
+/// The library folds several system errors into one kind; only its text tells them apart.
+pub fn refusal(e: &serialport::Error) -> Refusal {
+    let text = e.description.to_lowercase();
+    let says = |words: &[&str]| words.iter().any(|w| text.contains(w));
+    if says(&["busy", "lock", "temporarily unavailable"]) {
+        return Refusal::InUse;
+    }
+    if says(&["permission denied", "not permitted"]) {
+        return Refusal::Denied;
+    }
+    if says(&["typewriter", "ioctl", "is a directory", "not a directory", "not a tty"]) {
+        return Refusal::NotAPort;
+    }
+    if says(&["no such device or address", "input/output error", "i/o error"]) {
+        return Refusal::NoHardware;
+    }
+    match e.kind() {
+        serialport::ErrorKind::NoDevice | serialport::ErrorKind::Io(io::ErrorKind::NotFound) => {
+            Refusal::Absent
+        }
+        serialport::ErrorKind::InvalidInput => Refusal::Rate,
+        _ if says(&["invalid argument"]) => Refusal::Rate,
+        _ => Refusal::Unknown,
+    }
+}
+
 /// Makes an open port (of a pseudo-terminal, for example) one whose reads and writes take what there is room for now, or fail with
 /// [`io::ErrorKind::WouldBlock`] or [`io::ErrorKind::TimedOut`].
 ///
@@ -37,5 +99,36 @@ pub fn never_wait(mut port: TTYPort) -> io::Result<Box<dyn SerialPort>> {
         Ok(Box::new(port))
     } else {
         Err(io::Error::last_os_error())
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn what_is_no_port_is_told_from_what_is_not_there() {
+        let of = |path: &str, baud| refusal(&open(path, baud).map(|_| ()).expect_err("no port opens here"));
+        assert_eq!(of("/dev/no-such-port", 9600), Refusal::Absent);
+        for no_port in ["/dev/null", "/tmp", "/proc/version", "/proc/version/tty"] {
+            assert_eq!(of(no_port, 9600), Refusal::NotAPort, "{no_port}");
+        }
+    }
+
+    #[test]
+    fn the_systems_words_find_their_remedy() {
+        use serialport::{Error, ErrorKind as K};
+        for (kind, text, refusal_) in [
+            (K::NoDevice, "Device or resource busy", Refusal::InUse),
+            (K::NoDevice, "Unable to acquire exclusive lock on serial port", Refusal::InUse),
+            (K::Io(io::ErrorKind::PermissionDenied), "Permission denied", Refusal::Denied),
+            (K::Unknown, "Not a typewriter", Refusal::NotAPort),
+            (K::Unknown, "I/O error", Refusal::NoHardware),
+            (K::Unknown, "No such device or address", Refusal::NoHardware),
+            (K::Unknown, "Invalid argument", Refusal::Rate),
+            (K::Unknown, "Out of memory", Refusal::Unknown),
+        ] {
+            assert_eq!(refusal(&Error::new(kind, text)), refusal_, "{text}");
+        }
     }
 }

@@ -24,6 +24,11 @@ pub trait HidPort {
     /// Receives one report.
     fn read_report(&mut self, report: &mut [u8; REPORT_BYTES], timeout: Duration) -> Result<(), PortError>;
 
+    /// What to call the controller in messages.
+    fn name(&self) -> &str {
+        "DLPC900"
+    }
+
     /// Lets time pass. Simulated ports let theirs.
     fn pause(&mut self, time: Duration) {
         std::thread::sleep(time);
@@ -34,10 +39,10 @@ pub trait HidPort {
 #[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
 pub enum PortError {
     /// Nothing within the time given.
-    #[error("no answer in time")]
+    #[error("no answer in time: is it switched on, and past its start (10 s)? Else switch it off and on")]
     Timeout,
     /// The device has gone.
-    #[error("the device was unplugged or has lost power")]
+    #[error("the device was unplugged or has lost power: check cable and supply")]
     Gone,
     /// No such device.
     #[error("no DLPC900 (USB 0451:c900) is plugged in: check cable and power")]
@@ -46,7 +51,7 @@ pub enum PortError {
     #[error("no permission to open the device: {0}")]
     Denied(String),
     /// Somebody else holds the device.
-    #[error("another program holds the device: close it (TI's own, or a second dpm)")]
+    #[error("another program holds the device: close it (TI's own, or a second dpm; `fuser -v` on the device file names it)")]
     Busy,
     /// Anything else.
     #[error("{0}")]
@@ -59,7 +64,7 @@ pub enum Dlpc900Error {
     /// The cable failed.
     #[error("{doing}: {source}")]
     Port {
-        /// During which command.
+        /// On which device, during which command.
         doing: String,
         /// How.
         source: PortError,
@@ -297,10 +302,14 @@ impl<P: HidPort> Dlpc900<P> {
         };
         let reports = command.reports().map_err(|e: TooLong| protocol(doing, e))?;
         for report in reports {
-            self.port.write_report(&report, TIMEOUT).map_err(|source| port(doing, source))?;
+            self.port.write_report(&report, TIMEOUT).map_err(|source| self.failed(doing, source))?;
         }
         self.counters.commands += 1;
         Ok(())
+    }
+
+    fn failed(&self, doing: &str, source: PortError) -> Dlpc900Error {
+        Dlpc900Error::Port { doing: format!("{}: {doing}", self.port.name()), source }
     }
 
     /// Waits for the reply to the last command. `explain` asks the controller why, when it refused.
@@ -310,7 +319,7 @@ impl<P: HidPort> Dlpc900<P> {
         let mut stale = 0;
         // A reply has at most this many reports, and so many strays may come before it: the loop ends.
         for _ in 0..MOST_STALE * MAX_REPLY_DATA.div_ceil(REPORT_BYTES) {
-            self.port.read_report(&mut report, TIMEOUT).map_err(|source| port(doing, source))?;
+            self.port.read_report(&mut report, TIMEOUT).map_err(|source| self.failed(doing, source))?;
             match assembler.push(&report) {
                 Ok(None) => {}
                 Ok(Some(reply)) if reply.sequence == self.sequence => {
@@ -552,10 +561,6 @@ impl<P: HidPort> Dlpc900<P> {
     pub fn wake(&mut self) -> Result<(), Dlpc900Error> {
         self.run(&sequence::wake(self.firmware), &mut |_| ())
     }
-}
-
-fn port(doing: &str, source: PortError) -> Dlpc900Error {
-    Dlpc900Error::Port { doing: doing.to_owned(), source }
 }
 
 fn protocol(doing: &str, what: impl ToString) -> Dlpc900Error {

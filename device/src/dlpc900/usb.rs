@@ -6,6 +6,7 @@ use rusb::{Context, Device, DeviceHandle, Direction, TransferType, UsbContext};
 
 use super::command::REPORT_BYTES;
 use super::driver::{HidPort, PortError};
+use crate::usb_help::{node, node_of, remedy};
 
 /// USB vendor, Texas Instruments.
 pub const VENDOR: u16 = 0x0451;
@@ -26,6 +27,19 @@ pub struct UsbPlace {
     pub address: u8,
 }
 
+impl std::fmt::Display for UsbPlace {
+    /// The device file.
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        f.write_str(&node(self.bus, self.address))
+    }
+}
+
+/// The controller at `place` in words: vendor, product, device file where it is known.
+pub fn describe(place: Option<UsbPlace>) -> String {
+    let at = place.map_or(String::new(), |p| format!(" at {p}"));
+    format!("DLPC900 ({VENDOR:04x}:{PRODUCT:04x}){at}")
+}
+
 impl std::str::FromStr for UsbPlace {
     type Err = &'static str;
 
@@ -39,6 +53,7 @@ impl std::str::FromStr for UsbPlace {
 
 /// An open DLPC900. Dropping it gives the interface back to the kernel's driver.
 pub struct UsbHid {
+    name: String,
     handle: DeviceHandle<Context>,
     interface: u8,
     endpoint_out: u8,
@@ -60,7 +75,7 @@ fn error(e: rusb::Error) -> PortError {
         rusb::Error::Access => PortError::Denied(format!(
             "put the line {UDEV_RULE} into /etc/udev/rules.d/70-dlpc900.rules, run `udevadm control --reload` and plug the device in again"
         )),
-        other => PortError::Other(other.to_string()),
+        other => PortError::Other(format!("{other}; {}", remedy(other))),
     }
 }
 
@@ -129,11 +144,16 @@ impl UsbHid {
                 Err(e) => return Err(error(e)),
             }
         }
-        Ok(Self { handle, interface, endpoint_out, endpoint_in })
+        let name = format!("DLPC900 ({VENDOR:04x}:{PRODUCT:04x}) at {}", node_of(&device));
+        Ok(Self { name, handle, interface, endpoint_out, endpoint_in })
     }
 }
 
 impl HidPort for UsbHid {
+    fn name(&self) -> &str {
+        &self.name
+    }
+
     fn write_report(&mut self, report: &[u8; REPORT_BYTES], timeout: Duration) -> Result<(), PortError> {
         let write = |h: &DeviceHandle<Context>, e| h.write_interrupt(e, report, timeout);
         let sent = match write(&self.handle, self.endpoint_out) {

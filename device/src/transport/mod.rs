@@ -24,7 +24,7 @@ pub enum Lane {
 #[non_exhaustive]
 pub enum TransportError {
     /// The device is gone; opening again may succeed.
-    #[error("{device}: unplugged")]
+    #[error("{device}: unplugged or without power; check cable and supply")]
     Unplugged {
         /// Which device.
         device: String,
@@ -46,14 +46,16 @@ pub enum TransportError {
         remedy: String,
     },
     /// Another program has the device.
-    #[error("{device}: in use by another program; end it first (two hosts cannot drive one projector)")]
+    #[error(
+        "{device}: in use by another program; end it first, `fuser -v` on the device file names it (two hosts cannot drive one projector)"
+    )]
     InUse {
         /// Which device.
         device: String,
     },
     /// libusb reports an error.
     #[cfg(feature = "usb")]
-    #[error("cannot {doing} {device}: {source}")]
+    #[error("cannot {doing} {device}: {source}; {}", crate::usb_help::remedy(*.source))]
     Usb {
         /// What was being done.
         doing: &'static str,
@@ -62,14 +64,36 @@ pub enum TransportError {
         /// libusb's error.
         source: rusb::Error,
     },
-    /// The operating system refused; the text names the object and the remedy.
-    #[error("{context}: {source}")]
-    Io {
-        /// What was being done, on which object, and what to try.
-        context: String,
-        /// The operating system's error.
-        source: std::io::Error,
+    /// A serial port cannot be opened.
+    #[cfg(feature = "serial")]
+    #[error("cannot open {device}: {source}; {remedy}")]
+    Serial {
+        /// Which port.
+        device: String,
+        /// The library's error.
+        source: serialport::Error,
+        /// What to do.
+        remedy: &'static str,
     },
+}
+
+#[cfg(feature = "usb")]
+impl TransportError {
+    /// What libusb said while `doing` something to or with `device`, which names vendor, product and device file.
+    pub(crate) fn of_usb(doing: &'static str, device: String, source: rusb::Error) -> Self {
+        match source {
+            rusb::Error::NoDevice => Self::Unplugged { device },
+            rusb::Error::Busy => Self::InUse { device },
+            rusb::Error::Access => Self::PermissionDenied {
+                device,
+                remedy: format!(
+                    "copy packaging/60-dpm.rules to /etc/udev/rules.d/ and plug it in again, or write there: {}",
+                    usb::UDEV_RULE
+                ),
+            },
+            source => Self::Usb { doing, device, source },
+        }
+    }
 }
 
 /// Why [`Transport::send`] took nothing.

@@ -13,7 +13,7 @@ use crate::cobs::{encode, encoded_bytes, Deframer};
 use crate::link::{packet_bytes, Packet, MAX_CONTROL_BYTES};
 use crate::planes::MAX_PLANES;
 use crate::time::HostTime;
-use crate::tty;
+use crate::tty::{self, Refusal};
 
 /// Bytes of control messages that may wait.
 const CONTROL_WAITING: usize = 4096;
@@ -255,20 +255,12 @@ impl Transport for SerialTransport {
 
 fn open_error(path: &str, e: serialport::Error) -> TransportError {
     let device = format!("serial port {path}");
-    // The library folds several system errors into "no device"; only its text tells them apart.
-    let text = e.description.to_lowercase();
-    if text.contains("busy") || text.contains("lock") || text.contains("temporarily unavailable") {
-        return TransportError::InUse { device };
-    }
-    if text.contains("permission denied") {
-        let remedy =
-            "add this user to the group that owns it (`sudo usermod -aG dialout $USER`, then log in again)";
-        return TransportError::PermissionDenied { device, remedy: remedy.into() };
-    }
-    match e.kind() {
-        serialport::ErrorKind::NoDevice | serialport::ErrorKind::Io(ErrorKind::NotFound) => {
-            TransportError::NotFound { device }
+    match tty::refusal(&e) {
+        Refusal::InUse => TransportError::InUse { device },
+        Refusal::Absent => TransportError::NotFound { device },
+        refusal @ Refusal::Denied => {
+            TransportError::PermissionDenied { device, remedy: refusal.remedy().into() }
         }
-        _ => TransportError::Io { context: format!("cannot open {device}"), source: e.into() },
+        refusal => TransportError::Serial { device, source: e, remedy: refusal.remedy() },
     }
 }

@@ -180,8 +180,8 @@ impl UsbTransport {
     /// Not found; no permission (with the udev rule to install); in use by another program; usbfs too small for one frame (with the
     /// setting to change).
     pub fn open(settings: UsbSettings) -> Result<Self, TransportError> {
-        let context = open::context()?;
         let name = settings.describe();
+        let context = open::context(&name)?;
         let mut transport = Self {
             settings,
             context,
@@ -398,7 +398,7 @@ impl Transport for UsbTransport {
                 Err(SendError::Busy)
             }
             Err(rusb::Error::NoDevice) => Err(self.gone().into()),
-            Err(e) => Err(open::error("send to", &self.name, e).into()),
+            Err(e) => Err(TransportError::of_usb("send to", self.name.clone(), e).into()),
         }
     }
 
@@ -418,8 +418,10 @@ impl Transport for UsbTransport {
     fn reopen(&mut self) -> Result<(), TransportError> {
         self.device = None;
         self.reset_due = false;
-        let handle = Arc::new(self.settings.open_handle(&self.context)?);
-        let failed = |e| open::error("allocate transfers of", &self.name, e);
+        let (handle, name) = self.settings.open_handle(&self.context)?;
+        let handle = Arc::new(handle);
+        self.name = name;
+        let failed = |e| TransportError::of_usb("allocate transfers of", self.name.clone(), e);
         let depth = self.settings.depth_within_limit();
         let mut device = Open {
             data: Outgoing::new(&handle, DATA_OUT, depth, self.settings.frame_bytes).map_err(failed)?,
@@ -433,10 +435,11 @@ impl Transport for UsbTransport {
             device
                 .handle
                 .clear_halt(endpoint)
-                .map_err(|e| open::error("clear the endpoints of", &self.name, e))?;
+                .map_err(|e| TransportError::of_usb("clear the endpoints of", self.name.clone(), e))?;
         }
         for slot in 0..REPLY_DEPTH {
-            device.replies.submit(slot, REPLY_BYTES).map_err(|e| open::error("read from", &self.name, e))?;
+            (device.replies.submit(slot, REPLY_BYTES))
+                .map_err(|e| TransportError::of_usb("read from", self.name.clone(), e))?;
         }
         device.data.progress_at = NEVER;
         self.device = Some(device);

@@ -26,6 +26,11 @@ pub enum Device {
     Vrpn(vrpn::VrpnArguments),
 }
 
+/// Why a serial port cannot be opened, and what to do about it.
+fn cannot_open(path: &str, e: &serialport::Error) -> String {
+    format!("cannot open {path}: {e}; {}", dpm_device::tty::refusal(e).remedy())
+}
+
 /// Runs `device` until it is stopped or fails.
 pub fn run(device: Device) -> Result<(), Box<dyn Error>> {
     match device {

@@ -14,6 +14,7 @@ use hil_mock::projector::{MockConfig, MockProjector};
 use hil_mock::serial_server::pseudo_terminal;
 use hil_mock::usb_model::Speed;
 
+use super::cannot_open;
 use super::usb::{offer, UsbArguments};
 
 /// Arguments of `hil-mock serve projector`.
@@ -94,7 +95,7 @@ fn serve_port(
         (line, path, Some(other_end))
     } else {
         let line = dpm_device::tty::open(port, arguments.baud);
-        (line.map_err(|e| format!("cannot open {port}: {e}"))?, port.to_string(), None)
+        (line.map_err(|e| cannot_open(port, &e))?, port.to_string(), None)
     };
     println!("bit-plane projector on {path}");
     let mut device = SerialProjector::new(projector);
@@ -105,7 +106,7 @@ fn serve_port(
             return Ok(());
         }
         if !device.serve(now, &mut line)? {
-            return Err(format!("{path} failed: unplugged?").into());
+            return Err(format!("{path} failed: unplugged? Check cable and adapter").into());
         }
         report.look(now, device.projector());
         std::thread::sleep(Duration::from_micros(500));

@@ -1,6 +1,7 @@
 //! `hil-mock serve serial`: arguments into a serial pose stream on a port or a new pseudo-terminal.
 
 use super::bodies::{clock_from_now, TrackerArguments};
+use super::cannot_open;
 use clap::Args;
 use hil_mock::serial_server::{pseudo_terminal, SerialPoseDevice, SerialPoseHost};
 use std::error::Error;
@@ -25,7 +26,7 @@ pub fn run(arguments: &SerialArguments) -> Result<(), Box<dyn Error>> {
     let (port, path, _other_end) = match &arguments.port {
         Some(path) => {
             let port = dpm_device::tty::open(path, arguments.baud);
-            (port.map_err(|e| format!("cannot open {path}: {e}"))?, path.clone(), None)
+            (port.map_err(|e| cannot_open(path, &e))?, path.clone(), None)
         }
         None => {
             let (port, path, other_end) = pseudo_terminal()?;
@@ -44,5 +45,5 @@ pub fn run(arguments: &SerialArguments) -> Result<(), Box<dyn Error>> {
         }
         std::thread::sleep(Duration::from_millis(50));
     }
-    Err(format!("{path} failed: unplugged?").into())
+    Err(format!("{path} failed: unplugged? Check cable and adapter").into())
 }

@@ -8,7 +8,7 @@ use dpm_device::dlpc900::driver::{Dlpc900, Dlpc900Error, UploadProgress};
 use dpm_device::dlpc900::image::{Compression, PlaneOrder};
 use dpm_device::dlpc900::lut::{led, LutEntry};
 use dpm_device::dlpc900::sequence::{LedSetup, Receiver, Repeat, VideoPatterns};
-use dpm_device::dlpc900::usb::{list, UsbHid, UsbPlace};
+use dpm_device::dlpc900::usb::{describe, list, UsbHid, UsbPlace};
 use std::path::PathBuf;
 
 /// Flags of `dpm dlpc900`.
@@ -170,10 +170,10 @@ impl From<PatternFileError> for Failure {
 }
 
 fn open(args: &Dlpc900Args) -> Result<Dlpc900<UsbHid>, Failure> {
-    let device = |e| Failure::new(FailureKind::Device, e);
+    let device = |text: String| Failure::new(FailureKind::Device, text);
     let mut place = args.device;
     if place.is_none() {
-        let all = list().map_err(device)?;
+        let all = list().map_err(|e| device(e.to_string()))?;
         if all.len() > 1 {
             let names: Vec<_> = all.iter().map(|p| format!("{}:{}", p.bus, p.address)).collect();
             let text = format!(
@@ -185,7 +185,8 @@ fn open(args: &Dlpc900Args) -> Result<Dlpc900<UsbHid>, Failure> {
         }
         place = all.first().copied();
     }
-    Ok(Dlpc900::new(UsbHid::open(place).map_err(device)?)?)
+    let named = |e| device(format!("{}: {e}", describe(place)));
+    Ok(Dlpc900::new(UsbHid::open(place).map_err(named)?)?)
 }
 
 /// Runs the command.

@@ -20,7 +20,7 @@ use dpm_device::dlpc900::lut::{led, Dmd, LutEntry, IMAGE_PLANES, MAX_IMAGES};
 use dpm_device::dlpc900::sequence::{
     LedSetup, Pattern, PatternSequence, Receiver, Repeat, SequenceBuilder, SequenceError, VideoPatterns,
 };
-use dpm_device::dlpc900::usb::{UsbHid, UsbPlace};
+use dpm_device::dlpc900::usb::{describe, UsbHid, UsbPlace};
 use dpm_device::link::faults;
 use dpm_device::planes::{Channel, PlaneSchedule};
 use std::time::Duration;
@@ -170,7 +170,7 @@ pub fn run_dlpc900(config: &RigConfig, monitor: &RunMonitor) -> Result<Dlpc900Re
         place.map_err(|e| Failure::new(FailureKind::BadInput, format!("projector.backend.device: {e}")))?;
     let mut open = || {
         let port =
-            UsbHid::open(place).map_err(|source| Dlpc900Error::Port { doing: "open".into(), source })?;
+            UsbHid::open(place).map_err(|source| Dlpc900Error::Port { doing: describe(place), source })?;
         Dlpc900::new(port)
     };
     // Before minutes of rendering: is it there, and the one that is meant?

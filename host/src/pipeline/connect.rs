@@ -17,8 +17,14 @@ pub enum ConnectError {
     #[error(transparent)]
     Link(#[from] LinkError),
     /// It does not answer.
-    #[error("the projector did not get beyond {state:?} within {0} s; check power and cable", LIMIT_NS / 1_000_000_000)]
+    #[error(
+        "{device}: no projector got beyond {state:?} within {0} s; is it switched on, and the one that is meant (port, baud)? Check the \
+         cable, and switch it off and on",
+        LIMIT_NS / 1_000_000_000
+    )]
     Silent {
+        /// Name of the transport.
+        device: String,
         /// How far it came.
         state: LinkState,
     },
@@ -70,7 +76,7 @@ pub fn connect(
             }
         }
         if t.ns_since(begin) > LIMIT_NS {
-            return Err(ConnectError::Silent { state });
+            return Err(ConnectError::Silent { device: transport.name().to_owned(), state });
         }
     }
 }

@@ -27,8 +27,11 @@ fn bench(projector: Projector, options: Options) -> Bench {
 
 impl Bench {
     fn open(&self) -> Result<UsbHid, PortError> {
-        let place = UsbPlace { bus: self.socket.bus_number(), address: self.socket.address() };
-        UsbHid::open(Some(place))
+        UsbHid::open(Some(self.place()))
+    }
+
+    fn place(&self) -> UsbPlace {
+        UsbPlace { bus: self.socket.bus_number(), address: self.socket.address() }
     }
 }
 
@@ -101,6 +104,11 @@ fn stalls_are_cleared_and_silence_and_unplugging_end_in_time() {
     let start = Instant::now();
     let err = d.status().unwrap_err();
     assert!(matches!(err, Dlpc900Error::Port { source: PortError::Timeout, .. }), "{err}");
+    let (text, place) = (err.to_string(), b.place().to_string());
+    assert!(
+        text.contains("0451:c900") && text.contains(&place) && text.contains("switch it off and on"),
+        "{text}"
+    );
     assert!((900..2000).contains(&start.elapsed().as_millis()));
     b.plug.inject(0x01, 0, Fault::Short(10));
     let err = d.status().unwrap_err().to_string();

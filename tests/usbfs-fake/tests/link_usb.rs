@@ -232,7 +232,8 @@ fn u13_a_second_host_is_refused() {
     let _host = Host::connected(&device);
     let second = UsbTransport::open(device.settings()).unwrap_err();
     assert!(matches!(second, TransportError::InUse { .. }), "{second}");
-    assert!(second.to_string().contains("in use by another program"), "{second}");
+    let text = second.to_string();
+    assert!(text.contains("in use by another program") && text.contains(" at /dev/bus/usb/"), "{text}");
 }
 
 #[test]
@@ -244,6 +245,7 @@ fn u14_denied_names_the_rule_and_absent_names_the_device() {
     let text = refused.to_string();
     assert!(text.contains("permission denied") && text.contains("packaging/60-dpm.rules"), "{text}");
     assert!(text.contains(r#"ATTR{idVendor}=="1209""#), "{text}");
+    assert!(text.contains("1209:000d") && text.contains(" at /dev/bus/usb/"), "which device: {text}");
     let rules = include_str!("../../../packaging/60-dpm.rules");
     assert!(
         rules.contains(dpm_device::transport::usb::UDEV_RULE),

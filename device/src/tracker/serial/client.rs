@@ -162,7 +162,7 @@ impl SerialTracker {
     }
 
     fn hung_up(&mut self, now: HostTime) -> usize {
-        self.lose(now, format!("{} was unplugged", self.config.port));
+        self.lose(now, format!("{} was unplugged: check cable and supply", self.config.port));
         0
     }
 
@@ -291,7 +291,10 @@ impl Tracker for SerialTracker {
             State::Idle { .. } => {}
             State::Opening(result) => match result.try_recv() {
                 Ok(Ok(port)) => self.begin(port, now),
-                Ok(Err(error)) => self.lose(now, format!("cannot open {}: {error}", self.config.port)),
+                Ok(Err(error)) => {
+                    let remedy = crate::tty::refusal(&error).remedy();
+                    self.lose(now, format!("cannot open {}: {error}; {remedy}", self.config.port));
+                }
                 Err(TryRecvError::Empty) => {}
                 Err(TryRecvError::Disconnected) => self.lose(now, "the opening thread ended".into()),
             },

@@ -6,6 +6,7 @@ use rusb::{Context, Device, DeviceHandle, UsbContext};
 
 use super::{CONTROL_BYTES, CONTROL_DEPTH, PRODUCT_ID, REPLY_BYTES, REPLY_DEPTH, VENDOR_ID};
 use crate::transport::TransportError;
+use crate::usb_help::node_of;
 
 /// The rule that lets the user at the machine open the reference device; `packaging/60-dpm.rules` has it with others.
 pub const UDEV_RULE: &str =
@@ -78,19 +79,29 @@ impl UsbSettings {
         ))
     }
 
-    pub(super) fn open_handle(&self, context: &Context) -> Result<DeviceHandle<Context>, TransportError> {
+    /// The open device with its interface claimed, and its name with the device file in it.
+    pub(super) fn open_handle(
+        &self,
+        context: &Context,
+    ) -> Result<(DeviceHandle<Context>, String), TransportError> {
         let name = self.describe();
-        let devices = context.devices().map_err(|e| error("list devices for", &name, e))?;
+        let devices = context.devices().map_err(|e| TransportError::of_usb("look for", name.clone(), e))?;
         let mut refused = None;
         for device in devices.iter() {
             let Ok(d) = device.device_descriptor() else { continue };
             if (d.vendor_id(), d.product_id()) != (self.vendor_id, self.product_id) {
                 continue;
             }
+            let name = format!("{name} at {}", node_of(&device));
             match self.try_open(&device) {
-                Ok(Some(handle)) => return claim(handle, &name, &device),
+                Ok(Some(handle)) => {
+                    return match claim(&handle) {
+                        Ok(()) => Ok((handle, name)),
+                        Err(e) => Err(TransportError::of_usb("claim the interface of", name, e)),
+                    }
+                }
                 Ok(None) => {}
-                Err(e) => refused = Some(at(&name, &device, e)),
+                Err(e) => refused = Some(TransportError::of_usb("open", name, e)),
             }
         }
         Err(refused.unwrap_or(TransportError::NotFound { device: name }))
@@ -109,52 +120,25 @@ impl UsbSettings {
     }
 }
 
-fn claim(
-    handle: DeviceHandle<Context>,
-    name: &str,
-    device: &Device<Context>,
-) -> Result<DeviceHandle<Context>, TransportError> {
+fn claim(handle: &DeviceHandle<Context>) -> Result<(), rusb::Error> {
     match handle.set_auto_detach_kernel_driver(true) {
         Ok(()) | Err(rusb::Error::NotSupported) => {}
-        Err(e) => return Err(at(name, device, e)),
+        Err(e) => return Err(e),
     }
     let start = Instant::now();
     loop {
         match handle.claim_interface(0) {
-            Ok(()) => return Ok(handle),
             Err(rusb::Error::NotFound) if start.elapsed() < CLAIM_PATIENCE => {
                 std::thread::sleep(Duration::from_millis(10));
             }
-            Err(e) => return Err(at(name, device, e)),
+            other => return other,
         }
     }
 }
 
-/// An error of opening `device`, with what to do about it.
-fn at(name: &str, device: &Device<Context>, e: rusb::Error) -> TransportError {
-    let node = format!("/dev/bus/usb/{:03}/{:03}", device.bus_number(), device.address());
-    match e {
-        rusb::Error::Access => TransportError::PermissionDenied {
-            device: format!("{name} at {node}"),
-            remedy: format!(
-                "copy packaging/60-dpm.rules to /etc/udev/rules.d/ and plug it in again, or write there: {UDEV_RULE}"
-            ),
-        },
-        rusb::Error::Busy => TransportError::InUse { device: format!("{name} at {node}") },
-        rusb::Error::NoDevice => TransportError::Unplugged { device: name.to_string() },
-        e => error("open", &format!("{name} at {node}"), e),
-    }
-}
-
-pub(super) fn error(doing: &'static str, name: &str, e: rusb::Error) -> TransportError {
-    if e == rusb::Error::NoDevice {
-        return TransportError::Unplugged { device: name.to_string() };
-    }
-    TransportError::Usb { doing, device: name.to_string(), source: e }
-}
-
-pub(super) fn context() -> Result<Context, TransportError> {
-    Context::new().map_err(|e| error("use libusb for", "USB", e))
+/// libusb, about to look for `name`.
+pub(super) fn context(name: &str) -> Result<Context, TransportError> {
+    Context::new().map_err(|e| TransportError::of_usb("start libusb to look for", name.to_owned(), e))
 }
 
 /// Megabytes of transfers that the kernel allows in flight on all devices together; 0 means no limit. `None` where the kernel
