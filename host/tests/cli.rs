@@ -8,11 +8,40 @@ use std::process::Command;
 #[test]
 fn version_and_help_go_to_standard_output() {
     let version = dpm(&["--version"], &[]);
-    assert_eq!((code(&version), out(&version)), (0, format!("dpm {}\n", env!("CARGO_PKG_VERSION"))));
+    let told = out(&version);
+    let begins = format!("dpm {} (", env!("CARGO_PKG_VERSION"));
+    assert!(code(&version) == 0 && told.starts_with(&begins) && told.ends_with(")\n"), "{told}");
     let help = dpm(&["--help"], &[]);
     assert_eq!(code(&help), 0);
     for word in ["doctor", "Exit codes", "--set a.b=c"] {
         assert!(out(&help).contains(word), "{word} in {}", out(&help));
+    }
+}
+
+#[test]
+fn a_program_knows_its_commit_wherever_it_lies() {
+    let known = out(&dpm(&["--version"], &[]));
+    // In another project's work tree, far from the one it was built in.
+    let folder = std::env::temp_dir().join(format!("dpm-elsewhere-{}", std::process::id()));
+    std::fs::create_dir_all(folder.join(".git")).unwrap();
+    std::fs::write(folder.join(".git/HEAD"), "f".repeat(40)).unwrap();
+    let program = folder.join("dpm");
+    std::fs::copy(env!("CARGO_BIN_EXE_dpm"), &program).unwrap();
+    let there = Command::new(&program).arg("--version").current_dir(&folder).output().unwrap();
+    std::fs::remove_dir_all(&folder).unwrap();
+    assert_eq!(String::from_utf8_lossy(&there.stdout), known);
+    let (_, commit) = known.trim_end_matches(")\n").split_once('(').expect("a commit in parentheses");
+    let top = concat!(env!("CARGO_MANIFEST_DIR"), "/..");
+    let head = Command::new("git").args(["rev-parse", "HEAD"]).current_dir(top).output();
+    let head =
+        head.ok().filter(|h| h.status.success()).map(|h| String::from_utf8_lossy(&h.stdout).into_owned());
+    match head {
+        // Packagers may say another.
+        _ if option_env!("DPM_COMMIT").is_some() => {}
+        Some(head) if std::path::Path::new(top).join(".git").exists() => {
+            assert_eq!(commit.trim_end_matches("-dirty"), &head[..12]);
+        }
+        _ => assert_eq!(commit, "unknown"),
     }
 }
 

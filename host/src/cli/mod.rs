@@ -76,11 +76,15 @@ enum Command {
     Dlpc900(dlpc900::Dlpc900Args),
 }
 
-/// Runs the program with the process's arguments.
-pub fn main() -> ExitCode {
+/// Runs the program with the process's arguments. `commit`: what it was compiled from, see [`crate::commit::get`].
+pub fn main(commit: &'static str) -> ExitCode {
+    crate::commit::set(commit);
     // https://no-color.org: set and not empty.
     let plain = std::env::var_os("NO_COLOR").is_some_and(|v| !v.is_empty());
-    let command = Cli::command().color(if plain { ColorChoice::Never } else { ColorChoice::Auto });
+    // Once in the life of the process; the parser keeps it for as long.
+    let version: &'static str = format!("{} ({commit})", env!("CARGO_PKG_VERSION")).leak();
+    let command =
+        Cli::command().version(version).color(if plain { ColorChoice::Never } else { ColorChoice::Auto });
     let parsed = command.try_get_matches().and_then(|m| Cli::from_arg_matches(&m));
     let cli = match parsed {
         Ok(cli) => cli,

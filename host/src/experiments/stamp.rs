@@ -48,7 +48,7 @@ pub struct Stamp {
     pub software: bool,
     /// Version of this program.
     pub version: String,
-    /// Commit of the program: `DPM_COMMIT` when it was built, else what is checked out around the executable, else `unknown`.
+    /// Commit that the program was compiled from, see [`crate::commit::get`].
     #[serde(default)]
     pub commit: String,
     /// Hash of the rig (without what is written and how long it runs) and of the files that it names.
@@ -68,7 +68,7 @@ impl Stamp {
             driver: device.driver.clone(),
             software: device.software,
             version: env!("CARGO_PKG_VERSION").to_owned(),
-            commit: commit(),
+            commit: crate::commit::get().to_owned(),
             config_hash: config_hash(rig),
             raster: [raster.width(), raster.height()],
             seed: rig.config.render.seed,
@@ -106,37 +106,6 @@ impl Stamp {
     }
 }
 
-fn commit() -> String {
-    let found = || commit_around(&std::env::current_exe().ok()?);
-    option_env!("DPM_COMMIT").map(str::to_owned).or_else(found).unwrap_or_else(|| "unknown".to_owned())
-}
-
-/// The first twelve digits of the commit that is checked out in the nearest Git work tree above `place`.
-fn commit_around(place: &Path) -> Option<String> {
-    let dot = place.ancestors().map(|p| p.join(".git")).find(|p| p.exists())?;
-    // In a linked work tree `.git` is a file that names the folder.
-    let dir = match std::fs::read_to_string(&dot) {
-        Ok(text) => dot.parent()?.join(text.strip_prefix("gitdir:")?.trim()),
-        Err(_) => dot,
-    };
-    let head = std::fs::read_to_string(dir.join("HEAD")).ok()?;
-    let commit = match head.strip_prefix("ref:") {
-        None => head,
-        Some(name) => {
-            // Branches live in the common folder, loose or packed.
-            let common =
-                std::fs::read_to_string(dir.join("commondir")).map_or(dir.clone(), |c| dir.join(c.trim()));
-            let packed = || {
-                let all = std::fs::read_to_string(common.join("packed-refs")).ok()?;
-                Some(all.lines().find(|l| l.ends_with(&format!(" {}", name.trim())))?.to_owned())
-            };
-            std::fs::read_to_string(common.join(name.trim())).ok().or_else(packed)?
-        }
-    };
-    let digits: String = commit.chars().take(12).collect();
-    (digits.len() == 12 && digits.chars().all(|c| c.is_ascii_hexdigit())).then_some(digits)
-}
-
 fn config_hash(rig: &Rig) -> String {
     let c = &rig.config;
     let mut hash = Fnv::default();
@@ -160,32 +129,6 @@ fn add_file(hash: &mut Fnv, path: &Path) {
 #[cfg(test)]
 mod tests {
     use super::*;
-
-    #[test]
-    fn the_commit_is_found_on_a_branch_loose_or_packed_in_a_linked_tree_or_detached() {
-        let root = std::env::temp_dir().join(format!("dpm-stamp-{}", std::process::id()));
-        let write = |name: &str, text: &str| {
-            let path = root.join(name);
-            std::fs::create_dir_all(path.parent().unwrap()).unwrap();
-            std::fs::write(path, text).unwrap();
-        };
-        let of = |place: &str| commit_around(&root.join(place));
-        let [a, b, c] = ["a", "b", "c"].map(|d| d.repeat(40));
-        write("main/.git/HEAD", "ref: refs/heads/main\n");
-        write("main/.git/packed-refs", &format!("# pack-refs\n{b} refs/heads/other\n{a} refs/heads/main\n"));
-        assert_eq!(of("main/target/debug/dpm"), Some(a[..12].to_owned()));
-        write("main/.git/refs/heads/main", &format!("{b}\n"));
-        assert_eq!(of("main/target/debug/dpm"), Some(b[..12].to_owned()), "a loose one is newer");
-        write("tree/.git", "gitdir: ../main/.git/worktrees/tree\n");
-        write("main/.git/worktrees/tree/HEAD", "ref: refs/heads/other\n");
-        write("main/.git/worktrees/tree/commondir", "../..\n");
-        assert_eq!(of("tree/dpm"), Some(b[..12].to_owned()));
-        write("main/.git/HEAD", &format!("{c}\n"));
-        assert_eq!(of("main/dpm"), Some(c[..12].to_owned()));
-        write("main/.git/HEAD", "nonsense");
-        assert_eq!(of("main/dpm"), None);
-        std::fs::remove_dir_all(root).unwrap();
-    }
 
     #[test]
     fn the_hash_is_fnv_1a() {

@@ -55,6 +55,8 @@ pub struct StageTime {
 pub struct Report {
     /// Version of the program.
     pub version: &'static str,
+    /// Commit that it was compiled from, see [`crate::commit::get`].
+    pub commit: &'static str,
     /// Frames whose light left the projector.
     pub frames_lit: u64,
     /// Frames that were planned and never lit.
@@ -123,6 +125,7 @@ impl Default for Report {
     fn default() -> Self {
         Self {
             version: env!("CARGO_PKG_VERSION"),
+            commit: crate::commit::get(),
             frames_lit: 0,
             frames_dropped: 0,
             frames_late: 0,
