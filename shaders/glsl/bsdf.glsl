@@ -60,6 +60,7 @@ struct Lobes {
     float diffuse;
     float transmit;
     float albedo_v; // E(n.v)
+    float average;  // E_avg
     float eta;      // beyond / this side
     float dielectric;
 };
@@ -76,6 +77,7 @@ Lobes lobes_of(Point s) {
     l.eta = inside ? 1.0 / s.ior : s.ior;
     l.dielectric = 1.0 - s.metallic;
     l.albedo_v = 0.0;
+    l.average = 0.0;
     float specular = 0.0, diffuse = 0.0, transmit = 0.0;
     if (inside) {
         // Facets of a rough surface may transmit where the mean surface reflects totally.
@@ -85,6 +87,7 @@ Lobes lobes_of(Point s) {
     } else {
         if (HAS_SPECULAR) {
             l.albedo_v = l.dielectric > 0.0 ? directional_albedo(s.table, coat_alpha(s), nv) : 0.0;
+            if (HAS_DIFFUSE) l.average = average_albedo(s.table, coat_alpha(s));
             specular = l.dielectric * l.albedo_v + (s.metallic > 0.0 ? s.metallic * luminance(fresnel_schlick(s.base, nv)) : 0.0);
         }
         float rest = l.dielectric * (1.0 - l.albedo_v) * luminance(s.base);
@@ -121,8 +124,7 @@ void evaluate(Point s, Lobes q, vec3 l, out vec3 value, out float pdf) {
         if (HAS_DIFFUSE && q.diffuse > 0.0) {
             float k = q.dielectric * (1.0 - s.transmission);
             if (HAS_SPECULAR) {
-                float e_avg = average_albedo(s.table, coat_alpha(s));
-                k *= (1.0 - q.albedo_v) * (1.0 - directional_albedo(s.table, coat_alpha(s), nl)) / max(1.0 - e_avg, 1e-4);
+                k *= (1.0 - q.albedo_v) * (1.0 - directional_albedo(s.table, coat_alpha(s), nl)) / max(1.0 - q.average, 1e-4);
             }
             value += s.base * (k * nl / PI);
             pdf += q.diffuse * nl / PI;

@@ -20,11 +20,13 @@ bool alpha_present(uint instance, uint triangle, vec2 barycentric);
 #endif
 
 struct Hit {
-    uint instance;
-    uint triangle; // of the body, in BVH order
+    uint id;          // as in Surface: which body, and its triangle in BVH order; NO_HIT: nothing was met
     vec2 barycentric; // weights of vertices 1 and 2
     float t;
 };
+
+uint instance_of(uint id) { return id >> 24u; }
+uint triangle_of(uint id) { return id & 0xffffffu; }
 
 const uint STACK_SIZE = 24u; // one entry per level; an 8-wide tree of 2^24 triangles is at most about 20 deep
 
@@ -78,6 +80,7 @@ struct LocalRay {
     vec3 inverse;
     vec3 u;
     vec3 v;
+    float length2; // of the direction, squared
 };
 
 // A zero component would make 0 * inf in the slab test: a tiny one of the same sign gives the same hits.
@@ -91,6 +94,7 @@ LocalRay local_ray(vec3 origin, vec3 direction) {
     LocalRay r;
     r.origin = origin;
     r.direction = direction;
+    r.length2 = dot(direction, direction);
     r.inverse = 1.0 / safe_direction(direction);
     // [Duff17] branchless basis.
     vec3 d = normalize(direction);
@@ -114,15 +118,18 @@ bool intersect_triangle(LocalRay r, uint row, float t_min, float t_max, out floa
     precise float w0 = b.x * c.y - b.y * c.x;
     precise float w1 = c.x * a.y - c.y * a.x;
     precise float w2 = a.x * b.y - a.y * b.x;
-    if ((w0 < 0.0 || w1 < 0.0 || w2 < 0.0) && (w0 > 0.0 || w1 > 0.0 || w2 > 0.0)) return false;
+    // Signs by bits, a negative zero being none: one instruction a minimum or maximum, as above. Nothing returns early: that would be two more
+    // masks for software Vulkan to carry.
+    uvec3 bits = floatBitsToUint(vec3(w0, w1, w2));
+    bool negative = max(bits.x, max(bits.y, bits.z)) > 0x80000000u;
+    bool positive = max(int(bits.x), max(int(bits.y), int(bits.z))) > 0;
     float area = w0 + w1 + w2;
-    if (area == 0.0) return false;
     float inverse_area = 1.0 / area;
     // Depth along the (possibly not unit) direction.
     float along = (w0 * dot(p0, r.direction) + w1 * dot(p1, r.direction) + w2 * dot(p2, r.direction)) * inverse_area;
-    t = along / dot(r.direction, r.direction);
+    t = along / r.length2;
     barycentric = vec2(w1, w2) * inverse_area;
-    return t > t_min && t < t_max;
+    return !(negative && positive) && area != 0.0 && t > t_min && t < t_max;
 }
 
 // Slab test against a body's world bounds.
@@ -157,7 +164,6 @@ struct Traversal {
     vec3 inverse;
     uint mask;      // bodies with any of these bits; 0: all
     bool any_hit;   // stops at the first surface
-    bool found;
     Hit hit;        // the nearest so far; `t` limits the ray
     uint body;      // the one that is being traversed
     uint next;      // the one after it; the number of bodies: there is none
@@ -181,7 +187,7 @@ void begin_ray(inout Traversal t, vec3 origin, vec3 direction, uint mask, bool a
     t.inverse = 1.0 / safe_direction(direction);
     t.mask = mask;
     t.any_hit = any_hit;
-    t.found = false;
+    t.hit.id = NO_HIT;
     t.hit.t = t_max;
     t.group = 0u;
     t.triangles = uvec2(0u);
@@ -209,8 +215,8 @@ bool at_triangles(Traversal t) { return t.triangles.y != 0u; }
 
 bool at_node(Traversal t) { return t.group != 0u && t.displaced == 0u && !at_triangles(t); }
 
-// Neither this body nor another has anything left.
-bool at_end(Traversal t) { return t.group == 0u && t.depth == 0u && t.next >= frame.instance_count; }
+// Any surface was enough and there is one, or neither this body nor another has anything left.
+bool at_end(Traversal t) { return t.any_hit && t.hit.id != NO_HIT || t.group == 0u && t.depth == 0u && t.next >= frame.instance_count; }
 
 // What is needed once in many nodes: room in the registers, a group that waited longest, or the next body.
 void go_on(inout Traversal t) {
@@ -257,17 +263,12 @@ void test_triangle(inout Traversal t) {
 #endif
     if (meets) {
         t.hit.t = distance_;
-        t.hit.instance = t.body;
-        t.hit.triangle = triangle;
+        t.hit.id = (t.body << 24u) | triangle;
         t.hit.barycentric = barycentric;
-        t.found = true;
     }
     bool over = meets && t.any_hit;
     t.triangles.y = over ? 0u : t.triangles.y;
     t.group = over ? 0u : t.group;
-    t.displaced = over ? 0u : t.displaced;
-    t.depth = over ? 0u : t.depth;
-    t.next = over ? frame.instance_count : t.next;
 }
 
 // Traces one ray through all bodies that have any of `mask` bits (mask 0: all). ANY_HIT: stops at the first surface.
@@ -280,14 +281,14 @@ bool trace_ray(vec3 origin, vec3 direction, uint mask, bool any_hit, inout Hit h
     do {
         go_on(t);
         do {
-            do {
-                if (at_node(t)) open_node(t);
-            } while (at_node(t));
-            do {
-                if (at_triangles(t)) test_triangle(t);
-            } while (at_triangles(t));
+            if (at_node(t)) {
+                do open_node(t); while (at_node(t));
+            }
+            if (at_triangles(t)) {
+                do test_triangle(t); while (at_triangles(t));
+            }
         } while (at_node(t));
     } while (!at_end(t));
     hit = t.hit;
-    return t.found;
+    return t.hit.id != NO_HIT;
 }

@@ -218,6 +218,10 @@ struct Light {
     float range;
 };
 
+struct AlbedoCell {
+    vec4 corners;
+};
+
 struct Surface {
     uint id;
     vec2 barycentric;

@@ -104,7 +104,7 @@ bool advance_path(inout Path path, Sampler rng, inout RayCount rays) {
     path.at = s;
     path.vertex++;
     if (HAS_EMISSIVE && s.light != NO_LIGHT && luminance(s.emitted) > 0.0) {
-        float light_pdf = next.delta ? 0.0 : emissive_pdf(s.light, hit.instance, hit.triangle, from, s.p, s.g);
+        float light_pdf = next.delta ? 0.0 : emissive_pdf(s.light, instance_of(hit.id), triangle_of(hit.id), from, s.p, s.g);
         float weight = next.delta ? 1.0 : balance(next.pdf, light_pdf);
         path.radiance += limit_indirect(path.throughput * s.emitted * weight, vertex);
     }

@@ -57,20 +57,21 @@ void main() {
     hit.t = INFINITY;
     uint shadow = 0u;
     if (trace_ray(frame.projector_position, direction, mask, false, hit)) {
-        surface.id = (hit.instance << 24u) | hit.triangle;
+        uint instance = instance_of(hit.id), triangle = triangle_of(hit.id);
+        surface.id = hit.id;
         surface.barycentric = hit.barycentric;
         surface.distance = hit.t;
         if (!camera_is_eye) {
-            vec3 o = object_position(hit.instance, hit.triangle, hit.barycentric);
-            vec3 p = transform_point(instance_at(hit.instance).world_from_object, o);
-            vec2 before = HAS_GUIDES ? project(transform_point(instance_at(hit.instance).previous_world_from_object, o)) : vec2(0.0);
-            vec3 g = transform_normal(instance_at(hit.instance).world_from_object, object_normal(hit.instance, hit.triangle));
+            vec3 o = object_position(instance, triangle, hit.barycentric);
+            vec3 p = transform_point(instance_at(instance).world_from_object, o);
+            vec2 before = HAS_GUIDES ? project(transform_point(instance_at(instance).previous_world_from_object, o)) : vec2(0.0);
+            vec3 g = transform_normal(instance_at(instance).world_from_object, object_normal(instance, triangle));
             vec3 to_eye = frame.eye_position - p;
             // The eye must be on the side that the projector lights.
             float projector_side = -dot(g, direction), eye_side = dot(g, to_eye);
             bool lit = projector_side * eye_side > 0.0;
-            if (lit && !(HAS_GUIDES && still_seen(pixel, hit.instance, before))) {
-                vec3 offset = g * (sign(eye_side) * surface_offset(p, hit.instance));
+            if (lit && !(HAS_GUIDES && still_seen(pixel, instance, before))) {
+                vec3 offset = g * (sign(eye_side) * surface_offset(p, instance));
                 Hit blocker;
                 blocker.t = 1.0;
                 shadow = 1u;

@@ -2,7 +2,6 @@
 
 layout(set = 0, binding = B_TEXTURES, scalar) readonly buffer Textures { TextureInfo textures[]; };
 layout(set = 0, binding = B_TEXELS, scalar) readonly buffer Texels { uvec2 texels[]; };
-layout(set = 0, binding = B_ALBEDO, scalar) readonly buffer Albedo { float albedo_table[]; };
 
 struct Point {
     vec3 p;         // world
@@ -81,44 +80,55 @@ float surface_offset(vec3 p, uint instance) {
     return 1.9e-6 * (max(abs(p.x), max(abs(p.y), abs(p.z))) + instance_at(instance).extent);
 }
 
-// E of docs/RENDERING.md: rows alpha, columns mu, nodes at (i / 31)^2 of both; the row past the last holds E_avg by alpha.
-float table_alpha_position(float alpha) { return sqrt(alpha) * float(ALBEDO_TABLE_SIZE - 1u); }
+// E of docs/RENDERING.md: nodes at (i / 31)^2 of alpha and of mu. Rows of cells between two alphas, in a row the cells between two mus; after
+// the last row E_avg, between two alphas.
+const uint ALBEDO_CELLS = ALBEDO_TABLE_SIZE - 1u;
+uint albedo_row(uint table, uint row) { return (table * ALBEDO_TABLE_SIZE + row) * ALBEDO_CELLS; }
+
+// Where alpha or mu lies among the nodes: lower node, and how far beyond it.
+void albedo_position(float v, out uint node, out float beyond) {
+    float x = sqrt(clamp(v, 0.0, 1.0)) * float(ALBEDO_CELLS);
+    node = min(uint(x), ALBEDO_CELLS - 1u);
+    beyond = x - float(node);
+}
 
 float directional_albedo(uint table, float alpha, float mu) {
-    float y = clamp(table_alpha_position(alpha), 0.0, float(ALBEDO_TABLE_SIZE - 1u));
-    float x = sqrt(clamp(mu, 0.0, 1.0)) * float(ALBEDO_TABLE_SIZE - 1u);
-    uint y0 = min(uint(y), ALBEDO_TABLE_SIZE - 2u), x0 = min(uint(x), ALBEDO_TABLE_SIZE - 2u);
-    uint i = table * ALBEDO_TABLE_SIZE * (ALBEDO_TABLE_SIZE + 1u) + y0 * ALBEDO_TABLE_SIZE + x0;
-    float fx = x - float(x0), fy = y - float(y0);
-    return mix(mix(albedo_table[i], albedo_table[i + 1u], fx), mix(albedo_table[i + ALBEDO_TABLE_SIZE], albedo_table[i + ALBEDO_TABLE_SIZE + 1u], fx), fy);
+    uint row, column;
+    float above, beside;
+    albedo_position(alpha, row, above);
+    albedo_position(mu, column, beside);
+    vec4 e = albedo_cell_at(albedo_row(table, row) + column).corners;
+    return mix(mix(e.x, e.y, beside), mix(e.z, e.w, beside), above);
 }
 
 float average_albedo(uint table, float alpha) {
-    float y = clamp(table_alpha_position(alpha), 0.0, float(ALBEDO_TABLE_SIZE - 1u));
-    uint y0 = min(uint(y), ALBEDO_TABLE_SIZE - 2u);
-    uint i = (table * (ALBEDO_TABLE_SIZE + 1u) + ALBEDO_TABLE_SIZE) * ALBEDO_TABLE_SIZE + y0;
-    return mix(albedo_table[i], albedo_table[i + 1u], y - float(y0));
+    uint row;
+    float above;
+    albedo_position(alpha, row, above);
+    vec4 e = albedo_cell_at(albedo_row(table, ALBEDO_CELLS) + row).corners;
+    return mix(e.x, e.y, above);
 }
 
 Point shading_point(Hit hit, vec3 v) {
     Point s;
-    TriangleRef ref = triangle_ref_at(instance_at(hit.instance).triangle_offset + hit.triangle);
+    uint instance = instance_of(hit.id), triangle = triangle_of(hit.id);
+    TriangleRef ref = triangle_ref_at(instance_at(instance).triangle_offset + triangle);
     uint m = ref.material;
     vec2 b = hit.barycentric;
-    s.p = transform_point(instance_at(hit.instance).world_from_object, object_position(hit.instance, hit.triangle, b));
-    s.g = transform_normal(instance_at(hit.instance).world_from_object, object_normal(hit.instance, hit.triangle));
+    s.p = transform_point(instance_at(instance).world_from_object, object_position(instance, triangle, b));
+    s.g = transform_normal(instance_at(instance).world_from_object, object_normal(instance, triangle));
     s.v = v;
     s.flags = material_at(m).flags;
     s.table = material_at(m).albedo_table;
     s.light = ref.light;
-    s.offset = surface_offset(s.p, hit.instance);
+    s.offset = surface_offset(s.p, instance);
     s.front = dot(s.g, v) > 0.0;
     vec3 n = vertex_at(ref.vertices.x).normal * (1.0 - b.x - b.y) + vertex_at(ref.vertices.y).normal * b.x + vertex_at(ref.vertices.z).normal * b.y;
-    n = dot(n, n) > 1e-12 ? transform_normal(instance_at(hit.instance).world_from_object, n) : s.g;
+    n = dot(n, n) > 1e-12 ? transform_normal(instance_at(instance).world_from_object, n) : s.g;
     vec2 uv = HAS_TEXTURES ? interpolate_uv(ref, b) : vec2(0.0);
     if (HAS_NORMAL_MAPS && material_at(m).normal_texture.texture != NO_TEXTURE) {
         vec4 t4 = vertex_at(ref.vertices.x).tangent * (1.0 - b.x - b.y) + vertex_at(ref.vertices.y).tangent * b.x + vertex_at(ref.vertices.z).tangent * b.y;
-        vec3 t = transform_vector(instance_at(hit.instance).world_from_object, t4.xyz);
+        vec3 t = transform_vector(instance_at(instance).world_from_object, t4.xyz);
         t -= n * dot(n, t);
         if (dot(t, t) > 1e-12) {
             t = normalize(t);

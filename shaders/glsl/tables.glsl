@@ -156,6 +156,19 @@ Material material_at(uint i) {
 #endif
 
 #ifdef TEXEL_TABLES
+layout(set = 0, binding = B_ALBEDO, rgba32ui) uniform readonly uimageBuffer albedo_cell_rows;
+AlbedoCell albedo_cell_at(uint i) {
+    uvec4 r0 = imageLoad(albedo_cell_rows, int(i) * 1 + 0);
+    return AlbedoCell(vec4(uintBitsToFloat(r0.x), uintBitsToFloat(r0.y), uintBitsToFloat(r0.z), uintBitsToFloat(r0.w)));
+}
+#else
+layout(set = 0, binding = B_ALBEDO, scalar) readonly buffer albedo_cell_block { AlbedoCell albedo_cell_table[]; };
+AlbedoCell albedo_cell_at(uint i) {
+    return AlbedoCell(albedo_cell_table[i].corners);
+}
+#endif
+
+#ifdef TEXEL_TABLES
 layout(set = 0, binding = B_SURFACE_ROWS, rgba32ui) uniform readonly uimageBuffer surface_rows;
 Surface surface_at(uint i) {
     uvec4 r0 = imageLoad(surface_rows, int(i) * 1 + 0);

@@ -23,12 +23,11 @@ void main() {
         return;
     }
     Hit hit;
-    hit.instance = surface.id >> 24u;
-    hit.triangle = surface.id & 0xffffffu;
+    hit.id = surface.id;
     hit.barycentric = surface.barycentric;
     hit.t = abs(surface.distance);
     bool camera_is_eye = (frame.flags & FRAME_CAMERA_IS_EYE) != 0u;
-    vec3 p = transform_point(instance_at(hit.instance).world_from_object, object_position(hit.instance, hit.triangle, hit.barycentric));
+    vec3 p = transform_point(instance_at(instance_of(hit.id)).world_from_object, object_position(instance_of(hit.id), triangle_of(hit.id), hit.barycentric));
     vec3 toward = normalize((camera_is_eye ? frame.projector_position : frame.eye_position) - p);
     Point first = shading_point(hit, toward);
     Sampler rng = Sampler(frame.seed, 0u, pixel);

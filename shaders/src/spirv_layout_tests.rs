@@ -59,6 +59,7 @@ const BLOCKS: &[(&str, &str, usize)] = &[
     ("B_MATERIALS", "Material", size_of::<structs::Material>()),
     ("B_TEXTURES", "TextureInfo", size_of::<structs::TextureInfo>()),
     ("B_LIGHTS", "Light", size_of::<structs::Light>()),
+    ("B_ALBEDO", "AlbedoCell", size_of::<structs::AlbedoCell>()),
     ("B_SURFACES", "Surface", size_of::<structs::Surface>()),
     ("B_COUNTERS", "Counters", size_of::<structs::Counters>()),
     ("B_GUIDES", "Guide", size_of::<structs::Guide>()),

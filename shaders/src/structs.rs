@@ -333,6 +333,12 @@ gpu_structs! {
         range: f32,
     }
 
+    /// Four neighbours of a table of directional albedo; of the averages the first two.
+    struct AlbedoCell {
+        /// At (mu, alpha), at the next mu, at the next alpha, at the next of both.
+        corners: [f32; 4],
+    }
+
     /// What the projector ray of a pixel met.
     struct Surface {
         /// Instance in the high 8 bits, triangle of the body in BVH order in the low 24; `NO_HIT`: nothing.
@@ -493,6 +499,7 @@ tables! {
     Vertex "vertex", "B_VERTICES" or "B_VERTICES";
     TriangleRef "triangle_ref", "B_TRIANGLE_REFS" or "B_TRIANGLE_REFS";
     Material "material", "B_MATERIALS" or "B_MATERIALS";
+    AlbedoCell "albedo_cell", "B_ALBEDO" or "B_ALBEDO";
     Surface "surface", "B_SURFACES" or "B_SURFACE_ROWS";
     Guide "guide", "B_GUIDES" or "B_GUIDE_ROWS";
     History "history", "B_HISTORY" or "B_HISTORY_ROWS";

@@ -12,6 +12,7 @@
 //! Row 0 is the Fresnel reflectance of a smooth surface. With `ior` 1 every entry is exactly 0.
 
 use crate::reference::microfacet::{fresnel_dielectric, smith_g2_over_g1};
+use dpm_shaders::structs::AlbedoCell;
 use glam::DVec3;
 use std::f64::consts::PI;
 
@@ -46,6 +47,18 @@ impl AlbedoTable {
         }
         let average = directional.chunks_exact(n).map(|row| row_average(row) as f32).collect();
         Self { ior, directional, average }
+    }
+
+    /// What the shader reads: the cells between nodes, row after row, then those between two averages.
+    pub fn cells(&self) -> Vec<AlbedoCell> {
+        let n = ALBEDO_NODES;
+        let mut cells = Vec::with_capacity((n - 1) * n);
+        for rows in self.directional.windows(2 * n).step_by(n) {
+            let (low, high) = rows.split_at(n);
+            cells.extend((1..n).map(|i| AlbedoCell { corners: [low[i - 1], low[i], high[i - 1], high[i]] }));
+        }
+        cells.extend(self.average.windows(2).map(|e| AlbedoCell { corners: [e[0], e[1], 0.0, 0.0] }));
+        cells
     }
 
     /// `E(mu, alpha)` in f64; arguments are clamped to 0..1.

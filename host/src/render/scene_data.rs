@@ -1,11 +1,13 @@
 //! A scene into the flat arrays that the shaders read: BVHs, vertices, materials, texels, lights, environment.
 
-use super::albedo_table::{AlbedoTable, ALBEDO_NODES};
+use super::albedo_table::AlbedoTable;
 use super::body_bvh::BodyBvh;
 use crate::scene::mesh::MAX_COORDINATE_M;
 use crate::scene::{Environment, PunctualKind, Scene, TextureRef, Wrap};
 use bytemuck::Zeroable;
-use dpm_shaders::structs::{self as gpu, Light, Material, TextureInfo, TextureUse, TriangleRef, Vertex};
+use dpm_shaders::structs::{
+    self as gpu, AlbedoCell, Light, Material, TextureInfo, TextureUse, TriangleRef, Vertex,
+};
 use glam::{DAffine3, Vec3};
 
 /// Most bodies a scene may have: the instance shares a word with the triangle.
@@ -63,7 +65,7 @@ pub struct SceneData {
     /// Probability of sampling the environment.
     pub environment_select: f32,
     /// Tables of directional albedo.
-    pub albedo: Vec<f32>,
+    pub albedo: Vec<AlbedoCell>,
     /// What the scene needs.
     pub needs: SceneNeeds,
 }
@@ -265,9 +267,7 @@ impl SceneData {
             let table = iors.iter().position(|&i| i == ior).unwrap_or_else(|| {
                 iors.push(ior);
                 let table = AlbedoTable::new(ior);
-                self.albedo.extend_from_slice(&table.directional);
-                self.albedo.extend_from_slice(&table.average);
-                debug_assert_eq!(table.average.len(), ALBEDO_NODES);
+                self.albedo.extend(table.cells());
                 iors.len() - 1
             });
             let transmissive = m.transmission > 0.0;

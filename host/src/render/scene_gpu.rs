@@ -46,7 +46,7 @@ impl SceneGpu {
             texels: Buffer::from_slice(gpu, "textures", &data.texels)?,
             lights: Buffer::from_slice(gpu, "lights", &data.lights)?,
             environment: Buffer::from_slice(gpu, "environment map", &data.environment)?,
-            albedo: Buffer::from_slice(gpu, "albedo tables", &data.albedo)?,
+            albedo: rows("albedo tables", cast_slice(&data.albedo), false)?,
         })
     }
 }
