@@ -4,7 +4,8 @@ mod cli_common;
 #[path = "cli_common/trace_check.rs"]
 mod trace_check;
 
-use cli_common::{code, dpm, err, out, Folder, NO_DRIVER};
+use cli_common::{code, dpm, err, out, start, Folder, NO_DRIVER};
+use std::time::Duration;
 
 /// One second at the full rate and raster, without any Vulkan driver. Lateness is the machine's affair here (other tests run beside this
 /// one); what must hold on any machine is that everything is accounted for and no frame is torn, shown twice or out of order.
@@ -98,6 +99,33 @@ fn bodies_that_were_never_seen_are_named_with_the_trackers_word_on_why() {
             "{text}"
         );
     }
+}
+
+/// Long before the report: a run without an end says it after its first second, once, and goes on.
+#[test]
+fn a_tracker_that_does_not_speak_is_told_within_the_first_seconds_of_a_run() {
+    let folder = Folder::new("silent");
+    let bodies = "[[scene.bodies]]\nname = \"bunny\"\n[[scene.bodies]]\nname = \"venus\"\n";
+    let rig = folder
+        .write("rig.toml", &format!("[tracker]\nkind = \"serial\"\nport = \"/dev/nonexistent\"\n{bodies}"));
+    let args = ["profile", &rig, "--no-render", "--seconds", "600", "--raster", "64x48", "--json"];
+    let mut running = start(&[&args[..], &["--out", folder.text()]].concat());
+    let lit = std::cell::Cell::new(0);
+    running.wait_for_line(Duration::from_secs(60), |line| {
+        let told: serde_json::Value = serde_json::from_str(line).expect("each line is JSON");
+        lit.set(told["frames_lit"].as_u64().unwrap_or(lit.get()));
+        told["note"].as_str().is_some_and(|note| {
+            let of_tracker = note.contains("has not seen");
+            let parts = ["serial tracker", "\"bunny\", \"venus\"", "/dev/nonexistent", "tracker.port"];
+            assert!(!of_tracker || parts.iter().all(|p| note.contains(p)), "{note}");
+            of_tracker
+        })
+    });
+    // A line of counts a second: the run was at most a few seconds old, on a machine that does other things too.
+    assert!(lit.get() < 5 * 947, "{} frames were lit before it was told", lit.get());
+    running.signal("TERM");
+    let rest = running.rest_of_lines(Duration::from_secs(60));
+    assert_eq!(rest.iter().filter(|line| line.contains("has not seen")).count(), 0, "once: {rest:?}");
 }
 
 #[test]

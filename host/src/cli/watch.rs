@@ -60,6 +60,7 @@ pub fn watch<T: Send + 'static>(
     };
     let mut progress = Progress::new(frames);
     let mut health = ProjectorHealth::Connecting;
+    let mut tracker_told = false;
     let mut keys = Keys::new();
     let keys_told = if keys.is_some() { "; keys b, f, s, a" } else { "" };
     let control = ControlSocket::serve(&runtime_folder(), Arc::clone(&monitor));
@@ -90,6 +91,10 @@ pub fn watch<T: Send + 'static>(
                 let now = monitor.projector();
                 if std::mem::replace(&mut health, now) != now {
                     progress.note(&format!("projector: {now}"));
+                }
+                if let (false, Some(word)) = (tracker_told, monitor.tracker()) {
+                    tracker_told = true;
+                    progress.note(word);
                 }
                 progress.tick(monitor.counts());
                 show(&monitor.counts());

@@ -3,6 +3,7 @@
 use super::job::{hash_codes, Fate, FrameJob, FrameMemory};
 use super::prepared::PreparedFrames;
 use crate::clock::Stopwatch;
+use crate::config::TrackerConfig;
 use crate::frame::{FrameId, Stage};
 use crate::gpu::GpuError;
 use crate::pack::{self, Kernel};
@@ -37,6 +38,31 @@ pub struct TrackingStage {
     bank: PoseFilterBank,
     received_at: [HostTime; MAX_TRACKED],
     bodies: usize,
+    /// First step, `None` before it.
+    began_at: Option<HostTime>,
+    /// It was looked at whether all bodies are seen.
+    looked: bool,
+}
+
+/// Time within which every body should have been seen once: a tracker that is there speaks within milliseconds, and one that has to be
+/// connected to anew within half a second.
+const SEEN_WITHIN_NS: i64 = 1_000_000_000;
+
+/// What to look at first where a tracker does not tell of a body.
+const fn remedy(tracker: &TrackerConfig) -> &'static str {
+    match tracker {
+        TrackerConfig::Mock(_) => "`tracker.faults` and `tracker.drop_out` may silence the mock",
+        TrackerConfig::Natnet(_) => {
+            "is streaming on in the tracking software, are tracker.server and tracker.local right, and do bodies have the same names there?"
+        }
+        TrackerConfig::Vrpn(_) => {
+            "is the server running, are tracker.server and tracker.tracker right, and do bodies have the same names or ids there?"
+        }
+        TrackerConfig::Serial(_) => {
+            "is the device on and plugged in, are tracker.port and tracker.baud right, and do bodies have its numbers as ids?"
+        }
+        TrackerConfig::Replay(_) => "does tracker.file hold these bodies, by name or id, from its beginning on?",
+    }
 }
 
 impl TrackingStage {
@@ -49,6 +75,8 @@ impl TrackingStage {
             bank: PoseFilterBank::new(&vec![config; bodies]),
             received_at: [HostTime(0); MAX_TRACKED],
             bodies,
+            began_at: None,
+            looked: false,
         }
     }
 
@@ -57,7 +85,8 @@ impl TrackingStage {
     /// # Errors
     /// The tracker is gone; what is known stays published.
     pub fn step(&mut self, now: HostTime, latest: &mut Publisher<TrackSnapshot>) -> Result<(), TrackerError> {
-        let Self { tracker, bank, received_at, bodies } = self;
+        self.began_at.get_or_insert(now);
+        let Self { tracker, bank, received_at, bodies, .. } = self;
         let result = tracker.poll(now, &mut |sample| {
             if let Some(verdict) = bank.update(sample) {
                 if verdict.is_accepted() {
@@ -75,15 +104,38 @@ impl TrackingStage {
         result.map(|_| ())
     }
 
-    /// The bodies that were never seen, which stay dark, and the tracker's word on why; `None` when all of them were.
+    fn is_unseen(&self, body: usize) -> bool {
+        self.bank.state(BodyIndex(body as u16)).is_none()
+    }
+
+    /// True once in a run: a second after the first step, when some body was not seen by then. Allocates nothing.
+    pub fn is_silence_due(&mut self, now: HostTime) -> bool {
+        let due = self.began_at.is_some_and(|began| now.ns_since(began) >= SEEN_WITHIN_NS);
+        if self.looked || !due {
+            return false;
+        }
+        self.looked = true;
+        (0..self.bodies).any(|body| self.is_unseen(body))
+    }
+
+    /// The bodies that were not seen so far, which are dark, the tracker's word on why, and what to do; `None` when all of them were.
+    pub fn not_seen_yet(&self, rig: &Rig) -> Option<String> {
+        self.unseen(rig, "has not seen", "and no light falls there until it does")
+    }
+
+    /// The same at the end of a run.
     pub fn never_seen(&self, rig: &Rig) -> Option<String> {
-        let unseen = |i: usize| self.bank.state(BodyIndex(i as u16)).is_none();
+        self.unseen(rig, "never saw", "so no light fell there")
+    }
+
+    fn unseen(&self, rig: &Rig, verb: &str, consequence: &str) -> Option<String> {
         let all = rig.bodies.iter().enumerate().take(self.bodies);
         let names: Vec<_> =
-            all.filter(|(i, _)| unseen(*i)).map(|(_, body)| format!("{:?}", body.name)).collect();
-        let (tracker, status) = (self.tracker.name(), self.tracker.status());
+            all.filter(|(i, _)| self.is_unseen(*i)).map(|(_, body)| format!("{:?}", body.name)).collect();
         (!names.is_empty()).then(|| {
-            format!("the {tracker} tracker never saw {}, so no light fell there: {status}", names.join(", "))
+            let (names, status) = (names.join(", "), self.tracker.status());
+            let (tracker, remedy) = (self.tracker.name(), remedy(&rig.config.tracker));
+            format!("the {tracker} tracker {verb} {names}, {consequence}: {status}; {remedy}")
         })
     }
 }
@@ -273,5 +325,81 @@ impl LinkTime {
             slot += 1;
         }
         slot
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::config::{Overrides, RigConfig};
+    use dpm_device::planes::Raster;
+    use dpm_device::pose::Pose;
+    use dpm_device::tracker::TrackerSample;
+    use dpm_handoff::latest::latest;
+
+    /// Tells of the bodies below a number, at every poll.
+    struct Speaks {
+        of: u16,
+    }
+
+    impl Tracker for Speaks {
+        fn poll(
+            &mut self,
+            now: HostTime,
+            sink: &mut dyn FnMut(&TrackerSample),
+        ) -> Result<usize, TrackerError> {
+            for body in 0..self.of {
+                sink(&TrackerSample {
+                    body: BodyIndex(body),
+                    pose: Pose::IDENTITY,
+                    tracked: true,
+                    mean_error_m: 0.0,
+                    sequence: now.0 as u32,
+                    captured_at: now,
+                    received_at: now,
+                });
+            }
+            Ok(usize::from(self.of))
+        }
+
+        fn name(&self) -> &str {
+            "speaking"
+        }
+
+        fn status(&self) -> String {
+            format!("speaks of {}", self.of)
+        }
+    }
+
+    #[test]
+    fn silence_is_due_once_after_a_second_and_only_where_a_body_is_missing() {
+        let config = RigConfig::demo(&Overrides::default()).unwrap_or_else(|e| panic!("{e}"));
+        let rig = Rig::build(&config, Raster::new(16, 16)).unwrap_or_else(|e| panic!("{e}"));
+        assert_eq!(rig.bodies.len(), 2);
+        let names = [0, 1].map(|i| format!("{:?}", rig.bodies[i].name));
+        for of in 0..3u16 {
+            let mut stage = TrackingStage::new(&rig, Box::new(Speaks { of }));
+            let (mut publisher, _reader) = latest(TrackSnapshot::EMPTY);
+            // From any instant on, in steps of 10 ms.
+            let due: Vec<i64> = (0..300i64)
+                .map(|step| HostTime(7_000_000_000 + step * 10_000_000))
+                .filter(|&now| {
+                    stage.step(now, &mut publisher).expect("it speaks");
+                    stage.is_silence_due(now)
+                })
+                .map(|now| now.0 - 7_000_000_000)
+                .collect();
+            assert_eq!(due, if of < 2 { vec![1_000_000_000] } else { vec![] }, "{of} of 2 are told");
+            let (early, late) = (stage.not_seen_yet(&rig), stage.never_seen(&rig));
+            assert_eq!(early.is_some(), of < 2);
+            for text in [early, late].into_iter().flatten() {
+                assert!(
+                    text.contains(&format!("speaks of {of}")) && text.contains("tracker.faults"),
+                    "{text}"
+                );
+                assert_eq!(text.contains(&names[0]), of == 0, "{text}");
+                assert!(text.contains(&names[1]), "{text}");
+            }
+        }
     }
 }

@@ -273,6 +273,13 @@ fn tracking_thread(
         enter_frame_path(steps >= WARM_UP_STEPS);
         // A tracker that fails is told by the freshness of its tracks: light goes off by itself, and the report says why.
         let _ = stage.step(now, &mut latest);
+        if stage.is_silence_due(now) {
+            // Off the frame path for once: a body is dark for want of samples, and the operator should not learn it from the report.
+            enter_frame_path(false);
+            if let Some(word) = stage.not_seen_yet(&shared.rig) {
+                shared.monitor.tell_of_tracker(word);
+            }
+        }
         if !shared.is_virtual() {
             std::thread::sleep(Duration::from_micros(200));
         }

@@ -4,6 +4,7 @@
 use dpm_device::link::faults;
 use std::fmt;
 use std::sync::atomic::{AtomicBool, AtomicU64, AtomicU8, Ordering};
+use std::sync::OnceLock;
 
 /// What an operator can ask of the projector of a running rig.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -105,6 +106,8 @@ pub struct RunMonitor {
     /// The newest order not yet taken; 0 for none.
     order: AtomicU8,
     projector: AtomicU64,
+    /// Written at most once.
+    tracker: OnceLock<String>,
     frames_planned: AtomicU64,
     frames_lit: AtomicU64,
     frames_dropped: AtomicU64,
@@ -159,6 +162,16 @@ impl RunMonitor {
     /// How the projector is.
     pub fn projector(&self) -> ProjectorHealth {
         ProjectorHealth::decode(self.projector.load(Ordering::Relaxed))
+    }
+
+    /// Says, once in a run, which bodies the tracker has not seen a second after its start, why and what to do. Off the frame path.
+    pub fn tell_of_tracker(&self, word: String) {
+        let _ = self.tracker.set(word);
+    }
+
+    /// What was said of the tracker; `None` while there is nothing to say.
+    pub fn tracker(&self) -> Option<&str> {
+        self.tracker.get().map(String::as_str)
     }
 
     /// Counts a planned frame.

@@ -84,6 +84,16 @@ impl Running {
         }
     }
 
+    /// The lines of the standard error stream up to its end.
+    pub fn rest_of_lines(&mut self, limit: Duration) -> Vec<String> {
+        let end = Instant::now() + limit;
+        let mut all = Vec::new();
+        while let Ok(line) = self.lines.recv_timeout(end.saturating_duration_since(Instant::now())) {
+            all.push(line);
+        }
+        all
+    }
+
     /// Sends a signal by its name.
     pub fn signal(&self, name: &str) {
         // The shell's own: a bare system has no program of that name.
