@@ -31,6 +31,17 @@ pub fn write_atomically(
     result.map_err(named)
 }
 
+/// Makes `folder` and sees that files can be written there: before the work whose result is to lie in it.
+///
+/// # Errors
+/// Those of the file system, with the folder in the message.
+pub fn check_folder(folder: &Path) -> io::Result<()> {
+    let named = |e: io::Error| io::Error::new(e.kind(), format!("cannot write to {}: {e}", folder.display()));
+    fs::create_dir_all(folder).map_err(named)?;
+    let trial = folder.join(format!(".trial.{}", std::process::id()));
+    File::create(&trial).and_then(|_| fs::remove_file(&trial)).map_err(named)
+}
+
 fn write_and_rename(
     temporary: &Path,
     path: &Path,

@@ -135,6 +135,8 @@ fn what_is_no_profile_is_refused_with_its_name() {
     let output = dpm(&["profile", "--compare", &text, "/nonexistent/b.json"], &[]);
     assert_eq!((code(&output), out(&output).as_str()), (2, ""));
     assert!(err(&output).contains("a.json: not a profile.json of dpm profile"), "{}", err(&output));
+    let output = dpm(&["profile", "--compare", "/nonexistent/a.json", &text], &[]);
+    assert!(err(&output).contains("/nonexistent/a.json: cannot read it: No such file"), "{}", err(&output));
     let output =
         dpm(&["profile", "--no-render", "--prometheus", "nowhere", "--out", folder.text()], &NO_DRIVER);
     assert_eq!(code(&output), 2);

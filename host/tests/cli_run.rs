@@ -64,13 +64,15 @@ fn the_rig_file_is_the_demo_and_the_same_seed_gives_the_same_light() {
     assert_ne!(demo["light_hash"], other["light_hash"]);
 }
 
+const RIG: &str = concat!(env!("CARGO_MANIFEST_DIR"), "/../rigs/demo.toml");
+
 #[test]
 fn bad_input_ends_with_2_and_names_the_place() {
     let folder = Folder::new("bad");
     let rig = folder.write("rig.toml", "[projector]\nwidth = 64\n\n[render]\n  smaples = 4\nspp = 0\n");
     let cut = folder.write("cut.glb", "glTF\u{2}\0\0\0");
     let in_the_way = folder.write("file", "");
-    let cases: [(&[&str], &[&str]); 9] = [
+    let cases: [(&[&str], &[&str]); 15] = [
         (
             &["run", &rig],
             &[
@@ -89,6 +91,13 @@ fn bad_input_ends_with_2_and_names_the_place() {
         ),
         (&["demo", "--frames", "1", "--seconds", "1"], &["cannot be used with"]),
         (&["demo", "--out", &in_the_way], &["cannot lock output folder"]),
+        (&["demo", "--scene", &in_the_way], &["is empty: no glTF document"]),
+        (&["demo", "--scene", RIG], &["demo.toml: file", "this is not glTF"]),
+        (&["demo", "--seconds", "1e300"], &["--seconds 1e300: must be above 0"]),
+        (&["demo", "--frames", "0"], &["--frames or --seconds"]),
+        // Before anything is drawn, which takes minutes.
+        (&["error", RIG, "--quick", "--out", &in_the_way], &["cannot write to", "another folder with --out"]),
+        (&["snapshot", "--out", &in_the_way], &["cannot write to", "another folder with --out"]),
     ];
     for (args, parts) in cases {
         let output = dpm(args, &[]);

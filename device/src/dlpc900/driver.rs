@@ -45,7 +45,7 @@ pub enum PortError {
     #[error("the device was unplugged or has lost power: check cable and supply")]
     Gone,
     /// No such device.
-    #[error("no DLPC900 (USB 0451:c900) is plugged in: check cable and power")]
+    #[error("none is plugged in and switched on there: check cable and supply; `lsusb -d 0451:c900` lists those that are")]
     NotFound,
     /// The operating system denies access; the text is the remedy.
     #[error("no permission to open the device: {0}")]

@@ -39,7 +39,7 @@ pub struct TrackerArguments {
     #[arg(long, default_value_t = 1)]
     seed: u64,
     /// Stop after this many seconds
-    #[arg(long)]
+    #[arg(long, value_parser = super::seconds)]
     pub seconds: Option<f64>,
 }
 

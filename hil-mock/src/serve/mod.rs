@@ -26,6 +26,12 @@ pub enum Device {
     Vrpn(vrpn::VrpnArguments),
 }
 
+/// A time that ends: not NaN, not infinite, not negative.
+fn seconds(text: &str) -> Result<f64, String> {
+    let s = text.parse().ok().filter(|s: &f64| (0.0..=1e9).contains(s));
+    s.ok_or_else(|| "write seconds from 0 to 1e9".to_owned())
+}
+
 /// Why a serial port cannot be opened, and what to do about it.
 fn cannot_open(path: &str, e: &serialport::Error) -> String {
     format!("cannot open {path}: {e}; {}", dpm_device::tty::refusal(e).remedy())
@@ -39,5 +45,18 @@ pub fn run(device: Device) -> Result<(), Box<dyn Error>> {
         Device::Projector(arguments) => projector::run(&arguments),
         Device::Serial(arguments) => serial::run(&arguments),
         Device::Vrpn(arguments) => vrpn::run(&arguments),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::seconds;
+
+    #[test]
+    fn a_time_to_stop_after_comes() {
+        assert_eq!((seconds("0"), seconds("2.5")), (Ok(0.0), Ok(2.5)));
+        for endless in ["nan", "inf", "-1", "1e300", "x", ""] {
+            assert!(seconds(endless).is_err(), "{endless}");
+        }
     }
 }

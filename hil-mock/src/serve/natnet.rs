@@ -68,7 +68,7 @@ pub fn run(arguments: &NatNetArguments) -> Result<(), Box<dyn Error>> {
     let server = NatNetServer::new(config, source)?;
     let address = SocketAddrV4::new(arguments.bind, arguments.command_port);
     let host = NatNetHost::start(server, streaming, address, clock_from_now())
-        .map_err(|e| format!("cannot serve on {address}: {e}; is another NatNet server running?"))?;
+        .map_err(|e| format!("cannot serve on {address}: {e}; is another NatNet server running, and is the address one of this machine's?"))?;
     println!("NatNet {version} on {}, {streaming:?}, data port {}", host.address(), arguments.data_port);
     for (name, id) in bodies {
         println!("  body {id}: {name}");

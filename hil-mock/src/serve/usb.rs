@@ -17,7 +17,7 @@ pub struct UsbArguments {
     #[arg(long, value_name = "ADDR", default_value = "127.0.0.1:3240")]
     usbip: SocketAddr,
     /// Stop after this many seconds
-    #[arg(long)]
+    #[arg(long, value_parser = super::seconds)]
     pub(super) seconds: Option<f64>,
     /// Faults of the cable: unplug and stall with a window, slow with a duration, such as `unplug@5s+1s,slow=2ms`
     #[arg(long, value_name = "PLAN", default_value = "")]
@@ -41,7 +41,7 @@ pub fn offer(
     let export = |plug: &UsbPlug| vec![Export::new("1-1", Arc::new(plug.clone()))];
     let mut plug = new_plug();
     let server = Server::start(arguments.usbip, export(&plug)).map_err(|e| {
-        format!("cannot serve on {}: {e}; is another USB/IP server running?", arguments.usbip)
+        format!("cannot serve on {}: {e}; is another USB/IP server running, and is the address one of this machine's?", arguments.usbip)
     })?;
     println!("{name} over USB/IP on {}, bus id 1-1", server.address());
     println!("  on the machine that is to see it: modprobe vhci-hcd; usbip attach -r HOST -b 1-1");

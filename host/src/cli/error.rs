@@ -12,6 +12,7 @@ use crate::experiments::error_runs::{
 };
 use crate::experiments::run_rig::open_gpu;
 use crate::failure::{Failure, FailureKind};
+use crate::files::check_folder;
 use crate::gpu::Gpu;
 use crate::pipeline::PipelineError;
 use crate::rig::Rig;
@@ -215,6 +216,9 @@ pub(super) fn options(args: &ErrorArgs, out: &Path) -> ErrorOptions {
 /// The GPU, and the rig at the raster to measure at: small without a GPU or in a hurry.
 pub(super) fn stage(args: &ErrorArgs) -> Result<(Arc<Gpu>, Rig), Failure> {
     let config = args.flags.rig(args.rig.as_deref())?;
+    // Not after the minutes that the first reference takes.
+    check_folder(&folder(args))
+        .map_err(|e| Failure::new(FailureKind::BadInput, format!("{e}; choose another folder with --out")))?;
     let gpu = open_gpu(&config)?;
     let small = args.flags.raster.is_none() && (args.quick || gpu.summary().software);
     let raster = if small { Raster::new(80, 60) } else { None };

@@ -56,7 +56,10 @@ pub fn execute(args: &ProfileArgs) -> Result<(), Failure> {
     let rig = flags.rig(args.rig.as_deref())?;
     let server = match &args.prometheus {
         Some(address) => Some(PageServer::start(address.as_str()).map_err(|e| {
-            Failure::new(FailureKind::BadInput, format!("--prometheus {address}: cannot listen there: {e}"))
+            let told = format!(
+                "--prometheus {address}: cannot listen there: {e}; give an address of this machine and a free port, for example 127.0.0.1:9947"
+            );
+            Failure::new(FailureKind::BadInput, told)
         })?),
         None => None,
     };
@@ -98,6 +101,10 @@ fn read(path: &Path) -> Result<ProfileReport, Failure> {
             format!("{}: not a profile.json of dpm profile: {e}", path.display()),
         )
     };
-    let text = std::fs::read_to_string(path).map_err(|e| refuse(&e))?;
+    let text = std::fs::read_to_string(path).map_err(|e| {
+        let told =
+            format!("{}: cannot read it: {e}; give two files profile.json of dpm profile", path.display());
+        Failure::new(FailureKind::BadInput, told)
+    })?;
     serde_json::from_str(&text).map_err(|e| refuse(&e))
 }

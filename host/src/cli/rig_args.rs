@@ -82,7 +82,7 @@ impl RigArgs {
         let flags = self.flags()?;
         let Some(seconds) = self.seconds else { return Ok(read(flags)?) };
         if !(seconds > 0.0 && seconds <= 1e9) {
-            let told = format!("--seconds {seconds}: must be above 0 and at most 1e9");
+            let told = format!("--seconds {seconds:?}: must be above 0 and at most 1e9");
             return Err(Failure::new(FailureKind::BadInput, told));
         }
         // How many frames a time is only the rate tells, which may itself come from the file or a flag.

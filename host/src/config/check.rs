@@ -266,7 +266,7 @@ fn time(rig: &RigConfig, reader: &mut Reader) {
                 reader,
                 &["real_time.pace", "run.frames"],
                 "virtual pace runs as fast as it can and would never end".into(),
-                "set `run.frames`".into(),
+                "set `run.frames`, or give --frames or --seconds".into(),
             );
         }
     }

@@ -11,7 +11,7 @@ use super::run_rig::{open_gpu, traced_raster};
 use super::sequence::{draw, poses_at};
 use crate::config::RigConfig;
 use crate::failure::{Failure, FailureKind};
-use crate::files::write_atomically;
+use crate::files::{check_folder, write_atomically};
 use crate::pipeline::light::LightFrame;
 use crate::pipeline::{renderer_settings, PipelineError};
 use crate::render::method::Method;
@@ -138,6 +138,7 @@ pub fn snapshot(
             return Err(bad(format!("--what {}: method {name}: {why}", image.name())));
         }
     }
+    check_folder(dir).map_err(|e| bad(format!("{e}; choose another folder with --out")))?;
     let gpu = open_gpu(config)?;
     let mut warnings = Vec::new();
     let raster = traced_raster(config, &gpu, &mut warnings);

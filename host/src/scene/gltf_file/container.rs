@@ -48,6 +48,14 @@ pub fn split(bytes: &[u8], limits: &Limits) -> Result<Container, SceneError> {
             "unpack it and give the .glb or .gltf inside",
         ));
     }
+    // What begins like no JSON is another kind of file; only white space and a byte-order mark may come before it.
+    let first = text.iter().find(|b| !b.is_ascii_whitespace() && ![0xef, 0xbb, 0xbf].contains(*b));
+    if !matches!(first, Some(b'{' | b'[')) {
+        return Err(SceneError::broken(
+            "file",
+            "is neither a .glb nor the JSON of a .gltf: this is not glTF",
+        ));
+    }
     SceneError::check_limit(
         "the JSON text in bytes",
         text.len() as u64,
