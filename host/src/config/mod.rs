@@ -112,8 +112,13 @@ impl RigConfig {
     /// input files that are not there.
     pub fn load(path: &Path, overrides: &Overrides) -> Result<Self, ConfigErrors> {
         let unreadable = |e: std::io::Error| {
-            let remedy = "give the path of a rig file, for example rigs/demo.toml";
-            ConfigErrors::unreadable(path, format!("cannot read the rig file: {e}"), remedy)
+            // A path from the manual, given elsewhere than at the top of the sources, is the most frequent mistake.
+            let here = std::env::current_dir().ok().filter(|_| path.is_relative());
+            let from =
+                here.map_or(String::new(), |here| format!("it was looked for in {}; ", here.display()));
+            let remedy =
+                format!("{from}give the path of a rig file, for example rigs/demo.toml in dpm's sources");
+            ConfigErrors::unreadable(path, format!("cannot read the rig file: {e}"), &remedy)
         };
         let file = std::fs::File::open(path).map_err(unreadable)?;
         let mut text = String::new();

@@ -388,6 +388,9 @@ fn an_unreadable_or_huge_file_is_one_error() {
         load(Path::new("/nonexistent/rig.toml")).contains("/nonexistent/rig.toml: cannot read the rig file")
     );
     assert!(load(Path::new("/")).contains("cannot read"));
+    let here = std::env::current_dir().unwrap().display().to_string();
+    assert!(load(Path::new("no-such-rig.toml")).contains(&format!("looked for in {here};")));
+    assert!(!load(Path::new("/nonexistent/rig.toml")).contains("looked for"));
     let huge = std::env::temp_dir().join(format!("dpm-huge-{}.toml", std::process::id()));
     std::fs::write(&huge, vec![b'#'; MAX_FILE_BYTES as usize + 1]).unwrap();
     let told = load(&huge);
