@@ -229,8 +229,7 @@ struct Surface {
 };
 
 struct Counters {
-    uint closest_rays;
-    uint shadow_rays;
+    uint rays;
     uint samples;
     uint invalid_samples;
     uint lit_pixels;

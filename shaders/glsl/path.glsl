@@ -23,11 +23,6 @@ float balance(float a, float b) {
     return finite(a) ? a / (a + b) : 1.0;
 }
 
-struct RayCount {
-    uint closest;
-    uint shadow;
-};
-
 // A path on its way.
 struct Path {
     Point at;        // its newest vertex
@@ -40,7 +35,7 @@ struct Path {
 Path begin_path(Point first) { return Path(first, 1u, vec3(1.0), first.emitted, true); }
 
 // Lights the newest vertex and goes on to the next one. False: the path is at its end, its radiance complete.
-bool advance_path(inout Path path, Sampler rng, inout RayCount rays) {
+bool advance_path(inout Path path, Sampler rng, inout uint rays) {
     Point s = path.at;
     uint vertex = path.vertex;
     // A single-sided opaque surface seen from behind is black.
@@ -70,7 +65,7 @@ bool advance_path(inout Path path, Sampler rng, inout RayCount rays) {
                 vec3 to_light = light.finite_distance ? light.to_light - s.g * (side * s.offset) : direction;
                 Hit blocker;
                 blocker.t = light.finite_distance ? 1.0 : INFINITY;
-                rays.shadow++;
+                rays++;
                 if (!trace_ray(origin, to_light, 0u, true, blocker)) {
                     float weight = light.pdf > 0.0 ? balance(light.pdf, pdf) : 1.0;
                     path.radiance += limit_indirect(path.throughput * value * light.radiance * weight, vertex);
@@ -90,7 +85,7 @@ bool advance_path(inout Path path, Sampler rng, inout RayCount rays) {
     vec3 origin = s.p + s.g * (next.below ? -s.offset : s.offset);
     Hit hit;
     hit.t = INFINITY;
-    rays.closest++;
+    rays++;
     if (!trace_ray(origin, next.direction, 0u, false, hit)) {
         if (ENVIRONMENT_KIND != 0u) {
             float light_pdf = next.delta ? 0.0 : environment_pdf(next.direction, s.n) * frame.environment_select;

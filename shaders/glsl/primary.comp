@@ -96,10 +96,5 @@ void main() {
         }
     }
     surfaces[pixel.y * frame.width + pixel.x] = surface;
-    // Both counts in one sum: a subgroup has at most 128 lanes.
-    uint both = subgroupAdd(1u + (shadow << 16u));
-    if (subgroupElect()) {
-        atomicAdd(counters.closest_rays, both & 0xffffu);
-        atomicAdd(counters.shadow_rays, both >> 16u);
-    }
+    COUNT(rays, 1u + shadow)
 }

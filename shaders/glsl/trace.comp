@@ -13,8 +13,10 @@ layout(set = 0, binding = B_RADIANCE, scalar) writeonly buffer Radiance { vec4 r
 layout(set = 0, binding = B_FILTERED, scalar) writeonly buffer FilteredBlock { Filtered filtered[]; };
 
 void main() {
-    if (gl_GlobalInvocationID.x >= schedule.items) return;
-    WorkItem item = work[gl_GlobalInvocationID.x];
+    // Read before lanes part. There is an item: without one no workgroup is dispatched.
+    uint items = schedule.items;
+    WorkItem item = work[min(gl_GlobalInvocationID.x, items - 1u)];
+    if (gl_GlobalInvocationID.x >= items) return;
     Surface surface = surface_at(item.pixel);
     uvec2 pixel = uvec2(item.pixel % frame.width, item.pixel / frame.width);
     if (surface.id == NO_HIT) {
@@ -44,7 +46,7 @@ void main() {
     float sum_squares = 0.0;
     uint count = 0u, invalid = 0u;
     bool dpm = (frame.flags & FRAME_DPM) != 0u, exact = false;
-    RayCount rays = RayCount(0u, 0u);
+    uint rays = 0u;
     // A lane whose path ends begins its next sample at once, while its neighbours are still on their way.
     Path path = begin_path(first);
     uint left = item.spp;
@@ -66,8 +68,7 @@ void main() {
     } while (left > 0u);
     radiance_out[item.pixel] = vec4(count > 0u ? sum / float(count) : vec3(0.0), float(count));
     if (dpm) filtered[item.pixel] = Filtered(vec3(sum_squares, exact ? 1.0 : 0.0, 0.0), 0.0);
-    COUNT(closest_rays, rays.closest)
-    COUNT(shadow_rays, rays.shadow)
+    COUNT(rays, rays)
     COUNT(samples, count + invalid)
     COUNT_RARE(invalid_samples, invalid)
 }

@@ -351,10 +351,8 @@ gpu_structs! {
 
     /// What one frame counted. Zeroed by the host before the frame.
     struct Counters {
-        /// Closest-hit rays.
-        closest_rays: u32,
-        /// Shadow rays.
-        shadow_rays: u32,
+        /// Rays, whether they ask for the nearest hit or for any.
+        rays: u32,
         /// Paths.
         samples: u32,
         /// Samples dropped because they were not finite.

@@ -112,8 +112,7 @@ fn measure(rig: &Rig, gpu: &Arc<Gpu>, frames: u32, which: RenderMethod) -> Resul
     }
     let n = costs.len() as f64;
     let mean = |of: &dyn Fn(&FrameCost) -> u64| costs.iter().map(of).sum::<u64>() as f64 / n;
-    let rays_per_frame =
-        mean(&|c| u64::from(c.counters().closest_rays) + u64::from(c.counters().shadow_rays));
+    let rays_per_frame = mean(&|c| u64::from(c.counters().rays));
     let samples_per_frame = mean(&|c| u64::from(c.counters().samples));
     let wall_ms = median(walls);
     let total = median_ms(costs.iter().map(|c| c.pass_ns.iter().sum()));

@@ -177,8 +177,7 @@ pub fn compare(rig: &Rig, gpu: &Arc<Gpu>, without: Side<'_>, with: Side<'_>) -> 
             let gpu_ns: u64 = cost.pass_ns.iter().sum();
             times[i].push(if gpu_ns > 0 { gpu_ns } else { watch.elapsed_ns() });
             let counters = cost.counters();
-            rays[i] +=
-                (f64::from(counters.closest_rays) + f64::from(counters.shadow_rays)) / f64::from(FRAMES);
+            rays[i] += f64::from(counters.rays) / f64::from(FRAMES);
         }
         let [a, b] = [0, 1].map(|i: usize| slots[i].radiance().unwrap_or(&[]));
         let same = |(a, b): (&[f32; 4], &[f32; 4])| a.map(f32::to_bits) == b.map(f32::to_bits);

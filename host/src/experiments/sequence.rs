@@ -178,7 +178,7 @@ impl Theatre {
             each(k, &slot);
             if k >= self.span.warm_up {
                 let c = cost.counters();
-                seen.rays += u64::from(c.closest_rays) + u64::from(c.shadow_rays);
+                seen.rays += u64::from(c.rays);
                 seen.samples += u64::from(c.samples);
                 seen.costs.push(cost);
                 seen.frames.push(self.look(

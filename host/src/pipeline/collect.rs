@@ -210,7 +210,7 @@ impl Collector {
         self.newest = Some(job.id.0 as u32);
         let cost = job.cost.unwrap_or_default();
         let c = cost.counters();
-        self.rays += u64::from(c.closest_rays) + u64::from(c.shadow_rays);
+        self.rays += u64::from(c.rays);
         self.samples += u64::from(c.samples);
         self.gpu_ns += cost.pass_ns.iter().sum::<u64>();
         self.lit_values += 3 * u64::from(c.lit_pixels);

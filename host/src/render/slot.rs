@@ -23,7 +23,7 @@ pub const PASSES: &[&str] = &[
 #[derive(Clone, Copy, Debug, Default)]
 pub struct FrameCost {
     /// Rays, samples and mishaps.
-    pub counters: [u32; 8],
+    pub counters: [u32; size_of::<Counters>() / 4],
     /// GPU time of each pass of [`PASSES`], nanoseconds; 0 where the device has no time stamps.
     pub pass_ns: [u64; PASSES.len()],
 }

@@ -201,7 +201,7 @@ impl Picture {
 
     /// Closest-hit and shadow rays of all frames.
     pub fn rays(&self) -> u64 {
-        self.counters.iter().map(|c| u64::from(c.closest_rays) + u64::from(c.shadow_rays)).sum()
+        self.counters.iter().map(|c| u64::from(c.rays)).sum()
     }
 
     /// The pixel's ray met a surface.
