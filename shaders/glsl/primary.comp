@@ -27,10 +27,29 @@ vec3 demodulation(Hit hit, vec3 toward) {
     return clamp(mix(e + (1.0 - e) * s.base, metal, s.metallic), 0.02, 1.0);
 }
 
+// Method dpm: every fourth frame a block of pixels asks for all that it could take from the last.
+bool asks_anew(uvec2 pixel) {
+    return (frame.flags & FRAME_DPM) == 0u || frame.history_frame == NO_FRAME || (((pixel.x >> 3u) + 2u * (pixel.y >> 3u) + frame.frame) & 3u) == 0u;
+}
+
+// Method dpm: no light fell on anything here in the last frame, nor as near as anything can have moved since. What only another body or the
+// eye's own motion uncovers there may wait for the block's turn.
+bool still_dark(uvec2 pixel) {
+    if (!HAS_GUIDES || (frame.flags & FRAME_STEADY) == 0u || asks_anew(pixel)) return false;
+    bool dark = true;
+    for (int i = 0; i < 25 && dark; i++) {
+        ivec2 q = ivec2(pixel) + ivec2(i % 5, i / 5) - 2;
+        // Anything may come in over the picture's border.
+        bool inside = all(greaterThanEqual(q, ivec2(0))) && all(lessThan(q, ivec2(frame.width, frame.height)));
+        dark = inside && former_at(uint(q.y) * frame.width + uint(q.x)).frame != frame.history_frame;
+    }
+    return dark;
+}
+
 // Method dpm: the eye has seen this body here in the last frame, and all around; every fourth frame it is looked at again all the same. Light
 // that the eye does not see is no fault, so what comes between inside a surface may wait for that; at borders nothing waits.
 bool still_seen(uvec2 pixel, uint instance, vec2 before) {
-    if ((frame.flags & FRAME_DPM) == 0u || frame.history_frame == NO_FRAME || (((pixel.x >> 3u) + 2u * (pixel.y >> 3u) + frame.frame) & 3u) == 0u) return false;
+    if (asks_anew(pixel)) return false;
     // Whatever jumps may stand anywhere.
     vec2 motion = abs(vec2(pixel) + 0.5 - before);
     if (!(max(motion.x, motion.y) < 4.0)) return false;
@@ -55,8 +74,8 @@ void main() {
     uint mask = camera_is_eye ? 0u : INSTANCE_PROJECTED;
     Hit hit;
     hit.t = INFINITY;
-    uint shadow = 0u;
-    if (trace_ray(frame.projector_position, direction, mask, false, hit)) {
+    uint closest = still_dark(pixel) ? 0u : 1u, shadow = 0u;
+    if (closest > 0u && trace_ray(frame.projector_position, direction, mask, false, hit)) {
         uint instance = instance_of(hit.id), triangle = triangle_of(hit.id);
         surface.id = hit.id;
         surface.barycentric = hit.barycentric;
@@ -96,5 +115,5 @@ void main() {
         }
     }
     surfaces[pixel.y * frame.width + pixel.x] = surface;
-    COUNT(rays, 1u + shadow)
+    COUNT(rays, closest + shadow)
 }

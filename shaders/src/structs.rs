@@ -393,6 +393,7 @@ pub const CONSTANTS: &[(&str, u32)] = &[
     ("HISTORY_EXACT", HISTORY_EXACT),
     ("HISTORY_HIDDEN", HISTORY_HIDDEN),
     ("FRAME_ALLOCATE", FRAME_ALLOCATE),
+    ("FRAME_STEADY", FRAME_STEADY),
     ("RATE_TABLE_OCTAVE", RATE_TABLE_OCTAVE),
     ("RATE_TABLE_OCTAVES", RATE_TABLE_OCTAVES),
     ("NOISE_SIZE", NOISE_SIZE),
@@ -445,6 +446,8 @@ pub const HISTORY_EXACT: u32 = 1;
 pub const HISTORY_HIDDEN: u32 = 2;
 /// Method dpm: samples go where they lower the error most.
 pub const FRAME_ALLOCATE: u32 = 64;
+/// Nothing has jumped, come or gone since the last frame: by so little has light moved that most pixels need not ask for it.
+pub const FRAME_STEADY: u32 = 128;
 /// Entries of the table of \[Yang19\]'s b functions per octave of velocity.
 pub const RATE_TABLE_OCTAVE: u32 = 1024;
 /// Octaves of that table, from 2^-6 pixels per frame.

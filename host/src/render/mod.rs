@@ -5,6 +5,7 @@ pub mod blue_noise;
 mod body_bvh;
 pub mod compensation;
 mod fill;
+mod last_frame;
 mod memory;
 pub mod method;
 pub mod rate_map;

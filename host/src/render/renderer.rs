@@ -1,5 +1,6 @@
 //! One frame on the GPU: surfaces, radiance, code values. Reads top to bottom in `Renderer::record`.
 
+use super::last_frame::LastFrame;
 use super::memory::{BytesPerPixel, RasterTooLarge, SharedBuffers};
 use super::method::Method;
 use super::scene_data::{world_bounds, Keep, SceneData, SceneDataError, SceneNeeds};
@@ -121,7 +122,7 @@ pub struct Renderer {
     /// Per body of the scene: which tracked body carries it.
     tracked: Vec<Option<u16>>,
     /// What the history holds: the last frame submitted and its poses.
-    last: Last,
+    last: LastFrame,
     pub(super) gpu: Arc<Gpu>,
 }
 
@@ -138,15 +139,9 @@ struct Pipelines {
     pack: Option<ComputePipeline>,
 }
 
-/// The frame that the history holds.
-struct Last {
-    frame: u32,
-    /// Which of the two history buffers it wrote.
-    parity: usize,
-    poses: Vec<DAffine3>,
-    origin: DVec3,
-    /// Frames submitted so far: rates are decided in every second one.
-    count: u64,
+/// `tracked`: per body of the scene, which tracked body carries it.
+fn is_lost(tracked: &[Option<u16>], body: usize, lost: &[bool]) -> bool {
+    tracked[body].is_some_and(|t| lost.get(usize::from(t)).copied().unwrap_or(false))
 }
 
 fn rows(m: &DAffine3) -> Rows {
@@ -228,8 +223,7 @@ impl Renderer {
                 .transpose()?,
         };
         let tracked = scene.bodies.iter().map(|b| b.tracked).collect();
-        let poses = Vec::with_capacity(scene.bodies.len());
-        let last = Last { frame: gpu_structs::NO_FRAME, parity: 0, poses, origin: DVec3::ZERO, count: 0 };
+        let last = LastFrame::none(scene.bodies.len());
         Ok(Self {
             pipelines,
             table,
@@ -243,10 +237,6 @@ impl Renderer {
             last,
             gpu: gpu.clone(),
         })
-    }
-
-    fn is_lost(&self, body: usize, lost: &[bool]) -> bool {
-        self.tracked[body].is_some_and(|t| lost.get(usize::from(t)).copied().unwrap_or(false))
     }
 
     /// What the scene needs of the tracer.
@@ -511,7 +501,7 @@ impl Renderer {
                     &previous
                 }),
                 // What is lost still casts virtual shadows where it was last, but gets no light.
-                flags: if self.is_lost(i, inputs.lost) {
+                flags: if is_lost(&self.tracked, i, inputs.lost) {
                     body.flags & !gpu_structs::INSTANCE_PROJECTED
                 } else {
                     body.flags
@@ -527,6 +517,8 @@ impl Renderer {
         let raster = self.settings.raster;
         let method = &self.settings.method;
         let c = inputs.camera;
+        let steady =
+            self.last.is_steady(&self.data.bodies, inputs, |i| is_lost(&self.tracked, i, inputs.lost));
         let frame = Frame {
             projector_position: [0.0; 3],
             seed: self.settings.seed,
@@ -547,7 +539,8 @@ impl Renderer {
             ambient: self.settings.ambient,
             light_count: self.data.lights.len() as u32,
             flags: method.flags()
-                | if self.settings.camera_is_eye { gpu_structs::FRAME_CAMERA_IS_EYE } else { 0 },
+                | if self.settings.camera_is_eye { gpu_structs::FRAME_CAMERA_IS_EYE } else { 0 }
+                | if steady { gpu_structs::FRAME_STEADY } else { 0 },
             environment: self.data.environment_constant.into(),
             environment_width: self.data.environment_size[0],
             environment_height: self.data.environment_size[1],
@@ -575,12 +568,8 @@ impl Renderer {
         slot.frame.write(&[frame]);
         slot.parity = 1 - self.last.parity;
         slot.lists[slot.parity].submit(&mut slot.fence)?;
-        self.last.frame = inputs.frame;
-        self.last.parity = slot.parity;
-        self.last.count += 1;
-        self.last.origin = origin;
-        self.last.poses.clear();
-        self.last.poses.extend_from_slice(inputs.poses);
+        let lost = (0..inputs.poses.len()).map(|i| is_lost(&self.tracked, i, inputs.lost));
+        self.last.becomes(inputs, slot.parity, lost);
         Ok(())
     }
 }

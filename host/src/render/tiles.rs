@@ -73,10 +73,7 @@ impl TileList {
     fn mark(&mut self, camera: &ProjectorCamera, body: &BodyData, pose: &DAffine3) {
         let (lower, upper) = (body.bounds_min.as_dvec3(), body.bounds_max.as_dvec3());
         let (mut from, mut to) = (DVec2::INFINITY, DVec2::NEG_INFINITY);
-        for corner in 0..8u32 {
-            let pick = |bit: u32, low: f64, high: f64| if corner >> bit & 1 == 1 { high } else { low };
-            let p =
-                DVec3::new(pick(0, lower.x, upper.x), pick(1, lower.y, upper.y), pick(2, lower.z, upper.z));
+        for p in corners(lower, upper) {
             match camera.project(pose.transform_point3(p)) {
                 Some(pixel) => {
                     from = from.min(pixel);
@@ -120,10 +117,14 @@ impl TileList {
 
 /// The whole box is behind the projector.
 fn behind(camera: &ProjectorCamera, lower: DVec3, upper: DVec3) -> bool {
-    (0..8u32).all(|c| {
+    corners(lower, upper).all(|p| camera.to_projector_space(p).z >= 0.0)
+}
+
+/// The eight corners of a box.
+pub(super) fn corners(lower: DVec3, upper: DVec3) -> impl Iterator<Item = DVec3> {
+    (0..8u32).map(move |c| {
         let pick = |bit: u32, low: f64, high: f64| if c >> bit & 1 == 1 { high } else { low };
-        let p = DVec3::new(pick(0, lower.x, upper.x), pick(1, lower.y, upper.y), pick(2, lower.z, upper.z));
-        camera.to_projector_space(p).z >= 0.0
+        DVec3::new(pick(0, lower.x, upper.x), pick(1, lower.y, upper.y), pick(2, lower.z, upper.z))
     })
 }
 

@@ -10,7 +10,7 @@ use crate::config::{RenderConfig, RenderMethod};
 use crate::experiments::error_plan::method_of;
 use crate::gpu::Gpu;
 use crate::render::method::Method;
-use crate::render::{FrameSlot, Renderer};
+use crate::render::Renderer;
 use crate::scene::{Environment, Material, Scene};
 use dpm_shaders::structs::{History, NO_HIT};
 use glam::{DAffine3, DQuat, DVec3, Vec3};
@@ -44,6 +44,14 @@ pub const CASES: &[GpuCase] = &[
         "frames over 3",
         0.0,
         looks_again,
+    ),
+    GpuCase(
+        "gpu-dark-stays-dark",
+        "a ball and a turning plate that glide, and a plate whose shadow is faster than a frame looks about itself, method dpm",
+        "where every pixel asks in every frame: what glides is lit there and nowhere else, by less than 0.7 of the rays; nothing seen is dark for more than three frames",
+        "frames over 3",
+        0.0,
+        stays_dark,
     ),
 ];
 
@@ -179,39 +187,111 @@ fn looks_again(gpu: &Arc<Gpu>, seed: u64) -> f64 {
         let x = f64::from(frame % 12) * 0.01 + if (frame / 12).is_multiple_of(2) { -0.2 } else { 0.1 };
         vec![DAffine3::IDENTITY, DAffine3::from_translation(DVec3::new(x, 0.8, 2.0))]
     };
-    let shot = |method: Method| Shot {
+    let scene_shot = Shot {
         eye: Some(eye),
-        spp: 1,
         frames: 48,
         seed: seed as u32,
-        method: Some(method),
         ..Shot::new(&scene, camera(48, 36, DVec3::new(0.0, 3.0, 0.3), DVec3::ZERO))
     };
-    let lit = |slot: &FrameSlot| -> Vec<bool> {
-        slot.surfaces().unwrap_or(&[]).iter().map(|s| s.id != NO_HIT && s.distance > 0.0).collect()
-    };
-    let (mut wanted, mut hidden) = (Vec::new(), 0usize);
-    play(gpu, &shot(Method::full(1)), poses, |_, slot| {
-        wanted.push(lit(slot));
-        hidden += slot.surfaces().unwrap_or(&[]).iter().filter(|s| s.distance < 0.0).count();
-    });
-    let (mut waited, mut over) = (vec![0u32; wanted[0].len()], 0u32);
-    let dpm = method_of(&RenderConfig::default(), RenderMethod::Dpm);
-    play(gpu, &shot(dpm), poses, |frame, slot| {
-        for ((shown, seen), waited) in lit(slot).into_iter().zip(&wanted[frame as usize]).zip(&mut waited) {
-            *waited = if shown && !seen { *waited + 1 } else { 0 };
-            // Four frames after a jump the shadow only glides: its borders are known, and nothing waits there.
-            if shown && !seen && frame % 12 >= 5 {
-                over = over.max(1);
-            }
-            over = over.max(waited.saturating_sub(3));
-            if *seen && !shown {
-                over = u32::MAX;
-            }
-        }
-    });
-    if hidden < 1000 {
+    let (wanted, found) = sights(gpu, &scene_shot, poses);
+    if wanted.hidden < 1000 {
         return f64::NAN;
     }
-    f64::from(over)
+    // Four frames after a jump the shadow only glides: its borders are known, and nothing waits there.
+    let glides = |frame: usize| frame % 12 >= 5;
+    let [dark, _] = longest(&wanted, &found, |_, seen, shown| seen && !shown);
+    let [bright, _] = longest(&wanted, &found, |frame, seen, shown| glides(frame) && shown && !seen);
+    let [late, _] = longest(&wanted, &found, |_, seen, shown| shown && !seen);
+    if dark > 0 || bright > 0 {
+        return f64::INFINITY;
+    }
+    f64::from(late.saturating_sub(3))
+}
+
+/// What was lit in every frame.
+#[derive(Default)]
+struct Sights {
+    lit: Vec<Vec<bool>>,
+    /// Pixels that the eye does not see, and rays, over all frames.
+    hidden: usize,
+    rays: u32,
+}
+
+/// Of a shot with depth 1: by method full, which asks for every pixel in every frame, and by method dpm.
+fn sights(gpu: &Arc<Gpu>, shot: &Shot<'_>, poses: impl Fn(u32) -> Vec<DAffine3>) -> (Sights, Sights) {
+    let of = |method: Method| {
+        let shot = Shot { spp: 1, depth: 1, method: Some(method), ..shot.clone() };
+        let mut renderer = Renderer::new(gpu, shot.scene, shot.settings()).expect("the scene fits the GPU");
+        let mut sights = Sights::default();
+        shot.play(&mut renderer, 0..shot.frames, &poses, |_, slot, counters| {
+            let surfaces = slot.surfaces().unwrap_or(&[]);
+            sights.lit.push(surfaces.iter().map(|s| s.id != NO_HIT && s.distance > 0.0).collect());
+            sights.hidden += surfaces.iter().filter(|s| s.distance < 0.0).count();
+            sights.rays += counters.rays;
+        });
+        sights
+    };
+    (of(Method::full(1)), of(method_of(&RenderConfig::default(), RenderMethod::Dpm)))
+}
+
+/// For how many frames on end, at most, a pixel was at fault, and how many were in all. The fault is told by the frame's place in the sequence,
+/// whether the pixel was lit by the first, and whether by the second.
+fn longest(wanted: &Sights, found: &Sights, fault: impl Fn(usize, bool, bool) -> bool) -> [u32; 2] {
+    let (mut on_end, mut most, mut all) = (vec![0u32; wanted.lit[0].len()], 0, 0);
+    for (frame, (wanted, found)) in wanted.lit.iter().zip(&found.lit).enumerate() {
+        for ((seen, shown), on_end) in wanted.iter().zip(found).zip(&mut on_end) {
+            *on_end = if fault(frame, *seen, *shown) { *on_end + 1 } else { 0 };
+            most = most.max(*on_end);
+            all += u32::from(*on_end > 0);
+        }
+    }
+    [most, all]
+}
+
+fn stays_dark(gpu: &Arc<Gpu>, seed: u64) -> f64 {
+    // Side light: half of the ball is dark for the eye. Less than a pixel a frame, over tiles and over the picture's border.
+    let mut scene = scene_of(sphere(Vec3::ZERO, 0.3, 3, true), glow(BLUE));
+    add(&mut scene, quad(Vec3::new(-0.3, -0.05, 0.0), Vec3::X * 0.6, Vec3::Y * 0.1), glow(RED));
+    scene.environment = Environment::Constant(Vec3::ZERO);
+    let glides = |frame: u32| {
+        let way = f64::from(frame) * 0.02;
+        let turn = DQuat::from_rotation_z(f64::from(frame) * 0.06);
+        vec![
+            DAffine3::from_translation(DVec3::new(1.2 - way, 0.2, 0.0)),
+            DAffine3::from_rotation_translation(turn, DVec3::new(0.5 * way - 0.6, -0.3, 0.2)),
+        ]
+    };
+    let shot = Shot {
+        eye: Some(DVec3::new(2.0, 0.5, 2.0)),
+        frames: 96,
+        seed: seed as u32,
+        ..Shot::new(&scene, camera(64, 48, DVec3::Z * 3.0, DVec3::ZERO))
+    };
+    let (wanted, found) = sights(gpu, &shot, glides);
+    let lit: usize = wanted.lit.iter().flatten().filter(|lit| **lit).count();
+    if lit < 10_000 || wanted.hidden < 1000 || f64::from(found.rays) > 0.7 * f64::from(wanted.rays) {
+        return f64::NAN;
+    }
+    if wanted.lit != found.lit {
+        return f64::INFINITY;
+    }
+    // A shadow of 3.6 pixels a frame by a plate of 1.4, to and fro.
+    let mut scene = even();
+    add(&mut scene, quad(Vec3::new(-0.1, -0.1, 0.0), Vec3::X * 0.2, Vec3::Y * 0.2), glow(RED));
+    let swings = |frame: u32| {
+        let x = 0.035 * (f64::from((frame + 12) % 24) - 12.0).abs() - 0.21;
+        vec![DAffine3::IDENTITY, DAffine3::from_translation(DVec3::new(x, 0.8, 2.0))]
+    };
+    let shot = Shot {
+        eye: Some(DVec3::new(0.0, 1.2, 3.0)),
+        frames: 72,
+        seed: seed as u32,
+        ..Shot::new(&scene, camera(48, 36, DVec3::new(0.0, 3.0, 0.3), DVec3::ZERO))
+    };
+    let (wanted, found) = sights(gpu, &shot, swings);
+    let [late, of] = longest(&wanted, &found, |_, seen, shown| seen && !shown);
+    if wanted.hidden < 1000 || of == 0 {
+        return f64::NAN;
+    }
+    f64::from(late.saturating_sub(3))
 }
