@@ -61,6 +61,7 @@ pub(super) fn keeping(feature: &str, method: &Method) -> Option<Keep> {
         "punctual lights" => &mut keep.needs.punctual,
         "firefly clamp" => &mut keep.needs.clamp,
         "tiles without bodies" => &mut keep.every_tile,
+        "pixels out of the light" if method.dpm => &mut keep.every_pixel,
         // Its decisions are read only where the frame's flag says so; without a history it has nothing to decide from.
         "rate map" if method.needs_history() && !method.needs_rates() => &mut keep.rate_map,
         _ => return None,
@@ -240,6 +241,7 @@ mod tests {
         kept.dedup();
         assert_eq!(kept.len(), 11, "each puts back another part: {kept:#?}");
         assert_eq!(with(&history), 11, "the switches of SceneNeeds but the environment's, and those of Keep");
+        assert_eq!(with(&Method { dpm: true, ..history.clone() }), 12, "what the last frame told");
         assert_eq!(with(&Method::full(1)), 10, "without a history there are no rates");
         assert_eq!(with(&Method { rate_map: true, ..history }), 10, "rates that are read are no spare code");
     }

@@ -2,7 +2,7 @@
 
 use super::plan_savings::{changed, compare, flipped, keeping, Saving, Side};
 use super::run_rig::{open_gpu, traced_raster};
-use crate::config::{EffectsConfig, RenderConfig, RigConfig};
+use crate::config::{EffectsConfig, RenderConfig, RenderMethod, RigConfig};
 use crate::failure::{Failure, FailureKind};
 use crate::pipeline::{renderer_settings, PipelineError};
 use crate::render::method::{Method, SamplerKind};
@@ -197,6 +197,13 @@ fn rig_entries(rig: &Rig) -> Vec<PlanEntry> {
             saving: None,
         },
         entry(
+            "pixels out of the light",
+            (config.render.method != RenderMethod::Dpm)
+                .then(|| format!("method {} does not look back", config.render.method.word())),
+            "no light fell there in the last frame, nor within two pixels",
+            "no ray in three frames of four while nothing jumps, decided per pixel",
+        ),
+        entry(
             "indirect light",
             (depth > 2).then(|| format!("render.depth = {depth}")),
             &format!("render.depth = {depth}"),
@@ -247,7 +254,10 @@ pub fn scene_plan(config: &RigConfig, measure: bool) -> Result<PlanReport, Failu
         // What no scene of this kind can be drawn without has another scene beside it: of what it needs one without, else one with.
         let scene = changed(e.feature, &rig.scene).filter(|_| e.needed || e.feature == "environment image");
         e.saving = match (with_code, flipped(e.feature, &own), scene) {
-            (Some(keep), ..) => Some(pair(mine, Side { keep, ..mine })?),
+            (Some(keep), ..) => {
+                let saving = pair(mine, Side { keep, ..mine })?;
+                Some(if keep.every_pixel { saving.of_pictures() } else { saving })
+            }
             (None, Some(other), _) => {
                 let other = Side { settings: &other, ..mine };
                 let (without, with) = if e.left_out { (mine, other) } else { (other, mine) };
@@ -265,6 +275,8 @@ pub fn scene_plan(config: &RigConfig, measure: bool) -> Result<PlanReport, Failu
         needs: SceneNeeds::default().everything(),
         rate_map: method.needs_history() && !method.needs_rates(),
         every_tile: true,
+        // A pixel that only another body's motion uncovers may be lit three frames later.
+        every_pixel: false,
         storage_tables: false,
     };
     report.together = Some(pair(mine, Side { keep: all, ..mine })?);

@@ -119,6 +119,7 @@ pub struct Renderer {
     pub(super) settings: RendererSettings,
     needs: SceneNeeds,
     every_tile: bool,
+    every_pixel: bool,
     /// Per body of the scene: which tracked body carries it.
     tracked: Vec<Option<u16>>,
     /// What the history holds: the last frame submitted and its poses.
@@ -233,6 +234,7 @@ impl Renderer {
             settings,
             needs,
             every_tile: keep.every_tile,
+            every_pixel: keep.every_pixel,
             tracked,
             last,
             gpu: gpu.clone(),
@@ -517,8 +519,8 @@ impl Renderer {
         let raster = self.settings.raster;
         let method = &self.settings.method;
         let c = inputs.camera;
-        let steady =
-            self.last.is_steady(&self.data.bodies, inputs, |i| is_lost(&self.tracked, i, inputs.lost));
+        let steady = !self.every_pixel
+            && self.last.is_steady(&self.data.bodies, inputs, |i| is_lost(&self.tracked, i, inputs.lost));
         let frame = Frame {
             projector_position: [0.0; 3],
             seed: self.settings.seed,

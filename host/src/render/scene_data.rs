@@ -154,6 +154,9 @@ pub struct Keep {
     pub rate_map: bool,
     /// Tiles that no body touches.
     pub every_tile: bool,
+    /// Rays of method dpm to pixels with no light in the last frame, nor near them; what another body's motion uncovers there is lit up to three
+    /// frames earlier with it.
+    pub every_pixel: bool,
     /// Tables in storage, as on a GPU, where software Vulkan would read texel buffers.
     pub storage_tables: bool,
 }

@@ -15,7 +15,7 @@ use crate::files::{check_folder, write_atomically};
 use crate::pipeline::light::LightFrame;
 use crate::pipeline::{renderer_settings, PipelineError};
 use crate::render::method::Method;
-use crate::render::{FrameSlot, RenderError, Renderer, RendererSettings};
+use crate::render::{FrameSlot, Keep, RenderError, Renderer, RendererSettings};
 use crate::rig::Rig;
 use dpm_device::time::HostTime;
 use glam::Vec3;
@@ -144,7 +144,10 @@ pub fn snapshot(
     let raster = traced_raster(config, &gpu, &mut warnings);
     let rig = Rig::build(config, raster)?;
     let raster = rig.camera.raster;
-    let mut renderer = Renderer::new(&gpu, &rig.scene, renderer_settings(&rig)).map_err(gpu_failure)?;
+    // What surfaces are like is of interest out of the light too.
+    let keep = Keep { every_pixel: true, ..Keep::default() };
+    let mut renderer =
+        Renderer::keeping(&gpu, &rig.scene, renderer_settings(&rig), keep).map_err(gpu_failure)?;
     let mut slot = renderer.create_slot(true).map_err(gpu_failure)?;
     let wanted: Vec<_> =
         SnapshotImage::ALL.into_iter().filter(|i| what.is_empty() || what.contains(i)).collect();
