@@ -1,13 +1,10 @@
 //! Rays, shapes, lights and histories at the edge of what numbers can hold: the stability cases on the GPU under validation, those that are
 //! quick; `dpm stability` runs all. And a lost body, which needs no numbers.
 
-use dpm_host::config::{RenderConfig, RenderMethod};
-use dpm_host::experiments::error_plan::method_of;
 use dpm_host::experiments::stability::gpu::cases;
 use dpm_host::experiments::stability::gpu_shot::{Picture, Shot};
 use dpm_host::experiments::stability::shapes::*;
 use dpm_host::experiments::stability::{CaseVerdict, StabilityReport, SEED};
-use dpm_host::render::Renderer;
 use dpm_host::scene::Material;
 use dpm_tests::gpu::with_gpu;
 use glam::{DVec3, Vec3};
@@ -94,23 +91,5 @@ fn a_lost_body_gets_no_light_but_its_reflection_stays() {
             }
         }
         assert!(mirrored > 20, "{mirrored}");
-    });
-}
-
-/// A raster whose history is longer than the device's storage buffers is refused, and the message names the buffer and the remedy.
-#[test]
-fn a_raster_beyond_the_device_is_refused_by_name() {
-    with_gpu(|gpu| {
-        let (width, height) = if gpu.summary().software { (2048, 1024) } else { (8192, 8192) };
-        let scene = scene_of(floor(1.0, 0.0), Material::default());
-        let camera = camera(width, height, DVec3::new(0.0, 3.0, 0.1), DVec3::ZERO);
-        let method = Some(method_of(&RenderConfig::default(), RenderMethod::Dpm));
-        let refused = Renderer::new(gpu, &scene, Shot { method, ..Shot::new(&scene, camera) }.settings());
-        let told = refused.err().map(|e| e.to_string()).unwrap_or_default();
-        assert!(
-            told.starts_with("history (bytes): ")
-                && told.ends_with("use a smaller scene or a smaller raster"),
-            "{told}"
-        );
     });
 }
