@@ -543,3 +543,10 @@ pub const BINDINGS: &[(&str, u32)] = &[
     ("B_FILTERED_ROWS", 30),
     ("B_FORMER", 31),
 ];
+
+impl Surface {
+    /// Light falls on it: something was met, and the eye sees it. As `is_lit` of the shaders.
+    pub fn is_lit(&self) -> bool {
+        self.id != NO_HIT && self.distance > 0.0
+    }
+}

@@ -238,7 +238,7 @@ fn what_is_no_number_is_black_and_counted() {
             }
         }
         let counters = assert_same(gpu, &input);
-        let lit = |i: &usize| input.surfaces[*i].id != NO_HIT && input.surfaces[*i].distance > 0.0;
+        let lit = |i: &usize| input.surfaces[*i].is_lit();
         let count = |m: usize| (0..PIXELS).filter(|i| i % 11 == m).filter(lit).count() as u32;
         assert_eq!(counters.nan_values, count(0) + 3 * count(4));
         assert!(counters.nan_values > 300 && counters.clipped_values >= count(1) + 3 * count(5));

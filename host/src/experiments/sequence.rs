@@ -123,7 +123,7 @@ impl Theatre {
             .iter()
             .zip(guides)
             .enumerate()
-            .filter(|(_, (s, _))| s.id != NO_HIT && s.distance > 0.0)
+            .filter(|(_, (s, _))| s.is_lit())
             .map(|(i, (s, g))| {
                 let body = (s.id >> 24) as usize;
                 let at = DVec2::new(f64::from(i as u32 % width) + 0.5, f64::from(i as u32 / width) + 0.5);

@@ -98,7 +98,7 @@ impl LastFrame {
 mod tests {
     use super::*;
     use dpm_device::planes::Raster;
-    use glam::{DQuat, Vec3};
+    use glam::DQuat;
 
     const EYE: DVec3 = DVec3::new(0.3, 0.2, 1.0);
 
@@ -109,14 +109,7 @@ mod tests {
 
     /// A box of 20 cm a metre away, then the same at `pose`, seen from `eye`, lost or not.
     fn steady_with(pose: DAffine3, eye: DVec3, lost: bool) -> bool {
-        let body = BodyData {
-            node_offset: 0,
-            triangle_offset: 0,
-            bounds_min: Vec3::splat(-0.1),
-            bounds_max: Vec3::splat(0.1),
-            flags: 0,
-            extent: 0.1,
-        };
+        let body = BodyData::of_20_cm();
         let camera = camera();
         let inputs = FrameInputs {
             frame: 7,

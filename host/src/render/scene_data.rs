@@ -33,6 +33,22 @@ pub struct BodyData {
     pub extent: f32,
 }
 
+#[cfg(test)]
+impl BodyData {
+    /// A box of 20 cm about its origin that the projector lights.
+    pub(super) fn of_20_cm() -> Self {
+        let half = 0.1;
+        Self {
+            node_offset: 0,
+            triangle_offset: 0,
+            bounds_min: Vec3::splat(-half),
+            bounds_max: Vec3::splat(half),
+            flags: dpm_shaders::structs::INSTANCE_PROJECTED,
+            extent: half,
+        }
+    }
+}
+
 /// A scene ready for upload.
 #[derive(Clone, Debug, Default)]
 pub struct SceneData {

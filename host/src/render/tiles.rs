@@ -140,21 +140,13 @@ fn gcd(a: usize, b: usize) -> usize {
 mod tests {
     use super::*;
     use dpm_device::planes::Raster;
-    use glam::Vec3;
 
     #[test]
     fn every_tile_that_a_point_of_the_body_falls_into_is_active() {
         let raster = Raster::new(250, 130).unwrap();
         let camera =
             ProjectorCamera::look_at(raster, DVec3::new(0.0, 0.1, 1.0), DVec3::ZERO, DVec3::Y, 0.6).unwrap();
-        let body = BodyData {
-            node_offset: 0,
-            triangle_offset: 0,
-            bounds_min: Vec3::splat(-0.1),
-            bounds_max: Vec3::splat(0.1),
-            flags: 1,
-            extent: 0.1,
-        };
+        let body = BodyData::of_20_cm();
         let pose = DAffine3::from_rotation_y(0.7);
         let mut list = TileList::new(250, 130);
         list.update(&camera, &[body], &[pose], 1);

@@ -50,14 +50,10 @@ pub fn missing(image: SnapshotImage, method: &Method) -> Option<&'static str> {
     (!there).then_some(why)
 }
 
-fn is_lit(s: &Surface) -> bool {
-    s.id != NO_HIT && s.distance > 0.0
-}
-
 impl Views<'_> {
     fn lit<T, U>(&self, of: Option<&[T]>, value: impl Fn(&T) -> U) -> Vec<Option<U>> {
         let (surfaces, of) = (self.slot.surfaces().unwrap_or(&[]), of.unwrap_or(&[]));
-        surfaces.iter().zip(of).map(|(s, t)| is_lit(s).then(|| value(t))).collect()
+        surfaces.iter().zip(of).map(|(s, t)| s.is_lit().then(|| value(t))).collect()
     }
 
     fn guide<U>(&self, value: impl Fn(&Guide) -> U) -> Vec<Option<U>> {
@@ -150,14 +146,18 @@ impl Views<'_> {
     /// Index into [`RATES`] of every lit pixel.
     fn rates(&self) -> Vec<Option<usize>> {
         let (surfaces, rates) = (self.slot.surfaces().unwrap_or(&[]), self.slot.rates().unwrap_or(&[]));
-        surfaces.iter().enumerate().map(|(i, s)| is_lit(s).then(|| kind_of(rates[self.tile_of(i)]))).collect()
+        surfaces
+            .iter()
+            .enumerate()
+            .map(|(i, s)| s.is_lit().then(|| kind_of(rates[self.tile_of(i)])))
+            .collect()
     }
 
     fn errors(&self) -> Vec<Option<f32>> {
         let surfaces = self.slot.surfaces().unwrap_or(&[]);
         // Some pixel of the tile had no history: there is no estimate.
         let tile = |i: usize| self.tile_errors.get(self.tile_of(i)).copied().flatten().or(Some(f32::NAN));
-        surfaces.iter().enumerate().map(|(i, s)| if is_lit(s) { tile(i) } else { None }).collect()
+        surfaces.iter().enumerate().map(|(i, s)| if s.is_lit() { tile(i) } else { None }).collect()
     }
 }
 
@@ -199,7 +199,7 @@ pub fn tile_errors(raster: Raster, method: &Method, slot: &FrameSlot) -> Vec<Opt
     };
     let pixel = |x: usize, y: usize| {
         let i = y * w + x;
-        (x < w && y < h && is_lit(&surfaces[i])).then(|| PixelGuide {
+        (x < w && y < h && surfaces[i].is_lit()).then(|| PixelGuide {
             luminance: (prior[i] >= 0.0).then_some(prior[i]),
             motion: guides[i].motion,
             size: guides[i].size,

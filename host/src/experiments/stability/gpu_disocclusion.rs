@@ -3,16 +3,14 @@
 //! What is drawn has no noise, so a picture with a past that must not show agrees with one without.
 
 use super::gpu::GpuCase;
-use super::gpu_history::{even, from_one, methods, play};
+use super::gpu_history::{dpm, even, from_one, methods, play};
 use super::gpu_shot::Shot;
 use super::shapes::*;
-use crate::config::{RenderConfig, RenderMethod};
-use crate::experiments::error_plan::method_of;
 use crate::gpu::Gpu;
 use crate::render::method::Method;
 use crate::render::Renderer;
 use crate::scene::{Environment, Material, Scene};
-use dpm_shaders::structs::{History, NO_HIT};
+use dpm_shaders::structs::{History, Surface};
 use glam::{DAffine3, DQuat, DVec3, Vec3};
 use std::sync::Arc;
 
@@ -225,13 +223,13 @@ fn sights(gpu: &Arc<Gpu>, shot: &Shot<'_>, poses: impl Fn(u32) -> Vec<DAffine3>)
         let mut sights = Sights::default();
         shot.play(&mut renderer, 0..shot.frames, &poses, |_, slot, counters| {
             let surfaces = slot.surfaces().unwrap_or(&[]);
-            sights.lit.push(surfaces.iter().map(|s| s.id != NO_HIT && s.distance > 0.0).collect());
+            sights.lit.push(surfaces.iter().map(Surface::is_lit).collect());
             sights.hidden += surfaces.iter().filter(|s| s.distance < 0.0).count();
             sights.rays += counters.rays;
         });
         sights
     };
-    (of(Method::full(1)), of(method_of(&RenderConfig::default(), RenderMethod::Dpm)))
+    (of(Method::full(1)), of(dpm()))
 }
 
 /// For how many frames on end, at most, a pixel was at fault, and how many were in all. The fault is told by the frame's place in the sequence,

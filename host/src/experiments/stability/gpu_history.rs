@@ -113,6 +113,11 @@ pub fn methods() -> Vec<Method> {
     METHODS.into_iter().map(|which| method_of(&RenderConfig::default(), which)).collect()
 }
 
+/// Method dpm with its own constants.
+pub(super) fn dpm() -> Method {
+    method_of(&RenderConfig::default(), RenderMethod::Dpm)
+}
+
 /// A white Lambertian floor in even light: whatever is sampled, a lit pixel is 1.
 pub(super) fn even() -> Scene {
     let mut scene = scene_of(floor(20.0, 0.0), diffuse(Vec3::ONE));
@@ -126,7 +131,7 @@ const BESIDE: DVec3 = DVec3::new(-0.5, 3.2, 0.8);
 /// Largest difference from 1 of what is shown at lit pixels; infinite when none is lit.
 pub(super) fn from_one(slot: &FrameSlot) -> f64 {
     let (shown, surfaces) = (slot.radiance().unwrap_or(&[]), slot.surfaces().unwrap_or(&[]));
-    let lit = shown.iter().zip(surfaces).filter(|(_, s)| s.id != NO_HIT && s.distance > 0.0);
+    let lit = shown.iter().zip(surfaces).filter(|(_, s)| s.is_lit());
     let worst = lit.flat_map(|(r, _)| r[..3].iter()).map(|v| f64::from((v - 1.0).abs()));
     worst.fold(-1.0, |a: f64, d| if d.is_nan() { f64::INFINITY } else { a.max(d) })
 }
@@ -390,7 +395,7 @@ fn rate_map(gpu: &Arc<Gpu>, seed: u64) -> f64 {
             let pixels: [Option<PixelGuide>; 256] = std::array::from_fn(|i| {
                 let at = (tile / 4 * 16 + i / 16) * 64 + tile % 4 * 16 + i % 16;
                 let s = surfaces.get(at)?;
-                (s.id != NO_HIT && s.distance > 0.0).then(|| PixelGuide {
+                s.is_lit().then(|| PixelGuide {
                     luminance: (prior[at] >= 0.0).then_some(prior[at]),
                     motion: guides[at].motion,
                     size: guides[at].size,
@@ -485,9 +490,9 @@ fn noise_free(gpu: &Arc<Gpu>, seed: u64) -> f64 {
         play(gpu, &shot(Method::full(1)), poses, |_, slot| {
             wanted.push(slot.radiance().unwrap_or(&[]).to_vec());
             let surfaces = slot.surfaces().unwrap_or(&[]).iter();
-            lit += surfaces.filter(|s| s.id != NO_HIT && s.distance > 0.0).count() as u32;
+            lit += surfaces.filter(|s| s.is_lit()).count() as u32;
         });
-        play(gpu, &shot(method_of(&RenderConfig::default(), RenderMethod::Dpm)), poses, |frame, slot| {
+        play(gpu, &shot(dpm()), poses, |frame, slot| {
             let shown = slot.radiance().unwrap_or(&[]).iter().zip(&wanted[frame as usize]);
             let off = shown.flat_map(|(a, b)| (0..3).map(|c| f64::from((a[c] - b[c]).abs())));
             worst = off.fold(worst, |w: f64, d| if d.is_nan() { f64::INFINITY } else { w.max(d) });
@@ -513,14 +518,14 @@ fn chance_comes_in(gpu: &Arc<Gpu>, seed: u64) -> f64 {
         spp: 2,
         frames: 48,
         seed: seed as u32,
-        method: Some(method_of(&RenderConfig::default(), RenderMethod::Dpm)),
+        method: Some(dpm()),
         ..Shot::new(&scene, camera(64, 48, DVec3::new(0.0, 0.3, 3.0), DVec3::ZERO))
     };
     // Of the mirror's pixels, which stand: the flags of the frame before.
     let (mut before, mut begun, mut ended, mut faults) = (Vec::new(), 0u32, 0u32, 0u32);
     play(gpu, &shot, poses, |_, slot| {
         let (history, traced) = (slot.history().unwrap_or(&[]), slot.traced().unwrap_or(&[]));
-        let mirrors = |s: &Surface| s.id != NO_HIT && s.distance > 0.0 && s.id >> 24 == 0;
+        let mirrors = |s: &Surface| s.is_lit() && s.id >> 24 == 0;
         let lit: Vec<bool> = slot.surfaces().unwrap_or(&[]).iter().map(mirrors).collect();
         let exact: Vec<bool> = history.iter().map(|h| h.flags & HISTORY_EXACT != 0).collect();
         for (i, was) in before.iter().enumerate().filter(|(i, _)| lit[*i]) {
@@ -553,7 +558,7 @@ fn new_points(gpu: &Arc<Gpu>, seed: u64) -> f64 {
         spp: 1,
         frames: 40,
         seed: seed as u32,
-        method: Some(method_of(&RenderConfig::default(), RenderMethod::Dpm)),
+        method: Some(dpm()),
         ..Shot::new(&scene, camera(64, 48, DVec3::new(0.0, 0.0, 3.0), DVec3::ZERO))
     };
     let poses = |frame: u32| vec![DAffine3::from_translation(DVec3::X * (f64::from(frame) * 0.06 - 1.2))];
@@ -561,8 +566,7 @@ fn new_points(gpu: &Arc<Gpu>, seed: u64) -> f64 {
     play(gpu, &shot, poses, |_, slot| {
         let (history, traced) = (slot.history().unwrap_or(&[]), slot.traced().unwrap_or(&[]));
         let surfaces = slot.surfaces().unwrap_or(&[]);
-        let lit = |i: &usize| surfaces[*i].id != NO_HIT && surfaces[*i].distance > 0.0;
-        for i in (0..surfaces.len()).filter(lit) {
+        for i in (0..surfaces.len()).filter(|i| surfaces[*i].is_lit()) {
             waits += u32::from(traced[i][3] == 0.0);
             new += u32::from(traced[i][3] > 0.0 && history[i].index == traced[i][3] as u32);
             faults += u32::from(history[i].index == 0);

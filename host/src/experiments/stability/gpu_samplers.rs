@@ -4,16 +4,13 @@
 //! frames do not take away). That the mean itself is right is judged against the f64 tracer, by cases of independent samples.
 
 use super::gpu::GpuCase;
-use super::gpu_history::play_at_rest;
+use super::gpu_history::{dpm, play_at_rest};
 use super::gpu_shot::Shot;
 use super::gpu_tracer::still_life;
 use super::shapes::*;
-use crate::config::{RenderConfig, RenderMethod};
-use crate::experiments::error_plan::method_of;
 use crate::gpu::Gpu;
 use crate::render::method::{Method, SamplerKind};
 use crate::scene::{Material, Scene};
-use dpm_shaders::structs::NO_HIT;
 use glam::{DVec3, Vec3};
 use std::sync::Arc;
 
@@ -39,7 +36,7 @@ pub const CASES: &[GpuCase] = &[
 
 /// Methods that trace every pixel alike, and whether their samples are independent of each other.
 fn samplers() -> [(Method, bool); 3] {
-    let sequences = Method { rate_map: false, ..method_of(&RenderConfig::default(), RenderMethod::Dpm) };
+    let sequences = Method { rate_map: false, ..dpm() };
     [
         (Method::full(1), true),
         (Method { sampler: SamplerKind::BlueNoise, ..Method::full(1) }, false),
@@ -74,7 +71,7 @@ fn traced(gpu: &Arc<Gpu>, scene: &Scene, method: &Method, spp: u32, frames: u32,
     let mut all = Vec::new();
     play_at_rest(gpu, &shot, |_, slot| {
         let (traced, surfaces) = (slot.traced().unwrap_or(&[]), slot.surfaces().unwrap_or(&[]));
-        let lit = traced.iter().zip(surfaces).filter(|(_, s)| s.id != NO_HIT && s.distance > 0.0);
+        let lit = traced.iter().zip(surfaces).filter(|(_, s)| s.is_lit());
         all.push(lit.flat_map(|(r, _)| r[..3].iter().map(|v| f64::from(*v))).collect());
     });
     all
