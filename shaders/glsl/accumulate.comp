@@ -19,10 +19,6 @@ layout(set = 0, binding = B_SHOWN, scalar) readonly buffer Shown { vec4 shown[];
 
 // Share of the light by which a frame's noise may stray without a history against it.
 const float UNSEEN = 0.002;
-// A history is kept whole while frames stray from it with less than so many times the power of their noise ...
-const float SURPRISE = 3.0;
-// ... and of this share of the light.
-const float LEAST = 0.003;
 
 void main() {
     uvec2 pixel;
@@ -62,17 +58,10 @@ void main() {
             float per_frame = max(frame.budget_spp, 0.5);
             float innovation = luminance(fresh - h.mean - shift);
             h.drift = h.weight > 0.0 ? mix(h.drift, innovation, 0.0625) : 0.0;
-            // A jump (a light switched on) is not waited for: a mean of weight 1/16 has 1/31 of a frame's variance.
-            float drift = h.drift * luminance(albedo);
-            float jump = drift * drift / max(h.surprise / 31.0 + 1e-4 * known * known, 1e-12);
-            if (jump > 25.0) h.weight *= 0.7;
-            // No longer a history than noise calls for: where a frame has next to none (a mirror of an even sky), or where frames are farther from
-            // the history than their noise tells (a reflection that moves), the eye's own mean does better.
-            float level = known * known, of_frame = h.variance / per_frame;
+            // No longer a history than noise calls for: where a frame has next to none (a mirror of an even sky) the eye's own mean does better.
             // In the periphery half as long again, against flicker.
             float cap = (1.0 + 0.5 * periphery(guide_at(at).angle)) * frame.history_cap;
-            float frames = min(cap, of_frame / max(UNSEEN * UNSEEN * level, 1e-12));
-            frames = min(frames, cap * SURPRISE * (of_frame + LEAST * LEAST * level) / max(h.surprise, 1e-12));
+            float frames = min(cap, h.variance / per_frame / max(UNSEEN * UNSEEN * known * known, 1e-12));
             h.weight = min(h.weight, frames * per_frame);
             // Every sample counts once, so that the sequence's points keep their even spread; their number follows from the variance of long
             // before, hardly from the sample that is weighed.

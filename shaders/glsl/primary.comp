@@ -17,14 +17,16 @@ layout(constant_id = 11) const bool HAS_GUIDES = true;
 // Radiance is filtered without the surface's albedo.
 layout(constant_id = 12) const bool HAS_DEMODULATION = true;
 
-// Reflectance of the look for white light from everywhere, roughly: what varies over a texture but not over the light.
+// Reflectance of the look for white light from everywhere, roughly: what varies over a texture but not over the light. Light from below the
+// surface itself is lost, however the shading normal leans: that share of a cosine lobe is (1 - cos) / 2 of the angle between the normals.
 vec3 demodulation(Hit hit, vec3 toward) {
     Point s = shading_point(hit, toward);
     float nv = dot(s.n, s.v);
     float e = HAS_SPECULAR ? directional_albedo(s.table, s.alpha, nv) : 0.0;
     float m = pow(clamp(1.0 - nv, 0.0, 1.0), 5.0);
     vec3 metal = s.base + (1.0 - s.base) * m;
-    return clamp(mix(e + (1.0 - e) * s.base, metal, s.metallic), 0.02, 1.0);
+    float above = 0.5 + 0.5 * dot(s.n, s.g);
+    return clamp(mix(e + (1.0 - e) * above * s.base, metal, s.metallic), 0.02, 1.0);
 }
 
 // Method dpm: every fourth frame a block of pixels asks for all that it could take from the last.

@@ -19,6 +19,11 @@ layout(set = 0, binding = B_SHOWN, scalar) writeonly buffer Shown { vec4 shown[]
 // that stays as bias, and without it there is noise, which flickers.
 const float TAKEN_OVER = 6.0, TAKEN_OVER_PERIPHERY = 24.0;
 
+// A history's lag is told from chance by so many times the power that chance gives it, and by this share of the light.
+const float LAG_BEYOND_CHANCE = 2.0, LEAST_LAG = 0.007;
+// Power of noise counts so much beside that of lag: what the spatial filter takes out, against what noise costs in flicker.
+const float NOISE_COUNTS = 1.2;
+
 struct Carried {
     vec3 mean;
     float weight, drift, variance, surprise;
@@ -93,6 +98,25 @@ void carry_bilinear(inout History h, vec3 normal, float footprint, vec2 before) 
     h.index = former_at(nearest).index;
 }
 
+// Frames' worth of samples that serve best where light changes: a history of n frames lags by n times the light's slope over time, and its noise in
+// what the eye sees is that of n + EYE_FRAMES frames. The sum of both powers is least where n (n + EYE_FRAMES)^2 is half the ratio of noise
+// to slope; the root is taken as the geometric mean of two estimates, exact where n is far below or far beyond the eye's frames. `length` frames
+// lag by `lag_power`. All powers are of luminance without albedo.
+float useful_frames(float lag_power, float frame_noise, float light_power, float length) {
+    float beyond = lag_power - LAG_BEYOND_CHANCE * (frame_noise / 31.0 + LEAST_LAG * LEAST_LAG * light_power);
+    if (!(beyond > 0.0)) return INFINITY;
+    float q = 0.5 * NOISE_COUNTS * frame_noise * length * length / beyond;
+    float n = min(pow(q, 1.0 / 3.0), q / (EYE_FRAMES * EYE_FRAMES));
+    return max(sqrt(n * q / (EYE_FRAMES * EYE_FRAMES + 2.0 * EYE_FRAMES * n + n * n)), 2.0);
+}
+
+// From a history's point to the pixel's, by the plane through the histories around: never beyond what these say, and never by more than half of the
+// most they say. A point's mean is what its pixel shows less this, so a step as large as the light itself would feed itself where histories are short.
+vec3 bounded_shift(vec3 mean, vec3 shift, vec3 lower, vec3 upper) {
+    vec3 most = 0.5 * max(abs(lower), abs(upper));
+    return clamp(clamp(mean + shift, lower, upper) - mean, -most, most);
+}
+
 // Method dpm: every history belongs to one surface point for as long as it is seen. It goes to the pixel that the point is in now, so nothing is
 // ever resampled; the pixel's own point, at most half a pixel away, is reached by the gradient of the histories around.
 void carry_point(inout History h, vec3 normal, float footprint, uvec2 pixel, vec2 before) {
@@ -103,6 +127,7 @@ void carry_point(inout History h, vec3 normal, float footprint, uvec2 pixel, vec
     float squares = 0.0, total = 0.0, x = 0.0, y = 0.0, xx = 0.0, xy = 0.0, yy = 0.0, nearest = 1.5;
     uint owner = NO_HIT, taps = 0u;
     vec2 apart = vec2(0.0);
+    float lag_power = 0.0, noise_power = 0.0;
     for (int i = 0; i < 9; i++) {
         ivec2 q = corner + ivec2(i % 3, i / 3) - 1;
         if (any(lessThan(q, ivec2(0))) || any(greaterThanEqual(q, ivec2(frame.width, frame.height)))) continue;
@@ -125,6 +150,8 @@ void carry_point(inout History h, vec3 normal, float footprint, uvec2 pixel, vec
         squares += w * luminance(m) * luminance(m);
         sum_x += w * e.x * m;
         sum_y += w * e.y * m;
+        lag_power += former_at(tap).drift * former_at(tap).drift;
+        noise_power += former_at(tap).surprise;
         lower = min(lower, m);
         upper = max(upper, m);
         float far = max(abs(e.x), abs(e.y));
@@ -151,9 +178,13 @@ void carry_point(inout History h, vec3 normal, float footprint, uvec2 pixel, vec
             g_x = (yy * sum_x - xy * sum_y) / determinant;
             g_y = (xx * sum_y - xy * sum_x) / determinant;
             shift = -(g_x * apart.x + g_y * apart.y);
-            shift = clamp(known.mean + shift, lower, upper) - known.mean;
+            shift = bounded_shift(known.mean, shift, lower, upper);
         }
         known.frame = h.frame;
+        float light = luminance(albedo_of(guide_at(at))), per_frame = max(frame.budget_spp, 0.5);
+        float level = luminance(sum), length = max(total / float(taps) / per_frame, 1.0);
+        float useful = useful_frames(lag_power / float(taps), noise_power / float(taps) / (light * light), level * level, length);
+        known.weight = min(known.weight, useful * per_frame);
         if (nearest <= 0.6) {
             h = known;
         } else {
@@ -168,13 +199,14 @@ void carry_point(inout History h, vec3 normal, float footprint, uvec2 pixel, vec
             vec3 there = -(g_x * (apart.x - e.x) + g_y * (apart.y - e.y));
             known.mean = clamp(known.mean + there, lower, upper);
             shift = -(g_x * e.x + g_y * e.y);
-            shift = clamp(known.mean + shift, lower, upper) - known.mean;
+            shift = bounded_shift(known.mean, shift, lower, upper);
             known.position = h.position;
             known.normal = h.normal;
             known.seed = h.seed;
             known.index = 0u;
+            known.flags = (known.flags & ~HISTORY_BORDER) | (taps < 8u ? HISTORY_BORDER : 0u);
             // Known as well as the histories around it agree: their scatter about the plane, or about each other where they lie on one side.
-            float light = luminance(albedo_of(guide_at(at))), noise = max(known.surprise, 1e-8), per_frame = max(frame.budget_spp, 0.5);
+            float noise = max(known.surprise, 1e-8);
             float expected = noise * per_frame / known.weight, rest;
             if (taps < 8u) {
                 float range = luminance(upper - lower) * light;

@@ -392,6 +392,7 @@ pub const CONSTANTS: &[(&str, u32)] = &[
     ("FRAME_DPM", FRAME_DPM),
     ("HISTORY_EXACT", HISTORY_EXACT),
     ("HISTORY_HIDDEN", HISTORY_HIDDEN),
+    ("HISTORY_BORDER", HISTORY_BORDER),
     ("FRAME_ALLOCATE", FRAME_ALLOCATE),
     ("FRAME_STEADY", FRAME_STEADY),
     ("RATE_TABLE_OCTAVE", RATE_TABLE_OCTAVE),
@@ -444,6 +445,8 @@ pub const FRAME_DPM: u32 = 32;
 pub const HISTORY_EXACT: u32 = 1;
 /// The pixel itself was not lit in the last frame: its history waits for a surface point that has just slipped out of it.
 pub const HISTORY_HIDDEN: u32 = 2;
+/// The point has come into view at the border of what is known, and has no sample of its own yet.
+pub const HISTORY_BORDER: u32 = 4;
 /// Method dpm: samples go where they lower the error most.
 pub const FRAME_ALLOCATE: u32 = 64;
 /// Nothing has jumped, come or gone since the last frame: by so little has light moved that most pixels need not ask for it.
