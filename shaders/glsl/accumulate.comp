@@ -59,9 +59,7 @@ void main() {
             float innovation = luminance(fresh - h.mean - shift);
             h.drift = h.weight > 0.0 ? mix(h.drift, innovation, 0.0625) : 0.0;
             // No longer a history than noise calls for: where a frame has next to none (a mirror of an even sky) the eye's own mean does better.
-            // In the periphery half as long again, against flicker.
-            float cap = (1.0 + 0.5 * periphery(guide_at(at).angle)) * frame.history_cap;
-            float frames = min(cap, h.variance / per_frame / max(UNSEEN * UNSEEN * known * known, 1e-12));
+            float frames = min(frame.history_cap, h.variance / per_frame / max(UNSEEN * UNSEEN * known * known, 1e-12));
             h.weight = min(h.weight, frames * per_frame);
             // Every sample counts once, so that the sequence's points keep their even spread; their number follows from the variance of long
             // before, hardly from the sample that is weighed.

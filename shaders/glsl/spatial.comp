@@ -18,12 +18,18 @@ layout(constant_id = 13) const bool HAS_FILTER = true;
 const vec2 DISK[12] = vec2[](vec2(0.03, -0.09), vec2(-0.51, 0.13), vec2(0.47, 0.22), vec2(-0.08, 0.53), vec2(0.12, -0.62), vec2(-0.46, -0.41),
                              vec2(0.62, -0.31), vec2(-0.94, -0.18), vec2(-0.58, 0.72), vec2(0.43, 0.83), vec2(0.96, 0.12), vec2(-0.31, -0.92));
 
-// Share of independent samples' variance that is left by the sequence (measured).
-const float SEQUENCE_VARIANCE = 0.3;
+// Share of independent samples' variance that the sequence leaves, of a few frames and of many (measured: the better spread, the less).
+const float SEQUENCE_VARIANCE_FEW = 0.5, SEQUENCE_VARIANCE_MANY = 0.27, MANY_FRAMES = 60.0;
 // Frames that the picture's own noise is taken to be seen over: what a filter gets wrong stays, noise goes.
 const float SEEN_FRAMES = 20.0;
+// Of a young point's samples, the share that the eye has not seen in all of its frames.
+const float OWN_CHANGING = 0.3;
 // Neighbours may differ by this share of their light beyond what the plane tells.
-const float TOLERANCE = 0.008;
+const float TOLERANCE = 0.025;
+
+float sequence_variance(float held) {
+    return mix(SEQUENCE_VARIANCE_FEW, SEQUENCE_VARIANCE_MANY, clamp(held / (MANY_FRAMES * max(frame.budget_spp, 0.5)), 0.0, 1.0));
+}
 
 // The neighbour at raster position `q`, if it is lit and of the body `instance`.
 bool neighbour(ivec2 q, uint instance, out uint tap) {
@@ -89,7 +95,7 @@ vec3 regressed(uvec2 pixel, uint at, vec3 own) {
         vec3 n = decode_normal(history_at(tap).normal);
         if (dot(n, normal) < 0.6 || abs(dot(history_at(tap).position - position, normal)) > 3.0 * footprint) continue;
         float light = luminance(albedo_of(guide_at(tap)));
-        float noise = filtered_at(tap).variance * SEQUENCE_VARIANCE / (light * light);
+        float noise = filtered_at(tap).variance * sequence_variance(history_at(tap).weight) / (light * light);
         float w = 1.0 / (noise + tolerated);
         vec3 m = filtered_at(tap).light - own;
         float v[5] = float[](1.0, float(d.x), float(d.y), dot(n, across), dot(n, along));
@@ -134,7 +140,9 @@ vec3 regressed(uvec2 pixel, uint at, vec3 own) {
     // In the periphery blur is the lesser evil beside flicker.
     float beyond = periphery(guide_at(at).angle);
     structure = max(structure, apart * apart - mix(3.0, 16.0, beyond) * noise);
-    noise *= mix(1.0, 5.0, beyond) * held / (held + SEEN_FRAMES * max(frame.budget_spp, 0.5));
+    // The eye's mean takes out what changes from frame to frame. Of a young point that is little: all its frames stand on the same samples.
+    float changing = min(SEEN_FRAMES * max(frame.budget_spp, 0.5), OWN_CHANGING * float(history_at(at).index));
+    noise *= mix(1.0, 5.0, beyond) * held / (held + changing);
     vec3 result = own + b[0] * (noise / max(structure + noise, 1e-12));
     return finite3(result) ? max(result, vec3(0.0)) : own;
 }
