@@ -216,7 +216,8 @@ pub fn tile_errors(raster: Raster, method: &Method, slot: &FrameSlot) -> Vec<Opt
     out
 }
 
-fn albedo_of(g: &Guide) -> [f32; 3] {
+/// Reflectance by which a pixel's radiance is divided before it is filtered.
+pub fn albedo_of(g: &Guide) -> [f32; 3] {
     let half = |bits: u32| half_to_f32(bits as u16);
     [half(g.albedo_rg), half(g.albedo_rg >> 16), half(g.albedo_b)]
 }

@@ -1,6 +1,9 @@
 //! A Vulkan device into the stability cases that need one: the shaders that run in the rig, on whichever device is here.
 
-use super::{gpu_chain, gpu_disocclusion, gpu_history, gpu_samplers, gpu_tracer, gpu_traversal, Case};
+use super::{
+    gpu_chain, gpu_disocclusion, gpu_histories_in_motion, gpu_history, gpu_samplers, gpu_tracer,
+    gpu_traversal, Case,
+};
 use crate::gpu::{Gpu, GpuOptions};
 use std::sync::Arc;
 
@@ -47,6 +50,7 @@ pub fn cases(device: &Device) -> Vec<Case> {
         gpu_traversal::CASES,
         gpu_history::CASES,
         gpu_disocclusion::CASES,
+        gpu_histories_in_motion::CASES,
         gpu_samplers::CASES,
         gpu_chain::CASES,
     ];

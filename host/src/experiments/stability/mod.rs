@@ -11,6 +11,7 @@ pub mod gpu;
 pub mod gpu_chain;
 pub mod gpu_compare;
 pub mod gpu_disocclusion;
+pub mod gpu_histories_in_motion;
 pub mod gpu_history;
 pub mod gpu_samplers;
 pub mod gpu_shot;
