@@ -110,6 +110,13 @@ float useful_frames(float lag_power, float frame_noise, float light_power, float
     return max(sqrt(n * q / (EYE_FRAMES * EYE_FRAMES + 2.0 * EYE_FRAMES * n + n * n)), 2.0);
 }
 
+// The same where light differs from point to point by more than a plane tells: a history is the mean over all places in its pixel that were
+// sampled, which blurs, and where that is more than a frame's noise the frames themselves serve better. While a body moves by a twentieth of a pixel
+// its points are sampled in one place: what stands is not concerned.
+float crisp_frames(float structure, float frame_noise, vec2 motion) {
+    return max(max(frame_noise / max(structure, 1e-12), 0.3), 0.05 / max(length(motion), 1e-6));
+}
+
 // From a history's point to the pixel's, by the plane through the histories around: never beyond what these say, and never by more than half of the
 // most they say. A point's mean is what its pixel shows less this, so a step as large as the light itself would feed itself where histories are short.
 vec3 bounded_shift(vec3 mean, vec3 shift, vec3 lower, vec3 upper) {
@@ -127,7 +134,7 @@ void carry_point(inout History h, vec3 normal, float footprint, uvec2 pixel, vec
     float squares = 0.0, total = 0.0, x = 0.0, y = 0.0, xx = 0.0, xy = 0.0, yy = 0.0, nearest = 1.5;
     uint owner = NO_HIT, taps = 0u;
     vec2 apart = vec2(0.0);
-    float lag_power = 0.0, noise_power = 0.0;
+    float lag_power = 0.0, noise_power = 0.0, variance = 0.0;
     for (int i = 0; i < 9; i++) {
         ivec2 q = corner + ivec2(i % 3, i / 3) - 1;
         if (any(lessThan(q, ivec2(0))) || any(greaterThanEqual(q, ivec2(frame.width, frame.height)))) continue;
@@ -152,6 +159,7 @@ void carry_point(inout History h, vec3 normal, float footprint, uvec2 pixel, vec
         sum_y += w * e.y * m;
         lag_power += former_at(tap).drift * former_at(tap).drift;
         noise_power += former_at(tap).surprise;
+        variance += former_at(tap).variance;
         lower = min(lower, m);
         upper = max(upper, m);
         float far = max(abs(e.x), abs(e.y));
@@ -182,8 +190,13 @@ void carry_point(inout History h, vec3 normal, float footprint, uvec2 pixel, vec
         }
         known.frame = h.frame;
         float light = luminance(albedo_of(guide_at(at))), per_frame = max(frame.budget_spp, 0.5);
-        float level = luminance(sum), length = max(total / float(taps) / per_frame, 1.0);
-        float useful = useful_frames(lag_power / float(taps), noise_power / float(taps) / (light * light), level * level, length);
+        // All powers without albedo.
+        float level = luminance(sum), frames = max(total / float(taps) / per_frame, 1.0);
+        float to_power = 1.0 / (float(taps) * light * light), of_frame = variance * to_power / per_frame;
+        float useful = useful_frames(lag_power / float(taps), noise_power * to_power, level * level, frames);
+        float fit = luminance(g_x) * luminance(sum_x) + luminance(g_y) * luminance(sum_y);
+        float scatter = max(squares * s - level * level - fit, 0.0);
+        if (taps > 1u) useful = min(useful, crisp_frames(1.5 * max(scatter - of_frame / frames, 0.0), of_frame, centre - before));
         known.weight = min(known.weight, useful * per_frame);
         if (nearest <= 0.6) {
             h = known;
@@ -212,8 +225,7 @@ void carry_point(inout History h, vec3 normal, float footprint, uvec2 pixel, vec
                 float range = luminance(upper - lower) * light;
                 rest = 0.5 * max(range * range - 4.0 * expected, 0.0);
             } else {
-                float mean = luminance(sum), fit = luminance(g_x) * luminance(sum_x) + luminance(g_y) * luminance(sum_y);
-                rest = 2.0 * max((squares * s - mean * mean - fit) * light * light - expected, 0.0);
+                rest = 2.0 * max(scatter * light * light - expected, 0.0);
             }
             known.weight = 1.0 / (1.0 / known.weight + rest / (noise * per_frame));
             known.weight = min(known.weight, mix(TAKEN_OVER, TAKEN_OVER_PERIPHERY, periphery(guide_at(at).angle)) * per_frame);
