@@ -100,12 +100,12 @@ void carry_bilinear(inout History h, vec3 normal, float footprint, vec2 before) 
 
 // Frames' worth of samples that serve best where light changes: a history of n frames lags by n times the light's slope over time, and its noise in
 // what the eye sees is that of n + EYE_FRAMES frames. The sum of both powers is least where n (n + EYE_FRAMES)^2 is half the ratio of noise
-// to slope; the root is taken as the geometric mean of two estimates, exact where n is far below or far beyond the eye's frames. `length` frames
+// to slope; the root is taken as the geometric mean of two estimates, exact where n is far below or far beyond the eye's frames. `frames` frames
 // lag by `lag_power`. All powers are of luminance without albedo.
-float useful_frames(float lag_power, float frame_noise, float light_power, float length) {
+float useful_frames(float lag_power, float frame_noise, float light_power, float frames) {
     float beyond = lag_power - LAG_BEYOND_CHANCE * (frame_noise / 31.0 + LEAST_LAG * LEAST_LAG * light_power);
     if (!(beyond > 0.0)) return INFINITY;
-    float q = 0.5 * NOISE_COUNTS * frame_noise * length * length / beyond;
+    float q = 0.5 * NOISE_COUNTS * frame_noise * frames * frames / beyond;
     float n = min(pow(q, 1.0 / 3.0), q / (EYE_FRAMES * EYE_FRAMES));
     return max(sqrt(n * q / (EYE_FRAMES * EYE_FRAMES + 2.0 * EYE_FRAMES * n + n * n)), 2.0);
 }
@@ -114,7 +114,8 @@ float useful_frames(float lag_power, float frame_noise, float light_power, float
 // sampled, which blurs, and where that is more than a frame's noise the frames themselves serve better. While a body moves by a twentieth of a pixel
 // its points are sampled in one place: what stands is not concerned.
 float crisp_frames(float structure, float frame_noise, vec2 motion) {
-    return max(max(frame_noise / max(structure, 1e-12), 0.3), 0.05 / max(length(motion), 1e-6));
+    if (!(structure > 0.0)) return INFINITY;
+    return max(max(frame_noise / structure, 0.3), 0.05 / max(length(motion), 1e-6));
 }
 
 // From a history's point to the pixel's, by the plane through the histories around: never beyond what these say, and never by more than half of the
