@@ -103,6 +103,7 @@ void carry_bilinear(inout History h, vec3 normal, float footprint, vec2 before) 
 // to slope; the root is taken as the geometric mean of two estimates, exact where n is far below or far beyond the eye's frames. `frames` frames
 // lag by `lag_power`. All powers are of luminance without albedo.
 float useful_frames(float lag_power, float frame_noise, float light_power, float frames) {
+    // The lag is a mean of weight 1/16 over frames, which has 1/31 of a frame's variance.
     float beyond = lag_power - LAG_BEYOND_CHANCE * (frame_noise / 31.0 + LEAST_LAG * LEAST_LAG * light_power);
     if (!(beyond > 0.0)) return INFINITY;
     float q = 0.5 * NOISE_COUNTS * frame_noise * frames * frames / beyond;
