@@ -55,9 +55,9 @@ void main() {
             // Power of what single frames say beyond the history: their noise, and what the history gets wrong.
             if (h.weight > 0.0) h.surprise = mix(h.surprise, (y - known) * (y - known), h.surprise > 0.0 ? 0.1 : 1.0);
             // Innovation: what the frame says beyond the history, as luminance without albedo. Its mean over the last few frames is the lag.
-            float per_frame = max(frame.budget_spp, 0.5);
+            float per_frame = samples_a_frame();
             float innovation = luminance(fresh - h.mean - shift);
-            h.drift = h.weight > 0.0 ? mix(h.drift, innovation, 0.0625) : 0.0;
+            h.drift = h.weight > 0.0 ? mix(h.drift, innovation, LAG_WEIGHT) : 0.0;
             // No longer a history than noise calls for: where a frame has next to none (a mirror of an even sky) the eye's own mean does better.
             float frames = min(frame.history_cap, h.variance / per_frame / max(UNSEEN * UNSEEN * known * known, 1e-12));
             h.weight = min(h.weight, frames * per_frame);

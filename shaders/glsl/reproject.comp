@@ -103,8 +103,8 @@ void carry_bilinear(inout History h, vec3 normal, float footprint, vec2 before) 
 // to slope; the root is taken as the geometric mean of two estimates, exact where n is far below or far beyond the eye's frames. `frames` frames
 // lag by `lag_power`. All powers are of luminance without albedo.
 float useful_frames(float lag_power, float frame_noise, float light_power, float frames) {
-    // The lag is a mean of weight 1/16 over frames, which has 1/31 of a frame's variance.
-    float beyond = lag_power - LAG_BEYOND_CHANCE * (frame_noise / 31.0 + LEAST_LAG * LEAST_LAG * light_power);
+    float by_chance = frame_noise * (LAG_WEIGHT / (2.0 - LAG_WEIGHT));
+    float beyond = lag_power - LAG_BEYOND_CHANCE * (by_chance + LEAST_LAG * LEAST_LAG * light_power);
     if (!(beyond > 0.0)) return INFINITY;
     float q = 0.5 * NOISE_COUNTS * frame_noise * frames * frames / beyond;
     float n = min(pow(q, 1.0 / 3.0), q / (EYE_FRAMES * EYE_FRAMES));
@@ -191,7 +191,7 @@ void carry_point(inout History h, vec3 normal, float footprint, uvec2 pixel, vec
             shift = bounded_shift(known.mean, shift, lower, upper);
         }
         known.frame = h.frame;
-        float light = luminance(albedo_of(guide_at(at))), per_frame = max(frame.budget_spp, 0.5);
+        float light = luminance(albedo_of(guide_at(at))), per_frame = samples_a_frame();
         // All powers without albedo.
         float level = luminance(sum), frames = max(total / float(taps) / per_frame, 1.0);
         float to_power = 1.0 / (float(taps) * light * light), of_frame = variance * to_power / per_frame;

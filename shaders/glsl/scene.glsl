@@ -28,6 +28,11 @@ const float PI = 3.14159265358979;
 const float INFINITY = 3.0e38;
 // Frames over which the eye takes the mean: 33 ms at 947 fps.
 const float EYE_FRAMES = 31.0;
+// Weight of a frame in the mean that tells how far a history lags behind.
+const float LAG_WEIGHT = 0.0625;
+
+// Samples that a pixel gets in a frame on average (method dpm): lengths of histories are told in such frames.
+float samples_a_frame() { return max(frame.budget_spp, 0.5); }
 
 vec3 transform_point(vec4 rows[3], vec3 p) {
     return vec3(dot(rows[0], vec4(p, 1.0)), dot(rows[1], vec4(p, 1.0)), dot(rows[2], vec4(p, 1.0)));

@@ -18,7 +18,7 @@ layout(constant_id = 13) const bool HAS_FILTER = true;
 const vec2 DISK[12] = vec2[](vec2(0.03, -0.09), vec2(-0.51, 0.13), vec2(0.47, 0.22), vec2(-0.08, 0.53), vec2(0.12, -0.62), vec2(-0.46, -0.41),
                              vec2(0.62, -0.31), vec2(-0.94, -0.18), vec2(-0.58, 0.72), vec2(0.43, 0.83), vec2(0.96, 0.12), vec2(-0.31, -0.92));
 
-// Share of independent samples' variance that the sequence leaves, of a few frames and of many (measured: the better spread, the less).
+// Share of independent samples' variance that the sequence leaves, of a few frames and of many: the more there are, the more even their spread.
 const float SEQUENCE_VARIANCE_FEW = 0.5, SEQUENCE_VARIANCE_MANY = 0.27, MANY_FRAMES = 60.0;
 // Frames that the picture's own noise is taken to be seen over: what a filter gets wrong stays, noise goes.
 const float SEEN_FRAMES = 20.0;
@@ -28,7 +28,7 @@ const float OWN_CHANGING = 0.3;
 const float TOLERANCE = 0.025;
 
 float sequence_variance(float held) {
-    return mix(SEQUENCE_VARIANCE_FEW, SEQUENCE_VARIANCE_MANY, clamp(held / (MANY_FRAMES * max(frame.budget_spp, 0.5)), 0.0, 1.0));
+    return mix(SEQUENCE_VARIANCE_FEW, SEQUENCE_VARIANCE_MANY, clamp(held / (MANY_FRAMES * samples_a_frame()), 0.0, 1.0));
 }
 
 // The neighbour at raster position `q`, if it is lit and of the body `instance`.
@@ -50,7 +50,7 @@ float lag_of(uvec2 pixel, uint at) {
     uint instance = surface_at(at).id >> 24u;
     vec3 normal = decode_normal(history_at(at).normal);
     mat2 rotation = turn_of(pixel, 0u);
-    float per_frame = max(frame.budget_spp, 0.5);
+    float per_frame = samples_a_frame();
     float age = history_at(at).weight / per_frame, drift = history_at(at).drift;
     float xx = age * age, xy = age * drift, yy = drift * drift, used = 1.0;
     for (int i = 0; i < 12; i++) {
@@ -141,7 +141,7 @@ vec3 regressed(uvec2 pixel, uint at, vec3 own) {
     float beyond = periphery(guide_at(at).angle);
     structure = max(structure, apart * apart - mix(3.0, 16.0, beyond) * noise);
     // The eye's mean takes out what changes from frame to frame. Of a young point that is little: all its frames stand on the same samples.
-    float changing = min(SEEN_FRAMES * max(frame.budget_spp, 0.5), OWN_CHANGING * float(history_at(at).index));
+    float changing = min(SEEN_FRAMES * samples_a_frame(), OWN_CHANGING * float(history_at(at).index));
     noise *= mix(1.0, 5.0, beyond) * held / (held + changing);
     vec3 result = own + b[0] * (noise / max(structure + noise, 1e-12));
     return finite3(result) ? max(result, vec3(0.0)) : own;

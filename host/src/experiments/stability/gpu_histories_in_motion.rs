@@ -9,7 +9,7 @@ use crate::experiments::snapshot::views::albedo_of;
 use crate::gpu::Gpu;
 use crate::render::method::Method;
 use crate::render::FrameSlot;
-use crate::scene::{Environment, Material};
+use crate::scene::{Environment, Material, Scene};
 use dpm_shaders::structs::Surface;
 use glam::{DAffine3, DVec2, DVec3, Vec3};
 use std::sync::Arc;
@@ -232,38 +232,61 @@ fn good_start(gpu: &Arc<Gpu>, seed: u64) -> f64 {
     (2.0 * inside.mean() / border.mean()).max(5.0 * old.mean() / border.mean()).max(off_budget)
 }
 
-fn lag_shortens(gpu: &Arc<Gpu>, seed: u64) -> f64 {
-    let metal = Material { metallic: 1.0, roughness: 0.5, ..diffuse(Vec3::splat(0.8)) };
-    let mut scene = scene_of(sphere(Vec3::ZERO, 0.6, 4, true), metal);
-    scene.environment = image_sky(1.0);
-    let shot = Shot {
-        eye: Some(DVec3::new(0.4, 0.3, 3.0)),
-        gaze: Some(DVec3::ZERO),
-        spp: 4,
-        depth: 2,
-        seed: seed as u32,
-        frames: 250,
-        method: Some(dpm()),
-        ..Shot::new(&scene, camera(32, 24, DVec3::Z * 3.0, DVec3::ZERO))
-    };
-    let mean_of = |shot: &Shot<'_>, from: u32, rate: f64| {
-        let mut means = vec![Estimate::default(); 32 * 24];
-        let mut length = Share::default();
-        let poses = |frame: u32| vec![DAffine3::from_rotation_y(rate * f64::from(frame))];
-        play(gpu, shot, poses, |frame, slot| {
+/// By pixel of 32 x 24, the mean of what is shown while it is lit from frame `from` on; and how many frames long the histories are, at four
+/// samples a frame.
+fn watched(
+    gpu: &Arc<Gpu>,
+    shot: &Shot<'_>,
+    from: u32,
+    pose: impl Fn(u32) -> DAffine3,
+) -> (Vec<Estimate>, f64) {
+    let mut means = vec![Estimate::default(); 32 * 24];
+    let mut length = Share::default();
+    play(
+        gpu,
+        shot,
+        |frame| vec![pose(frame)],
+        |frame, slot| {
             let (shown, history) = (slot.radiance().unwrap_or(&[]), slot.history().unwrap_or(&[]));
             for (i, _) in lit(slot).filter(|_| frame >= from) {
                 means[i].add([0, 1, 2].map(|c| f64::from(shown[i][c])));
                 length.add(history.get(i).map_or(0.0, |h| f64::from(h.weight / 4.0)));
             }
-        });
-        (means, length.mean())
-    };
+        },
+    );
+    (means, length.mean())
+}
+
+/// A metal ball under an uneven sky, seen for `frames` frames: what histories of method dpm lag behind, or blur.
+fn ball(scene: &Scene, seed: u64, frames: u32) -> Shot<'_> {
+    Shot {
+        eye: Some(DVec3::new(0.4, 0.3, 3.0)),
+        gaze: Some(DVec3::ZERO),
+        spp: 4,
+        depth: 2,
+        seed: seed as u32,
+        frames,
+        method: Some(dpm()),
+        ..Shot::new(scene, camera(32, 24, DVec3::Z * 3.0, DVec3::ZERO))
+    }
+}
+
+fn metal_ball(roughness: f32, level: u32, smooth: bool) -> Scene {
+    let metal = Material { metallic: 1.0, roughness, ..diffuse(Vec3::splat(0.8)) };
+    let mut scene = scene_of(sphere(Vec3::ZERO, 0.6, level, smooth), metal);
+    scene.environment = image_sky(1.0);
+    scene
+}
+
+fn lag_shortens(gpu: &Arc<Gpu>, seed: u64) -> f64 {
+    let scene = metal_ball(0.5, 4, true);
+    let shot = ball(&scene, seed, 250);
+    let turning = |rate: f64| move |frame: u32| DAffine3::from_rotation_y(rate * f64::from(frame));
     let many = Shot { spp: 64, frames: 48, method: None, seed: !shot.seed, ..shot.clone() };
-    let (truth, _) = mean_of(&many, 0, 0.0);
+    let (truth, _) = watched(gpu, &many, 0, turning(0.0));
     // Share of the light by which the mean of the last 100 frames is off, less what the truth's own noise adds; and the histories' length.
     let off_by = |rate: f64| {
-        let (means, length) = mean_of(&shot, shot.frames - 100, rate);
+        let (means, length) = watched(gpu, &shot, shot.frames - 100, turning(rate));
         let (mut off, mut power) = (0f64, 0f64);
         // Whatever is lit most of the time; the outline's pixels come and go.
         for (m, t) in means.iter().zip(&truth).filter(|(m, t)| m.count > 50.0 && t.count > 40.0) {
@@ -282,42 +305,20 @@ fn lag_shortens(gpu: &Arc<Gpu>, seed: u64) -> f64 {
 
 fn crisp_light(gpu: &Arc<Gpu>, seed: u64) -> f64 {
     // Each facet, a pixel or two large, mirrors another part of the sky; neighbours' normals are alike enough to share histories.
-    let metal = Material { metallic: 1.0, roughness: 0.15, ..diffuse(Vec3::splat(0.8)) };
-    let mut scene = scene_of(sphere(Vec3::ZERO, 0.6, 3, false), metal);
-    scene.environment = image_sky(1.0);
-    let shot = Shot {
-        eye: Some(DVec3::new(0.4, 0.3, 3.0)),
-        gaze: Some(DVec3::ZERO),
-        spp: 4,
-        depth: 2,
-        seed: seed as u32,
-        frames: 110,
-        method: Some(dpm()),
-        ..Shot::new(&scene, camera(32, 24, DVec3::Z * 3.0, DVec3::ZERO))
-    };
-    // What the eye takes for one picture: the last 31 frames, which truth sees alone.
+    let scene = metal_ball(0.15, 3, false);
+    let shot = ball(&scene, seed, 110);
+    // What the eye takes for one picture: the last 31 frames, which truth sees alone. 17.5 pixels a metre.
     let from = shot.frames - 31;
-    let seen = |shot: &Shot<'_>, first: u32, rate: f64| {
-        let mut means = vec![Estimate::default(); 32 * 24];
-        let mut length = Share::default();
-        // 17.5 pixels a metre.
-        let along = DVec3::new(0.8, 0.6, 0.0) * (0.1 / 17.5 * rate);
-        let poses = |frame: u32| {
-            vec![DAffine3::from_translation(along * (f64::from(first + frame) - f64::from(from)))]
-        };
-        play(gpu, shot, poses, |frame, slot| {
-            let (shown, history) = (slot.radiance().unwrap_or(&[]), slot.history().unwrap_or(&[]));
-            for (i, _) in lit(slot).filter(|_| first + frame >= from) {
-                means[i].add([0, 1, 2].map(|c| f64::from(shown[i][c])));
-                length.add(history.get(i).map_or(0.0, |h| f64::from(h.weight / 4.0)));
-            }
-        });
-        (means, length.mean())
+    let along = DVec3::new(0.8, 0.6, 0.0) * (0.1 / 17.5);
+    let gliding = |first: u32, rate: f64| {
+        move |frame: u32| {
+            DAffine3::from_translation(along * rate * (f64::from(first + frame) - f64::from(from)))
+        }
     };
     let many = Shot { spp: 32, frames: 31, method: None, seed: !shot.seed, ..shot.clone() };
-    let (truth, _) = seen(&many, from, 1.0);
-    let (means, _) = seen(&shot, 0, 1.0);
-    let (_, still) = seen(&shot, 0, 0.0);
+    let (truth, _) = watched(gpu, &many, 0, gliding(from, 1.0));
+    let (means, _) = watched(gpu, &shot, from, gliding(0, 1.0));
+    let (_, still) = watched(gpu, &shot, from, gliding(0, 0.0));
     let (mut off, mut power, mut pixels) = (0f64, 0f64, 0);
     // Whatever is lit in all of these frames.
     for (m, t) in means.iter().zip(&truth).filter(|(m, t)| m.count == 31.0 && t.count == 31.0) {
