@@ -108,13 +108,9 @@ pub enum RenderError {
 const PER_TILE_QUARTER: u64 = 0;
 const PER_TILE_RATES: u64 = 16;
 
-/// Draws frames of one scene.
+/// Draws frames of one scene. Owns what it needs: a thread may keep it, and may be left alone with it when the GPU hangs.
 pub struct Renderer {
-    // Dropped before the buffers they use.
-    pipelines: Pipelines,
-    table: Arc<BindingTable>,
-    pub(super) shared: SharedBuffers,
-    scene: SceneGpu,
+    pub(super) resources: Arc<Resources>,
     data: SceneData,
     pub(super) settings: RendererSettings,
     needs: SceneNeeds,
@@ -125,6 +121,16 @@ pub struct Renderer {
     /// What the history holds: the last frame submitted and its poses.
     last: LastFrame,
     pub(super) gpu: Arc<Gpu>,
+}
+
+/// What submissions read, held by the renderer and by every slot: it goes when the last submission is over, in whatever order they are
+/// dropped.
+pub(super) struct Resources {
+    // Dropped before the buffers they use.
+    pipelines: Pipelines,
+    table: Arc<BindingTable>,
+    pub(super) shared: SharedBuffers,
+    scene: SceneGpu,
 }
 
 /// One pipeline a pass; `None`: the method does not need it and it is not recorded.
@@ -226,10 +232,7 @@ impl Renderer {
         let tracked = scene.bodies.iter().map(|b| b.tracked).collect();
         let last = LastFrame::none(scene.bodies.len());
         Ok(Self {
-            pipelines,
-            table,
-            shared,
-            scene: scene_gpu,
+            resources: Arc::new(Resources { pipelines, table, shared, scene: scene_gpu }),
             data,
             settings,
             needs,
@@ -320,7 +323,8 @@ impl Renderer {
         } else {
             &radiance
         };
-        let s = &self.scene;
+        let resources = &self.resources;
+        let s = &resources.scene;
         let buffer_of = |name: &str, parity: usize| match name {
             "B_FRAME" => &frame,
             "B_INSTANCES" => &instances,
@@ -340,13 +344,13 @@ impl Renderer {
             "B_CODES" => &codes,
             "B_COUNTERS" => &counters,
             "B_GUIDES" | "B_GUIDE_ROWS" => &guides,
-            "B_HISTORY" | "B_HISTORY_ROWS" => &self.shared.history[parity],
-            "B_FORMER" => &self.shared.history[1 - parity],
-            "B_RATES" => &self.shared.rates,
-            "B_RATE_TABLE" => &self.shared.rate_table,
+            "B_HISTORY" | "B_HISTORY_ROWS" => &resources.shared.history[parity],
+            "B_FORMER" => &resources.shared.history[1 - parity],
+            "B_RATES" => &resources.shared.rates,
+            "B_RATE_TABLE" => &resources.shared.rate_table,
             "B_SCHEDULE" => &schedule,
             "B_WORK" => &work,
-            "B_NOISE" => &self.shared.noise,
+            "B_NOISE" => &resources.shared.noise,
             "B_FILTERED" | "B_FILTERED_ROWS" => &filtered,
             "B_SHOWN" => shown,
             "B_PLANES" => &planes,
@@ -355,7 +359,7 @@ impl Renderer {
         let set_of = |parity| {
             let bindings: Vec<_> =
                 gpu_structs::BINDINGS.iter().map(|&(n, b)| (b, buffer_of(n, parity))).collect();
-            BindingSet::new(&self.table, &bindings)
+            BindingSet::new(&resources.table, &bindings)
         };
         let sets = [set_of(0)?, set_of(1)?];
         // Tiles that are never traced must read as nothing hit and black from the start.
@@ -367,9 +371,9 @@ impl Renderer {
             super::fill::fill(gpu, &guides, &Guide::zeroed(), pixels)?;
         }
         super::fill::fill(gpu, shown, &[0f32; 4], pixels)?;
-        let p = &self.pipelines;
+        let p = &resources.pipelines;
         let record = |parity: usize, r: &mut Recorder<'_>| {
-            let (set, history) = (&sets[parity], &self.shared.history[parity]);
+            let (set, history) = (&sets[parity], &resources.shared.history[parity]);
             // The frame, in order. A pass that the method does not need is not recorded; its stamp is.
             let tiled = |r: &mut Recorder<'_>, pass: Option<&ComputePipeline>, offset: u64| {
                 if let Some(pass) = pass {
@@ -379,7 +383,7 @@ impl Renderer {
                 r.stamp();
             };
             r.clear(&counters);
-            r.copy(&self.shared.schedule_start, &schedule, size_of::<Schedule>());
+            r.copy(&resources.shared.schedule_start, &schedule, size_of::<Schedule>());
             r.barrier();
             r.stamp();
             tiled(r, Some(&p.primary), PER_TILE_QUARTER);
@@ -418,7 +422,7 @@ impl Renderer {
                     r.copy(history, to, pixels * each.history);
                 }
                 r.copy(&radiance, &d.traced, pixels * each.radiance);
-                r.copy(&self.shared.rates, &d.rates, tile_list.len() * 4);
+                r.copy(&resources.shared.rates, &d.rates, tile_list.len() * 4);
             }
             r.barrier_to_host();
             r.stamp();
@@ -454,18 +458,21 @@ impl Renderer {
             raster,
             parity: 0,
             stamps: [0; PASSES.len() + 1],
+            _resources: resources.clone(),
         })
     }
 
-    /// Writes the inputs and starts the GPU. The slot must not be in flight. Allocates nothing.
+    /// Writes the inputs and starts the GPU. Allocates nothing.
     ///
     /// # Errors
-    /// Device lost.
+    /// Device lost or given up, [`GpuError::InFlight`] when the slot's last frame was not waited for to its end. The next frame begins as if
+    /// this one had not been.
     ///
     /// # Panics
     /// When there are fewer poses than bodies: a programmer's mistake.
     pub fn submit(&mut self, slot: &mut FrameSlot, inputs: &FrameInputs<'_>) -> Result<(), GpuError> {
         assert_eq!(inputs.poses.len(), self.data.bodies.len(), "one pose per body");
+        slot.fence.check_free()?;
         if self.settings.camera_is_eye || self.every_tile {
             slot.tile_list.fill();
         } else {
