@@ -3,7 +3,8 @@
 //! Everything here runs headless on any Vulkan 1.1 device with scalar block layout, software ones included.
 //!
 //! A device may be lost, or hang. Then every call fails at once, everything can be dropped without waiting, and [`Gpu::reopen`] gives a
-//! device to go on with: make the renderer and its slots anew on that one. [`LossBudget`] says when to stop trying. Drivers' calls that do
+//! device to go on with: make the renderer and its slots anew on that one
+//! ([`crate::render::Renderer::from_plan`]). [`LossBudget`] says when to stop trying. Drivers' calls that do
 //! not return (a submission, the making of a device) can be left only with their thread.
 #![allow(unsafe_code)]
 

@@ -59,12 +59,15 @@ impl Gpu {
     fn same_again(&self) -> Result<Arc<Gpu>, GpuError> {
         let begin = Instant::now();
         loop {
-            let left = COMES_BACK_WITHIN.saturating_sub(begin.elapsed());
-            match self.open_now(self.id.clone(), left) {
+            let error = match self.open_now(self.id.clone(), COMES_BACK_WITHIN.saturating_sub(begin.elapsed())) {
                 Ok(gpu) => return Ok(gpu),
-                Err(error) if begin.elapsed() + BETWEEN >= COMES_BACK_WITHIN => return Err(error),
-                Err(_) => std::thread::sleep(BETWEEN),
+                Err(error) => error,
+            };
+            // An attempt without time enough would only say that it had none.
+            if begin.elapsed() + 2 * BETWEEN >= COMES_BACK_WITHIN {
+                return Err(error);
             }
+            std::thread::sleep(BETWEEN);
         }
     }
 

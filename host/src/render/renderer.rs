@@ -111,16 +111,25 @@ const PER_TILE_RATES: u64 = 16;
 /// Draws frames of one scene. Owns what it needs: a thread may keep it, and may be left alone with it when the GPU hangs.
 pub struct Renderer {
     pub(super) resources: Arc<Resources>,
-    data: SceneData,
+    data: Arc<SceneData>,
     pub(super) settings: RendererSettings,
+    keep: Keep,
     needs: SceneNeeds,
-    every_tile: bool,
-    every_pixel: bool,
     /// Per body of the scene: which tracked body carries it.
     tracked: Vec<Option<u16>>,
     /// What the history holds: the last frame submitted and its poses.
     last: LastFrame,
     pub(super) gpu: Arc<Gpu>,
+}
+
+/// What a renderer is made from, without a device: to be kept beside one, so that it can be made anew on another device without the scene
+/// being looked at again. Cheap to clone.
+#[derive(Clone)]
+pub struct RendererPlan {
+    data: Arc<SceneData>,
+    settings: RendererSettings,
+    keep: Keep,
+    tracked: Vec<Option<u16>>,
 }
 
 /// What submissions read, held by the renderer and by every slot: it goes when the last submission is over, in whatever order they are
@@ -180,7 +189,27 @@ impl Renderer {
         settings: RendererSettings,
         keep: Keep,
     ) -> Result<Self, RenderError> {
-        let data = SceneData::build(scene)?;
+        let data = Arc::new(SceneData::build(scene)?);
+        let tracked = scene.bodies.iter().map(|b| b.tracked).collect();
+        Self::from_plan(gpu, &RendererPlan { data, settings, keep, tracked })
+    }
+
+    /// What this renderer was made from.
+    pub fn plan(&self) -> RendererPlan {
+        RendererPlan {
+            data: self.data.clone(),
+            settings: self.settings.clone(),
+            keep: self.keep,
+            tracked: self.tracked.clone(),
+        }
+    }
+
+    /// The same renderer on this device, as it was before its first frame.
+    ///
+    /// # Errors
+    /// The raster or the scene is too large for this device, or the GPU's own.
+    pub fn from_plan(gpu: &Arc<Gpu>, plan: &RendererPlan) -> Result<Self, RenderError> {
+        let RendererPlan { data, settings, keep, tracked } = plan.clone();
         let shared = SharedBuffers::new(gpu, &settings)?;
         let texel = gpu.summary().software && !keep.storage_tables;
         let scene_gpu = SceneGpu::new(gpu, &data, texel)?;
@@ -229,15 +258,13 @@ impl Renderer {
                 })
                 .transpose()?,
         };
-        let tracked = scene.bodies.iter().map(|b| b.tracked).collect();
-        let last = LastFrame::none(scene.bodies.len());
+        let last = LastFrame::none(tracked.len());
         Ok(Self {
             resources: Arc::new(Resources { pipelines, table, shared, scene: scene_gpu }),
             data,
             settings,
+            keep,
             needs,
-            every_tile: keep.every_tile,
-            every_pixel: keep.every_pixel,
             tracked,
             last,
             gpu: gpu.clone(),
@@ -473,7 +500,7 @@ impl Renderer {
     pub fn submit(&mut self, slot: &mut FrameSlot, inputs: &FrameInputs<'_>) -> Result<(), GpuError> {
         assert_eq!(inputs.poses.len(), self.data.bodies.len(), "one pose per body");
         slot.fence.check_free()?;
-        if self.settings.camera_is_eye || self.every_tile {
+        if self.settings.camera_is_eye || self.keep.every_tile {
             slot.tile_list.fill();
         } else {
             slot.tile_list.update(
@@ -526,7 +553,7 @@ impl Renderer {
         let raster = self.settings.raster;
         let method = &self.settings.method;
         let c = inputs.camera;
-        let steady = !self.every_pixel
+        let steady = !self.keep.every_pixel
             && self.last.is_steady(&self.data.bodies, inputs, |i| is_lost(&self.tracked, i, inputs.lost));
         let frame = Frame {
             projector_position: [0.0; 3],

@@ -219,30 +219,3 @@ impl Drop for Session {
         self.layer.loaded.set(c"");
     }
 }
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    #[test]
-    fn a_program_gets_the_layer_beside_those_that_it_has() {
-        let layer = FaultLayer::new("variables").unwrap();
-        let variables = layer.variables("lost@frame=1");
-        let value = |name: &str| variables.iter().find(|v| v.0 == name).map(|v| v.1.clone()).unwrap();
-        assert!(value("VK_LAYER_PATH").contains(&text(&layer.folder)));
-        assert!(value("VK_INSTANCE_LAYERS").contains(LAYER_NAME));
-        assert_eq!(std::fs::read_to_string(value("DPM_VK_FAULTS_FILE")).unwrap(), "lost@frame=1");
-        assert!(layer.set("nonsense").is_err());
-        let manifest = std::fs::read_to_string(layer.folder.join("VkLayer_dpm_faults.json")).unwrap();
-        let path = manifest.split('"').find(|part| part.ends_with(".so")).unwrap();
-        assert!(Path::new(path).exists(), "{path}");
-        std::fs::write(layer.log(), "12 lost frame 40\n13 noticed submit-after-loss 1\nhalf a li").unwrap();
-        let events = layer.events();
-        assert_eq!(events.len(), 2);
-        assert_eq!((events[0].at_ns, events[0].what.as_str(), events[0].number), (12, "lost", 40));
-        assert_eq!(events[1].call, "submit-after-loss");
-        let folder = layer.folder.clone();
-        drop(layer);
-        assert!(!folder.exists());
-    }
-}

@@ -23,6 +23,8 @@ fn twice() -> bool {
     let list = manifests.iter().map(|path| path.display().to_string()).collect::<Vec<_>>().join(":");
     std::env::set_var("VK_DRIVER_FILES", &list);
     std::env::set_var("VK_ICD_FILENAMES", &list);
+    // Mesa's layer sorts the list, and what is the same in all it looks at it may sort differently each time.
+    std::env::set_var("NODEVICE_SELECT", "1");
     true
 }
 
