@@ -37,6 +37,8 @@ struct DeviceData {
     set_loader_data: Option<SetDeviceLoaderData>,
     fns: ash::DeviceFnV1_0,
     lost: AtomicBool,
+    /// The program was told so: what it submits from then on it should not have.
+    told: AtomicBool,
     state: Mutex<DeviceState>,
 }
 
@@ -228,6 +230,7 @@ unsafe extern "system" fn create_device(
                 set_loader_data,
                 fns,
                 lost: AtomicBool::new(false),
+                told: AtomicBool::new(false),
                 state: Mutex::default(),
             };
             table(&DEVICES).insert(key(handle), Arc::new(data));
@@ -265,6 +268,7 @@ impl DeviceData {
         self.lost.store(true, Ordering::Release);
         // SAFETY: the lock keeps other submissions of this layer away.
         let _ = unsafe { (self.fns.device_wait_idle)(self.handle) };
+        self.told.store(true, Ordering::Release);
         vk::Result::ERROR_DEVICE_LOST
     }
 
@@ -430,7 +434,9 @@ unsafe extern "system" fn queue_submit(
         batches.iter().flat_map(|b| &b.buffers).any(|b| state.frames.contains(b))
     };
     if data.is_lost() {
-        tell(Call::SubmitAfterLoss);
+        if data.told.load(Ordering::Acquire) {
+            tell(Call::SubmitAfterLoss);
+        }
         return vk::Result::ERROR_DEVICE_LOST;
     }
     let calls: &[Call] = if is_frame { &[Call::Frame, Call::Submit] } else { &[Call::Submit] };
@@ -450,6 +456,10 @@ unsafe extern "system" fn queue_submit(
         _ => {}
     }
     let mut state = lock(&data.state);
+    // Lost meanwhile: what the driver got now would still run when the program has destroyed it.
+    if data.is_lost() {
+        return vk::Result::ERROR_DEVICE_LOST;
+    }
     data.release_due(&mut state);
     if hold.is_some() || !state.held.is_empty() {
         // A queue keeps its order: what comes behind waits too.
