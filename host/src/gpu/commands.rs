@@ -88,6 +88,8 @@ impl CommandList {
         // SAFETY: the fence is unsignalled and unused: `wait` consumed its last run.
         unsafe {
             gpu.device.reset_fences(&[fence.fence]).on(gpu, "resetting a fence")?;
+            // Another thread may have learned meanwhile that the device is lost.
+            gpu.alive("submitting a frame")?;
             gpu.device.queue_submit(*queue, &info, fence.fence).on(gpu, "submitting a frame")?;
         }
         fence.pending = true;

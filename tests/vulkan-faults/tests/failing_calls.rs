@@ -88,6 +88,7 @@ fn making_a_renderer_or_a_slot_fails_clearly_at_every_call_and_the_next_attempt_
     let calls = every_call(&session, "oom-device", 1, 1, make);
     assert!(calls > 100, "{calls}");
     every_call(&session, "oom-host", 3, 7, make);
+    session.set("");
     let renderer = make().unwrap();
     let calls = every_call(&session, "oom-host", 1, 1, || renderer.create_slot(true));
     assert!(calls > 50, "{calls}");
