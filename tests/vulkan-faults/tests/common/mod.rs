@@ -108,7 +108,12 @@ pub fn clean() -> &'static [Vec<u32>] {
     })
 }
 
-/// Threads of this process.
-pub fn threads() -> usize {
-    std::fs::read_dir("/proc/self/task").map_or(0, Iterator::count)
+/// Names of the threads of this process, without those of the tests themselves, which come and go.
+pub fn threads() -> Vec<String> {
+    let tasks = std::fs::read_dir("/proc/self/task").into_iter().flatten().filter_map(Result::ok);
+    let name = |task: std::fs::DirEntry| std::fs::read_to_string(task.path().join("comm")).ok();
+    // Tests are named with underscores, and so is their program.
+    let mut names: Vec<_> = tasks.filter_map(name).filter(|name| !name.contains('_')).collect();
+    names.sort();
+    names
 }
