@@ -17,6 +17,8 @@ mod host;
 #[cfg(feature = "std")]
 mod measure;
 mod message;
+#[cfg(feature = "std")]
+mod session;
 mod slots;
 
 pub use codec::{rle_encode, CodecError, RleDecoder};
@@ -36,6 +38,9 @@ pub use host::{
 pub use measure::{measure, LinkMeasurement};
 pub use message::{
     faults, Assembly, Commit, Config, ConfigRefusal, DeviceHello, DeviceMessage, DeviceState, Echo, Fault,
-    FaultCode, HostHello, HostMessage, PayloadError, Status, Underrun, MAX_CONTROL_BYTES, MAX_WATCHDOG_US,
+    FaultCode, HostHello, HostMessage, PayloadError, Status, Underrun, COMMIT_BYTES, MAX_CONTROL_BYTES,
+    MAX_WATCHDOG_US,
 };
+#[cfg(feature = "std")]
+pub use session::SessionNumbers;
 pub use slots::SlotClock;
