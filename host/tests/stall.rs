@@ -30,7 +30,8 @@ fn run(stage: StallIn, watchdog_ms: u32) -> Vec<FrameRecord> {
         stall: Some(Stall { stage, frame: STALLED, length: STALL }),
         ..RunOptions::default()
     };
-    let outcome = run_prepared(rig, options, &RunMonitor::default()).unwrap_or_else(|e| panic!("{e}"));
+    let outcome =
+        run_prepared(rig, options, &Arc::new(RunMonitor::default())).unwrap_or_else(|e| panic!("{e}"));
     assert_eq!((outcome.frames_torn, outcome.frames_reordered), (0, 0), "{stage:?}");
     outcome.recent.into_iter().filter(|r| r.id.0 > STALLED).collect()
 }

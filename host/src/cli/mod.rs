@@ -94,13 +94,19 @@ pub fn main(commit: &'static str) -> ExitCode {
             return ExitCode::from(u8::try_from(e.exit_code()).unwrap_or(2));
         }
     };
-    match dispatch(&cli.command) {
-        Ok(()) => ExitCode::SUCCESS,
+    let code = match dispatch(&cli.command) {
+        Ok(()) => 0,
         Err(failure) => {
             let _ = writeln!(std::io::stderr(), "error: {failure}");
-            ExitCode::from(failure.kind.exit_code())
+            failure.kind.exit_code()
         }
+    };
+    if crate::pipeline::has_left_threads_behind() {
+        // Destructors of drivers could wait for a thread that hangs.
+        let _ = std::io::stdout().flush();
+        os::leave(code);
     }
+    ExitCode::from(code)
 }
 
 fn dispatch(command: &Command) -> Result<(), Failure> {

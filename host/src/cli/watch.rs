@@ -17,6 +17,9 @@ use std::time::{Duration, Instant};
 /// How often signals are looked at and the bar is drawn.
 const TICK: Duration = Duration::from_millis(50);
 
+/// How long the link is given to make the projector dark when the run itself will not return.
+const DARK_WITHIN: Duration = Duration::from_millis(500);
+
 /// Watches `run` (see [`watch`]), then prints the report to the standard output, as JSON or as a table.
 ///
 /// # Errors
@@ -88,6 +91,15 @@ pub fn watch<T: Send + 'static>(
                     progress.note(&format!("key: {}", order.word()));
                     monitor.give_order(order);
                 }
+                for note in monitor.take_notes() {
+                    progress.note(&note);
+                }
+                if let Some(why) = monitor.gave_up() {
+                    // The projector has been told to go dark by a thread that does not hang.
+                    std::thread::sleep(DARK_WITHIN);
+                    progress.finish(monitor.counts());
+                    return Err(Failure::new(FailureKind::Device, why));
+                }
                 let now = monitor.projector();
                 if std::mem::replace(&mut health, now) != now {
                     progress.note(&format!("projector: {now}"));
@@ -104,6 +116,9 @@ pub fn watch<T: Send + 'static>(
             }
         }
     };
+    for note in monitor.take_notes() {
+        progress.note(&note);
+    }
     // A panic was already turned into the error above.
     let _ = worker.join();
     progress.finish(monitor.counts());

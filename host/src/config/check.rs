@@ -276,39 +276,62 @@ fn time(rig: &RigConfig, reader: &mut Reader) {
         let problem = format!("core {last} is none of 0 to 1023");
         refuse(reader, &["real_time.affinity"], problem, String::new());
     }
-    let frame_ms = 1e3 / rig.projector.frame_rate.hz();
+    horizon(rig, reader);
+}
+
+/// Times in `[safety]` and `[output]` that somebody wrote, against the frame's and the tracker's. What nobody wrote follows these by itself, so
+/// each problem names the key that was written first.
+fn horizon(rig: &RigConfig, reader: &mut Reader) {
+    let (frame_ms, rate) = (rig.frame_ms(), rig.projector.frame_rate.hz());
     // A DLPC900 has no watchdog.
     let has_watchdog = !matches!(rig.projector.backend, ProjectorBackend::Dlpc900(_));
-    if has_watchdog && f64::from(rig.safety.watchdog_ms) < 2.0 * frame_ms {
+    if let Some(ms) = rig.safety.watchdog_ms.filter(|ms| has_watchdog && f64::from(*ms) < 2.0 * frame_ms) {
         refuse(
             reader,
-            &["safety.watchdog_ms", "projector.frame_rate"],
+            &["safety.watchdog_ms"],
             format!(
-                "{} ms is less than two frames of {frame_ms:.3} ms: the projector would go dark in between",
-                rig.safety.watchdog_ms
+                "safety.watchdog_ms = {ms} is less than two frames of {frame_ms:.3} ms (projector.frame_rate = {rate:.3}): the projector \
+                 would go dark in between"
             ),
-            format!("at least {:.0} ms", (2.0 * frame_ms).ceil()),
+            format!("leave it out, or write at least {:.0} ms", (2.0 * frame_ms).ceil()),
         );
     }
-    if rig.output.light_window_ms < frame_ms {
+    if let Some(ms) = rig.output.light_window_ms.filter(|ms| *ms < frame_ms) {
         refuse(
             reader,
-            &["output.light_window_ms", "projector.frame_rate"],
-            format!("{} ms is shorter than one frame of {frame_ms:.3} ms", rig.output.light_window_ms),
-            String::new(),
+            &["output.light_window_ms"],
+            format!(
+                "output.light_window_ms = {ms} is shorter than one frame of {frame_ms:.3} ms (projector.frame_rate = {rate:.3})"
+            ),
+            format!("leave it out, or write at least {frame_ms:.3} ms"),
         );
     }
+    let Some(predict_ms) = rig.safety.predict_ms else { return };
     if let Some(rate) = rig.tracker.rate_hz() {
         let period_ms = 1e3 / f64::from(rate);
-        let predict_ms = f64::from(rig.safety.predict_ms);
-        if predict_ms < 2.0 * period_ms {
+        if f64::from(predict_ms) < 2.0 * period_ms {
             refuse(
                 reader,
-                &["safety.predict_ms", "tracker.rate_hz"],
-                format!("{predict_ms} ms is less than two samples at {rate} Hz: every lost sample would blank the picture"),
-                format!("at least {:.0} ms", (2.0 * period_ms).ceil()),
+                &["safety.predict_ms"],
+                format!(
+                    "safety.predict_ms = {predict_ms} is less than two samples at tracker.rate_hz = {rate}: every lost sample would blank the \
+                     picture"
+                ),
+                format!("leave it out, or write at least {:.0} ms", (2.0 * period_ms).ceil()),
             );
         }
+    }
+    // Light cannot fall before the middle of the slot after the one in which the newest sample arrived.
+    if f64::from(predict_ms) < 1.5 * frame_ms {
+        refuse(
+            reader,
+            &["safety.predict_ms"],
+            format!(
+                "safety.predict_ms = {predict_ms} is less than a frame and a half of {frame_ms:.3} ms (projector.frame_rate = {rate:.3}): \
+                 every frame would be dark"
+            ),
+            format!("leave it out, or write at least {:.0} ms and what rendering takes", (1.5 * frame_ms).ceil()),
+        );
     }
 }
 

@@ -104,7 +104,30 @@ impl Overrides {
     }
 }
 
+/// Shortest watchdog, and shortest time over which an eye adds up light, of a rig that names none, milliseconds.
+const DEFAULT_WATCHDOG_MS: u32 = 50;
+const DEFAULT_LIGHT_WINDOW_MS: f64 = 33.0;
+
 impl RigConfig {
+    /// Length of a frame, milliseconds.
+    pub fn frame_ms(&self) -> f64 {
+        1e3 / self.projector.frame_rate.hz()
+    }
+
+    /// Silence after which the projector goes dark by itself, microseconds: what `safety.watchdog_ms` says, else 50 ms or three frames,
+    /// whichever is longer.
+    pub fn watchdog_us(&self) -> u32 {
+        let three_frames = (3.0 * self.frame_ms()).ceil() as u32;
+        let ms = self.safety.watchdog_ms.unwrap_or(DEFAULT_WATCHDOG_MS.max(three_frames));
+        ms.saturating_mul(1000).min(dpm_device::link::MAX_WATCHDOG_US)
+    }
+
+    /// Time over which an eye adds up light in pictures, milliseconds: what `output.light_window_ms` says, else 33 ms or a frame,
+    /// whichever is longer.
+    pub fn light_window_ms(&self) -> f64 {
+        self.output.light_window_ms.unwrap_or(DEFAULT_LIGHT_WINDOW_MS.max(self.frame_ms()))
+    }
+
     /// Reads a rig file of at most [`MAX_FILE_BYTES`].
     ///
     /// # Errors

@@ -217,18 +217,22 @@ section! {
         images: bool = false, "", Any;
         /// Write a Chrome trace of every frame.
         trace: bool = false, "", Any;
-        /// Time over which an eye adds up light in the images.
-        light_window_ms: f64 = 33.0, "ms", Within(0.01, 10_000.0);
+        /// Time over which an eye adds up light in the images, at least a frame. Left out, it is 33 ms, or a frame where that is longer.
+        light_window_ms: Option<f64> = None, "ms", Within(0.01, 10_000.0);
     }
 }
 
 section! {
     /// What happens when something fails.
     pub struct SafetyConfig {
-        /// The projector goes dark by itself when it hears nothing for this long.
-        watchdog_ms: u32 = 50, "ms", Within(1, 10_000);
-        /// A body that is not heard of is carried on by prediction for this long, then its light goes off.
-        predict_ms: u32 = 20, "ms", Within(0, 1_000);
+        /// The projector goes dark by itself when it hears nothing for this long, at least two frames. Left out, it is 50 ms, or three frames
+        /// where those are longer.
+        watchdog_ms: Option<u32> = None, "ms", Within(1, 10_000);
+        /// A body is carried on by prediction for at most this long after the tracker's newest sample of it, up to the middle of the light; then
+        /// its light goes off. A frame that would be lit later than that and a slot is not sent. Left out, it follows the rig: the longer of
+        /// 20 ms and the tracker's latency, two of its samples, the time from latch to light and two slots together. What is written is
+        /// law: a rig whose frames take longer stays dark, and says so.
+        predict_ms: Option<u32> = None, "ms", Within(0, 1_000);
         /// General flashes of the whole picture in a second; beyond it the projector rests in the dark for two seconds. WCAG 2.3.1 allows 3; 0 is off.
         flashes_per_second: u32 = 3, "1/s", Within(0, 1_000);
         /// The start of a run acknowledges heat, lamp, emergency stop and flashes that the projector has latched, too; else it refuses

@@ -228,7 +228,29 @@ const BAD: &[(&str, usize, usize, &str, &str)] = &[
     ("[real_time]\naffinity = [0, 5000]", 2, 12, "real_time.affinity", "core 5000"),
     ("[safety]\nwatchdog_ms = 2", 2, 15, "safety.watchdog_ms", "at least 3 ms"),
     ("[safety]\npredict_ms = 3", 2, 14, "safety.predict_ms", "less than two samples at 500 Hz"),
-    ("[tracker]\nrate_hz = 50", 2, 11, "tracker.rate_hz", "at least 40 ms"),
+    ("[tracker]\nrate_hz = 50\n[safety]\npredict_ms = 20", 4, 14, "safety.predict_ms", "at least 40 ms"),
+    // Found in use, O10: a first rig at an ordinary projector's rate, and the keys that it must change.
+    (
+        "[projector]\nframe_rate = 30\n[safety]\nwatchdog_ms = 50",
+        4,
+        15,
+        "safety.watchdog_ms",
+        "safety.watchdog_ms = 50 is less than two frames",
+    ),
+    (
+        "[projector]\nframe_rate = 24\n[output]\nlight_window_ms = 33",
+        4,
+        19,
+        "output.light_window_ms",
+        "output.light_window_ms = 33 is shorter than one frame",
+    ),
+    (
+        "[projector]\nframe_rate = 60\n[safety]\npredict_ms = 20",
+        4,
+        14,
+        "safety.predict_ms",
+        "less than a frame and a half of 16.667 ms",
+    ),
     ("[output]\nlight_window_ms = 1", 2, 19, "output.light_window_ms", "shorter than one frame"),
     // Files.
     ("[scene]\nfile = \"none.glb\"", 2, 8, "scene.file", "/nonexistent/none.glb"),
@@ -310,6 +332,30 @@ fn all_mistakes_are_told_at_once() {
     assert_eq!(lines, [4, 2, 3, 8, 6], "{errors}");
     let text = "[projector]\nframe_rate = 948\nup = [0, 0, 0]\n[safety]\nwatchdog_ms = 1\n";
     assert_eq!(parse(text).unwrap_err().0.len(), 3);
+}
+
+/// Found in use, C2 and O10: with the defaults a rig may have any usual frame rate and any usual tracker.
+#[test]
+fn the_defaults_fit_every_frame_rate_and_every_tracker() {
+    for (rate, planes, watchdog_us) in [
+        (24, 24, 125_000),
+        (30, 24, 100_000),
+        (60, 24, 50_000),
+        (100, 24, 50_000),
+        (120, 24, 50_000),
+        (240, 24, 50_000),
+        (947, 24, 50_000),
+        (2000, 8, 50_000),
+    ] {
+        for tracker in [30, 60, 120, 500, 1000] {
+            let text = format!(
+                "[projector]\nframe_rate = {rate}\nplanes = {planes}\n[tracker]\nrate_hz = {tracker}"
+            );
+            let rig = parse(&text).unwrap_or_else(|e| panic!("{rate} frames/s, {tracker} Hz: {e}"));
+            assert_eq!(rig.watchdog_us(), watchdog_us);
+            assert!(rig.light_window_ms() >= 33.0 && rig.light_window_ms() >= rig.frame_ms());
+        }
+    }
 }
 
 #[test]

@@ -233,7 +233,7 @@ fn way(
         std::thread::sleep(Duration::from_micros(200));
         clock.now()
     };
-    connect(&mut link, transport, ENDED_WITH_THE_LAST_RUN, &mut now).map_err(PipelineError::from)?;
+    connect(&mut link, transport, ENDED_WITH_THE_LAST_RUN, &mut now, stop).map_err(PipelineError::from)?;
     let duration_ns = (seconds * 1e9) as i64;
     let measured = measure(
         &mut link,

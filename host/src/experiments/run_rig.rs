@@ -36,7 +36,7 @@ pub fn run_rig(config: &RigConfig, monitor: &Arc<RunMonitor>) -> Result<Report, 
             "output.images: the light of a projector outside is not seen, no pictures are written".into(),
         );
     }
-    let window = (output.light_window_ms * 1e-3 * rig.rate().hz()).round().max(1.0) as usize;
+    let window = (config.light_window_ms() * 1e-3 * rig.rate().hz()).round().max(1.0) as usize;
     let keep_frames = if output.images && has_truth && has_light { window } else { 0 };
     let options = RunOptions { frames: config.run.frames, keep_frames, ..RunOptions::default() };
     let outcome = pipeline::run(rig.clone(), &gpu, options, monitor)?;
@@ -163,7 +163,8 @@ impl From<PipelineError> for Failure {
                 GpuError::OutOfMemory { .. } | GpuError::Limit { .. } => FailureKind::BadInput,
                 _ => FailureKind::NoGpu,
             },
-            PipelineError::Panicked(_) => FailureKind::Device,
+            PipelineError::Panicked(_) | PipelineError::Hung { .. } => FailureKind::Device,
+            PipelineError::GpuHangs { .. } | PipelineError::KeepsFailing { .. } => FailureKind::NoGpu,
         };
         Self::new(kind, error)
     }

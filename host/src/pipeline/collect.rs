@@ -1,5 +1,6 @@
 //! Finished frames and light into a report. Runs on its own thread, off the frame path: it may allocate.
 
+use super::crew::NotesBack;
 use super::job::{Fate, FrameNote};
 use super::light::LightNote;
 use super::placement::Placement;
@@ -13,7 +14,7 @@ use crate::telemetry::report::{Report, Spread, StageTime};
 use crate::telemetry::slots::SlotLedger;
 use crate::telemetry::trace::TracedFrame;
 use dpm_device::link::frame_newer;
-use dpm_handoff::channel::{Receiver, Sender};
+use dpm_handoff::channel::Receiver;
 use glam::{DAffine3, DVec3};
 use hdrhistogram::Histogram;
 use hil_mock::projector::LightKind;
@@ -64,6 +65,7 @@ pub struct Collector {
     dropped: u64,
     late: u64,
     repeated: u64,
+    too_old: u64,
     /// Slots without a frame of their own.
     pub slots: SlotLedger,
     /// Lit frames with parts of another (looked for in prepared frames only).
@@ -127,6 +129,7 @@ impl Collector {
             dropped: 0,
             late: 0,
             repeated: 0,
+            too_old: 0,
             slots: SlotLedger::default(),
             torn: 0,
             reordered: 0,
@@ -152,21 +155,23 @@ impl Collector {
         }
     }
 
-    /// Takes finished frames and light until both are over; gives the notes back to `free`.
-    pub fn run(
+    /// Takes finished frames and light until both are over, or until `goes_on`, which is asked at every look, says no; gives the notes back
+    /// to `free`.
+    pub(super) fn run(
         &mut self,
         mut done: Receiver<Box<FrameNote>>,
-        mut free: Sender<Box<FrameNote>>,
+        free: &NotesBack,
         mut lights: Receiver<LightNote>,
         monitor: &RunMonitor,
+        mut goes_on: impl FnMut() -> bool,
     ) {
         let mut held = None;
-        loop {
+        while goes_on() {
             // Asked before looking: what came before the end is taken first.
             let over = done.is_finished() && lights.is_finished();
-            self.take_finished(&mut done, &mut free, monitor);
+            self.take_finished(&mut done, free, monitor);
             while let Some(note) = held.take().or_else(|| lights.try_pop()) {
-                self.take_finished(&mut done, &mut free, monitor);
+                self.take_finished(&mut done, free, monitor);
                 // Lit before the link's thread came to say that it was sent.
                 let unknown = note.event.frame.is_some_and(|f| self.newest.is_none_or(|n| frame_newer(f, n)));
                 if unknown && !over {
@@ -187,15 +192,10 @@ impl Collector {
         }
     }
 
-    fn take_finished(
-        &mut self,
-        done: &mut Receiver<Box<FrameNote>>,
-        free: &mut Sender<Box<FrameNote>>,
-        monitor: &RunMonitor,
-    ) {
+    fn take_finished(&mut self, done: &mut Receiver<Box<FrameNote>>, free: &NotesBack, monitor: &RunMonitor) {
         while let Some(note) = done.try_pop() {
             self.finished(&note, monitor);
-            let _ = free.push(note);
+            free.push(note);
         }
     }
 
@@ -227,7 +227,7 @@ impl Collector {
         }
         self.placement.observe(&self.rig.camera, &job.tracked_poses, job.tracked, &self.points);
         let sent = job.is_sent();
-        let refused = !sent && job.fate != Fate::Overtaken;
+        let refused = !sent && !matches!(job.fate, Fate::Overtaken | Fate::Stopped);
         self.slots.planned(job.slot, &job.timeline, refused, job.waited_for_memory);
         while self.repeats.front().is_some_and(|&slot| slot < job.slot) {
             self.repeats.pop_front();
@@ -248,6 +248,7 @@ impl Collector {
                 pass_ns: cost.pass_ns,
             });
         } else {
+            self.too_old += u64::from(job.fate == Fate::TooOld);
             self.dropped += 1;
             monitor.count_dropped();
         }
@@ -353,6 +354,7 @@ impl Collector {
         report.frames_dropped = self.dropped;
         report.frames_late = self.late;
         report.frames_repeated = self.repeated;
+        report.frames_too_old = self.too_old;
         report.registration_error_px = spread(&self.registration, PER_PIXEL);
         report.registration_error_unpredicted_px = spread(&self.unpredicted, PER_PIXEL);
         report.motion_to_light_ms = spread(&self.motion_to_light, 1e6);

@@ -49,7 +49,8 @@ pub struct ProjectorReport {
 /// See the module's documentation.
 pub(super) struct LinkKeeper {
     time: LinkTime,
-    times: Publisher<LinkTime>,
+    /// Where planning learns the projector's clock; `None` before there is a crew.
+    times: Option<Publisher<LinkTime>>,
     retimed_at: HostTime,
     map: Option<ClockMap>,
     session: u64,
@@ -65,15 +66,10 @@ pub(super) struct LinkKeeper {
 impl LinkKeeper {
     /// For a link that has just come up with `time`. `lights`: where the projector's reports are all that is known of its light,
     /// notes of it go there.
-    pub(super) fn new(
-        time: LinkTime,
-        times: Publisher<LinkTime>,
-        link: &HostLink,
-        lights: Option<Sender<LightNote>>,
-    ) -> Self {
+    pub(super) fn new(time: LinkTime, link: &HostLink, lights: Option<Sender<LightNote>>) -> Self {
         Self {
             time,
-            times,
+            times: None,
             retimed_at: HostTime(i64::MIN),
             map: None,
             session: link.counters().sessions,
@@ -85,7 +81,14 @@ impl LinkKeeper {
         }
     }
 
-    /// Polls the link and does what is due. At virtual pace (`steady`) the projector's clock stays as the handshake found it.
+    /// From now on planning learns the projector's clock through `times`.
+    pub(super) fn tell_times_to(&mut self, mut times: Publisher<LinkTime>) {
+        times.publish(self.time);
+        self.times = Some(times);
+    }
+
+    /// Polls the link and does what is due. At virtual pace (`steady`) the projector's clock stays as the handshake found it. A picture is
+    /// held only while all stages are `alive`.
     ///
     /// # Errors
     /// The link cannot come up again: another projector was plugged in, or it refuses. While the medium is gone, or the projector
@@ -96,6 +99,7 @@ impl LinkKeeper {
         link: &mut HostLink,
         transport: &mut dyn Transport,
         steady: bool,
+        alive: bool,
         monitor: &RunMonitor,
     ) -> Result<(), ConnectError> {
         let result = match link.poll(now, transport) {
@@ -112,10 +116,18 @@ impl LinkKeeper {
         if !steady {
             self.keep_time(now, link);
         }
-        if let Some(order) = monitor.take_order() {
+        // After a stop was asked for nothing lights the projector again, whoever orders it.
+        let stopping = monitor.stop_requested() || self.standing == Some(Verb::Stop);
+        if let Some(order) = monitor.take_order().filter(|order| !(stopping && *order == Order::Arm)) {
             self.obey(now, order, link, transport);
         }
-        self.arm_again(now, link, steady);
+        if self.standing == Some(Verb::Freeze) && !alive {
+            // Nobody would replace the frame that is held, and nobody knows for how long.
+            self.obey(now, Order::Black, link, transport);
+        }
+        if !stopping {
+            self.arm_again(now, link, steady);
+        }
         if let (Some(reports), Some(status)) = (&mut self.reports, link.status().filter(|_| self.is_timed)) {
             reports.observe(status, &self.time);
         }
@@ -219,7 +231,9 @@ impl LinkKeeper {
             (self.time, self.is_timed) = (time, true);
         }
         self.retimed_at = now;
-        self.times.publish(self.time);
+        if let Some(times) = &mut self.times {
+            times.publish(self.time);
+        }
     }
 }
 

@@ -2,9 +2,10 @@
 //! a projector.
 
 use dpm_device::link::faults;
+use std::collections::VecDeque;
 use std::fmt;
 use std::sync::atomic::{AtomicBool, AtomicU64, AtomicU8, Ordering};
-use std::sync::OnceLock;
+use std::sync::{Mutex, OnceLock};
 
 /// What an operator can ask of the projector of a running rig.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -108,6 +109,10 @@ pub struct RunMonitor {
     projector: AtomicU64,
     /// Written at most once.
     tracker: OnceLock<String>,
+    /// What happened, for the operator; oldest first. Never touched by the frame path.
+    notes: Mutex<VecDeque<String>>,
+    /// Why the run will never return, written at most once.
+    gave_up: OnceLock<String>,
     frames_planned: AtomicU64,
     frames_lit: AtomicU64,
     frames_dropped: AtomicU64,
@@ -172,6 +177,32 @@ impl RunMonitor {
     /// What was said of the tracker; `None` while there is nothing to say.
     pub fn tracker(&self) -> Option<&str> {
         self.tracker.get().map(String::as_str)
+    }
+
+    /// Notes something for the operator: whoever watches takes it with [`RunMonitor::take_notes`]. Not for the frame path. Of more than 64
+    /// that nobody takes the oldest are lost.
+    pub fn tell(&self, note: String) {
+        if let Ok(mut notes) = self.notes.lock() {
+            if notes.len() >= 64 {
+                notes.pop_front();
+            }
+            notes.push_back(note);
+        }
+    }
+
+    /// What was noted since the last call, oldest first.
+    pub fn take_notes(&self) -> Vec<String> {
+        self.notes.lock().map(|mut notes| notes.drain(..).collect()).unwrap_or_default()
+    }
+
+    /// The thread that would return from the run hangs: whoever waits for it should not. The projector was told to go dark.
+    pub fn give_up(&self, why: String) {
+        let _ = self.gave_up.set(why);
+    }
+
+    /// Why the run will never return; `None` while it may.
+    pub fn gave_up(&self) -> Option<&str> {
+        self.gave_up.get().map(String::as_str)
     }
 
     /// Counts a planned frame.

@@ -65,6 +65,12 @@ pub struct Report {
     pub frames_late: u64,
     /// Slots in which the former frame was shown again.
     pub frames_repeated: u64,
+    /// Frames not sent because their poses would have been older than `safety.predict_ms` and a slot when they were lit.
+    pub frames_too_old: u64,
+    /// Slots from one planned frame to the next, on average at the end: 1 where the renderer keeps up.
+    pub slots_per_frame: f64,
+    /// Longest time for which a body was carried on by prediction, milliseconds, at the end.
+    pub predict_ms: f64,
     /// Columns and rows traced and projected.
     pub raster: [u32; 2],
     /// Bit planes in a frame.
@@ -130,6 +136,9 @@ impl Default for Report {
             frames_dropped: 0,
             frames_late: 0,
             frames_repeated: 0,
+            frames_too_old: 0,
+            slots_per_frame: 1.0,
+            predict_ms: 0.0,
             raster: [0, 0],
             planes: 0,
             frame_rate_hz: 0.0,

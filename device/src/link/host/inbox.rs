@@ -21,6 +21,8 @@ pub(super) struct Inbox {
     pub device_forgot: bool,
     pub echoes: [Option<EchoSample>; ECHOES_KEPT],
     pub next_echo: usize,
+    /// When the newest exchange that was answered had begun.
+    pub echo_answered: HostTime,
     pub ignored: u64,
     pub damaged: u64,
 }
@@ -70,6 +72,7 @@ impl Inbox {
             device_forgot: false,
             echoes: [None; ECHOES_KEPT],
             next_echo: 0,
+            echo_answered: HostTime(i64::MIN),
             ignored: 0,
             damaged: 0,
         }
@@ -105,6 +108,7 @@ impl Inbox {
                     host_received_at: self.now,
                 });
                 self.next_echo += 1;
+                self.echo_answered = sent_at;
             }
             DeviceMessage::Fault(f) => self.fault = Some(*f),
         }

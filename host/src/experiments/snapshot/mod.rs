@@ -151,7 +151,7 @@ pub fn snapshot(
     let mut slot = renderer.create_slot(true).map_err(gpu_failure)?;
     let wanted: Vec<_> =
         SnapshotImage::ALL.into_iter().filter(|i| what.is_empty() || what.contains(i)).collect();
-    let window = (config.output.light_window_ms * 1e-3 * rig.rate().hz()).round().max(1.0) as usize;
+    let window = (config.light_window_ms() * 1e-3 * rig.rate().hz()).round().max(1.0) as usize;
     let window = if wanted.contains(&SnapshotImage::Viewer) { window } else { 0 };
     let mut light = VecDeque::new();
     let (mut poses, mut errors) = (Vec::new(), Vec::new());
