@@ -69,7 +69,7 @@ mod tests {
         // 5 + 2 * 33.3 + 60 + 2 * 41.7
         assert_eq!(slow.predict_ns(60 * MS, 5 * MS) / MS, 214);
         assert_eq!(slow.predict_ns(5_000 * MS, 0), LONGEST_NS);
-        let written = horizon(&["projector.frame_rate=24", "tracker.rate_hz=500", "safety.predict_ms=20"]);
-        assert_eq!(written.predict_ns(60 * MS, 5 * MS), 20 * MS, "what is written is law");
+        let written = horizon(&["projector.frame_rate=24", "tracker.rate_hz=500", "safety.predict_ms=70"]);
+        assert_eq!(written.predict_ns(600 * MS, 5 * MS), 70 * MS, "what is written is law");
     }
 }
