@@ -107,7 +107,10 @@ fn whichever_thread_hangs_light_ends_by_itself_and_sigterm_ends_the_process_in_t
         let run = lit_run(&path, &far);
         threads(run.id()).into_iter().map(|(_, name)| name).collect()
     };
-    assert!(names.iter().any(|n| n == "dpm-plan") && names.iter().any(|n| n == "dpm-supervisor"), "{names:?}");
+    assert!(
+        names.iter().any(|n| n == "dpm-plan") && names.iter().any(|n| n == "dpm-supervisor"),
+        "{names:?}"
+    );
     for (i, name) in names.iter().enumerate() {
         let mut run = lit_run(&path, &far);
         let all = threads(run.id());

@@ -21,6 +21,8 @@ fn run(stage: StallIn, watchdog_ms: u32) -> Vec<FrameRecord> {
         set("real_time.pace=\"real\""),
         set("projector.frame_rate=\"100\""),
         format!("safety.watchdog_ms={watchdog_ms}"),
+        // Bodies are shown all through a stall: what is asked is how old their samples are.
+        "safety.predict_ms=500".to_owned(),
     ];
     let config = RigConfig::demo(&Overrides { variables: vec![], flags }).unwrap_or_else(|e| panic!("{e}"));
     let rig = Arc::new(Rig::build(&config, Raster::new(64, 48)).unwrap_or_else(|e| panic!("{e}")));

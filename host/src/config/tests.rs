@@ -227,7 +227,13 @@ const BAD: &[(&str, usize, usize, &str, &str)] = &[
     ),
     ("[real_time]\naffinity = [0, 5000]", 2, 12, "real_time.affinity", "core 5000"),
     ("[safety]\nwatchdog_ms = 2", 2, 15, "safety.watchdog_ms", "write at least 3 ms"),
-    ("[safety]\npredict_ms = 3", 2, 14, "safety.predict_ms", "less than two samples at tracker.rate_hz = 500"),
+    (
+        "[safety]\npredict_ms = 3",
+        2,
+        14,
+        "safety.predict_ms",
+        "less than two samples at tracker.rate_hz = 500",
+    ),
     ("[tracker]\nrate_hz = 50\n[safety]\npredict_ms = 20", 4, 14, "safety.predict_ms", "at least 40 ms"),
     // Found in use, O10: a first rig at an ordinary projector's rate, and the keys that it must change.
     (

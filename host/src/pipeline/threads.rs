@@ -58,6 +58,8 @@ const WAIT_NS: i64 = 20_000_000;
 pub(super) const STEP_NS: i64 = 20_000_000;
 /// What a poll of a tracker may take: some have to be opened or connected to anew.
 const POLL_NS: i64 = 200_000_000;
+/// How long frames that the GPU still works on are waited for at the end.
+const RELEASED_WITHIN_NS: u64 = 30_000_000_000;
 /// Virtual pace: a frame that the GPU has not finished by then is given up, and the run with it.
 const GPU_TIMEOUT_NS: u64 = 20_000_000_000;
 /// The same for the first one, for which drivers translate shaders: minutes on a slow machine that does other things too.
@@ -233,6 +235,19 @@ pub(super) fn plan_thread(
         shared.is_complete.store(true, Ordering::Release);
     }
     pulse.end();
+    let Planner { renderer, to_pack, .. } = planner;
+    // Packing comes to its end, too.
+    drop(to_pack);
+    let Some(renderer) = renderer else { return };
+    let watch = Stopwatch::start();
+    while crew.gpu.in_flight() > 0 {
+        if watch.elapsed_ns() > RELEASED_WITHIN_NS {
+            // The GPU may read what the renderer owns for as long as it likes: it is never freed.
+            std::mem::forget(renderer);
+            return;
+        }
+        std::thread::sleep(Duration::from_millis(1));
+    }
 }
 
 /// The planning thread's own.
@@ -499,7 +514,7 @@ pub(super) fn pack_thread(
             });
             break;
         }
-        if job.memory.gpu.is_some() && !shared.is_virtual() {
+        if job.memory.gpu.is_some() {
             crew.gpu.finish(times.finished(job.note.timeline.submitted_at, shared.clock.now()));
             gpu_waker.wake();
         }
