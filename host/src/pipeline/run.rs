@@ -271,7 +271,8 @@ fn tell_horizon(shared: &Shared) {
     if shared.rig.config.safety.predict_ms.is_none() && !shared.is_virtual() {
         let ms = shared.predict_ns.load(Ordering::Relaxed) as f64 / 1e6;
         shared.monitor.tell(format!(
-            "safety.predict_ms is left out: bodies are carried on by prediction for {ms:.0} ms and what the tracker takes, as long as a frame's              way to the light asks for"
+            "safety.predict_ms is left out: a body is carried on by prediction for {ms:.0} ms and the tracker's latency, which follows what \
+             frames need"
         ));
     }
 }
