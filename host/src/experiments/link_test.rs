@@ -136,7 +136,10 @@ enum Far {
 
 impl Far {
     fn open(rig: &Rig, clock: MonotonicClock) -> Result<Self, Failure> {
-        if let Some(medium) = projector::open(&rig.config, rig.camera.raster).map_err(PipelineError::from)? {
+        if let Some(mut medium) =
+            projector::open(&rig.config, rig.camera.raster).map_err(PipelineError::from)?
+        {
+            medium.transport.set_clock(std::sync::Arc::new(move || clock.now()));
             return Ok(Self::Outside(medium.transport));
         }
         let ProjectorBackend::Mock(mock) = &rig.config.projector.backend else {

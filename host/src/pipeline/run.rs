@@ -287,7 +287,13 @@ fn lay_cable(
     rights: &Arc<Rights>,
 ) -> Result<Laid, PipelineError> {
     Ok(match far {
-        Far::Outside(medium, lights) => (Cable::Outside(medium), None, Some(lights)),
+        Far::Outside(mut medium, lights) => {
+            if let RunClock::Real(clock) = **clock {
+                // Replies are stamped when they arrive, not when they are looked for.
+                medium.set_clock(Arc::new(move || clock.now()));
+            }
+            (Cable::Outside(medium), None, Some(lights))
+        }
         Far::Mock(mock, recorder) if matches!(**clock, RunClock::Virtual(_)) => {
             (Cable::Direct(Box::new(Direct::new(*mock)), recorder), None, None)
         }
