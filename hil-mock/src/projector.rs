@@ -236,13 +236,17 @@ impl MockProjector {
         self.core.setup.clock
     }
 
-    /// True time of the next thing that happens by itself (a slot or the watchdog); `None` while disarmed.
+    /// True time of the next thing that happens by itself (a slot, the end of a frame's light, or the watchdog); `None` while
+    /// disarmed.
     pub fn next_due(&self) -> Option<HostTime> {
         let (config, slots) = self.core.config.as_ref()?;
         if self.core.mode == Mode::Disarmed {
             return None;
         }
-        let due = slots.start(self.core.next_slot).min(self.core.bite_at(config));
+        let mut due = slots.start(self.core.next_slot).min(self.core.bite_at(config));
+        if let Some(dark_from) = self.core.dark_from() {
+            due = due.min(dark_from);
+        }
         Some(self.core.setup.clock.instant_of(due))
     }
 
@@ -394,21 +398,40 @@ impl Core {
         DeviceTicks(self.last_heard.0.saturating_add(ticks.max(1)))
     }
 
-    /// Slots and the watchdog up to `now`, in the order of time. Bounded: the watchdog ends it.
+    /// When the frame that is lit must be dark if no newer one is lit before; `None` while nothing is lit or light is frozen.
+    fn dark_from(&self) -> Option<DeviceTicks> {
+        let held = self.store.lit.filter(|_| self.lit_now && self.mode == Mode::Normal)?;
+        Some(held.dark_from)
+    }
+
+    /// The frame on the mirrors is over: dark until a newer one is lit, and nothing is left that could be lit again.
+    fn end_light(&mut self) {
+        self.lit_now = false;
+        self.store.lit = None;
+        self.status_due = true;
+    }
+
+    /// Slots, ends of light and the watchdog up to `now`, in the order of time. Bounded: the watchdog ends it.
     fn advance(&mut self, now: HostTime) {
         self.now = self.now.max(now);
         let ticks = self.ticks();
         while self.mode != Mode::Disarmed {
             let Some((config, slots)) = self.config else { break };
             let (start, bite) = (slots.start(self.next_slot), self.bite_at(&config));
-            if start.min(bite) > ticks {
+            // At one and the same tick a new frame comes before the end of the old one: there is no dark gap between them.
+            let dark = self.dark_from().filter(|dark| *dark < start);
+            let next = dark.unwrap_or(start);
+            if next.min(bite) > ticks {
                 break;
             }
-            if bite <= start {
+            if bite <= next {
                 self.latch(faults::WATCHDOG);
                 break;
             }
-            self.slot(&config, &slots, start);
+            match dark {
+                Some(_) => self.end_light(),
+                None => self.slot(&config, &slots, start),
+            }
         }
     }
 
@@ -418,14 +441,26 @@ impl Core {
         self.next_slot += 1;
         self.status.slots = self.status.slots.wrapping_add(1);
         self.status_due = true;
-        let due = self.store.take_due(slot);
+        let mut due = self.store.take_due(slot);
+        if let Some((_, superseded)) =
+            due.filter(|(frame, _)| self.mode == Mode::Normal && frame.dark_from <= start)
+        {
+            // It was allowed to be late, but its own light is over.
+            self.status.frames_superseded = self.status.frames_superseded.wrapping_add(superseded);
+            self.status.frames_late = self.status.frames_late.wrapping_add(1);
+            due = None;
+        }
+        if due.is_none() && self.dark_from().is_some_and(|dark| dark <= start) {
+            self.end_light();
+        }
         let kind = match (self.mode, due) {
             (Mode::Normal, Some((frame, superseded))) => {
                 self.status.frames_superseded = self.status.frames_superseded.wrapping_add(superseded);
                 self.status.frames_lit = self.status.frames_lit.wrapping_add(1);
                 self.status.last_lit_frame = frame.frame;
                 self.status.last_lit_at = start;
-                self.store.lit = Some(Held { frame: frame.frame, buffer: frame.buffer });
+                self.store.lit =
+                    Some(Held { frame: frame.frame, dark_from: frame.dark_from, buffer: frame.buffer });
                 self.generation += 1;
                 if self.flash.is_some() {
                     let bytes = config.raster.plane_bytes() * config.schedule.len();
@@ -438,8 +473,12 @@ impl Core {
                 // Told to be dark or to hold: frames are used up so that the stream goes on.
                 let refused = due.map_or(0, |(_, superseded)| superseded + 1);
                 self.status.frames_refused = self.status.frames_refused.wrapping_add(refused);
-                let again = self.store.lit.is_some()
-                    && (mode == Mode::Frozen || mode == Mode::Normal && config.underrun == Underrun::Repeat);
+                // FREEZE holds what is lit; where nothing is, it makes no light. A frame that BLACK hid may be over by now.
+                let again = self.store.lit.is_some_and(|held| match mode {
+                    Mode::Frozen => self.lit_now,
+                    Mode::Normal => config.underrun == Underrun::Repeat && start < held.dark_from,
+                    Mode::Black | Mode::Disarmed => false,
+                });
                 if again {
                     self.status.slots_repeated = self.status.slots_repeated.wrapping_add(1);
                     LightKind::Repeated
@@ -451,6 +490,7 @@ impl Core {
         };
         self.lit_now = kind != LightKind::Blank;
         let clock = &self.setup.clock;
+        let end = slots.start(slot + 1);
         let settle = if self.lit_now { i64::from(self.setup.settle_ns) } else { 0 };
         let event = LightEvent {
             slot,
@@ -458,7 +498,7 @@ impl Core {
             kind,
             lit_at: start,
             first_photon_at: clock.instant_of(start).plus_ns(settle),
-            last_photon_at: clock.instant_of(slots.start(slot + 1)),
+            last_photon_at: clock.instant_of(self.dark_from().unwrap_or(end).min(end)),
         };
         if self.events.len() >= self.setup.events_kept {
             self.events.pop_front();
@@ -556,6 +596,11 @@ impl Core {
         }
         self.mode = Mode::Normal;
         self.status_due = true;
+        // What FREEZE held may be over: then it ends now, not with the next slot.
+        let now = self.ticks();
+        if self.dark_from().is_some_and(|dark| dark <= now) {
+            self.end_light();
+        }
     }
 }
 

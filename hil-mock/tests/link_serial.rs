@@ -9,7 +9,7 @@ use std::time::{Duration, Instant};
 
 use dpm_device::link::{
     packet_bytes, Codec, Epoch, Header, HostLink, LinkSettings, LinkState, MessageType, Packet, SendOutcome,
-    Underrun,
+    Underrun, COMMIT_BYTES,
 };
 use dpm_device::planes::{PlaneSchedule, Raster};
 use dpm_device::time::{DeviceTicks, FrameRate, HostTime};
@@ -101,7 +101,7 @@ struct Near {
 }
 
 fn settings(path: &str) -> SerialSettings {
-    let frame_bytes = packet_bytes(raster().plane_bytes()) * 8 + packet_bytes(16);
+    let frame_bytes = packet_bytes(raster().plane_bytes()) * 8 + packet_bytes(COMMIT_BYTES);
     SerialSettings { path: path.into(), baud: 3_000_000, frame_bytes }
 }
 
@@ -117,7 +117,6 @@ impl Near {
             epoch: Epoch::At(DeviceTicks(0)),
             codecs,
             flash_limit: None,
-            session_seed: 5,
         });
         Self { link, line, next_id: 1 }
     }
@@ -134,7 +133,9 @@ impl Near {
                 let slots = self.link.slots().unwrap();
                 let slot = slots.slot_at(DeviceTicks(now.0 as u64)).unwrap() + 1;
                 let (id, target) = (self.next_id, slots.start(slot));
-                if self.link.send_frame(now, id, target, &planes(id), &mut self.line) == SendOutcome::Sent {
+                let dark_from = slots.dark_from(slot, 20_000_000_000);
+                let sent = self.link.send_frame(now, id, target, dark_from, &planes(id), &mut self.line);
+                if sent == SendOutcome::Sent {
                     self.next_id += 1;
                 }
             }

@@ -2,7 +2,7 @@
 //! behind the checksums is reached.
 
 use dpm_device::link::{
-    Codec, Epoch, Header, HostLink, LinkSettings, LinkState, MessageType, Packet, Underrun,
+    Codec, Epoch, Header, HostLink, LinkSettings, LinkState, MessageType, Packet, SessionNumbers, Underrun,
 };
 use dpm_device::planes::{PlaneSchedule, Raster};
 use dpm_device::time::{DeviceTicks, FrameRate, HostTime};
@@ -48,7 +48,7 @@ const PLANES: usize = 3;
 fn streaming() -> (HostLink, Cable, HostTime) {
     let raster = Raster::new(16, 2).expect("a raster");
     let schedule = PlaneSchedule::mono8();
-    let mut link = HostLink::new(LinkSettings {
+    let settings = LinkSettings {
         raster,
         schedule,
         rate: FrameRate::new(947, 1).expect("a rate"),
@@ -58,8 +58,9 @@ fn streaming() -> (HostLink, Cable, HostTime) {
         epoch: Epoch::At(DeviceTicks(0)),
         codecs: Codec::ALL,
         flash_limit: None,
-        session_seed: 1,
-    });
+    };
+    // The same session each time: what a fuzzer finds must repeat.
+    let mut link = HostLink::with_sessions(settings, SessionNumbers::from_source(|| 1));
     let mock = MockProjector::new(MockConfig { events_kept: 0, ..MockConfig::new(raster) });
     let mut cable = Cable { device: Direct::new(mock), session: 0, sent: Vec::new(), inbound: None };
     let mut now = HostTime(0);
@@ -73,8 +74,8 @@ fn streaming() -> (HostLink, Cable, HostTime) {
     }
     for id in 1..=PLANES as u64 {
         let planes = vec![id as u8; raster.plane_bytes() * schedule.len()];
-        let slot = link.slots().expect("slots").start(id + 4);
-        link.send_frame(now, id, slot, &planes, &mut cable);
+        let slots = link.slots().expect("slots");
+        link.send_frame(now, id, slots.start(id + 4), slots.dark_from(id + 4, 0), &planes, &mut cable);
     }
     (link, cable, now)
 }

@@ -15,6 +15,7 @@ use super::message::{
     Config, ConfigRefusal, DeviceHello, DeviceState, Echo, Fault, FaultCode, HostHello, HostMessage, Status,
     MAX_CONTROL_BYTES,
 };
+use super::session::SessionNumbers;
 use super::slots::SlotClock;
 use crate::time::{DeviceTicks, HostTime};
 use crate::transport::{Lane, SendError, Transport, TransportError};
@@ -38,6 +39,7 @@ const ARM_BEFORE_CONFIG: u16 = 1;
 #[derive(Debug)]
 pub struct HostLink {
     settings: LinkSettings,
+    sessions: SessionNumbers,
     state: LinkState,
     inbox: Inbox,
     decoders: [Decoder; 2],
@@ -67,8 +69,13 @@ pub struct HostLink {
 const NEVER: HostTime = HostTime(i64::MIN);
 
 impl HostLink {
-    /// A closed link. Its buffers are all it will ever allocate.
+    /// A closed link whose sessions are numbered by the operating system. Its buffers are all it will ever allocate.
     pub fn new(settings: LinkSettings) -> Self {
+        Self::with_sessions(settings, SessionNumbers::from_system())
+    }
+
+    /// As [`HostLink::new`], with session numbers of another source, for tests that must repeat byte for byte.
+    pub fn with_sessions(settings: LinkSettings, sessions: SessionNumbers) -> Self {
         let compactor = (settings.codecs & !Codec::Raw.mask() != 0).then(|| {
             let frame_ns = settings.rate.slot_len_ns(0);
             Compactor::new(settings.raster, settings.schedule.len(), frame_ns, settings.codecs)
@@ -76,6 +83,7 @@ impl HostLink {
         let flash = settings.flash_limit.map(|limit| FlashLimiter::new(settings.rate, limit));
         Self {
             settings,
+            sessions,
             state: LinkState::Closed,
             inbox: Inbox::new(),
             decoders: [Decoder::new(), Decoder::new()],
@@ -98,14 +106,10 @@ impl HostLink {
         }
     }
 
-    /// Opens a new session with the next [`HostLink::poll`]; an old one, and its light, end.
+    /// Opens a new session, with a number of its own, with the next [`HostLink::poll`]; an old one, and its light, end.
     pub fn connect(&mut self) {
         self.counters.sessions += 1;
-        // Odd multiplier: numbers differ for 2^32 sessions of one seed. 0 means "no session".
-        let n = (self.counters.sessions as u32)
-            .wrapping_mul(0x9e37_79b1)
-            .wrapping_add(self.settings.session_seed);
-        self.inbox.open(n.max(1));
+        self.inbox.open(self.sessions.draw());
         self.decoders = [Decoder::new(), Decoder::new()];
         self.state = LinkState::Greeting;
         self.slots = None;

@@ -15,6 +15,8 @@ pub use types::{
 
 /// Longest payload of any message except PLANE.
 pub const MAX_CONTROL_BYTES: usize = 96;
+/// Length of a FRAME_COMMIT's payload.
+pub const COMMIT_BYTES: usize = 24;
 /// Why a payload cannot be read.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum PayloadError {
@@ -197,12 +199,13 @@ impl HostMessage {
                 Self::Arm(u32_at(p, 0))
             }
             MessageType::FrameCommit => {
-                expect_len(kind, p, 16)?;
+                expect_len(kind, p, COMMIT_BYTES)?;
                 let commit = Commit {
                     sent: u32_at(p, 0),
                     kept: u32_at(p, 4),
                     base_frame: u32_at(p, 8),
                     frames_sent: u32_at(p, 12),
+                    dark_from: DeviceTicks(u64_at(p, 16)),
                 };
                 if commit.sent & commit.kept != 0 {
                     return Err(field("kept"));
@@ -246,7 +249,7 @@ impl HostMessage {
                 MessageType::Arm
             }
             Self::Commit(c) => {
-                w.u32(c.sent).u32(c.kept).u32(c.base_frame).u32(c.frames_sent);
+                w.u32(c.sent).u32(c.kept).u32(c.base_frame).u32(c.frames_sent).u64(c.dark_from.0);
                 MessageType::FrameCommit
             }
             Self::Sync(frames_sent) => {

@@ -18,6 +18,8 @@ mod limits;
 #[cfg(feature = "std")]
 mod measure;
 mod message;
+#[cfg(feature = "std")]
+mod session;
 mod slots;
 
 pub use codec::{rle_encode, CodecError, RleDecoder};
@@ -40,6 +42,9 @@ pub use limits::{
 pub use measure::{measure, LinkMeasurement};
 pub use message::{
     faults, Assembly, Commit, Config, ConfigRefusal, DeviceHello, DeviceMessage, DeviceState, Echo, Fault,
-    FaultCode, HostHello, HostMessage, PayloadError, Status, Underrun, MAX_CONTROL_BYTES, MAX_WATCHDOG_US,
+    FaultCode, HostHello, HostMessage, PayloadError, Status, Underrun, COMMIT_BYTES, MAX_CONTROL_BYTES,
+    MAX_WATCHDOG_US,
 };
+#[cfg(feature = "std")]
+pub use session::SessionNumbers;
 pub use slots::SlotClock;

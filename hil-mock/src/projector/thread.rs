@@ -35,7 +35,7 @@ pub fn serve_cable(
 mod tests {
     use super::super::{LightKind, MockConfig};
     use super::*;
-    use dpm_device::link::{packet_bytes, Epoch, HostLink, LinkSettings, LinkState, Underrun};
+    use dpm_device::link::{packet_bytes, Epoch, HostLink, LinkSettings, LinkState, Underrun, COMMIT_BYTES};
     use dpm_device::planes::{PlaneSchedule, Raster};
     use dpm_device::time::{DeviceTicks, FrameRate};
     use dpm_device::transport::inproc::threaded;
@@ -48,7 +48,7 @@ mod tests {
     #[test]
     fn frames_cross_between_threads() {
         let raster = Raster::new(64, 16).unwrap();
-        let frame_bytes = packet_bytes(raster.plane_bytes()) * 24 + packet_bytes(16);
+        let frame_bytes = packet_bytes(raster.plane_bytes()) * 24 + packet_bytes(COMMIT_BYTES);
         let (mut host, device) = threaded(frame_bytes, 4, WaitPolicy::Park);
         let start = Instant::now();
         let clock = move || HostTime(start.elapsed().as_nanos() as i64);
@@ -75,7 +75,6 @@ mod tests {
             epoch: Epoch::At(DeviceTicks(0)),
             codecs: 0,
             flash_limit: None,
-            session_seed: 3,
         });
         link.connect();
         let deadline = Instant::now() + Duration::from_secs(20);
@@ -88,7 +87,14 @@ mod tests {
                     let slots = link.slots().unwrap();
                     let slot = slots.slot_at(DeviceTicks(now.0 as u64)).unwrap();
                     let planes = vec![sent as u8; raster.plane_bytes() * 24];
-                    let outcome = link.send_frame(now, sent, slots.start(slot + 1), &planes, &mut host);
+                    let outcome = link.send_frame(
+                        now,
+                        sent,
+                        slots.start(slot + 1),
+                        slots.dark_from(slot + 1, 20_000_000_000),
+                        &planes,
+                        &mut host,
+                    );
                     if outcome == dpm_device::link::SendOutcome::Sent {
                         sent += 1;
                     }

@@ -131,8 +131,14 @@ impl Line {
         let now = if shared.is_virtual() { ready_at } else { self.await_credit(shared, note) };
         let waited_ns = now.ns_since(ready_at);
         let Self { link, cable, keeper, lead } = self;
-        let outcome =
-            link.send_frame(now, note.id.0, note.target_at, memory.planes.bytes(), cable.transport());
+        // A frame that nobody replaces goes dark by itself: its poses are too old to be lit.
+        let keep_ns = u64::from(shared.rig.config.safety.predict_ms) * 1_000_000;
+        let dark_from = link
+            .slots()
+            .and_then(|slots| Some(slots.dark_from(slots.slot_at(note.target_at)?, keep_ns)))
+            .unwrap_or(note.target_at);
+        let planes = memory.planes.bytes();
+        let outcome = link.send_frame(now, note.id.0, note.target_at, dark_from, planes, cable.transport());
         note.fate = Fate::Offered(outcome);
         if outcome != SendOutcome::Sent {
             return;

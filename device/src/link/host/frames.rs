@@ -13,7 +13,10 @@ impl HostLink {
     /// Hands one frame to the medium, all of it or nothing. `planes` are the frame's planes one after the other in the
     /// configured order, each [`crate::planes::Raster::plane_bytes`] long; raw planes go out as they lie, without a copy on this side. `frame_id`
     /// must grow from frame to frame; the wire carries its low 32 bits. `target_at` is the instant of light on the device's
-    /// clock, usually [`SlotClock::start`](crate::link::slots::SlotClock::start) of the slot.
+    /// clock, usually [`SlotClock::start`](crate::link::slots::SlotClock::start) of the slot. From `dark_from` on, on the same clock, the
+    /// device shows nothing of this frame, even if it never hears from a host again; usually
+    /// [`SlotClock::dark_from`](crate::link::slots::SlotClock::dark_from). A device takes no frame whose light would end before it
+    /// begins, so a `dark_from` that does not lie after `target_at` is sent as one tick after it.
     ///
     /// # Panics
     /// When `planes` has not the configured size.
@@ -22,11 +25,12 @@ impl HostLink {
         now: HostTime,
         frame_id: u64,
         target_at: DeviceTicks,
+        dark_from: DeviceTicks,
         planes: &[u8],
         transport: &mut dyn Transport,
     ) -> SendOutcome {
         self.counters.frames_offered += 1;
-        match self.try_send_frame(now, frame_id as u32, target_at, planes, transport) {
+        match self.try_send_frame(now, frame_id as u32, target_at, dark_from, planes, transport) {
             Ok(()) => {
                 self.counters.frames_sent += 1;
                 SendOutcome::Sent
@@ -50,6 +54,7 @@ impl HostLink {
         now: HostTime,
         frame: u32,
         target_at: DeviceTicks,
+        dark_from: DeviceTicks,
         planes: &[u8],
         transport: &mut dyn Transport,
     ) -> Result<(), DropReason> {
@@ -98,6 +103,7 @@ impl HostLink {
             kept,
             base_frame: if is_key { 0 } else { self.last_frame.unwrap_or(0) },
             frames_sent: self.frames_sent.wrapping_add(1),
+            dark_from: dark_from.max(DeviceTicks(target_at.0.saturating_add(1))),
         });
         let header =
             Header { frame, target_at, ..Header::control(MessageType::Plane, self.inbox.session, 0) };

@@ -56,13 +56,12 @@ fn link() -> HostLink {
         epoch: Epoch::At(DeviceTicks(0)),
         codecs: Codec::Raw.mask(),
         flash_limit: None,
-        session_seed: 1,
     })
 }
 
 fn hello() -> DeviceMessage {
     DeviceMessage::Hello(DeviceHello {
-        version: 1,
+        version: u16::from(VERSION),
         firmware: 0,
         codecs: 1,
         raster: raster(),
@@ -137,10 +136,13 @@ fn credit_wraps_and_never_goes_below_zero() {
     let (mut link, mut script) = streaming();
     let planes = [0u8; 16];
     for (id, expected) in [(1, SendOutcome::Sent), (2, SendOutcome::Sent)] {
-        assert_eq!(link.send_frame(HostTime(10), id, DeviceTicks(0), &planes, &mut script), expected);
+        assert_eq!(
+            link.send_frame(HostTime(10), id, DeviceTicks(0), DeviceTicks(1), &planes, &mut script),
+            expected
+        );
     }
     let none = SendOutcome::Dropped { reason: DropReason::NoCredit };
-    assert_eq!(link.send_frame(HostTime(10), 3, DeviceTicks(0), &planes, &mut script), none);
+    assert_eq!(link.send_frame(HostTime(10), 3, DeviceTicks(0), DeviceTicks(1), &planes, &mut script), none);
     // A device that takes credit back below what was sent.
     script.say(script.session, &DeviceMessage::Status(status(DeviceState::Armed, 90, 1)));
     link.poll(HostTime(11), &mut script).unwrap();
@@ -153,7 +155,8 @@ fn credit_wraps_and_never_goes_below_zero() {
     script.say(script.session, &DeviceMessage::Status(status(DeviceState::Armed, 91, 1)));
     link.poll(HostTime(60_000_001), &mut script).unwrap();
     assert_eq!(link.credit(), 2, "from 2^32 - 1 to 1");
-    let older = link.send_frame(HostTime(60_000_002), 2, DeviceTicks(0), &planes, &mut script);
+    let older =
+        link.send_frame(HostTime(60_000_002), 2, DeviceTicks(0), DeviceTicks(1), &planes, &mut script);
     assert_eq!(older, SendOutcome::Dropped { reason: DropReason::NotNewer });
 }
 

@@ -38,8 +38,6 @@ pub struct LinkSettings {
     /// Flashes of the whole field a second above which the host darkens the projector for two seconds; `None` switches
     /// the limiter off.
     pub flash_limit: Option<u8>,
-    /// Seed of the session numbers; two hosts should not use the same.
-    pub session_seed: u32,
 }
 
 /// Progress of a [`HostLink`](super::HostLink).

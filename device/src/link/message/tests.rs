@@ -52,9 +52,10 @@ fn golden_messages_of_the_host() {
             kept: 1,
             base_frame: 0x0102,
             frames_sent: 0xffff_ffff,
+            dark_from: DeviceTicks(0x1122_3344_5566_7788),
         }),
         MessageType::FrameCommit,
-        "feffff00 01000000 02010000 ffffffff",
+        "feffff00 01000000 02010000 ffffffff 8877665544332211",
     );
     host(HostMessage::Sync(258), MessageType::Sync, "02010000");
     host(

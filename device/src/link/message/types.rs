@@ -129,6 +129,17 @@ pub struct Commit {
     pub base_frame: u32,
     /// Frames sent in this session, this one included.
     pub frames_sent: u32,
+    /// From this tick of the device's clock on there is no light of this frame, whatever the host does or fails to do. It lies after
+    /// the frame's target, see [`Commit::ends_after`].
+    pub dark_from: DeviceTicks,
+}
+
+impl Commit {
+    /// True when the frame's light ends after `target_at`, the instant in the header at which it shall begin. A FRAME_COMMIT for which
+    /// this is false has a wrong field: the device ignores it.
+    pub const fn ends_after(&self, target_at: DeviceTicks) -> bool {
+        self.dark_from.0 > target_at.0
+    }
 }
 
 /// State of the device as STATUS reports it.

@@ -5,7 +5,7 @@ use std::sync::{Arc, Mutex};
 use std::time::{Duration, Instant};
 
 use dpm_device::link::{
-    packet_bytes, Codec, Epoch, HostLink, LinkSettings, LinkState, SendOutcome, Underrun,
+    packet_bytes, Codec, Epoch, HostLink, LinkSettings, LinkState, SendOutcome, Underrun, COMMIT_BYTES,
 };
 use dpm_device::planes::{PlaneSchedule, Raster};
 use dpm_device::time::{DeviceTicks, FrameRate, HostTime};
@@ -29,7 +29,7 @@ pub fn planes(id: u64) -> Vec<u8> {
 }
 
 pub fn frame_bytes() -> usize {
-    packet_bytes(raster().plane_bytes()) * PLANES + packet_bytes(16)
+    packet_bytes(raster().plane_bytes()) * PLANES + packet_bytes(COMMIT_BYTES)
 }
 
 /// A projector of its own serial number, on the bus.
@@ -101,7 +101,6 @@ impl Host {
             epoch: Epoch::At(DeviceTicks(0)),
             codecs: Codec::Raw.mask(),
             flash_limit: None,
-            session_seed: 1,
         });
         let usb = UsbTransport::open(device.settings()).expect("the device opens");
         Self { link, usb, next_id: 1 }
@@ -150,7 +149,8 @@ impl Host {
         let slots = self.link.slots().unwrap();
         let slot = slots.slot_at(DeviceTicks(now.0 as u64)).unwrap() + 1;
         let id = self.next_id;
-        let outcome = self.link.send_frame(now, id, slots.start(slot), &planes(id), &mut self.usb);
+        let dark_from = slots.dark_from(slot, 20_000_000_000);
+        let outcome = self.link.send_frame(now, id, slots.start(slot), dark_from, &planes(id), &mut self.usb);
         if outcome == SendOutcome::Sent {
             self.next_id += 1;
         }
