@@ -142,7 +142,9 @@ impl Interlock {
                     std::thread::sleep(ASK_EVERY);
                 }
             })
-            .map_err(|e| Failure::new(FailureKind::Device, format!("cannot start the interlock's thread: {e}")))?;
+            .map_err(|e| {
+                Failure::new(FailureKind::Device, format!("cannot start the interlock's thread: {e}"))
+            })?;
         let _ = first.recv_timeout(Duration::from_millis(200));
         Ok(Self { shared, key, what, thread: Some(thread) })
     }

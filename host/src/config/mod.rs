@@ -22,8 +22,8 @@ pub use projector::*;
 pub use read::KeyDoc;
 pub use run::*;
 pub use safety::{
-    InterlockConfig, InterlockSignal, KeyInterlockConfig, LimitsConfig, LineInterlockConfig, NoInterlockConfig,
-    ProcessInterlockConfig,
+    InterlockConfig, InterlockSignal, KeyInterlockConfig, LimitsConfig, LineInterlockConfig,
+    NoInterlockConfig, ProcessInterlockConfig,
 };
 pub use source::VARIABLE_PREFIX;
 pub use world::*;

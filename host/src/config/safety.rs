@@ -129,7 +129,8 @@ pub(super) fn check(rig: &RigConfig, reader: &mut Reader) {
         refuse("safety.limits.full_white_s", "is too short to be told from a flash", remedy);
     }
     if !limits.limits().is_off() && matches!(rig.projector.backend, ProjectorBackend::Dlpc900(_)) {
-        let key = if limits.mean_level > 0.0 { "safety.limits.mean_level" } else { "safety.limits.full_white_s" };
+        let key =
+            if limits.mean_level > 0.0 { "safety.limits.mean_level" } else { "safety.limits.full_white_s" };
         refuse(
             key,
             "cannot be kept on a DLPC900: its light comes from its own memory or a video input, which this program does not count",
@@ -142,7 +143,11 @@ pub(super) fn check(rig: &RigConfig, reader: &mut Reader) {
         InterlockConfig::None(_) => {}
         InterlockConfig::Process(p) => {
             if !one_of(p.name.is_some(), p.pid_file.is_some()) {
-                refuse("safety.interlock.kind", "names no process, or two", "give either `name` or `pid_file`");
+                refuse(
+                    "safety.interlock.kind",
+                    "names no process, or two",
+                    "give either `name` or `pid_file`",
+                );
             }
             if is_relative(&p.pid_file) {
                 refuse("safety.interlock.pid_file", "is a relative path", "write an absolute path");
@@ -168,7 +173,11 @@ pub(super) fn check(rig: &RigConfig, reader: &mut Reader) {
             if !usable {
                 refuse("safety.interlock.key", "is not one printable ASCII character", "for example \" \"");
             } else if crate::telemetry::monitor::Order::from_key(bytes[0]).is_some() {
-                refuse("safety.interlock.key", "is a key that gives an order", "take another, for example \" \"");
+                refuse(
+                    "safety.interlock.key",
+                    "is a key that gives an order",
+                    "take another, for example \" \"",
+                );
             }
         }
     }

@@ -28,9 +28,12 @@ pub(super) fn of(config: &InterlockConfig, shared: &Arc<Shared>) -> Box<dyn Cont
             (None, None) => Box::new(Nothing),
         },
         InterlockConfig::Line(l) => match (&l.port, &l.file) {
-            (Some(port), _) => {
-                Box::new(Line { path: port.clone(), signal: l.signal.line(), open: None, look_at: Instant::now() })
-            }
+            (Some(port), _) => Box::new(Line {
+                path: port.clone(),
+                signal: l.signal.line(),
+                open: None,
+                look_at: Instant::now(),
+            }),
             (None, Some(file)) => Box::new(One(file.clone())),
             (None, None) => Box::new(Nothing),
         },
@@ -49,7 +52,8 @@ impl Contact for Nothing {
 
 /// Reads a small file without ever waiting for a writer of a named pipe.
 fn read_small(path: &Path) -> Option<(Vec<u8>, std::fs::Metadata)> {
-    let file = OpenOptions::new().read(true).custom_flags(libc::O_NONBLOCK | libc::O_CLOEXEC).open(path).ok()?;
+    let file =
+        OpenOptions::new().read(true).custom_flags(libc::O_NONBLOCK | libc::O_CLOEXEC).open(path).ok()?;
     let meta = file.metadata().ok()?;
     let mut bytes = Vec::new();
     file.take(MOST_BYTES).read_to_end(&mut bytes).ok()?;

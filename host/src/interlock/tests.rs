@@ -1,9 +1,7 @@
 //! Contacts that open, close, hang and lie.
 
 use super::*;
-use crate::config::{
-    KeyInterlockConfig, LineInterlockConfig, NoInterlockConfig, ProcessInterlockConfig,
-};
+use crate::config::{KeyInterlockConfig, LineInterlockConfig, NoInterlockConfig, ProcessInterlockConfig};
 use std::path::PathBuf;
 use std::process::{Child, Command};
 use std::time::Instant;
