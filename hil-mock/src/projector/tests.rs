@@ -3,12 +3,14 @@
 mod cable;
 mod codec;
 mod dark;
+mod limits;
 mod safety;
 
 use super::*;
 use crate::rng::Draws;
 use dpm_device::link::{
-    DropReason, Epoch, HostLink, LinkError, LinkSettings, LinkState, MessageType, SendOutcome, Verb,
+    DropReason, Epoch, HostLink, LightLimits, LinkError, LinkSettings, LinkState, MessageType, SendOutcome,
+    Verb,
 };
 use dpm_device::planes::PlaneSchedule;
 use dpm_device::time::FrameRate;
@@ -34,6 +36,7 @@ fn settings() -> LinkSettings {
         epoch: Epoch::At(DeviceTicks(0)),
         codecs: 0,
         flash_limit: None,
+        limits: LightLimits::OFF,
     }
 }
 
