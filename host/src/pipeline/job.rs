@@ -5,6 +5,7 @@
 
 use crate::frame::{FrameId, FrameTimeline};
 use crate::pack::BitPlaneFrame;
+use crate::plan::dark::DarkCause;
 use crate::render::{FrameCost, FrameSlot};
 use dpm_device::link::SendOutcome;
 use dpm_device::time::{DeviceTicks, HostTime};
@@ -42,6 +43,8 @@ pub struct FrameNote {
     pub sampled_poses: Vec<DAffine3>,
     /// Bit k: the tracker sees body k, of the first 64.
     pub tracked: u64,
+    /// Per tracked body: why no light may fall on it; `None` where it may.
+    pub dark: Vec<Option<DarkCause>>,
     /// Eye, world.
     pub eye: DVec3,
     /// Thousandths of a sample that a pixel gets on average.
@@ -67,6 +70,7 @@ impl FrameNote {
             tracked_poses: Vec::with_capacity(bodies),
             sampled_poses: Vec::with_capacity(bodies),
             tracked: 0,
+            dark: Vec::with_capacity(bodies),
             eye: DVec3::ZERO,
             budget_milli: 0,
             cost: None,

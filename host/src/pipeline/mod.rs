@@ -12,6 +12,7 @@
 
 mod collect;
 mod connect;
+mod dark_bodies;
 pub mod job;
 mod keeper;
 pub mod light;

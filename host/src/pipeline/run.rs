@@ -20,7 +20,6 @@ use crate::gpu::Gpu;
 use crate::pack::{BitPlaneFrame, Kernel};
 use crate::plan::budget::{BudgetConfig, BudgetController};
 use crate::plan::lead::LeadEstimator;
-use crate::plan::slots::MissCause;
 use crate::realtime::os::usable_cores;
 use crate::realtime::standstill::StandstillMonitor;
 use crate::render::method::Method;
@@ -169,7 +168,8 @@ fn run_from(
                 seen,
                 lights,
             };
-            let mut collector = Collector::new(rig.clone(), options.keep_frames, options.verify);
+            let mut collector = Collector::new(rig.clone(), options.keep_frames, options.verify)
+                .about(gpu.is_none(), standstill.as_ref().map(StandstillMonitor::seen));
             let Leavings { recorder, carried, unseen } = run_threads(&shared, stages, &mut collector)?;
             let recorder = match device {
                 Some(thread) => Some(thread.join().map_err(|_| PipelineError::Panicked("mock projector"))?),
@@ -182,6 +182,7 @@ fn run_from(
         })?;
     let wall_s = watch.elapsed_ns() as f64 * 1e-9;
     let standstills = standstill.map(StandstillMonitor::finish).unwrap_or_default();
+    let slots = collector.finish(monitor);
 
     let mut report = Report {
         raster: [rig.camera.raster.width(), rig.camera.raster.height()],
@@ -192,7 +193,11 @@ fn run_from(
         software_gpu: gpu.is_some_and(|gpu| gpu.summary().software),
         method: if gpu.is_some() { config.render.method.word() } else { "prepared" },
         prediction: config.prediction.on,
-        light_hash: recorder.as_ref().map_or_else(String::new, |r| format!("{:016x}", r.light_hash)),
+        // Where light is not hashed, there is nothing to show.
+        light_hash: recorder
+            .as_ref()
+            .filter(|_| options.verify)
+            .map_or_else(String::new, |r| format!("{:016x}", r.light_hash)),
         projector: Some(carried),
         wall_s,
         ..Report::default()
@@ -203,17 +208,14 @@ fn run_from(
     report.warnings.extend(warnings);
     report.warnings.extend(rights.warnings());
     report.warnings.extend(rig.scene.warnings.iter().cloned());
-    let slots = collector.slots.counts(&standstills, modelled_ns(&rig));
-    for cause in MissCause::ALL {
-        collector.profiler.missed(cause, slots.missed[cause as usize]);
-    }
     Ok(RunOutcome {
         report,
         recent: std::mem::take(&mut collector.recent).into(),
         light: recorder.map_or_else(Vec::new, LightRecorder::into_frames),
         light_mismatches: collector.light_mismatches,
-        traced: std::mem::take(&mut collector.traced),
+        traced: std::mem::take(&mut collector.traced).into(),
         slots,
+        slot_batches: collector.slots.batches().to_vec(),
         frames_torn: collector.torn,
         frames_reordered: collector.reordered,
         profiler: collector.profiler,

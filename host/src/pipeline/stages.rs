@@ -7,6 +7,7 @@ use crate::config::TrackerConfig;
 use crate::frame::{FrameId, Stage};
 use crate::gpu::GpuError;
 use crate::pack::{self, Kernel};
+use crate::plan::dark::DarkCause;
 use crate::render::{FrameInputs, Renderer};
 use crate::rig::{affine, Rig};
 use crate::tracking::{Freshness, PoseFilterBank, PoseFilterConfig, TrackState};
@@ -157,29 +158,39 @@ pub fn plan(job: &mut FrameJob, rig: &Rig, snapshot: &TrackSnapshot, slots: &Lin
     note.tracked_poses.clear();
     note.sampled_poses.clear();
     memory.lost.clear();
+    note.dark.clear();
     note.tracked = 0;
-    let mut oldest: Option<(HostTime, HostTime)> = None;
+    // Of the bodies that are lit; of those that are dark only where none is lit.
+    let mut oldest: [Option<(HostTime, HostTime)>; 2] = [None; 2];
     for (i, body) in rig.bodies.iter().enumerate() {
         let track = snapshot.tracks.get(i).copied().flatten();
-        let (pose, sampled, lost) = match track {
+        let (pose, sampled, dark) = match track {
             Some((state, received_at)) => {
                 let sampled = state.predict(state.captured_at);
                 let used = state.predict(middle);
+                let dark = (used.freshness == Freshness::Lost).then(|| {
+                    // Where the sample was good enough when it was taken, the way to the light is what is too long.
+                    let taken = state.predict(snapshot.through.max(state.captured_at));
+                    if taken.freshness == Freshness::Lost { DarkCause::Silent } else { DarkCause::BeyondHorizon }
+                });
+                let oldest = &mut oldest[usize::from(dark.is_some())];
                 if oldest.is_none_or(|(captured, _)| state.captured_at < captured) {
-                    oldest = Some((state.captured_at, received_at));
+                    *oldest = Some((state.captured_at, received_at));
                 }
                 let pose = if predict { used.pose } else { sampled.pose };
-                (affine(&pose), affine(&sampled.pose), used.freshness == Freshness::Lost)
+                (affine(&pose), affine(&sampled.pose), dark)
             }
-            // Never seen: nothing may be lit.
-            None => (affine(&body.rest), affine(&body.rest), true),
+            // Nothing may be lit.
+            None => (affine(&body.rest), affine(&body.rest), Some(DarkCause::NeverSeen)),
         };
+        let lost = dark.is_some();
+        note.dark.push(dark);
         note.tracked_poses.push(pose);
         note.sampled_poses.push(sampled);
         memory.lost.push(lost);
         note.tracked |= u64::from(!lost && i < 64) << (i % 64);
     }
-    let (captured_at, received_at) = oldest.unwrap_or((due, due));
+    let (captured_at, received_at) = oldest[0].or(oldest[1]).unwrap_or((due, due));
     timeline.captured_at = captured_at;
     timeline.received_at = received_at;
     rig.scene_poses(&note.tracked_poses, &mut memory.scene_poses);
