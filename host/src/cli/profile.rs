@@ -4,7 +4,7 @@ use super::rig_args::RigArgs;
 use super::watch::{print, watch};
 use crate::experiments::profile::profile_rig;
 use crate::failure::{Failure, FailureKind};
-use crate::telemetry::compare::{compare, to_table};
+use crate::telemetry::compare::{compare, failed_gates, to_table};
 use crate::telemetry::monitor::RunCounts;
 use crate::telemetry::profile::ProfileReport;
 use crate::telemetry::prometheus::{page, PageServer};
@@ -30,7 +30,8 @@ pub struct ProfileArgs {
     /// Serve the figures for Prometheus while running, for example on 127.0.0.1:9473
     #[arg(long, value_name = "ADDR")]
     prometheus: Option<String>,
-    /// Compare two profile.json instead of running: what got better or worse, and whether beyond noise
+    /// Compare two profile.json instead of running: what got better or worse, and whether beyond noise; ends with 1 when more
+    /// slots are missed, or more frames late
     #[arg(long, num_args = 2, value_names = ["A.json", "B.json"], conflicts_with_all = ["rig", "no_render", "prometheus"])]
     compare: Vec<PathBuf>,
 }
@@ -38,11 +39,21 @@ pub struct ProfileArgs {
 /// Profiles a rig, or compares two profiles.
 ///
 /// # Errors
-/// Bad rig file, scene, address or profile; a device that fails.
+/// Bad rig file, scene, address or profile; a device that fails; torn frames; a comparison whose gates got worse.
 pub fn execute(args: &ProfileArgs) -> Result<(), Failure> {
     if let [before, after] = args.compare.as_slice() {
         let (rows, notes) = compare(&read(before)?, &read(after)?);
         print(&to_table(&rows, &notes));
+        let failed = failed_gates(&rows);
+        if !failed.is_empty() {
+            let told = format!(
+                "{} got worse by more than noise: {} against {}",
+                failed.join(" and "),
+                after.display(),
+                before.display()
+            );
+            return Err(Failure::new(FailureKind::CheckFailed, told));
+        }
         return Ok(());
     }
     let mut flags = args.flags.clone();
@@ -74,11 +85,16 @@ pub fn execute(args: &ProfileArgs) -> Result<(), Failure> {
         move |rig, monitor| profile_rig(rig, prepared, monitor),
     )?;
     if let Some(server) = &server {
+        let r = &profile.report;
         let counts = RunCounts {
-            frames_planned: profile.report.frames_lit + profile.report.frames_dropped,
-            frames_lit: profile.report.frames_lit,
-            frames_dropped: profile.report.frames_dropped,
-            frames_late: profile.report.frames_late,
+            frames_planned: r.frames_lit + r.frames_dark + r.frames_dropped + r.frames_withheld,
+            frames_lit: r.frames_lit,
+            frames_dark: r.frames_dark,
+            frames_dropped: r.frames_dropped,
+            frames_withheld: r.frames_withheld,
+            frames_late: r.frames_late,
+            slots: r.slots,
+            slots_missed: r.missed_slots,
         };
         server.show(page(&counts, Some(&profile.profile)));
     }
@@ -91,7 +107,7 @@ pub fn execute(args: &ProfileArgs) -> Result<(), Failure> {
         );
         return Err(Failure::new(FailureKind::CheckFailed, told));
     }
-    Ok(())
+    profile.report.check_lit()
 }
 
 fn read(path: &Path) -> Result<ProfileReport, Failure> {

@@ -8,6 +8,7 @@ use super::job::FrameNote;
 use super::light::LightNote;
 use super::stages::LinkTime;
 use super::status_light::{DeviceCounts, StatusLight};
+use crate::plan::slots::OrderedDark;
 use crate::telemetry::monitor::{Order, ProjectorHealth, RunMonitor};
 use dpm_device::clock_map::ClockMap;
 use dpm_device::link::{faults, DeviceState, HostLink, LinkError, LinkState, Verb};
@@ -42,6 +43,9 @@ pub struct ProjectorReport {
     pub not_sent: [u64; 6],
     /// What the projector reported; null for the mock in this process, whose light is seen itself.
     pub device: Option<DeviceCounts>,
+    /// Greatest error of the mapping from the projector's clock to the host's, as the newest exchange bounds it, nanoseconds; null at virtual pace,
+    /// and where no exchange was heard.
+    pub clock_bound_ns: Option<i64>,
     /// From sent to light in time, as learned from the reports, milliseconds; null for the mock in this process.
     pub travel_ms: Option<f64>,
 }
@@ -53,6 +57,7 @@ pub(super) struct LinkKeeper {
     times: Option<Publisher<LinkTime>>,
     retimed_at: HostTime,
     map: Option<ClockMap>,
+    clock_bound_ns: Option<i64>,
     session: u64,
     /// `time` is of this session.
     is_timed: bool,
@@ -74,6 +79,7 @@ impl LinkKeeper {
             times: None,
             retimed_at: HostTime(i64::MIN),
             map: None,
+            clock_bound_ns: None,
             session: link.counters().sessions,
             is_timed: true,
             reports: lights.map(StatusLight::new),
@@ -134,6 +140,7 @@ impl LinkKeeper {
         if !stopping {
             self.arm_again(now, link, steady);
         }
+        monitor.dark().tell(now, ordered_dark(now, link, self.standing));
         if let (Some(reports), Some(status)) = (&mut self.reports, link.status().filter(|_| self.is_timed)) {
             reports.observe(status, &self.time);
         }
@@ -179,6 +186,7 @@ impl LinkKeeper {
             planes: [c.planes_raw, c.planes_coded, c.planes_kept],
             not_sent: [c.not_streaming, c.no_credit, c.link_busy, c.link_lost, c.flash_limit, c.light_limit],
             device: self.reports.as_ref().map(StatusLight::counts),
+            clock_bound_ns: self.clock_bound_ns,
             travel_ms: self.reports.as_ref().map(|r| r.travel_ns() as f64 / 1e6),
         }
     }
@@ -263,6 +271,7 @@ impl LinkKeeper {
         });
         let (Some(ticks), Some(clock)) = (newest, link.slots()) else { return };
         let Some(mapped) = map.to_host(ticks) else { return };
+        self.clock_bound_ns = Some(mapped.uncertainty_ns);
         if self.is_timed {
             let due = self.retimed_at.0 == i64::MIN || now.ns_since(self.retimed_at) >= RETIME_NS;
             if !due || map.exchanges() < EXCHANGES {
@@ -288,6 +297,27 @@ pub(super) fn is_dark(link: &HostLink) -> bool {
         || link.status().is_some_and(|s| {
             !s.lit && !matches!(s.state, DeviceState::Armed | DeviceState::Black | DeviceState::Frozen)
         })
+}
+
+/// Why no new picture is wanted: slots are no one's fault then.
+fn ordered_dark(now: HostTime, link: &HostLink, standing: Option<Verb>) -> Option<OrderedDark> {
+    match standing {
+        Some(Verb::Black) => return Some(OrderedDark::Black),
+        Some(Verb::Freeze) => return Some(OrderedDark::Frozen),
+        Some(Verb::Safe) => return Some(OrderedDark::Safe),
+        Some(Verb::Stop) => return Some(OrderedDark::Stop),
+        _ => {}
+    }
+    let latched = link.status().map_or(0, |s| s.faults);
+    if link.is_resting(now) {
+        Some(OrderedDark::Rest)
+    } else if link.state() == LinkState::Faulted && latched & faults::HOST_SAFE != 0 {
+        Some(OrderedDark::Safe)
+    } else if link.state() == LinkState::Faulted && latched & !PASSING != 0 {
+        Some(OrderedDark::Fault)
+    } else {
+        None
+    }
 }
 
 fn health(link: &HostLink, standing: Option<Verb>) -> ProjectorHealth {

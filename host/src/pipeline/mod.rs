@@ -13,6 +13,7 @@
 mod collect;
 mod connect;
 mod crew;
+mod dark_bodies;
 pub mod job;
 mod keeper;
 pub mod light;

@@ -71,15 +71,17 @@ pub struct RunOutcome {
     pub light_mismatches: u64,
     /// Distributions of every interval.
     pub profiler: Profiler,
-    /// Slots without a frame of their own, by cause.
+    /// Slots by what became of them.
     pub slots: SlotCounts,
+    /// Slots in which a frame was wanted and those missed, of equal batches of consecutive slots.
+    pub slot_batches: Vec<(u64, u64)>,
     /// Lit frames with parts of another frame (looked for in prepared frames only).
     pub frames_torn: u64,
     /// Frames lit after a newer one, or twice.
     pub frames_reordered: u64,
     /// When the machine itself stood still (real pace).
     pub standstills: Standstills,
-    /// Frames for a trace, where the rig file asks for one.
+    /// The last frames, for a trace, where the rig file asks for one.
     pub traced: Vec<TracedFrame>,
 }
 

@@ -22,7 +22,6 @@ use crate::plan::budget::{BudgetConfig, BudgetController};
 use crate::plan::horizon::Horizon;
 use crate::plan::lead::LeadEstimator;
 use crate::plan::losses::LossBudget;
-use crate::plan::slots::MissCause;
 use crate::realtime::os::usable_cores;
 use crate::realtime::standstill::StandstillMonitor;
 use crate::render::method::Method;
@@ -120,7 +119,8 @@ fn run_from(
     let shared = Arc::new(shared(&rig, &clock, &rights, options, monitor, time, &lead));
     tell_horizon(&shared);
     let line = Line { keeper: super::keeper::LinkKeeper::new(time, &link, seen), link, cable, lead };
-    let mut collector = Collector::new(rig.clone(), options.keep_frames, options.verify);
+    let mut collector = Collector::new(rig.clone(), options.keep_frames, options.verify)
+        .about(gpu.is_none(), standstill.as_ref().map(StandstillMonitor::seen));
 
     // A panic up to the end of this function ends the light.
     let stop_on_panic = OnExit(|| {
@@ -181,6 +181,7 @@ fn run_from(
     };
     let wall_s = watch.elapsed_ns() as f64 * 1e-9;
     let standstills = standstill.map(StandstillMonitor::finish).unwrap_or_default();
+    let slots = collector.finish(monitor);
 
     let config = &rig.config;
     let mut report = Report {
@@ -192,7 +193,11 @@ fn run_from(
         software_gpu: gpu.is_some_and(|gpu| gpu.summary().software),
         method: if gpu.is_some() { config.render.method.word() } else { "prepared" },
         prediction: config.prediction.on,
-        light_hash: recorder.as_ref().map_or_else(String::new, |r| format!("{:016x}", r.light_hash)),
+        // Where light is not hashed, there is nothing to show.
+        light_hash: recorder
+            .as_ref()
+            .filter(|_| options.verify)
+            .map_or_else(String::new, |r| format!("{:016x}", r.light_hash)),
         projector: Some(carried),
         slots_per_frame: shared.stride_milli.load(Ordering::Relaxed) as f64 / 1e3,
         predict_ms: shared.predict_ns.load(Ordering::Relaxed) as f64 / 1e6,
@@ -205,17 +210,14 @@ fn run_from(
     report.warnings.extend(warnings);
     report.warnings.extend(rights.warnings());
     report.warnings.extend(rig.scene.warnings.iter().cloned());
-    let slots = collector.slots.counts(&standstills, modelled_ns(&rig));
-    for cause in MissCause::ALL {
-        collector.profiler.missed(cause, slots.missed[cause as usize]);
-    }
     Ok(RunOutcome {
         report,
         recent: std::mem::take(&mut collector.recent).into(),
         light: recorder.map_or_else(Vec::new, LightRecorder::into_frames),
         light_mismatches: collector.light_mismatches,
-        traced: std::mem::take(&mut collector.traced),
+        traced: std::mem::take(&mut collector.traced).into(),
         slots,
+        slot_batches: collector.slots.batches().to_vec(),
         frames_torn: collector.torn,
         frames_reordered: collector.reordered,
         profiler: collector.profiler,
@@ -270,7 +272,7 @@ fn shared(
 fn tell_horizon(shared: &Shared) {
     if shared.rig.config.safety.predict_ms.is_none() && !shared.is_virtual() {
         let ms = shared.predict_ns.load(Ordering::Relaxed) as f64 / 1e6;
-        shared.monitor.tell(format!(
+        shared.monitor.note(format!(
             "safety.predict_ms is left out: a body is carried on by prediction for {ms:.0} ms and the tracker's latency, which follows what \
              frames need"
         ));

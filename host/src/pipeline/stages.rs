@@ -201,7 +201,8 @@ pub fn plan(job: &mut FrameJob, rig: &Rig, snapshot: &TrackSnapshot, inputs: &Pl
     note.dark.clear();
     memory.lost.clear();
     note.tracked = 0;
-    let mut oldest: Option<(HostTime, HostTime)> = None;
+    // Of the bodies that are lit; of those that are dark only where none is lit.
+    let mut oldest: [Option<(HostTime, HostTime)>; 2] = [None; 2];
     for (i, body) in rig.bodies.iter().enumerate() {
         let track = snapshot.tracks.get(i).copied().flatten();
         let (pose, sampled, dark) = match track {
@@ -218,9 +219,9 @@ pub fn plan(job: &mut FrameJob, rig: &Rig, snapshot: &TrackSnapshot, inputs: &Pl
                         DarkCause::Silent
                     }
                 });
-                // What is dark has no age.
-                if dark.is_none() && oldest.is_none_or(|(captured, _)| state.captured_at < captured) {
-                    oldest = Some((state.captured_at, received_at));
+                let oldest = &mut oldest[usize::from(dark.is_some())];
+                if oldest.is_none_or(|(captured, _)| state.captured_at < captured) {
+                    *oldest = Some((state.captured_at, received_at));
                 }
                 let pose = if predict { used.pose } else { sampled.pose };
                 (affine(&pose), affine(&sampled.pose), dark)
@@ -234,8 +235,9 @@ pub fn plan(job: &mut FrameJob, rig: &Rig, snapshot: &TrackSnapshot, inputs: &Pl
         memory.lost.push(dark.is_some());
         note.tracked |= u64::from(dark.is_none() && i < 64) << (i % 64);
     }
-    note.oldest_captured_at = oldest.map(|(captured, _)| captured);
-    let (captured_at, received_at) = oldest.unwrap_or((due, due));
+    // What is dark has no age.
+    note.oldest_captured_at = oldest[0].map(|(captured, _)| captured);
+    let (captured_at, received_at) = oldest[0].or(oldest[1]).unwrap_or((due, due));
     timeline.captured_at = captured_at;
     timeline.received_at = received_at;
     rig.scene_poses(&note.tracked_poses, &mut memory.scene_poses);

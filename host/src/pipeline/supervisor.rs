@@ -157,7 +157,7 @@ impl Supervisor {
             Ok((crew, port)) => {
                 // There is room: the link takes ports within a millisecond, and crews come seconds apart.
                 let _ = self.ports.push(port);
-                self.shared.monitor.tell("new stages are at work; the picture is back".into());
+                self.shared.monitor.note("new stages are at work; the picture is back".into());
                 Shift::Works(crew)
             }
             Err(error) => {
@@ -201,7 +201,7 @@ impl Supervisor {
         }
         shared
             .monitor
-            .tell(format!("{}; the stages are made anew, dark meanwhile", trouble_in_words(&error)));
+            .note(format!("{}; the stages are made anew, dark meanwhile", trouble_in_words(&error)));
         let (done, result) = channel();
         let made = std::thread::Builder::new().name("dpm-remake".into()).spawn(move || {
             let _ = done.send(maker(remake));
@@ -224,7 +224,7 @@ impl Supervisor {
         }
         *told = is_slow;
         let hz = self.shared.rig.rate().hz();
-        self.shared.monitor.tell(if is_slow {
+        self.shared.monitor.note(if is_slow {
             let every = stride as f64 / 1e3;
             format!(
                 "the renderer is slower than its slots: every {every:.1}th slot gets a frame, {:.1} of {hz:.1} a second; \

@@ -9,7 +9,6 @@ use super::rights::Rights;
 use super::stages::{self, LinkTime, PlanInputs, TrackSnapshot, TrackingStage};
 use crate::clock::{Clock, RunClock, Stopwatch};
 use crate::config::{Pace, Wait};
-use crate::frame::Stage;
 use crate::gpu::GpuError;
 use crate::pack::Kernel;
 use crate::plan::budget::BudgetController;
@@ -375,6 +374,7 @@ impl<'a> Planner<'a> {
             let costs = shared.costs();
             t.submitted_at = t.latched_at.plus_ns(costs[0]);
             t.rendered_at = t.submitted_at.plus_ns(costs[1]);
+            t.packing_at = t.rendered_at;
             t.packed_at = t.rendered_at.plus_ns(costs[2]);
             t.sent_at = t.packed_at.plus_ns(costs[3]);
         }
@@ -522,6 +522,13 @@ pub(super) fn pack_thread(
             controller.measured(job.note.budget_milli, gpu_ns);
             crew.budget_milli.store(controller.rays(), Ordering::Relaxed);
         }
+        if !shared.is_virtual() {
+            let now = shared.clock.now();
+            let rendered = job.memory.gpu.is_some();
+            let t = &mut job.note.timeline;
+            // A prepared frame is there when it is planned: what follows is waiting for the packer.
+            (t.rendered_at, t.packing_at) = (if rendered { now } else { t.submitted_at }, now);
+        }
         // What waits behind is still being rendered. More late frames than were under way are no stall: a GPU this slow has no
         // newer frame that would be in time, and late frames are better than none while their poses are young enough.
         let is_late = !shared.is_virtual() && shared.clock.now() >= job.note.timeline.due_at;
@@ -531,10 +538,7 @@ pub(super) fn pack_thread(
             stages::pack(&mut job, kernel, shared.options.verify, &mut prepared);
         }
         if !shared.is_virtual() {
-            let now = shared.clock.now();
-            let t = &mut job.note.timeline;
-            t.rendered_at = now.plus_ns(-(t.wall_ns[Stage::Pack as usize] as i64));
-            t.packed_at = now;
+            job.note.timeline.packed_at = shared.clock.now();
         }
         if to_link.push(job).is_err() || crew.is_abandoned.load(Ordering::Relaxed) {
             break;

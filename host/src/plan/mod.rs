@@ -4,5 +4,6 @@ pub mod budget;
 pub mod dark;
 pub mod horizon;
 pub mod lead;
+pub mod light_centre;
 pub mod losses;
 pub mod slots;
