@@ -1,5 +1,6 @@
 //! Picture files into DLPC900 patterns, and the controller's state into lines for the operator.
 
+use dpm_device::regular_file;
 use dpm_device::dlpc900::driver::Status;
 use dpm_device::dlpc900::image::{Compression, PlaneOrder};
 use dpm_device::dlpc900::lut::Dmd;
@@ -61,11 +62,15 @@ pub struct ShowAs {
     pub compression: Option<Compression>,
 }
 
+/// Largest file of a picture that is read, bytes.
+const MAX_PICTURE_BYTES: u64 = 256 << 20;
+
 /// Reads a picture of exactly the DMD's size as grey values. The size is checked before pixels are decoded.
 pub fn read_grey(path: &Path, dmd: Dmd) -> Result<Vec<u8>, PatternFileError> {
     let fail = |why: String| PatternFileError::Read { path: path.to_owned(), why };
+    let bytes = regular_file::read(path, MAX_PICTURE_BYTES).map_err(|e| fail(e.to_string()))?;
     let open = || {
-        let reader = image::ImageReader::open(path).map_err(|e| fail(e.to_string()))?;
+        let reader = image::ImageReader::new(std::io::Cursor::new(&bytes));
         reader.with_guessed_format().map_err(|e| fail(e.to_string()))
     };
     let (width, height) = open()?.into_dimensions().map_err(|e| fail(e.to_string()))?;

@@ -8,11 +8,11 @@ use crate::scene::{self, BodySelector, Environment, LoadOptions, Scene, SceneErr
 use crate::tracking::source::{self, SourceError};
 use dpm_device::planes::Raster;
 use dpm_device::pose::Pose;
+use dpm_device::regular_file;
 use dpm_device::time::{FrameRate, HostClock, HostTime};
 use dpm_device::tracker::{BodyKey, Tracker};
 use glam::{DAffine3, DQuat, DVec3, Vec3};
 use hil_mock::motion::{Motion, MotionError, MotionSpec};
-use std::io::Read;
 use std::sync::Arc;
 
 /// Why a rig cannot be built from a configuration that is valid by itself.
@@ -170,7 +170,9 @@ impl Rig {
         let mut scene = load_scene(config)?;
         let features = SceneFeatures::of(&scene);
         let has_lights = features.emissive_triangles + features.punctual_lights > 0;
-        scene.environment = environment(config, has_lights)?.unwrap_or(scene.environment);
+        let (fitted, told) = environment(config, has_lights)?.unwrap_or(scene.environment).fitted();
+        scene.environment = fitted;
+        scene.warnings.extend(told.map(|t| format!("scene.environment: {t}")));
         let raster = raster.unwrap_or_else(|| config.projector.raster());
         let camera = camera(config, raster, &mut scene.warnings)?;
         let bodies = rig_bodies(config, &scene)?;
@@ -277,11 +279,9 @@ fn camera(
         Some(CalibrationUnit::Millimetre) => LengthUnit::Millimetre,
         None => return Err(wrong("projector.calibration_unit is missing".into())),
     };
-    let mut text = String::new();
-    std::fs::File::open(path)
-        .and_then(|f| f.take(opencv::MAX_BYTES as u64 + 1).read_to_string(&mut text))
-        .map_err(|e| wrong(e.to_string()))?;
-    let stored = opencv::read(&text, p.raster(), unit).map_err(|e| wrong(e.to_string()))?;
+    let text = regular_file::read_text(path, opencv::MAX_BYTES as u64).map_err(|e| wrong(e.to_string()))?;
+    let calibrated = p.calibrated_raster();
+    let stored = opencv::read(&text, calibrated, unit).map_err(|e| wrong(e.to_string()))?;
     if stored.distortion != Distortion::default() {
         warnings.push(format!(
             "projector.calibration: {}: its lens distortion is not compensated; light is off by as much as the lens bends",
@@ -289,8 +289,9 @@ fn camera(
         ));
     }
     let c = stored.camera;
-    let scale_x = f64::from(raster.width()) / f64::from(p.width);
-    let scale_y = f64::from(raster.height()) / f64::from(p.height);
+    // The same view cut into other pixels. The camera's coordinates count from the raster's corner, so everything scales.
+    let scale_x = f64::from(raster.width()) / f64::from(calibrated.width());
+    let scale_y = f64::from(raster.height()) / f64::from(calibrated.height());
     Ok(ProjectorCamera::new(
         raster,
         c.world_from_projector,

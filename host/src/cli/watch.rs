@@ -4,12 +4,14 @@ use super::keys::Keys;
 use super::signals;
 use crate::config::{OutputConfig, ProjectorBackend, RigConfig};
 use crate::control::{runtime_folder, ControlSocket};
-use crate::failure::{Failure, FailureKind};
-use crate::files::{InstanceLock, LockError};
+use crate::experiments::run_rig::{cannot_write, check_output_folder};
+use crate::failure::{Ended, Failure, FailureKind};
+use crate::files::{write_atomically, InstanceLock, LockError};
 use crate::telemetry::monitor::{ProjectorHealth, RunCounts, RunMonitor};
-use crate::telemetry::report::Report;
+use crate::telemetry::report::{to_json, Report};
 use indicatif::{ProgressBar, ProgressDrawTarget, ProgressStyle};
 use std::io::{IsTerminal, Write};
+use std::path::Path;
 use std::sync::mpsc::{channel, RecvTimeoutError};
 use std::sync::Arc;
 use std::time::{Duration, Instant};
@@ -24,11 +26,30 @@ const TICK: Duration = Duration::from_millis(50);
 pub fn run_and_report(
     rig: RigConfig,
     json: bool,
-    run: impl FnOnce(&RigConfig, &Arc<RunMonitor>) -> Result<Report, Failure> + Send + 'static,
+    run: impl FnOnce(&RigConfig, &Arc<RunMonitor>) -> Result<Ended<Report>, Failure> + Send + 'static,
 ) -> Result<(), Failure> {
-    let report = watch(rig, |_| {}, run)?;
+    let Ended { report, failure } = watch(rig, |_| {}, run)?;
     print(&if json { report.to_json() + "\n" } else { report.to_table() });
-    Ok(())
+    failure.map_or(Ok(()), Err)
+}
+
+/// Writes the report of a command that makes no others as `name` into the folder that `--out` names, where it does.
+///
+/// # Errors
+/// The folder or the file cannot be written.
+pub(super) fn write_out<T: serde::Serialize>(out: Option<&Path>, name: &str, report: &T) -> Result<(), Failure> {
+    let Some(folder) = out else { return Ok(()) };
+    let path = folder.join(name);
+    let text = to_json(report) + "\n";
+    write_atomically(&path, |file| file.write_all(text.as_bytes())).map_err(|e| cannot_write(&path, &e))
+}
+
+/// Sees that files can be written into the folder that `--out` names, before the work.
+///
+/// # Errors
+/// They cannot.
+pub(super) fn check_out(out: Option<&Path>) -> Result<(), Failure> {
+    out.map_or(Ok(()), check_output_folder)
 }
 
 /// Runs `run` while its progress is shown on the standard error stream, given to `show`, and signals become an ordered stop. The
@@ -46,7 +67,7 @@ pub fn watch<T: Send + 'static>(
         .map_err(|e| Failure::new(FailureKind::Device, format!("cannot handle signals: {e}")))?;
     let monitor = Arc::new(RunMonitor::default());
     let (done, finished) = channel();
-    let frames = rig.run.frames;
+    let (frames, seconds) = (rig.run.frames, rig.run.seconds);
     let worker = {
         let monitor = Arc::clone(&monitor);
         std::thread::Builder::new()
@@ -58,7 +79,7 @@ pub fn watch<T: Send + 'static>(
             })
             .map_err(|e| Failure::new(FailureKind::Device, format!("cannot start a thread: {e}")))?
     };
-    let mut progress = Progress::new(frames);
+    let mut progress = Progress::new(frames, seconds);
     let mut health = ProjectorHealth::Connecting;
     let mut tracker_told = false;
     let mut keys = Keys::new();
@@ -158,27 +179,40 @@ pub(super) fn take_locks(rig: &RigConfig) -> Result<Vec<InstanceLock>, Failure> 
 
 enum Progress {
     Bar(ProgressBar),
-    Lines { started: Instant, next: Duration, total: u64 },
+    /// Towards an end in time: the bar's unit is a millisecond since the first frame was planned.
+    Timed { bar: ProgressBar, began: Option<Instant> },
+    Lines { started: Instant, next: Duration, total: u64, seconds: f64 },
 }
 
 impl Progress {
-    fn new(total: u64) -> Self {
+    /// Towards `total` frames, or else `seconds` of time; 0 is no end.
+    fn new(total: u64, seconds: f64) -> Self {
         if !std::io::stderr().is_terminal() {
-            return Self::Lines { started: Instant::now(), next: Duration::from_secs(1), total };
+            return Self::Lines { started: Instant::now(), next: Duration::from_secs(1), total, seconds };
         }
-        let bar = if total > 0 { ProgressBar::new(total) } else { ProgressBar::no_length() };
+        let timed = total == 0 && seconds > 0.0;
+        let bar = match total {
+            0 if timed => ProgressBar::new((seconds * 1e3) as u64),
+            0 => ProgressBar::no_length(),
+            _ => ProgressBar::new(total),
+        };
         bar.set_draw_target(ProgressDrawTarget::stderr());
         let template = match total {
+            0 if timed => "{bar:40} {elapsed}, {msg}",
             0 => "{spinner} {pos} frames lit, {per_sec}, {msg}",
             _ => "{bar:40} {pos}/{len} frames lit, {per_sec}, {eta} left, {msg}",
         };
         bar.set_style(ProgressStyle::with_template(template).expect("the template is a constant"));
-        Self::Bar(bar)
+        if timed {
+            Self::Timed { bar, began: None }
+        } else {
+            Self::Bar(bar)
+        }
     }
 
     fn note(&self, text: &str) {
         match self {
-            Self::Bar(bar) => bar.println(text),
+            Self::Bar(bar) | Self::Timed { bar, .. } => bar.println(text),
             Self::Lines { .. } => {
                 let _ = writeln!(std::io::stderr(), "{}", serde_json::json!({ "note": text }));
             }
@@ -192,7 +226,16 @@ impl Progress {
                 bar.set_message(format!("{} dropped, {} late", counts.frames_dropped, counts.frames_late));
                 bar.tick();
             }
-            Self::Lines { started, next, total } => {
+            Self::Timed { bar, began } => {
+                if counts.frames_planned > 0 {
+                    let began = began.get_or_insert_with(Instant::now);
+                    bar.set_position(began.elapsed().as_millis() as u64);
+                }
+                let RunCounts { frames_lit, frames_dropped, frames_late, .. } = counts;
+                bar.set_message(format!("{frames_lit} frames lit, {frames_dropped} dropped, {frames_late} late"));
+                bar.tick();
+            }
+            Self::Lines { started, next, total, seconds } => {
                 let elapsed = started.elapsed();
                 if elapsed >= *next {
                     // After a pause of this thread the next line comes a second later, not a burst of lines at once.
@@ -200,6 +243,7 @@ impl Progress {
                     let line = serde_json::json!({
                         "elapsed_s": (elapsed.as_secs_f64() * 1e3).round() / 1e3,
                         "frames_total": total,
+                        "seconds_total": seconds,
                         "frames_lit": counts.frames_lit,
                         "frames_dropped": counts.frames_dropped,
                         "frames_late": counts.frames_late,
@@ -212,7 +256,7 @@ impl Progress {
 
     fn finish(mut self, counts: RunCounts) {
         self.tick(counts);
-        if let Self::Bar(bar) = self {
+        if let Self::Bar(bar) | Self::Timed { bar, .. } = self {
             bar.finish_and_clear();
         }
     }

@@ -1,5 +1,6 @@
 //! What a method should have shown, in two independent halves, so that it tells its own error; kept in files by what it was made from.
 
+use dpm_device::regular_file;
 use super::error_runs::{ErrorRunError, EYE_FRAMES};
 use super::sequence::{eye_mean, rmse, Theatre};
 use super::stamp::Fnv;
@@ -100,7 +101,7 @@ pub fn mean_of(values: &[Vec3]) -> f64 {
 
 /// Frames of `probes` values from the cache; `None` when there are none or they do not fit.
 fn read_frames(path: &Path, probes: usize) -> Option<Vec<Vec<Vec3>>> {
-    let bytes = std::fs::read(path).ok()?;
+    let bytes = regular_file::read(path, (EYE_FRAMES * probes * 12) as u64).ok()?;
     if probes == 0 || bytes.len() != EYE_FRAMES * probes * 12 {
         return None;
     }

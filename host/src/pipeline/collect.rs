@@ -112,7 +112,8 @@ impl Collector {
         let points = (0..rig.bodies.len()).map(|i| registration_points(&rig, i)).collect();
         let measured = rig.config.real_time.pace == Pace::Real;
         // A tenth of a known run, but enough frames for a 99th percentile.
-        let batch_frames = (rig.config.run.frames / 10).clamp(100, 10_000);
+        let frames = rig.config.run.frames.max(rig.config.slots_to_run());
+        let batch_frames = (frames / 10).clamp(100, 10_000);
         let profiler = Profiler::new(rig.rate(), measured, batch_frames);
         let trace_frames = if rig.config.output.trace { MAX_TRACED } else { 0 };
         Self {
