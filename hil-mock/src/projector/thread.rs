@@ -6,7 +6,7 @@
 use dpm_device::time::HostTime;
 use dpm_device::transport::inproc::DeviceEnd;
 
-use super::MockProjector;
+use super::Served;
 
 /// Longest rest of a thread for whose projector nothing is due.
 const REST_NS: i64 = 1_000_000_000;
@@ -33,7 +33,7 @@ pub fn serve_cable<P: Served>(
 
 #[cfg(test)]
 mod tests {
-    use super::super::{LightKind, MockConfig};
+    use super::super::{LightKind, MockConfig, MockProjector};
     use super::*;
     use dpm_device::link::{packet_bytes, Epoch, HostLink, LinkSettings, LinkState, Underrun};
     use dpm_device::planes::{PlaneSchedule, Raster};

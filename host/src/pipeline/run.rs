@@ -124,9 +124,7 @@ fn run_from(
                     let (clock, rights) = (&clock, &rights);
                     let thread = std::thread::Builder::new()
                         .name("dpm-mock".into())
-                        .spawn_scoped(scope, move || {
-                            device_thread(device_end, mock, recorder, clock, rights)
-                        })
+                        .spawn_scoped(scope, move || device_thread(device_end, mock, recorder, clock, rights))
                         .map_err(|source| PipelineError::Thread { stage: "mock projector", source })?;
                     (Cable::Threaded(host_end), Some(thread), None)
                 }
