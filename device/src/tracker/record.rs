@@ -304,8 +304,7 @@ impl Recording {
     /// Reads `path` up to its end or to the first frame that is not whole.
     pub fn read(path: &Path) -> Result<Self, RecordError> {
         let failed = |source| RecordError::Io { path: path.to_owned(), source };
-        let file = File::open(path).map_err(failed)?;
-        let size = file.metadata().map_err(failed)?.len();
+        let (file, size) = crate::regular_file::open(path).map_err(failed)?;
         Self::read_from(&mut std::io::BufReader::with_capacity(1 << 16, file), size, path)
     }
 

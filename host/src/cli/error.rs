@@ -103,6 +103,7 @@ pub fn execute(args: &ErrorArgs) -> Result<(), Failure> {
     if let Some(ErrorCommand::Merge { out, json }) = &args.merge {
         return merge(out, *json);
     }
+    args.flags.refuse("dpm error", &["--frames", "--seconds", "--no-prediction"])?;
     match args.preset {
         Some(Preset::Figure3) => return super::error_figure3::figure3(args),
         Some(Preset::Table) => return super::error_table::table(args),
@@ -177,7 +178,7 @@ pub(super) fn folder(args: &ErrorArgs) -> PathBuf {
 
 /// Names with their numbers. A rig file that cannot be run has no groups.
 pub(super) fn list(args: &ErrorArgs, names: impl Iterator<Item = String>) -> Result<(), Failure> {
-    args.flags.rig(args.rig.as_deref())?;
+    args.flags.rig_at_rest(args.rig.as_deref())?;
     if args.json {
         let names: Vec<String> = names.collect();
         print(&(to_json(&serde_json::json!({ "groups": names })) + "\n"));
@@ -215,7 +216,7 @@ pub(super) fn options(args: &ErrorArgs, out: &Path) -> ErrorOptions {
 
 /// The GPU, and the rig at the raster to measure at: small without a GPU or in a hurry.
 pub(super) fn stage(args: &ErrorArgs) -> Result<(Arc<Gpu>, Rig), Failure> {
-    let config = args.flags.rig(args.rig.as_deref())?;
+    let config = args.flags.rig_at_rest(args.rig.as_deref())?;
     // Not after the minutes that the first reference takes.
     check_folder(&folder(args))
         .map_err(|e| Failure::new(FailureKind::BadInput, format!("{e}; choose another folder with --out")))?;

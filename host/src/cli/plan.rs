@@ -1,7 +1,7 @@
 //! `dpm plan RIG.toml`: what a rig needs, what is left out, why, how, and what it saves.
 
 use super::rig_args::RigArgs;
-use super::watch::print;
+use super::watch::{check_out, print, write_out};
 use crate::experiments::plan_savings::Saving;
 use crate::experiments::scene_plan::scene_plan;
 use crate::failure::Failure;
@@ -44,11 +44,13 @@ fn saved(s: &Saving) -> String {
 /// # Errors
 /// Bad rig file or scene; with `--measure` no GPU, or pixels that differ.
 pub fn execute(args: &PlanArgs) -> Result<(), Failure> {
-    let rig = args.flags.rig(args.rig.as_deref())?;
+    args.flags.refuse("dpm plan", &["--frames", "--seconds", "--no-prediction"])?;
+    let rig = args.flags.rig_at_rest(args.rig.as_deref())?;
+    check_out(args.flags.out.as_deref())?;
     let report = scene_plan(&rig, args.measure)?;
     if args.json {
         print(&(to_json(&report) + "\n"));
-        return Ok(());
+        return write_out(args.flags.out.as_deref(), "plan.json", &report);
     }
     let mut text = String::new();
     report.warnings.iter().for_each(|w| text += &format!("note: {w}\n"));
@@ -68,5 +70,5 @@ pub fn execute(args: &PlanArgs) -> Result<(), Failure> {
         text += &format!("all that is left out and can be put back, together: {}\n", saved(s));
     }
     print(&text);
-    Ok(())
+    write_out(args.flags.out.as_deref(), "plan.json", &report)
 }

@@ -1,7 +1,7 @@
 //! `dpm run RIG.toml` and `dpm demo`: the rig from its file to light.
 
 use super::rig_args::RigArgs;
-use super::watch::{print, run_and_report, watch};
+use super::watch::{check_out, print, run_and_report, watch, write_out};
 use crate::config::ProjectorBackend;
 use crate::experiments::run_dlpc900::run_dlpc900;
 use crate::experiments::run_rig::run_rig;
@@ -51,9 +51,10 @@ pub fn execute_demo(args: &DemoArgs) -> Result<(), Failure> {
 fn start(path: Option<&Path>, flags: &RigArgs, json: bool) -> Result<(), Failure> {
     let rig = flags.rig(path)?;
     if matches!(rig.projector.backend, ProjectorBackend::Dlpc900(_)) {
+        check_out(flags.out.as_deref())?;
         let report = watch(rig, |_| {}, |rig, monitor| run_dlpc900(rig, monitor))?;
         print(&if json { to_json(&report) + "\n" } else { report.to_table() });
-        return Ok(());
+        return write_out(flags.out.as_deref(), "report.json", &report);
     }
     run_and_report(rig, json, run_rig)
 }

@@ -4,14 +4,16 @@ use super::keys::Keys;
 use super::signals;
 use crate::config::{InterlockConfig, OutputConfig, ProjectorBackend, RigConfig};
 use crate::control::{runtime_folder, ControlSocket};
-use crate::failure::{Failure, FailureKind};
-use crate::files::{InstanceLock, LockError};
+use crate::experiments::run_rig::{cannot_write, check_output_folder};
+use crate::failure::{Ended, Failure, FailureKind};
+use crate::files::{write_atomically, InstanceLock, LockError};
 use crate::interlock::Interlock;
 use crate::telemetry::monitor::{Order, ProjectorHealth, RunCounts, RunMonitor};
-use crate::telemetry::report::Report;
+use crate::telemetry::report::{to_json, Report};
 use indicatif::{ProgressBar, ProgressDrawTarget, ProgressStyle};
 use std::collections::VecDeque;
 use std::io::{IsTerminal, Write};
+use std::path::Path;
 use std::sync::mpsc::{channel, RecvTimeoutError};
 use std::sync::Arc;
 use std::time::{Duration, Instant};
@@ -31,11 +33,35 @@ const DARK_WITHIN: Duration = Duration::from_millis(500);
 pub fn run_and_report(
     rig: RigConfig,
     json: bool,
-    run: impl FnOnce(&RigConfig, &Arc<RunMonitor>) -> Result<Report, Failure> + Send + 'static,
+    run: impl FnOnce(&RigConfig, &Arc<RunMonitor>) -> Result<Ended<Report>, Failure> + Send + 'static,
 ) -> Result<(), Failure> {
-    let report = watch(rig, |_| {}, run)?;
+    let Ended { report, failure } = watch(rig, |_| {}, run)?;
     print(&if json { report.to_json() + "\n" } else { report.to_table() });
+    failure.map_or(Ok(()), Err)?;
     report.check_lit()
+}
+
+/// Writes the report of a command that makes no others as `name` into the folder that `--out` names, where it does.
+///
+/// # Errors
+/// The folder or the file cannot be written.
+pub(super) fn write_out<T: serde::Serialize>(
+    out: Option<&Path>,
+    name: &str,
+    report: &T,
+) -> Result<(), Failure> {
+    let Some(folder) = out else { return Ok(()) };
+    let path = folder.join(name);
+    let text = to_json(report) + "\n";
+    write_atomically(&path, |file| file.write_all(text.as_bytes())).map_err(|e| cannot_write(&path, &e))
+}
+
+/// Sees that files can be written into the folder that `--out` names, before the work.
+///
+/// # Errors
+/// They cannot.
+pub(super) fn check_out(out: Option<&Path>) -> Result<(), Failure> {
+    out.map_or(Ok(()), check_output_folder)
 }
 
 /// Runs `run` while its progress is shown on the standard error stream, given to `show`, and signals become an ordered stop. The
@@ -59,7 +85,7 @@ pub fn watch<T: Send + 'static>(
     }
     let tick = if matches!(rig.safety.interlock, InterlockConfig::Key(_)) { KEY_TICK } else { TICK };
     let (done, finished) = channel();
-    let frames = rig.run.frames;
+    let (frames, seconds) = (rig.run.frames, rig.run.seconds);
     let worker = {
         let monitor = Arc::clone(&monitor);
         std::thread::Builder::new()
@@ -71,7 +97,7 @@ pub fn watch<T: Send + 'static>(
             })
             .map_err(|e| Failure::new(FailureKind::Device, format!("cannot start a thread: {e}")))?
     };
-    let mut progress = Progress::new(frames);
+    let mut progress = Progress::new(frames, seconds);
     let mut health = ProjectorHealth::Connecting;
     let mut tracker_told = false;
     if let Some(interlock) = monitor.interlock() {
@@ -122,6 +148,7 @@ pub fn watch<T: Send + 'static>(
                 if std::mem::replace(&mut health, now) != now {
                     progress.note(&format!("projector: {now}"));
                 }
+                monitor.take_notes().iter().for_each(|note| progress.note(note));
                 if let (false, Some(word)) = (tracker_told, monitor.tracker()) {
                     tracker_told = true;
                     progress.note(word);
@@ -134,6 +161,7 @@ pub fn watch<T: Send + 'static>(
             }
         }
     };
+    monitor.take_notes().iter().for_each(|note| progress.note(note));
     // A panic was already turned into the error above.
     let _ = worker.join();
     monitor.take_notes().iter().for_each(|note| progress.note(note));
@@ -244,23 +272,46 @@ enum Shown {
 
 struct Progress {
     started: Instant,
+    /// Frames that the run was asked for; 0 for no end, or one in time.
     total: u64,
+    /// Seconds that the run was asked for; 0 for no end, or one in frames.
+    seconds: f64,
+    /// When the first frame was planned: an end in time counts from there.
+    began: Option<Instant>,
     rate: Rate,
     shown: Shown,
 }
 
 impl Progress {
-    fn new(total: u64) -> Self {
+    /// Towards `total` frames, or else `seconds` of time; 0 is no end.
+    fn new(total: u64, seconds: f64) -> Self {
+        let timed = total == 0 && seconds > 0.0;
         let shown = if std::io::stderr().is_terminal() {
-            let bar = if total > 0 { ProgressBar::new(total) } else { ProgressBar::no_length() };
+            let bar = match total {
+                0 if timed => ProgressBar::new((seconds * 1e3) as u64),
+                0 => ProgressBar::no_length(),
+                _ => ProgressBar::new(total),
+            };
             bar.set_draw_target(ProgressDrawTarget::stderr());
-            let template = if total == 0 { "{wide_msg}" } else { "{bar:20} {wide_msg}" };
+            let template = if total == 0 && !timed { "{wide_msg}" } else { "{bar:20} {wide_msg}" };
             bar.set_style(ProgressStyle::with_template(template).expect("the template is a constant"));
             Shown::Bar(bar)
         } else {
             Shown::Lines { next: Duration::from_secs(1) }
         };
-        Self { started: Instant::now(), total, rate: Rate { seen: VecDeque::new() }, shown }
+        let rate = Rate { seen: VecDeque::new() };
+        Self { started: Instant::now(), total, seconds, began: None, rate, shown }
+    }
+
+    /// How far the run is: frames, or milliseconds where its end is one in time.
+    fn position(&mut self, counts: &RunCounts) -> u64 {
+        if self.total == 0 && self.seconds > 0.0 {
+            if counts.frames_planned > 0 {
+                self.began.get_or_insert_with(Instant::now);
+            }
+            return self.began.map_or(0, |began| began.elapsed().as_millis() as u64);
+        }
+        counts.frames_lit + counts.frames_dark + counts.frames_dropped + counts.frames_withheld
     }
 
     fn note(&self, text: &str) {
@@ -275,10 +326,9 @@ impl Progress {
     fn tick(&mut self, health: ProjectorHealth, counts: RunCounts) {
         let elapsed = self.started.elapsed();
         let rate = self.rate.at(elapsed, counts.frames_lit);
+        let done = self.position(&counts);
         match &mut self.shown {
             Shown::Bar(bar) => {
-                let done =
-                    counts.frames_lit + counts.frames_dark + counts.frames_dropped + counts.frames_withheld;
                 bar.set_position(done);
                 bar.set_message(told(health, &counts, self.total, rate));
                 bar.tick();
@@ -291,6 +341,7 @@ impl Progress {
                         "elapsed_s": (elapsed.as_secs_f64() * 1e3).round() / 1e3,
                         "projector": health.word().to_lowercase(),
                         "frames_total": self.total,
+                        "seconds_total": self.seconds,
                         "frames_lit": counts.frames_lit,
                         "frames_lit_per_s": (rate * 10.0).round() / 10.0,
                         "frames_dark": counts.frames_dark,

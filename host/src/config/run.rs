@@ -206,6 +206,9 @@ section! {
     pub struct RunConfig {
         /// Frames to light; 0 runs until it is told to stop.
         frames: u64 = 0, "frames", Any;
+        /// Seconds to run for, counted from the first frame: of the wall clock at real pace, however many frames that makes, and of the rig's own clock at
+        /// virtual pace; 0 is no limit.
+        seconds: f64 = 0.0, "s", Within(0.0, 1e9);
     }
 }
 

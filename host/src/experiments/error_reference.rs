@@ -5,6 +5,7 @@ use super::sequence::{eye_mean, rmse, Theatre};
 use super::stamp::Fnv;
 use crate::files::write_atomically;
 use crate::render::method::{Method, SamplerKind};
+use dpm_device::regular_file;
 use glam::Vec3;
 use std::fmt::Write as _;
 use std::io::Write as _;
@@ -100,7 +101,7 @@ pub fn mean_of(values: &[Vec3]) -> f64 {
 
 /// Frames of `probes` values from the cache; `None` when there are none or they do not fit.
 fn read_frames(path: &Path, probes: usize) -> Option<Vec<Vec<Vec3>>> {
-    let bytes = std::fs::read(path).ok()?;
+    let bytes = regular_file::read(path, (EYE_FRAMES * probes * 12) as u64).ok()?;
     if probes == 0 || bytes.len() != EYE_FRAMES * probes * 12 {
         return None;
     }

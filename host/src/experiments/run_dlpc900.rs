@@ -199,7 +199,7 @@ pub fn run_dlpc900(config: &RigConfig, monitor: &RunMonitor) -> Result<Dlpc900Re
         }
     };
     let seconds = match config.run.frames {
-        0 => None,
+        0 => Some(config.run.seconds).filter(|s| *s > 0.0),
         frames => Some(frames as f64 / config.projector.frame_rate.hz()),
     };
     let mut report = present(&mut open, &show, seconds, monitor)?;

@@ -131,7 +131,8 @@ impl Collector {
         let points = (0..rig.bodies.len()).map(|i| registration_points(&rig, i)).collect();
         let measured = rig.config.real_time.pace == Pace::Real;
         // A tenth of a known run, but enough frames for a 99th percentile.
-        let batch_frames = (rig.config.run.frames / 10).clamp(100, 10_000);
+        let frames = rig.config.run.frames.max(rig.config.slots_to_run());
+        let batch_frames = (frames / 10).clamp(100, 10_000);
         let is_mock_tracker = matches!(rig.config.tracker, TrackerConfig::Mock(_));
         let is_mock_projector = matches!(rig.config.projector.backend, ProjectorBackend::Mock(_));
         let profiler =
@@ -308,7 +309,7 @@ impl Collector {
                 self.stages[stage as usize].saturating_record(ns);
             }
         }
-        self.placement.observe(&self.rig.camera, &job.tracked_poses, job.tracked, &self.points);
+        self.placement.observe(&self.rig.camera, &job.sampled_poses, &job.seen, &self.points);
         let sent = job.is_sent();
         let refused = !sent && !matches!(job.fate, Fate::Overtaken | Fate::Stopped);
         self.slots.planned(job.slot, &job.timeline, refused, job.waited_for_memory);

@@ -36,7 +36,7 @@ use dpm_device::transport::Transport;
 use dpm_handoff::channel::{channel, Sender};
 use dpm_handoff::wake::WaitPolicy;
 use glam::DVec3;
-use hil_mock::projector::{DeviceClock, MockConfig, MockProjector};
+use hil_mock::projector::{DeviceClock, EmulatedProjector, MockConfig};
 use std::sync::atomic::{AtomicBool, AtomicI64, AtomicU64, Ordering};
 use std::sync::{Arc, Mutex};
 use std::time::Duration;
@@ -95,7 +95,7 @@ fn run_from(
     let parts = crew_parts(&rig, gpu, options, &clock)?;
     let frame_ns = parts.frame_ns;
     let (lights_in, lights) = channel(LIGHTS, WaitPolicy::Park);
-    let (far, warnings) = far_end(&rig, lights_in, options, gpu.is_none())?;
+    let (far, warnings) = far_end(&rig, lights_in, options, gpu.is_none(), clock.now())?;
     let mut link = HostLink::new(projector::link_settings(&rig.config, rig.camera.raster));
     let rights = Arc::new(Rights::new(&rig.config.real_time));
     let standstill = match &*clock {
@@ -193,11 +193,7 @@ fn run_from(
         software_gpu: gpu.is_some_and(|gpu| gpu.summary().software),
         method: if gpu.is_some() { config.render.method.word() } else { "prepared" },
         prediction: config.prediction.on,
-        // Where light is not hashed, there is nothing to show.
-        light_hash: recorder
-            .as_ref()
-            .filter(|_| options.verify)
-            .map_or_else(String::new, |r| format!("{:016x}", r.light_hash)),
+        light_hash: recorder.as_ref().and_then(LightRecorder::hash).unwrap_or_default(),
         projector: Some(carried),
         slots_per_frame: shared.stride_milli.load(Ordering::Relaxed) as f64 / 1e3,
         predict_ms: shared.predict_ns.load(Ordering::Relaxed) as f64 / 1e6,
@@ -297,7 +293,7 @@ fn lay_cable(
             (Cable::Outside(medium), None, Some(lights))
         }
         Far::Mock(mock, recorder) if matches!(**clock, RunClock::Virtual(_)) => {
-            (Cable::Direct(Box::new(Direct::new(*mock)), recorder), None, None)
+            (Cable::Direct(Box::new(Direct::new(mock)), recorder), None, None)
         }
         Far::Mock(mock, recorder) => {
             let frame_bytes =
@@ -305,7 +301,7 @@ fn lay_cable(
             let (host_end, device_end) = threaded(frame_bytes, CABLE_BUFFERS, policy(rig));
             let (clock, rights) = (clock.clone(), rights.clone());
             let thread = named("mock")
-                .spawn(move || device_thread(device_end, *mock, recorder, &clock, &rights))
+                .spawn(move || device_thread(device_end, mock, recorder, &clock, &rights))
                 .map_err(no_thread("mock projector"))?;
             (Cable::Threaded(host_end), Some(thread), None)
         }
@@ -416,18 +412,19 @@ fn frame_memory(
 /// The other end of the cable.
 enum Far {
     /// The mock, and who watches its light.
-    Mock(Box<MockProjector>, LightRecorder),
+    Mock(EmulatedProjector, LightRecorder),
     /// A projector outside this process, and where notes of its light go.
     Outside(Box<dyn Transport>, Sender<LightNote>),
 }
 
 /// The projector of the rig file, dark, and what the operator should know about its medium. `lights` is where its light is told;
-/// `marked` says that frames carry marks to be looked for.
+/// `marked` says that frames carry marks to be looked for; times of injected faults count from `start`.
 fn far_end(
     rig: &Rig,
     lights: Sender<LightNote>,
     options: RunOptions,
     marked: bool,
+    start: HostTime,
 ) -> Result<(Far, Vec<String>), PipelineError> {
     let (config, raster) = (&rig.config, rig.camera.raster);
     let backend = &config.projector.backend;
@@ -438,7 +435,9 @@ fn far_end(
         setup.flash_limit = projector::flash_limit(config);
         let marks = marked.then(|| config.projector.schedule());
         let recorder = LightRecorder::new(lights, options.keep_frames, options.verify, marks);
-        return Ok((Far::Mock(Box::new(MockProjector::new(setup)), recorder), Vec::new()));
+        let emulated = EmulatedProjector::new(setup, &mock.faults, config.render.seed, start)
+            .map_err(|e| RigError::Unsupported(format!("projector.backend.faults: {e}")))?;
+        return Ok((Far::Mock(emulated, recorder), Vec::new()));
     }
     let medium = projector::open(config, raster)?.ok_or_else(|| {
         RigError::Unsupported(format!(

@@ -6,7 +6,7 @@ use crate::clock::Stopwatch;
 use crate::config::TrackerConfig;
 use crate::frame::{FrameId, Stage};
 use crate::gpu::GpuError;
-use crate::pack::{self, Kernel};
+use crate::pack::{self, Kernel, Shown};
 use crate::plan::dark::DarkCause;
 use crate::render::{FrameInputs, Renderer};
 use crate::rig::{affine, Rig};
@@ -200,7 +200,7 @@ pub fn plan(job: &mut FrameJob, rig: &Rig, snapshot: &TrackSnapshot, inputs: &Pl
     note.sampled_poses.clear();
     note.dark.clear();
     memory.lost.clear();
-    note.tracked = 0;
+    note.seen.clear();
     // Of the bodies that are lit; of those that are dark only where none is lit.
     let mut oldest: [Option<(HostTime, HostTime)>; 2] = [None; 2];
     for (i, body) in rig.bodies.iter().enumerate() {
@@ -233,7 +233,8 @@ pub fn plan(job: &mut FrameJob, rig: &Rig, snapshot: &TrackSnapshot, inputs: &Pl
         note.sampled_poses.push(sampled);
         note.dark.push(dark);
         memory.lost.push(dark.is_some());
-        note.tracked |= u64::from(dark.is_none() && i < 64) << (i % 64);
+        // Where the tracker saw it last is where the tracker says that it is, whether or not that is new enough for light.
+        note.seen.push(track.is_some());
     }
     // What is dark has no age.
     note.oldest_captured_at = oldest[0].map(|(captured, _)| captured);
@@ -344,7 +345,8 @@ pub fn pack(job: &mut FrameJob, kernel: Kernel, verify: bool, prepared: &mut Opt
         }
         note.timeline.wall_ns[Stage::Pack as usize] = watch.elapsed_ns();
         if verify {
-            note.code_hash = hash_codes(codes.iter().map(|c| c & 0x00ff_ffff));
+            let shown = Shown::by(memory.planes.schedule());
+            note.code_hash = hash_codes(codes.iter().map(|&c| shown.light(c)));
         }
     } else if let Some(prepared) = prepared {
         prepared.pack(kernel, note.id.0, &mut memory.planes);

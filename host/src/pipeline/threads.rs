@@ -410,11 +410,14 @@ impl<'a> Planner<'a> {
             let latch_at = time.host_of_slot(self.next_slot).plus_ns(-self.modelled_ns);
             shared.clock.wait_until(latch_at);
             job.note.latch_due_at = latch_at;
-            crew.listen_to.store(latch_at.0, Ordering::Release);
+            // What arrives later than this is no pose yet when the frame is latched.
+            let track_ns = i64::from(shared.rig.config.real_time.stage_costs_us.track) * 1000;
+            let heard = latch_at.plus_ns(-track_ns);
+            crew.listen_to.store(heard.0, Ordering::Release);
             if let Some(tracking) = crew.tracking.get() {
                 tracking.unpark();
             }
-            while self.inbox.latest.latest().0.through < latch_at && !crew.is_dismissed(shared) {
+            while self.inbox.latest.latest().0.through < heard && !crew.is_dismissed(shared) {
                 std::thread::yield_now();
             }
             return (latch_at, self.modelled_ns);
