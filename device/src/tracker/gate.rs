@@ -16,6 +16,8 @@ pub struct PacketCounters {
     pub used: u64,
     /// Not from the configured address.
     pub foreign_source: u64,
+    /// From the configured address, but from a port that the server does not send from.
+    pub foreign_port: u64,
     /// Contradicting themselves: lengths, counts, checksums, terminators.
     pub malformed: u64,
     /// Of a version or kind that this client does not speak or did not ask for.
@@ -25,7 +27,7 @@ pub struct PacketCounters {
 impl PacketCounters {
     /// Sum of all reasons for not using a packet.
     pub const fn dropped(&self) -> u64 {
-        self.foreign_source + self.malformed + self.unsupported
+        self.foreign_source + self.foreign_port + self.malformed + self.unsupported
     }
 }
 
@@ -94,6 +96,7 @@ impl core::fmt::Display for TrackerCounters {
         let reasons = [
             ("packets received", p.received),
             ("from elsewhere", p.foreign_source),
+            ("from another port", p.foreign_port),
             ("malformed", p.malformed),
             ("unsupported", p.unsupported),
             ("unknown body", s.unknown_body),
