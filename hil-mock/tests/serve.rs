@@ -2,10 +2,10 @@
 
 use std::io::{BufRead, BufReader};
 use std::net::{TcpListener, UdpSocket};
-use std::process::{Child, Command, Stdio};
+use std::process::{Child, ChildStdout, Command, Stdio};
 
-/// The program, ended with the test.
-struct Served(Child);
+/// The program, ended with the test, and its output, which must stay open as long as it speaks.
+struct Served(Child, Option<BufReader<ChildStdout>>);
 
 impl Drop for Served {
     fn drop(&mut self) {
@@ -22,9 +22,10 @@ fn command(words: &[&str]) -> Command {
 
 /// Starts it and waits for its first line, which it prints once it serves.
 fn serve(words: &[&str]) -> Served {
-    let mut served = Served(command(words).stdout(Stdio::piped()).spawn().expect("starts"));
+    let mut served = Served(command(words).stdout(Stdio::piped()).spawn().expect("starts"), None);
     let mut line = String::new();
-    BufReader::new(served.0.stdout.take().expect("piped")).read_line(&mut line).expect("a line");
+    let output = BufReader::new(served.0.stdout.take().expect("piped"));
+    served.1.insert(output).read_line(&mut line).expect("a line");
     assert!(line.contains(" on "), "{words:?}: {line}");
     served
 }
@@ -48,11 +49,12 @@ fn a_second_server_on_the_same_port_is_refused_by_name() {
         (vec!["projector", "--usbip", &usb], "--usbip"),
         (vec!["dlpc900", "--usbip", &usb], "--usbip"),
     ] {
-        let _first = serve(&words);
+        let mut first = serve(&words);
         let second = command(&words).output().expect("runs");
         let told = String::from_utf8_lossy(&second.stderr);
         assert_eq!(second.status.code(), Some(1), "{words:?}: {told}");
         let port = words[2].rsplit(':').next().expect("a port");
+        assert!(first.0.try_wait().expect("asked").is_none(), "{words:?}: the first one ended");
         assert!(told.contains("another program") && told.contains(flag) && told.contains(port), "{told}");
     }
 }
