@@ -194,7 +194,10 @@ fn what_waited_in_the_port_is_not_handed_out() {
         // Nothing from before the port was opened, and each where the body was when it was captured: within 40 mm at 1 m/s on a busy
         // machine, where a sample that waited was 340 mm off.
         for s in &samples {
-            assert!(s.captured_at.ns_since(opened) > -50 * MS, "opening {opening}: {s:?}, opened at {opened:?}");
+            assert!(
+                s.captured_at.ns_since(opened) > -50 * MS,
+                "opening {opening}: {s:?}, opened at {opened:?}"
+            );
             let p = truth.source().true_pose(s.body, s.captured_at.0).unwrap().position_m;
             assert!((p[0] - s.pose.position_m[0]).abs() < 0.04, "opening {opening}: {s:?} instead of {p:?}");
         }

@@ -15,7 +15,7 @@ use std::sync::Arc;
 use std::time::{Duration, Instant};
 
 /// How often signals are looked at and the bar is drawn.
-const TICK: Duration = Duration::from_millis(50);
+const TICK: Duration = Duration::from_millis(5);
 
 /// Watches `run` (see [`watch`]), then prints the report to the standard output, as JSON or as a table.
 ///

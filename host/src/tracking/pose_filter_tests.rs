@@ -462,7 +462,8 @@ fn every_tracker_rate_is_followed_alike() {
                 verdicts.push(feed(&mut filter, k));
                 k += 1;
                 // With a `predict_ms` below the period the rate must be measured before samples are taken for neighbours.
-                let most = if period <= lost_after_ns { ACQUIRE_SAMPLES } else { ACQUIRE_SAMPLES + LEAST_INTERVALS };
+                let most =
+                    if period <= lost_after_ns { ACQUIRE_SAMPLES } else { ACQUIRE_SAMPLES + LEAST_INTERVALS };
                 assert!(verdicts.len() <= most, "{what}: {verdicts:?}");
             }
             for _ in 0..60 {
@@ -478,11 +479,19 @@ fn every_tracker_rate_is_followed_alike() {
                 // What this rate brings with it is no drop-out.
                 assert_eq!(predicted.freshness, Freshness::Tracked, "{what}, {horizon_ns} ns ahead");
             }
-            assert_eq!(filter.freshness(HostTime((k - 1) * period + lost_after_ns + 1)), Freshness::Lost, "{what}");
+            assert_eq!(
+                filter.freshness(HostTime((k - 1) * period + lost_after_ns + 1)),
+                Freshness::Lost,
+                "{what}"
+            );
             // Two samples in a row missing, again and again.
             for _ in 0..20 {
                 k += 2;
-                assert_eq!(feed(&mut filter, k), Verdict::Accepted, "{what}: track ended by two missing samples");
+                assert_eq!(
+                    feed(&mut filter, k),
+                    Verdict::Accepted,
+                    "{what}: track ended by two missing samples"
+                );
                 for next in k + 1..k + 4 {
                     assert_eq!(feed(&mut filter, next), Verdict::Accepted, "{what}");
                 }
@@ -509,11 +518,8 @@ fn every_tracker_rate_is_followed_alike() {
 /// it, but no frame is without a pose, and none is thrown.
 #[test]
 fn noisy_trackers_of_every_rate_are_followed() {
-    let swing = MotionSpec::Sinusoid {
-        direction: [1.0, 0.0, 0.0],
-        peak_speed_m_s: 0.5,
-        peak_acceleration_m_s2: 2.0,
-    };
+    let swing =
+        MotionSpec::Sinusoid { direction: [1.0, 0.0, 0.0], peak_speed_m_s: 0.5, peak_acceleration_m_s2: 2.0 };
     // 99th percentile allowed, metres: a period and a half of 2 m/s2, unforeseen, and what 0.1 mm of noise make of the rest.
     for hz in [30u32, 60, 120, 500, 1000] {
         let mut rig = EvaluationConfig::with_noise(1e-4, 1e-3);
@@ -524,9 +530,18 @@ fn noisy_trackers_of_every_rate_are_followed() {
         let errors = evaluate(&swing, filter, &rig).unwrap();
         let period_s = 1.0 / f64::from(hz);
         let allowed = 4e-4 + 2.0 * (1.5 * period_s).powi(2);
-        println!("{hz} Hz: p50 {:.3} p99 {:.3} max {:.3} mm", errors.position_m.p50 * 1e3, errors.position_m.p99 * 1e3, errors.position_m.max * 1e3);
+        println!(
+            "{hz} Hz: p50 {:.3} p99 {:.3} max {:.3} mm",
+            errors.position_m.p50 * 1e3,
+            errors.position_m.p99 * 1e3,
+            errors.position_m.max * 1e3
+        );
         assert_eq!(errors.frames_without_pose, 0, "{hz} Hz");
         assert!(errors.position_m.p99 < allowed, "{hz} Hz: {:?}, {allowed} allowed", errors.position_m);
-        assert!(errors.horizon_ns.1 as f64 * 1e-9 < 2.0 * period_s + 6e-3, "{hz} Hz: {:?}", errors.horizon_ns);
+        assert!(
+            errors.horizon_ns.1 as f64 * 1e-9 < 2.0 * period_s + 6e-3,
+            "{hz} Hz: {:?}",
+            errors.horizon_ns
+        );
     }
 }

@@ -676,6 +676,10 @@ impl Tracker for NatNetClient {
     fn status(&self) -> String {
         super::report::status(self)
     }
+
+    fn warning(&self) -> Option<String> {
+        super::report::warning(self)
+    }
 }
 
 /// What [`super::report`] needs to know and nobody else.

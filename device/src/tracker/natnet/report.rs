@@ -45,19 +45,41 @@ pub(super) fn status(client: &NatNetClient) -> String {
             let _ = write!(text, ", {name} {count}");
         }
     }
-    let refused = client.counters().packets.foreign_port;
-    if refused > 0 {
-        let _ = write!(
-            text,
-            "; WARNING: {refused} packets came from {} but from ports {:?}, which are not the server's, and were refused: \
-             another program there sends tracker data, or tracker.command_port and tracker.data_port are not those of the server",
-            inside.config.server, inside.strange_ports
-        );
+    if let Some(refused) = refused_ports(client) {
+        let _ = write!(text, "; WARNING: {refused}");
     }
     if inside.is_filtered {
         text.push_str("; strangers flooded the port and are dropped by the kernel, uncounted");
     }
     text
+}
+
+fn refused_ports(client: &NatNetClient) -> Option<String> {
+    let (refused, inside) = (client.counters().packets.foreign_port, client.inside());
+    (refused > 0).then(|| {
+        format!(
+            "{refused} packets came from {} but from ports {:?}, which are not the server's, and were refused: another program there \
+             sends tracker data, or tracker.command_port and tracker.data_port are not those of the server",
+            inside.config.server, inside.strange_ports
+        )
+    })
+}
+
+/// What is behind [`crate::tracker::Tracker::warning`].
+pub(super) fn warning(client: &NatNetClient) -> Option<String> {
+    let mut all: Vec<String> = refused_ports(client).into_iter().collect();
+    let elsewhere = client.counters().packets.foreign_source;
+    if elsewhere > 0 {
+        let server = client.inside().config.server;
+        all.push(format!("{elsewhere} packets came from other addresses than {server} and were refused"));
+    }
+    if let Some(announced) = client.contradicted() {
+        all.push(format!(
+            "the server announces NatNet {announced}, and its frames have another layout, which is followed: update the tracking \
+             software, or choose its bit stream anew"
+        ));
+    }
+    (!all.is_empty()).then(|| format!("natnet tracker: {}", all.join("; ")))
 }
 
 fn explain(text: &mut String, client: &NatNetClient, reason: &Silence) {
