@@ -118,6 +118,12 @@ impl<T: Tracker> Recorder<T> {
         self.unrecorded
     }
 
+    /// True when the file could not be written on, for want of space for example; [`Recorder::finish`] has the reason. What was
+    /// written before can be played.
+    pub fn has_failed(&self) -> bool {
+        self.shared.failed.load(Ordering::Relaxed)
+    }
+
     /// The tracker recorded.
     pub fn inner(&self) -> &T {
         &self.inner
@@ -162,6 +168,10 @@ impl<T: Tracker> Tracker for Recorder<T> {
 
     fn name(&self) -> &str {
         self.inner.name()
+    }
+
+    fn warning(&self) -> Option<String> {
+        self.inner.warning()
     }
 
     fn status(&self) -> String {

@@ -1,5 +1,6 @@
 //! `dpm run RIG.toml` and `dpm demo`: the rig from its file to light.
 
+use super::dlpc900::Guard;
 use super::rig_args::RigArgs;
 use super::watch::{check_out, print, run_and_report, watch, write_out};
 use crate::config::ProjectorBackend;
@@ -50,9 +51,20 @@ pub fn execute_demo(args: &DemoArgs) -> Result<(), Failure> {
 
 fn start(path: Option<&Path>, flags: &RigArgs, json: bool) -> Result<(), Failure> {
     let rig = flags.rig(path)?;
-    if matches!(rig.projector.backend, ProjectorBackend::Dlpc900(_)) {
+    if let ProjectorBackend::Dlpc900(backend) = &rig.projector.backend {
         check_out(flags.out.as_deref())?;
-        let report = watch(rig, |_| {}, |rig, monitor| run_dlpc900(rig, monitor))?;
+        let device = backend.device.clone();
+        let report = watch(
+            rig,
+            |_| {},
+            move |rig, monitor| {
+                // Not before this instance has the controller's lock. A panic leaves without a word, as a SIGKILL does.
+                let guard = Guard::start(device.as_deref());
+                let result = run_dlpc900(rig, monitor);
+                guard.dismiss();
+                result
+            },
+        )?;
         print(&if json { to_json(&report) + "\n" } else { report.to_table() });
         return write_out(flags.out.as_deref(), "report.json", &report);
     }

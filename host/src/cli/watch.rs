@@ -2,7 +2,7 @@
 
 use super::keys::Keys;
 use super::signals;
-use crate::config::{InterlockConfig, OutputConfig, ProjectorBackend, RigConfig};
+use crate::config::{OutputConfig, ProjectorBackend, RigConfig};
 use crate::control::{runtime_folder, ControlSocket};
 use crate::experiments::run_rig::{cannot_write, check_output_folder};
 use crate::failure::{Ended, Failure, FailureKind};
@@ -19,9 +19,7 @@ use std::sync::Arc;
 use std::time::{Duration, Instant};
 
 /// How often signals are looked at and the bar is drawn.
-const TICK: Duration = Duration::from_millis(50);
-/// The same where a key that is held down must be noticed.
-const KEY_TICK: Duration = Duration::from_millis(5);
+const TICK: Duration = Duration::from_millis(5);
 
 /// How long the link is given to make the projector dark when the run itself will not return.
 const DARK_WITHIN: Duration = Duration::from_millis(500);
@@ -83,7 +81,6 @@ pub fn watch<T: Send + 'static>(
     if let Some(interlock) = Interlock::of_config(&rig.safety.interlock, keys.is_some())? {
         monitor.set_interlock(interlock);
     }
-    let tick = if matches!(rig.safety.interlock, InterlockConfig::Key(_)) { KEY_TICK } else { TICK };
     let (done, finished) = channel();
     let (frames, seconds) = (rig.run.frames, rig.run.seconds);
     let worker = {
@@ -117,7 +114,7 @@ pub fn watch<T: Send + 'static>(
         }
     }
     let result = loop {
-        match finished.recv_timeout(tick) {
+        match finished.recv_timeout(TICK) {
             Ok(result) => break result,
             Err(RecvTimeoutError::Timeout) => {
                 if let Some(signal) = signals::received() {

@@ -142,9 +142,10 @@ impl TrackingStage {
         self.unseen(rig, "has not seen", "and no light falls there until it does")
     }
 
-    /// The same at the end of a run.
+    /// The same at the end of a run, and what else the tracker has to say.
     pub fn never_seen(&self, rig: &Rig) -> Option<String> {
-        self.unseen(rig, "never saw", "so no light fell there")
+        let unseen = self.unseen(rig, "never saw", "so no light fell there");
+        unseen.into_iter().chain(self.tracker.warning()).reduce(|a, b| format!("{a}; {b}"))
     }
 
     fn unseen(&self, rig: &Rig, verb: &str, consequence: &str) -> Option<String> {
