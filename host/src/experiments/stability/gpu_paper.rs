@@ -176,7 +176,8 @@ fn disk_blends_in(gpu: &Arc<Gpu>, seed: u64) -> f64 {
         zones[usize::from(share > 0.1) + usize::from(share > 0.9)] += 1;
         for c in 0..3 {
             let (own, disk) = (f64::from(without[i][c]), f64::from(whole[i][c]));
-            let off = (f64::from(shown[i][c]) - (own + share * (disk - own))).abs() / (0.05 + (disk - own).abs());
+            let off =
+                (f64::from(shown[i][c]) - (own + share * (disk - own))).abs() / (0.05 + (disk - own).abs());
             worst = if off.is_nan() { f64::INFINITY } else { worst.max(off) };
             changed += (disk - own).abs() / (3 * pixels.len()) as f64;
         }
