@@ -4,11 +4,12 @@ use super::error_files::{known, known_or, merge, report, show, Kept, Origin};
 use super::progress::Progress;
 use super::rig_args::RigArgs;
 use super::watch::print;
-use crate::experiments::error_plan::{groups, Group};
+use crate::config::RenderConfig;
+use crate::experiments::error_plan::{contenders, groups, Group};
 use crate::experiments::error_plot::{curves, Cost};
 use crate::experiments::error_report::{csv, markdown};
 use crate::experiments::error_runs::{
-    ErrorOptions, ErrorRunError, ErrorRuns, Extent, GroupResult, EYE_FRAMES,
+    is_other, ErrorOptions, ErrorRunError, ErrorRuns, Extent, GroupResult, AT_EQUAL_TIME, EYE_FRAMES,
 };
 use crate::experiments::run_rig::open_gpu;
 use crate::failure::{Failure, FailureKind};
@@ -239,9 +240,20 @@ pub(super) fn weight(what: &str, group: Group, extent: Extent, methods: usize) -
         "reference" => EYE_FRAMES as f64 * f64::from(extent.reference_spp) / 2.0,
         "reference of every frame" => f64::from(extent.kept * extent.reference_spp),
         "times" => 40.0 / frames * sequence * methods as f64,
+        // About twice the samples, for the warm-up and the frames that the eye sees.
+        what if what.ends_with(AT_EQUAL_TIME) => {
+            f64::from(extent.warm_up + EYE_FRAMES as u32) * (2.0 * group.budget.max(1.0) + 3.0)
+        }
         _ => sequence,
     };
     of as u64
+}
+
+/// All that is drawn of a group, without its reference: each method twice, the races, and each of the others twice at equal time.
+pub(super) fn weight_of_methods(group: Group, extent: Extent, methods: usize) -> u64 {
+    let of = |what: &str| weight(what, group, extent, methods);
+    let others = contenders(&RenderConfig::default(), false).iter().filter(|c| is_other(c.name)).count();
+    2 * methods as u64 * of("") + 3 * of("times") + 2 * others as u64 * of(AT_EQUAL_TIME)
 }
 
 fn measure(
@@ -260,7 +272,7 @@ fn measure(
         let measured = if known::<GroupResult>(out, &group.name(), &runs.key(group)).is_some() {
             0
         } else {
-            2 * methods as u64 * of("") + of("times") + reference
+            weight_of_methods(group, extent, methods) + reference
         };
         measured + if args.sequences { methods as u64 * of("") + every } else { 0 }
     };

@@ -25,9 +25,15 @@ pub struct PlanArgs {
 }
 
 fn saved(s: &Saving) -> String {
+    let [low, high] = s.saved_middle_half_ms;
+    let told = if s.stands_out() { "" } else { ", not told from chance" };
+    let cost = format!(
+        "the part takes {:+.2} ms (middle half of the frames {low:+.2} to {high:+.2}{told})",
+        s.saved_ms
+    );
     if s.changes_pictures {
         return format!(
-            "{:.2} ms and {:.0} rays without, {:.2} ms and {:.0} rays with; pixels differ by {:.1} % RMS",
+            "{:.2} ms and {:.0} rays without, {:.2} ms and {:.0} rays with: {cost}; pixels differ by {:.1} % RMS",
             s.without_ms,
             s.without_rays,
             s.with_ms,
@@ -36,7 +42,7 @@ fn saved(s: &Saving) -> String {
         );
     }
     let same = if s.pixels_identical { "same pixels" } else { "PIXELS DIFFER" };
-    format!("{:.2} ms instead of {:.2} ms, {same}", s.without_ms, s.with_ms)
+    format!("{:.2} ms instead of {:.2} ms: {cost}; {same}", s.without_ms, s.with_ms)
 }
 
 /// Prints the plan.

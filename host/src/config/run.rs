@@ -44,8 +44,10 @@ words! {
         Paper = "paper",
         /// \[Miyamoto22\], the second reference of \[paper\]: no shading rates, no spatial filter.
         Miyamoto = "miyamoto",
-        /// Every pixel in every frame, nothing reused.
+        /// Every pixel in every frame, independent samples, nothing reused.
         Full = "full",
+        /// Every pixel in every frame, nothing reused; each pixel goes on with one low-discrepancy sequence from frame to frame.
+        Sequence = "sequence",
     }
 }
 
@@ -78,7 +80,7 @@ section! {
         rate_map: Option<bool> = None, "", Any;
         /// Every second block in every second frame.
         checkerboard: Option<bool> = None, "", Any;
-        /// Blue-noise instead of white sample offsets.
+        /// Evenly spread samples (blue noise, or a sequence that goes on) in place of independent ones.
         blue_noise: Option<bool> = None, "", Any;
         /// Reuse of former frames.
         temporal_filter: Option<bool> = None, "", Any;
@@ -109,16 +111,17 @@ pub struct Effects {
 impl RenderConfig {
     /// The parts of the method that are on.
     pub fn effects_on(&self) -> Effects {
-        let (shared, own) = match self.method {
-            RenderMethod::Dpm | RenderMethod::Paper => (true, true),
-            RenderMethod::Miyamoto => (true, false),
-            RenderMethod::Full => (false, false),
+        let (shared, own, even_samples) = match self.method {
+            RenderMethod::Dpm | RenderMethod::Paper => (true, true, true),
+            RenderMethod::Miyamoto => (true, false, true),
+            RenderMethod::Sequence => (false, false, true),
+            RenderMethod::Full => (false, false, false),
         };
         let e = &self.effects;
         Effects {
             rate_map: e.rate_map.unwrap_or(own),
             checkerboard: e.checkerboard.unwrap_or(shared),
-            blue_noise: e.blue_noise.unwrap_or(shared),
+            blue_noise: e.blue_noise.unwrap_or(even_samples),
             temporal_filter: e.temporal_filter.unwrap_or(shared),
             spatial_filter: e.spatial_filter.unwrap_or(own),
             spp_by_angle: e.spp_by_angle.unwrap_or(shared),

@@ -72,6 +72,11 @@ impl Reference {
         (raw.sqrt(), (raw - own).max(0.0).sqrt())
     }
 
+    /// Error of what the eye sees of either run, as measured.
+    pub fn each_run(&self, eyes: &[Vec<Vec3>; 2]) -> [f64; 2] {
+        eyes.each_ref().map(|eye| rmse(eye, &self.eye, |_| true))
+    }
+
     /// RMS bias: the mean product of the two runs' differences from the two halves. No noise of any of the four is in it, so its
     /// expectation is the squared bias; 0 where chance makes it negative. Second: root of the standard error of that mean over the
     /// probes, what chance leaves of a bias of 0.
