@@ -281,10 +281,7 @@ fn compute_family(instance: &ash::Instance, physical: vk::PhysicalDevice) -> Opt
 }
 
 /// What a device is, and its identity.
-fn summarise(
-    instance: &ash::Instance,
-    physical: vk::PhysicalDevice,
-) -> (DeviceSummary, [u8; vk::UUID_SIZE]) {
+fn summarise(instance: &ash::Instance, physical: vk::PhysicalDevice) -> (DeviceSummary, [u8; vk::UUID_SIZE]) {
     let mut driver = vk::PhysicalDeviceDriverProperties::default();
     let mut subgroup = vk::PhysicalDeviceSubgroupProperties::default();
     let mut id = vk::PhysicalDeviceIDProperties::default();
@@ -337,8 +334,8 @@ struct Candidate {
 /// The loader's list.
 fn candidates(instance: &ash::Instance) -> Result<Vec<Candidate>, GpuError> {
     // SAFETY: plain enumeration.
-    let all = unsafe { instance.enumerate_physical_devices() }
-        .map_err(without_device("listing Vulkan devices"))?;
+    let all =
+        unsafe { instance.enumerate_physical_devices() }.map_err(without_device("listing Vulkan devices"))?;
     let mut found: Vec<Candidate> = Vec::with_capacity(all.len());
     for physical in all {
         let (summary, uuid) = summarise(instance, physical);

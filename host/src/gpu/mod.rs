@@ -18,8 +18,8 @@ mod pipeline;
 mod reopen;
 
 pub use buffer::{Buffer, MemoryKind};
-pub use commands::{CommandList, FrameFence, Recorder};
 pub(crate) use commands::run_now;
+pub use commands::{CommandList, FrameFence, Recorder};
 pub use context::{memory_given_up, validation_messages, DeviceSummary, Gpu, GpuOptions, MemoryGivenUp};
 pub use error::{GpuError, MemoryPool};
 pub use loss::{AfterLoss, LossBudget};

@@ -114,8 +114,7 @@ impl BindingSet {
             let mut bound = Self { set: vk::DescriptorSet::null(), pool, table: table.clone() };
             let layouts = [table.layout];
             let info = vk::DescriptorSetAllocateInfo::default().descriptor_pool(pool).set_layouts(&layouts);
-            bound.set =
-                gpu.device.allocate_descriptor_sets(&info).on(gpu, "allocating a descriptor set")?[0];
+            bound.set = gpu.device.allocate_descriptor_sets(&info).on(gpu, "allocating a descriptor set")?[0];
             for &(binding, kind) in &table.bindings {
                 let buffer = buffers
                     .iter()

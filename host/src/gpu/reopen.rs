@@ -27,8 +27,10 @@ impl Gpu {
     /// [`GpuError::NoneLeft`] with what was tried.
     pub fn reopen(&self) -> Result<Arc<Gpu>, GpuError> {
         self.give_up();
-        let none_left =
-            |tried: &[String]| GpuError::NoneLeft { device: self.device_name().clone(), tried: tried.join("; ") };
+        let none_left = |tried: &[String]| GpuError::NoneLeft {
+            device: self.device_name().clone(),
+            tried: tried.join("; "),
+        };
         let mut told = Vec::new();
         match self.same_again() {
             Ok(gpu) => return Ok(gpu),
@@ -46,7 +48,10 @@ impl Gpu {
             match self.open_now(id, COMES_BACK_WITHIN) {
                 Ok(gpu) => {
                     let (was, is) = (self.device_name(), gpu.device_name());
-                    tracing::warn!("{was} did not come back ({}); {is} goes on in its place", told.join("; "));
+                    tracing::warn!(
+                        "{was} did not come back ({}); {is} goes on in its place",
+                        told.join("; ")
+                    );
                     return Ok(gpu);
                 }
                 Err(error) => told.push(error.to_string()),
@@ -59,10 +64,11 @@ impl Gpu {
     fn same_again(&self) -> Result<Arc<Gpu>, GpuError> {
         let begin = Instant::now();
         loop {
-            let error = match self.open_now(self.id.clone(), COMES_BACK_WITHIN.saturating_sub(begin.elapsed())) {
-                Ok(gpu) => return Ok(gpu),
-                Err(error) => error,
-            };
+            let error =
+                match self.open_now(self.id.clone(), COMES_BACK_WITHIN.saturating_sub(begin.elapsed())) {
+                    Ok(gpu) => return Ok(gpu),
+                    Err(error) => error,
+                };
             // An attempt without time enough would only say that it had none.
             if begin.elapsed() + 2 * BETWEEN >= COMES_BACK_WITHIN {
                 return Err(error);
@@ -88,7 +94,10 @@ fn within<T: Send + 'static>(
     what: &'static str,
     work: impl FnOnce() -> Result<T, GpuError> + Send + 'static,
 ) -> Result<T, GpuError> {
-    let late = |_| GpuError::Timeout { device: format!("the Vulkan driver ({what})").into(), waited_ms: limit.as_millis() as u64 };
+    let late = |_| GpuError::Timeout {
+        device: format!("the Vulkan driver ({what})").into(),
+        waited_ms: limit.as_millis() as u64,
+    };
     let (sender, receiver) = sync_channel(1);
     let thread = std::thread::Builder::new().name("dpm-gpu-open".into()).spawn(move || {
         let _ = sender.send(work());

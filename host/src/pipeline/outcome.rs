@@ -117,10 +117,11 @@ pub enum PipelineError {
         stage: &'static str,
     },
     /// Stages were made anew too often.
-    #[error("{count} failures within a minute, the last: {last}; the run ends in the dark")]
+    #[error(
+        "more than {} failures within a minute, the last: {last}; the run ends in the dark",
+        crate::gpu::LossBudget::MOST
+    )]
     KeepsFailing {
-        /// Failures.
-        count: usize,
         /// The last one.
         last: String,
     },

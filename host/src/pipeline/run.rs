@@ -16,12 +16,11 @@ use super::supervisor::{join_within, Maker, Remake, Supervisor};
 use super::threads::{policy, Shared, FIRST_FRAME_TIMEOUT_NS, LISTEN_NS, NOTES, RECEIPT_NS, STAGE_THREADS};
 use crate::clock::{Clock, ManualClock, MonotonicClock, RunClock, Stopwatch};
 use crate::config::{Pace, Packer, ProjectorBackend, RenderMethod};
-use crate::gpu::{Gpu, GpuOptions};
+use crate::gpu::{Gpu, LossBudget};
 use crate::pack::{BitPlaneFrame, Kernel};
 use crate::plan::budget::{BudgetConfig, BudgetController};
 use crate::plan::horizon::Horizon;
 use crate::plan::lead::LeadEstimator;
-use crate::plan::losses::LossBudget;
 use crate::realtime::os::usable_cores;
 use crate::realtime::standstill::StandstillMonitor;
 use crate::render::method::Method;
@@ -354,11 +353,7 @@ fn maker(rig: &Arc<Rig>, gpu: Option<Arc<Gpu>>, options: RunOptions, clock: &Arc
     Arc::new(move |remake| {
         let mut gpu = gpu.lock().map_err(|_| PipelineError::Panicked("remake"))?;
         if let (Some(old), Remake::CrewAndGpu) = (gpu.as_mut(), remake) {
-            let options = GpuOptions {
-                validation: std::env::var_os("DPM_VALIDATION").is_some(),
-                device: rig.config.render.gpu.clone(),
-            };
-            *old = Gpu::open(&options).map_err(RenderError::from)?;
+            *old = old.reopen().map_err(RenderError::from)?;
         }
         crew_parts(&rig, gpu.as_ref(), options, &clock)
     })

@@ -312,26 +312,28 @@ const GPU_STEP_NS: u64 = 5_000_000;
 
 /// Waits for the GPU, if the job has one, in steps of [`GPU_STEP_NS`]; `alive` is called before each.
 ///
+/// False when it did not finish within `timeout_ns`.
+///
 /// # Errors
-/// The GPU did not finish within `timeout_ns`, or was lost.
-pub fn finish(job: &mut FrameJob, timeout_ns: u64, mut alive: impl FnMut()) -> Result<(), GpuError> {
-    let Some(slot) = job.memory.gpu.as_mut() else { return Ok(()) };
+/// The GPU was lost.
+pub fn finish(job: &mut FrameJob, timeout_ns: u64, mut alive: impl FnMut()) -> Result<bool, GpuError> {
+    let Some(slot) = job.memory.gpu.as_mut() else { return Ok(true) };
     let watch = Stopwatch::start();
     let cost = loop {
         alive();
         let left = timeout_ns.saturating_sub(watch.elapsed_ns());
-        match slot.wait(left.min(GPU_STEP_NS)) {
-            Ok(cost) => break cost,
-            Err(GpuError::Timeout(_)) if left > GPU_STEP_NS => {}
-            Err(GpuError::Timeout(_)) => return Err(GpuError::Timeout(timeout_ns / 1_000_000)),
-            Err(e) => return Err(e),
+        if let Some(cost) = slot.poll_done(left.min(GPU_STEP_NS))? {
+            break cost;
+        }
+        if left <= GPU_STEP_NS {
+            return Ok(false);
         }
     };
     let gpu: u64 = cost.pass_ns.iter().sum();
     job.note.cost = Some(cost);
     // The fence's wait overlaps other frames; the GPU's own time is the stage's cost where it is known.
     job.note.timeline.wall_ns[Stage::Render as usize] = if gpu > 0 { gpu } else { watch.elapsed_ns() };
-    Ok(())
+    Ok(true)
 }
 
 /// Packs the finished GPU's code values into planes; a job without GPU takes its code values from `prepared`.

@@ -13,7 +13,7 @@ use super::outcome::PipelineError;
 use super::pulse::Silence;
 use super::threads::Shared;
 use crate::clock::{Clock, RunClock};
-use crate::plan::losses::LossBudget;
+use crate::gpu::{AfterLoss, LossBudget};
 use dpm_device::time::HostTime;
 use dpm_handoff::channel::Sender;
 use std::sync::atomic::{AtomicBool, Ordering};
@@ -194,9 +194,8 @@ impl Supervisor {
             return Shift::Over;
         };
         crew.abandon();
-        if !self.losses.lose(now) {
-            let count = self.losses.count(now);
-            shared.fail(PipelineError::KeepsFailing { count, last: error.to_string() });
+        if self.losses.lost(now) == AfterLoss::GiveUp {
+            shared.fail(PipelineError::KeepsFailing { last: error.to_string() });
             return Shift::Over;
         }
         shared

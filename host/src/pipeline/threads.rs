@@ -9,7 +9,6 @@ use super::rights::Rights;
 use super::stages::{self, LinkTime, PlanInputs, TrackSnapshot, TrackingStage};
 use crate::clock::{Clock, RunClock, Stopwatch};
 use crate::config::{Pace, Wait};
-use crate::gpu::GpuError;
 use crate::pack::Kernel;
 use crate::plan::budget::BudgetController;
 use crate::plan::horizon::Horizon;
@@ -510,11 +509,13 @@ pub(super) fn pack_thread(
             (true, _) => GPU_TIMEOUT_NS,
         };
         let alive = || pulse.beat(shared.clock.now(), WAIT_NS + STEP_NS);
-        if let Err(source) = stages::finish(&mut job, limit, alive) {
-            crew.fail(match source {
-                GpuError::Timeout(ms) => PipelineError::GpuHangs { frame: id, ms },
-                source => PipelineError::Gpu { frame: id, source },
-            });
+        let failure = match stages::finish(&mut job, limit, alive) {
+            Ok(true) => None,
+            Ok(false) => Some(PipelineError::GpuHangs { frame: id, ms: limit / 1_000_000 }),
+            Err(source) => Some(PipelineError::Gpu { frame: id, source }),
+        };
+        if let Some(failure) = failure {
+            crew.fail(failure);
             break;
         }
         if job.memory.gpu.is_some() {

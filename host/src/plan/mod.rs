@@ -5,5 +5,4 @@ pub mod dark;
 pub mod horizon;
 pub mod lead;
 pub mod light_centre;
-pub mod losses;
 pub mod slots;

@@ -114,9 +114,13 @@ fn text(path: &Path) -> String {
 fn library() -> std::io::Result<PathBuf> {
     let program = std::env::current_exe()?;
     let name = "libvulkan_faults.so";
-    (program.ancestors().skip(1).take(3).flat_map(|folder| [folder.join(name), folder.join("deps").join(name)]))
-        .find(|path| path.exists())
-        .ok_or_else(|| std::io::Error::other(format!("{name} is not beside {}", program.display())))
+    (program
+        .ancestors()
+        .skip(1)
+        .take(3)
+        .flat_map(|folder| [folder.join(name), folder.join("deps").join(name)]))
+    .find(|path| path.exists())
+    .ok_or_else(|| std::io::Error::other(format!("{name} is not beside {}", program.display())))
 }
 
 fn write_manifest(folder: &Path) -> std::io::Result<()> {
@@ -148,10 +152,7 @@ fn loader_variables(folder: &Path) -> Vec<(String, String)> {
     }
     let mut layers = vec![LAYER_NAME.to_owned()];
     layers.extend(was("VK_INSTANCE_LAYERS").filter(|l| !l.contains(LAYER_NAME)));
-    vec![
-        ("VK_LAYER_PATH".into(), folders.join(":")),
-        ("VK_INSTANCE_LAYERS".into(), layers.join(":")),
-    ]
+    vec![("VK_LAYER_PATH".into(), folders.join(":")), ("VK_INSTANCE_LAYERS".into(), layers.join(":"))]
 }
 
 /// The layer in this process.

@@ -138,7 +138,8 @@ unsafe extern "system" fn create_instance(
         let result = create(info, allocator, out);
         if result == vk::Result::SUCCESS {
             let handle = *out;
-            let fns = ash::InstanceFnV1_0::load(|name| address(get_instance_proc_addr(handle, name.as_ptr())));
+            let fns =
+                ash::InstanceFnV1_0::load(|name| address(get_instance_proc_addr(handle, name.as_ptr())));
             let data = InstanceData { handle, get_instance_proc_addr, fns, devices: Mutex::default() };
             table(&INSTANCES).insert(key(handle), Arc::new(data));
         }
@@ -285,8 +286,7 @@ impl DeviceData {
                 })
                 .collect();
             // SAFETY: the program keeps what it submitted alive until its fence is signalled; the lock keeps other submissions away.
-            let result =
-                unsafe { (self.fns.queue_submit)(queue, infos.len() as u32, infos.as_ptr(), fence) };
+            let result = unsafe { (self.fns.queue_submit)(queue, infos.len() as u32, infos.as_ptr(), fence) };
             if result != vk::Result::SUCCESS {
                 eprintln!("vulkan-faults: a submission that was held back failed: {result:?}");
             }
@@ -334,8 +334,7 @@ impl DeviceData {
         unsafe {
             let info = vk::CommandPoolCreateInfo::default().queue_family_index(family);
             let mut pool = vk::CommandPool::null();
-            if (f.create_command_pool)(self.handle, &info, std::ptr::null(), &mut pool)
-                != vk::Result::SUCCESS
+            if (f.create_command_pool)(self.handle, &info, std::ptr::null(), &mut pool) != vk::Result::SUCCESS
             {
                 return eprintln!("vulkan-faults: poison: no command pool");
             }
@@ -506,9 +505,8 @@ unsafe extern "system" fn wait_for_fences(
         }
         if wait_all == vk::FALSE && !free.is_empty() {
             // SAFETY: some of the caller's fences.
-            let result = unsafe {
-                (data.fns.wait_for_fences)(handle, free.len() as u32, free.as_ptr(), vk::FALSE, 0)
-            };
+            let result =
+                unsafe { (data.fns.wait_for_fences)(handle, free.len() as u32, free.as_ptr(), vk::FALSE, 0) };
             if result != vk::Result::TIMEOUT {
                 return result;
             }
@@ -619,12 +617,7 @@ unsafe extern "system" fn get_query_pool_results(
 
 /// # Safety
 /// As `vkGetDeviceQueue`.
-unsafe extern "system" fn get_device_queue(
-    handle: vk::Device,
-    family: u32,
-    index: u32,
-    out: *mut vk::Queue,
-) {
+unsafe extern "system" fn get_device_queue(handle: vk::Device, family: u32, index: u32, out: *mut vk::Queue) {
     // SAFETY: the caller's.
     unsafe {
         let data = device(handle);

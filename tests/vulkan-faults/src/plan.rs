@@ -161,7 +161,9 @@ impl Plan {
     /// The fault that strikes the call with this number; `gpu` is the device of the loader's list that it is for, where the call has one.
     pub fn fault(&self, call: Call, number: u64, gpu: Option<u64>) -> Option<Fault> {
         let strikes = |f: &&Fault| {
-            f.call == call && (f.first..=f.last).contains(&number) && f.gpu.is_none_or(|only| gpu == Some(only))
+            f.call == call
+                && (f.first..=f.last).contains(&number)
+                && f.gpu.is_none_or(|only| gpu == Some(only))
         };
         self.faults.iter().find(strikes).copied()
     }
@@ -232,9 +234,11 @@ mod tests {
 
     #[test]
     fn a_plan_strikes_the_calls_that_it_names_and_no_other() {
-        let plan: Plan =
-            "lost@frame=3; oom-device@create=2..4 ;late@submit=7..,ms=20;submit-hang@frame=3".parse().unwrap();
-        let struck = |call| -> Vec<u64> { (1..12).filter(|&n| plan.fault(call, n, None).is_some()).collect() };
+        let plan: Plan = "lost@frame=3; oom-device@create=2..4 ;late@submit=7..,ms=20;submit-hang@frame=3"
+            .parse()
+            .unwrap();
+        let struck =
+            |call| -> Vec<u64> { (1..12).filter(|&n| plan.fault(call, n, None).is_some()).collect() };
         assert_eq!(struck(Call::Frame), [3]);
         assert_eq!(plan.fault(Call::Frame, 3, None).unwrap().kind, Kind::Lost, "the first of the text wins");
         assert_eq!(struck(Call::Create), [2, 3, 4]);
@@ -244,7 +248,10 @@ mod tests {
             assert!(struck(call).is_empty(), "{call:?}");
         }
         let second: Plan = "init-failed@device=1..,gpu=2".parse().unwrap();
-        assert!(second.fault(Call::Device, 3, Some(2)).is_some() && second.fault(Call::Device, 3, Some(1)).is_none());
+        assert!(
+            second.fault(Call::Device, 3, Some(2)).is_some()
+                && second.fault(Call::Device, 3, Some(1)).is_none()
+        );
         assert_eq!("".parse::<Plan>(), Ok(Plan::default()));
         assert_eq!(" ; ;".parse::<Plan>(), Ok(Plan::default()));
     }

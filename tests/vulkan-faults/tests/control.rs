@@ -10,7 +10,9 @@ fn a_program_gets_the_layer_beside_those_that_it_has() {
     let value = |name: &str| variables.iter().find(|v| v.0 == name).map(|v| v.1.clone()).unwrap();
     let path = value("VK_LAYER_PATH");
     let folder = Path::new(path.split(':').next().unwrap());
-    assert!(path.contains("/usr/share/vulkan/explicit_layer.d") || std::env::var_os("VK_LAYER_PATH").is_some());
+    assert!(
+        path.contains("/usr/share/vulkan/explicit_layer.d") || std::env::var_os("VK_LAYER_PATH").is_some()
+    );
     assert!(value("VK_INSTANCE_LAYERS").contains(LAYER_NAME));
     assert_eq!(std::fs::read_to_string(value("DPM_VK_FAULTS_FILE")).unwrap(), "lost@frame=1");
     assert!(layer.set("nonsense").is_err());

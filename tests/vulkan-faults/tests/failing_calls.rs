@@ -32,7 +32,10 @@ fn every_call<T>(
                 return n;
             }
             Err(e) => {
-                assert!((n..n + WAYS).contains(&calls), "{calls} calls, of which {n} and all later ones failed: {e}");
+                assert!(
+                    (n..n + WAYS).contains(&calls),
+                    "{calls} calls, of which {n} and all later ones failed: {e}"
+                );
                 assert!(!e.is_loss() && !matches!(e, GpuError::Timeout { .. }), "call {n}: {e}");
                 let wanted = match kind {
                     "oom-device" => MemoryPool::Device,
@@ -109,8 +112,10 @@ fn a_loss_while_a_scene_is_loaded_is_told_at_once() {
             session.set("");
             let gpu = Gpu::open(&options()).unwrap();
             session.set(&plan);
-            let error =
-                Renderer::new(&gpu, &rig().scene, renderer_settings(rig())).map_err(gpu_error).err().expect("lost");
+            let error = Renderer::new(&gpu, &rig().scene, renderer_settings(rig()))
+                .map_err(gpu_error)
+                .err()
+                .expect("lost");
             assert!(error.is_loss() && error.to_string().contains(&name), "{plan}: {error}");
             assert_eq!((session.count(Call::Submit), session.count(Call::SubmitAfterLoss)), (n, 0), "{plan}");
         }
@@ -121,8 +126,10 @@ fn a_loss_while_a_scene_is_loaded_is_told_at_once() {
     let second = first.reopen().unwrap();
     session.set("submit-hang@submit=2");
     let begin = std::time::Instant::now();
-    let error =
-        Renderer::new(&second, &rig().scene, renderer_settings(rig())).map_err(gpu_error).err().expect("it hangs");
+    let error = Renderer::new(&second, &rig().scene, renderer_settings(rig()))
+        .map_err(gpu_error)
+        .err()
+        .expect("it hangs");
     assert!(matches!(error, GpuError::Timeout { .. }), "{error}");
     assert!(second.is_lost(), "and was given up");
     assert!(begin.elapsed() < std::time::Duration::from_secs(2) + common::SLACK, "{:?}", begin.elapsed());

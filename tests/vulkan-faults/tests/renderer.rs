@@ -204,7 +204,12 @@ fn a_device_that_needs_a_moment_comes_back_and_one_that_is_gone_is_named() {
     let again = reopened(&bench.gpu);
     assert_eq!(session.count(Call::Device), 4);
     bench = Bench::on(again).unwrap_or_else(|e| panic!("{e}"));
-    for gone in ["init-failed@device=1..", "oom-host@instance=1..", "submit-hang@submit=1..", "submit-block@submit=1..,ms=5000"] {
+    for gone in [
+        "init-failed@device=1..",
+        "oom-host@instance=1..",
+        "submit-hang@submit=1..",
+        "submit-block@submit=1..,ms=5000",
+    ] {
         session.set("lost@frame=1");
         assert!(bench.frame(0).is_err_and(|e| e.is_loss()));
         session.set(gone);
@@ -276,7 +281,10 @@ fn a_history_full_of_what_is_no_number_is_forgotten_within_two_frames() {
             // From the second frame on the whole picture is as bright as ever, and nowhere dark.
             if i >= 5 {
                 let (is, was) = (level(codes), level(wanted));
-                assert!((is / was - 1.0).abs() < 0.1, "frame {i}: mean code {is:.2}, without the fault {was:.2}");
+                assert!(
+                    (is / was - 1.0).abs() < 0.1,
+                    "frame {i}: mean code {is:.2}, without the fault {was:.2}"
+                );
                 let (is, was) = (lit(codes), lit(wanted));
                 assert!(is.abs_diff(was) * 50 <= was, "frame {i}: {is} pixels lit, without the fault {was}");
             }
