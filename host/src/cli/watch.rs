@@ -145,7 +145,6 @@ pub fn watch<T: Send + 'static>(
                 if std::mem::replace(&mut health, now) != now {
                     progress.note(&format!("projector: {now}"));
                 }
-                monitor.take_notes().iter().for_each(|note| progress.note(note));
                 if let (false, Some(word)) = (tracker_told, monitor.tracker()) {
                     tracker_told = true;
                     progress.note(word);
@@ -395,7 +394,7 @@ mod tests {
         let mut last = 0.0;
         for tick in 1..=200 {
             frames += if tick <= 100 { 50 } else { 1 };
-            last = rate.at(TICK * tick, frames);
+            last = rate.at(Duration::from_millis(50) * tick, frames);
             if tick == 100 {
                 assert!((last - 1000.0).abs() < 1e-6, "{last}");
             }
