@@ -38,12 +38,20 @@ fn the_demo_prints_one_object_with_the_agreed_keys_and_leaves_its_files() {
     }
     assert!(json["motion_to_light_ms"]["p999"].is_f64());
     // Found in use (second look at latency, section 1): 5.2 ms of a demo at virtual pace are constants of the rig file.
-    for key in ["motion_to_first_photon_ms", "motion_to_light_centre_ms", "motion_to_last_photon_ms", "motion_to_light_ms"] {
+    for key in [
+        "motion_to_first_photon_ms",
+        "motion_to_light_centre_ms",
+        "motion_to_last_photon_ms",
+        "motion_to_light_ms",
+    ] {
         assert_eq!(json[key]["modelled"], true, "{key}");
         assert_eq!(json[key]["source"], "from real_time.stage_costs_us, not measured", "{key}");
     }
     assert_eq!(json["registration_error_at"], "mid-exposure");
-    assert_eq!((&json["frames_dark"], &json["slots"], &json["missed_slots"]), (&0.into(), &6.into(), &0.into()));
+    assert_eq!(
+        (&json["frames_dark"], &json["slots"], &json["missed_slots"]),
+        (&0.into(), &6.into(), &0.into())
+    );
     let stages = json["stages_ms"].as_object().expect("a map");
     assert!(
         stages.len() >= 4 && stages.values().all(|s| s["p50"].is_f64() && s["p99"].is_f64()),
@@ -165,12 +173,19 @@ fn a_run_that_lights_nothing_ends_with_1_and_names_the_key() {
     let output = dpm(&args, &[]);
     assert_eq!(code(&output), 1, "{}", err(&output));
     let json: serde_json::Value = serde_json::from_str(&out(&output)).expect("the report all the same");
-    assert_eq!((&json["frames_lit"], &json["frames_dark"], &json["frames_dropped"]), (&0.into(), &6.into(), &0.into()));
+    assert_eq!(
+        (&json["frames_lit"], &json["frames_dark"], &json["frames_dropped"]),
+        (&0.into(), &6.into(), &0.into())
+    );
     let bodies = json["dark_by_body"].as_array().expect("bodies");
     assert_eq!(bodies.len(), 2);
     for body in bodies {
         let of = |cause: &str| body[cause].as_u64();
-        assert_eq!((of("beyond_horizon"), of("silent"), of("never_seen")), (Some(6), Some(0), Some(0)), "{body}");
+        assert_eq!(
+            (of("beyond_horizon"), of("silent"), of("never_seen")),
+            (Some(6), Some(0), Some(0)),
+            "{body}"
+        );
     }
     assert!(json["motion_to_light_ms"].is_null() && json["registration_error_px"].is_null(), "{json}");
     assert!(err(&output).contains("raise safety.predict_ms"), "{}", err(&output));

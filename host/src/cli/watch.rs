@@ -173,8 +173,7 @@ const RATE_READINGS: usize = (RATE_OVER.as_millis() / TICK.as_millis()) as usize
 impl Rate {
     /// Takes in how many there were at `elapsed`; returns how many a second.
     fn at(&mut self, elapsed: Duration, count: u64) -> f64 {
-        while self.seen.len() >= RATE_READINGS
-            || self.seen.len() > 1 && self.seen[1].0 + RATE_OVER <= elapsed
+        while self.seen.len() >= RATE_READINGS || self.seen.len() > 1 && self.seen[1].0 + RATE_OVER <= elapsed
         {
             self.seen.pop_front();
         }
@@ -196,9 +195,9 @@ fn told(health: ProjectorHealth, counts: &RunCounts, total: u64, rate: f64) -> S
     let mut text = format!("{:<10} {lit:>9} lit {rate:>7.1}/s", health.word());
     // A picture that does not move has no rate that would mean anything, and no time that is left.
     if let ProjectorHealth::Up | ProjectorHealth::Connecting = health {
-        let done = counts.frames_lit + counts.frames_dark + counts.frames_dropped + counts.frames_withheld;
-        if rate > 0.0 && total > done {
-            text += &format!(" {:>6.0} s left", (total - done) as f64 / rate);
+        let left = total.saturating_sub(counts.frames_done());
+        if rate > 0.0 && left > 0 {
+            text += &format!(" {:>6.0} s left", left as f64 / rate);
         }
     } else {
         text = format!("{:<10} {lit:>9} lit, no new picture", health.word());
@@ -250,9 +249,7 @@ impl Progress {
         let rate = self.rate.at(elapsed, counts.frames_lit);
         match &mut self.shown {
             Shown::Bar(bar) => {
-                let done =
-                    counts.frames_lit + counts.frames_dark + counts.frames_dropped + counts.frames_withheld;
-                bar.set_position(done);
+                bar.set_position(counts.frames_done());
                 bar.set_message(told(health, &counts, self.total, rate));
                 bar.tick();
             }

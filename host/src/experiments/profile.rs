@@ -102,8 +102,8 @@ fn save(profile: &mut Profile, outcome: &RunOutcome, dir: &Path) -> Result<(), F
         ("waits.svg", IntervalKind::Wait),
         ("latency.svg", IntervalKind::Total),
     ] {
-        let svg = percentiles(&outcome.profiler, kind, &made)
-            .map_err(|e| cannot_write(&dir.join(name), &e))?;
+        let svg =
+            percentiles(&outcome.profiler, kind, &made).map_err(|e| cannot_write(&dir.join(name), &e))?;
         put(name, &mut |out| out.write_all(svg.as_bytes()))?;
     }
     let text = to_json(&profile.profile);

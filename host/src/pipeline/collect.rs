@@ -12,8 +12,8 @@ use crate::plan::slots::OrderedDark;
 use crate::realtime::standstill::SeenStandstills;
 use crate::render::PASSES;
 use crate::rig::Rig;
-use crate::telemetry::monitor::RunMonitor;
 use crate::telemetry::interval::Interval;
+use crate::telemetry::monitor::RunMonitor;
 use crate::telemetry::profile::{missed_by_cause, ordered_dark, Profiler};
 use crate::telemetry::report::{Latency, Report, Spread, StageTime};
 use crate::telemetry::slots::{SlotCounts, SlotLedger};
@@ -132,8 +132,8 @@ impl Collector {
         let batch_frames = (rig.config.run.frames / 10).clamp(100, 10_000);
         let is_mock_tracker = matches!(rig.config.tracker, TrackerConfig::Mock(_));
         let is_mock_projector = matches!(rig.config.projector.backend, ProjectorBackend::Mock(_));
-        let profiler = Profiler::new(rig.rate(), measured, batch_frames)
-            .with_mocks(is_mock_tracker, is_mock_projector);
+        let profiler =
+            Profiler::new(rig.rate(), measured, batch_frames).with_mocks(is_mock_tracker, is_mock_projector);
         let lead_ns = i64::from(rig.config.real_time.stage_costs_us.total()) * 1000;
         let trace_frames = if rig.config.output.trace { MAX_TRACED } else { 0 };
         Self {
@@ -462,8 +462,7 @@ impl Collector {
         report.registration_error_px = spread(&self.registration, PER_PIXEL);
         report.registration_error_unpredicted_px = spread(&self.unpredicted, PER_PIXEL);
         report.registration_error_at = report.registration_error_px.map(|_| "mid-exposure");
-        let latency =
-            |interval| Latency::of(self.profiler.histogram(interval), !self.profiler.is_measured());
+        let latency = |interval| Latency::of(self.profiler.histogram(interval), !self.profiler.is_measured());
         report.motion_to_first_photon_ms = latency(Interval::MotionToFirstPhoton);
         report.motion_to_light_centre_ms = latency(Interval::MotionToCentre);
         report.motion_to_last_photon_ms = latency(Interval::MotionToLastPhoton);

@@ -109,6 +109,9 @@ mod tests {
         assert_eq!((report[1].body.as_str(), report[1].never_seen, report[1].total()), ("venus", 600, 600));
         let told: Vec<(i64, usize)> = notes.iter().map(|(k, body, _)| (*k, *body)).collect();
         assert_eq!(told, [(10, 1), (110, 0), (309, 0)]);
-        assert!(notes[1].2.contains("safety.predict_ms") && notes[2].2.contains("again, after 2.0 s"), "{notes:?}");
+        assert!(
+            notes[1].2.contains("safety.predict_ms") && notes[2].2.contains("again, after 2.0 s"),
+            "{notes:?}"
+        );
     }
 }

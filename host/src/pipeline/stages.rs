@@ -171,7 +171,11 @@ pub fn plan(job: &mut FrameJob, rig: &Rig, snapshot: &TrackSnapshot, slots: &Lin
                 let dark = (used.freshness == Freshness::Lost).then(|| {
                     // Where the sample was good enough when it was taken, the way to the light is what is too long.
                     let taken = state.predict(snapshot.through.max(state.captured_at));
-                    if taken.freshness == Freshness::Lost { DarkCause::Silent } else { DarkCause::BeyondHorizon }
+                    if taken.freshness == Freshness::Lost {
+                        DarkCause::Silent
+                    } else {
+                        DarkCause::BeyondHorizon
+                    }
                 });
                 let oldest = &mut oldest[usize::from(dark.is_some())];
                 if oldest.is_none_or(|(captured, _)| state.captured_at < captured) {

@@ -50,7 +50,8 @@ mod tests {
                 assert!((0..=exposure).contains(&a));
             }
         }
-        let equal = [Channel::Red, Channel::Green, Channel::Blue].map(|channel| PlaneSpec { channel, bit: 3 });
+        let equal =
+            [Channel::Red, Channel::Green, Channel::Blue].map(|channel| PlaneSpec { channel, bit: 3 });
         assert_eq!(centre_ns(&PlaneSchedule::new(&equal).unwrap(), 600), 300);
         assert_eq!(centre_ns(&PlaneSchedule::mono8(), -5), 0);
     }

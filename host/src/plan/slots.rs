@@ -58,8 +58,7 @@ pub enum OrderedDark {
 
 impl OrderedDark {
     /// All reasons, in the order of their counters.
-    pub const ALL: [Self; 6] =
-        [Self::Black, Self::Frozen, Self::Safe, Self::Rest, Self::Fault, Self::Stop];
+    pub const ALL: [Self; 6] = [Self::Black, Self::Frozen, Self::Safe, Self::Rest, Self::Fault, Self::Stop];
 
     /// As printed.
     pub const fn name(self) -> &'static str {

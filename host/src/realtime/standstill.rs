@@ -129,10 +129,7 @@ pub struct SeenStandstills {
 impl SeenStandstills {
     /// Nothing seen yet by any of `threads` control threads.
     fn new(threads: usize) -> Self {
-        Self {
-            all: Mutex::default(),
-            awake_at: (0..threads).map(|_| AtomicI64::new(i64::MIN)).collect(),
-        }
+        Self { all: Mutex::default(), awake_at: (0..threads).map(|_| AtomicI64::new(i64::MIN)).collect() }
     }
 
     /// Known standstills, with nothing to come.

@@ -179,7 +179,8 @@ pub(crate) mod tests {
             assert_eq!(of(Interval::LatchToFirstPhoton), 2400);
             assert_eq!((of(Interval::PackWait), of(Interval::Pack)), (200, 200));
             assert_eq!(of(Interval::LinkWait), if measured { 300 } else { 0 });
-            let totals = [Interval::MotionToFirstPhoton, Interval::MotionToCentre, Interval::MotionToLastPhoton];
+            let totals =
+                [Interval::MotionToFirstPhoton, Interval::MotionToCentre, Interval::MotionToLastPhoton];
             assert_eq!(totals.map(of), [3200, 3300, 3600]);
         }
         for (i, interval) in Interval::ALL.into_iter().enumerate() {

@@ -169,7 +169,9 @@ mod tests {
         let log = DarkLog::default();
         let mut seen = 0;
         let mut told = Vec::new();
-        for (at, wanted) in [(1, None), (2, Some(Black)), (3, Some(Black)), (4, Some(Safe)), (5, None), (6, None)] {
+        for (at, wanted) in
+            [(1, None), (2, Some(Black)), (3, Some(Black)), (4, Some(Safe)), (5, None), (6, None)]
+        {
             log.tell(ms(at), wanted);
         }
         log.news(&mut seen, |at, wanted| told.push((at, wanted)));

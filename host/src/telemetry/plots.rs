@@ -230,7 +230,12 @@ mod tests {
         let mut profiler = Profiler::new(FrameRate::new(947, 1).unwrap(), true, 100);
         (1..=20).for_each(|k| profiler.lit(&frame(k, k * 100_000), k as u64, false));
         let svg = percentiles(&profiler, IntervalKind::Total, "rig.toml, commit abc, 2026-11-22").unwrap();
-        for part in ["From motion to light, 20 frames", "rig.toml, commit abc, 2026-11-22", "one slot", "motion to centre"] {
+        for part in [
+            "From motion to light, 20 frames",
+            "rig.toml, commit abc, 2026-11-22",
+            "one slot",
+            "motion to centre",
+        ] {
             assert!(svg.contains(part), "{part}");
         }
     }

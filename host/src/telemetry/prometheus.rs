@@ -39,7 +39,12 @@ pub fn page(counts: &RunCounts, profile: Option<&ProfileReport>) -> String {
             let _ = writeln!(text, "dpm_{name}_total{{{label}=\"{}\"}} {n}", escaped(value));
         }
     };
-    labelled("slots_missed_by_cause", "Slots without a frame of their own, by cause.", "cause", &profile.missed);
+    labelled(
+        "slots_missed_by_cause",
+        "Slots without a frame of their own, by cause.",
+        "cause",
+        &profile.missed,
+    );
     labelled(
         "slots_ordered_dark",
         "Slots in which no new picture was wanted, by reason.",

@@ -571,7 +571,10 @@ mod tests {
         };
         let table = report.to_table();
         let lines: Vec<&str> = table.lines().collect();
-        assert!(lines[0].ends_with("84 of 22728 (0.370 %); 68 of them while the machine itself stood still"), "{table}");
+        assert!(
+            lines[0].ends_with("84 of 22728 (0.370 %); 68 of them while the machine itself stood still"),
+            "{table}"
+        );
         assert!(table.contains("1421 slots more, neither missed nor lit"), "{table}");
         assert!(lines.iter().all(|l| !l.starts_with("  plan") && !l.contains("safe")), "{table}");
         let json = report.to_json();
@@ -605,7 +608,10 @@ mod tests {
             missed_by_cause: [("link".into(), 8), ("plan".into(), 1)].into(),
             ..Report::default()
         };
-        assert!(dropped.nothing_lit().unwrap().contains("9 frames were made and never lit, most for the cause \"link\""));
+        assert!(dropped
+            .nothing_lit()
+            .unwrap()
+            .contains("9 frames were made and never lit, most for the cause \"link\""));
         // One lit frame is enough; and who wanted the dark, or nothing, got it.
         assert_eq!(Report { frames_lit: 1, ..report }.nothing_lit(), None);
         assert_eq!(Report { frames_withheld: 500, ..Report::default() }.nothing_lit(), None);

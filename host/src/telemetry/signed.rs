@@ -22,7 +22,8 @@ impl SignedHistogram {
     pub fn new(longest_ns: u64) -> Self {
         let longest_ns = longest_ns.max(2);
         // The bounds of HdrHistogram begin at 1, which is its unit: a 0 is kept as 0.
-        let half = || Histogram::new_with_bounds(1, longest_ns, DIGITS).expect("1 and at least 2 are in range");
+        let half =
+            || Histogram::new_with_bounds(1, longest_ns, DIGITS).expect("1 and at least 2 are in range");
         Self { early: half(), late: half(), longest_ns, saturated: 0 }
     }
 
