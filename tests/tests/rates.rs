@@ -49,7 +49,10 @@ fn judged(outcome: &RunOutcome, rig: &Rig, rendered: bool) -> Result<(), String>
     let shown = report.frames_lit + report.frames_dark;
     // The first samples of a slow tracker come after the first frames: until there are enough of them to follow a body it is dark.
     if report.frames_lit == 0 || 5 * report.frames_dark > 2 * shown {
-        return Err(format!("{} lit, {} dark: {:?}", report.frames_lit, report.frames_dark, report.dark_by_body));
+        return Err(format!(
+            "{} lit, {} dark: {:?}",
+            report.frames_lit, report.frames_dark, report.dark_by_body
+        ));
     }
     let Some(error) = report.registration_error_px else { return Err("no light to measure".into()) };
     // Bodies that move at 1 m/s and turn; half of the time they move steadily, and prediction has no excuse.
