@@ -8,6 +8,7 @@ mod clock;
 mod config;
 mod faulty;
 mod frames;
+mod guard;
 mod light;
 mod receive;
 pub mod serial;
@@ -17,9 +18,9 @@ pub mod usb;
 use std::collections::VecDeque;
 
 use dpm_device::link::{
-    faults, mean_luminance, Codec, Config, ConfigRefusal, Decoder, DeviceHello, DeviceMessage, DeviceState,
-    Echo, Fault, FaultCode, FlashLimiter, Header, Packet, SlotClock, Status, Underrun, MAX_CONTROL_BYTES,
-    REST_US,
+    faults, mean_luminance, Codec, Config, ConfigRefusal, Decoder, DecoderCounters, DeviceHello,
+    DeviceMessage, DeviceState, Echo, Fault, FaultCode, FlashLimiter, Header, Packet, SlotClock, Status,
+    Underrun, MAX_CONTROL_BYTES, REST_US,
 };
 use dpm_device::planes::{Raster, MAX_PLANES};
 use dpm_device::time::{DeviceTicks, HostTime};
@@ -29,6 +30,7 @@ pub use clock::DeviceClock;
 pub use config::{LightEvent, LightKind, MockConfig};
 pub use faulty::FaultyProjector;
 use frames::{FrameStore, Held};
+use guard::LightGuard;
 pub use light::{light_of_planes, Exposure};
 pub use thread::serve_cable;
 
@@ -69,6 +71,9 @@ struct Core {
     last_heard: DeviceTicks,
     next_slot: u64,
     flash: Option<FlashLimiter>,
+    guard: LightGuard,
+    /// Up to here the guard has counted.
+    counted_to: Option<HostTime>,
     /// Luminance of the frame on the mirrors.
     luminance: u32,
     /// No ARM before this, while light rests after too many flashes.
@@ -92,9 +97,14 @@ struct Core {
     generation: u64,
     /// Session whose HELLO waits for an answer.
     hello_due: Option<u32>,
+    /// Session that was not opened because its host speaks other versions.
+    version_refused_due: Option<u32>,
     fault_due: Option<Fault>,
     echoes: VecDeque<Echo>,
     status_due: bool,
+    /// A session was opened since the decoders' counters were last looked at, and what they were then.
+    counters_due: bool,
+    counted_before: DecoderCounters,
 }
 
 const NO_STATUS: Status = Status {
@@ -149,6 +159,8 @@ impl MockProjector {
                 last_heard: DeviceTicks(0),
                 next_slot: 0,
                 flash: None,
+                guard: LightGuard::default(),
+                counted_to: None,
                 luminance: 0,
                 rest_until: DeviceTicks(0),
                 damaged_at_whole: 0,
@@ -166,9 +178,12 @@ impl MockProjector {
                 light_is_of: None,
                 generation: 0,
                 hello_due: None,
+                version_refused_due: None,
                 fault_due: None,
                 echoes: VecDeque::with_capacity(ECHOES_KEPT),
                 status_due: false,
+                counters_due: false,
+                counted_before: DecoderCounters::default(),
             },
         }
     }
@@ -266,6 +281,7 @@ impl MockProjector {
         self.core.open_session(0);
         self.core.incoming = Default::default();
         self.decoders = [Decoder::new(), Decoder::new()];
+        (self.core.counters_due, self.core.counted_before) = (false, DecoderCounters::default());
     }
 
     /// Power fails and comes back: dark, no session, no memory, the clock starts again.
@@ -287,6 +303,10 @@ impl LinkDevice for MockProjector {
         self.core.advance(now);
         let mut sink = receive::LaneSink { core: &mut self.core, lane };
         self.decoders[lane as usize].push(bytes, &mut sink);
+        if std::mem::take(&mut self.core.counters_due) {
+            // What came before, the HELLO included, is not of this session.
+            self.core.counted_before = summed(&self.decoders);
+        }
         let [a, b] = self.decoders.each_ref().map(Decoder::counters);
         let damaged = [a.header_errors, a.payload_errors, b.header_errors, b.payload_errors];
         self.core.damaged(damaged.iter().fold(0, |sum, n| sum.wrapping_add(*n)));
@@ -321,6 +341,11 @@ impl LinkDevice for MockProjector {
         if let Some(asked) = self.core.hello_due.take() {
             send(asked, &DeviceMessage::Hello(self.core.hello(now_ticks)));
         }
+        if let Some(asked) = self.core.version_refused_due.take() {
+            let (latched, detail) = (self.core.latched, self.core.setup.version);
+            let fault = Fault { latched, code: FaultCode::Version, detail, at: now_ticks };
+            send(asked, &DeviceMessage::Fault(fault));
+        }
         if let Some(fault) = self.core.fault_due.take() {
             send(session, &DeviceMessage::Fault(fault));
         }
@@ -331,6 +356,19 @@ impl LinkDevice for MockProjector {
             let status = self.core.status_now(&self.decoders);
             send(session, &DeviceMessage::Status(status));
         }
+    }
+}
+
+/// What both lanes' decoders have counted since power-on.
+fn summed(decoders: &[Decoder; 2]) -> DecoderCounters {
+    let [a, b] = decoders.each_ref().map(Decoder::counters);
+    DecoderCounters {
+        packets: a.packets.wrapping_add(b.packets),
+        header_errors: a.header_errors.wrapping_add(b.header_errors),
+        payload_errors: a.payload_errors.wrapping_add(b.payload_errors),
+        foreign: a.foreign.wrapping_add(b.foreign),
+        cut_short: a.cut_short.wrapping_add(b.cut_short),
+        bytes_skipped: a.bytes_skipped.wrapping_add(b.bytes_skipped),
     }
 }
 
@@ -367,7 +405,7 @@ impl Core {
     }
 
     fn status_now(&self, decoders: &[Decoder; 2]) -> Status {
-        let [a, b] = decoders.each_ref().map(Decoder::counters);
+        let (all, before) = (summed(decoders), self.counted_before);
         Status {
             state: self.state(),
             lit: self.lit_now,
@@ -375,11 +413,14 @@ impl Core {
             faults: self.latched,
             frame_limit: self.frame_limit(),
             now: self.ticks(),
-            packets: a.packets.wrapping_add(b.packets),
-            header_errors: a.header_errors.wrapping_add(b.header_errors),
-            payload_errors: a.payload_errors.wrapping_add(b.payload_errors),
-            packets_ignored: self.status.packets_ignored.wrapping_add(a.foreign).wrapping_add(b.foreign),
-            bytes_skipped: a.bytes_skipped.wrapping_add(b.bytes_skipped),
+            packets: all.packets.wrapping_sub(before.packets),
+            header_errors: all.header_errors.wrapping_sub(before.header_errors),
+            payload_errors: all.payload_errors.wrapping_sub(before.payload_errors),
+            packets_ignored: self
+                .status
+                .packets_ignored
+                .wrapping_add(all.foreign.wrapping_sub(before.foreign)),
+            bytes_skipped: all.bytes_skipped.wrapping_sub(before.bytes_skipped),
             ..self.status
         }
     }
@@ -453,6 +494,33 @@ impl Core {
         if due.is_none() && self.dark_from().is_some_and(|dark| dark <= start) {
             self.end_light();
         }
+        // FREEZE holds what is lit; where nothing is, it makes no light. A frame that BLACK hid may be over by now.
+        let again = self.store.lit.is_some_and(|held| match self.mode {
+            Mode::Frozen => self.lit_now,
+            Mode::Normal => config.underrun == Underrun::Repeat && start < held.dark_from,
+            Mode::Black | Mode::Disarmed => false,
+        });
+        let too_much = match (self.mode, due) {
+            (Mode::Normal, Some((frame, _))) => {
+                let bytes = config.raster.plane_bytes() * config.schedule.len();
+                let planes = &self.store.bytes(frame.buffer)[..bytes];
+                self.guard.new_frame(config.raster, &config.schedule, planes)
+            }
+            _ if again => self.guard.same_frame(),
+            _ => {
+                self.guard.dark();
+                None
+            }
+        };
+        if let Some(rest_us) = too_much {
+            // The slot stays dark, and so does everything after it.
+            let refused = due.map_or(0, |(_, superseded)| superseded + 1);
+            self.status.frames_refused = self.status.frames_refused.wrapping_add(refused);
+            self.status.slots_blank = self.status.slots_blank.wrapping_add(1);
+            self.rest(start, rest_us);
+            self.latch(faults::LIGHT_LIMIT);
+            return self.note_light(slots, slot, LightKind::Blank);
+        }
         let kind = match (self.mode, due) {
             (Mode::Normal, Some((frame, superseded))) => {
                 self.status.frames_superseded = self.status.frames_superseded.wrapping_add(superseded);
@@ -469,16 +537,10 @@ impl Core {
                 }
                 LightKind::Lit
             }
-            (mode, due) => {
+            (_, due) => {
                 // Told to be dark or to hold: frames are used up so that the stream goes on.
                 let refused = due.map_or(0, |(_, superseded)| superseded + 1);
                 self.status.frames_refused = self.status.frames_refused.wrapping_add(refused);
-                // FREEZE holds what is lit; where nothing is, it makes no light. A frame that BLACK hid may be over by now.
-                let again = self.store.lit.is_some_and(|held| match mode {
-                    Mode::Frozen => self.lit_now,
-                    Mode::Normal => config.underrun == Underrun::Repeat && start < held.dark_from,
-                    Mode::Black | Mode::Disarmed => false,
-                });
                 if again {
                     self.status.slots_repeated = self.status.slots_repeated.wrapping_add(1);
                     LightKind::Repeated
@@ -489,7 +551,24 @@ impl Core {
             }
         };
         self.lit_now = kind != LightKind::Blank;
-        let clock = &self.setup.clock;
+        self.note_light(slots, slot, kind);
+        let luminance = if self.lit_now { self.luminance } else { 0 };
+        if self.flash.as_mut().is_some_and(|f| f.observe(luminance)) {
+            self.rest(start, u64::from(REST_US));
+            self.latch(faults::FLASH_LIMIT);
+        }
+    }
+
+    /// No ARM within `us` microseconds of `from`.
+    fn rest(&mut self, from: DeviceTicks, us: u64) {
+        let ticks = u128::from(us) * u128::from(self.setup.clock.tick_hz) / 1_000_000;
+        let ticks = u64::try_from(ticks).unwrap_or(u64::MAX);
+        self.rest_until = self.rest_until.max(DeviceTicks(from.0.saturating_add(ticks)));
+    }
+
+    /// Tells whoever watches what `slot` shows.
+    fn note_light(&mut self, slots: &SlotClock, slot: u64, kind: LightKind) {
+        let (start, clock) = (slots.start(slot), &self.setup.clock);
         let end = slots.start(slot + 1);
         let settle = if self.lit_now { i64::from(self.setup.settle_ns) } else { 0 };
         let event = LightEvent {
@@ -507,16 +586,13 @@ impl Core {
         if self.setup.events_kept > 0 {
             self.events.push_back(event);
         }
-        let luminance = if self.lit_now { self.luminance } else { 0 };
-        if self.flash.as_mut().is_some_and(|f| f.observe(luminance)) {
-            let rest = u64::from(REST_US) * u64::from(self.setup.clock.tick_hz) / 1_000_000;
-            self.rest_until = DeviceTicks(start.0.saturating_add(rest));
-            self.latch(faults::FLASH_LIMIT);
-        }
     }
 
     /// Goes dark and forgets every frame on its way.
     fn disarm(&mut self) {
+        if self.mode != Mode::Disarmed {
+            self.counted_to = Some(self.now);
+        }
         self.mode = Mode::Disarmed;
         self.lit_now = false;
         let thrown = self.store.clear();
@@ -552,6 +628,7 @@ impl Core {
         self.config = None;
         self.last_seen_frame = None;
         self.status = NO_STATUS;
+        self.counters_due = true;
     }
 
     fn configure(&mut self, config: Config) -> Result<(), ConfigRefusal> {
@@ -570,6 +647,7 @@ impl Core {
         }
         self.disarm();
         self.config = Some((config, slots));
+        self.guard.configure(config.rate, config.limits, self.setup.limits);
         self.flash = self.setup.flash_limit.map(|limit| FlashLimiter::backstop(config.rate, limit));
         Ok(())
     }
@@ -593,6 +671,10 @@ impl Core {
         if self.mode == Mode::Disarmed {
             let now = self.ticks();
             self.next_slot = slots.slot_at(now).map_or(0, |k| k + 1);
+            let dark_ns = self.counted_to.map_or(0, |to| self.now.ns_since(to).max(0));
+            let rate = slots.rate();
+            let dark = dark_ns as u128 * u128::from(rate.num()) / (u128::from(rate.den()) * 1_000_000_000);
+            self.guard.was_dark(u64::try_from(dark).unwrap_or(u64::MAX).saturating_sub(1));
         }
         self.mode = Mode::Normal;
         self.status_due = true;

@@ -8,8 +8,8 @@ use std::thread::JoinHandle;
 use std::time::{Duration, Instant};
 
 use dpm_device::link::{
-    packet_bytes, Codec, Epoch, Header, HostLink, LinkSettings, LinkState, MessageType, Packet, SendOutcome,
-    Underrun, COMMIT_BYTES,
+    packet_bytes, Codec, Epoch, Header, HostLink, LightLimits, LinkSettings, LinkState, MessageType, Packet,
+    SendOutcome, Underrun, COMMIT_BYTES,
 };
 use dpm_device::planes::{PlaneSchedule, Raster};
 use dpm_device::time::{DeviceTicks, FrameRate, HostTime};
@@ -117,6 +117,7 @@ impl Near {
             epoch: Epoch::At(DeviceTicks(0)),
             codecs,
             flash_limit: None,
+            limits: LightLimits::OFF,
         });
         Self { link, line, next_id: 1 }
     }

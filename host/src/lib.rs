@@ -14,6 +14,7 @@ pub mod files;
 pub mod frame;
 pub mod geometry;
 pub mod gpu;
+pub mod interlock;
 pub mod metrics;
 pub mod pack;
 pub mod pipeline;

@@ -2,7 +2,8 @@
 //! behind the checksums is reached.
 
 use dpm_device::link::{
-    Codec, Epoch, Header, HostLink, LinkSettings, LinkState, MessageType, Packet, SessionNumbers, Underrun,
+    Codec, Epoch, Header, HostLink, LightLimits, LinkSettings, LinkState, MessageType, Packet,
+    SessionNumbers, Underrun,
 };
 use dpm_device::planes::{PlaneSchedule, Raster};
 use dpm_device::time::{DeviceTicks, FrameRate, HostTime};
@@ -62,6 +63,7 @@ fn streaming() -> (HostLink, Cable, HostTime) {
         epoch: Epoch::At(DeviceTicks(0)),
         codecs: Codec::ALL,
         flash_limit: None,
+        limits: LightLimits::OFF,
     };
     // The same session each time: what a fuzzer finds must repeat.
     let mut link = HostLink::with_sessions(settings, SessionNumbers::from_source(|| 1));

@@ -12,8 +12,8 @@ use dpm_device::dlpc900::lut::Dmd;
 use dpm_device::dlpc900::sequence::{LedSetup, Pattern, Repeat, SequenceBuilder};
 use dpm_device::dlpc900::usb::{list, UsbHid};
 use dpm_device::link::{
-    faults, packet_bytes, Codec, Epoch, HostLink, LinkSettings, LinkState, SendOutcome, Underrun,
-    COMMIT_BYTES,
+    faults, packet_bytes, Codec, Epoch, HostLink, LightLimits, LinkSettings, LinkState, SendOutcome,
+    Underrun, COMMIT_BYTES,
 };
 use dpm_device::planes::{PlaneSchedule, Raster};
 use dpm_device::time::{DeviceTicks, FrameRate, HostTime};
@@ -146,6 +146,7 @@ impl Rig {
             epoch: Epoch::At(DeviceTicks(0)),
             codecs: Codec::Raw.mask(),
             flash_limit: None,
+            limits: LightLimits::OFF,
         });
         let frame_bytes = packet_bytes(raster.plane_bytes()) * PLANES + packet_bytes(COMMIT_BYTES);
         let settings = UsbSettings { stuck_after_ns: 2_000_000_000, ..UsbSettings::new(frame_bytes) };

@@ -5,12 +5,14 @@
 
 mod frames;
 mod inbox;
+mod light;
 mod types;
 
 use super::compact::Compactor;
 use super::decoder::Decoder;
 use super::flash::FlashLimiter;
 use super::header::{Codec, Header, Packet, VERSION};
+use super::limits::LimitReached;
 use super::message::{
     Config, ConfigRefusal, DeviceHello, DeviceState, Echo, Fault, FaultCode, HostHello, HostMessage, Status,
     MAX_CONTROL_BYTES,
@@ -20,6 +22,7 @@ use super::slots::SlotClock;
 use crate::time::{DeviceTicks, HostTime};
 use crate::transport::{Lane, SendError, Transport, TransportError};
 use inbox::{Inbox, ECHOES_KEPT};
+use light::LightCount;
 pub use types::{
     DropReason, EchoSample, Epoch, LinkCounters, LinkError, LinkSettings, LinkState, SendOutcome, Verb,
 };
@@ -54,8 +57,12 @@ pub struct HostLink {
     frames_sent: u32,
     last_frame: Option<u32>,
     flash: Option<FlashLimiter>,
-    /// While light rests after too many flashes: when it ends.
-    rest_until: Option<HostTime>,
+    /// What is left of the light that may be made.
+    light: LightCount,
+    /// While light rests by itself: when that ends, and why it does.
+    rest: Option<(HostTime, DropReason)>,
+    /// What [`HostLink::command`] ordered last and [`HostLink::arm`] has not taken back.
+    ordered: Option<Verb>,
     /// `None` when only raw planes are sent.
     compactor: Option<Compactor>,
     /// The next frame must not refer to another.
@@ -80,6 +87,7 @@ impl HostLink {
             let frame_ns = settings.rate.slot_len_ns(0);
             Compactor::new(settings.raster, settings.schedule.len(), frame_ns, settings.codecs)
         });
+        let (rate, limits) = (settings.rate, settings.limits);
         let flash = settings.flash_limit.map(|limit| FlashLimiter::new(settings.rate, limit));
         Self {
             settings,
@@ -98,7 +106,9 @@ impl HostLink {
             frames_sent: 0,
             last_frame: None,
             flash,
-            rest_until: None,
+            light: LightCount::new(rate, &limits),
+            rest: None,
+            ordered: None,
             compactor,
             key_due: true,
             losses: 0,
@@ -121,7 +131,8 @@ impl HostLink {
         self.last_frame = None;
         self.key_due = true;
         self.losses = 0;
-        self.rest_until = None;
+        self.rest = None;
+        self.light.new_session();
     }
 
     /// Permits light once the device is configured, shows the picture again after BLACK or FREEZE, or acknowledges latched
@@ -129,7 +140,8 @@ impl HostLink {
     pub fn arm(&mut self, acknowledge: u32) {
         self.acknowledge = acknowledge;
         self.verb = None;
-        self.rest_until = None;
+        self.rest = None;
+        self.ordered = None;
         self.requested_at = NEVER;
         if matches!(self.state, LinkState::Ready | LinkState::Faulted | LinkState::Streaming) {
             self.inbox.fault = None;
@@ -139,9 +151,17 @@ impl HostLink {
         }
     }
 
-    /// True while light rests after too many flashes.
+    /// True while light rests after too many flashes, or after a limit on light was reached.
     pub fn is_resting(&self, now: HostTime) -> bool {
-        self.rest_until.is_some_and(|end| now < end)
+        self.rest.is_some_and(|(end, _)| now < end)
+    }
+
+    /// The limit on light for which light rests now.
+    pub fn resting_for(&self) -> Option<LimitReached> {
+        match self.rest {
+            Some((_, DropReason::LightLimit(limit))) => Some(limit),
+            _ => None,
+        }
     }
 
     /// Sends `verb` now and again every 20 ms until the device confirms it. An order to be dark (all but FREEZE) goes before everything that
@@ -153,6 +173,15 @@ impl HostLink {
         verb: Verb,
         transport: &mut dyn Transport,
     ) -> Result<(), SendError> {
+        // Whoever asked for dark or stillness decides when it ends.
+        self.rest = None;
+        let given = self.give(now, verb, transport);
+        self.ordered = self.verb;
+        given
+    }
+
+    /// Sends `verb` until the device confirms it.
+    fn give(&mut self, now: HostTime, verb: Verb, transport: &mut dyn Transport) -> Result<(), SendError> {
         let verb = self.verb.filter(|pending| pending.strength() > verb.strength()).unwrap_or(verb);
         // Only once for an order: thrown away again, one that is on a slow line would never arrive.
         if verb.is_dark() && self.verb != Some(verb) {
@@ -160,8 +189,6 @@ impl HostLink {
         }
         self.verb = Some(verb);
         self.verb_sent_at = now;
-        // Whoever asked for dark or stillness decides when it ends.
-        self.rest_until = None;
         if self.state == LinkState::Arming {
             self.state = LinkState::Ready;
         }
@@ -200,8 +227,12 @@ impl HostLink {
             // Only HELLO helps; the caller decides about light again.
             self.connect();
         }
-        if self.rest_until.is_some_and(|end| now >= end) && self.state == LinkState::Streaming {
-            self.arm(0);
+        if self.rest.is_some_and(|(end, _)| now >= end) && self.state == LinkState::Streaming {
+            self.rest = None;
+            // An order of the operator outlasts any rest.
+            if self.ordered.is_none() {
+                self.arm(0);
+            }
         }
         self.advance(transport)?;
         // After what has arrived was read: where a medium stamps with the poll's `now`, no answer may be older than its question.
@@ -384,6 +415,7 @@ impl HostLink {
             watchdog_us: s.watchdog_us,
             underrun: s.underrun,
             late_slots: s.late_slots,
+            limits: s.limits,
             epoch: self.slots.map_or(DeviceTicks(0), |c| c.epoch()),
         }
     }

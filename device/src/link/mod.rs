@@ -14,6 +14,7 @@ mod flash;
 mod header;
 #[cfg(feature = "std")]
 mod host;
+mod limits;
 #[cfg(feature = "std")]
 mod measure;
 mod message;
@@ -33,6 +34,9 @@ pub use header::{
 pub use host::{
     DropReason, EchoSample, Epoch, HostLink, LinkCounters, LinkError, LinkSettings, LinkState, SendOutcome,
     Verb,
+};
+pub use limits::{
+    light_level, LightLimiter, LightLimits, LimitReached, FULL_WHITE_LEVEL, MAX_LIMIT_MS, MIN_LIMIT_MS,
 };
 #[cfg(feature = "std")]
 pub use measure::{measure, LinkMeasurement};

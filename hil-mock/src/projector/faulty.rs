@@ -202,8 +202,8 @@ mod tests {
     use super::super::MockConfig;
     use super::*;
     use dpm_device::link::{
-        measure, packet_bytes, Codec, Epoch, HostLink, LinkSettings, LinkState, SendOutcome, Underrun,
-        COMMIT_BYTES,
+        measure, packet_bytes, Codec, Epoch, HostLink, LightLimits, LinkSettings, LinkState, SendOutcome,
+        Underrun, COMMIT_BYTES,
     };
     use dpm_device::planes::{PlaneSchedule, Raster};
     use dpm_device::time::{DeviceTicks, FrameRate};
@@ -230,6 +230,7 @@ mod tests {
             epoch: Epoch::At(DeviceTicks(0)),
             codecs: Codec::ALL,
             flash_limit: None,
+            limits: LightLimits::OFF,
         }
     }
 

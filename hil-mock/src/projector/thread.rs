@@ -62,7 +62,9 @@ impl<W: FnMut(&mut MockProjector, HostTime) + Send> LinkDevice for Witnessed<'_,
 mod tests {
     use super::super::{LightKind, MockConfig};
     use super::*;
-    use dpm_device::link::{packet_bytes, Epoch, HostLink, LinkSettings, LinkState, Underrun, COMMIT_BYTES};
+    use dpm_device::link::{
+        packet_bytes, Epoch, HostLink, LightLimits, LinkSettings, LinkState, Underrun, COMMIT_BYTES,
+    };
     use dpm_device::planes::{PlaneSchedule, Raster};
     use dpm_device::time::{DeviceTicks, FrameRate};
     use dpm_device::transport::inproc::threaded;
@@ -101,6 +103,7 @@ mod tests {
             epoch: Epoch::At(DeviceTicks(0)),
             codecs: 0,
             flash_limit: None,
+            limits: LightLimits::OFF,
         });
         link.connect();
         let deadline = Instant::now() + Duration::from_secs(20);
@@ -169,6 +172,7 @@ mod tests {
             epoch: Epoch::At(DeviceTicks(0)),
             codecs: 0,
             flash_limit: None,
+            limits: LightLimits::OFF,
         });
         link.connect();
         let planes = vec![0x35; raster.plane_bytes() * 24];

@@ -6,6 +6,7 @@ use super::watch::{print, take_locks};
 use crate::experiments::link_test::{link_test, Content};
 use crate::experiments::run_rig::open_gpu;
 use crate::failure::{Failure, FailureKind};
+use crate::interlock::Interlock;
 use crate::rig::Rig;
 use crate::telemetry::report::to_json;
 use std::path::PathBuf;
@@ -41,7 +42,13 @@ pub fn execute(args: &LinkTestArgs) -> Result<(), Failure> {
     let _locks = take_locks(&config)?;
     signals::install()
         .map_err(|e| Failure::new(FailureKind::Device, format!("cannot handle signals: {e}")))?;
-    let stop = || signals::received().is_some();
+    let interlock = Interlock::of_config(&config.safety.interlock, false)?;
+    let is_open = || interlock.as_ref().is_some_and(|i| !i.is_closed());
+    if let Some(interlock) = interlock.as_ref().filter(|i| !i.is_closed()) {
+        let told = format!("safety.interlock is open: this test makes light only while {}", interlock.what());
+        return Err(Failure::new(FailureKind::Device, told));
+    }
+    let stop = || signals::received().is_some() || is_open();
     let rig = Rig::build(&config, None)?;
     let content = if args.prepared {
         Content::prepared(&rig, args.count)

@@ -2,11 +2,12 @@
 
 use super::keys::Keys;
 use super::signals;
-use crate::config::{OutputConfig, ProjectorBackend, RigConfig};
+use crate::config::{InterlockConfig, OutputConfig, ProjectorBackend, RigConfig};
 use crate::control::{runtime_folder, ControlSocket};
 use crate::failure::{Failure, FailureKind};
 use crate::files::{InstanceLock, LockError};
-use crate::telemetry::monitor::{ProjectorHealth, RunCounts, RunMonitor};
+use crate::interlock::Interlock;
+use crate::telemetry::monitor::{Order, ProjectorHealth, RunCounts, RunMonitor};
 use crate::telemetry::report::Report;
 use indicatif::{ProgressBar, ProgressDrawTarget, ProgressStyle};
 use std::io::{IsTerminal, Write};
@@ -16,6 +17,8 @@ use std::time::{Duration, Instant};
 
 /// How often signals are looked at and the bar is drawn.
 const TICK: Duration = Duration::from_millis(50);
+/// The same where a key that is held down must be noticed.
+const KEY_TICK: Duration = Duration::from_millis(5);
 
 /// Watches `run` (see [`watch`]), then prints the report to the standard output, as JSON or as a table.
 ///
@@ -45,6 +48,12 @@ pub fn watch<T: Send + 'static>(
     signals::install()
         .map_err(|e| Failure::new(FailureKind::Device, format!("cannot handle signals: {e}")))?;
     let monitor = Arc::new(RunMonitor::default());
+    let mut keys = Keys::new();
+    // Before anything can make light.
+    if let Some(interlock) = Interlock::of_config(&rig.safety.interlock, keys.is_some())? {
+        monitor.set_interlock(interlock);
+    }
+    let tick = if matches!(rig.safety.interlock, InterlockConfig::Key(_)) { KEY_TICK } else { TICK };
     let (done, finished) = channel();
     let frames = rig.run.frames;
     let worker = {
@@ -61,7 +70,10 @@ pub fn watch<T: Send + 'static>(
     let mut progress = Progress::new(frames);
     let mut health = ProjectorHealth::Connecting;
     let mut tracker_told = false;
-    let mut keys = Keys::new();
+    if let Some(interlock) = monitor.interlock() {
+        let now = if interlock.is_closed() { "closed" } else { "open" };
+        progress.note(&format!("safety.interlock: light only while {}; it is {now}", interlock.what()));
+    }
     let keys_told = if keys.is_some() { "; keys b, f, s, a" } else { "" };
     let control = ControlSocket::serve(&runtime_folder(), Arc::clone(&monitor));
     match &control {
@@ -75,7 +87,7 @@ pub fn watch<T: Send + 'static>(
         }
     }
     let result = loop {
-        match finished.recv_timeout(TICK) {
+        match finished.recv_timeout(tick) {
             Ok(result) => break result,
             Err(RecvTimeoutError::Timeout) => {
                 if let Some(signal) = signals::received() {
@@ -84,9 +96,14 @@ pub fn watch<T: Send + 'static>(
                         monitor.request_stop();
                     }
                 }
-                for order in keys.iter_mut().flat_map(Keys::pressed) {
-                    progress.note(&format!("key: {}", order.word()));
-                    monitor.give_order(order);
+                for key in keys.iter_mut().flat_map(Keys::pressed) {
+                    if monitor.interlock().is_some_and(|i| i.key_pressed(key)) {
+                        continue;
+                    }
+                    if let Some(order) = Order::from_key(key) {
+                        progress.note(&format!("key: {}", order.word()));
+                        monitor.give_order(order);
+                    }
                 }
                 let now = monitor.projector();
                 if std::mem::replace(&mut health, now) != now {

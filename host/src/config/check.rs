@@ -21,6 +21,7 @@ pub(super) fn check(rig: &RigConfig, reader: &mut Reader) {
     time(rig, reader);
     faults(rig, reader);
     addresses(rig, reader);
+    super::safety::check(rig, reader);
 }
 
 fn addresses(rig: &RigConfig, reader: &mut Reader) {

@@ -10,6 +10,7 @@ mod error;
 mod projector;
 mod read;
 mod run;
+mod safety;
 mod source;
 mod world;
 
@@ -20,6 +21,10 @@ pub use error::{ConfigError, ConfigErrors, Origin};
 pub use projector::*;
 pub use read::KeyDoc;
 pub use run::*;
+pub use safety::{
+    InterlockConfig, InterlockSignal, KeyInterlockConfig, LimitsConfig, LineInterlockConfig,
+    NoInterlockConfig, ProcessInterlockConfig,
+};
 pub use source::VARIABLE_PREFIX;
 pub use world::*;
 

@@ -2,6 +2,7 @@
 
 use super::declare::{section, words};
 use super::read::{Any, NotEmpty, Within};
+use super::safety::{InterlockConfig, LimitsConfig};
 use dpm_device::planes::Raster;
 use std::path::PathBuf;
 
@@ -234,5 +235,9 @@ section! {
         /// The start of a run acknowledges heat, lamp, emergency stop and flashes that the projector has latched, too; else it refuses
         /// to start and names them. Set it once, on the command line, when the cause is gone.
         acknowledge_faults: bool = false, "", Any;
+        /// How much light there may be; docs/SAFETY.md says what that does for people and what it does not.
+        limits: LimitsConfig = LimitsConfig::default(), "", Any;
+        /// Who else must agree that there is light.
+        interlock: InterlockConfig = InterlockConfig::default(), "", Any;
     }
 }

@@ -340,6 +340,12 @@ fn watch_over<P: HidPort>(
 ) -> Result<(), Failure> {
     let mut standing: Option<Order> = None;
     let mut lost = false;
+    // A controller that is set up shows at once: not before the interlock says so.
+    while !monitor.light_allowed() && !monitor.stop_requested() {
+        monitor.set_projector(ProjectorHealth::InterlockOpen);
+        std::thread::sleep(STEP);
+    }
+    let mut allowed = true;
     let set_up = |d: &mut Dlpc900<P>, report: &mut Dlpc900Report| {
         let watch = Stopwatch::start();
         let done = show.set_up(d);
@@ -355,8 +361,13 @@ fn watch_over<P: HidPort>(
             standing = (order != Order::Arm).then_some(order);
         }
         let due = looked.elapsed_ns() >= LOOK_NS;
+        let was_allowed = std::mem::replace(&mut allowed, monitor.light_allowed());
+        if !allowed && standing == Some(Order::Freeze) {
+            // What was held is dark now, and the operator's to show again.
+            standing = Some(Order::Black);
+        }
         let step = match (lost, order) {
-            (true, _) if due => {
+            (true, _) if due && allowed => {
                 looked = Stopwatch::start();
                 open().and_then(|found| {
                     *d = found;
@@ -371,6 +382,13 @@ fn watch_over<P: HidPort>(
                 })
             }
             (true, _) => Ok(()),
+            (false, _) if allowed != was_allowed => {
+                let order = if allowed { standing.unwrap_or(Order::Arm) } else { Order::Black };
+                let health = if allowed { health(standing) } else { ProjectorHealth::InterlockOpen };
+                obey(d, order).map(|()| monitor.set_projector(health))
+            }
+            // What was ordered is done when it closes.
+            (false, _) if !allowed => Ok(()),
             (false, Some(order)) => obey(d, order).map(|()| monitor.set_projector(health(standing))),
             (false, None) if due => {
                 looked = Stopwatch::start();

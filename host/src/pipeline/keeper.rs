@@ -38,8 +38,8 @@ pub struct ProjectorReport {
     pub sent_mb: f64,
     /// Planes sent as they are, by a codec, and not at all because they had not changed.
     pub planes: [u64; 3],
-    /// Frames not sent: link not up, no buffer in the projector, no room on the medium, medium lost, flashes.
-    pub not_sent: [u64; 5],
+    /// Frames not sent: link not up, no buffer in the projector, no room on the medium, medium lost, flashes, limits on light.
+    pub not_sent: [u64; 6],
     /// What the projector reported; null for the mock in this process, whose light is seen itself.
     pub device: Option<DeviceCounts>,
     /// From sent to light in time, as learned from the reports, milliseconds; null for the mock in this process.
@@ -60,6 +60,8 @@ pub(super) struct LinkKeeper {
     standing: Option<Verb>,
     rearmed_at: HostTime,
     rearmed: u64,
+    /// The interlock was closed when it was asked last.
+    allowed: bool,
 }
 
 impl LinkKeeper {
@@ -82,6 +84,7 @@ impl LinkKeeper {
             standing: None,
             rearmed_at: HostTime(i64::MIN),
             rearmed: 0,
+            allowed: true,
         }
     }
 
@@ -112,6 +115,7 @@ impl LinkKeeper {
         if !steady {
             self.keep_time(now, link);
         }
+        self.follow_interlock(now, monitor.light_allowed(), link, transport);
         if let Some(order) = monitor.take_order() {
             self.obey(now, order, link, transport);
         }
@@ -119,7 +123,16 @@ impl LinkKeeper {
         if let (Some(reports), Some(status)) = (&mut self.reports, link.status().filter(|_| self.is_timed)) {
             reports.observe(status, &self.time);
         }
-        monitor.set_projector(health(link, self.standing));
+        monitor.set_projector(if self.allowed {
+            health(link, self.standing)
+        } else {
+            match health(link, self.standing) {
+                dark @ (ProjectorHealth::Lost | ProjectorHealth::Faulted(_) | ProjectorHealth::Stopped) => {
+                    dark
+                }
+                _ => ProjectorHealth::InterlockOpen,
+            }
+        });
         result
     }
 
@@ -150,17 +163,47 @@ impl LinkKeeper {
             rearmed: self.rearmed,
             sent_mb: c.bytes_sent as f64 / 1e6,
             planes: [c.planes_raw, c.planes_coded, c.planes_kept],
-            not_sent: [c.not_streaming, c.no_credit, c.link_busy, c.link_lost, c.flash_limit],
+            not_sent: [c.not_streaming, c.no_credit, c.link_busy, c.link_lost, c.flash_limit, c.light_limit],
             device: self.reports.as_ref().map(StatusLight::counts),
             travel_ms: self.reports.as_ref().map(|r| r.travel_ns() as f64 / 1e6),
+        }
+    }
+
+    /// The interlock opens: BLACK at once. It closes: light again, unless the operator ordered otherwise meanwhile or before.
+    fn follow_interlock(
+        &mut self,
+        now: HostTime,
+        allowed: bool,
+        link: &mut HostLink,
+        transport: &mut dyn Transport,
+    ) {
+        if allowed == std::mem::replace(&mut self.allowed, allowed) {
+            return;
+        }
+        if self.standing == Some(Verb::Freeze) {
+            // What was held is dark now and old when light may come back: that is for the operator to say.
+            self.standing = Some(Verb::Black);
+        }
+        if !allowed && !matches!(self.standing, Some(Verb::Stop | Verb::Safe)) {
+            // What does not get through now is repeated by the link.
+            let _ = link.command(now, Verb::Black, transport);
+        } else if allowed && self.standing.is_none() && link.state() == LinkState::Streaming {
+            link.arm(0);
         }
     }
 
     fn obey(&mut self, now: HostTime, order: Order, link: &mut HostLink, transport: &mut dyn Transport) {
         let verb = match order {
             Order::Black => Verb::Black,
+            // Nothing is lit that could be held.
+            Order::Freeze if !self.allowed => Verb::Black,
             Order::Freeze => Verb::Freeze,
             Order::Safe => Verb::Safe,
+            Order::Arm if !self.allowed => {
+                // Light comes when the interlock closes; latched faults then still want to be acknowledged.
+                self.standing = None;
+                return;
+            }
             Order::Arm => {
                 self.standing = None;
                 return link.arm(link.status().map_or(0, |s| s.faults));
@@ -174,7 +217,7 @@ impl LinkKeeper {
     /// A projector that came back, or stopped for a reason that has passed, is armed unless the operator wants it dark.
     fn arm_again(&mut self, now: HostTime, link: &mut HostLink, steady: bool) {
         // A rest after flashes ends by itself, and only by itself.
-        if self.standing.is_some() || link.is_resting(now) {
+        if self.standing.is_some() || !self.allowed || link.is_resting(now) {
             return;
         }
         match link.state() {
@@ -234,6 +277,9 @@ pub(super) fn is_dark(link: &HostLink) -> bool {
 fn health(link: &HostLink, standing: Option<Verb>) -> ProjectorHealth {
     use DeviceState as D;
     let state = link.status().map_or(D::Idle, |s| s.state);
+    if let (Some(limit), LinkState::Streaming) = (link.resting_for(), link.state()) {
+        return ProjectorHealth::Resting(limit);
+    }
     match (link.state(), standing) {
         (LinkState::Lost | LinkState::Closed, _) => ProjectorHealth::Lost,
         (LinkState::Faulted, _) => ProjectorHealth::Faulted(link.status().map_or(0, |s| s.faults)),

@@ -88,5 +88,6 @@ pub fn link_settings(config: &RigConfig, raster: Raster) -> LinkSettings {
         epoch: Epoch::AfterHello(EPOCH_NS),
         codecs: codecs(&config.projector.backend),
         flash_limit: flash_limit(config),
+        limits: config.safety.limits.limits(),
     }
 }

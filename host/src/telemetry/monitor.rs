@@ -1,7 +1,8 @@
 //! Counters that a running pipeline keeps and a watching thread reads, and the operator's wishes the other way: stop, and the verbs of
 //! a projector.
 
-use dpm_device::link::faults;
+use crate::interlock::Interlock;
+use dpm_device::link::{faults, LimitReached};
 use std::fmt;
 use std::sync::atomic::{AtomicBool, AtomicU64, AtomicU8, Ordering};
 use std::sync::OnceLock;
@@ -30,6 +31,11 @@ impl Order {
         Self::ALL.iter().find(|(order, _)| *order == self).map_or("", |(_, word)| word)
     }
 
+    /// The order that a key on the terminal of a run gives: the first letter of its word, small or capital.
+    pub fn from_key(key: u8) -> Option<Self> {
+        Self::ALL.iter().find(|(_, w)| w.as_bytes()[0] == key.to_ascii_lowercase()).map(|(order, _)| *order)
+    }
+
     /// The order with this word.
     pub fn from_word(word: &str) -> Option<Self> {
         Self::ALL.iter().find(|(_, w)| *w == word).map(|(order, _)| *order)
@@ -54,6 +60,10 @@ pub enum ProjectorHealth {
     Frozen,
     /// Dark at the end of the run.
     Stopped,
+    /// Dark because the interlock is open.
+    InterlockOpen,
+    /// Dark for a while because a limit on light was reached.
+    Resting(LimitReached),
 }
 
 impl ProjectorHealth {
@@ -66,6 +76,9 @@ impl ProjectorHealth {
             Self::Frozen => 4,
             Self::Stopped => 5,
             Self::Faulted(mask) => 6 | (mask as u64) << 8,
+            Self::InterlockOpen => 7,
+            Self::Resting(LimitReached::Mean) => 8,
+            Self::Resting(LimitReached::FullWhite) => 9,
         }
     }
 
@@ -77,6 +90,9 @@ impl ProjectorHealth {
             4 => Self::Frozen,
             5 => Self::Stopped,
             6 => Self::Faulted((code >> 8) as u32),
+            7 => Self::InterlockOpen,
+            8 => Self::Resting(LimitReached::Mean),
+            9 => Self::Resting(LimitReached::FullWhite),
             _ => Self::Connecting,
         }
     }
@@ -94,6 +110,17 @@ impl fmt::Display for ProjectorHealth {
             Self::Black => write!(f, "black; `dpm arm` shows the picture again"),
             Self::Frozen => write!(f, "frozen; `dpm arm` lets the picture move again"),
             Self::Stopped => write!(f, "dark"),
+            Self::InterlockOpen => {
+                write!(f, "dark, safety.interlock is open; light comes back when it closes, unless black, freeze or safe was ordered")
+            }
+            Self::Resting(LimitReached::Mean) => write!(
+                f,
+                "dark, the mean light reached safety.limits.mean_level; light comes back after safety.limits.mean_window_s"
+            ),
+            Self::Resting(LimitReached::FullWhite) => write!(
+                f,
+                "dark, full white lasted for safety.limits.full_white_s; light comes back after as long"
+            ),
         }
     }
 }
@@ -108,6 +135,8 @@ pub struct RunMonitor {
     projector: AtomicU64,
     /// Written at most once.
     tracker: OnceLock<String>,
+    /// Written at most once, before there is light.
+    interlock: OnceLock<Interlock>,
     frames_planned: AtomicU64,
     frames_lit: AtomicU64,
     frames_dropped: AtomicU64,
@@ -162,6 +191,21 @@ impl RunMonitor {
     /// How the projector is.
     pub fn projector(&self) -> ProjectorHealth {
         ProjectorHealth::decode(self.projector.load(Ordering::Relaxed))
+    }
+
+    /// Makes light depend on `interlock`, for the whole run. A second one is dropped: set it before the run begins.
+    pub fn set_interlock(&self, interlock: Interlock) {
+        let _ = self.interlock.set(interlock);
+    }
+
+    /// The interlock, if light depends on one.
+    pub fn interlock(&self) -> Option<&Interlock> {
+        self.interlock.get()
+    }
+
+    /// True while there may be light: there is no interlock, or it is closed. Never waits; the link thread asks with every poll.
+    pub fn light_allowed(&self) -> bool {
+        self.interlock.get().is_none_or(Interlock::is_closed)
     }
 
     /// Says, once in a run, which bodies the tracker has not seen a second after its start, why and what to do. Off the frame path.
@@ -237,6 +281,9 @@ mod tests {
             H::Black,
             H::Frozen,
             H::Stopped,
+            H::InterlockOpen,
+            H::Resting(LimitReached::Mean),
+            H::Resting(LimitReached::FullWhite),
             H::Faulted(0),
             H::Faulted(u32::MAX),
         ];

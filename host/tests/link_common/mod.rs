@@ -99,7 +99,13 @@ pub struct Running {
 
 /// Starts `rig` for `frames` frames; 0 until it is stopped.
 pub fn start(rig: &Arc<Rig>, frames: u64) -> Running {
+    start_with(rig, frames, |_| {})
+}
+
+/// As [`start`], with a monitor that `prepare` has seen before the run.
+pub fn start_with(rig: &Arc<Rig>, frames: u64, prepare: impl FnOnce(&RunMonitor)) -> Running {
     let monitor = Arc::new(RunMonitor::default());
+    prepare(&monitor);
     let (rig, watched) = (rig.clone(), monitor.clone());
     let options = RunOptions { frames, ..RunOptions::default() };
     let thread = std::thread::spawn(move || run_prepared(rig, options, &watched));

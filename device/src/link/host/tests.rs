@@ -1,7 +1,7 @@
 //! A device that says what it should not: answers to other sessions, old answers, answers never asked for.
 
 use super::*;
-use crate::link::{Codec, DeviceMessage, Fault, MessageType, Underrun};
+use crate::link::{Codec, DeviceMessage, Fault, LightLimits, MessageType, Underrun};
 use crate::planes::{PlaneSchedule, Raster};
 use crate::time::FrameRate;
 use proptest::prelude::*;
@@ -64,6 +64,7 @@ fn link() -> HostLink {
         epoch: Epoch::At(DeviceTicks(0)),
         codecs: Codec::Raw.mask(),
         flash_limit: None,
+        limits: LightLimits::OFF,
     })
 }
 

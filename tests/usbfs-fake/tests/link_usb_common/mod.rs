@@ -5,7 +5,8 @@ use std::sync::{Arc, Mutex};
 use std::time::{Duration, Instant};
 
 use dpm_device::link::{
-    packet_bytes, Codec, Epoch, HostLink, LinkSettings, LinkState, SendOutcome, Underrun, COMMIT_BYTES,
+    packet_bytes, Codec, Epoch, HostLink, LightLimits, LinkSettings, LinkState, SendOutcome, Underrun,
+    COMMIT_BYTES,
 };
 use dpm_device::planes::{PlaneSchedule, Raster};
 use dpm_device::time::{DeviceTicks, FrameRate, HostTime};
@@ -102,6 +103,7 @@ impl Host {
             epoch: Epoch::At(DeviceTicks(0)),
             codecs: Codec::Raw.mask(),
             flash_limit: None,
+            limits: LightLimits::OFF,
         });
         let mut usb = UsbTransport::open(device.settings()).expect("the device opens");
         let clock = device.clock.clone();
