@@ -27,7 +27,7 @@ use dpm_device::time::{DeviceTicks, HostTime};
 use dpm_device::transport::{Lane, LinkDevice};
 
 pub use clock::DeviceClock;
-pub use config::{LightEvent, LightKind, MockConfig};
+pub use config::{LightChange, LightEvent, LightKind, MockConfig};
 pub use faulty::FaultyProjector;
 use frames::{FrameStore, Held};
 use guard::LightGuard;
@@ -40,6 +40,9 @@ const ECHOES_KEPT: usize = 16;
 const CHECKSUM_STORM: u32 = 1000;
 /// A target further ahead than this is refused, seconds: it would hold a buffer for good.
 const MAX_LEAD_S: u64 = 2;
+
+/// Changes of light or state that are kept; older ones go and are counted with the light events.
+const CHANGES_KEPT: usize = 1024;
 
 /// Armed or not, and how.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -91,6 +94,10 @@ struct Core {
     incoming: [receive::Incoming; 2],
     events: VecDeque<LightEvent>,
     events_lost: u64,
+    /// When what happens now happens: `now`, or the exact instant of what the device does by itself.
+    at: HostTime,
+    changes: VecDeque<LightChange>,
+    before: (bool, DeviceState),
     light: Vec<[u8; 3]>,
     light_is_of: Option<u64>,
     /// Counts lit frames over all sessions.
@@ -174,6 +181,9 @@ impl MockProjector {
                 incoming: Default::default(),
                 events: VecDeque::with_capacity(setup.events_kept),
                 events_lost: 0,
+                at: HostTime(i64::MIN),
+                changes: VecDeque::with_capacity(CHANGES_KEPT),
+                before: (false, DeviceState::Idle),
                 light: Vec::new(),
                 light_is_of: None,
                 generation: 0,
@@ -196,6 +206,11 @@ impl MockProjector {
     /// Light events that were pushed out by newer ones before anybody took them.
     pub fn light_events_lost(&self) -> u64 {
         self.core.events_lost
+    }
+
+    /// The oldest change of light or state not yet taken.
+    pub fn next_change(&mut self) -> Option<LightChange> {
+        self.core.changes.pop_front()
     }
 
     /// True when light is on.
@@ -272,6 +287,7 @@ impl MockProjector {
         self.core.present = present;
         if new != 0 {
             self.core.latch(new);
+            self.core.note_change();
         }
     }
 
@@ -279,6 +295,7 @@ impl MockProjector {
     pub fn bus_reset(&mut self, now: HostTime) {
         self.advance_to(now);
         self.core.open_session(0);
+        self.core.note_change();
         self.core.incoming = Default::default();
         self.decoders = [Decoder::new(), Decoder::new()];
         (self.core.counters_due, self.core.counted_before) = (false, DecoderCounters::default());
@@ -288,6 +305,9 @@ impl MockProjector {
     pub fn power_cycle(&mut self, now: HostTime) {
         self.advance_to(now);
         let present = self.core.present;
+        self.core.disarm();
+        self.core.note_change();
+        let changes = std::mem::take(&mut self.core.changes);
         let setup = MockConfig {
             clock: DeviceClock { power_on_at: now, ..self.core.setup.clock },
             ..self.core.setup
@@ -295,6 +315,7 @@ impl MockProjector {
         *self = Self::new(setup);
         self.core.present = present;
         self.core.latched = present;
+        self.core.changes = changes;
     }
 }
 
@@ -310,6 +331,7 @@ impl LinkDevice for MockProjector {
         let [a, b] = self.decoders.each_ref().map(Decoder::counters);
         let damaged = [a.header_errors, a.payload_errors, b.header_errors, b.payload_errors];
         self.core.damaged(damaged.iter().fold(0, |sum, n| sum.wrapping_add(*n)));
+        self.core.note_change();
     }
 
     fn end_of_transfer(&mut self, now: HostTime, lane: Lane) {
@@ -445,6 +467,26 @@ impl Core {
         Some(held.dark_from)
     }
 
+    /// Notes that light went on or off, or that the state changed.
+    fn note_change(&mut self) {
+        let now = (self.lit_now, self.state());
+        if now == self.before {
+            return;
+        }
+        self.before = now;
+        let settle = if self.lit_now { i64::from(self.setup.settle_ns) } else { 0 };
+        if self.changes.len() >= CHANGES_KEPT {
+            self.changes.pop_front();
+            self.events_lost += 1;
+        }
+        self.changes.push_back(LightChange {
+            at: self.at.plus_ns(settle),
+            frame: self.store.lit.filter(|_| self.lit_now).map(|held| held.frame),
+            state: now.1,
+            faults: self.latched,
+        });
+    }
+
     /// The frame on the mirrors is over: dark until a newer one is lit, and nothing is left that could be lit again.
     fn end_light(&mut self) {
         self.lit_now = false;
@@ -465,6 +507,7 @@ impl Core {
             if next.min(bite) > ticks {
                 break;
             }
+            self.at = self.setup.clock.instant_of(next.min(bite));
             if bite <= next {
                 self.latch(faults::WATCHDOG);
                 break;
@@ -473,7 +516,11 @@ impl Core {
                 Some(_) => self.end_light(),
                 None => self.slot(&config, &slots, start),
             }
+            self.note_change();
         }
+        // What comes from outside happens now; what the watchdog did was noted at its own instant.
+        self.note_change();
+        self.at = self.now;
     }
 
     /// One slot begins.
@@ -618,7 +665,8 @@ impl Core {
     }
 
     fn report(&mut self, code: FaultCode, detail: u16) {
-        self.fault_due = Some(Fault { latched: self.latched, code, detail, at: self.ticks() });
+        self.fault_due =
+            Some(Fault { latched: self.latched, code, detail, at: self.setup.clock.ticks_at(self.at) });
         self.status_due = true;
     }
 
