@@ -6,6 +6,7 @@
 
 mod clock;
 mod config;
+mod emulated;
 mod faulty;
 mod frames;
 mod light;
@@ -27,6 +28,7 @@ use dpm_device::transport::{Lane, LinkDevice};
 
 pub use clock::DeviceClock;
 pub use config::{LightEvent, LightKind, MockConfig};
+pub use emulated::{EmulatedProjector, Served};
 pub use faulty::FaultyProjector;
 use frames::{FrameStore, Held};
 pub use light::{light_of_planes, Exposure};

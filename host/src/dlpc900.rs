@@ -1,11 +1,11 @@
 //! Picture files into DLPC900 patterns, and the controller's state into lines for the operator.
 
-use dpm_device::regular_file;
 use dpm_device::dlpc900::driver::Status;
 use dpm_device::dlpc900::image::{Compression, PlaneOrder};
 use dpm_device::dlpc900::lut::Dmd;
 use dpm_device::dlpc900::sequence::{Pattern, PatternSequence, Repeat, SequenceBuilder, SequenceError};
 use dpm_device::planes::Raster;
+use dpm_device::regular_file;
 use std::fmt::Write as _;
 use std::path::{Path, PathBuf};
 

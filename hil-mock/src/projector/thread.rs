@@ -6,18 +6,18 @@
 use dpm_device::time::HostTime;
 use dpm_device::transport::inproc::DeviceEnd;
 
-use super::MockProjector;
+use super::Served;
 
 /// Longest rest of a thread for whose projector nothing is due.
 const REST_NS: i64 = 1_000_000_000;
 
 /// Serves `cable` with `projector` until the host's end is gone. Sleeps between what arrives and what is due. `clock` gives the rig's
 /// time; `witness` is called with it before anything that arrived is delivered, to let the projector live up to then and take its light.
-pub fn serve_cable(
-    projector: &mut MockProjector,
+pub fn serve_cable<P: Served>(
+    projector: &mut P,
     mut cable: DeviceEnd,
     clock: impl Fn() -> HostTime,
-    mut witness: impl FnMut(&mut MockProjector, HostTime),
+    mut witness: impl FnMut(&mut P, HostTime),
 ) {
     loop {
         let now = clock();
@@ -33,7 +33,7 @@ pub fn serve_cable(
 
 #[cfg(test)]
 mod tests {
-    use super::super::{LightKind, MockConfig};
+    use super::super::{LightKind, MockConfig, MockProjector};
     use super::*;
     use dpm_device::link::{packet_bytes, Epoch, HostLink, LinkSettings, LinkState, Underrun};
     use dpm_device::planes::{PlaneSchedule, Raster};

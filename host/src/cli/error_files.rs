@@ -1,6 +1,5 @@
 //! Measured groups of `dpm error` in a folder: found again or measured and kept, joined, and reported.
 
-use dpm_device::regular_file;
 use super::watch::print;
 use crate::experiments::error_figure3::Figure3Group;
 use crate::experiments::error_runs::{Extent, GroupResult, Measured};
@@ -11,6 +10,7 @@ use crate::experiments::stamp::Stamp;
 use crate::failure::{Failure, FailureKind};
 use crate::files::write_atomically;
 use crate::telemetry::report::to_json;
+use dpm_device::regular_file;
 use serde::de::DeserializeOwned;
 use serde::Serialize;
 use serde_json::Value;

@@ -93,7 +93,8 @@ impl RigArgs {
         match given.iter().find(|(flag, given)| *given && meaningless.contains(flag)) {
             None => Ok(()),
             Some((flag, _)) => {
-                let told = format!("{flag} means nothing to {command}: leave it out; --help lists what it takes");
+                let told =
+                    format!("{flag} means nothing to {command}: leave it out; --help lists what it takes");
                 Err(Failure::new(FailureKind::BadInput, told))
             }
         }
@@ -129,7 +130,8 @@ impl RigArgs {
             // A calibration counts the pixels of the raster that the file says. Only without the flag is that to be seen.
             let without = Self { raster: None, ..self.clone() }.flags()?;
             let calibrated = read(without, true).ok().map(|rig| rig.projector);
-            if let Some(p) = calibrated.filter(|p| p.calibration.is_some() && p.calibration_raster.is_none()) {
+            if let Some(p) = calibrated.filter(|p| p.calibration.is_some() && p.calibration_raster.is_none())
+            {
                 flags.insert(0, format!("projector.calibration_raster=[{}, {}]", p.width, p.height));
             }
         }
@@ -211,7 +213,8 @@ mod tests {
         let told = read(|a| a.pace = Some("virtual".into())).unwrap_err();
         assert!(told.contains("natnet") && told.contains("usb"), "{told}");
         for pace in ["real", "virtual"] {
-            let mut args = RigArgs { simulate: true, frames: Some(4), pace: Some(pace.into()), ..RigArgs::default() };
+            let mut args =
+                RigArgs { simulate: true, frames: Some(4), pace: Some(pace.into()), ..RigArgs::default() };
             let rig = args.rig(Some(&path)).unwrap();
             assert!(matches!(&rig.tracker, TrackerConfig::Mock(mock) if mock.rate_hz == 240));
             assert!(matches!(rig.projector.backend, ProjectorBackend::Mock(_)));

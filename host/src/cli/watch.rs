@@ -37,7 +37,11 @@ pub fn run_and_report(
 ///
 /// # Errors
 /// The folder or the file cannot be written.
-pub(super) fn write_out<T: serde::Serialize>(out: Option<&Path>, name: &str, report: &T) -> Result<(), Failure> {
+pub(super) fn write_out<T: serde::Serialize>(
+    out: Option<&Path>,
+    name: &str,
+    report: &T,
+) -> Result<(), Failure> {
     let Some(folder) = out else { return Ok(()) };
     let path = folder.join(name);
     let text = to_json(report) + "\n";
@@ -113,6 +117,7 @@ pub fn watch<T: Send + 'static>(
                 if std::mem::replace(&mut health, now) != now {
                     progress.note(&format!("projector: {now}"));
                 }
+                monitor.take_notes().iter().for_each(|note| progress.note(note));
                 if let (false, Some(word)) = (tracker_told, monitor.tracker()) {
                     tracker_told = true;
                     progress.note(word);
@@ -125,6 +130,7 @@ pub fn watch<T: Send + 'static>(
             }
         }
     };
+    monitor.take_notes().iter().for_each(|note| progress.note(note));
     // A panic was already turned into the error above.
     let _ = worker.join();
     progress.finish(monitor.counts());
@@ -180,8 +186,16 @@ pub(super) fn take_locks(rig: &RigConfig) -> Result<Vec<InstanceLock>, Failure> 
 enum Progress {
     Bar(ProgressBar),
     /// Towards an end in time: the bar's unit is a millisecond since the first frame was planned.
-    Timed { bar: ProgressBar, began: Option<Instant> },
-    Lines { started: Instant, next: Duration, total: u64, seconds: f64 },
+    Timed {
+        bar: ProgressBar,
+        began: Option<Instant>,
+    },
+    Lines {
+        started: Instant,
+        next: Duration,
+        total: u64,
+        seconds: f64,
+    },
 }
 
 impl Progress {
@@ -232,7 +246,9 @@ impl Progress {
                     bar.set_position(began.elapsed().as_millis() as u64);
                 }
                 let RunCounts { frames_lit, frames_dropped, frames_late, .. } = counts;
-                bar.set_message(format!("{frames_lit} frames lit, {frames_dropped} dropped, {frames_late} late"));
+                bar.set_message(format!(
+                    "{frames_lit} frames lit, {frames_dropped} dropped, {frames_late} late"
+                ));
                 bar.tick();
             }
             Self::Lines { started, next, total, seconds } => {

@@ -100,7 +100,10 @@ fn projector(rig: &RigConfig, reader: &mut Reader) {
                 ("projector.planes", shown(p.planes)),
                 ("projector.max_planes_per_second", shown(p.max_planes_per_second)),
             ],
-            &format!("{:.0} planes/s are more than the projector shows", p.frame_rate.hz() * f64::from(p.planes)),
+            &format!(
+                "{:.0} planes/s are more than the projector shows",
+                p.frame_rate.hz() * f64::from(p.planes)
+            ),
             format!("at most {most} frames/s of {} planes", p.planes),
         );
     }
@@ -158,7 +161,12 @@ fn projector(rig: &RigConfig, reader: &mut Reader) {
                     ("projector.backend.panel", shown(dlpc900.panel)),
                     ("projector.backend.kind", format!("{:?}", p.backend.word())),
                 ],
-                &format!("a {} has {} x {} mirrors", dlpc900.panel.dmd().name(), panel.width(), panel.height()),
+                &format!(
+                    "a {} has {} x {} mirrors",
+                    dlpc900.panel.dmd().name(),
+                    panel.width(),
+                    panel.height()
+                ),
                 format!("set projector.width = {} and projector.height = {}", panel.width(), panel.height()),
             );
         }
@@ -190,7 +198,10 @@ fn bodies(rig: &RigConfig, reader: &mut Reader) {
             refuse(reader, &[&format!("{key}.name")], told, String::new());
         }
         if let Some(other) = nodes.get(body.node_name()) {
-            let told = format!("two bodies move the node {:?}, this one and `scene.bodies.{other}`", body.node_name());
+            let told = format!(
+                "two bodies move the node {:?}, this one and `scene.bodies.{other}`",
+                body.node_name()
+            );
             refuse(reader, &[&format!("{key}.node"), &key], told, "give each its own node".into());
         }
         if let Some((id, other)) = body.id.and_then(|id| Some((id, ids.get(&id)?))) {

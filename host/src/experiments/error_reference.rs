@@ -1,11 +1,11 @@
 //! What a method should have shown, in two independent halves, so that it tells its own error; kept in files by what it was made from.
 
-use dpm_device::regular_file;
 use super::error_runs::{ErrorRunError, EYE_FRAMES};
 use super::sequence::{eye_mean, rmse, Theatre};
 use super::stamp::Fnv;
 use crate::files::write_atomically;
 use crate::render::method::{Method, SamplerKind};
+use dpm_device::regular_file;
 use glam::Vec3;
 use std::fmt::Write as _;
 use std::io::Write as _;

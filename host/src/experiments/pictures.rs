@@ -33,9 +33,8 @@ fn window<'a>(rig: &Rig, light: &'a [LightFrame], records: &[FrameRecord]) -> Wi
         let record = records.iter().find(|r| r.id.0 as u32 == f.frame)?;
         Some(record.tracked_poses.clone())
     };
-    let poses = |f: &LightFrame| {
-        rig.true_poses(f.first_photon_at.plus_ns(half_slot).0).or_else(|| drawn_for(f))
-    };
+    let poses =
+        |f: &LightFrame| rig.true_poses(f.first_photon_at.plus_ns(half_slot).0).or_else(|| drawn_for(f));
     Window { frames: light.iter().filter_map(|f| Some((f, poses(f)?))).collect() }
 }
 

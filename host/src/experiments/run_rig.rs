@@ -39,7 +39,13 @@ pub fn run_rig(config: &RigConfig, monitor: &Arc<RunMonitor>) -> Result<Ended<Re
             "output.images: the light of a projector outside is not seen, no pictures are written".into(),
         );
     }
+    if config.projector.planes == 8 {
+        notes.push(
+            "projector.planes = 8: the one white channel shows the green of the picture; red and blue alone stay dark".into(),
+        );
+    }
     let window = (output.light_window_ms * 1e-3 * rig.rate().hz()).round().max(1.0) as usize;
+    tell_at_the_start(&rig, &notes, monitor);
     let keep_frames = if output.images && has_light { window } else { 0 };
     let slots = config.slots_to_run();
     let options = RunOptions { frames: config.run.frames, slots, keep_frames, ..RunOptions::default() };
@@ -79,6 +85,30 @@ pub fn run_rig(config: &RigConfig, monitor: &Arc<RunMonitor>) -> Result<Ended<Re
         ended.report.files.pop();
     }
     Ok(ended)
+}
+
+/// Most lines that are told at the start; the report has all of them.
+const TOLD: usize = 12;
+
+/// Tells what is known before the first frame: what is changed of the rig, what the scene loses, and bodies that have nothing to show. All of it stands in the
+/// report too, but that comes after the light.
+fn tell_at_the_start(rig: &Rig, notes: &[String], monitor: &RunMonitor) {
+    let shown = |i: usize| rig.scene.bodies.iter().any(|b| b.tracked.map(usize::from) == Some(i));
+    let known: Vec<&str> = rig.scene.bodies.iter().map(|b| b.name.as_str()).collect();
+    let empty = rig.bodies.iter().enumerate().filter(|(i, _)| !shown(*i)).map(|(_, body)| {
+        format!(
+            "body {:?} does not exist in the scene, so no light falls on it, wherever the {} tracker says that it is; the scene has {}",
+            body.name,
+            rig.config.tracker.word(),
+            known.join(", ")
+        )
+    });
+    let all: Vec<String> =
+        empty.chain(notes.iter().cloned()).chain(rig.scene.warnings.iter().cloned()).collect();
+    all.iter().take(TOLD).for_each(|line| monitor.tell(line.as_str()));
+    if all.len() > TOLD {
+        monitor.tell(format!("and {} more: see the report", all.len() - TOLD));
+    }
 }
 
 /// Writes what the kept light allows of `light.png` and `viewer.png`; the files, and why one is missing.

@@ -1,8 +1,8 @@
 //! A rig and a device into the words under which a measurement can be found again.
 
-use dpm_device::regular_file;
 use crate::gpu::DeviceSummary;
 use crate::rig::Rig;
+use dpm_device::regular_file;
 use serde::{Deserialize, Serialize};
 use std::fmt::Write;
 use std::path::Path;

@@ -226,7 +226,7 @@ impl Collector {
         for stage in [Stage::Plan, Stage::Render, Stage::Pack, Stage::Link] {
             self.stages[stage as usize].saturating_record(job.timeline.wall_ns[stage as usize].max(1));
         }
-        self.placement.observe(&self.rig.camera, &job.tracked_poses, job.tracked, &self.points);
+        self.placement.observe(&self.rig.camera, &job.sampled_poses, &job.seen, &self.points);
         let sent = job.is_sent();
         let refused = !sent && job.fate != Fate::Overtaken;
         self.slots.planned(job.slot, &job.timeline, refused, job.waited_for_memory);

@@ -40,8 +40,8 @@ pub struct FrameNote {
     pub tracked_poses: Vec<DAffine3>,
     /// The same without prediction: where the newest sample put them.
     pub sampled_poses: Vec<DAffine3>,
-    /// Bit k: the tracker sees body k, of the first 64.
-    pub tracked: u64,
+    /// Which bodies the tracker has seen so far.
+    pub seen: Vec<bool>,
     /// Eye, world.
     pub eye: DVec3,
     /// Thousandths of a sample that a pixel gets on average.
@@ -66,7 +66,7 @@ impl FrameNote {
             timeline: FrameTimeline::default(),
             tracked_poses: Vec::with_capacity(bodies),
             sampled_poses: Vec::with_capacity(bodies),
-            tracked: 0,
+            seen: Vec::with_capacity(bodies),
             eye: DVec3::ZERO,
             budget_milli: 0,
             cost: None,

@@ -15,7 +15,7 @@ use dpm_device::time::HostTime;
 use dpm_device::transport::inproc::{DeviceEnd, Direct, HostEnd};
 use dpm_device::transport::Transport;
 use dpm_handoff::channel::{Receiver, Sender};
-use hil_mock::projector::{serve_cable, MockProjector};
+use hil_mock::projector::{serve_cable, EmulatedProjector};
 use std::sync::atomic::Ordering;
 
 /// How often a link without credit looks for some.
@@ -27,7 +27,7 @@ const DARK_WITHIN_MS: u32 = 300;
 
 /// The link's medium.
 pub(super) enum Cable {
-    Direct(Box<Direct<MockProjector>>, LightRecorder),
+    Direct(Box<Direct<EmulatedProjector>>, LightRecorder),
     Threaded(HostEnd),
     /// A projector outside this process.
     Outside(Box<dyn Transport>),
@@ -197,7 +197,7 @@ impl Line {
 /// The mock projector at real pace, until the cable is unplugged. Its light, and its recorder for what is kept of it.
 pub(super) fn device_thread(
     end: DeviceEnd,
-    mut mock: MockProjector,
+    mut mock: EmulatedProjector,
     mut recorder: LightRecorder,
     clock: &RunClock,
     rights: &Rights,

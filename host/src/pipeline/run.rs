@@ -35,7 +35,7 @@ use dpm_device::transport::Transport;
 use dpm_handoff::channel::{channel, Sender};
 use dpm_handoff::wake::WaitPolicy;
 use glam::DVec3;
-use hil_mock::projector::{DeviceClock, MockConfig, MockProjector};
+use hil_mock::projector::{DeviceClock, EmulatedProjector, MockConfig};
 use std::sync::atomic::{AtomicBool, AtomicI64, AtomicU64};
 use std::sync::{Arc, Mutex, OnceLock};
 
@@ -98,7 +98,7 @@ fn run_from(
     }
     let (lights_in, lights) = channel(LIGHTS, WaitPolicy::Park);
     let prepared = gpu.is_none().then(|| PreparedFrames::new(rig.camera.raster));
-    let (far, warnings) = far_end(&rig, lights_in, options, prepared.is_some())?;
+    let (far, warnings) = far_end(&rig, lights_in, options, prepared.is_some(), clock.now())?;
     let mut link = HostLink::new(projector::link_settings(config, rig.camera.raster));
 
     let rights = Rights::new(&config.real_time);
@@ -115,7 +115,7 @@ fn run_from(
             let (mut cable, device, seen) = match far {
                 Far::Outside(medium, lights) => (Cable::Outside(medium), None, Some(lights)),
                 Far::Mock(mock, recorder) if is_virtual => {
-                    (Cable::Direct(Box::new(Direct::new(*mock)), recorder), None, None)
+                    (Cable::Direct(Box::new(Direct::new(mock)), recorder), None, None)
                 }
                 Far::Mock(mock, recorder) => {
                     let frame_bytes =
@@ -124,9 +124,7 @@ fn run_from(
                     let (clock, rights) = (&clock, &rights);
                     let thread = std::thread::Builder::new()
                         .name("dpm-mock".into())
-                        .spawn_scoped(scope, move || {
-                            device_thread(device_end, *mock, recorder, clock, rights)
-                        })
+                        .spawn_scoped(scope, move || device_thread(device_end, mock, recorder, clock, rights))
                         .map_err(|source| PipelineError::Thread { stage: "mock projector", source })?;
                     (Cable::Threaded(host_end), Some(thread), None)
                 }
@@ -192,7 +190,7 @@ fn run_from(
         software_gpu: gpu.is_some_and(|gpu| gpu.summary().software),
         method: if gpu.is_some() { config.render.method.word() } else { "prepared" },
         prediction: config.prediction.on,
-        light_hash: recorder.as_ref().map_or_else(String::new, |r| format!("{:016x}", r.light_hash)),
+        light_hash: recorder.as_ref().and_then(LightRecorder::hash).unwrap_or_default(),
         projector: Some(carried),
         wall_s,
         ..Report::default()
@@ -269,18 +267,19 @@ fn frame_memory(
 /// The other end of the cable.
 enum Far {
     /// The mock, and who watches its light.
-    Mock(Box<MockProjector>, LightRecorder),
+    Mock(EmulatedProjector, LightRecorder),
     /// A projector outside this process, and where notes of its light go.
     Outside(Box<dyn Transport>, Sender<LightNote>),
 }
 
 /// The projector of the rig file, dark, and what the operator should know about its medium. `lights` is where its light is told;
-/// `marked` says that frames carry marks to be looked for.
+/// `marked` says that frames carry marks to be looked for; times of injected faults count from `start`.
 fn far_end(
     rig: &Rig,
     lights: Sender<LightNote>,
     options: RunOptions,
     marked: bool,
+    start: HostTime,
 ) -> Result<(Far, Vec<String>), PipelineError> {
     let (config, raster) = (&rig.config, rig.camera.raster);
     let backend = &config.projector.backend;
@@ -291,7 +290,9 @@ fn far_end(
         setup.flash_limit = projector::flash_limit(config);
         let marks = marked.then(|| config.projector.schedule());
         let recorder = LightRecorder::new(lights, options.keep_frames, options.verify, marks);
-        return Ok((Far::Mock(Box::new(MockProjector::new(setup)), recorder), Vec::new()));
+        let emulated = EmulatedProjector::new(setup, &mock.faults, config.render.seed, start)
+            .map_err(|e| RigError::Unsupported(format!("projector.backend.faults: {e}")))?;
+        return Ok((Far::Mock(emulated, recorder), Vec::new()));
     }
     let medium = projector::open(config, raster)?.ok_or_else(|| {
         RigError::Unsupported(format!(

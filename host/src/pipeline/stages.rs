@@ -6,7 +6,7 @@ use crate::clock::Stopwatch;
 use crate::config::TrackerConfig;
 use crate::frame::{FrameId, Stage};
 use crate::gpu::GpuError;
-use crate::pack::{self, Kernel};
+use crate::pack::{self, Kernel, Shown};
 use crate::render::{FrameInputs, Renderer};
 use crate::rig::{affine, Rig};
 use crate::tracking::{Freshness, PoseFilterBank, PoseFilterConfig, TrackState};
@@ -157,7 +157,7 @@ pub fn plan(job: &mut FrameJob, rig: &Rig, snapshot: &TrackSnapshot, slots: &Lin
     note.tracked_poses.clear();
     note.sampled_poses.clear();
     memory.lost.clear();
-    note.tracked = 0;
+    note.seen.clear();
     let mut oldest: Option<(HostTime, HostTime)> = None;
     for (i, body) in rig.bodies.iter().enumerate() {
         let track = snapshot.tracks.get(i).copied().flatten();
@@ -177,7 +177,8 @@ pub fn plan(job: &mut FrameJob, rig: &Rig, snapshot: &TrackSnapshot, slots: &Lin
         note.tracked_poses.push(pose);
         note.sampled_poses.push(sampled);
         memory.lost.push(lost);
-        note.tracked |= u64::from(!lost && i < 64) << (i % 64);
+        // Where the tracker saw it last is where the tracker says that it is, whether or not that is new enough for light.
+        note.seen.push(track.is_some());
     }
     let (captured_at, received_at) = oldest.unwrap_or((due, due));
     timeline.captured_at = captured_at;
@@ -272,7 +273,8 @@ pub fn pack(job: &mut FrameJob, kernel: Kernel, verify: bool, prepared: &mut Opt
         }
         note.timeline.wall_ns[Stage::Pack as usize] = watch.elapsed_ns();
         if verify {
-            note.code_hash = hash_codes(codes.iter().map(|c| c & 0x00ff_ffff));
+            let shown = Shown::by(memory.planes.schedule());
+            note.code_hash = hash_codes(codes.iter().map(|&c| shown.light(c)));
         }
     } else if let Some(prepared) = prepared {
         prepared.pack(kernel, note.id.0, &mut memory.planes);

@@ -344,11 +344,13 @@ fn plan_thread(
         // Waking up too late counts; what kept the frame from being begun earlier does not.
         job.note.latch_due_at = latch_at.max(now);
         if shared.is_virtual() {
-            shared.listen_to.store(latch_at.0, Ordering::Release);
+            // What arrives later than this is no pose yet when the frame is latched.
+            let heard = latch_at.plus_ns(-i64::from(shared.rig.config.real_time.stage_costs_us.track) * 1000);
+            shared.listen_to.store(heard.0, Ordering::Release);
             if let Some(tracking) = shared.tracking.get() {
                 tracking.unpark();
             }
-            while latest.latest().0.through < latch_at && !shared.monitor.stop_requested() {
+            while latest.latest().0.through < heard && !shared.monitor.stop_requested() {
                 std::thread::yield_now();
             }
         }

@@ -62,8 +62,7 @@ impl BodyBvh {
     /// The faster tree: neighbours of least common area first. It may be deeper than a ray's stack; `None` where it surely is.
     fn clustered(boxes: &[Aabb]) -> Option<Self> {
         let mut tree = clustered(boxes);
-        let walkable =
-            optimise(&mut tree, Self::share(boxes.len()), &mut Work::of_reinsertion(boxes.len()));
+        let walkable = optimise(&mut tree, Self::share(boxes.len()), &mut Work::of_reinsertion(boxes.len()));
         walkable.then(|| Self::from(bvh2_to_cwbvh(&tree, LEAF, true, false)))
     }
 

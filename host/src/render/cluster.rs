@@ -428,7 +428,7 @@ mod tests {
             assert_eq!(bits(&clustered(&boxes)), bits(&by_the_crate(&boxes, 0.0)), "{name}: clustering");
             assert_eq!(bits(&own(&boxes, share)), bits(&by_the_crate(&boxes, share)), "{name}");
         }
-        for count in [1, 2, 3, 4, 9, 100, 300] {
+        for count in [1, 2, 3, 4, 9, 100] {
             for boxes in [twins(count), nested(count), overlapping(count)] {
                 assert_eq!(bits(&own(&boxes, 1.0)), bits(&by_the_crate(&boxes, 1.0)), "{count}");
             }
@@ -466,10 +466,17 @@ mod tests {
     fn no_arrangement_of_boxes_takes_the_square_of_its_number() {
         for (name, boxes) in [
             ("twins", twins(200_000)),
-            ("groups", (0..100_000).flat_map(|k| twins(2).into_iter().map(move |b| {
-                let shift = Vec3A::X * (k % 10) as f32;
-                Aabb::new(b.min + shift, b.max + shift)
-            })).collect()),
+            (
+                "groups",
+                (0..100_000)
+                    .flat_map(|k| {
+                        twins(2).into_iter().map(move |b| {
+                            let shift = Vec3A::X * (k % 10) as f32;
+                            Aabb::new(b.min + shift, b.max + shift)
+                        })
+                    })
+                    .collect(),
+            ),
             ("nested", nested(100_000)),
             ("overlapping", overlapping(60_000)),
         ] {

@@ -469,7 +469,9 @@ mod tests {
             let spot = (x.wrapping_mul(2_654_435_761) ^ y.wrapping_mul(40_503)) % 997 == 0;
             Vec3::new(0.1 + (x % 7) as f32, 0.2, if spot { 5.0e4 } else { 0.3 })
         };
-        for ((w, h), (tw, th)) in [((1000, 500), (333, 166)), ((64, 32), (64, 32)), ((7, 5), (1, 1)), ((97, 89), (96, 11))] {
+        for ((w, h), (tw, th)) in
+            [((1000, 500), (333, 166)), ((64, 32), (64, 32)), ((7, 5), (1, 1)), ((97, 89), (96, 11))]
+        {
             let texels: Vec<Vec3> = (0..w * h).map(|i| light(i % w, i / w)).collect();
             let small = box_filtered(&texels, (w, h), (tw, th));
             assert_eq!(small.len(), (tw * th) as usize);
@@ -485,13 +487,17 @@ mod tests {
         let (fitted, told) = Environment::Equirect { width, height, texels, rotation_rad: 0.5 }.fitted();
         let Environment::Equirect { width, height, texels, rotation_rad } = fitted else { panic!() };
         assert_eq!((texels.len(), rotation_rad), (width as usize * height as usize, 0.5));
-        assert!(is_held(width, height) && (4000..4096).contains(&width) && height == width / 2, "{width} x {height}");
+        assert!(
+            is_held(width, height) && (4000..4096).contains(&width) && height == width / 2,
+            "{width} x {height}"
+        );
         let after = energies(&texels, width as usize);
         assert!((after[0] / before[0] - 1.0).abs() < 1e-6, "{before:?} {after:?}");
         // Up and down is moved by less than a row.
         assert!((after[1] - before[1]).abs() < before[0] * 1e-3, "{before:?} {after:?}");
         assert!(told.is_some_and(|t| t.contains("8192 x 4096") && t.contains(&format!("{width} x {height}"))));
-        let small = Environment::Equirect { width: 2, height: 1, texels: vec![Vec3::ONE; 2], rotation_rad: 0.0 };
+        let small =
+            Environment::Equirect { width: 2, height: 1, texels: vec![Vec3::ONE; 2], rotation_rad: 0.0 };
         assert!(small.fitted().1.is_none());
         assert!(Environment::Constant(Vec3::ONE).fitted().1.is_none());
     }

@@ -4,7 +4,7 @@
 use dpm_device::link::faults;
 use std::fmt;
 use std::sync::atomic::{AtomicBool, AtomicU64, AtomicU8, Ordering};
-use std::sync::OnceLock;
+use std::sync::{Mutex, OnceLock};
 
 /// What an operator can ask of the projector of a running rig.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -108,6 +108,8 @@ pub struct RunMonitor {
     projector: AtomicU64,
     /// Written at most once.
     tracker: OnceLock<String>,
+    /// What the operator should know at once. Never touched by the frame path.
+    notes: Mutex<Vec<String>>,
     frames_planned: AtomicU64,
     frames_lit: AtomicU64,
     frames_dropped: AtomicU64,
@@ -172,6 +174,18 @@ impl RunMonitor {
     /// What was said of the tracker; `None` while there is nothing to say.
     pub fn tracker(&self) -> Option<&str> {
         self.tracker.get().map(String::as_str)
+    }
+
+    /// Says something that the operator should know before the report. Off the frame path only: it locks and allocates.
+    pub fn tell(&self, note: impl Into<String>) {
+        if let Ok(mut notes) = self.notes.lock() {
+            notes.push(note.into());
+        }
+    }
+
+    /// What was said since the last time.
+    pub fn take_notes(&self) -> Vec<String> {
+        self.notes.lock().map(|mut notes| std::mem::take(&mut *notes)).unwrap_or_default()
     }
 
     /// Counts a planned frame.

@@ -228,7 +228,10 @@ fn viewer(
             let white = viewer.iter().fold(0.0f32, |m, v| m.max(v.max_element())).max(1e-9);
             Ok(srgb_canvas(rig.camera.raster, &viewer, (1.0 / white).min(1.0)))
         }
-        Err(_) => Err("only a mock tracker knows the true motion, which an eye follows; --simulate puts one in".into()),
+        Err(_) => {
+            Err("only a mock tracker knows the true motion, which an eye follows; --simulate puts one in"
+                .into())
+        }
     })
 }
 

@@ -116,8 +116,7 @@ fn find_node(names: &[Option<&str>], present: &[usize], name: &str) -> Result<us
     if let [one] = matching[..] {
         return Ok(one);
     }
-    let known: Vec<String> =
-        names.iter().flatten().take(30).map(|n| super::json::shorten(n)).collect();
+    let known: Vec<String> = names.iter().flatten().take(30).map(|n| super::json::shorten(n)).collect();
     let problem = match matching.len() {
         0 => format!("the scene has no node '{name}'"),
         n => format!(
@@ -216,7 +215,8 @@ pub fn flatten(
     warnings: &mut Vec<String>,
 ) -> Result<Flat, SceneError> {
     let Source { document, data, look, instances } = *source;
-    let claim_of: HashMap<usize, usize> = claims.bodies.iter().enumerate().map(|(c, b)| (b.node, c)).collect();
+    let claim_of: HashMap<usize, usize> =
+        claims.bodies.iter().enumerate().map(|(c, b)| (b.node, c)).collect();
     let here = [DAffine3::IDENTITY];
     let default_material = look.materials.len() - 1;
     let mut rest = vec![DAffine3::IDENTITY; claims.bodies.len()];

@@ -62,13 +62,13 @@ pub fn read_instances(nodes: &[Item], data: &Data, limits: &Limits) -> Result<In
             of.map_or(default, |a| DVec3::from_array(data.floats::<3>(a, k).map(f64::from)))
         };
         let place = |k: u64| {
-            let rotation = rotations.map_or(DQuat::IDENTITY, |a| {
-                DQuat::from_array(data.floats::<4>(a, k).map(f64::from))
-            });
+            let rotation = rotations
+                .map_or(DQuat::IDENTITY, |a| DQuat::from_array(data.floats::<4>(a, k).map(f64::from)));
             let (scale, at) = (vector(scales, k, DVec3::ONE), vector(translations, k, DVec3::ZERO));
             let length = rotation.length();
             if !(scale.is_finite() && at.is_finite() && length.is_finite() && length > 1e-6) {
-                let problem = format!("instance {k} holds a number that is not finite, or a rotation of length zero");
+                let problem =
+                    format!("instance {k} holds a number that is not finite, or a rotation of length zero");
                 return Err(attributes.error(problem));
             }
             Ok(DAffine3::from_scale_rotation_translation(scale, rotation.normalize(), at))
