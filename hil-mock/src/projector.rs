@@ -18,9 +18,9 @@ pub mod usb;
 use std::collections::VecDeque;
 
 use dpm_device::link::{
-    faults, mean_luminance, Codec, Config, ConfigRefusal, Decoder, DeviceHello, DeviceMessage, DeviceState,
-    Echo, Fault, FaultCode, FlashLimiter, Header, Packet, SlotClock, Status, Underrun, MAX_CONTROL_BYTES,
-    REST_US,
+    faults, mean_luminance, Codec, Config, ConfigRefusal, Decoder, DecoderCounters, DeviceHello,
+    DeviceMessage, DeviceState, Echo, Fault, FaultCode, FlashLimiter, Header, Packet, SlotClock, Status,
+    Underrun, MAX_CONTROL_BYTES, REST_US,
 };
 use dpm_device::planes::{Raster, MAX_PLANES};
 use dpm_device::time::{DeviceTicks, HostTime};
@@ -80,6 +80,10 @@ struct Core {
     rest_until: DeviceTicks,
     /// Damaged packets when a frame was whole last.
     damaged_at_whole: u32,
+    /// What the decoders had counted when the session opened.
+    counted_before: [DecoderCounters; 2],
+    /// A session has opened since the decoders were looked at.
+    begins_to_count: bool,
     whole_since: bool,
     store: FrameStore,
     /// An LZ4 block while it arrives.
@@ -159,6 +163,8 @@ impl MockProjector {
                 luminance: 0,
                 rest_until: DeviceTicks(0),
                 damaged_at_whole: 0,
+                counted_before: Default::default(),
+                begins_to_count: false,
                 whole_since: false,
                 store: FrameStore::new(setup.frame_buffers as usize, frame_bytes),
                 staging: vec![0; setup.raster.plane_bytes()],
@@ -273,6 +279,7 @@ impl MockProjector {
         self.core.open_session(0);
         self.core.incoming = Default::default();
         self.decoders = [Decoder::new(), Decoder::new()];
+        (self.core.counted_before, self.core.begins_to_count) = (Default::default(), false);
     }
 
     /// Power fails and comes back: dark, no session, no memory, the clock starts again.
@@ -295,6 +302,12 @@ impl LinkDevice for MockProjector {
         let mut sink = receive::LaneSink { core: &mut self.core, lane };
         self.decoders[lane as usize].push(bytes, &mut sink);
         let [a, b] = self.decoders.each_ref().map(Decoder::counters);
+        if std::mem::take(&mut self.core.begins_to_count) {
+            self.core.counted_before = [a, b];
+            // The HELLO that opened it is the first packet of the session.
+            let before = &mut self.core.counted_before[lane as usize].packets;
+            *before = before.wrapping_sub(1);
+        }
         let damaged = [a.header_errors, a.payload_errors, b.header_errors, b.payload_errors];
         self.core.damaged(damaged.iter().fold(0, |sum, n| sum.wrapping_add(*n)));
     }
@@ -375,6 +388,12 @@ impl Core {
 
     fn status_now(&self, decoders: &[Decoder; 2]) -> Status {
         let [a, b] = decoders.each_ref().map(Decoder::counters);
+        // Counters of this session: one that has just opened has counted its HELLO.
+        let before = if self.begins_to_count { [a, b] } else { self.counted_before };
+        let since = |counter: fn(&DecoderCounters) -> u32| {
+            let now = counter(&a).wrapping_add(counter(&b));
+            now.wrapping_sub(counter(&before[0])).wrapping_sub(counter(&before[1]))
+        };
         Status {
             state: self.state(),
             lit: self.lit_now,
@@ -382,11 +401,11 @@ impl Core {
             faults: self.latched,
             frame_limit: self.frame_limit(),
             now: self.ticks(),
-            packets: a.packets.wrapping_add(b.packets),
-            header_errors: a.header_errors.wrapping_add(b.header_errors),
-            payload_errors: a.payload_errors.wrapping_add(b.payload_errors),
-            packets_ignored: self.status.packets_ignored.wrapping_add(a.foreign).wrapping_add(b.foreign),
-            bytes_skipped: a.bytes_skipped.wrapping_add(b.bytes_skipped),
+            packets: since(|c| c.packets),
+            header_errors: since(|c| c.header_errors),
+            payload_errors: since(|c| c.payload_errors),
+            packets_ignored: self.status.packets_ignored.wrapping_add(since(|c| c.foreign)),
+            bytes_skipped: since(|c| c.bytes_skipped),
             ..self.status
         }
     }
@@ -594,6 +613,7 @@ impl Core {
         self.config = None;
         self.last_seen_frame = None;
         self.status = NO_STATUS;
+        self.begins_to_count = true;
     }
 
     fn configure(&mut self, config: Config) -> Result<(), ConfigRefusal> {

@@ -36,7 +36,11 @@ impl Transport for Apart {
         result
     }
 
-    fn receive(&mut self, now: HostTime, sink: &mut dyn FnMut(Lane, &[u8])) -> Result<(), TransportError> {
+    fn receive(
+        &mut self,
+        now: HostTime,
+        sink: &mut dyn FnMut(Lane, HostTime, &[u8]),
+    ) -> Result<(), TransportError> {
         self.device.receive(now, sink)
     }
 

@@ -30,9 +30,13 @@ impl Transport for Cable {
         self.device.send(now, lane, packets)
     }
 
-    fn receive(&mut self, now: HostTime, sink: &mut dyn FnMut(Lane, &[u8])) -> Result<(), TransportError> {
+    fn receive(
+        &mut self,
+        now: HostTime,
+        sink: &mut dyn FnMut(Lane, HostTime, &[u8]),
+    ) -> Result<(), TransportError> {
         match &mut self.inbound {
-            Some(bytes) => sink(Lane::Control, &std::mem::take(bytes)),
+            Some(bytes) => sink(Lane::Control, now, &std::mem::take(bytes)),
             None => self.device.receive(now, sink)?,
         }
         Ok(())

@@ -164,7 +164,9 @@ impl HostLink {
         }
     }
 
-    /// Sends `verb` now and again every 20 ms until the device confirms it.
+    /// Sends `verb` now and again every 20 ms until the device confirms it. An order to be dark (all but FREEZE) goes before everything that
+    /// waits on the medium, and until it is confirmed no frame is sent. While an order that forbids more is not confirmed (SAFE, then
+    /// STOP, then BLACK, then FREEZE) that one is sent again in its place.
     pub fn command(
         &mut self,
         now: HostTime,
@@ -179,6 +181,11 @@ impl HostLink {
 
     /// Sends `verb` until the device confirms it.
     fn give(&mut self, now: HostTime, verb: Verb, transport: &mut dyn Transport) -> Result<(), SendError> {
+        let verb = self.verb.filter(|pending| pending.strength() > verb.strength()).unwrap_or(verb);
+        // Only once for an order: thrown away again, one that is on a slow line would never arrive.
+        if verb.is_dark() && self.verb != Some(verb) {
+            transport.flush_output();
+        }
         self.verb = Some(verb);
         self.verb_sent_at = now;
         if self.state == LinkState::Arming {
@@ -188,7 +195,7 @@ impl HostLink {
     }
 
     /// Receives what has arrived, takes the next step of the handshake, keeps the device's watchdog fed. Call at least once a
-    /// frame slot. On an error of the handshake the link is [`LinkState::Closed`] (ARM refused: [`LinkState::Faulted`]); when the medium fails, the error is
+    /// frame slot, with a `now` that was read just before. On an error of the handshake the link is [`LinkState::Closed`] (ARM refused: [`LinkState::Faulted`]); when the medium fails, the error is
     /// returned once and the link is [`LinkState::Lost`] until it is back.
     pub fn poll(&mut self, now: HostTime, transport: &mut dyn Transport) -> Result<LinkState, LinkError> {
         let result = self.step(now, transport);
@@ -227,14 +234,18 @@ impl HostLink {
             }
         }
         self.advance(transport)?;
+        // After what has arrived was read: where a medium stamps with the poll's `now`, no answer may be older than its question.
+        self.exchange_clocks(now, transport)?;
         self.request(now, transport)?;
         Ok(self.state)
     }
 
     fn receive(&mut self, now: HostTime, transport: &mut dyn Transport) -> Result<(), TransportError> {
         let Self { inbox, decoders, .. } = self;
-        inbox.now = now;
-        let result = transport.receive(now, &mut |lane, bytes| decoders[lane as usize].push(bytes, inbox));
+        let result = transport.receive(now, &mut |lane, arrived_at, bytes| {
+            inbox.arrived_at = arrived_at;
+            decoders[lane as usize].push(bytes, inbox);
+        });
         self.counters.packets_ignored = self.inbox.ignored;
         self.counters.packets_damaged = self.inbox.damaged;
         result
@@ -345,9 +356,26 @@ impl HostLink {
         Ok(())
     }
 
-    /// Requests that are due: the next step of the handshake, a verb, an echo, a credit repair.
+    /// Asks for the device's clock when that is due, which also keeps the watchdog fed.
+    fn exchange_clocks(&mut self, now: HostTime, transport: &mut dyn Transport) -> Result<(), LinkError> {
+        if matches!(self.state, LinkState::Closed | LinkState::Lost | LinkState::Greeting) {
+            return Ok(());
+        }
+        let calm = (i64::from(self.settings.watchdog_us) * 1000 / 4).clamp(1_000_000, 100_000_000);
+        let every = if self.echoes_sent < FAST_ECHOES { FAST_ECHO_NS.min(calm) } else { calm };
+        if !is_due(now, self.echo_sent_at, every) {
+            return Ok(());
+        }
+        self.echo_sent_at = now;
+        self.echoes_sent += 1;
+        let echo =
+            Echo { host_sent_ns: now.0 as u64, device_received: DeviceTicks(0), device_sent: DeviceTicks(0) };
+        lost(self.control(now, &HostMessage::Echo(echo), transport))
+    }
+
+    /// Requests that are due: the next step of the handshake, a verb, a credit repair.
     fn request(&mut self, now: HostTime, transport: &mut dyn Transport) -> Result<(), LinkError> {
-        let due = |last: HostTime, every: i64| last == NEVER || now.ns_since(last) >= every;
+        let due = |last: HostTime, every: i64| is_due(now, last, every);
         if due(self.requested_at, RETRY_NS) {
             let message = match self.state {
                 LinkState::Greeting => Some(HostMessage::Hello(HostHello {
@@ -367,20 +395,6 @@ impl HostLink {
         if let Some(verb) = self.verb.filter(|_| due(self.verb_sent_at, RETRY_NS)) {
             self.verb_sent_at = now;
             lost(self.control(now, &verb.message(), transport))?;
-        }
-        if self.state != LinkState::Greeting {
-            let calm = (i64::from(self.settings.watchdog_us) * 1000 / 4).clamp(1_000_000, 100_000_000);
-            let every = if self.echoes_sent < FAST_ECHOES { FAST_ECHO_NS.min(calm) } else { calm };
-            if due(self.echo_sent_at, every) {
-                self.echo_sent_at = now;
-                self.echoes_sent += 1;
-                let echo = Echo {
-                    host_sent_ns: now.0 as u64,
-                    device_received: DeviceTicks(0),
-                    device_sent: DeviceTicks(0),
-                };
-                lost(self.control(now, &HostMessage::Echo(echo), transport))?;
-            }
         }
         let starved = self.state == LinkState::Streaming && self.credit() == 0;
         let silence = self.settings.rate.slot_start_ns(4);
@@ -485,6 +499,10 @@ impl HostLink {
         self.counters.bytes_sent += packet.wire_bytes() as u64;
         Ok(())
     }
+}
+
+fn is_due(now: HostTime, last: HostTime, every_ns: i64) -> bool {
+    last == NEVER || now.ns_since(last) >= every_ns
 }
 
 /// A busy medium is asked again later; a lost one is an error.

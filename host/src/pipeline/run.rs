@@ -113,7 +113,14 @@ fn run_from(
     let (mut collector, recorder, carried, unseen) =
         std::thread::scope(|scope| -> Result<_, PipelineError> {
             let (mut cable, device, seen) = match far {
-                Far::Outside(medium, lights) => (Cable::Outside(medium), None, Some(lights)),
+                Far::Outside(mut medium, lights) => {
+                    if let RunClock::Real(clock) = &clock {
+                        // Replies are stamped when they arrive, not when they are looked for.
+                        let clock = *clock;
+                        medium.set_clock(Arc::new(move || clock.now()));
+                    }
+                    (Cable::Outside(medium), None, Some(lights))
+                }
                 Far::Mock(mock, recorder) if is_virtual => {
                     (Cable::Direct(Box::new(Direct::new(*mock)), recorder), None, None)
                 }

@@ -188,8 +188,11 @@ impl PtyProjector {
         let thread = std::thread::spawn(move || {
             let _held = held;
             while !stopped.load(Ordering::Relaxed) {
-                let now = HostTime(start.elapsed().as_nanos() as i64);
-                assert!(device.lock().unwrap().serve(now, &mut master).expect("the line works"), "held open");
+                let clock = || HostTime(start.elapsed().as_nanos() as i64);
+                assert!(
+                    device.lock().unwrap().serve(clock, &mut master).expect("the line works"),
+                    "held open"
+                );
                 std::thread::sleep(Duration::from_micros(300));
             }
         });

@@ -200,7 +200,7 @@ impl Peer {
         let beyond = (count.wrapping_sub(limit) as i32) > 0 || free == 0;
         if self.breaks("credit-lost") {
             self.accounted += 1;
-        } else if !(self.breaks("black-frames") && self.mode == Mode::Black) {
+        } else {
             self.account(count, false);
         }
         self.say_status = !self.breaks("status-commit");
@@ -316,7 +316,12 @@ impl Peer {
                 new = None;
             }
         } else {
-            self.n.refused += others + u32::from(new.is_some());
+            let used_up = others + u32::from(new.is_some());
+            if self.breaks("black-frames") {
+                self.n.superseded += used_up;
+            } else {
+                self.n.refused += used_up;
+            }
             new = None;
         }
         if new.is_none() {

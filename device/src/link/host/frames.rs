@@ -65,7 +65,9 @@ impl HostLink {
         let plane_bytes = self.settings.raster.plane_bytes();
         let expected = plane_bytes * schedule.len();
         assert!(planes.len() == expected, "frame of {} bytes, configured {expected}", planes.len());
-        if self.state != LinkState::Streaming {
+        // Nothing may queue up behind or before an order to be dark.
+        let darkens = self.rest.is_none() && self.verb.is_some_and(Verb::is_dark);
+        if self.state != LinkState::Streaming || darkens {
             return Err(DropReason::NotStreaming);
         }
         if self.last_frame.is_some_and(|last| !frame_newer(frame, last)) {

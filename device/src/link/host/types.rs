@@ -197,7 +197,7 @@ pub struct EchoSample {
     pub device_received_at: DeviceTicks,
     /// Answer left, device's clock.
     pub device_sent_at: DeviceTicks,
-    /// Answer arrived, host's clock.
+    /// Answer arrived, host's clock: not when it was read, which may be much later, see [`crate::transport::Transport::receive`].
     pub host_received_at: HostTime,
 }
 
@@ -221,6 +221,21 @@ impl Verb {
             Self::Black => HostMessage::Black,
             Self::Freeze => HostMessage::Freeze,
             Self::Safe => HostMessage::Safe,
+        }
+    }
+
+    /// True for an order to be dark, which goes before everything that waits.
+    pub(super) const fn is_dark(self) -> bool {
+        !matches!(self, Self::Freeze)
+    }
+
+    /// How much an order forbids: one that has not been confirmed is not replaced by one that forbids less.
+    pub(super) const fn strength(self) -> u8 {
+        match self {
+            Self::Freeze => 0,
+            Self::Black => 1,
+            Self::Stop => 2,
+            Self::Safe => 3,
         }
     }
 

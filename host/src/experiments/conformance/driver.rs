@@ -171,7 +171,9 @@ impl<'a> Bench<'a> {
     pub fn noise(&self) -> [u32; 4] {
         let mut all = [0; 4];
         for c in self.decoders.iter().map(Decoder::counters) {
-            for (sum, n) in all.iter_mut().zip([c.header_errors, c.payload_errors, c.foreign, c.bytes_skipped]) {
+            for (sum, n) in
+                all.iter_mut().zip([c.header_errors, c.payload_errors, c.foreign, c.bytes_skipped])
+            {
                 *sum += n;
             }
         }
@@ -205,14 +207,16 @@ impl<'a> Bench<'a> {
                 Err(SendError::Failed(e)) => return Err(Stop::Lost(e)),
                 Err(SendError::Busy) if now < limit => self.rest()?,
                 Err(SendError::Busy) => {
-                    return Err(Stop::Failed("the medium takes nothing any more: expected room within 2 s".into()))
+                    return Err(Stop::Failed(
+                        "the medium takes nothing any more: expected room within 2 s".into(),
+                    ))
                 }
             }
         }
         self.fed_at = self.now();
-        let whole = packets.iter().filter(|p| {
-            p.parts()[0].first_chunk::<32>().is_some_and(|h| Header::decode(h).is_ok())
-        });
+        let whole = packets
+            .iter()
+            .filter(|p| p.parts()[0].first_chunk::<32>().is_some_and(|h| Header::decode(h).is_ok()));
         self.packets_sent = self.packets_sent.wrapping_add(whole.count() as u32);
         Ok(())
     }
@@ -240,7 +244,11 @@ impl<'a> Bench<'a> {
 
     /// An ECHO that says `stamp`.
     pub fn echo(&self, stamp: u64) -> HostMessage {
-        HostMessage::Echo(Echo { host_sent_ns: stamp, device_received: DeviceTicks(0), device_sent: DeviceTicks(0) })
+        HostMessage::Echo(Echo {
+            host_sent_ns: stamp,
+            device_received: DeviceTicks(0),
+            device_sent: DeviceTicks(0),
+        })
     }
 
     // --- hearing ---
@@ -257,10 +265,13 @@ impl<'a> Bench<'a> {
         }
         let Self { inbox, decoders, medium, .. } = self;
         inbox.now = (medium.clock)();
-        let from = inbox.heard.len();
+        let (from, now) = (inbox.heard.len(), inbox.now);
         medium
             .transport
-            .receive(inbox.now, &mut |lane, bytes| decoders[lane as usize].push(bytes, inbox))
+            .receive(now, &mut |lane, at, bytes| {
+                inbox.now = at;
+                decoders[lane as usize].push(bytes, inbox);
+            })
             .map_err(Stop::Lost)?;
         let from = from.min(self.inbox.heard.len());
         for i in from..self.inbox.heard.len() {
@@ -270,7 +281,9 @@ impl<'a> Bench<'a> {
                     self.clock = (s.now.0, heard.at);
                     self.newest = Some(s);
                 }
-                DeviceMessage::Echo(e) if heard.session == self.session => self.clock = (e.device_sent.0, heard.at),
+                DeviceMessage::Echo(e) if heard.session == self.session => {
+                    self.clock = (e.device_sent.0, heard.at)
+                }
                 _ => {}
             }
         }
@@ -305,7 +318,11 @@ impl<'a> Bench<'a> {
     }
 
     /// As [`Bench::wait`], for a STATUS of this session.
-    pub fn wait_status(&mut self, limit_ns: i64, mut wanted: impl FnMut(&Status) -> bool) -> R<Option<Status>> {
+    pub fn wait_status(
+        &mut self,
+        limit_ns: i64,
+        mut wanted: impl FnMut(&Status) -> bool,
+    ) -> R<Option<Status>> {
         let session = self.session;
         self.wait(limit_ns, |h| match h.message {
             DeviceMessage::Status(s) if h.session == session && wanted(&s) => Some(s),
@@ -372,7 +389,11 @@ impl<'a> Bench<'a> {
 
     /// A failure to answer.
     pub fn silent(&self, wanted: &str) -> Stop {
-        Stop::Failed(format!("expected {wanted}, saw none within {} ms; last: {}", self.answer_ns() / 1_000_000, self.newest()))
+        Stop::Failed(format!(
+            "expected {wanted}, saw none within {} ms; last: {}",
+            self.answer_ns() / 1_000_000,
+            self.newest()
+        ))
     }
 
     // --- the way to light ---
@@ -409,8 +430,9 @@ impl<'a> Bench<'a> {
     /// What the rules ask for, unless they are about something else: two planes at most, of the least light, repeated, never late.
     pub fn plain_config(&self) -> R<Config> {
         let hello = self.hello.ok_or(Stop::Failed("no HELLO".into()))?;
-        let planes: Vec<PlaneSpec> =
-            (0..2u8.min(hello.max_planes.max(1))).map(|k| PlaneSpec { channel: Channel::Red, bit: 1 - k }).collect();
+        let planes: Vec<PlaneSpec> = (0..2u8.min(hello.max_planes.max(1)))
+            .map(|k| PlaneSpec { channel: Channel::Red, bit: 1 - k })
+            .collect();
         let ahead = u64::from(hello.tick_hz) / 50;
         Ok(Config {
             raster: hello.raster,
@@ -451,10 +473,11 @@ impl<'a> Bench<'a> {
                 self.slots = SlotClock::new(config.epoch, hz, config.rate);
                 self.config = Some(*config);
                 // Known from here on: what was counted before.
-                self.report()
-                    .map(|s| if s.state == status.state { s } else { status })
+                self.report().map(|s| if s.state == status.state { s } else { status })
             }
-            Some(Err(detail)) => Err(Stop::Failed(format!("CONFIG that the device's HELLO allows refused, detail {detail}"))),
+            Some(Err(detail)) => {
+                Err(Stop::Failed(format!("CONFIG that the device's HELLO allows refused, detail {detail}")))
+            }
             None => Err(self.silent("STATUS \"configured\" after CONFIG")),
         }
     }
@@ -468,7 +491,9 @@ impl<'a> Bench<'a> {
             self.say(&HostMessage::Arm(faults))?;
             let session = self.session;
             let answer = self.wait(self.answer_ns(), |h| match h.message {
-                DeviceMessage::Status(s) if h.session == session && s.state == DeviceState::Armed => Some(Ok(s)),
+                DeviceMessage::Status(s) if h.session == session && s.state == DeviceState::Armed => {
+                    Some(Ok(s))
+                }
                 DeviceMessage::Fault(f) if f.code == FaultCode::Arm => Some(Err(f.detail)),
                 _ => None,
             })?;

@@ -136,7 +136,9 @@ fn credit_beyond(b: &mut Bench<'_>) -> R {
     }
     let full = b.report()?;
     check(
-        full.buffers_free == 0 && full.frame_limit == full.frames_accounted && full.frames_accounted == buffers,
+        full.buffers_free == 0
+            && full.frame_limit == full.frames_accounted
+            && full.frames_accounted == buffers,
         &format!("no buffer free and no credit after {buffers} frames"),
         || tell(&full),
     )?;
@@ -147,7 +149,8 @@ fn credit_beyond(b: &mut Bench<'_>) -> R {
     check(s.frames_accounted == buffers + 1, "it accounted all the same", || tell(&s))?;
     let s = b.until_slot(slot + 1)?;
     check(
-        fates(&before, &s) == [1, 0, 0, buffers - 1, 1] && s.buffers_free == full.buffers_free + buffers as u8,
+        fates(&before, &s) == [1, 0, 0, buffers - 1, 1]
+            && s.buffers_free == full.buffers_free + buffers as u8,
         "the newest lit, the others superseded, all buffers free",
         || tell(&s),
     )
@@ -165,7 +168,11 @@ fn credit_lost(b: &mut Bench<'_>) -> R {
     let limit = b.answer_ns() + 1_000_000_000;
     let s = b.wait_status(limit, |s| s.frames_accounted >= 6)?;
     let s = s.ok_or_else(|| b.silent("a STATUS with 6 frames accounted"))?;
-    check(s.frames_accounted == 6 && s.frame_limit >= 6, "6 frames accounted: 5 that were lost, and one", || tell(&s))
+    check(
+        s.frames_accounted == 6 && s.frame_limit >= 6,
+        "6 frames accounted: 5 that were lost, and one",
+        || tell(&s),
+    )
 }
 
 fn credit_sync(b: &mut Bench<'_>) -> R {
@@ -173,8 +180,14 @@ fn credit_sync(b: &mut Bench<'_>) -> R {
     for (sent, expected) in [(7u32, 7u32), (3, 7), (9, 9)] {
         b.frames_sent = sent;
         let s = b.report()?;
-        check(s.frames_accounted == expected, &format!("{expected} frames accounted after SYNC {sent}"), || tell(&s))?;
-        check(s.frame_limit == expected + u32::from(s.buffers_free), "credit for the free buffers", || tell(&s))?;
+        check(
+            s.frames_accounted == expected,
+            &format!("{expected} frames accounted after SYNC {sent}"),
+            || tell(&s),
+        )?;
+        check(s.frame_limit == expected + u32::from(s.buffers_free), "credit for the free buffers", || {
+            tell(&s)
+        })?;
     }
     Ok(())
 }
@@ -195,9 +208,11 @@ fn frame_lit(b: &mut Bench<'_>) -> R {
     let s = b.until_slot(slot)?;
     check(fates(&before, &s) == [1, 0, 0, 0, 0] && s.lit, "one frame lit", || tell(&s))?;
     check(s.last_lit_frame == shot.id, &format!("frame {} lit", shot.id), || tell(&s))?;
-    check(s.last_lit_at.0.abs_diff(shot.target) <= 1, &format!("lit at its target, tick {}", shot.target), || {
-        format!("tick {}", s.last_lit_at.0)
-    })
+    check(
+        s.last_lit_at.0.abs_diff(shot.target) <= 1,
+        &format!("lit at its target, tick {}", shot.target),
+        || format!("tick {}", s.last_lit_at.0),
+    )
 }
 
 fn slot_start(b: &mut Bench<'_>) -> R {
@@ -230,7 +245,9 @@ fn slots_counted(b: &mut Bench<'_>) -> R {
     let s = b.until(a.now.0 + b.ticks_of_ms(12 * ms))?;
     let expected = slots.slot_at(s.now).unwrap_or(0) - slots.slot_at(a.now).unwrap_or(0);
     let counted = u64::from(grew(&a, &s, |s| s.slots));
-    check(counted.abs_diff(expected) <= 1, &format!("{expected} slots between two reports"), || counted.to_string())?;
+    check(counted.abs_diff(expected) <= 1, &format!("{expected} slots between two reports"), || {
+        counted.to_string()
+    })?;
     check(u64::from(grew(&a, &s, |s| s.slots_blank)) == counted, "blank ones: nothing was sent", || tell(&s))
 }
 
@@ -252,7 +269,11 @@ fn underrun_blank(b: &mut Bench<'_>) -> R {
     let shot = b.shot(slot)?;
     b.send(&shot)?;
     let s = b.until_slot(slot + 2)?;
-    check(grew(&before, &s, |s| s.frames_lit) == 1 && !s.lit, "lit in its slot, and dark afterwards", || tell(&s))?;
+    check(
+        grew(&before, &s, |s| s.frames_lit) == 1 && !s.lit,
+        "lit in its slot, and dark afterwards",
+        || tell(&s),
+    )?;
     check(grew(&before, &s, |s| s.slots_repeated) == 0, "no repeated slot", || tell(&s))
 }
 
@@ -389,7 +410,11 @@ fn dark_from_mid_slot(b: &mut Bench<'_>) -> R {
     let slack = b.ticks_of_ms(5);
     let s = all.last().copied().ok_or_else(|| b.silent("a STATUS"))?;
     check(grew(&before, &s, |s| s.frames_lit) == 1, "the frame lit", || tell(&s))?;
-    check(all_lit(&all, lit_at + slack, dark, true) != Some(false), "light in the first half of the slot", || tell(&s))?;
+    check(
+        all_lit(&all, lit_at + slack, dark, true) != Some(false),
+        "light in the first half of the slot",
+        || tell(&s),
+    )?;
     let end = b.slots()?.start(b.slots()?.slot_at(DeviceTicks(lit_at)).unwrap_or(0) + 1).0;
     match all_lit(&all, dark + slack, end, false) {
         Some(dark) => check(dark, "no light in the second half of the slot", || "light".into()),

@@ -18,26 +18,31 @@ pub(super) const RULES: &[Rule] = &[
         statement: "ARM leads from configured to armed, dark until a frame is due",
         check: arm,
     },
-    Rule {
-        id: "arm-twice",
-        section: "6",
-        statement: "ARM is safe to receive twice",
-        check: arm_twice,
-    },
+    Rule { id: "arm-twice", section: "6", statement: "ARM is safe to receive twice", check: arm_twice },
     Rule {
         id: "arm-faults",
         section: "6",
         statement: "with latched faults ARM must name every one; else FAULT 3, detail 2",
         check: arm_faults,
     },
-    Rule { id: "stop", section: "6", statement: "STOP disarms and darkens at once, within the slot", check: stop },
+    Rule {
+        id: "stop",
+        section: "6",
+        statement: "STOP disarms and darkens at once, within the slot",
+        check: stop,
+    },
     Rule {
         id: "stop-any-session",
         section: "6",
         statement: "STOP is honoured whatever its session",
         check: stop_any_session,
     },
-    Rule { id: "black", section: "6", statement: "BLACK darkens at once, and ARM lights again", check: black },
+    Rule {
+        id: "black",
+        section: "6",
+        statement: "BLACK darkens at once, and ARM lights again",
+        check: black,
+    },
     Rule {
         id: "black-any-session",
         section: "6",
@@ -123,7 +128,9 @@ fn arm_unconfigured(b: &mut Bench<'_>) -> R {
 fn arm(b: &mut Bench<'_>) -> R {
     b.armed(|_| {})?;
     let s = b.report()?;
-    check(s.state == DeviceState::Armed && !s.lit && s.faults == 0, "armed, dark, without faults", || tell(&s))?;
+    check(s.state == DeviceState::Armed && !s.lit && s.faults == 0, "armed, dark, without faults", || {
+        tell(&s)
+    })?;
     let buffers = b.hello.map_or(0, |h| u32::from(h.frame_buffers));
     check(
         s.frame_limit.wrapping_sub(s.frames_accounted) == buffers,
@@ -152,9 +159,11 @@ fn arm_faults(b: &mut Bench<'_>) -> R {
         b.say(&HostMessage::Arm(acknowledged))?;
         let limit = b.answer_ns();
         let fault = b.wait_fault(limit, FaultCode::Arm)?.ok_or_else(|| b.silent("FAULT 3"))?;
-        check(fault.detail == 2 && fault.latched & faults::HOST_SAFE != 0, "detail 2, and fault 3 latched", || {
-            format!("detail {}, faults {:#x}", fault.detail, fault.latched)
-        })?;
+        check(
+            fault.detail == 2 && fault.latched & faults::HOST_SAFE != 0,
+            "detail 2, and fault 3 latched",
+            || format!("detail {}, faults {:#x}", fault.detail, fault.latched),
+        )?;
         let s = b.report()?;
         check(s.state == DeviceState::Faulted && !s.lit, "faulted and dark", || tell(&s))?;
     }
@@ -240,9 +249,15 @@ fn black_frames(b: &mut Bench<'_>) -> R {
         b.send(&shot)?;
     }
     let s = b.until_slot(last)?;
-    check(s.state == DeviceState::Black && !s.lit && s.frames_lit == before.frames_lit, "black", || tell(&s))?;
+    check(s.state == DeviceState::Black && !s.lit && s.frames_lit == before.frames_lit, "black", || {
+        tell(&s)
+    })?;
     check(grew(&before, &s, |s| s.frames_refused) == 3, "3 frames refused", || tell(&s))?;
-    check(s.frames_accounted == 3 && s.frame_limit.wrapping_sub(3) > 0, "3 accounted, credit for more", || tell(&s))?;
+    check(
+        s.frames_accounted == 3 && s.frame_limit.wrapping_sub(3) > 0,
+        "3 accounted, credit for more",
+        || tell(&s),
+    )?;
     check(grew(&before, &s, |s| s.slots_blank) > 0, "blank slots", || tell(&s))
 }
 
@@ -271,7 +286,11 @@ fn freeze(b: &mut Bench<'_>) -> R {
 }
 
 fn is_safe(b: &mut Bench<'_>, s: &Status) -> R {
-    check(s.state == DeviceState::Faulted && s.faults & faults::HOST_SAFE != 0, "faulted, fault 3 latched", || tell(s))?;
+    check(
+        s.state == DeviceState::Faulted && s.faults & faults::HOST_SAFE != 0,
+        "faulted, fault 3 latched",
+        || tell(s),
+    )?;
     // It stays so.
     b.pass(100_000_000)?;
     let s = b.report()?;
@@ -313,8 +332,12 @@ fn bitten(b: &mut Bench<'_>) -> R<u64> {
     let (mut heard_at, mut fault) = (None, None);
     let found = b.wait(limit, |h| {
         match h.message {
-            dpm_device::link::DeviceMessage::Echo(e) if e.host_sent_ns == stamp => heard_at = Some(e.device_received.0),
-            dpm_device::link::DeviceMessage::Fault(f) if f.latched & faults::WATCHDOG != 0 => fault = Some(f.at.0),
+            dpm_device::link::DeviceMessage::Echo(e) if e.host_sent_ns == stamp => {
+                heard_at = Some(e.device_received.0)
+            }
+            dpm_device::link::DeviceMessage::Fault(f) if f.latched & faults::WATCHDOG != 0 => {
+                fault = Some(f.at.0)
+            }
             _ => {}
         }
         heard_at.zip(fault)

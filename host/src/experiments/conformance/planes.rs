@@ -25,7 +25,12 @@ pub(super) const RULES: &[Rule] = &[
         statement: "packets of older frames are ignored",
         check: frame_old,
     },
-    Rule { id: "frame-wrap", section: "7", statement: "frame numbers go on from 2^32 - 1 to 0", check: frame_wrap },
+    Rule {
+        id: "frame-wrap",
+        section: "7",
+        statement: "frame numbers go on from 2^32 - 1 to 0",
+        check: frame_wrap,
+    },
     Rule {
         id: "plane-again",
         section: "7",
@@ -82,7 +87,12 @@ pub(super) const RULES: &[Rule] = &[
         statement: "RLE that gives less or more than a plane, or has bytes left over, is a damaged plane",
         check: codec_rle_wrong,
     },
-    Rule { id: "codec-xor", section: "8", statement: "XOR + RLE of the base frame's plane", check: codec_xor },
+    Rule {
+        id: "codec-xor",
+        section: "8",
+        statement: "XOR + RLE of the base frame's plane",
+        check: codec_xor,
+    },
     Rule {
         id: "codec-xor-base",
         section: "8",
@@ -157,7 +167,11 @@ fn frame_abandoned(b: &mut Bench<'_>) -> R {
     b.send(&whole)?;
     let s = b.until_slot(slot)?;
     check(fates(&before, &s) == [1, 1, 0, 0, 0], "one frame incomplete, the next lit", || tell(&s))?;
-    check(s.last_lit_frame == whole.id && grew(&before, &s, |s| s.frames_seen) == 2, "two frames seen", || tell(&s))
+    check(
+        s.last_lit_frame == whole.id && grew(&before, &s, |s| s.frames_seen) == 2,
+        "two frames seen",
+        || tell(&s),
+    )
 }
 
 fn frame_old(b: &mut Bench<'_>) -> R {
@@ -250,7 +264,9 @@ fn masks(b: &mut Bench<'_>) -> R {
     shot.commit.kept = 1;
     b.send(&shot)?;
     let s = b.until_slot(slot)?;
-    check(grew(&before, &s, |s| s.frames_lit) == 0 && !s.lit, "a plane in both masks: no light", || tell(&s))?;
+    check(grew(&before, &s, |s| s.frames_lit) == 0 && !s.lit, "a plane in both masks: no light", || {
+        tell(&s)
+    })?;
     check(grew(&before, &s, |s| s.packets_ignored) >= 1, "FRAME_COMMIT counted as ignored", || tell(&s))
 }
 
@@ -368,7 +384,7 @@ fn codec_rle(b: &mut Bench<'_>) -> R {
     let mut short = vec![1, first, 0];
     run(&mut short, n - 2);
     by_codec(b, Codec::Rle, "literals and runs", short)?;
-    if n > 128 + 1 + 64 && b.carry_ns(400) < 200_000_000 {
+    if n > 129 + 16 && b.carry_ns(400) < 200_000_000 {
         // The long literal of 130 bytes: 127, then 2.
         let mut long = vec![127, 2, 0, first];
         long.extend([0; 129]);
@@ -400,9 +416,12 @@ fn codec_rle_wrong(b: &mut Bench<'_>) -> R {
     let over = [full(n), vec![0, 0]].concat();
     let more = [full(n - 2), run(8)].concat();
     let cut = [full(n - 4), vec![3, 0]].concat();
-    for (what, bytes) in
-        [("a byte less than a plane", full(n - 1)), ("bytes left over", over), ("a run beyond the plane", more), ("a token cut short", cut)]
-    {
+    for (what, bytes) in [
+        ("a byte less than a plane", full(n - 1)),
+        ("bytes left over", over),
+        ("a run beyond the plane", more),
+        ("a token cut short", cut),
+    ] {
         if bytes.len() >= n {
             continue;
         }

@@ -11,6 +11,7 @@ use dpm_device::link::{
 use dpm_device::planes::{PlaneSchedule, Raster};
 use dpm_device::time::{DeviceTicks, FrameRate, HostTime};
 use dpm_device::transport::usb::{UsbSettings, UsbTransport};
+use dpm_device::transport::Transport;
 use hil_mock::projector::usb::UsbProjector;
 use hil_mock::projector::{MockConfig, MockProjector};
 use hil_mock::usb_model::Speed;
@@ -104,7 +105,9 @@ impl Host {
             flash_limit: None,
             limits: LightLimits::OFF,
         });
-        let usb = UsbTransport::open(device.settings()).expect("the device opens");
+        let mut usb = UsbTransport::open(device.settings()).expect("the device opens");
+        let clock = device.clock.clone();
+        usb.set_clock(Arc::new(move || clock()));
         Self { link, usb, next_id: 1 }
     }
 
