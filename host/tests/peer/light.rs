@@ -229,7 +229,9 @@ impl Peer {
         let Some(config) = self.config.clone() else { return };
         let slot = config.slot_at(a.target).unwrap_or(0);
         let whole = Whole { frame: a.frame, slot, dark, planes };
-        self.base = Some(whole.clone());
+        if !self.breaks("base-dropped") {
+            self.base = Some(whole.clone());
+        }
         if a.target > self.now() + 2 * HZ && !self.breaks("frame-early") {
             self.n.refused += 1;
             return;
@@ -244,6 +246,7 @@ impl Peer {
             self.n.late += 1;
             return;
         }
+        self.base = Some(whole.clone());
         self.waiting.push_back(whole);
     }
 
