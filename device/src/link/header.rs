@@ -263,6 +263,15 @@ impl<'a> Packet<'a> {
         Self { header, payload, trailer, trailer_len: trailer_len as u8 }
     }
 
+    /// Exactly these bytes, unchecked: a packet that is damaged, cut short or of another version, to see what its receiver does. Of
+    /// `trailer` at most eight bytes are sent.
+    pub fn from_raw(header: [u8; HEADER_BYTES], payload: &'a [u8], trailer: &[u8]) -> Self {
+        let mut bytes = [0u8; 8];
+        let n = trailer.len().min(bytes.len());
+        bytes[..n].copy_from_slice(&trailer[..n]);
+        Self { header, payload, trailer: bytes, trailer_len: n as u8 }
+    }
+
     /// Header, payload and trailer in the order they are sent; the last two may be empty.
     pub fn parts(&self) -> [&[u8]; 3] {
         [&self.header, self.payload, &self.trailer[..self.trailer_len as usize]]
@@ -270,7 +279,7 @@ impl<'a> Packet<'a> {
 
     /// Bytes of the whole packet.
     pub fn wire_bytes(&self) -> usize {
-        packet_bytes(self.payload.len())
+        HEADER_BYTES + self.payload.len() + self.trailer_len as usize
     }
 }
 
