@@ -2,7 +2,7 @@
 
 use super::stages::LinkTime;
 use dpm_device::link::{faults, HostLink, LinkError, LinkState, Verb};
-use dpm_device::time::HostTime;
+use dpm_device::time::{DeviceTicks, HostTime};
 use dpm_device::transport::Transport;
 
 /// Longest time that a device may take to answer.
@@ -80,9 +80,11 @@ pub fn connect(
         }
         if let (LinkState::Streaming, Some((round_trip, echo)), Some(clock)) = (state, best, link.slots()) {
             if echoes >= ECHOES {
-                // The device's stamp lies in the middle of the shortest exchange.
+                // The middle between the device's two stamps is that of the host's: what it did in between is no part of the way.
+                let held = echo.device_sent_at.0.saturating_sub(echo.device_received_at.0);
+                let there = DeviceTicks(echo.device_received_at.0.saturating_add(held / 2));
                 let middle = echo.host_sent_at.plus_ns(round_trip / 2);
-                return Ok(LinkTime { clock, first: 0, anchor: (echo.device_received_at, middle) });
+                return Ok(LinkTime { clock, first: 0, anchor: (there, middle) });
             }
         }
         if t.ns_since(begin) > LIMIT_NS {
