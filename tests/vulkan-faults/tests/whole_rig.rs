@@ -31,8 +31,7 @@ impl Running {
         let gpu = Gpu::open(&GpuOptions::default()).unwrap_or_else(|e| panic!("{e}"));
         let monitor = Arc::new(RunMonitor::default());
         let watched = monitor.clone();
-        let thread =
-            std::thread::spawn(move || pipeline::run(rig(), &gpu, RunOptions::default(), &watched));
+        let thread = std::thread::spawn(move || pipeline::run(rig(), &gpu, RunOptions::default(), &watched));
         Self { monitor, thread: Some(thread) }
     }
 
@@ -66,7 +65,9 @@ const BACK_WITHIN: Duration = Duration::from_secs(30);
 
 #[test]
 fn the_picture_comes_back_after_a_loss_and_after_a_submission_that_never_ends() {
-    for (plan, word) in [("lost@frame=1", "lost"), ("submit-hang@frame=1", "did not finish"), ("lost@wait=1", "lost")] {
+    for (plan, word) in
+        [("lost@frame=1", "lost"), ("submit-hang@frame=1", "did not finish"), ("lost@wait=1", "lost")]
+    {
         let session = layer("");
         let run = Running::start();
         run.lit(20, BACK_WITHIN);
