@@ -42,6 +42,7 @@ impl Bench {
         command.args(words).current_dir(&self.folder);
         command.env("LD_PRELOAD", library).env("USBFS_FAKE_USBIP", self.server.address().to_string());
         command.env("USBFS_FAKE_DRIVER", "usbhid");
+        command.env("DPM_RUNTIME_DIR", self.folder.join("run")).env("DPM_STATE_DIR", self.folder.join("state"));
         command.output().unwrap()
     }
 

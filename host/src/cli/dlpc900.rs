@@ -1,8 +1,10 @@
 //! `dpm dlpc900`: words into calls of the DLPC900 driver.
 
-use super::watch::print;
+use super::watch::{print, refuse_where_dark_stands};
+use crate::config::{Dlpc900Config, ProjectorBackend};
 use crate::dlpc900::{sequence_of, status_text, PatternFileError, ShowAs};
 use crate::failure::{Failure, FailureKind};
+use crate::standing::Identity;
 use clap::ValueEnum;
 use dpm_device::dlpc900::driver::{Dlpc900, Dlpc900Error, UploadProgress};
 use dpm_device::dlpc900::image::{Compression, PlaneOrder};
@@ -195,6 +197,14 @@ fn open(args: &Dlpc900Args) -> Result<Dlpc900<UsbHid>, Failure> {
 /// [`FailureKind::Device`] when the controller cannot be reached or refuses; [`FailureKind::BadInput`] when pictures or times
 /// break a rule, with the LUT entry and the rule.
 pub fn execute(args: &Dlpc900Args) -> Result<(), Failure> {
+    let lights = match &args.action {
+        Action::Upload(upload) => upload.start,
+        Action::Start | Action::VideoPattern(_) | Action::Wake => true,
+        _ => false,
+    };
+    if lights {
+        refuse_where_dark_stands(&Identity::of(&ProjectorBackend::Dlpc900(Dlpc900Config::default())))?;
+    }
     let mut d = open(args)?;
     match &args.action {
         Action::Status => print(&status_text(&d.status()?)),

@@ -2,11 +2,13 @@
 
 use super::rig_args::RigArgs;
 use super::signals;
-use super::watch::{print, take_locks};
+use super::watch::{print, refuse_where_dark_stands, take_locks};
 use crate::experiments::link_test::{link_test, Content};
 use crate::experiments::run_rig::open_gpu;
 use crate::failure::{Failure, FailureKind};
 use crate::rig::Rig;
+use crate::standing::Identity;
+use crate::stopping;
 use crate::telemetry::report::to_json;
 use std::path::PathBuf;
 
@@ -39,9 +41,10 @@ pub struct LinkTestArgs {
 pub fn execute(args: &LinkTestArgs) -> Result<(), Failure> {
     let config = args.flags.rig(Some(&args.rig))?;
     let _locks = take_locks(&config)?;
+    refuse_where_dark_stands(&Identity::of(&config.projector.backend))?;
     signals::install()
         .map_err(|e| Failure::new(FailureKind::Device, format!("cannot handle signals: {e}")))?;
-    let stop = || signals::received().is_some();
+    let stop = stopping::is_stopping;
     let rig = Rig::build(&config, None)?;
     let content = if args.prepared {
         Content::prepared(&rig, args.count)
@@ -49,6 +52,7 @@ pub fn execute(args: &LinkTestArgs) -> Result<(), Failure> {
         Content::rendered(&rig, &open_gpu(&config)?, args.count, &stop)?
     };
     let report = link_test(&rig, &content, f64::from(args.way_seconds), &stop)?;
+    stopping::end_in_order();
     print(&if args.json { to_json(&report) + "\n" } else { report.to_table() });
     Ok(())
 }

@@ -83,12 +83,26 @@ pub enum Show {
 }
 
 impl Show {
-    fn set_up<P: HidPort>(&self, d: &mut Dlpc900<P>) -> Result<(), Dlpc900Error> {
+    /// Sets the controller up and lets it show; where that is not wanted now, as far as it goes without light. True when it shows.
+    fn set_up<P: HidPort>(&self, d: &mut Dlpc900<P>, lit: bool) -> Result<bool, Dlpc900Error> {
         match self {
             Self::Preloaded(sequence) => {
                 d.upload(sequence, LedSetup::default(), &mut |_| ())?;
-                d.start()
+                if lit {
+                    d.start()?;
+                }
             }
+            Self::Video(video) if lit => d.start_video_patterns(video)?,
+            // Setting up and starting are one command here.
+            Self::Video(_) => d.stop()?,
+        }
+        Ok(lit)
+    }
+
+    /// Lets a controller that was set up dark show.
+    fn start<P: HidPort>(&self, d: &mut Dlpc900<P>) -> Result<(), Dlpc900Error> {
+        match self {
+            Self::Preloaded(_) => d.start(),
             Self::Video(video) => d.start_video_patterns(video),
         }
     }
@@ -338,21 +352,24 @@ fn watch_over<P: HidPort>(
     monitor: &RunMonitor,
     report: &mut Dlpc900Report,
 ) -> Result<(), Failure> {
-    let mut standing: Option<Order> = None;
+    // What stands from before the run, or was ordered while it rendered: the controller is set up dark.
+    let mut standing = monitor.take_order().filter(|order| *order != Order::Arm);
     let mut lost = false;
-    let set_up = |d: &mut Dlpc900<P>, report: &mut Dlpc900Report| {
+    let set_up = |d: &mut Dlpc900<P>, lit: bool, report: &mut Dlpc900Report| {
         let watch = Stopwatch::start();
-        let done = show.set_up(d);
+        let done = show.set_up(d, lit && !monitor.dark_is_ordered());
         report.setup_s = watch.elapsed_ns() as f64 * 1e-9;
         done
     };
-    set_up(d, report)?;
-    monitor.set_projector(ProjectorHealth::Up);
+    let mut has_shown = set_up(d, standing.is_none(), report)?;
+    monitor.set_projector(if has_shown { ProjectorHealth::Up } else { health(standing) });
     let (shown, mut looked) = (Stopwatch::start(), Stopwatch::start());
     while !monitor.stop_requested() && seconds.is_none_or(|s| shown.elapsed_ns() as f64 * 1e-9 < s) {
         let order = monitor.take_order();
         if let Some(order) = order {
-            standing = (order != Order::Arm).then_some(order);
+            // A weaker word does not replace a stronger one.
+            let holds = standing.is_some_and(|s| order != Order::Arm && s.strength() > order.strength());
+            standing = if holds { standing } else { Some(order).filter(|order| *order != Order::Arm) };
         }
         let due = looked.elapsed_ns() >= LOOK_NS;
         let step = match (lost, order) {
@@ -361,17 +378,20 @@ fn watch_over<P: HidPort>(
                 open().and_then(|found| {
                     *d = found;
                     // It may have been without power.
-                    set_up(d, report)?;
+                    has_shown = set_up(d, standing.is_none(), report)?;
                     (lost, report.came_back) = (false, report.came_back + 1);
-                    if standing.is_some() {
-                        d.stop()?;
-                    }
                     monitor.set_projector(health(standing));
                     Ok(())
                 })
             }
             (true, _) => Ok(()),
-            (false, Some(order)) => obey(d, order).map(|()| monitor.set_projector(health(standing))),
+            (false, Some(Order::Arm)) if !has_shown => show.start(d).map(|()| {
+                has_shown = true;
+                monitor.set_projector(health(standing));
+            }),
+            (false, Some(_)) => {
+                obey(d, standing.unwrap_or(Order::Arm)).map(|()| monitor.set_projector(health(standing)))
+            }
             (false, None) if due => {
                 looked = Stopwatch::start();
                 look(d, standing)

@@ -115,7 +115,13 @@ impl LinkKeeper {
         if let Some(order) = monitor.take_order() {
             self.obey(now, order, link, transport);
         }
-        self.arm_again(now, link, steady);
+        if monitor.must_be_dark() && self.standing != Some(Verb::Stop) {
+            // A signal or a panic: nothing that is under way is waited for.
+            self.stop(now, link, transport);
+        }
+        if !monitor.stop_requested() {
+            self.arm_again(now, link, steady);
+        }
         if let (Some(reports), Some(status)) = (&mut self.reports, link.status().filter(|_| self.is_timed)) {
             reports.observe(status, &self.time);
         }
@@ -166,6 +172,10 @@ impl LinkKeeper {
                 return link.arm(link.status().map_or(0, |s| s.faults));
             }
         };
+        // What stands is not weakened by a later word: FREEZE after BLACK, or BLACK after SAFE.
+        if self.standing.is_some_and(|standing| rank(standing) > rank(verb)) {
+            return;
+        }
         self.standing = Some(verb);
         // What does not get through now is repeated by the link; a medium that is gone is dark anyway.
         let _ = link.command(now, verb, transport);
@@ -231,6 +241,16 @@ pub(super) fn is_dark(link: &HostLink) -> bool {
         })
 }
 
+/// What stands gives way only to what is at least as strong.
+fn rank(verb: Verb) -> u8 {
+    match verb {
+        Verb::Freeze => 0,
+        Verb::Black => 1,
+        Verb::Safe => 2,
+        Verb::Stop => 3,
+    }
+}
+
 fn health(link: &HostLink, standing: Option<Verb>) -> ProjectorHealth {
     use DeviceState as D;
     let state = link.status().map_or(D::Idle, |s| s.state);
@@ -240,6 +260,8 @@ fn health(link: &HostLink, standing: Option<Verb>) -> ProjectorHealth {
         // Not before the projector says so.
         (_, Some(Verb::Black)) if !matches!(state, D::Armed | D::Frozen) => ProjectorHealth::Black,
         (_, Some(Verb::Freeze)) if state != D::Armed => ProjectorHealth::Frozen,
+        // A projector that came back without power has forgotten it; the host has not.
+        (_, Some(Verb::Safe)) if state == D::Configured => ProjectorHealth::Faulted(faults::HOST_SAFE),
         (_, Some(Verb::Stop)) if is_dark(link) => ProjectorHealth::Stopped,
         (LinkState::Streaming, _) => ProjectorHealth::Up,
         _ => ProjectorHealth::Connecting,

@@ -133,7 +133,7 @@ fn run_from(
             };
             let acknowledged =
                 if config.safety.acknowledge_faults { u32::MAX } else { ENDED_WITH_THE_LAST_RUN };
-            let time = connect(&mut link, cable.transport(), acknowledged, &mut || {
+            let time = connect(&mut link, cable.transport(), acknowledged, monitor, &mut || {
                 clock.wait_until(clock.now().plus_ns(if is_virtual { 50_000 } else { 200_000 }))
             })?;
             let lead = lead_estimator(&rig, &link);
