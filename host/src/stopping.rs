@@ -17,8 +17,8 @@ static SIGNAL: AtomicI32 = AtomicI32::new(0);
 /// Signals that asked for a stop.
 static STOPS: AtomicU32 = AtomicU32::new(0);
 static PANICKED: AtomicBool = AtomicBool::new(false);
-/// The run has ended in order.
-static ENDED: AtomicBool = AtomicBool::new(false);
+/// Files are being written after the run has ended in order.
+static WRITING: AtomicBool = AtomicBool::new(false);
 /// The strongest order that came as a signal and that the light has not taken; 0 for none.
 static FOR_LIGHT: AtomicU8 = AtomicU8::new(0);
 /// The same for whoever keeps orders over restarts.
@@ -53,14 +53,28 @@ pub fn note_panic() -> bool {
     unexpected
 }
 
-/// Says that the run has ended in order: its projector is dark and its threads are gone. What is left is to write files.
-pub fn end_in_order() {
-    ENDED.store(true, Ordering::SeqCst);
+/// Lives while files are written after a run that has ended in order: its projector is dark and its threads are gone, so a process that
+/// was asked to stop is given the time that the files take.
+#[derive(Debug)]
+pub struct WritingFiles(());
+
+impl WritingFiles {
+    /// Begins.
+    pub fn begin() -> Self {
+        WRITING.store(true, Ordering::SeqCst);
+        Self(())
+    }
 }
 
-/// True after [`end_in_order`]. A signal handler may call it.
-pub fn has_ended_in_order() -> bool {
-    ENDED.load(Ordering::SeqCst)
+impl Drop for WritingFiles {
+    fn drop(&mut self) {
+        WRITING.store(false, Ordering::SeqCst);
+    }
+}
+
+/// True while a [`WritingFiles`] lives. A signal handler may call it.
+pub fn is_writing_files() -> bool {
+    WRITING.load(Ordering::SeqCst)
 }
 
 /// Says that panics of the calling thread are caught and turned into errors, so that they end nothing.

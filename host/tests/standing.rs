@@ -9,7 +9,7 @@ use cli_common::{code, command, dpm, err, out, own_folder, start_with, Folder, R
 use dpm_device::link::{faults, DeviceState};
 use hil_mock::projector::MockConfig;
 use link_common::{raster, Projector, PtyProjector};
-use rig_file::{rig, WATCHDOG};
+use rig_file::{rig, run_words, WATCHDOG};
 use std::fs;
 use std::io::{BufRead, BufReader, Read, Write};
 use std::os::unix::fs::{chown, symlink, PermissionsExt};
@@ -43,14 +43,20 @@ impl Bench {
     }
 
     fn start(&self) -> Running {
-        start_with(&["run", &self.path], &[("DPM_STATE_DIR", self.state.to_str().unwrap())])
+        start_with(&run_words(&self.path), &[("DPM_STATE_DIR", self.state.to_str().unwrap())])
     }
 
     /// A run that lights a projector that has just been switched on.
     fn lit(&self) -> Running {
         self.power_cycle();
-        let run = self.start();
-        self.far.until(LONG, "light", &mut |s| s.lit && s.frames_lit >= 3);
+        let mut run = self.start();
+        let begin = Instant::now();
+        while !(self.far.is_lit() && self.far.status().frames_lit >= 3) {
+            if begin.elapsed() > LONG {
+                panic!("no light: {:?}, {:#?}", self.far.status(), run.rest_of_lines(Duration::ZERO));
+            }
+            std::thread::sleep(Duration::from_millis(1));
+        }
         run
     }
 
@@ -128,7 +134,8 @@ fn r4_safe_that_only_the_projector_remembers_holds_too() {
     fs::remove_file(bench.kept().unwrap()).unwrap();
     assert_eq!(bench.far.status().faults & faults::HOST_SAFE, faults::HOST_SAFE);
     let state = bench.state.to_str().unwrap().to_owned();
-    let args = ["run", &bench.path, "--set", "safety.acknowledge_faults=true"];
+    let mut args = run_words(&bench.path);
+    args.extend(["--set".into(), "safety.acknowledge_faults=true".into()]);
     let mut run = start_with(&args, &[("DPM_STATE_DIR", &state)]);
     run.wait_for_line(LONG, |line| line.contains("projector: dark, latched faults"));
     // From now on it is known here, too, should the projector lose its power.

@@ -52,7 +52,6 @@ pub fn execute(args: &LinkTestArgs) -> Result<(), Failure> {
         Content::rendered(&rig, &open_gpu(&config)?, args.count, &stop)?
     };
     let report = link_test(&rig, &content, f64::from(args.way_seconds), &stop)?;
-    stopping::end_in_order();
     print(&if args.json { to_json(&report) + "\n" } else { report.to_table() });
     Ok(())
 }

@@ -1,6 +1,7 @@
 //! Flags that every command with a rig takes, into a checked [`RigConfig`].
 
 use crate::config::{Overrides, RigConfig};
+use crate::control::set_rig_name;
 use crate::failure::{Failure, FailureKind};
 use std::path::{Path, PathBuf};
 
@@ -72,6 +73,8 @@ impl RigArgs {
     /// # Errors
     /// Every mistake in file, environment and flags.
     pub fn rig(&self, path: Option<&Path>) -> Result<RigConfig, Failure> {
+        // Whoever gives orders to this process is told which rig it is.
+        path.into_iter().for_each(set_rig_name);
         let read = |flags: Vec<String>| {
             let overrides = Overrides::from_environment(flags);
             match path {

@@ -3,7 +3,6 @@
 use super::rig_args::RigArgs;
 use super::watch::{print, run_and_report, watch};
 use crate::config::ProjectorBackend;
-use crate::control::set_rig_name;
 use crate::experiments::run_dlpc900::run_dlpc900;
 use crate::experiments::run_rig::run_rig;
 use crate::failure::Failure;
@@ -51,7 +50,6 @@ pub fn execute_demo(args: &DemoArgs) -> Result<(), Failure> {
 
 fn start(path: Option<&Path>, flags: &RigArgs, json: bool) -> Result<(), Failure> {
     let rig = flags.rig(path)?;
-    path.into_iter().for_each(set_rig_name);
     if matches!(rig.projector.backend, ProjectorBackend::Dlpc900(_)) {
         let report = watch(rig, |_| {}, |rig, monitor| run_dlpc900(rig, monitor))?;
         print(&if json { to_json(&report) + "\n" } else { report.to_table() });

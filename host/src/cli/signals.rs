@@ -7,7 +7,7 @@
 
 use crate::stopping;
 use std::io;
-use std::sync::atomic::{AtomicBool, Ordering};
+use std::sync::atomic::{AtomicBool, AtomicU32, Ordering};
 use std::sync::Once;
 
 /// Signals that ask for an ordered stop. Supervisors send some of them twice, so the second changes nothing; the third ends the process
@@ -16,16 +16,18 @@ const STOPS: [libc::c_int; 3] = [libc::SIGINT, libc::SIGTERM, libc::SIGHUP];
 /// From the first signal to the end of the process, microseconds: two seconds with a reserve for a busy machine.
 const GONE_WITHIN_US: libc::suseconds_t = 800_000;
 const GONE_WITHIN_S: libc::time_t = 1;
-/// What a run that has ended in order, dark and with all its threads at their end, may take to write its report and pictures, seconds
-/// beyond that.
-const FILES_WITHIN_S: libc::time_t = 10;
+/// A run that has ended in order, dark and with all its threads at their end, is looked at this often while it writes its report and
+/// pictures after SIGINT, microseconds...
+const FILES_STEP_US: libc::suseconds_t = 200_000;
+/// ...and this many times at most: ten seconds.
+const FILES_STEPS: u32 = 50;
 /// Exit code after a panic, as Rust's own.
 const PANIC_CODE: libc::c_int = 101;
 
 /// The timer runs.
 static COUNTING: AtomicBool = AtomicBool::new(false);
-/// It has been given more time for files.
-static EXTENDED: AtomicBool = AtomicBool::new(false);
+/// How often the timer has been given more time for files.
+static EXTENDED: AtomicU32 = AtomicU32::new(0);
 
 extern "C" fn on_stop(signal: libc::c_int) {
     if stopping::note_signal(signal) >= 2 {
@@ -42,8 +44,10 @@ extern "C" fn on_order(signal: libc::c_int) {
 extern "C" fn on_timer(_: libc::c_int) {
     const TOLD: &str = "error: the rig did not end in time after it was asked to stop; the process ends now, \
                         the projector goes dark by its watchdog\n";
-    if stopping::has_ended_in_order() && !EXTENDED.swap(true, Ordering::SeqCst) {
-        return set_timer(FILES_WITHIN_S, 0);
+    // A person at the terminal waits for files, or presses the key twice more; a supervisor does not wait.
+    let waits = stopping::signal() == Some(libc::SIGINT) && stopping::is_writing_files();
+    if waits && EXTENDED.fetch_add(1, Ordering::SeqCst) < FILES_STEPS {
+        return set_timer(0, FILES_STEP_US);
     }
     let code = stopping::signal().map_or(PANIC_CODE, |signal| 128 + signal);
     let mut stderr = libc::pollfd { fd: libc::STDERR_FILENO, events: libc::POLLOUT, revents: 0 };

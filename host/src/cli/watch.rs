@@ -109,7 +109,7 @@ pub fn watch<T: Send + 'static>(
                 }
                 let now = monitor.projector();
                 if let Some(status) = &mut status {
-                    status.say(now, orders.standing());
+                    status.say(now, orders.kept());
                 }
                 if std::mem::replace(&mut health, now) != now {
                     teller.note(&format!("projector: {now}"));
@@ -137,10 +137,9 @@ pub fn watch<T: Send + 'static>(
         }
         result => result,
     };
-    stopping::end_in_order();
     if let Some(status) = &mut status {
         // Whoever waits for a dark that came with the end sees it.
-        status.say(monitor.projector(), orders.standing());
+        status.say(monitor.projector(), orders.kept());
     }
     drop(control);
     if let Some(orders) = Arc::into_inner(orders) {

@@ -325,6 +325,7 @@ fn ask(place: &Place, order: Order) -> Option<Answer> {
         Order::Freeze | Order::Arm => None,
     };
     let mut signalled: Option<io::Result<()>> = None;
+    let mut seen = None;
     let rig = |text: &str| match text.lines().next().and_then(|l| l.strip_prefix(HEARD)) {
         Some(rig) => rig.trim().to_owned(),
         None => StatusFile::read(&place.folder, place.pid).map_or(String::new(), |said| said.rig),
@@ -354,14 +355,24 @@ fn ask(place: &Place, order: Order) -> Option<Answer> {
         if signalled.is_some() || is_heard && !open {
             let said = StatusFile::read(&place.folder, place.pid).ok();
             if let Some(said) = said.filter(|s| s.at_ns > begin_ns && is_obeyed(order, s.health)) {
-                let kept = match said.standing {
-                    Some(standing) => format!("; {} stands", standing.word()),
-                    None => String::new(),
+                let how = match signalled {
+                    Some(_) => "by a signal, for its control thread does not answer",
+                    None => "as its state file says",
                 };
-                let how = if signalled.is_some() { "by a signal, for its control thread does not answer" } else { "as its state file says" };
-                return answer(said.rig, format!("ok: projector {} ({how}{kept})", said.health), true);
+                let kept = said.standing.filter(|standing| standing.strength() >= order.strength());
+                if let (Some(kept), true) = (kept, order.is_dark()) {
+                    let text = format!("ok: projector {} ({how}); {} is kept", said.health, kept.word());
+                    return answer(said.rig, text, true);
+                }
+                if !order.is_dark() {
+                    return answer(said.rig, format!("ok: projector {} ({how})", said.health), true);
+                }
+                seen = Some(format!("projector {} ({how}), but NOT kept over a restart", said.health));
             }
         }
+    }
+    if let Some(seen) = seen {
+        return answer(rig(&text), seen, false);
     }
     let what = match (&signalled, text.starts_with(HEARD)) {
         (Some(Ok(())), _) => "delivered by a signal, NOT confirmed",

@@ -122,6 +122,13 @@ impl Orders {
         self.inner.state().stands
     }
 
+    /// What stands now, once it stands over restarts too (or the rig goes without that, as a mock may).
+    pub fn kept(&self) -> Option<Order> {
+        let state = self.inner.state();
+        let is_kept = matches!(state.outcome, Some(Kept::In(_) | Kept::Nowhere));
+        state.stands.filter(|_| is_kept && state.settled == state.newest)
+    }
+
     /// Ends the thread, waiting half a second at most. After an orderly end BLACK and FREEZE are forgotten, SAFE goes on standing.
     pub fn end(mut self, orderly: bool) {
         let mut state = self.inner.state();

@@ -31,7 +31,7 @@ pub struct Said {
     pub at_ns: u64,
     /// How the projector was then.
     pub health: ProjectorHealth,
-    /// The order that stood then.
+    /// The order that stood then, over restarts too.
     pub standing: Option<Order>,
     /// The rig's file.
     pub rig: String,

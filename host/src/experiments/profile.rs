@@ -63,6 +63,7 @@ pub fn profile_rig(
     };
     let mut profile = summary(&outcome, &rig, prepared);
     profile.report.warnings.splice(0..0, notes);
+    let _writing = crate::stopping::WritingFiles::begin();
     save(&mut profile, &outcome, &config.output.dir)?;
     Ok(profile)
 }

@@ -40,7 +40,7 @@ pub fn run_rig(config: &RigConfig, monitor: &Arc<RunMonitor>) -> Result<Report, 
     let keep_frames = if output.images && has_truth && has_light { window } else { 0 };
     let options = RunOptions { frames: config.run.frames, keep_frames, ..RunOptions::default() };
     let outcome = pipeline::run(rig.clone(), &gpu, options, monitor)?;
-    crate::stopping::end_in_order();
+    let _writing = crate::stopping::WritingFiles::begin();
     let mut report = outcome.report;
     report.warnings.splice(0..0, notes);
     if outcome.light_mismatches > 0 {

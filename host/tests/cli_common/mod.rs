@@ -1,6 +1,7 @@
 //! The program in a process of its own, for the tests of the command line.
 #![allow(dead_code)]
 
+use std::ffi::OsStr;
 use std::io::{BufRead, BufReader, Read};
 use std::path::PathBuf;
 use std::process::{Child, Command, ExitStatus, Output, Stdio};
@@ -17,7 +18,7 @@ pub fn own_folder(name: &str) -> PathBuf {
 }
 
 /// The program with arguments, in an environment without settings of ours. What this machine's own rigs keep is none of its business.
-pub fn command(args: &[&str]) -> Command {
+pub fn command<S: AsRef<OsStr>>(args: &[S]) -> Command {
     let mut command = Command::new(env!("CARGO_BIN_EXE_dpm"));
     command.args(args).env_remove("NO_COLOR").stdin(Stdio::null());
     command.env("DPM_RUNTIME_DIR", own_folder("run")).env("DPM_STATE_DIR", own_folder("state"));
@@ -56,12 +57,12 @@ pub struct Running {
 }
 
 /// Starts the program and goes on.
-pub fn start(args: &[&str]) -> Running {
+pub fn start<S: AsRef<OsStr>>(args: &[S]) -> Running {
     start_with(args, &[])
 }
 
 /// Starts the program with more variables in its environment, and goes on.
-pub fn start_with(args: &[&str], variables: &[(&str, &str)]) -> Running {
+pub fn start_with<S: AsRef<OsStr>>(args: &[S], variables: &[(&str, &str)]) -> Running {
     let mut command = command(args);
     command.envs(variables.iter().copied()).stdout(Stdio::piped()).stderr(Stdio::piped());
     let mut child = command.spawn().expect("the program starts");
