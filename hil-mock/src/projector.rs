@@ -6,8 +6,10 @@
 
 mod clock;
 mod config;
+mod emulated;
 mod faulty;
 mod frames;
+mod guard;
 mod light;
 mod receive;
 pub mod serial;
@@ -27,8 +29,10 @@ use dpm_device::transport::{Lane, LinkDevice};
 
 pub use clock::DeviceClock;
 pub use config::{LightEvent, LightKind, MockConfig};
+pub use emulated::{EmulatedProjector, Served};
 pub use faulty::FaultyProjector;
 use frames::{FrameStore, Held};
+use guard::LightGuard;
 pub use light::{light_of_planes, Exposure};
 pub use thread::serve_cable;
 
@@ -69,6 +73,9 @@ struct Core {
     last_heard: DeviceTicks,
     next_slot: u64,
     flash: Option<FlashLimiter>,
+    guard: LightGuard,
+    /// Up to here the guard has counted.
+    counted_to: Option<HostTime>,
     /// Luminance of the frame on the mirrors.
     luminance: u32,
     /// No ARM before this, while light rests after too many flashes.
@@ -149,6 +156,8 @@ impl MockProjector {
                 last_heard: DeviceTicks(0),
                 next_slot: 0,
                 flash: None,
+                guard: LightGuard::default(),
+                counted_to: None,
                 luminance: 0,
                 rest_until: DeviceTicks(0),
                 damaged_at_whole: 0,
@@ -236,13 +245,17 @@ impl MockProjector {
         self.core.setup.clock
     }
 
-    /// True time of the next thing that happens by itself (a slot or the watchdog); `None` while disarmed.
+    /// True time of the next thing that happens by itself (a slot, the end of a frame's light, or the watchdog); `None` while
+    /// disarmed.
     pub fn next_due(&self) -> Option<HostTime> {
         let (config, slots) = self.core.config.as_ref()?;
         if self.core.mode == Mode::Disarmed {
             return None;
         }
-        let due = slots.start(self.core.next_slot).min(self.core.bite_at(config));
+        let mut due = slots.start(self.core.next_slot).min(self.core.bite_at(config));
+        if let Some(dark_from) = self.core.dark_from() {
+            due = due.min(dark_from);
+        }
         Some(self.core.setup.clock.instant_of(due))
     }
 
@@ -394,21 +407,40 @@ impl Core {
         DeviceTicks(self.last_heard.0.saturating_add(ticks.max(1)))
     }
 
-    /// Slots and the watchdog up to `now`, in the order of time. Bounded: the watchdog ends it.
+    /// When the frame that is lit must be dark if no newer one is lit before; `None` while nothing is lit or light is frozen.
+    fn dark_from(&self) -> Option<DeviceTicks> {
+        let held = self.store.lit.filter(|_| self.lit_now && self.mode == Mode::Normal)?;
+        Some(held.dark_from)
+    }
+
+    /// The frame on the mirrors is over: dark until a newer one is lit, and nothing is left that could be lit again.
+    fn end_light(&mut self) {
+        self.lit_now = false;
+        self.store.lit = None;
+        self.status_due = true;
+    }
+
+    /// Slots, ends of light and the watchdog up to `now`, in the order of time. Bounded: the watchdog ends it.
     fn advance(&mut self, now: HostTime) {
         self.now = self.now.max(now);
         let ticks = self.ticks();
         while self.mode != Mode::Disarmed {
             let Some((config, slots)) = self.config else { break };
             let (start, bite) = (slots.start(self.next_slot), self.bite_at(&config));
-            if start.min(bite) > ticks {
+            // At one and the same tick a new frame comes before the end of the old one: there is no dark gap between them.
+            let dark = self.dark_from().filter(|dark| *dark < start);
+            let next = dark.unwrap_or(start);
+            if next.min(bite) > ticks {
                 break;
             }
-            if bite <= start {
+            if bite <= next {
                 self.latch(faults::WATCHDOG);
                 break;
             }
-            self.slot(&config, &slots, start);
+            match dark {
+                Some(_) => self.end_light(),
+                None => self.slot(&config, &slots, start),
+            }
         }
     }
 
@@ -418,14 +450,53 @@ impl Core {
         self.next_slot += 1;
         self.status.slots = self.status.slots.wrapping_add(1);
         self.status_due = true;
-        let due = self.store.take_due(slot);
+        let mut due = self.store.take_due(slot);
+        if let Some((_, superseded)) =
+            due.filter(|(frame, _)| self.mode == Mode::Normal && frame.dark_from <= start)
+        {
+            // It was allowed to be late, but its own light is over.
+            self.status.frames_superseded = self.status.frames_superseded.wrapping_add(superseded);
+            self.status.frames_late = self.status.frames_late.wrapping_add(1);
+            due = None;
+        }
+        if due.is_none() && self.dark_from().is_some_and(|dark| dark <= start) {
+            self.end_light();
+        }
+        // FREEZE holds what is lit; where nothing is, it makes no light. A frame that BLACK hid may be over by now.
+        let again = self.store.lit.is_some_and(|held| match self.mode {
+            Mode::Frozen => self.lit_now,
+            Mode::Normal => config.underrun == Underrun::Repeat && start < held.dark_from,
+            Mode::Black | Mode::Disarmed => false,
+        });
+        let too_much = match (self.mode, due) {
+            (Mode::Normal, Some((frame, _))) => {
+                let bytes = config.raster.plane_bytes() * config.schedule.len();
+                let planes = &self.store.bytes(frame.buffer)[..bytes];
+                self.guard.new_frame(config.raster, &config.schedule, planes)
+            }
+            _ if again => self.guard.same_frame(),
+            _ => {
+                self.guard.dark();
+                None
+            }
+        };
+        if let Some(rest_us) = too_much {
+            // The slot stays dark, and so does everything after it.
+            let refused = due.map_or(0, |(_, superseded)| superseded + 1);
+            self.status.frames_refused = self.status.frames_refused.wrapping_add(refused);
+            self.status.slots_blank = self.status.slots_blank.wrapping_add(1);
+            self.rest(start, rest_us);
+            self.latch(faults::LIGHT_LIMIT);
+            return self.note_light(slots, slot, LightKind::Blank);
+        }
         let kind = match (self.mode, due) {
             (Mode::Normal, Some((frame, superseded))) => {
                 self.status.frames_superseded = self.status.frames_superseded.wrapping_add(superseded);
                 self.status.frames_lit = self.status.frames_lit.wrapping_add(1);
                 self.status.last_lit_frame = frame.frame;
                 self.status.last_lit_at = start;
-                self.store.lit = Some(Held { frame: frame.frame, buffer: frame.buffer });
+                self.store.lit =
+                    Some(Held { frame: frame.frame, dark_from: frame.dark_from, buffer: frame.buffer });
                 self.generation += 1;
                 if self.flash.is_some() {
                     let bytes = config.raster.plane_bytes() * config.schedule.len();
@@ -434,12 +505,10 @@ impl Core {
                 }
                 LightKind::Lit
             }
-            (mode, due) => {
+            (_, due) => {
                 // Told to be dark or to hold: frames are used up so that the stream goes on.
                 let refused = due.map_or(0, |(_, superseded)| superseded + 1);
                 self.status.frames_refused = self.status.frames_refused.wrapping_add(refused);
-                let again = self.store.lit.is_some()
-                    && (mode == Mode::Frozen || mode == Mode::Normal && config.underrun == Underrun::Repeat);
                 if again {
                     self.status.slots_repeated = self.status.slots_repeated.wrapping_add(1);
                     LightKind::Repeated
@@ -450,7 +519,25 @@ impl Core {
             }
         };
         self.lit_now = kind != LightKind::Blank;
-        let clock = &self.setup.clock;
+        self.note_light(slots, slot, kind);
+        let luminance = if self.lit_now { self.luminance } else { 0 };
+        if self.flash.as_mut().is_some_and(|f| f.observe(luminance)) {
+            self.rest(start, u64::from(REST_US));
+            self.latch(faults::FLASH_LIMIT);
+        }
+    }
+
+    /// No ARM within `us` microseconds of `from`.
+    fn rest(&mut self, from: DeviceTicks, us: u64) {
+        let ticks = u128::from(us) * u128::from(self.setup.clock.tick_hz) / 1_000_000;
+        let ticks = u64::try_from(ticks).unwrap_or(u64::MAX);
+        self.rest_until = self.rest_until.max(DeviceTicks(from.0.saturating_add(ticks)));
+    }
+
+    /// Tells whoever watches what `slot` shows.
+    fn note_light(&mut self, slots: &SlotClock, slot: u64, kind: LightKind) {
+        let (start, clock) = (slots.start(slot), &self.setup.clock);
+        let end = slots.start(slot + 1);
         let settle = if self.lit_now { i64::from(self.setup.settle_ns) } else { 0 };
         let event = LightEvent {
             slot,
@@ -458,7 +545,7 @@ impl Core {
             kind,
             lit_at: start,
             first_photon_at: clock.instant_of(start).plus_ns(settle),
-            last_photon_at: clock.instant_of(slots.start(slot + 1)),
+            last_photon_at: clock.instant_of(self.dark_from().unwrap_or(end).min(end)),
         };
         if self.events.len() >= self.setup.events_kept {
             self.events.pop_front();
@@ -467,16 +554,13 @@ impl Core {
         if self.setup.events_kept > 0 {
             self.events.push_back(event);
         }
-        let luminance = if self.lit_now { self.luminance } else { 0 };
-        if self.flash.as_mut().is_some_and(|f| f.observe(luminance)) {
-            let rest = u64::from(REST_US) * u64::from(self.setup.clock.tick_hz) / 1_000_000;
-            self.rest_until = DeviceTicks(start.0.saturating_add(rest));
-            self.latch(faults::FLASH_LIMIT);
-        }
     }
 
     /// Goes dark and forgets every frame on its way.
     fn disarm(&mut self) {
+        if self.mode != Mode::Disarmed {
+            self.counted_to = Some(self.now);
+        }
         self.mode = Mode::Disarmed;
         self.lit_now = false;
         let thrown = self.store.clear();
@@ -530,6 +614,7 @@ impl Core {
         }
         self.disarm();
         self.config = Some((config, slots));
+        self.guard.configure(config.rate, config.limits, self.setup.limits);
         self.flash = self.setup.flash_limit.map(|limit| FlashLimiter::backstop(config.rate, limit));
         Ok(())
     }
@@ -553,9 +638,18 @@ impl Core {
         if self.mode == Mode::Disarmed {
             let now = self.ticks();
             self.next_slot = slots.slot_at(now).map_or(0, |k| k + 1);
+            let dark_ns = self.counted_to.map_or(0, |to| self.now.ns_since(to).max(0));
+            let rate = slots.rate();
+            let dark = dark_ns as u128 * u128::from(rate.num()) / (u128::from(rate.den()) * 1_000_000_000);
+            self.guard.was_dark(u64::try_from(dark).unwrap_or(u64::MAX).saturating_sub(1));
         }
         self.mode = Mode::Normal;
         self.status_due = true;
+        // What FREEZE held may be over: then it ends now, not with the next slot.
+        let now = self.ticks();
+        if self.dark_from().is_some_and(|dark| dark <= now) {
+            self.end_light();
+        }
     }
 }
 

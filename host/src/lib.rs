@@ -15,6 +15,7 @@ pub mod folder;
 pub mod frame;
 pub mod geometry;
 pub mod gpu;
+pub mod interlock;
 pub mod metrics;
 pub mod pack;
 pub mod pipeline;

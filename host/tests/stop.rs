@@ -209,7 +209,7 @@ fn panics_and_hangs() {
     assert!(!monitor.stop_requested());
     let thread = std::thread::spawn(|| panic!("as a stage might"));
     let _ = thread.join();
-    assert!(monitor.stop_requested() && monitor.must_be_dark() && monitor.dark_is_ordered());
+    assert!(monitor.stop_requested() && monitor.dark_is_ordered());
     println!("stopping");
     std::thread::sleep(LONG);
 }

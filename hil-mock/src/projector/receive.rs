@@ -315,7 +315,8 @@ impl Core {
     }
 
     fn commit(&mut self, header: &Header, commit: &Commit) {
-        if self.config.is_none() || !self.enter_frame(header) {
+        // A frame whose light would end before it begins has a wrong field, and like every such message no effect.
+        if self.config.is_none() || !commit.ends_after(header.target_at) || !self.enter_frame(header) {
             self.ignore();
             return;
         }
@@ -333,8 +334,8 @@ impl Core {
         }
         self.status.last_whole_frame = frame.frame;
         self.whole_since = true;
-        self.store.base = Some(Held { frame: frame.frame, buffer });
-        self.schedule(&frame, buffer);
+        self.store.base = Some(Held { frame: frame.frame, dark_from: commit.dark_from, buffer });
+        self.schedule(&frame, commit.dark_from, buffer);
     }
 
     /// True when every plane of the frame is in `buffer`, those that did not change copied from the base frame.
@@ -356,7 +357,7 @@ impl Core {
     }
 
     /// A whole frame gets its slot, or is too late or too early.
-    fn schedule(&mut self, frame: &Assembling, buffer: usize) {
+    fn schedule(&mut self, frame: &Assembling, dark_from: DeviceTicks, buffer: usize) {
         let Some((config, slots)) = self.config else { return };
         let lead = u64::from(self.setup.clock.tick_hz).saturating_mul(MAX_LEAD_S);
         if frame.target_at > DeviceTicks(self.ticks().0.saturating_add(lead)) {
@@ -364,10 +365,10 @@ impl Core {
         }
         let target = slots.slot_at(frame.target_at).unwrap_or(0);
         let late = self.next_slot.saturating_sub(target);
-        if late > u64::from(config.late_slots) {
+        if late > u64::from(config.late_slots) || dark_from <= self.ticks() {
             self.status.frames_late = self.status.frames_late.wrapping_add(1);
             return;
         }
-        self.store.push(Pending { frame: frame.frame, slot: target, buffer });
+        self.store.push(Pending { frame: frame.frame, slot: target, dark_from, buffer });
     }
 }

@@ -105,7 +105,7 @@ fn serve_port(
         if arguments.usb.seconds.is_some_and(|s| now.0 as f64 >= s * 1e9) {
             return Ok(());
         }
-        if !device.serve(now, &mut line)? {
+        if !device.serve(|| HostTime(start.elapsed().as_nanos() as i64), &mut line)? {
             return Err(format!("{path} failed: unplugged? Check cable and adapter").into());
         }
         report.look(now, device.projector());

@@ -6,6 +6,7 @@ use super::watch::{print, refuse_where_dark_stands, take_locks};
 use crate::experiments::link_test::{link_test, Content};
 use crate::experiments::run_rig::open_gpu;
 use crate::failure::{Failure, FailureKind};
+use crate::interlock::Interlock;
 use crate::rig::Rig;
 use crate::standing::Identity;
 use crate::stopping;
@@ -39,12 +40,19 @@ pub struct LinkTestArgs {
 /// # Errors
 /// Bad rig or flags, no GPU, no projector.
 pub fn execute(args: &LinkTestArgs) -> Result<(), Failure> {
-    let config = args.flags.rig(Some(&args.rig))?;
+    args.flags.refuse("dpm link-test", &["--frames", "--seconds", "--no-prediction", "--out"])?;
+    let config = args.flags.rig_at_rest(Some(&args.rig))?;
     let _locks = take_locks(&config)?;
     refuse_where_dark_stands(&Identity::of(&config.projector.backend))?;
     signals::install()
         .map_err(|e| Failure::new(FailureKind::Device, format!("cannot handle signals: {e}")))?;
-    let stop = stopping::is_stopping;
+    let interlock = Interlock::of_config(&config.safety.interlock, false)?;
+    let is_open = || interlock.as_ref().is_some_and(|i| !i.is_closed());
+    if let Some(interlock) = interlock.as_ref().filter(|i| !i.is_closed()) {
+        let told = format!("safety.interlock is open: this test makes light only while {}", interlock.what());
+        return Err(Failure::new(FailureKind::Device, told));
+    }
+    let stop = || stopping::is_stopping() || is_open();
     let rig = Rig::build(&config, None)?;
     let content = if args.prepared {
         Content::prepared(&rig, args.count)

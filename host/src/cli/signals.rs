@@ -110,6 +110,14 @@ pub fn install() -> io::Result<()> {
     Ok(())
 }
 
+/// Ignores those that ask for a stop: for a process that must outlive the one that they are meant for.
+///
+/// # Errors
+/// The operating system's, which does not happen for these signals.
+pub fn ignore() -> io::Result<()> {
+    STOPS.into_iter().try_for_each(|signal| handle(signal, libc::SIG_IGN))
+}
+
 fn handle(signal: libc::c_int, handler: libc::sighandler_t) -> io::Result<()> {
     // SAFETY: an all-zero sigaction is valid: no flags, an empty mask; the handlers touch atomics and make only calls that are
     // async-signal-safe.

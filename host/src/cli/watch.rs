@@ -6,41 +6,71 @@
 
 use super::keys::Keys;
 use super::signals;
-use super::tell::Teller;
+use super::tell::{Teller, SHOWN_EVERY};
 use crate::config::{OutputConfig, RigConfig};
 use crate::control::orders::Orders;
 use crate::control::server::ControlSocket;
 use crate::control::status_file::StatusFile;
 use crate::control::{rig_name, runtime_folder};
-use crate::failure::{Failure, FailureKind};
-use crate::files::{InstanceLock, LockError};
+use crate::experiments::run_rig::{cannot_write, check_output_folder};
+use crate::failure::{Ended, Failure, FailureKind};
+use crate::files::{write_atomically, InstanceLock, LockError};
 use crate::folder::{Folder, FolderError};
+use crate::interlock::Interlock;
 use crate::standing::{state_folder, By, Identity, OrderFile, Stands};
 use crate::stopping;
 use crate::telemetry::monitor::{Order, ProjectorHealth, RunCounts, RunMonitor};
-use crate::telemetry::report::Report;
+use crate::telemetry::report::{to_json, Report};
 use std::io::Write;
+use std::path::Path;
 use std::sync::mpsc::{channel, RecvTimeoutError};
 use std::sync::Arc;
 use std::time::Duration;
 
 /// How often keys, signals and the projector's health are looked at.
-const TICK: Duration = Duration::from_millis(10);
+const TICK: Duration = Duration::from_millis(5);
 /// Progress is shown at every so many ticks.
-const TICKS_SHOWN: u32 = 5;
+const TICKS_SHOWN: u32 = (SHOWN_EVERY.as_millis() / TICK.as_millis()) as u32;
+
+/// How long the link is given to make the projector dark when the run itself will not return.
+const DARK_WITHIN: Duration = Duration::from_millis(500);
 
 /// Watches `run` (see [`watch`]), then prints the report to the standard output, as JSON or as a table.
 ///
 /// # Errors
-/// As [`watch`].
+/// As [`watch`]; a run that lit nothing, after its report.
 pub fn run_and_report(
     rig: RigConfig,
     json: bool,
-    run: impl FnOnce(&RigConfig, &Arc<RunMonitor>) -> Result<Report, Failure> + Send + 'static,
+    run: impl FnOnce(&RigConfig, &Arc<RunMonitor>) -> Result<Ended<Report>, Failure> + Send + 'static,
 ) -> Result<(), Failure> {
-    let report = watch(rig, |_| {}, run)?;
+    let Ended { report, failure } = watch(rig, |_| {}, run)?;
     print(&if json { report.to_json() + "\n" } else { report.to_table() });
-    Ok(())
+    failure.map_or(Ok(()), Err)?;
+    report.check_lit()
+}
+
+/// Writes the report of a command that makes no others as `name` into the folder that `--out` names, where it does.
+///
+/// # Errors
+/// The folder or the file cannot be written.
+pub(super) fn write_out<T: serde::Serialize>(
+    out: Option<&Path>,
+    name: &str,
+    report: &T,
+) -> Result<(), Failure> {
+    let Some(folder) = out else { return Ok(()) };
+    let path = folder.join(name);
+    let text = to_json(report) + "\n";
+    write_atomically(&path, |file| file.write_all(text.as_bytes())).map_err(|e| cannot_write(&path, &e))
+}
+
+/// Sees that files can be written into the folder that `--out` names, before the work.
+///
+/// # Errors
+/// They cannot.
+pub(super) fn check_out(out: Option<&Path>) -> Result<(), Failure> {
+    out.map_or(Ok(()), check_output_folder)
 }
 
 /// Runs `run` while its progress is shown on the standard error stream, given to `show`, and signals become an ordered stop. The
@@ -57,7 +87,12 @@ pub fn watch<T: Send + 'static>(
     signals::install()
         .map_err(|e| Failure::new(FailureKind::Device, format!("cannot handle signals: {e}")))?;
     let monitor = Arc::new(RunMonitor::default());
-    let mut teller = Teller::start(rig.run.frames)?;
+    let mut keys = Keys::new();
+    // Before anything can make light.
+    if let Some(interlock) = Interlock::of_config(&rig.safety.interlock, keys.is_some())? {
+        monitor.set_interlock(interlock);
+    }
+    let mut teller = Teller::start(rig.run.frames, rig.run.seconds)?;
     // Before the run begins, so that it comes up dark where an order stands.
     let orders = Arc::new(stand_by(&rig, &monitor, &teller)?);
     let (done, finished) = channel();
@@ -75,7 +110,10 @@ pub fn watch<T: Send + 'static>(
     let mut health = ProjectorHealth::Connecting;
     let mut tracker_told = false;
     let mut signal_told = false;
-    let mut keys = Keys::new();
+    if let Some(interlock) = monitor.interlock() {
+        let now = if interlock.is_closed() { "closed" } else { "open" };
+        teller.note(&format!("safety.interlock: light only while {}; it is {now}", interlock.what()));
+    }
     let keys_told = if keys.is_some() { "; keys b, f, s, a" } else { "" };
     let listening = listen(&locks.runtime, &monitor, &orders);
     let (control, mut status) = match listening {
@@ -98,14 +136,26 @@ pub fn watch<T: Send + 'static>(
             Ok(result) => break result,
             Err(RecvTimeoutError::Timeout) => {
                 // Orders before everything that is told.
-                for order in keys.iter_mut().flat_map(Keys::pressed) {
-                    orders.give(order, By::Key);
-                    teller.note(&format!("key: {}", order.word()));
+                for key in keys.iter_mut().flat_map(Keys::pressed) {
+                    if monitor.interlock().is_some_and(|i| i.key_pressed(key)) {
+                        continue;
+                    }
+                    if let Some(order) = Order::from_key(key) {
+                        orders.give(order, By::Key);
+                        teller.note(&format!("key: {}", order.word()));
+                    }
                 }
                 if let Some(signal) = signals::received().filter(|_| !signal_told) {
                     signal_told = true;
                     monitor.request_stop();
                     teller.note(&format!("{signal}: stopping"));
+                }
+                monitor.take_notes().iter().for_each(|note| teller.note(note));
+                if let Some(why) = monitor.gave_up() {
+                    // The projector has been told to go dark by a thread that does not hang.
+                    std::thread::sleep(DARK_WITHIN);
+                    teller.finish(monitor.projector(), monitor.counts());
+                    return Err(Failure::new(FailureKind::Device, why));
                 }
                 let now = monitor.projector();
                 if let Some(status) = &mut status {
@@ -120,7 +170,7 @@ pub fn watch<T: Send + 'static>(
                 }
                 ticks = ticks.wrapping_add(1);
                 if ticks % TICKS_SHOWN == 0 {
-                    teller.tick(monitor.counts());
+                    teller.tick(now, monitor.counts());
                     show(&monitor.counts());
                 }
             }
@@ -145,7 +195,8 @@ pub fn watch<T: Send + 'static>(
     if let Some(orders) = Arc::into_inner(orders) {
         orders.end(result.is_ok());
     }
-    teller.finish(monitor.counts());
+    monitor.take_notes().iter().for_each(|note| teller.note(note));
+    teller.finish(monitor.projector(), monitor.counts());
     result
 }
 

@@ -3,11 +3,13 @@
 //! Every method is drawn twice with different seeds. What the two runs share is bias, what they do not is noise; half of the power of
 //! their difference is the flicker of one of them, without any reference. The reference comes in two independent halves for the same
 //! reason: half of their difference is its own error, and its power is taken off what is measured against it.
+//!
+//! Equal rays are not equal time, so the other methods are drawn once more with as many samples as fill the time of a frame of dpm.
 
 use super::error_parts::Part;
 use super::error_plan::{contenders, paper_at, Contender, Group};
 use super::error_reference::{mean_of, Reference};
-use super::sequence::{eye_mean, rmse, Seen, Span, Theatre};
+use super::sequence::{eye_mean, rmse, FrameTime, Seen, Span, Theatre};
 use super::stamp::{Fnv, Stamp};
 use crate::gpu::Gpu;
 use crate::metrics::error::compare;
@@ -53,8 +55,27 @@ pub const LAST_SLOT: u64 = 383;
 pub const EYE_FRAMES: usize = 31;
 /// Rays count as equal within this share.
 const EQUAL_RAYS: f64 = 0.01;
+/// At equal time no method is asked for more than so many times its samples at equal rays, nor for more than [`MOST_SPP`].
+const MOST_SAMPLES_MORE: f32 = 16.0;
+/// As many as a rig file may ask for.
+const MOST_SPP: f32 = 4096.0;
 /// Fewer probes in the periphery than this share of all do not tell its flicker.
 const LEAST_PERIPHERY: f64 = 0.01;
+
+/// A method with as many samples as fill the time of a frame of dpm: what the eye saw then.
+#[derive(Clone, Copy, Debug, Serialize, Deserialize)]
+pub struct EqualTime {
+    /// Samples a lit pixel and frame.
+    pub spp: f64,
+    /// Time of a frame by that of dpm, drawn in turns with it: how equal the times were.
+    pub time_to_dpm: f64,
+    /// RMSE of what the eye sees, as measured.
+    pub perceived_rmse_raw: f64,
+    /// The same with the reference's own error taken off.
+    pub perceived_rmse: f64,
+    /// `perceived_rmse_raw` of either run.
+    pub runs_raw: [f64; 2],
+}
 
 /// One method at one budget. Errors are in the scene's unit of radiance.
 #[derive(Clone, Debug, Serialize, Deserialize)]
@@ -77,6 +98,9 @@ pub struct ErrorRow {
     pub gpu_ms: f64,
     /// Time of a frame until its light is known, ms.
     pub wall_ms: f64,
+    /// Between these lies the middle half of the frames that were timed, ms.
+    #[serde(default)]
+    pub middle_half_ms: [f64; 2],
     /// RMSE of the last frame alone.
     pub single_rmse: f64,
     /// Relative MSE of the last frame alone \[Rousselle11\].
@@ -85,6 +109,9 @@ pub struct ErrorRow {
     pub perceived_rmse: f64,
     /// The same as measured.
     pub perceived_rmse_raw: f64,
+    /// `perceived_rmse_raw` of either run: how far chance moves it.
+    #[serde(default)]
+    pub runs_raw: [f64; 2],
     /// The same within 15 deg of the gaze (the paper's inner zone), and outside; `None` where too little is lit.
     pub perceived_fovea: Option<f64>,
     /// See `perceived_fovea`.
@@ -105,6 +132,9 @@ pub struct ErrorRow {
     pub flicker_periphery: Option<f64>,
     /// `perceived_rmse` by that of `paper`.
     pub ratio_to_paper: f64,
+    /// With the time of dpm in place of the rays of `paper`; `None` of dpm itself and its parts.
+    #[serde(default)]
+    pub equal_time: Option<EqualTime>,
 }
 
 /// A measured group, as it is kept in its file.
@@ -297,9 +327,11 @@ impl ErrorRuns {
         let runners: Vec<(Method, f32)> =
             contenders.iter().zip(&rows).map(|(c, r)| (c.method.clone(), r.spp as f32)).collect();
         each("times");
-        for (row, time) in rows.iter_mut().zip(theatre.race(&runners, self.stamp.seed as u32)?) {
-            (row.gpu_ms, row.wall_ms) = (time.gpu_ms, time.wall_ms);
+        let times = theatre.race(&runners, self.stamp.seed as u32)?;
+        for (row, time) in rows.iter_mut().zip(&times) {
+            (row.gpu_ms, row.wall_ms, row.middle_half_ms) = (time.gpu_ms, time.wall_ms, time.middle_half_ms);
         }
+        self.at_equal_time(&theatre, group, &contenders, &times, &mut rows, &reference, each)?;
         let result = GroupResult {
             stamp: self.stamp.clone(),
             key,
@@ -311,6 +343,79 @@ impl ErrorRuns {
         };
         let pixels = theatre.probes().iter().map(|p| p.pixel).collect();
         Ok(Measured { result, raster: theatre.raster(), pixels, reference: reference.eye, eyes, parts })
+    }
+
+    /// Draws every method but dpm and its parts with as many samples as fill the time of a frame of dpm.
+    ///
+    /// Times are compared within a race only, where all meet the same disturbances. A second race with samples in the ratio of the times
+    /// tells what a sample takes beside what a frame takes without any, a line through both meets the time of dpm, and a third race tells
+    /// how well.
+    #[allow(clippy::too_many_arguments)]
+    fn at_equal_time(
+        &self,
+        theatre: &Theatre,
+        group: Group,
+        contenders: &[Contender],
+        times: &[FrameTime],
+        rows: &mut [ErrorRow],
+        reference: &Reference,
+        each: &mut dyn FnMut(&str),
+    ) -> Result<(), ErrorRunError> {
+        let Some(dpm) = contenders.iter().position(|c| c.name == DPM) else { return Ok(()) };
+        let others: Vec<usize> = (0..rows.len()).filter(|&i| is_other(contenders[i].name)).collect();
+        let seed = self.stamp.seed as u32;
+        // Times by that of dpm, which runs along with as many samples as before.
+        let mut race = |spp: &[f32]| -> Result<Vec<f64>, RenderError> {
+            each("times");
+            let with =
+                others.iter().zip(spp).map(|(&i, &spp)| (with_samples(&contenders[i].method, spp), spp));
+            let runners: Vec<_> =
+                with.chain([(contenders[dpm].method.clone(), rows[dpm].spp as f32)]).collect();
+            let times = theatre.race(&runners, seed)?;
+            let of_dpm = times.last().map_or(f64::NAN, FrameTime::ms);
+            Ok(times[..others.len()].iter().map(|t| t.ms() / of_dpm).collect())
+        };
+        let bounded = |i: usize, spp: f64| {
+            let (own, least) = (rows[i].spp as f32, least_spp(&contenders[i].method));
+            let most = (MOST_SAMPLES_MORE * own).clamp(least, MOST_SPP);
+            if spp.is_finite() { spp as f32 } else { own }.clamp(least, most)
+        };
+        let first: Vec<f64> = others.iter().map(|&i| times[i].ms() / times[dpm].ms()).collect();
+        let guess: Vec<f32> = others.iter().zip(&first).map(|(&i, r)| bounded(i, rows[i].spp / r)).collect();
+        let second = race(&guess)?;
+        let chosen: Vec<f32> = (0..others.len())
+            .map(|k| {
+                bounded(
+                    others[k],
+                    where_equal((rows[others[k]].spp, first[k]), (f64::from(guess[k]), second[k])),
+                )
+            })
+            .collect();
+        let reached = race(&chosen)?;
+        for (k, &i) in others.iter().enumerate() {
+            let (name, spp) = (contenders[i].name, chosen[k]);
+            let method = with_samples(&contenders[i].method, spp);
+            // Only what the eye sees at the end is wanted.
+            let warm_up = if method.needs_history() { self.options.extent.warm_up } else { 0 };
+            let short = self.theatre(group, warm_up, EYE_FRAMES as u32)?;
+            let mut play = |seed: u32| {
+                each(&format!("{name}{AT_EQUAL_TIME}"));
+                Ok::<_, RenderError>(eye_mean(
+                    &short.play(&method, spp, seed, &mut |_, _| ())?.frames,
+                    EYE_FRAMES,
+                ))
+            };
+            let eyes = [play(seed)?, play(seed.wrapping_add(1_000_003))?];
+            let (raw, clean) = reference.perceived(&eyes, &|_| true);
+            rows[i].equal_time = Some(EqualTime {
+                spp: f64::from(spp),
+                time_to_dpm: reached[k],
+                perceived_rmse_raw: raw,
+                perceived_rmse: clean,
+                runs_raw: reference.each_run(&eyes),
+            });
+        }
+        Ok(())
     }
 
     /// Rays of a frame with so many samples, from a short sequence.
@@ -410,10 +515,12 @@ impl ErrorRuns {
             samples: both(&|s| s.samples),
             gpu_ms: 0.0,
             wall_ms: 0.0,
+            middle_half_ms: [0.0; 2],
             single_rmse: (0.5 * (first.rmse.powi(2) + second.rmse.powi(2))).sqrt(),
             single_rel_mse: 0.5 * (first.rel_mse + second.rel_mse),
             perceived_rmse: clean,
             perceived_rmse_raw: raw,
+            runs_raw: reference.each_run(&eyes),
             perceived_fovea: zone(1.0 - share >= LEAST_PERIPHERY, &|i| angle(i) < inner),
             perceived_periphery: zone(share >= LEAST_PERIPHERY, &|i| angle(i) >= inner),
             bias,
@@ -424,6 +531,7 @@ impl ErrorRuns {
             flicker,
             flicker_periphery: flicker_periphery.filter(|_| share >= LEAST_PERIPHERY),
             ratio_to_paper: 1.0,
+            equal_time: None,
         };
         let [eye, _] = eyes;
         Ok((row, eye))
@@ -487,6 +595,37 @@ impl ErrorRuns {
     }
 }
 
+/// What the row of this program's own method is called; those of its ablations begin so.
+pub const DPM: &str = "dpm";
+/// What the name of a method ends with while it is drawn at the time of dpm.
+pub const AT_EQUAL_TIME: &str = " at equal time";
+
+/// Whether this is the name of a method that dpm is compared with: neither dpm nor dpm without a part.
+pub fn is_other(method: &str) -> bool {
+    !method.starts_with(DPM)
+}
+
+/// A method whose samples go by the visual angle has them in its table; the others are told them frame by frame.
+fn with_samples(method: &Method, spp: f32) -> Method {
+    if method.spp_by_angle {
+        paper_at(method, f64::from(spp))
+    } else {
+        method.clone()
+    }
+}
+
+/// Where a line through two points of samples and time is 1. Not a number where more samples take no more time.
+fn where_equal(a: (f64, f64), b: (f64, f64)) -> f64 {
+    let slope = (b.1 - a.1) / (b.0 - a.0);
+    if slope > 0.0 {
+        a.0 + (1.0 - a.1) / slope
+    } else if a.0 == b.0 {
+        a.0
+    } else {
+        f64::NAN
+    }
+}
+
 /// A method that keeps nothing shows a pixel without samples black: it takes at least one. With a history a frame may pass.
 fn least_spp(method: &Method) -> f32 {
     if method.needs_history() {
@@ -503,5 +642,25 @@ fn corrected(spp: f32, base: f64, rays: f64, wanted: f64) -> f32 {
         ((wanted - base) / slope).max(0.02) as f32
     } else {
         spp
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_samples_that_fill_a_time_are_where_the_line_of_two_trials_meets_it() {
+        // 0.2 of the time without a sample, 0.1 a sample.
+        let time = |spp: f64| 0.2 + 0.1 * spp;
+        assert!((where_equal((2.0, time(2.0)), (5.0, time(5.0))) - 8.0).abs() < 1e-12);
+        assert!((where_equal((10.0, time(10.0)), (9.0, time(9.0))) - 8.0).abs() < 1e-12);
+        assert_eq!(where_equal((3.0, 1.0), (3.0, 1.1)), 3.0, "it was equal at once");
+        assert!(where_equal((2.0, 0.5), (4.0, 0.4)).is_nan(), "noise");
+    }
+
+    #[test]
+    fn parts_of_dpm_are_not_what_dpm_is_compared_with() {
+        assert!(is_other("sequence") && is_other("paper") && !is_other(DPM) && !is_other("dpm, even rays"));
     }
 }

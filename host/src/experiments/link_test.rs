@@ -16,7 +16,7 @@ use dpm_device::time::HostTime;
 use dpm_device::transport::inproc::{threaded, HostEnd};
 use dpm_device::transport::{LinkDevice, Transport};
 use dpm_handoff::wake::WaitPolicy;
-use hil_mock::projector::{serve_cable, MockConfig, MockProjector};
+use hil_mock::projector::{serve_cable, EmulatedProjector, MockConfig};
 use std::sync::Arc;
 use std::time::Duration;
 
@@ -137,7 +137,10 @@ enum Far {
 
 impl Far {
     fn open(rig: &Rig, clock: MonotonicClock) -> Result<Self, Failure> {
-        if let Some(medium) = projector::open(&rig.config, rig.camera.raster).map_err(PipelineError::from)? {
+        if let Some(mut medium) =
+            projector::open(&rig.config, rig.camera.raster).map_err(PipelineError::from)?
+        {
+            medium.transport.set_clock(std::sync::Arc::new(move || clock.now()));
             return Ok(Self::Outside(medium.transport));
         }
         let ProjectorBackend::Mock(mock) = &rig.config.projector.backend else {
@@ -150,12 +153,14 @@ impl Far {
             events_kept: 0,
             ..MockConfig::new(rig.camera.raster)
         };
+        let frame_buffers = usize::from(setup.frame_buffers);
+        let mut mock = EmulatedProjector::new(setup, &mock.faults, rig.config.render.seed, clock.now())
+            .map_err(|e| Failure::new(FailureKind::BadInput, format!("projector.backend.faults: {e}")))?;
         let bytes = projector::frame_bytes(rig.camera.raster, rig.config.projector.schedule().len());
-        let (host, device) = threaded(bytes, usize::from(setup.frame_buffers) + 1, WaitPolicy::Park);
+        let (host, device) = threaded(bytes, frame_buffers + 1, WaitPolicy::Park);
         std::thread::Builder::new()
             .name("dpm-mock".into())
             .spawn(move || {
-                let mut mock = MockProjector::new(setup);
                 serve_cable(&mut mock, device, || clock.now(), |mock, now| mock.advance_to(now));
             })
             .map_err(|e| Failure::new(FailureKind::Device, format!("cannot start a thread: {e}")))?;
@@ -206,13 +211,12 @@ pub fn link_test(
         ways: Vec::new(),
         stopped: false,
     };
-    for (k, (compaction, codecs)) in ways.into_iter().enumerate() {
+    for (compaction, codecs) in ways {
         if stop() {
             break;
         }
-        // Another seed, another session: an answer to the way before is not taken for one to this.
-        let session_seed = settings.session_seed.wrapping_add(2 * k as u32);
-        let settings = LinkSettings { codecs, session_seed, ..settings.clone() };
+        // Each way is a session of its own: an answer to the way before is not taken for one to this.
+        let settings = LinkSettings { codecs, ..settings.clone() };
         let way = way(settings, compaction, far.transport(), clock, content, seconds, stop)?;
         report.ways.push(way);
     }
@@ -236,7 +240,8 @@ fn way(
         clock.now()
     };
     let monitor = RunMonitor::default();
-    connect(&mut link, transport, ENDED_WITH_THE_LAST_RUN, &monitor, &mut now).map_err(PipelineError::from)?;
+    connect(&mut link, transport, ENDED_WITH_THE_LAST_RUN, &monitor, &mut now, stop)
+        .map_err(PipelineError::from)?;
     if monitor.take_found_safe() {
         let told = "the projector has latched SAFE; run its rig and say `dpm arm`";
         return Err(Failure::new(FailureKind::Device, format!("{}: {told}", transport.name())));

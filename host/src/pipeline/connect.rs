@@ -2,7 +2,7 @@
 
 use super::stages::LinkTime;
 use crate::telemetry::monitor::RunMonitor;
-use dpm_device::link::{faults, HostLink, LinkError, LinkState};
+use dpm_device::link::{faults, HostLink, LinkError, LinkState, Verb};
 use dpm_device::time::HostTime;
 use dpm_device::transport::Transport;
 
@@ -29,6 +29,9 @@ pub enum ConnectError {
         /// How far it came.
         state: LinkState,
     },
+    /// A stop was asked for while the link came up.
+    #[error("stopped before the projector was up; nothing was lit")]
+    Stopped,
 }
 
 /// Latched faults that say something about a host or a cable of the past. Starting a run acknowledges them; heat, lamp, emergency
@@ -38,7 +41,7 @@ pub const ENDED_WITH_THE_LAST_RUN: u32 = faults::WATCHDOG | faults::CHECKSUM_STO
 /// Connects and arms; latched faults in the mask `acknowledged` stand not in the way. Where `monitor` says that BLACK, SAFE or a stop is
 /// ordered, the link comes up and does not arm: what was ordered waits in the monitor for whoever takes the link over. A SAFE that
 /// the projector has latched itself counts as ordered, whatever is `acknowledged`, and is told to the monitor. `now` reads the clock and lets a
-/// little time pass with every call.
+/// little time pass with every call; `stop` says that nobody wants light any more.
 ///
 /// # Errors
 /// The device is missing, refuses, has latched other faults, or is silent.
@@ -48,6 +51,7 @@ pub fn connect(
     acknowledged: u32,
     monitor: &RunMonitor,
     now: &mut dyn FnMut() -> HostTime,
+    stop: &dyn Fn() -> bool,
 ) -> Result<LinkTime, ConnectError> {
     link.connect();
     let begin = now();
@@ -64,6 +68,11 @@ pub fn connect(
                 best = Some((round_trip, e));
             }
         });
+        if stop() {
+            // Never armed after a stop was asked for, and dark if it was armed before.
+            let _ = link.command(t, Verb::Stop, transport);
+            return Err(ConnectError::Stopped);
+        }
         let latched = link.status().map_or(0, |s| s.faults);
         if state == LinkState::Faulted && latched & faults::HOST_SAFE != 0 && !is_safe {
             is_safe = true;

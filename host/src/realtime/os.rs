@@ -209,6 +209,28 @@ pub fn allowed_core_list() -> Vec<u32> {
     (0..libc::CPU_SETSIZE as u32).filter(|&core| unsafe { libc::CPU_ISSET(core as usize, &set) }).collect()
 }
 
+/// The calling thread's number for the operating system.
+#[cfg(target_os = "linux")]
+pub fn thread_id() -> i32 {
+    // SAFETY: gettid takes no arguments and cannot fail.
+    unsafe { libc::gettid() }
+}
+
+/// How long the thread `id` of this process has been ready to run without getting a core, since it was made, nanoseconds. `None` where the
+/// kernel does not count it or the thread is gone. Allocates nothing.
+#[cfg(target_os = "linux")]
+pub fn waited_for_core_ns(id: i32) -> Option<i64> {
+    use std::io::{Read, Write};
+    let mut path = [0u8; 48];
+    let mut rest = &mut path[..];
+    write!(rest, "/proc/self/task/{id}/schedstat").ok()?;
+    let left = rest.len();
+    let used = path.len() - left;
+    let mut text = [0u8; 96];
+    let n = std::fs::File::open(std::str::from_utf8(&path[..used]).ok()?).ok()?.read(&mut text).ok()?;
+    std::str::from_utf8(&text[..n]).ok()?.split_whitespace().nth(1)?.parse().ok()
+}
+
 /// Nanoseconds of processor time the calling thread has used.
 #[cfg(target_os = "linux")]
 pub fn thread_cpu_ns() -> i64 {
@@ -269,6 +291,14 @@ mod elsewhere {
     /// Unknown.
     pub fn thread_cpu_ns() -> i64 {
         0
+    }
+    /// Unknown.
+    pub fn thread_id() -> i32 {
+        0
+    }
+    /// Unknown.
+    pub fn waited_for_core_ns(_id: i32) -> Option<i64> {
+        None
     }
 }
 #[cfg(not(target_os = "linux"))]
