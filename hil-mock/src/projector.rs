@@ -19,16 +19,16 @@ pub mod usb;
 use std::collections::VecDeque;
 
 use dpm_device::link::{
-    faults, mean_luminance, Codec, Config, ConfigRefusal, Decoder, DeviceHello, DeviceMessage, DeviceState,
-    Echo, Fault, FaultCode, FlashLimiter, Header, Packet, SlotClock, Status, Underrun, MAX_CONTROL_BYTES,
-    REST_US,
+    faults, mean_luminance, Codec, Config, ConfigRefusal, Decoder, DecoderCounters, DeviceHello,
+    DeviceMessage, DeviceState, Echo, Fault, FaultCode, FlashLimiter, Header, Packet, SlotClock, Status,
+    Underrun, MAX_CONTROL_BYTES, REST_US,
 };
 use dpm_device::planes::{Raster, MAX_PLANES};
 use dpm_device::time::{DeviceTicks, HostTime};
 use dpm_device::transport::{Lane, LinkDevice};
 
 pub use clock::DeviceClock;
-pub use config::{LightEvent, LightKind, MockConfig};
+pub use config::{LightChange, LightEvent, LightKind, MockConfig};
 pub use emulated::{EmulatedProjector, Served};
 pub use faulty::FaultyProjector;
 use frames::{FrameStore, Held};
@@ -42,6 +42,9 @@ const ECHOES_KEPT: usize = 16;
 const CHECKSUM_STORM: u32 = 1000;
 /// A target further ahead than this is refused, seconds: it would hold a buffer for good.
 const MAX_LEAD_S: u64 = 2;
+
+/// Changes of light or state that are kept; older ones go and are counted with the light events.
+const CHANGES_KEPT: usize = 1024;
 
 /// Armed or not, and how.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -93,15 +96,24 @@ struct Core {
     incoming: [receive::Incoming; 2],
     events: VecDeque<LightEvent>,
     events_lost: u64,
+    /// When what happens now happens: `now`, or the exact instant of what the device does by itself.
+    at: HostTime,
+    changes: VecDeque<LightChange>,
+    before: (bool, DeviceState),
     light: Vec<[u8; 3]>,
     light_is_of: Option<u64>,
     /// Counts lit frames over all sessions.
     generation: u64,
     /// Session whose HELLO waits for an answer.
     hello_due: Option<u32>,
+    /// Session that was not opened because its host speaks other versions.
+    version_refused_due: Option<u32>,
     fault_due: Option<Fault>,
     echoes: VecDeque<Echo>,
     status_due: bool,
+    /// A session was opened since the decoders' counters were last looked at, and what they were then.
+    counters_due: bool,
+    counted_before: DecoderCounters,
 }
 
 const NO_STATUS: Status = Status {
@@ -171,13 +183,19 @@ impl MockProjector {
                 incoming: Default::default(),
                 events: VecDeque::with_capacity(setup.events_kept),
                 events_lost: 0,
+                at: HostTime(i64::MIN),
+                changes: VecDeque::with_capacity(CHANGES_KEPT),
+                before: (false, DeviceState::Idle),
                 light: Vec::new(),
                 light_is_of: None,
                 generation: 0,
                 hello_due: None,
+                version_refused_due: None,
                 fault_due: None,
                 echoes: VecDeque::with_capacity(ECHOES_KEPT),
                 status_due: false,
+                counters_due: false,
+                counted_before: DecoderCounters::default(),
             },
         }
     }
@@ -190,6 +208,11 @@ impl MockProjector {
     /// Light events that were pushed out by newer ones before anybody took them.
     pub fn light_events_lost(&self) -> u64 {
         self.core.events_lost
+    }
+
+    /// The oldest change of light or state not yet taken.
+    pub fn next_change(&mut self) -> Option<LightChange> {
+        self.core.changes.pop_front()
     }
 
     /// True when light is on.
@@ -266,6 +289,7 @@ impl MockProjector {
         self.core.present = present;
         if new != 0 {
             self.core.latch(new);
+            self.core.note_change();
         }
     }
 
@@ -273,14 +297,19 @@ impl MockProjector {
     pub fn bus_reset(&mut self, now: HostTime) {
         self.advance_to(now);
         self.core.open_session(0);
+        self.core.note_change();
         self.core.incoming = Default::default();
         self.decoders = [Decoder::new(), Decoder::new()];
+        (self.core.counters_due, self.core.counted_before) = (false, DecoderCounters::default());
     }
 
     /// Power fails and comes back: dark, no session, no memory, the clock starts again.
     pub fn power_cycle(&mut self, now: HostTime) {
         self.advance_to(now);
         let present = self.core.present;
+        self.core.disarm();
+        self.core.note_change();
+        let changes = std::mem::take(&mut self.core.changes);
         let setup = MockConfig {
             clock: DeviceClock { power_on_at: now, ..self.core.setup.clock },
             ..self.core.setup
@@ -288,6 +317,7 @@ impl MockProjector {
         *self = Self::new(setup);
         self.core.present = present;
         self.core.latched = present;
+        self.core.changes = changes;
     }
 }
 
@@ -296,9 +326,14 @@ impl LinkDevice for MockProjector {
         self.core.advance(now);
         let mut sink = receive::LaneSink { core: &mut self.core, lane };
         self.decoders[lane as usize].push(bytes, &mut sink);
+        if std::mem::take(&mut self.core.counters_due) {
+            // What came before, the HELLO included, is not of this session.
+            self.core.counted_before = summed(&self.decoders);
+        }
         let [a, b] = self.decoders.each_ref().map(Decoder::counters);
         let damaged = [a.header_errors, a.payload_errors, b.header_errors, b.payload_errors];
         self.core.damaged(damaged.iter().fold(0, |sum, n| sum.wrapping_add(*n)));
+        self.core.note_change();
     }
 
     fn end_of_transfer(&mut self, now: HostTime, lane: Lane) {
@@ -330,6 +365,11 @@ impl LinkDevice for MockProjector {
         if let Some(asked) = self.core.hello_due.take() {
             send(asked, &DeviceMessage::Hello(self.core.hello(now_ticks)));
         }
+        if let Some(asked) = self.core.version_refused_due.take() {
+            let (latched, detail) = (self.core.latched, self.core.setup.version);
+            let fault = Fault { latched, code: FaultCode::Version, detail, at: now_ticks };
+            send(asked, &DeviceMessage::Fault(fault));
+        }
         if let Some(fault) = self.core.fault_due.take() {
             send(session, &DeviceMessage::Fault(fault));
         }
@@ -340,6 +380,19 @@ impl LinkDevice for MockProjector {
             let status = self.core.status_now(&self.decoders);
             send(session, &DeviceMessage::Status(status));
         }
+    }
+}
+
+/// What both lanes' decoders have counted since power-on.
+fn summed(decoders: &[Decoder; 2]) -> DecoderCounters {
+    let [a, b] = decoders.each_ref().map(Decoder::counters);
+    DecoderCounters {
+        packets: a.packets.wrapping_add(b.packets),
+        header_errors: a.header_errors.wrapping_add(b.header_errors),
+        payload_errors: a.payload_errors.wrapping_add(b.payload_errors),
+        foreign: a.foreign.wrapping_add(b.foreign),
+        cut_short: a.cut_short.wrapping_add(b.cut_short),
+        bytes_skipped: a.bytes_skipped.wrapping_add(b.bytes_skipped),
     }
 }
 
@@ -376,7 +429,7 @@ impl Core {
     }
 
     fn status_now(&self, decoders: &[Decoder; 2]) -> Status {
-        let [a, b] = decoders.each_ref().map(Decoder::counters);
+        let (all, before) = (summed(decoders), self.counted_before);
         Status {
             state: self.state(),
             lit: self.lit_now,
@@ -384,11 +437,14 @@ impl Core {
             faults: self.latched,
             frame_limit: self.frame_limit(),
             now: self.ticks(),
-            packets: a.packets.wrapping_add(b.packets),
-            header_errors: a.header_errors.wrapping_add(b.header_errors),
-            payload_errors: a.payload_errors.wrapping_add(b.payload_errors),
-            packets_ignored: self.status.packets_ignored.wrapping_add(a.foreign).wrapping_add(b.foreign),
-            bytes_skipped: a.bytes_skipped.wrapping_add(b.bytes_skipped),
+            packets: all.packets.wrapping_sub(before.packets),
+            header_errors: all.header_errors.wrapping_sub(before.header_errors),
+            payload_errors: all.payload_errors.wrapping_sub(before.payload_errors),
+            packets_ignored: self
+                .status
+                .packets_ignored
+                .wrapping_add(all.foreign.wrapping_sub(before.foreign)),
+            bytes_skipped: all.bytes_skipped.wrapping_sub(before.bytes_skipped),
             ..self.status
         }
     }
@@ -413,6 +469,26 @@ impl Core {
         Some(held.dark_from)
     }
 
+    /// Notes that light went on or off, or that the state changed.
+    fn note_change(&mut self) {
+        let now = (self.lit_now, self.state());
+        if now == self.before {
+            return;
+        }
+        self.before = now;
+        let settle = if self.lit_now { i64::from(self.setup.settle_ns) } else { 0 };
+        if self.changes.len() >= CHANGES_KEPT {
+            self.changes.pop_front();
+            self.events_lost += 1;
+        }
+        self.changes.push_back(LightChange {
+            at: self.at.plus_ns(settle),
+            frame: self.store.lit.filter(|_| self.lit_now).map(|held| held.frame),
+            state: now.1,
+            faults: self.latched,
+        });
+    }
+
     /// The frame on the mirrors is over: dark until a newer one is lit, and nothing is left that could be lit again.
     fn end_light(&mut self) {
         self.lit_now = false;
@@ -433,6 +509,7 @@ impl Core {
             if next.min(bite) > ticks {
                 break;
             }
+            self.at = self.setup.clock.instant_of(next.min(bite));
             if bite <= next {
                 self.latch(faults::WATCHDOG);
                 break;
@@ -441,7 +518,11 @@ impl Core {
                 Some(_) => self.end_light(),
                 None => self.slot(&config, &slots, start),
             }
+            self.note_change();
         }
+        // What comes from outside happens now; what the watchdog did was noted at its own instant.
+        self.note_change();
+        self.at = self.now;
     }
 
     /// One slot begins.
@@ -586,7 +667,8 @@ impl Core {
     }
 
     fn report(&mut self, code: FaultCode, detail: u16) {
-        self.fault_due = Some(Fault { latched: self.latched, code, detail, at: self.ticks() });
+        self.fault_due =
+            Some(Fault { latched: self.latched, code, detail, at: self.setup.clock.ticks_at(self.at) });
         self.status_due = true;
     }
 
@@ -596,6 +678,7 @@ impl Core {
         self.config = None;
         self.last_seen_frame = None;
         self.status = NO_STATUS;
+        self.counters_due = true;
     }
 
     fn configure(&mut self, config: Config) -> Result<(), ConfigRefusal> {

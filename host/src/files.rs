@@ -125,7 +125,10 @@ impl InstanceLock {
     }
 
     fn lock(mut file: File, path: &Path, what: &str) -> Result<Self, LockError> {
-        let io = |source| LockError::Io { what: what.into(), source: FolderError::Io { path: path.into(), source } };
+        let io = |source| LockError::Io {
+            what: what.into(),
+            source: FolderError::Io { path: path.into(), source },
+        };
         match file.try_lock() {
             Ok(()) => {}
             Err(fs::TryLockError::WouldBlock) => {

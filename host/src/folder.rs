@@ -229,8 +229,7 @@ fn link(path: &Path) -> FolderError {
 /// # Errors
 /// [`FolderError::NotOurs`].
 pub fn check_file(file: &File, path: &Path, owner: u32) -> Result<(), FolderError> {
-    let about: Metadata =
-        file.metadata().map_err(|source| FolderError::Io { path: path.into(), source })?;
+    let about: Metadata = file.metadata().map_err(|source| FolderError::Io { path: path.into(), source })?;
     let reason = if !about.is_file() {
         "is no plain file; remove it".into()
     } else if about.nlink() != 1 {

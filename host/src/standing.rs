@@ -51,7 +51,12 @@ impl Identity {
                 (format!("DLPC900 {}", or_any(&dlpc.device)), "DLPC900".into(), None)
             }
         };
-        Self { what, family: plain(&family), serial: serial.as_deref().map(plain), is_mock: matches!(backend, ProjectorBackend::Mock(_)) }
+        Self {
+            what,
+            family: plain(&family),
+            serial: serial.as_deref().map(plain),
+            is_mock: matches!(backend, ProjectorBackend::Mock(_)),
+        }
     }
 
     /// As messages call it.
@@ -80,7 +85,9 @@ impl Identity {
         let any = short(&format!("{}-any", self.family)) + ENDING;
         name == self.order_name()
             || name == any
-            || self.serial.is_none() && name.ends_with(ENDING) && name.starts_with(&(self.family.clone() + "-"))
+            || self.serial.is_none()
+                && name.ends_with(ENDING)
+                && name.starts_with(&(self.family.clone() + "-"))
     }
 }
 
@@ -100,7 +107,8 @@ fn short(stem: &str) -> String {
     if stem.len() <= MAX_STEM {
         return stem.to_owned();
     }
-    let hash = stem.bytes().fold(0xcbf2_9ce4_8422_2325u64, |h, b| (h ^ u64::from(b)).wrapping_mul(0x100_0000_01b3));
+    let hash =
+        stem.bytes().fold(0xcbf2_9ce4_8422_2325u64, |h, b| (h ^ u64::from(b)).wrapping_mul(0x100_0000_01b3));
     format!("{}-{hash:016x}", &stem[..MAX_STEM])
 }
 
@@ -226,7 +234,8 @@ impl OrderFile {
             process: std::process::id(),
             projector: self.identity.what.clone(),
         };
-        let text = serde_json::to_string(&content).map_err(|e| FolderError::Io { path: folder.path().join(&name), source: e.into() })?;
+        let text = serde_json::to_string(&content)
+            .map_err(|e| FolderError::Io { path: folder.path().join(&name), source: e.into() })?;
         folder.replace(&name, (text + "\n").as_bytes())?;
         Ok(folder.path().join(name))
     }
@@ -251,7 +260,8 @@ impl OrderFile {
 /// that is damaged or of a version that is not known, count as SAFE.
 pub fn standing_in(path: &std::path::Path, identity: &Identity) -> Option<Stands> {
     let safe = |told: String| Some(Stands { order: Order::Safe, told });
-    let unreadable = |e: FolderError| safe(format!("counts as SAFE, for the state folder cannot be read: {e}"));
+    let unreadable =
+        |e: FolderError| safe(format!("counts as SAFE, for the state folder cannot be read: {e}"));
     let folder = match Folder::open(path, Owner::OwnOrAnyForRoot) {
         Ok(folder) => folder,
         Err(e) if e.is_missing() => return None,
@@ -278,7 +288,11 @@ fn read(folder: &Folder, name: &str) -> Stands {
     });
     match parsed {
         Ok((order, content)) => {
-            let held = if order == Order::Freeze { " (FREEZE of a run that died: no frame is left to hold)" } else { "" };
+            let held = if order == Order::Freeze {
+                " (FREEZE of a run that died: no frame is left to hold)"
+            } else {
+                ""
+            };
             let clean = |text: &str| text.chars().filter(|c| !c.is_control()).take(200).collect::<String>();
             Stands {
                 order: if order == Order::Safe { Order::Safe } else { Order::Black },
@@ -287,7 +301,10 @@ fn read(folder: &Folder, name: &str) -> Stands {
         }
         Err(reason) => Stands {
             order: Order::Safe,
-            told: format!("counts as SAFE, for {} cannot be read: {reason}", folder.path().join(name).display()),
+            told: format!(
+                "counts as SAFE, for {} cannot be read: {reason}",
+                folder.path().join(name).display()
+            ),
         },
     }
 }

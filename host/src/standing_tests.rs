@@ -30,7 +30,9 @@ fn r4_an_order_stands_until_it_is_forgotten() {
     assert_eq!(standing_in(&dir, &usb), None);
     let (file, stands) = opened(&dir, &usb);
     assert_eq!(stands, None);
-    for (order, as_order) in [(Order::Safe, Order::Safe), (Order::Black, Order::Black), (Order::Freeze, Order::Black)] {
+    for (order, as_order) in
+        [(Order::Safe, Order::Safe), (Order::Black, Order::Black), (Order::Freeze, Order::Black)]
+    {
         let path = file.keep(order, By::Socket { uid: 0 }).unwrap();
         assert!(path.is_file());
         let (next, stands) = opened(&dir, &usb);
@@ -62,7 +64,9 @@ fn r4_whatever_cannot_be_read_counts_as_safe() {
         is_safe(&format!("{n} bytes"));
     }
     let text = String::from_utf8(whole).unwrap();
-    for (from, to) in [("\"version\":1", "\"version\":2"), ("black", "blacc"), ("black", "arm"), ("order", "odrer")] {
+    for (from, to) in
+        [("\"version\":1", "\"version\":2"), ("black", "blacc"), ("black", "arm"), ("order", "odrer")]
+    {
         assert!(text.contains(from));
         fs::write(&path, text.replace(from, to)).unwrap();
         is_safe(to);
@@ -124,10 +128,12 @@ fn an_order_for_any_projector_of_a_kind_is_for_each_and_the_other_way_round() {
 #[test]
 fn the_state_folder_is_the_first_that_is_named() {
     let choose = |set: &[(&str, &str)], is_root| {
-        let set: Vec<(String, PathBuf)> = set.iter().map(|(n, v)| ((*n).to_owned(), PathBuf::from(v))).collect();
+        let set: Vec<(String, PathBuf)> =
+            set.iter().map(|(n, v)| ((*n).to_owned(), PathBuf::from(v))).collect();
         choose(&|name| set.iter().find(|(n, _)| n == name).map(|(_, v)| v.clone()), is_root)
     };
-    let all = [("DPM_STATE_DIR", "a"), ("STATE_DIRECTORY", "/b:/c"), ("XDG_STATE_HOME", "/d"), ("HOME", "/e")];
+    let all =
+        [("DPM_STATE_DIR", "a"), ("STATE_DIRECTORY", "/b:/c"), ("XDG_STATE_HOME", "/d"), ("HOME", "/e")];
     assert_eq!(choose(&all, true), Some("a".into()));
     assert_eq!(choose(&all[1..], true), Some("/b".into()));
     assert_eq!(choose(&all[2..], true), Some("/var/lib/dpm".into()));

@@ -188,7 +188,11 @@ fn r4_a_real_projector_without_a_state_folder_is_refused() {
     fs::write(&bench.state, b"a file").unwrap();
     let told = dpm(&["run", &bench.path], &[("DPM_STATE_DIR", bench.state.to_str().unwrap())]);
     assert_eq!(code(&told), 2, "{}", err(&told));
-    assert!(err(&told).contains("SAFE could not be kept") && err(&told).contains("DPM_STATE_DIR"), "{}", err(&told));
+    assert!(
+        err(&told).contains("SAFE could not be kept") && err(&told).contains("DPM_STATE_DIR"),
+        "{}",
+        err(&told)
+    );
     assert_eq!(bench.far.status().state, DeviceState::Idle);
 }
 
@@ -238,8 +242,10 @@ fn r7_a_lock_folder_of_others_and_planted_links_are_refused() {
         assert_eq!(bench.far.status().state, DeviceState::Idle, "the projector was not even opened");
     };
     let port = bench.far.path.display().to_string();
-    let name: String =
-        format!("projector on {port}").chars().map(|c| if c.is_ascii_alphanumeric() { c } else { '-' }).collect();
+    let name: String = format!("projector on {port}")
+        .chars()
+        .map(|c| if c.is_ascii_alphanumeric() { c } else { '-' })
+        .collect();
     let lock = runtime.join(name + ".lock");
     symlink(&victim, &lock).unwrap();
     run("is a link");
@@ -302,7 +308,11 @@ fn r8_another_users_word_is_not_taken_for_a_rigs() {
     let _ = child.kill();
     let _ = child.wait();
     assert_eq!(code(&told), 3, "{}{}", out(&told), err(&told));
-    assert!(out(&told).contains("process 4242 of nobody") && out(&told).contains("nobody vouches"), "{}", out(&told));
+    assert!(
+        out(&told).contains("process 4242 of nobody") && out(&told).contains("nobody vouches"),
+        "{}",
+        out(&told)
+    );
     assert!(err(&told).contains("reached no rig of user root"), "{}", err(&told));
 }
 

@@ -32,7 +32,12 @@ impl Stopped {
         // SAFETY: requests without addresses to a thread of our own child; waitpid writes to a place that outlives it.
         unsafe {
             let none = std::ptr::null_mut::<libc::c_void>();
-            assert_eq!(libc::ptrace(libc::PTRACE_SEIZE, tid, none, none), 0, "{}", std::io::Error::last_os_error());
+            assert_eq!(
+                libc::ptrace(libc::PTRACE_SEIZE, tid, none, none),
+                0,
+                "{}",
+                std::io::Error::last_os_error()
+            );
             assert_eq!(libc::ptrace(libc::PTRACE_INTERRUPT, tid, none, none), 0);
             let mut status = 0;
             assert_eq!(libc::waitpid(tid, &raw mut status, libc::__WALL), tid);

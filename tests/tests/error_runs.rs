@@ -6,7 +6,7 @@ use dpm_host::experiments::error_export::FrameIndex;
 use dpm_host::experiments::error_plan::Group;
 use dpm_host::experiments::error_reference::Reference;
 use dpm_host::experiments::error_runs::{
-    is_other, ErrorOptions, ErrorRuns, Extent, AT_EQUAL_TIME, EYE_FRAMES,
+    is_other, ErrorOptions, ErrorRuns, Extent, AT_EQUAL_TIME, EYE_FRAMES, RACES,
 };
 use dpm_host::experiments::run_rig::open_gpu;
 use dpm_host::experiments::sequence::{eye_mean, rmse, Span, Theatre};
@@ -129,7 +129,7 @@ fn a_group_is_measured_at_equal_rays_and_tells_bias_from_noise() {
     let again = runs.measure(group, &mut |what| drawn.push(what.to_owned())).unwrap();
     let is_time = |what: &String| what == "times" || what.ends_with(AT_EQUAL_TIME);
     assert!(drawn.iter().all(is_time), "{drawn:?}");
-    assert_eq!(drawn.iter().filter(|what| *what == "times").count(), 3);
+    assert!((1..=1 + RACES).contains(&drawn.iter().filter(|what| *what == "times").count()), "{drawn:?}");
     assert_eq!(again.result.rows[1].perceived_rmse, full.perceived_rmse);
     // Once the group is kept as a whole, its parts are not.
     let parts = || {

@@ -177,8 +177,9 @@ impl HostLink {
     ) -> Result<(), SendError> {
         // Whoever asked for dark or stillness decides when it ends.
         self.rest = None;
-        self.ordered = Some(verb);
-        self.give(now, verb, transport)
+        let given = self.give(now, verb, transport);
+        self.ordered = self.verb;
+        given
     }
 
     /// Sends `verb` until the device confirms it.

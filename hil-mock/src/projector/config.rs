@@ -1,6 +1,6 @@
 //! What kind of projector the mock is, and what it tells about its light.
 
-use dpm_device::link::{Codec, LightLimits, MAX_FLASHES_PER_S, VERSION};
+use dpm_device::link::{Codec, DeviceState, LightLimits, MAX_FLASHES_PER_S, VERSION};
 use dpm_device::planes::Raster;
 use dpm_device::time::{DeviceTicks, HostTime};
 
@@ -68,6 +68,20 @@ pub enum LightKind {
     Repeated,
     /// Nothing.
     Blank,
+}
+
+/// Light went on or off, or the state of the projector changed.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct LightChange {
+    /// True time of the first photon, of the beginning of darkness, or of the change of state: exact, however late the model was
+    /// called.
+    pub at: HostTime,
+    /// The frame that is lit from here on (low 32 bits of its number); `None` when it is dark.
+    pub frame: Option<u32>,
+    /// State of the projector from here on.
+    pub state: DeviceState,
+    /// Faults that are latched from here on.
+    pub faults: u32,
 }
 
 /// One slot of an armed projector.

@@ -66,6 +66,8 @@ impl PacketSink for LaneSink<'_> {
         match std::mem::take(&mut self.core.incoming[self.lane as usize]) {
             Incoming::Control(assembly) if intact => self.core.control(&assembly),
             Incoming::Plane { plane, frame, buffer, form } if intact => {
+                // Only now: a header in front of damaged bits is no word of a host.
+                self.core.last_heard = self.core.ticks();
                 self.core.plane_arrived(plane, frame, buffer, &form);
             }
             _ => {}
@@ -94,8 +96,17 @@ impl Core {
         Incoming::Nothing
     }
 
-    /// True when a packet of `session` is of the open one; otherwise counts it, and lets the host know when there is none.
+    /// True when an intact packet of `session` is of the open one, which feeds the watchdog; else as [`Core::is_ours`].
     fn heard(&mut self, session: u32) -> bool {
+        let ours = self.is_ours(session);
+        if ours {
+            self.last_heard = self.ticks();
+        }
+        ours
+    }
+
+    /// True when `session` is the open one; otherwise counts the packet, and lets the host know when there is none.
+    fn is_ours(&mut self, session: u32) -> bool {
         if self.session == 0 {
             self.status_due = true;
         }
@@ -103,12 +114,11 @@ impl Core {
             self.ignore();
             return false;
         }
-        self.last_heard = self.ticks();
         true
     }
 
     fn begin_plane(&mut self, header: &Header) -> Incoming {
-        if !self.heard(header.session) {
+        if !self.is_ours(header.session) {
             return Incoming::Nothing;
         }
         let Some((config, _)) = self.config else { return self.ignore() };
@@ -258,8 +268,8 @@ impl Core {
                 if session == 0 {
                     self.ignore();
                 } else if !(hello.version_min..=hello.version_max).contains(&version) {
-                    self.report(FaultCode::Version, version);
                     self.hello_due = Some(session);
+                    self.version_refused_due = Some(session);
                 } else {
                     if session != self.session {
                         self.open_session(session);

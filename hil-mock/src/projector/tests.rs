@@ -4,6 +4,7 @@ mod cable;
 mod codec;
 mod dark;
 mod limits;
+mod protocol;
 mod safety;
 
 use super::*;
@@ -521,7 +522,12 @@ fn the_documents_example_makes_light() {
     let expected: Vec<[u8; 3]> =
         (0..16).map(|x| if (4..12).contains(&x) { [0; 3] } else { [128, 0, 0] }).collect();
     assert_eq!(light, expected);
-    mock.receive(HostTime(1_100_000), Lane::Control, stop);
-    assert!(!mock.is_lit());
+    mock.advance_to(HostTime(5_279_830));
+    assert!(mock.is_lit());
+    mock.advance_to(HostTime(5_279_831));
+    assert!(!mock.is_lit(), "dark from there on by itself");
+    assert_eq!(mock.status().state, DeviceState::Armed);
+    mock.receive(HostTime(5_300_000), Lane::Control, stop);
+    assert_eq!(mock.status().state, DeviceState::Configured);
     assert_eq!(mock.status().frames_lit, 1);
 }

@@ -172,6 +172,7 @@ mod tests {
             epoch: Epoch::At(DeviceTicks(0)),
             codecs: 0,
             flash_limit: None,
+            limits: LightLimits::OFF,
         });
         link.connect();
         let planes = vec![0x35; raster.plane_bytes() * 24];

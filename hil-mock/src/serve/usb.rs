@@ -27,12 +27,12 @@ pub struct UsbArguments {
 /// How often the plan is looked at.
 const TICK: Duration = Duration::from_millis(2);
 
-/// Offers `model` until the time is over. `look` is called every 2 ms with the instant on the model's clock.
+/// Offers `model` until the time is over. `look` is called every 2 ms with the model's clock.
 pub fn offer(
     arguments: &UsbArguments,
     name: &str,
     model: Arc<Mutex<dyn UsbDeviceModel>>,
-    mut look: impl FnMut(dpm_device::time::HostTime),
+    mut look: impl FnMut(&dyn Fn() -> dpm_device::time::HostTime),
 ) -> Result<(), Box<dyn Error>> {
     let plan = &arguments.faults;
     plan.check_supported(&[FaultKind::Unplug, FaultKind::Stall, FaultKind::Slow], "a USB cable")?;
@@ -71,7 +71,7 @@ pub fn offer(
         }
         plug.set_delay_ns(plan.amount(FaultKind::Slow, before, now.0) as i64);
         before = now.0;
-        look(now);
+        look(&*clock);
         std::thread::sleep(TICK);
     }
 }

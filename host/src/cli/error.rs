@@ -9,7 +9,7 @@ use crate::experiments::error_plan::{contenders, groups, Group};
 use crate::experiments::error_plot::{curves, Cost};
 use crate::experiments::error_report::{csv, markdown};
 use crate::experiments::error_runs::{
-    is_other, ErrorOptions, ErrorRunError, ErrorRuns, Extent, GroupResult, AT_EQUAL_TIME, EYE_FRAMES,
+    is_other, ErrorOptions, ErrorRunError, ErrorRuns, Extent, GroupResult, AT_EQUAL_TIME, EYE_FRAMES, RACES,
 };
 use crate::experiments::run_rig::open_gpu;
 use crate::failure::{Failure, FailureKind};
@@ -249,11 +249,14 @@ pub(super) fn weight(what: &str, group: Group, extent: Extent, methods: usize) -
     of as u64
 }
 
+/// Races of a group at most: one at equal rays, the others for equal time.
+const MOST_RACES: u64 = 1 + RACES as u64;
+
 /// All that is drawn of a group, without its reference: each method twice, the races, and each of the others twice at equal time.
 pub(super) fn weight_of_methods(group: Group, extent: Extent, methods: usize) -> u64 {
     let of = |what: &str| weight(what, group, extent, methods);
     let others = contenders(&RenderConfig::default(), false).iter().filter(|c| is_other(c.name)).count();
-    2 * methods as u64 * of("") + 3 * of("times") + 2 * others as u64 * of(AT_EQUAL_TIME)
+    2 * methods as u64 * of("") + MOST_RACES * of("times") + 2 * others as u64 * of(AT_EQUAL_TIME)
 }
 
 fn measure(

@@ -25,7 +25,10 @@ pub fn execute(args: &OrderArgs, order: Order) -> Result<(), Failure> {
     text.extend(told.refused.iter().map(|refused| format!("not reached: {refused}\n")));
     if order.is_dark() && args.pid.is_none() && !told.closed.is_empty() {
         let folders: Vec<_> = told.closed.iter().map(|f| f.display().to_string()).collect();
-        text += &format!("not looked into, for they are other users': {}; root reaches all\n", folders.join(", "));
+        text += &format!(
+            "not looked into, for they are other users': {}; root reaches all\n",
+            folders.join(", ")
+        );
     }
     print(&text);
     if told.is_done() {

@@ -42,7 +42,8 @@ extern "C" fn on_order(signal: libc::c_int) {
 }
 
 extern "C" fn on_timer(_: libc::c_int) {
-    const TOLD: &str = "error: the rig did not end in time after it was asked to stop; the process ends now, \
+    const TOLD: &str =
+        "error: the rig did not end in time after it was asked to stop; the process ends now, \
                         the projector goes dark by its watchdog\n";
     // A person at the terminal waits for files, or presses the key twice more; a supervisor does not wait.
     let waits = stopping::signal() == Some(libc::SIGINT) && stopping::is_writing_files();

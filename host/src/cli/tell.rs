@@ -131,9 +131,9 @@ fn told(health: ProjectorHealth, counts: &RunCounts, total: u64, rate: f64) -> S
     let mut text = format!("{:<10} {lit:>9} lit {rate:>7.1}/s", health.word());
     // A picture that does not move has no rate that would mean anything, and no time that is left.
     if let ProjectorHealth::Up | ProjectorHealth::Connecting = health {
-        let done = counts.frames_lit + counts.frames_dark + counts.frames_dropped + counts.frames_withheld;
-        if rate > 0.0 && total > done {
-            text += &format!(" {:>6.0} s left", (total - done) as f64 / rate);
+        let left = total.saturating_sub(counts.frames_done());
+        if rate > 0.0 && left > 0 {
+            text += &format!(" {:>6.0} s left", left as f64 / rate);
         }
     } else {
         text = format!("{:<10} {lit:>9} lit, no new picture", health.word());
@@ -191,7 +191,7 @@ impl Progress {
             }
             return self.began.map_or(0, |began| began.elapsed().as_millis() as u64);
         }
-        counts.frames_lit + counts.frames_dark + counts.frames_dropped + counts.frames_withheld
+        counts.frames_done()
     }
 
     fn note(&self, text: &str) {

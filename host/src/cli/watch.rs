@@ -182,9 +182,10 @@ pub fn watch<T: Send + 'static>(
     // A panic was already turned into the error above.
     let _ = worker.join();
     let result = match result {
-        Ok(_) if stopping::has_panicked() => {
-            Err(Failure::new(FailureKind::Device, "the run was stopped by a panic in one of its threads (see above)"))
-        }
+        Ok(_) if stopping::has_panicked() => Err(Failure::new(
+            FailureKind::Device,
+            "the run was stopped by a panic in one of its threads (see above)",
+        )),
         result => result,
     };
     if let Some(status) = &mut status {
@@ -208,7 +209,8 @@ fn stand_by(rig: &RigConfig, monitor: &Arc<RunMonitor>, teller: &Teller) -> Resu
     let identity = Identity::of(&rig.projector.backend);
     let (file, error, stands) = OrderFile::open(state_folder(), identity.clone());
     if let Some(e) = &error {
-        let told = format!("SAFE could not be kept over a restart: {e}; name another state folder by DPM_STATE_DIR");
+        let told =
+            format!("SAFE could not be kept over a restart: {e}; name another state folder by DPM_STATE_DIR");
         if !identity.is_mock() {
             return Err(Failure::new(FailureKind::BadInput, told));
         }
@@ -270,7 +272,10 @@ pub(super) fn take_locks(rig: &RigConfig) -> Result<Locks, Failure> {
     let identity = Identity::of(&rig.projector.backend);
     if !identity.is_mock() {
         let folder = runtime.as_ref().map_err(|e| {
-            Failure::new(FailureKind::BadInput, format!("cannot lock {identity}: the runtime folder {e}; {advice}"))
+            Failure::new(
+                FailureKind::BadInput,
+                format!("cannot lock {identity}: the runtime folder {e}; {advice}"),
+            )
         })?;
         held.push(InstanceLock::take_in(folder, &identity.lock_name(), identity.what()).map_err(or(advice))?);
     }
@@ -278,7 +283,8 @@ pub(super) fn take_locks(rig: &RigConfig) -> Result<Locks, Failure> {
     if *images || *trace {
         let what = format!("output folder {}", dir.display());
         held.push(
-            InstanceLock::take(&dir.join(".dpm.lock"), &what).map_err(or("choose another folder with --out"))?,
+            InstanceLock::take(&dir.join(".dpm.lock"), &what)
+                .map_err(or("choose another folder with --out"))?,
         );
     }
     Ok(Locks { _held: held, runtime })

@@ -137,7 +137,9 @@ fn search(folders: &[PathBuf]) -> Search {
                 match e {
                     _ if e.is_missing() => {}
                     _ if is_own => found.refused.push(e.to_string()),
-                    FolderError::Io { ref source, .. } if source.kind() == io::ErrorKind::PermissionDenied => {
+                    FolderError::Io { ref source, .. }
+                        if source.kind() == io::ErrorKind::PermissionDenied =>
+                    {
                         found.closed.push(path.clone());
                     }
                     // Another user's, or planted: told only where something in it would be a rig.
@@ -151,7 +153,12 @@ fn search(folders: &[PathBuf]) -> Search {
         };
         found.looked.push(path.clone());
         let is_vouched_for = folder.owner() == user() || is_made_by_root(path);
-        let pids = folder.names().unwrap_or_default().into_iter().filter_map(|name| pid_of(&name)).collect::<BTreeSet<_>>();
+        let pids = folder
+            .names()
+            .unwrap_or_default()
+            .into_iter()
+            .filter_map(|name| pid_of(&name))
+            .collect::<BTreeSet<_>>();
         found.rigs.extend(pids.into_iter().map(|pid| Place {
             folder: folder.clone(),
             pid,
@@ -218,7 +225,8 @@ pub fn tell(pid: Option<u32>, order: Order) -> Result<Told, ControlError> {
 
 pub(super) fn tell_in(folders: &[PathBuf], pid: Option<u32>, order: Order) -> Result<Told, ControlError> {
     let Search { rigs, refused, closed, looked } = search(folders);
-    let mut rigs: Vec<Place> = rigs.into_iter().filter(|place| pid.is_none_or(|pid| pid == place.pid)).collect();
+    let mut rigs: Vec<Place> =
+        rigs.into_iter().filter(|place| pid.is_none_or(|pid| pid == place.pid)).collect();
     let none = || ControlError::NoRig { order, looked: looked.clone() };
     if !order.is_dark() && pid.is_none() {
         // Light is let through by name only where there is a choice; sockets of the dead are none.
@@ -270,8 +278,12 @@ pub(super) fn tell_in(folders: &[PathBuf], pid: Option<u32>, order: Order) -> Re
 
 fn by_hand(order: Order, pid: u32) -> String {
     match order {
-        Order::Black => format!("look at the light, then `kill -USR1 {pid}`, `kill -KILL {pid}` or the projector's own switch"),
-        Order::Safe => format!("look at the light, then `kill -USR2 {pid}`, `kill -KILL {pid}` or the projector's own switch"),
+        Order::Black => format!(
+            "look at the light, then `kill -USR1 {pid}`, `kill -KILL {pid}` or the projector's own switch"
+        ),
+        Order::Safe => format!(
+            "look at the light, then `kill -USR2 {pid}`, `kill -KILL {pid}` or the projector's own switch"
+        ),
         Order::Freeze | Order::Arm => "look at the light and say it again".into(),
     }
 }
@@ -314,8 +326,12 @@ fn ask(place: &Place, order: Order) -> Option<Answer> {
     let (begin, begin_ns) = (Instant::now(), monotonic_ns());
     let (mut stream, listener) = match connect(place) {
         Ok(found) => found,
-        Err(e) if matches!(e.kind(), io::ErrorKind::ConnectionRefused | io::ErrorKind::NotFound) => return None,
-        Err(e) => return answer(String::new(), format!("NOT delivered: {e}; {}", by_hand(order, place.pid)), false),
+        Err(e) if matches!(e.kind(), io::ErrorKind::ConnectionRefused | io::ErrorKind::NotFound) => {
+            return None
+        }
+        Err(e) => {
+            return answer(String::new(), format!("NOT delivered: {e}; {}", by_hand(order, place.pid)), false)
+        }
     };
     let mut text = String::new();
     let mut open = say(&mut stream, order).is_ok();
@@ -402,7 +418,10 @@ fn more(stream: &mut UnixStream, text: &mut String) -> bool {
             text.push_str(&String::from_utf8_lossy(&bytes[..n]));
             text.len() < MAX_ANSWER
         }
-        Err(e) => matches!(e.kind(), io::ErrorKind::WouldBlock | io::ErrorKind::TimedOut | io::ErrorKind::Interrupted),
+        Err(e) => matches!(
+            e.kind(),
+            io::ErrorKind::WouldBlock | io::ErrorKind::TimedOut | io::ErrorKind::Interrupted
+        ),
     }
 }
 

@@ -57,7 +57,9 @@ fn choose(
     };
     variable("DPM_RUNTIME_DIR")
         // A shell that became another user by `su` still has the variable of the first.
-        .or_else(|| variable("XDG_RUNTIME_DIR").filter(|dir| owner(dir) == Some(me)).map(|dir| dir.join("dpm")))
+        .or_else(|| {
+            variable("XDG_RUNTIME_DIR").filter(|dir| owner(dir) == Some(me)).map(|dir| dir.join("dpm"))
+        })
         .or_else(|| is_for_me().then(|| run.into()))
         .or_else(|| (me == 0).then(|| "/run/dpm-0".into()))
         .unwrap_or_else(|| variable("TMPDIR").unwrap_or_else(|| "/tmp".into()).join(format!("dpm-{me}")))
@@ -101,11 +103,9 @@ mod tests {
     #[test]
     fn the_runtime_folder_is_the_first_that_is_this_users() {
         let choose = |set: &[(&str, &str)], me, owners: &[(&str, u32)]| {
-            choose(
-                &|name| set.iter().find(|(n, _)| *n == name).map(|(_, v)| PathBuf::from(v)),
-                me,
-                &|path| owners.iter().find(|(p, _)| Path::new(p) == path).map(|(_, uid)| *uid),
-            )
+            choose(&|name| set.iter().find(|(n, _)| *n == name).map(|(_, v)| PathBuf::from(v)), me, &|path| {
+                owners.iter().find(|(p, _)| Path::new(p) == path).map(|(_, uid)| *uid)
+            })
         };
         let xdg = [("XDG_RUNTIME_DIR", "/run/user/7")];
         let both = [("DPM_RUNTIME_DIR", "/x"), xdg[0]];

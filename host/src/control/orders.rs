@@ -92,7 +92,8 @@ impl Orders {
     ) -> std::io::Result<Self> {
         let stands = stands.map(|s| s.order);
         stands.into_iter().for_each(|order| monitor.give_order(order));
-        let state = Mutex::new(State { stands, outcome: stands.map(|_| Kept::In(file.path())), ..State::default() });
+        let state =
+            Mutex::new(State { stands, outcome: stands.map(|_| Kept::In(file.path())), ..State::default() });
         let inner = Arc::new(Inner { monitor, file, keeps, state, changed: Condvar::new() });
         let thread = std::thread::Builder::new().name("dpm-orders".into()).spawn({
             let inner = inner.clone();

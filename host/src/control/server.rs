@@ -44,7 +44,11 @@ impl ControlSocket {
     ///
     /// # Errors
     /// The socket cannot be made there.
-    pub fn serve(folder: Arc<Folder>, monitor: Arc<RunMonitor>, orders: Arc<Orders>) -> Result<Self, FolderError> {
+    pub fn serve(
+        folder: Arc<Folder>,
+        monitor: Arc<RunMonitor>,
+        orders: Arc<Orders>,
+    ) -> Result<Self, FolderError> {
         let name = socket_name(std::process::id());
         let failed = |source| FolderError::Io { path: folder.path().join(&name), source };
         // Left by a process of the same number that was killed.
@@ -55,7 +59,10 @@ impl ControlSocket {
         listener.set_nonblocking(true).map_err(failed)?;
         let stop = Arc::new(AtomicBool::new(false));
         let mut desk = Desk { listener, monitor, orders, clients: VecDeque::new(), stop: stop.clone() };
-        let thread = std::thread::Builder::new().name("dpm-control".into()).spawn(move || desk.run()).map_err(failed)?;
+        let thread = std::thread::Builder::new()
+            .name("dpm-control".into())
+            .spawn(move || desk.run())
+            .map_err(failed)?;
         Ok(Self { folder, name, stop, thread: Some(thread) })
     }
 
@@ -146,7 +153,13 @@ impl Desk {
             if self.clients.len() >= CLIENTS {
                 self.cut_off_the_oldest();
             }
-            self.clients.push_back(Client { stream, since: Instant::now(), uid, word: Vec::new(), given: None });
+            self.clients.push_back(Client {
+                stream,
+                since: Instant::now(),
+                uid,
+                word: Vec::new(),
+                given: None,
+            });
         }
         false
     }
@@ -182,7 +195,9 @@ impl Desk {
         let Self { clients, orders, monitor, .. } = self;
         clients.retain_mut(|client| {
             let Some((order, ticket)) = client.given else { return true };
-            let Some(text) = answer_to(order, ticket, client.since.elapsed(), monitor, orders) else { return true };
+            let Some(text) = answer_to(order, ticket, client.since.elapsed(), monitor, orders) else {
+                return true;
+            };
             let _ = writeln!(client.stream, "{text}");
             false
         });
@@ -190,7 +205,13 @@ impl Desk {
 }
 
 /// The last line for an order that was given `ago`; `None` while there is hope for a better one.
-fn answer_to(order: Order, ticket: Ticket, ago: Duration, monitor: &RunMonitor, orders: &Orders) -> Option<String> {
+fn answer_to(
+    order: Order,
+    ticket: Ticket,
+    ago: Duration,
+    monitor: &RunMonitor,
+    orders: &Orders,
+) -> Option<String> {
     let health = monitor.projector();
     let is_done = is_obeyed(order, health);
     let kept = orders.outcome(ticket);
@@ -211,8 +232,14 @@ fn answer_to(order: Order, ticket: Ticket, ago: Duration, monitor: &RunMonitor, 
         Some(Kept::Forgotten) => String::new(),
         Some(Kept::Nowhere) if order == Order::Arm => String::new(),
         Some(Kept::Nowhere) => "; not kept over a restart (a mock without a state folder)".into(),
-        Some(Kept::Not(why)) => return Some(format!("{done}, but NOT kept over a restart: {why}; projector {health}")),
-        None => return Some(format!("{done}, but NOT kept over a restart yet: the disk is slow; projector {health}")),
+        Some(Kept::Not(why)) => {
+            return Some(format!("{done}, but NOT kept over a restart: {why}; projector {health}"))
+        }
+        None => {
+            return Some(format!(
+                "{done}, but NOT kept over a restart yet: the disk is slow; projector {health}"
+            ))
+        }
     };
     Some(format!("{done}: projector {health}{on_disk}"))
 }

@@ -56,17 +56,17 @@ impl StatusFile {
         let this = Self { name, file, last: None, folder };
         let first = record(0, ProjectorHealth::Connecting, None);
         let text = format!("{first}{first}{HEARD} {rig}\n");
-        this.file.write_all_at(text.as_bytes(), 0).map_err(|source| FolderError::Io {
-            path: this.folder.path().join(&this.name),
-            source,
-        })?;
+        this.file
+            .write_all_at(text.as_bytes(), 0)
+            .map_err(|source| FolderError::Io { path: this.folder.path().join(&this.name), source })?;
         Ok(this)
     }
 
     /// Says how the projector is now. Off the frame path: a file system may take its time.
     pub fn say(&mut self, health: ProjectorHealth, standing: Option<Order>) {
         let now = monotonic_ns();
-        let is_known = |(at, h, s): (u64, _, _)| (h, s) == (health, standing) && now.saturating_sub(at) < AGAIN_NS;
+        let is_known =
+            |(at, h, s): (u64, _, _)| (h, s) == (health, standing) && now.saturating_sub(at) < AGAIN_NS;
         if self.last.is_some_and(is_known) {
             return;
         }
@@ -129,7 +129,10 @@ mod tests {
         ] {
             file.say(health, standing);
             let said = StatusFile::read(&folder, pid).unwrap();
-            assert_eq!((said.health, said.standing, said.rig.as_str()), (health, standing, "/etc/dpm/rig.toml"));
+            assert_eq!(
+                (said.health, said.standing, said.rig.as_str()),
+                (health, standing, "/etc/dpm/rig.toml")
+            );
             assert!((before..=monotonic_ns()).contains(&said.at_ns));
         }
         let text = std::fs::read_to_string(path.join(state_name(pid))).unwrap();

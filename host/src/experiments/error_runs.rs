@@ -59,6 +59,10 @@ const EQUAL_RAYS: f64 = 0.01;
 const MOST_SAMPLES_MORE: f32 = 16.0;
 /// As many as a rig file may ask for.
 const MOST_SPP: f32 = 4096.0;
+/// Times count as equal within this share ...
+const EQUAL_TIME: f64 = 0.05;
+/// ... for which so many races are run at most, beside the first at equal rays.
+pub const RACES: usize = 4;
 /// Fewer probes in the periphery than this share of all do not tell its flicker.
 const LEAST_PERIPHERY: f64 = 0.01;
 
@@ -347,9 +351,8 @@ impl ErrorRuns {
 
     /// Draws every method but dpm and its parts with as many samples as fill the time of a frame of dpm.
     ///
-    /// Times are compared within a race only, where all meet the same disturbances. A second race with samples in the ratio of the times
-    /// tells what a sample takes beside what a frame takes without any, a line through both meets the time of dpm, and a third race tells
-    /// how well.
+    /// Times are compared within a race only, where all meet the same disturbances. Races with more and fewer samples tell what a sample
+    /// takes beside what a frame takes without any, until the times are equal or [`RACES`] have been run; of all trials the nearest counts.
     #[allow(clippy::too_many_arguments)]
     fn at_equal_time(
         &self,
@@ -364,52 +367,50 @@ impl ErrorRuns {
         let Some(dpm) = contenders.iter().position(|c| c.name == DPM) else { return Ok(()) };
         let others: Vec<usize> = (0..rows.len()).filter(|&i| is_other(contenders[i].name)).collect();
         let seed = self.stamp.seed as u32;
-        // Times by that of dpm, which runs along with as many samples as before.
-        let mut race = |spp: &[f32]| -> Result<Vec<f64>, RenderError> {
+        // Samples that were tried, and the time of a frame by that of dpm, which ran along with its own.
+        let mut trials: Vec<Trials> =
+            others.iter().map(|&i| vec![(rows[i].spp, times[i].ms() / times[dpm].ms())]).collect();
+        for _ in 0..RACES {
+            if trials.iter().all(|t| off_equal(nearest(t)) <= EQUAL_TIME) {
+                break;
+            }
+            let next: Vec<f32> = others
+                .iter()
+                .zip(&trials)
+                .map(|(&i, tried)| {
+                    let (own, least) = (rows[i].spp as f32, least_spp(&contenders[i].method));
+                    (where_equal(tried) as f32).clamp(least, (MOST_SAMPLES_MORE * own).clamp(least, MOST_SPP))
+                })
+                .collect();
             each("times");
-            let with =
-                others.iter().zip(spp).map(|(&i, &spp)| (with_samples(&contenders[i].method, spp), spp));
-            let runners: Vec<_> =
-                with.chain([(contenders[dpm].method.clone(), rows[dpm].spp as f32)]).collect();
-            let times = theatre.race(&runners, seed)?;
-            let of_dpm = times.last().map_or(f64::NAN, FrameTime::ms);
-            Ok(times[..others.len()].iter().map(|t| t.ms() / of_dpm).collect())
-        };
-        let bounded = |i: usize, spp: f64| {
-            let (own, least) = (rows[i].spp as f32, least_spp(&contenders[i].method));
-            let most = (MOST_SAMPLES_MORE * own).clamp(least, MOST_SPP);
-            if spp.is_finite() { spp as f32 } else { own }.clamp(least, most)
-        };
-        let first: Vec<f64> = others.iter().map(|&i| times[i].ms() / times[dpm].ms()).collect();
-        let guess: Vec<f32> = others.iter().zip(&first).map(|(&i, r)| bounded(i, rows[i].spp / r)).collect();
-        let second = race(&guess)?;
-        let chosen: Vec<f32> = (0..others.len())
-            .map(|k| {
-                bounded(
-                    others[k],
-                    where_equal((rows[others[k]].spp, first[k]), (f64::from(guess[k]), second[k])),
-                )
-            })
-            .collect();
-        let reached = race(&chosen)?;
-        for (k, &i) in others.iter().enumerate() {
-            let (name, spp) = (contenders[i].name, chosen[k]);
-            let method = with_samples(&contenders[i].method, spp);
+            let runners: Vec<(Method, f32)> = others
+                .iter()
+                .zip(&next)
+                .map(|(&i, &spp)| (with_samples(&contenders[i].method, spp), spp))
+                .chain([(contenders[dpm].method.clone(), rows[dpm].spp as f32)])
+                .collect();
+            let raced = theatre.race(&runners, seed)?;
+            let of_dpm = raced.last().map_or(f64::NAN, FrameTime::ms);
+            for ((tried, &spp), time) in trials.iter_mut().zip(&next).zip(&raced) {
+                tried.push((f64::from(spp), time.ms() / of_dpm));
+            }
+        }
+        for (&i, tried) in others.iter().zip(&trials) {
+            let (name, (spp, time_to_dpm)) = (contenders[i].name, nearest(tried));
+            let method = with_samples(&contenders[i].method, spp as f32);
             // Only what the eye sees at the end is wanted.
             let warm_up = if method.needs_history() { self.options.extent.warm_up } else { 0 };
             let short = self.theatre(group, warm_up, EYE_FRAMES as u32)?;
             let mut play = |seed: u32| {
                 each(&format!("{name}{AT_EQUAL_TIME}"));
-                Ok::<_, RenderError>(eye_mean(
-                    &short.play(&method, spp, seed, &mut |_, _| ())?.frames,
-                    EYE_FRAMES,
-                ))
+                let seen = short.play(&method, spp as f32, seed, &mut |_, _| ())?;
+                Ok::<_, RenderError>(eye_mean(&seen.frames, EYE_FRAMES))
             };
             let eyes = [play(seed)?, play(seed.wrapping_add(1_000_003))?];
             let (raw, clean) = reference.perceived(&eyes, &|_| true);
             rows[i].equal_time = Some(EqualTime {
-                spp: f64::from(spp),
-                time_to_dpm: reached[k],
+                spp,
+                time_to_dpm,
                 perceived_rmse_raw: raw,
                 perceived_rmse: clean,
                 runs_raw: reference.each_run(&eyes),
@@ -614,16 +615,32 @@ fn with_samples(method: &Method, spp: f32) -> Method {
     }
 }
 
-/// Where a line through two points of samples and time is 1. Not a number where more samples take no more time.
-fn where_equal(a: (f64, f64), b: (f64, f64)) -> f64 {
-    let slope = (b.1 - a.1) / (b.0 - a.0);
-    if slope > 0.0 {
-        a.0 + (1.0 - a.1) / slope
-    } else if a.0 == b.0 {
-        a.0
-    } else {
-        f64::NAN
+/// Samples that were tried, and the time of a frame with them by the time that is wanted.
+type Trials = Vec<(f64, f64)>;
+
+/// How far a trial is from equal time, as a logarithm.
+fn off_equal(trial: (f64, f64)) -> f64 {
+    trial.1.ln().abs()
+}
+
+/// The trial nearest to equal time.
+fn nearest(trials: &Trials) -> (f64, f64) {
+    trials.iter().copied().min_by(|a, b| off_equal(*a).total_cmp(&off_equal(*b))).unwrap_or((1.0, 1.0))
+}
+
+/// Samples with which the time is the one wanted: where a line through the trials is 1. A frame without samples takes time, and samples
+/// take more; where the trials say otherwise they are mostly chance, and time is taken to grow with the samples alone.
+fn where_equal(trials: &Trials) -> f64 {
+    let n = trials.len() as f64;
+    let sum = |of: &dyn Fn(f64, f64) -> f64| trials.iter().map(|&(x, y)| of(x, y)).sum::<f64>();
+    let (x, y) = (sum(&|x, _| x) / n, sum(&|_, y| y) / n);
+    let (xx, xy) = (sum(&|a, _| (a - x) * (a - x)), sum(&|a, b| (a - x) * (b - y)));
+    let slope = xy / xx;
+    let base = y - slope * x;
+    if slope > 0.0 && base >= 0.0 && base < 1.0 {
+        return (1.0 - base) / slope;
     }
+    x / y
 }
 
 /// A method that keeps nothing shows a pixel without samples black: it takes at least one. With a history a frame may pass.
@@ -650,13 +667,16 @@ mod tests {
     use super::*;
 
     #[test]
-    fn the_samples_that_fill_a_time_are_where_the_line_of_two_trials_meets_it() {
+    fn the_samples_that_fill_a_time_are_where_the_line_of_the_trials_meets_it() {
         // 0.2 of the time without a sample, 0.1 a sample.
-        let time = |spp: f64| 0.2 + 0.1 * spp;
-        assert!((where_equal((2.0, time(2.0)), (5.0, time(5.0))) - 8.0).abs() < 1e-12);
-        assert!((where_equal((10.0, time(10.0)), (9.0, time(9.0))) - 8.0).abs() < 1e-12);
-        assert_eq!(where_equal((3.0, 1.0), (3.0, 1.1)), 3.0, "it was equal at once");
-        assert!(where_equal((2.0, 0.5), (4.0, 0.4)).is_nan(), "noise");
+        let of = |all: &[f64]| where_equal(&all.iter().map(|spp| (*spp, 0.2 + 0.1 * spp)).collect());
+        assert!((of(&[2.0, 5.0]) - 8.0).abs() < 1e-12);
+        assert!((of(&[10.0, 9.0, 1.0]) - 8.0).abs() < 1e-12);
+        // One trial, or trials that are chance: never the samples that were there before, which would flatter the slower method.
+        assert!((where_equal(&vec![(2.0, 0.5)]) - 4.0).abs() < 1e-12);
+        assert!((where_equal(&vec![(2.0, 0.5), (4.0, 0.4)]) - 3.0 / 0.45).abs() < 1e-12);
+        assert!((where_equal(&vec![(2.0, 0.1), (4.0, 0.5)]) - 3.0 / 0.3).abs() < 1e-12);
+        assert_eq!(nearest(&vec![(2.0, 0.5), (3.0, 1.1), (9.0, 4.0)]), (3.0, 1.1));
     }
 
     #[test]

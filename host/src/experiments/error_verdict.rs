@@ -122,8 +122,8 @@ pub(super) fn equal_time_table<'a>(groups: impl Iterator<Item = (String, &'a Gro
         return text;
     }
     format!(
-        "At equal time every other method is drawn again with as many samples as fill the time of a frame of dpm on this device: the line \
-         through two races of all methods in turns says how many, `time / dpm` how well that was met in a third.\n\n\
+        "At equal time every other method is drawn again with as many samples as fill the time of a frame of dpm on this device: races \
+         of all methods in turns say how many these are, and `time / dpm` how well that was met.\n\n\
          | group | method | samples at equal rays | in the time of dpm | time / dpm | perceived RMSE as measured | less the reference's own | \
          two runs | dpm / it, as measured |\n|---|---|---:|---:|---:|---:|---:|---|---:|\n{text}"
     )

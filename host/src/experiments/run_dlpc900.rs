@@ -89,10 +89,8 @@ pub enum Show {
 }
 
 impl Show {
-    /// Loaded and stopped. What the run before left the controller in, the 50/50 exercise or a sequence that runs, is ended first,
-    /// before seconds go into an upload.
+    /// Loaded and stopped.
     fn load<P: HidPort>(&self, d: &mut Dlpc900<P>) -> Result<(), Dlpc900Error> {
-        d.make_ready()?;
         match self {
             Self::Preloaded(sequence) => d.upload(sequence, LedSetup::default(), &mut |_| ()),
             Self::Video(video) => d.load_video_patterns(video),
@@ -453,14 +451,13 @@ fn watch_over<P: HidPort>(
         let watch = Stopwatch::start();
         *word.line.lock().unwrap_or_else(PoisonError::into_inner) = d.dark_line();
         d.stop_when(Arc::clone(&word.stop));
-        // What a run that was killed left running. In standby only waking is accepted.
-        match d.stop() {
-            Ok(()) | Err(Dlpc900Error::Refused { .. }) => {}
-            Err(e) => return Err(e),
-        }
+        // Before seconds go into an upload: out of the exercise that every run ends in, and of a sequence that a killed run left.
+        d.make_ready()?;
+        d.stop()?;
         word.loading.store(true, Ordering::SeqCst);
-        show.load(d)?;
+        let loaded = show.load(d);
         word.loading.store(false, Ordering::SeqCst);
+        loaded?;
         if let Some(order) = word.take() {
             *standing = standing_after(*standing, order);
         }

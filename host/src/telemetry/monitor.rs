@@ -227,6 +227,13 @@ pub struct RunCounts {
     pub slots_missed: u64,
 }
 
+impl RunCounts {
+    /// Planned frames whose fate is known.
+    pub fn frames_done(&self) -> u64 {
+        self.frames_lit + self.frames_dark + self.frames_dropped + self.frames_withheld
+    }
+}
+
 impl RunMonitor {
     /// Asks the run for an ordered stop: dark, flush, report.
     pub fn request_stop(&self) {

@@ -96,20 +96,22 @@ impl Track {
 
 /// What a distribution says, milliseconds. Every figure has its sign.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
-#[serde(default)]
 pub struct Distribution {
     /// "work", "wait" or "total".
     pub kind: String,
     /// It is no measurement of this machine, but follows from numbers of the rig file: every interval at virtual pace
     /// (`real_time.stage_costs_us`), and the interval of a mock tracker.
+    #[serde(default)]
     pub modelled: bool,
     /// Frames.
     pub count: u64,
     /// Arithmetic mean.
     pub mean: f64,
     /// Smallest.
+    #[serde(default)]
     pub min: f64,
     /// 1 %.
+    #[serde(default)]
     pub p01: f64,
     /// Median.
     pub p50: f64,
@@ -134,27 +136,32 @@ pub struct Distribution {
     pub batch_p99: Vec<f64>,
 }
 
-/// What a profiling run found, as `profile.json` keeps it.
+/// What a profiling run found, as `profile.json` keeps it. What older programs did not write may be left out in a file.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
-#[serde(default)]
 pub struct ProfileReport {
     /// What ran, for whoever compares two of them: machine, GPU, raster, pace and so on.
     pub setup: BTreeMap<String, String>,
     /// Nominal frames per second.
     pub frame_rate_hz: f64,
     /// Slots in which a frame of their own was wanted.
+    #[serde(default)]
     pub slots: u64,
     /// Of these, slots without one.
+    #[serde(default)]
     pub missed_slots: u64,
     /// `missed_slots` as a share of `slots`, 0 to 1.
+    #[serde(default)]
     pub missed_share: f64,
     /// Missed slots whose frame was under way while the machine itself stood still.
+    #[serde(default)]
     pub excused_by_standstill: u64,
     /// Missed slots by cause.
     pub missed: BTreeMap<String, u64>,
     /// Slots in which no new picture was wanted, by reason; they are not among `slots`.
+    #[serde(default)]
     pub ordered_dark: BTreeMap<String, u64>,
     /// `slots` and `missed_slots` of equal batches of consecutive slots, for the noise of the share.
+    #[serde(default)]
     pub missed_batches: Vec<(u64, u64)>,
     /// Frames that the projector lit, dark ones among them.
     pub frames_lit: u64,
@@ -162,7 +169,7 @@ pub struct ProfileReport {
     pub frames_late: u64,
     /// First photon against the exact slot times of consecutive frames, early (negative) or late; absent where a mock lights on an ideal
     /// clock and there is nothing to measure.
-    #[serde(skip_serializing_if = "Option::is_none")]
+    #[serde(default, skip_serializing_if = "Option::is_none")]
     pub jitter_ms: Option<Distribution>,
     /// Every interval by name.
     pub intervals_ms: BTreeMap<String, Distribution>,

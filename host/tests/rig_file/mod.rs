@@ -21,7 +21,7 @@ pub fn rig(name: &str) -> (Folder, String, PtyProjector) {
     let far = PtyProjector::new(name, MockConfig::new(raster()));
     let text = format!(
         "[projector]\nwidth = {}\nheight = {}\nframe_rate = 20\nplanes = 8\nbackend = {}\n\
-         [render]\nspp = 1\n[safety]\nwatchdog_ms = {}\n[output]\ndir = {:?}\nlight_window_ms = 100\n\
+         [render]\nspp = 1\n[safety]\npredict_ms = 1000\nwatchdog_ms = {}\n[output]\ndir = {:?}\nlight_window_ms = 100\n\
          [[scene.bodies]]\nname = \"bunny\"\n",
         raster().width(),
         raster().height(),
@@ -32,4 +32,3 @@ pub fn rig(name: &str) -> (Folder, String, PtyProjector) {
     let path = folder.write("rig.toml", &text);
     (folder, path, far)
 }
-
