@@ -45,7 +45,8 @@ impl Bench {
         }
         command.args(words).current_dir(&self.folder);
         command.env("LD_PRELOAD", library).env("USBFS_FAKE_USBIP", self.server.address().to_string());
-        command.env("USBFS_FAKE_DRIVER", "usbhid").env("DPM_RUNTIME_DIR", &self.folder);
+        command.env("USBFS_FAKE_DRIVER", "usbhid").env("DPM_RUNTIME_DIR", self.folder.join("run"));
+        command.env("DPM_STATE_DIR", self.folder.join("state"));
         command
     }
 

@@ -1,9 +1,11 @@
 //! `dpm dlpc900`: words into calls of the DLPC900 driver.
 
 use super::signals;
-use super::watch::print;
+use super::watch::{print, refuse_where_dark_stands};
+use crate::config::{Dlpc900Config, ProjectorBackend};
 use crate::dlpc900::{sequence_of, status_text, PatternFileError, ShowAs};
 use crate::failure::{Failure, FailureKind};
+use crate::standing::Identity;
 use clap::ValueEnum;
 use dpm_device::dlpc900::driver::{Dlpc900, Dlpc900Error, UploadProgress};
 use dpm_device::dlpc900::image::{Compression, PlaneOrder};
@@ -210,6 +212,14 @@ fn open(args: &Dlpc900Args) -> Result<Dlpc900<UsbHid>, Failure> {
 pub fn execute(args: &Dlpc900Args) -> Result<(), Failure> {
     if let Action::Guard = args.action {
         return guard(args.device);
+    }
+    let lights = match &args.action {
+        Action::Upload(upload) => upload.start,
+        Action::Start | Action::VideoPattern(_) | Action::Wake => true,
+        _ => false,
+    };
+    if lights {
+        refuse_where_dark_stands(&Identity::of(&ProjectorBackend::Dlpc900(Dlpc900Config::default())))?;
     }
     let mut d = open(args)?;
     match &args.action {

@@ -2,7 +2,7 @@
 
 use super::rig_args::RigArgs;
 use super::signals;
-use super::watch::{print, take_locks};
+use super::watch::{print, refuse_where_dark_stands, take_locks};
 use crate::config::RigConfig;
 use crate::experiments::conformance::{rules, Extent};
 use crate::experiments::link_test::{judge_projector, link_test, Content};
@@ -10,6 +10,8 @@ use crate::experiments::run_rig::open_gpu;
 use crate::failure::{Failure, FailureKind};
 use crate::interlock::Interlock;
 use crate::rig::Rig;
+use crate::standing::Identity;
+use crate::stopping;
 use crate::telemetry::report::to_json;
 use std::path::PathBuf;
 
@@ -53,6 +55,7 @@ pub fn execute(args: &LinkTestArgs) -> Result<(), Failure> {
     args.flags.refuse("dpm link-test", &["--frames", "--seconds", "--no-prediction", "--out"])?;
     let config = args.flags.rig_at_rest(Some(&args.rig))?;
     let _locks = take_locks(&config)?;
+    refuse_where_dark_stands(&Identity::of(&config.projector.backend))?;
     signals::install()
         .map_err(|e| Failure::new(FailureKind::Device, format!("cannot handle signals: {e}")))?;
     let interlock = Interlock::of_config(&config.safety.interlock, false)?;
@@ -61,7 +64,7 @@ pub fn execute(args: &LinkTestArgs) -> Result<(), Failure> {
         let told = format!("safety.interlock is open: this test makes light only while {}", interlock.what());
         return Err(Failure::new(FailureKind::Device, told));
     }
-    let stop = || signals::received().is_some() || is_open();
+    let stop = || stopping::is_stopping() || is_open();
     if args.conformance {
         return judge(args, &config, &stop);
     }

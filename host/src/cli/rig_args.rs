@@ -1,6 +1,7 @@
 //! Flags that every command with a rig takes, into a checked [`RigConfig`].
 
 use crate::config::{Overrides, Purpose, RigConfig};
+use crate::control::set_rig_name;
 use crate::failure::{Failure, FailureKind};
 use std::path::{Path, PathBuf};
 
@@ -117,6 +118,8 @@ impl RigArgs {
     }
 
     fn rig_for(&self, path: Option<&Path>, at_rest: bool) -> Result<RigConfig, Failure> {
+        // Whoever gives orders to this process is told which rig it is.
+        path.into_iter().for_each(set_rig_name);
         let read = |flags: Vec<String>, at_rest: bool| {
             let overrides = Overrides::from_environment(flags);
             let purpose = Purpose { simulate: self.simulate, at_rest };

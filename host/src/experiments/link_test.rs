@@ -11,6 +11,7 @@ use crate::pipeline::prepared::PreparedFrames;
 use crate::pipeline::{connect, projector, renderer_settings, PipelineError, ENDED_WITH_THE_LAST_RUN};
 use crate::render::{RenderError, Renderer};
 use crate::rig::Rig;
+use crate::telemetry::monitor::RunMonitor;
 use dpm_device::link::{measure, Codec, HostLink, LinkMeasurement, LinkSettings, LinkState, Verb};
 use dpm_device::planes::Raster;
 use dpm_device::time::HostTime;
@@ -260,7 +261,13 @@ fn way(
         std::thread::sleep(Duration::from_micros(200));
         clock.now()
     };
-    connect(&mut link, transport, ENDED_WITH_THE_LAST_RUN, &mut now, stop).map_err(PipelineError::from)?;
+    let monitor = RunMonitor::default();
+    connect(&mut link, transport, ENDED_WITH_THE_LAST_RUN, &monitor, &mut now, stop)
+        .map_err(PipelineError::from)?;
+    if monitor.take_found_safe() {
+        let told = "the projector has latched SAFE; run its rig and say `dpm arm`";
+        return Err(Failure::new(FailureKind::Device, format!("{}: {told}", transport.name())));
+    }
     let duration_ns = (seconds * 1e9) as i64;
     let measured = measure(
         &mut link,

@@ -58,6 +58,7 @@ pub fn profile_rig(
     };
     let mut profile = summary(&outcome, &rig, prepared);
     profile.report.warnings.splice(0..0, notes);
+    let _writing = crate::stopping::WritingFiles::begin();
     let saved = save(&mut profile, &outcome, &config.output.dir);
     let mut ended = Ended::from(profile);
     ended.keep(saved);

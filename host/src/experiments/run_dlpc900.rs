@@ -326,6 +326,10 @@ pub fn present<P: HidPort>(
         warnings: Vec::new(),
     };
     let word = Word::default();
+    if let Some(order) = monitor.take_order() {
+        // What stands from before the run, or was ordered while it rendered: the controller is set up dark.
+        word.waiting.store(order as u8, Ordering::Relaxed);
+    }
     let (result, rested) = std::thread::scope(|scope| {
         // Also when this unwinds: the scope waits for the other thread.
         let _over = Over(&word);

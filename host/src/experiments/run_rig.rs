@@ -50,6 +50,7 @@ pub fn run_rig(config: &RigConfig, monitor: &Arc<RunMonitor>) -> Result<Ended<Re
     let slots = config.slots_to_run();
     let options = RunOptions { frames: config.run.frames, slots, keep_frames, ..RunOptions::default() };
     let mut outcome = pipeline::run(rig.clone(), &gpu, options, monitor)?;
+    let _writing = crate::stopping::WritingFiles::begin();
     let mut ended = Ended::from(std::mem::take(&mut outcome.report));
     ended.report.warnings.splice(0..0, notes);
     if outcome.light_mismatches > 0 {

@@ -231,6 +231,10 @@ impl LinkKeeper {
                 return link.arm(link.status().map_or(0, |s| s.faults));
             }
         };
+        // What stands is not weakened by a later word: FREEZE after BLACK, or BLACK after SAFE.
+        if self.standing.is_some_and(|standing| rank(standing) > rank(verb)) {
+            return;
+        }
         self.standing = Some(verb);
         // What does not get through now is repeated by the link; a medium that is gone is dark anyway.
         let _ = link.command(now, verb, transport);
@@ -299,6 +303,16 @@ pub(super) fn is_dark(link: &HostLink) -> bool {
         })
 }
 
+/// What stands gives way only to what is at least as strong.
+fn rank(verb: Verb) -> u8 {
+    match verb {
+        Verb::Freeze => 0,
+        Verb::Black => 1,
+        Verb::Safe => 2,
+        Verb::Stop => 3,
+    }
+}
+
 /// Why no new picture is wanted: slots are no one's fault then.
 fn ordered_dark(now: HostTime, link: &HostLink, standing: Option<Verb>) -> Option<OrderedDark> {
     match standing {
@@ -332,6 +346,8 @@ fn health(link: &HostLink, standing: Option<Verb>) -> ProjectorHealth {
         // Not before the projector says so.
         (_, Some(Verb::Black)) if !matches!(state, D::Armed | D::Frozen) => ProjectorHealth::Black,
         (_, Some(Verb::Freeze)) if state != D::Armed => ProjectorHealth::Frozen,
+        // A projector that came back without power has forgotten it; the host has not.
+        (_, Some(Verb::Safe)) if state == D::Configured => ProjectorHealth::Faulted(faults::HOST_SAFE),
         (_, Some(Verb::Stop)) if is_dark(link) => ProjectorHealth::Stopped,
         (LinkState::Streaming, _) => ProjectorHealth::Up,
         _ => ProjectorHealth::Connecting,

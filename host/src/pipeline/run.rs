@@ -111,6 +111,7 @@ fn run_from(
         &mut link,
         cable.transport(),
         acknowledged,
+        monitor,
         &mut || clock.wait_until(clock.now().plus_ns(if is_virtual { 50_000 } else { 200_000 })),
         &|| monitor.stop_requested(),
     )?;

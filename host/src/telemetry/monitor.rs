@@ -3,10 +3,11 @@
 
 use super::ordered::DarkLog;
 use crate::interlock::Interlock;
+use crate::stopping;
 use dpm_device::link::{faults, LimitReached};
 use std::collections::VecDeque;
 use std::fmt;
-use std::sync::atomic::{AtomicBool, AtomicU64, AtomicU8, Ordering};
+use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
 use std::sync::{Mutex, OnceLock, PoisonError};
 
 /// Notes that wait for the watching thread; further ones are only counted.
@@ -34,6 +35,25 @@ impl Order {
     /// The word for it.
     pub fn word(self) -> &'static str {
         Self::ALL.iter().find(|(order, _)| *order == self).map_or("", |(_, word)| word)
+    }
+
+    /// True for the orders that make it dark.
+    pub fn is_dark(self) -> bool {
+        matches!(self, Self::Black | Self::Safe)
+    }
+
+    /// How strong it is: what stands is replaced by what is as strong or stronger, and by ARM only.
+    pub fn strength(self) -> u8 {
+        match self {
+            Self::Arm => 0,
+            Self::Freeze => 1,
+            Self::Black => 2,
+            Self::Safe => 3,
+        }
+    }
+
+    fn from_code(code: u8) -> Option<Self> {
+        Self::ALL.iter().map(|(order, _)| *order).find(|order| *order as u8 == code)
     }
 
     /// The order that a key on the terminal of a run gives: the first letter of its word, small or capital.
@@ -72,7 +92,8 @@ pub enum ProjectorHealth {
 }
 
 impl ProjectorHealth {
-    const fn encode(self) -> u64 {
+    /// As a number, for an atomic or a file.
+    pub(crate) const fn encode(self) -> u64 {
         match self {
             Self::Connecting => 0,
             Self::Up => 1,
@@ -87,7 +108,8 @@ impl ProjectorHealth {
         }
     }
 
-    const fn decode(code: u64) -> Self {
+    /// Undoes [`ProjectorHealth::encode`].
+    pub(crate) const fn decode(code: u64) -> Self {
         match code & 0xff {
             1 => Self::Up,
             2 => Self::Lost,
@@ -152,8 +174,11 @@ impl fmt::Display for ProjectorHealth {
 #[derive(Debug, Default)]
 pub struct RunMonitor {
     stop: AtomicBool,
-    /// The newest order not yet taken; 0 for none.
-    order: AtomicU8,
+    /// The newest order not yet taken; 0 for none. An ARM carries in its upper half how many orders had come as signals when it was
+    /// asked for, so that a BLACK or SAFE that came since is not undone by it.
+    order: AtomicU64,
+    /// The projector had SAFE latched when the link came up.
+    found_safe: AtomicBool,
     projector: AtomicU64,
     /// Written at most once.
     tracker: OnceLock<String>,
@@ -215,25 +240,61 @@ impl RunMonitor {
         self.stop.store(true, Ordering::Relaxed);
     }
 
-    /// True when an ordered stop was asked for. The frame path polls this once a frame.
+    /// True when an ordered stop was asked for, here, by a signal or by a panic. The frame path polls this once a frame.
     pub fn stop_requested(&self) -> bool {
-        self.stop.load(Ordering::Relaxed)
+        self.stop.load(Ordering::Relaxed) || stopping::is_stopping()
     }
 
     /// Gives the projector an order; one that was not yet taken is replaced. SAFE is never replaced but by ARM.
     pub fn give_order(&self, order: Order) {
-        let _ = self.order.fetch_update(Ordering::Relaxed, Ordering::Relaxed, |waiting| {
-            (waiting != Order::Safe as u8 || order == Order::Arm).then_some(order as u8)
-        });
+        match order {
+            Order::Arm => self.arm_unless_darkened(stopping::orders()),
+            _ => drop(self.order.fetch_update(Ordering::Relaxed, Ordering::Relaxed, |waiting| {
+                (waiting as u8 != Order::Safe as u8).then_some(order as u64)
+            })),
+        }
     }
 
-    /// The newest order, once. The link thread asks with every poll.
+    /// Gives ARM, which has no effect where more than `since` orders have come as signals when it is taken: they are newer than the
+    /// wish for light.
+    pub fn arm_unless_darkened(&self, since: u32) {
+        self.order.store(Order::Arm as u64 | u64::from(since) << 32, Ordering::Relaxed);
+    }
+
+    /// The newest order, once; of two that wait the one that makes it darker. The link thread asks with every poll. After a stop was
+    /// asked for there is no ARM and no FREEZE any more.
     pub fn take_order(&self) -> Option<Order> {
-        if self.order.load(Ordering::Relaxed) == 0 {
-            return None;
-        }
-        let code = self.order.swap(0, Ordering::Relaxed);
-        Order::ALL.iter().map(|(order, _)| *order).find(|order| *order as u8 == code)
+        let signalled = Order::from_code(stopping::take_order());
+        let own = match self.order.load(Ordering::Relaxed) {
+            0 => None,
+            _ => Some(self.order.swap(0, Ordering::Relaxed)),
+        };
+        let own = own.and_then(|code| {
+            let order = Order::from_code(code as u8)?;
+            let overtaken = order == Order::Arm && stopping::orders() != (code >> 32) as u32;
+            (!overtaken).then_some(order)
+        });
+        let order = signalled.into_iter().chain(own).max_by_key(|order| order.strength())?;
+        (order.is_dark() || !self.stop_requested()).then_some(order)
+    }
+
+    /// True when BLACK or SAFE has been ordered and not yet been taken, or a stop: a link that comes up does not arm.
+    pub fn dark_is_ordered(&self) -> bool {
+        let waiting = |code: u8| Order::from_code(code).is_some_and(Order::is_dark);
+        self.stop_requested()
+            || waiting(stopping::waiting_order())
+            || waiting(self.order.load(Ordering::Relaxed) as u8)
+    }
+
+    /// Says that the projector had SAFE latched when the link came up: it stands until ARM like one that was ordered here.
+    pub fn find_safe(&self) {
+        self.found_safe.store(true, Ordering::Relaxed);
+        self.give_order(Order::Safe);
+    }
+
+    /// True once after [`RunMonitor::find_safe`].
+    pub fn take_found_safe(&self) -> bool {
+        self.found_safe.swap(false, Ordering::Relaxed)
     }
 
     /// Says how the projector is.
@@ -374,6 +435,38 @@ mod tests {
         monitor.give_order(Order::Safe);
         monitor.give_order(Order::Arm);
         assert_eq!(monitor.take_order(), Some(Order::Arm));
+    }
+
+    /// Found in use, R2: the projector was armed again three times after the run had been told to stop.
+    #[test]
+    fn r2_nothing_arms_or_holds_light_after_a_stop_was_asked_for() {
+        let monitor = RunMonitor::default();
+        monitor.give_order(Order::Arm);
+        assert!(!monitor.dark_is_ordered());
+        monitor.request_stop();
+        assert!(monitor.dark_is_ordered());
+        assert_eq!(monitor.take_order(), None);
+        for (order, _) in Order::ALL {
+            monitor.give_order(order);
+            assert_eq!(monitor.take_order(), Some(order).filter(|o| o.is_dark()));
+        }
+    }
+
+    #[test]
+    fn a_link_that_comes_up_sees_the_dark_that_waits_and_an_overtaken_arm_is_none() {
+        let monitor = RunMonitor::default();
+        for (order, _) in Order::ALL {
+            monitor.give_order(order);
+            assert_eq!(monitor.dark_is_ordered(), matches!(order, Order::Black | Order::Safe));
+            assert_eq!(monitor.take_order(), Some(order));
+        }
+        assert!(!monitor.take_found_safe());
+        monitor.find_safe();
+        assert_eq!((monitor.take_found_safe(), monitor.take_found_safe()), (true, false));
+        assert_eq!(monitor.take_order(), Some(Order::Safe));
+        // As if one more order had come as a signal since this ARM was asked for.
+        monitor.arm_unless_darkened(stopping::orders().wrapping_sub(1));
+        assert_eq!(monitor.take_order(), None);
     }
 
     #[test]
