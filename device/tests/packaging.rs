@@ -170,7 +170,8 @@ fn systemd_finds_nothing_wrong() {
         assert!(ours.is_empty(), "{ours:#?}");
         assert!(!told.contains("Unknown"), "{told}");
     }
-    if let Some((done, told)) = run("systemd-sysusers", &["--dry-run", "./dpm.conf"]) {
+    let sysusers = folder.join("dpm.conf");
+    if let Some((done, told)) = run("systemd-sysusers", &["--dry-run", sysusers.to_str().expect("text")]) {
         assert!(done || told.contains("unrecognized option"), "{told}");
         assert!(!told.contains("dpm.conf:"), "{told}");
     }

@@ -460,7 +460,7 @@ fn wrong_units_of_a_real_tracker_are_told_at_the_end_of_a_run() {
             host.address().port()
         ),
     );
-    // A thousandth of what a frame takes here: nothing is new enough to be lit, and before, nothing was judged.
+    // Hardly what a frame takes here: little is new enough to be lit, and before, what was not lit was not judged.
     let args = [
         "run",
         &rig,
@@ -472,7 +472,7 @@ fn wrong_units_of_a_real_tracker_are_told_at_the_end_of_a_run() {
         "--out",
         folder.text(),
         "--set",
-        "safety.predict_ms=5",
+        "safety.predict_ms=30",
     ];
     let output = dpm(&args, &[]);
     let json: serde_json::Value =

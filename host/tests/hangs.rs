@@ -147,7 +147,7 @@ fn a_stage_that_hangs_is_replaced_and_does_nothing_when_it_wakes_up() {
         far.until(LONG, "light again", &mut |s| s.lit && s.frames_lit > lit);
         let back = hung.elapsed();
         // The making of pipelines takes what it takes on this machine; it must not be a matter of minutes.
-        assert!(back < Duration::from_secs(20), "{name}: {back:?}");
+        assert!(back < Duration::from_secs(60), "{name}: {back:?}");
         run.wait_for_line(LONG, |line| line.contains("made anew"));
         drop(stopped);
         let before = far.status();

@@ -3,7 +3,9 @@
 use super::rig_args::RigArgs;
 use super::signals;
 use super::watch::{print, take_locks};
-use crate::experiments::link_test::{link_test, Content};
+use crate::config::RigConfig;
+use crate::experiments::conformance::{rules, Extent};
+use crate::experiments::link_test::{judge_projector, link_test, Content};
 use crate::experiments::run_rig::open_gpu;
 use crate::failure::{Failure, FailureKind};
 use crate::interlock::Interlock;
@@ -28,6 +30,16 @@ pub struct LinkTestArgs {
     /// Seconds for each way to send
     #[arg(long = "for", value_name = "S", default_value_t = 2, value_parser = clap::value_parser!(u32).range(1..=600))]
     way_seconds: u32,
+    /// Judge the projector by every rule of docs/PROTOCOL.md instead: one line a rule, exit code 1 where one is broken. It shows next to no
+    /// light, but for up to half a second of it in the rules on limits
+    #[arg(long, conflicts_with_all = ["prepared", "count", "way_seconds"])]
+    conformance: bool,
+    /// Judge this rule only; may stand several times
+    #[arg(long = "rule", value_name = "RULE", requires = "conformance")]
+    rules: Vec<String>,
+    /// Let the projector's whole field flash for a second, for the rule on flashes. Nobody who is sensitive to flashes may look
+    #[arg(long, requires = "conformance")]
+    flashes: bool,
     /// Print one JSON object
     #[arg(long)]
     json: bool,
@@ -50,6 +62,9 @@ pub fn execute(args: &LinkTestArgs) -> Result<(), Failure> {
         return Err(Failure::new(FailureKind::Device, told));
     }
     let stop = || signals::received().is_some() || is_open();
+    if args.conformance {
+        return judge(args, &config, &stop);
+    }
     let rig = Rig::build(&config, None)?;
     let content = if args.prepared {
         Content::prepared(&rig, args.count)
@@ -59,4 +74,23 @@ pub fn execute(args: &LinkTestArgs) -> Result<(), Failure> {
     let report = link_test(&rig, &content, f64::from(args.way_seconds), &stop)?;
     print(&if args.json { to_json(&report) + "\n" } else { report.to_table() });
     Ok(())
+}
+
+fn judge(args: &LinkTestArgs, config: &RigConfig, stop: &dyn Fn() -> bool) -> Result<(), Failure> {
+    if let Some(unknown) = args.rules.iter().find(|id| !rules().any(|rule| rule.id == **id)) {
+        let known: Vec<&str> = rules().map(|rule| rule.id).collect();
+        let told = format!("--rule {unknown}: there is no such rule; known: {}", known.join(", "));
+        return Err(Failure::new(FailureKind::BadInput, told));
+    }
+    let extent = Extent { only: &args.rules, flashes: args.flashes };
+    let judgement = judge_projector(config, extent, stop)?;
+    print(&if args.json { to_json(&judgement) + "\n" } else { judgement.to_table() });
+    let [_, failed, _] = judgement.counts;
+    match (&judgement.ended, failed) {
+        (None, 0) => Ok(()),
+        (Some(why), 0) => Err(Failure::new(FailureKind::Device, format!("not judged to the end: {why}"))),
+        (_, failed) => {
+            Err(Failure::new(FailureKind::CheckFailed, format!("the projector breaks {failed} rules")))
+        }
+    }
 }

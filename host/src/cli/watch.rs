@@ -145,6 +145,7 @@ pub fn watch<T: Send + 'static>(
                 if std::mem::replace(&mut health, now) != now {
                     progress.note(&format!("projector: {now}"));
                 }
+                monitor.take_notes().iter().for_each(|note| progress.note(note));
                 if let (false, Some(word)) = (tracker_told, monitor.tracker()) {
                     tracker_told = true;
                     progress.note(word);

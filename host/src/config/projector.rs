@@ -19,8 +19,8 @@ section! {
         /// Frames a second, a whole number or a fraction written as a string, for example "60000/1001". Change it to what the
         /// projector is driven at.
         frame_rate: FrameRate = FrameRate::new(947, 1).expect("not zero"), "frames/s", Within(Rate(1, 1), Rate(100_000, 1));
-        /// Bit planes in a frame: 24 is eight bits of red, green and blue, 8 is eight bits of one white channel. Eight planes
-        /// leave a monochrome rig three times the frame rate.
+        /// Bit planes in a frame: 24 is eight bits of red, green and blue, 8 is eight bits of one white channel, which shows the green of the picture. Eight
+        /// planes leave a monochrome rig three times the frame rate.
         planes: u32 = 24, "", OneOf(&[8, 24]);
         /// Where the projector's lens stands in the world. Measure it, or give `calibration` instead.
         position: [f64; 3] = [0.0, 0.35, 1.1], "m", Within(-1e6, 1e6);

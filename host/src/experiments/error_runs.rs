@@ -368,7 +368,7 @@ impl ErrorRuns {
         let others: Vec<usize> = (0..rows.len()).filter(|&i| is_other(contenders[i].name)).collect();
         let seed = self.stamp.seed as u32;
         // Samples that were tried, and the time of a frame by that of dpm, which ran along with its own.
-        let mut trials: Vec<Trials> =
+        let mut trials: Vec<Vec<Trial>> =
             others.iter().map(|&i| vec![(rows[i].spp, times[i].ms() / times[dpm].ms())]).collect();
         for _ in 0..RACES {
             if trials.iter().all(|t| off_equal(nearest(t)) <= EQUAL_TIME) {
@@ -616,21 +616,21 @@ fn with_samples(method: &Method, spp: f32) -> Method {
 }
 
 /// Samples that were tried, and the time of a frame with them by the time that is wanted.
-type Trials = Vec<(f64, f64)>;
+type Trial = (f64, f64);
 
 /// How far a trial is from equal time, as a logarithm.
-fn off_equal(trial: (f64, f64)) -> f64 {
+fn off_equal(trial: Trial) -> f64 {
     trial.1.ln().abs()
 }
 
 /// The trial nearest to equal time.
-fn nearest(trials: &Trials) -> (f64, f64) {
+fn nearest(trials: &[Trial]) -> Trial {
     trials.iter().copied().min_by(|a, b| off_equal(*a).total_cmp(&off_equal(*b))).unwrap_or((1.0, 1.0))
 }
 
 /// Samples with which the time is the one wanted: where a line through the trials is 1. A frame without samples takes time, and samples
 /// take more; where the trials say otherwise they are mostly chance, and time is taken to grow with the samples alone.
-fn where_equal(trials: &Trials) -> f64 {
+fn where_equal(trials: &[Trial]) -> f64 {
     let n = trials.len() as f64;
     let sum = |of: &dyn Fn(f64, f64) -> f64| trials.iter().map(|&(x, y)| of(x, y)).sum::<f64>();
     let (x, y) = (sum(&|x, _| x) / n, sum(&|_, y| y) / n);
@@ -669,14 +669,15 @@ mod tests {
     #[test]
     fn the_samples_that_fill_a_time_are_where_the_line_of_the_trials_meets_it() {
         // 0.2 of the time without a sample, 0.1 a sample.
-        let of = |all: &[f64]| where_equal(&all.iter().map(|spp| (*spp, 0.2 + 0.1 * spp)).collect());
+        let of =
+            |all: &[f64]| where_equal(&all.iter().map(|spp| (*spp, 0.2 + 0.1 * spp)).collect::<Vec<_>>());
         assert!((of(&[2.0, 5.0]) - 8.0).abs() < 1e-12);
         assert!((of(&[10.0, 9.0, 1.0]) - 8.0).abs() < 1e-12);
         // One trial, or trials that are chance: never the samples that were there before, which would flatter the slower method.
-        assert!((where_equal(&vec![(2.0, 0.5)]) - 4.0).abs() < 1e-12);
-        assert!((where_equal(&vec![(2.0, 0.5), (4.0, 0.4)]) - 3.0 / 0.45).abs() < 1e-12);
-        assert!((where_equal(&vec![(2.0, 0.1), (4.0, 0.5)]) - 3.0 / 0.3).abs() < 1e-12);
-        assert_eq!(nearest(&vec![(2.0, 0.5), (3.0, 1.1), (9.0, 4.0)]), (3.0, 1.1));
+        assert!((where_equal(&[(2.0, 0.5)]) - 4.0).abs() < 1e-12);
+        assert!((where_equal(&[(2.0, 0.5), (4.0, 0.4)]) - 3.0 / 0.45).abs() < 1e-12);
+        assert!((where_equal(&[(2.0, 0.1), (4.0, 0.5)]) - 3.0 / 0.3).abs() < 1e-12);
+        assert_eq!(nearest(&[(2.0, 0.5), (3.0, 1.1), (9.0, 4.0)]), (3.0, 1.1));
     }
 
     #[test]

@@ -1,6 +1,7 @@
 //! Runs that answer a question: each is a command and a test.
 
 pub mod bench;
+pub mod conformance;
 pub mod error_export;
 pub mod error_figure3;
 pub mod error_parts;

@@ -5,6 +5,7 @@
 //! itself. In video mode the light comes from whatever feeds its video input; this program sets it up and looks after it.
 
 use super::sequence::{draw, poses_at};
+use crate::cli::signals;
 use crate::clock::Stopwatch;
 use crate::config::{Dlpc900Config, Dlpc900Mode, ProjectorBackend, RigConfig, TrackerConfig, VideoInput};
 use crate::experiments::run_rig::open_gpu;
@@ -89,10 +90,8 @@ pub enum Show {
 }
 
 impl Show {
-    /// Loaded and stopped. What the run before left the controller in, the 50/50 exercise or a sequence that runs, is ended first,
-    /// before seconds go into an upload.
+    /// Loaded and stopped.
     fn load<P: HidPort>(&self, d: &mut Dlpc900<P>) -> Result<(), Dlpc900Error> {
-        d.make_ready()?;
         match self {
             Self::Preloaded(sequence) => d.upload(sequence, LedSetup::default(), &mut |_| ()),
             Self::Video(video) => d.load_video_patterns(video),
@@ -328,6 +327,8 @@ pub fn present<P: HidPort>(
     };
     let word = Word::default();
     let (result, rested) = std::thread::scope(|scope| {
+        // Also when this unwinds: the scope waits for the other thread.
+        let _over = Over(&word);
         let spawned = std::thread::Builder::new()
             .name("dpm-dark".into())
             .spawn_scoped(scope, || word.make_dark_when_told(monitor))
@@ -340,7 +341,6 @@ pub fn present<P: HidPort>(
         // Half a command may have gone out before the stop; the first one after it may be lost with it.
         let stopped = d.stop().or_else(|e| if is_gone(&e) { Err(e) } else { d.stop() });
         let rested = if matches!(stopped, Err(Dlpc900Error::Port { .. })) { stopped } else { d.idle() };
-        word.over.store(true, Ordering::Release);
         (result, rested)
     });
     monitor.set_projector(ProjectorHealth::Stopped);
@@ -370,6 +370,15 @@ struct Word {
     line: Mutex<Option<DarkLine>>,
 }
 
+/// Ends the thread that makes dark when it is dropped.
+struct Over<'a>(&'a Word);
+
+impl Drop for Over<'_> {
+    fn drop(&mut self) {
+        self.0.over.store(true, Ordering::Release);
+    }
+}
+
 impl Word {
     /// Obeys what must be dark within milliseconds, and hands every order on to the run.
     fn make_dark_when_told(&self, monitor: &RunMonitor) {
@@ -382,6 +391,10 @@ impl Word {
                 if matches!(order, Order::Black | Order::Safe) {
                     self.make_dark(false);
                 }
+            }
+            // The signal itself as well: the thread that hands it on may be the one that hangs.
+            if signals::received().is_some() {
+                monitor.request_stop();
             }
             if monitor.stop_requested() && !self.stop.swap(true, Ordering::Relaxed) {
                 self.make_dark(true);
@@ -449,14 +462,13 @@ fn watch_over<P: HidPort>(
         let watch = Stopwatch::start();
         *word.line.lock().unwrap_or_else(PoisonError::into_inner) = d.dark_line();
         d.stop_when(Arc::clone(&word.stop));
-        // What a run that was killed left running. In standby only waking is accepted.
-        match d.stop() {
-            Ok(()) | Err(Dlpc900Error::Refused { .. }) => {}
-            Err(e) => return Err(e),
-        }
+        // Before seconds go into an upload: out of the exercise that every run ends in, and of a sequence that a killed run left.
+        d.make_ready()?;
+        d.stop()?;
         word.loading.store(true, Ordering::SeqCst);
-        show.load(d)?;
+        let loaded = show.load(d);
         word.loading.store(false, Ordering::SeqCst);
+        loaded?;
         if let Some(order) = word.take() {
             *standing = standing_after(*standing, order);
         }

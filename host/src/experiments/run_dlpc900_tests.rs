@@ -207,6 +207,9 @@ fn until(model: &Arc<Mutex<Dlpc900Model>>, what: &str, wanted: impl Fn(&mut Dlpc
     panic!("never {what}");
 }
 
+/// Something that a controller is told.
+type Act = fn(&mut Dlpc900<VirtualHid>) -> Result<(), Dlpc900Error>;
+
 fn is_running(m: &mut Dlpc900Model) -> bool {
     matches!(m.sequencer(HostTime(0)), Sequencer::Running(..))
 }
@@ -238,7 +241,7 @@ fn a_rig_starts_again_whatever_the_controller_was_left_in() {
         };
         for run in 0..14 {
             // After the tenth run: rested by hand, parked, in standby, and killed while it showed.
-            let left: Option<fn(&mut Dlpc900<VirtualHid>) -> Result<(), Dlpc900Error>> = match run {
+            let left: Option<Act> = match run {
                 10 => Some(Dlpc900::idle),
                 11 => Some(Dlpc900::park),
                 12 => Some(Dlpc900::standby),
@@ -279,7 +282,6 @@ fn a_refusal_names_the_remedy_for_the_state_that_the_controller_is_in() {
     let model = model();
     let mut d = Dlpc900::new(VirtualHid::new(model)).unwrap();
     let [show, _] = shows();
-    type Act = fn(&mut Dlpc900<VirtualHid>) -> Result<(), Dlpc900Error>;
     let states: [(Act, &str); 3] = [
         (Dlpc900::idle, "dpm dlpc900 leave-idle"),
         (Dlpc900::park, "dpm dlpc900 unpark"),

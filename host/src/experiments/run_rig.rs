@@ -39,6 +39,11 @@ pub fn run_rig(config: &RigConfig, monitor: &Arc<RunMonitor>) -> Result<Ended<Re
             "output.images: the light of a projector outside is not seen, no pictures are written".into(),
         );
     }
+    if config.projector.planes == 8 {
+        notes.push(
+            "projector.planes = 8: the one white channel shows the green of the picture; red and blue alone stay dark".into(),
+        );
+    }
     let window = (config.light_window_ms() * 1e-3 * rig.rate().hz()).round().max(1.0) as usize;
     tell_at_the_start(&rig, &notes, monitor);
     let keep_frames = if output.images && has_light { window } else { 0 };

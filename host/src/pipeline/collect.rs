@@ -17,6 +17,7 @@ use crate::telemetry::interval::Interval;
 use crate::telemetry::monitor::RunMonitor;
 use crate::telemetry::profile::{missed_by_cause, ordered_dark, Profiler};
 use crate::telemetry::report::{Latency, Report, Spread, StageTime};
+use crate::telemetry::signed::SignedHistogram;
 use crate::telemetry::slots::{SlotCounts, SlotLedger};
 use crate::telemetry::trace::TracedFrame;
 use dpm_device::link::frame_newer;
@@ -103,6 +104,10 @@ pub struct Collector {
     pub traced: VecDeque<TracedFrame>,
     trace_frames: usize,
     registration: Histogram<u64>,
+    /// The same of the frames that were lit in their own slot.
+    registration_in_time: Histogram<u64>,
+    /// True beginning of a slot, as the mock in this process saw it, less what the host took it for.
+    clock_error: SignedHistogram,
     unpredicted: Histogram<u64>,
     stages: Vec<Histogram<u64>>,
     passes: Vec<Histogram<u64>>,
@@ -168,6 +173,8 @@ impl Collector {
             traced: VecDeque::new(),
             trace_frames,
             registration: histogram(),
+            registration_in_time: histogram(),
+            clock_error: SignedHistogram::new(1_000_000_000),
             unpredicted: histogram(),
             stages: STAGES.iter().map(|_| histogram()).collect(),
             passes: PASSES.iter().map(|_| histogram()).collect(),
@@ -388,7 +395,8 @@ impl Collector {
                 if self.verify && note.hash != record.code_hash {
                     self.light_mismatches += 1;
                 }
-                self.measure_registration(note, &record);
+                self.measure_registration(note, &record, late);
+                self.measure_clock(note, &record);
                 // No light fell on a body: there is no way from its motion to light.
                 let is_dark = self.is_dark(&record);
                 let stamps = if is_dark { record.timeline.without_sample() } else { record.timeline };
@@ -415,8 +423,20 @@ impl Collector {
         }
     }
 
+    /// When the slot of this light truly began, against when the host believed that it would. Only the mock in this process knows: what is
+    /// known of another projector's light comes from the host's own map of its clock, which agrees with itself.
+    fn measure_clock(&mut self, note: &LightNote, record: &FrameRecord) {
+        let knows = matches!(self.rig.config.projector.backend, ProjectorBackend::Mock(_));
+        if knows && self.rig.config.real_time.pace == Pace::Real {
+            let rate = self.rig.rate();
+            let slots_ns = rate.slot_start_ns(note.event.slot) - rate.slot_start_ns(record.slot);
+            let due_at = record.timeline.due_at.plus_ns(slots_ns);
+            self.clock_error.record(note.event.first_photon_at.ns_since(due_at));
+        }
+    }
+
     /// Where the light of each point fell against where the point was at the middle of the exposure, on the bodies that were lit.
-    fn measure_registration(&mut self, note: &LightNote, record: &FrameRecord) {
+    fn measure_registration(&mut self, note: &LightNote, record: &FrameRecord, late: bool) {
         let (first, last) = (note.event.first_photon_at, note.event.last_photon_at);
         let middle = first.plus_ns(last.ns_since(first) / 2);
         let Some(truth) = self.rig.true_poses(middle.0) else { return };
@@ -428,7 +448,11 @@ impl Collector {
                 let at = |m: &DAffine3| self.rig.camera.project(m.transform_point3(*p));
                 let Some(real) = at(&truth[i]) else { continue };
                 if let Some(used) = at(&record.tracked_poses[i]) {
-                    self.registration.saturating_record(((used - real).length() * PER_PIXEL).round() as u64);
+                    let error = ((used - real).length() * PER_PIXEL).round() as u64;
+                    self.registration.saturating_record(error);
+                    if !late {
+                        self.registration_in_time.saturating_record(error);
+                    }
                 }
                 if let Some(held) = at(&record.sampled_poses[i]) {
                     self.unpredicted.saturating_record(((held - real).length() * PER_PIXEL).round() as u64);
@@ -463,6 +487,8 @@ impl Collector {
         report.frames_repeated = self.repeated;
         report.frames_too_old = self.too_old;
         report.registration_error_px = spread(&self.registration, PER_PIXEL);
+        report.registration_error_in_time_px = spread(&self.registration_in_time, PER_PIXEL);
+        report.clock_error_ms = Latency::of(&self.clock_error, false);
         report.registration_error_unpredicted_px = spread(&self.unpredicted, PER_PIXEL);
         report.registration_error_at = report.registration_error_px.map(|_| "mid-exposure");
         let latency = |interval| Latency::of(self.profiler.histogram(interval), !self.profiler.is_measured());

@@ -1,6 +1,6 @@
 //! Heartbeats: every thread of a run says by when it will say again that it is alive, and the supervisor looks whether it did.
 
-use crate::realtime::os;
+use crate::realtime::os::{self, Standing};
 use dpm_device::time::HostTime;
 use std::sync::atomic::{AtomicI32, AtomicI64, Ordering};
 
@@ -51,18 +51,18 @@ impl Pulse {
         self.until_ns.load(Ordering::Relaxed) < now.0
     }
 
-    /// How long the thread has waited for a core since it was made, nanoseconds; `None` where the system does not tell.
-    fn starved_ns(&self) -> Option<i64> {
-        os::waited_for_core_ns(self.thread.load(Ordering::Relaxed))
+    /// What the thread is doing; `None` where the system does not tell.
+    fn standing(&self) -> Option<Standing> {
+        os::standing_of(self.thread.load(Ordering::Relaxed))
     }
 }
 
 /// The supervisor's view of one thread: how long it has been silent beyond what it had announced. Time in which the thread was ready to
-/// run and got no core does not count: a thread that starves is late, not hung.
+/// run and got no core does not count: a thread that starves is late, not hung. One that runs without an end counts as silent.
 #[derive(Clone, Copy, Debug, Default)]
 pub(super) struct Silence {
     silent_ns: i64,
-    starved_ns: Option<i64>,
+    before: Option<Standing>,
 }
 
 impl Silence {
@@ -70,21 +70,22 @@ impl Silence {
     pub(super) fn observe(&mut self, pulse: &Pulse, now: HostTime, step_ns: i64) -> bool {
         let overdue = pulse.is_overdue(now);
         // The system is asked about threads in doubt only.
-        let starved = if overdue { pulse.starved_ns() } else { None };
-        self.step(overdue, step_ns, starved)
+        let standing = if overdue { pulse.standing() } else { None };
+        self.step(overdue, step_ns, standing)
     }
 
-    fn step(&mut self, overdue: bool, step_ns: i64, starved_ns: Option<i64>) -> bool {
+    fn step(&mut self, overdue: bool, step_ns: i64, standing: Option<Standing>) -> bool {
         if !overdue {
             *self = Self::default();
             return false;
         }
-        let starved = match (starved_ns, self.starved_ns) {
-            (Some(now), Some(before)) => (now - before).max(0),
+        let step_ns = step_ns.clamp(0, LONGEST_STEP_NS);
+        let ran_ns = match (standing, self.before) {
+            (Some(now), Some(before)) => (now.ran_ns - before.ran_ns).clamp(0, step_ns),
             _ => 0,
         };
-        self.starved_ns = starved_ns;
-        self.silent_ns += (step_ns.clamp(0, LONGEST_STEP_NS) - starved).max(0);
+        self.silent_ns += if standing.is_some_and(|s| s.ready) { ran_ns } else { step_ns };
+        self.before = standing;
         self.silent_ns > HUNG_AFTER_NS
     }
 }
@@ -104,7 +105,8 @@ mod tests {
     #[test]
     fn a_thread_is_hung_after_a_tenth_of_a_second_beyond_what_it_announced() {
         assert_eq!(steps(|s| s.step(true, 2 * MS, None)), Some(51));
-        assert_eq!(steps(|s| s.step(true, 2 * MS, Some(7))), Some(51), "waiting that does not grow is none");
+        let asleep = Standing { ready: false, ran_ns: 7 };
+        assert_eq!(steps(|s| s.step(true, 2 * MS, Some(asleep))), Some(51));
         assert_eq!(steps(|s| s.step(false, 2 * MS, None)), None);
     }
 
@@ -113,12 +115,15 @@ mod tests {
         let mut silence = Silence::default();
         assert!(!silence.step(true, 60_000 * MS, None), "the supervisor itself was away for a minute");
         assert_eq!(silence.silent_ns, LONGEST_STEP_NS);
-        let mut waited = 0;
-        let starving = steps(|s| {
-            waited += 2 * MS;
-            s.step(true, 2 * MS, Some(waited))
-        });
+        let starving = steps(|s| s.step(true, 2 * MS, Some(Standing { ready: true, ran_ns: 5 })));
         assert_eq!(starving, None);
+        // A thread that runs in a circle says nothing, either.
+        let mut ran_ns = 0;
+        let circling = steps(|s| {
+            ran_ns += 2 * MS;
+            s.step(true, 2 * MS, Some(Standing { ready: true, ran_ns }))
+        });
+        assert_eq!(circling, Some(52));
     }
 
     #[test]
@@ -143,15 +148,27 @@ mod tests {
         assert_eq!(pulse.name(), "plan");
     }
 
-    /// Found in use, R1: the system tells a stopped thread from one that waits for a core.
+    /// Found in use, R1: the system tells a thread that sleeps or was stopped from one that waits for a core.
     #[cfg(target_os = "linux")]
     #[test]
-    fn a_thread_that_sleeps_does_not_starve() {
+    fn the_system_tells_who_is_ready() {
         let pulse = Pulse::new("this");
         pulse.begin();
-        let before = pulse.starved_ns().expect("Linux tells");
-        std::thread::sleep(std::time::Duration::from_millis(60));
-        let after = pulse.starved_ns().expect("Linux tells");
-        assert!((0..50 * MS).contains(&(after - before)), "{before} to {after}");
+        let before = pulse.standing().expect("Linux tells");
+        assert!(before.ready, "it asks for itself");
+        let (to_test, from_thread) = std::sync::mpsc::channel();
+        let (to_thread, from_test) = std::sync::mpsc::channel::<()>();
+        let thread = std::thread::spawn(move || {
+            let pulse = Pulse::new("other");
+            pulse.begin();
+            to_test.send(pulse).unwrap();
+            let _ = from_test.recv();
+        });
+        let other = from_thread.recv().unwrap();
+        while other.standing().expect("Linux tells").ready {
+            std::thread::sleep(std::time::Duration::from_millis(1));
+        }
+        drop(to_thread);
+        thread.join().unwrap();
     }
 }

@@ -349,7 +349,13 @@ impl<'a> Planner<'a> {
         crew.planning.store(id, Ordering::Relaxed);
         shared.may_stall(StallIn::Plan, id);
         let time = *self.inbox.time.latest().0;
-        let (latch_at, lead_ns) = self.latch(&mut job, &time);
+        let (latch_at, lead_ns) = self.choose_slot(&mut job, &time);
+        if self.is_complete() {
+            // What this frame would be for lies beyond the end of the run.
+            self.hottest.push(job.memory);
+            return Some(());
+        }
+        self.wait_for(latch_at);
         let (snapshot, now) = (self.inbox.latest.latest().0, shared.clock.now());
         let latched_at = if shared.is_virtual() { latch_at } else { now };
         let predict_ns = self.horizon.predict_ns(lead_ns, snapshot.latency_ns);
@@ -401,27 +407,15 @@ impl<'a> Planner<'a> {
         self.next_slot = slot + 1;
     }
 
-    /// Chooses the slot and waits until it is time to read the poses. Returns that instant, and how long before its slot a frame is latched.
-    fn latch(&mut self, job: &mut FrameJob, time: &LinkTime) -> (HostTime, i64) {
+    /// Chooses the frame's slot. Returns when its poses are to be read, and how long before its slot that is.
+    fn choose_slot(&mut self, job: &mut FrameJob, time: &LinkTime) -> (HostTime, i64) {
         let Self { shared, crew, .. } = *self;
-        let travel = shared.travel_ns.load(Ordering::Relaxed);
         if shared.is_virtual() {
             let latch_at = time.host_of_slot(self.next_slot).plus_ns(-self.modelled_ns);
-            shared.clock.wait_until(latch_at);
             job.note.latch_due_at = latch_at;
-            // What arrives later than this is no pose yet when the frame is latched.
-            let track_ns = i64::from(shared.rig.config.real_time.stage_costs_us.track) * 1000;
-            let heard = latch_at.plus_ns(-track_ns);
-            crew.listen_to.store(heard.0, Ordering::Release);
-            if let Some(tracking) = crew.tracking.get() {
-                tracking.unpark();
-            }
-            while self.inbox.latest.latest().0.through < heard && !crew.is_dismissed(shared) {
-                std::thread::yield_now();
-            }
             return (latch_at, self.modelled_ns);
         }
-        let travel = travel + RECEIPT_NS;
+        let travel = shared.travel_ns.load(Ordering::Relaxed) + RECEIPT_NS;
         let lead = shared.lead_ns.load(Ordering::Relaxed) + travel;
         let now = shared.clock.now();
         // Frames are begun early enough for a bad moment, so after one there is time to catch up: a slot is given up only when a frame that
@@ -431,12 +425,31 @@ impl<'a> Planner<'a> {
         let needed = if slow { lead } else { shared.typical_ns.load(Ordering::Relaxed) + travel };
         self.next_slot = self.next_slot.max(time.slot_after(now.plus_ns(needed)));
         let latch_at = time.host_of_slot(self.next_slot).plus_ns(-lead);
-        crew.pulses[PLAN].beat(latch_at.max(now), WAIT_NS + STEP_NS);
-        shared.clock.wait_until(latch_at);
-        crew.pulses[PLAN].beat(shared.clock.now(), STEP_NS);
         // Waking up too late counts; what kept the frame from being begun earlier does not.
         job.note.latch_due_at = latch_at.max(now);
         (latch_at, lead)
+    }
+
+    /// Waits until it is time to read the poses.
+    fn wait_for(&mut self, latch_at: HostTime) {
+        let Self { shared, crew, .. } = *self;
+        if !shared.is_virtual() {
+            crew.pulses[PLAN].beat(latch_at.max(shared.clock.now()), WAIT_NS + STEP_NS);
+            let now = shared.clock.wait_until(latch_at);
+            crew.pulses[PLAN].beat(now, STEP_NS);
+            return;
+        }
+        shared.clock.wait_until(latch_at);
+        // What arrives later than this is no pose yet when the frame is latched.
+        let track_ns = i64::from(shared.rig.config.real_time.stage_costs_us.track) * 1000;
+        let heard = latch_at.plus_ns(-track_ns);
+        crew.listen_to.store(heard.0, Ordering::Release);
+        if let Some(tracking) = crew.tracking.get() {
+            tracking.unpark();
+        }
+        while self.inbox.latest.latest().0.through < heard && !crew.is_dismissed(shared) {
+            std::thread::yield_now();
+        }
     }
 }
 

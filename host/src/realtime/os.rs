@@ -216,19 +216,39 @@ pub fn thread_id() -> i32 {
     unsafe { libc::gettid() }
 }
 
-/// How long the thread `id` of this process has been ready to run without getting a core, since it was made, nanoseconds. `None` where the
-/// kernel does not count it or the thread is gone. Allocates nothing.
+/// What a thread of this process is doing.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct Standing {
+    /// It runs, or would if it got a core.
+    pub ready: bool,
+    /// Processor time that it has used, nanoseconds.
+    pub ran_ns: i64,
+}
+
+/// What the thread `id` of this process is doing; `None` where the kernel does not tell or the thread is gone. Allocates nothing.
 #[cfg(target_os = "linux")]
-pub fn waited_for_core_ns(id: i32) -> Option<i64> {
+pub fn standing_of(id: i32) -> Option<Standing> {
+    let mut text = [0u8; 256];
+    let stat = read_of_thread(id, "stat", &mut text)?;
+    // The name, in brackets, may hold anything.
+    let state = stat.rsplit(')').next()?.split_whitespace().next()?;
+    let ready = state == "R";
+    let mut text = [0u8; 96];
+    let ran_ns = read_of_thread(id, "schedstat", &mut text)?.split_whitespace().next()?.parse().ok()?;
+    Some(Standing { ready, ran_ns })
+}
+
+/// The beginning of a file that tells of the thread `id`.
+#[cfg(target_os = "linux")]
+fn read_of_thread<'a>(id: i32, name: &str, text: &'a mut [u8]) -> Option<&'a str> {
     use std::io::{Read, Write};
     let mut path = [0u8; 48];
     let mut rest = &mut path[..];
-    write!(rest, "/proc/self/task/{id}/schedstat").ok()?;
+    write!(rest, "/proc/self/task/{id}/{name}").ok()?;
     let left = rest.len();
     let used = path.len() - left;
-    let mut text = [0u8; 96];
-    let n = std::fs::File::open(std::str::from_utf8(&path[..used]).ok()?).ok()?.read(&mut text).ok()?;
-    std::str::from_utf8(&text[..n]).ok()?.split_whitespace().nth(1)?.parse().ok()
+    let n = std::fs::File::open(std::str::from_utf8(&path[..used]).ok()?).ok()?.read(text).ok()?;
+    std::str::from_utf8(&text[..n]).ok()
 }
 
 /// Nanoseconds of processor time the calling thread has used.
@@ -297,7 +317,7 @@ mod elsewhere {
         0
     }
     /// Unknown.
-    pub fn waited_for_core_ns(_id: i32) -> Option<i64> {
+    pub fn standing_of(_id: i32) -> Option<super::Standing> {
         None
     }
 }

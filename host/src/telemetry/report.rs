@@ -187,6 +187,12 @@ pub struct Report {
     pub registration_error_px: Option<Spread>,
     /// The same if the newest sample had been used as it was.
     pub registration_error_unpredicted_px: Option<Spread>,
+    /// The same of frames that were lit in their own slot: what is left when lateness is not counted.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub registration_error_in_time_px: Option<Spread>,
+    /// True beginning of a slot less what the host took it for, as the mock in this process saw it at real pace.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub clock_error_ms: Option<Latency>,
     /// The instant of the light at which the registration was measured.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub registration_error_at: Option<&'static str>,
@@ -264,6 +270,8 @@ impl Default for Report {
             prediction: false,
             registration_error_px: None,
             registration_error_unpredicted_px: None,
+            registration_error_in_time_px: None,
+            clock_error_ms: None,
             registration_error_at: None,
             motion_to_first_photon_ms: None,
             motion_to_light_centre_ms: None,

@@ -200,7 +200,7 @@ impl Peer {
         let beyond = (count.wrapping_sub(limit) as i32) > 0 || free == 0;
         if self.breaks("credit-lost") {
             self.accounted += 1;
-        } else if !(self.breaks("black-frames") && self.mode == Mode::Black) {
+        } else {
             self.account(count, false);
         }
         self.say_status = !self.breaks("status-commit");
@@ -229,7 +229,9 @@ impl Peer {
         let Some(config) = self.config.clone() else { return };
         let slot = config.slot_at(a.target).unwrap_or(0);
         let whole = Whole { frame: a.frame, slot, dark, planes };
-        self.base = Some(whole.clone());
+        if !self.breaks("base-dropped") {
+            self.base = Some(whole.clone());
+        }
         if a.target > self.now() + 2 * HZ && !self.breaks("frame-early") {
             self.n.refused += 1;
             return;
@@ -244,6 +246,7 @@ impl Peer {
             self.n.late += 1;
             return;
         }
+        self.base = Some(whole.clone());
         self.waiting.push_back(whole);
     }
 
@@ -316,7 +319,12 @@ impl Peer {
                 new = None;
             }
         } else {
-            self.n.refused += others + u32::from(new.is_some());
+            let used_up = others + u32::from(new.is_some());
+            if self.breaks("black-frames") {
+                self.n.superseded += used_up;
+            } else {
+                self.n.refused += used_up;
+            }
             new = None;
         }
         if new.is_none() {

@@ -364,6 +364,7 @@ impl Peer {
             9 => self.arm(u32_at(payload, 0)),
             11 if self.mode == Mode::Normal => {
                 self.mode = Mode::Frozen;
+                self.light |= self.breaks("freeze-dark");
                 self.say_status = true;
             }
             13 => {
@@ -509,7 +510,6 @@ impl Peer {
             self.accounted = 0;
             if !self.breaks("hello-new") {
                 self.n = Counts::default();
-                self.n.packets = 1;
             }
         }
         let mut a = 2u16.to_le_bytes().to_vec();
@@ -592,6 +592,9 @@ impl Peer {
             return self.fault(3, 3);
         }
         self.latched = 0;
+        if self.breaks("slots-over-arms") {
+            (self.n.slots, self.n.lit, self.n.repeated, self.n.blank) = (0, 0, 0, 0);
+        }
         if self.mode == Mode::Off {
             self.next_slot = config.slot_at(now).map_or(0, |k| k + 1);
             self.damaged = 0;

@@ -6,12 +6,10 @@
 use super::laws::Laws;
 use super::Stop;
 use dpm_device::link::{
-    Assembly, Config, Decoder, DeviceHello, DeviceMessage, DeviceState, Echo, Fault, FaultCode, Header,
-    HostHello, HostMessage, LightLimits, MessageType, Packet, PacketSink, SessionNumbers, SlotClock, Status,
-    Underrun, MAX_CONTROL_BYTES, VERSION,
+    Assembly, Config, Decoder, DeviceHello, DeviceMessage, Echo, Fault, FaultCode, Header, HostMessage,
+    MessageType, Packet, PacketSink, SessionNumbers, SlotClock, Status, MAX_CONTROL_BYTES,
 };
-use dpm_device::planes::{Channel, PlaneSchedule, PlaneSpec};
-use dpm_device::time::{DeviceTicks, FrameRate, HostTime};
+use dpm_device::time::{DeviceTicks, HostTime};
 use dpm_device::transport::{Lane, SendError, Transport};
 use std::collections::VecDeque;
 use std::time::Duration;
@@ -106,7 +104,7 @@ pub struct Bench<'a> {
     pub medium: Medium<'a>,
     decoders: [Decoder; 2],
     inbox: Inbox,
-    sessions: SessionNumbers,
+    pub sessions: SessionNumbers,
     /// The device's first answer.
     pub hello: Option<DeviceHello>,
     pub session: u32,
@@ -116,12 +114,12 @@ pub struct Bench<'a> {
     pub frames_sent: u32,
     pub next_frame: u32,
     /// Packets with a right header, sent in this session.
-    packets_sent: u32,
+    pub packets_sent: u32,
     /// `packets` of the session's first report less those sent until then.
-    packets_base: Option<u32>,
+    pub packets_base: Option<u32>,
     /// The device's clock as it was told last, and when.
-    clock: (u64, HostTime),
-    newest: Option<Status>,
+    pub clock: (u64, HostTime),
+    pub newest: Option<Status>,
     /// The watchdog is fed while a rule waits.
     pub feed: bool,
     fed_at: HostTime,
@@ -171,7 +169,9 @@ impl<'a> Bench<'a> {
     pub fn noise(&self) -> [u32; 4] {
         let mut all = [0; 4];
         for c in self.decoders.iter().map(Decoder::counters) {
-            for (sum, n) in all.iter_mut().zip([c.header_errors, c.payload_errors, c.foreign, c.bytes_skipped]) {
+            for (sum, n) in
+                all.iter_mut().zip([c.header_errors, c.payload_errors, c.foreign, c.bytes_skipped])
+            {
                 *sum += n;
             }
         }
@@ -205,14 +205,16 @@ impl<'a> Bench<'a> {
                 Err(SendError::Failed(e)) => return Err(Stop::Lost(e)),
                 Err(SendError::Busy) if now < limit => self.rest()?,
                 Err(SendError::Busy) => {
-                    return Err(Stop::Failed("the medium takes nothing any more: expected room within 2 s".into()))
+                    return Err(Stop::Failed(
+                        "the medium takes nothing any more: expected room within 2 s".into(),
+                    ))
                 }
             }
         }
         self.fed_at = self.now();
-        let whole = packets.iter().filter(|p| {
-            p.parts()[0].first_chunk::<32>().is_some_and(|h| Header::decode(h).is_ok())
-        });
+        let whole = packets
+            .iter()
+            .filter(|p| p.parts()[0].first_chunk::<32>().is_some_and(|h| Header::decode(h).is_ok()));
         self.packets_sent = self.packets_sent.wrapping_add(whole.count() as u32);
         Ok(())
     }
@@ -240,7 +242,11 @@ impl<'a> Bench<'a> {
 
     /// An ECHO that says `stamp`.
     pub fn echo(&self, stamp: u64) -> HostMessage {
-        HostMessage::Echo(Echo { host_sent_ns: stamp, device_received: DeviceTicks(0), device_sent: DeviceTicks(0) })
+        HostMessage::Echo(Echo {
+            host_sent_ns: stamp,
+            device_received: DeviceTicks(0),
+            device_sent: DeviceTicks(0),
+        })
     }
 
     // --- hearing ---
@@ -257,10 +263,13 @@ impl<'a> Bench<'a> {
         }
         let Self { inbox, decoders, medium, .. } = self;
         inbox.now = (medium.clock)();
-        let from = inbox.heard.len();
+        let (from, now) = (inbox.heard.len(), inbox.now);
         medium
             .transport
-            .receive(inbox.now, &mut |lane, bytes| decoders[lane as usize].push(bytes, inbox))
+            .receive(now, &mut |lane, at, bytes| {
+                inbox.now = at;
+                decoders[lane as usize].push(bytes, inbox);
+            })
             .map_err(Stop::Lost)?;
         let from = from.min(self.inbox.heard.len());
         for i in from..self.inbox.heard.len() {
@@ -270,7 +279,9 @@ impl<'a> Bench<'a> {
                     self.clock = (s.now.0, heard.at);
                     self.newest = Some(s);
                 }
-                DeviceMessage::Echo(e) if heard.session == self.session => self.clock = (e.device_sent.0, heard.at),
+                DeviceMessage::Echo(e) if heard.session == self.session => {
+                    self.clock = (e.device_sent.0, heard.at)
+                }
                 _ => {}
             }
         }
@@ -305,7 +316,11 @@ impl<'a> Bench<'a> {
     }
 
     /// As [`Bench::wait`], for a STATUS of this session.
-    pub fn wait_status(&mut self, limit_ns: i64, mut wanted: impl FnMut(&Status) -> bool) -> R<Option<Status>> {
+    pub fn wait_status(
+        &mut self,
+        limit_ns: i64,
+        mut wanted: impl FnMut(&Status) -> bool,
+    ) -> R<Option<Status>> {
         let session = self.session;
         self.wait(limit_ns, |h| match h.message {
             DeviceMessage::Status(s) if h.session == session && wanted(&s) => Some(s),
@@ -372,203 +387,10 @@ impl<'a> Bench<'a> {
 
     /// A failure to answer.
     pub fn silent(&self, wanted: &str) -> Stop {
-        Stop::Failed(format!("expected {wanted}, saw none within {} ms; last: {}", self.answer_ns() / 1_000_000, self.newest()))
-    }
-
-    // --- the way to light ---
-
-    /// Opens a new session and waits for the device's HELLO.
-    pub fn open(&mut self) -> R<DeviceHello> {
-        self.session = self.sessions.draw();
-        (self.config, self.slots, self.newest) = (None, None, None);
-        (self.frames_sent, self.packets_sent, self.packets_base) = (0, 0, None);
-        // Anywhere: no number is the first.
-        self.next_frame = self.session.rotate_left(7);
-        self.feed = true;
-        self.forget()?;
-        let session = self.session;
-        for _ in 0..3 {
-            self.say(&HostMessage::Hello(HostHello {
-                version_min: u16::from(VERSION),
-                version_max: u16::from(VERSION),
-                codecs: 0xf,
-            }))?;
-            let answer = self.wait(self.answer_ns(), |h| match h.message {
-                DeviceMessage::Hello(hello) if h.session == session => Some((hello, h.at)),
-                _ => None,
-            })?;
-            if let Some((hello, at)) = answer {
-                self.clock = (hello.now.0, at);
-                self.hello = Some(hello);
-                return Ok(hello);
-            }
-        }
-        Err(self.silent("HELLO of the session that was asked for"))
-    }
-
-    /// What the rules ask for, unless they are about something else: two planes at most, of the least light, repeated, never late.
-    pub fn plain_config(&self) -> R<Config> {
-        let hello = self.hello.ok_or(Stop::Failed("no HELLO".into()))?;
-        let planes: Vec<PlaneSpec> =
-            (0..2u8.min(hello.max_planes.max(1))).map(|k| PlaneSpec { channel: Channel::Red, bit: 1 - k }).collect();
-        let ahead = u64::from(hello.tick_hz) / 50;
-        Ok(Config {
-            raster: hello.raster,
-            schedule: PlaneSchedule::new(&planes).ok_or(Stop::Failed("no planes".into()))?,
-            rate: FrameRate::new(1000, self.slot_ms()).ok_or(Stop::Failed("no rate".into()))?,
-            watchdog_us: WATCHDOG_US,
-            underrun: Underrun::Repeat,
-            late_slots: 0,
-            epoch: DeviceTicks(hello.now.0 + ahead),
-            limits: LightLimits::OFF,
-        })
-    }
-
-    /// Length of a slot, ms: long enough for a frame and the reports of a slot.
-    pub fn slot_ms(&self) -> u32 {
-        let frame = self.frame_bytes() + 400;
-        (20 + self.carry_ns(frame) * 3 / 1_000_000).clamp(20, 1000) as u32
-    }
-
-    /// Asks for `config`; the report that confirms it. Latched faults hide the state, not the configuration.
-    pub fn configure(&mut self, config: &Config) -> R<Status> {
-        self.forget()?;
-        self.say(&HostMessage::Config(*config))?;
-        let session = self.session;
-        let answer = self.wait(self.answer_ns(), |h| match h.message {
-            DeviceMessage::Status(s)
-                if h.session == session
-                    && matches!(s.state, DeviceState::Configured | DeviceState::Faulted) =>
-            {
-                Some(Ok(s))
-            }
-            DeviceMessage::Fault(f) if f.code == FaultCode::Config => Some(Err(f.detail)),
-            _ => None,
-        })?;
-        match answer {
-            Some(Ok(status)) => {
-                let hz = self.hello.map_or(1, |h| h.tick_hz);
-                self.slots = SlotClock::new(config.epoch, hz, config.rate);
-                self.config = Some(*config);
-                // Known from here on: what was counted before.
-                self.report()
-                    .map(|s| if s.state == status.state { s } else { status })
-            }
-            Some(Err(detail)) => Err(Stop::Failed(format!("CONFIG that the device's HELLO allows refused, detail {detail}"))),
-            None => Err(self.silent("STATUS \"configured\" after CONFIG")),
-        }
-    }
-
-    /// Arms, acknowledging what is latched.
-    pub fn arm(&mut self) -> R<Status> {
-        // Light may rest after a rule on limits.
-        for _ in 0..30 {
-            let faults = self.report()?.faults;
-            self.forget()?;
-            self.say(&HostMessage::Arm(faults))?;
-            let session = self.session;
-            let answer = self.wait(self.answer_ns(), |h| match h.message {
-                DeviceMessage::Status(s) if h.session == session && s.state == DeviceState::Armed => Some(Ok(s)),
-                DeviceMessage::Fault(f) if f.code == FaultCode::Arm => Some(Err(f.detail)),
-                _ => None,
-            })?;
-            match answer {
-                Some(Ok(status)) => return Ok(status),
-                Some(Err(3)) => self.pass(100_000_000)?,
-                Some(Err(detail)) => {
-                    return Err(Stop::Failed(format!(
-                        "ARM that acknowledges {faults:#x} refused, detail {detail}; {}",
-                        self.newest()
-                    )))
-                }
-                None => return Err(self.silent("STATUS \"armed\" after ARM")),
-            }
-        }
-        Err(Stop::Failed("ARM refused for 3 s because light rests".into()))
-    }
-
-    /// A new session, configured; `change` may ask for something else than the plain configuration.
-    pub fn configured(&mut self, change: impl FnOnce(&mut Config)) -> R<Status> {
-        self.open()?;
-        let mut config = self.plain_config()?;
-        change(&mut config);
-        self.configure(&config)
-    }
-
-    /// The same, armed.
-    pub fn armed(&mut self, change: impl FnOnce(&mut Config)) -> R<Status> {
-        self.configured(change)?;
-        self.arm()
-    }
-
-    // --- the device's time ---
-
-    pub fn slots(&self) -> R<SlotClock> {
-        self.slots.ok_or(Stop::Failed("no slots: not configured".into()))
-    }
-
-    pub fn tick_hz(&self) -> u64 {
-        self.hello.map_or(1, |h| u64::from(h.tick_hz))
-    }
-
-    pub fn ticks_of_ms(&self, ms: u64) -> u64 {
-        (self.tick_hz() * ms).div_ceil(1000)
-    }
-
-    /// The device's clock now, as far as it was told; not ahead of it but for its rate.
-    pub fn ticks_now(&self) -> u64 {
-        let ns = self.now().ns_since(self.clock.1).max(0) as u128;
-        self.clock.0 + (ns * u128::from(self.tick_hz()) / 1_000_000_000) as u64
-    }
-
-    /// A slot that a frame sent now will make.
-    pub fn slot_ahead(&mut self) -> R<u64> {
-        // A clock that was told long ago, or late, is asked again.
-        self.report()?;
-        let slots = self.slots()?;
-        let carry = self.carry_ns(self.frame_bytes() + 200) * 2 + 30_000_000;
-        let ticks = (carry as u128 * u128::from(self.tick_hz()) / 1_000_000_000) as u64;
-        Ok(slots.slot_at(DeviceTicks(self.ticks_now() + ticks)).map_or(1, |k| k + 1))
-    }
-
-    /// The same by the clock as it was told last: SYNC would account frames.
-    pub fn slot_ahead_quietly(&mut self) -> R<u64> {
-        let slots = self.slots()?;
-        let carry = self.carry_ns(self.frame_bytes() + 200) * 2 + 60_000_000;
-        let ticks = (i128::from(carry) * i128::from(self.tick_hz()) / 1_000_000_000) as u64;
-        Ok(slots.slot_at(DeviceTicks(self.ticks_now() + ticks)).map_or(1, |k| k + 1))
-    }
-
-    /// Reports until one is of `ticks` or later: that one.
-    pub fn until(&mut self, ticks: u64) -> R<Status> {
-        let all = self.watch_until(ticks)?;
-        all.last().copied().ok_or_else(|| self.silent("a STATUS"))
-    }
-
-    /// All reports until one is of `ticks` or later, asked for every few milliseconds.
-    pub fn watch_until(&mut self, ticks: u64) -> R<Vec<Status>> {
-        let left = ticks.saturating_sub(self.ticks_now());
-        let left_ns = (u128::from(left) * 1_000_000_000 / u128::from(self.tick_hz().max(1))) as i64;
-        let end = self.now().plus_ns(left_ns.saturating_mul(2).saturating_add(2_000_000_000));
-        let mut all = Vec::new();
-        while self.now() < end {
-            let status = self.report()?;
-            all.push(status);
-            if status.now.0 >= ticks {
-                return Ok(all);
-            }
-            let step = 3_000_000 + self.carry_ns(400) * 2;
-            self.pass(step)?;
-        }
-        Err(Stop::Failed(format!(
-            "expected the device's clock to reach {ticks} (2 s of grace), saw {}",
-            all.last().map_or(0, |s| s.now.0)
-        )))
-    }
-
-    /// The device's moment in the slot `slot`, a little after its start.
-    pub fn until_slot(&mut self, slot: u64) -> R<Status> {
-        let start = self.slots()?.start(slot).0;
-        self.until(start + self.ticks_of_ms(2))
+        Stop::Failed(format!(
+            "expected {wanted}, saw none within {} ms; last: {}",
+            self.answer_ns() / 1_000_000,
+            self.newest()
+        ))
     }
 }

@@ -2,9 +2,7 @@
 
 use super::driver::{Bench, R};
 use super::{check, grew, tell, Rule, Stop};
-use dpm_device::link::{
-    DeviceMessage, DeviceState, FaultCode, HostHello, HostMessage, MessageType, VERSION,
-};
+use dpm_device::link::{DeviceMessage, DeviceState, FaultCode, HostHello, HostMessage, MessageType, VERSION};
 
 pub(super) const RULES: &[Rule] = &[
     Rule {
@@ -74,12 +72,7 @@ pub(super) const RULES: &[Rule] = &[
         statement: "fields out of range are refused: FAULT 2, detail 4",
         check: config_format,
     },
-    Rule {
-        id: "config-disarms",
-        section: "4",
-        statement: "CONFIG disarms",
-        check: config_disarms,
-    },
+    Rule { id: "config-disarms", section: "4", statement: "CONFIG disarms", check: config_disarms },
     Rule {
         id: "payload-length",
         section: "4",
@@ -131,9 +124,11 @@ fn hello_answer(b: &mut Bench<'_>) -> R {
     check(!s.lit, "no light", || tell(&s))?;
     // The same device says the same twice.
     let again = b.open()?;
-    check((again.raster, again.serial, again.codecs) == (h.raster, h.serial, h.codecs), "the same device", || {
-        format!("{again:?} after {h:?}")
-    })
+    check(
+        (again.raster, again.serial, again.codecs) == (h.raster, h.serial, h.codecs),
+        "the same device",
+        || format!("{again:?} after {h:?}"),
+    )
 }
 
 fn hello_version(b: &mut Bench<'_>) -> R {
@@ -211,7 +206,8 @@ fn hello_new(b: &mut Bench<'_>) -> R {
     b.open()?;
     let s = b.report()?;
     check(s.state == DeviceState::Greeted && !s.lit, "greeted and dark", || tell(&s))?;
-    let counters = [s.slots, s.frames_seen, s.frames_lit, s.frames_accounted, s.frames_refused, s.packets_ignored];
+    let counters =
+        [s.slots, s.frames_seen, s.frames_lit, s.frames_accounted, s.frames_refused, s.packets_ignored];
     check(counters == [0; 6], "counters at 0", || tell(&s))?;
     // HELLO, and SYNC; where STATUS was asked for again, more of them.
     check(s.packets <= 8, "packets counted from the HELLO on", || format!("{} packets", s.packets))
@@ -224,7 +220,11 @@ fn session_other(b: &mut Bench<'_>) -> R {
     b.say_as(other, &HostMessage::Arm(0))?;
     b.say_as(other, &b.echo(4711))?;
     let after = b.report()?;
-    check(after.state == DeviceState::Configured, "configured: ARM of another session has no effect", || tell(&after))?;
+    check(
+        after.state == DeviceState::Configured,
+        "configured: ARM of another session has no effect",
+        || tell(&after),
+    )?;
     let ignored = grew(&before, &after, |s| s.packets_ignored);
     check(ignored == 2, "2 packets more counted as ignored", || ignored.to_string())
 }
@@ -345,7 +345,9 @@ fn payload_length(b: &mut Bench<'_>) -> R {
     b.say_raw(MessageType::Freeze, &[0; 4])?;
     b.say_raw(MessageType::Echo, &[0; 20])?;
     let after = b.report()?;
-    check(after.state == DeviceState::Configured, "configured: an ARM of 8 bytes has no effect", || tell(&after))?;
+    check(after.state == DeviceState::Configured, "configured: an ARM of 8 bytes has no effect", || {
+        tell(&after)
+    })?;
     let ignored = grew(&before, &after, |s| s.packets_ignored);
     check(ignored == 4, "4 packets more counted as ignored", || ignored.to_string())
 }

@@ -30,12 +30,17 @@ fn first(of: &mut Option<String>, told: impl FnOnce() -> String) {
 impl Laws {
     /// A packet's header.
     pub fn header(&mut self, h: &Header) {
-        let from_device =
-            matches!(h.kind, MessageType::Hello | MessageType::Status | MessageType::Echo | MessageType::Fault);
+        let from_device = matches!(
+            h.kind,
+            MessageType::Hello | MessageType::Status | MessageType::Echo | MessageType::Fault
+        );
         if !from_device {
             first(&mut self.packets, || format!("{:?}, which only a host sends", h.kind));
-        } else if h.plane != 0 || h.frame != 0 || h.target_at.0 != 0 || h.led_code != 0 || h.codec as u8 != 0 {
-            first(&mut self.packets, || format!("{:?} with a flag, plane, frame, target or LED code that is not 0", h.kind));
+        } else if h.plane != 0 || h.frame != 0 || h.target_at.0 != 0 || h.led_code != 0 || h.codec as u8 != 0
+        {
+            first(&mut self.packets, || {
+                format!("{:?} with a flag, plane, frame, target or LED code that is not 0", h.kind)
+            });
         }
     }
 
@@ -58,7 +63,10 @@ impl Laws {
             DeviceMessage::Echo(e) => {
                 if e.device_sent < e.device_received {
                     first(&mut self.clock, || {
-                        format!("an ECHO that left at {} before it arrived at {}", e.device_sent.0, e.device_received.0)
+                        format!(
+                            "an ECHO that left at {} before it arrived at {}",
+                            e.device_sent.0, e.device_received.0
+                        )
                     });
                 }
                 // Echoes may overtake reports, so only reports are held against each other.
@@ -80,7 +88,10 @@ impl Laws {
         let sum = s.frames_lit.wrapping_add(s.slots_repeated).wrapping_add(s.slots_blank);
         if s.slots != sum {
             first(&mut self.slots, || {
-                format!("{} slots, {} lit + {} repeated + {} blank", s.slots, s.frames_lit, s.slots_repeated, s.slots_blank)
+                format!(
+                    "{} slots, {} lit + {} repeated + {} blank",
+                    s.slots, s.frames_lit, s.slots_repeated, s.slots_blank
+                )
             });
         }
         let ended = [s.frames_lit, s.frames_incomplete, s.frames_late, s.frames_superseded, s.frames_refused];

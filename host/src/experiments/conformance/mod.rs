@@ -3,6 +3,8 @@
 //! Each rule has a name, a section and one line; its function opens a session of its own, sends single packets, and compares what the device says with
 //! what the section demands. Nothing of the host's own half of the link stands in between.
 
+mod codecs;
+mod dark;
 mod driver;
 mod handshake;
 mod laws;
@@ -11,8 +13,10 @@ mod orders;
 mod packets;
 mod planes;
 mod safety;
+mod session;
 mod shot;
 mod time;
+mod watchdog;
 
 pub use driver::{Medium, MediumKind};
 
@@ -61,9 +65,20 @@ pub struct Rule {
 
 /// Every rule, in the order in which they are judged.
 pub fn rules() -> impl Iterator<Item = &'static Rule> {
-    [handshake::RULES, orders::RULES, light::RULES, planes::RULES, packets::RULES, safety::RULES, time::RULES]
-        .into_iter()
-        .flatten()
+    [
+        handshake::RULES,
+        orders::RULES,
+        watchdog::RULES,
+        light::RULES,
+        dark::RULES,
+        planes::RULES,
+        codecs::RULES,
+        packets::RULES,
+        safety::RULES,
+        time::RULES,
+    ]
+    .into_iter()
+    .flatten()
 }
 
 /// A rule's line.

@@ -1,8 +1,8 @@
-//! ARM and the four verbs, faults, and the watchdog: permission to make light, and its end.
+//! ARM and the four verbs: permission to make light, and its end.
 
 use super::driver::{Bench, R};
 use super::{check, grew, tell, Rule, Stop};
-use dpm_device::link::{faults, Config, DeviceState, FaultCode, HostMessage, Status, Underrun};
+use dpm_device::link::{faults, Config, DeviceState, FaultCode, HostMessage, Status};
 use dpm_device::time::FrameRate;
 
 pub(super) const RULES: &[Rule] = &[
@@ -18,26 +18,31 @@ pub(super) const RULES: &[Rule] = &[
         statement: "ARM leads from configured to armed, dark until a frame is due",
         check: arm,
     },
-    Rule {
-        id: "arm-twice",
-        section: "6",
-        statement: "ARM is safe to receive twice",
-        check: arm_twice,
-    },
+    Rule { id: "arm-twice", section: "6", statement: "ARM is safe to receive twice", check: arm_twice },
     Rule {
         id: "arm-faults",
         section: "6",
         statement: "with latched faults ARM must name every one; else FAULT 3, detail 2",
         check: arm_faults,
     },
-    Rule { id: "stop", section: "6", statement: "STOP disarms and darkens at once, within the slot", check: stop },
+    Rule {
+        id: "stop",
+        section: "6",
+        statement: "STOP disarms and darkens at once, within the slot",
+        check: stop,
+    },
     Rule {
         id: "stop-any-session",
         section: "6",
         statement: "STOP is honoured whatever its session",
         check: stop_any_session,
     },
-    Rule { id: "black", section: "6", statement: "BLACK darkens at once, and ARM lights again", check: black },
+    Rule {
+        id: "black",
+        section: "6",
+        statement: "BLACK darkens at once, and ARM lights again",
+        check: black,
+    },
     Rule {
         id: "black-any-session",
         section: "6",
@@ -57,6 +62,18 @@ pub(super) const RULES: &[Rule] = &[
         check: freeze,
     },
     Rule {
+        id: "freeze-dark",
+        section: "6",
+        statement: "where nothing is lit FREEZE makes no light: its slots are blank",
+        check: freeze_dark,
+    },
+    Rule {
+        id: "slots-over-arms",
+        section: "4",
+        statement: "counters go on over STOP and ARM of a session",
+        check: slots_over_arms,
+    },
+    Rule {
         id: "safe",
         section: "6",
         statement: "SAFE darkens at once and latches fault 3: FAULT 0, state 6",
@@ -68,46 +85,7 @@ pub(super) const RULES: &[Rule] = &[
         statement: "SAFE is honoured whatever its session",
         check: safe_any_session,
     },
-    Rule {
-        id: "watchdog",
-        section: "6",
-        statement: "after the configured silence the device is dark and fault 0 is latched",
-        check: watchdog,
-    },
-    Rule {
-        id: "watchdog-fed",
-        section: "6",
-        statement: "any intact packet of the session feeds the watchdog",
-        check: watchdog_fed,
-    },
-    Rule {
-        id: "watchdog-strangers",
-        section: "6",
-        statement: "packets of other sessions do not feed the watchdog",
-        check: watchdog_strangers,
-    },
-    Rule {
-        id: "watchdog-damaged",
-        section: "6",
-        statement: "damaged packets do not feed the watchdog",
-        check: watchdog_damaged,
-    },
-    Rule {
-        id: "watchdog-black",
-        section: "6",
-        statement: "the watchdog bites in black, too",
-        check: watchdog_black,
-    },
-    Rule {
-        id: "watchdog-disarmed",
-        section: "6",
-        statement: "a device that is not armed has no watchdog",
-        check: watchdog_disarmed,
-    },
 ];
-
-/// Watchdog of the rules about it.
-const BITE_US: u32 = 200_000;
 
 fn arm_unconfigured(b: &mut Bench<'_>) -> R {
     b.open()?;
@@ -123,7 +101,9 @@ fn arm_unconfigured(b: &mut Bench<'_>) -> R {
 fn arm(b: &mut Bench<'_>) -> R {
     b.armed(|_| {})?;
     let s = b.report()?;
-    check(s.state == DeviceState::Armed && !s.lit && s.faults == 0, "armed, dark, without faults", || tell(&s))?;
+    check(s.state == DeviceState::Armed && !s.lit && s.faults == 0, "armed, dark, without faults", || {
+        tell(&s)
+    })?;
     let buffers = b.hello.map_or(0, |h| u32::from(h.frame_buffers));
     check(
         s.frame_limit.wrapping_sub(s.frames_accounted) == buffers,
@@ -152,9 +132,11 @@ fn arm_faults(b: &mut Bench<'_>) -> R {
         b.say(&HostMessage::Arm(acknowledged))?;
         let limit = b.answer_ns();
         let fault = b.wait_fault(limit, FaultCode::Arm)?.ok_or_else(|| b.silent("FAULT 3"))?;
-        check(fault.detail == 2 && fault.latched & faults::HOST_SAFE != 0, "detail 2, and fault 3 latched", || {
-            format!("detail {}, faults {:#x}", fault.detail, fault.latched)
-        })?;
+        check(
+            fault.detail == 2 && fault.latched & faults::HOST_SAFE != 0,
+            "detail 2, and fault 3 latched",
+            || format!("detail {}, faults {:#x}", fault.detail, fault.latched),
+        )?;
         let s = b.report()?;
         check(s.state == DeviceState::Faulted && !s.lit, "faulted and dark", || tell(&s))?;
     }
@@ -240,9 +222,15 @@ fn black_frames(b: &mut Bench<'_>) -> R {
         b.send(&shot)?;
     }
     let s = b.until_slot(last)?;
-    check(s.state == DeviceState::Black && !s.lit && s.frames_lit == before.frames_lit, "black", || tell(&s))?;
+    check(s.state == DeviceState::Black && !s.lit && s.frames_lit == before.frames_lit, "black", || {
+        tell(&s)
+    })?;
     check(grew(&before, &s, |s| s.frames_refused) == 3, "3 frames refused", || tell(&s))?;
-    check(s.frames_accounted == 3 && s.frame_limit.wrapping_sub(3) > 0, "3 accounted, credit for more", || tell(&s))?;
+    check(
+        s.frames_accounted == 3 && s.frame_limit.wrapping_sub(3) > 0,
+        "3 accounted, credit for more",
+        || tell(&s),
+    )?;
     check(grew(&before, &s, |s| s.slots_blank) > 0, "blank slots", || tell(&s))
 }
 
@@ -270,8 +258,37 @@ fn freeze(b: &mut Bench<'_>) -> R {
     Ok(())
 }
 
+fn freeze_dark(b: &mut Bench<'_>) -> R {
+    b.armed(|_| {})?;
+    b.say(&HostMessage::Freeze)?;
+    let before = b.report()?;
+    check(before.state == DeviceState::Frozen && !before.lit, "frozen and dark", || tell(&before))?;
+    let s = b.until(before.now.0 + 4 * b.ticks_of_ms(u64::from(b.slot_ms())))?;
+    check(!s.lit && grew(&before, &s, |s| s.slots_repeated) == 0, "no light and no repeated slot", || {
+        tell(&s)
+    })?;
+    check(grew(&before, &s, |s| s.slots_blank) >= 2, "blank slots", || tell(&s))
+}
+
+fn slots_over_arms(b: &mut Bench<'_>) -> R {
+    b.armed(|_| {})?;
+    let before = lit_frame(b)?;
+    b.say(&HostMessage::Stop)?;
+    b.arm()?;
+    let s = b.report()?;
+    check(
+        s.frames_lit == before.frames_lit && s.slots >= before.slots && s.frames_seen == before.frames_seen,
+        "counters that go on",
+        || format!("{} after {}", tell(&s), tell(&before)),
+    )
+}
+
 fn is_safe(b: &mut Bench<'_>, s: &Status) -> R {
-    check(s.state == DeviceState::Faulted && s.faults & faults::HOST_SAFE != 0, "faulted, fault 3 latched", || tell(s))?;
+    check(
+        s.state == DeviceState::Faulted && s.faults & faults::HOST_SAFE != 0,
+        "faulted, fault 3 latched",
+        || tell(s),
+    )?;
     // It stays so.
     b.pass(100_000_000)?;
     let s = b.report()?;
@@ -295,115 +312,4 @@ fn safe_any_session(b: &mut Bench<'_>) -> R {
         is_safe(b, &s)?;
     }
     Ok(())
-}
-
-fn watchful(c: &mut Config) {
-    c.watchdog_us = BITE_US;
-    // What the watchdog must end is repeated without limit.
-    c.underrun = Underrun::Repeat;
-}
-
-/// Silence, until the device says that the watchdog bit; the device's time from the last packet to the bite, ms.
-fn bitten(b: &mut Bench<'_>) -> R<u64> {
-    let stamp = 0x0abc_0000_0000_0000 | u64::from(b.session);
-    b.forget()?;
-    b.say(&b.echo(stamp))?;
-    b.feed = false;
-    let limit = b.answer_ns() + 4 * i64::from(BITE_US) * 1000;
-    let (mut heard_at, mut fault) = (None, None);
-    let found = b.wait(limit, |h| {
-        match h.message {
-            dpm_device::link::DeviceMessage::Echo(e) if e.host_sent_ns == stamp => heard_at = Some(e.device_received.0),
-            dpm_device::link::DeviceMessage::Fault(f) if f.latched & faults::WATCHDOG != 0 => fault = Some(f.at.0),
-            _ => {}
-        }
-        heard_at.zip(fault)
-    });
-    b.feed = true;
-    let (heard, at) = found?.ok_or_else(|| {
-        Stop::Failed(format!(
-            "expected FAULT 0 with fault 0 after {} ms of silence, saw none; {}",
-            BITE_US / 1000,
-            b.newest()
-        ))
-    })?;
-    let s = b.report()?;
-    check(
-        s.state == DeviceState::Faulted && !s.lit && s.faults & faults::WATCHDOG != 0,
-        "faulted and dark, fault 0 latched",
-        || tell(&s),
-    )?;
-    Ok(at.saturating_sub(heard) * 1000 / b.tick_hz().max(1))
-}
-
-fn watchdog(b: &mut Bench<'_>) -> R {
-    b.armed(watchful)?;
-    lit_frame(b)?;
-    let ms = bitten(b)?;
-    let asked = u64::from(BITE_US / 1000);
-    check(
-        (asked - 2..=asked + asked / 10 + 5).contains(&ms),
-        &format!("the bite {asked} ms after the last packet"),
-        || format!("{ms} ms"),
-    )
-}
-
-fn watchdog_fed(b: &mut Bench<'_>) -> R {
-    b.armed(watchful)?;
-    b.feed = false;
-    let steps = 3 * 4;
-    for k in 0..steps {
-        match k % 3 {
-            0 => b.say(&b.echo(0))?,
-            1 => b.say(&HostMessage::Sync(b.frames_sent))?,
-            _ => b.say(&HostMessage::Arm(0))?,
-        }
-        b.pass(i64::from(BITE_US) * 1000 / 4)?;
-    }
-    b.feed = true;
-    let s = b.report()?;
-    check(s.state == DeviceState::Armed && s.faults == 0, "armed after three watchdogs' time", || tell(&s))
-}
-
-/// Three watchdogs' time in which only `send` is sent.
-fn not_fed(b: &mut Bench<'_>, mut send: impl FnMut(&mut Bench<'_>) -> R) -> R {
-    b.armed(watchful)?;
-    b.feed = false;
-    for _ in 0..9 {
-        send(b)?;
-        b.pass(i64::from(BITE_US) * 1000 / 3)?;
-    }
-    b.feed = true;
-    let s = b.report()?;
-    check(s.state == DeviceState::Faulted && s.faults & faults::WATCHDOG != 0, "fault 0 latched", || tell(&s))
-}
-
-fn watchdog_strangers(b: &mut Bench<'_>) -> R {
-    not_fed(b, |b| b.say_as(b.session ^ 7, &b.echo(0)))
-}
-
-fn watchdog_damaged(b: &mut Bench<'_>) -> R {
-    use super::shot::damaged_payload;
-    use dpm_device::link::{Header, MessageType};
-    not_fed(b, |b| {
-        let header = Header::control(MessageType::Echo, b.session, 24);
-        b.send_packets(dpm_device::transport::Lane::Control, &[damaged_payload(&header, &[0; 24])])
-    })
-}
-
-fn watchdog_black(b: &mut Bench<'_>) -> R {
-    b.armed(watchful)?;
-    b.say(&HostMessage::Black)?;
-    bitten(b)?;
-    Ok(())
-}
-
-fn watchdog_disarmed(b: &mut Bench<'_>) -> R {
-    b.armed(watchful)?;
-    b.say(&HostMessage::Stop)?;
-    b.feed = false;
-    b.pass(i64::from(BITE_US) * 1000 * 3)?;
-    b.feed = true;
-    let s = b.report()?;
-    check(s.state == DeviceState::Configured && s.faults == 0, "configured, no fault", || tell(&s))
 }

@@ -3,7 +3,9 @@
 use super::driver::{Bench, MediumKind, R};
 use super::shot::{damaged_payload, other_header};
 use super::{check, grew, tell, Rule, Stop};
-use dpm_device::link::{DeviceMessage, DeviceState, Header, HostMessage, MessageType, Packet, Status, MAX_CONTROL_BYTES};
+use dpm_device::link::{
+    DeviceMessage, DeviceState, Header, HostMessage, MessageType, Packet, Status, MAX_CONTROL_BYTES,
+};
 use dpm_device::transport::Lane;
 
 pub(super) const RULES: &[Rule] = &[
@@ -114,7 +116,9 @@ fn header_damaged(b: &mut Bench<'_>) -> R {
     bytes[29] ^= 0x40;
     let trailer = right.parts()[2].to_vec();
     let (before, after) = answered(b, &[Packet::from_raw(bytes, &payload, &trailer)], "a damaged header")?;
-    check(after.state == DeviceState::Configured, "no effect of an ARM with a damaged header", || tell(&after))?;
+    check(after.state == DeviceState::Configured, "no effect of an ARM with a damaged header", || {
+        tell(&after)
+    })?;
     check(grew(&before, &after, |s| s.header_errors) == 1, "one damaged header counted", || tell(&after))
 }
 
@@ -123,24 +127,27 @@ fn payload_damaged(b: &mut Bench<'_>) -> R {
     let (payload, header) = arm_payload();
     let header = Header { session: b.session, ..header };
     let (before, after) = answered(b, &[damaged_payload(&header, &payload)], "a damaged payload")?;
-    check(after.state == DeviceState::Configured, "no effect of an ARM with a damaged payload", || tell(&after))?;
+    check(after.state == DeviceState::Configured, "no effect of an ARM with a damaged payload", || {
+        tell(&after)
+    })?;
     check(grew(&before, &after, |s| s.payload_errors) == 1, "one damaged payload counted", || tell(&after))
 }
 
-/// A packet of twenty payload bytes, right but for one byte of its header.
+/// An ARM that is right but for one byte of its header. What it acknowledges spells the beginning of a packet: nobody must look for one there.
 fn foreign(b: &mut Bench<'_>, at: usize, value: u8, what: &str) -> R {
     b.configured(|_| {})?;
-    // The payload holds the beginning of a packet: it must not be looked for there.
-    let mut payload = [0u8; 20];
-    payload[..4].copy_from_slice(b"DPML");
-    let header = Header::control(MessageType::Echo, b.session, 20);
+    let payload = *b"DPML";
+    let header = Header::control(MessageType::Arm, b.session, 4);
     let right = Packet::new(header, &payload);
     let trailer = right.parts()[2].to_vec();
     let bytes = other_header(&header, at, value);
     let (before, after) = answered(b, &[Packet::from_raw(bytes, &payload, &trailer)], what)?;
+    check(after.state == DeviceState::Configured, &format!("no effect of {what}"), || tell(&after))?;
     let damaged = grew(&before, &after, |s| s.header_errors) + grew(&before, &after, |s| s.payload_errors);
     check(damaged == 0, &format!("{what} stepped over, not damaged"), || tell(&after))?;
-    check(grew(&before, &after, |s| s.packets_ignored) == 1, &format!("{what} counted as ignored"), || tell(&after))
+    check(grew(&before, &after, |s| s.packets_ignored) == 1, &format!("{what} counted as ignored"), || {
+        tell(&after)
+    })
 }
 
 fn version_foreign(b: &mut Bench<'_>) -> R {

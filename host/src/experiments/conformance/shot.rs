@@ -126,11 +126,6 @@ impl Bench<'_> {
         Ok(Shot { id, slot, target, pieces, commit, commits: true })
     }
 
-    /// A frame number and a count that were used, for a frame that never left.
-    pub fn lose(&mut self, shot: Shot) {
-        drop(shot);
-    }
-
     /// Sends it: all of it in one go, as a transfer carries a whole frame.
     pub fn send(&mut self, shot: &Shot) -> R {
         self.send_as(self.session, Lane::Data, shot)

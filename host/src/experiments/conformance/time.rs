@@ -11,7 +11,12 @@ pub(super) const RULES: &[Rule] = &[
         statement: "ECHO returns the host's stamp unread, with the device's clock at arrival and departure",
         check: echo,
     },
-    Rule { id: "echo-greeted", section: "4", statement: "ECHO is answered before CONFIG, too", check: echo_greeted },
+    Rule {
+        id: "echo-greeted",
+        section: "4",
+        statement: "ECHO is answered before CONFIG, too",
+        check: echo_greeted,
+    },
     Rule {
         id: "clock-rate",
         section: "4",
@@ -33,7 +38,8 @@ pub(super) const RULES: &[Rule] = &[
     Rule {
         id: "law-seen",
         section: "4",
-        statement: "frames seen = lit + incomplete + late + superseded + refused + under way, in every STATUS",
+        statement:
+            "frames seen = lit + incomplete + late + superseded + refused + under way, in every STATUS",
         check: |b| law(b, |b| b.laws().seen.clone(), "every frame seen once"),
     },
     Rule {
