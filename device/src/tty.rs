@@ -10,13 +10,15 @@ use std::time::Duration;
 
 use serialport::{SerialPort, TTYPort};
 
-/// Opens the port at `path` for this program alone, 8 data bits, no parity, one stop bit.
+/// Opens the port at `path` for this program alone, 8 data bits, no parity, one stop bit. What had waited in it is thrown away: nobody
+/// knows how old it is, and it answers nothing that was asked.
 ///
 /// # Errors
 /// The library's: not found, no permission, in use.
 pub fn open(path: &str, baud: u32) -> serialport::Result<Box<dyn SerialPort>> {
     // Exclusive by lock and by TIOCEXCL; the library's default, said here because it is a promise.
     let port = serialport::new(path, baud).exclusive(true).open_native()?;
+    port.clear(serialport::ClearBuffer::Input)?;
     Ok(never_wait(port)?)
 }
 

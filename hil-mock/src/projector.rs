@@ -6,6 +6,7 @@
 
 mod clock;
 mod config;
+mod emulated;
 mod faulty;
 mod frames;
 mod guard;
@@ -28,6 +29,7 @@ use dpm_device::transport::{Lane, LinkDevice};
 
 pub use clock::DeviceClock;
 pub use config::{LightChange, LightEvent, LightKind, MockConfig};
+pub use emulated::{EmulatedProjector, Served};
 pub use faulty::FaultyProjector;
 use frames::{FrameStore, Held};
 use guard::LightGuard;

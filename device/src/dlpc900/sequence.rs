@@ -250,6 +250,11 @@ pub fn stop() -> Vec<Step<'static>> {
     vec![write(Opcode::START_STOP, &[0])]
 }
 
+/// LEDs off by hand, whatever the sequencer does.
+pub fn leds_off() -> Step<'static> {
+    write(Opcode::LED_ENABLE, &[LEDS_OFF])
+}
+
 /// Pauses the sequencer; [`start`] goes on from there.
 pub fn pause() -> Vec<Step<'static>> {
     vec![write(Opcode::START_STOP, &[1])]
@@ -406,7 +411,6 @@ impl VideoPatterns {
         steps.extend(switch_mode(DisplayMode::VideoPattern, firmware));
         steps.extend(table(&self.entries, 0));
         steps.extend(self.leds.steps());
-        steps.extend(start());
         Ok(steps)
     }
 }

@@ -35,6 +35,8 @@ const REOPEN_NS: i64 = 100_000_000;
 const FAST_ECHO_NS: i64 = 2_000_000;
 /// Number of fast echoes.
 const FAST_ECHOES: u32 = 16;
+/// How long the answer to a clock exchange is worth waiting for closely.
+const ECHO_AWAITED_NS: i64 = 5_000_000;
 /// Detail of a refused ARM: CONFIG has not arrived.
 const ARM_BEFORE_CONFIG: u16 = 1;
 
@@ -464,6 +466,14 @@ impl HostLink {
                 sink(echo);
             }
         }
+    }
+
+    /// True while the answer to a clock exchange is under way that began less than [`ECHO_AWAITED_NS`] ago: a caller that polls soon learns the
+    /// device's clock the better.
+    pub fn awaits_echo(&self, now: HostTime) -> bool {
+        self.echo_sent_at != NEVER
+            && self.inbox.echo_answered != self.echo_sent_at
+            && now.ns_since(self.echo_sent_at) < ECHO_AWAITED_NS
     }
 
     /// A frame number that follows those sent in this session.

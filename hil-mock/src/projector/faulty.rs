@@ -100,6 +100,11 @@ impl FaultyProjector {
         &mut self.projector
     }
 
+    /// When the projector inside does something of which nobody tells it; `None` when nothing is to come.
+    pub fn next_due(&self) -> Option<HostTime> {
+        self.projector.next_due()
+    }
+
     /// Packets that a fault struck.
     pub fn struck(&self) -> u64 {
         self.struck

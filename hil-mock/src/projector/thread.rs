@@ -7,7 +7,7 @@ use dpm_device::time::HostTime;
 use dpm_device::transport::inproc::DeviceEnd;
 use dpm_device::transport::{Lane, LinkDevice};
 
-use super::MockProjector;
+use super::Served;
 
 /// Longest rest of a thread for whose projector nothing is due.
 const REST_NS: i64 = 1_000_000_000;
@@ -15,11 +15,11 @@ const REST_NS: i64 = 1_000_000_000;
 /// Serves `cable` with `projector` until the host's end is gone. Sleeps between what arrives and what is due. `clock` gives the rig's
 /// time, the one that the host reads too; `witness` is called with it before anything that arrived is delivered, to let the projector
 /// live up to then and take its light.
-pub fn serve_cable(
-    projector: &mut MockProjector,
+pub fn serve_cable<P: Served>(
+    projector: &mut P,
     mut cable: DeviceEnd,
     clock: impl Fn() -> HostTime,
-    mut witness: impl FnMut(&mut MockProjector, HostTime) + Send,
+    mut witness: impl FnMut(&mut P, HostTime) + Send,
 ) {
     // What has arrived first: it may lie before now, and a projector does not live backwards.
     while cable.serve(&clock, &mut Witnessed { projector, witness: &mut witness }) {
@@ -31,12 +31,12 @@ pub fn serve_cable(
 }
 
 /// A projector whose light is taken before anything happens to it.
-struct Witnessed<'a, W> {
-    projector: &'a mut MockProjector,
+struct Witnessed<'a, P, W> {
+    projector: &'a mut P,
     witness: &'a mut W,
 }
 
-impl<W: FnMut(&mut MockProjector, HostTime) + Send> LinkDevice for Witnessed<'_, W> {
+impl<P: Served, W: FnMut(&mut P, HostTime) + Send> LinkDevice for Witnessed<'_, P, W> {
     fn receive(&mut self, now: HostTime, lane: Lane, bytes: &[u8]) {
         (self.witness)(self.projector, now);
         self.projector.receive(now, lane, bytes);
@@ -60,7 +60,7 @@ impl<W: FnMut(&mut MockProjector, HostTime) + Send> LinkDevice for Witnessed<'_,
 
 #[cfg(test)]
 mod tests {
-    use super::super::{LightKind, MockConfig};
+    use super::super::{LightKind, MockConfig, MockProjector};
     use super::*;
     use dpm_device::link::{
         packet_bytes, Epoch, HostLink, LightLimits, LinkSettings, LinkState, Underrun, COMMIT_BYTES,

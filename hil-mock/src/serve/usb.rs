@@ -40,9 +40,8 @@ pub fn offer(
     let new_plug = || UsbPlug::new(model.clone(), clock.clone());
     let export = |plug: &UsbPlug| vec![Export::new("1-1", Arc::new(plug.clone()))];
     let mut plug = new_plug();
-    let server = Server::start(arguments.usbip, export(&plug)).map_err(|e| {
-        format!("cannot serve on {}: {e}; is another USB/IP server running, and is the address one of this machine's?", arguments.usbip)
-    })?;
+    let server = Server::start(arguments.usbip, export(&plug))
+        .map_err(|e| super::cannot_serve("USB/IP", arguments.usbip, &e, "--usbip"))?;
     println!("{name} over USB/IP on {}, bus id 1-1", server.address());
     println!("  on the machine that is to see it: modprobe vhci-hcd; usbip attach -r HOST -b 1-1");
     let mut out = false;

@@ -50,7 +50,8 @@ pub struct LinkTestArgs {
 /// # Errors
 /// Bad rig or flags, no GPU, no projector.
 pub fn execute(args: &LinkTestArgs) -> Result<(), Failure> {
-    let config = args.flags.rig(Some(&args.rig))?;
+    args.flags.refuse("dpm link-test", &["--frames", "--seconds", "--no-prediction", "--out"])?;
+    let config = args.flags.rig_at_rest(Some(&args.rig))?;
     let _locks = take_locks(&config)?;
     signals::install()
         .map_err(|e| Failure::new(FailureKind::Device, format!("cannot handle signals: {e}")))?;

@@ -14,6 +14,7 @@ pub mod os;
 pub mod plan;
 pub mod profile;
 mod progress;
+pub mod record;
 pub mod rig_args;
 pub mod run;
 pub mod signals;
@@ -58,6 +59,8 @@ enum Command {
     /// Let light through again after black, freeze, safe or a fault, which this acknowledges
     #[command(visible_alias = "resume")]
     Arm(order::OrderArgs),
+    /// Record what a rig's tracker says into a file that `tracker.kind = "replay"` plays
+    Record(record::RecordArgs),
     /// Measure where the time between motion and light goes
     Profile(profile::ProfileArgs),
     /// Say what this machine can do, and what to do about what is missing
@@ -94,13 +97,19 @@ pub fn main(commit: &'static str) -> ExitCode {
             return ExitCode::from(u8::try_from(e.exit_code()).unwrap_or(2));
         }
     };
-    match dispatch(&cli.command) {
-        Ok(()) => ExitCode::SUCCESS,
+    let code = match dispatch(&cli.command) {
+        Ok(()) => 0,
         Err(failure) => {
             let _ = writeln!(std::io::stderr(), "error: {failure}");
-            ExitCode::from(failure.kind.exit_code())
+            failure.kind.exit_code()
         }
+    };
+    if crate::pipeline::has_left_threads_behind() {
+        // Destructors of drivers could wait for a thread that hangs.
+        let _ = std::io::stdout().flush();
+        os::leave(code);
     }
+    ExitCode::from(code)
 }
 
 fn dispatch(command: &Command) -> Result<(), Failure> {
@@ -112,6 +121,7 @@ fn dispatch(command: &Command) -> Result<(), Failure> {
         Command::Freeze(args) => order::execute(args, Order::Freeze),
         Command::Safe(args) => order::execute(args, Order::Safe),
         Command::Arm(args) => order::execute(args, Order::Arm),
+        Command::Record(args) => record::execute(args),
         Command::Profile(args) => profile::execute(args),
         Command::Doctor(args) => doctor::execute(args),
         Command::Stability(args) => stability::execute(args),

@@ -39,6 +39,20 @@ pub fn install() -> std::io::Result<()> {
     Ok(())
 }
 
+/// Ignores them: for a process that must outlive the one that they are meant for.
+///
+/// # Errors
+/// The operating system's, which does not happen for these signals.
+pub fn ignore() -> std::io::Result<()> {
+    for signal in SIGNALS {
+        // SAFETY: SIG_IGN is a valid disposition for each of them, and no handler of this process is lost that anybody relies on.
+        if unsafe { libc::signal(signal, libc::SIG_IGN) } == libc::SIG_ERR {
+            return Err(std::io::Error::last_os_error());
+        }
+    }
+    Ok(())
+}
+
 /// The signal that asked for a stop, by name; `None` as long as none did.
 pub fn received() -> Option<&'static str> {
     if COUNT.load(Ordering::Relaxed) == 0 {

@@ -17,7 +17,7 @@ use dpm_device::time::HostTime;
 use dpm_device::transport::inproc::{threaded, HostEnd};
 use dpm_device::transport::{LinkDevice, Transport};
 use dpm_handoff::wake::WaitPolicy;
-use hil_mock::projector::{serve_cable, MockConfig, MockProjector};
+use hil_mock::projector::{serve_cable, EmulatedProjector, MockConfig};
 use std::sync::Arc;
 use std::time::Duration;
 
@@ -152,12 +152,14 @@ impl Far {
             events_kept: 0,
             ..MockConfig::new(raster)
         };
+        let frame_buffers = usize::from(setup.frame_buffers);
+        let mut mock = EmulatedProjector::new(setup, &mock.faults, config.render.seed, clock.now())
+            .map_err(|e| Failure::new(FailureKind::BadInput, format!("projector.backend.faults: {e}")))?;
         let bytes = projector::frame_bytes(raster, config.projector.schedule().len());
-        let (host, device) = threaded(bytes, usize::from(setup.frame_buffers) + 1, WaitPolicy::Park);
+        let (host, device) = threaded(bytes, frame_buffers + 1, WaitPolicy::Park);
         std::thread::Builder::new()
             .name("dpm-mock".into())
             .spawn(move || {
-                let mut mock = MockProjector::new(setup);
                 serve_cable(&mut mock, device, || clock.now(), |mock, now| mock.advance_to(now));
             })
             .map_err(|e| Failure::new(FailureKind::Device, format!("cannot start a thread: {e}")))?;
@@ -258,7 +260,7 @@ fn way(
         std::thread::sleep(Duration::from_micros(200));
         clock.now()
     };
-    connect(&mut link, transport, ENDED_WITH_THE_LAST_RUN, &mut now).map_err(PipelineError::from)?;
+    connect(&mut link, transport, ENDED_WITH_THE_LAST_RUN, &mut now, stop).map_err(PipelineError::from)?;
     let duration_ns = (seconds * 1e9) as i64;
     let measured = measure(
         &mut link,

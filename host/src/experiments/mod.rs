@@ -12,6 +12,7 @@ pub mod error_report;
 pub mod error_runs;
 pub mod error_sheet;
 pub mod error_table;
+pub mod error_verdict;
 pub mod link_test;
 pub mod median;
 pub mod pictures;

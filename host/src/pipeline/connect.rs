@@ -1,8 +1,8 @@
 //! Brings the link up: handshake, configuration, clock, ARM. Before the first frame, so it may wait (bounded).
 
 use super::stages::LinkTime;
-use dpm_device::link::{faults, HostLink, LinkError, LinkState};
-use dpm_device::time::HostTime;
+use dpm_device::link::{faults, HostLink, LinkError, LinkState, Verb};
+use dpm_device::time::{DeviceTicks, HostTime};
 use dpm_device::transport::Transport;
 
 /// Longest time that a device may take to answer.
@@ -28,13 +28,17 @@ pub enum ConnectError {
         /// How far it came.
         state: LinkState,
     },
+    /// A stop was asked for while the link came up.
+    #[error("stopped before the projector was up; nothing was lit")]
+    Stopped,
 }
 
 /// Latched faults that say something about a host or a cable of the past. Starting a run acknowledges them; heat, lamp, emergency
 /// stop and flashes want the operator's word.
 pub const ENDED_WITH_THE_LAST_RUN: u32 = faults::WATCHDOG | faults::CHECKSUM_STORM | faults::HOST_SAFE;
 
-/// Connects and arms; latched faults in the mask `acknowledged` stand not in the way. `now` reads the clock and lets a little time pass with every call.
+/// Connects and arms; latched faults in the mask `acknowledged` stand not in the way. `now` reads the clock and lets a little time pass with
+/// every call; `stop` says that nobody wants light any more.
 ///
 /// # Errors
 /// The device is missing, refuses, has latched other faults, or is silent.
@@ -43,6 +47,7 @@ pub fn connect(
     transport: &mut dyn Transport,
     acknowledged: u32,
     now: &mut dyn FnMut() -> HostTime,
+    stop: &dyn Fn() -> bool,
 ) -> Result<LinkTime, ConnectError> {
     link.connect();
     let begin = now();
@@ -58,6 +63,11 @@ pub fn connect(
                 best = Some((round_trip, e));
             }
         });
+        if stop() {
+            // Never armed after a stop was asked for, and dark if it was armed before.
+            let _ = link.command(t, Verb::Stop, transport);
+            return Err(ConnectError::Stopped);
+        }
         let latched = link.status().map_or(0, |s| s.faults);
         match state {
             LinkState::Ready => link.arm(0),
@@ -70,9 +80,11 @@ pub fn connect(
         }
         if let (LinkState::Streaming, Some((round_trip, echo)), Some(clock)) = (state, best, link.slots()) {
             if echoes >= ECHOES {
-                // The device's stamp lies in the middle of the shortest exchange.
+                // The middle between the device's two stamps is that of the host's: what it did in between is no part of the way.
+                let held = echo.device_sent_at.0.saturating_sub(echo.device_received_at.0);
+                let there = DeviceTicks(echo.device_received_at.0.saturating_add(held / 2));
                 let middle = echo.host_sent_at.plus_ns(round_trip / 2);
-                return Ok(LinkTime { clock, first: 0, anchor: (echo.device_received_at, middle) });
+                return Ok(LinkTime { clock, first: 0, anchor: (there, middle) });
             }
         }
         if t.ns_since(begin) > LIMIT_NS {

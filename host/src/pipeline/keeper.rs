@@ -8,6 +8,7 @@ use super::job::FrameNote;
 use super::light::LightNote;
 use super::stages::LinkTime;
 use super::status_light::{DeviceCounts, StatusLight};
+use crate::plan::slots::OrderedDark;
 use crate::telemetry::monitor::{Order, ProjectorHealth, RunMonitor};
 use dpm_device::clock_map::ClockMap;
 use dpm_device::link::{faults, DeviceState, HostLink, LinkError, LinkState, Verb};
@@ -42,6 +43,9 @@ pub struct ProjectorReport {
     pub not_sent: [u64; 6],
     /// What the projector reported; null for the mock in this process, whose light is seen itself.
     pub device: Option<DeviceCounts>,
+    /// Greatest error of the mapping from the projector's clock to the host's, as the newest exchange bounds it, nanoseconds; null at virtual pace,
+    /// and where no exchange was heard.
+    pub clock_bound_ns: Option<i64>,
     /// From sent to light in time, as learned from the reports, milliseconds; null for the mock in this process.
     pub travel_ms: Option<f64>,
 }
@@ -49,9 +53,11 @@ pub struct ProjectorReport {
 /// See the module's documentation.
 pub(super) struct LinkKeeper {
     time: LinkTime,
-    times: Publisher<LinkTime>,
+    /// Where planning learns the projector's clock; `None` before there is a crew.
+    times: Option<Publisher<LinkTime>>,
     retimed_at: HostTime,
     map: Option<ClockMap>,
+    clock_bound_ns: Option<i64>,
     session: u64,
     /// `time` is of this session.
     is_timed: bool,
@@ -67,17 +73,13 @@ pub(super) struct LinkKeeper {
 impl LinkKeeper {
     /// For a link that has just come up with `time`. `lights`: where the projector's reports are all that is known of its light,
     /// notes of it go there.
-    pub(super) fn new(
-        time: LinkTime,
-        times: Publisher<LinkTime>,
-        link: &HostLink,
-        lights: Option<Sender<LightNote>>,
-    ) -> Self {
+    pub(super) fn new(time: LinkTime, link: &HostLink, lights: Option<Sender<LightNote>>) -> Self {
         Self {
             time,
-            times,
+            times: None,
             retimed_at: HostTime(i64::MIN),
             map: None,
+            clock_bound_ns: None,
             session: link.counters().sessions,
             is_timed: true,
             reports: lights.map(StatusLight::new),
@@ -88,7 +90,14 @@ impl LinkKeeper {
         }
     }
 
-    /// Polls the link and does what is due. At virtual pace (`steady`) the projector's clock stays as the handshake found it.
+    /// From now on planning learns the projector's clock through `times`.
+    pub(super) fn tell_times_to(&mut self, mut times: Publisher<LinkTime>) {
+        times.publish(self.time);
+        self.times = Some(times);
+    }
+
+    /// Polls the link and does what is due. At virtual pace (`steady`) the projector's clock stays as the handshake found it. A picture is
+    /// held only while all stages are `alive`.
     ///
     /// # Errors
     /// The link cannot come up again: another projector was plugged in, or it refuses. While the medium is gone, or the projector
@@ -99,6 +108,7 @@ impl LinkKeeper {
         link: &mut HostLink,
         transport: &mut dyn Transport,
         steady: bool,
+        alive: bool,
         monitor: &RunMonitor,
     ) -> Result<(), ConnectError> {
         let result = match link.poll(now, transport) {
@@ -115,11 +125,22 @@ impl LinkKeeper {
         if !steady {
             self.keep_time(now, link);
         }
-        self.follow_interlock(now, monitor.light_allowed(), link, transport);
-        if let Some(order) = monitor.take_order() {
+        // After a stop was asked for nothing lights the projector again, whoever orders it.
+        let stopping = monitor.stop_requested() || self.standing == Some(Verb::Stop);
+        if !stopping {
+            self.follow_interlock(now, monitor.light_allowed(), link, transport);
+        }
+        if let Some(order) = monitor.take_order().filter(|order| !(stopping && *order == Order::Arm)) {
             self.obey(now, order, link, transport);
         }
-        self.arm_again(now, link, steady);
+        if self.standing == Some(Verb::Freeze) && !alive {
+            // Nobody would replace the frame that is held, and nobody knows for how long.
+            self.obey(now, Order::Black, link, transport);
+        }
+        if !stopping {
+            self.arm_again(now, link, steady);
+        }
+        monitor.dark().tell(now, ordered_dark(now, link, self.standing));
         if let (Some(reports), Some(status)) = (&mut self.reports, link.status().filter(|_| self.is_timed)) {
             reports.observe(status, &self.time);
         }
@@ -165,6 +186,7 @@ impl LinkKeeper {
             planes: [c.planes_raw, c.planes_coded, c.planes_kept],
             not_sent: [c.not_streaming, c.no_credit, c.link_busy, c.link_lost, c.flash_limit, c.light_limit],
             device: self.reports.as_ref().map(StatusLight::counts),
+            clock_bound_ns: self.clock_bound_ns,
             travel_ms: self.reports.as_ref().map(|r| r.travel_ns() as f64 / 1e6),
         }
     }
@@ -249,6 +271,7 @@ impl LinkKeeper {
         });
         let (Some(ticks), Some(clock)) = (newest, link.slots()) else { return };
         let Some(mapped) = map.to_host(ticks) else { return };
+        self.clock_bound_ns = Some(mapped.uncertainty_ns);
         if self.is_timed {
             let due = self.retimed_at.0 == i64::MIN || now.ns_since(self.retimed_at) >= RETIME_NS;
             if !due || map.exchanges() < EXCHANGES {
@@ -262,7 +285,9 @@ impl LinkKeeper {
             (self.time, self.is_timed) = (time, true);
         }
         self.retimed_at = now;
-        self.times.publish(self.time);
+        if let Some(times) = &mut self.times {
+            times.publish(self.time);
+        }
     }
 }
 
@@ -272,6 +297,27 @@ pub(super) fn is_dark(link: &HostLink) -> bool {
         || link.status().is_some_and(|s| {
             !s.lit && !matches!(s.state, DeviceState::Armed | DeviceState::Black | DeviceState::Frozen)
         })
+}
+
+/// Why no new picture is wanted: slots are no one's fault then.
+fn ordered_dark(now: HostTime, link: &HostLink, standing: Option<Verb>) -> Option<OrderedDark> {
+    match standing {
+        Some(Verb::Black) => return Some(OrderedDark::Black),
+        Some(Verb::Freeze) => return Some(OrderedDark::Frozen),
+        Some(Verb::Safe) => return Some(OrderedDark::Safe),
+        Some(Verb::Stop) => return Some(OrderedDark::Stop),
+        _ => {}
+    }
+    let latched = link.status().map_or(0, |s| s.faults);
+    if link.is_resting(now) {
+        Some(OrderedDark::Rest)
+    } else if link.state() == LinkState::Faulted && latched & faults::HOST_SAFE != 0 {
+        Some(OrderedDark::Safe)
+    } else if link.state() == LinkState::Faulted && latched & !PASSING != 0 {
+        Some(OrderedDark::Fault)
+    } else {
+        None
+    }
 }
 
 fn health(link: &HostLink, standing: Option<Verb>) -> ProjectorHealth {

@@ -81,7 +81,7 @@ pub fn link_settings(config: &RigConfig, raster: Raster) -> LinkSettings {
         raster,
         schedule: config.projector.schedule(),
         rate: config.projector.frame_rate,
-        watchdog_us: config.safety.watchdog_ms * 1000,
+        watchdog_us: config.watchdog_us(),
         underrun: Underrun::Repeat,
         // At real pace a late frame is better than none; at virtual pace none is late.
         late_slots: if config.real_time.pace == Pace::Virtual { 0 } else { 255 },

@@ -1,11 +1,16 @@
 //! Counters that a running pipeline keeps and a watching thread reads, and the operator's wishes the other way: stop, and the verbs of
 //! a projector.
 
+use super::ordered::DarkLog;
 use crate::interlock::Interlock;
 use dpm_device::link::{faults, LimitReached};
+use std::collections::VecDeque;
 use std::fmt;
 use std::sync::atomic::{AtomicBool, AtomicU64, AtomicU8, Ordering};
-use std::sync::OnceLock;
+use std::sync::{Mutex, OnceLock, PoisonError};
+
+/// Notes that wait for the watching thread; further ones are only counted.
+const NOTES: usize = 64;
 
 /// What an operator can ask of the projector of a running rig.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -98,6 +103,23 @@ impl ProjectorHealth {
     }
 }
 
+impl ProjectorHealth {
+    /// The state in one word of at most ten letters, in capitals where no picture moves although frames are made.
+    pub const fn word(self) -> &'static str {
+        match self {
+            Self::Connecting => "connecting",
+            Self::Up => "up",
+            Self::Lost => "LOST",
+            Self::Faulted(_) => "FAULTED",
+            Self::Black => "BLACK",
+            Self::Frozen => "FROZEN",
+            Self::Stopped => "dark",
+            Self::InterlockOpen => "INTERLOCK",
+            Self::Resting(_) => "RESTING",
+        }
+    }
+}
+
 impl fmt::Display for ProjectorHealth {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         match self {
@@ -125,8 +147,8 @@ impl fmt::Display for ProjectorHealth {
     }
 }
 
-/// Shared between a run and whoever watches it. All accesses are relaxed: the numbers are for display, and the stop flag
-/// guards no data.
+/// Shared between a run and whoever watches it. Accesses to numbers and flags are relaxed: the numbers are for display, and the
+/// stop flag guards no data.
 #[derive(Debug, Default)]
 pub struct RunMonitor {
     stop: AtomicBool,
@@ -135,12 +157,28 @@ pub struct RunMonitor {
     projector: AtomicU64,
     /// Written at most once.
     tracker: OnceLock<String>,
+    /// Why the run will never return, written at most once.
+    gave_up: OnceLock<String>,
     /// Written at most once, before there is light.
     interlock: OnceLock<Interlock>,
     frames_planned: AtomicU64,
     frames_lit: AtomicU64,
+    frames_dark: AtomicU64,
     frames_dropped: AtomicU64,
+    frames_withheld: AtomicU64,
     frames_late: AtomicU64,
+    slots: AtomicU64,
+    slots_missed: AtomicU64,
+    /// When no new picture was wanted, and why.
+    dark: DarkLog,
+    /// What the collector has to tell the operator. Neither the threads of the frame path nor those that make orders take this lock.
+    notes: Mutex<Notes>,
+}
+
+#[derive(Debug, Default)]
+struct Notes {
+    waiting: VecDeque<String>,
+    left_out: u64,
 }
 
 /// What the counters said at one moment.
@@ -148,12 +186,27 @@ pub struct RunMonitor {
 pub struct RunCounts {
     /// Frames planned so far.
     pub frames_planned: u64,
-    /// Frames lit so far.
+    /// Frames lit so far, with light on at least one body.
     pub frames_lit: u64,
+    /// Frames that the projector lit so far in which every body was dark.
+    pub frames_dark: u64,
     /// Frames dropped so far.
     pub frames_dropped: u64,
+    /// Frames so far that were not lit because no new picture was wanted.
+    pub frames_withheld: u64,
     /// Frames lit late so far.
     pub frames_late: u64,
+    /// Slots so far in which a frame of their own was wanted.
+    pub slots: u64,
+    /// Of these, slots without one.
+    pub slots_missed: u64,
+}
+
+impl RunCounts {
+    /// Planned frames whose fate is known.
+    pub fn frames_done(&self) -> u64 {
+        self.frames_lit + self.frames_dark + self.frames_dropped + self.frames_withheld
+    }
 }
 
 impl RunMonitor {
@@ -218,14 +271,57 @@ impl RunMonitor {
         self.tracker.get().map(String::as_str)
     }
 
+    /// The thread that would return from the run hangs: whoever waits for it should not. The projector was told to go dark.
+    pub fn give_up(&self, why: String) {
+        let _ = self.gave_up.set(why);
+    }
+
+    /// Why the run will never return; `None` while it may.
+    pub fn gave_up(&self) -> Option<&str> {
+        self.gave_up.get().map(String::as_str)
+    }
+
     /// Counts a planned frame.
     pub fn count_planned(&self) {
         self.frames_planned.fetch_add(1, Ordering::Relaxed);
     }
 
-    /// Counts a frame whose light left the projector, and whether that was after its slot.
-    pub fn count_lit(&self, late: bool) {
-        self.frames_lit.fetch_add(1, Ordering::Relaxed);
+    /// When no new picture was wanted: told by the link's thread, read by the collector.
+    pub fn dark(&self) -> &DarkLog {
+        &self.dark
+    }
+
+    /// Tells the operator something. Not from the frame path: it takes a lock.
+    pub fn note(&self, text: String) {
+        let mut notes = self.notes.lock().unwrap_or_else(PoisonError::into_inner);
+        if notes.waiting.len() < NOTES {
+            notes.waiting.push_back(text);
+        } else {
+            notes.left_out += 1;
+        }
+    }
+
+    /// What the operator has to be told, once each, oldest first.
+    pub fn take_notes(&self) -> Vec<String> {
+        let mut notes = self.notes.lock().unwrap_or_else(PoisonError::into_inner);
+        let mut all: Vec<String> = notes.waiting.drain(..).collect();
+        match std::mem::take(&mut notes.left_out) {
+            0 => {}
+            n => all.push(format!("{n} more notes were left out")),
+        }
+        all
+    }
+
+    /// Says how many slots are decided so far in which a frame was wanted, and how many of these were missed.
+    pub fn set_slots(&self, wanted: u64, missed: u64) {
+        self.slots.store(wanted, Ordering::Relaxed);
+        self.slots_missed.store(missed, Ordering::Relaxed);
+    }
+
+    /// Counts a frame whose light left the projector, whether every body was `dark` in it, and whether it came after its slot.
+    pub fn count_lit(&self, dark: bool, late: bool) {
+        let frames = if dark { &self.frames_dark } else { &self.frames_lit };
+        frames.fetch_add(1, Ordering::Relaxed);
         if late {
             self.frames_late.fetch_add(1, Ordering::Relaxed);
         }
@@ -236,11 +332,20 @@ impl RunMonitor {
         self.frames_dropped.fetch_add(1, Ordering::Relaxed);
     }
 
+    /// Counts a frame that was not lit because no new picture was wanted.
+    pub fn count_withheld(&self) {
+        self.frames_withheld.fetch_add(1, Ordering::Relaxed);
+    }
+
     /// The counters now; each is exact, together they are a moment apart.
     pub fn counts(&self) -> RunCounts {
         RunCounts {
             frames_planned: self.frames_planned.load(Ordering::Relaxed),
             frames_lit: self.frames_lit.load(Ordering::Relaxed),
+            frames_dark: self.frames_dark.load(Ordering::Relaxed),
+            frames_withheld: self.frames_withheld.load(Ordering::Relaxed),
+            slots: self.slots.load(Ordering::Relaxed),
+            slots_missed: self.slots_missed.load(Ordering::Relaxed),
             frames_dropped: self.frames_dropped.load(Ordering::Relaxed),
             frames_late: self.frames_late.load(Ordering::Relaxed),
         }
@@ -272,6 +377,17 @@ mod tests {
     }
 
     #[test]
+    fn notes_are_told_once_and_do_not_pile_up() {
+        let monitor = RunMonitor::default();
+        assert!(monitor.take_notes().is_empty());
+        (0..NOTES + 7).for_each(|k| monitor.note(k.to_string()));
+        let told = monitor.take_notes();
+        assert_eq!((told.len(), told[0].as_str()), (NOTES + 1, "0"));
+        assert_eq!(told[NOTES], "7 more notes were left out");
+        assert!(monitor.take_notes().is_empty());
+    }
+
+    #[test]
     fn the_projectors_health_crosses_the_atomic_whole() {
         use ProjectorHealth as H;
         let all = [
@@ -292,6 +408,7 @@ mod tests {
             monitor.set_projector(health);
             assert_eq!(monitor.projector(), health);
         }
+        assert!(all.iter().all(|h| h.word().len() <= 10));
         assert!(H::Faulted(faults::LAMP).to_string().contains("lamp"));
     }
 }

@@ -22,6 +22,8 @@ pub(super) struct Inbox {
     pub device_forgot: bool,
     pub echoes: [Option<EchoSample>; ECHOES_KEPT],
     pub next_echo: usize,
+    /// When the newest exchange that was answered had begun.
+    pub echo_answered: HostTime,
     pub ignored: u64,
     pub damaged: u64,
 }
@@ -71,6 +73,7 @@ impl Inbox {
             device_forgot: false,
             echoes: [None; ECHOES_KEPT],
             next_echo: 0,
+            echo_answered: HostTime(i64::MIN),
             ignored: 0,
             damaged: 0,
         }
@@ -106,6 +109,7 @@ impl Inbox {
                     host_received_at: self.arrived_at,
                 });
                 self.next_echo += 1;
+                self.echo_answered = sent_at;
             }
             DeviceMessage::Fault(f) => self.fault = Some(*f),
         }

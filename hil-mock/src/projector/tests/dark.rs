@@ -204,6 +204,35 @@ fn a_frame_that_ends_before_it_begins_has_a_wrong_field() {
     assert_eq!((s.frames_lit, s.lit), (2, false));
 }
 
+/// Found in use, R16 and its kind: what happens by itself is told with its own instant, however late somebody looks.
+#[test]
+fn changes_of_light_and_state_carry_their_own_instants() {
+    let (mut rig, slots) = armed();
+    let k = rig.slot + 2;
+    let states: Vec<DeviceState> =
+        std::iter::from_fn(|| rig.cable.device_mut().next_change()).map(|change| change.state).collect();
+    assert_eq!(states, [DeviceState::Greeted, DeviceState::Configured, DeviceState::Armed]);
+    let dark = DeviceTicks(slots.start(k + 3).0 + 777);
+    send(&mut rig, 1, k, dark);
+    // Nobody looks for a second.
+    let heard = rig.now;
+    rig.cable.device_mut().advance_to(heard.plus_ns(1_000_000_000));
+    let bite = heard.plus_ns(i64::from(WATCHDOG_US) * 1000);
+    let mut next = || rig.cable.device_mut().next_change().map(|c| (c.at.0, c.frame, c.state, c.faults));
+    assert_eq!(next(), Some((slots.start(k).0 as i64, Some(1), DeviceState::Armed, 0)));
+    assert_eq!(next(), Some((dark.0 as i64, None, DeviceState::Armed, 0)));
+    assert_eq!(next(), Some((bite.0, None, DeviceState::Faulted, faults::WATCHDOG)));
+    assert_eq!(next(), None);
+    // And an order's is that of its arrival.
+    let (mut rig, slots) = armed();
+    let k = rig.slot + 2;
+    send(&mut rig, 1, k, slots.start(k + 30));
+    live(&mut rig, slots.start(k + 4).0 + 4321);
+    rig.link.command(rig.now, Verb::Black, &mut rig.cable).unwrap();
+    let last = std::iter::from_fn(|| rig.cable.device_mut().next_change()).last().unwrap();
+    assert_eq!((last.at, last.frame, last.state), (rig.now, None, DeviceState::Black));
+}
+
 proptest! {
     #![proptest_config(ProptestConfig::with_cases(64))]
 
@@ -221,6 +250,7 @@ proptest! {
         rig.stream();
         let slots = rig.link.slots().unwrap();
         let mut ends = std::collections::HashMap::new();
+        let mut told = false;
         for (id, (action, ahead, keep, wait)) in steps.into_iter().enumerate() {
             let _ = rig.poll();
             match action {
@@ -251,6 +281,11 @@ proptest! {
                     let end = ends[&device.lit_frame().unwrap()];
                     prop_assert!(clock.ticks_at(due) < end, "lit at {:?}, over since {end:?}", clock.ticks_at(due));
                 }
+                while let Some(change) = device.next_change() {
+                    told = change.frame.is_some();
+                    prop_assert!(change.at <= due);
+                }
+                prop_assert_eq!(told, s.lit);
                 rig.now = due.max(rig.now.plus_ns(1));
             }
         }
