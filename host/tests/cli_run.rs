@@ -406,7 +406,7 @@ fn a_real_rig_runs_against_the_mocks_for_as_long_as_it_is_told() {
         assert!(lit > 0 && lit + dropped <= 40, "{json}");
         // Two seconds of slots: frames that a slow machine cannot make are left out, not waited for.
         let wall = json["wall_s"].as_f64().expect("a time");
-        assert!(pace == "virtual" || wall < 20.0, "{wall} s");
+        assert!(pace == "virtual" || wall < 60.0, "{wall} s");
     }
     let output = dpm(
         &[

@@ -604,7 +604,7 @@ fn no_file_of_a_megabyte_takes_long() {
             .map(|scene| dpm_host::render::scene_data::SceneData::build(&scene).map(|d| d.triangles.len()));
         let took = start.elapsed();
         println!("{name}: {} bytes, {took:?}", bytes.len());
-        assert!(took < Duration::from_secs(40), "{name} took {took:?}");
+        assert!(took < Duration::from_secs(120), "{name} took {took:?}");
         match ready {
             Ok(built) => assert!(accepted && built.is_ok(), "{name} was accepted"),
             Err(e) => assert!(!accepted && e.to_string().contains("limit"), "{name}: {e}"),

@@ -265,11 +265,15 @@ pub(super) fn optimise(bvh: &mut Bvh2, share: f32, work: &mut Work) -> bool {
             .collect();
         candidates.radix_sort_unstable();
         let mut moves = Vec::new();
+        let mut exhausted = false;
         for candidate in &candidates[..count - 1] {
             match better_place(bvh, candidate.node as usize, &mut stack, work) {
                 Some(found) if found.gain > 0.0 => moves.push(found),
                 Some(_) => {}
-                None => return true,
+                None => {
+                    exhausted = true;
+                    break;
+                }
             }
         }
         moves.sort_unstable_by(|a: &Move, b: &Move| b.gain.total_cmp(&a.gain));
@@ -283,6 +287,9 @@ pub(super) fn optimise(bvh: &mut Bvh2, share: f32, work: &mut Work) -> bool {
             }
             nodes.iter().for_each(|&n| touched[n] = true);
             reinsert_node(bvh, from, to);
+        }
+        if exhausted {
+            break;
         }
     }
     levels(bvh) <= DEEPEST
@@ -484,7 +491,7 @@ mod tests {
             let tree = own(&boxes, BodyBvh::share(boxes.len()));
             let depth = check_tree(&boxes, &tree);
             println!("{name}: {} boxes, {depth} levels, {:?}", boxes.len(), start.elapsed());
-            assert!(start.elapsed() < Duration::from_secs(30), "{name}: {:?}", start.elapsed());
+            assert!(start.elapsed() < Duration::from_secs(120), "{name}: {:?}", start.elapsed());
             let levels = BodyBvh::of_boxes(&boxes).levels();
             assert!(levels <= 25, "{name}: {levels} of the wide tree");
         }
