@@ -6,6 +6,7 @@ use dpm_host::render::{FrameInputs, Renderer};
 use dpm_host::telemetry::monitor::RunMonitor;
 use dpm_tests::gpu::with_gpu;
 use dpm_tests::rigs::{demo_rig, run};
+use std::sync::Arc;
 use std::time::{Duration, Instant};
 
 /// Every frame by itself: no picture depends on former ones, so that a single one can be drawn again.
@@ -164,7 +165,7 @@ fn a_stop_request_ends_the_run_at_once() {
     with_gpu(|gpu| {
         for pace in [REAL, "real_time.pace=\"virtual\""] {
             let rig = demo_rig(32, 24, &[pace, "render.spp=1"]);
-            let monitor = RunMonitor::default();
+            let monitor = Arc::new(RunMonitor::default());
             let options = RunOptions::default();
             let took = std::thread::scope(|scope| {
                 let stopper = scope.spawn(|| {

@@ -159,10 +159,11 @@ fn right(name: &str, granted: &str, tried: Result<(), Refusal>) -> Finding {
 
 /// Runs `ask` on a thread that ends at once, so that this one keeps nothing.
 fn briefly(ask: fn() -> Result<(), Refusal>) -> Result<(), Refusal> {
-    std::thread::spawn(ask).join().unwrap_or_else(|_| {
-        let reason = "the thread that asked panicked".to_string();
-        Err(Refusal { what: "a right".into(), reason, remedy: String::new() })
-    })
+    let refused = |reason: String| Err(Refusal { what: "a right".into(), reason, remedy: String::new() });
+    match std::thread::Builder::new().spawn(ask) {
+        Ok(thread) => thread.join().unwrap_or_else(|_| refused("the thread that asked panicked".to_string())),
+        Err(e) => refused(format!("no thread to ask it: {e}")),
+    }
 }
 
 fn lock_and_unlock() -> Result<(), Refusal> {

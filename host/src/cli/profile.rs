@@ -3,15 +3,19 @@
 use super::rig_args::RigArgs;
 use super::watch::{print, watch};
 use crate::experiments::profile::profile_rig;
-use crate::failure::{Failure, FailureKind};
+use crate::failure::{Ended, Failure, FailureKind};
 use crate::telemetry::compare::{compare, failed_gates, to_table};
 use crate::telemetry::monitor::RunCounts;
 use crate::telemetry::profile::ProfileReport;
 use crate::telemetry::prometheus::{page, PageServer};
+use dpm_device::regular_file;
 use std::path::{Path, PathBuf};
 
 /// Length of a profile without `--seconds` or `--frames`, s.
 const SECONDS: f64 = 10.0;
+
+/// Largest profile.json that is read, bytes; those of a day have some tens of thousands.
+const MAX_PROFILE_BYTES: u64 = 64 << 20;
 
 /// Flags of `dpm profile`.
 #[derive(clap::Args, Clone, Debug)]
@@ -58,8 +62,8 @@ pub fn execute(args: &ProfileArgs) -> Result<(), Failure> {
     }
     let mut flags = args.flags.clone();
     // In front, so that an explicit --set wins.
-    let pace = "real_time.pace=\"real\"".to_owned();
-    flags.set.splice(0..0, [pace, "output.images=false".into(), "output.trace=true".into()]);
+    flags.set.splice(0..0, ["output.images=false".into(), "output.trace=true".into()]);
+    flags.pace.get_or_insert_with(|| "real".into());
     flags.out.get_or_insert_with(|| "out/profile".into());
     if flags.frames.is_none() {
         flags.seconds.get_or_insert(SECONDS);
@@ -75,7 +79,7 @@ pub fn execute(args: &ProfileArgs) -> Result<(), Failure> {
         None => None,
     };
     let prepared = args.no_render;
-    let profile = watch(
+    let Ended { report: profile, failure } = watch(
         rig,
         |counts| {
             if let Some(server) = &server {
@@ -107,6 +111,7 @@ pub fn execute(args: &ProfileArgs) -> Result<(), Failure> {
         );
         return Err(Failure::new(FailureKind::CheckFailed, told));
     }
+    failure.map_or(Ok(()), Err)?;
     profile.report.check_lit()
 }
 
@@ -117,7 +122,7 @@ fn read(path: &Path) -> Result<ProfileReport, Failure> {
             format!("{}: not a profile.json of dpm profile: {e}", path.display()),
         )
     };
-    let text = std::fs::read_to_string(path).map_err(|e| {
+    let text = regular_file::read_text(path, MAX_PROFILE_BYTES).map_err(|e| {
         let told =
             format!("{}: cannot read it: {e}; give two files profile.json of dpm profile", path.display());
         Failure::new(FailureKind::BadInput, told)

@@ -1,8 +1,8 @@
 //! `dpm profile`: a rig at its true rate into distributions, logs, trace and plots.
 
-use super::run_rig::{cannot_write, open_gpu, traced_raster};
+use super::run_rig::{cannot_write, check_output_folder, open_gpu, traced_raster};
 use crate::config::RigConfig;
-use crate::failure::Failure;
+use crate::failure::{Ended, Failure};
 use crate::files::write_atomically;
 use crate::pipeline::{self, RunOptions, RunOutcome};
 use crate::rig::Rig;
@@ -42,9 +42,11 @@ pub fn profile_rig(
     config: &RigConfig,
     prepared: bool,
     monitor: &Arc<RunMonitor>,
-) -> Result<Profile, Failure> {
+) -> Result<Ended<Profile>, Failure> {
+    check_output_folder(&config.output.dir)?;
     // As many slots, not frames: a rig that cannot keep its rate must not profile for minutes.
-    let options = RunOptions { slots: config.run.frames, ..RunOptions::default() };
+    let slots = if config.run.frames > 0 { config.run.frames } else { config.slots_to_run() };
+    let options = RunOptions { slots, ..RunOptions::default() };
     let (outcome, notes, rig) = if prepared {
         let rig = Arc::new(Rig::build(config, None)?);
         (pipeline::run_prepared(rig.clone(), options, monitor)?, Vec::new(), rig)
@@ -56,8 +58,11 @@ pub fn profile_rig(
     };
     let mut profile = summary(&outcome, &rig, prepared);
     profile.report.warnings.splice(0..0, notes);
-    save(&mut profile, &outcome, &config.output.dir)?;
-    Ok(profile)
+    let _writing = crate::stopping::WritingFiles::begin();
+    let saved = save(&mut profile, &outcome, &config.output.dir);
+    let mut ended = Ended::from(profile);
+    ended.keep(saved);
+    Ok(ended)
 }
 
 fn summary(outcome: &RunOutcome, rig: &Rig, prepared: bool) -> Profile {

@@ -1,7 +1,7 @@
 //! Buffers: memory for shaders, mapped for the host where asked.
 
-use super::context::Gpu;
-use super::error::{Context as _, GpuError};
+use super::context::{Gpu, On as _};
+use super::error::{GpuError, MemoryPool};
 use ash::vk;
 use bytemuck::Pod;
 use std::ptr::NonNull;
@@ -25,6 +25,8 @@ pub struct Buffer {
     memory: vk::DeviceMemory,
     mapped: Option<NonNull<u8>>,
     len_bytes: usize,
+    /// What was allocated, alignment included.
+    held_bytes: u64,
     gpu: Arc<Gpu>,
 }
 
@@ -107,7 +109,7 @@ impl Buffer {
         // SAFETY: the buffer was created with texel usage and is alive.
         self.view = Some(
             unsafe { self.gpu.device.create_buffer_view(&info, None) }
-                .context("creating a texel-buffer view")?,
+                .on(&self.gpu, "creating a texel-buffer view")?,
         );
         Ok(self)
     }
@@ -145,24 +147,28 @@ impl Buffer {
             | vk::BufferUsageFlags::TRANSFER_DST
             | extra;
         let info = vk::BufferCreateInfo::default().size(len_bytes as u64).usage(usage);
+        gpu.alive("making a buffer")?;
         // SAFETY: valid create info; every handle made here is destroyed in Drop or on the error path below.
         unsafe {
-            let handle = gpu.device.create_buffer(&info, None).context("creating a buffer")?;
+            let handle = gpu.device.create_buffer(&info, None).on(gpu, "creating a buffer")?;
             let needs = gpu.device.get_buffer_memory_requirements(handle);
-            let memory = match Self::allocate(gpu, what, needs, kind) {
+            let memory = match gpu.takes(needs.size).and_then(|()| Self::allocate(gpu, what, needs, kind)) {
                 Ok(memory) => memory,
                 Err(e) => {
                     gpu.device.destroy_buffer(handle, None);
                     return Err(e);
                 }
             };
-            let mut buffer = Self { handle, view: None, memory, mapped: None, len_bytes, gpu: gpu.clone() };
-            gpu.device.bind_buffer_memory(handle, memory, 0).context("binding buffer memory")?;
+            gpu.holds(needs.size, 0);
+            let held_bytes = needs.size;
+            let mut buffer =
+                Self { handle, view: None, memory, mapped: None, len_bytes, held_bytes, gpu: gpu.clone() };
+            gpu.device.bind_buffer_memory(handle, memory, 0).on(gpu, "binding buffer memory")?;
             if kind != MemoryKind::Device {
                 let pointer = gpu
                     .device
                     .map_memory(memory, 0, vk::WHOLE_SIZE, vk::MemoryMapFlags::empty())
-                    .context("mapping a buffer")?;
+                    .on(gpu, "mapping a buffer")?;
                 buffer.mapped = NonNull::new(pointer.cast());
                 buffer.bytes_mut().fill(0);
             }
@@ -203,15 +209,18 @@ impl Buffer {
                 }
             }
         }
-        if matches!(last, vk::Result::ERROR_OUT_OF_DEVICE_MEMORY | vk::Result::ERROR_OUT_OF_HOST_MEMORY) {
-            let heaps = &gpu.memory.memory_heaps[..gpu.memory.memory_heap_count as usize];
-            return Err(GpuError::OutOfMemory {
-                what: what.to_owned(),
-                needed_mib: needs.size.div_ceil(1 << 20),
-                heap_mib: heaps.iter().map(|h| h.size >> 20).max().unwrap_or(0),
-            });
-        }
-        Err(last).context("allocating GPU memory")
+        let pool = match last {
+            vk::Result::ERROR_OUT_OF_DEVICE_MEMORY => MemoryPool::Device,
+            vk::Result::ERROR_OUT_OF_HOST_MEMORY => MemoryPool::Host,
+            other => return Err(other).on(gpu, "allocating GPU memory"),
+        };
+        Err(GpuError::OutOfMemory {
+            operation: format!("making the buffer of the {what}"),
+            device: gpu.device_name().clone(),
+            pool,
+            needed_mib: Some(needs.size.div_ceil(1 << 20)),
+            heap_mib: gpu.heap_mib(),
+        })
     }
 
     /// Size in bytes (at least 16).
@@ -256,7 +265,7 @@ impl Drop for Buffer {
         if self.gpu.is_abandoned() {
             return;
         }
-        // SAFETY: owners wait for the GPU before dropping (FrameFence does in its Drop); handles are ours alone.
+        // SAFETY: owners wait for the GPU before dropping (FrameFence does in its Drop), or the device is lost; handles are ours alone.
         unsafe {
             if let Some(view) = self.view {
                 self.gpu.device.destroy_buffer_view(view, None);
@@ -264,5 +273,6 @@ impl Drop for Buffer {
             self.gpu.device.destroy_buffer(self.handle, None);
             self.gpu.device.free_memory(self.memory, None);
         }
+        self.gpu.holds(0, self.held_bytes);
     }
 }

@@ -1,8 +1,8 @@
 //! Command lists recorded once and submitted every frame, with time stamps between passes.
 
 use super::buffer::Buffer;
-use super::context::Gpu;
-use super::error::{Context as _, GpuError};
+use super::context::{Gpu, On as _};
+use super::error::GpuError;
 use super::pipeline::{BindingSet, ComputePipeline};
 use ash::vk;
 use std::sync::Arc;
@@ -27,29 +27,29 @@ impl CommandList {
         max_stamps: u32,
         record: impl FnOnce(&mut Recorder<'_>),
     ) -> Result<Self, GpuError> {
+        gpu.alive("recording commands")?;
         let d = &gpu.device;
         let info = vk::CommandPoolCreateInfo::default().queue_family_index(gpu.queue_family);
         // SAFETY: valid create infos; everything is destroyed in Drop.
         unsafe {
-            let pool = d.create_command_pool(&info, None).context("creating a command pool")?;
+            let pool = d.create_command_pool(&info, None).on(gpu, "creating a command pool")?;
+            let buffer = vk::CommandBuffer::null();
+            let mut list = Self { buffer, pool, queries: None, stamps: 0, max_stamps, gpu: gpu.clone() };
             let info = vk::CommandBufferAllocateInfo::default().command_pool(pool).command_buffer_count(1);
-            let buffer = d.allocate_command_buffers(&info).context("allocating a command buffer")?[0];
-            let queries = if max_stamps > 0 && gpu.summary().timestamp_period_ns > 0.0 {
+            list.buffer = d.allocate_command_buffers(&info).on(gpu, "allocating a command buffer")?[0];
+            if max_stamps > 0 && gpu.summary().timestamp_period_ns > 0.0 {
                 let info = vk::QueryPoolCreateInfo::default()
                     .query_type(vk::QueryType::TIMESTAMP)
                     .query_count(max_stamps);
-                Some(d.create_query_pool(&info, None).context("creating time stamps")?)
-            } else {
-                None
-            };
-            let mut list = Self { buffer, pool, queries, stamps: 0, max_stamps, gpu: gpu.clone() };
+                list.queries = Some(d.create_query_pool(&info, None).on(gpu, "creating time stamps")?);
+            }
             let begin = vk::CommandBufferBeginInfo::default();
-            d.begin_command_buffer(buffer, &begin).context("beginning a command buffer")?;
-            if let Some(q) = queries {
-                d.cmd_reset_query_pool(buffer, q, 0, max_stamps);
+            d.begin_command_buffer(list.buffer, &begin).on(gpu, "beginning a command buffer")?;
+            if let Some(q) = list.queries {
+                d.cmd_reset_query_pool(list.buffer, q, 0, max_stamps);
             }
             record(&mut Recorder { list: &mut list });
-            d.end_command_buffer(buffer).context("ending a command buffer")?;
+            d.end_command_buffer(list.buffer).on(gpu, "ending a command buffer")?;
             Ok(list)
         }
     }
@@ -57,7 +57,7 @@ impl CommandList {
     /// Time stamps of the last finished run, in nanoseconds since the first of them; fills and returns how many there are.
     /// Allocates nothing.
     pub fn stamps_ns(&self, out: &mut [u64]) -> usize {
-        let Some(queries) = self.queries else { return 0 };
+        let Some(queries) = self.queries.filter(|_| !self.gpu.is_lost()) else { return 0 };
         let n = (self.stamps as usize).min(out.len());
         // SAFETY: the queries were written by the last submission, whose fence the caller waited for.
         let ok = unsafe {
@@ -74,19 +74,21 @@ impl CommandList {
         n
     }
 
-    /// Runs the list; `fence` is signalled when it is done.
+    /// Runs the list; `fence` is signalled when it is done. A device that is lost or was given up is not asked.
     ///
     /// # Errors
-    /// Device lost, or out of memory in the driver.
+    /// Device lost or given up, [`GpuError::InFlight`] when the fence's last submission was not waited for to its end, out of memory in
+    /// the driver.
     pub fn submit(&self, fence: &mut FrameFence) -> Result<(), GpuError> {
+        let gpu = &self.gpu;
+        fence.check_free()?;
         let buffers = [self.buffer];
         let info = [vk::SubmitInfo::default().command_buffers(&buffers)];
-        // Only the render thread submits on the frame path, so this lock is never contended there.
-        let queue = self.gpu.queue.lock().map_err(|_| GpuError::DeviceLost("submitting"))?;
+        let queue = gpu.queue()?;
         // SAFETY: the fence is unsignalled and unused: `wait` consumed its last run.
         unsafe {
-            self.gpu.device.reset_fences(&[fence.fence]).context("resetting a fence")?;
-            self.gpu.device.queue_submit(*queue, &info, fence.fence).context("submitting a frame")?;
+            gpu.device.reset_fences(&[fence.fence]).on(gpu, "resetting a fence")?;
+            gpu.device.queue_submit(*queue, &info, fence.fence).on(gpu, "submitting a frame")?;
         }
         fence.pending = true;
         Ok(())
@@ -228,10 +230,10 @@ impl Recorder<'_> {
     }
 }
 
-/// How long the end of a submission is waited for when its memory is to be freed. After that the memory stays with the device.
-const LAST_WAIT_NS: u64 = 5_000_000_000;
+/// How long the end of a submission is waited for when its memory is to be freed. After that the device is given up, and keeps it.
+const LAST_WAIT_NS: u64 = 2_000_000_000;
 
-/// Tells when a submission is done.
+/// Tells when a submission is done. Dropping it waits for the submission, at most 2 s, and not at all when the device is lost or given up.
 pub struct FrameFence {
     fence: vk::Fence,
     pending: bool,
@@ -242,56 +244,96 @@ impl FrameFence {
     /// # Errors
     /// Vulkan's.
     pub fn new(gpu: &Arc<Gpu>) -> Result<Self, GpuError> {
+        gpu.alive("making a fence")?;
         // SAFETY: valid create info; destroyed in Drop.
         let fence = unsafe { gpu.device.create_fence(&vk::FenceCreateInfo::default(), None) }
-            .context("creating a fence")?;
+            .on(gpu, "creating a fence")?;
         Ok(Self { fence, pending: false, gpu: gpu.clone() })
     }
 
-    /// Waits at most `timeout_ns` for the last submission; returns at once when there is none.
+    /// Waits at most `timeout_ns` for the last submission; returns at once when there is none. May be called again after a timeout, as often
+    /// as one likes: a wait that is cut into pieces is the same wait.
     ///
     /// # Errors
-    /// [`GpuError::Timeout`] (the submission is still pending) or device lost.
+    /// [`GpuError::Timeout`] (the submission is still pending), or device lost or given up.
     pub fn wait(&mut self, timeout_ns: u64) -> Result<(), GpuError> {
-        if !self.pending {
+        if self.poll(timeout_ns)? {
             return Ok(());
+        }
+        let device = self.gpu.device_name().clone();
+        Err(GpuError::Timeout { device, waited_ms: timeout_ns / 1_000_000 })
+    }
+
+    /// The same with false for a timeout. Allocates nothing.
+    ///
+    /// # Errors
+    /// Device lost or given up: for ever, what it was to signal does not become valid any more.
+    pub fn poll(&mut self, timeout_ns: u64) -> Result<bool, GpuError> {
+        self.gpu.alive("waiting for a frame")?;
+        if !self.pending {
+            return Ok(true);
         }
         // SAFETY: the fence is alive.
         match unsafe { self.gpu.device.wait_for_fences(&[self.fence], true, timeout_ns) } {
             Ok(()) => {
                 self.pending = false;
-                Ok(())
+                Ok(true)
             }
-            Err(vk::Result::TIMEOUT) => Err(GpuError::Timeout(timeout_ns / 1_000_000)),
-            Err(e) => {
-                self.pending = false;
-                Err(e).context("waiting for a frame")
-            }
+            Err(vk::Result::TIMEOUT) => Ok(false),
+            // Still pending for all that is known, unless the device is lost, which it remembers.
+            Err(e) => Err(e).on(&self.gpu, "waiting for a frame"),
         }
+    }
+
+    /// Refuses to be used for two submissions at once.
+    ///
+    /// # Errors
+    /// Device lost or given up; [`GpuError::InFlight`].
+    pub(crate) fn check_free(&self) -> Result<(), GpuError> {
+        self.gpu.alive("submitting a frame")?;
+        if self.pending {
+            return Err(GpuError::InFlight { device: self.gpu.device_name().clone() });
+        }
+        Ok(())
     }
 }
 
 impl Drop for FrameFence {
     fn drop(&mut self) {
-        if self.gpu.is_abandoned() || matches!(self.wait(LAST_WAIT_NS), Err(GpuError::Timeout(_))) {
-            return self.gpu.abandon();
+        if !matches!(self.poll(LAST_WAIT_NS), Ok(true)) && !self.gpu.is_lost() {
+            self.gpu.give_up();
+        }
+        if self.gpu.is_abandoned() {
+            return;
         }
         // SAFETY: not pending any more, or the device is lost.
         unsafe { self.gpu.device.destroy_fence(self.fence, None) }
     }
 }
 
-/// Copies now and waits: for loading, never on the frame path.
-pub(super) fn copy_now(gpu: &Arc<Gpu>, from: &Buffer, to: &Buffer, bytes: usize) -> Result<(), GpuError> {
-    let list = CommandList::record(gpu, 0, |r| r.copy(from, to, bytes))?;
+/// Records, runs and waits: for loading, never on the frame path. A device that does not finish is given up.
+///
+/// # Errors
+/// Vulkan's, or [`GpuError::Timeout`].
+pub(crate) fn run_now(gpu: &Arc<Gpu>, record: impl FnOnce(&mut Recorder<'_>)) -> Result<(), GpuError> {
+    let list = CommandList::record(gpu, 0, record)?;
     let mut fence = FrameFence::new(gpu)?;
     list.submit(&mut fence)?;
-    fence.wait(60_000_000_000)
+    let done = fence.wait(gpu.setup_wait_ns());
+    if matches!(done, Err(GpuError::Timeout { .. })) {
+        gpu.give_up();
+    }
+    done
+}
+
+/// Copies now and waits: for loading, never on the frame path.
+pub(super) fn copy_now(gpu: &Arc<Gpu>, from: &Buffer, to: &Buffer, bytes: usize) -> Result<(), GpuError> {
+    run_now(gpu, |r| r.copy(from, to, bytes))
 }
 
 #[cfg(test)]
 mod tests {
-    use crate::gpu::{Buffer, Gpu, GpuOptions, MemoryKind};
+    use crate::gpu::{memory_given_up, Buffer, Gpu, GpuOptions, MemoryKind};
 
     /// Large enough that its pages go back to the system when it is freed: reading them then would end this process.
     const LEN: usize = 64 << 20;
@@ -302,10 +344,15 @@ mod tests {
         let mut buffer = Buffer::new(&gpu, "kept", LEN, MemoryKind::Upload).expect("memory");
         buffer.bytes_mut().fill(7);
         let first = buffer.bytes_mut().as_ptr();
-        gpu.abandon();
+        let before = memory_given_up();
+        gpu.give_up();
+        gpu.give_up();
         drop((buffer, gpu));
-        // SAFETY: what an abandoned device holds is never freed.
+        // SAFETY: what a device that was given up holds is never freed.
         let bytes = unsafe { std::slice::from_raw_parts(first, LEN) };
         assert!(bytes.iter().step_by(4096).all(|b| *b == 7));
+        // Counted once, and by no more than what it held. (Other tests of this process may give up devices of their own meanwhile.)
+        let after = memory_given_up();
+        assert!(after.devices > before.devices && after.bytes >= before.bytes + LEN as u64);
     }
 }

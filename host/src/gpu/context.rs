@@ -1,11 +1,18 @@
 //! Picks a device and opens it.
 
-use super::error::{Context as _, GpuError};
+use super::address_space;
+use super::error::GpuError;
 use ash::{ext, khr, vk};
 use std::ffi::{c_void, CStr, CString};
 use std::mem::ManuallyDrop;
-use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
-use std::sync::{Arc, Mutex};
+use std::sync::atomic::{AtomicU64, AtomicU8, Ordering};
+use std::sync::{Arc, Mutex, MutexGuard, PoisonError, TryLockError};
+use std::time::{Duration, Instant};
+
+/// How long the copies of a first start are waited for, nanoseconds: a slow machine may do other things too.
+const FIRST_SETUP_WAIT_NS: u64 = 60_000_000_000;
+/// Longest wait for a queue that another thread submits to.
+const QUEUE_WAIT: Duration = Duration::from_secs(2);
 
 /// How to open the GPU.
 #[derive(Clone, Debug, Default)]
@@ -73,23 +80,104 @@ unsafe extern "system" fn on_message(
 }
 
 /// An open device. Shared by everything made from it; closed when the last of them is gone.
+///
+/// Once a device [is lost](Gpu::is_lost) nothing is asked of it any more: every call that would use it fails at once. A device that its
+/// driver calls lost is closed as any other. One that was [given up](Gpu::give_up) because it did not finish may go on using all that it
+/// was given, for as long as it likes: nothing is taken from it, and its memory stays taken until the process ends
+/// ([`memory_given_up`] tells how much).
 pub struct Gpu {
     pub(super) device: ash::Device,
-    pub(super) queue: Mutex<vk::Queue>,
+    queue: Mutex<vk::Queue>,
     pub(super) queue_family: u32,
     pub(super) memory: vk::PhysicalDeviceMemoryProperties,
     pub(super) limits: vk::PhysicalDeviceLimits,
     summary: DeviceSummary,
-    debug: Option<(ext::debug_utils::Instance, vk::DebugUtilsMessengerEXT)>,
-    instance: ash::Instance,
-    entry: ManuallyDrop<ash::Entry>,
-    /// The device did not finish in time: it may use everything it was given for as long as it likes, so nothing is taken from it any more.
-    abandoned: AtomicBool,
+    /// The device's name, for errors.
+    name: Arc<str>,
+    pub(super) id: DeviceId,
+    pub(super) options: GpuOptions,
+    instance: ManuallyDrop<Instance>,
+    /// One of [`State`].
+    state: AtomicU8,
+    /// Memory that buffers hold, bytes.
+    held_bytes: AtomicU64,
+    /// Software Vulkan in a process whose address space is limited: how much buffers may take of it, bytes.
+    most_bytes: Option<u64>,
+    /// How long copies at set-up are waited for, nanoseconds.
+    setup_wait_ns: u64,
+}
+
+/// How a device is.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+#[repr(u8)]
+enum State {
+    /// It works, as far as is known.
+    Well,
+    /// Its driver says that it is lost: nothing runs on it, and all that was made from it may be destroyed.
+    Lost,
+    /// It did not finish in time: it may be using everything it was given.
+    GivenUp,
+}
+
+/// Which device it is, over several lists of the same machine.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub(super) struct DeviceId {
+    uuid: [u8; vk::UUID_SIZE],
+    name: String,
+    /// Several may be the same in all of this (software Vulkan): which of them, in the order of the list.
+    twin: usize,
 }
 
 impl std::fmt::Debug for Gpu {
     fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
         f.debug_struct("Gpu").field("device", &self.summary.name).finish()
+    }
+}
+
+/// Memory of devices that were given up: it stays taken until the process ends.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub struct MemoryGivenUp {
+    /// How many devices were given up so far.
+    pub devices: u64,
+    /// What their buffers hold, bytes.
+    pub bytes: u64,
+}
+
+static DEVICES_GIVEN_UP: AtomicU64 = AtomicU64::new(0);
+static BYTES_GIVEN_UP: AtomicU64 = AtomicU64::new(0);
+
+/// Memory of all devices that this process gave up ([`Gpu::give_up`]).
+pub fn memory_given_up() -> MemoryGivenUp {
+    MemoryGivenUp {
+        devices: DEVICES_GIVEN_UP.load(Ordering::Relaxed),
+        bytes: BYTES_GIVEN_UP.load(Ordering::Relaxed),
+    }
+}
+
+/// An instance with its messenger and the loader, destroyed in this order.
+struct Instance {
+    debug: Option<(ext::debug_utils::Instance, vk::DebugUtilsMessengerEXT)>,
+    handle: ash::Instance,
+    _entry: ash::Entry,
+}
+
+impl std::ops::Deref for Instance {
+    type Target = ash::Instance;
+
+    fn deref(&self) -> &ash::Instance {
+        &self.handle
+    }
+}
+
+impl Drop for Instance {
+    fn drop(&mut self) {
+        // SAFETY: devices made from it are gone (`Gpu` closes its own first), and the loader outlives this call.
+        unsafe {
+            if let Some((loader, messenger)) = &self.debug {
+                loader.destroy_debug_utils_messenger(*messenger, None);
+            }
+            self.handle.destroy_instance(None);
+        }
     }
 }
 
@@ -102,10 +190,13 @@ fn version_text(v: u32) -> String {
     format!("{}.{}.{}", vk::api_version_major(v), vk::api_version_minor(v), vk::api_version_patch(v))
 }
 
-fn create_instance(
-    entry: &ash::Entry,
-    validation: bool,
-) -> Result<(ash::Instance, Option<(ext::debug_utils::Instance, vk::DebugUtilsMessengerEXT)>), GpuError> {
+/// The error of a call that is not for any device yet.
+fn without_device(operation: &'static str) -> impl Fn(vk::Result) -> GpuError {
+    move |result| GpuError::from_result(result, operation, &"the Vulkan loader".into(), 0)
+}
+
+fn create_instance(validation: bool) -> Result<Instance, GpuError> {
+    let entry = load()?;
     let application =
         vk::ApplicationInfo::default().application_name(c"dpm").api_version(vk::make_api_version(0, 1, 2, 0));
     let layer = c"VK_LAYER_KHRONOS_validation";
@@ -130,12 +221,13 @@ fn create_instance(
         info = info.push_next(&mut features);
     }
     // SAFETY: `info` and what it points to live until the call returns.
-    let instance = unsafe { entry.create_instance(&info, None) }.map_err(|e| match e {
+    let handle = unsafe { entry.create_instance(&info, None) }.map_err(|e| match e {
         vk::Result::ERROR_INCOMPATIBLE_DRIVER => GpuError::NoDriver(format!("{e:?}")),
-        result => GpuError::Vulkan { operation: "creating the Vulkan instance", result },
+        result => without_device("creating the Vulkan instance")(result),
     })?;
-    let debug = if validate {
-        let loader = ext::debug_utils::Instance::new(entry, &instance);
+    let mut instance = Instance { debug: None, handle, _entry: entry };
+    if validate {
+        let loader = ext::debug_utils::Instance::new(&instance._entry, &instance.handle);
         let info = vk::DebugUtilsMessengerCreateInfoEXT::default()
             .message_severity(
                 vk::DebugUtilsMessageSeverityFlagsEXT::ERROR | vk::DebugUtilsMessageSeverityFlagsEXT::WARNING,
@@ -147,12 +239,10 @@ fn create_instance(
             .pfn_user_callback(Some(on_message));
         // SAFETY: the callback is a plain function that outlives the instance.
         let messenger = unsafe { loader.create_debug_utils_messenger(&info, None) }
-            .context("creating the debug messenger")?;
-        Some((loader, messenger))
-    } else {
-        None
-    };
-    Ok((instance, debug))
+            .map_err(without_device("creating the debug messenger"))?;
+        instance.debug = Some((loader, messenger));
+    }
+    Ok(instance)
 }
 
 /// Features that every shader relies on.
@@ -190,10 +280,15 @@ fn compute_family(instance: &ash::Instance, physical: vk::PhysicalDevice) -> Opt
         .map(|i| i as u32)
 }
 
-fn summarise(instance: &ash::Instance, physical: vk::PhysicalDevice) -> DeviceSummary {
+/// What a device is, and its identity.
+fn summarise(instance: &ash::Instance, physical: vk::PhysicalDevice) -> (DeviceSummary, [u8; vk::UUID_SIZE]) {
     let mut driver = vk::PhysicalDeviceDriverProperties::default();
     let mut subgroup = vk::PhysicalDeviceSubgroupProperties::default();
-    let mut props = vk::PhysicalDeviceProperties2::default().push_next(&mut driver).push_next(&mut subgroup);
+    let mut id = vk::PhysicalDeviceIDProperties::default();
+    let mut props = vk::PhysicalDeviceProperties2::default()
+        .push_next(&mut driver)
+        .push_next(&mut subgroup)
+        .push_next(&mut id);
     // SAFETY: `props` chains valid structures; the rest are plain queries.
     unsafe { instance.get_physical_device_properties2(physical, &mut props) };
     let base = props.properties;
@@ -202,7 +297,7 @@ fn summarise(instance: &ash::Instance, physical: vk::PhysicalDevice) -> DeviceSu
     // SAFETY: plain query.
     let extensions = unsafe { instance.enumerate_device_extension_properties(physical) }.unwrap_or_default();
     let text = |r: Result<&CStr, _>| r.map(|c: &CStr| c.to_string_lossy().into_owned()).unwrap_or_default();
-    DeviceSummary {
+    let summary = DeviceSummary {
         name: text(base.device_name_as_c_str().map_err(|_| ())),
         driver: format!(
             "{} {}",
@@ -225,7 +320,49 @@ fn summarise(instance: &ash::Instance, physical: vk::PhysicalDevice) -> DeviceSu
             0.0
         },
         subgroup_size: subgroup.subgroup_size,
+    };
+    (summary, id.device_uuid)
+}
+
+/// A device of the loader's list.
+struct Candidate {
+    physical: vk::PhysicalDevice,
+    summary: DeviceSummary,
+    id: DeviceId,
+}
+
+/// The loader's list.
+fn candidates(instance: &ash::Instance) -> Result<Vec<Candidate>, GpuError> {
+    // SAFETY: plain enumeration.
+    let all =
+        unsafe { instance.enumerate_physical_devices() }.map_err(without_device("listing Vulkan devices"))?;
+    let mut found: Vec<Candidate> = Vec::with_capacity(all.len());
+    for physical in all {
+        let (summary, uuid) = summarise(instance, physical);
+        let same = |c: &&Candidate| (c.id.uuid, &c.id.name) == (uuid, &summary.name);
+        let twin = found.iter().filter(same).count();
+        let id = DeviceId { uuid, name: summary.name.clone(), twin };
+        found.push(Candidate { physical, summary, id });
     }
+    Ok(found)
+}
+
+/// Those that the options allow, best first: discrete before integrated before virtual before software.
+fn usable(instance: &ash::Instance, mut all: Vec<Candidate>, options: &GpuOptions) -> Vec<Candidate> {
+    all.retain(|c| {
+        c.summary.refused.is_none()
+            && options.device.as_ref().is_none_or(|wish| c.summary.name.contains(wish.as_str()))
+    });
+    all.sort_by_key(|c| {
+        // SAFETY: plain query.
+        match unsafe { instance.get_physical_device_properties(c.physical) }.device_type {
+            vk::PhysicalDeviceType::DISCRETE_GPU => 0,
+            vk::PhysicalDeviceType::INTEGRATED_GPU => 1,
+            vk::PhysicalDeviceType::VIRTUAL_GPU => 2,
+            _ => 3,
+        }
+    });
+    all
 }
 
 impl Gpu {
@@ -234,62 +371,56 @@ impl Gpu {
     /// # Errors
     /// [`GpuError::NoLoader`], [`GpuError::NoDriver`].
     pub fn list() -> Result<Vec<DeviceSummary>, GpuError> {
-        let entry = load()?;
-        let (instance, _) = create_instance(&entry, false)?;
-        // SAFETY: the instance lives until the end of this function and nothing made from it does longer.
-        unsafe {
-            let all = instance.enumerate_physical_devices().context("listing Vulkan devices")?;
-            let out = all.iter().map(|&p| summarise(&instance, p)).collect();
-            instance.destroy_instance(None);
-            Ok(out)
-        }
+        let instance = create_instance(false)?;
+        Ok(candidates(&instance)?.into_iter().map(|c| c.summary).collect())
     }
 
     /// Opens a device: discrete before integrated before software, or the one whose name contains `options.device`.
     ///
     /// # Errors
-    /// No loader, no driver, no device that has what is needed (the text lists them), or Vulkan's own.
+    /// No loader, no driver, no device that has what is needed (the text lists them), too little address space for software Vulkan, or
+    /// Vulkan's own. Nothing of Vulkan is left open then.
     pub fn open(options: &GpuOptions) -> Result<Arc<Self>, GpuError> {
-        let entry = load()?;
-        let (instance, debug) = create_instance(&entry, options.validation)?;
-        // SAFETY: plain enumeration.
-        let all = unsafe { instance.enumerate_physical_devices() }.context("listing Vulkan devices")?;
-        let mut candidates: Vec<_> = all.iter().map(|&p| (p, summarise(&instance, p))).collect();
+        Self::open_device(options, None, FIRST_SETUP_WAIT_NS)
+    }
+
+    /// The devices that the options allow, best first.
+    pub(super) fn ranked(options: &GpuOptions) -> Result<Vec<DeviceId>, GpuError> {
+        let instance = create_instance(options.validation)?;
+        let all = candidates(&instance)?;
+        Ok(usable(&instance, all, options).into_iter().map(|c| c.id).collect())
+    }
+
+    /// Opens the device `only`, or the best that the options allow; copies at set-up may take `setup_wait_ns`.
+    pub(super) fn open_device(
+        options: &GpuOptions,
+        only: Option<&DeviceId>,
+        setup_wait_ns: u64,
+    ) -> Result<Arc<Self>, GpuError> {
+        let instance = create_instance(options.validation)?;
+        let candidates = candidates(&instance)?;
         let found = candidates
             .iter()
-            .map(|(_, s)| format!("{} ({})", s.name, s.refused.as_deref().unwrap_or("usable")))
+            .map(|c| format!("{} ({})", c.summary.name, c.summary.refused.as_deref().unwrap_or("usable")))
             .collect::<Vec<_>>()
-            .join("; ");
-        if candidates.is_empty() {
-            return Err(GpuError::NoDriver("the loader lists no device".into()));
-        }
-        candidates.retain(|(_, s)| {
-            s.refused.is_none()
-                && options
-                    .device
-                    .as_ref()
-                    .is_none_or(|want| s.name.to_lowercase().contains(&want.to_lowercase()))
-        });
-        let rank = |p: vk::PhysicalDevice| {
-            // SAFETY: plain query.
-            match unsafe { instance.get_physical_device_properties(p) }.device_type {
-                vk::PhysicalDeviceType::DISCRETE_GPU => 0,
-                vk::PhysicalDeviceType::VIRTUAL_GPU => 1,
-                vk::PhysicalDeviceType::INTEGRATED_GPU => 2,
-                _ => 3,
-            }
-        };
-        candidates.sort_by_key(|&(p, _)| rank(p));
-        let Some((physical, summary)) = candidates.into_iter().next() else {
+            .join(", ");
+        let found = if found.is_empty() { "none".to_owned() } else { found };
+        let mut usable = usable(&instance, candidates, options);
+        usable.retain(|c| only.is_none_or(|id| c.id == *id));
+        let Some(Candidate { physical, summary, id }) = usable.into_iter().next() else {
             let name = options
                 .device
                 .as_ref()
                 .map_or(String::new(), |d| format!(" and a name that contains \"{d}\""));
+            let which = only.map_or(String::new(), |id| format!(", the very {} that was lost", id.name));
             return Err(GpuError::NoDevice {
                 found,
-                needed: format!("Vulkan 1.2 with scalarBlockLayout{name}"),
+                needed: format!("Vulkan 1.2 with scalarBlockLayout{name}{which}"),
             });
         };
+        let name: Arc<str> = summary.name.as_str().into();
+        let most_bytes =
+            if summary.software { address_space::for_buffers().map_err(|e| e.on(&name))? } else { None };
         let queue_family = compute_family(&instance, physical)
             .ok_or_else(|| GpuError::NoDevice { found, needed: "a compute queue".into() })?;
         let priorities = [1.0];
@@ -299,8 +430,8 @@ impl Gpu {
         let mut vulkan12 = vk::PhysicalDeviceVulkan12Features::default().scalar_block_layout(true);
         let info = vk::DeviceCreateInfo::default().queue_create_infos(&queues).push_next(&mut vulkan12);
         // SAFETY: `info` and what it points to live until the call returns.
-        let device =
-            unsafe { instance.create_device(physical, &info, None) }.context("opening the Vulkan device")?;
+        let device = unsafe { instance.create_device(physical, &info, None) }
+            .map_err(|e| GpuError::from_result(e, "opening the Vulkan device", &name, summary.memory_mib))?;
         // SAFETY: family and index were asked for above.
         let queue = unsafe { device.get_device_queue(queue_family, 0) };
         // SAFETY: plain queries.
@@ -317,16 +448,25 @@ impl Gpu {
             memory,
             limits,
             summary,
-            debug,
-            instance,
-            entry: ManuallyDrop::new(entry),
-            abandoned: AtomicBool::new(false),
+            name,
+            id,
+            options: options.clone(),
+            instance: ManuallyDrop::new(instance),
+            state: AtomicU8::new(State::Well as u8),
+            held_bytes: AtomicU64::new(0),
+            most_bytes,
+            setup_wait_ns,
         }))
     }
 
     /// What this device is.
     pub fn summary(&self) -> &DeviceSummary {
         &self.summary
+    }
+
+    /// The device's name, for errors.
+    pub(super) fn device_name(&self) -> &Arc<str> {
+        &self.name
     }
 
     /// Most elements of a texel buffer.
@@ -347,17 +487,123 @@ impl Gpu {
     pub(super) fn name(text: &str) -> CString {
         CString::new(text).unwrap_or_default()
     }
+
+    /// How long a copy at set-up is waited for, nanoseconds.
+    pub(super) fn setup_wait_ns(&self) -> u64 {
+        self.setup_wait_ns
+    }
+
+    /// Size of the largest heap, MiB.
+    pub(super) fn heap_mib(&self) -> u64 {
+        let heaps = &self.memory.memory_heaps[..self.memory.memory_heap_count as usize];
+        heaps.iter().map(|h| h.size >> 20).max().unwrap_or(0)
+    }
+}
+
+/// Results with the device and the operation in their errors.
+pub(super) trait On<T> {
+    /// A loss is remembered by the device.
+    fn on(self, gpu: &Gpu, operation: &'static str) -> Result<T, GpuError>;
+}
+
+impl<T> On<T> for Result<T, vk::Result> {
+    fn on(self, gpu: &Gpu, operation: &'static str) -> Result<T, GpuError> {
+        self.map_err(|result| {
+            if result == vk::Result::ERROR_DEVICE_LOST {
+                gpu.becomes(State::Lost);
+            }
+            GpuError::from_result(result, operation, &gpu.name, gpu.heap_mib())
+        })
+    }
 }
 
 impl Gpu {
-    /// Leaves the device what it holds: a submission is not over and nobody waits for it any longer.
-    pub(super) fn abandon(&self) {
-        self.abandoned.store(true, Ordering::Relaxed);
+    /// True once the driver called the device lost or [`Gpu::give_up`] was called: every use of it fails from then on, and
+    /// [`Gpu::reopen`] is the way on.
+    pub fn is_lost(&self) -> bool {
+        self.state() != State::Well
+    }
+
+    /// Gives up a device that does not finish: nothing is submitted to it or waited for any more, and nothing of it is freed, so that
+    /// dropping what was made from it returns at once. Calling it again changes nothing.
+    pub fn give_up(&self) {
+        if self.becomes(State::GivenUp) {
+            let bytes = self.held_bytes.load(Ordering::Relaxed);
+            DEVICES_GIVEN_UP.fetch_add(1, Ordering::Relaxed);
+            BYTES_GIVEN_UP.fetch_add(bytes, Ordering::Relaxed);
+            tracing::warn!(
+                "{} did not finish and was given up; {} MiB of its memory stay taken until this program ends",
+                self.name,
+                bytes.div_ceil(1 << 20)
+            );
+        }
+    }
+
+    fn state(&self) -> State {
+        match self.state.load(Ordering::Acquire) {
+            0 => State::Well,
+            1 => State::Lost,
+            _ => State::GivenUp,
+        }
+    }
+
+    /// Changes a device that is well; what is wrong with it first stays. True when it did.
+    fn becomes(&self, state: State) -> bool {
+        let well = State::Well as u8;
+        self.state.compare_exchange(well, state as u8, Ordering::AcqRel, Ordering::Acquire).is_ok()
+    }
+
+    /// Refuses to use a device that is lost or was given up.
+    pub(super) fn alive(&self, operation: &'static str) -> Result<(), GpuError> {
+        let device = || self.name.clone();
+        match self.state() {
+            State::Well => Ok(()),
+            State::Lost => Err(GpuError::DeviceLost { operation, device: device() }),
+            State::GivenUp => Err(GpuError::GivenUp { operation, device: device() }),
+        }
     }
 
     /// True when nothing of this device may be destroyed.
     pub(super) fn is_abandoned(&self) -> bool {
-        self.abandoned.load(Ordering::Relaxed)
+        self.state() == State::GivenUp
+    }
+
+    /// The queue, for one submission. Only one thread submits on the frame path, so it is free there.
+    pub(super) fn queue(&self) -> Result<MutexGuard<'_, vk::Queue>, GpuError> {
+        let begin = Instant::now();
+        loop {
+            match self.queue.try_lock() {
+                Ok(queue) => return Ok(queue),
+                // A handle cannot be left half changed by a thread that panicked.
+                Err(TryLockError::Poisoned(queue)) => return Ok(PoisonError::into_inner(queue)),
+                Err(TryLockError::WouldBlock) => {}
+            }
+            // Another thread may be in a call of the driver that does not return.
+            self.alive("submitting")?;
+            if begin.elapsed() >= QUEUE_WAIT {
+                let waited_ms = QUEUE_WAIT.as_millis() as u64;
+                return Err(GpuError::Timeout { device: self.name.clone(), waited_ms });
+            }
+            std::thread::sleep(Duration::from_micros(200));
+        }
+    }
+
+    /// Memory for a buffer is about to be taken.
+    ///
+    /// # Errors
+    /// [`GpuError::AddressSpace`]: software Vulkan would crash for want of what is left.
+    pub(super) fn takes(&self, bytes: u64) -> Result<(), GpuError> {
+        let held = self.held_bytes.load(Ordering::Relaxed);
+        if let Some(most) = self.most_bytes.filter(|most| held.saturating_add(bytes) > *most) {
+            return Err(address_space::short_of(held.saturating_add(bytes) - most).on(&self.name));
+        }
+        Ok(())
+    }
+
+    /// Memory of a buffer was taken, or freed.
+    pub(super) fn holds(&self, more_bytes: u64, fewer_bytes: u64) {
+        self.held_bytes.fetch_add(more_bytes, Ordering::Relaxed);
+        self.held_bytes.fetch_sub(fewer_bytes, Ordering::Relaxed);
     }
 }
 
@@ -366,15 +612,11 @@ impl Drop for Gpu {
         if self.is_abandoned() {
             return;
         }
-        // SAFETY: everything made from the device holds an Arc to this, so it is all gone; the loader goes last.
+        // SAFETY: everything made from the device holds an Arc to this, so it is all gone, and every submission was waited for by its
+        // fence (or is over because the device is lost): there is nothing left to wait for. The instance goes last.
         unsafe {
-            let _ = self.device.device_wait_idle();
             self.device.destroy_device(None);
-            if let Some((loader, messenger)) = &self.debug {
-                loader.destroy_debug_utils_messenger(*messenger, None);
-            }
-            self.instance.destroy_instance(None);
-            ManuallyDrop::drop(&mut self.entry);
+            ManuallyDrop::drop(&mut self.instance);
         }
     }
 }

@@ -1,9 +1,10 @@
 //! Vulkan results into messages an operator can act on.
 
 use ash::vk;
+use std::sync::Arc;
 
-/// What went wrong with the GPU.
-#[derive(Debug, thiserror::Error)]
+/// What went wrong with the GPU: during which operation, on which device, and what to do.
+#[derive(Clone, Debug, thiserror::Error)]
 pub enum GpuError {
     /// libvulkan is not installed.
     #[error(
@@ -24,14 +25,35 @@ pub enum GpuError {
         /// What dpm needs.
         needed: String,
     },
-    /// Memory ran out.
-    #[error("out of GPU memory: {what} needs {needed_mib} MiB; the largest heap has {heap_mib} MiB. Use a smaller scene, fewer textures or a smaller raster")]
-    OutOfMemory {
-        /// Buffer.
-        what: String,
-        /// Size asked for.
+    /// The process may not use as much address space as software Vulkan takes, which would crash for want of it.
+    #[error(
+        "{device} runs on the CPU and needs {needed_mib} MiB of address space, but this process is limited to {limit_mib} MiB \
+         (RLIMIT_AS). Raise the limit (`ulimit -v unlimited`; as a service: LimitAS=infinity), or use a hardware GPU"
+    )]
+    AddressSpace {
+        /// The software device.
+        device: Arc<str>,
+        /// Address space that it needs together with what the process uses already.
         needed_mib: u64,
-        /// Size of the largest heap.
+        /// The limit of the process.
+        limit_mib: u64,
+    },
+    /// Memory ran out.
+    #[error(
+        "out of {pool} memory on {device} while {operation}{}. Use a smaller scene, fewer textures or a smaller raster, or end other \
+         programs that use it",
+        needs(*needed_mib, *heap_mib)
+    )]
+    OutOfMemory {
+        /// What was being done, with the name of the buffer if there is one.
+        operation: String,
+        /// On which device.
+        device: Arc<str>,
+        /// Whose memory.
+        pool: MemoryPool,
+        /// Size asked for; `None` where the driver wanted memory for itself.
+        needed_mib: Option<u64>,
+        /// Size of the device's largest heap.
         heap_mib: u64,
     },
     /// A limit of the device is too small.
@@ -46,33 +68,145 @@ pub enum GpuError {
         /// Allowed.
         limit: u64,
     },
-    /// The wait ended before the GPU did. Not a loss: wait again or give up.
-    #[error("the GPU did not finish within {0} ms")]
-    Timeout(u64),
-    /// The device is lost; everything made from it is dead.
-    #[error("the GPU was lost while {0}; restart the renderer")]
-    DeviceLost(&'static str),
+    /// The wait ended before the GPU did. Not a loss: wait again, or give the device up ([`super::Gpu::give_up`]).
+    #[error(
+        "{device} did not finish within {waited_ms} ms. It is too slow for this scene (lower render.spp or the raster), or it hangs \
+         (see the kernel's log: dmesg)"
+    )]
+    Timeout {
+        /// Which device.
+        device: Arc<str>,
+        /// For how long it was waited.
+        waited_ms: u64,
+    },
+    /// The driver says that the device is lost; everything made from it is dead.
+    #[error(
+        "{device} was lost while {operation}: its driver gave it up (reset, unplugged, switched off, or a fault; the kernel's log tells \
+         more: dmesg). It must be opened anew"
+    )]
+    DeviceLost {
+        /// What was being done.
+        operation: &'static str,
+        /// Which device.
+        device: Arc<str>,
+    },
+    /// The program gave the device up because it did not finish: nothing is asked of it any more.
+    #[error(
+        "{device} was given up because it did not finish what it was given, and is not used for {operation}; see the kernel's log \
+         (dmesg). It must be opened anew"
+    )]
+    GivenUp {
+        /// What would have been done.
+        operation: &'static str,
+        /// Which device.
+        device: Arc<str>,
+    },
+    /// What the slot was submitted for last is not over.
+    #[error("a frame was submitted to {device} while the one before it in the same memory is still being made; wait for that first")]
+    InFlight {
+        /// Which device.
+        device: Arc<str>,
+    },
+    /// A lost device does not come back, and there is no other one.
+    #[error("{device} was lost and there is no other device to go on with: {tried}. Look at the kernel's log (dmesg), then start again")]
+    NoneLeft {
+        /// The device that was lost.
+        device: Arc<str>,
+        /// What was tried, and how each failed.
+        tried: String,
+    },
     /// Any other result.
-    #[error("{operation} failed: {result:?}")]
+    #[error("{operation} failed on {device}: {result:?}. Look at the kernel's log (dmesg); try another device with render.gpu")]
     Vulkan {
         /// What was being done.
         operation: &'static str,
+        /// On which device.
+        device: Arc<str>,
         /// Vulkan's code.
         result: vk::Result,
     },
 }
 
-/// Attaches the operation to a Vulkan result.
-pub(super) trait Context<T> {
-    /// Converts, keeping device loss apart.
-    fn context(self, operation: &'static str) -> Result<T, GpuError>;
+/// Whose memory ran out.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum MemoryPool {
+    /// The GPU's.
+    Device,
+    /// The computer's.
+    Host,
 }
 
-impl<T> Context<T> for Result<T, vk::Result> {
-    fn context(self, operation: &'static str) -> Result<T, GpuError> {
-        self.map_err(|result| match result {
-            vk::Result::ERROR_DEVICE_LOST => GpuError::DeviceLost(operation),
-            result => GpuError::Vulkan { operation, result },
+impl std::fmt::Display for MemoryPool {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        f.write_str(match self {
+            Self::Device => "GPU",
+            Self::Host => "main",
         })
+    }
+}
+
+fn needs(needed_mib: Option<u64>, heap_mib: u64) -> String {
+    match needed_mib {
+        Some(needed) => format!(", which needs {needed} MiB; the largest heap has {heap_mib} MiB"),
+        None => format!("; the largest heap has {heap_mib} MiB"),
+    }
+}
+
+impl GpuError {
+    /// What `result` means.
+    pub(super) fn from_result(
+        result: vk::Result,
+        operation: &'static str,
+        device: &Arc<str>,
+        heap_mib: u64,
+    ) -> Self {
+        let device = device.clone();
+        let out_of = |pool, device| Self::OutOfMemory {
+            operation: operation.to_owned(),
+            device,
+            pool,
+            needed_mib: None,
+            heap_mib,
+        };
+        match result {
+            vk::Result::ERROR_DEVICE_LOST => Self::DeviceLost { operation, device },
+            vk::Result::ERROR_OUT_OF_DEVICE_MEMORY => out_of(MemoryPool::Device, device),
+            vk::Result::ERROR_OUT_OF_HOST_MEMORY => out_of(MemoryPool::Host, device),
+            result => Self::Vulkan { operation, device, result },
+        }
+    }
+
+    /// The device is gone, and [`super::Gpu::reopen`] is what may help. False for a mere timeout, after which the caller may wait on.
+    pub fn is_loss(&self) -> bool {
+        matches!(self, Self::DeviceLost { .. } | Self::GivenUp { .. })
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// Found in use, R12: what an operator reads when a GPU fails. Every message names the device and what was being done.
+    #[test]
+    fn every_failure_names_device_and_operation_and_only_a_loss_is_one() {
+        let device: Arc<str> = "Some GPU".into();
+        let of = |result| GpuError::from_result(result, "submitting a frame", &device, 4096);
+        for (result, word, loss) in [
+            (vk::Result::ERROR_DEVICE_LOST, "lost", true),
+            (vk::Result::ERROR_OUT_OF_DEVICE_MEMORY, "out of GPU memory", false),
+            (vk::Result::ERROR_OUT_OF_HOST_MEMORY, "out of main memory", false),
+            (vk::Result::ERROR_INITIALIZATION_FAILED, "ERROR_INITIALIZATION_FAILED", false),
+        ] {
+            let error = of(result);
+            let text = error.to_string();
+            for word in [word, "Some GPU", "submitting a frame"] {
+                assert!(text.contains(word), "{word} in {text}");
+            }
+            assert_eq!(error.is_loss(), loss, "{text}");
+        }
+        let timeout = GpuError::Timeout { device: device.clone(), waited_ms: 100 };
+        assert!(!timeout.is_loss() && timeout.to_string().contains("Some GPU"));
+        let given_up = GpuError::GivenUp { operation: "submitting a frame", device };
+        assert!(given_up.is_loss() && given_up.to_string().contains("Some GPU"));
     }
 }

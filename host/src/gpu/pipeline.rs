@@ -1,8 +1,8 @@
 //! Compute pipelines and the one table of bindings that all shaders share.
 
 use super::buffer::Buffer;
-use super::context::Gpu;
-use super::error::{Context as _, GpuError};
+use super::context::{Gpu, On as _};
+use super::error::GpuError;
 use ash::vk;
 use dpm_shaders::Shader;
 use std::sync::Arc;
@@ -51,17 +51,20 @@ impl BindingTable {
             })
             .collect();
         let info = vk::DescriptorSetLayoutCreateInfo::default().bindings(&entries);
-        // SAFETY: valid create infos; destroyed in Drop.
+        gpu.alive("making a descriptor layout")?;
+        let pipeline_layout = vk::PipelineLayout::null();
+        // SAFETY: valid create infos; destroyed in Drop, which a null layout passes by.
         unsafe {
             let layout = gpu
                 .device
                 .create_descriptor_set_layout(&info, None)
-                .context("creating a descriptor layout")?;
+                .on(gpu, "creating a descriptor layout")?;
+            let mut table = Self { layout, pipeline_layout, bindings: bindings.to_vec(), gpu: gpu.clone() };
             let layouts = [layout];
             let info = vk::PipelineLayoutCreateInfo::default().set_layouts(&layouts);
-            let pipeline_layout =
-                gpu.device.create_pipeline_layout(&info, None).context("creating a pipeline layout")?;
-            Ok(Arc::new(Self { layout, pipeline_layout, bindings: bindings.to_vec(), gpu: gpu.clone() }))
+            table.pipeline_layout =
+                gpu.device.create_pipeline_layout(&info, None).on(gpu, "creating a pipeline layout")?;
+            Ok(Arc::new(table))
         }
     }
 }
@@ -103,13 +106,15 @@ impl BindingSet {
             .filter(|s| s.descriptor_count > 0)
             .collect();
         let info = vk::DescriptorPoolCreateInfo::default().max_sets(1).pool_sizes(&sizes);
+        gpu.alive("making a descriptor set")?;
         // SAFETY: valid create infos; the pool is destroyed in Drop and frees the set.
         unsafe {
             let pool =
-                gpu.device.create_descriptor_pool(&info, None).context("creating a descriptor pool")?;
+                gpu.device.create_descriptor_pool(&info, None).on(gpu, "creating a descriptor pool")?;
+            let mut bound = Self { set: vk::DescriptorSet::null(), pool, table: table.clone() };
             let layouts = [table.layout];
             let info = vk::DescriptorSetAllocateInfo::default().descriptor_pool(pool).set_layouts(&layouts);
-            let set = gpu.device.allocate_descriptor_sets(&info).context("allocating a descriptor set")?[0];
+            bound.set = gpu.device.allocate_descriptor_sets(&info).on(gpu, "allocating a descriptor set")?[0];
             for &(binding, kind) in &table.bindings {
                 let buffer = buffers
                     .iter()
@@ -120,7 +125,7 @@ impl BindingSet {
                     [vk::DescriptorBufferInfo { buffer: buffer.handle, offset: 0, range: vk::WHOLE_SIZE }];
                 let views = [buffer.view.unwrap_or_default()];
                 let write = vk::WriteDescriptorSet::default()
-                    .dst_set(set)
+                    .dst_set(bound.set)
                     .dst_binding(binding)
                     .descriptor_count(1)
                     .descriptor_type(kind.vulkan());
@@ -130,7 +135,7 @@ impl BindingSet {
                 };
                 gpu.device.update_descriptor_sets(&[write], &[]);
             }
-            Ok(Self { set, pool, table: table.clone() })
+            Ok(bound)
         }
     }
 }
@@ -178,10 +183,11 @@ impl ComputePipeline {
         let values: Vec<u32> = constants.iter().map(|c| c.1).collect();
         let data = bytemuck::cast_slice(&values);
         let specialization = vk::SpecializationInfo::default().map_entries(&entries).data(data);
+        gpu.alive("compiling a compute pipeline")?;
         // SAFETY: the SPIR-V is ours, checked by tests; module and pipeline are destroyed here and in Drop.
         unsafe {
             let module =
-                gpu.device.create_shader_module(&module_info, None).context("creating a shader module")?;
+                gpu.device.create_shader_module(&module_info, None).on(gpu, "creating a shader module")?;
             let name = Gpu::name("main");
             let stage = vk::PipelineShaderStageCreateInfo::default()
                 .stage(vk::ShaderStageFlags::COMPUTE)
@@ -191,7 +197,7 @@ impl ComputePipeline {
             let info = [vk::ComputePipelineCreateInfo::default().stage(stage).layout(table.pipeline_layout)];
             let result = gpu.device.create_compute_pipelines(vk::PipelineCache::null(), &info, None);
             gpu.device.destroy_shader_module(module, None);
-            let pipeline = result.map_err(|(_, e)| e).context("compiling a compute pipeline")?[0];
+            let pipeline = result.map_err(|(_, e)| e).on(gpu, "compiling a compute pipeline")?[0];
             Ok(Self { pipeline, layout: table.pipeline_layout, table: table.clone() })
         }
     }

@@ -1,5 +1,6 @@
 //! Finished frames and light into a report. Runs on its own thread, off the frame path: it may allocate.
 
+use super::crew::NotesBack;
 use super::dark_bodies::DarkBodies;
 use super::job::{Fate, FrameNote};
 use super::light::LightNote;
@@ -16,11 +17,12 @@ use crate::telemetry::interval::Interval;
 use crate::telemetry::monitor::RunMonitor;
 use crate::telemetry::profile::{missed_by_cause, ordered_dark, Profiler};
 use crate::telemetry::report::{Latency, Report, Spread, StageTime};
+use crate::telemetry::signed::SignedHistogram;
 use crate::telemetry::slots::{SlotCounts, SlotLedger};
 use crate::telemetry::trace::TracedFrame;
 use dpm_device::link::frame_newer;
 use dpm_device::time::HostTime;
-use dpm_handoff::channel::{Receiver, Sender};
+use dpm_handoff::channel::Receiver;
 use glam::{DAffine3, DVec3};
 use hdrhistogram::Histogram;
 use hil_mock::projector::LightKind;
@@ -82,6 +84,7 @@ pub struct Collector {
     withheld: u64,
     late: u64,
     repeated: u64,
+    too_old: u64,
     /// Slots without a frame of their own.
     pub slots: SlotLedger,
     /// Lit frames with parts of another (looked for in prepared frames only).
@@ -101,6 +104,10 @@ pub struct Collector {
     pub traced: VecDeque<TracedFrame>,
     trace_frames: usize,
     registration: Histogram<u64>,
+    /// The same of the frames that were lit in their own slot.
+    registration_in_time: Histogram<u64>,
+    /// True beginning of a slot, as the mock in this process saw it, less what the host took it for.
+    clock_error: SignedHistogram,
     unpredicted: Histogram<u64>,
     stages: Vec<Histogram<u64>>,
     passes: Vec<Histogram<u64>>,
@@ -129,7 +136,8 @@ impl Collector {
         let points = (0..rig.bodies.len()).map(|i| registration_points(&rig, i)).collect();
         let measured = rig.config.real_time.pace == Pace::Real;
         // A tenth of a known run, but enough frames for a 99th percentile.
-        let batch_frames = (rig.config.run.frames / 10).clamp(100, 10_000);
+        let frames = rig.config.run.frames.max(rig.config.slots_to_run());
+        let batch_frames = (frames / 10).clamp(100, 10_000);
         let is_mock_tracker = matches!(rig.config.tracker, TrackerConfig::Mock(_));
         let is_mock_projector = matches!(rig.config.projector.backend, ProjectorBackend::Mock(_));
         let profiler =
@@ -154,6 +162,7 @@ impl Collector {
             withheld: 0,
             late: 0,
             repeated: 0,
+            too_old: 0,
             torn: 0,
             reordered: 0,
             last_lit: None,
@@ -164,6 +173,8 @@ impl Collector {
             traced: VecDeque::new(),
             trace_frames,
             registration: histogram(),
+            registration_in_time: histogram(),
+            clock_error: SignedHistogram::new(1_000_000_000),
             unpredicted: histogram(),
             stages: STAGES.iter().map(|_| histogram()).collect(),
             passes: PASSES.iter().map(|_| histogram()).collect(),
@@ -192,22 +203,24 @@ impl Collector {
         self.slots.finish()
     }
 
-    /// Takes finished frames and light until both are over; gives the notes back to `free`.
-    pub fn run(
+    /// Takes finished frames and light until both are over, or until `goes_on`, which is asked at every look, says no; gives the notes back
+    /// to `free`.
+    pub(super) fn run(
         &mut self,
         mut done: Receiver<Box<FrameNote>>,
-        mut free: Sender<Box<FrameNote>>,
+        free: &NotesBack,
         mut lights: Receiver<LightNote>,
         monitor: &RunMonitor,
+        mut goes_on: impl FnMut() -> bool,
     ) {
         let mut held = None;
-        loop {
+        while goes_on() {
             // Asked before looking: what came before the end is taken first.
             let over = done.is_finished() && lights.is_finished();
             self.slots.read_orders(monitor.dark());
-            self.take_finished(&mut done, &mut free, monitor);
+            self.take_finished(&mut done, free, monitor);
             while let Some(note) = held.take().or_else(|| lights.try_pop()) {
-                self.take_finished(&mut done, &mut free, monitor);
+                self.take_finished(&mut done, free, monitor);
                 // Lit before the link's thread came to say that it was sent.
                 let unknown = note.event.frame.is_some_and(|f| self.newest.is_none_or(|n| frame_newer(f, n)));
                 if unknown && !over {
@@ -231,15 +244,10 @@ impl Collector {
         }
     }
 
-    fn take_finished(
-        &mut self,
-        done: &mut Receiver<Box<FrameNote>>,
-        free: &mut Sender<Box<FrameNote>>,
-        monitor: &RunMonitor,
-    ) {
+    fn take_finished(&mut self, done: &mut Receiver<Box<FrameNote>>, free: &NotesBack, monitor: &RunMonitor) {
         while let Some(note) = done.try_pop() {
             self.finished(&note, monitor);
-            let _ = free.push(note);
+            free.push(note);
         }
     }
 
@@ -308,9 +316,9 @@ impl Collector {
                 self.stages[stage as usize].saturating_record(ns);
             }
         }
-        self.placement.observe(&self.rig.camera, &job.tracked_poses, job.tracked, &self.points);
+        self.placement.observe(&self.rig.camera, &job.sampled_poses, &job.seen, &self.points);
         let sent = job.is_sent();
-        let refused = !sent && job.fate != Fate::Overtaken;
+        let refused = !sent && !matches!(job.fate, Fate::Overtaken | Fate::Stopped);
         self.slots.planned(job.slot, &job.timeline, refused, job.waited_for_memory);
         while self.repeats.front().is_some_and(|&slot| slot < job.slot) {
             self.repeats.pop_front();
@@ -332,6 +340,7 @@ impl Collector {
                 pass_ns: cost.pass_ns,
             });
         } else {
+            self.too_old += u64::from(job.fate == Fate::TooOld);
             self.count_unlit(&job.timeline, monitor);
         }
     }
@@ -386,7 +395,8 @@ impl Collector {
                 if self.verify && note.hash != record.code_hash {
                     self.light_mismatches += 1;
                 }
-                self.measure_registration(note, &record);
+                self.measure_registration(note, &record, late);
+                self.measure_clock(note, &record);
                 // No light fell on a body: there is no way from its motion to light.
                 let is_dark = self.is_dark(&record);
                 let stamps = if is_dark { record.timeline.without_sample() } else { record.timeline };
@@ -413,8 +423,20 @@ impl Collector {
         }
     }
 
+    /// When the slot of this light truly began, against when the host believed that it would. Only the mock in this process knows: what is
+    /// known of another projector's light comes from the host's own map of its clock, which agrees with itself.
+    fn measure_clock(&mut self, note: &LightNote, record: &FrameRecord) {
+        let knows = matches!(self.rig.config.projector.backend, ProjectorBackend::Mock(_));
+        if knows && self.rig.config.real_time.pace == Pace::Real {
+            let rate = self.rig.rate();
+            let slots_ns = rate.slot_start_ns(note.event.slot) - rate.slot_start_ns(record.slot);
+            let due_at = record.timeline.due_at.plus_ns(slots_ns);
+            self.clock_error.record(note.event.first_photon_at.ns_since(due_at));
+        }
+    }
+
     /// Where the light of each point fell against where the point was at the middle of the exposure, on the bodies that were lit.
-    fn measure_registration(&mut self, note: &LightNote, record: &FrameRecord) {
+    fn measure_registration(&mut self, note: &LightNote, record: &FrameRecord, late: bool) {
         let (first, last) = (note.event.first_photon_at, note.event.last_photon_at);
         let middle = first.plus_ns(last.ns_since(first) / 2);
         let Some(truth) = self.rig.true_poses(middle.0) else { return };
@@ -426,7 +448,11 @@ impl Collector {
                 let at = |m: &DAffine3| self.rig.camera.project(m.transform_point3(*p));
                 let Some(real) = at(&truth[i]) else { continue };
                 if let Some(used) = at(&record.tracked_poses[i]) {
-                    self.registration.saturating_record(((used - real).length() * PER_PIXEL).round() as u64);
+                    let error = ((used - real).length() * PER_PIXEL).round() as u64;
+                    self.registration.saturating_record(error);
+                    if !late {
+                        self.registration_in_time.saturating_record(error);
+                    }
                 }
                 if let Some(held) = at(&record.sampled_poses[i]) {
                     self.unpredicted.saturating_record(((held - real).length() * PER_PIXEL).round() as u64);
@@ -459,7 +485,10 @@ impl Collector {
         report.frames_dropped = self.dropped;
         report.frames_late = self.late;
         report.frames_repeated = self.repeated;
+        report.frames_too_old = self.too_old;
         report.registration_error_px = spread(&self.registration, PER_PIXEL);
+        report.registration_error_in_time_px = spread(&self.registration_in_time, PER_PIXEL);
+        report.clock_error_ms = Latency::of(&self.clock_error, false);
         report.registration_error_unpredicted_px = spread(&self.unpredicted, PER_PIXEL);
         report.registration_error_at = report.registration_error_px.map(|_| "mid-exposure");
         let latency = |interval| Latency::of(self.profiler.histogram(interval), !self.profiler.is_measured());

@@ -102,6 +102,29 @@ pub enum PipelineError {
         /// What happened.
         source: GpuError,
     },
+    /// The GPU does not finish a frame.
+    #[error("frame {frame}: the GPU did not finish within {ms} ms")]
+    GpuHangs {
+        /// Which frame.
+        frame: u64,
+        /// How long it was waited for.
+        ms: u64,
+    },
+    /// A thread does not answer and cannot be replaced. The projector went dark by itself, or was told to.
+    #[error("the {stage} thread has not answered for {} ms longer than it should: the run ends in the dark; start it again, and if it happens again report it with the rig file", super::pulse::HUNG_AFTER_NS / 1_000_000)]
+    Hung {
+        /// Which thread.
+        stage: &'static str,
+    },
+    /// Stages were made anew too often.
+    #[error(
+        "more than {} failures within a minute, the last: {last}; the run ends in the dark",
+        crate::gpu::LossBudget::MOST
+    )]
+    KeepsFailing {
+        /// The last one.
+        last: String,
+    },
     /// The projector.
     #[error(transparent)]
     Connect(#[from] ConnectError),

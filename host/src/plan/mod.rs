@@ -2,6 +2,7 @@
 
 pub mod budget;
 pub mod dark;
+pub mod horizon;
 pub mod lead;
 pub mod light_centre;
 pub mod slots;

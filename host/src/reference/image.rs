@@ -111,16 +111,19 @@ impl Reference<'_> {
         let next = AtomicUsize::new(0);
         let rows: Vec<Mutex<&mut [Pixel]>> = pixels.chunks_mut(width).map(Mutex::new).collect();
         std::thread::scope(|scope| {
-            for _ in 0..threads.min(height) {
-                scope.spawn(|| loop {
-                    let y = next.fetch_add(1, Ordering::Relaxed);
-                    let Some(row) = rows.get(y) else { break };
-                    let mut row = row.lock().unwrap_or_else(|e| e.into_inner());
-                    for (x, pixel) in row.iter_mut().enumerate() {
-                        *pixel = self.pixel(camera, view, settings, x, y);
-                    }
-                });
+            let work = || loop {
+                let y = next.fetch_add(1, Ordering::Relaxed);
+                let Some(row) = rows.get(y) else { break };
+                let mut row = row.lock().unwrap_or_else(|e| e.into_inner());
+                for (x, pixel) in row.iter_mut().enumerate() {
+                    *pixel = self.pixel(camera, view, settings, x, y);
+                }
+            };
+            for _ in 1..threads.min(height) {
+                // Where the system gives no more threads, those that there are take all rows.
+                let _ = std::thread::Builder::new().spawn_scoped(scope, work);
             }
+            work();
         });
         drop(rows);
         ReferenceImage {

@@ -1,7 +1,7 @@
 //! Fills a device buffer with copies of one value, or changes some of its values; at set-up time and between frames of a check.
 
 use super::renderer::Renderer;
-use crate::gpu::{Buffer, CommandList, FrameFence, Gpu, GpuError, MemoryKind, Recorder};
+use crate::gpu::{run_now, Buffer, Gpu, GpuError, MemoryKind};
 use bytemuck::Pod;
 use dpm_shaders::structs::History;
 use std::ops::Range;
@@ -24,7 +24,7 @@ impl Renderer {
         if !self.settings.method.needs_history() {
             return Ok(());
         }
-        (self.shared.history.iter())
+        (self.resources.shared.history.iter())
             .try_for_each(|buffer| edit(&self.gpu, buffer, range.clone(), &mut change))
     }
 }
@@ -38,19 +38,12 @@ fn edit<T: Pod>(
 ) -> Result<(), GpuError> {
     let bytes = range.end * size_of::<T>();
     let back = Buffer::new(gpu, "read back", bytes, MemoryKind::Readback)?;
-    run(gpu, |r| r.copy(buffer, &back, bytes))?;
+    run_now(gpu, |r| r.copy(buffer, &back, bytes))?;
     let mut staging = Buffer::new(gpu, "staging", bytes, MemoryKind::Upload)?;
     let mut values: Vec<T> = back.read::<T>(range.end).to_vec();
     values[range].iter_mut().for_each(&mut change);
     staging.bytes_mut()[..bytes].copy_from_slice(bytemuck::cast_slice(&values));
-    run(gpu, |r| r.copy(&staging, buffer, bytes))
-}
-
-fn run(gpu: &Arc<Gpu>, record: impl FnOnce(&mut Recorder)) -> Result<(), GpuError> {
-    let list = CommandList::record(gpu, 0, record)?;
-    let mut fence = FrameFence::new(gpu)?;
-    list.submit(&mut fence)?;
-    fence.wait(60_000_000_000)
+    run_now(gpu, |r| r.copy(&staging, buffer, bytes))
 }
 
 /// Writes `count` copies of `value` and waits.
@@ -60,5 +53,5 @@ pub(super) fn fill<T: Pod>(gpu: &Arc<Gpu>, buffer: &Buffer, value: &T, count: us
     for chunk in staging.bytes_mut()[..count * size_of::<T>()].chunks_exact_mut(bytes.len()) {
         chunk.copy_from_slice(bytes);
     }
-    run(gpu, |r| r.copy(&staging, buffer, count * size_of::<T>()))
+    run_now(gpu, |r| r.copy(&staging, buffer, count * size_of::<T>()))
 }

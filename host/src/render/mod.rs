@@ -3,6 +3,7 @@
 pub mod albedo_table;
 pub mod blue_noise;
 mod body_bvh;
+mod cluster;
 pub mod compensation;
 mod fill;
 mod last_frame;
@@ -17,6 +18,6 @@ pub mod sobol;
 pub mod tiles;
 
 pub use memory::RasterTooLarge;
-pub use renderer::{FrameInputs, Output, RenderError, Renderer, RendererSettings};
+pub use renderer::{FrameInputs, Output, RenderError, Renderer, RendererPlan, RendererSettings};
 pub use scene_data::Keep;
 pub use slot::{FrameCost, FrameSlot, PASSES};

@@ -108,23 +108,38 @@ pub enum RenderError {
 const PER_TILE_QUARTER: u64 = 0;
 const PER_TILE_RATES: u64 = 16;
 
-/// Draws frames of one scene.
+/// Draws frames of one scene. Owns what it needs: a thread may keep it, and may be left alone with it when the GPU hangs.
 pub struct Renderer {
-    // Dropped before the buffers they use.
-    pipelines: Pipelines,
-    table: Arc<BindingTable>,
-    pub(super) shared: SharedBuffers,
-    scene: SceneGpu,
-    data: SceneData,
+    pub(super) resources: Arc<Resources>,
+    data: Arc<SceneData>,
     pub(super) settings: RendererSettings,
+    keep: Keep,
     needs: SceneNeeds,
-    every_tile: bool,
-    every_pixel: bool,
     /// Per body of the scene: which tracked body carries it.
     tracked: Vec<Option<u16>>,
     /// What the history holds: the last frame submitted and its poses.
     last: LastFrame,
     pub(super) gpu: Arc<Gpu>,
+}
+
+/// What a renderer is made from, without a device: to be kept beside one, so that it can be made anew on another device without the scene
+/// being looked at again. Cheap to clone.
+#[derive(Clone)]
+pub struct RendererPlan {
+    data: Arc<SceneData>,
+    settings: RendererSettings,
+    keep: Keep,
+    tracked: Vec<Option<u16>>,
+}
+
+/// What submissions read, held by the renderer and by every slot: it goes when the last submission is over, in whatever order they are
+/// dropped.
+pub(super) struct Resources {
+    // Dropped before the buffers they use.
+    pipelines: Pipelines,
+    table: Arc<BindingTable>,
+    pub(super) shared: SharedBuffers,
+    scene: SceneGpu,
 }
 
 /// One pipeline a pass; `None`: the method does not need it and it is not recorded.
@@ -174,7 +189,27 @@ impl Renderer {
         settings: RendererSettings,
         keep: Keep,
     ) -> Result<Self, RenderError> {
-        let data = SceneData::build(scene)?;
+        let data = Arc::new(SceneData::build(scene)?);
+        let tracked = scene.bodies.iter().map(|b| b.tracked).collect();
+        Self::from_plan(gpu, &RendererPlan { data, settings, keep, tracked })
+    }
+
+    /// What this renderer was made from.
+    pub fn plan(&self) -> RendererPlan {
+        RendererPlan {
+            data: self.data.clone(),
+            settings: self.settings.clone(),
+            keep: self.keep,
+            tracked: self.tracked.clone(),
+        }
+    }
+
+    /// The same renderer on this device, as it was before its first frame.
+    ///
+    /// # Errors
+    /// The raster or the scene is too large for this device, or the GPU's own.
+    pub fn from_plan(gpu: &Arc<Gpu>, plan: &RendererPlan) -> Result<Self, RenderError> {
+        let RendererPlan { data, settings, keep, tracked } = plan.clone();
         let shared = SharedBuffers::new(gpu, &settings)?;
         let texel = gpu.summary().software && !keep.storage_tables;
         let scene_gpu = SceneGpu::new(gpu, &data, texel)?;
@@ -223,18 +258,13 @@ impl Renderer {
                 })
                 .transpose()?,
         };
-        let tracked = scene.bodies.iter().map(|b| b.tracked).collect();
-        let last = LastFrame::none(scene.bodies.len());
+        let last = LastFrame::none(tracked.len());
         Ok(Self {
-            pipelines,
-            table,
-            shared,
-            scene: scene_gpu,
+            resources: Arc::new(Resources { pipelines, table, shared, scene: scene_gpu }),
             data,
             settings,
+            keep,
             needs,
-            every_tile: keep.every_tile,
-            every_pixel: keep.every_pixel,
             tracked,
             last,
             gpu: gpu.clone(),
@@ -320,7 +350,8 @@ impl Renderer {
         } else {
             &radiance
         };
-        let s = &self.scene;
+        let resources = &self.resources;
+        let s = &resources.scene;
         let buffer_of = |name: &str, parity: usize| match name {
             "B_FRAME" => &frame,
             "B_INSTANCES" => &instances,
@@ -340,13 +371,13 @@ impl Renderer {
             "B_CODES" => &codes,
             "B_COUNTERS" => &counters,
             "B_GUIDES" | "B_GUIDE_ROWS" => &guides,
-            "B_HISTORY" | "B_HISTORY_ROWS" => &self.shared.history[parity],
-            "B_FORMER" => &self.shared.history[1 - parity],
-            "B_RATES" => &self.shared.rates,
-            "B_RATE_TABLE" => &self.shared.rate_table,
+            "B_HISTORY" | "B_HISTORY_ROWS" => &resources.shared.history[parity],
+            "B_FORMER" => &resources.shared.history[1 - parity],
+            "B_RATES" => &resources.shared.rates,
+            "B_RATE_TABLE" => &resources.shared.rate_table,
             "B_SCHEDULE" => &schedule,
             "B_WORK" => &work,
-            "B_NOISE" => &self.shared.noise,
+            "B_NOISE" => &resources.shared.noise,
             "B_FILTERED" | "B_FILTERED_ROWS" => &filtered,
             "B_SHOWN" => shown,
             "B_PLANES" => &planes,
@@ -355,7 +386,7 @@ impl Renderer {
         let set_of = |parity| {
             let bindings: Vec<_> =
                 gpu_structs::BINDINGS.iter().map(|&(n, b)| (b, buffer_of(n, parity))).collect();
-            BindingSet::new(&self.table, &bindings)
+            BindingSet::new(&resources.table, &bindings)
         };
         let sets = [set_of(0)?, set_of(1)?];
         // Tiles that are never traced must read as nothing hit and black from the start.
@@ -367,9 +398,9 @@ impl Renderer {
             super::fill::fill(gpu, &guides, &Guide::zeroed(), pixels)?;
         }
         super::fill::fill(gpu, shown, &[0f32; 4], pixels)?;
-        let p = &self.pipelines;
+        let p = &resources.pipelines;
         let record = |parity: usize, r: &mut Recorder<'_>| {
-            let (set, history) = (&sets[parity], &self.shared.history[parity]);
+            let (set, history) = (&sets[parity], &resources.shared.history[parity]);
             // The frame, in order. A pass that the method does not need is not recorded; its stamp is.
             let tiled = |r: &mut Recorder<'_>, pass: Option<&ComputePipeline>, offset: u64| {
                 if let Some(pass) = pass {
@@ -379,7 +410,7 @@ impl Renderer {
                 r.stamp();
             };
             r.clear(&counters);
-            r.copy(&self.shared.schedule_start, &schedule, size_of::<Schedule>());
+            r.copy(&resources.shared.schedule_start, &schedule, size_of::<Schedule>());
             r.barrier();
             r.stamp();
             tiled(r, Some(&p.primary), PER_TILE_QUARTER);
@@ -418,7 +449,7 @@ impl Renderer {
                     r.copy(history, to, pixels * each.history);
                 }
                 r.copy(&radiance, &d.traced, pixels * each.radiance);
-                r.copy(&self.shared.rates, &d.rates, tile_list.len() * 4);
+                r.copy(&resources.shared.rates, &d.rates, tile_list.len() * 4);
             }
             r.barrier_to_host();
             r.stamp();
@@ -454,19 +485,22 @@ impl Renderer {
             raster,
             parity: 0,
             stamps: [0; PASSES.len() + 1],
+            _resources: resources.clone(),
         })
     }
 
-    /// Writes the inputs and starts the GPU. The slot must not be in flight. Allocates nothing.
+    /// Writes the inputs and starts the GPU. Allocates nothing.
     ///
     /// # Errors
-    /// Device lost.
+    /// Device lost or given up, [`GpuError::InFlight`] when the slot's last frame was not waited for to its end. The next frame begins as if
+    /// this one had not been.
     ///
     /// # Panics
     /// When there are fewer poses than bodies: a programmer's mistake.
     pub fn submit(&mut self, slot: &mut FrameSlot, inputs: &FrameInputs<'_>) -> Result<(), GpuError> {
         assert_eq!(inputs.poses.len(), self.data.bodies.len(), "one pose per body");
-        if self.settings.camera_is_eye || self.every_tile {
+        slot.fence.check_free()?;
+        if self.settings.camera_is_eye || self.keep.every_tile {
             slot.tile_list.fill();
         } else {
             slot.tile_list.update(
@@ -477,8 +511,10 @@ impl Renderer {
             );
         }
         let tile_count = slot.tile_list.write(bytemuck::cast_slice_mut(slot.tiles.bytes_mut()));
-        // Four 8 x 8 workgroups a tile; rates are decided in every second frame, one workgroup a tile.
-        let rate_tiles = if self.last.count.is_multiple_of(2) { tile_count } else { 0 };
+        let turn = self.last.turn_of(inputs.frame);
+        // Four 8 x 8 workgroups a tile; rates are decided in every second frame drawn, one workgroup a tile. The checkerboard goes by the
+        // same count, so that both of its halves are traced at one rate.
+        let rate_tiles = if turn.drawn.is_multiple_of(2) { tile_count } else { 0 };
         slot.arguments.write(&[[tile_count * 4, 1u32, 1, 0], [rate_tiles, 1, 1, 0]]);
         // The projector is the origin: f32 is finest where the rays start.
         let origin = inputs.camera.position();
@@ -519,7 +555,7 @@ impl Renderer {
         let raster = self.settings.raster;
         let method = &self.settings.method;
         let c = inputs.camera;
-        let steady = !self.every_pixel
+        let steady = !self.keep.every_pixel
             && self.last.is_steady(&self.data.bodies, inputs, |i| is_lost(&self.tracked, i, inputs.lost));
         let frame = Frame {
             projector_position: [0.0; 3],
@@ -566,6 +602,8 @@ impl Renderer {
             rate_t: method.paper.t as f32,
             rate_l: method.paper.l as f32,
             pixel_size: (1.0 / c.fx) as f32,
+            drawn: turn.drawn,
+            first_sample: turn.first_sample,
         };
         slot.frame.write(&[frame]);
         slot.parity = 1 - self.last.parity;

@@ -1,9 +1,11 @@
 //! One frame in flight: its memory on both sides, what it cost, and what can be read back.
 
+use super::renderer::Resources;
 use super::tiles::TileList;
 use crate::gpu::{BindingSet, Buffer, CommandList, FrameFence, GpuError};
 use dpm_device::planes::Raster;
 use dpm_shaders::structs::{Counters, Guide, History, Surface};
+use std::sync::Arc;
 
 /// Names of the passes whose ends are stamped, in order.
 pub const PASSES: &[&str] = &[
@@ -35,7 +37,8 @@ impl FrameCost {
     }
 }
 
-/// The memory of one frame in flight. Moves between threads: the render thread fills and submits it, the pack thread waits and reads.
+/// The memory of one frame in flight. Moves between threads: the render thread fills and submits it, the pack thread waits and reads. It
+/// keeps alive what its submission reads, so it may outlive its renderer. Dropping it waits for the submission as [`FrameFence`] does.
 pub struct FrameSlot {
     // Dropped first: it waits until the GPU no longer uses the rest.
     pub(super) fence: FrameFence,
@@ -60,6 +63,8 @@ pub struct FrameSlot {
     /// Which of the lists ran last.
     pub(super) parity: usize,
     pub(super) stamps: [u64; PASSES.len() + 1],
+    // Dropped last: pipelines and buffers that the submission uses.
+    pub(super) _resources: Arc<Resources>,
 }
 
 /// Copies for looking at.
@@ -78,9 +83,23 @@ impl FrameSlot {
     /// Waits at most `timeout_ns` for the frame, then tells what it cost. Allocates nothing.
     ///
     /// # Errors
-    /// Timeout (still running) or device lost.
+    /// Timeout (still running: wait again, or give the device up), or device lost or given up.
     pub fn wait(&mut self, timeout_ns: u64) -> Result<FrameCost, GpuError> {
         self.fence.wait(timeout_ns)?;
+        Ok(self.cost())
+    }
+
+    /// Waits at most `wait_ns` for the frame: what it cost, or `None` while it is still being made. To be called again until it is done; a
+    /// thread that has to give signs of life does so in between. Allocates nothing.
+    ///
+    /// # Errors
+    /// Device lost or given up: the frame will never be there.
+    pub fn poll_done(&mut self, wait_ns: u64) -> Result<Option<FrameCost>, GpuError> {
+        Ok(if self.fence.poll(wait_ns)? { Some(self.cost()) } else { None })
+    }
+
+    /// What the finished frame cost.
+    fn cost(&mut self) -> FrameCost {
         let mut cost = FrameCost {
             counters: bytemuck::cast(self.counters_host.read::<Counters>(1)[0]),
             ..FrameCost::default()
@@ -91,7 +110,7 @@ impl FrameSlot {
                 *pass = self.stamps[i + 1].saturating_sub(self.stamps[i]);
             }
         }
-        Ok(cost)
+        cost
     }
 
     /// Code values 0x00BBGGRR, row by row; empty when the renderer's output is planes alone. Valid after [`FrameSlot::wait`].

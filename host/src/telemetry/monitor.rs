@@ -2,10 +2,12 @@
 //! a projector.
 
 use super::ordered::DarkLog;
-use dpm_device::link::faults;
+use crate::interlock::Interlock;
+use crate::stopping;
+use dpm_device::link::{faults, LimitReached};
 use std::collections::VecDeque;
 use std::fmt;
-use std::sync::atomic::{AtomicBool, AtomicU64, AtomicU8, Ordering};
+use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
 use std::sync::{Mutex, OnceLock, PoisonError};
 
 /// Notes that wait for the watching thread; further ones are only counted.
@@ -35,6 +37,30 @@ impl Order {
         Self::ALL.iter().find(|(order, _)| *order == self).map_or("", |(_, word)| word)
     }
 
+    /// True for the orders that make it dark.
+    pub fn is_dark(self) -> bool {
+        matches!(self, Self::Black | Self::Safe)
+    }
+
+    /// How strong it is: what stands is replaced by what is as strong or stronger, and by ARM only.
+    pub fn strength(self) -> u8 {
+        match self {
+            Self::Arm => 0,
+            Self::Freeze => 1,
+            Self::Black => 2,
+            Self::Safe => 3,
+        }
+    }
+
+    fn from_code(code: u8) -> Option<Self> {
+        Self::ALL.iter().map(|(order, _)| *order).find(|order| *order as u8 == code)
+    }
+
+    /// The order that a key on the terminal of a run gives: the first letter of its word, small or capital.
+    pub fn from_key(key: u8) -> Option<Self> {
+        Self::ALL.iter().find(|(_, w)| w.as_bytes()[0] == key.to_ascii_lowercase()).map(|(order, _)| *order)
+    }
+
     /// The order with this word.
     pub fn from_word(word: &str) -> Option<Self> {
         Self::ALL.iter().find(|(_, w)| *w == word).map(|(order, _)| *order)
@@ -59,10 +85,15 @@ pub enum ProjectorHealth {
     Frozen,
     /// Dark at the end of the run.
     Stopped,
+    /// Dark because the interlock is open.
+    InterlockOpen,
+    /// Dark for a while because a limit on light was reached.
+    Resting(LimitReached),
 }
 
 impl ProjectorHealth {
-    const fn encode(self) -> u64 {
+    /// As a number, for an atomic or a file.
+    pub(crate) const fn encode(self) -> u64 {
         match self {
             Self::Connecting => 0,
             Self::Up => 1,
@@ -71,10 +102,14 @@ impl ProjectorHealth {
             Self::Frozen => 4,
             Self::Stopped => 5,
             Self::Faulted(mask) => 6 | (mask as u64) << 8,
+            Self::InterlockOpen => 7,
+            Self::Resting(LimitReached::Mean) => 8,
+            Self::Resting(LimitReached::FullWhite) => 9,
         }
     }
 
-    const fn decode(code: u64) -> Self {
+    /// Undoes [`ProjectorHealth::encode`].
+    pub(crate) const fn decode(code: u64) -> Self {
         match code & 0xff {
             1 => Self::Up,
             2 => Self::Lost,
@@ -82,6 +117,9 @@ impl ProjectorHealth {
             4 => Self::Frozen,
             5 => Self::Stopped,
             6 => Self::Faulted((code >> 8) as u32),
+            7 => Self::InterlockOpen,
+            8 => Self::Resting(LimitReached::Mean),
+            9 => Self::Resting(LimitReached::FullWhite),
             _ => Self::Connecting,
         }
     }
@@ -98,6 +136,8 @@ impl ProjectorHealth {
             Self::Black => "BLACK",
             Self::Frozen => "FROZEN",
             Self::Stopped => "dark",
+            Self::InterlockOpen => "INTERLOCK",
+            Self::Resting(_) => "RESTING",
         }
     }
 }
@@ -114,6 +154,17 @@ impl fmt::Display for ProjectorHealth {
             Self::Black => write!(f, "black; `dpm arm` shows the picture again"),
             Self::Frozen => write!(f, "frozen; `dpm arm` lets the picture move again"),
             Self::Stopped => write!(f, "dark"),
+            Self::InterlockOpen => {
+                write!(f, "dark, safety.interlock is open; light comes back when it closes, unless black, freeze or safe was ordered")
+            }
+            Self::Resting(LimitReached::Mean) => write!(
+                f,
+                "dark, the mean light reached safety.limits.mean_level; light comes back after safety.limits.mean_window_s"
+            ),
+            Self::Resting(LimitReached::FullWhite) => write!(
+                f,
+                "dark, full white lasted for safety.limits.full_white_s; light comes back after as long"
+            ),
         }
     }
 }
@@ -123,11 +174,18 @@ impl fmt::Display for ProjectorHealth {
 #[derive(Debug, Default)]
 pub struct RunMonitor {
     stop: AtomicBool,
-    /// The newest order not yet taken; 0 for none.
-    order: AtomicU8,
+    /// The newest order not yet taken; 0 for none. An ARM carries in its upper half how many orders had come as signals when it was
+    /// asked for, so that a BLACK or SAFE that came since is not undone by it.
+    order: AtomicU64,
+    /// The projector had SAFE latched when the link came up.
+    found_safe: AtomicBool,
     projector: AtomicU64,
     /// Written at most once.
     tracker: OnceLock<String>,
+    /// Why the run will never return, written at most once.
+    gave_up: OnceLock<String>,
+    /// Written at most once, before there is light.
+    interlock: OnceLock<Interlock>,
     frames_planned: AtomicU64,
     frames_lit: AtomicU64,
     frames_dark: AtomicU64,
@@ -182,25 +240,61 @@ impl RunMonitor {
         self.stop.store(true, Ordering::Relaxed);
     }
 
-    /// True when an ordered stop was asked for. The frame path polls this once a frame.
+    /// True when an ordered stop was asked for, here, by a signal or by a panic. The frame path polls this once a frame.
     pub fn stop_requested(&self) -> bool {
-        self.stop.load(Ordering::Relaxed)
+        self.stop.load(Ordering::Relaxed) || stopping::is_stopping()
     }
 
     /// Gives the projector an order; one that was not yet taken is replaced. SAFE is never replaced but by ARM.
     pub fn give_order(&self, order: Order) {
-        let _ = self.order.fetch_update(Ordering::Relaxed, Ordering::Relaxed, |waiting| {
-            (waiting != Order::Safe as u8 || order == Order::Arm).then_some(order as u8)
-        });
+        match order {
+            Order::Arm => self.arm_unless_darkened(stopping::orders()),
+            _ => drop(self.order.fetch_update(Ordering::Relaxed, Ordering::Relaxed, |waiting| {
+                (waiting as u8 != Order::Safe as u8).then_some(order as u64)
+            })),
+        }
     }
 
-    /// The newest order, once. The link thread asks with every poll.
+    /// Gives ARM, which has no effect where more than `since` orders have come as signals when it is taken: they are newer than the
+    /// wish for light.
+    pub fn arm_unless_darkened(&self, since: u32) {
+        self.order.store(Order::Arm as u64 | u64::from(since) << 32, Ordering::Relaxed);
+    }
+
+    /// The newest order, once; of two that wait the one that makes it darker. The link thread asks with every poll. After a stop was
+    /// asked for there is no ARM and no FREEZE any more.
     pub fn take_order(&self) -> Option<Order> {
-        if self.order.load(Ordering::Relaxed) == 0 {
-            return None;
-        }
-        let code = self.order.swap(0, Ordering::Relaxed);
-        Order::ALL.iter().map(|(order, _)| *order).find(|order| *order as u8 == code)
+        let signalled = Order::from_code(stopping::take_order());
+        let own = match self.order.load(Ordering::Relaxed) {
+            0 => None,
+            _ => Some(self.order.swap(0, Ordering::Relaxed)),
+        };
+        let own = own.and_then(|code| {
+            let order = Order::from_code(code as u8)?;
+            let overtaken = order == Order::Arm && stopping::orders() != (code >> 32) as u32;
+            (!overtaken).then_some(order)
+        });
+        let order = signalled.into_iter().chain(own).max_by_key(|order| order.strength())?;
+        (order.is_dark() || !self.stop_requested()).then_some(order)
+    }
+
+    /// True when BLACK or SAFE has been ordered and not yet been taken, or a stop: a link that comes up does not arm.
+    pub fn dark_is_ordered(&self) -> bool {
+        let waiting = |code: u8| Order::from_code(code).is_some_and(Order::is_dark);
+        self.stop_requested()
+            || waiting(stopping::waiting_order())
+            || waiting(self.order.load(Ordering::Relaxed) as u8)
+    }
+
+    /// Says that the projector had SAFE latched when the link came up: it stands until ARM like one that was ordered here.
+    pub fn find_safe(&self) {
+        self.found_safe.store(true, Ordering::Relaxed);
+        self.give_order(Order::Safe);
+    }
+
+    /// True once after [`RunMonitor::find_safe`].
+    pub fn take_found_safe(&self) -> bool {
+        self.found_safe.swap(false, Ordering::Relaxed)
     }
 
     /// Says how the projector is.
@@ -213,6 +307,21 @@ impl RunMonitor {
         ProjectorHealth::decode(self.projector.load(Ordering::Relaxed))
     }
 
+    /// Makes light depend on `interlock`, for the whole run. A second one is dropped: set it before the run begins.
+    pub fn set_interlock(&self, interlock: Interlock) {
+        let _ = self.interlock.set(interlock);
+    }
+
+    /// The interlock, if light depends on one.
+    pub fn interlock(&self) -> Option<&Interlock> {
+        self.interlock.get()
+    }
+
+    /// True while there may be light: there is no interlock, or it is closed. Never waits; the link thread asks with every poll.
+    pub fn light_allowed(&self) -> bool {
+        self.interlock.get().is_none_or(Interlock::is_closed)
+    }
+
     /// Says, once in a run, which bodies the tracker has not seen a second after its start, why and what to do. Off the frame path.
     pub fn tell_of_tracker(&self, word: String) {
         let _ = self.tracker.set(word);
@@ -221,6 +330,16 @@ impl RunMonitor {
     /// What was said of the tracker; `None` while there is nothing to say.
     pub fn tracker(&self) -> Option<&str> {
         self.tracker.get().map(String::as_str)
+    }
+
+    /// The thread that would return from the run hangs: whoever waits for it should not. The projector was told to go dark.
+    pub fn give_up(&self, why: String) {
+        let _ = self.gave_up.set(why);
+    }
+
+    /// Why the run will never return; `None` while it may.
+    pub fn gave_up(&self) -> Option<&str> {
+        self.gave_up.get().map(String::as_str)
     }
 
     /// Counts a planned frame.
@@ -318,6 +437,38 @@ mod tests {
         assert_eq!(monitor.take_order(), Some(Order::Arm));
     }
 
+    /// Found in use, R2: the projector was armed again three times after the run had been told to stop.
+    #[test]
+    fn r2_nothing_arms_or_holds_light_after_a_stop_was_asked_for() {
+        let monitor = RunMonitor::default();
+        monitor.give_order(Order::Arm);
+        assert!(!monitor.dark_is_ordered());
+        monitor.request_stop();
+        assert!(monitor.dark_is_ordered());
+        assert_eq!(monitor.take_order(), None);
+        for (order, _) in Order::ALL {
+            monitor.give_order(order);
+            assert_eq!(monitor.take_order(), Some(order).filter(|o| o.is_dark()));
+        }
+    }
+
+    #[test]
+    fn a_link_that_comes_up_sees_the_dark_that_waits_and_an_overtaken_arm_is_none() {
+        let monitor = RunMonitor::default();
+        for (order, _) in Order::ALL {
+            monitor.give_order(order);
+            assert_eq!(monitor.dark_is_ordered(), matches!(order, Order::Black | Order::Safe));
+            assert_eq!(monitor.take_order(), Some(order));
+        }
+        assert!(!monitor.take_found_safe());
+        monitor.find_safe();
+        assert_eq!((monitor.take_found_safe(), monitor.take_found_safe()), (true, false));
+        assert_eq!(monitor.take_order(), Some(Order::Safe));
+        // As if one more order had come as a signal since this ARM was asked for.
+        monitor.arm_unless_darkened(stopping::orders().wrapping_sub(1));
+        assert_eq!(monitor.take_order(), None);
+    }
+
     #[test]
     fn notes_are_told_once_and_do_not_pile_up() {
         let monitor = RunMonitor::default();
@@ -339,6 +490,9 @@ mod tests {
             H::Black,
             H::Frozen,
             H::Stopped,
+            H::InterlockOpen,
+            H::Resting(LimitReached::Mean),
+            H::Resting(LimitReached::FullWhite),
             H::Faulted(0),
             H::Faulted(u32::MAX),
         ];

@@ -160,6 +160,12 @@ pub struct Report {
     pub frames_late: u64,
     /// Slots in which the former frame was shown again.
     pub frames_repeated: u64,
+    /// Frames not sent because their poses would have been older than `safety.predict_ms` and a slot when they were lit.
+    pub frames_too_old: u64,
+    /// Slots from one planned frame to the next, on average at the end: 1 where the renderer keeps up.
+    pub slots_per_frame: f64,
+    /// Longest time for which a body was carried on by prediction, milliseconds, at the end.
+    pub predict_ms: f64,
     /// Columns and rows traced and projected.
     pub raster: [u32; 2],
     /// Bit planes in a frame.
@@ -181,6 +187,12 @@ pub struct Report {
     pub registration_error_px: Option<Spread>,
     /// The same if the newest sample had been used as it was.
     pub registration_error_unpredicted_px: Option<Spread>,
+    /// The same of frames that were lit in their own slot: what is left when lateness is not counted.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub registration_error_in_time_px: Option<Spread>,
+    /// True beginning of a slot less what the host took it for, as the mock in this process saw it at real pace.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub clock_error_ms: Option<Latency>,
     /// The instant of the light at which the registration was measured.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub registration_error_at: Option<&'static str>,
@@ -245,6 +257,9 @@ impl Default for Report {
             frames_withheld: 0,
             frames_late: 0,
             frames_repeated: 0,
+            frames_too_old: 0,
+            slots_per_frame: 1.0,
+            predict_ms: 0.0,
             raster: [0, 0],
             planes: 0,
             frame_rate_hz: 0.0,
@@ -255,6 +270,8 @@ impl Default for Report {
             prediction: false,
             registration_error_px: None,
             registration_error_unpredicted_px: None,
+            registration_error_in_time_px: None,
+            clock_error_ms: None,
             registration_error_at: None,
             motion_to_first_photon_ms: None,
             motion_to_light_centre_ms: None,

@@ -1,0 +1,142 @@
+//! The way on after a loss: the same device opened anew, or another one.
+
+use super::commands::run_now;
+use super::context::{DeviceId, Gpu};
+use super::error::GpuError;
+use std::sync::mpsc::sync_channel;
+use std::sync::Arc;
+use std::time::{Duration, Instant};
+
+/// A device that has not opened and run an empty submission within this time does not come back.
+const COMES_BACK_WITHIN: Duration = Duration::from_secs(2);
+/// Time between two attempts on the same device: drivers need a moment to reset one.
+const BETWEEN: Duration = Duration::from_millis(100);
+/// How long copies at set-up are waited for on a device that was opened anew, nanoseconds.
+const SETUP_WAIT_NS: u64 = 2_000_000_000;
+/// Most devices that are tried.
+const MOST_TRIED: usize = 8;
+
+impl Gpu {
+    /// Opens a device in place of this one, which is given up unless its driver called it lost: the same device first, again and again for
+    /// 2 s, then, best first, the others that the options of [`Gpu::open`] allow, 2 s each. Open means that an empty submission ran. Another
+    /// device is told in the log, and by the summary of what is returned.
+    ///
+    /// The caller waits for at most 2 s a device. A driver that does not return from a call costs a thread, which stays behind.
+    ///
+    /// # Errors
+    /// [`GpuError::NoneLeft`] with what was tried.
+    pub fn reopen(&self) -> Result<Arc<Gpu>, GpuError> {
+        self.give_up();
+        let none_left = |tried: &[String]| GpuError::NoneLeft {
+            device: self.device_name().clone(),
+            tried: tried.join("; "),
+        };
+        let mut told = Vec::new();
+        match self.same_again() {
+            Ok(gpu) => return Ok(gpu),
+            Err(error) => told.push(error.to_string()),
+        }
+        let options = self.options.clone();
+        let others = match within(COMES_BACK_WITHIN, "listing devices", move || Gpu::ranked(&options)) {
+            Ok(all) => all.into_iter().filter(|id| *id != self.id).take(MOST_TRIED),
+            Err(error) => {
+                told.push(error.to_string());
+                return Err(none_left(&told));
+            }
+        };
+        for id in others {
+            match self.open_now(id, COMES_BACK_WITHIN) {
+                Ok(gpu) => {
+                    let (was, is) = (self.device_name(), gpu.device_name());
+                    tracing::warn!(
+                        "{was} did not come back ({}); {is} goes on in its place",
+                        told.join("; ")
+                    );
+                    return Ok(gpu);
+                }
+                Err(error) => told.push(error.to_string()),
+            }
+        }
+        Err(none_left(&told))
+    }
+
+    /// This device anew, tried until it works or its time is over.
+    fn same_again(&self) -> Result<Arc<Gpu>, GpuError> {
+        let begin = Instant::now();
+        loop {
+            let error =
+                match self.open_now(self.id.clone(), COMES_BACK_WITHIN.saturating_sub(begin.elapsed())) {
+                    Ok(gpu) => return Ok(gpu),
+                    Err(error) => error,
+                };
+            // An attempt without time enough would only say that it had none.
+            if begin.elapsed() + 2 * BETWEEN >= COMES_BACK_WITHIN {
+                return Err(error);
+            }
+            std::thread::sleep(BETWEEN);
+        }
+    }
+
+    /// Opens a device and runs an empty submission on it.
+    fn open_now(&self, id: DeviceId, limit: Duration) -> Result<Arc<Gpu>, GpuError> {
+        let options = self.options.clone();
+        within(limit, "opening a device", move || {
+            let gpu = Gpu::open_device(&options, Some(&id), SETUP_WAIT_NS)?;
+            run_now(&gpu, |_| ())?;
+            Ok(gpu)
+        })
+    }
+}
+
+/// What `work` gives, if it does so within `limit`. What comes later is dropped where it was made.
+fn within<T: Send + 'static>(
+    limit: Duration,
+    what: &'static str,
+    work: impl FnOnce() -> Result<T, GpuError> + Send + 'static,
+) -> Result<T, GpuError> {
+    let late = |_| GpuError::Timeout {
+        device: format!("the Vulkan driver ({what})").into(),
+        waited_ms: limit.as_millis() as u64,
+    };
+    let (sender, receiver) = sync_channel(1);
+    let thread = std::thread::Builder::new().name("dpm-gpu-open".into()).spawn(move || {
+        let _ = sender.send(work());
+    });
+    if let Err(e) = thread {
+        return Err(GpuError::NoDriver(format!("no thread for {what}: {e}")));
+    }
+    receiver.recv_timeout(limit).map_err(late)?
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::gpu::{Buffer, GpuOptions, MemoryKind};
+
+    /// Found in use, R12. Without any fault a device can be left and opened anew: what a caller does that sees a stage hang.
+    #[test]
+    fn a_device_that_was_left_is_refused_and_the_one_in_its_place_works() {
+        let options = GpuOptions { validation: false, device: None };
+        let first = Gpu::open(&options).expect("a Vulkan device");
+        assert!(!first.is_lost());
+        let second = first.reopen().expect("the device comes back");
+        assert!(first.is_lost() && !second.is_lost());
+        assert_eq!((second.id.clone(), &second.summary().name), (first.id.clone(), &first.summary().name));
+        let refused = Buffer::new(&first, "late", 16, MemoryKind::Device).expect_err("given up");
+        assert!(refused.is_loss(), "{refused}");
+        Buffer::from_slice(&second, "new", &[1u32, 2, 3]).expect("the new one works");
+    }
+
+    #[test]
+    fn a_driver_that_does_not_return_holds_nobody_up() {
+        let begin = Instant::now();
+        let (release, released) = sync_channel::<()>(0);
+        let error = within(Duration::from_millis(50), "sleeping", move || {
+            let _ = released.recv();
+            Ok(())
+        });
+        assert!(matches!(error, Err(GpuError::Timeout { .. })), "{error:?}");
+        assert!(begin.elapsed() < Duration::from_secs(20));
+        drop(release);
+    }
+}
