@@ -140,7 +140,7 @@ impl LinkKeeper {
         if !stopping {
             self.arm_again(now, link, steady);
         }
-        monitor.dark().tell(now, ordered_dark(now, link, self.standing));
+        monitor.dark().tell(now, ordered_dark(now, link, self.standing, self.allowed));
         if let (Some(reports), Some(status)) = (&mut self.reports, link.status().filter(|_| self.is_timed)) {
             reports.observe(status, &self.time);
         }
@@ -314,7 +314,12 @@ fn rank(verb: Verb) -> u8 {
 }
 
 /// Why no new picture is wanted: slots are no one's fault then.
-fn ordered_dark(now: HostTime, link: &HostLink, standing: Option<Verb>) -> Option<OrderedDark> {
+fn ordered_dark(
+    now: HostTime,
+    link: &HostLink,
+    standing: Option<Verb>,
+    allowed: bool,
+) -> Option<OrderedDark> {
     match standing {
         Some(Verb::Black) => return Some(OrderedDark::Black),
         Some(Verb::Freeze) => return Some(OrderedDark::Frozen),
@@ -323,7 +328,9 @@ fn ordered_dark(now: HostTime, link: &HostLink, standing: Option<Verb>) -> Optio
         _ => {}
     }
     let latched = link.status().map_or(0, |s| s.faults);
-    if link.is_resting(now) {
+    if !allowed {
+        Some(OrderedDark::Interlock)
+    } else if link.is_resting(now) {
         Some(OrderedDark::Rest)
     } else if link.state() == LinkState::Faulted && latched & faults::HOST_SAFE != 0 {
         Some(OrderedDark::Safe)

@@ -50,6 +50,8 @@ pub enum OrderedDark {
     Safe,
     /// A rest that a limit on light demands, for example the limit on flashes.
     Rest,
+    /// The interlock is open: light is not allowed.
+    Interlock,
     /// The projector has a fault that waits for the operator: heat, lamp, emergency stop, flashes.
     Fault,
     /// The run was asked to end.
@@ -58,7 +60,8 @@ pub enum OrderedDark {
 
 impl OrderedDark {
     /// All reasons, in the order of their counters.
-    pub const ALL: [Self; 6] = [Self::Black, Self::Frozen, Self::Safe, Self::Rest, Self::Fault, Self::Stop];
+    pub const ALL: [Self; 7] =
+        [Self::Black, Self::Frozen, Self::Safe, Self::Rest, Self::Interlock, Self::Fault, Self::Stop];
 
     /// As printed.
     pub const fn name(self) -> &'static str {
@@ -67,6 +70,7 @@ impl OrderedDark {
             Self::Frozen => "frozen",
             Self::Safe => "safe",
             Self::Rest => "rest",
+            Self::Interlock => "interlock",
             Self::Fault => "fault",
             Self::Stop => "stop",
         }
