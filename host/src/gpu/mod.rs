@@ -5,7 +5,8 @@
 //! A device may be lost, or hang. Then every call fails at once, everything can be dropped without waiting, and [`Gpu::reopen`] gives a
 //! device to go on with: make the renderer and its slots anew on that one
 //! ([`crate::render::Renderer::from_plan`]). [`LossBudget`] says when to stop trying. Drivers' calls that do
-//! not return (a submission, the making of a device) can be left only with their thread.
+//! not return (a submission, the making of a device) can be left only with their thread, and such a process should end by `_exit`: what
+//! drivers run at an orderly exit may wait for the very threads that hang.
 #![allow(unsafe_code)]
 
 mod address_space;

@@ -21,7 +21,7 @@ impl Gpu {
     /// 2 s, then, best first, the others that the options of [`Gpu::open`] allow, 2 s each. Open means that an empty submission ran. Another
     /// device is told in the log, and by the summary of what is returned.
     ///
-    /// The caller waits for at most 2 s a device. A driver that does not return from a call costs a thread, which stays behind.
+    /// The caller waits for at most 2 s a device, and 2 s for the list of them. A driver that does not return from a call costs a thread, which stays behind.
     ///
     /// # Errors
     /// [`GpuError::NoneLeft`] with what was tried.
