@@ -1,8 +1,10 @@
 //! `dpm link-test --conformance` judged: a device written from docs/PROTOCOL.md alone keeps every rule, the same device made to break a rule breaks exactly
 //! what it was made to, and the mock projector keeps them all.
 
+mod cli_common;
 mod peer;
 
+use cli_common::{code, dpm, err, out};
 use dpm_device::link::packet_bytes;
 use dpm_device::planes::Raster;
 use dpm_device::time::HostTime;
@@ -93,4 +95,40 @@ fn every_rule_has_a_name_of_its_own_and_a_section_of_the_document() {
     }
     let listed = text.lines().filter(|l| l.starts_with("| `")).count();
     assert_eq!(listed, seen.len(), "the document lists rules that are none");
+}
+
+/// Found in use, as a new user: "no conformance run against my device". The program judges one on a serial line, and its exit code is the judgement.
+#[test]
+fn the_program_prints_a_line_a_rule_and_its_exit_code_is_the_judgement() {
+    let rig = concat!(env!("CARGO_MANIFEST_DIR"), "/../rigs/demo.toml");
+    for (fault, expected) in [("", 0), ("black", 1)] {
+        let served = Served::new(fault);
+        let backend = format!("projector.backend={{kind=\"serial\", port={:?}, baud=3000000}}", served.path);
+        let mut args = vec!["link-test", rig, "--conformance", "--rule", "echo", "--rule", "black", "--json"];
+        let sets = [
+            "projector.width=40",
+            "projector.height=30",
+            "projector.planes=8",
+            "projector.frame_rate=100",
+            "real_time.pace=\"real\"",
+        ];
+        for set in sets.iter().copied().chain([backend.as_str()]) {
+            args.extend(["--set", set]);
+        }
+        let output = dpm(&args, &[]);
+        assert_eq!(code(&output), expected, "{fault}: {}{}", out(&output), err(&output));
+        let json: serde_json::Value = serde_json::from_str(&out(&output)).expect("one object");
+        let verdicts: Vec<(&str, &str)> = json["lines"]
+            .as_array()
+            .expect("lines")
+            .iter()
+            .map(|l| (l["rule"].as_str().unwrap_or(""), l["verdict"].as_str().unwrap_or("")))
+            .collect();
+        let black = if expected == 0 { "ok" } else { "failed" };
+        assert_eq!(verdicts, [("black", black), ("echo", "ok")], "{json}");
+        assert_eq!(json["device"]["raster"], serde_json::json!([40, 30]), "{json}");
+    }
+    let unknown = dpm(&["link-test", rig, "--conformance", "--rule", "nonsense"], &[]);
+    assert_eq!(code(&unknown), 2);
+    assert!(err(&unknown).contains("watchdog-fed"), "names the rules that there are: {}", err(&unknown));
 }

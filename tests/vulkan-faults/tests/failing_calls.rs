@@ -123,13 +123,12 @@ fn a_loss_while_a_scene_is_loaded_is_told_at_once() {
     // A device that was opened anew and hangs again while the scene is loaded costs 2 s a copy at most, and the first one ends it.
     session.set("");
     let first = Gpu::open(&options()).unwrap();
+    let plan =
+        Renderer::new(&first, &rig().scene, renderer_settings(rig())).map_err(gpu_error).unwrap().plan();
     let second = first.reopen().unwrap();
     session.set("submit-hang@submit=2");
     let begin = std::time::Instant::now();
-    let error = Renderer::new(&second, &rig().scene, renderer_settings(rig()))
-        .map_err(gpu_error)
-        .err()
-        .expect("it hangs");
+    let error = Renderer::from_plan(&second, &plan).map_err(gpu_error).err().expect("it hangs");
     assert!(matches!(error, GpuError::Timeout { .. }), "{error}");
     assert!(second.is_lost(), "and was given up");
     assert!(begin.elapsed() < std::time::Duration::from_secs(2) + common::SLACK, "{:?}", begin.elapsed());
