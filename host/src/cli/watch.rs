@@ -169,7 +169,7 @@ pub fn watch<T: Send + 'static>(
                     teller.note(word);
                 }
                 ticks = ticks.wrapping_add(1);
-                if ticks % TICKS_SHOWN == 0 {
+                if ticks.is_multiple_of(TICKS_SHOWN) {
                     teller.tick(now, monitor.counts());
                     show(&monitor.counts());
                 }

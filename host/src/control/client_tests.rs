@@ -100,11 +100,11 @@ fn r7_a_folder_that_others_can_write_to_is_named_and_not_used() {
     let dir = place("open");
     let server = rig(&dir, 5, 1, "heard /x\nok: projector black\n");
     fs::set_permissions(&dir, fs::Permissions::from_mode(0o777)).unwrap();
-    let told = tell_in(&[dir.clone()], None, Order::Black).unwrap();
+    let told = tell_in(std::slice::from_ref(&dir), None, Order::Black).unwrap();
     assert!(told.answers.is_empty() && !told.is_done(), "{told:?}");
     assert!(told.refused[0].contains("can be written by others"), "{told:?}");
     fs::set_permissions(&dir, fs::Permissions::from_mode(0o700)).unwrap();
-    assert!(tell_in(&[dir.clone()], None, Order::Black).unwrap().is_done());
+    assert!(tell_in(std::slice::from_ref(&dir), None, Order::Black).unwrap().is_done());
     assert_eq!(server.join().unwrap(), "black\n");
     fs::remove_dir_all(dir).unwrap();
 }

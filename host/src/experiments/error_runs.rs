@@ -637,7 +637,7 @@ fn where_equal(trials: &[Trial]) -> f64 {
     let (xx, xy) = (sum(&|a, _| (a - x) * (a - x)), sum(&|a, b| (a - x) * (b - y)));
     let slope = xy / xx;
     let base = y - slope * x;
-    if slope > 0.0 && base >= 0.0 && base < 1.0 {
+    if slope > 0.0 && (0.0..1.0).contains(&base) {
         return (1.0 - base) / slope;
     }
     x / y

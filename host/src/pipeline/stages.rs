@@ -310,7 +310,7 @@ pub fn warm_up(
 /// Longest wait for the GPU in one piece.
 const GPU_STEP_NS: u64 = 5_000_000;
 
-/// Waits for the GPU, if the job has one, in steps of [`GPU_STEP_NS`]; `alive` is called before each.
+/// Waits for the GPU, if the job has one, in steps of 5 ms; `alive` is called before each.
 ///
 /// False when it did not finish within `timeout_ns`.
 ///

@@ -257,6 +257,7 @@ struct Planner<'a> {
     to_pack: Sender<FrameJob>,
     horizon: Horizon,
     /// What came back last is taken first: it is the warmest in the caches.
+    #[allow(clippy::vec_box)] // The box is what travels between the threads.
     hottest: Vec<Box<FrameMemory>>,
     /// The last look at the memory that came back found none.
     waited: bool,

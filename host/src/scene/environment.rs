@@ -466,7 +466,7 @@ mod tests {
     fn large_environments_are_scaled_down_and_keep_their_light() {
         // Bright spots on a dim ground, as studios and suns are.
         let light = |x: u32, y: u32| {
-            let spot = (x.wrapping_mul(2_654_435_761) ^ y.wrapping_mul(40_503)) % 997 == 0;
+            let spot = (x.wrapping_mul(2_654_435_761) ^ y.wrapping_mul(40_503)).is_multiple_of(997);
             Vec3::new(0.1 + (x % 7) as f32, 0.2, if spot { 5.0e4 } else { 0.3 })
         };
         for ((w, h), (tw, th)) in

@@ -48,7 +48,7 @@ impl Track {
 
     fn end_batch(&mut self) {
         if !self.batch.is_empty() {
-            if self.ended % self.stride == 0 {
+            if self.ended.is_multiple_of(self.stride) {
                 if self.batches.len() == MAX_BATCHES {
                     let mut n = 0;
                     self.batches.retain(|_| {

@@ -444,7 +444,7 @@ impl Peer {
             + u32::from(self.breaks("law-credit") && state == 3);
         let lit = self.light || self.breaks("law-dark") && state == 2 || self.breaks("arm") && state == 3;
         let mut now = self.now();
-        if self.breaks("clock-monotonic") && self.statuses % 7 == 0 {
+        if self.breaks("clock-monotonic") && self.statuses.is_multiple_of(7) {
             now -= HZ / 10;
         }
         let mut p = vec![

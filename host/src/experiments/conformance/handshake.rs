@@ -279,7 +279,7 @@ fn config_planes(b: &mut Bench<'_>) -> R {
     }
     p[16] = most + 1;
     p.truncate(40);
-    p.extend((0..=most).map(|k| k / 8 << 4 | k % 8));
+    p.extend((0..=most).map(|k| ((k / 8) << 4) | (k % 8)));
     // So slow that the rate is no reason.
     p[4..12].copy_from_slice(&[1, 0, 0, 0, 1, 0, 0, 0]);
     refused(b, &p, &[2], "one plane more than it takes")

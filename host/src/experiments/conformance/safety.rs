@@ -71,7 +71,7 @@ fn checksum_storm(b: &mut Bench<'_>) -> R {
     while sent < 960 {
         b.send_packets(Lane::Control, &[one(), one(), one()])?;
         sent += 3;
-        if sent % 60 == 0 {
+        if sent.is_multiple_of(60) {
             // Intact packets, which are no whole frames, change nothing.
             b.report()?;
         }
