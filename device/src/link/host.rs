@@ -468,7 +468,7 @@ impl HostLink {
         }
     }
 
-    /// True while the answer to a clock exchange is under way that began less than [`ECHO_AWAITED_NS`] ago: a caller that polls soon learns the
+    /// True while the answer to a clock exchange is under way that began less than 5 ms ago: a caller that polls soon learns the
     /// device's clock the better.
     pub fn awaits_echo(&self, now: HostTime) -> bool {
         self.echo_sent_at != NEVER

@@ -94,7 +94,9 @@ fn every_order_is_obeyed_and_bad_clients_cost_nothing() {
         let told = rig.tell(order).unwrap();
         assert!(told.is_done() && told.answers.len() == 1, "{word}: {told:?}");
         assert_eq!((told.answers[0].pid, told.answers[0].uid), (std::process::id(), user()));
-        assert_eq!(told.answers[0].rig, "built-in demo");
+        // Another test of this process may have read a rig file by now.
+        let names = ["built-in demo", crate::control::rig_name()];
+        assert!(names.contains(&&*told.answers[0].rig), "{told:?}");
         assert_eq!(told.answers[0].text.contains("; kept in "), order != Order::Arm, "{told:?}");
         assert!(super::is_obeyed(order, rig.monitor.projector()));
     }

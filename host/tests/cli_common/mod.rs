@@ -119,11 +119,6 @@ impl Running {
         self.child.try_wait().expect("our own child")
     }
 
-    /// True when the process has ended.
-    pub fn has_ended(&mut self) -> bool {
-        self.child.try_wait().expect("it can be asked").is_some()
-    }
-
     /// Waits for the end; gives status and standard output.
     pub fn finish(mut self) -> (ExitStatus, String) {
         let mut text = String::new();

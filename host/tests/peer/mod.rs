@@ -327,7 +327,7 @@ impl Peer {
         };
         let wrong = payload.len() != length && !(self.breaks("payload-length") && payload.len() > length);
         if wrong || matches!(h[5], 4 | 7) {
-            self.n.ignored += u32::from(!(self.breaks("direction") && !wrong));
+            self.n.ignored += u32::from(!self.breaks("direction") || wrong);
             return;
         }
         match h[5] {
