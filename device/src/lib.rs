@@ -13,6 +13,8 @@ pub mod dlpc900;
 pub mod link;
 pub mod planes;
 pub mod pose;
+#[cfg(feature = "std")]
+pub mod regular_file;
 pub mod time;
 #[cfg(feature = "std")]
 pub mod tracker;

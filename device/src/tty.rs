@@ -10,13 +10,15 @@ use std::time::Duration;
 
 use serialport::{SerialPort, TTYPort};
 
-/// Opens the port at `path` for this program alone, 8 data bits, no parity, one stop bit.
+/// Opens the port at `path` for this program alone, 8 data bits, no parity, one stop bit. What had waited in it is thrown away: nobody
+/// knows how old it is, and it answers nothing that was asked.
 ///
 /// # Errors
 /// The library's: not found, no permission, in use.
 pub fn open(path: &str, baud: u32) -> serialport::Result<Box<dyn SerialPort>> {
     // Exclusive by lock and by TIOCEXCL; the library's default, said here because it is a promise.
     let port = serialport::new(path, baud).exclusive(true).open_native()?;
+    port.clear(serialport::ClearBuffer::Input)?;
     Ok(never_wait(port)?)
 }
 
@@ -99,6 +101,50 @@ pub fn never_wait(mut port: TTYPort) -> io::Result<Box<dyn SerialPort>> {
         Ok(Box::new(port))
     } else {
         Err(io::Error::last_os_error())
+    }
+}
+
+/// An input of a serial port that is read as a switch, not as data.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum ControlSignal {
+    /// Clear to send.
+    Cts,
+    /// Data set ready.
+    Dsr,
+    /// Data carrier detect.
+    Dcd,
+}
+
+/// A serial port of which only a control line is read: a contact between one of its outputs and an input, or a relay at it. Opening it
+/// raises RTS and DTR, which can feed the contact.
+pub struct ControlLine {
+    port: Box<dyn SerialPort>,
+    signal: ControlSignal,
+}
+
+impl ControlLine {
+    /// Opens the port at `path` for this program alone.
+    ///
+    /// # Errors
+    /// The library's: not found, no permission, in use.
+    pub fn open(path: &str, signal: ControlSignal) -> serialport::Result<Self> {
+        let mut port = open(path, 9600)?;
+        // Some drivers raise them when the port is opened; all do when they are told to.
+        port.write_request_to_send(true)?;
+        port.write_data_terminal_ready(true)?;
+        Ok(Self { port, signal })
+    }
+
+    /// True while the line is raised.
+    ///
+    /// # Errors
+    /// The port is gone, or has no such line (a pseudo-terminal).
+    pub fn is_raised(&mut self) -> serialport::Result<bool> {
+        match self.signal {
+            ControlSignal::Cts => self.port.read_clear_to_send(),
+            ControlSignal::Dsr => self.port.read_data_set_ready(),
+            ControlSignal::Dcd => self.port.read_carrier_detect(),
+        }
     }
 }
 

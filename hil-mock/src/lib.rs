@@ -5,6 +5,7 @@
 
 pub mod dlpc900;
 pub mod faults;
+pub mod monotonic;
 pub mod motion;
 mod motion_spec;
 pub mod natnet_host;

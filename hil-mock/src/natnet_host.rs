@@ -22,7 +22,7 @@ impl NatNetHost {
     /// Most commands answered between two looks at the frames: a flood of commands must not delay poses.
     const MAX_COMMANDS: usize = 64;
 
-    /// Binds `command` (port 0 for any) and starts the server. Multicast leaves through the interface of that address, which must
+    /// Binds `command` (port 0 for any), for this server alone, and starts the server. Multicast leaves through the interface of that address, which must
     /// then be given. `clock` is the clock of the server's sample source.
     pub fn start(
         server: NatNetServer,
@@ -30,7 +30,8 @@ impl NatNetHost {
         command: SocketAddrV4,
         clock: Arc<dyn HostClock>,
     ) -> io::Result<Self> {
-        let port = UdpPort::bind(command, true)?;
+        // Not shared: of two servers on one port the system would hand each command to one of them only.
+        let port = UdpPort::bind(command, false)?;
         if let Streaming::Multicast(_) = streaming {
             let interface = if command.ip().is_unspecified() { Ipv4Addr::LOCALHOST } else { *command.ip() };
             port.multicast_from(interface, 1)?;

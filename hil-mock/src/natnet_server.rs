@@ -40,6 +40,10 @@ pub enum Streaming {
 pub struct NatNetServerConfig {
     /// Newest and default version of the bit stream, 3.0 to 4.2.
     pub version: Version,
+    /// Version whose layout frames have, where it is not the one that was announced to the client.
+    pub frame_layout: Option<Version>,
+    /// Version whose layout model definitions have, where it is not the one that was announced to the client.
+    pub model_layout: Option<Version>,
     /// How frames travel.
     pub streaming: Streaming,
     /// Port announced for frames.
@@ -59,6 +63,8 @@ impl NatNetServerConfig {
     pub fn new(names: &[&str]) -> Self {
         Self {
             version: Version::V4_1,
+            frame_layout: None,
+            model_layout: None,
             streaming: Streaming::Unicast(UnicastTo::Both),
             data_port: 1511,
             bodies: names.iter().zip(1..).map(|(n, id)| ((*n).to_owned(), id)).collect(),
@@ -137,8 +143,11 @@ impl NatNetServer {
 
     /// A server for the bodies of `source`.
     pub fn new(config: NatNetServerConfig, source: SampleSource) -> Result<Self, NatNetServerError> {
-        if !config.version.is_spoken() || config.version > Version::V4_2 {
-            return Err(NatNetServerError::Version(config.version));
+        for version in [Some(config.version), config.frame_layout, config.model_layout].into_iter().flatten()
+        {
+            if !version.is_spoken() || version > Version::V4_2 {
+                return Err(NatNetServerError::Version(version));
+            }
         }
         let (hz, skew_ppb) = (config.clock_hz, config.clock_skew_ppb);
         if hz == 0 || hz > 1_000_000_000_000 || skew_ppb.abs() > 1_000_000 {
@@ -336,7 +345,7 @@ impl NatNetServer {
         let markers = &self.markers;
         let definitions: Vec<BodyDefinition<'_>> =
             self.config.bodies.iter().map(|(name, id)| BodyDefinition { name, id: *id, markers }).collect();
-        encode_models(&mut self.datagram, version, &definitions)
+        encode_models(&mut self.datagram, self.config.model_layout.unwrap_or(version), &definitions)
     }
 
     /// Instant at which the next report is due: when to call [`NatNetServer::stream`] again, at the latest.
@@ -449,7 +458,7 @@ impl NatNetServer {
             bodies: &self.bodies,
             labeled: &self.labeled,
         };
-        encode_frame(&mut self.datagram, version, &info, &content)
+        encode_frame(&mut self.datagram, self.config.frame_layout.unwrap_or(version), &info, &content)
     }
 
     /// Damages the datagram where the plan says so.

@@ -6,8 +6,10 @@
 
 mod clock;
 mod config;
+mod emulated;
 mod faulty;
 mod frames;
+mod guard;
 mod light;
 mod receive;
 pub mod serial;
@@ -17,18 +19,20 @@ pub mod usb;
 use std::collections::VecDeque;
 
 use dpm_device::link::{
-    faults, mean_luminance, Codec, Config, ConfigRefusal, Decoder, DeviceHello, DeviceMessage, DeviceState,
-    Echo, Fault, FaultCode, FlashLimiter, Header, Packet, SlotClock, Status, Underrun, MAX_CONTROL_BYTES,
-    REST_US,
+    faults, mean_luminance, Codec, Config, ConfigRefusal, Decoder, DecoderCounters, DeviceHello,
+    DeviceMessage, DeviceState, Echo, Fault, FaultCode, FlashLimiter, Header, Packet, SlotClock, Status,
+    Underrun, MAX_CONTROL_BYTES, REST_US,
 };
 use dpm_device::planes::{Raster, MAX_PLANES};
 use dpm_device::time::{DeviceTicks, HostTime};
 use dpm_device::transport::{Lane, LinkDevice};
 
 pub use clock::DeviceClock;
-pub use config::{LightEvent, LightKind, MockConfig};
+pub use config::{LightChange, LightEvent, LightKind, MockConfig};
+pub use emulated::{EmulatedProjector, Served};
 pub use faulty::FaultyProjector;
 use frames::{FrameStore, Held};
+use guard::LightGuard;
 pub use light::{light_of_planes, Exposure};
 pub use thread::serve_cable;
 
@@ -38,6 +42,9 @@ const ECHOES_KEPT: usize = 16;
 const CHECKSUM_STORM: u32 = 1000;
 /// A target further ahead than this is refused, seconds: it would hold a buffer for good.
 const MAX_LEAD_S: u64 = 2;
+
+/// Changes of light or state that are kept; older ones go and are counted with the light events.
+const CHANGES_KEPT: usize = 1024;
 
 /// Armed or not, and how.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -69,6 +76,9 @@ struct Core {
     last_heard: DeviceTicks,
     next_slot: u64,
     flash: Option<FlashLimiter>,
+    guard: LightGuard,
+    /// Up to here the guard has counted.
+    counted_to: Option<HostTime>,
     /// Luminance of the frame on the mirrors.
     luminance: u32,
     /// No ARM before this, while light rests after too many flashes.
@@ -86,15 +96,24 @@ struct Core {
     incoming: [receive::Incoming; 2],
     events: VecDeque<LightEvent>,
     events_lost: u64,
+    /// When what happens now happens: `now`, or the exact instant of what the device does by itself.
+    at: HostTime,
+    changes: VecDeque<LightChange>,
+    before: (bool, DeviceState),
     light: Vec<[u8; 3]>,
     light_is_of: Option<u64>,
     /// Counts lit frames over all sessions.
     generation: u64,
     /// Session whose HELLO waits for an answer.
     hello_due: Option<u32>,
+    /// Session that was not opened because its host speaks other versions.
+    version_refused_due: Option<u32>,
     fault_due: Option<Fault>,
     echoes: VecDeque<Echo>,
     status_due: bool,
+    /// A session was opened since the decoders' counters were last looked at, and what they were then.
+    counters_due: bool,
+    counted_before: DecoderCounters,
 }
 
 const NO_STATUS: Status = Status {
@@ -149,6 +168,8 @@ impl MockProjector {
                 last_heard: DeviceTicks(0),
                 next_slot: 0,
                 flash: None,
+                guard: LightGuard::default(),
+                counted_to: None,
                 luminance: 0,
                 rest_until: DeviceTicks(0),
                 damaged_at_whole: 0,
@@ -162,13 +183,19 @@ impl MockProjector {
                 incoming: Default::default(),
                 events: VecDeque::with_capacity(setup.events_kept),
                 events_lost: 0,
+                at: HostTime(i64::MIN),
+                changes: VecDeque::with_capacity(CHANGES_KEPT),
+                before: (false, DeviceState::Idle),
                 light: Vec::new(),
                 light_is_of: None,
                 generation: 0,
                 hello_due: None,
+                version_refused_due: None,
                 fault_due: None,
                 echoes: VecDeque::with_capacity(ECHOES_KEPT),
                 status_due: false,
+                counters_due: false,
+                counted_before: DecoderCounters::default(),
             },
         }
     }
@@ -181,6 +208,11 @@ impl MockProjector {
     /// Light events that were pushed out by newer ones before anybody took them.
     pub fn light_events_lost(&self) -> u64 {
         self.core.events_lost
+    }
+
+    /// The oldest change of light or state not yet taken.
+    pub fn next_change(&mut self) -> Option<LightChange> {
+        self.core.changes.pop_front()
     }
 
     /// True when light is on.
@@ -236,13 +268,17 @@ impl MockProjector {
         self.core.setup.clock
     }
 
-    /// True time of the next thing that happens by itself (a slot or the watchdog); `None` while disarmed.
+    /// True time of the next thing that happens by itself (a slot, the end of a frame's light, or the watchdog); `None` while
+    /// disarmed.
     pub fn next_due(&self) -> Option<HostTime> {
         let (config, slots) = self.core.config.as_ref()?;
         if self.core.mode == Mode::Disarmed {
             return None;
         }
-        let due = slots.start(self.core.next_slot).min(self.core.bite_at(config));
+        let mut due = slots.start(self.core.next_slot).min(self.core.bite_at(config));
+        if let Some(dark_from) = self.core.dark_from() {
+            due = due.min(dark_from);
+        }
         Some(self.core.setup.clock.instant_of(due))
     }
 
@@ -253,6 +289,7 @@ impl MockProjector {
         self.core.present = present;
         if new != 0 {
             self.core.latch(new);
+            self.core.note_change();
         }
     }
 
@@ -260,14 +297,19 @@ impl MockProjector {
     pub fn bus_reset(&mut self, now: HostTime) {
         self.advance_to(now);
         self.core.open_session(0);
+        self.core.note_change();
         self.core.incoming = Default::default();
         self.decoders = [Decoder::new(), Decoder::new()];
+        (self.core.counters_due, self.core.counted_before) = (false, DecoderCounters::default());
     }
 
     /// Power fails and comes back: dark, no session, no memory, the clock starts again.
     pub fn power_cycle(&mut self, now: HostTime) {
         self.advance_to(now);
         let present = self.core.present;
+        self.core.disarm();
+        self.core.note_change();
+        let changes = std::mem::take(&mut self.core.changes);
         let setup = MockConfig {
             clock: DeviceClock { power_on_at: now, ..self.core.setup.clock },
             ..self.core.setup
@@ -275,6 +317,7 @@ impl MockProjector {
         *self = Self::new(setup);
         self.core.present = present;
         self.core.latched = present;
+        self.core.changes = changes;
     }
 }
 
@@ -283,9 +326,14 @@ impl LinkDevice for MockProjector {
         self.core.advance(now);
         let mut sink = receive::LaneSink { core: &mut self.core, lane };
         self.decoders[lane as usize].push(bytes, &mut sink);
+        if std::mem::take(&mut self.core.counters_due) {
+            // What came before, the HELLO included, is not of this session.
+            self.core.counted_before = summed(&self.decoders);
+        }
         let [a, b] = self.decoders.each_ref().map(Decoder::counters);
         let damaged = [a.header_errors, a.payload_errors, b.header_errors, b.payload_errors];
         self.core.damaged(damaged.iter().fold(0, |sum, n| sum.wrapping_add(*n)));
+        self.core.note_change();
     }
 
     fn end_of_transfer(&mut self, now: HostTime, lane: Lane) {
@@ -317,6 +365,11 @@ impl LinkDevice for MockProjector {
         if let Some(asked) = self.core.hello_due.take() {
             send(asked, &DeviceMessage::Hello(self.core.hello(now_ticks)));
         }
+        if let Some(asked) = self.core.version_refused_due.take() {
+            let (latched, detail) = (self.core.latched, self.core.setup.version);
+            let fault = Fault { latched, code: FaultCode::Version, detail, at: now_ticks };
+            send(asked, &DeviceMessage::Fault(fault));
+        }
         if let Some(fault) = self.core.fault_due.take() {
             send(session, &DeviceMessage::Fault(fault));
         }
@@ -327,6 +380,19 @@ impl LinkDevice for MockProjector {
             let status = self.core.status_now(&self.decoders);
             send(session, &DeviceMessage::Status(status));
         }
+    }
+}
+
+/// What both lanes' decoders have counted since power-on.
+fn summed(decoders: &[Decoder; 2]) -> DecoderCounters {
+    let [a, b] = decoders.each_ref().map(Decoder::counters);
+    DecoderCounters {
+        packets: a.packets.wrapping_add(b.packets),
+        header_errors: a.header_errors.wrapping_add(b.header_errors),
+        payload_errors: a.payload_errors.wrapping_add(b.payload_errors),
+        foreign: a.foreign.wrapping_add(b.foreign),
+        cut_short: a.cut_short.wrapping_add(b.cut_short),
+        bytes_skipped: a.bytes_skipped.wrapping_add(b.bytes_skipped),
     }
 }
 
@@ -363,7 +429,7 @@ impl Core {
     }
 
     fn status_now(&self, decoders: &[Decoder; 2]) -> Status {
-        let [a, b] = decoders.each_ref().map(Decoder::counters);
+        let (all, before) = (summed(decoders), self.counted_before);
         Status {
             state: self.state(),
             lit: self.lit_now,
@@ -371,11 +437,14 @@ impl Core {
             faults: self.latched,
             frame_limit: self.frame_limit(),
             now: self.ticks(),
-            packets: a.packets.wrapping_add(b.packets),
-            header_errors: a.header_errors.wrapping_add(b.header_errors),
-            payload_errors: a.payload_errors.wrapping_add(b.payload_errors),
-            packets_ignored: self.status.packets_ignored.wrapping_add(a.foreign).wrapping_add(b.foreign),
-            bytes_skipped: a.bytes_skipped.wrapping_add(b.bytes_skipped),
+            packets: all.packets.wrapping_sub(before.packets),
+            header_errors: all.header_errors.wrapping_sub(before.header_errors),
+            payload_errors: all.payload_errors.wrapping_sub(before.payload_errors),
+            packets_ignored: self
+                .status
+                .packets_ignored
+                .wrapping_add(all.foreign.wrapping_sub(before.foreign)),
+            bytes_skipped: all.bytes_skipped.wrapping_sub(before.bytes_skipped),
             ..self.status
         }
     }
@@ -394,22 +463,66 @@ impl Core {
         DeviceTicks(self.last_heard.0.saturating_add(ticks.max(1)))
     }
 
-    /// Slots and the watchdog up to `now`, in the order of time. Bounded: the watchdog ends it.
+    /// When the frame that is lit must be dark if no newer one is lit before; `None` while nothing is lit or light is frozen.
+    fn dark_from(&self) -> Option<DeviceTicks> {
+        let held = self.store.lit.filter(|_| self.lit_now && self.mode == Mode::Normal)?;
+        Some(held.dark_from)
+    }
+
+    /// Notes that light went on or off, or that the state changed.
+    fn note_change(&mut self) {
+        let now = (self.lit_now, self.state());
+        if now == self.before {
+            return;
+        }
+        self.before = now;
+        let settle = if self.lit_now { i64::from(self.setup.settle_ns) } else { 0 };
+        if self.changes.len() >= CHANGES_KEPT {
+            self.changes.pop_front();
+            self.events_lost += 1;
+        }
+        self.changes.push_back(LightChange {
+            at: self.at.plus_ns(settle),
+            frame: self.store.lit.filter(|_| self.lit_now).map(|held| held.frame),
+            state: now.1,
+            faults: self.latched,
+        });
+    }
+
+    /// The frame on the mirrors is over: dark until a newer one is lit, and nothing is left that could be lit again.
+    fn end_light(&mut self) {
+        self.lit_now = false;
+        self.store.lit = None;
+        self.status_due = true;
+    }
+
+    /// Slots, ends of light and the watchdog up to `now`, in the order of time. Bounded: the watchdog ends it.
     fn advance(&mut self, now: HostTime) {
         self.now = self.now.max(now);
         let ticks = self.ticks();
         while self.mode != Mode::Disarmed {
             let Some((config, slots)) = self.config else { break };
             let (start, bite) = (slots.start(self.next_slot), self.bite_at(&config));
-            if start.min(bite) > ticks {
+            // At one and the same tick a new frame comes before the end of the old one: there is no dark gap between them.
+            let dark = self.dark_from().filter(|dark| *dark < start);
+            let next = dark.unwrap_or(start);
+            if next.min(bite) > ticks {
                 break;
             }
-            if bite <= start {
+            self.at = self.setup.clock.instant_of(next.min(bite));
+            if bite <= next {
                 self.latch(faults::WATCHDOG);
                 break;
             }
-            self.slot(&config, &slots, start);
+            match dark {
+                Some(_) => self.end_light(),
+                None => self.slot(&config, &slots, start),
+            }
+            self.note_change();
         }
+        // What comes from outside happens now; what the watchdog did was noted at its own instant.
+        self.note_change();
+        self.at = self.now;
     }
 
     /// One slot begins.
@@ -418,14 +531,53 @@ impl Core {
         self.next_slot += 1;
         self.status.slots = self.status.slots.wrapping_add(1);
         self.status_due = true;
-        let due = self.store.take_due(slot);
+        let mut due = self.store.take_due(slot);
+        if let Some((_, superseded)) =
+            due.filter(|(frame, _)| self.mode == Mode::Normal && frame.dark_from <= start)
+        {
+            // It was allowed to be late, but its own light is over.
+            self.status.frames_superseded = self.status.frames_superseded.wrapping_add(superseded);
+            self.status.frames_late = self.status.frames_late.wrapping_add(1);
+            due = None;
+        }
+        if due.is_none() && self.dark_from().is_some_and(|dark| dark <= start) {
+            self.end_light();
+        }
+        // FREEZE holds what is lit; where nothing is, it makes no light. A frame that BLACK hid may be over by now.
+        let again = self.store.lit.is_some_and(|held| match self.mode {
+            Mode::Frozen => self.lit_now,
+            Mode::Normal => config.underrun == Underrun::Repeat && start < held.dark_from,
+            Mode::Black | Mode::Disarmed => false,
+        });
+        let too_much = match (self.mode, due) {
+            (Mode::Normal, Some((frame, _))) => {
+                let bytes = config.raster.plane_bytes() * config.schedule.len();
+                let planes = &self.store.bytes(frame.buffer)[..bytes];
+                self.guard.new_frame(config.raster, &config.schedule, planes)
+            }
+            _ if again => self.guard.same_frame(),
+            _ => {
+                self.guard.dark();
+                None
+            }
+        };
+        if let Some(rest_us) = too_much {
+            // The slot stays dark, and so does everything after it.
+            let refused = due.map_or(0, |(_, superseded)| superseded + 1);
+            self.status.frames_refused = self.status.frames_refused.wrapping_add(refused);
+            self.status.slots_blank = self.status.slots_blank.wrapping_add(1);
+            self.rest(start, rest_us);
+            self.latch(faults::LIGHT_LIMIT);
+            return self.note_light(slots, slot, LightKind::Blank);
+        }
         let kind = match (self.mode, due) {
             (Mode::Normal, Some((frame, superseded))) => {
                 self.status.frames_superseded = self.status.frames_superseded.wrapping_add(superseded);
                 self.status.frames_lit = self.status.frames_lit.wrapping_add(1);
                 self.status.last_lit_frame = frame.frame;
                 self.status.last_lit_at = start;
-                self.store.lit = Some(Held { frame: frame.frame, buffer: frame.buffer });
+                self.store.lit =
+                    Some(Held { frame: frame.frame, dark_from: frame.dark_from, buffer: frame.buffer });
                 self.generation += 1;
                 if self.flash.is_some() {
                     let bytes = config.raster.plane_bytes() * config.schedule.len();
@@ -434,12 +586,10 @@ impl Core {
                 }
                 LightKind::Lit
             }
-            (mode, due) => {
+            (_, due) => {
                 // Told to be dark or to hold: frames are used up so that the stream goes on.
                 let refused = due.map_or(0, |(_, superseded)| superseded + 1);
                 self.status.frames_refused = self.status.frames_refused.wrapping_add(refused);
-                let again = self.store.lit.is_some()
-                    && (mode == Mode::Frozen || mode == Mode::Normal && config.underrun == Underrun::Repeat);
                 if again {
                     self.status.slots_repeated = self.status.slots_repeated.wrapping_add(1);
                     LightKind::Repeated
@@ -450,7 +600,25 @@ impl Core {
             }
         };
         self.lit_now = kind != LightKind::Blank;
-        let clock = &self.setup.clock;
+        self.note_light(slots, slot, kind);
+        let luminance = if self.lit_now { self.luminance } else { 0 };
+        if self.flash.as_mut().is_some_and(|f| f.observe(luminance)) {
+            self.rest(start, u64::from(REST_US));
+            self.latch(faults::FLASH_LIMIT);
+        }
+    }
+
+    /// No ARM within `us` microseconds of `from`.
+    fn rest(&mut self, from: DeviceTicks, us: u64) {
+        let ticks = u128::from(us) * u128::from(self.setup.clock.tick_hz) / 1_000_000;
+        let ticks = u64::try_from(ticks).unwrap_or(u64::MAX);
+        self.rest_until = self.rest_until.max(DeviceTicks(from.0.saturating_add(ticks)));
+    }
+
+    /// Tells whoever watches what `slot` shows.
+    fn note_light(&mut self, slots: &SlotClock, slot: u64, kind: LightKind) {
+        let (start, clock) = (slots.start(slot), &self.setup.clock);
+        let end = slots.start(slot + 1);
         let settle = if self.lit_now { i64::from(self.setup.settle_ns) } else { 0 };
         let event = LightEvent {
             slot,
@@ -458,7 +626,7 @@ impl Core {
             kind,
             lit_at: start,
             first_photon_at: clock.instant_of(start).plus_ns(settle),
-            last_photon_at: clock.instant_of(slots.start(slot + 1)),
+            last_photon_at: clock.instant_of(self.dark_from().unwrap_or(end).min(end)),
         };
         if self.events.len() >= self.setup.events_kept {
             self.events.pop_front();
@@ -467,16 +635,13 @@ impl Core {
         if self.setup.events_kept > 0 {
             self.events.push_back(event);
         }
-        let luminance = if self.lit_now { self.luminance } else { 0 };
-        if self.flash.as_mut().is_some_and(|f| f.observe(luminance)) {
-            let rest = u64::from(REST_US) * u64::from(self.setup.clock.tick_hz) / 1_000_000;
-            self.rest_until = DeviceTicks(start.0.saturating_add(rest));
-            self.latch(faults::FLASH_LIMIT);
-        }
     }
 
     /// Goes dark and forgets every frame on its way.
     fn disarm(&mut self) {
+        if self.mode != Mode::Disarmed {
+            self.counted_to = Some(self.now);
+        }
         self.mode = Mode::Disarmed;
         self.lit_now = false;
         let thrown = self.store.clear();
@@ -502,7 +667,8 @@ impl Core {
     }
 
     fn report(&mut self, code: FaultCode, detail: u16) {
-        self.fault_due = Some(Fault { latched: self.latched, code, detail, at: self.ticks() });
+        self.fault_due =
+            Some(Fault { latched: self.latched, code, detail, at: self.setup.clock.ticks_at(self.at) });
         self.status_due = true;
     }
 
@@ -512,6 +678,7 @@ impl Core {
         self.config = None;
         self.last_seen_frame = None;
         self.status = NO_STATUS;
+        self.counters_due = true;
     }
 
     fn configure(&mut self, config: Config) -> Result<(), ConfigRefusal> {
@@ -530,6 +697,7 @@ impl Core {
         }
         self.disarm();
         self.config = Some((config, slots));
+        self.guard.configure(config.rate, config.limits, self.setup.limits);
         self.flash = self.setup.flash_limit.map(|limit| FlashLimiter::backstop(config.rate, limit));
         Ok(())
     }
@@ -553,9 +721,18 @@ impl Core {
         if self.mode == Mode::Disarmed {
             let now = self.ticks();
             self.next_slot = slots.slot_at(now).map_or(0, |k| k + 1);
+            let dark_ns = self.counted_to.map_or(0, |to| self.now.ns_since(to).max(0));
+            let rate = slots.rate();
+            let dark = dark_ns as u128 * u128::from(rate.num()) / (u128::from(rate.den()) * 1_000_000_000);
+            self.guard.was_dark(u64::try_from(dark).unwrap_or(u64::MAX).saturating_sub(1));
         }
         self.mode = Mode::Normal;
         self.status_due = true;
+        // What FREEZE held may be over: then it ends now, not with the next slot.
+        let now = self.ticks();
+        if self.dark_from().is_some_and(|dark| dark <= now) {
+            self.end_light();
+        }
     }
 }
 

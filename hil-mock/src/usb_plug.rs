@@ -252,7 +252,8 @@ impl UsbPlug {
         s.queues.values_mut().for_each(|q| q.halted = false);
         s.configuration = 0;
         drop(s);
-        lock(&self.shared.model).bus_reset((self.shared.clock)());
+        let mut model = lock(&self.shared.model);
+        model.bus_reset((self.shared.clock)());
     }
 
     /// Selects a configuration as SET_CONFIGURATION does; halts end.
@@ -452,10 +453,12 @@ impl Shared {
                     Progress { bytes: 0, then: if skip { Then::Complete } else { Then::Nak } }
                 } else if let Some(setup) = r.setup {
                     drop(s);
-                    self.control(now, &setup, &mut r.buffer)
+                    self.control(&setup, &mut r.buffer)
                 } else {
                     drop(s);
                     let mut model = lock(&self.model);
+                    // Anew: the model may have been busy with another endpoint's transfer, and what it stamps must not be older.
+                    let now = (self.clock)();
                     if is_in {
                         model.transfer_in(now, endpoint, &mut r.buffer[moved..])
                     } else {
@@ -501,9 +504,10 @@ impl Shared {
     }
 
     /// A control transfer: the standard requests here, the others by the model.
-    fn control(&self, now: HostTime, setup: &Setup, data: &mut [u8]) -> Progress {
+    fn control(&self, setup: &Setup, data: &mut [u8]) -> Progress {
         if !setup.is_standard() {
-            return lock(&self.model).control(now, setup, data);
+            let mut model = lock(&self.model);
+            return model.control((self.clock)(), setup, data);
         }
         let mut give = |bytes: &[u8]| {
             let n = bytes.len().min(data.len());

@@ -45,7 +45,7 @@ impl VrpnHost {
         let listener = TcpListener::bind(address)?;
         listener.set_nonblocking(true)?;
         let bound = listener.local_addr()?;
-        let calls = UdpPort::bind(SocketAddrV4::new(*address.ip(), bound.port()), true)?;
+        let calls = UdpPort::bind(SocketAddrV4::new(*address.ip(), bound.port()), false)?;
         let stop = Arc::new(AtomicBool::new(false));
         let clients = Arc::new(AtomicUsize::new(0));
         let mut server = Server {

@@ -8,8 +8,8 @@ use std::thread::JoinHandle;
 use std::time::{Duration, Instant};
 
 use dpm_device::link::{
-    packet_bytes, Codec, Epoch, Header, HostLink, LinkSettings, LinkState, MessageType, Packet, SendOutcome,
-    Underrun,
+    packet_bytes, Codec, Epoch, Header, HostLink, LightLimits, LinkSettings, LinkState, MessageType, Packet,
+    SendOutcome, Underrun, COMMIT_BYTES,
 };
 use dpm_device::planes::{PlaneSchedule, Raster};
 use dpm_device::time::{DeviceTicks, FrameRate, HostTime};
@@ -60,7 +60,7 @@ impl Far {
                     mock.receive(now, &noise);
                     let _ = master.write(&noise);
                 }
-                match mock.serve(now, &mut master) {
+                match mock.serve(|| HostTime(start.elapsed().as_nanos() as i64), &mut master) {
                     Ok(true) => {}
                     Ok(false) => break,
                     Err(e) => panic!("{e}"),
@@ -101,7 +101,7 @@ struct Near {
 }
 
 fn settings(path: &str) -> SerialSettings {
-    let frame_bytes = packet_bytes(raster().plane_bytes()) * 8 + packet_bytes(16);
+    let frame_bytes = packet_bytes(raster().plane_bytes()) * 8 + packet_bytes(COMMIT_BYTES);
     SerialSettings { path: path.into(), baud: 3_000_000, frame_bytes }
 }
 
@@ -117,7 +117,7 @@ impl Near {
             epoch: Epoch::At(DeviceTicks(0)),
             codecs,
             flash_limit: None,
-            session_seed: 5,
+            limits: LightLimits::OFF,
         });
         Self { link, line, next_id: 1 }
     }
@@ -134,7 +134,9 @@ impl Near {
                 let slots = self.link.slots().unwrap();
                 let slot = slots.slot_at(DeviceTicks(now.0 as u64)).unwrap() + 1;
                 let (id, target) = (self.next_id, slots.start(slot));
-                if self.link.send_frame(now, id, target, &planes(id), &mut self.line) == SendOutcome::Sent {
+                let dark_from = slots.dark_from(slot, 20_000_000_000);
+                let sent = self.link.send_frame(now, id, target, dark_from, &planes(id), &mut self.line);
+                if sent == SendOutcome::Sent {
                     self.next_id += 1;
                 }
             }
@@ -265,4 +267,252 @@ fn a_line_that_nobody_reads_never_holds_the_caller() {
         sender.send(()).unwrap();
     });
     ended.recv_timeout(LONG).expect("nobody waits for a full line");
+}
+
+/// Found in use, section 2b of the second look at latency: a reply that waits for the next poll is stamped when it arrived.
+#[test]
+fn replies_are_stamped_when_they_arrive() {
+    let shortest = |with_clock: bool| {
+        let (master, slave) = pair();
+        let far = Far::new(master, setup(), Instant::now());
+        let mut near = Near::new(SerialTransport::with_port(settings("pty"), slave), Codec::Raw.mask());
+        if with_clock {
+            let start = far.start;
+            near.line.set_clock(Arc::new(move || HostTime(start.elapsed().as_nanos() as i64)));
+        }
+        near.link.connect();
+        let mut shortest = i64::MAX;
+        for _ in 0..40 {
+            // Long after any answer has come.
+            std::thread::sleep(Duration::from_millis(20));
+            let _ = near.link.poll(far.now(), &mut near.line);
+            near.link.take_echoes(|e| {
+                assert!(e.host_sent_at.0 <= e.device_received_at.0 as i64, "one clock stands behind both");
+                assert!(e.device_sent_at.0 as i64 <= e.host_received_at.0);
+                shortest = shortest.min(e.host_received_at.ns_since(e.host_sent_at));
+            });
+        }
+        shortest
+    };
+    assert!(shortest(true) < 10_000_000, "{} ns", shortest(true));
+    assert!(shortest(false) >= 20_000_000, "what the stamps are for: {} ns", shortest(false));
+}
+
+/// A line of a given rate in virtual time, whose kernel takes a lot and whose driver may be one that cannot take it back.
+#[derive(Clone)]
+struct SlowLine(Arc<Mutex<SlowLineState>>);
+
+struct SlowLineState {
+    /// Accepted by the kernel, not on the line yet.
+    queue: std::collections::VecDeque<u8>,
+    replies: Vec<u8>,
+    can_flush: bool,
+}
+
+/// What the kernel takes at once.
+const KERNEL_BYTES: usize = 64 * 1024;
+
+impl std::io::Write for SlowLine {
+    fn write(&mut self, bytes: &[u8]) -> std::io::Result<usize> {
+        let queue = &mut self.0.lock().unwrap().queue;
+        let n = bytes.len().min(KERNEL_BYTES - queue.len());
+        queue.extend(&bytes[..n]);
+        if n == 0 {
+            return Err(std::io::ErrorKind::WouldBlock.into());
+        }
+        Ok(n)
+    }
+    fn flush(&mut self) -> std::io::Result<()> {
+        Ok(())
+    }
+}
+
+impl std::io::Read for SlowLine {
+    fn read(&mut self, bytes: &mut [u8]) -> std::io::Result<usize> {
+        let replies = &mut self.0.lock().unwrap().replies;
+        let n = bytes.len().min(replies.len());
+        bytes[..n].copy_from_slice(&replies[..n]);
+        replies.drain(..n);
+        if n == 0 {
+            return Err(std::io::ErrorKind::WouldBlock.into());
+        }
+        Ok(n)
+    }
+}
+
+mod slow_line {
+    use super::SlowLine;
+    use serialport::{
+        ClearBuffer, DataBits, Error, ErrorKind, FlowControl, Parity, Result, SerialPort, StopBits,
+    };
+    use std::time::Duration;
+
+    fn absent<T>() -> Result<T> {
+        Err(Error::new(ErrorKind::Unknown, "this line has no such thing"))
+    }
+
+    impl SerialPort for SlowLine {
+        fn bytes_to_write(&self) -> Result<u32> {
+            Ok(self.0.lock().unwrap().queue.len() as u32)
+        }
+        fn clear(&self, buffer: ClearBuffer) -> Result<()> {
+            let mut state = self.0.lock().unwrap();
+            if buffer == ClearBuffer::Output && state.can_flush {
+                state.queue.clear();
+            }
+            Ok(())
+        }
+        fn name(&self) -> Option<String> {
+            None
+        }
+        fn baud_rate(&self) -> Result<u32> {
+            absent()
+        }
+        fn data_bits(&self) -> Result<DataBits> {
+            absent()
+        }
+        fn flow_control(&self) -> Result<FlowControl> {
+            absent()
+        }
+        fn parity(&self) -> Result<Parity> {
+            absent()
+        }
+        fn stop_bits(&self) -> Result<StopBits> {
+            absent()
+        }
+        fn timeout(&self) -> Duration {
+            Duration::ZERO
+        }
+        fn set_baud_rate(&mut self, _: u32) -> Result<()> {
+            absent()
+        }
+        fn set_data_bits(&mut self, _: DataBits) -> Result<()> {
+            absent()
+        }
+        fn set_flow_control(&mut self, _: FlowControl) -> Result<()> {
+            absent()
+        }
+        fn set_parity(&mut self, _: Parity) -> Result<()> {
+            absent()
+        }
+        fn set_stop_bits(&mut self, _: StopBits) -> Result<()> {
+            absent()
+        }
+        fn set_timeout(&mut self, _: Duration) -> Result<()> {
+            Ok(())
+        }
+        fn write_request_to_send(&mut self, _: bool) -> Result<()> {
+            absent()
+        }
+        fn write_data_terminal_ready(&mut self, _: bool) -> Result<()> {
+            absent()
+        }
+        fn read_clear_to_send(&mut self) -> Result<bool> {
+            absent()
+        }
+        fn read_data_set_ready(&mut self) -> Result<bool> {
+            absent()
+        }
+        fn read_ring_indicator(&mut self) -> Result<bool> {
+            absent()
+        }
+        fn read_carrier_detect(&mut self) -> Result<bool> {
+            absent()
+        }
+        fn bytes_to_read(&self) -> Result<u32> {
+            absent()
+        }
+        fn try_clone(&self) -> Result<Box<dyn SerialPort>> {
+            absent()
+        }
+        fn set_break(&self) -> Result<()> {
+            absent()
+        }
+        fn clear_break(&self) -> Result<()> {
+            absent()
+        }
+    }
+}
+
+/// Found in use, R2 and its siblings: dark within 50 ms of the order, on a line that is full of planes, whether its driver can take
+/// back what it was given or not, and whatever the order cuts.
+#[test]
+fn stop_means_dark_within_50_ms_on_a_line_that_is_full() {
+    use dpm_device::link::Verb;
+    for baud in [115_200u32, 921_600, 3_000_000] {
+        for (verb, can_flush) in
+            [(Verb::Stop, true), (Verb::Stop, false), (Verb::Black, true), (Verb::Safe, false)]
+        {
+            let queue = std::collections::VecDeque::new();
+            let line =
+                SlowLine(Arc::new(Mutex::new(SlowLineState { queue, replies: Vec::new(), can_flush })));
+            let far = SerialProjector::new(MockProjector::new(MockConfig::new(raster())));
+            let mut far = far;
+            let near_end = SerialSettings { baud, ..settings("slow") };
+            let near_end = SerialTransport::with_port(near_end, Box::new(line.clone()));
+            let mut near = Near::new(near_end, Codec::Raw.mask());
+            near.link.connect();
+            let (mut ordered_at, mut dark_at) = (None, None);
+            let mut carried = 0u64;
+            // A tenth of a millisecond a step; the host polls once a millisecond.
+            for step in 1..200_000i64 {
+                let now = HostTime(step * 100_000);
+                let due = now.0 as u64 * u64::from(baud) / 10_000_000_000;
+                let bytes: Vec<u8> = {
+                    let queue = &mut line.0.lock().unwrap().queue;
+                    let n = ((due - carried) as usize).min(queue.len());
+                    queue.drain(..n).collect()
+                };
+                carried = due;
+                far.receive(now, &bytes);
+                let out = far.replies(now);
+                line.0.lock().unwrap().replies.append(out);
+                if step % 10 != 0 && ordered_at.is_none() {
+                    continue;
+                }
+                let _ = near.link.poll(now, &mut near.line);
+                match near.link.state() {
+                    LinkState::Ready if ordered_at.is_none() => near.link.arm(0),
+                    LinkState::Streaming => {
+                        let slots = near.link.slots().unwrap();
+                        let slot = slots.slot_at(DeviceTicks(now.0 as u64)).unwrap() + 1;
+                        let (id, dark_from) = (near.next_id, slots.dark_from(slot, 60_000_000_000));
+                        let sent = near.link.send_frame(
+                            now,
+                            id,
+                            slots.start(slot),
+                            dark_from,
+                            &planes(id),
+                            &mut near.line,
+                        );
+                        near.next_id += u64::from(sent == SendOutcome::Sent);
+                    }
+                    _ => {}
+                }
+                let lit = far.projector().is_lit();
+                let frames_lit = far.projector().status().frames_lit;
+                // In the middle of a frame, some time after the first was lit.
+                if ordered_at.is_none() && lit && frames_lit >= 3 && near.line.waiting() > 500 {
+                    near.link.command(now, verb, &mut near.line).unwrap();
+                    ordered_at = Some(now);
+                }
+                if ordered_at.is_some() && !lit && dark_at.is_none() {
+                    dark_at = Some(now);
+                }
+                if dark_at.is_some_and(|at| now.ns_since(at) > 200_000_000) {
+                    break;
+                }
+            }
+            let context = format!("{baud} baud, {verb:?}, flush {can_flush}");
+            let ordered_at = ordered_at.unwrap_or_else(|| panic!("never streamed: {context}"));
+            let dark_at = dark_at.unwrap_or_else(|| panic!("never dark: {context}"));
+            let ms = dark_at.ns_since(ordered_at) as f64 * 1e-6;
+            println!("{context}: dark after {ms:.1} ms");
+            assert!(ms <= 50.0, "{context}: dark after {ms:.1} ms");
+            // And it stays so: nothing that was on its way lights it again, and the host knows.
+            assert!(!far.projector().is_lit(), "{context}");
+            let state = near.link.status().unwrap().state;
+            assert_ne!(state, dpm_device::link::DeviceState::Armed, "{context}");
+        }
+    }
 }

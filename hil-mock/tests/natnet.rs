@@ -513,3 +513,172 @@ fn garbage_of_every_length_is_survived() {
     hand.poll();
     assert_eq!(hand.client.counters().samples.used, 1, "{}", hand.client.status());
 }
+
+/// Found in use, C7: a server that announces 4.1 and sends the layout of 4.0 cost 70 % of the samples, because each answer to a
+/// connection turned the layout back. All pairs of versions, with the names in either of the two layouts.
+#[test]
+fn a_server_that_sends_another_layout_than_it_announces_costs_no_samples() {
+    let versions = [Version::V3_0, Version::new(3, 1), Version::V4_0, Version::V4_1, Version::V4_2];
+    for announced in versions {
+        for sent in versions {
+            for names in [announced, sent] {
+                let what = format!("{announced} announced, frames of {sent}, names of {names}");
+                let mut bench = Bench::new(
+                    "",
+                    |s| {
+                        s.streaming = Streaming::Unicast(UnicastTo::CommandSocket);
+                        (s.version, s.frame_layout, s.model_layout) = (announced, Some(sent), Some(names));
+                    },
+                    |_| {},
+                );
+                bench.run(MS / 2, 100 * MS);
+                let before = bench.server.frames_sent();
+                bench.samples.clear();
+                bench.run(MS / 2, 2 * S);
+                let sent_samples = 2 * (bench.server.frames_sent() - before);
+                assert!(sent_samples > 1800, "{what}: {sent_samples}");
+                let status = bench.client.status();
+                assert!(bench.samples.len() as u64 * 100 >= sent_samples * 99, "{what}: {status}");
+                let c = *bench.client.counters();
+                assert_eq!((c.samples.unknown_body, c.packets.malformed), (0, 0), "{what}: {status}");
+                assert_eq!(bench.client.models().len(), 2, "{what}: {status}");
+                let differs = announced.has_section_sizes() != sent.has_section_sizes();
+                assert_eq!(bench.client.contradicted(), differs.then_some(announced), "{what}: {status}");
+                assert_eq!(status.contains("which is followed"), differs, "{what}: {status}");
+                assert!(bench.worst_error() < 3e-3, "{what}: {}", bench.worst_error());
+            }
+        }
+    }
+}
+
+/// Found in use, C7, its sibling: frames of NatNet 2, whatever was announced, are named as unreadable, and the server is not asked anew
+/// for each of them.
+#[test]
+fn frames_of_a_layout_that_is_not_spoken_are_named() {
+    let mut hand = ByHand::new(LOCALHOST);
+    let mut buffer = [0; 2048];
+    while hand.socket.receive(&mut buffer).unwrap().is_some() {}
+    let mut connects = 0;
+    for n in 0..500i32 {
+        // NatNet 2.9: a rigid body of 32 bytes, no markers, error and parameters; a latency as f32 before the time code.
+        let mut payload = n.to_le_bytes().to_vec();
+        payload.extend([0i32, 0, 1, 1].iter().flat_map(|v| v.to_le_bytes()));
+        payload.extend([0.1f32, 0.2, 0.3, 0.0, 0.0, 0.0, 1.0].iter().flat_map(|v| v.to_le_bytes()));
+        payload.extend([0u8; 4 + 4 + 2]);
+        payload.extend([0u8; 4 + 4 + 4 + 4 + 8 + 8 + 2 + 4]);
+        let mut datagram = 7u16.to_le_bytes().to_vec();
+        datagram.extend((payload.len() as u16).to_le_bytes());
+        datagram.extend(payload);
+        hand.socket.send(&datagram, hand.client_address).unwrap();
+        assert_eq!(hand.poll(), [] as [u32; 0]);
+        while let Some(a) = hand.socket.receive(&mut buffer).unwrap() {
+            connects += u32::from(a.len > 4 && buffer[0] == 0);
+        }
+    }
+    assert_eq!(hand.client.silence(), Some(Silence::Unreadable));
+    assert!(hand.client.status().contains("choose a bit stream from 3.0 to 4.2"), "{}", hand.client.status());
+    assert!(connects <= 4, "{connects} connections in half a second");
+}
+
+/// Found in use, R14: frames, answers and farewells of another program at the server's own address were believed.
+#[test]
+fn only_the_servers_ports_are_heard() {
+    let mut hand = ByHand::new(LOCALHOST);
+    let stranger = UdpPort::bind(SocketAddrV4::new(LOCALHOST, 0), false).unwrap();
+    let strange_port = stranger.local().unwrap().port();
+    let mut honest = 0;
+    let mut refused = 0;
+    for n in 0..200 {
+        let frame = hand.frame(n);
+        hand.socket.send(&frame, hand.client_address).unwrap();
+        // Each of these, were it believed, would put the body elsewhere, forget the server, rename the bodies, or move the clock.
+        let forged: Vec<u8> = match n % 5 {
+            0 => hand.frame(n + 1_000_000),
+            1 => vec![9, 0, 0, 0],
+            2 => {
+                let info = ServerInfo {
+                    name: "forged".into(),
+                    app_version: [0; 4],
+                    natnet_version: [3, 0, 0, 0],
+                    clock_hz: 1,
+                    data_port: strange_port,
+                    multicast: None,
+                };
+                info.encode(&mut hand.out);
+                hand.out.clone()
+            }
+            3 => {
+                let definition = BodyDefinition { name: "a", id: 77, markers: &[] };
+                encode_models(&mut hand.out, Version::V4_1, &[definition]).unwrap();
+                hand.out.clone()
+            }
+            _ => vec![10, 0, 0, 0],
+        };
+        stranger.send(&forged, hand.client_address).unwrap();
+        refused += 1;
+        honest += hand.poll().iter().filter(|s| **s == n as u32).count();
+        assert_eq!(hand.client.server().map(|s| s.name.as_str()), Some("by hand"));
+    }
+    let c = *hand.client.counters();
+    assert_eq!((honest, c.samples.used, c.packets.foreign_port), (200, 200, refused), "{c}");
+    let status = hand.client.status();
+    assert!(status.contains("WARNING") && status.contains(&strange_port.to_string()), "{status}");
+}
+
+/// Found in use, R14: where frames come from a port that nobody named, it is learned, held while it speaks, and given up for the
+/// command port at once and for another one after a second of silence.
+#[test]
+fn a_data_port_that_nobody_named_is_learned_and_held() {
+    let mut hand = ByHand::new(LOCALHOST);
+    let [a, b] = [0, 0].map(|port| UdpPort::bind(SocketAddrV4::new(LOCALHOST, port), false).unwrap());
+    let mut number = 0;
+    let mut turn = |hand: &mut ByHand, port: Option<&UdpPort>| {
+        number += 1;
+        let frame = hand.frame(number);
+        port.unwrap_or(&hand.socket).send(&frame, hand.client_address).unwrap();
+        hand.poll().len()
+    };
+    // For 300 ms the named ports have the first word.
+    assert_eq!((0..290).map(|_| turn(&mut hand, Some(&a))).sum::<usize>(), 0);
+    let used = (0..100).map(|_| turn(&mut hand, Some(&a))).sum::<usize>();
+    assert!(used >= 80, "{used}: {}", hand.client.status());
+    // Held against another port, however often it tries.
+    let used = (0..500).map(|_| (turn(&mut hand, Some(&b)), turn(&mut hand, Some(&a))));
+    let (from_b, from_a) = used.fold((0, 0), |s, u| (s.0 + u.0, s.1 + u.1));
+    assert_eq!((from_b, from_a), (0, 500));
+    // Silent for a second: the other one takes its place.
+    let used = (0..1500).map(|_| turn(&mut hand, Some(&b))).collect::<Vec<_>>();
+    assert!(used[..990].iter().sum::<usize>() == 0 && used[1010..].iter().all(|n| *n == 1));
+    // The command port needs no learning, and while it sends frames no other port does.
+    let used = (0..100).map(|_| (turn(&mut hand, None), turn(&mut hand, Some(&b))));
+    let (named, learned) = used.fold((0, 0), |s, u| (s.0 + u.0, s.1 + u.1));
+    assert_eq!((named, learned), (100, 0), "{}", hand.client.status());
+}
+
+/// Found in use, R14: a flood from another port of the server's address is dropped by the kernel, and the server is still heard.
+#[test]
+fn a_flood_from_another_port_of_the_server_does_not_drown_it() {
+    let mut hand = ByHand::new(LOCALHOST);
+    let stranger = UdpPort::bind(SocketAddrV4::new(LOCALHOST, 0), false).unwrap();
+    let forged = hand.frame(7);
+    for _ in 0..150 {
+        stranger.send(&forged, hand.client_address).unwrap();
+    }
+    while hand.client.counters().packets.foreign_port < 150 {
+        assert_eq!(hand.poll(), [] as [u32; 0]);
+    }
+    for _ in 0..1000 {
+        stranger.send(&forged, hand.client_address).unwrap();
+    }
+    let honest = hand.frame(8);
+    hand.socket.send(&honest, hand.client_address).unwrap();
+    assert_eq!(hand.poll(), [8], "{}", hand.client.status());
+    assert_eq!(hand.client.counters().packets.foreign_port, 150);
+    // After the server fell silent it is looked for without the filter, for when it comes back it may send from other ports.
+    hand.clock.fetch_add(3 * S, Ordering::Relaxed);
+    hand.poll();
+    let before = hand.client.counters().packets.received;
+    stranger.send(&forged, hand.client_address).unwrap();
+    hand.poll();
+    assert_eq!(hand.client.counters().packets.received, before + 1, "{}", hand.client.status());
+}

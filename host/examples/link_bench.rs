@@ -36,7 +36,11 @@ impl Transport for Apart {
         result
     }
 
-    fn receive(&mut self, now: HostTime, sink: &mut dyn FnMut(Lane, &[u8])) -> Result<(), TransportError> {
+    fn receive(
+        &mut self,
+        now: HostTime,
+        sink: &mut dyn FnMut(Lane, HostTime, &[u8]),
+    ) -> Result<(), TransportError> {
         self.device.receive(now, sink)
     }
 
@@ -80,10 +84,11 @@ fn time(settings: LinkSettings, content: &Content, frames: u64) -> (f64, f64, f6
             }
         };
         let device_now = link.status().map_or(DeviceTicks(0), |s| s.now);
-        let target = slots.start(slots.slot_at(device_now).map_or(0, |k| k + 1));
+        let slot = slots.slot_at(device_now).map_or(0, |k| k + 1);
         let before = medium.device_time;
         let begin = Instant::now();
-        let outcome = link.send_frame(now, id, target, &planes, &mut medium);
+        let outcome =
+            link.send_frame(now, id, slots.start(slot), slots.dark_from(slot, 0), &planes, &mut medium);
         let spent = begin.elapsed() - (medium.device_time - before);
         assert_eq!(outcome, SendOutcome::Sent);
         host.push(spent.as_secs_f64() * 1e3);

@@ -5,6 +5,7 @@ use dpm_device::dlpc900::image::{Compression, PlaneOrder};
 use dpm_device::dlpc900::lut::Dmd;
 use dpm_device::dlpc900::sequence::{Pattern, PatternSequence, Repeat, SequenceBuilder, SequenceError};
 use dpm_device::planes::Raster;
+use dpm_device::regular_file;
 use std::fmt::Write as _;
 use std::path::{Path, PathBuf};
 
@@ -61,11 +62,15 @@ pub struct ShowAs {
     pub compression: Option<Compression>,
 }
 
+/// Largest file of a picture that is read, bytes.
+const MAX_PICTURE_BYTES: u64 = 256 << 20;
+
 /// Reads a picture of exactly the DMD's size as grey values. The size is checked before pixels are decoded.
 pub fn read_grey(path: &Path, dmd: Dmd) -> Result<Vec<u8>, PatternFileError> {
     let fail = |why: String| PatternFileError::Read { path: path.to_owned(), why };
+    let bytes = regular_file::read(path, MAX_PICTURE_BYTES).map_err(|e| fail(e.to_string()))?;
     let open = || {
-        let reader = image::ImageReader::open(path).map_err(|e| fail(e.to_string()))?;
+        let reader = image::ImageReader::new(std::io::Cursor::new(&bytes));
         reader.with_guessed_format().map_err(|e| fail(e.to_string()))
     };
     let (width, height) = open()?.into_dimensions().map_err(|e| fail(e.to_string()))?;

@@ -51,6 +51,39 @@ impl fmt::Display for Failure {
 
 impl std::error::Error for Failure {}
 
+/// The end of a command that has something to report, whether or not it did what it was asked to.
+#[derive(Debug)]
+pub struct Ended<T> {
+    /// What it found. It is printed in any case.
+    pub report: T,
+    /// Why the command fails all the same: a check that does not hold, a file that could not be written.
+    pub failure: Option<Failure>,
+}
+
+impl<T> Ended<T> {
+    /// `failure` joins those that there are: the first one gives the kind, all give their messages.
+    pub fn fail(&mut self, failure: Failure) {
+        match &mut self.failure {
+            Some(first) => {
+                first.message.push('\n');
+                first.message += &failure.message;
+            }
+            none => *none = Some(failure),
+        }
+    }
+
+    /// Keeps what `result` holds; its failure joins those that there are.
+    pub fn keep<R>(&mut self, result: Result<R, Failure>) -> Option<R> {
+        result.map_err(|e| self.fail(e)).ok()
+    }
+}
+
+impl<T> From<T> for Ended<T> {
+    fn from(report: T) -> Self {
+        Self { report, failure: None }
+    }
+}
+
 impl From<crate::config::ConfigErrors> for Failure {
     fn from(errors: crate::config::ConfigErrors) -> Self {
         Self::new(FailureKind::BadInput, errors)

@@ -1,7 +1,8 @@
 //! Bytes into files that are either the old ones or the new ones, whenever the power goes.
 
+use crate::folder::{open_own_file, Folder, FolderError};
 use std::fs::{self, File};
-use std::io::{self, BufWriter, Write};
+use std::io::{self, BufWriter, Read, Seek, Write};
 use std::path::{Path, PathBuf};
 
 /// Replaces `path` by what `write` writes: into a temporary file beside it, flushed to the disk, renamed over it, and the
@@ -39,7 +40,19 @@ pub fn check_folder(folder: &Path) -> io::Result<()> {
     let named = |e: io::Error| io::Error::new(e.kind(), format!("cannot write to {}: {e}", folder.display()));
     fs::create_dir_all(folder).map_err(named)?;
     let trial = folder.join(format!(".trial.{}", std::process::id()));
-    File::create(&trial).and_then(|_| fs::remove_file(&trial)).map_err(named)
+    create_new(&trial).and_then(|_| fs::remove_file(&trial)).map_err(named)
+}
+
+/// Makes a file that was not there. A link of that name, which somebody may have planted in a shared folder, is not followed; what a
+/// killed process of the same number left is removed.
+fn create_new(path: &Path) -> io::Result<File> {
+    match File::create_new(path) {
+        Err(e) if e.kind() == io::ErrorKind::AlreadyExists => {
+            fs::remove_file(path)?;
+            File::create_new(path)
+        }
+        result => result,
+    }
 }
 
 fn write_and_rename(
@@ -48,7 +61,7 @@ fn write_and_rename(
     folder: &Path,
     write: impl FnOnce(&mut BufWriter<&File>) -> io::Result<()>,
 ) -> io::Result<()> {
-    let file = File::create(temporary)?;
+    let file = create_new(temporary)?;
     let mut buffered = BufWriter::new(&file);
     write(&mut buffered)?;
     buffered.flush()?;
@@ -77,7 +90,7 @@ pub enum LockError {
         /// What the lock protects.
         what: String,
         /// Why.
-        source: io::Error,
+        source: FolderError,
     },
 }
 
@@ -88,26 +101,50 @@ pub struct InstanceLock {
 }
 
 impl InstanceLock {
-    /// Takes the lock file `path` for `what` (as messages name it); never waits.
+    /// Takes the lock file `path` for `what` (as messages name it); never waits. A missing folder is made. The file must be a plain one
+    /// of this user; a link is not followed.
     ///
     /// # Errors
     /// [`LockError::Held`] when another process, or another lock in this one, has it.
     pub fn take(path: &Path, what: &str) -> Result<Self, LockError> {
-        let io = |source| LockError::Io { what: what.into(), source };
+        let failed = |source| LockError::Io { what: what.into(), source };
         if let Some(folder) = path.parent() {
-            fs::create_dir_all(folder).map_err(io)?;
+            fs::create_dir_all(folder)
+                .map_err(|source| failed(FolderError::Io { path: folder.into(), source }))?;
         }
-        let mut file =
-            File::options().read(true).write(true).create(true).truncate(false).open(path).map_err(io)?;
+        Self::lock(open_own_file(path).map_err(failed)?, path, what)
+    }
+
+    /// As [`InstanceLock::take`], for the file `name` in a folder that was found to be ours.
+    ///
+    /// # Errors
+    /// As [`InstanceLock::take`].
+    pub fn take_in(folder: &Folder, name: &str, what: &str) -> Result<Self, LockError> {
+        let failed = |source| LockError::Io { what: what.into(), source };
+        Self::lock(folder.open_file(name, true).map_err(failed)?, &folder.path().join(name), what)
+    }
+
+    fn lock(mut file: File, path: &Path, what: &str) -> Result<Self, LockError> {
+        let io = |source| LockError::Io {
+            what: what.into(),
+            source: FolderError::Io { path: path.into(), source },
+        };
         match file.try_lock() {
             Ok(()) => {}
             Err(fs::TryLockError::WouldBlock) => {
-                let holder = fs::read_to_string(path).ok().and_then(|s| s.trim().parse().ok());
+                let mut text = String::new();
+                let told = file.take(32).read_to_string(&mut text);
+                let holder = told.ok().and_then(|_| text.trim().parse().ok());
                 return Err(LockError::Held { what: what.into(), path: path.into(), holder });
             }
             Err(fs::TryLockError::Error(e)) => return Err(io(e)),
         }
-        file.set_len(0).and_then(|()| writeln!(file, "{}", std::process::id())).map_err(io)?;
+        let mut say = || {
+            file.set_len(0)?;
+            file.rewind()?;
+            writeln!(file, "{}", std::process::id())
+        };
+        say().map_err(io)?;
         Ok(Self { _file: file })
     }
 }
@@ -162,6 +199,28 @@ mod tests {
         assert!(told.contains(&format!("process {}", std::process::id())), "{told}");
         drop(first);
         InstanceLock::take(&path, "projector X").unwrap();
+        fs::remove_dir_all(dir).unwrap();
+    }
+
+    /// Found in use, R7: root's run wrote its number into a file that nobody had linked from the place of the lock. Its kin: the
+    /// temporary files beside a report and the trial of a folder.
+    #[test]
+    fn r7_planted_links_are_never_written_through() {
+        let dir = folder("links");
+        fs::create_dir_all(&dir).unwrap();
+        let victim = dir.join("victim");
+        fs::write(&victim, b"precious").unwrap();
+        let id = std::process::id();
+        for name in ["a.lock".to_owned(), format!(".report.json.{id}"), format!(".trial.{id}")] {
+            std::os::unix::fs::symlink(&victim, dir.join(name)).unwrap();
+        }
+        let told = InstanceLock::take(&dir.join("a.lock"), "projector X").unwrap_err().to_string();
+        assert!(told.contains("a.lock: is a link") && told.contains("remove it"), "{told}");
+        write_atomically(&dir.join("report.json"), |w| w.write_all(b"new")).unwrap();
+        check_folder(&dir).unwrap();
+        assert_eq!(fs::read(&victim).unwrap(), b"precious");
+        assert_eq!(fs::read(dir.join("report.json")).unwrap(), b"new");
+        assert!(!fs::symlink_metadata(dir.join("report.json")).unwrap().is_symlink());
         fs::remove_dir_all(dir).unwrap();
     }
 }

@@ -30,7 +30,8 @@ pub enum Stage {
 /// One stamp per boundary, host's clock, in the order in which they happen.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub struct FrameTimeline {
-    /// Mid-exposure of the newest tracker sample that the frame used; the oldest among its bodies.
+    /// Mid-exposure of the newest tracker sample that the frame used; the oldest among its lit bodies. Equal to `due_at`, as
+    /// `received_at` then is too, in a frame without any sample.
     pub captured_at: HostTime,
     /// When that sample reached the process.
     pub received_at: HostTime,
@@ -40,6 +41,8 @@ pub struct FrameTimeline {
     pub submitted_at: HostTime,
     /// When the code values were there.
     pub rendered_at: HostTime,
+    /// When cutting them into bit planes began.
+    pub packing_at: HostTime,
     /// When the bit planes were there.
     pub packed_at: HostTime,
     /// When the transport had taken them.
@@ -48,13 +51,24 @@ pub struct FrameTimeline {
     pub due_at: HostTime,
     /// First photon, as the device reports it; `None` until lit.
     pub lit_at: Option<HostTime>,
+    /// Centre of the frame's light: the mean instant of its planes, each weighted with its intensity (see
+    /// [`crate::plan::light_centre`]); `None` until lit.
+    pub centre_at: Option<HostTime>,
+    /// Last photon of its last plane; `None` until lit.
+    pub last_photon_at: Option<HostTime>,
     /// Wall time of each of [`STAGES`], nanoseconds.
     pub wall_ns: [u64; STAGES.len()],
 }
 
 impl FrameTimeline {
-    /// Mid-exposure of the tracker to first light, nanoseconds; `None` when the frame was not lit.
-    pub fn motion_to_light_ns(&self) -> Option<i64> {
-        self.lit_at.map(|lit| lit.ns_since(self.captured_at))
+    /// True when a tracker's sample went into the frame, so that it makes sense to count from its exposure.
+    pub fn has_sample(&self) -> bool {
+        (self.captured_at, self.received_at) != (self.due_at, self.due_at)
+    }
+
+    /// Takes away what the frame has of a sample: no light came of it.
+    pub fn without_sample(mut self) -> Self {
+        (self.captured_at, self.received_at) = (self.due_at, self.due_at);
+        self
     }
 }

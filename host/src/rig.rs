@@ -1,6 +1,8 @@
 //! A checked configuration into the parts of a rig: scene, projector, bodies with their motions, tracker.
 
-use crate::config::{BodyConfig, CalibrationUnit, EnvironmentConfig, GazeConfig, RigConfig, TrackerConfig};
+use crate::config::{
+    BodyConfig, BuiltinScene, CalibrationUnit, EnvironmentConfig, GazeConfig, RigConfig, TrackerConfig,
+};
 use crate::geometry::distortion::Distortion;
 use crate::geometry::opencv::{self, LengthUnit};
 use crate::geometry::projector::{ProjectorCamera, ProjectorError};
@@ -8,11 +10,11 @@ use crate::scene::{self, BodySelector, Environment, LoadOptions, Scene, SceneErr
 use crate::tracking::source::{self, SourceError};
 use dpm_device::planes::Raster;
 use dpm_device::pose::Pose;
+use dpm_device::regular_file;
 use dpm_device::time::{FrameRate, HostClock, HostTime};
 use dpm_device::tracker::{BodyKey, Tracker};
 use glam::{DAffine3, DQuat, DVec3, Vec3};
 use hil_mock::motion::{Motion, MotionError, MotionSpec};
-use std::io::Read;
 use std::sync::Arc;
 
 /// Why a rig cannot be built from a configuration that is valid by itself.
@@ -170,7 +172,9 @@ impl Rig {
         let mut scene = load_scene(config)?;
         let features = SceneFeatures::of(&scene);
         let has_lights = features.emissive_triangles + features.punctual_lights > 0;
-        scene.environment = environment(config, has_lights)?.unwrap_or(scene.environment);
+        let (fitted, told) = environment(config, has_lights)?.unwrap_or(scene.environment).fitted();
+        scene.environment = fitted;
+        scene.warnings.extend(told.map(|t| format!("scene.environment: {t}")));
         let raster = raster.unwrap_or_else(|| config.projector.raster());
         let camera = camera(config, raster, &mut scene.warnings)?;
         let bodies = rig_bodies(config, &scene)?;
@@ -223,7 +227,11 @@ impl Rig {
 
 fn load_scene(config: &RigConfig) -> Result<Scene, SceneError> {
     let c = &config.scene;
-    let Some(file) = &c.file else { return Ok(scene::builtin()) };
+    let Some(file) = &c.file else {
+        return Ok(match c.builtin {
+            BuiltinScene::Demo => scene::builtin(),
+        });
+    };
     let options = LoadOptions {
         bodies: c
             .bodies
@@ -277,11 +285,9 @@ fn camera(
         Some(CalibrationUnit::Millimetre) => LengthUnit::Millimetre,
         None => return Err(wrong("projector.calibration_unit is missing".into())),
     };
-    let mut text = String::new();
-    std::fs::File::open(path)
-        .and_then(|f| f.take(opencv::MAX_BYTES as u64 + 1).read_to_string(&mut text))
-        .map_err(|e| wrong(e.to_string()))?;
-    let stored = opencv::read(&text, p.raster(), unit).map_err(|e| wrong(e.to_string()))?;
+    let text = regular_file::read_text(path, opencv::MAX_BYTES as u64).map_err(|e| wrong(e.to_string()))?;
+    let calibrated = p.calibrated_raster();
+    let stored = opencv::read(&text, calibrated, unit).map_err(|e| wrong(e.to_string()))?;
     if stored.distortion != Distortion::default() {
         warnings.push(format!(
             "projector.calibration: {}: its lens distortion is not compensated; light is off by as much as the lens bends",
@@ -289,8 +295,9 @@ fn camera(
         ));
     }
     let c = stored.camera;
-    let scale_x = f64::from(raster.width()) / f64::from(p.width);
-    let scale_y = f64::from(raster.height()) / f64::from(p.height);
+    // The same view cut into other pixels. The camera's coordinates count from the raster's corner, so everything scales.
+    let scale_x = f64::from(raster.width()) / f64::from(calibrated.width());
+    let scale_y = f64::from(raster.height()) / f64::from(calibrated.height());
     Ok(ProjectorCamera::new(
         raster,
         c.world_from_projector,
@@ -386,6 +393,54 @@ mod tests {
         let flags = settings.iter().map(|s| (*s).to_owned()).collect();
         let config = RigConfig::demo(&Overrides { variables: vec![], flags }).unwrap();
         Rig::build(&config, Raster::new(8, 8)).unwrap().observer
+    }
+
+    /// Found in use, O1: `--raster` cropped the view of a calibrated projector instead of cutting it into other pixels. Every point of the world falls on the
+    /// same place of the picture, whatever its pixels are.
+    #[test]
+    fn a_calibrated_view_stays_when_its_raster_changes() {
+        let dir = std::env::temp_dir().join(format!("dpm-calibrated-{}", std::process::id()));
+        std::fs::create_dir_all(&dir).unwrap();
+        let calibration = dir.join("procam.yml");
+        // Off the centre and not square, so that nothing falls on its own place by chance.
+        let text = "%YAML:1.0\n---\nproj_K: !!opencv-matrix\n  rows: 3\n  cols: 3\n  dt: d\n  data: [ 1890., 0., 530.25, 0., 1910., 371.5, 0., 0., 1. ]\n\
+                    R: !!opencv-matrix\n  rows: 3\n  cols: 3\n  dt: d\n  data: [ 1., 0., 0., 0., -1., 0., 0., 0., -1. ]\n\
+                    T: !!opencv-matrix\n  rows: 3\n  cols: 1\n  dt: d\n  data: [ 0.02, 0.1, 1.1 ]\n";
+        std::fs::write(&calibration, text).unwrap();
+        let file = format!(
+            "[projector]\ncalibration = {:?}\ncalibration_unit = \"metre\"\n[run]\nframes = 1\n",
+            calibration.display().to_string()
+        );
+        let path = dir.join("rig.toml");
+        std::fs::write(&path, file).unwrap();
+        let camera = |raster: Option<&str>| {
+            let args =
+                crate::cli::rig_args::RigArgs { raster: raster.map(str::to_owned), ..Default::default() };
+            let config = args.rig(Some(&path)).unwrap_or_else(|e| panic!("{e}"));
+            Rig::build(&config, None).unwrap_or_else(|e| panic!("{e}")).camera
+        };
+        let full = camera(None);
+        assert_eq!((full.raster.width(), full.raster.height()), (1024, 768));
+        for (flag, width, height) in
+            [("320x240", 320.0, 240.0), ("64x48", 64.0, 48.0), ("1024x300", 1024.0, 300.0)]
+        {
+            let small = camera(Some(flag));
+            assert_eq!((f64::from(small.raster.width()), f64::from(small.raster.height())), (width, height));
+            let mut seen = 0;
+            for i in 0..1000 {
+                let part = |prime: i32| f64::from(i * prime % 1009) / 1009.0 - 0.5;
+                let point = DVec3::new(0.6 * part(7), 0.5 * part(11), 0.3 * part(13));
+                let (Some(a), Some(b)) = (full.project(point), small.project(point)) else { continue };
+                let apart = (a.x / 1024.0 - b.x / width).abs().max((a.y / 768.0 - b.y / height).abs());
+                assert!(apart < 1e-12, "{flag}: {point} at {a} and {b}");
+                seen += 1;
+            }
+            assert!(seen > 900, "{seen}");
+            // The corner of the picture is the corner of the panel: pixels are areas, and their centres lie half a pixel inside.
+            let corner = |camera: &ProjectorCamera| camera.ray(glam::DVec2::ZERO).direction.normalize();
+            assert!((corner(&full) - corner(&small)).length() < 1e-12);
+        }
+        std::fs::remove_dir_all(dir).unwrap();
     }
 
     #[test]

@@ -447,3 +447,39 @@ fn scenes_folder() -> Option<std::path::PathBuf> {
     let beside = std::path::Path::new(env!("CARGO_MANIFEST_DIR")).join("../../shared/scenes");
     given.or(Some(beside)).filter(|p| p.join("bunny-venus-diffuse.glb").is_file())
 }
+
+/// Found in use, O12: the instances of EXT_mesh_gpu_instancing vanished without a word. Each stands where its node, its translation, rotation and scale put it.
+#[test]
+fn instances_stand_where_their_node_puts_them() {
+    let mut file = tetrahedra();
+    let floats = |values: &[f32]| values.iter().flat_map(|v| v.to_le_bytes()).collect::<Vec<u8>>();
+    let half = std::f32::consts::FRAC_1_SQRT_2;
+    let at = file.push_view(&floats(&[0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 2.0, 0.0]));
+    let turned = file.push_view(&floats(&[0.0, 0.0, 0.0, 1.0, 0.0, 0.0, half, half, 0.0, 0.0, 0.0, 1.0]));
+    let scaled = file.push_view(&floats(&[1.0, 1.0, 1.0, 2.0, 2.0, 2.0, 0.0, 0.0, 0.0]));
+    let accessor = |view: usize, kind: &str| json!({"bufferView": view, "componentType": 5126, "type": kind, "count": 3});
+    let file = file
+        .set("/accessors/3", accessor(at, "VEC3"))
+        .set("/accessors/4", accessor(turned, "VEC4"))
+        .set("/accessors/5", accessor(scaled, "VEC3"))
+        .set("/extensionsUsed", json!(["EXT_mesh_gpu_instancing", "EXT_of_somebody"]))
+        .set("/extensionsRequired", json!(["EXT_mesh_gpu_instancing"]))
+        .set(
+            "/nodes/0/extensions",
+            json!({"EXT_mesh_gpu_instancing": {"attributes": {"TRANSLATION": 3, "ROTATION": 4, "SCALE": 5}}}),
+        );
+    let scene = load_with(&file, &select(&[("left", "left")]));
+    let body = &scene.bodies[0];
+    // Two tetrahedra; the third is scaled to nothing, which is how exporters hide one.
+    assert_eq!(body.mesh.triangles.len(), 8);
+    let corners: Vec<Vec3> = body.mesh.positions.clone();
+    let stands = |p: Vec3| corners.iter().any(|c| c.distance(p) < 1e-6);
+    for p in [Vec3::ZERO, Vec3::new(0.1, 0.0, 0.0), Vec3::new(0.0, 0.1, 0.0), Vec3::new(0.0, 0.0, 0.1)] {
+        assert!(stands(p), "{p}: {corners:?}");
+        // A quarter turn about Z and twice the size, one metre to the right.
+        assert!(stands(Vec3::new(1.0 - 2.0 * p.y, 2.0 * p.x, 2.0 * p.z)), "{p}: {corners:?}");
+    }
+    // What is not reproduced is told by name; what is, is not.
+    let told = scene.warnings.join("; ");
+    assert!(told.contains("EXT_of_somebody") && !told.contains("instancing"), "{told}");
+}

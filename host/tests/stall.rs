@@ -21,6 +21,8 @@ fn run(stage: StallIn, watchdog_ms: u32) -> Vec<FrameRecord> {
         set("real_time.pace=\"real\""),
         set("projector.frame_rate=\"100\""),
         format!("safety.watchdog_ms={watchdog_ms}"),
+        // Bodies are shown all through a stall: what is asked is how old their samples are.
+        "safety.predict_ms=500".to_owned(),
     ];
     let config = RigConfig::demo(&Overrides { variables: vec![], flags }).unwrap_or_else(|e| panic!("{e}"));
     let rig = Arc::new(Rig::build(&config, Raster::new(64, 48)).unwrap_or_else(|e| panic!("{e}")));
@@ -30,7 +32,8 @@ fn run(stage: StallIn, watchdog_ms: u32) -> Vec<FrameRecord> {
         stall: Some(Stall { stage, frame: STALLED, length: STALL }),
         ..RunOptions::default()
     };
-    let outcome = run_prepared(rig, options, &RunMonitor::default()).unwrap_or_else(|e| panic!("{e}"));
+    let outcome =
+        run_prepared(rig, options, &Arc::new(RunMonitor::default())).unwrap_or_else(|e| panic!("{e}"));
     assert_eq!((outcome.frames_torn, outcome.frames_reordered), (0, 0), "{stage:?}");
     outcome.recent.into_iter().filter(|r| r.id.0 > STALLED).collect()
 }

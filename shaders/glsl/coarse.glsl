@@ -11,7 +11,7 @@ uvec2 block_size(uvec2 pixel) {
 bool is_traced_block(uvec2 pixel, uvec2 size) {
     if ((frame.flags & FRAME_CHECKERBOARD) == 0u) return true;
     uvec2 block = pixel / size;
-    return ((block.x + block.y + frame.frame) & 1u) == 0u;
+    return ((block.x + block.y + frame.drawn) & 1u) == 0u;
 }
 
 // A random pixel of the block; when nothing is lit there, the next lit one. The same answer for every pixel of the block.

@@ -101,6 +101,8 @@ struct Frame {
     float rate_t;
     float rate_l;
     float pixel_size;
+    uint drawn;
+    uint first_sample;
 };
 
 struct Guide {

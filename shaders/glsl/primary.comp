@@ -31,7 +31,7 @@ vec3 demodulation(Hit hit, vec3 toward) {
 
 // Method dpm: every fourth frame a block of pixels asks for all that it could take from the last.
 bool asks_anew(uvec2 pixel) {
-    return (frame.flags & FRAME_DPM) == 0u || frame.history_frame == NO_FRAME || (((pixel.x >> 3u) + 2u * (pixel.y >> 3u) + frame.frame) & 3u) == 0u;
+    return (frame.flags & FRAME_DPM) == 0u || frame.history_frame == NO_FRAME || (((pixel.x >> 3u) + 2u * (pixel.y >> 3u) + frame.drawn) & 3u) == 0u;
 }
 
 // Method dpm: no light fell on anything here in the last frame, nor as near as anything can have moved since. What only another body or the

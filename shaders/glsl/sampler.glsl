@@ -1,7 +1,7 @@
 // Random numbers in groups of four. Which sequence: a specialization constant.
 #include "noise.glsl"
 
-layout(constant_id = 10) const uint SAMPLER = 0u; // 0 independent, 1 one point set a frame shifted by blue noise, 2 one sequence a surface point
+layout(constant_id = 10) const uint SAMPLER = 0u; // 0 independent, 1 one point set a frame shifted by blue noise, 2 one sequence a surface point, 3 one sequence a pixel
 
 struct Sampler {
     uint seed;  // of the path's sequence
@@ -59,7 +59,7 @@ vec4 sample_4d(Sampler s, uint group) {
         // Every dimension reads the mask at an offset of its own, so that dimensions are independent.
         for (int i = 0; i < 4; i++) {
             uint h = hash_u32(group * 4u + uint(i) + 1u);
-            u[i] += blue_noise(s.pixel + uvec2(h & 63u, (h >> 6u) & 63u), frame.frame + ((h >> 12u) & 31u), uint(i));
+            u[i] += blue_noise(s.pixel + uvec2(h & 63u, (h >> 6u) & 63u), frame.drawn + ((h >> 12u) & 31u), uint(i));
             u[i] = min(u[i] - floor(u[i]), 0.99999994);
         }
     }

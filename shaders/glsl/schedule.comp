@@ -32,7 +32,7 @@ uint samples_of(uvec2 pixel, uint at) {
         if ((h.flags & HISTORY_EXACT) != 0u) share = max(one, 2.0 * frame.budget_spp);
         else if (h.index == 0u) share = max(share, one);
         float whole = floor(share);
-        return uint(whole) + (blue_noise(pixel, frame.frame, 0u) < share - whole ? 1u : 0u);
+        return uint(whole) + (blue_noise(pixel, frame.drawn, 0u) < share - whole ? 1u : 0u);
     }
     uvec2 size = block_size(pixel);
     if (!is_traced_block(pixel, size)) return 0u;

@@ -41,7 +41,7 @@ bool neighbour(ivec2 q, uint instance, out uint tap) {
 
 // The disk is turned anew in every pixel and frame.
 mat2 turn_of(uvec2 pixel, uint dimension) {
-    float turn = blue_noise(pixel, frame.frame, dimension) * 2.0 * PI;
+    float turn = blue_noise(pixel, frame.drawn, dimension) * 2.0 * PI;
     return mat2(cos(turn), sin(turn), -sin(turn), cos(turn));
 }
 

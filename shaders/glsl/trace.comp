@@ -37,6 +37,10 @@ void main() {
         rng.seed = hash_u32(item.pixel + hash_u32(frame.frame + hash_u32(frame.seed)));
     } else if (SAMPLER == 1u) {
         rng.seed = hash_u32(frame.frame + hash_u32(frame.seed));
+    } else if (SAMPLER == 3u) {
+        // The pixel's own sequence goes on where the last frame left it. A count by angle is the same in every frame.
+        rng.seed = hash_u32(item.pixel + hash_u32(frame.seed));
+        rng.index = (frame.flags & FRAME_SPP_BY_ANGLE) != 0u ? frame.drawn * item.spp : frame.first_sample;
     } else {
         History h = history_at(item.pixel);
         rng.seed = h.seed;

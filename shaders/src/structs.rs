@@ -121,6 +121,11 @@ gpu_structs! {
         rate_l: f32,
         /// Pixels per unit of tangent times 1: the size of a pixel at distance 1, metres.
         pixel_size: f32,
+        /// How many frames the renderer drew before this one, wraps. Whatever is done in turns from frame to frame goes by this count, and
+        /// not by the frame's number, which leaves out the frames that were dropped.
+        drawn: u32,
+        /// How many samples a pixel those frames took together, wraps: where a sequence that belongs to a pixel goes on.
+        first_sample: u32,
     }
 
     /// What is known of a pixel without noise.

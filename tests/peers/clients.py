@@ -7,7 +7,8 @@
     target/peers/bin/python tests/peers/clients.py --pycrafter target/Pycrafter6500
 
 `natnet` (PyPI) and `motioncapture` (PyPI; libmotioncapture with the VRPN project's own library) speak over the loopback. Pycrafter6500 runs
-on pyusb and the system's libusb (1.0.26 or later, with or without libudev), which finds the emulated device through libusbfs_fake.so. Whatever is
+on pyusb and the system's libusb (with or without libudev), which finds the emulated device through libusbfs_fake.so. The wheel of `hidapi` on PyPI
+brings libusb 1.0.21, which reads sysfs by other names of the C library; `pip install hidapi==0.15.0` tries it as well. Whatever is
 not installed is left out and said to be. The exit code is 1 when a client saw something wrong.
 """
 
@@ -145,6 +146,24 @@ def pycrafter(folder, pictures):
     return same, count - same, [f"{len(files)} patterns shown"]
 
 
+def hidapi():
+    """Greets the emulated DLPC900 through hidapi's libusb, twice: its firmware's version must come back as it was asked for."""
+    import hid
+
+    found = hid.enumerate(0x0451, 0xC900)
+    right = wrong = 0
+    for sequence, entry in enumerate(found, 7):
+        device = hid.device()
+        device.open_path(entry["path"])
+        # Report number, flags (read, reply), sequence, length, command 0x0205.
+        device.write(bytes([0, 0xC0, sequence, 2, 0, 0x05, 0x02]) + bytes(58))
+        reply = device.read(64, 2000)
+        good = len(reply) > 8 and reply[1] == sequence and not reply[0] & 0x20
+        right, wrong = right + good, wrong + (not good)
+        device.close()
+    return right, wrong, [e["product_string"] or "?" for e in found]
+
+
 def run(words, environment=None):
     """One client in a process of its own: (count, wrong, names), or a text that says why not."""
     command = [sys.executable, __file__, "--client", *words]
@@ -171,7 +190,7 @@ def main():
     if arguments.client:
         kind, *more = arguments.client
         result = {"natnet": lambda: natnet(more[0] == "multicast"), "motioncapture": lambda: motioncapture(more[0]),
-                  "pycrafter": lambda: pycrafter(*more)}[kind]()
+                  "pycrafter": lambda: pycrafter(*more), "hidapi": hidapi}[kind]()
         count, wrong, names = result
         print("RESULT", count, wrong, *(n.replace(" ", "_") for n in names), flush=True)
         # Threads of some clients never end.
@@ -209,6 +228,12 @@ def main():
         with Server(mock, "vrpn", "--rate", str(RATE), *named):
             # It looks for news a few hundred times a second.
             tell("motioncapture vrpn", "VRPN", run(["motioncapture", "vrpn"]), 100)
+    if has("hid"):
+        port = "127.0.0.1:3248"
+        with Server(mock, "dlpc900", "--usbip", port):
+            library = str(arguments.usbfs_fake.resolve())
+            environment = {"LD_PRELOAD": library, "USBFS_FAKE_USBIP": port, "USBFS_FAKE_DRIVER": "usbhid"}
+            tell("hidapi", "DLPC900 over libusb", run(["hidapi"], environment), 1)
     if arguments.pycrafter and has("usb") and has("numpy"):
         port = "127.0.0.1:3247"
         with tempfile.TemporaryDirectory() as pictures, Server(

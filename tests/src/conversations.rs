@@ -2,7 +2,8 @@
 //! behind the checksums is reached.
 
 use dpm_device::link::{
-    Codec, Epoch, Header, HostLink, LinkSettings, LinkState, MessageType, Packet, Underrun,
+    Codec, Epoch, Header, HostLink, LightLimits, LinkSettings, LinkState, MessageType, Packet,
+    SessionNumbers, Underrun,
 };
 use dpm_device::planes::{PlaneSchedule, Raster};
 use dpm_device::time::{DeviceTicks, FrameRate, HostTime};
@@ -29,9 +30,13 @@ impl Transport for Cable {
         self.device.send(now, lane, packets)
     }
 
-    fn receive(&mut self, now: HostTime, sink: &mut dyn FnMut(Lane, &[u8])) -> Result<(), TransportError> {
+    fn receive(
+        &mut self,
+        now: HostTime,
+        sink: &mut dyn FnMut(Lane, HostTime, &[u8]),
+    ) -> Result<(), TransportError> {
         match &mut self.inbound {
-            Some(bytes) => sink(Lane::Control, &std::mem::take(bytes)),
+            Some(bytes) => sink(Lane::Control, now, &std::mem::take(bytes)),
             None => self.device.receive(now, sink)?,
         }
         Ok(())
@@ -48,7 +53,7 @@ const PLANES: usize = 3;
 fn streaming() -> (HostLink, Cable, HostTime) {
     let raster = Raster::new(16, 2).expect("a raster");
     let schedule = PlaneSchedule::mono8();
-    let mut link = HostLink::new(LinkSettings {
+    let settings = LinkSettings {
         raster,
         schedule,
         rate: FrameRate::new(947, 1).expect("a rate"),
@@ -58,8 +63,10 @@ fn streaming() -> (HostLink, Cable, HostTime) {
         epoch: Epoch::At(DeviceTicks(0)),
         codecs: Codec::ALL,
         flash_limit: None,
-        session_seed: 1,
-    });
+        limits: LightLimits::OFF,
+    };
+    // The same session each time: what a fuzzer finds must repeat.
+    let mut link = HostLink::with_sessions(settings, SessionNumbers::from_source(|| 1));
     let mock = MockProjector::new(MockConfig { events_kept: 0, ..MockConfig::new(raster) });
     let mut cable = Cable { device: Direct::new(mock), session: 0, sent: Vec::new(), inbound: None };
     let mut now = HostTime(0);
@@ -73,8 +80,8 @@ fn streaming() -> (HostLink, Cable, HostTime) {
     }
     for id in 1..=PLANES as u64 {
         let planes = vec![id as u8; raster.plane_bytes() * schedule.len()];
-        let slot = link.slots().expect("slots").start(id + 4);
-        link.send_frame(now, id, slot, &planes, &mut cable);
+        let slots = link.slots().expect("slots");
+        link.send_frame(now, id, slots.start(id + 4), slots.dark_from(id + 4, 0), &planes, &mut cable);
     }
     (link, cable, now)
 }

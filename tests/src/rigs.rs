@@ -23,8 +23,8 @@ pub fn demo_rig(width: u32, height: u32, settings: &[&str]) -> Arc<Rig> {
 ///
 /// # Panics
 /// When the run fails.
-pub fn run(gpu: &Arc<Gpu>, rig: &Arc<Rig>, frames: u64, keep: usize) -> (RunOutcome, RunMonitor) {
-    let monitor = RunMonitor::default();
+pub fn run(gpu: &Arc<Gpu>, rig: &Arc<Rig>, frames: u64, keep: usize) -> (RunOutcome, Arc<RunMonitor>) {
+    let monitor = Arc::new(RunMonitor::default());
     let options = RunOptions { frames, keep_frames: keep, ..RunOptions::default() };
     let outcome = pipeline::run(rig.clone(), gpu, options, &monitor).unwrap_or_else(|e| panic!("{e}"));
     (outcome, monitor)

@@ -6,8 +6,9 @@
 use dpm_device::cobs::{encode, encoded_bytes};
 use dpm_device::dlpc900::command::{Command, Opcode};
 use dpm_device::dlpc900::image::{self, Compression, PlaneOrder};
-use dpm_device::link::{rle_encode, Header, HostMessage, MessageType, Packet, MAX_CONTROL_BYTES};
+use dpm_device::link::{rle_encode, Commit, Header, HostMessage, MessageType, Packet, MAX_CONTROL_BYTES};
 use dpm_device::planes::Raster;
+use dpm_device::time::DeviceTicks;
 use dpm_device::tracker::natnet::frame::{encode_frame, FrameContent, FrameInfo, RigidBody};
 use dpm_device::tracker::natnet::messages::{encode_echo_response, encode_request};
 use dpm_device::tracker::natnet::Version;
@@ -102,6 +103,15 @@ fn made() -> Vec<(&'static str, &'static str, Vec<u8>)> {
     let lz4 = script(MessageType::Plane, 3, &[0x14, 5, 1, 0]);
     let orders = [script(MessageType::Stop, 0, &[]), script(MessageType::Arm, 0, &[0; 4])].concat();
     seeds.push(("projector", "planes_and_orders", [plane.concat(), lz4, orders].concat()));
+    // Frames that keep every plane of the third frame sent: dark from a later tick, and from one before their target.
+    let commit = |dark_from: u64| {
+        let commit =
+            Commit { sent: 0, kept: 0xff, base_frame: 3, frames_sent: 4, dark_from: DeviceTicks(dark_from) };
+        let mut payload = [0; MAX_CONTROL_BYTES];
+        let (kind, n) = HostMessage::Commit(commit).write(&mut payload);
+        script(kind, 0, &payload[..n])
+    };
+    seeds.push(("projector", "commits", [commit(1), commit(40_000_000)].concat()));
     let answers = [script(MessageType::Status, 0, &[3; 96]), script(MessageType::Echo, 0, &[1; 24])].concat();
     seeds.push(("host_link", "answers", answers));
     let rig = b"[projector]\nframe_rate = \"60000/1001\"\n[[scene.bodies]]\nname = \"a\"\n".to_vec();

@@ -11,6 +11,7 @@ use dpm_host::pipeline::{on_frame_path, run_prepared, RunOptions};
 use dpm_host::telemetry::monitor::RunMonitor;
 use dpm_tests::rigs::demo_rig;
 use std::sync::atomic::{AtomicI64, AtomicU64, Ordering};
+use std::sync::Arc;
 
 /// What a stage may ask of the kernel: to sleep, to be woken and to wake; the time, where it is not read without a call.
 const LISTED: [i64; 5] = [
@@ -164,7 +165,7 @@ fn a_hundred_thousand_frames_only_wait_and_wake() {
                     let settings =
                         ["real_time.pace=\"real\"", "projector.frame_rate=\"2800\"", "projector.planes=8"];
                     let rig = demo_rig(32, 16, &settings);
-                    let monitor = RunMonitor::default();
+                    let monitor = Arc::new(RunMonitor::default());
                     let options = RunOptions { frames: FRAMES, ..RunOptions::default() };
                     let outcome = run_prepared(rig, options, &monitor).unwrap_or_else(|e| panic!("{e}"));
                     assert_eq!((outcome.frames_torn, outcome.frames_reordered), (0, 0));

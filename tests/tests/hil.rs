@@ -12,7 +12,8 @@ use dpm_device::dlpc900::lut::Dmd;
 use dpm_device::dlpc900::sequence::{LedSetup, Pattern, Repeat, SequenceBuilder};
 use dpm_device::dlpc900::usb::{list, UsbHid};
 use dpm_device::link::{
-    faults, packet_bytes, Codec, Epoch, HostLink, LinkSettings, LinkState, SendOutcome, Underrun,
+    faults, packet_bytes, Codec, Epoch, HostLink, LightLimits, LinkSettings, LinkState, SendOutcome,
+    Underrun, COMMIT_BYTES,
 };
 use dpm_device::planes::{PlaneSchedule, Raster};
 use dpm_device::time::{DeviceTicks, FrameRate, HostTime};
@@ -145,9 +146,9 @@ impl Rig {
             epoch: Epoch::At(DeviceTicks(0)),
             codecs: Codec::Raw.mask(),
             flash_limit: None,
-            session_seed: 1,
+            limits: LightLimits::OFF,
         });
-        let frame_bytes = packet_bytes(raster.plane_bytes()) * PLANES + packet_bytes(16);
+        let frame_bytes = packet_bytes(raster.plane_bytes()) * PLANES + packet_bytes(COMMIT_BYTES);
         let settings = UsbSettings { stuck_after_ns: 2_000_000_000, ..UsbSettings::new(frame_bytes) };
         let usb = within(ENUMERATION, "projector enumerated and opened", || {
             UsbTransport::open(settings.clone()).ok()
@@ -180,8 +181,10 @@ impl Rig {
                     if let Some(slots) = self.link.slots() {
                         let slot = slots.slot_at(DeviceTicks(now.0 as u64)).unwrap_or(0) + 1;
                         let frame = &self.frames[(self.next % 4) as usize];
-                        let at = slots.start(slot);
-                        if self.link.send_frame(now, self.next, at, frame, &mut self.usb) == SendOutcome::Sent
+                        let (at, dark_from) = (slots.start(slot), slots.dark_from(slot, 20_000_000_000));
+                        let usb = &mut self.usb;
+                        if self.link.send_frame(now, self.next, at, dark_from, frame, usb)
+                            == SendOutcome::Sent
                         {
                             self.next += 1;
                         }

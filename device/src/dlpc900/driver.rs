@@ -1,5 +1,7 @@
 //! Calls of a program into commands to a DLPC900, and its answers into values and errors that say what to do.
 
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::sync::{Arc, Mutex, PoisonError, TryLockError};
 use std::time::Duration;
 
 use super::command::{
@@ -13,8 +15,12 @@ use super::sequence::{self, LedSetup, PatternSequence, SequenceError, Step, Vers
 const TIMEOUT: Duration = Duration::from_millis(1000);
 /// Replies to other commands that are dropped before a reply counts as missing (another program's, or one never read).
 const MOST_STALE: usize = 8;
-/// Pause between two looks at the status while waiting.
+/// Pause between two looks at the status while waiting, and longest time until a stop is noticed during a wait.
 const POLL: Duration = Duration::from_millis(20);
+/// How long one report may take once a stop was asked for: the process must be gone within two seconds, whatever the cable does.
+const HURRY: Duration = Duration::from_millis(250);
+/// How long a [`DarkLine`] waits for a command that is under way, so as not to take its reply away.
+const MANNERS: Duration = Duration::from_millis(25);
 
 /// The cable: sends and receives reports of 64 bytes. Every wait MUST end within the time given.
 pub trait HidPort {
@@ -32,6 +38,62 @@ pub trait HidPort {
     /// Lets time pass. Simulated ports let theirs.
     fn pause(&mut self, time: Duration) {
         std::thread::sleep(time);
+    }
+
+    /// A second way to send reports over the same cable from another thread, which works also while this one is stuck inside a call.
+    /// `None` where there is none.
+    fn second_line(&self) -> Option<Box<dyn SecondLine>> {
+        None
+    }
+}
+
+/// Sends reports beside the [`HidPort`] that it belongs to.
+pub trait SecondLine: Send {
+    /// Sends one report. MUST end within `timeout`.
+    fn write_report(&mut self, report: &[u8; REPORT_BYTES], timeout: Duration) -> Result<(), PortError>;
+}
+
+/// Makes a controller dark from another thread than the one that talks to it. Its commands want no reply, so nothing has to be waited
+/// for; they wait a moment for a command that is under way, and no longer.
+pub struct DarkLine {
+    line: Box<dyn SecondLine>,
+    turn: Arc<Mutex<()>>,
+}
+
+impl DarkLine {
+    /// Stops the sequence, so that no light leaves the projector. With `leds_off`, for the end of a run, the LEDs are switched off as
+    /// well. The first report is on its way within some 25 ms.
+    ///
+    /// # Errors
+    /// The cable's. The orders were not heard then.
+    pub fn dark(&mut self, leds_off: bool) -> Result<(), PortError> {
+        let mut waited = Duration::ZERO;
+        let step = Duration::from_millis(1);
+        let turn = loop {
+            match self.turn.try_lock() {
+                Ok(turn) => break Some(turn),
+                Err(TryLockError::Poisoned(turn)) => break Some(turn.into_inner()),
+                // The other thread is stuck inside a command; its reply is of no use any more.
+                Err(TryLockError::WouldBlock) if waited >= MANNERS => break None,
+                Err(TryLockError::WouldBlock) => {
+                    std::thread::sleep(step);
+                    waited += step;
+                }
+            }
+        };
+        let mut steps = sequence::stop();
+        if leds_off {
+            steps.push(sequence::leds_off());
+        }
+        for step in &steps {
+            let Step::Write(opcode, data) = step else { continue };
+            // Fits one report, so it cannot fall apart between the reports of another command.
+            for report in Command::write(0, *opcode, data, false).reports().into_iter().flatten() {
+                self.line.write_report(&report, POLL)?;
+            }
+        }
+        drop(turn);
+        Ok(())
     }
 }
 
@@ -70,7 +132,7 @@ pub enum Dlpc900Error {
         source: PortError,
     },
     /// The controller refused a command.
-    #[error("{doing}: the controller refuses (error {code}, \"{text}\"): {}", remedy(*.code))]
+    #[error("{doing}: the controller refuses (error {code}, \"{text}\"): {remedy}")]
     Refused {
         /// Which command, with the entry or image it was about.
         doing: String,
@@ -78,6 +140,8 @@ pub enum Dlpc900Error {
         code: u8,
         /// The controller's own words.
         text: String,
+        /// What to do about it, in the state that the controller is in.
+        remedy: &'static str,
     },
     /// The controller answered something that makes no sense.
     #[error("{doing}: the answer makes no sense ({what})")]
@@ -96,6 +160,9 @@ pub enum Dlpc900Error {
     /// No video signal.
     #[error("the video source did not lock within {0:?}: check cable, resolution and that the graphics card sends a picture")]
     NotLocked(Duration),
+    /// A stop was asked for in the middle of it; see [`Dlpc900::stop_when`].
+    #[error("stopped before the controller was set up")]
+    Stopped,
     /// An unknown DMD.
     #[error("the controller drives a DMD with unknown number {0}: update this program or the controller's firmware")]
     UnknownDmd(u8),
@@ -225,6 +292,11 @@ pub struct Counters {
 #[derive(Debug)]
 pub struct Dlpc900<P> {
     port: P,
+    /// Held from a command to its reply.
+    turn: Arc<Mutex<()>>,
+    /// When set, whatever takes long ends with [`Dlpc900Error::Stopped`].
+    stop: Option<Arc<AtomicBool>>,
+    timeout: Duration,
     sequence: u8,
     firmware: Version,
     dmd: Dmd,
@@ -237,7 +309,8 @@ impl<P: HidPort> Dlpc900<P> {
     pub fn new(port: P) -> Result<Self, Dlpc900Error> {
         let firmware = Version { major: 0, minor: 0, patch: 0 };
         let (dmd, tag, counters) = (Dmd::Dlp6500, String::new(), Counters::default());
-        let mut this = Self { port, sequence: 0, firmware, dmd, tag, counters };
+        let (turn, stop, timeout) = (Arc::default(), None, TIMEOUT);
+        let mut this = Self { port, turn, stop, timeout, sequence: 0, firmware, dmd, tag, counters };
         let version = this.read(Opcode::VERSION, &[])?;
         let bytes = version.first_chunk::<4>().ok_or_else(|| short(Opcode::VERSION, &version, 4))?;
         this.firmware = Version::from_bytes(*bytes);
@@ -264,6 +337,41 @@ impl<P: HidPort> Dlpc900<P> {
         self.counters
     }
 
+    /// A way to make the controller dark from another thread; `None` where the cable has none.
+    pub fn dark_line(&self) -> Option<DarkLine> {
+        self.port.second_line().map(|line| DarkLine { line, turn: Arc::clone(&self.turn) })
+    }
+
+    /// Once `stop` is true, whatever takes long (uploads, the mirrors' three seconds, waiting for a video signal) ends with
+    /// [`Dlpc900Error::Stopped`] within 20 ms. Calls that make the controller dark are not concerned once [`Dlpc900::hurry`] was called.
+    pub fn stop_when(&mut self, stop: Arc<AtomicBool>) {
+        self.stop = Some(stop);
+    }
+
+    /// For the end of a run: commands are no longer stopped, and none waits longer than 250 ms for the cable.
+    pub fn hurry(&mut self) {
+        (self.stop, self.timeout) = (None, HURRY);
+    }
+
+    fn go_on(&self) -> Result<(), Dlpc900Error> {
+        match &self.stop {
+            Some(stop) if stop.load(Ordering::Relaxed) => Err(Dlpc900Error::Stopped),
+            _ => Ok(()),
+        }
+    }
+
+    /// Lets `time` pass, as long as nobody asks for a stop.
+    fn pause_for(&mut self, time: Duration) -> Result<(), Dlpc900Error> {
+        let mut left = time;
+        while !left.is_zero() {
+            self.go_on()?;
+            let piece = left.min(POLL);
+            self.port.pause(piece);
+            left -= piece;
+        }
+        Ok(())
+    }
+
     /// The cable, for tests and for closing it.
     pub fn into_port(self) -> P {
         self.port
@@ -272,8 +380,31 @@ impl<P: HidPort> Dlpc900<P> {
     /// Reads a command's data.
     pub fn read(&mut self, opcode: Opcode, parameters: &[u8]) -> Result<Vec<u8>, Dlpc900Error> {
         let doing = opcode.to_string();
-        self.send(opcode, parameters, true, true, &doing)?;
-        self.receive(&doing, true)
+        self.exchange(opcode, parameters, true, &doing, true)
+    }
+
+    /// A command and its reply, which nobody must come between: the controller keeps one reply only. `explain` asks the controller why,
+    /// when it refused.
+    fn exchange(
+        &mut self,
+        opcode: Opcode,
+        data: &[u8],
+        read: bool,
+        doing: &str,
+        explain: bool,
+    ) -> Result<Vec<u8>, Dlpc900Error> {
+        let turn = Arc::clone(&self.turn);
+        let held = turn.lock().unwrap_or_else(PoisonError::into_inner);
+        // Under the lock: after a stop was asked for and a dark line has had its turn, nothing starts the sequence again.
+        self.go_on()?;
+        self.send(opcode, data, read, true, doing)?;
+        let (refused, data) = self.receive(doing)?;
+        drop(held);
+        if refused && explain {
+            Err(self.why_refused(doing))
+        } else {
+            Ok(data)
+        }
     }
 
     /// Writes a command's data and waits for the acknowledgement.
@@ -282,8 +413,7 @@ impl<P: HidPort> Dlpc900<P> {
     }
 
     fn write_about(&mut self, opcode: Opcode, data: &[u8], doing: String) -> Result<(), Dlpc900Error> {
-        self.send(opcode, data, false, true, &doing)?;
-        self.receive(&doing, true).map(|_| ())
+        self.exchange(opcode, data, false, &doing, true).map(|_| ())
     }
 
     fn send(
@@ -302,7 +432,7 @@ impl<P: HidPort> Dlpc900<P> {
         };
         let reports = command.reports().map_err(|e: TooLong| protocol(doing, e))?;
         for report in reports {
-            self.port.write_report(&report, TIMEOUT).map_err(|source| self.failed(doing, source))?;
+            self.port.write_report(&report, self.timeout).map_err(|source| self.failed(doing, source))?;
         }
         self.counters.commands += 1;
         Ok(())
@@ -312,20 +442,20 @@ impl<P: HidPort> Dlpc900<P> {
         Dlpc900Error::Port { doing: format!("{}: {doing}", self.port.name()), source }
     }
 
-    /// Waits for the reply to the last command. `explain` asks the controller why, when it refused.
-    fn receive(&mut self, doing: &str, explain: bool) -> Result<Vec<u8>, Dlpc900Error> {
+    /// Waits for the reply to the last command: whether it was refused, and its data.
+    fn receive(&mut self, doing: &str) -> Result<(bool, Vec<u8>), Dlpc900Error> {
         let mut assembler = ReplyAssembler::default();
         let mut report = [0; REPORT_BYTES];
         let mut stale = 0;
         // A reply has at most this many reports, and so many strays may come before it: the loop ends.
         for _ in 0..MOST_STALE * MAX_REPLY_DATA.div_ceil(REPORT_BYTES) {
-            self.port.read_report(&mut report, TIMEOUT).map_err(|source| self.failed(doing, source))?;
+            self.port.read_report(&mut report, self.timeout).map_err(|source| self.failed(doing, source))?;
             match assembler.push(&report) {
                 Ok(None) => {}
                 Ok(Some(reply)) if reply.sequence == self.sequence => {
                     let (refused, data) = (reply.is_refused(), reply.data.to_vec());
                     self.counters.replies += 1;
-                    return if refused && explain { Err(self.why_refused(doing)) } else { Ok(data) };
+                    return Ok((refused, data));
                 }
                 Ok(Some(_)) | Err(Malformed::Short(_) | Malformed::Length(_)) => {
                     stale += 1;
@@ -350,14 +480,30 @@ impl<P: HidPort> Dlpc900<P> {
     fn refused(&mut self, doing: &str, code: u8) -> Dlpc900Error {
         let text = self.error_text().unwrap_or_default();
         let text = if text.is_empty() { error_meaning(code).to_owned() } else { text };
-        Dlpc900Error::Refused { doing: doing.to_owned(), code, text }
+        let remedy = self.remedy_for(code);
+        Dlpc900Error::Refused { doing: doing.to_owned(), code, text, remedy }
+    }
+
+    /// What to do about `code`: "not allowed now" has as many remedies as there are states in which nothing can be shown.
+    fn remedy_for(&mut self, code: u8) -> &'static str {
+        if code != 5 {
+            return remedy(code);
+        }
+        let is = |d: &mut Self, opcode| d.ask(opcode).is_ok_and(|b| b.first().is_some_and(|b| b & 1 != 0));
+        if is(self, Opcode::POWER_MODE) {
+            "the controller is in standby: `dpm dlpc900 wake` brings it back"
+        } else if is(self, Opcode::DMD_PARK) {
+            "the mirrors are parked: `dpm dlpc900 unpark` frees them; upload again afterwards"
+        } else if is(self, Opcode::DMD_IDLE) {
+            "the mirrors exercise: `dpm dlpc900 leave-idle` ends that, in 3 s"
+        } else {
+            remedy(code)
+        }
     }
 
     fn ask(&mut self, opcode: Opcode) -> Result<Vec<u8>, Dlpc900Error> {
-        let doing = opcode.to_string();
-        self.send(opcode, &[], true, true, &doing)?;
         // No explanation: asking why the question about errors was refused would not end.
-        self.receive(&doing, false)
+        self.exchange(opcode, &[], true, &opcode.to_string(), false)
     }
 
     /// The code of the last error, 0 for none.
@@ -401,6 +547,7 @@ impl<P: HidPort> Dlpc900<P> {
         let total = steps.iter().map(size).sum();
         let (mut sent, mut entry) = (0, 0);
         for step in steps {
+            self.go_on()?;
             match step {
                 Step::Write(opcode, data) => {
                     let mut doing = opcode.to_string();
@@ -416,7 +563,7 @@ impl<P: HidPort> Dlpc900<P> {
                         progress(UploadProgress { sent, total });
                     })?;
                 }
-                Step::Pause(time) => self.port.pause(*time),
+                Step::Pause(time) => self.pause_for(*time)?,
                 Step::WaitLocked(time) => {
                     if !self.wait(*time, |d| Ok(d.byte(Opcode::MAIN_STATUS)? & 8 != 0))? {
                         return Err(Dlpc900Error::NotLocked(*time));
@@ -449,7 +596,7 @@ impl<P: HidPort> Dlpc900<P> {
             if waited >= most {
                 return Ok(false);
             }
-            self.port.pause(POLL);
+            self.pause_for(POLL)?;
             waited += POLL;
         }
     }
@@ -475,8 +622,12 @@ impl<P: HidPort> Dlpc900<P> {
             data.clear();
             data.extend_from_slice(&(chunk.len() as u16).to_le_bytes());
             data.extend_from_slice(chunk);
+            self.go_on()?;
             // No acknowledgement: asking for one was seen to corrupt the decompression. The cable's own flow control paces us.
+            let turn = Arc::clone(&self.turn);
+            let held = turn.lock().unwrap_or_else(PoisonError::into_inner);
             self.send(load, &data, false, false, &doing)?;
+            drop(held);
             sent(chunk.len());
         }
         // The data were not acknowledged, so ask once how they were taken.
@@ -502,9 +653,43 @@ impl<P: HidPort> Dlpc900<P> {
 
     /// Sets video patterns up and starts them.
     pub fn start_video_patterns(&mut self, video: &VideoPatterns) -> Result<(), Dlpc900Error> {
+        self.load_video_patterns(video)?;
+        self.start()
+    }
+
+    /// Sets video patterns up; they are then loaded and stopped.
+    pub fn load_video_patterns(&mut self, video: &VideoPatterns) -> Result<(), Dlpc900Error> {
         let steps = video.steps(self.firmware).map_err(SequenceError::from)?;
-        self.run(&steps, &mut |_| ())?;
-        self.check_running()
+        self.run(&steps, &mut |_| ())
+    }
+
+    /// Brings the controller out of every state in which it shows nothing whatever it is told: standby, parked mirrors, and the 50/50
+    /// exercise, which every run ends in and which must last three seconds. True when it was in one of them. The table must be sent
+    /// afterwards.
+    ///
+    /// # Errors
+    /// The cable's, and the controller's.
+    pub fn make_ready(&mut self) -> Result<bool, Dlpc900Error> {
+        let mut rested = false;
+        if self.byte(Opcode::POWER_MODE)? & 1 != 0 {
+            self.wake()?;
+            rested = true;
+        }
+        if self.byte(Opcode::DMD_PARK)? & 1 != 0 {
+            self.unpark()?;
+            rested = true;
+        }
+        let exercises = match self.byte(Opcode::DMD_IDLE) {
+            Ok(byte) => byte & 1 != 0,
+            // A firmware that does not tell may well exercise them, and leaving what was not entered does nothing.
+            Err(Dlpc900Error::Refused { .. }) => true,
+            Err(e) => return Err(e),
+        };
+        if exercises {
+            self.leave_idle()?;
+            rested = true;
+        }
+        Ok(rested)
     }
 
     /// Starts the loaded sequence and makes sure that it runs.

@@ -250,6 +250,11 @@ pub fn stop() -> Vec<Step<'static>> {
     vec![write(Opcode::START_STOP, &[0])]
 }
 
+/// LEDs off by hand, whatever the sequencer does.
+pub fn leds_off() -> Step<'static> {
+    write(Opcode::LED_ENABLE, &[LEDS_OFF])
+}
+
 /// Pauses the sequencer; [`start`] goes on from there.
 pub fn pause() -> Vec<Step<'static>> {
     vec![write(Opcode::START_STOP, &[1])]
@@ -406,7 +411,6 @@ impl VideoPatterns {
         steps.extend(switch_mode(DisplayMode::VideoPattern, firmware));
         steps.extend(table(&self.entries, 0));
         steps.extend(self.leds.steps());
-        steps.extend(start());
         Ok(steps)
     }
 }
@@ -551,7 +555,9 @@ mod tests {
         assert_eq!(opcodes(&steps[..7]), [0x1a24, 0x1a07, 0x1a01, 0x1a00, 0x1a1b, 2, 0x1a1b]);
         assert_eq!(steps[4], Step::Write(Opcode::DISPLAY_MODE, vec![0]));
         assert_eq!(steps[6], Step::Write(Opcode::DISPLAY_MODE, vec![2]));
-        assert_eq!(steps.last(), Some(&Step::Write(Opcode::START_STOP, vec![2])));
+        // The LEDs last; what starts the sequence is the caller's.
+        assert_eq!(steps.last(), Some(&Step::Write(Opcode::LED_ENABLE, vec![LEDS_BY_SEQUENCER])));
+        assert!(!steps.contains(&Step::Write(Opcode::START_STOP, vec![2])));
         v.entries[23].exposure_us = 1500;
         assert_eq!(v.steps(NEW).unwrap_err().to_string(),
             "LUT entry 23: patterns up to here take 8400 us, a video frame has 8333 us: expose shorter or lower the frame rate");

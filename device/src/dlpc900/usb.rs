@@ -1,11 +1,12 @@
 //! The cable of a DLPC900: HID reports as interrupt transfers of libusb.
 
+use std::sync::Arc;
 use std::time::{Duration, Instant};
 
 use rusb::{Context, Device, DeviceHandle, Direction, TransferType, UsbContext};
 
 use super::command::REPORT_BYTES;
-use super::driver::{HidPort, PortError};
+use super::driver::{HidPort, PortError, SecondLine};
 use crate::usb_help::{node, node_of, remedy};
 
 /// USB vendor, Texas Instruments.
@@ -54,7 +55,7 @@ impl std::str::FromStr for UsbPlace {
 /// An open DLPC900. Dropping it gives the interface back to the kernel's driver.
 pub struct UsbHid {
     name: String,
-    handle: DeviceHandle<Context>,
+    handle: Arc<DeviceHandle<Context>>,
     interface: u8,
     endpoint_out: u8,
     endpoint_in: u8,
@@ -145,7 +146,20 @@ impl UsbHid {
             }
         }
         let name = format!("DLPC900 ({VENDOR:04x}:{PRODUCT:04x}) at {}", node_of(&device));
-        Ok(Self { name, handle, interface, endpoint_out, endpoint_in })
+        Ok(Self { name, handle: Arc::new(handle), interface, endpoint_out, endpoint_in })
+    }
+}
+
+/// The same open device from another thread. libusb's calls may come from any thread, and a transfer is with the kernel before libusb
+/// waits for it.
+struct UsbSecondLine {
+    handle: Arc<DeviceHandle<Context>>,
+    endpoint_out: u8,
+}
+
+impl SecondLine for UsbSecondLine {
+    fn write_report(&mut self, report: &[u8; REPORT_BYTES], timeout: Duration) -> Result<(), PortError> {
+        self.handle.write_interrupt(self.endpoint_out, report, timeout).map(|_| ()).map_err(error)
     }
 }
 
@@ -154,8 +168,12 @@ impl HidPort for UsbHid {
         &self.name
     }
 
+    fn second_line(&self) -> Option<Box<dyn SecondLine>> {
+        Some(Box::new(UsbSecondLine { handle: Arc::clone(&self.handle), endpoint_out: self.endpoint_out }))
+    }
+
     fn write_report(&mut self, report: &[u8; REPORT_BYTES], timeout: Duration) -> Result<(), PortError> {
-        let write = |h: &DeviceHandle<Context>, e| h.write_interrupt(e, report, timeout);
+        let write = |h: &DeviceHandle<Context>, e: u8| h.write_interrupt(e, report, timeout);
         let sent = match write(&self.handle, self.endpoint_out) {
             // A halted endpoint took nothing: clear it once and send again.
             Err(rusb::Error::Pipe) => {

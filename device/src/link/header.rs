@@ -6,7 +6,7 @@ use crate::time::DeviceTicks;
 /// First four bytes of every packet: `D P M L` in the order sent.
 pub const MAGIC: [u8; 4] = *b"DPML";
 /// Version of the protocol that this code speaks.
-pub const VERSION: u8 = 1;
+pub const VERSION: u8 = 2;
 /// Bytes of a header.
 pub const HEADER_BYTES: usize = 32;
 /// Largest payload: the length field has 24 bits.
@@ -134,7 +134,7 @@ pub enum HeaderError {
     Version(u8),
     /// A whole header of a type that this version does not know.
     Type(u8),
-    /// Reserved flag bits are set, or a codec that this version does not know.
+    /// Reserved flag bits are set, a codec that this version does not know, or a codec on a message that has none.
     Flags(u8),
 }
 
@@ -202,7 +202,9 @@ impl Header {
             return Err(HeaderError::Version(b[4]));
         }
         let kind = MessageType::from_code(b[5]).ok_or(HeaderError::Type(b[5]))?;
-        let codec = Codec::from_code(b[6]).ok_or(HeaderError::Flags(b[6]))?;
+        let codec = Codec::from_code(b[6])
+            .filter(|codec| kind == MessageType::Plane || *codec == Codec::Raw)
+            .ok_or(HeaderError::Flags(b[6]))?;
         Ok(Self {
             kind,
             codec,
@@ -261,6 +263,15 @@ impl<'a> Packet<'a> {
         Self { header, payload, trailer, trailer_len: trailer_len as u8 }
     }
 
+    /// Exactly these bytes, unchecked: a packet that is damaged, cut short or of another version, to see what its receiver does. Of
+    /// `trailer` at most eight bytes are sent.
+    pub fn from_raw(header: [u8; HEADER_BYTES], payload: &'a [u8], trailer: &[u8]) -> Self {
+        let mut bytes = [0u8; 8];
+        let n = trailer.len().min(bytes.len());
+        bytes[..n].copy_from_slice(&trailer[..n]);
+        Self { header, payload, trailer: bytes, trailer_len: n as u8 }
+    }
+
     /// Header, payload and trailer in the order they are sent; the last two may be empty.
     pub fn parts(&self) -> [&[u8]; 3] {
         [&self.header, self.payload, &self.trailer[..self.trailer_len as usize]]
@@ -268,7 +279,7 @@ impl<'a> Packet<'a> {
 
     /// Bytes of the whole packet.
     pub fn wire_bytes(&self) -> usize {
-        packet_bytes(self.payload.len())
+        HEADER_BYTES + self.payload.len() + self.trailer_len as usize
     }
 }
 
@@ -297,10 +308,10 @@ mod tests {
     /// Written by hand from docs/PROTOCOL.md; the checksums come from an independent bit-by-bit program.
     #[rustfmt::skip]
     const GOLDEN: [u8; 44] = [
-        0x44, 0x50, 0x4d, 0x4c,  0x01, 0x02, 0x00, 0x05,
+        0x44, 0x50, 0x4d, 0x4c,  0x02, 0x02, 0x00, 0x05,
         0xd4, 0xc3, 0xb2, 0xa1,  0x04, 0x03, 0x02, 0x01,
         0x88, 0x77, 0x66, 0x55,  0x44, 0x33, 0x22, 0x11,
-        0x05, 0x00, 0x00, 0x26,  0x7c, 0x20, 0xc7, 0x1a,
+        0x05, 0x00, 0x00, 0x26,  0x1f, 0x11, 0xfb, 0xd1,
         0x80, 0x01, 0xff, 0x00,  0x3c, 0x00, 0x00, 0x00,
         0x18, 0xa4, 0x30, 0x1a,
     ];
@@ -355,6 +366,12 @@ mod tests {
             assert_eq!(Header::decode(&b), Err(expected));
             assert_eq!(Header::payload_bytes_of(&b), 5);
         }
+        // Only planes have a codec.
+        let mut b = Header::control(MessageType::Sync, 1, 4).encode();
+        b[6] = Codec::Rle as u8;
+        let crc = crc32c(&b[..28]);
+        b[28..].copy_from_slice(&crc.to_le_bytes());
+        assert_eq!(Header::decode(&b), Err(HeaderError::Flags(1)));
     }
 
     #[test]

@@ -5,20 +5,24 @@
 
 mod frames;
 mod inbox;
+mod light;
 mod types;
 
 use super::compact::Compactor;
 use super::decoder::Decoder;
 use super::flash::FlashLimiter;
 use super::header::{Codec, Header, Packet, VERSION};
+use super::limits::LimitReached;
 use super::message::{
     Config, ConfigRefusal, DeviceHello, DeviceState, Echo, Fault, FaultCode, HostHello, HostMessage, Status,
     MAX_CONTROL_BYTES,
 };
+use super::session::SessionNumbers;
 use super::slots::SlotClock;
 use crate::time::{DeviceTicks, HostTime};
 use crate::transport::{Lane, SendError, Transport, TransportError};
 use inbox::{Inbox, ECHOES_KEPT};
+use light::LightCount;
 pub use types::{
     DropReason, EchoSample, Epoch, LinkCounters, LinkError, LinkSettings, LinkState, SendOutcome, Verb,
 };
@@ -31,6 +35,8 @@ const REOPEN_NS: i64 = 100_000_000;
 const FAST_ECHO_NS: i64 = 2_000_000;
 /// Number of fast echoes.
 const FAST_ECHOES: u32 = 16;
+/// How long the answer to a clock exchange is worth waiting for closely.
+const ECHO_AWAITED_NS: i64 = 5_000_000;
 /// Detail of a refused ARM: CONFIG has not arrived.
 const ARM_BEFORE_CONFIG: u16 = 1;
 
@@ -38,6 +44,7 @@ const ARM_BEFORE_CONFIG: u16 = 1;
 #[derive(Debug)]
 pub struct HostLink {
     settings: LinkSettings,
+    sessions: SessionNumbers,
     state: LinkState,
     inbox: Inbox,
     decoders: [Decoder; 2],
@@ -52,8 +59,12 @@ pub struct HostLink {
     frames_sent: u32,
     last_frame: Option<u32>,
     flash: Option<FlashLimiter>,
-    /// While light rests after too many flashes: when it ends.
-    rest_until: Option<HostTime>,
+    /// What is left of the light that may be made.
+    light: LightCount,
+    /// While light rests by itself: when that ends, and why it does.
+    rest: Option<(HostTime, DropReason)>,
+    /// What [`HostLink::command`] ordered last and [`HostLink::arm`] has not taken back.
+    ordered: Option<Verb>,
     /// `None` when only raw planes are sent.
     compactor: Option<Compactor>,
     /// The next frame must not refer to another.
@@ -67,15 +78,22 @@ pub struct HostLink {
 const NEVER: HostTime = HostTime(i64::MIN);
 
 impl HostLink {
-    /// A closed link. Its buffers are all it will ever allocate.
+    /// A closed link whose sessions are numbered by the operating system. Its buffers are all it will ever allocate.
     pub fn new(settings: LinkSettings) -> Self {
+        Self::with_sessions(settings, SessionNumbers::from_system())
+    }
+
+    /// As [`HostLink::new`], with session numbers of another source, for tests that must repeat byte for byte.
+    pub fn with_sessions(settings: LinkSettings, sessions: SessionNumbers) -> Self {
         let compactor = (settings.codecs & !Codec::Raw.mask() != 0).then(|| {
             let frame_ns = settings.rate.slot_len_ns(0);
             Compactor::new(settings.raster, settings.schedule.len(), frame_ns, settings.codecs)
         });
+        let (rate, limits) = (settings.rate, settings.limits);
         let flash = settings.flash_limit.map(|limit| FlashLimiter::new(settings.rate, limit));
         Self {
             settings,
+            sessions,
             state: LinkState::Closed,
             inbox: Inbox::new(),
             decoders: [Decoder::new(), Decoder::new()],
@@ -90,7 +108,9 @@ impl HostLink {
             frames_sent: 0,
             last_frame: None,
             flash,
-            rest_until: None,
+            light: LightCount::new(rate, &limits),
+            rest: None,
+            ordered: None,
             compactor,
             key_due: true,
             losses: 0,
@@ -98,14 +118,10 @@ impl HostLink {
         }
     }
 
-    /// Opens a new session with the next [`HostLink::poll`]; an old one, and its light, end.
+    /// Opens a new session, with a number of its own, with the next [`HostLink::poll`]; an old one, and its light, end.
     pub fn connect(&mut self) {
         self.counters.sessions += 1;
-        // Odd multiplier: numbers differ for 2^32 sessions of one seed. 0 means "no session".
-        let n = (self.counters.sessions as u32)
-            .wrapping_mul(0x9e37_79b1)
-            .wrapping_add(self.settings.session_seed);
-        self.inbox.open(n.max(1));
+        self.inbox.open(self.sessions.draw());
         self.decoders = [Decoder::new(), Decoder::new()];
         self.state = LinkState::Greeting;
         self.slots = None;
@@ -117,7 +133,8 @@ impl HostLink {
         self.last_frame = None;
         self.key_due = true;
         self.losses = 0;
-        self.rest_until = None;
+        self.rest = None;
+        self.light.new_session();
     }
 
     /// Permits light once the device is configured, shows the picture again after BLACK or FREEZE, or acknowledges latched
@@ -125,7 +142,8 @@ impl HostLink {
     pub fn arm(&mut self, acknowledge: u32) {
         self.acknowledge = acknowledge;
         self.verb = None;
-        self.rest_until = None;
+        self.rest = None;
+        self.ordered = None;
         self.requested_at = NEVER;
         if matches!(self.state, LinkState::Ready | LinkState::Faulted | LinkState::Streaming) {
             self.inbox.fault = None;
@@ -135,22 +153,44 @@ impl HostLink {
         }
     }
 
-    /// True while light rests after too many flashes.
+    /// True while light rests after too many flashes, or after a limit on light was reached.
     pub fn is_resting(&self, now: HostTime) -> bool {
-        self.rest_until.is_some_and(|end| now < end)
+        self.rest.is_some_and(|(end, _)| now < end)
     }
 
-    /// Sends `verb` now and again every 20 ms until the device confirms it.
+    /// The limit on light for which light rests now.
+    pub fn resting_for(&self) -> Option<LimitReached> {
+        match self.rest {
+            Some((_, DropReason::LightLimit(limit))) => Some(limit),
+            _ => None,
+        }
+    }
+
+    /// Sends `verb` now and again every 20 ms until the device confirms it. An order to be dark (all but FREEZE) goes before everything that
+    /// waits on the medium, and until it is confirmed no frame is sent. While an order that forbids more is not confirmed (SAFE, then
+    /// STOP, then BLACK, then FREEZE) that one is sent again in its place.
     pub fn command(
         &mut self,
         now: HostTime,
         verb: Verb,
         transport: &mut dyn Transport,
     ) -> Result<(), SendError> {
+        // Whoever asked for dark or stillness decides when it ends.
+        self.rest = None;
+        let given = self.give(now, verb, transport);
+        self.ordered = self.verb;
+        given
+    }
+
+    /// Sends `verb` until the device confirms it.
+    fn give(&mut self, now: HostTime, verb: Verb, transport: &mut dyn Transport) -> Result<(), SendError> {
+        let verb = self.verb.filter(|pending| pending.strength() > verb.strength()).unwrap_or(verb);
+        // Only once for an order: thrown away again, one that is on a slow line would never arrive.
+        if verb.is_dark() && self.verb != Some(verb) {
+            transport.flush_output();
+        }
         self.verb = Some(verb);
         self.verb_sent_at = now;
-        // Whoever asked for dark or stillness decides when it ends.
-        self.rest_until = None;
         if self.state == LinkState::Arming {
             self.state = LinkState::Ready;
         }
@@ -158,7 +198,7 @@ impl HostLink {
     }
 
     /// Receives what has arrived, takes the next step of the handshake, keeps the device's watchdog fed. Call at least once a
-    /// frame slot. On an error of the handshake the link is [`LinkState::Closed`] (ARM refused: [`LinkState::Faulted`]); when the medium fails, the error is
+    /// frame slot, with a `now` that was read just before. On an error of the handshake the link is [`LinkState::Closed`] (ARM refused: [`LinkState::Faulted`]); when the medium fails, the error is
     /// returned once and the link is [`LinkState::Lost`] until it is back.
     pub fn poll(&mut self, now: HostTime, transport: &mut dyn Transport) -> Result<LinkState, LinkError> {
         let result = self.step(now, transport);
@@ -189,18 +229,26 @@ impl HostLink {
             // Only HELLO helps; the caller decides about light again.
             self.connect();
         }
-        if self.rest_until.is_some_and(|end| now >= end) && self.state == LinkState::Streaming {
-            self.arm(0);
+        if self.rest.is_some_and(|(end, _)| now >= end) && self.state == LinkState::Streaming {
+            self.rest = None;
+            // An order of the operator outlasts any rest.
+            if self.ordered.is_none() {
+                self.arm(0);
+            }
         }
         self.advance(transport)?;
+        // After what has arrived was read: where a medium stamps with the poll's `now`, no answer may be older than its question.
+        self.exchange_clocks(now, transport)?;
         self.request(now, transport)?;
         Ok(self.state)
     }
 
     fn receive(&mut self, now: HostTime, transport: &mut dyn Transport) -> Result<(), TransportError> {
         let Self { inbox, decoders, .. } = self;
-        inbox.now = now;
-        let result = transport.receive(now, &mut |lane, bytes| decoders[lane as usize].push(bytes, inbox));
+        let result = transport.receive(now, &mut |lane, arrived_at, bytes| {
+            inbox.arrived_at = arrived_at;
+            decoders[lane as usize].push(bytes, inbox);
+        });
         self.counters.packets_ignored = self.inbox.ignored;
         self.counters.packets_damaged = self.inbox.damaged;
         result
@@ -311,9 +359,26 @@ impl HostLink {
         Ok(())
     }
 
-    /// Requests that are due: the next step of the handshake, a verb, an echo, a credit repair.
+    /// Asks for the device's clock when that is due, which also keeps the watchdog fed.
+    fn exchange_clocks(&mut self, now: HostTime, transport: &mut dyn Transport) -> Result<(), LinkError> {
+        if matches!(self.state, LinkState::Closed | LinkState::Lost | LinkState::Greeting) {
+            return Ok(());
+        }
+        let calm = (i64::from(self.settings.watchdog_us) * 1000 / 4).clamp(1_000_000, 100_000_000);
+        let every = if self.echoes_sent < FAST_ECHOES { FAST_ECHO_NS.min(calm) } else { calm };
+        if !is_due(now, self.echo_sent_at, every) {
+            return Ok(());
+        }
+        self.echo_sent_at = now;
+        self.echoes_sent += 1;
+        let echo =
+            Echo { host_sent_ns: now.0 as u64, device_received: DeviceTicks(0), device_sent: DeviceTicks(0) };
+        lost(self.control(now, &HostMessage::Echo(echo), transport))
+    }
+
+    /// Requests that are due: the next step of the handshake, a verb, a credit repair.
     fn request(&mut self, now: HostTime, transport: &mut dyn Transport) -> Result<(), LinkError> {
-        let due = |last: HostTime, every: i64| last == NEVER || now.ns_since(last) >= every;
+        let due = |last: HostTime, every: i64| is_due(now, last, every);
         if due(self.requested_at, RETRY_NS) {
             let message = match self.state {
                 LinkState::Greeting => Some(HostMessage::Hello(HostHello {
@@ -334,20 +399,6 @@ impl HostLink {
             self.verb_sent_at = now;
             lost(self.control(now, &verb.message(), transport))?;
         }
-        if self.state != LinkState::Greeting {
-            let calm = (i64::from(self.settings.watchdog_us) * 1000 / 4).clamp(1_000_000, 100_000_000);
-            let every = if self.echoes_sent < FAST_ECHOES { FAST_ECHO_NS.min(calm) } else { calm };
-            if due(self.echo_sent_at, every) {
-                self.echo_sent_at = now;
-                self.echoes_sent += 1;
-                let echo = Echo {
-                    host_sent_ns: now.0 as u64,
-                    device_received: DeviceTicks(0),
-                    device_sent: DeviceTicks(0),
-                };
-                lost(self.control(now, &HostMessage::Echo(echo), transport))?;
-            }
-        }
         let starved = self.state == LinkState::Streaming && self.credit() == 0;
         let silence = self.settings.rate.slot_start_ns(4);
         if starved && due(self.data_sent_at, silence) {
@@ -366,6 +417,7 @@ impl HostLink {
             watchdog_us: s.watchdog_us,
             underrun: s.underrun,
             late_slots: s.late_slots,
+            limits: s.limits,
             epoch: self.slots.map_or(DeviceTicks(0), |c| c.epoch()),
         }
     }
@@ -416,6 +468,14 @@ impl HostLink {
         }
     }
 
+    /// True while the answer to a clock exchange is under way that began less than 5 ms ago: a caller that polls soon learns the
+    /// device's clock the better.
+    pub fn awaits_echo(&self, now: HostTime) -> bool {
+        self.echo_sent_at != NEVER
+            && self.inbox.echo_answered != self.echo_sent_at
+            && now.ns_since(self.echo_sent_at) < ECHO_AWAITED_NS
+    }
+
     /// A frame number that follows those sent in this session.
     pub fn next_frame_id(&self) -> u64 {
         self.last_frame.map_or(1, |last| u64::from(last) + 1)
@@ -450,6 +510,10 @@ impl HostLink {
         self.counters.bytes_sent += packet.wire_bytes() as u64;
         Ok(())
     }
+}
+
+fn is_due(now: HostTime, last: HostTime, every_ns: i64) -> bool {
+    last == NEVER || now.ns_since(last) >= every_ns
 }
 
 /// A busy medium is asked again later; a lost one is an error.

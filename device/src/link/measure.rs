@@ -70,8 +70,10 @@ pub fn measure(
         }
         link.poll(now, transport)?;
         let device_now = link.status().map_or(DeviceTicks(0), |s| s.now);
-        let target = slots.start(slots.slot_at(device_now).map_or(0, |k| k + 1));
-        match link.send_frame(now, next, target, &planes, transport) {
+        let slot = slots.slot_at(device_now).map_or(0, |k| k + 1);
+        // What is measured is how much arrives: a slow link's late frames are seen for as long as the device would wait for its host.
+        let dark_from = slots.dark_from(slot, u64::from(link.settings().watchdog_us) * 1000);
+        match link.send_frame(now, next, slots.start(slot), dark_from, &planes, transport) {
             SendOutcome::Sent => {
                 next += 1;
                 content(next, &mut planes);

@@ -6,6 +6,7 @@
 mod types;
 
 use super::header::{u16_at, u32_at, u64_at, Header, MessageType};
+use super::limits::LightLimits;
 use crate::planes::{PlaneSchedule, PlaneSpec, Raster, MAX_PLANES};
 use crate::time::{DeviceTicks, FrameRate};
 pub use types::{
@@ -15,6 +16,10 @@ pub use types::{
 
 /// Longest payload of any message except PLANE.
 pub const MAX_CONTROL_BYTES: usize = 96;
+/// Length of a CONFIG's payload before the LED codes of its planes.
+pub const CONFIG_BYTES: usize = 40;
+/// Length of a FRAME_COMMIT's payload.
+pub const COMMIT_BYTES: usize = 24;
 /// Why a payload cannot be read.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum PayloadError {
@@ -135,22 +140,30 @@ fn write_echo(w: &mut Writer<'_>, e: &Echo) {
 impl Config {
     fn parse(p: &[u8]) -> Result<Self, PayloadError> {
         let kind = MessageType::Config;
-        if p.len() < 32 {
-            return Err(PayloadError::Length { kind, expected: 33, got: p.len() });
+        if p.len() < CONFIG_BYTES {
+            return Err(PayloadError::Length { kind, expected: CONFIG_BYTES + 1, got: p.len() });
         }
         let count = p[16] as usize;
         let field = |field| PayloadError::Field { kind, field };
         if count == 0 || count > MAX_PLANES {
             return Err(field("planes"));
         }
-        expect_len(kind, p, 32 + count)?;
+        expect_len(kind, p, CONFIG_BYTES + count)?;
         let mut specs = [PlaneSpec::from_led_code(0).expect("code 0 is red bit 0"); MAX_PLANES];
-        for (spec, &code) in specs.iter_mut().zip(&p[32..]) {
+        for (spec, &code) in specs.iter_mut().zip(&p[CONFIG_BYTES..]) {
             *spec = PlaneSpec::from_led_code(code).ok_or(field("led codes"))?;
         }
         let watchdog_us = u32_at(p, 12);
         if watchdog_us == 0 || watchdog_us > MAX_WATCHDOG_US {
             return Err(field("watchdog"));
+        }
+        let limits = LightLimits {
+            mean_permille: u16_at(p, 20),
+            window_ms: u32_at(p, 32),
+            full_white_ms: u32_at(p, 36),
+        };
+        if !limits.is_valid() {
+            return Err(field("limits"));
         }
         Ok(Self {
             raster: raster(kind, p, 0)?,
@@ -164,14 +177,16 @@ impl Config {
             },
             late_slots: p[18],
             epoch: DeviceTicks(u64_at(p, 24)),
+            limits,
         })
     }
 
     fn write(&self, w: &mut Writer<'_>) {
         w.u16(self.raster.width() as u16).u16(self.raster.height() as u16);
         w.u32(self.rate.num()).u32(self.rate.den()).u32(self.watchdog_us);
-        w.u8(self.schedule.len() as u8).u8(self.underrun as u8).u8(self.late_slots).u8(0).u32(0);
-        w.u64(self.epoch.0);
+        w.u8(self.schedule.len() as u8).u8(self.underrun as u8).u8(self.late_slots).u8(0);
+        w.u16(self.limits.mean_permille).u16(0).u64(self.epoch.0);
+        w.u32(self.limits.window_ms).u32(self.limits.full_white_ms);
         for plane in self.schedule.planes() {
             w.u8(plane.led_code());
         }
@@ -197,12 +212,13 @@ impl HostMessage {
                 Self::Arm(u32_at(p, 0))
             }
             MessageType::FrameCommit => {
-                expect_len(kind, p, 16)?;
+                expect_len(kind, p, COMMIT_BYTES)?;
                 let commit = Commit {
                     sent: u32_at(p, 0),
                     kept: u32_at(p, 4),
                     base_frame: u32_at(p, 8),
                     frames_sent: u32_at(p, 12),
+                    dark_from: DeviceTicks(u64_at(p, 16)),
                 };
                 if commit.sent & commit.kept != 0 {
                     return Err(field("kept"));
@@ -246,7 +262,7 @@ impl HostMessage {
                 MessageType::Arm
             }
             Self::Commit(c) => {
-                w.u32(c.sent).u32(c.kept).u32(c.base_frame).u32(c.frames_sent);
+                w.u32(c.sent).u32(c.kept).u32(c.base_frame).u32(c.frames_sent).u64(c.dark_from.0);
                 MessageType::FrameCommit
             }
             Self::Sync(frames_sent) => {

@@ -14,9 +14,12 @@ mod flash;
 mod header;
 #[cfg(feature = "std")]
 mod host;
+mod limits;
 #[cfg(feature = "std")]
 mod measure;
 mod message;
+#[cfg(feature = "std")]
+mod session;
 mod slots;
 
 pub use codec::{rle_encode, CodecError, RleDecoder};
@@ -32,10 +35,16 @@ pub use host::{
     DropReason, EchoSample, Epoch, HostLink, LinkCounters, LinkError, LinkSettings, LinkState, SendOutcome,
     Verb,
 };
+pub use limits::{
+    light_level, LightLimiter, LightLimits, LimitReached, FULL_WHITE_LEVEL, MAX_LIMIT_MS, MIN_LIMIT_MS,
+};
 #[cfg(feature = "std")]
 pub use measure::{measure, LinkMeasurement};
 pub use message::{
     faults, Assembly, Commit, Config, ConfigRefusal, DeviceHello, DeviceMessage, DeviceState, Echo, Fault,
-    FaultCode, HostHello, HostMessage, PayloadError, Status, Underrun, MAX_CONTROL_BYTES, MAX_WATCHDOG_US,
+    FaultCode, HostHello, HostMessage, PayloadError, Status, Underrun, COMMIT_BYTES, MAX_CONTROL_BYTES,
+    MAX_WATCHDOG_US,
 };
+#[cfg(feature = "std")]
+pub use session::SessionNumbers;
 pub use slots::SlotClock;

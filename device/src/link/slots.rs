@@ -41,6 +41,16 @@ impl SlotClock {
         Some(k as u64)
     }
 
+    /// From when a frame that is planned for slots up to `last` may no longer be lit: the end of that slot plus the longer of
+    /// `keep_ns` nanoseconds (nominal) and three slots. Saturates at the end of the counter.
+    pub const fn dark_from(&self, last: u64, keep_ns: u64) -> DeviceTicks {
+        let end = self.start(last.saturating_add(1)).0;
+        let ticks = keep_ns as u128 * self.tick_hz as u128 / 1_000_000_000;
+        let kept = end.saturating_add(if ticks > u64::MAX as u128 { u64::MAX } else { ticks as u64 });
+        let slots = self.start(last.saturating_add(4)).0;
+        DeviceTicks(if kept > slots { kept } else { slots })
+    }
+
     /// Start of slot 0.
     pub const fn epoch(&self) -> DeviceTicks {
         self.epoch
@@ -79,6 +89,21 @@ mod tests {
         // A day of 947 fps on a nanosecond clock is a day.
         let clock = SlotClock::new(DeviceTicks(7), 1_000_000_000, FrameRate::new(947, 1).unwrap()).unwrap();
         assert_eq!(clock.start(947 * 86_400).0, 86_400_000_000_007);
+    }
+
+    /// Found in use, R1: what ends a frame's light when nobody sends another.
+    #[test]
+    fn light_ends_after_the_longer_of_three_slots_and_the_given_time() {
+        let clock = SlotClock::new(DeviceTicks(77), 27_000_000, FrameRate::new(947, 1).unwrap()).unwrap();
+        for last in [0u64, 1, 946, 1 << 40] {
+            let end = clock.start(last + 1).0;
+            assert_eq!(clock.dark_from(last, 0), clock.start(last + 4));
+            assert_eq!(clock.dark_from(last, 3_000_000), clock.start(last + 4), "three slots are 3.17 ms");
+            assert_eq!(clock.dark_from(last, 20_000_000).0, end + 540_000);
+        }
+        assert_eq!(clock.dark_from(u64::MAX, u64::MAX).0, u64::MAX);
+        let slow = SlotClock::new(DeviceTicks(0), 1000, FrameRate::new(1, 1).unwrap()).unwrap();
+        assert_eq!(slow.dark_from(0, 20_000_000).0, 4000);
     }
 
     #[test]

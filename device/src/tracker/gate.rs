@@ -16,6 +16,8 @@ pub struct PacketCounters {
     pub used: u64,
     /// Not from the configured address.
     pub foreign_source: u64,
+    /// From the configured address, but from a port that the server does not send from.
+    pub foreign_port: u64,
     /// Contradicting themselves: lengths, counts, checksums, terminators.
     pub malformed: u64,
     /// Of a version or kind that this client does not speak or did not ask for.
@@ -25,7 +27,7 @@ pub struct PacketCounters {
 impl PacketCounters {
     /// Sum of all reasons for not using a packet.
     pub const fn dropped(&self) -> u64 {
-        self.foreign_source + self.malformed + self.unsupported
+        self.foreign_source + self.foreign_port + self.malformed + self.unsupported
     }
 }
 
@@ -42,6 +44,8 @@ pub struct SampleCounters {
     pub duplicate: u64,
     /// Captured before one that was already handed on.
     pub late: u64,
+    /// Of unknown age, because they came before the tracker's clock could be asked: what had waited in a serial port.
+    pub unknown_age: u64,
     /// With NaN or infinite numbers.
     pub not_finite: u64,
     /// Farther than [`SampleGate::REACH_M`] from the origin.
@@ -56,6 +60,7 @@ impl SampleCounters {
         self.unknown_body
             + self.duplicate
             + self.late
+            + self.unknown_age
             + self.not_finite
             + self.out_of_reach
             + self.bad_rotation
@@ -94,11 +99,13 @@ impl core::fmt::Display for TrackerCounters {
         let reasons = [
             ("packets received", p.received),
             ("from elsewhere", p.foreign_source),
+            ("from another port", p.foreign_port),
             ("malformed", p.malformed),
             ("unsupported", p.unsupported),
             ("unknown body", s.unknown_body),
             ("duplicate", s.duplicate),
             ("late", s.late),
+            ("of unknown age", s.unknown_age),
             ("not finite", s.not_finite),
             ("out of reach", s.out_of_reach),
             ("bad rotation", s.bad_rotation),
@@ -119,8 +126,10 @@ impl core::fmt::Display for TrackerCounters {
 #[derive(Clone, Copy)]
 struct BodyState {
     last: Option<TrackerSample>,
-    /// Samples in a row captured before `last`, and the newest of them: a clock that was set back looks like this.
+    /// Samples in a row captured before `last`, each newer than the one before: a clock that was set back looks like this.
     late_run: u32,
+    /// Capture and arrival of the first of them, and capture of the newest.
+    late_first: (HostTime, HostTime),
     late_newest: HostTime,
     /// Equal poses in a row, and whether the pose changed before them.
     equal_run: u32,
@@ -141,8 +150,9 @@ impl SampleGate {
     /// Largest gap in sequence numbers that counts as loss; a larger one counts as a restart.
     pub const MAX_GAP: u32 = 1000;
     /// Late samples in a row, each newer than the one before, that reveal a clock set back ...
-    pub const RESTART_RUN: u32 = 5;
-    /// ... when nothing else arrived for this long, nanoseconds: a burst of overtaken packets is over sooner.
+    pub const RESTART_RUN: u32 = 3;
+    /// ... when nothing else arrived for this long, nanoseconds, and they arrived at least at half of the pace at which they were
+    /// captured. A burst of overtaken packets arrives at once, whatever the tracker's rate.
     pub const RESTART_QUIET_NS: i64 = 20_000_000;
     /// Equal poses in a row that are called stuck.
     pub const STUCK_RUN: u32 = 10;
@@ -152,6 +162,7 @@ impl SampleGate {
         let fresh = BodyState {
             last: None,
             late_run: 0,
+            late_first: (HostTime(i64::MIN), HostTime(i64::MIN)),
             late_newest: HostTime(i64::MIN),
             equal_run: 0,
             was_moving: false,
@@ -173,6 +184,12 @@ impl SampleGate {
     pub fn count_unknown(&mut self) {
         self.counters.samples.received += 1;
         self.counters.samples.unknown_body += 1;
+    }
+
+    /// Counts a sample that cannot be used because nobody knows when it was captured.
+    pub fn count_unknown_age(&mut self) {
+        self.counters.samples.received += 1;
+        self.counters.samples.unknown_age += 1;
     }
 
     /// The last sample handed on for `body`.
@@ -223,9 +240,20 @@ impl SampleGate {
                     counters.samples.duplicate += 1;
                     return None;
                 }
-                state.late_run = if sample.captured_at > state.late_newest { state.late_run + 1 } else { 1 };
+                if state.late_run > 0 && sample.captured_at > state.late_newest {
+                    state.late_run = state.late_run.saturating_add(1);
+                } else {
+                    (state.late_run, state.late_first) = (1, (sample.captured_at, sample.received_at));
+                }
                 state.late_newest = sample.captured_at;
                 let quiet_ns = sample.received_at.ns_since(last.received_at);
+                let captured_ns = sample.captured_at.ns_since(state.late_first.0);
+                let arrived_ns = sample.received_at.ns_since(state.late_first.1);
+                let is_burst = arrived_ns < captured_ns / 2;
+                if state.late_run >= Self::RESTART_RUN && is_burst {
+                    // Look for the pace anew from here: what follows a burst must not be measured against its beginning.
+                    (state.late_run, state.late_first) = (1, (sample.captured_at, sample.received_at));
+                }
                 if state.late_run < Self::RESTART_RUN || quiet_ns < Self::RESTART_QUIET_NS {
                     counters.samples.late += 1;
                     return None;
@@ -411,6 +439,37 @@ mod tests {
         assert!(first.unwrap() <= 50, "{first:?} ms");
         assert_eq!(gate.counters().restarts, 1);
         assert!(gate.counters().is_conserved());
+    }
+
+    /// The matrix of tracker rates: neither what overtaken samples look like nor what a clock set back looks like depends on the rate.
+    #[test]
+    fn a_burst_and_a_clock_set_back_are_told_apart_at_every_rate() {
+        for hz in [30, 60, 120, 500, 1000] {
+            let period = 1_000_000_000 / hz;
+            let at = |k: i64| TrackerSample {
+                captured_at: HostTime(k * period),
+                received_at: HostTime(k * period + 1_000_000),
+                ..sample(k)
+            };
+            let mut gate = SampleGate::new(1);
+            feed(&mut gate, (1000..1010).map(at));
+            // Nothing for a second, which is quiet enough, then 40 overtaken samples at once.
+            let arrival = HostTime(at(1010).received_at.0 + 1_000_000_000);
+            let burst = (900..940).map(|k| TrackerSample { received_at: arrival, ..at(k) });
+            assert_eq!(feed(&mut gate, burst), [] as [u32; 0], "{hz} Hz");
+            assert_eq!((gate.counters().restarts, gate.counters().samples.late), (0, 40), "{hz} Hz");
+            // The clock leaps back one second while samples go on arriving at their pace.
+            let back = |k: i64| TrackerSample {
+                captured_at: HostTime(at(k).captured_at.0 - 1_000_000_000),
+                received_at: HostTime(arrival.0 + (k - 1010) * period),
+                ..at(k)
+            };
+            let followed = (1011..1200).find(|k| gate.admit(&back(*k)).is_some()).expect("followed");
+            let took_ns = back(followed).received_at.ns_since(arrival);
+            assert!(took_ns <= (4 * period).max(30_000_000), "{hz} Hz: {took_ns} ns");
+            assert_eq!(gate.counters().restarts, 1, "{hz} Hz");
+            assert!(gate.counters().is_conserved());
+        }
     }
 
     #[test]

@@ -75,4 +75,27 @@ pub trait Tracker: Send {
     fn status(&self) -> String {
         String::new()
     }
+
+    /// What the operator must know although poses come, such as data that somebody else sends; `None` where there is nothing.
+    fn warning(&self) -> Option<String> {
+        None
+    }
+}
+
+impl<T: Tracker + ?Sized> Tracker for Box<T> {
+    fn poll(&mut self, now: HostTime, sink: &mut dyn FnMut(&TrackerSample)) -> Result<usize, TrackerError> {
+        (**self).poll(now, sink)
+    }
+
+    fn name(&self) -> &str {
+        (**self).name()
+    }
+
+    fn status(&self) -> String {
+        (**self).status()
+    }
+
+    fn warning(&self) -> Option<String> {
+        (**self).warning()
+    }
 }

@@ -118,6 +118,12 @@ impl<T: Tracker> Recorder<T> {
         self.unrecorded
     }
 
+    /// True when the file could not be written on, for want of space for example; [`Recorder::finish`] has the reason. What was
+    /// written before can be played.
+    pub fn has_failed(&self) -> bool {
+        self.shared.failed.load(Ordering::Relaxed)
+    }
+
     /// The tracker recorded.
     pub fn inner(&self) -> &T {
         &self.inner
@@ -162,6 +168,10 @@ impl<T: Tracker> Tracker for Recorder<T> {
 
     fn name(&self) -> &str {
         self.inner.name()
+    }
+
+    fn warning(&self) -> Option<String> {
+        self.inner.warning()
     }
 
     fn status(&self) -> String {
@@ -304,8 +314,7 @@ impl Recording {
     /// Reads `path` up to its end or to the first frame that is not whole.
     pub fn read(path: &Path) -> Result<Self, RecordError> {
         let failed = |source| RecordError::Io { path: path.to_owned(), source };
-        let file = File::open(path).map_err(failed)?;
-        let size = file.metadata().map_err(failed)?.len();
+        let (file, size) = crate::regular_file::open(path).map_err(failed)?;
         Self::read_from(&mut std::io::BufReader::with_capacity(1 << 16, file), size, path)
     }
 

@@ -101,19 +101,35 @@ impl UdpPort {
         }
     }
 
-    /// Lets the kernel drop, before they are queued, all datagrams that are not from `source`.
-    pub fn keep_only(&self, source: Ipv4Addr) -> io::Result<()> {
-        // Classic BPF. SKF_NET_OFF (-0x100000) addresses the IP header; the source address is its word at 12.
+    /// Lets the kernel drop, before they are queued, all datagrams that are not from `source`; where `ports` holds any, also those
+    /// that are from none of these ports. A later call replaces the filter of an earlier one.
+    pub fn keep_only(&self, source: Ipv4Addr, ports: &[u16]) -> io::Result<()> {
+        // Classic BPF. SKF_NET_OFF (-0x100000) addresses the IP header; the source address is its word at 12. Without an offset, a
+        // filter of a UDP socket reads from the UDP header on, whose first half-word is the source port.
         const NET_HEADER: u32 = (-0x10_0000i32) as u32;
         let op = |code, jt, jf, k| libc::sock_filter { code, jt, jf, k };
-        let mut program = [
+        let is = (libc::BPF_JMP | libc::BPF_JEQ | libc::BPF_K) as u16;
+        let end = (libc::BPF_RET | libc::BPF_K) as u16;
+        let mut program = vec![
             op((libc::BPF_LD | libc::BPF_W | libc::BPF_ABS) as u16, 0, 0, NET_HEADER + 12),
-            op((libc::BPF_JMP | libc::BPF_JEQ | libc::BPF_K) as u16, 0, 1, u32::from(source)),
-            op((libc::BPF_RET | libc::BPF_K) as u16, 0, 0, u32::MAX),
-            op((libc::BPF_RET | libc::BPF_K) as u16, 0, 0, 0),
+            op(is, 1, 0, u32::from(source)),
+            op(end, 0, 0, 0),
         ];
+        if !ports.is_empty() {
+            program.push(op((libc::BPF_LD | libc::BPF_H | libc::BPF_ABS) as u16, 0, 0, 0));
+            for port in ports {
+                program.extend([op(is, 0, 1, u32::from(*port)), op(end, 0, 0, u32::MAX)]);
+            }
+            program.push(op(end, 0, 0, 0));
+        }
+        program.push(op(end, 0, 0, u32::MAX));
         let filter = libc::sock_fprog { len: program.len() as u16, filter: program.as_mut_ptr() };
         self.set(libc::SOL_SOCKET, libc::SO_ATTACH_FILTER, &filter)
+    }
+
+    /// Takes the filter of [`UdpPort::keep_only`] away again.
+    pub fn keep_all(&self) -> io::Result<()> {
+        self.set(libc::SOL_SOCKET, libc::SO_DETACH_FILTER, &0i32)
     }
 
     /// The next datagram waiting, `None` when there is none. Never waits.

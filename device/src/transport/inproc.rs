@@ -52,9 +52,13 @@ impl<D: LinkDevice> Transport for Direct<D> {
         Ok(())
     }
 
-    fn receive(&mut self, now: HostTime, sink: &mut dyn FnMut(Lane, &[u8])) -> Result<(), TransportError> {
+    fn receive(
+        &mut self,
+        now: HostTime,
+        sink: &mut dyn FnMut(Lane, HostTime, &[u8]),
+    ) -> Result<(), TransportError> {
         self.device.advance_to(now);
-        self.device.replies(now, sink);
+        self.device.replies(now, &mut |lane, bytes| sink(lane, now, bytes));
         Ok(())
     }
 
@@ -71,6 +75,8 @@ const SMALL_DEPTH: usize = 64;
 #[derive(Clone, Copy)]
 struct Small {
     lane: Lane,
+    /// When it was put in.
+    at: HostTime,
     len: u8,
     bytes: [u8; SMALL_BYTES],
 }
@@ -155,7 +161,7 @@ impl HostEnd {
 }
 
 impl Transport for HostEnd {
-    fn send(&mut self, _now: HostTime, lane: Lane, packets: &[Packet<'_>]) -> Result<(), SendError> {
+    fn send(&mut self, now: HostTime, lane: Lane, packets: &[Packet<'_>]) -> Result<(), SendError> {
         self.gone()?;
         let bytes: usize = packets.iter().map(Packet::wire_bytes).sum();
         match lane {
@@ -164,7 +170,7 @@ impl Transport for HostEnd {
                     bytes <= SMALL_BYTES,
                     "{bytes} bytes of control message, at most {SMALL_BYTES} travel"
                 );
-                let mut small = Small { lane, len: bytes as u8, bytes: [0; SMALL_BYTES] };
+                let mut small = Small { lane, at: now, len: bytes as u8, bytes: [0; SMALL_BYTES] };
                 gather(&mut small.bytes, packets);
                 self.control.push(small).map_err(|_| SendError::Busy)?;
             }
@@ -192,11 +198,15 @@ impl Transport for HostEnd {
         }
     }
 
-    fn receive(&mut self, _now: HostTime, sink: &mut dyn FnMut(Lane, &[u8])) -> Result<(), TransportError> {
+    fn receive(
+        &mut self,
+        _now: HostTime,
+        sink: &mut dyn FnMut(Lane, HostTime, &[u8]),
+    ) -> Result<(), TransportError> {
         // As many as the ring holds: a device that talks without end cannot keep this call from returning.
         for _ in 0..SMALL_DEPTH {
             let Some(small) = self.replies.pop() else { break };
-            sink(small.lane, &small.bytes[..small.len as usize]);
+            sink(small.lane, small.at, &small.bytes[..small.len as usize]);
         }
         self.gone()
     }
@@ -214,28 +224,37 @@ impl Drop for HostEnd {
 }
 
 impl DeviceEnd {
-    /// Delivers what has arrived to `device`, control first, lets it live up to `now`, and takes its replies. Returns `false`
-    /// when the host's end is gone. Replies that find no room are lost, as on a cable nobody reads.
-    pub fn serve(&mut self, now: HostTime, device: &mut dyn LinkDevice) -> bool {
+    /// Delivers what has arrived to `device`, control first, lets it live up to now, and takes its replies. Returns `false` when the
+    /// host's end is gone. Replies that find no room are lost, as on a cable nobody reads.
+    ///
+    /// `clock` is the host's clock. A control message arrives when the host puts it in, however late this is called: the device gets
+    /// that instant, as one gets it from hardware that stamps. A frame arrives when it is taken in, and a reply, which carries a stamp
+    /// of its own, when it is put out; an ECHO is answered before the frame beside it is taken in.
+    pub fn serve(&mut self, clock: impl Fn() -> HostTime, device: &mut dyn LinkDevice) -> bool {
         for _ in 0..SMALL_DEPTH {
             let Some(small) = self.control.pop() else { break };
-            device.receive(now, small.lane, &small.bytes[..small.len as usize]);
+            device.receive(small.at, small.lane, &small.bytes[..small.len as usize]);
         }
+        self.answer(&clock, device);
         if let Some(large) = self.frames.receive() {
-            device.receive(now, Lane::Data, &large.bytes[..large.len]);
+            device.receive(clock(), Lane::Data, &large.bytes[..large.len]);
             let returned = self.frames.give_back(large);
             debug_assert!(returned.is_ok(), "as many places as buffers");
+            self.answer(&clock, device);
         }
-        device.advance_to(now);
+        !self.unplugged.load(Ordering::Acquire)
+    }
+
+    /// Takes what the device has to say.
+    fn answer(&mut self, clock: &impl Fn() -> HostTime, device: &mut dyn LinkDevice) {
         let replies = &mut self.replies;
-        device.replies(now, &mut |lane, bytes| {
+        device.replies(clock(), &mut |lane, bytes| {
             if bytes.len() <= SMALL_BYTES {
-                let mut small = Small { lane, len: bytes.len() as u8, bytes: [0; SMALL_BYTES] };
+                let mut small = Small { lane, at: clock(), len: bytes.len() as u8, bytes: [0; SMALL_BYTES] };
                 small.bytes[..bytes.len()].copy_from_slice(bytes);
                 let _ = replies.push(small);
             }
         });
-        !self.unplugged.load(Ordering::Acquire)
     }
 
     /// Rests until something arrives, the host's end goes, or the clock `now` reaches `until` (the device's next own event); returns

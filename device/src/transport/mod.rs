@@ -1,13 +1,17 @@
 //! Packets into bytes on a medium and back: what the link needs from USB, a serial port, or a device in the same process.
 
 pub mod inproc;
+#[cfg(any(feature = "serial", feature = "usb"))]
+mod priority;
 #[cfg(feature = "serial")]
 pub mod serial;
 #[cfg(feature = "usb")]
 pub mod usb;
 
+use std::sync::Arc;
+
 use crate::link::Packet;
-use crate::time::HostTime;
+use crate::time::{HostClock, HostTime};
 
 /// The two independent streams of a link. Control never waits behind data.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Hash)]
@@ -119,8 +123,23 @@ pub trait Transport: Send {
         true
     }
 
-    /// Hands bytes that have arrived to `sink`, in order within a lane, without waiting for more.
-    fn receive(&mut self, now: HostTime, sink: &mut dyn FnMut(Lane, &[u8])) -> Result<(), TransportError>;
+    /// Gives the medium the clock that all `now` of its calls are read from, so that it can stamp what arrives while nobody polls. A
+    /// medium without a clock stamps with the `now` of the poll. A medium that needs no clock ignores it; a second clock is ignored.
+    fn set_clock(&mut self, clock: Arc<dyn HostClock>) {
+        let _ = clock;
+    }
+
+    /// Throws away what waits and has not been carried, on both lanes, so that what is sent next on the control lane goes out first:
+    /// for an order to be dark. A frame that was under way is lost.
+    fn flush_output(&mut self) {}
+
+    /// Hands bytes that have arrived to `sink`, in order within a lane, without waiting for more. With the bytes comes the instant of
+    /// their arrival, which may lie long before the poll, or a little after `now`.
+    fn receive(
+        &mut self,
+        now: HostTime,
+        sink: &mut dyn FnMut(Lane, HostTime, &[u8]),
+    ) -> Result<(), TransportError>;
 
     /// Gets the medium back after it was lost. May take some milliseconds, unlike all else here: the rig is dark anyway.
     ///
@@ -141,7 +160,17 @@ impl<T: Transport + ?Sized> Transport for &mut T {
     fn has_room(&mut self, lane: Lane) -> bool {
         (**self).has_room(lane)
     }
-    fn receive(&mut self, now: HostTime, sink: &mut dyn FnMut(Lane, &[u8])) -> Result<(), TransportError> {
+    fn set_clock(&mut self, clock: Arc<dyn HostClock>) {
+        (**self).set_clock(clock);
+    }
+    fn flush_output(&mut self) {
+        (**self).flush_output();
+    }
+    fn receive(
+        &mut self,
+        now: HostTime,
+        sink: &mut dyn FnMut(Lane, HostTime, &[u8]),
+    ) -> Result<(), TransportError> {
         (**self).receive(now, sink)
     }
     fn reopen(&mut self) -> Result<(), TransportError> {
@@ -164,6 +193,6 @@ pub trait LinkDevice: Send {
     /// Lets the device live up to `now`: light, watchdog.
     fn advance_to(&mut self, now: HostTime);
 
-    /// Takes everything the device has to say, as whole packets.
+    /// Lets the device live up to `now` and takes everything it has to say, as whole packets.
     fn replies(&mut self, now: HostTime, sink: &mut dyn FnMut(Lane, &[u8]));
 }

@@ -1,24 +1,33 @@
 //! Packets into COBS frames on a serial line: for control, slow panels and trigger boards.
 //!
 //! One stream carries both lanes, a packet a frame. Control messages overtake planes that still wait, so they are late by at most
-//! one packet and what the driver has buffered. Nothing waits: bytes that the line does not take now are kept, and while a frame
-//! is kept no other is taken.
+//! one packet and what the driver has buffered, which is kept short. Nothing waits: bytes that the line does not take now are kept,
+//! and while a frame is kept no other is taken. An order to be dark cuts the packet that is under way and goes first.
+
+mod reader;
 
 use std::io::{ErrorKind, Read, Write};
+use std::sync::{Arc, OnceLock};
 
-use serialport::SerialPort;
+use serialport::{ClearBuffer, SerialPort};
 
 use super::{Lane, SendError, Transport, TransportError};
 use crate::cobs::{encode, encoded_bytes, Deframer};
 use crate::link::{packet_bytes, Packet, MAX_CONTROL_BYTES};
 use crate::planes::MAX_PLANES;
-use crate::time::HostTime;
+use crate::time::{HostClock, HostTime};
 use crate::tty::{self, Refusal};
+use reader::{Reader, SharedClock};
 
 /// Bytes of control messages that may wait.
 const CONTROL_WAITING: usize = 4096;
 /// Bytes read in one call at most: bounds the time of `receive`.
 const READ_AT_ONCE: usize = 16 * 1024;
+/// Parts of a second for which the kernel may have planes to send: not every driver can take back what it was given, and what it
+/// has is before an order to be dark.
+const AHEAD_PER_S: u32 = 50;
+/// Bits of a byte on the line: start, eight, stop.
+const BITS_PER_BYTE: u32 = 10;
 
 /// Which port, and how it is used.
 #[derive(Clone, Debug)]
@@ -46,6 +55,9 @@ pub struct SerialCounters {
 pub struct SerialTransport {
     settings: SerialSettings,
     port: Option<Box<dyn SerialPort>>,
+    /// Reads the port; without it the port is read where it is polled, and what arrives is stamped late.
+    reader: Option<Reader>,
+    clock: SharedClock,
     deframer: Deframer<[u8; DEFRAMED]>,
     /// Encoded packets of the frame that is going out, and where each ends.
     data: Vec<u8>,
@@ -74,6 +86,7 @@ impl SerialTransport {
     /// On a port that is open already (a pseudo-terminal) and never waits, see [`tty::never_wait`].
     pub fn with_port(settings: SerialSettings, port: Box<dyn SerialPort>) -> Self {
         let mut serial = Self::closed(settings);
+        serial.reader = Reader::start(&*port, serial.clock.clone());
         serial.port = Some(port);
         serial
     }
@@ -83,6 +96,8 @@ impl SerialTransport {
         Self {
             settings,
             port: None,
+            reader: None,
+            clock: Arc::new(OnceLock::new()),
             deframer: Deframer::new([0; DEFRAMED]),
             data: vec![0; room],
             ends: [0; MAX_PLANES + 1],
@@ -114,7 +129,7 @@ impl SerialTransport {
     }
 
     fn gone(&mut self) -> TransportError {
-        self.port = None;
+        (self.port, self.reader) = (None, None);
         TransportError::Unplugged { device: self.settings.path.clone() }
     }
 
@@ -135,7 +150,15 @@ impl SerialTransport {
             let Some(port) = &mut self.port else { return Err(self.gone()) };
             let bytes = match lane {
                 Lane::Control => &self.control[at..end],
-                Lane::Data => &self.data[at..end],
+                Lane::Data => {
+                    let ahead = (self.settings.baud / BITS_PER_BYTE / AHEAD_PER_S).max(1) as usize;
+                    // A driver that does not say what it holds takes what it will.
+                    let room = ahead.saturating_sub(port.bytes_to_write().unwrap_or(0) as usize);
+                    if room == 0 {
+                        return Ok(());
+                    }
+                    &self.data[at..end.min(at + room)]
+                }
             };
             match port.write(bytes) {
                 Ok(0) => return Ok(()),
@@ -214,8 +237,21 @@ impl Transport for SerialTransport {
         }
     }
 
-    fn receive(&mut self, _now: HostTime, sink: &mut dyn FnMut(Lane, &[u8])) -> Result<(), TransportError> {
+    fn receive(
+        &mut self,
+        now: HostTime,
+        sink: &mut dyn FnMut(Lane, HostTime, &[u8]),
+    ) -> Result<(), TransportError> {
         self.flush()?;
+        if let Some(reader) = &mut self.reader {
+            let deframer = &mut self.deframer;
+            let taken = reader.take(now, &mut |at, bytes| {
+                deframer.push(bytes, &mut |frame| sink(Lane::Control, at, frame));
+            });
+            let Some(bytes) = taken else { return Err(self.gone()) };
+            self.counters.bytes_in += bytes as u64;
+            return Ok(());
+        }
         let mut bytes = [0u8; 2048];
         let mut left = READ_AT_ONCE;
         while left > 0 {
@@ -226,7 +262,7 @@ impl Transport for SerialTransport {
                 Ok(n) => {
                     self.counters.bytes_in += n as u64;
                     left = left.saturating_sub(n);
-                    self.deframer.push(&bytes[..n], &mut |frame| sink(Lane::Control, frame));
+                    self.deframer.push(&bytes[..n], &mut |frame| sink(Lane::Control, now, frame));
                 }
                 Err(e) => match e.kind() {
                     ErrorKind::WouldBlock | ErrorKind::TimedOut | ErrorKind::Interrupted => break,
@@ -237,10 +273,29 @@ impl Transport for SerialTransport {
         Ok(())
     }
 
+    fn set_clock(&mut self, clock: Arc<dyn HostClock>) {
+        // A second clock would make the stamps before it worthless.
+        let _ = self.clock.set(clock);
+    }
+
+    fn flush_output(&mut self) {
+        (self.packets, self.next_packet, self.going) = (0, 0, None);
+        self.control.clear();
+        if let Some(port) = &self.port {
+            // Where the driver cannot, what it holds is short.
+            let _ = port.clear(ClearBuffer::Output);
+        }
+        // Ends what the device has of a packet, wherever it was cut.
+        self.control.push(0);
+    }
+
     fn reopen(&mut self) -> Result<(), TransportError> {
-        self.port = None;
+        // The reader's handle, too, would keep the port from being opened again.
+        (self.port, self.reader) = (None, None);
         let path = &self.settings.path;
-        self.port = Some(tty::open(path, self.settings.baud).map_err(|e| open_error(path, e))?);
+        let port = tty::open(path, self.settings.baud).map_err(|e| open_error(path, e))?;
+        self.reader = Reader::start(&*port, self.clock.clone());
+        self.port = Some(port);
         self.deframer.reset();
         self.control.clear();
         (self.packets, self.next_packet, self.going) = (0, 0, None);

@@ -1,21 +1,24 @@
 //! Packets into queued USB bulk transfers: several frames in flight, one transfer a frame, nothing ever waits.
 //!
-//! Everything happens on the thread that calls: `send` and `receive` submit, and let libusb deliver what has completed. When an
-//! endpoint fails its transfers are taken back, then its halt is cleared, then the newest frame alone is sent again from its start;
+//! `send` and `receive` submit, and take what has completed; a thread of its own lets libusb deliver it, so that replies are stamped
+//! when they arrive. An order to be dark goes past everything else: the control lane is an endpoint of its own, and one of its transfers
+//! is kept for such an order. When an endpoint fails its transfers are taken back, then its halt is cleared, then the newest frame alone is sent again from its start;
 //! an endpoint that fails three times within a second costs the device a reset.
 
+mod events;
 mod open;
 mod ring;
 
-use std::sync::Arc;
+use std::sync::{Arc, OnceLock};
 
 use rusb::{Context, DeviceHandle};
 
 use super::{Lane, SendError, Transport, TransportError};
 use crate::link::Packet;
-use crate::time::HostTime;
+use crate::time::{HostClock, HostTime};
+use events::Events;
 pub use open::{memory_limit_mb, UsbSettings, UDEV_RULE};
-use ring::{pump, Ring, Status};
+use ring::{pump, Ring, SharedClock, Status};
 
 /// Vendor number of the reference device: the test numbers of pid.codes, free for anybody, never to be sold.
 pub const VENDOR_ID: u16 = 0x1209;
@@ -73,6 +76,8 @@ pub struct UsbCounters {
 struct Outgoing {
     ring: Ring,
     endpoint: u8,
+    /// Transfers that only an order to be dark may use.
+    kept_free: usize,
     /// Length of what each slot carries, for sending it again.
     lengths: Vec<usize>,
     /// Slot submitted last.
@@ -92,9 +97,12 @@ impl Outgoing {
         endpoint: u8,
         count: usize,
         bytes: usize,
+        kept_free: usize,
+        clock: &SharedClock,
     ) -> Result<Self, rusb::Error> {
         Ok(Self {
-            ring: Ring::new(handle.clone(), endpoint, count, bytes)?,
+            ring: Ring::new(handle.clone(), endpoint, count, bytes, clock)?,
+            kept_free,
             endpoint,
             lengths: vec![0; count],
             newest: None,
@@ -105,11 +113,12 @@ impl Outgoing {
     }
 
     fn has_room(&self) -> bool {
-        !self.recovering && self.ring.idle_slot().is_some()
+        !self.recovering && self.ring.idle_slots() > self.kept_free
     }
 
-    fn send(&mut self, now: HostTime, packets: &[Packet<'_>]) -> Result<(), rusb::Error> {
-        let slot = self.ring.idle_slot().filter(|_| !self.recovering).ok_or(rusb::Error::Busy)?;
+    fn send(&mut self, now: HostTime, packets: &[Packet<'_>], urgent: bool) -> Result<(), rusb::Error> {
+        let may = !self.recovering && (urgent || self.has_room());
+        let slot = self.ring.idle_slot().filter(|_| may).ok_or(rusb::Error::Busy)?;
         let buffer = self.ring.buffer(slot);
         let bytes: usize = packets.iter().map(Packet::wire_bytes).sum();
         assert!(
@@ -165,6 +174,11 @@ pub struct UsbTransport {
     name: String,
     counters: UsbCounters,
     reset_due: bool,
+    /// The next control message is an order to be dark.
+    urgent: bool,
+    clock: SharedClock,
+    /// Lets libusb deliver; without it that is done where the link is polled.
+    events: Option<Events>,
 }
 
 impl std::fmt::Debug for UsbTransport {
@@ -182,9 +196,13 @@ impl UsbTransport {
     pub fn open(settings: UsbSettings) -> Result<Self, TransportError> {
         let name = settings.describe();
         let context = open::context(&name)?;
+        let events = Events::start(&context);
         let mut transport = Self {
             settings,
             context,
+            urgent: false,
+            clock: Arc::new(OnceLock::new()),
+            events,
             device: None,
             name,
             counters: UsbCounters::default(),
@@ -228,8 +246,13 @@ impl UsbTransport {
         if self.device.is_none() {
             return Err(TransportError::Unplugged { device: self.name.clone() });
         }
-        if let Err(rusb::Error::NoDevice) = pump(&self.context) {
-            return Err(self.gone());
+        match &mut self.events {
+            Some(events) => events.follow(now),
+            None => {
+                if let Err(rusb::Error::NoDevice) = pump(&self.context) {
+                    return Err(self.gone());
+                }
+            }
         }
         let Some(device) = &mut self.device else { return Ok(()) };
         let stuck_after = self.settings.stuck_after_ns;
@@ -336,14 +359,19 @@ impl UsbTransport {
     }
 
     /// Hands replies on, oldest first, and asks for more.
-    fn replies(&mut self, sink: &mut dyn FnMut(Lane, &[u8])) -> Result<(), TransportError> {
+    fn replies(
+        &mut self,
+        now: HostTime,
+        sink: &mut dyn FnMut(Lane, HostTime, &[u8]),
+    ) -> Result<(), TransportError> {
         let Some(device) = &mut self.device else { return Ok(()) };
         let mut gone = false;
         // At most one round: a device that talks without end cannot keep this call from returning.
         for _ in 0..REPLY_DEPTH {
             let Some(ended) = device.replies.take_ended() else { break };
             if ended.actual > 0 {
-                sink(Lane::Control, &device.replies.buffer(ended.slot)[..ended.actual]);
+                let at = ended.at.unwrap_or(now);
+                sink(Lane::Control, at, &device.replies.buffer(ended.slot)[..ended.actual]);
             }
             match ended.status {
                 Status::NoDevice => gone = true,
@@ -387,7 +415,8 @@ impl Transport for UsbTransport {
         if self.reset_due {
             return Err(SendError::Busy);
         }
-        match out.send(now, packets) {
+        let urgent = lane == Lane::Control && std::mem::take(&mut self.urgent);
+        match out.send(now, packets, urgent) {
             Ok(()) => {
                 self.counters.frames_taken += u64::from(lane == Lane::Data);
                 Ok(())
@@ -410,9 +439,23 @@ impl Transport for UsbTransport {
             })
     }
 
-    fn receive(&mut self, now: HostTime, sink: &mut dyn FnMut(Lane, &[u8])) -> Result<(), TransportError> {
+    fn receive(
+        &mut self,
+        now: HostTime,
+        sink: &mut dyn FnMut(Lane, HostTime, &[u8]),
+    ) -> Result<(), TransportError> {
         self.service(now)?;
-        self.replies(sink)
+        self.replies(now, sink)
+    }
+
+    fn set_clock(&mut self, clock: Arc<dyn HostClock>) {
+        // A second clock would make the stamps before it worthless.
+        let _ = self.clock.set(clock);
+    }
+
+    fn flush_output(&mut self) {
+        // Frames under way are passed by; no transfer of the control lane waits for them.
+        self.urgent = true;
     }
 
     fn reopen(&mut self) -> Result<(), TransportError> {
@@ -424,9 +467,12 @@ impl Transport for UsbTransport {
         let failed = |e| TransportError::of_usb("allocate transfers of", self.name.clone(), e);
         let depth = self.settings.depth_within_limit();
         let mut device = Open {
-            data: Outgoing::new(&handle, DATA_OUT, depth, self.settings.frame_bytes).map_err(failed)?,
-            control: Outgoing::new(&handle, CONTROL_OUT, CONTROL_DEPTH, CONTROL_BYTES).map_err(failed)?,
-            replies: Ring::new(handle.clone(), REPLIES_IN, REPLY_DEPTH, REPLY_BYTES).map_err(failed)?,
+            data: Outgoing::new(&handle, DATA_OUT, depth, self.settings.frame_bytes, 0, &self.clock)
+                .map_err(failed)?,
+            control: Outgoing::new(&handle, CONTROL_OUT, CONTROL_DEPTH, CONTROL_BYTES, 1, &self.clock)
+                .map_err(failed)?,
+            replies: Ring::new(handle.clone(), REPLIES_IN, REPLY_DEPTH, REPLY_BYTES, &self.clock)
+                .map_err(failed)?,
             replies_recovering: false,
             handle,
         };

@@ -4,7 +4,7 @@ use std::sync::{Arc, Mutex, PoisonError};
 use std::time::Duration;
 
 use dpm_device::dlpc900::command::REPORT_BYTES;
-use dpm_device::dlpc900::driver::{HidPort, PortError};
+use dpm_device::dlpc900::driver::{HidPort, PortError, SecondLine};
 use dpm_device::time::HostTime;
 
 use super::Dlpc900Model;
@@ -22,7 +22,12 @@ pub struct VirtualHid {
 impl VirtualHid {
     /// A cable that starts at instant 0.
     pub fn new(model: Arc<Mutex<Dlpc900Model>>) -> Self {
-        Self { model, now: HostTime(0) }
+        Self::starting_at(model, HostTime(0))
+    }
+
+    /// A cable that is plugged in at instant `now`, for a controller that has been in use before.
+    pub fn starting_at(model: Arc<Mutex<Dlpc900Model>>, now: HostTime) -> Self {
+        Self { model, now }
     }
 
     /// The virtual instant reached.
@@ -59,5 +64,15 @@ impl HidPort for VirtualHid {
 
     fn pause(&mut self, time: Duration) {
         self.now = self.now.plus_ns(time.as_nanos() as i64);
+    }
+
+    fn second_line(&self) -> Option<Box<dyn SecondLine>> {
+        Some(Box::new(self.clone()))
+    }
+}
+
+impl SecondLine for VirtualHid {
+    fn write_report(&mut self, report: &[u8; REPORT_BYTES], timeout: Duration) -> Result<(), PortError> {
+        HidPort::write_report(self, report, timeout)
     }
 }

@@ -1,6 +1,6 @@
 //! What kind of projector the mock is, and what it tells about its light.
 
-use dpm_device::link::{Codec, MAX_FLASHES_PER_S, VERSION};
+use dpm_device::link::{Codec, DeviceState, LightLimits, MAX_FLASHES_PER_S, VERSION};
 use dpm_device::planes::Raster;
 use dpm_device::time::{DeviceTicks, HostTime};
 
@@ -31,6 +31,8 @@ pub struct MockConfig {
     pub version: u16,
     /// Flashes of the whole field a second above which it goes dark and latches; `None` switches the limiter off.
     pub flash_limit: Option<u8>,
+    /// How much light it makes at most, whatever the host asks for.
+    pub limits: LightLimits,
     /// Light events kept for [`super::MockProjector::next_light`]; when full the oldest go and are counted.
     pub events_kept: usize,
 }
@@ -51,6 +53,7 @@ impl MockConfig {
             firmware: 0x0100,
             version: u16::from(VERSION),
             flash_limit: Some(MAX_FLASHES_PER_S),
+            limits: LightLimits::OFF,
             events_kept: 4096,
         }
     }
@@ -65,6 +68,20 @@ pub enum LightKind {
     Repeated,
     /// Nothing.
     Blank,
+}
+
+/// Light went on or off, or the state of the projector changed.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct LightChange {
+    /// True time of the first photon, of the beginning of darkness, or of the change of state: exact, however late the model was
+    /// called.
+    pub at: HostTime,
+    /// The frame that is lit from here on (low 32 bits of its number); `None` when it is dark.
+    pub frame: Option<u32>,
+    /// State of the projector from here on.
+    pub state: DeviceState,
+    /// Faults that are latched from here on.
+    pub faults: u32,
 }
 
 /// One slot of an armed projector.

@@ -20,13 +20,15 @@ pub(super) struct Assembling {
 pub(super) struct Pending {
     pub frame: u32,
     pub slot: u64,
+    pub dark_from: DeviceTicks,
     pub buffer: usize,
 }
 
-/// A frame and where its planes are.
+/// A frame, where its planes are, and when its light ends by itself.
 #[derive(Clone, Copy, Debug)]
 pub(super) struct Held {
     pub frame: u32,
+    pub dark_from: DeviceTicks,
     pub buffer: usize,
 }
 

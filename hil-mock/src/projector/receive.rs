@@ -66,6 +66,8 @@ impl PacketSink for LaneSink<'_> {
         match std::mem::take(&mut self.core.incoming[self.lane as usize]) {
             Incoming::Control(assembly) if intact => self.core.control(&assembly),
             Incoming::Plane { plane, frame, buffer, form } if intact => {
+                // Only now: a header in front of damaged bits is no word of a host.
+                self.core.last_heard = self.core.ticks();
                 self.core.plane_arrived(plane, frame, buffer, &form);
             }
             _ => {}
@@ -94,8 +96,17 @@ impl Core {
         Incoming::Nothing
     }
 
-    /// True when a packet of `session` is of the open one; otherwise counts it, and lets the host know when there is none.
+    /// True when an intact packet of `session` is of the open one, which feeds the watchdog; else as [`Core::is_ours`].
     fn heard(&mut self, session: u32) -> bool {
+        let ours = self.is_ours(session);
+        if ours {
+            self.last_heard = self.ticks();
+        }
+        ours
+    }
+
+    /// True when `session` is the open one; otherwise counts the packet, and lets the host know when there is none.
+    fn is_ours(&mut self, session: u32) -> bool {
         if self.session == 0 {
             self.status_due = true;
         }
@@ -103,12 +114,11 @@ impl Core {
             self.ignore();
             return false;
         }
-        self.last_heard = self.ticks();
         true
     }
 
     fn begin_plane(&mut self, header: &Header) -> Incoming {
-        if !self.heard(header.session) {
+        if !self.is_ours(header.session) {
             return Incoming::Nothing;
         }
         let Some((config, _)) = self.config else { return self.ignore() };
@@ -258,8 +268,8 @@ impl Core {
                 if session == 0 {
                     self.ignore();
                 } else if !(hello.version_min..=hello.version_max).contains(&version) {
-                    self.report(FaultCode::Version, version);
                     self.hello_due = Some(session);
+                    self.version_refused_due = Some(session);
                 } else {
                     if session != self.session {
                         self.open_session(session);
@@ -315,7 +325,8 @@ impl Core {
     }
 
     fn commit(&mut self, header: &Header, commit: &Commit) {
-        if self.config.is_none() || !self.enter_frame(header) {
+        // A frame whose light would end before it begins has a wrong field, and like every such message no effect.
+        if self.config.is_none() || !commit.ends_after(header.target_at) || !self.enter_frame(header) {
             self.ignore();
             return;
         }
@@ -333,8 +344,8 @@ impl Core {
         }
         self.status.last_whole_frame = frame.frame;
         self.whole_since = true;
-        self.store.base = Some(Held { frame: frame.frame, buffer });
-        self.schedule(&frame, buffer);
+        self.store.base = Some(Held { frame: frame.frame, dark_from: commit.dark_from, buffer });
+        self.schedule(&frame, commit.dark_from, buffer);
     }
 
     /// True when every plane of the frame is in `buffer`, those that did not change copied from the base frame.
@@ -356,7 +367,7 @@ impl Core {
     }
 
     /// A whole frame gets its slot, or is too late or too early.
-    fn schedule(&mut self, frame: &Assembling, buffer: usize) {
+    fn schedule(&mut self, frame: &Assembling, dark_from: DeviceTicks, buffer: usize) {
         let Some((config, slots)) = self.config else { return };
         let lead = u64::from(self.setup.clock.tick_hz).saturating_mul(MAX_LEAD_S);
         if frame.target_at > DeviceTicks(self.ticks().0.saturating_add(lead)) {
@@ -364,10 +375,10 @@ impl Core {
         }
         let target = slots.slot_at(frame.target_at).unwrap_or(0);
         let late = self.next_slot.saturating_sub(target);
-        if late > u64::from(config.late_slots) {
+        if late > u64::from(config.late_slots) || dark_from <= self.ticks() {
             self.status.frames_late = self.status.frames_late.wrapping_add(1);
             return;
         }
-        self.store.push(Pending { frame: frame.frame, slot: target, buffer });
+        self.store.push(Pending { frame: frame.frame, slot: target, dark_from, buffer });
     }
 }

@@ -9,7 +9,7 @@ use dpm_device::transport::{Lane, LinkDevice};
 
 use super::MockProjector;
 
-/// Bytes of replies kept for a line that does not take them; then new ones are dropped, as STATUS is absolute.
+/// Bytes of replies kept at most; more are dropped, as STATUS is absolute.
 const REPLIES_KEPT: usize = 16 * 1024;
 /// Bytes read in one call at most.
 const READ_AT_ONCE: usize = 256 * 1024;
@@ -47,9 +47,14 @@ impl SerialProjector {
         });
     }
 
-    /// Bytes for the line; taken from the front as far as it takes them.
+    /// Bytes for the line; taken from the front as far as it takes them. While the line has not taken the last ones there are no new
+    /// ones: an older STATUS never keeps a newer one waiting, and an ECHO is stamped when it can leave.
     pub fn replies(&mut self, now: HostTime) -> &mut Vec<u8> {
         let Self { projector, out, .. } = self;
+        if !out.is_empty() {
+            projector.advance_to(now);
+            return out;
+        }
         projector.replies(now, &mut |_, packet| {
             let from = out.len();
             if from < REPLIES_KEPT {
@@ -61,16 +66,20 @@ impl SerialProjector {
         out
     }
 
-    /// One round on a line that does not block: reads what is there, lives up to `now`, writes what the line takes. `Ok(false)` when
-    /// the line has ended.
-    pub fn serve(&mut self, now: HostTime, line: &mut (impl Read + Write)) -> std::io::Result<bool> {
+    /// One round on a line that does not block: reads what is there, lives up to now, writes what the line takes. `Ok(false)` when
+    /// the line has ended. `clock` is read anew before everything that is delivered and before the answers.
+    pub fn serve(
+        &mut self,
+        clock: impl Fn() -> HostTime,
+        line: &mut (impl Read + Write),
+    ) -> std::io::Result<bool> {
         let mut bytes = [0u8; 4096];
         let mut left = READ_AT_ONCE;
         while left > 0 {
             match line.read(&mut bytes) {
                 Ok(0) => return Ok(false),
                 Ok(n) => {
-                    self.receive(now, &bytes[..n]);
+                    self.receive(clock(), &bytes[..n]);
                     left = left.saturating_sub(n);
                 }
                 Err(e) if later(&e) => break,
@@ -80,8 +89,7 @@ impl SerialProjector {
                 Err(e) => return Err(e),
             }
         }
-        self.projector.advance_to(now);
-        let out = self.replies(now);
+        let out = self.replies(clock());
         if !out.is_empty() {
             match line.write(out) {
                 Ok(n) => drop(out.drain(..n)),

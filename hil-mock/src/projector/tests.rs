@@ -2,12 +2,16 @@
 
 mod cable;
 mod codec;
+mod dark;
+mod limits;
+mod protocol;
 mod safety;
 
 use super::*;
 use crate::rng::Draws;
 use dpm_device::link::{
-    DropReason, Epoch, HostLink, LinkError, LinkSettings, LinkState, MessageType, SendOutcome, Verb,
+    DropReason, Epoch, HostLink, LightLimits, LinkError, LinkSettings, LinkState, MessageType, SendOutcome,
+    Verb,
 };
 use dpm_device::planes::PlaneSchedule;
 use dpm_device::time::FrameRate;
@@ -16,6 +20,7 @@ use dpm_device::transport::{SendError, Transport, TransportError};
 use proptest::prelude::*;
 
 const WATCHDOG_US: u32 = 50_000;
+const LONG_NS: u64 = 60_000_000_000;
 
 fn raster() -> Raster {
     Raster::new(20, 3).unwrap()
@@ -32,7 +37,7 @@ fn settings() -> LinkSettings {
         epoch: Epoch::At(DeviceTicks(0)),
         codecs: 0,
         flash_limit: None,
-        session_seed: 7,
+        limits: LightLimits::OFF,
     }
 }
 
@@ -120,8 +125,14 @@ impl<T: Transport> Rig<T> {
         self.slot += 1;
         self.now = HostTime(self.link.settings().rate.slot_start_ns(self.slot));
         self.poll().expect("poll");
-        let target = self.link.slots().unwrap().start(self.slot + 2);
-        self.link.send_frame(self.now, id, target, planes, &mut self.cable)
+        let (target, dark_from) = self.times(self.slot + 2);
+        self.link.send_frame(self.now, id, target, dark_from, planes, &mut self.cable)
+    }
+
+    /// When slot `slot` begins, and long after: what ends light by itself has tests of its own.
+    fn times(&self, slot: u64) -> (DeviceTicks, DeviceTicks) {
+        let slots = self.link.slots().unwrap();
+        (slots.start(slot), slots.dark_from(slot, LONG_NS))
     }
 
     fn idle(&mut self, slots: u64) {
@@ -288,7 +299,8 @@ fn the_newest_due_frame_wins_and_late_ones_are_dropped_unless_asked() {
         let send = |rig: &mut Rig<_>, id, slot| {
             rig.poll().unwrap();
             let planes = planes(id);
-            rig.link.send_frame(rig.now, id, slots.start(slot), &planes, &mut rig.cable)
+            let dark_from = slots.dark_from(slot, LONG_NS);
+            rig.link.send_frame(rig.now, id, slots.start(slot), dark_from, &planes, &mut rig.cable)
         };
         let k = rig.slot;
         // Two for the same slot, then one whose slot is over.
@@ -315,10 +327,10 @@ fn credit_is_what_the_buffers_hold() {
     let mut rig = clean(settings(), MockConfig { frame_buffers: 3, ..MockConfig::new(raster()) });
     rig.stream();
     // Frames for a slot far away fill the buffers; the fourth has no credit; when light takes them, credit returns.
-    let target = rig.link.slots().unwrap().start(rig.slot + 100);
+    let (target, dark_from) = rig.times(rig.slot + 100);
     for id in 0..5u64 {
         rig.poll().unwrap();
-        let outcome = rig.link.send_frame(rig.now, id, target, &planes(id), &mut rig.cable);
+        let outcome = rig.link.send_frame(rig.now, id, target, dark_from, &planes(id), &mut rig.cable);
         let expected =
             if id < 3 { SendOutcome::Sent } else { SendOutcome::Dropped { reason: DropReason::NoCredit } };
         assert_eq!(outcome, expected, "frame {id}");
@@ -434,7 +446,7 @@ fn impossible_rigs_are_refused_by_name() {
     );
     let old = MockConfig { version: 9, ..MockConfig::new(raster()) };
     let text = check(settings(), old);
-    assert!(text.contains("version 9, this program 1"), "{text}");
+    assert!(text.contains("version 9, this program 2"), "{text}");
 }
 
 #[test]
@@ -455,8 +467,8 @@ fn a_skewed_clock_lights_on_its_own_slots() {
         rig.poll().unwrap();
         // The host knows the device's clock only through the link.
         let now = rig.link.status().unwrap().now;
-        let target = slots.start(slots.slot_at(now).unwrap() + 2);
-        rig.link.send_frame(rig.now, id, target, &planes(id), &mut rig.cable);
+        let (target, dark_from) = rig.times(slots.slot_at(now).unwrap() + 2);
+        rig.link.send_frame(rig.now, id, target, dark_from, &planes(id), &mut rig.cable);
         while let Some(e) = rig.cable.device_mut().next_light() {
             assert_eq!(e.lit_at, slots.start(e.slot));
             let ticks = clock.ticks_at(e.first_photon_at);
@@ -510,7 +522,12 @@ fn the_documents_example_makes_light() {
     let expected: Vec<[u8; 3]> =
         (0..16).map(|x| if (4..12).contains(&x) { [0; 3] } else { [128, 0, 0] }).collect();
     assert_eq!(light, expected);
-    mock.receive(HostTime(1_100_000), Lane::Control, stop);
-    assert!(!mock.is_lit());
+    mock.advance_to(HostTime(5_279_830));
+    assert!(mock.is_lit());
+    mock.advance_to(HostTime(5_279_831));
+    assert!(!mock.is_lit(), "dark from there on by itself");
+    assert_eq!(mock.status().state, DeviceState::Armed);
+    mock.receive(HostTime(5_300_000), Lane::Control, stop);
+    assert_eq!(mock.status().state, DeviceState::Configured);
     assert_eq!(mock.status().frames_lit, 1);
 }

@@ -94,8 +94,9 @@ pub fn run(arguments: &Dlpc900Arguments) -> Result<(), Box<dyn Error>> {
     let model = Arc::new(Mutex::new(Dlpc900Model::new(options)));
     let (watched, mut warned, mut was) = (model.clone(), 0, Sequencer::Stopped);
     let mut starts = 0;
-    offer(&arguments.usb, "DLPC900", model, |now| {
+    offer(&arguments.usb, "DLPC900", model, |clock| {
         let mut m = watched.lock().unwrap_or_else(PoisonError::into_inner);
+        let now = clock();
         let is = m.sequencer(now);
         let started = matches!(is, Sequencer::Running(..)) && is != was;
         if arguments.verbose {

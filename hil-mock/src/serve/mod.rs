@@ -32,6 +32,20 @@ fn seconds(text: &str) -> Result<f64, String> {
     s.ok_or_else(|| "write seconds from 0 to 1e9".to_owned())
 }
 
+/// Why `what` cannot be served on `address`, and what to do about it; `flag` chooses another port.
+fn cannot_serve(what: &str, address: impl std::fmt::Display, e: &std::io::Error, flag: &str) -> String {
+    use std::io::ErrorKind;
+    let remedy = match e.kind() {
+        ErrorKind::AddrInUse => format!(
+            "another program, perhaps a second hil-mock, serves there already: end it, or choose another port with {flag}"
+        ),
+        ErrorKind::AddrNotAvailable => "this address is not one of this machine's: `ip address` lists them".into(),
+        ErrorKind::PermissionDenied => format!("ports below 1024 need privilege: choose another with {flag}"),
+        _ => "is the network interface up?".into(),
+    };
+    format!("cannot serve {what} on {address}: {e}; {remedy}")
+}
+
 /// Why a serial port cannot be opened, and what to do about it.
 fn cannot_open(path: &str, e: &serialport::Error) -> String {
     format!("cannot open {path}: {e}; {}", dpm_device::tty::refusal(e).remedy())

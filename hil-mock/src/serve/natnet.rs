@@ -30,6 +30,13 @@ pub struct NatNetArguments {
     /// Version of the bit stream: 3.0, 3.1, 4.0, 4.1 or 4.2
     #[arg(long, default_value = "4.1")]
     natnet_version: String,
+    /// Send frames and names in the layout of this version, whatever is announced: a server that announces one version and sends
+    /// another
+    #[arg(long, value_name = "VERSION")]
+    sends: Option<String>,
+    /// Send names in the layout of this version, where it differs from that of the frames
+    #[arg(long, value_name = "VERSION")]
+    sends_names: Option<String>,
     /// How much faster than this machine's the server's clock runs, parts per million
     #[arg(long, default_value_t = 0.0)]
     clock_skew_ppm: f64,
@@ -49,9 +56,10 @@ pub fn run(arguments: &NatNetArguments) -> Result<(), Box<dyn Error>> {
     let (names, source) = arguments.tracker.source()?;
     let names: Vec<&str> = names.iter().map(String::as_str).collect();
     let mut config = NatNetServerConfig::new(&names);
-    let parts = arguments.natnet_version.split_once('.');
-    let version = parts.and_then(|(a, b)| Some(Version::new(a.parse().ok()?, b.parse().ok()?)));
-    config.version = version.ok_or("--natnet-version: write it as 4.1")?;
+    config.version = version_of("--natnet-version", &arguments.natnet_version)?;
+    let layout = |flag, text: &Option<String>| text.as_deref().map(|t| version_of(flag, t)).transpose();
+    config.frame_layout = layout("--sends", &arguments.sends)?;
+    config.model_layout = layout("--sends-names", &arguments.sends_names)?.or(config.frame_layout);
     config.data_port = arguments.data_port;
     config.clock_skew_ppb = (arguments.clock_skew_ppm * 1e3) as i64;
     config.streaming = match (arguments.multicast, arguments.unicast) {
@@ -68,7 +76,7 @@ pub fn run(arguments: &NatNetArguments) -> Result<(), Box<dyn Error>> {
     let server = NatNetServer::new(config, source)?;
     let address = SocketAddrV4::new(arguments.bind, arguments.command_port);
     let host = NatNetHost::start(server, streaming, address, clock_from_now())
-        .map_err(|e| format!("cannot serve on {address}: {e}; is another NatNet server running, and is the address one of this machine's?"))?;
+        .map_err(|e| super::cannot_serve("NatNet", address, &e, "--command-port"))?;
     println!("NatNet {version} on {}, {streaming:?}, data port {}", host.address(), arguments.data_port);
     for (name, id) in bodies {
         println!("  body {id}: {name}");
@@ -82,4 +90,11 @@ pub fn run(arguments: &NatNetArguments) -> Result<(), Box<dyn Error>> {
         std::thread::sleep(Duration::from_millis(50));
     }
     Err("the network socket failed".into())
+}
+
+/// `4.1` as a version.
+fn version_of(flag: &str, text: &str) -> Result<Version, String> {
+    let parts = text.split_once('.');
+    let version = parts.and_then(|(a, b)| Some(Version::new(a.parse().ok()?, b.parse().ok()?)));
+    version.ok_or_else(|| format!("{flag} {text}: write it as 4.1"))
 }

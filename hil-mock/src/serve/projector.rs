@@ -1,16 +1,21 @@
 //! `hil-mock serve projector`: arguments into a bit-plane projector on a USB/IP port, a serial port or a pseudo-terminal.
 
 use std::error::Error;
+use std::fs::File;
+use std::io::Write;
 use std::path::{Path, PathBuf};
 use std::sync::{Arc, Mutex, PoisonError};
 use std::time::{Duration, Instant};
 
 use clap::{Args, ValueEnum};
+use dpm_device::link::faults;
 use dpm_device::planes::Raster;
 use dpm_device::time::HostTime;
+use dpm_device::transport::LinkDevice;
+use hil_mock::monotonic;
 use hil_mock::projector::serial::SerialProjector;
 use hil_mock::projector::usb::UsbProjector;
-use hil_mock::projector::{MockConfig, MockProjector};
+use hil_mock::projector::{LightChange, MockConfig, MockProjector};
 use hil_mock::serial_server::pseudo_terminal;
 use hil_mock::usb_model::Speed;
 
@@ -41,9 +46,13 @@ pub struct ProjectorArguments {
     /// Bits per second of the serial port
     #[arg(long, default_value_t = 3_000_000)]
     baud: u32,
-    /// Write the light of the frame on the mirrors to this PPM file once a second
+    /// Write the light on the mirrors to this PPM file once a second; black while it is dark
     #[arg(long, value_name = "FILE")]
     light: Option<PathBuf>,
+    /// Write a line to this file whenever light goes on or off or the state changes: the instant in nanoseconds of CLOCK_MONOTONIC, `lit`
+    /// with the frame or `dark`, and the state with the faults that are latched
+    #[arg(long, value_name = "FILE")]
+    light_log: Option<PathBuf>,
     #[command(flatten)]
     usb: UsbArguments,
 }
@@ -68,7 +77,15 @@ pub fn run(arguments: &ProjectorArguments) -> Result<(), Box<dyn Error>> {
         events_kept: 0,
         ..MockConfig::new(arguments.raster)
     });
-    let mut report = Report { due: HostTime(0), said: String::new(), light: arguments.light.clone() };
+    let log = arguments.light_log.as_deref().map(LightLog::create).transpose()?;
+    let mut report = Report {
+        due: HostTime(0),
+        said: String::new(),
+        light: arguments.light.clone(),
+        was_lit: true,
+        log,
+        ahead_ns: i64::MAX,
+    };
     if let Some(port) = &arguments.port {
         return serve_port(arguments, port, projector, &mut report);
     }
@@ -78,9 +95,9 @@ pub fn run(arguments: &ProjectorArguments) -> Result<(), Box<dyn Error>> {
     };
     let model = Arc::new(Mutex::new(UsbProjector::new(projector, speed, arguments.bytes_per_second)));
     let watched = model.clone();
-    offer(&arguments.usb, "bit-plane projector", model, move |now| {
+    offer(&arguments.usb, "bit-plane projector", model, move |clock| {
         let mut model = watched.lock().unwrap_or_else(PoisonError::into_inner);
-        report.look(now, model.projector());
+        report.look(clock(), model.projector());
     })
 }
 
@@ -105,32 +122,75 @@ fn serve_port(
         if arguments.usb.seconds.is_some_and(|s| now.0 as f64 >= s * 1e9) {
             return Ok(());
         }
-        if !device.serve(now, &mut line)? {
+        if !device.serve(|| HostTime(start.elapsed().as_nanos() as i64), &mut line)? {
             return Err(format!("{path} failed: unplugged? Check cable and adapter").into());
         }
-        report.look(now, device.projector());
+        report.look(HostTime(start.elapsed().as_nanos() as i64), device.projector());
         std::thread::sleep(Duration::from_micros(500));
     }
 }
 
-/// Says once a second what has changed.
+/// Light as it goes on and off, for other programs to read.
+struct LightLog {
+    path: PathBuf,
+    file: File,
+}
+
+impl LightLog {
+    fn create(path: &Path) -> Result<Self, String> {
+        match File::create(path) {
+            Ok(file) => Ok(Self { path: path.to_owned(), file }),
+            Err(e) => Err(format!("cannot write {}: {e}", path.display())),
+        }
+    }
+
+    /// Writes `change`, whose clock is `ahead_ns` behind CLOCK_MONOTONIC, a line in one piece, at once.
+    fn write(&mut self, change: &LightChange, ahead_ns: i64) -> std::io::Result<()> {
+        let light = change.frame.map_or_else(|| "dark".to_owned(), |frame| format!("lit {frame}"));
+        let state = format!("{:?}", change.state).to_lowercase();
+        let latched = match change.faults {
+            0 => String::new(),
+            mask => format!(": {}", faults::names(mask)),
+        };
+        self.file.write_all(format!("{} {light} {state}{latched}\n", change.at.0 + ahead_ns).as_bytes())
+    }
+}
+
+/// Says once a second what has changed, and at once when light goes on or off.
 struct Report {
     due: HostTime,
     said: String,
     light: Option<PathBuf>,
+    was_lit: bool,
+    log: Option<LightLog>,
+    /// CLOCK_MONOTONIC minus the model's clock.
+    ahead_ns: i64,
 }
 
 impl Report {
+    /// Lets `projector` live up to `now`, whether or not a packet arrives, and tells of it. `now` was read just before.
     fn look(&mut self, now: HostTime, projector: &mut MockProjector) {
+        // What lies between the two readings only adds to it.
+        self.ahead_ns = self.ahead_ns.min(monotonic::now_ns() - now.0);
+        projector.advance_to(now);
+        while let Some(change) = projector.next_change() {
+            if let Some(log) = &mut self.log {
+                if let Err(e) = log.write(&change, self.ahead_ns) {
+                    eprintln!("{}: {e}", log.path.display());
+                    self.log = None;
+                }
+            }
+        }
         if now < self.due {
             return;
         }
         self.due = now.plus_ns(1_000_000_000);
         let s = projector.status();
         let text = format!(
-            "{:?}: {} frames lit, {} repeated, {} blank; dropped {} incomplete, {} late, {} superseded, {} refused; \
+            "{:?}, {}: {} frames lit, {} repeated, {} blank; dropped {} incomplete, {} late, {} superseded, {} refused; \
              {} damaged packets",
             s.state,
+            if s.lit { "lit" } else { "dark" },
             s.frames_lit,
             s.slots_repeated,
             s.slots_blank,
@@ -144,12 +204,18 @@ impl Report {
             println!("{:8.1} s  {text}", now.0 as f64 * 1e-9);
             self.said = text;
         }
-        let raster = projector.raster();
-        if let (Some(path), Some(light)) = (&self.light, projector.light_of_frame()) {
-            if let Err(e) = write_ppm(path, raster, light) {
-                eprintln!("{}: {e}", path.display());
-                self.light = None;
-            }
+        let (raster, lit) = (projector.raster(), projector.is_lit());
+        let Some(path) = &self.light else { return };
+        let written = match projector.light_of_frame().filter(|_| lit) {
+            Some(light) => write_ppm(path, raster, light),
+            // A picture of the last light would say that it is still there.
+            None if self.was_lit => write_ppm(path, raster, &vec![[0; 3]; raster.pixel_count()]),
+            None => Ok(()),
+        };
+        self.was_lit = lit;
+        if let Err(e) = written {
+            eprintln!("{}: {e}", path.display());
+            self.light = None;
         }
     }
 }

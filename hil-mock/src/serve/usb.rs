@@ -27,12 +27,12 @@ pub struct UsbArguments {
 /// How often the plan is looked at.
 const TICK: Duration = Duration::from_millis(2);
 
-/// Offers `model` until the time is over. `look` is called every 2 ms with the instant on the model's clock.
+/// Offers `model` until the time is over. `look` is called every 2 ms with the model's clock.
 pub fn offer(
     arguments: &UsbArguments,
     name: &str,
     model: Arc<Mutex<dyn UsbDeviceModel>>,
-    mut look: impl FnMut(dpm_device::time::HostTime),
+    mut look: impl FnMut(&dyn Fn() -> dpm_device::time::HostTime),
 ) -> Result<(), Box<dyn Error>> {
     let plan = &arguments.faults;
     plan.check_supported(&[FaultKind::Unplug, FaultKind::Stall, FaultKind::Slow], "a USB cable")?;
@@ -40,9 +40,8 @@ pub fn offer(
     let new_plug = || UsbPlug::new(model.clone(), clock.clone());
     let export = |plug: &UsbPlug| vec![Export::new("1-1", Arc::new(plug.clone()))];
     let mut plug = new_plug();
-    let server = Server::start(arguments.usbip, export(&plug)).map_err(|e| {
-        format!("cannot serve on {}: {e}; is another USB/IP server running, and is the address one of this machine's?", arguments.usbip)
-    })?;
+    let server = Server::start(arguments.usbip, export(&plug))
+        .map_err(|e| super::cannot_serve("USB/IP", arguments.usbip, &e, "--usbip"))?;
     println!("{name} over USB/IP on {}, bus id 1-1", server.address());
     println!("  on the machine that is to see it: modprobe vhci-hcd; usbip attach -r HOST -b 1-1");
     let mut out = false;
@@ -72,7 +71,7 @@ pub fn offer(
         }
         plug.set_delay_ns(plan.amount(FaultKind::Slow, before, now.0) as i64);
         before = now.0;
-        look(now);
+        look(&*clock);
         std::thread::sleep(TICK);
     }
 }

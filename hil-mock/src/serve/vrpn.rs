@@ -34,7 +34,7 @@ pub fn run(arguments: &VrpnArguments) -> Result<(), Box<dyn Error>> {
     let shown = names.clone();
     let address = SocketAddrV4::new(arguments.bind, arguments.port);
     let host = VrpnHost::start(names, VrpnReports::new(source)?, address, clock_from_now())
-        .map_err(|e| format!("cannot serve on {address}: {e}; is another VRPN server running, and is the address one of this machine's?"))?;
+        .map_err(|e| super::cannot_serve("VRPN", address, &e, "--port"))?;
     println!("VRPN on {}, tracker {}", host.address(), shown.tracker);
     for (sensor, name) in shown.bodies.iter().enumerate() {
         println!("  sensor {sensor}: {name}");

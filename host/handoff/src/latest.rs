@@ -46,9 +46,15 @@ pub fn latest<T: Clone + Send>(initial: T) -> (Publisher<T>, Reader<T>) {
 impl<T> Publisher<T> {
     /// Makes `value` the newest. The value displaced (an old one) is dropped here, on the writer's thread.
     pub fn publish(&mut self, value: T) {
+        self.publish_with(|cell| *cell = value);
+    }
+
+    /// Makes what `write` leaves in the cell that it is given the newest value, without a copy. The cell holds some older value; nothing is
+    /// published if `write` panics.
+    pub fn publish_with(&mut self, write: impl FnOnce(&mut T)) {
         self.shared.cells[usize::from(self.back)].with_mut(|cell| {
             // SAFETY: `back` belongs to this publisher alone until the swap below; `&mut self` excludes a second call.
-            unsafe { *cell = value }
+            write(unsafe { &mut *cell });
         });
         // Release: the write above is visible to whoever takes the cell. Acquire: the cell we get back is no longer being read.
         let before = self.shared.middle.swap(self.back | FRESH, Ordering::AcqRel);

@@ -1,7 +1,7 @@
 //! `dpm bench`: what each method costs on this machine's Vulkan device.
 
 use super::rig_args::RigArgs;
-use super::watch::print;
+use super::watch::{check_out, print, write_out};
 use crate::config::RenderMethod;
 use crate::experiments::bench::{bench, MethodCost, METHODS};
 use crate::experiments::run_rig::open_gpu;
@@ -54,7 +54,9 @@ fn lines(c: &MethodCost) -> String {
 /// # Errors
 /// Bad rig or flags, no GPU.
 pub fn execute(args: &BenchArgs) -> Result<(), Failure> {
-    let config = args.flags.rig(args.rig.as_deref())?;
+    args.flags.refuse("dpm bench", &["--frames", "--seconds", "--no-prediction"])?;
+    let config = args.flags.rig_at_rest(args.rig.as_deref())?;
+    check_out(args.flags.out.as_deref())?;
     let gpu = open_gpu(&config)?;
     let rig = Rig::build(&config, None)?;
     if !args.json {
@@ -79,5 +81,5 @@ pub fn execute(args: &BenchArgs) -> Result<(), Failure> {
     if args.json {
         print(&(to_json(&report) + "\n"));
     }
-    Ok(())
+    write_out(args.flags.out.as_deref(), "bench.json", &report)
 }

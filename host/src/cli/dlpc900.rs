@@ -1,15 +1,27 @@
 //! `dpm dlpc900`: words into calls of the DLPC900 driver.
 
-use super::watch::print;
+use super::signals;
+use super::watch::{print, refuse_where_dark_stands};
+use crate::config::{Dlpc900Config, ProjectorBackend};
 use crate::dlpc900::{sequence_of, status_text, PatternFileError, ShowAs};
 use crate::failure::{Failure, FailureKind};
+use crate::standing::Identity;
 use clap::ValueEnum;
 use dpm_device::dlpc900::driver::{Dlpc900, Dlpc900Error, UploadProgress};
 use dpm_device::dlpc900::image::{Compression, PlaneOrder};
 use dpm_device::dlpc900::lut::{led, LutEntry};
 use dpm_device::dlpc900::sequence::{LedSetup, Receiver, Repeat, VideoPatterns};
 use dpm_device::dlpc900::usb::{describe, list, UsbHid, UsbPlace};
+use std::io::{Read, Write};
+use std::os::unix::process::CommandExt;
 use std::path::PathBuf;
+use std::process::{Child, Stdio};
+use std::time::Duration;
+
+/// How long the controller of a run that was killed is tried to be opened.
+const GUARD_PATIENCE: Duration = Duration::from_secs(5);
+/// Between two tries.
+const GUARD_STEP: Duration = Duration::from_millis(5);
 
 /// Flags of `dpm dlpc900`.
 #[derive(clap::Args, Clone, Debug)]
@@ -47,6 +59,9 @@ enum Action {
     Standby,
     /// Come back from standby
     Wake,
+    /// Started by `dpm run`: puts the controller to rest when that run is killed
+    #[command(hide = true)]
+    Guard,
 }
 
 #[derive(clap::Args, Clone, Debug)]
@@ -195,12 +210,27 @@ fn open(args: &Dlpc900Args) -> Result<Dlpc900<UsbHid>, Failure> {
 /// [`FailureKind::Device`] when the controller cannot be reached or refuses; [`FailureKind::BadInput`] when pictures or times
 /// break a rule, with the LUT entry and the rule.
 pub fn execute(args: &Dlpc900Args) -> Result<(), Failure> {
+    if let Action::Guard = args.action {
+        return guard(args.device);
+    }
+    let lights = match &args.action {
+        Action::Upload(upload) => upload.start,
+        Action::Start | Action::VideoPattern(_) | Action::Wake => true,
+        _ => false,
+    };
+    if lights {
+        refuse_where_dark_stands(&Identity::of(&ProjectorBackend::Dlpc900(Dlpc900Config::default())))?;
+    }
     let mut d = open(args)?;
     match &args.action {
+        Action::Guard => {}
         Action::Status => print(&status_text(&d.status()?)),
         Action::Upload(upload) => execute_upload(&mut d, upload)?,
         Action::VideoPattern(video) => execute_video(&mut d, video)?,
-        Action::Start => d.start()?,
+        Action::Start => {
+            make_ready(&mut d)?;
+            d.start()?;
+        }
         Action::Pause => d.pause()?,
         Action::Stop => d.stop()?,
         Action::Idle => d.idle()?,
@@ -214,6 +244,81 @@ pub fn execute(args: &Dlpc900Args) -> Result<(), Failure> {
         Action::Wake => d.wake()?,
     }
     Ok(())
+}
+
+/// What rests is woken before it is to show something: the mirrors' exercise takes 3 s to leave.
+fn make_ready(d: &mut Dlpc900<UsbHid>) -> Result<(), Failure> {
+    if d.make_ready()? {
+        let _ =
+            writeln!(std::io::stderr(), "the controller rested (exercise, park or standby); that is ended");
+    }
+    Ok(())
+}
+
+/// Looks after a run that may die without a word: waits until the pipe that the run holds is closed. Nothing said through it means that
+/// the run was killed; its controller, which has no watchdog, is then put to rest.
+///
+/// # Errors
+/// The controller cannot be reached or refuses.
+fn guard(place: Option<UsbPlace>) -> Result<(), Failure> {
+    let device = |e: String| Failure::new(FailureKind::Device, e);
+    // Whoever ends the run ends its group, its session or its service: this must outlive it.
+    signals::ignore().map_err(|e| device(format!("cannot ignore signals: {e}")))?;
+    let mut said = Vec::new();
+    let _ = std::io::stdin().lock().take(16).read_to_end(&mut said);
+    if !said.is_empty() {
+        return Ok(());
+    }
+    let limit = std::time::Instant::now() + GUARD_PATIENCE;
+    let mut d = loop {
+        match UsbHid::open(place).map(Dlpc900::new) {
+            Ok(d) => break d?,
+            // The kernel frees the dead process's interface in its own time.
+            Err(_) if std::time::Instant::now() < limit => std::thread::sleep(GUARD_STEP),
+            Err(e) => return Err(device(format!("{}: {e}; it goes on showing", describe(place)))),
+        }
+    };
+    d.stop()?;
+    d.idle()?;
+    let _ =
+        writeln!(std::io::stderr(), "the run was killed: its DLPC900 is stopped and exercises its mirrors");
+    Ok(())
+}
+
+/// A process that looks after this one; see [`Action::Guard`]. It acts when this process ends, or drops this value, without
+/// [`Guard::dismiss`].
+pub(super) struct Guard(Option<Child>);
+
+impl Guard {
+    /// Starts it. Without one the run goes on, as it would have without this precaution.
+    pub(super) fn start(device: Option<&str>) -> Self {
+        let start = || {
+            let mut command = std::process::Command::new(std::env::current_exe()?);
+            command.args(["dlpc900", "guard"]).stdin(Stdio::piped()).stdout(Stdio::null());
+            if let Some(place) = device {
+                command.args(["--device", place]);
+            }
+            command.process_group(0).spawn()
+        };
+        match start() {
+            Ok(child) => Self(Some(child)),
+            Err(e) => {
+                let _ =
+                    writeln!(std::io::stderr(), "nothing looks after the DLPC900 if this run is killed: {e}");
+                Self(None)
+            }
+        }
+    }
+
+    /// Ends it: the run has ended by itself and has put the controller to rest.
+    pub(super) fn dismiss(self) {
+        if let Some(mut child) = self.0 {
+            let said = child.stdin.take().map(|mut pipe| pipe.write_all(b"over"));
+            if let Some(Ok(())) = said {
+                let _ = child.wait();
+            }
+        }
+    }
 }
 
 fn execute_upload(d: &mut Dlpc900<UsbHid>, u: &UploadArgs) -> Result<(), Failure> {
@@ -238,6 +343,10 @@ fn execute_upload(d: &mut Dlpc900<UsbHid>, u: &UploadArgs) -> Result<(), Failure
     let sequence = sequence_of(&u.files, d.dmd(), &show)?;
     let bar = indicatif::ProgressBar::new(sequence.image_bytes() as u64);
     let leds = LedSetup { current: u.led_current, polarity: None };
+    if u.start {
+        // Before the upload, which takes many seconds and would have been in vain.
+        make_ready(d)?;
+    }
     d.upload(&sequence, leds, &mut |p: UploadProgress| bar.set_position(p.sent as u64))?;
     bar.finish_and_clear();
     if u.start {
@@ -252,6 +361,7 @@ fn execute_upload(d: &mut Dlpc900<UsbHid>, u: &UploadArgs) -> Result<(), Failure
 fn execute_video(d: &mut Dlpc900<UsbHid>, v: &VideoArgs) -> Result<(), Failure> {
     let exposure_us = v.exposure_us.unwrap_or(1_000_000 / v.frame_hz / u32::from(v.patterns));
     let entry = |i: u8| LutEntry { leds: v.leds.bits(), ..LutEntry::one_bit(i.into(), 0, i, exposure_us) };
+    make_ready(d)?;
     d.start_video_patterns(&VideoPatterns {
         dmd: d.dmd(),
         receiver: match v.input {

@@ -4,11 +4,12 @@ use super::error_files::{known, known_or, merge, report, show, Kept, Origin};
 use super::progress::Progress;
 use super::rig_args::RigArgs;
 use super::watch::print;
-use crate::experiments::error_plan::{groups, Group};
+use crate::config::RenderConfig;
+use crate::experiments::error_plan::{contenders, groups, Group};
 use crate::experiments::error_plot::{curves, Cost};
 use crate::experiments::error_report::{csv, markdown};
 use crate::experiments::error_runs::{
-    ErrorOptions, ErrorRunError, ErrorRuns, Extent, GroupResult, EYE_FRAMES,
+    is_other, ErrorOptions, ErrorRunError, ErrorRuns, Extent, GroupResult, AT_EQUAL_TIME, EYE_FRAMES, RACES,
 };
 use crate::experiments::run_rig::open_gpu;
 use crate::failure::{Failure, FailureKind};
@@ -103,6 +104,7 @@ pub fn execute(args: &ErrorArgs) -> Result<(), Failure> {
     if let Some(ErrorCommand::Merge { out, json }) = &args.merge {
         return merge(out, *json);
     }
+    args.flags.refuse("dpm error", &["--frames", "--seconds", "--no-prediction"])?;
     match args.preset {
         Some(Preset::Figure3) => return super::error_figure3::figure3(args),
         Some(Preset::Table) => return super::error_table::table(args),
@@ -177,7 +179,7 @@ pub(super) fn folder(args: &ErrorArgs) -> PathBuf {
 
 /// Names with their numbers. A rig file that cannot be run has no groups.
 pub(super) fn list(args: &ErrorArgs, names: impl Iterator<Item = String>) -> Result<(), Failure> {
-    args.flags.rig(args.rig.as_deref())?;
+    args.flags.rig_at_rest(args.rig.as_deref())?;
     if args.json {
         let names: Vec<String> = names.collect();
         print(&(to_json(&serde_json::json!({ "groups": names })) + "\n"));
@@ -215,7 +217,7 @@ pub(super) fn options(args: &ErrorArgs, out: &Path) -> ErrorOptions {
 
 /// The GPU, and the rig at the raster to measure at: small without a GPU or in a hurry.
 pub(super) fn stage(args: &ErrorArgs) -> Result<(Arc<Gpu>, Rig), Failure> {
-    let config = args.flags.rig(args.rig.as_deref())?;
+    let config = args.flags.rig_at_rest(args.rig.as_deref())?;
     // Not after the minutes that the first reference takes.
     check_folder(&folder(args))
         .map_err(|e| Failure::new(FailureKind::BadInput, format!("{e}; choose another folder with --out")))?;
@@ -238,9 +240,23 @@ pub(super) fn weight(what: &str, group: Group, extent: Extent, methods: usize) -
         "reference" => EYE_FRAMES as f64 * f64::from(extent.reference_spp) / 2.0,
         "reference of every frame" => f64::from(extent.kept * extent.reference_spp),
         "times" => 40.0 / frames * sequence * methods as f64,
+        // About twice the samples, for the warm-up and the frames that the eye sees.
+        what if what.ends_with(AT_EQUAL_TIME) => {
+            f64::from(extent.warm_up + EYE_FRAMES as u32) * (2.0 * group.budget.max(1.0) + 3.0)
+        }
         _ => sequence,
     };
     of as u64
+}
+
+/// Races of a group at most: one at equal rays, the others for equal time.
+const MOST_RACES: u64 = 1 + RACES as u64;
+
+/// All that is drawn of a group, without its reference: each method twice, the races, and each of the others twice at equal time.
+pub(super) fn weight_of_methods(group: Group, extent: Extent, methods: usize) -> u64 {
+    let of = |what: &str| weight(what, group, extent, methods);
+    let others = contenders(&RenderConfig::default(), false).iter().filter(|c| is_other(c.name)).count();
+    2 * methods as u64 * of("") + MOST_RACES * of("times") + 2 * others as u64 * of(AT_EQUAL_TIME)
 }
 
 fn measure(
@@ -259,7 +275,7 @@ fn measure(
         let measured = if known::<GroupResult>(out, &group.name(), &runs.key(group)).is_some() {
             0
         } else {
-            2 * methods as u64 * of("") + of("times") + reference
+            weight_of_methods(group, extent, methods) + reference
         };
         measured + if args.sequences { methods as u64 * of("") + every } else { 0 }
     };

@@ -10,6 +10,7 @@ use crate::experiments::stamp::Stamp;
 use crate::failure::{Failure, FailureKind};
 use crate::files::write_atomically;
 use crate::telemetry::report::to_json;
+use dpm_device::regular_file;
 use serde::de::DeserializeOwned;
 use serde::Serialize;
 use serde_json::Value;
@@ -47,6 +48,9 @@ pub(super) struct Origin<'a> {
     pub extent: Option<Extent>,
 }
 
+/// Largest file of a group that is read, bytes; real ones have some hundred thousand.
+const MAX_GROUP_BYTES: u64 = 1 << 30;
+
 fn path<T: Kept>(out: &Path, name: &str, key: &str) -> PathBuf {
     out.join(format!("{}-{name}-{key}.json", T::PREFIX))
 }
@@ -57,7 +61,7 @@ fn path_of<T: Kept>(out: &Path, group: &T) -> PathBuf {
 
 /// What an earlier run left of a group, when it was made from the same.
 pub(super) fn known<T: Kept>(out: &Path, name: &str, key: &str) -> Option<T> {
-    let bytes = std::fs::read(path::<T>(out, name, key)).ok()?;
+    let bytes = regular_file::read(&path::<T>(out, name, key), MAX_GROUP_BYTES).ok()?;
     serde_json::from_slice(&bytes).ok().filter(|group: &T| group.origin().key == key)
 }
 
@@ -208,7 +212,7 @@ fn read_all<T: Kept>(out: &Path) -> Result<Vec<T>, Failure> {
             let told = format!("{}: {e}; delete it and measure the group again", path.display());
             Failure::new(FailureKind::BadInput, told)
         };
-        let bytes = std::fs::read(&path).map_err(|e| bad(&e))?;
+        let bytes = regular_file::read(&path, MAX_GROUP_BYTES).map_err(|e| bad(&e))?;
         found.push(serde_json::from_slice::<T>(&bytes).map_err(|e| bad(&e))?);
     }
     Ok(found)
@@ -241,6 +245,9 @@ mod tests {
             samples: 1.0,
             gpu_ms: 1.0,
             wall_ms: 1.0,
+            middle_half_ms: [0.9, 1.1],
+            runs_raw: [0.1; 2],
+            equal_time: None,
             single_rmse: 1.0,
             single_rel_mse: 1.0,
             perceived_rmse: 1.0,

@@ -1,6 +1,8 @@
 //! `dpm error --preset table`: settings of the table that are not measured yet, then the whole table.
 
-use super::error::{chosen, end, failure, folder, list, options, stage, weight, ErrorArgs};
+use super::error::{
+    chosen, end, failure, folder, list, options, stage, weight, weight_of_methods, ErrorArgs,
+};
 use super::error_files::{known_or, Kept, Origin};
 use super::progress::Progress;
 use crate::experiments::error_plan::contenders;
@@ -46,7 +48,7 @@ pub(super) fn table(args: &ErrorArgs) -> Result<(), Failure> {
     let cost = |what: &str, s: TableSetting| weight(what, s.group(), options.extent, methods);
     let totals: Vec<u64> = chosen
         .iter()
-        .map(|&s| 2 * methods as u64 * cost("", s) + cost("times", s) + 2 * cost("reference", s))
+        .map(|&s| weight_of_methods(s.group(), options.extent, methods) + 2 * cost("reference", s))
         .collect();
     let mut progress = Progress::new(&totals);
     let mut groups = Vec::new();

@@ -1,18 +1,5 @@
-//! Keys pressed on the terminal of a run into orders: b black, f freeze, s safe, a arm.
+//! Keys pressed on the terminal of a run. b black, f freeze, s safe and a arm are orders; another may be the interlock's.
 #![allow(unsafe_code)]
-
-use crate::telemetry::monitor::Order;
-
-/// What a key means.
-pub fn order_of(key: u8) -> Option<Order> {
-    match key.to_ascii_lowercase() {
-        b'b' => Some(Order::Black),
-        b'f' => Some(Order::Freeze),
-        b's' => Some(Order::Safe),
-        b'a' => Some(Order::Arm),
-        _ => None,
-    }
-}
 
 /// The terminal at the standard input, reading single keys without echo; as it was before when dropped. Signals stay signals.
 pub struct Keys {
@@ -45,8 +32,8 @@ impl Keys {
         }
     }
 
-    /// The orders of the keys pressed since the last call, at most 16 keys; never waits.
-    pub fn pressed(&mut self) -> impl Iterator<Item = Order> {
+    /// The keys pressed since the last call, at most 16; never waits.
+    pub fn pressed(&mut self) -> impl Iterator<Item = u8> {
         let mut keys = [0u8; 16];
         let mut n = 0;
         if is_in_foreground() {
@@ -54,7 +41,7 @@ impl Keys {
             let got = unsafe { libc::read(libc::STDIN_FILENO, keys.as_mut_ptr().cast(), keys.len()) };
             n = usize::try_from(got).unwrap_or(0);
         }
-        keys.into_iter().take(n).filter_map(order_of)
+        keys.into_iter().take(n)
     }
 }
 

@@ -14,11 +14,13 @@ pub mod os;
 pub mod plan;
 pub mod profile;
 mod progress;
+pub mod record;
 pub mod rig_args;
 pub mod run;
 pub mod signals;
 pub mod snapshot;
 pub mod stability;
+mod tell;
 pub mod watch;
 
 use crate::failure::Failure;
@@ -49,15 +51,30 @@ enum Command {
     Run(run::RunArgs),
     /// Measure what the link to the projector carries of this rig's pictures, and the frame rate that allows
     LinkTest(link_test::LinkTestArgs),
-    /// Make the projector of a running rig dark; the rig goes on
+    /// Make the projectors of all running rigs dark, or of one; the rigs go on
+    ///
+    /// Dark until `dpm arm` or the orderly end of the run; a run that dies leaves it standing for the next one. Prints whose rigs were
+    /// reached and how each projector is. Exit code 0 only when every one confirmed. Where a rig does not answer within 20 ms the order
+    /// goes to it as the signal USR1, which needs no thread of it but its link's.
     Black(order::OrderArgs),
     /// Hold the frame that the projector of a running rig shows
+    ///
+    /// Until `dpm arm`, `dpm black` or `dpm safe`. Exit code 0 only when the projector confirmed.
     Freeze(order::OrderArgs),
-    /// Make the projector of a running rig dark and latch it
+    /// Make the projectors of all running rigs dark, or of one, and latch it over restarts until `dpm arm`
+    ///
+    /// Latched in the projector and in the state folder: the next run of that projector, after a crash, a restart of the service or of the
+    /// machine, comes up dark. Exit code 0 only when every projector confirmed and the order is on the disk. Where a rig does not answer
+    /// within 20 ms the order goes to it as the signal USR2.
     Safe(order::OrderArgs),
     /// Let light through again after black, freeze, safe or a fault, which this acknowledges
+    ///
+    /// Only a running rig can be armed. What stands in the state folder is forgotten first, then the light comes. Where several rigs run,
+    /// name one with --pid.
     #[command(visible_alias = "resume")]
     Arm(order::OrderArgs),
+    /// Record what a rig's tracker says into a file that `tracker.kind = "replay"` plays
+    Record(record::RecordArgs),
     /// Measure where the time between motion and light goes
     Profile(profile::ProfileArgs),
     /// Say what this machine can do, and what to do about what is missing
@@ -94,13 +111,19 @@ pub fn main(commit: &'static str) -> ExitCode {
             return ExitCode::from(u8::try_from(e.exit_code()).unwrap_or(2));
         }
     };
-    match dispatch(&cli.command) {
-        Ok(()) => ExitCode::SUCCESS,
+    let code = match dispatch(&cli.command) {
+        Ok(()) => 0,
         Err(failure) => {
             let _ = writeln!(std::io::stderr(), "error: {failure}");
-            ExitCode::from(failure.kind.exit_code())
+            failure.kind.exit_code()
         }
+    };
+    if crate::pipeline::has_left_threads_behind() {
+        // Destructors of drivers could wait for a thread that hangs.
+        let _ = std::io::stdout().flush();
+        os::leave(code);
     }
+    ExitCode::from(code)
 }
 
 fn dispatch(command: &Command) -> Result<(), Failure> {
@@ -112,6 +135,7 @@ fn dispatch(command: &Command) -> Result<(), Failure> {
         Command::Freeze(args) => order::execute(args, Order::Freeze),
         Command::Safe(args) => order::execute(args, Order::Safe),
         Command::Arm(args) => order::execute(args, Order::Arm),
+        Command::Record(args) => record::execute(args),
         Command::Profile(args) => profile::execute(args),
         Command::Doctor(args) => doctor::execute(args),
         Command::Stability(args) => stability::execute(args),

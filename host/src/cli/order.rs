@@ -1,9 +1,10 @@
 //! `dpm black | freeze | safe | arm`: a word to a rig that runs.
 
 use super::watch::print;
-use crate::control::{runtime_folder, tell};
+use crate::control::client::{tell, Answer};
 use crate::failure::{Failure, FailureKind};
 use crate::telemetry::monitor::Order;
+use crate::unix::{user, user_name};
 
 /// Flags of the four commands.
 #[derive(clap::Args, Clone, Debug)]
@@ -13,18 +14,38 @@ pub struct OrderArgs {
     pid: Option<u32>,
 }
 
-/// Gives `order` and prints the answers.
+/// Gives `order` and prints whose rigs it reached, what they answered, and which it did not reach.
 ///
 /// # Errors
-/// No rig runs, several do, or the projector has not obeyed within half a second.
+/// No rig runs, several do, or a projector has not confirmed that it obeyed (exit code 3).
 pub fn execute(args: &OrderArgs, order: Order) -> Result<(), Failure> {
     let device = |e: &dyn std::fmt::Display| Failure::new(FailureKind::Device, e);
-    let answers = tell(&runtime_folder(), args.pid, order).map_err(|e| device(&e))?;
-    for answer in &answers {
-        print(&format!("process {}: {}\n", answer.id, answer.text));
+    let told = tell(args.pid, order).map_err(|e| device(&e))?;
+    let mut text: String = told.answers.iter().map(line).collect();
+    text.extend(told.refused.iter().map(|refused| format!("not reached: {refused}\n")));
+    if order.is_dark() && args.pid.is_none() && !told.closed.is_empty() {
+        let folders: Vec<_> = told.closed.iter().map(|f| f.display().to_string()).collect();
+        text += &format!(
+            "not looked into, for they are other users': {}; root reaches all\n",
+            folders.join(", ")
+        );
     }
-    match answers.iter().find(|a| !a.obeyed) {
-        Some(a) => Err(device(&format!("{} has not taken effect in process {}", order.word(), a.id))),
-        None => Ok(()),
+    print(&text);
+    if told.is_done() {
+        return Ok(());
     }
+    let word = order.word();
+    match told.answers.iter().find(|a| !a.done) {
+        Some(a) => Err(device(&format!("{word} is not confirmed by process {}: {}", a.pid, a.text))),
+        None => Err(device(&format!("{word} reached no rig of user {} or of a service", user_name(user())))),
+    }
+}
+
+fn line(answer: &Answer) -> String {
+    let Answer { pid, uid, rig, text, is_vouched_for, .. } = answer;
+    let rig = if rig.is_empty() { "rig not told" } else { rig };
+    let says = if *is_vouched_for { "" } else { "says (nobody vouches for it): " };
+    // What a process of another user says could hold control characters.
+    let line = format!("process {pid} of {}, {rig}: {says}{text}", user_name(*uid));
+    line.chars().filter(|c| !c.is_control()).chain(['\n']).collect()
 }

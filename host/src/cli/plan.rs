@@ -1,7 +1,7 @@
 //! `dpm plan RIG.toml`: what a rig needs, what is left out, why, how, and what it saves.
 
 use super::rig_args::RigArgs;
-use super::watch::print;
+use super::watch::{check_out, print, write_out};
 use crate::experiments::plan_savings::Saving;
 use crate::experiments::scene_plan::scene_plan;
 use crate::failure::Failure;
@@ -25,9 +25,15 @@ pub struct PlanArgs {
 }
 
 fn saved(s: &Saving) -> String {
+    let [low, high] = s.saved_middle_half_ms;
+    let told = if s.stands_out() { "" } else { ", not told from chance" };
+    let cost = format!(
+        "the part takes {:+.2} ms (middle half of the frames {low:+.2} to {high:+.2}{told})",
+        s.saved_ms
+    );
     if s.changes_pictures {
         return format!(
-            "{:.2} ms and {:.0} rays without, {:.2} ms and {:.0} rays with; pixels differ by {:.1} % RMS",
+            "{:.2} ms and {:.0} rays without, {:.2} ms and {:.0} rays with: {cost}; pixels differ by {:.1} % RMS",
             s.without_ms,
             s.without_rays,
             s.with_ms,
@@ -36,7 +42,7 @@ fn saved(s: &Saving) -> String {
         );
     }
     let same = if s.pixels_identical { "same pixels" } else { "PIXELS DIFFER" };
-    format!("{:.2} ms instead of {:.2} ms, {same}", s.without_ms, s.with_ms)
+    format!("{:.2} ms instead of {:.2} ms: {cost}; {same}", s.without_ms, s.with_ms)
 }
 
 /// Prints the plan.
@@ -44,11 +50,13 @@ fn saved(s: &Saving) -> String {
 /// # Errors
 /// Bad rig file or scene; with `--measure` no GPU, or pixels that differ.
 pub fn execute(args: &PlanArgs) -> Result<(), Failure> {
-    let rig = args.flags.rig(args.rig.as_deref())?;
+    args.flags.refuse("dpm plan", &["--frames", "--seconds", "--no-prediction"])?;
+    let rig = args.flags.rig_at_rest(args.rig.as_deref())?;
+    check_out(args.flags.out.as_deref())?;
     let report = scene_plan(&rig, args.measure)?;
     if args.json {
         print(&(to_json(&report) + "\n"));
-        return Ok(());
+        return write_out(args.flags.out.as_deref(), "plan.json", &report);
     }
     let mut text = String::new();
     report.warnings.iter().for_each(|w| text += &format!("note: {w}\n"));
@@ -68,5 +76,5 @@ pub fn execute(args: &PlanArgs) -> Result<(), Failure> {
         text += &format!("all that is left out and can be put back, together: {}\n", saved(s));
     }
     print(&text);
-    Ok(())
+    write_out(args.flags.out.as_deref(), "plan.json", &report)
 }

@@ -3,15 +3,19 @@
 use super::rig_args::RigArgs;
 use super::watch::{print, watch};
 use crate::experiments::profile::profile_rig;
-use crate::failure::{Failure, FailureKind};
-use crate::telemetry::compare::{compare, to_table};
+use crate::failure::{Ended, Failure, FailureKind};
+use crate::telemetry::compare::{compare, failed_gates, to_table};
 use crate::telemetry::monitor::RunCounts;
 use crate::telemetry::profile::ProfileReport;
 use crate::telemetry::prometheus::{page, PageServer};
+use dpm_device::regular_file;
 use std::path::{Path, PathBuf};
 
 /// Length of a profile without `--seconds` or `--frames`, s.
 const SECONDS: f64 = 10.0;
+
+/// Largest profile.json that is read, bytes; those of a day have some tens of thousands.
+const MAX_PROFILE_BYTES: u64 = 64 << 20;
 
 /// Flags of `dpm profile`.
 #[derive(clap::Args, Clone, Debug)]
@@ -30,7 +34,8 @@ pub struct ProfileArgs {
     /// Serve the figures for Prometheus while running, for example on 127.0.0.1:9473
     #[arg(long, value_name = "ADDR")]
     prometheus: Option<String>,
-    /// Compare two profile.json instead of running: what got better or worse, and whether beyond noise
+    /// Compare two profile.json instead of running: what got better or worse, and whether beyond noise; ends with 1 when more
+    /// slots are missed, or more frames late
     #[arg(long, num_args = 2, value_names = ["A.json", "B.json"], conflicts_with_all = ["rig", "no_render", "prometheus"])]
     compare: Vec<PathBuf>,
 }
@@ -38,17 +43,27 @@ pub struct ProfileArgs {
 /// Profiles a rig, or compares two profiles.
 ///
 /// # Errors
-/// Bad rig file, scene, address or profile; a device that fails.
+/// Bad rig file, scene, address or profile; a device that fails; torn frames; a comparison whose gates got worse.
 pub fn execute(args: &ProfileArgs) -> Result<(), Failure> {
     if let [before, after] = args.compare.as_slice() {
         let (rows, notes) = compare(&read(before)?, &read(after)?);
         print(&to_table(&rows, &notes));
+        let failed = failed_gates(&rows);
+        if !failed.is_empty() {
+            let told = format!(
+                "{} got worse by more than noise: {} against {}",
+                failed.join(" and "),
+                after.display(),
+                before.display()
+            );
+            return Err(Failure::new(FailureKind::CheckFailed, told));
+        }
         return Ok(());
     }
     let mut flags = args.flags.clone();
     // In front, so that an explicit --set wins.
-    let pace = "real_time.pace=\"real\"".to_owned();
-    flags.set.splice(0..0, [pace, "output.images=false".into(), "output.trace=true".into()]);
+    flags.set.splice(0..0, ["output.images=false".into(), "output.trace=true".into()]);
+    flags.pace.get_or_insert_with(|| "real".into());
     flags.out.get_or_insert_with(|| "out/profile".into());
     if flags.frames.is_none() {
         flags.seconds.get_or_insert(SECONDS);
@@ -64,7 +79,7 @@ pub fn execute(args: &ProfileArgs) -> Result<(), Failure> {
         None => None,
     };
     let prepared = args.no_render;
-    let profile = watch(
+    let Ended { report: profile, failure } = watch(
         rig,
         |counts| {
             if let Some(server) = &server {
@@ -74,11 +89,16 @@ pub fn execute(args: &ProfileArgs) -> Result<(), Failure> {
         move |rig, monitor| profile_rig(rig, prepared, monitor),
     )?;
     if let Some(server) = &server {
+        let r = &profile.report;
         let counts = RunCounts {
-            frames_planned: profile.report.frames_lit + profile.report.frames_dropped,
-            frames_lit: profile.report.frames_lit,
-            frames_dropped: profile.report.frames_dropped,
-            frames_late: profile.report.frames_late,
+            frames_planned: r.frames_lit + r.frames_dark + r.frames_dropped + r.frames_withheld,
+            frames_lit: r.frames_lit,
+            frames_dark: r.frames_dark,
+            frames_dropped: r.frames_dropped,
+            frames_withheld: r.frames_withheld,
+            frames_late: r.frames_late,
+            slots: r.slots,
+            slots_missed: r.missed_slots,
         };
         server.show(page(&counts, Some(&profile.profile)));
     }
@@ -91,7 +111,8 @@ pub fn execute(args: &ProfileArgs) -> Result<(), Failure> {
         );
         return Err(Failure::new(FailureKind::CheckFailed, told));
     }
-    Ok(())
+    failure.map_or(Ok(()), Err)?;
+    profile.report.check_lit()
 }
 
 fn read(path: &Path) -> Result<ProfileReport, Failure> {
@@ -101,7 +122,7 @@ fn read(path: &Path) -> Result<ProfileReport, Failure> {
             format!("{}: not a profile.json of dpm profile: {e}", path.display()),
         )
     };
-    let text = std::fs::read_to_string(path).map_err(|e| {
+    let text = regular_file::read_text(path, MAX_PROFILE_BYTES).map_err(|e| {
         let told =
             format!("{}: cannot read it: {e}; give two files profile.json of dpm profile", path.display());
         Failure::new(FailureKind::BadInput, told)

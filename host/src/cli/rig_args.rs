@@ -1,6 +1,7 @@
 //! Flags that every command with a rig takes, into a checked [`RigConfig`].
 
-use crate::config::{Overrides, RigConfig};
+use crate::config::{Overrides, Purpose, RigConfig};
+use crate::control::set_rig_name;
 use crate::failure::{Failure, FailureKind};
 use std::path::{Path, PathBuf};
 
@@ -19,9 +20,17 @@ pub struct RigArgs {
     #[arg(long, value_name = "N", conflicts_with = "seconds")]
     pub frames: Option<u64>,
 
-    /// Rig time to run for, in seconds
+    /// Seconds to run for: of the wall clock at real pace, of the rig's own clock at virtual pace
     #[arg(long, value_name = "S")]
     pub seconds: Option<f64>,
+
+    /// What time is: real, the wall clock, or virtual, a clock that takes as long as the work does
+    #[arg(long, value_name = "PACE", value_parser = ["real", "virtual"])]
+    pub pace: Option<String>,
+
+    /// Run the rig file against the mocks: they take the place of its tracker and its projector, of whatever kind those are
+    #[arg(long)]
+    pub simulate: bool,
 
     /// Show the newest tracker sample as it is
     #[arg(long)]
@@ -57,6 +66,9 @@ impl RigArgs {
         if let Some(frames) = self.frames {
             flags.push(format!("run.frames={frames}"));
         }
+        if let Some(pace) = &self.pace {
+            flags.push(format!("real_time.pace={pace}"));
+        }
         if self.no_prediction {
             flags.push("prediction.on=false".into());
         }
@@ -67,28 +79,72 @@ impl RigArgs {
         Ok(flags)
     }
 
-    /// Reads the rig file `path`, or the demo's when there is none, with the environment and these flags over it.
+    /// Refuses the flags among `meaningless`, by their names in the command line, that `command` would accept and then ignore.
+    ///
+    /// # Errors
+    /// One of them is given.
+    pub fn refuse(&self, command: &str, meaningless: &[&str]) -> Result<(), Failure> {
+        let given = [
+            ("--frames", self.frames.is_some()),
+            ("--seconds", self.seconds.is_some()),
+            ("--pace", self.pace.is_some()),
+            ("--no-prediction", self.no_prediction),
+            ("--out", self.out.is_some()),
+        ];
+        match given.iter().find(|(flag, given)| *given && meaningless.contains(flag)) {
+            None => Ok(()),
+            Some((flag, _)) => {
+                let told =
+                    format!("{flag} means nothing to {command}: leave it out; --help lists what it takes");
+                Err(Failure::new(FailureKind::BadInput, told))
+            }
+        }
+    }
+
+    /// Reads the rig file `path`, or the demo's when there is none, for a run: with the environment and these flags over it.
     ///
     /// # Errors
     /// Every mistake in file, environment and flags.
     pub fn rig(&self, path: Option<&Path>) -> Result<RigConfig, Failure> {
-        let read = |flags: Vec<String>| {
+        self.rig_for(path, false)
+    }
+
+    /// The same for a command that runs nothing, or as many frames as it knows itself: what the file says about the end of a run does not matter to it.
+    ///
+    /// # Errors
+    /// As [`RigArgs::rig`].
+    pub fn rig_at_rest(&self, path: Option<&Path>) -> Result<RigConfig, Failure> {
+        self.rig_for(path, true)
+    }
+
+    fn rig_for(&self, path: Option<&Path>, at_rest: bool) -> Result<RigConfig, Failure> {
+        // Whoever gives orders to this process is told which rig it is.
+        path.into_iter().for_each(set_rig_name);
+        let read = |flags: Vec<String>, at_rest: bool| {
             let overrides = Overrides::from_environment(flags);
+            let purpose = Purpose { simulate: self.simulate, at_rest };
             match path {
-                Some(path) => RigConfig::load(path, &overrides),
-                None => RigConfig::demo(&overrides),
+                Some(path) => RigConfig::load_for(path, &overrides, purpose),
+                None => RigConfig::demo_for(&overrides, purpose),
             }
         };
-        let flags = self.flags()?;
-        let Some(seconds) = self.seconds else { return Ok(read(flags)?) };
+        let mut flags = self.flags()?;
+        if self.raster.is_some() {
+            // A calibration counts the pixels of the raster that the file says. Only without the flag is that to be seen.
+            let without = Self { raster: None, ..self.clone() }.flags()?;
+            let calibrated = read(without, true).ok().map(|rig| rig.projector);
+            if let Some(p) = calibrated.filter(|p| p.calibration.is_some() && p.calibration_raster.is_none())
+            {
+                flags.insert(0, format!("projector.calibration_raster=[{}, {}]", p.width, p.height));
+            }
+        }
+        let Some(seconds) = self.seconds else { return Ok(read(flags, at_rest)?) };
         if !(seconds > 0.0 && seconds <= 1e9) {
             let told = format!("--seconds {seconds:?}: must be above 0 and at most 1e9");
             return Err(Failure::new(FailureKind::BadInput, told));
         }
-        // How many frames a time is only the rate tells, which may itself come from the file or a flag.
-        let probe = read([flags.clone(), vec!["run.frames=1".into()]].concat())?;
-        let frames = probe.projector.frame_rate.slot_at_ns((seconds * 1e9) as i64).max(1);
-        Ok(read([flags, vec![format!("run.frames={frames}")]].concat())?)
+        flags.extend(["run.frames=0".to_owned(), format!("run.seconds={seconds:?}")]);
+        Ok(read(flags, at_rest)?)
     }
 }
 
@@ -100,6 +156,7 @@ fn number(text: &str) -> Option<u64> {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::config::{ProjectorBackend, TrackerConfig};
 
     fn rig(change: impl FnOnce(&mut RigArgs)) -> Result<RigConfig, Failure> {
         let mut args = RigArgs::default();
@@ -123,15 +180,68 @@ mod tests {
         assert_eq!(rig.output.dir, Path::new("a \"b\""));
     }
 
+    /// Found in use, O9: `--seconds` counted frames, so a slow renderer ran for any time. Seconds are slots, whatever is made of them.
     #[test]
-    fn seconds_become_frames_at_the_rigs_own_rate() {
-        assert_eq!(rig(|a| a.seconds = Some(1.0)).unwrap().run.frames, 947);
-        let slow = rig(|a| {
-            a.seconds = Some(10.0);
-            a.set = vec!["projector.frame_rate=\"60000/1001\"".into()];
-        });
-        assert_eq!(slow.unwrap().run.frames, 599);
-        assert_eq!(rig(|a| a.seconds = Some(1e-9)).unwrap().run.frames, 1);
+    fn seconds_become_slots_at_the_rigs_own_rate() {
+        let slots = |seconds: f64, set: &[&str]| {
+            let rig = rig(|a| {
+                a.seconds = Some(seconds);
+                a.set = set.iter().map(|s| (*s).to_owned()).collect();
+            })
+            .unwrap();
+            assert_eq!(rig.run.frames, 0, "the demo's own number of frames does not end the run");
+            rig.slots_to_run()
+        };
+        assert_eq!(slots(1.0, &[]), 947);
+        assert_eq!(slots(10.0, &["projector.frame_rate=\"60000/1001\""]), 599);
+        assert_eq!(slots(1e-9, &[]), 1);
+        assert_eq!(slots(3.0, &["real_time.pace=real"]), 2841);
+        assert_eq!(rig(|_| {}).unwrap().slots_to_run(), 0);
+    }
+
+    /// Found in use, O11: a rig file with real devices could not be tried without them. Its keys are still checked.
+    #[test]
+    fn any_rig_can_be_simulated() {
+        let dir = std::env::temp_dir().join(format!("dpm-simulate-{}", std::process::id()));
+        std::fs::create_dir_all(&dir).unwrap();
+        let path = dir.join("rig.toml");
+        let real = "[projector.backend]\nkind = \"usb\"\nserial_number = \"7\"\n[tracker]\nkind = \"natnet\"\nserver = \"10.0.0.9\"\nrate_hz = 240\n\
+                    [[scene.bodies]]\nname = \"bunny\"\n[[scene.bodies]]\nname = \"venus\"\n";
+        std::fs::write(&path, real).unwrap();
+        let read = |change: fn(&mut RigArgs)| {
+            let mut args = RigArgs { frames: Some(4), ..RigArgs::default() };
+            change(&mut args);
+            args.rig(Some(&path)).map_err(|f| f.message)
+        };
+        let told = read(|a| a.pace = Some("virtual".into())).unwrap_err();
+        assert!(told.contains("natnet") && told.contains("usb"), "{told}");
+        for pace in ["real", "virtual"] {
+            let mut args =
+                RigArgs { simulate: true, frames: Some(4), pace: Some(pace.into()), ..RigArgs::default() };
+            let rig = args.rig(Some(&path)).unwrap();
+            assert!(matches!(&rig.tracker, TrackerConfig::Mock(mock) if mock.rate_hz == 240));
+            assert!(matches!(rig.projector.backend, ProjectorBackend::Mock(_)));
+            assert_eq!(rig.real_time.pace.word(), pace);
+            args.set = vec!["scene.bodies.0.motion={kind=\"still\"}".into()];
+            args.rig(Some(&path)).unwrap();
+            args.set = vec!["tracker.server=\"nowhere\"".into()];
+            assert!(args.rig(Some(&path)).unwrap_err().message.contains("tracker.server"));
+        }
+        // What runs nothing needs no end.
+        let still = RigArgs { simulate: true, pace: Some("virtual".into()), ..RigArgs::default() };
+        assert!(still.rig(Some(&path)).unwrap_err().message.contains("never end"));
+        assert_eq!(still.rig_at_rest(Some(&path)).unwrap().run.frames, 0);
+        std::fs::remove_dir_all(dir).unwrap();
+    }
+
+    /// Found in use, a sibling of R13: flags that a command accepted and ignored.
+    #[test]
+    fn flags_without_a_meaning_are_refused_by_name() {
+        let args = RigArgs { seconds: Some(1.0), ..RigArgs::default() };
+        let told = args.refuse("dpm bench", &["--frames", "--seconds"]).unwrap_err();
+        assert!(told.message.contains("--seconds") && told.message.contains("dpm bench"), "{}", told.message);
+        assert_eq!(told.kind.exit_code(), 2);
+        args.refuse("dpm bench", &["--frames", "--out"]).unwrap();
     }
 
     #[test]

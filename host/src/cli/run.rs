@@ -1,7 +1,8 @@
 //! `dpm run RIG.toml` and `dpm demo`: the rig from its file to light.
 
+use super::dlpc900::Guard;
 use super::rig_args::RigArgs;
-use super::watch::{print, run_and_report, watch};
+use super::watch::{check_out, print, run_and_report, watch, write_out};
 use crate::config::ProjectorBackend;
 use crate::experiments::run_dlpc900::run_dlpc900;
 use crate::experiments::run_rig::run_rig;
@@ -50,10 +51,22 @@ pub fn execute_demo(args: &DemoArgs) -> Result<(), Failure> {
 
 fn start(path: Option<&Path>, flags: &RigArgs, json: bool) -> Result<(), Failure> {
     let rig = flags.rig(path)?;
-    if matches!(rig.projector.backend, ProjectorBackend::Dlpc900(_)) {
-        let report = watch(rig, |_| {}, |rig, monitor| run_dlpc900(rig, monitor))?;
+    if let ProjectorBackend::Dlpc900(backend) = &rig.projector.backend {
+        check_out(flags.out.as_deref())?;
+        let device = backend.device.clone();
+        let report = watch(
+            rig,
+            |_| {},
+            move |rig, monitor| {
+                // Not before this instance has the controller's lock. A panic leaves without a word, as a SIGKILL does.
+                let guard = Guard::start(device.as_deref());
+                let result = run_dlpc900(rig, monitor);
+                guard.dismiss();
+                result
+            },
+        )?;
         print(&if json { to_json(&report) + "\n" } else { report.to_table() });
-        return Ok(());
+        return write_out(flags.out.as_deref(), "report.json", &report);
     }
     run_and_report(rig, json, run_rig)
 }

@@ -31,7 +31,8 @@ pub struct SnapshotArgs {
 /// # Errors
 /// Bad rig file or scene, no GPU.
 pub fn execute(args: &SnapshotArgs) -> Result<(), Failure> {
-    let rig = args.flags.rig(args.rig.as_deref())?;
+    args.flags.refuse("dpm snapshot", &["--frames", "--seconds", "--no-prediction"])?;
+    let rig = args.flags.rig_at_rest(args.rig.as_deref())?;
     let dir = args.flags.out.clone().unwrap_or_else(|| rig.output.dir.join("snapshot"));
     let report = snapshot(&rig, args.frame, &args.what, &dir)?;
     if args.json {

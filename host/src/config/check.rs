@@ -1,11 +1,33 @@
 //! Contradictions between keys: each named at the key that somebody wrote, with what would resolve it.
 
-use super::read::Reader;
+use super::read::{ConfigValue, Reader};
 use super::world::{EnvironmentConfig, GazeConfig, TrackerConfig};
-use super::{Pace, ProjectorBackend, RigConfig};
-use hil_mock::faults::FaultPlan;
+use super::{Pace, ProjectorBackend, Purpose, RigConfig};
+use dpm_device::regular_file;
+use hil_mock::faults::{FaultKind, FaultPlan};
+use hil_mock::projector::FaultyProjector;
 use hil_mock::tracker::TRACKER_FAULTS;
+use std::collections::HashMap;
 use std::path::{Path, PathBuf};
+
+/// Most bodies that a rig tracks. It is the number of poses that a snapshot of the tracks has room for, and that of the bodies which the renderer tells apart.
+const MAX_TRACKED: usize = 256;
+
+/// Refuses several keys that contradict each other, at the first of them that somebody wrote. The message names all of them with their values, whichever it
+/// stands at: nobody must guess which other key takes part. Those with an empty value are named by `problem`.
+fn contradict(reader: &mut Reader, keys: &[(&str, String)], problem: &str, remedy: String) {
+    let at = keys.iter().position(|(key, _)| reader.is_written(key)).unwrap_or(0);
+    let (key, value) = &keys[at];
+    let others = keys.iter().enumerate().filter(|(i, _)| *i != at);
+    let others: Vec<String> = others.map(|(_, (key, value))| format!("`{key}` = {value}")).collect();
+    let origin = reader.origin_of(key);
+    reader.refuse(&origin, key, format!("is {value}, with {}: {problem}", others.join(" and ")), remedy);
+}
+
+/// A value as the rig file would say it.
+fn shown(value: impl ConfigValue) -> String {
+    value.show()
+}
 
 /// Refuses at the first of `keys` that somebody wrote.
 fn refuse(reader: &mut Reader, keys: &[&str], problem: String, remedy: String) {
@@ -14,16 +36,17 @@ fn refuse(reader: &mut Reader, keys: &[&str], problem: String, remedy: String) {
     reader.refuse(&origin, key, problem, remedy);
 }
 
-pub(super) fn check(rig: &RigConfig, reader: &mut Reader) {
+pub(super) fn check(rig: &RigConfig, purpose: Purpose, reader: &mut Reader) {
     projector(rig, reader);
     bodies(rig, reader);
     render(rig, reader);
-    time(rig, reader);
+    time(rig, purpose, reader);
     faults(rig, reader);
     addresses(rig, reader);
+    super::safety::check(rig, reader);
 }
 
-fn addresses(rig: &RigConfig, reader: &mut Reader) {
+pub(super) fn addresses(rig: &RigConfig, reader: &mut Reader) {
     let TrackerConfig::Natnet(natnet) = &rig.tracker else { return };
     let multicast = natnet.multicast.as_deref();
     let named =
@@ -52,17 +75,17 @@ fn addresses(rig: &RigConfig, reader: &mut Reader) {
 }
 
 fn faults(rig: &RigConfig, reader: &mut Reader) {
-    if let TrackerConfig::Mock(mock) = &rig.tracker {
-        let plan = mock.faults.parse::<FaultPlan>();
-        let known = plan.and_then(|plan| plan.check_supported(&TRACKER_FAULTS, "the mock tracker"));
-        if let Err(e) = known {
-            refuse(
-                reader,
-                &["tracker.faults"],
-                e.to_string(),
-                "for example \"loss=0.01,dropout@1.5s+20ms\"".into(),
-            );
+    let mut check = |key: &str, text: &str, known: &[FaultKind], mock| {
+        let plan = text.parse::<FaultPlan>().and_then(|plan| plan.check_supported(known, mock));
+        if let Err(e) = plan {
+            refuse(reader, &[key], e.to_string(), "for example \"loss=0.01,dropout@1.5s+20ms\"".into());
         }
+    };
+    if let TrackerConfig::Mock(mock) = &rig.tracker {
+        check("tracker.faults", &mock.faults, &TRACKER_FAULTS, "the mock tracker");
+    }
+    if let ProjectorBackend::Mock(mock) = &rig.projector.backend {
+        check("projector.backend.faults", &mock.faults, &FaultyProjector::KNOWN, "the mock projector");
     }
 }
 
@@ -71,15 +94,16 @@ fn projector(rig: &RigConfig, reader: &mut Reader) {
     let (num, den) = (u64::from(p.frame_rate.num()), u64::from(p.frame_rate.den()));
     if num * u64::from(p.planes) > u64::from(p.max_planes_per_second) * den {
         let most = p.max_planes_per_second / p.planes.max(1);
-        refuse(
+        contradict(
             reader,
-            &["projector.frame_rate", "projector.planes", "projector.max_planes_per_second"],
-            format!(
-                "{:.3} frames/s of {} planes are {:.0} planes/s, the projector shows {}",
-                p.frame_rate.hz(),
-                p.planes,
-                p.frame_rate.hz() * f64::from(p.planes),
-                p.max_planes_per_second
+            &[
+                ("projector.frame_rate", shown(p.frame_rate)),
+                ("projector.planes", shown(p.planes)),
+                ("projector.max_planes_per_second", shown(p.max_planes_per_second)),
+            ],
+            &format!(
+                "{:.0} planes/s are more than the projector shows",
+                p.frame_rate.hz() * f64::from(p.planes)
             ),
             format!("at most {most} frames/s of {} planes", p.planes),
         );
@@ -108,17 +132,21 @@ fn projector(rig: &RigConfig, reader: &mut Reader) {
         let view = glam::DVec3::from(p.look_at) - glam::DVec3::from(p.position);
         let up = glam::DVec3::from(p.up);
         if view.length() < 1e-6 {
-            refuse(
+            contradict(
                 reader,
-                &["projector.look_at", "projector.position"],
-                "the projector looks at the point where it stands".into(),
-                "move `look_at` into the scene".into(),
+                &[("projector.look_at", shown(p.look_at)), ("projector.position", shown(p.position))],
+                "the projector looks at the point where it stands",
+                "move `projector.look_at` into the scene".into(),
             );
         } else if up.length() < 1e-9 || view.normalize().cross(up.normalize()).length() < 1e-6 {
-            refuse(
+            contradict(
                 reader,
-                &["projector.up", "projector.look_at", "projector.position"],
-                "is zero or along the view, so the picture has no upper side".into(),
+                &[
+                    ("projector.up", shown(p.up)),
+                    ("projector.look_at", shown(p.look_at)),
+                    ("projector.position", shown(p.position)),
+                ],
+                "up is zero or along the view, so the picture has no upper side",
                 "use a direction across the view, for example [0, 0, -1] when looking down".into(),
             );
         }
@@ -126,13 +154,16 @@ fn projector(rig: &RigConfig, reader: &mut Reader) {
     if let ProjectorBackend::Dlpc900(dlpc900) = &p.backend {
         let panel = dlpc900.panel.dmd().raster();
         if (p.width, p.height) != (panel.width(), panel.height()) {
-            refuse(
+            contradict(
                 reader,
-                &["projector.width", "projector.height", "projector.backend.panel", "projector.backend.kind"],
-                format!(
-                    "{} x {}: a {} has {} x {} mirrors",
-                    p.width,
-                    p.height,
+                &[
+                    ("projector.width", shown(p.width)),
+                    ("projector.height", shown(p.height)),
+                    ("projector.backend.panel", shown(dlpc900.panel)),
+                    ("projector.backend.kind", format!("{:?}", p.backend.word())),
+                ],
+                &format!(
+                    "a {} has {} x {} mirrors",
                     dlpc900.panel.dmd().name(),
                     panel.width(),
                     panel.height()
@@ -142,10 +173,13 @@ fn projector(rig: &RigConfig, reader: &mut Reader) {
         }
     }
     if matches!(p.backend, ProjectorBackend::Dlpc900(_)) && num > 120 * den {
-        refuse(
+        contradict(
             reader,
-            &["projector.frame_rate", "projector.backend.kind"],
-            format!("{:.3} frames/s: a DLPC900 shows at most 120 frames/s of 24 planes", p.frame_rate.hz()),
+            &[
+                ("projector.frame_rate", shown(p.frame_rate)),
+                ("projector.backend.kind", format!("{:?}", p.backend.word())),
+            ],
+            "a DLPC900 shows at most 120 frames/s of 24 planes",
             "lower `projector.frame_rate` to 120 or choose another backend".into(),
         );
     }
@@ -153,48 +187,52 @@ fn projector(rig: &RigConfig, reader: &mut Reader) {
 
 fn bodies(rig: &RigConfig, reader: &mut Reader) {
     let bodies = &rig.scene.bodies;
+    let (mut names, mut nodes, mut ids) = (HashMap::new(), HashMap::new(), HashMap::new());
     for (i, body) in bodies.iter().enumerate() {
         let key = format!("scene.bodies.{i}");
         if body.name.is_empty() && !reader.is_written(&format!("{key}.name")) {
             refuse(reader, &[&key], "has no `name`".into(), "add the name that the tracker reports".into());
             continue;
         }
-        let earlier = &bodies[..i];
-        if earlier.iter().any(|b| b.name == body.name) {
-            refuse(
-                reader,
-                &[&format!("{key}.name")],
-                format!("two bodies are called {:?}", body.name),
-                String::new(),
-            );
+        if let Some(other) = names.get(body.name.as_str()) {
+            let told = format!("two bodies are called {:?}, this one and `scene.bodies.{other}`", body.name);
+            refuse(reader, &[&format!("{key}.name")], told, String::new());
         }
-        if earlier.iter().any(|b| b.node_name() == body.node_name()) {
-            refuse(
-                reader,
-                &[&format!("{key}.node"), &key],
-                format!("two bodies move the node {:?}", body.node_name()),
-                "give each its own node".into(),
+        if let Some(other) = nodes.get(body.node_name()) {
+            let told = format!(
+                "two bodies move the node {:?}, this one and `scene.bodies.{other}`",
+                body.node_name()
             );
+            refuse(reader, &[&format!("{key}.node"), &key], told, "give each its own node".into());
         }
-        if body.id.is_some() && earlier.iter().any(|b| b.id == body.id) {
+        if let Some((id, other)) = body.id.and_then(|id| Some((id, ids.get(&id)?))) {
             refuse(
                 reader,
                 &[&format!("{key}.id")],
-                "two bodies have the same id".into(),
+                format!("two bodies have the same id {id}, this one and `scene.bodies.{other}`"),
                 "every body needs the id that the tracker gives it".into(),
             );
         }
+        names.entry(body.name.as_str()).or_insert(i);
+        nodes.entry(body.node_name()).or_insert(i);
+        body.id.map(|id| ids.entry(id).or_insert(i));
         if body.motion.0.is_some() && !matches!(rig.tracker, TrackerConfig::Mock(_)) {
             refuse(
                 reader,
                 &[&format!("{key}.motion")],
-                format!("the poses come from the tracker of kind {:?}", rig.tracker.word()),
-                "remove it, or set tracker.kind = \"mock\"".into(),
+                format!("is given, with `tracker.kind` = {:?}, which tells the poses", rig.tracker.word()),
+                "remove it, set tracker.kind = \"mock\", or try the rig with --simulate".into(),
             );
         }
     }
-    if bodies.len() > usize::from(u16::MAX) {
-        refuse(reader, &["scene.bodies"], "more bodies than can be numbered".into(), String::new());
+    if let Some(first) = bodies.get(MAX_TRACKED) {
+        let count = bodies.len();
+        let problem = format!(
+            "has {count} bodies, {} more than the {MAX_TRACKED} that are tracked: {:?} is the first of them",
+            count - MAX_TRACKED,
+            first.name
+        );
+        refuse(reader, &["scene.bodies"], problem, "bodies that move as one can be one body".into());
     }
     let mut must_exist = |key: &str, name: &str| {
         if !bodies.iter().any(|b| b.name == name) {
@@ -213,7 +251,7 @@ fn bodies(rig: &RigConfig, reader: &mut Reader) {
         refuse(
             reader,
             &["scene.builtin"],
-            "is given together with `scene.file`".into(),
+            "is given together with `scene.file`, which takes its place".into(),
             "remove one of the two".into(),
         );
     }
@@ -221,7 +259,7 @@ fn bodies(rig: &RigConfig, reader: &mut Reader) {
         refuse(
             reader,
             &["observer.eye_offset"],
-            "needs a body to be measured from".into(),
+            "is given without `observer.body`, the body that it is measured from".into(),
             "set `observer.body`, or put the eye at `observer.position`".into(),
         );
     }
@@ -231,11 +269,12 @@ fn render(rig: &RigConfig, reader: &mut Reader) {
     let paper = &rig.render.paper;
     let mut ascending = |low: (&str, f64), high: (&str, f64)| {
         if low.1 > high.1 {
-            refuse(
+            let [a, b] = [low.0, high.0].map(|key| format!("render.paper.{key}"));
+            contradict(
                 reader,
-                &[&format!("render.paper.{}", low.0), &format!("render.paper.{}", high.0)],
-                format!("`{}` is {}, beyond `{}` = {}", low.0, low.1, high.0, high.1),
-                "the first must not be larger".into(),
+                &[(&a, shown(low.1)), (&b, shown(high.1))],
+                &format!("`{a}` is the larger of the two"),
+                format!("it must be at most `{b}`"),
             );
         }
     };
@@ -243,7 +282,7 @@ fn render(rig: &RigConfig, reader: &mut Reader) {
     ascending(("filter_from_deg", paper.filter_from_deg), ("filter_to_deg", paper.filter_to_deg));
 }
 
-fn time(rig: &RigConfig, reader: &mut Reader) {
+fn time(rig: &RigConfig, purpose: Purpose, reader: &mut Reader) {
     if rig.real_time.pace == Pace::Virtual {
         if !matches!(rig.projector.backend, ProjectorBackend::Mock(_)) {
             refuse(
@@ -261,7 +300,7 @@ fn time(rig: &RigConfig, reader: &mut Reader) {
                 "use real_time.pace = \"real\"".into(),
             );
         }
-        if rig.run.frames == 0 {
+        if rig.run.frames == 0 && rig.run.seconds <= 0.0 && !purpose.at_rest {
             refuse(
                 reader,
                 &["real_time.pace", "run.frames"],
@@ -276,39 +315,62 @@ fn time(rig: &RigConfig, reader: &mut Reader) {
         let problem = format!("core {last} is none of 0 to 1023");
         refuse(reader, &["real_time.affinity"], problem, String::new());
     }
-    let frame_ms = 1e3 / rig.projector.frame_rate.hz();
+    horizon(rig, reader);
+}
+
+/// Times in `[safety]` and `[output]` that somebody wrote, against the frame's and the tracker's. What nobody wrote follows these by itself, so
+/// each problem names the key that was written first.
+fn horizon(rig: &RigConfig, reader: &mut Reader) {
+    let (frame_ms, rate) = (rig.frame_ms(), rig.projector.frame_rate.hz());
     // A DLPC900 has no watchdog.
     let has_watchdog = !matches!(rig.projector.backend, ProjectorBackend::Dlpc900(_));
-    if has_watchdog && f64::from(rig.safety.watchdog_ms) < 2.0 * frame_ms {
+    if let Some(ms) = rig.safety.watchdog_ms.filter(|ms| has_watchdog && f64::from(*ms) < 2.0 * frame_ms) {
         refuse(
             reader,
-            &["safety.watchdog_ms", "projector.frame_rate"],
+            &["safety.watchdog_ms"],
             format!(
-                "{} ms is less than two frames of {frame_ms:.3} ms: the projector would go dark in between",
-                rig.safety.watchdog_ms
+                "safety.watchdog_ms = {ms} is less than two frames of {frame_ms:.3} ms (projector.frame_rate = {rate:.3}): the projector \
+                 would go dark in between"
             ),
-            format!("at least {:.0} ms", (2.0 * frame_ms).ceil()),
+            format!("leave it out, or write at least {:.0} ms", (2.0 * frame_ms).ceil()),
         );
     }
-    if rig.output.light_window_ms < frame_ms {
+    if let Some(ms) = rig.output.light_window_ms.filter(|ms| *ms < frame_ms) {
         refuse(
             reader,
-            &["output.light_window_ms", "projector.frame_rate"],
-            format!("{} ms is shorter than one frame of {frame_ms:.3} ms", rig.output.light_window_ms),
-            String::new(),
+            &["output.light_window_ms"],
+            format!(
+                "output.light_window_ms = {ms} is shorter than one frame of {frame_ms:.3} ms (projector.frame_rate = {rate:.3})"
+            ),
+            format!("leave it out, or write at least {frame_ms:.3} ms"),
         );
     }
+    let Some(predict_ms) = rig.safety.predict_ms else { return };
     if let Some(rate) = rig.tracker.rate_hz() {
         let period_ms = 1e3 / f64::from(rate);
-        let predict_ms = f64::from(rig.safety.predict_ms);
-        if predict_ms < 2.0 * period_ms {
+        if f64::from(predict_ms) < 2.0 * period_ms {
             refuse(
                 reader,
-                &["safety.predict_ms", "tracker.rate_hz"],
-                format!("{predict_ms} ms is less than two samples at {rate} Hz: every lost sample would blank the picture"),
-                format!("at least {:.0} ms", (2.0 * period_ms).ceil()),
+                &["safety.predict_ms"],
+                format!(
+                    "safety.predict_ms = {predict_ms} is less than two samples at tracker.rate_hz = {rate}: every lost sample would blank the \
+                     picture"
+                ),
+                format!("leave it out, or write at least {:.0} ms", (2.0 * period_ms).ceil()),
             );
         }
+    }
+    // Light cannot fall before the middle of the slot after the one in which the newest sample arrived.
+    if f64::from(predict_ms) < 1.5 * frame_ms {
+        refuse(
+            reader,
+            &["safety.predict_ms"],
+            format!(
+                "safety.predict_ms = {predict_ms} is less than a frame and a half of {frame_ms:.3} ms (projector.frame_rate = {rate:.3}): \
+                 every frame would be dark"
+            ),
+            format!("leave it out, or write at least {:.0} ms and what rendering takes", (1.5 * frame_ms).ceil()),
+        );
     }
 }
 
@@ -319,9 +381,8 @@ pub(super) fn resolve_files(rig: &mut RigConfig, base: &Path, reader: &mut Reade
         if path.is_relative() && matches!(reader.origin_of(key), super::Origin::File { .. }) {
             *path = base.join(&*path);
         }
-        let problem = match std::fs::metadata(&*path) {
-            Ok(meta) if meta.is_file() => return,
-            Ok(_) => format!("{} is not a file", path.display()),
+        let problem = match regular_file::open(path) {
+            Ok(_) => return,
             Err(e) => format!("{}: {e}", path.display()),
         };
         let in_file = matches!(reader.origin_of(key), super::Origin::File { .. });

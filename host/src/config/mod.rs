@@ -10,6 +10,7 @@ mod error;
 mod projector;
 mod read;
 mod run;
+mod safety;
 mod source;
 mod world;
 
@@ -20,10 +21,15 @@ pub use error::{ConfigError, ConfigErrors, Origin};
 pub use projector::*;
 pub use read::KeyDoc;
 pub use run::*;
+pub use safety::{
+    InterlockConfig, InterlockSignal, KeyInterlockConfig, LimitsConfig, LineInterlockConfig,
+    NoInterlockConfig, ProcessInterlockConfig,
+};
 pub use source::VARIABLE_PREFIX;
 pub use world::*;
 
 use declare::section;
+use dpm_device::regular_file;
 use hil_mock::motion::MotionSpec;
 use read::{Any, ConfigValue, Reader};
 use std::path::Path;
@@ -104,13 +110,75 @@ impl Overrides {
     }
 }
 
+/// Shortest watchdog, and shortest time over which an eye adds up light, of a rig that names none, milliseconds.
+const DEFAULT_WATCHDOG_MS: u32 = 50;
+const DEFAULT_LIGHT_WINDOW_MS: f64 = 33.0;
+
+/// What a rig file is read for.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub struct Purpose {
+    /// The mocks stand in for tracker and projector, of whatever kind they are: see [`RigConfig::simulate`].
+    pub simulate: bool,
+    /// Nothing runs: neither `run.frames` nor `run.seconds` must say when it ends.
+    pub at_rest: bool,
+}
+
 impl RigConfig {
+    /// Length of a frame, milliseconds.
+    pub fn frame_ms(&self) -> f64 {
+        1e3 / self.projector.frame_rate.hz()
+    }
+
+    /// Silence after which the projector goes dark by itself, microseconds: what `safety.watchdog_ms` says, else 50 ms or three frames,
+    /// whichever is longer.
+    pub fn watchdog_us(&self) -> u32 {
+        let three_frames = (3.0 * self.frame_ms()).ceil() as u32;
+        let ms = self.safety.watchdog_ms.unwrap_or(DEFAULT_WATCHDOG_MS.max(three_frames));
+        ms.saturating_mul(1000).min(dpm_device::link::MAX_WATCHDOG_US)
+    }
+
+    /// Time over which an eye adds up light in pictures, milliseconds: what `output.light_window_ms` says, else 33 ms or a frame,
+    /// whichever is longer.
+    pub fn light_window_ms(&self) -> f64 {
+        self.output.light_window_ms.unwrap_or(DEFAULT_LIGHT_WINDOW_MS.max(self.frame_ms()))
+    }
+
+    /// Puts the mocks in the place of a tracker and a projector that are real ones (or a recording). The mock tracker reports as often as
+    /// the real one is said to, and moves bodies by `scene.bodies[].motion`, or as it does when that is left out.
+    pub fn simulate(&mut self) {
+        if !matches!(self.tracker, TrackerConfig::Mock(_)) {
+            let default = MockTrackerConfig::default();
+            let rate_hz = self.tracker.rate_hz().unwrap_or(default.rate_hz);
+            self.tracker = TrackerConfig::Mock(MockTrackerConfig { rate_hz, ..default });
+        }
+        if !matches!(self.projector.backend, ProjectorBackend::Mock(_)) {
+            self.projector.backend = ProjectorBackend::default();
+        }
+    }
+
+    /// Slots that `run.seconds` comes to, at least one; 0 where it sets no limit.
+    pub fn slots_to_run(&self) -> u64 {
+        if self.run.seconds > 0.0 {
+            self.projector.frame_rate.slot_at_ns((self.run.seconds * 1e9) as i64).max(1)
+        } else {
+            0
+        }
+    }
+
     /// Reads a rig file of at most [`MAX_FILE_BYTES`].
     ///
     /// # Errors
     /// Every mistake at once: unreadable file, syntax, unknown keys, wrong types, values out of range, contradictions,
     /// input files that are not there.
     pub fn load(path: &Path, overrides: &Overrides) -> Result<Self, ConfigErrors> {
+        Self::load_for(path, overrides, Purpose::default())
+    }
+
+    /// Like [`RigConfig::load`], for a purpose.
+    ///
+    /// # Errors
+    /// As [`RigConfig::load`].
+    pub fn load_for(path: &Path, overrides: &Overrides, purpose: Purpose) -> Result<Self, ConfigErrors> {
         let unreadable = |e: std::io::Error| {
             // A path from the manual, given elsewhere than at the top of the sources, is the most frequent mistake.
             let here = std::env::current_dir().ok().filter(|_| path.is_relative());
@@ -120,16 +188,15 @@ impl RigConfig {
                 format!("{from}give the path of a rig file, for example rigs/demo.toml in dpm's sources");
             ConfigErrors::unreadable(path, format!("cannot read the rig file: {e}"), &remedy)
         };
-        let file = std::fs::File::open(path).map_err(unreadable)?;
-        let mut text = String::new();
-        std::io::Read::read_to_string(&mut std::io::Read::take(file, MAX_FILE_BYTES + 1), &mut text)
-            .map_err(unreadable)?;
-        if text.len() as u64 > MAX_FILE_BYTES {
-            let problem = format!("the rig file has more than {MAX_FILE_BYTES} bytes");
-            return Err(ConfigErrors::unreadable(path, problem, "is it a scene? give that by --scene"));
-        }
+        let text = match regular_file::read_text(path, MAX_FILE_BYTES) {
+            Err(e) if e.kind() == std::io::ErrorKind::FileTooLarge => {
+                let problem = format!("the rig file has more than {MAX_FILE_BYTES} bytes");
+                return Err(ConfigErrors::unreadable(path, problem, "is it a scene? give that by --scene"));
+            }
+            read => read.map_err(unreadable)?,
+        };
         let base = path.parent().unwrap_or(Path::new(""));
-        Self::parse(&path.display().to_string(), &text, base, overrides)
+        Self::parse_for(&path.display().to_string(), &text, base, overrides, purpose)
     }
 
     /// The rig that `dpm demo` runs.
@@ -137,7 +204,15 @@ impl RigConfig {
     /// # Errors
     /// Mistakes in `overrides`, all at once.
     pub fn demo(overrides: &Overrides) -> Result<Self, ConfigErrors> {
-        Self::parse("rigs/demo.toml", DEMO_RIG, Path::new(""), overrides)
+        Self::demo_for(overrides, Purpose::default())
+    }
+
+    /// Like [`RigConfig::demo`], for a purpose.
+    ///
+    /// # Errors
+    /// As [`RigConfig::demo`].
+    pub fn demo_for(overrides: &Overrides, purpose: Purpose) -> Result<Self, ConfigErrors> {
+        Self::parse_for("rigs/demo.toml", DEMO_RIG, Path::new(""), overrides, purpose)
     }
 
     /// Reads a rig file's text. `name` stands in messages; input files are relative to `base`.
@@ -145,6 +220,20 @@ impl RigConfig {
     /// # Errors
     /// As [`RigConfig::load`].
     pub fn parse(name: &str, text: &str, base: &Path, overrides: &Overrides) -> Result<Self, ConfigErrors> {
+        Self::parse_for(name, text, base, overrides, Purpose::default())
+    }
+
+    /// Like [`RigConfig::parse`], for a purpose.
+    ///
+    /// # Errors
+    /// As [`RigConfig::load`].
+    pub fn parse_for(
+        name: &str,
+        text: &str,
+        base: &Path,
+        overrides: &Overrides,
+        purpose: Purpose,
+    ) -> Result<Self, ConfigErrors> {
         let mut reader = Reader::default();
         let mut root = source::parse(name, text, &mut reader.errors);
         if !reader.errors.is_empty() {
@@ -156,7 +245,12 @@ impl RigConfig {
         let mut rig = rig.unwrap_or_default();
         // What is wrong by itself would be reported again as a contradiction.
         if reader.errors.is_empty() {
-            check::check(&rig, &mut reader);
+            if purpose.simulate {
+                // The keys of the real parts are not used, and still must make sense.
+                check::addresses(&rig, &mut reader);
+                rig.simulate();
+            }
+            check::check(&rig, purpose, &mut reader);
             check::resolve_files(&mut rig, base, &mut reader);
         }
         if reader.errors.is_empty() {

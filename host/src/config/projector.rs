@@ -19,8 +19,8 @@ section! {
         /// Frames a second, a whole number or a fraction written as a string, for example "60000/1001". Change it to what the
         /// projector is driven at.
         frame_rate: FrameRate = FrameRate::new(947, 1).expect("not zero"), "frames/s", Within(Rate(1, 1), Rate(100_000, 1));
-        /// Bit planes in a frame: 24 is eight bits of red, green and blue, 8 is eight bits of one white channel. Eight planes
-        /// leave a monochrome rig three times the frame rate.
+        /// Bit planes in a frame: 24 is eight bits of red, green and blue, 8 is eight bits of one white channel, which shows the green of the picture. Eight
+        /// planes leave a monochrome rig three times the frame rate.
         planes: u32 = 24, "", OneOf(&[8, 24]);
         /// Where the projector's lens stands in the world. Measure it, or give `calibration` instead.
         position: [f64; 3] = [0.0, 0.35, 1.1], "m", Within(-1e6, 1e6);
@@ -35,6 +35,9 @@ section! {
         calibration: Option<PathBuf> = None, "", NotEmpty;
         /// Unit of the lengths in the calibration file, which cannot be told from its numbers; required with `calibration`.
         calibration_unit: Option<CalibrationUnit> = None, "", Any;
+        /// Columns and rows whose pixels the calibration file counts; the projector's own when left out. The file's view is kept when `width` and
+        /// `height` are others, for example to trace fewer pixels (`--raster` sets it then).
+        calibration_raster: Option<[u32; 2]> = None, "px", Within(1, Raster::MAX_SIDE);
         /// Radiant intensity of one pixel at full drive, in scene units: the scene's radiance 1 needs `pi * d^2 / albedo` at
         /// distance d. Raise it when the report says that light is clipped, lower it when the picture uses few of its levels.
         max_intensity: f64 = 8.0, "scene units/sr", Within(1e-6, 1e12);
@@ -50,6 +53,14 @@ impl ProjectorConfig {
     /// The mirror array; sides are in range once the configuration is accepted.
     pub fn raster(&self) -> Raster {
         Raster::new(self.width, self.height).expect("sides were checked when the configuration was read")
+    }
+
+    /// The raster whose pixels the calibration file counts.
+    pub fn calibrated_raster(&self) -> Raster {
+        let own = self.raster();
+        self.calibration_raster.map_or(own, |[w, h]| {
+            Raster::new(w, h).expect("sides were checked when the configuration was read")
+        })
     }
 
     /// The planes of a frame in the order they are shown.
@@ -84,7 +95,7 @@ section! {
         clock_ppm: f64 = 0.0, "ppm", Within(-1000.0, 1000.0);
         /// Frames it can hold before one is shown.
         buffer_frames: u32 = 3, "frames", Within(2, 64);
-        /// Faults to inject, in the mock's own notation; empty for none.
+        /// Faults to inject, in the mocks' notation, for example "loss=0.01,dropout@1.5s+20ms"; empty for none. Times count from the start of the run.
         faults: String = String::new(), "", Any;
         /// How planes are compacted. Raw is fastest to a projector in this process.
         compaction: Compaction = Compaction::RAW, "", Any;

@@ -192,6 +192,15 @@ impl<T: PartialOrd + Display, const N: usize> Limit<[T; N]> for Within<T> {
     }
 }
 
+impl<T: PartialOrd + Display, const N: usize> Limit<Option<[T; N]>> for Within<T> {
+    fn allows(&self, value: &Option<[T; N]>) -> bool {
+        value.as_ref().is_none_or(|v| self.allows(v))
+    }
+    fn describe(&self) -> String {
+        Limit::<[T; N]>::describe(self)
+    }
+}
+
 /// A string, path or list with something in it.
 pub(super) struct NotEmpty;
 

@@ -2,6 +2,7 @@
 
 use super::declare::{section, words};
 use super::read::{Any, NotEmpty, Within};
+use super::safety::{InterlockConfig, LimitsConfig};
 use dpm_device::planes::Raster;
 use std::path::PathBuf;
 
@@ -43,8 +44,10 @@ words! {
         Paper = "paper",
         /// \[Miyamoto22\], the second reference of \[paper\]: no shading rates, no spatial filter.
         Miyamoto = "miyamoto",
-        /// Every pixel in every frame, nothing reused.
+        /// Every pixel in every frame, independent samples, nothing reused.
         Full = "full",
+        /// Every pixel in every frame, nothing reused; each pixel goes on with one low-discrepancy sequence from frame to frame.
+        Sequence = "sequence",
     }
 }
 
@@ -77,7 +80,7 @@ section! {
         rate_map: Option<bool> = None, "", Any;
         /// Every second block in every second frame.
         checkerboard: Option<bool> = None, "", Any;
-        /// Blue-noise instead of white sample offsets.
+        /// Evenly spread samples (blue noise, or a sequence that goes on) in place of independent ones.
         blue_noise: Option<bool> = None, "", Any;
         /// Reuse of former frames.
         temporal_filter: Option<bool> = None, "", Any;
@@ -108,16 +111,17 @@ pub struct Effects {
 impl RenderConfig {
     /// The parts of the method that are on.
     pub fn effects_on(&self) -> Effects {
-        let (shared, own) = match self.method {
-            RenderMethod::Dpm | RenderMethod::Paper => (true, true),
-            RenderMethod::Miyamoto => (true, false),
-            RenderMethod::Full => (false, false),
+        let (shared, own, even_samples) = match self.method {
+            RenderMethod::Dpm | RenderMethod::Paper => (true, true, true),
+            RenderMethod::Miyamoto => (true, false, true),
+            RenderMethod::Sequence => (false, false, true),
+            RenderMethod::Full => (false, false, false),
         };
         let e = &self.effects;
         Effects {
             rate_map: e.rate_map.unwrap_or(own),
             checkerboard: e.checkerboard.unwrap_or(shared),
-            blue_noise: e.blue_noise.unwrap_or(shared),
+            blue_noise: e.blue_noise.unwrap_or(even_samples),
             temporal_filter: e.temporal_filter.unwrap_or(shared),
             spatial_filter: e.spatial_filter.unwrap_or(own),
             spp_by_angle: e.spp_by_angle.unwrap_or(shared),
@@ -205,6 +209,9 @@ section! {
     pub struct RunConfig {
         /// Frames to light; 0 runs until it is told to stop.
         frames: u64 = 0, "frames", Any;
+        /// Seconds to run for, counted from the first frame: of the wall clock at real pace, however many frames that makes, and of the rig's own clock at
+        /// virtual pace; 0 is no limit.
+        seconds: f64 = 0.0, "s", Within(0.0, 1e9);
     }
 }
 
@@ -217,22 +224,30 @@ section! {
         images: bool = false, "", Any;
         /// Write a Chrome trace of every frame.
         trace: bool = false, "", Any;
-        /// Time over which an eye adds up light in the images.
-        light_window_ms: f64 = 33.0, "ms", Within(0.01, 10_000.0);
+        /// Time over which an eye adds up light in the images, at least a frame. Left out, it is 33 ms, or a frame where that is longer.
+        light_window_ms: Option<f64> = None, "ms", Within(0.01, 10_000.0);
     }
 }
 
 section! {
     /// What happens when something fails.
     pub struct SafetyConfig {
-        /// The projector goes dark by itself when it hears nothing for this long.
-        watchdog_ms: u32 = 50, "ms", Within(1, 10_000);
-        /// A body that is not heard of is carried on by prediction for this long, then its light goes off.
-        predict_ms: u32 = 20, "ms", Within(0, 1_000);
+        /// The projector goes dark by itself when it hears nothing for this long, at least two frames. Left out, it is 50 ms, or three frames
+        /// where those are longer.
+        watchdog_ms: Option<u32> = None, "ms", Within(1, 10_000);
+        /// A body is carried on by prediction for at most this long after the tracker's newest sample of it, up to the middle of the light; then
+        /// its light goes off. A frame that would be lit later than that and a slot is not sent. Left out, it follows the rig: the longer of
+        /// 20 ms and the tracker's latency, two of its samples, the time from latch to light and two slots together. What is written is
+        /// law: a rig whose frames take longer stays dark, and says so.
+        predict_ms: Option<u32> = None, "ms", Within(0, 1_000);
         /// General flashes of the whole picture in a second; beyond it the projector rests in the dark for two seconds. WCAG 2.3.1 allows 3; 0 is off.
         flashes_per_second: u32 = 3, "1/s", Within(0, 1_000);
         /// The start of a run acknowledges heat, lamp, emergency stop and flashes that the projector has latched, too; else it refuses
         /// to start and names them. Set it once, on the command line, when the cause is gone.
         acknowledge_faults: bool = false, "", Any;
+        /// How much light there may be; docs/SAFETY.md says what that does for people and what it does not.
+        limits: LimitsConfig = LimitsConfig::default(), "", Any;
+        /// Who else must agree that there is light.
+        interlock: InterlockConfig = InterlockConfig::default(), "", Any;
     }
 }

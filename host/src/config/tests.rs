@@ -106,6 +106,30 @@ const BAD: &[(&str, usize, usize, &str, &str)] = &[
     ("[real_time]\npriority = 100", 2, 12, "real_time.priority", "must be 0 to 99"),
     ("[real_time.stage_costs_us]\nrender = 2_000_000", 2, 10, "real_time.stage_costs_us.render", "us"),
     ("[safety]\nwatchdog_ms = 0", 2, 15, "safety.watchdog_ms", "must be 1 to 10000 ms"),
+    ("[safety.limits]\nmean_level = 1.1", 2, 14, "safety.limits.mean_level", "must be 0 to 1"),
+    ("[safety.limits]\nmean_level = 0.0005", 2, 14, "safety.limits.mean_level", "below a thousandth"),
+    ("[safety.limits]\nmean_window_s = 0.1", 2, 17, "safety.limits.mean_window_s", "must be 0.5 to 3600 s"),
+    ("[safety.limits]\nfull_white_s = 0.2", 2, 16, "safety.limits.full_white_s", "too short"),
+    ("[safety.interlock]\nkind = \"process\"", 2, 8, "safety.interlock.kind", "names no process"),
+    (
+        "[safety.interlock]\nkind = \"process\"\nname = \"guard\"\npid_file = \"/run/guard.pid\"",
+        2,
+        8,
+        "safety.interlock.kind",
+        "or two",
+    ),
+    ("[safety.interlock]\nkind = \"process\"\npid_file = \"guard.pid\"", 3, 12, "safety.interlock.pid_file", "relative"),
+    ("[safety.interlock]\nkind = \"line\"", 2, 8, "safety.interlock.kind", "names no line"),
+    ("[safety.interlock]\nkind = \"line\"\nfile = \"v\"", 3, 8, "safety.interlock.file", "relative"),
+    (
+        "[projector.backend]\nkind = \"serial\"\nport = \"/dev/a\"\n[safety.interlock]\nkind = \"line\"\nport = \"/dev/a\"\n[real_time]\npace = \"real\"",
+        6,
+        8,
+        "safety.interlock.port",
+        "projector's own",
+    ),
+    ("[safety.interlock]\nkind = \"key\"\nkey = \"b\"", 3, 7, "safety.interlock.key", "gives an order"),
+    ("[safety.interlock]\nkind = \"key\"\nkey = \"no\"", 3, 7, "safety.interlock.key", "not one printable"),
     ("[output]\nlight_window_ms = 0", 2, 19, "output.light_window_ms", "ms"),
     ("[prediction]\ngate_sigma = 0.5", 2, 14, "prediction.gate_sigma", "must be 1 to 100"),
     // Motions and faults, as the mock understands them.
@@ -142,6 +166,21 @@ const BAD: &[(&str, usize, usize, &str, &str)] = &[
     ("[tracker]\nfaults = \"gremlins\"", 2, 10, "tracker.faults", "unknown fault `gremlins`"),
     ("[tracker]\nfaults = \"loss=2\"", 2, 10, "tracker.faults", "0 to 1"),
     ("[tracker]\nfaults = \"unplug@1s+2s\"", 2, 10, "tracker.faults", "means nothing to the mock tracker"),
+    // Found in use, R20: the faults of the mock projector were neither read nor applied.
+    (
+        "[projector.backend]\nfaults = \"utter nonsense\"",
+        2,
+        10,
+        "projector.backend.faults",
+        "unknown fault `utter nonsense`",
+    ),
+    (
+        "[projector.backend]\nfaults = \"jump=1@1s\"",
+        2,
+        10,
+        "projector.backend.faults",
+        "means nothing to the mock projector",
+    ),
     // Contradictions.
     ("[projector]\nframe_rate = 948", 2, 14, "projector.frame_rate", "at most 947 frames/s of 24 planes"),
     ("[projector]\nmax_planes_per_second = 9523", 2, 25, "projector.max_planes_per_second", "at most 396"),
@@ -206,10 +245,16 @@ const BAD: &[(&str, usize, usize, &str, &str)] = &[
         "no body is called",
     ),
     ("[observer.gaze]\nkind = \"tracked\"", 1, 1, "observer.gaze.target", "no body is called"),
-    ("[observer]\neye_offset = [0, 0, 1]", 2, 14, "observer.eye_offset", "needs a body"),
+    ("[observer]\neye_offset = [0, 0, 1]", 2, 14, "observer.eye_offset", "without `observer.body`"),
     ("[scene]\nfile = \"a.glb\"\nbuiltin = \"demo\"", 3, 11, "scene.builtin", "together with `scene.file`"),
-    ("[render.paper]\nphi_h_deg = 40", 2, 13, "render.paper.phi_h_deg", "beyond `phi_q_deg` = 30"),
-    ("[render.paper]\nfilter_to_deg = 10", 2, 17, "render.paper.filter_to_deg", "must not be larger"),
+    ("[render.paper]\nphi_h_deg = 40", 2, 13, "render.paper.phi_h_deg", "`render.paper.phi_q_deg` = 30.0"),
+    (
+        "[render.paper]\nfilter_to_deg = 10",
+        2,
+        17,
+        "render.paper.filter_to_deg",
+        "must be at most `render.paper.filter_to_deg`",
+    ),
     ("[real_time]\npace = \"virtual\"", 2, 8, "real_time.pace", "never end"),
     (
         "[real_time]\npace = \"virtual\"\n[run]\nframes = 9\n[tracker]\nkind = \"vrpn\"",
@@ -226,9 +271,37 @@ const BAD: &[(&str, usize, usize, &str, &str)] = &[
         "its own clock",
     ),
     ("[real_time]\naffinity = [0, 5000]", 2, 12, "real_time.affinity", "core 5000"),
-    ("[safety]\nwatchdog_ms = 2", 2, 15, "safety.watchdog_ms", "at least 3 ms"),
-    ("[safety]\npredict_ms = 3", 2, 14, "safety.predict_ms", "less than two samples at 500 Hz"),
-    ("[tracker]\nrate_hz = 50", 2, 11, "tracker.rate_hz", "at least 40 ms"),
+    ("[safety]\nwatchdog_ms = 2", 2, 15, "safety.watchdog_ms", "write at least 3 ms"),
+    (
+        "[safety]\npredict_ms = 3",
+        2,
+        14,
+        "safety.predict_ms",
+        "less than two samples at tracker.rate_hz = 500",
+    ),
+    ("[tracker]\nrate_hz = 50\n[safety]\npredict_ms = 20", 4, 14, "safety.predict_ms", "at least 40 ms"),
+    // Found in use, O10: a first rig at an ordinary projector's rate, and the keys that it must change.
+    (
+        "[projector]\nframe_rate = 30\n[safety]\nwatchdog_ms = 50",
+        4,
+        15,
+        "safety.watchdog_ms",
+        "safety.watchdog_ms = 50 is less than two frames",
+    ),
+    (
+        "[projector]\nframe_rate = 24\n[output]\nlight_window_ms = 33",
+        4,
+        19,
+        "output.light_window_ms",
+        "output.light_window_ms = 33 is shorter than one frame",
+    ),
+    (
+        "[projector]\nframe_rate = 60\n[safety]\npredict_ms = 20",
+        4,
+        14,
+        "safety.predict_ms",
+        "less than a frame and a half of 16.667 ms",
+    ),
     ("[output]\nlight_window_ms = 1", 2, 19, "output.light_window_ms", "shorter than one frame"),
     // Files.
     ("[scene]\nfile = \"none.glb\"", 2, 8, "scene.file", "/nonexistent/none.glb"),
@@ -310,6 +383,30 @@ fn all_mistakes_are_told_at_once() {
     assert_eq!(lines, [4, 2, 3, 8, 6], "{errors}");
     let text = "[projector]\nframe_rate = 948\nup = [0, 0, 0]\n[safety]\nwatchdog_ms = 1\n";
     assert_eq!(parse(text).unwrap_err().0.len(), 3);
+}
+
+/// Found in use, C2 and O10: with the defaults a rig may have any usual frame rate and any usual tracker.
+#[test]
+fn the_defaults_fit_every_frame_rate_and_every_tracker() {
+    for (rate, planes, watchdog_us) in [
+        (24, 24, 125_000),
+        (30, 24, 100_000),
+        (60, 24, 50_000),
+        (100, 24, 50_000),
+        (120, 24, 50_000),
+        (240, 24, 50_000),
+        (947, 24, 50_000),
+        (2000, 8, 50_000),
+    ] {
+        for tracker in [30, 60, 120, 500, 1000] {
+            let text = format!(
+                "[projector]\nframe_rate = {rate}\nplanes = {planes}\n[tracker]\nrate_hz = {tracker}"
+            );
+            let rig = parse(&text).unwrap_or_else(|e| panic!("{rate} frames/s, {tracker} Hz: {e}"));
+            assert_eq!(rig.watchdog_us(), watchdog_us);
+            assert!(rig.light_window_ms() >= 33.0 && rig.light_window_ms() >= rig.frame_ms());
+        }
+    }
 }
 
 #[test]
@@ -399,6 +496,103 @@ fn an_unreadable_or_huge_file_is_one_error() {
     std::fs::remove_file(&huge).unwrap();
     assert!(told.contains("more than 1048576 bytes"), "{told}");
     assert!(not_text.contains("cannot read"), "{not_text}");
+}
+
+/// Found in use, O10: an error about several keys named only the one at which it stood, and not always the one that had to be changed. Whichever key is
+/// written, the message names all that take part, with their values.
+#[test]
+fn contradictions_name_every_key_with_its_value() {
+    for (text, parts) in [
+        (
+            "[projector]\nmax_planes_per_second = 9523",
+            &[
+                "max_planes_per_second`: is 9523",
+                "`projector.frame_rate` = \"947\"",
+                "`projector.planes` = 24",
+            ][..],
+        ),
+        (
+            "[projector]\nframe_rate = 948",
+            &["`projector.max_planes_per_second` = 22728", "`projector.planes` = 24"],
+        ),
+        (
+            "[projector]\nlook_at = [0, 0, 0]\nposition = [0, 2, 0]",
+            &[
+                "look_at`: is [0.0, 0.0, 0.0]",
+                "`projector.up` = [0.0, 1.0, 0.0]",
+                "`projector.position` = [0.0, 2.0, 0.0]",
+            ],
+        ),
+        (
+            "[projector]\nframe_rate = 60\n[projector.backend]\nkind = \"dlpc900\"",
+            &[
+                "`projector.width` = 1024",
+                "`projector.height` = 768",
+                "`projector.backend.panel` = \"dlp6500\"",
+            ],
+        ),
+        ("[render.paper]\nphi_q_deg = 3", &["phi_q_deg`: is 3.0", "`render.paper.phi_h_deg` = 15.0"]),
+        (
+            "[[scene.bodies]]\nname = \"a\"\n[[scene.bodies]]\nname = \"a\"\nnode = \"b\"",
+            &["`scene.bodies.1.name`", "`scene.bodies.0`"],
+        ),
+    ] {
+        let told = parse(text).unwrap_err().to_string();
+        for part in parts {
+            assert!(told.contains(part), "{text}: {part} in {told}");
+        }
+    }
+}
+
+/// As many bodies as the renderer's numbers of 8 bits tell apart, and the first one beyond is named.
+#[test]
+fn two_hundred_and_fifty_six_bodies_are_the_most() {
+    let bodies = |n: usize| {
+        (0..n).map(|i| format!("[[scene.bodies]]\nname = \"b{i}\"\nid = {i}\n")).collect::<String>()
+    };
+    assert_eq!(parse(&bodies(256)).unwrap().scene.bodies.len(), 256);
+    let told = parse(&bodies(300)).unwrap_err().to_string();
+    assert!(told.contains("300 bodies, 44 more than the 256") && told.contains("\"b256\""), "{told}");
+    assert_eq!(crate::render::scene_data::MAX_BODIES, 256);
+}
+
+/// Product code under `dir` as one text: without tests, and without the declarations and the checks of the keys themselves.
+fn product_code(dir: &Path, out: &mut String) {
+    for entry in std::fs::read_dir(dir).unwrap() {
+        let path = entry.unwrap().path();
+        let name = path.file_name().unwrap().to_string_lossy().into_owned();
+        if path.is_dir() && name != "tests" {
+            product_code(&path, out);
+        } else if name.ends_with(".rs") && !name.ends_with("tests.rs") && !path.ends_with("config/check.rs") {
+            let text = std::fs::read_to_string(&path).unwrap();
+            out.push_str(text.split("#[cfg(test)]\nmod tests {").next().unwrap());
+        }
+    }
+}
+
+/// Found in use, R20: a key of the manual that nothing reads. A field is read as `.name`; names that several sections declare must be read as often. What the
+/// check alone reads limits other keys.
+#[test]
+fn every_key_is_read_somewhere() {
+    const LIMITS: [&str; 1] = ["projector.max_planes_per_second"];
+    let mut code = String::new();
+    product_code(&Path::new(env!("CARGO_MANIFEST_DIR")).join("src"), &mut code);
+    let reads = |name: &str| {
+        let field = format!(".{name}");
+        let ends = |rest: &str| !rest.starts_with(|c: char| c.is_alphanumeric() || c == '_' || c == '(');
+        code.match_indices(&field).filter(|(at, _)| ends(&code[at + field.len()..])).count()
+    };
+    let docs = RigConfig::key_docs();
+    let mut unread = Vec::new();
+    for key in docs.iter().filter(|k| !LIMITS.contains(&k.key.as_str())) {
+        let name = key.key.rsplit('.').next().unwrap();
+        let declared = docs.iter().filter(|k| k.key.rsplit('.').next() == Some(name)).count();
+        if name != "kind" && reads(name) < declared {
+            unread.push(&key.key);
+        }
+    }
+    assert!(unread.is_empty(), "nothing reads {unread:?}");
+    assert_eq!(reads("no_such_key"), 0);
 }
 
 #[test]

@@ -14,8 +14,13 @@ use std::sync::Arc;
 use std::time::{Duration, Instant};
 
 /// The methods, in the order of the reports.
-pub const METHODS: [RenderMethod; 4] =
-    [RenderMethod::Full, RenderMethod::Miyamoto, RenderMethod::Paper, RenderMethod::Dpm];
+pub const METHODS: [RenderMethod; 5] = [
+    RenderMethod::Full,
+    RenderMethod::Sequence,
+    RenderMethod::Miyamoto,
+    RenderMethod::Paper,
+    RenderMethod::Dpm,
+];
 
 /// Frames drawn before those that count: histories fill, the driver settles.
 const WARM_UP: u32 = 4;

@@ -3,6 +3,7 @@
 use super::error_plan::file_word;
 use super::error_runs::ErrorRow;
 use crate::files::write_atomically;
+use dpm_device::regular_file;
 use glam::Vec3;
 use serde::{Deserialize, Serialize};
 use std::io::{self, Write};
@@ -21,6 +22,9 @@ struct Kept {
     eye: Vec<[u32; 3]>,
 }
 
+/// Largest part that is read, bytes.
+const MAX_PART_BYTES: u64 = 4 << 30;
+
 impl Part {
     /// That of method `name` in the group with this key.
     pub fn new(cache: &Path, key: &str, name: &str) -> Self {
@@ -29,7 +33,8 @@ impl Part {
 
     /// The row, and what the eye saw at each of `probes`. `None` when nothing is there that fits.
     pub fn read(&self, probes: usize) -> Option<(ErrorRow, Vec<Vec3>)> {
-        let kept: Kept = serde_json::from_slice(&std::fs::read(&self.path).ok()?).ok()?;
+        let kept: Kept =
+            serde_json::from_slice(&regular_file::read(&self.path, MAX_PART_BYTES).ok()?).ok()?;
         let eye: Vec<Vec3> = kept.eye.into_iter().map(|v| Vec3::from(v.map(f32::from_bits))).collect();
         (eye.len() == probes).then_some((kept.row, eye))
     }

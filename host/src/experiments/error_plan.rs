@@ -28,13 +28,14 @@ pub fn switched_method_of(render: &RenderConfig, which: RenderMethod) -> Method 
     Method::from_config(&own)
 }
 
-/// The four methods; with `ablation`, dpm with each part off in turn too. `paper` comes first: its rays are everybody's budget.
+/// The five methods; with `ablation`, dpm with each part off in turn too. `paper` comes first: its rays are everybody's budget.
 pub fn contenders(render: &RenderConfig, ablation: bool) -> Vec<Contender> {
     let of = |which: RenderMethod| Contender { name: which.word(), method: method_of(render, which) };
     let dpm = method_of(render, RenderMethod::Dpm);
     let mut all = vec![
         of(RenderMethod::Paper),
         of(RenderMethod::Full),
+        of(RenderMethod::Sequence),
         of(RenderMethod::Miyamoto),
         of(RenderMethod::Dpm),
     ];

@@ -5,6 +5,7 @@ use super::sequence::{eye_mean, rmse, Theatre};
 use super::stamp::Fnv;
 use crate::files::write_atomically;
 use crate::render::method::{Method, SamplerKind};
+use dpm_device::regular_file;
 use glam::Vec3;
 use std::fmt::Write as _;
 use std::io::Write as _;
@@ -71,6 +72,11 @@ impl Reference {
         (raw.sqrt(), (raw - own).max(0.0).sqrt())
     }
 
+    /// Error of what the eye sees of either run, as measured.
+    pub fn each_run(&self, eyes: &[Vec<Vec3>; 2]) -> [f64; 2] {
+        eyes.each_ref().map(|eye| rmse(eye, &self.eye, |_| true))
+    }
+
     /// RMS bias: the mean product of the two runs' differences from the two halves. No noise of any of the four is in it, so its
     /// expectation is the squared bias; 0 where chance makes it negative. Second: root of the standard error of that mean over the
     /// probes, what chance leaves of a bias of 0.
@@ -100,7 +106,7 @@ pub fn mean_of(values: &[Vec3]) -> f64 {
 
 /// Frames of `probes` values from the cache; `None` when there are none or they do not fit.
 fn read_frames(path: &Path, probes: usize) -> Option<Vec<Vec<Vec3>>> {
-    let bytes = std::fs::read(path).ok()?;
+    let bytes = regular_file::read(path, (EYE_FRAMES * probes * 12) as u64).ok()?;
     if probes == 0 || bytes.len() != EYE_FRAMES * probes * 12 {
         return None;
     }

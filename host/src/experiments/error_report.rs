@@ -1,6 +1,7 @@
 //! Measured groups into what people read: CSV, and Markdown tables at equal rays, at equal time and at equal error.
 
-use super::error_runs::{ErrorRow, GroupResult};
+use super::error_runs::{is_other, ErrorRow, GroupResult, DPM};
+use super::error_verdict::{equal_time_table, runs_text, table, time_text, verdict};
 use super::stamp::Stamp;
 use std::fmt::Write;
 
@@ -13,14 +14,15 @@ pub fn csv(groups: &[GroupResult]) -> String {
     let mut text = String::from(
         "device,driver,commit,config,seed,motion,budget,method,spp,rays,rays_to_paper,samples,gpu_ms,wall_ms,single_rmse,single_rel_mse,\
          perceived_rmse,perceived_rmse_raw,perceived_fovea,perceived_periphery,bias,bias_floor,noise,mean_shift,flip,flicker,\
-         flicker_periphery,ratio_to_paper,reference_error\n",
+         flicker_periphery,ratio_to_paper,reference_error,ms_low,ms_high,run_a_raw,run_b_raw,equal_time_spp,equal_time_to_dpm,\
+         equal_time_rmse_raw,equal_time_rmse\n",
     );
     for g in groups {
         for r in &g.rows {
             // Writing into a string cannot fail.
             let _ = writeln!(
                 text,
-                "{},{},{},\"{}\",{:.4},{:.1},{:.5},{:.1},{:.6},{:.6},{:.6e},{:.6e},{:.6e},{:.6e},{},{},{:.6e},{:.6e},{:.6e},{:.6e},{:.6e},{:.6e},{},{:.5},{:.6e}",
+                "{},{},{},\"{}\",{:.4},{:.1},{:.5},{:.1},{:.6},{:.6},{:.6e},{:.6e},{:.6e},{:.6e},{},{},{:.6e},{:.6e},{:.6e},{:.6e},{:.6e},{:.6e},{},{:.5},{:.6e},{:.6},{:.6},{:.6e},{:.6e},{}",
                 g.stamp.csv(),
                 if r.moving { "moving" } else { "still" },
                 r.budget,
@@ -45,7 +47,15 @@ pub fn csv(groups: &[GroupResult]) -> String {
                 r.flicker,
                 optional(r.flicker_periphery),
                 r.ratio_to_paper,
-                g.reference_error
+                g.reference_error,
+                r.middle_half_ms[0],
+                r.middle_half_ms[1],
+                r.runs_raw[0],
+                r.runs_raw[1],
+                r.equal_time.map_or(",,,".to_owned(), |t| format!(
+                    "{:.4},{:.4},{:.6e},{:.6e}",
+                    t.spp, t.time_to_dpm, t.perceived_rmse_raw, t.perceived_rmse
+                )),
             );
         }
     }
@@ -71,42 +81,45 @@ pub(super) fn stamps<'a>(all: impl Iterator<Item = &'a Stamp>) -> String {
 /// All rows as a Markdown table, with the stamps above and the best of the others beside dpm below.
 pub fn markdown(groups: &[GroupResult]) -> String {
     let mut text = stamps(groups.iter().map(|g| &g.stamp));
-    text += "| motion | budget | method | rays/frame | rays / paper | GPU ms | single RMSE | perceived RMSE | bias | of chance | noise | FLIP | flicker | perceived / paper |\n";
-    text += "|---|---:|---|---:|---:|---:|---:|---:|---:|---:|---:|---:|---:|---:|\n";
+    text += "| motion | budget | method | rays/frame | rays / paper | ms a frame (middle half) | single RMSE | perceived RMSE as measured | two runs | less the reference's own | bias | of chance | noise | mean | FLIP | flicker | perceived / paper |\n";
+    text += "|---|---:|---|---:|---:|---|---:|---:|---|---:|---:|---:|---:|---:|---:|---:|---:|\n";
     for r in groups.iter().flat_map(|g| &g.rows) {
         let _ = writeln!(
             text,
-            "| {} | {} | {} | {:.0} | {:.3} | {:.2} | {:.4} | {:.5} | {:.5} | {:.5} | {:.5} | {:.4} | {:.5} | {:.2} |",
+            "| {} | {} | {} | {:.0} | {:.3} | {} | {:.4} | {:.5} | {} | {:.5} | {:.5} | {:.5} | {:.5} | {:+.2} % | {:.4} | {:.5} | {:.2} |",
             if r.moving { "moving" } else { "still" },
             r.budget,
             r.method,
             r.rays,
             r.rays_to_paper,
-            r.gpu_ms,
+            time_text(r),
             r.single_rmse,
+            r.perceived_rmse_raw,
+            runs_text(r.runs_raw),
             r.perceived_rmse,
             r.bias,
             r.bias_floor,
             r.noise,
+            100.0 * r.mean_shift,
             r.flip,
             r.flicker,
             r.ratio_to_paper
         );
     }
     text.push('\n');
+    text += &equal_time_table(groups.iter().map(|g| (g.group().name(), g)));
+    text.push('\n');
     text += &equal_cost(groups);
     text.push('\n');
+    let verdicts: Vec<_> =
+        groups.iter().filter_map(|g| verdict(g.group().name(), g, &|r| r.flicker)).collect();
+    text += &table(&verdicts);
+    text.push('\n');
     for g in groups {
-        let (Some(dpm), Some(best)) = (dpm_of(g), best_other(g)) else { continue };
         let _ = writeln!(
             text,
-            "{}, budget {}: dpm has {:.2} of the perceived RMSE of the best other ({}) and {:.2} of the least flicker of the others; \
-             reference error {:.5}, mean radiance {:.4}, {} probes.",
-            if dpm.moving { "moving" } else { "still" },
-            dpm.budget,
-            dpm.perceived_rmse / best.perceived_rmse,
-            best.method,
-            dpm.flicker / least_flicker(g, |r| r.flicker),
+            "{}: reference error {:.5}, mean radiance {:.4}, {} probes.",
+            g.group().name(),
             g.reference_error,
             g.mean,
             g.probes
@@ -216,11 +229,11 @@ fn equal_cost(groups: &[GroupResult]) -> String {
 
 /// The row of this program's own method.
 pub(super) fn dpm_of(g: &GroupResult) -> Option<&ErrorRow> {
-    g.rows.iter().find(|r| r.method == "dpm")
+    g.rows.iter().find(|r| r.method == DPM)
 }
 
 fn others(g: &GroupResult) -> impl Iterator<Item = &ErrorRow> {
-    g.rows.iter().filter(|r| !r.method.starts_with("dpm"))
+    g.rows.iter().filter(|r| is_other(&r.method))
 }
 
 /// The least perceived error of the other methods.

@@ -3,11 +3,13 @@
 //! Every method is drawn twice with different seeds. What the two runs share is bias, what they do not is noise; half of the power of
 //! their difference is the flicker of one of them, without any reference. The reference comes in two independent halves for the same
 //! reason: half of their difference is its own error, and its power is taken off what is measured against it.
+//!
+//! Equal rays are not equal time, so the other methods are drawn once more with as many samples as fill the time of a frame of dpm.
 
 use super::error_parts::Part;
 use super::error_plan::{contenders, paper_at, Contender, Group};
 use super::error_reference::{mean_of, Reference};
-use super::sequence::{eye_mean, rmse, Seen, Span, Theatre};
+use super::sequence::{eye_mean, rmse, FrameTime, Seen, Span, Theatre};
 use super::stamp::{Fnv, Stamp};
 use crate::gpu::Gpu;
 use crate::metrics::error::compare;
@@ -53,8 +55,31 @@ pub const LAST_SLOT: u64 = 383;
 pub const EYE_FRAMES: usize = 31;
 /// Rays count as equal within this share.
 const EQUAL_RAYS: f64 = 0.01;
+/// At equal time no method is asked for more than so many times its samples at equal rays, nor for more than [`MOST_SPP`].
+const MOST_SAMPLES_MORE: f32 = 16.0;
+/// As many as a rig file may ask for.
+const MOST_SPP: f32 = 4096.0;
+/// Times count as equal within this share ...
+const EQUAL_TIME: f64 = 0.05;
+/// ... for which so many races are run at most, beside the first at equal rays.
+pub const RACES: usize = 4;
 /// Fewer probes in the periphery than this share of all do not tell its flicker.
 const LEAST_PERIPHERY: f64 = 0.01;
+
+/// A method with as many samples as fill the time of a frame of dpm: what the eye saw then.
+#[derive(Clone, Copy, Debug, Serialize, Deserialize)]
+pub struct EqualTime {
+    /// Samples a lit pixel and frame.
+    pub spp: f64,
+    /// Time of a frame by that of dpm, drawn in turns with it: how equal the times were.
+    pub time_to_dpm: f64,
+    /// RMSE of what the eye sees, as measured.
+    pub perceived_rmse_raw: f64,
+    /// The same with the reference's own error taken off.
+    pub perceived_rmse: f64,
+    /// `perceived_rmse_raw` of either run.
+    pub runs_raw: [f64; 2],
+}
 
 /// One method at one budget. Errors are in the scene's unit of radiance.
 #[derive(Clone, Debug, Serialize, Deserialize)]
@@ -77,6 +102,9 @@ pub struct ErrorRow {
     pub gpu_ms: f64,
     /// Time of a frame until its light is known, ms.
     pub wall_ms: f64,
+    /// Between these lies the middle half of the frames that were timed, ms.
+    #[serde(default)]
+    pub middle_half_ms: [f64; 2],
     /// RMSE of the last frame alone.
     pub single_rmse: f64,
     /// Relative MSE of the last frame alone \[Rousselle11\].
@@ -85,6 +113,9 @@ pub struct ErrorRow {
     pub perceived_rmse: f64,
     /// The same as measured.
     pub perceived_rmse_raw: f64,
+    /// `perceived_rmse_raw` of either run: how far chance moves it.
+    #[serde(default)]
+    pub runs_raw: [f64; 2],
     /// The same within 15 deg of the gaze (the paper's inner zone), and outside; `None` where too little is lit.
     pub perceived_fovea: Option<f64>,
     /// See `perceived_fovea`.
@@ -105,6 +136,9 @@ pub struct ErrorRow {
     pub flicker_periphery: Option<f64>,
     /// `perceived_rmse` by that of `paper`.
     pub ratio_to_paper: f64,
+    /// With the time of dpm in place of the rays of `paper`; `None` of dpm itself and its parts.
+    #[serde(default)]
+    pub equal_time: Option<EqualTime>,
 }
 
 /// A measured group, as it is kept in its file.
@@ -297,9 +331,11 @@ impl ErrorRuns {
         let runners: Vec<(Method, f32)> =
             contenders.iter().zip(&rows).map(|(c, r)| (c.method.clone(), r.spp as f32)).collect();
         each("times");
-        for (row, time) in rows.iter_mut().zip(theatre.race(&runners, self.stamp.seed as u32)?) {
-            (row.gpu_ms, row.wall_ms) = (time.gpu_ms, time.wall_ms);
+        let times = theatre.race(&runners, self.stamp.seed as u32)?;
+        for (row, time) in rows.iter_mut().zip(&times) {
+            (row.gpu_ms, row.wall_ms, row.middle_half_ms) = (time.gpu_ms, time.wall_ms, time.middle_half_ms);
         }
+        self.at_equal_time(&theatre, group, &contenders, &times, &mut rows, &reference, each)?;
         let result = GroupResult {
             stamp: self.stamp.clone(),
             key,
@@ -311,6 +347,76 @@ impl ErrorRuns {
         };
         let pixels = theatre.probes().iter().map(|p| p.pixel).collect();
         Ok(Measured { result, raster: theatre.raster(), pixels, reference: reference.eye, eyes, parts })
+    }
+
+    /// Draws every method but dpm and its parts with as many samples as fill the time of a frame of dpm.
+    ///
+    /// Times are compared within a race only, where all meet the same disturbances. Races with more and fewer samples tell what a sample
+    /// takes beside what a frame takes without any, until the times are equal or [`RACES`] have been run; of all trials the nearest counts.
+    #[allow(clippy::too_many_arguments)]
+    fn at_equal_time(
+        &self,
+        theatre: &Theatre,
+        group: Group,
+        contenders: &[Contender],
+        times: &[FrameTime],
+        rows: &mut [ErrorRow],
+        reference: &Reference,
+        each: &mut dyn FnMut(&str),
+    ) -> Result<(), ErrorRunError> {
+        let Some(dpm) = contenders.iter().position(|c| c.name == DPM) else { return Ok(()) };
+        let others: Vec<usize> = (0..rows.len()).filter(|&i| is_other(contenders[i].name)).collect();
+        let seed = self.stamp.seed as u32;
+        // Samples that were tried, and the time of a frame by that of dpm, which ran along with its own.
+        let mut trials: Vec<Vec<Trial>> =
+            others.iter().map(|&i| vec![(rows[i].spp, times[i].ms() / times[dpm].ms())]).collect();
+        for _ in 0..RACES {
+            if trials.iter().all(|t| off_equal(nearest(t)) <= EQUAL_TIME) {
+                break;
+            }
+            let next: Vec<f32> = others
+                .iter()
+                .zip(&trials)
+                .map(|(&i, tried)| {
+                    let (own, least) = (rows[i].spp as f32, least_spp(&contenders[i].method));
+                    (where_equal(tried) as f32).clamp(least, (MOST_SAMPLES_MORE * own).clamp(least, MOST_SPP))
+                })
+                .collect();
+            each("times");
+            let runners: Vec<(Method, f32)> = others
+                .iter()
+                .zip(&next)
+                .map(|(&i, &spp)| (with_samples(&contenders[i].method, spp), spp))
+                .chain([(contenders[dpm].method.clone(), rows[dpm].spp as f32)])
+                .collect();
+            let raced = theatre.race(&runners, seed)?;
+            let of_dpm = raced.last().map_or(f64::NAN, FrameTime::ms);
+            for ((tried, &spp), time) in trials.iter_mut().zip(&next).zip(&raced) {
+                tried.push((f64::from(spp), time.ms() / of_dpm));
+            }
+        }
+        for (&i, tried) in others.iter().zip(&trials) {
+            let (name, (spp, time_to_dpm)) = (contenders[i].name, nearest(tried));
+            let method = with_samples(&contenders[i].method, spp as f32);
+            // Only what the eye sees at the end is wanted.
+            let warm_up = if method.needs_history() { self.options.extent.warm_up } else { 0 };
+            let short = self.theatre(group, warm_up, EYE_FRAMES as u32)?;
+            let mut play = |seed: u32| {
+                each(&format!("{name}{AT_EQUAL_TIME}"));
+                let seen = short.play(&method, spp as f32, seed, &mut |_, _| ())?;
+                Ok::<_, RenderError>(eye_mean(&seen.frames, EYE_FRAMES))
+            };
+            let eyes = [play(seed)?, play(seed.wrapping_add(1_000_003))?];
+            let (raw, clean) = reference.perceived(&eyes, &|_| true);
+            rows[i].equal_time = Some(EqualTime {
+                spp,
+                time_to_dpm,
+                perceived_rmse_raw: raw,
+                perceived_rmse: clean,
+                runs_raw: reference.each_run(&eyes),
+            });
+        }
+        Ok(())
     }
 
     /// Rays of a frame with so many samples, from a short sequence.
@@ -410,10 +516,12 @@ impl ErrorRuns {
             samples: both(&|s| s.samples),
             gpu_ms: 0.0,
             wall_ms: 0.0,
+            middle_half_ms: [0.0; 2],
             single_rmse: (0.5 * (first.rmse.powi(2) + second.rmse.powi(2))).sqrt(),
             single_rel_mse: 0.5 * (first.rel_mse + second.rel_mse),
             perceived_rmse: clean,
             perceived_rmse_raw: raw,
+            runs_raw: reference.each_run(&eyes),
             perceived_fovea: zone(1.0 - share >= LEAST_PERIPHERY, &|i| angle(i) < inner),
             perceived_periphery: zone(share >= LEAST_PERIPHERY, &|i| angle(i) >= inner),
             bias,
@@ -424,6 +532,7 @@ impl ErrorRuns {
             flicker,
             flicker_periphery: flicker_periphery.filter(|_| share >= LEAST_PERIPHERY),
             ratio_to_paper: 1.0,
+            equal_time: None,
         };
         let [eye, _] = eyes;
         Ok((row, eye))
@@ -487,6 +596,53 @@ impl ErrorRuns {
     }
 }
 
+/// What the row of this program's own method is called; those of its ablations begin so.
+pub const DPM: &str = "dpm";
+/// What the name of a method ends with while it is drawn at the time of dpm.
+pub const AT_EQUAL_TIME: &str = " at equal time";
+
+/// Whether this is the name of a method that dpm is compared with: neither dpm nor dpm without a part.
+pub fn is_other(method: &str) -> bool {
+    !method.starts_with(DPM)
+}
+
+/// A method whose samples go by the visual angle has them in its table; the others are told them frame by frame.
+fn with_samples(method: &Method, spp: f32) -> Method {
+    if method.spp_by_angle {
+        paper_at(method, f64::from(spp))
+    } else {
+        method.clone()
+    }
+}
+
+/// Samples that were tried, and the time of a frame with them by the time that is wanted.
+type Trial = (f64, f64);
+
+/// How far a trial is from equal time, as a logarithm.
+fn off_equal(trial: Trial) -> f64 {
+    trial.1.ln().abs()
+}
+
+/// The trial nearest to equal time.
+fn nearest(trials: &[Trial]) -> Trial {
+    trials.iter().copied().min_by(|a, b| off_equal(*a).total_cmp(&off_equal(*b))).unwrap_or((1.0, 1.0))
+}
+
+/// Samples with which the time is the one wanted: where a line through the trials is 1. A frame without samples takes time, and samples
+/// take more; where the trials say otherwise they are mostly chance, and time is taken to grow with the samples alone.
+fn where_equal(trials: &[Trial]) -> f64 {
+    let n = trials.len() as f64;
+    let sum = |of: &dyn Fn(f64, f64) -> f64| trials.iter().map(|&(x, y)| of(x, y)).sum::<f64>();
+    let (x, y) = (sum(&|x, _| x) / n, sum(&|_, y| y) / n);
+    let (xx, xy) = (sum(&|a, _| (a - x) * (a - x)), sum(&|a, b| (a - x) * (b - y)));
+    let slope = xy / xx;
+    let base = y - slope * x;
+    if slope > 0.0 && (0.0..1.0).contains(&base) {
+        return (1.0 - base) / slope;
+    }
+    x / y
+}
+
 /// A method that keeps nothing shows a pixel without samples black: it takes at least one. With a history a frame may pass.
 fn least_spp(method: &Method) -> f32 {
     if method.needs_history() {
@@ -503,5 +659,29 @@ fn corrected(spp: f32, base: f64, rays: f64, wanted: f64) -> f32 {
         ((wanted - base) / slope).max(0.02) as f32
     } else {
         spp
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_samples_that_fill_a_time_are_where_the_line_of_the_trials_meets_it() {
+        // 0.2 of the time without a sample, 0.1 a sample.
+        let of =
+            |all: &[f64]| where_equal(&all.iter().map(|spp| (*spp, 0.2 + 0.1 * spp)).collect::<Vec<_>>());
+        assert!((of(&[2.0, 5.0]) - 8.0).abs() < 1e-12);
+        assert!((of(&[10.0, 9.0, 1.0]) - 8.0).abs() < 1e-12);
+        // One trial, or trials that are chance: never the samples that were there before, which would flatter the slower method.
+        assert!((where_equal(&[(2.0, 0.5)]) - 4.0).abs() < 1e-12);
+        assert!((where_equal(&[(2.0, 0.5), (4.0, 0.4)]) - 3.0 / 0.45).abs() < 1e-12);
+        assert!((where_equal(&[(2.0, 0.1), (4.0, 0.5)]) - 3.0 / 0.3).abs() < 1e-12);
+        assert_eq!(nearest(&[(2.0, 0.5), (3.0, 1.1), (9.0, 4.0)]), (3.0, 1.1));
+    }
+
+    #[test]
+    fn parts_of_dpm_are_not_what_dpm_is_compared_with() {
+        assert!(is_other("sequence") && is_other("paper") && !is_other(DPM) && !is_other("dpm, even rays"));
     }
 }

@@ -5,8 +5,9 @@
 
 use super::error_figure3::{dressed, looks};
 use super::error_plan::Group;
-use super::error_report::{best_other, dpm_of, least_flicker, stamps};
+use super::error_report::{best_other, least_flicker, stamps};
 use super::error_runs::{ErrorOptions, ErrorRunError, ErrorRuns, GroupResult, Measured};
+use super::error_verdict::{equal_time_table, runs_text, table, time_text, verdict};
 use super::stamp::Stamp;
 use crate::gpu::Gpu;
 use crate::rig::Rig;
@@ -126,8 +127,8 @@ fn flicker(group: &TableGroup, row: &super::error_runs::ErrorRow) -> f64 {
 /// All rows as a Markdown table with the stamps above, and dpm by the best of the others below.
 pub fn markdown(groups: &[TableGroup]) -> String {
     let mut text = stamps(groups.iter().map(|g| &g.result.stamp));
-    text += "| material | motion | eye | method | rays/frame | rays / paper | single RMSE | perceived RMSE | bias | noise | FLIP | flicker | perceived / best other | flicker / least other |\n";
-    text += "|---|---|---|---|---:|---:|---:|---:|---:|---:|---:|---:|---:|---:|\n";
+    text += "| material | motion | eye | method | rays/frame | rays / paper | ms a frame (middle half) | single RMSE | perceived RMSE as measured | two runs | less the reference's own | bias | noise | mean | FLIP | flicker | perceived / best other | flicker / least other |\n";
+    text += "|---|---|---|---|---:|---:|---|---:|---:|---|---:|---:|---:|---:|---:|---:|---:|---:|\n";
     for g in groups {
         let best = best_other(&g.result).map_or(f64::NAN, |r| r.perceived_rmse);
         let least = least_flicker(&g.result, |r| flicker(g, r));
@@ -135,17 +136,21 @@ pub fn markdown(groups: &[TableGroup]) -> String {
             // Writing into a string cannot fail.
             let _ = writeln!(
                 text,
-                "| {} | {} | {} | {} | {:.0} | {:.3} | {:.4} | {:.5} | {:.5} | {:.5} | {:.4} | {:.5} | {:.2} | {:.2} |",
+                "| {} | {} | {} | {} | {:.0} | {:.3} | {} | {:.4} | {:.5} | {} | {:.5} | {:.5} | {:.5} | {:+.2} % | {:.4} | {:.5} | {:.2} | {:.2} |",
                 g.material,
                 if g.moving { "moving" } else { "still" },
                 if g.aside { "past" } else { "at" },
                 r.method,
                 r.rays,
                 r.rays_to_paper,
+                time_text(r),
                 r.single_rmse,
+                r.perceived_rmse_raw,
+                runs_text(r.runs_raw),
                 r.perceived_rmse,
                 r.bias,
                 r.noise,
+                100.0 * r.mean_shift,
                 r.flip,
                 flicker(g, r),
                 r.perceived_rmse / best,
@@ -153,19 +158,18 @@ pub fn markdown(groups: &[TableGroup]) -> String {
             );
         }
     }
-    text += "\n| material | motion | eye | perceived / best other | best other | flicker / least other | reference error | probes |\n";
-    text += "|---|---|---|---:|---|---:|---:|---:|\n";
+    text.push('\n');
+    text += &equal_time_table(groups.iter().map(|g| (g.setting().name(), &g.result)));
+    text.push('\n');
+    let verdicts: Vec<_> =
+        groups.iter().filter_map(|g| verdict(g.setting().name(), &g.result, &|r| flicker(g, r))).collect();
+    text += &table(&verdicts);
+    text += "\n| group | reference error | probes |\n|---|---:|---:|\n";
     for g in groups {
-        let (Some(dpm), Some(best)) = (dpm_of(&g.result), best_other(&g.result)) else { continue };
         let _ = writeln!(
             text,
-            "| {} | {} | {} | {:.2} | {} | {:.2} | {:.5} | {} |",
-            g.material,
-            if g.moving { "moving" } else { "still" },
-            if g.aside { "past" } else { "at" },
-            dpm.perceived_rmse / best.perceived_rmse,
-            best.method,
-            flicker(g, dpm) / least_flicker(&g.result, |r| flicker(g, r)),
+            "| {} | {:.5} | {} |",
+            g.setting().name(),
             g.result.reference_error,
             g.result.probes,
         );

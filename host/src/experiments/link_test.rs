@@ -1,8 +1,9 @@
 //! `dpm link-test`: a rig's own pictures over its link as fast as it takes them, into the frame rate that the link allows.
 
+use super::conformance::{self, Extent, Judgement, Medium, MediumKind};
 use super::sequence::{draw, poses_at};
 use crate::clock::{Clock, MonotonicClock};
-use crate::config::{Compaction, ProjectorBackend};
+use crate::config::{Compaction, ProjectorBackend, RigConfig};
 use crate::failure::{Failure, FailureKind};
 use crate::gpu::Gpu;
 use crate::pack::{pack, BitPlaneFrame, Kernel};
@@ -10,12 +11,14 @@ use crate::pipeline::prepared::PreparedFrames;
 use crate::pipeline::{connect, projector, renderer_settings, PipelineError, ENDED_WITH_THE_LAST_RUN};
 use crate::render::{RenderError, Renderer};
 use crate::rig::Rig;
+use crate::telemetry::monitor::RunMonitor;
 use dpm_device::link::{measure, Codec, HostLink, LinkMeasurement, LinkSettings, LinkState, Verb};
+use dpm_device::planes::Raster;
 use dpm_device::time::HostTime;
 use dpm_device::transport::inproc::{threaded, HostEnd};
 use dpm_device::transport::{LinkDevice, Transport};
 use dpm_handoff::wake::WaitPolicy;
-use hil_mock::projector::{serve_cable, MockConfig, MockProjector};
+use hil_mock::projector::{serve_cable, EmulatedProjector, MockConfig};
 use std::sync::Arc;
 use std::time::Duration;
 
@@ -135,26 +138,29 @@ enum Far {
 }
 
 impl Far {
-    fn open(rig: &Rig, clock: MonotonicClock) -> Result<Self, Failure> {
-        if let Some(medium) = projector::open(&rig.config, rig.camera.raster).map_err(PipelineError::from)? {
+    fn open(config: &RigConfig, raster: Raster, clock: MonotonicClock) -> Result<Self, Failure> {
+        if let Some(mut medium) = projector::open(config, raster).map_err(PipelineError::from)? {
+            medium.transport.set_clock(std::sync::Arc::new(move || clock.now()));
             return Ok(Self::Outside(medium.transport));
         }
-        let ProjectorBackend::Mock(mock) = &rig.config.projector.backend else {
-            let word = rig.config.projector.backend.word();
+        let ProjectorBackend::Mock(mock) = &config.projector.backend else {
+            let word = config.projector.backend.word();
             let told = format!("projector.backend.kind = {word:?} takes no frames over a link");
             return Err(Failure::new(FailureKind::BadInput, told));
         };
         let setup = MockConfig {
             frame_buffers: mock.buffer_frames.min(64) as u8,
             events_kept: 0,
-            ..MockConfig::new(rig.camera.raster)
+            ..MockConfig::new(raster)
         };
-        let bytes = projector::frame_bytes(rig.camera.raster, rig.config.projector.schedule().len());
-        let (host, device) = threaded(bytes, usize::from(setup.frame_buffers) + 1, WaitPolicy::Park);
+        let frame_buffers = usize::from(setup.frame_buffers);
+        let mut mock = EmulatedProjector::new(setup, &mock.faults, config.render.seed, clock.now())
+            .map_err(|e| Failure::new(FailureKind::BadInput, format!("projector.backend.faults: {e}")))?;
+        let bytes = projector::frame_bytes(raster, config.projector.schedule().len());
+        let (host, device) = threaded(bytes, frame_buffers + 1, WaitPolicy::Park);
         std::thread::Builder::new()
             .name("dpm-mock".into())
             .spawn(move || {
-                let mut mock = MockProjector::new(setup);
                 serve_cable(&mut mock, device, || clock.now(), |mock, now| mock.advance_to(now));
             })
             .map_err(|e| Failure::new(FailureKind::Device, format!("cannot start a thread: {e}")))?;
@@ -169,6 +175,28 @@ impl Far {
     }
 }
 
+/// Judges the projector of `config` by docs/PROTOCOL.md, less of it when `stop` says so. It is dark afterwards.
+///
+/// # Errors
+/// The projector is missing, or is of a kind without a link.
+pub fn judge_projector(
+    config: &RigConfig,
+    extent: Extent<'_>,
+    stop: &dyn Fn() -> bool,
+) -> Result<Judgement, Failure> {
+    let clock = MonotonicClock::new(0);
+    let raster = config.projector.raster();
+    let mut far = Far::open(config, raster, clock)?;
+    let (kind, bytes_per_s) = match &config.projector.backend {
+        ProjectorBackend::Usb(_) => (MediumKind::Usb, None),
+        // Ten bits a byte.
+        ProjectorBackend::Serial(serial) => (MediumKind::Serial, Some(serial.baud / 10)),
+        _ => (MediumKind::InProcess, None),
+    };
+    let medium = Medium { transport: far.transport(), kind, bytes_per_s, clock: &|| clock.now(), stop };
+    Ok(conformance::judge(medium, extent))
+}
+
 /// Measures the link of `rig` for `seconds` each way, less when `stop` says so. The projector shows the frames meanwhile, and is dark
 /// afterwards.
 ///
@@ -181,7 +209,7 @@ pub fn link_test(
     stop: &dyn Fn() -> bool,
 ) -> Result<LinkTestReport, Failure> {
     let clock = MonotonicClock::new(0);
-    let mut far = Far::open(rig, clock)?;
+    let mut far = Far::open(&rig.config, rig.camera.raster, clock)?;
     let settings = projector::link_settings(&rig.config, rig.camera.raster);
     let mut ways = vec![("raw".to_owned(), Codec::Raw.mask())];
     let allowed = match &rig.config.projector.backend {
@@ -205,13 +233,12 @@ pub fn link_test(
         ways: Vec::new(),
         stopped: false,
     };
-    for (k, (compaction, codecs)) in ways.into_iter().enumerate() {
+    for (compaction, codecs) in ways {
         if stop() {
             break;
         }
-        // Another seed, another session: an answer to the way before is not taken for one to this.
-        let session_seed = settings.session_seed.wrapping_add(2 * k as u32);
-        let settings = LinkSettings { codecs, session_seed, ..settings.clone() };
+        // Each way is a session of its own: an answer to the way before is not taken for one to this.
+        let settings = LinkSettings { codecs, ..settings.clone() };
         let way = way(settings, compaction, far.transport(), clock, content, seconds, stop)?;
         report.ways.push(way);
     }
@@ -234,7 +261,13 @@ fn way(
         std::thread::sleep(Duration::from_micros(200));
         clock.now()
     };
-    connect(&mut link, transport, ENDED_WITH_THE_LAST_RUN, &mut now).map_err(PipelineError::from)?;
+    let monitor = RunMonitor::default();
+    connect(&mut link, transport, ENDED_WITH_THE_LAST_RUN, &monitor, &mut now, stop)
+        .map_err(PipelineError::from)?;
+    if monitor.take_found_safe() {
+        let told = "the projector has latched SAFE; run its rig and say `dpm arm`";
+        return Err(Failure::new(FailureKind::Device, format!("{}: {told}", transport.name())));
+    }
     let duration_ns = (seconds * 1e9) as i64;
     let measured = measure(
         &mut link,

@@ -1,6 +1,7 @@
 //! Runs that answer a question: each is a command and a test.
 
 pub mod bench;
+pub mod conformance;
 pub mod error_export;
 pub mod error_figure3;
 pub mod error_parts;
@@ -11,6 +12,7 @@ pub mod error_report;
 pub mod error_runs;
 pub mod error_sheet;
 pub mod error_table;
+pub mod error_verdict;
 pub mod link_test;
 pub mod median;
 pub mod pictures;

@@ -6,6 +6,7 @@
 use crate::geometry::projector::ProjectorCamera;
 use crate::gpu::GpuError;
 use crate::pipeline::light::LightFrame;
+use crate::pipeline::FrameRecord;
 use crate::render::{FrameInputs, Renderer};
 use crate::rig::Rig;
 use dpm_shaders::structs::NO_HIT;
@@ -13,18 +14,42 @@ use glam::{DAffine3, DVec2, DVec3, Vec3};
 
 /// The two pictures of a run, linear, row by row, of the projector's raster.
 pub struct Pictures {
-    /// Drive 0..1 that fell on the surface seen by each projector pixel.
+    /// Drive 0..1 that fell on the surface seen by each projector pixel. Where no pose is known, the mean light of each pixel of the raster.
     pub light: Vec<Vec3>,
-    /// Radiance that the observer saw, scene units, seen through a camera at the eye.
-    pub viewer: Vec<Vec3>,
+    /// Radiance that the observer saw, scene units, seen through a camera at the eye; or why there is none.
+    pub viewer: Result<Vec<Vec3>, &'static str>,
 }
 
-/// Frames of light with the true poses of the tracked bodies at the middle of each.
+/// Frames of light with the poses of the tracked bodies at the middle of each.
 struct Window<'a> {
     frames: Vec<(&'a LightFrame, Vec<DAffine3>)>,
 }
 
-/// Makes both pictures from the last frames of light. `None` without light or without ground truth.
+/// The frames of `light` whose poses are known: the true ones where the mock tracker tells them, else those that each frame was drawn for, which are where
+/// a real tracker and the prediction put the bodies.
+fn window<'a>(rig: &Rig, light: &'a [LightFrame], records: &[FrameRecord]) -> Window<'a> {
+    let half_slot = rig.rate().slot_len_ns(0) / 2;
+    let drawn_for = |f: &LightFrame| {
+        let record = records.iter().find(|r| r.id.0 as u32 == f.frame)?;
+        Some(record.tracked_poses.clone())
+    };
+    let poses =
+        |f: &LightFrame| rig.true_poses(f.first_photon_at.plus_ns(half_slot).0).or_else(|| drawn_for(f));
+    Window { frames: light.iter().filter_map(|f| Some((f, poses(f)?))).collect() }
+}
+
+/// Mean of the frames, pixel by pixel, 0..1.
+fn mean(light: &[LightFrame]) -> Vec<Vec3> {
+    let mut sum = vec![Vec3::ZERO; light.first().map_or(0, |f| f.codes.len())];
+    for frame in light {
+        for (s, c) in sum.iter_mut().zip(&frame.codes) {
+            *s += Vec3::from(c.map(f32::from));
+        }
+    }
+    sum.iter().map(|s| *s / (255.0 * light.len().max(1) as f32)).collect()
+}
+
+/// Makes both pictures from the last frames of light, of which there is at least one. `records` tell what those frames were drawn for.
 ///
 /// # Errors
 /// The GPU's.
@@ -32,19 +57,19 @@ pub fn pictures(
     rig: &Rig,
     renderer: &mut Renderer,
     light: &[LightFrame],
-) -> Result<Option<Pictures>, GpuError> {
-    let half_slot = rig.rate().slot_len_ns(0) / 2;
-    let frames: Option<Vec<_>> = light
-        .iter()
-        .map(|f| rig.true_poses(f.first_photon_at.plus_ns(half_slot).0).map(|poses| (f, poses)))
-        .collect();
-    let Some(window) = frames.filter(|f| !f.is_empty()).map(|frames| Window { frames }) else {
-        return Ok(None);
-    };
+    records: &[FrameRecord],
+) -> Result<Pictures, GpuError> {
+    let window = window(rig, light, records);
+    if window.frames.is_empty() {
+        let why = "neither the tracker nor the frames tell where the bodies were";
+        return Ok(Pictures { light: mean(light), viewer: Err(why) });
+    }
     let now = &window.frames[window.frames.len() - 1].1;
     let (eye, _) = rig.observer.eye_and_gaze(now);
     let light = integrate(rig, renderer, &rig.camera, eye, now, &window, |_, drive| drive)?;
-    let Some(viewer_camera) = viewer_camera(rig, eye, now) else { return Ok(None) };
+    let Some(viewer_camera) = viewer_camera(rig, eye, now) else {
+        return Ok(Pictures { light, viewer: Err("the bodies are nowhere that an eye could look at") });
+    };
     let projector = rig.camera.position();
     let max_intensity = rig.config.projector.max_intensity;
     let albedo = rig.config.scene.surface_albedo;
@@ -56,7 +81,7 @@ pub fn pictures(
         let cos = seen.normal.dot(to_projector).abs() / d2.sqrt();
         ambient + drive * (albedo / std::f64::consts::PI * max_intensity * cos / d2) as f32
     })?;
-    Ok(Some(Pictures { light, viewer }))
+    Ok(Pictures { light, viewer: Ok(viewer) })
 }
 
 /// A camera at the eye that frames what the projector lights.

@@ -1,6 +1,6 @@
 //! One part of a rig's plan, in and out, into what it costs: time and rays of a frame, and whether a pixel changes.
 
-use super::median::median_ms;
+use super::median::{median, quartiles};
 use super::sequence::{draw, poses_at};
 use crate::clock::Stopwatch;
 use crate::gpu::Gpu;
@@ -19,6 +19,10 @@ pub struct Saving {
     pub without_ms: f64,
     /// The same with it.
     pub with_ms: f64,
+    /// What the part costs, from frames drawn one right after the other: median of their differences, milliseconds.
+    pub saved_ms: f64,
+    /// Between these lies the middle half of the differences. Where 0 lies between them the part's cost is not told from chance.
+    pub saved_middle_half_ms: [f64; 2],
     /// Rays of a frame without the part, on average.
     pub without_rays: f64,
     /// The same with it.
@@ -35,6 +39,12 @@ impl Saving {
     /// The same of a part that is there for the picture.
     pub(super) fn of_pictures(self) -> Self {
         Self { changes_pictures: true, ..self }
+    }
+
+    /// The middle half of the differences lies on one side of 0: the part's cost, or gain, stands out from chance.
+    pub fn stands_out(&self) -> bool {
+        let [low, high] = self.saved_middle_half_ms;
+        low > 0.0 || high < 0.0
     }
 
     /// A pixel changed that must not.
@@ -185,11 +195,17 @@ pub fn compare(rig: &Rig, gpu: &Arc<Gpu>, without: Side<'_>, with: Side<'_>) -> 
         pixels_identical &= slots[0].codes() == slots[1].codes() && a.iter().zip(b).all(same);
         difference = relative_rms(a, b);
     }
-    let [without_ms, with_ms] = times.map(|t| median_ms(t.into_iter().skip(SETTLE)));
+    let times = times.map(|t| t.into_iter().skip(SETTLE).map(|ns| ns as f64 * 1e-6).collect::<Vec<f64>>());
+    // A disturbance of the machine that lasts meets both of a pair.
+    let differences: Vec<f64> =
+        times[0].iter().zip(&times[1]).map(|(without, with)| with - without).collect();
+    let [without_ms, with_ms] = times.map(median);
     let [without_rays, with_rays] = rays;
     Ok(Saving {
         without_ms,
         with_ms,
+        saved_ms: median(differences.iter().copied()),
+        saved_middle_half_ms: quartiles(differences),
         without_rays,
         with_rays,
         pixels_identical,

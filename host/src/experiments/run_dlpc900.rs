@@ -5,6 +5,7 @@
 //! itself. In video mode the light comes from whatever feeds its video input; this program sets it up and looks after it.
 
 use super::sequence::{draw, poses_at};
+use crate::cli::signals;
 use crate::clock::Stopwatch;
 use crate::config::{Dlpc900Config, Dlpc900Mode, ProjectorBackend, RigConfig, TrackerConfig, VideoInput};
 use crate::experiments::run_rig::open_gpu;
@@ -14,7 +15,7 @@ use crate::pipeline::{renderer_settings, PipelineError};
 use crate::render::{RenderError, Renderer};
 use crate::rig::Rig;
 use crate::telemetry::monitor::{Order, ProjectorHealth, RunMonitor};
-use dpm_device::dlpc900::driver::{Dlpc900, Dlpc900Error, HidPort, PortError};
+use dpm_device::dlpc900::driver::{DarkLine, Dlpc900, Dlpc900Error, HidPort, PortError};
 use dpm_device::dlpc900::image::PlaneOrder;
 use dpm_device::dlpc900::lut::{led, Dmd, LutEntry, IMAGE_PLANES, MAX_IMAGES};
 use dpm_device::dlpc900::sequence::{
@@ -23,10 +24,16 @@ use dpm_device::dlpc900::sequence::{
 use dpm_device::dlpc900::usb::{describe, UsbHid, UsbPlace};
 use dpm_device::link::faults;
 use dpm_device::planes::{Channel, PlaneSchedule};
+use std::sync::atomic::{AtomicBool, AtomicU8, Ordering};
+use std::sync::{Arc, Mutex, PoisonError};
 use std::time::Duration;
 
-/// How often orders are looked for.
+/// How often the run looks for orders, which the thread that makes dark has obeyed by then.
 const STEP: Duration = Duration::from_millis(20);
+/// How often the thread that makes dark looks for orders and for the end.
+const DARK_STEP: Duration = Duration::from_millis(2);
+/// How long a controller may be in other hands at the start: those of the run before, or of what puts it to rest after a SIGKILL.
+const BUSY_PATIENCE_NS: u64 = 5_000_000_000;
 /// How often the controller is asked how it is, and a lost one is looked for.
 const LOOK_NS: u64 = 200_000_000;
 
@@ -83,13 +90,11 @@ pub enum Show {
 }
 
 impl Show {
-    fn set_up<P: HidPort>(&self, d: &mut Dlpc900<P>) -> Result<(), Dlpc900Error> {
+    /// Loaded and stopped.
+    fn load<P: HidPort>(&self, d: &mut Dlpc900<P>) -> Result<(), Dlpc900Error> {
         match self {
-            Self::Preloaded(sequence) => {
-                d.upload(sequence, LedSetup::default(), &mut |_| ())?;
-                d.start()
-            }
-            Self::Video(video) => d.start_video_patterns(video),
+            Self::Preloaded(sequence) => d.upload(sequence, LedSetup::default(), &mut |_| ()),
+            Self::Video(video) => d.load_video_patterns(video),
         }
     }
 
@@ -168,10 +173,15 @@ pub fn run_dlpc900(config: &RigConfig, monitor: &RunMonitor) -> Result<Dlpc900Re
     let place = backend.device.as_deref().map(str::parse::<UsbPlace>).transpose();
     let place =
         place.map_err(|e| Failure::new(FailureKind::BadInput, format!("projector.backend.device: {e}")))?;
-    let mut open = || {
-        let port =
-            UsbHid::open(place).map_err(|source| Dlpc900Error::Port { doing: describe(place), source })?;
-        Dlpc900::new(port)
+    let waited = Stopwatch::start();
+    let mut open = || loop {
+        match UsbHid::open(place) {
+            Ok(port) => break Dlpc900::new(port),
+            Err(PortError::Busy) if waited.elapsed_ns() < BUSY_PATIENCE_NS && !monitor.stop_requested() => {
+                std::thread::sleep(STEP);
+            }
+            Err(source) => break Err(Dlpc900Error::Port { doing: describe(place), source }),
+        }
     };
     // Before minutes of rendering: is it there, and the one that is meant?
     let dmd = backend.panel.dmd();
@@ -185,7 +195,8 @@ pub fn run_dlpc900(config: &RigConfig, monitor: &RunMonitor) -> Result<Dlpc900Re
         return Err(Failure::new(FailureKind::BadInput, told));
     }
     let mut warnings =
-        vec!["a DLPC900 has no watchdog: if this program is killed, it goes on showing; `dpm dlpc900 idle` ends it".into()];
+        vec!["a DLPC900 has no watchdog: if this machine fails, or this program and the one that looks after it are killed, it goes on \
+              showing; `dpm dlpc900 idle` ends it".into()];
     let (show, frames_loaded) = match backend.mode {
         Dlpc900Mode::Preloaded => {
             let (sequence, frames) = load(config, backend, dmd, &mut warnings, monitor)?;
@@ -199,7 +210,7 @@ pub fn run_dlpc900(config: &RigConfig, monitor: &RunMonitor) -> Result<Dlpc900Re
         }
     };
     let seconds = match config.run.frames {
-        0 => None,
+        0 => Some(config.run.seconds).filter(|s| *s > 0.0),
         frames => Some(frames as f64 / config.projector.frame_rate.hz()),
     };
     let mut report = present(&mut open, &show, seconds, monitor)?;
@@ -314,10 +325,28 @@ pub fn present<P: HidPort>(
         shown_s: 0.0,
         warnings: Vec::new(),
     };
-    let result = watch_over(&mut d, open, show, seconds, monitor, &mut report);
-    // Whatever happened: stopped, LEDs off, mirrors exercised. A controller that is gone cannot be told.
-    let _ = d.stop();
-    let rested = d.idle();
+    let word = Word::default();
+    if let Some(order) = monitor.take_order() {
+        // What stands from before the run, or was ordered while it rendered: the controller is set up dark.
+        word.waiting.store(order as u8, Ordering::Relaxed);
+    }
+    let (result, rested) = std::thread::scope(|scope| {
+        // Also when this unwinds: the scope waits for the other thread.
+        let _over = Over(&word);
+        let spawned = std::thread::Builder::new()
+            .name("dpm-dark".into())
+            .spawn_scoped(scope, || word.make_dark_when_told(monitor))
+            .map_err(|e| Failure::new(FailureKind::Device, format!("cannot start a thread: {e}")));
+        let result =
+            spawned.and_then(|_| watch_over(&mut d, open, show, seconds, &word, monitor, &mut report));
+        // Whatever happened: stopped, LEDs off, mirrors exercised. A controller that is gone cannot be told, and one that does not
+        // answer is not asked again: the process must end.
+        d.hurry();
+        // Half a command may have gone out before the stop; the first one after it may be lost with it.
+        let stopped = d.stop().or_else(|e| if is_gone(&e) { Err(e) } else { d.stop() });
+        let rested = if matches!(stopped, Err(Dlpc900Error::Port { .. })) { stopped } else { d.idle() };
+        (result, rested)
+    });
     monitor.set_projector(ProjectorHealth::Stopped);
     result?;
     match rested {
@@ -330,56 +359,177 @@ fn is_gone(e: &Dlpc900Error) -> bool {
     matches!(e, Dlpc900Error::Port { source: PortError::Gone | PortError::NotFound, .. })
 }
 
+/// What the run's thread and the one that makes dark tell each other. The second one is there because the first may be inside a call
+/// of the cable for a second, in an upload for half a minute, or stopped.
+#[derive(Default)]
+struct Word {
+    /// The run is to end; read by the driver too.
+    stop: Arc<AtomicBool>,
+    /// The run has ended.
+    over: AtomicBool,
+    /// The order that the run has not seen yet; 0 for none.
+    waiting: AtomicU8,
+    /// The sequence is stopped for an upload, so nothing is lit, and a command from elsewhere would only tear the upload's apart.
+    loading: AtomicBool,
+    line: Mutex<Option<DarkLine>>,
+}
+
+/// Ends the thread that makes dark when it is dropped.
+struct Over<'a>(&'a Word);
+
+impl Drop for Over<'_> {
+    fn drop(&mut self) {
+        self.0.over.store(true, Ordering::Release);
+    }
+}
+
+impl Word {
+    /// Obeys what must be dark within milliseconds, and hands every order on to the run.
+    fn make_dark_when_told(&self, monitor: &RunMonitor) {
+        while !self.over.load(Ordering::Acquire) {
+            if let Some(order) = monitor.take_order() {
+                // Before it is obeyed: the run must not take a sequence that stops for one that stopped by itself.
+                let _ = self.waiting.fetch_update(Ordering::Relaxed, Ordering::Relaxed, |waiting| {
+                    Some(outweighing(from_code(waiting), order) as u8)
+                });
+                if matches!(order, Order::Black | Order::Safe) {
+                    self.make_dark(false);
+                }
+            }
+            // The signal itself as well: the thread that hands it on may be the one that hangs.
+            if signals::received().is_some() {
+                monitor.request_stop();
+            }
+            if monitor.stop_requested() && !self.stop.swap(true, Ordering::Relaxed) {
+                self.make_dark(true);
+            }
+            std::thread::sleep(DARK_STEP);
+        }
+    }
+
+    /// A cable that fails is the run's to tell.
+    fn make_dark(&self, leds_off: bool) {
+        if self.loading.load(Ordering::SeqCst) {
+            return;
+        }
+        if let Some(line) = self.line.lock().unwrap_or_else(PoisonError::into_inner).as_mut() {
+            let _ = line.dark(leds_off);
+        }
+    }
+
+    fn is_waiting(&self) -> bool {
+        self.waiting.load(Ordering::Relaxed) != 0 || self.stop.load(Ordering::Relaxed)
+    }
+
+    /// The order that was not seen yet, once.
+    fn take(&self) -> Option<Order> {
+        from_code(self.waiting.swap(0, Ordering::Relaxed))
+    }
+}
+
+fn from_code(code: u8) -> Option<Order> {
+    Order::ALL.iter().map(|(order, _)| *order).find(|order| *order as u8 == code)
+}
+
+/// The one that holds when `new` is given while `old` stands: nothing but ARM takes SAFE back, and FREEZE brings no light back.
+fn outweighing(old: Option<Order>, new: Order) -> Order {
+    match (old, new) {
+        (Some(Order::Safe), Order::Black | Order::Freeze) => Order::Safe,
+        (Some(Order::Black), Order::Freeze) => Order::Black,
+        (_, new) => new,
+    }
+}
+
+/// The order that stands after `new`; `None` after ARM.
+fn standing_after(old: Option<Order>, new: Order) -> Option<Order> {
+    Some(outweighing(old, new)).filter(|order| *order != Order::Arm)
+}
+
 fn watch_over<P: HidPort>(
     d: &mut Dlpc900<P>,
     open: &mut dyn FnMut() -> Result<Dlpc900<P>, Dlpc900Error>,
     show: &Show,
     seconds: Option<f64>,
+    word: &Word,
     monitor: &RunMonitor,
     report: &mut Dlpc900Report,
 ) -> Result<(), Failure> {
     let mut standing: Option<Order> = None;
     let mut lost = false;
-    let set_up = |d: &mut Dlpc900<P>, report: &mut Dlpc900Report| {
+    // A controller that is set up shows at once: not before the interlock says so.
+    while !monitor.light_allowed() && !monitor.stop_requested() {
+        monitor.set_projector(ProjectorHealth::InterlockOpen);
+        std::thread::sleep(STEP);
+    }
+    let mut allowed = true;
+    let set_up = |d: &mut Dlpc900<P>, standing: &mut Option<Order>, report: &mut Dlpc900Report| {
         let watch = Stopwatch::start();
-        let done = show.set_up(d);
+        *word.line.lock().unwrap_or_else(PoisonError::into_inner) = d.dark_line();
+        d.stop_when(Arc::clone(&word.stop));
+        // Before seconds go into an upload: out of the exercise that every run ends in, and of a sequence that a killed run left.
+        d.make_ready()?;
+        d.stop()?;
+        word.loading.store(true, Ordering::SeqCst);
+        let loaded = show.load(d);
+        word.loading.store(false, Ordering::SeqCst);
+        loaded?;
+        if let Some(order) = word.take() {
+            *standing = standing_after(*standing, order);
+        }
+        // Nobody's order to be dark is answered by light, not even by that of one pattern.
+        match *standing {
+            Some(Order::Black | Order::Safe) => {}
+            Some(Order::Freeze) => d.start().and_then(|()| d.pause())?,
+            Some(Order::Arm) | None => d.start()?,
+        }
         report.setup_s = watch.elapsed_ns() as f64 * 1e-9;
-        done
+        monitor.set_projector(health(*standing));
+        Ok(())
     };
-    set_up(d, report)?;
-    monitor.set_projector(ProjectorHealth::Up);
+    match set_up(d, &mut standing, report) {
+        Err(Dlpc900Error::Stopped) => return Ok(()),
+        other => other?,
+    }
     let (shown, mut looked) = (Stopwatch::start(), Stopwatch::start());
     while !monitor.stop_requested() && seconds.is_none_or(|s| shown.elapsed_ns() as f64 * 1e-9 < s) {
-        let order = monitor.take_order();
+        let order = word.take();
         if let Some(order) = order {
-            standing = (order != Order::Arm).then_some(order);
+            standing = standing_after(standing, order);
         }
         let due = looked.elapsed_ns() >= LOOK_NS;
+        let was_allowed = std::mem::replace(&mut allowed, monitor.light_allowed());
+        if !allowed && standing == Some(Order::Freeze) {
+            // What was held is dark now, and the operator's to show again.
+            standing = Some(Order::Black);
+        }
         let step = match (lost, order) {
-            (true, _) if due => {
+            (true, _) if due && allowed => {
                 looked = Stopwatch::start();
                 open().and_then(|found| {
                     *d = found;
                     // It may have been without power.
-                    set_up(d, report)?;
+                    set_up(d, &mut standing, report)?;
                     (lost, report.came_back) = (false, report.came_back + 1);
-                    if standing.is_some() {
-                        d.stop()?;
-                    }
-                    monitor.set_projector(health(standing));
                     Ok(())
                 })
             }
             (true, _) => Ok(()),
-            (false, Some(order)) => obey(d, order).map(|()| monitor.set_projector(health(standing))),
+            (false, _) if allowed != was_allowed => {
+                let wanted = if allowed { standing } else { Some(Order::Black) };
+                let health = if allowed { health(standing) } else { ProjectorHealth::InterlockOpen };
+                obey(d, wanted).map(|()| monitor.set_projector(health))
+            }
+            // What was ordered is done when it closes.
+            (false, _) if !allowed => Ok(()),
+            (false, Some(_)) => obey(d, standing).map(|()| monitor.set_projector(health(standing))),
             (false, None) if due => {
                 looked = Stopwatch::start();
-                look(d, standing)
+                look(d, standing, word)
             }
             (false, None) => Ok(()),
         };
         match step {
-            Ok(()) => {}
+            Ok(()) | Err(Dlpc900Error::Stopped) => {}
             // Right after it was plugged in it may still be without rights, in other hands, or silent.
             Err(e) if is_gone(&e) || lost && matches!(e, Dlpc900Error::Port { .. }) => {
                 lost = true;
@@ -393,12 +543,13 @@ fn watch_over<P: HidPort>(
     Ok(())
 }
 
-fn obey<P: HidPort>(d: &mut Dlpc900<P>, order: Order) -> Result<(), Dlpc900Error> {
-    match order {
+fn obey<P: HidPort>(d: &mut Dlpc900<P>, standing: Option<Order>) -> Result<(), Dlpc900Error> {
+    match standing {
         // The controller knows one kind of dark without losing its table.
-        Order::Black | Order::Safe => d.stop(),
-        Order::Freeze => d.pause(),
-        Order::Arm => d.start(),
+        Some(Order::Black | Order::Safe) => d.stop(),
+        // What is paused goes on from there, and pausing it again changes nothing.
+        Some(Order::Freeze) => d.pause(),
+        Some(Order::Arm) | None => d.start(),
     }
 }
 
@@ -412,11 +563,11 @@ fn health(standing: Option<Order>) -> ProjectorHealth {
 }
 
 /// A controller that stopped by itself, or complains, ends the run.
-fn look<P: HidPort>(d: &mut Dlpc900<P>, standing: Option<Order>) -> Result<(), Dlpc900Error> {
+fn look<P: HidPort>(d: &mut Dlpc900<P>, standing: Option<Order>, word: &Word) -> Result<(), Dlpc900Error> {
     let status = d.status()?;
     match status.complaint() {
         Some(what) => Err(Dlpc900Error::Hardware(what)),
-        None if standing.is_none() && !status.is_running() => {
+        None if standing.is_none() && !status.is_running() && !word.is_waiting() => {
             Err(Dlpc900Error::Hardware("the sequence stopped by itself".into()))
         }
         None => Ok(()),

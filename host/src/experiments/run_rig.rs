@@ -1,11 +1,11 @@
 //! `dpm run` and `dpm demo`: a rig from its configuration to its report and pictures.
 
 use super::pictures::{pictures, to_srgb};
-use crate::config::{ProjectorBackend, RigConfig, TrackerConfig};
-use crate::failure::{Failure, FailureKind};
-use crate::files::write_atomically;
+use crate::config::{ProjectorBackend, RigConfig};
+use crate::failure::{Ended, Failure, FailureKind};
+use crate::files::{check_folder, write_atomically};
 use crate::gpu::{validation_messages, Gpu, GpuError, GpuOptions};
-use crate::pipeline::{self, PipelineError, RunOptions};
+use crate::pipeline::{self, PipelineError, RunOptions, RunOutcome};
 use crate::render::method::Method;
 use crate::render::{RenderError, Renderer, RendererSettings};
 use crate::rig::{Rig, RigError};
@@ -22,61 +22,131 @@ use std::sync::Arc;
 ///
 /// # Errors
 /// Bad scene or numbers (exit code 2), a device that fails (3), no GPU (4).
-pub fn run_rig(config: &RigConfig, monitor: &Arc<RunMonitor>) -> Result<Report, Failure> {
+///
+/// What goes wrong after the run leaves the report as it is, so that nobody loses what was measured: see [`Ended`].
+pub fn run_rig(config: &RigConfig, monitor: &Arc<RunMonitor>) -> Result<Ended<Report>, Failure> {
+    // Not after the run whose report is to lie there.
+    check_output_folder(&config.output.dir)?;
     let gpu = open_gpu(config)?;
     let mut notes = Vec::new();
     let raster = traced_raster(config, &gpu, &mut notes);
     let rig = Arc::new(Rig::build(config, raster)?);
     let output = &config.output;
     // Pictures are made of the light itself, which only the mock sees.
-    let has_truth = matches!(config.tracker, TrackerConfig::Mock(_));
     let has_light = matches!(config.projector.backend, ProjectorBackend::Mock(_));
     if output.images && !has_light {
         notes.push(
             "output.images: the light of a projector outside is not seen, no pictures are written".into(),
         );
     }
-    let window = (output.light_window_ms * 1e-3 * rig.rate().hz()).round().max(1.0) as usize;
-    let keep_frames = if output.images && has_truth && has_light { window } else { 0 };
-    let options = RunOptions { frames: config.run.frames, keep_frames, ..RunOptions::default() };
-    let outcome = pipeline::run(rig.clone(), &gpu, options, monitor)?;
-    let mut report = outcome.report;
-    report.warnings.splice(0..0, notes);
+    if config.projector.planes == 8 {
+        notes.push(
+            "projector.planes = 8: the one white channel shows the green of the picture; red and blue alone stay dark".into(),
+        );
+    }
+    let window = (config.light_window_ms() * 1e-3 * rig.rate().hz()).round().max(1.0) as usize;
+    tell_at_the_start(&rig, &notes, monitor);
+    let keep_frames = if output.images && has_light { window } else { 0 };
+    let slots = config.slots_to_run();
+    let options = RunOptions { frames: config.run.frames, slots, keep_frames, ..RunOptions::default() };
+    let mut outcome = pipeline::run(rig.clone(), &gpu, options, monitor)?;
+    let _writing = crate::stopping::WritingFiles::begin();
+    let mut ended = Ended::from(std::mem::take(&mut outcome.report));
+    ended.report.warnings.splice(0..0, notes);
     if outcome.light_mismatches > 0 {
-        return Err(Failure::new(
-            FailureKind::CheckFailed,
-            format!("{} frames of light differ from what was rendered", outcome.light_mismatches),
-        ));
+        let told = format!("{} frames of light differ from what was rendered", outcome.light_mismatches);
+        ended.fail(Failure::new(FailureKind::CheckFailed, told));
     }
     if keep_frames > 0 {
-        // Only surfaces are asked of it, so the simplest method will do.
-        let settings = RendererSettings { method: Method::full(1), ..pipeline::renderer_settings(&rig) };
-        let mut renderer = Renderer::new(&gpu, &rig.scene, settings).map_err(PipelineError::from)?;
-        let made = pictures(&rig, &mut renderer, &outcome.light)
-            .map_err(|e| Failure::from(PipelineError::Render(e.into())))?;
-        if let Some(made) = made {
-            let white = made.viewer.iter().fold(0.0f32, |m, v| m.max(v.max_element())).max(1e-9);
-            report.files.push(save(&output.dir, "light.png", &rig, &made.light, 1.0)?);
-            report.files.push(save(&output.dir, "viewer.png", &rig, &made.viewer, (1.0 / white).min(1.0))?);
+        let written = write_pictures(&rig, &gpu, &outcome);
+        if let Some((files, why_not)) = ended.keep(written) {
+            ended.report.files.extend(files);
+            ended.report.warnings.extend(why_not);
         }
     }
     if output.trace {
-        std::fs::create_dir_all(&output.dir).map_err(|e| cannot_write(&output.dir, &e))?;
         let path = output.dir.join("trace.json");
-        write_atomically(&path, |out| write_trace(out, &outcome.traced, &outcome.standstills))
-            .map_err(|e| cannot_write(&path, &e))?;
-        report.files.push(path);
+        let written = write_atomically(&path, |out| write_trace(out, &outcome.traced, &outcome.standstills));
+        if ended.keep(written.map_err(|e| cannot_write(&path, &e))).is_some() {
+            ended.report.files.push(path);
+        }
     }
     let (count, texts) = validation_messages();
     if let Some(first) = texts.first() {
-        report.warnings.push(format!("{count} messages of the Vulkan validation layer, the first: {first}"));
+        ended
+            .report
+            .warnings
+            .push(format!("{count} messages of the Vulkan validation layer, the first: {first}"));
     }
     let path = output.dir.join("report.json");
-    report.files.push(path.clone());
-    std::fs::create_dir_all(&output.dir).map_err(|e| cannot_write(&output.dir, &e))?;
-    write_atomically(&path, |out| std::io::Write::write_all(out, report.to_json().as_bytes()))
-        .map_err(|e| cannot_write(&path, &e))?;
-    Ok(report)
+    ended.report.files.push(path.clone());
+    let text = ended.report.to_json();
+    let written = write_atomically(&path, |out| std::io::Write::write_all(out, text.as_bytes()));
+    if ended.keep(written.map_err(|e| cannot_write(&path, &e))).is_none() {
+        ended.report.files.pop();
+    }
+    Ok(ended)
+}
+
+/// Most lines that are told at the start; the report has all of them.
+const TOLD: usize = 12;
+
+/// Tells what is known before the first frame: what is changed of the rig, what the scene loses, and bodies that have nothing to show. All of it stands in the
+/// report too, but that comes after the light.
+fn tell_at_the_start(rig: &Rig, notes: &[String], monitor: &RunMonitor) {
+    let shown = |i: usize| rig.scene.bodies.iter().any(|b| b.tracked.map(usize::from) == Some(i));
+    let known: Vec<&str> = rig.scene.bodies.iter().map(|b| b.name.as_str()).collect();
+    let empty = rig.bodies.iter().enumerate().filter(|(i, _)| !shown(*i)).map(|(_, body)| {
+        format!(
+            "body {:?} does not exist in the scene, so no light falls on it, wherever the {} tracker says that it is; the scene has {}",
+            body.name,
+            rig.config.tracker.word(),
+            known.join(", ")
+        )
+    });
+    let all: Vec<String> =
+        empty.chain(notes.iter().cloned()).chain(rig.scene.warnings.iter().cloned()).collect();
+    all.iter().take(TOLD).for_each(|line| monitor.note(line.clone()));
+    if all.len() > TOLD {
+        monitor.note(format!("and {} more: see the report", all.len() - TOLD));
+    }
+}
+
+/// Writes what the kept light allows of `light.png` and `viewer.png`; the files, and why one is missing.
+fn write_pictures(
+    rig: &Rig,
+    gpu: &Arc<Gpu>,
+    outcome: &RunOutcome,
+) -> Result<(Vec<PathBuf>, Option<String>), Failure> {
+    let dir = &rig.config.output.dir;
+    if outcome.light.is_empty() {
+        let why = "output.images: no frame was lit, so there is no light to make pictures of";
+        return Ok((Vec::new(), Some(why.into())));
+    }
+    // Only surfaces are asked of it, so the simplest method will do.
+    let settings = RendererSettings { method: Method::full(1), ..pipeline::renderer_settings(rig) };
+    let mut renderer = Renderer::new(gpu, &rig.scene, settings).map_err(PipelineError::from)?;
+    let made = pictures(rig, &mut renderer, &outcome.light, &outcome.recent)
+        .map_err(|e| Failure::from(PipelineError::Render(e.into())))?;
+    let mut files = vec![save(dir, "light.png", rig, &made.light, 1.0)?];
+    let why_not = match &made.viewer {
+        Ok(viewer) => {
+            let white = viewer.iter().fold(0.0f32, |m, v| m.max(v.max_element())).max(1e-9);
+            files.push(save(dir, "viewer.png", rig, viewer, (1.0 / white).min(1.0))?);
+            None
+        }
+        Err(why) => Some(format!("output.images: no viewer.png: {why}")),
+    };
+    Ok((files, why_not))
+}
+
+/// Sees that files can be written into the folder of the output, before the work.
+///
+/// # Errors
+/// They cannot; the message names the folder.
+pub(crate) fn check_output_folder(dir: &Path) -> Result<(), Failure> {
+    check_folder(dir)
+        .map_err(|e| Failure::new(FailureKind::BadInput, format!("{e}; choose another folder with --out")))
 }
 
 /// Opens the device that the rig file names.
@@ -133,7 +203,7 @@ fn save(dir: &Path, name: &str, rig: &Rig, linear: &[Vec3], scale: f32) -> Resul
     Ok(path)
 }
 
-pub(super) fn cannot_write(path: &Path, error: &dyn std::fmt::Display) -> Failure {
+pub(crate) fn cannot_write(path: &Path, error: &dyn std::fmt::Display) -> Failure {
     Failure::new(
         FailureKind::BadInput,
         format!("cannot write {}: {error}; choose another folder with --out", path.display()),
@@ -163,7 +233,8 @@ impl From<PipelineError> for Failure {
                 GpuError::OutOfMemory { .. } | GpuError::Limit { .. } => FailureKind::BadInput,
                 _ => FailureKind::NoGpu,
             },
-            PipelineError::Panicked(_) => FailureKind::Device,
+            PipelineError::Panicked(_) | PipelineError::Hung { .. } => FailureKind::Device,
+            PipelineError::GpuHangs { .. } | PipelineError::KeepsFailing { .. } => FailureKind::NoGpu,
         };
         Self::new(kind, error)
     }

@@ -236,6 +236,8 @@ pub fn scene_plan(config: &RigConfig, measure: bool) -> Result<PlanReport, Failu
     let mut warnings = Vec::new();
     let raster = gpu.as_ref().and_then(|gpu| traced_raster(config, gpu, &mut warnings));
     let rig = Rig::build(config, raster)?;
+    // What a run would say of the scene: the file's losses and what was changed of it.
+    warnings.extend(rig.scene.warnings.iter().cloned());
     let method = Method::from_config(&config.render);
     let mut needs = SceneData::build(&rig.scene).map_err(gpu_failure)?.needs;
     needs.clamp = config.render.clamp_indirect > 0.0;

@@ -3,7 +3,7 @@
 //! No tracker, link or quantisation: true poses in, shown radiance out. The probes are the surface points that the projector lights at the
 //! last frame; each is carried back through the sequence with its body, so motion blur of a following eye, lag and smear are all in.
 
-use super::median::{median, steady_mean};
+use super::median::{median, quartiles, steady_mean};
 use crate::clock::Stopwatch;
 use crate::gpu::{Gpu, GpuError};
 use crate::pipeline::renderer_settings;
@@ -58,6 +58,19 @@ pub struct FrameTime {
     pub gpu_ms: f64,
     /// From recording to the end of waiting, ms.
     pub wall_ms: f64,
+    /// Between these lies the middle half of the frames, ms: on the GPU, or until the end of waiting where there are no time stamps.
+    pub middle_half_ms: [f64; 2],
+}
+
+impl FrameTime {
+    /// The time that methods are compared by, ms: the GPU's, or until the end of waiting where the device has no time stamps.
+    pub fn ms(&self) -> f64 {
+        if self.gpu_ms > 0.0 {
+            self.gpu_ms
+        } else {
+            self.wall_ms
+        }
+    }
 }
 
 /// Frames of [`Theatre::race`] before those that count: histories fill, the driver settles.
@@ -226,6 +239,9 @@ impl Theatre {
         let time = |(_, _, _, gpu, wall): &(_, _, _, Vec<f64>, Vec<f64>)| FrameTime {
             gpu_ms: steady_mean(gpu),
             wall_ms: steady_mean(wall),
+            middle_half_ms: quartiles(
+                if gpu.iter().any(|ms| *ms > 0.0) { gpu } else { wall }.iter().copied(),
+            ),
         };
         Ok(all.iter().map(time).collect())
     }

@@ -2,6 +2,7 @@
 
 use crate::gpu::DeviceSummary;
 use crate::rig::Rig;
+use dpm_device::regular_file;
 use serde::{Deserialize, Serialize};
 use std::fmt::Write;
 use std::path::Path;
@@ -121,9 +122,12 @@ fn config_hash(rig: &Rig) -> String {
     hash.text()
 }
 
+/// Most bytes of an input file: more than any reader of one takes.
+const MAX_INPUT_BYTES: u64 = 2 << 30;
+
 /// The file's bytes. One that cannot be read any more counts as empty: the rig was built from it a moment ago.
 fn add_file(hash: &mut Fnv, path: &Path) {
-    hash.add(&std::fs::read(path).unwrap_or_default());
+    hash.add(&regular_file::read(path, MAX_INPUT_BYTES).unwrap_or_default());
 }
 
 #[cfg(test)]

@@ -12,7 +12,7 @@ mod simd;
 pub use frame::BitPlaneFrame;
 pub use quantise::{quantise, QuantiseCounts};
 
-use dpm_device::planes::{Channel, PlaneSpec};
+use dpm_device::planes::{Channel, PlaneSchedule, PlaneSpec};
 
 /// Pixels that a kernel packs at once.
 const BLOCK_PIXELS: usize = 512;
@@ -91,6 +91,41 @@ pub const fn source_bit(plane: PlaneSpec) -> u32 {
         Channel::Blue => 16,
     };
     channel + plane.bit as u32
+}
+
+/// What a schedule's planes show of a code value: the light of a mirror, which is what the projector sends out for it.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct Shown {
+    /// Bits of the code value that planes of their own colour show.
+    coloured: u32,
+    /// Bits of the green code value that white planes show.
+    white: u32,
+}
+
+impl Shown {
+    /// That of `schedule`.
+    pub fn by(schedule: &PlaneSchedule) -> Self {
+        let mut shown = Self { coloured: 0, white: 0 };
+        for &plane in schedule.planes() {
+            match plane.channel {
+                Channel::White => shown.white |= 1 << plane.bit,
+                _ => shown.coloured |= 1 << source_bit(plane),
+            }
+        }
+        shown
+    }
+
+    /// The light of a mirror with the code value `code`, `0x00BBGGRR`, as code values of red, green and blue: white planes light all three, and a sum
+    /// above full light stays full.
+    pub fn light(self, code: u32) -> u32 {
+        let own = code & self.coloured;
+        let white = code >> 8 & self.white;
+        if white == 0 {
+            return own;
+        }
+        let sum = |shift: u32| ((own >> shift & 0xff) + white).min(0xff) << shift;
+        sum(0) | sum(8) | sum(16)
+    }
 }
 
 /// Code values `0x00BBGGRR`, row after row, into the planes of `frame`; bits 24 to 31 are ignored, padding bits become 0.

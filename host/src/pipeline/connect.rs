@@ -1,8 +1,9 @@
 //! Brings the link up: handshake, configuration, clock, ARM. Before the first frame, so it may wait (bounded).
 
 use super::stages::LinkTime;
-use dpm_device::link::{faults, HostLink, LinkError, LinkState};
-use dpm_device::time::HostTime;
+use crate::telemetry::monitor::RunMonitor;
+use dpm_device::link::{faults, HostLink, LinkError, LinkState, Verb};
+use dpm_device::time::{DeviceTicks, HostTime};
 use dpm_device::transport::Transport;
 
 /// Longest time that a device may take to answer.
@@ -28,13 +29,19 @@ pub enum ConnectError {
         /// How far it came.
         state: LinkState,
     },
+    /// A stop was asked for while the link came up.
+    #[error("stopped before the projector was up; nothing was lit")]
+    Stopped,
 }
 
 /// Latched faults that say something about a host or a cable of the past. Starting a run acknowledges them; heat, lamp, emergency
-/// stop and flashes want the operator's word.
-pub const ENDED_WITH_THE_LAST_RUN: u32 = faults::WATCHDOG | faults::CHECKSUM_STORM | faults::HOST_SAFE;
+/// stop and flashes want the operator's word, and SAFE wants `dpm arm`.
+pub const ENDED_WITH_THE_LAST_RUN: u32 = faults::WATCHDOG | faults::CHECKSUM_STORM;
 
-/// Connects and arms; latched faults in the mask `acknowledged` stand not in the way. `now` reads the clock and lets a little time pass with every call.
+/// Connects and arms; latched faults in the mask `acknowledged` stand not in the way. Where `monitor` says that BLACK, SAFE or a stop is
+/// ordered, the link comes up and does not arm: what was ordered waits in the monitor for whoever takes the link over. A SAFE that
+/// the projector has latched itself counts as ordered, whatever is `acknowledged`, and is told to the monitor. `now` reads the clock and lets a
+/// little time pass with every call; `stop` says that nobody wants light any more.
 ///
 /// # Errors
 /// The device is missing, refuses, has latched other faults, or is silent.
@@ -42,12 +49,15 @@ pub fn connect(
     link: &mut HostLink,
     transport: &mut dyn Transport,
     acknowledged: u32,
+    monitor: &RunMonitor,
     now: &mut dyn FnMut() -> HostTime,
+    stop: &dyn Fn() -> bool,
 ) -> Result<LinkTime, ConnectError> {
     link.connect();
     let begin = now();
     let mut best: Option<(i64, dpm_device::link::EchoSample)> = None;
     let mut echoes = 0;
+    let mut is_safe = false;
     loop {
         let t = now();
         let state = link.poll(t, transport)?;
@@ -58,8 +68,19 @@ pub fn connect(
                 best = Some((round_trip, e));
             }
         });
+        if stop() {
+            // Never armed after a stop was asked for, and dark if it was armed before.
+            let _ = link.command(t, Verb::Stop, transport);
+            return Err(ConnectError::Stopped);
+        }
         let latched = link.status().map_or(0, |s| s.faults);
+        if state == LinkState::Faulted && latched & faults::HOST_SAFE != 0 && !is_safe {
+            is_safe = true;
+            monitor.find_safe();
+        }
+        let stays_dark = monitor.dark_is_ordered();
         match state {
+            LinkState::Ready | LinkState::Faulted if stays_dark => {}
             LinkState::Ready => link.arm(0),
             LinkState::Faulted if latched & !acknowledged == 0 => link.arm(latched),
             LinkState::Faulted => {
@@ -68,11 +89,15 @@ pub fn connect(
             }
             _ => {}
         }
-        if let (LinkState::Streaming, Some((round_trip, echo)), Some(clock)) = (state, best, link.slots()) {
+        let is_up = state == LinkState::Streaming
+            || stays_dark && matches!(state, LinkState::Ready | LinkState::Faulted);
+        if let (true, Some((round_trip, echo)), Some(clock)) = (is_up, best, link.slots()) {
             if echoes >= ECHOES {
-                // The device's stamp lies in the middle of the shortest exchange.
+                // The middle between the device's two stamps is that of the host's: what it did in between is no part of the way.
+                let held = echo.device_sent_at.0.saturating_sub(echo.device_received_at.0);
+                let there = DeviceTicks(echo.device_received_at.0.saturating_add(held / 2));
                 let middle = echo.host_sent_at.plus_ns(round_trip / 2);
-                return Ok(LinkTime { clock, first: 0, anchor: (echo.device_received_at, middle) });
+                return Ok(LinkTime { clock, first: 0, anchor: (there, middle) });
             }
         }
         if t.ns_since(begin) > LIMIT_NS {

@@ -5,6 +5,7 @@
 
 use crate::frame::{FrameId, FrameTimeline};
 use crate::pack::BitPlaneFrame;
+use crate::plan::dark::DarkCause;
 use crate::render::{FrameCost, FrameSlot};
 use dpm_device::link::SendOutcome;
 use dpm_device::time::{DeviceTicks, HostTime};
@@ -18,6 +19,10 @@ pub enum Fate {
     UnderWay,
     /// Its slot had begun and a newer frame was waiting behind it: left out, so that nothing queues up after a stall.
     Overtaken,
+    /// Its poses would have been older than `predict_ms` and one slot when it was lit: not sent.
+    TooOld,
+    /// It was still under way when the projector had been told to go dark.
+    Stopped,
     /// The link took it or did not.
     Offered(SendOutcome),
 }
@@ -30,6 +35,14 @@ pub struct FrameNote {
     pub slot: u64,
     /// Start of that slot on the projector's clock.
     pub target_at: DeviceTicks,
+    /// From this instant of the projector's clock on there must be no light of it.
+    pub dark_from: DeviceTicks,
+    /// Longest time for which its bodies are carried on by prediction, nanoseconds.
+    pub predict_ns: i64,
+    /// Capture of the oldest newest sample among the bodies that are lit; `None` when all are dark.
+    pub oldest_captured_at: Option<HostTime>,
+    /// By body: why it is dark, `None` when it is lit.
+    pub dark: Vec<Option<DarkCause>>,
     /// Planning waited for memory: a later stage held all of it.
     pub waited_for_memory: bool,
     /// When it should have been latched.
@@ -40,8 +53,8 @@ pub struct FrameNote {
     pub tracked_poses: Vec<DAffine3>,
     /// The same without prediction: where the newest sample put them.
     pub sampled_poses: Vec<DAffine3>,
-    /// Bit k: the tracker sees body k, of the first 64.
-    pub tracked: u64,
+    /// Which bodies the tracker has seen so far.
+    pub seen: Vec<bool>,
     /// Eye, world.
     pub eye: DVec3,
     /// Thousandths of a sample that a pixel gets on average.
@@ -61,12 +74,16 @@ impl FrameNote {
             id: FrameId::default(),
             slot: 0,
             target_at: DeviceTicks(0),
+            dark_from: DeviceTicks(0),
+            predict_ns: 0,
+            oldest_captured_at: None,
+            dark: Vec::with_capacity(bodies),
             waited_for_memory: false,
             latch_due_at: HostTime(0),
             timeline: FrameTimeline::default(),
             tracked_poses: Vec::with_capacity(bodies),
             sampled_poses: Vec::with_capacity(bodies),
-            tracked: 0,
+            seen: Vec::with_capacity(bodies),
             eye: DVec3::ZERO,
             budget_milli: 0,
             cost: None,

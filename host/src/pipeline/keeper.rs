@@ -8,6 +8,7 @@ use super::job::FrameNote;
 use super::light::LightNote;
 use super::stages::LinkTime;
 use super::status_light::{DeviceCounts, StatusLight};
+use crate::plan::slots::OrderedDark;
 use crate::telemetry::monitor::{Order, ProjectorHealth, RunMonitor};
 use dpm_device::clock_map::ClockMap;
 use dpm_device::link::{faults, DeviceState, HostLink, LinkError, LinkState, Verb};
@@ -38,10 +39,13 @@ pub struct ProjectorReport {
     pub sent_mb: f64,
     /// Planes sent as they are, by a codec, and not at all because they had not changed.
     pub planes: [u64; 3],
-    /// Frames not sent: link not up, no buffer in the projector, no room on the medium, medium lost, flashes.
-    pub not_sent: [u64; 5],
+    /// Frames not sent: link not up, no buffer in the projector, no room on the medium, medium lost, flashes, limits on light.
+    pub not_sent: [u64; 6],
     /// What the projector reported; null for the mock in this process, whose light is seen itself.
     pub device: Option<DeviceCounts>,
+    /// Greatest error of the mapping from the projector's clock to the host's, as the newest exchange bounds it, nanoseconds; null at virtual pace,
+    /// and where no exchange was heard.
+    pub clock_bound_ns: Option<i64>,
     /// From sent to light in time, as learned from the reports, milliseconds; null for the mock in this process.
     pub travel_ms: Option<f64>,
 }
@@ -49,9 +53,11 @@ pub struct ProjectorReport {
 /// See the module's documentation.
 pub(super) struct LinkKeeper {
     time: LinkTime,
-    times: Publisher<LinkTime>,
+    /// Where planning learns the projector's clock; `None` before there is a crew.
+    times: Option<Publisher<LinkTime>>,
     retimed_at: HostTime,
     map: Option<ClockMap>,
+    clock_bound_ns: Option<i64>,
     session: u64,
     /// `time` is of this session.
     is_timed: bool,
@@ -60,32 +66,38 @@ pub(super) struct LinkKeeper {
     standing: Option<Verb>,
     rearmed_at: HostTime,
     rearmed: u64,
+    /// The interlock was closed when it was asked last.
+    allowed: bool,
 }
 
 impl LinkKeeper {
     /// For a link that has just come up with `time`. `lights`: where the projector's reports are all that is known of its light,
     /// notes of it go there.
-    pub(super) fn new(
-        time: LinkTime,
-        times: Publisher<LinkTime>,
-        link: &HostLink,
-        lights: Option<Sender<LightNote>>,
-    ) -> Self {
+    pub(super) fn new(time: LinkTime, link: &HostLink, lights: Option<Sender<LightNote>>) -> Self {
         Self {
             time,
-            times,
+            times: None,
             retimed_at: HostTime(i64::MIN),
             map: None,
+            clock_bound_ns: None,
             session: link.counters().sessions,
             is_timed: true,
             reports: lights.map(StatusLight::new),
             standing: None,
             rearmed_at: HostTime(i64::MIN),
             rearmed: 0,
+            allowed: true,
         }
     }
 
-    /// Polls the link and does what is due. At virtual pace (`steady`) the projector's clock stays as the handshake found it.
+    /// From now on planning learns the projector's clock through `times`.
+    pub(super) fn tell_times_to(&mut self, mut times: Publisher<LinkTime>) {
+        times.publish(self.time);
+        self.times = Some(times);
+    }
+
+    /// Polls the link and does what is due. At virtual pace (`steady`) the projector's clock stays as the handshake found it. A picture is
+    /// held only while all stages are `alive`.
     ///
     /// # Errors
     /// The link cannot come up again: another projector was plugged in, or it refuses. While the medium is gone, or the projector
@@ -96,6 +108,7 @@ impl LinkKeeper {
         link: &mut HostLink,
         transport: &mut dyn Transport,
         steady: bool,
+        alive: bool,
         monitor: &RunMonitor,
     ) -> Result<(), ConnectError> {
         let result = match link.poll(now, transport) {
@@ -112,14 +125,35 @@ impl LinkKeeper {
         if !steady {
             self.keep_time(now, link);
         }
-        if let Some(order) = monitor.take_order() {
+        // After a stop was asked for nothing lights the projector again, whoever orders it.
+        let stopping = monitor.stop_requested() || self.standing == Some(Verb::Stop);
+        if !stopping {
+            self.follow_interlock(now, monitor.light_allowed(), link, transport);
+        }
+        if let Some(order) = monitor.take_order().filter(|order| !(stopping && *order == Order::Arm)) {
             self.obey(now, order, link, transport);
         }
-        self.arm_again(now, link, steady);
+        if self.standing == Some(Verb::Freeze) && !alive {
+            // Nobody would replace the frame that is held, and nobody knows for how long.
+            self.obey(now, Order::Black, link, transport);
+        }
+        if !stopping {
+            self.arm_again(now, link, steady);
+        }
+        monitor.dark().tell(now, ordered_dark(now, link, self.standing, self.allowed));
         if let (Some(reports), Some(status)) = (&mut self.reports, link.status().filter(|_| self.is_timed)) {
             reports.observe(status, &self.time);
         }
-        monitor.set_projector(health(link, self.standing));
+        monitor.set_projector(if self.allowed {
+            health(link, self.standing)
+        } else {
+            match health(link, self.standing) {
+                dark @ (ProjectorHealth::Lost | ProjectorHealth::Faulted(_) | ProjectorHealth::Stopped) => {
+                    dark
+                }
+                _ => ProjectorHealth::InterlockOpen,
+            }
+        });
         result
     }
 
@@ -150,22 +184,57 @@ impl LinkKeeper {
             rearmed: self.rearmed,
             sent_mb: c.bytes_sent as f64 / 1e6,
             planes: [c.planes_raw, c.planes_coded, c.planes_kept],
-            not_sent: [c.not_streaming, c.no_credit, c.link_busy, c.link_lost, c.flash_limit],
+            not_sent: [c.not_streaming, c.no_credit, c.link_busy, c.link_lost, c.flash_limit, c.light_limit],
             device: self.reports.as_ref().map(StatusLight::counts),
+            clock_bound_ns: self.clock_bound_ns,
             travel_ms: self.reports.as_ref().map(|r| r.travel_ns() as f64 / 1e6),
+        }
+    }
+
+    /// The interlock opens: BLACK at once. It closes: light again, unless the operator ordered otherwise meanwhile or before.
+    fn follow_interlock(
+        &mut self,
+        now: HostTime,
+        allowed: bool,
+        link: &mut HostLink,
+        transport: &mut dyn Transport,
+    ) {
+        if allowed == std::mem::replace(&mut self.allowed, allowed) {
+            return;
+        }
+        if self.standing == Some(Verb::Freeze) {
+            // What was held is dark now and old when light may come back: that is for the operator to say.
+            self.standing = Some(Verb::Black);
+        }
+        if !allowed && !matches!(self.standing, Some(Verb::Stop | Verb::Safe)) {
+            // What does not get through now is repeated by the link.
+            let _ = link.command(now, Verb::Black, transport);
+        } else if allowed && self.standing.is_none() && link.state() == LinkState::Streaming {
+            link.arm(0);
         }
     }
 
     fn obey(&mut self, now: HostTime, order: Order, link: &mut HostLink, transport: &mut dyn Transport) {
         let verb = match order {
             Order::Black => Verb::Black,
+            // Nothing is lit that could be held.
+            Order::Freeze if !self.allowed => Verb::Black,
             Order::Freeze => Verb::Freeze,
             Order::Safe => Verb::Safe,
+            Order::Arm if !self.allowed => {
+                // Light comes when the interlock closes; latched faults then still want to be acknowledged.
+                self.standing = None;
+                return;
+            }
             Order::Arm => {
                 self.standing = None;
                 return link.arm(link.status().map_or(0, |s| s.faults));
             }
         };
+        // What stands is not weakened by a later word: FREEZE after BLACK, or BLACK after SAFE.
+        if self.standing.is_some_and(|standing| rank(standing) > rank(verb)) {
+            return;
+        }
         self.standing = Some(verb);
         // What does not get through now is repeated by the link; a medium that is gone is dark anyway.
         let _ = link.command(now, verb, transport);
@@ -174,7 +243,7 @@ impl LinkKeeper {
     /// A projector that came back, or stopped for a reason that has passed, is armed unless the operator wants it dark.
     fn arm_again(&mut self, now: HostTime, link: &mut HostLink, steady: bool) {
         // A rest after flashes ends by itself, and only by itself.
-        if self.standing.is_some() || link.is_resting(now) {
+        if self.standing.is_some() || !self.allowed || link.is_resting(now) {
             return;
         }
         match link.state() {
@@ -206,6 +275,7 @@ impl LinkKeeper {
         });
         let (Some(ticks), Some(clock)) = (newest, link.slots()) else { return };
         let Some(mapped) = map.to_host(ticks) else { return };
+        self.clock_bound_ns = Some(mapped.uncertainty_ns);
         if self.is_timed {
             let due = self.retimed_at.0 == i64::MIN || now.ns_since(self.retimed_at) >= RETIME_NS;
             if !due || map.exchanges() < EXCHANGES {
@@ -219,7 +289,9 @@ impl LinkKeeper {
             (self.time, self.is_timed) = (time, true);
         }
         self.retimed_at = now;
-        self.times.publish(self.time);
+        if let Some(times) = &mut self.times {
+            times.publish(self.time);
+        }
     }
 }
 
@@ -231,15 +303,58 @@ pub(super) fn is_dark(link: &HostLink) -> bool {
         })
 }
 
+/// What stands gives way only to what is at least as strong.
+fn rank(verb: Verb) -> u8 {
+    match verb {
+        Verb::Freeze => 0,
+        Verb::Black => 1,
+        Verb::Safe => 2,
+        Verb::Stop => 3,
+    }
+}
+
+/// Why no new picture is wanted: slots are no one's fault then.
+fn ordered_dark(
+    now: HostTime,
+    link: &HostLink,
+    standing: Option<Verb>,
+    allowed: bool,
+) -> Option<OrderedDark> {
+    match standing {
+        Some(Verb::Black) => return Some(OrderedDark::Black),
+        Some(Verb::Freeze) => return Some(OrderedDark::Frozen),
+        Some(Verb::Safe) => return Some(OrderedDark::Safe),
+        Some(Verb::Stop) => return Some(OrderedDark::Stop),
+        _ => {}
+    }
+    let latched = link.status().map_or(0, |s| s.faults);
+    if !allowed {
+        Some(OrderedDark::Interlock)
+    } else if link.is_resting(now) {
+        Some(OrderedDark::Rest)
+    } else if link.state() == LinkState::Faulted && latched & faults::HOST_SAFE != 0 {
+        Some(OrderedDark::Safe)
+    } else if link.state() == LinkState::Faulted && latched & !PASSING != 0 {
+        Some(OrderedDark::Fault)
+    } else {
+        None
+    }
+}
+
 fn health(link: &HostLink, standing: Option<Verb>) -> ProjectorHealth {
     use DeviceState as D;
     let state = link.status().map_or(D::Idle, |s| s.state);
+    if let (Some(limit), LinkState::Streaming) = (link.resting_for(), link.state()) {
+        return ProjectorHealth::Resting(limit);
+    }
     match (link.state(), standing) {
         (LinkState::Lost | LinkState::Closed, _) => ProjectorHealth::Lost,
         (LinkState::Faulted, _) => ProjectorHealth::Faulted(link.status().map_or(0, |s| s.faults)),
         // Not before the projector says so.
         (_, Some(Verb::Black)) if !matches!(state, D::Armed | D::Frozen) => ProjectorHealth::Black,
         (_, Some(Verb::Freeze)) if state != D::Armed => ProjectorHealth::Frozen,
+        // A projector that came back without power has forgotten it; the host has not.
+        (_, Some(Verb::Safe)) if state == D::Configured => ProjectorHealth::Faulted(faults::HOST_SAFE),
         (_, Some(Verb::Stop)) if is_dark(link) => ProjectorHealth::Stopped,
         (LinkState::Streaming, _) => ProjectorHealth::Up,
         _ => ProjectorHealth::Connecting,

@@ -8,7 +8,7 @@ use crate::clock::Stopwatch;
 use dpm_device::planes::PlaneSchedule;
 use dpm_device::time::HostTime;
 use dpm_handoff::channel::Sender;
-use hil_mock::projector::{LightEvent, LightKind, MockProjector};
+use hil_mock::projector::{EmulatedProjector, LightEvent, LightKind, MockProjector, Served};
 use std::collections::VecDeque;
 
 /// What the projector did in one slot.
@@ -49,7 +49,7 @@ pub struct LightRecorder {
     marks: Option<PlaneSchedule>,
     frames: VecDeque<LightFrame>,
     /// Hash over all light in order.
-    pub light_hash: u64,
+    light_hash: u64,
 }
 
 impl LightRecorder {
@@ -68,16 +68,16 @@ impl LightRecorder {
     }
 
     /// Lets the mock live up to `now`, one slot at a time, and notes all light.
-    pub fn advance(&mut self, mock: &mut MockProjector, now: HostTime) {
+    pub fn advance(&mut self, mock: &mut EmulatedProjector, now: HostTime) {
         use dpm_device::transport::LinkDevice;
         while let Some(due) = mock.next_due().filter(|&due| due <= now) {
             let watch = Stopwatch::start();
             mock.advance_to(due);
-            self.drain(mock, watch);
+            self.drain(mock.projector(), watch);
         }
         let watch = Stopwatch::start();
         mock.advance_to(now);
-        self.drain(mock, watch);
+        self.drain(mock.projector(), watch);
     }
 
     fn drain(&mut self, mock: &mut MockProjector, watch: Stopwatch) {
@@ -99,6 +99,11 @@ impl LightRecorder {
                 self.notes_lost += 1;
             }
         }
+    }
+
+    /// The hash of all light in order, in hexadecimal digits; `None` where it was not asked for.
+    pub fn hash(&self) -> Option<String> {
+        self.hash.then(|| format!("{:016x}", self.light_hash))
     }
 
     /// No more light will be noted: whoever takes the notes comes to their end.

@@ -1,11 +1,12 @@
 //! Packed frames over the cable into light: the link's thread, and the mock projector's where it has one of its own.
 
+use super::crew::Port;
 use super::job::{Fate, FrameJob, FrameMemory, FrameNote};
 use super::keeper::{is_dark, LinkKeeper, ProjectorReport};
 use super::light::LightRecorder;
-use super::outcome::StallIn;
+use super::outcome::{PipelineError, StallIn};
 use super::rights::Rights;
-use super::threads::{enter_frame_path, is_overtaken, pop_within, Shared, WARM_UP_FRAMES};
+use super::threads::{enter_frame_path, is_overtaken, pop_within, Shared, STEP_NS, WARM_UP_FRAMES};
 use crate::clock::{Clock, RunClock, Stopwatch};
 use crate::frame::Stage;
 use crate::plan::lead::LeadEstimator;
@@ -15,19 +16,29 @@ use dpm_device::time::HostTime;
 use dpm_device::transport::inproc::{DeviceEnd, Direct, HostEnd};
 use dpm_device::transport::Transport;
 use dpm_handoff::channel::{Receiver, Sender};
-use hil_mock::projector::{serve_cable, MockProjector};
+use hil_mock::projector::{serve_cable, EmulatedProjector};
+use std::panic::{catch_unwind, AssertUnwindSafe};
 use std::sync::atomic::Ordering;
+use std::time::Duration;
 
 /// How often a link without credit looks for some.
 const CREDIT_STEP_NS: i64 = 50_000;
 /// A link with nothing to send looks after its device this often.
 const IDLE_NS: i64 = 1_000_000;
+/// The same while an answer to a clock exchange is under way: how late it is looked at is how wrong the clock may be.
+const ECHO_STEP_NS: i64 = 50_000;
+/// What getting a lost medium back may take.
+const REOPEN_NS: i64 = 2_000_000_000;
+/// The supervisor says at least this often that every stage is alive, or it is not believed.
+const ALIVE_WITHIN_NS: i64 = 150_000_000;
+/// How long frames that are still under way after the dark are waited for, to be counted.
+const CLEARED_WITHIN_NS: u64 = 300_000_000;
 /// A projector outside is told to stop for at most this long; its watchdog does the rest.
 const DARK_WITHIN_MS: u32 = 300;
 
 /// The link's medium.
 pub(super) enum Cable {
-    Direct(Box<Direct<MockProjector>>, LightRecorder),
+    Direct(Box<Direct<EmulatedProjector>>, LightRecorder),
     Threaded(HostEnd),
     /// A projector outside this process.
     Outside(Box<dyn Transport>),
@@ -69,56 +80,150 @@ pub(super) struct Line {
     pub(super) lead: LeadEstimator,
 }
 
-/// Sends frames until no more come, then tells the projector to go dark. Returns the recorder of a projector without a thread of its
-/// own, and what was carried.
+/// What the link leaves behind: the recorder of a projector without a thread of its own, and what was carried.
+pub(super) type LineEnd = (Option<LightRecorder>, ProjectorReport);
+
+/// Sends the frames of whichever crew works, then tells the projector to go dark: at once when a stop was asked for, after the last frames'
+/// light when the run has all that it was asked for. A panic in here ends in the dark, too.
 pub(super) fn link_thread(
-    shared: &Shared<'_>,
+    shared: &Shared,
     mut line: Line,
-    mut jobs: Receiver<FrameJob>,
-    mut free: Sender<Box<FrameMemory>>,
-    mut done: Sender<Box<FrameNote>>,
-) -> (Option<LightRecorder>, ProjectorReport) {
+    ports: Receiver<Port>,
+    done: Sender<Box<FrameNote>>,
+) -> LineEnd {
     shared.rights.enter(3);
-    let mut last = shared.clock.now();
-    while !jobs.is_finished() {
-        let Some(mut job) = pop_within(&mut jobs, IDLE_NS) else {
-            if !shared.is_virtual() {
-                // Feeds the device's watchdog while nothing is to be sent.
-                line.poll(shared, shared.clock.now());
+    shared.link_pulse.begin();
+    let mut desk = Desk { ports, crew: None, done };
+    let served = catch_unwind(AssertUnwindSafe(|| line.serve(shared, &mut desk)));
+    enter_frame_path(false);
+    if served.is_err() {
+        shared.fail(PipelineError::Panicked("link"));
+    }
+    let last = served.unwrap_or_else(|_| shared.clock.now());
+    line.go_dark(shared, last);
+    desk.clear(shared);
+    shared.link_pulse.end();
+    let report = line.keeper.report(&line.link, line.cable.transport().name());
+    let end = (line.cable.end(), report);
+    shared.is_link_over.store(true, Ordering::Release);
+    end
+}
+
+/// Where the link's thread gets its frames and where it puts what is left of them.
+struct Desk {
+    ports: Receiver<Port>,
+    /// Frames of the crew that works, and the way back for their memory.
+    crew: Option<(Receiver<FrameJob>, Sender<Box<FrameMemory>>)>,
+    done: Sender<Box<FrameNote>>,
+}
+
+impl Desk {
+    /// True when no frame will come any more, unless from another crew.
+    fn is_finished(&self) -> bool {
+        self.crew.as_ref().is_none_or(|(jobs, _)| jobs.is_finished())
+    }
+
+    /// The next frame, waited for at most `limit_ns`.
+    fn next(&mut self, limit_ns: i64) -> Option<FrameJob> {
+        match &mut self.crew {
+            Some((jobs, _)) => pop_within(jobs, limit_ns),
+            None => {
+                std::thread::sleep(Duration::from_nanos(limit_ns as u64));
+                None
             }
-            continue;
-        };
-        // Getting a lost medium back allocates; the rig is dark then.
-        enter_frame_path(job.note.id.0 >= WARM_UP_FRAMES && line.link.state() == LinkState::Streaming);
-        shared.may_stall(StallIn::Link, job.note.id.0);
-        let now = if shared.is_virtual() { job.note.timeline.sent_at } else { shared.clock.now() };
-        last = now;
-        line.cable.live(now);
+        }
+    }
+
+    /// The frame's memory goes back to the crew, its note on to the collector. False when nobody collects.
+    fn finish(&mut self, job: FrameJob) -> bool {
+        let FrameJob { note, memory } = job;
+        if let Some((_, free)) = &mut self.crew {
+            // A crew that is gone needs no memory back.
+            let _ = free.push(memory);
+        }
+        self.done.push(note).is_ok()
+    }
+
+    /// The projector is dark: what is still under way is counted as not sent. Waits for the crew's end, but not for long.
+    fn clear(&mut self, shared: &Shared) {
         let watch = Stopwatch::start();
-        line.poll(shared, now);
-        if !is_overtaken(shared, &mut job.note, &jobs) {
-            line.send(shared, &mut job, now);
+        while !self.is_finished() && (shared.is_virtual() || watch.elapsed_ns() < CLEARED_WITHIN_NS) {
+            shared.link_pulse.beat(shared.clock.now(), STEP_NS);
+            if let Some(mut job) = self.next(IDLE_NS) {
+                job.note.fate = Fate::Stopped;
+                self.finish(job);
+            }
+        }
+    }
+}
+
+impl Line {
+    /// Sends frames until no more will come or a stop is asked for. Returns when the last one came.
+    fn serve(&mut self, shared: &Shared, desk: &mut Desk) -> HostTime {
+        let mut last = shared.clock.now();
+        while !shared.monitor.stop_requested() {
+            if let Some(port) = desk.ports.try_pop() {
+                // The frames of the crew before are dropped where they are.
+                desk.crew = Some((port.jobs, port.free));
+                self.keeper.tell_times_to(port.times);
+            }
+            let is_close = !shared.is_virtual() && self.link.awaits_echo(shared.clock.now());
+            let job = desk.next(if is_close { ECHO_STEP_NS } else { IDLE_NS });
+            if !shared.is_virtual() {
+                shared.link_pulse.beat(shared.clock.now(), self.expected_ns());
+            }
+            let Some(mut job) = job else {
+                if desk.is_finished() && shared.is_complete.load(Ordering::Acquire) {
+                    break;
+                }
+                if !shared.is_virtual() {
+                    // Feeds the device's watchdog while nothing is to be sent.
+                    self.poll(shared, shared.clock.now());
+                }
+                continue;
+            };
+            last = if shared.is_virtual() { job.note.timeline.sent_at } else { shared.clock.now() };
+            let is_last = desk.crew.as_ref().is_none_or(|(jobs, _)| jobs.is_empty());
+            self.take(shared, &mut job, last, is_last);
+            if !desk.finish(job) {
+                break;
+            }
+        }
+        last
+    }
+
+    /// Brings one frame to the medium, or decides that it is not sent.
+    /// `is_newest`: no other waits behind it.
+    fn take(&mut self, shared: &Shared, job: &mut FrameJob, now: HostTime, is_newest: bool) {
+        // Getting a lost medium back allocates; the rig is dark then.
+        enter_frame_path(job.note.id.0 >= WARM_UP_FRAMES && self.link.state() == LinkState::Streaming);
+        shared.may_stall(StallIn::Link, job.note.id.0);
+        self.cable.live(now);
+        let watch = Stopwatch::start();
+        self.poll(shared, now);
+        if !is_overtaken(shared, &mut job.note, is_newest) {
+            self.send(shared, job, now);
         }
         job.note.timeline.wall_ns[Stage::Link as usize] = watch.elapsed_ns();
         if !shared.is_virtual() {
             job.note.timeline.sent_at = shared.clock.now();
         }
-        let FrameJob { note, memory } = job;
-        if free.push(memory).is_err() || done.push(note).is_err() {
-            break;
+    }
+
+    /// How long this thread may be silent: a medium that is gone is opened anew, which takes its time.
+    fn expected_ns(&self) -> i64 {
+        match self.link.state() {
+            LinkState::Lost => REOPEN_NS,
+            _ => STEP_NS,
         }
     }
-    enter_frame_path(false);
-    line.go_dark(shared, last);
-    let report = line.keeper.report(&line.link, line.cable.transport().name());
-    (line.cable.end(), report)
-}
 
-impl Line {
     /// Moves the link along and does what is due beside frames.
-    fn poll(&mut self, shared: &Shared<'_>, now: HostTime) {
+    fn poll(&mut self, shared: &Shared, now: HostTime) {
         let Self { link, cable, keeper, .. } = self;
-        let result = keeper.poll(now, link, cable.transport(), shared.is_virtual(), shared.monitor);
+        let steady = shared.is_virtual();
+        let alive = steady || now.0 - shared.alive_at_ns.load(Ordering::Relaxed) <= ALIVE_WITHIN_NS;
+        let result = keeper.poll(now, link, cable.transport(), steady, alive, &shared.monitor);
         shared.travel_ns.store(keeper.travel_ns(), Ordering::Relaxed);
         if let Err(e) = result {
             shared.fail(e.into());
@@ -126,42 +231,55 @@ impl Line {
     }
 
     /// Offers a frame to the device and learns how long it took.
-    fn send(&mut self, shared: &Shared<'_>, job: &mut FrameJob, ready_at: HostTime) {
+    fn send(&mut self, shared: &Shared, job: &mut FrameJob, ready_at: HostTime) {
         let FrameJob { note, memory } = job;
         let now = if shared.is_virtual() { ready_at } else { self.await_credit(shared, note) };
         let waited_ns = now.ns_since(ready_at);
-        let Self { link, cable, keeper, lead } = self;
-        let outcome =
-            link.send_frame(now, note.id.0, note.target_at, memory.planes.bytes(), cable.transport());
-        note.fate = Fate::Offered(outcome);
-        if outcome != SendOutcome::Sent {
+        if is_too_old(note, now, shared.rig.rate().slot_len_ns(0)) {
+            note.fate = Fate::TooOld;
+            // It needed what it needed, and the next one should be begun earlier.
+            self.learn(shared, note, waited_ns);
             return;
         }
-        keeper.sent(note);
+        let Self { link, cable, keeper, .. } = self;
+        let planes = memory.planes.bytes();
+        let outcome =
+            link.send_frame(now, note.id.0, note.target_at, note.dark_from, planes, cable.transport());
+        note.fate = Fate::Offered(outcome);
+        if outcome == SendOutcome::Sent {
+            keeper.sent(note);
+            self.learn(shared, note, waited_ns);
+        }
+    }
+
+    /// Takes in what a frame needed. Waiting for room in a device that is ahead does not ask for an earlier start: that would only fill it more.
+    fn learn(&mut self, shared: &Shared, note: &FrameNote, waited_ns: i64) {
         if shared.is_virtual() {
             return;
         }
-        // Waiting for room in a device that is ahead does not ask for an earlier start: that would only fill it more.
+        let lead = &mut self.lead;
         lead.measured(shared.clock.now().ns_since(note.latch_due_at) - waited_ns);
         shared.lead_ns.store(lead.lead_ns(), Ordering::Relaxed);
         shared.typical_ns.store(lead.typical_ns(), Ordering::Relaxed);
     }
 
     /// Waits until the device has room for the frame, at most until the frame's slot begins; returns the time.
-    fn await_credit(&mut self, shared: &Shared<'_>, note: &FrameNote) -> HostTime {
+    fn await_credit(&mut self, shared: &Shared, note: &FrameNote) -> HostTime {
         let mut now = shared.clock.now();
         while self.link.state() == LinkState::Streaming
             && self.link.credit() == 0
             && now < note.timeline.due_at
+            && !shared.monitor.stop_requested()
         {
             now = shared.clock.wait_until(now.plus_ns(CREDIT_STEP_NS));
+            shared.link_pulse.beat(now, STEP_NS);
             self.poll(shared, now);
         }
         now
     }
 
-    /// The last frames' light, then dark. `last` is when the last frame came.
-    fn go_dark(&mut self, shared: &Shared<'_>, last: HostTime) {
+    /// The last frames' light where the run came to its end, then dark. `last` is when the last frame came.
+    fn go_dark(&mut self, shared: &Shared, last: HostTime) {
         let step = |from: HostTime| {
             if shared.is_virtual() {
                 from.plus_ns(1_000_000)
@@ -173,11 +291,11 @@ impl Line {
             last.plus_ns(2 * shared.rig.rate().slot_len_ns(0))
         } else {
             let end = shared.clock.now().plus_ns(10_000_000 + self.keeper.travel_ns());
-            while shared.clock.now() < end {
+            while shared.clock.now() < end && !shared.monitor.stop_requested() {
                 self.poll(shared, shared.clock.now());
                 step(end);
             }
-            end
+            shared.clock.now()
         };
         self.cable.live(now);
         self.keeper.stop(now, &mut self.link, self.cable.transport());
@@ -185,6 +303,7 @@ impl Line {
         let steps = if matches!(self.cable, Cable::Outside(_)) { DARK_WITHIN_MS } else { 4 };
         for i in 1..=steps {
             now = step(now);
+            shared.link_pulse.beat(now, STEP_NS);
             self.poll(shared, now);
             self.cable.live(now);
             if i >= 4 && is_dark(&self.link) {
@@ -194,10 +313,16 @@ impl Line {
     }
 }
 
+/// True when the poses of a frame that is sent at `now` will be older, once it is lit, than prediction may carry them and a slot more.
+fn is_too_old(note: &FrameNote, now: HostTime, slot_ns: i64) -> bool {
+    let lit_at = note.timeline.due_at.max(now);
+    note.oldest_captured_at.is_some_and(|captured| lit_at.ns_since(captured) > note.predict_ns + slot_ns)
+}
+
 /// The mock projector at real pace, until the cable is unplugged. Its light, and its recorder for what is kept of it.
 pub(super) fn device_thread(
     end: DeviceEnd,
-    mut mock: MockProjector,
+    mut mock: EmulatedProjector,
     mut recorder: LightRecorder,
     clock: &RunClock,
     rights: &Rights,

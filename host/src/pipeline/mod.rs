@@ -12,6 +12,8 @@
 
 mod collect;
 mod connect;
+mod crew;
+mod dark_bodies;
 pub mod job;
 mod keeper;
 pub mod light;
@@ -20,10 +22,12 @@ mod outcome;
 mod placement;
 pub mod prepared;
 pub mod projector;
+mod pulse;
 mod rights;
 mod run;
 pub mod stages;
 mod status_light;
+mod supervisor;
 mod threads;
 
 pub use collect::FrameRecord;
@@ -32,4 +36,5 @@ pub use keeper::ProjectorReport;
 pub use outcome::{PipelineError, RunOptions, RunOutcome, Stall, StallIn};
 pub use run::{output, renderer_settings, run, run_prepared};
 pub use status_light::DeviceCounts;
+pub use supervisor::has_left_threads_behind;
 pub use threads::on_frame_path;

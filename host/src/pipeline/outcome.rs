@@ -71,15 +71,17 @@ pub struct RunOutcome {
     pub light_mismatches: u64,
     /// Distributions of every interval.
     pub profiler: Profiler,
-    /// Slots without a frame of their own, by cause.
+    /// Slots by what became of them.
     pub slots: SlotCounts,
+    /// Slots in which a frame was wanted and those missed, of equal batches of consecutive slots.
+    pub slot_batches: Vec<(u64, u64)>,
     /// Lit frames with parts of another frame (looked for in prepared frames only).
     pub frames_torn: u64,
     /// Frames lit after a newer one, or twice.
     pub frames_reordered: u64,
     /// When the machine itself stood still (real pace).
     pub standstills: Standstills,
-    /// Frames for a trace, where the rig file asks for one.
+    /// The last frames, for a trace, where the rig file asks for one.
     pub traced: Vec<TracedFrame>,
 }
 
@@ -99,6 +101,29 @@ pub enum PipelineError {
         frame: u64,
         /// What happened.
         source: GpuError,
+    },
+    /// The GPU does not finish a frame.
+    #[error("frame {frame}: the GPU did not finish within {ms} ms")]
+    GpuHangs {
+        /// Which frame.
+        frame: u64,
+        /// How long it was waited for.
+        ms: u64,
+    },
+    /// A thread does not answer and cannot be replaced. The projector went dark by itself, or was told to.
+    #[error("the {stage} thread has not answered for {} ms longer than it should: the run ends in the dark; start it again, and if it happens again report it with the rig file", super::pulse::HUNG_AFTER_NS / 1_000_000)]
+    Hung {
+        /// Which thread.
+        stage: &'static str,
+    },
+    /// Stages were made anew too often.
+    #[error(
+        "more than {} failures within a minute, the last: {last}; the run ends in the dark",
+        crate::gpu::LossBudget::MOST
+    )]
+    KeepsFailing {
+        /// The last one.
+        last: String,
     },
     /// The projector.
     #[error(transparent)]

@@ -2,14 +2,12 @@
 
 use super::connect::ConnectError;
 use crate::config::{Compaction, Pace, ProjectorBackend, RigConfig};
-use dpm_device::link::{packet_bytes, Codec, Epoch, LinkError, LinkSettings, Underrun};
+use dpm_device::link::{packet_bytes, Codec, Epoch, LinkError, LinkSettings, Underrun, COMMIT_BYTES};
 use dpm_device::planes::Raster;
 use dpm_device::transport::serial::{SerialSettings, SerialTransport};
 use dpm_device::transport::usb::{UsbSettings, UsbTransport};
 use dpm_device::transport::Transport;
 
-/// Payload of a FRAME_COMMIT.
-const COMMIT_BYTES: usize = 16;
 /// From the handshake to slot 0.
 const EPOCH_NS: u64 = 5_000_000;
 
@@ -83,13 +81,13 @@ pub fn link_settings(config: &RigConfig, raster: Raster) -> LinkSettings {
         raster,
         schedule: config.projector.schedule(),
         rate: config.projector.frame_rate,
-        watchdog_us: config.safety.watchdog_ms * 1000,
+        watchdog_us: config.watchdog_us(),
         underrun: Underrun::Repeat,
         // At real pace a late frame is better than none; at virtual pace none is late.
         late_slots: if config.real_time.pace == Pace::Virtual { 0 } else { 255 },
         epoch: Epoch::AfterHello(EPOCH_NS),
-        session_seed: config.render.seed as u32 | 1,
         codecs: codecs(&config.projector.backend),
         flash_limit: flash_limit(config),
+        limits: config.safety.limits.limits(),
     }
 }

@@ -63,6 +63,13 @@ impl Rights {
         }
     }
 
+    /// The same for the supervisor, whom no stage may hold up, and who needs next to nothing.
+    pub(super) fn enter_supervisor(&self) {
+        if self.wanted {
+            let _ = enter_frame_path(ThreadRights { priority: self.highest_priority(), core: None });
+        }
+    }
+
     /// The highest priority that any thread of the run asks for; 0 under the normal scheduler.
     pub(super) fn highest_priority(&self) -> u32 {
         if self.wanted && self.priority > 0 {

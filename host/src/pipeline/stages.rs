@@ -6,7 +6,8 @@ use crate::clock::Stopwatch;
 use crate::config::TrackerConfig;
 use crate::frame::{FrameId, Stage};
 use crate::gpu::GpuError;
-use crate::pack::{self, Kernel};
+use crate::pack::{self, Kernel, Shown};
+use crate::plan::dark::DarkCause;
 use crate::render::{FrameInputs, Renderer};
 use crate::rig::{affine, Rig};
 use crate::tracking::{Freshness, PoseFilterBank, PoseFilterConfig, TrackState};
@@ -15,34 +16,43 @@ use dpm_device::time::{DeviceTicks, HostTime};
 use dpm_device::tracker::{BodyIndex, Tracker, TrackerError};
 use dpm_handoff::latest::Publisher;
 
-/// Most bodies that a rig tracks.
-pub const MAX_TRACKED: usize = 32;
+/// Most bodies that a rig tracks. The configuration refuses more.
+pub const MAX_TRACKED: usize = 256;
 
-/// What the tracking stage knows: plain data for the latest-wins slot.
-#[derive(Clone, Copy, Debug)]
+/// What the tracking stage knows, for the latest-wins slot.
+#[derive(Clone, Debug)]
 pub struct TrackSnapshot {
     /// Everything that arrived up to here is in.
     pub through: HostTime,
-    /// Per body: its track and when the newest sample arrived.
-    pub tracks: [Option<(TrackState, HostTime)>; MAX_TRACKED],
+    /// By body: its track and when the newest sample arrived.
+    pub tracks: Vec<Option<(TrackState, HostTime)>>,
+    /// From mid-exposure of the tracker to the arrival of a sample, the longest of the last samples, nanoseconds.
+    pub latency_ns: i64,
 }
 
 impl TrackSnapshot {
-    /// Nothing known.
-    pub const EMPTY: Self = Self { through: HostTime(i64::MIN), tracks: [None; MAX_TRACKED] };
+    /// Nothing is known of `bodies` bodies.
+    pub fn empty(bodies: usize) -> Self {
+        Self { through: HostTime(i64::MIN), tracks: vec![None; bodies.min(MAX_TRACKED)], latency_ns: 0 }
+    }
 }
 
 /// Samples into tracks.
 pub struct TrackingStage {
     tracker: Box<dyn Tracker>,
     bank: PoseFilterBank,
-    received_at: [HostTime; MAX_TRACKED],
+    received_at: Vec<HostTime>,
     bodies: usize,
+    /// Longest latency of the last samples; it fades by 1/1024 a sample.
+    latency_ns: i64,
     /// First step, `None` before it.
     began_at: Option<HostTime>,
     /// It was looked at whether all bodies are seen.
     looked: bool,
 }
+
+/// Longest time for which any rig carries a body on by prediction, milliseconds.
+pub(super) const MAX_PREDICT_MS: u32 = 1_000;
 
 /// Time within which every body should have been seen once: a tracker that is there speaks within milliseconds, and one that has to be
 /// connected to anew within half a second.
@@ -68,13 +78,17 @@ const fn remedy(tracker: &TrackerConfig) -> &'static str {
 impl TrackingStage {
     /// A stage for the rig's bodies.
     pub fn new(rig: &Rig, tracker: Box<dyn Tracker>) -> Self {
-        let config = PoseFilterConfig::from_rig(&rig.config.prediction, rig.config.safety.predict_ms);
+        // How long a body is shown without samples is decided for every frame, see [`plan`]; the filter only needs to know for how long
+        // a track is worth going on with.
+        let longest_ms = rig.config.safety.predict_ms.unwrap_or(MAX_PREDICT_MS);
+        let config = PoseFilterConfig::from_rig(&rig.config.prediction, longest_ms);
         let bodies = rig.bodies.len().min(MAX_TRACKED);
         Self {
             tracker,
             bank: PoseFilterBank::new(&vec![config; bodies]),
-            received_at: [HostTime(0); MAX_TRACKED],
+            received_at: vec![HostTime(0); bodies],
             bodies,
+            latency_ns: 0,
             began_at: None,
             looked: false,
         }
@@ -86,21 +100,26 @@ impl TrackingStage {
     /// The tracker is gone; what is known stays published.
     pub fn step(&mut self, now: HostTime, latest: &mut Publisher<TrackSnapshot>) -> Result<(), TrackerError> {
         self.began_at.get_or_insert(now);
-        let Self { tracker, bank, received_at, bodies, .. } = self;
+        let Self { tracker, bank, received_at, latency_ns, .. } = self;
         let result = tracker.poll(now, &mut |sample| {
             if let Some(verdict) = bank.update(sample) {
                 if verdict.is_accepted() {
                     if let Some(at) = received_at.get_mut(usize::from(sample.body.0)) {
                         *at = sample.received_at;
                     }
+                    let latency = sample.received_at.ns_since(sample.captured_at);
+                    *latency_ns = latency.max(*latency_ns - *latency_ns / 1024);
                 }
             }
         });
-        let mut snapshot = TrackSnapshot { through: now, ..TrackSnapshot::EMPTY };
-        for (i, track) in snapshot.tracks.iter_mut().enumerate().take(*bodies) {
-            *track = bank.state(BodyIndex(i as u16)).map(|s| (s, received_at[i]));
-        }
-        latest.publish(snapshot);
+        let (bank, received_at, latency_ns) = (&self.bank, &self.received_at, self.latency_ns);
+        latest.publish_with(|snapshot| {
+            snapshot.through = now;
+            snapshot.latency_ns = latency_ns;
+            for (i, (track, at)) in snapshot.tracks.iter_mut().zip(received_at).enumerate() {
+                *track = bank.state(BodyIndex(i as u16)).map(|s| (s, *at));
+            }
+        });
         result.map(|_| ())
     }
 
@@ -123,9 +142,10 @@ impl TrackingStage {
         self.unseen(rig, "has not seen", "and no light falls there until it does")
     }
 
-    /// The same at the end of a run.
+    /// The same at the end of a run, and what else the tracker has to say.
     pub fn never_seen(&self, rig: &Rig) -> Option<String> {
-        self.unseen(rig, "never saw", "so no light fell there")
+        let unseen = self.unseen(rig, "never saw", "so no light fell there");
+        unseen.into_iter().chain(self.tracker.warning()).reduce(|a, b| format!("{a}; {b}"))
     }
 
     fn unseen(&self, rig: &Rig, verb: &str, consequence: &str) -> Option<String> {
@@ -140,14 +160,37 @@ impl TrackingStage {
     }
 }
 
-/// Fills a job for slot `slot`: poses at the middle of its exposure, eye, gaze. `snapshot` is the newest there is.
-pub fn plan(job: &mut FrameJob, rig: &Rig, snapshot: &TrackSnapshot, slots: &LinkTime, id: u64, slot: u64) {
+/// What planning knows besides the newest tracks.
+#[derive(Clone, Copy, Debug)]
+pub struct PlanInputs<'a> {
+    /// The projector's slots.
+    pub slots: &'a LinkTime,
+    /// Number of the frame.
+    pub id: u64,
+    /// The slot that the frame is planned for.
+    pub slot: u64,
+    /// Slots until the next frame is expected: a renderer slower than its slots plans for every n-th.
+    pub stride: u64,
+    /// Longest time for which a body is carried on by prediction, nanoseconds (`safety.predict_ms`).
+    pub predict_ns: i64,
+    /// Age up to which the newest sample of a tracker that works may be when it is read, nanoseconds.
+    pub fresh_ns: i64,
+    /// Now.
+    pub now: HostTime,
+}
+
+/// Fills a job: poses at the middle of the slot's exposure, eye, gaze, and the instant from which its light must be off. `snapshot` is the
+/// newest there is.
+pub fn plan(job: &mut FrameJob, rig: &Rig, snapshot: &TrackSnapshot, inputs: &PlanInputs<'_>) {
     let watch = Stopwatch::start();
     let FrameJob { note, memory } = job;
+    let &PlanInputs { slots, id, slot, stride, predict_ns, .. } = inputs;
     note.id = FrameId(id);
     note.slot = slot;
     note.fate = Fate::UnderWay;
     note.target_at = slots.start(slot);
+    note.dark_from = slots.dark_from(slot, stride, predict_ns);
+    note.predict_ns = predict_ns;
     let due = slots.host_of_slot(slot);
     let middle = due.plus_ns(slots.host_of_slot(slot + 1).ns_since(due) / 2);
     let timeline = &mut note.timeline;
@@ -156,30 +199,47 @@ pub fn plan(job: &mut FrameJob, rig: &Rig, snapshot: &TrackSnapshot, slots: &Lin
     let predict = rig.config.prediction.on;
     note.tracked_poses.clear();
     note.sampled_poses.clear();
+    note.dark.clear();
     memory.lost.clear();
-    note.tracked = 0;
-    let mut oldest: Option<(HostTime, HostTime)> = None;
+    note.seen.clear();
+    // Of the bodies that are lit; of those that are dark only where none is lit.
+    let mut oldest: [Option<(HostTime, HostTime)>; 2] = [None; 2];
     for (i, body) in rig.bodies.iter().enumerate() {
         let track = snapshot.tracks.get(i).copied().flatten();
-        let (pose, sampled, lost) = match track {
+        let (pose, sampled, dark) = match track {
             Some((state, received_at)) => {
+                let state = TrackState { lost_after_ns: predict_ns, ..state };
                 let sampled = state.predict(state.captured_at);
                 let used = state.predict(middle);
+                let dark = (used.freshness == Freshness::Lost).then(|| {
+                    // The tracker does its part, but the light is further away than prediction may reach.
+                    let speaks = inputs.now.ns_since(state.captured_at) <= inputs.fresh_ns;
+                    if speaks {
+                        DarkCause::BeyondHorizon
+                    } else {
+                        DarkCause::Silent
+                    }
+                });
+                let oldest = &mut oldest[usize::from(dark.is_some())];
                 if oldest.is_none_or(|(captured, _)| state.captured_at < captured) {
-                    oldest = Some((state.captured_at, received_at));
+                    *oldest = Some((state.captured_at, received_at));
                 }
                 let pose = if predict { used.pose } else { sampled.pose };
-                (affine(&pose), affine(&sampled.pose), used.freshness == Freshness::Lost)
+                (affine(&pose), affine(&sampled.pose), dark)
             }
             // Never seen: nothing may be lit.
-            None => (affine(&body.rest), affine(&body.rest), true),
+            None => (affine(&body.rest), affine(&body.rest), Some(DarkCause::NeverSeen)),
         };
         note.tracked_poses.push(pose);
         note.sampled_poses.push(sampled);
-        memory.lost.push(lost);
-        note.tracked |= u64::from(!lost && i < 64) << (i % 64);
+        note.dark.push(dark);
+        memory.lost.push(dark.is_some());
+        // Where the tracker saw it last is where the tracker says that it is, whether or not that is new enough for light.
+        note.seen.push(track.is_some());
     }
-    let (captured_at, received_at) = oldest.unwrap_or((due, due));
+    // What is dark has no age.
+    note.oldest_captured_at = oldest[0].map(|(captured, _)| captured);
+    let (captured_at, received_at) = oldest[0].or(oldest[1]).unwrap_or((due, due));
     timeline.captured_at = captured_at;
     timeline.received_at = received_at;
     rig.scene_poses(&note.tracked_poses, &mut memory.scene_poses);
@@ -216,6 +276,7 @@ pub fn submit(job: &mut FrameJob, rig: &Rig, renderer: &mut Renderer) -> Result<
 }
 
 /// Renders one frame that nobody sees: what drivers put off to the first one (translating shaders) is over before a slot waits for it.
+/// Returns the wall time that it took, nanoseconds.
 ///
 /// # Errors
 /// The GPU did not finish within `timeout_ns`, or was lost.
@@ -224,8 +285,9 @@ pub fn warm_up(
     rig: &Rig,
     renderer: &mut Renderer,
     timeout_ns: u64,
-) -> Result<(), GpuError> {
-    let Some(slot) = memory.gpu.as_mut() else { return Ok(()) };
+) -> Result<i64, GpuError> {
+    let Some(slot) = memory.gpu.as_mut() else { return Ok(0) };
+    let watch = Stopwatch::start();
     let rest: Vec<_> = rig.bodies.iter().map(|b| affine(&b.rest)).collect();
     rig.scene_poses(&rest, &mut memory.scene_poses);
     let (eye, gaze) = rig.observer.eye_and_gaze(&rest);
@@ -242,22 +304,36 @@ pub fn warm_up(
         lost: &memory.lost,
     };
     renderer.submit(slot, &inputs)?;
-    slot.wait(timeout_ns).map(|_| ())
+    slot.wait(timeout_ns).map(|_| watch.elapsed_ns() as i64)
 }
 
-/// Waits for the GPU, if the job has one.
+/// Longest wait for the GPU in one piece.
+const GPU_STEP_NS: u64 = 5_000_000;
+
+/// Waits for the GPU, if the job has one, in steps of 5 ms; `alive` is called before each.
+///
+/// False when it did not finish within `timeout_ns`.
 ///
 /// # Errors
-/// The GPU did not finish within `timeout_ns`, or was lost.
-pub fn finish(job: &mut FrameJob, timeout_ns: u64) -> Result<(), GpuError> {
-    let Some(slot) = job.memory.gpu.as_mut() else { return Ok(()) };
+/// The GPU was lost.
+pub fn finish(job: &mut FrameJob, timeout_ns: u64, mut alive: impl FnMut()) -> Result<bool, GpuError> {
+    let Some(slot) = job.memory.gpu.as_mut() else { return Ok(true) };
     let watch = Stopwatch::start();
-    let cost = slot.wait(timeout_ns)?;
+    let cost = loop {
+        alive();
+        let left = timeout_ns.saturating_sub(watch.elapsed_ns());
+        if let Some(cost) = slot.poll_done(left.min(GPU_STEP_NS))? {
+            break cost;
+        }
+        if left <= GPU_STEP_NS {
+            return Ok(false);
+        }
+    };
     let gpu: u64 = cost.pass_ns.iter().sum();
     job.note.cost = Some(cost);
     // The fence's wait overlaps other frames; the GPU's own time is the stage's cost where it is known.
     job.note.timeline.wall_ns[Stage::Render as usize] = if gpu > 0 { gpu } else { watch.elapsed_ns() };
-    Ok(())
+    Ok(true)
 }
 
 /// Packs the finished GPU's code values into planes; a job without GPU takes its code values from `prepared`.
@@ -272,7 +348,8 @@ pub fn pack(job: &mut FrameJob, kernel: Kernel, verify: bool, prepared: &mut Opt
         }
         note.timeline.wall_ns[Stage::Pack as usize] = watch.elapsed_ns();
         if verify {
-            note.code_hash = hash_codes(codes.iter().map(|c| c & 0x00ff_ffff));
+            let shown = Shown::by(memory.planes.schedule());
+            note.code_hash = hash_codes(codes.iter().map(|&c| shown.light(c)));
         }
     } else if let Some(prepared) = prepared {
         prepared.pack(kernel, note.id.0, &mut memory.planes);
@@ -300,6 +377,13 @@ impl LinkTime {
     /// The slot that contains an instant of the device's clock; `None` before the clock's first slot.
     pub fn slot_at(&self, ticks: DeviceTicks) -> Option<u64> {
         self.clock.slot_at(ticks).map(|k| self.first.saturating_add(k))
+    }
+
+    /// From when the light of a frame must be off that is planned for `stride` slots from `slot` on and whose poses may be carried on for
+    /// `predict_ns`: the end of those slots plus the longer of `predict_ns` and three slots.
+    pub fn dark_from(&self, slot: u64, stride: u64, predict_ns: i64) -> DeviceTicks {
+        let last = slot.saturating_sub(self.first).saturating_add(stride.max(1) - 1);
+        self.clock.dark_from(last, predict_ns.max(0) as u64)
     }
 
     /// Start of a slot on the host's clock.
@@ -379,7 +463,7 @@ mod tests {
         let names = [0, 1].map(|i| format!("{:?}", rig.bodies[i].name));
         for of in 0..3u16 {
             let mut stage = TrackingStage::new(&rig, Box::new(Speaks { of }));
-            let (mut publisher, _reader) = latest(TrackSnapshot::EMPTY);
+            let (mut publisher, _reader) = latest(TrackSnapshot::empty(2));
             // From any instant on, in steps of 10 ms.
             let due: Vec<i64> = (0..300i64)
                 .map(|step| HostTime(7_000_000_000 + step * 10_000_000))

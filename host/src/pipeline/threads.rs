@@ -1,32 +1,28 @@
-//! The threads of a run and what they share: tracking, planning and packing. (`link.rs` has the link's.)
+//! What the stages of a run do in their threads, and what they share: tracking, planning and packing. (`link.rs` has the link's.)
 
-use super::collect::Collector;
+use super::crew::{CrewState, PACK, PLAN, TRACKING};
 use super::job::{Fate, FrameJob, FrameMemory, FrameNote};
-use super::keeper::{LinkKeeper, ProjectorReport};
-use super::light::{LightNote, LightRecorder};
-use super::link::{link_thread, Cable, Line};
 use super::outcome::{PipelineError, RunOptions, StallIn};
 use super::prepared::PreparedFrames;
+use super::pulse::Pulse;
 use super::rights::Rights;
-use super::stages::{self, LinkTime, TrackSnapshot, TrackingStage};
+use super::stages::{self, LinkTime, PlanInputs, TrackSnapshot, TrackingStage};
 use crate::clock::{Clock, RunClock, Stopwatch};
 use crate::config::{Pace, Wait};
-use crate::frame::Stage;
 use crate::pack::Kernel;
 use crate::plan::budget::BudgetController;
-use crate::plan::lead::LeadEstimator;
+use crate::plan::horizon::Horizon;
 use crate::realtime::wait_policy;
 use crate::render::Renderer;
 use crate::rig::Rig;
 use crate::telemetry::monitor::RunMonitor;
-use dpm_device::link::HostLink;
 use dpm_device::time::HostTime;
-use dpm_handoff::channel::{channel, Receiver, Sender};
-use dpm_handoff::latest::{latest, Publisher, Reader};
-use dpm_handoff::wake::WaitPolicy;
+use dpm_handoff::channel::{Receiver, Sender};
+use dpm_handoff::latest::{Publisher, Reader};
+use dpm_handoff::wake::{WaitPolicy, Waiter, Waker};
 use std::cell::Cell;
 use std::sync::atomic::{AtomicBool, AtomicI64, AtomicU64, Ordering};
-use std::sync::{Arc, Mutex, OnceLock};
+use std::sync::{Arc, Mutex};
 use std::time::Duration;
 
 thread_local! {
@@ -49,47 +45,64 @@ const WARM_UP_STEPS: u32 = 64;
 /// Virtual pace: time between the last byte of a frame and its slot, for jitter of the hand-offs.
 const MARGIN_NS: i64 = 50_000;
 /// Frames that may be between planning and the collector's books: a quarter of a second at 947 Hz.
-const NOTES: usize = 256;
+pub(super) const NOTES: usize = 256;
 /// Tracking, plan, pack, link, and the mock projector.
 pub(super) const STAGE_THREADS: usize = 5;
 /// Real pace: what a projector needs to take a frame in and check it once the medium has all of it. The host cannot measure it.
 pub(super) const RECEIPT_NS: i64 = 500_000;
 /// Longest wait for another stage before it is looked whether the run goes on.
-const WAIT_NS: i64 = 100_000_000;
-/// A frame that the GPU has not finished by then is given up, and the run with it.
+const WAIT_NS: i64 = 20_000_000;
+/// What a step of a stage may take beside its waits before anybody wonders.
+pub(super) const STEP_NS: i64 = 20_000_000;
+/// What a poll of a tracker may take: some have to be opened or connected to anew.
+const POLL_NS: i64 = 200_000_000;
+/// How long frames that the GPU still works on are waited for at the end.
+const RELEASED_WITHIN_NS: u64 = 30_000_000_000;
+/// Virtual pace: a frame that the GPU has not finished by then is given up, and the run with it.
 const GPU_TIMEOUT_NS: u64 = 20_000_000_000;
 /// The same for the first one, for which drivers translate shaders: minutes on a slow machine that does other things too.
 pub(super) const FIRST_FRAME_TIMEOUT_NS: u64 = 180_000_000_000;
 /// Time for which trackers are listened to before the first frame, so that the filters know the motion.
 pub(super) const LISTEN_NS: i64 = 150_000_000;
 
-/// Everything that the threads share.
-pub(super) struct Shared<'a> {
+/// Everything that the threads of a run share, whichever crew works.
+pub(super) struct Shared {
     pub(super) rig: Arc<Rig>,
-    pub(super) clock: &'a RunClock,
+    pub(super) clock: Arc<RunClock>,
+    /// The projector's clock as the handshake found it.
     pub(super) time: LinkTime,
-    /// Virtual pace: samples up to here are wanted.
-    pub(super) listen_to: AtomicI64,
-    /// Virtual pace: who to wake when more is wanted.
-    pub(super) tracking: OnceLock<std::thread::Thread>,
     /// Real pace: how long before its slot a frame is latched, nanoseconds.
     pub(super) lead_ns: AtomicI64,
     /// Real pace: what most frames need from latch to sent, nanoseconds.
     pub(super) typical_ns: AtomicI64,
     /// Learned time from sent to light, nanoseconds (projectors outside).
     pub(super) travel_ns: AtomicI64,
-    /// Thousandths of a sample that a pixel gets on average.
-    pub(super) budget_milli: AtomicU64,
-    /// The frame that is being planned.
-    pub(super) planning: AtomicU64,
-    pub(super) tracking_over: AtomicBool,
+    /// When the supervisor last found every stage alive.
+    pub(super) alive_at_ns: AtomicI64,
+    /// Number of the next frame.
+    pub(super) next_frame: AtomicU64,
+    /// Slot after the last one that the run was asked to plan for; 0 while it is not known.
+    pub(super) end_slot: AtomicU64,
+    /// Slots from one planned frame to the next, in thousandths, as an average of the last frames.
+    pub(super) stride_milli: AtomicU64,
+    /// Longest time for which a body is carried on by prediction, nanoseconds.
+    pub(super) predict_ns: AtomicI64,
+    /// Every frame that the run was asked for is planned.
+    pub(super) is_complete: AtomicBool,
+    /// The link's thread has ended, and the projector is dark.
+    pub(super) is_link_over: AtomicBool,
+    /// A thread that nobody can replace hangs: whoever can still end the run does not wait for the others.
+    pub(super) is_broken: AtomicBool,
+    pub(super) link_pulse: Pulse,
+    pub(super) collector_pulse: Pulse,
     pub(super) error: Mutex<Option<PipelineError>>,
-    pub(super) monitor: &'a RunMonitor,
+    pub(super) monitor: Arc<RunMonitor>,
     pub(super) options: RunOptions,
-    pub(super) rights: &'a Rights,
+    pub(super) rights: Arc<Rights>,
 }
 
-impl Shared<'_> {
+impl Shared {
+    /// The run ends, in the dark, with this error; the first one counts.
     pub(super) fn fail(&self, error: PipelineError) {
         if let Ok(mut first) = self.error.lock() {
             first.get_or_insert(error);
@@ -132,133 +145,29 @@ pub(super) fn pop_within<T>(from: &mut Receiver<T>, limit_ns: i64) -> Option<T> 
     })
 }
 
-/// What the stages of a run work with.
-pub(super) struct Stages<'a> {
-    pub(super) tracking: TrackingStage,
-    /// `None` if frames are prepared.
-    pub(super) renderer: Option<&'a mut Renderer>,
-    pub(super) prepared: Option<PreparedFrames>,
-    /// How planes are packed if the GPU has not done it.
-    pub(super) kernel: Kernel,
-    /// `None` if every frame gets the rays that the rig file asks for.
-    pub(super) budget: Option<BudgetController>,
-    pub(super) link: HostLink,
-    pub(super) cable: Cable,
-    pub(super) lead: LeadEstimator,
-    /// What frames are made in.
-    pub(super) memory: Vec<FrameMemory>,
-    /// Where the link's thread tells of light that it has word of; `None` if somebody sees the light itself.
-    pub(super) seen: Option<Sender<LightNote>>,
-    /// Light, from either of them.
-    pub(super) lights: Receiver<LightNote>,
-}
-
-/// What the stages leave behind.
-pub(super) struct Leavings {
-    /// The recorder of a projector without a thread of its own.
-    pub(super) recorder: Option<LightRecorder>,
-    /// What was carried.
-    pub(super) carried: ProjectorReport,
-    /// Bodies that were never seen, and why.
-    pub(super) unseen: Option<String>,
-}
-
-/// Starts the stages and waits for all of them.
-pub(super) fn run_threads(
-    shared: &Shared<'_>,
-    stages: Stages<'_>,
-    collector: &mut Collector,
-) -> Result<Leavings, PipelineError> {
-    let Stages { tracking, renderer, prepared, kernel, budget, link, cable, lead, memory, seen, lights } =
-        stages;
-    let policy = policy(&shared.rig);
-    // Room for everything there is: no stage ever finds the next one's channel full.
-    let jobs = memory.len();
-    let (mut free_in, free_out) = channel(jobs, policy);
-    let (to_pack_in, to_pack_out) = channel(jobs, policy);
-    let (to_link_in, to_link_out) = channel(jobs, policy);
-    let (done_in, done_out) = channel(NOTES, WaitPolicy::Park);
-    let (mut notes_in, notes_out) = channel(NOTES, WaitPolicy::Park);
-    for memory in memory {
-        let _ = free_in.push(Box::new(memory));
-    }
-    for _ in 0..NOTES {
-        let _ = notes_in.push(Box::new(FrameNote::new(shared.rig.bodies.len())));
-    }
-    std::thread::scope(|scope| {
-        let (publisher, reader) = latest(TrackSnapshot::EMPTY);
-        let (times, time) = latest(shared.time);
-        let keeper = LinkKeeper::new(shared.time, times, &link, seen);
-        let line = Line { link, cable, keeper, lead };
-        let named = |name: &'static str| std::thread::Builder::new().name(format!("dpm-{name}"));
-        let refused = |stage| move |source| PipelineError::Thread { stage, source };
-        // A stage that returns or panics drops its senders, which ends the next one: nobody waits for ever.
-        let tracking = named("tracking")
-            .spawn_scoped(scope, move || tracking_thread(shared, tracking, publisher))
-            .map_err(refused("tracking"))?;
-        let plan = named("plan")
-            .spawn_scoped(scope, move || {
-                let _close = OnExit(|| shared.tracking_over.store(true, Ordering::Release));
-                plan_thread(shared, renderer, reader, time, free_out, notes_out, to_pack_in);
-            })
-            .map_err(refused("plan"))?;
-        let pack = named("pack")
-            .spawn_scoped(scope, move || {
-                let _close = OnExit(|| shared.monitor.request_stop());
-                pack_thread(shared, kernel, prepared, budget, to_pack_out, to_link_in);
-            })
-            .map_err(refused("pack"))?;
-        let link = named("link")
-            .spawn_scoped(scope, move || {
-                let _close = OnExit(|| shared.monitor.request_stop());
-                link_thread(shared, line, to_link_out, free_in, done_in)
-            })
-            .map_err(refused("link"))?;
-        collector.run(done_out, notes_in, lights, shared.monitor);
-        let link = link.join();
-        for (name, thread) in [("pack", pack), ("plan", plan)] {
-            if thread.join().is_err() {
-                shared.fail(PipelineError::Panicked(name));
-            }
-        }
-        let unseen = tracking.join().unwrap_or_else(|_| {
-            shared.fail(PipelineError::Panicked("tracking"));
-            None
-        });
-        let (recorder, carried) = link.map_err(|_| PipelineError::Panicked("link"))?;
-        Ok(Leavings { recorder, carried, unseen })
-    })
-}
-
-/// Calls its function when dropped, during a panic too.
-struct OnExit<F: FnMut()>(F);
-
-impl<F: FnMut()> Drop for OnExit<F> {
-    fn drop(&mut self) {
-        (self.0)();
-    }
-}
-
-/// Returns what is wrong with the tracker at the end.
-fn tracking_thread(
-    shared: &Shared<'_>,
+/// Reads the tracker until planning is over. Returns what is wrong with the tracker at the end.
+pub(super) fn tracking_thread(
+    shared: &Shared,
+    crew: &CrewState,
     mut stage: TrackingStage,
     mut latest: Publisher<TrackSnapshot>,
 ) -> Option<String> {
     shared.rights.enter(0);
-    let _ = shared.tracking.set(std::thread::current());
+    let pulse = &crew.pulses[TRACKING];
+    pulse.begin();
+    let _ = crew.tracking.set(std::thread::current());
     let mut heard_to = i64::MIN;
     let mut steps = 0u32;
     let mut planned = 0;
-    while !shared.tracking_over.load(Ordering::Acquire) {
+    while !crew.tracking_over.load(Ordering::Acquire) {
         // Each frame once, also those that were planned while this thread slept.
-        let planning = shared.planning.load(Ordering::Relaxed);
+        let planning = crew.planning.load(Ordering::Relaxed);
         while planned < planning {
             planned += 1;
             shared.may_stall(StallIn::Tracking, planned);
         }
         let now = if shared.is_virtual() {
-            let wanted = shared.listen_to.load(Ordering::Acquire);
+            let wanted = crew.listen_to.load(Ordering::Acquire);
             if wanted == heard_to {
                 // Not spinning: software Vulkan needs every core.
                 std::thread::park_timeout(Duration::from_millis(1));
@@ -267,7 +176,9 @@ fn tracking_thread(
             heard_to = wanted;
             HostTime(wanted)
         } else {
-            shared.clock.now()
+            let now = shared.clock.now();
+            pulse.beat(now, POLL_NS);
+            now
         };
         steps = steps.saturating_add(1);
         enter_frame_path(steps >= WARM_UP_STEPS);
@@ -285,156 +196,382 @@ fn tracking_thread(
         }
     }
     enter_frame_path(false);
+    pulse.end();
     stage.never_seen(&shared.rig)
 }
 
-fn plan_thread(
-    shared: &Shared<'_>,
-    mut renderer: Option<&mut Renderer>,
-    mut latest: Reader<TrackSnapshot>,
-    mut time: Reader<LinkTime>,
-    mut free: Receiver<Box<FrameMemory>>,
-    mut notes: Receiver<Box<FrameNote>>,
-    mut to_pack: Sender<FrameJob>,
+/// Where planning finds what it works with.
+pub(super) struct PlanInbox {
+    pub(super) latest: Reader<TrackSnapshot>,
+    pub(super) time: Reader<LinkTime>,
+    pub(super) free: Receiver<Box<FrameMemory>>,
+    pub(super) notes: Receiver<Box<FrameNote>>,
+    /// Woken when the GPU has finished a frame.
+    pub(super) gpu_free: Waiter,
+}
+
+/// Latches, plans and submits frames until the run has all that it was asked for, or the crew is dismissed.
+pub(super) fn plan_thread(
+    shared: &Shared,
+    crew: &CrewState,
+    renderer: Option<Renderer>,
+    inbox: PlanInbox,
+    to_pack: Sender<FrameJob>,
 ) {
     shared.rights.enter(1);
-    let costs = shared.costs();
-    let modelled = costs.iter().sum::<i64>() + MARGIN_NS;
-    let begin = shared.clock.now();
-    let mut next_slot =
-        shared.time.slot_after(begin.plus_ns(modelled + if shared.is_virtual() { 0 } else { LISTEN_NS }));
-    let RunOptions { frames, slots, .. } = shared.options;
-    let end = if slots == 0 { u64::MAX } else { next_slot.saturating_add(slots) };
-    let mut id = 0u64;
-    let mut hottest = Vec::with_capacity(shared.options.in_flight.max(2));
-    while !shared.monitor.stop_requested() && (frames == 0 || id < frames) && next_slot < end {
-        enter_frame_path(id >= WARM_UP_FRAMES);
-        // What came back last is taken first: it is the warmest in the caches.
-        while let Some(memory) = free.try_pop() {
-            hottest.push(memory);
+    let pulse = &crew.pulses[PLAN];
+    pulse.begin();
+    let mut planner = Planner::new(shared, crew, renderer, inbox, to_pack);
+    while !crew.is_dismissed(shared) && !planner.is_complete() {
+        pulse.beat(shared.clock.now(), WAIT_NS + STEP_NS);
+        if planner.step().is_none() {
+            break;
         }
-        let waited = hottest.is_empty();
-        if waited {
-            hottest.extend(pop_within(&mut free, WAIT_NS));
+    }
+    enter_frame_path(false);
+    if planner.is_complete() {
+        shared.is_complete.store(true, Ordering::Release);
+    }
+    pulse.end();
+    let Planner { renderer, to_pack, .. } = planner;
+    // Packing comes to its end, too.
+    drop(to_pack);
+    let Some(renderer) = renderer else { return };
+    let watch = Stopwatch::start();
+    while crew.gpu.in_flight() > 0 {
+        if watch.elapsed_ns() > RELEASED_WITHIN_NS {
+            // The GPU may read what the renderer owns for as long as it likes: it is never freed.
+            std::mem::forget(renderer);
+            return;
         }
-        if hottest.is_empty() {
-            continue;
+        std::thread::sleep(Duration::from_millis(1));
+    }
+}
+
+/// The planning thread's own.
+struct Planner<'a> {
+    shared: &'a Shared,
+    crew: &'a CrewState,
+    renderer: Option<Renderer>,
+    inbox: PlanInbox,
+    to_pack: Sender<FrameJob>,
+    horizon: Horizon,
+    /// What came back last is taken first: it is the warmest in the caches.
+    #[allow(clippy::vec_box)] // The box is what travels between the threads.
+    hottest: Vec<Box<FrameMemory>>,
+    /// The last look at the memory that came back found none.
+    waited: bool,
+    slot_ns: i64,
+    modelled_ns: i64,
+    next_slot: u64,
+    last_slot: Option<u64>,
+}
+
+impl<'a> Planner<'a> {
+    fn new(
+        shared: &'a Shared,
+        crew: &'a CrewState,
+        renderer: Option<Renderer>,
+        mut inbox: PlanInbox,
+        to_pack: Sender<FrameJob>,
+    ) -> Self {
+        let modelled_ns = shared.costs().iter().sum::<i64>() + MARGIN_NS;
+        let listen_ns = if shared.is_virtual() { 0 } else { LISTEN_NS };
+        let time = *inbox.time.latest().0;
+        let next_slot = time.slot_after(shared.clock.now().plus_ns(modelled_ns + listen_ns));
+        if shared.options.slots > 0 {
+            let end = next_slot.saturating_add(shared.options.slots);
+            // The first crew decides; one that takes over keeps to it.
+            let _ = shared.end_slot.compare_exchange(0, end, Ordering::Relaxed, Ordering::Relaxed);
         }
-        let Some(note) = pop_within(&mut notes, WAIT_NS) else { continue };
-        let Some(memory) = hottest.pop() else { continue };
-        shared.planning.store(id, Ordering::Relaxed);
-        shared.may_stall(StallIn::Plan, id);
+        Self {
+            shared,
+            crew,
+            renderer,
+            inbox,
+            to_pack,
+            horizon: Horizon::of_rig(&shared.rig.config),
+            hottest: Vec::with_capacity(shared.options.in_flight.max(2)),
+            waited: false,
+            slot_ns: shared.rig.rate().slot_len_ns(0),
+            modelled_ns,
+            next_slot,
+            last_slot: None,
+        }
+    }
+
+    /// Everything that the run was asked for is planned.
+    fn is_complete(&self) -> bool {
+        let frames = self.shared.options.frames;
+        let end = self.shared.end_slot.load(Ordering::Relaxed);
+        (frames > 0 && self.shared.next_frame.load(Ordering::Relaxed) >= frames)
+            || (end > 0 && self.next_slot >= end)
+    }
+
+    /// Memory and a note for the next frame, waited for at most [`WAIT_NS`].
+    fn memory(&mut self) -> Option<FrameJob> {
+        while let Some(memory) = self.inbox.free.try_pop() {
+            self.hottest.push(memory);
+        }
+        self.waited |= self.hottest.is_empty();
+        if self.hottest.is_empty() {
+            self.hottest.extend(pop_within(&mut self.inbox.free, WAIT_NS));
+        }
+        if self.hottest.is_empty() {
+            return None;
+        }
+        let note = pop_within(&mut self.inbox.notes, WAIT_NS)?;
+        let memory = self.hottest.pop()?;
         let mut job = FrameJob { note, memory };
-        job.note.waited_for_memory = waited;
-        let travel =
-            shared.travel_ns.load(Ordering::Relaxed) + if shared.is_virtual() { 0 } else { RECEIPT_NS };
-        let lead =
-            travel + if shared.is_virtual() { modelled } else { shared.lead_ns.load(Ordering::Relaxed) };
-        let time = *time.latest().0;
-        let now = shared.clock.now();
-        if !shared.is_virtual() {
-            // Frames are begun early enough for a bad moment, so after one there is time to catch up: a slot is given up only
-            // when a frame that takes as long as most do would miss it.
-            let typical = shared.typical_ns.load(Ordering::Relaxed) + travel;
-            next_slot = next_slot.max(time.slot_after(now.plus_ns(typical)));
+        job.note.waited_for_memory = std::mem::take(&mut self.waited);
+        Some(job)
+    }
+
+    /// A GPU that needs a slot or more for a frame gets them one at a time. False while it is busy.
+    fn is_gpu_free(&mut self) -> bool {
+        let gpu = &self.crew.gpu;
+        if self.shared.is_virtual() || self.renderer.is_none() || !gpu.is_slow(self.slot_ns) {
+            return true;
         }
-        let due_at = time.host_of_slot(next_slot);
-        let latch_at = due_at.plus_ns(-lead);
-        shared.clock.wait_until(latch_at);
-        // Waking up too late counts; what kept the frame from being begun earlier does not.
-        job.note.latch_due_at = latch_at.max(now);
-        if shared.is_virtual() {
-            shared.listen_to.store(latch_at.0, Ordering::Release);
-            if let Some(tracking) = shared.tracking.get() {
-                tracking.unpark();
-            }
-            while latest.latest().0.through < latch_at && !shared.monitor.stop_requested() {
-                std::thread::yield_now();
-            }
+        let clock = &self.shared.clock;
+        let deadline = clock.now().plus_ns(WAIT_NS).0;
+        self.inbox.gpu_free.wait(deadline, || clock.now().0, || gpu.in_flight() == 0)
+    }
+
+    /// One frame, if there is memory for it. `None` when the crew cannot go on.
+    fn step(&mut self) -> Option<()> {
+        let Self { shared, crew, .. } = *self;
+        if !self.is_gpu_free() {
+            return Some(());
         }
-        job.note.budget_milli = shared.budget_milli.load(Ordering::Relaxed);
-        stages::plan(&mut job, &shared.rig, latest.latest().0, &time, id, next_slot);
+        let Some(mut job) = self.memory() else { return Some(()) };
+        let id = shared.next_frame.load(Ordering::Relaxed);
+        enter_frame_path(id >= WARM_UP_FRAMES);
+        crew.planning.store(id, Ordering::Relaxed);
+        shared.may_stall(StallIn::Plan, id);
+        let time = *self.inbox.time.latest().0;
+        let (latch_at, lead_ns) = self.choose_slot(&mut job, &time);
+        if self.is_complete() {
+            // What this frame would be for lies beyond the end of the run.
+            self.hottest.push(job.memory);
+            return Some(());
+        }
+        self.wait_for(latch_at);
+        let (snapshot, now) = (self.inbox.latest.latest().0, shared.clock.now());
+        let latched_at = if shared.is_virtual() { latch_at } else { now };
+        let predict_ns = self.horizon.predict_ns(lead_ns, snapshot.latency_ns);
+        shared.predict_ns.store(predict_ns, Ordering::Relaxed);
+        let slot = self.next_slot;
+        let stride = slot.saturating_sub(self.last_slot.unwrap_or(slot.saturating_sub(1))).clamp(1, 1000);
+        job.note.budget_milli = crew.budget_milli.load(Ordering::Relaxed);
+        let inputs = PlanInputs {
+            slots: &time,
+            id,
+            slot,
+            stride,
+            predict_ns,
+            fresh_ns: self.horizon.fresh_ns(snapshot.latency_ns),
+            now: latched_at,
+        };
+        stages::plan(&mut job, &shared.rig, snapshot, &inputs);
         let t = &mut job.note.timeline;
+        t.latched_at = latched_at;
         if shared.is_virtual() {
-            t.latched_at = latch_at;
+            let costs = shared.costs();
             t.submitted_at = t.latched_at.plus_ns(costs[0]);
             t.rendered_at = t.submitted_at.plus_ns(costs[1]);
+            t.packing_at = t.rendered_at;
             t.packed_at = t.rendered_at.plus_ns(costs[2]);
             t.sent_at = t.packed_at.plus_ns(costs[3]);
-        } else {
-            t.latched_at = shared.clock.now();
         }
-        let submitted = match renderer.as_deref_mut() {
-            Some(renderer) => stages::submit(&mut job, &shared.rig, renderer),
-            None => Ok(()),
-        };
-        if let Err(source) = submitted {
-            shared.fail(PipelineError::Gpu { frame: id, source });
-            break;
+        if let Some(renderer) = &mut self.renderer {
+            if let Err(source) = stages::submit(&mut job, &shared.rig, renderer) {
+                crew.fail(PipelineError::Gpu { frame: id, source });
+                return None;
+            }
+            crew.gpu.submit();
         }
         if !shared.is_virtual() {
             job.note.timeline.submitted_at = shared.clock.now();
         }
         shared.monitor.count_planned();
-        id += 1;
-        next_slot += 1;
-        if to_pack.push(job).is_err() {
-            break;
+        self.keep_count(id, slot, stride);
+        self.to_pack.push(job).ok()
+    }
+
+    fn keep_count(&mut self, id: u64, slot: u64, stride: u64) {
+        self.shared.next_frame.store(id + 1, Ordering::Relaxed);
+        let before = self.shared.stride_milli.load(Ordering::Relaxed);
+        let mean = before.saturating_mul(15).saturating_add(stride * 1000) / 16;
+        self.shared.stride_milli.store(mean, Ordering::Relaxed);
+        self.last_slot = Some(slot);
+        self.next_slot = slot + 1;
+    }
+
+    /// Chooses the frame's slot. Returns when its poses are to be read, and how long before its slot that is.
+    fn choose_slot(&mut self, job: &mut FrameJob, time: &LinkTime) -> (HostTime, i64) {
+        let Self { shared, crew, .. } = *self;
+        if shared.is_virtual() {
+            let latch_at = time.host_of_slot(self.next_slot).plus_ns(-self.modelled_ns);
+            job.note.latch_due_at = latch_at;
+            return (latch_at, self.modelled_ns);
+        }
+        let travel = shared.travel_ns.load(Ordering::Relaxed) + RECEIPT_NS;
+        let lead = shared.lead_ns.load(Ordering::Relaxed) + travel;
+        let now = shared.clock.now();
+        // Frames are begun early enough for a bad moment, so after one there is time to catch up: a slot is given up only when a frame that
+        // takes as long as most do would miss it. A renderer that is slower than its slots has nothing to catch up with: its frames are
+        // planned for slots that they can make.
+        let slow = self.renderer.is_some() && crew.gpu.is_slow(self.slot_ns);
+        let needed = if slow { lead } else { shared.typical_ns.load(Ordering::Relaxed) + travel };
+        self.next_slot = self.next_slot.max(time.slot_after(now.plus_ns(needed)));
+        let latch_at = time.host_of_slot(self.next_slot).plus_ns(-lead);
+        // Waking up too late counts; what kept the frame from being begun earlier does not.
+        job.note.latch_due_at = latch_at.max(now);
+        (latch_at, lead)
+    }
+
+    /// Waits until it is time to read the poses.
+    fn wait_for(&mut self, latch_at: HostTime) {
+        let Self { shared, crew, .. } = *self;
+        if !shared.is_virtual() {
+            crew.pulses[PLAN].beat(latch_at.max(shared.clock.now()), WAIT_NS + STEP_NS);
+            let now = shared.clock.wait_until(latch_at);
+            crew.pulses[PLAN].beat(now, STEP_NS);
+            return;
+        }
+        shared.clock.wait_until(latch_at);
+        // What arrives later than this is no pose yet when the frame is latched.
+        let track_ns = i64::from(shared.rig.config.real_time.stage_costs_us.track) * 1000;
+        let heard = latch_at.plus_ns(-track_ns);
+        crew.listen_to.store(heard.0, Ordering::Release);
+        if let Some(tracking) = crew.tracking.get() {
+            tracking.unpark();
+        }
+        while self.inbox.latest.latest().0.through < heard && !crew.is_dismissed(shared) {
+            std::thread::yield_now();
         }
     }
-    enter_frame_path(false);
 }
 
-fn pack_thread(
-    shared: &Shared<'_>,
+/// Where packing finds its work.
+pub(super) struct PackInbox {
+    pub(super) jobs: Receiver<FrameJob>,
+    /// Wakes planning where it waits for the GPU.
+    pub(super) gpu_waker: Waker,
+}
+
+/// What the GPU took for the last frames, and so how long the next is waited for.
+struct GpuTimes {
+    recent: [i64; 64],
+    count: usize,
+    last_done_at: HostTime,
+}
+
+impl GpuTimes {
+    /// Frames after which the GPU is warm.
+    const WARM: usize = 16;
+    /// Shortest and longest wait, nanoseconds.
+    const SHORTEST_NS: i64 = 100_000_000;
+    const LONGEST_NS: i64 = 2_000_000_000;
+
+    fn new() -> Self {
+        Self { recent: [0; 64], count: 0, last_done_at: HostTime(i64::MIN) }
+    }
+
+    /// The GPU finished a frame; returns what it took for this one alone.
+    fn finished(&mut self, submitted_at: HostTime, done_at: HostTime) -> i64 {
+        let took = done_at.ns_since(submitted_at);
+        self.recent[self.count % self.recent.len()] = took;
+        self.count += 1;
+        let alone = done_at.ns_since(submitted_at.max(self.last_done_at));
+        self.last_done_at = done_at;
+        alone
+    }
+
+    /// How long a frame is waited for: four times the recent 99th percentile (of 64 frames the longest), at most two seconds.
+    fn limit_ns(&self) -> u64 {
+        let longest = self.recent.iter().copied().max().unwrap_or(0);
+        let limit = if self.count < Self::WARM { Self::LONGEST_NS } else { longest.saturating_mul(4) };
+        limit.clamp(Self::SHORTEST_NS, Self::LONGEST_NS) as u64
+    }
+}
+
+/// Waits for rendered frames and cuts them into planes until no more come.
+pub(super) fn pack_thread(
+    shared: &Shared,
+    crew: &CrewState,
     kernel: Kernel,
     mut prepared: Option<PreparedFrames>,
     mut budget: Option<BudgetController>,
-    mut jobs: Receiver<FrameJob>,
+    inbox: PackInbox,
     mut to_link: Sender<FrameJob>,
 ) {
+    let PackInbox { mut jobs, gpu_waker } = inbox;
     shared.rights.enter(2);
+    let pulse = &crew.pulses[PACK];
+    pulse.begin();
+    let mut times = GpuTimes::new();
     let mut late_in_a_row = 0;
-    while let Some(mut job) = next(&mut jobs) {
+    while let Some(mut job) = next(&mut jobs, || pulse.beat(shared.clock.now(), WAIT_NS + STEP_NS)) {
         let id = job.note.id.0;
         enter_frame_path(id >= WARM_UP_FRAMES);
         shared.may_stall(StallIn::Pack, id);
-        let limit = if id == 0 { FIRST_FRAME_TIMEOUT_NS } else { GPU_TIMEOUT_NS };
-        if let Err(source) = stages::finish(&mut job, limit) {
-            shared.fail(PipelineError::Gpu { frame: id, source });
+        let limit = match (shared.is_virtual(), id) {
+            (false, _) => times.limit_ns(),
+            (true, 0) => FIRST_FRAME_TIMEOUT_NS,
+            (true, _) => GPU_TIMEOUT_NS,
+        };
+        let alive = || pulse.beat(shared.clock.now(), WAIT_NS + STEP_NS);
+        let failure = match stages::finish(&mut job, limit, alive) {
+            Ok(true) => None,
+            Ok(false) => Some(PipelineError::GpuHangs { frame: id, ms: limit / 1_000_000 }),
+            Err(source) => Some(PipelineError::Gpu { frame: id, source }),
+        };
+        if let Some(failure) = failure {
+            crew.fail(failure);
             break;
+        }
+        if job.memory.gpu.is_some() {
+            crew.gpu.finish(times.finished(job.note.timeline.submitted_at, shared.clock.now()));
+            gpu_waker.wake();
         }
         if let (Some(controller), Some(gpu_ns)) = (&mut budget, job.note.gpu_ns()) {
             controller.measured(job.note.budget_milli, gpu_ns);
-            shared.budget_milli.store(controller.rays(), Ordering::Relaxed);
-        }
-        // What waits behind is still being rendered. More late frames than were under way are no stall: a GPU this slow has no
-        // newer frame that would be in time, and late frames are better than none.
-        let is_late = !shared.is_virtual() && shared.clock.now() >= job.note.timeline.due_at;
-        late_in_a_row = if is_late { late_in_a_row + 1 } else { 0 };
-        let is_slow = prepared.is_none() && late_in_a_row > shared.options.in_flight;
-        if is_slow || !is_overtaken(shared, &mut job.note, &jobs) {
-            stages::pack(&mut job, kernel, shared.options.verify, &mut prepared);
+            crew.budget_milli.store(controller.rays(), Ordering::Relaxed);
         }
         if !shared.is_virtual() {
             let now = shared.clock.now();
+            let rendered = job.memory.gpu.is_some();
             let t = &mut job.note.timeline;
-            t.rendered_at = now.plus_ns(-(t.wall_ns[Stage::Pack as usize] as i64));
-            t.packed_at = now;
+            // A prepared frame is there when it is planned: what follows is waiting for the packer.
+            (t.rendered_at, t.packing_at) = (if rendered { now } else { t.submitted_at }, now);
         }
-        if to_link.push(job).is_err() {
+        // What waits behind is still being rendered. More late frames than were under way are no stall: a GPU this slow has no
+        // newer frame that would be in time, and late frames are better than none while their poses are young enough.
+        let is_late = !shared.is_virtual() && shared.clock.now() >= job.note.timeline.due_at;
+        late_in_a_row = if is_late { late_in_a_row + 1 } else { 0 };
+        let is_slow = prepared.is_none() && late_in_a_row > shared.options.in_flight;
+        if is_slow || !is_overtaken(shared, &mut job.note, jobs.is_empty()) {
+            stages::pack(&mut job, kernel, shared.options.verify, &mut prepared);
+        }
+        if !shared.is_virtual() {
+            job.note.timeline.packed_at = shared.clock.now();
+        }
+        if to_link.push(job).is_err() || crew.is_abandoned.load(Ordering::Relaxed) {
             break;
         }
     }
     enter_frame_path(false);
+    pulse.end();
 }
 
 /// Leaves a frame out whose slot has begun while a newer one waits behind it: after a stall nothing queues up. At virtual pace
 /// nothing is ever late.
-pub(super) fn is_overtaken(shared: &Shared<'_>, note: &mut FrameNote, behind: &Receiver<FrameJob>) -> bool {
+pub(super) fn is_overtaken(shared: &Shared, note: &mut FrameNote, is_newest: bool) -> bool {
     let overtaken = note.fate == Fate::UnderWay
         && !shared.is_virtual()
-        && !behind.is_empty()
+        && !is_newest
         && shared.clock.now() >= note.timeline.due_at;
     if overtaken {
         note.fate = Fate::Overtaken;
@@ -442,14 +579,39 @@ pub(super) fn is_overtaken(shared: &Shared<'_>, note: &mut FrameNote, behind: &R
     note.fate == Fate::Overtaken
 }
 
-/// The next job, or `None` when no more will come.
-fn next(from: &mut Receiver<FrameJob>) -> Option<FrameJob> {
+/// The next job, or `None` when no more will come; `alive` is called before each wait.
+fn next(from: &mut Receiver<FrameJob>, alive: impl Fn()) -> Option<FrameJob> {
     loop {
+        alive();
         if let Some(job) = pop_within(from, WAIT_NS) {
             return Some(job);
         }
         if from.is_finished() {
             return None;
         }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_gpu_is_waited_for_four_times_as_long_as_it_lately_took() {
+        let mut times = GpuTimes::new();
+        assert_eq!(times.limit_ns(), 2_000_000_000, "not warm yet");
+        let at = |ms: i64| HostTime(ms * 1_000_000);
+        for i in 0..40 {
+            // Two in flight: each is under way for 80 ms, of which 40 are its own.
+            let alone = times.finished(at(40 * i), at(40 * i + 80));
+            assert!(i == 0 || alone == 40_000_000, "{alone}");
+        }
+        assert_eq!(times.limit_ns(), 320_000_000);
+        times.finished(at(5000), at(9000));
+        assert_eq!(times.limit_ns(), 2_000_000_000, "never longer than two seconds");
+        for i in 0..64 {
+            times.finished(at(10_000 + 10 * i), at(10_001 + 10 * i));
+        }
+        assert_eq!(times.limit_ns(), 100_000_000);
     }
 }

@@ -1,6 +1,7 @@
 //! Why a slot got no frame of its own.
 //!
 //! A stall never shifts the phase: what was missed is counted by cause, and the next frame is for the next slot that can still be met.
+//! A slot in which the dark (or the stillness) was ordered is not missed: it has a reason of its own.
 
 /// Why a slot got no frame of its own.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Hash)]
@@ -11,7 +12,7 @@ pub enum MissCause {
     Render,
     /// Packing took too long.
     Pack,
-    /// The link or the device took no frame.
+    /// The link or the device took no frame, or nothing is known of the slot.
     Link,
     /// No memory for another frame in flight: a later stage holds all buffers.
     Buffers,
@@ -37,14 +38,56 @@ impl MissCause {
     }
 }
 
+/// Why no new picture was wanted in a slot: an order of the operator, or a rule of safety.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Hash)]
+#[repr(u8)]
+pub enum OrderedDark {
+    /// The operator ordered BLACK.
+    Black,
+    /// The operator ordered FREEZE: the frame is held.
+    Frozen,
+    /// The operator ordered SAFE.
+    Safe,
+    /// A rest that a limit on light demands, for example the limit on flashes.
+    Rest,
+    /// The interlock is open: light is not allowed.
+    Interlock,
+    /// The projector has a fault that waits for the operator: heat, lamp, emergency stop, flashes.
+    Fault,
+    /// The run was asked to end.
+    Stop,
+}
+
+impl OrderedDark {
+    /// All reasons, in the order of their counters.
+    pub const ALL: [Self; 7] =
+        [Self::Black, Self::Frozen, Self::Safe, Self::Rest, Self::Interlock, Self::Fault, Self::Stop];
+
+    /// As printed.
+    pub const fn name(self) -> &'static str {
+        match self {
+            Self::Black => "black",
+            Self::Frozen => "frozen",
+            Self::Safe => "safe",
+            Self::Rest => "rest",
+            Self::Interlock => "interlock",
+            Self::Fault => "fault",
+            Self::Stop => "stop",
+        }
+    }
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
 
     #[test]
-    fn causes_have_their_own_counters() {
+    fn causes_and_reasons_have_their_own_counters() {
         for (i, cause) in MissCause::ALL.into_iter().enumerate() {
             assert_eq!(cause as usize, i);
+        }
+        for (i, reason) in OrderedDark::ALL.into_iter().enumerate() {
+            assert_eq!(reason as usize, i);
         }
     }
 }

@@ -209,6 +209,48 @@ pub fn allowed_core_list() -> Vec<u32> {
     (0..libc::CPU_SETSIZE as u32).filter(|&core| unsafe { libc::CPU_ISSET(core as usize, &set) }).collect()
 }
 
+/// The calling thread's number for the operating system.
+#[cfg(target_os = "linux")]
+pub fn thread_id() -> i32 {
+    // SAFETY: gettid takes no arguments and cannot fail.
+    unsafe { libc::gettid() }
+}
+
+/// What a thread of this process is doing.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct Standing {
+    /// It runs, or would if it got a core.
+    pub ready: bool,
+    /// Processor time that it has used, nanoseconds.
+    pub ran_ns: i64,
+}
+
+/// What the thread `id` of this process is doing; `None` where the kernel does not tell or the thread is gone. Allocates nothing.
+#[cfg(target_os = "linux")]
+pub fn standing_of(id: i32) -> Option<Standing> {
+    let mut text = [0u8; 256];
+    let stat = read_of_thread(id, "stat", &mut text)?;
+    // The name, in brackets, may hold anything.
+    let state = stat.rsplit(')').next()?.split_whitespace().next()?;
+    let ready = state == "R";
+    let mut text = [0u8; 96];
+    let ran_ns = read_of_thread(id, "schedstat", &mut text)?.split_whitespace().next()?.parse().ok()?;
+    Some(Standing { ready, ran_ns })
+}
+
+/// The beginning of a file that tells of the thread `id`.
+#[cfg(target_os = "linux")]
+fn read_of_thread<'a>(id: i32, name: &str, text: &'a mut [u8]) -> Option<&'a str> {
+    use std::io::{Read, Write};
+    let mut path = [0u8; 48];
+    let mut rest = &mut path[..];
+    write!(rest, "/proc/self/task/{id}/{name}").ok()?;
+    let left = rest.len();
+    let used = path.len() - left;
+    let n = std::fs::File::open(std::str::from_utf8(&path[..used]).ok()?).ok()?.read(text).ok()?;
+    std::str::from_utf8(&text[..n]).ok()
+}
+
 /// Nanoseconds of processor time the calling thread has used.
 #[cfg(target_os = "linux")]
 pub fn thread_cpu_ns() -> i64 {
@@ -269,6 +311,14 @@ mod elsewhere {
     /// Unknown.
     pub fn thread_cpu_ns() -> i64 {
         0
+    }
+    /// Unknown.
+    pub fn thread_id() -> i32 {
+        0
+    }
+    /// Unknown.
+    pub fn standing_of(_id: i32) -> Option<super::Standing> {
+        None
     }
 }
 #[cfg(not(target_os = "linux"))]

@@ -22,7 +22,7 @@ pub use image::{ReferenceImage, RenderSettings};
 pub use sampler::Sampler;
 pub use surface::SurfacePoint;
 
-use crate::render::albedo_table::AlbedoTable;
+use crate::render::albedo_table::{tabulated, AlbedoTable};
 use crate::scene::Scene;
 use bvh::{Bvh, Hit, Triangle};
 use glam::{DAffine3, DMat3, DVec3};
@@ -66,15 +66,8 @@ impl<'a> Reference<'a> {
                 }
             }
         }
-        let mut iors: Vec<f32> = Vec::new();
-        let table_of_material = (scene.materials.iter())
-            .map(|m| {
-                iors.iter().position(|ior| *ior == m.ior).unwrap_or_else(|| {
-                    iors.push(m.ior);
-                    iors.len() - 1
-                })
-            })
-            .collect();
+        let iors: Vec<f32> = scene.materials.iter().map(|m| m.ior).collect();
+        let (iors, table_of_material) = tabulated(&iors);
         let tables = iors.into_iter().map(|ior| (ior, OnceLock::new())).collect();
         let bvh = Bvh::new(triangles);
         let lights = Lights::new(scene, &world_from_body, &bvh);

@@ -96,6 +96,30 @@ impl AlbedoTable {
     }
 }
 
+/// Most tables of a scene. Each takes a few hundredths of a second, so a file with ten thousand indices of refraction would take minutes.
+pub const MAX_TABLES: usize = 32;
+
+/// The indices of refraction of which a scene has tables and, for each of `iors`, which of them is its own. As many as there are different ones where
+/// they are at most [`MAX_TABLES`], in the order in which they first come; beyond that [`MAX_TABLES`] of them, spread evenly over the sorted indices, and each
+/// index has the nearest one. What is below 1 or not finite counts as 1.
+pub fn tabulated(iors: &[f32]) -> (Vec<f32>, Vec<usize>) {
+    let sound = |ior: f32| if ior.is_finite() { ior.max(1.0) } else { 1.0 };
+    let mut seen = std::collections::HashSet::new();
+    let mut chosen: Vec<f32> =
+        iors.iter().map(|&ior| sound(ior)).filter(|ior| seen.insert(ior.to_bits())).collect();
+    if chosen.len() > MAX_TABLES {
+        chosen.sort_unstable_by(f32::total_cmp);
+        let last = chosen.len() - 1;
+        chosen = (0..MAX_TABLES).map(|k| chosen[k * last / (MAX_TABLES - 1)]).collect();
+    }
+    let nearest = |ior: f32| {
+        let distance = |k: &usize| (chosen[*k] - ior).abs();
+        (0..chosen.len()).min_by(|a, b| distance(a).total_cmp(&distance(b))).unwrap_or(0)
+    };
+    let uses = iors.iter().map(|&ior| nearest(sound(ior))).collect();
+    (chosen, uses)
+}
+
 fn node(i: usize) -> f64 {
     let s = i as f64 / (ALBEDO_NODES - 1) as f64;
     s * s
@@ -374,5 +398,20 @@ mod tests {
             }
         }
         assert!(worst < 2e-3 && weighed < 3e-4, "{worst} {weighed}");
+    }
+
+    /// Found in use, a sibling of R10: every index of refraction had a table of its own, at a few hundredths of a second each.
+    #[test]
+    fn the_number_of_tables_is_bounded_and_few_indices_have_their_own() {
+        let (own, uses) = tabulated(&[1.5, 1.33, 1.5, f32::NAN, 2.4, 1.33]);
+        assert_eq!(own, [1.5, 1.33, 1.0, 2.4]);
+        assert_eq!(uses, [0, 1, 0, 2, 3, 1]);
+        assert_eq!(tabulated(&[]), (vec![], vec![]));
+        let many: Vec<f32> = (0..15_000).map(|k| 1.0 + k as f32 * 1e-4).collect();
+        let (shared, uses) = tabulated(&many);
+        assert_eq!(shared.len(), MAX_TABLES);
+        for (ior, table) in many.iter().zip(&uses) {
+            assert!((shared[*table] - ior).abs() < 0.03, "{ior}: {}", shared[*table]);
+        }
     }
 }

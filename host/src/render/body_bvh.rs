@@ -2,17 +2,15 @@
 //!
 //! The tree is built once in body space; a moving body changes only its entry in the top level.
 
+use super::cluster::{clustered, optimise, Work};
 use crate::scene::TriangleMesh;
 use glam::Vec3A;
 use obvhs::aabb::Aabb;
 use obvhs::bvh2::node::Bvh2Node;
-use obvhs::bvh2::reinsertion::ReinsertionOptimizer;
 use obvhs::bvh2::Bvh2;
 use obvhs::cwbvh::bvh2_to_cwbvh::bvh2_to_cwbvh;
 use obvhs::cwbvh::CwBvh;
-use obvhs::ploc::PlocBuilder;
 use obvhs::triangle::Triangle;
-use obvhs::BvhBuildParams;
 
 /// Entries of the traversal stack in `bvh.glsl`, besides eight in registers. A ray pushes at most one entry a level below the root, so a tree of one more level than
 /// this never overflows it.
@@ -46,39 +44,31 @@ impl BodyBvh {
         if mesh.triangles.is_empty() {
             return Self::default();
         }
-        let corner = |i: u32| Vec3A::from(mesh.positions[i as usize]);
-        let triangles: Vec<Triangle> = mesh
-            .triangles
-            .iter()
-            .map(|t| Triangle { v0: corner(t[0]), v1: corner(t[1]), v2: corner(t[2]) })
-            .collect();
-        let built = Self::clustered(&triangles);
-        if built.levels() <= TRAVERSAL_STACK + 1 {
-            return built;
-        }
-        // Clustering by area makes chains of triangles whose sizes grow geometrically. Halves by count never do.
-        Self::halved(&triangles)
+        Self::of_boxes(&boxes_of(mesh))
     }
 
-    /// The faster tree: neighbours of least common area first. Nothing bounds its depth.
-    fn clustered(triangles: &[Triangle]) -> Self {
-        let parameters = BvhBuildParams::very_slow_build();
-        let order = (0..triangles.len() as u32).collect();
-        let mut clustered = PlocBuilder::with_capacity(triangles.len()).build(
-            parameters.ploc_search_distance,
-            triangles,
-            order,
-            parameters.sort_precision,
-            parameters.search_depth_threshold,
-        );
-        let share = (REINSERTED / triangles.len() as f32).clamp(0.05, 1.0);
-        ReinsertionOptimizer::default().run(&mut clustered, share, None);
-        Self::from(bvh2_to_cwbvh(&clustered, LEAF, true, false))
+    /// The tree over boxes, of which there is at least one.
+    pub(super) fn of_boxes(boxes: &[Aabb]) -> Self {
+        // Clustering by area makes chains of triangles whose sizes grow geometrically. Halves by count never do.
+        let walkable = |built: &Self| built.levels() <= TRAVERSAL_STACK + 1;
+        Self::clustered(boxes).filter(walkable).unwrap_or_else(|| Self::halved(boxes))
+    }
+
+    /// Nodes of a tree over `boxes` boxes that may look for a better place, as a share of all.
+    pub(super) fn share(boxes: usize) -> f32 {
+        (REINSERTED / boxes as f32).clamp(0.05, 1.0)
+    }
+
+    /// The faster tree: neighbours of least common area first. It may be deeper than a ray's stack; `None` where it surely is.
+    fn clustered(boxes: &[Aabb]) -> Option<Self> {
+        let mut tree = clustered(boxes);
+        let walkable = optimise(&mut tree, Self::share(boxes.len()), &mut Work::of_reinsertion(boxes.len()));
+        walkable.then(|| Self::from(bvh2_to_cwbvh(&tree, LEAF, true, false)))
     }
 
     /// The tree of [`halves`].
-    fn halved(triangles: &[Triangle]) -> Self {
-        Self::from(bvh2_to_cwbvh(&halves(triangles), LEAF, true, false))
+    fn halved(boxes: &[Aabb]) -> Self {
+        Self::from(bvh2_to_cwbvh(&halves(boxes), LEAF, true, false))
     }
 
     /// Levels of nodes, the root's included; 0 of an empty tree.
@@ -121,10 +111,16 @@ impl From<CwBvh> for BodyBvh {
     }
 }
 
+/// The boxes of a mesh's triangles, in their order.
+pub(super) fn boxes_of(mesh: &TriangleMesh) -> Vec<Aabb> {
+    let corner = |i: u32| Vec3A::from(mesh.positions[i as usize]);
+    let triangle = |t: &[u32; 3]| Triangle { v0: corner(t[0]), v1: corner(t[1]), v2: corner(t[2]) }.aabb();
+    mesh.triangles.iter().map(triangle).collect()
+}
+
 /// A binary tree that halves the triangles by their centres along the widest axis: at most `log2(n)`, rounded up, levels of inner nodes, 24
 /// for the 2^24 triangles that a body may have. A wide node replaces at least one of them, so the wide tree is no deeper.
-fn halves(triangles: &[Triangle]) -> Bvh2 {
-    let bounds: Vec<Aabb> = triangles.iter().map(|t| t.aabb()).collect();
+fn halves(bounds: &[Aabb]) -> Bvh2 {
     let centre = |i: u32| bounds[i as usize].min * 0.5 + bounds[i as usize].max * 0.5;
     let union = |of: &[u32]| {
         of.iter().fold(Aabb::empty(), |mut all, &i| {
@@ -133,7 +129,7 @@ fn halves(triangles: &[Triangle]) -> Bvh2 {
             all
         })
     };
-    let mut order: Vec<u32> = (0..triangles.len() as u32).collect();
+    let mut order: Vec<u32> = (0..bounds.len() as u32).collect();
     let mut nodes = vec![Bvh2Node::new(union(&order), 0, 0)];
     let mut open = vec![(0usize, 0usize, order.len())];
     while let Some((node, from, to)) = open.pop() {
@@ -191,12 +187,9 @@ mod tests {
             ("sphere", sphere(Vec3::ZERO, 1.0, 4, true)),
         ] {
             let bvh = BodyBvh::build(&mesh);
-            let corner = |i: u32| Vec3A::from(mesh.positions[i as usize]);
-            let triangles: Vec<Triangle> = (mesh.triangles.iter())
-                .map(|t| Triangle { v0: corner(t[0]), v1: corner(t[1]), v2: corner(t[2]) })
-                .collect();
-            let natural = BodyBvh::clustered(&triangles).levels();
-            println!("{name}: {} levels, clustered {natural}, of {}", bvh.levels(), triangles.len());
+            let boxes = boxes_of(&mesh);
+            let natural = BodyBvh::clustered(&boxes).map_or(usize::MAX, |b| b.levels());
+            println!("{name}: {} levels, clustered {natural}, of {}", bvh.levels(), boxes.len());
             // Else nothing would be shown by what follows.
             assert_eq!(natural > TRAVERSAL_STACK + 1, name != "sphere", "{name}: {natural}");
             assert!(bvh.levels() <= TRAVERSAL_STACK + 1, "{name}: {}", bvh.levels());
@@ -209,10 +202,10 @@ mod tests {
         for n in [1usize, 2, 3, 4, 7, 1000, 20_000] {
             let corners = |i: usize| {
                 let x = (i as f32).sqrt();
-                Triangle { v0: Vec3A::splat(x), v1: Vec3A::X * x, v2: Vec3A::Y }
+                Triangle { v0: Vec3A::splat(x), v1: Vec3A::X * x, v2: Vec3A::Y }.aabb()
             };
-            let triangles: Vec<Triangle> = (0..n).map(corners).collect();
-            let bvh = BodyBvh::halved(&triangles);
+            let boxes: Vec<Aabb> = (0..n).map(corners).collect();
+            let bvh = BodyBvh::halved(&boxes);
             let mut all = bvh.order.clone();
             all.sort_unstable();
             assert!(all.iter().copied().eq(0..n as u32), "{n}");

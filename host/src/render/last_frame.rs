@@ -14,14 +14,25 @@ pub const STEADY_PX: f64 = 1.5;
 /// So far may the eye, and what is behind the projector, metres.
 pub const STEADY_M: f64 = 5e-3;
 
+/// Place of a frame among those that were drawn. Whatever is done in turns from frame to frame (the checkerboard, the rates of every second
+/// frame, the questions that each block asks in every fourth frame, the slices of blue noise) goes by this one count. The numbers of frames
+/// will not do: a rig that draws every second slot has even numbers only, and half of the turns would never come.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub(super) struct Turn {
+    /// Frames drawn before it, wraps.
+    pub(super) drawn: u32,
+    /// Samples a pixel that those frames took together, wraps.
+    pub(super) first_sample: u32,
+}
+
 /// The frame that the history holds.
 pub(super) struct LastFrame {
     /// Its number; `NO_FRAME` before the first.
     pub(super) frame: u32,
     /// Which of the two history buffers it wrote.
     pub(super) parity: usize,
-    /// Frames submitted so far: rates are decided in every second one.
-    pub(super) count: u64,
+    /// Place of the next frame in the order of those drawn, and the samples a pixel that all before it took.
+    turn: Turn,
     /// Per body: world-from-body.
     pub(super) poses: Vec<DAffine3>,
     /// Per body: lost.
@@ -38,7 +49,7 @@ impl LastFrame {
         Self {
             frame: NO_FRAME,
             parity: 0,
-            count: 0,
+            turn: Turn::default(),
             poses: Vec::with_capacity(bodies),
             lost: Vec::with_capacity(bodies),
             origin: DVec3::ZERO,
@@ -74,6 +85,15 @@ impl LastFrame {
             })
     }
 
+    /// The place of the frame with this number. Numbers that do not go up have begun anew (a run after its warm-up), and so do the turns.
+    pub(super) fn turn_of(&self, frame: u32) -> Turn {
+        if self.frame != NO_FRAME && frame > self.frame {
+            self.turn
+        } else {
+            Turn::default()
+        }
+    }
+
     /// This one is the last from now on. Allocates nothing.
     pub(super) fn becomes(
         &mut self,
@@ -81,9 +101,12 @@ impl LastFrame {
         parity: usize,
         lost: impl Iterator<Item = bool>,
     ) {
+        self.turn = self.turn_of(inputs.frame);
         self.frame = inputs.frame;
         self.parity = parity;
-        self.count += 1;
+        let Turn { drawn, first_sample } = self.turn;
+        self.turn =
+            Turn { drawn: drawn.wrapping_add(1), first_sample: first_sample.wrapping_add(inputs.spp) };
         self.poses.clear();
         self.poses.extend_from_slice(inputs.poses);
         self.lost.clear();
@@ -142,6 +165,33 @@ mod tests {
         assert!(!steady(along(1.01 * STEADY_PX)) && !steady(along(-1.01 * STEADY_PX)) && !steady(along(1e9)));
         let turn = |angle: f64| DAffine3::from_quat(DQuat::from_rotation_y(angle));
         assert!(steady(turn(0.5 * pixel)) && !steady(turn(0.1)));
+    }
+
+    #[test]
+    fn turns_are_counted_by_frames_drawn_and_begin_anew_with_their_numbers() {
+        let camera = camera();
+        let mut last = LastFrame::none(0);
+        let mut next = |frame: u32, spp: u32| {
+            let turn = last.turn_of(frame);
+            let inputs = FrameInputs {
+                frame,
+                spp,
+                budget_spp: 1.0,
+                camera: &camera,
+                eye: EYE,
+                gaze: DVec3::ZERO,
+                widen_deg: 0.0,
+                poses: &[],
+                lost: &[],
+            };
+            last.becomes(&inputs, 0, std::iter::empty());
+            (turn.drawn, turn.first_sample)
+        };
+        // A warm-up, then a run that begins at 0 and drops every second frame.
+        assert_eq!(next(0, 5), (0, 0));
+        assert_eq!(next(0, 3), (0, 0));
+        assert_eq!([next(2, 4), next(4, 4), next(6, 1)], [(1, 3), (2, 7), (3, 11)]);
+        assert_eq!(next(7, 1), (4, 12));
     }
 
     #[test]

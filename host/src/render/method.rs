@@ -11,8 +11,10 @@ pub enum SamplerKind {
     Independent = 0,
     /// One point set a frame, shifted at every pixel by blue noise.
     BlueNoise = 1,
-    /// One low-discrepancy sequence a surface point, continued over frames.
+    /// One low-discrepancy sequence a surface point, continued over frames; its place is kept in the history.
     Continued = 2,
+    /// One low-discrepancy sequence a pixel, continued over frames; needs no history.
+    PixelSequence = 3,
 }
 
 /// A method with all switches resolved.
@@ -65,15 +67,17 @@ impl Method {
     pub fn from_config(config: &RenderConfig) -> Self {
         let effects = config.effects_on();
         let dpm = config.method == RenderMethod::Dpm;
+        let sampler = match (effects.blue_noise, config.method) {
+            (false, _) => SamplerKind::Independent,
+            (true, RenderMethod::Dpm) => SamplerKind::Continued,
+            (true, RenderMethod::Sequence) => SamplerKind::PixelSequence,
+            (true, _) => SamplerKind::BlueNoise,
+        };
         Self {
             dpm,
             rate_map: effects.rate_map,
             checkerboard: effects.checkerboard && !dpm,
-            sampler: match (effects.blue_noise, dpm) {
-                (false, _) => SamplerKind::Independent,
-                (true, false) => SamplerKind::BlueNoise,
-                (true, true) => SamplerKind::Continued,
-            },
+            sampler,
             temporal: effects.temporal_filter,
             spatial: effects.spatial_filter,
             spp_by_angle: effects.spp_by_angle && !dpm,

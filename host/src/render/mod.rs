@@ -3,6 +3,7 @@
 pub mod albedo_table;
 pub mod blue_noise;
 mod body_bvh;
+mod cluster;
 pub mod compensation;
 mod fill;
 mod last_frame;

@@ -511,8 +511,10 @@ impl Renderer {
             );
         }
         let tile_count = slot.tile_list.write(bytemuck::cast_slice_mut(slot.tiles.bytes_mut()));
-        // Four 8 x 8 workgroups a tile; rates are decided in every second frame, one workgroup a tile.
-        let rate_tiles = if self.last.count.is_multiple_of(2) { tile_count } else { 0 };
+        let turn = self.last.turn_of(inputs.frame);
+        // Four 8 x 8 workgroups a tile; rates are decided in every second frame drawn, one workgroup a tile. The checkerboard goes by the
+        // same count, so that both of its halves are traced at one rate.
+        let rate_tiles = if turn.drawn.is_multiple_of(2) { tile_count } else { 0 };
         slot.arguments.write(&[[tile_count * 4, 1u32, 1, 0], [rate_tiles, 1, 1, 0]]);
         // The projector is the origin: f32 is finest where the rays start.
         let origin = inputs.camera.position();
@@ -600,6 +602,8 @@ impl Renderer {
             rate_t: method.paper.t as f32,
             rate_l: method.paper.l as f32,
             pixel_size: (1.0 / c.fx) as f32,
+            drawn: turn.drawn,
+            first_sample: turn.first_sample,
         };
         slot.frame.write(&[frame]);
         slot.parity = 1 - self.last.parity;

@@ -1,6 +1,6 @@
 //! A scene into the flat arrays that the shaders read: BVHs, vertices, materials, texels, lights, environment.
 
-use super::albedo_table::AlbedoTable;
+use super::albedo_table::{tabulated, AlbedoTable};
 use super::body_bvh::BodyBvh;
 use crate::scene::mesh::MAX_COORDINATE_M;
 use crate::scene::{Environment, PunctualKind, Scene, TextureRef, Wrap};
@@ -10,8 +10,8 @@ use dpm_shaders::structs::{
 };
 use glam::{DAffine3, Vec3};
 
-/// Most bodies a scene may have: the instance shares a word with the triangle.
-pub const MAX_BODIES: usize = 64;
+/// Most bodies a scene may have, those that never move included: their number has 8 bits of a word that it shares with the triangle.
+pub const MAX_BODIES: usize = 256;
 
 /// A solid with a smaller index is drawn as a thin wall: its refraction would be a spike that f32 cannot carry.
 const STRAIGHT_BELOW_IOR: f32 = 1.001;
@@ -181,8 +181,14 @@ pub struct Keep {
 #[derive(Debug, thiserror::Error)]
 pub enum SceneDataError {
     /// Too many bodies.
-    #[error("the scene has {0} bodies; at most {MAX_BODIES} can move. Name fewer rigid bodies in the rig file: what is not named is one static body")]
-    TooManyBodies(usize),
+    #[error("the scene has {tracked} tracked bodies and {fixed} that never move (what no body claims, lamps); all together may be {MAX_BODIES}. \
+             Name fewer in scene.bodies: what is not named is one body that never moves")]
+    TooManyBodies {
+        /// Bodies that the rig file names.
+        tracked: usize,
+        /// The others.
+        fixed: usize,
+    },
     /// A body too large for its index.
     #[error("body \"{0}\" has {1} triangles; at most 16 million fit. Simplify it")]
     TooManyTriangles(String, usize),
@@ -233,7 +239,8 @@ impl SceneData {
     pub fn build(scene: &Scene) -> Result<Self, SceneDataError> {
         let mut data = Self::default();
         if scene.bodies.len() > MAX_BODIES {
-            return Err(SceneDataError::TooManyBodies(scene.bodies.len()));
+            let tracked = scene.bodies.iter().filter(|b| b.tracked.is_some()).count();
+            return Err(SceneDataError::TooManyBodies { tracked, fixed: scene.bodies.len() - tracked });
         }
         data.add_textures(scene);
         data.add_materials(scene);
@@ -279,16 +286,12 @@ impl SceneData {
     }
 
     fn add_materials(&mut self, scene: &Scene) {
-        let mut iors: Vec<f32> = Vec::new();
         let used = scene.used_materials();
-        for (m, used) in scene.materials.iter().zip(used) {
-            let ior = if m.ior.is_finite() { m.ior.max(1.0) } else { 1.0 };
-            let table = iors.iter().position(|&i| i == ior).unwrap_or_else(|| {
-                iors.push(ior);
-                let table = AlbedoTable::new(ior);
-                self.albedo.extend(table.cells());
-                iors.len() - 1
-            });
+        let ior_of = |m: &crate::scene::Material| if m.ior.is_finite() { m.ior.max(1.0) } else { 1.0 };
+        let iors: Vec<f32> = scene.materials.iter().map(ior_of).collect();
+        let (tables, table_of) = tabulated(&iors);
+        self.albedo.extend(tables.iter().flat_map(|&ior| AlbedoTable::new(ior).cells()));
+        for (((m, used), &ior), table) in scene.materials.iter().zip(used).zip(&iors).zip(table_of) {
             let transmissive = m.transmission > 0.0;
             let metal_everywhere = m.metallic >= 1.0 && m.metallic_roughness_texture.is_none();
             if used {

@@ -2,7 +2,7 @@
 
 use std::path::Path;
 
-use glam::Vec3;
+use glam::{DVec3, Vec3};
 use image::{ImageFormat, ImageReader};
 
 use super::gltf_file::read_file;
@@ -30,6 +30,81 @@ pub fn load_environment(path: &Path, rotation_rad: f32, scale: f32) -> Result<En
         decode_environment(&bytes, rotation_rad, scale)
     };
     contained(&limits, work).map_err(|e| e.in_file(path))
+}
+
+/// Bytes of the storage buffer that every Vulkan device binds (`maxStorageBufferRange` is at least 2^27), in which the renderer keeps an environment with
+/// 16 bytes for each texel and each row.
+const RENDERED_BYTES: u64 = 1 << 27;
+
+/// True when the renderer can hold an environment of these sides on every device.
+fn is_held(width: u32, height: u32) -> bool {
+    (u64::from(width) * u64::from(height) + u64::from(height)) * 16 <= RENDERED_BYTES
+}
+
+impl Environment {
+    /// The same environment as large as the renderer holds on every device, and what was done, in words, where it had to be scaled down. A projector
+    /// shows reflections of it at a few texels a degree at most, so nothing is lost that could be seen.
+    ///
+    /// A texel of the smaller picture is the mean over its part of the sphere of what the larger one holds there, so the light from all around
+    /// stays the same.
+    pub fn fitted(self) -> (Self, Option<String>) {
+        let (width, height, texels, rotation_rad) = match self {
+            Self::Equirect { width, height, texels, rotation_rad } if !is_held(width, height) => {
+                (width, height, texels, rotation_rad)
+            }
+            other => return (other, None),
+        };
+        // The same shape where that is possible: both sides over the smallest factor that fits.
+        let side = |side: u32, factor: f64| ((f64::from(side) / factor) as u32).max(1);
+        let mut factor = 1.0;
+        while !is_held(side(width, factor), side(height, factor)) {
+            factor *= 1.0 + 1.0 / 1024.0;
+        }
+        let (w, h) = (side(width, factor), side(height, factor));
+        let small = box_filtered(&texels, (width, height), (w, h));
+        let told = format!(
+            "the environment of {width} x {height} texels is scaled down to {w} x {h}, the most that every device holds; its light stays the same"
+        );
+        (Self::Equirect { width: w, height: h, texels: small, rotation_rad }, Some(told))
+    }
+}
+
+/// Overlaps of `n` parts with the `m` parts beneath them, whose edges are where `edge` puts `k` of either number: for each of the `n` the first of the `m`
+/// and the sizes of the overlaps.
+fn overlaps(n: u32, m: u32, edge: impl Fn(u32, u32) -> f64) -> Vec<(usize, Vec<f64>)> {
+    let part = |k: u32| {
+        let (from, to) = (edge(k, n), edge(k + 1, n));
+        // Whole numbers, so that no rounding leaves a part out.
+        let first = (u64::from(k) * u64::from(m) / u64::from(n)) as u32;
+        let last = ((u64::from(k) + 1) * u64::from(m)).div_ceil(u64::from(n)).min(u64::from(m)) as u32;
+        let sizes = (first..last).map(|i| (edge(i + 1, m).min(to) - edge(i, m).max(from)).max(0.0));
+        (first as usize, sizes.collect())
+    };
+    (0..n).map(part).collect()
+}
+
+/// A latitude-longitude picture of `from` texels as one of `to`, no side larger: each texel the mean over its solid angle.
+fn box_filtered(texels: &[Vec3], from: (u32, u32), to: (u32, u32)) -> Vec<Vec3> {
+    let columns = overlaps(to.0, from.0, |k, of| f64::from(k) / f64::from(of));
+    // Rows by the height on the unit sphere, in which equal steps are equal solid angles.
+    let height = |k: u32, of: u32| 1.0 - (std::f64::consts::PI * f64::from(k) / f64::from(of)).cos();
+    let rows = overlaps(to.1, from.1, height);
+    let width = from.0 as usize;
+    let mut out = Vec::with_capacity(to.0 as usize * to.1 as usize);
+    for (top, down) in &rows {
+        for (left, across) in &columns {
+            let (mut sum, mut weight) = (DVec3::ZERO, 0.0);
+            for (y, dy) in down.iter().enumerate() {
+                let row = &texels[(top + y) * width + left..][..across.len()];
+                for (texel, dx) in row.iter().zip(across) {
+                    sum += texel.as_dvec3() * (dx * dy);
+                    weight += dx * dy;
+                }
+            }
+            out.push((sum / weight.max(f64::MIN_POSITIVE)).as_vec3());
+        }
+    }
+    out
 }
 
 fn decode_environment(bytes: &[u8], rotation_rad: f32, scale: f32) -> Result<Environment, SceneError> {
@@ -370,6 +445,61 @@ mod tests {
             .unwrap_err()
             .to_string()
             .contains("sky.pfm"));
+    }
+
+    /// Light from all around, and the light that falls on a plane that faces up: both are weighted by solid angle.
+    fn energies(texels: &[Vec3], width: usize) -> [f64; 2] {
+        let height = texels.len() / width;
+        let z = |k: usize| (std::f64::consts::PI * k as f64 / height as f64).cos();
+        let mut sums = [0.0; 2];
+        for (y, row) in texels.chunks_exact(width).enumerate() {
+            let of_row: f64 = row.iter().map(|t| t.as_dvec3().element_sum()).sum::<f64>() / width as f64;
+            sums[0] += of_row * (z(y) - z(y + 1));
+            sums[1] += of_row * (z(y) * z(y) - z(y + 1) * z(y + 1)) * 0.5;
+        }
+        sums
+    }
+
+    /// Found in use, R17: an environment of 8192 x 4096 took the run down. It is scaled down to what every device holds, says so, and keeps its light
+    /// to a millionth.
+    #[test]
+    fn large_environments_are_scaled_down_and_keep_their_light() {
+        // Bright spots on a dim ground, as studios and suns are.
+        let light = |x: u32, y: u32| {
+            let spot = (x.wrapping_mul(2_654_435_761) ^ y.wrapping_mul(40_503)).is_multiple_of(997);
+            Vec3::new(0.1 + (x % 7) as f32, 0.2, if spot { 5.0e4 } else { 0.3 })
+        };
+        for ((w, h), (tw, th)) in
+            [((1000, 500), (333, 166)), ((64, 32), (64, 32)), ((7, 5), (1, 1)), ((97, 89), (96, 11))]
+        {
+            let texels: Vec<Vec3> = (0..w * h).map(|i| light(i % w, i / w)).collect();
+            let small = box_filtered(&texels, (w, h), (tw, th));
+            assert_eq!(small.len(), (tw * th) as usize);
+            let [before, after] = [energies(&texels, w as usize), energies(&small, tw as usize)];
+            assert!((after[0] / before[0] - 1.0).abs() < 1e-6, "{w} x {h}: {before:?} {after:?}");
+            if (w, h) == (tw, th) {
+                assert_eq!(small, texels);
+            }
+        }
+        let (width, height) = (8192, 4096);
+        let texels: Vec<Vec3> = (0..width * height).map(|i| light(i % width, i / width)).collect();
+        let before = energies(&texels, width as usize);
+        let (fitted, told) = Environment::Equirect { width, height, texels, rotation_rad: 0.5 }.fitted();
+        let Environment::Equirect { width, height, texels, rotation_rad } = fitted else { panic!() };
+        assert_eq!((texels.len(), rotation_rad), (width as usize * height as usize, 0.5));
+        assert!(
+            is_held(width, height) && (4000..4096).contains(&width) && height == width / 2,
+            "{width} x {height}"
+        );
+        let after = energies(&texels, width as usize);
+        assert!((after[0] / before[0] - 1.0).abs() < 1e-6, "{before:?} {after:?}");
+        // Up and down is moved by less than a row.
+        assert!((after[1] - before[1]).abs() < before[0] * 1e-3, "{before:?} {after:?}");
+        assert!(told.is_some_and(|t| t.contains("8192 x 4096") && t.contains(&format!("{width} x {height}"))));
+        let small =
+            Environment::Equirect { width: 2, height: 1, texels: vec![Vec3::ONE; 2], rotation_rad: 0.0 };
+        assert!(small.fitted().1.is_none());
+        assert!(Environment::Constant(Vec3::ONE).fitted().1.is_none());
     }
 
     #[test]

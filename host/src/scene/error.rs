@@ -9,9 +9,6 @@ pub enum SceneError {
     /// The system could not read it.
     #[error("cannot read the file: {0}")]
     Read(#[source] std::io::Error),
-    /// A folder, device or pipe.
-    #[error("not a regular file")]
-    NotAFile,
     /// Beyond a limit that guards memory and time.
     #[error("{what} comes to {found}, the limit is {limit}: {remedy}")]
     TooLarge {

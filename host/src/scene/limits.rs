@@ -17,7 +17,7 @@ pub struct Limits {
     pub json_values: u64,
     /// Nodes, meshes, materials, accessors and so on: entries in any one list at the top of the file.
     pub objects: u64,
-    /// Triangles after every instance of a mesh is written out.
+    /// Triangles after every instance of a mesh is written out; of a short file fewer, a million and one for every two bytes.
     pub triangles: u64,
     /// Texels of all decoded textures together.
     pub texels: u64,
@@ -45,6 +45,14 @@ impl Default for Limits {
             lights: 1024,
             time: Duration::from_secs(30),
         }
+    }
+}
+
+impl Limits {
+    /// The bounds for a file of `bytes` bytes in all. Triangles cost time, and a short file may ask for any number of them by instances of a mesh: a million
+    /// are free, and more need bytes to stand for them.
+    pub(crate) fn of_file(&self, bytes: u64) -> Self {
+        Self { triangles: self.triangles.min(1_000_000 + bytes / 2), ..self.clone() }
     }
 }
 

@@ -60,6 +60,8 @@ pub(super) fn contained<T: Send + 'static>(
     let cancel = Cancel::default();
     let (inside, (send, receive)) = (cancel.clone(), mpsc::sync_channel(1));
     let helper = std::thread::Builder::new().name("scene-load".into()).spawn(move || {
+        // A panic in here is a broken scene, not a broken run.
+        crate::stopping::expect_panics();
         let result = std::panic::catch_unwind(std::panic::AssertUnwindSafe(|| work(&inside))).unwrap_or_else(
             |panic| {
                 let text = panic

@@ -3,6 +3,9 @@
 //! The noise of a figure is known from the batches of its run: the standard error of their mean. Welch's test compares the two
 //! means; neighbouring batches are not quite independent, so the level is strict (0.1 %) and a difference must also exceed
 //! the histogram's own resolution.
+//!
+//! Two figures are gates: the share of slots without a frame of their own, raw, and the share of frames that were lit late. A comparison in
+//! which one of them got worse fails. What a viewer sees is the missed slots: a change that drops frames makes no other figure worse.
 
 use super::profile::ProfileReport;
 use std::fmt::Write;
@@ -40,18 +43,25 @@ impl Verdict {
 pub struct Comparison {
     /// Interval and quantile.
     pub figure: String,
-    /// In the first report, ms.
+    /// In the first report, ms or %.
     pub before: f64,
-    /// In the second, ms.
+    /// In the second, ms or %.
     pub after: f64,
-    /// Half-width of the 99.9 % interval of the difference, ms; `None` when unknown.
+    /// Half-width of the interval of the difference, ms or %, at 99.9 %, of missed slots at 99 %; `None` when unknown.
     pub noise: Option<f64>,
     /// What that means.
     pub verdict: Verdict,
+    /// A figure that must not get worse.
+    pub gate: bool,
 }
 
-/// Compares every interval's median and 99th percentile, and the share of late frames. Figures that only one report has are left
-/// out and named in the second return value, together with differences in the setup.
+/// The gates that got worse, by name; a comparison without any passes.
+pub fn failed_gates(rows: &[Comparison]) -> Vec<&str> {
+    rows.iter().filter(|r| r.gate && r.verdict == Verdict::Worse).map(|r| r.figure.as_str()).collect()
+}
+
+/// Compares every interval's median and 99th percentile, and the shares of missed slots and late frames. Figures that only one report has
+/// are left out and named in the second return value, together with differences in the setup.
 pub fn compare(before: &ProfileReport, after: &ProfileReport) -> (Vec<Comparison>, Vec<String>) {
     let mut notes = Vec::new();
     for (key, a) in &before.setup {
@@ -83,6 +93,19 @@ pub fn compare(before: &ProfileReport, after: &ProfileReport) -> (Vec<Comparison
     for name in after.intervals_ms.keys().filter(|k| !before.intervals_ms.contains_key(*k)) {
         notes.push(format!("{name} is only in the second report"));
     }
+    for (report, which) in [(before, "first"), (after, "second")] {
+        if report.slots == 0 {
+            notes.push(format!(
+                "the {which} report tells of no slots: missed slots cannot be compared with it; make it anew with this program"
+            ));
+        }
+        if report.intervals_ms.values().any(|d| d.modelled && d.kind == "total") {
+            notes.push(format!(
+                "the {which} report was made at virtual pace: its times follow from real_time.stage_costs_us and are no measurement"
+            ));
+        }
+    }
+    rows.push(missed_share(before, after));
     rows.push(late_share(before, after));
     (rows, notes)
 }
@@ -97,7 +120,44 @@ fn judge(figure: String, before: f64, after: f64, noise: Option<f64>) -> Compari
         Some(_) if difference < 0.0 => Verdict::Better,
         Some(_) => Verdict::Worse,
     };
-    Comparison { figure, before, after, noise, verdict }
+    Comparison { figure, before, after, noise, verdict, gate: false }
+}
+
+/// Share of the slots without a frame of their own, percent, raw: standstills of the machine excuse nothing here. Slots are missed in
+/// bursts, so the noise is that of a binomial count (of at least one slot) times the dispersion of the batches, where that is above 1. The
+/// level is 99 %: this is the figure that a comparison is made for.
+fn missed_share(before: &ProfileReport, after: &ProfileReport) -> Comparison {
+    let share = |r: &ProfileReport| {
+        let n = r.slots.max(1) as f64;
+        let p = r.missed_slots as f64 / n;
+        let at_least_one = p.clamp(1.0 / n, 1.0);
+        (100.0 * p, 1e4 * (at_least_one * (1.0 - at_least_one)).max(1.0 / n) / n)
+    };
+    let ((x, vx), (y, vy)) = (share(before), share(after));
+    let noise = (before.slots > 0 && after.slots > 0).then(|| {
+        let (a, b) = (dispersion(&before.missed_batches), dispersion(&after.missed_batches));
+        let (squares, freedom) = (a.0 + b.0, a.1 + b.1);
+        // Without batches to tell, misses are taken to be independent.
+        let (factor, quantile) =
+            if freedom >= 4.0 { ((squares / freedom).max(1.0), student_t(freedom, 0)) } else { (1.0, 2.576) };
+        quantile * (factor * (vx + vy)).sqrt()
+    });
+    Comparison { gate: true, ..judge("missed slots, %".into(), x, y, noise) }
+}
+
+/// Sum of the squared deviations of the batches from their common share, each in units of its binomial variance, and its degrees of freedom:
+/// their quotient is 1 where misses are independent, and the mean length of a burst where they are not.
+fn dispersion(batches: &[(u64, u64)]) -> (f64, f64) {
+    let (slots, missed) = batches.iter().fold((0, 0), |(n, m), (a, b)| (n + a, m + b));
+    if batches.len() < 3 || missed == 0 || missed >= slots {
+        return (0.0, 0.0);
+    }
+    let p = missed as f64 / slots as f64;
+    let squares = batches.iter().filter(|(n, _)| *n > 0).map(|(n, m)| {
+        let (n, m) = (*n as f64, *m as f64);
+        (m - n * p).powi(2) / (n * p * (1.0 - p))
+    });
+    (squares.sum(), batches.len() as f64 - 1.0)
 }
 
 /// Share of late frames, percent; its noise is that of a binomial count (Poisson for the rare).
@@ -110,7 +170,7 @@ fn late_share(before: &ProfileReport, after: &ProfileReport) -> Comparison {
     };
     let ((x, vx), (y, vy)) = (share(before), share(after));
     let known = before.frames_lit > 0 && after.frames_lit > 0;
-    judge("late frames, %".into(), x, y, known.then(|| 3.29 * (vx + vy).sqrt()))
+    Comparison { gate: true, ..judge("late frames, %".into(), x, y, known.then(|| 3.29 * (vx + vy).sqrt())) }
 }
 
 /// Half-width of the 99.9 % confidence interval of the difference of two means (Welch).
@@ -130,35 +190,35 @@ fn difference_noise(a: &[f64], b: &[f64]) -> Option<f64> {
         return Some(0.0);
     }
     let freedom = sum * sum / (va * va / fa + vb * vb / fb);
-    Some(student_t_999(freedom) * sum.sqrt())
+    Some(student_t(freedom, 1) * sum.sqrt())
 }
 
-/// Two-sided 99.9 % quantile of Student's t: table values, linear in 1 / freedom between them.
-fn student_t_999(freedom: f64) -> f64 {
-    const TABLE: [(f64, f64); 10] = [
-        (2.0, 31.599),
-        (3.0, 12.924),
-        (4.0, 8.610),
-        (5.0, 6.869),
-        (7.0, 5.408),
-        (10.0, 4.587),
-        (15.0, 4.073),
-        (30.0, 3.646),
-        (60.0, 3.460),
-        (f64::INFINITY, 3.291),
+/// Two-sided quantile of Student's t, of 99 % (`level` 0) or 99.9 % (`level` 1): table values, linear in 1 / freedom between them.
+fn student_t(freedom: f64, level: usize) -> f64 {
+    const TABLE: [(f64, [f64; 2]); 10] = [
+        (2.0, [9.925, 31.599]),
+        (3.0, [5.841, 12.924]),
+        (4.0, [4.604, 8.610]),
+        (5.0, [4.032, 6.869]),
+        (7.0, [3.499, 5.408]),
+        (10.0, [3.169, 4.587]),
+        (15.0, [2.947, 4.073]),
+        (30.0, [2.750, 3.646]),
+        (60.0, [2.660, 3.460]),
+        (f64::INFINITY, [2.576, 3.291]),
     ];
     let inverse = 1.0 / freedom.max(2.0);
     for pair in TABLE.windows(2) {
         let ((f0, t0), (f1, t1)) = (pair[0], pair[1]);
         if inverse >= 1.0 / f1 {
             let share = (inverse - 1.0 / f1) / (1.0 / f0 - 1.0 / f1);
-            return t1 + share * (t0 - t1);
+            return t1[level] + share * (t0[level] - t1[level]);
         }
     }
-    TABLE[TABLE.len() - 1].1
+    TABLE[TABLE.len() - 1].1[level]
 }
 
-/// A table of all figures, worst news first.
+/// A table of all figures, gates first, then worst news first.
 pub fn to_table(rows: &[Comparison], notes: &[String]) -> String {
     let mut sorted: Vec<&Comparison> = rows.iter().collect();
     let rank = |v: Verdict| match v {
@@ -167,9 +227,10 @@ pub fn to_table(rows: &[Comparison], notes: &[String]) -> String {
         Verdict::Unknown => 2,
         Verdict::Same => 3,
     };
-    sorted.sort_by_key(|r| rank(r.verdict));
+    // Gates first, whatever became of them.
+    sorted.sort_by_key(|r| (!r.gate, rank(r.verdict)));
     let mut text = format!(
-        "{:<24} {:>10} {:>10} {:>9} {:>10}  verdict\n",
+        "{:<28} {:>10} {:>10} {:>9} {:>10}  verdict\n",
         "figure (ms)", "before", "after", "change", "noise"
     );
     for r in sorted {
@@ -182,11 +243,12 @@ pub fn to_table(rows: &[Comparison], notes: &[String]) -> String {
         // Writing to a String cannot fail.
         let _ = writeln!(
             text,
-            "{:<24} {:>10.4} {:>10.4} {change:>9} {noise:>10}  {}",
+            "{:<28} {:>10.4} {:>10.4} {change:>9} {noise:>10}  {}{}",
             r.figure,
             r.before,
             r.after,
-            r.verdict.word()
+            r.verdict.word(),
+            if r.gate { " (gate)" } else { "" }
         );
     }
     for note in notes {
@@ -219,6 +281,7 @@ mod tests {
             ..Default::default()
         };
         ProfileReport {
+            slots: 60_000,
             frames_lit: 60_000,
             frames_late: late,
             intervals_ms: [("render".to_owned(), d)].into(),
@@ -244,6 +307,85 @@ mod tests {
         }
         assert!(alarms <= 5, "{alarms} false alarms in 1000");
         assert!(missed <= 100, "{missed} changes of 10 % missed in 1000");
+    }
+
+    /// A run of `slots` in which stretches of `burst` slots are missed at random, with the share `p` of all.
+    fn run(slots: u64, p: f64, burst: u64, seed: u64) -> ProfileReport {
+        let mut state = seed.wrapping_mul(0x9e37_79b9_7f4a_7c15) | 1;
+        let mut uniform = || {
+            state = state.wrapping_mul(6_364_136_223_846_793_005).wrapping_add(1_442_695_040_888_963_407);
+            (state >> 11) as f64 / (1u64 << 53) as f64
+        };
+        let mut batches = vec![(0, 0); 40];
+        let mut left = 0;
+        for slot in 0..slots {
+            if left == 0 && uniform() < p / (burst as f64) {
+                left = burst;
+            }
+            let batch = &mut batches[(slot * 40 / slots) as usize];
+            batch.0 += 1;
+            batch.1 += u64::from(left > 0);
+            left = left.saturating_sub(1);
+        }
+        ProfileReport {
+            slots,
+            missed_slots: batches.iter().map(|b| b.1).sum(),
+            missed_batches: batches,
+            // No frame comes late: those that are not in time are not lit at all.
+            frames_lit: slots,
+            ..Default::default()
+        }
+    }
+
+    /// The runs "FIFO" and "FIFO + 2 CPU hogs" of the second look at latency: 84 of 22728 and 128 of 18940 slots missed, fewer late frames of
+    /// those lit. Found in use: the comparison said "same within noise", as it looked at late frames only.
+    #[test]
+    fn a_change_that_drops_frames_fails_the_comparison() {
+        let measured = |slots: u64, missed: u64, lit: u64, late: u64| ProfileReport {
+            slots,
+            missed_slots: missed,
+            missed_share: missed as f64 / slots as f64,
+            frames_lit: lit,
+            frames_late: late,
+            ..Default::default()
+        };
+        let (fifo, hogs) = (measured(22_728, 84, 22_667, 11), measured(18_940, 128, 18_850, 6));
+        let (rows, notes) = compare(&fifo, &hogs);
+        assert_eq!(failed_gates(&rows), ["missed slots, %"]);
+        let missed = rows.iter().find(|r| r.figure == "missed slots, %").unwrap();
+        assert!((missed.before - 0.370).abs() < 1e-3 && (missed.after - 0.676).abs() < 1e-3, "{missed:?}");
+        assert_eq!(verdict(&fifo, &hogs, "late frames, %"), Verdict::Same);
+        assert!(to_table(&rows, &notes).lines().nth(1).unwrap().contains("WORSE (gate)"));
+        // The other way round it got better, which fails nothing.
+        assert_eq!(verdict(&hogs, &fifo, "missed slots, %"), Verdict::Better);
+        assert!(failed_gates(&compare(&hogs, &fifo).0).is_empty());
+        // With batches of independent misses, the same.
+        let (mut a, mut b) = (fifo, hogs);
+        a.missed_batches = (0..32).map(|k| (710, 2 + [0, 1, 2, 0][k % 4])).collect();
+        b.missed_batches = (0..32).map(|k| (592, 3 + [0, 1, 2, 1][k % 4])).collect();
+        assert_eq!(failed_gates(&compare(&a, &b).0), ["missed slots, %"]);
+        // A report of an older program, which tells of no slots, is no pass and no failure, but told.
+        let (rows, notes) = compare(&ProfileReport { frames_lit: 100, ..Default::default() }, &b);
+        assert_eq!(rows.iter().find(|r| r.figure == "missed slots, %").unwrap().verdict, Verdict::Unknown);
+        assert!(notes.iter().any(|n| n.contains("the first report tells of no slots")), "{notes:?}");
+    }
+
+    /// Whether misses come one by one or in bursts: pairs of the same share are seldom told apart, a share that is 1.8 times as large with
+    /// single misses, or four times as large with bursts of eight, nearly always.
+    #[test]
+    fn the_spread_of_missed_slots_is_that_of_the_batches() {
+        for (burst, worse) in [(1, 1.8), (8, 4.0)] {
+            let (mut alarms, mut found) = (0, 0);
+            for seed in 0..200 {
+                let a = run(20_000, 0.004, burst, 3 * seed);
+                let same = run(20_000, 0.004, burst, 3 * seed + 1);
+                let more = run(20_000, 0.004 * worse, burst, 3 * seed + 2);
+                alarms += usize::from(verdict(&a, &same, "missed slots, %") != Verdict::Same);
+                found += usize::from(verdict(&a, &more, "missed slots, %") == Verdict::Worse);
+            }
+            assert!(alarms <= 10, "bursts of {burst}: {alarms} false alarms in 200");
+            assert!(found >= 180, "bursts of {burst}: {found} of 200 found");
+        }
     }
 
     #[test]
@@ -276,9 +418,11 @@ mod tests {
 
     #[test]
     fn t_quantiles_meet_the_table_and_fall() {
-        assert!((student_t_999(10.0) - 4.587).abs() < 1e-9);
-        assert!((student_t_999(1e12) - 3.291).abs() < 1e-3);
-        let values: Vec<f64> = (2..200).map(|f| student_t_999(f64::from(f))).collect();
-        assert!(values.windows(2).all(|w| w[1] < w[0]));
+        assert!((student_t(10.0, 1) - 4.587).abs() < 1e-9 && (student_t(10.0, 0) - 3.169).abs() < 1e-9);
+        assert!((student_t(1e12, 1) - 3.291).abs() < 1e-3 && (student_t(1e12, 0) - 2.576).abs() < 1e-3);
+        for level in [0, 1] {
+            let values: Vec<f64> = (2..200).map(|f| student_t(f64::from(f), level)).collect();
+            assert!(values.windows(2).all(|w| w[1] < w[0]));
+        }
     }
 }

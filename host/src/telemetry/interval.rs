@@ -37,17 +37,21 @@ pub enum Interval {
     Link,
     /// Taken by the transport to the slot's due time: what was left of the slot before.
     SlotWait,
-    /// Due time to first photon.
+    /// Due time to first photon. Negative: lit before it was due, by the error of the clock's map.
     Lateness,
     /// Latch to first photon.
-    LatchToLight,
+    LatchToFirstPhoton,
     /// Mid-exposure of the tracker to first photon.
-    MotionToLight,
+    MotionToFirstPhoton,
+    /// Mid-exposure of the tracker to the centre of the light.
+    MotionToCentre,
+    /// Mid-exposure of the tracker to last photon.
+    MotionToLastPhoton,
 }
 
 impl Interval {
     /// All, in the order in which a frame passes them.
-    pub const ALL: [Self; 12] = [
+    pub const ALL: [Self; 14] = [
         Self::Tracker,
         Self::PoseWait,
         Self::Plan,
@@ -58,8 +62,10 @@ impl Interval {
         Self::Link,
         Self::SlotWait,
         Self::Lateness,
-        Self::LatchToLight,
-        Self::MotionToLight,
+        Self::LatchToFirstPhoton,
+        Self::MotionToFirstPhoton,
+        Self::MotionToCentre,
+        Self::MotionToLastPhoton,
     ];
 
     /// As in reports.
@@ -75,8 +81,10 @@ impl Interval {
             Self::Link => "link",
             Self::SlotWait => "slot_wait",
             Self::Lateness => "lateness",
-            Self::LatchToLight => "latch_to_light",
-            Self::MotionToLight => "motion_to_light",
+            Self::LatchToFirstPhoton => "latch_to_first_photon",
+            Self::MotionToFirstPhoton => "motion_to_first_photon",
+            Self::MotionToCentre => "motion_to_centre",
+            Self::MotionToLastPhoton => "motion_to_last_photon",
         }
     }
 
@@ -85,38 +93,46 @@ impl Interval {
         match self {
             Self::Tracker | Self::Plan | Self::Render | Self::Pack | Self::Link => IntervalKind::Work,
             Self::PoseWait | Self::PackWait | Self::LinkWait | Self::SlotWait => IntervalKind::Wait,
-            Self::Lateness | Self::LatchToLight | Self::MotionToLight => IntervalKind::Total,
+            Self::Lateness
+            | Self::LatchToFirstPhoton
+            | Self::MotionToFirstPhoton
+            | Self::MotionToCentre
+            | Self::MotionToLastPhoton => IntervalKind::Total,
         }
     }
 
     /// Length in nanoseconds; negative where a stamp lies before its predecessor (a clock's error, or a frame sent after it
-    /// was due). `None` when the frame was not lit and the interval ends with light.
+    /// was due). `None` when the frame was not lit and the interval ends with light, and when it has no sample and the interval begins with
+    /// one.
     ///
-    /// `measured` says whether the stamps are readings of a clock. At virtual pace they are modelled: there the whole of pack
-    /// and link counts as work and nothing waits.
+    /// `measured` says whether the stamps are readings of a clock. At virtual pace they are modelled: there the whole of the
+    /// link counts as work and nothing waits.
     pub fn of(self, t: &FrameTimeline, measured: bool) -> Option<i64> {
-        let work = |stage: Stage, whole: i64| {
-            if measured {
-                i64::try_from(t.wall_ns[stage as usize]).unwrap_or(i64::MAX).min(whole.max(0))
-            } else {
-                whole
-            }
-        };
-        let pack = t.packed_at.ns_since(t.rendered_at);
+        let sample = t.has_sample().then_some((t.captured_at, t.received_at));
+        let captured = || sample.map(|s| s.0);
         let link = t.sent_at.ns_since(t.packed_at);
+        // The thread's own time in sending. It ends with the stamp and lies inside the whole; the clock that measured it was read apart,
+        // so it is held to the whole: the two parts then add up, and neither is negative where the whole is not.
+        let sending = if measured {
+            i64::try_from(t.wall_ns[Stage::Link as usize]).unwrap_or(i64::MAX).min(link.max(0))
+        } else {
+            link
+        };
         Some(match self {
-            Self::Tracker => t.received_at.ns_since(t.captured_at),
-            Self::PoseWait => t.latched_at.ns_since(t.received_at),
+            Self::Tracker => t.received_at.ns_since(captured()?),
+            Self::PoseWait => t.latched_at.ns_since(sample?.1),
             Self::Plan => t.submitted_at.ns_since(t.latched_at),
             Self::Render => t.rendered_at.ns_since(t.submitted_at),
-            Self::PackWait => pack - work(Stage::Pack, pack),
-            Self::Pack => work(Stage::Pack, pack),
-            Self::LinkWait => link - work(Stage::Link, link),
-            Self::Link => work(Stage::Link, link),
+            Self::PackWait => t.packing_at.ns_since(t.rendered_at),
+            Self::Pack => t.packed_at.ns_since(t.packing_at),
+            Self::LinkWait => link - sending,
+            Self::Link => sending,
             Self::SlotWait => t.due_at.ns_since(t.sent_at),
             Self::Lateness => t.lit_at?.ns_since(t.due_at),
-            Self::LatchToLight => t.lit_at?.ns_since(t.latched_at),
-            Self::MotionToLight => t.motion_to_light_ns()?,
+            Self::LatchToFirstPhoton => t.lit_at?.ns_since(t.latched_at),
+            Self::MotionToFirstPhoton => t.lit_at?.ns_since(captured()?),
+            Self::MotionToCentre => t.centre_at?.ns_since(captured()?),
+            Self::MotionToLastPhoton => t.last_photon_at?.ns_since(captured()?),
         })
     }
 }
@@ -127,7 +143,8 @@ pub(crate) mod tests {
     use crate::frame::STAGES;
     use dpm_device::time::HostTime;
 
-    /// A frame whose stamps are `step` ns apart; pack worked for half of its step, link for a quarter.
+    /// A frame whose stamps are `step` ns apart, but packing, which begins in the middle of its step; link worked for a quarter of its
+    /// step. Its light lasts for a step, with its centre after a quarter.
     pub(crate) fn frame(start: i64, step: i64) -> FrameTimeline {
         let at = |k: i64| HostTime(start + k * step);
         let mut wall_ns = [0; STAGES.len()];
@@ -139,29 +156,32 @@ pub(crate) mod tests {
             latched_at: at(2),
             submitted_at: at(3),
             rendered_at: at(4),
+            packing_at: at(4).plus_ns(step / 2),
             packed_at: at(5),
             sent_at: at(6),
             due_at: at(7),
             lit_at: Some(at(8)),
+            centre_at: Some(at(8).plus_ns(step / 4)),
+            last_photon_at: Some(at(9)),
             wall_ns,
         }
     }
 
-    /// Work and waits from sample to light add up to motion-to-light, measured or modelled.
+    /// Work and waits from sample to light add up to motion to first photon, measured or modelled.
     #[test]
     fn the_parts_add_up_to_the_whole() {
         for measured in [true, false] {
             let t = frame(1_000, 400);
-            let sum: i64 = Interval::ALL
-                .into_iter()
-                .filter(|i| i.kind() != IntervalKind::Total)
-                .map(|i| i.of(&t, measured).unwrap())
-                .sum();
-            let lateness = Interval::Lateness.of(&t, measured).unwrap();
-            assert_eq!(sum + lateness, Interval::MotionToLight.of(&t, measured).unwrap());
-            assert_eq!(Interval::LatchToLight.of(&t, measured), Some(2400));
-            let waits = (Interval::PackWait.of(&t, measured), Interval::LinkWait.of(&t, measured));
-            assert_eq!(waits, if measured { (Some(200), Some(300)) } else { (Some(0), Some(0)) });
+            let of = |i: Interval| i.of(&t, measured).unwrap();
+            let sum: i64 =
+                Interval::ALL.into_iter().filter(|i| i.kind() != IntervalKind::Total).map(of).sum();
+            assert_eq!(sum + of(Interval::Lateness), of(Interval::MotionToFirstPhoton));
+            assert_eq!(of(Interval::LatchToFirstPhoton), 2400);
+            assert_eq!((of(Interval::PackWait), of(Interval::Pack)), (200, 200));
+            assert_eq!(of(Interval::LinkWait), if measured { 300 } else { 0 });
+            let totals =
+                [Interval::MotionToFirstPhoton, Interval::MotionToCentre, Interval::MotionToLastPhoton];
+            assert_eq!(totals.map(of), [3200, 3300, 3600]);
         }
         for (i, interval) in Interval::ALL.into_iter().enumerate() {
             assert_eq!(interval as usize, i);
@@ -169,9 +189,29 @@ pub(crate) mod tests {
     }
 
     #[test]
+    fn a_frame_lit_before_it_was_due_has_a_negative_lateness() {
+        let t = FrameTimeline { due_at: HostTime(8_500), ..frame(0, 1_000) };
+        assert_eq!(Interval::Lateness.of(&t, true), Some(-500));
+    }
+
+    #[test]
     fn an_unlit_frame_has_no_light() {
-        let t = FrameTimeline { lit_at: None, ..frame(0, 10) };
-        assert_eq!(Interval::MotionToLight.of(&t, true), None);
+        let t = FrameTimeline { lit_at: None, centre_at: None, last_photon_at: None, ..frame(0, 10) };
+        for interval in Interval::ALL.into_iter().filter(|i| i.kind() == IntervalKind::Total) {
+            assert_eq!(interval.of(&t, true), None);
+        }
         assert_eq!(Interval::Link.of(&t, true), Some(2));
+    }
+
+    /// A frame for bodies that nobody has told of is not the fastest of all frames.
+    #[test]
+    fn a_frame_without_a_sample_has_no_way_from_one() {
+        let t = frame(0, 1_000).without_sample();
+        assert!(!t.has_sample() && frame(0, 1_000).has_sample());
+        for interval in Interval::ALL {
+            let from_sample = matches!(interval, Interval::Tracker | Interval::PoseWait)
+                || interval.name().starts_with("motion");
+            assert_eq!(interval.of(&t, true).is_none(), from_sample, "{}", interval.name());
+        }
     }
 }

@@ -3,10 +3,12 @@
 pub mod compare;
 pub mod interval;
 pub mod monitor;
+pub mod ordered;
 pub mod plots;
 pub mod profile;
 pub mod prometheus;
 pub mod report;
+pub mod signed;
 pub mod slots;
 pub mod trace;
 pub mod v2log;

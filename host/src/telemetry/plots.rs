@@ -48,6 +48,10 @@ pub enum Stroke {
 
 /// Room for the key beside a chart, pixels.
 const KEY_WIDTH: u32 = 190;
+/// Room for the titles above a chart, pixels.
+const TITLE_HEIGHT: u32 = 44;
+/// Colour of the line at the length of a slot.
+const SLOT_LINE: RGBColor = RGBColor(120, 120, 120);
 
 /// Names of curves with a piece of each, below each other beside the chart, where they cover none of it. Returns what is left for the chart.
 ///
@@ -75,12 +79,13 @@ pub fn key<B: DrawingBackend>(
     Ok(chart)
 }
 
-/// Latency against percentile for every interval of a kind, with the axis stretched towards the rare: one decade per nine.
+/// Latency against percentile for every interval of a kind, with the axis stretched towards the rare: one decade per nine. `made` says
+/// what ran, when and of which commit the program is; it stands above the plot with the number of frames.
 ///
 /// # Errors
 /// What the drawing library says.
-pub fn percentiles(profiler: &Profiler, kind: IntervalKind) -> Result<String, PlotError> {
-    let curves: Vec<(&str, Vec<(f64, f64)>)> = Interval::ALL
+pub fn percentiles(profiler: &Profiler, kind: IntervalKind, made: &str) -> Result<String, PlotError> {
+    let curves: Vec<(String, Vec<(f64, f64)>)> = Interval::ALL
         .into_iter()
         .filter(|i| i.kind() == kind && !profiler.histogram(*i).is_empty())
         .map(|interval| {
@@ -89,27 +94,54 @@ pub fn percentiles(profiler: &Profiler, kind: IntervalKind) -> Result<String, Pl
                 let nines = f64::from(i) * 0.05;
                 (nines, h.value_at_quantile(1.0 - 10f64.powf(-nines)) as f64 * 1e-6)
             });
-            (interval.name(), points.collect())
+            let modelled = if profiler.is_modelled(interval) { " (modelled)" } else { "" };
+            (interval.name().replace('_', " ") + modelled, points.collect())
         })
         .collect();
-    draw(&curves).map_err(|e| PlotError { what: "percentiles", reason: e.to_string() })
+    let what = match kind {
+        IntervalKind::Work => "Work on a frame",
+        IntervalKind::Wait => "Waiting of a frame",
+        IntervalKind::Total => "From motion to light",
+    };
+    let titles = [format!("{what}, {} frames", profiler.frames_lit()), made.to_owned()];
+    let slot_ms = profiler.rate().slot_len_ns(0) as f64 * 1e-6;
+    draw(&curves, &titles, slot_ms).map_err(|e| PlotError { what: "percentiles", reason: e.to_string() })
 }
 
-fn draw(curves: &[(&str, Vec<(f64, f64)>)]) -> Result<String, Box<dyn std::error::Error>> {
-    let most = curves.iter().flat_map(|(_, points)| points).fold(0f64, |m, (_, y)| m.max(*y));
-    let top = if most > 0.0 { 1.05 * most } else { 1.0 };
+fn draw(
+    curves: &[(String, Vec<(f64, f64)>)],
+    titles: &[String; 2],
+    slot_ms: f64,
+) -> Result<String, Box<dyn std::error::Error>> {
+    let all = || curves.iter().flat_map(|(_, points)| points).map(|(_, y)| *y);
+    let (least, most) = (all().fold(0f64, f64::min), all().fold(0f64, f64::max));
+    // Five hundredths of the range above and, where something is early, below.
+    let range = if most > least { most - least } else { 1.0 };
+    let (bottom, top) =
+        (if least < 0.0 { least - 0.05 * range } else { 0.0 }, most.max(least + range) + 0.05 * range);
     let mut text = String::new();
     {
         let root = SVGBackend::with_string(&mut text, SIZE).into_drawing_area();
         root.fill(&WHITE)?;
-        let named: Vec<_> =
-            curves.iter().enumerate().map(|(i, (name, _))| (*name, color(i), Stroke::Plain(2))).collect();
-        let area = key(&root, &named)?;
+        let (_, below) = root.split_vertically(TITLE_HEIGHT);
+        for (i, (title, size)) in titles.iter().zip([16, 12]).enumerate() {
+            root.draw_text(title, &("sans-serif", size).into_text_style(&root), (24, 6 + 22 * i as i32))?;
+        }
+        let mut named: Vec<(&str, RGBColor, Stroke)> = curves
+            .iter()
+            .enumerate()
+            .map(|(i, (name, _))| (name.as_str(), color(i), Stroke::Plain(2)))
+            .collect();
+        let has_slot = (bottom..=top).contains(&slot_ms);
+        if has_slot {
+            named.push(("one slot", SLOT_LINE, Stroke::Dashed(1)));
+        }
+        let area = key(&below, &named)?;
         let mut chart = ChartBuilder::on(&area)
             .margin(24)
             .x_label_area_size(36)
             .y_label_area_size(64)
-            .build_cartesian_2d(0.0..5.0, 0.0..top)?;
+            .build_cartesian_2d(0.0..5.0, bottom..top)?;
         chart
             .configure_mesh()
             .x_desc("share of frames that take no longer")
@@ -117,10 +149,15 @@ fn draw(curves: &[(&str, Vec<(f64, f64)>)]) -> Result<String, Box<dyn std::error
             // At whole nines.
             .x_labels(6)
             .x_label_formatter(&|x: &f64| {
+                // The label's place, not a figure: below one nine there are no decimals to show.
                 format!("{:.*} %", (*x - 2.0).max(0.0) as usize, 100.0 - 10f64.powf(2.0 - x))
             })
             .light_line_style(WHITE)
             .draw()?;
+        if has_slot {
+            let line = [(0.0, slot_ms), (5.0, slot_ms)];
+            chart.draw_series(DashedLineSeries::new(line, 6, 4, SLOT_LINE.stroke_width(1)))?;
+        }
         for (i, (_, points)) in curves.iter().enumerate() {
             chart.draw_series(LineSeries::new(points.iter().copied(), color(i).stroke_width(2)))?;
         }
@@ -157,7 +194,7 @@ mod tests {
         for k in 1..=2000 {
             profiler.lit(&frame(k, k * 1000), k as u64, false);
         }
-        let svg = percentiles(&profiler, IntervalKind::Work).unwrap();
+        let svg = percentiles(&profiler, IntervalKind::Work, "made today").unwrap();
         assert!(
             svg.trim_end().ends_with("</svg>") && svg.contains("render") && svg.contains("99.9 %"),
             "{svg}"
@@ -179,19 +216,52 @@ mod tests {
 
     #[test]
     fn nothing_is_an_empty_frame_and_labels_are_whole_nines() {
-        let svg = percentiles(&Profiler::new(FrameRate::new(947, 1).unwrap(), true, 100), IntervalKind::Work);
-        let svg = svg.unwrap();
+        let profiler = Profiler::new(FrameRate::new(947, 1).unwrap(), true, 100);
+        let svg = percentiles(&profiler, IntervalKind::Work, "").unwrap();
         assert!(polylines(&svg).is_empty() && !svg.contains("NaN"));
         let labels: Vec<&str> =
             svg.lines().map(str::trim).filter(|l| l.ends_with(" %") && !l.contains('<')).collect();
         assert_eq!(labels, ["0 %", "90 %", "99 %", "99.9 %", "99.99 %", "99.999 %"]);
     }
 
+    /// Found in use, user 4: a plot without title, count, date, commit and the slot's length cannot stand in a paper.
+    #[test]
+    fn a_plot_says_of_what_it_is_and_shows_the_slot() {
+        let mut profiler = Profiler::new(FrameRate::new(947, 1).unwrap(), true, 100);
+        (1..=20).for_each(|k| profiler.lit(&frame(k, k * 100_000), k as u64, false));
+        let svg = percentiles(&profiler, IntervalKind::Total, "rig.toml, commit abc, 2026-11-22").unwrap();
+        for part in [
+            "From motion to light, 20 frames",
+            "rig.toml, commit abc, 2026-11-22",
+            "one slot",
+            "motion to centre",
+        ] {
+            assert!(svg.contains(part), "{part}");
+        }
+    }
+
+    /// Found in use (second look at latency, section 2b): early light was drawn at 0.
+    #[test]
+    fn what_is_early_is_drawn_below_zero() {
+        let mut profiler = Profiler::new(FrameRate::new(947, 1).unwrap(), true, 100);
+        for k in 1..=200 {
+            let mut t = frame(k, 1000);
+            t.due_at = t.lit_at.unwrap().plus_ns(400_000);
+            profiler.lit(&t, k as u64, false);
+        }
+        let svg = percentiles(&profiler, IntervalKind::Total, "").unwrap();
+        let flat: Vec<f64> = polylines(&svg).iter().filter(|c| c.len() > 2).map(|c| c[0].1).collect();
+        let heights = Interval::ALL.iter().filter(|i| i.kind() == IntervalKind::Total).count();
+        assert_eq!(flat.len(), heights);
+        // Lateness is the first of the totals; the others are some microseconds above zero, 0.4 ms higher.
+        assert!(flat[1..].iter().all(|y| *y < flat[0] - 100.0), "{flat:?}");
+    }
+
     #[test]
     fn names_stand_beside_the_chart() {
         let mut profiler = Profiler::new(FrameRate::new(947, 1).unwrap(), true, 100);
         (1..=20).for_each(|k| profiler.lit(&frame(k, k * 1000), k as u64, false));
-        let svg = percentiles(&profiler, IntervalKind::Work).unwrap();
+        let svg = percentiles(&profiler, IntervalKind::Work, "made today").unwrap();
         let right = f64::from(SIZE.0 - KEY_WIDTH);
         let (mut beside, mut on_chart) = (0, 0);
         for curve in polylines(&svg) {

@@ -5,6 +5,7 @@
 
 use super::monitor::RunCounts;
 use super::profile::ProfileReport;
+use std::collections::BTreeMap;
 use std::fmt::Write as _;
 use std::io::{Read, Write};
 use std::net::{SocketAddr, TcpListener, TcpStream, ToSocketAddrs};
@@ -24,15 +25,35 @@ pub fn page(counts: &RunCounts, profile: Option<&ProfileReport>) -> String {
         );
     };
     counter("frames_planned", "Frames planned.", counts.frames_planned);
-    counter("frames_lit", "Frames whose light left the projector.", counts.frames_lit);
+    counter("frames_lit", "Frames whose light left the projector, with light on a body.", counts.frames_lit);
+    counter("frames_dark", "Frames that the projector lit in which every body was dark.", counts.frames_dark);
     counter("frames_dropped", "Frames that were planned and never lit.", counts.frames_dropped);
+    counter("frames_withheld", "Frames not lit because no new picture was wanted.", counts.frames_withheld);
     counter("frames_late", "Frames lit after their slot.", counts.frames_late);
+    counter("slots", "Slots in which a frame of their own was wanted.", counts.slots);
+    counter("slots_missed", "Of these, slots without one, whatever the cause.", counts.slots_missed);
     let Some(profile) = profile else { return text };
-    text.push_str("# HELP dpm_slots_missed_total Slots without a frame of their own.\n# TYPE dpm_slots_missed_total counter\n");
-    for (cause, n) in &profile.missed {
-        let _ = writeln!(text, "dpm_slots_missed_total{{cause=\"{}\"}} {n}", escaped(cause));
-    }
-    text.push_str("# HELP dpm_interval_seconds Parts of a frame's way from sample to light.\n# TYPE dpm_interval_seconds summary\n");
+    let mut labelled = |name: &str, help: &str, label: &str, values: &BTreeMap<String, u64>| {
+        let _ = writeln!(text, "# HELP dpm_{name}_total {help}\n# TYPE dpm_{name}_total counter");
+        for (value, n) in values {
+            let _ = writeln!(text, "dpm_{name}_total{{{label}=\"{}\"}} {n}", escaped(value));
+        }
+    };
+    labelled(
+        "slots_missed_by_cause",
+        "Slots without a frame of their own, by cause.",
+        "cause",
+        &profile.missed,
+    );
+    labelled(
+        "slots_ordered_dark",
+        "Slots in which no new picture was wanted, by reason.",
+        "reason",
+        &profile.ordered_dark,
+    );
+    let early = profile.intervals_ms.iter().map(|(name, d)| (name.clone(), d.negative)).collect();
+    labelled("interval_negative", "Frames in which the interval was negative.", "interval", &early);
+    text.push_str("# HELP dpm_interval_seconds Parts of a frame's way from sample to light, with their sign.\n# TYPE dpm_interval_seconds summary\n");
     for (name, d) in &profile.intervals_ms {
         let name = escaped(name);
         for (quantile, ms) in [("0.5", d.p50), ("0.9", d.p90), ("0.99", d.p99), ("0.999", d.p999)] {
@@ -162,12 +183,15 @@ mod tests {
     #[test]
     fn the_page_is_valid_exposition_text() {
         let d = Distribution { count: 4, mean: 2.0, p50: 1.5, p99: 3.0, ..Default::default() };
+        let early = Distribution { count: 4, mean: -2.0, p50: -0.25, negative: 4, ..Default::default() };
         let profile = ProfileReport {
             missed: [("li\"nk\n".to_owned(), 7)].into(),
-            intervals_ms: [("render".to_owned(), d)].into(),
+            ordered_dark: [("black".to_owned(), 9)].into(),
+            intervals_ms: [("render".to_owned(), d), ("lateness".to_owned(), early)].into(),
             ..Default::default()
         };
-        let text = page(&RunCounts { frames_lit: 12, ..Default::default() }, Some(&profile));
+        let counts = RunCounts { frames_lit: 12, slots: 40, slots_missed: 7, ..Default::default() };
+        let text = page(&counts, Some(&profile));
         let mut typed = Vec::new();
         for line in text.lines() {
             if let Some(rest) = line.strip_prefix("# TYPE ") {
@@ -180,7 +204,11 @@ mod tests {
             }
         }
         assert!(text.contains("dpm_frames_lit_total 12\n"));
-        assert!(text.contains(r#"dpm_slots_missed_total{cause="li\"nk\n"} 7"#));
+        assert!(text.contains("dpm_slots_total 40\n") && text.contains("dpm_slots_missed_total 7\n"));
+        assert!(text.contains(r#"dpm_slots_missed_by_cause_total{cause="li\"nk\n"} 7"#));
+        assert!(text.contains(r#"dpm_slots_ordered_dark_total{reason="black"} 9"#));
+        assert!(text.contains(r#"dpm_interval_negative_total{interval="lateness"} 4"#));
+        assert!(text.contains(r#"dpm_interval_seconds{interval="lateness",quantile="0.5"} -0.00025"#));
         assert!(text.contains(r#"dpm_interval_seconds{interval="render",quantile="0.5"} 0.0015"#));
         assert!(text.contains(r#"dpm_interval_seconds_sum{interval="render"} 0.008"#));
     }

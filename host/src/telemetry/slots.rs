@@ -1,108 +1,397 @@
 //! What a projector showed slot by slot, and what became of each frame, into slots without a frame of their own and their causes.
 //!
-//! A slot is missed when the projector, between the first and the last frame that was planned, repeats a frame or stays dark in it.
-//! Nothing is decided while the run goes on: at the end every missed slot is held against the frame that was planned for it.
+//! Every slot from the first frame that was planned to the last one is exactly one of these: it showed a frame of its own; it was missed,
+//! for one cause; or no new picture was wanted in it, for one reason. Slots of which the projector told nothing are missed.
+//!
+//! A slot is decided as soon as its light, its frame and the machine's standstills are known, and then only counted. The window of slots
+//! that are not decided has a fixed length, so a run may last for months.
 
-use crate::frame::{FrameTimeline, Stage};
-use crate::plan::slots::MissCause;
-use crate::realtime::standstill::Standstills;
-use dpm_device::time::HostTime;
-use std::collections::BTreeMap;
+use super::ordered::{DarkLog, DarkSpans};
+use crate::frame::FrameTimeline;
+use crate::plan::slots::{MissCause, OrderedDark};
+use crate::realtime::standstill::SeenStandstills;
+use dpm_device::time::{FrameRate, HostTime};
+use std::collections::VecDeque;
+use std::sync::Arc;
 
-/// Missed slots, and frames in trouble, that are kept; beyond this the run is broken and the rest only counted.
-const KEPT: usize = 1 << 16;
+/// Most slots that wait for their decision; the oldest is decided by what is known when another one comes.
+const WINDOW: usize = 8192;
+/// Slots that are judged one by one where a stall skipped many at once; more than these are judged together.
+const ONE_BY_ONE: u64 = 1 << 20;
+/// Batches kept; twice as many slots go into each when there are more.
+const MAX_BATCHES: usize = 64;
+/// Slots of a batch at first.
+const BATCH_SLOTS: u64 = 128;
 
-/// Slots of a run.
-#[derive(Clone, Debug, Default)]
-pub struct SlotLedger {
-    /// Missed slots with their beginning.
-    missed: Vec<(u64, HostTime)>,
-    not_kept: u64,
-    /// Why frames did not make it into their slot, by slot.
-    troubled: BTreeMap<u64, (MissCause, HostTime)>,
-    first_lit: Option<u64>,
-    last_planned: Option<u64>,
+/// What is known of a slot.
+#[derive(Clone, Copy, Debug, Default)]
+struct Entry {
+    light: Light,
+    /// Why its frame may not have made it, and when that frame was latched.
+    trouble: Option<(MissCause, HostTime)>,
 }
 
-/// What the ledger says at the end.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+enum Light {
+    /// Nothing was told so far.
+    #[default]
+    Untold,
+    /// The frame that was planned for it.
+    Own,
+    /// Dark, the frame before, or a frame that was planned for an earlier slot.
+    NothingNew,
+}
+
+/// Slots by what became of them.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub struct SlotCounts {
-    /// Slots from the first frame that was lit to the last that was planned.
-    pub slots: u64,
-    /// Of these, slots without a frame of their own, by cause.
+    /// Slots that showed a frame of their own.
+    pub own: u64,
+    /// Slots that did not although they should have, by cause.
     pub missed: [u64; MissCause::ALL.len()],
-}
-
-impl SlotLedger {
-    /// A frame for `slot` came to the end of the host's part of its way. `refused`: the link did not take
-    /// it. `waited_for_memory`: planning could not begin earlier because a later stage held all buffers.
-    pub fn planned(&mut self, slot: u64, timeline: &FrameTimeline, refused: bool, waited_for_memory: bool) {
-        let skipped = self.last_planned.map_or(slot, |last| last + 1)..slot;
-        let cause = if waited_for_memory { MissCause::Buffers } else { MissCause::Plan };
-        for between in skipped.take(KEPT) {
-            self.note(between, cause, timeline.latched_at);
-        }
-        self.last_planned = Some(self.last_planned.map_or(slot, |last| last.max(slot)));
-        if refused {
-            self.note(slot, MissCause::Link, timeline.latched_at);
-        } else if timeline.sent_at > timeline.due_at {
-            self.note(slot, slowest(timeline), timeline.latched_at);
-        }
-    }
-
-    fn note(&mut self, slot: u64, cause: MissCause, since: HostTime) {
-        if self.troubled.len() < KEPT {
-            self.troubled.insert(slot, (cause, since));
-        }
-    }
-
-    /// A frame was lit in `slot` for the first time.
-    pub fn lit(&mut self, slot: u64) {
-        self.first_lit.get_or_insert(slot);
-    }
-
-    /// The projector had nothing new in `slot`, which began at `begin`, or a frame that was meant for an earlier slot.
-    pub fn nothing_new(&mut self, slot: u64, begin: HostTime) {
-        if self.first_lit.is_none() {
-            return;
-        }
-        if self.missed.len() < KEPT {
-            self.missed.push((slot, begin));
-        } else {
-            self.not_kept += 1;
-        }
-    }
-
-    /// Counts by cause. Slots whose frame was under way (or `lead_ns` before them, where there was none) while the machine stood
-    /// still are the machine's. A frame that was sent in time and not lit is the link's.
-    pub fn counts(&self, standstills: &Standstills, lead_ns: i64) -> SlotCounts {
-        let (Some(first), Some(last)) = (self.first_lit, self.last_planned) else {
-            return SlotCounts::default();
-        };
-        let mut counts = SlotCounts { slots: (last + 1).saturating_sub(first), ..SlotCounts::default() };
-        for &(slot, begin) in self.missed.iter().filter(|(slot, _)| *slot <= last) {
-            let (cause, since) = self.troubled.get(&slot).copied().unwrap_or((MissCause::Link, begin));
-            let stood_still = standstills.touches(since.min(begin.plus_ns(-lead_ns)), begin);
-            counts.missed[if stood_still { MissCause::Standstill } else { cause } as usize] += 1;
-        }
-        counts.missed[MissCause::Link as usize] += self.not_kept;
-        counts
-    }
+    /// Slots in which no new picture was wanted, by reason; none of the others.
+    pub ordered: [u64; OrderedDark::ALL.len()],
 }
 
 impl SlotCounts {
+    /// Slots in which a frame of their own was wanted.
+    pub fn wanted(&self) -> u64 {
+        self.own + self.missed_total()
+    }
+
     /// Missed slots of every cause.
     pub fn missed_total(&self) -> u64 {
         self.missed.iter().sum()
+    }
+
+    /// Missed slots as a share of those in which a frame was wanted, 0 to 1; 0 where none was.
+    pub fn missed_share(&self) -> f64 {
+        self.missed_total() as f64 / self.wanted().max(1) as f64
+    }
+
+    /// Missed slots whose frame was under way while the machine itself stood still.
+    pub fn excused(&self) -> u64 {
+        self.missed[MissCause::Standstill as usize]
+    }
+
+    /// Slots of every reason in which no new picture was wanted.
+    pub fn ordered_total(&self) -> u64 {
+        self.ordered.iter().sum()
+    }
+}
+
+/// How a slot is counted.
+#[derive(Clone, Copy)]
+enum Judgement {
+    Own,
+    Missed(MissCause),
+    Ordered(OrderedDark),
+}
+
+impl SlotCounts {
+    fn add(&mut self, judgement: Judgement, slots: u64) {
+        *match judgement {
+            Judgement::Own => &mut self.own,
+            Judgement::Missed(cause) => &mut self.missed[cause as usize],
+            Judgement::Ordered(reason) => &mut self.ordered[reason as usize],
+        } += slots;
+    }
+}
+
+/// Consecutive slots in which a frame was wanted, and how many of them were missed: for the spread of the share.
+#[derive(Clone, Debug)]
+struct Batches {
+    all: Vec<(u64, u64)>,
+    length: u64,
+    now: (u64, u64),
+}
+
+impl Batches {
+    fn count(&mut self, slots: u64, missed: bool) {
+        self.now.0 += slots;
+        self.now.1 += if missed { slots } else { 0 };
+        if self.now.0 < self.length {
+            return;
+        }
+        self.all.push(std::mem::take(&mut self.now));
+        if self.all.len() == MAX_BATCHES {
+            for i in 0..MAX_BATCHES / 2 {
+                let ((a, b), (c, d)) = (self.all[2 * i], self.all[2 * i + 1]);
+                self.all[i] = (a + c, b + d);
+            }
+            self.all.truncate(MAX_BATCHES / 2);
+            self.length *= 2;
+        }
+    }
+}
+
+/// Slots of a run.
+#[derive(Clone, Debug)]
+pub struct SlotLedger {
+    rate: FrameRate,
+    /// How long before its slot a frame is begun, for slots that had none.
+    lead_ns: i64,
+    /// What is seen of the machine's standstills; `None` where nobody looks.
+    seen: Option<Arc<SeenStandstills>>,
+    spans: DarkSpans,
+    first_planned: Option<u64>,
+    last_planned: Option<u64>,
+    newest_light: Option<u64>,
+    /// A slot and its beginning, from which those of other slots follow.
+    reference: (u64, HostTime),
+    /// The first slot that is not decided.
+    base: u64,
+    window: VecDeque<Entry>,
+    counts: SlotCounts,
+    batches: Batches,
+}
+
+impl SlotLedger {
+    /// For slots of `rate`. A frame is begun about `lead_ns` before its slot.
+    pub fn new(rate: FrameRate, lead_ns: i64) -> Self {
+        Self {
+            rate,
+            lead_ns,
+            seen: None,
+            spans: DarkSpans::new(rate.slot_len_ns(0)),
+            first_planned: None,
+            last_planned: None,
+            newest_light: None,
+            reference: (0, HostTime(0)),
+            base: 0,
+            window: VecDeque::with_capacity(WINDOW),
+            counts: SlotCounts::default(),
+            batches: Batches { all: Vec::with_capacity(MAX_BATCHES), length: BATCH_SLOTS, now: (0, 0) },
+        }
+    }
+
+    /// Missed slots are held against what is seen there. To be called before the first slot.
+    pub fn excuse_by(&mut self, seen: Arc<SeenStandstills>) {
+        self.seen = Some(seen);
+    }
+
+    /// Learns what was ordered.
+    pub fn read_orders(&mut self, log: &DarkLog) {
+        self.spans.read(log);
+    }
+
+    /// Why no new picture was wanted in the slot that begins at `begin`; `None` where one was.
+    pub fn ordered_dark(&self, begin: HostTime) -> Option<OrderedDark> {
+        self.spans.reason_at(begin)
+    }
+
+    /// A frame for `slot` came to the end of the host's part of its way. `refused`: the link did not take
+    /// it. `waited_for_memory`: planning could not begin earlier because a later stage held all buffers.
+    pub fn planned(&mut self, slot: u64, timeline: &FrameTimeline, refused: bool, waited_for_memory: bool) {
+        self.reference = (slot, timeline.due_at);
+        if self.first_planned.is_none() {
+            self.first_planned = Some(slot);
+            self.begin_at(slot);
+        }
+        let skipped = self.last_planned.map_or(slot, |last| last.saturating_add(1));
+        let cause = if waited_for_memory { MissCause::Buffers } else { MissCause::Plan };
+        self.last_planned = Some(self.last_planned.map_or(slot, |last| last.max(slot)));
+        let between = Some((cause, timeline.latched_at));
+        for known in skipped.max(self.base)..slot.min(self.end()) {
+            self.window[(known - self.base) as usize].trouble = between;
+        }
+        self.extend(slot, between);
+        let own = if refused {
+            Some((MissCause::Link, timeline.latched_at))
+        } else {
+            (timeline.sent_at > timeline.due_at).then(|| (slowest(timeline), timeline.latched_at))
+        };
+        if let Some(entry) = self.entry(slot) {
+            entry.trouble = own;
+        }
+    }
+
+    /// The frame that was planned for `slot`, which begins at `begin`, was lit in it. The last `unseen` slots before it of which nothing
+    /// else was told showed frames of which only the number is known; they are taken for their own.
+    pub fn own(&mut self, slot: u64, begin: HostTime, unseen: u32) {
+        self.told(slot, begin, Light::Own, unseen);
+        self.spans.lit(begin);
+    }
+
+    /// The projector had nothing new in `slot`, which began at `begin`, or a frame that was meant for an earlier slot. `unseen` as in
+    /// [`SlotLedger::own`].
+    pub fn nothing_new(&mut self, slot: u64, begin: HostTime, unseen: u32) {
+        self.told(slot, begin, Light::NothingNew, unseen);
+    }
+
+    /// Decides what can be decided. To be called now and then.
+    pub fn settle(&mut self) {
+        let through = self.seen.as_ref().map_or(HostTime(i64::MAX), |seen| seen.through());
+        while let (Some(front), Some(last)) = (self.window.front(), self.last_planned) {
+            let slot = self.base;
+            let known = match front.light {
+                Light::Own => true,
+                Light::NothingNew => self.begin_of(slot) <= through,
+                // Light is told in order: what was passed over will not be told any more.
+                Light::Untold => {
+                    self.newest_light.is_some_and(|newest| newest > slot) && self.begin_of(slot) <= through
+                }
+            };
+            if slot > last || !known {
+                break;
+            }
+            self.decide_front();
+        }
+    }
+
+    /// Counts so far: all slots that are decided.
+    pub fn counts(&self) -> SlotCounts {
+        self.counts
+    }
+
+    /// The run is over: decides every slot up to the last planned one.
+    pub fn finish(&mut self) -> SlotCounts {
+        while self.last_planned.is_some_and(|last| self.base <= last) && !self.window.is_empty() {
+            self.decide_front();
+        }
+        self.counts
+    }
+
+    /// Slots in which a frame was wanted, and those of them that were missed, of equal batches of consecutive slots.
+    pub fn batches(&self) -> &[(u64, u64)] {
+        &self.batches.all
+    }
+
+    /// One past the newest slot of the window.
+    fn end(&self) -> u64 {
+        self.base.saturating_add(self.window.len() as u64)
+    }
+
+    /// The window begins at `slot`, where the run begins.
+    fn begin_at(&mut self, slot: u64) {
+        if self.window.is_empty() || self.end() <= slot || self.base > slot.saturating_add(WINDOW as u64) {
+            self.window.clear();
+        } else {
+            for _ in slot..self.base {
+                self.window.push_front(Entry::default());
+            }
+            for _ in self.base..slot {
+                self.window.pop_front();
+            }
+        }
+        self.base = slot;
+    }
+
+    /// When a slot begins, from the newest one of which it is known.
+    fn begin_of(&self, slot: u64) -> HostTime {
+        let (known, begin) = self.reference;
+        let ns = self.rate.slot_start_ns(slot).saturating_sub(self.rate.slot_start_ns(known));
+        begin.plus_ns(ns)
+    }
+
+    fn entry(&mut self, slot: u64) -> Option<&mut Entry> {
+        let at = usize::try_from(slot.checked_sub(self.base)?).ok()?;
+        self.window.get_mut(at)
+    }
+
+    /// Makes room for slots up to `slot`; new ones get `trouble`.
+    fn extend(&mut self, slot: u64, trouble: Option<(MissCause, HostTime)>) {
+        while slot.saturating_sub(self.base) >= WINDOW as u64 && !self.window.is_empty() {
+            self.decide_front();
+        }
+        let keep_from = slot.saturating_sub(WINDOW as u64 - 1);
+        if self.base < keep_from {
+            let skipped = keep_from - self.base;
+            if skipped > ONE_BY_ONE {
+                let judgement = self.judged_together(keep_from, trouble);
+                self.count(judgement, skipped);
+                self.base = keep_from;
+            }
+            while self.base < keep_from {
+                self.window.push_back(Entry { light: Light::Untold, trouble });
+                self.decide_front();
+            }
+        }
+        while self.end() <= slot {
+            self.window.push_back(Entry { light: Light::Untold, trouble });
+        }
+    }
+
+    fn told(&mut self, slot: u64, begin: HostTime, light: Light, unseen: u32) {
+        // What it shows far behind the last planned slot is not of the run, unless planning goes on, which then tells of it. And no
+        // projector has a say in how much memory or time is spent here.
+        let newest = self.last_planned.unwrap_or(slot).saturating_add(WINDOW as u64);
+        if slot > newest || slot < self.base {
+            return;
+        }
+        if self.first_planned.is_none() {
+            // Before the first frame: nothing counts yet, but its note may come after its light.
+            if self.window.is_empty() || slot >= self.end().saturating_add(WINDOW as u64) {
+                self.window.clear();
+                self.base = slot;
+            }
+        }
+        self.reference = (slot, begin);
+        self.newest_light = Some(self.newest_light.map_or(slot, |newest| newest.max(slot)));
+        self.extend(slot, None);
+        let at = slot.saturating_sub(self.base) as usize;
+        if let Some(entry) = self.window.get_mut(at) {
+            entry.light = light;
+        }
+        let before = self.window.iter_mut().take(at).rev();
+        for entry in before.filter(|e| e.light == Light::Untold).take(unseen as usize) {
+            entry.light = Light::Own;
+        }
+    }
+
+    fn decide_front(&mut self) {
+        let Some(entry) = self.window.pop_front() else { return };
+        let slot = self.base;
+        self.base += 1;
+        if self.first_planned.is_none() {
+            return;
+        }
+        let judgement = self.judged(slot, entry);
+        self.count(judgement, 1);
+    }
+
+    fn judged(&self, slot: u64, entry: Entry) -> Judgement {
+        if entry.light == Light::Own {
+            return Judgement::Own;
+        }
+        let begin = self.begin_of(slot);
+        if let Some(reason) = self.spans.reason_at(begin) {
+            return Judgement::Ordered(reason);
+        }
+        // A frame that was sent in time and not lit is the link's, and so is a slot of which nothing is known.
+        let (cause, since) = entry.trouble.unwrap_or((MissCause::Link, begin));
+        let under_way = since.min(begin.plus_ns(-self.lead_ns));
+        let stood_still = self.seen.as_ref().is_some_and(|seen| seen.with(|s| s.touches(under_way, begin)));
+        Judgement::Missed(if stood_still { MissCause::Standstill } else { cause })
+    }
+
+    /// The slots from the window's beginning to `end`, of which nothing is known but that they were skipped.
+    fn judged_together(&self, end: u64, trouble: Option<(MissCause, HostTime)>) -> Judgement {
+        let (from, to) = (self.begin_of(self.base), self.begin_of(end));
+        if let Some(reason) = self.spans.reason_throughout(from, to) {
+            return Judgement::Ordered(reason);
+        }
+        let stood_still = self.seen.as_ref().is_some_and(|seen| seen.with(|s| s.covers(from, to)));
+        Judgement::Missed(if stood_still {
+            MissCause::Standstill
+        } else {
+            trouble.map_or(MissCause::Link, |(cause, _)| cause)
+        })
+    }
+
+    fn count(&mut self, judgement: Judgement, slots: u64) {
+        self.counts.add(judgement, slots);
+        if slots > 0 && !matches!(judgement, Judgement::Ordered(_)) {
+            self.batches.count(slots, matches!(judgement, Judgement::Missed(_)));
+        }
     }
 }
 
 /// The part of a late frame's way that took longest.
 fn slowest(t: &FrameTimeline) -> MissCause {
-    let rendered = t.wall_ns[Stage::Render as usize] > 0;
     let parts = [
         (MissCause::Plan, t.submitted_at.ns_since(t.latched_at)),
-        (if rendered { MissCause::Render } else { MissCause::Pack }, t.rendered_at.ns_since(t.submitted_at)),
+        (MissCause::Render, t.rendered_at.ns_since(t.submitted_at)),
         (MissCause::Pack, t.packed_at.ns_since(t.rendered_at)),
         (MissCause::Link, t.sent_at.ns_since(t.packed_at)),
     ];
@@ -110,64 +399,5 @@ fn slowest(t: &FrameTimeline) -> MissCause {
 }
 
 #[cfg(test)]
-mod tests {
-    use super::*;
-
-    const SLOT: i64 = 1_000_000;
-
-    /// A frame for `slot`, due at its beginning, whose link part ends `after_due` later.
-    fn frame(slot: u64, after_due: i64) -> FrameTimeline {
-        let due = HostTime(slot as i64 * SLOT);
-        FrameTimeline {
-            latched_at: due.plus_ns(-2 * SLOT),
-            submitted_at: due.plus_ns(-2 * SLOT + 1),
-            rendered_at: due.plus_ns(-SLOT),
-            packed_at: due.plus_ns(-SLOT / 2),
-            sent_at: due.plus_ns(after_due),
-            due_at: due,
-            ..FrameTimeline::default()
-        }
-    }
-
-    /// Slots 10 to 19: 12 never planned, 13 not taken, 15 sent 2 slots late, 17 lost by the device; then 20 and 21, which nobody planned.
-    fn ledger() -> SlotLedger {
-        let mut ledger = SlotLedger::default();
-        ledger.nothing_new(9, HostTime(9 * SLOT));
-        for slot in [10, 11, 13, 14, 15, 16, 17, 18, 19] {
-            let after = if slot == 15 { 2 * SLOT } else { -100 };
-            ledger.planned(slot, &frame(slot, after), slot == 13, slot == 13);
-        }
-        for slot in 10..22 {
-            match slot {
-                12 | 13 | 15 | 17 | 20 | 21 => ledger.nothing_new(slot, HostTime(slot as i64 * SLOT)),
-                _ => ledger.lit(slot),
-            }
-        }
-        ledger
-    }
-
-    #[test]
-    fn every_missed_slot_of_the_run_has_one_cause() {
-        let counts = ledger().counts(&Standstills::default(), 0);
-        assert_eq!((counts.slots, counts.missed_total()), (10, 4));
-        let of = |cause: MissCause| counts.missed[cause as usize];
-        assert_eq!((of(MissCause::Buffers), of(MissCause::Link), of(MissCause::Standstill)), (1, 3, 0));
-        // The machine stood still while the frame of slot 15 was under way, and nothing else.
-        let mut standstills = Standstills::default();
-        standstills.note(HostTime(14 * SLOT + 10), HostTime(15 * SLOT - 10), 1);
-        let counts = ledger().counts(&standstills, 0);
-        let of = |cause: MissCause| counts.missed[cause as usize];
-        assert_eq!((of(MissCause::Buffers), of(MissCause::Link), of(MissCause::Standstill)), (1, 2, 1));
-        assert_eq!(SlotLedger::default().counts(&standstills, 0), SlotCounts::default());
-    }
-
-    #[test]
-    fn a_late_frame_is_blamed_on_its_longest_part() {
-        let mut t = frame(5, -100);
-        assert_eq!(slowest(&t), MissCause::Pack);
-        t.wall_ns[Stage::Render as usize] = 1;
-        assert_eq!(slowest(&t), MissCause::Render);
-        t.submitted_at = t.latched_at.plus_ns(10 * SLOT);
-        assert_eq!(slowest(&t), MissCause::Plan);
-    }
-}
+#[path = "slots_tests.rs"]
+mod tests;

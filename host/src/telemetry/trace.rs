@@ -132,10 +132,6 @@ impl<W: Write> TraceWriter<W> {
     /// Writes a frame's slices and its flow.
     pub fn frame(&mut self, frame: &FrameTrace<'_>) -> Result<(), Error> {
         let t = frame.timeline;
-        let began = |end: HostTime, stage: Stage, not_before: HostTime| {
-            let wall = i64::try_from(t.wall_ns[stage as usize]).unwrap_or(i64::MAX);
-            end.plus_ns(-wall).max(not_before)
-        };
         let mut journey = vec![
             self.slice(Track::Tracker, "sample", t.captured_at, t.received_at, frame)?,
             self.slice(Track::Plan, "latch and submit", t.latched_at, t.submitted_at, frame)?,
@@ -143,9 +139,9 @@ impl<W: Write> TraceWriter<W> {
         let gpu = self.slice(Track::Gpu, "render", t.submitted_at, t.rendered_at, frame)?;
         self.passes(&gpu, frame.passes)?;
         journey.push(gpu);
-        let pack_began = began(t.packed_at, Stage::Pack, t.rendered_at);
-        journey.push(self.slice(Track::Pack, "pack", pack_began, t.packed_at, frame)?);
-        let link_began = began(t.sent_at, Stage::Link, t.packed_at);
+        journey.push(self.slice(Track::Pack, "pack", t.packing_at, t.packed_at, frame)?);
+        let sending = i64::try_from(t.wall_ns[Stage::Link as usize]).unwrap_or(i64::MAX);
+        let link_began = t.sent_at.plus_ns(-sending).max(t.packed_at);
         journey.push(self.slice(Track::Link, "send", link_began, t.sent_at, frame)?);
         if let Some(lit_at) = t.lit_at {
             let end = frame.last_photon_at.unwrap_or(lit_at.plus_ns(1_000));

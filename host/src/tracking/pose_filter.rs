@@ -23,6 +23,17 @@ const QUATERNION_TOLERANCE: f64 = 1e-3;
 /// A sample stamped later than this after its own arrival is refused: it would make every true one look old.
 const FUTURE_TOLERANCE_NS: i64 = 1_000_000;
 
+/// Intervals between samples that are remembered to tell the tracker's rate.
+const INTERVALS: usize = 9;
+/// Intervals that must be known before the rate is believed.
+const LEAST_INTERVALS: usize = 3;
+/// The slowest tracker whose rate is believed, ns between two samples: 10 Hz.
+const LONGEST_PERIOD_NS: i64 = 100_000_000;
+/// A track goes on across a gap of so many half periods: two samples in a row may be missing, and the third may come late.
+const HALF_PERIODS_CARRIED: i64 = 7;
+/// The part of [`PoseFilterConfig::tracked_for_ns`] that is the rig's own latency, ns; a missing sample or two come on top.
+const OWN_LATENCY_NS: i64 = 6_000_000;
+
 /// Whether poses are carried on to the instant of light.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Prediction {
@@ -55,9 +66,11 @@ pub struct PoseFilterConfig {
     pub max_acceleration_m_s2: f64,
     /// Strongest angular acceleration taken for real, rad/s^2.
     pub max_angular_acceleration_rad_s2: f64,
-    /// Horizons up to this count as [`Freshness::Tracked`]: the rig's own latency and a missing sample or two, ns.
+    /// Horizons up to this count as [`Freshness::Tracked`]: the rig's own latency and a missing sample or two, ns. With a tracker
+    /// below 500 Hz it is that of two periods, and at most `lost_after_ns`.
     pub tracked_for_ns: i64,
-    /// Longest time that motion is carried on without samples; then the body is lost, ns.
+    /// Longest time that motion is carried on without samples; then the body is lost, ns. A track may be older: it goes on with the
+    /// next sample if no more than two are missing, at the rate at which samples come.
     pub lost_after_ns: i64,
     /// A body that moved and then delivers this many identical poses is reported stuck.
     pub stuck_after: u32,
@@ -237,6 +250,43 @@ pub struct PoseFilter {
     rotation_recall: Recall<Rotations>,
     counters: PoseFilterCounters,
     last_nis: Option<[f64; 2]>,
+    rate: Rate,
+}
+
+/// The time between two samples of a tracker, measured: what a rig file says of it may be wrong, and nothing else tells a tracker at
+/// 30 Hz, whose samples are all "late" by the measure of one at 500 Hz, from one that loses most of its samples.
+#[derive(Clone, Copy, Debug, Default)]
+struct Rate {
+    newest: Option<HostTime>,
+    intervals: [i64; INTERVALS],
+    filled: usize,
+    next: usize,
+}
+
+impl Rate {
+    fn push(&mut self, at: HostTime) {
+        let interval = self.newest.map_or(0, |newest| at.ns_since(newest));
+        if self.newest.is_none() || interval > 0 {
+            self.newest = Some(at);
+        }
+        if interval > 0 {
+            self.intervals[self.next] = interval;
+            self.next = (self.next + 1) % INTERVALS;
+            self.filled = (self.filled + 1).min(INTERVALS);
+        }
+    }
+
+    /// The median of the last intervals, which samples missing now and then do not move, at most [`LONGEST_PERIOD_NS`]; 0 while it is
+    /// not known. Nanoseconds.
+    fn period_ns(&self) -> i64 {
+        if self.filled < LEAST_INTERVALS {
+            return 0;
+        }
+        let mut sorted = self.intervals;
+        let known = &mut sorted[..self.filled];
+        known.sort_unstable();
+        known[(known.len() - 1) / 2].min(LONGEST_PERIOD_NS)
+    }
 }
 
 impl PoseFilter {
@@ -252,7 +302,18 @@ impl PoseFilter {
             rotation_recall: Recall::new(),
             counters: PoseFilterCounters::default(),
             last_nis: None,
+            rate: Rate::default(),
         }
+    }
+
+    /// Longest gap between two samples across which a track goes on, ns.
+    fn carried_for_ns(&self) -> i64 {
+        self.config.lost_after_ns.max(HALF_PERIODS_CARRIED * self.rate.period_ns() / 2)
+    }
+
+    fn tracked_for_ns(&self) -> i64 {
+        let slow = OWN_LATENCY_NS + 2 * self.rate.period_ns();
+        self.config.tracked_for_ns.max(slow).min(self.config.lost_after_ns)
     }
 
     /// The settings.
@@ -280,7 +341,10 @@ impl PoseFilter {
     /// Judges a sample and takes it in when it is good. Any bits may come in.
     pub fn update(&mut self, sample: &TrackerSample) -> Verdict {
         let verdict = match check(sample) {
-            Ok(measured) => self.take(measured),
+            Ok(measured) => {
+                self.rate.push(measured.at);
+                self.take(measured)
+            }
             Err(verdict) => verdict,
         };
         self.counters.count(verdict);
@@ -306,7 +370,7 @@ impl PoseFilter {
             captured_at: track.newest.at,
             position,
             rotation,
-            tracked_for_ns: self.config.tracked_for_ns,
+            tracked_for_ns: self.tracked_for_ns(),
             lost_after_ns: self.config.lost_after_ns,
         })
     }
@@ -328,6 +392,7 @@ impl PoseFilter {
     fn take(&mut self, z: Measured) -> Verdict {
         let (rp, rr) = self.variances();
         let c = self.config;
+        let carried_for_ns = self.carried_for_ns();
         if let Some(track) = &mut self.track {
             let gap_ns = z.at.ns_since(track.newest.at);
             if gap_ns == 0 {
@@ -336,7 +401,7 @@ impl PoseFilter {
             if gap_ns < 0 {
                 return Verdict::OutOfOrder;
             }
-            if gap_ns <= c.lost_after_ns {
+            if gap_ns <= carried_for_ns {
                 let h = gap_ns as f64 * 1e-9;
                 let mut position = track.position;
                 let mut rotation = track.rotation;
@@ -378,7 +443,7 @@ impl PoseFilter {
             if gap_ns < 0 {
                 return Verdict::OutOfOrder;
             }
-            if gap_ns > c.lost_after_ns || !self.agrees(z, rp) {
+            if gap_ns > self.carried_for_ns() || !self.agrees(z, rp) {
                 self.candidates = [None; ACQUIRE_SAMPLES];
             }
         }

@@ -433,3 +433,115 @@ fn rows_of_the_mode_table_are_probabilities() {
         assert!((row.iter().sum::<f64>() - 1.0).abs() < 1e-12);
     }
 }
+
+/// The matrix of tracker rates: whatever the rate, a track starts with the third sample, two missing samples in a row neither end it nor
+/// leave a mark, steady motion is exact at the horizon that this rate needs, and a teleport is taken over by the third sample. Nothing
+/// of this may depend on 500 Hz.
+#[test]
+fn every_tracker_rate_is_followed_alike() {
+    for hz in [30, 60, 120, 500, 1000] {
+        let period = 1_000_000_000 / hz;
+        // As a rig without `predict_ms` has it: 2 ms of latency, two periods, and 8 ms of lead and slots; at least 20 ms.
+        let lost_after_ns = (2 * MS + 2 * period + 8 * MS).max(20 * MS);
+        for lost_after_ns in [lost_after_ns, 20 * MS] {
+            let what = format!("{hz} Hz, lost after {} ms", lost_after_ns / MS);
+            let config = PoseFilterConfig {
+                lost_after_ns,
+                tracked_for_ns: lost_after_ns / 2,
+                ..PoseFilterConfig::default()
+            };
+            let motion = |t: f64| (DVec3::new(t, -0.5 * t, 0.2), so3_exp(DVec3::Y * (2.0 * t)));
+            let mut filter = PoseFilter::new(config);
+            let feed = |filter: &mut PoseFilter, k: i64| {
+                let (p, q) = motion((k * period) as f64 * 1e-9);
+                filter.update(&sample(k * period, p, q))
+            };
+            let mut verdicts = Vec::new();
+            let mut k = 0;
+            while verdicts.last() != Some(&Verdict::Acquired) {
+                verdicts.push(feed(&mut filter, k));
+                k += 1;
+                // With a `predict_ms` below the period the rate must be measured before samples are taken for neighbours.
+                let most =
+                    if period <= lost_after_ns { ACQUIRE_SAMPLES } else { ACQUIRE_SAMPLES + LEAST_INTERVALS };
+                assert!(verdicts.len() <= most, "{what}: {verdicts:?}");
+            }
+            for _ in 0..60 {
+                assert_eq!(feed(&mut filter, k), Verdict::Accepted, "{what}");
+                k += 1;
+            }
+            for horizon_ns in [2 * MS, (2 * MS + period + 4 * MS).min(lost_after_ns)] {
+                let at = (k - 1) * period + horizon_ns;
+                let predicted = filter.predict(HostTime(at)).unwrap();
+                let (p, q) = motion(at as f64 * 1e-9);
+                assert!((position(&predicted) - p).length() < 1e-5, "{what}");
+                assert!(so3_between(q, rotation(&predicted)).length() < 1e-4, "{what}");
+                // What this rate brings with it is no drop-out.
+                assert_eq!(predicted.freshness, Freshness::Tracked, "{what}, {horizon_ns} ns ahead");
+            }
+            assert_eq!(
+                filter.freshness(HostTime((k - 1) * period + lost_after_ns + 1)),
+                Freshness::Lost,
+                "{what}"
+            );
+            // Two samples in a row missing, again and again.
+            for _ in 0..20 {
+                k += 2;
+                assert_eq!(
+                    feed(&mut filter, k),
+                    Verdict::Accepted,
+                    "{what}: track ended by two missing samples"
+                );
+                for next in k + 1..k + 4 {
+                    assert_eq!(feed(&mut filter, next), Verdict::Accepted, "{what}");
+                }
+                k += 4;
+            }
+            let at = (k - 1) * period + 2 * MS;
+            let off = position(&filter.predict(HostTime(at)).unwrap()) - motion(at as f64 * 1e-9).0;
+            assert!(off.length() < 1e-5, "{what}: {off} after samples were missing");
+            // A teleport, too far for the strongest believable acceleration at this rate.
+            let far = DVec3::new(0.0, 50.0, 0.0);
+            let verdicts: Vec<_> = (k..k + 4)
+                .map(|k| {
+                    let (p, q) = motion((k * period) as f64 * 1e-9);
+                    filter.update(&sample(k * period, p + far, q))
+                })
+                .collect();
+            let taken = [Verdict::SetAside, Verdict::SetAside, Verdict::Acquired, Verdict::Accepted];
+            assert_eq!(verdicts, taken, "{what}");
+        }
+    }
+}
+
+/// The same through the mock tracker with noise: what is off at the instant of light grows with the horizon that the rate brings with
+/// it, but no frame is without a pose, and none is thrown.
+#[test]
+fn noisy_trackers_of_every_rate_are_followed() {
+    let swing =
+        MotionSpec::Sinusoid { direction: [1.0, 0.0, 0.0], peak_speed_m_s: 0.5, peak_acceleration_m_s2: 2.0 };
+    // 99th percentile allowed, metres: a period and a half of 2 m/s2, unforeseen, and what 0.1 mm of noise make of the rest.
+    for hz in [30u32, 60, 120, 500, 1000] {
+        let mut rig = EvaluationConfig::with_noise(1e-4, 1e-3);
+        rig.tracker.rate = dpm_device::time::FrameRate::new(hz, 1).unwrap();
+        rig.frames = 10 * 947;
+        rig.settle_frames = 947;
+        let filter = PoseFilterConfig::from_rig(&Default::default(), (30 + 2000 / hz).max(20));
+        let errors = evaluate(&swing, filter, &rig).unwrap();
+        let period_s = 1.0 / f64::from(hz);
+        let allowed = 4e-4 + 2.0 * (1.5 * period_s).powi(2);
+        println!(
+            "{hz} Hz: p50 {:.3} p99 {:.3} max {:.3} mm",
+            errors.position_m.p50 * 1e3,
+            errors.position_m.p99 * 1e3,
+            errors.position_m.max * 1e3
+        );
+        assert_eq!(errors.frames_without_pose, 0, "{hz} Hz");
+        assert!(errors.position_m.p99 < allowed, "{hz} Hz: {:?}, {allowed} allowed", errors.position_m);
+        assert!(
+            errors.horizon_ns.1 as f64 * 1e-9 < 2.0 * period_s + 6e-3,
+            "{hz} Hz: {:?}",
+            errors.horizon_ns
+        );
+    }
+}

@@ -1,6 +1,7 @@
 //! The program in a process of its own, for the tests of the command line.
 #![allow(dead_code)]
 
+use std::ffi::OsStr;
 use std::io::{BufRead, BufReader, Read};
 use std::path::PathBuf;
 use std::process::{Child, Command, ExitStatus, Output, Stdio};
@@ -11,10 +12,16 @@ use std::time::{Duration, Instant};
 pub const NO_DRIVER: [(&str, &str); 2] =
     [("VK_ICD_FILENAMES", "/nonexistent.json"), ("VK_DRIVER_FILES", "/nonexistent.json")];
 
-/// The program with arguments, in an environment without settings of ours.
-fn command(args: &[&str]) -> Command {
+/// A folder of this test program's own for locks, sockets and standing orders of the programs that it starts.
+pub fn own_folder(name: &str) -> PathBuf {
+    PathBuf::from(env!("CARGO_TARGET_TMPDIR")).join(format!("dpm-{}", std::process::id())).join(name)
+}
+
+/// The program with arguments, in an environment without settings of ours. What this machine's own rigs keep is none of its business.
+pub fn command<S: AsRef<OsStr>>(args: &[S]) -> Command {
     let mut command = Command::new(env!("CARGO_BIN_EXE_dpm"));
     command.args(args).env_remove("NO_COLOR").stdin(Stdio::null());
+    command.env("DPM_RUNTIME_DIR", own_folder("run")).env("DPM_STATE_DIR", own_folder("state"));
     for (name, _) in std::env::vars_os() {
         if name.to_string_lossy().starts_with("DPM_SET_") {
             command.env_remove(name);
@@ -50,9 +57,15 @@ pub struct Running {
 }
 
 /// Starts the program and goes on.
-pub fn start(args: &[&str]) -> Running {
-    let mut child =
-        command(args).stdout(Stdio::piped()).stderr(Stdio::piped()).spawn().expect("the program starts");
+pub fn start<S: AsRef<OsStr>>(args: &[S]) -> Running {
+    start_with(args, &[])
+}
+
+/// Starts the program with more variables in its environment, and goes on.
+pub fn start_with<S: AsRef<OsStr>>(args: &[S], variables: &[(&str, &str)]) -> Running {
+    let mut command = command(args);
+    command.envs(variables.iter().copied()).stdout(Stdio::piped()).stderr(Stdio::piped());
+    let mut child = command.spawn().expect("the program starts");
     let (sender, lines) = channel();
     let stderr = BufReader::new(child.stderr.take().expect("piped"));
     std::thread::spawn(move || {
@@ -99,6 +112,11 @@ impl Running {
         // The shell's own: a bare system has no program of that name.
         let status = Command::new("sh").args(["-c", &format!("kill -s {name} {}", self.id())]).status();
         assert!(status.expect("a shell starts").success());
+    }
+
+    /// Its end, where that has come.
+    pub fn try_wait(&mut self) -> Option<ExitStatus> {
+        self.child.try_wait().expect("our own child")
     }
 
     /// Waits for the end; gives status and standard output.

@@ -99,7 +99,13 @@ pub struct Running {
 
 /// Starts `rig` for `frames` frames; 0 until it is stopped.
 pub fn start(rig: &Arc<Rig>, frames: u64) -> Running {
+    start_with(rig, frames, |_| {})
+}
+
+/// As [`start`], with a monitor that `prepare` has seen before the run.
+pub fn start_with(rig: &Arc<Rig>, frames: u64, prepare: impl FnOnce(&RunMonitor)) -> Running {
     let monitor = Arc::new(RunMonitor::default());
+    prepare(&monitor);
     let (rig, watched) = (rig.clone(), monitor.clone());
     let options = RunOptions { frames, ..RunOptions::default() };
     let thread = std::thread::spawn(move || run_prepared(rig, options, &watched));
@@ -182,8 +188,11 @@ impl PtyProjector {
         let thread = std::thread::spawn(move || {
             let _held = held;
             while !stopped.load(Ordering::Relaxed) {
-                let now = HostTime(start.elapsed().as_nanos() as i64);
-                assert!(device.lock().unwrap().serve(now, &mut master).expect("the line works"), "held open");
+                let clock = || HostTime(start.elapsed().as_nanos() as i64);
+                assert!(
+                    device.lock().unwrap().serve(clock, &mut master).expect("the line works"),
+                    "held open"
+                );
                 std::thread::sleep(Duration::from_micros(300));
             }
         });

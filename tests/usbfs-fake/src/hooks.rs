@@ -98,7 +98,24 @@ pub(crate) fn send_event(message: &[u8]) {
 
 /// Names every function below, so that the linker keeps them in a test binary.
 pub(crate) fn keep_linked() {
-    let names: [*const (); 14] = [
+    let names: [*const (); 31] = [
+        fopen as *const (),
+        fopen64 as *const (),
+        openat as *const (),
+        openat64 as *const (),
+        __openat_2 as *const (),
+        __openat64_2 as *const (),
+        stat as *const (),
+        stat64 as *const (),
+        lstat as *const (),
+        lstat64 as *const (),
+        __xstat as *const (),
+        __xstat64 as *const (),
+        __lxstat as *const (),
+        __lxstat64 as *const (),
+        readlink as *const (),
+        readlinkat as *const (),
+        scandir as *const (),
         open as *const (),
         open64 as *const (),
         __open_2 as *const (),
@@ -181,6 +198,197 @@ pub extern "C" fn __open_2(path: *const c_char, flags: c_int) -> c_int {
 #[no_mangle]
 pub extern "C" fn __open64_2(path: *const c_char, flags: c_int) -> c_int {
     open_any(path, flags, 0)
+}
+
+/// True for the path that a call relative to `folder` resolves without it, which is how libraries name sysfs.
+fn is_absolute(path: *const c_char) -> bool {
+    // SAFETY: a path is a C string; its first byte is there, be it the zero.
+    !path.is_null() && unsafe { *path } == b'/' as c_char
+}
+
+fn openat_any(folder: c_int, path: *const c_char, flags: c_int, mode: c_int) -> c_int {
+    if is_absolute(path) {
+        return open_any(path, flags, mode);
+    }
+    // SAFETY: the kernel checks descriptor and path.
+    unsafe { libc::syscall(libc::SYS_openat, folder, path, flags, mode) as c_int }
+}
+
+/// `openat(2)`; variadic like `open`.
+#[no_mangle]
+pub extern "C" fn openat(folder: c_int, path: *const c_char, flags: c_int, mode: c_int) -> c_int {
+    openat_any(folder, path, flags, mode)
+}
+
+/// `openat64(3)`, the same on 64-bit targets.
+#[no_mangle]
+pub extern "C" fn openat64(folder: c_int, path: *const c_char, flags: c_int, mode: c_int) -> c_int {
+    openat_any(folder, path, flags, mode)
+}
+
+/// `openat` as fortified programs call it.
+#[no_mangle]
+pub extern "C" fn __openat_2(folder: c_int, path: *const c_char, flags: c_int) -> c_int {
+    openat_any(folder, path, flags, 0)
+}
+
+/// `openat64` as fortified programs call it.
+#[no_mangle]
+pub extern "C" fn __openat64_2(folder: c_int, path: *const c_char, flags: c_int) -> c_int {
+    openat_any(folder, path, flags, 0)
+}
+
+/// The C library's own function of this name, which ours stands in front of.
+///
+/// # Safety
+/// `F` must be the type of the C function.
+unsafe fn next<F: Copy>(name: &CStr) -> Option<F> {
+    assert_eq!(size_of::<F>(), size_of::<*mut c_void>());
+    // SAFETY: a C string; the result is a function of type `F` by the caller's promise, or null.
+    unsafe {
+        let found = libc::dlsym(libc::RTLD_NEXT, name.as_ptr());
+        (!found.is_null()).then(|| std::mem::transmute_copy(&found))
+    }
+}
+
+type Fopen = extern "C" fn(*const c_char, *const c_char) -> *mut libc::FILE;
+
+fn fopen_any(name: &CStr, path: *const c_char, mode: *const c_char) -> *mut libc::FILE {
+    // Kept for the time of the call.
+    let redirected = match place(path) {
+        Place::Redirected(p) => Some(p),
+        // Device files are not read through streams; the kernel may say so.
+        Place::Elsewhere | Place::Device(..) => None,
+    };
+    let path = redirected.as_ref().map_or(path, |p| p.as_ptr());
+    // SAFETY: this is the type of fopen.
+    match unsafe { next::<Fopen>(name) } {
+        Some(real) => real(path, mode),
+        None => {
+            fail(libc::ENOSYS);
+            std::ptr::null_mut()
+        }
+    }
+}
+
+/// `fopen(3)`, by which libusb up to 1.0.21 reads sysfs.
+#[no_mangle]
+pub extern "C" fn fopen(path: *const c_char, mode: *const c_char) -> *mut libc::FILE {
+    fopen_any(c"fopen", path, mode)
+}
+
+/// `fopen64(3)`, the same on 64-bit targets.
+#[no_mangle]
+pub extern "C" fn fopen64(path: *const c_char, mode: *const c_char) -> *mut libc::FILE {
+    fopen_any(c"fopen64", path, mode)
+}
+
+/// `struct stat` of a path, filled by the kernel; the C library's has the same layout on 64-bit targets.
+fn stat_any(path: *const c_char, out: *mut libc::stat, flags: c_int) -> c_int {
+    let redirected = match place(path) {
+        Place::Redirected(p) => Some(p),
+        Place::Device(bus, address) => {
+            let node = format!("{}/dev/bus/usb/{bus:03}/{address:03}", bus::root().display());
+            CString::new(node).ok()
+        }
+        Place::Elsewhere => None,
+    };
+    let path = redirected.as_ref().map_or(path, |p| p.as_ptr());
+    // SAFETY: the kernel checks path and `out`.
+    unsafe { libc::syscall(libc::SYS_newfstatat, libc::AT_FDCWD, path, out, flags) as c_int }
+}
+
+/// `stat(2)`.
+#[no_mangle]
+pub extern "C" fn stat(path: *const c_char, out: *mut libc::stat) -> c_int {
+    stat_any(path, out, 0)
+}
+
+/// `stat64(3)`, the same on 64-bit targets.
+#[no_mangle]
+pub extern "C" fn stat64(path: *const c_char, out: *mut libc::stat) -> c_int {
+    stat_any(path, out, 0)
+}
+
+/// `lstat(2)`.
+#[no_mangle]
+pub extern "C" fn lstat(path: *const c_char, out: *mut libc::stat) -> c_int {
+    stat_any(path, out, libc::AT_SYMLINK_NOFOLLOW)
+}
+
+/// `lstat64(3)`, the same on 64-bit targets.
+#[no_mangle]
+pub extern "C" fn lstat64(path: *const c_char, out: *mut libc::stat) -> c_int {
+    stat_any(path, out, libc::AT_SYMLINK_NOFOLLOW)
+}
+
+/// `stat` as programs built against C libraries before 2.33 call it.
+#[no_mangle]
+pub extern "C" fn __xstat(_version: c_int, path: *const c_char, out: *mut libc::stat) -> c_int {
+    stat_any(path, out, 0)
+}
+
+/// `stat64` as programs built against C libraries before 2.33 call it.
+#[no_mangle]
+pub extern "C" fn __xstat64(_version: c_int, path: *const c_char, out: *mut libc::stat) -> c_int {
+    stat_any(path, out, 0)
+}
+
+/// `lstat` as programs built against C libraries before 2.33 call it.
+#[no_mangle]
+pub extern "C" fn __lxstat(_version: c_int, path: *const c_char, out: *mut libc::stat) -> c_int {
+    stat_any(path, out, libc::AT_SYMLINK_NOFOLLOW)
+}
+
+/// `lstat64` as programs built against C libraries before 2.33 call it.
+#[no_mangle]
+pub extern "C" fn __lxstat64(_version: c_int, path: *const c_char, out: *mut libc::stat) -> c_int {
+    stat_any(path, out, libc::AT_SYMLINK_NOFOLLOW)
+}
+
+fn readlink_any(folder: c_int, path: *const c_char, out: *mut c_char, length: usize) -> isize {
+    let redirected = match place(path) {
+        Place::Redirected(p) => Some(p),
+        _ => None,
+    };
+    let path = redirected.as_ref().map_or(path, |p| p.as_ptr());
+    // SAFETY: the kernel checks path and buffer, whose length is the caller's word.
+    unsafe { libc::syscall(libc::SYS_readlinkat, folder, path, out, length) as isize }
+}
+
+/// `readlink(2)`.
+#[no_mangle]
+pub extern "C" fn readlink(path: *const c_char, out: *mut c_char, length: usize) -> isize {
+    readlink_any(libc::AT_FDCWD, path, out, length)
+}
+
+/// `readlinkat(2)`.
+#[no_mangle]
+pub extern "C" fn readlinkat(folder: c_int, path: *const c_char, out: *mut c_char, length: usize) -> isize {
+    readlink_any(folder, path, out, length)
+}
+
+type Scandir =
+    extern "C" fn(*const c_char, *mut *mut *mut libc::dirent, *const c_void, *const c_void) -> c_int;
+
+/// `scandir(3)`; filter and order are the caller's functions, passed on.
+#[no_mangle]
+pub extern "C" fn scandir(
+    path: *const c_char,
+    names: *mut *mut *mut libc::dirent,
+    filter: *const c_void,
+    order: *const c_void,
+) -> c_int {
+    let redirected = match place(path) {
+        Place::Redirected(p) => Some(p),
+        _ => None,
+    };
+    let path = redirected.as_ref().map_or(path, |p| p.as_ptr());
+    // SAFETY: this is the type of scandir, its function pointers as plain addresses.
+    match unsafe { next::<Scandir>(c"scandir") } {
+        Some(real) => real(path, names, filter, order),
+        None => fail(libc::ENOSYS),
+    }
 }
 
 /// `opendir(3)`.

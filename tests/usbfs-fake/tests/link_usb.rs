@@ -5,7 +5,7 @@ mod link_usb_common;
 use std::sync::{Arc, Mutex};
 use std::time::{Duration, Instant};
 
-use dpm_device::link::{faults, DeviceState, LinkState, SendOutcome};
+use dpm_device::link::{faults, DeviceState, Header, LinkState, MessageType, Packet, SendOutcome, Verb};
 use dpm_device::transport::usb::{UsbSettings, UsbTransport, CONTROL_OUT, DATA_OUT, REPLIES_IN};
 use dpm_device::transport::{Lane, Transport, TransportError};
 use hil_mock::projector::usb::UsbProjector;
@@ -316,4 +316,56 @@ fn frames_cross_usbip_bit_for_bit() {
     let noticed = host.until(&device, 5000, |h| h.link.state() == LinkState::Lost);
     assert!(noticed < Duration::from_millis(100), "{noticed:?}");
     assert_eq!(host.usb.in_flight(), 0);
+}
+
+/// Found in use, section 2b of the second look at latency: a reply that waits for the next poll is stamped when it arrived.
+#[test]
+fn replies_are_stamped_when_they_arrive() {
+    for (serial, with_clock) in [(31, true), (32, false)] {
+        let device = Device::new(serial, Options::default());
+        let mut host = Host::new(&device, 2_000_000, FPS);
+        if !with_clock {
+            let link = host.link;
+            drop(host.usb);
+            let usb = UsbTransport::open(device.settings()).unwrap();
+            host = Host { link, usb, next_id: 1 };
+        }
+        host.link.connect();
+        let mut shortest = i64::MAX;
+        for _ in 0..40 {
+            // Long after any answer has come.
+            std::thread::sleep(Duration::from_millis(20));
+            let _ = host.link.poll(device.now(), &mut host.usb);
+            host.link.take_echoes(|e| {
+                assert!(e.host_sent_at.0 as u64 <= e.device_received_at.0, "one clock stands behind both");
+                assert!(!with_clock || e.device_sent_at.0 <= e.host_received_at.0 as u64);
+                shortest = shortest.min(e.host_received_at.ns_since(e.host_sent_at));
+            });
+        }
+        if with_clock {
+            assert!(shortest < 10_000_000, "{shortest} ns");
+        } else {
+            assert!((20_000_000..i64::MAX).contains(&shortest), "what the stamps are for: {shortest} ns");
+        }
+    }
+}
+
+/// Found in use, R2: an order to be dark finds a transfer though all others of its lane hang.
+#[test]
+fn an_order_to_be_dark_passes_messages_that_wait() {
+    let device = Device::new(33, Options::default());
+    let mut host = Host::connected(&device);
+    host.stream(&device, 5000, |_| lit(&device) >= 3);
+    // The device takes no control message for a while: as many wait as the lane lets.
+    device.plug.inject(CONTROL_OUT, 0, Fault::NakNs(60_000_000));
+    let message = |kind| Packet::new(Header::control(kind, 1, 0), &[]);
+    let mut waiting = 0;
+    while host.usb.send(device.now(), Lane::Control, &[message(MessageType::Freeze)]).is_ok() {
+        waiting += 1;
+        assert!(waiting < 100, "the lane is never full");
+    }
+    assert!(!host.usb.has_room(Lane::Control));
+    host.link.command(device.now(), Verb::Stop, &mut host.usb).expect("a place is kept for it");
+    let dark = host.until(&device, 5000, |_| device.mock(|m| !m.is_lit()));
+    assert!(dark < Duration::from_millis(400), "{dark:?}");
 }

@@ -1,9 +1,11 @@
 //! One frame's planes into packets: whole or not at all.
 
+use super::light::Shown;
 use super::{DropReason, HostLink, LinkState, SendOutcome, Verb};
 use crate::link::compact::PlaneForm;
 use crate::link::flash::{mean_luminance, REST_US};
 use crate::link::header::{frame_newer, Codec, Header, MessageType, Packet};
+use crate::link::limits::light_level;
 use crate::link::message::{Commit, HostMessage, MAX_CONTROL_BYTES};
 use crate::planes::MAX_PLANES;
 use crate::time::{DeviceTicks, HostTime};
@@ -13,7 +15,10 @@ impl HostLink {
     /// Hands one frame to the medium, all of it or nothing. `planes` are the frame's planes one after the other in the
     /// configured order, each [`crate::planes::Raster::plane_bytes`] long; raw planes go out as they lie, without a copy on this side. `frame_id`
     /// must grow from frame to frame; the wire carries its low 32 bits. `target_at` is the instant of light on the device's
-    /// clock, usually [`SlotClock::start`](crate::link::slots::SlotClock::start) of the slot.
+    /// clock, usually [`SlotClock::start`](crate::link::slots::SlotClock::start) of the slot. From `dark_from` on, on the same clock, the
+    /// device shows nothing of this frame, even if it never hears from a host again; usually
+    /// [`SlotClock::dark_from`](crate::link::slots::SlotClock::dark_from). A device takes no frame whose light would end before it
+    /// begins, so a `dark_from` that does not lie after `target_at` is sent as one tick after it.
     ///
     /// # Panics
     /// When `planes` has not the configured size.
@@ -22,11 +27,12 @@ impl HostLink {
         now: HostTime,
         frame_id: u64,
         target_at: DeviceTicks,
+        dark_from: DeviceTicks,
         planes: &[u8],
         transport: &mut dyn Transport,
     ) -> SendOutcome {
         self.counters.frames_offered += 1;
-        match self.try_send_frame(now, frame_id as u32, target_at, planes, transport) {
+        match self.try_send_frame(now, frame_id as u32, target_at, dark_from, planes, transport) {
             Ok(()) => {
                 self.counters.frames_sent += 1;
                 SendOutcome::Sent
@@ -39,6 +45,7 @@ impl HostLink {
                     DropReason::LinkLost => &mut self.counters.link_lost,
                     DropReason::NotNewer => &mut self.counters.not_newer,
                     DropReason::FlashLimit => &mut self.counters.flash_limit,
+                    DropReason::LightLimit(_) => &mut self.counters.light_limit,
                 } += 1;
                 SendOutcome::Dropped { reason }
             }
@@ -50,6 +57,7 @@ impl HostLink {
         now: HostTime,
         frame: u32,
         target_at: DeviceTicks,
+        dark_from: DeviceTicks,
         planes: &[u8],
         transport: &mut dyn Transport,
     ) -> Result<(), DropReason> {
@@ -57,15 +65,15 @@ impl HostLink {
         let plane_bytes = self.settings.raster.plane_bytes();
         let expected = plane_bytes * schedule.len();
         assert!(planes.len() == expected, "frame of {} bytes, configured {expected}", planes.len());
-        if self.state != LinkState::Streaming {
+        // Nothing may queue up behind or before an order to be dark.
+        let darkens = self.rest.is_none() && self.verb.is_some_and(Verb::is_dark);
+        if self.state != LinkState::Streaming || darkens {
             return Err(DropReason::NotStreaming);
         }
         if self.last_frame.is_some_and(|last| !frame_newer(frame, last)) {
             return Err(DropReason::NotNewer);
         }
-        if self.rests(now, planes, transport) {
-            return Err(DropReason::FlashLimit);
-        }
+        self.rests(now, [target_at, dark_from], planes, transport)?;
         if self.credit() == 0 {
             return Err(DropReason::NoCredit);
         }
@@ -98,6 +106,7 @@ impl HostLink {
             kept,
             base_frame: if is_key { 0 } else { self.last_frame.unwrap_or(0) },
             frames_sent: self.frames_sent.wrapping_add(1),
+            dark_from: dark_from.max(DeviceTicks(target_at.0.saturating_add(1))),
         });
         let header =
             Header { frame, target_at, ..Header::control(MessageType::Plane, self.inbox.session, 0) };
@@ -145,20 +154,42 @@ impl HostLink {
         Ok(())
     }
 
-    /// Feeds the flash limiter with a frame that is about to be shown. True while light rests.
-    fn rests(&mut self, now: HostTime, planes: &[u8], transport: &mut dyn Transport) -> bool {
-        if self.rest_until.is_some() {
-            return true;
+    /// Feeds the limiters with a frame that is about to be shown in the slot of `target_at`. An error while light rests.
+    fn rests(
+        &mut self,
+        now: HostTime,
+        [target_at, dark_from]: [DeviceTicks; 2],
+        planes: &[u8],
+        transport: &mut dyn Transport,
+    ) -> Result<(), DropReason> {
+        if let Some((_, reason)) = self.rest {
+            return Err(reason);
         }
-        let Some(limiter) = &mut self.flash else { return false };
-        let light = mean_luminance(self.settings.raster, &self.settings.schedule, planes);
-        if !limiter.observe(light) {
-            return false;
+        let (raster, schedule) = (self.settings.raster, &self.settings.schedule);
+        // What was ordered decides what is seen, not what is sent: a frame that is not lit is no light, and no flash.
+        let is_shown = self.ordered.is_none();
+        let mut struck = None;
+        if let Some(limiter) = &mut self.flash {
+            if is_shown && limiter.observe(mean_luminance(raster, schedule, planes)) {
+                limiter.reset();
+                struck = Some((u64::from(REST_US), DropReason::FlashLimit));
+            }
         }
-        limiter.reset();
+        if let (Some(slots), false) = (self.slots, self.light.is_off()) {
+            let shown = match self.ordered {
+                None => Shown::New(light_level(raster, schedule, planes)),
+                Some(Verb::Freeze) => Shown::Same,
+                Some(_) => Shown::Nothing,
+            };
+            if let Some(limit) = self.light.slot(&slots, [target_at, dark_from], shown) {
+                struck = Some((self.settings.limits.rest_us(limit), DropReason::LightLimit(limit)));
+            }
+        }
+        let Some((rest_us, reason)) = struck else { return Ok(()) };
+        self.light.is_dark();
         // Repeated by `poll` until the device confirms it, should it not get through now.
-        let _ = self.command(now, Verb::Black, transport);
-        self.rest_until = Some(now.plus_ns(i64::from(REST_US) * 1000));
-        true
+        let _ = self.give(now, Verb::Black, transport);
+        self.rest = Some((now.plus_ns((rest_us * 1000) as i64), reason));
+        Err(reason)
     }
 }

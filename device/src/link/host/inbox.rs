@@ -12,7 +12,8 @@ pub(super) const ECHOES_KEPT: usize = 16;
 /// Everything that arrives.
 #[derive(Debug)]
 pub(super) struct Inbox {
-    pub now: HostTime,
+    /// When the bytes that are being read arrived.
+    pub arrived_at: HostTime,
     pub session: u32,
     pub assembly: Option<Assembly>,
     pub hello: Option<DeviceHello>,
@@ -21,6 +22,8 @@ pub(super) struct Inbox {
     pub device_forgot: bool,
     pub echoes: [Option<EchoSample>; ECHOES_KEPT],
     pub next_echo: usize,
+    /// When the newest exchange that was answered had begun.
+    pub echo_answered: HostTime,
     pub ignored: u64,
     pub damaged: u64,
 }
@@ -61,7 +64,7 @@ impl PacketSink for Inbox {
 impl Inbox {
     pub const fn new() -> Self {
         Self {
-            now: HostTime(i64::MIN),
+            arrived_at: HostTime(i64::MIN),
             session: 0,
             assembly: None,
             hello: None,
@@ -70,6 +73,7 @@ impl Inbox {
             device_forgot: false,
             echoes: [None; ECHOES_KEPT],
             next_echo: 0,
+            echo_answered: HostTime(i64::MIN),
             ignored: 0,
             damaged: 0,
         }
@@ -77,8 +81,8 @@ impl Inbox {
 
     /// Forgets the old session and listens to `session`.
     pub fn open(&mut self, session: u32) {
-        let (ignored, damaged, now) = (self.ignored, self.damaged, self.now);
-        *self = Self { session, ignored, damaged, now, ..Self::new() };
+        let (ignored, damaged) = (self.ignored, self.damaged);
+        *self = Self { session, ignored, damaged, ..Self::new() };
     }
 
     fn apply(&mut self, message: &DeviceMessage) {
@@ -94,7 +98,7 @@ impl Inbox {
             }
             DeviceMessage::Echo(e) => {
                 let sent_at = HostTime(e.host_sent_ns as i64);
-                if sent_at > self.now || e.device_sent < e.device_received {
+                if sent_at > self.arrived_at || e.device_sent < e.device_received {
                     self.ignored += 1;
                     return;
                 }
@@ -102,9 +106,10 @@ impl Inbox {
                     host_sent_at: sent_at,
                     device_received_at: e.device_received,
                     device_sent_at: e.device_sent,
-                    host_received_at: self.now,
+                    host_received_at: self.arrived_at,
                 });
                 self.next_echo += 1;
+                self.echo_answered = sent_at;
             }
             DeviceMessage::Fault(f) => self.fault = Some(*f),
         }

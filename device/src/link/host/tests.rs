@@ -1,7 +1,7 @@
 //! A device that says what it should not: answers to other sessions, old answers, answers never asked for.
 
 use super::*;
-use crate::link::{Codec, DeviceMessage, Fault, MessageType, Underrun};
+use crate::link::{Codec, DeviceMessage, Fault, LightLimits, MessageType, Underrun};
 use crate::planes::{PlaneSchedule, Raster};
 use crate::time::FrameRate;
 use proptest::prelude::*;
@@ -12,6 +12,7 @@ struct Script {
     inbound: Vec<u8>,
     sent: Vec<MessageType>,
     session: u32,
+    flushed: u32,
 }
 
 impl Script {
@@ -32,8 +33,15 @@ impl Transport for Script {
         }
         Ok(())
     }
-    fn receive(&mut self, _: HostTime, sink: &mut dyn FnMut(Lane, &[u8])) -> Result<(), TransportError> {
-        sink(Lane::Control, &std::mem::take(&mut self.inbound));
+    fn flush_output(&mut self) {
+        self.flushed += 1;
+    }
+    fn receive(
+        &mut self,
+        now: HostTime,
+        sink: &mut dyn FnMut(Lane, HostTime, &[u8]),
+    ) -> Result<(), TransportError> {
+        sink(Lane::Control, now, &std::mem::take(&mut self.inbound));
         Ok(())
     }
     fn name(&self) -> &str {
@@ -56,13 +64,13 @@ fn link() -> HostLink {
         epoch: Epoch::At(DeviceTicks(0)),
         codecs: Codec::Raw.mask(),
         flash_limit: None,
-        session_seed: 1,
+        limits: LightLimits::OFF,
     })
 }
 
 fn hello() -> DeviceMessage {
     DeviceMessage::Hello(DeviceHello {
-        version: 1,
+        version: u16::from(VERSION),
         firmware: 0,
         codecs: 1,
         raster: raster(),
@@ -137,10 +145,13 @@ fn credit_wraps_and_never_goes_below_zero() {
     let (mut link, mut script) = streaming();
     let planes = [0u8; 16];
     for (id, expected) in [(1, SendOutcome::Sent), (2, SendOutcome::Sent)] {
-        assert_eq!(link.send_frame(HostTime(10), id, DeviceTicks(0), &planes, &mut script), expected);
+        assert_eq!(
+            link.send_frame(HostTime(10), id, DeviceTicks(0), DeviceTicks(1), &planes, &mut script),
+            expected
+        );
     }
     let none = SendOutcome::Dropped { reason: DropReason::NoCredit };
-    assert_eq!(link.send_frame(HostTime(10), 3, DeviceTicks(0), &planes, &mut script), none);
+    assert_eq!(link.send_frame(HostTime(10), 3, DeviceTicks(0), DeviceTicks(1), &planes, &mut script), none);
     // A device that takes credit back below what was sent.
     script.say(script.session, &DeviceMessage::Status(status(DeviceState::Armed, 90, 1)));
     link.poll(HostTime(11), &mut script).unwrap();
@@ -153,8 +164,113 @@ fn credit_wraps_and_never_goes_below_zero() {
     script.say(script.session, &DeviceMessage::Status(status(DeviceState::Armed, 91, 1)));
     link.poll(HostTime(60_000_001), &mut script).unwrap();
     assert_eq!(link.credit(), 2, "from 2^32 - 1 to 1");
-    let older = link.send_frame(HostTime(60_000_002), 2, DeviceTicks(0), &planes, &mut script);
+    let older =
+        link.send_frame(HostTime(60_000_002), 2, DeviceTicks(0), DeviceTicks(1), &planes, &mut script);
     assert_eq!(older, SendOutcome::Dropped { reason: DropReason::NotNewer });
+}
+
+/// A device 30 us away at the other end of a medium that stamps, or of one that does not. Its clock is the host's, a tick a nanosecond.
+struct Distant {
+    script: Script,
+    stamps: bool,
+    waiting: Vec<(HostTime, Vec<u8>)>,
+}
+
+const WAY_NS: i64 = 30_000;
+
+impl Transport for Distant {
+    fn send(&mut self, now: HostTime, lane: Lane, packets: &[Packet<'_>]) -> Result<(), SendError> {
+        let [header, payload, _] = packets[0].parts();
+        if header[5] == MessageType::Echo as u8 {
+            let host_sent_ns = u64::from_le_bytes(payload[..8].try_into().unwrap());
+            let at = DeviceTicks(now.plus_ns(WAY_NS).0 as u64);
+            self.script.say(
+                self.script.session,
+                &DeviceMessage::Echo(Echo { host_sent_ns, device_received: at, device_sent: at }),
+            );
+            self.waiting.push((now.plus_ns(2 * WAY_NS), std::mem::take(&mut self.script.inbound)));
+        }
+        self.script.send(now, lane, packets)
+    }
+    fn receive(
+        &mut self,
+        now: HostTime,
+        sink: &mut dyn FnMut(Lane, HostTime, &[u8]),
+    ) -> Result<(), TransportError> {
+        self.script.receive(now, sink)?;
+        let (stamps, waiting) = (self.stamps, &mut self.waiting);
+        waiting.retain(|(at, bytes)| {
+            if *at <= now {
+                sink(Lane::Control, if stamps { *at } else { now }, bytes);
+            }
+            *at > now
+        });
+        Ok(())
+    }
+    fn name(&self) -> &str {
+        "distant"
+    }
+}
+
+/// Found in use, section 2b of the second look at latency: with replies stamped at the poll, the projector's clock was half a slot wrong.
+#[test]
+fn a_poll_that_comes_late_does_not_shift_the_map() {
+    use crate::clock_map::ClockMap;
+    let worst_ns = |stamps: bool| {
+        let (mut link, script) = streaming();
+        let mut medium = Distant { script, stamps, waiting: Vec::new() };
+        let mut map = ClockMap::new(1_000_000_000).unwrap();
+        let mut worst = 0;
+        for slot in 1..3000i64 {
+            // A frame's work, and every third poll a millisecond late on top of it.
+            let now = HostTime(slot * 1_055_966 + if slot % 3 == 0 { 1_000_000 } else { 0 });
+            link.poll(now, &mut medium).unwrap();
+            link.take_echoes(|e| {
+                map.add_exchange(e.host_sent_at, e.device_received_at, e.device_sent_at, e.host_received_at);
+            });
+            if slot > 100 {
+                let mapped = map.to_host(DeviceTicks(now.0 as u64)).unwrap();
+                let error = mapped.at.ns_since(now).abs();
+                assert!(error <= mapped.uncertainty_ns, "the bound holds");
+                worst = worst.max(error);
+            }
+        }
+        worst
+    };
+    assert!(worst_ns(true) <= WAY_NS, "{} ns", worst_ns(true));
+    assert!(worst_ns(false) > 400_000, "what the stamps are for: {} ns", worst_ns(false));
+}
+
+/// Found in use, R2: an order to be dark goes out once, whatever else waits, and is not weakened while it is not confirmed.
+#[test]
+fn an_order_to_be_dark_goes_first_once_and_is_not_replaced_by_a_weaker_one() {
+    let (mut link, mut script) = streaming();
+    script.sent.clear();
+    link.command(HostTime(100), Verb::Safe, &mut script).unwrap();
+    assert_eq!((script.flushed, &script.sent[..]), (1, &[MessageType::Safe][..]));
+    for (verb, flushed) in [(Verb::Black, 1), (Verb::Stop, 1), (Verb::Freeze, 1), (Verb::Safe, 1)] {
+        link.command(HostTime(200), verb, &mut script).unwrap();
+        assert_eq!((script.flushed, script.sent.last()), (flushed, Some(&MessageType::Safe)), "{verb:?}");
+    }
+    // Nothing that could be lit goes out before it is confirmed.
+    let planes = [0u8; 16];
+    let sent = link.send_frame(HostTime(300), 1, DeviceTicks(0), DeviceTicks(9), &planes, &mut script);
+    assert_eq!(sent, SendOutcome::Dropped { reason: DropReason::NotStreaming });
+    // A stronger order replaces a weaker one, and goes before it.
+    let (mut link, mut script) = streaming();
+    for (verb, kind, flushed) in [
+        (Verb::Freeze, MessageType::Freeze, 0),
+        (Verb::Black, MessageType::Black, 1),
+        (Verb::Stop, MessageType::Stop, 2),
+        (Verb::Safe, MessageType::Safe, 3),
+    ] {
+        link.command(HostTime(400), verb, &mut script).unwrap();
+        assert_eq!((script.flushed, script.sent.last()), (flushed, Some(&kind)));
+    }
+    // The word of whoever arms is newer than all of them.
+    link.arm(0);
+    link.command(HostTime(500), Verb::Black, &mut script).unwrap();
+    assert_eq!(script.sent.last(), Some(&MessageType::Black));
 }
 
 #[test]

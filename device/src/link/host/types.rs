@@ -1,6 +1,7 @@
 //! What a host asks of a link, and what it hears from it: settings, states, errors, outcomes, counters.
 
 use crate::link::header::VERSION;
+use crate::link::limits::{LightLimits, LimitReached};
 use crate::link::message::{ConfigRefusal, DeviceState, HostMessage, Underrun};
 use crate::planes::{PlaneSchedule, Raster};
 use crate::time::{DeviceTicks, FrameRate, HostTime};
@@ -38,8 +39,9 @@ pub struct LinkSettings {
     /// Flashes of the whole field a second above which the host darkens the projector for two seconds; `None` switches
     /// the limiter off.
     pub flash_limit: Option<u8>,
-    /// Seed of the session numbers; two hosts should not use the same.
-    pub session_seed: u32,
+    /// How much light there may be. The host goes dark before a limit is exceeded, and the device, which CONFIG tells of them, does so by
+    /// itself.
+    pub limits: LightLimits,
 }
 
 /// Progress of a [`HostLink`](super::HostLink).
@@ -109,7 +111,7 @@ pub enum LinkError {
         reason: Option<ConfigRefusal>,
     },
     /// The device refused ARM.
-    #[error("{device}: not armed, latched faults: {}; remove the cause and acknowledge them (after too many flashes light rests two seconds)", crate::link::faults::names(*.faults))]
+    #[error("{device}: not armed, latched faults: {}; remove the cause and acknowledge them (after too many flashes light rests two seconds, after a limit on light for as long as its window)", crate::link::faults::names(*.faults))]
     ArmRefused {
         /// Name of the transport.
         device: String,
@@ -136,6 +138,8 @@ pub enum DropReason {
     NotNewer,
     /// The picture flashed too much; the projector rests in the dark.
     FlashLimit,
+    /// With this frame a limit on light would have been exceeded, or one was, and the projector rests in the dark.
+    LightLimit(LimitReached),
 }
 
 /// Fate of a frame handed to [`super::HostLink::send_frame`].
@@ -151,7 +155,7 @@ pub enum SendOutcome {
 }
 
 /// Counters since [`super::HostLink::new`]: `frames_offered = frames_sent + not_streaming + no_credit + link_busy + link_lost +
-/// not_newer + flash_limit`.
+/// not_newer + flash_limit + light_limit`.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 #[allow(missing_docs)] // Named after `DropReason`.
 pub struct LinkCounters {
@@ -163,6 +167,7 @@ pub struct LinkCounters {
     pub link_lost: u64,
     pub not_newer: u64,
     pub flash_limit: u64,
+    pub light_limit: u64,
     /// Bytes handed to the medium.
     pub bytes_sent: u64,
     /// Of these, bytes of frames.
@@ -192,7 +197,7 @@ pub struct EchoSample {
     pub device_received_at: DeviceTicks,
     /// Answer left, device's clock.
     pub device_sent_at: DeviceTicks,
-    /// Answer arrived, host's clock.
+    /// Answer arrived, host's clock: not when it was read, which may be much later, see [`crate::transport::Transport::receive`].
     pub host_received_at: HostTime,
 }
 
@@ -216,6 +221,21 @@ impl Verb {
             Self::Black => HostMessage::Black,
             Self::Freeze => HostMessage::Freeze,
             Self::Safe => HostMessage::Safe,
+        }
+    }
+
+    /// True for an order to be dark, which goes before everything that waits.
+    pub(super) const fn is_dark(self) -> bool {
+        !matches!(self, Self::Freeze)
+    }
+
+    /// How much an order forbids: one that has not been confirmed is not replaced by one that forbids less.
+    pub(super) const fn strength(self) -> u8 {
+        match self {
+            Self::Freeze => 0,
+            Self::Black => 1,
+            Self::Stop => 2,
+            Self::Safe => 3,
         }
     }
 

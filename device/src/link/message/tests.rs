@@ -41,9 +41,10 @@ fn golden_messages_of_the_host() {
             underrun: Underrun::Blank,
             late_slots: 2,
             epoch: DeviceTicks(0x0102_0304_0506_0708),
+            limits: LightLimits { mean_permille: 300, window_ms: 10_000, full_white_ms: 70_000 },
         }),
         MessageType::Config,
-        "0004 0003 60ea0000 e9030000 50c30000 03 01 02 00 00000000 0807060504030201 07 10 33",
+        "0004 0003 60ea0000 e9030000 50c30000 03 01 02 00 2c01 0000 0807060504030201 10270000 70110100 07 10 33",
     );
     host(HostMessage::Arm(0x11), MessageType::Arm, "11000000");
     host(
@@ -52,9 +53,10 @@ fn golden_messages_of_the_host() {
             kept: 1,
             base_frame: 0x0102,
             frames_sent: 0xffff_ffff,
+            dark_from: DeviceTicks(0x1122_3344_5566_7788),
         }),
         MessageType::FrameCommit,
-        "feffff00 01000000 02010000 ffffffff",
+        "feffff00 01000000 02010000 ffffffff 8877665544332211",
     );
     host(HostMessage::Sync(258), MessageType::Sync, "02010000");
     host(
@@ -146,7 +148,7 @@ fn golden_messages_of_the_device() {
 
 #[test]
 fn wrong_fields_are_named() {
-    let good = hex("0004 0003 60ea0000 e9030000 50c30000 03 01 02 00 00000000 0807060504030201 07 10 33");
+    let good = hex("0004 0003 60ea0000 e9030000 50c30000 03 01 02 00 2c01 0000 0807060504030201 10270000 70110100 07 10 33");
     let broken = |at: usize, value: u8| {
         let mut p = good.clone();
         p[at] = value;
@@ -155,10 +157,13 @@ fn wrong_fields_are_named() {
     let field = |field| Err(PayloadError::Field { kind: MessageType::Config, field });
     assert_eq!(broken(16, 0), field("planes"));
     assert_eq!(broken(16, 33), field("planes"));
-    assert_eq!(broken(16, 4), Err(PayloadError::Length { kind: MessageType::Config, expected: 36, got: 35 }));
+    assert_eq!(broken(16, 4), Err(PayloadError::Length { kind: MessageType::Config, expected: 44, got: 43 }));
     assert_eq!(broken(17, 2), field("underrun"));
-    assert_eq!(broken(32, 0x08), field("led codes"));
-    assert_eq!(broken(33, 0x07), field("led codes"), "a plane stands twice");
+    assert_eq!(broken(40, 0x08), field("led codes"));
+    assert_eq!(broken(41, 0x07), field("led codes"), "a plane stands twice");
+    // 300 + 0x400 thousandths, a window of less than half a second, full white for less than that.
+    assert_eq!(broken(21, 5), field("limits"));
+    assert_eq!(broken(33, 0), field("limits"));
     let mut zero = good.clone();
     zero[..2].fill(0);
     assert_eq!(HostMessage::parse(MessageType::Config, &zero), field("raster"));

@@ -1,5 +1,6 @@
 //! What the control messages say, as values. docs/PROTOCOL.md section 4 lists the same fields as bytes.
 
+use crate::link::limits::LightLimits;
 use crate::planes::{PlaneSchedule, Raster};
 use crate::time::{DeviceTicks, FrameRate};
 
@@ -23,11 +24,13 @@ pub mod faults {
 
     /// The light flashed more than eyes should bear.
     pub const FLASH_LIMIT: u32 = 1 << 6;
+    /// A limit on the amount of light was reached.
+    pub const LIGHT_LIMIT: u32 = 1 << 7;
 
     /// Names of the faults in `mask`, for messages: `"watchdog, lamp"`; `"none"` when empty.
     #[cfg(feature = "std")]
     pub fn names(mask: u32) -> String {
-        const NAMES: [&str; 7] = [
+        const NAMES: [&str; 8] = [
             "watchdog",
             "over-temperature",
             "lamp",
@@ -35,6 +38,7 @@ pub mod faults {
             "checksum storm",
             "emergency stop",
             "flash limit",
+            "light limit",
         ];
         let mut all: Vec<String> = NAMES
             .iter()
@@ -116,6 +120,8 @@ pub struct Config {
     pub late_slots: u8,
     /// Start of slot 0 on the device's clock.
     pub epoch: DeviceTicks,
+    /// How much light the device must not exceed, whatever is sent.
+    pub limits: LightLimits,
 }
 
 /// FRAME_COMMIT: the end of a frame and how it is composed.
@@ -129,6 +135,17 @@ pub struct Commit {
     pub base_frame: u32,
     /// Frames sent in this session, this one included.
     pub frames_sent: u32,
+    /// From this tick of the device's clock on there is no light of this frame, whatever the host does or fails to do. It lies after
+    /// the frame's target, see [`Commit::ends_after`].
+    pub dark_from: DeviceTicks,
+}
+
+impl Commit {
+    /// True when the frame's light ends after `target_at`, the instant in the header at which it shall begin. A FRAME_COMMIT for which
+    /// this is false has a wrong field: the device ignores it.
+    pub const fn ends_after(&self, target_at: DeviceTicks) -> bool {
+        self.dark_from.0 > target_at.0
+    }
 }
 
 /// State of the device as STATUS reports it.
@@ -259,6 +276,8 @@ pub enum ConfigRefusal {
     Rate = 3,
     /// The payload breaks a rule of the format.
     Format = 4,
+    /// The device does not count light, or not for so long.
+    Limits = 5,
 }
 
 impl ConfigRefusal {
@@ -269,6 +288,7 @@ impl ConfigRefusal {
             2 => Self::Planes,
             3 => Self::Rate,
             4 => Self::Format,
+            5 => Self::Limits,
             _ => return None,
         })
     }

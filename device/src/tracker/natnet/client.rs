@@ -5,7 +5,7 @@
 use super::clock::ServerClock;
 use super::frame::{decode_frame, FrameInfo, RigidBody};
 use super::messages as msg;
-use super::models::{decode_models, BodyModel};
+use super::models::{decode_models_that_fit, BodyModel};
 use super::wire::{id, split, Version, MAX_DATAGRAM};
 use crate::clock_map::ClockMap;
 use crate::pose::Pose;
@@ -26,13 +26,20 @@ const MODELS_EVERY_NS: i64 = 1_000 * MS;
 const SILENCE_NS: i64 = 2_000 * MS;
 /// A server that answers but sent no frame for this long is connected to anew as well.
 const STARVED_NS: i64 = 1_000 * MS;
+/// A port that frames come from is held until it has been silent for this long; only then may another port take its place.
+const HOLD_PORT_NS: i64 = STARVED_NS;
+/// A port that is neither the command port nor a data port may send frames once these two have been silent for this long.
+const LEARN_PORT_AFTER_NS: i64 = 300 * MS;
+/// Distinct refused ports remembered for the report.
+const MAX_STRANGE_PORTS: usize = 8;
 /// Distinct unknown body numbers remembered for the report.
 const MAX_STRANGERS: usize = 16;
 
 /// How to reach a NatNet server.
 #[derive(Clone, Debug)]
 pub struct NatNetConfig {
-    /// Address of the server; datagrams from elsewhere are dropped.
+    /// Address of the server; datagrams from elsewhere are dropped, and so are those from other ports of this address than the
+    /// server sends from (`docs/TRACKERS.md` has the rule).
     pub server: Ipv4Addr,
     /// Address of the interface to use; unspecified lets the system choose.
     pub local: Ipv4Addr,
@@ -96,7 +103,19 @@ pub struct NatNetClient {
     data_problem: Option<String>,
     gate: SampleGate,
     server: Option<msg::ServerInfo>,
+    /// Version that the server announced last.
+    announced: Option<Version>,
+    /// Version that frames are read as. It has the layout of the frames, whatever was announced.
     version: Version,
+    /// Whether the frame read last had section sizes.
+    sized_frames: Option<bool>,
+    /// The server was asked anew what it speaks, because its frames contradict what it announced.
+    is_contradiction_asked: bool,
+    /// Port other than the command port and the data ports that the server sends frames from, and the last frame from it.
+    learned_port: Option<(u16, HostTime)>,
+    /// Last frame from the command port or a data port; before the first one, the instant of opening.
+    trusted_frame_at: HostTime,
+    strange_ports: Vec<u16>,
     models: Vec<BodyModel>,
     /// Streaming number to body, sorted by number.
     lookup: Vec<(i32, BodyIndex)>,
@@ -181,7 +200,13 @@ impl NatNetClient {
             data,
             data_problem,
             server: None,
+            announced: None,
             version: Version::V3_0,
+            sized_frames: None,
+            is_contradiction_asked: false,
+            learned_port: None,
+            trusted_frame_at: now,
+            strange_ports: Vec::with_capacity(MAX_STRANGE_PORTS),
             models: Vec::new(),
             lookup,
             strangers: Vec::with_capacity(MAX_STRANGERS),
@@ -216,6 +241,12 @@ impl NatNetClient {
         self.version
     }
 
+    /// The version that the server announces, where its frames have the layout of another one.
+    pub fn contradicted(&self) -> Option<Version> {
+        let (announced, sized) = (self.announced?, self.sized_frames?);
+        (announced.has_section_sizes() != sized).then_some(announced)
+    }
+
     /// Rigid bodies by the server's names.
     pub fn models(&self) -> &[BodyModel] {
         &self.models
@@ -235,7 +266,7 @@ impl NatNetClient {
     pub fn silence(&self) -> Option<Silence> {
         let c = self.gate.counters();
         let quiet = self.heard_at.is_some_and(|h| self.clock.now().ns_since(h) > SILENCE_NS);
-        if let (None, Some(version)) = (&self.server, self.refused) {
+        if let (None, Some(version), 0) = (&self.server, self.refused, c.samples.used) {
             return Some(Silence::Version(version));
         }
         if self.server.is_none() && self.connects_sent > 0 && self.frames == 0 {
@@ -307,6 +338,14 @@ impl NatNetClient {
 
     fn forget_server(&mut self, now: HostTime) {
         self.server = None;
+        (self.announced, self.sized_frames, self.is_contradiction_asked) = (None, None, false);
+        self.learned_port = None;
+        if std::mem::take(&mut self.is_filtered) {
+            // The next server may send from other ports.
+            for port in std::iter::once(&self.command).chain(&self.data) {
+                let _ = port.keep_all();
+            }
+        }
         self.server_clock.forget();
         self.asked = None;
         self.due = Due { connect: now, keep_alive: now, models: now };
@@ -339,12 +378,28 @@ impl NatNetClient {
             packets.foreign_source += 1;
             return 0;
         }
+        let port = arrival.from.port();
+        let is_frame = self.buffer[..arrival.len].starts_with(&id::FRAME.to_le_bytes());
+        if !self.may_send(port, is_frame, at) {
+            self.gate.packets_mut().foreign_port += 1;
+            if self.strange_ports.len() < MAX_STRANGE_PORTS && !self.strange_ports.contains(&port) {
+                self.strange_ports.push(port);
+            }
+            return 0;
+        }
         self.heard_at = Some(at);
         // The buffer is lent out while the datagram in it is read.
         let buffer = std::mem::take(&mut self.buffer);
         let result =
             if arrival.cut { Verdict::Malformed } else { self.handle(&buffer[..arrival.len], at, sink) };
         self.buffer = buffer;
+        if let (true, Verdict::Used(_)) = (is_frame, &result) {
+            if self.is_trusted(port) {
+                (self.trusted_frame_at, self.learned_port) = (at, None);
+            } else {
+                self.learned_port = Some((port, at));
+            }
+        }
         let packets = self.gate.packets_mut();
         match result {
             Verdict::Used(samples) => {
@@ -357,6 +412,26 @@ impl NatNetClient {
         0
     }
 
+    /// True for the ports that the configuration and the server name: commands, and frames.
+    fn is_trusted(&self, port: u16) -> bool {
+        let announced = self.server.as_ref().map_or(0, |s| s.data_port);
+        port != 0 && [self.config.command_port, self.config.data_port, announced].contains(&port)
+    }
+
+    /// Whether a datagram from `port` of the server's address counts as the server's. Answers come from the command port alone. Frames
+    /// come from the command port or a data port; from one other port, learned from its first frame and held until it falls silent,
+    /// only while those send none.
+    fn may_send(&self, port: u16, is_frame: bool, at: HostTime) -> bool {
+        if port == self.config.command_port || is_frame && self.is_trusted(port) {
+            return true;
+        }
+        is_frame
+            && at.ns_since(self.trusted_frame_at) > LEARN_PORT_AFTER_NS
+            && self
+                .learned_port
+                .is_none_or(|(learned, last)| learned == port || at.ns_since(last) > HOLD_PORT_NS)
+    }
+
     fn handle(&mut self, datagram: &[u8], at: HostTime, sink: &mut dyn FnMut(&TrackerSample)) -> Verdict {
         let Ok((message, payload)) = split(datagram) else {
             return Verdict::Malformed;
@@ -364,8 +439,10 @@ impl NatNetClient {
         match message {
             id::FRAME => self.on_frame(payload, at, sink),
             id::SERVER_INFO => self.on_server_info(payload, at),
-            id::MODEL_DEF => match decode_models(payload, self.version) {
-                Ok(models) => {
+            // Which version the names are laid out in is a question of its own: a server that announces one version and sends frames
+            // of another may use either for them.
+            id::MODEL_DEF => match decode_models_that_fit(payload, self.version) {
+                Ok((models, _)) => {
                     self.models = models;
                     self.rebuild_lookup();
                     Verdict::Used(0)
@@ -392,10 +469,19 @@ impl NatNetClient {
             }
             Err(_) => return Verdict::Malformed,
         };
-        if self.server.as_ref().is_some_and(|s| s.version() != info.version()) {
+        let said = info.version();
+        let is_news = self.announced != Some(said);
+        if self.server.is_some() && is_news {
             self.version_changes += 1;
         }
-        self.version = info.version();
+        self.announced = Some(said);
+        // Frames are the better witness of their own layout: a server that says again what its frames contradict is not believed.
+        if is_news || self.sized_frames.is_none_or(|sized| sized == said.has_section_sizes()) {
+            self.version = said;
+        }
+        if is_news {
+            self.is_contradiction_asked = false;
+        }
         self.server_clock.set_rate(info.clock_hz, at);
         if let (Some(wanted), None) = (self.config.bitstream, self.config.multicast) {
             if wanted != info.version() && info.version() >= Version::V4_0 {
@@ -431,13 +517,19 @@ impl NatNetClient {
         let mut info = decode_frame(payload, self.version, &mut bodies);
         if info.is_err() {
             // Frames have two layouts, with and without section sizes. If the other one fits, the stream was switched under us.
-            let other = if self.version.has_section_sizes() { Version::V4_0 } else { Version::V4_1 };
+            let other = self.other_layout();
             info = decode_frame(payload, other, &mut bodies);
             if info.is_ok() {
                 self.version = other;
                 self.version_changes += u64::from(self.server.is_some());
-                self.connect(at);
+                // Ask once what the server speaks now. If it announces again what the frames contradict, the frames are followed.
+                if !std::mem::replace(&mut self.is_contradiction_asked, true) || at >= self.due.connect {
+                    self.connect(at);
+                }
             }
+        }
+        if info.is_ok() {
+            self.sized_frames = Some(self.version.has_section_sizes());
         }
         let verdict = match info {
             Ok(info) => {
@@ -450,6 +542,13 @@ impl NatNetClient {
         };
         self.frame = bodies;
         verdict
+    }
+
+    /// A version whose frames have the layout that the present one does not have: the announced one, where it does.
+    fn other_layout(&self) -> Version {
+        let sized = !self.version.has_section_sizes();
+        let plain = if sized { Version::V4_1 } else { Version::V4_0 };
+        self.announced.filter(|v| v.has_section_sizes() == sized).unwrap_or(plain)
     }
 
     /// What a frame says besides poses.
@@ -511,7 +610,8 @@ enum Verdict {
 impl Tracker for NatNetClient {
     fn poll(&mut self, now: HostTime, sink: &mut dyn FnMut(&TrackerSample)) -> Result<usize, TrackerError> {
         self.housekeeping(now);
-        let foreign_before = self.gate.counters().packets.foreign_source;
+        let foreign = |c: &TrackerCounters| (c.packets.foreign_source, c.packets.foreign_port);
+        let before = foreign(self.gate.counters());
         let (mut delivered, mut budget, mut offset) = (0, Self::MAX_DATAGRAMS_PER_POLL, None);
         let mut is_crowded = false;
         // Commands first: names and clock before the frames that need them. They are few; frames get the rest of the budget.
@@ -551,12 +651,19 @@ impl Tracker for NatNetClient {
                 }
             }
         }
-        let foreign = self.gate.counters().packets.foreign_source - foreign_before;
-        if is_crowded && foreign > 0 && !self.is_filtered {
+        if is_crowded && before != foreign(self.gate.counters()) && !self.is_filtered {
             // Strangers fill the queue: let the kernel throw them away from now on, uncounted.
             self.is_filtered = true;
+            let announced = self.server.as_ref().map_or(0, |s| s.data_port);
+            let learned = self.learned_port.map_or(0, |(port, _)| port);
+            let mut ports = [self.config.command_port, self.config.data_port, announced, learned];
+            if before.1 == self.gate.counters().packets.foreign_port {
+                // All of them have other addresses; the port from which this server sends frames may still have to be learned.
+                ports = [0; 4];
+            }
+            let count = ports.iter().take_while(|p| **p != 0).count();
             for port in std::iter::once(&self.command).chain(&self.data) {
-                let _ = port.keep_only(self.config.server);
+                let _ = port.keep_only(self.config.server, &ports[..count]);
             }
         }
         Ok(delivered)
@@ -569,12 +676,17 @@ impl Tracker for NatNetClient {
     fn status(&self) -> String {
         super::report::status(self)
     }
+
+    fn warning(&self) -> Option<String> {
+        super::report::warning(self)
+    }
 }
 
 /// What [`super::report`] needs to know and nobody else.
 pub(super) struct Inside<'a> {
     pub config: &'a NatNetConfig,
     pub strangers: &'a [i32],
+    pub strange_ports: &'a [u16],
     pub connects_sent: u64,
     pub version_changes: u64,
     pub clock_doubts: u64,
@@ -588,6 +700,7 @@ impl NatNetClient {
         Inside {
             config: &self.config,
             strangers: &self.strangers,
+            strange_ports: &self.strange_ports,
             connects_sent: self.connects_sent,
             version_changes: self.version_changes,
             clock_doubts: self.server_clock.doubts(),

@@ -28,11 +28,39 @@ mod kind {
 /// The rigid bodies that a model-definition payload of `version` names, in its order. Later ones with a number that was already
 /// named are kept too: the caller decides about ambiguity.
 pub fn decode_models(payload: &[u8], version: Version) -> Result<Vec<BodyModel>, WireError> {
+    read_models(payload, version).map(|(models, _)| models)
+}
+
+/// The rigid bodies of a model-definition payload, read in the layout that its bytes fit without a rest, and a version that has this
+/// layout. A server may announce one version and send another, so `first`, the version that is tried first, is only a guess. If no
+/// layout fits without a rest, the payload is read as `first`.
+///
+/// # Errors
+/// Those of [`decode_models`] for `first`.
+pub fn decode_models_that_fit(
+    payload: &[u8],
+    first: Version,
+) -> Result<(Vec<BodyModel>, Version), WireError> {
+    let as_first = read_models(payload, first);
+    if let Ok((models, true)) = as_first {
+        return Ok((models, first));
+    }
+    for version in [Version::V4_2, Version::V4_1, Version::V4_0, Version::V3_0] {
+        if let Ok((models, true)) = read_models(payload, version) {
+            return Ok((models, version));
+        }
+    }
+    as_first.map(|(models, _)| (models, first))
+}
+
+/// The rigid bodies, and whether every byte of the payload and of each body's definition was read.
+fn read_models(payload: &[u8], version: Version) -> Result<(Vec<BodyModel>, bool), WireError> {
     if !version.is_spoken() {
         return Err(WireError::Version(version));
     }
     let mut r = Reader::new(payload);
     let mut models = Vec::new();
+    let mut fits = true;
     // The smallest definition is its kind and an empty name.
     let n = r.count("definitions", 5)?;
     for _ in 0..n {
@@ -42,6 +70,7 @@ pub fn decode_models(payload: &[u8], version: Version) -> Result<Vec<BodyModel>,
             let mut one = Reader::new(r.take(size, "definition")?);
             if kind == kind::RIGID_BODY {
                 keep(&mut models, rigid_body(&mut one, version)?);
+                fits &= one.left() == 0;
             }
             continue;
         }
@@ -81,7 +110,7 @@ pub fn decode_models(payload: &[u8], version: Version) -> Result<Vec<BodyModel>,
             _ => break,
         }
     }
-    Ok(models)
+    Ok((models, fits && r.left() == 0))
 }
 
 fn keep(models: &mut Vec<BodyModel>, model: BodyModel) {

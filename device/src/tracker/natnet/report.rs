@@ -8,7 +8,14 @@ use std::net::Ipv4Addr;
 pub(super) fn status(client: &NatNetClient) -> String {
     let inside = client.inside();
     let mut text = match client.server() {
-        Some(s) => format!("{} speaks NatNet {}", quoted(&s.name), client.version()),
+        Some(s) => match client.contradicted() {
+            None => format!("{} speaks NatNet {}", quoted(&s.name), client.version()),
+            Some(announced) => format!(
+                "{} announces NatNet {announced} and sends frames in the layout of {}, which is followed",
+                quoted(&s.name),
+                if client.version().has_section_sizes() { "4.1 and later" } else { "3.0 to 4.0" }
+            ),
+        },
         None => "no server".into(),
     };
     if let Some(reason) = client.silence() {
@@ -38,10 +45,41 @@ pub(super) fn status(client: &NatNetClient) -> String {
             let _ = write!(text, ", {name} {count}");
         }
     }
+    if let Some(refused) = refused_ports(client) {
+        let _ = write!(text, "; WARNING: {refused}");
+    }
     if inside.is_filtered {
         text.push_str("; strangers flooded the port and are dropped by the kernel, uncounted");
     }
     text
+}
+
+fn refused_ports(client: &NatNetClient) -> Option<String> {
+    let (refused, inside) = (client.counters().packets.foreign_port, client.inside());
+    (refused > 0).then(|| {
+        format!(
+            "{refused} packets came from {} but from ports {:?}, which are not the server's, and were refused: another program there \
+             sends tracker data, or tracker.command_port and tracker.data_port are not those of the server",
+            inside.config.server, inside.strange_ports
+        )
+    })
+}
+
+/// What is behind [`crate::tracker::Tracker::warning`].
+pub(super) fn warning(client: &NatNetClient) -> Option<String> {
+    let mut all: Vec<String> = refused_ports(client).into_iter().collect();
+    let elsewhere = client.counters().packets.foreign_source;
+    if elsewhere > 0 {
+        let server = client.inside().config.server;
+        all.push(format!("{elsewhere} packets came from other addresses than {server} and were refused"));
+    }
+    if let Some(announced) = client.contradicted() {
+        all.push(format!(
+            "the server announces NatNet {announced}, and its frames have another layout, which is followed: update the tracking \
+             software, or choose its bit stream anew"
+        ));
+    }
+    (!all.is_empty()).then(|| format!("natnet tracker: {}", all.join("; ")))
 }
 
 fn explain(text: &mut String, client: &NatNetClient, reason: &Silence) {
@@ -62,7 +100,12 @@ fn explain(text: &mut String, client: &NatNetClient, reason: &Silence) {
         }
         Silence::NoFrames => explain_no_frames(text, client),
         Silence::Unreadable => {
-            write!(text, "no frame can be read: does something else than NatNet send to port {}?", config.data_port)
+            write!(
+                text,
+                "no frame can be read: they have the layout neither of NatNet 3.0 to 4.0 nor of 4.1 to 4.2, whatever the server announces; \
+                 choose a bit stream from 3.0 to 4.2 in the tracking software, and see whether something else sends to port {}",
+                config.data_port
+            )
         }
         Silence::NoKnownBody => {
             let names: Vec<String> =

@@ -20,6 +20,11 @@ const MAX_BYTES_PER_POLL: usize = 8192;
 const QUICK_ECHOES: u32 = 20;
 const QUICK_ECHO_EVERY_NS: i64 = 10 * MS;
 const ECHO_EVERY_NS: i64 = 200 * MS;
+/// Samples are handed out once an echo came back within this time. What had waited in the port when it was opened (the kernel keeps
+/// more than can be thrown away) lies before the answer to the first echo, and delays it.
+const SETTLED_ROUND_TRIP_NS: i64 = 50 * MS;
+/// A device that answers no echo is believed this long after the port was opened, as soon as the port is empty.
+const SETTLED_AFTER_NS: i64 = 300 * MS;
 
 /// Which port, how fast, which bodies.
 #[derive(Clone, Debug)]
@@ -53,6 +58,9 @@ pub struct SerialTracker {
     echo_due: HostTime,
     echoes: u32,
     opened: u64,
+    opened_at: HostTime,
+    /// No sample that waited in the port can come any more.
+    is_settled: bool,
     problem: Option<String>,
 }
 
@@ -76,6 +84,8 @@ impl SerialTracker {
             echo_due: HostTime(i64::MIN),
             echoes: 0,
             opened: 0,
+            opened_at: HostTime(i64::MIN),
+            is_settled: false,
             problem: None,
         })
     }
@@ -115,6 +125,7 @@ impl SerialTracker {
         (self.map, self.ticks_per_second) = (None, 0);
         (self.echo_sent, self.echo_due, self.echoes) = (None, now, 0);
         self.opened += 1;
+        (self.opened_at, self.is_settled) = (now, false);
         self.problem = None;
         self.state = State::Open(port);
     }
@@ -156,7 +167,9 @@ impl SerialTracker {
         packets.received += u64::from(broken);
         packets.malformed += u64::from(broken);
         self.deframer = deframer;
+        let is_empty = n < buffer.len();
         self.buffer = buffer;
+        self.is_settled |= is_empty && at.ns_since(self.opened_at) >= SETTLED_AFTER_NS;
         self.echo(at);
         delivered
     }
@@ -189,6 +202,10 @@ impl SerialTracker {
                 let delivered = match self.config.bodies.iter().enumerate().position(place) {
                     None => {
                         self.gate.count_unknown();
+                        0
+                    }
+                    Some(_) if !self.is_settled => {
+                        self.gate.count_unknown_age();
                         0
                     }
                     Some(i) => {
@@ -240,6 +257,7 @@ impl SerialTracker {
         // Only the answer to the question just asked; anything else is not evidence.
         let Some(t1) = self.echo_sent.filter(|t| t.0 as u64 == token) else { return Err(false) };
         self.echo_sent = None;
+        self.is_settled |= at.ns_since(t1) <= SETTLED_ROUND_TRIP_NS;
         if let Some(map) = &mut self.map {
             let ticks = DeviceTicks(ticks);
             let outcome = map.add_exchange(t1, ticks, ticks, at);

@@ -9,8 +9,7 @@ use crate::transport::TransportError;
 use crate::usb_help::node_of;
 
 /// The rule that lets the user at the machine open the reference device; `packaging/60-dpm.rules` has it with others.
-pub const UDEV_RULE: &str =
-    r#"SUBSYSTEM=="usb", ATTR{idVendor}=="1209", ATTR{idProduct}=="000d", MODE="0660", TAG+="uaccess""#;
+pub const UDEV_RULE: &str = r#"SUBSYSTEM=="usb", ATTR{idVendor}=="1209", ATTR{idProduct}=="000d", GROUP="dpm", MODE="0660", TAG+="uaccess""#;
 
 /// Right after hot-plug a device may not be ready to be claimed; it is for this long that claiming is tried.
 const CLAIM_PATIENCE: Duration = Duration::from_millis(200);

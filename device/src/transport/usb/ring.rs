@@ -3,20 +3,22 @@
 //!
 //! **Who owns what.** A [`Ring`] owns its transfers, their buffers and their completion flags, and keeps the device handle alive. From
 //! `libusb_submit_transfer` until the flag is raised, transfer and buffer belong to libusb and the kernel, and nothing here touches them; the
-//! flag is raised by the callback, which libusb runs exactly once per submitted transfer, inside [`pump`]. After that they belong to
-//! the ring again. A ring that is dropped takes its transfers back first; if the kernel does not return one in time, its memory is
+//! flag is raised by the callback, which libusb runs exactly once per submitted transfer, on the thread that handles events ([`pump`], or
+//! the thread of `events`). After that they belong to the ring again. A ring that is dropped takes its transfers back first; if the kernel does not return one in time, its memory is
 //! leaked rather than freed under the kernel's hands.
 #![allow(unsafe_code)]
 
 use std::collections::VecDeque;
 use std::ffi::c_void;
-use std::sync::atomic::{AtomicBool, Ordering};
-use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, AtomicI64, Ordering};
+use std::sync::{Arc, OnceLock};
 use std::time::{Duration, Instant};
 
 use rusb::constants as c;
 use rusb::ffi;
 use rusb::{Context, DeviceHandle, UsbContext};
+
+use crate::time::{HostClock, HostTime};
 
 /// Longest wait for the kernel to return cancelled transfers when a ring is dropped.
 const TAKE_BACK: Duration = Duration::from_secs(2);
@@ -45,13 +47,28 @@ pub(super) struct Ended {
     pub status: Status,
     /// Bytes moved, on every status.
     pub actual: usize,
+    /// When it ended; `None` without a clock.
+    pub at: Option<HostTime>,
 }
+
+/// The clock that the transport was given, once it was.
+pub(super) type SharedClock = Arc<OnceLock<Arc<dyn HostClock>>>;
+
+/// What the callback says about a transfer.
+struct Mark {
+    ended: AtomicBool,
+    /// When; [`NO_TIME`] without a clock. Written before the flag is raised.
+    at: AtomicI64,
+    clock: SharedClock,
+}
+
+const NO_TIME: i64 = i64::MIN;
 
 struct Slot {
     transfer: *mut ffi::libusb_transfer,
     buffer: Box<[u8]>,
-    /// Raised by the callback. Boxed: its address must not move while a transfer is under way.
-    ended: Box<AtomicBool>,
+    /// Written by the callback. Boxed: its address must not move while a transfer is under way.
+    mark: Box<Mark>,
     in_flight: bool,
 }
 
@@ -65,16 +82,17 @@ pub(super) struct Ring {
 }
 
 // SAFETY: the raw pointers are owned by the ring and used only through `&mut self`; libusb allows its functions to be called from any
-// thread, and the callback touches nothing but an atomic flag.
+// thread, and the callback touches nothing but a `Mark`, whose parts may be shared between threads.
 unsafe impl Send for Ring {}
 
 extern "system" fn on_ended(transfer: *mut ffi::libusb_transfer) {
-    // SAFETY: libusb passes the transfer that was submitted; its `user_data` points to the flag of its slot, which lives until
+    // SAFETY: libusb passes the transfer that was submitted; its `user_data` points to the mark of its slot, which lives until
     // the slot is dropped, and a slot is dropped only after this call or is leaked.
-    unsafe {
-        let flag = (*transfer).user_data as *const AtomicBool;
-        (*flag).store(true, Ordering::Release);
+    let mark = unsafe { &*((*transfer).user_data as *const Mark) };
+    if let Some(clock) = mark.clock.get() {
+        mark.at.store(clock.now().0, Ordering::Relaxed);
     }
+    mark.ended.store(true, Ordering::Release);
 }
 
 /// Lets libusb deliver what has completed. Does not wait.
@@ -112,6 +130,7 @@ impl Ring {
         endpoint: u8,
         count: usize,
         bytes: usize,
+        clock: &SharedClock,
     ) -> Result<Self, rusb::Error> {
         let mut ring = Self {
             handle,
@@ -128,11 +147,20 @@ impl Ring {
             ring.slots.push(Slot {
                 transfer,
                 buffer: vec![0; bytes].into_boxed_slice(),
-                ended: Box::new(AtomicBool::new(false)),
+                mark: Box::new(Mark {
+                    ended: AtomicBool::new(false),
+                    at: AtomicI64::new(NO_TIME),
+                    clock: clock.clone(),
+                }),
                 in_flight: false,
             });
         }
         Ok(ring)
+    }
+
+    /// Slots that are not in flight.
+    pub fn idle_slots(&self) -> usize {
+        self.slots.len() - self.order.len()
     }
 
     /// A slot that is not in flight.
@@ -156,8 +184,9 @@ impl Ring {
     pub fn submit(&mut self, slot: usize, len: usize) -> Result<(), rusb::Error> {
         let s = &mut self.slots[slot];
         assert!(!s.in_flight && len <= s.buffer.len(), "slot {slot}: in flight, or {len} bytes too many");
-        s.ended.store(false, Ordering::Relaxed);
-        // SAFETY: transfer and buffer belong to this ring (not in flight); the buffer holds `len` bytes; both and the flag stay where
+        s.mark.at.store(NO_TIME, Ordering::Relaxed);
+        s.mark.ended.store(false, Ordering::Relaxed);
+        // SAFETY: transfer and buffer belong to this ring (not in flight); the buffer holds `len` bytes; both and the mark stay where
         // they are until the callback has run, see the module's documentation. A timeout of 0 means none.
         let rc = unsafe {
             ffi::libusb_fill_bulk_transfer(
@@ -167,7 +196,7 @@ impl Ring {
                 s.buffer.as_mut_ptr(),
                 len as i32,
                 on_ended,
-                std::ptr::from_ref::<AtomicBool>(&s.ended) as *mut c_void,
+                std::ptr::from_ref::<Mark>(&s.mark) as *mut c_void,
                 0,
             );
             ffi::libusb_submit_transfer(s.transfer)
@@ -182,7 +211,7 @@ impl Ring {
     pub fn take_ended(&mut self) -> Option<Ended> {
         let slot = *self.order.front()?;
         let s = &mut self.slots[slot];
-        if !s.ended.load(Ordering::Acquire) {
+        if !s.mark.ended.load(Ordering::Acquire) {
             return None;
         }
         self.order.pop_front();
@@ -197,15 +226,19 @@ impl Ring {
             c::LIBUSB_TRANSFER_OVERFLOW => Status::Overflow,
             _ => Status::Error,
         };
+        let at = match s.mark.at.load(Ordering::Relaxed) {
+            NO_TIME => None,
+            ns => Some(HostTime(ns)),
+        };
         // Cut at the buffer, whatever a device or a driver claims.
-        Some(Ended { slot, status, actual: (actual.max(0) as usize).min(s.buffer.len()) })
+        Some(Ended { slot, status, actual: (actual.max(0) as usize).min(s.buffer.len()), at })
     }
 
     /// Asks for every transfer in flight back. They end later, through [`Ring::take_ended`].
     pub fn cancel_all(&mut self) {
         for &slot in &self.order {
             let s = &self.slots[slot];
-            if !s.ended.load(Ordering::Acquire) {
+            if !s.mark.ended.load(Ordering::Acquire) {
                 // SAFETY: the transfer was submitted and its callback has not been seen to run; libusb answers NOT_FOUND when it ends
                 // in the meantime, which is as good.
                 unsafe { ffi::libusb_cancel_transfer(s.transfer) };
@@ -233,7 +266,7 @@ impl Drop for Ring {
         for mut s in self.slots.drain(..) {
             if s.in_flight {
                 std::mem::forget(std::mem::take(&mut s.buffer));
-                std::mem::forget(std::mem::replace(&mut s.ended, Box::new(AtomicBool::new(true))));
+                std::mem::forget(s.mark);
             } else {
                 // SAFETY: allocated by `libusb_alloc_transfer`, not in flight, freed once.
                 unsafe { ffi::libusb_free_transfer(s.transfer) };

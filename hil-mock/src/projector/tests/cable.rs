@@ -42,7 +42,11 @@ impl Transport for BadCable {
         Ok(())
     }
 
-    fn receive(&mut self, now: HostTime, sink: &mut dyn FnMut(Lane, &[u8])) -> Result<(), TransportError> {
+    fn receive(
+        &mut self,
+        now: HostTime,
+        sink: &mut dyn FnMut(Lane, HostTime, &[u8]),
+    ) -> Result<(), TransportError> {
         // The way back is as bad.
         self.inner.device_mut().advance_to(now);
         let (draws, per_mille) = (self.draws.stream(1), self.per_mille);
@@ -50,7 +54,7 @@ impl Transport for BadCable {
         self.inner.device_mut().replies(now, &mut |lane, bytes| {
             n += 1;
             if draws.bits(n) % 1000 >= per_mille {
-                sink(lane, bytes);
+                sink(lane, now, bytes);
             }
         });
         Ok(())

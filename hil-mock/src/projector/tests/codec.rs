@@ -1,11 +1,12 @@
 //! Compacted planes light the same frames as raw ones, and save what they should.
 
 use super::*;
+use dpm_device::link::COMMIT_BYTES;
 
 #[test]
 fn every_codec_saves_and_lights_the_same_frame() {
     let r = Raster::new(64, 16).unwrap();
-    let raw_frame = (24 * (32 + r.plane_bytes() + 4) + 32 + 16 + 4) as u64;
+    let raw_frame = (24 * (32 + r.plane_bytes() + 4) + 32 + COMMIT_BYTES + 4) as u64;
     for codecs in [0, Codec::Rle.mask(), Codec::XorRle.mask(), Codec::Lz4.mask(), Codec::ALL] {
         let mut rig = clean(LinkSettings { raster: r, codecs, ..settings() }, MockConfig::new(r));
         rig.stream();
@@ -41,9 +42,9 @@ fn every_codec_saves_and_lights_the_same_frame() {
             rig.step_with(40, &planes);
             let at = rig.link.counters().bytes_sent;
             rig.poll().unwrap();
-            let target = rig.link.slots().unwrap().start(rig.slot + 3);
-            rig.link.send_frame(rig.now, 41, target, &planes, &mut rig.cable);
-            assert_eq!(rig.link.counters().bytes_sent - at, 32 + 16 + 4);
+            let (target, dark_from) = rig.times(rig.slot + 3);
+            rig.link.send_frame(rig.now, 41, target, dark_from, &planes, &mut rig.cable);
+            assert_eq!(rig.link.counters().bytes_sent - at, (32 + COMMIT_BYTES + 4) as u64);
             rig.idle(4);
             assert_eq!(rig.cable.device().lit_frame(), Some(41));
             assert_eq!(rig.cable.device().lit_planes().unwrap(), planes);

@@ -151,7 +151,7 @@ pub fn snapshot(
     let mut slot = renderer.create_slot(true).map_err(gpu_failure)?;
     let wanted: Vec<_> =
         SnapshotImage::ALL.into_iter().filter(|i| what.is_empty() || what.contains(i)).collect();
-    let window = (config.output.light_window_ms * 1e-3 * rig.rate().hz()).round().max(1.0) as usize;
+    let window = (config.light_window_ms() * 1e-3 * rig.rate().hz()).round().max(1.0) as usize;
     let window = if wanted.contains(&SnapshotImage::Viewer) { window } else { 0 };
     let mut light = VecDeque::new();
     let (mut poses, mut errors) = (Vec::new(), Vec::new());
@@ -222,12 +222,17 @@ fn viewer(
     // Only surfaces are asked of it, so the simplest method will do.
     let settings = RendererSettings { method: Method::full(1), ..renderer_settings(rig) };
     let mut renderer = Renderer::new(gpu, &rig.scene, settings).map_err(gpu_failure)?;
-    let made = pictures(rig, &mut renderer, light).map_err(gpu_failure)?;
-    let Some(made) = made else {
-        return Ok(Err("only a mock tracker knows the true motion, which an eye follows".into()));
-    };
-    let white = made.viewer.iter().fold(0.0f32, |m, v| m.max(v.max_element())).max(1e-9);
-    Ok(Ok(srgb_canvas(rig.camera.raster, &made.viewer, (1.0 / white).min(1.0))))
+    let made = pictures(rig, &mut renderer, light, &[]).map_err(gpu_failure)?;
+    Ok(match made.viewer {
+        Ok(viewer) => {
+            let white = viewer.iter().fold(0.0f32, |m, v| m.max(v.max_element())).max(1e-9);
+            Ok(srgb_canvas(rig.camera.raster, &viewer, (1.0 / white).min(1.0)))
+        }
+        Err(_) => {
+            Err("only a mock tracker knows the true motion, which an eye follows; --simulate puts one in"
+                .into())
+        }
+    })
 }
 
 fn save_png(path: &Path, canvas: &Canvas) -> Result<PathBuf, Failure> {

@@ -1,7 +1,7 @@
 //! A Vulkan device into the stability cases that need one: the shaders that run in the rig, on whichever device is here.
 
 use super::{
-    gpu_chain, gpu_disocclusion, gpu_histories_in_motion, gpu_history, gpu_samplers, gpu_tracer,
+    gpu_chain, gpu_disocclusion, gpu_histories_in_motion, gpu_history, gpu_paper, gpu_samplers, gpu_tracer,
     gpu_traversal, Case,
 };
 use crate::gpu::{Gpu, GpuOptions};
@@ -49,6 +49,7 @@ pub fn cases(device: &Device) -> Vec<Case> {
         gpu_tracer::CASES,
         gpu_traversal::CASES,
         gpu_history::CASES,
+        gpu_paper::CASES,
         gpu_disocclusion::CASES,
         gpu_histories_in_motion::CASES,
         gpu_samplers::CASES,

@@ -1,6 +1,7 @@
 //! Histories, shading rates and filters on the GPU: what is constant stays, what changes is followed, what is broken is forgotten.
 
 use super::gpu::GpuCase;
+use super::gpu_paper::{gaze_aside, ALPHAS};
 use super::gpu_shot::Shot;
 use super::gpu_tracer::still_life;
 use super::shapes::*;
@@ -44,8 +45,8 @@ pub const CASES: &[GpuCase] = &[
     ),
     GpuCase(
         "gpu-step-follows-the-paper",
-        "the same step frame by frame, method paper",
-        "closed form: (1 - 0.2)^n",
+        "the same step frame by frame, method paper, 5, 22 and 40 degrees from the gaze",
+        "closed form: (1 - alpha)^n, alpha 0.2, 0.1 and 0.05",
         "radiance by step",
         1e-3,
         step_paper,
@@ -68,7 +69,7 @@ pub const CASES: &[GpuCase] = &[
     ),
     GpuCase(
         "gpu-nobody-waits",
-        "24 frames of method paper at mixed rates with checkerboard",
+        "24 frames of method paper at mixed rates with checkerboard, all drawn, and every second one dropped",
         "every block is traced in every second frame",
         "frames over 2",
         0.0,
@@ -208,7 +209,7 @@ fn constant_input(gpu: &Arc<Gpu>, seed: u64) -> f64 {
 }
 
 /// A floor under a point light that a second body carries: light without noise that a pose changes.
-fn carried_light() -> Scene {
+pub(super) fn carried_light() -> Scene {
     let mut scene = scene_of(floor(20.0, 0.0), diffuse(Vec3::splat(0.8)));
     let carrier = sphere(Vec3::ZERO, 0.01, 1, true);
     add(&mut scene, carrier, diffuse(Vec3::ZERO));
@@ -230,18 +231,18 @@ fn light_at(height: f64) -> Vec<DAffine3> {
 }
 
 /// Radiance of the floor in the middle of the picture (the origin), light at a height.
-fn lit_by(height: f64) -> f64 {
+pub(super) fn lit_by(height: f64) -> f64 {
     let d2 = 16.0 + height * height;
     0.8 / std::f64::consts::PI * 4.0 * height / d2.powf(1.5)
 }
 
 /// The middle pixel, frame by frame: the light comes down from 4 m to 1 m after frame `step`.
-fn stepped(gpu: &Arc<Gpu>, method: Method, seed: u64, step: u32, frames: u32) -> Vec<f64> {
+fn stepped(gpu: &Arc<Gpu>, method: Method, gaze: DVec3, seed: u64, step: u32, frames: u32) -> Vec<f64> {
     let scene = carried_light();
     let camera = camera(17, 17, DVec3::new(0.0, 3.0, 0.01), DVec3::ZERO);
     let shot = Shot {
         eye: Some(BESIDE),
-        gaze: Some(DVec3::ZERO),
+        gaze: Some(gaze),
         spp: 4,
         depth: 2,
         frames,
@@ -267,7 +268,7 @@ fn step_input(gpu: &Arc<Gpu>, seed: u64) -> f64 {
         // A block of the paper's method shows one of its pixels; here the light falls off from pixel to pixel.
         method.rate_map &= method.dpm;
         method.spatial &= method.dpm;
-        let seen = stepped(gpu, method, seed, 120, 120 + 237);
+        let seen = stepped(gpu, method, DVec3::ZERO, seed, 120, 120 + 237);
         let before = (seen[119] / lit_by(4.0) - 1.0).abs();
         let after = (seen[seen.len() - 1] / lit_by(1.0) - 1.0).abs();
         worst = worst.max(255.0 * before).max(255.0 * after);
@@ -282,15 +283,17 @@ fn step_paper(gpu: &Arc<Gpu>, seed: u64) -> f64 {
     let mut method = method_of(&RenderConfig::default(), RenderMethod::Paper);
     // Every pixel in every frame, so that the recursion alone is left.
     (method.checkerboard, method.rate_map, method.spatial) = (false, false, false);
-    let alpha = method.paper.temporal_alpha[0];
-    let seen = stepped(gpu, method, seed, 40, 60);
     let (from, to) = (lit_by(4.0), lit_by(1.0));
-    (1..19)
-        .map(|n| {
+    let mut worst = 0f64;
+    for (alpha, degrees) in ALPHAS {
+        let seen = stepped(gpu, method.clone(), gaze_aside(BESIDE, degrees), seed, 40, 60);
+        for n in 1..19 {
             let wanted = to + (from - to) * (1.0 - alpha).powi(n);
-            ((seen[40 + n as usize] - wanted) / (to - from)).abs()
-        })
-        .fold(0.0, f64::max)
+            let off = ((seen[40 + n as usize] - wanted) / (to - from)).abs();
+            worst = if off.is_nan() { f64::INFINITY } else { worst.max(off) };
+        }
+    }
+    worst
 }
 
 fn poisoned(gpu: &Arc<Gpu>, seed: u64) -> f64 {
@@ -360,6 +363,19 @@ fn drift(
     speed: f64,
     each: impl FnMut(u32, &FrameSlot),
 ) {
+    drift_by(gpu, method, seed, frames, speed, 1, each);
+}
+
+/// The same where the frames' numbers go up by `step`, as they do in a rig that drops the others.
+fn drift_by(
+    gpu: &Arc<Gpu>,
+    method: &Method,
+    seed: u64,
+    frames: u32,
+    speed: f64,
+    step: u32,
+    each: impl FnMut(u32, &FrameSlot),
+) {
     let mut scene = still_life(1.0);
     scene.environment = sky(0.2);
     let camera = camera(64, 48, DVec3::new(0.3, 1.6, 2.4), DVec3::new(0.0, 0.2, 0.0));
@@ -368,6 +384,7 @@ fn drift(
         gaze: Some(DVec3::new(-0.4, 0.1, 0.2)),
         spp: 4,
         frames,
+        step,
         seed: seed as u32,
         method: Some(method.clone()),
         ..Shot::new(&scene, camera)
@@ -416,9 +433,18 @@ fn rate_map(gpu: &Arc<Gpu>, seed: u64) -> f64 {
 }
 
 fn nobody_waits(gpu: &Arc<Gpu>, seed: u64) -> f64 {
+    [1, 2]
+        .map(|step| longest_wait(gpu, seed, step).saturating_sub(2))
+        .into_iter()
+        .max()
+        .map_or(f64::NAN, f64::from)
+}
+
+/// For how many frames on end a lit pixel's block is not traced at most, where the frames' numbers go up by `step`.
+fn longest_wait(gpu: &Arc<Gpu>, seed: u64, step: u32) -> u32 {
     let mut waited = vec![0u32; 64 * 48];
     let mut worst = 0;
-    drift(gpu, &paper(), seed, 24, 0.0, |_, slot| {
+    drift_by(gpu, &paper(), seed, 24, 0.0, step, |_, slot| {
         let (traced, rates) = (slot.traced().unwrap_or(&[]), slot.rates().unwrap_or(&[]));
         for (i, s) in slot.surfaces().unwrap_or(&[]).iter().enumerate() {
             if s.id == NO_HIT || s.distance <= 0.0 {
@@ -433,7 +459,7 @@ fn nobody_waits(gpu: &Arc<Gpu>, seed: u64) -> f64 {
             worst = worst.max(waited[i]);
         }
     });
-    f64::from(worst.saturating_sub(2))
+    worst
 }
 
 fn energy_kept(gpu: &Arc<Gpu>, seed: u64) -> f64 {
@@ -450,7 +476,7 @@ fn energy_kept(gpu: &Arc<Gpu>, seed: u64) -> f64 {
     };
     let wanted = total(&Method::full(4), 160, 0);
     let mut worst: f64 = 0.0;
-    for which in [RenderMethod::Paper, RenderMethod::Miyamoto, RenderMethod::Dpm] {
+    for which in [RenderMethod::Paper, RenderMethod::Miyamoto, RenderMethod::Sequence, RenderMethod::Dpm] {
         let mut method = method_of(&RenderConfig::default(), which);
         method.paper.zone_spp = [8; 3];
         worst = worst.max((total(&method, 112, 64) / wanted - 1.0).abs());

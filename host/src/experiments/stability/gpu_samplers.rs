@@ -18,7 +18,7 @@ use std::sync::Arc;
 pub const CASES: &[GpuCase] = &[
     GpuCase(
         "gpu-noise-falls",
-        "independent samples, blue noise and sequences that go on: 1 and 16 samples a frame, 1 and 64 frames",
+        "independent samples, blue noise and sequences that go on, of surface points and of pixels: 1 and 16 samples a frame, 1 and 64 frames",
         "closed form: by the root of their number, independent samples neither faster nor slower",
         "ratio",
         1.15,
@@ -35,12 +35,13 @@ pub const CASES: &[GpuCase] = &[
 ];
 
 /// Methods that trace every pixel alike, and whether their samples are independent of each other.
-fn samplers() -> [(Method, bool); 3] {
+fn samplers() -> [(Method, bool); 4] {
     let sequences = Method { rate_map: false, ..dpm() };
     [
         (Method::full(1), true),
         (Method { sampler: SamplerKind::BlueNoise, ..Method::full(1) }, false),
         (sequences, false),
+        (Method { sampler: SamplerKind::PixelSequence, ..Method::full(1) }, false),
     ]
 }
 

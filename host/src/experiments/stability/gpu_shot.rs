@@ -34,6 +34,8 @@ pub struct Shot<'a> {
     pub spp: u32,
     /// Frames, each with its own random numbers; the estimates' variances come from them.
     pub frames: u32,
+    /// By how much the numbers of the frames go up: more than 1 where frames are dropped.
+    pub step: u32,
     /// Closest hits per path.
     pub depth: u32,
     /// Seed.
@@ -62,6 +64,7 @@ impl<'a> Shot<'a> {
             lost: Vec::new(),
             spp: 16,
             frames: 1,
+            step: 1,
             depth: 4,
             seed: 1,
             clamp_indirect: None,
@@ -144,7 +147,7 @@ impl<'a> Shot<'a> {
         for frame in frames {
             let poses = poses(frame);
             let inputs = FrameInputs {
-                frame,
+                frame: frame * self.step,
                 spp: self.spp,
                 budget_spp: self.spp as f32,
                 camera: &self.camera,

@@ -13,6 +13,7 @@ pub mod gpu_compare;
 pub mod gpu_disocclusion;
 pub mod gpu_histories_in_motion;
 pub mod gpu_history;
+pub mod gpu_paper;
 pub mod gpu_samplers;
 pub mod gpu_shot;
 pub mod gpu_tracer;

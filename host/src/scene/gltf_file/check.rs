@@ -5,10 +5,12 @@
 use super::super::{Limits, SceneError};
 use super::accessor::{Component, Data};
 use super::check_look::check_look;
+use super::instancing::{self, read_instances, Instances};
 use super::json::{shorten, Item};
 
 /// Extensions this program understands, or may ignore without showing something wrong.
-const UNDERSTOOD: [&str; 11] = [
+const UNDERSTOOD: [&str; 12] = [
+    instancing::NAME,
     "KHR_lights_punctual",
     "KHR_materials_emissive_strength",
     "KHR_materials_ior",
@@ -40,8 +42,16 @@ pub struct Counts {
     pub lights: usize,
 }
 
-/// Checks the whole document but its buffers; returns what is accepted but not reproduced.
-pub fn check(root: &Item, data: &Data, limits: &Limits) -> Result<Vec<String>, SceneError> {
+/// What is known of a document that passed.
+pub struct Checked {
+    /// What is accepted but not reproduced.
+    pub warnings: Vec<String>,
+    /// Where the meshes of instanced nodes stand.
+    pub instances: Instances,
+}
+
+/// Checks the whole document but its buffers.
+pub fn check(root: &Item, data: &Data, limits: &Limits) -> Result<Checked, SceneError> {
     let mut warnings = vec![];
     let list = |key, kind| root.list(key, kind, limits.objects);
     let (nodes, meshes) = (list("nodes", "node")?, list("meshes", "mesh")?);
@@ -69,8 +79,18 @@ pub fn check(root: &Item, data: &Data, limits: &Limits) -> Result<Vec<String>, S
             warnings.push(format!("{what} are ignored: motion comes from the tracker"));
         }
     }
-    check_nodes(root, &nodes, &counts, &triangles, limits)?;
-    Ok(warnings)
+    let instances = read_instances(&nodes, data, limits)?;
+    check_nodes(root, &nodes, &counts, &triangles, &instances, limits)?;
+    let lost: Vec<String> = list_of_strings(root, "extensionsUsed")?
+        .into_iter()
+        // Materials tell of theirs one by one.
+        .filter(|name| !UNDERSTOOD.contains(name) && !name.contains("_materials_"))
+        .map(shorten)
+        .collect();
+    if !lost.is_empty() {
+        warnings.push(format!("the file uses what is not reproduced: {}", lost.join(", ")));
+    }
+    Ok(Checked { warnings, instances })
 }
 
 /// Checks the version and what the file says it cannot do without. Comes before everything else: a file that needs Draco has no
@@ -100,7 +120,6 @@ pub fn check_asset(root: &Item) -> Result<(), SceneError> {
             "KHR_texture_basisu" | "EXT_texture_webp" | "EXT_texture_avif" | "MSFT_texture_dds" => {
                 "re-export with PNG or JPEG textures"
             }
-            "EXT_mesh_gpu_instancing" => "re-export with one node for each instance",
             "KHR_materials_pbrSpecularGlossiness" => "convert the materials to metallic-roughness",
             _ => "re-export without it, or list it only in extensionsUsed if the scene can do without",
         };
@@ -235,6 +254,7 @@ fn check_nodes(
     nodes: &[Item],
     counts: &Counts,
     triangles: &[u64],
+    instances: &Instances,
     limits: &Limits,
 ) -> Result<(), SceneError> {
     let mut children = Vec::with_capacity(nodes.len());
@@ -251,7 +271,8 @@ fn check_nodes(
         }
         children.push(below);
         if let Some(mesh) = node.index("mesh", counts.meshes, "mesh")? {
-            total_triangles = total_triangles.saturating_add(triangles[mesh]);
+            let times = instances.get(&i).map_or(1, |all| all.len() as u64);
+            total_triangles = total_triangles.saturating_add(triangles[mesh].saturating_mul(times));
         }
         if let Some(light) = node.extension("KHR_lights_punctual")? {
             light.index("light", counts.lights, "light")?.ok_or_else(|| light.error("has no 'light'"))?;

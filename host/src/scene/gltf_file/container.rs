@@ -3,6 +3,7 @@
 use std::io::Read;
 use std::path::{Component, Path, PathBuf};
 
+use dpm_device::regular_file;
 use serde_json::Value;
 
 use super::super::{Limits, SceneError};
@@ -22,15 +23,10 @@ pub struct Container {
 
 /// Reads a whole regular file of at most `limit` bytes.
 pub fn read_file(path: &Path, limit: u64) -> Result<Vec<u8>, SceneError> {
-    // Asked before opening: opening a pipe would wait for its writer.
-    let metadata = std::fs::metadata(path).map_err(SceneError::Read)?;
-    if !metadata.is_file() {
-        return Err(SceneError::NotAFile);
-    }
+    let (file, size) = regular_file::open(path).map_err(SceneError::Read)?;
     let check = |size| SceneError::check_limit("the file's size in bytes", size, limit, "simplify the file");
-    check(metadata.len())?;
-    let mut bytes = Vec::with_capacity(metadata.len() as usize);
-    let file = std::fs::File::open(path).map_err(SceneError::Read)?;
+    check(size)?;
+    let mut bytes = Vec::with_capacity(size as usize);
     file.take(limit + 1).read_to_end(&mut bytes).map_err(SceneError::Read)?;
     check(bytes.len() as u64)?;
     Ok(bytes)
@@ -316,7 +312,7 @@ mod tests {
         }
         assert!(fetch("Cargo.toml", Some(&folder), 1 << 20).is_ok());
         assert!(fetch("src%2Flib.rs", Some(&folder), 1 << 20).is_ok());
-        assert!(matches!(fetch("src", Some(&folder), 1 << 20), Err(SceneError::NotAFile)));
+        assert!(fetch("src", Some(&folder), 1 << 20).unwrap_err().to_string().contains("a folder"));
         assert!(matches!(fetch("Cargo.toml", Some(&folder), 10), Err(SceneError::TooLarge { .. })));
     }
 }

@@ -1,13 +1,16 @@
 //! The node tree into rigid bodies: what a body of the rig file claims moves with it, everything else stands still.
 
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, HashMap, HashSet};
 
 use glam::{DAffine3, DMat3, DMat4, DVec3, Vec3};
 
 use super::super::limits::Cancel;
 use super::super::mesh::Dropped;
-use super::super::{Body, BodySelector, LoadOptions, PunctualKind, PunctualLight, SceneError, TriangleMesh};
+use super::super::{
+    Body, BodySelector, Limits, LoadOptions, PunctualKind, PunctualLight, SceneError, TriangleMesh,
+};
 use super::accessor::Data;
+use super::instancing::Instances;
 use super::look::Look;
 use super::primitive::read_primitive;
 
@@ -81,10 +84,12 @@ pub fn choose_bodies(
 ) -> Result<Claims, SceneError> {
     let roots = roots(document);
     let present = descendants(document, &roots);
-    let find = |name: &str| find_node(document, &present, name);
+    let names: Vec<Option<&str>> =
+        present.iter().map(|&i| document.nodes().nth(i).and_then(|n| n.name())).collect();
+    let find = |name: &str| find_node(&names, &present, name);
     let mut virtual_nodes = options.virtual_nodes.iter().map(|n| find(n)).collect::<Result<Vec<_>, _>>()?;
-    let named =
-        |name: &str| present.iter().any(|&i| document.nodes().nth(i).is_some_and(|n| n.name() == Some(name)));
+    let known: HashSet<&str> = names.iter().copied().flatten().collect();
+    let named = |name: &str| known.contains(name);
     if options.bodies.iter().all(|b| b.node.is_none() && !named(&b.name)) {
         return Ok(choose_automatically(document, roots, virtual_nodes, &options.bodies, warnings));
     }
@@ -104,15 +109,14 @@ pub fn choose_bodies(
     Ok(Claims { bodies, virtual_nodes })
 }
 
-fn find_node(document: &gltf::Document, present: &[usize], name: &str) -> Result<usize, SceneError> {
-    let name_of = |&i: &usize| document.nodes().nth(i).and_then(|n| n.name().map(str::to_owned));
+/// The one node in `present`, whose names are `names`, that is called `name`.
+fn find_node(names: &[Option<&str>], present: &[usize], name: &str) -> Result<usize, SceneError> {
     let matching: Vec<usize> =
-        present.iter().copied().filter(|i| name_of(i).as_deref() == Some(name)).collect();
+        present.iter().zip(names).filter(|(_, n)| **n == Some(name)).map(|(i, _)| *i).collect();
     if let [one] = matching[..] {
         return Ok(one);
     }
-    let known: Vec<String> =
-        present.iter().filter_map(name_of).take(30).map(|n| super::json::shorten(&n)).collect();
+    let known: Vec<String> = names.iter().flatten().take(30).map(|n| super::json::shorten(n)).collect();
     let problem = match matching.len() {
         0 => format!("the scene has no node '{name}'"),
         n => format!(
@@ -140,6 +144,7 @@ fn choose_automatically(
         }
         roots = below;
     }
+    let known_virtual: HashSet<usize> = virtual_nodes.iter().copied().collect();
     let wanted = if given.is_empty() { AUTO_BODIES } else { given.len() };
     let mut bodies = vec![];
     for root in roots {
@@ -157,7 +162,7 @@ fn choose_automatically(
             .nth(root)
             .and_then(|n| n.name())
             .map_or_else(|| format!("node {root}"), str::to_owned);
-        if materials.is_empty() || virtual_nodes.contains(&root) {
+        if materials.is_empty() || known_virtual.contains(&root) {
             continue;
         }
         if materials.iter().all(|&emits| emits) {
@@ -189,16 +194,30 @@ fn choose_automatically(
     Claims { bodies, virtual_nodes }
 }
 
+/// A checked document and what was read of it.
+pub struct Source<'a> {
+    /// Nodes and meshes.
+    pub document: &'a gltf::Document,
+    /// Buffers.
+    pub data: &'a Data,
+    /// Materials and textures.
+    pub look: &'a Look,
+    /// Where the meshes of instanced nodes stand.
+    pub instances: &'a Instances,
+}
+
 /// Walks the tree and gathers geometry and lights by body.
 pub fn flatten(
-    document: &gltf::Document,
-    data: &Data,
-    look: &Look,
+    source: &Source<'_>,
     claims: &Claims,
-    options: &LoadOptions,
+    limits: &Limits,
     cancel: &Cancel,
     warnings: &mut Vec<String>,
 ) -> Result<Flat, SceneError> {
+    let Source { document, data, look, instances } = *source;
+    let claim_of: HashMap<usize, usize> =
+        claims.bodies.iter().enumerate().map(|(c, b)| (b.node, c)).collect();
+    let here = [DAffine3::IDENTITY];
     let default_material = look.materials.len() - 1;
     let mut rest = vec![DAffine3::IDENTITY; claims.bodies.len()];
     let mut meshes: BTreeMap<Group, TriangleMesh> = BTreeMap::new();
@@ -210,10 +229,10 @@ pub fn flatten(
         .map(|node| Step { node, world: DAffine3::IDENTITY, claim: None, is_virtual: false })
         .collect();
     while let Some(step) = walk.pop() {
-        cancel.check(&options.limits)?;
+        cancel.check(limits)?;
         let Some(node) = document.nodes().nth(step.node) else { continue };
         let world = step.world * local_transform(&node);
-        let claimed_here = claims.bodies.iter().position(|b| b.node == step.node);
+        let claimed_here = claim_of.get(&step.node).copied();
         let claim = claimed_here.or(step.claim);
         let is_virtual = match claimed_here {
             Some(c) => !claims.bodies[c].projected,
@@ -231,14 +250,22 @@ pub fn flatten(
         if let Some(mesh) = node.mesh() {
             if is_invertible(&body_from_node) {
                 let into = meshes.entry((claim, is_virtual)).or_default();
+                let places = instances.get(&step.node).map_or(&here[..], Vec::as_slice);
                 for primitive in &document.as_json().meshes[mesh.index()].primitives {
-                    cancel.check(&options.limits)?;
+                    cancel.check(limits)?;
                     let material = primitive.material.map_or(default_material, |m| m.value());
                     if let Some((part, lost)) =
                         read_primitive(primitive, data, material as u32, look.uv_sets[material])?
                     {
-                        dropped.add(lost);
-                        into.append_transformed(&part, &body_from_node);
+                        for place in places {
+                            cancel.check(limits)?;
+                            dropped.add(lost);
+                            // An instance may be scaled to nothing, to hide it.
+                            let body_from_instance = body_from_node * *place;
+                            if is_invertible(&body_from_instance) {
+                                into.append_transformed(&part, &body_from_instance);
+                            }
+                        }
                     }
                 }
             } else {

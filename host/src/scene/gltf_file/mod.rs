@@ -5,6 +5,7 @@ mod check;
 mod check_look;
 mod container;
 mod flatten;
+mod instancing;
 mod json;
 mod look;
 mod primitive;
@@ -36,8 +37,10 @@ pub(super) fn read(
     let root = Item::new(&tree, "document".into())?;
     check::check_asset(&root)?;
     let buffers = container::load_buffers(&root, binary, folder.as_ref(), limits)?;
+    let all_bytes = bytes.len() + buffers.iter().map(Vec::len).sum::<usize>();
+    let limits = &limits.of_file(all_bytes as u64);
     let data = accessor::Data::new(&root, buffers, limits)?;
-    let mut warnings = check::check(&root, &data, limits)?;
+    let check::Checked { mut warnings, instances } = check::check(&root, &data, limits)?;
     cancel.check(limits)?;
 
     let typed: gltf::json::Root =
@@ -45,7 +48,8 @@ pub(super) fn read(
     let document = gltf::Document::from_json_without_validation(typed);
     let claims = flatten::choose_bodies(&document, options, &mut warnings)?;
     let look = look::read_look(&document, &root, &data, folder.as_ref(), limits, cancel, &mut warnings)?;
-    let flat = flatten::flatten(&document, &data, &look, &claims, options, cancel, &mut warnings)?;
+    let source = flatten::Source { document: &document, data: &data, look: &look, instances: &instances };
+    let flat = flatten::flatten(&source, &claims, limits, cancel, &mut warnings)?;
     if warnings.len() > MAX_WARNINGS {
         let more = warnings.len() - MAX_WARNINGS;
         warnings.truncate(MAX_WARNINGS);

@@ -5,11 +5,13 @@ use std::sync::{Arc, Mutex};
 use std::time::{Duration, Instant};
 
 use dpm_device::link::{
-    packet_bytes, Codec, Epoch, HostLink, LinkSettings, LinkState, SendOutcome, Underrun,
+    packet_bytes, Codec, Epoch, HostLink, LightLimits, LinkSettings, LinkState, SendOutcome, Underrun,
+    COMMIT_BYTES,
 };
 use dpm_device::planes::{PlaneSchedule, Raster};
 use dpm_device::time::{DeviceTicks, FrameRate, HostTime};
 use dpm_device::transport::usb::{UsbSettings, UsbTransport};
+use dpm_device::transport::Transport;
 use hil_mock::projector::usb::UsbProjector;
 use hil_mock::projector::{MockConfig, MockProjector};
 use hil_mock::usb_model::Speed;
@@ -29,7 +31,7 @@ pub fn planes(id: u64) -> Vec<u8> {
 }
 
 pub fn frame_bytes() -> usize {
-    packet_bytes(raster().plane_bytes()) * PLANES + packet_bytes(16)
+    packet_bytes(raster().plane_bytes()) * PLANES + packet_bytes(COMMIT_BYTES)
 }
 
 /// A projector of its own serial number, on the bus.
@@ -101,9 +103,11 @@ impl Host {
             epoch: Epoch::At(DeviceTicks(0)),
             codecs: Codec::Raw.mask(),
             flash_limit: None,
-            session_seed: 1,
+            limits: LightLimits::OFF,
         });
-        let usb = UsbTransport::open(device.settings()).expect("the device opens");
+        let mut usb = UsbTransport::open(device.settings()).expect("the device opens");
+        let clock = device.clock.clone();
+        usb.set_clock(Arc::new(move || clock()));
         Self { link, usb, next_id: 1 }
     }
 
@@ -150,7 +154,8 @@ impl Host {
         let slots = self.link.slots().unwrap();
         let slot = slots.slot_at(DeviceTicks(now.0 as u64)).unwrap() + 1;
         let id = self.next_id;
-        let outcome = self.link.send_frame(now, id, slots.start(slot), &planes(id), &mut self.usb);
+        let dark_from = slots.dark_from(slot, 20_000_000_000);
+        let outcome = self.link.send_frame(now, id, slots.start(slot), dark_from, &planes(id), &mut self.usb);
         if outcome == SendOutcome::Sent {
             self.next_id += 1;
         }

@@ -1,0 +1,184 @@
+//! `[safety.limits]` and `[safety.interlock]`: how much light there may be, and who else must agree that there is any.
+
+use super::declare::{kinds, section, words};
+use super::read::{Any, NotEmpty, Reader, Within};
+use super::{Origin, ProjectorBackend, RigConfig};
+use dpm_device::link::{LightLimits, MAX_LIMIT_MS, MIN_LIMIT_MS};
+use dpm_device::tty::ControlSignal;
+use std::path::{Path, PathBuf};
+
+const SHORTEST_S: f64 = MIN_LIMIT_MS as f64 / 1e3;
+const LONGEST_S: f64 = MAX_LIMIT_MS as f64 / 1e3;
+
+section! {
+    /// Limits on light. The host goes dark before one is exceeded, and the projector enforces the same by itself.
+    pub struct LimitsConfig {
+        /// Greatest mean level of the picture over `mean_window_s`, of full white, at least 0.001; 0 is off. The level is the mean drive
+        /// of the strongest of the three colours. What would exceed it is not dimmed: light goes off for a window's length.
+        mean_level: f64 = 0.0, "", Within(0.0, 1.0);
+        /// Length of every window over which the mean is taken.
+        mean_window_s: f64 = 10.0, "s", Within(SHORTEST_S, LONGEST_S);
+        /// Longest time of full white (a level above 0.95, pauses below a tenth of a second included), 0.5 to 3600; 0 is off. Afterwards
+        /// light goes off for as long.
+        full_white_s: f64 = 0.0, "s", Within(0.0, LONGEST_S);
+    }
+}
+
+impl LimitsConfig {
+    /// The limits as host and projector count them; each value is in its range once the configuration is accepted.
+    pub fn limits(&self) -> LightLimits {
+        // Rounded towards less light.
+        let mean_permille = (self.mean_level * 1000.0 + 1e-9).floor() as u16;
+        LightLimits {
+            mean_permille,
+            window_ms: if mean_permille > 0 { (self.mean_window_s * 1000.0).round() as u32 } else { 0 },
+            full_white_ms: (self.full_white_s * 1000.0).floor() as u32,
+        }
+    }
+}
+
+kinds! {
+    /// Who must agree, at every moment, that there is light.
+    pub enum InterlockConfig {
+        /// nobody else: the operator's orders decide alone.
+        None(NoInterlockConfig) = "none",
+        /// a process of this machine must be alive.
+        Process(ProcessInterlockConfig) = "process",
+        /// an input line of a serial port must be raised, or a file must hold "1".
+        Line(LineInterlockConfig) = "line",
+        /// a key of the terminal must be held down.
+        Key(KeyInterlockConfig) = "key",
+    }
+    default None
+}
+
+section! {
+    /// No interlock.
+    pub struct NoInterlockConfig {}
+}
+
+section! {
+    /// Light only while a process is alive; one that is stopped or a zombie is not. It must belong to this user or to root.
+    pub struct ProcessInterlockConfig {
+        /// Name of the process, as `ps -o comm` shows it. Give this or `pid_file`.
+        name: Option<String> = None, "", NotEmpty;
+        /// File that holds the number of the process, as services write it; an absolute path. Only the process that was alive when the
+        /// file was read first counts, until the file is written anew.
+        pid_file: Option<PathBuf> = None, "", NotEmpty;
+    }
+}
+
+section! {
+    /// Light only while a contact is closed.
+    pub struct LineInterlockConfig {
+        /// Serial port whose `signal` is the contact. Its RTS and DTR are raised and can feed it. Give this or `file`.
+        port: Option<String> = None, "", NotEmpty;
+        /// Which input of the port.
+        signal: InterlockSignal = InterlockSignal::Cts, "", Any;
+        /// File whose content must be "1", for example the `value` of a GPIO line; an absolute path.
+        file: Option<PathBuf> = None, "", NotEmpty;
+    }
+}
+
+section! {
+    /// Light only while a key is held down on the terminal that `dpm run` was started from. A terminal reports no release: light goes off when
+    /// the key's repetitions stay away for `release_ms`, and comes on with the second of them. For trying things out, not for protecting people.
+    pub struct KeyInterlockConfig {
+        /// The key: one printable ASCII character that is no order (b, f, s and a are).
+        key: String = " ".into(), "", NotEmpty;
+        /// The key counts as released when it was not repeated for this long; longer than the keyboard's own time between repetitions.
+        release_ms: u32 = 100, "ms", Within(20, 1_000);
+    }
+}
+
+words! {
+    /// Inputs of a serial port that are no data.
+    pub enum InterlockSignal {
+        /// Clear to send.
+        Cts = "cts",
+        /// Data set ready.
+        Dsr = "dsr",
+        /// Data carrier detect.
+        Dcd = "dcd",
+    }
+}
+
+impl InterlockSignal {
+    /// The line as the port knows it.
+    pub const fn line(self) -> ControlSignal {
+        match self {
+            Self::Cts => ControlSignal::Cts,
+            Self::Dsr => ControlSignal::Dsr,
+            Self::Dcd => ControlSignal::Dcd,
+        }
+    }
+}
+
+/// Contradictions within and with `[safety]`.
+pub(super) fn check(rig: &RigConfig, reader: &mut Reader) {
+    let mut refuse = |key: &str, problem: &str, remedy: &str| {
+        let origin: Origin = reader.origin_of(key);
+        reader.refuse(&origin, key, problem.to_owned(), remedy.to_owned());
+    };
+    let limits = &rig.safety.limits;
+    if limits.mean_level > 0.0 && limits.mean_level < 0.001 {
+        refuse("safety.limits.mean_level", "is below a thousandth of full white", "write 0 to switch it off");
+    }
+    if limits.full_white_s > 0.0 && limits.full_white_s < SHORTEST_S {
+        let remedy = "at least 0.5 s, or 0 to switch it off";
+        refuse("safety.limits.full_white_s", "is too short to be told from a flash", remedy);
+    }
+    if !limits.limits().is_off() && matches!(rig.projector.backend, ProjectorBackend::Dlpc900(_)) {
+        let key =
+            if limits.mean_level > 0.0 { "safety.limits.mean_level" } else { "safety.limits.full_white_s" };
+        refuse(
+            key,
+            "cannot be kept on a DLPC900: its light comes from its own memory or a video input, which this program does not count",
+            "limit its light by the LED currents, or remove the key",
+        );
+    }
+    let one_of = |a: bool, b: bool| a != b;
+    let is_relative = |path: &Option<PathBuf>| path.as_deref().is_some_and(Path::is_relative);
+    match &rig.safety.interlock {
+        InterlockConfig::None(_) => {}
+        InterlockConfig::Process(p) => {
+            if !one_of(p.name.is_some(), p.pid_file.is_some()) {
+                refuse(
+                    "safety.interlock.kind",
+                    "names no process, or two",
+                    "give either `name` or `pid_file`",
+                );
+            }
+            if is_relative(&p.pid_file) {
+                refuse("safety.interlock.pid_file", "is a relative path", "write an absolute path");
+            }
+        }
+        InterlockConfig::Line(l) => {
+            if !one_of(l.port.is_some(), l.file.is_some()) {
+                refuse("safety.interlock.kind", "names no line, or two", "give either `port` or `file`");
+            }
+            if is_relative(&l.file) {
+                refuse("safety.interlock.file", "is a relative path", "write an absolute path");
+            }
+            if let (Some(ours), ProjectorBackend::Serial(serial)) = (&l.port, &rig.projector.backend) {
+                if *ours == serial.port {
+                    let remedy = "a port can be opened once; use another";
+                    refuse("safety.interlock.port", "is the projector's own port", remedy);
+                }
+            }
+        }
+        InterlockConfig::Key(k) => {
+            let bytes = k.key.as_bytes();
+            let usable = bytes.len() == 1 && (bytes[0] == b' ' || bytes[0].is_ascii_graphic());
+            if !usable {
+                refuse("safety.interlock.key", "is not one printable ASCII character", "for example \" \"");
+            } else if crate::telemetry::monitor::Order::from_key(bytes[0]).is_some() {
+                refuse(
+                    "safety.interlock.key",
+                    "is a key that gives an order",
+                    "take another, for example \" \"",
+                );
+            }
+        }
+    }
+}

@@ -1,0 +1,174 @@
+//! Heartbeats: every thread of a run says by when it will say again that it is alive, and the supervisor looks whether it did.
+
+use crate::realtime::os::{self, Standing};
+use dpm_device::time::HostTime;
+use std::sync::atomic::{AtomicI32, AtomicI64, Ordering};
+
+/// Silence beyond what a thread had announced after which it counts as hung, nanoseconds.
+pub(super) const HUNG_AFTER_NS: i64 = 100_000_000;
+/// Longest step of the supervisor that counts as observed silence. When the machine itself stood still, all threads did.
+const LONGEST_STEP_NS: i64 = 10_000_000;
+
+/// The heartbeat of one thread. Beating it is one relaxed store.
+#[derive(Debug)]
+pub(super) struct Pulse {
+    /// What to call the thread.
+    name: &'static str,
+    /// By when it will beat again; `i64::MAX` before it began and after it ended.
+    until_ns: AtomicI64,
+    /// Its number for the operating system; 0 before it began.
+    thread: AtomicI32,
+}
+
+impl Pulse {
+    /// Of a thread that has not begun yet.
+    pub(super) const fn new(name: &'static str) -> Self {
+        Self { name, until_ns: AtomicI64::new(i64::MAX), thread: AtomicI32::new(0) }
+    }
+
+    /// What to call the thread.
+    pub(super) fn name(&self) -> &'static str {
+        self.name
+    }
+
+    /// The calling thread is the one whose heartbeat this is.
+    pub(super) fn begin(&self) {
+        self.thread.store(os::thread_id(), Ordering::Relaxed);
+    }
+
+    /// The thread is alive and will beat again within `expected_ns`.
+    pub(super) fn beat(&self, now: HostTime, expected_ns: i64) {
+        self.until_ns.store(now.0.saturating_add(expected_ns), Ordering::Relaxed);
+    }
+
+    /// The thread has ended as it should: nobody waits for its next beat.
+    pub(super) fn end(&self) {
+        self.until_ns.store(i64::MAX, Ordering::Relaxed);
+    }
+
+    /// True when a beat is overdue.
+    fn is_overdue(&self, now: HostTime) -> bool {
+        self.until_ns.load(Ordering::Relaxed) < now.0
+    }
+
+    /// What the thread is doing; `None` where the system does not tell.
+    fn standing(&self) -> Option<Standing> {
+        os::standing_of(self.thread.load(Ordering::Relaxed))
+    }
+}
+
+/// The supervisor's view of one thread: how long it has been silent beyond what it had announced. Time in which the thread was ready to
+/// run and got no core does not count: a thread that starves is late, not hung. One that runs without an end counts as silent.
+#[derive(Clone, Copy, Debug, Default)]
+pub(super) struct Silence {
+    silent_ns: i64,
+    before: Option<Standing>,
+}
+
+impl Silence {
+    /// Looks at `pulse` at `now`, `step_ns` after the last look. True when its thread is hung.
+    pub(super) fn observe(&mut self, pulse: &Pulse, now: HostTime, step_ns: i64) -> bool {
+        let overdue = pulse.is_overdue(now);
+        // The system is asked about threads in doubt only.
+        let standing = if overdue { pulse.standing() } else { None };
+        self.step(overdue, step_ns, standing)
+    }
+
+    fn step(&mut self, overdue: bool, step_ns: i64, standing: Option<Standing>) -> bool {
+        if !overdue {
+            *self = Self::default();
+            return false;
+        }
+        let step_ns = step_ns.clamp(0, LONGEST_STEP_NS);
+        let ran_ns = match (standing, self.before) {
+            (Some(now), Some(before)) => (now.ran_ns - before.ran_ns).clamp(0, step_ns),
+            _ => 0,
+        };
+        self.silent_ns += if standing.is_some_and(|s| s.ready) { ran_ns } else { step_ns };
+        self.before = standing;
+        self.silent_ns > HUNG_AFTER_NS
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    const MS: i64 = 1_000_000;
+
+    /// Steps until the thread counts as hung, at most 1000.
+    fn steps(mut each: impl FnMut(&mut Silence) -> bool) -> Option<usize> {
+        let mut silence = Silence::default();
+        (1..=1000).find(|_| each(&mut silence))
+    }
+
+    #[test]
+    fn a_thread_is_hung_after_a_tenth_of_a_second_beyond_what_it_announced() {
+        assert_eq!(steps(|s| s.step(true, 2 * MS, None)), Some(51));
+        let asleep = Standing { ready: false, ran_ns: 7 };
+        assert_eq!(steps(|s| s.step(true, 2 * MS, Some(asleep))), Some(51));
+        assert_eq!(steps(|s| s.step(false, 2 * MS, None)), None);
+    }
+
+    #[test]
+    fn a_machine_that_stood_still_and_a_thread_without_a_core_are_not_hung_threads() {
+        let mut silence = Silence::default();
+        assert!(!silence.step(true, 60_000 * MS, None), "the supervisor itself was away for a minute");
+        assert_eq!(silence.silent_ns, LONGEST_STEP_NS);
+        let starving = steps(|s| s.step(true, 2 * MS, Some(Standing { ready: true, ran_ns: 5 })));
+        assert_eq!(starving, None);
+        // A thread that runs in a circle says nothing, either.
+        let mut ran_ns = 0;
+        let circling = steps(|s| {
+            ran_ns += 2 * MS;
+            s.step(true, 2 * MS, Some(Standing { ready: true, ran_ns }))
+        });
+        assert_eq!(circling, Some(52));
+    }
+
+    #[test]
+    fn a_beat_in_between_begins_anew() {
+        let mut n = 0;
+        let now_and_then = steps(|s| {
+            n += 1;
+            s.step(n % 40 != 0, 2 * MS, None)
+        });
+        assert_eq!(now_and_then, None);
+    }
+
+    #[test]
+    fn a_pulse_is_overdue_only_after_what_it_announced() {
+        let pulse = Pulse::new("plan");
+        assert!(!pulse.is_overdue(HostTime(i64::MAX - 1)), "not begun");
+        pulse.begin();
+        pulse.beat(HostTime(100), 50);
+        assert!(!pulse.is_overdue(HostTime(150)) && pulse.is_overdue(HostTime(151)));
+        pulse.end();
+        assert!(!pulse.is_overdue(HostTime(i64::MAX - 1)));
+        assert_eq!(pulse.name(), "plan");
+    }
+
+    /// Found in use, R1: the system tells a thread that sleeps or was stopped from one that waits for a core.
+    #[cfg(target_os = "linux")]
+    #[test]
+    fn the_system_tells_who_is_ready() {
+        let pulse = Pulse::new("this");
+        pulse.begin();
+        let before = pulse.standing().expect("Linux tells");
+        assert!(before.ready, "it asks for itself");
+        let (to_test, from_thread) = std::sync::mpsc::channel();
+        let (to_thread, from_test) = std::sync::mpsc::channel::<()>();
+        let thread = std::thread::spawn(move || {
+            let pulse = Pulse::new("other");
+            pulse.begin();
+            to_test.send(pulse).unwrap();
+            let _ = from_test.recv();
+        });
+        let other = from_thread.recv().unwrap();
+        while other.standing().expect("Linux tells").ready {
+            std::thread::sleep(std::time::Duration::from_millis(1));
+        }
+        drop(to_thread);
+        thread.join().unwrap();
+    }
+}

@@ -1,0 +1,53 @@
+//! Why no light may fall on a body although its frame is lit.
+
+/// Why a body is dark in a frame.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Hash)]
+pub enum DarkCause {
+    /// The tracker has not told of the body since the run began.
+    NeverSeen,
+    /// The newest sample of the body was too old already when the frame's poses were taken: the tracker has fallen silent, or has lost the
+    /// body.
+    Silent,
+    /// The tracker tells of the body, but the light of the frame falls later after the newest sample than `safety.predict_ms` allows
+    /// to predict.
+    BeyondHorizon,
+}
+
+impl DarkCause {
+    /// All causes, in the order of their counters.
+    pub const ALL: [Self; 3] = [Self::NeverSeen, Self::Silent, Self::BeyondHorizon];
+
+    /// As in reports.
+    pub const fn name(self) -> &'static str {
+        match self {
+            Self::NeverSeen => "never_seen",
+            Self::Silent => "silent",
+            Self::BeyondHorizon => "beyond_horizon",
+        }
+    }
+
+    /// What the operator is told of it, after the name of the body.
+    pub const fn told(self) -> &'static str {
+        match self {
+            Self::NeverSeen => "the tracker has never seen it",
+            Self::Silent => "the tracker has not told of it for longer than safety.predict_ms",
+            Self::BeyondHorizon => {
+                "the light falls later after its newest sample than safety.predict_ms allows (raise safety.predict_ms, or make \
+                 the way from the tracker to the light shorter)"
+            }
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn causes_have_their_own_counters_and_names() {
+        for (i, cause) in DarkCause::ALL.into_iter().enumerate() {
+            assert_eq!(cause as usize, i);
+            assert_eq!(DarkCause::ALL.iter().filter(|c| c.name() == cause.name()).count(), 1);
+        }
+    }
+}

@@ -1,0 +1,75 @@
+//! How far ahead of its newest sample a body may be shown: `safety.predict_ms`, or what the rig needs where nobody wrote it.
+
+use crate::config::RigConfig;
+
+/// Shortest horizon of a rig that does not name its own, nanoseconds.
+const SHORTEST_NS: i64 = 20_000_000;
+/// Longest horizon of any rig, nanoseconds: the largest value of the key.
+pub const LONGEST_NS: i64 = 1_000_000_000;
+
+/// The rule for one rig.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct Horizon {
+    /// What the rig file says; that is law.
+    written_ns: Option<i64>,
+    /// Between two samples of the tracker, nanoseconds.
+    period_ns: i64,
+    slot_ns: i64,
+}
+
+impl Horizon {
+    /// The rule that a rig file sets.
+    pub fn of_rig(config: &RigConfig) -> Self {
+        Self {
+            written_ns: config.safety.predict_ms.map(|ms| i64::from(ms) * 1_000_000),
+            // A recording knows no rate; its samples are no rarer than those of the slowest trackers.
+            period_ns: 1_000_000_000 / i64::from(config.tracker.rate_hz().unwrap_or(30).max(1)),
+            slot_ns: config.projector.frame_rate.slot_len_ns(0),
+        }
+    }
+
+    /// Longest time for which a body is carried on by prediction, nanoseconds: what the rig file says, else the longer of 20 ms and the
+    /// tracker's latency, two of its samples, the lead and two slots together. `lead_ns`: how long before its slot a frame is latched;
+    /// `latency_ns`: from the capture of a sample to its arrival.
+    pub fn predict_ns(&self, lead_ns: i64, latency_ns: i64) -> i64 {
+        self.written_ns.unwrap_or_else(|| {
+            let needed = latency_ns
+                .saturating_add(2 * self.period_ns)
+                .saturating_add(lead_ns)
+                .saturating_add(2 * self.slot_ns);
+            needed.clamp(SHORTEST_NS, LONGEST_NS)
+        })
+    }
+
+    /// Age that the newest sample of a tracker that works has at most when it is read, nanoseconds.
+    pub fn fresh_ns(&self, latency_ns: i64) -> i64 {
+        latency_ns.saturating_add(3 * self.period_ns)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::config::Overrides;
+
+    fn horizon(flags: &[&str]) -> Horizon {
+        let flags = flags.iter().map(|f| (*f).to_owned()).collect();
+        let config = RigConfig::demo(&Overrides { variables: vec![], flags });
+        Horizon::of_rig(&config.unwrap_or_else(|e| panic!("{e}")))
+    }
+
+    const MS: i64 = 1_000_000;
+
+    /// Found in use, R6 and C2: at 60 frames/s 20 ms are less than the way of any frame.
+    #[test]
+    fn a_rig_that_names_no_horizon_has_one_that_its_frames_can_keep() {
+        let fast = horizon(&["projector.frame_rate=947", "tracker.rate_hz=500"]);
+        assert_eq!(fast.predict_ns(2 * MS, 2 * MS), 20 * MS);
+        let slow = horizon(&["projector.frame_rate=24", "tracker.rate_hz=30"]);
+        // 5 + 2 * 33.3 + 60 + 2 * 41.7
+        assert_eq!(slow.predict_ns(60 * MS, 5 * MS) / MS, 214);
+        assert_eq!(slow.predict_ns(5_000 * MS, 0), LONGEST_NS);
+        let written = horizon(&["projector.frame_rate=24", "tracker.rate_hz=500", "safety.predict_ms=70"]);
+        assert_eq!(written.predict_ns(600 * MS, 5 * MS), 70 * MS, "what is written is law");
+    }
+}
