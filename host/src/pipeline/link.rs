@@ -78,6 +78,8 @@ pub(super) struct Line {
     pub(super) cable: Cable,
     pub(super) keeper: LinkKeeper,
     pub(super) lead: LeadEstimator,
+    /// Until when this thread last waited for room in the device.
+    pub(super) credit_until: HostTime,
 }
 
 /// What the link leaves behind: the recorder of a projector without a thread of its own, and what was carried.
@@ -234,7 +236,12 @@ impl Line {
     fn send(&mut self, shared: &Shared, job: &mut FrameJob, ready_at: HostTime) {
         let FrameJob { note, memory } = job;
         let now = if shared.is_virtual() { ready_at } else { self.await_credit(shared, note) };
-        let waited_ns = now.ns_since(ready_at);
+        // What waited for room in the device, or behind a frame that did, was ready earlier.
+        let queued_ns = self.credit_until.min(ready_at).ns_since(note.timeline.packed_at).max(0);
+        if now > ready_at {
+            self.credit_until = now;
+        }
+        let waited_ns = now.ns_since(ready_at) + queued_ns;
         if is_too_old(note, now, shared.rig.rate().slot_len_ns(0)) {
             note.fate = Fate::TooOld;
             // It needed what it needed, and the next one should be begun earlier.

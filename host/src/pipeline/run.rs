@@ -118,7 +118,8 @@ fn run_from(
     let lead = lead_estimator(&rig, &link, frame_ns);
     let shared = Arc::new(shared(&rig, &clock, &rights, options, monitor, time, &lead));
     tell_horizon(&shared);
-    let line = Line { keeper: super::keeper::LinkKeeper::new(time, &link, seen), link, cable, lead };
+    let keeper = super::keeper::LinkKeeper::new(time, &link, seen);
+    let line = Line { keeper, link, cable, lead, credit_until: HostTime(i64::MIN / 2) };
     let mut collector = Collector::new(rig.clone(), options.keep_frames, options.verify)
         .about(gpu.is_none(), standstill.as_ref().map(StandstillMonitor::seen));
 
