@@ -1,4 +1,4 @@
-//! Boxes into a binary tree by locally ordered clustering (\[Meister18\]) and reinsertion (\[Meister18b\]), in bounded time.
+//! Boxes into a binary tree by locally ordered clustering (\[Meister18b\]) and reinsertion (\[Meister18\]), in bounded time.
 //!
 //! The algorithms are those of the crate `obvhs`, step for step, so that a mesh gets the tree that `obvhs` builds, bit for bit. What is added is a
 //! bound on the work. Clustering merges two neighbours when each is the other's best partner; on boxes that all coincide, or that lie one inside
