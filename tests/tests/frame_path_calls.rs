@@ -23,7 +23,7 @@ const LISTED: [i64; 5] = [
 ];
 /// What the C library does while signals are held back, at the beginning and the end of a thread, and the return from a handler. None of it can
 /// stand in for a call that frames could make: memory comes by other calls, or through the allocator that counts.
-const AROUND_THREADS: [i64; 9] = [
+const AROUND_THREADS: [i64; 11] = [
     libc::SYS_rt_sigreturn,
     libc::SYS_rt_sigprocmask,
     libc::SYS_clone,
@@ -31,6 +31,9 @@ const AROUND_THREADS: [i64; 9] = [
     libc::SYS_set_robust_list,
     libc::SYS_rseq,
     libc::SYS_madvise,
+    // The stack of a thread that nobody joins.
+    libc::SYS_munmap,
+    libc::SYS_gettid,
     libc::SYS_exit,
     libc::SYS_exit_group,
 ];

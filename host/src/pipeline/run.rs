@@ -46,8 +46,9 @@ const LIGHTS: usize = 8192;
 const CABLE_BUFFERS: usize = 3;
 /// A step of a control thread that ends this late is a standstill of the machine.
 const STANDSTILL_NS: i64 = 1_000_000;
-/// What the collector may take for one look: it may allocate, write and wait for a core.
-const LOOK_NS: i64 = 500_000_000;
+/// What the collector may take for one look. It is the only thread here that runs behind all others, it allocates, and no light depends on
+/// it: without it frames run out of notes and the light ends by itself.
+const LOOK_NS: i64 = 5_000_000_000;
 /// Longest reserve in the lead, nanoseconds.
 const RESERVE_NS: i64 = 528_000;
 /// Spare time in the first guess of the lead, of what a frame took while nobody was waiting: a quarter.
