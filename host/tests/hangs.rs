@@ -6,7 +6,7 @@
 mod cli_common;
 mod link_common;
 
-use cli_common::{start, Folder, Running};
+use cli_common::{code, dpm, err, start, Folder, Running};
 use hil_mock::projector::MockConfig;
 use link_common::{raster, served_time, Projector, PtyProjector};
 use std::time::{Duration, Instant};
@@ -142,4 +142,23 @@ fn a_stage_that_hangs_is_replaced_and_does_nothing_when_it_wakes_up() {
         let status = run.finish().0;
         assert!(!far.is_lit(), "{name}: {status}");
     }
+}
+
+/// A picture is held only while somebody could replace it.
+#[test]
+fn a_frozen_picture_goes_dark_when_a_stage_hangs() {
+    let (_folder, path, far) = rig("frozen");
+    let run = lit_run(&path, &far);
+    let told = dpm(&["freeze", "--pid", &run.id().to_string()], &[]);
+    assert_eq!(code(&told), 0, "{}", err(&told));
+    // Longer than any frame's own word lasts.
+    std::thread::sleep(Duration::from_millis(4 * SLOT_MS + 2 * PREDICT_MS));
+    assert!(far.is_lit(), "held");
+    let (thread, _) = threads(run.id()).into_iter().find(|(_, n)| n == "dpm-plan").expect("it runs");
+    let stopped = Stopped::new(thread).expect("it may be traced");
+    let dark = served_time("dark", || !far.is_lit());
+    // What the stage had announced, 0.1 s more, and the supervisor's word that is missed.
+    assert!(dark <= Duration::from_millis(500), "dark after {dark:?}");
+    run.signal("KILL");
+    stopped.reap(run.id());
 }

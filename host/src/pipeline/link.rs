@@ -341,3 +341,27 @@ pub(super) fn device_thread(
     recorder.close();
     recorder
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    const MS: i64 = 1_000_000;
+
+    /// Found in use, R5: what counts is how old the poses are when the light falls, in the frame's slot or, where that has begun, now.
+    #[test]
+    fn a_frame_is_too_old_by_what_its_poses_will_be_when_it_is_lit() {
+        let (slot_ns, predict_ns) = (10 * MS, 20 * MS);
+        let mut note = FrameNote::new(1);
+        note.predict_ns = predict_ns;
+        note.timeline.due_at = HostTime(100 * MS);
+        assert!(!is_too_old(&note, HostTime(500 * MS), slot_ns), "all bodies are dark: nothing is old");
+        let mut at = |captured_ms: i64, now_ms: i64| {
+            note.oldest_captured_at = Some(HostTime(captured_ms * MS));
+            is_too_old(&note, HostTime(now_ms * MS), slot_ns)
+        };
+        assert!(!at(70, 90), "30 ms old in its slot: predict_ms and a slot");
+        assert!(at(69, 90), "31 ms old in its slot");
+        assert!(!at(80, 110) && at(80, 111), "late: judged by now");
+    }
+}
