@@ -5,12 +5,11 @@
 
 use super::job::{FrameJob, FrameMemory, FrameNote};
 use super::outcome::PipelineError;
+use super::planning::{plan_thread, PlanInbox};
 use super::prepared::PreparedFrames;
 use super::pulse::{Pulse, Silence};
 use super::stages::{LinkTime, TrackSnapshot, TrackingStage};
-use super::threads::{
-    pack_thread, plan_thread, policy, tracking_thread, PackInbox, PlanInbox, Shared, NOTES,
-};
+use super::threads::{pack_thread, policy, tracking_thread, PackInbox, Shared, NOTES};
 use crate::pack::Kernel;
 use crate::plan::budget::BudgetController;
 use crate::render::Renderer;

@@ -20,6 +20,7 @@ pub mod light;
 mod link;
 mod outcome;
 mod placement;
+mod planning;
 pub mod prepared;
 pub mod projector;
 mod pulse;
