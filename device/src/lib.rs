@@ -15,6 +15,8 @@ pub mod planes;
 pub mod pose;
 #[cfg(feature = "std")]
 pub mod regular_file;
+#[cfg(feature = "std")]
+pub mod rng;
 pub mod time;
 #[cfg(feature = "std")]
 pub mod tracker;

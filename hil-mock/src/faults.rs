@@ -14,9 +14,9 @@
 //! on the first item at or after `start`. Which item a probability strikes depends only on the seed, the kind and the item's
 //! number, so adding one fault never moves another.
 
-use crate::rng::Draws;
 use core::fmt;
 use core::str::FromStr;
+use dpm_device::rng::Draws;
 
 /// What goes wrong. The text form is the variant's name in lower case.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Hash)]

@@ -1,7 +1,7 @@
 //! A projector and a tracker made of software: the same mock in-process, over USB/IP, pseudo-terminals and UDP.
 //!
 //! Reading order: [`motion`] is what truly happens, [`faults`] the one vocabulary of what goes wrong, [`tracker`] what a tracker
-//! would report, [`projector`] what a projector makes of the packets it gets. All randomness comes from [`rng`], keyed by a seed; time is always an argument.
+//! would report, [`projector`] what a projector makes of the packets it gets. All randomness comes from [`dpm_device::rng`], keyed by a seed; time is always an argument.
 
 pub mod dlpc900;
 pub mod faults;
@@ -12,7 +12,6 @@ pub mod natnet_host;
 pub mod natnet_server;
 pub mod projector;
 pub mod report_queue;
-pub mod rng;
 pub mod serial_server;
 pub mod tracker;
 pub mod usb_model;

@@ -5,8 +5,8 @@
 
 use crate::faults::{FaultError, FaultKind, FaultPlan};
 use crate::motion::{add, from_rotation_vector, multiply, normalize4, scale, Motion, Twist};
-use crate::rng::Draws;
 use dpm_device::pose::Pose;
+use dpm_device::rng::Draws;
 use dpm_device::time::{FrameRate, HostTime};
 use dpm_device::tracker::{BodyIndex, SampleGate, Tracker, TrackerCounters, TrackerError, TrackerSample};
 use std::collections::VecDeque;

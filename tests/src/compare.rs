@@ -1,8 +1,8 @@
 //! A picture of the GPU against the f64 reference, as demands: the same surfaces, the same light, errors that the variances explain.
 
-use dpm_host::experiments::stability::gpu_compare::{self, Comparison};
-use dpm_host::experiments::stability::gpu_shot::Shot;
-use dpm_host::gpu::Gpu;
+use dpm_lab::stability::gpu_compare::{self, Comparison};
+use dpm_lab::stability::gpu_shot::Shot;
+use dpm_render::gpu::Gpu;
 use std::sync::Arc;
 
 /// Draws `shot` with both tracers; the reference takes `spp` samples and drops none.

@@ -18,8 +18,8 @@ use dpm_device::tracker::natnet::Version;
 use dpm_device::tracker::record::{Recording, SAMPLE_BYTES};
 use dpm_device::tracker::serial::wire::SerialMessage;
 use dpm_device::tracker::vrpn::wire as vrpn;
-use dpm_host::config::{Overrides, RigConfig};
-use dpm_host::geometry::opencv;
+use dpm_rig::config::{Overrides, RigConfig};
+use dpm_scene::geometry::opencv;
 use hil_mock::usbip::wire as usbip;
 use std::path::Path;
 

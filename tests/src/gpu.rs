@@ -1,6 +1,6 @@
 //! The GPU under validation.
 
-use dpm_host::gpu::{validation_messages, Gpu, GpuOptions};
+use dpm_render::gpu::{validation_messages, Gpu, GpuOptions};
 use std::sync::Arc;
 
 /// Opens the GPU with validation and synchronisation validation, runs the test, closes the GPU, and demands that validation said nothing.

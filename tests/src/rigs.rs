@@ -1,11 +1,11 @@
 //! The demo rig made small, run through the whole pipeline.
 
 use dpm_device::planes::Raster;
-use dpm_host::config::{Overrides, RigConfig};
-use dpm_host::gpu::Gpu;
-use dpm_host::pipeline::{self, RunOptions, RunOutcome};
-use dpm_host::rig::Rig;
-use dpm_host::telemetry::monitor::RunMonitor;
+use dpm_render::gpu::Gpu;
+use dpm_rig::config::{Overrides, RigConfig};
+use dpm_rig::pipeline::{self, RunOptions, RunOutcome};
+use dpm_rig::rig::Rig;
+use dpm_rig::telemetry::monitor::RunMonitor;
 use std::sync::Arc;
 
 /// The demo rig at `width` x `height` with settings `a.b=c` over it.

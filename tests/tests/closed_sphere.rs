@@ -2,10 +2,10 @@
 //!
 //! A path of depth d sees the first d terms of `sum 0.5^k`, so its mean is `1 - 0.5^d`: from every position, at every size.
 
-use dpm_host::experiments::stability::estimate::pooled;
-use dpm_host::experiments::stability::gpu_shot::{Picture, Shot};
-use dpm_host::experiments::stability::shapes::*;
-use dpm_host::scene::{Material, Scene};
+use dpm_lab::stability::estimate::pooled;
+use dpm_lab::stability::gpu_shot::{Picture, Shot};
+use dpm_scene::shapes::*;
+use dpm_scene::{Material, Scene};
 use dpm_tests::gpu::with_gpu;
 use glam::{DAffine3, DQuat, DVec3, Vec3};
 

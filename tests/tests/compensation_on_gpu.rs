@@ -1,13 +1,13 @@
 //! The compensation shader against its CPU twin, bit for bit, on radiance and surfaces that no scene would give it.
 
 use bytemuck::Zeroable;
-use dpm_host::gpu::{
+use dpm_lab::reference::Sampler;
+use dpm_render::compensation::{real_cosine, Compensation};
+use dpm_render::gpu::{
     BindingKind, BindingSet, BindingTable, Buffer, CommandList, ComputePipeline, FrameFence, Gpu, MemoryKind,
 };
-use dpm_host::pack::{quantise, QuantiseCounts};
-use dpm_host::reference::Sampler;
-use dpm_host::render::compensation::{real_cosine, Compensation};
-use dpm_host::render::scene_data::SceneNeeds;
+use dpm_render::pack::{quantise, QuantiseCounts};
+use dpm_render::scene_data::SceneNeeds;
 use dpm_shaders::structs::{
     Counters, Frame, Instance, Rows, Surface, TriangleRef, Vertex, BINDINGS, NO_HIT, TEXEL_BINDINGS,
 };

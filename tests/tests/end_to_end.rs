@@ -1,9 +1,9 @@
 //! The whole rig against the mock projector and tracker: what was rendered is what falls, where the object is, when it is there.
 
 use dpm_device::time::HostTime;
-use dpm_host::pipeline::{self, renderer_settings, RunOptions};
-use dpm_host::render::{FrameInputs, Renderer};
-use dpm_host::telemetry::monitor::RunMonitor;
+use dpm_render::{FrameInputs, Renderer};
+use dpm_rig::pipeline::{self, renderer_settings, RunOptions};
+use dpm_rig::telemetry::monitor::RunMonitor;
 use dpm_tests::gpu::with_gpu;
 use dpm_tests::rigs::{demo_rig, run};
 use std::sync::Arc;

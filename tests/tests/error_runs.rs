@@ -1,18 +1,16 @@
 //! `dpm error` as a library: errors fall as theory says, a wrong sampler is caught, equal rays are equal.
 
 use dpm_device::planes::Raster;
-use dpm_host::config::{Overrides, RigConfig};
-use dpm_host::experiments::error_export::FrameIndex;
-use dpm_host::experiments::error_plan::Group;
-use dpm_host::experiments::error_reference::Reference;
-use dpm_host::experiments::error_runs::{
-    is_other, ErrorOptions, ErrorRuns, Extent, AT_EQUAL_TIME, EYE_FRAMES, RACES,
-};
-use dpm_host::experiments::run_rig::open_gpu;
-use dpm_host::experiments::sequence::{eye_mean, rmse, Span, Theatre};
-use dpm_host::gpu::Gpu;
-use dpm_host::render::method::Method;
-use dpm_host::rig::Rig;
+use dpm_lab::error::export::FrameIndex;
+use dpm_lab::error::plan::Group;
+use dpm_lab::error::reference::Reference;
+use dpm_lab::error::runs::{is_other, ErrorOptions, ErrorRuns, Extent, AT_EQUAL_TIME, EYE_FRAMES, RACES};
+use dpm_lab::sequence::{eye_mean, rmse, Span, Theatre};
+use dpm_render::gpu::Gpu;
+use dpm_render::method::Method;
+use dpm_rig::config::{Overrides, RigConfig};
+use dpm_rig::rig::Rig;
+use dpm_rig::run_rig::open_gpu;
 use glam::Vec3;
 use std::sync::Arc;
 

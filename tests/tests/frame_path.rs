@@ -1,7 +1,7 @@
 //! The steady state allocates nothing: a counting allocator watches every thread of the frame path.
 
 use counting_allocator::{Counting, Request};
-use dpm_host::pipeline::on_frame_path;
+use dpm_rig::pipeline::on_frame_path;
 use dpm_tests::gpu::with_gpu;
 use dpm_tests::rigs::{demo_rig, run};
 use std::cell::Cell;

@@ -7,8 +7,8 @@
 #![allow(unsafe_code)]
 
 use counting_allocator::Counting;
-use dpm_host::pipeline::{on_frame_path, run_prepared, RunOptions};
-use dpm_host::telemetry::monitor::RunMonitor;
+use dpm_rig::pipeline::{on_frame_path, run_prepared, RunOptions};
+use dpm_rig::telemetry::monitor::RunMonitor;
 use dpm_tests::rigs::demo_rig;
 use std::sync::atomic::{AtomicI64, AtomicU64, Ordering};
 use std::sync::Arc;

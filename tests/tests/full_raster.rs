@@ -1,10 +1,10 @@
 //! Found in use, real pace at full raster: the projector's clock was a quarter to half a millisecond wrong while frames flowed, and registration
 //! twenty times worse than at virtual pace, where every test looked. Frames are prepared, so that a slow GPU takes no part.
 
-use dpm_host::config::{Overrides, RigConfig};
-use dpm_host::pipeline::{run_prepared, RunOptions, RunOutcome};
-use dpm_host::rig::Rig;
-use dpm_host::telemetry::monitor::RunMonitor;
+use dpm_rig::config::{Overrides, RigConfig};
+use dpm_rig::pipeline::{run_prepared, RunOptions, RunOutcome};
+use dpm_rig::rig::Rig;
+use dpm_rig::telemetry::monitor::RunMonitor;
 use std::sync::Arc;
 
 /// Two seconds at 240 frames/s: half a slot of error, which is what a reply that is looked at a slot late costs, is 2 ms here, or 3 px.

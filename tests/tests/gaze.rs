@@ -1,7 +1,7 @@
 //! A gaze that the tracker no longer tells: held, then the zones of full quality grow until all of the picture is in them.
 
-use dpm_host::pipeline::renderer_settings;
-use dpm_host::render::{FrameInputs, Renderer, RendererSettings};
+use dpm_render::{FrameInputs, Renderer, RendererSettings};
+use dpm_rig::pipeline::renderer_settings;
 use dpm_tests::gpu::with_gpu;
 use dpm_tests::rigs::demo_rig;
 
@@ -27,7 +27,7 @@ fn wider_zones_are_the_zones_of_a_rig_file_with_wider_angles() {
             [settings.method.paper.phi_h_deg, settings.method.paper.phi_q_deg] = phi_deg;
             let mut renderer = Renderer::new(gpu, &rig.scene, settings).unwrap();
             let mut slot = renderer.create_slot(false).unwrap();
-            let tracked: Vec<_> = rig.bodies.iter().map(|b| dpm_host::rig::affine(&b.rest)).collect();
+            let tracked: Vec<_> = rig.bodies.iter().map(|b| dpm_rig::rig::affine(&b.rest)).collect();
             let mut poses = Vec::new();
             rig.scene_poses(&tracked, &mut poses);
             let (eye, gaze) = rig.observer.eye_and_gaze(&tracked);

@@ -1,10 +1,10 @@
 //! The GPU's pictures against the f64 reference, as the rig sees them: rays from the projector, radiance toward the eye.
 
-use dpm_host::experiments::stability::gpu_shot::Shot;
-use dpm_host::experiments::stability::shapes::*;
-use dpm_host::gpu::Gpu;
-use dpm_host::reference::Sampler;
-use dpm_host::scene::{Material, PunctualKind, PunctualLight, Scene};
+use dpm_lab::reference::Sampler;
+use dpm_lab::stability::gpu_shot::Shot;
+use dpm_render::gpu::Gpu;
+use dpm_scene::shapes::*;
+use dpm_scene::{Material, PunctualKind, PunctualLight, Scene};
 use dpm_tests::compare::{compare, Demands};
 use dpm_tests::gpu::with_gpu;
 use glam::{DAffine3, DQuat, DVec3, Vec3};

@@ -1,10 +1,9 @@
 //! Rasters at the limit of what a device binds at once: traced by every method whose own buffers fit, refused by name where they do not.
 
-use dpm_host::config::{RenderConfig, RenderMethod};
-use dpm_host::experiments::sequence::{draw, poses_at};
-use dpm_host::pipeline::renderer_settings;
-use dpm_host::render::method::Method;
-use dpm_host::render::{RenderError, Renderer, RendererSettings};
+use dpm_lab::sequence::{draw, poses_at};
+use dpm_render::{RenderError, Renderer, RendererSettings};
+use dpm_rig::config::{RenderConfig, RenderMethod};
+use dpm_rig::pipeline::renderer_settings;
 use dpm_tests::gpu::with_gpu;
 use dpm_tests::rigs::demo_rig;
 
@@ -17,7 +16,7 @@ fn a_raster_is_traced_where_the_buffers_of_its_method_fit() {
             (2560, 1440, RenderMethod::Dpm, 64),
         ] {
             let rig = demo_rig(width, height, &[]);
-            let method = Method::from_config(&RenderConfig { method: which, ..rig.config.render.clone() });
+            let method = RenderConfig { method: which, ..rig.config.render.clone() }.to_method();
             let settings = RendererSettings { method, ..renderer_settings(&rig) };
             let fits = u64::from(width * height * bytes_per_pixel) <= gpu.max_buffer_bytes();
             let what = format!("{which:?} at {width} x {height}");

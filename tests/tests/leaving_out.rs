@@ -1,17 +1,16 @@
 //! What a scene does not need is compiled away, and tables are read as suits the device. That may cost speed only: every pixel stays the
 //! same, bit for bit.
 
-use dpm_host::config::{Overrides, RenderMethod, RigConfig};
-use dpm_host::experiments::scene_plan::scene_plan;
-use dpm_host::experiments::sequence::{draw, poses_at};
-use dpm_host::experiments::stability::gpu_shot::Shot;
-use dpm_host::experiments::stability::shapes::*;
-use dpm_host::pipeline::renderer_settings;
-use dpm_host::render::method::Method;
-use dpm_host::render::scene_data::Keep;
-use dpm_host::render::{Renderer, RendererSettings};
-use dpm_host::rig::Rig;
-use dpm_host::scene::{Material, PunctualKind, PunctualLight, Scene};
+use dpm_lab::scene_plan::scene_plan;
+use dpm_lab::sequence::{draw, poses_at};
+use dpm_lab::stability::gpu_shot::Shot;
+use dpm_render::scene_data::Keep;
+use dpm_render::{Renderer, RendererSettings};
+use dpm_rig::config::{Overrides, RenderMethod, RigConfig};
+use dpm_rig::pipeline::renderer_settings;
+use dpm_rig::rig::Rig;
+use dpm_scene::shapes::*;
+use dpm_scene::{Material, PunctualKind, PunctualLight, Scene};
 use dpm_tests::gpu::with_gpu;
 use glam::{DVec3, Vec3};
 
@@ -88,7 +87,7 @@ fn leaving_out_changes_no_bit() {
             };
             let lean = shot.draw(gpu);
             let full = Shot { leave_nothing_out: true, ..shot.clone() }.draw(gpu);
-            let bits = |p: &dpm_host::experiments::stability::gpu_shot::Picture| -> Vec<[u32; 4]> {
+            let bits = |p: &dpm_lab::stability::gpu_shot::Picture| -> Vec<[u32; 4]> {
                 p.radiance.iter().map(|r| r.map(f32::to_bits)).collect()
             };
             let lit = lean.lit_estimates().count();
@@ -118,7 +117,7 @@ fn neither_changes_a_bit_of_a_method_with_histories() {
             render.paper.zone_spp = [2, 2, 1];
             let shown = |leave_nothing_out: bool, storage_tables: bool| {
                 let settings = RendererSettings {
-                    method: Method::from_config(&render),
+                    method: render.to_method(),
                     leave_nothing_out,
                     ..renderer_settings(&rig)
                 };

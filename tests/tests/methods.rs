@@ -1,12 +1,12 @@
 //! The passes between tracing and light: energy is kept, and the method of this program beats independent samples at equal rays. That rates
 //! are the CPU's, nobody waits and broken histories are forgotten are stability cases (`tracer_extremes.rs` runs them).
 
-use dpm_host::config::{Overrides, RenderMethod, RigConfig};
-use dpm_host::experiments::run_rig::{open_gpu, traced_raster};
-use dpm_host::experiments::sequence::{eye_mean, rmse, Span, Theatre};
-use dpm_host::gpu::{validation_messages, Gpu};
-use dpm_host::render::method::{Method, SamplerKind};
-use dpm_host::rig::Rig;
+use dpm_lab::sequence::{eye_mean, rmse, Span, Theatre};
+use dpm_render::gpu::{validation_messages, Gpu};
+use dpm_render::method::{Method, SamplerKind};
+use dpm_rig::config::{Overrides, RenderMethod, RigConfig};
+use dpm_rig::rig::Rig;
+use dpm_rig::run_rig::{open_gpu, traced_raster};
 use std::sync::Arc;
 
 const RASTER: &str = "render.software_raster=[64,48]";
@@ -37,7 +37,7 @@ fn stage(span: Span, moving: bool) -> (Arc<Rig>, Arc<Gpu>, Theatre) {
 fn method(rig: &Rig, which: RenderMethod) -> Method {
     let mut render = rig.config.render.clone();
     render.method = which;
-    let mut method = Method::from_config(&render);
+    let mut method = render.to_method();
     method.paper.zone_spp = [4, 4, 2];
     // The picture is small: angles that cut through it.
     method.paper.phi_h_deg = 5.0;
@@ -58,7 +58,7 @@ fn filters_and_rates_keep_the_energy() {
     let reference = theatre
         .play(&Method { sampler: SamplerKind::BlueNoise, ..Method::full(16) }, 16.0, 9, &mut |_, _| ())
         .unwrap();
-    let total = |seen: &dpm_host::experiments::sequence::Seen| -> f64 {
+    let total = |seen: &dpm_lab::sequence::Seen| -> f64 {
         let mean = eye_mean(&seen.frames, 48);
         mean.iter().map(|v| v.as_dvec3().element_sum()).filter(|v| v.is_finite()).sum()
     };
@@ -95,7 +95,7 @@ fn dpm_lowers_the_perceived_error_of_independent_samples() {
 #[test]
 fn dpm_shows_a_body_at_one_metre_a_second_where_it_is() {
     let (rig, _gpu, theatre) = stage(Span { last_slot: 150, warm_up: 64, kept: 31 }, true);
-    let centre = |slot| dpm_host::experiments::sequence::poses_at(&rig, slot)[0].translation;
+    let centre = |slot| dpm_lab::sequence::poses_at(&rig, slot)[0].translation;
     let speed = (centre(150) - centre(119)).length() / 31.0 * rig.rate().hz();
     assert!((0.9..1.1).contains(&speed), "the body moves at {speed} m/s while it is looked at");
     let seen = |m: &Method, spp: f32| eye_mean(&theatre.play(m, spp, 1, &mut |_, _| ()).unwrap().frames, 31);

@@ -1,11 +1,11 @@
 //! The packing shader against the CPU's packer, byte for byte, at rasters of every alignment; and a rig that packs on the GPU.
 
 use dpm_device::planes::{Channel, PlaneSchedule, PlaneSpec, Raster};
-use dpm_host::gpu::{
+use dpm_lab::reference::Sampler;
+use dpm_render::gpu::{
     BindingKind, BindingSet, BindingTable, Buffer, CommandList, ComputePipeline, FrameFence, Gpu, MemoryKind,
 };
-use dpm_host::pack::{self, BitPlaneFrame, Kernel};
-use dpm_host::reference::Sampler;
+use dpm_render::pack::{self, BitPlaneFrame, Kernel};
 use dpm_shaders::structs::BINDINGS;
 use dpm_tests::gpu::with_gpu;
 use dpm_tests::rigs::{demo_rig, run};

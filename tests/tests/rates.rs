@@ -1,10 +1,10 @@
 //! Found in use, C2, R5, R6 and R21: every frame rate with every tracker, with nothing but the defaults, at real pace. The light is compared with
 //! where the bodies truly were; frames are rendered up to 120 a second and prepared from 240 a second on.
 
-use dpm_host::gpu::Gpu;
-use dpm_host::pipeline::{self, RunOptions, RunOutcome};
-use dpm_host::rig::Rig;
-use dpm_host::telemetry::monitor::RunMonitor;
+use dpm_render::gpu::Gpu;
+use dpm_rig::pipeline::{self, RunOptions, RunOutcome};
+use dpm_rig::rig::Rig;
+use dpm_rig::telemetry::monitor::RunMonitor;
 use dpm_tests::gpu::with_gpu;
 use dpm_tests::rigs::demo_rig;
 use std::sync::Arc;

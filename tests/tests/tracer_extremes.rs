@@ -1,11 +1,11 @@
 //! Rays, shapes, lights and histories at the edge of what numbers can hold: the stability cases on the GPU under validation, those that are
 //! quick; `dpm stability` runs all. And a lost body, which needs no numbers.
 
-use dpm_host::experiments::stability::gpu::cases;
-use dpm_host::experiments::stability::gpu_shot::{Picture, Shot};
-use dpm_host::experiments::stability::shapes::*;
-use dpm_host::experiments::stability::{CaseVerdict, StabilityReport, SEED};
-use dpm_host::scene::Material;
+use dpm_lab::stability::gpu::cases;
+use dpm_lab::stability::gpu_shot::{Picture, Shot};
+use dpm_lab::stability::{CaseVerdict, StabilityReport, SEED};
+use dpm_scene::shapes::*;
+use dpm_scene::Material;
 use dpm_tests::gpu::with_gpu;
 use glam::{DVec3, Vec3};
 

@@ -1,9 +1,9 @@
 //! Everything in even light, on the GPU: no surface may create energy, and those that lose none must vanish.
 
-use dpm_host::experiments::stability::estimate::pooled;
-use dpm_host::experiments::stability::gpu_shot::Shot;
-use dpm_host::experiments::stability::shapes::*;
-use dpm_host::scene::{Material, Scene};
+use dpm_lab::stability::estimate::pooled;
+use dpm_lab::stability::gpu_shot::Shot;
+use dpm_scene::shapes::*;
+use dpm_scene::{Material, Scene};
 use dpm_tests::gpu::with_gpu;
 use glam::{DVec3, Vec3};
 

@@ -10,7 +10,7 @@ use dpm_device::transport::{Lane, LinkDevice};
 
 use super::MockProjector;
 use crate::faults::{FaultError, FaultKind, FaultPlan};
-use crate::rng::Draws;
+use dpm_device::rng::Draws;
 
 /// Packets of a stalled host that wait; a host that obeys its credits has fewer under way.
 const STALLED_KEPT: usize = 512;

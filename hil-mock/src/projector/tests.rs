@@ -8,12 +8,12 @@ mod protocol;
 mod safety;
 
 use super::*;
-use crate::rng::Draws;
 use dpm_device::link::{
     DropReason, Epoch, HostLink, LightLimits, LinkError, LinkSettings, LinkState, MessageType, SendOutcome,
     Verb,
 };
 use dpm_device::planes::PlaneSchedule;
+use dpm_device::rng::Draws;
 use dpm_device::time::FrameRate;
 use dpm_device::transport::inproc::Direct;
 use dpm_device::transport::{SendError, Transport, TransportError};

@@ -4,9 +4,9 @@
 mod common;
 
 use common::{assert_no_validation_messages, clean, layer, options, rig, threads, Bench};
-use dpm_host::gpu::{Gpu, GpuError, MemoryPool};
-use dpm_host::pipeline::renderer_settings;
-use dpm_host::render::{RenderError, Renderer};
+use dpm_render::gpu::{Gpu, GpuError, MemoryPool};
+use dpm_render::{RenderError, Renderer};
+use dpm_rig::pipeline::renderer_settings;
 use vulkan_faults::{Call, Session};
 
 /// Memory of one kind may be had in several ways, and all of them are tried before one gives up.

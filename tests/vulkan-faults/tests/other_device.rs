@@ -3,7 +3,7 @@
 mod common;
 
 use common::{layer, options, Bench};
-use dpm_host::gpu::Gpu;
+use dpm_render::gpu::Gpu;
 use std::path::PathBuf;
 use vulkan_faults::Call;
 

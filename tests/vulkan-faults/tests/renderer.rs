@@ -6,8 +6,8 @@
 mod common;
 
 use common::{assert_no_validation_messages, clean, layer, submit, Bench, PATIENCE_NS, SLACK};
-use dpm_host::gpu::{memory_given_up, Gpu, GpuError};
-use dpm_host::render::{FrameSlot, Renderer};
+use dpm_render::gpu::{memory_given_up, Gpu, GpuError};
+use dpm_render::{FrameSlot, Renderer};
 use dpm_shaders::structs::History;
 use std::sync::mpsc::channel;
 use std::sync::Arc;

@@ -5,11 +5,11 @@ mod common;
 
 use common::layer;
 use dpm_device::planes::Raster;
-use dpm_host::config::{Overrides, RigConfig};
-use dpm_host::gpu::{Gpu, GpuOptions};
-use dpm_host::pipeline::{self, PipelineError, RunOptions, RunOutcome};
-use dpm_host::rig::Rig;
-use dpm_host::telemetry::monitor::RunMonitor;
+use dpm_render::gpu::{Gpu, GpuOptions};
+use dpm_rig::config::{Overrides, RigConfig};
+use dpm_rig::pipeline::{self, PipelineError, RunOptions, RunOutcome};
+use dpm_rig::rig::Rig;
+use dpm_rig::telemetry::monitor::RunMonitor;
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 

@@ -2,11 +2,11 @@
 #![allow(dead_code)]
 
 use dpm_device::planes::Raster;
-use dpm_host::config::{Overrides, RigConfig};
-use dpm_host::gpu::{validation_messages, Gpu, GpuError, GpuOptions};
-use dpm_host::pipeline::renderer_settings;
-use dpm_host::render::{FrameInputs, FrameSlot, RenderError, Renderer};
-use dpm_host::rig::{affine, Rig};
+use dpm_render::gpu::{validation_messages, Gpu, GpuError, GpuOptions};
+use dpm_render::{FrameInputs, FrameSlot, RenderError, Renderer};
+use dpm_rig::config::{Overrides, RigConfig};
+use dpm_rig::pipeline::renderer_settings;
+use dpm_rig::rig::{affine, Rig};
 use glam::{DAffine3, DVec3};
 use std::sync::{Arc, OnceLock};
 use std::time::Duration;

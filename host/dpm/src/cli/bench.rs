@@ -1,0 +1,85 @@
+//! `dpm bench`: what each method costs on this machine's Vulkan device.
+
+use super::rig_args::RigArgs;
+use super::watch::{check_out, print, write_out};
+use dpm_lab::bench::{bench, MethodCost, METHODS};
+use dpm_rig::config::RenderMethod;
+use dpm_rig::failure::Failure;
+use dpm_rig::pipeline::PipelineError;
+use dpm_rig::rig::Rig;
+use dpm_rig::run_rig::open_gpu;
+use dpm_rig::telemetry::report::to_json;
+use std::path::PathBuf;
+
+/// Flags of `dpm bench`.
+#[derive(clap::Args, Clone, Debug)]
+pub struct BenchArgs {
+    /// The rig file; the demo's when left out
+    #[arg(value_name = "RIG.toml")]
+    rig: Option<PathBuf>,
+    #[command(flatten)]
+    flags: RigArgs,
+    /// Frames measured a method; fewer when they take longer than 20 s
+    #[arg(long, value_name = "N", default_value_t = 20, value_parser = clap::value_parser!(u32).range(3..=100_000))]
+    count: u32,
+    /// Only this method; may be given several times
+    #[arg(long, value_name = "NAME", value_parser = METHODS.map(RenderMethod::word))]
+    method: Vec<String>,
+    /// Print one JSON object
+    #[arg(long)]
+    json: bool,
+}
+
+fn lines(c: &MethodCost) -> String {
+    let gpu = c.gpu_ms.map_or("-".into(), |ms| format!("{ms:.3}"));
+    let mut text = format!(
+        "{:<9} {:>10.2} {:>10.2} {:>11.0} {:>11.0} {gpu:>10} {:>10.3}\n",
+        c.method,
+        c.rays_per_s * 1e-6,
+        c.samples_per_s * 1e-6,
+        c.rays_per_frame,
+        c.samples_per_frame,
+        c.wall_ms
+    );
+    let told: Vec<String> =
+        c.passes.iter().filter(|p| p.ms > 0.0).map(|p| format!("{} {:.3}", p.pass, p.ms)).collect();
+    if !told.is_empty() {
+        text += &format!("          ms by pass: {}\n", told.join(", "));
+    }
+    text
+}
+
+/// Measures every method at the projector's raster, whatever the device is.
+///
+/// # Errors
+/// Bad rig or flags, no GPU.
+pub fn execute(args: &BenchArgs) -> Result<(), Failure> {
+    args.flags.refuse("dpm bench", &["--frames", "--seconds", "--no-prediction"])?;
+    let config = args.flags.rig_at_rest(args.rig.as_deref())?;
+    check_out(args.flags.out.as_deref())?;
+    let gpu = open_gpu(&config)?;
+    let rig = Rig::build(&config, None)?;
+    if !args.json {
+        let (device, raster) = (gpu.summary(), rig.camera.raster);
+        print(&format!(
+            "{} ({}), {} x {}, spp {}, depth {}\n",
+            device.name,
+            device.driver,
+            raster.width(),
+            raster.height(),
+            config.render.spp,
+            config.render.depth
+        ));
+        print("method      Mrays/s Msamples/s  rays/frame  samples/fr     GPU ms    wall ms\n");
+    }
+    let report = bench(&rig, &gpu, args.count, &args.method, &mut |cost| {
+        if !args.json {
+            print(&lines(cost));
+        }
+    })
+    .map_err(PipelineError::from)?;
+    if args.json {
+        print(&(to_json(&report) + "\n"));
+    }
+    write_out(args.flags.out.as_deref(), "bench.json", &report)
+}

@@ -1,0 +1,371 @@
+//! `dpm dlpc900`: words into calls of the DLPC900 driver.
+
+use super::signals;
+use super::watch::{print, refuse_where_dark_stands};
+use crate::dlpc900::{sequence_of, status_text, PatternFileError, ShowAs};
+use clap::ValueEnum;
+use dpm_device::dlpc900::driver::{Dlpc900, UploadProgress};
+use dpm_device::dlpc900::image::{Compression, PlaneOrder};
+use dpm_device::dlpc900::lut::{led, LutEntry};
+use dpm_device::dlpc900::sequence::{LedSetup, Receiver, Repeat, VideoPatterns};
+use dpm_device::dlpc900::usb::{describe, list, UsbHid, UsbPlace};
+use dpm_rig::config::{Dlpc900Config, ProjectorBackend};
+use dpm_rig::failure::{Failure, FailureKind};
+use dpm_rig::standing::Identity;
+use std::io::{Read, Write};
+use std::os::unix::process::CommandExt;
+use std::path::PathBuf;
+use std::process::{Child, Stdio};
+use std::time::Duration;
+
+/// How long the controller of a run that was killed is tried to be opened.
+const GUARD_PATIENCE: Duration = Duration::from_secs(5);
+/// Between two tries.
+const GUARD_STEP: Duration = Duration::from_millis(5);
+
+/// Flags of `dpm dlpc900`.
+#[derive(clap::Args, Clone, Debug)]
+pub struct Dlpc900Args {
+    /// Which controller, as BUS:ADDRESS of lsusb; needed when several are plugged in
+    #[arg(long, value_name = "BUS:ADDRESS", global = true)]
+    device: Option<UsbPlace>,
+    #[command(subcommand)]
+    action: Action,
+}
+
+#[derive(clap::Subcommand, Clone, Debug)]
+enum Action {
+    /// Say what the controller is and does
+    Status,
+    /// Upload pictures as a pattern sequence (loaded and stopped; see --start)
+    Upload(UploadArgs),
+    /// Set up patterns cut out of the video signal, and start them
+    VideoPattern(VideoArgs),
+    /// Start the loaded sequence
+    Start,
+    /// Pause the sequence; start goes on from there
+    Pause,
+    /// Stop the sequence
+    Stop,
+    /// Exercise the mirrors 50/50 with the LEDs off, as they should be whenever nothing is shown
+    Idle,
+    /// Leave the exercise (takes 3 s)
+    LeaveIdle,
+    /// Park the mirrors with the LEDs off
+    Park,
+    /// Free the mirrors again; upload again afterwards
+    Unpark,
+    /// Go to standby, two minutes before power is cut
+    Standby,
+    /// Come back from standby
+    Wake,
+    /// Started by `dpm run`: puts the controller to rest when that run is killed
+    #[command(hide = true)]
+    Guard,
+}
+
+#[derive(clap::Args, Clone, Debug)]
+struct UploadArgs {
+    /// PNG or JPEG pictures of the DMD's size, one pattern each, in order
+    #[arg(required = true)]
+    files: Vec<PathBuf>,
+    /// Bits per pattern
+    #[arg(long, default_value_t = 1, value_parser = clap::value_parser!(u8).range(1..=8))]
+    depth: u8,
+    /// Time lit, microseconds; the shortest possible when not given
+    #[arg(long)]
+    exposure_us: Option<u32>,
+    /// Time black after each pattern, microseconds
+    #[arg(long, default_value_t = 0)]
+    dark_us: u32,
+    /// LEDs lit
+    #[arg(long, value_enum, default_value_t = Leds::White)]
+    leds: Leds,
+    /// LED currents as the driver board counts them, 0 to 255 each
+    #[arg(long, value_name = "R,G,B", value_parser = three)]
+    led_current: Option<[u8; 3]>,
+    /// Each pattern waits for an edge at TRIG_IN1
+    #[arg(long)]
+    wait_trigger: bool,
+    /// Show the sequence this many times; for ever when not given
+    #[arg(long)]
+    repeat: Option<u32>,
+    /// Which bytes of a pixel hold planes 0-7, 8-15, 16-23; matters for more than 8 planes an image
+    #[arg(long, value_enum, default_value_t = Order::Descending)]
+    plane_order: Order,
+    /// How images are coded
+    #[arg(long, value_enum, default_value_t = Coding::Smallest)]
+    compression: Coding,
+    /// Start at once
+    #[arg(long)]
+    start: bool,
+}
+
+#[derive(clap::Args, Clone, Debug)]
+struct VideoArgs {
+    /// Video input
+    #[arg(long, value_enum, default_value_t = Input::Hdmi)]
+    input: Input,
+    /// Frames per second of the video
+    #[arg(long, default_value_t = 60, value_parser = clap::value_parser!(u32).range(1..=120))]
+    frame_hz: u32,
+    /// Patterns per frame, 1 bit each
+    #[arg(long, default_value_t = 24, value_parser = clap::value_parser!(u8).range(1..=24))]
+    patterns: u8,
+    /// Time lit, microseconds; the frame is shared out evenly when not given
+    #[arg(long)]
+    exposure_us: Option<u32>,
+    /// LEDs lit
+    #[arg(long, value_enum, default_value_t = Leds::White)]
+    leds: Leds,
+}
+
+#[derive(Clone, Copy, Debug, ValueEnum)]
+enum Leds {
+    White,
+    Red,
+    Green,
+    Blue,
+}
+
+impl Leds {
+    const fn bits(self) -> u8 {
+        match self {
+            Self::White => led::WHITE,
+            Self::Red => led::RED,
+            Self::Green => led::GREEN,
+            Self::Blue => led::BLUE,
+        }
+    }
+}
+
+#[derive(Clone, Copy, Debug, ValueEnum)]
+enum Order {
+    /// 16-23, 8-15, 0-7, as common open programs write them
+    Descending,
+    /// 16-23, 0-7, 8-15, as TI's program writes them
+    BlueGreenRed,
+}
+
+#[derive(Clone, Copy, Debug, ValueEnum)]
+enum Coding {
+    Smallest,
+    Raw,
+    Rle,
+    Erle,
+}
+
+#[derive(Clone, Copy, Debug, ValueEnum)]
+enum Input {
+    Parallel,
+    Hdmi,
+    DisplayPort,
+}
+
+fn three(text: &str) -> Result<[u8; 3], String> {
+    let numbers: Result<Vec<u8>, _> = text.split(',').map(|n| n.trim().parse()).collect();
+    let numbers = numbers.ok().and_then(|n| <[u8; 3]>::try_from(n).ok());
+    numbers.ok_or_else(|| "write three numbers from 0 to 255, such as 80,80,80".to_owned())
+}
+
+impl From<PatternFileError> for Failure {
+    fn from(e: PatternFileError) -> Self {
+        Self::new(FailureKind::BadInput, e)
+    }
+}
+
+fn open(args: &Dlpc900Args) -> Result<Dlpc900<UsbHid>, Failure> {
+    let device = |text: String| Failure::new(FailureKind::Device, text);
+    let mut place = args.device;
+    if place.is_none() {
+        let all = list().map_err(|e| device(e.to_string()))?;
+        if all.len() > 1 {
+            let names: Vec<_> = all.iter().map(|p| format!("{}:{}", p.bus, p.address)).collect();
+            let text = format!(
+                "{} controllers are plugged in; name one by --device: {}",
+                all.len(),
+                names.join(", ")
+            );
+            return Err(Failure::new(FailureKind::BadInput, text));
+        }
+        place = all.first().copied();
+    }
+    let named = |e| device(format!("{}: {e}", describe(place)));
+    Ok(Dlpc900::new(UsbHid::open(place).map_err(named)?)?)
+}
+
+/// Runs the command.
+///
+/// # Errors
+/// [`FailureKind::Device`] when the controller cannot be reached or refuses; [`FailureKind::BadInput`] when pictures or times
+/// break a rule, with the LUT entry and the rule.
+pub fn execute(args: &Dlpc900Args) -> Result<(), Failure> {
+    if let Action::Guard = args.action {
+        return guard(args.device);
+    }
+    let lights = match &args.action {
+        Action::Upload(upload) => upload.start,
+        Action::Start | Action::VideoPattern(_) | Action::Wake => true,
+        _ => false,
+    };
+    if lights {
+        refuse_where_dark_stands(&Identity::of(&ProjectorBackend::Dlpc900(Dlpc900Config::default())))?;
+    }
+    let mut d = open(args)?;
+    match &args.action {
+        Action::Guard => {}
+        Action::Status => print(&status_text(&d.status()?)),
+        Action::Upload(upload) => execute_upload(&mut d, upload)?,
+        Action::VideoPattern(video) => execute_video(&mut d, video)?,
+        Action::Start => {
+            make_ready(&mut d)?;
+            d.start()?;
+        }
+        Action::Pause => d.pause()?,
+        Action::Stop => d.stop()?,
+        Action::Idle => d.idle()?,
+        Action::LeaveIdle => d.leave_idle()?,
+        Action::Park => d.park()?,
+        Action::Unpark => d.unpark()?,
+        Action::Standby => {
+            d.standby()?;
+            print("in standby; the mirrors are safe for a loss of power in 123 s\n");
+        }
+        Action::Wake => d.wake()?,
+    }
+    Ok(())
+}
+
+/// What rests is woken before it is to show something: the mirrors' exercise takes 3 s to leave.
+fn make_ready(d: &mut Dlpc900<UsbHid>) -> Result<(), Failure> {
+    if d.make_ready()? {
+        let _ =
+            writeln!(std::io::stderr(), "the controller rested (exercise, park or standby); that is ended");
+    }
+    Ok(())
+}
+
+/// Looks after a run that may die without a word: waits until the pipe that the run holds is closed. Nothing said through it means that
+/// the run was killed; its controller, which has no watchdog, is then put to rest.
+///
+/// # Errors
+/// The controller cannot be reached or refuses.
+fn guard(place: Option<UsbPlace>) -> Result<(), Failure> {
+    let device = |e: String| Failure::new(FailureKind::Device, e);
+    // Whoever ends the run ends its group, its session or its service: this must outlive it.
+    signals::ignore().map_err(|e| device(format!("cannot ignore signals: {e}")))?;
+    let mut said = Vec::new();
+    let _ = std::io::stdin().lock().take(16).read_to_end(&mut said);
+    if !said.is_empty() {
+        return Ok(());
+    }
+    let limit = std::time::Instant::now() + GUARD_PATIENCE;
+    let mut d = loop {
+        match UsbHid::open(place).map(Dlpc900::new) {
+            Ok(d) => break d?,
+            // The kernel frees the dead process's interface in its own time.
+            Err(_) if std::time::Instant::now() < limit => std::thread::sleep(GUARD_STEP),
+            Err(e) => return Err(device(format!("{}: {e}; it goes on showing", describe(place)))),
+        }
+    };
+    d.stop()?;
+    d.idle()?;
+    let _ =
+        writeln!(std::io::stderr(), "the run was killed: its DLPC900 is stopped and exercises its mirrors");
+    Ok(())
+}
+
+/// A process that looks after this one; see [`Action::Guard`]. It acts when this process ends, or drops this value, without
+/// [`Guard::dismiss`].
+pub(super) struct Guard(Option<Child>);
+
+impl Guard {
+    /// Starts it. Without one the run goes on, as it would have without this precaution.
+    pub(super) fn start(device: Option<&str>) -> Self {
+        let start = || {
+            let mut command = std::process::Command::new(std::env::current_exe()?);
+            command.args(["dlpc900", "guard"]).stdin(Stdio::piped()).stdout(Stdio::null());
+            if let Some(place) = device {
+                command.args(["--device", place]);
+            }
+            command.process_group(0).spawn()
+        };
+        match start() {
+            Ok(child) => Self(Some(child)),
+            Err(e) => {
+                let _ =
+                    writeln!(std::io::stderr(), "nothing looks after the DLPC900 if this run is killed: {e}");
+                Self(None)
+            }
+        }
+    }
+
+    /// Ends it: the run has ended by itself and has put the controller to rest.
+    pub(super) fn dismiss(self) {
+        if let Some(mut child) = self.0 {
+            let said = child.stdin.take().map(|mut pipe| pipe.write_all(b"over"));
+            if let Some(Ok(())) = said {
+                let _ = child.wait();
+            }
+        }
+    }
+}
+
+fn execute_upload(d: &mut Dlpc900<UsbHid>, u: &UploadArgs) -> Result<(), Failure> {
+    let show = ShowAs {
+        depth: u.depth,
+        exposure_us: u.exposure_us,
+        dark_us: u.dark_us,
+        leds: u.leds.bits(),
+        wait_trigger: u.wait_trigger,
+        repeat: u.repeat.map_or(Repeat::Forever, Repeat::Passes),
+        order: match u.plane_order {
+            Order::Descending => PlaneOrder::Descending,
+            Order::BlueGreenRed => PlaneOrder::BlueGreenRed,
+        },
+        compression: match u.compression {
+            Coding::Smallest => None,
+            Coding::Raw => Some(Compression::Raw),
+            Coding::Rle => Some(Compression::Rle),
+            Coding::Erle => Some(Compression::Erle),
+        },
+    };
+    let sequence = sequence_of(&u.files, d.dmd(), &show)?;
+    let bar = indicatif::ProgressBar::new(sequence.image_bytes() as u64);
+    let leds = LedSetup { current: u.led_current, polarity: None };
+    if u.start {
+        // Before the upload, which takes many seconds and would have been in vain.
+        make_ready(d)?;
+    }
+    d.upload(&sequence, leds, &mut |p: UploadProgress| bar.set_position(p.sent as u64))?;
+    bar.finish_and_clear();
+    if u.start {
+        d.start()?;
+    }
+    let (patterns, images, bytes) =
+        (sequence.entries().len(), sequence.images().len(), sequence.image_bytes());
+    print(&format!("{patterns} patterns in {images} images, {bytes} bytes\n"));
+    Ok(())
+}
+
+fn execute_video(d: &mut Dlpc900<UsbHid>, v: &VideoArgs) -> Result<(), Failure> {
+    let exposure_us = v.exposure_us.unwrap_or(1_000_000 / v.frame_hz / u32::from(v.patterns));
+    let entry = |i: u8| LutEntry { leds: v.leds.bits(), ..LutEntry::one_bit(i.into(), 0, i, exposure_us) };
+    make_ready(d)?;
+    d.start_video_patterns(&VideoPatterns {
+        dmd: d.dmd(),
+        receiver: match v.input {
+            Input::Parallel => Receiver::None,
+            Input::Hdmi => Receiver::Hdmi,
+            Input::DisplayPort => Receiver::DisplayPort,
+        },
+        frame_hz: v.frame_hz,
+        entries: (0..v.patterns).map(entry).collect(),
+        leds: LedSetup::default(),
+    })?;
+    print(&format!(
+        "{} patterns of {exposure_us} us in each of {} video frames per second\n",
+        v.patterns, v.frame_hz
+    ));
+    Ok(())
+}

@@ -1,0 +1,456 @@
+//! `dpm doctor`: what this machine can do, line by line, and what to do about what is missing.
+
+use super::os;
+use super::watch::print;
+use dpm_rig::failure::{Failure, FailureKind};
+use dpm_rig::realtime::{self, Refusal};
+use dpm_rig::telemetry::report::to_json;
+use std::fs;
+use std::path::PathBuf;
+
+/// Flags of `dpm doctor`.
+#[derive(clap::Args, Clone, Debug)]
+pub struct DoctorArgs {
+    /// Print one JSON object
+    #[arg(long)]
+    json: bool,
+}
+
+/// How bad a finding is.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, serde::Serialize)]
+#[serde(rename_all = "lowercase")]
+pub enum State {
+    /// As it should be.
+    Ok,
+    /// Works, with a price.
+    Warning,
+    /// Something cannot be used.
+    Missing,
+    /// Good to know.
+    Info,
+}
+
+/// One finding.
+#[derive(Clone, Debug, serde::Serialize)]
+pub struct Finding {
+    /// What was looked at.
+    pub name: String,
+    /// How it is.
+    pub state: State,
+    /// What was found.
+    pub found: String,
+    /// What to do; empty when nothing is to be done.
+    pub remedy: String,
+}
+
+impl Finding {
+    fn new(name: &str, state: State, found: impl Into<String>, remedy: impl Into<String>) -> Self {
+        Self { name: name.into(), state, found: found.into(), remedy: remedy.into() }
+    }
+}
+
+/// Everything that was found.
+#[derive(Debug, serde::Serialize)]
+pub struct Findings {
+    /// True when the main job can run: a Vulkan device is there.
+    pub can_render: bool,
+    /// Findings in the order in which a frame meets them.
+    pub findings: Vec<Finding>,
+}
+
+/// Runs the command.
+///
+/// # Errors
+/// [`FailureKind::NoGpu`] when there is no usable Vulkan device; everything else that is missing is only said.
+pub fn execute(args: &DoctorArgs) -> Result<(), Failure> {
+    let system = System { root: PathBuf::from("/") };
+    let mut findings = Vec::new();
+    let can_render = vulkan(&mut findings);
+    findings.push(cores(std::thread::available_parallelism().map_or(1, usize::from)));
+    findings.push(simd());
+    let fifo = briefly(|| realtime::os::set_fifo_priority(FRAME_PATH_PRIORITY));
+    findings.push(right("real-time priority", "SCHED_FIFO granted", fifo));
+    findings.push(right("locked memory", "granted", briefly(lock_and_unlock)));
+    findings.extend(system.throttling());
+    findings.extend(system.governor());
+    findings.extend(system.clock());
+    findings.extend(system.usb());
+    findings.push(system.serial_ports());
+    let all = Findings { can_render, findings };
+    print(&if args.json { to_json(&all) + "\n" } else { table(&all.findings) });
+    if all.can_render {
+        Ok(())
+    } else {
+        Err(Failure::new(
+            FailureKind::NoGpu,
+            "no usable Vulkan device: nothing can be rendered on this machine",
+        ))
+    }
+}
+
+/// What `packaging/99-dpm-limits.conf` grants.
+const FRAME_PATH_PRIORITY: u32 = 80;
+
+fn vulkan(findings: &mut Vec<Finding>) -> bool {
+    let devices = match dpm_render::gpu::Gpu::list() {
+        Ok(devices) => devices,
+        Err(e) => {
+            findings.push(Finding::new("Vulkan", State::Missing, e.to_string(), ""));
+            return false;
+        }
+    };
+    let mut usable = false;
+    for (i, device) in devices.iter().enumerate() {
+        let kind = if device.software { ", software" } else { "" };
+        let rays = if device.ray_query { "ray query" } else { "no ray query" };
+        let found = format!(
+            "{} ({}, Vulkan {}{kind}), {} MiB, subgroup {}, {rays}",
+            device.name, device.driver, device.api_version, device.memory_mib, device.subgroup_size
+        );
+        usable |= device.refused.is_none();
+        let (state, remedy) = match &device.refused {
+            Some(reason) => (State::Missing, format!("cannot be used: {reason}")),
+            None if device.software => {
+                let advice = "runs at virtual pace with a small raster; install your GPU vendor's driver for real time";
+                (State::Warning, advice.to_string())
+            }
+            None => (State::Ok, String::new()),
+        };
+        findings.push(Finding::new(&format!("Vulkan device {i}"), state, found, remedy));
+    }
+    if devices.is_empty() {
+        let remedy =
+            "install the GPU vendor's driver, or software Vulkan: apt-get install mesa-vulkan-drivers";
+        findings.push(Finding::new("Vulkan", State::Missing, "a loader but no device", remedy));
+    }
+    usable
+}
+
+fn cores(count: usize) -> Finding {
+    let found = format!("{count} usable");
+    if count >= 4 {
+        Finding::new("cores", State::Ok, found, "")
+    } else {
+        let remedy = "threads park instead of spinning (real_time.wait = \"auto\"): hand-offs take about 30 us, not 0.5 us";
+        Finding::new("cores", State::Warning, found, remedy)
+    }
+}
+
+fn simd() -> Finding {
+    let kernel = dpm_render::pack::Kernel::best();
+    let (state, remedy) = match kernel {
+        dpm_render::pack::Kernel::Scalar => {
+            (State::Warning, "packing on this CPU is slow: prefer a GPU or a CPU with AVX2")
+        }
+        _ => (State::Ok, ""),
+    };
+    Finding::new("bit-plane packing", state, kernel.name(), remedy)
+}
+
+/// A right that was tried, on a thread that ended at once.
+fn right(name: &str, granted: &str, tried: Result<(), Refusal>) -> Finding {
+    match tried {
+        Ok(()) => Finding::new(name, State::Ok, granted, ""),
+        Err(r) => {
+            Finding::new(name, State::Warning, format!("{} was refused ({})", r.what, r.reason), r.remedy)
+        }
+    }
+}
+
+/// Runs `ask` on a thread that ends at once, so that this one keeps nothing.
+fn briefly(ask: fn() -> Result<(), Refusal>) -> Result<(), Refusal> {
+    let refused = |reason: String| Err(Refusal { what: "a right".into(), reason, remedy: String::new() });
+    match std::thread::Builder::new().spawn(ask) {
+        Ok(thread) => thread.join().unwrap_or_else(|_| refused("the thread that asked panicked".to_string())),
+        Err(e) => refused(format!("no thread to ask it: {e}")),
+    }
+}
+
+fn lock_and_unlock() -> Result<(), Refusal> {
+    realtime::os::lock_memory()?;
+    realtime::os::unlock_memory();
+    Ok(())
+}
+
+/// The kernel's files under `/proc`, `/sys` and `/dev`, below a root that tests can replace.
+struct System {
+    root: PathBuf,
+}
+
+impl System {
+    fn read(&self, path: &str) -> Option<String> {
+        Some(fs::read_to_string(self.root.join(path)).ok()?.trim().to_string())
+    }
+
+    /// Names in a folder in order; empty when it is not there.
+    fn names(&self, path: &str) -> Vec<String> {
+        let Ok(entries) = fs::read_dir(self.root.join(path)) else { return Vec::new() };
+        let mut names: Vec<String> = entries.filter_map(|e| e.ok()?.file_name().into_string().ok()).collect();
+        names.sort();
+        names
+    }
+
+    fn throttling(&self) -> Option<Finding> {
+        let runtime: i64 = self.read("proc/sys/kernel/sched_rt_runtime_us")?.parse().ok()?;
+        let period: i64 = self.read("proc/sys/kernel/sched_rt_period_us")?.parse().ok()?;
+        let name = "real-time throttling";
+        Some(if runtime < 0 || runtime >= period {
+            Finding::new(name, State::Ok, "off", "")
+        } else {
+            let gap_ms = (period - runtime) as f64 / 1e3;
+            Finding::new(
+                name,
+                State::Warning,
+                format!("a thread that spins at real-time priority stands still {gap_ms:.0} ms in every {:.0} ms", period as f64 / 1e3),
+                "on a machine for the rig alone: sysctl kernel.sched_rt_runtime_us=-1; else real_time.wait = \"park\"",
+            )
+        })
+    }
+
+    fn governor(&self) -> Option<Finding> {
+        let governor = self.read("sys/devices/system/cpu/cpu0/cpufreq/scaling_governor")?;
+        let name = "clock frequency";
+        Some(if governor == "performance" {
+            Finding::new(name, State::Ok, "governor performance", "")
+        } else {
+            let remedy =
+                "cpupower frequency-set -g performance, so that a frame does not start on a slow core";
+            Finding::new(name, State::Warning, format!("governor {governor}"), remedy)
+        })
+    }
+
+    fn clock(&self) -> Option<Finding> {
+        let source = self.read("sys/devices/system/clocksource/clocksource0/current_clocksource")?;
+        let name = "clock source";
+        Some(
+            if matches!(
+                source.as_str(),
+                "tsc" | "kvm-clock" | "arch_sys_counter" | "hyperv_clocksource_tsc_page"
+            ) {
+                Finding::new(name, State::Ok, source, "")
+            } else {
+                let remedy = "reading the time takes a system call of about 1 us; boot with clocksource=tsc if the CPU's is stable";
+                Finding::new(name, State::Warning, source, remedy)
+            },
+        )
+    }
+
+    fn usb(&self) -> Vec<Finding> {
+        let mut out = Vec::new();
+        if !self.root.join("dev/bus/usb").is_dir() {
+            out.push(Finding::new(
+                "USB",
+                State::Info,
+                "no USB bus on this machine",
+                "needed only for projectors on USB",
+            ));
+            return out;
+        }
+        let frame_mb = 2.36;
+        if let Some(mb) =
+            self.read("sys/module/usbcore/parameters/usbfs_memory_mb").and_then(|t| t.parse::<u32>().ok())
+        {
+            let frames = if mb == 0 {
+                "any number of".into()
+            } else {
+                format!("{:.0}", (f64::from(mb) / frame_mb).floor())
+            };
+            let found = format!("usbfs_memory_mb = {mb}: {frames} frames of 1024 x 768 x 24 in flight");
+            out.push(if mb == 0 || mb >= 64 {
+                Finding::new("USB memory", State::Ok, found, "")
+            } else {
+                let remedy = "echo 256 > /sys/module/usbcore/parameters/usbfs_memory_mb, or usbcore.usbfs_memory_mb=256 at boot";
+                Finding::new("USB memory", State::Warning, found, remedy)
+            });
+        }
+        for name in self.names("sys/bus/usb/devices") {
+            let field = |f: &str| self.read(&format!("sys/bus/usb/devices/{name}/{f}"));
+            let (Some(vendor), Some(product)) = (field("idVendor"), field("idProduct")) else { continue };
+            let Some(what) = known_projector(&vendor, &product) else { continue };
+            let node = match (field("busnum"), field("devnum")) {
+                (Some(bus), Some(dev)) => format!("dev/bus/usb/{bus:0>3}/{dev:0>3}"),
+                _ => continue,
+            };
+            let found = format!("{what} ({vendor}:{product}) at /{node}");
+            out.push(if os::may_read_and_write(&self.root.join(&node)) {
+                Finding::new("USB projector", State::Ok, found, "")
+            } else {
+                Finding::new(
+                    "USB projector",
+                    State::Missing,
+                    format!("{found}: no permission"),
+                    udev_rule(&vendor, &product),
+                )
+            });
+        }
+        if out.iter().all(|f| f.name != "USB projector") {
+            out.push(Finding::new("USB projector", State::Info, "none plugged in", ""));
+        }
+        out
+    }
+
+    fn serial_ports(&self) -> Finding {
+        let ports: Vec<String> = self
+            .names("dev")
+            .into_iter()
+            .filter(|n| ["ttyUSB", "ttyACM", "ttyAMA"].iter().any(|p| n.starts_with(p)))
+            .collect();
+        if ports.is_empty() {
+            return Finding::new("serial ports", State::Info, "none", "");
+        }
+        let barred: Vec<&String> =
+            ports.iter().filter(|p| !os::may_read_and_write(&self.root.join("dev").join(p))).collect();
+        let found = ports.iter().map(|p| format!("/dev/{p}")).collect::<Vec<_>>().join(", ");
+        if barred.is_empty() {
+            Finding::new("serial ports", State::Ok, found, "")
+        } else {
+            let remedy = "no permission: usermod -aG dialout $USER, then log in again";
+            Finding::new("serial ports", State::Missing, found, remedy)
+        }
+    }
+}
+
+fn known_projector(vendor: &str, product: &str) -> Option<&'static str> {
+    match (vendor, product) {
+        ("0451", "c900") => Some("TI DLPC900"),
+        ("1209", "0947") => Some("bit-plane projector"),
+        _ => None,
+    }
+}
+
+fn udev_rule(vendor: &str, product: &str) -> String {
+    format!(
+        "put `SUBSYSTEM==\"usb\", ATTR{{idVendor}}==\"{vendor}\", ATTR{{idProduct}}==\"{product}\", TAG+=\"uaccess\"` into \
+         /etc/udev/rules.d/70-dpm.rules, then: udevadm control --reload, and plug it in again"
+    )
+}
+
+fn table(findings: &[Finding]) -> String {
+    let width = findings.iter().map(|f| f.name.len()).max().unwrap_or(0);
+    let mut out = String::new();
+    for f in findings {
+        let state = match f.state {
+            State::Ok => "ok     ",
+            State::Warning => "warning",
+            State::Missing => "MISSING",
+            State::Info => "       ",
+        };
+        out += &format!("{state}  {:width$}  {}\n", f.name, f.found);
+        if !f.remedy.is_empty() {
+            out += &format!("         {:width$}  -> {}\n", "", f.remedy);
+        }
+    }
+    out
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use std::path::Path;
+
+    struct Root(PathBuf);
+
+    impl Root {
+        fn new(name: &str, files: &[(&str, &str)]) -> (Self, System) {
+            let root = std::env::temp_dir().join(format!("dpm-doctor-{}-{name}", std::process::id()));
+            for (path, text) in files {
+                let path = root.join(path);
+                fs::create_dir_all(path.parent().unwrap_or(Path::new("/"))).unwrap();
+                fs::write(path, text).unwrap();
+            }
+            (Self(root.clone()), System { root })
+        }
+    }
+
+    impl Drop for Root {
+        fn drop(&mut self) {
+            let _ = fs::remove_dir_all(&self.0);
+        }
+    }
+
+    #[test]
+    fn throttling_names_the_gap() {
+        let files = |runtime| {
+            [
+                ("proc/sys/kernel/sched_rt_runtime_us", runtime),
+                ("proc/sys/kernel/sched_rt_period_us", "1000000\n"),
+            ]
+        };
+        let (_root, system) = Root::new("throttled", &files("950000\n"));
+        let finding = system.throttling().unwrap();
+        assert_eq!(finding.state, State::Warning);
+        assert!(finding.found.contains("50 ms in every 1000 ms"), "{}", finding.found);
+        let (_root, system) = Root::new("free", &files("-1\n"));
+        assert_eq!(system.throttling().unwrap().state, State::Ok);
+    }
+
+    #[test]
+    fn usb_memory_is_counted_in_frames_and_projectors_are_found() {
+        let (_root, system) = Root::new(
+            "usb",
+            &[
+                ("sys/module/usbcore/parameters/usbfs_memory_mb", "16\n"),
+                ("sys/bus/usb/devices/1-2/idVendor", "0451\n"),
+                ("sys/bus/usb/devices/1-2/idProduct", "c900\n"),
+                ("sys/bus/usb/devices/1-2/busnum", "1\n"),
+                ("sys/bus/usb/devices/1-2/devnum", "7\n"),
+                ("sys/bus/usb/devices/1-3/idVendor", "046d\n"),
+                ("sys/bus/usb/devices/1-3/idProduct", "c077\n"),
+                ("dev/bus/usb/001/007", ""),
+            ],
+        );
+        let findings = system.usb();
+        assert_eq!(findings.len(), 2, "{findings:?}");
+        assert!(findings[0].found.contains("16: 6 frames"), "{}", findings[0].found);
+        assert_eq!((findings[0].state, findings[1].state), (State::Warning, State::Ok));
+        assert!(findings[1].found.contains("TI DLPC900 (0451:c900) at /dev/bus/usb/001/007"));
+    }
+
+    #[test]
+    fn a_projector_without_permission_gets_its_udev_rule() {
+        let (_root, system) = Root::new(
+            "barred",
+            &[
+                ("sys/bus/usb/devices/1-2/idVendor", "0451\n"),
+                ("sys/bus/usb/devices/1-2/idProduct", "c900\n"),
+                ("sys/bus/usb/devices/1-2/busnum", "1\n"),
+                ("sys/bus/usb/devices/1-2/devnum", "9\n"),
+                ("dev/bus/usb/001/001", ""),
+            ],
+        );
+        // The node is not there, which is as inaccessible as a barred one (also for root).
+        let findings = system.usb();
+        assert_eq!(findings[0].state, State::Missing);
+        assert!(findings[0].remedy.contains("ATTR{idProduct}==\"c900\", TAG+=\"uaccess\""));
+    }
+
+    #[test]
+    fn a_machine_without_anything_is_told_so() {
+        let (_root, system) = Root::new("bare", &[("dev/null", "")]);
+        assert!(system.throttling().is_none() && system.governor().is_none() && system.clock().is_none());
+        assert_eq!(system.usb()[0].state, State::Info);
+        assert_eq!(system.serial_ports().found, "none");
+    }
+
+    #[test]
+    fn a_refused_right_says_what_to_set() {
+        let refusal = Refusal {
+            what: "SCHED_FIFO priority 80".into(),
+            reason: "Operation not permitted".into(),
+            remedy: "set rtprio".into(),
+        };
+        let finding = right("real-time priority", "granted", Err(refusal));
+        assert_eq!(finding.state, State::Warning);
+        assert!(finding.found.contains("priority 80 was refused (Operation not permitted)"));
+        assert_eq!(finding.remedy, "set rtprio");
+        assert_eq!(right("x", "granted", Ok(())).state, State::Ok);
+    }
+
+    #[test]
+    fn serial_ports_are_listed_but_not_other_terminals() {
+        let (_root, system) =
+            Root::new("serial", &[("dev/ttyUSB0", ""), ("dev/ttyACM3", ""), ("dev/tty7", "")]);
+        let finding = system.serial_ports();
+        assert_eq!((finding.state, finding.found.as_str()), (State::Ok, "/dev/ttyACM3, /dev/ttyUSB0"));
+    }
+}

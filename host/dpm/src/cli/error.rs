@@ -1,0 +1,308 @@
+//! `dpm error`: error against cost of every method, as tables and curves.
+
+use super::error_files::{known, known_or, merge, report, show, Kept, Origin};
+use super::progress::Progress;
+use super::rig_args::RigArgs;
+use super::watch::print;
+use dpm_common::files::check_folder;
+use dpm_device::planes::Raster;
+use dpm_lab::error::plan::{contenders, groups, Group};
+use dpm_lab::error::plot::{curves, Cost};
+use dpm_lab::error::report::{csv, markdown};
+use dpm_lab::error::runs::{
+    is_other, ErrorOptions, ErrorRunError, ErrorRuns, Extent, GroupResult, AT_EQUAL_TIME, EYE_FRAMES, RACES,
+};
+use dpm_render::gpu::Gpu;
+use dpm_rig::config::RenderConfig;
+use dpm_rig::failure::{Failure, FailureKind};
+use dpm_rig::pipeline::PipelineError;
+use dpm_rig::rig::Rig;
+use dpm_rig::run_rig::open_gpu;
+use dpm_rig::telemetry::report::to_json;
+use std::path::{Path, PathBuf};
+use std::sync::Arc;
+
+/// Flags of `dpm error`.
+#[derive(clap::Args, Clone, Debug)]
+#[command(args_conflicts_with_subcommands = true, subcommand_negates_reqs = true)]
+pub struct ErrorArgs {
+    #[command(subcommand)]
+    merge: Option<ErrorCommand>,
+    /// The rig file
+    #[arg(value_name = "RIG.toml", required = true)]
+    rig: Option<PathBuf>,
+    #[command(flatten)]
+    flags: RigArgs,
+    /// A small raster, few frames, three budgets: minutes on two cores without a GPU
+    #[arg(long)]
+    quick: bool,
+    /// Also measure dpm with each of its parts off in turn
+    #[arg(long)]
+    ablation: bool,
+    /// Samples a pixel of the paper's method where the eye looks, 1/64 to 4096, one a group: all methods get its rays; below 1, that
+    /// share of the rays of 1
+    #[arg(long, value_name = "SPP,...", value_delimiter = ',', value_parser = budget)]
+    budgets: Vec<f64>,
+    /// Samples a pixel of the reference
+    #[arg(long, value_name = "SPP", value_parser = clap::value_parser!(u32).range(2..=65536))]
+    reference_spp: Option<u32>,
+    /// Measure another experiment than methods at equal rays
+    #[arg(long, value_enum, conflicts_with_all = ["ablation", "budgets"])]
+    preset: Option<Preset>,
+    /// List the groups with their numbers and measure nothing
+    #[arg(long)]
+    pub(super) list: bool,
+    /// Measure this group only; `dpm error merge` joins them
+    #[arg(long, value_name = "N")]
+    pub(super) index: Option<usize>,
+    /// Also write what the eye saw of every method and of the reference, frame by frame, for metrics of others: OUT/sequences
+    #[arg(long, conflicts_with = "preset")]
+    sequences: bool,
+    /// Print one JSON object
+    #[arg(long)]
+    pub(super) json: bool,
+}
+
+/// Experiments of others.
+#[derive(clap::ValueEnum, Clone, Copy, Debug)]
+enum Preset {
+    /// Section 3 of the paper: one body in four materials, 5 to 30 samples a pixel, standing and moving
+    Figure3,
+    /// Every method on one body in four materials, standing and moving, looked at and looked past
+    Table,
+}
+
+fn budget(text: &str) -> Result<f64, String> {
+    let value = match text.split_once('/') {
+        Some((a, b)) => a.parse::<f64>().ok().zip(b.parse::<f64>().ok()).map(|(a, b)| a / b),
+        None => text.parse().ok(),
+    };
+    value
+        .filter(|v| (1.0 / 64.0..=4096.0).contains(v))
+        .ok_or_else(|| "write samples a pixel from 1/64 to 4096, for example 18 or 1/4".to_owned())
+}
+
+/// What else `dpm error` does.
+#[derive(clap::Subcommand, Clone, Debug)]
+enum ErrorCommand {
+    /// Join the groups that are measured in a folder into its tables and curves
+    Merge {
+        /// The folder
+        #[arg(long, value_name = "DIR", default_value = "out/error")]
+        out: PathBuf,
+        /// Print one JSON object: the groups of each experiment found, under the name of its report
+        #[arg(long)]
+        json: bool,
+    },
+}
+
+/// Measures what is not measured yet and writes tables and curves.
+///
+/// # Errors
+/// Bad rig or flags, no GPU, a folder that cannot be written.
+pub fn execute(args: &ErrorArgs) -> Result<(), Failure> {
+    if let Some(ErrorCommand::Merge { out, json }) = &args.merge {
+        return merge(out, *json);
+    }
+    args.flags.refuse("dpm error", &["--frames", "--seconds", "--no-prediction"])?;
+    match args.preset {
+        Some(Preset::Figure3) => return super::error_figure3::figure3(args),
+        Some(Preset::Table) => return super::error_table::table(args),
+        None => {}
+    }
+    let budgets = match (&args.budgets[..], args.quick) {
+        ([], true) => vec![2.0, 6.0, 18.0],
+        ([], false) => vec![0.25, 0.5, 1.0, 2.0, 4.0, 9.0, 18.0, 36.0, 64.0],
+        (given, _) => given.to_vec(),
+    };
+    let all = groups(&budgets);
+    if args.list {
+        return list(args, all.iter().map(Group::name));
+    }
+    let chosen = chosen(args, &all)?;
+    let out = folder(args);
+    let runs = prepare(args, &out)?;
+    let results = measure(&runs, &chosen, args, &out)?;
+    end(args, &out, &results)
+}
+
+/// Reports the whole experiment, or shows the group that `--index` names.
+pub(super) fn end<T: Kept>(args: &ErrorArgs, out: &Path, groups: &[T]) -> Result<(), Failure> {
+    if args.index.is_some() {
+        // One group of many is no report: those of the whole come from `merge`.
+        show(groups, args.json);
+        return Ok(());
+    }
+    report(out, groups, args.json)
+}
+
+impl Kept for GroupResult {
+    const PREFIX: &'static str = "group";
+    const REPORT: &'static str = "error";
+
+    fn name(&self) -> String {
+        self.group().name()
+    }
+
+    fn origin(&self) -> Origin<'_> {
+        Origin { key: &self.key, stamp: &self.stamp, extent: Some(self.extent) }
+    }
+
+    fn order(&self) -> (bool, bool, f64) {
+        let group = self.group();
+        (false, group.moving, group.budget)
+    }
+
+    fn markdown(groups: &[Self]) -> String {
+        markdown(groups)
+    }
+
+    fn reports(groups: &[Self]) -> Result<Vec<(String, String)>, String> {
+        let mut all = vec![(".csv".to_owned(), csv(groups))];
+        for (moving, motion) in [(false, "still"), (true, "moving")] {
+            for (cost, name) in [(Cost::Rays, "rays"), (Cost::GpuMs, "ms")] {
+                all.push((format!("-{motion}-{name}.svg"), curves(groups, moving, cost)?));
+            }
+        }
+        Ok(all)
+    }
+}
+
+pub(super) fn folder(args: &ErrorArgs) -> PathBuf {
+    let own = match args.preset {
+        Some(Preset::Figure3) => "out/figure3",
+        Some(Preset::Table) => "out/table",
+        None => "out/error",
+    };
+    args.flags.out.clone().unwrap_or_else(|| own.into())
+}
+
+/// Names with their numbers. A rig file that cannot be run has no groups.
+pub(super) fn list(args: &ErrorArgs, names: impl Iterator<Item = String>) -> Result<(), Failure> {
+    args.flags.rig_at_rest(args.rig.as_deref())?;
+    if args.json {
+        let names: Vec<String> = names.collect();
+        print(&(to_json(&serde_json::json!({ "groups": names })) + "\n"));
+        return Ok(());
+    }
+    let lines: String = names.enumerate().map(|(i, name)| format!("{i} {name}\n")).collect();
+    print(&lines);
+    Ok(())
+}
+
+/// What `--index` names, or all.
+pub(super) fn chosen<T: Copy>(args: &ErrorArgs, all: &[T]) -> Result<Vec<T>, Failure> {
+    match args.index {
+        None => Ok(all.to_vec()),
+        Some(i) if i < all.len() => Ok(vec![all[i]]),
+        Some(i) => {
+            let told = format!("--index {i}: there are groups 0 to {}; --list names them", all.len() - 1);
+            Err(Failure::new(FailureKind::BadInput, told))
+        }
+    }
+}
+
+pub(super) fn options(args: &ErrorArgs, out: &Path) -> ErrorOptions {
+    ErrorOptions {
+        extent: Extent {
+            warm_up: if args.quick { 48 } else { 96 },
+            // 250 ms at 947 fps: 33 ms for the eye at the end, flicker down to 4 Hz.
+            kept: 237,
+            reference_spp: args.reference_spp.unwrap_or(if args.quick { 128 } else { 1000 }),
+        },
+        ablation: args.ablation,
+        cache: out.join("cache"),
+    }
+}
+
+/// The GPU, and the rig at the raster to measure at: small without a GPU or in a hurry.
+pub(super) fn stage(args: &ErrorArgs) -> Result<(Arc<Gpu>, Rig), Failure> {
+    let config = args.flags.rig_at_rest(args.rig.as_deref())?;
+    // Not after the minutes that the first reference takes.
+    check_folder(&folder(args))
+        .map_err(|e| Failure::new(FailureKind::BadInput, format!("{e}; choose another folder with --out")))?;
+    let gpu = open_gpu(&config)?;
+    let small = args.flags.raster.is_none() && (args.quick || gpu.summary().software);
+    let raster = if small { Raster::new(80, 60) } else { None };
+    Ok((gpu, Rig::build(&config, raster)?))
+}
+
+fn prepare(args: &ErrorArgs, out: &Path) -> Result<ErrorRuns, Failure> {
+    let (gpu, rig) = stage(args)?;
+    Ok(ErrorRuns::new(Arc::new(rig), gpu, options(args, out)))
+}
+
+/// What a sequence costs beside the others, for the time that is left: sample frames, and as much for each frame as 3 samples take.
+pub(super) fn weight(what: &str, group: Group, extent: Extent, methods: usize) -> u64 {
+    let frames = f64::from(extent.warm_up + extent.kept);
+    let sequence = frames * (group.budget.max(1.0) + 3.0);
+    let of = match what {
+        "reference" => EYE_FRAMES as f64 * f64::from(extent.reference_spp) / 2.0,
+        "reference of every frame" => f64::from(extent.kept * extent.reference_spp),
+        "times" => 40.0 / frames * sequence * methods as f64,
+        // About twice the samples, for the warm-up and the frames that the eye sees.
+        what if what.ends_with(AT_EQUAL_TIME) => {
+            f64::from(extent.warm_up + EYE_FRAMES as u32) * (2.0 * group.budget.max(1.0) + 3.0)
+        }
+        _ => sequence,
+    };
+    of as u64
+}
+
+/// Races of a group at most: one at equal rays, the others for equal time.
+const MOST_RACES: u64 = 1 + RACES as u64;
+
+/// All that is drawn of a group, without its reference: each method twice, the races, and each of the others twice at equal time.
+pub(super) fn weight_of_methods(group: Group, extent: Extent, methods: usize) -> u64 {
+    let of = |what: &str| weight(what, group, extent, methods);
+    let others = contenders(&RenderConfig::default(), false).iter().filter(|c| is_other(c.name)).count();
+    2 * methods as u64 * of("") + MOST_RACES * of("times") + 2 * others as u64 * of(AT_EQUAL_TIME)
+}
+
+fn measure(
+    runs: &ErrorRuns,
+    chosen: &[Group],
+    args: &ErrorArgs,
+    out: &Path,
+) -> Result<Vec<GroupResult>, Failure> {
+    let extent = options(args, out).extent;
+    let methods = runs.methods();
+    let sequences = |group: Group| out.join("sequences").join(group.name());
+    let total = |group: Group, first: bool| {
+        let of = |what: &str| weight(what, group, extent, methods);
+        let reference = if first { 2 * of("reference") } else { 0 };
+        let every = if group.moving { of("reference of every frame") } else { 0 };
+        let measured = if known::<GroupResult>(out, &group.name(), &runs.key(group)).is_some() {
+            0
+        } else {
+            weight_of_methods(group, extent, methods) + reference
+        };
+        measured + if args.sequences { methods as u64 * of("") + every } else { 0 }
+    };
+    let first = |k: usize| chosen[..k].iter().all(|g| g.moving != chosen[k].moving);
+    let totals: Vec<u64> = chosen.iter().enumerate().map(|(k, &g)| total(g, first(k))).collect();
+    let mut progress = Progress::new(&totals);
+    let mut results = Vec::new();
+    for &group in chosen {
+        let name = group.name();
+        let mut each =
+            |what: &str| progress.step(&format!("{name} {what}"), weight(what, group, extent, methods));
+        let result = known_or(out, &name, &runs.key(group), || {
+            let measured = runs.measure(group, &mut each).map_err(failure)?;
+            Ok((measured.result.clone(), Some(measured)))
+        })?;
+        if args.sequences {
+            runs.export(group, &result, &sequences(group), &mut each).map_err(failure)?;
+        }
+        progress.end_of_part(&name);
+        results.push(result);
+    }
+    Ok(results)
+}
+
+pub(super) fn failure(error: ErrorRunError) -> Failure {
+    match error {
+        ErrorRunError::Render(e) => PipelineError::from(e).into(),
+        other => Failure::new(FailureKind::BadInput, other),
+    }
+}

@@ -1,0 +1,99 @@
+//! `dpm link-test RIG.toml`: what the link to the projector carries.
+
+use super::rig_args::RigArgs;
+use super::signals;
+use super::watch::{print, refuse_where_dark_stands, take_locks};
+use dpm_common::stopping;
+use dpm_lab::conformance::{rules, Extent};
+use dpm_lab::link_test::{judge_projector, link_test, Content};
+use dpm_rig::config::RigConfig;
+use dpm_rig::failure::{Failure, FailureKind};
+use dpm_rig::interlock::Interlock;
+use dpm_rig::rig::Rig;
+use dpm_rig::run_rig::open_gpu;
+use dpm_rig::standing::Identity;
+use dpm_rig::telemetry::report::to_json;
+use std::path::PathBuf;
+
+/// Flags of `dpm link-test`.
+#[derive(clap::Args, Clone, Debug)]
+pub struct LinkTestArgs {
+    /// The rig file
+    #[arg(value_name = "RIG.toml")]
+    rig: PathBuf,
+    #[command(flatten)]
+    flags: RigArgs,
+    /// Send a moving pattern instead of pictures of the rig's scene; needs no GPU
+    #[arg(long)]
+    prepared: bool,
+    /// Different frames to send
+    #[arg(long, value_name = "N", default_value_t = 8, value_parser = clap::value_parser!(u32).range(1..=64))]
+    count: u32,
+    /// Seconds for each way to send
+    #[arg(long = "for", value_name = "S", default_value_t = 2, value_parser = clap::value_parser!(u32).range(1..=600))]
+    way_seconds: u32,
+    /// Judge the projector by every rule of docs/PROTOCOL.md instead: one line a rule, exit code 1 where one is broken. It shows next to no
+    /// light, but for up to half a second of it in the rules on limits
+    #[arg(long, conflicts_with_all = ["prepared", "count", "way_seconds"])]
+    conformance: bool,
+    /// Judge this rule only; may stand several times
+    #[arg(long = "rule", value_name = "RULE", requires = "conformance")]
+    rules: Vec<String>,
+    /// Let the projector's whole field flash for a second, for the rule on flashes. Nobody who is sensitive to flashes may look
+    #[arg(long, requires = "conformance")]
+    flashes: bool,
+    /// Print one JSON object
+    #[arg(long)]
+    json: bool,
+}
+
+/// Measures and prints. The projector shows the frames meanwhile; a signal ends that in order: dark, with a report of what there is.
+///
+/// # Errors
+/// Bad rig or flags, no GPU, no projector.
+pub fn execute(args: &LinkTestArgs) -> Result<(), Failure> {
+    args.flags.refuse("dpm link-test", &["--frames", "--seconds", "--no-prediction", "--out"])?;
+    let config = args.flags.rig_at_rest(Some(&args.rig))?;
+    let _locks = take_locks(&config)?;
+    refuse_where_dark_stands(&Identity::of(&config.projector.backend))?;
+    signals::install()
+        .map_err(|e| Failure::new(FailureKind::Device, format!("cannot handle signals: {e}")))?;
+    let interlock = Interlock::of_config(&config.safety.interlock, false)?;
+    let is_open = || interlock.as_ref().is_some_and(|i| !i.is_closed());
+    if let Some(interlock) = interlock.as_ref().filter(|i| !i.is_closed()) {
+        let told = format!("safety.interlock is open: this test makes light only while {}", interlock.what());
+        return Err(Failure::new(FailureKind::Device, told));
+    }
+    let stop = || stopping::is_stopping() || is_open();
+    if args.conformance {
+        return judge(args, &config, &stop);
+    }
+    let rig = Rig::build(&config, None)?;
+    let content = if args.prepared {
+        Content::prepared(&rig, args.count)
+    } else {
+        Content::rendered(&rig, &open_gpu(&config)?, args.count, &stop)?
+    };
+    let report = link_test(&rig, &content, f64::from(args.way_seconds), &stop)?;
+    print(&if args.json { to_json(&report) + "\n" } else { report.to_table() });
+    Ok(())
+}
+
+fn judge(args: &LinkTestArgs, config: &RigConfig, stop: &dyn Fn() -> bool) -> Result<(), Failure> {
+    if let Some(unknown) = args.rules.iter().find(|id| !rules().any(|rule| rule.id == **id)) {
+        let known: Vec<&str> = rules().map(|rule| rule.id).collect();
+        let told = format!("--rule {unknown}: there is no such rule; known: {}", known.join(", "));
+        return Err(Failure::new(FailureKind::BadInput, told));
+    }
+    let extent = Extent { only: &args.rules, flashes: args.flashes };
+    let judgement = judge_projector(config, extent, stop)?;
+    print(&if args.json { to_json(&judgement) + "\n" } else { judgement.to_table() });
+    let [_, failed, _] = judgement.counts;
+    match (&judgement.ended, failed) {
+        (None, 0) => Ok(()),
+        (Some(why), 0) => Err(Failure::new(FailureKind::Device, format!("not judged to the end: {why}"))),
+        (_, failed) => {
+            Err(Failure::new(FailureKind::CheckFailed, format!("the projector breaks {failed} rules")))
+        }
+    }
+}

@@ -1,0 +1,51 @@
+//! `dpm black | freeze | safe | arm`: a word to a rig that runs.
+
+use super::watch::print;
+use dpm_common::unix::{user, user_name};
+use dpm_rig::control::client::{tell, Answer};
+use dpm_rig::failure::{Failure, FailureKind};
+use dpm_rig::telemetry::monitor::Order;
+
+/// Flags of the four commands.
+#[derive(clap::Args, Clone, Debug)]
+pub struct OrderArgs {
+    /// Process of the rig; needed for freeze and arm when several run
+    #[arg(long, value_name = "N")]
+    pid: Option<u32>,
+}
+
+/// Gives `order` and prints whose rigs it reached, what they answered, and which it did not reach.
+///
+/// # Errors
+/// No rig runs, several do, or a projector has not confirmed that it obeyed (exit code 3).
+pub fn execute(args: &OrderArgs, order: Order) -> Result<(), Failure> {
+    let device = |e: &dyn std::fmt::Display| Failure::new(FailureKind::Device, e);
+    let told = tell(args.pid, order).map_err(|e| device(&e))?;
+    let mut text: String = told.answers.iter().map(line).collect();
+    text.extend(told.refused.iter().map(|refused| format!("not reached: {refused}\n")));
+    if order.is_dark() && args.pid.is_none() && !told.closed.is_empty() {
+        let folders: Vec<_> = told.closed.iter().map(|f| f.display().to_string()).collect();
+        text += &format!(
+            "not looked into, for they are other users': {}; root reaches all\n",
+            folders.join(", ")
+        );
+    }
+    print(&text);
+    if told.is_done() {
+        return Ok(());
+    }
+    let word = order.word();
+    match told.answers.iter().find(|a| !a.done) {
+        Some(a) => Err(device(&format!("{word} is not confirmed by process {}: {}", a.pid, a.text))),
+        None => Err(device(&format!("{word} reached no rig of user {} or of a service", user_name(user())))),
+    }
+}
+
+fn line(answer: &Answer) -> String {
+    let Answer { pid, uid, rig, text, is_vouched_for, .. } = answer;
+    let rig = if rig.is_empty() { "rig not told" } else { rig };
+    let says = if *is_vouched_for { "" } else { "says (nobody vouches for it): " };
+    // What a process of another user says could hold control characters.
+    let line = format!("process {pid} of {}, {rig}: {says}{text}", user_name(*uid));
+    line.chars().filter(|c| !c.is_control()).chain(['\n']).collect()
+}

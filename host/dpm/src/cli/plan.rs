@@ -1,0 +1,80 @@
+//! `dpm plan RIG.toml`: what a rig needs, what is left out, why, how, and what it saves.
+
+use super::rig_args::RigArgs;
+use super::watch::{check_out, print, write_out};
+use dpm_lab::plan_savings::Saving;
+use dpm_lab::scene_plan::scene_plan;
+use dpm_rig::failure::Failure;
+use dpm_rig::telemetry::report::to_json;
+use std::path::PathBuf;
+
+/// Flags of `dpm plan`.
+#[derive(clap::Args, Clone, Debug)]
+pub struct PlanArgs {
+    /// The rig file; the built-in demo when left out
+    #[arg(value_name = "RIG.toml")]
+    rig: Option<PathBuf>,
+    #[command(flatten)]
+    flags: RigArgs,
+    /// Time frames with and without each part that can be put back or taken out, and compare their pixels
+    #[arg(long)]
+    measure: bool,
+    /// Print one JSON object
+    #[arg(long)]
+    json: bool,
+}
+
+fn saved(s: &Saving) -> String {
+    let [low, high] = s.saved_middle_half_ms;
+    let told = if s.stands_out() { "" } else { ", not told from chance" };
+    let cost = format!(
+        "the part takes {:+.2} ms (middle half of the frames {low:+.2} to {high:+.2}{told})",
+        s.saved_ms
+    );
+    if s.changes_pictures {
+        return format!(
+            "{:.2} ms and {:.0} rays without, {:.2} ms and {:.0} rays with: {cost}; pixels differ by {:.1} % RMS",
+            s.without_ms,
+            s.without_rays,
+            s.with_ms,
+            s.with_rays,
+            100.0 * s.difference
+        );
+    }
+    let same = if s.pixels_identical { "same pixels" } else { "PIXELS DIFFER" };
+    format!("{:.2} ms instead of {:.2} ms: {cost}; {same}", s.without_ms, s.with_ms)
+}
+
+/// Prints the plan.
+///
+/// # Errors
+/// Bad rig file or scene; with `--measure` no GPU, or pixels that differ.
+pub fn execute(args: &PlanArgs) -> Result<(), Failure> {
+    args.flags.refuse("dpm plan", &["--frames", "--seconds", "--no-prediction"])?;
+    let rig = args.flags.rig_at_rest(args.rig.as_deref())?;
+    check_out(args.flags.out.as_deref())?;
+    let report = scene_plan(&rig, args.measure)?;
+    if args.json {
+        print(&(to_json(&report) + "\n"));
+        return write_out(args.flags.out.as_deref(), "plan.json", &report);
+    }
+    let mut text = String::new();
+    report.warnings.iter().for_each(|w| text += &format!("note: {w}\n"));
+    for e in &report.entries {
+        let state = match (e.needed, e.left_out) {
+            (true, _) => "needed",
+            (false, true) if e.switched_off => "off",
+            (false, true) => "left out",
+            (false, false) => "kept",
+        };
+        text += &format!("{state:<9} {:<25} {} [{}]\n", e.feature, e.why, e.how);
+        if let Some(s) = &e.saving {
+            text += &format!("{:35} {}\n", "", saved(s));
+        }
+    }
+    if let Some(s) = &report.together {
+        text += &format!("all that is left out and can be put back, together: {}\n", saved(s));
+    }
+    print(&text);
+    write_out(args.flags.out.as_deref(), "plan.json", &report)
+}

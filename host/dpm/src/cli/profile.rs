@@ -1,0 +1,131 @@
+//! `dpm profile`: where the time between motion and light goes, and whether it got better.
+
+use super::rig_args::RigArgs;
+use super::watch::{print, watch};
+use dpm_device::regular_file;
+use dpm_lab::profile::profile_rig;
+use dpm_rig::failure::{Ended, Failure, FailureKind};
+use dpm_rig::telemetry::compare::{compare, failed_gates, to_table};
+use dpm_rig::telemetry::monitor::RunCounts;
+use dpm_rig::telemetry::profile::ProfileReport;
+use dpm_rig::telemetry::prometheus::{page, PageServer};
+use std::path::{Path, PathBuf};
+
+/// Length of a profile without `--seconds` or `--frames`, s.
+const SECONDS: f64 = 10.0;
+
+/// Largest profile.json that is read, bytes; those of a day have some tens of thousands.
+const MAX_PROFILE_BYTES: u64 = 64 << 20;
+
+/// Flags of `dpm profile`.
+#[derive(clap::Args, Clone, Debug)]
+pub struct ProfileArgs {
+    /// The rig file; the demo's rig without one
+    #[arg(value_name = "RIG.toml")]
+    rig: Option<PathBuf>,
+    #[command(flatten)]
+    flags: RigArgs,
+    /// Frames prepared ahead in place of rendered ones: hand-offs, packing and link at the true rate, without a GPU
+    #[arg(long)]
+    no_render: bool,
+    /// Print the report as one JSON object
+    #[arg(long)]
+    json: bool,
+    /// Serve the figures for Prometheus while running, for example on 127.0.0.1:9473
+    #[arg(long, value_name = "ADDR")]
+    prometheus: Option<String>,
+    /// Compare two profile.json instead of running: what got better or worse, and whether beyond noise; ends with 1 when more
+    /// slots are missed, or more frames late
+    #[arg(long, num_args = 2, value_names = ["A.json", "B.json"], conflicts_with_all = ["rig", "no_render", "prometheus"])]
+    compare: Vec<PathBuf>,
+}
+
+/// Profiles a rig, or compares two profiles.
+///
+/// # Errors
+/// Bad rig file, scene, address or profile; a device that fails; torn frames; a comparison whose gates got worse.
+pub fn execute(args: &ProfileArgs) -> Result<(), Failure> {
+    if let [before, after] = args.compare.as_slice() {
+        let (rows, notes) = compare(&read(before)?, &read(after)?);
+        print(&to_table(&rows, &notes));
+        let failed = failed_gates(&rows);
+        if !failed.is_empty() {
+            let told = format!(
+                "{} got worse by more than noise: {} against {}",
+                failed.join(" and "),
+                after.display(),
+                before.display()
+            );
+            return Err(Failure::new(FailureKind::CheckFailed, told));
+        }
+        return Ok(());
+    }
+    let mut flags = args.flags.clone();
+    // In front, so that an explicit --set wins.
+    flags.set.splice(0..0, ["output.images=false".into(), "output.trace=true".into()]);
+    flags.pace.get_or_insert_with(|| "real".into());
+    flags.out.get_or_insert_with(|| "out/profile".into());
+    if flags.frames.is_none() {
+        flags.seconds.get_or_insert(SECONDS);
+    }
+    let rig = flags.rig(args.rig.as_deref())?;
+    let server = match &args.prometheus {
+        Some(address) => Some(PageServer::start(address.as_str()).map_err(|e| {
+            let told = format!(
+                "--prometheus {address}: cannot listen there: {e}; give an address of this machine and a free port, for example 127.0.0.1:9947"
+            );
+            Failure::new(FailureKind::BadInput, told)
+        })?),
+        None => None,
+    };
+    let prepared = args.no_render;
+    let Ended { report: profile, failure } = watch(
+        rig,
+        |counts| {
+            if let Some(server) = &server {
+                server.show(page(counts, None));
+            }
+        },
+        move |rig, monitor| profile_rig(rig, prepared, monitor),
+    )?;
+    if let Some(server) = &server {
+        let r = &profile.report;
+        let counts = RunCounts {
+            frames_planned: r.frames_lit + r.frames_dark + r.frames_dropped + r.frames_withheld,
+            frames_lit: r.frames_lit,
+            frames_dark: r.frames_dark,
+            frames_dropped: r.frames_dropped,
+            frames_withheld: r.frames_withheld,
+            frames_late: r.frames_late,
+            slots: r.slots,
+            slots_missed: r.missed_slots,
+        };
+        server.show(page(&counts, Some(&profile.profile)));
+    }
+    print(&if args.json { profile.to_json() + "\n" } else { profile.to_table() });
+    if profile.frames_torn.unwrap_or(0) + profile.frames_reordered > 0 {
+        let told = format!(
+            "{} lit frames held parts of another and {} came out of order",
+            profile.frames_torn.unwrap_or(0),
+            profile.frames_reordered
+        );
+        return Err(Failure::new(FailureKind::CheckFailed, told));
+    }
+    failure.map_or(Ok(()), Err)?;
+    profile.report.check_lit()
+}
+
+fn read(path: &Path) -> Result<ProfileReport, Failure> {
+    let refuse = |e: &dyn std::fmt::Display| {
+        Failure::new(
+            FailureKind::BadInput,
+            format!("{}: not a profile.json of dpm profile: {e}", path.display()),
+        )
+    };
+    let text = regular_file::read_text(path, MAX_PROFILE_BYTES).map_err(|e| {
+        let told =
+            format!("{}: cannot read it: {e}; give two files profile.json of dpm profile", path.display());
+        Failure::new(FailureKind::BadInput, told)
+    })?;
+    serde_json::from_str(&text).map_err(|e| refuse(&e))
+}

@@ -1,0 +1,72 @@
+//! `dpm run RIG.toml` and `dpm demo`: the rig from its file to light.
+
+use super::dlpc900::Guard;
+use super::rig_args::RigArgs;
+use super::watch::{check_out, print, run_and_report, watch, write_out};
+use crate::run_dlpc900::run_dlpc900;
+use dpm_rig::config::ProjectorBackend;
+use dpm_rig::failure::Failure;
+use dpm_rig::run_rig::run_rig;
+use dpm_rig::telemetry::report::to_json;
+use std::path::{Path, PathBuf};
+
+/// Flags of `dpm run`.
+#[derive(clap::Args, Clone, Debug)]
+pub struct RunArgs {
+    /// The rig file
+    #[arg(value_name = "RIG.toml")]
+    rig: PathBuf,
+    #[command(flatten)]
+    flags: RigArgs,
+    /// Print the report as one JSON object
+    #[arg(long)]
+    json: bool,
+}
+
+/// Flags of `dpm demo`.
+#[derive(clap::Args, Clone, Debug)]
+pub struct DemoArgs {
+    #[command(flatten)]
+    flags: RigArgs,
+    /// Print the report as one JSON object
+    #[arg(long)]
+    json: bool,
+}
+
+/// Runs a rig file.
+///
+/// # Errors
+/// Bad rig file, scene or device.
+pub fn execute(args: &RunArgs) -> Result<(), Failure> {
+    start(Some(&args.rig), &args.flags, args.json)
+}
+
+/// Runs the built-in demo.
+///
+/// # Errors
+/// Bad flags, scene or device.
+pub fn execute_demo(args: &DemoArgs) -> Result<(), Failure> {
+    start(None, &args.flags, args.json)
+}
+
+fn start(path: Option<&Path>, flags: &RigArgs, json: bool) -> Result<(), Failure> {
+    let rig = flags.rig(path)?;
+    if let ProjectorBackend::Dlpc900(backend) = &rig.projector.backend {
+        check_out(flags.out.as_deref())?;
+        let device = backend.device.clone();
+        let report = watch(
+            rig,
+            |_| {},
+            move |rig, monitor| {
+                // Not before this instance has the controller's lock. A panic leaves without a word, as a SIGKILL does.
+                let guard = Guard::start(device.as_deref());
+                let result = run_dlpc900(rig, monitor);
+                guard.dismiss();
+                result
+            },
+        )?;
+        print(&if json { to_json(&report) + "\n" } else { report.to_table() });
+        return write_out(flags.out.as_deref(), "report.json", &report);
+    }
+    run_and_report(rig, json, run_rig)
+}

@@ -1,0 +1,49 @@
+//! `dpm snapshot RIG.toml`: everything that one frame was made from, as pictures.
+
+use super::rig_args::RigArgs;
+use super::watch::print;
+use dpm_lab::snapshot::{snapshot, SnapshotImage};
+use dpm_rig::failure::Failure;
+use dpm_rig::telemetry::report::to_json;
+use std::path::PathBuf;
+
+/// Flags of `dpm snapshot`.
+#[derive(clap::Args, Clone, Debug)]
+pub struct SnapshotArgs {
+    /// The rig file; the built-in demo when left out
+    #[arg(value_name = "RIG.toml")]
+    rig: Option<PathBuf>,
+    #[command(flatten)]
+    flags: RigArgs,
+    /// Which frame; those before it are played too, for histories to settle
+    #[arg(long, value_name = "N", default_value_t = 32)]
+    frame: u32,
+    /// Pictures to write, separated by commas; all that the method has when left out
+    #[arg(long, value_name = "NAME", value_enum, value_delimiter = ',')]
+    what: Vec<SnapshotImage>,
+    /// Print the list of files as one JSON object
+    #[arg(long)]
+    json: bool,
+}
+
+/// Writes the pictures.
+///
+/// # Errors
+/// Bad rig file or scene, no GPU.
+pub fn execute(args: &SnapshotArgs) -> Result<(), Failure> {
+    args.flags.refuse("dpm snapshot", &["--frames", "--seconds", "--no-prediction"])?;
+    let rig = args.flags.rig_at_rest(args.rig.as_deref())?;
+    let dir = args.flags.out.clone().unwrap_or_else(|| rig.output.dir.join("snapshot"));
+    let report = snapshot(&rig, args.frame, &args.what, &dir)?;
+    if args.json {
+        print(&(to_json(&report) + "\n"));
+        return Ok(());
+    }
+    let [width, height] = report.raster;
+    let mut text = format!("method {}, frame {}, {width} x {height}\n", report.method, report.frame);
+    report.warnings.iter().for_each(|w| text += &format!("note: {w}\n"));
+    report.files.iter().for_each(|f| text += &format!("{}\n", f.display()));
+    report.not_made.iter().for_each(|n| text += &format!("no {}: {}\n", n.image, n.why));
+    print(&text);
+    Ok(())
+}

@@ -1,0 +1,289 @@
+//! Notes and progress of a run to the standard error stream, from a thread of its own: where nobody reads it or the terminal is
+//! stopped, that thread waits and the run goes on.
+
+use dpm_rig::failure::{Failure, FailureKind};
+use dpm_rig::telemetry::monitor::{ProjectorHealth, RunCounts};
+use indicatif::{ProgressBar, ProgressDrawTarget, ProgressStyle};
+use std::collections::VecDeque;
+use std::io::{IsTerminal, Write};
+use std::sync::mpsc::{sync_channel, Receiver, RecvTimeoutError, SyncSender};
+use std::thread::JoinHandle;
+use std::time::{Duration, Instant};
+
+/// Notes that wait for a reader; more are dropped.
+const WAITING: usize = 256;
+/// How long the end of a run waits for what is not yet told.
+const END_WITHIN: Duration = Duration::from_millis(200);
+
+/// How often progress is shown.
+pub(super) const SHOWN_EVERY: Duration = Duration::from_millis(50);
+
+enum Word {
+    Note(String),
+    Tick(ProjectorHealth, RunCounts),
+}
+
+/// Says things without ever waiting.
+pub(super) struct Teller {
+    words: Option<SyncSender<Word>>,
+    over: Receiver<()>,
+    thread: Option<JoinHandle<()>>,
+}
+
+impl Teller {
+    /// For a run of `total` frames, or else `seconds` of time; 0 is no end.
+    ///
+    /// # Errors
+    /// No thread can be started (exit code 3).
+    pub(super) fn start(total: u64, seconds: f64) -> Result<Self, Failure> {
+        let (words, heard) = sync_channel(WAITING);
+        let (ended, over) = sync_channel::<()>(1);
+        let thread = std::thread::Builder::new()
+            .name("dpm-tell".into())
+            .spawn(move || {
+                // Dropped at the end of the thread, however that comes.
+                let _ended = ended;
+                let mut progress = Progress::new(total, seconds);
+                let mut last = (ProjectorHealth::Connecting, RunCounts::default());
+                while let Ok(word) = heard.recv() {
+                    match word {
+                        Word::Note(text) => progress.note(&text),
+                        Word::Tick(health, counts) => {
+                            last = (health, counts);
+                            progress.tick(health, counts);
+                        }
+                    }
+                }
+                progress.finish(last.0, last.1);
+            })
+            .map_err(|e| Failure::new(FailureKind::Device, format!("cannot start a thread: {e}")))?;
+        Ok(Self { words: Some(words), over, thread: Some(thread) })
+    }
+
+    /// Says `text`, a line.
+    pub(super) fn note(&self, text: &str) {
+        if let Some(words) = &self.words {
+            let _ = words.try_send(Word::Note(text.to_owned()));
+        }
+    }
+
+    /// Shows how far the run is.
+    pub(super) fn tick(&self, health: ProjectorHealth, counts: RunCounts) {
+        if let Some(words) = &self.words {
+            let _ = words.try_send(Word::Tick(health, counts));
+        }
+    }
+
+    /// Says the rest, for a fifth of a second at most.
+    pub(super) fn finish(&mut self, health: ProjectorHealth, counts: RunCounts) {
+        self.tick(health, counts);
+        self.words = None;
+        let told = self.over.recv_timeout(END_WITHIN) == Err(RecvTimeoutError::Disconnected);
+        if let Some(thread) = self.thread.take().filter(|_| told) {
+            let _ = thread.join();
+        }
+    }
+}
+
+impl Drop for Teller {
+    fn drop(&mut self) {
+        if self.thread.is_some() {
+            self.words = None;
+            // What was noted before an error at the start.
+            let _ = self.over.recv_timeout(END_WITHIN);
+        }
+    }
+}
+
+/// Frames a second over the last seconds.
+struct Rate {
+    /// The oldest is the one from which is counted.
+    seen: VecDeque<(Duration, u64)>,
+}
+
+/// Time over which the rate is taken.
+const RATE_OVER: Duration = Duration::from_secs(2);
+/// Most readings of it: one a [`SHOWN_EVERY`], and one more.
+const RATE_READINGS: usize = (RATE_OVER.as_millis() / SHOWN_EVERY.as_millis()) as usize + 1;
+
+impl Rate {
+    /// Takes in how many there were at `elapsed`; returns how many a second.
+    fn at(&mut self, elapsed: Duration, count: u64) -> f64 {
+        while self.seen.len() >= RATE_READINGS || self.seen.len() > 1 && self.seen[1].0 + RATE_OVER <= elapsed
+        {
+            self.seen.pop_front();
+        }
+        self.seen.push_back((elapsed, count));
+        let (since, before) = self.seen[0];
+        let seconds = elapsed.saturating_sub(since).as_secs_f64();
+        if seconds > 0.0 {
+            count.saturating_sub(before) as f64 / seconds
+        } else {
+            0.0
+        }
+    }
+}
+
+/// The text of the bar: the projector's state first, then what the run does, at places that do not move.
+fn told(health: ProjectorHealth, counts: &RunCounts, total: u64, rate: f64) -> String {
+    let of = if total > 0 { format!("/{total}") } else { String::new() };
+    let lit = format!("{}{of}", counts.frames_lit);
+    let mut text = format!("{:<10} {lit:>9} lit {rate:>7.1}/s", health.word());
+    // A picture that does not move has no rate that would mean anything, and no time that is left.
+    if let ProjectorHealth::Up | ProjectorHealth::Connecting = health {
+        let left = total.saturating_sub(counts.frames_done());
+        if rate > 0.0 && left > 0 {
+            text += &format!(" {:>6.0} s left", left as f64 / rate);
+        }
+    } else {
+        text = format!("{:<10} {lit:>9} lit, no new picture", health.word());
+    }
+    text += &format!(", {} slots missed, {} frames dropped", counts.slots_missed, counts.frames_dropped);
+    if counts.frames_dark > 0 {
+        text += &format!(", {} DARK on every body", counts.frames_dark);
+    }
+    text
+}
+
+enum Shown {
+    Bar(ProgressBar),
+    Lines { next: Duration },
+}
+
+struct Progress {
+    started: Instant,
+    /// Frames that the run was asked for; 0 for no end, or one in time.
+    total: u64,
+    /// Seconds that the run was asked for; 0 for no end, or one in frames.
+    seconds: f64,
+    /// When the first frame was planned: an end in time counts from there.
+    began: Option<Instant>,
+    rate: Rate,
+    shown: Shown,
+}
+
+impl Progress {
+    /// Towards `total` frames, or else `seconds` of time; 0 is no end.
+    fn new(total: u64, seconds: f64) -> Self {
+        let timed = total == 0 && seconds > 0.0;
+        let shown = if std::io::stderr().is_terminal() {
+            let bar = match total {
+                0 if timed => ProgressBar::new((seconds * 1e3) as u64),
+                0 => ProgressBar::no_length(),
+                _ => ProgressBar::new(total),
+            };
+            bar.set_draw_target(ProgressDrawTarget::stderr());
+            let template = if total == 0 && !timed { "{wide_msg}" } else { "{bar:20} {wide_msg}" };
+            bar.set_style(ProgressStyle::with_template(template).expect("the template is a constant"));
+            Shown::Bar(bar)
+        } else {
+            Shown::Lines { next: Duration::from_secs(1) }
+        };
+        let rate = Rate { seen: VecDeque::new() };
+        Self { started: Instant::now(), total, seconds, began: None, rate, shown }
+    }
+
+    /// How far the run is: frames, or milliseconds where its end is one in time.
+    fn position(&mut self, counts: &RunCounts) -> u64 {
+        if self.total == 0 && self.seconds > 0.0 {
+            if counts.frames_planned > 0 {
+                self.began.get_or_insert_with(Instant::now);
+            }
+            return self.began.map_or(0, |began| began.elapsed().as_millis() as u64);
+        }
+        counts.frames_done()
+    }
+
+    fn note(&self, text: &str) {
+        match &self.shown {
+            Shown::Bar(bar) => bar.println(text),
+            Shown::Lines { .. } => {
+                let _ = writeln!(std::io::stderr(), "{}", serde_json::json!({ "note": text }));
+            }
+        }
+    }
+
+    fn tick(&mut self, health: ProjectorHealth, counts: RunCounts) {
+        let elapsed = self.started.elapsed();
+        let rate = self.rate.at(elapsed, counts.frames_lit);
+        let done = self.position(&counts);
+        match &mut self.shown {
+            Shown::Bar(bar) => {
+                bar.set_position(done);
+                bar.set_message(told(health, &counts, self.total, rate));
+                bar.tick();
+            }
+            Shown::Lines { next } => {
+                if elapsed >= *next {
+                    // After a pause of this thread the next line comes a second later, not a burst of lines at once.
+                    *next = elapsed + Duration::from_secs(1);
+                    let line = serde_json::json!({
+                        "elapsed_s": (elapsed.as_secs_f64() * 1e3).round() / 1e3,
+                        "projector": health.word().to_lowercase(),
+                        "frames_total": self.total,
+                        "seconds_total": self.seconds,
+                        "frames_lit": counts.frames_lit,
+                        "frames_lit_per_s": (rate * 10.0).round() / 10.0,
+                        "frames_dark": counts.frames_dark,
+                        "frames_dropped": counts.frames_dropped,
+                        "frames_withheld": counts.frames_withheld,
+                        "frames_late": counts.frames_late,
+                        "slots": counts.slots,
+                        "slots_missed": counts.slots_missed,
+                    });
+                    let _ = writeln!(std::io::stderr(), "{line}");
+                }
+            }
+        }
+    }
+
+    fn finish(mut self, health: ProjectorHealth, counts: RunCounts) {
+        self.tick(health, counts);
+        if let Shown::Bar(bar) = self.shown {
+            bar.finish_and_clear();
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// Found in use, O13: "17.5505/s" and "17.476/s" one after the other, and while BLACK a line as if all were well.
+    #[test]
+    fn the_line_says_how_the_projector_is_and_its_figures_stay_in_place() {
+        use ProjectorHealth::{Black, Connecting, Faulted, Frozen, Lost, Stopped, Up};
+        let counts = |lit| RunCounts { frames_lit: lit, slots_missed: 3, ..RunCounts::default() };
+        let at = |lit, rate| told(Up, &counts(lit), 0, rate).find("lit").unwrap();
+        assert_eq!(at(7, 947.0), at(1_234_567, 17.476));
+        let rate_ends = |rate| told(Up, &counts(7), 0, rate).find("/s").unwrap();
+        assert_eq!(rate_ends(17.5505), rate_ends(947.0));
+        assert!(told(Up, &counts(146), 0, 17.5505).contains("17.6/s"));
+        assert!(told(Up, &counts(100), 1000, 10.0).contains("90 s left"));
+        for health in [Black, Frozen, Lost, Faulted(1), Stopped] {
+            let text = told(health, &counts(146), 1000, 16.3);
+            assert!(text.starts_with(health.word()) && text.contains("no new picture"), "{text}");
+            assert!(!text.contains("/s") && !text.contains("left"), "{text}");
+        }
+        assert!(told(Connecting, &counts(0), 0, 0.0).starts_with("connecting"));
+        let dark = RunCounts { frames_dark: 9, ..counts(0) };
+        assert!(told(Up, &dark, 0, 0.0).contains("9 DARK on every body"));
+    }
+
+    #[test]
+    fn the_rate_is_that_of_the_last_seconds() {
+        let mut rate = Rate { seen: VecDeque::new() };
+        assert_eq!(rate.at(Duration::ZERO, 0), 0.0);
+        let mut frames = 0;
+        let mut last = 0.0;
+        for tick in 1..=200 {
+            frames += if tick <= 100 { 50 } else { 1 };
+            last = rate.at(SHOWN_EVERY * tick, frames);
+            if tick == 100 {
+                assert!((last - 1000.0).abs() < 1e-6, "{last}");
+            }
+        }
+        assert!((last - 20.0).abs() < 1e-6, "{last}");
+        assert!(rate.seen.len() <= RATE_READINGS);
+    }
+}

@@ -1,0 +1,307 @@
+//! A running pipeline into a progress bar on a terminal, or one JSON line a second on anything else; and everything that can stop or
+//! darken it from outside: signals, keys, the control socket, orders that stand from before.
+//!
+//! The thread that watches writes nothing itself: a pipe that nobody reads or a stopped terminal holds up the thread that tells, and
+//! nobody else.
+
+use super::keys::Keys;
+use super::signals;
+use super::tell::{Teller, SHOWN_EVERY};
+use dpm_common::files::{write_atomically, InstanceLock, LockError};
+use dpm_common::folder::{Folder, FolderError};
+use dpm_common::stopping;
+use dpm_rig::config::{OutputConfig, RigConfig};
+use dpm_rig::control::orders::Orders;
+use dpm_rig::control::server::ControlSocket;
+use dpm_rig::control::status_file::StatusFile;
+use dpm_rig::control::{rig_name, runtime_folder};
+use dpm_rig::failure::{Ended, Failure, FailureKind};
+use dpm_rig::interlock::Interlock;
+use dpm_rig::run_rig::{cannot_write, check_output_folder};
+use dpm_rig::standing::{state_folder, By, Identity, OrderFile, Stands};
+use dpm_rig::telemetry::monitor::{Order, ProjectorHealth, RunCounts, RunMonitor};
+use dpm_rig::telemetry::report::{to_json, Report};
+use std::io::Write;
+use std::path::Path;
+use std::sync::mpsc::{channel, RecvTimeoutError};
+use std::sync::Arc;
+use std::time::Duration;
+
+/// How often keys, signals and the projector's health are looked at.
+const TICK: Duration = Duration::from_millis(5);
+/// Progress is shown at every so many ticks.
+const TICKS_SHOWN: u32 = (SHOWN_EVERY.as_millis() / TICK.as_millis()) as u32;
+
+/// How long the link is given to make the projector dark when the run itself will not return.
+const DARK_WITHIN: Duration = Duration::from_millis(500);
+
+/// Watches `run` (see [`watch`]), then prints the report to the standard output, as JSON or as a table.
+///
+/// # Errors
+/// As [`watch`]; a run that lit nothing, after its report.
+pub fn run_and_report(
+    rig: RigConfig,
+    json: bool,
+    run: impl FnOnce(&RigConfig, &Arc<RunMonitor>) -> Result<Ended<Report>, Failure> + Send + 'static,
+) -> Result<(), Failure> {
+    let Ended { report, failure } = watch(rig, |_| {}, run)?;
+    print(&if json { report.to_json() + "\n" } else { report.to_table() });
+    failure.map_or(Ok(()), Err)?;
+    report.check_lit()
+}
+
+/// Writes the report of a command that makes no others as `name` into the folder that `--out` names, where it does.
+///
+/// # Errors
+/// The folder or the file cannot be written.
+pub(super) fn write_out<T: serde::Serialize>(
+    out: Option<&Path>,
+    name: &str,
+    report: &T,
+) -> Result<(), Failure> {
+    let Some(folder) = out else { return Ok(()) };
+    let path = folder.join(name);
+    let text = to_json(report) + "\n";
+    write_atomically(&path, |file| file.write_all(text.as_bytes())).map_err(|e| cannot_write(&path, &e))
+}
+
+/// Sees that files can be written into the folder that `--out` names, before the work.
+///
+/// # Errors
+/// They cannot.
+pub(super) fn check_out(out: Option<&Path>) -> Result<(), Failure> {
+    out.map_or(Ok(()), check_output_folder)
+}
+
+/// Runs `run` while its progress is shown on the standard error stream, given to `show`, and signals become an ordered stop. The
+/// run itself has a thread of its own, so that this one stays free to watch.
+///
+/// # Errors
+/// What `run` returns; a device or output folder that another instance uses; a panic in the run.
+pub fn watch<T: Send + 'static>(
+    rig: RigConfig,
+    show: impl Fn(&RunCounts),
+    run: impl FnOnce(&RigConfig, &Arc<RunMonitor>) -> Result<T, Failure> + Send + 'static,
+) -> Result<T, Failure> {
+    let locks = take_locks(&rig)?;
+    signals::install()
+        .map_err(|e| Failure::new(FailureKind::Device, format!("cannot handle signals: {e}")))?;
+    let monitor = Arc::new(RunMonitor::default());
+    let mut keys = Keys::new();
+    // Before anything can make light.
+    if let Some(interlock) = Interlock::of_config(&rig.safety.interlock, keys.is_some())? {
+        monitor.set_interlock(interlock);
+    }
+    let mut teller = Teller::start(rig.run.frames, rig.run.seconds)?;
+    // Before the run begins, so that it comes up dark where an order stands.
+    let orders = Arc::new(stand_by(&rig, &monitor, &teller)?);
+    let (done, finished) = channel();
+    let worker = {
+        let monitor = Arc::clone(&monitor);
+        std::thread::Builder::new()
+            .name("dpm-run".into())
+            .spawn(move || {
+                let result = run(&rig, &monitor);
+                // The watcher is gone only when it panicked; then nobody wants the result.
+                let _ = done.send(result);
+            })
+            .map_err(|e| Failure::new(FailureKind::Device, format!("cannot start a thread: {e}")))?
+    };
+    let mut health = ProjectorHealth::Connecting;
+    let mut tracker_told = false;
+    let mut signal_told = false;
+    if let Some(interlock) = monitor.interlock() {
+        let now = if interlock.is_closed() { "closed" } else { "open" };
+        teller.note(&format!("safety.interlock: light only while {}; it is {now}", interlock.what()));
+    }
+    let keys_told = if keys.is_some() { "; keys b, f, s, a" } else { "" };
+    let listening = listen(&locks.runtime, &monitor, &orders);
+    let (control, mut status) = match listening {
+        Ok((socket, status)) => {
+            teller.note(&format!(
+                "control: dpm black | freeze | safe | arm --pid {}{keys_told}; socket {}",
+                std::process::id(),
+                socket.path().display()
+            ));
+            (Some(socket), Some(status))
+        }
+        Err(e) => {
+            teller.note(&format!("no control socket: {e}{keys_told}; signals USR1 (black) and USR2 (safe)"));
+            (None, None)
+        }
+    };
+    let mut ticks = 0u32;
+    let result = loop {
+        match finished.recv_timeout(TICK) {
+            Ok(result) => break result,
+            Err(RecvTimeoutError::Timeout) => {
+                // Orders before everything that is told.
+                for key in keys.iter_mut().flat_map(Keys::pressed) {
+                    if monitor.interlock().is_some_and(|i| i.key_pressed(key)) {
+                        continue;
+                    }
+                    if let Some(order) = Order::from_key(key) {
+                        orders.give(order, By::Key);
+                        teller.note(&format!("key: {}", order.word()));
+                    }
+                }
+                if let Some(signal) = signals::received().filter(|_| !signal_told) {
+                    signal_told = true;
+                    monitor.request_stop();
+                    teller.note(&format!("{signal}: stopping"));
+                }
+                monitor.take_notes().iter().for_each(|note| teller.note(note));
+                if let Some(why) = monitor.gave_up() {
+                    // The projector has been told to go dark by a thread that does not hang.
+                    std::thread::sleep(DARK_WITHIN);
+                    teller.finish(monitor.projector(), monitor.counts());
+                    return Err(Failure::new(FailureKind::Device, why));
+                }
+                let now = monitor.projector();
+                if let Some(status) = &mut status {
+                    status.say(now, orders.kept());
+                }
+                if std::mem::replace(&mut health, now) != now {
+                    teller.note(&format!("projector: {now}"));
+                }
+                if let (false, Some(word)) = (tracker_told, monitor.tracker()) {
+                    tracker_told = true;
+                    teller.note(word);
+                }
+                ticks = ticks.wrapping_add(1);
+                if ticks.is_multiple_of(TICKS_SHOWN) {
+                    teller.tick(now, monitor.counts());
+                    show(&monitor.counts());
+                }
+            }
+            Err(RecvTimeoutError::Disconnected) => {
+                break Err(Failure::new(FailureKind::Device, "the run ended by a panic (see above)"))
+            }
+        }
+    };
+    // A panic was already turned into the error above.
+    let _ = worker.join();
+    let result = match result {
+        Ok(_) if stopping::has_panicked() => Err(Failure::new(
+            FailureKind::Device,
+            "the run was stopped by a panic in one of its threads (see above)",
+        )),
+        result => result,
+    };
+    if let Some(status) = &mut status {
+        // Whoever waits for a dark that came with the end sees it.
+        status.say(monitor.projector(), orders.kept());
+    }
+    drop(control);
+    if let Some(orders) = Arc::into_inner(orders) {
+        orders.end(result.is_ok());
+    }
+    monitor.take_notes().iter().for_each(|note| teller.note(note));
+    teller.finish(monitor.projector(), monitor.counts());
+    result
+}
+
+/// Reads what stands for the rig's projector, gives it to the run that is about to begin, and starts the thread that keeps orders.
+///
+/// # Errors
+/// The projector is real and the state folder cannot be used: an order could not be kept (exit code 2).
+fn stand_by(rig: &RigConfig, monitor: &Arc<RunMonitor>, teller: &Teller) -> Result<Orders, Failure> {
+    let identity = Identity::of(&rig.projector.backend);
+    let (file, error, stands) = OrderFile::open(state_folder(), identity.clone());
+    if let Some(e) = &error {
+        let told =
+            format!("SAFE could not be kept over a restart: {e}; name another state folder by DPM_STATE_DIR");
+        if !identity.is_mock() {
+            return Err(Failure::new(FailureKind::BadInput, told));
+        }
+        teller.note(&format!("warning: {told}"));
+    }
+    if let Some(stands) = &stands {
+        teller.note(&told_of(stands));
+    }
+    Orders::start(Arc::clone(monitor), file, error.is_none(), stands.as_ref())
+        .map_err(|e| Failure::new(FailureKind::Device, format!("cannot start a thread: {e}")))
+}
+
+/// What the operator is told of an order that stands.
+fn told_of(stands: &Stands) -> String {
+    let word = if stands.order == Order::Safe { "SAFE" } else { "BLACK" };
+    let pid = std::process::id();
+    format!("projector: {word} stands {}; it stays dark until `dpm arm --pid {pid}` (or key a)", stands.told)
+}
+
+/// The control socket and the state file, in the runtime folder.
+fn listen(
+    runtime: &Result<Arc<Folder>, FolderError>,
+    monitor: &Arc<RunMonitor>,
+    orders: &Arc<Orders>,
+) -> Result<(ControlSocket, StatusFile), String> {
+    let folder = runtime.as_ref().map_err(ToString::to_string)?;
+    let status = StatusFile::create(folder.clone(), rig_name()).map_err(|e| e.to_string())?;
+    let socket = ControlSocket::serve(folder.clone(), Arc::clone(monitor), Arc::clone(orders));
+    Ok((socket.map_err(|e| e.to_string())?, status))
+}
+
+/// Writes to the standard output; a reader that has gone away (`dpm ... | head`) is no error.
+pub fn print(text: &str) {
+    let mut out = std::io::stdout().lock();
+    let _ = out.write_all(text.as_bytes()).and_then(|()| out.flush());
+}
+
+/// What a run holds while it lasts.
+pub(super) struct Locks {
+    _held: Vec<InstanceLock>,
+    /// The runtime folder, or why it is not used.
+    runtime: Result<Arc<Folder>, FolderError>,
+}
+
+/// One lock for the projector and one for the folder that is written to.
+///
+/// # Errors
+/// Another instance has one of them; the projector is real and the runtime folder cannot be trusted.
+pub(super) fn take_locks(rig: &RigConfig) -> Result<Locks, Failure> {
+    let or = |advice: &'static str| {
+        move |e: LockError| match e {
+            LockError::Held { .. } => Failure::new(FailureKind::Device, e),
+            LockError::Io { .. } => Failure::new(FailureKind::BadInput, format!("{e}; {advice}")),
+        }
+    };
+    let advice = "name another folder by DPM_RUNTIME_DIR";
+    let mut held = Vec::new();
+    let runtime = runtime_folder().map(Arc::new);
+    let identity = Identity::of(&rig.projector.backend);
+    if !identity.is_mock() {
+        let folder = runtime.as_ref().map_err(|e| {
+            Failure::new(
+                FailureKind::BadInput,
+                format!("cannot lock {identity}: the runtime folder {e}; {advice}"),
+            )
+        })?;
+        held.push(InstanceLock::take_in(folder, &identity.lock_name(), identity.what()).map_err(or(advice))?);
+    }
+    let OutputConfig { dir, images, trace, .. } = &rig.output;
+    if *images || *trace {
+        let what = format!("output folder {}", dir.display());
+        held.push(
+            InstanceLock::take(&dir.join(".dpm.lock"), &what)
+                .map_err(or("choose another folder with --out"))?,
+        );
+    }
+    Ok(Locks { _held: held, runtime })
+}
+
+/// Refuses light where SAFE stands for the projector of `identity`: for commands that light without a rig that could be armed.
+///
+/// # Errors
+/// What stands, since when and by whom (exit code 3).
+pub(super) fn refuse_where_dark_stands(identity: &Identity) -> Result<(), Failure> {
+    let stands = state_folder().and_then(|folder| dpm_rig::standing::standing_in(&folder, identity));
+    match stands {
+        None => Ok(()),
+        Some(stands) => {
+            let word = if stands.order == Order::Safe { "SAFE" } else { "BLACK" };
+            let told = format!("{identity}: {word} stands {}; run its rig and say `dpm arm`", stands.told);
+            Err(Failure::new(FailureKind::Device, told))
+        }
+    }
+}

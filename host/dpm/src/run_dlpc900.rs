@@ -1,0 +1,579 @@
+//! `dpm run` on a DLPC900: frames loaded before they are shown, or patterns cut out of a video signal; watched, and put to rest.
+//!
+//! USB carries seconds, not frames, to a DLPC900, so nothing that a tracker says while it runs reaches its light. Preloaded, it shows the
+//! first frames of the rig's known motion over and over, three 8-bit patterns each (red, green, blue), whose bits the controller weighs
+//! itself. In video mode the light comes from whatever feeds its video input; this program sets it up and looks after it.
+
+use crate::cli::signals;
+use dpm_common::clock::Stopwatch;
+use dpm_device::dlpc900::driver::{DarkLine, Dlpc900, Dlpc900Error, HidPort, PortError};
+use dpm_device::dlpc900::image::PlaneOrder;
+use dpm_device::dlpc900::lut::{led, Dmd, LutEntry, IMAGE_PLANES, MAX_IMAGES};
+use dpm_device::dlpc900::sequence::{
+    LedSetup, Pattern, PatternSequence, Receiver, Repeat, SequenceBuilder, SequenceError, VideoPatterns,
+};
+use dpm_device::dlpc900::usb::{describe, UsbHid, UsbPlace};
+use dpm_device::link::faults;
+use dpm_device::planes::{Channel, PlaneSchedule};
+use dpm_lab::sequence::{draw, poses_at};
+use dpm_render::pack::{pack, BitPlaneFrame, Kernel};
+use dpm_render::{RenderError, Renderer};
+use dpm_rig::config::{Dlpc900Config, Dlpc900Mode, ProjectorBackend, RigConfig, TrackerConfig, VideoInput};
+use dpm_rig::failure::{Failure, FailureKind};
+use dpm_rig::pipeline::{renderer_settings, PipelineError};
+use dpm_rig::rig::Rig;
+use dpm_rig::run_rig::open_gpu;
+use dpm_rig::telemetry::monitor::{Order, ProjectorHealth, RunMonitor};
+use std::sync::atomic::{AtomicBool, AtomicU8, Ordering};
+use std::sync::{Arc, Mutex, PoisonError};
+use std::time::Duration;
+
+/// How often the run looks for orders, which the thread that makes dark has obeyed by then.
+const STEP: Duration = Duration::from_millis(20);
+/// How often the thread that makes dark looks for orders and for the end.
+const DARK_STEP: Duration = Duration::from_millis(2);
+/// How long a controller may be in other hands at the start: those of the run before, or of what puts it to rest after a SIGKILL.
+const BUSY_PATIENCE_NS: u64 = 5_000_000_000;
+/// How often the controller is asked how it is, and a lost one is looked for.
+const LOOK_NS: u64 = 200_000_000;
+
+/// What a run on a DLPC900 did.
+#[derive(Clone, Debug, serde::Serialize)]
+pub struct Dlpc900Report {
+    /// Version of the program.
+    pub version: &'static str,
+    /// The DMD.
+    pub dmd: &'static str,
+    /// "preloaded" or "video".
+    pub mode: &'static str,
+    /// Frames loaded; null in video mode, whose frames come from elsewhere.
+    pub frames_loaded: Option<usize>,
+    /// Frames a second that the pattern table adds up to.
+    pub frame_rate_hz: f64,
+    /// Patterns in the table.
+    pub patterns: usize,
+    /// Bytes of coded images loaded; null in video mode.
+    pub image_bytes: Option<usize>,
+    /// Time that the set-up took, the last time, seconds.
+    pub setup_s: f64,
+    /// Times that the controller was lost and set up again.
+    pub came_back: u64,
+    /// Wall time from the start of the sequence to its end, seconds.
+    pub shown_s: f64,
+    /// What the operator should know.
+    pub warnings: Vec<String>,
+}
+
+impl Dlpc900Report {
+    /// The report for people.
+    pub fn to_table(&self) -> String {
+        let mut out = format!(
+            "projector  {} ({}), {} patterns, {:.3} frames/s\nset up in  {:.2} s, shown for {:.2} s, came back {} times\n",
+            self.dmd, self.mode, self.patterns, self.frame_rate_hz, self.setup_s, self.shown_s, self.came_back
+        );
+        if let (Some(frames), Some(bytes)) = (self.frames_loaded, self.image_bytes) {
+            out += &format!("loaded     {frames} frames in {bytes} bytes\n");
+        }
+        for warning in &self.warnings {
+            out += &format!("warning: {warning}\n");
+        }
+        out
+    }
+}
+
+/// What the controller is set up with.
+pub enum Show {
+    /// Frames that are loaded.
+    Preloaded(PatternSequence),
+    /// Patterns out of the video signal.
+    Video(VideoPatterns),
+}
+
+impl Show {
+    /// Loaded and stopped.
+    fn load<P: HidPort>(&self, d: &mut Dlpc900<P>) -> Result<(), Dlpc900Error> {
+        match self {
+            Self::Preloaded(sequence) => d.upload(sequence, LedSetup::default(), &mut |_| ()),
+            Self::Video(video) => d.load_video_patterns(video),
+        }
+    }
+
+    fn entries(&self) -> &[LutEntry] {
+        match self {
+            Self::Preloaded(sequence) => sequence.entries(),
+            Self::Video(video) => &video.entries,
+        }
+    }
+}
+
+/// Most frames of `planes` planes that a DMD's controller holds.
+pub fn frames_held(dmd: Dmd, planes: usize) -> usize {
+    let images = (dmd.max_planes() as usize / IMAGE_PLANES).min(MAX_IMAGES);
+    images * (IMAGE_PLANES / planes.max(1))
+}
+
+/// `frames` as a sequence that runs for ever: for each channel one pattern of its eight bits, all of a frame in `frame_us` us.
+/// `exposure_us`: time lit of each pattern, its whole share of the frame when `None`.
+///
+/// # Errors
+/// The rule of the controller that they break.
+pub fn preload(
+    dmd: Dmd,
+    schedule: &PlaneSchedule,
+    frames: &[BitPlaneFrame],
+    frame_us: u32,
+    exposure_us: Option<u32>,
+) -> Result<PatternSequence, SequenceError> {
+    let channels = [Channel::Red, Channel::Green, Channel::Blue, Channel::White];
+    // Indices of a channel's planes, least significant first.
+    let bits_of = |channel: Channel| {
+        let mut bits: Vec<(u8, usize)> = schedule
+            .planes()
+            .iter()
+            .enumerate()
+            .filter(|(_, p)| p.channel == channel)
+            .map(|(k, p)| (p.bit, k))
+            .collect();
+        bits.sort_unstable();
+        bits.into_iter().map(|(_, k)| k).collect::<Vec<_>>()
+    };
+    let shown: Vec<(Channel, Vec<usize>)> =
+        channels.into_iter().map(|c| (c, bits_of(c))).filter(|(_, bits)| !bits.is_empty()).collect();
+    let share = frame_us / shown.len().max(1) as u32;
+    let exposure_us = exposure_us.unwrap_or(share).min(share);
+    let mut builder = SequenceBuilder::new(dmd);
+    for frame in frames {
+        for (channel, bits) in &shown {
+            builder.push(&Pattern {
+                planes: bits.iter().map(|&k| frame.plane(k)).collect(),
+                exposure_us,
+                dark_us: share - exposure_us,
+                leds: match channel {
+                    Channel::Red => led::RED,
+                    Channel::Green => led::GREEN,
+                    Channel::Blue => led::BLUE,
+                    Channel::White => led::WHITE,
+                },
+                wait_trigger: false,
+                no_trigger_out2: false,
+            });
+        }
+    }
+    builder.finish(Repeat::Forever, PlaneOrder::default(), None)
+}
+
+/// Runs the rig of `config`, whose backend is a DLPC900, until its frames are over or `monitor` asks to stop.
+///
+/// # Errors
+/// Bad scene or rules of the controller broken (exit code 2), a controller that fails (3), no GPU (4).
+pub fn run_dlpc900(config: &RigConfig, monitor: &RunMonitor) -> Result<Dlpc900Report, Failure> {
+    let ProjectorBackend::Dlpc900(backend) = &config.projector.backend else {
+        return Err(Failure::new(FailureKind::BadInput, "projector.backend.kind is not \"dlpc900\""));
+    };
+    let place = backend.device.as_deref().map(str::parse::<UsbPlace>).transpose();
+    let place =
+        place.map_err(|e| Failure::new(FailureKind::BadInput, format!("projector.backend.device: {e}")))?;
+    let waited = Stopwatch::start();
+    let mut open = || loop {
+        match UsbHid::open(place) {
+            Ok(port) => break Dlpc900::new(port),
+            Err(PortError::Busy) if waited.elapsed_ns() < BUSY_PATIENCE_NS && !monitor.stop_requested() => {
+                std::thread::sleep(STEP);
+            }
+            Err(source) => break Err(Dlpc900Error::Port { doing: describe(place), source }),
+        }
+    };
+    // Before minutes of rendering: is it there, and the one that is meant?
+    let dmd = backend.panel.dmd();
+    let found = open()?.dmd();
+    if found != dmd {
+        let told = format!(
+            "projector.backend.panel = {:?}, the controller drives a {}",
+            backend.panel.word(),
+            found.name()
+        );
+        return Err(Failure::new(FailureKind::BadInput, told));
+    }
+    let mut warnings =
+        vec!["a DLPC900 has no watchdog: if this machine fails, or this program and the one that looks after it are killed, it goes on \
+              showing; `dpm dlpc900 idle` ends it".into()];
+    let (show, frames_loaded) = match backend.mode {
+        Dlpc900Mode::Preloaded => {
+            let (sequence, frames) = load(config, backend, dmd, &mut warnings, monitor)?;
+            (Show::Preloaded(sequence), Some(frames))
+        }
+        Dlpc900Mode::Video => {
+            warnings.push(
+                "video mode: the light is what the video input carries; this program traces nothing".into(),
+            );
+            (Show::Video(video(config, backend, dmd)), None)
+        }
+    };
+    let seconds = match config.run.frames {
+        0 => Some(config.run.seconds).filter(|s| *s > 0.0),
+        frames => Some(frames as f64 / config.projector.frame_rate.hz()),
+    };
+    let mut report = present(&mut open, &show, seconds, monitor)?;
+    report.frames_loaded = frames_loaded;
+    report.warnings = warnings;
+    Ok(report)
+}
+
+/// Renders the frames that fit.
+fn load(
+    config: &RigConfig,
+    backend: &Dlpc900Config,
+    dmd: Dmd,
+    warnings: &mut Vec<String>,
+    monitor: &RunMonitor,
+) -> Result<(PatternSequence, usize), Failure> {
+    let rig = Rig::build(config, None)?;
+    let schedule = config.projector.schedule();
+    let most = frames_held(dmd, schedule.len());
+    let frames = if matches!(config.tracker, TrackerConfig::Mock(_)) {
+        let wanted = if config.run.frames == 0 { most as u64 } else { config.run.frames };
+        if wanted > most as u64 {
+            warnings.push(format!("the {} holds {most} frames; they are shown over and over", dmd.name()));
+        }
+        wanted.min(most as u64)
+    } else {
+        warnings.push(
+            "nothing that the tracker says reaches preloaded frames: one is shown, all bodies at rest".into(),
+        );
+        1
+    };
+    let gpu = open_gpu(config)?;
+    let mut renderer =
+        Renderer::new(&gpu, &rig.scene, renderer_settings(&rig)).map_err(PipelineError::from)?;
+    let mut slot = renderer.create_slot(false).map_err(RenderError::from).map_err(PipelineError::from)?;
+    let spp = config.render.spp;
+    let mut packed = Vec::new();
+    for k in 0..frames {
+        if monitor.stop_requested() {
+            break;
+        }
+        let poses = poses_at(&rig, k);
+        draw(&rig, &mut renderer, &mut slot, &poses, k as u32, spp, spp as f32)
+            .map_err(|source| PipelineError::Gpu { frame: k, source })?;
+        let mut frame = BitPlaneFrame::new(rig.camera.raster, schedule);
+        pack(Kernel::best(), slot.codes(), &mut frame);
+        packed.push(frame);
+        monitor.count_planned();
+    }
+    if packed.is_empty() {
+        return Err(Failure::new(FailureKind::BadInput, "stopped before the first frame was rendered"));
+    }
+    let rate = config.projector.frame_rate;
+    let frame_us = (1_000_000 * u64::from(rate.den()) / u64::from(rate.num())) as u32;
+    let sequence = preload(dmd, &schedule, &packed, frame_us, backend.exposure_us).map_err(|e| {
+        let remedy = "lower projector.frame_rate, or set projector.planes = 8";
+        Failure::new(FailureKind::BadInput, format!("{e}; {remedy}"))
+    })?;
+    Ok((sequence, packed.len()))
+}
+
+/// One-bit patterns of the video's 24 planes, the frame shared out evenly.
+fn video(config: &RigConfig, backend: &Dlpc900Config, dmd: Dmd) -> VideoPatterns {
+    let rate = config.projector.frame_rate;
+    let frame_hz = rate.hz().round() as u32;
+    let patterns = config.projector.planes as u8;
+    let share = 1_000_000 / frame_hz.max(1) / u32::from(patterns);
+    let exposure_us = backend.exposure_us.unwrap_or(share).min(share);
+    let entry = |i: u8| LutEntry { leds: led::WHITE, ..LutEntry::one_bit(i.into(), 0, i, exposure_us) };
+    VideoPatterns {
+        dmd,
+        receiver: match backend.input {
+            VideoInput::Parallel => Receiver::None,
+            VideoInput::Hdmi => Receiver::Hdmi,
+            VideoInput::DisplayPort => Receiver::DisplayPort,
+        },
+        frame_hz,
+        entries: (0..patterns).map(entry).collect(),
+        leds: LedSetup::default(),
+    }
+}
+
+/// Sets the controller up, obeys orders, looks after it for `seconds` (for ever when `None`), and puts it to rest.
+///
+/// # Errors
+/// The controller refuses or fails. While it is unplugged there is no error: it is looked for, and set up again.
+pub fn present<P: HidPort>(
+    open: &mut dyn FnMut() -> Result<Dlpc900<P>, Dlpc900Error>,
+    show: &Show,
+    seconds: Option<f64>,
+    monitor: &RunMonitor,
+) -> Result<Dlpc900Report, Failure> {
+    let mut d = open()?;
+    let step_us: u64 = show.entries().iter().map(|e| u64::from(e.exposure_us) + u64::from(e.dark_us)).sum();
+    let frames = match show {
+        Show::Preloaded(s) => s.images().len(),
+        Show::Video(_) => 1,
+    };
+    let mut report = Dlpc900Report {
+        version: env!("CARGO_PKG_VERSION"),
+        dmd: d.dmd().name(),
+        mode: if matches!(show, Show::Preloaded(_)) { "preloaded" } else { "video" },
+        frames_loaded: None,
+        frame_rate_hz: frames as f64 * 1e6 / step_us.max(1) as f64,
+        patterns: show.entries().len(),
+        image_bytes: match show {
+            Show::Preloaded(s) => Some(s.image_bytes()),
+            Show::Video(_) => None,
+        },
+        setup_s: 0.0,
+        came_back: 0,
+        shown_s: 0.0,
+        warnings: Vec::new(),
+    };
+    let word = Word::default();
+    if let Some(order) = monitor.take_order() {
+        // What stands from before the run, or was ordered while it rendered: the controller is set up dark.
+        word.waiting.store(order as u8, Ordering::Relaxed);
+    }
+    let (result, rested) = std::thread::scope(|scope| {
+        // Also when this unwinds: the scope waits for the other thread.
+        let _over = Over(&word);
+        let spawned = std::thread::Builder::new()
+            .name("dpm-dark".into())
+            .spawn_scoped(scope, || word.make_dark_when_told(monitor))
+            .map_err(|e| Failure::new(FailureKind::Device, format!("cannot start a thread: {e}")));
+        let result =
+            spawned.and_then(|_| watch_over(&mut d, open, show, seconds, &word, monitor, &mut report));
+        // Whatever happened: stopped, LEDs off, mirrors exercised. A controller that is gone cannot be told, and one that does not
+        // answer is not asked again: the process must end.
+        d.hurry();
+        // Half a command may have gone out before the stop; the first one after it may be lost with it.
+        let stopped = d.stop().or_else(|e| if is_gone(&e) { Err(e) } else { d.stop() });
+        let rested = if matches!(stopped, Err(Dlpc900Error::Port { .. })) { stopped } else { d.idle() };
+        (result, rested)
+    });
+    monitor.set_projector(ProjectorHealth::Stopped);
+    result?;
+    match rested {
+        Err(e) if !is_gone(&e) => Err(e.into()),
+        _ => Ok(report),
+    }
+}
+
+fn is_gone(e: &Dlpc900Error) -> bool {
+    matches!(e, Dlpc900Error::Port { source: PortError::Gone | PortError::NotFound, .. })
+}
+
+/// What the run's thread and the one that makes dark tell each other. The second one is there because the first may be inside a call
+/// of the cable for a second, in an upload for half a minute, or stopped.
+#[derive(Default)]
+struct Word {
+    /// The run is to end; read by the driver too.
+    stop: Arc<AtomicBool>,
+    /// The run has ended.
+    over: AtomicBool,
+    /// The order that the run has not seen yet; 0 for none.
+    waiting: AtomicU8,
+    /// The sequence is stopped for an upload, so nothing is lit, and a command from elsewhere would only tear the upload's apart.
+    loading: AtomicBool,
+    line: Mutex<Option<DarkLine>>,
+}
+
+/// Ends the thread that makes dark when it is dropped.
+struct Over<'a>(&'a Word);
+
+impl Drop for Over<'_> {
+    fn drop(&mut self) {
+        self.0.over.store(true, Ordering::Release);
+    }
+}
+
+impl Word {
+    /// Obeys what must be dark within milliseconds, and hands every order on to the run.
+    fn make_dark_when_told(&self, monitor: &RunMonitor) {
+        while !self.over.load(Ordering::Acquire) {
+            if let Some(order) = monitor.take_order() {
+                // Before it is obeyed: the run must not take a sequence that stops for one that stopped by itself.
+                let _ = self.waiting.fetch_update(Ordering::Relaxed, Ordering::Relaxed, |waiting| {
+                    Some(outweighing(from_code(waiting), order) as u8)
+                });
+                if matches!(order, Order::Black | Order::Safe) {
+                    self.make_dark(false);
+                }
+            }
+            // The signal itself as well: the thread that hands it on may be the one that hangs.
+            if signals::received().is_some() {
+                monitor.request_stop();
+            }
+            if monitor.stop_requested() && !self.stop.swap(true, Ordering::Relaxed) {
+                self.make_dark(true);
+            }
+            std::thread::sleep(DARK_STEP);
+        }
+    }
+
+    /// A cable that fails is the run's to tell.
+    fn make_dark(&self, leds_off: bool) {
+        if self.loading.load(Ordering::SeqCst) {
+            return;
+        }
+        if let Some(line) = self.line.lock().unwrap_or_else(PoisonError::into_inner).as_mut() {
+            let _ = line.dark(leds_off);
+        }
+    }
+
+    fn is_waiting(&self) -> bool {
+        self.waiting.load(Ordering::Relaxed) != 0 || self.stop.load(Ordering::Relaxed)
+    }
+
+    /// The order that was not seen yet, once.
+    fn take(&self) -> Option<Order> {
+        from_code(self.waiting.swap(0, Ordering::Relaxed))
+    }
+}
+
+fn from_code(code: u8) -> Option<Order> {
+    Order::ALL.iter().map(|(order, _)| *order).find(|order| *order as u8 == code)
+}
+
+/// The one that holds when `new` is given while `old` stands: nothing but ARM takes SAFE back, and FREEZE brings no light back.
+fn outweighing(old: Option<Order>, new: Order) -> Order {
+    match (old, new) {
+        (Some(Order::Safe), Order::Black | Order::Freeze) => Order::Safe,
+        (Some(Order::Black), Order::Freeze) => Order::Black,
+        (_, new) => new,
+    }
+}
+
+/// The order that stands after `new`; `None` after ARM.
+fn standing_after(old: Option<Order>, new: Order) -> Option<Order> {
+    Some(outweighing(old, new)).filter(|order| *order != Order::Arm)
+}
+
+fn watch_over<P: HidPort>(
+    d: &mut Dlpc900<P>,
+    open: &mut dyn FnMut() -> Result<Dlpc900<P>, Dlpc900Error>,
+    show: &Show,
+    seconds: Option<f64>,
+    word: &Word,
+    monitor: &RunMonitor,
+    report: &mut Dlpc900Report,
+) -> Result<(), Failure> {
+    let mut standing: Option<Order> = None;
+    let mut lost = false;
+    // A controller that is set up shows at once: not before the interlock says so.
+    while !monitor.light_allowed() && !monitor.stop_requested() {
+        monitor.set_projector(ProjectorHealth::InterlockOpen);
+        std::thread::sleep(STEP);
+    }
+    let mut allowed = true;
+    let set_up = |d: &mut Dlpc900<P>, standing: &mut Option<Order>, report: &mut Dlpc900Report| {
+        let watch = Stopwatch::start();
+        *word.line.lock().unwrap_or_else(PoisonError::into_inner) = d.dark_line();
+        d.stop_when(Arc::clone(&word.stop));
+        // Before seconds go into an upload: out of the exercise that every run ends in, and of a sequence that a killed run left.
+        d.make_ready()?;
+        d.stop()?;
+        word.loading.store(true, Ordering::SeqCst);
+        let loaded = show.load(d);
+        word.loading.store(false, Ordering::SeqCst);
+        loaded?;
+        if let Some(order) = word.take() {
+            *standing = standing_after(*standing, order);
+        }
+        // Nobody's order to be dark is answered by light, not even by that of one pattern.
+        match *standing {
+            Some(Order::Black | Order::Safe) => {}
+            Some(Order::Freeze) => d.start().and_then(|()| d.pause())?,
+            Some(Order::Arm) | None => d.start()?,
+        }
+        report.setup_s = watch.elapsed_ns() as f64 * 1e-9;
+        monitor.set_projector(health(*standing));
+        Ok(())
+    };
+    match set_up(d, &mut standing, report) {
+        Err(Dlpc900Error::Stopped) => return Ok(()),
+        other => other?,
+    }
+    let (shown, mut looked) = (Stopwatch::start(), Stopwatch::start());
+    while !monitor.stop_requested() && seconds.is_none_or(|s| shown.elapsed_ns() as f64 * 1e-9 < s) {
+        let order = word.take();
+        if let Some(order) = order {
+            standing = standing_after(standing, order);
+        }
+        let due = looked.elapsed_ns() >= LOOK_NS;
+        let was_allowed = std::mem::replace(&mut allowed, monitor.light_allowed());
+        if !allowed && standing == Some(Order::Freeze) {
+            // What was held is dark now, and the operator's to show again.
+            standing = Some(Order::Black);
+        }
+        let step = match (lost, order) {
+            (true, _) if due && allowed => {
+                looked = Stopwatch::start();
+                open().and_then(|found| {
+                    *d = found;
+                    // It may have been without power.
+                    set_up(d, &mut standing, report)?;
+                    (lost, report.came_back) = (false, report.came_back + 1);
+                    Ok(())
+                })
+            }
+            (true, _) => Ok(()),
+            (false, _) if allowed != was_allowed => {
+                let wanted = if allowed { standing } else { Some(Order::Black) };
+                let health = if allowed { health(standing) } else { ProjectorHealth::InterlockOpen };
+                obey(d, wanted).map(|()| monitor.set_projector(health))
+            }
+            // What was ordered is done when it closes.
+            (false, _) if !allowed => Ok(()),
+            (false, Some(_)) => obey(d, standing).map(|()| monitor.set_projector(health(standing))),
+            (false, None) if due => {
+                looked = Stopwatch::start();
+                look(d, standing, word)
+            }
+            (false, None) => Ok(()),
+        };
+        match step {
+            Ok(()) | Err(Dlpc900Error::Stopped) => {}
+            // Right after it was plugged in it may still be without rights, in other hands, or silent.
+            Err(e) if is_gone(&e) || lost && matches!(e, Dlpc900Error::Port { .. }) => {
+                lost = true;
+                monitor.set_projector(ProjectorHealth::Lost);
+            }
+            Err(e) => return Err(e.into()),
+        }
+        std::thread::sleep(STEP);
+    }
+    report.shown_s = shown.elapsed_ns() as f64 * 1e-9;
+    Ok(())
+}
+
+fn obey<P: HidPort>(d: &mut Dlpc900<P>, standing: Option<Order>) -> Result<(), Dlpc900Error> {
+    match standing {
+        // The controller knows one kind of dark without losing its table.
+        Some(Order::Black | Order::Safe) => d.stop(),
+        // What is paused goes on from there, and pausing it again changes nothing.
+        Some(Order::Freeze) => d.pause(),
+        Some(Order::Arm) | None => d.start(),
+    }
+}
+
+fn health(standing: Option<Order>) -> ProjectorHealth {
+    match standing {
+        Some(Order::Black) => ProjectorHealth::Black,
+        Some(Order::Freeze) => ProjectorHealth::Frozen,
+        Some(Order::Safe) => ProjectorHealth::Faulted(faults::HOST_SAFE),
+        Some(Order::Arm) | None => ProjectorHealth::Up,
+    }
+}
+
+/// A controller that stopped by itself, or complains, ends the run.
+fn look<P: HidPort>(d: &mut Dlpc900<P>, standing: Option<Order>, word: &Word) -> Result<(), Dlpc900Error> {
+    let status = d.status()?;
+    match status.complaint() {
+        Some(what) => Err(Dlpc900Error::Hardware(what)),
+        None if standing.is_none() && !status.is_running() && !word.is_waiting() => {
+            Err(Dlpc900Error::Hardware("the sequence stopped by itself".into()))
+        }
+        None => Ok(()),
+    }
+}
+
+#[cfg(test)]
+#[path = "run_dlpc900_tests.rs"]
+mod tests;

@@ -1,0 +1,473 @@
+//! A DLPC900 run against the emulator: what is shown, what orders do, and what happens when the cable is pulled.
+
+use super::*;
+use dpm_device::dlpc900::lut::DisplayMode;
+use dpm_device::time::HostTime;
+use dpm_render::pack::unpack;
+use dpm_rig::pipeline::prepared::PreparedFrames;
+use hil_mock::dlpc900::{Dlpc900Model, Options, Sequencer, VirtualHid};
+use std::sync::{Arc, Mutex};
+
+const DMD: Dmd = Dmd::Dlp5500;
+
+fn model() -> Arc<Mutex<Dlpc900Model>> {
+    Arc::new(Mutex::new(Dlpc900Model::new(Options { dmd: DMD, strict: true, ..Options::default() })))
+}
+
+fn frames(schedule: PlaneSchedule, n: u64) -> Vec<BitPlaneFrame> {
+    let mut prepared = PreparedFrames::new(DMD.raster());
+    (0..n)
+        .map(|k| {
+            let mut frame = BitPlaneFrame::new(DMD.raster(), schedule);
+            prepared.pack(Kernel::best(), k, &mut frame);
+            frame
+        })
+        .collect()
+}
+
+#[test]
+fn a_frame_becomes_three_patterns_of_eight_bits_that_share_its_time() {
+    let schedule = PlaneSchedule::rgb24();
+    let frames = frames(schedule, 2);
+    let sequence = preload(DMD, &schedule, &frames, 33_333, Some(10_000)).unwrap();
+    let entries = sequence.entries();
+    assert_eq!(entries.len(), 6);
+    for (i, e) in entries.iter().enumerate() {
+        assert_eq!((e.depth, e.exposure_us, e.dark_us), (8, 10_000, 1_111), "entry {i}");
+        assert_eq!(e.leds, [led::RED, led::GREEN, led::BLUE][i % 3]);
+    }
+    // Frames of one channel share an image.
+    let mono = PlaneSchedule::mono8();
+    let sequence = preload(DMD, &mono, &self::frames(mono, 4), 16_666, None).unwrap();
+    assert_eq!((sequence.entries().len(), sequence.images().len()), (4, 2));
+    assert!(sequence.entries().iter().all(|e| e.leds == led::WHITE && e.exposure_us == 16_666));
+    for (dmd, planes, held) in [(Dmd::Dlp6500, 24, 16), (Dmd::Dlp6500, 8, 48), (Dmd::Dlp500yx, 24, 18)] {
+        assert_eq!(frames_held(dmd, planes), held, "{dmd:?} {planes}");
+    }
+    // A DLP6500 shows eight bits in 4046 us at least.
+    let none: &[BitPlaneFrame] = &[];
+    assert!(preload(Dmd::Dlp6500, &schedule, none, 10_000, None).is_err());
+}
+
+/// What the emulator projects is, grey value by grey value, what was packed; it runs, obeys, and is put to rest.
+#[test]
+fn loaded_frames_are_shown_bit_for_bit_and_put_to_rest() {
+    let schedule = PlaneSchedule::rgb24();
+    let frames = frames(schedule, 2);
+    let show = Show::Preloaded(preload(DMD, &schedule, &frames, 33_333, None).unwrap());
+    let model = model();
+    let monitor = Arc::new(RunMonitor::default());
+    let (seen, watched) = (model.clone(), monitor.clone());
+    let observer = std::thread::spawn(move || {
+        let _ends = StopOnExit(watched.clone());
+        let until = |what: &str, wanted: &dyn Fn(&mut Dlpc900Model) -> bool| {
+            for _ in 0..4000 {
+                if wanted(&mut seen.lock().unwrap()) {
+                    return;
+                }
+                std::thread::sleep(Duration::from_millis(5));
+            }
+            panic!("never {what}");
+        };
+        let running = |m: &mut Dlpc900Model| matches!(m.sequencer(HostTime(0)), Sequencer::Running(..));
+        until("running", &running);
+        {
+            let m = seen.lock().unwrap();
+            assert_eq!(m.mode(), DisplayMode::OnTheFly);
+            let mut codes = vec![0u32; DMD.raster().pixel_count()];
+            for (k, frame) in frames.iter().enumerate() {
+                unpack(frame, &mut codes);
+                for channel in 0..3 {
+                    let grey = m.projected_grey(3 * k + channel).expect("a pattern");
+                    let wanted = codes.iter().map(|c| (c >> (8 * channel)) as u8);
+                    assert!(grey.into_iter().eq(wanted), "frame {k} channel {channel}");
+                }
+            }
+            assert_eq!(m.warnings(), [] as [String; 0]);
+        }
+        watched.give_order(Order::Black);
+        until("stopped", &|m| m.sequencer(HostTime(0)) == Sequencer::Stopped);
+        watched.give_order(Order::Arm);
+        until("running again", &running);
+    });
+    let mut open = || Dlpc900::new(VirtualHid::new(model.clone()));
+    let report = present(&mut open, &show, None, &monitor).unwrap();
+    observer.join().unwrap();
+    assert_eq!((report.patterns, report.mode, report.came_back), (6, "preloaded", 0));
+    assert!((report.frame_rate_hz - 30.0).abs() < 0.01, "{}", report.frame_rate_hz);
+    assert_eq!(model.lock().unwrap().dark_because(), Some("mirrors exercised"));
+    assert_eq!(monitor.projector(), ProjectorHealth::Stopped);
+}
+
+/// Ends the run with the thread that watches it, should that fail, too.
+struct StopOnExit(Arc<RunMonitor>);
+
+impl Drop for StopOnExit {
+    fn drop(&mut self) {
+        self.0.request_stop();
+    }
+}
+
+/// A cable that can be cut: what stands at its other end is looked up each time it is opened.
+struct Cut {
+    hid: VirtualHid,
+    plugged: Arc<Mutex<Option<Arc<Mutex<Dlpc900Model>>>>>,
+}
+
+impl Cut {
+    fn is_whole(&self) -> Result<(), PortError> {
+        self.plugged.lock().unwrap().as_ref().map(|_| ()).ok_or(PortError::Gone)
+    }
+}
+
+impl HidPort for Cut {
+    fn write_report(&mut self, report: &[u8; 64], timeout: Duration) -> Result<(), PortError> {
+        self.is_whole()?;
+        self.hid.write_report(report, timeout)
+    }
+    fn read_report(&mut self, report: &mut [u8; 64], timeout: Duration) -> Result<(), PortError> {
+        self.is_whole()?;
+        self.hid.read_report(report, timeout)
+    }
+    fn pause(&mut self, time: Duration) {
+        self.hid.pause(time);
+    }
+}
+
+/// Unplugged it is lost within a look, plugged in again it is set up from nothing, and what the operator said last still holds.
+#[test]
+fn a_controller_that_was_unplugged_is_set_up_again_as_the_operator_left_it() {
+    let schedule = PlaneSchedule::mono8();
+    let frames = frames(schedule, 3);
+    let show = Show::Preloaded(preload(DMD, &schedule, &frames, 33_333, None).unwrap());
+    let plugged = Arc::new(Mutex::new(Some(model())));
+    let monitor = Arc::new(RunMonitor::default());
+    let (socket, watched) = (plugged.clone(), monitor.clone());
+    let observer = std::thread::spawn(move || {
+        let _ends = StopOnExit(watched.clone());
+        let until = |what: &str, limit: Duration, wanted: &dyn Fn() -> bool| {
+            let (mut waited, step) = (Duration::ZERO, Duration::from_millis(2));
+            while !wanted() {
+                assert!(waited < limit, "not {what} within {limit:?} of this machine's time");
+                std::thread::sleep(step);
+                waited += step;
+            }
+        };
+        let sequencer = || {
+            let model = socket.lock().unwrap().clone().expect("plugged in");
+            let state = model.lock().unwrap().sequencer(HostTime(0));
+            state
+        };
+        let long = Duration::from_secs(20);
+        // The sequencer runs before the set-up has had its last answer, and one that is unplugged before that ends the run.
+        until("set up", long, &|| watched.projector() == ProjectorHealth::Up);
+        until("running", long, &|| matches!(sequencer(), Sequencer::Running(..)));
+        for (order, stays_dark) in [(None, false), (Some(Order::Black), true)] {
+            *socket.lock().unwrap() = None;
+            // It is looked at five times a second.
+            let noticed = || watched.projector() == ProjectorHealth::Lost;
+            until("lost", Duration::from_millis(500), &noticed);
+            order.into_iter().for_each(|o| watched.give_order(o));
+            std::thread::sleep(Duration::from_millis(50));
+            // Another one, or the same without power meanwhile: it knows nothing.
+            *socket.lock().unwrap() = Some(model());
+            let wanted = if stays_dark { ProjectorHealth::Black } else { ProjectorHealth::Up };
+            until("taken up again", long, &|| watched.projector() == wanted);
+            assert_eq!(matches!(sequencer(), Sequencer::Running(..)), !stays_dark);
+            let model = socket.lock().unwrap().clone().expect("plugged in");
+            let m = model.lock().unwrap();
+            let mut codes = vec![0u32; DMD.raster().pixel_count()];
+            unpack(&frames[2], &mut codes);
+            // A white plane comes back as the green bits.
+            let wanted = codes.iter().map(|c| (c >> 8) as u8);
+            assert!(m.projected_grey(2).expect("a pattern").into_iter().eq(wanted), "loaded again");
+        }
+    });
+    let mut open = || {
+        let there = plugged.lock().unwrap().clone();
+        let not_found = Dlpc900Error::Port { doing: "open".into(), source: PortError::NotFound };
+        let hid = VirtualHid::new(there.ok_or(not_found)?);
+        Dlpc900::new(Cut { hid, plugged: plugged.clone() })
+    };
+    let report = present(&mut open, &show, None, &monitor).unwrap();
+    observer.join().unwrap();
+    assert_eq!(report.came_back, 2);
+    let last = plugged.lock().unwrap().clone().expect("plugged in");
+    assert_eq!(last.lock().unwrap().dark_because(), Some("mirrors exercised"));
+}
+
+/// Waits for `wanted` of the emulator, at most 20 s of this machine's time.
+fn until(model: &Arc<Mutex<Dlpc900Model>>, what: &str, wanted: impl Fn(&mut Dlpc900Model) -> bool) {
+    for _ in 0..10_000 {
+        if wanted(&mut model.lock().unwrap()) {
+            return;
+        }
+        std::thread::sleep(Duration::from_millis(2));
+    }
+    panic!("never {what}");
+}
+
+/// Something that a controller is told.
+type Act = fn(&mut Dlpc900<VirtualHid>) -> Result<(), Dlpc900Error>;
+
+fn is_running(m: &mut Dlpc900Model) -> bool {
+    matches!(m.sequencer(HostTime(0)), Sequencer::Running(..))
+}
+
+fn shows() -> [Show; 2] {
+    let schedule = PlaneSchedule::mono8();
+    let preloaded = preload(DMD, &schedule, &frames(schedule, 1), 33_333, None).unwrap();
+    let entry = |i: u8| LutEntry { leds: led::WHITE, ..LutEntry::one_bit(i.into(), 0, i, 600) };
+    let video = VideoPatterns {
+        dmd: DMD,
+        receiver: Receiver::Hdmi,
+        frame_hz: 60,
+        entries: (0..8).map(entry).collect(),
+        leds: LedSetup::default(),
+    };
+    [Show::Preloaded(preloaded), Show::Video(video)]
+}
+
+/// Found in use, O2: the second run on one controller was refused, because the first one had ended in the mirrors' exercise. Ten in a
+/// row, in both modes, and after everything else that a controller may be left in, by the rules of a controller that is strict.
+#[test]
+fn a_rig_starts_again_whatever_the_controller_was_left_in() {
+    for show in shows() {
+        let model = model();
+        let mut at = HostTime(0);
+        let mut controller = |later_s: i64| {
+            at = at.plus_ns(later_s * 1_000_000_000);
+            Dlpc900::new(VirtualHid::starting_at(model.clone(), at))
+        };
+        for run in 0..14 {
+            // After the tenth run: rested by hand, parked, in standby, and killed while it showed.
+            let left: Option<Act> = match run {
+                10 => Some(Dlpc900::idle),
+                11 => Some(Dlpc900::park),
+                12 => Some(Dlpc900::standby),
+                13 => Some(|d| d.make_ready().and_then(|_| shows()[0].load(d)).and_then(|()| d.start())),
+                _ => None,
+            };
+            if let Some(leave) = left {
+                leave(&mut controller(1000).unwrap()).unwrap();
+            }
+            let monitor = Arc::new(RunMonitor::default());
+            let (seen, watched) = (model.clone(), monitor.clone());
+            let observer = std::thread::spawn(move || {
+                let _ends = StopOnExit(watched.clone());
+                for _ in 0..10_000 {
+                    if watched.projector() == ProjectorHealth::Up {
+                        assert!(is_running(&mut seen.lock().unwrap()));
+                        assert_eq!(seen.lock().unwrap().dark_because(), None);
+                        return;
+                    }
+                    std::thread::sleep(Duration::from_millis(2));
+                }
+                panic!("never up");
+            });
+            let result = present(&mut || controller(1000), &show, None, &monitor);
+            assert!(result.is_ok(), "run {run}: {:?}", result.err().map(|e| e.to_string()));
+            observer.join().unwrap();
+            let m = model.lock().unwrap();
+            assert_eq!(m.dark_because(), Some("mirrors exercised"), "run {run}");
+            assert_eq!(m.warnings(), [] as [String; 0], "run {run}: against the guide");
+        }
+    }
+}
+
+/// Found in use, O2: what is not allowed while the mirrors exercise, are parked or the controller sleeps is explained by that, not by
+/// the display mode.
+#[test]
+fn a_refusal_names_the_remedy_for_the_state_that_the_controller_is_in() {
+    let model = model();
+    let mut d = Dlpc900::new(VirtualHid::new(model)).unwrap();
+    let [show, _] = shows();
+    let states: [(Act, &str); 3] = [
+        (Dlpc900::idle, "dpm dlpc900 leave-idle"),
+        (Dlpc900::park, "dpm dlpc900 unpark"),
+        (Dlpc900::standby, "dpm dlpc900 wake"),
+    ];
+    for (rest, remedy) in states {
+        d.make_ready().unwrap();
+        show.load(&mut d).unwrap();
+        rest(&mut d).unwrap();
+        let told = d.start().unwrap_err().to_string();
+        assert!(told.contains("(error 5") && told.contains(remedy), "{told}");
+    }
+    d.make_ready().unwrap();
+    let told = d.run(&dpm_device::dlpc900::sequence::pause(), &mut |_| ()).unwrap_err().to_string();
+    assert!(told.contains("stop the sequence and select the right display mode"), "{told}");
+}
+
+/// A cable whose user can be made to hang inside its calls, as a thread that is stopped does, and that takes time for a report.
+struct Sticky {
+    hid: VirtualHid,
+    stuck: Arc<AtomicBool>,
+    is_inside: Arc<AtomicBool>,
+    report_time: Duration,
+}
+
+impl Sticky {
+    fn wait(&self) {
+        std::thread::sleep(self.report_time);
+        while self.stuck.load(Ordering::Relaxed) {
+            self.is_inside.store(true, Ordering::Relaxed);
+            std::thread::sleep(Duration::from_millis(1));
+        }
+    }
+}
+
+impl HidPort for Sticky {
+    fn write_report(&mut self, report: &[u8; 64], timeout: Duration) -> Result<(), PortError> {
+        self.wait();
+        self.hid.write_report(report, timeout)
+    }
+    fn read_report(&mut self, report: &mut [u8; 64], timeout: Duration) -> Result<(), PortError> {
+        self.wait();
+        self.hid.read_report(report, timeout)
+    }
+    fn pause(&mut self, time: Duration) {
+        self.hid.pause(time);
+    }
+    fn second_line(&self) -> Option<Box<dyn dpm_device::dlpc900::driver::SecondLine>> {
+        self.hid.second_line()
+    }
+}
+
+/// Found in use, R2 on this device: a stop, SAFE and BLACK are obeyed within 50 ms also while the run's own thread hangs inside the
+/// cable, and no later word of that thread brings the light back.
+#[test]
+fn a_hanging_run_is_made_dark_within_50_ms() {
+    let [show, _] = shows();
+    for order in [None, Some(Order::Safe), Some(Order::Black)] {
+        // A machine that is busy with something else may be late; one of three tries must be in time.
+        let mut took = Vec::new();
+        for _ in 0..3 {
+            let (model, stuck) = (model(), Arc::new(AtomicBool::new(false)));
+            let is_inside = Arc::new(AtomicBool::new(false));
+            let monitor = Arc::new(RunMonitor::default());
+            let (seen, watched, hold, held) =
+                (model.clone(), monitor.clone(), stuck.clone(), is_inside.clone());
+            let observer = std::thread::spawn(move || {
+                let _ends = StopOnExit(watched.clone());
+                until(&seen, "running", is_running);
+                // Up first: the start is acknowledged.
+                while watched.projector() != ProjectorHealth::Up {
+                    std::thread::sleep(Duration::from_millis(1));
+                }
+                hold.store(true, Ordering::Relaxed);
+                while !held.load(Ordering::Relaxed) {
+                    std::thread::sleep(Duration::from_millis(1));
+                }
+                let watch = Stopwatch::start();
+                match order {
+                    None => watched.request_stop(),
+                    Some(order) => watched.give_order(order),
+                }
+                until(&seen, "dark", |m| m.dark_because().is_some());
+                let took_ms = watch.elapsed_ns() / 1_000_000;
+                hold.store(false, Ordering::Relaxed);
+                // The run goes on where it was: it must not take the stopped sequence for a failure, nor start it again.
+                for _ in 0..60 {
+                    assert!(seen.lock().unwrap().dark_because().is_some(), "{order:?}: lit again");
+                    std::thread::sleep(Duration::from_millis(5));
+                }
+                took_ms
+            });
+            let mut open = || {
+                let (stuck, is_inside) = (stuck.clone(), is_inside.clone());
+                let hid = VirtualHid::new(model.clone());
+                Dlpc900::new(Sticky { hid, stuck, is_inside, report_time: Duration::ZERO })
+            };
+            let result = present(&mut open, &show, None, &monitor);
+            took.push(observer.join().unwrap());
+            assert!(result.is_ok(), "{order:?}: {:?}", result.err().map(|e| e.to_string()));
+            assert_eq!(model.lock().unwrap().dark_because(), Some("mirrors exercised"));
+            if took.last().is_some_and(|ms| *ms <= 50) {
+                break;
+            }
+        }
+        assert!(took.iter().any(|ms| *ms <= 50), "{order:?}: dark after {took:?} ms");
+    }
+}
+
+/// A stop in the middle of an upload, or of the three seconds that mirrors must exercise, ends the run at once and lights nothing.
+#[test]
+fn a_stop_is_heard_during_the_set_up() {
+    let [show, _] = shows();
+    for exercised in [false, true] {
+        let model = model();
+        if exercised {
+            Dlpc900::new(VirtualHid::new(model.clone())).unwrap().idle().unwrap();
+        }
+        let monitor = Arc::new(RunMonitor::default());
+        let (seen, watched) = (model.clone(), monitor.clone());
+        let observer = std::thread::spawn(move || {
+            let _ends = StopOnExit(watched.clone());
+            until(&seen, "begun", |m| m.commands() > if exercised { 10 } else { 30 });
+            watched.request_stop();
+            Stopwatch::start()
+        });
+        let mut open = || {
+            let hid = VirtualHid::new(model.clone());
+            let (stuck, is_inside) = (Arc::default(), Arc::default());
+            // Some seconds for the whole upload.
+            Dlpc900::new(Sticky { hid, stuck, is_inside, report_time: Duration::from_millis(1) })
+        };
+        let report = present(&mut open, &show, None, &monitor).unwrap();
+        let took = observer.join().unwrap().elapsed_ns();
+        assert!(took < 1_000_000_000, "{took} ns");
+        assert_eq!(report.shown_s, 0.0);
+        let m = model.lock().unwrap();
+        assert_eq!(m.dark_because(), Some("mirrors exercised"));
+        let started = m.executed().iter().any(|e| e.opcode.0 == 0x1a24 && e.data == [2]);
+        assert!(!started, "never lit");
+    }
+}
+
+/// SAFE is taken back by ARM alone, FREEZE does not bring back light that was ordered off, and neither ends the run.
+#[test]
+fn orders_outweigh_one_another() {
+    use Order::{Arm, Black, Freeze, Safe};
+    let [show, _] = shows();
+    let model = model();
+    let monitor = Arc::new(RunMonitor::default());
+    let (seen, watched) = (model.clone(), monitor.clone());
+    let observer = std::thread::spawn(move || {
+        let _ends = StopOnExit(watched.clone());
+        until(&seen, "running", is_running);
+        let safe = ProjectorHealth::Faulted(faults::HOST_SAFE);
+        for (order, health) in [
+            (Freeze, ProjectorHealth::Frozen),
+            (Freeze, ProjectorHealth::Frozen),
+            (Black, ProjectorHealth::Black),
+            (Freeze, ProjectorHealth::Black),
+            (Safe, safe),
+            (Black, safe),
+            (Freeze, safe),
+            (Arm, ProjectorHealth::Up),
+            (Arm, ProjectorHealth::Up),
+            (Black, ProjectorHealth::Black),
+        ] {
+            watched.give_order(order);
+            let watch = Stopwatch::start();
+            while watched.projector() != health {
+                assert!(
+                    watch.elapsed_ns() < 20_000_000_000,
+                    "{order:?}: {} instead of {health}",
+                    watched.projector()
+                );
+                std::thread::sleep(Duration::from_millis(1));
+            }
+            // Longer than between two looks at the controller.
+            std::thread::sleep(Duration::from_millis(250));
+            assert_eq!(watched.projector(), health, "{order:?}");
+            let dark = seen.lock().unwrap().dark_because();
+            let lit = matches!(health, ProjectorHealth::Up | ProjectorHealth::Frozen);
+            assert_eq!(dark.is_none(), lit, "{order:?}: {dark:?}");
+        }
+    });
+    let report = present(&mut || Dlpc900::new(VirtualHid::new(model.clone())), &show, None, &monitor);
+    assert!(report.is_ok(), "{:?}", report.err().map(|e| e.to_string()));
+    observer.join().unwrap();
+}

@@ -1,0 +1,221 @@
+//! A rig with prepared frames on a projector that stands outside the pipeline: behind a pseudo-terminal or a USB cable.
+#![allow(dead_code)]
+
+use dpm_device::link::Status;
+use dpm_device::planes::{PlaneSchedule, Raster};
+use dpm_device::time::HostTime;
+use dpm_device::transport::LinkDevice;
+use dpm_rig::config::{Overrides, RigConfig};
+use dpm_rig::pipeline::prepared::is_whole;
+use dpm_rig::pipeline::{run_prepared, PipelineError, RunOptions, RunOutcome};
+use dpm_rig::rig::Rig;
+use dpm_rig::telemetry::monitor::RunMonitor;
+use hil_mock::projector::serial::SerialProjector;
+use hil_mock::projector::{MockConfig, MockProjector};
+use serialport::{SerialPort, TTYPort};
+use std::path::{Path, PathBuf};
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::sync::{Arc, Mutex};
+use std::thread::JoinHandle;
+use std::time::{Duration, Instant};
+
+/// The panel.
+pub fn raster() -> Raster {
+    Raster::new(64, 32).unwrap()
+}
+
+/// The rig on `backend` (a TOML table), 8 planes at 100 frames a second.
+pub fn rig(backend: &str, more: &[&str]) -> Arc<Rig> {
+    let mut flags = vec![
+        "real_time.pace=\"real\"".to_owned(),
+        "projector.frame_rate=100".into(),
+        "projector.planes=8".into(),
+        "safety.watchdog_ms=1000".into(),
+        format!("projector.backend={backend}"),
+    ];
+    flags.extend(more.iter().map(|s| (*s).to_owned()));
+    let config = RigConfig::demo(&Overrides { variables: vec![], flags }).unwrap_or_else(|e| panic!("{e}"));
+    Arc::new(Rig::build(&config, Some(raster())).unwrap_or_else(|e| panic!("{e}")))
+}
+
+/// Waits until `done`, at most 20 s, and gives the time that counts against a deadline: a sleep of a millisecond that took longer than two
+/// is time that a shared machine gave to others.
+pub fn served_time(what: &str, mut done: impl FnMut() -> bool) -> Duration {
+    let (start, mut counted) = (Instant::now(), Duration::ZERO);
+    while !done() {
+        assert!(start.elapsed() < Duration::from_secs(20), "{what}");
+        let step = Instant::now();
+        std::thread::sleep(Duration::from_millis(1));
+        counted += step.elapsed().min(Duration::from_millis(2));
+    }
+    counted
+}
+
+/// A projector that can be looked at while it works.
+pub trait Projector: Send + Sync {
+    /// Lets it live up to now and looks at it.
+    fn look(&self, see: &mut dyn FnMut(&mut MockProjector));
+
+    /// What it would report.
+    fn status(&self) -> Status {
+        let mut status = None;
+        self.look(&mut |m| status = Some(m.status()));
+        status.expect("looked at")
+    }
+
+    /// True when light is on.
+    fn is_lit(&self) -> bool {
+        let mut lit = false;
+        self.look(&mut |m| lit = m.is_lit());
+        lit
+    }
+
+    /// The planes on the mirrors are those of one frame.
+    fn check_whole(&self) {
+        self.look(&mut |m| {
+            if let (Some(id), Some(planes)) = (m.lit_frame(), m.lit_planes()) {
+                assert!(is_whole(m.raster(), &PlaneSchedule::mono8(), planes, id), "frame {id} is torn");
+            }
+            assert_eq!(m.credit_violations(), 0);
+        });
+    }
+
+    /// Waits until `done`, at most `limit`; gives the time it took.
+    fn until(&self, limit: Duration, what: &str, done: &mut dyn FnMut(&Status) -> bool) -> Duration {
+        let start = Instant::now();
+        while !done(&self.status()) {
+            assert!(start.elapsed() < limit, "{what}: not within {limit:?}: {:?}", self.status());
+            std::thread::sleep(Duration::from_micros(500));
+        }
+        start.elapsed()
+    }
+}
+
+/// A run on a thread of its own. It ends with the test.
+pub struct Running {
+    pub monitor: Arc<RunMonitor>,
+    thread: Option<JoinHandle<Result<RunOutcome, PipelineError>>>,
+}
+
+/// Starts `rig` for `frames` frames; 0 until it is stopped.
+pub fn start(rig: &Arc<Rig>, frames: u64) -> Running {
+    start_with(rig, frames, |_| {})
+}
+
+/// As [`start`], with a monitor that `prepare` has seen before the run.
+pub fn start_with(rig: &Arc<Rig>, frames: u64, prepare: impl FnOnce(&RunMonitor)) -> Running {
+    let monitor = Arc::new(RunMonitor::default());
+    prepare(&monitor);
+    let (rig, watched) = (rig.clone(), monitor.clone());
+    let options = RunOptions { frames, ..RunOptions::default() };
+    let thread = std::thread::spawn(move || run_prepared(rig, options, &watched));
+    Running { monitor, thread: Some(thread) }
+}
+
+impl Running {
+    /// Waits for the end.
+    pub fn end(mut self) -> Result<RunOutcome, PipelineError> {
+        self.thread.take().expect("taken once").join().expect("no panic")
+    }
+
+    /// Asks it to end, as a signal does.
+    pub fn stop(self) -> Result<RunOutcome, PipelineError> {
+        self.monitor.request_stop();
+        self.end()
+    }
+}
+
+impl Drop for Running {
+    fn drop(&mut self) {
+        self.monitor.request_stop();
+        if let Some(thread) = self.thread.take() {
+            let _ = thread.join();
+        }
+    }
+}
+
+/// A projector behind a pseudo-terminal whose path stays the same when it is plugged in again.
+pub struct PtyProjector {
+    pub path: PathBuf,
+    device: Arc<Mutex<SerialProjector>>,
+    start: Instant,
+    served: Mutex<Option<(Arc<AtomicBool>, JoinHandle<()>)>>,
+}
+
+impl PtyProjector {
+    /// Plugs in a projector of `setup`.
+    pub fn new(name: &str, setup: MockConfig) -> Self {
+        let path = std::env::temp_dir().join(format!("dpm-run-{name}-{}", std::process::id()));
+        let device = Arc::new(Mutex::new(SerialProjector::new(MockProjector::new(setup))));
+        let this = Self { path, device, start: Instant::now(), served: Mutex::new(None) };
+        this.plug_in();
+        this
+    }
+
+    /// The backend of a rig file on it.
+    pub fn backend(&self, more: &str) -> String {
+        format!(
+            "{{ kind = \"serial\", port = {:?}, baud = 3000000 {more} }}",
+            self.path.display().to_string()
+        )
+    }
+
+    /// Pulls the plug. The projector keeps its power, and its light until the watchdog.
+    pub fn unplug(&self) {
+        if let Some((stop, thread)) = self.served.lock().unwrap().take() {
+            stop.store(true, Ordering::Relaxed);
+            thread.join().unwrap();
+        }
+        let _ = std::fs::remove_file(&self.path);
+    }
+
+    /// Puts another projector there while it is unplugged.
+    pub fn exchange(&self, setup: MockConfig) {
+        *self.device.lock().unwrap() = SerialProjector::new(MockProjector::new(setup));
+    }
+
+    /// Plugs it in again.
+    pub fn plug_in(&self) {
+        let (master, slave) = TTYPort::pair().expect("a pseudo-terminal");
+        let mut master = dpm_device::tty::never_wait(master).unwrap();
+        let theirs = slave.name().unwrap();
+        // Holds the line open, and raw, between hosts; without the lock of the library's own handle.
+        let held = std::fs::OpenOptions::new().read(true).write(true).open(&theirs).unwrap();
+        drop(slave);
+        link(Path::new(&theirs), &self.path);
+        let stop = Arc::new(AtomicBool::new(false));
+        let (stopped, device, start) = (stop.clone(), self.device.clone(), self.start);
+        let thread = std::thread::spawn(move || {
+            let _held = held;
+            while !stopped.load(Ordering::Relaxed) {
+                let clock = || HostTime(start.elapsed().as_nanos() as i64);
+                assert!(
+                    device.lock().unwrap().serve(clock, &mut master).expect("the line works"),
+                    "held open"
+                );
+                std::thread::sleep(Duration::from_micros(300));
+            }
+        });
+        *self.served.lock().unwrap() = Some((stop, thread));
+    }
+}
+
+fn link(to: &Path, path: &Path) {
+    let _ = std::fs::remove_file(path);
+    std::os::unix::fs::symlink(to, path).unwrap();
+}
+
+impl Projector for PtyProjector {
+    fn look(&self, see: &mut dyn FnMut(&mut MockProjector)) {
+        let now = HostTime(self.start.elapsed().as_nanos() as i64);
+        let mut device = self.device.lock().unwrap();
+        device.projector().advance_to(now);
+        see(device.projector());
+    }
+}
+
+impl Drop for PtyProjector {
+    fn drop(&mut self) {
+        self.unplug();
+    }
+}

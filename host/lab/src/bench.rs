@@ -1,0 +1,142 @@
+//! A rig into what each method costs on this device: rays, samples, and milliseconds of every pass.
+
+use super::median::{median, median_ms};
+use super::sequence::{draw, poses_at};
+use super::stamp::Stamp;
+use crate::error::plan::switched_method_of;
+use dpm_render::gpu::Gpu;
+use dpm_render::{FrameCost, RenderError, Renderer, RendererSettings, PASSES};
+use dpm_rig::config::RenderMethod;
+use dpm_rig::pipeline::{output, renderer_settings};
+use dpm_rig::rig::Rig;
+use serde::Serialize;
+use std::sync::Arc;
+use std::time::{Duration, Instant};
+
+/// The methods, in the order of the reports.
+pub const METHODS: [RenderMethod; 5] = [
+    RenderMethod::Full,
+    RenderMethod::Sequence,
+    RenderMethod::Miyamoto,
+    RenderMethod::Paper,
+    RenderMethod::Dpm,
+];
+
+/// Frames drawn before those that count: histories fill, the driver settles.
+const WARM_UP: u32 = 4;
+/// So many frames are measured however slow the device is ...
+const FEWEST: usize = 3;
+/// ... and no more once a method has taken this long.
+const LONGEST: Duration = Duration::from_secs(20);
+
+/// Milliseconds of one pass.
+#[derive(Clone, Debug, Serialize)]
+pub struct PassTime {
+    /// Name as in [`PASSES`].
+    pub pass: &'static str,
+    /// Median over the frames, ms.
+    pub ms: f64,
+}
+
+/// One method's cost. Counts are means over the frames, times are medians.
+#[derive(Clone, Debug, Serialize)]
+pub struct MethodCost {
+    /// Name.
+    pub method: &'static str,
+    /// Frames measured.
+    pub frames: usize,
+    /// Closest-hit and shadow rays of a frame.
+    pub rays_per_frame: f64,
+    /// Paths of a frame.
+    pub samples_per_frame: f64,
+    /// Pixels that the frame lights.
+    pub lit_pixels: f64,
+    /// GPU time of a frame, all passes, ms; `None` without time stamps.
+    pub gpu_ms: Option<f64>,
+    /// From recording to the end of waiting, ms.
+    pub wall_ms: f64,
+    /// Rays by `gpu_ms`, or by `wall_ms` where there are no time stamps, 1/s.
+    pub rays_per_s: f64,
+    /// Samples in the same way, 1/s.
+    pub samples_per_s: f64,
+    /// By pass; empty without time stamps.
+    pub passes: Vec<PassTime>,
+}
+
+/// What `dpm bench` tells.
+#[derive(Clone, Debug, Serialize)]
+pub struct BenchReport {
+    /// With what it was measured.
+    pub stamp: Stamp,
+    /// Samples a pixel where no angle decides.
+    pub spp: u32,
+    /// One a method.
+    pub methods: Vec<MethodCost>,
+}
+
+/// Draws up to `frames` frames with every method of `only` (all when it is empty), with the switches of the rig file. `each` is told about
+/// a method as soon as it is measured.
+///
+/// # Errors
+/// The renderer's.
+pub fn bench(
+    rig: &Rig,
+    gpu: &Arc<Gpu>,
+    frames: u32,
+    only: &[String],
+    each: &mut dyn FnMut(&MethodCost),
+) -> Result<BenchReport, RenderError> {
+    let mut methods = Vec::new();
+    for which in METHODS.into_iter().filter(|m| only.is_empty() || only.iter().any(|o| o == m.word())) {
+        let cost = measure(rig, gpu, frames, which)?;
+        each(&cost);
+        methods.push(cost);
+    }
+    Ok(BenchReport { stamp: Stamp::new(rig, gpu.summary()), spp: rig.config.render.spp, methods })
+}
+
+fn measure(rig: &Rig, gpu: &Arc<Gpu>, frames: u32, which: RenderMethod) -> Result<MethodCost, RenderError> {
+    let spp = rig.config.render.spp;
+    let method = switched_method_of(&rig.config.render, which);
+    let settings = RendererSettings { method, output: output(rig, gpu, false), ..renderer_settings(rig) };
+    let mut renderer = Renderer::new(gpu, &rig.scene, settings)?;
+    let mut slot = renderer.create_slot(false)?;
+    let (mut costs, mut walls): (Vec<FrameCost>, Vec<f64>) = (Vec::new(), Vec::new());
+    let started = Instant::now();
+    for k in 0..WARM_UP + frames.max(FEWEST as u32) {
+        let poses = poses_at(rig, u64::from(k));
+        let before = Instant::now();
+        let cost = draw(rig, &mut renderer, &mut slot, &poses, k, spp, spp as f32)?;
+        if k >= WARM_UP {
+            walls.push(before.elapsed().as_secs_f64() * 1e3);
+            costs.push(cost);
+            if costs.len() >= FEWEST && started.elapsed() > LONGEST {
+                break;
+            }
+        }
+    }
+    let n = costs.len() as f64;
+    let mean = |of: &dyn Fn(&FrameCost) -> u64| costs.iter().map(of).sum::<u64>() as f64 / n;
+    let rays_per_frame = mean(&|c| u64::from(c.counters().rays));
+    let samples_per_frame = mean(&|c| u64::from(c.counters().samples));
+    let wall_ms = median(walls);
+    let total = median_ms(costs.iter().map(|c| c.pass_ns.iter().sum()));
+    let gpu_ms = (total > 0.0).then_some(total);
+    let seconds = gpu_ms.unwrap_or(wall_ms) * 1e-3;
+    let passes = PASSES
+        .iter()
+        .enumerate()
+        .map(|(i, &pass)| PassTime { pass, ms: median_ms(costs.iter().map(|c| c.pass_ns[i])) });
+    Ok(MethodCost {
+        method: which.word(),
+        frames: costs.len(),
+        rays_per_frame,
+        samples_per_frame,
+        lit_pixels: mean(&|c| u64::from(c.counters().lit_pixels)),
+        gpu_ms,
+        wall_ms,
+        rays_per_s: rays_per_frame / seconds,
+        samples_per_s: samples_per_frame / seconds,
+        passes: if gpu_ms.is_some() { passes.collect() } else { Vec::new() },
+    })
+}

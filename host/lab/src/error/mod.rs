@@ -1,0 +1,13 @@
+//! Error against rays and time of every method: runs, references, tables, plots.
+
+pub mod export;
+pub mod figure3;
+pub mod parts;
+pub mod plan;
+pub mod plot;
+pub mod reference;
+pub mod report;
+pub mod runs;
+pub mod sheet;
+pub mod table;
+pub mod verdict;

@@ -1,0 +1,17 @@
+//! The laboratory: what judges the rig and its renderer. Each experiment is a command and a test.
+
+pub mod bench;
+pub mod conformance;
+pub mod error;
+pub mod handoff_cost;
+pub mod link_test;
+pub mod median;
+pub mod metrics;
+pub mod plan_savings;
+pub mod profile;
+pub mod reference;
+pub mod scene_plan;
+pub mod sequence;
+pub mod snapshot;
+pub mod stability;
+pub mod stamp;

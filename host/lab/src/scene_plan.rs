@@ -1,0 +1,382 @@
+//! `dpm plan`: a rig into what its scene and method need of the renderer, what is left out of it and how, and what that saves.
+
+use super::plan_savings::{changed, compare, flipped, keeping, Saving, Side};
+use dpm_render::method::{Method, SamplerKind};
+use dpm_render::scene_data::{SceneData, SceneNeeds};
+use dpm_render::{Keep, RenderError};
+use dpm_rig::config::{EffectsConfig, RenderConfig, RenderMethod, RigConfig};
+use dpm_rig::failure::{Failure, FailureKind};
+use dpm_rig::pipeline::{renderer_settings, PipelineError};
+use dpm_rig::rig::Rig;
+use dpm_rig::run_rig::{open_gpu, traced_raster};
+use dpm_scene::{Environment, Material, Scene};
+use serde::Serialize;
+
+/// One part that not every rig needs.
+#[derive(Clone, Debug, Serialize)]
+pub struct PlanEntry {
+    /// Its name.
+    pub feature: &'static str,
+    /// Something in the rig calls for it.
+    pub needed: bool,
+    /// It is left out of what runs. Never true of what is needed; false for what is not needed but kept.
+    pub left_out: bool,
+    /// The rig file switched it off; the method would have it.
+    pub switched_off: bool,
+    /// What calls for it: a material, a light, a key of the rig file; or that nothing does.
+    pub why: String,
+    /// How it is, or would be, left out.
+    pub how: &'static str,
+    /// What leaving it out saves or would save; only when measured.
+    pub saving: Option<Saving>,
+}
+
+/// The plan of a rig.
+#[derive(Clone, Debug, Serialize)]
+pub struct PlanReport {
+    /// Method of the rig file.
+    pub method: String,
+    /// Everything optional.
+    pub entries: Vec<PlanEntry>,
+    /// All of the scene's parts that are left out, at once; only when measured.
+    pub together: Option<Saving>,
+    /// What differs from a run on the rig.
+    pub warnings: Vec<String>,
+}
+
+const BY_CONSTANT: &str = "specialization constant";
+const BY_PASS: &str = "pass not recorded";
+
+fn entry(feature: &'static str, why: Option<String>, or: &str, how: &'static str) -> PlanEntry {
+    let needed = why.is_some();
+    let why = why.unwrap_or_else(|| or.into());
+    PlanEntry { feature, needed, left_out: !needed, switched_off: false, why, how, saving: None }
+}
+
+/// A part that is always there, needed or not.
+fn kept(feature: &'static str, needed: bool, why: String) -> PlanEntry {
+    PlanEntry { feature, needed, left_out: false, switched_off: false, why, how: "kept", saving: None }
+}
+
+/// The first material on any triangle that calls for something.
+fn material(scene: &Scene, calls: impl Fn(&Material) -> bool) -> Option<String> {
+    let used = scene.used_materials();
+    let mut found = scene.materials.iter().zip(used).filter(|(_, used)| *used).map(|(m, _)| m);
+    found.find(|m| calls(m)).map(|m| format!("material \"{}\"", m.name))
+}
+
+/// Parts that depend on the scene alone. `needs` is what the renderer decided; the scene only says why.
+pub fn scene_entries(scene: &Scene, needs: &SceneNeeds, clamp: f64) -> Vec<PlanEntry> {
+    let part = |feature, need: bool, reason: Option<String>, or| {
+        entry(feature, need.then(|| reason.unwrap_or_else(|| "the scene".into())), or, BY_CONSTANT)
+    };
+    let lights = scene.lights.len();
+    let environment = match &scene.environment {
+        Environment::Constant(_) => "constant environment",
+        Environment::Equirect { .. } => "environment image",
+    };
+    vec![
+        part(
+            "textures",
+            needs.textures,
+            material(scene, |m| m.textures().any(|t| t.is_some())),
+            "no texture on any triangle",
+        ),
+        part(
+            "normal maps",
+            needs.normal_maps,
+            material(scene, |m| m.normal_texture.is_some()),
+            "no normal map",
+        ),
+        part(
+            "alpha mask",
+            needs.alpha_mask,
+            material(scene, |m| m.alpha_cutoff.is_some()),
+            "no material is cut out",
+        ),
+        part(
+            "transmission",
+            needs.transmission,
+            material(scene, |m| m.transmission > 0.0),
+            "light passes nothing",
+        ),
+        part(
+            "specular",
+            needs.specular,
+            material(scene, |m| m.metallic > 0.0 || m.ior != 1.0),
+            "every index is 1 and nothing is metal",
+        ),
+        part(
+            "diffuse",
+            needs.diffuse,
+            material(scene, |m| m.metallic < 1.0 || m.metallic_roughness_texture.is_some()),
+            "every material is metal",
+        ),
+        part(
+            "emissive",
+            needs.emissive,
+            material(scene, |m| m.emissive.max_element() > 0.0),
+            "nothing emits",
+        ),
+        part(
+            "punctual lights",
+            needs.punctual,
+            Some(format!("{lights} in the scene file")),
+            "no point, spot or directional light",
+        ),
+        part("environment", needs.environment_kind > 0, Some(environment.into()), "black surroundings"),
+        part(
+            "environment image",
+            needs.environment_kind > 1,
+            Some(environment.into()),
+            "the same radiance from everywhere",
+        ),
+        part(
+            "firefly clamp",
+            needs.clamp,
+            Some(format!("render.clamp_indirect = {clamp}")),
+            "render.clamp_indirect = 0",
+        ),
+    ]
+}
+
+/// Parts that depend on the method and its switches. `full` is the method as it is without any switch of the rig file.
+pub fn method_entries(method: &Method, full: &Method, word: &str) -> Vec<PlanEntry> {
+    let part = |feature, of: &dyn Fn(&Method) -> bool, key: &str, how| {
+        let (on, would) = (of(method), of(full));
+        PlanEntry {
+            feature,
+            needed: on,
+            left_out: !on,
+            switched_off: would && !on,
+            why: match (on, would) {
+                (true, true) => format!("method {word}"),
+                (true, false) => format!("{key} on"),
+                (false, true) => format!("{key} off"),
+                (false, false) => format!("method {word} does without"),
+            },
+            how,
+            saving: None,
+        }
+    };
+    let switch = "a bit of the frame's flags, tested per pixel";
+    let effects = "render.effects";
+    vec![
+        part("history and reprojection", &Method::needs_history, effects, BY_PASS),
+        part("rate map", &Method::needs_rates, "render.effects.rate_map", BY_PASS),
+        part("spatial pass", &Method::needs_spatial, "render.effects.spatial_filter", BY_PASS),
+        part("spatial filter taps", &|m| m.spatial, "render.effects.spatial_filter", BY_CONSTANT),
+        part("demodulation by albedo", &|m| m.dpm, "render.method", BY_CONSTANT),
+        part(
+            "blue noise and sequences",
+            &|m| m.sampler != SamplerKind::Independent,
+            "render.effects.blue_noise",
+            BY_CONSTANT,
+        ),
+        part("temporal blending", &|m| m.temporal, "render.effects.temporal_filter", switch),
+        part("checkerboard", &|m| m.checkerboard, "render.effects.checkerboard", switch),
+        part("spp by angle", &|m| m.spp_by_angle, "render.effects.spp_by_angle", switch),
+        part("allocation by variance", &|m| m.dpm && m.rate_map, "render.effects.rate_map", switch),
+    ]
+}
+
+fn rig_entries(rig: &Rig) -> Vec<PlanEntry> {
+    let config = &rig.config;
+    let resting = rig.scene.bodies.iter().filter(|b| b.tracked.is_none()).count();
+    let planes = config.projector.planes;
+    let mono = planes == 8;
+    let depth = config.render.depth;
+    vec![
+        PlanEntry {
+            feature: "tiles without bodies",
+            needed: false,
+            left_out: true,
+            switched_off: false,
+            why: "no ray of theirs can meet a body's bounds".into(),
+            how: "tile not listed, decided per frame",
+            saving: None,
+        },
+        entry(
+            "pixels out of the light",
+            (config.render.method != RenderMethod::Dpm)
+                .then(|| format!("method {} does not look back", config.render.method.word())),
+            "no light fell there in the last frame, nor within two pixels",
+            "no ray in three frames of four while nothing jumps, decided per pixel",
+        ),
+        entry(
+            "indirect light",
+            (depth > 2).then(|| format!("render.depth = {depth}")),
+            &format!("render.depth = {depth}"),
+            "the path ends: a uniform, not compiled out",
+        ),
+        kept(
+            "motion of bodies at rest",
+            false,
+            format!("{resting} bodies never move; their poses are still written every frame"),
+        ),
+        entry(
+            "planes of three colours",
+            (!mono).then(|| format!("projector.planes = {planes}")),
+            "projector.planes = 8, one colour",
+            "plane not sent; radiance still has three channels",
+        ),
+    ]
+}
+
+fn gpu_failure(error: impl Into<RenderError>) -> Failure {
+    PipelineError::Render(error.into()).into()
+}
+
+/// Plans the rig; `measure` opens the GPU and times frames with and without each part that can be put back or taken out.
+///
+/// # Errors
+/// Bad scene or numbers (exit code 2), no GPU (4), leaving out changed a pixel (1).
+pub fn scene_plan(config: &RigConfig, measure: bool) -> Result<PlanReport, Failure> {
+    let gpu = if measure { Some(open_gpu(config)?) } else { None };
+    let mut warnings = Vec::new();
+    let raster = gpu.as_ref().and_then(|gpu| traced_raster(config, gpu, &mut warnings));
+    let rig = Rig::build(config, raster)?;
+    // What a run would say of the scene: the file's losses and what was changed of it.
+    warnings.extend(rig.scene.warnings.iter().cloned());
+    let method = config.render.to_method();
+    let mut needs = SceneData::build(&rig.scene).map_err(gpu_failure)?.needs;
+    needs.clamp = config.render.clamp_indirect > 0.0;
+    let word = config.render.method.word();
+    let mut entries = scene_entries(&rig.scene, &needs, config.render.clamp_indirect);
+    let unswitched = RenderConfig { effects: EffectsConfig::default(), ..config.render.clone() };
+    entries.extend(method_entries(&method, &unswitched.to_method(), word));
+    entries.extend(rig_entries(&rig));
+    let mut report = PlanReport { method: word.to_owned(), entries, together: None, warnings };
+    let Some(gpu) = gpu else { return Ok(report) };
+    let (own, lean) = (renderer_settings(&rig), Keep::default());
+    let mine = Side { scene: &rig.scene, settings: &own, keep: lean };
+    let pair = |without: Side<'_>, with: Side<'_>| compare(&rig, &gpu, without, with).map_err(gpu_failure);
+    for e in &mut report.entries {
+        let with_code = if e.left_out { keeping(e.feature, &method) } else { None };
+        // What no scene of this kind can be drawn without has another scene beside it: of what it needs one without, else one with.
+        let scene = changed(e.feature, &rig.scene).filter(|_| e.needed || e.feature == "environment image");
+        e.saving = match (with_code, flipped(e.feature, &own), scene) {
+            (Some(keep), ..) => {
+                let saving = pair(mine, Side { keep, ..mine })?;
+                Some(if keep.every_pixel { saving.of_pictures() } else { saving })
+            }
+            (None, Some(other), _) => {
+                let other = Side { settings: &other, ..mine };
+                let (without, with) = if e.left_out { (mine, other) } else { (other, mine) };
+                Some(pair(without, with)?.of_pictures())
+            }
+            (None, None, Some(other)) => {
+                let other = Side { scene: &other, ..mine };
+                let (without, with) = if e.left_out { (mine, other) } else { (other, mine) };
+                Some(pair(without, with)?.of_pictures())
+            }
+            (None, None, None) => None,
+        };
+    }
+    let all = Keep {
+        needs: SceneNeeds::default().everything(),
+        rate_map: method.needs_history() && !method.needs_rates(),
+        every_tile: true,
+        // A pixel that only another body's motion uncovers may be lit three frames later.
+        every_pixel: false,
+        storage_tables: false,
+    };
+    report.together = Some(pair(mine, Side { keep: all, ..mine })?);
+    let changed: Vec<&str> = (report.entries.iter())
+        .filter(|e| e.saving.as_ref().is_some_and(Saving::is_wrong))
+        .map(|e| e.feature)
+        .chain(report.together.iter().filter(|s| s.is_wrong()).map(|_| "all together"))
+        .collect();
+    if changed.is_empty() {
+        return Ok(report);
+    }
+    Err(Failure::new(FailureKind::CheckFailed, format!("leaving out changed pixels: {}", changed.join(", "))))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use dpm_rig::config::Overrides;
+
+    fn plan(flags: &[&str]) -> PlanReport {
+        let flags = flags.iter().map(|f| (*f).to_owned()).collect();
+        let config =
+            RigConfig::demo(&Overrides { variables: vec![], flags }).unwrap_or_else(|e| panic!("{e}"));
+        scene_plan(&config, false).unwrap_or_else(|e| panic!("{e}"))
+    }
+
+    fn is_left_out(plan: &PlanReport, feature: &str) -> bool {
+        plan.entries.iter().find(|e| e.feature == feature).unwrap_or_else(|| panic!("{feature}")).left_out
+    }
+
+    #[test]
+    fn the_demo_needs_what_it_is_made_of() {
+        let plan = plan(&[]);
+        for feature in
+            ["textures", "normal maps", "emissive", "environment", "diffuse", "history and reprojection"]
+        {
+            assert!(!is_left_out(&plan, feature), "{feature}");
+        }
+        for feature in [
+            "alpha mask",
+            "transmission",
+            "punctual lights",
+            "environment image",
+            "firefly clamp",
+            "rate map",
+        ] {
+            assert!(is_left_out(&plan, feature), "{feature}");
+        }
+        assert!(plan.entries.iter().all(|e| !(e.needed && e.left_out)));
+    }
+
+    #[test]
+    fn the_rig_file_brings_parts_in_and_out() {
+        let paper = plan(&["render.method=\"paper\"", "render.clamp_indirect=4"]);
+        for feature in ["rate map", "checkerboard", "spp by angle", "firefly clamp"] {
+            assert!(!is_left_out(&paper, feature), "{feature}");
+        }
+        assert!(is_left_out(&paper, "demodulation by albedo"));
+        let full = plan(&["render.method=\"full\""]);
+        for feature in ["history and reprojection", "rate map", "spatial pass", "blue noise and sequences"] {
+            assert!(is_left_out(&full, feature), "{feature}");
+        }
+    }
+
+    #[test]
+    fn what_the_rig_file_switches_off_is_told_apart_from_what_is_not_needed() {
+        let entry = |flags: &[&str], feature: &str| {
+            plan(flags)
+                .entries
+                .into_iter()
+                .find(|e| e.feature == feature)
+                .unwrap_or_else(|| panic!("{feature}"))
+        };
+        let off = entry(&["render.effects.spatial_filter=false"], "spatial filter taps");
+        assert!(
+            off.left_out && off.switched_off && off.why == "render.effects.spatial_filter off",
+            "{off:?}"
+        );
+        let never = entry(&["render.method=\"full\""], "spatial filter taps");
+        assert!(never.left_out && !never.switched_off && never.why.contains("does without"), "{never:?}");
+        let on = entry(
+            &["render.method=\"miyamoto\"", "render.effects.spatial_filter=true"],
+            "spatial filter taps",
+        );
+        assert!(on.needed && on.why == "render.effects.spatial_filter on", "{on:?}");
+        assert!(plan(&[]).entries.iter().all(|e| !e.switched_off));
+    }
+
+    #[test]
+    fn materials_that_no_triangle_has_need_nothing() {
+        let config = RigConfig::demo(&Overrides { variables: vec![], flags: vec![] }).unwrap();
+        let mut scene = Rig::build(&config, None).unwrap().scene;
+        let plain = SceneData::build(&scene).unwrap().needs;
+        scene.materials.push(Material { transmission: 1.0, alpha_cutoff: Some(0.5), ..Material::default() });
+        assert_eq!(SceneData::build(&scene).unwrap().needs, plain);
+        let last = scene.materials.len() as u32 - 1;
+        scene.bodies[0].mesh.materials[0] = last;
+        let needs = SceneData::build(&scene).unwrap().needs;
+        assert!(needs.transmission && needs.alpha_mask && !plain.transmission && !plain.alpha_mask);
+    }
+}

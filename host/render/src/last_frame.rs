@@ -1,0 +1,206 @@
+//! What the last frame was drawn from, and whether the next one may rely on what it saw.
+
+use super::renderer::FrameInputs;
+use super::scene_data::BodyData;
+use super::tiles::corners;
+use dpm_scene::geometry::projector::ProjectorCamera;
+use dpm_shaders::structs::{INSTANCE_EMPTY, NO_FRAME};
+use glam::{DAffine3, DVec3};
+
+/// So far may a body's corners move on the picture from one frame to the next, in pixels and along each axis, before every pixel asks anew:
+/// half a pixel less than as far as `still_dark` of `primary.comp` looks about itself.
+pub const STEADY_PX: f64 = 1.5;
+
+/// So far may the eye, and what is behind the projector, metres.
+pub const STEADY_M: f64 = 5e-3;
+
+/// Place of a frame among those that were drawn. Whatever is done in turns from frame to frame (the checkerboard, the rates of every second
+/// frame, the questions that each block asks in every fourth frame, the slices of blue noise) goes by this one count. The numbers of frames
+/// will not do: a rig that draws every second slot has even numbers only, and half of the turns would never come.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub(super) struct Turn {
+    /// Frames drawn before it, wraps.
+    pub(super) drawn: u32,
+    /// Samples a pixel that those frames took together, wraps.
+    pub(super) first_sample: u32,
+}
+
+/// The frame that the history holds.
+pub(super) struct LastFrame {
+    /// Its number; `NO_FRAME` before the first.
+    pub(super) frame: u32,
+    /// Which of the two history buffers it wrote.
+    pub(super) parity: usize,
+    /// Place of the next frame in the order of those drawn, and the samples a pixel that all before it took.
+    turn: Turn,
+    /// Per body: world-from-body.
+    pub(super) poses: Vec<DAffine3>,
+    /// Per body: lost.
+    lost: Vec<bool>,
+    /// Of the projector.
+    pub(super) origin: DVec3,
+    eye: DVec3,
+    camera: Option<ProjectorCamera>,
+}
+
+impl LastFrame {
+    /// None yet, of a scene with so many bodies.
+    pub(super) fn none(bodies: usize) -> Self {
+        Self {
+            frame: NO_FRAME,
+            parity: 0,
+            turn: Turn::default(),
+            poses: Vec::with_capacity(bodies),
+            lost: Vec::with_capacity(bodies),
+            origin: DVec3::ZERO,
+            eye: DVec3::ZERO,
+            camera: None,
+        }
+    }
+
+    /// Nothing has jumped, come or gone since: light can have moved by [`STEADY_PX`] at most, but for what another body or the eye's own
+    /// motion uncovers.
+    pub(super) fn is_steady(
+        &self,
+        bodies: &[BodyData],
+        inputs: &FrameInputs<'_>,
+        is_lost: impl Fn(usize) -> bool,
+    ) -> bool {
+        let near = |a: DVec3, b: DVec3| (a - b).length() <= STEADY_M;
+        self.frame != NO_FRAME
+            && self.camera.as_ref() == Some(inputs.camera)
+            && near(self.eye, inputs.eye)
+            && self.poses.len() == bodies.len()
+            && bodies.iter().enumerate().all(|(i, body)| {
+                let (was, is) = (&self.poses[i], &inputs.poses[i]);
+                body.flags & INSTANCE_EMPTY != 0
+                    || (self.lost[i] == is_lost(i)
+                        && corners(body.bounds_min.as_dvec3(), body.bounds_max.as_dvec3()).all(|corner| {
+                            let (was, is) = (was.transform_point3(corner), is.transform_point3(corner));
+                            match (inputs.camera.project(was), inputs.camera.project(is)) {
+                                (Some(was), Some(is)) => (was - is).abs().max_element() <= STEADY_PX,
+                                _ => near(was, is),
+                            }
+                        }))
+            })
+    }
+
+    /// The place of the frame with this number. Numbers that do not go up have begun anew (a run after its warm-up), and so do the turns.
+    pub(super) fn turn_of(&self, frame: u32) -> Turn {
+        if self.frame != NO_FRAME && frame > self.frame {
+            self.turn
+        } else {
+            Turn::default()
+        }
+    }
+
+    /// This one is the last from now on. Allocates nothing.
+    pub(super) fn becomes(
+        &mut self,
+        inputs: &FrameInputs<'_>,
+        parity: usize,
+        lost: impl Iterator<Item = bool>,
+    ) {
+        self.turn = self.turn_of(inputs.frame);
+        self.frame = inputs.frame;
+        self.parity = parity;
+        let Turn { drawn, first_sample } = self.turn;
+        self.turn =
+            Turn { drawn: drawn.wrapping_add(1), first_sample: first_sample.wrapping_add(inputs.spp) };
+        self.poses.clear();
+        self.poses.extend_from_slice(inputs.poses);
+        self.lost.clear();
+        self.lost.extend(lost);
+        self.origin = inputs.camera.position();
+        self.eye = inputs.eye;
+        self.camera = Some(*inputs.camera);
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use dpm_device::planes::Raster;
+    use glam::DQuat;
+
+    const EYE: DVec3 = DVec3::new(0.3, 0.2, 1.0);
+
+    fn camera() -> ProjectorCamera {
+        let raster = Raster::new(640, 480).unwrap();
+        ProjectorCamera::look_at(raster, DVec3::Z, DVec3::ZERO, DVec3::Y, 0.6).unwrap()
+    }
+
+    /// A box of 20 cm a metre away, then the same at `pose`, seen from `eye`, lost or not.
+    fn steady_with(pose: DAffine3, eye: DVec3, lost: bool) -> bool {
+        let body = BodyData::of_20_cm();
+        let camera = camera();
+        let inputs = FrameInputs {
+            frame: 7,
+            spp: 1,
+            budget_spp: 1.0,
+            camera: &camera,
+            eye: EYE,
+            gaze: DVec3::ZERO,
+            widen_deg: 0.0,
+            poses: &[DAffine3::IDENTITY],
+            lost: &[],
+        };
+        let mut last = LastFrame::none(1);
+        let bodies = [body];
+        assert!(!last.is_steady(&bodies, &inputs, |_| false), "the first frame");
+        last.becomes(&inputs, 1, [false].into_iter());
+        last.is_steady(&bodies, &FrameInputs { eye, poses: &[pose], ..inputs }, |_| lost)
+    }
+
+    fn steady(pose: DAffine3) -> bool {
+        steady_with(pose, EYE, false)
+    }
+
+    #[test]
+    fn the_limit_is_in_pixels_on_the_picture() {
+        // The nearest corners are 0.9 m away.
+        let pixel = 0.9 / camera().fx;
+        let along = |x: f64| DAffine3::from_translation(DVec3::X * x * pixel);
+        assert!(steady(along(0.0)) && steady(along(0.99 * STEADY_PX)) && steady(along(-0.99 * STEADY_PX)));
+        assert!(!steady(along(1.01 * STEADY_PX)) && !steady(along(-1.01 * STEADY_PX)) && !steady(along(1e9)));
+        let turn = |angle: f64| DAffine3::from_quat(DQuat::from_rotation_y(angle));
+        assert!(steady(turn(0.5 * pixel)) && !steady(turn(0.1)));
+    }
+
+    #[test]
+    fn turns_are_counted_by_frames_drawn_and_begin_anew_with_their_numbers() {
+        let camera = camera();
+        let mut last = LastFrame::none(0);
+        let mut next = |frame: u32, spp: u32| {
+            let turn = last.turn_of(frame);
+            let inputs = FrameInputs {
+                frame,
+                spp,
+                budget_spp: 1.0,
+                camera: &camera,
+                eye: EYE,
+                gaze: DVec3::ZERO,
+                widen_deg: 0.0,
+                poses: &[],
+                lost: &[],
+            };
+            last.becomes(&inputs, 0, std::iter::empty());
+            (turn.drawn, turn.first_sample)
+        };
+        // A warm-up, then a run that begins at 0 and drops every second frame.
+        assert_eq!(next(0, 5), (0, 0));
+        assert_eq!(next(0, 3), (0, 0));
+        assert_eq!([next(2, 4), next(4, 4), next(6, 1)], [(1, 3), (2, 7), (3, 11)]);
+        assert_eq!(next(7, 1), (4, 12));
+    }
+
+    #[test]
+    fn who_comes_goes_or_cannot_be_told_is_not_steady() {
+        let nan = DAffine3::from_translation(DVec3::NAN);
+        assert!(!steady(nan) && !steady_with(DAffine3::IDENTITY, EYE, true));
+        assert!(!steady(DAffine3::from_translation(DVec3::Z * 5.0)), "from before to behind the projector");
+        assert!(steady_with(DAffine3::IDENTITY, EYE + DVec3::X * 0.9 * STEADY_M, false));
+        assert!(!steady_with(DAffine3::IDENTITY, EYE + DVec3::X * 1.1 * STEADY_M, false));
+        assert!(!steady_with(DAffine3::IDENTITY, DVec3::NAN, false));
+    }
+}

@@ -1,0 +1,24 @@
+//! A `FramePlan` into radiance: what the shaders compute, and the tables and CPU twins they share.
+
+pub mod blue_noise;
+mod body_bvh;
+mod cluster;
+pub mod compensation;
+mod fill;
+pub mod gpu;
+mod last_frame;
+mod memory;
+pub mod method;
+pub mod pack;
+pub mod rate_map;
+mod renderer;
+pub mod scene_data;
+mod scene_gpu;
+mod slot;
+pub mod sobol;
+pub mod tiles;
+
+pub use memory::RasterTooLarge;
+pub use renderer::{FrameInputs, Output, RenderError, Renderer, RendererPlan, RendererSettings};
+pub use scene_data::Keep;
+pub use slot::{FrameCost, FrameSlot, PASSES};

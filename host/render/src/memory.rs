@@ -1,0 +1,249 @@
+//! A raster and a method into the memory that grows with them: how large each buffer is, whether the device can hold it, and what outlives
+//! a frame.
+
+use super::blue_noise;
+use super::fill::fill;
+use super::method::Method;
+use super::rate_map;
+use super::renderer::{RenderError, RendererSettings};
+use super::scene_gpu::table_buffer;
+use super::tiles::TILE;
+use crate::gpu::{Buffer, Gpu, GpuError, MemoryKind};
+use bytemuck::Zeroable;
+use dpm_device::planes::Raster;
+use dpm_shaders::structs::{Filtered, Guide, History, Schedule, Surface, WorkItem, NO_FRAME};
+use std::sync::Arc;
+
+/// Bytes a pixel of every buffer that grows with the raster; 0 where the method does without.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(super) struct BytesPerPixel {
+    /// What is known of the surface point that the pixel shows; there are two such buffers, written in turn.
+    pub history: usize,
+    /// Motion, apparent size, angle, albedo.
+    pub guides: usize,
+    /// What every pixel's ray met.
+    pub surfaces: usize,
+    /// What was traced.
+    pub radiance: usize,
+    /// The history's picture.
+    pub filtered: usize,
+    /// The filtered picture.
+    pub shown: usize,
+    /// What the tracer is to do.
+    pub work: usize,
+    /// Code values.
+    pub codes: usize,
+}
+
+impl BytesPerPixel {
+    /// Those of `method`.
+    pub fn of(method: &Method) -> Self {
+        let when = |wanted: bool, bytes: usize| if wanted { bytes } else { 0 };
+        Self {
+            history: when(method.needs_history(), size_of::<History>()),
+            guides: when(method.needs_guides(), size_of::<Guide>()),
+            surfaces: size_of::<Surface>(),
+            radiance: size_of::<[f32; 4]>(),
+            filtered: when(method.needs_history(), size_of::<Filtered>()),
+            shown: when(method.needs_spatial(), size_of::<[f32; 4]>()),
+            work: size_of::<WorkItem>(),
+            codes: size_of::<u32>(),
+        }
+    }
+
+    /// Name and bytes a pixel of the buffer that is the first to be too large.
+    fn largest(&self) -> (&'static str, usize) {
+        [
+            ("history", self.history),
+            ("guide", self.guides),
+            ("surface", self.surfaces),
+            ("radiance", self.radiance),
+            ("filtered radiance", self.filtered),
+            ("shown radiance", self.shown),
+            ("work", self.work),
+            ("code", self.codes),
+        ]
+        .into_iter()
+        // The first of equals.
+        .rev()
+        .max_by_key(|b| b.1)
+        .unwrap_or(("code", 0))
+    }
+}
+
+/// A raster whose buffers are larger than a device binds at once.
+#[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
+#[error(
+    "a raster of {} x {} is too large for {device}: its {what} buffer takes {} MiB, and the device binds at most {} MiB at once \
+     ({most_pixels} pixels). {}",
+    raster.width(),
+    raster.height(),
+    mib(*needed),
+    mib(*limit),
+    remedy(*frugal_fits)
+)]
+pub struct RasterTooLarge {
+    /// The raster.
+    pub raster: Raster,
+    /// Name of the device.
+    pub device: String,
+    /// The largest of the buffers.
+    pub what: &'static str,
+    /// Its size, bytes.
+    pub needed: u64,
+    /// Largest buffer that the device binds, bytes.
+    pub limit: u64,
+    /// Largest number of pixels that this method can trace there.
+    pub most_pixels: u64,
+    /// Method `full` could trace this raster there.
+    pub frugal_fits: bool,
+}
+
+/// Mebibytes with one decimal, rounded up.
+fn mib(bytes: u64) -> String {
+    format!("{:.1}", (bytes as f64 / f64::from(1 << 20) * 10.0).ceil() / 10.0)
+}
+
+fn remedy(frugal_fits: bool) -> &'static str {
+    if frugal_fits {
+        "Trace a smaller raster (--raster WxH), or trace this one by a method without a history: --set render.method=full"
+    } else {
+        "Trace a smaller raster (--raster WxH)"
+    }
+}
+
+/// Refuses a raster that cannot be traced by `method` on a device that binds buffers of at most `limit` bytes.
+///
+/// # Errors
+/// The buffer that is too large, and what to do.
+pub(super) fn check_raster(
+    raster: Raster,
+    method: &Method,
+    limit: u64,
+    device: &str,
+) -> Result<(), RasterTooLarge> {
+    let pixels = raster.pixel_count() as u64;
+    let (what, bytes) = BytesPerPixel::of(method).largest();
+    let needed = pixels * bytes as u64;
+    if needed <= limit {
+        return Ok(());
+    }
+    let frugal = BytesPerPixel::of(&Method::full(1)).largest().1;
+    Err(RasterTooLarge {
+        raster,
+        device: device.to_owned(),
+        what,
+        needed,
+        limit,
+        most_pixels: limit / bytes as u64,
+        frugal_fits: pixels * frugal as u64 <= limit,
+    })
+}
+
+/// Memory that outlives a frame.
+pub(super) struct SharedBuffers {
+    /// Two, one entry a pixel each: frames write them in turn and read the other.
+    pub history: [Buffer; 2],
+    pub rates: Buffer,
+    pub rate_table: Buffer,
+    pub noise: Buffer,
+    /// What the schedule starts from.
+    pub schedule_start: Buffer,
+}
+
+impl SharedBuffers {
+    /// Allocates and fills.
+    ///
+    /// # Errors
+    /// The raster is too large for the device, or the GPU's own.
+    pub fn new(gpu: &Arc<Gpu>, settings: &RendererSettings) -> Result<Self, RenderError> {
+        let raster = settings.raster;
+        check_raster(raster, &settings.method, gpu.max_buffer_bytes(), &gpu.summary().name)?;
+        let pixels = if settings.method.needs_history() { raster.pixel_count() } else { 1 };
+        let history = || -> Result<Buffer, GpuError> {
+            let buffer = table_buffer(gpu, "history", pixels * size_of::<History>(), MemoryKind::Device)?;
+            fill(gpu, &buffer, &History { frame: NO_FRAME, ..History::zeroed() }, pixels)?;
+            Ok(buffer)
+        };
+        let tiles = raster.width().div_ceil(TILE) * raster.height().div_ceil(TILE);
+        let start = Schedule { groups: [0, 1, 1], ..Schedule::zeroed() };
+        Ok(Self {
+            history: [history()?, history()?],
+            rates: Buffer::from_slice(gpu, "shading rates", &vec![0u32; tiles as usize])?,
+            rate_table: Buffer::from_slice(gpu, "rate table", &rate_map::rate_table())?,
+            noise: Buffer::from_slice(gpu, "blue noise", blue_noise::MASK)?,
+            schedule_start: Buffer::from_slice(gpu, "schedule", &[start])?,
+        })
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::method::SamplerKind;
+
+    const LIMIT: u64 = 128 << 20;
+
+    /// Method `dpm`, the paper's and that of its predecessor, as a rig file's defaults give them.
+    fn with_history() -> [Method; 3] {
+        let paper = Method {
+            rate_map: true,
+            checkerboard: true,
+            sampler: SamplerKind::BlueNoise,
+            temporal: true,
+            spatial: true,
+            spp_by_angle: true,
+            ..Method::full(2)
+        };
+        let miyamoto = Method { rate_map: false, checkerboard: false, ..paper.clone() };
+        let dpm = Method {
+            dpm: true,
+            checkerboard: false,
+            spp_by_angle: false,
+            sampler: SamplerKind::Continued,
+            history_cap: crate::method::HISTORY_CAP,
+            ..paper.clone()
+        };
+        [dpm, paper, miyamoto]
+    }
+
+    fn refusal(width: u32, height: u32, method: &Method) -> Option<RasterTooLarge> {
+        check_raster(Raster::new(width, height).unwrap(), method, LIMIT, "a device").err()
+    }
+
+    #[test]
+    fn a_method_without_a_history_is_refused_for_no_buffer_of_those_with_one() {
+        let full = Method::full(2);
+        assert!(!full.needs_history() && !full.needs_guides() && !full.needs_spatial());
+        // Sixteen bytes a pixel is what it needs: 128 MiB of them are 8388608 pixels, to the pixel.
+        for (w, h) in [(2560, 1440), (3840, 2160), (4096, 2048)] {
+            assert_eq!(refusal(w, h, &full), None, "{w} x {h}");
+        }
+        let error = refusal(4097, 2048, &full).unwrap();
+        assert_eq!((error.what, error.needed, error.most_pixels), ("surface", 4097 * 2048 * 16, 1 << 23));
+        assert!(!error.frugal_fits && !error.to_string().contains("render.method"), "{error}");
+    }
+
+    #[test]
+    fn a_history_fits_up_to_two_megapixels_and_the_refusal_says_what_to_do() {
+        for method in with_history() {
+            for (w, h) in [(1280, 1024), (1920, 1080), (2048, 1024)] {
+                assert_eq!(refusal(w, h, &method), None, "{w} x {h}");
+            }
+            let error = refusal(2560, 1440, &method).unwrap();
+            assert_eq!((error.what, error.needed, error.most_pixels), ("history", 2560 * 1440 * 64, 1 << 21));
+            let text = error.to_string();
+            for word in [
+                "2560 x 1440",
+                "a device",
+                "history",
+                "225.0 MiB",
+                "128.0 MiB",
+                "--raster",
+                "render.method=full",
+            ] {
+                assert!(text.contains(word), "{word} in {text}");
+            }
+        }
+    }
+}

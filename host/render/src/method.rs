@@ -1,0 +1,133 @@
+//! How a frame spends its rays: a method of the rig file with its switches, as the renderer needs it.
+
+use dpm_shaders::structs as gpu;
+
+/// Where random numbers come from.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+#[repr(u32)]
+pub enum SamplerKind {
+    /// Independent for every path.
+    Independent = 0,
+    /// One point set a frame, shifted at every pixel by blue noise.
+    BlueNoise = 1,
+    /// One low-discrepancy sequence a surface point, continued over frames; its place is kept in the history.
+    Continued = 2,
+    /// One low-discrepancy sequence a pixel, continued over frames; needs no history.
+    PixelSequence = 3,
+}
+
+/// The constants of the paper's method \[paper\]; angles are measured at the eye from the gaze.
+#[derive(Clone, Debug, PartialEq)]
+pub struct PaperConstants {
+    /// Sensitivity threshold of equation 2.
+    pub t: f64,
+    /// Background luminance of equation 2, scene units.
+    pub l: f64,
+    /// Full rate up to here, degrees, equation 4; also the inner bound of table 1.
+    pub phi_h_deg: f64,
+    /// Quarter rate from here, degrees, equation 4; also the outer bound of table 1.
+    pub phi_q_deg: f64,
+    /// Table 1: weight of the new frame inside `phi_h_deg`, between the two, and outside `phi_q_deg`; above 0, at most 1.
+    pub temporal_alpha: [f64; 3],
+    /// Table 1: samples of a pixel in the same three zones.
+    pub zone_spp: [u32; 3],
+    /// The spatial filter blends in from this angle on, degrees.
+    pub filter_from_deg: f64,
+    /// From this angle on, degrees, nothing but the filtered picture is seen.
+    pub filter_to_deg: f64,
+}
+
+impl Default for PaperConstants {
+    /// The published numbers.
+    fn default() -> Self {
+        Self {
+            t: 0.0762,
+            l: 0.363,
+            phi_h_deg: 15.0,
+            phi_q_deg: 30.0,
+            temporal_alpha: [0.2, 0.1, 0.05],
+            zone_spp: [18, 18, 2],
+            filter_from_deg: 15.0,
+            filter_to_deg: 18.0,
+        }
+    }
+}
+
+/// A method with all switches resolved.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Method {
+    /// This program's own method (history counts samples, demodulated) instead of the paper's.
+    pub dpm: bool,
+    /// Rays by importance (dpm) or shading rates per tile (paper).
+    pub rate_map: bool,
+    /// Half of the coarse pixels a frame (not dpm).
+    pub checkerboard: bool,
+    /// Random numbers.
+    pub sampler: SamplerKind,
+    /// Former frames are blended in.
+    pub temporal: bool,
+    /// The picture is filtered in space.
+    pub spatial: bool,
+    /// Samples by visual angle (not dpm).
+    pub spp_by_angle: bool,
+    /// Samples per lit pixel and frame that dpm may spend; also the count where no other rule applies.
+    pub budget_spp: f32,
+    /// Frames' worth of samples that dpm's history may weigh.
+    pub history_cap: f32,
+    /// The paper's constants.
+    pub paper: PaperConstants,
+}
+
+/// Frames' worth of samples in dpm's history: long enough that the eye's own 31 frames are not the limit; what it lags behind when the
+/// light changes is measured and made up for.
+pub const HISTORY_CAP: f32 = 96.0;
+
+impl Method {
+    /// The paper's predecessor \[Nomoto20\]: every pixel, independent samples, nothing kept.
+    pub fn full(spp: u32) -> Self {
+        Self {
+            dpm: false,
+            rate_map: false,
+            checkerboard: false,
+            sampler: SamplerKind::Independent,
+            temporal: false,
+            spatial: false,
+            spp_by_angle: false,
+            budget_spp: spp as f32,
+            history_cap: 0.0,
+            paper: PaperConstants::default(),
+        }
+    }
+
+    /// A history is kept: for blending, because not every pixel is traced in every frame, or for the spatial pass, which reads what the
+    /// history shows.
+    pub fn needs_history(&self) -> bool {
+        self.dpm || self.temporal || self.rate_map || self.checkerboard || self.spatial
+    }
+
+    /// The pass `rate_map` is recorded.
+    pub fn needs_rates(&self) -> bool {
+        self.rate_map && !self.dpm
+    }
+
+    /// Motion, size, angle and albedo of every pixel are written: for the history, for the filters, or to choose samples.
+    pub fn needs_guides(&self) -> bool {
+        self.needs_history() || self.needs_spatial() || self.spp_by_angle
+    }
+
+    /// The pass `spatial` is recorded.
+    pub fn needs_spatial(&self) -> bool {
+        self.dpm || self.spatial
+    }
+
+    /// `FRAME_*` bits.
+    pub fn flags(&self) -> u32 {
+        let bit = |on: bool, flag: u32| if on { flag } else { 0 };
+        bit(self.needs_rates(), gpu::FRAME_RATE_MAP)
+            | bit(self.checkerboard, gpu::FRAME_CHECKERBOARD)
+            | bit(self.spp_by_angle, gpu::FRAME_SPP_BY_ANGLE)
+            | bit(self.temporal, gpu::FRAME_TEMPORAL)
+            | bit(self.dpm, gpu::FRAME_DPM)
+            | bit(self.dpm && self.rate_map, gpu::FRAME_ALLOCATE)
+    }
+}

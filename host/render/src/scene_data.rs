@@ -1,0 +1,570 @@
+//! A scene into the flat arrays that the shaders read: BVHs, vertices, materials, texels, lights, environment.
+
+use super::body_bvh::BodyBvh;
+use bytemuck::Zeroable;
+use dpm_scene::albedo_table::{tabulated, AlbedoTable, ALBEDO_NODES};
+use dpm_scene::mesh::MAX_COORDINATE_M;
+use dpm_scene::{Environment, PunctualKind, Scene, TextureRef, Wrap};
+use dpm_shaders::structs::{
+    self as gpu, AlbedoCell, Light, Material, TextureInfo, TextureUse, TriangleRef, Vertex,
+};
+use glam::{DAffine3, Vec3};
+
+/// Most bodies a scene may have, those that never move included: their number has 8 bits of a word that it shares with the triangle.
+pub const MAX_BODIES: usize = 256;
+
+/// A solid with a smaller index is drawn as a thin wall: its refraction would be a spike that f32 cannot carry.
+const STRAIGHT_BELOW_IOR: f32 = 1.001;
+
+/// Where one body's data lie, and its bounds in body space.
+#[derive(Clone, Debug)]
+pub struct BodyData {
+    /// First node.
+    pub node_offset: u32,
+    /// First triangle.
+    pub triangle_offset: u32,
+    /// Lower corner, body space.
+    pub bounds_min: Vec3,
+    /// Upper corner, body space.
+    pub bounds_max: Vec3,
+    /// `INSTANCE_*`.
+    pub flags: u32,
+    /// Largest magnitude among coordinates.
+    pub extent: f32,
+}
+
+/// What the shader reads of an albedo table: the cells between nodes, row after row, then those between two averages.
+fn albedo_cells(table: &AlbedoTable) -> Vec<AlbedoCell> {
+    let n = ALBEDO_NODES;
+    let mut cells = Vec::with_capacity((n - 1) * n);
+    for rows in table.directional.windows(2 * n).step_by(n) {
+        let (low, high) = rows.split_at(n);
+        cells.extend((1..n).map(|i| AlbedoCell { corners: [low[i - 1], low[i], high[i - 1], high[i]] }));
+    }
+    cells.extend(table.average.windows(2).map(|e| AlbedoCell { corners: [e[0], e[1], 0.0, 0.0] }));
+    cells
+}
+
+#[cfg(test)]
+impl BodyData {
+    /// A box of 20 cm about its origin that the projector lights.
+    pub(super) fn of_20_cm() -> Self {
+        let half = 0.1;
+        Self {
+            node_offset: 0,
+            triangle_offset: 0,
+            bounds_min: Vec3::splat(-half),
+            bounds_max: Vec3::splat(half),
+            flags: dpm_shaders::structs::INSTANCE_PROJECTED,
+            extent: half,
+        }
+    }
+}
+
+/// A scene ready for upload.
+#[derive(Clone, Debug, Default)]
+pub struct SceneData {
+    /// One entry per body of the scene.
+    pub bodies: Vec<BodyData>,
+    /// BVH nodes, five words each.
+    pub nodes: Vec<[u32; 4]>,
+    /// Three rows of f32 bits per triangle in BVH order: the corners.
+    pub triangles: Vec<[u32; 4]>,
+    /// Indices and material per triangle in BVH order.
+    pub refs: Vec<TriangleRef>,
+    /// All vertices.
+    pub vertices: Vec<Vertex>,
+    /// All materials.
+    pub materials: Vec<Material>,
+    /// All textures.
+    pub textures: Vec<TextureInfo>,
+    /// Linear RGBA, 16 bits each.
+    pub texels: Vec<[u32; 2]>,
+    /// Emissive triangles and punctual lights with their alias table.
+    pub lights: Vec<Light>,
+    /// Map texels with conditional cdf, then the marginal cdf.
+    pub environment: Vec<[f32; 4]>,
+    /// Width and height of the map; 0 when constant.
+    pub environment_size: [u32; 2],
+    /// Constant radiance.
+    pub environment_constant: Vec3,
+    /// Rotation about +Y.
+    pub environment_rotation: f32,
+    /// Probability of sampling the environment.
+    pub environment_select: f32,
+    /// Tables of directional albedo.
+    pub albedo: Vec<AlbedoCell>,
+    /// What the scene needs.
+    pub needs: SceneNeeds,
+}
+
+/// What of the tracer the scene needs: the specialization constants.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub struct SceneNeeds {
+    /// Any texture.
+    pub textures: bool,
+    /// Any normal map.
+    pub normal_maps: bool,
+    /// Any material with a hole.
+    pub alpha_mask: bool,
+    /// Any light passing through.
+    pub transmission: bool,
+    /// Any reflection lobe: metal, or an index other than 1.
+    pub specular: bool,
+    /// Any diffuse lobe.
+    pub diffuse: bool,
+    /// Any emissive triangle.
+    pub emissive: bool,
+    /// Any punctual light.
+    pub punctual: bool,
+    /// 0 none, 1 constant, 2 map.
+    pub environment_kind: u32,
+    /// The firefly clamp is on.
+    pub clamp: bool,
+}
+
+impl SceneNeeds {
+    /// What either of both needs. The kind of environment stays this scene's: another kind reads tables that it does not have.
+    pub fn with(self, other: Self) -> Self {
+        Self {
+            textures: self.textures || other.textures,
+            normal_maps: self.normal_maps || other.normal_maps,
+            alpha_mask: self.alpha_mask || other.alpha_mask,
+            transmission: self.transmission || other.transmission,
+            specular: self.specular || other.specular,
+            diffuse: self.diffuse || other.diffuse,
+            emissive: self.emissive || other.emissive,
+            punctual: self.punctual || other.punctual,
+            environment_kind: self.environment_kind,
+            clamp: self.clamp || other.clamp,
+        }
+    }
+
+    /// Everything in: for proving that leaving out changes nothing.
+    pub fn everything(self) -> Self {
+        Self {
+            textures: true,
+            normal_maps: true,
+            alpha_mask: true,
+            transmission: true,
+            specular: true,
+            diffuse: true,
+            emissive: true,
+            punctual: true,
+            clamp: true,
+            ..self
+        }
+    }
+
+    /// Specialization constants of `scene.glsl`.
+    pub fn constants(&self) -> [(u32, u32); 10] {
+        [
+            (0, u32::from(self.textures)),
+            (1, u32::from(self.normal_maps)),
+            (2, u32::from(self.alpha_mask)),
+            (3, u32::from(self.transmission)),
+            (4, u32::from(self.specular)),
+            (5, u32::from(self.emissive)),
+            (6, u32::from(self.punctual)),
+            (7, self.environment_kind),
+            (8, u32::from(self.clamp)),
+            (9, u32::from(self.diffuse)),
+        ]
+    }
+}
+
+/// What stays in although nothing needs it: for measuring what leaving it out saves. No pixel may change.
+#[derive(Clone, Copy, Debug, Default)]
+pub struct Keep {
+    /// Code of the tracer.
+    pub needs: SceneNeeds,
+    /// The pass that decides shading rates, for methods with a history; nobody reads what it decides.
+    pub rate_map: bool,
+    /// Tiles that no body touches.
+    pub every_tile: bool,
+    /// Rays of method dpm to pixels with no light in the last frame, nor near them; what another body's motion uncovers there is lit up to three
+    /// frames earlier with it.
+    pub every_pixel: bool,
+    /// Tables in storage, as on a GPU, where software Vulkan would read texel buffers.
+    pub storage_tables: bool,
+}
+
+/// Why a scene cannot be drawn.
+#[derive(Debug, thiserror::Error)]
+pub enum SceneDataError {
+    /// Too many bodies.
+    #[error("the scene has {tracked} tracked bodies and {fixed} that never move (what no body claims, lamps); all together may be {MAX_BODIES}. \
+             Name fewer in scene.bodies: what is not named is one body that never moves")]
+    TooManyBodies {
+        /// Bodies that the rig file names.
+        tracked: usize,
+        /// The others.
+        fixed: usize,
+    },
+    /// A body too large for its index.
+    #[error("body \"{0}\" has {1} triangles; at most 16 million fit. Simplify it")]
+    TooManyTriangles(String, usize),
+    /// A corner that arithmetic cannot hold.
+    #[error("body \"{0}\" has a vertex at {1} m; coordinates are finite and at most {MAX_COORDINATE_M:e} m. Check the file's unit")]
+    TooFar(String, f32),
+}
+
+fn srgb_to_linear(v: u8) -> f32 {
+    let v = f32::from(v) / 255.0;
+    if v <= 0.040_45 {
+        v / 12.92
+    } else {
+        ((v + 0.055) / 1.055).powf(2.4)
+    }
+}
+
+fn texture_use(t: Option<TextureRef>) -> TextureUse {
+    let Some(t) = t else {
+        return TextureUse { texture: gpu::NO_TEXTURE, row_u: [1.0, 0.0, 0.0], row_v: [0.0, 1.0, 0.0] };
+    };
+    // KHR_texture_transform: uv' = translation * rotation * scale * uv, rotation counter-clockwise with v down.
+    let (s, c) = t.rotation.sin_cos();
+    TextureUse {
+        texture: t.texture,
+        row_u: [c * t.scale.x, s * t.scale.y, t.offset.x],
+        row_v: [-s * t.scale.x, c * t.scale.y, t.offset.y],
+    }
+}
+
+/// Largest radiance or intensity that is uploaded: its square times any count of samples is far below what f32 holds, and it is far above
+/// what any projector can show.
+const BRIGHTEST: f32 = 1e12;
+
+fn bounded(light: Vec3) -> Vec3 {
+    light.min(Vec3::splat(BRIGHTEST))
+}
+
+fn luminance(c: Vec3) -> f32 {
+    c.dot(Vec3::new(0.2126, 0.7152, 0.0722))
+}
+
+impl SceneData {
+    /// Flattens `scene`; builds one BVH per body.
+    ///
+    /// # Errors
+    /// More bodies or triangles than the packed hit record can name.
+    pub fn build(scene: &Scene) -> Result<Self, SceneDataError> {
+        let mut data = Self::default();
+        if scene.bodies.len() > MAX_BODIES {
+            let tracked = scene.bodies.iter().filter(|b| b.tracked.is_some()).count();
+            return Err(SceneDataError::TooManyBodies { tracked, fixed: scene.bodies.len() - tracked });
+        }
+        data.add_textures(scene);
+        data.add_materials(scene);
+        let mut powers = Vec::new();
+        for (i, body) in scene.bodies.iter().enumerate() {
+            data.add_body(scene, i, body, &mut powers)?;
+        }
+        let radius = data.scene_radius(scene);
+        data.add_punctual(scene, radius, &mut powers);
+        let light_power: f32 = powers.iter().sum();
+        data.add_environment(scene, radius, light_power);
+        data.make_alias_table(&powers);
+        Ok(data)
+    }
+
+    fn add_textures(&mut self, scene: &Scene) {
+        for t in &scene.textures {
+            let wrap = |w: Wrap| w as u32;
+            self.textures.push(TextureInfo {
+                offset: self.texels.len() as u32,
+                width: t.width,
+                height: t.height,
+                flags: wrap(t.wrap_u)
+                    | (wrap(t.wrap_v) << 2)
+                    | (u32::from(t.srgb) << 4)
+                    | (u32::from(t.nearest) << 5),
+            });
+            let linear: Vec<u32> =
+                (0..=255u8)
+                    .map(|v| {
+                        if t.srgb {
+                            (srgb_to_linear(v) * 65535.0).round() as u32
+                        } else {
+                            u32::from(v) * 257
+                        }
+                    })
+                    .collect();
+            self.texels.extend(t.texels.iter().map(|p| {
+                let c = |i: usize| linear[p[i] as usize];
+                [c(0) | (c(1) << 16), c(2) | ((u32::from(p[3]) * 257) << 16)]
+            }));
+        }
+    }
+
+    fn add_materials(&mut self, scene: &Scene) {
+        let used = scene.used_materials();
+        let ior_of = |m: &dpm_scene::Material| if m.ior.is_finite() { m.ior.max(1.0) } else { 1.0 };
+        let iors: Vec<f32> = scene.materials.iter().map(ior_of).collect();
+        let (tables, table_of) = tabulated(&iors);
+        self.albedo.extend(tables.iter().flat_map(|&ior| albedo_cells(&AlbedoTable::new(ior))));
+        for (((m, used), &ior), table) in scene.materials.iter().zip(used).zip(&iors).zip(table_of) {
+            let transmissive = m.transmission > 0.0;
+            let metal_everywhere = m.metallic >= 1.0 && m.metallic_roughness_texture.is_none();
+            if used {
+                let needs = &mut self.needs;
+                needs.textures |= m.textures().any(|t| t.is_some());
+                needs.normal_maps |= m.normal_texture.is_some();
+                needs.alpha_mask |= m.alpha_cutoff.is_some();
+                needs.transmission |= transmissive;
+                needs.specular |= m.metallic > 0.0 || ior != 1.0;
+                needs.diffuse |= !metal_everywhere;
+            }
+            let mut flags = 0;
+            if m.double_sided {
+                flags |= gpu::MATERIAL_DOUBLE_SIDED;
+            }
+            if m.thin_walled || ior < STRAIGHT_BELOW_IOR {
+                flags |= gpu::MATERIAL_THIN;
+            }
+            if transmissive {
+                flags |= gpu::MATERIAL_TRANSMISSIVE;
+            }
+            self.materials.push(Material {
+                base_color: m.base_color.into(),
+                alpha: m.alpha,
+                emissive: bounded(m.emissive).into(),
+                alpha_cutoff: m.alpha_cutoff.unwrap_or(-1.0),
+                metallic: m.metallic,
+                roughness: m.roughness,
+                ior,
+                transmission: m.transmission,
+                normal_scale: m.normal_scale,
+                flags,
+                albedo_table: table as u32,
+                base_color_texture: texture_use(m.base_color_texture),
+                metallic_roughness_texture: texture_use(m.metallic_roughness_texture),
+                normal_texture: texture_use(m.normal_texture),
+                emissive_texture: texture_use(m.emissive_texture),
+                transmission_texture: texture_use(m.transmission_texture),
+                reserved: [0; 2],
+            });
+        }
+    }
+
+    fn add_body(
+        &mut self,
+        scene: &Scene,
+        index: usize,
+        body: &dpm_scene::Body,
+        powers: &mut Vec<f32>,
+    ) -> Result<(), SceneDataError> {
+        let mesh = &body.mesh;
+        let far = mesh
+            .positions
+            .iter()
+            .flat_map(|p| p.to_array())
+            .find(|v| v.is_nan() || v.abs() > MAX_COORDINATE_M);
+        if let Some(far) = far {
+            return Err(SceneDataError::TooFar(body.name.clone(), far));
+        }
+        let bvh = BodyBvh::build(mesh);
+        if bvh.order.len() >= 1 << 24 {
+            return Err(SceneDataError::TooManyTriangles(body.name.clone(), bvh.order.len()));
+        }
+        let vertex_base = self.vertices.len() as u32;
+        let mut flags = 0;
+        if body.projected {
+            flags |= gpu::INSTANCE_PROJECTED;
+        }
+        if mesh.triangles.is_empty() {
+            flags |= gpu::INSTANCE_EMPTY;
+        }
+        let (mut lower, mut upper) = (Vec3::INFINITY, Vec3::NEG_INFINITY);
+        for p in &mesh.positions {
+            lower = lower.min(*p);
+            upper = upper.max(*p);
+        }
+        if mesh.positions.is_empty() {
+            (lower, upper) = (Vec3::ZERO, Vec3::ZERO);
+        }
+        self.bodies.push(BodyData {
+            node_offset: (self.nodes.len() / 5) as u32,
+            triangle_offset: self.refs.len() as u32,
+            bounds_min: lower,
+            bounds_max: upper,
+            flags,
+            extent: lower.abs().max(upper.abs()).max_element(),
+        });
+        for i in 0..mesh.positions.len() {
+            self.vertices.push(Vertex {
+                normal: mesh.normals[i].into(),
+                uv: mesh.uvs[i].into(),
+                tangent: mesh.tangents[i].into(),
+                reserved: [0; 3],
+            });
+        }
+        let mut emitter_of = std::collections::HashMap::new();
+        for (place, &t) in bvh.order.iter().enumerate() {
+            let corners = mesh.triangles[t as usize];
+            let p = corners.map(|v| mesh.positions[v as usize]);
+            self.triangles.extend(p.map(|p| [p.x.to_bits(), p.y.to_bits(), p.z.to_bits(), 0]));
+            let material = mesh.materials[t as usize];
+            let m = &scene.materials[material as usize];
+            let mut light = gpu::NO_LIGHT;
+            if m.emissive.max_element() > 0.0 {
+                // A triangle that stands in several places of the tree is one light.
+                light = *emitter_of.entry(t).or_insert_with(|| {
+                    let sides = if m.double_sided { 2.0 } else { 1.0 };
+                    let area = 0.5 * (p[1] - p[0]).cross(p[2] - p[0]).length();
+                    powers.push(std::f32::consts::PI * area * sides * luminance(bounded(m.emissive)));
+                    self.lights.push(Light {
+                        kind: gpu::LIGHT_TRIANGLE,
+                        instance: index as u32,
+                        triangle: place as u32,
+                        ..Light::zeroed()
+                    });
+                    self.needs.emissive = true;
+                    (self.lights.len() - 1) as u32
+                });
+            }
+            self.refs.push(TriangleRef {
+                vertices: corners.map(|v| v + vertex_base),
+                material,
+                light,
+                reserved: [0; 3],
+            });
+        }
+        self.nodes.extend_from_slice(&bvh.nodes);
+        Ok(())
+    }
+
+    /// Radius about the origin that holds all bodies at rest.
+    fn scene_radius(&self, scene: &Scene) -> f32 {
+        let mut radius = 0.0f64;
+        for (body, data) in scene.bodies.iter().zip(&self.bodies) {
+            let (lower, upper) = world_bounds(&body.world_from_body_rest, data.bounds_min, data.bounds_max);
+            radius = radius.max(lower.abs().max(upper.abs()).length());
+        }
+        radius as f32
+    }
+
+    fn add_punctual(&mut self, scene: &Scene, radius: f32, powers: &mut Vec<f32>) {
+        use std::f32::consts::PI;
+        for l in &scene.lights {
+            let intensity = luminance(bounded(l.intensity));
+            let (kind, power, scale, offset) = match l.kind {
+                PunctualKind::Point => (gpu::LIGHT_POINT, 4.0 * PI * intensity, 0.0, 0.0),
+                PunctualKind::Spot { inner, outer } => {
+                    // KHR_lights_punctual: linear in the cosine between the cones, then squared.
+                    let scale = 1.0 / (inner.cos() - outer.cos()).max(0.001);
+                    (gpu::LIGHT_SPOT, 2.0 * PI * (1.0 - outer.cos()) * intensity, scale, -outer.cos() * scale)
+                }
+                PunctualKind::Directional => {
+                    (gpu::LIGHT_DIRECTIONAL, PI * radius * radius * intensity, 0.0, 0.0)
+                }
+            };
+            if power.is_nan() || power <= 0.0 {
+                continue;
+            }
+            powers.push(power);
+            self.lights.push(Light {
+                kind,
+                instance: l.body.unwrap_or(gpu::NO_INSTANCE),
+                position: l.position.into(),
+                direction: l.direction.into(),
+                intensity: bounded(l.intensity).into(),
+                cone_scale: scale,
+                cone_offset: offset,
+                range: if l.range.is_finite() { l.range } else { 3.0e38 },
+                ..Light::zeroed()
+            });
+            self.needs.punctual = true;
+        }
+    }
+
+    fn add_environment(&mut self, scene: &Scene, radius: f32, light_power: f32) {
+        let mean = match &scene.environment {
+            Environment::Constant(c) => {
+                self.environment_constant = bounded(*c);
+                self.needs.environment_kind = u32::from(c.max_element() > 0.0);
+                luminance(bounded(*c))
+            }
+            Environment::Equirect { width, height, texels, rotation_rad } => {
+                self.environment_size = [*width, *height];
+                self.environment_rotation = *rotation_rad;
+                self.environment_constant = Vec3::ONE;
+                let mean = self.tabulate_environment(*width as usize, *height as usize, texels);
+                self.needs.environment_kind = if mean > 0.0 { 2 } else { 0 };
+                mean
+            }
+        };
+        if self.needs.environment_kind == 0 {
+            return;
+        }
+        let power = 4.0 * std::f32::consts::PI.powi(2) * radius * radius * mean;
+        self.environment_select =
+            if light_power > 0.0 { (power / (power + light_power)).clamp(0.2, 0.8) } else { 1.0 };
+    }
+
+    /// Fills texels with conditional cdf and the marginal cdf; returns the mean luminance over the sphere.
+    fn tabulate_environment(&mut self, width: usize, height: usize, texels: &[Vec3]) -> f32 {
+        let mut row_sums = Vec::with_capacity(height);
+        self.environment.clear();
+        for y in 0..height {
+            let row = &texels[y * width..(y + 1) * width];
+            let sum: f64 = row.iter().map(|t| f64::from(luminance(bounded(*t)))).sum();
+            let mut run = 0.0f64;
+            for (x, t) in row.iter().enumerate() {
+                run += f64::from(luminance(bounded(*t)));
+                let cdf = if sum > 0.0 { run / sum } else { (x + 1) as f64 / width as f64 };
+                let cdf = if x + 1 == width { 1.0 } else { cdf };
+                let t = bounded(*t);
+                self.environment.push([t.x, t.y, t.z, cdf as f32]);
+            }
+            let c = |k: usize| (std::f64::consts::PI * k as f64 / height as f64).cos();
+            row_sums.push(sum / width as f64 * (c(y) - c(y + 1)));
+        }
+        let total: f64 = row_sums.iter().sum();
+        let mut run = 0.0;
+        for (y, s) in row_sums.iter().enumerate() {
+            run += s;
+            let cdf = if total > 0.0 { run / total } else { (y + 1) as f64 / height as f64 };
+            let cdf = if y + 1 == height { 1.0 } else { cdf };
+            self.environment.push([cdf as f32, 0.0, 0.0, 0.0]);
+        }
+        (total / 2.0) as f32
+    }
+
+    /// \[Vose91\]: any light in constant time, with probability proportional to its power.
+    fn make_alias_table(&mut self, powers: &[f32]) {
+        let n = powers.len();
+        let total: f64 = powers.iter().map(|&p| f64::from(p)).sum();
+        if n == 0 || total <= 0.0 {
+            return;
+        }
+        let mut scaled: Vec<f64> = powers.iter().map(|&p| f64::from(p) / total * n as f64).collect();
+        let (mut small, mut large): (Vec<usize>, Vec<usize>) = (0..n).partition(|&i| scaled[i] < 1.0);
+        for (light, &p) in self.lights.iter_mut().zip(powers) {
+            light.select = (f64::from(p) / total) as f32;
+            light.alias_keep = 1.0;
+        }
+        for i in 0..n {
+            self.lights[i].alias_other = i as u32;
+        }
+        while let (Some(s), Some(&l)) = (small.pop(), large.last()) {
+            self.lights[s].alias_keep = scaled[s] as f32;
+            self.lights[s].alias_other = l as u32;
+            scaled[l] -= 1.0 - scaled[s];
+            if scaled[l] < 1.0 {
+                large.pop();
+                small.push(l);
+            }
+        }
+    }
+}
+
+/// Bounds of a body after a rigid transform.
+pub fn world_bounds(world_from_body: &DAffine3, lower: Vec3, upper: Vec3) -> (glam::DVec3, glam::DVec3) {
+    let centre = ((lower + upper) * 0.5).as_dvec3();
+    let half = ((upper - lower) * 0.5).as_dvec3();
+    let m = world_from_body.matrix3;
+    let c = world_from_body.transform_point3(centre);
+    let h = m.x_axis.abs() * half.x + m.y_axis.abs() * half.y + m.z_axis.abs() * half.z;
+    (c - h, c + h)
+}

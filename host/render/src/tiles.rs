@@ -1,0 +1,170 @@
+//! Poses into the tiles worth tracing: those that some body's bounds may touch.
+
+use super::scene_data::{world_bounds, BodyData};
+use dpm_scene::geometry::projector::ProjectorCamera;
+use dpm_shaders::structs::INSTANCE_EMPTY;
+use glam::{DAffine3, DVec2, DVec3};
+
+/// Side of a tile in pixels (\[paper\] section 2.1).
+pub const TILE: u32 = 16;
+
+/// The tiles of one raster, in the order in which they are traced, and which of them are active.
+#[derive(Clone, Debug)]
+pub struct TileList {
+    tiles_x: u32,
+    tiles_y: u32,
+    /// A walk over all tiles in large steps: software Vulkan splits a grid in two halves, which should cost alike.
+    order: Vec<u32>,
+    active: Vec<bool>,
+    previous: Vec<bool>,
+}
+
+impl TileList {
+    /// A list for a raster of `width` x `height` pixels.
+    pub fn new(width: u32, height: u32) -> Self {
+        let (tiles_x, tiles_y) = (width.div_ceil(TILE), height.div_ceil(TILE));
+        let n = (tiles_x * tiles_y) as usize;
+        let mut step = (n as f64 * 0.618) as usize | 1;
+        while gcd(step, n) != 1 {
+            step += 2;
+        }
+        let order = (0..n).map(|i| ((i * step) % n) as u32).collect();
+        Self { tiles_x, tiles_y, order, active: vec![false; n], previous: vec![false; n] }
+    }
+
+    /// Number of tiles of the raster.
+    pub fn len(&self) -> usize {
+        self.active.len()
+    }
+
+    /// Never true.
+    pub fn is_empty(&self) -> bool {
+        self.active.is_empty()
+    }
+
+    /// Tiles in a row.
+    pub fn tiles_x(&self) -> u32 {
+        self.tiles_x
+    }
+
+    /// Marks the tiles that the bodies may touch. `only`: bodies to look at (all bits of `flags_mask` set). Allocates nothing.
+    pub fn update(
+        &mut self,
+        camera: &ProjectorCamera,
+        bodies: &[BodyData],
+        poses: &[DAffine3],
+        flags_mask: u32,
+    ) {
+        std::mem::swap(&mut self.active, &mut self.previous);
+        self.active.fill(false);
+        for (body, pose) in bodies.iter().zip(poses) {
+            if body.flags & INSTANCE_EMPTY == 0 && body.flags & flags_mask == flags_mask {
+                self.mark(camera, body, pose);
+            }
+        }
+    }
+
+    /// Marks every tile.
+    pub fn fill(&mut self) {
+        std::mem::swap(&mut self.active, &mut self.previous);
+        self.active.fill(true);
+    }
+
+    fn mark(&mut self, camera: &ProjectorCamera, body: &BodyData, pose: &DAffine3) {
+        let (lower, upper) = (body.bounds_min.as_dvec3(), body.bounds_max.as_dvec3());
+        let (mut from, mut to) = (DVec2::INFINITY, DVec2::NEG_INFINITY);
+        for p in corners(lower, upper) {
+            match camera.project(pose.transform_point3(p)) {
+                Some(pixel) => {
+                    from = from.min(pixel);
+                    to = to.max(pixel);
+                }
+                // Partly behind the projector: the projected box has no bounds.
+                None => {
+                    let (world_lower, world_upper) = world_bounds(pose, body.bounds_min, body.bounds_max);
+                    if !behind(camera, world_lower, world_upper) {
+                        self.active.fill(true);
+                    }
+                    return;
+                }
+            }
+        }
+        let clamp = |v: f64, n: u32| (v / f64::from(TILE)).floor().clamp(-1.0, f64::from(n)) as i64;
+        // One pixel of margin for rounding.
+        let x0 = clamp(from.x - 1.0, self.tiles_x).max(0);
+        let x1 = clamp(to.x + 1.0, self.tiles_x).min(i64::from(self.tiles_x) - 1);
+        let y0 = clamp(from.y - 1.0, self.tiles_y).max(0);
+        let y1 = clamp(to.y + 1.0, self.tiles_y).min(i64::from(self.tiles_y) - 1);
+        for y in y0..=y1 {
+            for x in x0..=x1 {
+                self.active[(y * i64::from(self.tiles_x) + x) as usize] = true;
+            }
+        }
+    }
+
+    /// Writes the tiles that are active now or were at the last update (those must be cleared) to `out`; returns how many.
+    pub fn write(&self, out: &mut [u32]) -> u32 {
+        let mut n = 0;
+        for &tile in &self.order {
+            if self.active[tile as usize] || self.previous[tile as usize] {
+                out[n] = tile;
+                n += 1;
+            }
+        }
+        n as u32
+    }
+}
+
+/// The whole box is behind the projector.
+fn behind(camera: &ProjectorCamera, lower: DVec3, upper: DVec3) -> bool {
+    corners(lower, upper).all(|p| camera.to_projector_space(p).z >= 0.0)
+}
+
+/// The eight corners of a box.
+pub(super) fn corners(lower: DVec3, upper: DVec3) -> impl Iterator<Item = DVec3> {
+    (0..8u32).map(move |c| {
+        let pick = |bit: u32, low: f64, high: f64| if c >> bit & 1 == 1 { high } else { low };
+        DVec3::new(pick(0, lower.x, upper.x), pick(1, lower.y, upper.y), pick(2, lower.z, upper.z))
+    })
+}
+
+fn gcd(a: usize, b: usize) -> usize {
+    if b == 0 {
+        a
+    } else {
+        gcd(b, a % b)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use dpm_device::planes::Raster;
+
+    #[test]
+    fn every_tile_that_a_point_of_the_body_falls_into_is_active() {
+        let raster = Raster::new(250, 130).unwrap();
+        let camera =
+            ProjectorCamera::look_at(raster, DVec3::new(0.0, 0.1, 1.0), DVec3::ZERO, DVec3::Y, 0.6).unwrap();
+        let body = BodyData::of_20_cm();
+        let pose = DAffine3::from_rotation_y(0.7);
+        let mut list = TileList::new(250, 130);
+        list.update(&camera, &[body], &[pose], 1);
+        let mut tiles = vec![0; list.len()];
+        let n = list.write(&mut tiles) as usize;
+        assert!(n > 4 && n < list.len(), "{n} of {}", list.len());
+        for i in 0..1000 {
+            let h = |k: u32| f64::from((i * k) % 997) / 997.0 * 0.2 - 0.1;
+            let p = camera.project(pose.transform_point3(DVec3::new(h(31), h(57), h(91)))).unwrap();
+            if p.x >= 0.0 && p.y >= 0.0 && p.x < 250.0 && p.y < 130.0 {
+                let tile = p.y as u32 / TILE * list.tiles_x() + p.x as u32 / TILE;
+                assert!(tiles[..n].contains(&tile), "{p}");
+            }
+        }
+        // When the body is gone its tiles come once more, to be cleared, then no more.
+        list.update(&camera, &[], &[], 1);
+        assert_eq!(list.write(&mut tiles) as usize, n);
+        list.update(&camera, &[], &[], 1);
+        assert_eq!(list.write(&mut tiles), 0);
+    }
+}

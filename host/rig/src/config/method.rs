@@ -1,0 +1,56 @@
+//! `[render]` of the rig file into the renderer's method.
+
+use super::{PaperConfig, RenderConfig, RenderMethod};
+use dpm_render::method::{Method, PaperConstants, SamplerKind, HISTORY_CAP};
+
+impl RenderConfig {
+    /// The method that the rig file asks for, with all its switches resolved.
+    pub fn to_method(&self) -> Method {
+        let effects = self.effects_on();
+        let dpm = self.method == RenderMethod::Dpm;
+        let sampler = match (effects.blue_noise, self.method) {
+            (false, _) => SamplerKind::Independent,
+            (true, RenderMethod::Dpm) => SamplerKind::Continued,
+            (true, RenderMethod::Sequence) => SamplerKind::PixelSequence,
+            (true, _) => SamplerKind::BlueNoise,
+        };
+        Method {
+            dpm,
+            rate_map: effects.rate_map,
+            checkerboard: effects.checkerboard && !dpm,
+            sampler,
+            temporal: effects.temporal_filter,
+            spatial: effects.spatial_filter,
+            spp_by_angle: effects.spp_by_angle && !dpm,
+            budget_spp: self.spp as f32,
+            history_cap: if effects.temporal_filter { HISTORY_CAP } else { 0.0 },
+            paper: self.paper.to_constants(),
+        }
+    }
+}
+
+impl PaperConfig {
+    /// The constants as the renderer takes them.
+    fn to_constants(&self) -> PaperConstants {
+        PaperConstants {
+            t: self.t,
+            l: self.l,
+            phi_h_deg: self.phi_h_deg,
+            phi_q_deg: self.phi_q_deg,
+            temporal_alpha: self.temporal_alpha,
+            zone_spp: self.zone_spp,
+            filter_from_deg: self.filter_from_deg,
+            filter_to_deg: self.filter_to_deg,
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_rig_files_defaults_are_the_published_constants() {
+        assert_eq!(PaperConfig::default().to_constants(), PaperConstants::default());
+    }
+}

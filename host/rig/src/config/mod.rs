@@ -1,0 +1,339 @@
+//! A rig file, the environment and `--set` flags into a checked [`RigConfig`].
+//!
+//! Defaults < file < environment (`DPM_SET_PROJECTOR__WIDTH=640`) < `--set projector.width=640`. All mistakes are
+//! reported at once, each with file, line and column. The keys are listed in `docs/CONFIG.md`, which is made from their
+//! declarations here.
+
+mod check;
+mod declare;
+mod error;
+mod method;
+mod prediction;
+mod projector;
+mod read;
+mod run;
+mod safety;
+mod source;
+mod world;
+
+#[cfg(test)]
+mod tests;
+
+pub use error::{ConfigError, ConfigErrors, Origin};
+pub use projector::*;
+pub use read::KeyDoc;
+pub use run::*;
+pub use safety::{
+    InterlockConfig, InterlockSignal, KeyInterlockConfig, LimitsConfig, LineInterlockConfig,
+    NoInterlockConfig, ProcessInterlockConfig,
+};
+pub use source::VARIABLE_PREFIX;
+pub use world::*;
+
+use declare::section;
+use dpm_device::regular_file;
+use hil_mock::motion::MotionSpec;
+use read::{Any, ConfigValue, Reader};
+use std::path::Path;
+
+/// Largest accepted rig file in bytes.
+pub const MAX_FILE_BYTES: u64 = 1 << 20;
+
+/// The rig file that `dpm demo` runs.
+pub const DEMO_RIG: &str = include_str!("../../../../rigs/demo.toml");
+
+section! {
+    /// A whole rig. Every value is in its range and no two contradict each other.
+    pub struct RigConfig {
+        /// What the light comes out of.
+        projector: ProjectorConfig = ProjectorConfig::default(), "", Any;
+        /// Where poses come from.
+        tracker: TrackerConfig = TrackerConfig::default(), "", Any;
+        /// The eye for which the picture is right.
+        observer: ObserverConfig = ObserverConfig::default(), "", Any;
+        /// What is to be seen.
+        scene: SceneConfig = SceneConfig::default(), "", Any;
+        /// How radiance is found.
+        render: RenderConfig = RenderConfig::default(), "", Any;
+        /// From samples to the pose at the time of light.
+        prediction: PredictionConfig = PredictionConfig::default(), "", Any;
+        /// Time and the operating system.
+        real_time: RealTimeConfig = RealTimeConfig::default(), "", Any;
+        /// How long to run.
+        run: RunConfig = RunConfig::default(), "", Any;
+        /// What is written.
+        output: OutputConfig = OutputConfig::default(), "", Any;
+        /// What happens when something fails.
+        safety: SafetyConfig = SafetyConfig::default(), "", Any;
+    }
+}
+
+/// Settings from outside the file.
+#[derive(Clone, Debug, Default)]
+pub struct Overrides {
+    /// Environment variables, name and value; those without [`VARIABLE_PREFIX`] are ignored.
+    pub variables: Vec<(String, String)>,
+    /// Texts `a.b=c` in the order given; later ones win.
+    pub flags: Vec<String>,
+}
+
+impl Overrides {
+    /// The process's environment together with `flags`.
+    pub fn from_environment(flags: Vec<String>) -> Self {
+        let mut variables: Vec<_> = std::env::vars_os()
+            .filter_map(|(k, v)| Some((k.into_string().ok()?, v.to_string_lossy().into_owned())))
+            .filter(|(k, _)| k.starts_with(VARIABLE_PREFIX))
+            .collect();
+        variables.sort();
+        Self { variables, flags }
+    }
+
+    fn apply(&self, root: &mut source::Node, errors: &mut Vec<ConfigError>) {
+        for (name, value) in &self.variables {
+            if let Some(path) = source::variable_path(name) {
+                source::set(root, &path, value, &Origin::Variable(name.clone()), errors);
+            }
+        }
+        for flag in &self.flags {
+            let origin = Origin::Flag(flag.clone());
+            match flag.split_once('=') {
+                Some((key, value)) => {
+                    let path: Vec<String> = key.trim().split('.').map(|p| p.trim().to_string()).collect();
+                    source::set(root, &path, value.trim(), &origin, errors);
+                }
+                None => errors.push(ConfigError {
+                    origin,
+                    key: String::new(),
+                    problem: "has no `=`".into(),
+                    remedy: "write for example `render.spp=4`".into(),
+                }),
+            }
+        }
+    }
+}
+
+/// Shortest watchdog, and shortest time over which an eye adds up light, of a rig that names none, milliseconds.
+const DEFAULT_WATCHDOG_MS: u32 = 50;
+const DEFAULT_LIGHT_WINDOW_MS: f64 = 33.0;
+
+/// What a rig file is read for.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub struct Purpose {
+    /// The mocks stand in for tracker and projector, of whatever kind they are: see [`RigConfig::simulate`].
+    pub simulate: bool,
+    /// Nothing runs: neither `run.frames` nor `run.seconds` must say when it ends.
+    pub at_rest: bool,
+}
+
+impl RigConfig {
+    /// Length of a frame, milliseconds.
+    pub fn frame_ms(&self) -> f64 {
+        1e3 / self.projector.frame_rate.hz()
+    }
+
+    /// Silence after which the projector goes dark by itself, microseconds: what `safety.watchdog_ms` says, else 50 ms or three frames,
+    /// whichever is longer.
+    pub fn watchdog_us(&self) -> u32 {
+        let three_frames = (3.0 * self.frame_ms()).ceil() as u32;
+        let ms = self.safety.watchdog_ms.unwrap_or(DEFAULT_WATCHDOG_MS.max(three_frames));
+        ms.saturating_mul(1000).min(dpm_device::link::MAX_WATCHDOG_US)
+    }
+
+    /// Time over which an eye adds up light in pictures, milliseconds: what `output.light_window_ms` says, else 33 ms or a frame,
+    /// whichever is longer.
+    pub fn light_window_ms(&self) -> f64 {
+        self.output.light_window_ms.unwrap_or(DEFAULT_LIGHT_WINDOW_MS.max(self.frame_ms()))
+    }
+
+    /// Puts the mocks in the place of a tracker and a projector that are real ones (or a recording). The mock tracker reports as often as
+    /// the real one is said to, and moves bodies by `scene.bodies[].motion`, or as it does when that is left out.
+    pub fn simulate(&mut self) {
+        if !matches!(self.tracker, TrackerConfig::Mock(_)) {
+            let default = MockTrackerConfig::default();
+            let rate_hz = self.tracker.rate_hz().unwrap_or(default.rate_hz);
+            self.tracker = TrackerConfig::Mock(MockTrackerConfig { rate_hz, ..default });
+        }
+        if !matches!(self.projector.backend, ProjectorBackend::Mock(_)) {
+            self.projector.backend = ProjectorBackend::default();
+        }
+    }
+
+    /// Slots that `run.seconds` comes to, at least one; 0 where it sets no limit.
+    pub fn slots_to_run(&self) -> u64 {
+        if self.run.seconds > 0.0 {
+            self.projector.frame_rate.slot_at_ns((self.run.seconds * 1e9) as i64).max(1)
+        } else {
+            0
+        }
+    }
+
+    /// Reads a rig file of at most [`MAX_FILE_BYTES`].
+    ///
+    /// # Errors
+    /// Every mistake at once: unreadable file, syntax, unknown keys, wrong types, values out of range, contradictions,
+    /// input files that are not there.
+    pub fn load(path: &Path, overrides: &Overrides) -> Result<Self, ConfigErrors> {
+        Self::load_for(path, overrides, Purpose::default())
+    }
+
+    /// Like [`RigConfig::load`], for a purpose.
+    ///
+    /// # Errors
+    /// As [`RigConfig::load`].
+    pub fn load_for(path: &Path, overrides: &Overrides, purpose: Purpose) -> Result<Self, ConfigErrors> {
+        let unreadable = |e: std::io::Error| {
+            // A path from the manual, given elsewhere than at the top of the sources, is the most frequent mistake.
+            let here = std::env::current_dir().ok().filter(|_| path.is_relative());
+            let from =
+                here.map_or(String::new(), |here| format!("it was looked for in {}; ", here.display()));
+            let remedy =
+                format!("{from}give the path of a rig file, for example rigs/demo.toml in dpm's sources");
+            ConfigErrors::unreadable(path, format!("cannot read the rig file: {e}"), &remedy)
+        };
+        let text = match regular_file::read_text(path, MAX_FILE_BYTES) {
+            Err(e) if e.kind() == std::io::ErrorKind::FileTooLarge => {
+                let problem = format!("the rig file has more than {MAX_FILE_BYTES} bytes");
+                return Err(ConfigErrors::unreadable(path, problem, "is it a scene? give that by --scene"));
+            }
+            read => read.map_err(unreadable)?,
+        };
+        let base = path.parent().unwrap_or(Path::new(""));
+        Self::parse_for(&path.display().to_string(), &text, base, overrides, purpose)
+    }
+
+    /// The rig that `dpm demo` runs.
+    ///
+    /// # Errors
+    /// Mistakes in `overrides`, all at once.
+    pub fn demo(overrides: &Overrides) -> Result<Self, ConfigErrors> {
+        Self::demo_for(overrides, Purpose::default())
+    }
+
+    /// Like [`RigConfig::demo`], for a purpose.
+    ///
+    /// # Errors
+    /// As [`RigConfig::demo`].
+    pub fn demo_for(overrides: &Overrides, purpose: Purpose) -> Result<Self, ConfigErrors> {
+        Self::parse_for("rigs/demo.toml", DEMO_RIG, Path::new(""), overrides, purpose)
+    }
+
+    /// Reads a rig file's text. `name` stands in messages; input files are relative to `base`.
+    ///
+    /// # Errors
+    /// As [`RigConfig::load`].
+    pub fn parse(name: &str, text: &str, base: &Path, overrides: &Overrides) -> Result<Self, ConfigErrors> {
+        Self::parse_for(name, text, base, overrides, Purpose::default())
+    }
+
+    /// Like [`RigConfig::parse`], for a purpose.
+    ///
+    /// # Errors
+    /// As [`RigConfig::load`].
+    pub fn parse_for(
+        name: &str,
+        text: &str,
+        base: &Path,
+        overrides: &Overrides,
+        purpose: Purpose,
+    ) -> Result<Self, ConfigErrors> {
+        let mut reader = Reader::default();
+        let mut root = source::parse(name, text, &mut reader.errors);
+        if !reader.errors.is_empty() {
+            // A half-read file would only add errors that are none.
+            return Err(ConfigErrors(reader.errors));
+        }
+        overrides.apply(&mut root, &mut reader.errors);
+        let rig = <Self as ConfigValue>::read(&root, &mut reader, "");
+        let mut rig = rig.unwrap_or_default();
+        // What is wrong by itself would be reported again as a contradiction.
+        if reader.errors.is_empty() {
+            if purpose.simulate {
+                // The keys of the real parts are not used, and still must make sense.
+                check::addresses(&rig, &mut reader);
+                rig.simulate();
+            }
+            check::check(&rig, purpose, &mut reader);
+            check::resolve_files(&mut rig, base, &mut reader);
+        }
+        if reader.errors.is_empty() {
+            Ok(rig)
+        } else {
+            Err(ConfigErrors(reader.errors))
+        }
+    }
+
+    /// Every key of the rig file, for the manual.
+    pub fn key_docs() -> Vec<KeyDoc> {
+        let mut out = Vec::new();
+        Self::document("", &mut out);
+        out
+    }
+
+    /// The manual `docs/CONFIG.md`.
+    pub fn manual() -> String {
+        let mut out = String::from(MANUAL_HEAD);
+        let mut section = String::new();
+        for key in Self::key_docs() {
+            let (table, name) = key.key.rsplit_once('.').unwrap_or(("", &key.key));
+            if table != section {
+                if section == "scene.bodies[]" {
+                    out += &motions();
+                }
+                section = table.to_string();
+                out += &format!(
+                    "\n## {}\n\n| key | type | default | allowed | what it does |\n|---|---|---|---|---|\n",
+                    heading(table)
+                );
+            }
+            let cell = |text: &str| text.replace('|', "\\|");
+            let allowed = [key.range.as_str(), key.unit].join(" ");
+            out += &format!(
+                "| `{name}` | {} | `{}` | {} | {} |\n",
+                cell(&key.kind),
+                cell(&key.default),
+                cell(allowed.trim()),
+                cell(&key.doc)
+            );
+        }
+        out
+    }
+}
+
+const MANUAL_HEAD: &str = "# The rig file
+
+Made from the declarations in `host/rig/src/config/`; `DPM_UPDATE_MANUAL=1 cargo test -p dpm-rig --lib manual` writes it anew.
+
+A rig file is TOML. What it leaves out has the default. Over the file come environment variables
+(`DPM_SET_PROJECTOR__WIDTH=640` sets `projector.width`; two underscores part the levels) and over those the flag
+`--set projector.width=640`, which may stand several times; a number steps into a list (`--set scene.bodies.0.node=Hare`).
+All mistakes of a file are reported at once, each with line and column. Paths in a rig file are relative to its folder.
+";
+
+/// The manual's table of what `scene.bodies[].motion` may hold.
+fn motions() -> String {
+    let mut out =
+        "\n## `motion` of `[[scene.bodies]]`\n\n| `kind` | key | type | what it does |\n|---|---|---|---|\n"
+            .to_string();
+    let text = |lines: &[&str]| lines.iter().map(|l| l.trim()).collect::<Vec<_>>().join(" ");
+    for kind in MotionSpec::KINDS {
+        out += &format!("| `{}` | | | {} |\n", kind.name, text(kind.doc));
+        for (key, ty, doc) in kind.keys {
+            let ty = match *ty {
+                "f64" => f64::kind(),
+                "[f64; 3]" => <[f64; 3]>::kind(),
+                _ => "a list of motions".to_string(),
+            };
+            out += &format!("| | `{key}` | {ty} | {} |\n", text(doc));
+        }
+    }
+    out
+}
+
+/// `projector.backend(usb)` into `[projector.backend]` with `kind = "usb"`; `scene.bodies[]` into `[[scene.bodies]]`.
+fn heading(table: &str) -> String {
+    match (table.strip_suffix(')').and_then(|t| t.split_once('(')), table.strip_suffix("[]")) {
+        (Some((table, kind)), _) => format!("`[{table}]` with `kind = \"{kind}\"`"),
+        (_, Some(list)) => format!("`[[{list}]]`"),
+        _ => format!("`[{table}]`"),
+    }
+}

@@ -1,0 +1,430 @@
+//! The operator's end: an order to the rigs that run, and whether it was obeyed.
+
+use super::status_file::StatusFile;
+use super::{is_obeyed, runtime_path, socket_name, HEARD};
+use crate::standing::state_folder;
+use crate::telemetry::monitor::Order;
+use dpm_common::folder::{Folder, FolderError, Owner};
+use dpm_common::unix::{monotonic_ns, peer, send_signal, user, user_name, Peer};
+use std::collections::BTreeSet;
+use std::fs;
+use std::io::{self, Read, Write};
+use std::os::unix::fs::{FileTypeExt, MetadataExt};
+use std::os::unix::net::UnixStream;
+use std::path::{Path, PathBuf};
+use std::sync::mpsc::channel;
+use std::sync::Arc;
+use std::time::{Duration, Instant};
+
+/// A rig that has not said by then that it heard BLACK or SAFE is sent a signal.
+const HEARD_WITHIN: Duration = Duration::from_millis(20);
+/// After this an order counts as not confirmed.
+const ANSWERED_WITHIN: Duration = Duration::from_millis(2000);
+/// How often the second way is looked at.
+const LOOK: Duration = Duration::from_millis(5);
+/// Longest answer.
+const MAX_ANSWER: usize = 2048;
+/// Most rigs that one order goes to; this user's come first.
+const MAX_RIGS: usize = 256;
+
+/// A rig that listens, as its socket says.
+#[derive(Clone, Debug)]
+pub struct Place {
+    folder: Arc<Folder>,
+    /// Its process.
+    pub pid: u32,
+    /// Its user.
+    pub uid: u32,
+    /// It is this user's, or stands where only root can have put its folder (`/run/dpm` of a service). What another one says is passed on
+    /// as that user's word.
+    is_vouched_for: bool,
+}
+
+/// What a look for running rigs found.
+#[derive(Debug, Default)]
+pub struct Search {
+    /// Rigs that this user may give orders to.
+    pub rigs: Vec<Place>,
+    /// Rigs and folders that it may not, with the reason.
+    pub refused: Vec<String>,
+    /// Folders of other users, into which this one cannot look.
+    pub closed: Vec<PathBuf>,
+    /// Where was looked.
+    pub looked: Vec<PathBuf>,
+}
+
+/// Why an order did not reach a rig.
+#[derive(Debug, thiserror::Error)]
+pub enum ControlError {
+    /// Nobody listens.
+    #[error("no running rig listens in {}{}", list(looked), advice(*order))]
+    NoRig {
+        /// What was ordered.
+        order: Order,
+        /// Where was looked.
+        looked: Vec<PathBuf>,
+    },
+    /// Several rigs run, and only the dark is for all of them.
+    #[error("{} rigs are running (processes {}); name one with --pid", ids.len(), ids.iter().map(u32::to_string).collect::<Vec<_>>().join(", "))]
+    Several {
+        /// Their processes.
+        ids: Vec<u32>,
+    },
+}
+
+fn list(folders: &[PathBuf]) -> String {
+    folders.iter().map(|f| f.display().to_string()).collect::<Vec<_>>().join(", ")
+}
+
+fn advice(order: Order) -> String {
+    let nothing = "; `dpm run` prints where its control socket is, DPM_RUNTIME_DIR names another folder";
+    match order {
+        Order::Arm => {
+            let state = state_folder().map_or(String::new(), |f| format!(" in {}", f.display()));
+            format!("; nothing was armed, and an order that stands{state} still stands: only a running rig can be armed{nothing}")
+        }
+        _ => format!("; no light was darkened, and a rig that starts now is not held back{nothing}"),
+    }
+}
+
+/// A rig's answer.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct Answer {
+    /// Its process.
+    pub pid: u32,
+    /// Its user.
+    pub uid: u32,
+    /// Its rig file; empty where it did not say so.
+    pub rig: String,
+    /// What it said, or what is known without its word.
+    pub text: String,
+    /// The projector has obeyed, and the order is kept as it should be.
+    pub done: bool,
+    /// It is this user's or a service's; the word of another user's process proves nothing.
+    pub is_vouched_for: bool,
+}
+
+/// Folders in which rigs may listen: the one that DPM_RUNTIME_DIR names and no other; else this user's own and the service's, and those
+/// of other users, which root may use and others are told about.
+fn folders() -> Vec<PathBuf> {
+    let own = runtime_path();
+    if std::env::var_os("DPM_RUNTIME_DIR").is_some_and(|dir| !dir.is_empty()) {
+        return vec![own];
+    }
+    let mut all = vec![own, "/run/dpm".into()];
+    let below = |folder: &Path, name: &dyn Fn(&str) -> Option<PathBuf>| -> Vec<PathBuf> {
+        let entries = fs::read_dir(folder).into_iter().flatten().filter_map(Result::ok).take(4096);
+        entries.filter_map(|e| Some(folder.join(name(e.file_name().to_str()?)?))).collect()
+    };
+    all.extend(below(Path::new("/run/user"), &|uid| Some(Path::new(uid).join("dpm"))));
+    let numbered = |name: &str| name.strip_prefix("dpm-")?.parse::<u32>().ok().map(|_| PathBuf::from(name));
+    all.extend(below(Path::new("/run"), &numbered));
+    all.extend(below(&std::env::temp_dir(), &numbered));
+    let mut seen = BTreeSet::new();
+    all.retain(|folder| seen.insert(folder.clone()));
+    all
+}
+
+/// Looks for rigs in `folders`.
+fn search(folders: &[PathBuf]) -> Search {
+    let mut found = Search::default();
+    for path in folders {
+        let folder = match Folder::open(path, Owner::OwnOrAnyForRoot) {
+            Ok(folder) => Arc::new(folder),
+            Err(e) => {
+                // The first is where this user's rigs are: what is wrong with that is always told.
+                let is_own = path == &folders[0];
+                match e {
+                    _ if e.is_missing() => {}
+                    _ if is_own => found.refused.push(e.to_string()),
+                    FolderError::Io { ref source, .. }
+                        if source.kind() == io::ErrorKind::PermissionDenied =>
+                    {
+                        found.closed.push(path.clone());
+                    }
+                    // Another user's, or planted: told only where something in it would be a rig.
+                    _ => found.refused.extend(foreign(path, &e)),
+                }
+                if is_own {
+                    found.looked.push(path.clone());
+                }
+                continue;
+            }
+        };
+        found.looked.push(path.clone());
+        let is_vouched_for = folder.owner() == user() || is_made_by_root(path);
+        let pids = folder
+            .names()
+            .unwrap_or_default()
+            .into_iter()
+            .filter_map(|name| pid_of(&name))
+            .collect::<BTreeSet<_>>();
+        found.rigs.extend(pids.into_iter().map(|pid| Place {
+            folder: folder.clone(),
+            pid,
+            uid: folder.owner(),
+            is_vouched_for,
+        }));
+    }
+    let me = user();
+    // This user's rigs first.
+    found.rigs.sort_by_key(|place| (place.uid != me, place.uid, place.pid));
+    found
+}
+
+/// True where only root could make a folder.
+fn is_made_by_root(folder: &Path) -> bool {
+    let above = folder.parent().and_then(|above| fs::metadata(above).ok());
+    above.is_some_and(|above| above.uid() == 0 && above.mode() & 0o022 == 0)
+}
+
+fn pid_of(name: &str) -> Option<u32> {
+    name.strip_prefix("run-")?.strip_suffix(".sock")?.parse().ok()
+}
+
+/// Sockets of rigs in a folder that is not ours.
+fn foreign(path: &Path, why: &FolderError) -> Option<String> {
+    let entries = fs::read_dir(path).ok()?.filter_map(Result::ok).take(4096);
+    let rigs: Vec<String> = entries
+        .filter(|e| e.file_type().is_ok_and(|t| t.is_socket()))
+        .filter_map(|e| {
+            let pid = pid_of(e.file_name().to_str()?)?;
+            let uid = e.metadata().ok()?.uid();
+            Some(format!("process {pid} of {}", user_name(uid)))
+        })
+        .collect();
+    (!rigs.is_empty()).then(|| format!("{}: {why}", rigs.join(", ")))
+}
+
+/// What became of an order.
+#[derive(Debug)]
+pub struct Told {
+    /// Of every rig that was reached.
+    pub answers: Vec<Answer>,
+    /// Rigs that were not.
+    pub refused: Vec<String>,
+    /// Folders of other users, into which this one cannot look.
+    pub closed: Vec<PathBuf>,
+}
+
+impl Told {
+    /// True when every rig that was reached has done it, and one of them is this user's or a service's.
+    pub fn is_done(&self) -> bool {
+        self.answers.iter().all(|a| a.done) && self.answers.iter().any(|a| a.is_vouched_for)
+    }
+}
+
+/// Gives `order` to the rig in process `pid`; without it to the one of this user that runs. BLACK and SAFE go to all that this user may
+/// give orders to: going dark needs no choice.
+///
+/// # Errors
+/// No rig runs there; several do and `order` lets light through.
+pub fn tell(pid: Option<u32>, order: Order) -> Result<Told, ControlError> {
+    tell_in(&folders(), pid, order)
+}
+
+pub(super) fn tell_in(folders: &[PathBuf], pid: Option<u32>, order: Order) -> Result<Told, ControlError> {
+    let Search { rigs, refused, closed, looked } = search(folders);
+    let mut rigs: Vec<Place> =
+        rigs.into_iter().filter(|place| pid.is_none_or(|pid| pid == place.pid)).collect();
+    let none = || ControlError::NoRig { order, looked: looked.clone() };
+    if !order.is_dark() && pid.is_none() {
+        // Light is let through by name only where there is a choice; sockets of the dead are none.
+        rigs.retain(|place| connect(place).is_ok());
+        if rigs.len() > 1 {
+            return Err(ControlError::Several { ids: rigs.iter().map(|place| place.pid).collect() });
+        }
+    }
+    rigs.truncate(MAX_RIGS);
+    let (sender, answers) = channel();
+    let asked = rigs.len();
+    for (n, place) in rigs.iter().cloned().enumerate() {
+        let sender = sender.clone();
+        // One that hangs holds up none of the others.
+        let ask = move || {
+            let _ = sender.send((n, ask(&place, order)));
+        };
+        // Where no thread can be had, it is told below that nothing was delivered.
+        let _ = std::thread::Builder::new().name(format!("dpm-ask-{n}")).spawn(ask);
+    }
+    drop(sender);
+    let end = Instant::now() + ANSWERED_WITHIN + Duration::from_millis(200);
+    let mut told: Vec<Option<Option<Answer>>> = vec![None; asked];
+    while let Ok((n, answer)) = answers.recv_timeout(end.saturating_duration_since(Instant::now())) {
+        told[n] = Some(answer);
+    }
+    let answers: Vec<Answer> = rigs
+        .iter()
+        .zip(told)
+        .filter_map(|(place, answer)| {
+            answer.unwrap_or_else(|| {
+                // Its socket takes no connection: not even a signal can be sent, for nobody vouches for its process.
+                Some(Answer {
+                    pid: place.pid,
+                    uid: place.uid,
+                    rig: String::new(),
+                    text: format!("NOT delivered: it takes no connection; {}", by_hand(order, place.pid)),
+                    done: false,
+                    is_vouched_for: place.is_vouched_for,
+                })
+            })
+        })
+        .collect();
+    if answers.is_empty() && (refused.is_empty() || pid.is_some()) {
+        return Err(none());
+    }
+    Ok(Told { answers, refused, closed })
+}
+
+fn by_hand(order: Order, pid: u32) -> String {
+    match order {
+        Order::Black => format!(
+            "look at the light, then `kill -USR1 {pid}`, `kill -KILL {pid}` or the projector's own switch"
+        ),
+        Order::Safe => format!(
+            "look at the light, then `kill -USR2 {pid}`, `kill -KILL {pid}` or the projector's own switch"
+        ),
+        Order::Freeze | Order::Arm => "look at the light and say it again".into(),
+    }
+}
+
+/// Connects, and asks the kernel who listens there.
+fn connect(place: &Place) -> io::Result<(UnixStream, Peer)> {
+    let name = socket_name(place.pid);
+    let stream = UnixStream::connect(place.folder.path_to(&name)).inspect_err(|e| {
+        if e.kind() == io::ErrorKind::ConnectionRefused {
+            // Left by a process that was killed.
+            let _ = place.folder.remove(&name);
+            let _ = place.folder.remove(&super::state_name(place.pid));
+        }
+    })?;
+    let listener = peer(&stream)?;
+    check_listener(listener, place)?;
+    Ok((stream, listener))
+}
+
+/// Whoever may write to a folder could listen in it: only the folder's own user is believed.
+fn check_listener(listener: Peer, place: &Place) -> io::Result<()> {
+    if listener.uid == place.uid {
+        return Ok(());
+    }
+    let told = format!(
+        "the socket of process {} in a folder of {} is served by process {} of {}",
+        place.pid,
+        user_name(place.uid),
+        listener.pid,
+        user_name(listener.uid)
+    );
+    Err(io::Error::new(io::ErrorKind::PermissionDenied, told))
+}
+
+/// One rig's answer; `None` where no rig is.
+fn ask(place: &Place, order: Order) -> Option<Answer> {
+    let answer = |rig: String, text: String, done: bool| {
+        Some(Answer { pid: place.pid, uid: place.uid, rig, text, done, is_vouched_for: place.is_vouched_for })
+    };
+    let (begin, begin_ns) = (Instant::now(), monotonic_ns());
+    let (mut stream, listener) = match connect(place) {
+        Ok(found) => found,
+        Err(e) if matches!(e.kind(), io::ErrorKind::ConnectionRefused | io::ErrorKind::NotFound) => {
+            return None
+        }
+        Err(e) => {
+            return answer(String::new(), format!("NOT delivered: {e}; {}", by_hand(order, place.pid)), false)
+        }
+    };
+    let mut text = String::new();
+    let mut open = say(&mut stream, order).is_ok();
+    let signal = match order {
+        Order::Black => Some(libc::SIGUSR1),
+        Order::Safe => Some(libc::SIGUSR2),
+        Order::Freeze | Order::Arm => None,
+    };
+    let mut signalled: Option<io::Result<()>> = None;
+    let mut seen = None;
+    let rig = |text: &str| match text.lines().next().and_then(|l| l.strip_prefix(HEARD)) {
+        Some(rig) => rig.trim().to_owned(),
+        None => StatusFile::read(&place.folder, place.pid).map_or(String::new(), |said| said.rig),
+    };
+    while begin.elapsed() < ANSWERED_WITHIN {
+        if open {
+            open = more(&mut stream, &mut text);
+        } else {
+            std::thread::sleep(LOOK);
+        }
+        let mut lines = text.lines();
+        let first = lines.next().unwrap_or_default();
+        let is_heard = first.starts_with(HEARD);
+        let last = if is_heard { lines.next() } else { Some(first).filter(|l| !l.is_empty()) };
+        if let Some(last) = last.filter(|_| !open || text.ends_with('\n')) {
+            return answer(rig(&text), last.to_owned(), last.starts_with("ok:"));
+        }
+        if !is_heard && signalled.is_none() && (!open || begin.elapsed() >= HEARD_WITHIN) {
+            match signal {
+                // The kernel says that this process listens, and it does as long as the connection stands.
+                Some(signal) => signalled = Some(send_signal(listener.pid, signal)),
+                None if !open => break,
+                None => {}
+            }
+        }
+        // A word that was heard and a signal are obeyed without the thread that answers.
+        if signalled.is_some() || is_heard && !open {
+            let said = StatusFile::read(&place.folder, place.pid).ok();
+            if let Some(said) = said.filter(|s| s.at_ns > begin_ns && is_obeyed(order, s.health)) {
+                let how = match signalled {
+                    Some(_) => "by a signal, for its control thread does not answer",
+                    None => "as its state file says",
+                };
+                let kept = said.standing.filter(|standing| standing.strength() >= order.strength());
+                if let (Some(kept), true) = (kept, order.is_dark()) {
+                    let text = format!("ok: projector {} ({how}); {} is kept", said.health, kept.word());
+                    return answer(said.rig, text, true);
+                }
+                if !order.is_dark() {
+                    return answer(said.rig, format!("ok: projector {} ({how})", said.health), true);
+                }
+                seen = Some(format!("projector {} ({how}), but NOT kept over a restart", said.health));
+            }
+        }
+    }
+    if let Some(seen) = seen {
+        return answer(rig(&text), seen, false);
+    }
+    let what = match (&signalled, text.starts_with(HEARD)) {
+        (Some(Ok(())), _) => "delivered by a signal, NOT confirmed",
+        (_, true) => "delivered, NOT confirmed",
+        (Some(Err(_)), _) | (None, _) => "perhaps not delivered, NOT confirmed",
+    };
+    let why = match signalled {
+        Some(Err(e)) => format!(" (no signal could be sent: {e})"),
+        _ => String::new(),
+    };
+    answer(rig(&text), format!("{what}{why}; {}", by_hand(order, place.pid)), false)
+}
+
+fn say(stream: &mut UnixStream, order: Order) -> io::Result<()> {
+    stream.set_write_timeout(Some(HEARD_WITHIN))?;
+    stream.set_read_timeout(Some(LOOK))?;
+    // In one piece: whoever hears the word may hang up at once.
+    stream.write_all(format!("{}\n", order.word()).as_bytes())
+}
+
+/// Reads what has come, for [`LOOK`] at most. False when no more will come.
+fn more(stream: &mut UnixStream, text: &mut String) -> bool {
+    let mut bytes = [0u8; 512];
+    match stream.read(&mut bytes) {
+        Ok(0) => false,
+        Ok(n) => {
+            text.push_str(&String::from_utf8_lossy(&bytes[..n]));
+            text.len() < MAX_ANSWER
+        }
+        Err(e) => matches!(
+            e.kind(),
+            io::ErrorKind::WouldBlock | io::ErrorKind::TimedOut | io::ErrorKind::Interrupted
+        ),
+    }
+}
+
+#[cfg(test)]
+#[path = "client_tests.rs"]
+mod tests;

@@ -1,0 +1,386 @@
+//! Orders to the rig of this process: to the light first, then to the disk, so that they outlive the program.
+//!
+//! Whoever has an order (the control socket, a key) gives it here and goes on at once. A thread of its own writes it down, which may
+//! take as long as a disk takes, and gives ARM to the light only after what stood is forgotten. Orders that come as signals reach the
+//! light by themselves (see [`dpm_common::stopping`]); the thread only writes them down.
+
+use crate::standing::{By, OrderFile, Stands};
+use crate::telemetry::monitor::{Order, RunMonitor};
+use dpm_common::stopping;
+use std::path::PathBuf;
+use std::sync::{Arc, Condvar, Mutex, MutexGuard, PoisonError};
+use std::thread::JoinHandle;
+use std::time::Duration;
+
+/// How often it is looked for orders that came as signals.
+const LOOK: Duration = Duration::from_millis(20);
+/// How long the end of a run waits for a disk.
+const END_WITHIN: Duration = Duration::from_millis(500);
+
+/// Names an order that was given, to ask what became of it.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
+pub struct Ticket(u64);
+
+/// What the disk has of an order.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub enum Kept {
+    /// It stands over restarts, in this file.
+    In(PathBuf),
+    /// What stood is forgotten (after ARM).
+    Forgotten,
+    /// It does not stand over restarts, or (for ARM) what stood still does: why.
+    Not(String),
+    /// There is no state folder, which a rig whose projector is a mock may go without.
+    Nowhere,
+}
+
+#[derive(Debug)]
+struct Given {
+    number: u64,
+    order: Order,
+    by: By,
+    /// Orders that had come as signals when it was given.
+    signals: u32,
+    /// It changes what stands; otherwise what is on the disk already, with who ordered it, stays.
+    changes: bool,
+}
+
+#[derive(Debug, Default)]
+struct State {
+    /// Number of the newest order.
+    newest: u64,
+    /// The newest order, until the thread takes it.
+    waiting: Option<Given>,
+    /// Orders up to this number have been dealt with.
+    settled: u64,
+    outcome: Option<Kept>,
+    /// What stands now, whether it could be written down or not.
+    stands: Option<Order>,
+    /// The thread is to end.
+    closing: bool,
+    closed: bool,
+}
+
+#[derive(Debug)]
+struct Inner {
+    monitor: Arc<RunMonitor>,
+    file: OrderFile,
+    /// The folder can be written to.
+    keeps: bool,
+    state: Mutex<State>,
+    changed: Condvar,
+}
+
+/// See the module's documentation. Dropped without [`Orders::end`], what stands goes on standing.
+#[derive(Debug)]
+pub struct Orders {
+    inner: Arc<Inner>,
+    thread: Option<JoinHandle<()>>,
+}
+
+impl Orders {
+    /// Starts the thread. What `stands` is given to the light before this returns, so that a run that begins afterwards comes up dark.
+    /// `keeps` says that the file can be written.
+    ///
+    /// # Errors
+    /// The thread cannot be started.
+    pub fn start(
+        monitor: Arc<RunMonitor>,
+        file: OrderFile,
+        keeps: bool,
+        stands: Option<&Stands>,
+    ) -> std::io::Result<Self> {
+        let stands = stands.map(|s| s.order);
+        stands.into_iter().for_each(|order| monitor.give_order(order));
+        let state =
+            Mutex::new(State { stands, outcome: stands.map(|_| Kept::In(file.path())), ..State::default() });
+        let inner = Arc::new(Inner { monitor, file, keeps, state, changed: Condvar::new() });
+        let thread = std::thread::Builder::new().name("dpm-orders".into()).spawn({
+            let inner = inner.clone();
+            move || inner.write_down()
+        })?;
+        Ok(Self { inner, thread: Some(thread) })
+    }
+
+    /// Gives an order: to the light at once (ARM when nothing stands on the disk any more), then to the disk. Never waits for a disk.
+    pub fn give(&self, order: Order, by: By) -> Ticket {
+        let mut state = self.inner.state();
+        self.inner.absorb(&mut state);
+        let ticket = self.inner.give(&mut state, order, by);
+        self.inner.changed.notify_all();
+        ticket
+    }
+
+    /// What the disk has of the order; `None` while that is being settled. Of orders that were given in quick succession the newest
+    /// one's answer stands for all.
+    pub fn outcome(&self, ticket: Ticket) -> Option<Kept> {
+        let state = self.inner.state();
+        state.outcome.clone().filter(|_| state.settled >= ticket.0)
+    }
+
+    /// What stands now.
+    pub fn standing(&self) -> Option<Order> {
+        self.inner.state().stands
+    }
+
+    /// What stands now, once it stands over restarts too (or the rig goes without that, as a mock may).
+    pub fn kept(&self) -> Option<Order> {
+        let state = self.inner.state();
+        let is_kept = matches!(state.outcome, Some(Kept::In(_) | Kept::Nowhere));
+        state.stands.filter(|_| is_kept && state.settled == state.newest)
+    }
+
+    /// Ends the thread, waiting half a second at most. After an orderly end BLACK and FREEZE are forgotten, SAFE goes on standing.
+    pub fn end(mut self, orderly: bool) {
+        let mut state = self.inner.state();
+        self.inner.absorb(&mut state);
+        if orderly && matches!(state.stands, Some(Order::Black | Order::Freeze)) {
+            // Nothing is armed by it: the run is over, and a monitor that was asked to stop lets no ARM through.
+            self.inner.monitor.request_stop();
+            self.inner.give(&mut state, Order::Arm, By::Signal);
+        }
+        state.closing = true;
+        self.inner.changed.notify_all();
+        let waited = self.inner.changed.wait_timeout_while(state, END_WITHIN, |state| !state.closed);
+        let closed = waited.map_or_else(|e| e.into_inner().0.closed, |(state, _)| state.closed);
+        if let Some(thread) = self.thread.take().filter(|_| closed) {
+            let _ = thread.join();
+        }
+    }
+}
+
+impl Drop for Orders {
+    fn drop(&mut self) {
+        self.inner.state().closing = true;
+        self.inner.changed.notify_all();
+    }
+}
+
+impl Inner {
+    fn state(&self) -> MutexGuard<'_, State> {
+        // Nothing in here panics while it holds the lock; and an order must get through even so.
+        self.state.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+
+    fn give(&self, state: &mut State, order: Order, by: By) -> Ticket {
+        state.newest += 1;
+        if order != Order::Arm {
+            self.monitor.give_order(order);
+        }
+        self.queue(state, order, by)
+    }
+
+    /// For the disk. A stronger order that stands, or waits to be written, is not replaced by a weaker one.
+    fn queue(&self, state: &mut State, order: Order, by: By) -> Ticket {
+        let number = state.newest;
+        let standing = state.stands.filter(|s| order != Order::Arm && s.strength() > order.strength());
+        state.stands = if order == Order::Arm { state.stands } else { standing.or(Some(order)) };
+        match &mut state.waiting {
+            // What waits is written down in its place: the same file, the same answer.
+            Some(waiting) if standing.is_some() && waiting.order != Order::Arm => waiting.number = number,
+            waiting => {
+                let (order, changes) = standing.map_or((order, true), |standing| (standing, false));
+                *waiting = Some(Given { number, order, by, signals: stopping::orders(), changes });
+            }
+        }
+        Ticket(number)
+    }
+
+    /// Orders that came to the light by themselves are written down like the others.
+    fn absorb(&self, state: &mut State) {
+        let order = match stopping::take_order_to_keep() {
+            0 => None,
+            stopping::BLACK => Some(Order::Black),
+            _ => Some(Order::Safe),
+        };
+        if let Some(order) = order {
+            state.newest += 1;
+            self.queue(state, order, By::Signal);
+        }
+        if self.monitor.take_found_safe() && state.stands != Some(Order::Safe) {
+            state.newest += 1;
+            self.queue(state, Order::Safe, By::Projector);
+        }
+    }
+
+    fn write_down(&self) {
+        let mut state = self.state();
+        loop {
+            self.absorb(&mut state);
+            let Some(given) = state.waiting.take() else {
+                if state.closing {
+                    break;
+                }
+                let waited = self.changed.wait_timeout(state, LOOK);
+                state = waited.unwrap_or_else(PoisonError::into_inner).0;
+                continue;
+            };
+            let before = state.outcome.take();
+            drop(state);
+            let outcome = match before {
+                Some(kept @ Kept::In(_)) if !given.changes => kept,
+                _ => self.settle(&given),
+            };
+            state = self.state();
+            self.absorb(&mut state);
+            if given.order == Order::Arm && !matches!(outcome, Kept::Not(_)) {
+                // An order that came while the disk was at it is newer than this one.
+                if state.newest == given.number {
+                    state.stands = None;
+                    self.monitor.arm_unless_darkened(given.signals);
+                }
+            }
+            // What has come meanwhile is answered when it is settled itself.
+            state.settled = given.number;
+            state.outcome = Some(outcome);
+            self.changed.notify_all();
+        }
+        state.closed = true;
+        self.changed.notify_all();
+    }
+
+    fn settle(&self, given: &Given) -> Kept {
+        if !self.keeps {
+            return Kept::Nowhere;
+        }
+        let done = match given.order {
+            Order::Arm => self.file.forget().map(|()| Kept::Forgotten),
+            order => self.file.keep(order, given.by).map(Kept::In),
+        };
+        done.unwrap_or_else(|e| Kept::Not(e.to_string()))
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::config::{MockProjectorConfig, ProjectorBackend};
+    use crate::standing::{standing_in, Identity};
+    use std::time::Instant;
+
+    struct Rig {
+        dir: PathBuf,
+        identity: Identity,
+        monitor: Arc<RunMonitor>,
+    }
+
+    impl Rig {
+        fn new(name: &str) -> Self {
+            let dir = std::env::temp_dir().join(format!("dpm-order-thread-{}-{name}", std::process::id()));
+            let _ = std::fs::remove_dir_all(&dir);
+            let identity = Identity::of(&ProjectorBackend::Mock(MockProjectorConfig::default()));
+            Self { dir, identity, monitor: Arc::default() }
+        }
+
+        fn start(&self) -> Orders {
+            let (file, error, stands) = OrderFile::open(Some(self.dir.clone()), self.identity.clone());
+            assert!(error.is_none(), "{error:?}");
+            Orders::start(self.monitor.clone(), file, true, stands.as_ref()).unwrap()
+        }
+
+        fn on_disk(&self) -> Option<Order> {
+            standing_in(&self.dir, &self.identity).map(|s| s.order)
+        }
+    }
+
+    impl Drop for Rig {
+        fn drop(&mut self) {
+            let _ = std::fs::remove_dir_all(&self.dir);
+        }
+    }
+
+    fn settled(orders: &Orders, ticket: Ticket) -> Kept {
+        let begin = Instant::now();
+        loop {
+            if let Some(kept) = orders.outcome(ticket) {
+                return kept;
+            }
+            assert!(begin.elapsed() < Duration::from_secs(20), "never settled");
+            std::thread::sleep(Duration::from_millis(1));
+        }
+    }
+
+    /// Found in use, R4.
+    #[test]
+    fn r4_the_light_hears_first_and_arm_comes_after_the_disk_has_forgotten() {
+        let rig = Rig::new("first");
+        let orders = rig.start();
+        assert_eq!(rig.monitor.take_order(), None);
+        let ticket = orders.give(Order::Safe, By::Key);
+        // The light has it before the disk can have.
+        assert_eq!(rig.monitor.take_order(), Some(Order::Safe));
+        let Kept::In(path) = settled(&orders, ticket) else { panic!("not kept") };
+        assert!(path.starts_with(&rig.dir));
+        // A weaker order does not replace it, on the disk or in memory.
+        let ticket = orders.give(Order::Freeze, By::Key);
+        assert!(matches!(settled(&orders, ticket), Kept::In(_)));
+        assert_eq!((rig.on_disk(), orders.standing()), (Some(Order::Safe), Some(Order::Safe)));
+        let _ = rig.monitor.take_order();
+        let ticket = orders.give(Order::Arm, By::Key);
+        assert_eq!(settled(&orders, ticket), Kept::Forgotten);
+        assert_eq!((rig.on_disk(), rig.monitor.take_order()), (None, Some(Order::Arm)));
+        orders.end(true);
+    }
+
+    #[test]
+    fn r4_an_orderly_end_forgets_black_but_not_safe_and_a_run_that_died_forgets_nothing() {
+        let mut rig = Rig::new("end");
+        for (order, orderly, left) in [
+            (Order::Black, true, None),
+            (Order::Freeze, true, None),
+            (Order::Safe, true, Some(Order::Safe)),
+            (Order::Arm, true, None),
+            (Order::Black, false, Some(Order::Black)),
+            (Order::Arm, false, None),
+            (Order::Freeze, false, Some(Order::Black)),
+            (Order::Safe, false, Some(Order::Safe)),
+        ] {
+            // The monitor of a run that is over stays stopped.
+            rig.monitor = Arc::default();
+            let orders = rig.start();
+            // What stood has been given to the light.
+            assert_eq!(rig.monitor.dark_is_ordered(), rig.on_disk().is_some());
+            let ticket = orders.give(order, By::Key);
+            settled(&orders, ticket);
+            orders.end(orderly);
+            assert_eq!(rig.on_disk(), left, "{order:?} {orderly}");
+        }
+    }
+
+    #[test]
+    fn a_dark_order_that_follows_an_arm_at_once_wins() {
+        let rig = Rig::new("race");
+        let orders = rig.start();
+        for _ in 0..50 {
+            orders.give(Order::Safe, By::Key);
+            orders.give(Order::Arm, By::Key);
+            let ticket = orders.give(Order::Safe, By::Key);
+            assert!(matches!(settled(&orders, ticket), Kept::In(_)));
+            assert_eq!(rig.on_disk(), Some(Order::Safe));
+            assert_eq!(rig.monitor.take_order(), Some(Order::Safe));
+            assert_eq!(rig.monitor.take_order(), None, "the ARM before it is not taken after it");
+        }
+        orders.end(true);
+    }
+
+    #[test]
+    fn an_order_that_cannot_be_kept_is_obeyed_and_an_arm_that_cannot_forget_is_not() {
+        let rig = Rig::new("broken");
+        let orders = rig.start();
+        let ticket = orders.give(Order::Safe, By::Key);
+        settled(&orders, ticket);
+        let _ = rig.monitor.take_order();
+        // Something in its place that no rename replaces and no unlink removes.
+        let path = rig.dir.join(rig.identity.order_name());
+        std::fs::remove_file(&path).unwrap();
+        std::fs::create_dir(&path).unwrap();
+        std::fs::write(path.join("x"), b"").unwrap();
+        let ticket = orders.give(Order::Safe, By::Key);
+        assert_eq!(rig.monitor.take_order(), Some(Order::Safe));
+        assert!(matches!(settled(&orders, ticket), Kept::Not(why) if why.contains("mock-projector")));
+        let ticket = orders.give(Order::Arm, By::Key);
+        assert!(matches!(settled(&orders, ticket), Kept::Not(_)));
+        assert_eq!(rig.monitor.take_order(), None);
+        orders.end(true);
+    }
+}

@@ -1,0 +1,282 @@
+//! The rig's end of the control socket: one thread that waits for no client.
+
+use super::orders::{Kept, Orders, Ticket};
+use super::{is_obeyed, rig_name, socket_name, HEARD, MAX_WORD};
+use crate::standing::By;
+use crate::telemetry::monitor::{Order, RunMonitor};
+use dpm_common::folder::{Folder, FolderError};
+use dpm_common::unix::{peer, user, wait_readable};
+use std::collections::VecDeque;
+use std::io::{self, Read, Write};
+use std::os::fd::AsRawFd;
+use std::os::unix::fs::PermissionsExt;
+use std::os::unix::net::{UnixListener, UnixStream};
+use std::path::PathBuf;
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::sync::Arc;
+use std::thread::JoinHandle;
+use std::time::{Duration, Instant};
+
+/// A client that has not said its word by then is cut off.
+const PATIENCE: Duration = Duration::from_millis(200);
+/// How long an answer waits for the projector to obey.
+const OBEYED_WITHIN: Duration = Duration::from_millis(500);
+/// How long an answer waits for the disk.
+const KEPT_WITHIN: Duration = Duration::from_millis(1000);
+/// Most clients at a time. One more, and the oldest that has said nothing is cut off.
+const CLIENTS: usize = 64;
+/// Clients taken in before it is looked at what they say.
+const AT_ONCE: usize = 16;
+/// How often it is looked whether the projector has obeyed.
+const LOOK_MS: i32 = 1;
+
+/// Listens for orders until it is dropped.
+#[derive(Debug)]
+pub struct ControlSocket {
+    folder: Arc<Folder>,
+    name: String,
+    stop: Arc<AtomicBool>,
+    thread: Option<JoinHandle<()>>,
+}
+
+impl ControlSocket {
+    /// Listens in `folder` under this process's number. Only this user and root may give orders.
+    ///
+    /// # Errors
+    /// The socket cannot be made there.
+    pub fn serve(
+        folder: Arc<Folder>,
+        monitor: Arc<RunMonitor>,
+        orders: Arc<Orders>,
+    ) -> Result<Self, FolderError> {
+        let name = socket_name(std::process::id());
+        let failed = |source| FolderError::Io { path: folder.path().join(&name), source };
+        // Left by a process of the same number that was killed.
+        folder.remove(&name)?;
+        let path = folder.path_to(&name);
+        let listener = UnixListener::bind(&path).map_err(failed)?;
+        std::fs::set_permissions(&path, std::fs::Permissions::from_mode(0o600)).map_err(failed)?;
+        listener.set_nonblocking(true).map_err(failed)?;
+        let stop = Arc::new(AtomicBool::new(false));
+        let mut desk = Desk { listener, monitor, orders, clients: VecDeque::new(), stop: stop.clone() };
+        let thread = std::thread::Builder::new()
+            .name("dpm-control".into())
+            .spawn(move || desk.run())
+            .map_err(failed)?;
+        Ok(Self { folder, name, stop, thread: Some(thread) })
+    }
+
+    /// Path of the socket, for messages.
+    pub fn path(&self) -> PathBuf {
+        self.folder.path().join(&self.name)
+    }
+}
+
+impl Drop for ControlSocket {
+    fn drop(&mut self) {
+        self.stop.store(true, Ordering::Relaxed);
+        // Wakes the thread. Where that fails it ends with the process.
+        let woken = UnixStream::connect(self.folder.path_to(&self.name)).is_ok();
+        let _ = self.folder.remove(&self.name);
+        if let Some(thread) = self.thread.take().filter(|_| woken) {
+            let _ = thread.join();
+        }
+    }
+}
+
+/// A client, and how far it has come.
+struct Client {
+    stream: UnixStream,
+    since: Instant,
+    uid: u32,
+    word: Vec<u8>,
+    /// Its order, once it has said it.
+    given: Option<(Order, Ticket)>,
+}
+
+struct Desk {
+    listener: UnixListener,
+    monitor: Arc<RunMonitor>,
+    orders: Arc<Orders>,
+    /// Oldest first; never more than [`CLIENTS`].
+    clients: VecDeque<Client>,
+    stop: Arc<AtomicBool>,
+}
+
+impl Desk {
+    fn run(&mut self) {
+        let mut ready = Vec::new();
+        while !self.stop.load(Ordering::Relaxed) {
+            let waits = self.clients.iter().any(|c| c.given.is_some());
+            let limit = if waits { LOOK_MS } else { PATIENCE.as_millis() as i32 / 4 };
+            let mut watched = vec![self.listener.as_raw_fd()];
+            watched.extend(self.clients.iter().filter(|c| c.given.is_none()).map(|c| c.stream.as_raw_fd()));
+            if wait_readable(&watched, limit, &mut ready).is_err() {
+                // Out of memory, for example: not in a tight loop.
+                std::thread::sleep(Duration::from_millis(10));
+            }
+            self.listen();
+            loop {
+                // Whoever connects is heard before the next one is taken in, so that no flood of silent clients pushes out one that speaks.
+                let all_taken = self.take_in();
+                self.listen();
+                if all_taken || self.stop.load(Ordering::Relaxed) {
+                    break;
+                }
+            }
+            self.answer();
+        }
+    }
+
+    /// Takes in a few of the clients that wait; true when none is left.
+    fn take_in(&mut self) -> bool {
+        for _ in 0..AT_ONCE {
+            let stream = match self.listener.accept() {
+                Ok((stream, _)) => stream,
+                Err(e) if e.kind() == io::ErrorKind::ConnectionAborted => continue,
+                // None is left, or none can be taken for want of descriptors: the oldest silent one makes room.
+                Err(e) => {
+                    if e.kind() != io::ErrorKind::WouldBlock {
+                        self.cut_off_the_oldest();
+                    }
+                    return true;
+                }
+            };
+            let Some(uid) = peer(&stream).ok().map(|peer| peer.uid) else { continue };
+            if stream.set_nonblocking(true).is_err() {
+                continue;
+            }
+            if !may_give_orders(uid, user()) {
+                let _ = (&stream).write_all(b"refused: this rig belongs to another user\n");
+                continue;
+            }
+            if self.clients.len() >= CLIENTS {
+                self.cut_off_the_oldest();
+            }
+            self.clients.push_back(Client {
+                stream,
+                since: Instant::now(),
+                uid,
+                word: Vec::new(),
+                given: None,
+            });
+        }
+        false
+    }
+
+    fn cut_off_the_oldest(&mut self) {
+        let silent = self.clients.iter().position(|c| c.given.is_none());
+        // Where all wait for an answer, the orders of all have been given: the oldest one's client will see that nothing more comes.
+        self.clients.remove(silent.unwrap_or(0));
+    }
+
+    /// Reads what clients have said, and gives their orders.
+    fn listen(&mut self) {
+        let Self { clients, orders, .. } = self;
+        clients.retain_mut(|client| {
+            if client.given.is_some() {
+                return true;
+            }
+            match client.read_word() {
+                Ok(None) => client.since.elapsed() < PATIENCE,
+                Ok(Some(order)) => {
+                    let by = By::Socket { uid: client.uid };
+                    client.given = Some((order, orders.give(order, by)));
+                    // A client that has hung up has given its order all the same.
+                    let _ = writeln!(client.stream, "{HEARD} {}", rig_name());
+                    true
+                }
+                Err(_) => false,
+            }
+        });
+    }
+
+    fn answer(&mut self) {
+        let Self { clients, orders, monitor, .. } = self;
+        clients.retain_mut(|client| {
+            let Some((order, ticket)) = client.given else { return true };
+            let Some(text) = answer_to(order, ticket, client.since.elapsed(), monitor, orders) else {
+                return true;
+            };
+            let _ = writeln!(client.stream, "{text}");
+            false
+        });
+    }
+}
+
+/// The last line for an order that was given `ago`; `None` while there is hope for a better one.
+fn answer_to(
+    order: Order,
+    ticket: Ticket,
+    ago: Duration,
+    monitor: &RunMonitor,
+    orders: &Orders,
+) -> Option<String> {
+    let health = monitor.projector();
+    let is_done = is_obeyed(order, health);
+    let kept = orders.outcome(ticket);
+    if let (Order::Arm, Some(Kept::Not(why))) = (order, &kept) {
+        return Some(format!("not armed: what stands cannot be forgotten: {why}; projector {health}"));
+    }
+    let hope = if is_done { kept.is_none() && ago < KEPT_WITHIN } else { ago < OBEYED_WITHIN };
+    if hope {
+        return None;
+    }
+    let done = match (is_done, order) {
+        (true, _) => "ok",
+        // The link repeats it until the projector confirms.
+        (false, _) => "not yet",
+    };
+    let on_disk = match kept {
+        Some(Kept::In(path)) => format!("; kept in {}", path.display()),
+        Some(Kept::Forgotten) => String::new(),
+        Some(Kept::Nowhere) if order == Order::Arm => String::new(),
+        Some(Kept::Nowhere) => "; not kept over a restart (a mock without a state folder)".into(),
+        Some(Kept::Not(why)) => {
+            return Some(format!("{done}, but NOT kept over a restart: {why}; projector {health}"))
+        }
+        None => {
+            return Some(format!(
+                "{done}, but NOT kept over a restart yet: the disk is slow; projector {health}"
+            ))
+        }
+    };
+    Some(format!("{done}: projector {health}{on_disk}"))
+}
+
+/// Whether user `client` may give orders to a rig of user `me`.
+fn may_give_orders(client: u32, me: u32) -> bool {
+    client == me || client == 0
+}
+
+impl Client {
+    /// The order, once the word is complete.
+    ///
+    /// # Errors
+    /// It hung up, or said something else (which it is told).
+    fn read_word(&mut self) -> io::Result<Option<Order>> {
+        let mut bytes = [0u8; MAX_WORD];
+        while self.word.len() < MAX_WORD && !self.word.contains(&b'\n') {
+            let room = MAX_WORD - self.word.len();
+            match self.stream.read(&mut bytes[..room]) {
+                Ok(0) if self.word.is_empty() => return Err(io::ErrorKind::UnexpectedEof.into()),
+                Ok(0) => break,
+                Ok(n) => self.word.extend_from_slice(&bytes[..n]),
+                Err(e) if e.kind() == io::ErrorKind::WouldBlock => return Ok(None),
+                Err(e) if e.kind() == io::ErrorKind::Interrupted => {}
+                Err(e) => return Err(e),
+            }
+        }
+        let word = std::str::from_utf8(&self.word).ok().and_then(|w| Order::from_word(w.trim_end()));
+        if word.is_none() {
+            let known: Vec<_> = Order::ALL.iter().map(|(_, word)| *word).collect();
+            let _ = writeln!(self.stream, "unknown word; known: {}", known.join(", "));
+            return Err(io::ErrorKind::InvalidData.into());
+        }
+        Ok(word)
+    }
+}
+
+#[cfg(test)]
+#[path = "server_tests.rs"]
+mod tests;

@@ -1,0 +1,151 @@
+use super::*;
+use crate::config::{MockProjectorConfig, ProjectorBackend};
+use crate::control::client;
+use crate::standing::{Identity, OrderFile};
+use crate::telemetry::monitor::ProjectorHealth;
+use dpm_common::folder::Owner;
+use dpm_device::link::faults;
+
+/// Obeys like a link thread.
+fn link(monitor: &Arc<RunMonitor>, stop: &Arc<AtomicBool>) -> JoinHandle<()> {
+    let (monitor, stop) = (monitor.clone(), stop.clone());
+    std::thread::spawn(move || {
+        while !stop.load(Ordering::Relaxed) {
+            let health = match monitor.take_order() {
+                Some(Order::Black) => ProjectorHealth::Black,
+                Some(Order::Freeze) => ProjectorHealth::Frozen,
+                Some(Order::Safe) => ProjectorHealth::Faulted(faults::HOST_SAFE),
+                Some(Order::Arm) => ProjectorHealth::Up,
+                None => {
+                    std::thread::sleep(Duration::from_micros(200));
+                    continue;
+                }
+            };
+            monitor.set_projector(health);
+        }
+    })
+}
+
+/// A rig that listens, and somebody who obeys.
+struct Rig {
+    dir: PathBuf,
+    monitor: Arc<RunMonitor>,
+    socket: Option<ControlSocket>,
+    obeys: Arc<AtomicBool>,
+    thread: Option<JoinHandle<()>>,
+}
+
+impl Rig {
+    fn new(name: &str) -> Self {
+        let dir = std::env::temp_dir().join(format!("dpm-control-{}-{name}", std::process::id()));
+        let _ = std::fs::remove_dir_all(&dir);
+        let identity = Identity::of(&ProjectorBackend::Mock(MockProjectorConfig::default()));
+        let (file, error, _) = OrderFile::open(Some(dir.join("state")), identity);
+        assert!(error.is_none(), "{error:?}");
+        let monitor = Arc::new(RunMonitor::default());
+        let orders = Arc::new(Orders::start(monitor.clone(), file, true, None).unwrap());
+        let folder = Arc::new(Folder::make(&dir.join("run"), Owner::Own).unwrap());
+        let socket = ControlSocket::serve(folder, monitor.clone(), orders).unwrap();
+        let obeys = Arc::new(AtomicBool::new(false));
+        let thread = link(&monitor, &obeys);
+        Self { dir, monitor, socket: Some(socket), obeys, thread: Some(thread) }
+    }
+
+    fn socket(&self) -> PathBuf {
+        self.socket.as_ref().unwrap().path()
+    }
+
+    fn tell(&self, order: Order) -> Result<client::Told, client::ControlError> {
+        client::tell_in(&[self.dir.join("run")], None, order)
+    }
+
+    /// Nobody obeys any more.
+    fn stop_link(&mut self) {
+        self.obeys.store(true, Ordering::Relaxed);
+        if let Some(thread) = self.thread.take() {
+            thread.join().unwrap();
+        }
+    }
+}
+
+impl Drop for Rig {
+    fn drop(&mut self) {
+        self.stop_link();
+        self.socket = None;
+        let _ = std::fs::remove_dir_all(&self.dir);
+    }
+}
+
+#[test]
+fn every_order_is_obeyed_and_bad_clients_cost_nothing() {
+    let mut rig = Rig::new("orders");
+    assert_eq!(std::fs::metadata(rig.socket()).unwrap().permissions().mode() & 0o777, 0o600);
+    // One that says nothing, one that never ends, one that talks nonsense.
+    let mut silent = UnixStream::connect(rig.socket()).unwrap();
+    let mut endless = UnixStream::connect(rig.socket()).unwrap();
+    let _ = endless.write_all(&[b'x'; 4096]);
+    let mut nonsense = UnixStream::connect(rig.socket()).unwrap();
+    nonsense.write_all(b"light!\n").unwrap();
+    for (order, word) in Order::ALL {
+        // A FREEZE is none while it is black.
+        if order == Order::Freeze {
+            assert!(rig.tell(Order::Arm).unwrap().is_done());
+        }
+        let told = rig.tell(order).unwrap();
+        assert!(told.is_done() && told.answers.len() == 1, "{word}: {told:?}");
+        assert_eq!((told.answers[0].pid, told.answers[0].uid), (std::process::id(), user()));
+        // Another test of this process may have read a rig file by now.
+        let names = ["built-in demo", crate::control::rig_name()];
+        assert!(names.contains(&&*told.answers[0].rig), "{told:?}");
+        assert_eq!(told.answers[0].text.contains("; kept in "), order != Order::Arm, "{told:?}");
+        assert!(super::is_obeyed(order, rig.monitor.projector()));
+    }
+    let mut told = String::new();
+    nonsense.read_to_string(&mut told).unwrap();
+    assert!(told.contains("known: black, freeze, safe, arm"), "{told}");
+    silent.set_read_timeout(Some(Duration::from_secs(5))).unwrap();
+    assert_eq!(silent.read(&mut [0; 8]).unwrap(), 0, "cut off");
+    // A projector that does not obey: the answer says so.
+    rig.stop_link();
+    rig.monitor.set_projector(ProjectorHealth::Lost);
+    for order in [Order::Black, Order::Arm] {
+        let told = rig.tell(order).unwrap();
+        assert!(!told.is_done() && told.answers[0].text.contains("not yet: projector lost"), "{told:?}");
+    }
+    rig.socket = None;
+    let gone = rig.tell(Order::Arm).unwrap_err().to_string();
+    assert!(gone.contains("no running rig listens") && gone.contains("nothing was armed"), "{gone}");
+    assert!(rig.tell(Order::Black).unwrap_err().to_string().contains("no light was darkened"));
+}
+
+/// Found in use, R9: a thousand clients that say nothing held `dpm safe` up for ever.
+#[test]
+fn r9_a_thousand_silent_clients_hold_no_order_up() {
+    let rig = Rig::new("flood");
+    let mut flood = Vec::new();
+    for _ in 0..500 {
+        // Descriptors of this process, and of the other end in it, may be few.
+        match UnixStream::connect(rig.socket()) {
+            Ok(stream) => flood.push(stream),
+            Err(_) => break,
+        }
+        if flood.len() == 400 {
+            flood.drain(..300);
+        }
+    }
+    for order in [Order::Black, Order::Arm, Order::Safe] {
+        let begin = Instant::now();
+        let told = rig.tell(order).unwrap();
+        assert!(told.is_done(), "{told:?}");
+        assert!(begin.elapsed() < Duration::from_millis(1500), "{:?}", begin.elapsed());
+        // More of them, of which those before are the oldest.
+        flood.extend((0..100).map_while(|_| UnixStream::connect(rig.socket()).ok()));
+    }
+}
+
+#[test]
+fn only_the_rigs_user_and_root_may_give_orders() {
+    for (client, me, may) in [(0, 0, true), (7, 7, true), (0, 7, true), (7, 0, false), (7, 8, false)] {
+        assert_eq!(may_give_orders(client, me), may, "{client} {me}");
+    }
+}

@@ -1,0 +1,121 @@
+//! Why a command ends: a kind that the caller can act on, its exit code, and a message for the operator.
+
+use std::fmt;
+
+/// What an operator can do about a failure.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum FailureKind {
+    /// The command ran and what it checks does not hold.
+    CheckFailed,
+    /// A file, flag or setting is wrong.
+    BadInput,
+    /// A projector, tracker or the operating system refused.
+    Device,
+    /// No usable Vulkan device.
+    NoGpu,
+}
+
+impl FailureKind {
+    /// The process's exit code: 1 check failed, 2 usage or bad input, 3 device, 4 no GPU. (0 is success.)
+    pub const fn exit_code(self) -> u8 {
+        match self {
+            Self::CheckFailed => 1,
+            Self::BadInput => 2,
+            Self::Device => 3,
+            Self::NoGpu => 4,
+        }
+    }
+}
+
+/// The end of a command that did not do what it was asked to.
+#[derive(Debug)]
+pub struct Failure {
+    /// What can be done about it.
+    pub kind: FailureKind,
+    /// What failed, on which object, and the next step; may have several lines.
+    pub message: String,
+}
+
+impl Failure {
+    /// A failure of `kind`.
+    pub fn new(kind: FailureKind, message: impl fmt::Display) -> Self {
+        Self { kind, message: message.to_string() }
+    }
+}
+
+impl fmt::Display for Failure {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.write_str(&self.message)
+    }
+}
+
+impl std::error::Error for Failure {}
+
+/// The end of a command that has something to report, whether or not it did what it was asked to.
+#[derive(Debug)]
+pub struct Ended<T> {
+    /// What it found. It is printed in any case.
+    pub report: T,
+    /// Why the command fails all the same: a check that does not hold, a file that could not be written.
+    pub failure: Option<Failure>,
+}
+
+impl<T> Ended<T> {
+    /// `failure` joins those that there are: the first one gives the kind, all give their messages.
+    pub fn fail(&mut self, failure: Failure) {
+        match &mut self.failure {
+            Some(first) => {
+                first.message.push('\n');
+                first.message += &failure.message;
+            }
+            none => *none = Some(failure),
+        }
+    }
+
+    /// Keeps what `result` holds; its failure joins those that there are.
+    pub fn keep<R>(&mut self, result: Result<R, Failure>) -> Option<R> {
+        result.map_err(|e| self.fail(e)).ok()
+    }
+}
+
+impl<T> From<T> for Ended<T> {
+    fn from(report: T) -> Self {
+        Self { report, failure: None }
+    }
+}
+
+impl From<crate::config::ConfigErrors> for Failure {
+    fn from(errors: crate::config::ConfigErrors) -> Self {
+        Self::new(FailureKind::BadInput, errors)
+    }
+}
+
+impl From<dpm_device::dlpc900::driver::Dlpc900Error> for Failure {
+    fn from(e: dpm_device::dlpc900::driver::Dlpc900Error) -> Self {
+        use dpm_device::dlpc900::driver::Dlpc900Error;
+        let kind = match e {
+            Dlpc900Error::Sequence(_) => FailureKind::BadInput,
+            _ => FailureKind::Device,
+        };
+        Self::new(kind, e)
+    }
+}
+
+impl From<dpm_device::tracker::record::RecordError> for Failure {
+    fn from(e: dpm_device::tracker::record::RecordError) -> Self {
+        use dpm_device::tracker::record::RecordError;
+        use std::io::ErrorKind as K;
+        let RecordError::Io { source, .. } = &e else { return Self::new(FailureKind::BadInput, e) };
+        match source.kind() {
+            K::AlreadyExists => Self::new(
+                FailureKind::BadInput,
+                format!("{e}; recordings are not overwritten: choose another name"),
+            ),
+            K::NotFound | K::PermissionDenied | K::IsADirectory | K::NotADirectory => Self::new(
+                FailureKind::BadInput,
+                format!("{e}; choose a folder that is there and may be written to"),
+            ),
+            _ => Self::new(FailureKind::Device, e),
+        }
+    }
+}

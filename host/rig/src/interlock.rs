@@ -1,0 +1,189 @@
+//! Somebody else's word that there may be light: a process that lives, a contact that is closed, a key that is held down.
+//!
+//! A thread of its own asks every few milliseconds and notes when it last heard "yes". Whoever makes light asks [`Interlock::is_closed`], one
+//! atomic read and the clock: a "no", and equally a thread that hangs, fails or ends, is an open interlock. Open means BLACK at once;
+//! closed again means light again where the operator did not order otherwise. docs/SAFETY.md says what it is good for.
+
+mod contacts;
+
+use crate::config::InterlockConfig;
+use crate::failure::{Failure, FailureKind};
+use dpm_common::clock::{Clock, MonotonicClock};
+use std::sync::atomic::{AtomicBool, AtomicI64, Ordering};
+use std::sync::Arc;
+use std::thread::JoinHandle;
+use std::time::Duration;
+
+/// How often the contact is asked.
+const ASK_EVERY: Duration = Duration::from_millis(5);
+/// A "yes" older than this is none: the thread that asks has fallen silent.
+pub const SILENCE_NS: i64 = 100_000_000;
+/// Before any instant of the clock.
+const NEVER: i64 = i64::MIN / 2;
+
+/// What decides whether there may be light.
+pub trait Contact: Send {
+    /// True while there may be. Errors and doubts are `false`. Should return within milliseconds; light is off after [`SILENCE_NS`] otherwise.
+    fn is_closed(&mut self) -> bool;
+}
+
+/// What the asking thread and everybody else share.
+#[derive(Debug)]
+struct Shared {
+    clock: MonotonicClock,
+    /// When the contact was found closed last; [`NEVER`] since it was found open.
+    closed_at: AtomicI64,
+    keys: HeldKey,
+    stop: AtomicBool,
+}
+
+/// A key of a terminal, which repeats while it is held.
+#[derive(Debug)]
+struct HeldKey {
+    /// When it came last.
+    at: AtomicI64,
+    /// It came at least twice, each time soon after the time before.
+    repeats: AtomicBool,
+    release_ns: i64,
+}
+
+impl HeldKey {
+    fn pressed(&self, now: i64) {
+        let before = self.at.swap(now, Ordering::AcqRel);
+        self.repeats.store(now - before <= self.release_ns, Ordering::Release);
+    }
+
+    fn is_held(&self, now: i64) -> bool {
+        self.repeats.load(Ordering::Acquire) && now - self.at.load(Ordering::Acquire) <= self.release_ns
+    }
+}
+
+/// An interlock and the thread that asks its contact, until it is dropped.
+#[derive(Debug)]
+pub struct Interlock {
+    shared: Arc<Shared>,
+    key: Option<u8>,
+    what: String,
+    thread: Option<JoinHandle<()>>,
+}
+
+impl Interlock {
+    /// The interlock of a rig file; `None` where it has none. Returns when its contact was asked once, or did not answer in time. `has_keys`: keys of
+    /// the terminal will be passed to [`Interlock::key_pressed`].
+    ///
+    /// # Errors
+    /// A key is wanted and there is no terminal; the system gives no thread.
+    pub fn of_config(config: &InterlockConfig, has_keys: bool) -> Result<Option<Self>, Failure> {
+        let bad = |text: &str| Failure::new(FailureKind::BadInput, text);
+        let (what, key, release_ms) = match config {
+            InterlockConfig::None(_) => return Ok(None),
+            InterlockConfig::Process(p) => match (&p.name, &p.pid_file) {
+                (Some(name), _) => (format!("process {name:?}"), None, 0),
+                (None, Some(file)) => (format!("process of {}", file.display()), None, 0),
+                (None, None) => return Err(bad("safety.interlock names no process")),
+            },
+            InterlockConfig::Line(l) => match (&l.port, &l.file) {
+                (Some(port), _) => (format!("{} of {port}", l.signal.word().to_uppercase()), None, 0),
+                (None, Some(file)) => (format!("\"1\" in {}", file.display()), None, 0),
+                (None, None) => return Err(bad("safety.interlock names no line")),
+            },
+            InterlockConfig::Key(k) => {
+                if !has_keys {
+                    return Err(bad(
+                        "safety.interlock.kind = \"key\": there is no terminal whose key could be held down; start the run from a terminal, in its \
+                         foreground, or use kind = \"process\" or \"line\"",
+                    ));
+                }
+                let key = k.key.bytes().next().unwrap_or(b' ');
+                (format!("key {:?} held down", char::from(key)), Some(key), k.release_ms)
+            }
+        };
+        let interlock = Self::start(what, key, release_ms, |shared| contacts::of(config, shared))?;
+        Ok(Some(interlock))
+    }
+
+    /// An interlock that asks `contact`; `what` names it in messages.
+    ///
+    /// # Errors
+    /// The system gives no thread.
+    pub fn with_contact(what: &str, contact: impl Contact + 'static) -> Result<Self, Failure> {
+        Self::start(what.to_owned(), None, 0, |_| Box::new(contact))
+    }
+
+    fn start(
+        what: String,
+        key: Option<u8>,
+        release_ms: u32,
+        contact: impl FnOnce(&Arc<Shared>) -> Box<dyn Contact>,
+    ) -> Result<Self, Failure> {
+        let shared = Arc::new(Shared {
+            clock: MonotonicClock::new(0),
+            closed_at: AtomicI64::new(NEVER),
+            keys: HeldKey {
+                at: AtomicI64::new(NEVER),
+                repeats: AtomicBool::new(false),
+                release_ns: i64::from(release_ms) * 1_000_000,
+            },
+            stop: AtomicBool::new(false),
+        });
+        let mut contact = contact(&shared);
+        let (asked, first) = std::sync::mpsc::channel();
+        let asking = shared.clone();
+        let thread = std::thread::Builder::new()
+            .name("dpm-interlock".into())
+            .spawn(move || {
+                // A panic of the contact ends the thread, and with it the light.
+                while !asking.stop.load(Ordering::Relaxed) {
+                    let before = asking.clock.now().0;
+                    // As of before it was asked: an answer that took long is already old.
+                    let at = if contact.is_closed() { before } else { NEVER };
+                    asking.closed_at.store(at, Ordering::Release);
+                    let _ = asked.send(());
+                    std::thread::sleep(ASK_EVERY);
+                }
+            })
+            .map_err(|e| {
+                Failure::new(FailureKind::Device, format!("cannot start the interlock's thread: {e}"))
+            })?;
+        let _ = first.recv_timeout(Duration::from_millis(200));
+        Ok(Self { shared, key, what, thread: Some(thread) })
+    }
+
+    /// True while there may be light: the contact said so within the last [`SILENCE_NS`]. Never waits.
+    pub fn is_closed(&self) -> bool {
+        self.shared.clock.now().0 - self.shared.closed_at.load(Ordering::Acquire) <= SILENCE_NS
+    }
+
+    /// What must be so, for messages: `process "laser-guard"`.
+    pub fn what(&self) -> &str {
+        &self.what
+    }
+
+    /// A key came from the terminal. `true` when it is the interlock's own.
+    pub fn key_pressed(&self, key: u8) -> bool {
+        let ours = self.key == Some(key);
+        if ours {
+            self.shared.keys.pressed(self.shared.clock.now().0);
+        }
+        ours
+    }
+}
+
+impl Drop for Interlock {
+    fn drop(&mut self) {
+        self.shared.stop.store(true, Ordering::Relaxed);
+        // A thread that hangs in its contact is left to the end of the process.
+        if let Some(thread) = self.thread.take().filter(|t| {
+            let deadline = std::time::Instant::now() + Duration::from_millis(200);
+            while !t.is_finished() && std::time::Instant::now() < deadline {
+                std::thread::sleep(Duration::from_millis(1));
+            }
+            t.is_finished()
+        }) {
+            let _ = thread.join();
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests;

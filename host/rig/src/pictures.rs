@@ -1,0 +1,200 @@
+//! Frames of light into what an eye saw: light added up over a window by an eye that follows each body.
+//!
+//! For every pixel of the picture the surface point it shows at the last instant is carried back through the window with its body's true
+//! motion, and the light that fell on it in each frame is averaged. Motion blur of a following eye, lag and misregistration are all in it.
+
+use crate::pipeline::light::LightFrame;
+use crate::pipeline::FrameRecord;
+use crate::rig::Rig;
+use dpm_render::gpu::GpuError;
+use dpm_render::{FrameInputs, Renderer};
+use dpm_scene::geometry::projector::ProjectorCamera;
+use dpm_shaders::structs::NO_HIT;
+use glam::{DAffine3, DVec2, DVec3, Vec3};
+
+/// The two pictures of a run, linear, row by row, of the projector's raster.
+pub struct Pictures {
+    /// Drive 0..1 that fell on the surface seen by each projector pixel. Where no pose is known, the mean light of each pixel of the raster.
+    pub light: Vec<Vec3>,
+    /// Radiance that the observer saw, scene units, seen through a camera at the eye; or why there is none.
+    pub viewer: Result<Vec<Vec3>, &'static str>,
+}
+
+/// Frames of light with the poses of the tracked bodies at the middle of each.
+struct Window<'a> {
+    frames: Vec<(&'a LightFrame, Vec<DAffine3>)>,
+}
+
+/// The frames of `light` whose poses are known: the true ones where the mock tracker tells them, else those that each frame was drawn for, which are where
+/// a real tracker and the prediction put the bodies.
+fn window<'a>(rig: &Rig, light: &'a [LightFrame], records: &[FrameRecord]) -> Window<'a> {
+    let half_slot = rig.rate().slot_len_ns(0) / 2;
+    let drawn_for = |f: &LightFrame| {
+        let record = records.iter().find(|r| r.id.0 as u32 == f.frame)?;
+        Some(record.tracked_poses.clone())
+    };
+    let poses =
+        |f: &LightFrame| rig.true_poses(f.first_photon_at.plus_ns(half_slot).0).or_else(|| drawn_for(f));
+    Window { frames: light.iter().filter_map(|f| Some((f, poses(f)?))).collect() }
+}
+
+/// Mean of the frames, pixel by pixel, 0..1.
+fn mean(light: &[LightFrame]) -> Vec<Vec3> {
+    let mut sum = vec![Vec3::ZERO; light.first().map_or(0, |f| f.codes.len())];
+    for frame in light {
+        for (s, c) in sum.iter_mut().zip(&frame.codes) {
+            *s += Vec3::from(c.map(f32::from));
+        }
+    }
+    sum.iter().map(|s| *s / (255.0 * light.len().max(1) as f32)).collect()
+}
+
+/// Makes both pictures from the last frames of light, of which there is at least one. `records` tell what those frames were drawn for.
+///
+/// # Errors
+/// The GPU's.
+pub fn pictures(
+    rig: &Rig,
+    renderer: &mut Renderer,
+    light: &[LightFrame],
+    records: &[FrameRecord],
+) -> Result<Pictures, GpuError> {
+    let window = window(rig, light, records);
+    if window.frames.is_empty() {
+        let why = "neither the tracker nor the frames tell where the bodies were";
+        return Ok(Pictures { light: mean(light), viewer: Err(why) });
+    }
+    let now = &window.frames[window.frames.len() - 1].1;
+    let (eye, _) = rig.observer.eye_and_gaze(now);
+    let light = integrate(rig, renderer, &rig.camera, eye, now, &window, |_, drive| drive)?;
+    let Some(viewer_camera) = viewer_camera(rig, eye, now) else {
+        return Ok(Pictures { light, viewer: Err("the bodies are nowhere that an eye could look at") });
+    };
+    let projector = rig.camera.position();
+    let max_intensity = rig.config.projector.max_intensity;
+    let albedo = rig.config.scene.surface_albedo;
+    let ambient = Vec3::from_array(rig.config.scene.ambient.map(|v| v as f32));
+    let viewer = integrate(rig, renderer, &viewer_camera, projector, now, &window, |seen, drive| {
+        // Radiance of a Lambertian surface under the projector's light.
+        let to_projector = projector - seen.position;
+        let d2 = to_projector.length_squared();
+        let cos = seen.normal.dot(to_projector).abs() / d2.sqrt();
+        ambient + drive * (albedo / std::f64::consts::PI * max_intensity * cos / d2) as f32
+    })?;
+    Ok(Pictures { light, viewer: Ok(viewer) })
+}
+
+/// A camera at the eye that frames what the projector lights.
+fn viewer_camera(rig: &Rig, eye: DVec3, tracked: &[DAffine3]) -> Option<ProjectorCamera> {
+    let mut poses = Vec::new();
+    rig.scene_poses(tracked, &mut poses);
+    let (mut lower, mut upper) = (DVec3::INFINITY, DVec3::NEG_INFINITY);
+    for (body, pose) in rig.scene.bodies.iter().zip(&poses).filter(|(b, _)| b.projected) {
+        for p in &body.mesh.positions {
+            let p = pose.transform_point3(p.as_dvec3());
+            lower = lower.min(p);
+            upper = upper.max(p);
+        }
+    }
+    if !lower.is_finite() {
+        return None;
+    }
+    let centre = (lower + upper) * 0.5;
+    let radius = ((upper - lower).length() * 0.5).max(1e-9);
+    let distance = (centre - eye).length().max(radius * 1.05);
+    let raster = rig.camera.raster;
+    let aspect = f64::from(raster.width()) / f64::from(raster.height());
+    let vertical = 2.0 * (radius / distance).asin();
+    let horizontal = 2.0 * ((0.5 * vertical).tan() * aspect.max(1.0)).atan();
+    ProjectorCamera::look_at(raster, eye, centre, DVec3::Y, horizontal.clamp(0.01, 3.0)).ok()
+}
+
+/// A point as the picture sees it at the last instant.
+struct Seen {
+    position: DVec3,
+    normal: DVec3,
+}
+
+fn integrate(
+    rig: &Rig,
+    renderer: &mut Renderer,
+    camera: &ProjectorCamera,
+    other: DVec3,
+    tracked: &[DAffine3],
+    window: &Window<'_>,
+    shade: impl Fn(&Seen, Vec3) -> Vec3,
+) -> Result<Vec<Vec3>, GpuError> {
+    let mut poses = Vec::new();
+    rig.scene_poses(tracked, &mut poses);
+    let mut slot = renderer.create_slot(true)?;
+    let inputs = FrameInputs {
+        frame: 0,
+        spp: 1,
+        budget_spp: 1.0,
+        camera,
+        eye: other,
+        gaze: other,
+        widen_deg: 0.0,
+        poses: &poses,
+        lost: &[],
+    };
+    renderer.submit(&mut slot, &inputs)?;
+    slot.wait(60_000_000_000)?;
+    let surfaces = slot.surfaces().unwrap_or(&[]);
+    let width = camera.raster.width();
+    let mut out = vec![Vec3::ZERO; surfaces.len()];
+    let mut window_poses: Vec<Vec<DAffine3>> = Vec::new();
+    for (_, tracked) in &window.frames {
+        let mut all = Vec::new();
+        rig.scene_poses(tracked, &mut all);
+        window_poses.push(all);
+    }
+    for (i, surface) in surfaces.iter().enumerate() {
+        if surface.id == NO_HIT || surface.distance <= 0.0 {
+            continue;
+        }
+        let body = (surface.id >> 24) as usize;
+        let pixel = DVec2::new(f64::from(i as u32 % width) + 0.5, f64::from(i as u32 / width) + 0.5);
+        let ray = camera.ray(pixel);
+        let position = ray.origin + ray.direction * f64::from(surface.distance);
+        let in_body = poses[body].inverse().transform_point3(position);
+        let normal =
+            poses[body].transform_vector3(renderer.shading_normal(surface).as_dvec3()).normalize_or_zero();
+        let seen = Seen { position, normal };
+        let mut sum = Vec3::ZERO;
+        for ((frame, _), all) in window.frames.iter().zip(&window_poses) {
+            if let Some(p) = rig.camera.project(all[body].transform_point3(in_body)) {
+                sum += sample(frame, rig.camera.raster.width(), rig.camera.raster.height(), p);
+            }
+        }
+        out[i] = shade(&seen, sum / window.frames.len() as f32);
+    }
+    Ok(out)
+}
+
+/// Light at a raster position, bilinear between pixel centres, 0..1.
+fn sample(frame: &LightFrame, width: u32, height: u32, at: DVec2) -> Vec3 {
+    let (x, y) = (at.x - 0.5, at.y - 0.5);
+    let (x0, y0) = (x.floor(), y.floor());
+    let (fx, fy) = ((x - x0) as f32, (y - y0) as f32);
+    let texel = |x: f64, y: f64| {
+        if x < 0.0 || y < 0.0 || x >= f64::from(width) || y >= f64::from(height) {
+            return Vec3::ZERO;
+        }
+        let c = frame.codes[y as usize * width as usize + x as usize];
+        Vec3::new(f32::from(c[0]), f32::from(c[1]), f32::from(c[2])) / 255.0
+    };
+    let top = texel(x0, y0).lerp(texel(x0 + 1.0, y0), fx);
+    let bottom = texel(x0, y0 + 1.0).lerp(texel(x0 + 1.0, y0 + 1.0), fx);
+    top.lerp(bottom, fy)
+}
+
+/// Linear values as 8-bit sRGB.
+pub fn to_srgb(linear: &[Vec3], scale: f32) -> Vec<u8> {
+    let encode = |v: f32| {
+        let v = (v * scale).clamp(0.0, 1.0);
+        let s = if v <= 0.003_130_8 { 12.92 * v } else { 1.055 * v.powf(1.0 / 2.4) - 0.055 };
+        (s * 255.0 + 0.5) as u8
+    };
+    linear.iter().flat_map(|v| [encode(v.x), encode(v.y), encode(v.z)]).collect()
+}

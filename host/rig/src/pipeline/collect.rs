@@ -1,0 +1,537 @@
+//! Finished frames and light into a report. Runs on its own thread, off the frame path: it may allocate.
+
+use super::crew::NotesBack;
+use super::dark_bodies::DarkBodies;
+use super::job::{Fate, FrameNote};
+use super::light::LightNote;
+use super::placement::Placement;
+use crate::config::{Pace, ProjectorBackend, TrackerConfig};
+use crate::frame::{FrameId, FrameTimeline, Stage, STAGES};
+use crate::plan::dark::DarkCause;
+use crate::plan::light_centre::centre_ns;
+use crate::plan::slots::OrderedDark;
+use crate::realtime::standstill::SeenStandstills;
+use crate::rig::Rig;
+use crate::telemetry::interval::Interval;
+use crate::telemetry::monitor::RunMonitor;
+use crate::telemetry::profile::{missed_by_cause, ordered_dark, Profiler};
+use crate::telemetry::report::{Latency, Report, Spread, StageTime};
+use crate::telemetry::signed::SignedHistogram;
+use crate::telemetry::slots::{SlotCounts, SlotLedger};
+use crate::telemetry::trace::TracedFrame;
+use dpm_device::link::frame_newer;
+use dpm_device::time::HostTime;
+use dpm_handoff::channel::Receiver;
+use dpm_render::PASSES;
+use glam::{DAffine3, DVec3};
+use hdrhistogram::Histogram;
+use hil_mock::projector::LightKind;
+use std::collections::VecDeque;
+use std::sync::Arc;
+use std::time::Duration;
+
+/// Points on each body at which registration is measured.
+const POINTS_PER_BODY: usize = 48;
+/// Sent frames that may wait for their light; beyond this they count as never lit.
+const MAX_PENDING: usize = 256;
+
+/// Time between two looks at what is finished.
+const REST: Duration = Duration::from_millis(2);
+
+/// What is kept of one lit frame for pictures.
+#[derive(Clone, Debug)]
+pub struct FrameRecord {
+    /// Which frame.
+    pub id: FrameId,
+    /// Its slot.
+    pub slot: u64,
+    /// Its stamps.
+    pub timeline: FrameTimeline,
+    /// world-from-body of the tracked bodies that it was drawn for.
+    pub tracked_poses: Vec<DAffine3>,
+    /// The same without prediction.
+    pub sampled_poses: Vec<DAffine3>,
+    /// Why no light fell on each tracked body; `None` where it did.
+    pub dark: Vec<Option<DarkCause>>,
+    /// Eye, world.
+    pub eye: DVec3,
+    /// Hash of its code values.
+    pub code_hash: u64,
+    /// GPU time of each pass, nanoseconds.
+    pub pass_ns: [u64; PASSES.len()],
+}
+
+/// Counts and distributions of a run.
+pub struct Collector {
+    rig: Arc<Rig>,
+    points: Vec<Vec<DVec3>>,
+    placement: Placement,
+    pending: VecDeque<FrameRecord>,
+    /// The last lit frames, oldest first.
+    pub recent: VecDeque<FrameRecord>,
+    keep: usize,
+    verify: bool,
+    /// Frames are prepared: their light does not depend on what the tracker sees.
+    prepared: bool,
+    /// Something is lit that no tracker tells of.
+    has_still_light: bool,
+    dark_bodies: DarkBodies,
+    lit: u64,
+    /// Lit frames in which every body was dark.
+    dark: u64,
+    dropped: u64,
+    /// Frames not lit because no new picture was wanted.
+    withheld: u64,
+    late: u64,
+    repeated: u64,
+    too_old: u64,
+    /// Slots without a frame of their own.
+    pub slots: SlotLedger,
+    /// Lit frames with parts of another (looked for in prepared frames only).
+    pub torn: u64,
+    /// Frames lit after a newer one, or twice.
+    pub reordered: u64,
+    last_lit: Option<u32>,
+    /// The newest frame that the link is done with, low 32 bits.
+    newest: Option<u32>,
+    /// Slots in which the frame before was shown again, until the last planned one is known to be later.
+    repeats: VecDeque<u64>,
+    /// Lit frames whose light was not what was rendered.
+    pub light_mismatches: u64,
+    /// Intervals of every lit frame.
+    pub profiler: Profiler,
+    /// The last lit frames, for a trace, oldest first.
+    pub traced: VecDeque<TracedFrame>,
+    trace_frames: usize,
+    registration: Histogram<u64>,
+    /// The same of the frames that were lit in their own slot.
+    registration_in_time: Histogram<u64>,
+    /// True beginning of a slot, as the mock in this process saw it, less what the host took it for.
+    clock_error: SignedHistogram,
+    unpredicted: Histogram<u64>,
+    stages: Vec<Histogram<u64>>,
+    passes: Vec<Histogram<u64>>,
+    rays: u64,
+    samples: u64,
+    gpu_ns: u64,
+    lit_values: u64,
+    clipped_values: u64,
+    nan_values: u64,
+    invalid_samples: u64,
+}
+
+/// Frames in a trace, the last ones of a run: half a minute at 947 fps, some 60 MB; viewers do not like more.
+const MAX_TRACED: usize = 30_000;
+
+/// Registration is counted in millionths of a pixel.
+const PER_PIXEL: f64 = 1e6;
+
+fn histogram() -> Histogram<u64> {
+    Histogram::new_with_bounds(1, 1_000_000_000_000, 3).expect("bounds and digits are in range")
+}
+
+impl Collector {
+    /// Keeps the last `keep` lit frames; `verify`: compares hashes of code values and light.
+    pub fn new(rig: Arc<Rig>, keep: usize, verify: bool) -> Self {
+        let points = (0..rig.bodies.len()).map(|i| registration_points(&rig, i)).collect();
+        let measured = rig.config.real_time.pace == Pace::Real;
+        // A tenth of a known run, but enough frames for a 99th percentile.
+        let frames = rig.config.run.frames.max(rig.config.slots_to_run());
+        let batch_frames = (frames / 10).clamp(100, 10_000);
+        let is_mock_tracker = matches!(rig.config.tracker, TrackerConfig::Mock(_));
+        let is_mock_projector = matches!(rig.config.projector.backend, ProjectorBackend::Mock(_));
+        let profiler =
+            Profiler::new(rig.rate(), measured, batch_frames).with_mocks(is_mock_tracker, is_mock_projector);
+        let lead_ns = i64::from(rig.config.real_time.stage_costs_us.total()) * 1000;
+        let trace_frames = if rig.config.output.trace { MAX_TRACED } else { 0 };
+        Self {
+            placement: Placement::new(rig.bodies.len()),
+            dark_bodies: DarkBodies::new(rig.bodies.len()),
+            has_still_light: rig.scene.bodies.iter().any(|b| b.tracked.is_none() && b.projected),
+            slots: SlotLedger::new(rig.rate(), lead_ns),
+            rig,
+            points,
+            pending: VecDeque::new(),
+            recent: VecDeque::new(),
+            keep,
+            verify,
+            prepared: false,
+            lit: 0,
+            dark: 0,
+            dropped: 0,
+            withheld: 0,
+            late: 0,
+            repeated: 0,
+            too_old: 0,
+            torn: 0,
+            reordered: 0,
+            last_lit: None,
+            newest: None,
+            repeats: VecDeque::new(),
+            light_mismatches: 0,
+            profiler,
+            traced: VecDeque::new(),
+            trace_frames,
+            registration: histogram(),
+            registration_in_time: histogram(),
+            clock_error: SignedHistogram::new(1_000_000_000),
+            unpredicted: histogram(),
+            stages: STAGES.iter().map(|_| histogram()).collect(),
+            passes: PASSES.iter().map(|_| histogram()).collect(),
+            rays: 0,
+            samples: 0,
+            gpu_ns: 0,
+            lit_values: 0,
+            clipped_values: 0,
+            nan_values: 0,
+            invalid_samples: 0,
+        }
+    }
+
+    /// Says that frames are prepared, and what is seen of the machine's standstills. To be called before the first frame.
+    pub fn about(mut self, prepared: bool, standstills: Option<Arc<SeenStandstills>>) -> Self {
+        self.prepared = prepared;
+        if let Some(seen) = standstills {
+            self.slots.excuse_by(seen);
+        }
+        self
+    }
+
+    /// The run is over and everything is known: what became of every slot.
+    pub fn finish(&mut self, monitor: &RunMonitor) -> SlotCounts {
+        self.slots.read_orders(monitor.dark());
+        self.slots.finish()
+    }
+
+    /// Takes finished frames and light until both are over, or until `goes_on`, which is asked at every look, says no; gives the notes back
+    /// to `free`.
+    pub(super) fn run(
+        &mut self,
+        mut done: Receiver<Box<FrameNote>>,
+        free: &NotesBack,
+        mut lights: Receiver<LightNote>,
+        monitor: &RunMonitor,
+        mut goes_on: impl FnMut() -> bool,
+    ) {
+        let mut held = None;
+        while goes_on() {
+            // Asked before looking: what came before the end is taken first.
+            let over = done.is_finished() && lights.is_finished();
+            self.slots.read_orders(monitor.dark());
+            self.take_finished(&mut done, free, monitor);
+            while let Some(note) = held.take().or_else(|| lights.try_pop()) {
+                self.take_finished(&mut done, free, monitor);
+                // Lit before the link's thread came to say that it was sent.
+                let unknown = note.event.frame.is_some_and(|f| self.newest.is_none_or(|n| frame_newer(f, n)));
+                if unknown && !over {
+                    held = Some(note);
+                    break;
+                }
+                self.light(&note, monitor);
+            }
+            self.slots.settle();
+            let slots = self.slots.counts();
+            monitor.set_slots(slots.wanted(), slots.missed_total());
+            if over {
+                break;
+            }
+            // Not woken for every frame: that would cost the frame path two system calls a frame. There are notes for longer.
+            std::thread::sleep(REST);
+        }
+        // What was sent and never lit is dropped.
+        for _ in 0..self.pending.len() {
+            self.drop_oldest(monitor);
+        }
+    }
+
+    fn take_finished(&mut self, done: &mut Receiver<Box<FrameNote>>, free: &NotesBack, monitor: &RunMonitor) {
+        while let Some(note) = done.try_pop() {
+            self.finished(&note, monitor);
+            free.push(note);
+        }
+    }
+
+    fn drop_oldest(&mut self, monitor: &RunMonitor) {
+        if let Some(record) = self.pending.pop_front() {
+            self.count_unlit(&record.timeline, monitor);
+        }
+    }
+
+    /// A frame will never be lit: nobody wanted it, or it is dropped. What was under way when the run ended is dropped.
+    fn count_unlit(&mut self, timeline: &FrameTimeline, monitor: &RunMonitor) {
+        match self.slots.ordered_dark(timeline.due_at) {
+            None | Some(OrderedDark::Stop) => {
+                self.dropped += 1;
+                monitor.count_dropped();
+            }
+            Some(_) => {
+                self.withheld += 1;
+                monitor.count_withheld();
+            }
+        }
+    }
+
+    /// The light of a frame left the projector.
+    fn count_lit(&mut self, record: &FrameRecord, at: HostTime, late: bool, monitor: &RunMonitor) {
+        let is_dark = self.is_dark(record);
+        self.lit += u64::from(!is_dark);
+        self.dark += u64::from(is_dark);
+        self.late += u64::from(late);
+        monitor.count_lit(is_dark, late);
+        if !self.prepared {
+            let bodies = &self.rig.bodies;
+            self.dark_bodies.lit(&record.dark, at, |body, told| {
+                monitor.note(format!("{:?} {told}", bodies[body].name));
+            });
+        }
+    }
+
+    /// No light fell anywhere although the frame was lit.
+    fn is_dark(&self, record: &FrameRecord) -> bool {
+        let nothing_tracked = record.dark.is_empty() || record.dark.iter().any(Option::is_none);
+        !self.prepared && !self.has_still_light && !nothing_tracked
+    }
+
+    fn finished(&mut self, job: &FrameNote, monitor: &RunMonitor) {
+        self.newest = Some(job.id.0 as u32);
+        let cost = job.cost.unwrap_or_default();
+        let c = cost.counters();
+        self.rays += u64::from(c.rays);
+        self.samples += u64::from(c.samples);
+        self.gpu_ns += cost.pass_ns.iter().sum::<u64>();
+        self.lit_values += 3 * u64::from(c.lit_pixels);
+        self.clipped_values += u64::from(c.clipped_values);
+        self.nan_values += u64::from(c.nan_values);
+        self.invalid_samples += u64::from(c.invalid_samples);
+        for (histogram, &ns) in self.passes.iter_mut().zip(&cost.pass_ns) {
+            // 0: the pass was left out of this frame, or the device has no time stamps. It is no measurement.
+            if ns > 0 {
+                histogram.saturating_record(ns);
+            }
+        }
+        for stage in [Stage::Plan, Stage::Render, Stage::Pack, Stage::Link] {
+            // 0: the frame was left out before this stage, or there is no such stage: prepared frames are not rendered.
+            let ns = job.timeline.wall_ns[stage as usize];
+            if ns > 0 {
+                self.stages[stage as usize].saturating_record(ns);
+            }
+        }
+        self.placement.observe(&self.rig.camera, &job.sampled_poses, &job.seen, &self.points);
+        let sent = job.is_sent();
+        let refused = !sent && !matches!(job.fate, Fate::Overtaken | Fate::Stopped);
+        self.slots.planned(job.slot, &job.timeline, refused, job.waited_for_memory);
+        while self.repeats.front().is_some_and(|&slot| slot < job.slot) {
+            self.repeats.pop_front();
+            self.repeated += 1;
+        }
+        if sent {
+            if self.pending.len() >= MAX_PENDING {
+                self.drop_oldest(monitor);
+            }
+            self.pending.push_back(FrameRecord {
+                id: job.id,
+                slot: job.slot,
+                timeline: job.timeline,
+                tracked_poses: job.tracked_poses.clone(),
+                sampled_poses: job.sampled_poses.clone(),
+                dark: job.dark.clone(),
+                eye: job.eye,
+                code_hash: job.code_hash,
+                pass_ns: cost.pass_ns,
+            });
+        } else {
+            self.too_old += u64::from(job.fate == Fate::TooOld);
+            self.count_unlit(&job.timeline, monitor);
+        }
+    }
+
+    fn light(&mut self, note: &LightNote, monitor: &RunMonitor) {
+        if note.wall_ns > 0 {
+            self.stages[Stage::Light as usize].saturating_record(note.wall_ns);
+        }
+        let (slot, begin) = (note.event.slot, note.event.first_photon_at);
+        self.slots.read_orders(monitor.dark());
+        match note.event.kind {
+            LightKind::Repeated => {
+                self.slots.nothing_new(slot, begin, 0);
+                // After the last frame the projector repeats it until it is told to stop: no fault.
+                if self.repeats.len() < MAX_PENDING {
+                    self.repeats.push_back(slot);
+                }
+            }
+            LightKind::Blank => self.slots.nothing_new(slot, begin, 0),
+            LightKind::Lit => {
+                let Some(frame) = note.event.frame else { return };
+                self.torn += u64::from(note.torn);
+                self.reordered += u64::from(self.last_lit.is_some_and(|last| !frame_newer(frame, last)));
+                self.last_lit = Some(frame);
+                let Some(at) = self.pending.iter().position(|r| r.id.0 as u32 == frame) else {
+                    // Given up for dropped long ago: whose slot this was, it was not this frame's.
+                    self.slots.nothing_new(slot, begin, note.unseen);
+                    return;
+                };
+                // Frames before it were lit without being told one by one, or overtaken and will never be lit.
+                for k in 0..at {
+                    if k >= note.unseen as usize {
+                        self.drop_oldest(monitor);
+                    } else if let Some(unseen) = self.pending.pop_front() {
+                        self.count_lit(&unseen, unseen.timeline.due_at, false, monitor);
+                    }
+                }
+                let Some(mut record) = self.pending.pop_front() else { return };
+                let last_photon_at = note.event.last_photon_at;
+                let exposure_ns = last_photon_at.ns_since(begin);
+                let centre_at = begin.plus_ns(centre_ns(&self.rig.config.projector.schedule(), exposure_ns));
+                record.timeline.lit_at = Some(begin);
+                record.timeline.centre_at = Some(centre_at);
+                record.timeline.last_photon_at = Some(last_photon_at);
+                let late = slot > record.slot;
+                if late {
+                    self.slots.nothing_new(slot, begin, note.unseen);
+                } else {
+                    self.slots.own(slot, begin, note.unseen);
+                }
+                self.count_lit(&record, begin, late, monitor);
+                if self.verify && note.hash != record.code_hash {
+                    self.light_mismatches += 1;
+                }
+                self.measure_registration(note, &record, late);
+                self.measure_clock(note, &record);
+                // No light fell on a body: there is no way from its motion to light.
+                let is_dark = self.is_dark(&record);
+                let stamps = if is_dark { record.timeline.without_sample() } else { record.timeline };
+                self.profiler.lit(&stamps, slot, late);
+                if self.trace_frames > 0 {
+                    if self.traced.len() >= self.trace_frames {
+                        self.traced.pop_front();
+                    }
+                    self.traced.push_back(TracedFrame {
+                        id: record.id,
+                        slot,
+                        timeline: record.timeline,
+                        last_photon_at,
+                        pass_ns: record.pass_ns,
+                    });
+                }
+                if self.keep > 0 {
+                    if self.recent.len() >= self.keep {
+                        self.recent.pop_front();
+                    }
+                    self.recent.push_back(record);
+                }
+            }
+        }
+    }
+
+    /// When the slot of this light truly began, against when the host believed that it would. Only the mock in this process knows: what is
+    /// known of another projector's light comes from the host's own map of its clock, which agrees with itself.
+    fn measure_clock(&mut self, note: &LightNote, record: &FrameRecord) {
+        let knows = matches!(self.rig.config.projector.backend, ProjectorBackend::Mock(_));
+        if knows && self.rig.config.real_time.pace == Pace::Real {
+            let rate = self.rig.rate();
+            let slots_ns = rate.slot_start_ns(note.event.slot) - rate.slot_start_ns(record.slot);
+            let due_at = record.timeline.due_at.plus_ns(slots_ns);
+            self.clock_error.record(note.event.first_photon_at.ns_since(due_at));
+        }
+    }
+
+    /// Where the light of each point fell against where the point was at the middle of the exposure, on the bodies that were lit.
+    fn measure_registration(&mut self, note: &LightNote, record: &FrameRecord, late: bool) {
+        let (first, last) = (note.event.first_photon_at, note.event.last_photon_at);
+        let middle = first.plus_ns(last.ns_since(first) / 2);
+        let Some(truth) = self.rig.true_poses(middle.0) else { return };
+        for (i, points) in self.points.iter().enumerate() {
+            if !self.prepared && record.dark.get(i).copied().flatten().is_some() {
+                continue;
+            }
+            for p in points {
+                let at = |m: &DAffine3| self.rig.camera.project(m.transform_point3(*p));
+                let Some(real) = at(&truth[i]) else { continue };
+                if let Some(used) = at(&record.tracked_poses[i]) {
+                    let error = ((used - real).length() * PER_PIXEL).round() as u64;
+                    self.registration.saturating_record(error);
+                    if !late {
+                        self.registration_in_time.saturating_record(error);
+                    }
+                }
+                if let Some(held) = at(&record.sampled_poses[i]) {
+                    self.unpredicted.saturating_record(((held - real).length() * PER_PIXEL).round() as u64);
+                }
+            }
+        }
+    }
+
+    /// Fills what the run measured into a report.
+    pub fn fill(&self, report: &mut Report) {
+        let spread = |h: &Histogram<u64>, unit: f64| {
+            (!h.is_empty()).then(|| Spread {
+                p50: h.value_at_quantile(0.5) as f64 / unit,
+                p99: h.value_at_quantile(0.99) as f64 / unit,
+                p999: h.value_at_quantile(0.999) as f64 / unit,
+                max: h.max() as f64 / unit,
+            })
+        };
+        let slots = self.slots.counts();
+        report.slots = slots.wanted();
+        report.missed_slots = slots.missed_total();
+        report.missed_share = slots.missed_share();
+        report.excused_by_standstill = slots.excused();
+        report.missed_by_cause = missed_by_cause(&slots);
+        report.ordered_dark = ordered_dark(&slots);
+        report.frames_lit = self.lit;
+        report.frames_dark = self.dark;
+        report.dark_by_body = self.dark_bodies.report(self.rig.bodies.iter().map(|b| b.name.as_str()));
+        report.frames_withheld = self.withheld;
+        report.frames_dropped = self.dropped;
+        report.frames_late = self.late;
+        report.frames_repeated = self.repeated;
+        report.frames_too_old = self.too_old;
+        report.registration_error_px = spread(&self.registration, PER_PIXEL);
+        report.registration_error_in_time_px = spread(&self.registration_in_time, PER_PIXEL);
+        report.clock_error_ms = Latency::of(&self.clock_error, false);
+        report.registration_error_unpredicted_px = spread(&self.unpredicted, PER_PIXEL);
+        report.registration_error_at = report.registration_error_px.map(|_| "mid-exposure");
+        let latency = |interval| Latency::of(self.profiler.histogram(interval), !self.profiler.is_measured());
+        report.motion_to_first_photon_ms = latency(Interval::MotionToFirstPhoton);
+        report.motion_to_light_centre_ms = latency(Interval::MotionToCentre);
+        report.motion_to_last_photon_ms = latency(Interval::MotionToLastPhoton);
+        report.motion_to_light_ms = report.motion_to_first_photon_ms;
+        report.lateness_ms = latency(Interval::Lateness);
+        let stages = STAGES.iter().map(|s| (*s).to_owned()).zip(&self.stages);
+        let passes = PASSES.iter().map(|p| format!("gpu {p}")).zip(&self.passes);
+        report.stages_ms = stages
+            .chain(passes)
+            .filter_map(|(stage, h)| spread(h, 1e6).map(|ms| StageTime { stage, ms }))
+            .collect();
+        report.mrays_per_s = (self.gpu_ns > 0).then(|| self.rays as f64 / self.gpu_ns as f64 * 1e3);
+        report.clipped =
+            if self.lit_values > 0 { self.clipped_values as f64 / self.lit_values as f64 } else { 0.0 };
+        report.nan_pixels = self.nan_values;
+        if self.invalid_samples > 0 {
+            report.warnings.push(format!(
+                "{} samples of {} were not finite and were left out",
+                self.invalid_samples, self.samples
+            ));
+        }
+        let names: Vec<String> = self.rig.bodies.iter().map(|b| b.name.clone()).collect();
+        report.warnings.extend(self.placement.warnings(&names));
+        if self.light_mismatches > 0 {
+            report
+                .warnings
+                .push(format!("{} frames of light differ from what was rendered", self.light_mismatches));
+        }
+    }
+}
+
+/// Points spread over the vertices of a tracked body.
+fn registration_points(rig: &Rig, tracked: usize) -> Vec<DVec3> {
+    let all: Vec<DVec3> = rig
+        .scene
+        .bodies
+        .iter()
+        .filter(|b| b.tracked == Some(tracked as u16) && b.projected)
+        .flat_map(|b| b.mesh.positions.iter().map(|p| p.as_dvec3()))
+        .collect();
+    let n = all.len().min(POINTS_PER_BODY);
+    (0..n).map(|i| all[i * all.len() / n]).collect()
+}

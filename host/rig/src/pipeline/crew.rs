@@ -1,0 +1,299 @@
+//! Tracking, planning and packing as one crew: started together, watched by the supervisor, and abandoned together when one of them hangs.
+//!
+//! A crew owns everything that it works with and hands frames to the link through a [`Port`]. Abandoning it is dropping the port's other
+//! end: whatever its threads still do when they wake up, none of it reaches the link, and so none of it reaches the light.
+
+use super::job::{FrameJob, FrameMemory, FrameNote};
+use super::outcome::PipelineError;
+use super::planning::{plan_thread, PlanInbox};
+use super::prepared::PreparedFrames;
+use super::pulse::{Pulse, Silence};
+use super::stages::{LinkTime, TrackSnapshot, TrackingStage};
+use super::threads::{pack_thread, policy, tracking_thread, PackInbox, Shared, NOTES};
+use crate::plan::budget::BudgetController;
+use dpm_device::time::HostTime;
+use dpm_handoff::channel::{channel, Receiver, Sender};
+use dpm_handoff::latest::{latest, Publisher};
+use dpm_handoff::wake::{WaitPolicy, Waiter};
+use dpm_render::pack::Kernel;
+use dpm_render::Renderer;
+use std::sync::atomic::{AtomicBool, AtomicI64, AtomicU64, Ordering};
+use std::sync::{Arc, Mutex, OnceLock};
+use std::thread::JoinHandle;
+
+/// Places of the stages in [`CrewState::pulses`].
+pub(super) const TRACKING: usize = 0;
+/// See [`TRACKING`].
+pub(super) const PLAN: usize = 1;
+/// See [`TRACKING`].
+pub(super) const PACK: usize = 2;
+
+/// What a crew works with.
+pub(super) struct CrewParts {
+    pub(super) tracking: TrackingStage,
+    /// `None` if frames are prepared.
+    pub(super) renderer: Option<Renderer>,
+    pub(super) prepared: Option<PreparedFrames>,
+    /// How planes are packed if the GPU has not done it.
+    pub(super) kernel: Kernel,
+    /// `None` if every frame gets the rays that the rig file asks for.
+    pub(super) budget: Option<BudgetController>,
+    /// What frames are made in.
+    pub(super) memory: Vec<FrameMemory>,
+    /// What a frame took while nobody was waiting for it, nanoseconds; 0 if frames are prepared.
+    pub(super) frame_ns: i64,
+}
+
+/// Where the link's thread finds the frames of a crew, and gives their memory back.
+pub(super) struct Port {
+    pub(super) jobs: Receiver<FrameJob>,
+    pub(super) free: Sender<Box<FrameMemory>>,
+    /// Where the crew learns the projector's clock.
+    pub(super) times: Publisher<LinkTime>,
+}
+
+/// The collector's way to give notes back to whichever crew works now. Not on the frame path: it may lock.
+#[derive(Clone, Default)]
+pub(super) struct NotesBack(Arc<Mutex<Option<Sender<Box<FrameNote>>>>>);
+
+impl NotesBack {
+    /// Gives one back; one that belongs to a crew of the past may end in the present one.
+    pub(super) fn push(&self, note: Box<FrameNote>) {
+        if let Ok(mut to) = self.0.lock() {
+            if let Some(to) = to.as_mut() {
+                let _ = to.push(note);
+            }
+        }
+    }
+
+    fn lead_to(&self, to: Sender<Box<FrameNote>>) {
+        if let Ok(mut place) = self.0.lock() {
+            *place = Some(to);
+        }
+    }
+}
+
+/// What the GPU has to do and how long it takes, shared by planning and packing.
+#[derive(Debug, Default)]
+pub(super) struct GpuPace {
+    submitted: AtomicU64,
+    finished: AtomicU64,
+    frame_ns: AtomicI64,
+}
+
+impl GpuPace {
+    /// Share of a slot beyond which frames are begun one at a time: a GPU that needs longer than that would only queue them up, and each
+    /// would be drawn for poses that grow old in the queue.
+    const SLOW: f64 = 0.9;
+
+    fn new(frame_ns: i64) -> Self {
+        Self { frame_ns: AtomicI64::new(frame_ns), ..Self::default() }
+    }
+
+    /// A frame was handed to the GPU.
+    pub(super) fn submit(&self) {
+        self.submitted.fetch_add(1, Ordering::Relaxed);
+    }
+
+    /// The GPU has finished a frame, for which it took `took_ns`.
+    pub(super) fn finish(&self, took_ns: i64) {
+        let before = self.frame_ns.load(Ordering::Relaxed);
+        let mean = if before == 0 { took_ns } else { before + (took_ns - before) / 8 };
+        self.frame_ns.store(mean, Ordering::Relaxed);
+        // Release: who sees the frame finished sees what it took.
+        self.finished.fetch_add(1, Ordering::Release);
+    }
+
+    /// Frames that the GPU has not finished.
+    pub(super) fn in_flight(&self) -> u64 {
+        let finished = self.finished.load(Ordering::Acquire);
+        self.submitted.load(Ordering::Relaxed).saturating_sub(finished)
+    }
+
+    /// True when a frame takes about a slot or more.
+    pub(super) fn is_slow(&self, slot_ns: i64) -> bool {
+        self.frame_ns.load(Ordering::Relaxed) as f64 > Self::SLOW * slot_ns as f64
+    }
+}
+
+/// What the threads of one crew share.
+#[derive(Debug)]
+pub(super) struct CrewState {
+    /// Nothing that this crew does counts any more.
+    pub(super) is_abandoned: AtomicBool,
+    /// Virtual pace: samples up to here are wanted.
+    pub(super) listen_to: AtomicI64,
+    /// Virtual pace: who to wake when more is wanted.
+    pub(super) tracking: OnceLock<std::thread::Thread>,
+    pub(super) tracking_over: AtomicBool,
+    /// The frame that is being planned.
+    pub(super) planning: AtomicU64,
+    /// Thousandths of a sample that a pixel gets on average.
+    pub(super) budget_milli: AtomicU64,
+    pub(super) gpu: GpuPace,
+    pub(super) pulses: [Pulse; 3],
+    /// By stage: its thread has returned, not panicked.
+    pub(super) returned: [AtomicBool; 3],
+    /// Why planning or packing cannot go on.
+    failure: Mutex<Option<PipelineError>>,
+}
+
+impl CrewState {
+    /// The crew cannot go on.
+    pub(super) fn fail(&self, error: PipelineError) {
+        if let Ok(mut first) = self.failure.lock() {
+            first.get_or_insert(error);
+        }
+    }
+
+    /// True when the crew's threads should end.
+    pub(super) fn is_dismissed(&self, shared: &Shared) -> bool {
+        self.is_abandoned.load(Ordering::Relaxed) || shared.monitor.stop_requested()
+    }
+}
+
+/// What is wrong with a crew.
+pub(super) enum Trouble {
+    /// A stage does not answer.
+    Hung(&'static str),
+    /// A stage panicked: a programmer's mistake.
+    Panicked(&'static str),
+    /// The GPU failed or does not finish.
+    Failed(PipelineError),
+}
+
+/// The threads of one crew.
+pub(super) struct Crew {
+    pub(super) state: Arc<CrewState>,
+    tracking: JoinHandle<Option<String>>,
+    others: [JoinHandle<()>; 2],
+    silences: [Silence; 3],
+}
+
+impl Crew {
+    /// Starts the threads; frames come out of the port. Notes travel from here to the collector and back through `notes_back`.
+    ///
+    /// # Errors
+    /// The system gives no thread.
+    pub(super) fn start(
+        shared: &Arc<Shared>,
+        parts: CrewParts,
+        notes_back: &NotesBack,
+    ) -> Result<(Self, Port), PipelineError> {
+        let CrewParts { tracking, renderer, prepared, kernel, budget, memory, frame_ns } = parts;
+        let policy = policy(&shared.rig);
+        // Room for everything there is: no stage ever finds the next one's channel full.
+        let jobs = memory.len();
+        let (mut free_in, free) = channel(jobs, policy);
+        let (to_pack_in, to_pack_out) = channel(jobs, policy);
+        let (to_link_in, to_link_out) = channel(jobs, policy);
+        let (mut notes_in, notes) = channel(NOTES, WaitPolicy::Park);
+        for memory in memory {
+            let _ = free_in.push(Box::new(memory));
+        }
+        for _ in 0..NOTES {
+            let _ = notes_in.push(Box::new(FrameNote::new(shared.rig.bodies.len())));
+        }
+        notes_back.lead_to(notes_in);
+        let state = Arc::new(CrewState {
+            is_abandoned: AtomicBool::new(false),
+            listen_to: AtomicI64::new(0),
+            tracking: OnceLock::new(),
+            tracking_over: AtomicBool::new(false),
+            planning: AtomicU64::new(0),
+            budget_milli: AtomicU64::new(u64::from(shared.rig.config.render.spp) * 1000),
+            gpu: GpuPace::new(frame_ns),
+            pulses: [Pulse::new("tracking"), Pulse::new("plan"), Pulse::new("pack")],
+            returned: [const { AtomicBool::new(false) }; 3],
+            failure: Mutex::new(None),
+        });
+        let (publisher, reader) = latest(TrackSnapshot::empty(shared.rig.bodies.len()));
+        let (times, time) = latest(shared.time);
+        let gpu_free = Waiter::new(policy);
+        let gpu_waker = gpu_free.waker();
+        let named = |name: &'static str| std::thread::Builder::new().name(format!("dpm-{name}"));
+        let refused = |stage| move |source| PipelineError::Thread { stage, source };
+        // A stage that returns or panics drops its senders, which ends the next one: nobody waits for ever.
+        let tracking = {
+            let (shared, state) = (shared.clone(), state.clone());
+            named("tracking")
+                .spawn(move || {
+                    let unseen = tracking_thread(&shared, &state, tracking, publisher);
+                    state.returned[TRACKING].store(true, Ordering::Release);
+                    unseen
+                })
+                .map_err(refused("tracking"))?
+        };
+        let plan = {
+            let (shared, state) = (shared.clone(), state.clone());
+            named("plan")
+                .spawn(move || {
+                    let _close = OnExit(|| state.tracking_over.store(true, Ordering::Release));
+                    let inbox = PlanInbox { latest: reader, time, free, notes, gpu_free };
+                    plan_thread(&shared, &state, renderer, inbox, to_pack_in);
+                    state.returned[PLAN].store(true, Ordering::Release);
+                })
+                .map_err(refused("plan"))?
+        };
+        let pack = {
+            let (shared, state) = (shared.clone(), state.clone());
+            named("pack")
+                .spawn(move || {
+                    let inbox = PackInbox { jobs: to_pack_out, gpu_waker };
+                    pack_thread(&shared, &state, kernel, prepared, budget, inbox, to_link_in);
+                    state.returned[PACK].store(true, Ordering::Release);
+                })
+                .map_err(refused("pack"))?
+        };
+        let crew = Self { state, tracking, others: [plan, pack], silences: Default::default() };
+        Ok((crew, Port { jobs: to_link_out, free: free_in, times }))
+    }
+
+    /// Looks at the crew, `step_ns` after the last look.
+    pub(super) fn trouble(&mut self, now: HostTime, step_ns: i64) -> Option<Trouble> {
+        let failure = self.state.failure.lock().ok().and_then(|mut f| f.take());
+        if let Some(error) = failure {
+            return Some(Trouble::Failed(error));
+        }
+        let finished =
+            [self.tracking.is_finished(), self.others[0].is_finished(), self.others[1].is_finished()];
+        for (i, pulse) in self.state.pulses.iter().enumerate() {
+            if finished[i] && !self.state.returned[i].load(Ordering::Acquire) {
+                return Some(Trouble::Panicked(pulse.name()));
+            }
+            if self.silences[i].observe(pulse, now, step_ns) {
+                return Some(Trouble::Hung(pulse.name()));
+            }
+        }
+        None
+    }
+
+    /// Nothing that this crew does counts any more. Its threads end when they come to see it, or with the process.
+    pub(super) fn abandon(self) {
+        self.state.is_abandoned.store(true, Ordering::Relaxed);
+        self.state.tracking_over.store(true, Ordering::Release);
+    }
+
+    /// True when all threads have ended.
+    pub(super) fn is_over(&self) -> bool {
+        self.tracking.is_finished() && self.others.iter().all(JoinHandle::is_finished)
+    }
+
+    /// Takes what is left when all threads have ended: what the tracker says of bodies that were never seen, or which stage panicked.
+    pub(super) fn join(self) -> Result<Option<String>, &'static str> {
+        let names = ["plan", "pack"];
+        for (thread, name) in self.others.into_iter().zip(names) {
+            thread.join().map_err(|_| name)?;
+        }
+        self.tracking.join().map_err(|_| "tracking")
+    }
+}
+
+/// Calls its function when dropped, during a panic too.
+pub(super) struct OnExit<F: FnMut()>(pub(super) F);
+
+impl<F: FnMut()> Drop for OnExit<F> {
+    fn drop(&mut self) {
+        (self.0)();
+    }
+}

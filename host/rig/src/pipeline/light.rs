@@ -1,0 +1,141 @@
+//! Light events of the mock projector into notes for the telemetry, and the last frames of light for pictures.
+//!
+//! Runs where the mock runs: in the link thread at virtual pace, in the mock's own thread at real pace.
+
+use super::job::hash_codes;
+use super::prepared::is_whole;
+use dpm_common::clock::Stopwatch;
+use dpm_device::planes::PlaneSchedule;
+use dpm_device::time::HostTime;
+use dpm_handoff::channel::Sender;
+use hil_mock::projector::{EmulatedProjector, LightEvent, LightKind, MockProjector, Served};
+use std::collections::VecDeque;
+
+/// What the projector did in one slot.
+#[derive(Clone, Copy, Debug)]
+pub struct LightNote {
+    /// The event.
+    pub event: LightEvent,
+    /// Hash of the light as code values; 0 when not asked for.
+    pub hash: u64,
+    /// Parts of it are of another frame (prepared frames only).
+    pub torn: bool,
+    /// Wall time that the mock took for it, nanoseconds; 0 for a projector outside this process.
+    pub wall_ns: u64,
+    /// Frames lit since the note before of which only the number is known.
+    pub unseen: u32,
+}
+
+/// One frame of light as it fell.
+#[derive(Clone, Debug)]
+pub struct LightFrame {
+    /// Low 32 bits of the frame's number.
+    pub frame: u32,
+    /// True time of its first photon.
+    pub first_photon_at: HostTime,
+    /// Red, green, blue code values, rows top to bottom.
+    pub codes: Vec<[u8; 3]>,
+}
+
+/// Watches a mock projector.
+pub struct LightRecorder {
+    /// `None` after [`LightRecorder::close`].
+    notes: Option<Sender<LightNote>>,
+    /// Notes that found no room.
+    pub notes_lost: u64,
+    keep: usize,
+    hash: bool,
+    /// Lit planes carry marks in this schedule.
+    marks: Option<PlaneSchedule>,
+    frames: VecDeque<LightFrame>,
+    /// Hash over all light in order.
+    light_hash: u64,
+}
+
+impl LightRecorder {
+    /// Notes go to `notes`; the last `keep` frames of light stay; `hash`: hash every frame of light; `marks`: the
+    /// planes, in this order, are of [`super::prepared`] and are looked at for parts of other frames.
+    pub fn new(notes: Sender<LightNote>, keep: usize, hash: bool, marks: Option<PlaneSchedule>) -> Self {
+        Self {
+            notes: Some(notes),
+            notes_lost: 0,
+            keep,
+            hash,
+            marks,
+            frames: VecDeque::with_capacity(keep + 1),
+            light_hash: 0,
+        }
+    }
+
+    /// Lets the mock live up to `now`, one slot at a time, and notes all light.
+    pub fn advance(&mut self, mock: &mut EmulatedProjector, now: HostTime) {
+        use dpm_device::transport::LinkDevice;
+        while let Some(due) = mock.next_due().filter(|&due| due <= now) {
+            let watch = Stopwatch::start();
+            mock.advance_to(due);
+            self.drain(mock.projector(), watch);
+        }
+        let watch = Stopwatch::start();
+        mock.advance_to(now);
+        self.drain(mock.projector(), watch);
+    }
+
+    fn drain(&mut self, mock: &mut MockProjector, watch: Stopwatch) {
+        while let Some(event) = mock.next_light() {
+            let mut hash = 0;
+            if event.kind == LightKind::Lit && (self.hash || self.keep > 0) {
+                if let Some(light) = mock.light_of_frame() {
+                    if self.hash {
+                        hash = hash_codes(light.iter().map(|c| u32::from_le_bytes([c[0], c[1], c[2], 0])));
+                        self.light_hash =
+                            (self.light_hash ^ hash).wrapping_mul(0x9e37_79b9_7f4a_7c15).rotate_left(23);
+                    }
+                    keep(&mut self.frames, self.keep, &event, light);
+                }
+            }
+            let torn = event.kind == LightKind::Lit && self.is_torn(mock, event.frame);
+            let note = LightNote { event, hash, torn, wall_ns: watch.elapsed_ns(), unseen: 0 };
+            if self.notes.as_mut().is_none_or(|notes| notes.push(note).is_err()) {
+                self.notes_lost += 1;
+            }
+        }
+    }
+
+    /// The hash of all light in order, in hexadecimal digits; `None` where it was not asked for.
+    pub fn hash(&self) -> Option<String> {
+        self.hash.then(|| format!("{:016x}", self.light_hash))
+    }
+
+    /// No more light will be noted: whoever takes the notes comes to their end.
+    pub fn close(&mut self) {
+        self.notes = None;
+    }
+
+    fn is_torn(&self, mock: &MockProjector, frame: Option<u32>) -> bool {
+        match (&self.marks, mock.lit_planes(), frame) {
+            (Some(schedule), Some(planes), Some(id)) => !is_whole(mock.raster(), schedule, planes, id),
+            _ => false,
+        }
+    }
+
+    /// The last frames of light, oldest first.
+    pub fn into_frames(self) -> Vec<LightFrame> {
+        self.frames.into()
+    }
+}
+
+/// Keeps a copy of `light`; the oldest frame's memory is used again when `limit` are kept.
+fn keep(frames: &mut VecDeque<LightFrame>, limit: usize, event: &LightEvent, light: &[[u8; 3]]) {
+    if limit == 0 {
+        return;
+    }
+    let mut codes =
+        if frames.len() >= limit { frames.pop_front().map_or(Vec::new(), |f| f.codes) } else { Vec::new() };
+    codes.clear();
+    codes.extend_from_slice(light);
+    frames.push_back(LightFrame {
+        frame: event.frame.unwrap_or(0),
+        first_photon_at: event.first_photon_at,
+        codes,
+    });
+}

@@ -1,0 +1,115 @@
+//! Where the tracker says the bodies are into a warning about one that never is where the projector's light can fall: millimetres taken for
+//! metres, axes exchanged, a camera calibrated against another origin.
+
+use dpm_scene::geometry::projector::ProjectorCamera;
+use glam::{DAffine3, DVec3};
+
+/// Frames for which the tracker had told of a body before it is judged. Not the frames for which it was new enough to be lit: a rig whose frames take longer than
+/// `safety.predict_ms` lights nothing, and wrong units are to be told all the same.
+const ENOUGH: u64 = 50;
+/// Points of a body that are looked at, at most.
+const POINTS: usize = 8;
+
+#[derive(Clone, Copy, Debug, Default)]
+struct Body {
+    tracked: u64,
+    within_reach: u64,
+    last: DVec3,
+}
+
+/// Looks at every frame, off the frame path.
+#[derive(Clone, Debug)]
+pub(super) struct Placement {
+    bodies: Vec<Body>,
+}
+
+impl Placement {
+    /// For `bodies` tracked bodies.
+    pub fn new(bodies: usize) -> Self {
+        Self { bodies: vec![Body::default(); bodies] }
+    }
+
+    /// A frame for world-from-body `poses`, which for those that are `seen` are where the tracker saw them last. `points` of each body, in its own space, say
+    /// how large it is.
+    pub fn observe(
+        &mut self,
+        camera: &ProjectorCamera,
+        poses: &[DAffine3],
+        seen: &[bool],
+        points: &[Vec<DVec3>],
+    ) {
+        let (width, height) = (f64::from(camera.raster.width()), f64::from(camera.raster.height()));
+        for (i, (body, pose)) in self.bodies.iter_mut().zip(poses).enumerate() {
+            if seen.get(i) != Some(&true) {
+                continue;
+            }
+            body.tracked += 1;
+            body.last = pose.translation;
+            let points = points.get(i).map_or(&[][..], Vec::as_slice);
+            let step = points.len().div_ceil(POINTS).max(1);
+            let lit = |p: DVec3| {
+                camera.project(p).is_some_and(|at| {
+                    (-0.5 * width..1.5 * width).contains(&at.x)
+                        && (-0.5 * height..1.5 * height).contains(&at.y)
+                })
+            };
+            let near =
+                lit(pose.translation) || points.iter().step_by(step).any(|p| lit(pose.transform_point3(*p)));
+            body.within_reach += u64::from(near);
+        }
+    }
+
+    /// One warning for each body that was tracked for long enough and never came near the light.
+    pub fn warnings(&self, names: &[String]) -> Vec<String> {
+        let lost = self.bodies.iter().zip(names).filter(|(b, _)| b.tracked >= ENOUGH && b.within_reach == 0);
+        let told = |(body, name): (&Body, &String)| {
+            let p = body.last;
+            format!(
+                "body \"{name}\": the tracker puts it at ({:.3}, {:.3}, {:.3}) m, and never where the projector's light can fall; check that the \
+                 tracking software streams metres, its axes and handedness, and the projector's pose",
+                p.x, p.y, p.z
+            )
+        };
+        lost.map(told).collect()
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::config::{Overrides, RigConfig};
+    use crate::rig::Rig;
+
+    /// Found in use, O4; T17: positions in millimetres, mirrored axes and exchanged axes are told of; true ones, at the edge and for a short while wrong
+    /// ones are not.
+    #[test]
+    fn wrong_units_and_axes_are_told() {
+        let config = RigConfig::demo(&Overrides::default()).unwrap_or_else(|e| panic!("{e}"));
+        let rig = Rig::build(&config, None).unwrap_or_else(|e| panic!("{e}"));
+        let names = vec!["hare".to_owned()];
+        let true_pose = rig.true_poses(dpm_device::time::HostTime(0).0).expect("the mock tells")[0];
+        let told = |wrong: &dyn Fn(DVec3) -> DVec3, seen: bool, frames: u64| {
+            let mut placement = Placement::new(1);
+            let pose = DAffine3 { translation: wrong(true_pose.translation), ..true_pose };
+            for _ in 0..frames {
+                placement.observe(&rig.camera, &[pose], &[seen], &[vec![DVec3::ZERO, DVec3::splat(0.05)]]);
+            }
+            placement.warnings(&names)
+        };
+        // The rig's frame: where the projector stands and looks.
+        let (from, depth) = (rig.camera.position(), rig.camera.to_projector_space(true_pose.translation).z);
+        assert_eq!(told(&|p| p, true, 1000), [] as [String; 0]);
+        // Behind the projector, as a flipped axis has it.
+        let behind = |p: DVec3| 2.0 * from - p;
+        let warning = told(&behind, true, ENOUGH);
+        assert_eq!(warning.len(), 1);
+        assert!(warning[0].contains("\"hare\"") && warning[0].contains("streams metres"), "{}", warning[0]);
+        // Sideways by three times its distance.
+        assert_eq!(told(&|p| p + DVec3::X * 3.0 * depth.abs(), true, ENOUGH).len(), 1);
+        // Too short to be judged; not tracked at all.
+        assert_eq!(told(&behind, true, ENOUGH - 1).len(), 0);
+        assert_eq!(told(&behind, false, 1000).len(), 0);
+        let thousandfold = told(&|p| 1000.0 * (p + DVec3::new(0.1, 0.2, 0.0)), true, ENOUGH);
+        assert_eq!(thousandfold.len(), 1, "{:?} from {from:?}", true_pose.translation);
+    }
+}

@@ -1,0 +1,120 @@
+//! Frames prepared ahead in place of rendered ones: a pattern that moves from frame to frame, each frame marked with its number, so
+//! that whoever sees the planes can tell whether they all belong to one frame.
+
+use dpm_device::planes::{Channel, PlaneSchedule, Raster};
+use dpm_render::pack::{self, BitPlaneFrame, Kernel};
+
+/// Positions of the pattern.
+const POSITIONS: usize = 4;
+/// Pixels by which the pattern moves from frame to frame: whole bytes of a plane.
+const STEP: usize = 8;
+/// Every how many rows the first pixel carries the frame's number.
+const MARK_ROWS: usize = 16;
+/// Bits of a code value, and of the number in a mark.
+const MARK_BITS: u32 = 0x00ff_ffff;
+
+/// Code values `0x00BBGGRR` of a picture, and a little more of it: each frame is the picture from a pixel further on. One picture takes no more
+/// of the caches than a renderer's output does, and more than a core has for itself.
+#[derive(Clone, Debug)]
+pub struct PreparedFrames {
+    raster: Raster,
+    codes: Vec<u32>,
+}
+
+impl PreparedFrames {
+    /// A pattern of ramps that moves by 8 pixels a frame and always sends out about the same light, so that it never flashes.
+    pub fn new(raster: Raster) -> Self {
+        let width = raster.width();
+        let pixels = raster.pixel_count() + STEP * (POSITIONS - 1);
+        let codes = (0..pixels as u32).map(|i| pattern(i % width, i / width));
+        Self { raster, codes: codes.collect() }
+    }
+
+    /// The code values of frame `id`.
+    fn frame(&mut self, id: u64) -> &mut [u32] {
+        let from = STEP * (id % POSITIONS as u64) as usize;
+        &mut self.codes[from..from + self.raster.pixel_count()]
+    }
+
+    /// Marks the next frame with its number and packs it.
+    pub fn pack(&mut self, kernel: Kernel, id: u64, planes: &mut BitPlaneFrame) {
+        let rows = MARK_ROWS * self.raster.width() as usize;
+        let codes = self.frame(id);
+        // Marks of other positions stay where they are: lone pixels like any other.
+        codes.iter_mut().step_by(rows).for_each(|code| *code = id as u32 & MARK_BITS);
+        pack::pack(kernel, codes, planes);
+    }
+}
+
+/// A ramp in each channel, in a different direction each.
+fn pattern(x: u32, y: u32) -> u32 {
+    let (r, g, b) = (x & 0xff, (x ^ y) & 0xff, (x + 2 * y) & 0xff);
+    r | g << 8 | b << 16
+}
+
+/// True when every mark in `planes` (one after the other, in the order of `schedule`) is the number of frame `id`: no plane, and no
+/// part of one, is of another frame.
+pub fn is_whole(raster: Raster, schedule: &PlaneSchedule, planes: &[u8], id: u32) -> bool {
+    let rows = MARK_ROWS * raster.row_bytes();
+    planes.chunks_exact(raster.plane_bytes()).zip(schedule.planes()).all(|(plane, spec)| {
+        let channel = match spec.channel {
+            Channel::Red => 0,
+            Channel::Green | Channel::White => 8,
+            Channel::Blue => 16,
+        };
+        let expected = (id >> (channel + u32::from(spec.bit)) & 1) as u8;
+        plane.iter().step_by(rows).all(|byte| byte >> 7 == expected)
+    })
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_plane_or_a_part_of_one_from_another_frame_is_found() {
+        let raster = Raster::new(72, 40).unwrap();
+        for schedule in [PlaneSchedule::rgb24(), PlaneSchedule::mono8()] {
+            let mut prepared = PreparedFrames::new(raster);
+            let (mut a, mut b) = (BitPlaneFrame::new(raster, schedule), BitPlaneFrame::new(raster, schedule));
+            for (id, other) in [(1u32, 2u32), (0x00a5_5a0f, 0x005a_a5f0)] {
+                prepared.pack(Kernel::best(), u64::from(id), &mut a);
+                prepared.pack(Kernel::best(), u64::from(other), &mut b);
+                assert!(is_whole(raster, &schedule, a.bytes(), id));
+                let in_mark = if schedule.len() == 24 { MARK_BITS } else { 0xff00 };
+                assert_eq!(is_whole(raster, &schedule, a.bytes(), other), (id ^ other) & in_mark == 0);
+                // One plane whose bit differs, from its 17th row on: the upper half is of the right frame.
+                for (k, spec) in schedule.planes().iter().enumerate() {
+                    let mut torn = a.bytes().to_vec();
+                    let half = k * raster.plane_bytes() + 16 * raster.row_bytes();
+                    let end = (k + 1) * raster.plane_bytes();
+                    torn[half..end].copy_from_slice(&b.bytes()[half..end]);
+                    let channel = if schedule.len() == 8 { 8 } else { 8 * spec.channel as u32 };
+                    let differs = (id ^ other) >> (channel + u32::from(spec.bit)) & 1 == 1;
+                    assert_eq!(is_whole(raster, &schedule, &torn, id), !differs, "plane {k}");
+                }
+            }
+        }
+    }
+
+    /// About the same light in every frame: nothing that a limiter of flashes would stop.
+    #[test]
+    fn the_pattern_moves_and_sends_out_the_same_light() {
+        let raster = Raster::new(1024, 768).unwrap();
+        let mut prepared = PreparedFrames::new(raster);
+        let light = |frame: &[u32]| -> u64 {
+            frame.iter().map(|c| u64::from((c & 0xff) + (c >> 8 & 0xff) + (c >> 16))).sum()
+        };
+        let first = prepared.frame(0).to_vec();
+        let mut before = first.clone();
+        for id in 1..POSITIONS as u64 {
+            let frame = prepared.frame(id);
+            assert_eq!(frame[..1000], before[STEP..1000 + STEP], "moved");
+            assert_ne!(frame, before);
+            // The smallest change that counts as half a flash is a tenth of full.
+            assert!(light(frame).abs_diff(light(&first)) * 1000 < light(&first));
+            before = frame.to_vec();
+        }
+        assert_eq!(prepared.frame(POSITIONS as u64), first);
+    }
+}

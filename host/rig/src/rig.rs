@@ -1,0 +1,415 @@
+//! A checked configuration into the parts of a rig: scene, projector, bodies with their motions, tracker.
+
+use crate::config::{
+    BodyConfig, BuiltinScene, CalibrationUnit, EnvironmentConfig, GazeConfig, RigConfig, TrackerConfig,
+};
+use crate::tracks::source::{self, SourceError};
+use dpm_device::planes::Raster;
+use dpm_device::pose::Pose;
+use dpm_device::regular_file;
+use dpm_device::time::{FrameRate, HostClock, HostTime};
+use dpm_device::tracker::{BodyKey, Tracker};
+use dpm_scene::geometry::distortion::Distortion;
+use dpm_scene::geometry::opencv::{self, LengthUnit};
+use dpm_scene::geometry::projector::{ProjectorCamera, ProjectorError};
+use dpm_scene::{BodySelector, Environment, LoadOptions, Scene, SceneError, SceneFeatures};
+use glam::{DAffine3, DQuat, DVec3, Vec3};
+use hil_mock::motion::{Motion, MotionError, MotionSpec};
+use std::sync::Arc;
+
+/// Why a rig cannot be built from a configuration that is valid by itself.
+#[derive(Debug, thiserror::Error)]
+pub enum RigError {
+    /// The scene.
+    #[error(transparent)]
+    Scene(#[from] SceneError),
+    /// The projector's pose or lens.
+    #[error(transparent)]
+    Projector(#[from] ProjectorError),
+    /// A body's motion.
+    #[error("scene.bodies[{index}] \"{name}\": motion: {source}")]
+    Motion {
+        /// Index in the rig file.
+        index: usize,
+        /// Its name.
+        name: String,
+        /// What is wrong.
+        source: MotionError,
+    },
+    /// A motion table that cannot be read.
+    #[error("scene.bodies[{index}] \"{name}\": motion: {message}")]
+    MotionTable {
+        /// Index in the rig file.
+        index: usize,
+        /// Its name.
+        name: String,
+        /// What is wrong.
+        message: String,
+    },
+    /// The tracker.
+    #[error(transparent)]
+    Tracker(#[from] SourceError),
+    /// The calibration file.
+    #[error("projector.calibration: {path}: {message}")]
+    Calibration {
+        /// Which file.
+        path: String,
+        /// What is wrong.
+        message: String,
+    },
+    /// A name that no body has.
+    #[error("{key}: no body is named \"{name}\"; bodies: {known}")]
+    UnknownBody {
+        /// Configuration key.
+        key: &'static str,
+        /// Name given.
+        name: String,
+        /// Names there are.
+        known: String,
+    },
+    /// A kind of part that this build does not drive.
+    #[error("{0}")]
+    Unsupported(String),
+}
+
+/// One tracked body of the rig.
+#[derive(Clone, Debug)]
+pub struct RigBody {
+    /// Name, as the tracker reports it.
+    pub name: String,
+    /// Pose at rest.
+    pub rest: Pose,
+    /// How it truly moves; known only when the tracker is the mock.
+    pub motion: Option<Motion>,
+}
+
+/// Where the eye is and where it looks, given the poses of the tracked bodies.
+#[derive(Clone, Debug)]
+pub struct Observer {
+    position: DVec3,
+    carrier: Option<usize>,
+    eye_offset: DVec3,
+    gaze: Gaze,
+    gaze_hold_ns: i64,
+    gaze_widen_deg_per_s: f64,
+}
+
+#[derive(Clone, Debug)]
+enum Gaze {
+    Point(DVec3),
+    Body(usize),
+    Straight,
+}
+
+impl Observer {
+    /// The same eye, but looking at a fixed point of the world.
+    pub fn looking_at(self, point: DVec3) -> Self {
+        Self { gaze: Gaze::Point(point), ..self }
+    }
+
+    /// The tracked body without which the gaze is not known; `None` for a gaze that does not depend on a tracker.
+    pub fn gaze_body(&self) -> Option<usize> {
+        match self.gaze {
+            Gaze::Point(_) => None,
+            Gaze::Body(i) => Some(i),
+            Gaze::Straight => self.carrier,
+        }
+    }
+
+    /// By how much all zones about the gaze grow when its body was last seen `unseen_ns` ago, degrees: 0 while it is held, 180 at most.
+    pub fn widening_deg(&self, unseen_ns: i64) -> f64 {
+        let beyond_s = unseen_ns.saturating_sub(self.gaze_hold_ns).max(0) as f64 * 1e-9;
+        (beyond_s * self.gaze_widen_deg_per_s).min(180.0)
+    }
+
+    /// Eye and gaze point, world.
+    pub fn eye_and_gaze(&self, world_from_body: &[DAffine3]) -> (DVec3, DVec3) {
+        let carrier = self.carrier.and_then(|i| world_from_body.get(i));
+        let eye = carrier.map_or(self.position, |m| m.transform_point3(self.eye_offset));
+        let gaze = match self.gaze {
+            Gaze::Point(p) => p,
+            Gaze::Body(i) => world_from_body.get(i).map_or(eye - DVec3::Z, |m| m.translation),
+            Gaze::Straight => eye + carrier.map_or(-DVec3::Z, |m| m.transform_vector3(-DVec3::Z)),
+        };
+        (eye, gaze)
+    }
+}
+
+/// All that a run needs and that does not change while it runs.
+pub struct Rig {
+    /// The configuration it was built from.
+    pub config: RigConfig,
+    /// What is to be seen.
+    pub scene: Scene,
+    /// The projector at the raster that is traced and projected.
+    pub camera: ProjectorCamera,
+    /// Tracked bodies in the order of the rig file.
+    pub bodies: Vec<RigBody>,
+    /// The eye.
+    pub observer: Observer,
+}
+
+/// A rigid transform from a pose.
+pub fn affine(pose: &Pose) -> DAffine3 {
+    DAffine3::from_rotation_translation(
+        DQuat::from_array(pose.rotation_xyzw).normalize(),
+        DVec3::from_array(pose.position_m),
+    )
+}
+
+/// The pose of a rigid transform.
+pub fn pose_of(m: &DAffine3) -> Pose {
+    let (_, rotation, translation) = m.to_scale_rotation_translation();
+    Pose { position_m: translation.to_array(), rotation_xyzw: rotation.normalize().to_array() }
+}
+
+impl Rig {
+    /// Builds the parts. `raster` replaces the projector's (software Vulkan); the field of view stays.
+    ///
+    /// # Errors
+    /// Whatever part cannot be built, with its key.
+    pub fn build(config: &RigConfig, raster: Option<Raster>) -> Result<Self, RigError> {
+        let mut scene = load_scene(config)?;
+        let features = SceneFeatures::of(&scene);
+        let has_lights = features.emissive_triangles + features.punctual_lights > 0;
+        let (fitted, told) = environment(config, has_lights)?.unwrap_or(scene.environment).fitted();
+        scene.environment = fitted;
+        scene.warnings.extend(told.map(|t| format!("scene.environment: {t}")));
+        let raster = raster.unwrap_or_else(|| config.projector.raster());
+        let camera = camera(config, raster, &mut scene.warnings)?;
+        let bodies = rig_bodies(config, &scene)?;
+        let observer = observer(config, &bodies)?;
+        Ok(Self { config: config.clone(), scene, camera, bodies, observer })
+    }
+
+    /// Frames a second.
+    pub fn rate(&self) -> FrameRate {
+        self.config.projector.frame_rate
+    }
+
+    /// The tracker that the configuration asks for. Time 0 of the mock's motions is instant 0 of the host's clock; a recording
+    /// starts at `start`.
+    ///
+    /// # Errors
+    /// Its address, file or numbers are wrong.
+    pub fn tracker(&self, clock: Arc<dyn HostClock>, start: HostTime) -> Result<Box<dyn Tracker>, RigError> {
+        let named = &self.config.scene.bodies;
+        let keys = self
+            .bodies
+            .iter()
+            .enumerate()
+            .map(|(i, b)| BodyKey { name: b.name.clone(), id: named.get(i).and_then(|c| c.id) });
+        let motions = self.bodies.iter().filter_map(|b| b.motion.clone()).collect();
+        Ok(source::open(&self.config.tracker, keys.collect(), motions, clock, start)?)
+    }
+
+    /// True world-from-body of every tracked body at an instant; `None` unless the tracker is the mock.
+    pub fn true_poses(&self, t_ns: i64) -> Option<Vec<DAffine3>> {
+        self.bodies.iter().map(|b| b.motion.as_ref().map(|m| affine(&m.pose_at(t_ns)))).collect()
+    }
+
+    /// Spreads poses of tracked bodies over the bodies of the scene; what is not tracked stays at rest. Allocates nothing when
+    /// `out` has room.
+    pub fn scene_poses(&self, tracked: &[DAffine3], out: &mut Vec<DAffine3>) {
+        out.clear();
+        out.extend(self.scene.bodies.iter().map(|b| {
+            b.tracked.and_then(|i| tracked.get(usize::from(i))).copied().unwrap_or(b.world_from_body_rest)
+        }));
+    }
+
+    /// `pi * exposure / (albedo * max_intensity)`.
+    pub fn drive_gain(&self) -> f32 {
+        let c = &self.config;
+        (std::f64::consts::PI * c.render.exposure / (c.scene.surface_albedo * c.projector.max_intensity))
+            as f32
+    }
+}
+
+fn load_scene(config: &RigConfig) -> Result<Scene, SceneError> {
+    let c = &config.scene;
+    let Some(file) = &c.file else {
+        return Ok(match c.builtin {
+            BuiltinScene::Demo => dpm_scene::builtin(),
+        });
+    };
+    let options = LoadOptions {
+        bodies: c
+            .bodies
+            .iter()
+            .map(|b| BodySelector { name: b.name.clone(), node: b.node.clone(), projected: true })
+            .collect(),
+        virtual_nodes: c.virtual_nodes.clone(),
+        ..LoadOptions::default()
+    };
+    dpm_scene::load(file, &options)
+}
+
+/// Radiance from all around for files with lamps; files bring no environment of their own.
+const FILE_SCENE_RADIANCE: f32 = 0.25;
+
+/// The environment of the rig file, for a scene that has lights or has none; `None` keeps the scene's own (the built-in scene brings one).
+fn environment(config: &RigConfig, has_lights: bool) -> Result<Option<Environment>, RigError> {
+    let even = |[r, g, b]: [f64; 3]| Environment::Constant(Vec3::new(r as f32, g as f32, b as f32));
+    Ok(match &config.scene.environment {
+        EnvironmentConfig::Auto(_) if config.scene.file.is_none() => None,
+        EnvironmentConfig::Auto(_) if !has_lights => Some(dpm_scene::studio()),
+        EnvironmentConfig::Studio(_) => Some(dpm_scene::studio()),
+        EnvironmentConfig::Auto(_) => Some(Environment::Constant(Vec3::splat(FILE_SCENE_RADIANCE))),
+        EnvironmentConfig::Constant(c) => Some(even(c.radiance)),
+        EnvironmentConfig::Image(c) => {
+            Some(dpm_scene::load_environment(&c.file, c.rotation_deg.to_radians() as f32, c.scale as f32)?)
+        }
+    })
+}
+
+/// The projector's camera at `raster`, from its calibration or from position and direction; what is not reproduced goes to
+/// `warnings`.
+fn camera(
+    config: &RigConfig,
+    raster: Raster,
+    warnings: &mut Vec<String>,
+) -> Result<ProjectorCamera, RigError> {
+    let p = &config.projector;
+    let Some(path) = &p.calibration else {
+        return Ok(ProjectorCamera::look_at(
+            raster,
+            DVec3::from_array(p.position),
+            DVec3::from_array(p.look_at),
+            DVec3::from_array(p.up),
+            p.horizontal_fov_deg.to_radians(),
+        )?);
+    };
+    let wrong = |message: String| RigError::Calibration { path: path.display().to_string(), message };
+    let unit = match p.calibration_unit {
+        Some(CalibrationUnit::Metre) => LengthUnit::Metre,
+        Some(CalibrationUnit::Millimetre) => LengthUnit::Millimetre,
+        None => return Err(wrong("projector.calibration_unit is missing".into())),
+    };
+    let text = regular_file::read_text(path, opencv::MAX_BYTES as u64).map_err(|e| wrong(e.to_string()))?;
+    let calibrated = p.calibrated_raster();
+    let stored = opencv::read(&text, calibrated, unit).map_err(|e| wrong(e.to_string()))?;
+    if stored.distortion != Distortion::default() {
+        warnings.push(format!(
+            "projector.calibration: {}: its lens distortion is not compensated; light is off by as much as the lens bends",
+            path.display()
+        ));
+    }
+    let c = stored.camera;
+    // The same view cut into other pixels. The camera's coordinates count from the raster's corner, so everything scales.
+    let scale_x = f64::from(raster.width()) / f64::from(calibrated.width());
+    let scale_y = f64::from(raster.height()) / f64::from(calibrated.height());
+    Ok(ProjectorCamera::new(
+        raster,
+        c.world_from_projector,
+        c.fx * scale_x,
+        c.fy * scale_y,
+        c.cx * scale_x,
+        c.cy * scale_y,
+    )?)
+}
+
+fn motion_spec(index: usize, body: &BodyConfig) -> Result<MotionSpec, RigError> {
+    match &body.motion.0 {
+        None => Ok(default_motion(index)),
+        Some(table) => toml::Value::Table(table.clone()).try_into().map_err(|e: toml::de::Error| {
+            RigError::MotionTable { index, name: body.name.clone(), message: e.message().to_owned() }
+        }),
+    }
+}
+
+/// The paper's experiment: the first body moves to and fro at 1 m/s, the second turns in place, others stand.
+fn default_motion(index: usize) -> MotionSpec {
+    match index {
+        0 => MotionSpec::paper_translation(),
+        1 => MotionSpec::Rotate {
+            axis: [0.0, 1.0, 0.0],
+            rate_rad_s: std::f64::consts::PI,
+            pivot_offset_m: [0.0; 3],
+        },
+        _ => MotionSpec::Still {},
+    }
+}
+
+fn rig_bodies(config: &RigConfig, scene: &Scene) -> Result<Vec<RigBody>, RigError> {
+    let named = &config.scene.bodies;
+    let count = scene.bodies.iter().filter_map(|b| b.tracked).map(|i| usize::from(i) + 1).max().unwrap_or(0);
+    let mock = matches!(config.tracker, TrackerConfig::Mock(_));
+    (0..count.max(named.len()))
+        .map(|i| {
+            let first = scene.bodies.iter().find(|b| b.tracked == Some(i as u16));
+            let rest = first.map_or(Pose::IDENTITY, |b| pose_of(&b.world_from_body_rest));
+            let name = named
+                .get(i)
+                .map(|b| b.name.clone())
+                .or_else(|| first.map(|b| b.name.clone()))
+                .unwrap_or_default();
+            let spec = match named.get(i) {
+                Some(body) => motion_spec(i, body)?,
+                None => default_motion(i),
+            };
+            let motion = if mock {
+                Some(Motion::new(&spec, rest).map_err(|source| RigError::Motion {
+                    index: i,
+                    name: name.clone(),
+                    source,
+                })?)
+            } else {
+                None
+            };
+            Ok(RigBody { name, rest, motion })
+        })
+        .collect()
+}
+
+fn observer(config: &RigConfig, bodies: &[RigBody]) -> Result<Observer, RigError> {
+    let find = |key: &'static str, name: &str| {
+        bodies.iter().position(|b| b.name == name).ok_or_else(|| RigError::UnknownBody {
+            key,
+            name: name.to_owned(),
+            known: bodies.iter().map(|b| b.name.as_str()).collect::<Vec<_>>().join(", "),
+        })
+    };
+    let c = &config.observer;
+    Ok(Observer {
+        position: DVec3::from_array(c.position),
+        carrier: c.body.as_deref().map(|n| find("observer.body", n)).transpose()?,
+        eye_offset: DVec3::from_array(c.eye_offset),
+        gaze: match &c.gaze {
+            GazeConfig::Point(p) => Gaze::Point(DVec3::from_array(p.point)),
+            GazeConfig::Tracked(t) => Gaze::Body(find("observer.gaze.target", &t.target)?),
+            GazeConfig::Straight(_) => Gaze::Straight,
+        },
+        gaze_hold_ns: i64::from(c.gaze_hold_ms) * 1_000_000,
+        gaze_widen_deg_per_s: c.gaze_widen_deg_per_s,
+    })
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::config::Overrides;
+
+    fn observer(settings: &[&str]) -> Observer {
+        let flags = settings.iter().map(|s| (*s).to_owned()).collect();
+        let config = RigConfig::demo(&Overrides { variables: vec![], flags }).unwrap();
+        Rig::build(&config, Raster::new(8, 8)).unwrap().observer
+    }
+
+    #[test]
+    fn a_gaze_that_is_lost_is_held_and_then_its_zones_grow() {
+        let o = observer(&["observer.gaze={kind=\"tracked\",target=\"venus\"}", "observer.gaze_hold_ms=100"]);
+        assert_eq!(o.gaze_body(), Some(1));
+        let after = |ms: i64| o.widening_deg(ms * 1_000_000);
+        // 60 degrees a second from 100 ms on.
+        assert_eq!([after(-5), after(0), after(100), after(600)], [0.0, 0.0, 0.0, 30.0]);
+        assert_eq!(o.widening_deg(i64::MAX), 180.0);
+    }
+
+    #[test]
+    fn a_gaze_that_no_tracker_tells_is_never_lost() {
+        assert_eq!(observer(&[]).gaze_body(), None);
+        assert_eq!(observer(&["observer.gaze={kind=\"straight\"}"]).gaze_body(), None);
+        let carried = observer(&["observer.gaze={kind=\"straight\"}", "observer.body=\"bunny\""]);
+        assert_eq!(carried.gaze_body(), Some(0));
+    }
+}

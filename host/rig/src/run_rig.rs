@@ -1,0 +1,242 @@
+//! `dpm run` and `dpm demo`: a rig from its configuration to its report and pictures.
+
+use super::pictures::{pictures, to_srgb};
+use crate::config::{ProjectorBackend, RigConfig};
+use crate::failure::{Ended, Failure, FailureKind};
+use crate::pipeline::{self, PipelineError, RunOptions, RunOutcome};
+use crate::rig::{Rig, RigError};
+use crate::telemetry::monitor::RunMonitor;
+use crate::telemetry::report::Report;
+use crate::telemetry::trace::write_trace;
+use crate::tracks::source::SourceError;
+use dpm_common::files::{check_folder, write_atomically};
+use dpm_device::planes::Raster;
+use dpm_render::gpu::{validation_messages, Gpu, GpuError, GpuOptions};
+use dpm_render::method::Method;
+use dpm_render::{RenderError, Renderer, RendererSettings};
+use glam::Vec3;
+use std::path::{Path, PathBuf};
+use std::sync::Arc;
+
+/// Runs the rig until its frames are lit or `monitor` asks to stop; writes what `[output]` asks for.
+///
+/// # Errors
+/// Bad scene or numbers (exit code 2), a device that fails (3), no GPU (4).
+///
+/// What goes wrong after the run leaves the report as it is, so that nobody loses what was measured: see [`Ended`].
+pub fn run_rig(config: &RigConfig, monitor: &Arc<RunMonitor>) -> Result<Ended<Report>, Failure> {
+    // Not after the run whose report is to lie there.
+    check_output_folder(&config.output.dir)?;
+    let gpu = open_gpu(config)?;
+    let mut notes = Vec::new();
+    let raster = traced_raster(config, &gpu, &mut notes);
+    let rig = Arc::new(Rig::build(config, raster)?);
+    let output = &config.output;
+    // Pictures are made of the light itself, which only the mock sees.
+    let has_light = matches!(config.projector.backend, ProjectorBackend::Mock(_));
+    if output.images && !has_light {
+        notes.push(
+            "output.images: the light of a projector outside is not seen, no pictures are written".into(),
+        );
+    }
+    if config.projector.planes == 8 {
+        notes.push(
+            "projector.planes = 8: the one white channel shows the green of the picture; red and blue alone stay dark".into(),
+        );
+    }
+    let window = (config.light_window_ms() * 1e-3 * rig.rate().hz()).round().max(1.0) as usize;
+    tell_at_the_start(&rig, &notes, monitor);
+    let keep_frames = if output.images && has_light { window } else { 0 };
+    let slots = config.slots_to_run();
+    let options = RunOptions { frames: config.run.frames, slots, keep_frames, ..RunOptions::default() };
+    let mut outcome = pipeline::run(rig.clone(), &gpu, options, monitor)?;
+    let _writing = dpm_common::stopping::WritingFiles::begin();
+    let mut ended = Ended::from(std::mem::take(&mut outcome.report));
+    ended.report.warnings.splice(0..0, notes);
+    if outcome.light_mismatches > 0 {
+        let told = format!("{} frames of light differ from what was rendered", outcome.light_mismatches);
+        ended.fail(Failure::new(FailureKind::CheckFailed, told));
+    }
+    if keep_frames > 0 {
+        let written = write_pictures(&rig, &gpu, &outcome);
+        if let Some((files, why_not)) = ended.keep(written) {
+            ended.report.files.extend(files);
+            ended.report.warnings.extend(why_not);
+        }
+    }
+    if output.trace {
+        let path = output.dir.join("trace.json");
+        let written = write_atomically(&path, |out| write_trace(out, &outcome.traced, &outcome.standstills));
+        if ended.keep(written.map_err(|e| cannot_write(&path, &e))).is_some() {
+            ended.report.files.push(path);
+        }
+    }
+    let (count, texts) = validation_messages();
+    if let Some(first) = texts.first() {
+        ended
+            .report
+            .warnings
+            .push(format!("{count} messages of the Vulkan validation layer, the first: {first}"));
+    }
+    let path = output.dir.join("report.json");
+    ended.report.files.push(path.clone());
+    let text = ended.report.to_json();
+    let written = write_atomically(&path, |out| std::io::Write::write_all(out, text.as_bytes()));
+    if ended.keep(written.map_err(|e| cannot_write(&path, &e))).is_none() {
+        ended.report.files.pop();
+    }
+    Ok(ended)
+}
+
+/// Most lines that are told at the start; the report has all of them.
+const TOLD: usize = 12;
+
+/// Tells what is known before the first frame: what is changed of the rig, what the scene loses, and bodies that have nothing to show. All of it stands in the
+/// report too, but that comes after the light.
+fn tell_at_the_start(rig: &Rig, notes: &[String], monitor: &RunMonitor) {
+    let shown = |i: usize| rig.scene.bodies.iter().any(|b| b.tracked.map(usize::from) == Some(i));
+    let known: Vec<&str> = rig.scene.bodies.iter().map(|b| b.name.as_str()).collect();
+    let empty = rig.bodies.iter().enumerate().filter(|(i, _)| !shown(*i)).map(|(_, body)| {
+        format!(
+            "body {:?} does not exist in the scene, so no light falls on it, wherever the {} tracker says that it is; the scene has {}",
+            body.name,
+            rig.config.tracker.word(),
+            known.join(", ")
+        )
+    });
+    let all: Vec<String> =
+        empty.chain(notes.iter().cloned()).chain(rig.scene.warnings.iter().cloned()).collect();
+    all.iter().take(TOLD).for_each(|line| monitor.note(line.clone()));
+    if all.len() > TOLD {
+        monitor.note(format!("and {} more: see the report", all.len() - TOLD));
+    }
+}
+
+/// Writes what the kept light allows of `light.png` and `viewer.png`; the files, and why one is missing.
+fn write_pictures(
+    rig: &Rig,
+    gpu: &Arc<Gpu>,
+    outcome: &RunOutcome,
+) -> Result<(Vec<PathBuf>, Option<String>), Failure> {
+    let dir = &rig.config.output.dir;
+    if outcome.light.is_empty() {
+        let why = "output.images: no frame was lit, so there is no light to make pictures of";
+        return Ok((Vec::new(), Some(why.into())));
+    }
+    // Only surfaces are asked of it, so the simplest method will do.
+    let settings = RendererSettings { method: Method::full(1), ..pipeline::renderer_settings(rig) };
+    let mut renderer = Renderer::new(gpu, &rig.scene, settings).map_err(PipelineError::from)?;
+    let made = pictures(rig, &mut renderer, &outcome.light, &outcome.recent)
+        .map_err(|e| Failure::from(PipelineError::Render(e.into())))?;
+    let mut files = vec![save(dir, "light.png", rig, &made.light, 1.0)?];
+    let why_not = match &made.viewer {
+        Ok(viewer) => {
+            let white = viewer.iter().fold(0.0f32, |m, v| m.max(v.max_element())).max(1e-9);
+            files.push(save(dir, "viewer.png", rig, viewer, (1.0 / white).min(1.0))?);
+            None
+        }
+        Err(why) => Some(format!("output.images: no viewer.png: {why}")),
+    };
+    Ok((files, why_not))
+}
+
+/// Sees that files can be written into the folder of the output, before the work.
+///
+/// # Errors
+/// They cannot; the message names the folder.
+pub fn check_output_folder(dir: &Path) -> Result<(), Failure> {
+    check_folder(dir)
+        .map_err(|e| Failure::new(FailureKind::BadInput, format!("{e}; choose another folder with --out")))
+}
+
+/// Opens the device that the rig file names.
+///
+/// # Errors
+/// Exit code 4 with what to install.
+pub fn open_gpu(config: &RigConfig) -> Result<Arc<Gpu>, Failure> {
+    let options = GpuOptions {
+        validation: std::env::var_os("DPM_VALIDATION").is_some(),
+        device: config.render.gpu.clone(),
+    };
+    Gpu::open(&options).map_err(|e| Failure::new(FailureKind::NoGpu, e))
+}
+
+/// Software Vulkan traces a smaller raster, and says so.
+pub fn traced_raster(config: &RigConfig, gpu: &Gpu, notes: &mut Vec<String>) -> Option<Raster> {
+    let [width, height] = config.render.software_raster;
+    let small = Raster::new(width, height)?;
+    let full = config.projector.raster();
+    if !gpu.summary().software || small.pixel_count() >= full.pixel_count() {
+        return None;
+    }
+    if !matches!(config.projector.backend, ProjectorBackend::Mock(_)) {
+        // A real panel has the mirrors that it has.
+        notes.push(format!(
+            "no GPU: software Vulkan ({}) traces all {} x {} mirrors of the projector, which is slow",
+            gpu.summary().name,
+            full.width(),
+            full.height()
+        ));
+        return None;
+    }
+    notes.push(format!(
+        "no GPU: software Vulkan ({}) traces {width} x {height} instead of {} x {}; --raster changes it",
+        gpu.summary().name,
+        full.width(),
+        full.height()
+    ));
+    Some(small)
+}
+
+fn save(dir: &Path, name: &str, rig: &Rig, linear: &[Vec3], scale: f32) -> Result<PathBuf, Failure> {
+    let path = dir.join(name);
+    let raster = rig.camera.raster;
+    std::fs::create_dir_all(dir).map_err(|e| cannot_write(dir, &e))?;
+    image::save_buffer(
+        &path,
+        &to_srgb(linear, scale),
+        raster.width(),
+        raster.height(),
+        image::ColorType::Rgb8,
+    )
+    .map_err(|e| cannot_write(&path, &e))?;
+    Ok(path)
+}
+
+/// A failure that says which file cannot be written, and why.
+pub fn cannot_write(path: &Path, error: &dyn std::fmt::Display) -> Failure {
+    Failure::new(
+        FailureKind::BadInput,
+        format!("cannot write {}: {error}; choose another folder with --out", path.display()),
+    )
+}
+
+impl From<RigError> for Failure {
+    fn from(error: RigError) -> Self {
+        let kind = match error {
+            RigError::Tracker(SourceError::Tracker(_)) => FailureKind::Device,
+            _ => FailureKind::BadInput,
+        };
+        Self::new(kind, error)
+    }
+}
+
+impl From<PipelineError> for Failure {
+    fn from(error: PipelineError) -> Self {
+        let kind = match &error {
+            PipelineError::Rig(RigError::Tracker(SourceError::Tracker(_)))
+            | PipelineError::Connect(_)
+            | PipelineError::Thread { .. } => FailureKind::Device,
+            PipelineError::Rig(_) | PipelineError::Render(RenderError::Scene(_) | RenderError::Raster(_)) => {
+                FailureKind::BadInput
+            }
+            PipelineError::Render(RenderError::Gpu(e)) | PipelineError::Gpu { source: e, .. } => match e {
+                GpuError::OutOfMemory { .. } | GpuError::Limit { .. } => FailureKind::BadInput,
+                _ => FailureKind::NoGpu,
+            },
+            PipelineError::Panicked(_) | PipelineError::Hung { .. } => FailureKind::Device,
+            PipelineError::GpuHangs { .. } | PipelineError::KeepsFailing { .. } => FailureKind::NoGpu,
+        };
+        Self::new(kind, error)
+    }
+}

@@ -1,0 +1,329 @@
+//! Orders that outlive the program: one small file for each projector, in a state folder. What cannot be read counts as SAFE.
+//!
+//! SAFE stands until a person says `dpm arm` to a running rig, over restarts of the program, the service and the machine. BLACK and
+//! FREEZE stand as long as the run that they were given to; where that died without an orderly end, they stand as BLACK (there is no
+//! frame left to hold). `docs/ORDERS.md` says this to operators.
+
+use crate::config::ProjectorBackend;
+use crate::telemetry::monitor::Order;
+use dpm_common::folder::{Folder, FolderError, Owner};
+use dpm_common::unix::{user, user_name};
+use std::fmt;
+use std::io;
+use std::path::PathBuf;
+use std::time::{SystemTime, UNIX_EPOCH};
+
+/// Version of the files' content.
+const VERSION: u32 = 1;
+/// A file that is longer is damaged.
+const MAX_BYTES: u64 = 4096;
+/// Ending of the files' names.
+const ENDING: &str = ".order";
+/// Longest name of a file without its ending; beyond that it is cut and made different by a hash.
+const MAX_STEM: usize = 160;
+
+/// Which projector: what locks, standing orders and messages call it.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct Identity {
+    what: String,
+    /// What all projectors of the kind have in common in the names of their files.
+    family: String,
+    /// What tells it from others of the kind; `None` where the rig file takes any.
+    serial: Option<String>,
+    is_mock: bool,
+}
+
+impl Identity {
+    /// The projector of a rig file.
+    pub fn of(backend: &ProjectorBackend) -> Self {
+        let or_any = |s: &Option<String>| s.clone().unwrap_or_else(|| "any".into());
+        let (what, family, serial) = match backend {
+            ProjectorBackend::Mock(_) => ("mock projector".into(), "mock projector".into(), None),
+            ProjectorBackend::Usb(usb) => {
+                let family = format!("USB projector {:04x}:{:04x}", usb.vendor_id, usb.product_id);
+                (format!("{family} {}", or_any(&usb.serial_number)), family, usb.serial_number.clone())
+            }
+            ProjectorBackend::Serial(port) => {
+                ("projector on ".to_owned() + &port.port, "projector on".into(), Some(port.port.clone()))
+            }
+            // It is told by its place on the bus, which is another one after every re-plug: an order for one holds for all.
+            ProjectorBackend::Dlpc900(dlpc) => {
+                (format!("DLPC900 {}", or_any(&dlpc.device)), "DLPC900".into(), None)
+            }
+        };
+        Self {
+            what,
+            family: plain(&family),
+            serial: serial.as_deref().map(plain),
+            is_mock: matches!(backend, ProjectorBackend::Mock(_)),
+        }
+    }
+
+    /// As messages call it.
+    pub fn what(&self) -> &str {
+        &self.what
+    }
+
+    /// True for the projector inside this process, which lights nothing.
+    pub fn is_mock(&self) -> bool {
+        self.is_mock
+    }
+
+    /// Name of its lock file.
+    pub fn lock_name(&self) -> String {
+        short(&plain(&self.what)) + ".lock"
+    }
+
+    /// Name of the file of its standing order.
+    pub fn order_name(&self) -> String {
+        short(&format!("{}-{}", self.family, self.serial.as_deref().unwrap_or("any"))) + ENDING
+    }
+
+    /// True when an order in the file `name` is for this projector: its own; the one for any of the kind; and where the rig file takes
+    /// any of the kind, the one for each of them.
+    fn is_meant_by(&self, name: &str) -> bool {
+        let any = short(&format!("{}-any", self.family)) + ENDING;
+        name == self.order_name()
+            || name == any
+            || self.serial.is_none()
+                && name.ends_with(ENDING)
+                && name.starts_with(&(self.family.clone() + "-"))
+    }
+}
+
+impl fmt::Display for Identity {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.write_str(&self.what)
+    }
+}
+
+/// Letters and digits of `text`; what is between them as dashes.
+fn plain(text: &str) -> String {
+    text.chars().map(|c| if c.is_ascii_alphanumeric() { c } else { '-' }).collect()
+}
+
+/// `stem` where it can be the name of a file, else its beginning and a hash of the whole (FNV-1a).
+fn short(stem: &str) -> String {
+    if stem.len() <= MAX_STEM {
+        return stem.to_owned();
+    }
+    let hash =
+        stem.bytes().fold(0xcbf2_9ce4_8422_2325u64, |h, b| (h ^ u64::from(b)).wrapping_mul(0x100_0000_01b3));
+    format!("{}-{hash:016x}", &stem[..MAX_STEM])
+}
+
+/// Who gave an order.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum By {
+    /// A user, over the control socket.
+    Socket {
+        /// As the kernel says it.
+        uid: u32,
+    },
+    /// A key on the terminal of the run.
+    Key,
+    /// A signal.
+    Signal,
+    /// The projector, which had it latched when the link came up.
+    Projector,
+}
+
+impl fmt::Display for By {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        match self {
+            Self::Socket { uid } => write!(f, "user {} over the control socket", user_name(*uid)),
+            Self::Key => write!(f, "a key"),
+            Self::Signal => write!(f, "a signal"),
+            Self::Projector => write!(f, "the projector, which had it latched"),
+        }
+    }
+}
+
+/// Content of a file.
+#[derive(serde::Serialize, serde::Deserialize)]
+struct Content {
+    version: u32,
+    order: String,
+    at: String,
+    by: String,
+    process: u32,
+    projector: String,
+}
+
+/// An order that stands when a run starts: the rig comes up and does not arm.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct Stands {
+    /// BLACK or SAFE.
+    pub order: Order,
+    /// Since when, and by whom; or why it counts as SAFE.
+    pub told: String,
+}
+
+/// Where the files are: `$DPM_STATE_DIR`, else systemd's `$STATE_DIRECTORY`, else `/var/lib/dpm` for root, else `$XDG_STATE_HOME/dpm`
+/// or `~/.local/state/dpm`. `None` for a user without a home.
+pub fn state_folder() -> Option<PathBuf> {
+    choose(&|name| std::env::var_os(name).filter(|v| !v.is_empty()).map(PathBuf::from), user() == 0)
+}
+
+fn choose(variable: &dyn Fn(&str) -> Option<PathBuf>, is_root: bool) -> Option<PathBuf> {
+    // Several folders are separated by colons; the first is the unit's own.
+    let systemd = || {
+        let list = variable("STATE_DIRECTORY")?.into_os_string().into_string().ok()?;
+        list.split(':').next().filter(|first| !first.is_empty()).map(PathBuf::from)
+    };
+    let absolute = |name| variable(name).filter(|path| path.is_absolute());
+    variable("DPM_STATE_DIR")
+        .or_else(systemd)
+        .or_else(|| is_root.then(|| "/var/lib/dpm".into()))
+        .or_else(|| absolute("XDG_STATE_HOME").map(|dir| dir.join("dpm")))
+        .or_else(|| absolute("HOME").map(|dir| dir.join(".local/state/dpm")))
+}
+
+/// The file of one projector.
+#[derive(Debug)]
+pub struct OrderFile {
+    identity: Identity,
+    folder: Option<Folder>,
+    path: PathBuf,
+}
+
+impl OrderFile {
+    /// Opens the state folder `path`, which is made where it is missing, and reads what stands for `identity`. A folder that cannot be
+    /// used is the second part of the answer; the file then keeps nothing.
+    pub fn open(path: Option<PathBuf>, identity: Identity) -> (Self, Option<FolderError>, Option<Stands>) {
+        let Some(path) = path else {
+            let source = io::Error::new(io::ErrorKind::NotFound, "this user has no home; set DPM_STATE_DIR");
+            let error = FolderError::Io { path: "(no state folder)".into(), source };
+            return (Self { identity, folder: None, path: PathBuf::new() }, Some(error), None);
+        };
+        let stands = standing_in(&path, &identity);
+        let usable = Folder::make(&path, Owner::OwnOrAnyForRoot).and_then(|folder| {
+            let trial = format!(".trial-{}", std::process::id());
+            folder.replace(&trial, b"")?;
+            folder.remove(&trial)?;
+            Ok(folder)
+        });
+        let (folder, error) = match usable {
+            Ok(folder) => (Some(folder), None),
+            Err(e) => (None, Some(e)),
+        };
+        (Self { identity, folder, path }, error, stands)
+    }
+
+    /// Where orders for this projector are kept.
+    pub fn path(&self) -> PathBuf {
+        self.path.join(self.identity.order_name())
+    }
+
+    /// Keeps `order`, which is on the disk when this returns; a weaker one must not replace a stronger one, which is the caller's part.
+    /// Gives the path of the file.
+    ///
+    /// # Errors
+    /// The state folder could not be used at the start, or cannot be written to now.
+    pub fn keep(&self, order: Order, by: By) -> Result<PathBuf, FolderError> {
+        let Some(folder) = &self.folder else {
+            let source = io::Error::other("could not be used when the run began");
+            return Err(FolderError::Io { path: self.path.clone(), source });
+        };
+        let name = self.identity.order_name();
+        let content = Content {
+            version: VERSION,
+            order: order.word().into(),
+            at: utc(SystemTime::now()),
+            by: by.to_string(),
+            process: std::process::id(),
+            projector: self.identity.what.clone(),
+        };
+        let text = serde_json::to_string(&content)
+            .map_err(|e| FolderError::Io { path: folder.path().join(&name), source: e.into() })?;
+        folder.replace(&name, (text + "\n").as_bytes())?;
+        Ok(folder.path().join(name))
+    }
+
+    /// Forgets every order for this projector; that is on the disk when this returns. Where nothing can be kept there is nothing to
+    /// forget.
+    ///
+    /// # Errors
+    /// Those of the operating system; an order then still stands.
+    pub fn forget(&self) -> Result<(), FolderError> {
+        let Some(folder) = &self.folder else { return Ok(()) };
+        for name in folder.names()? {
+            if self.identity.is_meant_by(&name) {
+                folder.remove(&name)?;
+            }
+        }
+        Ok(())
+    }
+}
+
+/// What stands for `identity` in the state folder `path`. A missing folder holds nothing; one that cannot be read or trusted, and a file
+/// that is damaged or of a version that is not known, count as SAFE.
+pub fn standing_in(path: &std::path::Path, identity: &Identity) -> Option<Stands> {
+    let safe = |told: String| Some(Stands { order: Order::Safe, told });
+    let unreadable =
+        |e: FolderError| safe(format!("counts as SAFE, for the state folder cannot be read: {e}"));
+    let folder = match Folder::open(path, Owner::OwnOrAnyForRoot) {
+        Ok(folder) => folder,
+        Err(e) if e.is_missing() => return None,
+        Err(e) => return unreadable(e),
+    };
+    let names = match folder.names() {
+        Ok(names) => names,
+        Err(e) => return unreadable(e),
+    };
+    let mine = names.iter().filter(|name| identity.is_meant_by(name));
+    mine.map(|name| read(&folder, name)).max_by_key(|stands| stands.order.strength())
+}
+
+fn read(folder: &Folder, name: &str) -> Stands {
+    let parsed = folder.read(name, MAX_BYTES).map_err(|e| e.to_string()).and_then(|bytes| {
+        let content: Content = serde_json::from_slice(&bytes).map_err(|e| format!("damaged: {e}"))?;
+        if content.version != VERSION {
+            return Err(format!("version {} is not known", content.version));
+        }
+        match Order::from_word(&content.order) {
+            Some(Order::Arm) | None => Err(format!("damaged: {:?} is no order that stands", content.order)),
+            Some(order) => Ok((order, content)),
+        }
+    });
+    match parsed {
+        Ok((order, content)) => {
+            let held = if order == Order::Freeze {
+                " (FREEZE of a run that died: no frame is left to hold)"
+            } else {
+                ""
+            };
+            let clean = |text: &str| text.chars().filter(|c| !c.is_control()).take(200).collect::<String>();
+            Stands {
+                order: if order == Order::Safe { Order::Safe } else { Order::Black },
+                told: format!("since {}, ordered by {}{held}", clean(&content.at), clean(&content.by)),
+            }
+        }
+        Err(reason) => Stands {
+            order: Order::Safe,
+            told: format!(
+                "counts as SAFE, for {} cannot be read: {reason}",
+                folder.path().join(name).display()
+            ),
+        },
+    }
+}
+
+/// `at` as 2026-03-01T12:00:00Z (proleptic Gregorian calendar, leap seconds not counted); before 1970 as 1970.
+fn utc(at: SystemTime) -> String {
+    let seconds = at.duration_since(UNIX_EPOCH).map_or(0, |d| d.as_secs());
+    let (days, second) = (seconds / 86_400, seconds % 86_400);
+    // Days are counted from the first of March of the year 0: the leap day is then the last of its year.
+    let days = days + 719_468;
+    let (era, day) = (days / 146_097, days % 146_097);
+    let year = (day - day / 1460 + day / 36_524 - day / 146_096) / 365;
+    let day = day - (365 * year + year / 4 - year / 100);
+    let month = (5 * day + 2) / 153;
+    let (day, month) = (day - (153 * month + 2) / 5 + 1, if month < 10 { month + 3 } else { month - 9 });
+    let year = era * 400 + year + u64::from(month <= 2);
+    format!("{year:04}-{month:02}-{day:02}T{:02}:{:02}:{:02}Z", second / 3600, second / 60 % 60, second % 60)
+}
+
+#[cfg(test)]
+#[path = "standing_tests.rs"]
+mod tests;

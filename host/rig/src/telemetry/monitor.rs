@@ -1,0 +1,507 @@
+//! Counters that a running pipeline keeps and a watching thread reads, and the operator's wishes the other way: stop, and the verbs of
+//! a projector.
+
+use super::ordered::DarkLog;
+use crate::interlock::Interlock;
+use dpm_common::stopping;
+use dpm_device::link::{faults, LimitReached};
+use std::collections::VecDeque;
+use std::fmt;
+use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
+use std::sync::{Mutex, OnceLock, PoisonError};
+
+/// Notes that wait for the watching thread; further ones are only counted.
+const NOTES: usize = 64;
+
+/// What an operator can ask of the projector of a running rig.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+#[repr(u8)]
+pub enum Order {
+    /// Dark at once; frames go on being made.
+    Black = 1,
+    /// Hold the frame that is lit.
+    Freeze = 2,
+    /// Dark and latched.
+    Safe = 3,
+    /// Light again, after any of these or after a fault.
+    Arm = 4,
+}
+
+impl Order {
+    /// Every order with the word for it.
+    pub const ALL: [(Self, &'static str); 4] =
+        [(Self::Black, "black"), (Self::Freeze, "freeze"), (Self::Safe, "safe"), (Self::Arm, "arm")];
+
+    /// The word for it.
+    pub fn word(self) -> &'static str {
+        Self::ALL.iter().find(|(order, _)| *order == self).map_or("", |(_, word)| word)
+    }
+
+    /// True for the orders that make it dark.
+    pub fn is_dark(self) -> bool {
+        matches!(self, Self::Black | Self::Safe)
+    }
+
+    /// How strong it is: what stands is replaced by what is as strong or stronger, and by ARM only.
+    pub fn strength(self) -> u8 {
+        match self {
+            Self::Arm => 0,
+            Self::Freeze => 1,
+            Self::Black => 2,
+            Self::Safe => 3,
+        }
+    }
+
+    fn from_code(code: u8) -> Option<Self> {
+        Self::ALL.iter().map(|(order, _)| *order).find(|order| *order as u8 == code)
+    }
+
+    /// The order that a key on the terminal of a run gives: the first letter of its word, small or capital.
+    pub fn from_key(key: u8) -> Option<Self> {
+        Self::ALL.iter().find(|(_, w)| w.as_bytes()[0] == key.to_ascii_lowercase()).map(|(order, _)| *order)
+    }
+
+    /// The order with this word.
+    pub fn from_word(word: &str) -> Option<Self> {
+        Self::ALL.iter().find(|(_, w)| *w == word).map(|(order, _)| *order)
+    }
+}
+
+/// How the projector is, as the link knows it.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub enum ProjectorHealth {
+    /// Handshake under way.
+    #[default]
+    Connecting,
+    /// It takes frames.
+    Up,
+    /// The medium is gone; it is tried again ten times a second.
+    Lost,
+    /// Dark; these faults (bits of [`faults`]) are latched.
+    Faulted(u32),
+    /// Dark because the operator said so.
+    Black,
+    /// Holds a frame because the operator said so.
+    Frozen,
+    /// Dark at the end of the run.
+    Stopped,
+    /// Dark because the interlock is open.
+    InterlockOpen,
+    /// Dark for a while because a limit on light was reached.
+    Resting(LimitReached),
+}
+
+impl ProjectorHealth {
+    /// As a number, for an atomic or a file.
+    pub(crate) const fn encode(self) -> u64 {
+        match self {
+            Self::Connecting => 0,
+            Self::Up => 1,
+            Self::Lost => 2,
+            Self::Black => 3,
+            Self::Frozen => 4,
+            Self::Stopped => 5,
+            Self::Faulted(mask) => 6 | (mask as u64) << 8,
+            Self::InterlockOpen => 7,
+            Self::Resting(LimitReached::Mean) => 8,
+            Self::Resting(LimitReached::FullWhite) => 9,
+        }
+    }
+
+    /// Undoes [`ProjectorHealth::encode`].
+    pub(crate) const fn decode(code: u64) -> Self {
+        match code & 0xff {
+            1 => Self::Up,
+            2 => Self::Lost,
+            3 => Self::Black,
+            4 => Self::Frozen,
+            5 => Self::Stopped,
+            6 => Self::Faulted((code >> 8) as u32),
+            7 => Self::InterlockOpen,
+            8 => Self::Resting(LimitReached::Mean),
+            9 => Self::Resting(LimitReached::FullWhite),
+            _ => Self::Connecting,
+        }
+    }
+}
+
+impl ProjectorHealth {
+    /// The state in one word of at most ten letters, in capitals where no picture moves although frames are made.
+    pub const fn word(self) -> &'static str {
+        match self {
+            Self::Connecting => "connecting",
+            Self::Up => "up",
+            Self::Lost => "LOST",
+            Self::Faulted(_) => "FAULTED",
+            Self::Black => "BLACK",
+            Self::Frozen => "FROZEN",
+            Self::Stopped => "dark",
+            Self::InterlockOpen => "INTERLOCK",
+            Self::Resting(_) => "RESTING",
+        }
+    }
+}
+
+impl fmt::Display for ProjectorHealth {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        match self {
+            Self::Connecting => write!(f, "connecting"),
+            Self::Up => write!(f, "up"),
+            Self::Lost => write!(f, "lost, dark; plug it in again and the run goes on"),
+            Self::Faulted(mask) => {
+                write!(f, "dark, latched faults: {}; `dpm arm` acknowledges them", faults::names(*mask))
+            }
+            Self::Black => write!(f, "black; `dpm arm` shows the picture again"),
+            Self::Frozen => write!(f, "frozen; `dpm arm` lets the picture move again"),
+            Self::Stopped => write!(f, "dark"),
+            Self::InterlockOpen => {
+                write!(f, "dark, safety.interlock is open; light comes back when it closes, unless black, freeze or safe was ordered")
+            }
+            Self::Resting(LimitReached::Mean) => write!(
+                f,
+                "dark, the mean light reached safety.limits.mean_level; light comes back after safety.limits.mean_window_s"
+            ),
+            Self::Resting(LimitReached::FullWhite) => write!(
+                f,
+                "dark, full white lasted for safety.limits.full_white_s; light comes back after as long"
+            ),
+        }
+    }
+}
+
+/// Shared between a run and whoever watches it. Accesses to numbers and flags are relaxed: the numbers are for display, and the
+/// stop flag guards no data.
+#[derive(Debug, Default)]
+pub struct RunMonitor {
+    stop: AtomicBool,
+    /// The newest order not yet taken; 0 for none. An ARM carries in its upper half how many orders had come as signals when it was
+    /// asked for, so that a BLACK or SAFE that came since is not undone by it.
+    order: AtomicU64,
+    /// The projector had SAFE latched when the link came up.
+    found_safe: AtomicBool,
+    projector: AtomicU64,
+    /// Written at most once.
+    tracker: OnceLock<String>,
+    /// Why the run will never return, written at most once.
+    gave_up: OnceLock<String>,
+    /// Written at most once, before there is light.
+    interlock: OnceLock<Interlock>,
+    frames_planned: AtomicU64,
+    frames_lit: AtomicU64,
+    frames_dark: AtomicU64,
+    frames_dropped: AtomicU64,
+    frames_withheld: AtomicU64,
+    frames_late: AtomicU64,
+    slots: AtomicU64,
+    slots_missed: AtomicU64,
+    /// When no new picture was wanted, and why.
+    dark: DarkLog,
+    /// What the collector has to tell the operator. Neither the threads of the frame path nor those that make orders take this lock.
+    notes: Mutex<Notes>,
+}
+
+#[derive(Debug, Default)]
+struct Notes {
+    waiting: VecDeque<String>,
+    left_out: u64,
+}
+
+/// What the counters said at one moment.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, serde::Serialize)]
+pub struct RunCounts {
+    /// Frames planned so far.
+    pub frames_planned: u64,
+    /// Frames lit so far, with light on at least one body.
+    pub frames_lit: u64,
+    /// Frames that the projector lit so far in which every body was dark.
+    pub frames_dark: u64,
+    /// Frames dropped so far.
+    pub frames_dropped: u64,
+    /// Frames so far that were not lit because no new picture was wanted.
+    pub frames_withheld: u64,
+    /// Frames lit late so far.
+    pub frames_late: u64,
+    /// Slots so far in which a frame of their own was wanted.
+    pub slots: u64,
+    /// Of these, slots without one.
+    pub slots_missed: u64,
+}
+
+impl RunCounts {
+    /// Planned frames whose fate is known.
+    pub fn frames_done(&self) -> u64 {
+        self.frames_lit + self.frames_dark + self.frames_dropped + self.frames_withheld
+    }
+}
+
+impl RunMonitor {
+    /// Asks the run for an ordered stop: dark, flush, report.
+    pub fn request_stop(&self) {
+        self.stop.store(true, Ordering::Relaxed);
+    }
+
+    /// True when an ordered stop was asked for, here, by a signal or by a panic. The frame path polls this once a frame.
+    pub fn stop_requested(&self) -> bool {
+        self.stop.load(Ordering::Relaxed) || stopping::is_stopping()
+    }
+
+    /// Gives the projector an order; one that was not yet taken is replaced. SAFE is never replaced but by ARM.
+    pub fn give_order(&self, order: Order) {
+        match order {
+            Order::Arm => self.arm_unless_darkened(stopping::orders()),
+            _ => drop(self.order.fetch_update(Ordering::Relaxed, Ordering::Relaxed, |waiting| {
+                (waiting as u8 != Order::Safe as u8).then_some(order as u64)
+            })),
+        }
+    }
+
+    /// Gives ARM, which has no effect where more than `since` orders have come as signals when it is taken: they are newer than the
+    /// wish for light.
+    pub fn arm_unless_darkened(&self, since: u32) {
+        self.order.store(Order::Arm as u64 | u64::from(since) << 32, Ordering::Relaxed);
+    }
+
+    /// The newest order, once; of two that wait the one that makes it darker. The link thread asks with every poll. After a stop was
+    /// asked for there is no ARM and no FREEZE any more.
+    pub fn take_order(&self) -> Option<Order> {
+        let signalled = Order::from_code(stopping::take_order());
+        let own = match self.order.load(Ordering::Relaxed) {
+            0 => None,
+            _ => Some(self.order.swap(0, Ordering::Relaxed)),
+        };
+        let own = own.and_then(|code| {
+            let order = Order::from_code(code as u8)?;
+            let overtaken = order == Order::Arm && stopping::orders() != (code >> 32) as u32;
+            (!overtaken).then_some(order)
+        });
+        let order = signalled.into_iter().chain(own).max_by_key(|order| order.strength())?;
+        (order.is_dark() || !self.stop_requested()).then_some(order)
+    }
+
+    /// True when BLACK or SAFE has been ordered and not yet been taken, or a stop: a link that comes up does not arm.
+    pub fn dark_is_ordered(&self) -> bool {
+        let waiting = |code: u8| Order::from_code(code).is_some_and(Order::is_dark);
+        self.stop_requested()
+            || waiting(stopping::waiting_order())
+            || waiting(self.order.load(Ordering::Relaxed) as u8)
+    }
+
+    /// Says that the projector had SAFE latched when the link came up: it stands until ARM like one that was ordered here.
+    pub fn find_safe(&self) {
+        self.found_safe.store(true, Ordering::Relaxed);
+        self.give_order(Order::Safe);
+    }
+
+    /// True once after [`RunMonitor::find_safe`].
+    pub fn take_found_safe(&self) -> bool {
+        self.found_safe.swap(false, Ordering::Relaxed)
+    }
+
+    /// Says how the projector is.
+    pub fn set_projector(&self, health: ProjectorHealth) {
+        self.projector.store(health.encode(), Ordering::Relaxed);
+    }
+
+    /// How the projector is.
+    pub fn projector(&self) -> ProjectorHealth {
+        ProjectorHealth::decode(self.projector.load(Ordering::Relaxed))
+    }
+
+    /// Makes light depend on `interlock`, for the whole run. A second one is dropped: set it before the run begins.
+    pub fn set_interlock(&self, interlock: Interlock) {
+        let _ = self.interlock.set(interlock);
+    }
+
+    /// The interlock, if light depends on one.
+    pub fn interlock(&self) -> Option<&Interlock> {
+        self.interlock.get()
+    }
+
+    /// True while there may be light: there is no interlock, or it is closed. Never waits; the link thread asks with every poll.
+    pub fn light_allowed(&self) -> bool {
+        self.interlock.get().is_none_or(Interlock::is_closed)
+    }
+
+    /// Says, once in a run, which bodies the tracker has not seen a second after its start, why and what to do. Off the frame path.
+    pub fn tell_of_tracker(&self, word: String) {
+        let _ = self.tracker.set(word);
+    }
+
+    /// What was said of the tracker; `None` while there is nothing to say.
+    pub fn tracker(&self) -> Option<&str> {
+        self.tracker.get().map(String::as_str)
+    }
+
+    /// The thread that would return from the run hangs: whoever waits for it should not. The projector was told to go dark.
+    pub fn give_up(&self, why: String) {
+        let _ = self.gave_up.set(why);
+    }
+
+    /// Why the run will never return; `None` while it may.
+    pub fn gave_up(&self) -> Option<&str> {
+        self.gave_up.get().map(String::as_str)
+    }
+
+    /// Counts a planned frame.
+    pub fn count_planned(&self) {
+        self.frames_planned.fetch_add(1, Ordering::Relaxed);
+    }
+
+    /// When no new picture was wanted: told by the link's thread, read by the collector.
+    pub fn dark(&self) -> &DarkLog {
+        &self.dark
+    }
+
+    /// Tells the operator something. Not from the frame path: it takes a lock.
+    pub fn note(&self, text: String) {
+        let mut notes = self.notes.lock().unwrap_or_else(PoisonError::into_inner);
+        if notes.waiting.len() < NOTES {
+            notes.waiting.push_back(text);
+        } else {
+            notes.left_out += 1;
+        }
+    }
+
+    /// What the operator has to be told, once each, oldest first.
+    pub fn take_notes(&self) -> Vec<String> {
+        let mut notes = self.notes.lock().unwrap_or_else(PoisonError::into_inner);
+        let mut all: Vec<String> = notes.waiting.drain(..).collect();
+        match std::mem::take(&mut notes.left_out) {
+            0 => {}
+            n => all.push(format!("{n} more notes were left out")),
+        }
+        all
+    }
+
+    /// Says how many slots are decided so far in which a frame was wanted, and how many of these were missed.
+    pub fn set_slots(&self, wanted: u64, missed: u64) {
+        self.slots.store(wanted, Ordering::Relaxed);
+        self.slots_missed.store(missed, Ordering::Relaxed);
+    }
+
+    /// Counts a frame whose light left the projector, whether every body was `dark` in it, and whether it came after its slot.
+    pub fn count_lit(&self, dark: bool, late: bool) {
+        let frames = if dark { &self.frames_dark } else { &self.frames_lit };
+        frames.fetch_add(1, Ordering::Relaxed);
+        if late {
+            self.frames_late.fetch_add(1, Ordering::Relaxed);
+        }
+    }
+
+    /// Counts a frame that will never be lit.
+    pub fn count_dropped(&self) {
+        self.frames_dropped.fetch_add(1, Ordering::Relaxed);
+    }
+
+    /// Counts a frame that was not lit because no new picture was wanted.
+    pub fn count_withheld(&self) {
+        self.frames_withheld.fetch_add(1, Ordering::Relaxed);
+    }
+
+    /// The counters now; each is exact, together they are a moment apart.
+    pub fn counts(&self) -> RunCounts {
+        RunCounts {
+            frames_planned: self.frames_planned.load(Ordering::Relaxed),
+            frames_lit: self.frames_lit.load(Ordering::Relaxed),
+            frames_dark: self.frames_dark.load(Ordering::Relaxed),
+            frames_withheld: self.frames_withheld.load(Ordering::Relaxed),
+            slots: self.slots.load(Ordering::Relaxed),
+            slots_missed: self.slots_missed.load(Ordering::Relaxed),
+            frames_dropped: self.frames_dropped.load(Ordering::Relaxed),
+            frames_late: self.frames_late.load(Ordering::Relaxed),
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn an_order_is_taken_once_the_newest_wins_and_nothing_but_arm_takes_safe_back() {
+        let monitor = RunMonitor::default();
+        assert_eq!(monitor.take_order(), None);
+        for (order, word) in Order::ALL {
+            assert_eq!((Order::from_word(word), order.word()), (Some(order), word));
+            monitor.give_order(order);
+            assert_eq!((monitor.take_order(), monitor.take_order()), (Some(order), None));
+        }
+        monitor.give_order(Order::Black);
+        monitor.give_order(Order::Freeze);
+        assert_eq!(monitor.take_order(), Some(Order::Freeze));
+        monitor.give_order(Order::Safe);
+        monitor.give_order(Order::Black);
+        assert_eq!(monitor.take_order(), Some(Order::Safe));
+        monitor.give_order(Order::Safe);
+        monitor.give_order(Order::Arm);
+        assert_eq!(monitor.take_order(), Some(Order::Arm));
+    }
+
+    /// Found in use, R2: the projector was armed again three times after the run had been told to stop.
+    #[test]
+    fn r2_nothing_arms_or_holds_light_after_a_stop_was_asked_for() {
+        let monitor = RunMonitor::default();
+        monitor.give_order(Order::Arm);
+        assert!(!monitor.dark_is_ordered());
+        monitor.request_stop();
+        assert!(monitor.dark_is_ordered());
+        assert_eq!(monitor.take_order(), None);
+        for (order, _) in Order::ALL {
+            monitor.give_order(order);
+            assert_eq!(monitor.take_order(), Some(order).filter(|o| o.is_dark()));
+        }
+    }
+
+    #[test]
+    fn a_link_that_comes_up_sees_the_dark_that_waits_and_an_overtaken_arm_is_none() {
+        let monitor = RunMonitor::default();
+        for (order, _) in Order::ALL {
+            monitor.give_order(order);
+            assert_eq!(monitor.dark_is_ordered(), matches!(order, Order::Black | Order::Safe));
+            assert_eq!(monitor.take_order(), Some(order));
+        }
+        assert!(!monitor.take_found_safe());
+        monitor.find_safe();
+        assert_eq!((monitor.take_found_safe(), monitor.take_found_safe()), (true, false));
+        assert_eq!(monitor.take_order(), Some(Order::Safe));
+        // As if one more order had come as a signal since this ARM was asked for.
+        monitor.arm_unless_darkened(stopping::orders().wrapping_sub(1));
+        assert_eq!(monitor.take_order(), None);
+    }
+
+    #[test]
+    fn notes_are_told_once_and_do_not_pile_up() {
+        let monitor = RunMonitor::default();
+        assert!(monitor.take_notes().is_empty());
+        (0..NOTES + 7).for_each(|k| monitor.note(k.to_string()));
+        let told = monitor.take_notes();
+        assert_eq!((told.len(), told[0].as_str()), (NOTES + 1, "0"));
+        assert_eq!(told[NOTES], "7 more notes were left out");
+        assert!(monitor.take_notes().is_empty());
+    }
+
+    #[test]
+    fn the_projectors_health_crosses_the_atomic_whole() {
+        use ProjectorHealth as H;
+        let all = [
+            H::Connecting,
+            H::Up,
+            H::Lost,
+            H::Black,
+            H::Frozen,
+            H::Stopped,
+            H::InterlockOpen,
+            H::Resting(LimitReached::Mean),
+            H::Resting(LimitReached::FullWhite),
+            H::Faulted(0),
+            H::Faulted(u32::MAX),
+        ];
+        let monitor = RunMonitor::default();
+        for health in all {
+            monitor.set_projector(health);
+            assert_eq!(monitor.projector(), health);
+        }
+        assert!(all.iter().all(|h| h.word().len() <= 10));
+        assert!(H::Faulted(faults::LAMP).to_string().contains("lamp"));
+    }
+}

@@ -1,0 +1,639 @@
+//! What a run was like: one JSON object for programs, one short table for people.
+
+use super::signed::SignedHistogram;
+use crate::failure::{Failure, FailureKind};
+use crate::pipeline::ProjectorReport;
+use crate::plan::dark::DarkCause;
+use serde::ser::{Serialize, SerializeMap, Serializer};
+use std::collections::BTreeMap;
+use std::fmt::Write;
+use std::path::PathBuf;
+
+/// Percentiles of a quantity: the smallest value that at least that share of all values does not exceed.
+#[derive(Clone, Copy, Debug, PartialEq, serde::Serialize)]
+pub struct Spread {
+    /// Median.
+    pub p50: f64,
+    /// 99 %.
+    pub p99: f64,
+    /// 99.9 %.
+    pub p999: f64,
+    /// Largest.
+    pub max: f64,
+}
+
+impl Spread {
+    /// Percentiles of `values`, which are reordered; values that are not finite are left out. `None` when none is left.
+    pub fn of(values: &mut Vec<f64>) -> Option<Self> {
+        values.retain(|v| v.is_finite());
+        values.sort_unstable_by(f64::total_cmp);
+        let last = values.len().checked_sub(1)?;
+        // Nearest rank: the ceil(n q / 1000)-th value, counted from 1, in whole numbers.
+        let at = |per_mille: usize| values[(values.len() * per_mille).div_ceil(1000).saturating_sub(1)];
+        Some(Self { p50: at(500), p99: at(990), p999: at(999), max: values[last] })
+    }
+
+    /// Percentiles of a histogram of nanoseconds, in milliseconds. `None` when it is empty.
+    pub fn ms_of_ns(histogram: &hdrhistogram::Histogram<u64>) -> Option<Self> {
+        let ms = |ns: u64| ns as f64 / 1e6;
+        (!histogram.is_empty()).then(|| Self {
+            p50: ms(histogram.value_at_quantile(0.5)),
+            p99: ms(histogram.value_at_quantile(0.99)),
+            p999: ms(histogram.value_at_quantile(0.999)),
+            max: ms(histogram.max()),
+        })
+    }
+}
+
+/// What stands beside a number that virtual pace cannot know.
+pub const MODELLED: &str = "from real_time.stage_costs_us, not measured";
+
+/// Percentiles of a time that may be negative, and whether it is a measurement.
+#[derive(Clone, Copy, Debug, PartialEq, serde::Serialize)]
+pub struct Latency {
+    /// Percentiles, milliseconds.
+    #[serde(flatten)]
+    pub spread: Spread,
+    /// Smallest, milliseconds.
+    pub min: f64,
+    /// True at virtual pace: the costs of the stages are constants of the rig file there.
+    pub modelled: bool,
+    /// Where a modelled number comes from.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub source: Option<&'static str>,
+}
+
+impl Latency {
+    /// Percentiles of a histogram of nanoseconds; `None` when it is empty.
+    pub fn of(histogram: &SignedHistogram, modelled: bool) -> Option<Self> {
+        let ms = |ns: i64| ns as f64 * 1e-6;
+        (!histogram.is_empty()).then(|| Self {
+            spread: Spread {
+                p50: ms(histogram.value_at_quantile(0.5)),
+                p99: ms(histogram.value_at_quantile(0.99)),
+                p999: ms(histogram.value_at_quantile(0.999)),
+                max: ms(histogram.max()),
+            },
+            min: ms(histogram.min()),
+            modelled,
+            source: modelled.then_some(MODELLED),
+        })
+    }
+}
+
+impl std::ops::Deref for Latency {
+    type Target = Spread;
+
+    fn deref(&self) -> &Spread {
+        &self.spread
+    }
+}
+
+/// Frames in which a body was dark although the projector lit the frame, by cause.
+#[derive(Clone, Debug, Default, PartialEq, Eq, serde::Serialize)]
+pub struct DarkBody {
+    /// Its name in the rig file.
+    pub body: String,
+    /// Frames in which the tracker had never told of it.
+    pub never_seen: u64,
+    /// Frames in which its newest sample was too old already when the poses were taken.
+    pub silent: u64,
+    /// Frames whose light fell later after the newest sample than `safety.predict_ms` allows.
+    pub beyond_horizon: u64,
+}
+
+impl DarkBody {
+    /// Of one cause.
+    pub fn of(&self, cause: DarkCause) -> u64 {
+        match cause {
+            DarkCause::NeverSeen => self.never_seen,
+            DarkCause::Silent => self.silent,
+            DarkCause::BeyondHorizon => self.beyond_horizon,
+        }
+    }
+
+    /// Of all causes.
+    pub fn total(&self) -> u64 {
+        DarkCause::ALL.iter().map(|cause| self.of(*cause)).sum()
+    }
+}
+
+/// A stage's wall time.
+#[derive(Clone, Debug, PartialEq)]
+pub struct StageTime {
+    /// Name of the stage.
+    pub stage: String,
+    /// Wall time of one frame in it, milliseconds.
+    pub ms: Spread,
+}
+
+/// The report of a run, as `--json` prints it and `report.json` keeps it.
+#[derive(Clone, Debug, PartialEq, serde::Serialize)]
+pub struct Report {
+    /// Version of the program.
+    pub version: &'static str,
+    /// Commit that it was compiled from, see [`dpm_common::commit::get`].
+    pub commit: &'static str,
+    /// Slots, from the first planned frame to the last, in which a frame of their own was wanted.
+    pub slots: u64,
+    /// Of these, slots without one, whatever the cause.
+    pub missed_slots: u64,
+    /// `missed_slots` as a share of `slots`, 0 to 1.
+    pub missed_share: f64,
+    /// Missed slots whose frame was under way while the machine itself stood still.
+    pub excused_by_standstill: u64,
+    /// Missed slots by cause.
+    pub missed_by_cause: BTreeMap<String, u64>,
+    /// Slots in which no new picture was wanted, by reason: they are not among `slots`.
+    pub ordered_dark: BTreeMap<String, u64>,
+    /// Frames whose light left the projector, with light on at least one body. Prepared frames always have light.
+    pub frames_lit: u64,
+    /// Frames that the projector lit in which every body was dark.
+    pub frames_dark: u64,
+    /// Bodies that were dark in some of all these frames, by cause.
+    pub dark_by_body: Vec<DarkBody>,
+    /// Frames that were planned and never lit.
+    pub frames_dropped: u64,
+    /// Frames that were not lit because no new picture was wanted.
+    pub frames_withheld: u64,
+    /// Frames lit after the slot they were planned for.
+    pub frames_late: u64,
+    /// Slots in which the former frame was shown again.
+    pub frames_repeated: u64,
+    /// Frames not sent because their poses would have been older than `safety.predict_ms` and a slot when they were lit.
+    pub frames_too_old: u64,
+    /// Slots from one planned frame to the next, on average at the end: 1 where the renderer keeps up.
+    pub slots_per_frame: f64,
+    /// Longest time for which a body was carried on by prediction, milliseconds, at the end.
+    pub predict_ms: f64,
+    /// Columns and rows traced and projected.
+    pub raster: [u32; 2],
+    /// Bit planes in a frame.
+    pub planes: u32,
+    /// Nominal rate, frames a second.
+    pub frame_rate_hz: f64,
+    /// "real" or "virtual".
+    pub pace: &'static str,
+    /// Name of the Vulkan device; "none" when nothing was rendered.
+    pub gpu: String,
+    /// True when that device is the CPU.
+    pub software_gpu: bool,
+    /// Method that spent the rays.
+    pub method: &'static str,
+    /// Whether poses were predicted to the time of light.
+    pub prediction: bool,
+    /// Distance in projector pixels between where the light of a surface point fell and where that point was at that
+    /// instant; null without ground truth.
+    pub registration_error_px: Option<Spread>,
+    /// The same if the newest sample had been used as it was.
+    pub registration_error_unpredicted_px: Option<Spread>,
+    /// The same of frames that were lit in their own slot: what is left when lateness is not counted.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub registration_error_in_time_px: Option<Spread>,
+    /// True beginning of a slot less what the host took it for, as the mock in this process saw it at real pace.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub clock_error_ms: Option<Latency>,
+    /// The instant of the light at which the registration was measured.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub registration_error_at: Option<&'static str>,
+    /// From the tracker's mid-exposure to the frame's first photon, milliseconds.
+    pub motion_to_first_photon_ms: Option<Latency>,
+    /// From the tracker's mid-exposure to the centre of the frame's light, milliseconds.
+    pub motion_to_light_centre_ms: Option<Latency>,
+    /// From the tracker's mid-exposure to the frame's last photon, milliseconds.
+    pub motion_to_last_photon_ms: Option<Latency>,
+    /// The same as `motion_to_first_photon_ms`, under the name that it had before there were three of them.
+    pub motion_to_light_ms: Option<Latency>,
+    /// From the instant for which a frame was due to its first photon, milliseconds; negative: lit before it was due.
+    pub lateness_ms: Option<Latency>,
+    /// Wall time of each stage.
+    #[serde(serialize_with = "stages_as_map")]
+    pub stages_ms: Vec<StageTime>,
+    /// Frames lit in a second of wall time.
+    pub frames_per_wall_second: f64,
+    /// Camera rays and all rays traced, in millions a second of render time; null when nothing was rendered.
+    pub mrays_per_s: Option<f64>,
+    /// Share of lit channel values that the projector was too weak for, 0 to 1.
+    pub clipped: f64,
+    /// Pixels that were not a number and became black.
+    pub nan_pixels: u64,
+    /// Hash of all light; the same for the same seed at virtual pace. Absent where nobody saw the light.
+    #[serde(skip_serializing_if = "String::is_empty")]
+    pub light_hash: String,
+    /// What the link to the projector carried, and what the projector said.
+    pub projector: Option<ProjectorReport>,
+    /// What the operator should know.
+    pub warnings: Vec<String>,
+    /// Files written.
+    pub files: Vec<PathBuf>,
+    /// Wall time of the run after set-up, seconds.
+    pub wall_s: f64,
+}
+
+fn stages_as_map<S: Serializer>(stages: &[StageTime], serializer: S) -> Result<S::Ok, S::Error> {
+    let mut map = serializer.serialize_map(Some(stages.len()))?;
+    for stage in stages {
+        map.serialize_entry(&stage.stage, &stage.ms)?;
+    }
+    map.end()
+}
+
+impl Default for Report {
+    /// A run that did nothing.
+    fn default() -> Self {
+        Self {
+            version: env!("CARGO_PKG_VERSION"),
+            commit: dpm_common::commit::get(),
+            slots: 0,
+            missed_slots: 0,
+            missed_share: 0.0,
+            excused_by_standstill: 0,
+            missed_by_cause: BTreeMap::new(),
+            ordered_dark: BTreeMap::new(),
+            frames_lit: 0,
+            frames_dark: 0,
+            dark_by_body: Vec::new(),
+            frames_dropped: 0,
+            frames_withheld: 0,
+            frames_late: 0,
+            frames_repeated: 0,
+            frames_too_old: 0,
+            slots_per_frame: 1.0,
+            predict_ms: 0.0,
+            raster: [0, 0],
+            planes: 0,
+            frame_rate_hz: 0.0,
+            pace: "virtual",
+            gpu: "none".into(),
+            software_gpu: false,
+            method: "full",
+            prediction: false,
+            registration_error_px: None,
+            registration_error_unpredicted_px: None,
+            registration_error_in_time_px: None,
+            clock_error_ms: None,
+            registration_error_at: None,
+            motion_to_first_photon_ms: None,
+            motion_to_light_centre_ms: None,
+            motion_to_last_photon_ms: None,
+            motion_to_light_ms: None,
+            lateness_ms: None,
+            stages_ms: Vec::new(),
+            frames_per_wall_second: 0.0,
+            mrays_per_s: None,
+            clipped: 0.0,
+            nan_pixels: 0,
+            light_hash: String::new(),
+            projector: None,
+            warnings: Vec::new(),
+            files: Vec::new(),
+            wall_s: 0.0,
+        }
+    }
+}
+
+impl Report {
+    /// The report as one JSON object with indentation.
+    pub fn to_json(&self) -> String {
+        to_json(self)
+    }
+
+    /// The report as a table of at most 100 columns.
+    pub fn to_table(&self) -> String {
+        let mut rows: Vec<(String, String)> = Vec::new();
+        let mut row = |name: &str, text: String| rows.push((name.to_string(), text));
+        if self.slots > 0 || self.ordered_dark.values().any(|n| *n > 0) {
+            row("missed slots", self.missed_line());
+            for (name, slots) in self.missed_by_cause.iter().filter(|(_, n)| **n > 0) {
+                let told = if name == "standstill" { ", the machine itself stood still" } else { "" };
+                row(&format!("  {name}"), format!("{slots} slots{told}"));
+            }
+        }
+        for (reason, slots) in self.ordered_dark.iter().filter(|(_, n)| **n > 0) {
+            row(&format!("ordered: {reason}"), format!("{slots} slots more, neither missed nor lit"));
+        }
+        let dark = if self.frames_dark > 0 {
+            format!("{} dark on every body, ", self.frames_dark)
+        } else {
+            String::new()
+        };
+        let withheld = if self.frames_withheld > 0 {
+            format!(", {} not wanted", self.frames_withheld)
+        } else {
+            String::new()
+        };
+        row(
+            "frames",
+            format!(
+                "{} lit, {dark}{} dropped, {} late, {} repeated{withheld}",
+                self.frames_lit, self.frames_dropped, self.frames_late, self.frames_repeated
+            ),
+        );
+        for body in self.dark_by_body.iter().filter(|b| b.total() > 0) {
+            let causes = DarkCause::ALL.iter().filter(|c| body.of(**c) > 0);
+            let causes: Vec<String> =
+                causes.map(|c| format!("{} {}", c.name().replace('_', " "), body.of(*c))).collect();
+            row(&format!("  dark: {}", body.body), format!("{} frames: {}", body.total(), causes.join(", ")));
+        }
+        row(
+            "raster",
+            format!(
+                "{} x {}, {} planes, {:.3} frames/s ({} pace)",
+                self.raster[0], self.raster[1], self.planes, self.frame_rate_hz, self.pace
+            ),
+        );
+        let software = if self.software_gpu { " (software)" } else { "" };
+        row("GPU", format!("{}{software}", self.gpu));
+        row("method", self.method.to_string());
+        if let Some(error) = self.registration_error_px {
+            let how = if self.prediction { "predicted" } else { "prediction off" };
+            let at = self.registration_error_at.map_or(String::new(), |at| format!(", at {at}"));
+            row("registration error", format!("{} px ({how}{at})", percentiles(error)));
+        }
+        if let Some(error) = self.registration_error_unpredicted_px {
+            row("  without prediction", format!("{} px", percentiles(error)));
+        }
+        let latencies = [
+            ("motion to first photon", self.motion_to_first_photon_ms),
+            ("motion to centre of light", self.motion_to_light_centre_ms),
+            ("motion to last photon", self.motion_to_last_photon_ms),
+            ("lateness of light", self.lateness_ms),
+        ];
+        for (name, latency) in latencies {
+            let Some(latency) = latency else { continue };
+            let min = if latency.min < 0.0 { format!("min {:.3}  ", latency.min) } else { String::new() };
+            let modelled = if latency.modelled { " (modelled)" } else { "" };
+            row(name, format!("{min}{} ms{modelled}", percentiles(latency.spread)));
+        }
+        if latencies.iter().any(|(_, l)| l.is_some_and(|l| l.modelled)) {
+            row("  modelled", MODELLED.into());
+        }
+        for stage in &self.stages_ms {
+            row(
+                &format!("  {}", stage.stage),
+                format!("p50 {:.3}  p99 {:.3} ms", stage.ms.p50, stage.ms.p99),
+            );
+        }
+        row("wall time", format!("{:.2} s, {:.1} frames/s", self.wall_s, self.frames_per_wall_second));
+        if let Some(p) = &self.projector {
+            let [raw, coded, kept] = p.planes;
+            row("projector", format!("{}, {:.1} MB sent", p.name, p.sent_mb));
+            if let Some(bound) = p.clock_bound_ns {
+                row("  its clock", format!("known to {:.1} us", bound as f64 * 1e-3));
+            }
+            if coded + kept > 0 {
+                row("  planes", format!("{raw} raw, {coded} coded, {kept} unchanged and not sent"));
+            }
+            if let Some(d) = p.device {
+                let dropped = format!(
+                    "{} incomplete, {} too late, {} superseded, {} refused",
+                    d.incomplete, d.too_late, d.superseded, d.refused
+                );
+                row(
+                    "  its report",
+                    format!(
+                        "{} lit, {} repeated, {} blank slots; dropped {dropped}",
+                        d.lit, d.repeated, d.blank
+                    ),
+                );
+            }
+            if p.sessions > 1 || p.rearmed > 0 {
+                row(
+                    "  came back",
+                    format!(
+                        "{} times, armed again {} times after a fault",
+                        p.sessions.saturating_sub(1),
+                        p.rearmed
+                    ),
+                );
+            }
+        }
+        if let Some(rays) = self.mrays_per_s {
+            row("rays", format!("{rays:.2} million/s"));
+        }
+        if self.clipped > 0.0 {
+            let advice = "raise projector.max_intensity or lower render.exposure";
+            row("clipped", format!("{:.2} % of the light: {advice}", 100.0 * self.clipped));
+        }
+        if self.nan_pixels > 0 {
+            row("not a number", format!("{} pixels became black", self.nan_pixels));
+        }
+        if !self.light_hash.is_empty() {
+            row("hash of the light", self.light_hash.clone());
+        }
+        let width = rows.iter().map(|(name, _)| name.chars().count()).max().unwrap_or(0);
+        let mut out = String::new();
+        for (name, text) in &rows {
+            // Writing into a string cannot fail.
+            let _ = writeln!(out, "{name:width$}  {text}");
+        }
+        for warning in &self.warnings {
+            let _ = writeln!(out, "warning: {warning}");
+        }
+        for file in &self.files {
+            let _ = writeln!(out, "see {}", file.display());
+        }
+        out
+    }
+}
+
+impl Report {
+    /// The headline: raw missed slots first, what of them is the machine's second.
+    fn missed_line(&self) -> String {
+        let excused = if self.excused_by_standstill > 0 {
+            format!("; {} of them while the machine itself stood still", self.excused_by_standstill)
+        } else {
+            String::new()
+        };
+        let unknowable = if self.pace == "virtual" { "; at virtual pace no frame can be late" } else { "" };
+        format!(
+            "{} of {} ({:.3} %){excused}{unknowable}",
+            self.missed_slots,
+            self.slots,
+            100.0 * self.missed_share
+        )
+    }
+
+    /// Refuses a run that lit nothing.
+    ///
+    /// # Errors
+    /// A failed check that says why, see [`Report::nothing_lit`].
+    pub fn check_lit(&self) -> Result<(), Failure> {
+        self.nothing_lit().map_or(Ok(()), |told| Err(Failure::new(FailureKind::CheckFailed, told)))
+    }
+
+    /// Why the run lit nothing, with the largest cause first and what to do; `None` when it did light something, when it planned nothing, or
+    /// when no picture was wanted from its beginning to its end.
+    pub fn nothing_lit(&self) -> Option<String> {
+        let planned = self.frames_dark + self.frames_dropped;
+        let ordered: u64 = self.ordered_dark.values().sum();
+        if self.frames_lit > 0 || planned == 0 || self.slots == 0 && ordered > 0 {
+            return None;
+        }
+        let mut causes: Vec<(u64, String)> = Vec::new();
+        for body in &self.dark_by_body {
+            for cause in DarkCause::ALL.into_iter().filter(|c| body.of(*c) > 0) {
+                causes.push((
+                    body.of(cause),
+                    format!("{:?} was dark in {} frames: {}", body.body, body.of(cause), cause.told()),
+                ));
+            }
+        }
+        if self.frames_dropped > 0 {
+            let (cause, n) = self
+                .missed_by_cause
+                .iter()
+                .max_by_key(|(_, n)| **n)
+                .map_or(("link", 0), |(cause, n)| (cause.as_str(), *n));
+            let most = if n > 0 { format!(", most for the cause \"{cause}\"") } else { String::new() };
+            causes.push((
+                self.frames_dropped,
+                format!("{} frames were made and never lit{most}", self.frames_dropped),
+            ));
+        }
+        causes.sort_by_key(|(frames, _)| std::cmp::Reverse(*frames));
+        let told: Vec<String> = causes.into_iter().map(|(_, told)| told).collect();
+        Some(format!("no light fell on any body: {}", told.join("; ")))
+    }
+}
+
+fn percentiles(s: Spread) -> String {
+    format!("p50 {:.3}  p99 {:.3}  p99.9 {:.3}  max {:.3}", s.p50, s.p99, s.p999, s.max)
+}
+
+/// Any report as one indented JSON object; numbers that are not finite become null.
+pub fn to_json<T: Serialize>(value: &T) -> String {
+    serde_json::to_string_pretty(value).expect("reports hold only strings, numbers and lists")
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn percentiles_are_nearest_rank() {
+        let mut values: Vec<f64> = (1..=1000).rev().map(f64::from).collect();
+        let spread = Spread::of(&mut values).unwrap();
+        assert_eq!(spread, Spread { p50: 500.0, p99: 990.0, p999: 999.0, max: 1000.0 });
+        let mut one = vec![f64::NAN, 7.0, f64::INFINITY];
+        assert_eq!(Spread::of(&mut one), Some(Spread { p50: 7.0, p99: 7.0, p999: 7.0, max: 7.0 }));
+        let mut two = vec![2.0, 1.0];
+        assert_eq!(Spread::of(&mut two), Some(Spread { p50: 1.0, p99: 2.0, p999: 2.0, max: 2.0 }));
+        assert_eq!(Spread::of(&mut vec![f64::NAN]), None);
+    }
+
+    #[test]
+    fn histograms_of_ns_become_ms() {
+        let mut h = hdrhistogram::Histogram::<u64>::new(3).unwrap();
+        assert_eq!(Spread::ms_of_ns(&h), None);
+        for i in 1..=1000u64 {
+            h.record(i * 1_000_000).unwrap();
+        }
+        let spread = Spread::ms_of_ns(&h).unwrap();
+        for (got, want) in
+            [(spread.p50, 500.0), (spread.p99, 990.0), (spread.p999, 999.0), (spread.max, 1000.0)]
+        {
+            assert!((got / want - 1.0).abs() < 2e-3, "{got} {want}");
+        }
+    }
+
+    #[test]
+    fn json_has_the_agreed_keys_in_the_order_of_the_stages() {
+        let spread = Spread { p50: 1.0, p99: 2.0, p999: 3.0, max: f64::NAN };
+        let latency = Latency { spread, min: -0.5, modelled: true, source: Some(MODELLED) };
+        let stage = |name: &str| StageTime { stage: name.into(), ms: spread };
+        let report = Report {
+            registration_error_px: Some(spread),
+            motion_to_light_ms: Some(latency),
+            motion_to_first_photon_ms: Some(latency),
+            stages_ms: vec![stage("track"), stage("plan"), stage("render")],
+            raster: [320, 240],
+            ..Report::default()
+        };
+        let text = report.to_json();
+        let json: serde_json::Value = serde_json::from_str(&text).unwrap();
+        for key in "frames_lit frames_dropped frames_late raster frame_rate_hz pace gpu wall_s".split(' ') {
+            assert!(!json[key].is_null(), "{key} in {text}");
+        }
+        for key in ["p50", "p99"] {
+            assert!(json["registration_error_px"][key].is_f64());
+            assert!(json["stages_ms"]["plan"][key].is_f64());
+        }
+        assert!(json["motion_to_light_ms"]["p999"].is_f64());
+        assert!(json["motion_to_light_ms"]["max"].is_null(), "NaN must not break the JSON");
+        assert_eq!(json["motion_to_first_photon_ms"]["min"], -0.5);
+        // Found in use (second look at latency, section 1): 5.2 ms of constants looked like a measurement.
+        assert_eq!(json["motion_to_first_photon_ms"]["modelled"], true);
+        assert_eq!(json["motion_to_first_photon_ms"]["source"], MODELLED);
+        let table = report.to_table();
+        assert!(table.contains("ms (modelled)") && table.contains(MODELLED), "{table}");
+        let at = |s: &str| text.find(s).unwrap();
+        assert!(at("\"track\"") < at("\"plan\"") && at("\"plan\"") < at("\"render\""));
+        assert!(report.to_table().contains("320 x 240"));
+    }
+
+    /// The first figure of the table is every slot without a frame of its own; what the machine is to blame for comes second, and what the
+    /// operator ordered is in neither.
+    #[test]
+    fn the_headline_is_the_raw_share() {
+        let report = Report {
+            slots: 22_728,
+            missed_slots: 84,
+            missed_share: 84.0 / 22_728.0,
+            excused_by_standstill: 68,
+            missed_by_cause: [("link".into(), 16), ("standstill".into(), 68), ("plan".into(), 0)].into(),
+            ordered_dark: [("black".into(), 1421), ("safe".into(), 0)].into(),
+            pace: "real",
+            ..Report::default()
+        };
+        let table = report.to_table();
+        let lines: Vec<&str> = table.lines().collect();
+        assert!(
+            lines[0].ends_with("84 of 22728 (0.370 %); 68 of them while the machine itself stood still"),
+            "{table}"
+        );
+        assert!(table.contains("1421 slots more, neither missed nor lit"), "{table}");
+        assert!(lines.iter().all(|l| !l.starts_with("  plan") && !l.contains("safe")), "{table}");
+        let json = report.to_json();
+        let at = |key: &str| json.find(key).unwrap_or_else(|| panic!("{key}"));
+        assert!(at("\"slots\"") < at("\"missed_slots\"") && at("\"missed_slots\"") < at("\"missed_share\""));
+        assert!(at("\"missed_share\"") < at("\"excused_by_standstill\""));
+    }
+
+    /// Found in use, R6 and C2: a rig that was black all the time said that its frames were lit, and ended with 0.
+    #[test]
+    fn a_run_that_lit_nothing_says_why_with_the_largest_cause_first() {
+        let dark = |body: &str, never_seen, silent, beyond_horizon| DarkBody {
+            body: body.into(),
+            never_seen,
+            silent,
+            beyond_horizon,
+        };
+        let report = Report {
+            frames_dark: 1195,
+            dark_by_body: vec![dark("venus", 3, 0, 0), dark("bunny", 0, 2, 1193)],
+            ..Report::default()
+        };
+        let told = report.nothing_lit().unwrap();
+        let (first, rest) = told.split_once("; ").unwrap();
+        assert!(first.contains("\"bunny\" was dark in 1193 frames"), "{told}");
+        assert!(told.contains("raise safety.predict_ms"), "{told}");
+        assert!(rest.contains("\"venus\""), "{told}");
+        assert!(report.to_table().contains("1195 dark on every body"));
+        let dropped = Report {
+            frames_dropped: 9,
+            missed_by_cause: [("link".into(), 8), ("plan".into(), 1)].into(),
+            ..Report::default()
+        };
+        assert!(dropped
+            .nothing_lit()
+            .unwrap()
+            .contains("9 frames were made and never lit, most for the cause \"link\""));
+        // One lit frame is enough; and who wanted the dark, or nothing, got it.
+        assert_eq!(Report { frames_lit: 1, ..report }.nothing_lit(), None);
+        assert_eq!(Report { frames_withheld: 500, ..Report::default() }.nothing_lit(), None);
+        let ordered_dark: BTreeMap<String, u64> = [("safe".into(), 300)].into();
+        assert_eq!(Report { frames_dropped: 4, ordered_dark, ..Report::default() }.nothing_lit(), None);
+        assert_eq!(Report::default().nothing_lit(), None);
+    }
+}

@@ -1,0 +1,154 @@
+//! A roughly known pinhole and point pairs into the pinhole of least reprojection error: Levenberg-Marquardt (\[Marquardt63\]).
+
+use super::calibration::Pair;
+use super::svd::{inverse_diagonal, solve_spd};
+use dpm_common::se3::{hat, so3_exp};
+use glam::{DMat3, DVec2, DVec3};
+
+/// A pinhole in the usual equations: `x = centre + focal * (R X + t).xy / (R X + t).z`, looking along +Z, y down.
+#[derive(Clone, Copy, Debug)]
+pub(super) struct Pinhole {
+    pub rotation: DMat3,
+    pub translation: DVec3,
+    pub focal: DVec2,
+    pub centre: DVec2,
+}
+
+impl Pinhole {
+    fn local(&self, world: DVec3) -> DVec3 {
+        self.rotation * world + self.translation
+    }
+
+    /// Distance in front along the axis.
+    pub fn depth(&self, world: DVec3) -> f64 {
+        self.local(world).z
+    }
+
+    /// Computed minus given pixel; infinite behind the pinhole.
+    pub fn residual(&self, p: &Pair) -> DVec2 {
+        let q = self.local(p.world);
+        if q.z <= 0.0 {
+            return DVec2::INFINITY;
+        }
+        self.centre + self.focal * q.truncate() / q.z - p.pixel
+    }
+
+    fn cost(&self, pairs: &[Pair]) -> f64 {
+        pairs.iter().map(|p| self.residual(p).length_squared()).sum()
+    }
+
+    /// Moved by (focal 2, centre 2, rotation 3, translation 3).
+    fn step(&self, d: &[f64]) -> Self {
+        // Focal lengths are stepped in their logarithm: they cannot turn negative, and 100 times too long is a distance of 4.6.
+        let turn = so3_exp(DVec3::new(d[4], d[5], d[6]));
+        let rotation = DMat3::from_quat(turn) * self.rotation;
+        // Rounding would let the matrix drift from a rotation over many steps.
+        let x = rotation.x_axis.normalize();
+        let y = (rotation.y_axis - x * x.dot(rotation.y_axis)).normalize();
+        Self {
+            rotation: DMat3::from_cols(x, y, x.cross(y)),
+            translation: self.translation + DVec3::new(d[7], d[8], d[9]),
+            focal: self.focal * DVec2::new(d[0].exp(), d[1].exp()),
+            centre: self.centre + DVec2::new(d[2], d[3]),
+        }
+    }
+
+    /// Derivatives of the residual's x and y by the ten parameters.
+    fn jacobian(&self, p: &Pair) -> [[f64; 10]; 2] {
+        let turned = self.rotation * p.world;
+        let q = turned + self.translation;
+        let by_turn = -hat(turned);
+        std::array::from_fn(|k| {
+            let (f, z) = (self.focal[k], q.z);
+            let mut by_point = DVec3::ZERO;
+            by_point[k] = f / z;
+            by_point.z = -f * q[k] / (z * z);
+            let w = by_turn.transpose() * by_point;
+            let mut row = [0.0; 10];
+            row[k] = f * q[k] / z;
+            row[2 + k] = 1.0;
+            row[4..7].copy_from_slice(&w.to_array());
+            row[7..].copy_from_slice(&by_point.to_array());
+            row
+        })
+    }
+}
+
+/// What the refinement came to.
+pub(super) struct Refined {
+    pub model: Pinhole,
+    pub rms: f64,
+    pub converged: bool,
+    pub iterations: usize,
+    /// Standard deviation of the focal length over itself.
+    pub focal_uncertainty: f64,
+}
+
+const STEPS: usize = 400;
+
+pub(super) fn refine(start: Pinhole, pairs: &[Pair]) -> Refined {
+    let n = pairs.len() as f64;
+    let mut model = start;
+    let mut cost = model.cost(pairs);
+    let mut damping = 1e-3;
+    let mut converged = false;
+    let mut iterations = 0;
+    let mut normal = vec![vec![0.0; 10]; 10];
+    while iterations < STEPS && cost.is_finite() {
+        iterations += 1;
+        let mut gradient = [0.0; 10];
+        normal.iter_mut().for_each(|row| row.fill(0.0));
+        for p in pairs {
+            let (r, j) = (model.residual(p), model.jacobian(p));
+            for k in 0..2 {
+                for a in 0..10 {
+                    gradient[a] -= j[k][a] * r[k];
+                    for b in 0..10 {
+                        normal[a][b] += j[k][a] * j[k][b];
+                    }
+                }
+            }
+        }
+        // Residuals at the rounding error of the coordinates: nothing is left to gain.
+        if cost <= n * 1e-30 {
+            converged = true;
+            break;
+        }
+        let mut accepted = false;
+        while damping < 1e12 {
+            let mut damped = normal.clone();
+            (0..10).for_each(|i| damped[i][i] += damping * normal[i][i].max(1e-12));
+            let trial = solve_spd(&damped, &gradient).map(|d| (model.step(&d), d));
+            let better = trial.map(|(m, d)| (m, m.cost(pairs), d)).filter(|(_, c, _)| *c < cost);
+            let Some((next, next_cost, d)) = better else {
+                damping *= 4.0;
+                continue;
+            };
+            let gain = (cost - next_cost) / cost;
+            let length = d.iter().map(|x| x * x).sum::<f64>().sqrt();
+            (model, cost) = (next, next_cost);
+            damping = (damping * 0.2).max(1e-15);
+            accepted = true;
+            // A step that is small although hardly damped is the end; small because of damping is not.
+            converged = gain < 1e-12 && length < 1e-7 && damping < 1e-2;
+            break;
+        }
+        if !accepted {
+            // No direction lowers the cost: a minimum, if the slope has vanished too.
+            let steep =
+                (0..10).map(|i| gradient[i].abs() / normal[i][i].sqrt().max(1e-300)).fold(0.0, f64::max);
+            converged = steep <= 1e-5 * (cost / n).sqrt().max(1e-12) * n.sqrt();
+            break;
+        }
+        if converged {
+            break;
+        }
+    }
+    let freedom = (2.0 * n - 10.0).max(1.0);
+    let focal_uncertainty = if cost <= n * 1e-24 {
+        0.0
+    } else {
+        inverse_diagonal(&normal).map_or(f64::INFINITY, |d| (d[0].max(d[1]) * cost / freedom).sqrt())
+    };
+    Refined { model, rms: (cost / n).sqrt(), converged, iterations, focal_uncertainty }
+}

@@ -1,0 +1,568 @@
+//! Noisy points on a manifold into position, velocity and acceleration: a bank of Kalman filters with mode mixing.
+//!
+//! A body that is still or coasts is best followed by a constant-velocity filter with a long memory; a body that turns
+//! needs one that models acceleration and forgets fast. No single process noise serves both, so several filters run side by
+//! side and are weighed by how well each foretold the last samples (interacting multiple models, Blom and Bar-Shalom 1988).
+//!
+//! Every axis of the tangent space has a bank of its own: a body that shuttles along x stays calm in y and z. The same code
+//! follows translations and, by way of [`Chart`], rotations.
+
+use dpm_common::se3::{so3_between, so3_exp};
+use glam::{DQuat, DVec3};
+
+/// A manifold of dimension three with tangents in the world frame.
+pub trait Chart {
+    /// A point on it.
+    type Point: Copy + std::fmt::Debug + PartialEq;
+    /// Tangents up to this length add up like vectors, nearly enough to fit curves to.
+    const FLAT: f64;
+    /// The tangent that leads from `from` to `to`.
+    fn between(from: Self::Point, to: Self::Point) -> DVec3;
+    /// The point reached from `from` along a tangent.
+    fn moved(from: Self::Point, by: DVec3) -> Self::Point;
+}
+
+/// Translations, metres.
+#[derive(Clone, Copy, Debug)]
+pub struct Translations;
+
+impl Chart for Translations {
+    type Point = DVec3;
+    const FLAT: f64 = f64::INFINITY;
+    fn between(from: DVec3, to: DVec3) -> DVec3 {
+        to - from
+    }
+    fn moved(from: DVec3, by: DVec3) -> DVec3 {
+        from + by
+    }
+}
+
+/// Rotations as unit quaternions; tangents are world-space rotation vectors, rad.
+#[derive(Clone, Copy, Debug)]
+pub struct Rotations;
+
+impl Chart for Rotations {
+    type Point = DQuat;
+    const FLAT: f64 = 1.0;
+    fn between(from: DQuat, to: DQuat) -> DVec3 {
+        so3_between(from, to)
+    }
+    fn moved(from: DQuat, by: DVec3) -> DQuat {
+        (so3_exp(by) * from).normalize()
+    }
+}
+
+/// Symmetric covariance of position p, velocity v and acceleration a along one axis. SI units.
+#[derive(Clone, Copy, Debug, Default, PartialEq)]
+#[allow(missing_docs)] // the names are the entries
+pub struct Covariance {
+    pub pp: f64,
+    pub pv: f64,
+    pub pa: f64,
+    pub vv: f64,
+    pub va: f64,
+    pub aa: f64,
+}
+
+impl Covariance {
+    /// Variance of the position after `h` seconds of constant acceleration.
+    pub fn position_variance_at(&self, h: f64) -> f64 {
+        let half = 0.5 * h * h;
+        self.pp
+            + h * (2.0 * self.pv + h * self.vv)
+            + half * (2.0 * self.pa + 2.0 * h * self.va + half * self.aa)
+    }
+
+    /// F P F^T for the transition matrix F.
+    fn propagated(&self, f: &Transition) -> Self {
+        // M = F P, row by row; then M F^T.
+        let row = |r: [f64; 3]| {
+            [
+                r[0] * self.pp + r[1] * self.pv + r[2] * self.pa,
+                r[0] * self.pv + r[1] * self.vv + r[2] * self.va,
+                r[0] * self.pa + r[1] * self.va + r[2] * self.aa,
+            ]
+        };
+        let dot = |a: [f64; 3], b: [f64; 3]| a[0] * b[0] + a[1] * b[1] + a[2] * b[2];
+        let (m0, m1, m2) = (row(f.p), row(f.v), row(f.a));
+        Self {
+            pp: dot(m0, f.p),
+            pv: dot(m0, f.v),
+            pa: dot(m0, f.a),
+            vv: dot(m1, f.v),
+            va: dot(m1, f.a),
+            aa: dot(m2, f.a),
+        }
+    }
+
+    /// Joseph form for one position measurement of variance `r`; returns the gains too. 1 - K is computed as R / S, because
+    /// the subtraction would lose every digit when P exceeds R by sixteen orders of magnitude.
+    fn updated(&self, r: f64) -> (Self, [f64; 3]) {
+        let s = self.pp + r;
+        if s <= 0.0 {
+            return (*self, [0.0; 3]);
+        }
+        let [k0, k1, k2] = [self.pp / s, self.pv / s, self.pa / s];
+        let rest = r / s;
+        let new = Self {
+            pp: rest * rest * self.pp + r * k0 * k0,
+            pv: rest * (self.pv - k1 * self.pp) + r * k0 * k1,
+            pa: rest * (self.pa - k2 * self.pp) + r * k0 * k2,
+            vv: self.vv - 2.0 * k1 * self.pv + k1 * k1 * self.pp + r * k1 * k1,
+            va: self.va - k2 * self.pv - k1 * self.pa + k1 * k2 * self.pp + r * k1 * k2,
+            aa: self.aa - 2.0 * k2 * self.pa + k2 * k2 * self.pp + r * k2 * k2,
+        };
+        (new.repaired(), [k0, k1, k2])
+    }
+
+    /// The least change upwards that makes rounding's victims possible again: an LDL^T factorisation from the acceleration down,
+    /// in which a negative conditional variance becomes zero by raising the variance it belongs to. Acts only when the prior
+    /// exceeds what the measurements leave by twelve orders of magnitude and more, where no digits are left to be right.
+    fn repaired(mut self) -> Self {
+        if self.aa <= 0.0 {
+            (self.aa, self.va, self.pa) = (0.0, 0.0, 0.0);
+        }
+        let over_a = if self.aa > 0.0 { 1.0 / self.aa } else { 0.0 };
+        let conditional_v = self.vv - self.va * self.va * over_a;
+        let link = self.pv - self.va * self.pa * over_a;
+        if conditional_v <= 0.0 {
+            // Set anew, not by the difference: that has the rounding of what it is taken from, which may be far larger.
+            self.vv = self.va * self.va * over_a;
+            self.pv = self.va * self.pa * over_a;
+        }
+        let explained = if conditional_v > 0.0 { link * link / conditional_v } else { 0.0 };
+        self.pp = self.pp.max(self.pa * self.pa * over_a + explained);
+        self
+    }
+
+    fn add_scaled(&mut self, o: &Self, w: f64) {
+        self.pp += w * o.pp;
+        self.pv += w * o.pv;
+        self.pa += w * o.pa;
+        self.vv += w * o.vv;
+        self.va += w * o.va;
+        self.aa += w * o.aa;
+    }
+
+    /// Spread of the means in a mixture.
+    fn add_spread(&mut self, dp: f64, dv: f64, da: f64, w: f64) {
+        self.pp += w * dp * dp;
+        self.pv += w * dp * dv;
+        self.pa += w * dp * da;
+        self.vv += w * dv * dv;
+        self.va += w * dv * da;
+        self.aa += w * da * da;
+    }
+
+    /// Sum of the variances.
+    pub fn trace(&self) -> f64 {
+        self.pp + self.vv + self.aa
+    }
+}
+
+/// Rows of the matrix that moves (p, v, a) on.
+struct Transition {
+    p: [f64; 3],
+    v: [f64; 3],
+    a: [f64; 3],
+}
+
+/// How a body is assumed to move along one axis between two samples.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct MotionModel {
+    /// False: acceleration is zero. True: it is a state.
+    pub accelerates: bool,
+    /// Jerk is `-w^2` times velocity: a swing about any centre at this angular frequency, rad/s; 0 is constant acceleration.
+    /// Only where `accelerates`.
+    pub swing_rad_s: f64,
+    /// Power spectral density of the driving noise: white acceleration (m^2/s^3) where the model does not accelerate, else
+    /// white jerk (m^2/s^5).
+    pub noise: f64,
+}
+
+impl MotionModel {
+    fn transition(&self, h: f64) -> Transition {
+        if !self.accelerates {
+            return Transition { p: [1.0, h, 0.0], v: [0.0, 1.0, 0.0], a: [0.0; 3] };
+        }
+        let w = self.swing_rad_s;
+        let x = w * h;
+        let (sin, cos) = x.sin_cos();
+        // (1 - cos x) / w^2 by the half angle: no cancellation; both quotients have their limits at w = 0.
+        let (first, second) = if x.abs() < 1e-8 {
+            (h, 0.5 * h * h)
+        } else {
+            let half = (0.5 * x).sin();
+            (sin / w, 2.0 * half * half / (w * w))
+        };
+        Transition { p: [1.0, first, second], v: [0.0, cos, first], a: [0.0, -w * sin, cos] }
+    }
+
+    /// The noise collected in `h` seconds; the swing's feedback changes it by O((w h)^2) and is left out.
+    fn process_noise(&self, h: f64) -> Covariance {
+        let q = self.noise;
+        let (h2, h3) = (h * h, h * h * h);
+        if self.accelerates {
+            Covariance {
+                pp: q * h2 * h3 / 20.0,
+                pv: q * h2 * h2 / 8.0,
+                pa: q * h3 / 6.0,
+                vv: q * h3 / 3.0,
+                va: q * h2 / 2.0,
+                aa: q * h,
+            }
+        } else {
+            Covariance { pp: q * h3 / 3.0, pv: q * h2 / 2.0, vv: q * h, ..Covariance::default() }
+        }
+    }
+}
+
+/// Mean and covariance of a motion at one instant.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Kinematics<P> {
+    /// Position or rotation.
+    pub point: P,
+    /// Per second, world frame.
+    pub velocity: DVec3,
+    /// Per second squared, world frame.
+    pub acceleration: DVec3,
+    /// Of the three, along x, y and z.
+    pub covariance: [Covariance; 3],
+}
+
+impl<P: Copy> Kinematics<P> {
+    /// A point that stands still, known to `variance` per axis.
+    pub fn held(point: P, variance: f64) -> Self {
+        let covariance = [Covariance { pp: variance, ..Covariance::default() }; 3];
+        Self { point, velocity: DVec3::ZERO, acceleration: DVec3::ZERO, covariance }
+    }
+
+    /// Where the point will be after `h` seconds (may be negative) at constant acceleration.
+    pub fn point_at<C: Chart<Point = P>>(&self, h: f64) -> P {
+        C::moved(self.point, (self.velocity + self.acceleration * (0.5 * h)) * h)
+    }
+}
+
+/// What a body did the last time that it came by here, over one step ([`super::recall`]).
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Recalled {
+    /// Where it went beyond what its velocity at the step's begin makes, m or rad.
+    pub moved: DVec3,
+    /// How much faster it became, per second.
+    pub faster: DVec3,
+    /// Its mean acceleration over the horizon after the step, per second squared.
+    pub acceleration: DVec3,
+    /// Axes along which there is any acceleration near by. Along the others the models know better, without the past's noise.
+    pub matters: [bool; 3],
+}
+
+/// One axis of [`Recalled`].
+#[derive(Clone, Copy, Debug)]
+struct RecalledAxis {
+    moved: f64,
+    faster: f64,
+    acceleration: f64,
+}
+
+/// Number of filters in a bank.
+pub const MODES: usize = 5;
+/// The filter that moves on as the body did the last time; its model says how exactly it repeats itself. It takes part only
+/// while something is recalled.
+pub const RECALLED: usize = 4;
+
+/// What a bank assumes of motion in general.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct ImmConfig {
+    /// The models.
+    pub models: [MotionModel; MODES],
+    /// Mean time a mode lasts, seconds: the chance to leave it within `h` is 1 - exp(-h / dwell).
+    pub dwell_s: [f64; MODES],
+    /// Of those who leave mode i, the share that goes to mode j; rows sum to 1, the diagonal is 0.
+    pub leave_to: [[f64; MODES]; MODES],
+    /// While something is recalled: mean time after which any mode leaves for [`RECALLED`], seconds.
+    pub recall_after_s: f64,
+    /// Standard deviation of the acceleration that a coasting body may start with, m/s^2 or rad/s^2.
+    pub onset_acceleration: f64,
+    /// Standard deviation of the velocity before anything is known, m/s or rad/s.
+    pub initial_velocity: f64,
+}
+
+/// One filter on one axis. Its position is an offset from the bank's common base point.
+#[derive(Clone, Copy, Debug, Default)]
+struct AxisMode {
+    offset: f64,
+    velocity: f64,
+    acceleration: f64,
+    covariance: Covariance,
+}
+
+/// The filters of one axis.
+#[derive(Clone, Copy, Debug)]
+struct AxisBank {
+    modes: [AxisMode; MODES],
+    probability: [f64; MODES],
+}
+
+impl AxisBank {
+    fn new(config: &ImmConfig, r: f64) -> Self {
+        let modes = config.models.map(|model| AxisMode {
+            covariance: Covariance {
+                pp: r,
+                vv: config.initial_velocity * config.initial_velocity,
+                aa: if model.accelerates {
+                    config.onset_acceleration * config.onset_acceleration
+                } else {
+                    0.0
+                },
+                ..Covariance::default()
+            },
+            ..AxisMode::default()
+        });
+        Self { modes, probability: Self::UNKNOWN }
+    }
+
+    /// The same for all but [`RECALLED`].
+    const UNKNOWN: [f64; MODES] = {
+        let mut all = [1.0 / (MODES - 1) as f64; MODES];
+        all[RECALLED] = 0.0;
+        all
+    };
+
+    /// Moment-matched mean and covariance of weighted modes.
+    fn mixture(modes: &[AxisMode; MODES], weight: &[f64; MODES]) -> AxisMode {
+        let mut mean = AxisMode::default();
+        for (m, &w) in modes.iter().zip(weight) {
+            mean.offset += m.offset * w;
+            mean.velocity += m.velocity * w;
+            mean.acceleration += m.acceleration * w;
+        }
+        for (m, &w) in modes.iter().zip(weight) {
+            mean.covariance.add_scaled(&m.covariance, w);
+            let (dp, dv, da) =
+                (m.offset - mean.offset, m.velocity - mean.velocity, m.acceleration - mean.acceleration);
+            mean.covariance.add_spread(dp, dv, da, w);
+        }
+        mean
+    }
+
+    /// Share of mode `i` that is in mode `j` after `h` seconds.
+    fn share(config: &ImmConfig, h: f64, i: usize, j: usize, recalls: bool) -> f64 {
+        if i == RECALLED && !recalls {
+            return config.leave_to[i][j];
+        }
+        let stays = (-h / config.dwell_s[i]).exp();
+        let among = if i == j { stays } else { (1.0 - stays) * config.leave_to[i][j] };
+        match (recalls && i != RECALLED, (-h / config.recall_after_s).exp()) {
+            (true, stays) if j == RECALLED => 1.0 - stays,
+            (true, stays) => among * stays,
+            (false, _) => among,
+        }
+    }
+
+    /// Mixes the modes and moves all of them `h` >= 0 seconds on.
+    fn advance(&mut self, config: &ImmConfig, h: f64, recalled: Option<RecalledAxis>) {
+        let mut moved = self.modes;
+        let mut foretold = [0.0; MODES];
+        // A coasting mode knows nothing of the acceleration that a turn starts with; its zero is not knowledge.
+        let mut open = self.modes;
+        for (source, model) in open.iter_mut().zip(&config.models) {
+            if !model.accelerates {
+                source.covariance.aa = config.onset_acceleration * config.onset_acceleration;
+            }
+        }
+        for (j, model) in config.models.iter().enumerate() {
+            let mut weight: [f64; MODES] = std::array::from_fn(|i| {
+                Self::share(config, h, i, j, recalled.is_some()) * self.probability[i]
+            });
+            foretold[j] = weight.iter().sum();
+            let mode = &mut moved[j];
+            if foretold[j] > 0.0 {
+                weight.iter_mut().for_each(|w| *w /= foretold[j]);
+                *mode = Self::mixture(if model.accelerates { &open } else { &self.modes }, &weight);
+            }
+            let f = model.transition(h);
+            let (v, a) = (mode.velocity, mode.acceleration);
+            mode.offset += f.p[1] * v + f.p[2] * a;
+            mode.velocity = f.v[1] * v + f.v[2] * a;
+            mode.acceleration = f.a[1] * v + f.a[2] * a;
+            if let (RECALLED, Some(recalled)) = (j, recalled) {
+                mode.offset += recalled.moved;
+                mode.velocity += recalled.faster;
+                mode.acceleration = recalled.acceleration;
+            }
+            mode.covariance = mode.covariance.propagated(&f);
+            mode.covariance.add_scaled(&model.process_noise(h), 1.0);
+        }
+        self.modes = moved;
+        self.probability = foretold;
+    }
+
+    /// Takes in a measured offset of variance `r`.
+    fn update(&mut self, z: f64, r: f64) {
+        let mut log_likelihood = [0.0; MODES];
+        for (mode, log_l) in self.modes.iter_mut().zip(&mut log_likelihood) {
+            let innovation = z - mode.offset;
+            let s = (mode.covariance.pp + r).max(f64::MIN_POSITIVE);
+            *log_l = -0.5 * (innovation * innovation / s + s.ln());
+            let (covariance, [kp, kv, ka]) = mode.covariance.updated(r);
+            mode.covariance = covariance;
+            mode.offset += innovation * kp;
+            mode.velocity += innovation * kv;
+            mode.acceleration += innovation * ka;
+        }
+        let possible = log_likelihood.iter().zip(&self.probability).filter(|(_, p)| **p > 0.0);
+        let best = possible.map(|(l, _)| *l).fold(f64::NEG_INFINITY, f64::max);
+        let mut total = 0.0;
+        for (p, log_l) in self.probability.iter_mut().zip(log_likelihood) {
+            *p = if *p > 0.0 { *p * (log_l - best).exp() } else { 0.0 };
+            total += *p;
+        }
+        if total > 0.0 && total.is_finite() {
+            self.probability.iter_mut().for_each(|p| *p /= total);
+        } else {
+            self.probability = Self::UNKNOWN;
+        }
+    }
+}
+
+/// The banks of all three axes at the instant of the last sample.
+#[derive(Clone, Copy, Debug)]
+pub struct Imm<C: Chart> {
+    base: C::Point,
+    axes: [AxisBank; 3],
+}
+
+impl<C: Chart> Imm<C> {
+    /// Starts at a measured point of variance `r` with unknown velocity.
+    pub fn new(config: &ImmConfig, z: C::Point, r: f64) -> Self {
+        Self { base: z, axes: [AxisBank::new(config, r); 3] }
+    }
+
+    /// Weight of each model on each axis; each row sums to 1.
+    pub fn probability(&self) -> [[f64; MODES]; 3] {
+        self.axes.map(|axis| axis.probability)
+    }
+
+    /// The covariance of each mode on each axis, for invariants in tests.
+    pub fn covariances(&self) -> [[Covariance; MODES]; 3] {
+        self.axes.map(|axis| axis.modes.map(|m| m.covariance))
+    }
+
+    /// Moment-matched mean and covariance of the banks.
+    pub fn combined(&self) -> Kinematics<C::Point> {
+        let mean = self.axes.map(|axis| AxisBank::mixture(&axis.modes, &axis.probability));
+        Kinematics {
+            point: C::moved(self.base, DVec3::from_array(mean.map(|m| m.offset))),
+            velocity: DVec3::from_array(mean.map(|m| m.velocity)),
+            acceleration: DVec3::from_array(mean.map(|m| m.acceleration)),
+            covariance: mean.map(|m| m.covariance),
+        }
+    }
+
+    /// Moves the base point into the middle of the modes, so that offsets stay small against the chart's curvature.
+    fn rebase(&mut self) {
+        let mut mean = [0.0; 3];
+        for (axis, mean) in self.axes.iter_mut().zip(&mut mean) {
+            *mean = axis.modes.iter().zip(axis.probability).map(|(m, p)| m.offset * p).sum();
+            axis.modes.iter_mut().for_each(|m| m.offset -= *mean);
+        }
+        self.base = C::moved(self.base, DVec3::from_array(mean));
+    }
+
+    /// Mixes the modes and moves all of them `h` >= 0 seconds on, [`RECALLED`] as in `recalled`.
+    pub fn advance(&mut self, config: &ImmConfig, h: f64, recalled: Option<Recalled>) {
+        for (i, axis) in self.axes.iter_mut().enumerate() {
+            let along = recalled.filter(|r| r.matters[i]).map(|r| RecalledAxis {
+                moved: r.moved[i],
+                faster: r.faster[i],
+                acceleration: r.acceleration[i],
+            });
+            axis.advance(config, h, along);
+        }
+        self.rebase();
+    }
+
+    /// Squared Mahalanobis distance of a measurement of variance `r` (after [`Imm::advance`]): each axis by its most generous
+    /// mode, with `slack` metres or rad of standard deviation added for what no mode expects.
+    pub fn distance_squared(&self, z: C::Point, r: f64, slack: f64) -> f64 {
+        let z = C::between(self.base, z).to_array();
+        let axis = |(bank, z): (&AxisBank, f64)| {
+            let distance = |m: &AxisMode| {
+                let d = z - m.offset;
+                d * d / (m.covariance.pp + r + slack * slack).max(f64::MIN_POSITIVE)
+            };
+            let possible = bank.modes.iter().zip(bank.probability).filter(|(_, p)| *p > 0.0);
+            possible.map(|(m, _)| distance(m)).fold(f64::INFINITY, f64::min)
+        };
+        self.axes.iter().zip(z).map(axis).sum()
+    }
+
+    /// Takes in a measurement of variance `r` >= 0 per axis at the instant that [`Imm::advance`] moved to. Returns the
+    /// normalised innovation squared of the mixture (3 degrees of freedom).
+    pub fn update(&mut self, z: C::Point, r: f64) -> f64 {
+        let z = C::between(self.base, z).to_array();
+        let mut nis = 0.0;
+        for (axis, z) in self.axes.iter_mut().zip(z) {
+            let before = AxisBank::mixture(&axis.modes, &axis.probability);
+            let d = z - before.offset;
+            nis += d * d / (before.covariance.pp + r).max(f64::MIN_POSITIVE);
+            axis.update(z, r);
+        }
+        self.rebase();
+        nis
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::super::pose_filter::models_for;
+    use super::*;
+    use proptest::prelude::*;
+
+    /// Whatever leaves a mode arrives in another.
+    #[test]
+    fn shares_of_a_mode_sum_to_one() {
+        let config = models_for(5.0);
+        for (h, recalls) in [0.0, 0.002, 0.1, 10.0].into_iter().flat_map(|h| [(h, false), (h, true)]) {
+            for i in 0..MODES {
+                let sum: f64 = (0..MODES).map(|j| AxisBank::share(&config, h, i, j, recalls)).sum();
+                assert!((sum - 1.0).abs() < 1e-12, "{sum} of mode {i} after {h} s, recalled: {recalls}");
+            }
+        }
+    }
+
+    proptest! {
+        /// The gain lies in [0, 1], a measurement never makes the position less certain, and what is left is no more than the
+        /// measurement's own variance: over 24 orders of magnitude either way.
+        #[test]
+        fn gains_are_weights(p in -12f64..12.0, r in -12f64..12.0, v in -12f64..12.0, rho in -0.99f64..0.99) {
+            let [p, r, v] = [p, r, v].map(|e| 10f64.powf(e));
+            let before = Covariance { pp: p, pv: rho * (p * v).sqrt(), vv: v, ..Covariance::default() };
+            let (after, [k, ..]) = before.updated(r);
+            prop_assert!((0.0..=1.0).contains(&k));
+            prop_assert!(after.pp <= p.min(r) * (1.0 + 1e-9), "{} of {p}, {r}", after.pp);
+            prop_assert!(after.vv <= v * (1.0 + 1e-9) && after.vv >= 0.0);
+            prop_assert!(after.pv * after.pv <= after.pp * after.vv * (1.0 + 1e-9));
+        }
+
+        /// Two steps are one step of their sum, for the motion and for its noise (the noise exactly only without swing).
+        #[test]
+        fn transitions_compose(h1 in 0f64..0.05, h2 in 0f64..0.05, w in 0f64..30.0, x in prop::array::uniform3(-10f64..10.0)) {
+            let model = MotionModel { accelerates: true, swing_rad_s: w, noise: 2.0 };
+            let apply = |f: &Transition, x: [f64; 3]| [f.p, f.v, f.a].map(|r| r[0] * x[0] + r[1] * x[1] + r[2] * x[2]);
+            let twice = apply(&model.transition(h2), apply(&model.transition(h1), x));
+            let once = apply(&model.transition(h1 + h2), x);
+            for (a, b) in twice.iter().zip(once) {
+                prop_assert!((a - b).abs() < 1e-11 * 1e3);
+            }
+            for model in [MotionModel { swing_rad_s: 0.0, ..model }, MotionModel { accelerates: false, swing_rad_s: 0.0, noise: 2.0 }] {
+                let mut twice = model.process_noise(h1).propagated(&model.transition(h2));
+                twice.add_scaled(&model.process_noise(h2), 1.0);
+                let once = model.process_noise(h1 + h2);
+                let close = |a: f64, b: f64| (a - b).abs() <= 1e-12 * b.abs() + 1e-30;
+                prop_assert!(close(twice.pp, once.pp) && close(twice.pv, once.pv) && close(twice.vv, once.vv));
+                prop_assert!(close(twice.pa, once.pa) && close(twice.va, once.va) && close(twice.aa, once.aa));
+            }
+        }
+    }
+}

@@ -1,0 +1,538 @@
+//! Samples of one body into its motion: each sample is judged, the good ones feed two banks of Kalman filters.
+//!
+//! Three samples that agree with one another start a track; a sample far from where the track should be is set aside, and
+//! three that agree replace the track. So a teleport is taken over within three samples and never extrapolated across,
+//! and a burst of outliers changes nothing.
+
+use super::imm::{Imm, ImmConfig, Kinematics, MotionModel, Rotations, Translations};
+use super::noise::NoiseEstimator;
+use super::recall::Recall;
+use super::state::{Freshness, PosePrediction, TrackState};
+use dpm_common::se3::so3_between;
+use dpm_device::time::HostTime;
+use dpm_device::tracker::TrackerSample;
+use glam::{DQuat, DVec3};
+
+/// Samples that must agree before a track starts or is replaced.
+pub const ACQUIRE_SAMPLES: usize = 3;
+
+/// A quaternion whose norm differs from 1 by more is refused instead of normalised.
+const QUATERNION_TOLERANCE: f64 = 1e-3;
+
+/// A sample stamped later than this after its own arrival is refused: it would make every true one look old.
+const FUTURE_TOLERANCE_NS: i64 = 1_000_000;
+
+/// Intervals between samples that are remembered to tell the tracker's rate.
+const INTERVALS: usize = 9;
+/// Intervals that must be known before the rate is believed.
+const LEAST_INTERVALS: usize = 3;
+/// The slowest tracker whose rate is believed, ns between two samples: 10 Hz.
+const LONGEST_PERIOD_NS: i64 = 100_000_000;
+/// A track goes on across a gap of so many half periods: two samples in a row may be missing, and the third may come late.
+const HALF_PERIODS_CARRIED: i64 = 7;
+/// The part of [`PoseFilterConfig::tracked_for_ns`] that is the rig's own latency, ns; a missing sample or two come on top.
+const OWN_LATENCY_NS: i64 = 6_000_000;
+
+/// Whether poses are carried on to the instant of light.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Prediction {
+    /// Filtered and predicted.
+    On,
+    /// The newest accepted pose is held as it came: what a rig without prediction would show, for comparison.
+    Off,
+}
+
+/// Settings of one body's filter. Everything has a default for a 500 Hz optical tracker and hand-held objects.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct PoseFilterConfig {
+    /// Predict or hold.
+    pub prediction: Prediction,
+    /// Standard deviation of a sample's position along one axis before it has been measured, metres, > 0.
+    pub position_noise_m: f64,
+    /// Standard deviation of a sample's rotation about one axis before it has been measured, rad, > 0.
+    pub rotation_noise_rad: f64,
+    /// Measure the noise from the samples themselves instead of believing the two above for ever.
+    pub measure_noise: bool,
+    /// Positions are followed by this.
+    pub position_models: ImmConfig,
+    /// Rotations are followed by this.
+    pub rotation_models: ImmConfig,
+    /// Samples further than this many standard deviations from the prediction are set aside.
+    pub gate_sigmas: f64,
+    /// Fastest motion taken for real, m/s.
+    pub max_speed_m_s: f64,
+    /// Strongest acceleration taken for real, m/s^2.
+    pub max_acceleration_m_s2: f64,
+    /// Strongest angular acceleration taken for real, rad/s^2.
+    pub max_angular_acceleration_rad_s2: f64,
+    /// Horizons up to this count as [`Freshness::Tracked`]: the rig's own latency and a missing sample or two, ns. With a tracker
+    /// below 500 Hz it is that of two periods, and at most `lost_after_ns`.
+    pub tracked_for_ns: i64,
+    /// Longest time that motion is carried on without samples; then the body is lost, ns. A track may be older: it goes on with the
+    /// next sample if no more than two are missing, at the rate at which samples come.
+    pub lost_after_ns: i64,
+    /// A body that moved and then delivers this many identical poses is reported stuck.
+    pub stuck_after: u32,
+}
+
+impl Default for PoseFilterConfig {
+    fn default() -> Self {
+        Self {
+            prediction: Prediction::On,
+            position_noise_m: 1e-4,
+            rotation_noise_rad: 1e-3,
+            measure_noise: true,
+            position_models: models_for(5.0),
+            rotation_models: models_for(20.0),
+            gate_sigmas: 6.0,
+            max_speed_m_s: 20.0,
+            max_acceleration_m_s2: 500.0,
+            max_angular_acceleration_rad_s2: 20_000.0,
+            tracked_for_ns: 10_000_000,
+            lost_after_ns: 20_000_000,
+            stuck_after: 5,
+        }
+    }
+}
+
+/// Models for bodies whose turns take about `acceleration` (m/s^2 or rad/s^2) and whose velocity changes in a good part of a
+/// second: coasting; steady acceleration; swinging at a hand's or a rocker's pace; a sharp manoeuvre, which bridges
+/// the onset of a turn; and what the body did the last time. The numbers were found by a random search over shuttles and swings of
+/// 1 to 3 Hz with 0.1 mm of noise at 500 Hz (the table in `docs/LATENCY.md`); densities scale with the square of the acceleration.
+pub fn models_for(acceleration: f64) -> ImmConfig {
+    let a2 = acceleration * acceleration;
+    let model = |accelerates, swing_rad_s, noise| MotionModel { accelerates, swing_rad_s, noise };
+    ImmConfig {
+        models: [
+            model(false, 0.0, 1e-7 * a2),
+            model(true, 0.0, 0.012 * a2),
+            model(true, 10.0, 0.0017 * a2),
+            model(true, 0.0, 28.0 * a2),
+            model(false, 0.0, 1e-5 * a2),
+        ],
+        dwell_s: [1.0, 0.07, 1.0, 0.03, 1.5],
+        leave_to: [
+            [0.0, 0.02, 0.94, 0.04, 0.0],
+            [0.54, 0.0, 0.01, 0.45, 0.0],
+            [0.24, 0.01, 0.0, 0.75, 0.0],
+            [0.05, 0.8, 0.15, 0.0, 0.0],
+            [0.85, 0.05, 0.05, 0.05, 0.0],
+        ],
+        recall_after_s: 0.03,
+        onset_acceleration: 0.83 * acceleration,
+        initial_velocity: 4.0 * acceleration,
+    }
+}
+
+impl PoseFilterConfig {
+    /// The same without what a body did the last time ([`super::recall`]): for comparison.
+    pub fn without_recall(mut self) -> Self {
+        // So long after that it never comes.
+        self.position_models.recall_after_s = f64::INFINITY;
+        self.rotation_models.recall_after_s = f64::INFINITY;
+        self
+    }
+
+    /// Settings for bodies that accelerate by about `acceleration` (m/s^2) and `angular_acceleration` (rad/s^2), and that are lost when no
+    /// sample has come for `lost_after_ms`, at least 1.
+    pub fn for_bodies(acceleration: f64, angular_acceleration: f64, lost_after_ms: u32) -> Self {
+        let lost_after_ns = i64::from(lost_after_ms.max(1)) * 1_000_000;
+        let defaults = Self::default();
+        Self {
+            position_models: models_for(acceleration),
+            rotation_models: models_for(angular_acceleration),
+            max_acceleration_m_s2: (100.0 * acceleration).max(defaults.max_acceleration_m_s2),
+            max_angular_acceleration_rad_s2: (100.0 * angular_acceleration)
+                .max(defaults.max_angular_acceleration_rad_s2),
+            tracked_for_ns: lost_after_ns / 2,
+            lost_after_ns,
+            ..defaults
+        }
+    }
+}
+
+/// What became of a sample.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Verdict {
+    /// Taken in.
+    Accepted,
+    /// Taken in, and the body moves no more although it did and its noise has gone: the tracker repeats itself.
+    Stuck,
+    /// Taken in; a track starts here, or the body is somewhere else than its track was.
+    Acquired,
+    /// Agrees with no track yet; waits for others that agree with it.
+    SetAside,
+    /// The tracker says that it does not see the body.
+    Untracked,
+    /// A component is not finite.
+    NotFinite,
+    /// The quaternion's norm is further than 1e-3 from 1.
+    NotUnit,
+    /// Same stamp as the newest.
+    Duplicate,
+    /// Older than the newest.
+    OutOfOrder,
+    /// Stamped after its own arrival.
+    FromFuture,
+}
+
+impl Verdict {
+    /// True when the sample changed the track.
+    pub fn is_accepted(self) -> bool {
+        matches!(self, Self::Accepted | Self::Stuck | Self::Acquired)
+    }
+}
+
+/// How many samples met each fate since the start.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+#[allow(missing_docs)] // one per Verdict, named after it
+pub struct PoseFilterCounters {
+    pub accepted: u64,
+    pub stuck: u64,
+    pub acquired: u64,
+    pub set_aside: u64,
+    pub untracked: u64,
+    pub not_finite: u64,
+    pub not_unit: u64,
+    pub duplicate: u64,
+    pub out_of_order: u64,
+    pub from_future: u64,
+}
+
+impl PoseFilterCounters {
+    fn count(&mut self, verdict: Verdict) {
+        *match verdict {
+            Verdict::Accepted => &mut self.accepted,
+            Verdict::Stuck => &mut self.stuck,
+            Verdict::Acquired => &mut self.acquired,
+            Verdict::SetAside => &mut self.set_aside,
+            Verdict::Untracked => &mut self.untracked,
+            Verdict::NotFinite => &mut self.not_finite,
+            Verdict::NotUnit => &mut self.not_unit,
+            Verdict::Duplicate => &mut self.duplicate,
+            Verdict::OutOfOrder => &mut self.out_of_order,
+            Verdict::FromFuture => &mut self.from_future,
+        } += 1;
+    }
+}
+
+/// A checked measurement.
+#[derive(Clone, Copy, Debug, PartialEq)]
+struct Measured {
+    at: HostTime,
+    position: DVec3,
+    rotation: DQuat,
+}
+
+#[derive(Clone, Debug)]
+struct Track {
+    position: Imm<Translations>,
+    rotation: Imm<Rotations>,
+    newest: Measured,
+    /// Length of the current run of identical poses, and whether the body moved before it.
+    repeats: u32,
+    moved_before_repeats: bool,
+}
+
+/// Follows one body. Allocates once and never blocks; one update costs a few microseconds, with a new point of the past ten more.
+#[derive(Clone, Debug)]
+pub struct PoseFilter {
+    config: PoseFilterConfig,
+    track: Option<Track>,
+    candidates: [Option<Measured>; ACQUIRE_SAMPLES],
+    position_noise: NoiseEstimator<Translations>,
+    rotation_noise: NoiseEstimator<Rotations>,
+    position_recall: Recall<Translations>,
+    rotation_recall: Recall<Rotations>,
+    counters: PoseFilterCounters,
+    last_nis: Option<[f64; 2]>,
+    rate: Rate,
+}
+
+/// The time between two samples of a tracker, measured: what a rig file says of it may be wrong, and nothing else tells a tracker at
+/// 30 Hz, whose samples are all "late" by the measure of one at 500 Hz, from one that loses most of its samples.
+#[derive(Clone, Copy, Debug, Default)]
+struct Rate {
+    newest: Option<HostTime>,
+    intervals: [i64; INTERVALS],
+    filled: usize,
+    next: usize,
+}
+
+impl Rate {
+    fn push(&mut self, at: HostTime) {
+        let interval = self.newest.map_or(0, |newest| at.ns_since(newest));
+        if self.newest.is_none() || interval > 0 {
+            self.newest = Some(at);
+        }
+        if interval > 0 {
+            self.intervals[self.next] = interval;
+            self.next = (self.next + 1) % INTERVALS;
+            self.filled = (self.filled + 1).min(INTERVALS);
+        }
+    }
+
+    /// The median of the last intervals, which samples missing now and then do not move, at most [`LONGEST_PERIOD_NS`]; 0 while it is
+    /// not known. Nanoseconds.
+    fn period_ns(&self) -> i64 {
+        if self.filled < LEAST_INTERVALS {
+            return 0;
+        }
+        let mut sorted = self.intervals;
+        let known = &mut sorted[..self.filled];
+        known.sort_unstable();
+        known[(known.len() - 1) / 2].min(LONGEST_PERIOD_NS)
+    }
+}
+
+impl PoseFilter {
+    /// A filter that has seen nothing.
+    pub fn new(config: PoseFilterConfig) -> Self {
+        Self {
+            config,
+            track: None,
+            candidates: [None; ACQUIRE_SAMPLES],
+            position_noise: NoiseEstimator::new(config.position_noise_m, 1e-6),
+            rotation_noise: NoiseEstimator::new(config.rotation_noise_rad, 1e-6),
+            position_recall: Recall::new(),
+            rotation_recall: Recall::new(),
+            counters: PoseFilterCounters::default(),
+            last_nis: None,
+            rate: Rate::default(),
+        }
+    }
+
+    /// Longest gap between two samples across which a track goes on, ns.
+    fn carried_for_ns(&self) -> i64 {
+        self.config.lost_after_ns.max(HALF_PERIODS_CARRIED * self.rate.period_ns() / 2)
+    }
+
+    fn tracked_for_ns(&self) -> i64 {
+        let slow = OWN_LATENCY_NS + 2 * self.rate.period_ns();
+        self.config.tracked_for_ns.max(slow).min(self.config.lost_after_ns)
+    }
+
+    /// The settings.
+    pub fn config(&self) -> &PoseFilterConfig {
+        &self.config
+    }
+
+    /// Fates of all samples so far.
+    pub fn counters(&self) -> PoseFilterCounters {
+        self.counters
+    }
+
+    /// Normalised innovation squared of the last accepted sample, position and rotation: mean 3 when the filter's
+    /// account of its own error is right.
+    pub fn last_nis(&self) -> Option<[f64; 2]> {
+        self.last_nis
+    }
+
+    /// The noise in use: standard deviation per axis, metres and rad.
+    pub fn noise(&self) -> (f64, f64) {
+        let (p, r) = self.variances();
+        (p.sqrt(), r.sqrt())
+    }
+
+    /// Judges a sample and takes it in when it is good. Any bits may come in.
+    pub fn update(&mut self, sample: &TrackerSample) -> Verdict {
+        let verdict = match check(sample) {
+            Ok(measured) => {
+                self.rate.push(measured.at);
+                self.take(measured)
+            }
+            Err(verdict) => verdict,
+        };
+        self.counters.count(verdict);
+        verdict
+    }
+
+    /// The body at `at`; `None` until a track has started for the first time.
+    pub fn predict(&self, at: HostTime) -> Option<PosePrediction> {
+        self.state().map(|state| state.predict(at))
+    }
+
+    /// The track as plain data, to be predicted elsewhere.
+    pub fn state(&self) -> Option<TrackState> {
+        let track = self.track.as_ref()?;
+        let (position, rotation) = match self.config.prediction {
+            Prediction::On => (track.position.combined(), track.rotation.combined()),
+            Prediction::Off => (
+                Kinematics::held(track.newest.position, self.position_noise.variance()),
+                Kinematics::held(track.newest.rotation, self.rotation_noise.variance()),
+            ),
+        };
+        Some(TrackState {
+            captured_at: track.newest.at,
+            position,
+            rotation,
+            tracked_for_ns: self.tracked_for_ns(),
+            lost_after_ns: self.config.lost_after_ns,
+        })
+    }
+
+    /// Shorthand for the freshness of [`PoseFilter::predict`]; `Lost` before the first track.
+    pub fn freshness(&self, at: HostTime) -> Freshness {
+        self.predict(at).map_or(Freshness::Lost, |p| p.freshness)
+    }
+
+    fn variances(&self) -> (f64, f64) {
+        if self.config.measure_noise {
+            (self.position_noise.variance(), self.rotation_noise.variance())
+        } else {
+            let c = &self.config;
+            (c.position_noise_m * c.position_noise_m, c.rotation_noise_rad * c.rotation_noise_rad)
+        }
+    }
+
+    fn take(&mut self, z: Measured) -> Verdict {
+        let (rp, rr) = self.variances();
+        let c = self.config;
+        let carried_for_ns = self.carried_for_ns();
+        if let Some(track) = &mut self.track {
+            let gap_ns = z.at.ns_since(track.newest.at);
+            if gap_ns == 0 {
+                return Verdict::Duplicate;
+            }
+            if gap_ns < 0 {
+                return Verdict::OutOfOrder;
+            }
+            if gap_ns <= carried_for_ns {
+                let h = gap_ns as f64 * 1e-9;
+                let mut position = track.position;
+                let mut rotation = track.rotation;
+                let (from_ns, to_ns) = (track.newest.at.0, z.at.0);
+                position.advance(&c.position_models, h, self.position_recall.between(from_ns, to_ns));
+                rotation.advance(&c.rotation_models, h, self.rotation_recall.between(from_ns, to_ns));
+                // What the strongest believable acceleration could do unseen counts as two standard deviations.
+                let slack = 0.25 * h * h;
+                let gate = c.gate_sigmas * c.gate_sigmas;
+                let inside = position.distance_squared(z.position, rp, slack * c.max_acceleration_m_s2)
+                    <= gate
+                    && rotation.distance_squared(z.rotation, rr, slack * c.max_angular_acceleration_rad_s2)
+                        <= gate;
+                if inside {
+                    self.last_nis = Some([position.update(z.position, rp), rotation.update(z.rotation, rr)]);
+                    track.position = position;
+                    track.rotation = rotation;
+                    self.candidates = [None; ACQUIRE_SAMPLES];
+                    self.position_noise.push(z.at.0, z.position);
+                    self.rotation_noise.push(z.at.0, z.rotation);
+                    let (p, r) = (position.combined(), rotation.combined());
+                    self.position_recall.push(to_ns, z.position, p.point, p.velocity, rp.sqrt());
+                    self.rotation_recall.push(to_ns, z.rotation, r.point, r.velocity, rr.sqrt());
+                    return track.accept(z, c.stuck_after);
+                }
+            }
+        }
+        self.acquire(z, rp, rr)
+    }
+
+    /// Collects samples that agree; the third in a row starts a new track.
+    fn acquire(&mut self, z: Measured, rp: f64, rr: f64) -> Verdict {
+        let c = self.config;
+        if let [.., Some(last)] = self.candidates {
+            let gap_ns = z.at.ns_since(last.at);
+            if gap_ns == 0 {
+                return Verdict::Duplicate;
+            }
+            if gap_ns < 0 {
+                return Verdict::OutOfOrder;
+            }
+            if gap_ns > self.carried_for_ns() || !self.agrees(z, rp) {
+                self.candidates = [None; ACQUIRE_SAMPLES];
+            }
+        }
+        self.candidates.rotate_left(1);
+        self.candidates[ACQUIRE_SAMPLES - 1] = Some(z);
+        let [Some(first), rest @ ..] = self.candidates else {
+            return Verdict::SetAside;
+        };
+        let mut position = Imm::new(&c.position_models, first.position, rp);
+        let mut rotation = Imm::new(&c.rotation_models, first.rotation, rr);
+        self.position_noise.break_track();
+        self.rotation_noise.break_track();
+        self.position_recall.break_track();
+        self.rotation_recall.break_track();
+        let mut before = first;
+        for z in rest.into_iter().flatten() {
+            let h = z.at.ns_since(before.at) as f64 * 1e-9;
+            position.advance(&c.position_models, h, None);
+            rotation.advance(&c.rotation_models, h, None);
+            position.update(z.position, rp);
+            rotation.update(z.rotation, rr);
+            before = z;
+        }
+        self.last_nis = None;
+        self.candidates = [None; ACQUIRE_SAMPLES];
+        self.track = Some(Track { position, rotation, newest: z, repeats: 0, moved_before_repeats: false });
+        Verdict::Acquired
+    }
+
+    /// Whether `z` continues the candidates: no faster than a body can move, and no sharper turn than it can take.
+    fn agrees(&self, z: Measured, rp: f64) -> bool {
+        let c = &self.config;
+        let [.., previous, Some(last)] = self.candidates else {
+            return true;
+        };
+        let h = z.at.ns_since(last.at) as f64 * 1e-9;
+        let step = z.position - last.position;
+        let noise = c.gate_sigmas * rp.sqrt();
+        if step.length() > c.max_speed_m_s * h + 2.0 * noise {
+            return false;
+        }
+        let Some(previous) = previous else {
+            return true;
+        };
+        let h0 = last.at.ns_since(previous.at) as f64 * 1e-9;
+        let foretold = (last.position - previous.position) * (h / h0);
+        (step - foretold).length() <= c.max_acceleration_m_s2 * h * (h + h0) + noise * (2.0 + 2.0 * h / h0)
+    }
+}
+
+impl Track {
+    fn accept(&mut self, z: Measured, stuck_after: u32) -> Verdict {
+        let identical = z.position == self.newest.position && z.rotation == self.newest.rotation;
+        if identical {
+            self.repeats += 1;
+        } else {
+            let h = z.at.ns_since(self.newest.at) as f64 * 1e-9;
+            let step = (z.position - self.newest.position).length();
+            let turn = so3_between(self.newest.rotation, z.rotation).length();
+            self.repeats = 0;
+            // 1 cm/s and 0.1 rad/s: motion that cannot stop dead between two samples.
+            self.moved_before_repeats = step > 0.01 * h || turn > 0.1 * h;
+        }
+        self.newest = z;
+        if self.moved_before_repeats && self.repeats >= stuck_after {
+            Verdict::Stuck
+        } else {
+            Verdict::Accepted
+        }
+    }
+}
+
+fn check(sample: &TrackerSample) -> Result<Measured, Verdict> {
+    if !sample.tracked {
+        return Err(Verdict::Untracked);
+    }
+    let finite = |x: &f64| x.is_finite() && x.abs() < 1e9;
+    if !sample.pose.position_m.iter().all(finite) || !sample.pose.rotation_xyzw.iter().all(finite) {
+        return Err(Verdict::NotFinite);
+    }
+    if !sample.pose.is_valid(QUATERNION_TOLERANCE) {
+        return Err(Verdict::NotUnit);
+    }
+    if sample.captured_at.ns_since(sample.received_at) > FUTURE_TOLERANCE_NS {
+        return Err(Verdict::FromFuture);
+    }
+    Ok(Measured {
+        at: sample.captured_at,
+        position: DVec3::from_array(sample.pose.position_m),
+        rotation: DQuat::from_array(sample.pose.rotation_xyzw).normalize(),
+    })
+}
+
+#[cfg(test)]
+#[path = "pose_filter_tests.rs"]
+mod tests;
