@@ -172,7 +172,7 @@ fn a_hundred_thousand_frames_only_wait_and_wake() {
                     let options = RunOptions { frames: FRAMES, ..RunOptions::default() };
                     let outcome = run_prepared(rig, options, &monitor).unwrap_or_else(|e| panic!("{e}"));
                     assert_eq!((outcome.frames_torn, outcome.frames_reordered), (0, 0));
-                    assert!(outcome.report.frames_lit > FRAMES / 10, "{} lit", outcome.report.frames_lit);
+                    assert!(outcome.report.frames_lit > FRAMES / 50, "{} lit", outcome.report.frames_lit);
                     monitor.counts().frames_planned
                 })
             })

@@ -203,8 +203,8 @@ impl Collector {
         self.slots.finish()
     }
 
-    /// Takes finished frames and light until both are over, or until `goes_on`, which is asked at every look, says no; gives the notes back
-    /// to `free`.
+    /// Takes finished frames and light until both are over, or until `goes_on`, which is asked at every look and for every note, says no at
+    /// a look; gives the notes back to `free`.
     pub(super) fn run(
         &mut self,
         mut done: Receiver<Box<FrameNote>>,
@@ -218,9 +218,9 @@ impl Collector {
             // Asked before looking: what came before the end is taken first.
             let over = done.is_finished() && lights.is_finished();
             self.slots.read_orders(monitor.dark());
-            self.take_finished(&mut done, free, monitor);
+            self.take_finished(&mut done, free, monitor, &mut goes_on);
             while let Some(note) = held.take().or_else(|| lights.try_pop()) {
-                self.take_finished(&mut done, free, monitor);
+                self.take_finished(&mut done, free, monitor, &mut goes_on);
                 // Lit before the link's thread came to say that it was sent.
                 let unknown = note.event.frame.is_some_and(|f| self.newest.is_none_or(|n| frame_newer(f, n)));
                 if unknown && !over {
@@ -244,8 +244,16 @@ impl Collector {
         }
     }
 
-    fn take_finished(&mut self, done: &mut Receiver<Box<FrameNote>>, free: &NotesBack, monitor: &RunMonitor) {
+    fn take_finished(
+        &mut self,
+        done: &mut Receiver<Box<FrameNote>>,
+        free: &NotesBack,
+        monitor: &RunMonitor,
+        goes_on: &mut impl FnMut() -> bool,
+    ) {
         while let Some(note) = done.try_pop() {
+            // A long backlog on a busy machine takes seconds: every note of it is a sign of life.
+            goes_on();
             self.finished(&note, monitor);
             free.push(note);
         }

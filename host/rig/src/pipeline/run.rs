@@ -45,7 +45,7 @@ const LIGHTS: usize = 8192;
 const CABLE_BUFFERS: usize = 3;
 /// A step of a control thread that ends this late is a standstill of the machine.
 const STANDSTILL_NS: i64 = 1_000_000;
-/// What the collector may take for one look. It is the only thread here that runs behind all others, it allocates, and no light depends on
+/// What the collector may take for one look, and for one note. It is the only thread here that runs behind all others, it allocates, and no light depends on
 /// it: without it frames run out of notes and the light ends by itself.
 const LOOK_NS: i64 = 5_000_000_000;
 /// Longest reserve in the lead, nanoseconds.
@@ -202,6 +202,7 @@ fn run_from(
         ..Report::default()
     };
     collector.fill(&mut report);
+    report.stopped = monitor.stop_requested();
     report.frames_per_wall_second = report.frames_lit as f64 / wall_s.max(1e-9);
     report.warnings.extend(unseen);
     report.warnings.extend(warnings);

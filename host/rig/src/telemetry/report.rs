@@ -152,6 +152,8 @@ pub struct Report {
     pub frames_dark: u64,
     /// Bodies that were dark in some of all these frames, by cause.
     pub dark_by_body: Vec<DarkBody>,
+    /// The run was asked to stop before it had all that it was started for.
+    pub stopped: bool,
     /// Frames that were planned and never lit.
     pub frames_dropped: u64,
     /// Frames that were not lit because no new picture was wanted.
@@ -253,6 +255,7 @@ impl Default for Report {
             frames_lit: 0,
             frames_dark: 0,
             dark_by_body: Vec::new(),
+            stopped: false,
             frames_dropped: 0,
             frames_withheld: 0,
             frames_late: 0,
@@ -462,13 +465,21 @@ impl Report {
         self.nothing_lit().map_or(Ok(()), |told| Err(Failure::new(FailureKind::CheckFailed, told)))
     }
 
-    /// Why the run lit nothing, with the largest cause first and what to do; `None` when it did light something, when it planned nothing, or
-    /// when no picture was wanted from its beginning to its end.
+    /// Why the run lit nothing, with the largest cause first and what to do; `None` when it did light something, when it was stopped before it
+    /// planned a frame, or when no picture was wanted from its beginning to its end.
     pub fn nothing_lit(&self) -> Option<String> {
         let planned = self.frames_dark + self.frames_dropped;
         let ordered: u64 = self.ordered_dark.values().sum();
-        if self.frames_lit > 0 || planned == 0 || self.slots == 0 && ordered > 0 {
+        if self.frames_lit > 0 || self.slots == 0 && ordered > 0 {
             return None;
+        }
+        if planned == 0 {
+            let excused = self.stopped || self.frames_withheld > 0;
+            return (!excused).then(|| {
+                "no frame was planned before the run was over: the machine stood still or a stage hung; \
+                 see the notes above, and run longer (--seconds) or with fewer programs beside it"
+                    .to_owned()
+            });
         }
         let mut causes: Vec<(u64, String)> = Vec::new();
         for body in &self.dark_by_body {
@@ -634,6 +645,8 @@ mod tests {
         assert_eq!(Report { frames_withheld: 500, ..Report::default() }.nothing_lit(), None);
         let ordered_dark: BTreeMap<String, u64> = [("safe".into(), 300)].into();
         assert_eq!(Report { frames_dropped: 4, ordered_dark, ..Report::default() }.nothing_lit(), None);
-        assert_eq!(Report::default().nothing_lit(), None);
+        assert_eq!(Report { stopped: true, ..Report::default() }.nothing_lit(), None);
+        // A second in which the machine stood still lit nothing, too.
+        assert!(Report::default().nothing_lit().unwrap().starts_with("no frame was planned"));
     }
 }
