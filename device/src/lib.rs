@@ -10,6 +10,7 @@
 pub mod clock_map;
 pub mod cobs;
 pub mod dlpc900;
+pub mod light;
 pub mod link;
 pub mod planes;
 pub mod pose;

@@ -28,7 +28,8 @@ use dpm_device::time::{DeviceTicks, HostTime};
 use dpm_device::transport::{Lane, LinkDevice};
 
 pub use clock::DeviceClock;
-pub use config::{LightChange, LightEvent, LightKind, MockConfig};
+pub use config::{LightChange, MockConfig};
+pub use dpm_device::light::{LightEvent, LightKind};
 pub use emulated::{EmulatedProjector, Served};
 pub use faulty::FaultyProjector;
 use frames::{FrameStore, Held};

@@ -2,7 +2,7 @@
 
 use dpm_device::link::{Codec, DeviceState, LightLimits, MAX_FLASHES_PER_S, VERSION};
 use dpm_device::planes::Raster;
-use dpm_device::time::{DeviceTicks, HostTime};
+use dpm_device::time::HostTime;
 
 use super::DeviceClock;
 
@@ -59,17 +59,6 @@ impl MockConfig {
     }
 }
 
-/// What the mirrors did in one slot.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum LightKind {
-    /// A frame for the first time.
-    Lit,
-    /// The frame before again.
-    Repeated,
-    /// Nothing.
-    Blank,
-}
-
 /// Light went on or off, or the state of the projector changed.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct LightChange {
@@ -82,21 +71,4 @@ pub struct LightChange {
     pub state: DeviceState,
     /// Faults that are latched from here on.
     pub faults: u32,
-}
-
-/// One slot of an armed projector.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub struct LightEvent {
-    /// Which slot.
-    pub slot: u64,
-    /// The frame on the mirrors (low 32 bits of its number); `None` when dark.
-    pub frame: Option<u32>,
-    /// What was lit.
-    pub kind: LightKind,
-    /// Start of the slot on the device's clock.
-    pub lit_at: DeviceTicks,
-    /// True time of the first photon; of a blank slot, of its beginning.
-    pub first_photon_at: HostTime,
-    /// True time of the last photon; of a blank slot, of its end.
-    pub last_photon_at: HostTime,
 }

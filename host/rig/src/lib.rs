@@ -7,6 +7,7 @@ pub mod control;
 pub mod failure;
 pub mod frame;
 pub mod interlock;
+pub mod mock;
 pub mod pictures;
 pub mod pipeline;
 pub mod plan;

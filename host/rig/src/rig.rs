@@ -3,6 +3,7 @@
 use crate::config::{
     BodyConfig, BuiltinScene, CalibrationUnit, EnvironmentConfig, GazeConfig, RigConfig, TrackerConfig,
 };
+use crate::mock::{Motion, MotionError, MotionSpec};
 use crate::tracks::source::{self, SourceError};
 use dpm_device::planes::Raster;
 use dpm_device::pose::Pose;
@@ -14,7 +15,6 @@ use dpm_scene::geometry::opencv::{self, LengthUnit};
 use dpm_scene::geometry::projector::{ProjectorCamera, ProjectorError};
 use dpm_scene::{BodySelector, Environment, LoadOptions, Scene, SceneError, SceneFeatures};
 use glam::{DAffine3, DQuat, DVec3, Vec3};
-use hil_mock::motion::{Motion, MotionError, MotionSpec};
 use std::sync::Arc;
 
 /// Why a rig cannot be built from a configuration that is valid by itself.

@@ -3,10 +3,8 @@
 use super::read::{ConfigValue, Reader};
 use super::world::{EnvironmentConfig, GazeConfig, TrackerConfig};
 use super::{Pace, ProjectorBackend, Purpose, RigConfig};
+use crate::mock::{self, FaultError};
 use dpm_device::regular_file;
-use hil_mock::faults::{FaultKind, FaultPlan};
-use hil_mock::projector::FaultyProjector;
-use hil_mock::tracker::TRACKER_FAULTS;
 use std::collections::HashMap;
 use std::path::{Path, PathBuf};
 
@@ -75,17 +73,16 @@ pub(super) fn addresses(rig: &RigConfig, reader: &mut Reader) {
 }
 
 fn faults(rig: &RigConfig, reader: &mut Reader) {
-    let mut check = |key: &str, text: &str, known: &[FaultKind], mock| {
-        let plan = text.parse::<FaultPlan>().and_then(|plan| plan.check_supported(known, mock));
+    let mut check = |key: &str, plan: Result<(), FaultError>| {
         if let Err(e) = plan {
             refuse(reader, &[key], e.to_string(), "for example \"loss=0.01,dropout@1.5s+20ms\"".into());
         }
     };
     if let TrackerConfig::Mock(mock) = &rig.tracker {
-        check("tracker.faults", &mock.faults, &TRACKER_FAULTS, "the mock tracker");
+        check("tracker.faults", mock::check_tracker_faults(&mock.faults));
     }
     if let ProjectorBackend::Mock(mock) = &rig.projector.backend {
-        check("projector.backend.faults", &mock.faults, &FaultyProjector::KNOWN, "the mock projector");
+        check("projector.backend.faults", mock::check_projector_faults(&mock.faults));
     }
 }
 

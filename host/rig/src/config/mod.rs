@@ -30,9 +30,9 @@ pub use safety::{
 pub use source::VARIABLE_PREFIX;
 pub use world::*;
 
+use crate::mock::MotionSpec;
 use declare::section;
 use dpm_device::regular_file;
-use hil_mock::motion::MotionSpec;
 use read::{Any, ConfigValue, Reader};
 use std::path::Path;
 

@@ -3,8 +3,8 @@
 use super::declare::{kinds, section, words};
 use super::read::{Any, ConfigValue, NotEmpty, Reader, Within};
 use super::source::Node;
+use crate::mock::{Motion, MotionSpec};
 use dpm_device::pose::Pose;
-use hil_mock::motion::{Motion, MotionSpec};
 use std::path::PathBuf;
 
 kinds! {
@@ -258,7 +258,7 @@ impl BodyConfig {
     }
 }
 
-/// The table that says how a body moves: a checked `hil_mock::motion::MotionSpec`; `None` when the rig file says nothing.
+/// The table that says how a body moves: a checked [`MotionSpec`]; `None` when the rig file says nothing.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct MotionValue(pub Option<toml::Table>);
 

@@ -4,11 +4,12 @@
 
 use super::job::hash_codes;
 use super::prepared::is_whole;
+use crate::mock::{EmulatedProjector, MockProjector, Served};
 use dpm_common::clock::Stopwatch;
+use dpm_device::light::{LightEvent, LightKind};
 use dpm_device::planes::PlaneSchedule;
 use dpm_device::time::HostTime;
 use dpm_handoff::channel::Sender;
-use hil_mock::projector::{EmulatedProjector, LightEvent, LightKind, MockProjector, Served};
 use std::collections::VecDeque;
 
 /// What the projector did in one slot.

@@ -15,6 +15,7 @@ use super::stages::{self, LinkTime, TrackingStage};
 use super::supervisor::{join_within, Maker, Remake, Supervisor};
 use super::threads::{policy, Shared, FIRST_FRAME_TIMEOUT_NS, LISTEN_NS, NOTES, RECEIPT_NS, STAGE_THREADS};
 use crate::config::{Pace, Packer, ProjectorBackend, RenderMethod};
+use crate::mock::{self, EmulatedProjector};
 use crate::plan::budget::{BudgetConfig, BudgetController};
 use crate::plan::horizon::Horizon;
 use crate::plan::lead::LeadEstimator;
@@ -34,7 +35,6 @@ use dpm_render::gpu::{Gpu, LossBudget};
 use dpm_render::pack::{BitPlaneFrame, Kernel};
 use dpm_render::{Output, RenderError, Renderer, RendererSettings};
 use glam::DVec3;
-use hil_mock::projector::{DeviceClock, EmulatedProjector, MockConfig};
 use std::sync::atomic::{AtomicBool, AtomicI64, AtomicU64, Ordering};
 use std::sync::{Arc, Mutex};
 use std::time::Duration;
@@ -427,13 +427,10 @@ fn far_end(
     let (config, raster) = (&rig.config, rig.camera.raster);
     let backend = &config.projector.backend;
     if let ProjectorBackend::Mock(mock) = backend {
-        let mut setup = MockConfig::new(raster);
-        setup.frame_buffers = mock.buffer_frames.min(64) as u8;
-        setup.clock = DeviceClock { skew_ppb: (mock.clock_ppm * 1000.0) as i32, ..DeviceClock::IDEAL };
-        setup.flash_limit = projector::flash_limit(config);
         let marks = marked.then(|| config.projector.schedule());
         let recorder = LightRecorder::new(lights, options.keep_frames, options.verify, marks);
-        let emulated = EmulatedProjector::new(setup, &mock.faults, config.render.seed, start)
+        let flash_limit = projector::flash_limit(config);
+        let emulated = mock::projector(mock, raster, flash_limit, config.render.seed, start)
             .map_err(|e| RigError::Unsupported(format!("projector.backend.faults: {e}")))?;
         return Ok((Far::Mock(emulated, recorder), Vec::new()));
     }

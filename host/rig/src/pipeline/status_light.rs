@@ -5,9 +5,9 @@
 
 use super::light::LightNote;
 use super::stages::LinkTime;
+use dpm_device::light::{LightEvent, LightKind};
 use dpm_device::link::Status;
 use dpm_handoff::channel::Sender;
-use hil_mock::projector::{LightEvent, LightKind};
 
 /// Slots of one report that are told one by one: a second of silence at 1 kHz.
 const MOST_SLOTS: u32 = 1024;

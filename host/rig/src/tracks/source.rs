@@ -1,27 +1,22 @@
 //! `[tracker]` of the rig file into the tracker itself, ready to be polled.
 
-use crate::config::{MockTrackerConfig as MockKeys, TrackerConfig};
-use dpm_device::time::{FrameRate, HostClock, HostTime};
+use crate::config::TrackerConfig;
+use crate::mock::{self, MockOpenError, Motion};
+use dpm_device::time::{HostClock, HostTime};
 use dpm_device::tracker::natnet::client::{NatNetClient, NatNetConfig};
 use dpm_device::tracker::record::{RecordError, Replay};
 use dpm_device::tracker::serial::client::{SerialTracker, SerialTrackerConfig};
 use dpm_device::tracker::vrpn::client::{VrpnClient, VrpnConfig};
 use dpm_device::tracker::{BodyKey, Tracker, TrackerError};
-use hil_mock::faults::{FaultError, FaultPlan};
-use hil_mock::motion::Motion;
-use hil_mock::tracker::{MockTracker, MockTrackerConfig, MockTrackerError};
 use std::net::Ipv4Addr;
 use std::sync::Arc;
 
 /// Why there is no tracker.
 #[derive(Debug, thiserror::Error)]
 pub enum SourceError {
-    /// The mock's numbers.
-    #[error("tracker: {0}")]
-    Mock(#[from] MockTrackerError),
-    /// The mock's faults.
-    #[error("tracker.faults: {0}")]
-    Faults(#[from] FaultError),
+    /// The mock's numbers or faults.
+    #[error(transparent)]
+    Mock(#[from] MockOpenError),
     /// An address that is none. The configuration's check finds it first.
     #[error("{key}: {text:?} is not an IPv4 address such as 192.168.1.10")]
     Address {
@@ -52,7 +47,7 @@ pub fn open(
     start: HostTime,
 ) -> Result<Box<dyn Tracker>, SourceError> {
     Ok(match config {
-        TrackerConfig::Mock(c) => Box::new(MockTracker::new(mock(c)?, motions)?),
+        TrackerConfig::Mock(c) => Box::new(mock::tracker(c, motions)?),
         TrackerConfig::Natnet(c) => {
             let config = NatNetConfig {
                 server: address("tracker.server", &c.server)?,
@@ -78,25 +73,6 @@ pub fn open(
     })
 }
 
-/// The mock's settings; `drop_out` is one more fault.
-fn mock(c: &MockKeys) -> Result<MockTrackerConfig, SourceError> {
-    let mut faults = c.faults.clone();
-    if c.drop_out > 0.0 {
-        let separator = if faults.trim().is_empty() { "" } else { "," };
-        faults.push_str(&format!("{separator}loss={}", c.drop_out));
-    }
-    Ok(MockTrackerConfig {
-        seed: c.seed,
-        rate: FrameRate::new(c.rate_hz, 1).expect("the rate was checked when the configuration was read"),
-        position_noise_m: c.noise_m,
-        rotation_noise_rad: c.noise_rad,
-        latency_ns: i64::from(c.latency_us) * 1000,
-        latency_jitter_ns: i64::from(c.jitter_us) * 1000,
-        faults: faults.parse::<FaultPlan>()?,
-        ..MockTrackerConfig::default()
-    })
-}
-
 fn address(key: &'static str, text: &str) -> Result<Ipv4Addr, SourceError> {
     text.trim().parse().map_err(|_| SourceError::Address { key, text: text.into() })
 }
@@ -105,7 +81,7 @@ fn address(key: &'static str, text: &str) -> Result<Ipv4Addr, SourceError> {
 mod tests {
     use super::*;
     use crate::config::{NatnetConfig, Overrides, ReplayConfig, RigConfig};
-    use hil_mock::motion::MotionSpec;
+    use crate::mock::MotionSpec;
     use std::path::Path;
 
     fn bodies() -> Vec<BodyKey> {
