@@ -12,7 +12,7 @@ struct Sampler {
 // [0, 1) always: 24 bits, so rounding never gives 1.
 float to_unit(uint x) { return float(x >> 8u) * (1.0 / 16777216.0); }
 
-// The twin of render/sobol.rs, bit for bit.
+// The twin of host/lab/src/sobol.rs, bit for bit.
 uint owen_scramble(uint x, uint seed) {
     x = bitfieldReverse(x);
     x += seed;

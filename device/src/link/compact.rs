@@ -62,7 +62,7 @@ impl std::fmt::Debug for Compactor {
 
 impl Compactor {
     /// For frames of `planes` planes every `frame_ns` nanoseconds; `codecs` is the mask of those allowed.
-    pub fn new(raster: Raster, planes: usize, frame_ns: i64, codecs: u32) -> Self {
+    pub(super) fn new(raster: Raster, planes: usize, frame_ns: i64, codecs: u32) -> Self {
         let plane_bytes = raster.plane_bytes();
         let lz4_ns = LZ4_NS_PER_BYTE * plane_bytes as i64;
         Self {
@@ -88,17 +88,17 @@ impl Compactor {
     }
 
     /// Narrows the codecs to those that the device reads, too.
-    pub fn restrict(&mut self, codecs: u32) {
+    pub(super) fn restrict(&mut self, codecs: u32) {
         self.codecs &= codecs | Codec::Raw.mask();
     }
 
     /// The medium had no room for a frame: fewer bytes are worth more of the host's time.
-    pub fn refused(&mut self) {
+    pub(super) fn refused(&mut self) {
         self.pressed = REMEMBERED;
     }
 
     /// Chooses the form of every plane of `planes`. Without `has_base` no plane refers to the frame before.
-    pub fn compact(&mut self, planes: &[u8], has_base: bool) -> [PlaneForm; MAX_PLANES] {
+    pub(super) fn compact(&mut self, planes: &[u8], has_base: bool) -> [PlaneForm; MAX_PLANES] {
         let mut forms = [PlaneForm::Raw; MAX_PLANES];
         self.frames = self.frames.wrapping_add(1);
         self.pressed = self.pressed.saturating_sub(1);
@@ -188,12 +188,12 @@ impl Compactor {
     }
 
     /// The first `n` bytes of plane `k` as [`Compactor::compact`] coded it.
-    pub fn coded(&self, k: usize, n: usize) -> &[u8] {
+    pub(super) fn coded(&self, k: usize, n: usize) -> &[u8] {
         &self.coded[k * self.plane_bytes..][..n]
     }
 
     /// The frame that was compacted last went out: it is what the next one refers to.
-    pub fn sent(&mut self, planes: &[u8]) {
+    pub(super) fn sent(&mut self, planes: &[u8]) {
         let pairs = self.before.chunks_exact_mut(self.plane_bytes).zip(planes.chunks_exact(self.plane_bytes));
         for (k, (before, plane)) in pairs.enumerate() {
             if self.changed >> k & 1 == 1 {

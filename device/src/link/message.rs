@@ -17,7 +17,7 @@ pub use types::{
 /// Longest payload of any message except PLANE.
 pub const MAX_CONTROL_BYTES: usize = 96;
 /// Length of a CONFIG's payload before the LED codes of its planes.
-pub const CONFIG_BYTES: usize = 40;
+pub(super) const CONFIG_BYTES: usize = 40;
 /// Length of a FRAME_COMMIT's payload.
 pub const COMMIT_BYTES: usize = 24;
 /// Why a payload cannot be read.

@@ -17,13 +17,13 @@ pub(super) struct Follower {
 }
 
 impl Follower {
-    pub const fn new() -> Self {
+    pub(super) const fn new() -> Self {
         Self { looked_at: HostTime(i64::MIN), given: None }
     }
 
     /// Gives `thread` the policy and priority of the calling thread. Looks twice a second and changes something only when they have
     /// changed. A refusal is no error: the thread then runs as it did, and stamps arrive later.
-    pub fn follow<T>(&mut self, now: HostTime, thread: &JoinHandle<T>) {
+    pub(super) fn follow<T>(&mut self, now: HostTime, thread: &JoinHandle<T>) {
         if self.looked_at.0 != i64::MIN && now.ns_since(self.looked_at) < EVERY_NS {
             return;
         }

@@ -53,7 +53,7 @@ fn refuse<T>(code: u8, why: impl ToString) -> Result<T, Refusal> {
 }
 
 impl Controller {
-    pub fn new(options: Options) -> Self {
+    pub(super) fn new(options: Options) -> Self {
         Self {
             patterns: Patterns::new(options.dmd, options.plane_order),
             sequencer: Sequencer::Stopped,
@@ -82,7 +82,7 @@ impl Controller {
     }
 
     /// Does one command: the data of its reply (empty for a write), and whether it was refused.
-    pub fn execute(&mut self, now: HostTime, c: &Command<'_>) -> (Vec<u8>, bool) {
+    pub(super) fn execute(&mut self, now: HostTime, c: &Command<'_>) -> (Vec<u8>, bool) {
         self.settle(now);
         // The two questions about the last error leave it as it is. Some programs ask them with the write flag.
         match c.opcode {
@@ -117,7 +117,7 @@ impl Controller {
     }
 
     /// Brings the state up to `now`: a sequence that has run its passes stops.
-    pub fn settle(&mut self, now: HostTime) {
+    pub(super) fn settle(&mut self, now: HostTime) {
         let pattern_mode = matches!(self.mode, DisplayMode::OnTheFly | DisplayMode::PreStored);
         if pattern_mode
             && self.elapsed_us(now).is_some_and(|us| self.patterns.showing(us, self.counts_patterns()).1)
@@ -141,7 +141,7 @@ impl Controller {
     }
 
     /// Why no light leaves the projector, if so.
-    pub fn dark_because(&self) -> Option<&'static str> {
+    pub(super) fn dark_because(&self) -> Option<&'static str> {
         let leds = self.setting(Opcode::LED_ENABLE);
         match () {
             () if self.standby_since.is_some() => Some("standby"),
@@ -157,7 +157,7 @@ impl Controller {
     }
 
     /// The pattern lit at `now`.
-    pub fn showing(&self, now: HostTime) -> Option<(usize, LutEntry)> {
+    pub(super) fn showing(&self, now: HostTime) -> Option<(usize, LutEntry)> {
         if self.dark_because().is_some() || self.mode == DisplayMode::Video {
             return None;
         }
@@ -175,7 +175,7 @@ impl Controller {
     }
 
     /// Value of a one-byte setting.
-    pub fn setting_byte(&self, opcode: Opcode) -> u8 {
+    pub(super) fn setting_byte(&self, opcode: Opcode) -> u8 {
         self.setting(opcode).first().copied().unwrap_or(0)
     }
 

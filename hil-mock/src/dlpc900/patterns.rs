@@ -41,7 +41,7 @@ pub(super) struct Patterns {
 }
 
 impl Patterns {
-    pub fn new(dmd: Dmd, order: PlaneOrder) -> Self {
+    pub(super) fn new(dmd: Dmd, order: PlaneOrder) -> Self {
         Self {
             dmd,
             order,
@@ -56,23 +56,23 @@ impl Patterns {
     }
 
     /// The table in the order shown.
-    pub fn table(&self) -> Vec<LutEntry> {
+    pub(super) fn table(&self) -> Vec<LutEntry> {
         self.shown_order.iter().filter_map(|i| self.effective.get(usize::from(*i))).copied().collect()
     }
 
     /// The table stops being effective (park, invert); definitions and images stay.
-    pub fn deactivate(&mut self) {
+    pub(super) fn deactivate(&mut self) {
         self.effective.clear();
         self.shown_order.clear();
     }
 
     /// Everything is forgotten (reset, mode switch).
-    pub fn clear(&mut self) {
+    pub(super) fn clear(&mut self) {
         *self = Self::new(self.dmd, self.order);
     }
 
     /// 0x1A34.
-    pub fn define(&mut self, data: &[u8]) -> Result<(), Refusal> {
+    pub(super) fn define(&mut self, data: &[u8]) -> Result<(), Refusal> {
         let Some(bytes) = data.first_chunk::<12>().filter(|_| data.len() == 12) else {
             return refuse(6, format!("a LUT definition has 12 bytes, not {}", data.len()));
         };
@@ -90,7 +90,7 @@ impl Patterns {
     }
 
     /// 0x1A31: makes entries 0 to n - 1 effective.
-    pub fn configure(&mut self, data: &[u8], mode: DisplayMode) -> Result<(), Refusal> {
+    pub(super) fn configure(&mut self, data: &[u8], mode: DisplayMode) -> Result<(), Refusal> {
         let Some([n0, n1, repeat @ ..]) = data.first_chunk::<6>().filter(|_| data.len() == 6) else {
             return refuse(6, format!("a LUT configuration has 6 bytes, not {}", data.len()));
         };
@@ -124,7 +124,7 @@ impl Patterns {
     }
 
     /// 0x1A32: shows the effective entries in another order.
-    pub fn reorder(&mut self, data: &[u8]) -> Result<(), Refusal> {
+    pub(super) fn reorder(&mut self, data: &[u8]) -> Result<(), Refusal> {
         let Some(([n0, n1, repeat @ ..], list)) = data.split_first_chunk::<6>() else {
             return refuse(6, format!("a LUT reorder has at least 6 bytes, not {}", data.len()));
         };
@@ -151,7 +151,7 @@ impl Patterns {
     }
 
     /// 0x1A2A / 0x1A2C. The text is a warning where the order is not what the guide asks for.
-    pub fn begin_image(&mut self, data: &[u8], secondary: bool) -> Result<Option<String>, Refusal> {
+    pub(super) fn begin_image(&mut self, data: &[u8], secondary: bool) -> Result<Option<String>, Refusal> {
         let Some([i0, i1, total @ ..]) = data.first_chunk::<6>().filter(|_| data.len() == 6) else {
             return refuse(6, format!("an image load has 6 bytes, not {}", data.len()));
         };
@@ -200,7 +200,7 @@ impl Patterns {
     }
 
     /// 0x1A2B / 0x1A2D.
-    pub fn image_data(&mut self, data: &[u8], secondary: bool) -> Result<(), Refusal> {
+    pub(super) fn image_data(&mut self, data: &[u8], secondary: bool) -> Result<(), Refusal> {
         let Some(([c0, c1], bytes)) = data.split_first_chunk::<2>() else {
             return refuse(6, "image data start with a count");
         };
@@ -261,7 +261,7 @@ impl Patterns {
     }
 
     /// Whether every image that the table names is there; otherwise which is not.
-    pub fn missing_image(&self) -> Option<u16> {
+    pub(super) fn missing_image(&self) -> Option<u16> {
         let there = |i: u16| {
             self.images.contains_key(&(i, false))
                 && (!self.dmd.has_two_controllers() || self.images.contains_key(&(i, true)))
@@ -270,7 +270,7 @@ impl Patterns {
     }
 
     /// Plane `bit` of pattern `place` (0 = its least significant bit) in the project's plane layout; `None` when there is none.
-    pub fn plane(&self, place: usize, bit: u8) -> Option<Vec<u8>> {
+    pub(super) fn plane(&self, place: usize, bit: u8) -> Option<Vec<u8>> {
         let e = *self.table().get(place)?;
         if bit >= e.depth {
             return None;
@@ -294,7 +294,7 @@ impl Patterns {
     }
 
     /// How many patterns are shown before the sequence ends; `None` for ever.
-    pub fn patterns_to_show(&self, counts_patterns: bool) -> Option<u64> {
+    pub(super) fn patterns_to_show(&self, counts_patterns: bool) -> Option<u64> {
         match u64::from(self.repeat) {
             0 => None,
             n if counts_patterns => Some(n),
@@ -303,7 +303,7 @@ impl Patterns {
     }
 
     /// The pattern lit `elapsed_us` after the start, or `None` when it is dark or over; and whether it is over.
-    pub fn showing(&self, elapsed_us: u64, counts_patterns: bool) -> (Option<usize>, bool) {
+    pub(super) fn showing(&self, elapsed_us: u64, counts_patterns: bool) -> (Option<usize>, bool) {
         let table = self.table();
         let cycle: u64 = (0..table.len()).map(|i| step_us(&table, i)).sum();
         if cycle == 0 {
@@ -324,7 +324,7 @@ impl Patterns {
     }
 
     /// Time of the whole table, microseconds.
-    pub fn table_us(&self) -> u64 {
+    pub(super) fn table_us(&self) -> u64 {
         self.effective.iter().map(|e| u64::from(e.exposure_us) + u64::from(e.dark_us)).sum()
     }
 }

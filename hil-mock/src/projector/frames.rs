@@ -46,7 +46,7 @@ pub(super) struct FrameStore {
 }
 
 impl FrameStore {
-    pub fn new(capacity: usize, frame_bytes: usize) -> Self {
+    pub(super) fn new(capacity: usize, frame_bytes: usize) -> Self {
         Self {
             buffers: (0..capacity + 3).map(|_| vec![0; frame_bytes].into_boxed_slice()).collect(),
             assembling: None,
@@ -58,7 +58,7 @@ impl FrameStore {
     }
 
     /// A buffer that nothing refers to. There always is one when no frame is being assembled.
-    pub fn free_buffer(&self) -> usize {
+    pub(super) fn free_buffer(&self) -> usize {
         debug_assert!(self.assembling.is_none_or(|a| a.buffer.is_none()));
         (0..self.buffers.len())
             .find(|&i| {
@@ -69,16 +69,16 @@ impl FrameStore {
             .expect("capacity + 3 buffers, at most capacity + 2 referred to")
     }
 
-    pub fn bytes(&self, buffer: usize) -> &[u8] {
+    pub(super) fn bytes(&self, buffer: usize) -> &[u8] {
         &self.buffers[buffer]
     }
 
-    pub fn bytes_mut(&mut self, buffer: usize) -> &mut [u8] {
+    pub(super) fn bytes_mut(&mut self, buffer: usize) -> &mut [u8] {
         &mut self.buffers[buffer]
     }
 
     /// Copies `len` bytes at `at` from buffer `from` to buffer `to`.
-    pub fn copy(&mut self, from: usize, to: usize, at: usize, len: usize) {
+    pub(super) fn copy(&mut self, from: usize, to: usize, at: usize, len: usize) {
         if from == to {
             return;
         }
@@ -88,22 +88,22 @@ impl FrameStore {
     }
 
     #[cfg(test)]
-    pub fn waiting(&self) -> usize {
+    pub(super) fn waiting(&self) -> usize {
         self.pending.len()
     }
 
-    pub fn free(&self) -> usize {
+    pub(super) fn free(&self) -> usize {
         self.capacity - self.pending.len()
     }
 
-    pub fn push(&mut self, pending: Pending) {
+    pub(super) fn push(&mut self, pending: Pending) {
         assert!(self.pending.len() < self.capacity, "checked by the caller");
         self.pending.push(pending);
     }
 
     /// Takes the newest frame due in or before `slot`, and tells how many older ones it replaces. Frames arrive in the order
     /// of their numbers, so everything before it in the queue is older.
-    pub fn take_due(&mut self, slot: u64) -> Option<(Pending, u32)> {
+    pub(super) fn take_due(&mut self, slot: u64) -> Option<(Pending, u32)> {
         let newest = self.pending.iter().rposition(|p| p.slot <= slot)?;
         let due = self.pending[newest];
         self.pending.drain(..=newest);
@@ -111,7 +111,7 @@ impl FrameStore {
     }
 
     /// Dark: nothing waits, nothing is lit, nothing can be referred to. Returns how many frames were thrown away.
-    pub fn clear(&mut self) -> u32 {
+    pub(super) fn clear(&mut self) -> u32 {
         let thrown =
             self.pending.len() as u32 + u32::from(self.assembling.is_some_and(|a| a.buffer.is_some()));
         self.assembling = None;

@@ -24,7 +24,7 @@ pub(super) struct LightGuard {
 impl LightGuard {
     /// Slots of `rate` begin, under the host's limits and the owner's. What was counted under the same limits still counts: a host cannot
     /// make a device forget by asking again.
-    pub fn configure(&mut self, rate: FrameRate, host: LightLimits, owner: LightLimits) {
+    pub(super) fn configure(&mut self, rate: FrameRate, host: LightLimits, owner: LightLimits) {
         for (counted, limits) in self.counted.iter_mut().zip([host, owner]) {
             if counted.as_ref().is_none_or(|c| (c.limits, c.rate) != (limits, rate)) {
                 *counted = LightLimiter::new(rate, &limits).map(|limiter| Counted { limits, rate, limiter });
@@ -33,14 +33,19 @@ impl LightGuard {
     }
 
     /// `slots` slots have passed in the dark, uncounted until now.
-    pub fn was_dark(&mut self, slots: u64) {
+    pub(super) fn was_dark(&mut self, slots: u64) {
         for c in self.counted.iter_mut().flatten() {
             c.limiter.repeated(0, slots);
         }
     }
 
     /// A slot is about to light `planes`, a frame that was not on the mirrors before. The rest in microseconds when it must not.
-    pub fn new_frame(&mut self, raster: Raster, schedule: &PlaneSchedule, planes: &[u8]) -> Option<u64> {
+    pub(super) fn new_frame(
+        &mut self,
+        raster: Raster,
+        schedule: &PlaneSchedule,
+        planes: &[u8],
+    ) -> Option<u64> {
         if self.counted.iter().all(Option::is_none) {
             return None;
         }
@@ -49,12 +54,12 @@ impl LightGuard {
     }
 
     /// A slot is about to light the frame on the mirrors again.
-    pub fn same_frame(&mut self) -> Option<u64> {
+    pub(super) fn same_frame(&mut self) -> Option<u64> {
         self.observe(self.level)
     }
 
     /// A slot is dark.
-    pub fn dark(&mut self) {
+    pub(super) fn dark(&mut self) {
         let _ = self.observe(0);
     }
 

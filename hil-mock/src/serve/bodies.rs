@@ -12,7 +12,7 @@ use std::time::Instant;
 
 /// Bodies, noise and faults.
 #[derive(Args)]
-pub struct TrackerArguments {
+pub(super) struct TrackerArguments {
     /// Body as NAME[@X,Y,Z][=MOTION], metres; MOTION is `still`, `translate`, `rotate` or a JSON object as in a rig file.
     /// May be repeated
     #[arg(long = "body", value_name = "BODY", default_values = ["Hare@0,0,1.5=translate", "Bust@0.3,0,1.5=rotate"])]
@@ -45,7 +45,7 @@ pub struct TrackerArguments {
 
 impl TrackerArguments {
     /// Names of the bodies and the source of their samples.
-    pub fn source(&self) -> Result<(Vec<String>, SampleSource), Box<dyn Error>> {
+    pub(super) fn source(&self) -> Result<(Vec<String>, SampleSource), Box<dyn Error>> {
         let mut names = Vec::new();
         let mut motions = Vec::new();
         for text in &self.bodies {
@@ -68,7 +68,7 @@ impl TrackerArguments {
 }
 
 /// A clock that starts at 0 now.
-pub fn clock_from_now() -> Arc<dyn HostClock> {
+pub(super) fn clock_from_now() -> Arc<dyn HostClock> {
     let epoch = Instant::now();
     Arc::new(move || HostTime(i64::try_from(epoch.elapsed().as_nanos()).unwrap_or(i64::MAX)))
 }

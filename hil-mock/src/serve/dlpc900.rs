@@ -12,7 +12,7 @@ use std::sync::{Arc, Mutex, PoisonError};
 
 /// Arguments of `hil-mock serve dlpc900`.
 #[derive(Args)]
-pub struct Dlpc900Arguments {
+pub(crate) struct Dlpc900Arguments {
     /// Mirror array behind the controller
     #[arg(long, value_enum, default_value_t = DmdWord::Dlp6500)]
     dmd: DmdWord,
@@ -62,7 +62,7 @@ enum OrderWord {
 }
 
 /// Serves until the time is over or the port fails.
-pub fn run(arguments: &Dlpc900Arguments) -> Result<(), Box<dyn Error>> {
+pub(super) fn run(arguments: &Dlpc900Arguments) -> Result<(), Box<dyn Error>> {
     let mut numbers = arguments.firmware.split('.').map(str::parse::<u16>);
     let mut next = || numbers.next().transpose().ok().flatten();
     let version = (|| {

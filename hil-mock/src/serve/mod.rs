@@ -13,7 +13,7 @@ use std::error::Error;
 
 /// A mock device.
 #[derive(Subcommand)]
-pub enum Device {
+pub(crate) enum Device {
     /// DLPC900 projector controller (LightCrafter 6500 / 9000): a USB HID device over USB/IP
     Dlpc900(dlpc900::Dlpc900Arguments),
     /// OptiTrack NatNet server: poses over UDP
@@ -52,7 +52,7 @@ fn cannot_open(path: &str, e: &serialport::Error) -> String {
 }
 
 /// Runs `device` until it is stopped or fails.
-pub fn run(device: Device) -> Result<(), Box<dyn Error>> {
+pub(crate) fn run(device: Device) -> Result<(), Box<dyn Error>> {
     match device {
         Device::Dlpc900(arguments) => dlpc900::run(&arguments),
         Device::Natnet(arguments) => natnet::run(&arguments),

@@ -11,7 +11,7 @@ use std::time::{Duration, Instant};
 
 /// Arguments of `hil-mock serve natnet`.
 #[derive(Args)]
-pub struct NatNetArguments {
+pub(crate) struct NatNetArguments {
     /// Address to serve on; with --multicast also the interface that the group is sent through
     #[arg(long, default_value = "127.0.0.1")]
     bind: Ipv4Addr,
@@ -52,7 +52,7 @@ enum UnicastWord {
 }
 
 /// Serves until the time is over or the socket fails.
-pub fn run(arguments: &NatNetArguments) -> Result<(), Box<dyn Error>> {
+pub(super) fn run(arguments: &NatNetArguments) -> Result<(), Box<dyn Error>> {
     let (names, source) = arguments.tracker.source()?;
     let names: Vec<&str> = names.iter().map(String::as_str).collect();
     let mut config = NatNetServerConfig::new(&names);

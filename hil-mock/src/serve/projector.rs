@@ -24,7 +24,7 @@ use super::usb::{offer, UsbArguments};
 
 /// Arguments of `hil-mock serve projector`.
 #[derive(Args)]
-pub struct ProjectorArguments {
+pub(crate) struct ProjectorArguments {
     /// Mirrors, width and height
     #[arg(long, value_name = "WxH", default_value = "1024x768", value_parser = raster)]
     raster: Raster,
@@ -70,7 +70,7 @@ fn raster(text: &str) -> Result<Raster, String> {
 }
 
 /// Serves until the time is over or the port fails.
-pub fn run(arguments: &ProjectorArguments) -> Result<(), Box<dyn Error>> {
+pub(super) fn run(arguments: &ProjectorArguments) -> Result<(), Box<dyn Error>> {
     let projector = MockProjector::new(MockConfig {
         frame_buffers: arguments.buffers,
         serial: arguments.serial_number,

@@ -9,7 +9,7 @@ use std::time::{Duration, Instant};
 
 /// Arguments of `hil-mock serve serial`.
 #[derive(Args)]
-pub struct SerialArguments {
+pub(crate) struct SerialArguments {
     /// Serial port to serve on; without it a pseudo-terminal is made and its path printed
     #[arg(long)]
     port: Option<String>,
@@ -21,7 +21,7 @@ pub struct SerialArguments {
 }
 
 /// Serves until the time is over or the port fails.
-pub fn run(arguments: &SerialArguments) -> Result<(), Box<dyn Error>> {
+pub(super) fn run(arguments: &SerialArguments) -> Result<(), Box<dyn Error>> {
     let (names, source) = arguments.tracker.source()?;
     let (port, path, _other_end) = match &arguments.port {
         Some(path) => {

@@ -12,7 +12,7 @@ use std::time::Duration;
 
 /// Arguments of every USB device that is served.
 #[derive(Args)]
-pub struct UsbArguments {
+pub(super) struct UsbArguments {
     /// Serve over USB/IP on this address
     #[arg(long, value_name = "ADDR", default_value = "127.0.0.1:3240")]
     usbip: SocketAddr,
@@ -28,7 +28,7 @@ pub struct UsbArguments {
 const TICK: Duration = Duration::from_millis(2);
 
 /// Offers `model` until the time is over. `look` is called every 2 ms with the model's clock.
-pub fn offer(
+pub(super) fn offer(
     arguments: &UsbArguments,
     name: &str,
     model: Arc<Mutex<dyn UsbDeviceModel>>,

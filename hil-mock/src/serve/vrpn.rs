@@ -10,7 +10,7 @@ use std::time::{Duration, Instant};
 
 /// Arguments of `hil-mock serve vrpn`.
 #[derive(Args)]
-pub struct VrpnArguments {
+pub(crate) struct VrpnArguments {
     /// Address to serve on
     #[arg(long, default_value = "127.0.0.1")]
     bind: Ipv4Addr,
@@ -28,7 +28,7 @@ pub struct VrpnArguments {
 }
 
 /// Serves until the time is over or the socket fails.
-pub fn run(arguments: &VrpnArguments) -> Result<(), Box<dyn Error>> {
+pub(super) fn run(arguments: &VrpnArguments) -> Result<(), Box<dyn Error>> {
     let (bodies, source) = arguments.tracker.source()?;
     let names = VrpnNames { tracker: arguments.name.clone(), bodies, each_body: !arguments.one_tracker };
     let shown = names.clone();

@@ -191,7 +191,7 @@ impl<L: Link> Session<L> {
     }
 
     /// Serves URBs on `link` until either side goes.
-    pub fn run(mut link: L, cable: Arc<dyn UsbCable>) -> io::Result<()> {
+    pub(crate) fn run(mut link: L, cable: Arc<dyn UsbCable>) -> io::Result<()> {
         let state = Mutex::new(State { out: link.another()?, pending: BTreeMap::new() });
         let number = SESSIONS.fetch_add(1, Ordering::Relaxed);
         let session = Arc::new(Self { number, state });

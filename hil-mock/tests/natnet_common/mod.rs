@@ -6,17 +6,17 @@ use hil_mock::motion::{Motion, MotionSpec};
 use hil_mock::tracker::{MockTrackerConfig, SampleSource};
 use std::net::Ipv4Addr;
 
-pub const MS: i64 = 1_000_000;
-pub const S: i64 = 1_000 * MS;
-pub const LOCALHOST: Ipv4Addr = Ipv4Addr::LOCALHOST;
+pub(crate) const MS: i64 = 1_000_000;
+pub(crate) const S: i64 = 1_000 * MS;
+pub(crate) const LOCALHOST: Ipv4Addr = Ipv4Addr::LOCALHOST;
 
 /// Bodies known by name alone.
-pub fn keys(names: &[&str]) -> Vec<BodyKey> {
+pub(crate) fn keys(names: &[&str]) -> Vec<BodyKey> {
     names.iter().map(|n| BodyKey { name: (*n).to_owned(), id: None }).collect()
 }
 
 /// A body that goes to and fro in x, and one that turns in place; 500 Hz.
-pub fn source(faults: &str, latency_ns: i64) -> SampleSource {
+pub(crate) fn source(faults: &str, latency_ns: i64) -> SampleSource {
     let rest = Pose { position_m: [0.1, 0.2, 1.5], ..Pose::IDENTITY };
     let rotate = MotionSpec::Rotate { axis: [0.0, 1.0, 0.0], rate_rad_s: 3.0, pivot_offset_m: [0.0; 3] };
     let motions = vec![

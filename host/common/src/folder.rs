@@ -228,7 +228,7 @@ fn link(path: &Path) -> FolderError {
 ///
 /// # Errors
 /// [`FolderError::NotOurs`].
-pub fn check_file(file: &File, path: &Path, owner: u32) -> Result<(), FolderError> {
+pub(crate) fn check_file(file: &File, path: &Path, owner: u32) -> Result<(), FolderError> {
     let about: Metadata = file.metadata().map_err(|source| FolderError::Io { path: path.into(), source })?;
     let reason = if !about.is_file() {
         "is no plain file; remove it".into()
@@ -247,7 +247,7 @@ pub fn check_file(file: &File, path: &Path, owner: u32) -> Result<(), FolderErro
 ///
 /// # Errors
 /// As [`check_file`]; those of the operating system.
-pub fn open_own_file(path: &Path) -> Result<File, FolderError> {
+pub(crate) fn open_own_file(path: &Path) -> Result<File, FolderError> {
     let opened = File::options()
         .read(true)
         .write(true)

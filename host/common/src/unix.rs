@@ -34,7 +34,7 @@ fn text(name: &str) -> io::Result<CString> {
 ///
 /// # Errors
 /// Those of openat(2).
-pub fn open_at(folder: &File, name: &str, flags: libc::c_int, mode: libc::mode_t) -> io::Result<File> {
+pub(crate) fn open_at(folder: &File, name: &str, flags: libc::c_int, mode: libc::mode_t) -> io::Result<File> {
     let name = text(name)?;
     let flags = flags | libc::O_NOFOLLOW | libc::O_CLOEXEC | libc::O_NONBLOCK;
     // SAFETY: the name ends with a NUL and outlives the call; the descriptor is open as long as `folder` is borrowed.
@@ -50,7 +50,7 @@ pub fn open_at(folder: &File, name: &str, flags: libc::c_int, mode: libc::mode_t
 ///
 /// # Errors
 /// Those of unlinkat(2).
-pub fn remove_at(folder: &File, name: &str) -> io::Result<()> {
+pub(crate) fn remove_at(folder: &File, name: &str) -> io::Result<()> {
     let name = text(name)?;
     // SAFETY: the name ends with a NUL and outlives the call.
     checked(unsafe { libc::unlinkat(folder.as_raw_fd(), name.as_ptr(), 0) })
@@ -60,7 +60,7 @@ pub fn remove_at(folder: &File, name: &str) -> io::Result<()> {
 ///
 /// # Errors
 /// Those of renameat(2).
-pub fn rename_at(folder: &File, from: &str, to: &str) -> io::Result<()> {
+pub(crate) fn rename_at(folder: &File, from: &str, to: &str) -> io::Result<()> {
     let (from, to) = (text(from)?, text(to)?);
     let fd = folder.as_raw_fd();
     // SAFETY: both names end with a NUL and outlive the call.

@@ -11,7 +11,7 @@ use std::path::{Path, PathBuf};
 
 /// Why pictures make no sequence.
 #[derive(Debug, thiserror::Error)]
-pub enum PatternFileError {
+pub(crate) enum PatternFileError {
     /// A file cannot be read.
     #[error("{}: {why}", path.display())]
     Read {
@@ -43,7 +43,7 @@ pub enum PatternFileError {
 
 /// How pictures are shown.
 #[derive(Clone, Copy, Debug)]
-pub struct ShowAs {
+pub(crate) struct ShowAs {
     /// Bits per pattern, 1 to 8; the pictures' highest bits are taken (1: black below 128).
     pub depth: u8,
     /// Time lit, microseconds; `None` for the shortest that the DMD can.
@@ -66,7 +66,7 @@ pub struct ShowAs {
 const MAX_PICTURE_BYTES: u64 = 256 << 20;
 
 /// Reads a picture of exactly the DMD's size as grey values. The size is checked before pixels are decoded.
-pub fn read_grey(path: &Path, dmd: Dmd) -> Result<Vec<u8>, PatternFileError> {
+pub(crate) fn read_grey(path: &Path, dmd: Dmd) -> Result<Vec<u8>, PatternFileError> {
     let fail = |why: String| PatternFileError::Read { path: path.to_owned(), why };
     let bytes = regular_file::read(path, MAX_PICTURE_BYTES).map_err(|e| fail(e.to_string()))?;
     let open = || {
@@ -84,7 +84,7 @@ pub fn read_grey(path: &Path, dmd: Dmd) -> Result<Vec<u8>, PatternFileError> {
 }
 
 /// The `depth` highest bits of grey values as planes, least significant first.
-pub fn planes_of(grey: &[u8], raster: Raster, depth: u8) -> Vec<Vec<u8>> {
+pub(crate) fn planes_of(grey: &[u8], raster: Raster, depth: u8) -> Vec<Vec<u8>> {
     let depth = depth.clamp(1, 8);
     let plane = |bit: u8| {
         let mut plane = vec![0u8; raster.plane_bytes()];
@@ -100,7 +100,11 @@ pub fn planes_of(grey: &[u8], raster: Raster, depth: u8) -> Vec<Vec<u8>> {
 }
 
 /// Makes a sequence of `files`, one pattern each, in order.
-pub fn sequence_of(files: &[PathBuf], dmd: Dmd, show: &ShowAs) -> Result<PatternSequence, PatternFileError> {
+pub(crate) fn sequence_of(
+    files: &[PathBuf],
+    dmd: Dmd,
+    show: &ShowAs,
+) -> Result<PatternSequence, PatternFileError> {
     let mut all = Vec::with_capacity(files.len());
     for file in files {
         all.push(planes_of(&read_grey(file, dmd)?, dmd.raster(), show.depth));
@@ -121,7 +125,7 @@ pub fn sequence_of(files: &[PathBuf], dmd: Dmd, show: &ShowAs) -> Result<Pattern
 }
 
 /// The controller's state, one fact a line.
-pub fn status_text(status: &Status) -> String {
+pub(crate) fn status_text(status: &Status) -> String {
     let mut s = String::new();
     let raster = status.dmd.raster();
     let word = |yes: bool| if yes { "yes" } else { "no" };

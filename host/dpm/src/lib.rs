@@ -1,5 +1,5 @@
 //! The program `dpm`: the rig controller and its tools on the command line.
 
 pub mod cli;
-pub mod dlpc900;
-pub mod run_dlpc900;
+mod dlpc900;
+mod run_dlpc900;

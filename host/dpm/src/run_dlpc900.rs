@@ -39,7 +39,7 @@ const LOOK_NS: u64 = 200_000_000;
 
 /// What a run on a DLPC900 did.
 #[derive(Clone, Debug, serde::Serialize)]
-pub struct Dlpc900Report {
+pub(crate) struct Dlpc900Report {
     /// Version of the program.
     pub version: &'static str,
     /// The DMD.
@@ -66,7 +66,7 @@ pub struct Dlpc900Report {
 
 impl Dlpc900Report {
     /// The report for people.
-    pub fn to_table(&self) -> String {
+    pub(crate) fn to_table(&self) -> String {
         let mut out = format!(
             "projector  {} ({}), {} patterns, {:.3} frames/s\nset up in  {:.2} s, shown for {:.2} s, came back {} times\n",
             self.dmd, self.mode, self.patterns, self.frame_rate_hz, self.setup_s, self.shown_s, self.came_back
@@ -82,7 +82,7 @@ impl Dlpc900Report {
 }
 
 /// What the controller is set up with.
-pub enum Show {
+pub(crate) enum Show {
     /// Frames that are loaded.
     Preloaded(PatternSequence),
     /// Patterns out of the video signal.
@@ -107,7 +107,7 @@ impl Show {
 }
 
 /// Most frames of `planes` planes that a DMD's controller holds.
-pub fn frames_held(dmd: Dmd, planes: usize) -> usize {
+pub(crate) fn frames_held(dmd: Dmd, planes: usize) -> usize {
     let images = (dmd.max_planes() as usize / IMAGE_PLANES).min(MAX_IMAGES);
     images * (IMAGE_PLANES / planes.max(1))
 }
@@ -117,7 +117,7 @@ pub fn frames_held(dmd: Dmd, planes: usize) -> usize {
 ///
 /// # Errors
 /// The rule of the controller that they break.
-pub fn preload(
+pub(crate) fn preload(
     dmd: Dmd,
     schedule: &PlaneSchedule,
     frames: &[BitPlaneFrame],
@@ -166,7 +166,7 @@ pub fn preload(
 ///
 /// # Errors
 /// Bad scene or rules of the controller broken (exit code 2), a controller that fails (3), no GPU (4).
-pub fn run_dlpc900(config: &RigConfig, monitor: &RunMonitor) -> Result<Dlpc900Report, Failure> {
+pub(crate) fn run_dlpc900(config: &RigConfig, monitor: &RunMonitor) -> Result<Dlpc900Report, Failure> {
     let ProjectorBackend::Dlpc900(backend) = &config.projector.backend else {
         return Err(Failure::new(FailureKind::BadInput, "projector.backend.kind is not \"dlpc900\""));
     };
@@ -297,7 +297,7 @@ fn video(config: &RigConfig, backend: &Dlpc900Config, dmd: Dmd) -> VideoPatterns
 ///
 /// # Errors
 /// The controller refuses or fails. While it is unplugged there is no error: it is looked for, and set up again.
-pub fn present<P: HidPort>(
+pub(crate) fn present<P: HidPort>(
     open: &mut dyn FnMut() -> Result<Dlpc900<P>, Dlpc900Error>,
     show: &Show,
     seconds: Option<f64>,

@@ -5,13 +5,15 @@ pub mod conformance;
 pub mod error;
 pub mod handoff_cost;
 pub mod link_test;
-pub mod median;
-pub mod metrics;
+mod median;
+mod metrics;
 pub mod plan_savings;
 pub mod profile;
 pub mod reference;
 pub mod scene_plan;
 pub mod sequence;
 pub mod snapshot;
+#[cfg(test)]
+mod sobol;
 pub mod stability;
 pub mod stamp;

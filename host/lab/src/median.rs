@@ -1,7 +1,7 @@
 //! Times of frames into the one that stands for them: a stall of the machine moves a mean, not a median.
 
 /// Middle value, or the mean of the two in the middle; 0 of none.
-pub fn median(values: impl IntoIterator<Item = f64>) -> f64 {
+pub(crate) fn median(values: impl IntoIterator<Item = f64>) -> f64 {
     let mut sorted: Vec<f64> = values.into_iter().collect();
     sorted.sort_by(f64::total_cmp);
     match sorted.len() {
@@ -11,12 +11,12 @@ pub fn median(values: impl IntoIterator<Item = f64>) -> f64 {
 }
 
 /// Median of nanoseconds, as milliseconds; 0 of none.
-pub fn median_ms(ns: impl IntoIterator<Item = u64>) -> f64 {
+pub(crate) fn median_ms(ns: impl IntoIterator<Item = u64>) -> f64 {
     1e-6 * median(ns.into_iter().map(|ns| ns as f64))
 }
 
 /// Where the middle half of the values lies: the quartiles, each the value whose rank is nearest; zeros of none.
-pub fn quartiles(values: impl IntoIterator<Item = f64>) -> [f64; 2] {
+pub(crate) fn quartiles(values: impl IntoIterator<Item = f64>) -> [f64; 2] {
     let mut sorted: Vec<f64> = values.into_iter().collect();
     sorted.sort_by(f64::total_cmp);
     let last = sorted.len().saturating_sub(1) as f64;
@@ -25,7 +25,7 @@ pub fn quartiles(values: impl IntoIterator<Item = f64>) -> [f64; 2] {
 
 /// Mean without the stalls of the machine: what takes more than three times the median is left out; 0 of none. Unlike a median it
 /// tells the cost of frames that take turns between more and fewer samples.
-pub fn steady_mean(values: &[f64]) -> f64 {
+pub(crate) fn steady_mean(values: &[f64]) -> f64 {
     let most = 3.0 * median(values.iter().copied());
     let steady: Vec<f64> = values.iter().copied().filter(|v| *v <= most).collect();
     steady.iter().sum::<f64>() / steady.len().max(1) as f64

@@ -66,7 +66,7 @@ fn material(scene: &Scene, calls: impl Fn(&Material) -> bool) -> Option<String> 
 }
 
 /// Parts that depend on the scene alone. `needs` is what the renderer decided; the scene only says why.
-pub fn scene_entries(scene: &Scene, needs: &SceneNeeds, clamp: f64) -> Vec<PlanEntry> {
+pub(crate) fn scene_entries(scene: &Scene, needs: &SceneNeeds, clamp: f64) -> Vec<PlanEntry> {
     let part = |feature, need: bool, reason: Option<String>, or| {
         entry(feature, need.then(|| reason.unwrap_or_else(|| "the scene".into())), or, BY_CONSTANT)
     };
@@ -141,7 +141,7 @@ pub fn scene_entries(scene: &Scene, needs: &SceneNeeds, clamp: f64) -> Vec<PlanE
 }
 
 /// Parts that depend on the method and its switches. `full` is the method as it is without any switch of the rig file.
-pub fn method_entries(method: &Method, full: &Method, word: &str) -> Vec<PlanEntry> {
+pub(crate) fn method_entries(method: &Method, full: &Method, word: &str) -> Vec<PlanEntry> {
     let part = |feature, of: &dyn Fn(&Method) -> bool, key: &str, how| {
         let (on, would) = (of(method), of(full));
         PlanEntry {

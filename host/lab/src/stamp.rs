@@ -9,7 +9,7 @@ use std::path::Path;
 
 /// 64 bits of FNV-1a [Fowler, Noll, Vo]: names files by what they were made from. Not for enemies.
 #[derive(Clone, Copy, Debug)]
-pub struct Fnv(u64);
+pub(crate) struct Fnv(u64);
 
 impl Default for Fnv {
     fn default() -> Self {
@@ -19,14 +19,14 @@ impl Default for Fnv {
 
 impl Fnv {
     /// Takes bytes in.
-    pub fn add(&mut self, bytes: &[u8]) {
+    pub(crate) fn add(&mut self, bytes: &[u8]) {
         for &b in bytes {
             self.0 = (self.0 ^ u64::from(b)).wrapping_mul(0x0100_0000_01b3);
         }
     }
 
     /// The hash as 16 hexadecimal digits.
-    pub fn text(&self) -> String {
+    pub(crate) fn text(&self) -> String {
         format!("{:016x}", self.0)
     }
 }

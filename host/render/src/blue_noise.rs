@@ -11,9 +11,9 @@ pub const SIZE: usize = 64;
 /// Slices (frames) of the committed masks.
 pub const FRAMES: usize = 32;
 /// Independent masks, interleaved.
-pub const CHANNELS: usize = 2;
+pub(crate) const CHANNELS: usize = 2;
 /// Seeds of the committed masks, one a channel.
-pub const SEEDS: [u64; CHANNELS] = [0x5eed_0001, 0x5eed_0002];
+pub(crate) const SEEDS: [u64; CHANNELS] = [0x5eed_0001, 0x5eed_0002];
 
 /// The committed masks: `MASK[((frame * SIZE + y) * SIZE + x) * CHANNELS + channel]`, each value 0 to 255 equally often.
 /// `(value + 0.5) / 256` is the offset to use. Made by `cargo run -p dpm-render --example make_blue_noise`.

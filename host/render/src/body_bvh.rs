@@ -14,7 +14,7 @@ use obvhs::triangle::Triangle;
 
 /// Entries of the traversal stack in `bvh.glsl`, besides eight in registers. A ray pushes at most one entry a level below the root, so a tree of one more level than
 /// this never overflows it.
-pub const TRAVERSAL_STACK: usize = 24;
+pub(crate) const TRAVERSAL_STACK: usize = 24;
 
 /// Most triangles of a leaf of the wide tree.
 const LEAF: u32 = 3;
@@ -28,7 +28,7 @@ const NODE_WORDS: usize = 5;
 
 /// A BVH ready for upload.
 #[derive(Clone, Debug, Default)]
-pub struct BodyBvh {
+pub(crate) struct BodyBvh {
     /// Five words of four u32 per node, as \[Ylitie17\] has them but for where children stand: the fifth u32 is a block, and the inner child in
     /// slot s is node 8 * block + s of this body. So the walk need not count bits to find it, and one u32 is an entry of its stack. Places
     /// whose slot holds triangles or nothing are zero. The root is node 0, in slot 0 of block 0.
@@ -40,7 +40,7 @@ pub struct BodyBvh {
 impl BodyBvh {
     /// Builds the tree; an empty mesh gives an empty tree. Coordinates are finite and at most [`dpm_scene::mesh::MAX_COORDINATE_M`]:
     /// `scene_data` sees to it, and areas stay far below what f32 holds.
-    pub fn build(mesh: &TriangleMesh) -> Self {
+    pub(crate) fn build(mesh: &TriangleMesh) -> Self {
         if mesh.triangles.is_empty() {
             return Self::default();
         }
@@ -72,7 +72,7 @@ impl BodyBvh {
     }
 
     /// Levels of nodes, the root's included; 0 of an empty tree.
-    pub fn levels(&self) -> usize {
+    pub(crate) fn levels(&self) -> usize {
         let mut level: Vec<u32> = if self.nodes.is_empty() { vec![] } else { vec![0] };
         let mut levels = 0;
         while !level.is_empty() {

@@ -9,10 +9,10 @@ use glam::{DAffine3, DVec3};
 
 /// So far may a body's corners move on the picture from one frame to the next, in pixels and along each axis, before every pixel asks anew:
 /// half a pixel less than as far as `still_dark` of `primary.comp` looks about itself.
-pub const STEADY_PX: f64 = 1.5;
+pub(crate) const STEADY_PX: f64 = 1.5;
 
 /// So far may the eye, and what is behind the projector, metres.
-pub const STEADY_M: f64 = 5e-3;
+pub(crate) const STEADY_M: f64 = 5e-3;
 
 /// Place of a frame among those that were drawn. Whatever is done in turns from frame to frame (the checkerboard, the rates of every second
 /// frame, the questions that each block asks in every fourth frame, the slices of blue noise) goes by this one count. The numbers of frames

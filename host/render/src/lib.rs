@@ -15,10 +15,8 @@ mod renderer;
 pub mod scene_data;
 mod scene_gpu;
 mod slot;
-pub mod sobol;
 pub mod tiles;
 
-pub use memory::RasterTooLarge;
-pub use renderer::{FrameInputs, Output, RenderError, Renderer, RendererPlan, RendererSettings};
+pub use renderer::{FrameInputs, Output, RenderError, Renderer, RendererSettings};
 pub use scene_data::Keep;
 pub use slot::{FrameCost, FrameSlot, PASSES};

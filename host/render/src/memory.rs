@@ -37,7 +37,7 @@ pub(super) struct BytesPerPixel {
 
 impl BytesPerPixel {
     /// Those of `method`.
-    pub fn of(method: &Method) -> Self {
+    pub(crate) fn of(method: &Method) -> Self {
         let when = |wanted: bool, bytes: usize| if wanted { bytes } else { 0 };
         Self {
             history: when(method.needs_history(), size_of::<History>()),
@@ -156,7 +156,7 @@ impl SharedBuffers {
     ///
     /// # Errors
     /// The raster is too large for the device, or the GPU's own.
-    pub fn new(gpu: &Arc<Gpu>, settings: &RendererSettings) -> Result<Self, RenderError> {
+    pub(crate) fn new(gpu: &Arc<Gpu>, settings: &RendererSettings) -> Result<Self, RenderError> {
         let raster = settings.raster;
         check_raster(raster, &settings.method, gpu.max_buffer_bytes(), &gpu.summary().name)?;
         let pixels = if settings.method.needs_history() { raster.pixel_count() } else { 1 };

@@ -111,7 +111,7 @@ impl Method {
     }
 
     /// Motion, size, angle and albedo of every pixel are written: for the history, for the filters, or to choose samples.
-    pub fn needs_guides(&self) -> bool {
+    pub(crate) fn needs_guides(&self) -> bool {
         self.needs_history() || self.needs_spatial() || self.spp_by_angle
     }
 

@@ -6,12 +6,12 @@
 use dpm_shaders::structs::{RATE_TABLE_OCTAVE, RATE_TABLE_OCTAVES};
 
 /// \[Yang19\] `b_H`: 1 at rest, falls with `v` pixels per frame.
-pub fn blur_half(v: f64) -> f64 {
+pub(crate) fn blur_half(v: f64) -> f64 {
     (1.0 / (1.0 + (1.05 * v).powf(3.10))).powf(0.35)
 }
 
 /// \[Yang19\] `b_Q`: 2.13 at rest.
-pub fn blur_quarter(v: f64) -> f64 {
+pub(crate) fn blur_quarter(v: f64) -> f64 {
     2.13 * (1.0 / (1.0 + (0.55 * v).powf(2.41))).powf(0.49)
 }
 

@@ -560,7 +560,11 @@ impl SceneData {
 }
 
 /// Bounds of a body after a rigid transform.
-pub fn world_bounds(world_from_body: &DAffine3, lower: Vec3, upper: Vec3) -> (glam::DVec3, glam::DVec3) {
+pub(crate) fn world_bounds(
+    world_from_body: &DAffine3,
+    lower: Vec3,
+    upper: Vec3,
+) -> (glam::DVec3, glam::DVec3) {
     let centre = ((lower + upper) * 0.5).as_dvec3();
     let half = ((upper - lower) * 0.5).as_dvec3();
     let m = world_from_body.matrix3;

@@ -6,7 +6,7 @@ use bytemuck::cast_slice;
 use std::sync::Arc;
 
 /// The buffers of one scene; immutable after creation.
-pub struct SceneGpu {
+pub(crate) struct SceneGpu {
     pub(super) nodes: Buffer,
     pub(super) triangles: Buffer,
     pub(super) refs: Buffer,
@@ -24,7 +24,7 @@ impl SceneGpu {
     ///
     /// # Errors
     /// Out of memory or beyond the device's limits.
-    pub fn new(gpu: &Arc<Gpu>, data: &SceneData, texel: bool) -> Result<Self, GpuError> {
+    pub(crate) fn new(gpu: &Arc<Gpu>, data: &SceneData, texel: bool) -> Result<Self, GpuError> {
         // Buffers cannot be empty; one element of padding is never read.
         let empty = [[0u32; 4]; 5];
         let nodes = if data.nodes.is_empty() { &empty[..] } else { &data.nodes };

@@ -10,7 +10,7 @@ pub const TILE: u32 = 16;
 
 /// The tiles of one raster, in the order in which they are traced, and which of them are active.
 #[derive(Clone, Debug)]
-pub struct TileList {
+pub(crate) struct TileList {
     tiles_x: u32,
     tiles_y: u32,
     /// A walk over all tiles in large steps: software Vulkan splits a grid in two halves, which should cost alike.
@@ -21,7 +21,7 @@ pub struct TileList {
 
 impl TileList {
     /// A list for a raster of `width` x `height` pixels.
-    pub fn new(width: u32, height: u32) -> Self {
+    pub(crate) fn new(width: u32, height: u32) -> Self {
         let (tiles_x, tiles_y) = (width.div_ceil(TILE), height.div_ceil(TILE));
         let n = (tiles_x * tiles_y) as usize;
         let mut step = (n as f64 * 0.618) as usize | 1;
@@ -33,22 +33,17 @@ impl TileList {
     }
 
     /// Number of tiles of the raster.
-    pub fn len(&self) -> usize {
+    pub(crate) fn len(&self) -> usize {
         self.active.len()
     }
 
-    /// Never true.
-    pub fn is_empty(&self) -> bool {
-        self.active.is_empty()
-    }
-
     /// Tiles in a row.
-    pub fn tiles_x(&self) -> u32 {
+    pub(crate) fn tiles_x(&self) -> u32 {
         self.tiles_x
     }
 
     /// Marks the tiles that the bodies may touch. `only`: bodies to look at (all bits of `flags_mask` set). Allocates nothing.
-    pub fn update(
+    pub(crate) fn update(
         &mut self,
         camera: &ProjectorCamera,
         bodies: &[BodyData],
@@ -65,7 +60,7 @@ impl TileList {
     }
 
     /// Marks every tile.
-    pub fn fill(&mut self) {
+    pub(crate) fn fill(&mut self) {
         std::mem::swap(&mut self.active, &mut self.previous);
         self.active.fill(true);
     }
@@ -103,7 +98,7 @@ impl TileList {
     }
 
     /// Writes the tiles that are active now or were at the last update (those must be cleared) to `out`; returns how many.
-    pub fn write(&self, out: &mut [u32]) -> u32 {
+    pub(crate) fn write(&self, out: &mut [u32]) -> u32 {
         let mut n = 0;
         for &tile in &self.order {
             if self.active[tile as usize] || self.previous[tile as usize] {

@@ -10,11 +10,11 @@ use dpm_device::time::HostTime;
 pub struct FrameId(pub u64);
 
 /// The stages whose wall time is kept, in the order in which a frame passes them.
-pub const STAGES: [&str; 5] = ["plan", "render", "pack", "link", "light"];
+pub(crate) const STAGES: [&str; 5] = ["plan", "render", "pack", "link", "light"];
 /// Index of a stage in [`STAGES`].
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 #[repr(usize)]
-pub enum Stage {
+pub(crate) enum Stage {
     /// Poses latched and predicted, uniforms written.
     Plan = 0,
     /// Submission to the fence.
@@ -62,12 +62,12 @@ pub struct FrameTimeline {
 
 impl FrameTimeline {
     /// True when a tracker's sample went into the frame, so that it makes sense to count from its exposure.
-    pub fn has_sample(&self) -> bool {
+    pub(crate) fn has_sample(&self) -> bool {
         (self.captured_at, self.received_at) != (self.due_at, self.due_at)
     }
 
     /// Takes away what the frame has of a sample: no light came of it.
-    pub fn without_sample(mut self) -> Self {
+    pub(crate) fn without_sample(mut self) -> Self {
         (self.captured_at, self.received_at) = (self.due_at, self.due_at);
         self
     }

@@ -7,9 +7,9 @@ use hil_mock::faults::{FaultKind, FaultPlan};
 use hil_mock::projector::{DeviceClock, FaultyProjector, MockConfig};
 use hil_mock::tracker::{MockTracker, MockTrackerError, TRACKER_FAULTS};
 
-pub use hil_mock::faults::FaultError;
-pub use hil_mock::motion::{Motion, MotionError, MotionSpec};
-pub use hil_mock::projector::{serve_cable, EmulatedProjector, MockProjector, Served};
+pub(crate) use hil_mock::faults::FaultError;
+pub(crate) use hil_mock::motion::{Motion, MotionError, MotionSpec};
+pub(crate) use hil_mock::projector::{serve_cable, EmulatedProjector, MockProjector, Served};
 
 /// Why there is no mock tracker.
 #[derive(Debug, thiserror::Error)]
@@ -26,7 +26,7 @@ pub enum MockOpenError {
 ///
 /// # Errors
 /// Numbers or faults that a mock tracker cannot have.
-pub fn tracker(c: &MockTrackerConfig, motions: Vec<Motion>) -> Result<MockTracker, MockOpenError> {
+pub(crate) fn tracker(c: &MockTrackerConfig, motions: Vec<Motion>) -> Result<MockTracker, MockOpenError> {
     let mut faults = c.faults.clone();
     // `drop_out` is one more fault.
     if c.drop_out > 0.0 {
@@ -50,7 +50,7 @@ pub fn tracker(c: &MockTrackerConfig, motions: Vec<Motion>) -> Result<MockTracke
 ///
 /// # Errors
 /// Faults that a mock projector cannot have.
-pub fn projector(
+pub(crate) fn projector(
     c: &MockProjectorConfig,
     raster: Raster,
     flash_limit: Option<u8>,
@@ -68,7 +68,7 @@ pub fn projector(
 ///
 /// # Errors
 /// Text that is no plan of faults, or faults that a tracker does not have.
-pub fn check_tracker_faults(text: &str) -> Result<(), FaultError> {
+pub(crate) fn check_tracker_faults(text: &str) -> Result<(), FaultError> {
     check_faults(text, &TRACKER_FAULTS, "the mock tracker")
 }
 
@@ -76,7 +76,7 @@ pub fn check_tracker_faults(text: &str) -> Result<(), FaultError> {
 ///
 /// # Errors
 /// Text that is no plan of faults, or faults that a projector does not have.
-pub fn check_projector_faults(text: &str) -> Result<(), FaultError> {
+pub(crate) fn check_projector_faults(text: &str) -> Result<(), FaultError> {
     check_faults(text, &FaultyProjector::KNOWN, "the mock projector")
 }
 

@@ -108,7 +108,7 @@ impl Observer {
     }
 
     /// The tracked body without which the gaze is not known; `None` for a gaze that does not depend on a tracker.
-    pub fn gaze_body(&self) -> Option<usize> {
+    pub(crate) fn gaze_body(&self) -> Option<usize> {
         match self.gaze {
             Gaze::Point(_) => None,
             Gaze::Body(i) => Some(i),
@@ -117,7 +117,7 @@ impl Observer {
     }
 
     /// By how much all zones about the gaze grow when its body was last seen `unseen_ns` ago, degrees: 0 while it is held, 180 at most.
-    pub fn widening_deg(&self, unseen_ns: i64) -> f64 {
+    pub(crate) fn widening_deg(&self, unseen_ns: i64) -> f64 {
         let beyond_s = unseen_ns.saturating_sub(self.gaze_hold_ns).max(0) as f64 * 1e-9;
         (beyond_s * self.gaze_widen_deg_per_s).min(180.0)
     }
@@ -158,7 +158,7 @@ pub fn affine(pose: &Pose) -> DAffine3 {
 }
 
 /// The pose of a rigid transform.
-pub fn pose_of(m: &DAffine3) -> Pose {
+pub(crate) fn pose_of(m: &DAffine3) -> Pose {
     let (_, rotation, translation) = m.to_scale_rotation_translation();
     Pose { position_m: translation.to_array(), rotation_xyzw: rotation.normalize().to_array() }
 }

@@ -75,7 +75,7 @@ impl Identity {
     }
 
     /// Name of the file of its standing order.
-    pub fn order_name(&self) -> String {
+    pub(crate) fn order_name(&self) -> String {
         short(&format!("{}-{}", self.family, self.serial.as_deref().unwrap_or("any"))) + ENDING
     }
 

@@ -83,7 +83,7 @@ impl AlbedoTable {
 }
 
 /// Most tables of a scene. Each takes a few hundredths of a second, so a file with ten thousand indices of refraction would take minutes.
-pub const MAX_TABLES: usize = 32;
+pub(crate) const MAX_TABLES: usize = 32;
 
 /// The indices of refraction of which a scene has tables and, for each of `iors`, which of them is its own. As many as there are different ones where
 /// they are at most [`MAX_TABLES`], in the order in which they first come; beyond that [`MAX_TABLES`] of them, spread evenly over the sorted indices, and each

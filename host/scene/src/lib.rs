@@ -12,12 +12,11 @@ mod gltf_file;
 mod limits;
 mod load;
 pub mod mesh;
-pub mod polygonise;
+mod polygonise;
 mod procedural;
 pub mod shapes;
 mod stats;
 mod studio;
-mod surface;
 
 use glam::{DAffine3, Vec2, Vec3, Vec4};
 
@@ -26,9 +25,8 @@ pub use environment::load_environment;
 pub use error::SceneError;
 pub use limits::Limits;
 pub use load::{load, load_bytes, BodySelector, LoadOptions};
-pub use stats::{EnvironmentFeature, SceneFeatures};
+pub use stats::SceneFeatures;
 pub use studio::studio;
-pub use surface::sample_points;
 
 /// Everything that light meets. Immutable once loaded; bodies move by poses that are kept elsewhere.
 #[derive(Clone, Debug, Default)]

@@ -39,7 +39,7 @@ impl TriangleMesh {
     }
 
     /// Removes triangles that no ray could meaningfully hit (non-finite corners, no area), then the vertices that nothing uses any more.
-    pub fn drop_unusable(&mut self) -> Dropped {
+    pub(crate) fn drop_unusable(&mut self) -> Dropped {
         let mut dropped = Dropped::default();
         let mut keep = Vec::with_capacity(self.triangles.len());
         for triangle in &self.triangles {
@@ -99,7 +99,7 @@ impl TriangleMesh {
     }
 
     /// Gives every triangle its own three vertices with the face normal, as glTF asks for where a file has no normals.
-    pub fn split_into_flat_faces(&mut self) {
+    pub(crate) fn split_into_flat_faces(&mut self) {
         let corners: Vec<u32> = self.triangles.iter().flatten().copied().collect();
         let normals = self
             .triangles
@@ -119,7 +119,7 @@ impl TriangleMesh {
     }
 
     /// Normalises the normals; one that is zero or not finite becomes the area-weighted mean of the faces around it.
-    pub fn repair_normals(&mut self) {
+    pub(crate) fn repair_normals(&mut self) {
         let unit =
             |n: Vec3| n.is_finite().then(|| n.as_dvec3().try_normalize()).flatten().map(DVec3::as_vec3);
         let needs_repair = self.normals.iter().any(|&n| unit(n).is_none());
@@ -140,7 +140,7 @@ impl TriangleMesh {
     /// Computes tangents from the texture coordinates: the tangent follows +u, the bitangent `w * n x t` follows -v (up in the image),
     /// as glTF's normal maps have it. Faces around a vertex count by their angle there, in the way of \[Mikkelsen08\]; a vertex that
     /// joins mirrored and unmirrored faces is split. Where the coordinates are degenerate, any unit vector across the normal is taken.
-    pub fn generate_tangents(&mut self) {
+    pub(crate) fn generate_tangents(&mut self) {
         self.split_mirrored_vertices();
         let mut sum = vec![DVec3::ZERO; self.positions.len()];
         let mut sign = vec![1.0f32; self.positions.len()];
@@ -170,7 +170,7 @@ impl TriangleMesh {
     }
 
     /// Replaces tangents that are not finite, too short or along the normal; makes all of them unit length, across the normal, `w = +-1`.
-    pub fn repair_tangents(&mut self) {
+    pub(crate) fn repair_tangents(&mut self) {
         for (t, n) in self.tangents.iter_mut().zip(&self.normals) {
             let n = n.as_dvec3();
             let raw = t.truncate().as_dvec3();
@@ -220,7 +220,7 @@ impl TriangleMesh {
     }
 
     /// Appends `other` seen through `transform` (any invertible affine map; a mirroring one turns the winding so that outside stays outside).
-    pub fn append_transformed(&mut self, other: &TriangleMesh, transform: &DAffine3) {
+    pub(crate) fn append_transformed(&mut self, other: &TriangleMesh, transform: &DAffine3) {
         let base = self.positions.len() as u32;
         let linear = transform.matrix3;
         let mirrored = linear.determinant() < 0.0;

@@ -3,7 +3,7 @@
 use glam::{UVec3, Vec3};
 
 /// Vertices, their outward unit normals, and faces counter-clockwise seen from outside.
-pub struct Surface {
+pub(crate) struct Surface {
     /// On the surface within a small share of a cell.
     pub positions: Vec<Vec3>,
     /// Unit gradients of the field.
@@ -16,7 +16,7 @@ pub struct Surface {
 ///
 /// The surface must not touch the box. The result is closed: every edge belongs to two triangles, except where the surface
 /// passes twice through a cell, where four may meet.
-pub fn surface_nets(field: &dyn Fn(Vec3) -> f32, min: Vec3, max: Vec3, cell: f32) -> Surface {
+pub(crate) fn surface_nets(field: &dyn Fn(Vec3) -> f32, min: Vec3, max: Vec3, cell: f32) -> Surface {
     let samples = ((max - min) / cell).ceil().as_uvec3() + UVec3::ONE;
     let [nx, ny, nz] = samples.to_array();
     let at = |x: u32, y: u32, z: u32| (x + nx * (y + ny * z)) as usize;

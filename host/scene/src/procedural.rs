@@ -7,7 +7,7 @@ use super::{Texture, Wrap};
 const SIZE: u32 = 256;
 
 /// Base colour (sRGB) and normal map of a crackled blue-and-white glaze.
-pub fn glaze_textures() -> [Texture; 2] {
+pub(crate) fn glaze_textures() -> [Texture; 2] {
     let color = |p: Vec2| {
         let petals = cells(p, 6, 11);
         let ring = 1.0 - smooth(0.24, 0.30, petals.nearest);
@@ -24,7 +24,7 @@ pub fn glaze_textures() -> [Texture; 2] {
 }
 
 /// Base colour (sRGB) and metallic-roughness of bronze with green patina in its hollows.
-pub fn bronze_textures() -> [Texture; 2] {
+pub(crate) fn bronze_textures() -> [Texture; 2] {
     let patina = |p: Vec2| smooth(0.56, 0.70, fractal(p, 6, 17));
     let color = |p: Vec2| {
         let metal = Vec3::new(0.80, 0.52, 0.28).lerp(Vec3::new(0.66, 0.40, 0.20), fractal(p, 16, 7));

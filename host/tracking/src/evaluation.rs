@@ -1,7 +1,7 @@
 //! Closed-form motions through the mock tracker and the pose filter into errors at the instant of light, as a table.
 
 use super::pose_filter::{PoseFilter, PoseFilterConfig, Prediction};
-use dpm_common::se3::so3_between;
+use dpm_common::so3::so3_between;
 use dpm_device::pose::Pose;
 use dpm_device::time::{FrameRate, HostTime};
 use dpm_device::tracker::{BodyIndex, Tracker};
@@ -12,7 +12,7 @@ use std::fmt::Write;
 
 /// The rig around the filter.
 #[derive(Clone, Debug)]
-pub struct EvaluationConfig {
+pub(crate) struct EvaluationConfig {
     /// Rate, latency, noise and seed of the tracker.
     pub tracker: MockTrackerConfig,
     /// Frames per second.
@@ -28,7 +28,7 @@ pub struct EvaluationConfig {
 
 impl EvaluationConfig {
     /// 500 Hz, 2 ms of tracker latency, 947 fps, 20 s; noise as standard deviation per axis, m and rad.
-    pub fn with_noise(position_noise_m: f64, rotation_noise_rad: f64) -> Self {
+    pub(crate) fn with_noise(position_noise_m: f64, rotation_noise_rad: f64) -> Self {
         Self {
             tracker: MockTrackerConfig {
                 position_noise_m,
@@ -46,7 +46,7 @@ impl EvaluationConfig {
 /// Quantiles of an error.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 #[allow(missing_docs)] // named after what they are
-pub struct Quantiles {
+pub(crate) struct Quantiles {
     pub p50: f64,
     pub p99: f64,
     pub max: f64,
@@ -68,7 +68,7 @@ impl Quantiles {
 
 /// Errors at the instant of light.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
-pub struct PredictionErrors {
+pub(crate) struct PredictionErrors {
     /// Distance between predicted and true position, m.
     pub position_m: Quantiles,
     /// Angle between predicted and true rotation, rad.
@@ -81,7 +81,7 @@ pub struct PredictionErrors {
 
 /// Why there is nothing to evaluate.
 #[derive(Debug, thiserror::Error)]
-pub enum EvaluationError {
+pub(crate) enum EvaluationError {
     /// The motion does not exist.
     #[error(transparent)]
     Motion(#[from] MotionError),
@@ -94,7 +94,7 @@ pub enum EvaluationError {
 }
 
 /// Runs one motion through tracker and filter and compares with the truth at every frame's light.
-pub fn evaluate(
+pub(crate) fn evaluate(
     motion: &MotionSpec,
     filter: PoseFilterConfig,
     rig: &EvaluationConfig,
@@ -134,7 +134,7 @@ pub fn evaluate(
 
 /// A row of the table: what moves, and the error that must not be exceeded with 0.1 mm and 1 mrad of noise and without.
 #[derive(Clone, Debug)]
-pub struct PredictionCase {
+pub(crate) struct PredictionCase {
     /// As printed.
     pub name: &'static str,
     /// What moves.
@@ -146,7 +146,7 @@ pub struct PredictionCase {
 }
 
 /// The motions of the table.
-pub fn prediction_cases() -> Vec<PredictionCase> {
+pub(crate) fn prediction_cases() -> Vec<PredictionCase> {
     let shuttle = MotionSpec::shuttle;
     let resting = MotionSpec::Translate {
         direction: [1.0, 0.0, 0.0],
@@ -216,14 +216,14 @@ pub fn prediction_cases() -> Vec<PredictionCase> {
 
 impl PredictionCase {
     /// The 99th percentile that the case is about: mm or mrad.
-    pub fn p99(&self, errors: &PredictionErrors) -> f64 {
+    pub(crate) fn p99(&self, errors: &PredictionErrors) -> f64 {
         1e3 * if self.rotates { errors.rotation_rad.p99 } else { errors.position_m.p99 }
     }
 }
 
 /// What became of a case.
 #[derive(Clone, Debug)]
-pub struct PredictionRow {
+pub(crate) struct PredictionRow {
     /// The case.
     pub case: PredictionCase,
     /// With 0.1 mm and 1 mrad of noise.
@@ -244,7 +244,7 @@ pub struct PredictionRow {
 ///
 /// # Errors
 /// As [`evaluate`].
-pub fn prediction_rows() -> Result<Vec<PredictionRow>, EvaluationError> {
+pub(crate) fn prediction_rows() -> Result<Vec<PredictionRow>, EvaluationError> {
     let on = PoseFilterConfig::default();
     let off = PoseFilterConfig { prediction: Prediction::Off, ..on };
     let [noisy, fine, quiet] =
@@ -265,7 +265,7 @@ pub fn prediction_rows() -> Result<Vec<PredictionRow>, EvaluationError> {
 }
 
 /// The table of `docs/LATENCY.md` in Markdown: 99th percentile of the error at the instant of light.
-pub fn prediction_table(rows: &[PredictionRow]) -> String {
+pub(crate) fn prediction_table(rows: &[PredictionRow]) -> String {
     let mut table = String::from(
         "| motion | 0.1 mm | without the fifth filter | 0.01 mm | without the fifth filter | no noise | held, no noise | unit |\n\
          |---|---:|---:|---:|---:|---:|---:|---|\n",

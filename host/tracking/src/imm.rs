@@ -7,7 +7,7 @@
 //! Every axis of the tangent space has a bank of its own: a body that shuttles along x stays calm in y and z. The same code
 //! follows translations and, by way of [`Chart`], rotations.
 
-use dpm_common::se3::{so3_between, so3_exp};
+use dpm_common::so3::{so3_between, so3_exp};
 use glam::{DQuat, DVec3};
 
 /// A manifold of dimension three with tangents in the world frame.
@@ -39,7 +39,7 @@ impl Chart for Translations {
 
 /// Rotations as unit quaternions; tangents are world-space rotation vectors, rad.
 #[derive(Clone, Copy, Debug)]
-pub struct Rotations;
+pub(crate) struct Rotations;
 
 impl Chart for Rotations {
     type Point = DQuat;
@@ -66,7 +66,7 @@ pub struct Covariance {
 
 impl Covariance {
     /// Variance of the position after `h` seconds of constant acceleration.
-    pub fn position_variance_at(&self, h: f64) -> f64 {
+    pub(crate) fn position_variance_at(&self, h: f64) -> f64 {
         let half = 0.5 * h * h;
         self.pp
             + h * (2.0 * self.pv + h * self.vv)
@@ -238,7 +238,7 @@ impl<P: Copy> Kinematics<P> {
     }
 
     /// Where the point will be after `h` seconds (may be negative) at constant acceleration.
-    pub fn point_at<C: Chart<Point = P>>(&self, h: f64) -> P {
+    pub(crate) fn point_at<C: Chart<Point = P>>(&self, h: f64) -> P {
         C::moved(self.point, (self.velocity + self.acceleration * (0.5 * h)) * h)
     }
 }
@@ -265,10 +265,10 @@ struct RecalledAxis {
 }
 
 /// Number of filters in a bank.
-pub const MODES: usize = 5;
+pub(crate) const MODES: usize = 5;
 /// The filter that moves on as the body did the last time; its model says how exactly it repeats itself. It takes part only
 /// while something is recalled.
-pub const RECALLED: usize = 4;
+pub(crate) const RECALLED: usize = 4;
 
 /// What a bank assumes of motion in general.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -449,7 +449,7 @@ impl<C: Chart> Imm<C> {
     }
 
     /// Moment-matched mean and covariance of the banks.
-    pub fn combined(&self) -> Kinematics<C::Point> {
+    pub(crate) fn combined(&self) -> Kinematics<C::Point> {
         let mean = self.axes.map(|axis| AxisBank::mixture(&axis.modes, &axis.probability));
         Kinematics {
             point: C::moved(self.base, DVec3::from_array(mean.map(|m| m.offset))),

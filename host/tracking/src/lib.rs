@@ -4,18 +4,18 @@
 //! [`bank`] keeps one filter a body. [`imm`], [`noise`] and [`recall`] (from smoothed samples) are the estimators inside.
 //! The tests measure it all against closed-form motion. No sample is used before it arrived; everything is f64; time is integer nanoseconds.
 
-pub mod bank;
+mod bank;
 #[cfg(test)]
 mod evaluation;
 pub mod imm;
-pub mod noise;
+mod noise;
 pub mod pose_filter;
-pub mod recall;
+mod recall;
 mod smooth;
-pub mod state;
+mod state;
 
 pub use bank::PoseFilterBank;
-pub use pose_filter::{PoseFilter, PoseFilterConfig, PoseFilterCounters, Prediction, Verdict};
+pub use pose_filter::{PoseFilter, PoseFilterConfig, Prediction, Verdict};
 pub use state::{Freshness, PosePrediction, TrackState};
 
 /// Seeded normal deviates for tests.
@@ -25,19 +25,19 @@ mod testing {
 
     /// Normal deviates by Box and Muller over splitmix64.
     #[derive(Clone, Debug)]
-    pub struct Gauss {
+    pub(crate) struct Gauss {
         state: u64,
         spare: Option<f64>,
     }
 
     impl Gauss {
         /// The same seed gives the same deviates on every machine.
-        pub fn new(seed: u64) -> Self {
+        pub(crate) fn new(seed: u64) -> Self {
             Self { state: seed, spare: None }
         }
 
         /// Uniform in (0, 1).
-        pub fn uniform(&mut self) -> f64 {
+        pub(crate) fn uniform(&mut self) -> f64 {
             self.state = self.state.wrapping_add(0x9e37_79b9_7f4a_7c15);
             let mut z = self.state;
             z = (z ^ (z >> 30)).wrapping_mul(0xbf58_476d_1ce4_e5b9);
@@ -46,7 +46,7 @@ mod testing {
         }
 
         /// Standard normal.
-        pub fn normal(&mut self) -> f64 {
+        pub(crate) fn normal(&mut self) -> f64 {
             if let Some(spare) = self.spare.take() {
                 return spare;
             }
@@ -57,7 +57,7 @@ mod testing {
         }
 
         /// Three independent deviates of standard deviation `sigma`.
-        pub fn vector(&mut self, sigma: f64) -> DVec3 {
+        pub(crate) fn vector(&mut self, sigma: f64) -> DVec3 {
             DVec3::new(self.normal(), self.normal(), self.normal()) * sigma
         }
     }

@@ -15,7 +15,7 @@ const CHI2_3_MEDIAN: f64 = 2.365_974;
 
 /// Running estimate of the variance per axis of one sample.
 #[derive(Clone, Debug)]
-pub struct NoiseEstimator<C: Chart> {
+pub(crate) struct NoiseEstimator<C: Chart> {
     points: [Option<(i64, C::Point)>; 3],
     ring: [f64; WINDOW],
     sorted: [f64; WINDOW],
@@ -28,7 +28,7 @@ pub struct NoiseEstimator<C: Chart> {
 impl<C: Chart> NoiseEstimator<C> {
     /// `prior` and `floor` are standard deviations in metres or rad: what is assumed until the window is half full, and the
     /// least that is ever reported.
-    pub fn new(prior: f64, floor: f64) -> Self {
+    pub(crate) fn new(prior: f64, floor: f64) -> Self {
         Self {
             points: [None; 3],
             ring: [0.0; WINDOW],
@@ -41,17 +41,17 @@ impl<C: Chart> NoiseEstimator<C> {
     }
 
     /// Variance per axis, m^2 or rad^2.
-    pub fn variance(&self) -> f64 {
+    pub(crate) fn variance(&self) -> f64 {
         self.variance.max(self.floor)
     }
 
     /// Forgets the last points (not the estimate): the next samples belong to another track.
-    pub fn break_track(&mut self) {
+    pub(crate) fn break_track(&mut self) {
         self.points = [None; 3];
     }
 
     /// Takes in a sample captured at `at_ns`, later than the one before.
-    pub fn push(&mut self, at_ns: i64, z: C::Point) {
+    pub(crate) fn push(&mut self, at_ns: i64, z: C::Point) {
         if let [Some((t0, p0)), Some((t1, p1)), Some((t2, p2))] = self.points {
             // Seconds from the newest, exact in f64 for any gap a track survives.
             let t = [t0, t1, t2].map(|t| (t - at_ns) as f64 * 1e-9);
@@ -94,7 +94,7 @@ mod tests {
     use super::super::imm::{Rotations, Translations};
     use super::super::testing::Gauss;
     use super::*;
-    use dpm_common::se3::so3_exp;
+    use dpm_common::so3::so3_exp;
     use glam::DVec3;
 
     #[test]

@@ -8,13 +8,13 @@ use super::imm::{Imm, ImmConfig, Kinematics, MotionModel, Rotations, Translation
 use super::noise::NoiseEstimator;
 use super::recall::Recall;
 use super::state::{Freshness, PosePrediction, TrackState};
-use dpm_common::se3::so3_between;
+use dpm_common::so3::so3_between;
 use dpm_device::time::HostTime;
 use dpm_device::tracker::TrackerSample;
 use glam::{DQuat, DVec3};
 
 /// Samples that must agree before a track starts or is replaced.
-pub const ACQUIRE_SAMPLES: usize = 3;
+pub(crate) const ACQUIRE_SAMPLES: usize = 3;
 
 /// A quaternion whose norm differs from 1 by more is refused instead of normalised.
 const QUATERNION_TOLERANCE: f64 = 1e-3;
@@ -126,7 +126,8 @@ pub fn models_for(acceleration: f64) -> ImmConfig {
 
 impl PoseFilterConfig {
     /// The same without what a body did the last time ([`super::recall`]): for comparison.
-    pub fn without_recall(mut self) -> Self {
+    #[cfg(test)]
+    pub(crate) fn without_recall(mut self) -> Self {
         // So long after that it never comes.
         self.position_models.recall_after_s = f64::INFINITY;
         self.rotation_models.recall_after_s = f64::INFINITY;

@@ -4,7 +4,7 @@ use super::super::evaluation::{evaluate, EvaluationConfig};
 use super::super::imm::{Covariance, MODES};
 use super::super::testing::Gauss;
 use super::*;
-use dpm_common::se3::so3_exp;
+use dpm_common::so3::so3_exp;
 use dpm_device::pose::Pose;
 use dpm_device::tracker::BodyIndex;
 use hil_mock::motion::MotionSpec;

@@ -59,7 +59,7 @@ struct Point<P> {
 
 /// What one body did in the last seconds, and which part of it it is repeating.
 #[derive(Clone, Debug)]
-pub struct Recall<C: Chart> {
+pub(crate) struct Recall<C: Chart> {
     /// Oldest first; `None` only before the first samples of a track.
     samples: [Option<(i64, C::Point)>; SAMPLES],
     /// A ring: point `i` lies at `i` modulo [`POINTS`].
@@ -78,7 +78,7 @@ pub struct Recall<C: Chart> {
 
 impl<C: Chart> Recall<C> {
     /// Knows nothing. Allocates all that it will ever need (about 0.2 MB).
-    pub fn new() -> Self {
+    pub(crate) fn new() -> Self {
         Self {
             samples: [None; SAMPLES],
             points: vec![None; POINTS].into_boxed_slice(),
@@ -93,18 +93,19 @@ impl<C: Chart> Recall<C> {
     }
 
     /// How long ago the body was where it is now, ns; `None` if it is not known to repeat itself.
-    pub fn lag_ns(&self) -> Option<i64> {
+    #[cfg(test)]
+    pub(crate) fn lag_ns(&self) -> Option<i64> {
         self.lag_ns
     }
 
     /// The next samples belong to another track.
-    pub fn break_track(&mut self) {
+    pub(crate) fn break_track(&mut self) {
         self.samples = [None; SAMPLES];
         self.lag_ns = None;
     }
 
     /// What the body did after `from_ns` and up to `to_ns` the last time.
-    pub fn between(&self, from_ns: i64, to_ns: i64) -> Option<Recalled> {
+    pub(crate) fn between(&self, from_ns: i64, to_ns: i64) -> Option<Recalled> {
         let lag = self.lag_ns?;
         let then_ns = to_ns.saturating_sub(lag);
         let from = self.at(from_ns.saturating_sub(lag))?.motion;
@@ -122,7 +123,7 @@ impl<C: Chart> Recall<C> {
 
     /// Takes in a sample with `sigma` standard deviation per axis, captured after the ones before, and the motion that the bank
     /// makes of it.
-    pub fn push(&mut self, at_ns: i64, z: C::Point, point: C::Point, velocity: DVec3, sigma: f64) {
+    pub(crate) fn push(&mut self, at_ns: i64, z: C::Point, point: C::Point, velocity: DVec3, sigma: f64) {
         let [.., newest] = &self.samples;
         if newest.is_none_or(|(last_ns, _)| at_ns.saturating_sub(last_ns) >= SAMPLE_NS) {
             self.samples.rotate_left(1);

@@ -9,7 +9,7 @@ use super::imm::Chart;
 use glam::{DMat3, DVec3};
 
 /// Time on either side of a point that its windows reach, ns.
-pub const MARGIN_NS: i64 = 80_000_000;
+pub(crate) const MARGIN_NS: i64 = 80_000_000;
 
 /// Time before and after the instant, ms.
 const WINDOWS_MS: [[f64; 2]; 9] = [
@@ -34,7 +34,7 @@ const EXCESS: f64 = 2.0;
 
 /// A motion at one instant.
 #[derive(Clone, Copy, Debug)]
-pub struct Smoothed<P> {
+pub(crate) struct Smoothed<P> {
     /// Position or rotation.
     pub point: P,
     /// Per second, world frame.
@@ -49,7 +49,7 @@ pub struct Smoothed<P> {
 
 /// The motion at sample `middle` of `samples` (in order of time, capture in ns and point) of `sigma` standard deviation per axis, and
 /// its capture. `None` when there are too few of them, or a rotation so fast that its tangents are no vectors.
-pub fn smoothed<C: Chart>(
+pub(crate) fn smoothed<C: Chart>(
     samples: &[Option<(i64, C::Point)>],
     middle: usize,
     sigma: f64,
@@ -148,7 +148,7 @@ mod tests {
     use super::super::imm::{Rotations, Translations};
     use super::super::testing::Gauss;
     use super::*;
-    use dpm_common::se3::{so3_between, so3_exp};
+    use dpm_common::so3::{so3_between, so3_exp};
 
     const MIDDLE: usize = 48;
 

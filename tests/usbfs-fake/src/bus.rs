@@ -233,7 +233,7 @@ impl Device {
     }
 
     /// Writes the selected configuration where libusb reads it.
-    pub fn note_configuration(&self, value: u8) {
+    pub(crate) fn note_configuration(&self, value: u8) {
         lock(&self.state).configuration = value;
         let file = root().join(format!("sys/bus/usb/devices/{}/bConfigurationValue", self.name()));
         let text = if value == 0 { String::new() } else { format!("{value}\n") };
@@ -261,7 +261,7 @@ impl Device {
     }
 
     /// Forgets a closed file and the interfaces it held.
-    pub fn forget(&self, file: u64) {
+    pub(crate) fn forget(&self, file: u64) {
         let mut state = lock(&self.state);
         state.holders.retain(|_, h| *h != Holder::File(file));
         state.files.retain(|f| f.id() != file);

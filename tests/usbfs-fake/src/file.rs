@@ -73,7 +73,7 @@ struct Inner {
 static NEXT_ID: AtomicU64 = AtomicU64::new(1);
 
 impl OpenFile {
-    pub fn open(device: Arc<Device>) -> Result<Arc<Self>, i32> {
+    pub(crate) fn open(device: Arc<Device>) -> Result<Arc<Self>, i32> {
         let mut ends = [0; 2];
         // SAFETY: `ends` has room for the two descriptors.
         if unsafe { libc::pipe2(ends.as_mut_ptr(), libc::O_CLOEXEC | libc::O_NONBLOCK) } != 0 {
@@ -93,11 +93,11 @@ impl OpenFile {
         Ok(Arc::new(file))
     }
 
-    pub fn fd(&self) -> c_int {
+    pub(crate) fn fd(&self) -> c_int {
         self.write_end
     }
 
-    pub fn id(&self) -> u64 {
+    pub(crate) fn id(&self) -> u64 {
         self.id
     }
 
@@ -118,7 +118,7 @@ impl OpenFile {
     }
 
     /// The device is gone: `poll` reports an error from now on.
-    pub fn disconnect(&self) {
+    pub(crate) fn disconnect(&self) {
         let mut inner = lock(&self.inner);
         if inner.read_end >= 0 {
             raw::close(inner.read_end);
@@ -127,7 +127,7 @@ impl OpenFile {
     }
 
     /// Takes every transfer back and waits until none can touch the caller's memory any more.
-    pub fn close(&self) {
+    pub(crate) fn close(&self) {
         let mut inner = lock(&self.inner);
         let running: Vec<_> = inner.running.values().map(|v| v.0).collect();
         drop(inner);
@@ -147,7 +147,7 @@ impl OpenFile {
     ///
     /// # Safety
     /// `argument` is what the kernel's usbfs demands for `number`: libusb's side of the contract.
-    pub unsafe fn ioctl(self: &Arc<Self>, number: u8, argument: *mut c_void) -> Result<c_int, c_int> {
+    pub(crate) unsafe fn ioctl(self: &Arc<Self>, number: u8, argument: *mut c_void) -> Result<c_int, c_int> {
         let gone = lock(&self.device.state).gone;
         if gone && number != 13 {
             return Err(libc::ENODEV);

@@ -20,27 +20,27 @@ pub(crate) mod raw {
         r as c_int
     }
 
-    pub fn open(path: *const c_char, flags: c_int, mode: c_int) -> c_int {
+    pub(crate) fn open(path: *const c_char, flags: c_int, mode: c_int) -> c_int {
         // SAFETY: the kernel checks the path.
         as_int(unsafe { libc::syscall(libc::SYS_openat, libc::AT_FDCWD, path, flags, mode) })
     }
-    pub fn close(fd: c_int) -> c_int {
+    pub(crate) fn close(fd: c_int) -> c_int {
         // SAFETY: closing a descriptor touches no memory of ours.
         as_int(unsafe { libc::syscall(libc::SYS_close, fd) })
     }
-    pub fn ioctl(fd: c_int, request: c_ulong, argument: *mut c_void) -> c_int {
+    pub(crate) fn ioctl(fd: c_int, request: c_ulong, argument: *mut c_void) -> c_int {
         // SAFETY: passed through as the caller gave it.
         as_int(unsafe { libc::syscall(libc::SYS_ioctl, fd, request, argument) })
     }
-    pub fn socket(domain: c_int, kind: c_int, protocol: c_int) -> c_int {
+    pub(crate) fn socket(domain: c_int, kind: c_int, protocol: c_int) -> c_int {
         // SAFETY: plain numbers.
         as_int(unsafe { libc::syscall(libc::SYS_socket, domain, kind, protocol) })
     }
-    pub fn bind(fd: c_int, address: *const libc::sockaddr, length: libc::socklen_t) -> c_int {
+    pub(crate) fn bind(fd: c_int, address: *const libc::sockaddr, length: libc::socklen_t) -> c_int {
         // SAFETY: the kernel checks the address.
         as_int(unsafe { libc::syscall(libc::SYS_bind, fd, address, length) })
     }
-    pub fn recvmsg(fd: c_int, message: *mut libc::msghdr, flags: c_int) -> isize {
+    pub(crate) fn recvmsg(fd: c_int, message: *mut libc::msghdr, flags: c_int) -> isize {
         // SAFETY: passed through as the caller gave it.
         unsafe { libc::syscall(libc::SYS_recvmsg, fd, message, flags) as isize }
     }
@@ -178,25 +178,25 @@ fn open_any(path: *const c_char, flags: c_int, mode: c_int) -> c_int {
 
 /// `open(2)`. The third argument of the C function is variadic; on the targets this runs on it arrives like a plain one.
 #[no_mangle]
-pub extern "C" fn open(path: *const c_char, flags: c_int, mode: c_int) -> c_int {
+pub(crate) extern "C" fn open(path: *const c_char, flags: c_int, mode: c_int) -> c_int {
     open_any(path, flags, mode)
 }
 
 /// `open64(3)`, the same on 64-bit targets.
 #[no_mangle]
-pub extern "C" fn open64(path: *const c_char, flags: c_int, mode: c_int) -> c_int {
+pub(crate) extern "C" fn open64(path: *const c_char, flags: c_int, mode: c_int) -> c_int {
     open_any(path, flags, mode)
 }
 
 /// `open` as fortified programs call it.
 #[no_mangle]
-pub extern "C" fn __open_2(path: *const c_char, flags: c_int) -> c_int {
+pub(crate) extern "C" fn __open_2(path: *const c_char, flags: c_int) -> c_int {
     open_any(path, flags, 0)
 }
 
 /// `open64` as fortified programs call it.
 #[no_mangle]
-pub extern "C" fn __open64_2(path: *const c_char, flags: c_int) -> c_int {
+pub(crate) extern "C" fn __open64_2(path: *const c_char, flags: c_int) -> c_int {
     open_any(path, flags, 0)
 }
 
@@ -216,25 +216,25 @@ fn openat_any(folder: c_int, path: *const c_char, flags: c_int, mode: c_int) -> 
 
 /// `openat(2)`; variadic like `open`.
 #[no_mangle]
-pub extern "C" fn openat(folder: c_int, path: *const c_char, flags: c_int, mode: c_int) -> c_int {
+pub(crate) extern "C" fn openat(folder: c_int, path: *const c_char, flags: c_int, mode: c_int) -> c_int {
     openat_any(folder, path, flags, mode)
 }
 
 /// `openat64(3)`, the same on 64-bit targets.
 #[no_mangle]
-pub extern "C" fn openat64(folder: c_int, path: *const c_char, flags: c_int, mode: c_int) -> c_int {
+pub(crate) extern "C" fn openat64(folder: c_int, path: *const c_char, flags: c_int, mode: c_int) -> c_int {
     openat_any(folder, path, flags, mode)
 }
 
 /// `openat` as fortified programs call it.
 #[no_mangle]
-pub extern "C" fn __openat_2(folder: c_int, path: *const c_char, flags: c_int) -> c_int {
+pub(crate) extern "C" fn __openat_2(folder: c_int, path: *const c_char, flags: c_int) -> c_int {
     openat_any(folder, path, flags, 0)
 }
 
 /// `openat64` as fortified programs call it.
 #[no_mangle]
-pub extern "C" fn __openat64_2(folder: c_int, path: *const c_char, flags: c_int) -> c_int {
+pub(crate) extern "C" fn __openat64_2(folder: c_int, path: *const c_char, flags: c_int) -> c_int {
     openat_any(folder, path, flags, 0)
 }
 
@@ -273,13 +273,13 @@ fn fopen_any(name: &CStr, path: *const c_char, mode: *const c_char) -> *mut libc
 
 /// `fopen(3)`, by which libusb up to 1.0.21 reads sysfs.
 #[no_mangle]
-pub extern "C" fn fopen(path: *const c_char, mode: *const c_char) -> *mut libc::FILE {
+pub(crate) extern "C" fn fopen(path: *const c_char, mode: *const c_char) -> *mut libc::FILE {
     fopen_any(c"fopen", path, mode)
 }
 
 /// `fopen64(3)`, the same on 64-bit targets.
 #[no_mangle]
-pub extern "C" fn fopen64(path: *const c_char, mode: *const c_char) -> *mut libc::FILE {
+pub(crate) extern "C" fn fopen64(path: *const c_char, mode: *const c_char) -> *mut libc::FILE {
     fopen_any(c"fopen64", path, mode)
 }
 
@@ -300,49 +300,49 @@ fn stat_any(path: *const c_char, out: *mut libc::stat, flags: c_int) -> c_int {
 
 /// `stat(2)`.
 #[no_mangle]
-pub extern "C" fn stat(path: *const c_char, out: *mut libc::stat) -> c_int {
+pub(crate) extern "C" fn stat(path: *const c_char, out: *mut libc::stat) -> c_int {
     stat_any(path, out, 0)
 }
 
 /// `stat64(3)`, the same on 64-bit targets.
 #[no_mangle]
-pub extern "C" fn stat64(path: *const c_char, out: *mut libc::stat) -> c_int {
+pub(crate) extern "C" fn stat64(path: *const c_char, out: *mut libc::stat) -> c_int {
     stat_any(path, out, 0)
 }
 
 /// `lstat(2)`.
 #[no_mangle]
-pub extern "C" fn lstat(path: *const c_char, out: *mut libc::stat) -> c_int {
+pub(crate) extern "C" fn lstat(path: *const c_char, out: *mut libc::stat) -> c_int {
     stat_any(path, out, libc::AT_SYMLINK_NOFOLLOW)
 }
 
 /// `lstat64(3)`, the same on 64-bit targets.
 #[no_mangle]
-pub extern "C" fn lstat64(path: *const c_char, out: *mut libc::stat) -> c_int {
+pub(crate) extern "C" fn lstat64(path: *const c_char, out: *mut libc::stat) -> c_int {
     stat_any(path, out, libc::AT_SYMLINK_NOFOLLOW)
 }
 
 /// `stat` as programs built against C libraries before 2.33 call it.
 #[no_mangle]
-pub extern "C" fn __xstat(_version: c_int, path: *const c_char, out: *mut libc::stat) -> c_int {
+pub(crate) extern "C" fn __xstat(_version: c_int, path: *const c_char, out: *mut libc::stat) -> c_int {
     stat_any(path, out, 0)
 }
 
 /// `stat64` as programs built against C libraries before 2.33 call it.
 #[no_mangle]
-pub extern "C" fn __xstat64(_version: c_int, path: *const c_char, out: *mut libc::stat) -> c_int {
+pub(crate) extern "C" fn __xstat64(_version: c_int, path: *const c_char, out: *mut libc::stat) -> c_int {
     stat_any(path, out, 0)
 }
 
 /// `lstat` as programs built against C libraries before 2.33 call it.
 #[no_mangle]
-pub extern "C" fn __lxstat(_version: c_int, path: *const c_char, out: *mut libc::stat) -> c_int {
+pub(crate) extern "C" fn __lxstat(_version: c_int, path: *const c_char, out: *mut libc::stat) -> c_int {
     stat_any(path, out, libc::AT_SYMLINK_NOFOLLOW)
 }
 
 /// `lstat64` as programs built against C libraries before 2.33 call it.
 #[no_mangle]
-pub extern "C" fn __lxstat64(_version: c_int, path: *const c_char, out: *mut libc::stat) -> c_int {
+pub(crate) extern "C" fn __lxstat64(_version: c_int, path: *const c_char, out: *mut libc::stat) -> c_int {
     stat_any(path, out, libc::AT_SYMLINK_NOFOLLOW)
 }
 
@@ -358,13 +358,18 @@ fn readlink_any(folder: c_int, path: *const c_char, out: *mut c_char, length: us
 
 /// `readlink(2)`.
 #[no_mangle]
-pub extern "C" fn readlink(path: *const c_char, out: *mut c_char, length: usize) -> isize {
+pub(crate) extern "C" fn readlink(path: *const c_char, out: *mut c_char, length: usize) -> isize {
     readlink_any(libc::AT_FDCWD, path, out, length)
 }
 
 /// `readlinkat(2)`.
 #[no_mangle]
-pub extern "C" fn readlinkat(folder: c_int, path: *const c_char, out: *mut c_char, length: usize) -> isize {
+pub(crate) extern "C" fn readlinkat(
+    folder: c_int,
+    path: *const c_char,
+    out: *mut c_char,
+    length: usize,
+) -> isize {
     readlink_any(folder, path, out, length)
 }
 
@@ -373,7 +378,7 @@ type Scandir =
 
 /// `scandir(3)`; filter and order are the caller's functions, passed on.
 #[no_mangle]
-pub extern "C" fn scandir(
+pub(crate) extern "C" fn scandir(
     path: *const c_char,
     names: *mut *mut *mut libc::dirent,
     filter: *const c_void,
@@ -393,7 +398,7 @@ pub extern "C" fn scandir(
 
 /// `opendir(3)`.
 #[no_mangle]
-pub extern "C" fn opendir(path: *const c_char) -> *mut libc::DIR {
+pub(crate) extern "C" fn opendir(path: *const c_char) -> *mut libc::DIR {
     let flags = libc::O_RDONLY | libc::O_DIRECTORY | libc::O_CLOEXEC | libc::O_NONBLOCK;
     let fd = match place(path) {
         Place::Redirected(p) => raw::open(p.as_ptr(), flags, 0),
@@ -408,7 +413,7 @@ pub extern "C" fn opendir(path: *const c_char) -> *mut libc::DIR {
 
 /// `access(2)`.
 #[no_mangle]
-pub extern "C" fn access(path: *const c_char, mode: c_int) -> c_int {
+pub(crate) extern "C" fn access(path: *const c_char, mode: c_int) -> c_int {
     let redirected = match place(path) {
         Place::Redirected(p) => Some(p),
         _ => None,
@@ -420,7 +425,7 @@ pub extern "C" fn access(path: *const c_char, mode: c_int) -> c_int {
 
 /// `ioctl(2)`.
 #[no_mangle]
-pub extern "C" fn ioctl(fd: c_int, request: c_ulong, argument: *mut c_void) -> c_int {
+pub(crate) extern "C" fn ioctl(fd: c_int, request: c_ulong, argument: *mut c_void) -> c_int {
     // usbfs numbers its requests with the letter U.
     if !is_ours(fd) || (request >> 8) & 0xff != c_ulong::from(b'U') {
         return raw::ioctl(fd, request, argument);
@@ -432,7 +437,7 @@ pub extern "C" fn ioctl(fd: c_int, request: c_ulong, argument: *mut c_void) -> c
 
 /// `close(2)`.
 #[no_mangle]
-pub extern "C" fn close(fd: c_int) -> c_int {
+pub(crate) extern "C" fn close(fd: c_int) -> c_int {
     if is_ours(fd) {
         OURS[fd as usize].store(false, Ordering::Release);
         let file = lock(&FILES).remove(&fd);
@@ -450,7 +455,7 @@ pub extern "C" fn close(fd: c_int) -> c_int {
 
 /// `socket(2)`: a uevent socket becomes one end of a socket pair.
 #[no_mangle]
-pub extern "C" fn socket(domain: c_int, kind: c_int, protocol: c_int) -> c_int {
+pub(crate) extern "C" fn socket(domain: c_int, kind: c_int, protocol: c_int) -> c_int {
     if domain != libc::AF_NETLINK || protocol != libc::NETLINK_KOBJECT_UEVENT {
         return raw::socket(domain, kind, protocol);
     }
@@ -467,7 +472,7 @@ pub extern "C" fn socket(domain: c_int, kind: c_int, protocol: c_int) -> c_int {
 
 /// `bind(2)`: the uevent socket needs none.
 #[no_mangle]
-pub extern "C" fn bind(fd: c_int, address: *const libc::sockaddr, length: libc::socklen_t) -> c_int {
+pub(crate) extern "C" fn bind(fd: c_int, address: *const libc::sockaddr, length: libc::socklen_t) -> c_int {
     if fd >= 0 && EVENT_FD.load(Ordering::Acquire) == fd {
         return 0;
     }
@@ -476,7 +481,7 @@ pub extern "C" fn bind(fd: c_int, address: *const libc::sockaddr, length: libc::
 
 /// `recvmsg(2)`: on the uevent socket the message comes from the kernel, user 0.
 #[no_mangle]
-pub extern "C" fn recvmsg(fd: c_int, message: *mut libc::msghdr, flags: c_int) -> isize {
+pub(crate) extern "C" fn recvmsg(fd: c_int, message: *mut libc::msghdr, flags: c_int) -> isize {
     if fd < 0 || EVENT_FD.load(Ordering::Acquire) != fd || message.is_null() {
         return raw::recvmsg(fd, message, flags);
     }
@@ -530,13 +535,13 @@ fn statfs_any(path: *const c_char, out: *mut libc::statfs) -> c_int {
 
 /// `statfs(2)`.
 #[no_mangle]
-pub extern "C" fn statfs(path: *const c_char, out: *mut libc::statfs) -> c_int {
+pub(crate) extern "C" fn statfs(path: *const c_char, out: *mut libc::statfs) -> c_int {
     statfs_any(path, out)
 }
 
 /// `statfs64(3)`, the same on 64-bit targets.
 #[no_mangle]
-pub extern "C" fn statfs64(path: *const c_char, out: *mut libc::statfs) -> c_int {
+pub(crate) extern "C" fn statfs64(path: *const c_char, out: *mut libc::statfs) -> c_int {
     statfs_any(path, out)
 }
 

@@ -8,25 +8,25 @@ use std::ptr::{null, null_mut};
 use crate::{bus, hooks};
 
 /// A USB device as libudev tells it.
-pub struct Device {
+pub(crate) struct Device {
     node: CString,
     name: CString,
     action: CString,
 }
 
 /// One name of a list, and the next.
-pub struct Entry {
+pub(crate) struct Entry {
     name: CString,
     next: *const Entry,
 }
 
 /// A list of devices, made by a scan.
-pub struct Enumerate {
+pub(crate) struct Enumerate {
     entries: Vec<Entry>,
 }
 
 /// The descriptor that hot-plug events arrive on.
-pub struct Monitor {
+pub(crate) struct Monitor {
     fd: c_int,
 }
 
@@ -68,20 +68,20 @@ fn device(name: &str, bus: u8, address: u8, action: &str) -> *mut Device {
 
 /// `udev_new(3)`: there is one library; a context needs no state.
 #[no_mangle]
-pub extern "C" fn udev_new() -> *mut c_void {
+pub(crate) extern "C" fn udev_new() -> *mut c_void {
     crate::remote::attach_from_environment();
     std::ptr::NonNull::<u64>::dangling().as_ptr().cast()
 }
 
 /// `udev_unref(3)`.
 #[no_mangle]
-pub extern "C" fn udev_unref(_: *mut c_void) -> *mut c_void {
+pub(crate) extern "C" fn udev_unref(_: *mut c_void) -> *mut c_void {
     null_mut()
 }
 
 /// `udev_enumerate_new(3)`.
 #[no_mangle]
-pub extern "C" fn udev_enumerate_new(_: *mut c_void) -> *mut Enumerate {
+pub(crate) extern "C" fn udev_enumerate_new(_: *mut c_void) -> *mut Enumerate {
     Box::into_raw(Box::new(Enumerate { entries: Vec::new() }))
 }
 
@@ -90,7 +90,7 @@ pub extern "C" fn udev_enumerate_new(_: *mut c_void) -> *mut Enumerate {
 /// # Safety
 /// `list` is from [`udev_enumerate_new`] and is not used again.
 #[no_mangle]
-pub unsafe extern "C" fn udev_enumerate_unref(list: *mut Enumerate) -> *mut Enumerate {
+pub(crate) unsafe extern "C" fn udev_enumerate_unref(list: *mut Enumerate) -> *mut Enumerate {
     if !list.is_null() {
         // SAFETY: by contract.
         drop(unsafe { Box::from_raw(list) });
@@ -100,13 +100,13 @@ pub unsafe extern "C" fn udev_enumerate_unref(list: *mut Enumerate) -> *mut Enum
 
 /// `udev_enumerate_add_match_subsystem(3)`: there is only USB here.
 #[no_mangle]
-pub extern "C" fn udev_enumerate_add_match_subsystem(_: *mut Enumerate, _: *const c_char) -> c_int {
+pub(crate) extern "C" fn udev_enumerate_add_match_subsystem(_: *mut Enumerate, _: *const c_char) -> c_int {
     0
 }
 
 /// `udev_enumerate_add_match_property(3)`: there are only whole devices here.
 #[no_mangle]
-pub extern "C" fn udev_enumerate_add_match_property(
+pub(crate) extern "C" fn udev_enumerate_add_match_property(
     _: *mut Enumerate,
     _: *const c_char,
     _: *const c_char,
@@ -119,7 +119,7 @@ pub extern "C" fn udev_enumerate_add_match_property(
 /// # Safety
 /// `list` is from [`udev_enumerate_new`]; entries of an earlier scan are not used again.
 #[no_mangle]
-pub unsafe extern "C" fn udev_enumerate_scan_devices(list: *mut Enumerate) -> c_int {
+pub(crate) unsafe extern "C" fn udev_enumerate_scan_devices(list: *mut Enumerate) -> c_int {
     let names = bus::device_names();
     // SAFETY: by contract.
     let entries = unsafe { &mut (*list).entries };
@@ -138,7 +138,7 @@ pub unsafe extern "C" fn udev_enumerate_scan_devices(list: *mut Enumerate) -> c_
 /// # Safety
 /// `list` is from [`udev_enumerate_new`].
 #[no_mangle]
-pub unsafe extern "C" fn udev_enumerate_get_list_entry(list: *mut Enumerate) -> *const Entry {
+pub(crate) unsafe extern "C" fn udev_enumerate_get_list_entry(list: *mut Enumerate) -> *const Entry {
     // SAFETY: by contract.
     unsafe { (*list).entries.first().map_or(null(), std::ptr::from_ref) }
 }
@@ -148,7 +148,7 @@ pub unsafe extern "C" fn udev_enumerate_get_list_entry(list: *mut Enumerate) -> 
 /// # Safety
 /// `entry` belongs to a list that is still there.
 #[no_mangle]
-pub unsafe extern "C" fn udev_list_entry_get_next(entry: *const Entry) -> *const Entry {
+pub(crate) unsafe extern "C" fn udev_list_entry_get_next(entry: *const Entry) -> *const Entry {
     // SAFETY: by contract.
     unsafe { entry.as_ref().map_or(null(), |e| e.next) }
 }
@@ -158,7 +158,7 @@ pub unsafe extern "C" fn udev_list_entry_get_next(entry: *const Entry) -> *const
 /// # Safety
 /// As [`udev_list_entry_get_next`].
 #[no_mangle]
-pub unsafe extern "C" fn udev_list_entry_get_name(entry: *const Entry) -> *const c_char {
+pub(crate) unsafe extern "C" fn udev_list_entry_get_name(entry: *const Entry) -> *const c_char {
     // SAFETY: by contract.
     unsafe { entry.as_ref().map_or(null(), |e| e.name.as_ptr()) }
 }
@@ -168,7 +168,10 @@ pub unsafe extern "C" fn udev_list_entry_get_name(entry: *const Entry) -> *const
 /// # Safety
 /// `path` is a C string.
 #[no_mangle]
-pub unsafe extern "C" fn udev_device_new_from_syspath(_: *mut c_void, path: *const c_char) -> *mut Device {
+pub(crate) unsafe extern "C" fn udev_device_new_from_syspath(
+    _: *mut c_void,
+    path: *const c_char,
+) -> *mut Device {
     // SAFETY: by contract.
     let path = unsafe { CStr::from_ptr(path) }.to_string_lossy();
     let Some(name) = path.strip_prefix(DEVICES) else { return null_mut() };
@@ -180,7 +183,7 @@ pub unsafe extern "C" fn udev_device_new_from_syspath(_: *mut c_void, path: *con
 /// # Safety
 /// `device` is from a function here and is not used again.
 #[no_mangle]
-pub unsafe extern "C" fn udev_device_unref(device: *mut Device) -> *mut Device {
+pub(crate) unsafe extern "C" fn udev_device_unref(device: *mut Device) -> *mut Device {
     if !device.is_null() {
         // SAFETY: by contract.
         drop(unsafe { Box::from_raw(device) });
@@ -193,7 +196,7 @@ pub unsafe extern "C" fn udev_device_unref(device: *mut Device) -> *mut Device {
 /// # Safety
 /// `device` is from a function here.
 #[no_mangle]
-pub unsafe extern "C" fn udev_device_get_devnode(device: *const Device) -> *const c_char {
+pub(crate) unsafe extern "C" fn udev_device_get_devnode(device: *const Device) -> *const c_char {
     // SAFETY: by contract.
     unsafe { (*device).node.as_ptr() }
 }
@@ -203,7 +206,7 @@ pub unsafe extern "C" fn udev_device_get_devnode(device: *const Device) -> *cons
 /// # Safety
 /// `device` is from a function here.
 #[no_mangle]
-pub unsafe extern "C" fn udev_device_get_sysname(device: *const Device) -> *const c_char {
+pub(crate) unsafe extern "C" fn udev_device_get_sysname(device: *const Device) -> *const c_char {
     // SAFETY: by contract.
     unsafe { (*device).name.as_ptr() }
 }
@@ -213,14 +216,14 @@ pub unsafe extern "C" fn udev_device_get_sysname(device: *const Device) -> *cons
 /// # Safety
 /// `device` is from a function here.
 #[no_mangle]
-pub unsafe extern "C" fn udev_device_get_action(device: *const Device) -> *const c_char {
+pub(crate) unsafe extern "C" fn udev_device_get_action(device: *const Device) -> *const c_char {
     // SAFETY: by contract.
     unsafe { (*device).action.as_ptr() }
 }
 
 /// `udev_monitor_new_from_netlink(3)`.
 #[no_mangle]
-pub extern "C" fn udev_monitor_new_from_netlink(_: *mut c_void, _: *const c_char) -> *mut Monitor {
+pub(crate) extern "C" fn udev_monitor_new_from_netlink(_: *mut c_void, _: *const c_char) -> *mut Monitor {
     let kind = libc::SOCK_DGRAM | libc::SOCK_NONBLOCK | libc::SOCK_CLOEXEC;
     match hooks::socket(libc::AF_NETLINK, kind, libc::NETLINK_KOBJECT_UEVENT) {
         fd if fd < 0 => null_mut(),
@@ -233,7 +236,7 @@ pub extern "C" fn udev_monitor_new_from_netlink(_: *mut c_void, _: *const c_char
 /// # Safety
 /// `monitor` is from [`udev_monitor_new_from_netlink`] and is not used again.
 #[no_mangle]
-pub unsafe extern "C" fn udev_monitor_unref(monitor: *mut Monitor) -> *mut Monitor {
+pub(crate) unsafe extern "C" fn udev_monitor_unref(monitor: *mut Monitor) -> *mut Monitor {
     if !monitor.is_null() {
         // SAFETY: by contract.
         let monitor = unsafe { Box::from_raw(monitor) };
@@ -244,7 +247,7 @@ pub unsafe extern "C" fn udev_monitor_unref(monitor: *mut Monitor) -> *mut Monit
 
 /// `udev_monitor_filter_add_match_subsystem_devtype(3)`: only USB devices are told of here.
 #[no_mangle]
-pub extern "C" fn udev_monitor_filter_add_match_subsystem_devtype(
+pub(crate) extern "C" fn udev_monitor_filter_add_match_subsystem_devtype(
     _: *mut Monitor,
     _: *const c_char,
     _: *const c_char,
@@ -254,7 +257,7 @@ pub extern "C" fn udev_monitor_filter_add_match_subsystem_devtype(
 
 /// `udev_monitor_enable_receiving(3)`.
 #[no_mangle]
-pub extern "C" fn udev_monitor_enable_receiving(_: *mut Monitor) -> c_int {
+pub(crate) extern "C" fn udev_monitor_enable_receiving(_: *mut Monitor) -> c_int {
     0
 }
 
@@ -263,7 +266,7 @@ pub extern "C" fn udev_monitor_enable_receiving(_: *mut Monitor) -> c_int {
 /// # Safety
 /// `monitor` is from [`udev_monitor_new_from_netlink`].
 #[no_mangle]
-pub unsafe extern "C" fn udev_monitor_get_fd(monitor: *mut Monitor) -> c_int {
+pub(crate) unsafe extern "C" fn udev_monitor_get_fd(monitor: *mut Monitor) -> c_int {
     // SAFETY: by contract.
     unsafe { (*monitor).fd }
 }
@@ -273,7 +276,7 @@ pub unsafe extern "C" fn udev_monitor_get_fd(monitor: *mut Monitor) -> c_int {
 /// # Safety
 /// `monitor` is from [`udev_monitor_new_from_netlink`].
 #[no_mangle]
-pub unsafe extern "C" fn udev_monitor_receive_device(monitor: *mut Monitor) -> *mut Device {
+pub(crate) unsafe extern "C" fn udev_monitor_receive_device(monitor: *mut Monitor) -> *mut Device {
     let mut message = [0u8; 1024];
     // SAFETY: by contract; the buffer is as long as said.
     let n =

@@ -12,7 +12,7 @@ pub(crate) const LOADER_DATA_CALLBACK: c_int = 1;
 
 /// `VkNegotiateLayerInterface`.
 #[repr(C)]
-pub struct NegotiateInterface {
+pub(crate) struct NegotiateInterface {
     s_type: c_int,
     p_next: *mut c_void,
     version: u32,
@@ -83,7 +83,7 @@ pub(crate) unsafe fn find_in_chain(
 /// Called by the loader with a valid structure.
 #[no_mangle]
 #[allow(non_snake_case)]
-pub unsafe extern "system" fn vkNegotiateLoaderLayerInterfaceVersion(
+pub(crate) unsafe extern "system" fn vkNegotiateLoaderLayerInterfaceVersion(
     interface: *mut NegotiateInterface,
 ) -> vk::Result {
     // SAFETY: see above; null is checked.
@@ -126,7 +126,7 @@ pub(crate) fn read_monotonic_clock(t: &mut libc::timespec) {
 /// # Safety
 /// `text` is a C string.
 #[no_mangle]
-pub unsafe extern "C" fn dpm_vk_faults_set(text: *const c_char) -> c_int {
+pub(crate) unsafe extern "C" fn dpm_vk_faults_set(text: *const c_char) -> c_int {
     // SAFETY: see above.
     let text = unsafe { CStr::from_ptr(text) }.to_string_lossy();
     if crate::state::replace(&text) {
@@ -141,7 +141,7 @@ pub unsafe extern "C" fn dpm_vk_faults_set(text: *const c_char) -> c_int {
 /// # Safety
 /// `word` is a C string.
 #[no_mangle]
-pub unsafe extern "C" fn dpm_vk_faults_count(word: *const c_char) -> u64 {
+pub(crate) unsafe extern "C" fn dpm_vk_faults_count(word: *const c_char) -> u64 {
     // SAFETY: see above.
     let word = unsafe { CStr::from_ptr(word) }.to_string_lossy();
     crate::state::count(&word).unwrap_or(u64::MAX)

@@ -62,7 +62,7 @@ impl PacketSink for Inbox {
 }
 
 impl Inbox {
-    pub const fn new() -> Self {
+    pub(super) const fn new() -> Self {
         Self {
             arrived_at: HostTime(i64::MIN),
             session: 0,
@@ -80,7 +80,7 @@ impl Inbox {
     }
 
     /// Forgets the old session and listens to `session`.
-    pub fn open(&mut self, session: u32) {
+    pub(super) fn open(&mut self, session: u32) {
         let (ignored, damaged) = (self.ignored, self.damaged);
         *self = Self { session, ignored, damaged, ..Self::new() };
     }

@@ -30,26 +30,26 @@ pub(super) struct LightCount {
 }
 
 impl LightCount {
-    pub fn new(rate: FrameRate, limits: &LightLimits) -> Self {
+    pub(super) fn new(rate: FrameRate, limits: &LightLimits) -> Self {
         Self { limiter: LightLimiter::ahead(rate, limits, OBEYED_WITHIN_MS), slot: None, level: 0, over: 0 }
     }
 
-    pub fn is_off(&self) -> bool {
+    pub(super) fn is_off(&self) -> bool {
         self.limiter.is_none()
     }
 
     /// The device is dark until a frame is sent.
-    pub fn is_dark(&mut self) {
+    pub(super) fn is_dark(&mut self) {
         self.level = 0;
     }
 
     /// Slots are counted anew, from the dark. What was lit before still counts, as if no time had passed.
-    pub fn new_session(&mut self) {
+    pub(super) fn new_session(&mut self) {
         (self.slot, self.level) = (None, 0);
     }
 
     /// A frame is to be sent for the slot that `target_at` lies in; the limit that its light would exceed.
-    pub fn slot(
+    pub(super) fn slot(
         &mut self,
         clock: &SlotClock,
         [target_at, dark_from]: [DeviceTicks; 2],

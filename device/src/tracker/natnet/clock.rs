@@ -27,7 +27,7 @@ pub(super) struct ServerClock {
 }
 
 impl ServerClock {
-    pub fn new() -> Self {
+    pub(super) fn new() -> Self {
         Self {
             hz: 0,
             map: None,
@@ -41,22 +41,22 @@ impl ServerClock {
     }
 
     /// The map, once an echo was answered.
-    pub fn map(&self) -> Option<&ClockMap> {
+    pub(super) fn map(&self) -> Option<&ClockMap> {
         self.map.as_ref().filter(|m| m.is_ready())
     }
 
     /// Echoes answered.
-    pub fn answered(&self) -> u64 {
+    pub(super) fn answered(&self) -> u64 {
         self.answered
     }
 
     /// How often the stamps of a frame contradicted the map.
-    pub fn doubts(&self) -> u64 {
+    pub(super) fn doubts(&self) -> u64 {
         self.doubts
     }
 
     /// The server told the rate of its clock; 0 means that it has none.
-    pub fn set_rate(&mut self, hz: u64, at: HostTime) {
+    pub(super) fn set_rate(&mut self, hz: u64, at: HostTime) {
         if hz != self.hz || self.map.is_none() {
             self.hz = hz;
             self.restart(at);
@@ -64,7 +64,7 @@ impl ServerClock {
     }
 
     /// The server is gone: what comes back may be another.
-    pub fn forget(&mut self) {
+    pub(super) fn forget(&mut self) {
         self.hz = 0;
         self.map = None;
     }
@@ -76,12 +76,12 @@ impl ServerClock {
     }
 
     /// True when an echo request is to be sent at `now`; [`ServerClock::note_sent`] must follow.
-    pub fn is_due(&self, now: HostTime) -> bool {
+    pub(super) fn is_due(&self, now: HostTime) -> bool {
         self.map.is_some() && now >= self.due
     }
 
     /// An echo request stamped `t1` is under way.
-    pub fn note_sent(&mut self, t1: HostTime) {
+    pub(super) fn note_sent(&mut self, t1: HostTime) {
         let quick = self.sent < QUICK_PROBES;
         self.due = t1.plus_ns(if quick { QUICK_PROBE_EVERY_NS } else { PROBE_EVERY_NS });
         self.sent = self.sent.saturating_add(1);
@@ -91,7 +91,7 @@ impl ServerClock {
 
     /// Takes in an answer; false when it answers no question of ours, or answers one again: an old or invented answer must not
     /// move the clock.
-    pub fn on_echo(&mut self, stamp: u64, ticks: u64, at: HostTime) -> bool {
+    pub(super) fn on_echo(&mut self, stamp: u64, ticks: u64, at: HostTime) -> bool {
         let t1 = stamp as i64;
         let Some(slot) = self.under_way.iter_mut().find(|s| **s == Some(t1)) else {
             return false;
@@ -111,7 +111,7 @@ impl ServerClock {
 
     /// Middle of the exposure of a frame that arrived `at`: through the map where there is one, otherwise arrival less the server's
     /// own latency, which leaves out only the way through the network.
-    pub fn captured_at(&mut self, info: &FrameInfo, at: HostTime) -> HostTime {
+    pub(super) fn captured_at(&mut self, info: &FrameInfo, at: HostTime) -> HostTime {
         let has_stamps = info.mid_exposure != 0 && info.transmit >= info.mid_exposure && self.hz > 0;
         if !has_stamps {
             return at;

@@ -17,12 +17,12 @@ pub struct BodyModel {
 
 /// Kinds of definitions.
 mod kind {
-    pub const MARKER_SET: i32 = 0;
-    pub const RIGID_BODY: i32 = 1;
-    pub const SKELETON: i32 = 2;
-    pub const FORCE_PLATE: i32 = 3;
-    pub const DEVICE: i32 = 4;
-    pub const CAMERA: i32 = 5;
+    pub(super) const MARKER_SET: i32 = 0;
+    pub(super) const RIGID_BODY: i32 = 1;
+    pub(super) const SKELETON: i32 = 2;
+    pub(super) const FORCE_PLATE: i32 = 3;
+    pub(super) const DEVICE: i32 = 4;
+    pub(super) const CAMERA: i32 = 5;
 }
 
 /// The rigid bodies that a model-definition payload of `version` names, in its order. Later ones with a number that was already

@@ -54,11 +54,11 @@ pub enum SerialMessage {
 }
 
 mod kind {
-    pub const POSE: u8 = 0x01;
-    pub const HELLO: u8 = 0x02;
-    pub const ECHO_REQUEST: u8 = 0x10;
-    pub const ECHO_RESPONSE: u8 = 0x11;
-    pub const HELLO_REQUEST: u8 = 0x12;
+    pub(super) const POSE: u8 = 0x01;
+    pub(super) const HELLO: u8 = 0x02;
+    pub(super) const ECHO_REQUEST: u8 = 0x10;
+    pub(super) const ECHO_RESPONSE: u8 = 0x11;
+    pub(super) const HELLO_REQUEST: u8 = 0x12;
 }
 
 /// Why a packet is none of the stream's.

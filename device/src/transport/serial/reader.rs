@@ -43,7 +43,7 @@ pub(super) struct Reader {
 
 impl Reader {
     /// Reads from a second handle on `port`. `None` when the system has no handle or thread to give: then the caller reads by itself.
-    pub fn start(port: &dyn SerialPort, clock: SharedClock) -> Option<Self> {
+    pub(super) fn start(port: &dyn SerialPort, clock: SharedClock) -> Option<Self> {
         let mut line = port.try_clone().ok()?;
         line.set_timeout(PATIENCE).ok()?;
         let (into, chunks) = ring(CHUNKS);
@@ -59,7 +59,7 @@ impl Reader {
 
     /// Hands on what has arrived, with the instant of its arrival, or `now` where there is no clock. Returns the bytes handed on,
     /// or `None` when the line has ended and everything was handed on before.
-    pub fn take(&mut self, now: HostTime, sink: &mut dyn FnMut(HostTime, &[u8])) -> Option<usize> {
+    pub(super) fn take(&mut self, now: HostTime, sink: &mut dyn FnMut(HostTime, &[u8])) -> Option<usize> {
         if let Some(thread) = &self.thread {
             self.follower.follow(now, thread);
         }

@@ -25,7 +25,7 @@ pub(super) struct Events {
 
 impl Events {
     /// Handles the events of `context` from now on. `None` when the system has no thread to give: then the caller must.
-    pub fn start(context: &Context) -> Option<Self> {
+    pub(super) fn start(context: &Context) -> Option<Self> {
         let stop = Arc::new(AtomicBool::new(false));
         let (stopped, ours) = (stop.clone(), context.clone());
         let run = move || {
@@ -40,7 +40,7 @@ impl Events {
     }
 
     /// Lets the thread run as the calling thread does.
-    pub fn follow(&mut self, now: HostTime) {
+    pub(super) fn follow(&mut self, now: HostTime) {
         if let Some(thread) = &self.thread {
             self.follower.follow(now, thread);
         }

@@ -125,7 +125,7 @@ fn result(rc: i32) -> Result<(), rusb::Error> {
 
 impl Ring {
     /// `count` transfers of up to `bytes` on `endpoint` (bit 7 set: IN). All memory is allocated here.
-    pub fn new(
+    pub(super) fn new(
         handle: Arc<DeviceHandle<Context>>,
         endpoint: u8,
         count: usize,
@@ -159,12 +159,12 @@ impl Ring {
     }
 
     /// Slots that are not in flight.
-    pub fn idle_slots(&self) -> usize {
+    pub(super) fn idle_slots(&self) -> usize {
         self.slots.len() - self.order.len()
     }
 
     /// A slot that is not in flight.
-    pub fn idle_slot(&self) -> Option<usize> {
+    pub(super) fn idle_slot(&self) -> Option<usize> {
         self.slots.iter().position(|s| !s.in_flight)
     }
 
@@ -172,7 +172,7 @@ impl Ring {
     ///
     /// # Panics
     /// When the slot is in flight: its buffer belongs to the kernel.
-    pub fn buffer(&mut self, slot: usize) -> &mut [u8] {
+    pub(super) fn buffer(&mut self, slot: usize) -> &mut [u8] {
         assert!(!self.slots[slot].in_flight, "slot {slot} is in flight");
         &mut self.slots[slot].buffer
     }
@@ -181,7 +181,7 @@ impl Ring {
     ///
     /// # Panics
     /// When the slot is in flight or its buffer shorter.
-    pub fn submit(&mut self, slot: usize, len: usize) -> Result<(), rusb::Error> {
+    pub(super) fn submit(&mut self, slot: usize, len: usize) -> Result<(), rusb::Error> {
         let s = &mut self.slots[slot];
         assert!(!s.in_flight && len <= s.buffer.len(), "slot {slot}: in flight, or {len} bytes too many");
         s.mark.at.store(NO_TIME, Ordering::Relaxed);
@@ -208,7 +208,7 @@ impl Ring {
     }
 
     /// The oldest transfer, if it has ended. Its slot is idle from here on.
-    pub fn take_ended(&mut self) -> Option<Ended> {
+    pub(super) fn take_ended(&mut self) -> Option<Ended> {
         let slot = *self.order.front()?;
         let s = &mut self.slots[slot];
         if !s.mark.ended.load(Ordering::Acquire) {
@@ -235,7 +235,7 @@ impl Ring {
     }
 
     /// Asks for every transfer in flight back. They end later, through [`Ring::take_ended`].
-    pub fn cancel_all(&mut self) {
+    pub(super) fn cancel_all(&mut self) {
         for &slot in &self.order {
             let s = &self.slots[slot];
             if !s.mark.ended.load(Ordering::Acquire) {
@@ -247,7 +247,7 @@ impl Ring {
     }
 
     /// Transfers in flight.
-    pub fn in_flight(&self) -> usize {
+    pub(super) fn in_flight(&self) -> usize {
         self.order.len()
     }
 }

@@ -13,7 +13,7 @@ use std::path::PathBuf;
 
 /// Flags of `dpm bench`.
 #[derive(clap::Args, Clone, Debug)]
-pub struct BenchArgs {
+pub(crate) struct BenchArgs {
     /// The rig file; the demo's when left out
     #[arg(value_name = "RIG.toml")]
     rig: Option<PathBuf>,
@@ -53,7 +53,7 @@ fn lines(c: &MethodCost) -> String {
 ///
 /// # Errors
 /// Bad rig or flags, no GPU.
-pub fn execute(args: &BenchArgs) -> Result<(), Failure> {
+pub(super) fn execute(args: &BenchArgs) -> Result<(), Failure> {
     args.flags.refuse("dpm bench", &["--frames", "--seconds", "--no-prediction"])?;
     let config = args.flags.rig_at_rest(args.rig.as_deref())?;
     check_out(args.flags.out.as_deref())?;

@@ -25,7 +25,7 @@ const GUARD_STEP: Duration = Duration::from_millis(5);
 
 /// Flags of `dpm dlpc900`.
 #[derive(clap::Args, Clone, Debug)]
-pub struct Dlpc900Args {
+pub(crate) struct Dlpc900Args {
     /// Which controller, as BUS:ADDRESS of lsusb; needed when several are plugged in
     #[arg(long, value_name = "BUS:ADDRESS", global = true)]
     device: Option<UsbPlace>,
@@ -199,7 +199,7 @@ fn open(args: &Dlpc900Args) -> Result<Dlpc900<UsbHid>, Failure> {
 /// # Errors
 /// [`FailureKind::Device`] when the controller cannot be reached or refuses; [`FailureKind::BadInput`] when pictures or times
 /// break a rule, with the LUT entry and the rule.
-pub fn execute(args: &Dlpc900Args) -> Result<(), Failure> {
+pub(super) fn execute(args: &Dlpc900Args) -> Result<(), Failure> {
     if let Action::Guard = args.action {
         return guard(args.device);
     }

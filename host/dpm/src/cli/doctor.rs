@@ -10,7 +10,7 @@ use std::path::PathBuf;
 
 /// Flags of `dpm doctor`.
 #[derive(clap::Args, Clone, Debug)]
-pub struct DoctorArgs {
+pub(crate) struct DoctorArgs {
     /// Print one JSON object
     #[arg(long)]
     json: bool,
@@ -19,7 +19,7 @@ pub struct DoctorArgs {
 /// How bad a finding is.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, serde::Serialize)]
 #[serde(rename_all = "lowercase")]
-pub enum State {
+pub(super) enum State {
     /// As it should be.
     Ok,
     /// Works, with a price.
@@ -32,7 +32,7 @@ pub enum State {
 
 /// One finding.
 #[derive(Clone, Debug, serde::Serialize)]
-pub struct Finding {
+pub(crate) struct Finding {
     /// What was looked at.
     pub name: String,
     /// How it is.
@@ -51,7 +51,7 @@ impl Finding {
 
 /// Everything that was found.
 #[derive(Debug, serde::Serialize)]
-pub struct Findings {
+pub(super) struct Findings {
     /// True when the main job can run: a Vulkan device is there.
     pub can_render: bool,
     /// Findings in the order in which a frame meets them.
@@ -62,7 +62,7 @@ pub struct Findings {
 ///
 /// # Errors
 /// [`FailureKind::NoGpu`] when there is no usable Vulkan device; everything else that is missing is only said.
-pub fn execute(args: &DoctorArgs) -> Result<(), Failure> {
+pub(super) fn execute(args: &DoctorArgs) -> Result<(), Failure> {
     let system = System { root: PathBuf::from("/") };
     let mut findings = Vec::new();
     let can_render = vulkan(&mut findings);

@@ -25,7 +25,7 @@ use std::sync::Arc;
 /// Flags of `dpm error`.
 #[derive(clap::Args, Clone, Debug)]
 #[command(args_conflicts_with_subcommands = true, subcommand_negates_reqs = true)]
-pub struct ErrorArgs {
+pub(crate) struct ErrorArgs {
     #[command(subcommand)]
     merge: Option<ErrorCommand>,
     /// The rig file
@@ -100,7 +100,7 @@ enum ErrorCommand {
 ///
 /// # Errors
 /// Bad rig or flags, no GPU, a folder that cannot be written.
-pub fn execute(args: &ErrorArgs) -> Result<(), Failure> {
+pub(super) fn execute(args: &ErrorArgs) -> Result<(), Failure> {
     if let Some(ErrorCommand::Merge { out, json }) = &args.merge {
         return merge(out, *json);
     }

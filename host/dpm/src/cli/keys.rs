@@ -2,7 +2,7 @@
 #![allow(unsafe_code)]
 
 /// The terminal at the standard input, reading single keys without echo; as it was before when dropped. Signals stay signals.
-pub struct Keys {
+pub(super) struct Keys {
     before: libc::termios,
 }
 
@@ -14,7 +14,7 @@ fn is_in_foreground() -> bool {
 
 impl Keys {
     /// `None` when the standard input is no terminal, or not this process's.
-    pub fn new() -> Option<Self> {
+    pub(super) fn new() -> Option<Self> {
         if !is_in_foreground() {
             return None;
         }
@@ -33,7 +33,7 @@ impl Keys {
     }
 
     /// The keys pressed since the last call, at most 16; never waits.
-    pub fn pressed(&mut self) -> impl Iterator<Item = u8> {
+    pub(super) fn pressed(&mut self) -> impl Iterator<Item = u8> {
         let mut keys = [0u8; 16];
         let mut n = 0;
         if is_in_foreground() {

@@ -17,7 +17,7 @@ use std::path::PathBuf;
 
 /// Flags of `dpm link-test`.
 #[derive(clap::Args, Clone, Debug)]
-pub struct LinkTestArgs {
+pub(crate) struct LinkTestArgs {
     /// The rig file
     #[arg(value_name = "RIG.toml")]
     rig: PathBuf,
@@ -51,7 +51,7 @@ pub struct LinkTestArgs {
 ///
 /// # Errors
 /// Bad rig or flags, no GPU, no projector.
-pub fn execute(args: &LinkTestArgs) -> Result<(), Failure> {
+pub(super) fn execute(args: &LinkTestArgs) -> Result<(), Failure> {
     args.flags.refuse("dpm link-test", &["--frames", "--seconds", "--no-prediction", "--out"])?;
     let config = args.flags.rig_at_rest(Some(&args.rig))?;
     let _locks = take_locks(&config)?;

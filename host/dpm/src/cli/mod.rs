@@ -1,27 +1,27 @@
 //! Words into calls: the command line of `dpm`. One file per command, no logic of its own.
 
-pub mod bench;
-pub mod dlpc900;
-pub mod doctor;
-pub mod error;
+mod bench;
+mod dlpc900;
+mod doctor;
+mod error;
 mod error_figure3;
 mod error_files;
 mod error_table;
-pub mod keys;
-pub mod link_test;
-pub mod order;
-pub mod os;
-pub mod plan;
-pub mod profile;
+mod keys;
+mod link_test;
+mod order;
+mod os;
+mod plan;
+mod profile;
 mod progress;
-pub mod record;
-pub mod rig_args;
+mod record;
+mod rig_args;
 pub mod run;
 pub mod signals;
-pub mod snapshot;
-pub mod stability;
+mod snapshot;
+mod stability;
 mod tell;
-pub mod watch;
+mod watch;
 
 use clap::{ColorChoice, CommandFactory, FromArgMatches, Parser, Subcommand};
 use dpm_rig::failure::Failure;

@@ -8,7 +8,7 @@ use dpm_rig::telemetry::monitor::Order;
 
 /// Flags of the four commands.
 #[derive(clap::Args, Clone, Debug)]
-pub struct OrderArgs {
+pub(crate) struct OrderArgs {
     /// Process of the rig; needed for freeze and arm when several run
     #[arg(long, value_name = "N")]
     pid: Option<u32>,
@@ -18,7 +18,7 @@ pub struct OrderArgs {
 ///
 /// # Errors
 /// No rig runs, several do, or a projector has not confirmed that it obeyed (exit code 3).
-pub fn execute(args: &OrderArgs, order: Order) -> Result<(), Failure> {
+pub(super) fn execute(args: &OrderArgs, order: Order) -> Result<(), Failure> {
     let device = |e: &dyn std::fmt::Display| Failure::new(FailureKind::Device, e);
     let told = tell(args.pid, order).map_err(|e| device(&e))?;
     let mut text: String = told.answers.iter().map(line).collect();

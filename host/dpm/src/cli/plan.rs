@@ -10,7 +10,7 @@ use std::path::PathBuf;
 
 /// Flags of `dpm plan`.
 #[derive(clap::Args, Clone, Debug)]
-pub struct PlanArgs {
+pub(crate) struct PlanArgs {
     /// The rig file; the built-in demo when left out
     #[arg(value_name = "RIG.toml")]
     rig: Option<PathBuf>,
@@ -49,7 +49,7 @@ fn saved(s: &Saving) -> String {
 ///
 /// # Errors
 /// Bad rig file or scene; with `--measure` no GPU, or pixels that differ.
-pub fn execute(args: &PlanArgs) -> Result<(), Failure> {
+pub(super) fn execute(args: &PlanArgs) -> Result<(), Failure> {
     args.flags.refuse("dpm plan", &["--frames", "--seconds", "--no-prediction"])?;
     let rig = args.flags.rig_at_rest(args.rig.as_deref())?;
     check_out(args.flags.out.as_deref())?;

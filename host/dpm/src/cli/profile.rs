@@ -19,7 +19,7 @@ const MAX_PROFILE_BYTES: u64 = 64 << 20;
 
 /// Flags of `dpm profile`.
 #[derive(clap::Args, Clone, Debug)]
-pub struct ProfileArgs {
+pub(crate) struct ProfileArgs {
     /// The rig file; the demo's rig without one
     #[arg(value_name = "RIG.toml")]
     rig: Option<PathBuf>,
@@ -44,7 +44,7 @@ pub struct ProfileArgs {
 ///
 /// # Errors
 /// Bad rig file, scene, address or profile; a device that fails; torn frames; a comparison whose gates got worse.
-pub fn execute(args: &ProfileArgs) -> Result<(), Failure> {
+pub(super) fn execute(args: &ProfileArgs) -> Result<(), Failure> {
     if let [before, after] = args.compare.as_slice() {
         let (rows, notes) = compare(&read(before)?, &read(after)?);
         print(&to_table(&rows, &notes));

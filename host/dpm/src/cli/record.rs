@@ -19,7 +19,7 @@ const SAY_EVERY_NS: i64 = 1_000_000_000;
 
 /// Flags of `dpm record`.
 #[derive(clap::Args, Clone, Debug)]
-pub struct RecordArgs {
+pub(crate) struct RecordArgs {
     /// The new file; one that is there already is not overwritten
     #[arg(value_name = "OUT")]
     out: PathBuf,
@@ -44,7 +44,7 @@ fn seconds(text: &str) -> Result<f64, String> {
 /// # Errors
 /// Exit code 2: a bad rig file, an output that cannot be made. 3: the file could not be written to its end (what was written before can be
 /// played), or the tracker failed or delivered nothing, with its own word on why.
-pub fn execute(args: &RecordArgs) -> Result<(), Failure> {
+pub(super) fn execute(args: &RecordArgs) -> Result<(), Failure> {
     let config = RigArgs { set: args.set.clone(), ..RigArgs::default() }.rig(Some(&args.rig))?;
     let rig = Rig::build(&config, None)?;
     signals::install()

@@ -7,7 +7,7 @@ use std::path::{Path, PathBuf};
 
 /// Flags over the rig file. Each is a short form of `--set`.
 #[derive(clap::Args, Clone, Debug, Default)]
-pub struct RigArgs {
+pub(crate) struct RigArgs {
     /// glTF 2.0 file (.glb or .gltf) to show in place of the rig's scene
     #[arg(long, value_name = "FILE")]
     pub scene: Option<PathBuf>,
@@ -83,7 +83,7 @@ impl RigArgs {
     ///
     /// # Errors
     /// One of them is given.
-    pub fn refuse(&self, command: &str, meaningless: &[&str]) -> Result<(), Failure> {
+    pub(super) fn refuse(&self, command: &str, meaningless: &[&str]) -> Result<(), Failure> {
         let given = [
             ("--frames", self.frames.is_some()),
             ("--seconds", self.seconds.is_some()),
@@ -105,7 +105,7 @@ impl RigArgs {
     ///
     /// # Errors
     /// Every mistake in file, environment and flags.
-    pub fn rig(&self, path: Option<&Path>) -> Result<RigConfig, Failure> {
+    pub(super) fn rig(&self, path: Option<&Path>) -> Result<RigConfig, Failure> {
         self.rig_for(path, false)
     }
 
@@ -113,7 +113,7 @@ impl RigArgs {
     ///
     /// # Errors
     /// As [`RigArgs::rig`].
-    pub fn rig_at_rest(&self, path: Option<&Path>) -> Result<RigConfig, Failure> {
+    pub(crate) fn rig_at_rest(&self, path: Option<&Path>) -> Result<RigConfig, Failure> {
         self.rig_for(path, true)
     }
 

@@ -25,7 +25,7 @@ pub struct RunArgs {
 
 /// Flags of `dpm demo`.
 #[derive(clap::Args, Clone, Debug)]
-pub struct DemoArgs {
+pub(crate) struct DemoArgs {
     #[command(flatten)]
     flags: RigArgs,
     /// Print the report as one JSON object
@@ -45,7 +45,7 @@ pub fn execute(args: &RunArgs) -> Result<(), Failure> {
 ///
 /// # Errors
 /// Bad flags, scene or device.
-pub fn execute_demo(args: &DemoArgs) -> Result<(), Failure> {
+pub(crate) fn execute_demo(args: &DemoArgs) -> Result<(), Failure> {
     start(None, &args.flags, args.json)
 }
 

@@ -9,7 +9,7 @@ use std::path::PathBuf;
 
 /// Flags of `dpm snapshot`.
 #[derive(clap::Args, Clone, Debug)]
-pub struct SnapshotArgs {
+pub(crate) struct SnapshotArgs {
     /// The rig file; the built-in demo when left out
     #[arg(value_name = "RIG.toml")]
     rig: Option<PathBuf>,
@@ -30,7 +30,7 @@ pub struct SnapshotArgs {
 ///
 /// # Errors
 /// Bad rig file or scene, no GPU.
-pub fn execute(args: &SnapshotArgs) -> Result<(), Failure> {
+pub(super) fn execute(args: &SnapshotArgs) -> Result<(), Failure> {
     args.flags.refuse("dpm snapshot", &["--frames", "--seconds", "--no-prediction"])?;
     let rig = args.flags.rig_at_rest(args.rig.as_deref())?;
     let dir = args.flags.out.clone().unwrap_or_else(|| rig.output.dir.join("snapshot"));

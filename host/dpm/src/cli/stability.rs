@@ -8,7 +8,7 @@ use dpm_rig::telemetry::report::to_json;
 
 /// Flags of `dpm stability`.
 #[derive(clap::Args, Clone, Debug)]
-pub struct StabilityArgs {
+pub(crate) struct StabilityArgs {
     /// Only cases whose name contains this
     #[arg(long, value_name = "NAME")]
     only: Option<String>,
@@ -34,7 +34,7 @@ fn line(c: &CaseResult) -> String {
 }
 
 /// Runs the cases; a failed one makes the command fail.
-pub fn execute(args: &StabilityArgs) -> Result<(), Failure> {
+pub(super) fn execute(args: &StabilityArgs) -> Result<(), Failure> {
     let mut all = cases();
     let device = gpu::open();
     all.extend(gpu::cases(&device));

@@ -39,7 +39,7 @@ const DARK_WITHIN: Duration = Duration::from_millis(500);
 ///
 /// # Errors
 /// As [`watch`]; a run that lit nothing, after its report.
-pub fn run_and_report(
+pub(crate) fn run_and_report(
     rig: RigConfig,
     json: bool,
     run: impl FnOnce(&RigConfig, &Arc<RunMonitor>) -> Result<Ended<Report>, Failure> + Send + 'static,
@@ -78,7 +78,7 @@ pub(super) fn check_out(out: Option<&Path>) -> Result<(), Failure> {
 ///
 /// # Errors
 /// What `run` returns; a device or output folder that another instance uses; a panic in the run.
-pub fn watch<T: Send + 'static>(
+pub(super) fn watch<T: Send + 'static>(
     rig: RigConfig,
     show: impl Fn(&RunCounts),
     run: impl FnOnce(&RigConfig, &Arc<RunMonitor>) -> Result<T, Failure> + Send + 'static,
@@ -243,7 +243,7 @@ fn listen(
 }
 
 /// Writes to the standard output; a reader that has gone away (`dpm ... | head`) is no error.
-pub fn print(text: &str) {
+pub(super) fn print(text: &str) {
     let mut out = std::io::stdout().lock();
     let _ = out.write_all(text.as_bytes()).and_then(|()| out.flush());
 }

@@ -9,16 +9,16 @@ use std::sync::mpsc::{channel, Receiver};
 use std::time::{Duration, Instant};
 
 /// No Vulkan driver, whatever the machine has.
-pub const NO_DRIVER: [(&str, &str); 2] =
+pub(crate) const NO_DRIVER: [(&str, &str); 2] =
     [("VK_ICD_FILENAMES", "/nonexistent.json"), ("VK_DRIVER_FILES", "/nonexistent.json")];
 
 /// A folder of this test program's own for locks, sockets and standing orders of the programs that it starts.
-pub fn own_folder(name: &str) -> PathBuf {
+pub(crate) fn own_folder(name: &str) -> PathBuf {
     PathBuf::from(env!("CARGO_TARGET_TMPDIR")).join(format!("dpm-{}", std::process::id())).join(name)
 }
 
 /// The program with arguments, in an environment without settings of ours. What this machine's own rigs keep is none of its business.
-pub fn command<S: AsRef<OsStr>>(args: &[S]) -> Command {
+pub(crate) fn command<S: AsRef<OsStr>>(args: &[S]) -> Command {
     let mut command = Command::new(env!("CARGO_BIN_EXE_dpm"));
     command.args(args).env_remove("NO_COLOR").stdin(Stdio::null());
     command.env("DPM_RUNTIME_DIR", own_folder("run")).env("DPM_STATE_DIR", own_folder("state"));
@@ -31,38 +31,38 @@ pub fn command<S: AsRef<OsStr>>(args: &[S]) -> Command {
 }
 
 /// Runs the program to its end.
-pub fn dpm(args: &[&str], variables: &[(&str, &str)]) -> Output {
+pub(crate) fn dpm(args: &[&str], variables: &[(&str, &str)]) -> Output {
     command(args).envs(variables.iter().copied()).output().expect("the program starts")
 }
 
 /// Its exit code.
-pub fn code(output: &Output) -> i32 {
+pub(crate) fn code(output: &Output) -> i32 {
     output.status.code().expect("not ended by a signal")
 }
 
 /// Its standard output.
-pub fn out(output: &Output) -> String {
+pub(crate) fn out(output: &Output) -> String {
     String::from_utf8_lossy(&output.stdout).into_owned()
 }
 
 /// Its standard error stream.
-pub fn err(output: &Output) -> String {
+pub(crate) fn err(output: &Output) -> String {
     String::from_utf8_lossy(&output.stderr).into_owned()
 }
 
 /// A program that runs beside the test; killed when the test ends early.
-pub struct Running {
+pub(crate) struct Running {
     child: Child,
     lines: Receiver<String>,
 }
 
 /// Starts the program and goes on.
-pub fn start<S: AsRef<OsStr>>(args: &[S]) -> Running {
+pub(crate) fn start<S: AsRef<OsStr>>(args: &[S]) -> Running {
     start_with(args, &[])
 }
 
 /// Starts the program with more variables in its environment, and goes on.
-pub fn start_with<S: AsRef<OsStr>>(args: &[S], variables: &[(&str, &str)]) -> Running {
+pub(crate) fn start_with<S: AsRef<OsStr>>(args: &[S], variables: &[(&str, &str)]) -> Running {
     let mut command = command(args);
     command.envs(variables.iter().copied()).stdout(Stdio::piped()).stderr(Stdio::piped());
     let mut child = command.spawn().expect("the program starts");
@@ -80,12 +80,12 @@ pub fn start_with<S: AsRef<OsStr>>(args: &[S], variables: &[(&str, &str)]) -> Ru
 
 impl Running {
     /// Process number.
-    pub fn id(&self) -> u32 {
+    pub(crate) fn id(&self) -> u32 {
         self.child.id()
     }
 
     /// Reads the standard error stream until a line is `wanted`.
-    pub fn wait_for_line(&mut self, limit: Duration, wanted: impl Fn(&str) -> bool) {
+    pub(crate) fn wait_for_line(&mut self, limit: Duration, wanted: impl Fn(&str) -> bool) {
         let end = Instant::now() + limit;
         loop {
             let left = end.saturating_duration_since(Instant::now());
@@ -98,7 +98,7 @@ impl Running {
     }
 
     /// The lines of the standard error stream up to its end.
-    pub fn rest_of_lines(&mut self, limit: Duration) -> Vec<String> {
+    pub(crate) fn rest_of_lines(&mut self, limit: Duration) -> Vec<String> {
         let end = Instant::now() + limit;
         let mut all = Vec::new();
         while let Ok(line) = self.lines.recv_timeout(end.saturating_duration_since(Instant::now())) {
@@ -108,19 +108,19 @@ impl Running {
     }
 
     /// Sends a signal by its name.
-    pub fn signal(&self, name: &str) {
+    pub(crate) fn signal(&self, name: &str) {
         // The shell's own: a bare system has no program of that name.
         let status = Command::new("sh").args(["-c", &format!("kill -s {name} {}", self.id())]).status();
         assert!(status.expect("a shell starts").success());
     }
 
     /// Its end, where that has come.
-    pub fn try_wait(&mut self) -> Option<ExitStatus> {
+    pub(crate) fn try_wait(&mut self) -> Option<ExitStatus> {
         self.child.try_wait().expect("our own child")
     }
 
     /// Waits for the end; gives status and standard output.
-    pub fn finish(mut self) -> (ExitStatus, String) {
+    pub(crate) fn finish(mut self) -> (ExitStatus, String) {
         let mut text = String::new();
         let mut stdout = self.child.stdout.take().expect("piped");
         stdout.read_to_string(&mut text).expect("UTF-8");
@@ -136,11 +136,11 @@ impl Drop for Running {
 }
 
 /// A folder that goes when the test is over.
-pub struct Folder(PathBuf, String);
+pub(crate) struct Folder(PathBuf, String);
 
 impl Folder {
     /// An empty folder.
-    pub fn new(name: &str) -> Self {
+    pub(crate) fn new(name: &str) -> Self {
         let path = std::env::temp_dir().join(format!("dpm-cli-{}-{name}", std::process::id()));
         let _ = std::fs::remove_dir_all(&path);
         std::fs::create_dir_all(&path).expect("the temporary folder can be written");
@@ -149,17 +149,17 @@ impl Folder {
     }
 
     /// Its path, for an argument.
-    pub fn text(&self) -> &str {
+    pub(crate) fn text(&self) -> &str {
         &self.1
     }
 
     /// A path in it.
-    pub fn path(&self, name: &str) -> PathBuf {
+    pub(crate) fn path(&self, name: &str) -> PathBuf {
         self.0.join(name)
     }
 
     /// Writes a file; gives its path.
-    pub fn write(&self, name: &str, text: &str) -> String {
+    pub(crate) fn write(&self, name: &str, text: &str) -> String {
         let path = self.path(name);
         std::fs::write(&path, text).expect("the temporary folder can be written");
         path.display().to_string()

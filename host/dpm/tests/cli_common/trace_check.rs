@@ -11,7 +11,7 @@ type Slice = (f64, f64, String, Option<u64>);
 
 /// Where a flow touches a slice.
 #[derive(Clone, Debug)]
-pub struct Point {
+pub(crate) struct Point {
     /// "s", "t" or "f".
     pub phase: String,
     /// The frame's own slice there.
@@ -24,7 +24,7 @@ pub struct Point {
 ///
 /// # Panics
 /// Where the trace breaks a rule of the format, or a flow touches the slice of another frame.
-pub fn check(text: &str) -> BTreeMap<u64, Vec<Point>> {
+pub(crate) fn check(text: &str) -> BTreeMap<u64, Vec<Point>> {
     let events: Vec<Value> = serde_json::from_str(text).expect("valid JSON");
     let number = |e: &Value, key: &str| e[key].as_f64().unwrap_or_else(|| panic!("{key} missing in {e}"));
     let track = |e: &Value| (number(e, "pid") as u64, number(e, "tid") as u64);
@@ -81,7 +81,7 @@ pub fn check(text: &str) -> BTreeMap<u64, Vec<Point>> {
 ///
 /// # Panics
 /// Where one does not.
-pub fn every_frame_can_be_followed(flows: &BTreeMap<u64, Vec<Point>>) {
+pub(crate) fn every_frame_can_be_followed(flows: &BTreeMap<u64, Vec<Point>>) {
     for (id, points) in flows {
         let names: Vec<&str> = points.iter().map(|p| p.slice.as_str()).collect();
         assert_eq!(names, ["sample", "latch and submit", "render", "pack", "send", "light"], "frame {id}");

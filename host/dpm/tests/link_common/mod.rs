@@ -20,12 +20,12 @@ use std::thread::JoinHandle;
 use std::time::{Duration, Instant};
 
 /// The panel.
-pub fn raster() -> Raster {
+pub(crate) fn raster() -> Raster {
     Raster::new(64, 32).unwrap()
 }
 
 /// The rig on `backend` (a TOML table), 8 planes at 100 frames a second.
-pub fn rig(backend: &str, more: &[&str]) -> Arc<Rig> {
+pub(crate) fn rig(backend: &str, more: &[&str]) -> Arc<Rig> {
     let mut flags = vec![
         "real_time.pace=\"real\"".to_owned(),
         "projector.frame_rate=100".into(),
@@ -40,7 +40,7 @@ pub fn rig(backend: &str, more: &[&str]) -> Arc<Rig> {
 
 /// Waits until `done`, at most 20 s, and gives the time that counts against a deadline: a sleep of a millisecond that took longer than two
 /// is time that a shared machine gave to others.
-pub fn served_time(what: &str, mut done: impl FnMut() -> bool) -> Duration {
+pub(crate) fn served_time(what: &str, mut done: impl FnMut() -> bool) -> Duration {
     let (start, mut counted) = (Instant::now(), Duration::ZERO);
     while !done() {
         assert!(start.elapsed() < Duration::from_secs(20), "{what}");
@@ -52,7 +52,7 @@ pub fn served_time(what: &str, mut done: impl FnMut() -> bool) -> Duration {
 }
 
 /// A projector that can be looked at while it works.
-pub trait Projector: Send + Sync {
+pub(crate) trait Projector: Send + Sync {
     /// Lets it live up to now and looks at it.
     fn look(&self, see: &mut dyn FnMut(&mut MockProjector));
 
@@ -92,18 +92,18 @@ pub trait Projector: Send + Sync {
 }
 
 /// A run on a thread of its own. It ends with the test.
-pub struct Running {
+pub(crate) struct Running {
     pub monitor: Arc<RunMonitor>,
     thread: Option<JoinHandle<Result<RunOutcome, PipelineError>>>,
 }
 
 /// Starts `rig` for `frames` frames; 0 until it is stopped.
-pub fn start(rig: &Arc<Rig>, frames: u64) -> Running {
+pub(crate) fn start(rig: &Arc<Rig>, frames: u64) -> Running {
     start_with(rig, frames, |_| {})
 }
 
 /// As [`start`], with a monitor that `prepare` has seen before the run.
-pub fn start_with(rig: &Arc<Rig>, frames: u64, prepare: impl FnOnce(&RunMonitor)) -> Running {
+pub(crate) fn start_with(rig: &Arc<Rig>, frames: u64, prepare: impl FnOnce(&RunMonitor)) -> Running {
     let monitor = Arc::new(RunMonitor::default());
     prepare(&monitor);
     let (rig, watched) = (rig.clone(), monitor.clone());
@@ -114,12 +114,12 @@ pub fn start_with(rig: &Arc<Rig>, frames: u64, prepare: impl FnOnce(&RunMonitor)
 
 impl Running {
     /// Waits for the end.
-    pub fn end(mut self) -> Result<RunOutcome, PipelineError> {
+    pub(crate) fn end(mut self) -> Result<RunOutcome, PipelineError> {
         self.thread.take().expect("taken once").join().expect("no panic")
     }
 
     /// Asks it to end, as a signal does.
-    pub fn stop(self) -> Result<RunOutcome, PipelineError> {
+    pub(crate) fn stop(self) -> Result<RunOutcome, PipelineError> {
         self.monitor.request_stop();
         self.end()
     }
@@ -135,7 +135,7 @@ impl Drop for Running {
 }
 
 /// A projector behind a pseudo-terminal whose path stays the same when it is plugged in again.
-pub struct PtyProjector {
+pub(crate) struct PtyProjector {
     pub path: PathBuf,
     device: Arc<Mutex<SerialProjector>>,
     start: Instant,
@@ -144,7 +144,7 @@ pub struct PtyProjector {
 
 impl PtyProjector {
     /// Plugs in a projector of `setup`.
-    pub fn new(name: &str, setup: MockConfig) -> Self {
+    pub(crate) fn new(name: &str, setup: MockConfig) -> Self {
         let path = std::env::temp_dir().join(format!("dpm-run-{name}-{}", std::process::id()));
         let device = Arc::new(Mutex::new(SerialProjector::new(MockProjector::new(setup))));
         let this = Self { path, device, start: Instant::now(), served: Mutex::new(None) };
@@ -153,7 +153,7 @@ impl PtyProjector {
     }
 
     /// The backend of a rig file on it.
-    pub fn backend(&self, more: &str) -> String {
+    pub(crate) fn backend(&self, more: &str) -> String {
         format!(
             "{{ kind = \"serial\", port = {:?}, baud = 3000000 {more} }}",
             self.path.display().to_string()
@@ -161,7 +161,7 @@ impl PtyProjector {
     }
 
     /// Pulls the plug. The projector keeps its power, and its light until the watchdog.
-    pub fn unplug(&self) {
+    pub(crate) fn unplug(&self) {
         if let Some((stop, thread)) = self.served.lock().unwrap().take() {
             stop.store(true, Ordering::Relaxed);
             thread.join().unwrap();
@@ -170,12 +170,12 @@ impl PtyProjector {
     }
 
     /// Puts another projector there while it is unplugged.
-    pub fn exchange(&self, setup: MockConfig) {
+    pub(crate) fn exchange(&self, setup: MockConfig) {
         *self.device.lock().unwrap() = SerialProjector::new(MockProjector::new(setup));
     }
 
     /// Plugs it in again.
-    pub fn plug_in(&self) {
+    pub(crate) fn plug_in(&self) {
         let (master, slave) = TTYPort::pair().expect("a pseudo-terminal");
         let mut master = dpm_device::tty::never_wait(master).unwrap();
         let theirs = slave.name().unwrap();

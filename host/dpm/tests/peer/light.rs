@@ -5,12 +5,12 @@ use super::{Arriving, Config, Mode, Peer, Whole, BUFFERS, HEIGHT, HZ, PLANE, WID
 use std::collections::VecDeque;
 
 impl Config {
-    pub fn start(&self, slot: u64) -> u64 {
+    pub(super) fn start(&self, slot: u64) -> u64 {
         let ticks = u128::from(slot) * u128::from(HZ) * u128::from(self.den) / u128::from(self.num);
         self.epoch + ticks as u64
     }
 
-    pub fn slot_at(&self, tick: u64) -> Option<u64> {
+    pub(super) fn slot_at(&self, tick: u64) -> Option<u64> {
         let d = tick.checked_sub(self.epoch)?;
         let k = (u128::from(d) + 1) * u128::from(self.num) - 1;
         Some((k / (u128::from(HZ) * u128::from(self.den))) as u64)
@@ -19,7 +19,7 @@ impl Config {
 
 /// Flashes, slot by slot.
 #[derive(Default)]
-pub struct Flash {
+pub(super) struct Flash {
     extreme: f64,
     rising: Option<bool>,
     changes: VecDeque<u64>,
@@ -51,7 +51,7 @@ impl Flash {
 
 /// Limits on light, slot by slot.
 #[derive(Default)]
-pub struct Level {
+pub(super) struct Level {
     mean: Option<(f64, usize)>,
     white: Option<u64>,
     rests: [u64; 2],
@@ -62,7 +62,7 @@ pub struct Level {
 }
 
 impl Level {
-    pub fn configure(&mut self, num: u64, den: u64, [mean, window, white]: [u64; 3]) {
+    pub(super) fn configure(&mut self, num: u64, den: u64, [mean, window, white]: [u64; 3]) {
         let slots = |ms: u64| (ms * num / (1000 * den)).max(1);
         *self = Self::default();
         if mean > 0 {

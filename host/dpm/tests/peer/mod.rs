@@ -82,7 +82,7 @@ struct Counts {
 }
 
 /// The projector.
-pub struct Peer {
+pub(crate) struct Peer {
     fault: String,
     start: Instant,
     codecs: u32,
@@ -116,7 +116,7 @@ pub struct Peer {
 }
 
 /// A peer on a pseudo-terminal, until it is dropped.
-pub struct Served {
+pub(crate) struct Served {
     pub path: String,
     stop: Arc<AtomicBool>,
     thread: Option<std::thread::JoinHandle<()>>,
@@ -125,7 +125,7 @@ pub struct Served {
 
 impl Served {
     /// `fault`: the rule to break; "" for none.
-    pub fn new(fault: &str) -> Self {
+    pub(crate) fn new(fault: &str) -> Self {
         let (mut ours, theirs) = TTYPort::pair().expect("a pseudo-terminal");
         let path = theirs.name().expect("its path");
         // Held open, so that our end does not hang up between clients, but not claimed.

@@ -1,7 +1,7 @@
 //! Bytes: checksums, stuffing, packets, codecs. Written from docs/PROTOCOL.md, with nothing of this project's own code.
 
 /// CRC-32C, bit by bit.
-pub fn crc(bytes: &[u8]) -> u32 {
+pub(super) fn crc(bytes: &[u8]) -> u32 {
     let mut c = u32::MAX;
     for &b in bytes {
         c ^= u32::from(b);
@@ -12,20 +12,20 @@ pub fn crc(bytes: &[u8]) -> u32 {
     !c
 }
 
-pub fn u16_at(b: &[u8], at: usize) -> u16 {
+pub(super) fn u16_at(b: &[u8], at: usize) -> u16 {
     u16::from_le_bytes([b[at], b[at + 1]])
 }
 
-pub fn u32_at(b: &[u8], at: usize) -> u32 {
+pub(super) fn u32_at(b: &[u8], at: usize) -> u32 {
     u32::from_le_bytes(b[at..at + 4].try_into().unwrap())
 }
 
-pub fn u64_at(b: &[u8], at: usize) -> u64 {
+pub(super) fn u64_at(b: &[u8], at: usize) -> u64 {
     u64::from_le_bytes(b[at..at + 8].try_into().unwrap())
 }
 
 /// A packet of the device as a frame of the line.
-pub fn packet(kind: u8, session: u32, payload: &[u8], spoil: bool) -> Vec<u8> {
+pub(super) fn packet(kind: u8, session: u32, payload: &[u8], spoil: bool) -> Vec<u8> {
     let mut p = b"DPML\x02".to_vec();
     p.extend([kind, 0, 0]);
     p.extend(session.to_le_bytes());
@@ -64,7 +64,7 @@ fn stuffed(bytes: &[u8]) -> Vec<u8> {
 }
 
 /// The bytes between two zeros of the line without their stuffing.
-pub fn unstuffed(mut frame: &[u8]) -> Option<Vec<u8>> {
+pub(super) fn unstuffed(mut frame: &[u8]) -> Option<Vec<u8>> {
     let mut out = Vec::new();
     while let Some((&code, rest)) = frame.split_first() {
         let n = usize::from(code) - 1;
@@ -81,7 +81,7 @@ pub fn unstuffed(mut frame: &[u8]) -> Option<Vec<u8>> {
 }
 
 /// RLE of section 8. `long`: what 127 adds to its count (128, unless the device is to be wrong).
-pub fn rle(mut b: &[u8], long: usize) -> Option<Vec<u8>> {
+pub(super) fn rle(mut b: &[u8], long: usize) -> Option<Vec<u8>> {
     let mut out = Vec::new();
     while let Some((&t, rest)) = b.split_first() {
         let (literal, n, head) = match t {
@@ -103,7 +103,7 @@ pub fn rle(mut b: &[u8], long: usize) -> Option<Vec<u8>> {
 }
 
 /// One LZ4 block.
-pub fn lz4(b: &[u8]) -> Option<Vec<u8>> {
+pub(super) fn lz4(b: &[u8]) -> Option<Vec<u8>> {
     let mut out: Vec<u8> = Vec::new();
     let mut at = 0;
     let count = |at: &mut usize, first: usize| -> Option<usize> {

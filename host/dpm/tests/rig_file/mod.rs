@@ -7,16 +7,16 @@ use hil_mock::projector::MockConfig;
 use std::time::Duration;
 
 /// The watchdog that the rig asks of its projector.
-pub const WATCHDOG: Duration = Duration::from_millis(250);
+pub(crate) const WATCHDOG: Duration = Duration::from_millis(250);
 
 /// Words that run the rig file `path` with frames made ahead: real pace and all threads, no GPU. Its files go beside the rig file.
-pub fn run_words(path: &str) -> Vec<String> {
+pub(crate) fn run_words(path: &str) -> Vec<String> {
     let out = path.trim_end_matches("rig.toml").to_owned() + "out";
     ["profile", path, "--no-render", "--seconds", "1000", "--out", &out].map(str::to_owned).into()
 }
 
 /// A rig file for the projector, and the projector.
-pub fn rig(name: &str) -> (Folder, String, PtyProjector) {
+pub(crate) fn rig(name: &str) -> (Folder, String, PtyProjector) {
     let folder = Folder::new(name);
     let far = PtyProjector::new(name, MockConfig::new(raster()));
     let text = format!(

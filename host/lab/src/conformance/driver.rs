@@ -15,14 +15,14 @@ use std::collections::VecDeque;
 use std::time::Duration;
 
 /// What a rule and its steps return.
-pub type R<T = ()> = Result<T, Stop>;
+pub(super) type R<T = ()> = Result<T, Stop>;
 
 /// Longest wait for an answer that is due at once, on a medium that takes no time.
 const ANSWER_NS: i64 = 400_000_000;
 /// While a rule waits, the device hears of the host this often.
 const FEED_NS: i64 = 60_000_000;
 /// Watchdog of the rules that are not about it: this machine may be busy for a while.
-pub const WATCHDOG_US: u32 = 2_000_000;
+pub(super) const WATCHDOG_US: u32 = 2_000_000;
 
 /// What the device's packets arrive on.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -51,7 +51,7 @@ pub struct Medium<'a> {
 
 /// A message of the device, and when it arrived.
 #[derive(Clone, Copy, Debug)]
-pub struct Heard {
+pub(super) struct Heard {
     /// Host's clock.
     pub at: HostTime,
     /// Session field of its header.
@@ -100,7 +100,7 @@ impl PacketSink for Inbox {
 }
 
 /// The driver.
-pub struct Bench<'a> {
+pub(super) struct Bench<'a> {
     pub medium: Medium<'a>,
     decoders: [Decoder; 2],
     inbox: Inbox,
@@ -129,7 +129,7 @@ pub struct Bench<'a> {
 
 impl<'a> Bench<'a> {
     /// Nothing is sent yet.
-    pub fn new(medium: Medium<'a>) -> Self {
+    pub(super) fn new(medium: Medium<'a>) -> Self {
         let now = (medium.clock)();
         Self {
             medium,
@@ -153,7 +153,7 @@ impl<'a> Bench<'a> {
     }
 
     /// STOP, for whoever listens; a device that is gone is dark by itself.
-    pub fn darken(&mut self) {
+    pub(super) fn darken(&mut self) {
         for _ in 0..3 {
             let _ = self.say(&HostMessage::Stop);
             let _ = self.rest();
@@ -161,12 +161,12 @@ impl<'a> Bench<'a> {
     }
 
     /// The laws that hold over all of it.
-    pub fn laws(&self) -> &Laws {
+    pub(super) fn laws(&self) -> &Laws {
         &self.inbox.laws
     }
 
     /// Bytes on the way back that were no intact packets: damaged headers, damaged payloads, foreign packets, bytes outside.
-    pub fn noise(&self) -> [u32; 4] {
+    pub(super) fn noise(&self) -> [u32; 4] {
         let mut all = [0; 4];
         for c in self.decoders.iter().map(Decoder::counters) {
             for (sum, n) in
@@ -178,24 +178,24 @@ impl<'a> Bench<'a> {
         all
     }
 
-    pub fn now(&self) -> HostTime {
+    pub(super) fn now(&self) -> HostTime {
         (self.medium.clock)()
     }
 
     /// Time that `bytes` take on the medium, ns.
-    pub fn carry_ns(&self, bytes: usize) -> i64 {
+    pub(crate) fn carry_ns(&self, bytes: usize) -> i64 {
         self.medium.bytes_per_s.map_or(0, |rate| (bytes as i64 * 1_000_000_000) / i64::from(rate.max(1)))
     }
 
     /// How long an answer to a short message may take.
-    pub fn answer_ns(&self) -> i64 {
+    pub(crate) fn answer_ns(&self) -> i64 {
         ANSWER_NS + self.carry_ns(2000)
     }
 
     // --- sending ---
 
     /// Sends packets as they are; waits while the medium has no room.
-    pub fn send_packets(&mut self, lane: Lane, packets: &[Packet<'_>]) -> R {
+    pub(crate) fn send_packets(&mut self, lane: Lane, packets: &[Packet<'_>]) -> R {
         let bytes: usize = packets.iter().map(Packet::wire_bytes).sum();
         let limit = self.now().plus_ns(2_000_000_000 + 2 * self.carry_ns(bytes + 4096));
         loop {
@@ -220,7 +220,7 @@ impl<'a> Bench<'a> {
     }
 
     /// A control message of `session`.
-    pub fn say_as(&mut self, session: u32, message: &HostMessage) -> R {
+    pub(crate) fn say_as(&mut self, session: u32, message: &HostMessage) -> R {
         let mut payload = [0u8; MAX_CONTROL_BYTES];
         let (kind, n) = message.write(&mut payload);
         let lane = if kind == MessageType::Sync { Lane::Data } else { Lane::Control };
@@ -229,19 +229,19 @@ impl<'a> Bench<'a> {
     }
 
     /// A control message of this session.
-    pub fn say(&mut self, message: &HostMessage) -> R {
+    pub(super) fn say(&mut self, message: &HostMessage) -> R {
         self.say_as(self.session, message)
     }
 
     /// A message of any payload.
-    pub fn say_raw(&mut self, kind: MessageType, payload: &[u8]) -> R {
+    pub(crate) fn say_raw(&mut self, kind: MessageType, payload: &[u8]) -> R {
         let lane = if kind == MessageType::Sync { Lane::Data } else { Lane::Control };
         let packet = Packet::new(Header::control(kind, self.session, 0), payload);
         self.send_packets(lane, &[packet])
     }
 
     /// An ECHO that says `stamp`.
-    pub fn echo(&self, stamp: u64) -> HostMessage {
+    pub(super) fn echo(&self, stamp: u64) -> HostMessage {
         HostMessage::Echo(Echo {
             host_sent_ns: stamp,
             device_received: DeviceTicks(0),
@@ -252,7 +252,7 @@ impl<'a> Bench<'a> {
     // --- hearing ---
 
     /// Lets a little time pass, and hears what has arrived.
-    pub fn rest(&mut self) -> R {
+    pub(super) fn rest(&mut self) -> R {
         std::thread::sleep(Duration::from_micros(300));
         self.hear()
     }
@@ -289,14 +289,18 @@ impl<'a> Bench<'a> {
     }
 
     /// Forgets what was heard.
-    pub fn forget(&mut self) -> R {
+    pub(super) fn forget(&mut self) -> R {
         self.hear()?;
         self.inbox.heard.clear();
         Ok(())
     }
 
     /// The first message for which `wanted` says something, from those not yet taken; those before it are dropped. `None` after `limit_ns`.
-    pub fn wait<T>(&mut self, limit_ns: i64, mut wanted: impl FnMut(&Heard) -> Option<T>) -> R<Option<T>> {
+    pub(super) fn wait<T>(
+        &mut self,
+        limit_ns: i64,
+        mut wanted: impl FnMut(&Heard) -> Option<T>,
+    ) -> R<Option<T>> {
         let end = self.now().plus_ns(limit_ns);
         loop {
             while let Some(heard) = self.inbox.heard.pop_front() {
@@ -316,7 +320,7 @@ impl<'a> Bench<'a> {
     }
 
     /// As [`Bench::wait`], for a STATUS of this session.
-    pub fn wait_status(
+    pub(crate) fn wait_status(
         &mut self,
         limit_ns: i64,
         mut wanted: impl FnMut(&Status) -> bool,
@@ -329,7 +333,7 @@ impl<'a> Bench<'a> {
     }
 
     /// A FAULT of any session.
-    pub fn wait_fault(&mut self, limit_ns: i64, code: FaultCode) -> R<Option<Fault>> {
+    pub(crate) fn wait_fault(&mut self, limit_ns: i64, code: FaultCode) -> R<Option<Fault>> {
         self.wait(limit_ns, |h| match h.message {
             DeviceMessage::Fault(f) if f.code == code => Some(f),
             _ => None,
@@ -337,12 +341,12 @@ impl<'a> Bench<'a> {
     }
 
     /// The newest STATUS of this session, for what was seen instead of what was expected.
-    pub fn newest(&self) -> String {
+    pub(super) fn newest(&self) -> String {
         self.newest.as_ref().map_or("no STATUS".into(), super::tell)
     }
 
     /// Lets time pass, feeding the watchdog; what is heard is kept.
-    pub fn pass(&mut self, ns: i64) -> R {
+    pub(super) fn pass(&mut self, ns: i64) -> R {
         let end = self.now().plus_ns(ns);
         while self.now() < end {
             if self.feed && self.session != 0 && self.now().ns_since(self.fed_at) >= FEED_NS {
@@ -355,7 +359,7 @@ impl<'a> Bench<'a> {
 
     /// A STATUS that was made after everything sent so far had been received: SYNC asks for it, on every lane in its order, and the count of
     /// packets tells it from an earlier one.
-    pub fn report(&mut self) -> R<Status> {
+    pub(super) fn report(&mut self) -> R<Status> {
         self.report_within(self.answer_ns())
     }
 
@@ -386,7 +390,7 @@ impl<'a> Bench<'a> {
     }
 
     /// A failure to answer.
-    pub fn silent(&self, wanted: &str) -> Stop {
+    pub(super) fn silent(&self, wanted: &str) -> Stop {
         Stop::Failed(format!(
             "expected {wanted}, saw none within {} ms; last: {}",
             self.answer_ns() / 1_000_000,

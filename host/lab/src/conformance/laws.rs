@@ -4,7 +4,7 @@ use dpm_device::link::{DeviceMessage, DeviceState, Header, MessageType, PayloadE
 
 /// First breach of each law, and how much it was tried on.
 #[derive(Clone, Debug, Default)]
-pub struct Laws {
+pub(super) struct Laws {
     /// Reports seen.
     pub reports: u64,
     /// `slots = lit + repeated + blank`.
@@ -29,7 +29,7 @@ fn first(of: &mut Option<String>, told: impl FnOnce() -> String) {
 
 impl Laws {
     /// A packet's header.
-    pub fn header(&mut self, h: &Header) {
+    pub(super) fn header(&mut self, h: &Header) {
         let from_device = matches!(
             h.kind,
             MessageType::Hello | MessageType::Status | MessageType::Echo | MessageType::Fault
@@ -45,12 +45,12 @@ impl Laws {
     }
 
     /// A payload that cannot be read.
-    pub fn unreadable(&mut self, e: &PayloadError) {
+    pub(super) fn unreadable(&mut self, e: &PayloadError) {
         first(&mut self.packets, || e.to_string());
     }
 
     /// A message.
-    pub fn message(&mut self, message: &DeviceMessage) {
+    pub(super) fn message(&mut self, message: &DeviceMessage) {
         match message {
             DeviceMessage::Hello(h) => {
                 self.buffers = Some(u32::from(h.frame_buffers));

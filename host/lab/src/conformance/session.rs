@@ -11,7 +11,7 @@ use dpm_device::time::{DeviceTicks, FrameRate};
 
 impl Bench<'_> {
     /// Opens a new session and waits for the device's HELLO.
-    pub fn open(&mut self) -> R<DeviceHello> {
+    pub(super) fn open(&mut self) -> R<DeviceHello> {
         self.session = self.sessions.draw();
         (self.config, self.slots, self.newest) = (None, None, None);
         (self.frames_sent, self.packets_sent, self.packets_base) = (0, 0, None);
@@ -40,7 +40,7 @@ impl Bench<'_> {
     }
 
     /// What the rules ask for, unless they are about something else: two planes at most, of the least light, repeated, never late.
-    pub fn plain_config(&self) -> R<Config> {
+    pub(crate) fn plain_config(&self) -> R<Config> {
         let hello = self.hello.ok_or(Stop::Failed("no HELLO".into()))?;
         let planes: Vec<PlaneSpec> = (0..2u8.min(hello.max_planes.max(1)))
             .map(|k| PlaneSpec { channel: Channel::Red, bit: 1 - k })
@@ -59,13 +59,13 @@ impl Bench<'_> {
     }
 
     /// Length of a slot, ms: long enough for a frame and the reports of a slot.
-    pub fn slot_ms(&self) -> u32 {
+    pub(super) fn slot_ms(&self) -> u32 {
         let frame = self.frame_bytes() + 400;
         (20 + self.carry_ns(frame) * 3 / 1_000_000).clamp(20, 1000) as u32
     }
 
     /// Asks for `config`; the report that confirms it. Latched faults hide the state, not the configuration.
-    pub fn configure(&mut self, config: &Config) -> R<Status> {
+    pub(super) fn configure(&mut self, config: &Config) -> R<Status> {
         self.forget()?;
         self.say(&HostMessage::Config(*config))?;
         let session = self.session;
@@ -95,7 +95,7 @@ impl Bench<'_> {
     }
 
     /// Arms, acknowledging what is latched.
-    pub fn arm(&mut self) -> R<Status> {
+    pub(super) fn arm(&mut self) -> R<Status> {
         // Light may rest after a rule on limits.
         for _ in 0..30 {
             let faults = self.report()?.faults;
@@ -125,7 +125,7 @@ impl Bench<'_> {
     }
 
     /// A new session, configured; `change` may ask for something else than the plain configuration.
-    pub fn configured(&mut self, change: impl FnOnce(&mut Config)) -> R<Status> {
+    pub(super) fn configured(&mut self, change: impl FnOnce(&mut Config)) -> R<Status> {
         self.open()?;
         let mut config = self.plain_config()?;
         change(&mut config);
@@ -133,33 +133,33 @@ impl Bench<'_> {
     }
 
     /// The same, armed.
-    pub fn armed(&mut self, change: impl FnOnce(&mut Config)) -> R<Status> {
+    pub(super) fn armed(&mut self, change: impl FnOnce(&mut Config)) -> R<Status> {
         self.configured(change)?;
         self.arm()
     }
 
     // --- the device's time ---
 
-    pub fn slots(&self) -> R<SlotClock> {
+    pub(super) fn slots(&self) -> R<SlotClock> {
         self.slots.ok_or(Stop::Failed("no slots: not configured".into()))
     }
 
-    pub fn tick_hz(&self) -> u64 {
+    pub(super) fn tick_hz(&self) -> u64 {
         self.hello.map_or(1, |h| u64::from(h.tick_hz))
     }
 
-    pub fn ticks_of_ms(&self, ms: u64) -> u64 {
+    pub(crate) fn ticks_of_ms(&self, ms: u64) -> u64 {
         (self.tick_hz() * ms).div_ceil(1000)
     }
 
     /// The device's clock now, as far as it was told; not ahead of it but for its rate.
-    pub fn ticks_now(&self) -> u64 {
+    pub(crate) fn ticks_now(&self) -> u64 {
         let ns = self.now().ns_since(self.clock.1).max(0) as u128;
         self.clock.0 + (ns * u128::from(self.tick_hz()) / 1_000_000_000) as u64
     }
 
     /// A slot that a frame sent now will make.
-    pub fn slot_ahead(&mut self) -> R<u64> {
+    pub(crate) fn slot_ahead(&mut self) -> R<u64> {
         // A clock that was told long ago, or late, is asked again.
         self.report()?;
         let slots = self.slots()?;
@@ -169,7 +169,7 @@ impl Bench<'_> {
     }
 
     /// The same by the clock as it was told last: SYNC would account frames.
-    pub fn slot_ahead_quietly(&mut self) -> R<u64> {
+    pub(crate) fn slot_ahead_quietly(&mut self) -> R<u64> {
         let slots = self.slots()?;
         let carry = self.carry_ns(self.frame_bytes() + 200) * 2 + 60_000_000;
         let ticks = (i128::from(carry) * i128::from(self.tick_hz()) / 1_000_000_000) as u64;
@@ -177,13 +177,13 @@ impl Bench<'_> {
     }
 
     /// Reports until one is of `ticks` or later: that one.
-    pub fn until(&mut self, ticks: u64) -> R<Status> {
+    pub(super) fn until(&mut self, ticks: u64) -> R<Status> {
         let all = self.watch_until(ticks)?;
         all.last().copied().ok_or_else(|| self.silent("a STATUS"))
     }
 
     /// All reports until one is of `ticks` or later, asked for every few milliseconds.
-    pub fn watch_until(&mut self, ticks: u64) -> R<Vec<Status>> {
+    pub(crate) fn watch_until(&mut self, ticks: u64) -> R<Vec<Status>> {
         let left = ticks.saturating_sub(self.ticks_now());
         let left_ns = (u128::from(left) * 1_000_000_000 / u128::from(self.tick_hz().max(1))) as i64;
         let end = self.now().plus_ns(left_ns.saturating_mul(2).saturating_add(2_000_000_000));
@@ -204,7 +204,7 @@ impl Bench<'_> {
     }
 
     /// The device's moment in the slot `slot`, a little after its start.
-    pub fn until_slot(&mut self, slot: u64) -> R<Status> {
+    pub(crate) fn until_slot(&mut self, slot: u64) -> R<Status> {
         let start = self.slots()?.start(slot).0;
         self.until(start + self.ticks_of_ms(2))
     }

@@ -14,7 +14,7 @@ const LONGEST_PLANE_NS: i64 = 800_000_000;
 
 /// One plane on its way.
 #[derive(Clone, Debug)]
-pub struct Piece {
+pub(crate) struct Piece {
     pub plane: u8,
     pub codec: Codec,
     pub led: u8,
@@ -26,7 +26,7 @@ pub struct Piece {
 
 /// A frame on its way.
 #[derive(Clone, Debug)]
-pub struct Shot {
+pub(super) struct Shot {
     pub id: u32,
     pub slot: u64,
     pub target: u64,
@@ -38,22 +38,22 @@ pub struct Shot {
 
 impl Bench<'_> {
     /// Bytes of one plane.
-    pub fn plane_bytes(&self) -> usize {
+    pub(super) fn plane_bytes(&self) -> usize {
         self.hello.map_or(1, |h| h.raster.plane_bytes())
     }
 
-    pub fn reads(&self, codec: Codec) -> bool {
+    pub(super) fn reads(&self, codec: Codec) -> bool {
         self.hello.is_some_and(|h| h.codecs & codec.mask() != 0)
     }
 
     /// Bytes of a plain frame on the wire.
-    pub fn frame_bytes(&self) -> usize {
+    pub(super) fn frame_bytes(&self) -> usize {
         let plane = if self.reads(Codec::Rle) { 64.min(self.plane_bytes()) } else { self.plane_bytes() };
         2 * packet_bytes(plane) + packet_bytes(COMMIT_BYTES)
     }
 
     /// Without raw planes that the medium carries in time a device that reads no codec cannot be judged.
-    pub fn needs_frames(&self) -> R {
+    pub(crate) fn needs_frames(&self) -> R {
         if !self.reads(Codec::Rle) {
             self.needs_raw()?;
         }
@@ -61,7 +61,7 @@ impl Bench<'_> {
     }
 
     /// See [`Bench::needs_frames`], for a rule that is about raw planes.
-    pub fn needs_raw(&self) -> R {
+    pub(crate) fn needs_raw(&self) -> R {
         if self.carry_ns(packet_bytes(self.plane_bytes())) > LONGEST_PLANE_NS {
             return Err(Stop::NotJudged(format!(
                 "a raw plane of {} bytes takes this medium longer than {} ms",
@@ -73,7 +73,7 @@ impl Bench<'_> {
     }
 
     /// A plane that is dark but for its first mirrors, which `value` draws: the least light that is still a picture.
-    pub fn faint(&self, value: u8) -> Vec<u8> {
+    pub(crate) fn faint(&self, value: u8) -> Vec<u8> {
         let mut plane = vec![0; self.plane_bytes()];
         let width = self.hello.map_or(8, |h| h.raster.width());
         plane[0] = if width >= 8 { value } else { value & (0xff00 >> width) as u8 };
@@ -81,7 +81,7 @@ impl Bench<'_> {
     }
 
     /// `plane` by the shortest codec that needs no other frame, of those that the device reads.
-    pub fn coded(&self, plane: &[u8]) -> (Codec, Vec<u8>) {
+    pub(super) fn coded(&self, plane: &[u8]) -> (Codec, Vec<u8>) {
         let mut out = vec![0; plane.len()];
         if self.reads(Codec::Rle) {
             // Shorter than the plane, as every coded plane must be.
@@ -94,14 +94,14 @@ impl Bench<'_> {
     }
 
     /// The next frame, for `slot`, whole and right. Its light ends two seconds after its slot.
-    pub fn shot(&mut self, slot: u64) -> R<Shot> {
+    pub(super) fn shot(&mut self, slot: u64) -> R<Shot> {
         let slots = self.slots()?;
         let target = slots.start(slot).0;
         self.shot_at(slot, target)
     }
 
     /// The same for the instant `target`.
-    pub fn shot_at(&mut self, slot: u64, target: u64) -> R<Shot> {
+    pub(crate) fn shot_at(&mut self, slot: u64, target: u64) -> R<Shot> {
         let Some(config) = self.config else { return Err(Stop::Failed("not configured".into())) };
         let id = self.next_frame;
         self.next_frame = id.wrapping_add(1);
@@ -127,12 +127,12 @@ impl Bench<'_> {
     }
 
     /// Sends it: all of it in one go, as a transfer carries a whole frame.
-    pub fn send(&mut self, shot: &Shot) -> R {
+    pub(super) fn send(&mut self, shot: &Shot) -> R {
         self.send_as(self.session, Lane::Data, shot)
     }
 
     /// The same in another session or on another lane.
-    pub fn send_as(&mut self, session: u32, lane: Lane, shot: &Shot) -> R {
+    pub(crate) fn send_as(&mut self, session: u32, lane: Lane, shot: &Shot) -> R {
         let header = |kind| Header {
             frame: shot.id,
             target_at: DeviceTicks(shot.target),
@@ -164,7 +164,7 @@ impl Bench<'_> {
 }
 
 /// A packet with a right header and a payload whose checksum is wrong.
-pub fn damaged_payload<'a>(header: &Header, payload: &'a [u8]) -> Packet<'a> {
+pub(crate) fn damaged_payload<'a>(header: &Header, payload: &'a [u8]) -> Packet<'a> {
     let header = Header { payload_bytes: payload.len() as u32, ..*header };
     let pad = (4 - payload.len() % 4) % 4;
     let mut trailer = [0u8; 8];
@@ -173,7 +173,7 @@ pub fn damaged_payload<'a>(header: &Header, payload: &'a [u8]) -> Packet<'a> {
 }
 
 /// `header` with `value` at `at`, its checksum right again.
-pub fn other_header(header: &Header, at: usize, value: u8) -> [u8; 32] {
+pub(crate) fn other_header(header: &Header, at: usize, value: u8) -> [u8; 32] {
     let mut bytes = header.encode();
     bytes[at] = value;
     let crc = crc32c(&bytes[..28]);
@@ -182,7 +182,7 @@ pub fn other_header(header: &Header, at: usize, value: u8) -> [u8; 32] {
 }
 
 /// One LZ4 block of `plane`: its first byte, a match for the longest run after it, and the rest as it is.
-pub fn lz4_block(plane: &[u8]) -> Vec<u8> {
+pub(crate) fn lz4_block(plane: &[u8]) -> Vec<u8> {
     let length = |out: &mut Vec<u8>, mut n: usize| {
         while n >= 255 {
             out.push(255);

@@ -2,7 +2,7 @@
 
 pub mod export;
 pub mod figure3;
-pub mod parts;
+mod parts;
 pub mod plan;
 pub mod plot;
 pub mod reference;
@@ -10,4 +10,4 @@ pub mod report;
 pub mod runs;
 pub mod sheet;
 pub mod table;
-pub mod verdict;
+mod verdict;

@@ -11,7 +11,7 @@ use std::path::{Path, PathBuf};
 
 /// Where a method's part of a group lies.
 #[derive(Clone, Debug)]
-pub struct Part {
+pub(super) struct Part {
     path: PathBuf,
 }
 
@@ -27,12 +27,12 @@ const MAX_PART_BYTES: u64 = 4 << 30;
 
 impl Part {
     /// That of method `name` in the group with this key.
-    pub fn new(cache: &Path, key: &str, name: &str) -> Self {
+    pub(super) fn new(cache: &Path, key: &str, name: &str) -> Self {
         Self { path: cache.join(format!("part-{key}-{}.json", file_word(name))) }
     }
 
     /// The row, and what the eye saw at each of `probes`. `None` when nothing is there that fits.
-    pub fn read(&self, probes: usize) -> Option<(ErrorRow, Vec<Vec3>)> {
+    pub(super) fn read(&self, probes: usize) -> Option<(ErrorRow, Vec<Vec3>)> {
         let kept: Kept =
             serde_json::from_slice(&regular_file::read(&self.path, MAX_PART_BYTES).ok()?).ok()?;
         let eye: Vec<Vec3> = kept.eye.into_iter().map(|v| Vec3::from(v.map(f32::from_bits))).collect();
@@ -43,14 +43,14 @@ impl Part {
     ///
     /// # Errors
     /// The file system's.
-    pub fn write(&self, (row, eye): &(ErrorRow, Vec<Vec3>)) -> io::Result<()> {
+    pub(super) fn write(&self, (row, eye): &(ErrorRow, Vec<Vec3>)) -> io::Result<()> {
         let eye = eye.iter().map(|v| v.to_array().map(f32::to_bits)).collect();
         let bytes = serde_json::to_vec(&Kept { row: row.clone(), eye })?;
         write_atomically(&self.path, |out| out.write_all(&bytes))
     }
 
     /// Removes the file. That it stays when this fails does no harm: its key fits nothing else.
-    pub fn remove(&self) {
+    pub(super) fn remove(&self) {
         let _ = std::fs::remove_file(&self.path);
     }
 }

@@ -13,12 +13,12 @@ pub struct Contender {
 }
 
 /// A method as its authors have it: the rig's constants, but none of the rig's switches.
-pub fn method_of(render: &RenderConfig, which: RenderMethod) -> Method {
+pub(crate) fn method_of(render: &RenderConfig, which: RenderMethod) -> Method {
     switched_method_of(&RenderConfig { effects: EffectsConfig::default(), ..render.clone() }, which)
 }
 
 /// A method with the switches that the rig file sets.
-pub fn switched_method_of(render: &RenderConfig, which: RenderMethod) -> Method {
+pub(crate) fn switched_method_of(render: &RenderConfig, which: RenderMethod) -> Method {
     let mut own = render.clone();
     own.method = which;
     if which == RenderMethod::Miyamoto {
@@ -51,7 +51,7 @@ pub fn contenders(render: &RenderConfig, ablation: bool) -> Vec<Contender> {
 }
 
 /// `paper` at a budget: its table 1 (18, 18, 2) scaled to `budget` in the middle of the view, never below 1.
-pub fn paper_at(method: &Method, budget: f64) -> Method {
+pub(crate) fn paper_at(method: &Method, budget: f64) -> Method {
     let mut scaled = method.clone();
     let of = &method.paper.zone_spp;
     let most = of.iter().copied().max().unwrap_or(1).max(1);
@@ -60,7 +60,7 @@ pub fn paper_at(method: &Method, budget: f64) -> Method {
 }
 
 /// A method's name as part of a file's.
-pub fn file_word(name: &str) -> String {
+pub(crate) fn file_word(name: &str) -> String {
     name.chars().map(|c| if c.is_ascii_alphanumeric() { c } else { '_' }).collect()
 }
 

@@ -8,7 +8,7 @@ use plotters::coord::combinators::{LogCoord, WithKeyPoints};
 use plotters::prelude::*;
 
 /// One frame at 947 fps, ms: what the rig allows.
-pub const FRAME_MS: f64 = 1.056;
+pub(crate) const FRAME_MS: f64 = 1.056;
 
 /// What the horizontal axis shows.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -20,7 +20,7 @@ pub enum Cost {
 }
 
 /// Points that no other point beats in both cost and error, by rising cost.
-pub fn pareto(points: &[(f64, f64)]) -> Vec<(f64, f64)> {
+pub(crate) fn pareto(points: &[(f64, f64)]) -> Vec<(f64, f64)> {
     let mut sorted = points.to_vec();
     sorted.sort_by(|a, b| a.0.total_cmp(&b.0).then(a.1.total_cmp(&b.1)));
     let mut least = f64::INFINITY;

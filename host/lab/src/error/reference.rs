@@ -73,7 +73,7 @@ impl Reference {
     }
 
     /// Error of what the eye sees of either run, as measured.
-    pub fn each_run(&self, eyes: &[Vec<Vec3>; 2]) -> [f64; 2] {
+    pub(crate) fn each_run(&self, eyes: &[Vec<Vec3>; 2]) -> [f64; 2] {
         eyes.each_ref().map(|eye| rmse(eye, &self.eye, |_| true))
     }
 
@@ -99,7 +99,7 @@ impl Reference {
 }
 
 /// Mean over channels of all finite values.
-pub fn mean_of(values: &[Vec3]) -> f64 {
+pub(crate) fn mean_of(values: &[Vec3]) -> f64 {
     let finite = || values.iter().filter(|v| v.is_finite());
     finite().map(|v| v.as_dvec3().element_sum()).sum::<f64>() / (3 * finite().count()).max(1) as f64
 }

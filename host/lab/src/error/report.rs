@@ -129,7 +129,7 @@ pub fn markdown(groups: &[GroupResult]) -> String {
 }
 
 /// Time of a frame, ms: the GPU's, or until its light is known where the device has no time stamps.
-pub fn time_ms(r: &ErrorRow) -> f64 {
+pub(crate) fn time_ms(r: &ErrorRow) -> f64 {
     if r.gpu_ms > 0.0 {
         r.gpu_ms
     } else {
@@ -151,7 +151,7 @@ pub const REACH: f64 = 4.0;
 
 /// `y` where `x` is on a curve of straight lines between the logarithms of points. `None` farther beyond its ends than [`REACH`], and where
 /// it passes `x` more than once: then no one value is right.
-pub fn on_curve(points: &[(f64, f64)], x: f64) -> Option<Reading> {
+pub(crate) fn on_curve(points: &[(f64, f64)], x: f64) -> Option<Reading> {
     let at = |a: (f64, f64), b: (f64, f64)| {
         let t = (x / a.0).ln() / (b.0 / a.0).ln();
         (a.1.ln() + t * (b.1 / a.1).ln()).exp()

@@ -50,7 +50,7 @@ pub struct ErrorOptions {
 
 /// Slot of the last frame of every sequence: the same however much is drawn before it, so that short runs and long ones judge one moment of
 /// the motions. Late enough for the longest warm-up and 250 ms at 947 fps.
-pub const LAST_SLOT: u64 = 383;
+pub(crate) const LAST_SLOT: u64 = 383;
 /// Frames over which the eye takes the mean: 33 ms at 947 fps.
 pub const EYE_FRAMES: usize = 31;
 /// Rays count as equal within this share.
@@ -597,7 +597,7 @@ impl ErrorRuns {
 }
 
 /// What the row of this program's own method is called; those of its ablations begin so.
-pub const DPM: &str = "dpm";
+pub(crate) const DPM: &str = "dpm";
 /// What the name of a method ends with while it is drawn at the time of dpm.
 pub const AT_EQUAL_TIME: &str = " at equal time";
 

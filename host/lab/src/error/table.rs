@@ -17,9 +17,9 @@ use std::fmt::Write as _;
 use std::sync::Arc;
 
 /// Samples of \[paper\] table 1 where the eye looks.
-pub const BUDGET: f64 = 18.0;
+pub(crate) const BUDGET: f64 = 18.0;
 /// Angle at the eye between the middle of the picture and the gaze that looks past it, degrees.
-pub const ASIDE_DEG: f64 = 27.0;
+pub(crate) const ASIDE_DEG: f64 = 27.0;
 
 /// One condition: a material, standing or moving, looked at or past.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]

@@ -11,7 +11,7 @@ use std::fmt::Write as _;
 
 /// The error of dpm by that of the best of the other methods.
 #[derive(Clone, Debug, PartialEq)]
-pub struct Ratio {
+pub(super) struct Ratio {
     /// As measured.
     pub raw: f64,
     /// With the reference's own error taken off both.
@@ -24,7 +24,7 @@ pub struct Ratio {
 
 /// What one group says.
 #[derive(Clone, Debug, PartialEq)]
-pub struct Verdict {
+pub(super) struct Verdict {
     /// Name of the group.
     pub group: String,
     /// Errors at the rays of the method `paper`.
@@ -54,7 +54,11 @@ fn errors(r: &ErrorRow) -> [f64; 2] {
 }
 
 /// What a group says; `flicker` is what counts as that of a row. `None` without dpm or without any other method.
-pub fn verdict(group: String, result: &GroupResult, flicker: &dyn Fn(&ErrorRow) -> f64) -> Option<Verdict> {
+pub(super) fn verdict(
+    group: String,
+    result: &GroupResult,
+    flicker: &dyn Fn(&ErrorRow) -> f64,
+) -> Option<Verdict> {
     let (dpm, best) = (dpm_of(result)?, best_other(result)?);
     let timed = result.rows.iter().filter(|r| is_other(&r.method)).filter_map(|r| Some((r, r.equal_time?)));
     let best_timed = timed

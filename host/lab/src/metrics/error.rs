@@ -1,7 +1,5 @@
 //! Two pictures into numbers of their difference, weighted where the eye looks.
 
-use glam::{DVec3, Vec3};
-
 use super::{MetricError, Picture};
 
 /// Keeps dark pixels from ruling [`PictureError::rel_mse`].
@@ -9,7 +7,7 @@ const REL_MSE_EPSILON: f64 = 0.01;
 
 /// How a picture differs from its reference. All are means over pixels and channels with the given weights.
 #[derive(Clone, Copy, Debug, PartialEq)]
-pub struct PictureError {
+pub(crate) struct PictureError {
     /// Root of the mean squared difference, in the pictures' unit.
     pub rmse: f64,
     /// Mean of `(t - r)^2 / (r^2 + 0.01)` \[Rousselle11\].
@@ -24,12 +22,12 @@ pub struct PictureError {
     pub not_finite: usize,
 }
 
-/// Compares `test` with `reference`. `weights`: one a pixel, from [`eccentricity_weights`] or 0 and 1 to choose pixels; `None` is one
+/// Compares `test` with `reference`. `weights`: one a pixel, 0 and 1 to choose pixels; `None` is one
 /// everywhere. `peak`: what counts as white for [`PictureError::psnr_db`].
 ///
 /// # Errors
 /// Sizes that differ; weights as described at [`MetricError::Weights`], also when every pixel that has one is not finite.
-pub fn compare(
+pub(crate) fn compare(
     test: &Picture,
     reference: &Picture,
     weights: Option<&[f32]>,
@@ -75,27 +73,10 @@ pub fn compare(
     })
 }
 
-/// Eccentricity at which the eye resolves half of what it does in the fovea, degrees \[GeislerPerry98\].
-pub const HALF_RESOLUTION_DEG: f64 = 2.3;
-
-/// Weight of an error at `eccentricity_deg` from the gaze: the area that one resolved element has in the fovea over that here,
-/// `(e2 / (e2 + e))^2` with e2 of [`HALF_RESOLUTION_DEG`].
-pub fn eccentricity_weight(eccentricity_deg: f64) -> f64 {
-    (HALF_RESOLUTION_DEG / (HALF_RESOLUTION_DEG + eccentricity_deg.abs())).powi(2)
-}
-
-/// Weights of surface points as an eye at `eye` that looks at `gaze` sees them; `None` (nothing there) weighs 0.
-pub fn eccentricity_weights(points: &[Option<Vec3>], eye: DVec3, gaze: DVec3) -> Vec<f32> {
-    let ahead = gaze - eye;
-    let weight = |p: &Option<Vec3>| {
-        p.map_or(0.0, |p| eccentricity_weight(ahead.angle_between(p.as_dvec3() - eye).to_degrees()) as f32)
-    };
-    points.iter().map(weight).collect()
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;
+    use glam::Vec3;
 
     fn picture(pixels: &[Vec3]) -> Picture<'_> {
         Picture::new(pixels.len(), 1, pixels).unwrap()
@@ -139,19 +120,5 @@ mod tests {
                 && Picture::new(0, 5, &[]).is_err()
                 && Picture::new(usize::MAX, 2, &r).is_err()
         );
-    }
-
-    #[test]
-    fn weight_halves_twice_at_the_half_resolution_eccentricity() {
-        assert_eq!(eccentricity_weight(0.0), 1.0);
-        assert!((eccentricity_weight(HALF_RESOLUTION_DEG) - 0.25).abs() < 1e-12);
-        let eye = DVec3::new(0.0, 0.0, 1.0);
-        let off_axis = (HALF_RESOLUTION_DEG.to_radians()).tan() as f32;
-        let w = eccentricity_weights(
-            &[Some(Vec3::ZERO), Some(Vec3::new(off_axis, 0.0, 0.0)), None],
-            eye,
-            DVec3::ZERO,
-        );
-        assert!((w[0] - 1.0).abs() < 1e-6 && (w[1] - 0.25).abs() < 1e-5 && w[2] == 0.0);
     }
 }

@@ -3,14 +3,14 @@
 use super::MetricError;
 
 /// The slowest change that counts as flicker, Hz.
-pub const LOWEST_HZ: f64 = 1.0;
+pub(crate) const LOWEST_HZ: f64 = 1.0;
 
 /// Critical flicker fusion: the fastest that is seen, Hz.
-pub const HIGHEST_HZ: f64 = 60.0;
+pub(crate) const HIGHEST_HZ: f64 = 60.0;
 
 /// Means of square tiles over time.
 #[derive(Clone, Debug)]
-pub struct TileSeries {
+pub(crate) struct TileSeries {
     width: usize,
     height: usize,
     tile: usize,
@@ -26,7 +26,12 @@ impl TileSeries {
     ///
     /// # Errors
     /// [`MetricError::Parameter`] when a size or the period is 0.
-    pub fn new(width: usize, height: usize, tile: usize, frame_period_ns: u64) -> Result<Self, MetricError> {
+    pub(crate) fn new(
+        width: usize,
+        height: usize,
+        tile: usize,
+        frame_period_ns: u64,
+    ) -> Result<Self, MetricError> {
         if width == 0 || height == 0 || tile == 0 {
             return Err(MetricError::Parameter("a size"));
         }
@@ -44,20 +49,15 @@ impl TileSeries {
     }
 
     /// Tiles in a row and rows of tiles.
-    pub fn tiles(&self) -> (usize, usize) {
+    pub(crate) fn tiles(&self) -> (usize, usize) {
         (self.width.div_ceil(self.tile), self.height.div_ceil(self.tile))
-    }
-
-    /// Frames added.
-    pub fn frames(&self) -> usize {
-        self.frames
     }
 
     /// Adds a frame of one value a pixel: luminance, or its difference from a reference when the scene itself changes.
     ///
     /// # Errors
     /// [`MetricError::PixelCount`].
-    pub fn add(&mut self, values: &[f32]) -> Result<(), MetricError> {
+    pub(crate) fn add(&mut self, values: &[f32]) -> Result<(), MetricError> {
         if values.len() != self.width * self.height {
             return Err(MetricError::PixelCount {
                 width: self.width,
@@ -86,7 +86,7 @@ impl TileSeries {
     ///
     /// # Errors
     /// [`MetricError::Parameter`] when the sequence is too short to hold a frequency of the band: 250 ms is a sensible least.
-    pub fn power(&self) -> Result<Vec<f64>, MetricError> {
+    pub(crate) fn power(&self) -> Result<Vec<f64>, MetricError> {
         let n = self.frames;
         let duration_s = n as f64 * self.frame_period_s;
         let band: Vec<usize> =

@@ -8,7 +8,7 @@ use glam::{DMat3, DVec3};
 use super::{MetricError, Picture};
 
 /// Pixels a degree at which the paper judges by default: a screen 0.7 m wide of 3840 pixels seen from 0.7 m.
-pub const DEFAULT_PIXELS_PER_DEGREE: f64 = 67.020_643_276_582_26;
+pub(crate) const DEFAULT_PIXELS_PER_DEGREE: f64 = 67.020_643_276_582_26;
 
 /// Exponent of colour differences (q_c), and the two numbers of the mapping to 0..1 (p_c, p_t).
 const COLOR_EXPONENT: f64 = 0.7;
@@ -34,7 +34,11 @@ const WIDEST: f64 = 0.04;
 ///
 /// # Errors
 /// Sizes that differ; `pixels_per_degree` outside 1 to 1000.
-pub fn flip(test: &Picture, reference: &Picture, pixels_per_degree: f64) -> Result<Vec<f32>, MetricError> {
+pub(crate) fn flip(
+    test: &Picture,
+    reference: &Picture,
+    pixels_per_degree: f64,
+) -> Result<Vec<f32>, MetricError> {
     test.check_same_size(reference)?;
     if !(1.0..=1000.0).contains(&pixels_per_degree) {
         return Err(MetricError::Parameter("pixels per degree"));
@@ -56,7 +60,11 @@ pub fn flip(test: &Picture, reference: &Picture, pixels_per_degree: f64) -> Resu
 ///
 /// # Errors
 /// As [`flip`].
-pub fn mean_flip(test: &Picture, reference: &Picture, pixels_per_degree: f64) -> Result<f64, MetricError> {
+pub(crate) fn mean_flip(
+    test: &Picture,
+    reference: &Picture,
+    pixels_per_degree: f64,
+) -> Result<f64, MetricError> {
     let map = flip(test, reference, pixels_per_degree)?;
     Ok(map.iter().map(|&x| f64::from(x)).sum::<f64>() / map.len() as f64)
 }

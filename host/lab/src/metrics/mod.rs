@@ -1,17 +1,16 @@
 //! Two sequences of light into how different they are to a camera and to an eye.
 //!
-//! Light first passes the eye model ([`eye`]), then pictures are compared ([`error`], [`flip`]) and tiles watched over time ([`flicker`]).
+//! Pictures of what an eye sees are compared ([`error`], [`flip`]), and tiles are watched over time ([`flicker`]).
 //! Judging single frames would be wrong: at 947 fps the eye never sees one.
 
-pub mod error;
-pub mod eye;
-pub mod flicker;
-pub mod flip;
+pub(crate) mod error;
+pub(crate) mod flicker;
+pub(crate) mod flip;
 
 use glam::Vec3;
 
 /// What a viewer takes for white: the brightest channel that all but a hundredth of the finite colours stay below; at least 1e-6.
-pub fn white_of(colours: &[Vec3]) -> f32 {
+pub(crate) fn white_of(colours: &[Vec3]) -> f32 {
     let mut all: Vec<f32> = colours.iter().filter(|v| v.is_finite()).map(|v| v.max_element()).collect();
     all.sort_by(f32::total_cmp);
     all.get(all.len() * 99 / 100).copied().unwrap_or(1.0).max(1e-6)
@@ -19,7 +18,7 @@ pub fn white_of(colours: &[Vec3]) -> f32 {
 
 /// A picture in linear Rec. 709, rows from the top.
 #[derive(Clone, Copy, Debug)]
-pub struct Picture<'a> {
+pub(crate) struct Picture<'a> {
     width: usize,
     height: usize,
     pixels: &'a [Vec3],
@@ -54,7 +53,7 @@ impl<'a> Picture<'a> {
     ///
     /// # Errors
     /// [`MetricError::PixelCount`].
-    pub fn new(width: usize, height: usize, pixels: &'a [Vec3]) -> Result<Self, MetricError> {
+    pub(crate) fn new(width: usize, height: usize, pixels: &'a [Vec3]) -> Result<Self, MetricError> {
         if pixels.is_empty() || width.checked_mul(height) != Some(pixels.len()) {
             return Err(MetricError::PixelCount { width, height, found: pixels.len() });
         }
@@ -62,12 +61,12 @@ impl<'a> Picture<'a> {
     }
 
     /// Width and height.
-    pub fn size(&self) -> (usize, usize) {
+    pub(crate) fn size(&self) -> (usize, usize) {
         (self.width, self.height)
     }
 
     /// All pixels.
-    pub fn pixels(&self) -> &'a [Vec3] {
+    pub(crate) fn pixels(&self) -> &'a [Vec3] {
         self.pixels
     }
 
@@ -80,6 +79,6 @@ impl<'a> Picture<'a> {
 }
 
 /// Luminance of linear Rec. 709 colour.
-pub fn luminance(c: Vec3) -> f32 {
+pub(crate) fn luminance(c: Vec3) -> f32 {
     c.dot(Vec3::new(0.2126, 0.7152, 0.0722))
 }

@@ -7,13 +7,13 @@ use glam::{DMat3, DVec3};
 use std::f64::consts::PI;
 
 /// GGX widths below this are mirrors: delta lobes.
-pub const DELTA_BELOW_ALPHA: f64 = 1e-3;
+pub(crate) const DELTA_BELOW_ALPHA: f64 = 1e-3;
 
 /// Smallest cosine between the shading normal and the viewing direction; below, the normal is bent.
 pub const LEAST_COS: f64 = 1e-3;
 
 /// Scattering at a point seen from one direction.
-pub struct Bsdf<'t> {
+pub(crate) struct Bsdf<'t> {
     look: Look,
     table: &'t AlbedoTable,
     /// Columns tangent, bitangent, shading normal; the normal is on the side of the viewer.
@@ -32,7 +32,7 @@ pub struct Bsdf<'t> {
 
 /// A sampled direction.
 #[derive(Clone, Copy, Debug)]
-pub struct BsdfSample {
+pub(crate) struct BsdfSample {
     /// Unit, world, away from the surface.
     pub l: DVec3,
     /// `f |cos| / pdf`.
@@ -43,7 +43,7 @@ pub struct BsdfSample {
 
 /// Value and density of the lobes that are not deltas.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
-pub struct BsdfValue {
+pub(crate) struct BsdfValue {
     /// `f |n.l|`, 1/sr.
     pub f_cos: DVec3,
     /// Density of [`Bsdf::sample`] per steradian.
@@ -52,7 +52,7 @@ pub struct BsdfValue {
 
 impl<'t> Bsdf<'t> {
     /// Scattering toward `v` (unit, away from the surface). `None` where the surface is black: the back of a single-sided one.
-    pub fn new(point: &SurfacePoint, table: &'t AlbedoTable, v: DVec3) -> Option<Self> {
+    pub(crate) fn new(point: &SurfacePoint, table: &'t AlbedoTable, v: DVec3) -> Option<Self> {
         let look = point.look;
         let front = point.geometric.dot(v) > 0.0;
         if !front && !look.two_sided {
@@ -128,7 +128,7 @@ impl<'t> Bsdf<'t> {
     }
 
     /// `f |n.l|` and the density of all lobes but the deltas. `l`: unit, world, away from the surface.
-    pub fn evaluate(&self, l: DVec3) -> BsdfValue {
+    pub(crate) fn evaluate(&self, l: DVec3) -> BsdfValue {
         let above = self.geometric.dot(l);
         self.evaluate_local(self.world_from_local.transpose() * l, above)
     }
@@ -182,7 +182,7 @@ impl<'t> Bsdf<'t> {
     }
 
     /// Draws a direction. `None`: the light is absorbed.
-    pub fn sample(&self, choose: f64, u: [f64; 2], facet: f64) -> Option<BsdfSample> {
+    pub(crate) fn sample(&self, choose: f64, u: [f64; 2], facet: f64) -> Option<BsdfSample> {
         if choose < self.choose_straight {
             let (m, t) = (self.look.metallic, self.look.transmission);
             let weight = self.look.base * ((1.0 - m) * t * (1.0 - self.coat) / self.choose_straight);

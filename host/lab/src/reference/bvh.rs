@@ -204,7 +204,7 @@ impl Bvh {
     }
 
     /// Every triangle tested in turn: the oracle of [`Self::closest`].
-    pub fn closest_brute_force(&self, origin: DVec3, direction: DVec3, t_max: f64) -> Option<Hit> {
+    pub(crate) fn closest_brute_force(&self, origin: DVec3, direction: DVec3, t_max: f64) -> Option<Hit> {
         if !(origin.is_finite() && direction.is_finite()) || direction == DVec3::ZERO {
             return None;
         }

@@ -45,7 +45,7 @@ pub struct ReferenceImage {
 
 impl ReferenceImage {
     /// Mean over all lit pixels per channel; 0 when none is.
-    pub fn mean_lit(&self) -> [f64; 3] {
+    pub(crate) fn mean_lit(&self) -> [f64; 3] {
         let n = self.lit.iter().filter(|l| **l).count().max(1) as f64;
         let mut sum = [0.0; 3];
         for (pixel, _) in self.mean.iter().zip(&self.lit).filter(|(_, lit)| **lit) {
@@ -73,12 +73,6 @@ struct Pixel {
 }
 
 impl Reference<'_> {
-    /// The first real surface on the ray of a pixel position.
-    pub fn first_hit(&self, camera: &ProjectorCamera, pixel: DVec2) -> Option<SurfacePoint> {
-        let ray = camera.ray(pixel);
-        self.trace(ray.origin, ray.direction, f64::INFINITY, true)
-    }
-
     /// True when light from `projector` at a point that it sees can reach `eye`: both are on one side, and nothing real is between.
     pub fn lit(&self, point: &SurfacePoint, projector: DVec3, eye: DVec3) -> bool {
         let (p, e) = (projector - point.position, eye - point.position);
@@ -95,7 +89,11 @@ impl Reference<'_> {
     }
 
     /// An ordinary camera's image: radiance back along each ray, every body visible, the sky behind them. All pixels are lit.
-    pub fn render_camera(&self, camera: &ProjectorCamera, settings: &RenderSettings) -> ReferenceImage {
+    pub(crate) fn render_camera(
+        &self,
+        camera: &ProjectorCamera,
+        settings: &RenderSettings,
+    ) -> ReferenceImage {
         self.render_view(camera, View::Camera, settings)
     }
 

@@ -15,13 +15,13 @@ fn brightness(c: DVec3) -> f64 {
 
 /// A list of weights from which one is drawn in proportion.
 #[derive(Clone, Debug, Default)]
-pub struct Choice {
+pub(crate) struct Choice {
     cumulative: Vec<f64>,
 }
 
 impl Choice {
     /// From weights, none negative.
-    pub fn new(weights: impl Iterator<Item = f64>) -> Self {
+    pub(super) fn new(weights: impl Iterator<Item = f64>) -> Self {
         let mut sum = 0.0;
         let cumulative = weights
             .map(|w| {
@@ -33,12 +33,12 @@ impl Choice {
     }
 
     /// Sum of the weights.
-    pub fn total(&self) -> f64 {
+    pub(super) fn total(&self) -> f64 {
         self.cumulative.last().copied().unwrap_or(0.0)
     }
 
     /// Probability of entry `i`; 0 when there is nothing to choose.
-    pub fn probability(&self, i: usize) -> f64 {
+    pub(super) fn probability(&self, i: usize) -> f64 {
         let below = if i == 0 { 0.0 } else { self.cumulative[i - 1] };
         if self.total() > 0.0 {
             (self.cumulative[i] - below) / self.total()
@@ -48,7 +48,7 @@ impl Choice {
     }
 
     /// The entry for `u` in 0..1 and where in it `u` fell (0..1); `None` when the sum is 0.
-    pub fn draw(&self, u: f64) -> Option<(usize, f64)> {
+    pub(super) fn draw(&self, u: f64) -> Option<(usize, f64)> {
         let total = self.total();
         if total.is_nan() || total <= 0.0 {
             return None;
@@ -70,7 +70,7 @@ impl Choice {
 
 /// A triangle chosen as light, and a point on it.
 #[derive(Clone, Copy, Debug)]
-pub struct TriangleSample {
+pub(crate) struct TriangleSample {
     /// Triangle of the hierarchy.
     pub triangle: usize,
     /// Barycentric weights of the point.
@@ -81,7 +81,7 @@ pub struct TriangleSample {
 
 /// Punctual light in world space.
 #[derive(Clone, Copy, Debug)]
-pub struct WorldLight {
+pub(crate) struct WorldLight {
     kind: PunctualKind,
     intensity: DVec3,
     position: DVec3,
@@ -91,7 +91,7 @@ pub struct WorldLight {
 
 /// Light arriving at a point from a light that has no extent.
 #[derive(Clone, Copy, Debug)]
-pub struct Arriving {
+pub(super) struct Arriving {
     /// Unit direction toward the light.
     pub l: DVec3,
     /// Distance to it; infinite for directional light.
@@ -102,7 +102,7 @@ pub struct Arriving {
 
 impl WorldLight {
     /// What arrives at `x`; `None` outside the cone or range, or at the light itself.
-    pub fn arriving(&self, x: DVec3) -> Option<Arriving> {
+    pub(super) fn arriving(&self, x: DVec3) -> Option<Arriving> {
         if self.kind == PunctualKind::Directional {
             return Some(Arriving {
                 l: -self.direction,
@@ -136,7 +136,7 @@ impl WorldLight {
 
 /// Light from infinity.
 #[derive(Clone, Debug)]
-pub enum Sky {
+pub(crate) enum Sky {
     /// Even; found by scattering alone.
     Constant(DVec3),
     /// An image.
@@ -145,7 +145,7 @@ pub enum Sky {
 
 /// A latitude-longitude image with its sampling tables.
 #[derive(Clone, Debug)]
-pub struct SkyImage {
+pub(crate) struct SkyImage {
     width: usize,
     height: usize,
     texels: Vec<Vec3>,
@@ -156,7 +156,7 @@ pub struct SkyImage {
 
 impl SkyImage {
     /// Tables for an image of `width * height` texels, each of even radiance.
-    pub fn new(width: usize, height: usize, texels: Vec<Vec3>, rotation: f64) -> Self {
+    pub(super) fn new(width: usize, height: usize, texels: Vec<Vec3>, rotation: f64) -> Self {
         let columns: Vec<Choice> = texels
             .chunks_exact(width)
             .map(|row| Choice::new(row.iter().map(|t| brightness(t.as_dvec3()))))
@@ -166,13 +166,13 @@ impl SkyImage {
     }
 
     /// Radiance from a direction (unit, world).
-    pub fn radiance(&self, direction: DVec3) -> DVec3 {
+    pub(super) fn radiance(&self, direction: DVec3) -> DVec3 {
         let (x, y) = self.texel(direction);
         self.texels[y * self.width + x].as_dvec3()
     }
 
     /// A direction by brightness and its density per steradian; `None` for a black sky.
-    pub fn sample(&self, u: [f64; 2]) -> Option<(DVec3, f64)> {
+    pub(super) fn sample(&self, u: [f64; 2]) -> Option<(DVec3, f64)> {
         let (y, fy) = self.rows.draw(u[1])?;
         let (x, fx) = self.columns[y].draw(u[0])?;
         let azimuth = ((x as f64 + fx) / self.width as f64 - 0.5) * 2.0 * PI;
@@ -187,7 +187,7 @@ impl SkyImage {
     }
 
     /// Density of [`Self::sample`], per steradian.
-    pub fn pdf(&self, direction: DVec3) -> f64 {
+    pub(crate) fn pdf(&self, direction: DVec3) -> f64 {
         let (x, y) = self.texel(direction);
         self.texel_pdf(x, y)
     }
@@ -215,7 +215,7 @@ fn band(y: usize, height: usize) -> f64 {
 
 /// All that emits.
 #[derive(Clone, Debug)]
-pub struct Lights {
+pub(super) struct Lights {
     triangles: Vec<(usize, f64)>,
     choice: Choice,
     /// Density per square metre of every triangle of the hierarchy; 0 for what is no light.
@@ -231,7 +231,7 @@ const ALL_PUNCTUAL: usize = 16;
 
 impl Lights {
     /// Gathers the emitters of a scene.
-    pub fn new(scene: &Scene, poses: &[DAffine3], bvh: &Bvh) -> Self {
+    pub(super) fn new(scene: &Scene, poses: &[DAffine3], bvh: &Bvh) -> Self {
         let power: Vec<f64> = (scene.materials.iter())
             .map(|m| {
                 let mean = m.emissive_texture.map_or(DVec3::ONE, |r| {
@@ -283,7 +283,7 @@ impl Lights {
     }
 
     /// A point on an emissive triangle, by power; `None` when nothing emits.
-    pub fn sample_triangle(&self, choose: f64, u: [f64; 2]) -> Option<TriangleSample> {
+    pub(crate) fn sample_triangle(&self, choose: f64, u: [f64; 2]) -> Option<TriangleSample> {
         let triangle = self.triangles[self.choice.draw(choose)?.0].0;
         let r = u[0].sqrt();
         let weights = [1.0 - r, r * (1.0 - u[1]), r * u[1]];
@@ -291,12 +291,12 @@ impl Lights {
     }
 
     /// Density per square metre with which [`Self::sample_triangle`] finds points of a triangle.
-    pub fn triangle_pdf(&self, triangle: usize) -> f64 {
+    pub(crate) fn triangle_pdf(&self, triangle: usize) -> f64 {
         self.pdf_area[triangle]
     }
 
     /// Visits what arrives from punctual lights: all of them, or one of many with its irradiance divided by its probability.
-    pub fn punctual(&self, x: DVec3, choose: f64, mut visit: impl FnMut(Arriving)) {
+    pub(super) fn punctual(&self, x: DVec3, choose: f64, mut visit: impl FnMut(Arriving)) {
         if self.punctual.len() <= ALL_PUNCTUAL {
             self.punctual.iter().filter_map(|l| l.arriving(x)).for_each(visit);
         } else if let Some((i, _)) = self.punctual_choice.draw(choose) {
@@ -308,7 +308,7 @@ impl Lights {
     }
 
     /// Radiance from infinity.
-    pub fn sky_radiance(&self, direction: DVec3) -> DVec3 {
+    pub(crate) fn sky_radiance(&self, direction: DVec3) -> DVec3 {
         match &self.sky {
             Sky::Constant(l) => *l,
             Sky::Image(image) => image.radiance(direction),
@@ -316,7 +316,7 @@ impl Lights {
     }
 
     /// Density with which light sampling finds a direction of the sky, per steradian.
-    pub fn sky_pdf(&self, direction: DVec3) -> f64 {
+    pub(crate) fn sky_pdf(&self, direction: DVec3) -> f64 {
         match &self.sky {
             Sky::Constant(_) => 0.0,
             Sky::Image(image) => image.pdf(direction),

@@ -10,7 +10,7 @@ use std::f64::consts::PI;
 /// `cos`: between the incident direction and the normal, 0..1. 1 under total reflection, exactly 0 for `eta` 1.
 ///
 /// \[Walter07\] eq. 22, with `g - c` written as `(eta^2 - 1) / (g + c)`: the difference cancels when `eta` is near 1.
-pub fn fresnel_dielectric(eta: f64, cos: f64) -> f64 {
+pub(crate) fn fresnel_dielectric(eta: f64, cos: f64) -> f64 {
     let c = cos.clamp(0.0, 1.0);
     let contrast = (eta - 1.0) * (eta + 1.0);
     if contrast == 0.0 {
@@ -27,7 +27,7 @@ pub fn fresnel_dielectric(eta: f64, cos: f64) -> f64 {
 }
 
 /// Schlick's approximation per channel: `f0 + (1 - f0)(1 - cos)^5`.
-pub fn fresnel_schlick(f0: DVec3, cos: f64) -> DVec3 {
+pub(crate) fn fresnel_schlick(f0: DVec3, cos: f64) -> DVec3 {
     let m = (1.0 - cos).clamp(0.0, 1.0);
     f0 + (DVec3::ONE - f0) * (m * m * m * m * m)
 }
@@ -41,7 +41,7 @@ pub fn refract(v: DVec3, h: DVec3, eta: f64) -> Option<DVec3> {
 }
 
 /// Density of microfacet normals, per steradian: `alpha^2 / (pi ((h.z^2)(alpha^2 - 1) + 1)^2)`, 0 below the surface.
-pub fn ggx_d(h: DVec3, alpha: f64) -> f64 {
+pub(crate) fn ggx_d(h: DVec3, alpha: f64) -> f64 {
     if h.z <= 0.0 {
         return 0.0;
     }
@@ -52,7 +52,7 @@ pub fn ggx_d(h: DVec3, alpha: f64) -> f64 {
 }
 
 /// Smith's auxiliary function for a direction of the given |cosine| to the normal; infinite at grazing.
-pub fn smith_lambda(cos: f64, alpha: f64) -> f64 {
+pub(crate) fn smith_lambda(cos: f64, alpha: f64) -> f64 {
     let c2 = cos * cos;
     let tan2 = (1.0 - c2).max(0.0) / c2;
     // sqrt(1 + x) - 1 without cancellation for small x.
@@ -65,17 +65,18 @@ pub fn smith_lambda(cos: f64, alpha: f64) -> f64 {
 }
 
 /// Share of microfacets visible from a direction.
-pub fn smith_g1(cos: f64, alpha: f64) -> f64 {
+pub(crate) fn smith_g1(cos: f64, alpha: f64) -> f64 {
     1.0 / (1.0 + smith_lambda(cos.abs(), alpha))
 }
 
 /// Height-correlated shadowing and masking `1 / (1 + L(v) + L(l))`; for refraction with the |cosine| of both, as for reflection.
-pub fn smith_g2(cos_v: f64, cos_l: f64, alpha: f64) -> f64 {
+pub(crate) fn smith_g2(cos_v: f64, cos_l: f64, alpha: f64) -> f64 {
     1.0 / (1.0 + smith_lambda(cos_v.abs(), alpha) + smith_lambda(cos_l.abs(), alpha))
 }
 
 /// `G2 / G1(v)`: the weight of a direction drawn through a visible normal. Finite at grazing `v`.
-pub fn smith_g2_over_g1(cos_v: f64, cos_l: f64, alpha: f64) -> f64 {
+#[cfg(test)]
+pub(crate) fn smith_g2_over_g1(cos_v: f64, cos_l: f64, alpha: f64) -> f64 {
     let lambda_v = smith_lambda(cos_v.abs(), alpha);
     let lambda_l = smith_lambda(cos_l.abs(), alpha);
     if lambda_v.is_infinite() {
@@ -85,7 +86,8 @@ pub fn smith_g2_over_g1(cos_v: f64, cos_l: f64, alpha: f64) -> f64 {
 }
 
 /// Density of normals visible from `v` (`v.z > 0`), per steradian.
-pub fn visible_normal_pdf(v: DVec3, h: DVec3, alpha: f64) -> f64 {
+#[cfg(test)]
+pub(crate) fn visible_normal_pdf(v: DVec3, h: DVec3, alpha: f64) -> f64 {
     if h.z <= 0.0 || v.z <= 0.0 {
         return 0.0;
     }
@@ -93,7 +95,7 @@ pub fn visible_normal_pdf(v: DVec3, h: DVec3, alpha: f64) -> f64 {
 }
 
 /// Draws a normal visible from `v`. `None` for the one cap point at which the half vector vanishes.
-pub fn sample_visible_normal(v: DVec3, alpha: f64, u: [f64; 2]) -> Option<DVec3> {
+pub(crate) fn sample_visible_normal(v: DVec3, alpha: f64, u: [f64; 2]) -> Option<DVec3> {
     let v_std = DVec3::new(v.x * alpha, v.y * alpha, v.z).normalize();
     let phi = 2.0 * PI * u[0];
     let z = (1.0 - u[1]) * (1.0 + v_std.z) - v_std.z;

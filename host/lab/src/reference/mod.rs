@@ -10,12 +10,12 @@
 
 pub mod bsdf;
 pub mod bvh;
-pub mod image;
-pub mod light;
+mod image;
+mod light;
 pub mod microfacet;
-pub mod path;
-pub mod surface;
-pub mod texture;
+mod path;
+mod surface;
+mod texture;
 
 pub use dpm_device::rng::Sampler;
 pub use image::{ReferenceImage, RenderSettings};
@@ -29,7 +29,7 @@ use light::Lights;
 use std::sync::OnceLock;
 
 /// Distance of a new ray's origin from its surface, in units of the largest coordinate.
-pub const OFFSET: f64 = 1e-12;
+pub(crate) const OFFSET: f64 = 1e-12;
 
 /// A scene with every body at a pose, ready to be traced.
 pub struct Reference<'a> {

@@ -58,7 +58,7 @@ pub struct Look {
 }
 
 /// Below this index a solid refracts too little to be told from none: its rough transmission would be a spike that f32 cannot carry.
-pub const STRAIGHT_BELOW_IOR: f64 = 1.001;
+pub(super) const STRAIGHT_BELOW_IOR: f64 = 1.001;
 
 impl Reference<'_> {
     /// What lies at a hit.

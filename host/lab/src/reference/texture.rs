@@ -5,14 +5,14 @@ use glam::{DVec2, DVec4};
 
 /// Applies KHR_texture_transform: `offset + R scale uv` with `R = (cos, sin; -sin, cos)`: v runs down, so this turns the coordinates
 /// counter-clockwise as seen in the image (the extension's own example fixes the sign).
-pub fn transform(r: &TextureRef, uv: DVec2) -> DVec2 {
+pub(super) fn transform(r: &TextureRef, uv: DVec2) -> DVec2 {
     let (sin, cos) = f64::from(r.rotation).sin_cos();
     let p = uv * r.scale.as_dvec2();
     r.offset.as_dvec2() + DVec2::new(cos * p.x + sin * p.y, cos * p.y - sin * p.x)
 }
 
 /// The value at transformed coordinates: RGB decoded, alpha linear, each 0..1. White for an image without texels.
-pub fn sample(texture: &Texture, uv: DVec2) -> DVec4 {
+pub(super) fn sample(texture: &Texture, uv: DVec2) -> DVec4 {
     if texture.width == 0 || texture.height == 0 {
         return DVec4::ONE;
     }
@@ -55,7 +55,7 @@ fn fold(i: f64, n: u32, wrap: Wrap) -> usize {
 }
 
 /// The transfer function of IEC 61966-2-1, code value 0..1 to linear 0..1.
-pub fn decode_srgb(v: f64) -> f64 {
+pub(crate) fn decode_srgb(v: f64) -> f64 {
     if v <= 0.04045 {
         v / 12.92
     } else {
@@ -64,7 +64,7 @@ pub fn decode_srgb(v: f64) -> f64 {
 }
 
 /// Mean over all texels, linear.
-pub fn mean(texture: &Texture) -> DVec4 {
+pub(super) fn mean(texture: &Texture) -> DVec4 {
     let mut histogram = [[0u64; 4]; 256];
     for t in &texture.texels {
         for c in 0..4 {

@@ -3,9 +3,9 @@
 /// Columns and rows of a character.
 const SIZE: [usize; 2] = [3, 5];
 /// From one character to the next, dots.
-pub const ADVANCE: usize = SIZE[0] + 1;
+pub(crate) const ADVANCE: usize = SIZE[0] + 1;
 /// From one line to the next, dots.
-pub const LINE: usize = SIZE[1] + 2;
+pub(crate) const LINE: usize = SIZE[1] + 2;
 
 /// Five rows of three dots, the first row in the highest bits; small letters look like capitals, what is not here like a space.
 fn dots(c: char) -> u16 {
@@ -60,7 +60,7 @@ fn dots(c: char) -> u16 {
 }
 
 /// Calls `dot` with column and row of every dot of `text` that is set; lines end at `\n`.
-pub fn for_each_dot(text: &str, mut dot: impl FnMut(usize, usize)) {
+pub(crate) fn for_each_dot(text: &str, mut dot: impl FnMut(usize, usize)) {
     for (row, line) in text.lines().enumerate() {
         for (column, c) in line.chars().enumerate() {
             let bits = dots(c);

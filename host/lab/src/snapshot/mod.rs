@@ -27,7 +27,7 @@ use std::path::{Path, PathBuf};
 use views::{missing, srgb_canvas, tile_errors, Views};
 
 /// A frame that comes later takes too long to reach; histories have settled long before.
-pub const MAX_FRAME: u32 = 100_000;
+pub(crate) const MAX_FRAME: u32 = 100_000;
 
 /// What a picture shows.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, clap::ValueEnum)]

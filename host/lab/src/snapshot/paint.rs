@@ -18,16 +18,16 @@ pub struct Canvas {
 }
 
 /// Colour of pixels that have no value: not lit.
-pub const NOTHING: [u8; 3] = [16, 16, 16];
+pub(crate) const NOTHING: [u8; 3] = [16, 16, 16];
 /// Colour of values that are not finite. No colour map has it.
-pub const NOT_FINITE: [u8; 3] = [255, 0, 255];
+pub(crate) const NOT_FINITE: [u8; 3] = [255, 0, 255];
 
 const PAPER: [u8; 3] = [250, 250, 250];
 const INK: [u8; 3] = [20, 20, 20];
 /// Pictures are enlarged by a whole factor until they have this many rows.
 const LEAST_ROWS: usize = 480;
 /// Pixels of a dot of text.
-pub const DOT: usize = 3;
+pub(crate) const DOT: usize = 3;
 const LEGEND_COLUMNS: usize = 15 * ADVANCE * DOT + 2 * MARGIN;
 const MARGIN: usize = 12;
 const BAR: usize = 28;
@@ -70,7 +70,7 @@ impl Canvas {
     }
 
     /// Copies a picture in, every pixel as a square of `m`; what lies outside is cut off.
-    pub fn paste(&mut self, x: usize, y: usize, m: usize, other: &Canvas) {
+    pub(crate) fn paste(&mut self, x: usize, y: usize, m: usize, other: &Canvas) {
         for j in 0..other.height {
             for i in 0..other.width {
                 self.block(x + i * m, y + j * m, m, m, other.at(i, j));
@@ -112,7 +112,7 @@ impl Canvas {
 }
 
 /// By what factor a raster is enlarged beside a legend.
-pub fn magnification(raster: Raster) -> usize {
+pub(crate) fn magnification(raster: Raster) -> usize {
     LEAST_ROWS.div_ceil(raster.height() as usize).clamp(1, 32)
 }
 

@@ -14,7 +14,7 @@ use glam::{DAffine3, Vec3};
 const TILE: usize = dpm_render::tiles::TILE as usize;
 
 /// What the pictures of one frame are made from.
-pub struct Views<'a> {
+pub(crate) struct Views<'a> {
     /// The raster.
     pub raster: Raster,
     /// How rays were spent.
@@ -65,7 +65,7 @@ impl Views<'_> {
     }
 
     /// Radiance of every pixel, black where nothing is lit.
-    pub fn radiance(&self) -> Vec<Vec3> {
+    pub(crate) fn radiance(&self) -> Vec<Vec3> {
         self.lit(self.slot.radiance(), |r| Vec3::new(r[0], r[1], r[2]))
             .into_iter()
             .map(Option::unwrap_or_default)
@@ -73,7 +73,7 @@ impl Views<'_> {
     }
 
     /// The picture; [`missing`] says whether there is one. The observer's view is not made from one frame: see `snapshot`.
-    pub fn paint(&self, image: SnapshotImage) -> Canvas {
+    pub(crate) fn paint(&self, image: SnapshotImage) -> Canvas {
         use SnapshotImage as I;
         let raster = self.raster;
         let surfaces = self.slot.surfaces().unwrap_or(&[]);
@@ -162,7 +162,7 @@ impl Views<'_> {
 }
 
 /// The six allowed rates with their colours, fine to coarse.
-pub const RATES: [(&str, [u8; 3]); 6] = [
+pub(crate) const RATES: [(&str, [u8; 3]); 6] = [
     ("1 x 1", [215, 48, 39]),
     ("1 x 2", [252, 141, 89]),
     ("2 x 1", [254, 224, 144]),
@@ -185,7 +185,7 @@ fn kind_of(code: u32) -> usize {
 }
 
 /// The larger of both axes' error of \[paper\] eq. 1 of every tile, from a slot that was made for debugging.
-pub fn tile_errors(raster: Raster, method: &Method, slot: &FrameSlot) -> Vec<Option<f32>> {
+pub(crate) fn tile_errors(raster: Raster, method: &Method, slot: &FrameSlot) -> Vec<Option<f32>> {
     let (Some(surfaces), Some(guides), Some(prior)) =
         (slot.surfaces(), slot.guides(), slot.prior_luminance())
     else {
@@ -217,7 +217,7 @@ pub fn tile_errors(raster: Raster, method: &Method, slot: &FrameSlot) -> Vec<Opt
 }
 
 /// Reflectance by which a pixel's radiance is divided before it is filtered.
-pub fn albedo_of(g: &Guide) -> [f32; 3] {
+pub(crate) fn albedo_of(g: &Guide) -> [f32; 3] {
     let half = |bits: u32| half_to_f32(bits as u16);
     [half(g.albedo_rg), half(g.albedo_rg >> 16), half(g.albedo_b)]
 }
@@ -239,7 +239,7 @@ fn half_to_f32(bits: u16) -> f32 {
 }
 
 /// Linear colours as an sRGB picture.
-pub fn srgb_canvas(raster: Raster, linear: &[Vec3], scale: f32) -> Canvas {
+pub(crate) fn srgb_canvas(raster: Raster, linear: &[Vec3], scale: f32) -> Canvas {
     Canvas { width: raster.width() as usize, height: raster.height() as usize, rgb: to_srgb(linear, scale) }
 }
 

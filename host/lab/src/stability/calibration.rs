@@ -9,7 +9,7 @@ use dpm_scene::geometry::projector::ProjectorCamera;
 use glam::{DVec2, DVec3};
 
 /// The cases.
-pub fn cases() -> Vec<Case> {
+pub(super) fn cases() -> Vec<Case> {
     vec![
         Case::new("calibration-exact-data", "6 to 40 exact pairs, lens shift outside the raster", "truth", "relative", 1e-9, exact),
         Case::new("calibration-degenerate", "5 pairs, one point, a line, a plane, two views of five points, a cubic through the projector, NaN", "refused with the rank", "faults", 0.0, degenerate),

@@ -6,7 +6,7 @@ use dpm_device::clock_map::{ClockMap, ExchangeOutcome};
 use dpm_device::time::{DeviceTicks, HostTime};
 
 /// The cases.
-pub fn cases() -> Vec<Case> {
+pub(super) fn cases() -> Vec<Case> {
     vec![
         Case::new(
             "clock-skew-and-drift",

@@ -17,7 +17,7 @@ pub fn open() -> Device {
 }
 
 /// A case that needs a device: name, input, oracle, unit, bound and measure, as [`Case::new`] takes them.
-pub struct GpuCase(
+pub(crate) struct GpuCase(
     pub &'static str,
     pub &'static str,
     pub &'static str,

@@ -14,7 +14,7 @@ use std::sync::Arc;
 const SCENES: u64 = 17;
 
 /// The cases.
-pub const CASES: &[GpuCase] = &[
+pub(crate) const CASES: &[GpuCase] = &[
     GpuCase(
         "gpu-random-scenes-pixels",
         "17 scenes by chance: shapes, poses, all materials, textures, lights, skies",

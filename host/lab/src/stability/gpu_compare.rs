@@ -87,7 +87,7 @@ pub struct Explained {
 
 impl Comparison {
     /// Share of the pixels that met anything whose surfaces differ.
-    pub fn different_share(&self) -> f64 {
+    pub(crate) fn different_share(&self) -> f64 {
         if self.met == 0 {
             return f64::NAN;
         }

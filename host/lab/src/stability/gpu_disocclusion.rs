@@ -19,7 +19,7 @@ const fn case(name: &'static str, input: &'static str, measure: fn(&Arc<Gpu>, u6
 }
 
 /// The cases.
-pub const CASES: &[GpuCase] = &[
+pub(crate) const CASES: &[GpuCase] = &[
     case(
         "gpu-pose-jump",
         "a glowing plate over a glowing floor that jumps by its width, every method without shading rates",

@@ -16,7 +16,7 @@ use glam::{DAffine3, DVec2, DVec3, Vec3};
 use std::sync::Arc;
 
 /// The cases.
-pub const CASES: &[GpuCase] = &[
+pub(crate) const CASES: &[GpuCase] = &[
     GpuCase(
         "gpu-short-histories-stay-bounded",
         "the demo's hare that crosses and bust that turns, one sample asked for, histories of two frames, method dpm",

@@ -18,7 +18,7 @@ use glam::{DAffine3, DVec3, Vec3};
 use std::sync::Arc;
 
 /// The cases.
-pub const CASES: &[GpuCase] = &[
+pub(crate) const CASES: &[GpuCase] = &[
     GpuCase(
         "gpu-tiles-at-borders",
         "rasters of 1 x 1 to 33 x 31, every method",
@@ -110,7 +110,7 @@ pub const CASES: &[GpuCase] = &[
 ];
 
 /// Every method with its authors' constants.
-pub fn methods() -> Vec<Method> {
+pub(super) fn methods() -> Vec<Method> {
     METHODS.into_iter().map(|which| method_of(&RenderConfig::default(), which)).collect()
 }
 

@@ -13,7 +13,7 @@ use glam::{DAffine3, DQuat, DVec2, DVec3, Vec3};
 use std::sync::Arc;
 
 /// The cases.
-pub const CASES: &[GpuCase] = &[
+pub(crate) const CASES: &[GpuCase] = &[
     GpuCase(
         "gpu-size-follows-equation-3",
         "a floor, the projector above and the eye low beside it, method paper",

@@ -15,7 +15,7 @@ use glam::{DVec3, Vec3};
 use std::sync::Arc;
 
 /// The cases.
-pub const CASES: &[GpuCase] = &[
+pub(crate) const CASES: &[GpuCase] = &[
     GpuCase(
         "gpu-noise-falls",
         "independent samples, blue noise and sequences that go on, of surface points and of pixels: 1 and 16 samples a frame, 1 and 64 frames",

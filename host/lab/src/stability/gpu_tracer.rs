@@ -12,7 +12,7 @@ use glam::{DAffine3, DQuat, DVec2, DVec3, Vec3};
 use std::sync::Arc;
 
 /// The cases.
-pub const CASES: &[GpuCase] = &[
+pub(crate) const CASES: &[GpuCase] = &[
     GpuCase(
         "gpu-furnace-convex",
         "white Lambertian sphere in even light, 64 bounces",
@@ -290,7 +290,7 @@ fn form_factor(gpu: &Arc<Gpu>, seed: u64) -> f64 {
 }
 
 /// A table with a ball, a lamp and a light, all lengths times `scale`.
-pub fn still_life(scale: f32) -> Scene {
+pub(crate) fn still_life(scale: f32) -> Scene {
     let mut scene = scene_of(floor(scale, 0.0), diffuse(Vec3::new(0.7, 0.5, 0.4)));
     let ball = sphere(Vec3::Y * 0.45 * scale, 0.4 * scale, 2, true);
     add(&mut scene, ball, Material { roughness: 0.4, ..diffuse(Vec3::new(0.3, 0.5, 0.8)) });

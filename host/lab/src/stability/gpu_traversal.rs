@@ -14,7 +14,7 @@ use glam::{DAffine3, DMat3, DVec3, Vec3};
 use std::sync::Arc;
 
 /// The cases.
-pub const CASES: &[GpuCase] = &[
+pub(crate) const CASES: &[GpuCase] = &[
     GpuCase("gpu-axis-parallel-rays", "rays along all axes, in the planes of seams and through vertices, at distances that round differently", "every ray hits at its closed form", "faults", 0.0, axis_parallel),
     GpuCase("gpu-needles-and-zero-areas", "points, lines, needles of 1e-20 and twins in a closed mesh", "the picture without them", "radiance", 1e-5, needles),
     GpuCase("gpu-watertight", "a million rays inside a closed mesh 80 m off its origin under a bright sky", "none gets out", "share", 0.0, watertight),

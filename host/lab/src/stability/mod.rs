@@ -4,27 +4,27 @@
 //! error and the bound. The cases call the code that runs in the rig, not copies of its formulas. Each is a function of a seed, so a failure
 //! replays.
 
-pub mod calibration;
+mod calibration;
 #[cfg(test)]
 mod calibration_tests;
-pub mod clocks;
+mod clocks;
 pub mod estimate;
 pub mod gpu;
-pub mod gpu_chain;
+mod gpu_chain;
 pub mod gpu_compare;
-pub mod gpu_disocclusion;
-pub mod gpu_histories_in_motion;
-pub mod gpu_history;
-pub mod gpu_paper;
-pub mod gpu_samplers;
+mod gpu_disocclusion;
+mod gpu_histories_in_motion;
+mod gpu_history;
+mod gpu_paper;
+mod gpu_samplers;
 pub mod gpu_shot;
-pub mod gpu_tracer;
-pub mod gpu_traversal;
-pub mod planes;
-pub mod predictor;
+mod gpu_tracer;
+mod gpu_traversal;
+mod planes;
+mod predictor;
 pub mod scattering;
 pub mod statistics;
-pub mod tracer;
+mod tracer;
 
 use serde::Serialize;
 use std::ops::RangeInclusive;
@@ -179,7 +179,7 @@ pub fn worst(case: &Case, seeds: RangeInclusive<u64>) -> Option<CaseResult> {
 }
 
 /// Runs one case. A panic inside it is a failure of the case, not of the run.
-pub fn run_case(case: &Case, seed: u64) -> CaseResult {
+pub(crate) fn run_case(case: &Case, seed: u64) -> CaseResult {
     let start = Instant::now();
     if let Some(missing) = &case.missing {
         return result(case, seed, start, (None, Some(missing.clone())), CaseVerdict::NotRun);

@@ -8,7 +8,7 @@ use dpm_device::time::{DeviceTicks, FrameRate};
 use dpm_render::pack::{pack, quantise, unpack, BitPlaneFrame, Kernel};
 
 /// The cases.
-pub fn cases() -> Vec<Case> {
+pub(super) fn cases() -> Vec<Case> {
     vec![
         Case::new(
             "planes-all-code-values",

@@ -3,7 +3,7 @@
 use super::statistics::Mean;
 use super::Case;
 use crate::reference::Sampler;
-use dpm_common::se3::{so3_between, so3_exp, so3_log};
+use dpm_common::so3::{so3_between, so3_exp, so3_log};
 use dpm_device::pose::Pose;
 use dpm_device::time::HostTime;
 use dpm_device::tracker::{BodyIndex, TrackerSample};
@@ -13,7 +13,7 @@ use dpm_tracking::{Freshness, PoseFilter, PoseFilterConfig, PosePrediction, Verd
 use glam::{DQuat, DVec3};
 
 /// The cases.
-pub fn cases() -> Vec<Case> {
+pub(super) fn cases() -> Vec<Case> {
     vec![
         Case::new(
             "predictor-at-rest",

@@ -5,7 +5,7 @@ use std::f64::consts::PI;
 
 /// Outcome of a chi-square test of directions.
 #[derive(Clone, Copy, Debug, PartialEq)]
-pub struct DirectionTest {
+pub(crate) struct DirectionTest {
     /// Integral of the density over the sphere minus the share of samples that were not absorbed.
     pub integral_error: f64,
     /// Probability of a worse fit by chance.
@@ -14,7 +14,7 @@ pub struct DirectionTest {
 
 /// Upper tail of the chi-square distribution by the normal approximation of its cube root \[Wilson31\], tail by \[Abramowitz64\] 7.1.26:
 /// good to a few percent of p, enough for thresholds.
-pub fn chi2_p_value(chi2: f64, freedom: f64) -> f64 {
+pub(crate) fn chi2_p_value(chi2: f64, freedom: f64) -> f64 {
     let spread = 2.0 / (9.0 * freedom);
     let z = ((chi2 / freedom).cbrt() - (1.0 - spread)) / spread.sqrt();
     let t = 1.0 / (1.0 + 0.3275911 * z.abs() / std::f64::consts::SQRT_2);
@@ -34,7 +34,7 @@ const CELLS: usize = 40;
 const SUB: usize = 14;
 
 /// Draws `samples` directions (`None`: absorbed) and compares their histogram with the density per steradian.
-pub fn test_directions(
+pub(crate) fn test_directions(
     samples: u32,
     sample: &mut dyn FnMut() -> Option<DVec3>,
     pdf: &dyn Fn(DVec3) -> f64,
@@ -106,7 +106,7 @@ impl Mean {
     }
 
     /// Its standard error.
-    pub fn standard_error(&self) -> f64 {
+    pub(crate) fn standard_error(&self) -> f64 {
         (self.m2 / (self.n * (self.n - 1.0).max(1.0))).sqrt()
     }
 

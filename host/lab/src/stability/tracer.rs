@@ -9,7 +9,7 @@ use dpm_scene::{Environment, Material, PunctualKind, Scene};
 use glam::{DAffine3, DVec3, Vec3};
 
 /// The cases.
-pub fn cases() -> Vec<Case> {
+pub(super) fn cases() -> Vec<Case> {
     vec![
         Case::new(
             "tracer-furnace-convex",

@@ -56,7 +56,7 @@ impl CommandList {
 
     /// Time stamps of the last finished run, in nanoseconds since the first of them; fills and returns how many there are.
     /// Allocates nothing.
-    pub fn stamps_ns(&self, out: &mut [u64]) -> usize {
+    pub(crate) fn stamps_ns(&self, out: &mut [u64]) -> usize {
         let Some(queries) = self.queries.filter(|_| !self.gpu.is_lost()) else { return 0 };
         let n = (self.stamps as usize).min(out.len());
         // SAFETY: the queries were written by the last submission, whose fence the caller waited for.
@@ -119,7 +119,7 @@ pub struct Recorder<'a> {
 
 impl Recorder<'_> {
     /// Runs `pipeline` over as many workgroups as `arguments` holds at `offset` (three u32) when the list runs.
-    pub fn dispatch_indirect(
+    pub(crate) fn dispatch_indirect(
         &mut self,
         pipeline: &ComputePipeline,
         set: &BindingSet,

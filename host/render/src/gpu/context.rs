@@ -470,7 +470,7 @@ impl Gpu {
     }
 
     /// Most elements of a texel buffer.
-    pub fn max_texel_elements(&self) -> u64 {
+    pub(crate) fn max_texel_elements(&self) -> u64 {
         u64::from(self.limits.max_texel_buffer_elements)
     }
 

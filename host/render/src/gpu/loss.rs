@@ -27,7 +27,7 @@ impl LossBudget {
     /// Three losses a minute are survived: a GPU that is lost more often will not hold a picture.
     pub const MOST: usize = 3;
     /// A minute, nanoseconds.
-    pub const WITHIN_NS: i64 = 60_000_000_000;
+    pub(crate) const WITHIN_NS: i64 = 60_000_000_000;
 
     /// Survives `most` losses within any `within_ns` nanoseconds.
     pub fn new(most: usize, within_ns: i64) -> Self {

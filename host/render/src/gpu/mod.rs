@@ -21,7 +21,7 @@ mod reopen;
 pub use buffer::{Buffer, MemoryKind};
 pub(crate) use commands::run_now;
 pub use commands::{CommandList, FrameFence, Recorder};
-pub use context::{memory_given_up, validation_messages, DeviceSummary, Gpu, GpuOptions, MemoryGivenUp};
+pub use context::{memory_given_up, validation_messages, DeviceSummary, Gpu, GpuOptions};
 pub use error::{GpuError, MemoryPool};
 pub use loss::{AfterLoss, LossBudget};
 pub use pipeline::{BindingKind, BindingSet, BindingTable, ComputePipeline};

@@ -84,7 +84,7 @@ impl Kernel {
 }
 
 /// The bit of a code value `0x00BBGGRR` that a plane shows. A white plane shows the green bit.
-pub const fn source_bit(plane: PlaneSpec) -> u32 {
+pub(crate) const fn source_bit(plane: PlaneSpec) -> u32 {
     let channel = match plane.channel {
         Channel::Red => 0,
         Channel::Green | Channel::White => 8,

@@ -14,7 +14,7 @@ pub struct QuantiseCounts {
 }
 
 /// Offset that rounds to nearest.
-pub const ROUND: f32 = 0.5;
+pub(crate) const ROUND: f32 = 0.5;
 
 /// Drive (red, green, blue, and a fourth value that is ignored) into code values `0x00BBGGRR`. Values below 0 become 0, above
 /// 1 become 255. `offsets` holds one offset per pixel, 0 up to but not including 1; `None` rounds to nearest.

@@ -21,13 +21,13 @@ mod tests;
 
 pub use error::{ConfigError, ConfigErrors, Origin};
 pub use projector::*;
-pub use read::KeyDoc;
+pub(crate) use read::KeyDoc;
 pub use run::*;
 pub use safety::{
     InterlockConfig, InterlockSignal, KeyInterlockConfig, LimitsConfig, LineInterlockConfig,
     NoInterlockConfig, ProcessInterlockConfig,
 };
-pub use source::VARIABLE_PREFIX;
+pub(crate) use source::VARIABLE_PREFIX;
 pub use world::*;
 
 use crate::mock::MotionSpec;

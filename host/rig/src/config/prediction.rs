@@ -5,7 +5,7 @@ use dpm_tracking::{PoseFilterConfig, Prediction};
 
 impl PredictionConfig {
     /// The filter of every body; a body is lost when no sample has come for `lost_after_ms`.
-    pub fn to_filter(&self, lost_after_ms: u32) -> PoseFilterConfig {
+    pub(crate) fn to_filter(&self, lost_after_ms: u32) -> PoseFilterConfig {
         PoseFilterConfig {
             prediction: if self.on { Prediction::On } else { Prediction::Off },
             position_noise_m: self.noise_m,

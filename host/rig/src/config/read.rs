@@ -17,7 +17,7 @@ pub(super) struct Reader {
 
 impl Reader {
     /// Adds an error about `key`, written at `origin`.
-    pub fn refuse(
+    pub(super) fn refuse(
         &mut self,
         origin: &Origin,
         key: &str,
@@ -33,7 +33,7 @@ impl Reader {
     }
 
     /// Where `key` was written: itself, else the innermost table around it, else [`Origin::Default`].
-    pub fn origin_of(&self, key: &str) -> Origin {
+    pub(crate) fn origin_of(&self, key: &str) -> Origin {
         let mut key = key;
         loop {
             if let Some(origin) = self.written.get(key) {
@@ -47,17 +47,17 @@ impl Reader {
     }
 
     /// True when somebody wrote `key` itself.
-    pub fn is_written(&self, key: &str) -> bool {
+    pub(crate) fn is_written(&self, key: &str) -> bool {
         self.written.contains_key(key)
     }
 
     /// Marks `key` as written at `origin`.
-    pub fn mark(&mut self, key: &str, origin: &Origin) {
+    pub(super) fn mark(&mut self, key: &str, origin: &Origin) {
         self.written.insert(key.to_string(), origin.clone());
     }
 
     /// The entries of a table, or an error and `None`.
-    pub fn table<'n>(&mut self, node: &'n Node, key: &str) -> Option<&'n BTreeMap<String, Entry>> {
+    pub(super) fn table<'n>(&mut self, node: &'n Node, key: &str) -> Option<&'n BTreeMap<String, Entry>> {
         match &node.value {
             Value::Table(table) => Some(table),
             other => {
@@ -68,7 +68,7 @@ impl Reader {
     }
 
     /// Refuses every key of `table` that is not in `known`, naming the nearest one that is.
-    pub fn unknown_keys(&mut self, table: &BTreeMap<String, Entry>, section: &str, known: &[&str]) {
+    pub(crate) fn unknown_keys(&mut self, table: &BTreeMap<String, Entry>, section: &str, known: &[&str]) {
         for (name, entry) in table {
             if known.contains(&name.as_str()) {
                 continue;

@@ -6,7 +6,7 @@ use std::sync::Arc;
 use toml::de::{DeTable, DeValue};
 
 /// Prefix of environment variables that set a key: `DPM_SET_PROJECTOR__WIDTH=640` sets `projector.width`.
-pub const VARIABLE_PREFIX: &str = "DPM_SET_";
+pub(crate) const VARIABLE_PREFIX: &str = "DPM_SET_";
 
 /// A value and where it was written.
 #[derive(Clone, Debug)]
@@ -37,7 +37,7 @@ pub(super) struct Entry {
 
 impl Value {
     /// The kind, as messages name it.
-    pub fn kind(&self) -> &'static str {
+    pub(super) fn kind(&self) -> &'static str {
         match self {
             Self::Bool(_) => "a boolean",
             Self::Integer(_) => "an integer",
@@ -205,7 +205,7 @@ pub(super) fn variable_path(name: &str) -> Option<Vec<String>> {
 
 impl Node {
     /// The same value in the `toml` crate's own type; `None` for what no key takes.
-    pub fn to_toml(&self) -> Option<toml::Value> {
+    pub(crate) fn to_toml(&self) -> Option<toml::Value> {
         Some(match &self.value {
             Value::Bool(b) => toml::Value::Boolean(*b),
             Value::Integer(i) => toml::Value::Integer(*i),

@@ -42,7 +42,7 @@ pub struct Place {
 
 /// What a look for running rigs found.
 #[derive(Debug, Default)]
-pub struct Search {
+pub(crate) struct Search {
     /// Rigs that this user may give orders to.
     pub rigs: Vec<Place>,
     /// Rigs and folders that it may not, with the reason.

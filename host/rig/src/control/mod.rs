@@ -40,7 +40,7 @@ pub fn rig_name() -> &'static str {
 
 /// Where the environment says that locks and control sockets of running rigs are: `$DPM_RUNTIME_DIR`; `$XDG_RUNTIME_DIR/dpm`, where
 /// that folder is this user's; `/run/dpm` for root, or where it is this user's; else `dpm-UID` in the temporary folder.
-pub fn runtime_path() -> PathBuf {
+pub(crate) fn runtime_path() -> PathBuf {
     let variable = |name: &str| std::env::var_os(name).filter(|dir| !dir.is_empty()).map(PathBuf::from);
     choose(&variable, user(), &|path| std::fs::metadata(path).ok().map(|about| about.uid()))
 }
@@ -82,7 +82,7 @@ fn state_name(pid: u32) -> String {
 }
 
 /// True when the projector is as `order` wants it. Dark is dark: a projector with latched faults is as black as an order can make it.
-pub fn is_obeyed(order: Order, health: ProjectorHealth) -> bool {
+pub(crate) fn is_obeyed(order: Order, health: ProjectorHealth) -> bool {
     use ProjectorHealth as H;
     match order {
         Order::Black => matches!(health, H::Black | H::Faulted(_) | H::Stopped),

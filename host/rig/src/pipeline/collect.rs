@@ -62,7 +62,7 @@ pub struct FrameRecord {
 }
 
 /// Counts and distributions of a run.
-pub struct Collector {
+pub(crate) struct Collector {
     rig: Arc<Rig>,
     points: Vec<Vec<DVec3>>,
     placement: Placement,
@@ -132,7 +132,7 @@ fn histogram() -> Histogram<u64> {
 
 impl Collector {
     /// Keeps the last `keep` lit frames; `verify`: compares hashes of code values and light.
-    pub fn new(rig: Arc<Rig>, keep: usize, verify: bool) -> Self {
+    pub(super) fn new(rig: Arc<Rig>, keep: usize, verify: bool) -> Self {
         let points = (0..rig.bodies.len()).map(|i| registration_points(&rig, i)).collect();
         let measured = rig.config.real_time.pace == Pace::Real;
         // A tenth of a known run, but enough frames for a 99th percentile.
@@ -189,7 +189,7 @@ impl Collector {
     }
 
     /// Says that frames are prepared, and what is seen of the machine's standstills. To be called before the first frame.
-    pub fn about(mut self, prepared: bool, standstills: Option<Arc<SeenStandstills>>) -> Self {
+    pub(super) fn about(mut self, prepared: bool, standstills: Option<Arc<SeenStandstills>>) -> Self {
         self.prepared = prepared;
         if let Some(seen) = standstills {
             self.slots.excuse_by(seen);
@@ -198,7 +198,7 @@ impl Collector {
     }
 
     /// The run is over and everything is known: what became of every slot.
-    pub fn finish(&mut self, monitor: &RunMonitor) -> SlotCounts {
+    pub(super) fn finish(&mut self, monitor: &RunMonitor) -> SlotCounts {
         self.slots.read_orders(monitor.dark());
         self.slots.finish()
     }
@@ -470,7 +470,7 @@ impl Collector {
     }
 
     /// Fills what the run measured into a report.
-    pub fn fill(&self, report: &mut Report) {
+    pub(super) fn fill(&self, report: &mut Report) {
         let spread = |h: &Histogram<u64>, unit: f64| {
             (!h.is_empty()).then(|| Spread {
                 p50: h.value_at_quantile(0.5) as f64 / unit,

@@ -13,7 +13,7 @@ use glam::{DAffine3, DVec3};
 
 /// What became of a frame on the host.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
-pub enum Fate {
+pub(super) enum Fate {
     /// Still under way.
     #[default]
     UnderWay,
@@ -28,7 +28,7 @@ pub enum Fate {
 }
 
 /// A frame without its memory: who it is and what happened to it.
-pub struct FrameNote {
+pub(crate) struct FrameNote {
     /// Which frame.
     pub id: FrameId,
     /// Which slot of the projector it is for.
@@ -69,7 +69,7 @@ pub struct FrameNote {
 
 impl FrameNote {
     /// An empty note with room for `bodies` tracked bodies.
-    pub fn new(bodies: usize) -> Self {
+    pub(super) fn new(bodies: usize) -> Self {
         Self {
             id: FrameId::default(),
             slot: 0,
@@ -93,19 +93,19 @@ impl FrameNote {
     }
 
     /// Time that the GPU worked on it, nanoseconds; `None` where the device has no time stamps.
-    pub fn gpu_ns(&self) -> Option<i64> {
+    pub(super) fn gpu_ns(&self) -> Option<i64> {
         let ns: u64 = self.cost?.pass_ns.iter().sum();
         i64::try_from(ns).ok().filter(|&ns| ns > 0)
     }
 
     /// True when the link took it.
-    pub fn is_sent(&self) -> bool {
+    pub(crate) fn is_sent(&self) -> bool {
         self.fate == Fate::Offered(SendOutcome::Sent)
     }
 }
 
 /// The memory of a frame.
-pub struct FrameMemory {
+pub(crate) struct FrameMemory {
     /// Bodies that are lost: no light falls on them.
     pub lost: Vec<bool>,
     /// world-from-body of every body of the scene.
@@ -121,7 +121,7 @@ pub struct FrameMemory {
 }
 
 /// A frame and its memory.
-pub struct FrameJob {
+pub(crate) struct FrameJob {
     /// Who it is.
     pub note: Box<FrameNote>,
     /// Where it is.
@@ -129,7 +129,7 @@ pub struct FrameJob {
 }
 
 /// A hash of a frame's code values that is cheap enough for every frame.
-pub fn hash_codes(codes: impl Iterator<Item = u32>) -> u64 {
+pub(crate) fn hash_codes(codes: impl Iterator<Item = u32>) -> u64 {
     let mut hash = 0x9e37_79b9_7f4a_7c15u64;
     for code in codes {
         hash = (hash ^ u64::from(code)).wrapping_mul(0xff51_afd7_ed55_8ccd);

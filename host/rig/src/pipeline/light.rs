@@ -14,7 +14,7 @@ use std::collections::VecDeque;
 
 /// What the projector did in one slot.
 #[derive(Clone, Copy, Debug)]
-pub struct LightNote {
+pub(crate) struct LightNote {
     /// The event.
     pub event: LightEvent,
     /// Hash of the light as code values; 0 when not asked for.
@@ -39,7 +39,7 @@ pub struct LightFrame {
 }
 
 /// Watches a mock projector.
-pub struct LightRecorder {
+pub(crate) struct LightRecorder {
     /// `None` after [`LightRecorder::close`].
     notes: Option<Sender<LightNote>>,
     /// Notes that found no room.
@@ -56,7 +56,12 @@ pub struct LightRecorder {
 impl LightRecorder {
     /// Notes go to `notes`; the last `keep` frames of light stay; `hash`: hash every frame of light; `marks`: the
     /// planes, in this order, are of [`super::prepared`] and are looked at for parts of other frames.
-    pub fn new(notes: Sender<LightNote>, keep: usize, hash: bool, marks: Option<PlaneSchedule>) -> Self {
+    pub(crate) fn new(
+        notes: Sender<LightNote>,
+        keep: usize,
+        hash: bool,
+        marks: Option<PlaneSchedule>,
+    ) -> Self {
         Self {
             notes: Some(notes),
             notes_lost: 0,
@@ -69,7 +74,7 @@ impl LightRecorder {
     }
 
     /// Lets the mock live up to `now`, one slot at a time, and notes all light.
-    pub fn advance(&mut self, mock: &mut EmulatedProjector, now: HostTime) {
+    pub(crate) fn advance(&mut self, mock: &mut EmulatedProjector, now: HostTime) {
         use dpm_device::transport::LinkDevice;
         while let Some(due) = mock.next_due().filter(|&due| due <= now) {
             let watch = Stopwatch::start();
@@ -103,12 +108,12 @@ impl LightRecorder {
     }
 
     /// The hash of all light in order, in hexadecimal digits; `None` where it was not asked for.
-    pub fn hash(&self) -> Option<String> {
+    pub(crate) fn hash(&self) -> Option<String> {
         self.hash.then(|| format!("{:016x}", self.light_hash))
     }
 
     /// No more light will be noted: whoever takes the notes comes to their end.
-    pub fn close(&mut self) {
+    pub(crate) fn close(&mut self) {
         self.notes = None;
     }
 
@@ -120,7 +125,7 @@ impl LightRecorder {
     }
 
     /// The last frames of light, oldest first.
-    pub fn into_frames(self) -> Vec<LightFrame> {
+    pub(crate) fn into_frames(self) -> Vec<LightFrame> {
         self.frames.into()
     }
 }

@@ -25,13 +25,13 @@ pub(super) struct Placement {
 
 impl Placement {
     /// For `bodies` tracked bodies.
-    pub fn new(bodies: usize) -> Self {
+    pub(super) fn new(bodies: usize) -> Self {
         Self { bodies: vec![Body::default(); bodies] }
     }
 
     /// A frame for world-from-body `poses`, which for those that are `seen` are where the tracker saw them last. `points` of each body, in its own space, say
     /// how large it is.
-    pub fn observe(
+    pub(super) fn observe(
         &mut self,
         camera: &ProjectorCamera,
         poses: &[DAffine3],
@@ -60,7 +60,7 @@ impl Placement {
     }
 
     /// One warning for each body that was tracked for long enough and never came near the light.
-    pub fn warnings(&self, names: &[String]) -> Vec<String> {
+    pub(super) fn warnings(&self, names: &[String]) -> Vec<String> {
         let lost = self.bodies.iter().zip(names).filter(|(b, _)| b.tracked >= ENOUGH && b.within_reach == 0);
         let told = |(body, name): (&Body, &String)| {
             let p = body.last;

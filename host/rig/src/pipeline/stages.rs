@@ -17,11 +17,11 @@ use dpm_render::{FrameInputs, Renderer};
 use dpm_tracking::{Freshness, PoseFilterBank, TrackState};
 
 /// Most bodies that a rig tracks. The configuration refuses more.
-pub const MAX_TRACKED: usize = 256;
+pub(crate) const MAX_TRACKED: usize = 256;
 
 /// What the tracking stage knows, for the latest-wins slot.
 #[derive(Clone, Debug)]
-pub struct TrackSnapshot {
+pub(crate) struct TrackSnapshot {
     /// Everything that arrived up to here is in.
     pub through: HostTime,
     /// By body: its track and when the newest sample arrived.
@@ -32,13 +32,13 @@ pub struct TrackSnapshot {
 
 impl TrackSnapshot {
     /// Nothing is known of `bodies` bodies.
-    pub fn empty(bodies: usize) -> Self {
+    pub(super) fn empty(bodies: usize) -> Self {
         Self { through: HostTime(i64::MIN), tracks: vec![None; bodies.min(MAX_TRACKED)], latency_ns: 0 }
     }
 }
 
 /// Samples into tracks.
-pub struct TrackingStage {
+pub(crate) struct TrackingStage {
     tracker: Box<dyn Tracker>,
     bank: PoseFilterBank,
     received_at: Vec<HostTime>,
@@ -77,7 +77,7 @@ const fn remedy(tracker: &TrackerConfig) -> &'static str {
 
 impl TrackingStage {
     /// A stage for the rig's bodies.
-    pub fn new(rig: &Rig, tracker: Box<dyn Tracker>) -> Self {
+    pub(super) fn new(rig: &Rig, tracker: Box<dyn Tracker>) -> Self {
         // How long a body is shown without samples is decided for every frame, see [`plan`]; the filter only needs to know for how long
         // a track is worth going on with.
         let longest_ms = rig.config.safety.predict_ms.unwrap_or(MAX_PREDICT_MS);
@@ -98,7 +98,11 @@ impl TrackingStage {
     ///
     /// # Errors
     /// The tracker is gone; what is known stays published.
-    pub fn step(&mut self, now: HostTime, latest: &mut Publisher<TrackSnapshot>) -> Result<(), TrackerError> {
+    pub(super) fn step(
+        &mut self,
+        now: HostTime,
+        latest: &mut Publisher<TrackSnapshot>,
+    ) -> Result<(), TrackerError> {
         self.began_at.get_or_insert(now);
         let Self { tracker, bank, received_at, latency_ns, .. } = self;
         let result = tracker.poll(now, &mut |sample| {
@@ -128,7 +132,7 @@ impl TrackingStage {
     }
 
     /// True once in a run: a second after the first step, when some body was not seen by then. Allocates nothing.
-    pub fn is_silence_due(&mut self, now: HostTime) -> bool {
+    pub(crate) fn is_silence_due(&mut self, now: HostTime) -> bool {
         let due = self.began_at.is_some_and(|began| now.ns_since(began) >= SEEN_WITHIN_NS);
         if self.looked || !due {
             return false;
@@ -138,12 +142,12 @@ impl TrackingStage {
     }
 
     /// The bodies that were not seen so far, which are dark, the tracker's word on why, and what to do; `None` when all of them were.
-    pub fn not_seen_yet(&self, rig: &Rig) -> Option<String> {
+    pub(crate) fn not_seen_yet(&self, rig: &Rig) -> Option<String> {
         self.unseen(rig, "has not seen", "and no light falls there until it does")
     }
 
     /// The same at the end of a run, and what else the tracker has to say.
-    pub fn never_seen(&self, rig: &Rig) -> Option<String> {
+    pub(crate) fn never_seen(&self, rig: &Rig) -> Option<String> {
         let unseen = self.unseen(rig, "never saw", "so no light fell there");
         unseen.into_iter().chain(self.tracker.warning()).reduce(|a, b| format!("{a}; {b}"))
     }
@@ -162,7 +166,7 @@ impl TrackingStage {
 
 /// What planning knows besides the newest tracks.
 #[derive(Clone, Copy, Debug)]
-pub struct PlanInputs<'a> {
+pub(crate) struct PlanInputs<'a> {
     /// The projector's slots.
     pub slots: &'a LinkTime,
     /// Number of the frame.
@@ -181,7 +185,7 @@ pub struct PlanInputs<'a> {
 
 /// Fills a job: poses at the middle of the slot's exposure, eye, gaze, and the instant from which its light must be off. `snapshot` is the
 /// newest there is.
-pub fn plan(job: &mut FrameJob, rig: &Rig, snapshot: &TrackSnapshot, inputs: &PlanInputs<'_>) {
+pub(super) fn plan(job: &mut FrameJob, rig: &Rig, snapshot: &TrackSnapshot, inputs: &PlanInputs<'_>) {
     let watch = Stopwatch::start();
     let FrameJob { note, memory } = job;
     let &PlanInputs { slots, id, slot, stride, predict_ns, .. } = inputs;
@@ -256,7 +260,7 @@ pub fn plan(job: &mut FrameJob, rig: &Rig, snapshot: &TrackSnapshot, inputs: &Pl
 ///
 /// # Errors
 /// Device lost.
-pub fn submit(job: &mut FrameJob, rig: &Rig, renderer: &mut Renderer) -> Result<(), GpuError> {
+pub(super) fn submit(job: &mut FrameJob, rig: &Rig, renderer: &mut Renderer) -> Result<(), GpuError> {
     let FrameJob { note, memory } = job;
     let Some(slot) = memory.gpu.as_mut() else { return Ok(()) };
     renderer.submit(
@@ -280,7 +284,7 @@ pub fn submit(job: &mut FrameJob, rig: &Rig, renderer: &mut Renderer) -> Result<
 ///
 /// # Errors
 /// The GPU did not finish within `timeout_ns`, or was lost.
-pub fn warm_up(
+pub(super) fn warm_up(
     memory: &mut FrameMemory,
     rig: &Rig,
     renderer: &mut Renderer,
@@ -316,7 +320,7 @@ const GPU_STEP_NS: u64 = 5_000_000;
 ///
 /// # Errors
 /// The GPU was lost.
-pub fn finish(job: &mut FrameJob, timeout_ns: u64, mut alive: impl FnMut()) -> Result<bool, GpuError> {
+pub(super) fn finish(job: &mut FrameJob, timeout_ns: u64, mut alive: impl FnMut()) -> Result<bool, GpuError> {
     let Some(slot) = job.memory.gpu.as_mut() else { return Ok(true) };
     let watch = Stopwatch::start();
     let cost = loop {
@@ -337,7 +341,7 @@ pub fn finish(job: &mut FrameJob, timeout_ns: u64, mut alive: impl FnMut()) -> R
 }
 
 /// Packs the finished GPU's code values into planes; a job without GPU takes its code values from `prepared`.
-pub fn pack(job: &mut FrameJob, kernel: Kernel, verify: bool, prepared: &mut Option<PreparedFrames>) {
+pub(super) fn pack(job: &mut FrameJob, kernel: Kernel, verify: bool, prepared: &mut Option<PreparedFrames>) {
     let FrameJob { note, memory } = job;
     let watch = Stopwatch::start();
     if let Some(slot) = &memory.gpu {
@@ -387,19 +391,19 @@ impl LinkTime {
     }
 
     /// Start of a slot on the host's clock.
-    pub fn host_of_slot(&self, slot: u64) -> HostTime {
+    pub(crate) fn host_of_slot(&self, slot: u64) -> HostTime {
         self.host_of(self.start(slot))
     }
 
     /// A reading of the device's clock on the host's, at the nominal rate.
-    pub fn host_of(&self, ticks: DeviceTicks) -> HostTime {
+    pub(crate) fn host_of(&self, ticks: DeviceTicks) -> HostTime {
         let delta = i128::from(ticks.0) - i128::from(self.anchor.0 .0);
         let ns = delta * 1_000_000_000 / i128::from(self.clock.tick_hz());
         self.anchor.1.plus_ns(i64::try_from(ns).unwrap_or(if ns > 0 { i64::MAX } else { i64::MIN }))
     }
 
     /// The first slot that starts at or after `at`.
-    pub fn slot_after(&self, at: HostTime) -> u64 {
+    pub(crate) fn slot_after(&self, at: HostTime) -> u64 {
         let since = at.ns_since(self.host_of_slot(self.first));
         if since <= 0 {
             return self.first;

@@ -133,7 +133,8 @@ impl BudgetController {
     }
 
     /// True when the fewest rays are asked for: if frames are still late, rays are not the reason.
-    pub fn is_at_minimum(&self) -> bool {
+    #[cfg(test)]
+    pub(crate) fn is_at_minimum(&self) -> bool {
         self.rays() == self.config.min_rays
     }
 

@@ -5,11 +5,11 @@ use crate::config::RigConfig;
 /// Shortest horizon of a rig that does not name its own, nanoseconds.
 const SHORTEST_NS: i64 = 20_000_000;
 /// Longest horizon of any rig, nanoseconds: the largest value of the key.
-pub const LONGEST_NS: i64 = 1_000_000_000;
+pub(crate) const LONGEST_NS: i64 = 1_000_000_000;
 
 /// The rule for one rig.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub struct Horizon {
+pub(crate) struct Horizon {
     /// What the rig file says; that is law.
     written_ns: Option<i64>,
     /// Between two samples of the tracker, nanoseconds.
@@ -19,7 +19,7 @@ pub struct Horizon {
 
 impl Horizon {
     /// The rule that a rig file sets.
-    pub fn of_rig(config: &RigConfig) -> Self {
+    pub(crate) fn of_rig(config: &RigConfig) -> Self {
         Self {
             written_ns: config.safety.predict_ms.map(|ms| i64::from(ms) * 1_000_000),
             // A recording knows no rate; its samples are no rarer than those of the slowest trackers.
@@ -31,7 +31,7 @@ impl Horizon {
     /// Longest time for which a body is carried on by prediction, nanoseconds: what the rig file says, else the longer of 20 ms and the
     /// tracker's latency, two of its samples, the lead and two slots together. `lead_ns`: how long before its slot a frame is latched;
     /// `latency_ns`: from the capture of a sample to its arrival.
-    pub fn predict_ns(&self, lead_ns: i64, latency_ns: i64) -> i64 {
+    pub(crate) fn predict_ns(&self, lead_ns: i64, latency_ns: i64) -> i64 {
         self.written_ns.unwrap_or_else(|| {
             let needed = latency_ns
                 .saturating_add(2 * self.period_ns)
@@ -42,7 +42,7 @@ impl Horizon {
     }
 
     /// Age that the newest sample of a tracker that works has at most when it is read, nanoseconds.
-    pub fn fresh_ns(&self, latency_ns: i64) -> i64 {
+    pub(crate) fn fresh_ns(&self, latency_ns: i64) -> i64 {
         latency_ns.saturating_add(3 * self.period_ns)
     }
 }

@@ -10,7 +10,7 @@ use dpm_device::planes::PlaneSchedule;
 /// middles of the planes, each weighted with its intensity `2^bit`. Rounded down; 0 for a negative exposure.
 ///
 /// Every code value of every channel is taken to be white: what a picture is made of shifts the centre of each pixel for itself.
-pub fn centre_ns(schedule: &PlaneSchedule, exposure_ns: i64) -> i64 {
+pub(crate) fn centre_ns(schedule: &PlaneSchedule, exposure_ns: i64) -> i64 {
     let (mut weights, mut moments) = (0i128, 0i128);
     for (i, plane) in schedule.planes().iter().enumerate() {
         let weight = 1i128 << plane.bit;

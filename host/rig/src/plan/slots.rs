@@ -5,7 +5,7 @@
 
 /// Why a slot got no frame of its own.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Hash)]
-pub enum MissCause {
+pub(crate) enum MissCause {
     /// Planning was not ready.
     Plan,
     /// Rendering took too long.
@@ -22,11 +22,11 @@ pub enum MissCause {
 
 impl MissCause {
     /// All causes, in the order of their counters.
-    pub const ALL: [Self; 6] =
+    pub(crate) const ALL: [Self; 6] =
         [Self::Plan, Self::Render, Self::Pack, Self::Link, Self::Buffers, Self::Standstill];
 
     /// As printed.
-    pub const fn name(self) -> &'static str {
+    pub(crate) const fn name(self) -> &'static str {
         match self {
             Self::Plan => "plan",
             Self::Render => "render",

@@ -94,12 +94,12 @@ impl Standstills {
     }
 
     /// Total length of all gaps of the run, ns.
-    pub fn total_ns(&self) -> i64 {
+    pub(crate) fn total_ns(&self) -> i64 {
         self.gaps.iter().map(|g| g.ns()).fold(self.past_ns, i64::saturating_add)
     }
 
     /// Longest gap of the run, ns; 0 without any.
-    pub fn longest_ns(&self) -> i64 {
+    pub(crate) fn longest_ns(&self) -> i64 {
         self.gaps.iter().map(|g| g.ns()).fold(self.past_longest_ns, i64::max)
     }
 
@@ -120,7 +120,7 @@ impl Standstills {
 
 /// What the control threads have seen so far, for threads that are not on the frame path.
 #[derive(Debug)]
-pub struct SeenStandstills {
+pub(crate) struct SeenStandstills {
     all: Mutex<Standstills>,
     /// Per control thread: when it ran last, with everything before written down.
     awake_at: Vec<AtomicI64>,
@@ -133,17 +133,18 @@ impl SeenStandstills {
     }
 
     /// Known standstills, with nothing to come.
-    pub fn known(standstills: Standstills) -> Self {
+    #[cfg(test)]
+    pub(crate) fn known(standstills: Standstills) -> Self {
         Self { all: Mutex::new(standstills), awake_at: Vec::new() }
     }
 
     /// Every standstill that began before this instant is known.
-    pub fn through(&self) -> HostTime {
+    pub(crate) fn through(&self) -> HostTime {
         HostTime(self.awake_at.iter().map(|at| at.load(Ordering::Acquire)).min().unwrap_or(i64::MAX))
     }
 
     /// Looks at what is known. Short, please: control threads put off what they have to write meanwhile.
-    pub fn with<R>(&self, look: impl FnOnce(&Standstills) -> R) -> R {
+    pub(crate) fn with<R>(&self, look: impl FnOnce(&Standstills) -> R) -> R {
         look(&self.lock())
     }
 
@@ -173,7 +174,7 @@ impl SeenStandstills {
 
 /// The running control threads.
 #[derive(Debug)]
-pub struct StandstillMonitor {
+pub(crate) struct StandstillMonitor {
     stop: Arc<AtomicBool>,
     seen: Arc<SeenStandstills>,
     threads: Vec<JoinHandle<()>>,
@@ -185,7 +186,7 @@ impl StandstillMonitor {
     ///
     /// # Errors
     /// The system's, when it has no more threads.
-    pub fn start(clock: Arc<dyn Clock>, threshold_ns: i64, above: u32) -> std::io::Result<Self> {
+    pub(crate) fn start(clock: Arc<dyn Clock>, threshold_ns: i64, above: u32) -> std::io::Result<Self> {
         let priority = if (1..99).contains(&above) && Self::is_granted(above + 1)? { above + 1 } else { 0 };
         let cores: Vec<Option<u32>> =
             if priority > 0 { os::allowed_core_list().into_iter().map(Some).collect() } else { Vec::new() };
@@ -211,17 +212,18 @@ impl StandstillMonitor {
     }
 
     /// Control threads that run.
-    pub fn threads(&self) -> usize {
+    #[cfg(test)]
+    pub(crate) fn threads(&self) -> usize {
         self.threads.len()
     }
 
     /// What they see, as they go on.
-    pub fn seen(&self) -> Arc<SeenStandstills> {
+    pub(crate) fn seen(&self) -> Arc<SeenStandstills> {
         self.seen.clone()
     }
 
     /// Ends the threads (within a step) and returns what they saw.
-    pub fn finish(mut self) -> Standstills {
+    pub(crate) fn finish(mut self) -> Standstills {
         self.stop.store(true, Ordering::Relaxed);
         for thread in self.threads.drain(..) {
             let _ = thread.join();

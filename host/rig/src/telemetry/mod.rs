@@ -3,7 +3,7 @@
 pub mod compare;
 pub mod interval;
 pub mod monitor;
-pub mod ordered;
+mod ordered;
 pub mod plots;
 pub mod profile;
 pub mod prometheus;

@@ -62,7 +62,7 @@ impl Order {
     }
 
     /// The order with this word.
-    pub fn from_word(word: &str) -> Option<Self> {
+    pub(crate) fn from_word(word: &str) -> Option<Self> {
         Self::ALL.iter().find(|(_, w)| *w == word).map(|(order, _)| *order)
     }
 }
@@ -257,7 +257,7 @@ impl RunMonitor {
 
     /// Gives ARM, which has no effect where more than `since` orders have come as signals when it is taken: they are newer than the
     /// wish for light.
-    pub fn arm_unless_darkened(&self, since: u32) {
+    pub(crate) fn arm_unless_darkened(&self, since: u32) {
         self.order.store(Order::Arm as u64 | u64::from(since) << 32, Ordering::Relaxed);
     }
 
@@ -287,7 +287,7 @@ impl RunMonitor {
     }
 
     /// Says that the projector had SAFE latched when the link came up: it stands until ARM like one that was ordered here.
-    pub fn find_safe(&self) {
+    pub(crate) fn find_safe(&self) {
         self.found_safe.store(true, Ordering::Relaxed);
         self.give_order(Order::Safe);
     }
@@ -323,7 +323,7 @@ impl RunMonitor {
     }
 
     /// Says, once in a run, which bodies the tracker has not seen a second after its start, why and what to do. Off the frame path.
-    pub fn tell_of_tracker(&self, word: String) {
+    pub(crate) fn tell_of_tracker(&self, word: String) {
         let _ = self.tracker.set(word);
     }
 
@@ -374,13 +374,13 @@ impl RunMonitor {
     }
 
     /// Says how many slots are decided so far in which a frame was wanted, and how many of these were missed.
-    pub fn set_slots(&self, wanted: u64, missed: u64) {
+    pub(crate) fn set_slots(&self, wanted: u64, missed: u64) {
         self.slots.store(wanted, Ordering::Relaxed);
         self.slots_missed.store(missed, Ordering::Relaxed);
     }
 
     /// Counts a frame whose light left the projector, whether every body was `dark` in it, and whether it came after its slot.
-    pub fn count_lit(&self, dark: bool, late: bool) {
+    pub(crate) fn count_lit(&self, dark: bool, late: bool) {
         let frames = if dark { &self.frames_dark } else { &self.frames_lit };
         frames.fetch_add(1, Ordering::Relaxed);
         if late {
@@ -389,12 +389,12 @@ impl RunMonitor {
     }
 
     /// Counts a frame that will never be lit.
-    pub fn count_dropped(&self) {
+    pub(crate) fn count_dropped(&self) {
         self.frames_dropped.fetch_add(1, Ordering::Relaxed);
     }
 
     /// Counts a frame that was not lit because no new picture was wanted.
-    pub fn count_withheld(&self) {
+    pub(crate) fn count_withheld(&self) {
         self.frames_withheld.fetch_add(1, Ordering::Relaxed);
     }
 

@@ -54,7 +54,7 @@ impl DarkLog {
 
     /// Hands the changes since `seen` to `take`, oldest first, and moves `seen` on. Changes that were overwritten meanwhile are left
     /// out.
-    pub fn news(&self, seen: &mut u64, mut take: impl FnMut(HostTime, Option<OrderedDark>)) {
+    pub(crate) fn news(&self, seen: &mut u64, mut take: impl FnMut(HostTime, Option<OrderedDark>)) {
         // Acquire: see `tell`.
         let written = self.written.load(Ordering::Acquire);
         // One place is left to the writer, who may be at the next change.
@@ -77,7 +77,7 @@ struct Span {
 
 /// The intervals in which no new picture was wanted.
 #[derive(Clone, Debug)]
-pub struct DarkSpans {
+pub(crate) struct DarkSpans {
     spans: VecDeque<Span>,
     /// Changes of the log that are taken in.
     seen: u64,
@@ -90,7 +90,7 @@ pub struct DarkSpans {
 
 impl DarkSpans {
     /// For slots of `slot_ns` > 0.
-    pub fn new(slot_ns: i64) -> Self {
+    pub(super) fn new(slot_ns: i64) -> Self {
         Self {
             spans: VecDeque::with_capacity(SPANS),
             seen: 0,
@@ -101,14 +101,14 @@ impl DarkSpans {
     }
 
     /// Takes in what the log has to tell.
-    pub fn read(&mut self, log: &DarkLog) {
+    pub(super) fn read(&mut self, log: &DarkLog) {
         let mut seen = self.seen;
         log.news(&mut seen, |at, reason| self.change(at, reason));
         self.seen = seen;
     }
 
     /// From `at` on no new picture is wanted for `reason`; `None`: from `at` on one is wanted again.
-    pub fn change(&mut self, at: HostTime, reason: Option<OrderedDark>) {
+    pub(super) fn change(&mut self, at: HostTime, reason: Option<OrderedDark>) {
         if !self.open && reason.is_none() {
             return;
         }
@@ -133,7 +133,7 @@ impl DarkSpans {
     }
 
     /// A frame was lit in the slot that begins at `begin`: light is back.
-    pub fn lit(&mut self, begin: HostTime) {
+    pub(super) fn lit(&mut self, begin: HostTime) {
         if let (Some(_), Some(last)) = (self.returning_from.filter(|s| begin >= *s), self.spans.back_mut()) {
             last.to = last.to.min(begin);
             self.returning_from = None;
@@ -142,13 +142,13 @@ impl DarkSpans {
 
     /// Why no new picture was wanted in the slot that begins at `begin`; `None` where one was. Slots have to be asked for in the order in
     /// which their light is told.
-    pub fn reason_at(&self, begin: HostTime) -> Option<OrderedDark> {
+    pub(crate) fn reason_at(&self, begin: HostTime) -> Option<OrderedDark> {
         let end = begin.plus_ns(self.slot_ns);
         self.spans.iter().rev().find(|s| s.from < end && begin < s.to).map(|s| s.reason)
     }
 
     /// The reason that holds all of `from` to `to`, if a single one does.
-    pub fn reason_throughout(&self, from: HostTime, to: HostTime) -> Option<OrderedDark> {
+    pub(crate) fn reason_throughout(&self, from: HostTime, to: HostTime) -> Option<OrderedDark> {
         self.spans.iter().rev().find(|s| s.from <= from && to <= s.to).map(|s| s.reason)
     }
 }

@@ -217,7 +217,7 @@ impl Profiler {
     }
 
     /// Says which devices are mocks: what they would show of themselves is a constant of the rig file.
-    pub fn with_mocks(mut self, tracker: bool, projector: bool) -> Self {
+    pub(crate) fn with_mocks(mut self, tracker: bool, projector: bool) -> Self {
         (self.tracker_modelled, self.ideal_light) = (tracker, projector);
         self
     }
@@ -251,12 +251,12 @@ impl Profiler {
     }
 
     /// True when the figures of `interval` are no measurement, see [`Distribution::modelled`].
-    pub fn is_modelled(&self, interval: Interval) -> bool {
+    pub(crate) fn is_modelled(&self, interval: Interval) -> bool {
         !self.measured || interval == Interval::Tracker && self.tracker_modelled
     }
 
     /// True when stamps are readings of a clock.
-    pub fn is_measured(&self) -> bool {
+    pub(crate) fn is_measured(&self) -> bool {
         self.measured
     }
 
@@ -301,12 +301,12 @@ impl Profiler {
 }
 
 /// Missed slots by the name of the cause, all causes.
-pub fn missed_by_cause(slots: &SlotCounts) -> BTreeMap<String, u64> {
+pub(crate) fn missed_by_cause(slots: &SlotCounts) -> BTreeMap<String, u64> {
     MissCause::ALL.iter().map(|c| (c.name().to_owned(), slots.missed[*c as usize])).collect()
 }
 
 /// Slots in which no new picture was wanted by the name of the reason, all reasons.
-pub fn ordered_dark(slots: &SlotCounts) -> BTreeMap<String, u64> {
+pub(crate) fn ordered_dark(slots: &SlotCounts) -> BTreeMap<String, u64> {
     OrderedDark::ALL.iter().map(|r| (r.name().to_owned(), slots.ordered[*r as usize])).collect()
 }
 

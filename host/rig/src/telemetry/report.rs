@@ -34,7 +34,8 @@ impl Spread {
     }
 
     /// Percentiles of a histogram of nanoseconds, in milliseconds. `None` when it is empty.
-    pub fn ms_of_ns(histogram: &hdrhistogram::Histogram<u64>) -> Option<Self> {
+    #[cfg(test)]
+    pub(crate) fn ms_of_ns(histogram: &hdrhistogram::Histogram<u64>) -> Option<Self> {
         let ms = |ns: u64| ns as f64 / 1e6;
         (!histogram.is_empty()).then(|| Self {
             p50: ms(histogram.value_at_quantile(0.5)),
@@ -467,7 +468,7 @@ impl Report {
 
     /// Why the run lit nothing, with the largest cause first and what to do; `None` when it did light something, when it was stopped before it
     /// planned a frame, or when no picture was wanted from its beginning to its end.
-    pub fn nothing_lit(&self) -> Option<String> {
+    pub(crate) fn nothing_lit(&self) -> Option<String> {
         let planned = self.frames_dark + self.frames_dropped;
         let ordered: u64 = self.ordered_dark.values().sum();
         if self.frames_lit > 0 || self.slots == 0 && ordered > 0 {

@@ -51,7 +51,7 @@ impl SignedHistogram {
     }
 
     /// Values that were beyond the bound.
-    pub fn saturated(&self) -> u64 {
+    pub(crate) fn saturated(&self) -> u64 {
         self.saturated
     }
 

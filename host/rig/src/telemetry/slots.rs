@@ -60,12 +60,12 @@ impl SlotCounts {
     }
 
     /// Missed slots of every cause.
-    pub fn missed_total(&self) -> u64 {
+    pub(crate) fn missed_total(&self) -> u64 {
         self.missed.iter().sum()
     }
 
     /// Missed slots as a share of those in which a frame was wanted, 0 to 1; 0 where none was.
-    pub fn missed_share(&self) -> f64 {
+    pub(crate) fn missed_share(&self) -> f64 {
         self.missed_total() as f64 / self.wanted().max(1) as f64
     }
 
@@ -75,7 +75,8 @@ impl SlotCounts {
     }
 
     /// Slots of every reason in which no new picture was wanted.
-    pub fn ordered_total(&self) -> u64 {
+    #[cfg(test)]
+    pub(crate) fn ordered_total(&self) -> u64 {
         self.ordered.iter().sum()
     }
 }
@@ -127,7 +128,7 @@ impl Batches {
 
 /// Slots of a run.
 #[derive(Clone, Debug)]
-pub struct SlotLedger {
+pub(crate) struct SlotLedger {
     rate: FrameRate,
     /// How long before its slot a frame is begun, for slots that had none.
     lead_ns: i64,
@@ -148,7 +149,7 @@ pub struct SlotLedger {
 
 impl SlotLedger {
     /// For slots of `rate`. A frame is begun about `lead_ns` before its slot.
-    pub fn new(rate: FrameRate, lead_ns: i64) -> Self {
+    pub(crate) fn new(rate: FrameRate, lead_ns: i64) -> Self {
         Self {
             rate,
             lead_ns,
@@ -166,23 +167,29 @@ impl SlotLedger {
     }
 
     /// Missed slots are held against what is seen there. To be called before the first slot.
-    pub fn excuse_by(&mut self, seen: Arc<SeenStandstills>) {
+    pub(crate) fn excuse_by(&mut self, seen: Arc<SeenStandstills>) {
         self.seen = Some(seen);
     }
 
     /// Learns what was ordered.
-    pub fn read_orders(&mut self, log: &DarkLog) {
+    pub(crate) fn read_orders(&mut self, log: &DarkLog) {
         self.spans.read(log);
     }
 
     /// Why no new picture was wanted in the slot that begins at `begin`; `None` where one was.
-    pub fn ordered_dark(&self, begin: HostTime) -> Option<OrderedDark> {
+    pub(crate) fn ordered_dark(&self, begin: HostTime) -> Option<OrderedDark> {
         self.spans.reason_at(begin)
     }
 
     /// A frame for `slot` came to the end of the host's part of its way. `refused`: the link did not take
     /// it. `waited_for_memory`: planning could not begin earlier because a later stage held all buffers.
-    pub fn planned(&mut self, slot: u64, timeline: &FrameTimeline, refused: bool, waited_for_memory: bool) {
+    pub(crate) fn planned(
+        &mut self,
+        slot: u64,
+        timeline: &FrameTimeline,
+        refused: bool,
+        waited_for_memory: bool,
+    ) {
         self.reference = (slot, timeline.due_at);
         if self.first_planned.is_none() {
             self.first_planned = Some(slot);
@@ -208,19 +215,19 @@ impl SlotLedger {
 
     /// The frame that was planned for `slot`, which begins at `begin`, was lit in it. The last `unseen` slots before it of which nothing
     /// else was told showed frames of which only the number is known; they are taken for their own.
-    pub fn own(&mut self, slot: u64, begin: HostTime, unseen: u32) {
+    pub(crate) fn own(&mut self, slot: u64, begin: HostTime, unseen: u32) {
         self.told(slot, begin, Light::Own, unseen);
         self.spans.lit(begin);
     }
 
     /// The projector had nothing new in `slot`, which began at `begin`, or a frame that was meant for an earlier slot. `unseen` as in
     /// [`SlotLedger::own`].
-    pub fn nothing_new(&mut self, slot: u64, begin: HostTime, unseen: u32) {
+    pub(crate) fn nothing_new(&mut self, slot: u64, begin: HostTime, unseen: u32) {
         self.told(slot, begin, Light::NothingNew, unseen);
     }
 
     /// Decides what can be decided. To be called now and then.
-    pub fn settle(&mut self) {
+    pub(crate) fn settle(&mut self) {
         let through = self.seen.as_ref().map_or(HostTime(i64::MAX), |seen| seen.through());
         while let (Some(front), Some(last)) = (self.window.front(), self.last_planned) {
             let slot = self.base;
@@ -240,12 +247,12 @@ impl SlotLedger {
     }
 
     /// Counts so far: all slots that are decided.
-    pub fn counts(&self) -> SlotCounts {
+    pub(crate) fn counts(&self) -> SlotCounts {
         self.counts
     }
 
     /// The run is over: decides every slot up to the last planned one.
-    pub fn finish(&mut self) -> SlotCounts {
+    pub(crate) fn finish(&mut self) -> SlotCounts {
         while self.last_planned.is_some_and(|last| self.base <= last) && !self.window.is_empty() {
             self.decide_front();
         }
@@ -253,7 +260,7 @@ impl SlotLedger {
     }
 
     /// Slots in which a frame was wanted, and those of them that were missed, of equal batches of consecutive slots.
-    pub fn batches(&self) -> &[(u64, u64)] {
+    pub(crate) fn batches(&self) -> &[(u64, u64)] {
         &self.batches.all
     }
 

@@ -41,7 +41,7 @@ const LANES: usize = 8;
 
 /// A frame's way as the trace shows it.
 #[derive(Clone, Debug)]
-pub struct FrameTrace<'a> {
+pub(crate) struct FrameTrace<'a> {
     /// Which frame.
     pub id: FrameId,
     /// Which slot it was lit in.
@@ -93,7 +93,7 @@ pub fn write_trace(out: impl Write, frames: &[TracedFrame], standstills: &Stands
 
 /// Writes a trace event by event. Call [`TraceWriter::finish`]; a trace cut off before still opens, as the format allows.
 #[derive(Debug)]
-pub struct TraceWriter<W: Write> {
+pub(crate) struct TraceWriter<W: Write> {
     out: W,
     lanes: [[i64; LANES]; TRACKS.len()],
     first: bool,
@@ -109,7 +109,7 @@ struct Placed {
 
 impl<W: Write> TraceWriter<W> {
     /// Starts a trace and names its tracks.
-    pub fn new(out: W) -> Result<Self, Error> {
+    pub(crate) fn new(out: W) -> Result<Self, Error> {
         let mut trace = Self { out, lanes: [[i64::MIN; LANES]; TRACKS.len()], first: true };
         trace.out.write_all(b"[\n")?;
         for (pid, name) in [(HOST, "host"), (GPU, "GPU"), (DEVICE, "devices")] {
@@ -130,7 +130,7 @@ impl<W: Write> TraceWriter<W> {
     }
 
     /// Writes a frame's slices and its flow.
-    pub fn frame(&mut self, frame: &FrameTrace<'_>) -> Result<(), Error> {
+    pub(crate) fn frame(&mut self, frame: &FrameTrace<'_>) -> Result<(), Error> {
         let t = frame.timeline;
         let mut journey = vec![
             self.slice(Track::Tracker, "sample", t.captured_at, t.received_at, frame)?,
@@ -166,7 +166,7 @@ impl<W: Write> TraceWriter<W> {
     }
 
     /// Marks an instant that concerns everything: a missed slot, a standstill, a lost body. `name` must need no escaping.
-    pub fn mark(&mut self, name: &str, at: HostTime) -> Result<(), Error> {
+    pub(crate) fn mark(&mut self, name: &str, at: HostTime) -> Result<(), Error> {
         let plain: String = name.chars().filter(|c| !c.is_control() && !matches!(c, '"' | '\\')).collect();
         self.event(format_args!(
             r#"{{"ph":"i","name":"{plain}","s":"g","pid":{HOST},"tid":{},"ts":{}}}"#,
@@ -176,7 +176,7 @@ impl<W: Write> TraceWriter<W> {
     }
 
     /// Closes the array and returns the writer.
-    pub fn finish(mut self) -> Result<W, Error> {
+    pub(crate) fn finish(mut self) -> Result<W, Error> {
         self.out.write_all(b"\n]\n")?;
         self.out.flush()?;
         Ok(self.out)

@@ -1,3 +1,3 @@
 //! What the tracker says, into the tracks of all bodies.
 
-pub mod source;
+pub(crate) mod source;

@@ -39,7 +39,7 @@ pub enum SourceError {
 ///
 /// # Errors
 /// Numbers, addresses or files that cannot be used; a socket that the system refuses.
-pub fn open(
+pub(crate) fn open(
     config: &TrackerConfig,
     bodies: Vec<BodyKey>,
     motions: Vec<Motion>,

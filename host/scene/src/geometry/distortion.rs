@@ -50,7 +50,7 @@ impl Distortion {
     }
 
     /// Largest r up to which `r * radial(r^2)` grows, by scanning; the lens has no inverse beyond.
-    pub fn valid_radius(&self) -> f64 {
+    pub(crate) fn valid_radius(&self) -> f64 {
         const STEPS: u32 = 4000;
         let mut last = 0.0;
         for i in 1..=STEPS {

@@ -231,7 +231,7 @@ pub fn read(text: &str, raster: Raster, unit: LengthUnit) -> Result<StoredCalibr
     }
     let rotation = match (r.rows, r.columns) {
         (3, 3) => DMat3::from_cols_slice(&r.data).transpose(),
-        (3, 1) | (1, 3) => DMat3::from_quat(dpm_common::se3::so3_exp(DVec3::from_slice(&r.data))),
+        (3, 1) | (1, 3) => DMat3::from_quat(dpm_common::so3::so3_exp(DVec3::from_slice(&r.data))),
         (rows, columns) => {
             return Err(value(&r_name, format!("is {rows} x {columns}, not 3 x 3 or a rotation vector")))
         }

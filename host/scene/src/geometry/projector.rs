@@ -159,7 +159,7 @@ impl ProjectorCamera {
     }
 
     /// Full vertical angle of the raster, radians.
-    pub fn vertical_fov(&self) -> f64 {
+    pub(crate) fn vertical_fov(&self) -> f64 {
         let h = f64::from(self.raster.height());
         (self.cy / self.fy).atan() + ((h - self.cy) / self.fy).atan()
     }

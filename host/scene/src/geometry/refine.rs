@@ -2,7 +2,7 @@
 
 use super::calibration::Pair;
 use super::svd::{inverse_diagonal, solve_spd};
-use dpm_common::se3::{hat, so3_exp};
+use dpm_common::so3::{hat, so3_exp};
 use glam::{DMat3, DVec2, DVec3};
 
 /// A pinhole in the usual equations: `x = centre + focal * (R X + t).xy / (R X + t).z`, looking along +Z, y down.
@@ -20,12 +20,12 @@ impl Pinhole {
     }
 
     /// Distance in front along the axis.
-    pub fn depth(&self, world: DVec3) -> f64 {
+    pub(super) fn depth(&self, world: DVec3) -> f64 {
         self.local(world).z
     }
 
     /// Computed minus given pixel; infinite behind the pinhole.
-    pub fn residual(&self, p: &Pair) -> DVec2 {
+    pub(super) fn residual(&self, p: &Pair) -> DVec2 {
         let q = self.local(p.world);
         if q.z <= 0.0 {
             return DVec2::INFINITY;

@@ -4,10 +4,10 @@
 //! rounding error of the largest one; that is what telling a degenerate calibration from a poor one needs.
 
 /// Columns of a matrix, all of one length.
-pub type Columns = Vec<Vec<f64>>;
+pub(super) type Columns = Vec<Vec<f64>>;
 
 /// Singular values, descending, and the right singular vector of each.
-pub struct Svd {
+pub(crate) struct Svd {
     /// Not negative, descending.
     pub values: Vec<f64>,
     /// `vectors[i]` belongs to `values[i]`.
@@ -15,7 +15,7 @@ pub struct Svd {
 }
 
 /// Decomposes a matrix of any shape with finite entries.
-pub fn svd(mut columns: Columns) -> Svd {
+pub(crate) fn svd(mut columns: Columns) -> Svd {
     let n = columns.len();
     let mut v: Columns = (0..n).map(|i| (0..n).map(|j| f64::from(u8::from(i == j))).collect()).collect();
     for _ in 0..60 {
@@ -57,7 +57,7 @@ pub fn svd(mut columns: Columns) -> Svd {
 }
 
 /// Solves `A x = b` for a symmetric positive definite matrix in rows; `None` where it is not.
-pub fn solve_spd(a: &[Vec<f64>], b: &[f64]) -> Option<Vec<f64>> {
+pub(crate) fn solve_spd(a: &[Vec<f64>], b: &[f64]) -> Option<Vec<f64>> {
     let l = cholesky(a)?;
     let n = b.len();
     let mut x = b.to_vec();
@@ -73,7 +73,7 @@ pub fn solve_spd(a: &[Vec<f64>], b: &[f64]) -> Option<Vec<f64>> {
 }
 
 /// Diagonal of the inverse of a symmetric positive definite matrix; `None` where it is not.
-pub fn inverse_diagonal(a: &[Vec<f64>]) -> Option<Vec<f64>> {
+pub(crate) fn inverse_diagonal(a: &[Vec<f64>]) -> Option<Vec<f64>> {
     let n = a.len();
     (0..n)
         .map(|i| {

@@ -5,7 +5,7 @@ use super::json::Item;
 
 /// How a component is stored.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum Component {
+pub(crate) enum Component {
     /// 5120.
     I8,
     /// 5121.
@@ -42,7 +42,7 @@ impl Component {
     }
 
     /// True for the three types that indices may have.
-    pub fn is_unsigned(self) -> bool {
+    pub(crate) fn is_unsigned(self) -> bool {
         matches!(self, Self::U8 | Self::U16 | Self::U32)
     }
 }
@@ -75,7 +75,7 @@ struct Sparse {
 
 /// A checked accessor.
 #[derive(Clone, Debug)]
-pub struct Accessor {
+pub(crate) struct Accessor {
     /// Its name in messages: "accessor 3".
     pub name: String,
     /// Storage of one component.
@@ -92,7 +92,7 @@ pub struct Accessor {
 
 /// The buffers of a file with its checked accessors.
 #[derive(Debug)]
-pub struct Data {
+pub(super) struct Data {
     buffers: Vec<Vec<u8>>,
     views: Vec<View>,
     /// In the order of the file.
@@ -101,7 +101,7 @@ pub struct Data {
 
 impl Data {
     /// Checks all buffer views and accessors of `root` against the buffers.
-    pub fn new(root: &Item, buffers: Vec<Vec<u8>>, limits: &Limits) -> Result<Self, SceneError> {
+    pub(super) fn new(root: &Item, buffers: Vec<Vec<u8>>, limits: &Limits) -> Result<Self, SceneError> {
         let mut data = Self { buffers, views: vec![], accessors: vec![] };
         for item in root.list("bufferViews", "bufferView", limits.objects)? {
             let view = data.check_view(&item)?;
@@ -115,7 +115,7 @@ impl Data {
     }
 
     /// The bytes of a buffer view.
-    pub fn view_bytes(&self, view: usize) -> Option<&[u8]> {
+    pub(crate) fn view_bytes(&self, view: usize) -> Option<&[u8]> {
         let v = self.views.get(view)?;
         self.buffers[v.buffer].get(v.start as usize..(v.start + v.length) as usize)
     }
@@ -300,12 +300,12 @@ impl Data {
     }
 
     /// An index. `element` must be below the accessor's count.
-    pub fn index(&self, accessor: &Accessor, element: u64) -> u64 {
+    pub(super) fn index(&self, accessor: &Accessor, element: u64) -> u64 {
         self.locate(accessor, element).map_or(0, |(run, i)| self.unsigned(accessor.component, run, i))
     }
 
     /// The first `N` components of an element as floats, integers scaled as `normalized` says. `element` must be below the count.
-    pub fn floats<const N: usize>(&self, accessor: &Accessor, element: u64) -> [f32; N] {
+    pub(super) fn floats<const N: usize>(&self, accessor: &Accessor, element: u64) -> [f32; N] {
         let Some((run, i)) = self.locate(accessor, element) else { return [0.0; N] };
         let scale = |x: f32, greatest: f32| if accessor.normalized { (x / greatest).max(-1.0) } else { x };
         let mut out = [0.0; N];

@@ -25,7 +25,7 @@ const UNDERSTOOD: [&str; 12] = [
 ];
 
 /// Counts that references are checked against.
-pub struct Counts {
+pub(super) struct Counts {
     /// Entries of "nodes".
     pub nodes: usize,
     /// Entries of "meshes".
@@ -43,7 +43,7 @@ pub struct Counts {
 }
 
 /// What is known of a document that passed.
-pub struct Checked {
+pub(crate) struct Checked {
     /// What is accepted but not reproduced.
     pub warnings: Vec<String>,
     /// Where the meshes of instanced nodes stand.
@@ -51,7 +51,7 @@ pub struct Checked {
 }
 
 /// Checks the whole document but its buffers.
-pub fn check(root: &Item, data: &Data, limits: &Limits) -> Result<Checked, SceneError> {
+pub(super) fn check(root: &Item, data: &Data, limits: &Limits) -> Result<Checked, SceneError> {
     let mut warnings = vec![];
     let list = |key, kind| root.list(key, kind, limits.objects);
     let (nodes, meshes) = (list("nodes", "node")?, list("meshes", "mesh")?);
@@ -95,7 +95,7 @@ pub fn check(root: &Item, data: &Data, limits: &Limits) -> Result<Checked, Scene
 
 /// Checks the version and what the file says it cannot do without. Comes before everything else: a file that needs Draco has no
 /// plain vertices, and that is what the operator should read.
-pub fn check_asset(root: &Item) -> Result<(), SceneError> {
+pub(crate) fn check_asset(root: &Item) -> Result<(), SceneError> {
     let asset = root.object("asset")?.ok_or_else(|| root.error("has no 'asset': this is not glTF"))?;
     let version = asset.text("version")?.ok_or_else(|| asset.error("has no 'version'"))?;
     let needed = asset.text("minVersion")?.unwrap_or(version);

@@ -16,7 +16,7 @@ const REPRODUCED: [&str; 4] = [
 ];
 
 /// Checks everything about how surfaces look and how lights shine.
-pub fn check_look(
+pub(crate) fn check_look(
     root: &Item,
     counts: &Counts,
     lights: &[Item],

@@ -14,7 +14,7 @@ const BIN_CHUNK: u32 = 0x004E_4942;
 
 /// The two halves of a file.
 #[derive(Debug)]
-pub struct Container {
+pub(crate) struct Container {
     /// The document.
     pub root: Value,
     /// The binary chunk of a `.glb`.
@@ -22,7 +22,7 @@ pub struct Container {
 }
 
 /// Reads a whole regular file of at most `limit` bytes.
-pub fn read_file(path: &Path, limit: u64) -> Result<Vec<u8>, SceneError> {
+pub(crate) fn read_file(path: &Path, limit: u64) -> Result<Vec<u8>, SceneError> {
     let (file, size) = regular_file::open(path).map_err(SceneError::Read)?;
     let check = |size| SceneError::check_limit("the file's size in bytes", size, limit, "simplify the file");
     check(size)?;
@@ -33,7 +33,7 @@ pub fn read_file(path: &Path, limit: u64) -> Result<Vec<u8>, SceneError> {
 }
 
 /// Splits a file into JSON and binary chunk.
-pub fn split(bytes: &[u8], limits: &Limits) -> Result<Container, SceneError> {
+pub(super) fn split(bytes: &[u8], limits: &Limits) -> Result<Container, SceneError> {
     let (text, binary) = if bytes.starts_with(b"glTF") { split_glb(bytes)? } else { (bytes, None) };
     if text.is_empty() {
         return Err(SceneError::broken("file", "is empty: no glTF document in it"));
@@ -112,11 +112,11 @@ fn split_glb(bytes: &[u8]) -> Result<Chunks<'_>, SceneError> {
 
 /// Where side files may lie.
 #[derive(Clone, Debug)]
-pub struct Folder(PathBuf);
+pub(super) struct Folder(PathBuf);
 
 impl Folder {
     /// The folder that holds `file`.
-    pub fn of(file: &Path) -> Result<Self, SceneError> {
+    pub(super) fn of(file: &Path) -> Result<Self, SceneError> {
         let parent = file.parent().filter(|p| !p.as_os_str().is_empty()).unwrap_or(Path::new("."));
         parent.canonicalize().map(Self).map_err(SceneError::Read)
     }
@@ -178,7 +178,7 @@ fn percent_decode(uri: &str) -> Result<String, SceneError> {
 }
 
 /// The bytes behind a URI: `data:` with base64, or a file in `folder`.
-pub fn fetch(uri: &str, folder: Option<&Folder>, limit: u64) -> Result<Vec<u8>, SceneError> {
+pub(crate) fn fetch(uri: &str, folder: Option<&Folder>, limit: u64) -> Result<Vec<u8>, SceneError> {
     if let Some(rest) = uri.strip_prefix("data:") {
         let Some((head, payload)) = rest.split_once(',') else {
             return Err(SceneError::broken("data URI", "has no comma before its content"));
@@ -231,7 +231,7 @@ fn base64(text: &[u8]) -> Result<Vec<u8>, SceneError> {
 }
 
 /// Loads every buffer of the document, each cut to its declared length; together at most `limits.bytes`.
-pub fn load_buffers(
+pub(crate) fn load_buffers(
     root: &Item,
     binary: Option<Vec<u8>>,
     folder: Option<&Folder>,

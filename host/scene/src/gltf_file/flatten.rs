@@ -29,7 +29,7 @@ struct Step {
 }
 
 /// What [`flatten`] gives.
-pub struct Flat {
+pub(crate) struct Flat {
     /// In the order of the selectors, fixed things last.
     pub bodies: Vec<Body>,
     /// All of the file's lights that a scene uses.
@@ -37,7 +37,7 @@ pub struct Flat {
 }
 
 /// Nodes claimed by rigid bodies and nodes that are virtual.
-pub struct Claims {
+pub(crate) struct Claims {
     /// In the order of the rig file.
     bodies: Vec<Claim>,
     virtual_nodes: Vec<usize>,
@@ -50,7 +50,7 @@ struct Claim {
 }
 
 /// Roots of the scene to show: the default scene, else the first, else every node without a parent.
-pub fn roots(document: &gltf::Document) -> Vec<usize> {
+pub(super) fn roots(document: &gltf::Document) -> Vec<usize> {
     match document.default_scene().or_else(|| document.scenes().next()) {
         Some(scene) => scene.nodes().map(|n| n.index()).collect(),
         None => {
@@ -77,7 +77,7 @@ fn descendants(document: &gltf::Document, roots: &[usize]) -> Vec<usize> {
 }
 
 /// Resolves the names of the rig file; without selectors the first two objects of the scene become movable.
-pub fn choose_bodies(
+pub(crate) fn choose_bodies(
     document: &gltf::Document,
     options: &LoadOptions,
     warnings: &mut Vec<String>,
@@ -195,7 +195,7 @@ fn choose_automatically(
 }
 
 /// A checked document and what was read of it.
-pub struct Source<'a> {
+pub(super) struct Source<'a> {
     /// Nodes and meshes.
     pub document: &'a gltf::Document,
     /// Buffers.
@@ -207,7 +207,7 @@ pub struct Source<'a> {
 }
 
 /// Walks the tree and gathers geometry and lights by body.
-pub fn flatten(
+pub(super) fn flatten(
     source: &Source<'_>,
     claims: &Claims,
     limits: &Limits,

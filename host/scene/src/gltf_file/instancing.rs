@@ -9,17 +9,17 @@ use super::accessor::{Accessor, Component, Data};
 use super::json::Item;
 
 /// Name of the extension.
-pub const NAME: &str = "EXT_mesh_gpu_instancing";
+pub(super) const NAME: &str = "EXT_mesh_gpu_instancing";
 
 /// Node to where its mesh stands, node-from-instance, for all nodes that have the extension.
-pub type Instances = HashMap<usize, Vec<DAffine3>>;
+pub(crate) type Instances = HashMap<usize, Vec<DAffine3>>;
 
 /// Reads the instances of all nodes.
 ///
 /// # Errors
 /// Attributes of other types or of different lengths, numbers that are not finite, a rotation of length zero, more instances than
 /// [`Limits::objects`].
-pub fn read_instances(nodes: &[Item], data: &Data, limits: &Limits) -> Result<Instances, SceneError> {
+pub(crate) fn read_instances(nodes: &[Item], data: &Data, limits: &Limits) -> Result<Instances, SceneError> {
     let mut instances = Instances::new();
     let mut total = 0u64;
     for (index, node) in nodes.iter().enumerate() {

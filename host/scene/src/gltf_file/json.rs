@@ -8,7 +8,7 @@ use serde_json::{Map, Value};
 use super::super::SceneError;
 
 /// Parses `text`. Refused: more than `max_values` values, nesting beyond 128 levels, a key twice in one object, text after the end.
-pub fn parse(text: &[u8], max_values: u64) -> Result<Value, SceneError> {
+pub(super) fn parse(text: &[u8], max_values: u64) -> Result<Value, SceneError> {
     let text = text.strip_prefix(b"\xef\xbb\xbf").unwrap_or(text);
     let left = Cell::new(max_values);
     let mut parser = serde_json::Deserializer::from_slice(text);
@@ -95,7 +95,7 @@ impl<'de> Visitor<'de> for Tree<'_> {
 
 /// A JSON object with the words by which messages name it: "accessor 3", "material 1 'glass'".
 #[derive(Clone)]
-pub struct Item<'a> {
+pub(super) struct Item<'a> {
     map: &'a Map<String, Value>,
     /// Name for messages.
     pub name: String,
@@ -103,7 +103,7 @@ pub struct Item<'a> {
 
 impl<'a> Item<'a> {
     /// Takes `value` as an object called `name`.
-    pub fn new(value: &'a Value, name: String) -> Result<Self, SceneError> {
+    pub(super) fn new(value: &'a Value, name: String) -> Result<Self, SceneError> {
         match value {
             Value::Object(map) => Ok(Self { map, name }),
             _ => Err(SceneError::broken(name, "must be a JSON object")),
@@ -111,27 +111,27 @@ impl<'a> Item<'a> {
     }
 
     /// An error at this object.
-    pub fn error(&self, problem: impl Into<String>) -> SceneError {
+    pub(super) fn error(&self, problem: impl Into<String>) -> SceneError {
         SceneError::broken(self.name.clone(), problem)
     }
 
     /// The raw value, where present.
-    pub fn get(&self, key: &str) -> Option<&'a Value> {
+    pub(super) fn get(&self, key: &str) -> Option<&'a Value> {
         self.map.get(key)
     }
 
     /// Keys of the object.
-    pub fn keys(&self) -> impl Iterator<Item = &'a String> {
+    pub(super) fn keys(&self) -> impl Iterator<Item = &'a String> {
         self.map.keys()
     }
 
     /// A nested object.
-    pub fn object(&self, key: &str) -> Result<Option<Item<'a>>, SceneError> {
+    pub(super) fn object(&self, key: &str) -> Result<Option<Item<'a>>, SceneError> {
         self.get(key).map(|v| Item::new(v, format!("{}, {key}", self.name))).transpose()
     }
 
     /// A nested object inside `extensions`.
-    pub fn extension(&self, key: &str) -> Result<Option<Item<'a>>, SceneError> {
+    pub(super) fn extension(&self, key: &str) -> Result<Option<Item<'a>>, SceneError> {
         match self.object("extensions")? {
             Some(all) => all.get(key).map(|v| Item::new(v, format!("{}, {key}", self.name))).transpose(),
             None => Ok(None),
@@ -139,7 +139,7 @@ impl<'a> Item<'a> {
     }
 
     /// The objects of a list; none where the key is absent. Each is called `kind` and its index, with its "name" if it has one.
-    pub fn list(&self, key: &str, kind: &str, limit: u64) -> Result<Vec<Item<'a>>, SceneError> {
+    pub(super) fn list(&self, key: &str, kind: &str, limit: u64) -> Result<Vec<Item<'a>>, SceneError> {
         let Some(value) = self.get(key) else { return Ok(vec![]) };
         let Value::Array(values) = value else { return Err(self.error(format!("'{key}' must be a list"))) };
         SceneError::check_limit(
@@ -162,7 +162,7 @@ impl<'a> Item<'a> {
     }
 
     /// A whole number from 0.
-    pub fn whole(&self, key: &str) -> Result<Option<u64>, SceneError> {
+    pub(super) fn whole(&self, key: &str) -> Result<Option<u64>, SceneError> {
         self.get(key)
             .map(|v| {
                 v.as_u64().ok_or_else(|| {
@@ -173,7 +173,7 @@ impl<'a> Item<'a> {
     }
 
     /// An index that must point into a list of `count` things called `kind`.
-    pub fn index(&self, key: &str, count: usize, kind: &str) -> Result<Option<usize>, SceneError> {
+    pub(super) fn index(&self, key: &str, count: usize, kind: &str) -> Result<Option<usize>, SceneError> {
         match self.whole(key)? {
             Some(i) if i >= count as u64 => {
                 Err(self.error(format!("'{key}' points at {kind} {i}, but the file has {count}")))
@@ -183,7 +183,7 @@ impl<'a> Item<'a> {
     }
 
     /// Indices, each of which must point into a list of `count` things called `kind`.
-    pub fn indices(&self, key: &str, count: usize, kind: &str) -> Result<Vec<usize>, SceneError> {
+    pub(super) fn indices(&self, key: &str, count: usize, kind: &str) -> Result<Vec<usize>, SceneError> {
         let Some(value) = self.get(key) else { return Ok(vec![]) };
         let Value::Array(values) = value else { return Err(self.error(format!("'{key}' must be a list"))) };
         let check = |v: &Value| match v.as_u64() {
@@ -197,12 +197,12 @@ impl<'a> Item<'a> {
     }
 
     /// A number that stays finite in f32.
-    pub fn number(&self, key: &str) -> Result<Option<f32>, SceneError> {
+    pub(super) fn number(&self, key: &str) -> Result<Option<f32>, SceneError> {
         self.get(key).map(|v| self.finite(key, v)).transpose()
     }
 
     /// Exactly `N` numbers that stay finite in f32.
-    pub fn numbers<const N: usize>(&self, key: &str) -> Result<Option<[f32; N]>, SceneError> {
+    pub(super) fn numbers<const N: usize>(&self, key: &str) -> Result<Option<[f32; N]>, SceneError> {
         let Some(value) = self.get(key) else { return Ok(None) };
         let list = value.as_array().map_or(&[][..], |v| v);
         let Ok(values) = <&[Value; N]>::try_from(list) else {
@@ -223,14 +223,14 @@ impl<'a> Item<'a> {
     }
 
     /// A string.
-    pub fn text(&self, key: &str) -> Result<Option<&'a str>, SceneError> {
+    pub(super) fn text(&self, key: &str) -> Result<Option<&'a str>, SceneError> {
         self.get(key)
             .map(|v| v.as_str().ok_or_else(|| self.error(format!("'{key}' must be a string"))))
             .transpose()
     }
 
     /// True or false.
-    pub fn flag(&self, key: &str) -> Result<bool, SceneError> {
+    pub(super) fn flag(&self, key: &str) -> Result<bool, SceneError> {
         self.get(key).map_or(Ok(false), |v| {
             v.as_bool().ok_or_else(|| self.error(format!("'{key}' must be true or false")))
         })
@@ -238,7 +238,7 @@ impl<'a> Item<'a> {
 }
 
 /// Text from a file, made fit for a message: one line, not long.
-pub fn shorten(text: &str) -> String {
+pub(crate) fn shorten(text: &str) -> String {
     let mut out: String = text.chars().take(60).map(|c| if c.is_control() { '?' } else { c }).collect();
     if text.chars().nth(60).is_some() {
         out.push_str("...");

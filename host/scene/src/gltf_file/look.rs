@@ -13,7 +13,7 @@ use super::container::{fetch, Folder};
 use super::json::Item;
 
 /// What [`read_look`] gives.
-pub struct Look {
+pub(super) struct Look {
     /// One for each material of the file, and glTF's default material after them.
     pub materials: Vec<Material>,
     /// Set of texture coordinates that each material needs.
@@ -23,7 +23,7 @@ pub struct Look {
 }
 
 /// Reads all materials of a checked document and decodes the images they use.
-pub fn read_look(
+pub(crate) fn read_look(
     document: &gltf::Document,
     root: &Item,
     data: &Data,

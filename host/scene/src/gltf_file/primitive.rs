@@ -12,7 +12,7 @@ use super::accessor::{Accessor, Data};
 
 /// Reads a primitive's triangles with their material; only vertices that a triangle uses are decoded. `None` where there is nothing
 /// to see (points, lines, no positions), about which the check has warned.
-pub fn read_primitive(
+pub(crate) fn read_primitive(
     primitive: &Primitive,
     data: &Data,
     material: u32,

@@ -5,7 +5,7 @@ use serde_json::{json, Value};
 
 /// A document and its binary chunk.
 #[derive(Clone)]
-pub struct Glb {
+pub(crate) struct Glb {
     /// The JSON part.
     pub json: Value,
     /// The binary part.
@@ -13,13 +13,13 @@ pub struct Glb {
 }
 
 /// The corners of a tetrahedron with its faces counter-clockwise from outside.
-pub const TETRAHEDRON: ([[f32; 3]; 4], [u16; 12]) = (
+pub(crate) const TETRAHEDRON: ([[f32; 3]; 4], [u16; 12]) = (
     [[0.0, 0.0, 0.0], [0.1, 0.0, 0.0], [0.0, 0.1, 0.0], [0.0, 0.0, 0.1]],
     [0, 2, 1, 0, 1, 3, 0, 3, 2, 1, 2, 3],
 );
 
 /// Two nodes, "left" and "right", with one tetrahedron mesh: positions (accessor 0), texture coordinates (1), indices (2).
-pub fn tetrahedra() -> Glb {
+pub(crate) fn tetrahedra() -> Glb {
     let mut bin = vec![];
     let (corners, indices) = TETRAHEDRON;
     corners.iter().flatten().for_each(|x| bin.extend(x.to_le_bytes()));
@@ -49,14 +49,14 @@ pub fn tetrahedra() -> Glb {
 
 impl Glb {
     /// The file's bytes.
-    pub fn bytes(&self) -> Vec<u8> {
+    pub(crate) fn bytes(&self) -> Vec<u8> {
         let mut text = serde_json::to_vec(&self.json).unwrap();
         text.resize(text.len().next_multiple_of(4), b' ');
         glb(&text, Some(&self.bin))
     }
 
     /// Sets the value at a JSON pointer; the last step may be new.
-    pub fn set(mut self, pointer: &str, value: Value) -> Self {
+    pub(crate) fn set(mut self, pointer: &str, value: Value) -> Self {
         let (parent, key) = pointer.rsplit_once('/').unwrap();
         let parent = self.json.pointer_mut(parent).unwrap_or_else(|| panic!("{pointer}: no such place"));
         match parent {
@@ -74,7 +74,7 @@ impl Glb {
     }
 
     /// Appends bytes to the binary part as a new buffer view and returns its index.
-    pub fn push_view(&mut self, bytes: &[u8]) -> usize {
+    pub(crate) fn push_view(&mut self, bytes: &[u8]) -> usize {
         let start = self.bin.len().next_multiple_of(4);
         self.bin.resize(start, 0);
         self.bin.extend(bytes);
@@ -86,7 +86,7 @@ impl Glb {
 }
 
 /// Wraps JSON text and a binary part without looking at them.
-pub fn glb(text: &[u8], bin: Option<&[u8]>) -> Vec<u8> {
+pub(crate) fn glb(text: &[u8], bin: Option<&[u8]>) -> Vec<u8> {
     let mut chunks = vec![];
     for (kind, content) in [(b"JSON", Some(text)), (b"BIN\0", bin)] {
         if let Some(content) = content {
@@ -103,7 +103,7 @@ pub fn glb(text: &[u8], bin: Option<&[u8]>) -> Vec<u8> {
 }
 
 /// A PNG of the given texels.
-pub fn png(width: u32, height: u32, texels: &[[u8; 4]]) -> Vec<u8> {
+pub(crate) fn png(width: u32, height: u32, texels: &[[u8; 4]]) -> Vec<u8> {
     let mut out = std::io::Cursor::new(vec![]);
     image::RgbaImage::from_raw(width, height, texels.concat())
         .unwrap()
@@ -113,7 +113,7 @@ pub fn png(width: u32, height: u32, texels: &[[u8; 4]]) -> Vec<u8> {
 }
 
 /// A file whose only material shows the image with these bytes.
-pub fn with_image(bytes: &[u8]) -> Glb {
+pub(crate) fn with_image(bytes: &[u8]) -> Glb {
     let mut file = tetrahedra();
     let view = file.push_view(bytes);
     file.set("/images", json!([{"bufferView": view}]))
@@ -122,7 +122,7 @@ pub fn with_image(bytes: &[u8]) -> Glb {
 }
 
 /// Base64 with padding.
-pub fn base64(bytes: &[u8]) -> String {
+pub(crate) fn base64(bytes: &[u8]) -> String {
     const ALPHABET: &[u8; 64] = b"ABCDEFGHIJKLMNOPQRSTUVWXYZabcdefghijklmnopqrstuvwxyz0123456789+/";
     let mut out = String::new();
     for group in bytes.chunks(3) {

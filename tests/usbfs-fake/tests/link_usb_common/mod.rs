@@ -18,24 +18,24 @@ use hil_mock::usb_model::Speed;
 use hil_mock::usb_plug::{monotonic_clock, Clock, UsbPlug};
 use usbfs_fake::{plug_in, Options, Socket};
 
-pub fn raster() -> Raster {
+pub(crate) fn raster() -> Raster {
     Raster::new(128, 32).unwrap()
 }
 
-pub const PLANES: usize = 24;
-pub const FPS: u32 = 200;
+pub(crate) const PLANES: usize = 24;
+pub(crate) const FPS: u32 = 200;
 
-pub fn planes(id: u64) -> Vec<u8> {
+pub(crate) fn planes(id: u64) -> Vec<u8> {
     let n = raster().plane_bytes() * PLANES;
     (0..n as u64).map(|i| ((i + 1).wrapping_mul(0x9e37_79b9_7f4a_7c15 ^ (id << 20)) >> 40) as u8).collect()
 }
 
-pub fn frame_bytes() -> usize {
+pub(crate) fn frame_bytes() -> usize {
     packet_bytes(raster().plane_bytes()) * PLANES + packet_bytes(COMMIT_BYTES)
 }
 
 /// A projector of its own serial number, on the bus.
-pub struct Device {
+pub(crate) struct Device {
     pub model: Arc<Mutex<UsbProjector>>,
     pub plug: UsbPlug,
     pub socket: Option<Socket>,
@@ -44,7 +44,7 @@ pub struct Device {
 }
 
 impl Device {
-    pub fn new(serial: u64, options: Options) -> Self {
+    pub(crate) fn new(serial: u64, options: Options) -> Self {
         let clock = monotonic_clock();
         let setup = MockConfig { serial, min_plane_ns: 5_000, ..MockConfig::new(raster()) };
         let mock = MockProjector::new(setup);
@@ -54,20 +54,20 @@ impl Device {
         Self { model, plug, socket: Some(socket), clock, serial }
     }
 
-    pub fn unplug(&mut self) {
+    pub(crate) fn unplug(&mut self) {
         self.socket = None;
     }
 
-    pub fn plug_in_again(&mut self) {
+    pub(crate) fn plug_in_again(&mut self) {
         self.plug = UsbPlug::new(self.model.clone(), self.clock.clone());
         self.socket = Some(plug_in(Arc::new(self.plug.clone()), Options::default()));
     }
 
-    pub fn now(&self) -> HostTime {
+    pub(crate) fn now(&self) -> HostTime {
         (self.clock)()
     }
 
-    pub fn mock<R>(&self, f: impl FnOnce(&mut MockProjector) -> R) -> R {
+    pub(crate) fn mock<R>(&self, f: impl FnOnce(&mut MockProjector) -> R) -> R {
         let now = self.now();
         let mut model = self.model.lock().unwrap();
         let mock = model.projector();
@@ -75,7 +75,7 @@ impl Device {
         f(mock)
     }
 
-    pub fn settings(&self) -> UsbSettings {
+    pub(crate) fn settings(&self) -> UsbSettings {
         UsbSettings {
             serial: Some(format!("{:016x}", self.serial)),
             stuck_after_ns: 150_000_000,
@@ -85,14 +85,14 @@ impl Device {
 }
 
 /// A host at the other end.
-pub struct Host {
+pub(crate) struct Host {
     pub link: HostLink,
     pub usb: UsbTransport,
     pub next_id: u64,
 }
 
 impl Host {
-    pub fn new(device: &Device, watchdog_us: u32, fps: u32) -> Self {
+    pub(crate) fn new(device: &Device, watchdog_us: u32, fps: u32) -> Self {
         let link = HostLink::new(LinkSettings {
             raster: raster(),
             schedule: PlaneSchedule::rgb24(),
@@ -111,14 +111,14 @@ impl Host {
         Self { link, usb, next_id: 1 }
     }
 
-    pub fn connected(device: &Device) -> Self {
+    pub(crate) fn connected(device: &Device) -> Self {
         let mut host = Self::new(device, 2_000_000, FPS);
         host.link.connect();
         host.arm(device);
         host
     }
 
-    pub fn until(
+    pub(crate) fn until(
         &mut self,
         device: &Device,
         limit_ms: u64,
@@ -142,14 +142,14 @@ impl Host {
         }
     }
 
-    pub fn arm(&mut self, device: &Device) {
+    pub(crate) fn arm(&mut self, device: &Device) {
         self.until(device, 5000, |h| h.link.state() == LinkState::Ready);
         self.link.arm(0);
         self.until(device, 5000, |h| h.link.state() == LinkState::Streaming);
     }
 
     /// Offers a new frame for the next slot.
-    pub fn offer(&mut self, device: &Device) -> SendOutcome {
+    pub(crate) fn offer(&mut self, device: &Device) -> SendOutcome {
         let now = device.now();
         let slots = self.link.slots().unwrap();
         let slot = slots.slot_at(DeviceTicks(now.0 as u64)).unwrap() + 1;
@@ -163,7 +163,7 @@ impl Host {
     }
 
     /// Streams until `done`, a frame as often as one is taken.
-    pub fn stream(
+    pub(crate) fn stream(
         &mut self,
         device: &Device,
         limit_ms: u64,
@@ -179,7 +179,7 @@ impl Host {
 }
 
 /// What must hold at the end of every test: the lit frame is one that was sent, bit for bit, and every frame is accounted for.
-pub fn check(device: &Device) {
+pub(crate) fn check(device: &Device) {
     device.mock(|m| {
         if let Some(id) = m.lit_frame() {
             assert_eq!(m.lit_planes().unwrap(), planes(u64::from(id)), "frame {id}");
@@ -193,6 +193,6 @@ pub fn check(device: &Device) {
     });
 }
 
-pub fn lit(device: &Device) -> u32 {
+pub(crate) fn lit(device: &Device) -> u32 {
     device.mock(|m| m.status().frames_lit)
 }

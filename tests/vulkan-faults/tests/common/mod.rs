@@ -12,30 +12,30 @@ use std::sync::{Arc, OnceLock};
 use std::time::Duration;
 use vulkan_faults::{in_this_process, Layer, Session};
 
-pub const WIDTH: u32 = 48;
-pub const HEIGHT: u32 = 32;
+pub(crate) const WIDTH: u32 = 48;
+pub(crate) const HEIGHT: u32 = 32;
 /// Long enough for software Vulkan that translates shaders on a busy machine.
-pub const PATIENCE_NS: u64 = 120_000_000_000;
+pub(crate) const PATIENCE_NS: u64 = 120_000_000_000;
 /// What a bound of this program may be exceeded by on a machine that does other things too.
-pub const SLACK: Duration = Duration::from_secs(3);
+pub(crate) const SLACK: Duration = Duration::from_secs(3);
 
 /// The layer, for one test at a time.
-pub fn layer(plan: &str) -> Session {
+pub(crate) fn layer(plan: &str) -> Session {
     let layer: &'static Layer = in_this_process();
     layer.plan(plan)
 }
 
-pub fn options() -> GpuOptions {
+pub(crate) fn options() -> GpuOptions {
     GpuOptions { validation: true, device: None }
 }
 
 /// Validation looks at everything that goes through the layer.
-pub fn assert_no_validation_messages() {
+pub(crate) fn assert_no_validation_messages() {
     let (count, texts) = validation_messages();
     assert_eq!(count, 0, "Vulkan validation reported:\n{}", texts.join("\n"));
 }
 
-pub fn rig() -> &'static Rig {
+pub(crate) fn rig() -> &'static Rig {
     static RIG: OnceLock<Rig> = OnceLock::new();
     RIG.get_or_init(|| {
         let config = RigConfig::demo(&Overrides::default()).unwrap_or_else(|e| panic!("{e}"));
@@ -44,7 +44,7 @@ pub fn rig() -> &'static Rig {
 }
 
 /// A device, a renderer and a slot.
-pub struct Bench {
+pub(crate) struct Bench {
     // In an order in which none could be dropped before those that use it: they must not mind.
     pub renderer: Renderer,
     pub slot: FrameSlot,
@@ -52,31 +52,31 @@ pub struct Bench {
 }
 
 impl Bench {
-    pub fn open() -> Self {
+    pub(crate) fn open() -> Self {
         let gpu = Gpu::open(&options()).unwrap_or_else(|e| panic!("this test needs Vulkan: {e}"));
         Self::on(gpu).unwrap_or_else(|e| panic!("{e}"))
     }
 
-    pub fn on(gpu: Arc<Gpu>) -> Result<Self, RenderError> {
+    pub(crate) fn on(gpu: Arc<Gpu>) -> Result<Self, RenderError> {
         let renderer = Renderer::new(&gpu, &rig().scene, renderer_settings(rig()))?;
         let slot = renderer.create_slot(true)?;
         Ok(Self { renderer, slot, gpu })
     }
 
     /// Starts a frame: bodies move with its number.
-    pub fn submit(&mut self, frame: u32) -> Result<(), GpuError> {
+    pub(crate) fn submit(&mut self, frame: u32) -> Result<(), GpuError> {
         submit(&mut self.renderer, &mut self.slot, frame)
     }
 
     /// A whole frame.
-    pub fn frame(&mut self, frame: u32) -> Result<Vec<u32>, GpuError> {
+    pub(crate) fn frame(&mut self, frame: u32) -> Result<Vec<u32>, GpuError> {
         self.submit(frame)?;
         self.slot.wait(PATIENCE_NS)?;
         Ok(self.slot.codes().to_vec())
     }
 }
 
-pub fn submit(renderer: &mut Renderer, slot: &mut FrameSlot, frame: u32) -> Result<(), GpuError> {
+pub(crate) fn submit(renderer: &mut Renderer, slot: &mut FrameSlot, frame: u32) -> Result<(), GpuError> {
     let rig = rig();
     let along = DAffine3::from_translation(DVec3::X * 5e-4 * f64::from(frame));
     let tracked: Vec<_> = rig.bodies.iter().map(|b| along * affine(&b.rest)).collect();
@@ -98,7 +98,7 @@ pub fn submit(renderer: &mut Renderer, slot: &mut FrameSlot, frame: u32) -> Resu
 }
 
 /// The first frames as a device without faults makes them.
-pub fn clean() -> &'static [Vec<u32>] {
+pub(crate) fn clean() -> &'static [Vec<u32>] {
     static CLEAN: OnceLock<Vec<Vec<u32>>> = OnceLock::new();
     CLEAN.get_or_init(|| {
         let mut bench = Bench::open();
@@ -109,7 +109,7 @@ pub fn clean() -> &'static [Vec<u32>] {
 }
 
 /// Names of the threads of this process, without those of the tests themselves, which come and go.
-pub fn threads() -> Vec<String> {
+pub(crate) fn threads() -> Vec<String> {
     let tasks = std::fs::read_dir("/proc/self/task").into_iter().flatten().filter_map(Result::ok);
     let name = |task: std::fs::DirEntry| std::fs::read_to_string(task.path().join("comm")).ok();
     // Tests are named with underscores, and so is their program.

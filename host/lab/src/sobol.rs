@@ -6,10 +6,10 @@
 //! The sequence may be continued over frames: the error of the mean keeps falling faster than with fresh points every frame.
 
 /// Dimensions that [`sobol`] knows.
-pub const DIMENSIONS: usize = 16;
+pub(crate) const DIMENSIONS: usize = 16;
 
 /// Direction numbers: bit `b` of the index adds (exclusive or) `DIRECTIONS[dimension][b]`. The first 4 rows are all that the shaders need.
-pub const DIRECTIONS: [[u32; 32]; DIMENSIONS] = directions();
+pub(crate) const DIRECTIONS: [[u32; 32]; DIMENSIONS] = directions();
 
 /// Initial direction numbers of dimensions 1 to 15, chosen by \[JoeKuo08\] for good projections on two dimensions (table 6.21201);
 /// as many as the degree of the dimension's polynomial, the rest is zero.
@@ -105,7 +105,7 @@ const fn directions() -> [[u32; 32]; DIMENSIONS] {
 }
 
 /// Sobol's point `index` in `dimension` (0 to 15) as a 32-bit fraction of 1. Dimension 0 is the radical inverse of van der Corput.
-pub fn sobol(index: u32, dimension: usize) -> u32 {
+pub(crate) fn sobol(index: u32, dimension: usize) -> u32 {
     let bits = (0..32).filter(|b| index >> b & 1 == 1);
     bits.fold(0, |x, b| x ^ DIRECTIONS[dimension][b])
 }
@@ -115,7 +115,7 @@ pub fn sobol(index: u32, dimension: usize) -> u32 {
 ///
 /// Works on the reversed bits with steps in which a bit can only reach higher ones, after \[LaineKarras11\]; the even constants come from
 /// a search for the least avalanche bias.
-pub fn owen_scramble(x: u32, seed: u32) -> u32 {
+pub(crate) fn owen_scramble(x: u32, seed: u32) -> u32 {
     let mut x = x.reverse_bits();
     x = x.wrapping_add(seed);
     x ^= x.wrapping_mul(0x641c_a70e);
@@ -126,7 +126,7 @@ pub fn owen_scramble(x: u32, seed: u32) -> u32 {
 }
 
 /// Mixes two words into a seed in which every bit depends on all of theirs (rounds of multiplication and shift).
-pub fn mix(seed: u32, value: u32) -> u32 {
+pub(crate) fn mix(seed: u32, value: u32) -> u32 {
     let mut x = seed ^ value.wrapping_mul(0x9e37_79b9).wrapping_add(0x7f4a_7c15);
     x = (x ^ (x >> 16)).wrapping_mul(0x85eb_ca6b);
     x = (x ^ (x >> 13)).wrapping_mul(0xc2b2_ae35);
@@ -136,7 +136,7 @@ pub fn mix(seed: u32, value: u32) -> u32 {
 }
 
 /// Four dimensions of sample `index`: group 0 holds dimensions 0 to 3 of the integrand, group 1 the next four, and so on without end.
-pub fn sample4(index: u32, group: u32, seed: u32) -> [u32; 4] {
+pub(crate) fn sample4(index: u32, group: u32, seed: u32) -> [u32; 4] {
     let key = mix(seed, group);
     // Indices below 2^16 share all higher bits, so leaving those out moves every point by the same scramble.
     let shuffled = owen_scramble(index, key) & 0xffff;
@@ -144,13 +144,18 @@ pub fn sample4(index: u32, group: u32, seed: u32) -> [u32; 4] {
 }
 
 /// A 32-bit fraction as a float in [0, 1): the upper 24 bits, so that it never rounds up to 1.
-pub fn to_unit(x: u32) -> f32 {
+pub(crate) fn to_unit(x: u32) -> f32 {
     (x >> 8) as f32 * (1.0 / 16_777_216.0)
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn the_shaders_have_the_same_direction_numbers() {
+        assert_eq!(dpm_shaders::generate::sobol_rows(), [1, 2, 3].map(|d| DIRECTIONS[d]));
+    }
 
     #[test]
     fn polynomials_are_the_known_primitive_ones() {
