@@ -160,7 +160,7 @@ fn other_sky(sky: &Environment) -> Option<Environment> {
 
 /// One of two renderers: its scene, its settings, and what stays in although nothing needs it.
 #[derive(Clone, Copy)]
-pub struct Side<'a> {
+pub(crate) struct Side<'a> {
     /// The rig's, or the rig's with a part changed; the bodies are the rig's.
     pub scene: &'a Scene,
     /// Method and numbers.
@@ -173,7 +173,12 @@ pub struct Side<'a> {
 ///
 /// # Errors
 /// The renderer's.
-pub fn compare(rig: &Rig, gpu: &Arc<Gpu>, without: Side<'_>, with: Side<'_>) -> Result<Saving, RenderError> {
+pub(crate) fn compare(
+    rig: &Rig,
+    gpu: &Arc<Gpu>,
+    without: Side<'_>,
+    with: Side<'_>,
+) -> Result<Saving, RenderError> {
     let open = |side: Side<'_>| Renderer::keeping(gpu, side.scene, side.settings.clone(), side.keep);
     let mut renderers = [open(without)?, open(with)?];
     let mut slots: [FrameSlot; 2] = [renderers[0].create_slot(true)?, renderers[1].create_slot(true)?];

@@ -53,7 +53,7 @@ pub struct Seen {
 
 /// What a frame of a method takes.
 #[derive(Clone, Copy, Debug)]
-pub struct FrameTime {
+pub(crate) struct FrameTime {
     /// On the GPU, all passes, ms; 0 without time stamps.
     pub gpu_ms: f64,
     /// From recording to the end of waiting, ms.
@@ -64,7 +64,7 @@ pub struct FrameTime {
 
 impl FrameTime {
     /// The time that methods are compared by, ms: the GPU's, or until the end of waiting where the device has no time stamps.
-    pub fn ms(&self) -> f64 {
+    pub(crate) fn ms(&self) -> f64 {
         if self.gpu_ms > 0.0 {
             self.gpu_ms
         } else {
@@ -164,11 +164,6 @@ impl Theatre {
         self.rig.camera.raster
     }
 
-    /// The span.
-    pub fn span(&self) -> Span {
-        self.span
-    }
-
     /// Draws the sequence with `method` at `spp` (fractions allowed) and `seed`. `each` is called after every frame.
     ///
     /// # Errors
@@ -216,7 +211,7 @@ impl Theatre {
     ///
     /// # Errors
     /// The renderer's.
-    pub fn race(&self, runners: &[(Method, f32)], seed: u32) -> Result<Vec<FrameTime>, RenderError> {
+    pub(crate) fn race(&self, runners: &[(Method, f32)], seed: u32) -> Result<Vec<FrameTime>, RenderError> {
         let rig = &self.rig;
         let mut all = Vec::new();
         for (method, spp) in runners {
@@ -248,7 +243,7 @@ impl Theatre {
     }
 
     /// Pixels of the raster in a degree of the observer's view, where neighbouring pixels of one body lie: the median. `None` without any.
-    pub fn pixels_per_degree(&self) -> Option<f64> {
+    pub(crate) fn pixels_per_degree(&self) -> Option<f64> {
         let poses = poses_at(&self.rig, self.span.last_slot);
         let tracked: Vec<DAffine3> = tracked_poses(&self.rig, &poses);
         let (eye, _) = self.rig.observer.eye_and_gaze(&tracked);

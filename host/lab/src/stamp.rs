@@ -79,7 +79,7 @@ impl Stamp {
 
 impl Stamp {
     /// A line for people, with an empty one after it.
-    pub fn line(&self) -> String {
+    pub(crate) fn line(&self) -> String {
         format!(
             "{} ({}), {} x {}, dpm {} of commit {}, configuration {}, seed {}\n\n",
             self.device,
@@ -94,7 +94,7 @@ impl Stamp {
     }
 
     /// The first columns of a table: device, driver, commit, config, seed.
-    pub fn csv(&self) -> String {
+    pub(crate) fn csv(&self) -> String {
         let quoted = |s: &str| format!("\"{}\"", s.replace('"', "'"));
         format!(
             "{},{},{},{},{}",

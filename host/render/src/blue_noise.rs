@@ -7,9 +7,9 @@
 use dpm_device::rng::Draws;
 
 /// Texels along each side of the committed masks.
-pub const SIZE: usize = 64;
+pub(crate) const SIZE: usize = 64;
 /// Slices (frames) of the committed masks.
-pub const FRAMES: usize = 32;
+pub(crate) const FRAMES: usize = 32;
 /// Independent masks, interleaved.
 pub(crate) const CHANNELS: usize = 2;
 /// Seeds of the committed masks, one a channel.
@@ -156,7 +156,7 @@ impl Torus {
 ///
 /// # Panics
 /// When there are fewer than 100 texels: too few for a pattern.
-pub fn generate(side: usize, frames: usize, seed: u64) -> Vec<u32> {
+pub(crate) fn generate(side: usize, frames: usize, seed: u64) -> Vec<u32> {
     let mut torus = Torus::new(side, frames);
     let n = torus.set.len();
     assert!(n >= 100, "a mask needs at least 100 texels");

@@ -6,7 +6,7 @@
 use dpm_shaders::structs::{Frame, Rows};
 
 /// Smallest cosine between surface and projector that is still compensated: beyond it the drive would be full anyway.
-pub const LEAST_COS: f64 = 1e-3;
+pub(crate) const LEAST_COS: f64 = 1e-3;
 
 /// What the light falls on and what the projector can give. Fixed for a rig.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -63,7 +63,8 @@ impl Compensation {
     }
 
     /// Radiance toward the eye that a drive produces on the real surface: the inverse, for judging.
-    pub fn radiance(&self, drive: [f64; 3], distance: f64, cos: f64) -> [f64; 3] {
+    #[cfg(test)]
+    pub(crate) fn radiance(&self, drive: [f64; 3], distance: f64, cos: f64) -> [f64; 3] {
         std::array::from_fn(|c| {
             drive[c] * cos.abs() / (f64::from(self.gain[c]) * distance * distance)
                 + f64::from(self.ambient[c])

@@ -121,7 +121,7 @@ impl Method {
     }
 
     /// `FRAME_*` bits.
-    pub fn flags(&self) -> u32 {
+    pub(crate) fn flags(&self) -> u32 {
         let bit = |on: bool, flag: u32| if on { flag } else { 0 };
         bit(self.needs_rates(), gpu::FRAME_RATE_MAP)
             | bit(self.checkerboard, gpu::FRAME_CHECKERBOARD)

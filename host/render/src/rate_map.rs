@@ -29,7 +29,7 @@ pub fn rate_table() -> Vec<[f32; 2]> {
 }
 
 /// The table read as the shader reads it.
-pub fn blur(table: &[[f32; 2]], v: f32) -> [f32; 2] {
+pub(crate) fn blur(table: &[[f32; 2]], v: f32) -> [f32; 2] {
     if v < FIRST {
         let rest = [1.0f32, 2.13];
         return std::array::from_fn(|c| rest[c] + (table[0][c] - rest[c]) * (v * 64.0));

@@ -3,7 +3,7 @@
 use super::last_frame::LastFrame;
 use super::memory::{BytesPerPixel, RasterTooLarge, SharedBuffers};
 use super::method::Method;
-use super::scene_data::{world_bounds, Keep, SceneData, SceneDataError, SceneNeeds};
+use super::scene_data::{world_bounds, Keep, SceneData, SceneDataError};
 use super::scene_gpu::{table_buffer, SceneGpu};
 use super::slot::{DebugBuffers, FrameSlot, PASSES};
 use super::tiles::TileList;
@@ -59,7 +59,7 @@ pub enum Output {
 
 impl Output {
     /// The planes that the GPU packs.
-    pub fn schedule(&self) -> Option<&PlaneSchedule> {
+    pub(crate) fn schedule(&self) -> Option<&PlaneSchedule> {
         match self {
             Self::Codes => None,
             Self::Planes(schedule) | Self::Both(schedule) => Some(schedule),
@@ -114,7 +114,6 @@ pub struct Renderer {
     data: Arc<SceneData>,
     pub(super) settings: RendererSettings,
     keep: Keep,
-    needs: SceneNeeds,
     /// Per body of the scene: which tracked body carries it.
     tracked: Vec<Option<u16>>,
     /// What the history holds: the last frame submitted and its poses.
@@ -264,21 +263,10 @@ impl Renderer {
             data,
             settings,
             keep,
-            needs,
             tracked,
             last,
             gpu: gpu.clone(),
         })
-    }
-
-    /// What the scene needs of the tracer.
-    pub fn needs(&self) -> SceneNeeds {
-        self.needs
-    }
-
-    /// Bodies of the scene, in order.
-    pub fn body_count(&self) -> usize {
-        self.data.bodies.len()
     }
 
     /// Interpolated normal of a surface in its body's space, without the normal map.

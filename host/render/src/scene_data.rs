@@ -125,7 +125,7 @@ pub struct SceneNeeds {
 
 impl SceneNeeds {
     /// What either of both needs. The kind of environment stays this scene's: another kind reads tables that it does not have.
-    pub fn with(self, other: Self) -> Self {
+    pub(crate) fn with(self, other: Self) -> Self {
         Self {
             textures: self.textures || other.textures,
             normal_maps: self.normal_maps || other.normal_maps,

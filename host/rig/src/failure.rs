@@ -62,7 +62,7 @@ pub struct Ended<T> {
 
 impl<T> Ended<T> {
     /// `failure` joins those that there are: the first one gives the kind, all give their messages.
-    pub fn fail(&mut self, failure: Failure) {
+    pub(crate) fn fail(&mut self, failure: Failure) {
         match &mut self.failure {
             Some(first) => {
                 first.message.push('\n');

@@ -17,7 +17,7 @@ use std::time::Duration;
 /// How often the contact is asked.
 const ASK_EVERY: Duration = Duration::from_millis(5);
 /// A "yes" older than this is none: the thread that asks has fallen silent.
-pub const SILENCE_NS: i64 = 100_000_000;
+pub(crate) const SILENCE_NS: i64 = 100_000_000;
 /// Before any instant of the clock.
 const NEVER: i64 = i64::MIN / 2;
 

@@ -218,7 +218,7 @@ impl Rig {
     }
 
     /// `pi * exposure / (albedo * max_intensity)`.
-    pub fn drive_gain(&self) -> f32 {
+    pub(crate) fn drive_gain(&self) -> f32 {
         let c = &self.config;
         (std::f64::consts::PI * c.render.exposure / (c.scene.surface_albedo * c.projector.max_intensity))
             as f32

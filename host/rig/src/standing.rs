@@ -211,7 +211,7 @@ impl OrderFile {
     }
 
     /// Where orders for this projector are kept.
-    pub fn path(&self) -> PathBuf {
+    pub(crate) fn path(&self) -> PathBuf {
         self.path.join(self.identity.order_name())
     }
 
@@ -220,7 +220,7 @@ impl OrderFile {
     ///
     /// # Errors
     /// The state folder could not be used at the start, or cannot be written to now.
-    pub fn keep(&self, order: Order, by: By) -> Result<PathBuf, FolderError> {
+    pub(crate) fn keep(&self, order: Order, by: By) -> Result<PathBuf, FolderError> {
         let Some(folder) = &self.folder else {
             let source = io::Error::other("could not be used when the run began");
             return Err(FolderError::Io { path: self.path.clone(), source });
@@ -245,7 +245,7 @@ impl OrderFile {
     ///
     /// # Errors
     /// Those of the operating system; an order then still stands.
-    pub fn forget(&self) -> Result<(), FolderError> {
+    pub(crate) fn forget(&self) -> Result<(), FolderError> {
         let Some(folder) = &self.folder else { return Ok(()) };
         for name in folder.names()? {
             if self.identity.is_meant_by(&name) {

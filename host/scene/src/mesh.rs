@@ -12,7 +12,7 @@ const MIN_RELATIVE_AREA: f64 = 1.0e-12;
 
 /// What [`TriangleMesh::drop_unusable`] removed.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
-pub struct Dropped {
+pub(crate) struct Dropped {
     /// Triangles with a corner that is NaN, infinite or beyond [`MAX_COORDINATE_M`].
     pub not_finite: usize,
     /// Triangles without area.
@@ -21,7 +21,7 @@ pub struct Dropped {
 
 impl Dropped {
     /// Adds the counts of another mesh.
-    pub fn add(&mut self, other: Dropped) {
+    pub(crate) fn add(&mut self, other: Dropped) {
         self.not_finite += other.not_finite;
         self.degenerate += other.degenerate;
     }

@@ -1,8 +1,7 @@
 //! Samples of many bodies to the filter of each.
 
 use super::pose_filter::{PoseFilter, PoseFilterConfig, Verdict};
-use super::state::{PosePrediction, TrackState};
-use dpm_device::time::HostTime;
+use super::state::TrackState;
 use dpm_device::tracker::{BodyIndex, TrackerSample};
 
 /// One filter a tracked body, in the order of the rig file.
@@ -20,16 +19,6 @@ impl PoseFilterBank {
     /// Hands a sample to its body's filter; `None` when the rig file names no such body.
     pub fn update(&mut self, sample: &TrackerSample) -> Option<Verdict> {
         Some(self.filters.get_mut(usize::from(sample.body.0))?.update(sample))
-    }
-
-    /// The filters, in the order of the bodies.
-    pub fn filters(&self) -> &[PoseFilter] {
-        &self.filters
-    }
-
-    /// A body at an instant; `None` for an unknown body and before its first track.
-    pub fn predict(&self, body: BodyIndex, at: HostTime) -> Option<PosePrediction> {
-        self.filters.get(usize::from(body.0))?.predict(at)
     }
 
     /// A body's track as plain data.

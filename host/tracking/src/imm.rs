@@ -155,7 +155,8 @@ impl Covariance {
     }
 
     /// Sum of the variances.
-    pub fn trace(&self) -> f64 {
+    #[cfg(test)]
+    pub(crate) fn trace(&self) -> f64 {
         self.pp + self.vv + self.aa
     }
 }
@@ -232,7 +233,7 @@ pub struct Kinematics<P> {
 
 impl<P: Copy> Kinematics<P> {
     /// A point that stands still, known to `variance` per axis.
-    pub fn held(point: P, variance: f64) -> Self {
+    pub(crate) fn held(point: P, variance: f64) -> Self {
         let covariance = [Covariance { pp: variance, ..Covariance::default() }; 3];
         Self { point, velocity: DVec3::ZERO, acceleration: DVec3::ZERO, covariance }
     }
@@ -439,7 +440,8 @@ impl<C: Chart> Imm<C> {
     }
 
     /// Weight of each model on each axis; each row sums to 1.
-    pub fn probability(&self) -> [[f64; MODES]; 3] {
+    #[cfg(test)]
+    pub(crate) fn probability(&self) -> [[f64; MODES]; 3] {
         self.axes.map(|axis| axis.probability)
     }
 
@@ -484,7 +486,7 @@ impl<C: Chart> Imm<C> {
 
     /// Squared Mahalanobis distance of a measurement of variance `r` (after [`Imm::advance`]): each axis by its most generous
     /// mode, with `slack` metres or rad of standard deviation added for what no mode expects.
-    pub fn distance_squared(&self, z: C::Point, r: f64, slack: f64) -> f64 {
+    pub(crate) fn distance_squared(&self, z: C::Point, r: f64, slack: f64) -> f64 {
         let z = C::between(self.base, z).to_array();
         let axis = |(bank, z): (&AxisBank, f64)| {
             let distance = |m: &AxisMode| {

@@ -7,7 +7,9 @@
 use super::imm::{Imm, ImmConfig, Kinematics, MotionModel, Rotations, Translations};
 use super::noise::NoiseEstimator;
 use super::recall::Recall;
-use super::state::{Freshness, PosePrediction, TrackState};
+#[cfg(test)]
+use super::state::Freshness;
+use super::state::{PosePrediction, TrackState};
 use dpm_common::so3::so3_between;
 use dpm_device::time::HostTime;
 use dpm_device::tracker::TrackerSample;
@@ -187,7 +189,7 @@ impl Verdict {
 /// How many samples met each fate since the start.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 #[allow(missing_docs)] // one per Verdict, named after it
-pub struct PoseFilterCounters {
+pub(crate) struct PoseFilterCounters {
     pub accepted: u64,
     pub stuck: u64,
     pub acquired: u64,
@@ -319,7 +321,8 @@ impl PoseFilter {
     }
 
     /// Fates of all samples so far.
-    pub fn counters(&self) -> PoseFilterCounters {
+    #[cfg(test)]
+    pub(crate) fn counters(&self) -> PoseFilterCounters {
         self.counters
     }
 
@@ -327,12 +330,6 @@ impl PoseFilter {
     /// account of its own error is right.
     pub fn last_nis(&self) -> Option<[f64; 2]> {
         self.last_nis
-    }
-
-    /// The noise in use: standard deviation per axis, metres and rad.
-    pub fn noise(&self) -> (f64, f64) {
-        let (p, r) = self.variances();
-        (p.sqrt(), r.sqrt())
     }
 
     /// Judges a sample and takes it in when it is good. Any bits may come in.
@@ -354,7 +351,7 @@ impl PoseFilter {
     }
 
     /// The track as plain data, to be predicted elsewhere.
-    pub fn state(&self) -> Option<TrackState> {
+    pub(crate) fn state(&self) -> Option<TrackState> {
         let track = self.track.as_ref()?;
         let (position, rotation) = match self.config.prediction {
             Prediction::On => (track.position.combined(), track.rotation.combined()),
@@ -373,7 +370,8 @@ impl PoseFilter {
     }
 
     /// Shorthand for the freshness of [`PoseFilter::predict`]; `Lost` before the first track.
-    pub fn freshness(&self, at: HostTime) -> Freshness {
+    #[cfg(test)]
+    pub(crate) fn freshness(&self, at: HostTime) -> Freshness {
         self.predict(at).map_or(Freshness::Lost, |p| p.freshness)
     }
 

@@ -12,7 +12,7 @@ use std::path::{Path, PathBuf};
 
 /// Flags of `dpm run`.
 #[derive(clap::Args, Clone, Debug)]
-pub struct RunArgs {
+pub(crate) struct RunArgs {
     /// The rig file
     #[arg(value_name = "RIG.toml")]
     rig: PathBuf,
@@ -37,7 +37,7 @@ pub(crate) struct DemoArgs {
 ///
 /// # Errors
 /// Bad rig file, scene or device.
-pub fn execute(args: &RunArgs) -> Result<(), Failure> {
+pub(crate) fn execute(args: &RunArgs) -> Result<(), Failure> {
     start(Some(&args.rig), &args.flags, args.json)
 }
 

@@ -115,7 +115,7 @@ pub fn install() -> io::Result<()> {
 ///
 /// # Errors
 /// The operating system's, which does not happen for these signals.
-pub fn ignore() -> io::Result<()> {
+pub(crate) fn ignore() -> io::Result<()> {
     STOPS.into_iter().try_for_each(|signal| handle(signal, libc::SIG_IGN))
 }
 
@@ -153,7 +153,7 @@ fn unblock() -> io::Result<()> {
 }
 
 /// The signal that asked for a stop, by name; `None` as long as none did.
-pub fn received() -> Option<&'static str> {
+pub(crate) fn received() -> Option<&'static str> {
     Some(match stopping::signal()? {
         libc::SIGINT => "SIGINT",
         libc::SIGTERM => "SIGTERM",

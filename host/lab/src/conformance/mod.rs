@@ -29,7 +29,7 @@ const TRIES: u32 = 3;
 
 /// Why a rule's function ends early.
 #[derive(Debug)]
-pub enum Stop {
+pub(crate) enum Stop {
     /// The device broke the rule: what was expected, and what was seen.
     Failed(String),
     /// Nothing that the device reports can show it, and why.

@@ -23,7 +23,7 @@ use std::sync::Arc;
 pub const SPP: [u32; 5] = [5, 10, 15, 20, 30];
 
 /// The four reflections: names and looks, the diffuse ones first. \[paper\] gives no numbers; these are the scenes' that rebuild it.
-pub fn looks() -> [Material; 4] {
+pub(crate) fn looks() -> [Material; 4] {
     let of = |name: &str, color: [u8; 3], metallic, roughness| Material {
         name: name.into(),
         base_color: Vec3::from_array(color.map(|c| f32::from(c) / 255.0)),
@@ -191,7 +191,7 @@ pub fn measure(
 
 /// What the two findings of \[paper\] section 3 are here.
 #[derive(Clone, Copy, Debug, PartialEq)]
-pub struct Findings {
+pub(crate) struct Findings {
     /// Conditions measured both standing and moving.
     pub pairs: usize,
     /// Those in which the moving one is no worse, within 5 %.
@@ -203,7 +203,7 @@ pub struct Findings {
 }
 
 /// Reads the findings off the rows.
-pub fn findings(groups: &[Figure3Group]) -> Findings {
+pub(crate) fn findings(groups: &[Figure3Group]) -> Findings {
     let rows = || groups.iter().flat_map(|g| &g.rows);
     let pairs: Vec<f64> = rows()
         .filter(|r| r.moving)

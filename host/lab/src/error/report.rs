@@ -139,7 +139,7 @@ pub(crate) fn time_ms(r: &ErrorRow) -> f64 {
 
 /// What a curve says at a place.
 #[derive(Clone, Copy, Debug, PartialEq)]
-pub enum Reading {
+pub(crate) enum Reading {
     /// Between two measured points.
     Within(f64),
     /// Beyond an end by at most [`REACH`] either way, along the last line.
@@ -147,7 +147,7 @@ pub enum Reading {
 }
 
 /// How far beyond its measured points a curve is read, as a factor.
-pub const REACH: f64 = 4.0;
+pub(crate) const REACH: f64 = 4.0;
 
 /// `y` where `x` is on a curve of straight lines between the logarithms of points. `None` farther beyond its ends than [`REACH`], and where
 /// it passes `x` more than once: then no one value is right.

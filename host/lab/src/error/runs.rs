@@ -227,7 +227,7 @@ impl ErrorRuns {
     }
 
     /// The same for a rig that was changed beside its file: `variant` says how, `scene` names all of it that the reference depends on.
-    pub fn variant(
+    pub(crate) fn variant(
         rig: Arc<Rig>,
         gpu: Arc<Gpu>,
         options: ErrorOptions,
@@ -236,11 +236,6 @@ impl ErrorRuns {
     ) -> Self {
         let stamp = Stamp::new(&rig, gpu.summary());
         Self { rig, gpu, options, stamp, variant, scene }
-    }
-
-    /// The stamp of all groups.
-    pub fn stamp(&self) -> &Stamp {
-        &self.stamp
     }
 
     /// How many methods a group has.

@@ -10,7 +10,7 @@ use std::f64::consts::PI;
 pub(crate) const DELTA_BELOW_ALPHA: f64 = 1e-3;
 
 /// Smallest cosine between the shading normal and the viewing direction; below, the normal is bent.
-pub const LEAST_COS: f64 = 1e-3;
+pub(crate) const LEAST_COS: f64 = 1e-3;
 
 /// Scattering at a point seen from one direction.
 pub(crate) struct Bsdf<'t> {

@@ -7,7 +7,7 @@ use glam::DVec3;
 
 /// A triangle in world space and where it comes from.
 #[derive(Clone, Copy, Debug)]
-pub struct Triangle {
+pub(crate) struct Triangle {
     /// Corners, counter-clockwise from outside.
     pub p: [DVec3; 3],
     /// Body it belongs to.
@@ -18,7 +18,7 @@ pub struct Triangle {
 
 /// Where a ray meets a triangle.
 #[derive(Clone, Copy, Debug, PartialEq)]
-pub struct Hit {
+pub(crate) struct Hit {
     /// Ray parameter, in lengths of the direction.
     pub t: f64,
     /// Barycentric weights of the three corners, sum 1.
@@ -39,7 +39,7 @@ struct Node {
 
 /// The hierarchy.
 #[derive(Clone, Debug)]
-pub struct Bvh {
+pub(crate) struct Bvh {
     nodes: Vec<Node>,
     triangles: Vec<Triangle>,
 }
@@ -128,7 +128,7 @@ impl Prepared {
 
 impl Bvh {
     /// Builds the hierarchy with the surface area heuristic; any number of triangles, any arrangement.
-    pub fn new(mut triangles: Vec<Triangle>) -> Self {
+    pub(crate) fn new(mut triangles: Vec<Triangle>) -> Self {
         let mut nodes = Vec::with_capacity(2 * triangles.len() / LEAF + 1);
         if triangles.is_empty() {
             return Self { nodes, triangles };
@@ -154,22 +154,17 @@ impl Bvh {
     }
 
     /// The triangles in the order of the leaves.
-    pub fn triangles(&self) -> &[Triangle] {
+    pub(crate) fn triangles(&self) -> &[Triangle] {
         &self.triangles
     }
 
     /// One of them.
-    pub fn triangle(&self, i: usize) -> &Triangle {
+    pub(crate) fn triangle(&self, i: usize) -> &Triangle {
         &self.triangles[i]
     }
 
-    /// Smallest box around everything; zero when empty.
-    pub fn bounds(&self) -> (DVec3, DVec3) {
-        self.nodes.first().map_or((DVec3::ZERO, DVec3::ZERO), |n| (n.min, n.max))
-    }
-
     /// The nearest accepted hit at 0 < t < `t_max`.
-    pub fn closest(
+    pub(crate) fn closest(
         &self,
         origin: DVec3,
         direction: DVec3,
@@ -188,7 +183,7 @@ impl Bvh {
     }
 
     /// True when there is an accepted hit at 0 < t < `t_max`.
-    pub fn any(
+    pub(crate) fn any(
         &self,
         origin: DVec3,
         direction: DVec3,

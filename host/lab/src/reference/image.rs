@@ -74,7 +74,7 @@ struct Pixel {
 
 impl Reference<'_> {
     /// True when light from `projector` at a point that it sees can reach `eye`: both are on one side, and nothing real is between.
-    pub fn lit(&self, point: &SurfacePoint, projector: DVec3, eye: DVec3) -> bool {
+    pub(crate) fn lit(&self, point: &SurfacePoint, projector: DVec3, eye: DVec3) -> bool {
         let (p, e) = (projector - point.position, eye - point.position);
         let (cos_p, cos_e) = (point.geometric.dot(p), point.geometric.dot(e));
         if cos_p * cos_e <= 0.0 || !e.is_finite() {
@@ -84,7 +84,12 @@ impl Reference<'_> {
     }
 
     /// The rig's image: rays from the projector, radiance toward the eye.
-    pub fn render(&self, camera: &ProjectorCamera, eye: DVec3, settings: &RenderSettings) -> ReferenceImage {
+    pub(crate) fn render(
+        &self,
+        camera: &ProjectorCamera,
+        eye: DVec3,
+        settings: &RenderSettings,
+    ) -> ReferenceImage {
         self.render_view(camera, View::Eye(eye), settings)
     }
 

@@ -34,7 +34,7 @@ pub(crate) fn fresnel_schlick(f0: DVec3, cos: f64) -> DVec3 {
 
 /// Direction behind the interface for a direction `v` in front of it (both pointing away from it), `h` the normal on the side of
 /// `v`, `eta` as in [`fresnel_dielectric`]. `None` under total reflection.
-pub fn refract(v: DVec3, h: DVec3, eta: f64) -> Option<DVec3> {
+pub(crate) fn refract(v: DVec3, h: DVec3, eta: f64) -> Option<DVec3> {
     let c = v.dot(h);
     let cos2 = 1.0 - (1.0 - c * c).max(0.0) / (eta * eta);
     (cos2 > 0.0).then(|| ((c / eta - cos2.sqrt()) * h - v / eta).normalize())

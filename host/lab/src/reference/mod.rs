@@ -32,7 +32,7 @@ use std::sync::OnceLock;
 pub(crate) const OFFSET: f64 = 1e-12;
 
 /// A scene with every body at a pose, ready to be traced.
-pub struct Reference<'a> {
+pub(crate) struct Reference<'a> {
     scene: &'a Scene,
     bvh: Bvh,
     normal_from_body: Vec<DMat3>,
@@ -47,7 +47,7 @@ pub struct Reference<'a> {
 
 impl<'a> Reference<'a> {
     /// Builds the tracer. `poses`: world-from-body for each body of the scene; bodies beyond its end are at rest.
-    pub fn new(scene: &'a Scene, poses: &[DAffine3]) -> Self {
+    pub(crate) fn new(scene: &'a Scene, poses: &[DAffine3]) -> Self {
         let world_from_body: Vec<DAffine3> = (scene.bodies.iter().enumerate())
             .map(|(i, body)| poses.get(i).copied().unwrap_or(body.world_from_body_rest))
             .collect();
@@ -84,17 +84,13 @@ impl<'a> Reference<'a> {
     }
 
     /// The acceleration structure, for tests that compare it with brute force.
-    pub fn bvh(&self) -> &Bvh {
+    #[cfg(test)]
+    pub(crate) fn bvh(&self) -> &Bvh {
         &self.bvh
     }
 
-    /// World-from-body of every body.
-    pub fn poses(&self) -> &[DAffine3] {
-        &self.world_from_body
-    }
-
     /// The first surface on a ray at 0 < t < `t_max`; masked-out texels let it pass. `projected_only`: see [`Self::visible`].
-    pub fn trace(
+    pub(crate) fn trace(
         &self,
         origin: DVec3,
         direction: DVec3,
@@ -106,19 +102,19 @@ impl<'a> Reference<'a> {
     }
 
     /// True when nothing stands between two points. `projected_only`: only bodies on which the projector's light can fall count.
-    pub fn visible(&self, from: DVec3, to: DVec3, projected_only: bool) -> bool {
+    pub(crate) fn visible(&self, from: DVec3, to: DVec3, projected_only: bool) -> bool {
         let way = to - from;
         let length = way.length();
         length > 0.0 && !self.occluded(from, way / length, length, projected_only)
     }
 
     /// True when something stands on a ray at 0 < t < `t_max`.
-    pub fn occluded(&self, origin: DVec3, direction: DVec3, t_max: f64, projected_only: bool) -> bool {
+    pub(crate) fn occluded(&self, origin: DVec3, direction: DVec3, t_max: f64, projected_only: bool) -> bool {
         self.bvh.any(origin, direction, t_max, |hit| self.exists(hit, projected_only))
     }
 
     /// The coat's albedo table of a material.
-    pub fn table(&self, material: u32) -> &AlbedoTable {
+    pub(crate) fn table(&self, material: u32) -> &AlbedoTable {
         let (ior, table) = &self.tables[self.table_of_material[material as usize]];
         table.get_or_init(|| AlbedoTable::new(*ior))
     }
@@ -135,7 +131,7 @@ impl<'a> Reference<'a> {
 }
 
 /// A point moved off its surface: `normal` is the geometric one, `toward` tells the side. `scale`: largest coordinate involved.
-pub fn offset(point: DVec3, normal: DVec3, toward: DVec3, scale: f64) -> DVec3 {
+pub(crate) fn offset(point: DVec3, normal: DVec3, toward: DVec3, scale: f64) -> DVec3 {
     let side = if normal.dot(toward) >= 0.0 { 1.0 } else { -1.0 };
     point + normal * (side * OFFSET * scale)
 }

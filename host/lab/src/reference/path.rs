@@ -24,7 +24,7 @@ fn balance(own: f64, other: f64) -> f64 {
 
 impl Reference<'_> {
     /// One sample of the radiance that leaves `x1` toward `toward_viewer` (unit), with at most `depth` closest hits counting `x1`.
-    pub fn radiance(
+    pub(crate) fn radiance(
         &self,
         x1: &SurfacePoint,
         toward_viewer: DVec3,

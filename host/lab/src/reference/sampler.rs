@@ -4,13 +4,13 @@
 
 /// A stream of random numbers.
 #[derive(Clone, Debug)]
-pub struct Sampler {
+pub(crate) struct Sampler {
     state: [u64; 4],
 }
 
 impl Sampler {
     /// Stream `stream` of seed `seed`; different streams are independent.
-    pub fn new(seed: u64, stream: u64) -> Self {
+    pub(crate) fn new(seed: u64, stream: u64) -> Self {
         let mut x = seed ^ stream.wrapping_mul(0xD134_2543_DE82_EF95).rotate_left(17);
         let mut state = [0; 4];
         for s in &mut state {
@@ -24,7 +24,7 @@ impl Sampler {
     }
 
     /// The next 64 random bits.
-    pub fn next_u64(&mut self) -> u64 {
+    pub(crate) fn next_u64(&mut self) -> u64 {
         let s = &mut self.state;
         let result = s[0].wrapping_add(s[3]).rotate_left(23).wrapping_add(s[0]);
         let t = s[1] << 17;
@@ -38,12 +38,12 @@ impl Sampler {
     }
 
     /// Uniform in 0..1, 1 excluded, 53 bits.
-    pub fn uniform(&mut self) -> f64 {
+    pub(crate) fn uniform(&mut self) -> f64 {
         (self.next_u64() >> 11) as f64 * (1.0 / (1u64 << 53) as f64)
     }
 
     /// Two of them.
-    pub fn uniform2(&mut self) -> [f64; 2] {
+    pub(crate) fn uniform2(&mut self) -> [f64; 2] {
         [self.uniform(), self.uniform()]
     }
 }

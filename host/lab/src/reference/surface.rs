@@ -62,7 +62,7 @@ pub(super) const STRAIGHT_BELOW_IOR: f64 = 1.001;
 
 impl Reference<'_> {
     /// What lies at a hit.
-    pub fn resolve(&self, hit: &Hit) -> SurfacePoint {
+    pub(crate) fn resolve(&self, hit: &Hit) -> SurfacePoint {
         let triangle = self.bvh.triangle(hit.triangle);
         let [a, b, c] = triangle.p;
         let body = &self.scene.bodies[triangle.body as usize];

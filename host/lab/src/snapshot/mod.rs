@@ -64,7 +64,7 @@ pub enum SnapshotImage {
 
 impl SnapshotImage {
     /// All of them.
-    pub const ALL: [Self; 14] = [
+    pub(crate) const ALL: [Self; 14] = [
         Self::Radiance,
         Self::Rate,
         Self::Error,
@@ -82,7 +82,7 @@ impl SnapshotImage {
     ];
 
     /// Name on the command line and of the file.
-    pub fn name(self) -> String {
+    pub(crate) fn name(self) -> String {
         clap::ValueEnum::to_possible_value(&self).map_or(String::new(), |v| v.get_name().to_owned())
     }
 }
@@ -244,7 +244,7 @@ fn save_png(path: &Path, canvas: &Canvas) -> Result<PathBuf, Failure> {
 }
 
 /// A portable float map: little-endian, rows bottom to top.
-pub fn pfm(linear: &[Vec3], width: usize) -> Vec<u8> {
+pub(crate) fn pfm(linear: &[Vec3], width: usize) -> Vec<u8> {
     let height = linear.len() / width.max(1);
     let mut out = format!("PF\n{width} {height}\n-1.0\n").into_bytes();
     for row in linear.chunks_exact(width.max(1)).rev() {

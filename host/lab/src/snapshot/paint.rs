@@ -34,7 +34,7 @@ const BAR: usize = 28;
 
 /// How values become places on the colour bar.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum Scale {
+pub(crate) enum Scale {
     /// From zero to nearly the largest value.
     FromZero,
     /// From the smallest to the largest value.
@@ -45,7 +45,7 @@ pub enum Scale {
 
 impl Canvas {
     /// Empty paper.
-    pub fn new(width: usize, height: usize) -> Self {
+    pub(crate) fn new(width: usize, height: usize) -> Self {
         Self { width, height, rgb: PAPER.repeat(width * height) }
     }
 
@@ -56,7 +56,7 @@ impl Canvas {
     }
 
     /// Fills a rectangle; what lies outside is cut off.
-    pub fn block(&mut self, x: usize, y: usize, width: usize, height: usize, colour: [u8; 3]) {
+    pub(crate) fn block(&mut self, x: usize, y: usize, width: usize, height: usize, colour: [u8; 3]) {
         for j in y..y + height {
             for i in x..x + width {
                 self.put(i, j, colour);
@@ -65,7 +65,7 @@ impl Canvas {
     }
 
     /// Writes text, three pixels a dot.
-    pub fn text(&mut self, x: usize, y: usize, text: &str) {
+    pub(crate) fn text(&mut self, x: usize, y: usize, text: &str) {
         for_each_dot(text, |dx, dy| self.block(x + dx * DOT, y + dy * DOT, DOT, DOT, INK));
     }
 
@@ -105,7 +105,7 @@ impl Canvas {
     }
 
     /// The colour of a pixel.
-    pub fn at(&self, x: usize, y: usize) -> [u8; 3] {
+    pub(crate) fn at(&self, x: usize, y: usize) -> [u8; 3] {
         let i = (y * self.width + x) * 3;
         [self.rgb[i], self.rgb[i + 1], self.rgb[i + 2]]
     }
@@ -187,7 +187,7 @@ fn range(values: &[Option<f32>], scale: Scale) -> (f32, f32) {
 }
 
 /// A quantity in colours with its bar. `None`: no value there.
-pub fn quantity(raster: Raster, values: &[Option<f32>], scale: Scale, title: &str) -> Canvas {
+pub(crate) fn quantity(raster: Raster, values: &[Option<f32>], scale: Scale, title: &str) -> Canvas {
     let (low, high) = range(values, scale);
     let place = |v: f32| match scale {
         Scale::Log => (v.max(low) / low).ln() / (high / low).ln(),
@@ -214,7 +214,12 @@ pub fn quantity(raster: Raster, values: &[Option<f32>], scale: Scale, title: &st
 }
 
 /// Kinds in colours with their names.
-pub fn kinds(raster: Raster, values: &[Option<usize>], names: &[(&str, [u8; 3])], title: &str) -> Canvas {
+pub(crate) fn kinds(
+    raster: Raster,
+    values: &[Option<usize>],
+    names: &[(&str, [u8; 3])],
+    title: &str,
+) -> Canvas {
     let (mut canvas, left, top) = with_legend(raster, title, |i| {
         values[i].map_or(NOTHING, |k| names.get(k).map_or(NOT_FINITE, |n| n.1))
     });
@@ -239,7 +244,7 @@ fn wheel(x: f32, y: f32) -> [u8; 3] {
 }
 
 /// Vectors (x to the right, y **down** as the raster's rows) as directions and lengths, with a disc that tells both.
-pub fn directions(raster: Raster, values: &[Option<[f32; 2]>], title: &str) -> Canvas {
+pub(crate) fn directions(raster: Raster, values: &[Option<[f32; 2]>], title: &str) -> Canvas {
     let lengths: Vec<Option<f32>> = values.iter().map(|v| v.map(|[x, y]| x.hypot(y))).collect();
     let (_, longest) = range(&lengths, Scale::FromZero);
     let (mut canvas, left, top) = with_legend(raster, title, |i| match values[i] {
@@ -261,7 +266,7 @@ pub fn directions(raster: Raster, values: &[Option<[f32; 2]>], title: &str) -> C
 }
 
 /// Colours 0..1 as they are, without a legend and not enlarged.
-pub fn colours(raster: Raster, values: &[Option<[f32; 3]>]) -> Canvas {
+pub(crate) fn colours(raster: Raster, values: &[Option<[f32; 3]>]) -> Canvas {
     let rgb = values
         .iter()
         .flat_map(|v| match v {

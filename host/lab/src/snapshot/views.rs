@@ -30,7 +30,7 @@ pub(crate) struct Views<'a> {
 }
 
 /// What [`SnapshotImage`] needs that `method` does not compute; `None`: nothing is missing.
-pub fn missing(image: SnapshotImage, method: &Method) -> Option<&'static str> {
+pub(crate) fn missing(image: SnapshotImage, method: &Method) -> Option<&'static str> {
     use SnapshotImage as I;
     let guides = method.needs_history() || method.needs_spatial() || method.spp_by_angle;
     let (there, why) = match image {

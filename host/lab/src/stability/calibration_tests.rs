@@ -182,17 +182,3 @@ fn wide_lenses_work_and_are_remarked() {
     assert!(got.warnings.iter().any(|w| w.contains("132 deg")), "{:?}", got.warnings);
     assert!(got.summary().iter().any(|l| l.starts_with("field of view 131.8 x")), "{:#?}", got.summary());
 }
-
-#[test]
-fn share_inside_counts_points_on_the_raster() {
-    let c = truth();
-    let ray = |x, y| {
-        let r = c.ray(DVec2::new(x, y));
-        r.origin + r.direction
-    };
-    let points = [ray(1.0, 1.0), ray(1023.0, 767.0), ray(-1.0, 5.0), ray(10.0, 769.0)];
-    assert_eq!(share_inside(&c, points), 0.5);
-    assert_eq!(share_inside(&c, []), 0.0);
-    let back = c.position() * 2.0 - points[0];
-    assert_eq!(share_inside(&c, [back]), 0.0);
-}

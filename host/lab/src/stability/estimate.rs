@@ -12,7 +12,7 @@ pub struct Estimate {
 
 impl Estimate {
     /// Takes one more value.
-    pub fn add(&mut self, value: [f64; 3]) {
+    pub(crate) fn add(&mut self, value: [f64; 3]) {
         self.count += 1.0;
         for (c, v) in value.into_iter().enumerate() {
             let delta = v - self.mean[c];
@@ -22,7 +22,7 @@ impl Estimate {
     }
 
     /// Variance of the mean; infinite with fewer than two values.
-    pub fn variance(&self, channel: usize) -> f64 {
+    pub(crate) fn variance(&self, channel: usize) -> f64 {
         if self.count > 1.0 {
             self.squares[channel] / (self.count * (self.count - 1.0))
         } else {

@@ -8,7 +8,7 @@ use dpm_render::gpu::{Gpu, GpuOptions};
 use std::sync::Arc;
 
 /// The device, or why there is none.
-pub type Device = Result<Arc<Gpu>, String>;
+pub(crate) type Device = Result<Arc<Gpu>, String>;
 
 /// The first usable device, software included; with `DPM_VALIDATION` set, under the validation layer.
 pub fn open() -> Device {

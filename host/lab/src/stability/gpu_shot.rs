@@ -76,7 +76,7 @@ impl<'a> Shot<'a> {
     }
 
     /// Poses in use.
-    pub fn world_from_body(&self) -> Vec<DAffine3> {
+    pub(crate) fn world_from_body(&self) -> Vec<DAffine3> {
         if self.poses.is_empty() {
             self.scene.bodies.iter().map(|b| b.world_from_body_rest).collect()
         } else {
@@ -85,7 +85,7 @@ impl<'a> Shot<'a> {
     }
 
     /// The renderer's settings.
-    pub fn settings(&self) -> RendererSettings {
+    pub(crate) fn settings(&self) -> RendererSettings {
         RendererSettings {
             raster: self.camera.raster,
             depth: self.depth,
@@ -135,7 +135,7 @@ impl<'a> Shot<'a> {
     ///
     /// # Panics
     /// As [`Shot::draw`].
-    pub fn play(
+    pub(crate) fn play(
         &self,
         renderer: &mut Renderer,
         frames: Range<u32>,
@@ -198,12 +198,12 @@ impl Picture {
     }
 
     /// Samples of all frames that were dropped because they were not finite.
-    pub fn invalid_samples(&self) -> u32 {
+    pub(crate) fn invalid_samples(&self) -> u32 {
         self.counters.iter().map(|c| c.invalid_samples).sum()
     }
 
     /// Closest-hit and shadow rays of all frames.
-    pub fn rays(&self) -> u64 {
+    pub(crate) fn rays(&self) -> u64 {
         self.counters.iter().map(|c| u64::from(c.rays)).sum()
     }
 

@@ -51,7 +51,7 @@ pub struct Case {
 
 impl Case {
     /// A case from its parts, in the order of the fields.
-    pub fn new(
+    pub(crate) fn new(
         name: &'static str,
         input: &'static str,
         oracle: &'static str,
@@ -117,7 +117,7 @@ pub struct StabilityReport {
 
 impl StabilityReport {
     /// Adds a result.
-    pub fn push(&mut self, result: CaseResult) {
+    pub(crate) fn push(&mut self, result: CaseResult) {
         match result.verdict {
             CaseVerdict::Pass => self.passed += 1,
             CaseVerdict::Fail => self.failed += 1,
@@ -157,14 +157,15 @@ pub fn cases() -> Vec<Case> {
 }
 
 /// Runs the cases whose name contains `only` (all without it).
-pub fn run(only: Option<&str>) -> StabilityReport {
+#[cfg(test)]
+pub(crate) fn run(only: Option<&str>) -> StabilityReport {
     let mut report = StabilityReport::default();
     report.run_cases(&cases(), only, SEED..=SEED, |_| {});
     report
 }
 
 /// Runs one case with several seeds: the first result that is no pass, else that of the largest error. `None` without a seed.
-pub fn worst(case: &Case, seeds: RangeInclusive<u64>) -> Option<CaseResult> {
+pub(crate) fn worst(case: &Case, seeds: RangeInclusive<u64>) -> Option<CaseResult> {
     let mut largest: Option<CaseResult> = None;
     for seed in seeds {
         let result = run_case(case, seed);

@@ -14,7 +14,7 @@ use glam::{DVec3, Vec3};
 use std::f64::consts::PI;
 
 /// The cases.
-pub fn cases() -> Vec<Case> {
+pub(crate) fn cases() -> Vec<Case> {
     vec![
         Case::new("tracer-energy-of-every-lobe", "roughness 0, 1e-4, 1e-3, 0.5, 1; ior 1 to 2.4; metal, coat, thin, solid; down to grazing 89.99 deg", "albedo at most 1", "excess", 1e-2, energy),
         Case::new("tracer-single-scatter-loss", "white rough metal, alpha 0.25, 0.5, 1", "directional albedo 0.882, 0.700, 0.409 on average", "albedo", 3e-3, single_scatter),

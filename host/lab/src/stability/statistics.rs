@@ -85,7 +85,7 @@ pub(crate) fn test_directions(
 
 /// Mean and standard error of a stream of values.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
-pub struct Mean {
+pub(crate) struct Mean {
     n: f64,
     mean: f64,
     m2: f64,
@@ -93,7 +93,7 @@ pub struct Mean {
 
 impl Mean {
     /// Adds a value (\[Welford62\]).
-    pub fn push(&mut self, x: f64) {
+    pub(crate) fn push(&mut self, x: f64) {
         self.n += 1.0;
         let d = x - self.mean;
         self.mean += d / self.n;
@@ -101,7 +101,7 @@ impl Mean {
     }
 
     /// The mean.
-    pub fn mean(&self) -> f64 {
+    pub(crate) fn mean(&self) -> f64 {
         self.mean
     }
 
@@ -111,7 +111,7 @@ impl Mean {
     }
 
     /// Standard deviation of one value.
-    pub fn deviation(&self) -> f64 {
+    pub(crate) fn deviation(&self) -> f64 {
         (self.m2 / self.n.max(1.0)).sqrt()
     }
 }

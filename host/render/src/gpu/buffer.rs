@@ -62,7 +62,12 @@ impl Buffer {
     ///
     /// # Errors
     /// As [`Buffer::new`]; [`GpuError::Limit`] when there are more texels than the device's texel buffers hold.
-    pub fn texels(gpu: &Arc<Gpu>, what: &str, data: &[[u32; 4]], float: bool) -> Result<Self, GpuError> {
+    pub(crate) fn texels(
+        gpu: &Arc<Gpu>,
+        what: &str,
+        data: &[[u32; 4]],
+        float: bool,
+    ) -> Result<Self, GpuError> {
         Self::check_texels(gpu, what, data.len())?;
         Self::filled(gpu, what, bytemuck::cast_slice(data), vk::BufferUsageFlags::STORAGE_TEXEL_BUFFER)?
             .viewed_as_texels(float)
@@ -223,16 +228,11 @@ impl Buffer {
         })
     }
 
-    /// Size in bytes (at least 16).
-    pub fn len_bytes(&self) -> usize {
-        self.len_bytes
-    }
-
     /// The mapped bytes. The GPU must not be writing them: wait for the frame's fence first.
     ///
     /// # Panics
     /// For [`MemoryKind::Device`] buffers, which are never mapped.
-    pub fn bytes(&self) -> &[u8] {
+    pub(crate) fn bytes(&self) -> &[u8] {
         let pointer = self.mapped.expect("a mapped kind of buffer");
         // SAFETY: mapped for `len_bytes` for the life of the buffer.
         unsafe { std::slice::from_raw_parts(pointer.as_ptr(), self.len_bytes) }
@@ -254,7 +254,7 @@ impl Buffer {
     }
 
     /// Copies `data` to the start.
-    pub fn write<T: Pod>(&mut self, data: &[T]) {
+    pub(crate) fn write<T: Pod>(&mut self, data: &[T]) {
         let bytes: &[u8] = bytemuck::cast_slice(data);
         self.bytes_mut()[..bytes.len()].copy_from_slice(bytes);
     }

@@ -214,7 +214,7 @@ impl Recorder<'_> {
     }
 
     /// A time stamp after all passes so far. Stamps beyond the list's maximum are left out.
-    pub fn stamp(&mut self) {
+    pub(crate) fn stamp(&mut self) {
         if let Some(queries) = self.list.queries {
             if self.list.stamps < self.list.max_stamps {
                 // SAFETY: recording; the index is below the pool's size.
@@ -270,7 +270,7 @@ impl FrameFence {
     ///
     /// # Errors
     /// Device lost or given up: for ever, what it was to signal does not become valid any more.
-    pub fn poll(&mut self, timeout_ns: u64) -> Result<bool, GpuError> {
+    pub(crate) fn poll(&mut self, timeout_ns: u64) -> Result<bool, GpuError> {
         self.gpu.alive("waiting for a frame")?;
         if !self.pending {
             return Ok(true);

@@ -30,7 +30,7 @@ impl LossBudget {
     pub(crate) const WITHIN_NS: i64 = 60_000_000_000;
 
     /// Survives `most` losses within any `within_ns` nanoseconds.
-    pub fn new(most: usize, within_ns: i64) -> Self {
+    pub(crate) fn new(most: usize, within_ns: i64) -> Self {
         Self { recent: Vec::with_capacity(most), most, within_ns, total: 0 }
     }
 
@@ -47,7 +47,8 @@ impl LossBudget {
     }
 
     /// Losses so far, those of long ago included.
-    pub fn total(&self) -> u64 {
+    #[cfg(test)]
+    pub(crate) fn total(&self) -> u64 {
         self.total
     }
 }

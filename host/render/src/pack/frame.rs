@@ -30,7 +30,7 @@ impl BitPlaneFrame {
     }
 
     /// Mirrors of every plane.
-    pub fn raster(&self) -> Raster {
+    pub(crate) fn raster(&self) -> Raster {
         self.raster
     }
 
@@ -74,7 +74,8 @@ impl BitPlaneFrame {
     }
 
     /// Makes every plane dark.
-    pub fn clear(&mut self) {
+    #[cfg(test)]
+    pub(crate) fn clear(&mut self) {
         self.bytes_mut().fill(0);
     }
 

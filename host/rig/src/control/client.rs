@@ -29,7 +29,7 @@ const MAX_RIGS: usize = 256;
 
 /// A rig that listens, as its socket says.
 #[derive(Clone, Debug)]
-pub struct Place {
+pub(crate) struct Place {
     folder: Arc<Folder>,
     /// Its process.
     pub pid: u32,

@@ -23,7 +23,7 @@ pub struct Ticket(u64);
 
 /// What the disk has of an order.
 #[derive(Clone, Debug, PartialEq, Eq)]
-pub enum Kept {
+pub(crate) enum Kept {
     /// It stands over restarts, in this file.
     In(PathBuf),
     /// What stood is forgotten (after ARM).
@@ -113,13 +113,14 @@ impl Orders {
 
     /// What the disk has of the order; `None` while that is being settled. Of orders that were given in quick succession the newest
     /// one's answer stands for all.
-    pub fn outcome(&self, ticket: Ticket) -> Option<Kept> {
+    pub(crate) fn outcome(&self, ticket: Ticket) -> Option<Kept> {
         let state = self.inner.state();
         state.outcome.clone().filter(|_| state.settled >= ticket.0)
     }
 
     /// What stands now.
-    pub fn standing(&self) -> Option<Order> {
+    #[cfg(test)]
+    pub(crate) fn standing(&self) -> Option<Order> {
         self.inner.state().stands
     }
 

@@ -26,7 +26,7 @@ pub struct StatusFile {
 
 /// What the file said.
 #[derive(Clone, Debug, PartialEq, Eq)]
-pub struct Said {
+pub(crate) struct Said {
     /// When it was written, nanoseconds of [`monotonic_ns`].
     pub at_ns: u64,
     /// How the projector was then.
@@ -81,7 +81,7 @@ impl StatusFile {
     ///
     /// # Errors
     /// It is not there, cannot be read, or is half written: look again.
-    pub fn read(folder: &Folder, pid: u32) -> Result<Said, FolderError> {
+    pub(crate) fn read(folder: &Folder, pid: u32) -> Result<Said, FolderError> {
         let name = state_name(pid);
         let bytes = folder.read(&name, MAX_BYTES)?;
         parse(&String::from_utf8_lossy(&bytes)).ok_or_else(|| FolderError::Io {

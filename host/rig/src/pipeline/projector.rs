@@ -54,7 +54,7 @@ pub fn open(config: &RigConfig, raster: Raster) -> Result<Option<Medium>, Connec
 }
 
 /// Codecs that the rig file allows on its link, bits [`Codec::mask`].
-pub fn codecs(backend: &ProjectorBackend) -> u32 {
+pub(crate) fn codecs(backend: &ProjectorBackend) -> u32 {
     let compaction = match backend {
         ProjectorBackend::Mock(c) => &c.compaction,
         ProjectorBackend::Usb(c) => &c.compaction,
@@ -68,7 +68,7 @@ pub fn codecs(backend: &ProjectorBackend) -> u32 {
 }
 
 /// Flashes a second that the host lets through; `None` when the limiter is off.
-pub fn flash_limit(config: &RigConfig) -> Option<u8> {
+pub(crate) fn flash_limit(config: &RigConfig) -> Option<u8> {
     match config.safety.flashes_per_second {
         0 => None,
         n => Some(n.min(255) as u8),

@@ -374,18 +374,18 @@ pub struct LinkTime {
 
 impl LinkTime {
     /// Start of a slot on the device's clock; of the clock's first slot for those before it.
-    pub fn start(&self, slot: u64) -> DeviceTicks {
+    pub(crate) fn start(&self, slot: u64) -> DeviceTicks {
         self.clock.start(slot.saturating_sub(self.first))
     }
 
     /// The slot that contains an instant of the device's clock; `None` before the clock's first slot.
-    pub fn slot_at(&self, ticks: DeviceTicks) -> Option<u64> {
+    pub(crate) fn slot_at(&self, ticks: DeviceTicks) -> Option<u64> {
         self.clock.slot_at(ticks).map(|k| self.first.saturating_add(k))
     }
 
     /// From when the light of a frame must be off that is planned for `stride` slots from `slot` on and whose poses may be carried on for
     /// `predict_ns`: the end of those slots plus the longer of `predict_ns` and three slots.
-    pub fn dark_from(&self, slot: u64, stride: u64, predict_ns: i64) -> DeviceTicks {
+    pub(crate) fn dark_from(&self, slot: u64, stride: u64, predict_ns: i64) -> DeviceTicks {
         let last = slot.saturating_sub(self.first).saturating_add(stride.max(1) - 1);
         self.clock.dark_from(last, predict_ns.max(0) as u64)
     }

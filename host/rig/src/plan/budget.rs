@@ -139,33 +139,10 @@ impl BudgetController {
     }
 
     /// Measurements that could not be, and cuts made.
-    pub fn counters(&self) -> (u64, u64) {
+    #[cfg(test)]
+    pub(crate) fn counters(&self) -> (u64, u64) {
         (self.ignored, self.cuts)
     }
-}
-
-/// How a frame's rays are spread.
-#[derive(Clone, Copy, Debug, PartialEq)]
-pub struct RaySplit {
-    /// Share of its full number of rays that the fovea gets, 0 to 1.
-    pub fovea: f64,
-    /// The same of everything else, 0 to 1.
-    pub periphery: f64,
-}
-
-/// Spreads `rays` over a frame that wants `full_fovea` and `full_periphery` rays: the periphery gives way first, down to
-/// `periphery_floor` (share, 0 to 1) of its rays, then the fovea, and at last both in proportion. The sum never exceeds `rays`.
-pub fn split(rays: u64, full_fovea: u64, full_periphery: u64, periphery_floor: f64) -> RaySplit {
-    let (rays, fovea, periphery) = (rays as f64, full_fovea as f64, full_periphery as f64);
-    let floor = periphery_floor.clamp(0.0, 1.0) * periphery;
-    let of = |part: f64, whole: f64| if whole > 0.0 { (part / whole).clamp(0.0, 1.0) } else { 1.0 };
-    if rays >= fovea + floor {
-        return RaySplit { fovea: 1.0, periphery: of(rays - fovea, periphery) };
-    }
-    if rays >= 2.0 * floor {
-        return RaySplit { fovea: of(rays - floor, fovea), periphery: of(floor, periphery) };
-    }
-    RaySplit { fovea: of(0.5 * rays, fovea), periphery: of(0.5 * rays, periphery) }
 }
 
 #[cfg(test)]
@@ -283,18 +260,6 @@ mod tests {
                 controller.measured(rays, ns);
                 prop_assert!((10..=100_000_000).contains(&controller.rays()));
             }
-        }
-
-        #[test]
-        fn a_split_spends_no_more_than_there_is(rays in 0u64..2_000_000, f in 0u64..1_000_000, p in 0u64..1_000_000, floor in 0f64..1.0) {
-            let s = split(rays, f, p, floor);
-            prop_assert!((0.0..=1.0).contains(&s.fovea) && (0.0..=1.0).contains(&s.periphery));
-            let spent = s.fovea * f as f64 + s.periphery * p as f64;
-            prop_assert!(spent <= rays as f64 * (1.0 + 1e-12) + 1e-6, "{spent} of {rays}");
-            // The fovea suffers only when the periphery is at its floor.
-            prop_assert!(s.fovea == 1.0 || s.periphery <= floor + 1e-12 || f == 0 || p == 0 );
-            let more = split(rays + 1000, f, p, floor);
-            prop_assert!(more.fovea >= s.fovea - 1e-12);
         }
     }
 

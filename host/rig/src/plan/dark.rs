@@ -15,10 +15,10 @@ pub enum DarkCause {
 
 impl DarkCause {
     /// All causes, in the order of their counters.
-    pub const ALL: [Self; 3] = [Self::NeverSeen, Self::Silent, Self::BeyondHorizon];
+    pub(crate) const ALL: [Self; 3] = [Self::NeverSeen, Self::Silent, Self::BeyondHorizon];
 
     /// As in reports.
-    pub const fn name(self) -> &'static str {
+    pub(crate) const fn name(self) -> &'static str {
         match self {
             Self::NeverSeen => "never_seen",
             Self::Silent => "silent",
@@ -27,7 +27,7 @@ impl DarkCause {
     }
 
     /// What the operator is told of it, after the name of the body.
-    pub const fn told(self) -> &'static str {
+    pub(crate) const fn told(self) -> &'static str {
         match self {
             Self::NeverSeen => "the tracker has never seen it",
             Self::Silent => "the tracker has not told of it for longer than safety.predict_ms",

@@ -131,7 +131,8 @@ impl LeadEstimator {
     }
 
     /// Frames that took longer than any lead could mend.
-    pub fn stalls(&self) -> u64 {
+    #[cfg(test)]
+    pub(crate) fn stalls(&self) -> u64 {
         self.stalls
     }
 

@@ -41,7 +41,7 @@ impl MissCause {
 /// Why no new picture was wanted in a slot: an order of the operator, or a rule of safety.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Hash)]
 #[repr(u8)]
-pub enum OrderedDark {
+pub(crate) enum OrderedDark {
     /// The operator ordered BLACK.
     Black,
     /// The operator ordered FREEZE: the frame is held.
@@ -60,11 +60,11 @@ pub enum OrderedDark {
 
 impl OrderedDark {
     /// All reasons, in the order of their counters.
-    pub const ALL: [Self; 7] =
+    pub(crate) const ALL: [Self; 7] =
         [Self::Black, Self::Frozen, Self::Safe, Self::Rest, Self::Interlock, Self::Fault, Self::Stop];
 
     /// As printed.
-    pub const fn name(self) -> &'static str {
+    pub(crate) const fn name(self) -> &'static str {
         match self {
             Self::Black => "black",
             Self::Frozen => "frozen",

@@ -278,7 +278,7 @@ mod elsewhere {
     }
 
     /// Refused.
-    pub fn set_fifo_priority(_priority: u32) -> Result<(), Refusal> {
+    pub(crate) fn set_fifo_priority(_priority: u32) -> Result<(), Refusal> {
         Err(not_here("real-time priority"))
     }
     /// Always the normal scheduler.
@@ -290,11 +290,11 @@ mod elsewhere {
         Err(not_here("binding to a core"))
     }
     /// Refused.
-    pub fn lock_memory() -> Result<(), Refusal> {
+    pub(crate) fn lock_memory() -> Result<(), Refusal> {
         Err(not_here("locking memory"))
     }
     /// Nothing to undo.
-    pub fn unlock_memory() {}
+    pub(crate) fn unlock_memory() {}
     /// Refused.
     pub(crate) fn set_timer_slack_ns(_slack_ns: u64) -> Result<(), Refusal> {
         Err(not_here("a shorter timer slack"))

@@ -27,7 +27,7 @@ const WAITING: usize = 64;
 
 /// An interval in which the control thread did not run although it should have.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub struct Gap {
+pub(crate) struct Gap {
     /// When it should have run.
     pub from: HostTime,
     /// When it ran.
@@ -84,12 +84,13 @@ impl Standstills {
     }
 
     /// The newest gaps, in order.
-    pub fn gaps(&self) -> impl Iterator<Item = Gap> + '_ {
+    pub(crate) fn gaps(&self) -> impl Iterator<Item = Gap> + '_ {
         self.gaps.iter().copied()
     }
 
     /// Gaps of the whole run.
-    pub fn count(&self) -> u64 {
+    #[cfg(test)]
+    pub(crate) fn count(&self) -> u64 {
         self.past + self.gaps.len() as u64
     }
 
@@ -105,14 +106,14 @@ impl Standstills {
 
     /// True when the machine stood still at some instant of [`from`, `to`]: a frame in flight then is excused. Asked for instants before
     /// the gaps that are kept, it knows nothing.
-    pub fn touches(&self, from: HostTime, to: HostTime) -> bool {
+    pub(crate) fn touches(&self, from: HostTime, to: HostTime) -> bool {
         // The first gap that ends after `from` is the only one that can begin early enough.
         let first = self.gaps.partition_point(|g| g.to < from);
         self.gaps.get(first).is_some_and(|g| g.from <= to)
     }
 
     /// True when the machine stood still throughout [`from`, `to`].
-    pub fn covers(&self, from: HostTime, to: HostTime) -> bool {
+    pub(crate) fn covers(&self, from: HostTime, to: HostTime) -> bool {
         let first = self.gaps.partition_point(|g| g.to < to);
         self.gaps.get(first).is_some_and(|g| g.from <= from)
     }

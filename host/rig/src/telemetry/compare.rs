@@ -28,7 +28,7 @@ pub enum Verdict {
 
 impl Verdict {
     /// As printed.
-    pub const fn word(self) -> &'static str {
+    pub(crate) const fn word(self) -> &'static str {
         match self {
             Self::Better => "better",
             Self::Worse => "WORSE",

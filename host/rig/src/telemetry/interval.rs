@@ -89,7 +89,7 @@ impl Interval {
     }
 
     /// Work, waiting or a sum.
-    pub const fn kind(self) -> IntervalKind {
+    pub(crate) const fn kind(self) -> IntervalKind {
         match self {
             Self::Tracker | Self::Plan | Self::Render | Self::Pack | Self::Link => IntervalKind::Work,
             Self::PoseWait | Self::PackWait | Self::LinkWait | Self::SlotWait => IntervalKind::Wait,
@@ -107,7 +107,7 @@ impl Interval {
     ///
     /// `measured` says whether the stamps are readings of a clock. At virtual pace they are modelled: there the whole of the
     /// link counts as work and nothing waits.
-    pub fn of(self, t: &FrameTimeline, measured: bool) -> Option<i64> {
+    pub(crate) fn of(self, t: &FrameTimeline, measured: bool) -> Option<i64> {
         let sample = t.has_sample().then_some((t.captured_at, t.received_at));
         let captured = || sample.map(|s| s.0);
         let link = t.sent_at.ns_since(t.packed_at);

@@ -43,7 +43,7 @@ impl Order {
     }
 
     /// How strong it is: what stands is replaced by what is as strong or stronger, and by ARM only.
-    pub fn strength(self) -> u8 {
+    pub(crate) fn strength(self) -> u8 {
         match self {
             Self::Arm => 0,
             Self::Freeze => 1,
@@ -333,7 +333,7 @@ impl RunMonitor {
     }
 
     /// The thread that would return from the run hangs: whoever waits for it should not. The projector was told to go dark.
-    pub fn give_up(&self, why: String) {
+    pub(crate) fn give_up(&self, why: String) {
         let _ = self.gave_up.set(why);
     }
 
@@ -348,12 +348,12 @@ impl RunMonitor {
     }
 
     /// When no new picture was wanted: told by the link's thread, read by the collector.
-    pub fn dark(&self) -> &DarkLog {
+    pub(crate) fn dark(&self) -> &DarkLog {
         &self.dark
     }
 
     /// Tells the operator something. Not from the frame path: it takes a lock.
-    pub fn note(&self, text: String) {
+    pub(crate) fn note(&self, text: String) {
         let mut notes = self.notes.lock().unwrap_or_else(PoisonError::into_inner);
         if notes.waiting.len() < NOTES {
             notes.waiting.push_back(text);

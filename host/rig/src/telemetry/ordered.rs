@@ -17,7 +17,7 @@ const RETURN_SLOTS: i64 = 4;
 
 /// What is wanted, as it changes: written by one thread, which neither waits nor allocates, and read by one other.
 #[derive(Debug)]
-pub struct DarkLog {
+pub(crate) struct DarkLog {
     /// The instant of a change and its code; change `n` is in place `n % CHANGES`.
     changes: [(AtomicI64, AtomicU8); CHANGES],
     /// Changes written so far.
@@ -37,7 +37,7 @@ fn code(wanted: Option<OrderedDark>) -> u8 {
 
 impl DarkLog {
     /// Says at `now` why no new picture is wanted, `None` when one is. Only a change is kept. To be called from one thread at a time.
-    pub fn tell(&self, now: HostTime, reason: Option<OrderedDark>) {
+    pub(crate) fn tell(&self, now: HostTime, reason: Option<OrderedDark>) {
         // Relaxed: this thread is the only writer.
         let written = self.written.load(Ordering::Relaxed);
         let place = |n: u64| &self.changes[(n % CHANGES as u64) as usize];

@@ -246,7 +246,7 @@ impl Profiler {
     }
 
     /// The histogram of an interval, for V2 logs and plots.
-    pub fn histogram(&self, interval: Interval) -> &SignedHistogram {
+    pub(crate) fn histogram(&self, interval: Interval) -> &SignedHistogram {
         &self.tracks[interval as usize].whole
     }
 
@@ -261,12 +261,12 @@ impl Profiler {
     }
 
     /// Nominal frames a second.
-    pub fn rate(&self) -> FrameRate {
+    pub(crate) fn rate(&self) -> FrameRate {
         self.rate
     }
 
     /// Frames that were lit so far.
-    pub fn frames_lit(&self) -> u64 {
+    pub(crate) fn frames_lit(&self) -> u64 {
         self.frames_lit
     }
 

@@ -108,7 +108,8 @@ impl PageServer {
     }
 
     /// Where it listens.
-    pub fn address(&self) -> SocketAddr {
+    #[cfg(test)]
+    pub(crate) fn address(&self) -> SocketAddr {
         self.address
     }
 

@@ -24,7 +24,8 @@ pub struct Spread {
 
 impl Spread {
     /// Percentiles of `values`, which are reordered; values that are not finite are left out. `None` when none is left.
-    pub fn of(values: &mut Vec<f64>) -> Option<Self> {
+    #[cfg(test)]
+    pub(crate) fn of(values: &mut Vec<f64>) -> Option<Self> {
         values.retain(|v| v.is_finite());
         values.sort_unstable_by(f64::total_cmp);
         let last = values.len().checked_sub(1)?;
@@ -66,7 +67,7 @@ pub struct Latency {
 
 impl Latency {
     /// Percentiles of a histogram of nanoseconds; `None` when it is empty.
-    pub fn of(histogram: &SignedHistogram, modelled: bool) -> Option<Self> {
+    pub(crate) fn of(histogram: &SignedHistogram, modelled: bool) -> Option<Self> {
         let ms = |ns: i64| ns as f64 * 1e-6;
         (!histogram.is_empty()).then(|| Self {
             spread: Spread {
@@ -105,7 +106,7 @@ pub struct DarkBody {
 
 impl DarkBody {
     /// Of one cause.
-    pub fn of(&self, cause: DarkCause) -> u64 {
+    pub(crate) fn of(&self, cause: DarkCause) -> u64 {
         match cause {
             DarkCause::NeverSeen => self.never_seen,
             DarkCause::Silent => self.silent,
@@ -114,7 +115,7 @@ impl DarkBody {
     }
 
     /// Of all causes.
-    pub fn total(&self) -> u64 {
+    pub(crate) fn total(&self) -> u64 {
         DarkCause::ALL.iter().map(|cause| self.of(*cause)).sum()
     }
 }

@@ -7,7 +7,7 @@ const DIGITS: u8 = 3;
 
 /// Nanoseconds, early (negative) and not (zero and above).
 #[derive(Clone, Debug)]
-pub struct SignedHistogram {
+pub(crate) struct SignedHistogram {
     /// Magnitudes of the negative values.
     early: Histogram<u64>,
     /// Zero and positive values.
@@ -19,7 +19,7 @@ pub struct SignedHistogram {
 impl SignedHistogram {
     /// Tells values between `-longest_ns` and `longest_ns` apart; those beyond count as the bound and are counted as saturated.
     /// `longest_ns` below 2 is taken for 2.
-    pub fn new(longest_ns: u64) -> Self {
+    pub(crate) fn new(longest_ns: u64) -> Self {
         let longest_ns = longest_ns.max(2);
         // The bounds of HdrHistogram begin at 1, which is its unit: a 0 is kept as 0.
         let half =
@@ -28,7 +28,7 @@ impl SignedHistogram {
     }
 
     /// Takes a value in.
-    pub fn record(&mut self, ns: i64) {
+    pub(crate) fn record(&mut self, ns: i64) {
         let magnitude = ns.unsigned_abs();
         self.saturated += u64::from(magnitude > self.longest_ns);
         let half = if ns < 0 { &mut self.early } else { &mut self.late };
@@ -36,17 +36,17 @@ impl SignedHistogram {
     }
 
     /// Values taken in.
-    pub fn len(&self) -> u64 {
+    pub(crate) fn len(&self) -> u64 {
         self.early.len() + self.late.len()
     }
 
     /// True before the first value.
-    pub fn is_empty(&self) -> bool {
+    pub(crate) fn is_empty(&self) -> bool {
         self.len() == 0
     }
 
     /// Values below zero.
-    pub fn negative(&self) -> u64 {
+    pub(crate) fn negative(&self) -> u64 {
         self.early.len()
     }
 
@@ -56,14 +56,14 @@ impl SignedHistogram {
     }
 
     /// Forgets all values; allocates nothing.
-    pub fn reset(&mut self) {
+    pub(crate) fn reset(&mut self) {
         self.early.reset();
         self.late.reset();
         self.saturated = 0;
     }
 
     /// The smallest value that at least the share `quantile` (0 to 1) of all values does not exceed, within 0.1 %; 0 without values.
-    pub fn value_at_quantile(&self, quantile: f64) -> i64 {
+    pub(crate) fn value_at_quantile(&self, quantile: f64) -> i64 {
         let all = self.len();
         if all == 0 {
             return 0;
@@ -79,7 +79,7 @@ impl SignedHistogram {
     }
 
     /// Arithmetic mean, within 0.1 %; 0 without values.
-    pub fn mean(&self) -> f64 {
+    pub(crate) fn mean(&self) -> f64 {
         let (early, late) = (self.early.len() as f64, self.late.len() as f64);
         if early + late == 0.0 {
             return 0.0;
@@ -88,7 +88,7 @@ impl SignedHistogram {
     }
 
     /// The smallest value, within 0.1 %; 0 without values.
-    pub fn min(&self) -> i64 {
+    pub(crate) fn min(&self) -> i64 {
         if self.early.is_empty() {
             signed(self.late.min())
         } else {
@@ -97,7 +97,7 @@ impl SignedHistogram {
     }
 
     /// The largest value, within 0.1 %; 0 without values.
-    pub fn max(&self) -> i64 {
+    pub(crate) fn max(&self) -> i64 {
         if self.late.is_empty() {
             -signed(self.early.min())
         } else {
@@ -106,12 +106,12 @@ impl SignedHistogram {
     }
 
     /// Magnitudes of the values below zero.
-    pub fn early(&self) -> &Histogram<u64> {
+    pub(crate) fn early(&self) -> &Histogram<u64> {
         &self.early
     }
 
     /// Values that are zero or above.
-    pub fn late(&self) -> &Histogram<u64> {
+    pub(crate) fn late(&self) -> &Histogram<u64> {
         &self.late
     }
 }

@@ -55,7 +55,7 @@ pub struct SlotCounts {
 
 impl SlotCounts {
     /// Slots in which a frame of their own was wanted.
-    pub fn wanted(&self) -> u64 {
+    pub(crate) fn wanted(&self) -> u64 {
         self.own + self.missed_total()
     }
 
@@ -70,7 +70,7 @@ impl SlotCounts {
     }
 
     /// Missed slots whose frame was under way while the machine itself stood still.
-    pub fn excused(&self) -> u64 {
+    pub(crate) fn excused(&self) -> u64 {
         self.missed[MissCause::Standstill as usize]
     }
 

@@ -245,22 +245,6 @@ impl Calibration {
     }
 }
 
-/// Share 0..1 of world points that fall onto the raster.
-pub fn share_inside(camera: &ProjectorCamera, points: impl IntoIterator<Item = DVec3>) -> f64 {
-    let (w, h) = (f64::from(camera.raster.width()), f64::from(camera.raster.height()));
-    let (mut inside, mut all) = (0usize, 0usize);
-    for point in points {
-        all += 1;
-        let hit = camera.project(point);
-        inside += usize::from(hit.is_some_and(|p| p.x >= 0.0 && p.y >= 0.0 && p.x < w && p.y < h));
-    }
-    if all == 0 {
-        0.0
-    } else {
-        inside as f64 / all as f64
-    }
-}
-
 /// Refuses world points in a plane, on a line or in one place, and pixels on a line or in one place.
 fn check_spread(pairs: &[Pair]) -> Result<(), CalibrationError> {
     let spread = |columns: Columns| {

@@ -27,7 +27,7 @@ impl Distortion {
     }
 
     /// True when nothing is bent.
-    pub fn is_none(&self) -> bool {
+    pub(crate) fn is_none(&self) -> bool {
         self.c.iter().all(|c| *c == 0.0)
     }
 

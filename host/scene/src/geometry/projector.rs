@@ -153,7 +153,7 @@ impl ProjectorCamera {
     }
 
     /// Full horizontal angle of the raster, radians.
-    pub fn horizontal_fov(&self) -> f64 {
+    pub(crate) fn horizontal_fov(&self) -> f64 {
         let w = f64::from(self.raster.width());
         (self.cx / self.fx).atan() + ((w - self.cx) / self.fx).atan()
     }
