@@ -8,11 +8,11 @@ use super::{BodyIndex, BodyKey, SampleGate, Tracker, TrackerCounters, TrackerErr
 use crate::link::{crc32c, crc32c_append};
 use crate::pose::Pose;
 use crate::time::HostTime;
+use crossbeam::channel::{bounded, Receiver, Sender, TryRecvError};
 use std::fs::{File, OpenOptions};
 use std::io::{Read, Write};
 use std::path::{Path, PathBuf};
 use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
-use std::sync::mpsc::{sync_channel, Receiver, SyncSender, TryRecvError};
 use std::sync::Arc;
 use std::thread::JoinHandle;
 use std::time::Duration;
@@ -72,7 +72,7 @@ pub enum RecordError {
 /// cannot keep up, samples go unrecorded and are counted, never delayed.
 pub struct Recorder<T> {
     inner: T,
-    queue: Option<SyncSender<TrackerSample>>,
+    queue: Option<Sender<TrackerSample>>,
     unrecorded: u64,
     shared: Arc<Shared>,
     thread: Option<JoinHandle<std::io::Result<()>>>,
@@ -92,7 +92,7 @@ impl<T: Tracker> Recorder<T> {
         let failed = |source| RecordError::Io { path: path.to_owned(), source };
         let mut file = OpenOptions::new().write(true).create_new(true).open(path).map_err(failed)?;
         file.write_all(&header(bodies, start)).map_err(failed)?;
-        let (queue, samples) = sync_channel(QUEUE);
+        let (queue, samples) = bounded(QUEUE);
         let shared = Arc::new(Shared::default());
         let thread = {
             let shared = shared.clone();

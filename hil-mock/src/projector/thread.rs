@@ -248,7 +248,7 @@ mod tests {
         let (host, device) = threaded(1000, 2, WaitPolicy::Park);
         let start = Instant::now();
         let clock = move || HostTime(start.elapsed().as_nanos() as i64);
-        let (give, take) = std::sync::mpsc::channel();
+        let (give, take) = crossbeam::channel::unbounded();
         let thread = std::thread::spawn(move || {
             let id = std::fs::read_link("/proc/thread-self").unwrap();
             give.send(id.file_name().unwrap().to_str().unwrap().to_owned()).unwrap();

@@ -1,9 +1,9 @@
 //! The far end of USB/IP as a cable: a device of a USB/IP server driven without a kernel.
 
+use crossbeam::channel::{unbounded, RecvTimeoutError};
 use std::collections::BTreeMap;
 use std::io::{self, Read, Write};
 use std::net::{TcpStream, ToSocketAddrs};
-use std::sync::mpsc::{channel, RecvTimeoutError};
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::time::Duration;
 
@@ -80,7 +80,7 @@ impl RemoteCable {
 
     /// A control transfer without OUT data, waited for.
     pub fn control(&self, setup: Setup) -> io::Result<Vec<u8>> {
-        let (tx, rx) = channel();
+        let (tx, rx) = unbounded();
         let done = Box::new(move |c: Completed| drop(tx.send((c.status, c.buffer, c.actual))));
         // Names of our own requests lie beyond those that a front end gives.
         let request = Request {

@@ -6,6 +6,7 @@
 #![allow(unsafe_code)]
 
 use crate::sync::{Arc, AtomicU8, Ordering, UnsafeCell};
+use crossbeam::utils::CachePadded;
 
 /// The middle cell holds a value the reader has not seen.
 const FRESH: u8 = 0b100;
@@ -15,7 +16,7 @@ const INDEX: u8 = 0b011;
 struct Shared<T> {
     cells: [UnsafeCell<T>; 3],
     /// Index of the middle cell, and [`FRESH`].
-    middle: AtomicU8,
+    middle: CachePadded<AtomicU8>,
 }
 
 // SAFETY: a cell is accessed by the one side that owns its index at the time; ownership moves through `middle` with acquire
@@ -39,7 +40,7 @@ pub struct Reader<T> {
 /// A slot in which the newest value wins. The reader sees `initial` until something is published.
 pub fn latest<T: Clone + Send>(initial: T) -> (Publisher<T>, Reader<T>) {
     let cells = [initial.clone(), initial.clone(), initial].map(UnsafeCell::new);
-    let shared = Arc::new(Shared { cells, middle: AtomicU8::new(1) });
+    let shared = Arc::new(Shared { cells, middle: CachePadded::new(AtomicU8::new(1)) });
     (Publisher { shared: shared.clone(), back: 0 }, Reader { shared, front: 2 })
 }
 

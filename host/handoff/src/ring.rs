@@ -6,19 +6,15 @@
 #![allow(unsafe_code)]
 
 use crate::sync::{Arc, AtomicUsize, Ordering, UnsafeCell};
+use crossbeam::utils::CachePadded;
 use std::mem::MaybeUninit;
-
-/// Keeps the two positions on cache lines of their own (128: adjacent-line prefetch).
-#[derive(Debug)]
-#[repr(align(128))]
-struct Line<T>(T);
 
 struct Shared<T> {
     cells: Box<[UnsafeCell<MaybeUninit<T>>]>,
     /// Values ever taken.
-    head: Line<AtomicUsize>,
+    head: CachePadded<AtomicUsize>,
     /// Values ever put.
-    tail: Line<AtomicUsize>,
+    tail: CachePadded<AtomicUsize>,
 }
 
 // SAFETY: the cell at a position is touched by the producer before it stores a greater `tail` (release) and by the consumer
@@ -34,7 +30,7 @@ impl<T> Shared<T> {
 
 impl<T> Drop for Shared<T> {
     fn drop(&mut self) {
-        let (mut head, tail) = (self.head.0.load(Ordering::Relaxed), self.tail.0.load(Ordering::Relaxed));
+        let (mut head, tail) = (self.head.load(Ordering::Relaxed), self.tail.load(Ordering::Relaxed));
         while head != tail {
             self.cell(head).with_mut(|cell| {
                 // SAFETY: both sides are gone (`&mut self`); cells from head to tail are initialised and dropped once.
@@ -76,7 +72,11 @@ impl<T> std::fmt::Debug for Consumer<T> {
 pub fn ring<T: Send>(capacity: usize) -> (Producer<T>, Consumer<T>) {
     let capacity = capacity.max(1);
     let cells = (0..capacity.next_power_of_two()).map(|_| UnsafeCell::new(MaybeUninit::uninit())).collect();
-    let shared = Arc::new(Shared { cells, head: Line(AtomicUsize::new(0)), tail: Line(AtomicUsize::new(0)) });
+    let shared = Arc::new(Shared {
+        cells,
+        head: CachePadded::new(AtomicUsize::new(0)),
+        tail: CachePadded::new(AtomicUsize::new(0)),
+    });
     (
         Producer { shared: shared.clone(), tail: 0, head_seen: 0, capacity },
         Consumer { shared, head: 0, tail_seen: 0 },
@@ -88,7 +88,7 @@ impl<T> Producer<T> {
     pub fn push(&mut self, value: T) -> Result<(), T> {
         if self.tail.wrapping_sub(self.head_seen) >= self.capacity {
             // Acquire: the consumer has moved the value out of the cell we are about to fill.
-            self.head_seen = self.shared.head.0.load(Ordering::Acquire);
+            self.head_seen = self.shared.head.load(Ordering::Acquire);
             if self.tail.wrapping_sub(self.head_seen) >= self.capacity {
                 return Err(value);
             }
@@ -99,13 +99,13 @@ impl<T> Producer<T> {
         });
         self.tail = self.tail.wrapping_add(1);
         // Release: the value is in the cell before the consumer can count it.
-        self.shared.tail.0.store(self.tail, Ordering::Release);
+        self.shared.tail.store(self.tail, Ordering::Release);
         Ok(())
     }
 
     /// Values put and not yet taken, at most; the consumer may be taking some right now.
     pub fn len(&self) -> usize {
-        self.tail.wrapping_sub(self.shared.head.0.load(Ordering::Relaxed))
+        self.tail.wrapping_sub(self.shared.head.load(Ordering::Relaxed))
     }
 
     /// True when everything put has been taken.
@@ -119,7 +119,7 @@ impl<T> Consumer<T> {
     pub fn pop(&mut self) -> Option<T> {
         if self.head == self.tail_seen {
             // Acquire: the values counted are in their cells.
-            self.tail_seen = self.shared.tail.0.load(Ordering::Acquire);
+            self.tail_seen = self.shared.tail.load(Ordering::Acquire);
             if self.head == self.tail_seen {
                 return None;
             }
@@ -130,13 +130,13 @@ impl<T> Consumer<T> {
         });
         self.head = self.head.wrapping_add(1);
         // Release: the value is out of the cell before the producer can fill it again.
-        self.shared.head.0.store(self.head, Ordering::Release);
+        self.shared.head.store(self.head, Ordering::Release);
         Some(value)
     }
 
     /// Values waiting, at least; the producer may be putting more.
     pub fn len(&self) -> usize {
-        self.shared.tail.0.load(Ordering::Relaxed).wrapping_sub(self.head)
+        self.shared.tail.load(Ordering::Relaxed).wrapping_sub(self.head)
     }
 
     /// True when nothing waits.
@@ -249,8 +249,8 @@ mod tests {
     fn positions_wrap() {
         let (mut producer, mut consumer) = ring(3);
         let near_end = usize::MAX - 1;
-        producer.shared.head.0.store(near_end, SeqCst);
-        producer.shared.tail.0.store(near_end, SeqCst);
+        producer.shared.head.store(near_end, SeqCst);
+        producer.shared.tail.store(near_end, SeqCst);
         (producer.tail, producer.head_seen) = (near_end, near_end);
         (consumer.head, consumer.tail_seen) = (near_end, near_end);
         for i in 0..20 {

@@ -4,10 +4,15 @@
 //! itself, so a wake-up is only ever a hint and a spurious one is harmless.
 
 use crate::sync::{fence, thread, Arc, AtomicBool, Ordering};
+use crossbeam::utils::Backoff;
 // Of the standard library under the model checker, too: it only hands over who waits, and what it promises is not in question.
 use std::sync::OnceLock;
 #[cfg(not(loom))]
 use std::time::Duration;
+
+/// Looks between two readings of the clock. The pauses between them double from one to eight: with longer ones the waiting thread would
+/// notice late, and nobody contends with it.
+const LOOKS: u32 = 4;
 
 /// How a stage waits.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -87,12 +92,13 @@ impl Waiter {
         if let WaitPolicy::SpinThenPark { spin_ns } = self.policy {
             let until = now_ns().saturating_add(spin_ns).min(deadline_ns);
             loop {
-                // The clock costs as much as many looks: read it once in 32.
-                for _ in 0..32 {
+                // The clock costs as much as many looks: it is read once in [`LOOKS`].
+                let backoff = Backoff::new();
+                for _ in 0..LOOKS {
                     if ready() {
                         return true;
                     }
-                    std::hint::spin_loop();
+                    backoff.spin();
                 }
                 if now_ns() >= until {
                     break;

@@ -127,7 +127,7 @@ impl Interlock {
             stop: AtomicBool::new(false),
         });
         let mut contact = contact(&shared);
-        let (asked, first) = std::sync::mpsc::channel();
+        let (asked, first) = crossbeam::channel::unbounded();
         let asking = shared.clone();
         let thread = std::thread::Builder::new()
             .name("dpm-interlock".into())

@@ -1,7 +1,7 @@
 //! A path to a glTF file into a [`Scene`], with nothing that the file does able to take the caller down or hold it up.
 
+use crossbeam::channel::{bounded, RecvTimeoutError};
 use std::path::Path;
-use std::sync::mpsc;
 
 use super::limits::{Cancel, Limits};
 use super::{gltf_file, Scene, SceneError};
@@ -58,7 +58,7 @@ pub(super) fn contained<T: Send + 'static>(
     work: impl FnOnce(&Cancel) -> Result<T, SceneError> + Send + 'static,
 ) -> Result<T, SceneError> {
     let cancel = Cancel::default();
-    let (inside, (send, receive)) = (cancel.clone(), mpsc::sync_channel(1));
+    let (inside, (send, receive)) = (cancel.clone(), bounded(1));
     let helper = std::thread::Builder::new().name("scene-load".into()).spawn(move || {
         // A panic in here is a broken scene, not a broken run.
         dpm_common::stopping::expect_panics();
@@ -76,11 +76,11 @@ pub(super) fn contained<T: Send + 'static>(
     helper.map_err(SceneError::Read)?;
     match receive.recv_timeout(limits.time) {
         Ok(result) => result,
-        Err(mpsc::RecvTimeoutError::Timeout) => {
+        Err(RecvTimeoutError::Timeout) => {
             cancel.cancel();
             Err(SceneError::TimedOut(limits.time))
         }
-        Err(mpsc::RecvTimeoutError::Disconnected) => {
+        Err(RecvTimeoutError::Disconnected) => {
             Err(SceneError::Internal("the loading thread vanished".into()))
         }
     }
@@ -100,7 +100,7 @@ mod tests {
     #[test]
     fn time_is_bounded_and_the_helper_is_told_to_stop() {
         let limits = Limits { time: Duration::from_millis(20), ..Limits::default() };
-        let (told, ended) = mpsc::channel();
+        let (told, ended) = bounded(1);
         let inner = limits.clone();
         let start = Instant::now();
         let result: Result<(), _> = contained(&limits, move |cancel| loop {

@@ -7,9 +7,9 @@ use crate::cobs::Deframer;
 use crate::pose::Pose;
 use crate::time::{DeviceTicks, HostClock, HostTime};
 use crate::tracker::{BodyIndex, BodyKey, SampleGate, Tracker, TrackerCounters, TrackerError, TrackerSample};
+use crossbeam::channel::{Receiver, TryRecvError};
 use serialport::SerialPort;
 use std::io::ErrorKind;
-use std::sync::mpsc::{Receiver, TryRecvError};
 use std::sync::Arc;
 
 const MS: i64 = 1_000_000;
@@ -106,7 +106,7 @@ impl SerialTracker {
     }
 
     fn start_opening(&self, now: HostTime) -> State {
-        let (send, receive) = std::sync::mpsc::sync_channel(1);
+        let (send, receive) = crossbeam::channel::bounded(1);
         let (port, baud) = (self.config.port.clone(), self.config.baud);
         // Opening a port can wait for its driver; one attempt at a time, elsewhere. Zero time-out: reads and writes never wait.
         let spawned = std::thread::Builder::new().name("serial-open".into()).spawn(move || {

@@ -5,10 +5,10 @@ use super::wire::{self, system, type_name, Message, COOKIE, COOKIE_BYTES};
 use crate::clock_map::{ClockMap, ExchangeOutcome};
 use crate::time::{DeviceTicks, HostClock, HostTime};
 use crate::tracker::{BodyIndex, BodyKey, SampleGate, Tracker, TrackerCounters, TrackerError, TrackerSample};
+use crossbeam::channel::{Receiver, TryRecvError};
 use std::io::{ErrorKind, Read, Write};
 use std::net::{SocketAddr, TcpStream, ToSocketAddrs};
 use std::sync::atomic::{AtomicBool, Ordering};
-use std::sync::mpsc::{Receiver, TryRecvError};
 use std::sync::Arc;
 use std::time::Duration;
 
@@ -163,7 +163,7 @@ impl VrpnClient {
     }
 
     fn start_connecting(&self) -> State {
-        let (send, receive) = std::sync::mpsc::sync_channel(1);
+        let (send, receive) = crossbeam::channel::bounded(1);
         let server = self.config.server.clone();
         let abandoned = self.abandoned.clone();
         // Name look-up and connecting wait without bound on their own terms, so they do it elsewhere; one attempt at a time.

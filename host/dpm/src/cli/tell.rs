@@ -1,12 +1,12 @@
 //! Notes and progress of a run to the standard error stream, from a thread of its own: where nobody reads it or the terminal is
 //! stopped, that thread waits and the run goes on.
 
+use crossbeam::channel::{bounded, Receiver, RecvTimeoutError, Sender};
 use dpm_rig::failure::{Failure, FailureKind};
 use dpm_rig::telemetry::monitor::{ProjectorHealth, RunCounts};
 use indicatif::{ProgressBar, ProgressDrawTarget, ProgressStyle};
 use std::collections::VecDeque;
 use std::io::{IsTerminal, Write};
-use std::sync::mpsc::{sync_channel, Receiver, RecvTimeoutError, SyncSender};
 use std::thread::JoinHandle;
 use std::time::{Duration, Instant};
 
@@ -25,7 +25,7 @@ enum Word {
 
 /// Says things without ever waiting.
 pub(super) struct Teller {
-    words: Option<SyncSender<Word>>,
+    words: Option<Sender<Word>>,
     over: Receiver<()>,
     thread: Option<JoinHandle<()>>,
 }
@@ -36,8 +36,8 @@ impl Teller {
     /// # Errors
     /// No thread can be started (exit code 3).
     pub(super) fn start(total: u64, seconds: f64) -> Result<Self, Failure> {
-        let (words, heard) = sync_channel(WAITING);
-        let (ended, over) = sync_channel::<()>(1);
+        let (words, heard) = bounded(WAITING);
+        let (ended, over) = bounded::<()>(1);
         let thread = std::thread::Builder::new()
             .name("dpm-tell".into())
             .spawn(move || {

@@ -7,6 +7,7 @@
 use super::keys::Keys;
 use super::signals;
 use super::tell::{Teller, SHOWN_EVERY};
+use crossbeam::channel::{unbounded, RecvTimeoutError};
 use dpm_common::files::{write_atomically, InstanceLock, LockError};
 use dpm_common::folder::{Folder, FolderError};
 use dpm_common::stopping;
@@ -23,7 +24,6 @@ use dpm_rig::telemetry::monitor::{Order, ProjectorHealth, RunCounts, RunMonitor}
 use dpm_rig::telemetry::report::{to_json, Report};
 use std::io::Write;
 use std::path::Path;
-use std::sync::mpsc::{channel, RecvTimeoutError};
 use std::sync::Arc;
 use std::time::Duration;
 
@@ -95,7 +95,7 @@ pub(super) fn watch<T: Send + 'static>(
     let mut teller = Teller::start(rig.run.frames, rig.run.seconds)?;
     // Before the run begins, so that it comes up dark where an order stands.
     let orders = Arc::new(stand_by(&rig, &monitor, &teller)?);
-    let (done, finished) = channel();
+    let (done, finished) = unbounded();
     let worker = {
         let monitor = Arc::clone(&monitor);
         std::thread::Builder::new()

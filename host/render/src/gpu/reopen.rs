@@ -3,7 +3,7 @@
 use super::commands::run_now;
 use super::context::{DeviceId, Gpu};
 use super::error::GpuError;
-use std::sync::mpsc::sync_channel;
+use crossbeam::channel::bounded;
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
@@ -98,7 +98,7 @@ fn within<T: Send + 'static>(
         device: format!("the Vulkan driver ({what})").into(),
         waited_ms: limit.as_millis() as u64,
     };
-    let (sender, receiver) = sync_channel(1);
+    let (sender, receiver) = bounded(1);
     let thread = std::thread::Builder::new().name("dpm-gpu-open".into()).spawn(move || {
         let _ = sender.send(work());
     });
@@ -130,7 +130,7 @@ mod tests {
     #[test]
     fn a_driver_that_does_not_return_holds_nobody_up() {
         let begin = Instant::now();
-        let (release, released) = sync_channel::<()>(0);
+        let (release, released) = bounded::<()>(0);
         let error = within(Duration::from_millis(50), "sleeping", move || {
             let _ = released.recv();
             Ok(())

@@ -4,6 +4,7 @@ use super::status_file::StatusFile;
 use super::{is_obeyed, runtime_path, socket_name, HEARD};
 use crate::standing::state_folder;
 use crate::telemetry::monitor::Order;
+use crossbeam::channel::unbounded;
 use dpm_common::folder::{Folder, FolderError, Owner};
 use dpm_common::unix::{monotonic_ns, peer, send_signal, user, user_name, Peer};
 use std::collections::BTreeSet;
@@ -12,7 +13,6 @@ use std::io::{self, Read, Write};
 use std::os::unix::fs::{FileTypeExt, MetadataExt};
 use std::os::unix::net::UnixStream;
 use std::path::{Path, PathBuf};
-use std::sync::mpsc::channel;
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
@@ -236,7 +236,7 @@ pub(super) fn tell_in(folders: &[PathBuf], pid: Option<u32>, order: Order) -> Re
         }
     }
     rigs.truncate(MAX_RIGS);
-    let (sender, answers) = channel();
+    let (sender, answers) = unbounded();
     let asked = rigs.len();
     for (n, place) in rigs.iter().cloned().enumerate() {
         let sender = sender.clone();

@@ -12,12 +12,12 @@ use super::crew::{Crew, CrewParts, NotesBack, Port, Trouble};
 use super::outcome::PipelineError;
 use super::pulse::Silence;
 use super::threads::Shared;
+use crossbeam::channel::{unbounded, Receiver, TryRecvError};
 use dpm_common::clock::{Clock, RunClock};
 use dpm_device::time::HostTime;
 use dpm_handoff::channel::Sender;
 use dpm_render::gpu::{AfterLoss, LossBudget};
 use std::sync::atomic::{AtomicBool, Ordering};
-use std::sync::mpsc::{channel, Receiver, TryRecvError};
 use std::sync::Arc;
 use std::time::Duration;
 
@@ -201,7 +201,7 @@ impl Supervisor {
         shared
             .monitor
             .note(format!("{}; the stages are made anew, dark meanwhile", trouble_in_words(&error)));
-        let (done, result) = channel();
+        let (done, result) = unbounded();
         let made = std::thread::Builder::new().name("dpm-remake".into()).spawn(move || {
             let _ = done.send(maker(remake));
         });
