@@ -48,7 +48,7 @@ pub fn measure_handoff(policy: WaitPolicy, rate: FrameRate, frames: u64) -> std:
 mod tests {
     use super::*;
 
-    /// `cargo test -p dpm-host --lib handoff_cost -- --nocapture` prints the figures of docs/LATENCY.md.
+    /// `cargo test -p dpm-host --lib handoff_cost -- --nocapture` prints the figures of docs/lab/LATENCY.md.
     #[test]
     fn every_value_or_a_newer_one_arrives() {
         let rate = FrameRate::new(947, 1).unwrap();
