@@ -92,12 +92,24 @@ fn without_code(text: &str) -> (String, Vec<String>) {
     (kept, spans)
 }
 
-/// Targets of links and pictures, without those to other places and without the part after `#`.
-fn links(text: &str) -> Vec<String> {
+/// Targets of links and pictures, without those to other places: a path, and the heading after `#`; either may be empty.
+fn links(text: &str) -> Vec<(String, String)> {
     let (text, _) = without_code(text);
     let targets = text.split("](").skip(1).filter_map(|rest| rest.split(')').next());
     let paths = targets.filter(|t| !t.contains("://") && !t.starts_with("mailto:"));
-    paths.filter_map(|t| t.split('#').next()).filter(|t| !t.is_empty()).map(str::to_owned).collect()
+    let parts = paths.map(|t| t.split_once('#').unwrap_or((t, "")));
+    parts.map(|(path, heading)| (path.to_owned(), heading.to_owned())).collect()
+}
+
+/// The headings of a document as links name them: small letters, digits, `-` for blanks.
+fn headings(text: &str) -> BTreeSet<String> {
+    let of_line = |line: &str| {
+        let kept =
+            line.trim_start_matches('#').trim().chars().filter(|c| c.is_alphanumeric() || " -_".contains(*c));
+        kept.flat_map(char::to_lowercase).map(|c| if c == ' ' { '-' } else { c }).collect()
+    };
+    let prose = lines(text).into_iter().filter(|(kind, line)| *kind == Kind::Prose && line.starts_with('#'));
+    prose.map(|(_, line)| of_line(line)).collect()
 }
 
 /// Code spans that name a file or a folder of the tree: whatever ends as a source file does, and whatever begins at a folder of the root.
@@ -158,15 +170,18 @@ fn text_of(path: &str) -> String {
 }
 
 #[test]
-fn every_link_leads_to_a_file_of_the_tree() {
+fn every_link_leads_to_a_file_of_the_tree_and_to_a_heading_in_it() {
     let tree = whole_tree();
     let (mut broken, mut count) = (Vec::new(), 0);
     for document in documents(&tree) {
         let folder = document.rsplit_once('/').map_or("", |(folder, _)| folder);
-        for link in links(&text_of(document)) {
+        for (link, heading) in links(&text_of(document)) {
             count += 1;
-            if !resolved(folder, &link).is_some_and(|path| tree.contains(&path)) {
-                broken.push(format!("{document}: {link}"));
+            let path = if link.is_empty() { Some(document.to_owned()) } else { resolved(folder, &link) };
+            let path = path.filter(|path| tree.contains(path));
+            let is_whole = |path: &str| heading.is_empty() || headings(&text_of(path)).contains(&heading);
+            if !path.is_some_and(|path| is_whole(&path)) {
+                broken.push(format!("{document}: {link}#{heading}"));
             }
         }
     }
@@ -225,7 +240,11 @@ fn broken_links_missing_files_and_long_lines_are_seen() {
         ["docs", "docs/a.md", "host", "host/src", "host/src/run.rs"].map(String::from).into();
     let text = "See [a](a.md#part), [b](b.md), [web](https://example.org/x.md) and `host/src/run.rs`,\n`run.rs`, \
                 `src/gone.rs`, `host/gone/`, `RunOptions::new`, `a.toml`.\n\n    [code](nowhere.md) `no.rs`\n\n```\n`no.rs`\n```\n";
-    assert_eq!(links(text), ["a.md", "b.md"]);
+    assert_eq!(links(text), [("a.md", "part"), ("b.md", "")].map(|(path, part)| (path.into(), part.into())));
+    assert_eq!(
+        headings("# A `b`, c\n\n```\n# no\n```\n## Über 2-3\n"),
+        ["a-b-c", "über-2-3"].map(String::from).into()
+    );
     assert_eq!(resolved("docs", "a.md").as_deref(), Some("docs/a.md"));
     assert_eq!(resolved("docs/lab", "../../x.rs").as_deref(), Some("x.rs"));
     assert_eq!(resolved("docs", "../../x.rs"), None, "out of the tree");
