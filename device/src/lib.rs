@@ -5,6 +5,49 @@
 //!
 //! Reading order: [`time`] and [`pose`] and [`planes`] are the vocabulary; [`tracker`] is where motion comes in.
 //! **Only this crate knows bytes on a wire.** Nothing here knows about scenes, rendering or the GPU.
+//!
+//! # Example: what firmware does with the host's bytes
+//!
+//! A [`link::Decoder`] finds packets in a stream, however it is cut; a [`link::PacketSink`] is told of them. Neither allocates.
+//!
+//! ```
+//! use dpm_device::link::{Assembly, Decoder, Header, HostHello, HostMessage, Packet, PacketSink, MAX_CONTROL_BYTES};
+//!
+//! /// Keeps the last message of the host.
+//! #[derive(Default)]
+//! struct Firmware {
+//!     incoming: Option<Assembly>,
+//!     heard: Option<HostMessage>,
+//! }
+//!
+//! impl PacketSink for Firmware {
+//!     fn begin(&mut self, header: &Header) -> bool {
+//!         self.incoming = Assembly::new(header);
+//!         self.incoming.is_some()
+//!     }
+//!     fn payload(&mut self, bytes: &[u8]) {
+//!         self.incoming.as_mut().expect("a packet has begun").push(bytes);
+//!     }
+//!     fn end(&mut self, intact: bool) {
+//!         let Some(packet) = self.incoming.take().filter(|_| intact) else { return };
+//!         self.heard = HostMessage::parse(packet.header().kind, packet.payload()).ok();
+//!     }
+//! }
+//!
+//! // The host greets the device in session 7.
+//! let hello = HostMessage::Hello(HostHello { version_min: 2, version_max: 2, codecs: 1 });
+//! let mut payload = [0; MAX_CONTROL_BYTES];
+//! let (kind, n) = hello.write(&mut payload);
+//! let bytes = Packet::new(Header::control(kind, 7, 0), &payload[..n]).parts().concat();
+//!
+//! // Its bytes arrive in small pieces, behind some noise.
+//! let (mut decoder, mut firmware) = (Decoder::new(), Firmware::default());
+//! decoder.push(b"noise on the line", &mut firmware);
+//! for piece in bytes.chunks(5) {
+//!     decoder.push(piece, &mut firmware);
+//! }
+//! assert_eq!(firmware.heard, Some(hello));
+//! ```
 #![cfg_attr(not(feature = "std"), no_std)]
 
 pub mod clock_map;

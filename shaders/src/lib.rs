@@ -2,6 +2,26 @@
 //!
 //! `glsl/generated.glsl` and `glsl/tables.glsl` are written from [`structs`] by `cargo run -p dpm-shaders --bin build-shaders`, which also runs `glslc`;
 //! tests fail when either is stale, so users need no shader compiler.
+//!
+//! # Example
+//!
+//! ```
+//! use dpm_shaders::{generate::generated_glsl, structs::Frame, ALL, TRACE};
+//!
+//! // Software Vulkan reads tables through texel buffers, GPUs through storage buffers.
+//! assert_eq!(TRACE.reading(true).name, "trace.texel");
+//! assert_eq!(TRACE.reading(false).name, "trace.storage");
+//!
+//! // Every shader is SPIR-V, ready for `vkCreateShaderModule`.
+//! for shader in ALL {
+//!     assert_eq!(shader.spirv[..4], 0x0723_0203_u32.to_le_bytes(), "{}", shader.name);
+//! }
+//!
+//! // What Rust writes is what GLSL reads: one struct, declared once.
+//! let frame: Frame = bytemuck::Zeroable::zeroed();
+//! assert_eq!(bytemuck::bytes_of(&frame).len(), size_of::<Frame>());
+//! assert!(generated_glsl().contains("struct Frame {"));
+//! ```
 
 pub mod generate;
 #[cfg(test)]

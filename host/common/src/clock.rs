@@ -1,4 +1,4 @@
-//! The one place that asks the operating system for the time, and the clock that a test or a virtual run sets by hand.
+//! The clock that all time of the rig comes from, and the one that a test or a virtual run sets by hand.
 //!
 //! Contract: `now` never goes back on one thread, and a value read on one thread and handed to another is not ahead of what
 //! the other reads (`std::time::Instant` is CLOCK_MONOTONIC on Linux: no leap seconds, no steps, slewed by NTP by at most

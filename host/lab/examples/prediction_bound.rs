@@ -2,7 +2,7 @@
 //!
 //! `cargo run --release -p dpm-lab --example prediction_bound`
 //!
-//! The motions are those of the table of docs/LATENCY.md whose acceleration jumps: 0.5 m/s there and back, turns of 5 m/s^2. The
+//! The motions are those of the table of docs/lab/PREDICTION.md whose acceleration jumps: 0.5 m/s there and back, turns of 5 m/s^2. The
 //! predictor is told what no filter of a rig knows: the noise, that acceleration is exactly -5, 0 or 5 m/s^2, and how long each lasts on
 //! average. It keeps the likeliest histories of jumps, each with the exact (Kalman) distribution of position and velocity, so that its
 //! belief is Bayes' up to the histories it drops. From the belief come two predictions: the mean, which has the least mean square

@@ -1,4 +1,4 @@
-//! A `FramePlan` into radiance: what the shaders compute, and the tables and CPU twins they share.
+//! Frame inputs into code values and bit planes: what the shaders compute, and the tables and CPU twins that they share.
 
 pub mod blue_noise;
 mod body_bvh;

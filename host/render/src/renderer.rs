@@ -1,4 +1,4 @@
-//! One frame on the GPU: surfaces, radiance, code values. Reads top to bottom in `Renderer::record`.
+//! One frame on the GPU: surfaces, radiance, code values. `Renderer::create_slot` records the passes in their order.
 
 use super::last_frame::LastFrame;
 use super::memory::{BytesPerPixel, RasterTooLarge, SharedBuffers};

@@ -1,6 +1,32 @@
 //! The rig. **Follow one frame**: tracks, plan, render, pack, link, light.
 //!
-//! See `docs/ARCHITECTURE.md` for the picture and one invariant per folder.
+//! See `docs/FRAME.md` for the way of a frame with its picture, and `docs/ARCHITECTURE.md` for one invariant per folder.
+//!
+//! # Example: twenty frames from motion to light
+//!
+//! The demo's rig with the mock tracker and the mock projector. Prepared frames take the renderer's place, so no GPU is needed;
+//! [`pipeline::run`] with a [`dpm_render::gpu::Gpu`] renders them.
+//!
+//! ```
+//! use dpm_device::planes::Raster;
+//! use dpm_rig::config::{Overrides, RigConfig};
+//! use dpm_rig::pipeline::{run_prepared, RunOptions};
+//! use dpm_rig::rig::Rig;
+//! use dpm_rig::telemetry::monitor::RunMonitor;
+//! use std::sync::Arc;
+//!
+//! # fn main() -> Result<(), Box<dyn std::error::Error>> {
+//! let flags = vec!["tracker.noise_m=0.0001".to_owned()];
+//! let config = RigConfig::demo(&Overrides { flags, ..Default::default() })?;
+//! let rig = Arc::new(Rig::build(&config, Raster::new(64, 48))?);
+//! let options = RunOptions { frames: 20, ..Default::default() };
+//! let outcome = run_prepared(rig, options, &Arc::new(RunMonitor::default()))?;
+//!
+//! assert_eq!(outcome.report.frames_lit, 20);
+//! assert_eq!(outcome.frames_torn, 0, "no frame was lit with a part of another");
+//! # Ok(())
+//! # }
+//! ```
 
 pub mod config;
 pub mod control;

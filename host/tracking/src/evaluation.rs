@@ -264,7 +264,7 @@ pub(crate) fn prediction_rows() -> Result<Vec<PredictionRow>, EvaluationError> {
     prediction_cases().into_iter().map(row).collect()
 }
 
-/// The table of `docs/LATENCY.md` in Markdown: 99th percentile of the error at the instant of light.
+/// The table of `docs/lab/PREDICTION.md` in Markdown: 99th percentile of the error at the instant of light.
 pub(crate) fn prediction_table(rows: &[PredictionRow]) -> String {
     let mut table = String::from(
         "| motion | 0.1 mm | without the fifth filter | 0.01 mm | without the fifth filter | no noise | held, no noise | unit |\n\

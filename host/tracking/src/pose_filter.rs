@@ -100,7 +100,7 @@ impl Default for PoseFilterConfig {
 /// Models for bodies whose turns take about `acceleration` (m/s^2 or rad/s^2) and whose velocity changes in a good part of a
 /// second: coasting; steady acceleration; swinging at a hand's or a rocker's pace; a sharp manoeuvre, which bridges
 /// the onset of a turn; and what the body did the last time. The numbers were found by a random search over shuttles and swings of
-/// 1 to 3 Hz with 0.1 mm of noise at 500 Hz (the table in `docs/LATENCY.md`); densities scale with the square of the acceleration.
+/// 1 to 3 Hz with 0.1 mm of noise at 500 Hz (the table in `docs/lab/PREDICTION.md`); densities scale with the square of the acceleration.
 pub fn models_for(acceleration: f64) -> ImmConfig {
     let a2 = acceleration * acceleration;
     let model = |accelerates, swing_rad_s, noise| MotionModel { accelerates, swing_rad_s, noise };

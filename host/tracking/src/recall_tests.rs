@@ -319,7 +319,7 @@ fn wandering(seed: u64, [lasts, strength, damping, pull]: [f64; 4]) -> Vec<f64> 
 }
 
 /// Turns anywhere or half of the time where they were before, starts at any time, and accelerations that wander: at most 3 % worse than
-/// without. `cargo test -p dpm-tracking --lib bodies_that_do_not_repeat -- --nocapture` prints the table of `docs/LATENCY.md`.
+/// without. `cargo test -p dpm-tracking --lib bodies_that_do_not_repeat -- --nocapture` prints the table of `docs/lab/PREDICTION.md`.
 #[test]
 fn bodies_that_do_not_repeat_themselves_are_no_worse_off() {
     type Draw = dyn Fn(u64) -> Vec<f64>;

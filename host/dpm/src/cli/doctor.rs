@@ -313,7 +313,7 @@ impl System {
 fn known_projector(vendor: &str, product: &str) -> Option<&'static str> {
     match (vendor, product) {
         ("0451", "c900") => Some("TI DLPC900"),
-        ("1209", "0947") => Some("bit-plane projector"),
+        ("1209", "000d") => Some("bit-plane projector"),
         _ => None,
     }
 }

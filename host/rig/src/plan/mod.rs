@@ -1,4 +1,4 @@
-//! A slot and the newest poses into the plan of one frame: when its light is due and how many rays it may cost.
+//! What is decided before a frame is drawn: how early it is begun, how far poses are predicted, how many rays it may cost.
 
 pub mod budget;
 pub mod dark;
