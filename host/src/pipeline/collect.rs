@@ -5,6 +5,7 @@ use super::dark_bodies::DarkBodies;
 use super::job::{Fate, FrameNote};
 use super::light::LightNote;
 use super::placement::Placement;
+use super::registration::{measured_at, RegistrationMeter};
 use crate::config::{Pace, ProjectorBackend, TrackerConfig};
 use crate::frame::{FrameId, FrameTimeline, Stage, STAGES};
 use crate::plan::dark::DarkCause;
@@ -30,8 +31,6 @@ use std::collections::VecDeque;
 use std::sync::Arc;
 use std::time::Duration;
 
-/// Points on each body at which registration is measured.
-const POINTS_PER_BODY: usize = 48;
 /// Sent frames that may wait for their light; beyond this they count as never lit.
 const MAX_PENDING: usize = 256;
 
@@ -64,7 +63,7 @@ pub struct FrameRecord {
 /// Counts and distributions of a run.
 pub struct Collector {
     rig: Arc<Rig>,
-    points: Vec<Vec<DVec3>>,
+    meter: RegistrationMeter,
     placement: Placement,
     pending: VecDeque<FrameRecord>,
     /// The last lit frames, oldest first.
@@ -133,7 +132,7 @@ fn histogram() -> Histogram<u64> {
 impl Collector {
     /// Keeps the last `keep` lit frames; `verify`: compares hashes of code values and light.
     pub fn new(rig: Arc<Rig>, keep: usize, verify: bool) -> Self {
-        let points = (0..rig.bodies.len()).map(|i| registration_points(&rig, i)).collect();
+        let meter = RegistrationMeter::new(&rig);
         let measured = rig.config.real_time.pace == Pace::Real;
         // A tenth of a known run, but enough frames for a 99th percentile.
         let frames = rig.config.run.frames.max(rig.config.slots_to_run());
@@ -150,7 +149,7 @@ impl Collector {
             has_still_light: rig.scene.bodies.iter().any(|b| b.tracked.is_none() && b.projected),
             slots: SlotLedger::new(rig.rate(), lead_ns),
             rig,
-            points,
+            meter,
             pending: VecDeque::new(),
             recent: VecDeque::new(),
             keep,
@@ -316,7 +315,7 @@ impl Collector {
                 self.stages[stage as usize].saturating_record(ns);
             }
         }
-        self.placement.observe(&self.rig.camera, &job.sampled_poses, &job.seen, &self.points);
+        self.placement.observe(&self.rig.camera, &job.sampled_poses, &job.seen, self.meter.points());
         let sent = job.is_sent();
         let refused = !sent && !matches!(job.fate, Fate::Overtaken | Fate::Stopped);
         self.slots.planned(job.slot, &job.timeline, refused, job.waited_for_memory);
@@ -437,26 +436,21 @@ impl Collector {
 
     /// Where the light of each point fell against where the point was at the middle of the exposure, on the bodies that were lit.
     fn measure_registration(&mut self, note: &LightNote, record: &FrameRecord, late: bool) {
-        let (first, last) = (note.event.first_photon_at, note.event.last_photon_at);
-        let middle = first.plus_ns(last.ns_since(first) / 2);
-        let Some(truth) = self.rig.true_poses(middle.0) else { return };
-        for (i, points) in self.points.iter().enumerate() {
+        let at = measured_at(note.event.first_photon_at, note.event.last_photon_at);
+        let Some(truth) = self.rig.true_poses(at.0) else { return };
+        let counted = |px: f64| (px * PER_PIXEL).round() as u64;
+        for (i, truth) in truth.iter().enumerate() {
             if !self.prepared && record.dark.get(i).copied().flatten().is_some() {
                 continue;
             }
-            for p in points {
-                let at = |m: &DAffine3| self.rig.camera.project(m.transform_point3(*p));
-                let Some(real) = at(&truth[i]) else { continue };
-                if let Some(used) = at(&record.tracked_poses[i]) {
-                    let error = ((used - real).length() * PER_PIXEL).round() as u64;
-                    self.registration.saturating_record(error);
-                    if !late {
-                        self.registration_in_time.saturating_record(error);
-                    }
+            for px in self.meter.errors(i, &record.tracked_poses[i], truth) {
+                self.registration.saturating_record(counted(px));
+                if !late {
+                    self.registration_in_time.saturating_record(counted(px));
                 }
-                if let Some(held) = at(&record.sampled_poses[i]) {
-                    self.unpredicted.saturating_record(((held - real).length() * PER_PIXEL).round() as u64);
-                }
+            }
+            for px in self.meter.errors(i, &record.sampled_poses[i], truth) {
+                self.unpredicted.saturating_record(counted(px));
             }
         }
     }
@@ -521,17 +515,4 @@ impl Collector {
                 .push(format!("{} frames of light differ from what was rendered", self.light_mismatches));
         }
     }
-}
-
-/// Points spread over the vertices of a tracked body.
-fn registration_points(rig: &Rig, tracked: usize) -> Vec<DVec3> {
-    let all: Vec<DVec3> = rig
-        .scene
-        .bodies
-        .iter()
-        .filter(|b| b.tracked == Some(tracked as u16) && b.projected)
-        .flat_map(|b| b.mesh.positions.iter().map(|p| p.as_dvec3()))
-        .collect();
-    let n = all.len().min(POINTS_PER_BODY);
-    (0..n).map(|i| all[i * all.len() / n]).collect()
 }

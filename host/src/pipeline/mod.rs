@@ -24,6 +24,7 @@ mod planning;
 pub mod prepared;
 pub mod projector;
 mod pulse;
+pub mod registration;
 mod rights;
 mod run;
 pub mod stages;
