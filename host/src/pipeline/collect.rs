@@ -31,7 +31,7 @@ use std::collections::VecDeque;
 use std::sync::Arc;
 use std::time::Duration;
 
-/// Sent frames that may wait for their light; beyond this they count as never lit.
+/// Sent frames that may wait for their light; beyond this the oldest count as never lit, once no light is left to look at.
 const MAX_PENDING: usize = 256;
 
 /// Time between two looks at what is finished.
@@ -95,6 +95,8 @@ pub struct Collector {
     newest: Option<u32>,
     /// Slots in which the frame before was shown again, until the last planned one is known to be later.
     repeats: VecDeque<u64>,
+    /// The last planned slot of the frames that the link is done with.
+    last_planned: Option<u64>,
     /// Lit frames whose light was not what was rendered.
     pub light_mismatches: u64,
     /// Intervals of every lit frame.
@@ -167,6 +169,7 @@ impl Collector {
             last_lit: None,
             newest: None,
             repeats: VecDeque::new(),
+            last_planned: None,
             light_mismatches: 0,
             profiler,
             traced: VecDeque::new(),
@@ -217,16 +220,25 @@ impl Collector {
             // Asked before looking: what came before the end is taken first.
             let over = done.is_finished() && lights.is_finished();
             self.slots.read_orders(monitor.dark());
-            self.take_finished(&mut done, free, monitor);
-            while let Some(note) = held.take().or_else(|| lights.try_pop()) {
+            loop {
+                let light = held.take().or_else(|| lights.try_pop());
+                // After the light was taken: of the frames before it all has been said.
                 self.take_finished(&mut done, free, monitor);
                 // Lit before the link's thread came to say that it was sent.
-                let unknown = note.event.frame.is_some_and(|f| self.newest.is_none_or(|n| frame_newer(f, n)));
-                if unknown && !over {
-                    held = Some(note);
-                    break;
+                let unknown = |f: u32| self.newest.is_none_or(|n| frame_newer(f, n));
+                match light {
+                    Some(note) if over || !note.event.frame.is_some_and(unknown) => {
+                        self.light(&note, monitor)
+                    }
+                    light => {
+                        held = light;
+                        if self.pending.len() < MAX_PENDING || done.is_empty() {
+                            break;
+                        }
+                        // Frames are finished behind as many that no light is told of.
+                        self.drop_oldest(monitor);
+                    }
                 }
-                self.light(&note, monitor);
             }
             self.slots.settle();
             let slots = self.slots.counts();
@@ -243,8 +255,11 @@ impl Collector {
         }
     }
 
+    /// Takes finished frames until no more can wait for their light: what they wait for is looked at before others are taken, however long
+    /// this thread stood still.
     fn take_finished(&mut self, done: &mut Receiver<Box<FrameNote>>, free: &NotesBack, monitor: &RunMonitor) {
-        while let Some(note) = done.try_pop() {
+        while self.pending.len() < MAX_PENDING {
+            let Some(note) = done.try_pop() else { break };
             self.finished(&note, monitor);
             free.push(note);
         }
@@ -319,14 +334,12 @@ impl Collector {
         let sent = job.is_sent();
         let refused = !sent && !matches!(job.fate, Fate::Overtaken | Fate::Stopped);
         self.slots.planned(job.slot, &job.timeline, refused, job.waited_for_memory);
+        self.last_planned = self.last_planned.max(Some(job.slot));
         while self.repeats.front().is_some_and(|&slot| slot < job.slot) {
             self.repeats.pop_front();
             self.repeated += 1;
         }
         if sent {
-            if self.pending.len() >= MAX_PENDING {
-                self.drop_oldest(monitor);
-            }
             self.pending.push_back(FrameRecord {
                 id: job.id,
                 slot: job.slot,
@@ -353,8 +366,10 @@ impl Collector {
         match note.event.kind {
             LightKind::Repeated => {
                 self.slots.nothing_new(slot, begin, 0);
-                // After the last frame the projector repeats it until it is told to stop: no fault.
-                if self.repeats.len() < MAX_PENDING {
+                if self.last_planned.is_some_and(|last| slot < last) {
+                    self.repeated += 1;
+                } else if self.repeats.len() < MAX_PENDING {
+                    // After the last frame the projector repeats it until it is told to stop: no fault.
                     self.repeats.push_back(slot);
                 }
             }
@@ -514,5 +529,71 @@ impl Collector {
                 .warnings
                 .push(format!("{} frames of light differ from what was rendered", self.light_mismatches));
         }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::config::{Overrides, RigConfig};
+    use dpm_device::link::SendOutcome;
+    use dpm_device::planes::Raster;
+    use dpm_device::time::DeviceTicks;
+    use dpm_handoff::channel::channel;
+    use dpm_handoff::wake::WaitPolicy;
+    use hil_mock::projector::LightEvent;
+
+    const SLOT_NS: i64 = 1_000_000;
+
+    /// Lit, dropped and missed of frames that were all sent, and of which those are lit that `lit` says, when the collector finds them all at
+    /// once; and slots in which another was repeated.
+    fn counted(frames: u64, lit: impl Fn(u64) -> bool) -> [u64; 4] {
+        let config = RigConfig::demo(&Overrides::default()).unwrap_or_else(|e| panic!("{e}"));
+        let rig = Arc::new(Rig::build(&config, Raster::new(16, 16)).unwrap_or_else(|e| panic!("{e}")));
+        let (mut done_in, done) = channel(frames as usize, WaitPolicy::Park);
+        let (mut lights_in, lights) = channel(frames as usize, WaitPolicy::Park);
+        for k in 0..frames {
+            let begin = HostTime(k as i64 * SLOT_NS);
+            let mut note = FrameNote::new(rig.bodies.len());
+            (note.id, note.slot, note.fate) = (FrameId(k), k, Fate::Offered(SendOutcome::Sent));
+            note.timeline.due_at = begin;
+            let poses = rig.true_poses(begin.0).expect("the mock tells");
+            (note.tracked_poses, note.sampled_poses) = (poses.clone(), poses);
+            note.dark = vec![None; rig.bodies.len()];
+            assert!(done_in.push(Box::new(note)).is_ok());
+            let (kind, frame) =
+                if lit(k) { (LightKind::Lit, Some(k as u32)) } else { (LightKind::Repeated, None) };
+            let event = LightEvent {
+                slot: k,
+                kind,
+                frame,
+                lit_at: DeviceTicks(k),
+                first_photon_at: begin,
+                last_photon_at: begin.plus_ns(SLOT_NS),
+            };
+            let note = LightNote { event, hash: 0, torn: false, wall_ns: 0, unseen: 0 };
+            assert!(lights_in.push(note).is_ok());
+        }
+        drop((done_in, lights_in));
+        let mut collector = Collector::new(rig, 0, false);
+        let monitor = RunMonitor::default();
+        collector.run(done, &NotesBack::default(), lights, &monitor, || true);
+        let missed = collector.finish(&monitor).missed_total();
+        [collector.lit, collector.dropped, missed, collector.repeated]
+    }
+
+    /// Found by reading: of frames that were finished while the collector had no core, those beyond 256 counted as dropped although their light had
+    /// been told, and repeats that were told behind the last frame did not count: the counts of a run at virtual pace were the machine's.
+    #[test]
+    fn a_collector_that_stood_still_counts_what_it_would_have_counted() {
+        let many = 3 * MAX_PENDING as u64 + 7;
+        assert_eq!(counted(many, |_| true), [many, 0, 0, 0]);
+        // What is shown in the last slot may be shown for as long as nobody says stop.
+        assert_eq!(counted(many, |_| false), [0, many, many, many - 1]);
+        let (odd, even) = (many / 2, many - many / 2);
+        assert_eq!(counted(many, |k| k % 2 == 1), [odd, even, even, even - 1]);
+        // Nothing but light that is told late, behind more frames than can wait.
+        let late = many - MAX_PENDING as u64 - 10;
+        assert_eq!(counted(many, |k| k >= late), [many - late, late, late, late]);
     }
 }

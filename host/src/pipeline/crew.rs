@@ -197,7 +197,8 @@ impl Crew {
         notes_back.lead_to(notes_in);
         let state = Arc::new(CrewState {
             is_abandoned: AtomicBool::new(false),
-            listen_to: AtomicI64::new(0),
+            // Nothing is wanted before planning says so: whether tracking looks before that is chance.
+            listen_to: AtomicI64::new(i64::MIN),
             tracking: OnceLock::new(),
             tracking_over: AtomicBool::new(false),
             planning: AtomicU64::new(0),

@@ -143,7 +143,8 @@ impl<'a> Planner<'a> {
         let note = pop_within(&mut self.inbox.notes, WAIT_NS)?;
         let memory = self.hottest.pop()?;
         let mut job = FrameJob { note, memory };
-        job.note.waited_for_memory = std::mem::take(&mut self.waited);
+        // At virtual pace waiting takes no time, and is the cause of nothing.
+        job.note.waited_for_memory = std::mem::take(&mut self.waited) && !self.shared.is_virtual();
         Some(job)
     }
 
