@@ -18,6 +18,7 @@ pub mod job;
 mod keeper;
 pub mod light;
 mod link;
+pub mod offline;
 mod outcome;
 mod placement;
 mod planning;
