@@ -4,8 +4,10 @@ use dpm_device::time::HostTime;
 use dpm_render::{FrameInputs, Renderer};
 use dpm_rig::pipeline::{self, renderer_settings, RunOptions};
 use dpm_rig::telemetry::monitor::RunMonitor;
+use dpm_rig::telemetry::report::Report;
 use dpm_tests::gpu::with_gpu;
 use dpm_tests::rigs::{demo_rig, run};
+use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
@@ -82,6 +84,65 @@ fn a_run_repeats_to_the_bit() {
         assert_ne!(first, hash(dpm, "render.seed=8"), "the seed has no effect");
         assert_eq!(hash(paper, "render.seed=7"), hash(paper, "render.seed=7"));
     });
+}
+
+/// What a report says but for wall time, which is the machine's.
+fn told(report: &Report) -> serde_json::Value {
+    let mut json: serde_json::Value = serde_json::from_str(&report.to_json()).unwrap();
+    let fields = json.as_object_mut().unwrap();
+    for wall in ["stages_ms", "frames_per_wall_second", "mrays_per_s", "wall_s"] {
+        assert!(fields.remove(wall).is_some(), "no {wall}");
+    }
+    assert!(fields.len() > 20, "{json}");
+    json
+}
+
+/// Runs `work` while other threads keep every core busy.
+fn beside_others<T>(work: impl FnOnce() -> T) -> T {
+    let over = AtomicBool::new(false);
+    std::thread::scope(|scope| {
+        for _ in 0..6 {
+            scope.spawn(|| {
+                while !over.load(Ordering::Relaxed) {
+                    std::hint::spin_loop();
+                }
+            });
+        }
+        let done = work();
+        over.store(true, Ordering::Relaxed);
+        done
+    })
+}
+
+/// All that a run at virtual pace says, not the light alone, with samples and packets lost on the way, is the same on an idle machine and on a busy one.
+#[test]
+fn a_whole_report_repeats_on_a_busy_machine() {
+    with_gpu(|gpu| {
+        let lossy = ["tracker.drop_out=0.1", "projector.backend={kind=\"mock\",faults=\"loss=0.05\"}"];
+        for method in ["dpm", "paper"] {
+            let method = format!("render.method=\"{method}\"");
+            let settings = [lossy[0], lossy[1], &method, "render.spp=1"];
+            let rig = demo_rig(64, 48, &settings);
+            let once = || told(&run(gpu, &rig, 60, 0).0.report);
+            let first = once();
+            assert!(first["frames_dropped"].as_u64() > Some(0), "nothing was lost: {first}");
+            assert_eq!(first, once());
+            assert_eq!(first, beside_others(once));
+        }
+    });
+    // More frames than the collector holds at once, faster than it looks.
+    let rig =
+        demo_rig(16, 12, &["tracker.drop_out=0.1", "projector.backend={kind=\"mock\",faults=\"loss=0.02\"}"]);
+    let once = || {
+        let options = RunOptions { frames: 3000, ..RunOptions::default() };
+        let outcome = pipeline::run_prepared(rig.clone(), options, &Arc::new(RunMonitor::default()));
+        told(&outcome.unwrap_or_else(|e| panic!("{e}")).report)
+    };
+    let first = once();
+    assert!(first["missed_slots"].as_u64() > Some(0), "{first}");
+    for _ in 0..3 {
+        assert_eq!(first, beside_others(once));
+    }
 }
 
 #[test]

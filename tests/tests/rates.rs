@@ -66,7 +66,7 @@ fn judged(outcome: &RunOutcome, rig: &Rig, rendered: bool) -> Result<(), String>
     if oldest > report.predict_ms + 2.0 * slot_ms {
         return Err(format!("light of poses {oldest} ms old, prediction reaches {} ms", report.predict_ms));
     }
-    let bright = |f: &pipeline::light::LightFrame| f.codes.iter().any(|c| c.iter().any(|&v| v > 0));
+    let bright = |f: &dpm_rig::light::recorder::LightFrame| f.codes.iter().any(|c| c.iter().any(|&v| v > 0));
     if rendered && !outcome.light.iter().any(bright) {
         return Err("every plane is black".into());
     }

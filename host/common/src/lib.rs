@@ -4,6 +4,7 @@ pub mod clock;
 pub mod commit;
 pub mod files;
 pub mod folder;
+pub mod quantiles;
 pub mod so3;
 pub mod stopping;
 pub mod unix;

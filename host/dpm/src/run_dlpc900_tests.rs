@@ -4,7 +4,7 @@ use super::*;
 use dpm_device::dlpc900::lut::DisplayMode;
 use dpm_device::time::HostTime;
 use dpm_render::pack::unpack;
-use dpm_rig::pipeline::prepared::PreparedFrames;
+use dpm_rig::pack::prepared::PreparedFrames;
 use hil_mock::dlpc900::{Dlpc900Model, Options, Sequencer, VirtualHid};
 use std::sync::{Arc, Mutex};
 

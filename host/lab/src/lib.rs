@@ -7,6 +7,7 @@ pub mod handoff_cost;
 pub mod link_test;
 mod median;
 mod metrics;
+pub mod offline;
 pub mod plan_savings;
 pub mod profile;
 pub mod reference;

@@ -14,7 +14,7 @@ use dpm_render::pack::{pack, BitPlaneFrame, Kernel};
 use dpm_render::{RenderError, Renderer};
 use dpm_rig::config::{Compaction, ProjectorBackend, RigConfig};
 use dpm_rig::failure::{Failure, FailureKind};
-use dpm_rig::pipeline::prepared::PreparedFrames;
+use dpm_rig::pack::prepared::PreparedFrames;
 use dpm_rig::pipeline::{connect, projector, renderer_settings, PipelineError, ENDED_WITH_THE_LAST_RUN};
 use dpm_rig::rig::Rig;
 use dpm_rig::telemetry::monitor::RunMonitor;

@@ -118,6 +118,8 @@ pub struct Renderer {
     tracked: Vec<Option<u16>>,
     /// What the history holds: the last frame submitted and its poses.
     last: LastFrame,
+    /// The tiles that were active when shading rates were decided last. All others have the full rate.
+    rated: Vec<bool>,
     pub(super) gpu: Arc<Gpu>,
 }
 
@@ -258,6 +260,7 @@ impl Renderer {
                 .transpose()?,
         };
         let last = LastFrame::none(tracked.len());
+        let rated = vec![false; TileList::new(settings.raster.width(), settings.raster.height()).len()];
         Ok(Self {
             resources: Arc::new(Resources { pipelines, table, shared, scene: scene_gpu }),
             data,
@@ -265,6 +268,7 @@ impl Renderer {
             keep,
             tracked,
             last,
+            rated,
             gpu: gpu.clone(),
         })
     }
@@ -498,11 +502,15 @@ impl Renderer {
                 gpu_structs::INSTANCE_PROJECTED,
             );
         }
-        let tile_count = slot.tile_list.write(bytemuck::cast_slice_mut(slot.tiles.bytes_mut()));
         let turn = self.last.turn_of(inputs.frame);
         // Four 8 x 8 workgroups a tile; rates are decided in every second frame drawn, one workgroup a tile. The checkerboard goes by the
         // same count, so that both of its halves are traced at one rate.
-        let rate_tiles = if turn.drawn.is_multiple_of(2) { tile_count } else { 0 };
+        let decides_rates = self.resources.pipelines.rate_map.is_some() && turn.drawn.is_multiple_of(2);
+        // A tile that is left loses its rate, whichever slot's turn it is: a body that comes back to it would else find a rate of long ago in one
+        // slot and none in another, and a run would not repeat.
+        let left = if decides_rates { &self.rated[..] } else { &[] };
+        let tile_count = slot.tile_list.write(left, bytemuck::cast_slice_mut(slot.tiles.bytes_mut()));
+        let rate_tiles = if decides_rates { tile_count } else { 0 };
         slot.arguments.write(&[[tile_count * 4, 1u32, 1, 0], [rate_tiles, 1, 1, 0]]);
         // The projector is the origin: f32 is finest where the rays start.
         let origin = inputs.camera.position();
@@ -596,6 +604,9 @@ impl Renderer {
         slot.frame.write(&[frame]);
         slot.parity = 1 - self.last.parity;
         slot.lists[slot.parity].submit(&mut slot.fence)?;
+        if decides_rates {
+            self.rated.copy_from_slice(slot.tile_list.active());
+        }
         let lost = (0..inputs.poses.len()).map(|i| is_lost(&self.tracked, i, inputs.lost));
         self.last.becomes(inputs, slot.parity, lost);
         Ok(())

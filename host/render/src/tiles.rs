@@ -97,11 +97,18 @@ impl TileList {
         }
     }
 
-    /// Writes the tiles that are active now or were at the last update (those must be cleared) to `out`; returns how many.
-    pub(crate) fn write(&self, out: &mut [u32]) -> u32 {
+    /// The tiles that are active now, row by row.
+    pub(crate) fn active(&self) -> &[bool] {
+        &self.active
+    }
+
+    /// Writes the tiles that are active now, were at the last update (those must be cleared) or are `wanted` to `out`; returns how many.
+    /// `wanted` may be empty.
+    pub(crate) fn write(&self, wanted: &[bool], out: &mut [u32]) -> u32 {
         let mut n = 0;
         for &tile in &self.order {
-            if self.active[tile as usize] || self.previous[tile as usize] {
+            let at = tile as usize;
+            if self.active[at] || self.previous[at] || wanted.get(at) == Some(&true) {
                 out[n] = tile;
                 n += 1;
             }
@@ -146,7 +153,7 @@ mod tests {
         let mut list = TileList::new(250, 130);
         list.update(&camera, &[body], &[pose], 1);
         let mut tiles = vec![0; list.len()];
-        let n = list.write(&mut tiles) as usize;
+        let n = list.write(&[], &mut tiles) as usize;
         assert!(n > 4 && n < list.len(), "{n} of {}", list.len());
         for i in 0..1000 {
             let h = |k: u32| f64::from((i * k) % 997) / 997.0 * 0.2 - 0.1;
@@ -158,8 +165,11 @@ mod tests {
         }
         // When the body is gone its tiles come once more, to be cleared, then no more.
         list.update(&camera, &[], &[], 1);
-        assert_eq!(list.write(&mut tiles) as usize, n);
+        assert_eq!(list.write(&[], &mut tiles) as usize, n);
         list.update(&camera, &[], &[], 1);
-        assert_eq!(list.write(&mut tiles), 0);
+        assert_eq!(list.write(&[], &mut tiles), 0);
+        let mut wanted = vec![false; list.len()];
+        wanted[5] = true;
+        assert_eq!((list.write(&wanted, &mut tiles), tiles[0]), (1, 5));
     }
 }

@@ -3,8 +3,8 @@
 //! For every pixel of the picture the surface point it shows at the last instant is carried back through the window with its body's true
 //! motion, and the light that fell on it in each frame is averaged. Motion blur of a following eye, lag and misregistration are all in it.
 
-use crate::pipeline::light::LightFrame;
-use crate::pipeline::FrameRecord;
+use crate::light::recorder::LightFrame;
+use crate::light::FrameRecord;
 use crate::rig::Rig;
 use dpm_render::gpu::GpuError;
 use dpm_render::{FrameInputs, Renderer};

@@ -4,7 +4,7 @@ use crate::config::{
     BodyConfig, BuiltinScene, CalibrationUnit, EnvironmentConfig, GazeConfig, RigConfig, TrackerConfig,
 };
 use crate::mock::{Motion, MotionError, MotionSpec};
-use crate::tracks::source::{self, SourceError};
+use crate::tracks::{self, SourceError};
 use dpm_device::planes::Raster;
 use dpm_device::pose::Pose;
 use dpm_device::regular_file;
@@ -200,7 +200,7 @@ impl Rig {
             .enumerate()
             .map(|(i, b)| BodyKey { name: b.name.clone(), id: named.get(i).and_then(|c| c.id) });
         let motions = self.bodies.iter().filter_map(|b| b.motion.clone()).collect();
-        Ok(source::open(&self.config.tracker, keys.collect(), motions, clock, start)?)
+        Ok(tracks::open(&self.config.tracker, keys.collect(), motions, clock, start)?)
     }
 
     /// True world-from-body of every tracked body at an instant; `None` unless the tracker is the mock.

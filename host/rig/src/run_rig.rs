@@ -8,7 +8,7 @@ use crate::rig::{Rig, RigError};
 use crate::telemetry::monitor::RunMonitor;
 use crate::telemetry::report::Report;
 use crate::telemetry::trace::write_trace;
-use crate::tracks::source::SourceError;
+use crate::tracks::SourceError;
 use dpm_common::files::{check_folder, write_atomically};
 use dpm_device::planes::Raster;
 use dpm_render::gpu::{validation_messages, Gpu, GpuError, GpuOptions};

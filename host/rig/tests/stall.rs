@@ -2,7 +2,8 @@
 
 use dpm_device::planes::Raster;
 use dpm_rig::config::{Overrides, RigConfig};
-use dpm_rig::pipeline::{run_prepared, FrameRecord, RunOptions, Stall, StallIn};
+use dpm_rig::light::FrameRecord;
+use dpm_rig::pipeline::{run_prepared, RunOptions, Stall, StallIn};
 use dpm_rig::rig::Rig;
 use dpm_rig::telemetry::monitor::RunMonitor;
 use std::sync::Arc;

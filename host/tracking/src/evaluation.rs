@@ -1,6 +1,7 @@
 //! Closed-form motions through the mock tracker and the pose filter into errors at the instant of light, as a table.
 
 use super::pose_filter::{PoseFilter, PoseFilterConfig, Prediction};
+use dpm_common::quantiles::Quantiles;
 use dpm_common::so3::so3_between;
 use dpm_device::pose::Pose;
 use dpm_device::time::{FrameRate, HostTime};
@@ -40,29 +41,6 @@ impl EvaluationConfig {
             frames: 20 * 947,
             settle_frames: 474,
         }
-    }
-}
-
-/// Quantiles of an error.
-#[derive(Clone, Copy, Debug, Default, PartialEq)]
-#[allow(missing_docs)] // named after what they are
-pub(crate) struct Quantiles {
-    pub p50: f64,
-    pub p99: f64,
-    pub max: f64,
-    pub rms: f64,
-}
-
-impl Quantiles {
-    fn of(mut values: Vec<f64>) -> Self {
-        values.sort_by(f64::total_cmp);
-        let n = values.len();
-        if n == 0 {
-            return Self::default();
-        }
-        let at = |q: f64| values[((n as f64 * q).ceil() as usize).clamp(1, n) - 1];
-        let rms = (values.iter().map(|v| v * v).sum::<f64>() / n as f64).sqrt();
-        Self { p50: at(0.5), p99: at(0.99), max: values[n - 1], rms }
     }
 }
 

@@ -6,7 +6,7 @@ use dpm_device::planes::{PlaneSchedule, Raster};
 use dpm_device::time::HostTime;
 use dpm_device::transport::LinkDevice;
 use dpm_rig::config::{Overrides, RigConfig};
-use dpm_rig::pipeline::prepared::is_whole;
+use dpm_rig::pack::prepared::is_whole;
 use dpm_rig::pipeline::{run_prepared, PipelineError, RunOptions, RunOutcome};
 use dpm_rig::rig::Rig;
 use dpm_rig::telemetry::monitor::RunMonitor;

@@ -9,7 +9,7 @@ use std::collections::HashMap;
 use std::path::{Path, PathBuf};
 
 /// Most bodies that a rig tracks. It is the number of poses that a snapshot of the tracks has room for, and that of the bodies which the renderer tells apart.
-const MAX_TRACKED: usize = 256;
+pub(crate) const MAX_TRACKED: usize = 256;
 
 /// Refuses several keys that contradict each other, at the first of them that somebody wrote. The message names all of them with their values, whichever it
 /// stands at: nobody must guess which other key takes part. Those with an empty value are named by `problem`.

@@ -19,6 +19,7 @@ mod world;
 #[cfg(test)]
 mod tests;
 
+pub(crate) use check::MAX_TRACKED;
 pub use error::{ConfigError, ConfigErrors, Origin};
 pub use projector::*;
 pub(crate) use read::KeyDoc;

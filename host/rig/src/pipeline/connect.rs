@@ -1,6 +1,6 @@
 //! Brings the link up: handshake, configuration, clock, ARM. Before the first frame, so it may wait (bounded).
 
-use super::stages::LinkTime;
+use crate::plan::link_time::LinkTime;
 use crate::telemetry::monitor::RunMonitor;
 use dpm_device::link::{faults, HostLink, LinkError, LinkState, Verb};
 use dpm_device::time::{DeviceTicks, HostTime};

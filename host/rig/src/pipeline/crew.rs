@@ -3,14 +3,15 @@
 //! A crew owns everything that it works with and hands frames to the link through a [`Port`]. Abandoning it is dropping the port's other
 //! end: whatever its threads still do when they wake up, none of it reaches the link, and so none of it reaches the light.
 
-use super::job::{FrameJob, FrameMemory, FrameNote};
 use super::outcome::PipelineError;
 use super::planning::{plan_thread, PlanInbox};
-use super::prepared::PreparedFrames;
 use super::pulse::{Pulse, Silence};
-use super::stages::{LinkTime, TrackSnapshot, TrackingStage};
 use super::threads::{pack_thread, policy, tracking_thread, PackInbox, Shared, NOTES};
+use crate::frame::job::{FrameJob, FrameMemory, FrameNote};
+use crate::pack::prepared::PreparedFrames;
 use crate::plan::budget::BudgetController;
+use crate::plan::link_time::LinkTime;
+use crate::tracks::{TrackSnapshot, TrackingStage};
 use dpm_device::time::HostTime;
 use dpm_handoff::channel::{channel, Receiver, Sender};
 use dpm_handoff::latest::{latest, Publisher};
@@ -54,7 +55,7 @@ pub(super) struct Port {
 
 /// The collector's way to give notes back to whichever crew works now. Not on the frame path: it may lock.
 #[derive(Clone, Default)]
-pub(super) struct NotesBack(Arc<Mutex<Option<Sender<Box<FrameNote>>>>>);
+pub(crate) struct NotesBack(Arc<Mutex<Option<Sender<Box<FrameNote>>>>>);
 
 impl NotesBack {
     /// Gives one back; one that belongs to a crew of the past may end in the present one.
@@ -197,7 +198,8 @@ impl Crew {
         notes_back.lead_to(notes_in);
         let state = Arc::new(CrewState {
             is_abandoned: AtomicBool::new(false),
-            listen_to: AtomicI64::new(0),
+            // Nothing is wanted before planning says so: whether tracking looks before that is chance.
+            listen_to: AtomicI64::new(i64::MIN),
             tracking: OnceLock::new(),
             tracking_over: AtomicBool::new(false),
             planning: AtomicU64::new(0),

@@ -4,12 +4,13 @@
 //! unplugging or a reset, the watchdog, damaged packets. Heat, lamp, emergency stop, flashes and SAFE wait for an ARM of the operator.
 
 use super::connect::ConnectError;
-use super::job::FrameNote;
-use super::light::LightNote;
-use super::stages::LinkTime;
-use super::status_light::{DeviceCounts, StatusLight};
+use crate::frame::job::FrameNote;
+use crate::light::recorder::LightNote;
+use crate::light::status::StatusLight;
+use crate::plan::link_time::LinkTime;
 use crate::plan::slots::OrderedDark;
 use crate::telemetry::monitor::{Order, ProjectorHealth, RunMonitor};
+use crate::telemetry::projector::ProjectorReport;
 use dpm_device::clock_map::ClockMap;
 use dpm_device::link::{faults, DeviceState, HostLink, LinkError, LinkState, Verb};
 use dpm_device::time::HostTime;
@@ -25,30 +26,6 @@ const REARM_NS: i64 = 1_000_000_000;
 const RETIME_NS: i64 = 100_000_000;
 /// Exchanges that beat those of the handshake.
 const EXCHANGES: usize = 8;
-
-/// What the link carried in a run, for its report.
-#[derive(Clone, Debug, PartialEq, serde::Serialize)]
-pub struct ProjectorReport {
-    /// Name of the medium.
-    pub name: String,
-    /// Sessions opened: 1 and one for every time that the projector came back.
-    pub sessions: u64,
-    /// Times that light came back after the watchdog or damaged packets.
-    pub rearmed: u64,
-    /// Megabytes handed to the medium, 10^6 bytes each.
-    pub sent_mb: f64,
-    /// Planes sent as they are, by a codec, and not at all because they had not changed.
-    pub planes: [u64; 3],
-    /// Frames not sent: link not up, no buffer in the projector, no room on the medium, medium lost, flashes, limits on light.
-    pub not_sent: [u64; 6],
-    /// What the projector reported; null for the mock in this process, whose light is seen itself.
-    pub device: Option<DeviceCounts>,
-    /// Greatest error of the mapping from the projector's clock to the host's, as the newest exchange bounds it, nanoseconds; null at virtual pace,
-    /// and where no exchange was heard.
-    pub clock_bound_ns: Option<i64>,
-    /// From sent to light in time, as learned from the reports, milliseconds; null for the mock in this process.
-    pub travel_ms: Option<f64>,
-}
 
 /// See the module's documentation.
 pub(super) struct LinkKeeper {

@@ -1,16 +1,17 @@
 //! Packed frames over the cable into light: the link's thread, and the mock projector's where it has one of its own.
 
 use super::crew::Port;
-use super::job::{Fate, FrameJob, FrameMemory, FrameNote};
-use super::keeper::{is_dark, LinkKeeper, ProjectorReport};
-use super::light::LightRecorder;
+use super::keeper::{is_dark, LinkKeeper};
 use super::outcome::{PipelineError, StallIn};
 use super::rights::Rights;
 use super::threads::{enter_frame_path, is_overtaken, pop_within, Shared, STEP_NS, WARM_UP_FRAMES};
+use crate::frame::job::{Fate, FrameJob, FrameMemory, FrameNote};
 use crate::frame::Stage;
+use crate::light::recorder::LightRecorder;
 use crate::mock::{serve_cable, EmulatedProjector};
 use crate::plan::lead::LeadEstimator;
 use crate::realtime::os::set_timer_slack_ns;
+use crate::telemetry::projector::ProjectorReport;
 use dpm_common::clock::{Clock, RunClock, Stopwatch};
 use dpm_device::link::{HostLink, LinkState, SendOutcome};
 use dpm_device::time::HostTime;

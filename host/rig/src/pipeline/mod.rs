@@ -10,30 +10,20 @@
 //! One frame is one [`job::FrameJob`]: memory and a note, boxed once and recycled. In the steady state no stage allocates, locks or
 //! logs, and every wait is bounded. All hand-offs are those of `dpm_handoff`.
 
-mod collect;
 mod connect;
 mod crew;
-mod dark_bodies;
-mod job;
 mod keeper;
-pub mod light;
 mod link;
 mod outcome;
-mod placement;
 mod planning;
-pub mod prepared;
 pub mod projector;
 mod pulse;
 mod rights;
 mod run;
-mod stages;
-mod status_light;
 mod supervisor;
 mod threads;
 
-pub use collect::FrameRecord;
 pub use connect::{connect, ENDED_WITH_THE_LAST_RUN};
-pub use keeper::ProjectorReport;
 pub use outcome::{PipelineError, RunOptions, RunOutcome, Stall, StallIn};
 pub use run::{output, renderer_settings, run, run_prepared};
 pub use supervisor::has_left_threads_behind;

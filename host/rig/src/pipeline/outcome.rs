@@ -1,8 +1,8 @@
 //! How a run may differ from its rig file, what it leaves behind, and why it may end early.
 
-use super::collect::FrameRecord;
 use super::connect::ConnectError;
-use super::light::LightFrame;
+use crate::light::collector::FrameRecord;
+use crate::light::recorder::LightFrame;
 use crate::realtime::standstill::Standstills;
 use crate::rig::RigError;
 use crate::telemetry::profile::Profiler;

@@ -1,13 +1,15 @@
 //! Planning in its thread: which slot a frame is for, when its poses are read, and the GPU's share of the work begun.
 
 use super::crew::{CrewState, PLAN};
-use super::job::{FrameJob, FrameMemory, FrameNote};
 use super::outcome::{PipelineError, StallIn};
-use super::stages::{self, LinkTime, PlanInputs, TrackSnapshot};
 use super::threads::{
     enter_frame_path, pop_within, Shared, LISTEN_NS, MARGIN_NS, RECEIPT_NS, STEP_NS, WAIT_NS, WARM_UP_FRAMES,
 };
+use crate::frame::job::{FrameJob, FrameMemory, FrameNote};
+use crate::plan::frame::{plan, PlanInputs};
 use crate::plan::horizon::Horizon;
+use crate::plan::link_time::LinkTime;
+use crate::tracks::TrackSnapshot;
 use dpm_common::clock::{Clock, Stopwatch};
 use dpm_device::time::HostTime;
 use dpm_handoff::channel::{Receiver, Sender};
@@ -143,7 +145,8 @@ impl<'a> Planner<'a> {
         let note = pop_within(&mut self.inbox.notes, WAIT_NS)?;
         let memory = self.hottest.pop()?;
         let mut job = FrameJob { note, memory };
-        job.note.waited_for_memory = std::mem::take(&mut self.waited);
+        // At virtual pace waiting takes no time, and is the cause of nothing.
+        job.note.waited_for_memory = std::mem::take(&mut self.waited) && !self.shared.is_virtual();
         Some(job)
     }
 
@@ -193,7 +196,7 @@ impl<'a> Planner<'a> {
             fresh_ns: self.horizon.fresh_ns(snapshot.latency_ns),
             now: latched_at,
         };
-        stages::plan(&mut job, &shared.rig, snapshot, &inputs);
+        plan(&mut job, &shared.rig, snapshot, &inputs);
         let t = &mut job.note.timeline;
         t.latched_at = latched_at;
         if shared.is_virtual() {
@@ -205,7 +208,7 @@ impl<'a> Planner<'a> {
             t.sent_at = t.packed_at.plus_ns(costs[3]);
         }
         if let Some(renderer) = &mut self.renderer {
-            if let Err(source) = stages::submit(&mut job, &shared.rig, renderer) {
+            if let Err(source) = crate::render::submit(&mut job, &shared.rig, renderer) {
                 crew.fail(PipelineError::Gpu { frame: id, source });
                 return None;
             }

@@ -1,29 +1,30 @@
 //! Threads, paces and shutdown.
 
-use super::collect::Collector;
 use super::connect::{connect, ENDED_WITH_THE_LAST_RUN};
 use super::crew::{Crew, CrewParts, NotesBack, OnExit};
-use super::job::FrameMemory;
-use super::light::{LightNote, LightRecorder};
 use super::link::{device_thread, link_thread, Cable, Line};
 use super::outcome::{PipelineError, RunOptions, RunOutcome};
-use super::prepared::PreparedFrames;
 use super::projector;
 use super::pulse::Pulse;
 use super::rights::Rights;
-use super::stages::{self, LinkTime, TrackingStage};
 use super::supervisor::{join_within, Maker, Remake, Supervisor};
 use super::threads::{policy, Shared, FIRST_FRAME_TIMEOUT_NS, LISTEN_NS, NOTES, RECEIPT_NS, STAGE_THREADS};
 use crate::config::{Pace, Packer, ProjectorBackend, RenderMethod};
+use crate::frame::job::FrameMemory;
+use crate::light::collector::Collector;
+use crate::light::recorder::{LightNote, LightRecorder};
 use crate::mock::{self, EmulatedProjector};
+use crate::pack::prepared::PreparedFrames;
 use crate::plan::budget::{BudgetConfig, BudgetController};
 use crate::plan::horizon::Horizon;
 use crate::plan::lead::LeadEstimator;
+use crate::plan::link_time::LinkTime;
 use crate::realtime::os::usable_cores;
 use crate::realtime::standstill::StandstillMonitor;
 use crate::rig::{Rig, RigError};
 use crate::telemetry::monitor::RunMonitor;
 use crate::telemetry::report::Report;
+use crate::tracks::TrackingStage;
 use dpm_common::clock::{Clock, ManualClock, MonotonicClock, RunClock, Stopwatch};
 use dpm_device::link::HostLink;
 use dpm_device::time::{HostClock, HostTime};
@@ -159,15 +160,17 @@ fn run_from(
         })?
     };
     shared.collector_pulse.begin();
-    collector.run(done, &notes_back, lights, monitor, || {
+    collector.run(done, &|note| notes_back.push(note), lights, monitor, || {
         if !is_virtual {
             shared.collector_pulse.beat(shared.clock.now(), LOOK_NS);
         }
         !shared.is_broken.load(Ordering::Acquire)
     });
     shared.collector_pulse.end();
-    let unseen = join_within(supervisor, 2 * END_WITHIN).and_then(Result::ok).flatten();
-    let line = join_within(link_thread, END_WITHIN).and_then(Result::ok);
+    // At virtual pace nobody is late: what is left to be said does not depend on how busy the machine is.
+    let end_within = if is_virtual { Duration::MAX } else { END_WITHIN };
+    let unseen = join_within(supervisor, end_within.saturating_mul(2)).and_then(Result::ok).flatten();
+    let line = join_within(link_thread, end_within).and_then(Result::ok);
     drop(stop_on_panic);
     if let Some(error) = shared.error.lock().ok().and_then(|mut e| e.take()) {
         return Err(error);
@@ -332,8 +335,8 @@ fn crew_parts(
     let mut frame_ns = 0;
     if let (Some(renderer), Some(first), false) = (&mut renderer, memory.first_mut(), is_virtual) {
         for _ in 0..2 {
-            frame_ns =
-                stages::warm_up(first, rig, renderer, FIRST_FRAME_TIMEOUT_NS).map_err(RenderError::from)?;
+            frame_ns = crate::render::warm_up(first, rig, renderer, FIRST_FRAME_TIMEOUT_NS)
+                .map_err(RenderError::from)?;
         }
     }
     // At virtual pace pictures must not depend on how fast the machine is.

@@ -1,17 +1,18 @@
 //! What the stages of a run do in their threads, and what they share: tracking and packing. (`planning.rs` has planning's, `link.rs` the link's.)
 
 use super::crew::{CrewState, PACK, TRACKING};
-use super::job::{Fate, FrameJob, FrameNote};
 use super::outcome::{PipelineError, RunOptions, StallIn};
-use super::prepared::PreparedFrames;
 use super::pulse::Pulse;
 use super::rights::Rights;
-use super::stages::{self, LinkTime, TrackSnapshot, TrackingStage};
 use crate::config::{Pace, Wait};
+use crate::frame::job::{Fate, FrameJob, FrameNote};
+use crate::pack::prepared::PreparedFrames;
 use crate::plan::budget::BudgetController;
+use crate::plan::link_time::LinkTime;
 use crate::realtime::wait_policy;
 use crate::rig::Rig;
 use crate::telemetry::monitor::RunMonitor;
+use crate::tracks::{TrackSnapshot, TrackingStage};
 use dpm_common::clock::{Clock, RunClock, Stopwatch};
 use dpm_device::time::HostTime;
 use dpm_handoff::channel::{Receiver, Sender};
@@ -265,7 +266,7 @@ pub(super) fn pack_thread(
             (true, _) => GPU_TIMEOUT_NS,
         };
         let alive = || pulse.beat(shared.clock.now(), WAIT_NS + STEP_NS);
-        let failure = match stages::finish(&mut job, limit, alive) {
+        let failure = match crate::render::finish(&mut job, limit, alive) {
             Ok(true) => None,
             Ok(false) => Some(PipelineError::GpuHangs { frame: id, ms: limit / 1_000_000 }),
             Err(source) => Some(PipelineError::Gpu { frame: id, source }),
@@ -295,7 +296,7 @@ pub(super) fn pack_thread(
         late_in_a_row = if is_late { late_in_a_row + 1 } else { 0 };
         let is_slow = prepared.is_none() && late_in_a_row > shared.options.in_flight;
         if is_slow || !is_overtaken(shared, &mut job.note, jobs.is_empty()) {
-            stages::pack(&mut job, kernel, shared.options.verify, &mut prepared);
+            crate::pack::pack(&mut job, kernel, shared.options.verify, &mut prepared);
         }
         if !shared.is_virtual() {
             job.note.timeline.packed_at = shared.clock.now();

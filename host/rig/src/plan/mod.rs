@@ -2,7 +2,9 @@
 
 pub mod budget;
 pub mod dark;
+pub(crate) mod frame;
 pub mod horizon;
 pub mod lead;
 pub mod light_centre;
+pub(crate) mod link_time;
 pub mod slots;

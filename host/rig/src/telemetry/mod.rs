@@ -6,6 +6,7 @@ pub mod monitor;
 mod ordered;
 pub mod plots;
 pub mod profile;
+pub(crate) mod projector;
 pub mod prometheus;
 pub mod report;
 pub mod signed;

@@ -1,8 +1,8 @@
 //! What a run was like: one JSON object for programs, one short table for people.
 
+use super::projector::ProjectorReport;
 use super::signed::SignedHistogram;
 use crate::failure::{Failure, FailureKind};
-use crate::pipeline::ProjectorReport;
 use crate::plan::dark::DarkCause;
 use serde::ser::{Serialize, SerializeMap, Serializer};
 use std::collections::BTreeMap;

@@ -1,3 +1,8 @@
 //! What the tracker says, into the tracks of all bodies.
 
-pub(crate) mod source;
+mod source;
+mod stage;
+
+pub(crate) use source::open;
+pub use source::SourceError;
+pub use stage::{TrackSnapshot, TrackingStage};

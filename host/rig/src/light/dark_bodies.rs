@@ -21,19 +21,19 @@ struct Body {
 
 /// Per tracked body.
 #[derive(Clone, Debug)]
-pub(super) struct DarkBodies {
+pub(crate) struct DarkBodies {
     bodies: Vec<Body>,
 }
 
 impl DarkBodies {
     /// For `bodies` tracked bodies.
-    pub(super) fn new(bodies: usize) -> Self {
+    pub(crate) fn new(bodies: usize) -> Self {
         Self { bodies: vec![Body::default(); bodies] }
     }
 
     /// A frame was lit at `at`, with or without light on each body. `note` gets the number of a body whose episode began or ended, and what
     /// is to be told of it.
-    pub(super) fn lit(
+    pub(crate) fn lit(
         &mut self,
         dark: &[Option<DarkCause>],
         at: HostTime,
@@ -68,7 +68,7 @@ impl DarkBodies {
     }
 
     /// The counters, with the bodies' names.
-    pub(super) fn report<'a>(&self, names: impl Iterator<Item = &'a str>) -> Vec<DarkBody> {
+    pub(crate) fn report<'a>(&self, names: impl Iterator<Item = &'a str>) -> Vec<DarkBody> {
         let of = |body: &Body, cause: DarkCause| body.frames[cause as usize];
         self.bodies
             .iter()

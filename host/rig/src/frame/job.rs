@@ -13,7 +13,7 @@ use glam::{DAffine3, DVec3};
 
 /// What became of a frame on the host.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
-pub(super) enum Fate {
+pub(crate) enum Fate {
     /// Still under way.
     #[default]
     UnderWay,
@@ -69,7 +69,7 @@ pub(crate) struct FrameNote {
 
 impl FrameNote {
     /// An empty note with room for `bodies` tracked bodies.
-    pub(super) fn new(bodies: usize) -> Self {
+    pub(crate) fn new(bodies: usize) -> Self {
         Self {
             id: FrameId::default(),
             slot: 0,
@@ -93,7 +93,7 @@ impl FrameNote {
     }
 
     /// Time that the GPU worked on it, nanoseconds; `None` where the device has no time stamps.
-    pub(super) fn gpu_ns(&self) -> Option<i64> {
+    pub(crate) fn gpu_ns(&self) -> Option<i64> {
         let ns: u64 = self.cost?.pass_ns.iter().sum();
         i64::try_from(ns).ok().filter(|&ns| ns > 0)
     }

@@ -1,12 +1,12 @@
 //! Finished frames and light into a report. Runs on its own thread, off the frame path: it may allocate.
 
-use super::crew::NotesBack;
-use super::dark_bodies::DarkBodies;
-use super::job::{Fate, FrameNote};
-use super::light::LightNote;
-use super::placement::Placement;
 use crate::config::{Pace, ProjectorBackend, TrackerConfig};
+use crate::frame::job::{Fate, FrameNote};
 use crate::frame::{FrameId, FrameTimeline, Stage, STAGES};
+use crate::light::dark_bodies::DarkBodies;
+use crate::light::placement::Placement;
+use crate::light::recorder::LightNote;
+use crate::light::registration::{measured_at, RegistrationMeter};
 use crate::plan::dark::DarkCause;
 use crate::plan::light_centre::centre_ns;
 use crate::plan::slots::OrderedDark;
@@ -30,9 +30,7 @@ use std::collections::VecDeque;
 use std::sync::Arc;
 use std::time::Duration;
 
-/// Points on each body at which registration is measured.
-const POINTS_PER_BODY: usize = 48;
-/// Sent frames that may wait for their light; beyond this they count as never lit.
+/// Sent frames that may wait for their light; beyond this the oldest count as never lit, once no light is left to look at.
 const MAX_PENDING: usize = 256;
 
 /// Time between two looks at what is finished.
@@ -64,7 +62,7 @@ pub struct FrameRecord {
 /// Counts and distributions of a run.
 pub(crate) struct Collector {
     rig: Arc<Rig>,
-    points: Vec<Vec<DVec3>>,
+    meter: RegistrationMeter,
     placement: Placement,
     pending: VecDeque<FrameRecord>,
     /// The last lit frames, oldest first.
@@ -96,6 +94,8 @@ pub(crate) struct Collector {
     newest: Option<u32>,
     /// Slots in which the frame before was shown again, until the last planned one is known to be later.
     repeats: VecDeque<u64>,
+    /// The last planned slot of the frames that the link is done with.
+    last_planned: Option<u64>,
     /// Lit frames whose light was not what was rendered.
     pub light_mismatches: u64,
     /// Intervals of every lit frame.
@@ -132,8 +132,8 @@ fn histogram() -> Histogram<u64> {
 
 impl Collector {
     /// Keeps the last `keep` lit frames; `verify`: compares hashes of code values and light.
-    pub(super) fn new(rig: Arc<Rig>, keep: usize, verify: bool) -> Self {
-        let points = (0..rig.bodies.len()).map(|i| registration_points(&rig, i)).collect();
+    pub(crate) fn new(rig: Arc<Rig>, keep: usize, verify: bool) -> Self {
+        let meter = RegistrationMeter::new(&rig);
         let measured = rig.config.real_time.pace == Pace::Real;
         // A tenth of a known run, but enough frames for a 99th percentile.
         let frames = rig.config.run.frames.max(rig.config.slots_to_run());
@@ -150,7 +150,7 @@ impl Collector {
             has_still_light: rig.scene.bodies.iter().any(|b| b.tracked.is_none() && b.projected),
             slots: SlotLedger::new(rig.rate(), lead_ns),
             rig,
-            points,
+            meter,
             pending: VecDeque::new(),
             recent: VecDeque::new(),
             keep,
@@ -168,6 +168,7 @@ impl Collector {
             last_lit: None,
             newest: None,
             repeats: VecDeque::new(),
+            last_planned: None,
             light_mismatches: 0,
             profiler,
             traced: VecDeque::new(),
@@ -189,7 +190,7 @@ impl Collector {
     }
 
     /// Says that frames are prepared, and what is seen of the machine's standstills. To be called before the first frame.
-    pub(super) fn about(mut self, prepared: bool, standstills: Option<Arc<SeenStandstills>>) -> Self {
+    pub(crate) fn about(mut self, prepared: bool, standstills: Option<Arc<SeenStandstills>>) -> Self {
         self.prepared = prepared;
         if let Some(seen) = standstills {
             self.slots.excuse_by(seen);
@@ -198,17 +199,17 @@ impl Collector {
     }
 
     /// The run is over and everything is known: what became of every slot.
-    pub(super) fn finish(&mut self, monitor: &RunMonitor) -> SlotCounts {
+    pub(crate) fn finish(&mut self, monitor: &RunMonitor) -> SlotCounts {
         self.slots.read_orders(monitor.dark());
         self.slots.finish()
     }
 
     /// Takes finished frames and light until both are over, or until `goes_on`, which is asked at every look and for every note, says no at
     /// a look; gives the notes back to `free`.
-    pub(super) fn run(
+    pub(crate) fn run(
         &mut self,
         mut done: Receiver<Box<FrameNote>>,
-        free: &NotesBack,
+        free: &dyn Fn(Box<FrameNote>),
         mut lights: Receiver<LightNote>,
         monitor: &RunMonitor,
         mut goes_on: impl FnMut() -> bool,
@@ -218,16 +219,25 @@ impl Collector {
             // Asked before looking: what came before the end is taken first.
             let over = done.is_finished() && lights.is_finished();
             self.slots.read_orders(monitor.dark());
-            self.take_finished(&mut done, free, monitor, &mut goes_on);
-            while let Some(note) = held.take().or_else(|| lights.try_pop()) {
+            loop {
+                let light = held.take().or_else(|| lights.try_pop());
+                // After the light was taken: of the frames before it all has been said.
                 self.take_finished(&mut done, free, monitor, &mut goes_on);
                 // Lit before the link's thread came to say that it was sent.
-                let unknown = note.event.frame.is_some_and(|f| self.newest.is_none_or(|n| frame_newer(f, n)));
-                if unknown && !over {
-                    held = Some(note);
-                    break;
+                let unknown = |f: u32| self.newest.is_none_or(|n| frame_newer(f, n));
+                match light {
+                    Some(note) if over || !note.event.frame.is_some_and(unknown) => {
+                        self.light(&note, monitor)
+                    }
+                    light => {
+                        held = light;
+                        if self.pending.len() < MAX_PENDING || done.is_empty() {
+                            break;
+                        }
+                        // Frames are finished behind as many that no light is told of.
+                        self.drop_oldest(monitor);
+                    }
                 }
-                self.light(&note, monitor);
             }
             self.slots.settle();
             let slots = self.slots.counts();
@@ -244,18 +254,21 @@ impl Collector {
         }
     }
 
+    /// Takes finished frames until no more can wait for their light: what they wait for is looked at before others are taken, however long
+    /// this thread stood still.
     fn take_finished(
         &mut self,
         done: &mut Receiver<Box<FrameNote>>,
-        free: &NotesBack,
+        free: &dyn Fn(Box<FrameNote>),
         monitor: &RunMonitor,
         goes_on: &mut impl FnMut() -> bool,
     ) {
-        while let Some(note) = done.try_pop() {
+        while self.pending.len() < MAX_PENDING {
+            let Some(note) = done.try_pop() else { break };
             // A long backlog on a busy machine takes seconds: every note of it is a sign of life.
             goes_on();
             self.finished(&note, monitor);
-            free.push(note);
+            free(note);
         }
     }
 
@@ -324,18 +337,16 @@ impl Collector {
                 self.stages[stage as usize].saturating_record(ns);
             }
         }
-        self.placement.observe(&self.rig.camera, &job.sampled_poses, &job.seen, &self.points);
+        self.placement.observe(&self.rig.camera, &job.sampled_poses, &job.seen, self.meter.points());
         let sent = job.is_sent();
         let refused = !sent && !matches!(job.fate, Fate::Overtaken | Fate::Stopped);
         self.slots.planned(job.slot, &job.timeline, refused, job.waited_for_memory);
+        self.last_planned = self.last_planned.max(Some(job.slot));
         while self.repeats.front().is_some_and(|&slot| slot < job.slot) {
             self.repeats.pop_front();
             self.repeated += 1;
         }
         if sent {
-            if self.pending.len() >= MAX_PENDING {
-                self.drop_oldest(monitor);
-            }
             self.pending.push_back(FrameRecord {
                 id: job.id,
                 slot: job.slot,
@@ -362,8 +373,10 @@ impl Collector {
         match note.event.kind {
             LightKind::Repeated => {
                 self.slots.nothing_new(slot, begin, 0);
-                // After the last frame the projector repeats it until it is told to stop: no fault.
-                if self.repeats.len() < MAX_PENDING {
+                if self.last_planned.is_some_and(|last| slot < last) {
+                    self.repeated += 1;
+                } else if self.repeats.len() < MAX_PENDING {
+                    // After the last frame the projector repeats it until it is told to stop: no fault.
                     self.repeats.push_back(slot);
                 }
             }
@@ -445,32 +458,27 @@ impl Collector {
 
     /// Where the light of each point fell against where the point was at the middle of the exposure, on the bodies that were lit.
     fn measure_registration(&mut self, note: &LightNote, record: &FrameRecord, late: bool) {
-        let (first, last) = (note.event.first_photon_at, note.event.last_photon_at);
-        let middle = first.plus_ns(last.ns_since(first) / 2);
-        let Some(truth) = self.rig.true_poses(middle.0) else { return };
-        for (i, points) in self.points.iter().enumerate() {
+        let at = measured_at(note.event.first_photon_at, note.event.last_photon_at);
+        let Some(truth) = self.rig.true_poses(at.0) else { return };
+        let counted = |px: f64| (px * PER_PIXEL).round() as u64;
+        for (i, truth) in truth.iter().enumerate() {
             if !self.prepared && record.dark.get(i).copied().flatten().is_some() {
                 continue;
             }
-            for p in points {
-                let at = |m: &DAffine3| self.rig.camera.project(m.transform_point3(*p));
-                let Some(real) = at(&truth[i]) else { continue };
-                if let Some(used) = at(&record.tracked_poses[i]) {
-                    let error = ((used - real).length() * PER_PIXEL).round() as u64;
-                    self.registration.saturating_record(error);
-                    if !late {
-                        self.registration_in_time.saturating_record(error);
-                    }
+            for px in self.meter.errors(i, &record.tracked_poses[i], truth) {
+                self.registration.saturating_record(counted(px));
+                if !late {
+                    self.registration_in_time.saturating_record(counted(px));
                 }
-                if let Some(held) = at(&record.sampled_poses[i]) {
-                    self.unpredicted.saturating_record(((held - real).length() * PER_PIXEL).round() as u64);
-                }
+            }
+            for px in self.meter.errors(i, &record.sampled_poses[i], truth) {
+                self.unpredicted.saturating_record(counted(px));
             }
         }
     }
 
     /// Fills what the run measured into a report.
-    pub(super) fn fill(&self, report: &mut Report) {
+    pub(crate) fn fill(&self, report: &mut Report) {
         let spread = |h: &Histogram<u64>, unit: f64| {
             (!h.is_empty()).then(|| Spread {
                 p50: h.value_at_quantile(0.5) as f64 / unit,
@@ -531,15 +539,68 @@ impl Collector {
     }
 }
 
-/// Points spread over the vertices of a tracked body.
-fn registration_points(rig: &Rig, tracked: usize) -> Vec<DVec3> {
-    let all: Vec<DVec3> = rig
-        .scene
-        .bodies
-        .iter()
-        .filter(|b| b.tracked == Some(tracked as u16) && b.projected)
-        .flat_map(|b| b.mesh.positions.iter().map(|p| p.as_dvec3()))
-        .collect();
-    let n = all.len().min(POINTS_PER_BODY);
-    (0..n).map(|i| all[i * all.len() / n]).collect()
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::config::{Overrides, RigConfig};
+    use dpm_device::light::LightEvent;
+    use dpm_device::link::SendOutcome;
+    use dpm_device::planes::Raster;
+    use dpm_device::time::DeviceTicks;
+    use dpm_handoff::channel::channel;
+    use dpm_handoff::wake::WaitPolicy;
+
+    const SLOT_NS: i64 = 1_000_000;
+
+    /// Lit, dropped and missed of frames that were all sent, and of which those are lit that `lit` says, when the collector finds them all at
+    /// once; and slots in which another was repeated.
+    fn counted(frames: u64, lit: impl Fn(u64) -> bool) -> [u64; 4] {
+        let config = RigConfig::demo(&Overrides::default()).unwrap_or_else(|e| panic!("{e}"));
+        let rig = Arc::new(Rig::build(&config, Raster::new(16, 16)).unwrap_or_else(|e| panic!("{e}")));
+        let (mut done_in, done) = channel(frames as usize, WaitPolicy::Park);
+        let (mut lights_in, lights) = channel(frames as usize, WaitPolicy::Park);
+        for k in 0..frames {
+            let begin = HostTime(k as i64 * SLOT_NS);
+            let mut note = FrameNote::new(rig.bodies.len());
+            (note.id, note.slot, note.fate) = (FrameId(k), k, Fate::Offered(SendOutcome::Sent));
+            note.timeline.due_at = begin;
+            let poses = rig.true_poses(begin.0).expect("the mock tells");
+            (note.tracked_poses, note.sampled_poses) = (poses.clone(), poses);
+            note.dark = vec![None; rig.bodies.len()];
+            assert!(done_in.push(Box::new(note)).is_ok());
+            let (kind, frame) =
+                if lit(k) { (LightKind::Lit, Some(k as u32)) } else { (LightKind::Repeated, None) };
+            let event = LightEvent {
+                slot: k,
+                kind,
+                frame,
+                lit_at: DeviceTicks(k),
+                first_photon_at: begin,
+                last_photon_at: begin.plus_ns(SLOT_NS),
+            };
+            let note = LightNote { event, hash: 0, torn: false, wall_ns: 0, unseen: 0 };
+            assert!(lights_in.push(note).is_ok());
+        }
+        drop((done_in, lights_in));
+        let mut collector = Collector::new(rig, 0, false);
+        let monitor = RunMonitor::default();
+        collector.run(done, &|_| (), lights, &monitor, || true);
+        let missed = collector.finish(&monitor).missed_total();
+        [collector.lit, collector.dropped, missed, collector.repeated]
+    }
+
+    /// Found by reading: of frames that were finished while the collector had no core, those beyond 256 counted as dropped although their light had
+    /// been told, and repeats that were told behind the last frame did not count: the counts of a run at virtual pace were the machine's.
+    #[test]
+    fn a_collector_that_stood_still_counts_what_it_would_have_counted() {
+        let many = 3 * MAX_PENDING as u64 + 7;
+        assert_eq!(counted(many, |_| true), [many, 0, 0, 0]);
+        // What is shown in the last slot may be shown for as long as nobody says stop.
+        assert_eq!(counted(many, |_| false), [0, many, many, many - 1]);
+        let (odd, even) = (many / 2, many - many / 2);
+        assert_eq!(counted(many, |k| k % 2 == 1), [odd, even, even, even - 1]);
+        // Nothing but light that is told late, behind more frames than can wait.
+        let late = many - MAX_PENDING as u64 - 10;
+        assert_eq!(counted(many, |k| k >= late), [many - late, late, late, late]);
+    }
 }

@@ -19,19 +19,19 @@ struct Body {
 
 /// Looks at every frame, off the frame path.
 #[derive(Clone, Debug)]
-pub(super) struct Placement {
+pub(crate) struct Placement {
     bodies: Vec<Body>,
 }
 
 impl Placement {
     /// For `bodies` tracked bodies.
-    pub(super) fn new(bodies: usize) -> Self {
+    pub(crate) fn new(bodies: usize) -> Self {
         Self { bodies: vec![Body::default(); bodies] }
     }
 
     /// A frame for world-from-body `poses`, which for those that are `seen` are where the tracker saw them last. `points` of each body, in its own space, say
     /// how large it is.
-    pub(super) fn observe(
+    pub(crate) fn observe(
         &mut self,
         camera: &ProjectorCamera,
         poses: &[DAffine3],
@@ -60,7 +60,7 @@ impl Placement {
     }
 
     /// One warning for each body that was tracked for long enough and never came near the light.
-    pub(super) fn warnings(&self, names: &[String]) -> Vec<String> {
+    pub(crate) fn warnings(&self, names: &[String]) -> Vec<String> {
         let lost = self.bodies.iter().zip(names).filter(|(b, _)| b.tracked >= ENOUGH && b.within_reach == 0);
         let told = |(body, name): (&Body, &String)| {
             let p = body.last;

@@ -3,6 +3,8 @@
 //! At real pace the stamps are readings of the host's clock. At virtual pace they are the rig's clock, advanced by the modelled cost
 //! of each stage, so that a run repeats bit for bit; what the stages really took is kept apart in [`FrameTimeline::wall_ns`].
 
+pub(crate) mod job;
+
 use dpm_device::time::HostTime;
 
 /// Number of a frame since the start of the run. Never reused; the link carries the low 32 bits.

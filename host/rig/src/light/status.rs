@@ -3,8 +3,9 @@
 //! Counters are absolute and reports may be merged or lost. A report that follows after one slot tells everything about it. One that
 //! covers several slots tells how many were lit, repeated and dark, and the frame lit last: the others are handed on as numbers.
 
-use super::light::LightNote;
-use super::stages::LinkTime;
+use crate::light::recorder::LightNote;
+use crate::plan::link_time::LinkTime;
+use crate::telemetry::projector::DeviceCounts;
 use dpm_device::light::{LightEvent, LightKind};
 use dpm_device::link::Status;
 use dpm_handoff::channel::Sender;
@@ -16,32 +17,9 @@ const REMEMBERED: usize = 64;
 /// Longest travel of a frame that is believed, nanoseconds.
 const LONGEST_TRAVEL_NS: i64 = 500_000_000;
 
-/// What the projector counted over all sessions of a run.
-#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, serde::Serialize)]
-pub struct DeviceCounts {
-    /// Frames lit.
-    pub lit: u64,
-    /// Of these, frames whose report was merged into a later one: whether they were late is not known.
-    pub lit_unseen: u64,
-    /// Slots that showed the frame before again, those after the last frame included.
-    pub repeated: u64,
-    /// Dark slots while armed.
-    pub blank: u64,
-    /// Frames dropped because a part was missing or damaged.
-    pub incomplete: u64,
-    /// Whole frames dropped because their slot was over.
-    pub too_late: u64,
-    /// Whole frames dropped because a newer one was due too.
-    pub superseded: u64,
-    /// Frames refused: the projector was told to be dark, was ahead of its memory, or did not believe the target.
-    pub refused: u64,
-    /// Damaged packets that it received.
-    pub damaged_packets: u64,
-}
-
 /// Reads one session's reports after the other.
 #[derive(Debug)]
-pub(super) struct StatusLight {
+pub(crate) struct StatusLight {
     lights: Sender<LightNote>,
     before: Option<Status>,
     counts: DeviceCounts,
@@ -52,7 +30,7 @@ pub(super) struct StatusLight {
 
 impl StatusLight {
     /// Notes go to `lights`; those that find no room are lost, as a mock's are.
-    pub(super) fn new(lights: Sender<LightNote>) -> Self {
+    pub(crate) fn new(lights: Sender<LightNote>) -> Self {
         Self {
             lights,
             before: None,
@@ -64,29 +42,29 @@ impl StatusLight {
     }
 
     /// What was counted so far.
-    pub(super) fn counts(&self) -> DeviceCounts {
+    pub(crate) fn counts(&self) -> DeviceCounts {
         self.counts
     }
 
     /// A new session counts from zero again.
-    pub(super) fn new_session(&mut self) {
+    pub(crate) fn new_session(&mut self) {
         self.before = None;
     }
 
     /// Frame number `frame` is on its way to `slot`.
-    pub(super) fn sent(&mut self, frame: u32, slot: u64) {
+    pub(crate) fn sent(&mut self, frame: u32, slot: u64) {
         self.planned[self.next % REMEMBERED] = (frame, slot);
         self.next = (self.next + 1) % REMEMBERED;
     }
 
     /// How much earlier than the host believed a frame must be sent to be lit in its slot, nanoseconds: rises at once when frames
     /// are lit late, falls slowly while they are not.
-    pub(super) fn travel_ns(&self) -> i64 {
+    pub(crate) fn travel_ns(&self) -> i64 {
         self.travel_ns
     }
 
     /// Takes in a report. `time` tells slots and instants.
-    pub(super) fn observe(&mut self, status: &Status, time: &LinkTime) {
+    pub(crate) fn observe(&mut self, status: &Status, time: &LinkTime) {
         let before = self.before.replace(*status);
         if before == Some(*status) {
             return;

@@ -2,9 +2,9 @@
 //!
 //! Runs where the mock runs: in the link thread at virtual pace, in the mock's own thread at real pace.
 
-use super::job::hash_codes;
-use super::prepared::is_whole;
+use crate::frame::job::hash_codes;
 use crate::mock::{EmulatedProjector, MockProjector, Served};
+use crate::pack::prepared::is_whole;
 use dpm_common::clock::Stopwatch;
 use dpm_device::light::{LightEvent, LightKind};
 use dpm_device::planes::PlaneSchedule;
@@ -55,7 +55,7 @@ pub(crate) struct LightRecorder {
 
 impl LightRecorder {
     /// Notes go to `notes`; the last `keep` frames of light stay; `hash`: hash every frame of light; `marks`: the
-    /// planes, in this order, are of [`super::prepared`] and are looked at for parts of other frames.
+    /// planes, in this order, are of [`crate::pack::prepared`] and are looked at for parts of other frames.
     pub(crate) fn new(
         notes: Sender<LightNote>,
         keep: usize,

@@ -1,0 +1,30 @@
+//! Code values of a finished frame into bit planes.
+
+pub mod prepared;
+
+use crate::frame::job::{hash_codes, FrameJob};
+use crate::frame::Stage;
+use dpm_common::clock::Stopwatch;
+use dpm_render::pack::{self, Kernel, Shown};
+use prepared::PreparedFrames;
+
+/// Packs the finished GPU's code values into planes; a job without GPU takes its code values from `prepared`.
+pub(crate) fn pack(job: &mut FrameJob, kernel: Kernel, verify: bool, prepared: &mut Option<PreparedFrames>) {
+    let FrameJob { note, memory } = job;
+    let watch = Stopwatch::start();
+    if let Some(slot) = &memory.gpu {
+        let codes = slot.codes();
+        match slot.planes() {
+            Some(planes) => pack::gpu::take(planes, &mut memory.planes),
+            None => pack::pack(kernel, codes, &mut memory.planes),
+        }
+        note.timeline.wall_ns[Stage::Pack as usize] = watch.elapsed_ns();
+        if verify {
+            let shown = Shown::by(memory.planes.schedule());
+            note.code_hash = hash_codes(codes.iter().map(|&c| shown.light(c)));
+        }
+    } else if let Some(prepared) = prepared {
+        prepared.pack(kernel, note.id.0, &mut memory.planes);
+        note.timeline.wall_ns[Stage::Pack as usize] = watch.elapsed_ns();
+    }
+}

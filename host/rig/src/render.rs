@@ -1,0 +1,92 @@
+//! A planned frame into work of the GPU, and its end.
+
+use crate::frame::job::{FrameJob, FrameMemory};
+use crate::frame::Stage;
+use crate::rig::{affine, Rig};
+use dpm_common::clock::Stopwatch;
+use dpm_render::gpu::GpuError;
+use dpm_render::{FrameInputs, Renderer};
+
+/// Starts the GPU on a planned job.
+///
+/// # Errors
+/// Device lost.
+pub(crate) fn submit(job: &mut FrameJob, rig: &Rig, renderer: &mut Renderer) -> Result<(), GpuError> {
+    let FrameJob { note, memory } = job;
+    let Some(slot) = memory.gpu.as_mut() else { return Ok(()) };
+    renderer.submit(
+        slot,
+        &FrameInputs {
+            frame: note.id.0 as u32,
+            spp: rig.config.render.spp,
+            budget_spp: note.budget_milli as f32 * 1e-3,
+            camera: &rig.camera,
+            eye: note.eye,
+            gaze: memory.gaze,
+            widen_deg: memory.widen_deg,
+            poses: &memory.scene_poses,
+            lost: &memory.lost,
+        },
+    )
+}
+
+/// Renders one frame that nobody sees: what drivers put off to the first one (translating shaders) is over before a slot waits for it.
+/// Returns the wall time that it took, nanoseconds.
+///
+/// # Errors
+/// The GPU did not finish within `timeout_ns`, or was lost.
+pub(crate) fn warm_up(
+    memory: &mut FrameMemory,
+    rig: &Rig,
+    renderer: &mut Renderer,
+    timeout_ns: u64,
+) -> Result<i64, GpuError> {
+    let Some(slot) = memory.gpu.as_mut() else { return Ok(0) };
+    let watch = Stopwatch::start();
+    let rest: Vec<_> = rig.bodies.iter().map(|b| affine(&b.rest)).collect();
+    rig.scene_poses(&rest, &mut memory.scene_poses);
+    let (eye, gaze) = rig.observer.eye_and_gaze(&rest);
+    let spp = rig.config.render.spp;
+    let inputs = FrameInputs {
+        frame: 0,
+        spp,
+        budget_spp: spp as f32,
+        camera: &rig.camera,
+        eye,
+        gaze,
+        widen_deg: 0.0,
+        poses: &memory.scene_poses,
+        lost: &memory.lost,
+    };
+    renderer.submit(slot, &inputs)?;
+    slot.wait(timeout_ns).map(|_| watch.elapsed_ns() as i64)
+}
+
+/// Longest wait for the GPU in one piece.
+const GPU_STEP_NS: u64 = 5_000_000;
+
+/// Waits for the GPU, if the job has one, in steps of 5 ms; `alive` is called before each.
+///
+/// False when it did not finish within `timeout_ns`.
+///
+/// # Errors
+/// The GPU was lost.
+pub(crate) fn finish(job: &mut FrameJob, timeout_ns: u64, mut alive: impl FnMut()) -> Result<bool, GpuError> {
+    let Some(slot) = job.memory.gpu.as_mut() else { return Ok(true) };
+    let watch = Stopwatch::start();
+    let cost = loop {
+        alive();
+        let left = timeout_ns.saturating_sub(watch.elapsed_ns());
+        if let Some(cost) = slot.poll_done(left.min(GPU_STEP_NS))? {
+            break cost;
+        }
+        if left <= GPU_STEP_NS {
+            return Ok(false);
+        }
+    };
+    let gpu: u64 = cost.pass_ns.iter().sum();
+    job.note.cost = Some(cost);
+    // The fence's wait overlaps other frames; the GPU's own time is the stage's cost where it is known.
+    job.note.timeline.wall_ns[Stage::Render as usize] = if gpu > 0 { gpu } else { watch.elapsed_ns() };
+    Ok(true)
+}

@@ -1,0 +1,225 @@
+//! What has arrived from the tracker, into the tracks of all bodies: the first stage of a frame.
+
+use crate::config::{TrackerConfig, MAX_TRACKED};
+use crate::rig::Rig;
+use dpm_device::time::HostTime;
+use dpm_device::tracker::{BodyIndex, Tracker, TrackerError};
+use dpm_handoff::latest::Publisher;
+use dpm_tracking::{PoseFilterBank, TrackState};
+
+/// What the tracking stage knows, for the latest-wins slot.
+#[derive(Clone, Debug)]
+pub struct TrackSnapshot {
+    /// Everything that arrived up to here is in.
+    pub through: HostTime,
+    /// By body: its track and when the newest sample arrived.
+    pub tracks: Vec<Option<(TrackState, HostTime)>>,
+    /// From mid-exposure of the tracker to the arrival of a sample, the longest of the last samples, nanoseconds.
+    pub latency_ns: i64,
+}
+
+impl TrackSnapshot {
+    /// Nothing is known of `bodies` bodies.
+    pub fn empty(bodies: usize) -> Self {
+        Self { through: HostTime(i64::MIN), tracks: vec![None; bodies.min(MAX_TRACKED)], latency_ns: 0 }
+    }
+}
+
+/// Samples into tracks.
+pub struct TrackingStage {
+    tracker: Box<dyn Tracker>,
+    bank: PoseFilterBank,
+    received_at: Vec<HostTime>,
+    bodies: usize,
+    /// Longest latency of the last samples; it fades by 1/1024 a sample.
+    latency_ns: i64,
+    /// First step, `None` before it.
+    began_at: Option<HostTime>,
+    /// It was looked at whether all bodies are seen.
+    looked: bool,
+}
+
+/// Longest time for which any rig carries a body on by prediction, milliseconds.
+pub(crate) const MAX_PREDICT_MS: u32 = 1_000;
+
+/// Time within which every body should have been seen once: a tracker that is there speaks within milliseconds, and one that has to be
+/// connected to anew within half a second.
+const SEEN_WITHIN_NS: i64 = 1_000_000_000;
+
+/// What to look at first where a tracker does not tell of a body.
+const fn remedy(tracker: &TrackerConfig) -> &'static str {
+    match tracker {
+        TrackerConfig::Mock(_) => "`tracker.faults` and `tracker.drop_out` may silence the mock",
+        TrackerConfig::Natnet(_) => {
+            "is streaming on in the tracking software, are tracker.server and tracker.local right, and do bodies have the same names there?"
+        }
+        TrackerConfig::Vrpn(_) => {
+            "is the server running, are tracker.server and tracker.tracker right, and do bodies have the same names or ids there?"
+        }
+        TrackerConfig::Serial(_) => {
+            "is the device on and plugged in, are tracker.port and tracker.baud right, and do bodies have its numbers as ids?"
+        }
+        TrackerConfig::Replay(_) => "does tracker.file hold these bodies, by name or id, from its beginning on?",
+    }
+}
+
+impl TrackingStage {
+    /// A stage for the rig's bodies.
+    pub fn new(rig: &Rig, tracker: Box<dyn Tracker>) -> Self {
+        // How long a body is shown without samples is decided for every frame, see [`crate::plan::frame::plan`]; the filter only needs to know for how long
+        // a track is worth going on with.
+        let longest_ms = rig.config.safety.predict_ms.unwrap_or(MAX_PREDICT_MS);
+        let config = rig.config.prediction.to_filter(longest_ms);
+        let bodies = rig.bodies.len().min(MAX_TRACKED);
+        Self {
+            tracker,
+            bank: PoseFilterBank::new(&vec![config; bodies]),
+            received_at: vec![HostTime(0); bodies],
+            bodies,
+            latency_ns: 0,
+            began_at: None,
+            looked: false,
+        }
+    }
+
+    /// Takes what has arrived by `now` and publishes the tracks.
+    ///
+    /// # Errors
+    /// The tracker is gone; what is known stays published.
+    pub fn step(&mut self, now: HostTime, latest: &mut Publisher<TrackSnapshot>) -> Result<(), TrackerError> {
+        self.began_at.get_or_insert(now);
+        let Self { tracker, bank, received_at, latency_ns, .. } = self;
+        let result = tracker.poll(now, &mut |sample| {
+            if let Some(verdict) = bank.update(sample) {
+                if verdict.is_accepted() {
+                    if let Some(at) = received_at.get_mut(usize::from(sample.body.0)) {
+                        *at = sample.received_at;
+                    }
+                    let latency = sample.received_at.ns_since(sample.captured_at);
+                    *latency_ns = latency.max(*latency_ns - *latency_ns / 1024);
+                }
+            }
+        });
+        let (bank, received_at, latency_ns) = (&self.bank, &self.received_at, self.latency_ns);
+        latest.publish_with(|snapshot| {
+            snapshot.through = now;
+            snapshot.latency_ns = latency_ns;
+            for (i, (track, at)) in snapshot.tracks.iter_mut().zip(received_at).enumerate() {
+                *track = bank.state(BodyIndex(i as u16)).map(|s| (s, *at));
+            }
+        });
+        result.map(|_| ())
+    }
+
+    fn is_unseen(&self, body: usize) -> bool {
+        self.bank.state(BodyIndex(body as u16)).is_none()
+    }
+
+    /// True once in a run: a second after the first step, when some body was not seen by then. Allocates nothing.
+    pub(crate) fn is_silence_due(&mut self, now: HostTime) -> bool {
+        let due = self.began_at.is_some_and(|began| now.ns_since(began) >= SEEN_WITHIN_NS);
+        if self.looked || !due {
+            return false;
+        }
+        self.looked = true;
+        (0..self.bodies).any(|body| self.is_unseen(body))
+    }
+
+    /// The bodies that were not seen so far, which are dark, the tracker's word on why, and what to do; `None` when all of them were.
+    pub(crate) fn not_seen_yet(&self, rig: &Rig) -> Option<String> {
+        self.unseen(rig, "has not seen", "and no light falls there until it does")
+    }
+
+    /// The same at the end of a run, and what else the tracker has to say.
+    pub(crate) fn never_seen(&self, rig: &Rig) -> Option<String> {
+        let unseen = self.unseen(rig, "never saw", "so no light fell there");
+        unseen.into_iter().chain(self.tracker.warning()).reduce(|a, b| format!("{a}; {b}"))
+    }
+
+    fn unseen(&self, rig: &Rig, verb: &str, consequence: &str) -> Option<String> {
+        let all = rig.bodies.iter().enumerate().take(self.bodies);
+        let names: Vec<_> =
+            all.filter(|(i, _)| self.is_unseen(*i)).map(|(_, body)| format!("{:?}", body.name)).collect();
+        (!names.is_empty()).then(|| {
+            let (names, status) = (names.join(", "), self.tracker.status());
+            let (tracker, remedy) = (self.tracker.name(), remedy(&rig.config.tracker));
+            format!("the {tracker} tracker {verb} {names}, {consequence}: {status}; {remedy}")
+        })
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::config::{Overrides, RigConfig};
+    use dpm_device::planes::Raster;
+    use dpm_device::pose::Pose;
+    use dpm_device::tracker::TrackerSample;
+    use dpm_handoff::latest::latest;
+
+    /// Tells of the bodies below a number, at every poll.
+    struct Speaks {
+        of: u16,
+    }
+
+    impl Tracker for Speaks {
+        fn poll(
+            &mut self,
+            now: HostTime,
+            sink: &mut dyn FnMut(&TrackerSample),
+        ) -> Result<usize, TrackerError> {
+            for body in 0..self.of {
+                sink(&TrackerSample {
+                    body: BodyIndex(body),
+                    pose: Pose::IDENTITY,
+                    tracked: true,
+                    mean_error_m: 0.0,
+                    sequence: now.0 as u32,
+                    captured_at: now,
+                    received_at: now,
+                });
+            }
+            Ok(usize::from(self.of))
+        }
+
+        fn name(&self) -> &str {
+            "speaking"
+        }
+
+        fn status(&self) -> String {
+            format!("speaks of {}", self.of)
+        }
+    }
+
+    #[test]
+    fn silence_is_due_once_after_a_second_and_only_where_a_body_is_missing() {
+        let config = RigConfig::demo(&Overrides::default()).unwrap_or_else(|e| panic!("{e}"));
+        let rig = Rig::build(&config, Raster::new(16, 16)).unwrap_or_else(|e| panic!("{e}"));
+        assert_eq!(rig.bodies.len(), 2);
+        let names = [0, 1].map(|i| format!("{:?}", rig.bodies[i].name));
+        for of in 0..3u16 {
+            let mut stage = TrackingStage::new(&rig, Box::new(Speaks { of }));
+            let (mut publisher, _reader) = latest(TrackSnapshot::empty(2));
+            // From any instant on, in steps of 10 ms.
+            let due: Vec<i64> = (0..300i64)
+                .map(|step| HostTime(7_000_000_000 + step * 10_000_000))
+                .filter(|&now| {
+                    stage.step(now, &mut publisher).expect("it speaks");
+                    stage.is_silence_due(now)
+                })
+                .map(|now| now.0 - 7_000_000_000)
+                .collect();
+            assert_eq!(due, if of < 2 { vec![1_000_000_000] } else { vec![] }, "{of} of 2 are told");
+            let (early, late) = (stage.not_seen_yet(&rig), stage.never_seen(&rig));
+            assert_eq!(early.is_some(), of < 2);
+            for text in [early, late].into_iter().flatten() {
+                assert!(
+                    text.contains(&format!("speaks of {of}")) && text.contains("tracker.faults"),
+                    "{text}"
+                );
+                assert_eq!(text.contains(&names[0]), of == 0, "{text}");
+                assert!(text.contains(&names[1]), "{text}");
+            }
+        }
+    }
+}
