@@ -225,9 +225,13 @@ impl Collector {
                 self.take_finished(&mut done, free, monitor, &mut goes_on);
                 // Lit before the link's thread came to say that it was sent.
                 let unknown = |f: u32| self.newest.is_none_or(|n| frame_newer(f, n));
+                // Or in a slot that those still to be taken were planned for.
+                let ahead = |slot: u64| !done.is_empty() && self.last_planned.is_none_or(|last| last < slot);
                 match light {
-                    Some(note) if over || !note.event.frame.is_some_and(unknown) => {
-                        self.light(&note, monitor)
+                    Some(note)
+                        if !ahead(note.event.slot) && (over || !note.event.frame.is_some_and(unknown)) =>
+                    {
+                        self.light(&note, monitor);
                     }
                     light => {
                         held = light;
