@@ -5,6 +5,7 @@ use dpm_device::tracker::record::Recording;
 use dpm_device::tracker::{BodyIndex, TrackerSample};
 use dpm_rig::config::{Overrides, RigConfig};
 use dpm_rig::rig::Rig;
+use dpm_rig::tracks::open_for;
 use hil_mock::motion::{Motion, MotionSpec};
 use hil_mock::natnet_host::NatNetHost;
 use hil_mock::natnet_server::{NatNetServer, NatNetServerConfig, Streaming, UnicastTo};
@@ -85,7 +86,8 @@ fn replayed(folder: &Path, file: &str, start: HostTime) -> Vec<TrackerSample> {
          [[scene.bodies]]\nname = \"Hare\"\nnode = \"bunny\"\n[[scene.bodies]]\nname = \"Bust\"\nnode = \"venus\"\n"
     );
     let config = RigConfig::parse("replay.toml", &text, folder, &Overrides::default()).expect("a valid rig");
-    let mut tracker = Rig::build(&config, None).unwrap().tracker(Arc::new(|| HostTime(0)), start).unwrap();
+    let rig = Rig::build(&config, None).unwrap();
+    let mut tracker = open_for(&rig, Arc::new(|| HostTime(0)), start).unwrap();
     let mut samples = Vec::new();
     tracker.poll(HostTime(i64::MAX), &mut |s| samples.push(*s)).unwrap();
     samples

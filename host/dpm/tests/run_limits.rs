@@ -4,7 +4,8 @@ mod link_common;
 
 use dpm_device::link::DeviceState;
 use dpm_rig::interlock::{Contact, Interlock};
-use dpm_rig::telemetry::monitor::{Order, ProjectorHealth};
+use dpm_rig::order::Order;
+use dpm_rig::telemetry::monitor::ProjectorHealth;
 use hil_mock::projector::MockConfig;
 use link_common::{raster, rig, served_time, start_with, Projector, PtyProjector};
 use std::sync::atomic::{AtomicBool, Ordering};

@@ -3,8 +3,9 @@
 mod link_common;
 
 use dpm_device::link::{faults, DeviceState};
+use dpm_rig::order::Order;
 use dpm_rig::pipeline::PipelineError;
-use dpm_rig::telemetry::monitor::{Order, ProjectorHealth};
+use dpm_rig::telemetry::monitor::ProjectorHealth;
 use hil_mock::projector::MockConfig;
 use link_common::{raster, rig, served_time, start, Projector, PtyProjector};
 use std::time::Duration;

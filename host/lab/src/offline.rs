@@ -7,8 +7,8 @@ use dpm_device::tracker::TrackerError;
 use dpm_handoff::latest::{latest, Publisher, Reader};
 use dpm_rig::light::registration::{measured_at, RegistrationMeter};
 use dpm_rig::light::FrameRecord;
-use dpm_rig::rig::{affine, Rig, RigError};
-use dpm_rig::tracks::{TrackSnapshot, TrackingStage};
+use dpm_rig::rig::{affine, Rig};
+use dpm_rig::tracks::{open_for, SourceError, TrackSnapshot, TrackingStage};
 use glam::DAffine3;
 
 /// Between two predictions of [`AgainstOffline::evenly`].
@@ -19,7 +19,7 @@ const EVENLY_NS: i64 = 5_000_000;
 pub enum OfflineError {
     /// The tracker does not exist.
     #[error(transparent)]
-    Rig(#[from] RigError),
+    Source(#[from] SourceError),
     /// The tracker failed.
     #[error(transparent)]
     Tracker(#[from] TrackerError),
@@ -39,9 +39,9 @@ impl OfflinePredictor {
     /// As the rig's own at the beginning of a run.
     ///
     /// # Errors
-    /// As [`Rig::tracker`].
-    pub fn new(rig: &Rig) -> Result<Self, RigError> {
-        let tracker = rig.tracker(std::sync::Arc::new(|| HostTime(0)), HostTime(0))?;
+    /// As [`open_for`].
+    pub fn new(rig: &Rig) -> Result<Self, SourceError> {
+        let tracker = open_for(rig, std::sync::Arc::new(|| HostTime(0)), HostTime(0))?;
         let stage = TrackingStage::new(rig, tracker);
         let (publisher, reader) = latest(TrackSnapshot::empty(rig.bodies.len()));
         Ok(Self { stage, publisher, reader })

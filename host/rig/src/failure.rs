@@ -84,12 +84,6 @@ impl<T> From<T> for Ended<T> {
     }
 }
 
-impl From<crate::config::ConfigErrors> for Failure {
-    fn from(errors: crate::config::ConfigErrors) -> Self {
-        Self::new(FailureKind::BadInput, errors)
-    }
-}
-
 impl From<dpm_device::dlpc900::driver::Dlpc900Error> for Failure {
     fn from(e: dpm_device::dlpc900::driver::Dlpc900Error) -> Self {
         use dpm_device::dlpc900::driver::Dlpc900Error;

@@ -35,6 +35,7 @@ pub mod frame;
 pub mod interlock;
 pub mod light;
 mod mock;
+pub mod order;
 pub mod pack;
 pub mod pictures;
 pub mod pipeline;

@@ -4,18 +4,15 @@ use crate::config::{
     BodyConfig, BuiltinScene, CalibrationUnit, EnvironmentConfig, GazeConfig, RigConfig, TrackerConfig,
 };
 use crate::mock::{Motion, MotionError, MotionSpec};
-use crate::tracks::{self, SourceError};
 use dpm_device::planes::Raster;
 use dpm_device::pose::Pose;
 use dpm_device::regular_file;
-use dpm_device::time::{FrameRate, HostClock, HostTime};
-use dpm_device::tracker::{BodyKey, Tracker};
+use dpm_device::time::FrameRate;
 use dpm_scene::geometry::distortion::Distortion;
 use dpm_scene::geometry::opencv::{self, LengthUnit};
 use dpm_scene::geometry::projector::{ProjectorCamera, ProjectorError};
 use dpm_scene::{BodySelector, Environment, LoadOptions, Scene, SceneError, SceneFeatures};
 use glam::{DAffine3, DQuat, DVec3, Vec3};
-use std::sync::Arc;
 
 /// Why a rig cannot be built from a configuration that is valid by itself.
 #[derive(Debug, thiserror::Error)]
@@ -46,9 +43,6 @@ pub enum RigError {
         /// What is wrong.
         message: String,
     },
-    /// The tracker.
-    #[error(transparent)]
-    Tracker(#[from] SourceError),
     /// The calibration file.
     #[error("projector.calibration: {path}: {message}")]
     Calibration {
@@ -185,22 +179,6 @@ impl Rig {
     /// Frames a second.
     pub fn rate(&self) -> FrameRate {
         self.config.projector.frame_rate
-    }
-
-    /// The tracker that the configuration asks for. Time 0 of the mock's motions is instant 0 of the host's clock; a recording
-    /// starts at `start`.
-    ///
-    /// # Errors
-    /// Its address, file or numbers are wrong.
-    pub fn tracker(&self, clock: Arc<dyn HostClock>, start: HostTime) -> Result<Box<dyn Tracker>, RigError> {
-        let named = &self.config.scene.bodies;
-        let keys = self
-            .bodies
-            .iter()
-            .enumerate()
-            .map(|(i, b)| BodyKey { name: b.name.clone(), id: named.get(i).and_then(|c| c.id) });
-        let motions = self.bodies.iter().filter_map(|b| b.motion.clone()).collect();
-        Ok(tracks::open(&self.config.tracker, keys.collect(), motions, clock, start)?)
     }
 
     /// True world-from-body of every tracked body at an instant; `None` unless the tracker is the mock.

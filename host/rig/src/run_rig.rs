@@ -213,8 +213,14 @@ pub fn cannot_write(path: &Path, error: &dyn std::fmt::Display) -> Failure {
 
 impl From<RigError> for Failure {
     fn from(error: RigError) -> Self {
+        Self::new(FailureKind::BadInput, error)
+    }
+}
+
+impl From<SourceError> for Failure {
+    fn from(error: SourceError) -> Self {
         let kind = match error {
-            RigError::Tracker(SourceError::Tracker(_)) => FailureKind::Device,
+            SourceError::Tracker(_) => FailureKind::Device,
             _ => FailureKind::BadInput,
         };
         Self::new(kind, error)
@@ -224,12 +230,12 @@ impl From<RigError> for Failure {
 impl From<PipelineError> for Failure {
     fn from(error: PipelineError) -> Self {
         let kind = match &error {
-            PipelineError::Rig(RigError::Tracker(SourceError::Tracker(_)))
+            PipelineError::Tracker(SourceError::Tracker(_))
             | PipelineError::Connect(_)
             | PipelineError::Thread { .. } => FailureKind::Device,
-            PipelineError::Rig(_) | PipelineError::Render(RenderError::Scene(_) | RenderError::Raster(_)) => {
-                FailureKind::BadInput
-            }
+            PipelineError::Rig(_)
+            | PipelineError::Tracker(_)
+            | PipelineError::Render(RenderError::Scene(_) | RenderError::Raster(_)) => FailureKind::BadInput,
             PipelineError::Render(RenderError::Gpu(e)) | PipelineError::Gpu { source: e, .. } => match e {
                 GpuError::OutOfMemory { .. } | GpuError::Limit { .. } => FailureKind::BadInput,
                 _ => FailureKind::NoGpu,

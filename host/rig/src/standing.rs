@@ -5,7 +5,7 @@
 //! frame left to hold). `docs/ORDERS.md` says this to operators.
 
 use crate::config::ProjectorBackend;
-use crate::telemetry::monitor::Order;
+use crate::order::Order;
 use dpm_common::folder::{Folder, FolderError, Owner};
 use dpm_common::unix::{user, user_name};
 use std::fmt;

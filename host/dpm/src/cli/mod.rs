@@ -25,7 +25,7 @@ mod watch;
 
 use clap::{ColorChoice, CommandFactory, FromArgMatches, Parser, Subcommand};
 use dpm_rig::failure::Failure;
-use dpm_rig::telemetry::monitor::Order;
+use dpm_rig::order::Order;
 use std::io::Write;
 use std::process::ExitCode;
 

@@ -4,7 +4,7 @@ use super::watch::print;
 use dpm_common::unix::{user, user_name};
 use dpm_rig::control::client::{tell, Answer};
 use dpm_rig::failure::{Failure, FailureKind};
-use dpm_rig::telemetry::monitor::Order;
+use dpm_rig::order::Order;
 
 /// Flags of the four commands.
 #[derive(clap::Args, Clone, Debug)]

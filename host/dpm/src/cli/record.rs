@@ -51,7 +51,7 @@ pub(super) fn execute(args: &RecordArgs) -> Result<(), Failure> {
         .map_err(|e| Failure::new(FailureKind::Device, format!("cannot handle signals: {e}")))?;
     let clock = MonotonicClock::new(0);
     let start = clock.now();
-    let tracker = rig.tracker(Arc::new(move || clock.now()), start)?;
+    let tracker = dpm_rig::tracks::open_for(&rig, Arc::new(move || clock.now()), start)?;
     let bodies: Vec<_> = rig.bodies.iter().map(|b| BodyKey { name: b.name.clone(), id: None }).collect();
     let mut recorder = Recorder::create(tracker, &args.out, &bodies, start)?;
     let mut say_at = start.plus_ns(SAY_EVERY_NS);

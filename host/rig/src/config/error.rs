@@ -95,3 +95,9 @@ impl fmt::Display for ConfigErrors {
 }
 
 impl std::error::Error for ConfigErrors {}
+
+impl From<ConfigErrors> for crate::failure::Failure {
+    fn from(errors: ConfigErrors) -> Self {
+        Self::new(crate::failure::FailureKind::BadInput, errors)
+    }
+}

@@ -172,7 +172,7 @@ pub(super) fn check(rig: &RigConfig, reader: &mut Reader) {
             let usable = bytes.len() == 1 && (bytes[0] == b' ' || bytes[0].is_ascii_graphic());
             if !usable {
                 refuse("safety.interlock.key", "is not one printable ASCII character", "for example \" \"");
-            } else if crate::telemetry::monitor::Order::from_key(bytes[0]).is_some() {
+            } else if crate::order::Order::from_key(bytes[0]).is_some() {
                 refuse(
                     "safety.interlock.key",
                     "is a key that gives an order",

@@ -2,8 +2,8 @@
 
 use super::status_file::StatusFile;
 use super::{is_obeyed, runtime_path, socket_name, HEARD};
+use crate::order::Order;
 use crate::standing::state_folder;
-use crate::telemetry::monitor::Order;
 use crossbeam::channel::unbounded;
 use dpm_common::folder::{Folder, FolderError, Owner};
 use dpm_common::unix::{monotonic_ns, peer, send_signal, user, user_name, Peer};

@@ -11,7 +11,8 @@ pub mod orders;
 pub mod server;
 pub mod status_file;
 
-use crate::telemetry::monitor::{Order, ProjectorHealth};
+use crate::order::Order;
+use crate::telemetry::monitor::ProjectorHealth;
 use dpm_common::folder::{Folder, FolderError, Owner};
 use dpm_common::unix::user;
 use dpm_device::link::faults;

@@ -4,8 +4,9 @@
 //! take as long as a disk takes, and gives ARM to the light only after what stood is forgotten. Orders that come as signals reach the
 //! light by themselves (see [`dpm_common::stopping`]); the thread only writes them down.
 
+use crate::order::Order;
 use crate::standing::{By, OrderFile, Stands};
-use crate::telemetry::monitor::{Order, RunMonitor};
+use crate::telemetry::monitor::RunMonitor;
 use dpm_common::stopping;
 use std::path::PathBuf;
 use std::sync::{Arc, Condvar, Mutex, MutexGuard, PoisonError};

@@ -2,8 +2,9 @@
 
 use super::orders::{Kept, Orders, Ticket};
 use super::{is_obeyed, rig_name, socket_name, HEARD, MAX_WORD};
+use crate::order::Order;
 use crate::standing::By;
-use crate::telemetry::monitor::{Order, RunMonitor};
+use crate::telemetry::monitor::RunMonitor;
 use dpm_common::folder::{Folder, FolderError};
 use dpm_common::unix::{peer, user, wait_readable};
 use std::collections::VecDeque;

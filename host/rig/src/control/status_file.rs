@@ -2,7 +2,8 @@
 //! for the case that the thread of the control socket hangs.
 
 use super::{state_name, HEARD};
-use crate::telemetry::monitor::{Order, ProjectorHealth};
+use crate::order::Order;
+use crate::telemetry::monitor::ProjectorHealth;
 use dpm_common::folder::{Folder, FolderError};
 use dpm_common::unix::monotonic_ns;
 use std::fs::File;

@@ -3,8 +3,8 @@
 //! A frame is a big piece of memory and a small note. The memory goes straight back to planning when the link is done with it, so that few
 //! of them go round and stay in the caches; the note goes on to the collector, which may be slow.
 
+use crate::frame::dark::DarkCause;
 use crate::frame::{FrameId, FrameTimeline};
-use crate::plan::dark::DarkCause;
 use dpm_device::link::SendOutcome;
 use dpm_device::time::{DeviceTicks, HostTime};
 use dpm_render::pack::BitPlaneFrame;

@@ -3,7 +3,9 @@
 //! At real pace the stamps are readings of the host's clock. At virtual pace they are the rig's clock, advanced by the modelled cost
 //! of each stage, so that a run repeats bit for bit; what the stages really took is kept apart in [`FrameTimeline::wall_ns`].
 
+pub mod dark;
 pub(crate) mod job;
+pub(crate) mod slots;
 
 use dpm_device::time::HostTime;
 

@@ -1,15 +1,15 @@
 //! Finished frames and light into a report. Runs on its own thread, off the frame path: it may allocate.
 
 use crate::config::{Pace, ProjectorBackend, TrackerConfig};
+use crate::frame::dark::DarkCause;
 use crate::frame::job::{Fate, FrameNote};
+use crate::frame::slots::OrderedDark;
 use crate::frame::{FrameId, FrameTimeline, Stage, STAGES};
 use crate::light::dark_bodies::DarkBodies;
 use crate::light::placement::Placement;
 use crate::light::recorder::LightNote;
 use crate::light::registration::{measured_at, RegistrationMeter};
-use crate::plan::dark::DarkCause;
 use crate::plan::light_centre::centre_ns;
-use crate::plan::slots::OrderedDark;
 use crate::realtime::standstill::SeenStandstills;
 use crate::rig::Rig;
 use crate::telemetry::interval::Interval;

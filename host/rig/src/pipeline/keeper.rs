@@ -5,11 +5,12 @@
 
 use super::connect::ConnectError;
 use crate::frame::job::FrameNote;
+use crate::frame::slots::OrderedDark;
 use crate::light::recorder::LightNote;
 use crate::light::status::StatusLight;
+use crate::order::Order;
 use crate::plan::link_time::LinkTime;
-use crate::plan::slots::OrderedDark;
-use crate::telemetry::monitor::{Order, ProjectorHealth, RunMonitor};
+use crate::telemetry::monitor::{ProjectorHealth, RunMonitor};
 use crate::telemetry::projector::ProjectorReport;
 use dpm_device::clock_map::ClockMap;
 use dpm_device::link::{faults, DeviceState, HostLink, LinkError, LinkState, Verb};

@@ -9,6 +9,7 @@ use crate::telemetry::profile::Profiler;
 use crate::telemetry::report::Report;
 use crate::telemetry::slots::SlotCounts;
 use crate::telemetry::trace::TracedFrame;
+use crate::tracks::SourceError;
 use dpm_render::gpu::GpuError;
 use dpm_render::RenderError;
 
@@ -91,6 +92,9 @@ pub enum PipelineError {
     /// The rig.
     #[error(transparent)]
     Rig(#[from] RigError),
+    /// The tracker.
+    #[error(transparent)]
+    Tracker(#[from] SourceError),
     /// The renderer.
     #[error(transparent)]
     Render(#[from] RenderError),

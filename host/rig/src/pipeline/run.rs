@@ -13,7 +13,7 @@ use crate::config::{Pace, Packer, ProjectorBackend, RenderMethod};
 use crate::frame::job::FrameMemory;
 use crate::light::collector::Collector;
 use crate::light::recorder::{LightNote, LightRecorder};
-use crate::mock::{self, EmulatedProjector};
+use crate::mock::{DeviceClock, EmulatedProjector, MockConfig};
 use crate::pack::prepared::PreparedFrames;
 use crate::plan::budget::{BudgetConfig, BudgetController};
 use crate::plan::horizon::Horizon;
@@ -24,7 +24,7 @@ use crate::realtime::standstill::StandstillMonitor;
 use crate::rig::{Rig, RigError};
 use crate::telemetry::monitor::RunMonitor;
 use crate::telemetry::report::Report;
-use crate::tracks::TrackingStage;
+use crate::tracks::{open_for, TrackingStage};
 use dpm_common::clock::{Clock, ManualClock, MonotonicClock, RunClock, Stopwatch};
 use dpm_device::link::HostLink;
 use dpm_device::time::{HostClock, HostTime};
@@ -330,7 +330,7 @@ fn crew_parts(
         }
         None => None,
     };
-    let tracker = rig.tracker(tracker_clock(clock), HostTime(0))?;
+    let tracker = open_for(rig, tracker_clock(clock), HostTime(0))?;
     let mut memory = frame_memory(rig, renderer.as_mut(), options.in_flight.max(2))?;
     let mut frame_ns = 0;
     if let (Some(renderer), Some(first), false) = (&mut renderer, memory.first_mut(), is_virtual) {
@@ -432,8 +432,11 @@ fn far_end(
     if let ProjectorBackend::Mock(mock) = backend {
         let marks = marked.then(|| config.projector.schedule());
         let recorder = LightRecorder::new(lights, options.keep_frames, options.verify, marks);
-        let flash_limit = projector::flash_limit(config);
-        let emulated = mock::projector(mock, raster, flash_limit, config.render.seed, start)
+        let mut setup = MockConfig::new(raster);
+        setup.frame_buffers = mock.buffer_frames.min(64) as u8;
+        setup.clock = DeviceClock { skew_ppb: (mock.clock_ppm * 1000.0) as i32, ..DeviceClock::IDEAL };
+        setup.flash_limit = projector::flash_limit(config);
+        let emulated = EmulatedProjector::new(setup, &mock.faults, config.render.seed, start)
             .map_err(|e| RigError::Unsupported(format!("projector.backend.faults: {e}")))?;
         return Ok((Far::Mock(emulated, recorder), Vec::new()));
     }

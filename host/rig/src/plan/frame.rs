@@ -1,7 +1,7 @@
 //! The newest tracks and a slot into the plan of one frame: poses at the time of light, the eye, and when the light must be off.
 
-use super::dark::DarkCause;
 use super::link_time::LinkTime;
+use crate::frame::dark::DarkCause;
 use crate::frame::job::{Fate, FrameJob};
 use crate::frame::{FrameId, Stage};
 use crate::rig::{affine, Rig};

@@ -3,6 +3,7 @@
 
 use super::ordered::DarkLog;
 use crate::interlock::Interlock;
+use crate::order::Order;
 use dpm_common::stopping;
 use dpm_device::link::{faults, LimitReached};
 use std::collections::VecDeque;
@@ -12,60 +13,6 @@ use std::sync::{Mutex, OnceLock, PoisonError};
 
 /// Notes that wait for the watching thread; further ones are only counted.
 const NOTES: usize = 64;
-
-/// What an operator can ask of the projector of a running rig.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-#[repr(u8)]
-pub enum Order {
-    /// Dark at once; frames go on being made.
-    Black = 1,
-    /// Hold the frame that is lit.
-    Freeze = 2,
-    /// Dark and latched.
-    Safe = 3,
-    /// Light again, after any of these or after a fault.
-    Arm = 4,
-}
-
-impl Order {
-    /// Every order with the word for it.
-    pub const ALL: [(Self, &'static str); 4] =
-        [(Self::Black, "black"), (Self::Freeze, "freeze"), (Self::Safe, "safe"), (Self::Arm, "arm")];
-
-    /// The word for it.
-    pub fn word(self) -> &'static str {
-        Self::ALL.iter().find(|(order, _)| *order == self).map_or("", |(_, word)| word)
-    }
-
-    /// True for the orders that make it dark.
-    pub fn is_dark(self) -> bool {
-        matches!(self, Self::Black | Self::Safe)
-    }
-
-    /// How strong it is: what stands is replaced by what is as strong or stronger, and by ARM only.
-    pub(crate) fn strength(self) -> u8 {
-        match self {
-            Self::Arm => 0,
-            Self::Freeze => 1,
-            Self::Black => 2,
-            Self::Safe => 3,
-        }
-    }
-
-    fn from_code(code: u8) -> Option<Self> {
-        Self::ALL.iter().map(|(order, _)| *order).find(|order| *order as u8 == code)
-    }
-
-    /// The order that a key on the terminal of a run gives: the first letter of its word, small or capital.
-    pub fn from_key(key: u8) -> Option<Self> {
-        Self::ALL.iter().find(|(_, w)| w.as_bytes()[0] == key.to_ascii_lowercase()).map(|(order, _)| *order)
-    }
-
-    /// The order with this word.
-    pub(crate) fn from_word(word: &str) -> Option<Self> {
-        Self::ALL.iter().find(|(_, w)| *w == word).map(|(order, _)| *order)
-    }
-}
 
 /// How the projector is, as the link knows it.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]

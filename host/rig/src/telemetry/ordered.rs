@@ -1,6 +1,6 @@
 //! When no new picture was wanted: from the link's thread, which knows the orders, to the collector, which judges slots.
 
-use crate::plan::slots::OrderedDark;
+use crate::frame::slots::OrderedDark;
 use dpm_device::time::HostTime;
 use std::collections::VecDeque;
 use std::sync::atomic::{AtomicI64, AtomicU64, AtomicU8, Ordering};

@@ -5,8 +5,8 @@
 use super::interval::{Interval, IntervalKind};
 use super::signed::SignedHistogram;
 use super::slots::SlotCounts;
+use crate::frame::slots::{MissCause, OrderedDark};
 use crate::frame::FrameTimeline;
-use crate::plan::slots::{MissCause, OrderedDark};
 use crate::realtime::standstill::Standstills;
 use dpm_device::time::{FrameRate, HostTime};
 use serde::{Deserialize, Serialize};

@@ -7,8 +7,8 @@
 //! that are not decided has a fixed length, so a run may last for months.
 
 use super::ordered::{DarkLog, DarkSpans};
+use crate::frame::slots::{MissCause, OrderedDark};
 use crate::frame::FrameTimeline;
-use crate::plan::slots::{MissCause, OrderedDark};
 use crate::realtime::standstill::SeenStandstills;
 use dpm_device::time::{FrameRate, HostTime};
 use std::collections::VecDeque;

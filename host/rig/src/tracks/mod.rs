@@ -3,6 +3,5 @@
 mod source;
 mod stage;
 
-pub(crate) use source::open;
-pub use source::SourceError;
+pub use source::{open_for, SourceError};
 pub use stage::{TrackSnapshot, TrackingStage};

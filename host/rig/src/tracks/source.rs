@@ -1,8 +1,9 @@
 //! `[tracker]` of the rig file into the tracker itself, ready to be polled.
 
-use crate::config::TrackerConfig;
-use crate::mock::{self, MockOpenError, Motion};
-use dpm_device::time::{HostClock, HostTime};
+use crate::config::{MockTrackerConfig as MockKeys, TrackerConfig};
+use crate::mock::{FaultError, FaultPlan, MockTracker, MockTrackerConfig, MockTrackerError, Motion};
+use crate::rig::Rig;
+use dpm_device::time::{FrameRate, HostClock, HostTime};
 use dpm_device::tracker::natnet::client::{NatNetClient, NatNetConfig};
 use dpm_device::tracker::record::{RecordError, Replay};
 use dpm_device::tracker::serial::client::{SerialTracker, SerialTrackerConfig};
@@ -14,9 +15,12 @@ use std::sync::Arc;
 /// Why there is no tracker.
 #[derive(Debug, thiserror::Error)]
 pub enum SourceError {
-    /// The mock's numbers or faults.
-    #[error(transparent)]
-    Mock(#[from] MockOpenError),
+    /// The mock's numbers.
+    #[error("tracker: {0}")]
+    Mock(#[from] MockTrackerError),
+    /// The mock's faults.
+    #[error("tracker.faults: {0}")]
+    Faults(#[from] FaultError),
     /// An address that is none. The configuration's check finds it first.
     #[error("{key}: {text:?} is not an IPv4 address such as 192.168.1.10")]
     Address {
@@ -33,6 +37,26 @@ pub enum SourceError {
     Tracker(#[from] TrackerError),
 }
 
+/// The tracker of `rig`, which polls are stamped by `clock`. Time 0 of the mock's motions is instant 0 of the host's clock; a recording starts
+/// at `start`.
+///
+/// # Errors
+/// Its address, file or numbers are wrong.
+pub fn open_for(
+    rig: &Rig,
+    clock: Arc<dyn HostClock>,
+    start: HostTime,
+) -> Result<Box<dyn Tracker>, SourceError> {
+    let named = &rig.config.scene.bodies;
+    let key = |(i, b): (usize, &crate::rig::RigBody)| BodyKey {
+        name: b.name.clone(),
+        id: named.get(i).and_then(|c| c.id),
+    };
+    let keys = rig.bodies.iter().enumerate().map(key).collect();
+    let motions = rig.bodies.iter().filter_map(|b| b.motion.clone()).collect();
+    open(&rig.config.tracker, keys, motions, clock, start)
+}
+
 /// Opens the tracker. `bodies` are the rig's in their order; `motions` are how they truly move, which only the mock needs; `clock` is the
 /// clock that polls are stamped with; a recording starts at `start`. Network and serial trackers connect while they are
 /// polled, and again after every loss: that nobody answers yet is no error.
@@ -47,7 +71,7 @@ pub(crate) fn open(
     start: HostTime,
 ) -> Result<Box<dyn Tracker>, SourceError> {
     Ok(match config {
-        TrackerConfig::Mock(c) => Box::new(mock::tracker(c, motions)?),
+        TrackerConfig::Mock(c) => Box::new(mock(c, motions)?),
         TrackerConfig::Natnet(c) => {
             let config = NatNetConfig {
                 server: address("tracker.server", &c.server)?,
@@ -71,6 +95,27 @@ pub(crate) fn open(
         }
         TrackerConfig::Replay(c) => Box::new(Replay::open(&c.file, &bodies, start)?),
     })
+}
+
+/// The mock tracker of bodies that move by `motions`.
+fn mock(c: &MockKeys, motions: Vec<Motion>) -> Result<MockTracker, SourceError> {
+    let mut faults = c.faults.clone();
+    // `drop_out` is one more fault.
+    if c.drop_out > 0.0 {
+        let separator = if faults.trim().is_empty() { "" } else { "," };
+        faults.push_str(&format!("{separator}loss={}", c.drop_out));
+    }
+    let config = MockTrackerConfig {
+        seed: c.seed,
+        rate: FrameRate::new(c.rate_hz, 1).expect("the rate was checked when the configuration was read"),
+        position_noise_m: c.noise_m,
+        rotation_noise_rad: c.noise_rad,
+        latency_ns: i64::from(c.latency_us) * 1000,
+        latency_jitter_ns: i64::from(c.jitter_us) * 1000,
+        faults: faults.parse::<FaultPlan>()?,
+        ..Default::default()
+    };
+    Ok(MockTracker::new(config, motions)?)
 }
 
 fn address(key: &'static str, text: &str) -> Result<Ipv4Addr, SourceError> {
