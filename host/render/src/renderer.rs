@@ -1,23 +1,22 @@
 //! One frame on the GPU: surfaces, radiance, code values. `Renderer::create_slot` records the passes in their order.
 
-use super::last_frame::LastFrame;
-use super::memory::{BytesPerPixel, RasterTooLarge, SharedBuffers};
+use super::frame_buffers::FrameBuffers;
+use super::last_frame::{LastFrame, Turn};
+use super::memory::{RasterTooLarge, SharedBuffers};
 use super::method::Method;
+use super::passes::{Grid, PASSES, TABLE};
 use super::scene_data::{world_bounds, Keep, SceneData, SceneDataError};
-use super::scene_gpu::{table_buffer, SceneGpu};
-use super::slot::{DebugBuffers, FrameSlot, PASSES};
+use super::scene_gpu::SceneGpu;
+use super::slot::FrameSlot;
 use super::tiles::TileList;
 use crate::gpu::{
-    BindingKind, BindingSet, BindingTable, Buffer, CommandList, ComputePipeline, FrameFence, Gpu, GpuError,
-    MemoryKind, Recorder,
+    BindingKind, BindingSet, BindingTable, CommandList, ComputePipeline, FrameFence, Gpu, GpuError, Recorder,
 };
 use crate::pack;
-use bytemuck::Zeroable;
 use dpm_device::planes::{PlaneSchedule, Raster};
 use dpm_scene::geometry::projector::ProjectorCamera;
 use dpm_scene::Scene;
-use dpm_shaders::structs::{self as gpu_structs, Counters, Frame, Guide, Instance, Rows, Schedule, Surface};
-use dpm_shaders::TableShader;
+use dpm_shaders::structs::{self as gpu_structs, Counters, Frame, Instance, Rows, Schedule, Surface};
 use glam::{DAffine3, DVec3, Vec3};
 use std::sync::Arc;
 
@@ -107,6 +106,8 @@ pub enum RenderError {
 /// Byte offsets in the dispatch arguments: four workgroups a tile, and one a tile in frames that decide rates.
 const PER_TILE_QUARTER: u64 = 0;
 const PER_TILE_RATES: u64 = 16;
+/// The pass whose end is the state of the history before the frame's samples.
+const REPROJECT: &str = "reproject";
 
 /// Draws frames of one scene. Owns what it needs: a thread may keep it, and may be left alone with it when the GPU hangs.
 pub struct Renderer {
@@ -116,6 +117,8 @@ pub struct Renderer {
     keep: Keep,
     /// Per body of the scene: which tracked body carries it.
     tracked: Vec<Option<u16>>,
+    /// The pass that decides rates is recorded.
+    decides_rates: bool,
     /// What the history holds: the last frame submitted and its poses.
     last: LastFrame,
     /// The tiles that were active when shading rates were decided last. All others have the full rate.
@@ -137,23 +140,11 @@ pub struct RendererPlan {
 /// dropped.
 pub(super) struct Resources {
     // Dropped before the buffers they use.
-    pipelines: Pipelines,
+    /// One a row of [`TABLE`]; `None`: the method does not need it and it is not recorded.
+    pipelines: Vec<Option<ComputePipeline>>,
     table: Arc<BindingTable>,
     pub(super) shared: SharedBuffers,
     scene: SceneGpu,
-}
-
-/// One pipeline a pass; `None`: the method does not need it and it is not recorded.
-struct Pipelines {
-    primary: ComputePipeline,
-    reproject: Option<ComputePipeline>,
-    rate_map: Option<ComputePipeline>,
-    schedule: ComputePipeline,
-    trace: ComputePipeline,
-    accumulate: Option<ComputePipeline>,
-    spatial: Option<ComputePipeline>,
-    compensate: ComputePipeline,
-    pack: Option<ComputePipeline>,
 }
 
 /// `tracked`: per body of the scene, which tracked body carries it.
@@ -238,27 +229,15 @@ impl Renderer {
             (12, u32::from(method.dpm)),
             (13, u32::from(method.spatial)),
         ]);
-        let pipeline = |shader: TableShader| ComputePipeline::new(&table, shader.reading(texel), &constants);
-        let only = |wanted: bool, shader| wanted.then(|| pipeline(shader)).transpose();
-        let pipelines = Pipelines {
-            primary: pipeline(dpm_shaders::PRIMARY)?,
-            reproject: only(method.needs_history(), dpm_shaders::REPROJECT)?,
-            rate_map: only(
-                method.needs_rates() || keep.rate_map && method.needs_history(),
-                dpm_shaders::RATE_MAP,
-            )?,
-            schedule: pipeline(dpm_shaders::SCHEDULE)?,
-            trace: pipeline(dpm_shaders::TRACE)?,
-            accumulate: only(method.needs_history(), dpm_shaders::ACCUMULATE)?,
-            spatial: only(method.needs_spatial(), dpm_shaders::SPATIAL)?,
-            compensate: pipeline(dpm_shaders::COMPENSATE)?,
-            pack: (settings.output.schedule())
-                .map(|schedule| {
-                    let constants = pack::gpu::constants(settings.raster, schedule);
-                    ComputePipeline::new(&table, dpm_shaders::PACK, &constants)
-                })
-                .transpose()?,
-        };
+        let pipelines = (TABLE.iter())
+            .map(|pass| {
+                let wanted = (pass.when)(&settings, keep);
+                let constants = pass.constants(&constants, &settings);
+                wanted.then(|| ComputePipeline::new(&table, (pass.shader)(texel), &constants)).transpose()
+            })
+            .collect::<Result<Vec<_>, _>>()?;
+        let decides_rates =
+            TABLE.iter().zip(&pipelines).any(|(pass, p)| pass.grid == Grid::Rates && p.is_some());
         let last = LastFrame::none(tracked.len());
         let rated = vec![false; TileList::new(settings.raster.width(), settings.raster.height()).len()];
         Ok(Self {
@@ -267,6 +246,7 @@ impl Renderer {
             settings,
             keep,
             tracked,
+            decides_rates,
             last,
             rated,
             gpu: gpu.clone(),
@@ -287,198 +267,90 @@ impl Renderer {
     /// # Errors
     /// Out of memory.
     pub fn create_slot(&self, debug: bool) -> Result<FrameSlot, GpuError> {
-        let gpu = &self.gpu;
-        let raster = self.settings.raster;
-        let pixels = raster.pixel_count();
-        let size = |what, bytes, kind| Buffer::new(gpu, what, bytes, kind);
-        use MemoryKind::{Device, Readback, Upload};
-        let tile_list = TileList::new(raster.width(), raster.height());
-        let frame = size("frame uniforms", size_of::<Frame>(), Upload)?;
-        let table = |what, bytes, kind| table_buffer(gpu, what, bytes, kind);
-        let instances = table("instances", size_of::<Instance>() * self.data.bodies.len().max(1), Upload)?;
-        let arguments = size("dispatch arguments", 32, Upload)?;
-        let tiles = size("tile list", tile_list.len() * 4, Upload)?;
-        let counters = size("counters", size_of::<Counters>(), Device)?;
-        let counters_host = size("counters", size_of::<Counters>(), Readback)?;
-        let each = BytesPerPixel::of(&self.settings.method);
-        let surfaces = table("surfaces", pixels * each.surfaces, Device)?;
-        let radiance = size("radiance", pixels * each.radiance, Device)?;
-        let codes = size("code values", pixels * each.codes, Device)?;
-        let schedule_packed = self.settings.output.schedule();
-        let codes_host = match self.settings.output {
-            Output::Planes(_) => None,
-            Output::Codes | Output::Both(_) => Some(size("code values", pixels * each.codes, Readback)?),
-        };
-        let plane_bytes = schedule_packed.map_or(4, |schedule| pack::gpu::len_bytes(raster, schedule));
-        let planes = size("bit planes", plane_bytes, Device)?;
-        let planes_host = schedule_packed.map(|_| size("bit planes", plane_bytes, Readback)).transpose()?;
-        let method = &self.settings.method;
-        // What the method does without is bound all the same, but as small as can be.
-        let with = |what, each: usize| table(what, (pixels * each).max(16), Device);
-        let guides = with("guides", each.guides)?;
-        let schedule = size("schedule", size_of::<Schedule>(), Device)?;
-        let work = size("work list", pixels * each.work, Device)?;
-        let filtered = with("filtered radiance", each.filtered)?;
-        let filtered_shown = with("shown radiance", each.shown)?;
-        let kept = |what, each: usize| (each > 0).then(|| size(what, pixels * each, Readback)).transpose();
-        let debug_host = if debug {
-            Some(DebugBuffers {
-                shown: size("shown radiance", pixels * 16, Readback)?,
-                surfaces: size("surfaces", pixels * each.surfaces, Readback)?,
-                guides: kept("guides", each.guides)?,
-                history: kept("history", each.history)?,
-                prior: kept("prior history", each.history)?,
-                traced: size("radiance", pixels * each.radiance, Readback)?,
-                rates: size("shading rates", tile_list.len() * 4, Readback)?,
-            })
-        } else {
-            None
-        };
-        // The last pass that ran before compensation is what is shown.
-        let shown = if method.needs_spatial() {
-            &filtered_shown
-        } else if method.needs_history() {
-            &filtered
-        } else {
-            &radiance
-        };
-        let resources = &self.resources;
-        let s = &resources.scene;
-        let buffer_of = |name: &str, parity: usize| match name {
-            "B_FRAME" => &frame,
-            "B_INSTANCES" => &instances,
-            "B_NODES" => &s.nodes,
-            "B_TRIANGLES" => &s.triangles,
-            "B_TRIANGLE_REFS" => &s.refs,
-            "B_VERTICES" => &s.vertices,
-            "B_MATERIALS" => &s.materials,
-            "B_TEXTURES" => &s.textures,
-            "B_TEXELS" => &s.texels,
-            "B_LIGHTS" => &s.lights,
-            "B_ENVIRONMENT" => &s.environment,
-            "B_ALBEDO" => &s.albedo,
-            "B_TILES" => &tiles,
-            "B_SURFACES" | "B_SURFACE_ROWS" => &surfaces,
-            "B_RADIANCE" => &radiance,
-            "B_CODES" => &codes,
-            "B_COUNTERS" => &counters,
-            "B_GUIDES" | "B_GUIDE_ROWS" => &guides,
-            "B_HISTORY" | "B_HISTORY_ROWS" => &resources.shared.history[parity],
-            "B_FORMER" => &resources.shared.history[1 - parity],
-            "B_RATES" => &resources.shared.rates,
-            "B_RATE_TABLE" => &resources.shared.rate_table,
-            "B_SCHEDULE" => &schedule,
-            "B_WORK" => &work,
-            "B_NOISE" => &resources.shared.noise,
-            "B_FILTERED" | "B_FILTERED_ROWS" => &filtered,
-            "B_SHOWN" => shown,
-            "B_PLANES" => &planes,
-            other => unreachable!("binding {other} has no buffer"),
-        };
+        let (gpu, resources, settings) = (&self.gpu, &self.resources, &self.settings);
+        let tile_list = TileList::new(settings.raster.width(), settings.raster.height());
+        let buffers = FrameBuffers::new(gpu, settings, (self.data.bodies.len(), tile_list.len()), debug)?;
+        buffers.clear(gpu, settings)?;
         let set_of = |parity| {
-            let bindings: Vec<_> =
-                gpu_structs::BINDINGS.iter().map(|&(n, b)| (b, buffer_of(n, parity))).collect();
+            let all = (&resources.shared, &resources.scene);
+            let bindings: Vec<_> = gpu_structs::BINDINGS
+                .iter()
+                .map(|&(name, binding)| (binding, buffers.of(name, parity, settings, all)))
+                .collect();
             BindingSet::new(&resources.table, &bindings)
         };
         let sets = [set_of(0)?, set_of(1)?];
-        // Tiles that are never traced must read as nothing hit and black from the start.
-        let nothing = Surface { id: gpu_structs::NO_HIT, ..Surface::zeroed() };
-        super::fill::fill(gpu, &surfaces, &nothing, pixels)?;
-        super::fill::fill(gpu, &codes, &0u32, pixels)?;
-        super::fill::fill(gpu, &radiance, &[0f32; 4], pixels)?;
-        if each.guides > 0 {
-            super::fill::fill(gpu, &guides, &Guide::zeroed(), pixels)?;
-        }
-        super::fill::fill(gpu, shown, &[0f32; 4], pixels)?;
-        let p = &resources.pipelines;
-        let record = |parity: usize, r: &mut Recorder<'_>| {
-            let (set, history) = (&sets[parity], &resources.shared.history[parity]);
-            // The frame, in order. A pass that the method does not need is not recorded; its stamp is.
-            let tiled = |r: &mut Recorder<'_>, pass: Option<&ComputePipeline>, offset: u64| {
-                if let Some(pass) = pass {
-                    r.dispatch_indirect(pass, set, &arguments, offset);
-                    r.barrier();
-                }
-                r.stamp();
-            };
-            r.clear(&counters);
-            r.copy(&resources.shared.schedule_start, &schedule, size_of::<Schedule>());
-            r.barrier();
-            r.stamp();
-            tiled(r, Some(&p.primary), PER_TILE_QUARTER);
-            tiled(r, p.reproject.as_ref(), PER_TILE_QUARTER);
-            if let Some(prior) = debug_host.as_ref().and_then(|d| d.prior.as_ref()) {
-                r.copy(history, prior, pixels * each.history);
-                r.barrier();
-            }
-            tiled(r, p.rate_map.as_ref(), PER_TILE_RATES);
-            tiled(r, Some(&p.schedule), PER_TILE_QUARTER);
-            r.dispatch_indirect(&p.trace, set, &schedule, 0);
-            r.barrier();
-            r.stamp();
-            tiled(r, p.accumulate.as_ref(), PER_TILE_QUARTER);
-            tiled(r, p.spatial.as_ref(), PER_TILE_QUARTER);
-            tiled(r, Some(&p.compensate), PER_TILE_QUARTER);
-            if let Some(pass) = &p.pack {
-                r.dispatch(pass, set, pack::gpu::workgroups(raster));
-                r.barrier();
-            }
-            r.stamp();
-            if let Some(planes_host) = &planes_host {
-                r.copy(&planes, planes_host, plane_bytes);
-            }
-            if let Some(codes_host) = &codes_host {
-                r.copy(&codes, codes_host, pixels * each.codes);
-            }
-            r.copy(&counters, &counters_host, size_of::<Counters>());
-            if let Some(d) = &debug_host {
-                r.copy(shown, &d.shown, pixels * 16);
-                r.copy(&surfaces, &d.surfaces, pixels * each.surfaces);
-                if let Some(to) = &d.guides {
-                    r.copy(&guides, to, pixels * each.guides);
-                }
-                if let Some(to) = &d.history {
-                    r.copy(history, to, pixels * each.history);
-                }
-                r.copy(&radiance, &d.traced, pixels * each.radiance);
-                r.copy(&resources.shared.rates, &d.rates, tile_list.len() * 4);
-            }
-            r.barrier_to_host();
-            r.stamp();
+        let list = |parity: usize| {
+            CommandList::record(gpu, PASSES.len() as u32 + 1, |r| {
+                self.record_passes(r, &sets[parity], &buffers, parity);
+                self.record_readback(r, &buffers, parity, tile_list.len());
+            })
         };
-        let list = |parity| CommandList::record(gpu, PASSES.len() as u32 + 1, |r| record(parity, r));
         let lists = [list(0)?, list(1)?];
         Ok(FrameSlot {
             fence: FrameFence::new(gpu)?,
             lists,
             _sets: sets,
-            frame,
-            instances,
-            arguments,
-            tiles,
-            counters_host,
-            codes_host,
-            planes_host,
-            plane_bytes,
-            _device_only: vec![
-                counters,
-                surfaces,
-                radiance,
-                codes,
-                planes,
-                guides,
-                schedule,
-                work,
-                filtered,
-                filtered_shown,
-            ],
-            debug_host,
+            buffers,
             tile_list,
-            raster,
+            raster: settings.raster,
             parity: 0,
             stamps: [0; PASSES.len() + 1],
             _resources: resources.clone(),
         })
+    }
+
+    /// The frame, in the order of [`TABLE`], with a barrier after each pass. A pass that the method does not need is not recorded; its stamp is.
+    fn record_passes(&self, r: &mut Recorder<'_>, set: &BindingSet, b: &FrameBuffers, parity: usize) {
+        let (resources, raster) = (&self.resources, self.settings.raster);
+        r.clear(&b.counters);
+        r.copy(&resources.shared.schedule_start, &b.schedule, size_of::<Schedule>());
+        r.barrier();
+        r.stamp();
+        for (pass, pipeline) in TABLE.iter().zip(&resources.pipelines) {
+            if let Some(pipeline) = pipeline {
+                match pass.grid {
+                    Grid::Tiles => r.dispatch_indirect(pipeline, set, &b.arguments, PER_TILE_QUARTER),
+                    Grid::Rates => r.dispatch_indirect(pipeline, set, &b.arguments, PER_TILE_RATES),
+                    Grid::Work => r.dispatch_indirect(pipeline, set, &b.schedule, 0),
+                    Grid::Planes => r.dispatch(pipeline, set, pack::gpu::workgroups(raster)),
+                }
+                r.barrier();
+            }
+            r.stamp();
+            // What the history was before this frame's samples.
+            let prior = b.debug_host.as_ref().and_then(|d| d.prior.as_ref());
+            if let (REPROJECT, Some(prior)) = (pass.name, prior) {
+                r.copy(&resources.shared.history[parity], prior, raster.pixel_count() * b.each.history);
+                r.barrier();
+            }
+        }
+    }
+
+    /// What the host reads, and the copies for looking at.
+    fn record_readback(&self, r: &mut Recorder<'_>, b: &FrameBuffers, parity: usize, tiles: usize) {
+        let (shared, pixels) = (&self.resources.shared, self.settings.raster.pixel_count());
+        if let Some(planes_host) = &b.planes_host {
+            r.copy(&b.planes, planes_host, b.plane_bytes);
+        }
+        if let Some(codes_host) = &b.codes_host {
+            r.copy(&b.codes, codes_host, pixels * b.each.codes);
+        }
+        r.copy(&b.counters, &b.counters_host, size_of::<Counters>());
+        if let Some(d) = &b.debug_host {
+            r.copy(b.shown(&self.settings), &d.shown, pixels * 16);
+            r.copy(&b.surfaces, &d.surfaces, pixels * b.each.surfaces);
+            if let Some(to) = &d.guides {
+                r.copy(&b.guides, to, pixels * b.each.guides);
+            }
+            if let Some(to) = &d.history {
+                r.copy(&shared.history[parity], to, pixels * b.each.history);
+            }
+            r.copy(&b.radiance, &d.traced, pixels * b.each.radiance);
+            r.copy(&shared.rates, &d.rates, tiles * 4);
+        }
+        r.barrier_to_host();
+        r.stamp();
     }
 
     /// Writes the inputs and starts the GPU. Allocates nothing.
@@ -505,55 +377,77 @@ impl Renderer {
         let turn = self.last.turn_of(inputs.frame);
         // Four 8 x 8 workgroups a tile; rates are decided in every second frame drawn, one workgroup a tile. The checkerboard goes by the
         // same count, so that both of its halves are traced at one rate.
-        let decides_rates = self.resources.pipelines.rate_map.is_some() && turn.drawn.is_multiple_of(2);
+        let decides_rates = self.decides_rates && turn.drawn.is_multiple_of(2);
         // A tile that is left loses its rate, whichever slot's turn it is: a body that comes back to it would else find a rate of long ago in one
         // slot and none in another, and a run would not repeat.
         let left = if decides_rates { &self.rated[..] } else { &[] };
-        let tile_count = slot.tile_list.write(left, bytemuck::cast_slice_mut(slot.tiles.bytes_mut()));
+        let tile_count = slot.tile_list.write(left, bytemuck::cast_slice_mut(slot.buffers.tiles.bytes_mut()));
         let rate_tiles = if decides_rates { tile_count } else { 0 };
-        slot.arguments.write(&[[tile_count * 4, 1u32, 1, 0], [rate_tiles, 1, 1, 0]]);
-        // The projector is the origin: f32 is finest where the rays start.
-        let origin = inputs.camera.position();
-        let shift = DAffine3::from_translation(-origin);
-        for (i, (body, pose)) in self.data.bodies.iter().zip(inputs.poses).enumerate() {
-            let world_from_object = shift * *pose;
-            let before = self.last.poses.get(i).copied().unwrap_or(*pose);
-            let previous = DAffine3::from_translation(-self.last.origin) * before;
-            let (lower, upper) = world_bounds(&world_from_object, body.bounds_min, body.bounds_max);
-            // Bounds grow by the rounding of the transforms.
-            let slack = (lower.abs().max(upper.abs()).max_element() + f64::from(body.extent)) * 1e-6;
-            let instance = Instance {
-                world_from_object: rows(&world_from_object),
-                object_from_world: rows(&world_from_object.inverse()),
-                bounds_min: (lower - slack).as_vec3().into(),
-                node_offset: body.node_offset,
-                bounds_max: (upper + slack).as_vec3().into(),
-                triangle_offset: body.triangle_offset,
-                previous_world_from_object: rows(if self.last.frame == gpu_structs::NO_FRAME {
-                    &world_from_object
-                } else {
-                    &previous
-                }),
-                // What is lost still casts virtual shadows where it was last, but gets no light.
-                flags: if is_lost(&self.tracked, i, inputs.lost) {
-                    body.flags & !gpu_structs::INSTANCE_PROJECTED
-                } else {
-                    body.flags
-                },
-                body: i as u32,
-                extent: body.extent,
-                reserved: 0,
-            };
-            let at = i * size_of::<Instance>();
-            slot.instances.bytes_mut()[at..at + size_of::<Instance>()]
-                .copy_from_slice(bytemuck::bytes_of(&instance));
+        slot.buffers.arguments.write(&[[tile_count * 4, 1u32, 1, 0], [rate_tiles, 1, 1, 0]]);
+        let instances = slot.buffers.instances.bytes_mut().chunks_exact_mut(size_of::<Instance>());
+        for (i, to) in instances.take(inputs.poses.len()).enumerate() {
+            to.copy_from_slice(bytemuck::bytes_of(&self.instance(i, inputs)));
         }
+        let frame = self.frame_constants(inputs, &turn, (tile_count, slot.tile_list.tiles_x()));
+        slot.buffers.frame.write(&[frame]);
+        slot.parity = 1 - self.last.parity;
+        slot.lists[slot.parity].submit(&mut slot.fence)?;
+        if decides_rates {
+            self.rated.copy_from_slice(slot.tile_list.active());
+        }
+        let lost = (0..inputs.poses.len()).map(|i| is_lost(&self.tracked, i, inputs.lost));
+        self.last.becomes(inputs, slot.parity, lost);
+        Ok(())
+    }
+
+    /// Body `i` of the scene as the shaders have it. The projector is the origin: f32 is finest where the rays start.
+    fn instance(&self, i: usize, inputs: &FrameInputs<'_>) -> Instance {
+        let (body, pose) = (&self.data.bodies[i], &inputs.poses[i]);
+        let shift = DAffine3::from_translation(-inputs.camera.position());
+        let world_from_object = shift * *pose;
+        let before = self.last.poses.get(i).copied().unwrap_or(*pose);
+        let previous = DAffine3::from_translation(-self.last.origin) * before;
+        let (lower, upper) = world_bounds(&world_from_object, body.bounds_min, body.bounds_max);
+        // Bounds grow by the rounding of the transforms.
+        let slack = (lower.abs().max(upper.abs()).max_element() + f64::from(body.extent)) * 1e-6;
+        Instance {
+            world_from_object: rows(&world_from_object),
+            object_from_world: rows(&world_from_object.inverse()),
+            bounds_min: (lower - slack).as_vec3().into(),
+            node_offset: body.node_offset,
+            bounds_max: (upper + slack).as_vec3().into(),
+            triangle_offset: body.triangle_offset,
+            previous_world_from_object: rows(if self.last.frame == gpu_structs::NO_FRAME {
+                &world_from_object
+            } else {
+                &previous
+            }),
+            // What is lost still casts virtual shadows where it was last, but gets no light.
+            flags: if is_lost(&self.tracked, i, inputs.lost) {
+                body.flags & !gpu_structs::INSTANCE_PROJECTED
+            } else {
+                body.flags
+            },
+            body: i as u32,
+            extent: body.extent,
+            reserved: 0,
+        }
+    }
+
+    /// The constants of a frame that lists `tile_count` tiles, in rows of `tiles_x`.
+    fn frame_constants(
+        &self,
+        inputs: &FrameInputs<'_>,
+        turn: &Turn,
+        (tile_count, tiles_x): (u32, u32),
+    ) -> Frame {
+        let origin = inputs.camera.position();
         let raster = self.settings.raster;
         let method = &self.settings.method;
         let c = inputs.camera;
         let steady = !self.keep.every_pixel
             && self.last.is_steady(&self.data.bodies, inputs, |i| is_lost(&self.tracked, i, inputs.lost));
-        let frame = Frame {
+        Frame {
             projector_position: [0.0; 3],
             seed: self.settings.seed,
             world_from_projector: rows(&DAffine3::from_mat3(c.world_from_projector.matrix3)),
@@ -567,7 +461,7 @@ impl Renderer {
             spp: inputs.spp,
             depth: self.settings.depth,
             tile_count,
-            tiles_x: slot.tile_list.tiles_x(),
+            tiles_x,
             clamp_indirect: self.settings.clamp_indirect.unwrap_or(f32::MAX),
             drive_gain: self.settings.drive_gain,
             ambient: self.settings.ambient,
@@ -600,15 +494,6 @@ impl Renderer {
             pixel_size: (1.0 / c.fx) as f32,
             drawn: turn.drawn,
             first_sample: turn.first_sample,
-        };
-        slot.frame.write(&[frame]);
-        slot.parity = 1 - self.last.parity;
-        slot.lists[slot.parity].submit(&mut slot.fence)?;
-        if decides_rates {
-            self.rated.copy_from_slice(slot.tile_list.active());
         }
-        let lost = (0..inputs.poses.len()).map(|i| is_lost(&self.tracked, i, inputs.lost));
-        self.last.becomes(inputs, slot.parity, lost);
-        Ok(())
     }
 }

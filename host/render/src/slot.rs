@@ -1,25 +1,13 @@
 //! One frame in flight: its memory on both sides, what it cost, and what can be read back.
 
+use super::frame_buffers::FrameBuffers;
+use super::passes::PASSES;
 use super::renderer::Resources;
 use super::tiles::TileList;
-use crate::gpu::{BindingSet, Buffer, CommandList, FrameFence, GpuError};
+use crate::gpu::{BindingSet, CommandList, FrameFence, GpuError};
 use dpm_device::planes::Raster;
 use dpm_shaders::structs::{Counters, Guide, History, Surface};
 use std::sync::Arc;
-
-/// Names of the passes whose ends are stamped, in order.
-pub const PASSES: &[&str] = &[
-    "primary",
-    "reproject",
-    "rate map",
-    "schedule",
-    "trace",
-    "accumulate",
-    "spatial",
-    "compensate",
-    "pack",
-    "readback",
-];
 
 /// What a frame cost.
 #[derive(Clone, Copy, Debug, Default)]
@@ -45,19 +33,7 @@ pub struct FrameSlot {
     /// One for each of the two history buffers that a frame may write.
     pub(super) lists: [CommandList; 2],
     pub(super) _sets: [BindingSet; 2],
-    pub(super) frame: Buffer,
-    pub(super) instances: Buffer,
-    pub(super) arguments: Buffer,
-    pub(super) tiles: Buffer,
-    pub(super) counters_host: Buffer,
-    /// `None`: only the planes come back.
-    pub(super) codes_host: Option<Buffer>,
-    /// `None`: only the code values come back.
-    pub(super) planes_host: Option<Buffer>,
-    /// Bytes of all planes.
-    pub(super) plane_bytes: usize,
-    pub(super) _device_only: Vec<Buffer>,
-    pub(super) debug_host: Option<DebugBuffers>,
+    pub(super) buffers: FrameBuffers,
     pub(super) tile_list: TileList,
     pub(super) raster: Raster,
     /// Which of the lists ran last.
@@ -65,18 +41,6 @@ pub struct FrameSlot {
     pub(super) stamps: [u64; PASSES.len() + 1],
     // Dropped last: pipelines and buffers that the submission uses.
     pub(super) _resources: Arc<Resources>,
-}
-
-/// Copies for looking at.
-pub(super) struct DebugBuffers {
-    pub(super) shown: Buffer,
-    pub(super) surfaces: Buffer,
-    /// `None` for the methods that do without; so below.
-    pub(super) guides: Option<Buffer>,
-    pub(super) history: Option<Buffer>,
-    pub(super) prior: Option<Buffer>,
-    pub(super) traced: Buffer,
-    pub(super) rates: Buffer,
 }
 
 impl FrameSlot {
@@ -101,7 +65,7 @@ impl FrameSlot {
     /// What the finished frame cost.
     fn cost(&mut self) -> FrameCost {
         let mut cost = FrameCost {
-            counters: bytemuck::cast(self.counters_host.read::<Counters>(1)[0]),
+            counters: bytemuck::cast(self.buffers.counters_host.read::<Counters>(1)[0]),
             ..FrameCost::default()
         };
         let n = self.lists[self.parity].stamps_ns(&mut self.stamps);
@@ -115,40 +79,40 @@ impl FrameSlot {
 
     /// Code values 0x00BBGGRR, row by row; empty when the renderer's output is planes alone. Valid after [`FrameSlot::wait`].
     pub fn codes(&self) -> &[u32] {
-        self.codes_host.as_ref().map_or(&[], |codes| codes.read(self.raster.pixel_count()))
+        self.buffers.codes_host.as_ref().map_or(&[], |codes| codes.read(self.raster.pixel_count()))
     }
 
     /// Bit planes as [`crate::pack::gpu`] lays them out; `None` unless the renderer packs. Valid after [`FrameSlot::wait`].
     pub fn planes(&self) -> Option<&[u8]> {
-        self.planes_host.as_ref().map(|planes| planes.read(self.plane_bytes))
+        self.buffers.planes_host.as_ref().map(|planes| planes.read(self.buffers.plane_bytes))
     }
 
     /// Mean radiance and sample count of every pixel; only with `debug` at creation.
     pub fn radiance(&self) -> Option<&[[f32; 4]]> {
-        self.debug_host.as_ref().map(|d| d.shown.read(self.raster.pixel_count()))
+        self.buffers.debug_host.as_ref().map(|d| d.shown.read(self.raster.pixel_count()))
     }
 
     /// What each pixel's ray met; only with `debug` at creation.
     pub fn surfaces(&self) -> Option<&[Surface]> {
-        self.debug_host.as_ref().map(|d| d.surfaces.read(self.raster.pixel_count()))
+        self.buffers.debug_host.as_ref().map(|d| d.surfaces.read(self.raster.pixel_count()))
     }
 
     /// Noise-free facts of each lit pixel; only with `debug` at creation and for methods that use them.
     pub fn guides(&self) -> Option<&[Guide]> {
-        let guides = self.debug_host.as_ref()?.guides.as_ref()?;
+        let guides = self.buffers.debug_host.as_ref()?.guides.as_ref()?;
         Some(guides.read(self.raster.pixel_count()))
     }
 
     /// History after this frame; only with `debug` at creation and for methods that keep one.
     pub fn history(&self) -> Option<&[History]> {
-        let history = self.debug_host.as_ref()?.history.as_ref()?;
+        let history = self.buffers.debug_host.as_ref()?.history.as_ref()?;
         Some(history.read(self.raster.pixel_count()))
     }
 
     /// Luminance that each pixel's history had before this frame's samples, -1 where none; only with `debug` at creation and for methods
     /// that keep a history.
     pub fn prior_luminance(&self) -> Option<Vec<f32>> {
-        self.debug_host.as_ref()?.prior.as_ref().map(|prior| {
+        self.buffers.debug_host.as_ref()?.prior.as_ref().map(|prior| {
             let known = |h: &History| {
                 let [r, g, b] = h.mean;
                 if h.weight > 0.0 {
@@ -163,11 +127,11 @@ impl FrameSlot {
 
     /// Samples taken at each pixel this frame, w of the radiance; only with `debug` at creation.
     pub fn traced(&self) -> Option<&[[f32; 4]]> {
-        self.debug_host.as_ref().map(|d| d.traced.read(self.raster.pixel_count()))
+        self.buffers.debug_host.as_ref().map(|d| d.traced.read(self.raster.pixel_count()))
     }
 
     /// Shading rate of every tile, log2 of the coarse pixel's sides in bits 0..1 and 2..3; only with `debug` at creation.
     pub fn rates(&self) -> Option<&[u32]> {
-        self.debug_host.as_ref().map(|d| d.rates.read(self.tile_list.len()))
+        self.buffers.debug_host.as_ref().map(|d| d.rates.read(self.tile_list.len()))
     }
 }

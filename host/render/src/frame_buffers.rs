@@ -1,0 +1,188 @@
+//! The memory of one frame in flight, on both sides, and which of it each binding of the shaders means.
+
+use super::fill::fill;
+use super::memory::{BytesPerPixel, SharedBuffers};
+use super::renderer::{Output, RendererSettings};
+use super::scene_gpu::{table_buffer, SceneGpu};
+use crate::gpu::{Buffer, Gpu, GpuError, MemoryKind};
+use crate::pack;
+use bytemuck::Zeroable;
+use dpm_shaders::structs::{Counters, Frame, Guide, Instance, Schedule, Surface, NO_HIT};
+use std::sync::Arc;
+
+/// What one frame in flight needs for itself.
+pub(super) struct FrameBuffers {
+    pub frame: Buffer,
+    pub instances: Buffer,
+    pub arguments: Buffer,
+    pub tiles: Buffer,
+    pub counters: Buffer,
+    pub counters_host: Buffer,
+    pub surfaces: Buffer,
+    pub radiance: Buffer,
+    pub codes: Buffer,
+    /// `None`: only the planes come back.
+    pub codes_host: Option<Buffer>,
+    pub planes: Buffer,
+    /// `None`: only the code values come back.
+    pub planes_host: Option<Buffer>,
+    /// Bytes of all planes.
+    pub plane_bytes: usize,
+    pub guides: Buffer,
+    pub schedule: Buffer,
+    pub work: Buffer,
+    /// The history's picture.
+    pub filtered: Buffer,
+    /// The picture after the spatial filter.
+    pub filtered_shown: Buffer,
+    /// Copies for looking at, where they were asked for.
+    pub debug_host: Option<DebugBuffers>,
+    /// Sizes of those that grow with the raster.
+    pub each: BytesPerPixel,
+}
+
+/// Copies for looking at.
+pub(super) struct DebugBuffers {
+    pub shown: Buffer,
+    pub surfaces: Buffer,
+    /// `None` for the methods that do without; so below.
+    pub guides: Option<Buffer>,
+    pub history: Option<Buffer>,
+    pub prior: Option<Buffer>,
+    pub traced: Buffer,
+    pub rates: Buffer,
+}
+
+impl FrameBuffers {
+    /// Memory for a scene of `bodies` bodies and a raster of `tiles` tiles; `debug` adds the copies for looking at. Tiles that are never traced
+    /// read as nothing hit and black from the start.
+    ///
+    /// # Errors
+    /// Out of memory.
+    pub(super) fn new(
+        gpu: &Arc<Gpu>,
+        settings: &RendererSettings,
+        (bodies, tiles): (usize, usize),
+        debug: bool,
+    ) -> Result<Self, GpuError> {
+        use MemoryKind::{Device, Readback, Upload};
+        let pixels = settings.raster.pixel_count();
+        let size = |what, bytes, kind| Buffer::new(gpu, what, bytes, kind);
+        let table = |what, bytes, kind| table_buffer(gpu, what, bytes, kind);
+        let each = BytesPerPixel::of(&settings.method);
+        // What the method does without is bound all the same, but as small as can be.
+        let with = |what, each: usize| table(what, (pixels * each).max(16), Device);
+        let packed = settings.output.schedule();
+        let plane_bytes = packed.map_or(4, |schedule| pack::gpu::len_bytes(settings.raster, schedule));
+        let codes_host = match settings.output {
+            Output::Planes(_) => None,
+            Output::Codes | Output::Both(_) => Some(size("code values", pixels * each.codes, Readback)?),
+        };
+        Ok(Self {
+            frame: size("frame uniforms", size_of::<Frame>(), Upload)?,
+            instances: table("instances", size_of::<Instance>() * bodies.max(1), Upload)?,
+            arguments: size("dispatch arguments", 32, Upload)?,
+            tiles: size("tile list", tiles * 4, Upload)?,
+            counters: size("counters", size_of::<Counters>(), Device)?,
+            counters_host: size("counters", size_of::<Counters>(), Readback)?,
+            surfaces: table("surfaces", pixels * each.surfaces, Device)?,
+            radiance: size("radiance", pixels * each.radiance, Device)?,
+            codes: size("code values", pixels * each.codes, Device)?,
+            codes_host,
+            planes: size("bit planes", plane_bytes, Device)?,
+            planes_host: packed.map(|_| size("bit planes", plane_bytes, Readback)).transpose()?,
+            plane_bytes,
+            guides: with("guides", each.guides)?,
+            schedule: size("schedule", size_of::<Schedule>(), Device)?,
+            work: size("work list", pixels * each.work, Device)?,
+            filtered: with("filtered radiance", each.filtered)?,
+            filtered_shown: with("shown radiance", each.shown)?,
+            debug_host: debug.then(|| DebugBuffers::new(gpu, pixels, tiles, each)).transpose()?,
+            each,
+        })
+    }
+
+    /// Makes tiles that are never traced read as nothing hit and black.
+    ///
+    /// # Errors
+    /// The GPU's own.
+    pub(super) fn clear(&self, gpu: &Arc<Gpu>, settings: &RendererSettings) -> Result<(), GpuError> {
+        let pixels = settings.raster.pixel_count();
+        let nothing = Surface { id: NO_HIT, ..Surface::zeroed() };
+        fill(gpu, &self.surfaces, &nothing, pixels)?;
+        fill(gpu, &self.codes, &0u32, pixels)?;
+        fill(gpu, &self.radiance, &[0f32; 4], pixels)?;
+        if self.each.guides > 0 {
+            fill(gpu, &self.guides, &Guide::zeroed(), pixels)?;
+        }
+        fill(gpu, self.shown(settings), &[0f32; 4], pixels)
+    }
+
+    /// The picture that is shown: that of the last pass before compensation that the method has.
+    pub(super) fn shown(&self, settings: &RendererSettings) -> &Buffer {
+        if settings.method.needs_spatial() {
+            &self.filtered_shown
+        } else if settings.method.needs_history() {
+            &self.filtered
+        } else {
+            &self.radiance
+        }
+    }
+
+    /// The buffer that the binding `name` means in frames that write history `parity`.
+    pub(super) fn of<'a>(
+        &'a self,
+        name: &str,
+        parity: usize,
+        settings: &RendererSettings,
+        (shared, scene): (&'a SharedBuffers, &'a SceneGpu),
+    ) -> &'a Buffer {
+        match name {
+            "B_FRAME" => &self.frame,
+            "B_INSTANCES" => &self.instances,
+            "B_NODES" => &scene.nodes,
+            "B_TRIANGLES" => &scene.triangles,
+            "B_TRIANGLE_REFS" => &scene.refs,
+            "B_VERTICES" => &scene.vertices,
+            "B_MATERIALS" => &scene.materials,
+            "B_TEXTURES" => &scene.textures,
+            "B_TEXELS" => &scene.texels,
+            "B_LIGHTS" => &scene.lights,
+            "B_ENVIRONMENT" => &scene.environment,
+            "B_ALBEDO" => &scene.albedo,
+            "B_TILES" => &self.tiles,
+            "B_SURFACES" | "B_SURFACE_ROWS" => &self.surfaces,
+            "B_RADIANCE" => &self.radiance,
+            "B_CODES" => &self.codes,
+            "B_COUNTERS" => &self.counters,
+            "B_GUIDES" | "B_GUIDE_ROWS" => &self.guides,
+            "B_HISTORY" | "B_HISTORY_ROWS" => &shared.history[parity],
+            "B_FORMER" => &shared.history[1 - parity],
+            "B_RATES" => &shared.rates,
+            "B_RATE_TABLE" => &shared.rate_table,
+            "B_SCHEDULE" => &self.schedule,
+            "B_WORK" => &self.work,
+            "B_NOISE" => &shared.noise,
+            "B_FILTERED" | "B_FILTERED_ROWS" => &self.filtered,
+            "B_SHOWN" => self.shown(settings),
+            "B_PLANES" => &self.planes,
+            other => unreachable!("binding {other} has no buffer"),
+        }
+    }
+}
+
+impl DebugBuffers {
+    fn new(gpu: &Arc<Gpu>, pixels: usize, tiles: usize, each: BytesPerPixel) -> Result<Self, GpuError> {
+        let size = |what, bytes| Buffer::new(gpu, what, bytes, MemoryKind::Readback);
+        let kept = |what, each: usize| (each > 0).then(|| size(what, pixels * each)).transpose();
+        Ok(Self {
+            shown: size("shown radiance", pixels * 16)?,
+            surfaces: size("surfaces", pixels * each.surfaces)?,
+            guides: kept("guides", each.guides)?,
+            history: kept("history", each.history)?,
+            prior: kept("prior history", each.history)?,
+            traced: size("radiance", pixels * each.radiance)?,
+            rates: size("shading rates", tiles * 4)?,
+        })
+    }
+}

@@ -1,0 +1,252 @@
+//! The passes of a frame, one row each: what runs, when, over what, and which buffers it reads and writes.
+
+use super::renderer::RendererSettings;
+use super::scene_data::Keep;
+use crate::pack;
+use dpm_shaders as shaders;
+use dpm_shaders::Shader;
+
+/// One pass of a frame.
+pub(super) struct Pass {
+    /// As in reports.
+    pub name: &'static str,
+    /// The shader; `true` asks for the one that reads tables through texel buffers.
+    pub shader: fn(bool) -> Shader,
+    /// Whether the pass is recorded. What the method does without is not.
+    pub when: fn(&RendererSettings, Keep) -> bool,
+    /// How many workgroups run.
+    pub grid: Grid,
+    /// Buffers that an earlier pass of this frame, or the frame before, has written and that this pass reads. Inputs that no pass writes are
+    /// not listed: the frame's constants, the tiles, the scene, the noise and the table of rates.
+    #[cfg_attr(not(test), allow(dead_code))]
+    pub reads: &'static [&'static str],
+    /// Buffers that this pass writes.
+    #[cfg_attr(not(test), allow(dead_code))]
+    pub writes: &'static [&'static str],
+}
+
+/// How many workgroups of a pass run.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(super) enum Grid {
+    /// Four a listed tile.
+    Tiles,
+    /// One a listed tile, in frames that decide rates.
+    Rates,
+    /// As many as the pass `schedule` asked for.
+    Work,
+    /// All of the bit planes.
+    Planes,
+}
+
+/// Every pass, in the order in which they run. Between two of them lies a barrier.
+pub(super) const TABLE: [Pass; 9] = [
+    Pass {
+        name: "primary",
+        shader: |texel| shaders::PRIMARY.reading(texel),
+        when: |_, _| true,
+        grid: Grid::Tiles,
+        reads: &["B_COUNTERS", "B_FORMER"],
+        writes: &["B_SURFACES", "B_COUNTERS", "B_GUIDES"],
+    },
+    Pass {
+        name: "reproject",
+        shader: |texel| shaders::REPROJECT.reading(texel),
+        when: |s, _| s.method.needs_history(),
+        grid: Grid::Tiles,
+        reads: &["B_SURFACES", "B_GUIDES", "B_SCHEDULE", "B_FORMER"],
+        writes: &["B_HISTORY", "B_SCHEDULE", "B_SHOWN"],
+    },
+    Pass {
+        name: "rate map",
+        shader: |texel| shaders::RATE_MAP.reading(texel),
+        when: |s, keep| s.method.needs_rates() || keep.rate_map && s.method.needs_history(),
+        grid: Grid::Rates,
+        reads: &["B_SURFACES", "B_GUIDES", "B_HISTORY"],
+        writes: &["B_RATES"],
+    },
+    Pass {
+        name: "schedule",
+        shader: |texel| shaders::SCHEDULE.reading(texel),
+        when: |_, _| true,
+        grid: Grid::Tiles,
+        reads: &["B_SURFACES", "B_GUIDES", "B_HISTORY", "B_RATES", "B_SCHEDULE"],
+        writes: &["B_RADIANCE", "B_SCHEDULE", "B_WORK"],
+    },
+    Pass {
+        name: "trace",
+        shader: |texel| shaders::TRACE.reading(texel),
+        when: |_, _| true,
+        grid: Grid::Work,
+        reads: &["B_SURFACES", "B_COUNTERS", "B_HISTORY", "B_SCHEDULE", "B_WORK"],
+        writes: &["B_RADIANCE", "B_COUNTERS", "B_FILTERED"],
+    },
+    Pass {
+        name: "accumulate",
+        shader: |texel| shaders::ACCUMULATE.reading(texel),
+        when: |s, _| s.method.needs_history(),
+        grid: Grid::Tiles,
+        reads: &["B_SURFACES", "B_RADIANCE", "B_GUIDES", "B_HISTORY", "B_RATES", "B_FILTERED", "B_SHOWN"],
+        writes: &["B_HISTORY", "B_FILTERED"],
+    },
+    Pass {
+        name: "spatial",
+        shader: |texel| shaders::SPATIAL.reading(texel),
+        when: |s, _| s.method.needs_spatial(),
+        grid: Grid::Tiles,
+        reads: &["B_SURFACES", "B_GUIDES", "B_HISTORY", "B_FILTERED"],
+        writes: &["B_SHOWN"],
+    },
+    Pass {
+        name: "compensate",
+        shader: |texel| shaders::COMPENSATE.reading(texel),
+        when: |_, _| true,
+        grid: Grid::Tiles,
+        reads: &["B_SURFACES", "B_COUNTERS", "B_SHOWN"],
+        writes: &["B_CODES", "B_COUNTERS"],
+    },
+    Pass {
+        name: "pack",
+        shader: |_| shaders::PACK,
+        when: |s, _| s.output.schedule().is_some(),
+        grid: Grid::Planes,
+        reads: &["B_CODES"],
+        writes: &["B_PLANES"],
+    },
+];
+
+/// Names of the passes whose ends are stamped, in order; the last is the copying of what the host reads.
+pub const PASSES: &[&str] = &{
+    let mut names = ["readback"; TABLE.len() + 1];
+    let mut i = 0;
+    while i < TABLE.len() {
+        names[i] = TABLE[i].name;
+        i += 1;
+    }
+    names
+};
+
+impl Pass {
+    /// Specialisation constants: `shared` with every pass that reads the scene; packing has its own.
+    pub(super) fn constants(&self, shared: &[(u32, u32)], settings: &RendererSettings) -> Vec<(u32, u32)> {
+        match (self.grid, settings.output.schedule()) {
+            (Grid::Planes, Some(schedule)) => pack::gpu::constants(settings.raster, schedule).to_vec(),
+            _ => shared.to_vec(),
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use dpm_shaders::structs::BINDINGS;
+    use std::collections::{BTreeSet, HashMap};
+
+    /// What no pass writes: the host fills it, at the start or before a frame.
+    const INPUTS: [&str; 15] = [
+        "B_FRAME",
+        "B_INSTANCES",
+        "B_NODES",
+        "B_TRIANGLES",
+        "B_TRIANGLE_REFS",
+        "B_VERTICES",
+        "B_MATERIALS",
+        "B_TEXTURES",
+        "B_TEXELS",
+        "B_LIGHTS",
+        "B_ENVIRONMENT",
+        "B_ALBEDO",
+        "B_TILES",
+        "B_RATE_TABLE",
+        "B_NOISE",
+    ];
+
+    /// Names of the buffers that a shader loads from and stores to, as its SPIR-V says: every pointer is followed back to the variable that it
+    /// was made from. Inputs are left out; a second binding of a buffer as texels counts as the buffer.
+    fn loads_and_stores(shader: &Shader) -> [BTreeSet<&'static str>; 2] {
+        let words: Vec<u32> =
+            shader.spirv.chunks_exact(4).map(|w| u32::from_le_bytes(w.try_into().unwrap())).collect();
+        let (mut binding, mut origin) = (HashMap::new(), HashMap::new());
+        let mut touched = [BTreeSet::new(), BTreeSet::new()];
+        let mut at = 5;
+        while at < words.len() {
+            let (length, op) = ((words[at] >> 16) as usize, words[at] & 0xffff);
+            let a = &words[at + 1..at + length];
+            let mut touch = |pointer: u32, load: bool, store: bool| {
+                if let Some(&variable) = origin.get(&pointer) {
+                    if load {
+                        touched[0].insert(variable);
+                    }
+                    if store {
+                        touched[1].insert(variable);
+                    }
+                }
+            };
+            match op {
+                // OpDecorate Binding, OpVariable, then OpLoad, OpStore and atomics.
+                71 if a[1] == 33 => drop(binding.insert(a[0], a[2])),
+                61 => touch(a[2], true, false),
+                62 => touch(a[0], false, true),
+                228 => touch(a[0], false, true),
+                227 => touch(a[2], true, false),
+                229..=242 => touch(a[2], true, true),
+                57 => assert!(
+                    !a[3..].iter().any(|p| origin.contains_key(p)),
+                    "a pointer is passed to a function"
+                ),
+                _ => {}
+            }
+            match op {
+                59 => drop(origin.insert(a[1], a[1])),
+                // Access chains and copies.
+                65 | 66 | 83 => {
+                    if let Some(&variable) = origin.get(&a[2]) {
+                        origin.insert(a[1], variable);
+                    }
+                }
+                _ => {}
+            }
+            at += length;
+        }
+        touched.map(|variables| {
+            variables
+                .into_iter()
+                .filter_map(|v| binding.get(&v))
+                .map(|b| BINDINGS.iter().find(|(_, known)| known == b).expect("a known binding").0)
+                .map(|name| match name {
+                    "B_SURFACE_ROWS" => "B_SURFACES",
+                    "B_GUIDE_ROWS" => "B_GUIDES",
+                    "B_HISTORY_ROWS" => "B_HISTORY",
+                    "B_FILTERED_ROWS" => "B_FILTERED",
+                    name => name,
+                })
+                .filter(|name| !INPUTS.contains(name))
+                .collect()
+        })
+    }
+
+    #[test]
+    fn every_row_says_what_its_shader_reads_and_writes() {
+        for pass in &TABLE {
+            for texel in [true, false] {
+                let shader = (pass.shader)(texel);
+                let listed = [pass.reads, pass.writes].map(|names| names.iter().copied().collect());
+                let [loads, stores] = loads_and_stores(&shader);
+                assert_eq!([loads, stores], listed, "{}: [reads, writes]", shader.name);
+            }
+        }
+    }
+
+    /// What a pass reads was written by a pass before it in this frame, is cleared or filled before the first, or is kept from the frame before.
+    #[test]
+    fn nothing_is_read_before_it_is_written() {
+        let kept = ["B_COUNTERS", "B_SCHEDULE", "B_FORMER", "B_RATES"];
+        let mut written: BTreeSet<&str> = kept.into();
+        for pass in &TABLE {
+            for name in pass.reads {
+                // The history's pass is left out together with all that read what it writes.
+                assert!(written.contains(name), "{} reads {name}", pass.name);
+            }
+            written.extend(pass.writes);
+        }
+    }
+}
