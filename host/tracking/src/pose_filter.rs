@@ -67,7 +67,7 @@ pub struct PoseFilterConfig {
     pub max_acceleration_m_s2: f64,
     /// Strongest angular acceleration taken for real, rad/s^2.
     pub max_angular_acceleration_rad_s2: f64,
-    /// Horizons up to this count as [`Freshness::Tracked`]: the rig's own latency and a missing sample or two, ns. With a tracker
+    /// Horizons up to this count as [`super::state::Freshness::Tracked`]: the rig's own latency and a missing sample or two, ns. With a tracker
     /// below 500 Hz it is that of two periods, and at most `lost_after_ns`.
     pub tracked_for_ns: i64,
     /// Longest time that motion is carried on without samples; then the body is lost, ns. A track may be older: it goes on with the

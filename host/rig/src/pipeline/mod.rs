@@ -7,7 +7,7 @@
 //!                            +---------------------------------[notes]-----------------------+
 //! ```
 //!
-//! One frame is one [`job::FrameJob`]: memory and a note, boxed once and recycled. In the steady state no stage allocates, locks or
+//! One frame is one [`crate::frame::job::FrameJob`]: memory and a note, boxed once and recycled. In the steady state no stage allocates, locks or
 //! logs, and every wait is bounded. All hand-offs are those of `dpm_handoff`.
 
 mod connect;
