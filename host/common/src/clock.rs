@@ -83,7 +83,7 @@ impl ManualClock {
     }
 
     /// Moves the clock to `at`; it never goes back. Returns the time now.
-    pub(crate) fn advance_to(&self, at: HostTime) -> HostTime {
+    pub fn advance_to(&self, at: HostTime) -> HostTime {
         // Acquire and release: what happened before the clock was moved is seen by whoever reads the new time.
         HostTime(self.now_ns.fetch_max(at.0, Ordering::AcqRel).max(at.0))
     }

@@ -1,4 +1,16 @@
 //! The laboratory: what judges the rig and its renderer. Each experiment is a command and a test.
+//!
+//! # Example: one of the stiff cases
+//!
+//! ```
+//! use dpm_lab::stability::{cases, StabilityReport, SEED};
+//!
+//! let mut report = StabilityReport::default();
+//! report.run_cases(&cases(), Some("compensation-extremes"), SEED..=SEED, |case| {
+//!     println!("{}: {:?} of at most {} {}", case.name, case.error, case.bound, case.unit);
+//! });
+//! assert_eq!((report.cases.len(), report.passed), (1, 1));
+//! ```
 
 pub mod bench;
 pub mod conformance;

@@ -1,4 +1,20 @@
 //! Frame inputs into code values and bit planes: what the shaders compute, and the tables and CPU twins that they share.
+//!
+//! # Example: code values into bit planes, without a GPU
+//!
+//! ```
+//! use dpm_device::planes::{PlaneSchedule, Raster};
+//! use dpm_render::pack::{pack, unpack, BitPlaneFrame, Kernel};
+//!
+//! let raster = Raster::new(64, 48).expect("sides in range");
+//! let codes: Vec<u32> = (0..raster.pixel_count() as u32).map(|i| i * 1001 & 0x00ff_ffff).collect();
+//! let mut planes = BitPlaneFrame::new(raster, PlaneSchedule::rgb24());
+//! pack(Kernel::best(), &codes, &mut planes);
+//!
+//! let mut back = vec![0; codes.len()];
+//! unpack(&planes, &mut back);
+//! assert_eq!(back, codes, "nothing is lost");
+//! ```
 
 pub mod blue_noise;
 mod body_bvh;

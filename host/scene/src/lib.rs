@@ -2,6 +2,20 @@
 //!
 //! Lengths in metres, Y up, right-handed, linear Rec. 709 colour. Radiance is in scene units: a unit of radiance is what
 //! `projector.white_radiance` in the rig file relates to the projector's brightest light.
+//!
+//! # Example: the scene of the demo
+//!
+//! ```
+//! use dpm_scene::SceneFeatures;
+//!
+//! let scene = dpm_scene::builtin();
+//! let tracked: Vec<&str> =
+//!     scene.bodies.iter().filter(|body| body.tracked.is_some()).map(|body| body.name.as_str()).collect();
+//! assert_eq!(tracked.len(), 2, "{tracked:?}");
+//! // What the scene does not need is left out of the shaders.
+//! let features = SceneFeatures::of(&scene);
+//! println!("{features:?}");
+//! ```
 
 pub mod albedo_table;
 pub mod builtin;
