@@ -26,7 +26,7 @@ fn main() -> ExitCode {
     match result {
         Ok(()) => ExitCode::SUCCESS,
         Err(error) => {
-            eprintln!("hil-mock: {error}");
+            serve::complain(format_args!("hil-mock: {error}"));
             ExitCode::FAILURE
         }
     }

@@ -184,20 +184,22 @@ impl UsbPlug {
         lock(&self.shared.state).delay_ns = ns;
     }
 
-    /// Queues a transfer. Gives it back when the plug is pulled.
+    /// Queues a transfer. Gives it back when the plug is pulled, and where the system gives no thread for its endpoint.
     pub fn submit(&self, request: Request) -> Result<(), Request> {
         let mut s = lock(&self.shared.state);
         if s.pulled {
             return Err(request);
         }
         let endpoint = request.endpoint;
-        let first = !s.queues.contains_key(&endpoint);
+        if !s.queues.contains_key(&endpoint) {
+            let (shared, name) = (self.shared.clone(), format!("usb-{endpoint:02x}"));
+            // It waits for the lock that is held here.
+            if std::thread::Builder::new().name(name).spawn(move || shared.work(endpoint)).is_err() {
+                return Err(request);
+            }
+        }
         s.queues.entry(endpoint).or_default().pending.push_back(request);
         self.shared.changed.notify_all();
-        if first {
-            let shared = self.shared.clone();
-            std::thread::spawn(move || shared.work(endpoint));
-        }
         Ok(())
     }
 

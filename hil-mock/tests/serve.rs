@@ -1,8 +1,9 @@
-//! `hil-mock serve` as a program: what a second one on the same port is told.
+//! `hil-mock serve` as a program: what a second one on the same port is told, and what becomes of one that nobody listens to.
 
 use std::io::{BufRead, BufReader};
 use std::net::{TcpListener, UdpSocket};
 use std::process::{Child, ChildStdout, Command, Stdio};
+use std::time::{Duration, Instant};
 
 /// The program, ended with the test, and its output, which must stay open as long as it speaks.
 struct Served(Child, Option<BufReader<ChildStdout>>);
@@ -15,8 +16,12 @@ impl Drop for Served {
 }
 
 fn command(words: &[&str]) -> Command {
+    command_for(words, "60")
+}
+
+fn command_for(words: &[&str], seconds: &str) -> Command {
     let mut command = Command::new(env!("CARGO_BIN_EXE_hil-mock"));
-    command.arg("serve").args(words).args(["--seconds", "60"]);
+    command.arg("serve").args(words).args(["--seconds", seconds]);
     command
 }
 
@@ -56,6 +61,28 @@ fn a_second_server_on_the_same_port_is_refused_by_name() {
         let port = words[2].rsplit(':').next().expect("a port");
         assert!(first.0.try_wait().expect("asked").is_none(), "{words:?}: the first one ended");
         assert!(told.contains("another program") && told.contains(flag) && told.contains(port), "{told}");
+    }
+}
+
+/// Noticed in use: `hil-mock serve ... | head` ended the device with a panic.
+#[test]
+fn a_reader_that_goes_away_does_not_end_the_device() {
+    let (natnet, data, vrpn) = (free_udp(), free_udp(), free_tcp());
+    for words in [
+        vec!["natnet", "--command-port", &natnet, "--data-port", &data],
+        vec!["vrpn", "--port", &vrpn],
+        vec!["serial"],
+        vec!["projector", "--port", "pty"],
+        vec!["projector", "--usbip", "127.0.0.1:0", "--faults", "unplug@0.2s+0.1s"],
+        vec!["dlpc900", "--usbip", "127.0.0.1:0"],
+    ] {
+        let (reader, writer) = std::io::pipe().expect("a pipe");
+        drop(reader);
+        let started = Instant::now();
+        let output = command_for(&words, "1").stdout(writer).stderr(Stdio::piped()).output().expect("runs");
+        let told = String::from_utf8_lossy(&output.stderr);
+        assert!(output.status.success() && told.is_empty(), "{words:?}: {} {told}", output.status);
+        assert!(started.elapsed() >= Duration::from_secs(1), "{words:?}: it served to the end of its time");
     }
 }
 

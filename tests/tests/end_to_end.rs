@@ -1,7 +1,8 @@
 //! The whole rig against the mock projector and tracker: what was rendered is what falls, where the object is, when it is there.
 
 use dpm_device::time::HostTime;
-use dpm_render::{FrameInputs, Renderer};
+use dpm_lab::sequence::draw;
+use dpm_render::Renderer;
 use dpm_rig::pipeline::{self, renderer_settings, RunOptions};
 use dpm_rig::telemetry::monitor::RunMonitor;
 use dpm_rig::telemetry::report::Report;
@@ -34,21 +35,9 @@ fn the_light_is_the_rendered_picture_in_all_24_planes() {
         for (light, record) in outcome.light.iter().zip(&outcome.recent) {
             assert_eq!(light.frame, record.id.0 as u32);
             rig.scene_poses(&record.tracked_poses, &mut poses);
-            let (eye, gaze) = rig.observer.eye_and_gaze(&record.tracked_poses);
-            assert_eq!(eye, record.eye);
-            let inputs = FrameInputs {
-                frame: record.id.0 as u32,
-                spp: rig.config.render.spp,
-                budget_spp: rig.config.render.spp as f32,
-                camera: &rig.camera,
-                eye,
-                gaze,
-                widen_deg: 0.0,
-                poses: &poses,
-                lost: &[],
-            };
-            renderer.submit(&mut slot, &inputs).unwrap();
-            slot.wait(60_000_000_000).unwrap();
+            assert_eq!(rig.observer.eye_and_gaze(&record.tracked_poses).0, record.eye);
+            let spp = rig.config.render.spp;
+            draw(&rig, &mut renderer, &mut slot, &poses, light.frame, spp, spp as f32).unwrap();
             for (i, (code, fell)) in slot.codes().iter().zip(&light.codes).enumerate() {
                 let rendered = [*code as u8, (*code >> 8) as u8, (*code >> 16) as u8];
                 assert_eq!(rendered, *fell, "frame {} pixel {i}", light.frame);

@@ -190,13 +190,13 @@ fn write_all(mut file: File, samples: &Receiver<TrackerSample>, shared: &Shared)
     let done = AtomicBool::new(false);
     // Forcing bytes to the disk can take longer than the promised 100 ms; it must not hold up handing them to the kernel.
     std::thread::scope(|scope| {
-        scope.spawn(|| {
+        std::thread::Builder::new().name("tracker-sync".into()).spawn_scoped(scope, || {
             while !done.load(Ordering::Relaxed) {
                 std::thread::sleep(SYNC_EVERY);
                 // A disk that cannot be forced is reported by the last sync of all.
                 let _ = disk.sync_data();
             }
-        });
+        })?;
         let result = write_frames(&mut file, samples, shared);
         done.store(true, Ordering::Relaxed);
         result

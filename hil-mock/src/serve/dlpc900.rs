@@ -1,6 +1,7 @@
 //! `hil-mock serve dlpc900`: arguments into an emulated projector controller on a USB/IP port.
 
 use super::usb::{offer, UsbArguments};
+use super::{complain, say};
 use clap::{Args, ValueEnum};
 use dpm_device::dlpc900::image::PlaneOrder;
 use dpm_device::dlpc900::lut::Dmd;
@@ -100,9 +101,9 @@ pub(super) fn run(arguments: &Dlpc900Arguments) -> Result<(), Box<dyn Error>> {
         let is = m.sequencer(now);
         let started = matches!(is, Sequencer::Running(..)) && is != was;
         if arguments.verbose {
-            m.warnings()[warned..].iter().for_each(|w| println!("warning: {w}"));
+            m.warnings()[warned..].iter().for_each(|w| say(format_args!("warning: {w}")));
             if std::mem::discriminant(&is) != std::mem::discriminant(&was) || started {
-                print!("{}", m.summary(now));
+                say(format_args!("{}", m.summary(now).trim_end()));
             }
         }
         (warned, was) = (m.warnings().len(), is);
@@ -111,10 +112,10 @@ pub(super) fn run(arguments: &Dlpc900Arguments) -> Result<(), Box<dyn Error>> {
         for place in 0..m.table().len() {
             let path = folder.join(format!("{starts:03}-{place:03}.pgm"));
             if let Some(Err(e)) = m.projected_pgm(place).map(|bytes| std::fs::write(&path, bytes)) {
-                eprintln!("{}: {e}", path.display());
+                complain(format_args!("{}: {e}", path.display()));
                 return;
             }
         }
-        println!("sequence {starts}: {} patterns written to {}", m.table().len(), folder.display());
+        say(format_args!("sequence {starts}: {} patterns written to {}", m.table().len(), folder.display()));
     })
 }

@@ -10,6 +10,8 @@ mod vrpn;
 
 use clap::Subcommand;
 use std::error::Error;
+use std::fmt::Arguments;
+use std::io::Write;
 
 /// A mock device.
 #[derive(Subcommand)]
@@ -24,6 +26,16 @@ pub(crate) enum Device {
     Serial(serial::SerialArguments),
     /// VRPN server: poses over TCP
     Vrpn(vrpn::VrpnArguments),
+}
+
+/// Writes a line to the standard output. A reader that has gone away (`hil-mock serve ... | head`) is no error: the device goes on.
+fn say(line: Arguments<'_>) {
+    let _ = writeln!(std::io::stdout().lock(), "{line}");
+}
+
+/// Writes a line to the standard error stream, whether anybody reads it or not.
+pub(crate) fn complain(line: Arguments<'_>) {
+    let _ = writeln!(std::io::stderr().lock(), "{line}");
 }
 
 /// A time that ends: not NaN, not infinite, not negative.

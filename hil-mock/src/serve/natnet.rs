@@ -1,6 +1,7 @@
 //! `hil-mock serve natnet`: arguments into a running NatNet server.
 
 use super::bodies::{clock_from_now, TrackerArguments};
+use super::say;
 use clap::{Args, ValueEnum};
 use dpm_device::tracker::natnet::Version;
 use hil_mock::natnet_host::NatNetHost;
@@ -77,14 +78,18 @@ pub(super) fn run(arguments: &NatNetArguments) -> Result<(), Box<dyn Error>> {
     let address = SocketAddrV4::new(arguments.bind, arguments.command_port);
     let host = NatNetHost::start(server, streaming, address, clock_from_now())
         .map_err(|e| super::cannot_serve("NatNet", address, &e, "--command-port"))?;
-    println!("NatNet {version} on {}, {streaming:?}, data port {}", host.address(), arguments.data_port);
+    say(format_args!(
+        "NatNet {version} on {}, {streaming:?}, data port {}",
+        host.address(),
+        arguments.data_port
+    ));
     for (name, id) in bodies {
-        println!("  body {id}: {name}");
+        say(format_args!("  body {id}: {name}"));
     }
     let started = Instant::now();
     while host.is_running() {
         if arguments.tracker.seconds.is_some_and(|s| started.elapsed().as_secs_f64() >= s) {
-            println!("{} frames sent", host.frames_sent());
+            say(format_args!("{} frames sent", host.frames_sent()));
             return Ok(());
         }
         std::thread::sleep(Duration::from_millis(50));

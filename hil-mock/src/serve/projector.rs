@@ -19,8 +19,8 @@ use hil_mock::projector::{LightChange, MockConfig, MockProjector};
 use hil_mock::serial_server::pseudo_terminal;
 use hil_mock::usb_model::Speed;
 
-use super::cannot_open;
 use super::usb::{offer, UsbArguments};
+use super::{cannot_open, complain, say};
 
 /// Arguments of `hil-mock serve projector`.
 #[derive(Args)]
@@ -114,7 +114,7 @@ fn serve_port(
         let line = dpm_device::tty::open(port, arguments.baud);
         (line.map_err(|e| cannot_open(port, &e))?, port.to_string(), None)
     };
-    println!("bit-plane projector on {path}");
+    say(format_args!("bit-plane projector on {path}"));
     let mut device = SerialProjector::new(projector);
     let start = Instant::now();
     loop {
@@ -176,7 +176,7 @@ impl Report {
         while let Some(change) = projector.next_change() {
             if let Some(log) = &mut self.log {
                 if let Err(e) = log.write(&change, self.ahead_ns) {
-                    eprintln!("{}: {e}", log.path.display());
+                    complain(format_args!("{}: {e}", log.path.display()));
                     self.log = None;
                 }
             }
@@ -201,7 +201,7 @@ impl Report {
             s.header_errors.wrapping_add(s.payload_errors)
         );
         if text != self.said {
-            println!("{:8.1} s  {text}", now.0 as f64 * 1e-9);
+            say(format_args!("{:8.1} s  {text}", now.0 as f64 * 1e-9));
             self.said = text;
         }
         let (raster, lit) = (projector.raster(), projector.is_lit());
@@ -214,7 +214,7 @@ impl Report {
         };
         self.was_lit = lit;
         if let Err(e) = written {
-            eprintln!("{}: {e}", path.display());
+            complain(format_args!("{}: {e}", path.display()));
             self.light = None;
         }
     }

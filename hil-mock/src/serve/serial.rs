@@ -1,7 +1,7 @@
 //! `hil-mock serve serial`: arguments into a serial pose stream on a port or a new pseudo-terminal.
 
 use super::bodies::{clock_from_now, TrackerArguments};
-use super::cannot_open;
+use super::{cannot_open, say};
 use clap::Args;
 use hil_mock::serial_server::{pseudo_terminal, SerialPoseDevice, SerialPoseHost};
 use std::error::Error;
@@ -34,9 +34,9 @@ pub(super) fn run(arguments: &SerialArguments) -> Result<(), Box<dyn Error>> {
         }
     };
     let host = SerialPoseHost::start(SerialPoseDevice::new(source)?, port, clock_from_now())?;
-    println!("serial pose stream on {path}");
+    say(format_args!("serial pose stream on {path}"));
     for (number, name) in names.iter().enumerate() {
-        println!("  body {number}: {name}");
+        say(format_args!("  body {number}: {name}"));
     }
     let started = Instant::now();
     while host.is_running() {

@@ -1,5 +1,6 @@
 //! A USB device model on offer over USB/IP until stopped, with the faults of the cable played on time.
 
+use super::say;
 use clap::Args;
 use hil_mock::faults::{FaultKind, FaultPlan};
 use hil_mock::usb_model::UsbDeviceModel;
@@ -42,8 +43,8 @@ pub(super) fn offer(
     let mut plug = new_plug();
     let server = Server::start(arguments.usbip, export(&plug))
         .map_err(|e| super::cannot_serve("USB/IP", arguments.usbip, &e, "--usbip"))?;
-    println!("{name} over USB/IP on {}, bus id 1-1", server.address());
-    println!("  on the machine that is to see it: modprobe vhci-hcd; usbip attach -r HOST -b 1-1");
+    say(format_args!("{name} over USB/IP on {}, bus id 1-1", server.address()));
+    say(format_args!("  on the machine that is to see it: modprobe vhci-hcd; usbip attach -r HOST -b 1-1"));
     let mut out = false;
     let mut before = clock().0;
     loop {
@@ -55,13 +56,13 @@ pub(super) fn offer(
             (true, false) => {
                 server.set_exports(Vec::new());
                 plug.unplug();
-                println!("unplugged at {:.3} s", now.0 as f64 * 1e-9);
+                say(format_args!("unplugged at {:.3} s", now.0 as f64 * 1e-9));
                 out = true;
             }
             (false, true) => {
                 plug = new_plug();
                 server.set_exports(export(&plug));
-                println!("plugged in at {:.3} s", now.0 as f64 * 1e-9);
+                say(format_args!("plugged in at {:.3} s", now.0 as f64 * 1e-9));
                 out = false;
             }
             _ => {}

@@ -1,6 +1,7 @@
 //! `hil-mock serve vrpn`: arguments into a running VRPN server.
 
 use super::bodies::{clock_from_now, TrackerArguments};
+use super::say;
 use clap::Args;
 use hil_mock::vrpn_host::VrpnHost;
 use hil_mock::vrpn_server::{VrpnNames, VrpnReports};
@@ -35,9 +36,9 @@ pub(super) fn run(arguments: &VrpnArguments) -> Result<(), Box<dyn Error>> {
     let address = SocketAddrV4::new(arguments.bind, arguments.port);
     let host = VrpnHost::start(names, VrpnReports::new(source)?, address, clock_from_now())
         .map_err(|e| super::cannot_serve("VRPN", address, &e, "--port"))?;
-    println!("VRPN on {}, tracker {}", host.address(), shown.tracker);
+    say(format_args!("VRPN on {}, tracker {}", host.address(), shown.tracker));
     for (sensor, name) in shown.bodies.iter().enumerate() {
-        println!("  sensor {sensor}: {name}");
+        say(format_args!("  sensor {sensor}: {name}"));
     }
     let started = Instant::now();
     while host.is_running() {

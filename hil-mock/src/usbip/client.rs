@@ -63,7 +63,7 @@ impl RemoteCable {
         };
         let shared = Arc::new(Shared { state: Mutex::new(state), devid: record.bus << 16 | record.device });
         let reader = shared.clone();
-        std::thread::spawn(move || reader.read(stream));
+        std::thread::Builder::new().name("usbip-read".into()).spawn(move || reader.read(stream))?;
         let mut this = Self { shared, record, descriptors: Vec::new() };
         let mut descriptors = this.descriptor(1, 18)?;
         let head = this.descriptor(2, 9)?;

@@ -37,6 +37,11 @@ impl Export {
         Self { bus_id: bus_id.into(), cable, in_use: Arc::default() }
     }
 
+    /// True while a client has it, and for a moment after that client has gone.
+    pub fn is_in_use(&self) -> bool {
+        self.in_use.load(Ordering::Acquire)
+    }
+
     /// What clients are told about it.
     pub fn record(&self) -> DeviceRecord {
         let d = self.cable.descriptors();
@@ -101,22 +106,27 @@ impl Server {
         let (address, stop) = (listener.local_addr()?, Arc::new(AtomicBool::new(false)));
         let exports = Arc::new(Mutex::new(exports));
         let (stopped, offered) = (stop.clone(), exports.clone());
-        std::thread::spawn(move || {
+        std::thread::Builder::new().name("usbip-listen".into()).spawn(move || {
             for stream in listener.incoming() {
                 if stopped.load(Ordering::Acquire) {
                     return;
                 }
                 let Ok(stream) = stream else { continue };
                 let exports = offered.lock().unwrap_or_else(PoisonError::into_inner).clone();
-                std::thread::spawn(move || {
+                let connection = std::thread::Builder::new().name("usbip-serve".into()).spawn(move || {
                     // Small messages must not wait for each other; a client that does not read is given up.
                     let _ = stream.set_nodelay(true);
                     let _ = stream.set_write_timeout(Some(Duration::from_secs(10)));
                     // A client that breaks the protocol loses its connection; nobody else notices.
                     let _ = serve(stream, &exports);
                 });
+                if let Err(e) = connection {
+                    // Its stream is closed by now; the next one may find a thread.
+                    let _ =
+                        writeln!(std::io::stderr(), "a USB/IP client is turned away: no thread for it: {e}");
+                }
             }
-        });
+        })?;
         Ok(Self { address, stop, exports })
     }
 

@@ -25,14 +25,17 @@ use dpm_rig::pipeline::{renderer_settings, PipelineError};
 use dpm_rig::rig::Rig;
 use dpm_rig::run_rig::open_gpu;
 use dpm_rig::telemetry::monitor::{ProjectorHealth, RunMonitor};
-use std::sync::atomic::{AtomicBool, AtomicU8, Ordering};
+use std::sync::atomic::{AtomicBool, AtomicU32, AtomicU8, Ordering};
 use std::sync::{Arc, Mutex, PoisonError};
 use std::time::Duration;
 
 /// How often the run looks for orders, which the thread that makes dark has obeyed by then.
 const STEP: Duration = Duration::from_millis(20);
-/// How often the thread that makes dark looks for orders and for the end.
+/// How often the thread that makes dark looks for orders, at the interlock and for the end.
 const DARK_STEP: Duration = Duration::from_millis(2);
+/// How often a controller is told to be dark until the run has acted on it itself: a start of the run's that was under way may have
+/// followed the first word.
+const AGAIN_NS: u64 = u64::MAX;
 /// How long a controller may be in other hands at the start: those of the run before, or of what puts it to rest after a SIGKILL.
 const BUSY_PATIENCE_NS: u64 = 5_000_000_000;
 /// How often the controller is asked how it is, and a lost one is looked for.
@@ -345,6 +348,7 @@ pub(crate) fn present<P: HidPort>(
         d.hurry();
         // Half a command may have gone out before the stop; the first one after it may be lost with it.
         let stopped = d.stop().or_else(|e| if is_gone(&e) { Err(e) } else { d.stop() });
+        word.is_dark.store(stopped.is_ok(), Ordering::SeqCst);
         let rested = if matches!(stopped, Err(Dlpc900Error::Port { .. })) { stopped } else { d.idle() };
         (result, rested)
     });
@@ -368,10 +372,18 @@ struct Word {
     stop: Arc<AtomicBool>,
     /// The run has ended.
     over: AtomicBool,
-    /// The order that the run has not seen yet; 0 for none.
+    /// The order that the run has not acted on yet; 0 for none.
     waiting: AtomicU8,
-    /// The sequence is stopped for an upload, so nothing is lit, and a command from elsewhere would only tear the upload's apart.
-    loading: AtomicBool,
+    /// How often the interlock opened or closed, as the thread that makes dark saw it: an odd number while it is open. So the run
+    /// misses no opening, however short.
+    interlock: AtomicU32,
+    /// The number that the run has acted on.
+    interlock_done: AtomicU32,
+    /// How often the thread that makes dark has spoken. A command that hangs may lose its answer to that.
+    spoken: AtomicU32,
+    /// The run has stopped the sequence itself, for an upload or at its end, so nothing is lit, and a command from elsewhere would only
+    /// tear its own apart.
+    is_dark: AtomicBool,
     line: Mutex<Option<DarkLine>>,
 }
 
@@ -387,15 +399,27 @@ impl Drop for Over<'_> {
 impl Word {
     /// Obeys what must be dark within milliseconds, and hands every order on to the run.
     fn make_dark_when_told(&self, monitor: &RunMonitor) {
+        let (mut was_open, mut told) = (false, None::<Stopwatch>);
         while !self.over.load(Ordering::Acquire) {
+            let mut is_due =
+                told.as_ref().is_some_and(|told| told.elapsed_ns() >= AGAIN_NS) && self.must_be_dark();
             if let Some(order) = monitor.take_order() {
                 // Before it is obeyed: the run must not take a sequence that stops for one that stopped by itself.
                 let _ = self.waiting.fetch_update(Ordering::Relaxed, Ordering::Relaxed, |waiting| {
                     Some(outweighing(from_code(waiting), order) as u8)
                 });
-                if matches!(order, Order::Black | Order::Safe) {
-                    self.make_dark(false);
-                }
+                is_due |= order.is_dark();
+            }
+            let is_open = !monitor.light_allowed();
+            if is_open != was_open {
+                // Before it is obeyed, as above.
+                self.interlock.fetch_add(1, Ordering::SeqCst);
+                was_open = is_open;
+                let _ = is_open;
+            }
+            if is_due {
+                self.make_dark(false);
+                told = Some(Stopwatch::start());
             }
             // The signal itself as well: the thread that hands it on may be the one that hangs.
             if signals::received().is_some() {
@@ -410,19 +434,47 @@ impl Word {
 
     /// A cable that fails is the run's to tell.
     fn make_dark(&self, leds_off: bool) {
-        if self.loading.load(Ordering::SeqCst) {
+        if self.is_dark.load(Ordering::SeqCst) {
             return;
         }
         if let Some(line) = self.line.lock().unwrap_or_else(PoisonError::into_inner).as_mut() {
+            self.spoken.fetch_add(1, Ordering::SeqCst);
             let _ = line.dark(leds_off);
         }
     }
 
+    /// A sequence that has stopped may have been stopped by the thread that makes dark, for a reason that the run has not acted on yet.
     fn is_waiting(&self) -> bool {
-        self.waiting.load(Ordering::Relaxed) != 0 || self.stop.load(Ordering::Relaxed)
+        self.waiting.load(Ordering::Relaxed) != 0
+            || self.stop.load(Ordering::Relaxed)
+            || self.interlock.load(Ordering::SeqCst) != self.interlock_done.load(Ordering::SeqCst)
     }
 
-    /// The order that was not seen yet, once.
+    /// There is an order to be dark, or an open interlock, that the run has not acted on.
+    fn must_be_dark(&self) -> bool {
+        let number = self.interlock.load(Ordering::SeqCst);
+        self.order().is_some_and(Order::is_dark)
+            || !number.is_multiple_of(2) && number != self.interlock_done.load(Ordering::SeqCst)
+    }
+
+    /// The run's look at the interlock: whether there may be light, and the number to note in `interlock_done` once that is acted on.
+    fn look_at_interlock(&self, monitor: &RunMonitor) -> (bool, u32) {
+        let number = self.interlock.load(Ordering::SeqCst);
+        // While the other thread is still at its command to be dark, a start would be undone by it.
+        (number.is_multiple_of(2) && monitor.light_allowed(), number)
+    }
+
+    /// The order that was not acted on yet.
+    fn order(&self) -> Option<Order> {
+        from_code(self.waiting.load(Ordering::Relaxed))
+    }
+
+    /// The run has acted on `order`; one that came meanwhile goes on waiting.
+    fn acted_on(&self, order: Order) {
+        let _ = self.waiting.compare_exchange(order as u8, 0, Ordering::Relaxed, Ordering::Relaxed);
+    }
+
+    /// The order that was not acted on yet, once.
     fn take(&self) -> Option<Order> {
         from_code(self.waiting.swap(0, Ordering::Relaxed))
     }
@@ -458,67 +510,89 @@ fn watch_over<P: HidPort>(
     let mut standing: Option<Order> = None;
     let mut lost = false;
     // A controller that is set up shows at once: not before the interlock says so.
+    if !monitor.light_allowed() {
+        // A run that was killed may have left it lit. One that rests refuses, and is dark.
+        match d.stop() {
+            Ok(()) | Err(Dlpc900Error::Refused { .. }) => {}
+            Err(e) => return Err(e.into()),
+        }
+    }
     while !monitor.light_allowed() && !monitor.stop_requested() {
         monitor.set_projector(ProjectorHealth::InterlockOpen);
         std::thread::sleep(STEP);
     }
     let mut allowed = true;
-    let set_up = |d: &mut Dlpc900<P>, standing: &mut Option<Order>, report: &mut Dlpc900Report| {
-        let watch = Stopwatch::start();
-        *word.line.lock().unwrap_or_else(PoisonError::into_inner) = d.dark_line();
-        d.stop_when(Arc::clone(&word.stop));
-        // Before seconds go into an upload: out of the exercise that every run ends in, and of a sequence that a killed run left.
-        d.make_ready()?;
-        d.stop()?;
-        word.loading.store(true, Ordering::SeqCst);
-        let loaded = show.load(d);
-        word.loading.store(false, Ordering::SeqCst);
-        loaded?;
-        if let Some(order) = word.take() {
-            *standing = standing_after(*standing, order);
-        }
-        // Nobody's order to be dark is answered by light, not even by that of one pattern.
-        match *standing {
-            Some(Order::Black | Order::Safe) => {}
-            Some(Order::Freeze) => d.start().and_then(|()| d.pause())?,
-            Some(Order::Arm) | None => d.start()?,
-        }
-        report.setup_s = watch.elapsed_ns() as f64 * 1e-9;
-        monitor.set_projector(health(*standing));
-        Ok(())
-    };
-    match set_up(d, &mut standing, report) {
+    let set_up =
+        |d: &mut Dlpc900<P>, standing: &mut Option<Order>, allowed: &mut bool, report: &mut Dlpc900Report| {
+            let watch = Stopwatch::start();
+            *word.line.lock().unwrap_or_else(PoisonError::into_inner) = d.dark_line();
+            d.stop_when(Arc::clone(&word.stop));
+            // Before seconds go into an upload: out of the exercise that every run ends in, and of a sequence that a killed run left.
+            d.make_ready()?;
+            d.stop()?;
+            word.is_dark.store(true, Ordering::SeqCst);
+            let loaded = show.load(d);
+            word.is_dark.store(false, Ordering::SeqCst);
+            loaded?;
+            if let Some(order) = word.take() {
+                *standing = standing_after(*standing, order);
+            }
+            // It may have opened during the seconds of the upload.
+            let number;
+            (*allowed, number) = word.look_at_interlock(monitor);
+            // Nobody's order to be dark is answered by light, not even by that of one pattern.
+            match *standing {
+                _ if !*allowed => {}
+                Some(Order::Black | Order::Safe) => {}
+                Some(Order::Freeze) => d.start().and_then(|()| d.pause())?,
+                Some(Order::Arm) | None => d.start()?,
+            }
+            word.interlock_done.store(number, Ordering::SeqCst);
+            report.setup_s = watch.elapsed_ns() as f64 * 1e-9;
+            monitor.set_projector(if *allowed { health(*standing) } else { ProjectorHealth::InterlockOpen });
+            Ok(())
+        };
+    match set_up(d, &mut standing, &mut allowed, report) {
         Err(Dlpc900Error::Stopped) => return Ok(()),
         other => other?,
     }
+    let mut is_torn = false;
     let (shown, mut looked) = (Stopwatch::start(), Stopwatch::start());
     while !monitor.stop_requested() && seconds.is_none_or(|s| shown.elapsed_ns() as f64 * 1e-9 < s) {
-        let order = word.take();
+        let order = word.order();
         if let Some(order) = order {
             standing = standing_after(standing, order);
         }
         let due = looked.elapsed_ns() >= LOOK_NS;
-        let was_allowed = std::mem::replace(&mut allowed, monitor.light_allowed());
-        if !allowed && standing == Some(Order::Freeze) {
+        let was_allowed = allowed;
+        let number;
+        (allowed, number) = word.look_at_interlock(monitor);
+        // Open and closed again since the last look counts as well: the other thread has stopped the sequence.
+        let changed = allowed != was_allowed || number != word.interlock_done.load(Ordering::SeqCst);
+        if (changed || !allowed) && standing == Some(Order::Freeze) {
             // What was held is dark now, and the operator's to show again.
             standing = Some(Order::Black);
         }
+        let spoken = word.spoken.load(Ordering::SeqCst);
         let step = match (lost, order) {
             (true, _) if due && allowed => {
                 looked = Stopwatch::start();
                 open().and_then(|found| {
                     *d = found;
                     // It may have been without power.
-                    set_up(d, &mut standing, report)?;
+                    set_up(d, &mut standing, &mut allowed, report)?;
                     (lost, report.came_back) = (false, report.came_back + 1);
                     Ok(())
                 })
             }
             (true, _) => Ok(()),
-            (false, _) if allowed != was_allowed => {
+            (false, _) if changed => {
                 let wanted = if allowed { standing } else { Some(Order::Black) };
                 let health = if allowed { health(standing) } else { ProjectorHealth::InterlockOpen };
-                obey(d, wanted).map(|()| monitor.set_projector(health))
+                obey(d, wanted).map(|()| {
+                    word.interlock_done.store(number, Ordering::SeqCst);
+                    monitor.set_projector(health);
+                })
             }
             // What was ordered is done when it closes.
             (false, _) if !allowed => Ok(()),
@@ -530,7 +604,17 @@ fn watch_over<P: HidPort>(
             (false, None) => Ok(()),
         };
         match step {
-            Ok(()) | Err(Dlpc900Error::Stopped) => {}
+            Ok(()) => {
+                is_torn = false;
+                order.into_iter().for_each(|order| word.acted_on(order));
+            }
+            Err(Dlpc900Error::Stopped) => {}
+            // The other thread spoke meanwhile and took the answer away: what is to be done is done in the next round. Not twice in a row.
+            Err(Dlpc900Error::Port { source: PortError::Timeout, .. })
+                if !is_torn && word.spoken.load(Ordering::SeqCst) != spoken =>
+            {
+                is_torn = true;
+            }
             // Right after it was plugged in it may still be without rights, in other hands, or silent.
             Err(e) if is_gone(&e) || lost && matches!(e, Dlpc900Error::Port { .. }) => {
                 lost = true;

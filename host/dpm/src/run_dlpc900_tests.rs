@@ -1,9 +1,11 @@
 //! A DLPC900 run against the emulator: what is shown, what orders do, and what happens when the cable is pulled.
 
 use super::*;
+use dpm_device::dlpc900::command::Opcode;
 use dpm_device::dlpc900::lut::DisplayMode;
 use dpm_device::time::HostTime;
 use dpm_render::pack::unpack;
+use dpm_rig::interlock::{Contact, Interlock};
 use dpm_rig::pack::prepared::PreparedFrames;
 use hil_mock::dlpc900::{Dlpc900Model, Options, Sequencer, VirtualHid};
 use std::sync::{Arc, Mutex};
@@ -334,43 +336,88 @@ impl HidPort for Sticky {
     }
 }
 
-/// Found in use, R2 on this device: a stop, SAFE and BLACK are obeyed within 50 ms also while the run's own thread hangs inside the
-/// cable, and no later word of that thread brings the light back.
+/// Closed while the flag is set.
+struct Switch(Arc<AtomicBool>);
+
+impl Contact for Switch {
+    fn is_closed(&mut self) -> bool {
+        self.0.load(Ordering::Relaxed)
+    }
+}
+
+/// A monitor whose interlock is closed while the flag is set.
+fn with_interlock(closed: bool) -> (Arc<RunMonitor>, Arc<AtomicBool>) {
+    let (monitor, flag) = (RunMonitor::default(), Arc::new(AtomicBool::new(closed)));
+    monitor.set_interlock(Interlock::with_contact("a switch", Switch(flag.clone())).unwrap());
+    (Arc::new(monitor), flag)
+}
+
+/// Why it must be dark.
+#[derive(Clone, Copy, Debug, PartialEq)]
+enum Cause {
+    Stop,
+    Ordered(Order),
+    InterlockOpens,
+}
+
+impl Cause {
+    fn happen(self, monitor: &RunMonitor, closed: &AtomicBool) {
+        match self {
+            Self::Stop => monitor.request_stop(),
+            Self::Ordered(order) => monitor.give_order(order),
+            Self::InterlockOpens => closed.store(false, Ordering::Relaxed),
+        }
+    }
+}
+
+/// Waits until the run says so of its projector, at most 20 s.
+fn until_told(monitor: &RunMonitor, wanted: ProjectorHealth) {
+    let watch = Stopwatch::start();
+    while monitor.projector() != wanted {
+        assert!(watch.elapsed_ns() < 20_000_000_000, "{} instead of {wanted}", monitor.projector());
+        std::thread::sleep(Duration::from_millis(1));
+    }
+}
+
+/// Found in use, R2 on this device: a stop, SAFE, BLACK and an interlock that opens are obeyed within 50 ms also while the run's own
+/// thread hangs inside the cable, and no later word of that thread brings the light back.
 #[test]
 fn a_hanging_run_is_made_dark_within_50_ms() {
     let [show, _] = shows();
-    for order in [None, Some(Order::Safe), Some(Order::Black)] {
+    let causes =
+        [Cause::Stop, Cause::Ordered(Order::Safe), Cause::Ordered(Order::Black), Cause::InterlockOpens];
+    for cause in causes {
         // A machine that is busy with something else may be late; one of three tries must be in time.
         let mut took = Vec::new();
         for _ in 0..3 {
             let (model, stuck) = (model(), Arc::new(AtomicBool::new(false)));
             let is_inside = Arc::new(AtomicBool::new(false));
-            let monitor = Arc::new(RunMonitor::default());
+            let (monitor, closed) = with_interlock(true);
             let (seen, watched, hold, held) =
                 (model.clone(), monitor.clone(), stuck.clone(), is_inside.clone());
             let observer = std::thread::spawn(move || {
                 let _ends = StopOnExit(watched.clone());
                 until(&seen, "running", is_running);
                 // Up first: the start is acknowledged.
-                while watched.projector() != ProjectorHealth::Up {
-                    std::thread::sleep(Duration::from_millis(1));
-                }
+                until_told(&watched, ProjectorHealth::Up);
                 hold.store(true, Ordering::Relaxed);
                 while !held.load(Ordering::Relaxed) {
                     std::thread::sleep(Duration::from_millis(1));
                 }
                 let watch = Stopwatch::start();
-                match order {
-                    None => watched.request_stop(),
-                    Some(order) => watched.give_order(order),
-                }
+                cause.happen(&watched, &closed);
                 until(&seen, "dark", |m| m.dark_because().is_some());
                 let took_ms = watch.elapsed_ns() / 1_000_000;
                 hold.store(false, Ordering::Relaxed);
                 // The run goes on where it was: it must not take the stopped sequence for a failure, nor start it again.
                 for _ in 0..60 {
-                    assert!(seen.lock().unwrap().dark_because().is_some(), "{order:?}: lit again");
+                    assert!(seen.lock().unwrap().dark_because().is_some(), "{cause:?}: lit again");
                     std::thread::sleep(Duration::from_millis(5));
+                }
+                if cause == Cause::InterlockOpens {
+                    assert_eq!(watched.projector(), ProjectorHealth::InterlockOpen);
+                    closed.store(true, Ordering::Relaxed);
+                    until(&seen, "running again", is_running);
                 }
                 took_ms
             });
@@ -381,13 +428,197 @@ fn a_hanging_run_is_made_dark_within_50_ms() {
             };
             let result = present(&mut open, &show, None, &monitor);
             took.push(observer.join().unwrap());
-            assert!(result.is_ok(), "{order:?}: {:?}", result.err().map(|e| e.to_string()));
+            assert!(result.is_ok(), "{cause:?}: {:?}", result.err().map(|e| e.to_string()));
             assert_eq!(model.lock().unwrap().dark_because(), Some("mirrors exercised"));
             if took.last().is_some_and(|ms| *ms <= 50) {
                 break;
             }
         }
-        assert!(took.iter().any(|ms| *ms <= 50), "{order:?}: dark after {took:?} ms");
+        assert!(took.iter().any(|ms| *ms <= 50), "{cause:?}: dark after {took:?} ms");
+    }
+}
+
+/// A cable over which, once, a start of the sequence is held back until the order to be dark that `cause` brings has passed it; the
+/// answer to that start then comes when `stuck` is cleared.
+struct LateStart {
+    hid: VirtualHid,
+    model: Arc<Mutex<Dlpc900Model>>,
+    is_due: Arc<AtomicBool>,
+    stuck: Arc<AtomicBool>,
+    cause: Arc<dyn Fn() + Send + Sync>,
+}
+
+/// Times that the sequence was told to stop.
+fn stops(m: &Dlpc900Model) -> usize {
+    m.executed().iter().filter(|e| e.opcode == Opcode::START_STOP && e.data == [0]).count()
+}
+
+/// Times that it was told to start.
+fn starts(m: &Dlpc900Model) -> usize {
+    m.executed().iter().filter(|e| e.opcode == Opcode::START_STOP && e.data == [2]).count()
+}
+
+impl HidPort for LateStart {
+    fn write_report(&mut self, report: &[u8; 64], timeout: Duration) -> Result<(), PortError> {
+        let [low, high] = Opcode::START_STOP.0.to_le_bytes();
+        let is_start = report.windows(3).any(|bytes| bytes == [low, high, 2]);
+        if is_start && self.is_due.swap(false, Ordering::Relaxed) {
+            let before = stops(&self.model.lock().unwrap());
+            (self.cause)();
+            until(&self.model, "told to be dark", |m| stops(m) > before);
+            self.hid.write_report(report, timeout)?;
+            self.stuck.store(true, Ordering::SeqCst);
+            return Ok(());
+        }
+        self.hid.write_report(report, timeout)
+    }
+    fn read_report(&mut self, report: &mut [u8; 64], timeout: Duration) -> Result<(), PortError> {
+        while self.stuck.load(Ordering::SeqCst) {
+            std::thread::sleep(Duration::from_millis(1));
+        }
+        self.hid.read_report(report, timeout)
+    }
+    fn pause(&mut self, time: Duration) {
+        self.hid.pause(time);
+    }
+    fn second_line(&self) -> Option<Box<dyn dpm_device::dlpc900::driver::SecondLine>> {
+        self.hid.second_line()
+    }
+}
+
+/// The awkward place: the order to be dark overtakes a start that is under way, and the run hangs when that start has arrived. The light
+/// that it makes ends within 50 ms.
+#[test]
+fn a_start_that_arrives_after_the_order_to_be_dark_lights_for_50_ms_at_most() {
+    let [show, _] = shows();
+    for cause in [Cause::InterlockOpens, Cause::Ordered(Order::Safe), Cause::Ordered(Order::Black)] {
+        let mut took = Vec::new();
+        for _ in 0..3 {
+            let (model, stuck, is_due) =
+                (model(), Arc::<AtomicBool>::default(), Arc::<AtomicBool>::default());
+            let (monitor, closed) = with_interlock(true);
+            let (seen, watched, hold, due) = (model.clone(), monitor.clone(), stuck.clone(), is_due.clone());
+            let observer = std::thread::spawn(move || {
+                let _ends = StopOnExit(watched.clone());
+                until_told(&watched, ProjectorHealth::Up);
+                watched.give_order(Order::Black);
+                until_told(&watched, ProjectorHealth::Black);
+                due.store(true, Ordering::Relaxed);
+                watched.give_order(Order::Arm);
+                let begin = Stopwatch::start();
+                while !hold.load(Ordering::SeqCst) {
+                    assert!(begin.elapsed_ns() < 20_000_000_000, "{cause:?}: no start");
+                    std::thread::sleep(Duration::from_millis(1));
+                }
+                let watch = Stopwatch::start();
+                until(&seen, "dark", |m| m.dark_because().is_some());
+                let took_ms = watch.elapsed_ns() / 1_000_000;
+                hold.store(false, Ordering::SeqCst);
+                for _ in 0..60 {
+                    assert!(seen.lock().unwrap().dark_because().is_some(), "{cause:?}: lit again");
+                    std::thread::sleep(Duration::from_millis(5));
+                }
+                took_ms
+            });
+            let (heard, switch) = (monitor.clone(), closed.clone());
+            let happens: Arc<dyn Fn() + Send + Sync> = Arc::new(move || cause.happen(&heard, &switch));
+            let mut open = || {
+                let (hid, model) = (VirtualHid::new(model.clone()), model.clone());
+                let (is_due, stuck, cause) = (is_due.clone(), stuck.clone(), happens.clone());
+                Dlpc900::new(LateStart { hid, model, is_due, stuck, cause })
+            };
+            let result = present(&mut open, &show, None, &monitor);
+            took.push(observer.join().unwrap());
+            assert!(result.is_ok(), "{cause:?}: {:?}", result.err().map(|e| e.to_string()));
+            if took.last().is_some_and(|ms| *ms <= 50) {
+                break;
+            }
+        }
+        assert!(took.iter().any(|ms| *ms <= 50), "{cause:?}: dark after {took:?} ms");
+    }
+}
+
+/// Openings so short that the run itself may see none of them: it is dark each time, the run neither ends ("stopped by itself") nor
+/// stays dark, and what was frozen is dark until somebody arms.
+#[test]
+fn an_interlock_that_opens_for_a_moment_is_dark_for_a_moment() {
+    let [show, _] = shows();
+    let model = model();
+    let (monitor, closed) = with_interlock(true);
+    let (seen, watched) = (model.clone(), monitor.clone());
+    let observer = std::thread::spawn(move || {
+        let _ends = StopOnExit(watched.clone());
+        let opens = || {
+            closed.store(false, Ordering::Relaxed);
+            until(&seen, "dark", |m| m.dark_because().is_some());
+            closed.store(true, Ordering::Relaxed);
+        };
+        for _ in 0..20 {
+            until(&seen, "running", is_running);
+            until_told(&watched, ProjectorHealth::Up);
+            opens();
+        }
+        until(&seen, "running", is_running);
+        watched.give_order(Order::Freeze);
+        until_told(&watched, ProjectorHealth::Frozen);
+        opens();
+        until_told(&watched, ProjectorHealth::Black);
+        for _ in 0..60 {
+            assert!(seen.lock().unwrap().dark_because().is_some(), "an old frame is lit again");
+            std::thread::sleep(Duration::from_millis(5));
+        }
+        watched.give_order(Order::Arm);
+        until(&seen, "running", is_running);
+    });
+    let result = present(&mut || Dlpc900::new(VirtualHid::new(model.clone())), &show, None, &monitor);
+    observer.join().unwrap();
+    assert!(result.is_ok(), "{:?}", result.err().map(|e| e.to_string()));
+}
+
+/// Open before the start or during the upload: what a killed run left lit goes dark, and nothing is started until it closes.
+#[test]
+fn nothing_is_started_while_the_interlock_is_open() {
+    let [show, _] = shows();
+    for opens_in_the_upload in [false, true] {
+        let model = model();
+        if !opens_in_the_upload {
+            let mut killed = Dlpc900::new(VirtualHid::new(model.clone())).unwrap();
+            killed.make_ready().and_then(|_| show.load(&mut killed)).and_then(|()| killed.start()).unwrap();
+            assert!(model.lock().unwrap().dark_because().is_none());
+        }
+        let m = model.lock().unwrap();
+        let (before, commands) = (starts(&m), m.commands());
+        drop(m);
+        let (monitor, closed) = with_interlock(opens_in_the_upload);
+        let (seen, watched) = (model.clone(), monitor.clone());
+        let observer = std::thread::spawn(move || {
+            let _ends = StopOnExit(watched.clone());
+            if opens_in_the_upload {
+                until(&seen, "begun", |m| m.commands() > commands + 30);
+                closed.store(false, Ordering::Relaxed);
+            }
+            until_told(&watched, ProjectorHealth::InterlockOpen);
+            until(&seen, "dark", |m| m.dark_because().is_some());
+            for _ in 0..60 {
+                let m = seen.lock().unwrap();
+                assert!(m.dark_because().is_some() && starts(&m) == before, "started");
+                drop(m);
+                std::thread::sleep(Duration::from_millis(5));
+            }
+            closed.store(true, Ordering::Relaxed);
+            until(&seen, "running", is_running);
+        });
+        let mut open = || {
+            let hid = VirtualHid::new(model.clone());
+            let (stuck, is_inside) = (Arc::default(), Arc::default());
+            // Some seconds for the tens of thousands of reports of the upload.
+            let report_time = Duration::from_micros(if opens_in_the_upload { 20 } else { 0 });
+            Dlpc900::new(Sticky { hid, stuck, is_inside, report_time })
+        };
+        let result = present(&mut open, &show, None, &monitor);
+        observer.join().unwrap();
+        assert!(result.is_ok(), "{:?}", result.err().map(|e| e.to_string()));
+        assert_eq!(model.lock().unwrap().dark_because(), Some("mirrors exercised"));
     }
 }
 
@@ -420,8 +651,7 @@ fn a_stop_is_heard_during_the_set_up() {
         assert_eq!(report.shown_s, 0.0);
         let m = model.lock().unwrap();
         assert_eq!(m.dark_because(), Some("mirrors exercised"));
-        let started = m.executed().iter().any(|e| e.opcode.0 == 0x1a24 && e.data == [2]);
-        assert!(!started, "never lit");
+        assert_eq!(starts(&m), 0, "never lit");
     }
 }
 

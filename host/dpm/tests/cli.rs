@@ -2,7 +2,7 @@
 
 mod cli_common;
 
-use cli_common::{code, dpm, err, out, NO_DRIVER};
+use cli_common::{code, command, command_of, dpm, err, out, NO_DRIVER};
 use std::process::Command;
 
 #[test]
@@ -30,7 +30,7 @@ fn a_program_knows_its_commit_wherever_it_lies() {
     // A test beside this one that starts a program holds the copy open for writing until that program runs.
     let mut tries = 0;
     let there = loop {
-        match Command::new(&program).arg("--version").current_dir(&folder).output() {
+        match command_of(&program, &["--version"]).current_dir(&folder).output() {
             Err(e) if e.kind() == std::io::ErrorKind::ExecutableFileBusy && tries < 100 => {
                 tries += 1;
                 std::thread::sleep(std::time::Duration::from_millis(20));
@@ -100,8 +100,7 @@ fn doctor_reports_on_every_topic_and_ends_with_4_without_a_gpu() {
 #[test]
 fn a_reader_that_goes_away_is_no_error() {
     use std::process::Stdio;
-    let mut child = Command::new(env!("CARGO_BIN_EXE_dpm"))
-        .args(["doctor", "--json"])
+    let mut child = command(&["doctor", "--json"])
         .envs(NO_DRIVER)
         .stdout(Stdio::piped())
         .stderr(Stdio::piped())

@@ -5,6 +5,14 @@
 mod cli_common;
 
 use cli_common::{code, dpm, err, out, start, Folder, NO_DRIVER};
+use dpm_device::pose::Pose;
+use dpm_device::time::{HostClock, HostTime};
+use hil_mock::motion::{Motion, MotionSpec};
+use hil_mock::natnet_host::NatNetHost;
+use hil_mock::natnet_server::{NatNetServer, NatNetServerConfig, Streaming, UnicastTo};
+use hil_mock::tracker::{MockTrackerConfig, SampleSource};
+use std::net::{Ipv4Addr, SocketAddrV4};
+use std::sync::Arc;
 use std::time::{Duration, Instant};
 
 const SMALL: [&str; 5] = ["--json", "--raster", "48x32", "--frames", "6"];
@@ -427,39 +435,37 @@ fn a_real_rig_runs_against_the_mocks_for_as_long_as_it_is_told() {
     assert_eq!(code(&output), 0, "{}", err(&output));
 }
 
-/// Found in use, O4 and T17: a tracker that streams millimetres, or other axes, puts its bodies where no light can fall. The run says so, whether or not its poses are
-/// new enough for light.
-#[test]
-fn wrong_units_of_a_real_tracker_are_told_at_the_end_of_a_run() {
-    use dpm_device::pose::Pose;
-    use dpm_device::time::{HostClock, HostTime};
-    use hil_mock::motion::{Motion, MotionSpec};
-    use hil_mock::natnet_host::NatNetHost;
-    use hil_mock::natnet_server::{NatNetServer, NatNetServerConfig, Streaming, UnicastTo};
-    use hil_mock::tracker::{MockTrackerConfig, SampleSource};
-    use std::net::{Ipv4Addr, SocketAddrV4};
-    use std::sync::Arc;
-
-    let folder = Folder::new("units");
+/// A NatNet server of one body, "bunny", that moves about `position_m`.
+fn natnet(motion: &MotionSpec, position_m: [f64; 3]) -> NatNetHost {
     let epoch = Instant::now();
     let clock: Arc<dyn HostClock> = Arc::new(move || HostTime(epoch.elapsed().as_nanos() as i64));
-    let far = Pose { position_m: [150.0, 0.0, 0.0], ..Pose::IDENTITY };
-    let motion = Motion::new(&MotionSpec::Still {}, far).expect("a motion");
+    let motion = Motion::new(motion, Pose { position_m, ..Pose::IDENTITY }).expect("a motion");
     let source = SampleSource::new(MockTrackerConfig::default(), vec![motion]).expect("a source");
     let streaming = Streaming::Unicast(UnicastTo::CommandSocket);
     let config = NatNetServerConfig { streaming, ..NatNetServerConfig::new(&["bunny"]) };
     let server = NatNetServer::new(config, source).expect("a server");
-    let host = NatNetHost::start(server, streaming, SocketAddrV4::new(Ipv4Addr::LOCALHOST, 0), clock)
-        .expect("a socket on the loopback");
-    let rig = folder.write(
-        "rig.toml",
-        &format!(
-            "[projector]\nframe_rate = 50\n[tracker]\nkind = \"natnet\"\nserver = \"127.0.0.1\"\nlocal = \"127.0.0.1\"\n\
-             command_port = {}\n[[scene.bodies]]\nname = \"bunny\"\n[safety]\nwatchdog_ms = 2000\n\
-             [output]\nlight_window_ms = 200\nimages = true\n",
-            host.address().port()
-        ),
+    NatNetHost::start(server, streaming, SocketAddrV4::new(Ipv4Addr::LOCALHOST, 0), clock)
+        .expect("a socket on the loopback")
+}
+
+/// A rig file for the body of `server`; `safety` are further lines of its last table.
+fn natnet_rig(folder: &Folder, server: &NatNetHost, frame_rate: u32, safety: &str) -> String {
+    let port = server.address().port();
+    let text = format!(
+        "[projector]\nframe_rate = {frame_rate}\n[tracker]\nkind = \"natnet\"\nserver = \"127.0.0.1\"\nlocal = \"127.0.0.1\"\n\
+         command_port = {port}\n[[scene.bodies]]\nname = \"bunny\"\n[output]\nlight_window_ms = 200\n\
+         [safety]\nwatchdog_ms = 2000\n{safety}"
     );
+    folder.write("rig.toml", &text)
+}
+
+/// Found in use, O4 and T17: a tracker that streams millimetres, or other axes, puts its bodies where no light can fall. The run says so, whether or not its poses are
+/// new enough for light.
+#[test]
+fn wrong_units_of_a_real_tracker_are_told_at_the_end_of_a_run() {
+    let folder = Folder::new("units");
+    let server = natnet(&MotionSpec::Still {}, [150.0, 0.0, 0.0]);
+    let rig = natnet_rig(&folder, &server, 50, "");
     // Hardly what a frame takes here: little is new enough to be lit, and before, what was not lit was not judged.
     let args = [
         "run",
@@ -473,6 +479,8 @@ fn wrong_units_of_a_real_tracker_are_told_at_the_end_of_a_run() {
         folder.text(),
         "--set",
         "safety.predict_ms=30",
+        "--set",
+        "output.images=true",
     ];
     let output = dpm(&args, &[]);
     let json: serde_json::Value =
@@ -495,36 +503,9 @@ fn wrong_units_of_a_real_tracker_are_told_at_the_end_of_a_run() {
 /// A deployed rig: poses come over UDP from a NatNet server with a clock of its own, light leaves at real pace.
 #[test]
 fn a_rig_with_a_networked_tracker_lights_what_the_tracker_sees() {
-    use dpm_device::pose::Pose;
-    use dpm_device::time::{HostClock, HostTime};
-    use hil_mock::motion::{Motion, MotionSpec};
-    use hil_mock::natnet_host::NatNetHost;
-    use hil_mock::natnet_server::{NatNetServer, NatNetServerConfig, Streaming, UnicastTo};
-    use hil_mock::tracker::{MockTrackerConfig, SampleSource};
-    use std::net::{Ipv4Addr, SocketAddrV4};
-    use std::sync::Arc;
-
     let folder = Folder::new("natnet");
-    let epoch = Instant::now();
-    let clock: Arc<dyn HostClock> = Arc::new(move || HostTime(epoch.elapsed().as_nanos() as i64));
-    let place = Pose { position_m: [0.0, 0.1, 0.0], ..Pose::IDENTITY };
-    let motion = Motion::new(&MotionSpec::paper_translation(), place).expect("a motion");
-    let source = SampleSource::new(MockTrackerConfig::default(), vec![motion]).expect("a source");
-    let streaming = Streaming::Unicast(UnicastTo::CommandSocket);
-    let config = NatNetServerConfig { streaming, ..NatNetServerConfig::new(&["bunny"]) };
-    let server = NatNetServer::new(config, source).expect("a server");
-    let host = NatNetHost::start(server, streaming, SocketAddrV4::new(Ipv4Addr::LOCALHOST, 0), clock)
-        .expect("a socket on the loopback");
-
-    let rig = folder.write(
-        "rig.toml",
-        &format!(
-            "[projector]\nframe_rate = 10\n[tracker]\nkind = \"natnet\"\nserver = \"127.0.0.1\"\nlocal = \"127.0.0.1\"\n\
-             command_port = {}\n[[scene.bodies]]\nname = \"bunny\"\n[safety]\nwatchdog_ms = 2000\npredict_ms = 500\n\
-             [output]\nlight_window_ms = 200\n",
-            host.address().port()
-        ),
-    );
+    let server = natnet(&MotionSpec::paper_translation(), [0.0, 0.1, 0.0]);
+    let rig = natnet_rig(&folder, &server, 10, "predict_ms = 500\n");
     let json = report(&["run", &rig], &folder, &["--set", "output.images=true"]);
     assert_eq!(json["pace"], "real");
     // Found in use, O8: no picture of a run with a real tracker.

@@ -1,5 +1,9 @@
 //! The program `dpm dlpc900` over its own libusb, preloaded with an in-process usbfs, against the emulator over USB/IP.
 
+mod cli_common;
+
+use cli_common::{start_with, Running};
+use dpm_device::dlpc900::command::Opcode;
 use dpm_device::dlpc900::lut::{DisplayMode, Dmd};
 use dpm_device::time::HostTime;
 use hil_mock::dlpc900::{Dlpc900Model, Options, Sequencer};
@@ -11,6 +15,7 @@ use std::sync::{Arc, Mutex};
 
 struct Bench {
     model: Arc<Mutex<Dlpc900Model>>,
+    export: Export,
     server: Server,
     folder: PathBuf,
 }
@@ -25,8 +30,10 @@ impl Bench {
         let export = |(i, m): (usize, &Arc<Mutex<Dlpc900Model>>)| {
             Export::new(format!("1-{}", i + 1), Arc::new(UsbPlug::new(m.clone(), monotonic_clock())))
         };
-        let server = Server::start("127.0.0.1:0", models.iter().enumerate().map(export).collect()).unwrap();
-        Self { model: models[0].clone(), server, folder }
+        let exports: Vec<Export> = models.iter().enumerate().map(export).collect();
+        let export = exports[0].clone();
+        let server = Server::start("127.0.0.1:0", exports).unwrap();
+        Self { model: models[0].clone(), export, server, folder }
     }
 
     /// Runs `dpm dlpc900` on the emulated bus.
@@ -35,19 +42,62 @@ impl Bench {
     }
 
     fn command(&self, words: &[&str]) -> Command {
+        // Words of `dpm` itself stand for themselves, everything else is a word of `dpm dlpc900`.
+        let own = ["run", "safe", "arm"].contains(&words[0]);
+        let words: Vec<&str> = (!own).then_some("dlpc900").into_iter().chain(words.iter().copied()).collect();
+        let mut command = cli_common::command(&words);
+        command.current_dir(&self.folder).envs(self.variables());
+        command
+    }
+
+    /// What leads a program to the emulated bus and keeps its locks and orders in this test's folder.
+    fn variables(&self) -> [(&'static str, String); 5] {
         let deps = std::env::current_exe().unwrap().parent().unwrap().to_owned();
         let library = deps.join("libusbfs_fake.so");
         assert!(library.exists(), "{} is built with the tests", library.display());
-        let mut command = Command::new(env!("CARGO_BIN_EXE_dpm"));
-        // `run` stands for itself, everything else is a word of `dpm dlpc900`.
-        if words[0] != "run" {
-            command.arg("dlpc900");
+        [
+            ("LD_PRELOAD", library.display().to_string()),
+            ("USBFS_FAKE_USBIP", self.server.address().to_string()),
+            ("USBFS_FAKE_DRIVER", "usbhid".into()),
+            ("DPM_RUNTIME_DIR", self.folder.join("run").display().to_string()),
+            ("DPM_STATE_DIR", self.folder.join("state").display().to_string()),
+        ]
+    }
+
+    /// Waits until the server has noticed that the program before has gone; at most 20 s.
+    fn until_free(&self) {
+        for _ in 0..4000 {
+            if !self.export.is_in_use() {
+                return;
+            }
+            std::thread::sleep(std::time::Duration::from_millis(5));
         }
-        command.args(words).current_dir(&self.folder);
-        command.env("LD_PRELOAD", library).env("USBFS_FAKE_USBIP", self.server.address().to_string());
-        command.env("USBFS_FAKE_DRIVER", "usbhid").env("DPM_RUNTIME_DIR", self.folder.join("run"));
-        command.env("DPM_STATE_DIR", self.folder.join("state"));
-        command
+        panic!("a program still has the device");
+    }
+
+    /// A run of the rig file that goes on beside the test.
+    fn start(&self) -> Running {
+        self.until_free();
+        let variables = self.variables();
+        let variables: Vec<_> = variables.iter().map(|(name, value)| (*name, value.as_str())).collect();
+        start_with(&["run", self.folder.join("rig.toml").to_str().unwrap()], &variables)
+    }
+
+    /// Orders a running rig, which confirms it.
+    fn order(&self, word: &str, run: &Running) {
+        let told = self.dpm(&[word, "--pid", &run.id().to_string()]);
+        let out = text(&told.stdout);
+        assert!(
+            told.status.success() && out.contains("ok: projector"),
+            "{word}: {out}{}",
+            text(&told.stderr)
+        );
+    }
+
+    /// Times that the sequence was started.
+    fn starts(&self) -> usize {
+        let m = self.model.lock().unwrap();
+        m.executed().iter().filter(|e| e.opcode == Opcode::START_STOP && e.data == [2]).count()
     }
 
     fn ok(&self, words: &[&str]) -> String {
@@ -225,13 +275,7 @@ fn a_rig_in_video_mode_runs_again_and_again() {
     until_lit(&b, false);
     let took = killed.elapsed();
     assert!(took < std::time::Duration::from_secs(5), "{took:?}");
-    for _ in 0..400 {
-        if b.model.lock().unwrap().dark_because() == Some("mirrors exercised") {
-            break;
-        }
-        std::thread::sleep(std::time::Duration::from_millis(5));
-    }
-    assert_eq!(b.model.lock().unwrap().dark_because(), Some("mirrors exercised"));
+    until_rested(&b);
     b.ok(&["idle"]);
     b.ok(&["run", "rig.toml", "--seconds", "0.2"]);
     b.ok(&["video-pattern", "--patterns", "8"]);
@@ -239,6 +283,63 @@ fn a_rig_in_video_mode_runs_again_and_again() {
     assert_eq!(m.dark_because(), None);
     assert!(m.executed().iter().all(|e| e.error == 0), "no command was refused");
     assert_eq!(m.warnings(), [] as [String; 0]);
+}
+
+/// Waits until the mirrors exercise, as after a run; at most 20 s.
+fn until_rested(b: &Bench) {
+    for _ in 0..4000 {
+        if b.model.lock().unwrap().dark_because() == Some("mirrors exercised") {
+            return;
+        }
+        std::thread::sleep(std::time::Duration::from_millis(5));
+    }
+    panic!("not put to rest: {:?}", b.model.lock().unwrap().dark_because());
+}
+
+/// Found in use, R4, on this device, which latches nothing itself: SAFE of a run that was killed, and of one that ended in order, keeps
+/// the next one dark until somebody arms it; no other command makes light meanwhile.
+#[test]
+fn r4_safe_stands_over_restarts_until_somebody_arms() {
+    let b = Bench::new("safe", 1);
+    video_rig(&b);
+    let long = std::time::Duration::from_secs(60);
+    let run = b.start();
+    until_lit(&b, true);
+    b.order("safe", &run);
+    until_lit(&b, false);
+    run.signal("KILL");
+    assert_eq!(run.finish().0.code(), None);
+    until_rested(&b);
+    let started = b.starts();
+    for ends in ["TERM", "the order to arm"] {
+        let refused = b.dpm(&["start"]);
+        let err = text(&refused.stderr);
+        assert!(refused.status.code() == Some(3) && err.contains("SAFE stands since"), "{err}");
+        let mut run = b.start();
+        run.wait_for_line(long, |line| line.contains("SAFE stands since") && line.contains("dpm arm"));
+        // Set up, with all that a start needs.
+        run.wait_for_line(long, |line| line.contains("projector: dark, latched faults"));
+        for _ in 0..100 {
+            assert!(b.model.lock().unwrap().dark_because().is_some() && b.starts() == started);
+            std::thread::sleep(std::time::Duration::from_millis(5));
+        }
+        if ends == "TERM" {
+            run.signal(ends);
+            assert_eq!(run.finish().0.code(), Some(0));
+            until_rested(&b);
+            continue;
+        }
+        b.order("arm", &run);
+        until_lit(&b, true);
+        run.signal("TERM");
+        assert_eq!(run.finish().0.code(), Some(0));
+    }
+    // It is over: the next one lights by itself.
+    until_rested(&b);
+    let run = b.start();
+    until_lit(&b, true);
+    run.signal("TERM");
+    assert_eq!(run.finish().0.code(), Some(0));
 }
 
 /// SIGTERM: dark within 50 ms (in one of three tries, on a machine that others use too), the process gone within two seconds with exit
@@ -249,6 +350,7 @@ fn sigterm_makes_it_dark_and_ends_the_process() {
     video_rig(&b);
     let mut took = Vec::new();
     for _ in 0..3 {
+        b.until_free();
         let mut run = b.command(&["run", "rig.toml"]).stderr(std::process::Stdio::null()).spawn().unwrap();
         until_lit(&b, true);
         std::thread::sleep(std::time::Duration::from_millis(300));
@@ -263,6 +365,7 @@ fn sigterm_makes_it_dark_and_ends_the_process() {
     let limit = std::time::Duration::from_millis(60);
     assert!(took.iter().any(|t| *t < limit), "dark after {took:?}");
     // During the three seconds before the start.
+    b.until_free();
     let mut run = b.command(&["run", "rig.toml"]).stderr(std::process::Stdio::null()).spawn().unwrap();
     std::thread::sleep(std::time::Duration::from_millis(1500));
     let told = std::time::Instant::now();

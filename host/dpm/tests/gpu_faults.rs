@@ -4,8 +4,8 @@
 
 mod cli_common;
 
-use cli_common::{code, dpm, err, out, Folder};
-use std::process::{Command, Output, Stdio};
+use cli_common::{code, command_after, dpm, err, out, Folder};
+use std::process::Output;
 use std::time::{Duration, Instant};
 use vulkan_faults::FaultLayer;
 
@@ -111,14 +111,9 @@ fn too_little_address_space_for_software_vulkan_is_refused_before_it_crashes() {
         return eprintln!("a hardware GPU is used here: nothing to be seen");
     }
     for limit_kb in [600_000, 700_000, 800_000, 900_000] {
-        let line = format!("ulimit -v {limit_kb}; exec \"$0\" \"$@\"");
-        let output = Command::new("sh")
-            .args(["-c", &line, env!("CARGO_BIN_EXE_dpm")])
-            .args(SMALL)
-            .args([folder.text(), "--frames", "1"])
-            .stdin(Stdio::null())
-            .output()
-            .expect("a shell starts");
+        let args = [&SMALL[..], &[folder.text(), "--frames", "1"]].concat();
+        let mut limited = command_after(&format!("ulimit -v {limit_kb}"), &args);
+        let output = limited.output().expect("a shell starts");
         assert_eq!(output.status.code(), Some(4), "{limit_kb} kB: {:?} {}", output.status, err(&output));
         let text = error(&output);
         assert!(text.contains("address space") && text.contains("ulimit -v"), "{limit_kb} kB: {text}");

@@ -1,5 +1,7 @@
 //! `dpm record` as a program against mock trackers: what it writes is what was sent, and what `tracker.kind = "replay"` plays.
 
+mod cli_common;
+
 use dpm_device::time::{HostClock, HostTime};
 use dpm_device::tracker::record::Recording;
 use dpm_device::tracker::{BodyIndex, TrackerSample};
@@ -55,8 +57,8 @@ impl Bench {
     }
 
     fn command(&self, words: &[&str]) -> Command {
-        let mut command = Command::new(env!("CARGO_BIN_EXE_dpm"));
-        command.arg("record").args(words).current_dir(&self.folder).stdin(Stdio::null());
+        let mut command = cli_common::command(&[&["record"], words].concat());
+        command.current_dir(&self.folder);
         command
     }
 
@@ -161,12 +163,10 @@ fn a_killed_recording_lacks_its_last_tenth_of_a_second_at_most() {
 fn a_full_disk_and_a_signal_end_a_recording_clearly() {
     let b = Bench::new("full", true);
     // No file may grow beyond 32 KiB: to the writer the same as a disk without space.
-    let line = format!(
-        "trap '' XFSZ; ulimit -f 32; exec {} record a.dpmt --rig rig.toml --seconds 60",
-        env!("CARGO_BIN_EXE_dpm")
-    );
+    let words = ["record", "a.dpmt", "--rig", "rig.toml", "--seconds", "60"];
     let started = Instant::now();
-    let o = Command::new("bash").args(["-c", &line]).current_dir(&b.folder).output().unwrap();
+    let mut limited = cli_common::command_after("trap '' XFSZ; ulimit -f 32", &words);
+    let o = limited.current_dir(&b.folder).output().unwrap();
     assert_eq!(o.status.code(), Some(3), "{}", told(&o));
     assert!(told(&o).contains("a.dpmt") && told(&o).contains("can be played"), "{}", told(&o));
     assert!(

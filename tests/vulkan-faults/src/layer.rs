@@ -569,21 +569,6 @@ unsafe extern "system" fn reset_fences(
 }
 
 /// # Safety
-/// As `vkDestroyFence`.
-unsafe extern "system" fn destroy_fence(
-    handle: vk::Device,
-    fence: vk::Fence,
-    allocator: *const vk::AllocationCallbacks<'_>,
-) {
-    // SAFETY: the caller's.
-    unsafe {
-        let data = device(handle);
-        lock(&data.state).late.remove(&fence);
-        (data.fns.destroy_fence)(handle, fence, allocator);
-    }
-}
-
-/// # Safety
 /// As `vkDeviceWaitIdle`.
 unsafe extern "system" fn device_wait_idle(handle: vk::Device) -> vk::Result {
     // SAFETY: the caller's.
@@ -692,21 +677,6 @@ unsafe extern "system" fn create_buffer(
 }
 
 /// # Safety
-/// As `vkDestroyBuffer`.
-unsafe extern "system" fn destroy_buffer(
-    handle: vk::Device,
-    buffer: vk::Buffer,
-    allocator: *const vk::AllocationCallbacks<'_>,
-) {
-    // SAFETY: the caller's.
-    unsafe {
-        let data = device(handle);
-        lock(&data.state).sizes.remove(&buffer);
-        (data.fns.destroy_buffer)(handle, buffer, allocator);
-    }
-}
-
-/// # Safety
 /// As `vkCreateComputePipelines`.
 unsafe extern "system" fn create_compute_pipelines(
     handle: vk::Device,
@@ -747,6 +717,27 @@ macro_rules! counted {
 }
 
 type Allocator<'a> = *const vk::AllocationCallbacks<'a>;
+
+/// Calls that end an object of which the layer keeps something, and are otherwise the driver's.
+macro_rules! forgotten {
+    ($($name:ident($object:ty) $kept:ident;)*) => {$(
+        /// # Safety
+        /// As Vulkan's function of this name.
+        unsafe extern "system" fn $name(handle: vk::Device, object: $object, allocator: Allocator<'_>) {
+            // SAFETY: the caller's.
+            unsafe {
+                let data = device(handle);
+                lock(&data.state).$kept.remove(&object);
+                (data.fns.$name)(handle, object, allocator);
+            }
+        }
+    )*};
+}
+
+forgotten! {
+    destroy_fence(vk::Fence) late;
+    destroy_buffer(vk::Buffer) sizes;
+}
 
 counted! {
     allocate_memory(d: vk::Device, info: *const vk::MemoryAllocateInfo<'_>, a: Allocator<'_>, out: *mut vk::DeviceMemory)

@@ -19,7 +19,19 @@ pub(crate) fn own_folder(name: &str) -> PathBuf {
 
 /// The program with arguments, in an environment without settings of ours. What this machine's own rigs keep is none of its business.
 pub(crate) fn command<S: AsRef<OsStr>>(args: &[S]) -> Command {
-    let mut command = Command::new(env!("CARGO_BIN_EXE_dpm"));
+    command_of(env!("CARGO_BIN_EXE_dpm"), args)
+}
+
+/// The same after `preparation`, commands of the shell that set limits of the process.
+pub(crate) fn command_after<S: AsRef<OsStr>>(preparation: &str, args: &[S]) -> Command {
+    let line = format!("{preparation}; exec \"$0\" \"$@\"");
+    let words = ["-c", &line, env!("CARGO_BIN_EXE_dpm")].map(OsStr::new);
+    command_of("bash", &words.into_iter().chain(args.iter().map(AsRef::as_ref)).collect::<Vec<_>>())
+}
+
+/// The same of a copy of the program, or of another that starts it.
+pub(crate) fn command_of<S: AsRef<OsStr>>(program: impl AsRef<OsStr>, args: &[S]) -> Command {
+    let mut command = Command::new(program);
     command.args(args).env_remove("NO_COLOR").stdin(Stdio::null());
     command.env("DPM_RUNTIME_DIR", own_folder("run")).env("DPM_STATE_DIR", own_folder("state"));
     for (name, _) in std::env::vars_os() {
@@ -86,13 +98,13 @@ impl Running {
 
     /// Reads the standard error stream until a line is `wanted`.
     pub(crate) fn wait_for_line(&mut self, limit: Duration, wanted: impl Fn(&str) -> bool) {
-        let end = Instant::now() + limit;
+        let (end, mut heard) = (Instant::now() + limit, Vec::new());
         loop {
             let left = end.saturating_duration_since(Instant::now());
             match self.lines.recv_timeout(left) {
                 Ok(line) if wanted(&line) => return,
-                Ok(_) => {}
-                Err(e) => panic!("no such line within {limit:?}: {e}"),
+                Ok(line) => heard.push(line),
+                Err(e) => panic!("no such line within {limit:?}: {e}; {heard:#?}"),
             }
         }
     }

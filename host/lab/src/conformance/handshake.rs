@@ -1,6 +1,7 @@
 //! HELLO and CONFIG: who is there, what it can do, and what it must refuse.
 
 use super::driver::{Bench, R};
+use super::orders::lit_frame;
 use super::{check, grew, tell, Rule, Stop};
 use dpm_device::link::{DeviceMessage, DeviceState, FaultCode, HostHello, HostMessage, MessageType, VERSION};
 
@@ -165,11 +166,7 @@ fn hello_zero(b: &mut Bench<'_>) -> R {
 
 fn hello_same(b: &mut Bench<'_>) -> R {
     b.armed(|_| {})?;
-    b.needs_frames()?;
-    let slot = b.slot_ahead()?;
-    let shot = b.shot(slot)?;
-    b.send(&shot)?;
-    let before = b.until_slot(slot)?;
+    let before = lit_frame(b)?;
     b.forget()?;
     b.say(&HostMessage::Hello(HostHello {
         version_min: u16::from(VERSION),
@@ -194,12 +191,8 @@ fn hello_same(b: &mut Bench<'_>) -> R {
 
 fn hello_new(b: &mut Bench<'_>) -> R {
     b.armed(|_| {})?;
-    b.needs_frames()?;
-    let slot = b.slot_ahead()?;
-    let shot = b.shot(slot)?;
-    b.send(&shot)?;
-    let lit = b.until_slot(slot)?;
-    check(lit.lit && lit.frames_lit == 1, "light", || tell(&lit))?;
+    let lit = lit_frame(b)?;
+    check(lit.frames_lit == 1, "one frame lit", || tell(&lit))?;
     // Something damaged and something ignored, so that no counter is 0.
     b.say_as(b.session ^ 1, &b.echo(0))?;
     b.report()?;
@@ -326,12 +319,7 @@ fn config_format(b: &mut Bench<'_>) -> R {
 
 fn config_disarms(b: &mut Bench<'_>) -> R {
     b.armed(|_| {})?;
-    b.needs_frames()?;
-    let slot = b.slot_ahead()?;
-    let shot = b.shot(slot)?;
-    b.send(&shot)?;
-    let lit = b.until_slot(slot)?;
-    check(lit.lit, "light", || tell(&lit))?;
+    lit_frame(b)?;
     let config = b.plain_config()?;
     let s = b.configure(&config)?;
     check(s.state == DeviceState::Configured && !s.lit, "configured and dark", || tell(&s))

@@ -2,8 +2,9 @@
 
 use super::driver::{Bench, R};
 use super::orders::lit_frame;
+use super::shot::Shot;
 use super::{check, fates, grew, tell, Rule, Stop};
-use dpm_device::link::Underrun;
+use dpm_device::link::{Status, Underrun};
 use dpm_device::time::{DeviceTicks, FrameRate};
 
 pub(super) const RULES: &[Rule] = &[
@@ -95,8 +96,7 @@ fn credit_beyond(b: &mut Bench<'_>) -> R {
     // All of the slot after the next: none is taken out while they arrive.
     b.until_slot(slot)?;
     for _ in 0..buffers {
-        let shot = b.shot(slot + 1)?;
-        b.send(&shot)?;
+        b.send_for(slot + 1)?;
     }
     let full = b.report()?;
     check(
@@ -106,8 +106,7 @@ fn credit_beyond(b: &mut Bench<'_>) -> R {
         &format!("no buffer free and no credit after {buffers} frames"),
         || tell(&full),
     )?;
-    let shot = b.shot(slot + 1)?;
-    b.send(&shot)?;
+    b.send_for(slot + 1)?;
     let s = b.report()?;
     check(grew(&full, &s, |s| s.frames_refused) == 1, "the frame beyond the limit refused", || tell(&s))?;
     check(s.frames_accounted == buffers + 1, "it accounted all the same", || tell(&s))?;
@@ -126,8 +125,7 @@ fn credit_lost(b: &mut Bench<'_>) -> R {
     b.frames_sent = 5;
     b.next_frame = b.next_frame.wrapping_add(5);
     let slot = b.slot_ahead_quietly()?;
-    let shot = b.shot(slot)?;
-    b.send(&shot)?;
+    b.send_for(slot)?;
     // Not SYNC, which accounts by itself: the STATUS that follows FRAME_COMMIT.
     let limit = b.answer_ns() + 1_000_000_000;
     let s = b.wait_status(limit, |s| s.frames_accounted >= 6)?;
@@ -160,16 +158,14 @@ fn frame_lit(b: &mut Bench<'_>) -> R {
     b.armed(|_| {})?;
     b.needs_frames()?;
     let before = b.report()?;
-    let slot = b.slot_ahead()?;
-    let shot = b.shot(slot)?;
-    b.send(&shot)?;
+    let shot = b.send_ahead()?;
     let sent = b.report()?;
     check(
         sent.last_whole_frame == shot.id && (sent.buffers_free < before.buffers_free || sent.frames_lit > 0),
         "the frame whole and in a buffer",
         || tell(&sent),
     )?;
-    let s = b.until_slot(slot)?;
+    let s = b.until_slot(shot.slot)?;
     check(fates(&before, &s) == [1, 0, 0, 0, 0] && s.lit, "one frame lit", || tell(&s))?;
     check(s.last_lit_frame == shot.id, &format!("frame {} lit", shot.id), || tell(&s))?;
     check(
@@ -229,10 +225,8 @@ fn underrun_blank(b: &mut Bench<'_>) -> R {
     b.armed(|c| c.underrun = Underrun::Blank)?;
     b.needs_frames()?;
     let before = b.report()?;
-    let slot = b.slot_ahead()?;
-    let shot = b.shot(slot)?;
-    b.send(&shot)?;
-    let s = b.until_slot(slot + 2)?;
+    let shot = b.send_ahead()?;
+    let s = b.until_slot(shot.slot + 2)?;
     check(
         grew(&before, &s, |s| s.frames_lit) == 1 && !s.lit,
         "lit in its slot, and dark afterwards",
@@ -249,31 +243,30 @@ pub(super) fn begun(b: &mut Bench<'_>) -> R<u64> {
     Ok(slot)
 }
 
-fn frame_late(b: &mut Bench<'_>) -> R {
-    b.armed(|_| {})?;
+/// A frame for the slot that runs, with the reports before it and three slots later.
+fn late(b: &mut Bench<'_>) -> R<(Shot, Status, Status)> {
     b.needs_frames()?;
     let slot = begun(b)?;
     let before = b.report()?;
-    let shot = b.shot(slot)?;
-    b.send(&shot)?;
-    let s = b.until_slot(slot + 3)?;
+    let shot = b.send_for(slot)?;
+    let after = b.until_slot(slot + 3)?;
+    Ok((shot, before, after))
+}
+
+fn frame_late(b: &mut Bench<'_>) -> R {
+    b.armed(|_| {})?;
+    let (_, before, s) = late(b)?;
     check(fates(&before, &s) == [0, 0, 1, 0, 0] && !s.lit, "one frame late, none lit", || tell(&s))
 }
 
 fn frame_late_allowed(b: &mut Bench<'_>) -> R {
     b.armed(|c| c.late_slots = 20)?;
-    b.needs_frames()?;
-    let slot = begun(b)?;
-    let before = b.report()?;
-    let shot = b.shot(slot)?;
-    b.send(&shot)?;
-    let s = b.until_slot(slot + 3)?;
+    let (shot, before, s) = late(b)?;
     check(fates(&before, &s) == [1, 0, 0, 0, 0], "the late frame lit", || tell(&s))?;
     check(s.last_lit_at.0 > shot.target, "lit in a later slot", || tell(&s))?;
     // Later than that it is dropped.
-    let before = b.until_slot(slot + 35)?;
-    let shot = b.shot(slot)?;
-    b.send(&shot)?;
+    let before = b.until_slot(shot.slot + 35)?;
+    b.send_for(shot.slot)?;
     let s = b.report()?;
     check(fates(&before, &s) == [0, 0, 1, 0, 0], "a frame 35 slots late dropped as late", || tell(&s))
 }
@@ -284,16 +277,12 @@ fn frame_early(b: &mut Bench<'_>) -> R {
     let before = b.report()?;
     let slots = b.slots()?;
     let far = b.ticks_now() + b.tick_hz() * 2 + b.ticks_of_ms(1500);
-    let slot = slots.slot_at(DeviceTicks(far)).unwrap_or(0);
-    let shot = b.shot(slot)?;
-    b.send(&shot)?;
+    b.send_for(slots.slot_at(DeviceTicks(far)).unwrap_or(0))?;
     let s = b.report()?;
     check(fates(&before, &s) == [0, 0, 0, 0, 1], "a frame 3.5 s ahead refused", || tell(&s))?;
     check(s.buffers_free == before.buffers_free, "no buffer taken by it", || tell(&s))?;
     let near = b.ticks_now() + b.tick_hz() + b.ticks_of_ms(500);
-    let slot = slots.slot_at(DeviceTicks(near)).unwrap_or(0);
-    let shot = b.shot(slot)?;
-    b.send(&shot)?;
+    b.send_for(slots.slot_at(DeviceTicks(near)).unwrap_or(0))?;
     let s = b.report()?;
     check(fates(&before, &s) == [0, 0, 0, 0, 1], "a frame 1.5 s ahead taken", || tell(&s))
 }

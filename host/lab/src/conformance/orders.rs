@@ -147,10 +147,8 @@ fn arm_faults(b: &mut Bench<'_>) -> R {
 /// One frame is lit, and stays so for two seconds.
 pub(super) fn lit_frame(b: &mut Bench<'_>) -> R<Status> {
     b.needs_frames()?;
-    let slot = b.slot_ahead()?;
-    let shot = b.shot(slot)?;
-    b.send(&shot)?;
-    let s = b.until_slot(slot)?;
+    let shot = b.send_ahead()?;
+    let s = b.until_slot(shot.slot)?;
     check(s.lit && s.last_lit_frame == shot.id, "the frame lit that the rule needs", || tell(&s))?;
     Ok(s)
 }
@@ -240,10 +238,8 @@ fn freeze(b: &mut Bench<'_>) -> R {
     b.say(&HostMessage::Freeze)?;
     let s = b.report()?;
     check(s.state == DeviceState::Frozen && s.lit, "frozen, with light", || tell(&s))?;
-    let slot = b.slot_ahead()?;
-    let shot = b.shot(slot)?;
-    b.send(&shot)?;
-    let s = b.until_slot(slot + 1)?;
+    let shot = b.send_ahead()?;
+    let s = b.until_slot(shot.slot + 1)?;
     check(
         s.state == DeviceState::Frozen && s.lit && s.last_lit_frame == before.last_lit_frame,
         "the frame before, still lit",

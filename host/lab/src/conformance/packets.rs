@@ -256,8 +256,7 @@ fn status_commit(b: &mut Bench<'_>) -> R {
     b.until_slot(slot)?;
     b.feed = false;
     b.forget()?;
-    let shot = b.shot(slot + 1)?;
-    b.send(&shot)?;
+    let shot = b.send_for(slot + 1)?;
     let limit = b.answer_ns();
     let s = b.wait_status(limit, |s| s.last_whole_frame == shot.id)?;
     let s = s.ok_or_else(|| b.silent("STATUS after FRAME_COMMIT"))?;

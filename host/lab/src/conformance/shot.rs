@@ -126,6 +126,19 @@ impl Bench<'_> {
         Ok(Shot { id, slot, target, pieces, commit, commits: true })
     }
 
+    /// Makes and sends the next frame, for `slot`.
+    pub(super) fn send_for(&mut self, slot: u64) -> R<Shot> {
+        let shot = self.shot(slot)?;
+        self.send(&shot)?;
+        Ok(shot)
+    }
+
+    /// Makes and sends the next frame, for a slot that is ahead.
+    pub(super) fn send_ahead(&mut self) -> R<Shot> {
+        let slot = self.slot_ahead()?;
+        self.send_for(slot)
+    }
+
     /// Sends it: all of it in one go, as a transfer carries a whole frame.
     pub(super) fn send(&mut self, shot: &Shot) -> R {
         self.send_as(self.session, Lane::Data, shot)
