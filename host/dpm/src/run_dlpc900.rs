@@ -35,7 +35,7 @@ const STEP: Duration = Duration::from_millis(20);
 const DARK_STEP: Duration = Duration::from_millis(2);
 /// How often a controller is told to be dark until the run has acted on it itself: a start of the run's that was under way may have
 /// followed the first word.
-const AGAIN_NS: u64 = u64::MAX;
+const AGAIN_NS: u64 = 10_000_000;
 /// How long a controller may be in other hands at the start: those of the run before, or of what puts it to rest after a SIGKILL.
 const BUSY_PATIENCE_NS: u64 = 5_000_000_000;
 /// How often the controller is asked how it is, and a lost one is looked for.
@@ -415,7 +415,7 @@ impl Word {
                 // Before it is obeyed, as above.
                 self.interlock.fetch_add(1, Ordering::SeqCst);
                 was_open = is_open;
-                let _ = is_open;
+                is_due |= is_open;
             }
             if is_due {
                 self.make_dark(false);

@@ -110,6 +110,15 @@ impl Drop for StopOnExit {
     }
 }
 
+/// Lets what hangs go on with the thread that watches it, should that fail, too: a test that fails must end.
+struct ReleaseOnExit(Arc<AtomicBool>);
+
+impl Drop for ReleaseOnExit {
+    fn drop(&mut self) {
+        self.0.store(false, Ordering::SeqCst);
+    }
+}
+
 /// A cable that can be cut: what stands at its other end is looked up each time it is opened.
 struct Cut {
     hid: VirtualHid,
@@ -396,7 +405,7 @@ fn a_hanging_run_is_made_dark_within_50_ms() {
             let (seen, watched, hold, held) =
                 (model.clone(), monitor.clone(), stuck.clone(), is_inside.clone());
             let observer = std::thread::spawn(move || {
-                let _ends = StopOnExit(watched.clone());
+                let (_ends, _goes_on) = (StopOnExit(watched.clone()), ReleaseOnExit(hold.clone()));
                 until(&seen, "running", is_running);
                 // Up first: the start is acknowledged.
                 until_told(&watched, ProjectorHealth::Up);
@@ -473,7 +482,11 @@ impl HidPort for LateStart {
         self.hid.write_report(report, timeout)
     }
     fn read_report(&mut self, report: &mut [u8; 64], timeout: Duration) -> Result<(), PortError> {
-        while self.stuck.load(Ordering::SeqCst) {
+        // For some 20 s at most, should the thread that clears it have failed before.
+        for _ in 0..20_000 {
+            if !self.stuck.load(Ordering::SeqCst) {
+                break;
+            }
             std::thread::sleep(Duration::from_millis(1));
         }
         self.hid.read_report(report, timeout)
@@ -499,7 +512,7 @@ fn a_start_that_arrives_after_the_order_to_be_dark_lights_for_50_ms_at_most() {
             let (monitor, closed) = with_interlock(true);
             let (seen, watched, hold, due) = (model.clone(), monitor.clone(), stuck.clone(), is_due.clone());
             let observer = std::thread::spawn(move || {
-                let _ends = StopOnExit(watched.clone());
+                let (_ends, _goes_on) = (StopOnExit(watched.clone()), ReleaseOnExit(hold.clone()));
                 until_told(&watched, ProjectorHealth::Up);
                 watched.give_order(Order::Black);
                 until_told(&watched, ProjectorHealth::Black);
