@@ -84,7 +84,7 @@ fn libusb_and_serialport_are_explained() {
         assert!(text.contains(words), "{words}");
     }
     // The command that the text tells must mean what it says.
-    let host = read("host/Cargo.toml");
+    let host = read("host/dpm/Cargo.toml");
     assert!(
         host.contains("default = [\"vendored-libusb\"]")
             && host.contains("vendored-libusb = [\"dpm-device/vendored-libusb\"]")
