@@ -102,6 +102,22 @@ fn an_unplugged_port_is_opened_again_within_a_second() {
     let _ = std::fs::remove_file(&link);
 }
 
+/// A packet that tells of body 0.
+fn pose(sequence: u32) -> Vec<u8> {
+    let mut out = Vec::new();
+    let message = SerialMessage::Pose {
+        body: 0,
+        tracked: true,
+        sequence,
+        captured: 0,
+        position: [0.1, 0.2, 0.3],
+        rotation_xyzw: [0.0, 0.0, 0.0, 1.0],
+        mean_error: 0.0,
+    };
+    message.encode(&mut out);
+    out
+}
+
 #[test]
 fn half_lines_and_other_baud_rates_do_no_harm() {
     let clock = clock();
@@ -110,20 +126,6 @@ fn half_lines_and_other_baud_rates_do_no_harm() {
     // Longer than a device is given to answer the first echo; this one never does.
     run(&mut tracker, &clock, 400);
     assert!(tracker.is_open() && tracker.status().contains("nothing has been heard"), "{}", tracker.status());
-    let pose = |sequence: u32| {
-        let mut out = Vec::new();
-        let message = SerialMessage::Pose {
-            body: 0,
-            tracked: true,
-            sequence,
-            captured: 0,
-            position: [0.1, 0.2, 0.3],
-            rotation_xyzw: [0.0, 0.0, 0.0, 1.0],
-            mean_error: 0.0,
-        };
-        message.encode(&mut out);
-        out
-    };
     // Joined in the middle of a packet: the rest of it is lost, the next one is not.
     ours.write_all(&pose(1)[20..]).unwrap();
     ours.write_all(&pose(2)).unwrap();
@@ -217,22 +219,10 @@ fn a_device_without_echo_is_heard_after_a_moment() {
     let clock = clock();
     let (mut ours, path, _held) = pseudo_terminal().unwrap();
     let mut tracker = tracker(&path, &clock);
-    let mut pose = Vec::new();
     let mut samples = Vec::new();
     let started = clock.now();
     for sequence in 0..60 {
-        pose.clear();
-        let message = SerialMessage::Pose {
-            body: 0,
-            tracked: true,
-            sequence,
-            captured: 0,
-            position: [0.1, 0.2, 0.3],
-            rotation_xyzw: [0.0, 0.0, 0.0, 1.0],
-            mean_error: 0.0,
-        };
-        message.encode(&mut pose);
-        ours.write_all(&pose).unwrap();
+        ours.write_all(&pose(sequence)).unwrap();
         samples.extend(run(&mut tracker, &clock, 10));
     }
     let first = samples.first().expect("heard").received_at.ns_since(started);

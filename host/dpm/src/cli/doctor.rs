@@ -310,10 +310,13 @@ impl System {
     }
 }
 
+/// What a USB device is by its numbers, four hexadecimal digits each, if it is a projector that this program drives.
 fn known_projector(vendor: &str, product: &str) -> Option<&'static str> {
-    match (vendor, product) {
-        ("0451", "c900") => Some("TI DLPC900"),
-        ("1209", "000d") => Some("bit-plane projector"),
+    use dpm_device::{dlpc900::usb as dlpc900, transport::usb as link};
+    let number = |text: &str| u16::from_str_radix(text, 16).ok();
+    match (number(vendor)?, number(product)?) {
+        (dlpc900::VENDOR, dlpc900::PRODUCT) => Some("TI DLPC900"),
+        (link::VENDOR_ID, link::PRODUCT_ID) => Some("bit-plane projector"),
         _ => None,
     }
 }
@@ -382,6 +385,18 @@ mod tests {
         assert!(finding.found.contains("50 ms in every 1000 ms"), "{}", finding.found);
         let (_root, system) = Root::new("free", &files("-1\n"));
         assert_eq!(system.throttling().unwrap().state, State::Ok);
+    }
+
+    /// Found in use: the doctor looked for numbers that no projector of the link has.
+    #[test]
+    fn a_projector_is_known_by_the_numbers_that_its_driver_opens() {
+        use dpm_device::{dlpc900::usb as dlpc900, transport::usb as link};
+        let known =
+            |vendor: u16, product: u16| known_projector(&format!("{vendor:04x}"), &format!("{product:04x}"));
+        assert_eq!(known(link::VENDOR_ID, link::PRODUCT_ID), Some("bit-plane projector"));
+        assert_eq!(known(dlpc900::VENDOR, dlpc900::PRODUCT), Some("TI DLPC900"));
+        assert_eq!(known(link::VENDOR_ID, link::PRODUCT_ID + 1), None);
+        assert_eq!(known_projector("", "000d"), None);
     }
 
     #[test]

@@ -396,21 +396,22 @@ fn hierarchy(seed: u64) -> f64 {
     let one = Triangle { p: [DVec3::X, DVec3::Y, DVec3::Z], body: 0, index: 0 };
     let equal = Bvh::new(vec![one; 20_000]);
     wrong += mismatch(&equal, DVec3::ZERO, DVec3::ONE);
-    let doubling = (0..900)
-        .map(|i| {
-            let x = 2f64.powi(i - 450);
-            Triangle {
-                p: [DVec3::X * x, DVec3::new(x, 1.0, 0.0), DVec3::new(x, 0.0, 1.0)],
-                body: 0,
-                index: i as u32,
-            }
-        })
-        .collect();
-    let doubling = Bvh::new(doubling);
+    let doubling = Bvh::new(doubling());
     for i in [0, 1, 450, 700] {
         wrong += mismatch(&doubling, DVec3::new(0.75 * 2f64.powi(i - 450), 0.25, 0.25), DVec3::X);
     }
     f64::from(wrong)
+}
+
+/// 900 triangles whose coordinates double from one to the next: cut by area they would give a tree as deep as their number. Triangle `i`
+/// stands across the x axis at `2^(i - 450)`.
+pub(crate) fn doubling() -> Vec<Triangle> {
+    let one = |i: i32| {
+        let x = 2f64.powi(i - 450);
+        let p = [DVec3::X * x, DVec3::new(x, 1.0, 0.0), DVec3::new(x, 0.0, 1.0)];
+        Triangle { p, body: 0, index: i as u32 }
+    };
+    (0..900).map(one).collect()
 }
 
 fn invalid_rays(_: u64) -> f64 {

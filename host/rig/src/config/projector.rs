@@ -106,9 +106,9 @@ section! {
     /// A bit-plane projector on USB.
     pub struct UsbProjectorConfig {
         /// USB vendor id.
-        vendor_id: u16 = 0x1209, "", Any;
+        vendor_id: u16 = dpm_device::transport::usb::VENDOR_ID, "", Any;
         /// USB product id.
-        product_id: u16 = 0x000d, "", Any;
+        product_id: u16 = dpm_device::transport::usb::PRODUCT_ID, "", Any;
         /// Serial number of the device; needed when several are plugged in.
         serial_number: Option<String> = None, "", NotEmpty;
         /// Frames queued at once. More bridge longer pauses of the host, and each adds a frame of latency to a link that is full;

@@ -559,6 +559,11 @@ mod tests {
     /// Lit, dropped and missed of frames that were all sent, and of which those are lit that `lit` says, when the collector finds them all at
     /// once; and slots in which another was repeated.
     fn counted(frames: u64, lit: impl Fn(u64) -> bool) -> [u64; 4] {
+        collected(frames, lit, &mut || ())
+    }
+
+    /// The same; `alive` is called for every sign of life of the collector.
+    fn collected(frames: u64, lit: impl Fn(u64) -> bool, alive: &mut dyn FnMut()) -> [u64; 4] {
         let config = RigConfig::demo(&Overrides::default()).unwrap_or_else(|e| panic!("{e}"));
         let rig = Arc::new(Rig::build(&config, Raster::new(16, 16)).unwrap_or_else(|e| panic!("{e}")));
         let (mut done_in, done) = channel(frames as usize, WaitPolicy::Park);
@@ -588,7 +593,10 @@ mod tests {
         drop((done_in, lights_in));
         let mut collector = Collector::new(rig, 0, false);
         let monitor = RunMonitor::default();
-        collector.run(done, &|_| (), lights, &monitor, || true);
+        collector.run(done, &|_| (), lights, &monitor, || {
+            alive();
+            true
+        });
         let missed = collector.finish(&monitor).missed_total();
         [collector.lit, collector.dropped, missed, collector.repeated]
     }
@@ -606,5 +614,13 @@ mod tests {
         // Nothing but light that is told late, behind more frames than can wait.
         let late = many - MAX_PENDING as u64 - 10;
         assert_eq!(counted(many, |k| k >= late), [many - late, late, late, late]);
+    }
+
+    /// Found in use: on a busy machine a backlog of thousands of notes takes seconds, in which the collector is alive.
+    #[test]
+    fn every_note_of_a_backlog_is_a_sign_of_life() {
+        let mut signs = 0;
+        assert_eq!(collected(5_000, |_| true, &mut || signs += 1)[0], 5_000);
+        assert!(signs >= 5_000, "{signs}");
     }
 }

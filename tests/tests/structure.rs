@@ -1,0 +1,153 @@
+//! The house held to its plan: no file of the sources lies beside it, one file of the rig names the mocks, and no circle of imports joins
+//! the folders of a crate. What lies between crates Cargo keeps.
+
+use std::collections::{BTreeMap, BTreeSet};
+use std::path::{Path, PathBuf};
+
+/// The crates of the rig controller, folders of `host/`. The laboratory's reference and its stability cases still use each other's tests.
+const CRATES: [&str; 5] = ["common", "scene", "tracking", "render", "rig"];
+
+fn root() -> PathBuf {
+    Path::new(env!("CARGO_MANIFEST_DIR")).join("..")
+}
+
+/// The Rust files below `folder`, with their texts.
+fn sources(folder: &Path) -> Vec<(PathBuf, String)> {
+    let mut all = Vec::new();
+    for entry in std::fs::read_dir(folder).unwrap_or_else(|e| panic!("{}: {e}", folder.display())) {
+        let path = entry.unwrap().path();
+        if path.is_dir() {
+            all.extend(sources(&path));
+        } else if path.extension().is_some_and(|e| e == "rs") {
+            let text = std::fs::read_to_string(&path).unwrap_or_else(|e| panic!("{}: {e}", path.display()));
+            all.push((path, text));
+        }
+    }
+    all.sort();
+    all
+}
+
+/// The code of a file: without its comments, and without the module of tests at its end.
+fn code(text: &str) -> String {
+    let end = text.find("#[cfg(test)]\nmod ").unwrap_or(text.len());
+    text[..end].lines().filter(|line| !line.trim_start().starts_with("//")).collect::<Vec<_>>().join("\n")
+}
+
+/// What follows `mark` in `text`, up to the end of the name.
+fn names_after<'a>(text: &'a str, mark: &'a str) -> impl Iterator<Item = &'a str> {
+    text.split(mark).skip(1).map(|rest| {
+        let end = rest.find(|c: char| c != '_' && !c.is_ascii_alphanumeric()).unwrap_or(rest.len());
+        &rest[..end]
+    })
+}
+
+/// Files of `all`, sources of the folder `src`, that no module of it declares.
+fn undeclared(src: &Path, all: &[(PathBuf, String)]) -> Vec<PathBuf> {
+    let mut declared: BTreeSet<PathBuf> = ["lib.rs", "main.rs"].map(|root| src.join(root)).into();
+    for (path, text) in all {
+        let folder = path.parent().expect("in a folder");
+        let stem = path.file_stem().expect("a name");
+        let inner =
+            if ["lib", "main", "mod"].iter().any(|s| stem == *s) { folder.into() } else { folder.join(stem) };
+        for name in names_after(text, "mod ") {
+            declared.extend([inner.join(format!("{name}.rs")), inner.join(name).join("mod.rs")]);
+        }
+        // Tests in a file beside the one that they test.
+        for path in text.split("#[path = \"").skip(1).filter_map(|rest| rest.split('"').next()) {
+            declared.extend([folder.join(path), inner.join(path)]);
+        }
+    }
+    all.iter().map(|(path, _)| path.clone()).filter(|path| !declared.contains(path)).collect()
+}
+
+#[test]
+fn no_source_file_is_left_behind() {
+    let mut left = Vec::new();
+    for krate in ["device", "hil-mock", "host/dpm", "host/handoff", "host/lab"]
+        .map(String::from)
+        .into_iter()
+        .chain(CRATES.map(|c| format!("host/{c}")))
+    {
+        let src = root().join(krate).join("src");
+        left.extend(undeclared(&src, &sources(&src)));
+    }
+    assert!(left.is_empty(), "no module declares {left:?}");
+}
+
+#[test]
+fn one_file_of_the_rig_names_the_mocks() {
+    let src = root().join("host/rig/src");
+    let naming: Vec<PathBuf> = sources(&src)
+        .into_iter()
+        .map(|(path, text)| (path.strip_prefix(&src).expect("below it").to_owned(), text))
+        .filter(|(path, text)| !path.to_string_lossy().contains("tests") && code(text).contains("hil_mock"))
+        .map(|(path, _)| path)
+        .collect();
+    assert_eq!(naming, [PathBuf::from("mock.rs")]);
+}
+
+/// Modules at the top of a crate, and those whose names each uses.
+type Arrows = BTreeMap<String, BTreeSet<String>>;
+
+fn arrows(src: &Path) -> Arrows {
+    let mut all = Arrows::new();
+    for (path, text) in sources(src) {
+        let below = path.strip_prefix(src).expect("below it");
+        let top = below.components().next().expect("a name").as_os_str().to_string_lossy();
+        let module = top.trim_end_matches(".rs").to_owned();
+        if module == "lib" || below.to_string_lossy().contains("tests") {
+            continue;
+        }
+        let used = all.entry(module.clone()).or_default();
+        used.extend(names_after(&code(&text), "crate::").filter(|name| *name != module).map(String::from));
+    }
+    // Items that the crate's root gives out are no modules.
+    let modules: BTreeSet<String> = all.keys().cloned().collect();
+    all.values_mut().for_each(|used| used.retain(|name| modules.contains(name)));
+    all
+}
+
+/// A module that reaches itself, and the way.
+fn circle(all: &Arrows) -> Option<Vec<String>> {
+    fn walk<'a>(
+        all: &'a Arrows,
+        way: &mut Vec<&'a str>,
+        done: &mut BTreeSet<&'a str>,
+    ) -> Option<Vec<String>> {
+        let here = *way.last()?;
+        for next in &all[here] {
+            if let Some(begin) = way.iter().position(|w| w == next) {
+                return Some(way[begin..].iter().map(|w| (*w).to_owned()).collect());
+            }
+            if !done.contains(next.as_str()) {
+                way.push(next);
+                if let Some(found) = walk(all, way, done) {
+                    return Some(found);
+                }
+                way.pop();
+            }
+        }
+        done.insert(here);
+        None
+    }
+    let mut done = BTreeSet::new();
+    all.keys().find_map(|module| walk(all, &mut vec![module.as_str()], &mut done))
+}
+
+#[test]
+fn no_circle_joins_the_folders_of_a_crate() {
+    for krate in CRATES {
+        let all = arrows(&root().join("host").join(krate).join("src"));
+        assert_eq!(circle(&all), None, "host/{krate}");
+    }
+}
+
+#[test]
+fn a_circle_is_found_and_a_diamond_is_none() {
+    let of = |arrows: &[(&str, &[&str])]| -> Arrows {
+        arrows.iter().map(|(m, used)| ((*m).into(), used.iter().map(|u| (*u).into()).collect())).collect()
+    };
+    assert_eq!(circle(&of(&[("a", &["b", "c"]), ("b", &["d"]), ("c", &["d"]), ("d", &[])])), None);
+    let found = circle(&of(&[("a", &["b"]), ("b", &["c"]), ("c", &["b"])]));
+    assert_eq!(found, Some(vec!["b".into(), "c".into()]));
+}
