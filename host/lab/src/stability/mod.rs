@@ -24,7 +24,7 @@ mod planes;
 mod predictor;
 pub mod scattering;
 pub mod statistics;
-mod tracer;
+pub(crate) mod tracer;
 
 use serde::Serialize;
 use std::ops::RangeInclusive;
