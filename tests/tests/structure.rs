@@ -86,6 +86,32 @@ fn one_file_of_the_rig_names_the_mocks() {
     assert_eq!(naming, [PathBuf::from("mock.rs")]);
 }
 
+/// What no file of the engine may name in its code: threads, clocks, and ways to the outside. A medium comes in as a `Transport`.
+const OUTSIDE: [&str; 10] = [
+    "std::thread",
+    "SystemTime",
+    "Instant",
+    "Stopwatch",
+    "dpm_common::clock",
+    "std::fs",
+    "std::net",
+    "std::io::Read",
+    "crate::pipeline",
+    "crate::mock",
+];
+
+#[test]
+fn the_engine_has_no_thread_no_clock_and_no_io() {
+    let src = root().join("host/rig/src/engine");
+    let files = sources(&src);
+    assert!(files.len() >= 10, "the engine lies elsewhere: {files:?}");
+    for (path, text) in files {
+        let code = code(&text);
+        let named: Vec<_> = OUTSIDE.iter().filter(|outside| code.contains(**outside)).collect();
+        assert!(named.is_empty(), "{} names {named:?}", path.display());
+    }
+}
+
 /// Modules at the top of a crate, and those whose names each uses.
 type Arrows = BTreeMap<String, BTreeSet<String>>;
 

@@ -115,31 +115,6 @@ impl Stopwatch {
     }
 }
 
-/// The clock of a run: the wall's, or one that the planning stage moves.
-#[derive(Debug)]
-pub enum RunClock {
-    /// Real pace.
-    Real(MonotonicClock),
-    /// Virtual pace.
-    Virtual(ManualClock),
-}
-
-impl Clock for RunClock {
-    fn now(&self) -> HostTime {
-        match self {
-            Self::Real(clock) => clock.now(),
-            Self::Virtual(clock) => clock.now(),
-        }
-    }
-
-    fn wait_until(&self, at: HostTime) -> HostTime {
-        match self {
-            Self::Real(clock) => clock.wait_until(at),
-            Self::Virtual(clock) => clock.wait_until(at),
-        }
-    }
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;

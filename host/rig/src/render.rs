@@ -1,31 +1,35 @@
 //! A planned frame into work of the GPU, and its end.
 
-use crate::frame::job::{FrameJob, FrameMemory};
+use crate::frame::job::FrameJob;
 use crate::frame::Stage;
+use crate::plan::frame::FramePlan;
 use crate::rig::{affine, Rig};
 use dpm_common::clock::Stopwatch;
 use dpm_render::gpu::GpuError;
-use dpm_render::{FrameInputs, Renderer};
+use dpm_render::{FrameInputs, FrameSlot, Renderer};
 
-/// Starts the GPU on a planned job.
+/// Starts the GPU on a planned frame.
 ///
 /// # Errors
 /// Device lost.
-pub(crate) fn submit(job: &mut FrameJob, rig: &Rig, renderer: &mut Renderer) -> Result<(), GpuError> {
-    let FrameJob { note, memory } = job;
-    let Some(slot) = memory.gpu.as_mut() else { return Ok(()) };
+pub(crate) fn submit(
+    plan: &FramePlan,
+    slot: &mut FrameSlot,
+    rig: &Rig,
+    renderer: &mut Renderer,
+) -> Result<(), GpuError> {
     renderer.submit(
         slot,
         &FrameInputs {
-            frame: note.id.0 as u32,
+            frame: plan.id.0 as u32,
             spp: rig.config.render.spp,
-            budget_spp: note.budget_milli as f32 * 1e-3,
+            budget_spp: plan.budget_milli as f32 * 1e-3,
             camera: &rig.camera,
-            eye: note.eye,
-            gaze: memory.gaze,
-            widen_deg: memory.widen_deg,
-            poses: &memory.scene_poses,
-            lost: &memory.lost,
+            eye: plan.eye,
+            gaze: plan.gaze,
+            widen_deg: plan.widen_deg,
+            poses: &plan.scene_poses,
+            lost: &plan.lost,
         },
     )
 }
@@ -36,29 +40,18 @@ pub(crate) fn submit(job: &mut FrameJob, rig: &Rig, renderer: &mut Renderer) -> 
 /// # Errors
 /// The GPU did not finish within `timeout_ns`, or was lost.
 pub(crate) fn warm_up(
-    memory: &mut FrameMemory,
+    slot: &mut FrameSlot,
     rig: &Rig,
     renderer: &mut Renderer,
     timeout_ns: u64,
 ) -> Result<i64, GpuError> {
-    let Some(slot) = memory.gpu.as_mut() else { return Ok(0) };
     let watch = Stopwatch::start();
-    let rest: Vec<_> = rig.bodies.iter().map(|b| affine(&b.rest)).collect();
-    rig.scene_poses(&rest, &mut memory.scene_poses);
-    let (eye, gaze) = rig.observer.eye_and_gaze(&rest);
-    let spp = rig.config.render.spp;
-    let inputs = FrameInputs {
-        frame: 0,
-        spp,
-        budget_spp: spp as f32,
-        camera: &rig.camera,
-        eye,
-        gaze,
-        widen_deg: 0.0,
-        poses: &memory.scene_poses,
-        lost: &memory.lost,
-    };
-    renderer.submit(slot, &inputs)?;
+    let mut plan = FramePlan::empty(rig);
+    plan.tracked_poses.extend(rig.bodies.iter().map(|b| affine(&b.rest)));
+    rig.scene_poses(&plan.tracked_poses, &mut plan.scene_poses);
+    (plan.eye, plan.gaze) = rig.observer.eye_and_gaze(&plan.tracked_poses);
+    plan.budget_milli = u64::from(rig.config.render.spp) * 1000;
+    submit(&plan, slot, rig, renderer)?;
     slot.wait(timeout_ns).map(|_| watch.elapsed_ns() as i64)
 }
 

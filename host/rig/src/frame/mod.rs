@@ -3,15 +3,10 @@
 //! At real pace the stamps are readings of the host's clock. At virtual pace they are the rig's clock, advanced by the modelled cost
 //! of each stage, so that a run repeats bit for bit; what the stages really took is kept apart in [`FrameTimeline::wall_ns`].
 
-pub mod dark;
 pub(crate) mod job;
 pub(crate) mod slots;
 
 use dpm_device::time::HostTime;
-
-/// Number of a frame since the start of the run. Never reused; the link carries the low 32 bits.
-#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, PartialOrd, Ord, Hash)]
-pub struct FrameId(pub u64);
 
 /// The stages whose wall time is kept, in the order in which a frame passes them.
 pub(crate) const STAGES: [&str; 5] = ["plan", "render", "pack", "link", "light"];

@@ -1,14 +1,15 @@
 //! Finished frames and light into a report. Runs on its own thread, off the frame path: it may allocate.
 
 use crate::config::{Pace, ProjectorBackend, TrackerConfig};
-use crate::frame::dark::DarkCause;
 use crate::frame::job::{Fate, FrameNote};
 use crate::frame::slots::OrderedDark;
-use crate::frame::{FrameId, FrameTimeline, Stage, STAGES};
+use crate::frame::{FrameTimeline, Stage, STAGES};
 use crate::light::dark_bodies::DarkBodies;
 use crate::light::placement::Placement;
 use crate::light::recorder::LightNote;
 use crate::light::registration::{measured_at, RegistrationMeter};
+use crate::plan::dark::DarkCause;
+use crate::plan::frame::FrameId;
 use crate::plan::light_centre::centre_ns;
 use crate::realtime::standstill::SeenStandstills;
 use crate::rig::Rig;
@@ -28,13 +29,9 @@ use glam::{DAffine3, DVec3};
 use hdrhistogram::Histogram;
 use std::collections::VecDeque;
 use std::sync::Arc;
-use std::time::Duration;
 
 /// Sent frames that may wait for their light; beyond this the oldest count as never lit, once no light is left to look at.
 const MAX_PENDING: usize = 256;
-
-/// Time between two looks at what is finished.
-const REST: Duration = Duration::from_millis(2);
 
 /// What is kept of one lit frame for pictures.
 #[derive(Clone, Debug)]
@@ -59,9 +56,19 @@ pub struct FrameRecord {
     pub pass_ns: [u64; PASSES.len()],
 }
 
+/// Where the collector finds what it counts.
+pub(crate) struct Inbox {
+    /// Frames that the link is done with.
+    pub done: Receiver<Box<FrameNote>>,
+    /// What the projector did in each slot.
+    pub lights: Receiver<LightNote>,
+}
+
 /// Counts and distributions of a run.
 pub(crate) struct Collector {
     rig: Arc<Rig>,
+    /// Light of a frame that the link has not said yet that it sent.
+    held: Option<LightNote>,
     meter: RegistrationMeter,
     placement: Placement,
     pending: VecDeque<FrameRecord>,
@@ -150,6 +157,7 @@ impl Collector {
             has_still_light: rig.scene.bodies.iter().any(|b| b.tracked.is_none() && b.projected),
             slots: SlotLedger::new(rig.rate(), lead_ns),
             rig,
+            held: None,
             meter,
             pending: VecDeque::new(),
             recent: VecDeque::new(),
@@ -200,62 +208,53 @@ impl Collector {
 
     /// The run is over and everything is known: what became of every slot.
     pub(crate) fn finish(&mut self, monitor: &RunMonitor) -> SlotCounts {
+        // What was sent and never lit is dropped.
+        while !self.pending.is_empty() {
+            self.drop_oldest(monitor);
+        }
         self.slots.read_orders(monitor.dark());
         self.slots.finish()
     }
 
-    /// Takes finished frames and light until both are over, or until `goes_on`, which is asked at every look and for every note, says no at
-    /// a look; gives the notes back to `free`.
-    pub(crate) fn run(
+    /// Takes the frames that the link is done with, and light, as far as they have come; gives the notes back to `free`. `alive` is called for
+    /// every note: a long backlog on a busy machine takes seconds. True when both are over.
+    pub(crate) fn look(
         &mut self,
-        mut done: Receiver<Box<FrameNote>>,
+        inbox: &mut Inbox,
         free: &dyn Fn(Box<FrameNote>),
-        mut lights: Receiver<LightNote>,
         monitor: &RunMonitor,
-        mut goes_on: impl FnMut() -> bool,
-    ) {
-        let mut held = None;
-        while goes_on() {
-            // Asked before looking: what came before the end is taken first.
-            let over = done.is_finished() && lights.is_finished();
-            self.slots.read_orders(monitor.dark());
-            loop {
-                let light = held.take().or_else(|| lights.try_pop());
-                // After the light was taken: of the frames before it all has been said.
-                self.take_finished(&mut done, free, monitor, &mut goes_on);
-                // Lit before the link's thread came to say that it was sent.
-                let unknown = |f: u32| self.newest.is_none_or(|n| frame_newer(f, n));
-                // Or in a slot that those still to be taken were planned for.
-                let ahead = |slot: u64| !done.is_empty() && self.last_planned.is_none_or(|last| last < slot);
-                match light {
-                    Some(note)
-                        if !ahead(note.event.slot) && (over || !note.event.frame.is_some_and(unknown)) =>
-                    {
-                        self.light(&note, monitor);
+        alive: &mut dyn FnMut(),
+    ) -> bool {
+        // Asked before looking: what came before the end is taken first.
+        let over = inbox.done.is_finished() && inbox.lights.is_finished();
+        self.slots.read_orders(monitor.dark());
+        loop {
+            let light = self.held.take().or_else(|| inbox.lights.try_pop());
+            // After the light was taken: of the frames before it all has been said.
+            self.take_finished(&mut inbox.done, free, monitor, alive);
+            // Lit before the link's thread came to say that it was sent.
+            let unknown = |f: u32| self.newest.is_none_or(|n| frame_newer(f, n));
+            // Or in a slot that those still to be taken were planned for.
+            let ahead =
+                |slot: u64| !inbox.done.is_empty() && self.last_planned.is_none_or(|last| last < slot);
+            match light {
+                Some(note) if !ahead(note.event.slot) && (over || !note.event.frame.is_some_and(unknown)) => {
+                    self.light(&note, monitor);
+                }
+                light => {
+                    self.held = light;
+                    if self.pending.len() < MAX_PENDING || inbox.done.is_empty() {
+                        break;
                     }
-                    light => {
-                        held = light;
-                        if self.pending.len() < MAX_PENDING || done.is_empty() {
-                            break;
-                        }
-                        // Frames are finished behind as many that no light is told of.
-                        self.drop_oldest(monitor);
-                    }
+                    // Frames are finished behind as many that no light is told of.
+                    self.drop_oldest(monitor);
                 }
             }
-            self.slots.settle();
-            let slots = self.slots.counts();
-            monitor.set_slots(slots.wanted(), slots.missed_total());
-            if over {
-                break;
-            }
-            // Not woken for every frame: that would cost the frame path two system calls a frame. There are notes for longer.
-            std::thread::sleep(REST);
         }
-        // What was sent and never lit is dropped.
-        for _ in 0..self.pending.len() {
-            self.drop_oldest(monitor);
-        }
+        self.slots.settle();
+        let slots = self.slots.counts();
+        monitor.set_slots(slots.wanted(), slots.missed_total());
+        over
     }
 
     /// Takes finished frames until no more can wait for their light: what they wait for is looked at before others are taken, however long
@@ -265,12 +264,11 @@ impl Collector {
         done: &mut Receiver<Box<FrameNote>>,
         free: &dyn Fn(Box<FrameNote>),
         monitor: &RunMonitor,
-        goes_on: &mut impl FnMut() -> bool,
+        alive: &mut dyn FnMut(),
     ) {
         while self.pending.len() < MAX_PENDING {
             let Some(note) = done.try_pop() else { break };
-            // A long backlog on a busy machine takes seconds: every note of it is a sign of life.
-            goes_on();
+            alive();
             self.finished(&note, monitor);
             free(note);
         }
@@ -318,7 +316,7 @@ impl Collector {
     }
 
     fn finished(&mut self, job: &FrameNote, monitor: &RunMonitor) {
-        self.newest = Some(job.id.0 as u32);
+        self.newest = Some(job.plan.id.0 as u32);
         let cost = job.cost.unwrap_or_default();
         let c = cost.counters();
         self.rays += u64::from(c.rays);
@@ -341,24 +339,29 @@ impl Collector {
                 self.stages[stage as usize].saturating_record(ns);
             }
         }
-        self.placement.observe(&self.rig.camera, &job.sampled_poses, &job.seen, self.meter.points());
+        self.placement.observe(
+            &self.rig.camera,
+            &job.plan.sampled_poses,
+            &job.plan.seen,
+            self.meter.points(),
+        );
         let sent = job.is_sent();
         let refused = !sent && !matches!(job.fate, Fate::Overtaken | Fate::Stopped);
-        self.slots.planned(job.slot, &job.timeline, refused, job.waited_for_memory);
-        self.last_planned = self.last_planned.max(Some(job.slot));
-        while self.repeats.front().is_some_and(|&slot| slot < job.slot) {
+        self.slots.planned(job.plan.slot, &job.timeline, refused, job.waited_for_memory);
+        self.last_planned = self.last_planned.max(Some(job.plan.slot));
+        while self.repeats.front().is_some_and(|&slot| slot < job.plan.slot) {
             self.repeats.pop_front();
             self.repeated += 1;
         }
         if sent {
             self.pending.push_back(FrameRecord {
-                id: job.id,
-                slot: job.slot,
+                id: job.plan.id,
+                slot: job.plan.slot,
                 timeline: job.timeline,
-                tracked_poses: job.tracked_poses.clone(),
-                sampled_poses: job.sampled_poses.clone(),
-                dark: job.dark.clone(),
-                eye: job.eye,
+                tracked_poses: job.plan.tracked_poses.clone(),
+                sampled_poses: job.plan.sampled_poses.clone(),
+                dark: job.plan.dark.clone(),
+                eye: job.plan.eye,
                 code_hash: job.code_hash,
                 pass_ns: cost.pass_ns,
             });
@@ -570,12 +573,12 @@ mod tests {
         let (mut lights_in, lights) = channel(frames as usize, WaitPolicy::Park);
         for k in 0..frames {
             let begin = HostTime(k as i64 * SLOT_NS);
-            let mut note = FrameNote::new(rig.bodies.len());
-            (note.id, note.slot, note.fate) = (FrameId(k), k, Fate::Offered(SendOutcome::Sent));
+            let mut note = FrameNote::new(&rig);
+            (note.plan.id, note.plan.slot, note.fate) = (FrameId(k), k, Fate::Offered(SendOutcome::Sent));
             note.timeline.due_at = begin;
             let poses = rig.true_poses(begin.0).expect("the mock tells");
-            (note.tracked_poses, note.sampled_poses) = (poses.clone(), poses);
-            note.dark = vec![None; rig.bodies.len()];
+            (note.plan.tracked_poses, note.plan.sampled_poses) = (poses.clone(), poses);
+            note.plan.dark = vec![None; rig.bodies.len()];
             assert!(done_in.push(Box::new(note)).is_ok());
             let (kind, frame) =
                 if lit(k) { (LightKind::Lit, Some(k as u32)) } else { (LightKind::Repeated, None) };
@@ -593,10 +596,8 @@ mod tests {
         drop((done_in, lights_in));
         let mut collector = Collector::new(rig, 0, false);
         let monitor = RunMonitor::default();
-        collector.run(done, &|_| (), lights, &monitor, || {
-            alive();
-            true
-        });
+        let mut inbox = Inbox { done, lights };
+        while !collector.look(&mut inbox, &|_| (), &monitor, alive) {}
         let missed = collector.finish(&monitor).missed_total();
         [collector.lit, collector.dropped, missed, collector.repeated]
     }

@@ -2,7 +2,7 @@
 //!
 //! Beside the frame path: it may allocate.
 
-use crate::frame::dark::DarkCause;
+use crate::plan::dark::DarkCause;
 use crate::telemetry::report::DarkBody;
 use dpm_device::time::HostTime;
 

@@ -24,7 +24,7 @@ pub(crate) fn pack(job: &mut FrameJob, kernel: Kernel, verify: bool, prepared: &
             note.code_hash = hash_codes(codes.iter().map(|&c| shown.light(c)));
         }
     } else if let Some(prepared) = prepared {
-        prepared.pack(kernel, note.id.0, &mut memory.planes);
+        prepared.pack(kernel, note.plan.id.0, &mut memory.planes);
         note.timeline.wall_ns[Stage::Pack as usize] = watch.elapsed_ns();
     }
 }

@@ -3,23 +3,25 @@
 //! A crew owns everything that it works with and hands frames to the link through a [`Port`]. Abandoning it is dropping the port's other
 //! end: whatever its threads still do when they wake up, none of it reaches the link, and so none of it reaches the light.
 
-use super::outcome::PipelineError;
-use super::planning::{plan_thread, PlanInbox};
-use super::pulse::{Pulse, Silence};
-use super::threads::{pack_thread, policy, tracking_thread, PackInbox, Shared, NOTES};
+use super::parts::CrewParts;
+use super::threads::{
+    pack_thread, plan_thread, policy, tracking_thread, PackInbox, PlanInbox, Shared, NOTES,
+};
+use crate::engine::error::PipelineError;
+use crate::engine::facts::CrewFacts;
+use crate::engine::pack::PackStage;
+use crate::engine::pulse::{Pulse, Silence};
+use crate::engine::supervision::Trouble;
 use crate::frame::job::{FrameJob, FrameMemory, FrameNote};
-use crate::pack::prepared::PreparedFrames;
-use crate::plan::budget::BudgetController;
 use crate::plan::link_time::LinkTime;
-use crate::tracks::{TrackSnapshot, TrackingStage};
+use crate::realtime::os::standing_of;
+use crate::tracks::TrackSnapshot;
 use dpm_device::time::HostTime;
 use dpm_handoff::channel::{channel, Receiver, Sender};
 use dpm_handoff::latest::{latest, Publisher};
 use dpm_handoff::wake::{WaitPolicy, Waiter};
-use dpm_render::pack::Kernel;
-use dpm_render::Renderer;
-use std::sync::atomic::{AtomicBool, AtomicI64, AtomicU64, Ordering};
-use std::sync::{Arc, Mutex, OnceLock};
+use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
+use std::sync::{Arc, Mutex};
 use std::thread::JoinHandle;
 
 /// Places of the stages in [`CrewState::pulses`].
@@ -28,22 +30,6 @@ pub(super) const TRACKING: usize = 0;
 pub(super) const PLAN: usize = 1;
 /// See [`TRACKING`].
 pub(super) const PACK: usize = 2;
-
-/// What a crew works with.
-pub(super) struct CrewParts {
-    pub(super) tracking: TrackingStage,
-    /// `None` if frames are prepared.
-    pub(super) renderer: Option<Renderer>,
-    pub(super) prepared: Option<PreparedFrames>,
-    /// How planes are packed if the GPU has not done it.
-    pub(super) kernel: Kernel,
-    /// `None` if every frame gets the rays that the rig file asks for.
-    pub(super) budget: Option<BudgetController>,
-    /// What frames are made in.
-    pub(super) memory: Vec<FrameMemory>,
-    /// What a frame took while nobody was waiting for it, nanoseconds; 0 if frames are prepared.
-    pub(super) frame_ns: i64,
-}
 
 /// Where the link's thread finds the frames of a crew, and gives their memory back.
 pub(super) struct Port {
@@ -74,64 +60,15 @@ impl NotesBack {
     }
 }
 
-/// What the GPU has to do and how long it takes, shared by planning and packing.
-#[derive(Debug, Default)]
-pub(super) struct GpuPace {
-    submitted: AtomicU64,
-    finished: AtomicU64,
-    frame_ns: AtomicI64,
-}
-
-impl GpuPace {
-    /// Share of a slot beyond which frames are begun one at a time: a GPU that needs longer than that would only queue them up, and each
-    /// would be drawn for poses that grow old in the queue.
-    const SLOW: f64 = 0.9;
-
-    fn new(frame_ns: i64) -> Self {
-        Self { frame_ns: AtomicI64::new(frame_ns), ..Self::default() }
-    }
-
-    /// A frame was handed to the GPU.
-    pub(super) fn submit(&self) {
-        self.submitted.fetch_add(1, Ordering::Relaxed);
-    }
-
-    /// The GPU has finished a frame, for which it took `took_ns`.
-    pub(super) fn finish(&self, took_ns: i64) {
-        let before = self.frame_ns.load(Ordering::Relaxed);
-        let mean = if before == 0 { took_ns } else { before + (took_ns - before) / 8 };
-        self.frame_ns.store(mean, Ordering::Relaxed);
-        // Release: who sees the frame finished sees what it took.
-        self.finished.fetch_add(1, Ordering::Release);
-    }
-
-    /// Frames that the GPU has not finished.
-    pub(super) fn in_flight(&self) -> u64 {
-        let finished = self.finished.load(Ordering::Acquire);
-        self.submitted.load(Ordering::Relaxed).saturating_sub(finished)
-    }
-
-    /// True when a frame takes about a slot or more.
-    pub(super) fn is_slow(&self, slot_ns: i64) -> bool {
-        self.frame_ns.load(Ordering::Relaxed) as f64 > Self::SLOW * slot_ns as f64
-    }
-}
-
 /// What the threads of one crew share.
-#[derive(Debug)]
 pub(super) struct CrewState {
     /// Nothing that this crew does counts any more.
     pub(super) is_abandoned: AtomicBool,
-    /// Virtual pace: samples up to here are wanted.
-    pub(super) listen_to: AtomicI64,
-    /// Virtual pace: who to wake when more is wanted.
-    pub(super) tracking: OnceLock<std::thread::Thread>,
     pub(super) tracking_over: AtomicBool,
     /// The frame that is being planned.
     pub(super) planning: AtomicU64,
-    /// Thousandths of a sample that a pixel gets on average.
-    pub(super) budget_milli: AtomicU64,
-    pub(super) gpu: GpuPace,
+    /// What planning and packing tell each other.
+    pub(super) facts: Arc<CrewFacts>,
     pub(super) pulses: [Pulse; 3],
     /// By stage: its thread has returned, not panicked.
     pub(super) returned: [AtomicBool; 3],
@@ -149,18 +86,8 @@ impl CrewState {
 
     /// True when the crew's threads should end.
     pub(super) fn is_dismissed(&self, shared: &Shared) -> bool {
-        self.is_abandoned.load(Ordering::Relaxed) || shared.monitor.stop_requested()
+        self.is_abandoned.load(Ordering::Relaxed) || shared.facts.monitor.stop_requested()
     }
-}
-
-/// What is wrong with a crew.
-pub(super) enum Trouble {
-    /// A stage does not answer.
-    Hung(&'static str),
-    /// A stage panicked: a programmer's mistake.
-    Panicked(&'static str),
-    /// The GPU failed or does not finish.
-    Failed(PipelineError),
 }
 
 /// The threads of one crew.
@@ -182,7 +109,10 @@ impl Crew {
         notes_back: &NotesBack,
     ) -> Result<(Self, Port), PipelineError> {
         let CrewParts { tracking, renderer, prepared, kernel, budget, memory, frame_ns } = parts;
-        let policy = policy(&shared.rig);
+        let rig = &shared.facts.rig;
+        let policy = policy(rig);
+        let facts = Arc::new(CrewFacts::new(rig, frame_ns));
+        let stage = PackStage::new(shared.facts.clone(), facts.clone(), budget);
         // Room for everything there is: no stage ever finds the next one's channel full.
         let jobs = memory.len();
         let (mut free_in, free) = channel(jobs, policy);
@@ -193,23 +123,19 @@ impl Crew {
             let _ = free_in.push(Box::new(memory));
         }
         for _ in 0..NOTES {
-            let _ = notes_in.push(Box::new(FrameNote::new(shared.rig.bodies.len())));
+            let _ = notes_in.push(Box::new(FrameNote::new(rig)));
         }
         notes_back.lead_to(notes_in);
         let state = Arc::new(CrewState {
             is_abandoned: AtomicBool::new(false),
-            // Nothing is wanted before planning says so: whether tracking looks before that is chance.
-            listen_to: AtomicI64::new(i64::MIN),
-            tracking: OnceLock::new(),
             tracking_over: AtomicBool::new(false),
             planning: AtomicU64::new(0),
-            budget_milli: AtomicU64::new(u64::from(shared.rig.config.render.spp) * 1000),
-            gpu: GpuPace::new(frame_ns),
+            facts: facts.clone(),
             pulses: [Pulse::new("tracking"), Pulse::new("plan"), Pulse::new("pack")],
             returned: [const { AtomicBool::new(false) }; 3],
             failure: Mutex::new(None),
         });
-        let (publisher, reader) = latest(TrackSnapshot::empty(shared.rig.bodies.len()));
+        let (publisher, reader) = latest(TrackSnapshot::empty(rig.bodies.len()));
         let (times, time) = latest(shared.time);
         let gpu_free = Waiter::new(policy);
         let gpu_waker = gpu_free.waker();
@@ -242,7 +168,7 @@ impl Crew {
             named("pack")
                 .spawn(move || {
                     let inbox = PackInbox { jobs: to_pack_out, gpu_waker };
-                    pack_thread(&shared, &state, kernel, prepared, budget, inbox, to_link_in);
+                    pack_thread(&shared, &state, stage, kernel, prepared, inbox, to_link_in);
                     state.returned[PACK].store(true, Ordering::Release);
                 })
                 .map_err(refused("pack"))?
@@ -263,7 +189,7 @@ impl Crew {
             if finished[i] && !self.state.returned[i].load(Ordering::Acquire) {
                 return Some(Trouble::Panicked(pulse.name()));
             }
-            if self.silences[i].observe(pulse, now, step_ns) {
+            if self.silences[i].observe(pulse, now, step_ns, standing_of) {
                 return Some(Trouble::Hung(pulse.name()));
             }
         }

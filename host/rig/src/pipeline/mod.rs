@@ -1,4 +1,4 @@
-//! The threads and their hand-offs: tracking, plan and render, pack, link, and beside the frame path the collector.
+//! Threads and hand-offs of a run: tracking, plan and render, pack, link, and beside the frame path the collector and the supervisor.
 //!
 //! ```text
 //!  tracking --[latest]--> plan+render --[channel]--> pack --[channel]--> link --[notes]--> collector
@@ -7,24 +7,30 @@
 //!                            +---------------------------------[notes]-----------------------+
 //! ```
 //!
+//! What is decided is [`crate::engine`]'s; here it is driven: by a thread for each stage at real pace (`real.rs`), by one thread and a clock of
+//! its own at virtual pace (`virtual_pace.rs`).
+//!
 //! One frame is one [`crate::frame::job::FrameJob`]: memory and a note, boxed once and recycled. In the steady state no stage allocates, locks or
 //! logs, and every wait is bounded. All hand-offs are those of `dpm_handoff`.
 
-mod connect;
 mod crew;
-mod keeper;
 mod link;
 mod outcome;
-mod planning;
+mod parts;
 pub mod projector;
-mod pulse;
+mod real;
 mod rights;
 mod run;
+mod settings;
 mod supervisor;
 mod threads;
+mod virtual_pace;
 
-pub use connect::{connect, ENDED_WITH_THE_LAST_RUN};
-pub use outcome::{PipelineError, RunOptions, RunOutcome, Stall, StallIn};
-pub use run::{output, renderer_settings, run, run_prepared};
+pub use crate::engine::connect::{connect, ENDED_WITH_THE_LAST_RUN};
+pub use crate::engine::error::PipelineError;
+pub use crate::engine::options::{RunOptions, Stall, StallIn};
+pub use outcome::RunOutcome;
+pub use run::{run, run_prepared};
+pub use settings::{output, renderer_settings};
 pub use supervisor::has_left_threads_behind;
 pub use threads::on_frame_path;

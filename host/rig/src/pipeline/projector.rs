@@ -1,7 +1,7 @@
 //! `[projector.backend]` into an open medium, and the rig file into what is asked of the link over it.
 
-use super::connect::ConnectError;
 use crate::config::{Compaction, Pace, ProjectorBackend, RigConfig};
+use crate::engine::connect::ConnectError;
 use dpm_device::link::{packet_bytes, Codec, Epoch, LinkError, LinkSettings, Underrun, COMMIT_BYTES};
 use dpm_device::planes::Raster;
 use dpm_device::transport::serial::{SerialSettings, SerialTransport};

@@ -1,6 +1,6 @@
 //! What each stage asks of the operating system, from the rig file into granted rights and warnings, each once.
 
-use crate::config::{Pace, RealTimeConfig};
+use crate::config::RealTimeConfig;
 use crate::realtime::{enter_frame_path, os, Refusal, ThreadRights};
 use std::sync::Mutex;
 
@@ -11,18 +11,16 @@ const PROJECTOR: usize = 4;
 pub(super) struct Rights {
     priority: u32,
     cores: Vec<u32>,
-    wanted: bool,
     locked: bool,
     refusals: Mutex<Vec<Refusal>>,
 }
 
 impl Rights {
-    /// Reads `[real_time]` and locks memory if it says so. At virtual pace nothing is asked for: there are no deadlines.
+    /// Reads `[real_time]` and locks memory if it says so.
     pub(super) fn new(config: &RealTimeConfig) -> Self {
-        let wanted = config.pace == Pace::Real;
         let mut refusals = Vec::new();
         let mut locked = false;
-        if wanted && config.lock_memory {
+        if config.lock_memory {
             match os::lock_memory() {
                 Ok(()) => locked = true,
                 Err(refusal) => refusals.push(refusal),
@@ -31,7 +29,6 @@ impl Rights {
         Self {
             priority: config.priority,
             cores: config.affinity.clone(),
-            wanted,
             locked,
             refusals: Mutex::new(refusals),
         }
@@ -39,9 +36,6 @@ impl Rights {
 
     /// Asks for the rights of the calling thread, the `stage`th of the frame path. Call before its first frame.
     pub(super) fn enter(&self, stage: usize) {
-        if !self.wanted {
-            return;
-        }
         let core = self.cores.get(stage).copied();
         let granted = enter_frame_path(ThreadRights { priority: self.priority, core });
         if let Ok(mut refusals) = self.refusals.lock() {
@@ -55,24 +49,20 @@ impl Rights {
 
     /// The same for the mock projector's thread: it stands for a machine of its own, so no stage may hold it up.
     pub(super) fn enter_projector(&self) {
-        if self.wanted {
-            let above = self.highest_priority();
-            // A refusal is told by the stages, which ask for nearly the same.
-            let core = self.cores.get(PROJECTOR).copied();
-            let _ = enter_frame_path(ThreadRights { priority: above, core });
-        }
+        let above = self.highest_priority();
+        // A refusal is told by the stages, which ask for nearly the same.
+        let core = self.cores.get(PROJECTOR).copied();
+        let _ = enter_frame_path(ThreadRights { priority: above, core });
     }
 
     /// The same for the supervisor, whom no stage may hold up, and who needs next to nothing.
     pub(super) fn enter_supervisor(&self) {
-        if self.wanted {
-            let _ = enter_frame_path(ThreadRights { priority: self.highest_priority(), core: None });
-        }
+        let _ = enter_frame_path(ThreadRights { priority: self.highest_priority(), core: None });
     }
 
     /// The highest priority that any thread of the run asks for; 0 under the normal scheduler.
     pub(super) fn highest_priority(&self) -> u32 {
-        if self.wanted && self.priority > 0 {
+        if self.priority > 0 {
             (self.priority + 1).min(99)
         } else {
             0
@@ -110,8 +100,5 @@ mod tests {
         let warnings = rights.warnings();
         assert_eq!(warnings.len(), 1, "{warnings:?}");
         assert!(warnings[0].contains("core 1023"));
-        let virtual_pace = Rights::new(&RealTimeConfig { pace: Pace::Virtual, ..config });
-        virtual_pace.enter(0);
-        assert!(virtual_pace.warnings().is_empty());
     }
 }

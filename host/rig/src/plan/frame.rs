@@ -1,14 +1,60 @@
 //! The newest tracks and a slot into the plan of one frame: poses at the time of light, the eye, and when the light must be off.
 
+use super::dark::DarkCause;
 use super::link_time::LinkTime;
-use crate::frame::dark::DarkCause;
-use crate::frame::job::{Fate, FrameJob};
-use crate::frame::{FrameId, Stage};
 use crate::rig::{affine, Rig};
 use crate::tracks::TrackSnapshot;
-use dpm_common::clock::Stopwatch;
-use dpm_device::time::HostTime;
+use dpm_device::time::{DeviceTicks, HostTime};
 use dpm_tracking::{Freshness, TrackState};
+use glam::{DAffine3, DVec3};
+
+/// Number of a frame since the start of the run. Never reused; the link carries the low 32 bits.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, PartialOrd, Ord, Hash)]
+pub struct FrameId(pub u64);
+
+/// What one frame is to show, where, and for how long. Made by [`FramePlan::fill`] when the poses are latched; the renderer draws it, the link
+/// sends its planes for its slot, and the collector compares the light with it.
+#[derive(Clone, Debug)]
+pub(crate) struct FramePlan {
+    /// Which frame.
+    pub id: FrameId,
+    /// The projector's slot that it is for.
+    pub slot: u64,
+    /// Start of that slot on the host's clock.
+    pub due_at: HostTime,
+    /// Start of that slot on the projector's clock.
+    pub target_at: DeviceTicks,
+    /// From this instant of the projector's clock on there must be no light of it.
+    pub dark_from: DeviceTicks,
+    /// Longest time for which a body is carried on by prediction, nanoseconds.
+    pub predict_ns: i64,
+    /// Mid-exposure of the oldest newest sample among the lit bodies, else among all; `due_at` without any sample.
+    pub captured_at: HostTime,
+    /// When that sample reached the process.
+    pub received_at: HostTime,
+    /// At least one body is lit, so that `captured_at` is the age of light.
+    pub is_lit: bool,
+    /// By tracked body: predicted world-from-body.
+    pub tracked_poses: Vec<DAffine3>,
+    /// By tracked body: the same without prediction, where the newest sample put it.
+    pub sampled_poses: Vec<DAffine3>,
+    /// By tracked body: the tracker has seen it so far.
+    pub seen: Vec<bool>,
+    /// By tracked body: why it is dark, `None` when it is lit.
+    pub dark: Vec<Option<DarkCause>>,
+    /// By tracked body: no light falls on it.
+    pub lost: Vec<bool>,
+    /// By body of the scene: world-from-body.
+    pub scene_poses: Vec<DAffine3>,
+    /// Eye, world, metres.
+    pub eye: DVec3,
+    /// Gaze point, world, metres.
+    pub gaze: DVec3,
+    /// Degrees by which the zones about a gaze that is no longer tracked have grown.
+    pub widen_deg: f32,
+    /// Thousandths of a sample that a pixel gets on average.
+    pub budget_milli: u64,
+}
 
 /// What planning knows besides the newest tracks.
 #[derive(Clone, Copy, Debug)]
@@ -25,79 +71,113 @@ pub(crate) struct PlanInputs<'a> {
     pub predict_ns: i64,
     /// Age up to which the newest sample of a tracker that works may be when it is read, nanoseconds.
     pub fresh_ns: i64,
+    /// Thousandths of a sample that a pixel gets on average.
+    pub budget_milli: u64,
     /// Now.
     pub now: HostTime,
 }
 
-/// Fills a job: poses at the middle of the slot's exposure, eye, gaze, and the instant from which its light must be off. `snapshot` is the
-/// newest there is.
-pub(crate) fn plan(job: &mut FrameJob, rig: &Rig, snapshot: &TrackSnapshot, inputs: &PlanInputs<'_>) {
-    let watch = Stopwatch::start();
-    let FrameJob { note, memory } = job;
-    let &PlanInputs { slots, id, slot, stride, predict_ns, .. } = inputs;
-    note.id = FrameId(id);
-    note.slot = slot;
-    note.fate = Fate::UnderWay;
-    note.target_at = slots.start(slot);
-    note.dark_from = slots.dark_from(slot, stride, predict_ns);
-    note.predict_ns = predict_ns;
-    let due = slots.host_of_slot(slot);
-    let middle = due.plus_ns(slots.host_of_slot(slot + 1).ns_since(due) / 2);
-    let timeline = &mut note.timeline;
-    *timeline = Default::default();
-    timeline.due_at = due;
-    let predict = rig.config.prediction.on;
-    note.tracked_poses.clear();
-    note.sampled_poses.clear();
-    note.dark.clear();
-    memory.lost.clear();
-    note.seen.clear();
-    // Of the bodies that are lit; of those that are dark only where none is lit.
-    let mut oldest: [Option<(HostTime, HostTime)>; 2] = [None; 2];
-    for (i, body) in rig.bodies.iter().enumerate() {
-        let track = snapshot.tracks.get(i).copied().flatten();
-        let (pose, sampled, dark) = match track {
-            Some((state, received_at)) => {
-                let state = TrackState { lost_after_ns: predict_ns, ..state };
-                let sampled = state.predict(state.captured_at);
-                let used = state.predict(middle);
-                let dark = (used.freshness == Freshness::Lost).then(|| {
-                    // The tracker does its part, but the light is further away than prediction may reach.
-                    let speaks = inputs.now.ns_since(state.captured_at) <= inputs.fresh_ns;
-                    if speaks {
-                        DarkCause::BeyondHorizon
-                    } else {
-                        DarkCause::Silent
-                    }
-                });
-                let oldest = &mut oldest[usize::from(dark.is_some())];
-                if oldest.is_none_or(|(captured, _)| state.captured_at < captured) {
-                    *oldest = Some((state.captured_at, received_at));
-                }
-                let pose = if predict { used.pose } else { sampled.pose };
-                (affine(&pose), affine(&sampled.pose), dark)
-            }
-            // Never seen: nothing may be lit.
-            None => (affine(&body.rest), affine(&body.rest), Some(DarkCause::NeverSeen)),
-        };
-        note.tracked_poses.push(pose);
-        note.sampled_poses.push(sampled);
-        note.dark.push(dark);
-        memory.lost.push(dark.is_some());
-        // Where the tracker saw it last is where the tracker says that it is, whether or not that is new enough for light.
-        note.seen.push(track.is_some());
+impl FramePlan {
+    /// A plan of nothing, with room for what `rig` has.
+    pub(crate) fn empty(rig: &Rig) -> Self {
+        let bodies = rig.bodies.len();
+        Self {
+            id: FrameId::default(),
+            slot: 0,
+            due_at: HostTime(0),
+            target_at: DeviceTicks(0),
+            dark_from: DeviceTicks(0),
+            predict_ns: 0,
+            captured_at: HostTime(0),
+            received_at: HostTime(0),
+            is_lit: false,
+            tracked_poses: Vec::with_capacity(bodies),
+            sampled_poses: Vec::with_capacity(bodies),
+            seen: Vec::with_capacity(bodies),
+            dark: Vec::with_capacity(bodies),
+            lost: Vec::with_capacity(bodies),
+            scene_poses: Vec::with_capacity(rig.scene.bodies.len()),
+            eye: DVec3::ZERO,
+            gaze: DVec3::ZERO,
+            widen_deg: 0.0,
+            budget_milli: 0,
+        }
     }
-    // What is dark has no age.
-    note.oldest_captured_at = oldest[0].map(|(captured, _)| captured);
-    let (captured_at, received_at) = oldest[0].or(oldest[1]).unwrap_or((due, due));
-    timeline.captured_at = captured_at;
-    timeline.received_at = received_at;
-    rig.scene_poses(&note.tracked_poses, &mut memory.scene_poses);
-    (note.eye, memory.gaze) = rig.observer.eye_and_gaze(&note.tracked_poses);
-    memory.widen_deg = rig.observer.gaze_body().map_or(0.0, |body| {
-        let track = snapshot.tracks.get(body).copied().flatten();
-        let unseen_ns = track.map_or(i64::MAX, |(state, _)| middle.ns_since(state.captured_at));
-        rig.observer.widening_deg(unseen_ns) as f32
-    });
-    timeline.wall_ns[Stage::Plan as usize] = watch.elapsed_ns();
+
+    /// Plans a frame: poses at the middle of the slot's exposure, eye, gaze, and the instant from which its light must be off. `snapshot` is
+    /// the newest there is. Allocates nothing in the steady state.
+    pub(crate) fn fill(&mut self, rig: &Rig, snapshot: &TrackSnapshot, inputs: &PlanInputs<'_>) {
+        let &PlanInputs { slots, id, slot, stride, predict_ns, .. } = inputs;
+        (self.id, self.slot) = (FrameId(id), slot);
+        (self.predict_ns, self.budget_milli) = (predict_ns, inputs.budget_milli);
+        self.target_at = slots.start(slot);
+        self.dark_from = slots.dark_from(slot, stride, predict_ns);
+        self.due_at = slots.host_of_slot(slot);
+        let middle = self.due_at.plus_ns(slots.host_of_slot(slot + 1).ns_since(self.due_at) / 2);
+        self.place_bodies(rig, snapshot, inputs, middle);
+        rig.scene_poses(&self.tracked_poses, &mut self.scene_poses);
+        (self.eye, self.gaze) = rig.observer.eye_and_gaze(&self.tracked_poses);
+        self.widen_deg = rig.observer.gaze_body().map_or(0.0, |body| {
+            let track = snapshot.tracks.get(body).copied().flatten();
+            let unseen_ns = track.map_or(i64::MAX, |(state, _)| middle.ns_since(state.captured_at));
+            rig.observer.widening_deg(unseen_ns) as f32
+        });
+    }
+
+    /// Every tracked body: where it will be at `middle`, and whether light may fall on it there.
+    fn place_bodies(
+        &mut self,
+        rig: &Rig,
+        snapshot: &TrackSnapshot,
+        inputs: &PlanInputs<'_>,
+        middle: HostTime,
+    ) {
+        self.tracked_poses.clear();
+        self.sampled_poses.clear();
+        self.seen.clear();
+        self.dark.clear();
+        self.lost.clear();
+        // Of the bodies that are lit; of those that are dark only where none is lit.
+        let mut oldest: [Option<(HostTime, HostTime)>; 2] = [None; 2];
+        for (i, body) in rig.bodies.iter().enumerate() {
+            let track = snapshot.tracks.get(i).copied().flatten();
+            let (pose, sampled, dark) = match track {
+                Some((state, received_at)) => {
+                    let state = TrackState { lost_after_ns: inputs.predict_ns, ..state };
+                    let sampled = state.predict(state.captured_at);
+                    let used = state.predict(middle);
+                    let dark = (used.freshness == Freshness::Lost).then(|| {
+                        // The tracker does its part, but the light is further away than prediction may reach.
+                        let speaks = inputs.now.ns_since(state.captured_at) <= inputs.fresh_ns;
+                        if speaks {
+                            DarkCause::BeyondHorizon
+                        } else {
+                            DarkCause::Silent
+                        }
+                    });
+                    let oldest = &mut oldest[usize::from(dark.is_some())];
+                    if oldest.is_none_or(|(captured, _)| state.captured_at < captured) {
+                        *oldest = Some((state.captured_at, received_at));
+                    }
+                    let pose = if rig.config.prediction.on { used.pose } else { sampled.pose };
+                    (affine(&pose), affine(&sampled.pose), dark)
+                }
+                // Never seen: nothing may be lit.
+                None => (affine(&body.rest), affine(&body.rest), Some(DarkCause::NeverSeen)),
+            };
+            self.tracked_poses.push(pose);
+            self.sampled_poses.push(sampled);
+            self.dark.push(dark);
+            self.lost.push(dark.is_some());
+            // Where the tracker saw it last is where the tracker says that it is, whether or not that is new enough for light.
+            self.seen.push(track.is_some());
+        }
+        self.is_lit = oldest[0].is_some();
+        (self.captured_at, self.received_at) = oldest[0].or(oldest[1]).unwrap_or((self.due_at, self.due_at));
+    }
+
+    /// Capture of the oldest newest sample among the bodies that are lit; `None` when all are dark: what is dark has no age.
+    pub(crate) fn oldest_captured_at(&self) -> Option<HostTime> {
+        self.is_lit.then_some(self.captured_at)
+    }
 }

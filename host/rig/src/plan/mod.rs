@@ -1,7 +1,8 @@
 //! What is decided before a frame is drawn: how early it is begun, how far poses are predicted, how many rays it may cost.
 
 pub mod budget;
-pub(crate) mod frame;
+pub mod dark;
+pub mod frame;
 pub mod horizon;
 pub mod lead;
 pub mod light_centre;

@@ -401,4 +401,23 @@ mod tests {
             assert_ne!(x, 0);
         });
     }
+
+    /// Found in use, R1: the system tells a thread that sleeps or was stopped from one that waits for a core.
+    #[test]
+    fn the_system_tells_who_is_ready() {
+        let this = standing_of(thread_id()).expect("Linux tells");
+        assert!(this.ready, "it asks for itself");
+        let (to_test, from_thread) = std::sync::mpsc::channel();
+        let (to_thread, from_test) = std::sync::mpsc::channel::<()>();
+        let thread = std::thread::spawn(move || {
+            to_test.send(thread_id()).unwrap();
+            let _ = from_test.recv();
+        });
+        let other = from_thread.recv().unwrap();
+        while standing_of(other).expect("Linux tells").ready {
+            std::thread::sleep(std::time::Duration::from_millis(1));
+        }
+        drop(to_thread);
+        thread.join().unwrap();
+    }
 }

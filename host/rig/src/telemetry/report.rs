@@ -3,7 +3,7 @@
 use super::projector::ProjectorReport;
 use super::signed::SignedHistogram;
 use crate::failure::{Failure, FailureKind};
-use crate::frame::dark::DarkCause;
+use crate::plan::dark::DarkCause;
 use serde::ser::{Serialize, SerializeMap, Serializer};
 use std::collections::BTreeMap;
 use std::fmt::Write;

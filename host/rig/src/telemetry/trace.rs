@@ -4,7 +4,8 @@
 //! a flow of id n ("s", "t", "f" with `bp: e`), whose points lie inside the slices they bind to. Slices on one track must
 //! nest or follow each other, so frames in flight together are spread over lanes.
 
-use crate::frame::{FrameId, FrameTimeline, Stage};
+use crate::frame::{FrameTimeline, Stage};
+use crate::plan::frame::FrameId;
 use crate::realtime::standstill::Standstills;
 use dpm_device::time::HostTime;
 use dpm_render::PASSES;

@@ -1,17 +1,17 @@
 //! Heartbeats: every thread of a run says by when it will say again that it is alive, and the supervisor looks whether it did.
 
-use crate::realtime::os::{self, Standing};
+use crate::realtime::os::Standing;
 use dpm_device::time::HostTime;
 use std::sync::atomic::{AtomicI32, AtomicI64, Ordering};
 
 /// Silence beyond what a thread had announced after which it counts as hung, nanoseconds.
-pub(super) const HUNG_AFTER_NS: i64 = 100_000_000;
+pub(crate) const HUNG_AFTER_NS: i64 = 100_000_000;
 /// Longest step of the supervisor that counts as observed silence. When the machine itself stood still, all threads did.
 const LONGEST_STEP_NS: i64 = 10_000_000;
 
 /// The heartbeat of one thread. Beating it is one relaxed store.
 #[derive(Debug)]
-pub(super) struct Pulse {
+pub(crate) struct Pulse {
     /// What to call the thread.
     name: &'static str,
     /// By when it will beat again; `i64::MAX` before it began and after it ended.
@@ -22,27 +22,27 @@ pub(super) struct Pulse {
 
 impl Pulse {
     /// Of a thread that has not begun yet.
-    pub(super) const fn new(name: &'static str) -> Self {
+    pub(crate) const fn new(name: &'static str) -> Self {
         Self { name, until_ns: AtomicI64::new(i64::MAX), thread: AtomicI32::new(0) }
     }
 
     /// What to call the thread.
-    pub(super) fn name(&self) -> &'static str {
+    pub(crate) fn name(&self) -> &'static str {
         self.name
     }
 
-    /// The calling thread is the one whose heartbeat this is.
-    pub(super) fn begin(&self) {
-        self.thread.store(os::thread_id(), Ordering::Relaxed);
+    /// The thread whose heartbeat this is, by its number for the operating system, has begun.
+    pub(crate) fn begin(&self, thread: i32) {
+        self.thread.store(thread, Ordering::Relaxed);
     }
 
     /// The thread is alive and will beat again within `expected_ns`.
-    pub(super) fn beat(&self, now: HostTime, expected_ns: i64) {
+    pub(crate) fn beat(&self, now: HostTime, expected_ns: i64) {
         self.until_ns.store(now.0.saturating_add(expected_ns), Ordering::Relaxed);
     }
 
     /// The thread has ended as it should: nobody waits for its next beat.
-    pub(super) fn end(&self) {
+    pub(crate) fn end(&self) {
         self.until_ns.store(i64::MAX, Ordering::Relaxed);
     }
 
@@ -50,27 +50,25 @@ impl Pulse {
     fn is_overdue(&self, now: HostTime) -> bool {
         self.until_ns.load(Ordering::Relaxed) < now.0
     }
-
-    /// What the thread is doing; `None` where the system does not tell.
-    fn standing(&self) -> Option<Standing> {
-        os::standing_of(self.thread.load(Ordering::Relaxed))
-    }
 }
+
+/// Looks up what a thread is doing by its number; `None` where that is not known.
+pub(crate) type StandingOf = fn(i32) -> Option<Standing>;
 
 /// The supervisor's view of one thread: how long it has been silent beyond what it had announced. Time in which the thread was ready to
 /// run and got no core does not count: a thread that starves is late, not hung. One that runs without an end counts as silent.
 #[derive(Clone, Copy, Debug, Default)]
-pub(super) struct Silence {
+pub(crate) struct Silence {
     silent_ns: i64,
     before: Option<Standing>,
 }
 
 impl Silence {
     /// Looks at `pulse` at `now`, `step_ns` after the last look. True when its thread is hung.
-    pub(super) fn observe(&mut self, pulse: &Pulse, now: HostTime, step_ns: i64) -> bool {
+    pub(crate) fn observe(&mut self, pulse: &Pulse, now: HostTime, step_ns: i64, ask: StandingOf) -> bool {
         let overdue = pulse.is_overdue(now);
-        // The system is asked about threads in doubt only.
-        let standing = if overdue { pulse.standing() } else { None };
+        // Only threads in doubt are asked about.
+        let standing = if overdue { ask(pulse.thread.load(Ordering::Relaxed)) } else { None };
         self.step(overdue, step_ns, standing)
     }
 
@@ -140,35 +138,11 @@ mod tests {
     fn a_pulse_is_overdue_only_after_what_it_announced() {
         let pulse = Pulse::new("plan");
         assert!(!pulse.is_overdue(HostTime(i64::MAX - 1)), "not begun");
-        pulse.begin();
+        pulse.begin(1);
         pulse.beat(HostTime(100), 50);
         assert!(!pulse.is_overdue(HostTime(150)) && pulse.is_overdue(HostTime(151)));
         pulse.end();
         assert!(!pulse.is_overdue(HostTime(i64::MAX - 1)));
         assert_eq!(pulse.name(), "plan");
-    }
-
-    /// Found in use, R1: the system tells a thread that sleeps or was stopped from one that waits for a core.
-    #[cfg(target_os = "linux")]
-    #[test]
-    fn the_system_tells_who_is_ready() {
-        let pulse = Pulse::new("this");
-        pulse.begin();
-        let before = pulse.standing().expect("Linux tells");
-        assert!(before.ready, "it asks for itself");
-        let (to_test, from_thread) = std::sync::mpsc::channel();
-        let (to_thread, from_test) = std::sync::mpsc::channel::<()>();
-        let thread = std::thread::spawn(move || {
-            let pulse = Pulse::new("other");
-            pulse.begin();
-            to_test.send(pulse).unwrap();
-            let _ = from_test.recv();
-        });
-        let other = from_thread.recv().unwrap();
-        while other.standing().expect("Linux tells").ready {
-            std::thread::sleep(std::time::Duration::from_millis(1));
-        }
-        drop(to_thread);
-        thread.join().unwrap();
     }
 }

@@ -4,11 +4,11 @@
 //! unplugging or a reset, the watchdog, damaged packets. Heat, lamp, emergency stop, flashes and SAFE wait for an ARM of the operator.
 
 use super::connect::ConnectError;
-use crate::frame::job::FrameNote;
 use crate::frame::slots::OrderedDark;
 use crate::light::recorder::LightNote;
 use crate::light::status::StatusLight;
 use crate::order::Order;
+use crate::plan::frame::FramePlan;
 use crate::plan::link_time::LinkTime;
 use crate::telemetry::monitor::{ProjectorHealth, RunMonitor};
 use crate::telemetry::projector::ProjectorReport;
@@ -29,7 +29,7 @@ const RETIME_NS: i64 = 100_000_000;
 const EXCHANGES: usize = 8;
 
 /// See the module's documentation.
-pub(super) struct LinkKeeper {
+pub(crate) struct LinkKeeper {
     time: LinkTime,
     /// Where planning learns the projector's clock; `None` before there is a crew.
     times: Option<Publisher<LinkTime>>,
@@ -51,7 +51,7 @@ pub(super) struct LinkKeeper {
 impl LinkKeeper {
     /// For a link that has just come up with `time`. `lights`: where the projector's reports are all that is known of its light,
     /// notes of it go there.
-    pub(super) fn new(time: LinkTime, link: &HostLink, lights: Option<Sender<LightNote>>) -> Self {
+    pub(crate) fn new(time: LinkTime, link: &HostLink, lights: Option<Sender<LightNote>>) -> Self {
         Self {
             time,
             times: None,
@@ -68,8 +68,13 @@ impl LinkKeeper {
         }
     }
 
+    /// The projector's reports are all that is known of its light: it is outside this process.
+    pub(crate) fn has_reports(&self) -> bool {
+        self.reports.is_some()
+    }
+
     /// From now on planning learns the projector's clock through `times`.
-    pub(super) fn tell_times_to(&mut self, mut times: Publisher<LinkTime>) {
+    pub(crate) fn tell_times_to(&mut self, mut times: Publisher<LinkTime>) {
         times.publish(self.time);
         self.times = Some(times);
     }
@@ -80,7 +85,7 @@ impl LinkKeeper {
     /// # Errors
     /// The link cannot come up again: another projector was plugged in, or it refuses. While the medium is gone, or the projector
     /// refuses to be armed, there is no error: the run goes on in the dark.
-    pub(super) fn poll(
+    pub(crate) fn poll(
         &mut self,
         now: HostTime,
         link: &mut HostLink,
@@ -136,25 +141,25 @@ impl LinkKeeper {
     }
 
     /// The frame is on its way.
-    pub(super) fn sent(&mut self, note: &FrameNote) {
+    pub(crate) fn sent(&mut self, plan: &FramePlan) {
         if let Some(reports) = &mut self.reports {
-            reports.sent(note.id.0 as u32, note.slot);
+            reports.sent(plan.id.0 as u32, plan.slot);
         }
     }
 
     /// How much earlier frames must leave than the host's own stages need, nanoseconds.
-    pub(super) fn travel_ns(&self) -> i64 {
+    pub(crate) fn travel_ns(&self) -> i64 {
         self.reports.as_ref().map_or(0, StatusLight::travel_ns)
     }
 
     /// Ends the light; nothing brings it back.
-    pub(super) fn stop(&mut self, now: HostTime, link: &mut HostLink, transport: &mut dyn Transport) {
+    pub(crate) fn stop(&mut self, now: HostTime, link: &mut HostLink, transport: &mut dyn Transport) {
         self.standing = Some(Verb::Stop);
         let _ = link.command(now, Verb::Stop, transport);
     }
 
     /// What was carried.
-    pub(super) fn report(&self, link: &HostLink, name: &str) -> ProjectorReport {
+    pub(crate) fn report(&self, link: &HostLink, name: &str) -> ProjectorReport {
         let c = link.counters();
         ProjectorReport {
             name: name.to_owned(),
@@ -274,7 +279,7 @@ impl LinkKeeper {
 }
 
 /// True when the device says that it is dark and will stay so, or cannot be asked.
-pub(super) fn is_dark(link: &HostLink) -> bool {
+pub(crate) fn is_dark(link: &HostLink) -> bool {
     matches!(link.state(), LinkState::Lost | LinkState::Closed)
         || link.status().is_some_and(|s| {
             !s.lit && !matches!(s.state, DeviceState::Armed | DeviceState::Black | DeviceState::Frozen)

@@ -2,7 +2,7 @@
 
 use crate::plan::link_time::LinkTime;
 use crate::telemetry::monitor::RunMonitor;
-use dpm_device::link::{faults, HostLink, LinkError, LinkState, Verb};
+use dpm_device::link::{faults, EchoSample, HostLink, LinkError, LinkState, Verb};
 use dpm_device::time::{DeviceTicks, HostTime};
 use dpm_device::transport::Transport;
 
@@ -38,10 +38,88 @@ pub enum ConnectError {
 /// stop and flashes want the operator's word, and SAFE wants `dpm arm`.
 pub const ENDED_WITH_THE_LAST_RUN: u32 = faults::WATCHDOG | faults::CHECKSUM_STORM;
 
-/// Connects and arms; latched faults in the mask `acknowledged` stand not in the way. Where `monitor` says that BLACK, SAFE or a stop is
-/// ordered, the link comes up and does not arm: what was ordered waits in the monitor for whoever takes the link over. A SAFE that
-/// the projector has latched itself counts as ordered, whatever is `acknowledged`, and is told to the monitor. `now` reads the clock and lets a
-/// little time pass with every call; `stop` says that nobody wants light any more.
+/// Brings a link up, step by step: connects, learns the projector's clock, and arms.
+///
+/// Latched faults in the mask `acknowledged` are acknowledged. Where the monitor says that BLACK, SAFE or a stop is ordered, the link comes up
+/// and does not arm: the order waits in the monitor for whoever takes the link over. A SAFE that the projector has latched itself counts as
+/// ordered, whatever is `acknowledged`, and the monitor learns of it.
+pub(crate) struct Connecting {
+    acknowledged: u32,
+    begin: HostTime,
+    /// The exchange with the shortest way there and back, nanoseconds.
+    best: Option<(i64, EchoSample)>,
+    echoes: usize,
+    is_safe: bool,
+}
+
+impl Connecting {
+    /// Begins at `now`.
+    pub(crate) fn begin(link: &mut HostLink, acknowledged: u32, now: HostTime) -> Self {
+        link.connect();
+        Self { acknowledged, begin: now, best: None, echoes: 0, is_safe: false }
+    }
+
+    /// Goes on at `now`; `stop`: nobody wants light any more. `None` while the link is not up yet.
+    ///
+    /// # Errors
+    /// The device is missing, refuses, has latched other faults, or is silent.
+    pub(crate) fn step(
+        &mut self,
+        now: HostTime,
+        link: &mut HostLink,
+        transport: &mut dyn Transport,
+        monitor: &RunMonitor,
+        stop: bool,
+    ) -> Result<Option<LinkTime>, ConnectError> {
+        let state = link.poll(now, transport)?;
+        link.take_echoes(|e| {
+            self.echoes += 1;
+            let round_trip = e.host_received_at.ns_since(e.host_sent_at);
+            if self.best.is_none_or(|(shortest, _)| round_trip < shortest) {
+                self.best = Some((round_trip, e));
+            }
+        });
+        if stop {
+            // Never armed after a stop was asked for, and dark if it was armed before.
+            let _ = link.command(now, Verb::Stop, transport);
+            return Err(ConnectError::Stopped);
+        }
+        let latched = link.status().map_or(0, |s| s.faults);
+        if state == LinkState::Faulted && latched & faults::HOST_SAFE != 0 && !self.is_safe {
+            self.is_safe = true;
+            monitor.find_safe();
+        }
+        let stays_dark = monitor.dark_is_ordered();
+        match state {
+            LinkState::Ready | LinkState::Faulted if stays_dark => {}
+            LinkState::Ready => link.arm(0),
+            LinkState::Faulted if latched & !self.acknowledged == 0 => link.arm(latched),
+            LinkState::Faulted => {
+                let device = transport.name().to_owned();
+                return Err(LinkError::ArmRefused { device, faults: latched }.into());
+            }
+            _ => {}
+        }
+        let is_up = state == LinkState::Streaming
+            || stays_dark && matches!(state, LinkState::Ready | LinkState::Faulted);
+        if let (true, Some((round_trip, echo)), Some(clock)) = (is_up, self.best, link.slots()) {
+            if self.echoes >= ECHOES {
+                // The middle between the device's two stamps is that of the host's: what it did in between is no part of the way.
+                let held = echo.device_sent_at.0.saturating_sub(echo.device_received_at.0);
+                let there = DeviceTicks(echo.device_received_at.0.saturating_add(held / 2));
+                let middle = echo.host_sent_at.plus_ns(round_trip / 2);
+                return Ok(Some(LinkTime { clock, first: 0, anchor: (there, middle) }));
+            }
+        }
+        if now.ns_since(self.begin) > LIMIT_NS {
+            return Err(ConnectError::Silent { device: transport.name().to_owned(), state });
+        }
+        Ok(None)
+    }
+}
+
+/// Brings a link up as [`Connecting`] describes. `now` reads the clock and lets a little time pass with every call; `stop` says that nobody
+/// wants light any more.
 ///
 /// # Errors
 /// The device is missing, refuses, has latched other faults, or is silent.
@@ -53,55 +131,10 @@ pub fn connect(
     now: &mut dyn FnMut() -> HostTime,
     stop: &dyn Fn() -> bool,
 ) -> Result<LinkTime, ConnectError> {
-    link.connect();
-    let begin = now();
-    let mut best: Option<(i64, dpm_device::link::EchoSample)> = None;
-    let mut echoes = 0;
-    let mut is_safe = false;
+    let mut connecting = Connecting::begin(link, acknowledged, now());
     loop {
-        let t = now();
-        let state = link.poll(t, transport)?;
-        link.take_echoes(|e| {
-            echoes += 1;
-            let round_trip = e.host_received_at.ns_since(e.host_sent_at);
-            if best.is_none_or(|(shortest, _)| round_trip < shortest) {
-                best = Some((round_trip, e));
-            }
-        });
-        if stop() {
-            // Never armed after a stop was asked for, and dark if it was armed before.
-            let _ = link.command(t, Verb::Stop, transport);
-            return Err(ConnectError::Stopped);
-        }
-        let latched = link.status().map_or(0, |s| s.faults);
-        if state == LinkState::Faulted && latched & faults::HOST_SAFE != 0 && !is_safe {
-            is_safe = true;
-            monitor.find_safe();
-        }
-        let stays_dark = monitor.dark_is_ordered();
-        match state {
-            LinkState::Ready | LinkState::Faulted if stays_dark => {}
-            LinkState::Ready => link.arm(0),
-            LinkState::Faulted if latched & !acknowledged == 0 => link.arm(latched),
-            LinkState::Faulted => {
-                let device = transport.name().to_owned();
-                return Err(LinkError::ArmRefused { device, faults: latched }.into());
-            }
-            _ => {}
-        }
-        let is_up = state == LinkState::Streaming
-            || stays_dark && matches!(state, LinkState::Ready | LinkState::Faulted);
-        if let (true, Some((round_trip, echo)), Some(clock)) = (is_up, best, link.slots()) {
-            if echoes >= ECHOES {
-                // The middle between the device's two stamps is that of the host's: what it did in between is no part of the way.
-                let held = echo.device_sent_at.0.saturating_sub(echo.device_received_at.0);
-                let there = DeviceTicks(echo.device_received_at.0.saturating_add(held / 2));
-                let middle = echo.host_sent_at.plus_ns(round_trip / 2);
-                return Ok(LinkTime { clock, first: 0, anchor: (there, middle) });
-            }
-        }
-        if t.ns_since(begin) > LIMIT_NS {
-            return Err(ConnectError::Silent { device: transport.name().to_owned(), state });
+        if let Some(time) = connecting.step(now(), link, transport, monitor, stop())? {
+            return Ok(time);
         }
     }
 }

@@ -1,0 +1,270 @@
+//! When a packed frame is sent or left out, what is done beside frames, and how the light ends.
+
+use super::facts::Facts;
+use super::keeper::{is_dark, LinkKeeper};
+use super::pace::Pace;
+use super::pack::is_overtaken;
+use crate::frame::job::{Fate, FrameNote};
+use crate::plan::lead::LeadEstimator;
+use crate::telemetry::projector::ProjectorReport;
+use dpm_device::link::{HostLink, LinkState, SendOutcome};
+use dpm_device::time::HostTime;
+use dpm_device::transport::Transport;
+use dpm_handoff::latest::Publisher;
+use std::marker::PhantomData;
+use std::sync::atomic::Ordering;
+use std::sync::Arc;
+
+use crate::plan::link_time::LinkTime;
+
+/// How often a link without credit looks for some, nanoseconds.
+const CREDIT_STEP_NS: i64 = 50_000;
+/// A link with nothing to send looks after its device this often, nanoseconds.
+const IDLE_NS: i64 = 1_000_000;
+/// The same while an answer to a clock exchange is under way: how late it is looked at is how wrong the clock may be.
+const ECHO_STEP_NS: i64 = 50_000;
+/// What getting a lost medium back may take, nanoseconds.
+const REOPEN_NS: i64 = 2_000_000_000;
+/// The supervisor says at least this often that every stage is alive, or it is not believed, nanoseconds.
+const ALIVE_WITHIN_NS: i64 = 150_000_000;
+/// Between two looks at a projector that is to go dark, nanoseconds.
+const DARK_STEP_NS: i64 = 1_000_000;
+/// Looks at a projector that is to go dark, at least: it may say that it is dark before the order arrives.
+const DARK_LOOKS: u32 = 4;
+/// Looks at a projector outside this process: STOP is repeated for 300 ms, and its watchdog does the rest.
+const DARK_LOOKS_OUTSIDE: u32 = 300;
+
+/// What becomes of a frame that was offered.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(crate) enum Offer {
+    /// The device has no room for it: offer it again at this instant.
+    Again(HostTime),
+    /// It is on its way, or left out: its fate is in its note.
+    Settled,
+}
+
+/// How far the end of the light has come.
+#[derive(Clone, Copy, Debug)]
+enum Ending {
+    /// The last frames are still lit.
+    LastLight { until: HostTime },
+    /// STOP was sent, and the projector was looked at so often.
+    Stopped { looks: u32 },
+}
+
+/// The link and what is done beside frames.
+pub(crate) struct LinkStage<P> {
+    facts: Arc<Facts>,
+    link: HostLink,
+    keeper: LinkKeeper,
+    lead: LeadEstimator,
+    slot_ns: i64,
+    /// When the frame that is being offered was ready; `None` between frames.
+    ready_at: Option<HostTime>,
+    /// Until when a frame last waited for room in the device.
+    credit_until: HostTime,
+    /// How long the frame that is being offered waited for room, where it is to be learned from, nanoseconds.
+    waited_ns: Option<i64>,
+    ending: Option<Ending>,
+    looks: u32,
+    pace: PhantomData<P>,
+}
+
+impl<P: Pace> LinkStage<P> {
+    /// For a link that is up.
+    pub(crate) fn new(facts: Arc<Facts>, link: HostLink, keeper: LinkKeeper, lead: LeadEstimator) -> Self {
+        let slot_ns = facts.rig.rate().slot_len_ns(0);
+        // Where light is only reported of, the projector is outside this process.
+        let looks = if keeper.has_reports() { DARK_LOOKS_OUTSIDE } else { DARK_LOOKS };
+        Self {
+            facts,
+            link,
+            keeper,
+            lead,
+            slot_ns,
+            ready_at: None,
+            credit_until: HostTime(i64::MIN / 2),
+            waited_ns: None,
+            ending: None,
+            looks,
+            pace: PhantomData,
+        }
+    }
+
+    /// From now on planning learns the projector's clock through `times`.
+    pub(crate) fn tell_times_to(&mut self, times: Publisher<LinkTime>) {
+        self.keeper.tell_times_to(times);
+    }
+
+    /// True while frames can be sent.
+    pub(crate) fn is_streaming(&self) -> bool {
+        self.link.state() == LinkState::Streaming
+    }
+
+    /// How long a frame may be waited for at `now` before the link wants to be polled, nanoseconds.
+    pub(crate) fn rest_ns(&self, now: HostTime) -> i64 {
+        if self.link.awaits_echo(now) {
+            ECHO_STEP_NS
+        } else {
+            IDLE_NS
+        }
+    }
+
+    /// How long one call may take beyond `step_ns`, which a step takes otherwise: a medium that is gone is opened anew.
+    pub(crate) fn expected_ns(&self, step_ns: i64) -> i64 {
+        match self.link.state() {
+            LinkState::Lost => REOPEN_NS,
+            _ => step_ns,
+        }
+    }
+
+    /// Moves the link along and does what is due beside frames.
+    pub(crate) fn poll(&mut self, now: HostTime, transport: &mut dyn Transport) {
+        let Self { facts, link, keeper, .. } = self;
+        let alive = now.ns_since(HostTime(facts.alive_at_ns.load(Ordering::Relaxed))) <= ALIVE_WITHIN_NS;
+        let result = keeper.poll(now, link, transport, !P::FOLLOWS_CLOCK, alive, &facts.monitor);
+        facts.travel_ns.store(keeper.travel_ns(), Ordering::Relaxed);
+        if let Err(e) = result {
+            facts.fail(e.into());
+        }
+    }
+
+    /// Offers a packed frame at `now`. `is_newest`: no other frame waits behind it. Say [`LinkStage::taken`] when it is settled.
+    pub(crate) fn offer(
+        &mut self,
+        now: HostTime,
+        note: &mut FrameNote,
+        planes: &[u8],
+        is_newest: bool,
+        transport: &mut dyn Transport,
+    ) -> Offer {
+        self.poll(now, transport);
+        let ready_at = match self.ready_at {
+            None if is_overtaken(note, now, is_newest) => return Offer::Settled,
+            None => *self.ready_at.insert(now),
+            Some(ready_at) => ready_at,
+        };
+        if self.waits_for_room(now, note) {
+            return Offer::Again(now.plus_ns(CREDIT_STEP_NS));
+        }
+        self.ready_at = None;
+        // What waited for room in the device, or behind a frame that did, was ready earlier.
+        let queued_ns = self.credit_until.min(ready_at).ns_since(note.timeline.packed_at).max(0);
+        if now > ready_at {
+            self.credit_until = now;
+        }
+        self.waited_ns = Some(now.ns_since(ready_at) + queued_ns);
+        if is_too_old(note, now, self.slot_ns) {
+            // It needed what it needed, and the next one should be begun earlier.
+            note.fate = Fate::TooOld;
+            return Offer::Settled;
+        }
+        let plan = &note.plan;
+        let outcome = self.link.send_frame(now, plan.id.0, plan.target_at, plan.dark_from, planes, transport);
+        note.fate = Fate::Offered(outcome);
+        if outcome == SendOutcome::Sent {
+            self.keeper.sent(plan);
+        } else {
+            self.waited_ns = None;
+        }
+        Offer::Settled
+    }
+
+    /// A settled frame left the stage at `now`: learns what it needed. Waiting for room in a device that is ahead does not ask for an
+    /// earlier start: that would only fill it more.
+    pub(crate) fn taken(&mut self, note: &mut FrameNote, now: HostTime) {
+        note.timeline.sent_at = now;
+        if let Some(waited_ns) = self.waited_ns.take() {
+            self.lead.measured(now.ns_since(note.latch_due_at) - waited_ns);
+            self.facts.lead_ns.store(self.lead.lead_ns(), Ordering::Relaxed);
+            self.facts.typical_ns.store(self.lead.typical_ns(), Ordering::Relaxed);
+        }
+    }
+
+    /// A frame waits for room in the device at most until its slot begins.
+    fn waits_for_room(&self, now: HostTime, note: &FrameNote) -> bool {
+        self.is_streaming()
+            && self.link.credit() == 0
+            && now < note.timeline.due_at
+            && !self.facts.monitor.stop_requested()
+    }
+
+    /// Ends the light, step by step: the last frames' where the run came to its end, none where a stop was asked for. `last`: when the last
+    /// frame was sent. Returns when to be called again; `None` when the projector is dark, or was told often enough.
+    pub(crate) fn end(
+        &mut self,
+        now: HostTime,
+        last: HostTime,
+        transport: &mut dyn Transport,
+    ) -> Option<HostTime> {
+        let ending = self.ending.unwrap_or_else(|| {
+            let until = last.plus_ns(P::last_light_ns(&self.facts, self.keeper.travel_ns()));
+            Ending::LastLight { until }
+        });
+        let next = match ending {
+            Ending::LastLight { until } if now < until && !self.facts.monitor.stop_requested() => {
+                self.poll(now, transport);
+                ending
+            }
+            Ending::LastLight { .. } => {
+                self.keeper.stop(now, &mut self.link, transport);
+                Ending::Stopped { looks: 0 }
+            }
+            Ending::Stopped { looks } => {
+                // A line may still be busy with a frame: STOP is repeated by the link until the projector says that it is dark.
+                self.poll(now, transport);
+                Ending::Stopped { looks: looks + 1 }
+            }
+        };
+        self.ending = Some(next);
+        let again = now.plus_ns(DARK_STEP_NS);
+        match next {
+            Ending::LastLight { until } => Some(again.min(until)),
+            Ending::Stopped { looks } => {
+                let is_over = looks >= self.looks || looks >= DARK_LOOKS && is_dark(&self.link);
+                (!is_over).then_some(again)
+            }
+        }
+    }
+
+    /// What was carried over the medium `name`.
+    pub(crate) fn report(&self, name: &str) -> ProjectorReport {
+        self.keeper.report(&self.link, name)
+    }
+}
+
+/// True when the poses of a frame that is sent at `now` will be older, once it is lit, than prediction may carry them and a slot more.
+fn is_too_old(note: &FrameNote, now: HostTime, slot_ns: i64) -> bool {
+    let lit_at = note.timeline.due_at.max(now);
+    let oldest = note.plan.oldest_captured_at();
+    oldest.is_some_and(|captured| lit_at.ns_since(captured) > note.plan.predict_ns + slot_ns)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::config::{Overrides, RigConfig};
+    use crate::rig::Rig;
+    use dpm_device::planes::Raster;
+
+    const MS: i64 = 1_000_000;
+
+    /// Found in use, R5: what counts is how old the poses are when the light falls, in the frame's slot or, where that has begun, now.
+    #[test]
+    fn a_frame_is_too_old_by_what_its_poses_will_be_when_it_is_lit() {
+        let config = RigConfig::demo(&Overrides::default()).unwrap_or_else(|e| panic!("{e}"));
+        let rig = Rig::build(&config, Raster::new(16, 16)).unwrap_or_else(|e| panic!("{e}"));
+        let (slot_ns, predict_ns) = (10 * MS, 20 * MS);
+        let mut note = FrameNote::new(&rig);
+        note.plan.predict_ns = predict_ns;
+        note.timeline.due_at = HostTime(100 * MS);
+        assert!(!is_too_old(&note, HostTime(500 * MS), slot_ns), "all bodies are dark: nothing is old");
+        let mut at = |captured_ms: i64, now_ms: i64| {
+            (note.plan.is_lit, note.plan.captured_at) = (true, HostTime(captured_ms * MS));
+            is_too_old(&note, HostTime(now_ms * MS), slot_ns)
+        };
+        assert!(!at(70, 90), "30 ms old in its slot: predict_ms and a slot");
+        assert!(at(69, 90), "31 ms old in its slot");
+        assert!(!at(80, 110) && at(80, 111), "late: judged by now");
+    }
+}

@@ -1,0 +1,121 @@
+//! How long a rendered frame is waited for, what is learned from the time it took, and which frame is not worth packing any more.
+
+use super::facts::{CrewFacts, Facts};
+use crate::frame::job::{Fate, FrameNote};
+use crate::plan::budget::BudgetController;
+use dpm_device::time::HostTime;
+use std::sync::atomic::Ordering;
+use std::sync::Arc;
+
+/// What the GPU took for the last frames, and so how long the next is waited for.
+struct GpuTimes {
+    recent: [i64; 64],
+    count: usize,
+    last_done_at: HostTime,
+}
+
+impl GpuTimes {
+    /// Frames after which the GPU is warm.
+    const WARM: usize = 16;
+    /// Shortest and longest wait, nanoseconds.
+    const SHORTEST_NS: i64 = 100_000_000;
+    const LONGEST_NS: i64 = 2_000_000_000;
+
+    fn new() -> Self {
+        Self { recent: [0; 64], count: 0, last_done_at: HostTime(i64::MIN) }
+    }
+
+    /// The GPU finished a frame; returns what it took for this one alone.
+    fn finished(&mut self, submitted_at: HostTime, done_at: HostTime) -> i64 {
+        let took = done_at.ns_since(submitted_at);
+        self.recent[self.count % self.recent.len()] = took;
+        self.count += 1;
+        let alone = done_at.ns_since(submitted_at.max(self.last_done_at));
+        self.last_done_at = done_at;
+        alone
+    }
+
+    /// How long a frame is waited for: four times the recent 99th percentile (of 64 frames the longest), at most two seconds.
+    fn limit_ns(&self) -> u64 {
+        let longest = self.recent.iter().copied().max().unwrap_or(0);
+        let limit = if self.count < Self::WARM { Self::LONGEST_NS } else { longest.saturating_mul(4) };
+        limit.clamp(Self::SHORTEST_NS, Self::LONGEST_NS) as u64
+    }
+}
+
+/// What packing decides.
+pub(crate) struct PackStage {
+    facts: Arc<Facts>,
+    crew: Arc<CrewFacts>,
+    times: GpuTimes,
+    budget: Option<BudgetController>,
+    late_in_a_row: usize,
+}
+
+impl PackStage {
+    /// For a crew; `budget`: `None` if every frame gets the rays that the rig file asks for.
+    pub(crate) fn new(facts: Arc<Facts>, crew: Arc<CrewFacts>, budget: Option<BudgetController>) -> Self {
+        Self { facts, crew, times: GpuTimes::new(), budget, late_in_a_row: 0 }
+    }
+
+    /// How long the GPU may take for the next frame, nanoseconds.
+    pub(crate) fn limit_ns(&self) -> u64 {
+        self.times.limit_ns()
+    }
+
+    /// The GPU finished a frame at `now`.
+    pub(crate) fn rendered(&mut self, note: &FrameNote, now: HostTime) {
+        self.crew.gpu.finish(self.times.finished(note.timeline.submitted_at, now));
+        if let (Some(controller), Some(gpu_ns)) = (&mut self.budget, note.gpu_ns()) {
+            controller.measured(note.plan.budget_milli, gpu_ns);
+            self.crew.budget_milli.store(controller.rays(), Ordering::Relaxed);
+        }
+    }
+
+    /// Whether the frame is to be packed at `now`. What waits behind a rendered frame is still being rendered: more late frames than were
+    /// under way are no stall. A GPU this slow has no newer frame that would be in time, and late frames are better than none while their
+    /// poses are young enough. `is_newest`: no other frame waits behind it.
+    pub(crate) fn is_wanted(&mut self, note: &mut FrameNote, now: HostTime, is_newest: bool) -> bool {
+        let is_rendered = note.cost.is_some();
+        self.late_in_a_row = if is_late(note, now) { self.late_in_a_row + 1 } else { 0 };
+        let is_slow = is_rendered && self.late_in_a_row > self.facts.options.in_flight;
+        is_slow || !is_overtaken(note, now, is_newest)
+    }
+}
+
+/// The frame's slot has begun.
+fn is_late(note: &FrameNote, now: HostTime) -> bool {
+    now >= note.timeline.due_at
+}
+
+/// Leaves a frame out whose slot has begun while a newer one waits behind it: after a stall nothing queues up.
+pub(crate) fn is_overtaken(note: &mut FrameNote, now: HostTime, is_newest: bool) -> bool {
+    if note.fate == Fate::UnderWay && !is_newest && is_late(note, now) {
+        note.fate = Fate::Overtaken;
+    }
+    note.fate == Fate::Overtaken
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_gpu_is_waited_for_four_times_as_long_as_it_lately_took() {
+        let mut times = GpuTimes::new();
+        assert_eq!(times.limit_ns(), 2_000_000_000, "not warm yet");
+        let at = |ms: i64| HostTime(ms * 1_000_000);
+        for i in 0..40 {
+            // Two in flight: each is under way for 80 ms, of which 40 are its own.
+            let alone = times.finished(at(40 * i), at(40 * i + 80));
+            assert!(i == 0 || alone == 40_000_000, "{alone}");
+        }
+        assert_eq!(times.limit_ns(), 320_000_000);
+        times.finished(at(5000), at(9000));
+        assert_eq!(times.limit_ns(), 2_000_000_000, "never longer than two seconds");
+        for i in 0..64 {
+            times.finished(at(10_000 + 10 * i), at(10_001 + 10 * i));
+        }
+        assert_eq!(times.limit_ns(), 100_000_000);
+    }
+}

@@ -1,0 +1,149 @@
+//! Which slot the next frame is for, when its poses are read, and when the run has all frames that it was asked for.
+
+use super::facts::{CrewFacts, Facts};
+use super::pace::{modelled_ns, Pace};
+use crate::frame::job::{Fate, FrameNote};
+use crate::frame::FrameTimeline;
+use crate::plan::frame::PlanInputs;
+use crate::plan::horizon::Horizon;
+use crate::plan::link_time::LinkTime;
+use crate::tracks::TrackSnapshot;
+use dpm_device::time::HostTime;
+use std::marker::PhantomData;
+use std::sync::atomic::Ordering;
+use std::sync::Arc;
+
+/// Time for which trackers are listened to before the first frame, so that the filters know the motion, nanoseconds.
+pub(crate) const LISTEN_NS: i64 = 150_000_000;
+
+/// The next frame: its slot, and when its poses are to be read.
+#[derive(Clone, Copy, Debug)]
+pub(crate) struct Latch {
+    /// Number of the frame.
+    pub id: u64,
+    /// The projector's slot that it is for.
+    pub slot: u64,
+    /// When its poses are to be read.
+    pub at: HostTime,
+    /// When that would have been, had nothing kept the frame from being begun: what is later than this is lateness of this thread.
+    pub due_at: HostTime,
+    /// How long before its slot that is, nanoseconds.
+    lead_ns: i64,
+}
+
+/// Plans frames one after the other.
+pub(crate) struct PlanStage<P> {
+    facts: Arc<Facts>,
+    crew: Arc<CrewFacts>,
+    horizon: Horizon,
+    slot_ns: i64,
+    next_slot: u64,
+    last_slot: Option<u64>,
+    pace: PhantomData<P>,
+}
+
+impl<P: Pace> PlanStage<P> {
+    /// For a crew that begins at `now`.
+    pub(crate) fn new(facts: Arc<Facts>, crew: Arc<CrewFacts>, time: &LinkTime, now: HostTime) -> Self {
+        // What the rig file says that stages cost: nothing is learned of this crew yet.
+        let first_ns = modelled_ns(&facts) + P::LISTEN_NS;
+        let next_slot = time.slot_after(now.plus_ns(first_ns));
+        if facts.options.slots > 0 {
+            let end = next_slot.saturating_add(facts.options.slots);
+            // The first crew decides; one that takes over keeps to it.
+            let _ = facts.end_slot.compare_exchange(0, end, Ordering::Relaxed, Ordering::Relaxed);
+        }
+        let horizon = Horizon::of_rig(&facts.rig.config);
+        let slot_ns = facts.rig.rate().slot_len_ns(0);
+        Self { facts, crew, horizon, slot_ns, next_slot, last_slot: None, pace: PhantomData }
+    }
+
+    /// Everything that the run was asked for is planned.
+    pub(crate) fn is_complete(&self) -> bool {
+        let frames = self.facts.options.frames;
+        let end = self.facts.end_slot.load(Ordering::Relaxed);
+        (frames > 0 && self.next_frame() >= frames) || (end > 0 && self.next_slot >= end)
+    }
+
+    /// Number of the next frame.
+    pub(crate) fn next_frame(&self) -> u64 {
+        self.facts.next_frame.load(Ordering::Relaxed)
+    }
+
+    /// A GPU that needs a slot or more for a frame gets them one at a time. False while it is busy.
+    pub(crate) fn may_begin(&self) -> bool {
+        !self.is_slow() || self.crew.gpu.in_flight() == 0
+    }
+
+    fn is_slow(&self) -> bool {
+        self.crew.gpu.is_slow(self.slot_ns)
+    }
+
+    /// Chooses the slot of the next frame at `now`. `None` when that lies beyond the end of the run.
+    pub(crate) fn choose_slot(&mut self, time: &LinkTime, now: HostTime) -> Option<Latch> {
+        let leads = P::leads(&self.facts, self.is_slow());
+        self.next_slot = self.next_slot.max(time.slot_after(now.plus_ns(leads.needed_ns)));
+        if self.is_complete() {
+            return None;
+        }
+        let at = time.host_of_slot(self.next_slot).plus_ns(-leads.lead_ns);
+        Some(Latch {
+            id: self.next_frame(),
+            slot: self.next_slot,
+            at,
+            due_at: at.max(now),
+            lead_ns: leads.lead_ns,
+        })
+    }
+
+    /// Plans the frame of `latch` from the newest tracks, read at `now`.
+    pub(crate) fn plan(
+        &mut self,
+        latch: &Latch,
+        note: &mut FrameNote,
+        time: &LinkTime,
+        snapshot: &TrackSnapshot,
+        now: HostTime,
+    ) {
+        let predict_ns = self.horizon.predict_ns(latch.lead_ns, snapshot.latency_ns);
+        self.facts.predict_ns.store(predict_ns, Ordering::Relaxed);
+        let inputs = PlanInputs {
+            slots: time,
+            id: latch.id,
+            slot: latch.slot,
+            stride: self.stride(latch.slot),
+            predict_ns,
+            fresh_ns: self.horizon.fresh_ns(snapshot.latency_ns),
+            budget_milli: self.crew.budget_milli.load(Ordering::Relaxed),
+            now,
+        };
+        note.plan.fill(&self.facts.rig, snapshot, &inputs);
+        note.fate = Fate::UnderWay;
+        note.latch_due_at = latch.due_at;
+        note.timeline = FrameTimeline {
+            captured_at: note.plan.captured_at,
+            received_at: note.plan.received_at,
+            due_at: note.plan.due_at,
+            latched_at: now,
+            ..FrameTimeline::default()
+        };
+    }
+
+    /// The planned frame is on its way to the next stage.
+    pub(crate) fn submitted(&mut self, note: &mut FrameNote, now: HostTime) {
+        let slot = note.plan.slot;
+        note.timeline.submitted_at = now;
+        self.facts.monitor.count_planned();
+        self.facts.next_frame.store(note.plan.id.0 + 1, Ordering::Relaxed);
+        let before = self.facts.stride_milli.load(Ordering::Relaxed);
+        let mean = before.saturating_mul(15).saturating_add(self.stride(slot) * 1000) / 16;
+        self.facts.stride_milli.store(mean, Ordering::Relaxed);
+        self.last_slot = Some(slot);
+        self.next_slot = slot + 1;
+    }
+
+    /// Slots from the frame before to one for `slot`.
+    fn stride(&self, slot: u64) -> u64 {
+        slot.saturating_sub(self.last_slot.unwrap_or(slot.saturating_sub(1))).clamp(1, 1000)
+    }
+}

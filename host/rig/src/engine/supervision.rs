@@ -1,0 +1,220 @@
+//! Who has fallen silent, and what is done about it.
+//!
+//! - A stage of the crew (tracking, plan, pack) that hangs, or a GPU that fails or does not finish: the crew is abandoned, so that nothing it
+//!   still does reaches the light, and a new one is made. The projector is dark meanwhile: every frame says itself from when on.
+//! - The link's thread or the collector hangs: nobody can take its place, so the run ends. The projector goes dark by its watchdog in the
+//!   first case, and is told to in the second.
+//! - A stage panics: a mistake of this program. The run ends in the dark.
+
+use super::error::PipelineError;
+use super::facts::Facts;
+use super::pulse::{Pulse, Silence, StandingOf};
+use dpm_device::time::HostTime;
+use dpm_render::gpu::{AfterLoss, LossBudget};
+use std::sync::atomic::Ordering;
+use std::sync::Arc;
+
+/// How long a new crew may take to be made, nanoseconds: drivers translate shaders for it.
+const MADE_WITHIN_NS: i64 = 180_000_000_000;
+/// Slots from frame to frame, in thousandths, from which on the operator is told that the renderer is slower than its slots.
+const SLOW_MILLI: u64 = 1_500;
+
+/// What is wrong with a crew.
+#[derive(Debug)]
+pub(crate) enum Trouble {
+    /// A stage does not answer.
+    Hung(&'static str),
+    /// A stage panicked: a programmer's mistake.
+    Panicked(&'static str),
+    /// The GPU failed or does not finish.
+    Failed(PipelineError),
+}
+
+impl Trouble {
+    /// Threads of the crew may never return.
+    fn hangs(&self) -> bool {
+        matches!(self, Self::Hung(_) | Self::Failed(PipelineError::GpuHangs { .. }))
+    }
+
+    /// Planning and packing call the GPU's driver, which may be what hangs.
+    fn remake(&self) -> Remake {
+        match self {
+            Self::Hung("tracking") => Remake::Crew,
+            Self::Failed(PipelineError::Gpu { .. } | PipelineError::GpuHangs { .. }) | Self::Hung(_) => {
+                Remake::CrewAndGpu
+            }
+            Self::Failed(_) | Self::Panicked(_) => Remake::Crew,
+        }
+    }
+
+    /// What happened, for the operator.
+    fn in_words(&self) -> String {
+        match self {
+            Self::Hung(stage) => format!("the {stage} stage hangs and is abandoned"),
+            Self::Failed(error) => error.to_string(),
+            Self::Panicked(stage) => PipelineError::Panicked(stage).to_string(),
+        }
+    }
+
+    fn into_error(self) -> PipelineError {
+        match self {
+            Self::Hung(stage) => PipelineError::Hung { stage },
+            Self::Failed(error) => error,
+            Self::Panicked(stage) => PipelineError::Panicked(stage),
+        }
+    }
+}
+
+/// How a new crew is to be made.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(crate) enum Remake {
+    /// With the GPU as it is.
+    Crew,
+    /// With the GPU opened anew, or another one.
+    CrewAndGpu,
+}
+
+/// What is to be done with a crew that is in trouble.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(crate) enum Verdict {
+    /// The run ends; the crew ends by itself.
+    End,
+    /// The crew is abandoned; `hangs`: its threads may never return. Then a new one is made, or with `None` the run ends.
+    Abandon {
+        /// Threads are left behind.
+        hangs: bool,
+        /// How the next crew is made.
+        remake: Option<Remake>,
+    },
+}
+
+/// How the making of a new crew stands.
+#[derive(Debug)]
+pub(crate) enum Making {
+    /// It goes on.
+    Waits,
+    /// It ended with an error.
+    Failed(PipelineError),
+    /// Whoever makes it ended with a panic.
+    Panicked,
+}
+
+/// A thread that nobody can replace hangs.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(crate) enum Irreplaceable {
+    /// The link's: nobody tells the projector anything any more.
+    Link,
+    /// The collector's, which would return from the run.
+    Collector,
+}
+
+/// The supervisor's mind.
+pub(crate) struct Supervision {
+    facts: Arc<Facts>,
+    losses: LossBudget,
+    link: Silence,
+    collector: Silence,
+    ask: StandingOf,
+    made_by: HostTime,
+    told_slow: bool,
+}
+
+impl Supervision {
+    /// Of a run that begins; `ask` is asked what a thread in doubt is doing.
+    pub(crate) fn new(facts: Arc<Facts>, ask: StandingOf) -> Self {
+        Self {
+            facts,
+            losses: LossBudget::default(),
+            link: Silence::default(),
+            collector: Silence::default(),
+            ask,
+            made_by: HostTime(i64::MAX),
+            told_slow: false,
+        }
+    }
+
+    /// Looks at the threads that nobody can replace, `step_ns` after the last look, and ends the run when one of them hangs.
+    pub(crate) fn watch(
+        &mut self,
+        link: &Pulse,
+        collector: &Pulse,
+        now: HostTime,
+        step_ns: i64,
+    ) -> Option<Irreplaceable> {
+        self.tell_if_slow();
+        if self.link.observe(link, now, step_ns, self.ask) {
+            self.facts.fail(PipelineError::Hung { stage: link.name() });
+            return Some(Irreplaceable::Link);
+        }
+        if self.collector.observe(collector, now, step_ns, self.ask) {
+            let hung = PipelineError::Hung { stage: collector.name() };
+            // The link still makes the projector dark; but the thread that would return from the run is the one that hangs.
+            self.facts.monitor.give_up(hung.to_string());
+            self.facts.fail(hung);
+            self.collector = Silence::default();
+            return Some(Irreplaceable::Collector);
+        }
+        None
+    }
+
+    /// The crew was found at work at `now`.
+    pub(crate) fn is_well(&self, now: HostTime) {
+        self.facts.alive_at_ns.store(now.0, Ordering::Relaxed);
+    }
+
+    /// What is to be done with a crew in `trouble`.
+    pub(crate) fn judge(&mut self, trouble: Trouble, now: HostTime) -> Verdict {
+        let facts = self.facts.clone();
+        if let Trouble::Panicked(_) = trouble {
+            facts.fail(trouble.into_error());
+            return Verdict::End;
+        }
+        let (hangs, remake) = (trouble.hangs(), trouble.remake());
+        let is_ending = facts.monitor.stop_requested() || facts.is_complete.load(Ordering::Acquire);
+        if is_ending {
+            facts.fail(trouble.into_error());
+            return Verdict::Abandon { hangs, remake: None };
+        }
+        if self.losses.lost(now) == AfterLoss::GiveUp {
+            facts.fail(PipelineError::KeepsFailing { last: trouble.into_error().to_string() });
+            return Verdict::Abandon { hangs, remake: None };
+        }
+        facts.monitor.note(format!("{}; the stages are made anew, dark meanwhile", trouble.in_words()));
+        self.made_by = now.plus_ns(MADE_WITHIN_NS);
+        Verdict::Abandon { hangs, remake: Some(remake) }
+    }
+
+    /// A new crew is not there yet. True when it is waited for; otherwise the run has ended, and `Making::Waits` means that whoever makes it
+    /// may hang in a driver.
+    pub(crate) fn waits_for(&self, making: Making, now: HostTime) -> bool {
+        let error = match making {
+            Making::Waits if now < self.made_by && !self.facts.monitor.stop_requested() => return true,
+            Making::Waits => PipelineError::Hung { stage: "GPU" },
+            Making::Failed(error) => error,
+            Making::Panicked => PipelineError::Panicked("GPU"),
+        };
+        self.facts.fail(error);
+        false
+    }
+
+    /// Says once when the renderer turns out slower than its slots, and when it is quick again.
+    fn tell_if_slow(&mut self) {
+        let stride = self.facts.stride_milli.load(Ordering::Relaxed);
+        let is_slow = stride >= SLOW_MILLI;
+        if is_slow == self.told_slow {
+            return;
+        }
+        self.told_slow = is_slow;
+        let hz = self.facts.rig.rate().hz();
+        self.facts.monitor.note(if is_slow {
+            let every = stride as f64 / 1e3;
+            format!(
+                "the renderer is slower than its slots: every {every:.1}th slot gets a frame, {:.1} of {hz:.1} a second; \
+                 a smaller raster, fewer samples (render.spp) or another method make it faster",
+                hz / every
+            )
+        } else {
+            format!("the renderer keeps up: every slot of {hz:.1} a second gets a frame")
+        });
+    }
+}

@@ -1,0 +1,335 @@
+//! The engine under a clock that the test moves: no thread runs, nobody sleeps.
+
+use super::connect::Connecting;
+use super::error::PipelineError;
+use super::facts::{CrewFacts, Facts, RECEIPT_NS};
+use super::keeper::LinkKeeper;
+use super::link::{LinkStage, Offer};
+use super::options::RunOptions;
+use super::pace::{Pace, Real, Virtual};
+use super::pack::PackStage;
+use super::plan::PlanStage;
+use super::pulse::Pulse;
+use super::supervision::{Irreplaceable, Making, Remake, Supervision, Trouble, Verdict};
+use crate::config::{Overrides, RigConfig};
+use crate::frame::job::{Fate, FrameNote};
+use crate::mock::{EmulatedProjector, MockConfig};
+use crate::pipeline::projector;
+use crate::plan::lead::LeadEstimator;
+use crate::plan::link_time::LinkTime;
+use crate::rig::Rig;
+use crate::telemetry::monitor::RunMonitor;
+use crate::tracks::TrackSnapshot;
+use dpm_device::link::{DeviceState, HostLink, SendOutcome};
+use dpm_device::planes::Raster;
+use dpm_device::time::HostTime;
+use dpm_device::transport::inproc::Direct;
+use dpm_render::pack::BitPlaneFrame;
+use std::sync::atomic::Ordering;
+use std::sync::Arc;
+
+const MS: i64 = 1_000_000;
+
+fn rig(flags: &[&str]) -> Arc<Rig> {
+    let flags = flags.iter().map(|f| (*f).to_owned()).collect();
+    let config = RigConfig::demo(&Overrides { variables: vec![], flags }).unwrap_or_else(|e| panic!("{e}"));
+    Arc::new(Rig::build(&config, Raster::new(16, 16)).unwrap_or_else(|e| panic!("{e}")))
+}
+
+/// A rig whose link to a mock is up, and the time.
+struct Bench {
+    facts: Arc<Facts>,
+    crew: Arc<CrewFacts>,
+    link: Option<(HostLink, LinkKeeper)>,
+    cable: Direct<EmulatedProjector>,
+    lead: LeadEstimator,
+    time: LinkTime,
+    now: HostTime,
+    slot_ns: i64,
+}
+
+fn bench(flags: &[&str], options: RunOptions) -> Bench {
+    let rig = rig(flags);
+    let monitor = Arc::new(RunMonitor::default());
+    let mut now = HostTime(5 * MS);
+    let mut setup = MockConfig::new(rig.camera.raster);
+    setup.frame_buffers = 1;
+    let mock = EmulatedProjector::new(setup, "", 1, now).expect("no faults");
+    let mut cable = Direct::new(mock);
+    let mut link = HostLink::new(projector::link_settings(&rig.config, rig.camera.raster));
+    let mut connecting = Connecting::begin(&mut link, 0, now);
+    let time = loop {
+        now = now.plus_ns(50_000);
+        if let Some(time) = connecting.step(now, &mut link, &mut cable, &monitor, false).expect("it comes up")
+        {
+            break time;
+        }
+    };
+    let slot_ns = rig.rate().slot_len_ns(0);
+    let lead = LeadEstimator::new(slot_ns, 3 * MS, slot_ns / 2, 2 * slot_ns);
+    let facts = Arc::new(Facts::new(rig.clone(), monitor, options, &lead, now));
+    let keeper = LinkKeeper::new(time, &link, None);
+    let crew = Arc::new(CrewFacts::new(&rig, 0));
+    Bench { facts, crew, link: Some((link, keeper)), cable, lead, time, now, slot_ns }
+}
+
+impl Bench {
+    fn plan<P: Pace>(&self) -> PlanStage<P> {
+        PlanStage::new(self.facts.clone(), self.crew.clone(), &self.time, self.now)
+    }
+
+    fn link(&mut self) -> LinkStage<Real> {
+        let (link, keeper) = self.link.take().expect("once");
+        LinkStage::new(self.facts.clone(), link, keeper, self.lead.clone())
+    }
+
+    /// Plans the next frame at the instant at which it wants to be planned.
+    fn planned<P: Pace>(&mut self, stage: &mut PlanStage<P>) -> Option<Box<FrameNote>> {
+        let latch = stage.choose_slot(&self.time, self.now)?;
+        self.now = self.now.max(latch.at);
+        let mut note = Box::new(FrameNote::new(&self.facts.rig));
+        let nothing = TrackSnapshot::empty(self.facts.rig.bodies.len());
+        stage.plan(&latch, &mut note, &self.time, &nothing, self.now);
+        stage.submitted(&mut note, self.now);
+        Some(note)
+    }
+}
+
+#[test]
+fn every_slot_gets_a_frame_that_is_latched_its_lead_before() {
+    let mut bench = bench(&[], RunOptions { frames: 50, ..RunOptions::default() });
+    let mut stage = bench.plan::<Real>();
+    let mut slots = Vec::new();
+    while let Some(note) = bench.planned(&mut stage) {
+        let lead_ns = bench.facts.lead_ns.load(Ordering::Relaxed) + RECEIPT_NS;
+        assert_eq!(note.timeline.due_at.ns_since(note.timeline.latched_at), lead_ns);
+        slots.push(note.plan.slot);
+    }
+    assert_eq!(slots.len(), 50);
+    assert!(slots.windows(2).all(|w| w[1] == w[0] + 1), "{slots:?}");
+    assert!(stage.is_complete());
+}
+
+#[test]
+fn a_planner_that_stood_still_goes_on_with_the_first_slot_that_a_usual_frame_can_reach() {
+    let mut bench = bench(&[], RunOptions::default());
+    let mut stage = bench.plan::<Real>();
+    let before = bench.planned(&mut stage).expect("no end");
+    bench.now = bench.now.plus_ns(500 * MS);
+    let needed_ns = bench.facts.typical_ns.load(Ordering::Relaxed) + RECEIPT_NS;
+    let earliest = bench.now.plus_ns(needed_ns);
+    let after = bench.planned(&mut stage).expect("no end");
+    assert!(after.timeline.due_at >= earliest, "the slot can still be reached");
+    assert!(after.timeline.due_at.ns_since(earliest) < bench.slot_ns, "and it is the first one");
+    let missed = 500 * MS / bench.slot_ns;
+    assert!((after.plan.slot - before.plan.slot) as i64 >= missed - 1);
+}
+
+#[test]
+fn a_gpu_slower_than_its_slots_gets_its_frames_one_at_a_time() {
+    let bench = bench(&[], RunOptions::default());
+    let stage = bench.plan::<Real>();
+    assert!(stage.may_begin());
+    bench.crew.gpu.submit();
+    assert!(stage.may_begin(), "a quick one may have several");
+    for _ in 0..20 {
+        bench.crew.gpu.submit();
+        bench.crew.gpu.finish(3 * bench.slot_ns);
+    }
+    assert!(!stage.may_begin());
+    bench.crew.gpu.finish(3 * bench.slot_ns);
+    assert!(stage.may_begin(), "it is free");
+}
+
+#[test]
+fn a_run_by_slots_ends_at_its_last_slot_whether_frames_made_it_or_not() {
+    let mut bench = bench(&[], RunOptions { slots: 100, ..RunOptions::default() });
+    let mut stage = bench.plan::<Real>();
+    let first = bench.planned(&mut stage).expect("begins").plan.slot;
+    bench.now = bench.now.plus_ns(60 * bench.slot_ns);
+    let mut last = first;
+    while let Some(note) = bench.planned(&mut stage) {
+        last = note.plan.slot;
+    }
+    assert_eq!(last, first + 99);
+    // A crew that takes over keeps to the same end.
+    assert!(bench.plan::<Real>().choose_slot(&bench.time, bench.now).is_none());
+}
+
+#[test]
+fn at_virtual_pace_a_frame_is_latched_as_early_as_the_rig_file_says_that_its_stages_take() {
+    let mut bench = bench(&[], RunOptions { frames: 20, ..RunOptions::default() });
+    let mut stage = bench.plan::<Virtual>();
+    let costs: i64 = bench.facts.modelled_costs().iter().sum();
+    // Whatever was learned of real time has no say.
+    bench.facts.lead_ns.store(123 * MS, Ordering::Relaxed);
+    while let Some(note) = bench.planned(&mut stage) {
+        let lead_ns = note.timeline.due_at.ns_since(note.timeline.latched_at);
+        assert_eq!(lead_ns, costs + 50_000);
+    }
+}
+
+#[test]
+fn packing_leaves_out_what_a_newer_frame_has_overtaken_but_shows_a_slow_gpus_late_frames() {
+    let mut bench = bench(&[], RunOptions { in_flight: 4, ..RunOptions::default() });
+    let mut plan = bench.plan::<Real>();
+    let mut stage = PackStage::new(bench.facts.clone(), bench.crew.clone(), None);
+    let mut note = bench.planned(&mut plan).expect("no end");
+    let due = note.timeline.due_at;
+    assert!(stage.is_wanted(&mut note, due.plus_ns(-1), false), "in time");
+    assert!(stage.is_wanted(&mut note, due, true), "late, and the newest there is");
+    assert!(!stage.is_wanted(&mut note, due, false));
+    assert_eq!(note.fate, Fate::Overtaken);
+    // Rendered frames that are late one after the other are no stall, from the fifth of four in flight on.
+    let wanted: Vec<bool> = (0..8)
+        .map(|_| {
+            let mut note = bench.planned(&mut plan).expect("no end");
+            note.cost = Some(Default::default());
+            let late = note.timeline.due_at.plus_ns(MS);
+            stage.is_wanted(&mut note, late, false)
+        })
+        .collect();
+    // The two late ones above count.
+    assert_eq!(wanted, [false, false, true, true, true, true, true, true]);
+}
+
+/// A frame waits for a buffer of the projector, but not beyond the beginning of its slot; one that is overtaken or too old is not sent.
+#[test]
+fn a_frame_waits_for_room_until_its_slot_begins() {
+    let mut bench = bench(&[], RunOptions::default());
+    let mut plan = bench.plan::<Real>();
+    let mut stage = bench.link();
+    let schedule = bench.facts.rig.config.projector.schedule();
+    let planes = BitPlaneFrame::new(bench.facts.rig.camera.raster, schedule);
+    // The mock holds one frame beside the one that it shows: the second finds no room before the first is lit.
+    let begin = bench.now;
+    let mut first = bench.planned(&mut plan).expect("no end");
+    let at = bench.now;
+    for ms in 0..at.ns_since(begin) / MS {
+        // The watchdog wants to hear of the host.
+        stage.poll(begin.plus_ns(ms * MS), &mut bench.cable);
+    }
+    assert_eq!(stage.offer(at, &mut first, planes.bytes(), true, &mut bench.cable), Offer::Settled);
+    assert_eq!(first.fate, Fate::Offered(SendOutcome::Sent));
+    stage.taken(&mut first, at.plus_ns(MS));
+    assert_eq!(first.timeline.sent_at, at.plus_ns(MS));
+    let mut second = bench.planned(&mut plan).expect("no end");
+    second.timeline.packed_at = bench.now;
+    let (mut now, mut waits) = (bench.now, 0);
+    while let Offer::Again(at) = stage.offer(now, &mut second, planes.bytes(), true, &mut bench.cable) {
+        assert!(at > now && at.ns_since(now) <= MS, "it asks again soon");
+        assert!(now < second.timeline.due_at, "it does not wait beyond its slot");
+        (now, waits) = (at, waits + 1);
+    }
+    assert!(waits > 0 && second.is_sent(), "{waits} waits, {:?}", second.fate);
+    assert!(now >= first.timeline.due_at, "the first frame made room when it was lit");
+    // Overtaken: its slot has begun and a newer one waits.
+    let mut third = bench.planned(&mut plan).expect("no end");
+    let late = third.timeline.due_at.plus_ns(MS);
+    assert_eq!(stage.offer(late, &mut third, planes.bytes(), false, &mut bench.cable), Offer::Settled);
+    assert_eq!(third.fate, Fate::Overtaken);
+    // Too old when it would be lit.
+    let mut fourth = bench.planned(&mut plan).expect("no end");
+    let old_ns = fourth.plan.predict_ns + bench.slot_ns + 1;
+    (fourth.plan.is_lit, fourth.plan.captured_at) = (true, late.plus_ns(-old_ns));
+    fourth.timeline.due_at = late;
+    assert_eq!(stage.offer(late, &mut fourth, planes.bytes(), true, &mut bench.cable), Offer::Settled);
+    assert_eq!(fourth.fate, Fate::TooOld);
+}
+
+#[test]
+fn a_run_that_ends_shows_its_last_frames_and_one_that_is_stopped_is_dark_at_once() {
+    for stopped in [false, true] {
+        let mut bench = bench(&[], RunOptions::default());
+        let mut stage = bench.link();
+        let last = bench.now;
+        if stopped {
+            bench.facts.monitor.request_stop();
+        }
+        let (mut now, mut told_at) = (last, None);
+        while let Some(at) = stage.end(now, last, &mut bench.cable) {
+            assert!(at > now && at.ns_since(now) <= MS);
+            if told_at.is_none() && bench.cable.device_mut().projector().status().state != DeviceState::Armed
+            {
+                told_at = Some(now);
+            }
+            now = at;
+        }
+        let told_after = told_at.expect("the projector is told").ns_since(last);
+        assert_eq!(told_after, if stopped { 0 } else { 10 * MS }, "stopped: {stopped}");
+        assert!(now.ns_since(last) < 20 * MS, "and it comes to an end");
+    }
+}
+
+fn supervision(facts: &Arc<Facts>) -> Supervision {
+    Supervision::new(facts.clone(), |_| None)
+}
+
+#[test]
+fn a_crew_in_trouble_is_made_anew_three_times_a_minute_and_the_fourth_ends_the_run() {
+    let bench = bench(&[], RunOptions::default());
+    let mut mind = supervision(&bench.facts);
+    let gpu = || Trouble::Failed(PipelineError::GpuHangs { frame: 7, ms: 100 });
+    let at = |s: i64| HostTime(s * 1_000 * MS);
+    let troubles = [
+        (Trouble::Hung("tracking"), true, Remake::Crew),
+        (Trouble::Hung("pack"), true, Remake::CrewAndGpu),
+        (gpu(), true, Remake::CrewAndGpu),
+    ];
+    for (second, (trouble, hangs, remake)) in troubles.into_iter().enumerate() {
+        let verdict = mind.judge(trouble, at(second as i64));
+        assert_eq!(verdict, Verdict::Abandon { hangs, remake: Some(remake) });
+        assert!(bench.facts.take_error().is_none(), "the run goes on");
+    }
+    assert_eq!(mind.judge(gpu(), at(4)), Verdict::Abandon { hangs: true, remake: None });
+    assert!(matches!(bench.facts.take_error(), Some(PipelineError::KeepsFailing { .. })));
+    assert!(bench.facts.monitor.stop_requested());
+}
+
+#[test]
+fn a_panic_and_a_failure_at_the_end_are_not_made_good() {
+    let bench = bench(&[], RunOptions::default());
+    let mut mind = supervision(&bench.facts);
+    assert_eq!(mind.judge(Trouble::Panicked("plan"), HostTime(0)), Verdict::End);
+    assert!(matches!(bench.facts.take_error(), Some(PipelineError::Panicked("plan"))));
+    // The run was asked to stop by that: no crew is made any more.
+    let verdict = mind.judge(Trouble::Hung("plan"), HostTime(MS));
+    assert_eq!(verdict, Verdict::Abandon { hangs: true, remake: None });
+}
+
+#[test]
+fn a_new_crew_is_waited_for_three_minutes() {
+    let bench = bench(&[], RunOptions::default());
+    let mut mind = supervision(&bench.facts);
+    let began = HostTime(7_000 * MS);
+    mind.judge(Trouble::Hung("pack"), began);
+    let limit_ns = 180_000 * MS;
+    assert!(mind.waits_for(Making::Waits, began.plus_ns(limit_ns - 1)));
+    assert!(bench.facts.take_error().is_none());
+    assert!(!mind.waits_for(Making::Waits, began.plus_ns(limit_ns)));
+    assert!(matches!(bench.facts.take_error(), Some(PipelineError::Hung { stage: "GPU" })));
+    assert!(!mind.waits_for(Making::Panicked, began));
+    assert!(matches!(bench.facts.take_error(), Some(PipelineError::Panicked("GPU"))));
+}
+
+#[test]
+fn the_run_ends_when_the_link_or_the_collector_falls_silent() {
+    for (which, expected) in [(0, Irreplaceable::Link), (1, Irreplaceable::Collector)] {
+        let bench = bench(&[], RunOptions::default());
+        let mut mind = supervision(&bench.facts);
+        let pulses = [Pulse::new("link"), Pulse::new("collector")];
+        pulses[which].beat(HostTime(0), 20 * MS);
+        let mut at_ms = 0;
+        let hung = loop {
+            at_ms += 2;
+            assert!(at_ms < 1_000, "{expected:?} hangs and nobody says so");
+            if let Some(hung) = mind.watch(&pulses[0], &pulses[1], HostTime(at_ms * MS), 2 * MS) {
+                break hung;
+            }
+        };
+        assert_eq!(hung, expected);
+        assert!((120..=124).contains(&at_ms), "a tenth of a second beyond what was announced: {at_ms} ms");
+        assert!(matches!(bench.facts.take_error(), Some(PipelineError::Hung { .. })));
+        assert!(bench.facts.monitor.stop_requested());
+    }
+}

@@ -1,0 +1,122 @@
+//! What a run works with: the tracker, the renderer, the memory of frames, and the projector at the other end of the cable.
+
+use super::settings::{budget_controller, output, renderer_settings};
+use crate::config::{MockProjectorConfig, RenderMethod};
+use crate::engine::error::PipelineError;
+use crate::engine::options::RunOptions;
+use crate::frame::job::FrameMemory;
+use crate::light::recorder::{LightNote, LightRecorder};
+use crate::mock::{DeviceClock, EmulatedProjector, MockConfig};
+use crate::pack::prepared::PreparedFrames;
+use crate::pipeline::projector;
+use crate::plan::budget::BudgetController;
+use crate::rig::{Rig, RigError};
+use crate::tracks::{open_for, TrackingStage};
+use dpm_device::time::{HostClock, HostTime};
+use dpm_handoff::channel::Sender;
+use dpm_render::gpu::Gpu;
+use dpm_render::pack::{BitPlaneFrame, Kernel};
+use dpm_render::{RenderError, Renderer, RendererSettings};
+use std::sync::Arc;
+
+/// How long the first frame may take, for which drivers translate shaders, nanoseconds: minutes on a slow machine that does other things too.
+pub(super) const FIRST_FRAME_TIMEOUT_NS: u64 = 180_000_000_000;
+
+/// What tracking, plan and pack work with.
+pub(super) struct CrewParts {
+    pub(super) tracking: TrackingStage,
+    /// `None` if frames are prepared.
+    pub(super) renderer: Option<Renderer>,
+    pub(super) prepared: Option<PreparedFrames>,
+    /// How planes are packed if the GPU has not done it.
+    pub(super) kernel: Kernel,
+    /// `None` if every frame gets the rays that the rig file asks for.
+    pub(super) budget: Option<BudgetController>,
+    /// What frames are made in.
+    pub(super) memory: Vec<FrameMemory>,
+    /// What a frame took while nobody was waiting for it, nanoseconds; 0 if that was not measured.
+    pub(super) frame_ns: i64,
+}
+
+impl CrewParts {
+    /// Without a GPU frames are prepared. Trackers outside this process stamp their packets with `clock`.
+    ///
+    /// # Errors
+    /// The tracker cannot be opened, or the GPU refuses.
+    pub(super) fn new(
+        rig: &Rig,
+        gpu: Option<&Arc<Gpu>>,
+        options: RunOptions,
+        clock: Arc<dyn HostClock>,
+    ) -> Result<Self, PipelineError> {
+        let settings = |gpu: &Gpu| RendererSettings {
+            output: output(rig, gpu, options.verify),
+            ..renderer_settings(rig)
+        };
+        let mut renderer = gpu.map(|gpu| Renderer::new(gpu, &rig.scene, settings(gpu))).transpose()?;
+        let tracker = open_for(rig, clock, HostTime(0))?;
+        let memory = (0..options.in_flight.max(2))
+            .map(|_| frame_memory(rig, renderer.as_mut()))
+            .collect::<Result<_, _>>()?;
+        Ok(Self {
+            tracking: TrackingStage::new(rig, tracker),
+            renderer,
+            prepared: gpu.is_none().then(|| PreparedFrames::new(rig.camera.raster)),
+            kernel: Kernel::best(),
+            budget: None,
+            memory,
+            frame_ns: 0,
+        })
+    }
+
+    /// Makes the parts ready for real pace: they draw two frames that nobody sees, so that what drivers put off to the first one is over
+    /// before a slot waits for it, and the second tells how long a frame takes. From then on the ray budget follows the time that frames take,
+    /// which it must not at virtual pace: there pictures do not depend on how fast the machine is.
+    ///
+    /// # Errors
+    /// The GPU does not finish, or is lost.
+    pub(super) fn at_real_pace(mut self, rig: &Rig) -> Result<Self, PipelineError> {
+        let slot = self.memory.first_mut().and_then(|memory| memory.gpu.as_mut());
+        if let (Some(renderer), Some(slot)) = (&mut self.renderer, slot) {
+            for _ in 0..2 {
+                self.frame_ns = crate::render::warm_up(slot, rig, renderer, FIRST_FRAME_TIMEOUT_NS)
+                    .map_err(RenderError::from)?;
+            }
+            if rig.config.render.method == RenderMethod::Dpm {
+                self.budget = budget_controller(rig);
+            }
+        }
+        Ok(self)
+    }
+}
+
+/// Memory for a frame in the making, with its slot on the GPU if one renders.
+fn frame_memory(rig: &Rig, renderer: Option<&mut Renderer>) -> Result<FrameMemory, PipelineError> {
+    let gpu = renderer.map(|renderer| renderer.create_slot(false)).transpose().map_err(RenderError::from)?;
+    Ok(FrameMemory { gpu, planes: BitPlaneFrame::new(rig.camera.raster, rig.config.projector.schedule()) })
+}
+
+/// The mock projector that the rig file describes by `mock`, dark, and who watches its light and tells it to `lights`. `marked`: frames carry
+/// marks to be looked for. Times of injected faults count from `start`.
+///
+/// # Errors
+/// The rig file injects faults that no projector has.
+pub(super) fn mock_projector(
+    rig: &Rig,
+    mock: &MockProjectorConfig,
+    lights: Sender<LightNote>,
+    options: RunOptions,
+    marked: bool,
+    start: HostTime,
+) -> Result<(EmulatedProjector, LightRecorder), PipelineError> {
+    let config = &rig.config;
+    let mut setup = MockConfig::new(rig.camera.raster);
+    setup.frame_buffers = mock.buffer_frames.min(64) as u8;
+    setup.clock = DeviceClock { skew_ppb: (mock.clock_ppm * 1000.0) as i32, ..DeviceClock::IDEAL };
+    setup.flash_limit = projector::flash_limit(config);
+    let emulated = EmulatedProjector::new(setup, &mock.faults, config.render.seed, start)
+        .map_err(|e| RigError::Unsupported(format!("projector.backend.faults: {e}")))?;
+    let marks = marked.then(|| config.projector.schedule());
+    let recorder = LightRecorder::new(lights, options.keep_frames, options.verify, marks);
+    Ok((emulated, recorder))
+}

@@ -1,0 +1,295 @@
+//! A run at real pace: a thread for each stage, the link, the supervisor and the mock projector; the caller's collects.
+
+use super::crew::{Crew, NotesBack, OnExit, Port};
+use super::link::{device_thread, link_thread, Line};
+use super::parts::{mock_projector, CrewParts};
+use super::projector;
+use super::rights::Rights;
+use super::run::{Ran, LIGHTS};
+use super::settings::lead_estimator;
+use super::supervisor::{join_within, Maker, Supervisor};
+use super::threads::{policy, Shared, NOTES, STAGE_THREADS};
+use crate::config::ProjectorBackend;
+use crate::engine::connect::{connect, ENDED_WITH_THE_LAST_RUN};
+use crate::engine::error::PipelineError;
+use crate::engine::facts::Facts;
+use crate::engine::keeper::LinkKeeper;
+use crate::engine::link::LinkStage;
+use crate::engine::options::RunOptions;
+use crate::engine::pulse::Pulse;
+use crate::engine::supervision::{Remake, Supervision};
+use crate::light::collector::{Collector, Inbox};
+use crate::light::recorder::{LightNote, LightRecorder};
+use crate::realtime::os::{standing_of, thread_id, usable_cores};
+use crate::realtime::standstill::StandstillMonitor;
+use crate::rig::{Rig, RigError};
+use crate::telemetry::monitor::RunMonitor;
+use crate::telemetry::projector::ProjectorReport;
+use dpm_common::clock::{Clock, MonotonicClock, Stopwatch};
+use dpm_device::link::HostLink;
+use dpm_device::transport::inproc::threaded;
+use dpm_device::transport::Transport;
+use dpm_handoff::channel::{channel, Sender};
+use dpm_handoff::wake::WaitPolicy;
+use dpm_render::gpu::Gpu;
+use dpm_render::RenderError;
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::sync::{Arc, Mutex};
+use std::thread::JoinHandle;
+use std::time::Duration;
+
+/// Buffers of the cable to a projector in this process: one is filled while another is read, and one for a projector that is late.
+const CABLE_BUFFERS: usize = 3;
+/// A step of a control thread that ends this late is a standstill of the machine, nanoseconds.
+const STANDSTILL_NS: i64 = 1_000_000;
+/// Time between two polls of a link that comes up, nanoseconds.
+const CONNECT_STEP_NS: i64 = 200_000;
+/// What the collector may take for one look, and for one note, nanoseconds. It is the only thread here that runs behind all others, it
+/// allocates, and no light depends on it: without it frames run out of notes and the light ends by itself.
+const LOOK_NS: i64 = 5_000_000_000;
+/// Time between two looks of the collector. It is not woken for every frame: that would cost the frame path two system calls a frame.
+const REST: Duration = Duration::from_millis(2);
+/// How long threads are waited for that have nothing left to do.
+const END_WITHIN: Duration = Duration::from_secs(1);
+
+pub(super) fn run_at_real_pace(
+    rig: &Arc<Rig>,
+    gpu: Option<&Arc<Gpu>>,
+    options: RunOptions,
+    monitor: &Arc<RunMonitor>,
+) -> Result<Ran, PipelineError> {
+    // A spinning thread on a machine with fewer cores than stages delays the very stages it waits for.
+    let clock = MonotonicClock::new(if usable_cores() > STAGE_THREADS { 50_000 } else { 0 });
+    let parts = crew_parts(rig, gpu, options, clock)?;
+    let (lights_in, lights) = channel(LIGHTS, WaitPolicy::Park);
+    let rights = Arc::new(Rights::new(&rig.config.real_time));
+    let standstill =
+        StandstillMonitor::start(Arc::new(clock.sleeping()), STANDSTILL_NS, rights.highest_priority()).ok();
+    let watch = Stopwatch::start();
+    let mut far = open_far_end(rig, lights_in, options, gpu.is_none(), clock, &rights)?;
+    let mut link = HostLink::new(projector::link_settings(&rig.config, rig.camera.raster));
+    let acknowledged = if rig.config.safety.acknowledge_faults { u32::MAX } else { ENDED_WITH_THE_LAST_RUN };
+    let time = connect(
+        &mut link,
+        far.medium.as_mut(),
+        acknowledged,
+        monitor,
+        &mut || clock.wait_until(clock.now().plus_ns(CONNECT_STEP_NS)),
+        &|| monitor.stop_requested(),
+    )?;
+    let lead = lead_estimator(rig, &link, parts.frame_ns);
+    let facts = Arc::new(Facts::new(rig.clone(), monitor.clone(), options, &lead, clock.now()));
+    tell_horizon(&facts);
+    let keeper = LinkKeeper::new(time, &link, far.lights);
+    let line = Line { stage: LinkStage::new(facts.clone(), link, keeper, lead), medium: far.medium };
+    let shared = Arc::new(Shared {
+        facts: facts.clone(),
+        clock,
+        time,
+        is_link_over: AtomicBool::new(false),
+        is_broken: AtomicBool::new(false),
+        link_pulse: Pulse::new("link"),
+        collector_pulse: Pulse::new("collector"),
+        rights: rights.clone(),
+    });
+    let mut collector = Collector::new(rig.clone(), options.keep_frames, options.verify)
+        .about(gpu.is_none(), standstill.as_ref().map(StandstillMonitor::seen));
+
+    let maker = maker(rig, gpu.cloned(), options, clock);
+    let (threads, mut inbox, notes_back) = Threads::start(&shared, parts, line, maker, lights)?;
+    // A panic up to the end of this function ends the light.
+    let stop_on_panic = OnExit(|| {
+        if std::thread::panicking() {
+            monitor.request_stop();
+        }
+    });
+    collect(&shared, &mut collector, &mut inbox, &notes_back);
+    let ended = threads.end();
+    let slots = collector.finish(monitor);
+    drop(stop_on_panic);
+    if let Some(error) = facts.take_error() {
+        return Err(error);
+    }
+    let Some(carried) = ended.carried else { return Err(PipelineError::Hung { stage: "link" }) };
+    let recorder = far.device.map(recorder_of).transpose()?;
+    let warnings = ended.unseen.into_iter().chain(far.warnings).chain(rights.warnings()).collect();
+    Ok(Ran {
+        facts,
+        collector,
+        slots,
+        recorder,
+        carried,
+        wall_s: watch.elapsed_ns() as f64 * 1e-9,
+        standstills: standstill.map(StandstillMonitor::finish).unwrap_or_default(),
+        warnings,
+    })
+}
+
+fn crew_parts(
+    rig: &Rig,
+    gpu: Option<&Arc<Gpu>>,
+    options: RunOptions,
+    clock: MonotonicClock,
+) -> Result<CrewParts, PipelineError> {
+    CrewParts::new(rig, gpu, options, Arc::new(move || clock.now()))?.at_real_pace(rig)
+}
+
+/// Makes crews that take over. A GPU that failed is opened anew, with the options of the one before.
+fn maker(rig: &Arc<Rig>, gpu: Option<Arc<Gpu>>, options: RunOptions, clock: MonotonicClock) -> Maker {
+    let rig = rig.clone();
+    let gpu = Mutex::new(gpu);
+    Arc::new(move |remake| {
+        let mut gpu = gpu.lock().map_err(|_| PipelineError::Panicked("remake"))?;
+        if let (Some(old), Remake::CrewAndGpu) = (gpu.as_mut(), remake) {
+            *old = old.reopen().map_err(RenderError::from)?;
+        }
+        crew_parts(&rig, gpu.as_ref(), options, clock)
+    })
+}
+
+/// Says how long bodies are carried on by prediction where the rig file leaves it open.
+fn tell_horizon(facts: &Facts) {
+    if facts.rig.config.safety.predict_ms.is_none() {
+        let ms = facts.predict_ns.load(Ordering::Relaxed) as f64 / 1e6;
+        facts.monitor.note(format!(
+            "safety.predict_ms is left out: a body is carried on by prediction for {ms:.0} ms and the tracker's latency, which follows what \
+             frames need"
+        ));
+    }
+}
+
+/// The way to the projector, and what is at its other end.
+struct FarEnd {
+    medium: Box<dyn Transport>,
+    /// The thread of a mock in this process.
+    device: Option<JoinHandle<LightRecorder>>,
+    /// Where reports of light go that nobody in this process sees.
+    lights: Option<Sender<LightNote>>,
+    /// What the operator should know about the medium.
+    warnings: Vec<String>,
+}
+
+fn open_far_end(
+    rig: &Rig,
+    lights: Sender<LightNote>,
+    options: RunOptions,
+    marked: bool,
+    clock: MonotonicClock,
+    rights: &Arc<Rights>,
+) -> Result<FarEnd, PipelineError> {
+    let (config, raster) = (&rig.config, rig.camera.raster);
+    let backend = &config.projector.backend;
+    if let ProjectorBackend::Mock(mock) = backend {
+        let (mock, recorder) = mock_projector(rig, mock, lights, options, marked, clock.now())?;
+        let frame_bytes = projector::frame_bytes(raster, config.projector.schedule().len());
+        let (host_end, device_end) = threaded(frame_bytes, CABLE_BUFFERS, policy(rig));
+        let rights = rights.clone();
+        let device =
+            spawn("mock projector", move || device_thread(device_end, mock, recorder, clock, &rights))?;
+        return Ok(FarEnd {
+            medium: Box::new(host_end),
+            device: Some(device),
+            lights: None,
+            warnings: Vec::new(),
+        });
+    }
+    let medium = projector::open(config, raster)?.ok_or_else(|| {
+        let word = backend.word();
+        RigError::Unsupported(format!("projector.backend.kind = {word:?} takes no frames over a link"))
+    })?;
+    let (mut transport, warnings) = (medium.transport, medium.warnings);
+    // Replies are stamped when they arrive, not when they are looked for.
+    transport.set_clock(Arc::new(move || clock.now()));
+    Ok(FarEnd { medium: transport, device: None, lights: Some(lights), warnings })
+}
+
+/// The recorder of the mock's thread, which ends when its cable is unplugged.
+fn recorder_of(device: JoinHandle<LightRecorder>) -> Result<LightRecorder, PipelineError> {
+    match join_within(device, END_WITHIN) {
+        Some(ended) => ended.map_err(|_| PipelineError::Panicked("mock projector")),
+        None => Err(PipelineError::Hung { stage: "mock projector" }),
+    }
+}
+
+/// The threads of a run but for the collector's.
+struct Threads {
+    link: JoinHandle<ProjectorReport>,
+    supervisor: JoinHandle<Option<String>>,
+}
+
+/// What the threads left behind.
+struct Ended {
+    /// `None` when the link's thread hangs.
+    carried: Option<ProjectorReport>,
+    /// What the tracker says of bodies that were never seen.
+    unseen: Option<String>,
+}
+
+impl Threads {
+    fn start(
+        shared: &Arc<Shared>,
+        parts: CrewParts,
+        line: Line,
+        maker: Maker,
+        lights: dpm_handoff::channel::Receiver<LightNote>,
+    ) -> Result<(Self, Inbox, NotesBack), PipelineError> {
+        let notes_back = NotesBack::default();
+        let (crew, port) = Crew::start(shared, parts, &notes_back)?;
+        let (mut ports_in, ports) = channel::<Port>(4, WaitPolicy::Park);
+        let _ = ports_in.push(port);
+        let (done_in, done) = channel(NOTES, WaitPolicy::Park);
+        let on_link = shared.clone();
+        let link = spawn("link", move || link_thread(&on_link, line, ports, done_in))?;
+        let supervisor = Supervisor {
+            shared: shared.clone(),
+            mind: Supervision::new(shared.facts.clone(), standing_of),
+            ports: ports_in,
+            notes_back: notes_back.clone(),
+            maker,
+        };
+        let rights = shared.rights.clone();
+        let supervisor = spawn("supervisor", move || {
+            rights.enter_supervisor();
+            supervisor.run(crew)
+        })
+        .inspect_err(|_| {
+            // Nobody would watch: the link ends, and with it the light.
+            shared.facts.monitor.request_stop();
+        })?;
+        Ok((Self { link, supervisor }, Inbox { done, lights }, notes_back))
+    }
+
+    fn end(self) -> Ended {
+        let unseen =
+            join_within(self.supervisor, END_WITHIN.saturating_mul(2)).and_then(Result::ok).flatten();
+        Ended { carried: join_within(self.link, END_WITHIN).and_then(Result::ok), unseen }
+    }
+}
+
+/// Collects until the run is over, or until nobody can end it any more.
+fn collect(shared: &Shared, collector: &mut Collector, inbox: &mut Inbox, notes_back: &NotesBack) {
+    let pulse = &shared.collector_pulse;
+    pulse.begin(thread_id());
+    let mut alive = || pulse.beat(shared.clock.now(), LOOK_NS);
+    while !shared.is_broken.load(Ordering::Acquire) {
+        alive();
+        let free = |note| notes_back.push(note);
+        if collector.look(inbox, &free, &shared.facts.monitor, &mut alive) {
+            break;
+        }
+        std::thread::sleep(REST);
+    }
+    pulse.end();
+}
+
+/// A thread of the run.
+fn spawn<T: Send + 'static>(
+    stage: &'static str,
+    work: impl FnOnce() -> T + Send + 'static,
+) -> Result<JoinHandle<T>, PipelineError> {
+    let name = stage.split(' ').next().unwrap_or(stage);
+    std::thread::Builder::new()
+        .name(format!("dpm-{name}"))
+        .spawn(work)
+        .map_err(|source| PipelineError::Thread { stage, source })
+}

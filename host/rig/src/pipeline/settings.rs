@@ -1,0 +1,79 @@
+//! What a run works with, from the rig file: the renderer's settings, the first guess of the lead, the budget's limits.
+
+use crate::config::Packer;
+use crate::engine::facts::RECEIPT_NS;
+use crate::plan::budget::{BudgetConfig, BudgetController};
+use crate::plan::lead::LeadEstimator;
+use crate::rig::Rig;
+use dpm_device::link::HostLink;
+use dpm_render::gpu::Gpu;
+use dpm_render::{Output, RendererSettings};
+
+/// Longest reserve in the lead, nanoseconds.
+const RESERVE_NS: i64 = 528_000;
+/// Spare time in the first guess of the lead, of what a frame took while nobody was waiting: a quarter.
+const GUESS_SPARE: i64 = 4;
+
+/// The time from latch to sent that the rig file states, nanoseconds.
+fn modelled_ns(rig: &Rig) -> i64 {
+    i64::from(rig.config.real_time.stage_costs_us.total()) * 1000
+}
+
+/// How early frames are latched, learned from what the rig file states and from the `frame_ns` that a frame took while nobody was waiting.
+pub(super) fn lead_estimator(rig: &Rig, link: &HostLink, frame_ns: i64) -> LeadEstimator {
+    let slot_ns = rig.rate().slot_len_ns(0);
+    // Sent earlier, a frame would find no room in the device, whose word of a free buffer takes part of a slot.
+    let held = link.device().map_or(1, |hello| i64::from(hello.frame_buffers));
+    let longest_wait_ns = (held * slot_ns - slot_ns / 2 - RECEIPT_NS).max(0);
+    // In reserve: what a core does beside frames, and lends to others, is mostly shorter than half a millisecond.
+    let reserve_ns = (slot_ns / 2).min(RESERVE_NS);
+    let rendered_ns = frame_ns + frame_ns / GUESS_SPARE;
+    LeadEstimator::new(slot_ns, modelled_ns(rig).max(rendered_ns), reserve_ns, longest_wait_ns)
+}
+
+/// Holds the GPU's time inside the slot by spending fewer samples: thousandths of a sample a pixel, from what the rig file asks for down
+/// to an eighth of it.
+pub(super) fn budget_controller(rig: &Rig) -> Option<BudgetController> {
+    let full = u64::from(rig.config.render.spp) * 1000;
+    let config = BudgetConfig {
+        slot_ns: rig.rate().slot_len_ns(0),
+        aim: 0.8,
+        limit: 0.92,
+        min_rays: (full / 8).max(1),
+        max_rays: full.max(1),
+        initial_rays: full,
+    };
+    BudgetController::new(config).ok()
+}
+
+/// The renderer's settings from the rig file.
+pub fn renderer_settings(rig: &Rig) -> RendererSettings {
+    let r = &rig.config.render;
+    RendererSettings {
+        raster: rig.camera.raster,
+        depth: r.depth,
+        seed: r.seed as u32,
+        clamp_indirect: (r.clamp_indirect > 0.0).then_some(r.clamp_indirect as f32),
+        drive_gain: rig.drive_gain(),
+        ambient: rig.config.scene.ambient.map(|v| v as f32),
+        camera_is_eye: false,
+        leave_nothing_out: false,
+        method: r.to_method(),
+        output: Output::Codes,
+    }
+}
+
+/// What the rig file wants back from `gpu`; with `check` the code values in any case.
+pub fn output(rig: &Rig, gpu: &Gpu, check: bool) -> Output {
+    let packs = match rig.config.render.packer {
+        Packer::Auto => !gpu.summary().software,
+        Packer::Gpu => true,
+        Packer::Cpu => false,
+    };
+    let schedule = rig.config.projector.schedule();
+    match (packs, check) {
+        (false, _) => Output::Codes,
+        (true, false) => Output::Planes(schedule),
+        (true, true) => Output::Both(schedule),
+    }
+}

@@ -1,0 +1,318 @@
+//! A run at virtual pace: one thread drives every part of the engine under a clock that it moves. Each stage takes what the rig file says that
+//! it costs, so a run is a function of its inputs, however fast or busy the machine is.
+
+use super::parts::{mock_projector, CrewParts, FIRST_FRAME_TIMEOUT_NS};
+use super::projector;
+use super::run::{Ran, LIGHTS};
+use super::settings::lead_estimator;
+use super::supervisor::leave_behind;
+use super::threads::{enter_frame_path, may_stall, read_tracker, rendered, NOTES, WARM_UP_FRAMES};
+use crate::config::ProjectorBackend;
+use crate::engine::connect::{connect, ENDED_WITH_THE_LAST_RUN};
+use crate::engine::error::PipelineError;
+use crate::engine::facts::{CrewFacts, Facts};
+use crate::engine::keeper::LinkKeeper;
+use crate::engine::link::{LinkStage, Offer};
+use crate::engine::options::{RunOptions, StallIn};
+use crate::engine::pace::Virtual;
+use crate::engine::pack::PackStage;
+use crate::engine::plan::{PlanStage, LISTEN_NS};
+use crate::frame::job::{Fate, FrameJob, FrameMemory, FrameNote};
+use crate::frame::Stage;
+use crate::light::collector::{Collector, Inbox};
+use crate::light::recorder::LightRecorder;
+use crate::mock::EmulatedProjector;
+use crate::plan::link_time::LinkTime;
+use crate::realtime::standstill::Standstills;
+use crate::rig::{Rig, RigError};
+use crate::telemetry::monitor::RunMonitor;
+use crate::tracks::TrackSnapshot;
+use dpm_common::clock::Stopwatch;
+use dpm_device::link::HostLink;
+use dpm_device::time::HostTime;
+use dpm_device::transport::inproc::Direct;
+use dpm_device::transport::Transport;
+use dpm_handoff::channel::{channel, Sender};
+use dpm_handoff::latest::{latest, Publisher, Reader};
+use dpm_handoff::wake::WaitPolicy;
+use dpm_render::gpu::Gpu;
+use std::cell::RefCell;
+use std::collections::VecDeque;
+use std::panic::{catch_unwind, AssertUnwindSafe};
+use std::sync::atomic::Ordering;
+use std::sync::Arc;
+
+/// A frame that the GPU has not finished by then is given up, and the run with it, nanoseconds.
+const GPU_TIMEOUT_NS: u64 = 20_000_000_000;
+/// Time between two polls of a link that comes up, nanoseconds.
+const CONNECT_STEP_NS: i64 = 50_000;
+
+pub(super) fn run_at_virtual_pace(
+    rig: &Arc<Rig>,
+    gpu: Option<&Arc<Gpu>>,
+    options: RunOptions,
+    monitor: &Arc<RunMonitor>,
+) -> Result<Ran, PipelineError> {
+    // Only trackers without a clock of their own are allowed at virtual pace.
+    let mut parts = CrewParts::new(rig, gpu, options, Arc::new(|| HostTime(0)))?;
+    // The link comes up just before the first frame, so that nobody waits for the filters.
+    let mut now = HostTime(LISTEN_NS);
+    let (lights_in, lights) = channel(LIGHTS, WaitPolicy::Park);
+    let ProjectorBackend::Mock(mock) = &rig.config.projector.backend else {
+        let told = "real_time.pace = \"virtual\" takes the mock projector only";
+        return Err(RigError::Unsupported(told.into()).into());
+    };
+    let (mock, recorder) = mock_projector(rig, mock, lights_in, options, gpu.is_none(), now)?;
+    let mut cable = Direct::new(mock);
+    let watch = Stopwatch::start();
+    let mut link = HostLink::new(projector::link_settings(&rig.config, rig.camera.raster));
+    let acknowledged = if rig.config.safety.acknowledge_faults { u32::MAX } else { ENDED_WITH_THE_LAST_RUN };
+    let mut clock = || {
+        now = now.plus_ns(CONNECT_STEP_NS);
+        now
+    };
+    let time =
+        connect(&mut link, &mut cable, acknowledged, monitor, &mut clock, &|| monitor.stop_requested())?;
+    let lead = lead_estimator(rig, &link, 0);
+    let facts = Arc::new(Facts::new(rig.clone(), monitor.clone(), options, &lead, now));
+    let crew = Arc::new(CrewFacts::new(rig, 0));
+    let keeper = LinkKeeper::new(time, &link, None);
+    let (done, finished) = channel(NOTES, WaitPolicy::Park);
+    let free: Vec<_> = std::mem::take(&mut parts.memory).into_iter().map(Box::new).collect();
+    let frames = free.len();
+    let mut world = World {
+        plan: PlanStage::new(facts.clone(), crew.clone(), &time, now),
+        pack: PackStage::new(facts.clone(), crew, None),
+        link: LinkStage::new(facts.clone(), link, keeper, lead),
+        time,
+        now,
+        sent_at: now,
+        costs: facts.modelled_costs(),
+        track_ns: i64::from(rig.config.real_time.stage_costs_us.track) * 1000,
+        latest: latest(TrackSnapshot::empty(rig.bodies.len())),
+        cable,
+        recorder,
+        free,
+        notes: RefCell::new((0..frames).map(|_| Box::new(FrameNote::new(rig))).collect()),
+        under_way: VecDeque::with_capacity(frames),
+        done: Some(done),
+        collector: Collector::new(rig.clone(), options.keep_frames, options.verify)
+            .about(gpu.is_none(), None),
+        inbox: Inbox { done: finished, lights },
+        at_work: "plan",
+        parts,
+        facts: facts.clone(),
+    };
+    world.run();
+    let slots = world.collector.finish(monitor);
+    if let Some(error) = facts.take_error() {
+        return Err(error);
+    }
+    Ok(Ran {
+        carried: world.link.report(world.cable.name()),
+        collector: world.collector,
+        slots,
+        recorder: Some(world.recorder),
+        wall_s: watch.elapsed_ns() as f64 * 1e-9,
+        standstills: Standstills::default(),
+        warnings: world.parts.tracking.never_seen(rig).into_iter().collect(),
+        facts,
+    })
+}
+
+/// All parts of a run, and the time.
+struct World {
+    facts: Arc<Facts>,
+    plan: PlanStage<Virtual>,
+    pack: PackStage,
+    link: LinkStage<Virtual>,
+    /// The projector's clock as the handshake found it.
+    time: LinkTime,
+    /// When the last frame was latched.
+    now: HostTime,
+    /// When the last frame was sent.
+    sent_at: HostTime,
+    /// What plan, render, pack and link cost, nanoseconds.
+    costs: [i64; 4],
+    /// A sample that arrives later than this before the latch is no pose yet, nanoseconds.
+    track_ns: i64,
+    latest: (Publisher<TrackSnapshot>, Reader<TrackSnapshot>),
+    parts: CrewParts,
+    cable: Direct<EmulatedProjector>,
+    recorder: LightRecorder,
+    #[allow(clippy::vec_box)] // The boxes travel with the frames.
+    free: Vec<Box<FrameMemory>>,
+    #[allow(clippy::vec_box)]
+    notes: RefCell<Vec<Box<FrameNote>>>,
+    /// Frames that the GPU works on, oldest first.
+    under_way: VecDeque<FrameJob>,
+    /// `None` when no frame will be finished any more.
+    done: Option<Sender<Box<FrameNote>>>,
+    collector: Collector,
+    inbox: Inbox,
+    /// The stage that works, for the word on a panic.
+    at_work: &'static str,
+}
+
+impl World {
+    /// Runs until all frames are lit or a stop is asked for, then goes dark. A failure or a panic ends in the dark, too.
+    fn run(&mut self) {
+        let served = catch_unwind(AssertUnwindSafe(|| self.serve()));
+        enter_frame_path(false);
+        match served {
+            Ok(Ok(())) => {}
+            Ok(Err(error)) => self.facts.fail(error),
+            Err(_) => self.facts.fail(PipelineError::Panicked(self.at_work)),
+        }
+        self.go_dark();
+        self.clear();
+        self.done = None;
+        self.recorder.close();
+        while !self.collect() {}
+    }
+
+    fn serve(&mut self) -> Result<(), PipelineError> {
+        while !self.facts.monitor.stop_requested() {
+            let begun = match self.free.pop() {
+                Some(memory) => self.begin(memory)?,
+                None => false,
+            };
+            if begun {
+                continue;
+            }
+            let Some(mut job) = self.under_way.pop_front() else {
+                self.facts.is_complete.store(true, Ordering::Release);
+                break;
+            };
+            if let Err(error) = self.finish(&mut job) {
+                self.abandon(job);
+                return Err(error);
+            }
+            self.release(job);
+        }
+        Ok(())
+    }
+
+    /// Latches the next frame and starts the GPU on it. False when the run has all that it was asked for.
+    fn begin(&mut self, memory: Box<FrameMemory>) -> Result<bool, PipelineError> {
+        self.at_work = "plan";
+        let id = self.plan.next_frame();
+        may_stall(&self.facts, StallIn::Plan, id);
+        let latch = if self.plan.is_complete() { None } else { self.plan.choose_slot(&self.time, self.now) };
+        let note = self.notes.get_mut().pop();
+        let (Some(latch), Some(note)) = (latch, note) else {
+            self.free.push(memory);
+            return Ok(false);
+        };
+        enter_frame_path(id >= WARM_UP_FRAMES);
+        let mut job = FrameJob { note, memory };
+        self.now = latch.at;
+        self.at_work = "tracking";
+        may_stall(&self.facts, StallIn::Tracking, id);
+        read_tracker(
+            &self.facts,
+            &mut self.parts.tracking,
+            &mut self.latest.0,
+            latch.at.plus_ns(-self.track_ns),
+        );
+        self.at_work = "plan";
+        let watch = Stopwatch::start();
+        let snapshot = self.latest.1.latest().0;
+        self.plan.plan(&latch, &mut job.note, &self.time, snapshot, latch.at);
+        job.note.timeline.wall_ns[Stage::Plan as usize] = watch.elapsed_ns();
+        if let (Some(renderer), Some(slot)) = (&mut self.parts.renderer, job.memory.gpu.as_mut()) {
+            if let Err(source) = crate::render::submit(&job.note.plan, slot, &self.facts.rig, renderer) {
+                self.abandon(job);
+                return Err(PipelineError::Gpu { frame: id, source });
+            }
+        }
+        self.plan.submitted(&mut job.note, latch.at.plus_ns(self.costs[0]));
+        self.under_way.push_back(job);
+        Ok(true)
+    }
+
+    /// Waits for the GPU, packs the frame and brings it to the projector.
+    fn finish(&mut self, job: &mut FrameJob) -> Result<(), PipelineError> {
+        let frame = job.note.plan.id.0;
+        enter_frame_path(frame >= WARM_UP_FRAMES);
+        self.at_work = "pack";
+        may_stall(&self.facts, StallIn::Pack, frame);
+        rendered(job, if frame == 0 { FIRST_FRAME_TIMEOUT_NS } else { GPU_TIMEOUT_NS }, || ())?;
+        let rendered_at = job.note.timeline.submitted_at.plus_ns(self.costs[1]);
+        (job.note.timeline.rendered_at, job.note.timeline.packing_at) = (rendered_at, rendered_at);
+        if self.pack.is_wanted(&mut job.note, rendered_at, true) {
+            crate::pack::pack(job, self.parts.kernel, self.facts.options.verify, &mut self.parts.prepared);
+        }
+        job.note.timeline.packed_at = rendered_at.plus_ns(self.costs[2]);
+        self.send(job);
+        Ok(())
+    }
+
+    fn send(&mut self, job: &mut FrameJob) {
+        self.at_work = "link";
+        let FrameJob { note, memory } = job;
+        let frame = note.plan.id.0;
+        enter_frame_path(frame >= WARM_UP_FRAMES && self.link.is_streaming());
+        may_stall(&self.facts, StallIn::Link, frame);
+        let mut now = note.timeline.packed_at.plus_ns(self.costs[3]);
+        self.live(now);
+        let watch = Stopwatch::start();
+        let planes = memory.planes.bytes();
+        while let Offer::Again(at) = self.link.offer(now, note, planes, true, &mut self.cable) {
+            now = at;
+            self.live(now);
+        }
+        note.timeline.wall_ns[Stage::Link as usize] = watch.elapsed_ns();
+        self.link.taken(note, now);
+        self.sent_at = now;
+    }
+
+    /// The link is done with a frame: its memory is free again, its note is the collector's.
+    fn release(&mut self, job: FrameJob) {
+        enter_frame_path(false);
+        self.free.push(job.memory);
+        if let Some(done) = &mut self.done {
+            // There are fewer notes than places.
+            let _ = done.push(job.note);
+        }
+        self.collect();
+    }
+
+    /// The projector lives up to `now`. Everybody is alive: nobody can be late.
+    fn live(&mut self, now: HostTime) {
+        self.facts.alive_at_ns.store(now.0, Ordering::Relaxed);
+        self.recorder.advance(self.cable.device_mut(), now);
+    }
+
+    /// The last frames' light where the run came to its end, then dark.
+    fn go_dark(&mut self) {
+        let (last, mut now) = (self.sent_at, self.sent_at);
+        while let Some(at) = self.link.end(now, last, &mut self.cable) {
+            now = at;
+            self.live(now);
+        }
+    }
+
+    /// Frames that are still under way are counted as not sent. Their memory is not freed before the GPU is done with it.
+    fn clear(&mut self) {
+        while let Some(mut job) = self.under_way.pop_front() {
+            job.note.fate = Fate::Stopped;
+            if rendered(&mut job, GPU_TIMEOUT_NS, || ()).is_err() {
+                return self.abandon(job);
+            }
+            self.release(job);
+        }
+    }
+
+    /// The GPU does not finish `job`, or is lost. It may read what frames and the renderer own for as long as it likes: they are never freed.
+    fn abandon(&mut self, job: FrameJob) {
+        leave_behind();
+        std::mem::forget((job, std::mem::take(&mut self.under_way), self.parts.renderer.take()));
+    }
+
+    /// True when everything is collected.
+    fn collect(&mut self) -> bool {
+        let Self { collector, inbox, notes, facts, .. } = self;
+        collector.look(inbox, &|note| notes.borrow_mut().push(note), &facts.monitor, &mut || ())
+    }
+}
