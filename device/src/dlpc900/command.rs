@@ -2,8 +2,8 @@
 //!
 //! A message is a header and data, split into zero-padded reports of 64 bytes; only the first report carries the
 //! header. Command header, 6 bytes: flags, sequence, u16 length (opcode + data), u16 opcode. Reply header, 4 bytes:
-//! flags, sequence, u16 length (data): a reply does not repeat the opcode. All numbers are little-endian. \[DLPU018
-//! section 1.2\]
+//! flags, sequence, u16 length (data): a reply does not repeat the opcode. All numbers are little-endian.
+//! \[DLPU018 section 1.2\]
 
 /// Bytes of every report on the wire (the report ID 0 that HID libraries put in front is not sent).
 pub const REPORT_BYTES: usize = 64;

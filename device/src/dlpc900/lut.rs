@@ -2,8 +2,8 @@
 //! entries.
 //!
 //! The rules are defined only here. The driver checks a sequence before it sends anything, and names the entry and the
-//! rule. The emulator answers with the controller's error code for the same rule. \[DLPU018 tables 2-102, 2-103,
-//! section 2.4.4.3.5\]
+//! rule. The emulator answers with the controller's error code for the same rule.
+//! \[DLPU018 tables 2-102, 2-103, section 2.4.4.3.5\]
 
 use crate::planes::Raster;
 
