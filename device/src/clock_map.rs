@@ -1,12 +1,14 @@
-//! Echo exchanges into a map from a device's ticks to host time, with a bound on its error.
+//! Maps a device's ticks to host time by echo exchanges, with a bound on the error.
 //!
-//! Method: Cristian's exchange (Distributed Computing 3, 1989). The host sends at `t1`, the device stamps `rx` and `tx`, the host
-//! receives at `t4`; whatever the delays were, the host's clock read at least `t1` when the device's read `rx`, and at most `t4`
-//! when it read `tx`. Each exchange thus encloses the offset between the clocks in an interval as wide as its round trip, and the
-//! shortest round trips of a short window say most. The drift is the slope between the best exchanges of the window's two halves.
+//! Method: Cristian's exchange (Distributed Computing 3, 1989). The host sends at `t1`, the device stamps `rx` and
+//! `tx`, the host receives at `t4`. Whatever the delays were, the host's clock read at least `t1` when the device's
+//! read `rx`, and at most `t4` when it read `tx`. Each exchange thus bounds the offset between the clocks to an
+//! interval as wide as its round trip, and the shortest round trips of a short window are the most precise. The drift
+//! is the slope between the best exchanges of the window's two halves.
 //!
-//! The error bound is `round trip / 2 + drift error * age`: it does not assume that the way there takes as long as the way back.
-//! All arithmetic is in whole nanoseconds; ticks are carried in 128 bits, so neither 400 days nor a wrapping counter lose one.
+//! The error bound is `round trip / 2 + drift error * age`: it does not assume that both directions take the same time.
+//! All arithmetic is in whole nanoseconds; ticks are carried in 128 bits, so neither 400 days nor a wrapping counter
+//! loses a tick.
 
 use crate::time::{DeviceTicks, HostTime};
 
@@ -14,18 +16,18 @@ use crate::time::{DeviceTicks, HostTime};
 const WINDOW: usize = 64;
 /// Longest age of a kept exchange, device nanoseconds.
 const WINDOW_NS: i64 = 4_000_000_000;
-/// Largest believed rate difference: 1,000 ppm. Crystals stay within 200.
+/// Largest plausible rate difference: 1,000 ppm. Crystals stay within 200.
 const MAX_SKEW_PPB: i64 = 1_000_000;
-/// Largest believed change of the rate: 1 ppm per second, in ppb per second.
+/// Largest plausible change of the rate: 1 ppm per second, in ppb per second.
 const MAX_WANDER_PPB_PER_S: i64 = 1_000;
-/// Exchanges in a row that must contradict the map before the device's clock is taken to have stepped.
+/// Number of consecutive exchanges that must contradict the map before the device's clock counts as stepped.
 const STEP_RUN: usize = 3;
 
 /// Why a clock cannot be mapped.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 #[cfg_attr(feature = "std", derive(thiserror::Error))]
 pub enum ClockMapError {
-    /// The device says its clock does not tick, or ticks faster than any clock does.
+    /// The device reports that its clock does not tick, or ticks faster than any clock does.
     #[cfg_attr(
         feature = "std",
         error("the device gives its clock {0} ticks per second; 1 to 1e12 make sense")
@@ -36,16 +38,16 @@ pub enum ClockMapError {
     Bits(u32),
 }
 
-/// What became of an exchange.
+/// The outcome of an exchange.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum ExchangeOutcome {
     /// It joined the window.
     Used,
     /// Its stamps contradict themselves (received before sent); ignored.
     Impossible,
-    /// It contradicts the map; ignored for now, and held against the device's clock.
+    /// It contradicts the map; ignored for now, and counted as evidence of a step.
     Contradicting,
-    /// The third contradiction in a row: the device's clock stepped, and the map starts anew from these exchanges.
+    /// The third contradiction in a row: the device's clock stepped, and the map restarts from these exchanges.
     Stepped,
 }
 
@@ -76,7 +78,7 @@ impl Exchange {
     }
 }
 
-/// The rate difference host over device, and how wrong it may be at device time `at_ns`.
+/// The rate difference host over device, and its possible error at device time `at_ns`.
 #[derive(Clone, Copy)]
 struct Skew {
     ppb: i64,
@@ -147,8 +149,8 @@ impl ClockMap {
         })
     }
 
-    /// Takes in one exchange: sent at `t1`, seen by the device at `rx`, answered at `tx` (equal to `rx` where the device stamps
-    /// once), received at `t4`.
+    /// Adds one exchange: sent at `t1`, received by the device at `rx`, answered at `tx` (equal to `rx` if the device
+    /// stamps only once), received at `t4`.
     pub fn add_exchange(
         &mut self,
         t1: HostTime,
@@ -175,14 +177,14 @@ impl ClockMap {
         ExchangeOutcome::Used
     }
 
-    /// Host time of `ticks`, `None` before the first exchange. Meant for instants near the newest exchange; the bound says how far
-    /// from it the answer can be trusted.
+    /// Host time of `ticks`; `None` before the first exchange. Meant for instants near the newest exchange; the bound
+    /// grows with the distance from it.
     pub fn to_host(&self, ticks: DeviceTicks) -> Option<Mapped> {
         (self.len > 0).then(|| self.map_total(self.total(ticks)))
     }
 
-    /// Like [`ClockMap::to_host`] for a stream of stamps in order: never earlier than the answer before, not even across a refit
-    /// or a step of the device's clock.
+    /// Like [`ClockMap::to_host`] for a stream of stamps in order: never earlier than the previous answer, even across
+    /// a refit or a step of the device's clock.
     pub fn map_forward(&mut self, ticks: DeviceTicks) -> Option<Mapped> {
         let mut mapped = self.to_host(ticks)?;
         mapped.at = mapped.at.max(self.last);
@@ -204,7 +206,7 @@ impl ClockMap {
         Some(DeviceTicks(ticks & mask(self.bits)))
     }
 
-    /// True when at least one exchange stands.
+    /// True when the map holds at least one exchange.
     pub fn is_ready(&self) -> bool {
         self.len > 0
     }
@@ -281,12 +283,14 @@ impl ClockMap {
         self.len = 0;
         self.next = 0;
         self.steps = self.steps.saturating_add(1);
-        // The rate survives a step (the crystal is the same), with doubt: a restarted server may be another machine.
+        // The rate survives a step (the crystal is the same), but with a larger error: a restarted server may be
+        // another machine.
         self.skew = Skew::UNKNOWN;
         self.note_newest(ticks, total);
         let doubts = self.doubts;
         for d in doubts {
-            // The doubts may disagree among themselves (the clock stepped between them): keep those that fit the newest.
+            // The contradicting exchanges may disagree among themselves (the clock stepped between them): keep those
+            // that fit the newest.
             let slack =
                 per_billion((e.device_ns - d.device_ns).saturating_abs(), MAX_SKEW_PPB).saturating_add(1);
             if d.low <= e.high.saturating_add(slack) && e.low <= d.high.saturating_add(slack) {
@@ -301,7 +305,8 @@ impl ClockMap {
         self.window[self.next] = e;
         self.next = (self.next + 1) % WINDOW;
         self.len = (self.len + 1).min(WINDOW);
-        // What is too old goes; the newest always stays. Order inside the window does not matter but for the ring's head.
+        // Drop exchanges that are too old; the newest always stays. The order inside the window matters only for the
+        // ring's head.
         let newest = e.device_ns;
         let mut kept = [Exchange::default(); WINDOW];
         let mut n = 0;
@@ -334,7 +339,7 @@ impl ClockMap {
                 let error_ppb = slope(a.half_ns() + b.half_ns() + 2).saturating_add(wander_over(span));
                 let candidate =
                     Skew { ppb: slope(b.offset() - a.offset()), error_ppb, at_ns: a.device_ns + span / 2 };
-                // An old good slope beats a new one from a bad stretch (stalls, few exchanges).
+                // A good old slope is better than a new one from a bad period (stalls, few exchanges).
                 if candidate.error_at(newest) <= self.skew.error_at(newest)
                     && candidate.ppb.abs() <= MAX_SKEW_PPB
                 {

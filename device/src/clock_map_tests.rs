@@ -14,7 +14,8 @@ struct World {
     skew_ppb: f64,
     drift_ppb_s: f64,
     step_ns: i64,
-    /// Delay of a way: fixed part there and back, mean of the exponential part, chance of a stall and its length.
+    /// Delay of one direction: fixed part there and back, mean of the exponential part, chance of a stall and its
+    /// length.
     there: f64,
     back: f64,
     tail: f64,
@@ -182,7 +183,7 @@ fn one_lying_exchange_is_forgotten() {
     world.step_ns = 0;
     assert_eq!(map.to_host(world.ticks_at(t)), Some(honest));
     assert_eq!(world.exchange(&mut map, t + 1_000_000), ExchangeOutcome::Used);
-    // Received before it was sent, answered before it was received: not evidence of anything.
+    // Received before it was sent, answered before it was received: such an exchange proves nothing.
     let (a, b) = (world.ticks_at(t), world.ticks_at(t + S));
     assert_eq!(map.add_exchange(HostTime(t + 10), a, a, HostTime(t)), ExchangeOutcome::Impossible);
     assert_eq!(map.add_exchange(HostTime(t), b, a, HostTime(t + S)), ExchangeOutcome::Impossible);

@@ -1,17 +1,18 @@
-//! Byte strings into frames on a serial line and back: consistent overhead byte stuffing, each frame ended by a zero byte.
+//! Encodes byte strings as frames on a serial line, and decodes them: consistent overhead byte stuffing, with a zero
+//! byte at the end of each frame.
 //!
-//! The zero byte occurs nowhere else, so a receiver that was cut in, or lost bytes, is back in step at the next frame
-//! \[Cheshire99\]. Overhead: one byte in 254, and the delimiter.
+//! The zero byte occurs nowhere else, so a receiver that joined late, or lost bytes, is synchronised again at the next
+//! frame \[Cheshire99\]. Overhead: one byte in 254, and the delimiter.
 
 /// Most bytes that [`encode`] writes for `n` bytes of content, delimiter included.
 pub const fn encoded_bytes(n: usize) -> usize {
     n + n / 254 + 2
 }
 
-/// Writes `parts`, one after the other, as one frame with its delimiter into `out`; the length, or `None` when it does not
-/// fit ([`encoded_bytes`] always does).
+/// Writes `parts`, one after the other, as one frame with its delimiter into `out`. Returns the length, or `None` if
+/// the frame does not fit ([`encoded_bytes`] bytes always suffice).
 pub fn encode(parts: &[&[u8]], out: &mut [u8]) -> Option<usize> {
-    // `code_at` is where the distance to the next zero will stand.
+    // `code_at` is the place of the distance to the next zero.
     let (mut code_at, mut at) = (0, 1);
     for &byte in parts.iter().copied().flatten() {
         if byte != 0 {
@@ -29,10 +30,10 @@ pub fn encode(parts: &[&[u8]], out: &mut [u8]) -> Option<usize> {
     Some(at + 1)
 }
 
-/// What a [`Deframer`] could not use. All wrap at 2^32.
+/// Counters of a [`Deframer`]. All wrap at 2^32.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub struct DeframerCounters {
-    /// Frames handed on.
+    /// Frames passed on.
     pub frames: u32,
     /// Frames longer than the buffer.
     pub too_long: u32,
@@ -40,14 +41,14 @@ pub struct DeframerCounters {
     pub broken: u32,
 }
 
-/// Cuts a stream into frames, in a buffer given once.
+/// Cuts a stream into frames, in a buffer that is given at creation.
 #[derive(Clone, Debug)]
 pub struct Deframer<B> {
     buffer: B,
     len: usize,
     /// Bytes until the next code byte.
     left: u8,
-    /// The block that is running ends with a zero (unless the frame ends there).
+    /// The current block ends with a zero (unless the frame ends there).
     zero_due: bool,
     overflow: bool,
     started: bool,
@@ -55,13 +56,13 @@ pub struct Deframer<B> {
 }
 
 impl<B: AsRef<[u8]> + AsMut<[u8]>> Deframer<B> {
-    /// `buffer` holds the content of the longest frame.
+    /// `buffer` must hold the content of the longest frame.
     pub const fn new(buffer: B) -> Self {
         let counters = DeframerCounters { frames: 0, too_long: 0, broken: 0 };
         Self { buffer, len: 0, left: 0, zero_due: false, overflow: false, started: false, counters }
     }
 
-    /// What was seen so far.
+    /// The counters so far.
     pub const fn counters(&self) -> DeframerCounters {
         self.counters
     }
@@ -71,13 +72,14 @@ impl<B: AsRef<[u8]> + AsMut<[u8]>> Deframer<B> {
         (self.len, self.left, self.zero_due, self.overflow, self.started) = (0, 0, false, false, false);
     }
 
-    /// Feeds the next bytes of the line; every whole frame goes to `sink`. Empty frames (two delimiters in a row) are passed over.
+    /// Feeds the next bytes of the line; every whole frame goes to `sink`. Empty frames (two delimiters in a row) are
+    /// skipped.
     pub fn push(&mut self, bytes: &[u8], sink: &mut dyn FnMut(&[u8])) {
         for &byte in bytes {
             if byte == 0 {
                 self.end(sink);
             } else if self.left == 0 {
-                // A code byte: the zero that the block before it stood for was real, as the frame goes on.
+                // A code byte. The frame continues, so the zero that the previous block implied was real.
                 self.started = true;
                 if self.zero_due {
                     self.put(0);

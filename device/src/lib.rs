@@ -8,7 +8,8 @@
 //!
 //! # Example: what firmware does with the host's bytes
 //!
-//! A [`link::Decoder`] finds packets in a stream, however it is cut; a [`link::PacketSink`] is told of them. Neither allocates.
+//! A [`link::Decoder`] finds packets in a stream, however the stream is cut, and reports them to a
+//! [`link::PacketSink`]. Neither allocates.
 //!
 //! ```
 //! use dpm_device::link::{Assembly, Decoder, Header, HostHello, HostMessage, Packet, PacketSink, MAX_CONTROL_BYTES};

@@ -1,13 +1,13 @@
-//! What a projector lit, slot by slot: as a mock sees it, or as it follows from a real projector's status reports.
+//! The light of a projector, slot by slot: as a mock observes it, or as derived from a real projector's status reports.
 
 use crate::time::{DeviceTicks, HostTime};
 
-/// What the mirrors did in one slot.
+/// What the mirrors showed in one slot.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum LightKind {
-    /// A frame for the first time.
+    /// A new frame.
     Lit,
-    /// The frame before again.
+    /// The previous frame again.
     Repeated,
     /// Nothing.
     Blank,
@@ -24,8 +24,8 @@ pub struct LightEvent {
     pub kind: LightKind,
     /// Start of the slot on the device's clock.
     pub lit_at: DeviceTicks,
-    /// True time of the first photon; of a blank slot, of its beginning.
+    /// True time of the first photon; for a blank slot, of its beginning.
     pub first_photon_at: HostTime,
-    /// True time of the last photon; of a blank slot, of its end.
+    /// True time of the last photon; for a blank slot, of its end.
     pub last_photon_at: HostTime,
 }

@@ -73,7 +73,7 @@ pub struct PlaneSpec {
 }
 
 impl PlaneSpec {
-    /// The byte that stands for this plane's light on the wire: channel in bits 4..5, bit number in bits 0..2.
+    /// The code of this plane's light on the wire: channel in bits 4..5, bit number in bits 0..2.
     pub const fn led_code(self) -> u8 {
         ((self.channel as u8) << 4) | self.bit
     }
@@ -107,7 +107,8 @@ pub struct PlaneSchedule {
 }
 
 impl PlaneSchedule {
-    /// Planes in the order given; `None` when empty, longer than [`MAX_PLANES`], or a (channel, bit) pair stands twice.
+    /// Planes in the order given; `None` if the list is empty, longer than [`MAX_PLANES`], or contains a (channel, bit)
+    /// pair twice.
     pub fn new(planes: &[PlaneSpec]) -> Option<Self> {
         if planes.is_empty() || planes.len() > MAX_PLANES {
             return None;

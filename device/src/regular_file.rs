@@ -1,14 +1,16 @@
-//! Files that people name, opened without waiting for anybody: a pipe, a socket, a folder or a device is refused by its kind.
+//! Opens files that users name, and never blocks: a pipe, a socket, a folder or a device is refused, and the error
+//! names its kind.
 //!
-//! Opening a named pipe waits until somebody writes to it, and reading `/dev/zero` never ends. Whoever asks a path what it is before opening it
-//! asks about a file that may be another one by then. So the file is opened in a way that never waits, and the open file is asked.
+//! Opening a named pipe blocks until somebody writes to it, and reading `/dev/zero` never ends. Checking the path
+//! before opening it is a race: the path may name another file by then. So the file is opened in a way that never
+//! blocks, and the check is made on the open file.
 
 use std::fs::{File, FileType};
 use std::io::{self, Read};
 use std::os::unix::fs::{FileTypeExt, OpenOptionsExt};
 use std::path::Path;
 
-/// What stands at a path that is no regular file, with its article.
+/// The kind of a file that is not a regular file, with its article.
 fn kind(of: FileType) -> &'static str {
     if of.is_dir() {
         "a folder"
@@ -23,20 +25,21 @@ fn kind(of: FileType) -> &'static str {
     }
 }
 
-/// The error for what is no regular file.
+/// The error for a file that is not a regular file.
 fn refused(of: FileType) -> io::Error {
     io::Error::new(io::ErrorKind::InvalidInput, format!("it is {}; give a regular file", kind(of)))
 }
 
-/// Opens a regular file for reading and returns its size in bytes with it. Never waits, whatever stands at `path`; links are followed.
+/// Opens a regular file for reading and returns it with its size in bytes. Never blocks, whatever is at `path`; links
+/// are followed.
 ///
 /// # Errors
-/// Those of the operating system; [`io::ErrorKind::InvalidInput`] with the kind in words for what is no regular file.
+/// Those of the operating system; [`io::ErrorKind::InvalidInput`], naming the kind, if it is not a regular file.
 pub fn open(path: &Path) -> io::Result<(File, u64)> {
     let flags = libc::O_NONBLOCK | libc::O_NOCTTY;
     let file = match File::options().read(true).custom_flags(flags).open(path) {
         Ok(file) => file,
-        // A socket cannot be opened at all, and the system's word for that tells nobody what it is.
+        // A socket cannot be opened at all, and the system's error does not say that it is a socket.
         Err(e) => match std::fs::metadata(path) {
             Ok(m) if !m.is_file() => return Err(refused(m.file_type())),
             _ => return Err(e),
@@ -72,7 +75,7 @@ pub fn read(path: &Path, limit: u64) -> io::Result<Vec<u8>> {
 /// Reads a whole text file of at most `limit` bytes.
 ///
 /// # Errors
-/// As [`read`]; [`io::ErrorKind::InvalidData`] for what is no UTF-8.
+/// As [`read`]; [`io::ErrorKind::InvalidData`] if the content is not UTF-8.
 pub fn read_text(path: &Path, limit: u64) -> io::Result<String> {
     let not_text = |_| io::Error::new(io::ErrorKind::InvalidData, "it is not a text file (UTF-8)");
     String::from_utf8(read(path, limit)?).map_err(not_text)
@@ -84,8 +87,8 @@ mod tests {
     use std::os::unix::net::UnixListener;
     use std::time::{Duration, Instant};
 
-    /// Found in use, R18: reading a named pipe waited for ever. Every kind of file that is none is refused at once and by its name, and a file
-    /// beyond the limit is not read.
+    /// Found in use, R18: reading a named pipe blocked for ever. Every other kind of file is refused at once and by
+    /// name, and a file beyond the limit is not read.
     #[test]
     fn what_is_no_regular_file_is_refused_by_its_kind_at_once() {
         let folder = std::env::temp_dir().join(format!("dpm-regular-{}", std::process::id()));

@@ -1,8 +1,8 @@
-//! Random numbers from seeds: the only source of chance in pictures, mocks and experiments.
+//! Random numbers from seeds: the only source of randomness in pictures, mocks and experiments.
 //!
-//! [`Draws`] has no state. A stateful generator would make the noise of sample 7 depend on whether sample 6 was lost; here each draw is
-//! a pure function of (seed, stream, index), so that one fault switched on leaves all others and the noise as they were.
-//! [`Sampler`] is a stream that gives one number after another, for integrals by chance.
+//! [`Draws`] has no state. With a stateful generator the noise of sample 7 would depend on whether sample 6 was lost.
+//! Here each draw is a pure function of (seed, stream, index), so switching on one fault leaves all other faults and
+//! the noise unchanged. [`Sampler`] is a stream of numbers, for Monte Carlo integration.
 
 /// A keyed source of draws. Copyable and without state.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -58,8 +58,8 @@ impl Draws {
     }
 }
 
-/// A stream of independent random numbers: xoshiro256++ of \[Blackman21\], seeded through splitmix64. It is not a low-discrepancy
-/// sequence: who integrates with it may rely on the variance of a mean being sigma^2 / n.
+/// A stream of independent random numbers: xoshiro256++ of \[Blackman21\], seeded through splitmix64. It is not a
+/// low-discrepancy sequence: the variance of a mean is sigma^2 / n.
 #[derive(Clone, Debug)]
 pub struct Sampler {
     state: [u64; 4],
@@ -99,7 +99,7 @@ impl Sampler {
         (self.next_u64() >> 11) as f64 * (1.0 / (1u64 << 53) as f64)
     }
 
-    /// Two of them.
+    /// Two such numbers.
     pub fn uniform2(&mut self) -> [f64; 2] {
         [self.uniform(), self.uniform()]
     }

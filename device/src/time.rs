@@ -18,9 +18,10 @@ impl HostTime {
     }
 }
 
-/// Where "now" comes from: the monotonic clock in a deployed rig, a counter in a test. Any `Fn() -> HostTime` is one.
+/// The source of "now": the monotonic clock in a deployed rig, a counter in a test. Any `Fn() -> HostTime` implements
+/// it.
 pub trait HostClock: Send + Sync {
-    /// The present instant; never earlier than the answer before.
+    /// The present instant; never earlier than the previous answer.
     fn now(&self) -> HostTime;
 }
 
@@ -66,8 +67,8 @@ impl FrameRate {
         f64::from(self.num) / f64::from(self.den)
     }
 
-    /// Nanoseconds from the epoch of slot 0 to the start of slot `slot`, rounded down: within 1 ns of the exact
-    /// rational value for ever, with no accumulated drift. Saturates beyond 292 years.
+    /// Nanoseconds from the epoch of slot 0 to the start of slot `slot`, rounded down: always within 1 ns of the exact
+    /// rational value, with no accumulated drift. Saturates beyond 292 years.
     pub const fn slot_start_ns(self, slot: u64) -> i64 {
         let exact = slot as u128 * 1_000_000_000 * self.den as u128 / self.num as u128;
         if exact > i64::MAX as u128 {

@@ -1,7 +1,8 @@
-//! Serial ports whose reads and writes never wait.
+//! Serial ports whose reads and writes never block.
 //!
-//! serialport's write looks for room and then writes to a descriptor that blocks: the kernel then holds the caller until the last
-//! byte has found room, for the whole time of a frame on a slow line, and for ever on a line that nobody reads.
+//! The write of the serialport crate waits for room and then writes to a blocking descriptor. The kernel then blocks
+//! the caller until the last byte has found room: for the whole time of a frame on a slow line, and for ever on a line
+//! that nobody reads.
 #![allow(unsafe_code)]
 
 use std::io;
@@ -10,24 +11,24 @@ use std::time::Duration;
 
 use serialport::{SerialPort, TTYPort};
 
-/// Opens the port at `path` for this program alone, 8 data bits, no parity, one stop bit. What had waited in it is thrown away: nobody
-/// knows how old it is, and it answers nothing that was asked.
+/// Opens the port at `path` exclusively, with 8 data bits, no parity and one stop bit. Discards the bytes that had
+/// waited in it: their age is unknown, and they answer no request.
 ///
 /// # Errors
 /// The library's: not found, no permission, in use.
 pub fn open(path: &str, baud: u32) -> serialport::Result<Box<dyn SerialPort>> {
-    // Exclusive by lock and by TIOCEXCL; the library's default, said here because it is a promise.
+    // Exclusive by lock and by TIOCEXCL. This is the library's default, but stated because callers rely on it.
     let port = serialport::new(path, baud).exclusive(true).open_native()?;
     port.clear(serialport::ClearBuffer::Input)?;
     Ok(never_wait(port)?)
 }
 
-/// Why a port cannot be opened, as far as the library tells.
+/// Why a port cannot be opened, as far as the library reports it.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Refusal {
     /// There is no such device file.
     Absent,
-    /// Another program has it.
+    /// Another program uses it.
     InUse,
     /// The operating system does not let this user open it.
     Denied,
@@ -35,14 +36,14 @@ pub enum Refusal {
     NotAPort,
     /// A device file with no hardware behind it.
     NoHardware,
-    /// It does not do this rate.
+    /// It does not support this rate.
     Rate,
-    /// The library does not say.
+    /// The library gives no reason.
     Unknown,
 }
 
 impl Refusal {
-    /// What to do about it.
+    /// The remedy, for an operator.
     pub const fn remedy(self) -> &'static str {
         match self {
             Self::Absent => "is it plugged in? `dpm doctor` lists the ports that are there",
@@ -58,7 +59,7 @@ impl Refusal {
     }
 }
 
-/// The library folds several system errors into one kind; only its text tells them apart.
+/// The library maps several system errors to one kind; only its text distinguishes them.
 pub fn refusal(e: &serialport::Error) -> Refusal {
     let text = e.description.to_lowercase();
     let says = |words: &[&str]| words.iter().any(|w| text.contains(w));
@@ -84,15 +85,15 @@ pub fn refusal(e: &serialport::Error) -> Refusal {
     }
 }
 
-/// Makes an open port (of a pseudo-terminal, for example) one whose reads and writes take what there is room for now, or fail with
-/// [`io::ErrorKind::WouldBlock`] or [`io::ErrorKind::TimedOut`].
+/// Makes an open port (for example of a pseudo-terminal) non-blocking: reads and writes transfer as much as is possible
+/// now, or fail with [`io::ErrorKind::WouldBlock`] or [`io::ErrorKind::TimedOut`].
 ///
 /// # Errors
 /// The operating system's.
 pub fn never_wait(mut port: TTYPort) -> io::Result<Box<dyn SerialPort>> {
     port.set_timeout(Duration::ZERO)?;
     let descriptor = port.as_raw_fd();
-    // SAFETY: two calls on a descriptor that `port` owns and keeps open; they take and give plain numbers.
+    // SAFETY: two calls on a descriptor that `port` owns and keeps open; their arguments and results are plain numbers.
     let set = unsafe {
         let flags = libc::fcntl(descriptor, libc::F_GETFL);
         flags >= 0 && libc::fcntl(descriptor, libc::F_SETFL, flags | libc::O_NONBLOCK) >= 0
@@ -115,21 +116,21 @@ pub enum ControlSignal {
     Dcd,
 }
 
-/// A serial port of which only a control line is read: a contact between one of its outputs and an input, or a relay at it. Opening it
-/// raises RTS and DTR, which can feed the contact.
+/// A serial port of which only a control line is read: a contact between one of its outputs and an input, or a relay.
+/// Opening it raises RTS and DTR, which can supply the contact.
 pub struct ControlLine {
     port: Box<dyn SerialPort>,
     signal: ControlSignal,
 }
 
 impl ControlLine {
-    /// Opens the port at `path` for this program alone.
+    /// Opens the port at `path` exclusively.
     ///
     /// # Errors
     /// The library's: not found, no permission, in use.
     pub fn open(path: &str, signal: ControlSignal) -> serialport::Result<Self> {
         let mut port = open(path, 9600)?;
-        // Some drivers raise them when the port is opened; all do when they are told to.
+        // Some drivers raise them when the port is opened; all do on request.
         port.write_request_to_send(true)?;
         port.write_data_terminal_ready(true)?;
         Ok(Self { port, signal })

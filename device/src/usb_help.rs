@@ -1,8 +1,8 @@
-//! libusb's words into what an operator does about them.
+//! Turns errors of libusb into instructions for an operator.
 
 use rusb::{Device, Error, UsbContext};
 
-/// What to do about an error of libusb, for an operator who stands beside the device.
+/// The remedy for an error of libusb, for an operator who stands beside the device.
 pub(crate) const fn remedy(e: Error) -> &'static str {
     match e {
         Error::Io => "the cable or a hub failed: plug the device straight into the machine, try another cable, and see `dmesg`",
@@ -26,7 +26,7 @@ pub(crate) const fn remedy(e: Error) -> &'static str {
     }
 }
 
-/// The device file, as `lsusb` and `fuser` name it too.
+/// The path of the device file, in the form that `lsusb` and `fuser` use.
 pub(crate) fn node(bus: u8, address: u8) -> String {
     format!("/dev/bus/usb/{bus:03}/{address:03}")
 }
@@ -65,7 +65,7 @@ mod tests {
             let device = format!("USB projector 1209:000d at {}", node(3, 12));
             let told = TransportError::of_usb("send to", device, e).to_string();
             assert!(told.contains("1209:000d at /dev/bus/usb/003/012"), "{told}");
-            // Beyond libusb's own words there is advice, in the imperative.
+            // The text contains advice, in the imperative, besides libusb's own message.
             let advice = [
                 "check",
                 "see `dmesg`",

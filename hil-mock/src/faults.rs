@@ -1,4 +1,4 @@
-//! Text into a plan of faults: the one vocabulary of what can go wrong, for every mock and every command line of this crate.
+//! Parses fault plans: the one vocabulary of faults for every mock and every command line of this crate.
 //!
 //! A plan is a comma-separated list of `kind[=amount][@start[+length][/period]]`:
 //!
@@ -10,15 +10,15 @@
 //! slow=2ms,duplicate=0.1         2 ms more latency throughout, each packet twice with probability 0.1
 //! ```
 //!
-//! Durations need a unit (`ns`, `us`, `ms`, `s`). Without `@` a fault lasts for the whole run. With `@start` alone it strikes once,
-//! on the first item at or after `start`. Which item a probability strikes depends only on the seed, the kind and the item's
-//! number, so adding one fault never moves another.
+//! Durations need a unit (`ns`, `us`, `ms`, `s`). Without `@` a fault lasts for the whole run. With `@start` alone it
+//! strikes once, on the first item at or after `start`. The choice of items for a probability depends only on the seed,
+//! the kind and the item's number, so adding one fault never moves another.
 
 use core::fmt;
 use core::str::FromStr;
 use dpm_device::rng::Draws;
 
-/// What goes wrong. The text form is the variant's name in lower case.
+/// Kinds of faults. The text form is the variant's name in lower case.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Hash)]
 pub enum FaultKind {
     /// An item (sample, packet, datagram) vanishes. Amount: probability.
@@ -35,27 +35,27 @@ pub enum FaultKind {
     Nan,
     /// The quaternion's norm becomes 0, 0.5 or 1e-20. Amount: probability.
     Norm,
-    /// The quaternion changes sign (the same rotation; nothing may change). Amount: probability.
+    /// The quaternion changes sign (the same rotation; the output must not change). Amount: probability.
     Flip,
-    /// The tracker says itself that it does not see the body. Amount: probability, 1 if none is given.
+    /// The tracker reports that it does not see the body. Amount: probability, 1 if none is given.
     Invalid,
     /// Nothing is captured or sent. Needs a window.
     Dropout,
-    /// The same pose again and again with new sequence numbers. Needs a window.
+    /// The same pose repeats with new sequence numbers. Needs a window.
     Stuck,
     /// The pose is off. Amount: metres. Needs a start.
     Jump,
-    /// Nothing moves until the window ends, then all that waited comes at once. Needs a window.
+    /// Nothing arrives until the window ends; then everything that waited arrives at once. Needs a window.
     Stall,
-    /// Everything comes later. Amount: duration.
+    /// Everything arrives later. Amount: duration.
     Slow,
     /// The device is gone and comes back when the window ends. Needs a window.
     Unplug,
-    /// The device starts anew: counters at 0, state lost. Needs a start.
+    /// The device restarts: counters at 0, state lost. Needs a start.
     Reset,
 }
 
-/// What the amount of a kind means.
+/// Meaning of a kind's amount.
 #[derive(Clone, Copy, PartialEq, Eq)]
 enum Amount {
     Probability,
@@ -64,7 +64,7 @@ enum Amount {
     None,
 }
 
-/// What a kind needs after `@`.
+/// What a kind requires after `@`.
 #[derive(Clone, Copy, PartialEq, Eq)]
 enum When {
     Any,
@@ -93,7 +93,7 @@ impl FaultKind {
         Self::Reset,
     ];
 
-    /// The word for this kind in a plan.
+    /// The name of this kind in a plan.
     pub const fn name(self) -> &'static str {
         match self {
             Self::Loss => "loss",
@@ -129,14 +129,14 @@ impl FaultKind {
     }
 }
 
-/// When a fault is on, nanoseconds after the mock's start.
+/// When a fault is active, nanoseconds after the mock's start.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Window {
     /// First instant.
     pub start_ns: i64,
     /// Length; 0 means the one item at or after the start.
     pub length_ns: i64,
-    /// Distance of the starts of repeated windows; 0 means it does not repeat.
+    /// Distance between the starts of repeated windows; 0 means that it does not repeat.
     pub period_ns: i64,
 }
 
@@ -148,7 +148,8 @@ impl Window {
         (into < self.length_ns.max(1)).then_some(t_ns - into)
     }
 
-    /// True when a window starts in `(after_ns, until_ns]`: how items at discrete times notice a window of length 0.
+    /// True when a window starts in `(after_ns, until_ns]`: this is how items at discrete times detect a window of
+    /// length 0.
     pub fn starts_within(&self, after_ns: i64, until_ns: i64) -> bool {
         if until_ns < self.start_ns || until_ns <= after_ns {
             return false;
@@ -165,16 +166,16 @@ impl Window {
 /// One entry of a plan.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Fault {
-    /// What goes wrong.
+    /// The kind of fault.
     pub kind: FaultKind,
-    /// Probability, metres or nanoseconds, as the kind says; 1 for kinds without amount.
+    /// Probability, metres or nanoseconds, according to the kind; 1 for kinds without amount.
     pub amount: f64,
     /// When; `None` means always.
     pub window: Option<Window>,
 }
 
 impl Fault {
-    /// True for the item at `t_ns` whose predecessor was at `previous_ns`, before probability is asked.
+    /// True for the item at `t_ns` whose predecessor was at `previous_ns`, before the probability is applied.
     fn is_on(&self, previous_ns: i64, t_ns: i64) -> bool {
         match self.window {
             None => true,
@@ -184,17 +185,17 @@ impl Fault {
     }
 }
 
-/// A checked list of faults. The default is the empty plan: nothing goes wrong.
+/// A checked list of faults. The default is the empty plan, without faults.
 #[derive(Clone, Debug, Default, PartialEq, serde::Serialize, serde::Deserialize)]
 #[serde(try_from = "String", into = "String")]
 pub struct FaultPlan {
     faults: Vec<Fault>,
 }
 
-/// Why a text is no fault plan. Every message names the offending piece.
+/// Why a text is not a fault plan. Every message quotes the offending piece.
 #[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
 pub enum FaultError {
-    /// Not a word of the vocabulary.
+    /// Not a known kind.
     #[error("faults: unknown fault `{0}`; known are loss, corrupt, truncate, duplicate, reorder, nan, norm, flip, invalid, dropout, stuck, jump, stall, slow, unplug, reset")]
     UnknownKind(String),
     /// The amount is missing, unreadable or out of range.
@@ -210,17 +211,17 @@ pub enum FaultError {
     Window {
         /// The whole entry.
         token: String,
-        /// What must stand there.
+        /// What is required there.
         rule: &'static str,
     },
-    /// This mock cannot commit that fault.
+    /// This mock does not implement that fault.
     #[error("faults: `{kind}` means nothing to {mock}; it knows {known}")]
     Unsupported {
-        /// The fault's word.
+        /// The fault's name.
         kind: &'static str,
         /// Which mock.
         mock: &'static str,
-        /// Words that it knows.
+        /// The faults that it implements.
         known: String,
     },
     /// More entries than [`FaultPlan::MAX_FAULTS`].
@@ -237,7 +238,7 @@ impl FaultPlan {
         &self.faults
     }
 
-    /// True when nothing goes wrong.
+    /// True when the plan has no faults.
     pub fn is_empty(&self) -> bool {
         self.faults.is_empty()
     }
@@ -261,7 +262,8 @@ impl FaultPlan {
         })
     }
 
-    /// Sum of the amounts of the faults of `kind` that are on for the item at `t_ns` (metres of `jump`, nanoseconds of `slow`).
+    /// Sum of the amounts of the faults of `kind` that are active for the item at `t_ns` (metres of `jump`, nanoseconds
+    /// of `slow`).
     pub fn amount(&self, kind: FaultKind, previous_ns: i64, t_ns: i64) -> f64 {
         self.of(kind).filter(|(_, f)| f.is_on(previous_ns, t_ns)).map(|(_, f)| f.amount).sum()
     }
@@ -276,10 +278,12 @@ impl FaultPlan {
         self.of(kind).find_map(|(_, f)| f.window?.containing(t_ns))
     }
 
-    /// First instant at or after `t_ns` that no window of `kind` contains: when what waits for a stall may go on.
+    /// First instant at or after `t_ns` that no window of `kind` contains: when items that wait for a stall may
+    /// continue.
     pub fn end_of(&self, kind: FaultKind, t_ns: i64) -> i64 {
         let mut t = t_ns;
-        // Each round leaves at least one window for good, or ends; touching periodic windows are bounded by the rounds.
+        // Each round passes the end of at least one window for good, or stops; the number of rounds bounds periodic
+        // windows that touch.
         for _ in 0..=Self::MAX_FAULTS {
             let leave = self.of(kind).find_map(|(_, f)| {
                 let w = f.window?;

@@ -1,7 +1,8 @@
-//! A projector and a tracker made of software: the same mock in-process, over USB/IP, pseudo-terminals and UDP.
+//! A software projector and a software tracker: the same mocks in-process, over USB/IP, pseudo-terminals and UDP.
 //!
-//! Reading order: [`motion`] is what truly happens, [`faults`] the one vocabulary of what goes wrong, [`tracker`] what a tracker
-//! would report, [`projector`] what a projector makes of the packets it gets. All randomness comes from [`dpm_device::rng`], keyed by a seed; time is always an argument.
+//! Reading order: [`motion`] is the true motion, [`faults`] the one vocabulary of faults, [`tracker`] the samples that
+//! a tracker would report, [`projector`] the light that a projector makes from its packets. All randomness comes from
+//! [`dpm_device::rng`], keyed by a seed; time is always an argument.
 //!
 //! # Example: a tracker that goes blind for 10 ms
 //!

@@ -1,4 +1,4 @@
-//! Command line into running mocks: `hil-mock serve ...` offers this crate's devices to programs that know nothing of it.
+//! The command line: `hil-mock serve ...` offers this crate's devices to programs that do not know about it.
 
 mod serve;
 

@@ -1,7 +1,8 @@
-//! The machine's monotonic clock as a number that other programs read too.
+//! The machine's monotonic clock as a number that other programs can read too.
 #![allow(unsafe_code)]
 
-/// CLOCK_MONOTONIC now, nanoseconds: the clock behind [`std::time::Instant`], with the epoch that all programs of the machine share.
+/// CLOCK_MONOTONIC now, nanoseconds: the clock of [`std::time::Instant`], with the epoch that all programs of the
+/// machine share.
 pub fn now_ns() -> i64 {
     let mut t = libc::timespec { tv_sec: 0, tv_nsec: 0 };
     // SAFETY: writes one plain value that lives for the call; the clock exists on every Linux.

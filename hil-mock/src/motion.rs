@@ -1,13 +1,14 @@
-//! A time into the true pose: closed forms of the motions that the mock tracker reports and the mock projector lights.
+//! Computes the true pose at any time: closed forms of the motions that the mock tracker reports and the mock projector
+//! lights.
 //!
-//! Every motion is periodic with a period of whole nanoseconds, and time is reduced to the period as an integer before any
-//! floating point: a body is as exactly placed after 400 days as in the first second.
+//! Every motion is periodic with a period of whole nanoseconds, and time is reduced to the period as an integer before
+//! any floating-point operation: a pose is as exact after 400 days as in the first second.
 
 use dpm_device::pose::Pose;
 
 pub use crate::motion_spec::{MotionKind, MotionSpec};
 
-/// Why a [`MotionSpec`] describes no motion.
+/// Why a [`MotionSpec`] is invalid.
 #[derive(Clone, Debug, PartialEq, thiserror::Error)]
 pub enum MotionError {
     /// A number outside its range.
@@ -66,7 +67,7 @@ pub struct Twist {
     pub angular_rad_s: [f64; 3],
 }
 
-/// A checked motion of one body about its rest pose: time in, truth out.
+/// A checked motion of one body about its rest pose: computes the true pose at any time.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Motion {
     rest: Pose,
@@ -76,7 +77,8 @@ pub struct Motion {
 /// One elementary motion with its period in whole nanoseconds.
 #[derive(Clone, Copy, Debug, PartialEq)]
 enum Part {
-    /// Two stretches of twice `half_stretch_ns` joined by turns of `turn_ns`, at rest for `rest_ns` in the middle of each.
+    /// Two straight stretches of twice `half_stretch_ns`, joined by turns of `turn_ns`, with a rest of `rest_ns` in the
+    /// middle of each turn.
     Line { direction: [f64; 3], speed: f64, half_stretch_ns: i64, turn_ns: i64, rest_ns: i64 },
     /// `amplitude * sin(2 pi t / period)`.
     Wave { direction: [f64; 3], amplitude: f64, period_ns: i64 },
@@ -87,7 +89,7 @@ enum Part {
 }
 
 impl Motion {
-    /// Checks `spec` and fixes it to `rest`, the pose that the motion is relative to.
+    /// Checks `spec` and applies it relative to `rest`.
     pub fn new(spec: &MotionSpec, rest: Pose) -> Result<Self, MotionError> {
         if !rest.is_valid(1e-6) {
             return Err(MotionError::RestPose(rest));
@@ -109,7 +111,7 @@ impl Motion {
         Ok(Self { rest, parts })
     }
 
-    /// A body that stays where it is. Panics never: an invalid pose is returned as the error.
+    /// A body at rest. Never panics: an invalid pose is returned as the error.
     pub fn still(rest: Pose) -> Result<Self, MotionError> {
         Self::new(&MotionSpec::Still {}, rest)
     }
@@ -119,8 +121,8 @@ impl Motion {
         self.rest
     }
 
-    /// World-from-body at `t_ns` nanoseconds after the motion's start (any value, negative too). The quaternion is of unit
-    /// length within 4e-16.
+    /// World-from-body at `t_ns` nanoseconds after the motion's start (any value, also negative). The quaternion has
+    /// unit length within 4e-16.
     pub fn pose_at(&self, t_ns: i64) -> Pose {
         self.state_at(t_ns).0
     }
@@ -206,7 +208,8 @@ fn line(
     let stretch_s = 2.0 * (amplitude - turn_depth) / speed;
     let turn_s = 2.0 * speed / acceleration;
     whole_period(2.0 * (stretch_s + turn_s + rest_s))?;
-    // Whole nanoseconds for each piece keep position and speed continuous for ever; the amplitude moves by less than 1 nm per m/s.
+    // Whole nanoseconds for each piece keep position and speed continuous without drift; the amplitude changes by less
+    // than 1 nm per m/s.
     let turn_ns = ((turn_s * 1e9).round() as i64).max(2);
     let half_stretch_ns = (stretch_s * 0.5e9).round() as i64;
     Ok(Part::Line { direction, speed, half_stretch_ns, turn_ns, rest_ns: (rest_s * 1e9).round() as i64 })
@@ -225,7 +228,7 @@ fn turn(axis: [f64; 3], rate: f64, pivot: [f64; 3], parts: &mut Vec<Part>) -> Re
 }
 
 impl Part {
-    /// Moves `pose` and `twist`, the state after the parts before this one.
+    /// Applies this part to `pose` and `twist`, the state after the previous parts.
     fn apply(&self, t_ns: i64, pose: &mut Pose, twist: &mut Twist) {
         match *self {
             Part::Line { direction, speed, half_stretch_ns, turn_ns, rest_ns } => {
@@ -274,7 +277,7 @@ fn line_at(t_ns: i64, speed: f64, half_stretch_ns: i64, turn_ns: i64, rest_ns: i
     if u <= half_stretch_ns {
         (sign * speed * u as f64 * 1e-9, sign * speed)
     } else {
-        // The rest takes no part in the turn: before it the first half, after it the second.
+        // The rest is not part of the turn: the first half comes before it, the second after it.
         let turned_ns = u - half_stretch_ns;
         let turned_ns = turned_ns.min((turn_ns / 2).max(turned_ns - rest_ns));
         if rest_ns > 0 && turned_ns == turn_ns / 2 {
@@ -316,7 +319,7 @@ fn whole_period(seconds: f64) -> Result<i64, MotionError> {
 }
 
 fn unit3(field: &'static str, value: [f64; 3]) -> Result<[f64; 3], MotionError> {
-    // Scaling by the largest component first keeps 1e-200 and 1e200 from under- and overflowing.
+    // Scaling by the largest component first prevents underflow and overflow of 1e-200 and 1e200.
     let largest = value.iter().fold(0.0f64, |m, c| m.max(c.abs()));
     if value.iter().any(|c| !c.is_finite()) || largest == 0.0 {
         return Err(MotionError::NoDirection { field, value });

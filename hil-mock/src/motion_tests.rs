@@ -1,4 +1,4 @@
-//! Laws of the closed-form motions: derivative, bounds, periodicity, and refusal of nonsense.
+//! Laws of the closed-form motions: derivative, bounds, periodicity, and refusal of invalid ones.
 
 use super::*;
 
@@ -123,7 +123,7 @@ fn rotation_turns_in_place_and_is_on_time_after_400_days() {
         let t = day * 86_400 * S;
         let pose = motion.pose_at(t + S / 2);
         assert_eq!(pose.position_m, rest().position_m);
-        // A quarter turn about +y after half a second, whatever the day: the period is exactly 2 s.
+        // A quarter turn about +y after half a second, on any day: the period is exactly 2 s.
         let h = core::f64::consts::FRAC_1_SQRT_2;
         let expected = multiply([0.0, h, 0.0, h], rest().rotation_xyzw);
         for (a, b) in pose.rotation_xyzw.iter().zip(expected) {

@@ -19,18 +19,18 @@ pub struct NatNetHost {
 }
 
 impl NatNetHost {
-    /// Most commands answered between two looks at the frames: a flood of commands must not delay poses.
+    /// Maximum number of commands answered between two checks for due frames: a flood of commands must not delay poses.
     const MAX_COMMANDS: usize = 64;
 
-    /// Binds `command` (port 0 for any), for this server alone, and starts the server. Multicast leaves through the interface of that address, which must
-    /// then be given. `clock` is the clock of the server's sample source.
+    /// Binds `command` (port 0 for any) exclusively, and starts the server. Multicast leaves through the interface of
+    /// that address, which must then be given. `clock` is the clock of the server's sample source.
     pub fn start(
         server: NatNetServer,
         streaming: Streaming,
         command: SocketAddrV4,
         clock: Arc<dyn HostClock>,
     ) -> io::Result<Self> {
-        // Not shared: of two servers on one port the system would hand each command to one of them only.
+        // Not shared: with two servers on one port, the system would pass each command to only one of them.
         let port = UdpPort::bind(command, false)?;
         if let Streaming::Multicast(_) = streaming {
             let interface = if command.ip().is_unspecified() { Ipv4Addr::LOCALHOST } else { *command.ip() };
@@ -57,7 +57,7 @@ impl NatNetHost {
         self.sent.load(Ordering::Relaxed)
     }
 
-    /// True until the thread ends, which it does on a socket error only.
+    /// True until the thread ends, which happens only on a socket error.
     pub fn is_running(&self) -> bool {
         self.thread.as_ref().is_some_and(|t| !t.is_finished())
     }
@@ -67,7 +67,7 @@ impl Drop for NatNetHost {
     fn drop(&mut self) {
         self.stop.store(true, Ordering::Relaxed);
         if let Some(thread) = self.thread.take() {
-            // An error or panic of the thread has been seen through `is_running`; there is nobody left to tell.
+            // `is_running` shows an error or panic of the thread; nobody is left to inform here.
             let _ = thread.join();
         }
     }
@@ -81,7 +81,7 @@ fn run(
     sent: &AtomicU64,
 ) -> io::Result<()> {
     let mut buffer = vec![0; 2048];
-    // A send that fails (no route, no listener) concerns one receiver and one datagram, as on a real network.
+    // A failed send (no route, no listener) concerns one receiver and one datagram, as on a real network.
     let mut send = |bytes: &[u8], to: SocketAddrV4| drop(port.send(bytes, to));
     while !stop.load(Ordering::Relaxed) {
         let wait_ns = server.next_due().ns_since(clock.now()).clamp(0, 20_000_000);

@@ -1,8 +1,8 @@
-//! True poses into NatNet datagrams: the server's conversation as a state machine without sockets or threads.
+//! Sends true poses as NatNet datagrams: the server's protocol as a state machine without sockets or threads.
 //!
-//! It answers every way of connecting seen in the wild, streams to a multicast group or to each client (at the address that
-//! connected, at the conventional data port of its host, or both), and tells its names before it streams to an endpoint: some
-//! clients take whatever comes next for the answer to their question.
+//! It answers every form of connect message seen in the field, and streams to a multicast group or to each client (at
+//! the address that connected, at the conventional data port of its host, or both). It sends its names before it
+//! streams to an endpoint, because some clients mistake whatever arrives next for the answer to their request.
 
 use crate::faults::{FaultError, FaultKind};
 use crate::report_queue::ReportQueue;
@@ -26,7 +26,7 @@ pub enum UnicastTo {
     Both,
 }
 
-/// How frames travel.
+/// The destination of frames.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Streaming {
     /// To a group, for everyone.
@@ -35,16 +35,16 @@ pub enum Streaming {
     Unicast(UnicastTo),
 }
 
-/// How the server presents itself.
+/// Configuration of the server.
 #[derive(Clone, Debug)]
 pub struct NatNetServerConfig {
     /// Newest and default version of the bit stream, 3.0 to 4.2.
     pub version: Version,
-    /// Version whose layout frames have, where it is not the one that was announced to the client.
+    /// Version whose layout frames have, if it differs from the one announced to the client.
     pub frame_layout: Option<Version>,
-    /// Version whose layout model definitions have, where it is not the one that was announced to the client.
+    /// Version whose layout model definitions have, if it differs from the one announced to the client.
     pub model_layout: Option<Version>,
-    /// How frames travel.
+    /// The destination of frames.
     pub streaming: Streaming,
     /// Port announced for frames.
     pub data_port: u16,
@@ -54,7 +54,7 @@ pub struct NatNetServerConfig {
     pub clock_hz: u64,
     /// What the clock shows at time 0, ticks.
     pub clock_start: u64,
-    /// How much faster than the host's clock it runs, parts per billion, within 1e6.
+    /// Rate of the server's clock relative to the host's, parts per billion above 1, within 1e6.
     pub clock_skew_ppb: i64,
 }
 
@@ -78,7 +78,7 @@ impl NatNetServerConfig {
 /// Why a server cannot be made.
 #[derive(Debug, thiserror::Error)]
 pub enum NatNetServerError {
-    /// A version that is not spoken.
+    /// An unsupported version.
     #[error("NatNet server: version {0} is not among 3.0, 3.1, 4.0, 4.1, 4.2")]
     Version(Version),
     /// Clock rate or skew out of range.
@@ -100,12 +100,12 @@ pub enum NatNetServerError {
     /// More bodies than a datagram holds.
     #[error("NatNet server: {0} bodies do not fit one datagram")]
     TooMany(usize),
-    /// A fault that this server cannot commit.
+    /// A fault that this server does not implement.
     #[error(transparent)]
     Fault(#[from] FaultError),
 }
 
-/// All that a NatNet server can do wrong.
+/// The faults that a NatNet server implements.
 pub const NATNET_FAULTS: [FaultKind; 16] = FaultKind::ALL;
 
 #[derive(Clone, Copy)]
@@ -114,7 +114,7 @@ struct Client {
     version: Version,
     connected_at: HostTime,
     heard_at: HostTime,
-    /// Names were told, so frames may follow.
+    /// The names were sent, so frames may follow.
     is_told: bool,
 }
 
@@ -134,11 +134,11 @@ pub struct NatNetServer {
 }
 
 impl NatNetServer {
-    /// Most clients served at a time; more are answered but get no frames.
+    /// Maximum number of clients at a time; further ones are answered but get no frames.
     pub const MAX_CLIENTS: usize = 64;
-    /// A unicast client that said nothing for this long is dropped.
+    /// A unicast client that sent nothing for this long is dropped.
     pub const CLIENT_TIMEOUT_NS: i64 = 5_000_000_000;
-    /// A client that never asked for names gets frames after this long.
+    /// A client that never requested names gets frames after this long.
     pub const GRACE_NS: i64 = 300_000_000;
 
     /// A server for the bodies of `source`.
@@ -185,7 +185,7 @@ impl NatNetServer {
         Ok(server)
     }
 
-    /// Clients that get frames.
+    /// Number of clients that get frames.
     pub fn client_count(&self) -> usize {
         self.clients.len()
     }
@@ -200,10 +200,10 @@ impl NatNetServer {
         &self.source
     }
 
-    /// What the server's clock shows at `now`.
+    /// Reading of the server's clock at `now`.
     pub fn ticks_at(&self, now: HostTime) -> u64 {
         let t = i128::from(now.ns_since(self.source.config().start));
-        // A restarted server's clock starts anew.
+        // The clock of a restarted server restarts.
         let faults = &self.source.config().faults;
         let t = match faults.last_start(FaultKind::Reset, t as i64) {
             Some(reset) => t - i128::from(reset),
@@ -219,7 +219,7 @@ impl NatNetServer {
         self.source.config().faults.is_on(FaultKind::Unplug, t)
     }
 
-    /// Answers one datagram on the command port through `send`. Nonsense is ignored, or answered as unrecognized.
+    /// Answers one datagram on the command port through `send`. Invalid ones are ignored, or answered as unrecognized.
     pub fn on_datagram(
         &mut self,
         datagram: &[u8],
@@ -230,7 +230,7 @@ impl NatNetServer {
         if self.is_away(now) {
             return;
         }
-        // Some clients announce a wrong length (the text without its zero): the number alone decides.
+        // Some clients announce a wrong length (the text without its zero): the message number alone decides.
         let (message, payload) = match split(datagram) {
             Ok(parts) => parts,
             Err(WireError::Length { .. }) => (u16::from_le_bytes([datagram[0], datagram[1]]), &datagram[4..]),
@@ -282,7 +282,7 @@ impl NatNetServer {
 
     fn connect(&mut self, address: SocketAddrV4, wanted: Option<Version>, now: HostTime) -> Version {
         let unicast = matches!(self.config.streaming, Streaming::Unicast(_));
-        // A group has one bit stream for all.
+        // A multicast group has one bit stream for all.
         let version = if unicast { wanted.unwrap_or(self.config.version) } else { self.config.version };
         if let Some(client) = self.clients.iter_mut().find(|c| c.address == address) {
             client.version = version;
@@ -461,7 +461,7 @@ impl NatNetServer {
         encode_frame(&mut self.datagram, self.config.frame_layout.unwrap_or(version), &info, &content)
     }
 
-    /// Damages the datagram where the plan says so.
+    /// Damages the datagram if the plan says so.
     fn spoil(&mut self, k: u64) {
         if let Some(bits) = self.source.byte_fault(FaultKind::Corrupt, 0, k) {
             let at = bits as usize % self.datagram.len();

@@ -1,8 +1,9 @@
-//! Packets into light: the device's half of the bit-plane link as a state machine without I/O.
+//! The mock projector: the device's half of the bit-plane link, from packets to light, as a state machine without I/O.
 //!
-//! Everything is driven by [`LinkDevice::receive`] and [`LinkDevice::advance_to`] with the true time as an argument; the device's
-//! own clock is derived from it ([`DeviceClock`]). It starts dark, makes light only after HELLO, CONFIG and ARM, goes dark and
-//! latches when the host falls silent, and lights a frame only when every bit of it has arrived.
+//! [`LinkDevice::receive`] and [`LinkDevice::advance_to`] drive everything, with the true time as an argument; the
+//! device's own clock is derived from it ([`DeviceClock`]). The projector starts dark, makes light only after HELLO,
+//! CONFIG and ARM, goes dark and latches when the host falls silent, and lights a frame only after every bit of it has
+//! arrived.
 
 mod clock;
 mod config;
@@ -37,17 +38,17 @@ use guard::LightGuard;
 pub use light::{light_of_planes, Exposure};
 pub use thread::serve_cable;
 
-/// Echo answers that may wait to be fetched; later requests are dropped, as a busy device would.
+/// Echo answers that may wait; later requests are dropped, as a busy device would.
 const ECHOES_KEPT: usize = 16;
-/// Damaged packets without one whole frame among them that end the light.
+/// Number of damaged packets without one whole frame among them that ends the light.
 const CHECKSUM_STORM: u32 = 1000;
-/// A target further ahead than this is refused, seconds: it would hold a buffer for good.
+/// A target further ahead than this is refused, seconds: it would occupy a buffer too long.
 const MAX_LEAD_S: u64 = 2;
 
-/// Changes of light or state that are kept; older ones go and are counted with the light events.
+/// Changes of light or state that are kept; older ones are dropped and counted with the light events.
 const CHANGES_KEPT: usize = 1024;
 
-/// Armed or not, and how.
+/// Whether the projector is armed, and how.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 enum Mode {
     Disarmed,
@@ -63,7 +64,7 @@ pub struct MockProjector {
     core: Core,
 }
 
-/// Everything but the decoders, so that packets found by a decoder can act on it.
+/// Everything but the decoders, so that packets that a decoder finds can act on it.
 #[derive(Debug)]
 struct Core {
     setup: MockConfig,
@@ -72,23 +73,23 @@ struct Core {
     config: Option<(Config, SlotClock)>,
     mode: Mode,
     latched: u32,
-    /// Causes of faults that are present now; cannot be acknowledged away.
+    /// Causes of faults that are present now; ARM cannot acknowledge them.
     present: u32,
     last_heard: DeviceTicks,
     next_slot: u64,
     flash: Option<FlashLimiter>,
     guard: LightGuard,
-    /// Up to here the guard has counted.
+    /// The time up to which the guard has counted.
     counted_to: Option<HostTime>,
     /// Luminance of the frame on the mirrors.
     luminance: u32,
-    /// No ARM before this, while light rests after too many flashes.
+    /// No ARM before this, during the rest after too many flashes.
     rest_until: DeviceTicks,
-    /// Damaged packets when a frame was whole last.
+    /// Count of damaged packets when a frame was last whole.
     damaged_at_whole: u32,
     whole_since: bool,
     store: FrameStore,
-    /// An LZ4 block while it arrives.
+    /// Buffer for an arriving LZ4 block.
     staging: Vec<u8>,
     lit_now: bool,
     last_seen_frame: Option<u32>,
@@ -97,7 +98,7 @@ struct Core {
     incoming: [receive::Incoming; 2],
     events: VecDeque<LightEvent>,
     events_lost: u64,
-    /// When what happens now happens: `now`, or the exact instant of what the device does by itself.
+    /// The instant of the present event: `now`, or the exact instant of the device's own events.
     at: HostTime,
     changes: VecDeque<LightChange>,
     before: (bool, DeviceState),
@@ -107,12 +108,12 @@ struct Core {
     generation: u64,
     /// Session whose HELLO waits for an answer.
     hello_due: Option<u32>,
-    /// Session that was not opened because its host speaks other versions.
+    /// Session that was not opened because its host speaks only other versions.
     version_refused_due: Option<u32>,
     fault_due: Option<Fault>,
     echoes: VecDeque<Echo>,
     status_due: bool,
-    /// A session was opened since the decoders' counters were last looked at, and what they were then.
+    /// A session was opened since the decoders' counters were last read, and their values then.
     counters_due: bool,
     counted_before: DecoderCounters,
 }
@@ -146,7 +147,7 @@ const NO_STATUS: Status = Status {
 };
 
 impl MockProjector {
-    /// A projector that was just powered on. Its buffers are all it will ever allocate.
+    /// A projector that was just powered on. It allocates all its buffers here.
     ///
     /// # Panics
     /// When a field of `setup` is outside its documented range.
@@ -206,7 +207,7 @@ impl MockProjector {
         self.core.events.pop_front()
     }
 
-    /// Light events that were pushed out by newer ones before anybody took them.
+    /// Number of light events that were replaced by newer ones before they were taken.
     pub fn light_events_lost(&self) -> u64 {
         self.core.events_lost
     }
@@ -233,8 +234,8 @@ impl MockProjector {
         Some(&self.core.store.bytes(held.buffer)[..config.raster.plane_bytes() * config.schedule.len()])
     }
 
-    /// Light of the frame on the mirrors as code values, rows top to bottom; computed when asked for, once a frame. `None` while
-    /// no frame is on the mirrors. The first call allocates.
+    /// Light of the frame on the mirrors as code values, rows top to bottom; computed on demand, once per frame. `None`
+    /// while no frame is on the mirrors. The first call allocates.
     pub fn light_of_frame(&mut self) -> Option<&[[u8; 3]]> {
         let core = &mut self.core;
         let held = core.store.lit?;
@@ -249,12 +250,12 @@ impl MockProjector {
         Some(&core.light)
     }
 
-    /// What STATUS would say now.
+    /// The content of a STATUS now.
     pub fn status(&self) -> Status {
         self.core.status_now(&self.decoders)
     }
 
-    /// Frames that arrived without credit: a host that counts right never causes one.
+    /// Frames that arrived without credit: a correct host never causes one.
     pub fn credit_violations(&self) -> u64 {
         self.core.credit_violations
     }
@@ -269,7 +270,7 @@ impl MockProjector {
         self.core.setup.clock
     }
 
-    /// True time of the next thing that happens by itself (a slot, the end of a frame's light, or the watchdog); `None` while
+    /// True time of the device's next own event (a slot, the end of a frame's light, or the watchdog); `None` while
     /// disarmed.
     pub fn next_due(&self) -> Option<HostTime> {
         let (config, slots) = self.core.config.as_ref()?;
@@ -283,7 +284,7 @@ impl MockProjector {
         Some(self.core.setup.clock.instant_of(due))
     }
 
-    /// Sets which causes of faults are present (bits of [`faults`]): a hot lamp, a pressed button. New ones latch at once.
+    /// Sets the present causes of faults (bits of [`faults`]): a hot lamp, a pressed button. New ones latch at once.
     pub fn set_faults(&mut self, now: HostTime, present: u32) {
         self.advance_to(now);
         let new = present & !self.core.present;
@@ -294,7 +295,8 @@ impl MockProjector {
         }
     }
 
-    /// The bus was reset, or the cable pulled: the session and its light end at once. What it is, and its latched faults, stay.
+    /// The bus was reset, or the cable pulled: the session and its light end at once. The device's properties and its
+    /// latched faults stay.
     pub fn bus_reset(&mut self, now: HostTime) {
         self.advance_to(now);
         self.core.open_session(0);
@@ -328,7 +330,7 @@ impl LinkDevice for MockProjector {
         let mut sink = receive::LaneSink { core: &mut self.core, lane };
         self.decoders[lane as usize].push(bytes, &mut sink);
         if std::mem::take(&mut self.core.counters_due) {
-            // What came before, the HELLO included, is not of this session.
+            // Earlier packets, including the HELLO, do not belong to this session.
             self.core.counted_before = summed(&self.decoders);
         }
         let [a, b] = self.decoders.each_ref().map(Decoder::counters);
@@ -384,7 +386,7 @@ impl LinkDevice for MockProjector {
     }
 }
 
-/// What both lanes' decoders have counted since power-on.
+/// Counts of both lanes' decoders since power-on.
 fn summed(decoders: &[Decoder; 2]) -> DecoderCounters {
     let [a, b] = decoders.each_ref().map(Decoder::counters);
     DecoderCounters {
@@ -452,19 +454,19 @@ impl Core {
 
     fn frame_limit(&self) -> u32 {
         if self.mode == Mode::Disarmed {
-            // No credit while frames would be refused.
+            // No credit while the device would refuse frames.
             return self.status.frames_accounted;
         }
         self.status.frames_accounted.wrapping_add(self.store.free() as u32)
     }
 
-    /// When the watchdog bites if nothing more is heard.
+    /// When the watchdog expires if nothing more arrives.
     fn bite_at(&self, config: &Config) -> DeviceTicks {
         let ticks = u64::from(config.watchdog_us) * u64::from(self.setup.clock.tick_hz) / 1_000_000;
         DeviceTicks(self.last_heard.0.saturating_add(ticks.max(1)))
     }
 
-    /// When the frame that is lit must be dark if no newer one is lit before; `None` while nothing is lit or light is frozen.
+    /// When the lit frame must go dark if no newer one is lit before; `None` while nothing is lit or light is frozen.
     fn dark_from(&self) -> Option<DeviceTicks> {
         let held = self.store.lit.filter(|_| self.lit_now && self.mode == Mode::Normal)?;
         Some(held.dark_from)
@@ -490,21 +492,24 @@ impl Core {
         });
     }
 
-    /// The frame on the mirrors is over: dark until a newer one is lit, and nothing is left that could be lit again.
+    /// Ends the light of the frame on the mirrors: dark until a newer one is lit, and no frame is left that could be
+    /// lit again.
     fn end_light(&mut self) {
         self.lit_now = false;
         self.store.lit = None;
         self.status_due = true;
     }
 
-    /// Slots, ends of light and the watchdog up to `now`, in the order of time. Bounded: the watchdog ends it.
+    /// Processes slots, ends of light and the watchdog up to `now`, in the order of time. Bounded: the watchdog ends
+    /// the loop.
     fn advance(&mut self, now: HostTime) {
         self.now = self.now.max(now);
         let ticks = self.ticks();
         while self.mode != Mode::Disarmed {
             let Some((config, slots)) = self.config else { break };
             let (start, bite) = (slots.start(self.next_slot), self.bite_at(&config));
-            // At one and the same tick a new frame comes before the end of the old one: there is no dark gap between them.
+            // If both fall on one tick, the new frame comes before the end of the old one: there is no dark gap between
+            // them.
             let dark = self.dark_from().filter(|dark| *dark < start);
             let next = dark.unwrap_or(start);
             if next.min(bite) > ticks {
@@ -521,12 +526,12 @@ impl Core {
             }
             self.note_change();
         }
-        // What comes from outside happens now; what the watchdog did was noted at its own instant.
+        // External events happen now; the watchdog's effect was noted at its own instant.
         self.note_change();
         self.at = self.now;
     }
 
-    /// One slot begins.
+    /// Begins one slot.
     fn slot(&mut self, config: &Config, slots: &SlotClock, start: DeviceTicks) {
         let slot = self.next_slot;
         self.next_slot += 1;
@@ -536,7 +541,7 @@ impl Core {
         if let Some((_, superseded)) =
             due.filter(|(frame, _)| self.mode == Mode::Normal && frame.dark_from <= start)
         {
-            // It was allowed to be late, but its own light is over.
+            // The frame was allowed to be late, but its own light is over.
             self.status.frames_superseded = self.status.frames_superseded.wrapping_add(superseded);
             self.status.frames_late = self.status.frames_late.wrapping_add(1);
             due = None;
@@ -544,7 +549,7 @@ impl Core {
         if due.is_none() && self.dark_from().is_some_and(|dark| dark <= start) {
             self.end_light();
         }
-        // FREEZE holds what is lit; where nothing is, it makes no light. A frame that BLACK hid may be over by now.
+        // FREEZE holds the lit frame; if nothing is lit, it makes no light. A frame that BLACK hid may be over by now.
         let again = self.store.lit.is_some_and(|held| match self.mode {
             Mode::Frozen => self.lit_now,
             Mode::Normal => config.underrun == Underrun::Repeat && start < held.dark_from,
@@ -563,7 +568,7 @@ impl Core {
             }
         };
         if let Some(rest_us) = too_much {
-            // The slot stays dark, and so does everything after it.
+            // The slot stays dark, and so do all later ones.
             let refused = due.map_or(0, |(_, superseded)| superseded + 1);
             self.status.frames_refused = self.status.frames_refused.wrapping_add(refused);
             self.status.slots_blank = self.status.slots_blank.wrapping_add(1);
@@ -588,7 +593,7 @@ impl Core {
                 LightKind::Lit
             }
             (_, due) => {
-                // Told to be dark or to hold: frames are used up so that the stream goes on.
+                // Dark or holding by order: frames are used up so that the stream continues.
                 let refused = due.map_or(0, |(_, superseded)| superseded + 1);
                 self.status.frames_refused = self.status.frames_refused.wrapping_add(refused);
                 if again {
@@ -609,14 +614,14 @@ impl Core {
         }
     }
 
-    /// No ARM within `us` microseconds of `from`.
+    /// Refuses ARM for `us` microseconds from `from`.
     fn rest(&mut self, from: DeviceTicks, us: u64) {
         let ticks = u128::from(us) * u128::from(self.setup.clock.tick_hz) / 1_000_000;
         let ticks = u64::try_from(ticks).unwrap_or(u64::MAX);
         self.rest_until = self.rest_until.max(DeviceTicks(from.0.saturating_add(ticks)));
     }
 
-    /// Tells whoever watches what `slot` shows.
+    /// Notes the light of `slot` for observers.
     fn note_light(&mut self, slots: &SlotClock, slot: u64, kind: LightKind) {
         let (start, clock) = (slots.start(slot), &self.setup.clock);
         let end = slots.start(slot + 1);
@@ -638,7 +643,7 @@ impl Core {
         }
     }
 
-    /// Goes dark and forgets every frame on its way.
+    /// Goes dark and drops every frame in flight.
     fn disarm(&mut self) {
         if self.mode != Mode::Disarmed {
             self.counted_to = Some(self.now);
@@ -650,7 +655,7 @@ impl Core {
         self.status_due = true;
     }
 
-    /// Notes how many packets were damaged so far; too many since a frame was whole, and light ends.
+    /// Notes the number of damaged packets so far; if there are too many since a frame was whole, light ends.
     fn damaged(&mut self, total: u32) {
         if std::mem::take(&mut self.whole_since) || self.mode == Mode::Disarmed {
             self.damaged_at_whole = total;
@@ -729,7 +734,7 @@ impl Core {
         }
         self.mode = Mode::Normal;
         self.status_due = true;
-        // What FREEZE held may be over: then it ends now, not with the next slot.
+        // The light of the frozen frame may be over: then it ends now, not with the next slot.
         let now = self.ticks();
         if self.dark_from().is_some_and(|dark| dark <= now) {
             self.end_light();

@@ -1,9 +1,9 @@
-//! Captures into reports in order of arrival: what all tracker servers have in common.
+//! Orders reports by arrival: the common part of all tracker servers.
 
 use crate::tracker::SampleSource;
 use dpm_device::time::HostTime;
 
-/// Reports under way: captured, but not yet at their consumer.
+/// Reports in flight: captured, but not yet at their consumer.
 pub struct ReportQueue {
     next: u64,
     under_way: Vec<(HostTime, u64)>,
@@ -11,9 +11,9 @@ pub struct ReportQueue {
 }
 
 impl ReportQueue {
-    /// Most captures caught up with in one call; older ones were never sent.
+    /// Maximum number of captures that one call catches up with; older ones are never sent.
     const MAX_CATCH_UP: u64 = 256;
-    /// Most reports under way; further ones are lost, as in a real queue.
+    /// Maximum number of reports in flight; further ones are lost, as in a real queue.
     const MAX_UNDER_WAY: usize = 4096;
 
     /// Nothing captured yet.
@@ -21,7 +21,7 @@ impl ReportQueue {
         Self { next: 0, under_way: Vec::with_capacity(64), due: Vec::with_capacity(64) }
     }
 
-    /// When to ask again, at the latest.
+    /// Latest time for the next call.
     pub fn next_due(&self, source: &SampleSource) -> HostTime {
         let capture = source.config().start.plus_ns(source.captured_ns(self.next));
         self.under_way.iter().map(|(due, _)| *due).min().map_or(capture, |due| due.min(capture))
@@ -32,8 +32,8 @@ impl ReportQueue {
         self.next.checked_sub(1)
     }
 
-    /// Numbers of the reports that arrive by `now` and were not handed out before, in order of arrival. Each report carries all
-    /// bodies, so its way is that of stream 0.
+    /// Numbers of the reports that arrive by `now` and were not returned before, in order of arrival. Each report
+    /// carries all bodies, so its passage is that of stream 0.
     pub fn take_due(&mut self, source: &SampleSource, now: HostTime) -> &[u64] {
         self.due.clear();
         let since = now.ns_since(source.config().start).saturating_sub(source.config().phase_ns);

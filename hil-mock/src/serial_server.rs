@@ -1,4 +1,5 @@
-//! True poses into the serial pose stream: the device's side as a state machine, and the same on a port or pseudo-terminal.
+//! Sends true poses as the serial pose stream: the device's side as a state machine, and the same on a port or
+//! pseudo-terminal.
 
 use crate::faults::{FaultError, FaultKind};
 use crate::report_queue::ReportQueue;
@@ -17,7 +18,7 @@ use std::sync::Arc;
 use std::thread::JoinHandle;
 use std::time::Duration;
 
-/// What the device can do wrong: everything but `unplug` and `reset` of its port, which are the port's to do.
+/// The faults that the device implements: all but `unplug` and `reset`, which concern its port.
 pub const SERIAL_FAULTS: [FaultKind; 14] = [
     FaultKind::Loss,
     FaultKind::Corrupt,
@@ -72,7 +73,7 @@ impl SerialPoseDevice {
         self.echoes
     }
 
-    /// When to ask for reports again, at the latest.
+    /// Latest time for the next call of `report`.
     pub fn next_due(&self) -> HostTime {
         self.queue.next_due(&self.source).min(self.hello_due)
     }
@@ -81,7 +82,7 @@ impl SerialPoseDevice {
         (now.ns_since(self.source.config().start).max(0) / 1000) as u64
     }
 
-    /// Takes in bytes of the host and appends answers to `out`.
+    /// Handles bytes of the host and appends answers to `out`.
     pub fn on_bytes(&mut self, bytes: &[u8], now: HostTime, out: &mut Vec<u8>) {
         let (ticks, echoes, hello_due) = (self.ticks_at(now), &mut self.echoes, &mut self.hello_due);
         self.deframer.push(bytes, &mut |packet| match SerialMessage::decode(packet) {
@@ -94,7 +95,7 @@ impl SerialPoseDevice {
         });
     }
 
-    /// Appends all that is due by `now` to `out`.
+    /// Appends all reports due by `now` to `out`.
     pub fn report(&mut self, now: HostTime, out: &mut Vec<u8>) {
         let bodies = self.source.body_count().min(256);
         if now >= self.hello_due {
@@ -140,7 +141,8 @@ pub struct SerialPoseHost {
 }
 
 impl SerialPoseHost {
-    /// Serves on `port`, which must never wait (see [`dpm_device::tty`]): a line that nobody reads would hold the thread for ever.
+    /// Serves on `port`, which must never block (see [`dpm_device::tty`]): a line that nobody reads would block the
+    /// thread for ever.
     pub fn start(
         device: SerialPoseDevice,
         port: Box<dyn SerialPort>,
@@ -155,7 +157,7 @@ impl SerialPoseHost {
         Ok(Self { stop, thread: Some(thread) })
     }
 
-    /// True until the thread ends, which it does when the port fails.
+    /// True until the thread ends, which happens when the port fails.
     pub fn is_running(&self) -> bool {
         self.thread.as_ref().is_some_and(|t| !t.is_finished())
     }
@@ -165,19 +167,19 @@ impl Drop for SerialPoseHost {
     fn drop(&mut self) {
         self.stop.store(true, Ordering::Relaxed);
         if let Some(thread) = self.thread.take() {
-            // An error or panic of the thread has been seen through `is_running`; there is nobody left to tell.
+            // `is_running` shows an error or panic of the thread; nobody is left to inform here.
             let _ = thread.join();
         }
     }
 }
 
-/// A pseudo-terminal: the end to serve on, which never waits, and the path that clients open. The last value holds the client's end open, without
-/// claiming it, so that the server's end does not hang up between clients.
+/// A pseudo-terminal: the end to serve on, which never blocks, and the path that clients open. The last value holds the
+/// client's end open, without claiming it, so that the server's end does not hang up between clients.
 pub fn pseudo_terminal() -> serialport::Result<(Box<dyn SerialPort>, String, File)> {
     let (ours, theirs) = TTYPort::pair()?;
     let path = theirs.name().unwrap_or_default();
     let held = OpenOptions::new().read(true).write(true).custom_flags(libc::O_NOCTTY).open(&path)?;
-    // Closing it gives up the lock that would keep clients out; the raw mode that it set stays while `held` is open.
+    // Closing it releases the lock that would keep clients out; the raw mode that it set stays while `held` is open.
     drop(theirs);
     Ok((never_wait(ours)?, path, held))
 }
@@ -205,7 +207,7 @@ fn run(
             }
         }
         if out.len() > 16 * 1024 {
-            // Nobody reads: a real line drops what is not taken.
+            // Nobody reads: a real line drops the bytes.
             out.clear();
         }
         let wait_ns = device.next_due().ns_since(clock.now()).clamp(0, 200_000);

@@ -1,7 +1,7 @@
-//! True poses into what a 500 Hz tracker would report of them: noise, latency, faults, all seeded and deterministic.
+//! Turns true poses into the samples of a 500 Hz tracker: noise, latency, faults, all seeded and deterministic.
 //!
-//! A sample is a pure function of (seed, body, sample number); polling only decides when it is handed over. So two runs that
-//! poll at different instants see the same samples.
+//! A sample is a pure function of (seed, body, sample number); polling only decides when it is delivered. So two runs
+//! that poll at different instants see the same samples.
 
 use crate::faults::{FaultError, FaultKind, FaultPlan};
 use crate::motion::{add, from_rotation_vector, multiply, normalize4, scale, Motion, Twist};
@@ -11,7 +11,7 @@ use dpm_device::time::{FrameRate, HostTime};
 use dpm_device::tracker::{BodyIndex, SampleGate, Tracker, TrackerCounters, TrackerError, TrackerSample};
 use std::collections::VecDeque;
 
-/// How the mock tracker reports. All randomness follows from `seed`.
+/// Configuration of the mock tracker. All randomness follows from `seed`.
 #[derive(Clone, Debug)]
 pub struct MockTrackerConfig {
     /// Seed of noise, jitter and faults.
@@ -30,10 +30,10 @@ pub struct MockTrackerConfig {
     pub latency_ns: i64,
     /// Added to the latency: uniform in `0..jitter`, nanoseconds, 0 to 1 s.
     pub latency_jitter_ns: i64,
-    /// What goes wrong, times relative to `start`.
+    /// The faults, with times relative to `start`.
     pub faults: FaultPlan,
-    /// Whether samples pass the gate that every real client has. Off, faults reach the consumer raw, out of order and NaN
-    /// included, which breaks the promises of [`Tracker`]: for tests of what comes after.
+    /// Whether samples pass the gate that every real client has. Without it, faults reach the consumer raw, including
+    /// disorder and NaN, which breaks the guarantees of [`Tracker`]: for tests of later stages.
     pub gated: bool,
 }
 
@@ -68,7 +68,7 @@ pub enum MockTrackerError {
         /// Range.
         rule: &'static str,
     },
-    /// A fault that a tracker without bytes cannot commit.
+    /// A fault that does not apply to a tracker without bytes.
     #[error(transparent)]
     Fault(#[from] FaultError),
 }
@@ -98,7 +98,7 @@ pub struct SampleSource {
     draws: Draws,
 }
 
-/// The way of one report from the tracker to its consumer.
+/// The passage of one report from the tracker to its consumer.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Passage {
     /// When it arrives.
@@ -154,7 +154,7 @@ impl SampleSource {
         self.config.rate.slot_start_ns(k).saturating_add(self.config.phase_ns)
     }
 
-    /// True pose of `body` at `t_ns` after the start; `None` for a body that is not there.
+    /// True pose of `body` at `t_ns` after the start; `None` for an unknown body.
     pub fn true_pose(&self, body: BodyIndex, t_ns: i64) -> Option<Pose> {
         Some(self.bodies.get(usize::from(body.0))?.pose_at(t_ns))
     }
@@ -164,14 +164,14 @@ impl SampleSource {
         Some(self.bodies.get(usize::from(body.0))?.twist_at(t_ns))
     }
 
-    /// Sample `k` of `body` as the tracker sees it, before anything happens to it on its way; `received_at` is the capture. `None`
-    /// for a body that is not there.
+    /// Sample `k` of `body` as the tracker sees it, before any fault in transit; `received_at` is the capture. `None`
+    /// for an unknown body.
     pub fn sample(&self, body: BodyIndex, k: u64) -> Option<TrackerSample> {
         let faults = &self.config.faults;
         let draws = self.draws.stream(u64::from(body.0));
         let (before, t) = self.instants(k);
         let strikes = |kind| faults.strikes(kind, draws, k, before, t);
-        // A stuck tracker repeats the last sample from before it stuck, or its first one.
+        // A stuck tracker repeats the last sample before it got stuck, or its first one.
         let seen = match faults.window_start(FaultKind::Stuck, t) {
             Some(since) => self.number_before(since),
             None => k,
@@ -209,8 +209,8 @@ impl SampleSource {
         })
     }
 
-    /// What becomes of report `k` on its way: when it arrives, and when a second copy does. `None` when it is lost. `stream` is
-    /// the body's number where each body travels alone, and 0 where one packet carries all.
+    /// The passage of report `k`: when it arrives, and when a second copy does. `None` if it is lost. `stream` is the
+    /// body's number if each body travels alone, and 0 if one packet carries all.
     pub fn passage(&self, stream: u64, k: u64) -> Option<Passage> {
         let faults = &self.config.faults;
         let draws = self.draws.stream(stream);
@@ -238,7 +238,7 @@ impl SampleSource {
         (if k == 0 { i64::MIN } else { self.captured_ns(k - 1) }, self.captured_ns(k))
     }
 
-    /// Longest time from capture to arrival of any copy, nanoseconds: what a queue must be able to hold.
+    /// Longest time from capture to arrival of any copy, nanoseconds: the required capacity of a queue.
     pub fn longest_delay_ns(&self) -> i64 {
         let c = &self.config;
         let of = |kind, value: fn(&crate::faults::Fault) -> f64| -> f64 {
@@ -283,7 +283,7 @@ impl SampleSource {
         let slow = faults.amount(FaultKind::Slow, before, t) as i64;
         let mut arrival = t + self.config.latency_ns + jitter + slow;
         if faults.strikes(FaultKind::Reorder, draws, k, before, t) {
-            // Behind its successor, before the one after.
+            // After its successor, before the next one.
             arrival += self.config.rate.slot_len_ns(k) * 3 / 2;
         }
         faults.end_of(FaultKind::Stall, arrival)
@@ -297,21 +297,22 @@ fn jump_direction(draws: Draws) -> [f64; 3] {
     scale(v, 1.0 / norm)
 }
 
-/// A tracker made of software. Allocates when made, never when polled.
+/// A software tracker. Allocates when made, never when polled.
 pub struct MockTracker {
     source: SampleSource,
     /// Number of the next sample to be captured.
     next: u64,
-    /// Under way, in order of arrival.
+    /// Samples in flight, in order of arrival.
     pending: VecDeque<TrackerSample>,
     capacity: usize,
     gate: SampleGate,
-    /// Captures never generated because the consumer was away for too long, or because too many were under way.
+    /// Captures that were never generated, because the consumer was away for too long or too many were in flight.
     skipped: u64,
 }
 
 impl MockTracker {
-    /// Most capture instants handled in one poll; after a longer absence the older ones are skipped and counted.
+    /// Maximum number of capture instants handled in one poll; after a longer absence the older ones are skipped and
+    /// counted.
     pub const MAX_CAPTURES_PER_POLL: u64 = 4096;
 
     /// A tracker that reports `bodies`: body `i` of the rig is `bodies[i]`.
@@ -324,7 +325,8 @@ impl MockTracker {
         Ok(Self { source, next: 0, pending: VecDeque::with_capacity(capacity), capacity, gate, skipped: 0 })
     }
 
-    /// True pose of `body` at `t_ns` nanoseconds after [`MockTrackerConfig::start`]: what registration errors are measured against.
+    /// True pose of `body` at `t_ns` nanoseconds after [`MockTrackerConfig::start`]: the reference for registration
+    /// errors.
     pub fn true_pose(&self, body: BodyIndex, t_ns: i64) -> Option<Pose> {
         self.source.true_pose(body, t_ns)
     }
@@ -339,7 +341,7 @@ impl MockTracker {
         &self.source
     }
 
-    /// What became of the samples so far.
+    /// Counters of the samples so far, by outcome.
     pub fn counters(&self) -> &TrackerCounters {
         self.gate.counters()
     }
@@ -353,7 +355,7 @@ impl MockTracker {
         self.pending.insert(at, sample);
     }
 
-    /// Skips what is too long ago, and returns the number of the newest capture due, if any is.
+    /// Skips captures that are too old, and returns the number of the newest one due, if any.
     fn newest_due(&mut self, now: HostTime) -> Option<u64> {
         let since = now.ns_since(self.source.config.start).saturating_sub(self.source.config.phase_ns);
         if since < 0 {
@@ -402,8 +404,8 @@ impl Tracker for MockTracker {
         if let Some(newest) = self.newest_due(now) {
             while self.next <= newest {
                 let k = self.next;
-                // Nothing captured from here on can arrive before its capture, so what arrived by then may go; the queue
-                // then never holds more than one latency's worth, however long ago the last poll was.
+                // Later captures cannot arrive before their capture, so samples that arrive by then may be delivered.
+                // The queue then never holds more than one latency's worth, however long ago the last poll was.
                 delivered += self.deliver(self.source.at(self.source.captured_ns(k)).min(now), sink);
                 self.capture(k);
                 self.next = k + 1;

@@ -1,4 +1,4 @@
-//! What the mock tracker promises: timing, statistics, determinism, and each fault with its count.
+//! Guarantees of the mock tracker: timing, statistics, determinism, and each fault with its count.
 
 use super::*;
 use crate::motion::MotionSpec;
@@ -16,7 +16,7 @@ fn tracker(faults: &str, change: impl FnOnce(&mut MockTrackerConfig)) -> MockTra
     MockTracker::new(config, vec![moving()]).unwrap()
 }
 
-/// Polls every `step` until `until`; checks the promises of the trait on the way when the tracker is gated.
+/// Polls every `step` until `until`; checks the guarantees of the trait if the tracker is gated.
 fn run(tracker: &mut MockTracker, step: i64, until: i64) -> Vec<TrackerSample> {
     let mut all: Vec<TrackerSample> = Vec::new();
     for now in (0..=until).step_by(step as usize) {
@@ -113,7 +113,7 @@ fn each_fault_shows_in_its_own_counter() {
     near(c.samples.duplicate, 0.1);
     assert!(samples.len() >= all);
     let (_, c) = count("reorder=0.1");
-    // Late unless its successor was delayed as well: p (1 - p).
+    // Late unless its successor was delayed too: p (1 - p).
     near(c.samples.late, 0.09);
     let (_, c) = count("nan=0.1");
     near(c.samples.not_finite + c.samples.out_of_reach + c.samples.bad_rotation, 0.1);
@@ -135,7 +135,7 @@ fn windows_strike_exactly_the_samples_inside() {
     let missing: Vec<i64> =
         (0..999).map(|k| k * 2 * MS).filter(|t| !samples.iter().any(|s| s.captured_at.0 == *t)).collect();
     assert_eq!(missing, [1000 * MS, 1002 * MS, 1004 * MS]);
-    // T4: stuck keeps pose and noise, not the numbers.
+    // T4: stuck repeats pose and noise, but not the sequence numbers.
     let mut t = tracker("stuck@1s+100ms", |c| c.position_noise_m = 1e-3);
     let samples = run(&mut t, MS, 2 * S);
     assert_eq!(samples.len(), 1000);
@@ -157,7 +157,7 @@ fn windows_strike_exactly_the_samples_inside() {
     assert_eq!(samples.len(), 1000);
     assert_eq!(held, 26);
     assert!(!samples.iter().any(|s| (1000 * MS..1050 * MS).contains(&s.received_at.0)));
-    // T11: the counter starts anew, the samples go on.
+    // T11: the counter restarts, the samples continue.
     let mut t = tracker("reset@1s", |_| {});
     let samples = run(&mut t, MS, 2 * S);
     assert_eq!((samples.len(), samples[499].sequence, samples[500].sequence), (1000, 499, 0));

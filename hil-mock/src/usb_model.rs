@@ -1,12 +1,13 @@
-//! What a USB device is to its front ends: a state machine that turns setup packets and payload into payload, without I/O.
+//! A USB device as its front ends see it: a state machine that turns setup packets and payload into payload, without
+//! I/O.
 //!
-//! A model implements [`UsbDeviceModel`]; [`crate::usb_plug::UsbPlug`] adds what every device shares (standard requests, halted endpoints,
-//! queues, faults), and thin front ends (USB/IP, the in-process usbfs) carry its transfers to a host. Time is an argument, so a
-//! model behaves the same at virtual pace.
+//! A model implements [`UsbDeviceModel`]. [`crate::usb_plug::UsbPlug`] adds the common part of all devices (standard
+//! requests, halted endpoints, queues, faults), and thin front ends (USB/IP, the in-process usbfs) carry its transfers
+//! to a host. Time is an argument, so a model behaves the same at virtual pace.
 
 use dpm_device::time::HostTime;
 
-/// Signalling rate of the cable, with the number that USB/IP and usbfs give it.
+/// Signalling rate of the cable, with its number in USB/IP and usbfs.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 #[repr(u8)]
 pub enum Speed {
@@ -45,7 +46,7 @@ pub struct Setup {
 }
 
 impl Setup {
-    /// Reads the eight bytes as they stand on the wire.
+    /// Reads the eight bytes of the wire format.
     pub const fn from_bytes(b: [u8; 8]) -> Self {
         Self {
             request_type: b[0],
@@ -56,7 +57,7 @@ impl Setup {
         }
     }
 
-    /// The bytes as they stand on the wire.
+    /// The eight bytes of the wire format.
     pub const fn to_bytes(self) -> [u8; 8] {
         let (v, i, l) = (self.value.to_le_bytes(), self.index.to_le_bytes(), self.length.to_le_bytes());
         [self.request_type, self.request, v[0], v[1], i[0], i[1], l[0], l[1]]
@@ -73,27 +74,27 @@ impl Setup {
     }
 }
 
-/// How far a transfer came in one call.
+/// Progress of a transfer in one call.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Progress {
     /// Bytes moved by this call.
     pub bytes: usize,
-    /// What the device says after them.
+    /// The device's response after them.
     pub then: Then,
 }
 
 /// What ends, or interrupts, a transfer.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Then {
-    /// The transfer is over: everything was taken, or the device sent its last (perhaps short) packet.
+    /// The transfer is complete: everything was taken, or the device sent its last (perhaps short) packet.
     Complete,
     /// Not now. The front end calls again with the rest of the same transfer until it moves, is cancelled or the cable is pulled.
     Nak,
     /// The endpoint halts; a control transfer is merely refused.
     Stall,
-    /// The packet was damaged on the cable (the host's three attempts included).
+    /// The packet was damaged on the cable (in all three attempts of the host).
     BusError,
-    /// The device sent more than the host asked for.
+    /// The device sent more than the host requested.
     Babble,
     /// The device left the bus.
     Disconnect,
@@ -105,7 +106,7 @@ impl Progress {
         Self { bytes, then: Then::Complete }
     }
 
-    /// `bytes` moved, the rest later.
+    /// `bytes` moved; the rest follows later.
     pub const fn nak(bytes: usize) -> Self {
         Self { bytes, then: Then::Nak }
     }
@@ -118,8 +119,8 @@ impl Progress {
 
 /// A USB device with one configuration, as a state machine.
 ///
-/// Endpoint addresses carry the direction in bit 7 (`0x81` = IN 1). Implementations MUST return without waiting, must not panic
-/// on any bytes, and must bound what they allocate by what their descriptors promise.
+/// Endpoint addresses carry the direction in bit 7 (`0x81` = IN 1). Implementations MUST return without blocking, must
+/// not panic on any bytes, and must bound their allocation by their descriptors.
 pub trait UsbDeviceModel: Send {
     /// Speed it enumerates at.
     fn speed(&self) -> Speed;
@@ -139,8 +140,8 @@ pub trait UsbDeviceModel: Send {
         None
     }
 
-    /// A class or vendor request. `data` has `setup.length` bytes: the host's for OUT, to be filled for IN. Answer with
-    /// [`Then::Stall`] what the device does not know.
+    /// A class or vendor request. `data` has `setup.length` bytes: the host's for OUT, to be filled for IN. Answer
+    /// unknown requests with [`Then::Stall`].
     fn control(&mut self, now: HostTime, setup: &Setup, data: &mut [u8]) -> Progress;
 
     /// The host sends `data` to `endpoint`; empty data is a zero-length packet. After [`Then::Nak`] the next call carries the rest of
@@ -155,13 +156,14 @@ pub trait UsbDeviceModel: Send {
         let _ = endpoint;
     }
 
-    /// Bus reset, SET_CONFIGURATION or re-plug: communication state is lost, the device's own state as its kind of device keeps it.
+    /// Bus reset, SET_CONFIGURATION or re-plug: communication state is lost; the device keeps its own state as its kind
+    /// does.
     fn bus_reset(&mut self, now: HostTime) {
         let _ = now;
     }
 }
 
-/// The UTF-16 string descriptor of `text`, cut at 126 characters (the length byte holds no more).
+/// The UTF-16 string descriptor of `text`, truncated to 126 characters (the limit of the length byte).
 pub fn string_descriptor(text: &str) -> Vec<u8> {
     let mut d = vec![0, 3];
     for unit in text.encode_utf16().take(126) {
@@ -187,7 +189,7 @@ pub fn interfaces(configuration: &[u8]) -> Vec<(u8, u8, u8)> {
         .collect()
 }
 
-/// The descriptors that a configuration is made of; ends at the first whose length is below 2 or beyond the end.
+/// The descriptors of a configuration; ends at the first whose length is below 2 or beyond the end.
 fn walk(configuration: &[u8]) -> impl Iterator<Item = &[u8]> {
     let mut rest = configuration;
     std::iter::from_fn(move || {

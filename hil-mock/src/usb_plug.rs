@@ -1,9 +1,10 @@
 //! The plug between a USB device model and its front ends: queues requests per endpoint, answers the standard requests, keeps halts, and
 //! injects faults by endpoint and transfer number.
 //!
-//! One worker thread per endpoint runs that endpoint's transfers in order, so a busy bulk endpoint never delays control. A
-//! transfer that the device refuses for now (NAK) waits until the model moves again, is cancelled or the plug is pulled. Pulling
-//! is atomic: new requests are refused, queued ones fail, running ones finish, and only then is the disconnect signalled.
+//! One worker thread per endpoint runs that endpoint's transfers in order, so a busy bulk endpoint never delays
+//! control. A transfer that the device refuses for now (NAK) waits until the model moves again, it is cancelled, or the
+//! plug is pulled. Pulling is atomic: new requests are refused, queued ones fail, running ones finish, and only then is
+//! the disconnect signalled.
 
 use std::collections::{BTreeMap, VecDeque};
 use std::sync::{Arc, Condvar, Mutex, MutexGuard, PoisonError};
@@ -22,15 +23,15 @@ pub fn monotonic_clock() -> Clock {
     Arc::new(move || HostTime(start.elapsed().as_nanos() as i64))
 }
 
-/// One transfer that a host asks for.
+/// One transfer that a host requests.
 pub struct Request {
-    /// Names the transfer for [`UsbPlug::cancel`]; unique among those not completed yet.
+    /// Identifies the transfer for [`UsbPlug::cancel`]; unique among the pending ones.
     pub id: u64,
     /// Address with the direction in bit 7; 0 for control.
     pub endpoint: u8,
     /// The setup packet of a control transfer.
     pub setup: Option<Setup>,
-    /// OUT: what to send. IN: its length is how much is asked for.
+    /// OUT: the bytes to send. IN: its length is the requested number of bytes.
     pub buffer: Vec<u8>,
     /// Called exactly once, from a worker thread or from the call that ends the transfer.
     pub done: Box<dyn FnOnce(Completed) + Send>,
@@ -38,7 +39,7 @@ pub struct Request {
 
 /// How a transfer ended.
 pub struct Completed {
-    /// The request's name.
+    /// The request's identifier.
     pub id: u64,
     /// Outcome.
     pub status: Status,
@@ -59,7 +60,7 @@ pub enum Status {
     BusError,
     /// The device sent too much (EOVERFLOW).
     Babble,
-    /// The host took it back (ECONNRESET).
+    /// The host cancelled it (ECONNRESET).
     Cancelled,
     /// The device is gone (ESHUTDOWN).
     Gone,
@@ -86,7 +87,7 @@ pub enum Fault {
     Stall,
     /// Damage the transfer.
     BusError,
-    /// Answer an IN transfer with more than was asked for.
+    /// Answer an IN transfer with more bytes than requested.
     Babble,
     /// Refuse the transfer for this long before serving it (`i64::MAX`: until it is cancelled).
     NakNs(i64),
@@ -96,7 +97,7 @@ pub enum Fault {
     Unplug(usize),
 }
 
-/// The plug of one device. Cloning gives another handle on the same plug; dropping the last one pulls it.
+/// The plug of one device. Cloning makes another handle on the same plug; dropping the last one pulls it.
 #[derive(Clone)]
 pub struct UsbPlug {
     shared: Arc<Shared>,
@@ -116,7 +117,7 @@ struct Shared {
     model: Arc<Mutex<dyn UsbDeviceModel>>,
     clock: Clock,
     state: Mutex<State>,
-    /// Signalled when anything changed that a worker may wait for.
+    /// Signalled on every change that a worker may wait for.
     changed: Condvar,
 }
 
@@ -147,16 +148,17 @@ struct Queue {
     started: u64,
 }
 
-/// How long a refused transfer waits before it asks the model again though nothing else moved (the model's own time may have).
+/// How long a refused transfer waits before it tries the model again although nothing else moved (the model's own time
+/// may have).
 const RETRY: Duration = Duration::from_micros(500);
 
 fn lock<T: ?Sized>(m: &Mutex<T>) -> MutexGuard<'_, T> {
-    // A panicking model must not take the front ends with it: its state is still the best there is.
+    // A panicking model must not take the front ends down: its last state is still the best one.
     m.lock().unwrap_or_else(PoisonError::into_inner)
 }
 
 impl UsbPlug {
-    /// Plugs `model` in. The caller may keep its own handle on the model to look inside.
+    /// Plugs `model` in. The caller may keep its own handle on the model for inspection.
     pub fn new(model: Arc<Mutex<dyn UsbDeviceModel>>, clock: Clock) -> Self {
         let shared = Arc::new(Shared { model, clock, state: Mutex::default(), changed: Condvar::new() });
         Self { _last_handle: Arc::new(LastHandle(shared.clone())), shared }
@@ -174,7 +176,7 @@ impl UsbPlug {
         s.faults.push((endpoint, base + nth, fault));
     }
 
-    /// Lets nothing move before `until`: a device that is busy, as the host sees it.
+    /// Blocks all transfers before `until`: to the host, a busy device.
     pub fn hold_until(&self, until: HostTime) {
         lock(&self.shared.state).held_until = Some(until);
     }
@@ -184,7 +186,7 @@ impl UsbPlug {
         lock(&self.shared.state).delay_ns = ns;
     }
 
-    /// Queues a transfer. Gives it back when the plug is pulled, and where the system gives no thread for its endpoint.
+    /// Queues a transfer. Returns it if the plug is pulled, or if the system provides no thread for its endpoint.
     pub fn submit(&self, request: Request) -> Result<(), Request> {
         let mut s = lock(&self.shared.state);
         if s.pulled {
@@ -193,7 +195,7 @@ impl UsbPlug {
         let endpoint = request.endpoint;
         if !s.queues.contains_key(&endpoint) {
             let (shared, name) = (self.shared.clone(), format!("usb-{endpoint:02x}"));
-            // It waits for the lock that is held here.
+            // The thread waits for the lock that is held here.
             if std::thread::Builder::new().name(name).spawn(move || shared.work(endpoint)).is_err() {
                 return Err(request);
             }
@@ -203,8 +205,8 @@ impl UsbPlug {
         Ok(())
     }
 
-    /// Takes a transfer back. True when it had not ended: its completion, with [`Status::Cancelled`] or with what it reached
-    /// in the meantime, follows or has just been made.
+    /// Cancels a transfer. True if it had not ended: its completion, with [`Status::Cancelled`] or with its progress in
+    /// the meantime, follows or has just been made.
     pub fn cancel(&self, id: u64) -> bool {
         let mut s = lock(&self.shared.state);
         let mut cancelled = None;
@@ -229,7 +231,7 @@ impl UsbPlug {
         }
     }
 
-    /// Takes every transfer of `endpoint` back.
+    /// Cancels every transfer of `endpoint`.
     pub fn cancel_endpoint(&self, endpoint: u8) {
         let mut s = lock(&self.shared.state);
         let Some(q) = s.queues.get_mut(&endpoint) else { return };
@@ -281,7 +283,7 @@ impl UsbPlug {
         s.queues.values().map(|q| q.pending.len() + usize::from(q.running.is_some())).sum()
     }
 
-    /// Calls `f` once the plug is pulled and every transfer has ended; at once when that is already so.
+    /// Calls `f` once the plug is pulled and every transfer has ended; immediately if that is already so.
     pub fn on_unplug(&self, f: Box<dyn FnOnce() + Send>) {
         let mut s = lock(&self.shared.state);
         if s.signalled {
@@ -304,9 +306,9 @@ pub trait UsbCable: Send + Sync {
     fn descriptors(&self) -> Vec<u8>;
     /// Speed of the cable.
     fn speed(&self) -> crate::usb_model::Speed;
-    /// Queues a transfer; gives it back when the device is gone.
+    /// Queues a transfer; returns it if the device is gone.
     fn submit(&self, request: Request) -> Result<(), Request>;
-    /// Takes a transfer back; true when it had not ended.
+    /// Cancels a transfer; true if it had not ended.
     fn cancel(&self, id: u64) -> bool;
     /// Ends the halt of an endpoint.
     fn clear_halt(&self, endpoint: u8);
@@ -381,7 +383,7 @@ impl Shared {
         listeners.into_iter().for_each(|f| f());
     }
 
-    /// A worker's life: runs the transfers of one endpoint in order until the plug is pulled.
+    /// The worker's loop: runs the transfers of one endpoint in order until the plug is pulled.
     fn work(self: Arc<Self>, endpoint: u8) {
         loop {
             let mut s = lock(&self.state);
@@ -459,7 +461,8 @@ impl Shared {
                 } else {
                     drop(s);
                     let mut model = lock(&self.model);
-                    // Anew: the model may have been busy with another endpoint's transfer, and what it stamps must not be older.
+                    // Read the clock again: the model may have been busy with another endpoint's transfer, and its
+                    // stamps must not be older.
                     let now = (self.clock)();
                     if is_in {
                         model.transfer_in(now, endpoint, &mut r.buffer[moved..])
@@ -469,7 +472,7 @@ impl Shared {
                 };
                 (seen, step)
             };
-            // A model that claims more than it was given is cut: the host never sees bytes that nobody wrote.
+            // If a model claims more than it was given, the claim is limited: the host never sees unwritten bytes.
             moved = (moved + step.bytes).min(r.buffer.len());
             if step.bytes > 0 {
                 lock(&self.state).moves += 1;
@@ -505,7 +508,7 @@ impl Shared {
         }
     }
 
-    /// A control transfer: the standard requests here, the others by the model.
+    /// A control transfer: standard requests are handled here, the others by the model.
     fn control(&self, setup: &Setup, data: &mut [u8]) -> Progress {
         if !setup.is_standard() {
             let mut model = lock(&self.model);

@@ -4,7 +4,7 @@ use super::*;
 use crate::usb_model::Speed;
 use std::sync::mpsc::{channel, Receiver};
 
-/// Endpoint 0x01 stores, 0x81 gives back what was stored and refuses while empty.
+/// Endpoint 0x01 stores bytes, 0x81 returns them and refuses while empty.
 #[derive(Default)]
 struct Loopback {
     stored: VecDeque<u8>,

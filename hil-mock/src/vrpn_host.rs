@@ -27,11 +27,11 @@ struct Client {
 }
 
 impl VrpnHost {
-    /// Most clients at a time; more are turned away.
+    /// Maximum number of clients at a time; further ones are rejected.
     pub const MAX_CLIENTS: usize = 32;
-    /// Bytes waiting for a client that does not read; with more it is dropped.
+    /// Maximum number of bytes that wait for a client that does not read; with more it is dropped.
     const MAX_BACKLOG: usize = 256 * 1024;
-    /// A connection that has not greeted by then is dropped.
+    /// A connection without a greeting after this time is dropped.
     const GREETING_NS: i64 = 2_000_000_000;
 
     /// Listens on `address` (port 0 for any), by TCP and by UDP for clients that ask to be called back. `clock` is the clock of
@@ -79,7 +79,7 @@ impl VrpnHost {
         self.clients.load(Ordering::Relaxed)
     }
 
-    /// True until the thread ends, which it does on a socket error only.
+    /// True until the thread ends, which happens only on a socket error.
     pub fn is_running(&self) -> bool {
         self.thread.as_ref().is_some_and(|t| !t.is_finished())
     }
@@ -89,7 +89,7 @@ impl Drop for VrpnHost {
     fn drop(&mut self) {
         self.stop.store(true, Ordering::Relaxed);
         if let Some(thread) = self.thread.take() {
-            // An error or panic of the thread has been seen through `is_running`; there is nobody left to tell.
+            // `is_running` shows an error or panic of the thread; nobody is left to inform here.
             let _ = thread.join();
         }
     }
@@ -150,14 +150,14 @@ impl Server {
                 Ok((stream, _)) if !away => self.add(stream, now),
                 Ok(_) => {}
                 Err(e) if e.kind() == ErrorKind::WouldBlock => break,
-                // The client went away between knocking and being let in; running out of descriptors passes too.
+                // The client disconnected before it was accepted; running out of descriptors passes too.
                 Err(_) => break,
             }
         }
         let mut buffer = [0; 256];
-        // One call back at a time, and not for long: an address that does not answer must not delay reports either.
+        // One call back at a time, with a short timeout: an address that does not answer must not delay reports either.
         if let Some(call) = calls.receive(&mut buffer)? {
-            // "address port\0": only the port is believed, so nobody can have a third machine called.
+            // "address port\0": only the port is used, so nobody can direct a call to a third machine.
             let text = String::from_utf8_lossy(&buffer[..call.len]);
             let port =
                 text.trim_end_matches('\0').split_whitespace().nth(1).and_then(|p| p.parse::<u16>().ok());
@@ -180,7 +180,7 @@ impl Server {
     }
 }
 
-/// Reads what the client sent; false when it is gone or talks nonsense.
+/// Reads the client's input; false if it is gone or sends invalid data.
 fn read(client: &mut Client, names: &VrpnNames, wall_us: u64) -> bool {
     let mut buffer = [0; 4096];
     for _ in 0..4 {
@@ -197,7 +197,7 @@ fn read(client: &mut Client, names: &VrpnNames, wall_us: u64) -> bool {
     true
 }
 
-/// Sends what waits; false when the client is gone or reads too slowly.
+/// Sends waiting bytes; false if the client is gone or reads too slowly.
 fn write(client: &mut Client) -> bool {
     while !client.out.is_empty() {
         match client.stream.write(&client.out) {

@@ -1,4 +1,5 @@
-//! True poses into VRPN messages: the server's side of one connection as a state machine, and the samples all connections get.
+//! Sends true poses as VRPN messages: the server's side of one connection as a state machine, and the samples of all
+//! connections.
 
 use crate::faults::{FaultError, FaultKind};
 use crate::report_queue::ReportQueue;
@@ -7,14 +8,15 @@ use dpm_device::time::HostTime;
 use dpm_device::tracker::vrpn::wire::{self, system, type_name, Message, COOKIE, COOKIE_BYTES};
 use dpm_device::tracker::BodyIndex;
 
-/// What a VRPN server can do wrong. A stream loses no bytes, so a lost or overtaken report is one that was not sent, or late.
+/// The faults of a VRPN server. A stream loses no bytes, so a lost or overtaken report is one that was not sent, or
+/// late.
 pub const VRPN_FAULTS: [FaultKind; 16] = FaultKind::ALL;
 
 /// Number of the pose type on our side; ping and pong follow.
 const POS_QUAT: i32 = 0;
 const PING: i32 = 1;
 const PONG: i32 = 2;
-/// Most senders and types a client may describe.
+/// Maximum number of senders and types that a client may describe.
 const MAX_NUMBERS: usize = 1024;
 
 /// Names of the server's devices, and where each body appears.
@@ -30,7 +32,7 @@ pub struct VrpnNames {
 
 /// One client's connection: bytes in, bytes out.
 pub struct VrpnConnection {
-    /// Their numbers of our senders: index is theirs, value ours.
+    /// The client's numbers of our senders: the index is theirs, the value ours.
     their_senders: Vec<Option<i32>>,
     their_ping: Option<i32>,
     greeted: bool,
@@ -40,10 +42,10 @@ pub struct VrpnConnection {
 }
 
 impl VrpnConnection {
-    /// Bytes of an unfinished message that are kept; a client that sends more without finishing one is cut off.
+    /// Maximum number of bytes kept of an incomplete message; a client that sends more is cut off.
     const MAX_PENDING: usize = wire::HEADER_BYTES + wire::MAX_PAYLOAD + 8;
 
-    /// A connection just accepted; appends the greeting and the names to `out`.
+    /// A newly accepted connection; appends the greeting and the names to `out`.
     pub fn new(names: &VrpnNames, out: &mut Vec<u8>) -> Self {
         out.extend_from_slice(&COOKIE);
         for (number, name) in
@@ -74,7 +76,8 @@ impl VrpnConnection {
         self.pongs
     }
 
-    /// Takes in bytes of the client and appends answers to `out`. `wall_us` is the server's clock. An error means: hang up.
+    /// Handles bytes of the client and appends answers to `out`. `wall_us` is the server's clock. On an error, close
+    /// the connection.
     pub fn on_bytes(
         &mut self,
         names: &VrpnNames,
@@ -181,13 +184,13 @@ impl VrpnReports {
         self.queue.next_due(&self.source)
     }
 
-    /// Numbers of the reports due by `now`, in order; each is handed out once.
+    /// Numbers of the reports due by `now`, in order; each is returned once.
     pub fn take_due(&mut self, now: HostTime) -> Vec<u64> {
         self.queue.take_due(&self.source, now).to_vec()
     }
 
-    /// Appends report `k` to `out` for `connection`. `wall_us_at` turns a host time into the server's clock, microseconds. False:
-    /// the plan cuts this report short, hang up after it.
+    /// Appends report `k` to `out` for `connection`. `wall_us_at` converts a host time to the server's clock,
+    /// microseconds. Returns false if the plan truncates this report; close the connection after it.
     pub fn put_report(
         &self,
         k: u64,

@@ -105,7 +105,7 @@ fn the_engine_has_no_thread_no_clock_and_no_io() {
     let src = root().join("host/rig/src/engine");
     let files = sources(&src);
     assert!(files.len() >= 10, "the engine lies elsewhere: {files:?}");
-    for (path, text) in files {
+    for (path, text) in files.into_iter().filter(|(path, _)| !path.ends_with("tests.rs")) {
         let code = code(&text);
         let named: Vec<_> = OUTSIDE.iter().filter(|outside| code.contains(**outside)).collect();
         assert!(named.is_empty(), "{} names {named:?}", path.display());

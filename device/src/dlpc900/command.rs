@@ -1,8 +1,9 @@
-//! DLPC900 commands and replies into 64-byte HID reports and back.
+//! Encodes DLPC900 commands and replies as 64-byte HID reports, and decodes them.
 //!
-//! A message is a header and data cut into 64-byte reports, zero padded; only the first carries the header. Command header, 6
-//! bytes: flags, sequence, u16 length (opcode + data), u16 opcode. Reply header, 4 bytes: flags, sequence, u16 length (data): a
-//! reply does not repeat the opcode. All numbers are little-endian. \[DLPU018 section 1.2\]
+//! A message is a header and data, split into zero-padded reports of 64 bytes; only the first report carries the
+//! header. Command header, 6 bytes: flags, sequence, u16 length (opcode + data), u16 opcode. Reply header, 4 bytes:
+//! flags, sequence, u16 length (data): a reply does not repeat the opcode. All numbers are little-endian.
+//! \[DLPU018 section 1.2\]
 
 /// Bytes of every report on the wire (the report ID 0 that HID libraries put in front is not sent).
 pub const REPORT_BYTES: usize = 64;
@@ -39,7 +40,7 @@ macro_rules! opcodes {
         impl Opcode {
             $($(#[$doc])* pub const $name: Self = Self($code);)*
 
-            /// What the programmer's guide calls the command; `None` for one that is not in the table.
+            /// The name of the command in the programmer's guide; `None` for one that is not in the table.
             pub const fn name(self) -> Option<&'static str> {
                 match self.0 {
                     $($code => Some($text),)*
@@ -184,7 +185,7 @@ pub struct Command<'a> {
     pub flags: u8,
     /// Echoed in the reply.
     pub sequence: u8,
-    /// What to do.
+    /// The command's opcode.
     pub opcode: Opcode,
     /// Its data, at most [`MAX_COMMAND_DATA`] bytes.
     pub data: &'a [u8],
@@ -312,7 +313,7 @@ impl core::fmt::Display for Malformed {
     }
 }
 
-/// Puts messages together from reports. Holds one message; the next first report replaces it.
+/// Assembles messages from reports. Holds one message; the next first report replaces it.
 #[derive(Clone, Debug)]
 struct Assembler {
     buffer: [u8; BUFFER_BYTES],
@@ -325,7 +326,8 @@ impl Assembler {
         Self { buffer: [0; BUFFER_BYTES], filled: 0, wanted: 0 }
     }
 
-    /// Takes a report; true when the message in `buffer[..wanted]` is complete. `least` and `total` interpret the header.
+    /// Adds a report; true when the message in `buffer[..wanted]` is complete. `least` and `total` interpret the
+    /// header.
     fn push(&mut self, report: &[u8], header: usize, least: u16) -> Result<bool, Malformed> {
         if self.filled >= self.wanted {
             if report.len() < header {
@@ -346,7 +348,7 @@ impl Assembler {
     }
 }
 
-/// Puts commands together from the host's reports (the controller's side of the wire).
+/// Assembles commands from the host's reports (the controller's side of the wire).
 #[derive(Clone, Debug)]
 pub struct CommandAssembler(Assembler);
 
@@ -357,7 +359,8 @@ impl Default for CommandAssembler {
 }
 
 impl CommandAssembler {
-    /// Takes one report; gives the command when it is whole. A malformed first report is dropped and the next one starts afresh.
+    /// Adds one report; returns the command when it is complete. A malformed first report is dropped, and the next one
+    /// starts anew.
     pub fn push(&mut self, report: &[u8]) -> Result<Option<Command<'_>>, Malformed> {
         if !self.0.push(report, COMMAND_HEADER, 2)? {
             return Ok(None);
@@ -367,14 +370,14 @@ impl CommandAssembler {
         Ok(Some(Command { flags: b[0], sequence: b[1], opcode, data: &b[COMMAND_HEADER..] }))
     }
 
-    /// Forgets a command that is only partly there.
+    /// Drops an incomplete command.
     pub fn reset(&mut self) {
         self.0.wanted = 0;
         self.0.filled = 0;
     }
 }
 
-/// Puts replies together from the controller's reports (the host's side of the wire).
+/// Assembles replies from the controller's reports (the host's side of the wire).
 #[derive(Clone, Debug)]
 pub struct ReplyAssembler(Assembler);
 
@@ -385,7 +388,7 @@ impl Default for ReplyAssembler {
 }
 
 impl ReplyAssembler {
-    /// Takes one report; gives the reply when it is whole.
+    /// Adds one report; returns the reply when it is complete.
     pub fn push(&mut self, report: &[u8]) -> Result<Option<Reply<'_>>, Malformed> {
         if !self.0.push(report, REPLY_HEADER, 0)? {
             return Ok(None);
@@ -394,7 +397,7 @@ impl ReplyAssembler {
         Ok(Some(Reply { flags: b[0], sequence: b[1], data: &b[REPLY_HEADER..] }))
     }
 
-    /// Forgets a reply that is only partly there.
+    /// Drops an incomplete reply.
     pub fn reset(&mut self) {
         self.0.wanted = 0;
         self.0.filled = 0;
@@ -436,7 +439,7 @@ mod tests {
         assert_eq!(ReplyAssembler::default().push(&report), Ok(Some(reply)));
     }
 
-    /// 504 image bytes: the header stands in the first report only, 58 data bytes with it, then 64 at a time.
+    /// 504 image bytes: only the first report has the header, with 58 data bytes; the others have 64 each.
     #[test]
     fn golden_layout_of_the_longest_command() {
         let mut data = [0u8; MAX_COMMAND_DATA];

@@ -1,4 +1,5 @@
-//! Calls of a program into commands to a DLPC900, and its answers into values and errors that say what to do.
+//! The driver: turns calls into commands to a DLPC900, and its answers into values, or into errors that name the
+//! remedy.
 
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::{Arc, Mutex, PoisonError, TryLockError};
@@ -10,16 +11,16 @@ use super::command::{
 use super::lut::{DisplayMode, Dmd};
 use super::sequence::{self, LedSetup, PatternSequence, SequenceError, Step, Version, VideoPatterns};
 
-/// How long one report may take to go out, and one reply to come in. The controller answers within a few milliseconds; while
+/// Timeout for sending one report, and for receiving one reply. The controller answers within a few milliseconds; while
 /// it takes an image it may refuse data for some time.
 const TIMEOUT: Duration = Duration::from_millis(1000);
 /// Replies to other commands that are dropped before a reply counts as missing (another program's, or one never read).
 const MOST_STALE: usize = 8;
-/// Pause between two looks at the status while waiting, and longest time until a stop is noticed during a wait.
+/// Pause between two polls of the status while waiting, and the longest time until a stop is noticed during a wait.
 const POLL: Duration = Duration::from_millis(20);
-/// How long one report may take once a stop was asked for: the process must be gone within two seconds, whatever the cable does.
+/// Timeout for one report once a stop was requested: the process must end within two seconds, whatever the cable does.
 const HURRY: Duration = Duration::from_millis(250);
-/// How long a [`DarkLine`] waits for a command that is under way, so as not to take its reply away.
+/// How long a [`DarkLine`] waits for a pending command, so as not to disturb its reply.
 const MANNERS: Duration = Duration::from_millis(25);
 
 /// The cable: sends and receives reports of 64 bytes. Every wait MUST end within the time given.
@@ -30,18 +31,18 @@ pub trait HidPort {
     /// Receives one report.
     fn read_report(&mut self, report: &mut [u8; REPORT_BYTES], timeout: Duration) -> Result<(), PortError>;
 
-    /// What to call the controller in messages.
+    /// Name of the controller in messages.
     fn name(&self) -> &str {
         "DLPC900"
     }
 
-    /// Lets time pass. Simulated ports let theirs.
+    /// Waits. Simulated ports advance their own time.
     fn pause(&mut self, time: Duration) {
         std::thread::sleep(time);
     }
 
-    /// A second way to send reports over the same cable from another thread, which works also while this one is stuck inside a call.
-    /// `None` where there is none.
+    /// A second way to send reports over the same cable from another thread. It works even while this thread hangs
+    /// inside a call. `None` if there is none.
     fn second_line(&self) -> Option<Box<dyn SecondLine>> {
         None
     }
@@ -53,19 +54,19 @@ pub trait SecondLine: Send {
     fn write_report(&mut self, report: &[u8; REPORT_BYTES], timeout: Duration) -> Result<(), PortError>;
 }
 
-/// Makes a controller dark from another thread than the one that talks to it. Its commands want no reply, so nothing has to be waited
-/// for; they wait a moment for a command that is under way, and no longer.
+/// Makes a controller dark from another thread than the one that uses it. Its commands request no reply, so it need not
+/// wait for one. It waits briefly for a pending command, and no longer.
 pub struct DarkLine {
     line: Box<dyn SecondLine>,
     turn: Arc<Mutex<()>>,
 }
 
 impl DarkLine {
-    /// Stops the sequence, so that no light leaves the projector. With `leds_off`, for the end of a run, the LEDs are switched off as
-    /// well. The first report is on its way within some 25 ms.
+    /// Stops the sequence, so that no light leaves the projector. With `leds_off`, for the end of a run, it also
+    /// switches the LEDs off. The first report is sent within some 25 ms.
     ///
     /// # Errors
-    /// The cable's. The orders were not heard then.
+    /// Those of the cable. The controller did not receive the orders then.
     pub fn dark(&mut self, leds_off: bool) -> Result<(), PortError> {
         let mut waited = Duration::ZERO;
         let step = Duration::from_millis(1);
@@ -73,7 +74,7 @@ impl DarkLine {
             match self.turn.try_lock() {
                 Ok(turn) => break Some(turn),
                 Err(TryLockError::Poisoned(turn)) => break Some(turn.into_inner()),
-                // The other thread is stuck inside a command; its reply is of no use any more.
+                // The other thread hangs inside a command; its reply is no longer of use.
                 Err(TryLockError::WouldBlock) if waited >= MANNERS => break None,
                 Err(TryLockError::WouldBlock) => {
                     std::thread::sleep(step);
@@ -87,7 +88,7 @@ impl DarkLine {
         }
         for step in &steps {
             let Step::Write(opcode, data) = step else { continue };
-            // Fits one report, so it cannot fall apart between the reports of another command.
+            // Fits one report, so it cannot end up between the reports of another command.
             for report in Command::write(0, *opcode, data, false).reports().into_iter().flatten() {
                 self.line.write_report(&report, POLL)?;
             }
@@ -97,7 +98,7 @@ impl DarkLine {
     }
 }
 
-/// What a cable can say.
+/// Errors of the cable.
 #[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
 pub enum PortError {
     /// Nothing within the time given.
@@ -112,7 +113,7 @@ pub enum PortError {
     /// The operating system denies access; the text is the remedy.
     #[error("no permission to open the device: {0}")]
     Denied(String),
-    /// Somebody else holds the device.
+    /// Another program uses the device.
     #[error("another program holds the device: close it (TI's own, or a second dpm; `fuser -v` on the device file names it)")]
     Busy,
     /// Anything else.
@@ -120,30 +121,30 @@ pub enum PortError {
     Other(String),
 }
 
-/// Why something was not done.
+/// Why a call failed.
 #[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
 pub enum Dlpc900Error {
     /// The cable failed.
     #[error("{doing}: {source}")]
     Port {
-        /// On which device, during which command.
+        /// The device and the command.
         doing: String,
-        /// How.
+        /// The error.
         source: PortError,
     },
     /// The controller refused a command.
     #[error("{doing}: the controller refuses (error {code}, \"{text}\"): {remedy}")]
     Refused {
-        /// Which command, with the entry or image it was about.
+        /// The command, with the entry or image that it concerned.
         doing: String,
         /// The controller's error code.
         code: u8,
-        /// The controller's own words.
+        /// The controller's error text.
         text: String,
-        /// What to do about it, in the state that the controller is in.
+        /// The remedy in the present state of the controller.
         remedy: &'static str,
     },
-    /// The controller answered something that makes no sense.
+    /// The controller's answer makes no sense.
     #[error("{doing}: the answer makes no sense ({what})")]
     Protocol {
         /// Which command.
@@ -154,13 +155,13 @@ pub enum Dlpc900Error {
     /// A sequence that the controller cannot show.
     #[error(transparent)]
     Sequence(#[from] SequenceError),
-    /// The controller says that hardware is wrong.
+    /// The controller reports a hardware error.
     #[error("the controller reports {0}: check DMD, cable and power, then reset")]
     Hardware(String),
     /// No video signal.
     #[error("the video source did not lock within {0:?}: check cable, resolution and that the graphics card sends a picture")]
     NotLocked(Duration),
-    /// A stop was asked for in the middle of it; see [`Dlpc900::stop_when`].
+    /// A stop was requested during the call; see [`Dlpc900::stop_when`].
     #[error("stopped before the controller was set up")]
     Stopped,
     /// An unknown DMD.
@@ -194,7 +195,7 @@ pub const fn error_meaning(code: u8) -> &'static str {
     }
 }
 
-/// What to do about an error code.
+/// The remedy for an error code.
 pub const fn remedy(code: u8) -> &'static str {
     match code {
         1 | 7 | 11 => {
@@ -219,7 +220,7 @@ pub const fn remedy(code: u8) -> &'static str {
     }
 }
 
-/// Everything that one look at the controller tells.
+/// Everything that one poll of the controller yields.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Status {
     /// Firmware.
@@ -252,7 +253,7 @@ impl Status {
         self.main & 8 != 0
     }
 
-    /// What the hardware bits complain about, if anything.
+    /// The errors in the hardware bits, if any.
     pub fn complaint(&self) -> Option<String> {
         let bits = [
             (self.hardware & 0x01 == 0, "initialisation failed"),
@@ -292,9 +293,9 @@ pub struct Counters {
 #[derive(Debug)]
 pub struct Dlpc900<P> {
     port: P,
-    /// Held from a command to its reply.
+    /// Locked from a command to its reply.
     turn: Arc<Mutex<()>>,
-    /// When set, whatever takes long ends with [`Dlpc900Error::Stopped`].
+    /// When set, every long operation ends with [`Dlpc900Error::Stopped`].
     stop: Option<Arc<AtomicBool>>,
     timeout: Duration,
     sequence: u8,
@@ -337,18 +338,19 @@ impl<P: HidPort> Dlpc900<P> {
         self.counters
     }
 
-    /// A way to make the controller dark from another thread; `None` where the cable has none.
+    /// A way to make the controller dark from another thread; `None` if the cable has none.
     pub fn dark_line(&self) -> Option<DarkLine> {
         self.port.second_line().map(|line| DarkLine { line, turn: Arc::clone(&self.turn) })
     }
 
-    /// Once `stop` is true, whatever takes long (uploads, the mirrors' three seconds, waiting for a video signal) ends with
-    /// [`Dlpc900Error::Stopped`] within 20 ms. Calls that make the controller dark are not concerned once [`Dlpc900::hurry`] was called.
+    /// Once `stop` is true, every long operation (uploads, the mirrors' three seconds, waiting for a video signal) ends
+    /// with [`Dlpc900Error::Stopped`] within 20 ms. Calls that make the controller dark are exempt once
+    /// [`Dlpc900::hurry`] was called.
     pub fn stop_when(&mut self, stop: Arc<AtomicBool>) {
         self.stop = Some(stop);
     }
 
-    /// For the end of a run: commands are no longer stopped, and none waits longer than 250 ms for the cable.
+    /// For the end of a run: commands are no longer stopped, and none waits for the cable for more than 250 ms.
     pub fn hurry(&mut self) {
         (self.stop, self.timeout) = (None, HURRY);
     }
@@ -360,7 +362,7 @@ impl<P: HidPort> Dlpc900<P> {
         }
     }
 
-    /// Lets `time` pass, as long as nobody asks for a stop.
+    /// Waits for `time`, or until a stop is requested.
     fn pause_for(&mut self, time: Duration) -> Result<(), Dlpc900Error> {
         let mut left = time;
         while !left.is_zero() {
@@ -383,8 +385,8 @@ impl<P: HidPort> Dlpc900<P> {
         self.exchange(opcode, parameters, true, &doing, true)
     }
 
-    /// A command and its reply, which nobody must come between: the controller keeps one reply only. `explain` asks the controller why,
-    /// when it refused.
+    /// Sends a command and receives its reply. No other command may come between, because the controller keeps only one
+    /// reply. With `explain`, asks the controller for the reason of a refusal.
     fn exchange(
         &mut self,
         opcode: Opcode,
@@ -395,7 +397,8 @@ impl<P: HidPort> Dlpc900<P> {
     ) -> Result<Vec<u8>, Dlpc900Error> {
         let turn = Arc::clone(&self.turn);
         let held = turn.lock().unwrap_or_else(PoisonError::into_inner);
-        // Under the lock: after a stop was asked for and a dark line has had its turn, nothing starts the sequence again.
+        // Checked under the lock: after a stop was requested and a dark line has had its turn, nothing starts the
+        // sequence again.
         self.go_on()?;
         self.send(opcode, data, read, true, doing)?;
         let (refused, data) = self.receive(doing)?;
@@ -442,12 +445,12 @@ impl<P: HidPort> Dlpc900<P> {
         Dlpc900Error::Port { doing: format!("{}: {doing}", self.port.name()), source }
     }
 
-    /// Waits for the reply to the last command: whether it was refused, and its data.
+    /// Waits for the reply to the last command: returns whether it was refused, and its data.
     fn receive(&mut self, doing: &str) -> Result<(bool, Vec<u8>), Dlpc900Error> {
         let mut assembler = ReplyAssembler::default();
         let mut report = [0; REPORT_BYTES];
         let mut stale = 0;
-        // A reply has at most this many reports, and so many strays may come before it: the loop ends.
+        // A reply has at most this many reports, and at most this many stale replies precede it, so the loop ends.
         for _ in 0..MOST_STALE * MAX_REPLY_DATA.div_ceil(REPORT_BYTES) {
             self.port.read_report(&mut report, self.timeout).map_err(|source| self.failed(doing, source))?;
             match assembler.push(&report) {
@@ -469,7 +472,7 @@ impl<P: HidPort> Dlpc900<P> {
         Err(protocol(doing, format!("{stale} replies to other commands and none to this one")))
     }
 
-    /// Asks for the last error's code and text.
+    /// Reads the last error's code and text.
     fn why_refused(&mut self, doing: &str) -> Dlpc900Error {
         match self.error_code() {
             Ok(code) => self.refused(doing, code),
@@ -484,7 +487,7 @@ impl<P: HidPort> Dlpc900<P> {
         Dlpc900Error::Refused { doing: doing.to_owned(), code, text, remedy }
     }
 
-    /// What to do about `code`: "not allowed now" has as many remedies as there are states in which nothing can be shown.
+    /// The remedy for `code`: "not allowed now" has as many remedies as there are states in which nothing can be shown.
     fn remedy_for(&mut self, code: u8) -> &'static str {
         if code != 5 {
             return remedy(code);
@@ -502,7 +505,7 @@ impl<P: HidPort> Dlpc900<P> {
     }
 
     fn ask(&mut self, opcode: Opcode) -> Result<Vec<u8>, Dlpc900Error> {
-        // No explanation: asking why the question about errors was refused would not end.
+        // No explanation here: asking why a question about errors was refused would recurse without end.
         self.exchange(opcode, &[], true, &opcode.to_string(), false)
     }
 
@@ -512,7 +515,7 @@ impl<P: HidPort> Dlpc900<P> {
         data.first().copied().ok_or_else(|| short(Opcode::ERROR_CODE, &data, 1))
     }
 
-    /// The last error in the controller's words.
+    /// The last error as the controller's text.
     pub fn error_text(&mut self) -> Result<String, Dlpc900Error> {
         let data = self.ask(Opcode::ERROR_TEXT)?;
         let text = data.split(|b| *b == 0).next().unwrap_or_default();
@@ -524,7 +527,7 @@ impl<P: HidPort> Dlpc900<P> {
         data.first().copied().ok_or_else(|| short(opcode, &data, 1))
     }
 
-    /// One look at everything.
+    /// Reads the whole status.
     pub fn status(&mut self) -> Result<Status, Dlpc900Error> {
         Ok(Status {
             firmware: self.firmware,
@@ -537,7 +540,7 @@ impl<P: HidPort> Dlpc900<P> {
         })
     }
 
-    /// Does `steps` in order and stops at the first that fails.
+    /// Executes `steps` in order and stops at the first that fails.
     pub fn run(
         &mut self,
         steps: &[Step<'_>],
@@ -570,7 +573,7 @@ impl<P: HidPort> Dlpc900<P> {
                     }
                 }
                 Step::WaitReady(time) => {
-                    // While it wakes it may not answer at all.
+                    // While the controller wakes up it may not answer at all.
                     let ready =
                         self.wait(*time, |d| Ok(d.byte(Opcode::HARDWARE_STATUS).is_ok_and(|s| s & 1 != 0)))?;
                     if !ready {
@@ -582,7 +585,7 @@ impl<P: HidPort> Dlpc900<P> {
         Ok(())
     }
 
-    /// Looks until `done` or until `most` has passed.
+    /// Polls until `done` or until `most` has passed.
     fn wait(
         &mut self,
         most: Duration,
@@ -623,14 +626,15 @@ impl<P: HidPort> Dlpc900<P> {
             data.extend_from_slice(&(chunk.len() as u16).to_le_bytes());
             data.extend_from_slice(chunk);
             self.go_on()?;
-            // No acknowledgement: asking for one was seen to corrupt the decompression. The cable's own flow control paces us.
+            // No acknowledgement: requesting one was seen to corrupt the decompression. The cable's own flow control
+            // sets the pace.
             let turn = Arc::clone(&self.turn);
             let held = turn.lock().unwrap_or_else(PoisonError::into_inner);
             self.send(load, &data, false, false, &doing)?;
             drop(held);
             sent(chunk.len());
         }
-        // The data were not acknowledged, so ask once how they were taken.
+        // The data were not acknowledged, so ask once whether they were accepted.
         match self.error_code()? {
             0 => Ok(()),
             code => Err(self.refused(&doing, code)),
@@ -651,24 +655,24 @@ impl<P: HidPort> Dlpc900<P> {
         self.run(&sequence.upload(leds, self.firmware), progress)
     }
 
-    /// Sets video patterns up and starts them.
+    /// Sets up video patterns and starts them.
     pub fn start_video_patterns(&mut self, video: &VideoPatterns) -> Result<(), Dlpc900Error> {
         self.load_video_patterns(video)?;
         self.start()
     }
 
-    /// Sets video patterns up; they are then loaded and stopped.
+    /// Sets up video patterns; they are then loaded and stopped.
     pub fn load_video_patterns(&mut self, video: &VideoPatterns) -> Result<(), Dlpc900Error> {
         let steps = video.steps(self.firmware).map_err(SequenceError::from)?;
         self.run(&steps, &mut |_| ())
     }
 
-    /// Brings the controller out of every state in which it shows nothing whatever it is told: standby, parked mirrors, and the 50/50
-    /// exercise, which every run ends in and which must last three seconds. True when it was in one of them. The table must be sent
-    /// afterwards.
+    /// Brings the controller out of every state in which it shows nothing whatever the commands: standby, parked
+    /// mirrors, and the 50/50 exercise, which every run ends in and which must last three seconds. True if it was in
+    /// one of them. The table must be sent afterwards.
     ///
     /// # Errors
-    /// The cable's, and the controller's.
+    /// Those of the cable and of the controller.
     pub fn make_ready(&mut self) -> Result<bool, Dlpc900Error> {
         let mut rested = false;
         if self.byte(Opcode::POWER_MODE)? & 1 != 0 {
@@ -681,7 +685,7 @@ impl<P: HidPort> Dlpc900<P> {
         }
         let exercises = match self.byte(Opcode::DMD_IDLE) {
             Ok(byte) => byte & 1 != 0,
-            // A firmware that does not tell may well exercise them, and leaving what was not entered does nothing.
+            // If the firmware does not report it, assume the exercise: leaving it when it is not active does nothing.
             Err(Dlpc900Error::Refused { .. }) => true,
             Err(e) => return Err(e),
         };
@@ -715,15 +719,15 @@ impl<P: HidPort> Dlpc900<P> {
         self.run(&sequence::pause(), &mut |_| ())
     }
 
-    /// Mirrors into the 50/50 exercise, LEDs off.
+    /// Puts the mirrors into the 50/50 exercise, LEDs off.
     pub fn idle(&mut self) -> Result<(), Dlpc900Error> {
         let mode = DisplayMode::from_byte(self.byte(Opcode::DISPLAY_MODE)?).unwrap_or(DisplayMode::Video);
         self.run(&sequence::idle(mode, self.firmware), &mut |_| ())
     }
 
-    /// Out of the exercise after at least three seconds of it.
+    /// Leaves the exercise, after at least three seconds of it.
     pub fn leave_idle(&mut self) -> Result<(), Dlpc900Error> {
-        // When it began is not known here: wait as if it were now.
+        // The start of the exercise is unknown here: wait as if it were now.
         self.run(&sequence::leave_idle(Duration::ZERO), &mut |_| ())
     }
 
@@ -732,17 +736,17 @@ impl<P: HidPort> Dlpc900<P> {
         self.run(&sequence::park(), &mut |_| ())
     }
 
-    /// Frees the mirrors; the sequence must be uploaded again.
+    /// Unparks the mirrors; the sequence must be uploaded again.
     pub fn unpark(&mut self) -> Result<(), Dlpc900Error> {
         self.run(&sequence::unpark(), &mut |_| ())
     }
 
-    /// Into standby, as must happen before power is cut.
+    /// Enters standby, which must happen before power is cut.
     pub fn standby(&mut self) -> Result<(), Dlpc900Error> {
         self.run(&sequence::standby(), &mut |_| ())
     }
 
-    /// Out of standby.
+    /// Leaves standby.
     pub fn wake(&mut self) -> Result<(), Dlpc900Error> {
         self.run(&sequence::wake(self.firmware), &mut |_| ())
     }

@@ -1,7 +1,9 @@
-//! The pattern table: an entry into its 12 bytes and back, the DMDs' timing tables, and the rules an entry must keep.
+//! The pattern table: encodes and decodes an entry of 12 bytes, and holds the DMDs' timing tables and the rules for
+//! entries.
 //!
-//! The rules stand here once: the driver checks a sequence before it sends anything and names the entry and the rule, the
-//! emulator answers with the controller's error code of the same rule. \[DLPU018 tables 2-102, 2-103, section 2.4.4.3.5\]
+//! The rules are defined only here. The driver checks a sequence before it sends anything, and names the entry and the
+//! rule. The emulator answers with the controller's error code for the same rule.
+//! \[DLPU018 tables 2-102, 2-103, section 2.4.4.3.5\]
 
 use crate::planes::Raster;
 
@@ -13,7 +15,7 @@ pub const MAX_TIME_US: u32 = 0xff_ffff;
 pub const IMAGE_PLANES: usize = 24;
 /// Images that the controller holds for patterns on the fly (indices 0 to 17).
 pub const MAX_IMAGES: usize = 18;
-/// Black that the controller appends to a pattern standing before a triggered one, microseconds.
+/// Black that the controller appends to a pattern before a triggered one, microseconds.
 pub const TRIGGER_BLACK_US: u32 = 105;
 
 /// The mirror array behind the controller.
@@ -32,7 +34,7 @@ pub enum Dmd {
 }
 
 impl Dmd {
-    /// All of them.
+    /// All DMDs.
     pub const ALL: [Self; 5] = [Self::Dlp6500, Self::Dlp9000, Self::Dlp670s, Self::Dlp500yx, Self::Dlp5500];
 
     /// From the first byte of the hardware reply (0x0206); `None` for 0, unknown, and numbers without a meaning.
@@ -192,7 +194,8 @@ pub struct LutEntry {
     pub depth: u8,
     /// LEDs lit, see [`led`]; 0 is none.
     pub leds: u8,
-    /// Mirrors go off after the exposure. Heeded for 1-bit patterns with an external trigger only; others always go off.
+    /// Mirrors go off after the exposure. Effective only for 1-bit patterns with an external trigger; others always go
+    /// off.
     pub clear_after: bool,
     /// Starts only at a TRIG_IN1 edge.
     pub wait_trigger: bool,
@@ -221,7 +224,7 @@ impl LutEntry {
         }
     }
 
-    /// The 12 bytes of command 0x1A34. Numbers beyond their fields are cut: [`validate`] refuses them first.
+    /// The 12 bytes of command 0x1A34. Numbers beyond their fields are truncated: [`validate`] refuses them first.
     pub const fn encode(&self) -> [u8; ENTRY_BYTES] {
         let (i, e, d) =
             (self.index.to_le_bytes(), self.exposure_us.to_le_bytes(), self.dark_us.to_le_bytes());
@@ -233,7 +236,7 @@ impl LutEntry {
         [i[0], i[1], e[0], e[1], e[2], options, d[0], d[1], d[2], more, place[0], place[1]]
     }
 
-    /// Reads the 12 bytes of command 0x1A34; any bytes mean some entry.
+    /// Reads the 12 bytes of command 0x1A34; any bytes are a valid entry.
     pub const fn decode(b: &[u8; ENTRY_BYTES]) -> Self {
         let place = u16::from_le_bytes([b[10], b[11]]);
         Self {
@@ -268,12 +271,12 @@ pub enum Rule {
         /// The number found.
         found: u16,
     },
-    /// Depth that this DMD does not show.
+    /// Depth that this DMD does not support.
     Depth {
         /// The depth found.
         depth: u8,
     },
-    /// Exposure below what the depth takes to load.
+    /// Exposure below the load time of the depth.
     ExposureTooShort {
         /// The exposure found, microseconds.
         exposure_us: u32,
@@ -282,7 +285,7 @@ pub enum Rule {
         /// The least, microseconds.
         least_us: u32,
     },
-    /// Exposure or dark time above 24 bits, or a dark time with which the whole does not fit.
+    /// Exposure or dark time above 24 bits, or a dark time that makes the sum too long.
     TimeTooLong {
         /// The time found, microseconds.
         time_us: u32,
@@ -383,7 +386,7 @@ impl core::fmt::Display for LutError {
 
 impl core::error::Error for LutError {}
 
-/// What a table is checked against.
+/// The limits for a table.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Limits {
     /// The DMD.
@@ -394,7 +397,7 @@ pub struct Limits {
     pub frame_us: Option<u64>,
 }
 
-/// The rule that one entry breaks, if any; `place` is where it stands in the table.
+/// The rule that one entry breaks, if any; `place` is its position in the table.
 pub fn check_entry(place: usize, e: &LutEntry, limits: &Limits) -> Result<(), Rule> {
     if usize::from(e.index) != place {
         return Err(Rule::Index { found: e.index });
@@ -424,7 +427,7 @@ pub fn check_entry(place: usize, e: &LutEntry, limits: &Limits) -> Result<(), Ru
     Ok(())
 }
 
-/// Checks a whole table; the first entry that breaks a rule is named.
+/// Checks a whole table; the error names the first entry that breaks a rule.
 pub fn validate(entries: &[LutEntry], limits: &Limits) -> Result<(), LutError> {
     let fail = |entry, rule| Err(LutError { entry, rule });
     if entries.is_empty() {

@@ -1,8 +1,9 @@
-//! TI DLPC900 (LightCrafter 6500 / 9000 and relatives): patterns into the controller's HID commands.
+//! TI DLPC900 (LightCrafter 6500 / 9000 and relatives): shows patterns through the controller's HID commands.
 //!
-//! Reading order: [`command`] is the byte codec (`no_std`), [`lut`] the pattern table and its timing rules (`no_std`), `image` the
-//! 24-plane image format, `sequence` the order in which the controller wants things, `driver` what a program calls, `usb` the cable.
-//! Facts: TI DLPU018 (programmer's guide), DLPS037 (data sheet), DLPT028 (errata).
+//! Reading order: [`command`] is the byte codec (`no_std`), [`lut`] the pattern table and its timing rules (`no_std`),
+//! `image` the 24-plane image format, `sequence` the order in which the controller expects things, `driver` the
+//! interface for programs, `usb` the cable. Facts: TI DLPU018 (programmer's guide), DLPS037 (data sheet), DLPT028
+//! (errata).
 
 pub mod command;
 #[cfg(feature = "std")]

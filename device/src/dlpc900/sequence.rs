@@ -1,8 +1,8 @@
-//! What is to be shown into the steps that the controller wants, in the order that it wants them.
+//! Turns patterns into the steps that the controller expects, in the order that it expects.
 //!
-//! Patterns on the fly: stop, LEDs off, display mode, every LUT entry, LUT configuration (which makes the entries effective), images
-//! with the last one first, LEDs on, start. Steps are plain values, so their order can be looked at without a device.
-//! \[DLPU018 sections 2.4.4 and 3; DLPT028 for the block lock of firmware 4.0.0 to 5.0.0\]
+//! Patterns on the fly: stop, LEDs off, display mode, every LUT entry, LUT configuration (which makes the entries
+//! effective), images with the last one first, LEDs on, start. Steps are plain values, so their order can be inspected
+//! without a device. \[DLPU018 sections 2.4.4 and 3; DLPT028 for the block lock of firmware 4.0.0 to 5.0.0\]
 
 use std::fmt;
 use std::time::Duration;
@@ -57,7 +57,7 @@ impl fmt::Display for Version {
     }
 }
 
-/// One thing to do.
+/// One step.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub enum Step<'a> {
     /// A command with its data, to be acknowledged.
@@ -90,7 +90,8 @@ pub enum Repeat {
 }
 
 impl Repeat {
-    /// The u32 of the LUT configuration. Revision F of the guide counts passes, revision J (firmware 6) patterns; 0 is for ever.
+    /// The u32 of the LUT configuration. Revision F of the guide counts passes, revision J (firmware 6) patterns; 0
+    /// means without end.
     pub fn number(self, entries: usize, firmware: Version) -> u32 {
         match self {
             Self::Forever => 0,
@@ -103,7 +104,7 @@ impl Repeat {
 /// An image for both controllers.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct ImagePair {
-    /// Whole DMD, or its left half where there are two controllers.
+    /// Whole DMD, or its left half if there are two controllers.
     pub primary: EncodedImage,
     /// Right half.
     pub secondary: Option<EncodedImage>,
@@ -118,13 +119,13 @@ pub struct PatternSequence {
     repeat: Repeat,
 }
 
-/// Why patterns make no sequence.
+/// Why patterns cannot form a sequence.
 #[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
 pub enum SequenceError {
     /// An entry breaks a rule.
     #[error(transparent)]
     Lut(#[from] LutError),
-    /// Planes make no image.
+    /// Planes cannot form an image.
     #[error("image {image}: {source}")]
     Image {
         /// Which image.
@@ -163,7 +164,7 @@ pub struct Pattern<'a> {
     pub leds: u8,
     /// Waits for a TRIG_IN1 edge.
     pub wait_trigger: bool,
-    /// Gives no pulse on TRIG_OUT2.
+    /// No pulse on TRIG_OUT2.
     pub no_trigger_out2: bool,
 }
 
@@ -175,7 +176,7 @@ impl<'a> Pattern<'a> {
     }
 }
 
-/// Puts patterns into images of 24 planes and makes their LUT entries.
+/// Packs patterns into images of 24 planes and makes their LUT entries.
 #[derive(Clone, Debug)]
 pub struct SequenceBuilder<'a> {
     dmd: Dmd,
@@ -189,7 +190,7 @@ impl<'a> SequenceBuilder<'a> {
         Self { dmd, entries: Vec::new(), images: Vec::new() }
     }
 
-    /// Appends a pattern. Its planes stand side by side in one image; rules are checked when the sequence is finished.
+    /// Appends a pattern. Its planes are adjacent in one image; rules are checked when the sequence is finished.
     pub fn push(&mut self, pattern: &Pattern<'a>) {
         let depth = pattern.planes.len();
         let fits = self.images.last().is_some_and(|i| i.len() + depth <= IMAGE_PLANES);
@@ -213,7 +214,7 @@ impl<'a> SequenceBuilder<'a> {
         planes.extend_from_slice(&pattern.planes);
     }
 
-    /// Checks the rules and encodes the images. `compression` `None` takes the smallest.
+    /// Checks the rules and encodes the images. With `compression` `None`, uses the smallest encoding.
     pub fn finish(
         self,
         repeat: Repeat,
@@ -255,7 +256,7 @@ pub fn leds_off() -> Step<'static> {
     write(Opcode::LED_ENABLE, &[LEDS_OFF])
 }
 
-/// Pauses the sequencer; [`start`] goes on from there.
+/// Pauses the sequencer; [`start`] resumes it.
 pub fn pause() -> Vec<Step<'static>> {
     vec![write(Opcode::START_STOP, &[1])]
 }
@@ -265,7 +266,7 @@ pub fn start() -> Vec<Step<'static>> {
     vec![write(Opcode::START_STOP, &[2])]
 }
 
-/// LED currents and polarity; `None` leaves what is set.
+/// LED currents and polarity; `None` keeps the present setting.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub struct LedSetup {
     /// Currents R, G, B as the driver board counts them.
@@ -275,7 +276,7 @@ pub struct LedSetup {
 }
 
 impl LedSetup {
-    /// Current, polarity, then enable by the sequencer: never lit before the current is right.
+    /// Current, polarity, then enable by the sequencer: no LED is lit before its current is right.
     fn steps(&self) -> Vec<Step<'static>> {
         let mut steps = Vec::new();
         steps.extend(self.current.map(|c| write(Opcode::LED_CURRENT, &c)));
@@ -285,14 +286,14 @@ impl LedSetup {
     }
 }
 
-/// A mode switch, dark, with the park cycle that firmware with the block lock needs after it.
+/// A mode switch in the dark, with the park cycle that firmware with the block lock needs after it.
 fn switch_mode(mode: DisplayMode, firmware: Version) -> Vec<Step<'static>> {
     let mut steps = vec![write(Opcode::DISPLAY_MODE, &[mode as u8])];
     steps.extend(unlock_blocks(firmware));
     steps
 }
 
-/// Park and unpark where the firmware locks mirror blocks; nothing elsewhere.
+/// Parks and unparks if the firmware locks mirror blocks; else nothing.
 pub fn unlock_blocks(firmware: Version) -> Vec<Step<'static>> {
     if firmware.locks_blocks() {
         vec![write(Opcode::DMD_PARK, &[1]), write(Opcode::DMD_PARK, &[0])]
@@ -367,7 +368,7 @@ impl PatternSequence {
     }
 }
 
-/// Which video input feeds video-pattern mode.
+/// The video input for video-pattern mode.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 #[repr(u8)]
 pub enum Receiver {
@@ -385,7 +386,7 @@ pub enum Receiver {
 pub struct VideoPatterns {
     /// The DMD.
     pub dmd: Dmd,
-    /// Where the video comes in.
+    /// The video input.
     pub receiver: Receiver,
     /// Frames per second of the video, at most 120.
     pub frame_hz: u32,
@@ -415,7 +416,8 @@ impl VideoPatterns {
     }
 }
 
-/// Into the 50/50 mirror exercise: stopped, LEDs off by hand (they were seen to stay on otherwise), out of video mode.
+/// Enters the 50/50 mirror exercise: stopped, LEDs off by hand (otherwise they were seen to stay on), out of video
+/// mode.
 pub fn idle(mode: DisplayMode, firmware: Version) -> Vec<Step<'static>> {
     let mut steps = stop();
     steps.push(write(Opcode::LED_ENABLE, &[LEDS_OFF]));
@@ -426,7 +428,7 @@ pub fn idle(mode: DisplayMode, firmware: Version) -> Vec<Step<'static>> {
     steps
 }
 
-/// Out of the exercise, not before it has lasted [`IDLE_LEAST`]: `lasted` is how long it has.
+/// Leaves the exercise, but not before [`IDLE_LEAST`]: `lasted` is how long it has lasted.
 pub fn leave_idle(lasted: Duration) -> Vec<Step<'static>> {
     let mut steps = Vec::new();
     if lasted < IDLE_LEAST {
@@ -437,7 +439,7 @@ pub fn leave_idle(lasted: Duration) -> Vec<Step<'static>> {
     steps
 }
 
-/// Mirrors parked, LEDs off.
+/// Parks the mirrors, LEDs off.
 pub fn park() -> Vec<Step<'static>> {
     let mut steps = stop();
     steps.push(write(Opcode::LED_ENABLE, &[LEDS_OFF]));
@@ -445,12 +447,12 @@ pub fn park() -> Vec<Step<'static>> {
     steps
 }
 
-/// Mirrors free again. The table must be sent again afterwards.
+/// Unparks the mirrors. The table must be sent again afterwards.
 pub fn unpark() -> Vec<Step<'static>> {
     vec![write(Opcode::DMD_PARK, &[0]), write(Opcode::LED_ENABLE, &[LEDS_BY_SEQUENCER])]
 }
 
-/// What must precede a loss of power; the mirrors are safe [`STANDBY_TIME`] later.
+/// Must precede a loss of power; the mirrors are safe [`STANDBY_TIME`] later.
 pub fn standby() -> Vec<Step<'static>> {
     let mut steps = stop();
     steps.push(write(Opcode::LED_ENABLE, &[LEDS_OFF]));
@@ -458,7 +460,7 @@ pub fn standby() -> Vec<Step<'static>> {
     steps
 }
 
-/// Back from standby.
+/// Leaves standby.
 pub fn wake(firmware: Version) -> Vec<Step<'static>> {
     let mut steps = vec![write(Opcode::POWER_MODE, &[0]), Step::WaitReady(Duration::from_secs(5))];
     steps.extend(unlock_blocks(firmware));
@@ -555,7 +557,7 @@ mod tests {
         assert_eq!(opcodes(&steps[..7]), [0x1a24, 0x1a07, 0x1a01, 0x1a00, 0x1a1b, 2, 0x1a1b]);
         assert_eq!(steps[4], Step::Write(Opcode::DISPLAY_MODE, vec![0]));
         assert_eq!(steps[6], Step::Write(Opcode::DISPLAY_MODE, vec![2]));
-        // The LEDs last; what starts the sequence is the caller's.
+        // The LEDs come last; the caller starts the sequence.
         assert_eq!(steps.last(), Some(&Step::Write(Opcode::LED_ENABLE, vec![LEDS_BY_SEQUENCER])));
         assert!(!steps.contains(&Step::Write(Opcode::START_STOP, vec![2])));
         v.entries[23].exposure_us = 1500;

@@ -16,10 +16,10 @@ pub const PRODUCT: u16 = 0xc900;
 /// The udev rule that lets the user at the seat open the device.
 pub const UDEV_RULE: &str =
     r#"SUBSYSTEM=="usb", ATTR{idVendor}=="0451", ATTR{idProduct}=="c900", TAG+="uaccess""#;
-/// Right after plugging in, the kernel may not be done with the interface.
+/// Right after plugging in, the kernel may still use the interface.
 const CLAIM_PATIENCE: Duration = Duration::from_millis(500);
 
-/// Which of several controllers is meant: bus and address as `lsusb` prints them.
+/// Selects one of several controllers: bus and address as `lsusb` prints them.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct UsbPlace {
     /// Bus number.
@@ -35,7 +35,7 @@ impl std::fmt::Display for UsbPlace {
     }
 }
 
-/// The controller at `place` in words: vendor, product, device file where it is known.
+/// Describes the controller at `place`: vendor, product, and the device file if it is known.
 pub fn describe(place: Option<UsbPlace>) -> String {
     let at = place.map_or(String::new(), |p| format!(" at {p}"));
     format!("DLPC900 ({VENDOR:04x}:{PRODUCT:04x}){at}")
@@ -80,9 +80,9 @@ fn error(e: rusb::Error) -> PortError {
     }
 }
 
-/// Where every DLPC900 is plugged in.
+/// The places of all DLPC900.
 pub fn list() -> Result<Vec<UsbPlace>, PortError> {
-    // Without any USB there is no context, and certainly no device.
+    // Without USB there is no context, and certainly no device.
     let Ok(context) = Context::new() else { return Ok(Vec::new()) };
     let devices = context.devices().map_err(error)?;
     Ok(devices
@@ -96,7 +96,7 @@ fn is_dlpc900(d: &Device<Context>) -> bool {
     d.device_descriptor().is_ok_and(|d| (d.vendor_id(), d.product_id()) == (VENDOR, PRODUCT))
 }
 
-/// The interface to use with its endpoints: of the HID interfaces the one with the lowest number that has both.
+/// The interface to use and its endpoints: of the HID interfaces with both endpoints, the one with the lowest number.
 fn pick(device: &Device<Context>) -> Result<(u8, u8, u8), PortError> {
     let configuration =
         device.active_config_descriptor().or_else(|_| device.config_descriptor(0)).map_err(error)?;
@@ -131,7 +131,7 @@ impl UsbHid {
         let (interface, endpoint_out, endpoint_in) = pick(&device)?;
         let handle = device.open().map_err(error)?;
         match handle.set_auto_detach_kernel_driver(true) {
-            // Systems without kernel drivers to detach need none detached.
+            // Some systems have no kernel driver to detach.
             Ok(()) | Err(rusb::Error::NotSupported) => {}
             Err(e) => return Err(error(e)),
         }
@@ -150,8 +150,8 @@ impl UsbHid {
     }
 }
 
-/// The same open device from another thread. libusb's calls may come from any thread, and a transfer is with the kernel before libusb
-/// waits for it.
+/// The same open device for another thread. libusb's calls may come from any thread, and libusb submits a transfer to
+/// the kernel before it waits for it.
 struct UsbSecondLine {
     handle: Arc<DeviceHandle<Context>>,
     endpoint_out: u8,
@@ -175,7 +175,7 @@ impl HidPort for UsbHid {
     fn write_report(&mut self, report: &[u8; REPORT_BYTES], timeout: Duration) -> Result<(), PortError> {
         let write = |h: &DeviceHandle<Context>, e: u8| h.write_interrupt(e, report, timeout);
         let sent = match write(&self.handle, self.endpoint_out) {
-            // A halted endpoint took nothing: clear it once and send again.
+            // A halted endpoint accepted nothing: clear it once and send again.
             Err(rusb::Error::Pipe) => {
                 self.handle.clear_halt(self.endpoint_out).map_err(error)?;
                 write(&self.handle, self.endpoint_out)
@@ -206,7 +206,7 @@ impl HidPort for UsbHid {
 
 impl Drop for UsbHid {
     fn drop(&mut self) {
-        // Gives the interface back; a device that has gone has nothing to give back to.
+        // Returns the interface; if the device is gone, there is nothing to return.
         let _ = self.handle.release_interface(self.interface);
     }
 }

@@ -1,9 +1,10 @@
-//! One plane into fewer bytes and back: runs of equal bytes, alone or of the difference to the plane before.
+//! Compresses one plane and decompresses it: runs of equal bytes, of the plane itself or of its difference from the
+//! previous plane.
 //!
-//! The decoder takes its input in any pieces and needs three bytes of state, so firmware can decode while a packet arrives. The output is
-//! always exactly as long as the plane: docs/PROTOCOL.md section 8 has the tokens.
+//! The decoder takes its input in any pieces and needs three bytes of state, so firmware can decode while a packet
+//! arrives. The output is always exactly as long as the plane. Section 8 of docs/PROTOCOL.md lists the tokens.
 
-/// Longest literal or run that one byte announces.
+/// Longest literal or run that a one-byte token announces.
 const SHORT: usize = 127;
 /// Longest literal or run of a token.
 const LONG: usize = 128 + u16::MAX as usize;
@@ -28,15 +29,15 @@ impl core::fmt::Display for CodecError {
 
 impl core::error::Error for CodecError {}
 
-/// Bytes that are looked at together. Runs shorter than this stay literal: one more token costs the decoder more time than its few bytes
-/// cost the cable.
+/// Bytes that are compared at once. Shorter runs stay literal: one more token costs the decoder more time than its few
+/// bytes cost the cable.
 const WORD: usize = 8;
-/// Bytes that are copied at once where there is room for them, however few are meant.
+/// Bytes that are copied at once where there is room, even if fewer are needed.
 const BLOCK: usize = 16;
 
-/// Writes `plane` as RLE into `out`; the number of bytes, or `None` when they do not fit. Give `out` the length below which the
-/// result is worth having: the encoder stops as soon as it is exceeded. Every run of 11 bytes is found, of the shorter ones those that fill a
-/// word of eight at a multiple of four from where the last one ended.
+/// Writes `plane` as RLE into `out`. Returns the number of bytes, or `None` if they do not fit. Give `out` the length
+/// below which the result is worthwhile: the encoder stops as soon as it is exceeded. It finds every run of 11 bytes.
+/// Of the shorter runs it finds those that fill a word of eight at a multiple of four from the end of the last one.
 pub fn rle_encode(plane: &[u8], out: &mut [u8]) -> Option<usize> {
     let mut at = 0;
     let mut literal_from = 0;
@@ -59,7 +60,7 @@ pub fn rle_encode(plane: &[u8], out: &mut [u8]) -> Option<usize> {
 /// The first run worth a token in `bytes` from `from` on.
 fn next_run(bytes: &[u8], from: usize) -> Option<core::ops::Range<usize>> {
     let mut at = from;
-    // Noise has no runs: four words, two overlapping ones of each eight bytes, are judged before anything is decided.
+    // Noise has no runs: four words, in pairs of overlapping words of eight bytes, are tested before a decision.
     while let Some(block) = bytes.get(at..at + 2 * WORD + 4) {
         if uniform(block, 0) | uniform(block, 4) | uniform(block, 8) | uniform(block, 12) {
             break;
@@ -118,12 +119,12 @@ fn put_token(n: usize, kind: u8, out: &mut [u8], at: usize) -> Option<usize> {
     }
 }
 
-/// Writes the first `len` of `bytes` as they are.
+/// Writes the first `len` of `bytes` literally.
 fn put_literal(bytes: &[u8], len: usize, out: &mut [u8], mut at: usize) -> Option<usize> {
     if let (1..=BLOCK, Some(block), Some(to)) =
         (len, bytes.first_chunk::<BLOCK>(), out.get_mut(at..at + 1 + BLOCK))
     {
-        // Most are short: one block is copied, and what is too much of it is written over by the next token.
+        // Most literals are short: one block is copied, and the next token overwrites the excess.
         to[0] = (len - 1) as u8;
         to[1..].copy_from_slice(block);
         return Some(at + 1 + len);
@@ -222,8 +223,8 @@ impl RleDecoder {
         Ok(())
     }
 
-    /// Decodes a short token at once where payload and plane go on for a block behind it: the bytes used of `rest`. `None`: nothing
-    /// was done.
+    /// Decodes a short token in one step if payload and plane continue for at least a block after it. Returns the
+    /// number of bytes of `rest` that it used; `None` if it did nothing.
     #[inline]
     fn short(&mut self, token: u8, rest: &[u8], plane: &mut [u8]) -> Option<usize> {
         if !matches!(self.expect, Expect::Token) {
@@ -237,14 +238,14 @@ impl RleDecoder {
             let mask = u128::MAX >> (8 * (BLOCK - n));
             *to = (u128::from_le_bytes(*to) ^ (u128::from_le_bytes(block) & mask)).to_le_bytes();
         } else {
-            // What is too much of it is written over by the next token, or the plane is not full and not believed.
+            // The next token overwrites the excess; without one the plane is not full, and counts as damaged.
             *to = block;
         }
         self.at += n;
         Some(if run { 1 } else { n })
     }
 
-    /// The payload is over: an error unless it described the whole plane of `plane_bytes`.
+    /// Call at the end of the payload: an error unless it described the whole plane of `plane_bytes`.
     pub const fn finish(&self, plane_bytes: usize) -> Result<(), CodecError> {
         if matches!(self.expect, Expect::Token) && self.at == plane_bytes {
             Ok(())
@@ -301,7 +302,7 @@ mod tests {
         assert_eq!(decode(&golden, 10, plane.len()), Ok(plane.clone()));
         // A run of five is not worth a token of its own.
         assert_eq!(encode(&plane), [7, 1, 2, 3, 0x77, 0x77, 0x77, 0x77, 0x77, 0xff, 0xac, 0x00, 0x00]);
-        // One of eleven always is, wherever it lies, and the three tokens of any length around it.
+        // A run of eleven always gets one, wherever it lies, and the three tokens of any length around it.
         for before in 0..40 {
             let plane =
                 [vec![9; before], (0..before as u8).collect(), vec![0x77; 11], vec![1, 2, 3]].concat();

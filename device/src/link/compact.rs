@@ -1,10 +1,11 @@
-//! A frame's planes into what has to be sent of them: nothing for a plane that did not change, else the shortest of raw, RLE, XOR + RLE
-//! and LZ4.
+//! Decides what to send of each plane of a frame: nothing for a plane that did not change, else the shortest of raw,
+//! RLE, XOR + RLE and LZ4.
 //!
-//! Trying every codec on every plane would cost more than it saves: each plane keeps the codec that won last time and the others
-//! are tried again every [`RETRIAL`] frames, staggered so that a frame's cost stays even. A codec that takes the host longer has to save more.
-//! LZ4 takes several times longer than all else here, so it stands back until the medium refuses frames, and then serves the planes where it saves
-//! most, as many as half a frame's time allows: a cable that is fast enough is never slowed down by the processor.
+//! Trying every codec on every plane would cost more than it saves. So each plane keeps the codec that won last time,
+//! and the others are tried again every [`RETRIAL`] frames, staggered so that the cost per frame stays even. A codec
+//! that takes the host longer has to save more bytes. LZ4 takes several times longer than all others here. It is
+//! therefore used only when the medium refuses frames, and then for the planes where it saves most, as many as half a
+//! frame's time allows. So the processor never slows down a cable that is fast enough.
 
 use lz4_flex::block::{compress_into_with_table, get_maximum_output_size, CompressTable};
 
@@ -16,7 +17,7 @@ use crate::planes::{Raster, MAX_PLANES};
 const RETRIAL: u32 = 16;
 /// Frames for which a refusal of the medium is remembered.
 const REMEMBERED: u32 = 64;
-/// Time that LZ4 is supposed to take for a byte, nanoseconds; measured on noisy planes, 0.4 to 1 on one core of 2020.
+/// Assumed time of LZ4 per byte, nanoseconds; measured on noisy planes: 0.4 to 1 on one core of 2020.
 const LZ4_NS_PER_BYTE: i64 = 1;
 
 /// What to send of one plane.
@@ -30,24 +31,24 @@ pub(super) enum PlaneForm {
     Coded(Codec, usize),
 }
 
-/// Keeps the frame sent before and the codec that each plane likes. Allocates only in [`Compactor::new`].
+/// Keeps the previously sent frame and the best codec of each plane. Allocates only in [`Compactor::new`].
 pub(super) struct Compactor {
     plane_bytes: usize,
     codecs: u32,
-    /// The planes of the frame sent before.
+    /// The planes of the previously sent frame.
     before: Vec<u8>,
     coded: Vec<u8>,
     difference: Vec<u8>,
     scratch: Vec<u8>,
     table: CompressTable,
     favourite: [Codec; MAX_PLANES],
-    /// Bytes that LZ4 saved over the next best when it was tried last.
+    /// Bytes that LZ4 saved over the next best codec in its last trial.
     lz4_saves: [usize; MAX_PLANES],
     /// Planes of a frame that LZ4 has time for.
     lz4_planes: usize,
     /// Frames for which the medium still counts as the bottleneck.
     pressed: u32,
-    /// Bit k: plane k's favourite was chosen with a base frame at hand.
+    /// Bit k: plane k's best codec was chosen while a base frame was available.
     tried_base: u32,
     frames: u32,
     /// Bit k: plane k differs from the frame sent before.
@@ -61,7 +62,7 @@ impl std::fmt::Debug for Compactor {
 }
 
 impl Compactor {
-    /// For frames of `planes` planes every `frame_ns` nanoseconds; `codecs` is the mask of those allowed.
+    /// For frames of `planes` planes every `frame_ns` nanoseconds; `codecs` is the mask of the permitted codecs.
     pub(super) fn new(raster: Raster, planes: usize, frame_ns: i64, codecs: u32) -> Self {
         let plane_bytes = raster.plane_bytes();
         let lz4_ns = LZ4_NS_PER_BYTE * plane_bytes as i64;
@@ -87,17 +88,17 @@ impl Compactor {
         }
     }
 
-    /// Narrows the codecs to those that the device reads, too.
+    /// Restricts the codecs to those that the device decodes too.
     pub(super) fn restrict(&mut self, codecs: u32) {
         self.codecs &= codecs | Codec::Raw.mask();
     }
 
-    /// The medium had no room for a frame: fewer bytes are worth more of the host's time.
+    /// The medium had no room for a frame: saving bytes is now worth more of the host's time.
     pub(super) fn refused(&mut self) {
         self.pressed = REMEMBERED;
     }
 
-    /// Chooses the form of every plane of `planes`. Without `has_base` no plane refers to the frame before.
+    /// Chooses the form of every plane of `planes`. Without `has_base` no plane refers to the previous frame.
     pub(super) fn compact(&mut self, planes: &[u8], has_base: bool) -> [PlaneForm; MAX_PLANES] {
         let mut forms = [PlaneForm::Raw; MAX_PLANES];
         self.frames = self.frames.wrapping_add(1);
@@ -126,7 +127,7 @@ impl Compactor {
                 && match codec {
                     Codec::XorRle => has_base && (trial || codec == favourite),
                     Codec::Lz4 => lz4 && (trial || codec == favourite),
-                    // What a favourite that cannot be had now falls back on.
+                    // The fallback while the best codec is unavailable.
                     _ => trial || codec == favourite || (codec_waits(favourite, has_base, lz4)),
                 };
             let Some(below) = best.1.checked_sub(self.plane_bytes / worth(codec)).filter(|_| usable) else {
@@ -151,8 +152,8 @@ impl Compactor {
         }
     }
 
-    /// True when LZ4 may be used on plane `k`: it is all there is, or the medium is the bottleneck and the plane one of those where it saves
-    /// most.
+    /// True when LZ4 may be used on plane `k`: it is the only codec, or the medium is the bottleneck and the plane is
+    /// one of those where it saves most.
     fn has_time_for_lz4(&self, k: usize, trial: bool) -> bool {
         if self.codecs & (Codec::Rle.mask() | Codec::XorRle.mask()) == 0 {
             return true;
@@ -192,7 +193,7 @@ impl Compactor {
         &self.coded[k * self.plane_bytes..][..n]
     }
 
-    /// The frame that was compacted last went out: it is what the next one refers to.
+    /// The frame that was compacted last was sent: the next frame refers to it.
     pub(super) fn sent(&mut self, planes: &[u8]) {
         let pairs = self.before.chunks_exact_mut(self.plane_bytes).zip(planes.chunks_exact(self.plane_bytes));
         for (k, (before, plane)) in pairs.enumerate() {
@@ -203,12 +204,13 @@ impl Compactor {
     }
 }
 
-/// True when a plane that likes `favourite` cannot have it now.
+/// True when a plane whose best codec is `favourite` cannot use it now.
 fn codec_waits(favourite: Codec, has_base: bool, lz4: bool) -> bool {
     (favourite == Codec::XorRle && !has_base) || (favourite == Codec::Lz4 && !lz4)
 }
 
-/// A codec must save this part of a plane over what takes less time than it: over the plane itself, and each over the one before it.
+/// A codec must save this fraction of a plane compared with any cheaper form: compared with the raw plane, and each
+/// codec compared with the one before it.
 const fn worth(codec: Codec) -> usize {
     match codec {
         Codec::Raw | Codec::Rle => 32,

@@ -1,4 +1,4 @@
-//! Laws of compaction: what is chosen decodes to the plane, is worth it, and costs what it may.
+//! Laws of compaction: the chosen form decodes to the plane, is worth its time, and stays within its cost limits.
 
 use super::*;
 use crate::link::codec::RleDecoder;
@@ -36,7 +36,7 @@ fn decoded(c: &Compactor, k: usize, form: PlaneForm, plane: &[u8], base: &[u8]) 
     out
 }
 
-/// Frames of the four kinds of planes: still, dark with something moving, half new, noise, periodic.
+/// Frames with all kinds of planes: still, dark with something moving, half new, noise, periodic.
 fn frame(raster: Raster, n: u64) -> Vec<u8> {
     let bytes = raster.plane_bytes();
     let mut dark = vec![0; bytes];
@@ -55,7 +55,7 @@ fn every_form_is_the_plane_and_the_right_one() {
         let mut base = vec![0; 5 * bytes];
         for n in 0..60 {
             let planes = frame(raster, n);
-            // A medium that is slow in the second half, and a frame now and then that does not get through.
+            // A medium that is slow in the second half, and now and then a frame that does not get through.
             if n >= 30 {
                 c.refused();
             }
@@ -97,12 +97,12 @@ fn every_form_is_the_plane_and_the_right_one() {
 fn lz4_takes_at_most_half_a_frames_time_and_goes_where_it_saves_most() {
     let raster = Raster::new(1024, 768).unwrap();
     let bytes = raster.plane_bytes();
-    // Half of 1.056 ms at the supposed speed is five planes of 98,304 bytes.
+    // Half of 1.056 ms at the assumed speed is five planes of 98,304 bytes.
     let mut c = Compactor::new(raster, 8, FAST_NS, Codec::ALL);
     assert_eq!(c.lz4_planes, 5);
     let mut at_most = 0;
     for n in 0..40 {
-        // Every plane is periodic up to a length of its own: the first ones least.
+        // Every plane is periodic up to a different length: the first ones least.
         let planes: Vec<u8> = (0..8)
             .flat_map(|k| {
                 let long = bytes / 4 + k * bytes / 16;

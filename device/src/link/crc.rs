@@ -1,4 +1,4 @@
-//! Bytes into CRC-32C (Castagnoli), the checksum of every header and payload on the link.
+//! CRC-32C (Castagnoli), the checksum of every header and payload on the link.
 //!
 //! Reflected polynomial 0x82F63B78, initial value and final XOR 0xFFFFFFFF \[RFC3720\] B.4. With the feature `std` the
 //! processor's own instruction is used through the crate `crc32c`; firmware gets a 1 KiB table. Both give the same value.

@@ -1,30 +1,32 @@
-//! A stream of bytes, cut anywhere and damaged anyhow, into packets.
+//! Finds packets in a stream of bytes that may be cut anywhere and damaged in any way.
 //!
-//! Keeps 40 bytes of state and no payload: payload bytes go straight from the caller's slice to the [`PacketSink`], so a plane
-//! is copied once. A header counts only when its own checksum is right, so a damaged length never swallows the stream.
+//! The decoder keeps 40 bytes of state and no payload. Payload bytes go straight from the caller's slice to the
+//! [`PacketSink`], so a plane is copied once. A header counts only if its own checksum is right, so a damaged length
+//! never swallows the stream.
 
 use super::crc::crc32c_append;
 use super::header::{trailer_bytes, u32_at, Header, HeaderError, HEADER_BYTES, MAGIC};
 
-/// Payload bytes checksummed and handed on in one step: small enough that the sink reads them from the first-level cache.
+/// Payload bytes that are checksummed and passed on in one step: few enough that the sink reads them from the
+/// first-level cache.
 const BLOCK_BYTES: usize = 16 * 1024;
 
 /// Receives what a [`Decoder`] finds. Calls come as `begin`, then any number of `payload`, then `end`.
 pub trait PacketSink {
-    /// A header with a right checksum. Return `false` to have the payload passed over: neither `payload` nor `end` follow.
+    /// A header with a right checksum. Return `false` to skip the payload: neither `payload` nor `end` follow.
     fn begin(&mut self, header: &Header) -> bool;
-    /// The next bytes of the payload, not yet known to be right.
+    /// The next bytes of the payload, not yet verified.
     fn payload(&mut self, bytes: &[u8]);
-    /// The packet is complete; `intact` tells whether the payload's checksum is right.
+    /// The packet is complete; `intact` says whether the payload's checksum is right.
     fn end(&mut self, intact: bool);
 }
 
-/// What a [`Decoder`] has seen since it was made. All wrap at 2^32.
+/// Counters of a [`Decoder`] since it was made. All wrap at 2^32.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub struct DecoderCounters {
     /// Packets with a right header, wanted or not.
     pub packets: u32,
-    /// Places that began like a packet and whose header checksum was wrong.
+    /// Places that began like a packet but whose header checksum was wrong.
     pub header_errors: u32,
     /// Packets whose payload checksum was wrong.
     pub payload_errors: u32,
@@ -83,13 +85,13 @@ impl Decoder {
         }
     }
 
-    /// What was seen so far.
+    /// The counters so far.
     pub const fn counters(&self) -> DecoderCounters {
         self.counters
     }
 
-    /// Forgets a half-received packet: the medium says that a new transfer begins here. A sink that was told of the packet's
-    /// beginning is told of its end as not intact.
+    /// Drops a half-received packet, because a new transfer begins here on the medium. A sink that received the
+    /// packet's beginning receives its end as not intact.
     pub fn reset(&mut self, sink: &mut impl PacketSink) {
         match self.state {
             State::Hunting => {
@@ -132,7 +134,7 @@ impl Decoder {
         &bytes[take..]
     }
 
-    /// A full buffer into a packet's beginning, or into fewer bytes that may still begin one.
+    /// Turns a full buffer into a packet's beginning, or shortens it to the bytes that may still begin one.
     fn header(&mut self, sink: &mut impl PacketSink) {
         match Header::decode(&self.buffer) {
             Ok(header) => {
@@ -151,7 +153,7 @@ impl Decoder {
                 if error == HeaderError::Checksum {
                     self.counters.header_errors = self.counters.header_errors.wrapping_add(1);
                 }
-                // Steps of one byte: a medium that keeps words aligned finds the same packets in steps of four.
+                // Steps of one byte. On a medium that keeps words aligned, steps of four find the same packets.
                 let next = (1..HEADER_BYTES)
                     .find(|&at| {
                         let n = (HEADER_BYTES - at).min(MAGIC.len());
@@ -281,7 +283,7 @@ mod tests {
             prop_assert_eq!(decoder.counters().bytes_skipped as usize, noise);
         }
 
-        /// Any bytes at all: no panic, and every byte is either in a packet or counted as skipped or still held.
+        /// Any bytes: no panic, and every byte is in a packet, counted as skipped, or still held.
         #[test]
         fn any_bytes_are_survived(
             pieces in prop::collection::vec(
@@ -299,7 +301,7 @@ mod tests {
             let total: usize = pieces.iter().map(Vec::len).sum();
             let c = decoder.counters();
             prop_assert!(c.bytes_skipped as usize + sink.done.len() * HEADER_BYTES <= total);
-            // After garbage of any kind the stream is found again: within the longest payload that a header could claim.
+            // After any garbage the decoder resynchronises within the longest payload that a header could claim.
             decoder.reset(&mut sink);
             sink.open = None;
             sink.done.clear();

@@ -1,9 +1,9 @@
-//! Mean light of the whole field, slot by slot, into the decision whether it flashes more than eyes and brains should bear.
+//! Decides from the mean light of the whole field, slot by slot, whether it flashes more than is safe for people.
 //!
-//! A flash is a pair of opposing changes of the field's luminance by a tenth of full or more, the darker below 0.8 of full; more than
-//! three in a second can cause seizures \[WCAG22\] 2.3.1, \[BT1702\]. What changes faster than the eye follows does not count: luminance is
-//! averaged over a sixtieth of a second first, so alternating frames at 947 Hz are steady light and a beat at 10 Hz is not.
-//! Both ends of the link run the same limiter.
+//! A flash is a pair of opposing changes of the field's luminance by a tenth of full or more, with the darker side
+//! below 0.8 of full. More than three in a second can cause seizures \[WCAG22\] 2.3.1, \[BT1702\]. Changes that are too
+//! fast for the eye do not count: luminance is averaged over a sixtieth of a second first, so alternating frames at 947
+//! Hz are steady light and a beat at 10 Hz is not. Both ends of the link run the same limiter.
 
 use crate::planes::{Channel, PlaneSchedule, Raster};
 use crate::time::FrameRate;
@@ -16,17 +16,17 @@ const STEP: u32 = FULL_LUMINANCE / 10;
 const DARK_SIDE: u32 = FULL_LUMINANCE * 8 / 10;
 /// Most flashes a second that the standards allow.
 pub const MAX_FLASHES_PER_S: u8 = 3;
-/// Most flashes a second that there can be at all in averages over a sixtieth of a second.
+/// Most flashes a second that are possible in averages over a sixtieth of a second.
 pub const HIGHEST_LIMIT: u8 = 30;
-/// After it struck, light stays off for this long: the dark itself must not become a flash.
+/// Light stays off for this long after the limiter has acted: the dark itself must not become a flash.
 pub const REST_US: u32 = 2_000_000;
-/// Rows of a plane that are counted; more do not change a mean that matters.
+/// Rows of a plane that are counted; more rows change the mean only insignificantly.
 const ROWS: u32 = 32;
 
 /// Mean luminance of a frame, 0 to [`FULL_LUMINANCE`], from evenly spaced rows of its planes. Channel weights are those of Rec. 709.
 ///
 /// # Panics
-/// When `planes` has not the size that raster and schedule demand.
+/// When `planes` does not have the size that raster and schedule demand.
 pub fn mean_luminance(raster: Raster, schedule: &PlaneSchedule, planes: &[u8]) -> u32 {
     let (plane_bytes, row_bytes) = (raster.plane_bytes(), raster.row_bytes());
     assert!(planes.len() == plane_bytes * schedule.len(), "bytes of planes");
@@ -54,17 +54,17 @@ pub fn mean_luminance(raster: Raster, schedule: &PlaneSchedule, planes: &[u8]) -
     (light * u64::from(FULL_LUMINANCE) / full).min(u64::from(FULL_LUMINANCE)) as u32
 }
 
-/// Counts flashes. Feed it every slot once, in order.
+/// Counts flashes. Must observe every slot once, in order.
 #[derive(Clone, Debug)]
 pub struct FlashLimiter {
     slots_per_window: u32,
     windows_per_s: u32,
-    /// Opposing changes within a second that are still allowed: two a flash.
+    /// Opposing changes that are allowed within a second: two per flash.
     allowed: usize,
     sum: u64,
     in_window: u32,
     window: u32,
-    /// Lowest or highest window mean since the last change, and where the next change leads.
+    /// Lowest or highest window mean since the last change, and the direction of that change.
     extreme: u32,
     rising: Option<bool>,
     /// Windows of the last changes, oldest overwritten.
@@ -75,7 +75,7 @@ pub struct FlashLimiter {
 impl FlashLimiter {
     /// For slots of `rate`; `limit` flashes a second, 1 to [`HIGHEST_LIMIT`] (clamped), are allowed.
     pub fn new(rate: FrameRate, limit: u8) -> Self {
-        // Even, so that a light that alternates from slot to slot averages out exactly.
+        // Even, so that light that alternates from slot to slot averages out exactly.
         let slots = rate.num() / rate.den().saturating_mul(60).max(1);
         let slots_per_window = if slots > 1 { slots & !1 } else { 1 };
         let per_s = rate.num().div_ceil(rate.den()).div_ceil(slots_per_window).max(1);
@@ -93,15 +93,15 @@ impl FlashLimiter {
         }
     }
 
-    /// As [`FlashLimiter::new`], with a flash of margin: for a device behind a host that limits, too. The host is the first to strike,
-    /// and the darkness that it orders is a change more.
+    /// As [`FlashLimiter::new`], with a margin of one flash: for a device behind a host that limits too. The host must
+    /// act first, and the darkness that it orders is one more change.
     pub fn backstop(rate: FrameRate, limit: u8) -> Self {
         let limiter = Self::new(rate, limit);
         Self { allowed: (limiter.allowed + 2).min(limiter.changes.len() - 1), ..limiter }
     }
 
-    /// The light of the next slot (0 when dark). `true` when with it there were more flashes in the last second than allowed: the
-    /// light must go off and stay off for [`REST_US`].
+    /// Observes the light of the next slot (0 when dark). Returns `true` if this slot makes more flashes in the last
+    /// second than allowed: the light must go off and stay off for [`REST_US`].
     pub fn observe(&mut self, luminance: u32) -> bool {
         self.sum += u64::from(luminance.min(FULL_LUMINANCE));
         self.in_window += 1;
@@ -114,7 +114,7 @@ impl FlashLimiter {
         self.changed(mean) && self.too_many()
     }
 
-    /// Starts anew after a rest, from the dark.
+    /// Restarts after a rest, from the dark.
     pub fn reset(&mut self) {
         (self.sum, self.in_window, self.extreme, self.count) = (0, 0, 0, 0);
         self.rising = None;
@@ -125,7 +125,7 @@ impl FlashLimiter {
         let up = mean >= self.extreme.saturating_add(STEP) && self.extreme < DARK_SIDE;
         let down = self.extreme >= mean.saturating_add(STEP) && mean < DARK_SIDE;
         match self.rising {
-            // In the direction of the last change the extreme moves along.
+            // In the direction of the last change the extreme follows the mean.
             Some(true) if mean > self.extreme => self.extreme = mean,
             Some(false) if mean < self.extreme => self.extreme = mean,
             Some(true) if down => return self.note(mean, false),
@@ -163,7 +163,7 @@ mod tests {
         FrameRate::new(947, 1).unwrap()
     }
 
-    /// Slots until the limiter strikes within `seconds` of a light that follows `f` (time in seconds to luminance 0..1).
+    /// Time until the limiter acts, within `seconds` of a light that follows `f` (time in seconds to luminance 0..1).
     fn strikes(seconds: f64, f: impl Fn(f64) -> f64) -> Option<f64> {
         let mut limiter = FlashLimiter::new(rate(), MAX_FLASHES_PER_S);
         (0..(seconds * 947.0) as u64)

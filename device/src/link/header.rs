@@ -1,4 +1,4 @@
-//! One packet's 32-byte header, and a header with a payload into the three pieces that go on the wire.
+//! The 32-byte header of a packet, and the three pieces of a packet on the wire.
 
 use super::crc::crc32c;
 use crate::time::DeviceTicks;
@@ -66,7 +66,7 @@ impl MessageType {
     }
 }
 
-/// How the payload of a PLANE packet is written.
+/// The encoding of a PLANE payload.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Hash)]
 #[repr(u8)]
 pub enum Codec {
@@ -107,7 +107,7 @@ impl Codec {
 pub struct Header {
     /// What the packet carries.
     pub kind: MessageType,
-    /// How a PLANE payload is written.
+    /// Encoding of a PLANE payload.
     pub codec: Codec,
     /// Index of the plane in the configured order (PLANE only).
     pub plane: u8,
@@ -170,7 +170,7 @@ impl Header {
     /// The 32 bytes on the wire.
     ///
     /// # Panics
-    /// When the payload is longer than the length field can say: a mistake of the caller, never of the input.
+    /// When the payload is longer than the length field can express: an error of the caller, never of the input.
     pub fn encode(&self) -> [u8; HEADER_BYTES] {
         assert!(self.payload_bytes as usize <= MAX_PAYLOAD_BYTES, "payload of {} bytes", self.payload_bytes);
         let mut b = [0u8; HEADER_BYTES];
@@ -238,7 +238,7 @@ pub const fn packet_bytes(payload_bytes: usize) -> usize {
     HEADER_BYTES + payload_bytes + trailer_bytes(payload_bytes)
 }
 
-/// A packet ready to send: the payload stays where it is, so a transport may gather instead of copying.
+/// A packet ready to send. The payload is borrowed, so a transport may gather instead of copying.
 #[derive(Clone, Copy, Debug)]
 pub struct Packet<'a> {
     header: [u8; HEADER_BYTES],
@@ -263,8 +263,8 @@ impl<'a> Packet<'a> {
         Self { header, payload, trailer, trailer_len: trailer_len as u8 }
     }
 
-    /// Exactly these bytes, unchecked: a packet that is damaged, cut short or of another version, to see what its receiver does. Of
-    /// `trailer` at most eight bytes are sent.
+    /// Exactly these bytes, unchecked, to test how a receiver treats a packet that is damaged, cut short or of another
+    /// version. At most eight bytes of `trailer` are sent.
     pub fn from_raw(header: [u8; HEADER_BYTES], payload: &'a [u8], trailer: &[u8]) -> Self {
         let mut bytes = [0u8; 8];
         let n = trailer.len().min(bytes.len());

@@ -1,7 +1,8 @@
-//! The host's half of the conversation: whole frames and wishes into packets, the device's packets into state.
+//! The host's half of the link protocol: turns whole frames and requests into packets, and the device's packets into
+//! state.
 //!
-//! [`HostLink::poll`] moves it along: HELLO, CONFIG, and after an explicit [`HostLink::arm`] ARM, each repeated until the device
-//! confirms. It never waits; time is an argument. Nothing is allocated after [`HostLink::new`].
+//! [`HostLink::poll`] advances the handshake: HELLO, CONFIG, and after an explicit [`HostLink::arm`] ARM, each repeated
+//! until the device confirms it. It never blocks; time is an argument. Nothing is allocated after [`HostLink::new`].
 
 mod frames;
 mod inbox;
@@ -29,13 +30,13 @@ pub use types::{
 
 /// An unanswered request is repeated after this long.
 const RETRY_NS: i64 = 20_000_000;
-/// A lost medium is tried this often.
+/// Interval between attempts to reopen a lost medium.
 const REOPEN_NS: i64 = 100_000_000;
-/// Echoes of the first second of a session come this fast, to learn the clock soon.
+/// Interval of the first echoes of a session, which are frequent so that the clock is known soon.
 const FAST_ECHO_NS: i64 = 2_000_000;
 /// Number of fast echoes.
 const FAST_ECHOES: u32 = 16;
-/// How long the answer to a clock exchange is worth waiting for closely.
+/// How long the caller should poll closely for the answer to a clock exchange.
 const ECHO_AWAITED_NS: i64 = 5_000_000;
 /// Detail of a refused ARM: CONFIG has not arrived.
 const ARM_BEFORE_CONFIG: u16 = 1;
@@ -59,31 +60,31 @@ pub struct HostLink {
     frames_sent: u32,
     last_frame: Option<u32>,
     flash: Option<FlashLimiter>,
-    /// What is left of the light that may be made.
+    /// Counts the light against the limits.
     light: LightCount,
-    /// While light rests by itself: when that ends, and why it does.
+    /// While the host keeps the projector dark because of a limit: the end of this rest, and its reason.
     rest: Option<(HostTime, DropReason)>,
-    /// What [`HostLink::command`] ordered last and [`HostLink::arm`] has not taken back.
+    /// The last order of [`HostLink::command`] that [`HostLink::arm`] has not withdrawn.
     ordered: Option<Verb>,
     /// `None` when only raw planes are sent.
     compactor: Option<Compactor>,
-    /// The next frame must not refer to another.
+    /// The next frame must not refer to another frame.
     key_due: bool,
-    /// Frames that the device had lost when a key frame was last asked for.
+    /// The device's count of lost frames when a key frame was last requested.
     losses: u32,
     counters: LinkCounters,
 }
 
-/// Long before any instant that a caller may pass.
+/// Earlier than any instant that a caller may pass.
 const NEVER: HostTime = HostTime(i64::MIN);
 
 impl HostLink {
-    /// A closed link whose sessions are numbered by the operating system. Its buffers are all it will ever allocate.
+    /// A closed link with session numbers from the operating system. It allocates all its buffers here.
     pub fn new(settings: LinkSettings) -> Self {
         Self::with_sessions(settings, SessionNumbers::from_system())
     }
 
-    /// As [`HostLink::new`], with session numbers of another source, for tests that must repeat byte for byte.
+    /// As [`HostLink::new`], with session numbers from another source, for tests that must repeat byte for byte.
     pub fn with_sessions(settings: LinkSettings, sessions: SessionNumbers) -> Self {
         let compactor = (settings.codecs & !Codec::Raw.mask() != 0).then(|| {
             let frame_ns = settings.rate.slot_len_ns(0);
@@ -118,7 +119,7 @@ impl HostLink {
         }
     }
 
-    /// Opens a new session, with a number of its own, with the next [`HostLink::poll`]; an old one, and its light, end.
+    /// Opens a new session with a new number at the next [`HostLink::poll`]. An old session, and its light, end.
     pub fn connect(&mut self) {
         self.counters.sessions += 1;
         self.inbox.open(self.sessions.draw());
@@ -148,7 +149,7 @@ impl HostLink {
         if matches!(self.state, LinkState::Ready | LinkState::Faulted | LinkState::Streaming) {
             self.inbox.fault = None;
             self.state = LinkState::Arming;
-            // Disarming made the device forget what frames could refer to.
+            // When it was disarmed, the device dropped the frames that others could refer to.
             self.key_due = true;
         }
     }
@@ -158,7 +159,7 @@ impl HostLink {
         self.rest.is_some_and(|(end, _)| now < end)
     }
 
-    /// The limit on light for which light rests now.
+    /// The limit on light that caused the present rest.
     pub fn resting_for(&self) -> Option<LimitReached> {
         match self.rest {
             Some((_, DropReason::LightLimit(limit))) => Some(limit),
@@ -166,16 +167,16 @@ impl HostLink {
         }
     }
 
-    /// Sends `verb` now and again every 20 ms until the device confirms it. An order to be dark (all but FREEZE) goes before everything that
-    /// waits on the medium, and until it is confirmed no frame is sent. While an order that forbids more is not confirmed (SAFE, then
-    /// STOP, then BLACK, then FREEZE) that one is sent again in its place.
+    /// Sends `verb` now, and repeats it every 20 ms until the device confirms it. An order to go dark (all but FREEZE)
+    /// overtakes everything that waits on the medium, and until it is confirmed no frame is sent. While a stronger
+    /// order is unconfirmed (SAFE, then STOP, then BLACK, then FREEZE), that order is sent again instead.
     pub fn command(
         &mut self,
         now: HostTime,
         verb: Verb,
         transport: &mut dyn Transport,
     ) -> Result<(), SendError> {
-        // Whoever asked for dark or stillness decides when it ends.
+        // The light returns when the operator says so, not when a rest ends.
         self.rest = None;
         let given = self.give(now, verb, transport);
         self.ordered = self.verb;
@@ -185,7 +186,7 @@ impl HostLink {
     /// Sends `verb` until the device confirms it.
     fn give(&mut self, now: HostTime, verb: Verb, transport: &mut dyn Transport) -> Result<(), SendError> {
         let verb = self.verb.filter(|pending| pending.strength() > verb.strength()).unwrap_or(verb);
-        // Only once for an order: thrown away again, one that is on a slow line would never arrive.
+        // Flush only once per order: on a slow line, repeated flushes would discard the order itself each time.
         if verb.is_dark() && self.verb != Some(verb) {
             transport.flush_output();
         }
@@ -197,9 +198,10 @@ impl HostLink {
         self.control(now, &verb.message(), transport)
     }
 
-    /// Receives what has arrived, takes the next step of the handshake, keeps the device's watchdog fed. Call at least once a
-    /// frame slot, with a `now` that was read just before. On an error of the handshake the link is [`LinkState::Closed`] (ARM refused: [`LinkState::Faulted`]); when the medium fails, the error is
-    /// returned once and the link is [`LinkState::Lost`] until it is back.
+    /// Reads the input, takes the next step of the handshake, and keeps the device's watchdog fed. Call at least once
+    /// per frame slot, with a `now` that was read immediately before. On an error of the handshake the link becomes
+    /// [`LinkState::Closed`] (ARM refused: [`LinkState::Faulted`]). If the medium fails, the error is returned once,
+    /// and the link is [`LinkState::Lost`] until the medium is back.
     pub fn poll(&mut self, now: HostTime, transport: &mut dyn Transport) -> Result<LinkState, LinkError> {
         let result = self.step(now, transport);
         if matches!(result, Err(LinkError::Transport(_))) && self.state != LinkState::Closed {
@@ -218,7 +220,7 @@ impl HostLink {
             if transport.reopen().is_err() {
                 return Ok(self.state);
             }
-            // A new session: the picture comes back when the caller arms, after the dark.
+            // A new session is dark: the picture returns when the caller arms.
             self.connect();
         }
         self.receive(now, transport)?;
@@ -226,7 +228,7 @@ impl HostLink {
             return Ok(self.state);
         }
         if std::mem::take(&mut self.inbox.device_forgot) && self.state != LinkState::Greeting {
-            // Only HELLO helps; the caller decides about light again.
+            // Only a new HELLO helps; the caller decides whether to arm again.
             self.connect();
         }
         if self.rest.is_some_and(|(end, _)| now >= end) && self.state == LinkState::Streaming {
@@ -237,7 +239,8 @@ impl HostLink {
             }
         }
         self.advance(transport)?;
-        // After what has arrived was read: where a medium stamps with the poll's `now`, no answer may be older than its question.
+        // Runs after the input was read: where a medium stamps with the poll's `now`, no answer may be older than its
+        // question.
         self.exchange_clocks(now, transport)?;
         self.request(now, transport)?;
         Ok(self.state)
@@ -294,7 +297,8 @@ impl HostLink {
             (L::Configuring, D::Configured | D::Armed) => L::Ready,
             (L::Arming, D::Armed) => L::Streaming,
             (L::Streaming | L::Ready, D::Faulted) => L::Faulted,
-            // Latched faults hide whether it is configured: CONFIG must be under way before an ARM can follow it.
+            // Latched faults hide whether the device is configured, so CONFIG must have been sent before an ARM can
+            // follow it.
             (L::Configuring, D::Faulted) if self.requested_at != NEVER => L::Faulted,
             (L::Streaming | L::Faulted, D::Configured) => L::Ready,
             (state, _) => state,
@@ -331,7 +335,7 @@ impl HostLink {
         }
     }
 
-    /// What HELLO already shows to be impossible.
+    /// Rejects a configuration that HELLO shows to be impossible.
     fn check(&self, hello: &DeviceHello, transport: &dyn Transport) -> Result<(), LinkError> {
         let device = || transport.name().to_string();
         let s = &self.settings;
@@ -359,7 +363,7 @@ impl HostLink {
         Ok(())
     }
 
-    /// Asks for the device's clock when that is due, which also keeps the watchdog fed.
+    /// Sends a clock exchange when one is due, which also keeps the watchdog fed.
     fn exchange_clocks(&mut self, now: HostTime, transport: &mut dyn Transport) -> Result<(), LinkError> {
         if matches!(self.state, LinkState::Closed | LinkState::Lost | LinkState::Greeting) {
             return Ok(());
@@ -376,7 +380,7 @@ impl HostLink {
         lost(self.control(now, &HostMessage::Echo(echo), transport))
     }
 
-    /// Requests that are due: the next step of the handshake, a verb, a credit repair.
+    /// Sends the requests that are due: the next step of the handshake, a verb, a credit repair.
     fn request(&mut self, now: HostTime, transport: &mut dyn Transport) -> Result<(), LinkError> {
         let due = |last: HostTime, every: i64| is_due(now, last, every);
         if due(self.requested_at, RETRY_NS) {
@@ -428,12 +432,12 @@ impl HostLink {
         (limit.wrapping_sub(self.frames_sent) as i32).max(0) as u32
     }
 
-    /// Progress.
+    /// State of the handshake.
     pub fn state(&self) -> LinkState {
         self.state
     }
 
-    /// What the device said it is, once it answered.
+    /// The device's HELLO, once it answered.
     pub fn device(&self) -> Option<&DeviceHello> {
         self.inbox.hello.as_ref()
     }
@@ -443,12 +447,12 @@ impl HostLink {
         self.inbox.status.as_ref()
     }
 
-    /// When slots begin on the device's clock, once configured.
+    /// The start of each slot on the device's clock, once configured.
     pub fn slots(&self) -> Option<SlotClock> {
         self.slots
     }
 
-    /// What was asked of the device.
+    /// The requested configuration.
     pub fn settings(&self) -> &LinkSettings {
         &self.settings
     }
@@ -468,8 +472,8 @@ impl HostLink {
         }
     }
 
-    /// True while the answer to a clock exchange is under way that began less than 5 ms ago: a caller that polls soon learns the
-    /// device's clock the better.
+    /// True while a clock exchange that began less than 5 ms ago is unanswered: a caller that polls soon gets a more
+    /// precise map of the device's clock.
     pub fn awaits_echo(&self, now: HostTime) -> bool {
         self.echo_sent_at != NEVER
             && self.inbox.echo_answered != self.echo_sent_at
@@ -516,7 +520,7 @@ fn is_due(now: HostTime, last: HostTime, every_ns: i64) -> bool {
     last == NEVER || now.ns_since(last) >= every_ns
 }
 
-/// A busy medium is asked again later; a lost one is an error.
+/// A busy medium is tried again later; a lost one is an error.
 fn lost(sent: Result<(), SendError>) -> Result<(), LinkError> {
     match sent {
         Err(SendError::Failed(e)) => Err(LinkError::Transport(e)),

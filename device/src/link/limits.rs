@@ -1,27 +1,28 @@
-//! The level of each slot into the decision whether the light of the field exceeds what an installation allows: a greatest mean over a
-//! window of time, and a longest time of full white.
+//! Decides from the level of each slot whether the light of the field exceeds the limits of an installation: a greatest
+//! mean over a window of time, and a longest time of full white.
 //!
-//! The level of a frame is the greatest of the mean drives of its colour channels over all mirrors. However the powers of the LEDs
-//! are divided, a field at level `l` emits at most `l` times what it emits in full white, so the limits bound irradiance and not only what
-//! the eye calls bright. Both ends of the link run the same limiter; the host's strikes earlier by the time that its order to
-//! go dark needs ([`LightLimiter::ahead`]), so that the device's never has to. docs/SAFETY.md tells people what the limits do for them.
+//! The level of a frame is the greatest of the mean drives of its colour channels over all mirrors. However the powers
+//! of the LEDs are divided, a field at level `l` emits at most `l` times what it emits in full white. So the limits
+//! bound irradiance, and not only perceived brightness. Both ends of the link run the same limiter. The host's limiter
+//! acts earlier, by the time that its order to go dark needs ([`LightLimiter::ahead`]), so that the device's never has
+//! to. docs/SAFETY.md explains the limits to users.
 
 use super::flash::{FULL_LUMINANCE, REST_US};
 use crate::planes::{Channel, PlaneSchedule, Raster};
 use crate::time::FrameRate;
 
-/// Bins that a window is cut into: a window of as many slots or fewer is summed slot by slot.
+/// Number of bins of a window: a window of at most that many slots is summed slot by slot.
 const BINS: usize = 256;
 /// A slot of at least this level is full white: 95 % of full drive in the strongest channel.
 pub const FULL_WHITE_LEVEL: u32 = FULL_LUMINANCE / 20 * 19;
-/// Full white that was interrupted for less than this part of a second goes on.
+/// An interruption of full white that is shorter than this fraction of a second does not count.
 const PAUSES_PER_S: u32 = 10;
-/// Longest window and longest time of full white that can be asked for, milliseconds (an hour).
+/// Longest window and longest time of full white that CONFIG may request, milliseconds (an hour).
 pub const MAX_LIMIT_MS: u32 = 3_600_000;
-/// Shortest window and shortest time of full white that can be asked for, milliseconds.
+/// Shortest window and shortest time of full white that CONFIG may request, milliseconds.
 pub const MIN_LIMIT_MS: u32 = 500;
 
-/// What the light of a projector must not exceed. CONFIG carries it to the device.
+/// Upper limits on the light of a projector. CONFIG carries them to the device.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub struct LightLimits {
     /// Greatest mean level of the field over [`LightLimits::window_ms`], in thousandths of full white, 1 to 1000; 0 is off.
@@ -61,9 +62,9 @@ impl LightLimits {
         self.mean_permille <= 1000 && mean && (self.full_white_ms == 0 || in_range(self.full_white_ms))
     }
 
-    /// After `limit` was reached, light stays off for this long, microseconds: the length of the window or of the full white that was
-    /// allowed, and never less than [`REST_US`], so that the dark itself is no flash. Nothing of what was counted lies in a window that
-    /// begins afterwards.
+    /// Time for which light stays off after `limit` was reached, microseconds: the length of the window or of the
+    /// permitted full white, and never less than [`REST_US`], so that the dark itself is not a flash. A window that
+    /// begins afterwards contains nothing of what was counted.
     pub fn rest_us(&self, limit: LimitReached) -> u64 {
         let ms = match limit {
             LimitReached::Mean => self.window_ms,
@@ -73,12 +74,12 @@ impl LightLimits {
     }
 }
 
-/// Level of a frame, 0 to [`FULL_LUMINANCE`]: the greatest of the mean drives of red, green and blue over all mirrors, planes of
-/// [`Channel::White`] counting for each. Every row is counted: no pattern hides between samples. Schedules with both white and coloured
-/// planes can reach twice the full level.
+/// Level of a frame, 0 to [`FULL_LUMINANCE`]: the greatest of the mean drives of red, green and blue over all mirrors;
+/// planes of [`Channel::White`] count for each. Every row is counted, so no pattern can hide between samples. Schedules
+/// with both white and coloured planes can reach twice the full level.
 ///
 /// # Panics
-/// When `planes` has not the size that raster and schedule demand.
+/// When `planes` does not have the size that raster and schedule demand.
 pub fn light_level(raster: Raster, schedule: &PlaneSchedule, planes: &[u8]) -> u32 {
     let plane_bytes = raster.plane_bytes();
     assert!(planes.len() == plane_bytes * schedule.len(), "bytes of planes");
@@ -92,7 +93,7 @@ pub fn light_level(raster: Raster, schedule: &PlaneSchedule, planes: &[u8]) -> u
     let white = drive[Channel::White as usize];
     let greatest = drive[..3].iter().map(|d| d + white).fold(0, u64::max);
     let full = raster.pixel_count() as u64 * 255;
-    // Rounded up: a limit is never exceeded by what rounding hides.
+    // Rounded up, so that rounding never hides an excess.
     (greatest * u64::from(FULL_LUMINANCE)).div_ceil(full) as u32
 }
 
@@ -113,12 +114,12 @@ struct Bin {
     greatest: u32,
 }
 
-/// The last slots' levels, in bins.
+/// The levels of the last slots, in bins.
 #[derive(Clone, Debug)]
 struct Mean {
     /// Slots that are summed: the window without `reserve`.
     slots: u64,
-    /// Slots after this one that may be lit like it before an order to go dark is obeyed.
+    /// Number of further slots that may be lit at the same level before an order to go dark takes effect.
     reserve: u64,
     /// Greatest sum of levels over the window and the reserve.
     budget: u64,
@@ -144,8 +145,8 @@ impl Mean {
         }
     }
 
-    /// No less than the sum of the levels of the last `slots` slots. The oldest bin lies in the window with a part of its slots: as much of
-    /// its light as these can have held.
+    /// An upper bound of the sum of the levels of the last `slots` slots. Only part of the oldest bin's slots lie in
+    /// the window; they are assumed to have held as much of its light as they can.
     fn sum(&self) -> u64 {
         let mut sum = self.bins[self.newest].sum;
         let mut left = self.slots.saturating_sub(self.filled);
@@ -165,7 +166,7 @@ impl Mean {
     }
 
     fn add(&mut self, level: u32, mut slots: u64) {
-        // More than a window of the same is as much as a window.
+        // More slots of one level than a window holds count like a window.
         slots = slots.min(self.slots + self.slots_per_bin);
         while slots > 0 {
             if self.filled == self.slots_per_bin {
@@ -182,7 +183,8 @@ impl Mean {
         }
     }
 
-    /// True when a slot of `level`, and as many more as the reserve, keep every window within the budget. `self` is left with it counted.
+    /// Counts a slot of `level`. True if that slot, and as many more as the reserve, keep every window within the
+    /// budget.
     fn takes(&mut self, level: u32) -> bool {
         self.add(level, 1);
         self.sum() + self.reserve * u64::from(level) <= self.budget
@@ -194,9 +196,9 @@ impl Mean {
 struct FullWhite {
     allowed: u64,
     pause: u64,
-    /// Slots from the first of full white to the last.
+    /// Slots from the first to the last one of full white.
     run: u64,
-    /// Slots since the last of full white.
+    /// Slots since the last one of full white.
     since: u64,
 }
 
@@ -225,7 +227,7 @@ impl FullWhite {
     }
 }
 
-/// Counts light against [`LightLimits`]. Feed it every slot once, in order, before the slot is lit.
+/// Counts light against [`LightLimits`]. Must observe every slot once, in order, before the slot is lit.
 #[derive(Clone, Debug)]
 pub struct LightLimiter {
     mean: Option<Mean>,
@@ -233,16 +235,17 @@ pub struct LightLimiter {
 }
 
 impl LightLimiter {
-    /// For a device, which is dark as soon as it wants to be, and slots of `rate`. `None` when nothing is limited, or a value is out of
-    /// its range.
+    /// For a device, which goes dark without delay, and slots of `rate`. `None` if no limit is set, or a value is out
+    /// of its range.
     pub fn new(rate: FrameRate, limits: &LightLimits) -> Option<Self> {
         Self::with_reserve(rate, limits, 0)
     }
 
-    /// As [`LightLimiter::new`] for a host, whose order to go dark takes up to `ahead_ms` to be obeyed: it strikes as soon as light as
-    /// it is now, for so much longer, would exceed a limit. Light that stays at one level within the limit is never struck.
+    /// As [`LightLimiter::new`] for a host, whose order to go dark takes up to `ahead_ms` to be obeyed: it acts as soon
+    /// as light at the present level for that much longer would exceed a limit. It never acts on light that stays at
+    /// one level within the limit.
     pub fn ahead(rate: FrameRate, limits: &LightLimits, ahead_ms: u32) -> Option<Self> {
-        // What the device has in its buffers is shown first.
+        // The device first shows what is in its buffers.
         Self::with_reserve(rate, limits, slots_in(rate, u64::from(ahead_ms)) + 3)
     }
 
@@ -256,10 +259,11 @@ impl LightLimiter {
         })
     }
 
-    /// The level (0 when dark) at which the next slot would be lit. `Some` when that would exceed a limit: the slot must not be lit, and
-    /// light stays off for [`LightLimits::rest_us`], after which [`LightLimiter::reset`] starts anew.
+    /// Observes the level (0 when dark) at which the next slot would be lit. Returns `Some` if that would exceed a
+    /// limit: the slot must not be lit, and light stays off for [`LightLimits::rest_us`]. Then call
+    /// [`LightLimiter::reset`].
     pub fn observe(&mut self, level: u32) -> Option<LimitReached> {
-        // Both count every slot, whichever strikes.
+        // Both must count every slot, whichever acts.
         let mean = self.mean.as_mut().is_none_or(|m| m.takes(level));
         let full = self.full.as_mut().is_none_or(|f| f.takes(level));
         match (mean, full) {
@@ -269,7 +273,8 @@ impl LightLimiter {
         }
     }
 
-    /// Notes that `slots` slots were lit at `level` without a decision: the device repeated a frame. Work does not grow with `slots`.
+    /// Notes that `slots` slots were lit at `level` without a decision, because the device repeated a frame. The work
+    /// does not grow with `slots`.
     pub fn repeated(&mut self, level: u32, slots: u64) {
         if slots == 0 {
             return;
@@ -282,7 +287,7 @@ impl LightLimiter {
         }
     }
 
-    /// Starts anew after a rest, from the dark.
+    /// Restarts after a rest, from the dark.
     pub fn reset(&mut self) {
         if let Some(mean) = &mut self.mean {
             (mean.bins, mean.newest, mean.filled) = ([Bin::default(); BINS + 1], 0, 0);

@@ -1,4 +1,5 @@
-//! Laws of the limits: no window and no stretch of white beyond what is allowed, whatever is shown; nothing struck that stays within.
+//! Laws of the limits: no window and no run of white exceeds what is allowed, for any content; light within the limits
+//! is never cut.
 
 use super::*;
 use proptest::prelude::*;
@@ -9,7 +10,8 @@ fn rate(num: u32, den: u32) -> FrameRate {
     FrameRate::new(num, den).unwrap()
 }
 
-/// What a device would light of `levels`: dark from the slot that would exceed on, for the rest. Also the strikes.
+/// The light that a device makes of `levels`: dark from the slot that would exceed a limit, for the rest. Also returns
+/// the strikes.
 fn lit(
     limiter: &mut LightLimiter,
     rest_slots: usize,
@@ -34,7 +36,7 @@ fn lit(
     (out, strikes)
 }
 
-/// Greatest sum over `window` successive slots, counted the plain way.
+/// Greatest sum over `window` successive slots, counted naively.
 fn greatest_window(levels: &[u32], window: usize) -> u64 {
     let mut sum = 0u64;
     let mut greatest = 0;
@@ -90,7 +92,7 @@ proptest! {
             prop_assert!(strikes.is_empty(), "{strikes:?}");
             prop_assert_eq!(&shown, &levels);
         }
-        // And what is struck did exceed it, up to a bin.
+        // Light that was cut did exceed the limit, up to a bin.
         if let Some(&(slot, limit)) = strikes.first() {
             prop_assert_eq!(limit, LimitReached::Mean);
             prop_assert!(greatest_window(&levels[..=slot], window) + room > budget);
@@ -102,7 +104,7 @@ proptest! {
         let limits = LightLimits { full_white_ms: allowed_ms, ..LightLimits::OFF };
         let r = rate(240, 1);
         let (allowed, pause) = (slots_within(r, u64::from(allowed_ms)), slots_in(r, 100));
-        // Half of the light full, so that there are stretches of it.
+        // Half of the light is full, so that there are runs of it.
         let levels: Vec<u32> = levels.iter().map(|l| if *l > FULL / 3 { FULL } else { *l }).collect();
         let mut limiter = LightLimiter::new(r, &limits).unwrap();
         let (shown, strikes) = lit(&mut limiter, 480, &levels);
@@ -133,12 +135,12 @@ proptest! {
         permille in 50u16..1000,
         late in 0usize..10,
     ) {
-        // The host's order is obeyed `late` slots after the frame that it was given for would have been lit.
+        // The device obeys the host's order `late` slots after the slot of the frame that caused it.
         let limits = LightLimits { mean_permille: permille, window_ms: 1000, full_white_ms: 700 };
         let r = rate(240, 1);
         let mut host = LightLimiter::ahead(r, &limits, 50).unwrap();
         let mut device = LightLimiter::new(r, &limits).unwrap();
-        // What is on the mirrors until the order arrives.
+        // The frame on the mirrors until the order arrives.
         let mut held = 0;
         for (slot, &level) in levels.iter().enumerate() {
             if host.observe(level).is_none() {
@@ -249,7 +251,7 @@ fn values_out_of_range_and_nothing_at_all_make_no_limiter() {
         assert!(!bad.is_valid(), "{bad:?}");
         assert!(LightLimiter::new(rate(947, 1), &bad).is_none(), "{bad:?}");
     }
-    // Long windows at high rates stay in 64 bits, and one slot a second works.
+    // Long windows at high rates fit 64 bits, and one slot a second works.
     let long = LightLimits { mean_permille: 1000, window_ms: MAX_LIMIT_MS, full_white_ms: MAX_LIMIT_MS };
     let mut limiter = LightLimiter::new(rate(100_000, 1), &long).unwrap();
     limiter.repeated(2 * FULL, u64::MAX);

@@ -1,16 +1,16 @@
-//! A running link and some content into what the link carries of it: frames a second, bytes a frame, and what limited them.
+//! Measures a running link with given content: frames a second, bytes a frame, and which side limits them.
 
 use super::host::{HostLink, LinkCounters, LinkError, LinkState, SendOutcome};
 use super::{DropReason, Status};
 use crate::time::{DeviceTicks, HostTime};
 use crate::transport::Transport;
 
-/// What [`measure`] found.
+/// The result of [`measure`].
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct LinkMeasurement {
     /// Length of the measurement, nanoseconds.
     pub duration_ns: i64,
-    /// Frames that the link took.
+    /// Frames that the link accepted.
     pub frames_sent: u64,
     /// Frames that arrived whole.
     pub frames_whole: u64,
@@ -37,9 +37,10 @@ fn whole(s: &Status) -> u32 {
     s.frames_seen.wrapping_sub(s.frames_incomplete)
 }
 
-/// Offers frames as fast as the link takes them for `duration_ns` and counts what arrives. `content` fills the planes of frame
-/// `n`; `clock` is the host's clock; `rest` is called when nothing can be done at once and should wait some ten microseconds. `stop` ends the measurement early, with
-/// what there is. The link must be [`LinkState::Streaming`]; it is left so, unless the device ends it.
+/// Offers frames as fast as the link takes them for `duration_ns`, and counts those that arrive. `content` fills the
+/// planes of frame `n`; `clock` is the host's clock. `rest` is called when nothing can be done at once, and should wait
+/// some ten microseconds. `stop` ends the measurement early, with the results so far. The link must be
+/// [`LinkState::Streaming`], and stays so unless the device ends it.
 ///
 /// # Errors
 /// The link's, from polling.
@@ -71,7 +72,8 @@ pub fn measure(
         link.poll(now, transport)?;
         let device_now = link.status().map_or(DeviceTicks(0), |s| s.now);
         let slot = slots.slot_at(device_now).map_or(0, |k| k + 1);
-        // What is measured is how much arrives: a slow link's late frames are seen for as long as the device would wait for its host.
+        // The measurement counts arrivals, so late frames of a slow link are shown for as long as the device waits for
+        // its host.
         let dark_from = slots.dark_from(slot, u64::from(link.settings().watchdog_us) * 1000);
         match link.send_frame(now, next, slots.start(slot), dark_from, &planes, transport) {
             SendOutcome::Sent => {

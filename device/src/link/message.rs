@@ -1,7 +1,8 @@
-//! Payloads of the control messages into values and back. PLANE payloads are bits and have no structure of their own.
+//! Encodes and decodes the payloads of the control messages. PLANE payloads are bits and have no structure of their
+//! own.
 //!
-//! Every payload has one fixed length (CONFIG grows with its planes); another length is an error, so a wrong build of one side
-//! is noticed at the first message. docs/PROTOCOL.md lists the bytes.
+//! Every payload has one fixed length (that of CONFIG grows with its planes). Another length is an error, so a wrong
+//! build of one side is noticed at the first message. docs/PROTOCOL.md lists the bytes.
 
 mod types;
 
@@ -417,7 +418,8 @@ impl Assembly {
         Some(Self { header: *header, bytes: [0; MAX_CONTROL_BYTES], len: 0 })
     }
 
-    /// The next bytes; what would not fit is ignored (a [`super::Decoder`] never delivers more than the header claimed).
+    /// Adds the next bytes; ignores those that do not fit (a [`super::Decoder`] never delivers more than the header
+    /// claimed).
     pub fn push(&mut self, bytes: &[u8]) {
         let n = bytes.len().min(MAX_CONTROL_BYTES - self.len);
         self.bytes[self.len..self.len + n].copy_from_slice(&bytes[..n]);

@@ -1,8 +1,8 @@
-//! The bit-plane link: planes into packets and back, and the state both sides keep.
+//! The bit-plane link: encodes planes as packets, decodes packets, and keeps the state of both sides.
 //!
 //! Reading order: [`header`](Header) is one packet, [`Decoder`] finds packets in a stream, [`HostMessage`] and
-//! [`DeviceMessage`] are what they say, [`SlotClock`] is when frames are lit; [`HostLink`] is the host's half of the
-//! conversation. Everything but [`HostLink`] is `no_std` without allocation and is meant to be reused by firmware:
+//! [`DeviceMessage`] are their contents, [`SlotClock`] computes when frames are lit; [`HostLink`] is the host's half of
+//! the protocol. Everything but [`HostLink`] is `no_std` without allocation and is meant to be reused by firmware:
 //! docs/PROTOCOL.md is the specification.
 
 mod codec;

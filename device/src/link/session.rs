@@ -1,9 +1,11 @@
-//! Numbers of sessions: new for every connection, so that a device that stayed on never takes one host for another.
+//! Session numbers: a new one for every connection, so that a device that stayed on never mistakes one host for
+//! another.
 
-/// Where a [`HostLink`](super::HostLink) takes the numbers of its sessions from.
+/// The source of the session numbers of a [`HostLink`](super::HostLink).
 ///
-/// A device only answers a HELLO of the session that it has open. A host that used a number again would go on with the frame numbers and
-/// counters of the connection before, and stay dark until its own frame numbers had passed them.
+/// A device only answers a HELLO of the session that is already open. If a host reused a number, the device would
+/// continue with the frame numbers and counters of the previous connection, and would stay dark until the host's own
+/// frame numbers had passed them.
 pub struct SessionNumbers {
     source: Source,
     last: u32,
@@ -20,12 +22,13 @@ impl SessionNumbers {
         Self { source: Source::System, last: 0 }
     }
 
-    /// Numbers that `source` gives, for tests that must repeat. A number that may not be used (0, or the one before) is stepped over.
+    /// Numbers from `source`, for tests that must repeat. It skips a number that may not be used (0, or the previous
+    /// one).
     pub fn from_source(source: impl FnMut() -> u32 + Send + 'static) -> Self {
         Self { source: Source::Injected(Box::new(source)), last: 0 }
     }
 
-    /// The number of the next session: never 0, which means "no session", and never the one before.
+    /// The number of the next session: never 0, which means "no session", and never the previous one.
     pub fn draw(&mut self) -> u32 {
         let drawn = match &mut self.source {
             Source::System => getrandom::u32().unwrap_or_else(|_| without_system()),
@@ -40,7 +43,7 @@ impl SessionNumbers {
     }
 }
 
-/// A number for a system that has no random ones to give: the time, the process and an address, mixed.
+/// A number for a system without a source of randomness: the time, the process and an address, mixed.
 fn without_system() -> u32 {
     use std::hash::{BuildHasher, Hasher};
     let mut hasher = std::hash::RandomState::new().build_hasher();
@@ -65,7 +68,8 @@ mod tests {
     use super::*;
     use std::collections::HashSet;
 
-    /// Found in use, R3 and C1: every process began with the same number, so the second run on a projector that stayed on was dark.
+    /// Found in use, R3 and C1: every process began with the same number, so on a projector that stayed on the second
+    /// run was dark.
     #[test]
     fn numbers_of_the_system_are_new_in_every_link_and_never_0() {
         let mut seen = HashSet::new();

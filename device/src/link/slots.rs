@@ -1,4 +1,4 @@
-//! A frame rate into the device's slots: when, in device ticks, each frame time begins.
+//! Computes from a frame rate when each of the device's slots begins, in device ticks.
 
 use crate::time::{DeviceTicks, FrameRate};
 
@@ -41,8 +41,8 @@ impl SlotClock {
         Some(k as u64)
     }
 
-    /// From when a frame that is planned for slots up to `last` may no longer be lit: the end of that slot plus the longer of
-    /// `keep_ns` nanoseconds (nominal) and three slots. Saturates at the end of the counter.
+    /// The tick from which a frame that is planned for slots up to `last` may no longer be lit: the end of that slot
+    /// plus the longer of `keep_ns` nanoseconds (nominal) and three slots. Saturates at the end of the counter.
     pub const fn dark_from(&self, last: u64, keep_ns: u64) -> DeviceTicks {
         let end = self.start(last.saturating_add(1)).0;
         let ticks = keep_ns as u128 * self.tick_hz as u128 / 1_000_000_000;
@@ -91,7 +91,7 @@ mod tests {
         assert_eq!(clock.start(947 * 86_400).0, 86_400_000_000_007);
     }
 
-    /// Found in use, R1: what ends a frame's light when nobody sends another.
+    /// Found in use, R1: the end of a frame's light when nobody sends another.
     #[test]
     fn light_ends_after_the_longer_of_three_slots_and_the_given_time() {
         let clock = SlotClock::new(DeviceTicks(77), 27_000_000, FrameRate::new(947, 1).unwrap()).unwrap();

@@ -1,24 +1,24 @@
-//! Samples as decoded into samples that may be used: finite, rigid, in capture order, each one once; the rest counted by reason.
+//! Admits decoded samples that may be used: finite, rigid, in capture order, each once. The rest are counted by reason.
 //!
-//! Every [`super::Tracker`] of this project ends in one gate, so that the promises of the trait and the law
-//! *received = used + dropped by reason* have one home.
+//! Every [`super::Tracker`] of this project ends in one gate, which is the only implementation of the trait's
+//! guarantees and of the law *received = used + dropped by reason*.
 
 use super::{BodyIndex, TrackerSample};
 use crate::pose::Pose;
 use crate::time::HostTime;
 
-/// Datagrams or stream messages by what became of them.
+/// Counts of datagrams or stream messages by outcome.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub struct PacketCounters {
     /// All that arrived.
     pub received: u64,
-    /// Understood and acted upon.
+    /// Understood and used.
     pub used: u64,
     /// Not from the configured address.
     pub foreign_source: u64,
     /// From the configured address, but from a port that the server does not send from.
     pub foreign_port: u64,
-    /// Contradicting themselves: lengths, counts, checksums, terminators.
+    /// Inconsistent: lengths, counts, checksums, terminators.
     pub malformed: u64,
     /// Of a version or kind that this client does not speak or did not ask for.
     pub unsupported: u64,
@@ -31,20 +31,20 @@ impl PacketCounters {
     }
 }
 
-/// Samples of single bodies by what became of them.
+/// Counts of samples of single bodies by outcome.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub struct SampleCounters {
     /// All that were decoded.
     pub received: u64,
-    /// Handed on (those marked as not tracked included).
+    /// Passed on (including those marked as not tracked).
     pub used: u64,
     /// Of a body that the rig does not know.
     pub unknown_body: u64,
     /// Already seen: same sequence number and capture instant.
     pub duplicate: u64,
-    /// Captured before one that was already handed on.
+    /// Captured before a sample that was already passed on.
     pub late: u64,
-    /// Of unknown age, because they came before the tracker's clock could be asked: what had waited in a serial port.
+    /// Of unknown age, because they arrived before the first echo: bytes that had waited in a serial port.
     pub unknown_age: u64,
     /// With NaN or infinite numbers.
     pub not_finite: u64,
@@ -67,7 +67,7 @@ impl SampleCounters {
     }
 }
 
-/// What a tracker counted since it was made. Counters only grow.
+/// Counters of a tracker since it was made. Counters only grow.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub struct TrackerCounters {
     /// Packets; all zero for trackers without packets.
@@ -76,9 +76,9 @@ pub struct TrackerCounters {
     pub samples: SampleCounters,
     /// Of the used samples, those that the tracker marked as not seen.
     pub untracked: u64,
-    /// Samples missing by their sequence numbers (gaps up to [`SampleGate::MAX_GAP`]).
+    /// Samples that are missing according to their sequence numbers (gaps up to [`SampleGate::MAX_GAP`]).
     pub lost: u64,
-    /// Sequence or clock of a body started anew.
+    /// Restarts of a body's sequence or clock.
     pub restarts: u64,
     /// Episodes in which a body that had moved repeated the same pose bit for bit.
     pub stuck: u64,
@@ -126,17 +126,18 @@ impl core::fmt::Display for TrackerCounters {
 #[derive(Clone, Copy)]
 struct BodyState {
     last: Option<TrackerSample>,
-    /// Samples in a row captured before `last`, each newer than the one before: a clock that was set back looks like this.
+    /// Consecutive samples captured before `last`, each newer than the previous one: the sign of a clock that was set
+    /// back.
     late_run: u32,
     /// Capture and arrival of the first of them, and capture of the newest.
     late_first: (HostTime, HostTime),
     late_newest: HostTime,
-    /// Equal poses in a row, and whether the pose changed before them.
+    /// Consecutive equal poses, and whether the pose changed before them.
     equal_run: u32,
     was_moving: bool,
 }
 
-/// The gate for a fixed set of bodies. Allocates when made, never afterwards.
+/// The gate for a fixed set of bodies. Allocates only when made.
 pub struct SampleGate {
     bodies: Vec<BodyState>,
     counters: TrackerCounters,
@@ -149,12 +150,12 @@ impl SampleGate {
     pub const NORM_TOLERANCE: f64 = 1e-3;
     /// Largest gap in sequence numbers that counts as loss; a larger one counts as a restart.
     pub const MAX_GAP: u32 = 1000;
-    /// Late samples in a row, each newer than the one before, that reveal a clock set back ...
+    /// Number of consecutive late samples, each newer than the previous one, that reveal a clock set back ...
     pub const RESTART_RUN: u32 = 3;
-    /// ... when nothing else arrived for this long, nanoseconds, and they arrived at least at half of the pace at which they were
-    /// captured. A burst of overtaken packets arrives at once, whatever the tracker's rate.
+    /// ... if nothing else arrived for this long, nanoseconds, and they arrived at at least half of the pace at which
+    /// they were captured. A burst of overtaken packets arrives at once, whatever the tracker's rate.
     pub const RESTART_QUIET_NS: i64 = 20_000_000;
-    /// Equal poses in a row that are called stuck.
+    /// Number of consecutive equal poses that counts as stuck.
     pub const STUCK_RUN: u32 = 10;
 
     /// A gate for bodies `0..bodies`.
@@ -186,13 +187,13 @@ impl SampleGate {
         self.counters.samples.unknown_body += 1;
     }
 
-    /// Counts a sample that cannot be used because nobody knows when it was captured.
+    /// Counts a sample that cannot be used because its time of capture is unknown.
     pub fn count_unknown_age(&mut self) {
         self.counters.samples.received += 1;
         self.counters.samples.unknown_age += 1;
     }
 
-    /// The last sample handed on for `body`.
+    /// The last sample passed on for `body`.
     pub fn last(&self, body: BodyIndex) -> Option<&TrackerSample> {
         self.bodies.get(usize::from(body.0))?.last.as_ref()
     }
@@ -202,15 +203,16 @@ impl SampleGate {
         self.bodies.get(usize::from(body.0)).is_some_and(|b| b.was_moving && b.equal_run >= Self::STUCK_RUN)
     }
 
-    /// Forgets order and sequence (the source was reconnected); counters stay.
+    /// Resets order and sequence (the source was reconnected); counters stay.
     pub fn reconnect(&mut self) {
         for body in &mut self.bodies {
             *body = BodyState { last: None, late_run: 0, equal_run: 0, was_moving: false, ..*body };
         }
     }
 
-    /// The sample to hand on, or `None` when it must not be used; either way it is counted. A handed-on quaternion is of unit
-    /// length; the pose of a sample marked as not tracked is replaced by the last good one, so nobody can act on it by mistake.
+    /// The sample to pass on, or `None` if it must not be used; either way it is counted. Its quaternion has unit
+    /// length. The pose of a sample marked as not tracked is replaced by the last good one, so nobody can use it by
+    /// mistake.
     pub fn admit(&mut self, sample: &TrackerSample) -> Option<TrackerSample> {
         self.counters.samples.received += 1;
         let counters = &mut self.counters;
@@ -251,7 +253,8 @@ impl SampleGate {
                 let arrived_ns = sample.received_at.ns_since(state.late_first.1);
                 let is_burst = arrived_ns < captured_ns / 2;
                 if state.late_run >= Self::RESTART_RUN && is_burst {
-                    // Look for the pace anew from here: what follows a burst must not be measured against its beginning.
+                    // Restart the measurement of the pace here: samples after a burst must not be measured against its
+                    // beginning.
                     (state.late_run, state.late_first) = (1, (sample.captured_at, sample.received_at));
                 }
                 if state.late_run < Self::RESTART_RUN || quiet_ns < Self::RESTART_QUIET_NS {
@@ -261,7 +264,8 @@ impl SampleGate {
                 counters.restarts += 1;
             } else {
                 match sample.sequence.wrapping_sub(last.sequence) {
-                    // Equal numbers with a newer capture: a source that does not count (VRPN) or restarted on the spot.
+                    // Equal numbers with a newer capture: a source without sequence numbers (VRPN), or one that
+                    // restarted at the same number.
                     0 | 1 => {}
                     gap if gap - 1 <= Self::MAX_GAP => counters.lost += u64::from(gap - 1),
                     _ => counters.restarts += 1,
@@ -304,7 +308,7 @@ enum Reason {
     BadRotation,
 }
 
-/// Refuses poses that are no rigid motion within reach, and makes the quaternion's length 1.
+/// Refuses poses that are not a rigid motion within reach, and normalises the quaternion.
 fn check_pose(pose: &mut Pose) -> Result<(), Reason> {
     if pose.position_m.iter().chain(&pose.rotation_xyzw).any(|c| !c.is_finite()) {
         return Err(Reason::NotFinite);
@@ -313,7 +317,7 @@ fn check_pose(pose: &mut Pose) -> Result<(), Reason> {
         return Err(Reason::OutOfReach);
     }
     let norm = pose.rotation_xyzw.iter().map(|c| c * c).sum::<f64>().sqrt();
-    // A huge component makes the norm infinite, which fails the comparison as it should.
+    // A huge component makes the norm infinite, so the comparison fails as it should.
     if (norm - 1.0).abs() <= SampleGate::NORM_TOLERANCE {
         pose.rotation_xyzw = pose.rotation_xyzw.map(|c| c / norm);
         Ok(())
@@ -441,7 +445,7 @@ mod tests {
         assert!(gate.counters().is_conserved());
     }
 
-    /// The matrix of tracker rates: neither what overtaken samples look like nor what a clock set back looks like depends on the rate.
+    /// All tracker rates: the signs of overtaken samples and of a clock set back do not depend on the rate.
     #[test]
     fn a_burst_and_a_clock_set_back_are_told_apart_at_every_rate() {
         for hz in [30, 60, 120, 500, 1000] {

@@ -20,9 +20,9 @@ pub struct BodyIndex(pub u16);
 /// How the rig file names a body to a tracker; a body's index is its place in the list of keys.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct BodyKey {
-    /// Name in the tracking software; used where the tracker tells names.
+    /// Name in the tracking software; used if the tracker sends names.
     pub name: String,
-    /// Number in the tracking software; used where it does not.
+    /// Number in the tracking software; used if it does not.
     pub id: Option<i64>,
 }
 
@@ -33,7 +33,7 @@ pub struct TrackerSample {
     pub body: BodyIndex,
     /// world-from-body.
     pub pose: Pose,
-    /// The tracker's own word that it sees the body; when false the pose means nothing.
+    /// The tracker's own flag that it sees the body; if false, the pose is meaningless.
     pub tracked: bool,
     /// The tracker's mean marker error, metres; 0 when it gives none.
     pub mean_error_m: f32,
@@ -56,19 +56,19 @@ pub enum TrackerError {
         /// The operating system's error.
         source: std::io::Error,
     },
-    /// The other side speaks something else.
+    /// The other side speaks another protocol.
     #[error("{0}")]
     Protocol(String),
 }
 
-/// A source of poses. Implementations MUST return within a bounded time, never block for data, never allocate without bound
-/// on what arrives, and deliver samples of one body in the order of `captured_at`.
+/// A source of poses. Implementations MUST return within a bounded time, never block for data, never allocate memory
+/// that the input could grow without bound, and deliver samples of one body in the order of `captured_at`.
 pub trait Tracker: Send {
-    /// Hands every sample that has arrived by `now` to `sink`, oldest first; returns how many. `now` is the host's clock:
-    /// network trackers use it to stamp arrivals, simulated trackers to know how far to advance.
+    /// Passes every sample that has arrived by `now` to `sink`, oldest first; returns their number. `now` is the host's
+    /// clock: network trackers use it to stamp arrivals, simulated trackers to know how far to advance.
     fn poll(&mut self, now: HostTime, sink: &mut dyn FnMut(&TrackerSample)) -> Result<usize, TrackerError>;
 
-    /// What the tracker calls itself, for reports.
+    /// Name of the tracker, for reports.
     fn name(&self) -> &str;
 
     /// Counters and the reason for silence in one line, for `dpm doctor` and reports.
@@ -76,7 +76,8 @@ pub trait Tracker: Send {
         String::new()
     }
 
-    /// What the operator must know although poses come, such as data that somebody else sends; `None` where there is nothing.
+    /// A warning for the operator although poses arrive, for example about data from somebody else; `None` if there is
+    /// none.
     fn warning(&self) -> Option<String> {
         None
     }

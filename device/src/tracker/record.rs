@@ -1,4 +1,5 @@
-//! Samples into an append-only file and back: a recorder around any tracker, and a tracker that replays a recording.
+//! Records samples in an append-only file and replays them: a recorder around any tracker, and a tracker that plays a
+//! recording.
 //!
 //! File: the header (16-byte magic `dpm-track-0001\r\n`, then one frame with the start instant and the names of the bodies), then
 //! frames. A frame is `u32 length, payload, u32 CRC-32C of length and payload`, little-endian; a payload holds samples of
@@ -20,13 +21,13 @@ use std::time::Duration;
 const MAGIC: &[u8; 16] = b"dpm-track-0001\r\n";
 /// Bytes of one sample.
 pub const SAMPLE_BYTES: usize = 92;
-/// Largest payload of a frame: the writer never makes a larger one, the reader refuses it.
+/// Largest payload of a frame: the writer never makes a larger one, and the reader refuses one.
 const MAX_PAYLOAD: usize = 64 * 1024;
 /// Samples that may wait for the writer: seconds of a busy rig.
 const QUEUE: usize = 16_384;
-/// The writer looks this often; with the write itself this stays well below the promised 100 ms.
+/// Interval of the writer; together with the write itself this stays well below the promised 100 ms.
 const WRITE_EVERY: Duration = Duration::from_millis(20);
-/// The file is forced to the disk this often, for crashes of the whole machine.
+/// Interval at which the file is synchronised to the disk, for crashes of the whole machine.
 const SYNC_EVERY: Duration = Duration::from_millis(80);
 /// Most samples of a recording that is replayed: 2.4 GB, 12 hours of two bodies at 500 Hz.
 const MAX_REPLAYED: usize = 25_000_000;
@@ -42,7 +43,7 @@ pub enum RecordError {
         /// The operating system's error.
         source: std::io::Error,
     },
-    /// The file is something else, or damaged in its very header.
+    /// The file is something else, or its header is damaged.
     #[error("{path} is not a tracker recording: {why}")]
     NotARecording {
         /// The file.
@@ -68,8 +69,8 @@ pub enum RecordError {
     },
 }
 
-/// A tracker that passes on another one's samples and writes them down on the way. Writing happens on a thread of its own; when that
-/// cannot keep up, samples go unrecorded and are counted, never delayed.
+/// A tracker that passes on the samples of another one and records them. A separate thread writes. If it cannot keep
+/// up, samples go unrecorded and are counted, never delayed.
 pub struct Recorder<T> {
     inner: T,
     queue: Option<Sender<TrackerSample>>,
@@ -118,8 +119,8 @@ impl<T: Tracker> Recorder<T> {
         self.unrecorded
     }
 
-    /// True when the file could not be written on, for want of space for example; [`Recorder::finish`] has the reason. What was
-    /// written before can be played.
+    /// True if writing failed, for example for lack of space; [`Recorder::finish`] has the reason. The part written
+    /// before can be played.
     pub fn has_failed(&self) -> bool {
         self.shared.failed.load(Ordering::Relaxed)
     }
@@ -129,7 +130,7 @@ impl<T: Tracker> Recorder<T> {
         &self.inner
     }
 
-    /// Writes what is left and closes the file.
+    /// Writes the rest and closes the file.
     pub fn finish(mut self) -> Result<u64, RecordError> {
         self.close().map_err(|source| RecordError::Io { path: self.path.clone(), source })?;
         Ok(self.written())
@@ -149,7 +150,7 @@ impl<T> Recorder<T> {
 
 impl<T> Drop for Recorder<T> {
     fn drop(&mut self) {
-        // `finish` reports errors; a recorder that is merely dropped has nobody to report to.
+        // `finish` reports errors; a recorder that is merely dropped cannot report any.
         let _ = self.close();
     }
 }
@@ -158,7 +159,7 @@ impl<T: Tracker> Tracker for Recorder<T> {
     fn poll(&mut self, now: HostTime, sink: &mut dyn FnMut(&TrackerSample)) -> Result<usize, TrackerError> {
         let (queue, unrecorded) = (&self.queue, &mut self.unrecorded);
         self.inner.poll(now, &mut |sample| {
-            // The writer never blocks in receive, so this neither waits nor wakes anybody.
+            // The writer never blocks in receive, so this call neither blocks nor wakes a thread.
             if queue.as_ref().is_none_or(|q| q.try_send(*sample).is_err()) {
                 *unrecorded += 1;
             }
@@ -188,12 +189,13 @@ impl<T: Tracker> Tracker for Recorder<T> {
 fn write_all(mut file: File, samples: &Receiver<TrackerSample>, shared: &Shared) -> std::io::Result<()> {
     let disk = file.try_clone()?;
     let done = AtomicBool::new(false);
-    // Forcing bytes to the disk can take longer than the promised 100 ms; it must not hold up handing them to the kernel.
+    // Synchronising to the disk can take longer than the promised 100 ms; it must not delay handing bytes to the
+    // kernel.
     std::thread::scope(|scope| {
         std::thread::Builder::new().name("tracker-sync".into()).spawn_scoped(scope, || {
             while !done.load(Ordering::Relaxed) {
                 std::thread::sleep(SYNC_EVERY);
-                // A disk that cannot be forced is reported by the last sync of all.
+                // The last sync reports a disk that cannot be synchronised.
                 let _ = disk.sync_data();
             }
         })?;
@@ -229,7 +231,7 @@ fn write_frames(file: &mut File, samples: &Receiver<TrackerSample>, shared: &Sha
         if count > 0 {
             frame.clear();
             put_frame(&mut frame, &payload);
-            // One write for a whole frame: after it the bytes are the kernel's, and this process may die.
+            // One write for a whole frame: afterwards the kernel has the bytes, and this process may die.
             file.write_all(&frame)?;
             shared.written.fetch_add(count, Ordering::Relaxed);
         }
@@ -297,7 +299,7 @@ fn get_sample(bytes: &[u8; SAMPLE_BYTES]) -> TrackerSample {
     }
 }
 
-/// A recording, read.
+/// A recording in memory.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Recording {
     /// Instant given when it was made.
@@ -306,19 +308,19 @@ pub struct Recording {
     pub bodies: Vec<String>,
     /// The samples in the order in which they arrived.
     pub samples: Vec<TrackerSample>,
-    /// Bytes behind the last whole frame: above 0 when the writer died while writing, or the file was damaged there.
+    /// Bytes after the last whole frame: above 0 if the writer died while writing, or the file was damaged there.
     pub torn_bytes: u64,
 }
 
 impl Recording {
-    /// Reads `path` up to its end or to the first frame that is not whole.
+    /// Reads `path` up to its end or to the first incomplete frame.
     pub fn read(path: &Path) -> Result<Self, RecordError> {
         let failed = |source| RecordError::Io { path: path.to_owned(), source };
         let (file, size) = crate::regular_file::open(path).map_err(failed)?;
         Self::read_from(&mut std::io::BufReader::with_capacity(1 << 16, file), size, path)
     }
 
-    /// Reads a recording of `size` bytes that is called `path`. What it allocates is bounded by what it has read.
+    /// Reads a recording of `size` bytes with the name `path`. Its allocation is bounded by the bytes read.
     ///
     /// # Errors
     /// As [`Recording::read`].
@@ -395,7 +397,7 @@ fn parse_header(payload: &[u8]) -> Option<(HostTime, Vec<String>)> {
     rest.is_empty().then(|| (HostTime(i64::from_le_bytes(*start)), bodies))
 }
 
-/// A tracker that hands out a recording at the pace at which it was made.
+/// A tracker that plays a recording at its original pace.
 pub struct Replay {
     samples: Vec<TrackerSample>,
     next: usize,
@@ -404,8 +406,9 @@ pub struct Replay {
 }
 
 impl Replay {
-    /// Replays `path` so that its start instant falls on `start`; all stamps move by the same amount, to the nanosecond. The
-    /// rig's `bodies` are found by name; recorded bodies that the rig does not know are counted as such.
+    /// Replays `path` so that its start instant falls on `start`; all stamps are shifted by the same amount, to the
+    /// nanosecond. The rig's `bodies` are found by name; recorded bodies that the rig does not know are counted as
+    /// unknown.
     pub fn open(path: &Path, bodies: &[BodyKey], start: HostTime) -> Result<Self, RecordError> {
         let Recording { start: recorded, bodies: names, mut samples, torn_bytes } = Recording::read(path)?;
         if let Some(missing) = bodies.iter().find(|b| !names.contains(&b.name)) {
@@ -428,12 +431,12 @@ impl Replay {
         Ok(Self { samples, next: 0, gate: SampleGate::new(bodies.len()), status })
     }
 
-    /// What became of the samples so far.
+    /// Counters of the samples so far, by outcome.
     pub fn counters(&self) -> &TrackerCounters {
         self.gate.counters()
     }
 
-    /// True when all samples have been handed out.
+    /// True when all samples have been passed on.
     pub fn is_over(&self) -> bool {
         self.next == self.samples.len()
     }

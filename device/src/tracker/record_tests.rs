@@ -1,10 +1,10 @@
-//! What is recorded is what was seen, to the bit; what a crash leaves is read up to the tear; nothing in a file does harm.
+//! A recording equals its samples, to the bit; after a crash it is readable up to the tear; no file content does harm.
 
 use super::*;
 use proptest::prelude::*;
 use std::time::Instant;
 
-/// A tracker that hands out `n` samples in one poll of each of two bodies, counting up.
+/// A tracker that delivers `n` samples of each of two bodies in one poll, counting up.
 struct Counting(u32);
 
 impl Tracker for Counting {
@@ -131,7 +131,7 @@ fn a_torn_tail_is_left_out_wherever_it_tears() {
 
 #[test]
 fn at_most_100_ms_are_lost_when_the_process_dies() {
-    // A machine that stands still for 100 ms proves nothing; three times in a row it would.
+    // A single standstill of the machine of 100 ms proves nothing; three in a row would.
     let worst = (0..3).map(lost_in_a_crash).find(|lost| *lost < Duration::from_millis(100));
     assert!(worst.is_some());
 }
@@ -146,7 +146,7 @@ fn lost_in_a_crash(attempt: u32) -> Duration {
         recorder.poll(HostTime(begin.elapsed().as_nanos() as i64), &mut |_| {}).unwrap();
         std::thread::sleep(Duration::from_millis(2));
     }
-    // What the file holds now is what a killed process would leave: the recorder is neither finished nor dropped.
+    // The file now holds what a killed process would leave: the recorder is neither finished nor dropped.
     let end = begin.elapsed();
     let left = Recording::read(&place.0).unwrap().samples.len() / 2;
     assert!(left > 0);

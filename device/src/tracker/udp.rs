@@ -1,5 +1,5 @@
-//! A UDP socket with what trackers need and the standard library lacks: options before binding, multicast by source, the kernel's
-//! own arrival stamps, and a filter by source address inside the kernel.
+//! A UDP socket with features that trackers need and the standard library lacks: options before binding, multicast by
+//! source, the kernel's arrival stamps, and a filter by source address inside the kernel.
 #![allow(unsafe_code)]
 
 use crate::time::HostClock;
@@ -26,7 +26,7 @@ pub struct UdpPort {
     socket: UdpSocket,
 }
 
-/// Receive buffer asked for: a tenth of a second of the largest frames at 500 Hz; the kernel may grant less.
+/// Requested receive buffer: a tenth of a second of the largest frames at 500 Hz; the kernel may grant less.
 const RECEIVE_BUFFER_BYTES: libc::c_int = 4 << 20;
 
 impl UdpPort {
@@ -44,7 +44,7 @@ impl UdpPort {
         if shared {
             port.set(libc::SOL_SOCKET, libc::SO_REUSEADDR, &1i32)?;
         }
-        // Arrival stamps and a larger buffer are improvements, not conditions.
+        // Arrival stamps and a larger buffer are improvements, not requirements.
         let _ = port.set(libc::SOL_SOCKET, libc::SO_TIMESTAMPNS, &1i32);
         let _ = port.set(libc::SOL_SOCKET, libc::SO_RCVBUF, &RECEIVE_BUFFER_BYTES);
         // Only groups joined by this very socket, not those of other programs on this machine.
@@ -61,7 +61,7 @@ impl UdpPort {
         Ok(port)
     }
 
-    /// Joins `group` on the interface with address `interface`. Given a `source`, only its datagrams come through.
+    /// Joins `group` on the interface with address `interface`. With a `source`, only its datagrams are received.
     pub fn join(&self, group: Ipv4Addr, source: Option<Ipv4Addr>, interface: Ipv4Addr) -> io::Result<()> {
         let raw = |a: Ipv4Addr| libc::in_addr { s_addr: u32::from(a).to_be() };
         match source {
@@ -77,7 +77,8 @@ impl UdpPort {
         }
     }
 
-    /// Sends multicast through the interface with address `interface`, at most `hops` routers far, heard on this machine too.
+    /// Sends multicast through the interface with address `interface`, across at most `hops` routers; this machine
+    /// receives it too.
     pub fn multicast_from(&self, interface: Ipv4Addr, hops: u8) -> io::Result<()> {
         let raw = libc::in_addr { s_addr: u32::from(interface).to_be() };
         self.set(libc::IPPROTO_IP, libc::IP_MULTICAST_IF, &raw)?;
@@ -85,7 +86,7 @@ impl UdpPort {
         self.socket.set_multicast_loop_v4(true)
     }
 
-    /// Waits until a datagram is there or `timeout` is over; true when one is there.
+    /// Waits until a datagram has arrived or `timeout` is over; true if one has arrived.
     pub fn wait(&self, timeout: std::time::Duration) -> io::Result<bool> {
         let mut waiting = libc::pollfd { fd: self.socket.as_raw_fd(), events: libc::POLLIN, revents: 0 };
         let limit = libc::timespec {
@@ -101,8 +102,8 @@ impl UdpPort {
         }
     }
 
-    /// Lets the kernel drop, before they are queued, all datagrams that are not from `source`; where `ports` holds any, also those
-    /// that are from none of these ports. A later call replaces the filter of an earlier one.
+    /// Lets the kernel drop, before they are queued, all datagrams that are not from `source`, and, if `ports` is not
+    /// empty, those that are not from one of these ports. A later call replaces the filter of an earlier one.
     pub fn keep_only(&self, source: Ipv4Addr, ports: &[u16]) -> io::Result<()> {
         // Classic BPF. SKF_NET_OFF (-0x100000) addresses the IP header; the source address is its word at 12. Without an offset, a
         // filter of a UDP socket reads from the UDP header on, whose first half-word is the source port.
@@ -127,12 +128,12 @@ impl UdpPort {
         self.set(libc::SOL_SOCKET, libc::SO_ATTACH_FILTER, &filter)
     }
 
-    /// Takes the filter of [`UdpPort::keep_only`] away again.
+    /// Removes the filter of [`UdpPort::keep_only`].
     pub fn keep_all(&self) -> io::Result<()> {
         self.set(libc::SOL_SOCKET, libc::SO_DETACH_FILTER, &0i32)
     }
 
-    /// The next datagram waiting, `None` when there is none. Never waits.
+    /// The next waiting datagram, or `None`. Never blocks.
     pub fn receive(&self, buffer: &mut [u8]) -> io::Result<Option<Arrival>> {
         let mut control = [0u64; 8];
         let mut from: libc::sockaddr_in = unset();
@@ -150,7 +151,8 @@ impl UdpPort {
         if n < 0 {
             let error = io::Error::last_os_error();
             return match error.kind() {
-                // ConnectionRefused reports an earlier send that found no listener; the conversation's timeouts deal with that.
+                // ConnectionRefused reports an earlier send that found no listener; the protocol's timeouts handle
+                // that.
                 io::ErrorKind::WouldBlock | io::ErrorKind::Interrupted | io::ErrorKind::ConnectionRefused => {
                     Ok(None)
                 }
@@ -166,7 +168,7 @@ impl UdpPort {
         }))
     }
 
-    /// Sends one datagram; a full buffer or an unreachable peer is an error, not a wait.
+    /// Sends one datagram; a full buffer or an unreachable peer is an error and does not block.
     pub fn send(&self, bytes: &[u8], to: SocketAddrV4) -> io::Result<()> {
         self.socket.send_to(bytes, to).map(drop)
     }

@@ -1,5 +1,5 @@
-//! Packets to a device in the same process: called directly (deterministic, for virtual pace), or over bounded rings to a
-//! device on a thread of its own (for real pace).
+//! Carries packets to a device in the same process: by direct calls (deterministic, for virtual pace), or over bounded
+//! rings to a device on its own thread (for real pace).
 
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::Arc;
@@ -11,8 +11,8 @@ use super::{Lane, LinkDevice, SendError, Transport, TransportError};
 use crate::link::Packet;
 use crate::time::HostTime;
 
-/// Calls the device as part of `send` and `receive`: nothing is copied, nothing is queued, and a run is a function of its
-/// inputs. The device lives exactly as far as the `now` it is called with.
+/// Calls the device as part of `send` and `receive`: nothing is copied or queued, and a run is a function of its
+/// inputs. The device's time advances exactly to the `now` that it is called with.
 #[derive(Debug)]
 pub struct Direct<D> {
     device: D,
@@ -29,7 +29,7 @@ impl<D: LinkDevice> Direct<D> {
         &self.device
     }
 
-    /// The device, to let it live or to take its light.
+    /// The device, to advance it or to take its light.
     pub fn device_mut(&mut self) -> &mut D {
         &mut self.device
     }
@@ -67,7 +67,7 @@ impl<D: LinkDevice> Transport for Direct<D> {
     }
 }
 
-/// Longest run of packets in one control message slot.
+/// Maximum number of bytes in one control message slot.
 const SMALL_BYTES: usize = 160;
 /// Control messages and replies that may wait.
 const SMALL_DEPTH: usize = 64;
@@ -75,7 +75,7 @@ const SMALL_DEPTH: usize = 64;
 #[derive(Clone, Copy)]
 struct Small {
     lane: Lane,
-    /// When it was put in.
+    /// When the host put it in.
     at: HostTime,
     len: u8,
     bytes: [u8; SMALL_BYTES],
@@ -90,7 +90,7 @@ struct Large {
 /// The host's end of a threaded in-process cable.
 pub struct HostEnd {
     frames: Filler<Large>,
-    /// Buffers that came back, the last one on top: it is the warmest in the caches.
+    /// Returned buffers, the last one on top: it is the warmest in the caches.
     free: Vec<Large>,
     control: Producer<Small>,
     replies: Consumer<Small>,
@@ -107,11 +107,12 @@ pub struct DeviceEnd {
     unplugged: Arc<AtomicBool>,
 }
 
-/// A cable between two threads with `depth` recycled buffers of `frame_bytes` each: neither end locks, waits or allocates, and the device's
-/// thread, which rests by `policy` in [`DeviceEnd::rest`], is woken by whatever arrives. `frame_bytes` is the size of the largest frame
-/// on the wire, see [`crate::link::packet_bytes`]. Two buffers keep both ends busy; more only leave the caches colder.
+/// A cable between two threads with `depth` recycled buffers of `frame_bytes` each. Neither end locks, blocks or
+/// allocates. The device's thread waits in [`DeviceEnd::rest`] according to `policy`, and any arrival wakes it.
+/// `frame_bytes` is the size of the largest frame on the wire, see [`crate::link::packet_bytes`]. Two buffers keep both
+/// ends busy; more only make the caches colder.
 pub fn threaded(frame_bytes: usize, depth: usize, policy: WaitPolicy) -> (HostEnd, DeviceEnd) {
-    // Written once, so that the memory is there before the first frame.
+    // Written once, so that the pages are mapped before the first frame.
     let buffers =
         (0..depth.max(1)).map(|_| Large { len: 0, bytes: vec![0x5a; frame_bytes].into_boxed_slice() });
     let (filler, drainer) = exchange(buffers.collect());
@@ -203,7 +204,7 @@ impl Transport for HostEnd {
         _now: HostTime,
         sink: &mut dyn FnMut(Lane, HostTime, &[u8]),
     ) -> Result<(), TransportError> {
-        // As many as the ring holds: a device that talks without end cannot keep this call from returning.
+        // At most as many as the ring holds: a device that sends without end cannot keep this call from returning.
         for _ in 0..SMALL_DEPTH {
             let Some(small) = self.replies.pop() else { break };
             sink(small.lane, small.at, &small.bytes[..small.len as usize]);
@@ -224,12 +225,13 @@ impl Drop for HostEnd {
 }
 
 impl DeviceEnd {
-    /// Delivers what has arrived to `device`, control first, lets it live up to now, and takes its replies. Returns `false` when the
-    /// host's end is gone. Replies that find no room are lost, as on a cable nobody reads.
+    /// Delivers the input to `device`, control first, advances the device to now, and takes its replies. Returns
+    /// `false` when the host's end is gone. Replies that find no room are lost, as on a cable nobody reads.
     ///
-    /// `clock` is the host's clock. A control message arrives when the host puts it in, however late this is called: the device gets
-    /// that instant, as one gets it from hardware that stamps. A frame arrives when it is taken in, and a reply, which carries a stamp
-    /// of its own, when it is put out; an ECHO is answered before the frame beside it is taken in.
+    /// `clock` is the host's clock. A control message arrives when the host puts it in, however late this function is
+    /// called; the device gets that instant, as it would from hardware that stamps. A frame arrives when it is taken
+    /// in. A reply carries its own stamp, taken when it is put out. An ECHO is answered before the frame beside it is
+    /// taken in.
     pub fn serve(&mut self, clock: impl Fn() -> HostTime, device: &mut dyn LinkDevice) -> bool {
         for _ in 0..SMALL_DEPTH {
             let Some(small) = self.control.pop() else { break };
@@ -245,7 +247,7 @@ impl DeviceEnd {
         !self.unplugged.load(Ordering::Acquire)
     }
 
-    /// Takes what the device has to say.
+    /// Takes the device's replies.
     fn answer(&mut self, clock: &impl Fn() -> HostTime, device: &mut dyn LinkDevice) {
         let replies = &mut self.replies;
         device.replies(clock(), &mut |lane, bytes| {
@@ -257,8 +259,8 @@ impl DeviceEnd {
         });
     }
 
-    /// Rests until something arrives, the host's end goes, or the clock `now` reaches `until` (the device's next own event); returns
-    /// at once when there is something to be served.
+    /// Waits until something arrives, the host's end is dropped, or the clock `now` reaches `until` (the device's next
+    /// own event). Returns at once if there is something to serve.
     pub fn rest(&mut self, until: HostTime, now: impl Fn() -> HostTime) {
         let Self { frames, control, unplugged, waiter, .. } = self;
         waiter.wait(
@@ -273,7 +275,7 @@ impl DeviceEnd {
         self.control.is_empty() && !self.frames.has_filled()
     }
 
-    /// Wakes the thread that rests, for whoever wants to end it.
+    /// Wakes the waiting thread, for whoever wants to end it.
     pub fn waker(&self) -> Waker {
         self.waiter.waker()
     }

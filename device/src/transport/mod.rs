@@ -1,4 +1,4 @@
-//! Packets into bytes on a medium and back: what the link needs from USB, a serial port, or a device in the same process.
+//! Carries packets over a medium: what the link requires of USB, a serial port, or a device in the same process.
 
 pub mod inproc;
 #[cfg(any(feature = "serial", feature = "usb"))]
@@ -30,7 +30,7 @@ pub enum TransportError {
     /// The device is gone; opening again may succeed.
     #[error("{device}: unplugged or without power; check cable and supply")]
     Unplugged {
-        /// Which device.
+        /// Name of the device.
         device: String,
     },
     /// No such device.
@@ -38,32 +38,32 @@ pub enum TransportError {
         "{device}: not found; is it plugged in and switched on? `lsusb` or `dpm doctor` list what is there"
     )]
     NotFound {
-        /// Which device.
+        /// Name of the device.
         device: String,
     },
     /// The operating system does not let this user open the device.
     #[error("{device}: permission denied; {remedy}")]
     PermissionDenied {
-        /// Which device.
+        /// Name of the device.
         device: String,
-        /// What to do.
+        /// The remedy.
         remedy: String,
     },
-    /// Another program has the device.
+    /// Another program uses the device.
     #[error(
         "{device}: in use by another program; end it first, `fuser -v` on the device file names it (two hosts cannot drive one projector)"
     )]
     InUse {
-        /// Which device.
+        /// Name of the device.
         device: String,
     },
     /// libusb reports an error.
     #[cfg(feature = "usb")]
     #[error("cannot {doing} {device}: {source}; {}", crate::usb_help::remedy(*.source))]
     Usb {
-        /// What was being done.
+        /// The failed operation.
         doing: &'static str,
-        /// On which device.
+        /// Name of the device.
         device: String,
         /// libusb's error.
         source: rusb::Error,
@@ -76,14 +76,14 @@ pub enum TransportError {
         device: String,
         /// The library's error.
         source: serialport::Error,
-        /// What to do.
+        /// The remedy.
         remedy: &'static str,
     },
 }
 
 #[cfg(feature = "usb")]
 impl TransportError {
-    /// What libusb said while `doing` something to or with `device`, which names vendor, product and device file.
+    /// The error of libusb while `doing` something with `device`, which names vendor, product and device file.
     pub(crate) fn of_usb(doing: &'static str, device: String, source: rusb::Error) -> Self {
         match source {
             rusb::Error::NoDevice => Self::Unplugged { device },
@@ -100,7 +100,7 @@ impl TransportError {
     }
 }
 
-/// Why [`Transport::send`] took nothing.
+/// Why [`Transport::send`] accepted nothing.
 #[derive(Debug, thiserror::Error)]
 pub enum SendError {
     /// No room now. Nothing was sent; later, or with newer content, it may fit.
@@ -123,33 +123,35 @@ pub trait Transport: Send {
         true
     }
 
-    /// Gives the medium the clock that all `now` of its calls are read from, so that it can stamp what arrives while nobody polls. A
-    /// medium without a clock stamps with the `now` of the poll. A medium that needs no clock ignores it; a second clock is ignored.
+    /// Sets the clock that every `now` of this medium's calls comes from, so that the medium can stamp arrivals between
+    /// polls. Without a clock it stamps with the `now` of the poll. A medium that needs no clock ignores it; a second
+    /// clock is ignored.
     fn set_clock(&mut self, clock: Arc<dyn HostClock>) {
         let _ = clock;
     }
 
-    /// Throws away what waits and has not been carried, on both lanes, so that what is sent next on the control lane goes out first:
-    /// for an order to be dark. A frame that was under way is lost.
+    /// Discards everything on both lanes that waits and has not been carried, so that the next message on the control
+    /// lane goes out first: for an order to go dark. A frame in transmission is lost.
     fn flush_output(&mut self) {}
 
-    /// Hands bytes that have arrived to `sink`, in order within a lane, without waiting for more. With the bytes comes the instant of
-    /// their arrival, which may lie long before the poll, or a little after `now`.
+    /// Passes arrived bytes to `sink`, in order within a lane, without waiting for more. With the bytes comes the
+    /// instant of their arrival, which may lie long before the poll, or a little after `now`.
     fn receive(
         &mut self,
         now: HostTime,
         sink: &mut dyn FnMut(Lane, HostTime, &[u8]),
     ) -> Result<(), TransportError>;
 
-    /// Gets the medium back after it was lost. May take some milliseconds, unlike all else here: the rig is dark anyway.
+    /// Reopens the medium after it was lost. Unlike all other calls, this may take some milliseconds, because the rig
+    /// is dark anyway.
     ///
     /// # Errors
-    /// While it is still gone, or cannot be had.
+    /// While it is still gone, or cannot be opened.
     fn reopen(&mut self) -> Result<(), TransportError> {
         Ok(())
     }
 
-    /// What to call this medium in messages.
+    /// Name of this medium in messages.
     fn name(&self) -> &str;
 }
 
@@ -181,18 +183,18 @@ impl<T: Transport + ?Sized> Transport for &mut T {
     }
 }
 
-/// A device that lives in this process: a state machine without I/O. `now` is the true time of the rig, from which the device
-/// derives its own clock; it never decreases.
+/// A simulated device in this process: a state machine without I/O. `now` is the true time of the rig, from which the
+/// device derives its own clock; it never decreases.
 pub trait LinkDevice: Send {
-    /// Bytes arrive. The device first lives up to `now`.
+    /// Bytes arrive. The device first advances to `now`.
     fn receive(&mut self, now: HostTime, lane: Lane, bytes: &[u8]);
 
-    /// The medium says that the bytes received so far on `lane` end a transfer, and that the next ones begin another.
+    /// The bytes received so far on `lane` end a transfer on the medium, and the next ones begin another.
     fn end_of_transfer(&mut self, now: HostTime, lane: Lane);
 
-    /// Lets the device live up to `now`: light, watchdog.
+    /// Advances the device to `now`: light, watchdog.
     fn advance_to(&mut self, now: HostTime);
 
-    /// Lets the device live up to `now` and takes everything it has to say, as whole packets.
+    /// Advances the device to `now` and takes all its replies, as whole packets.
     fn replies(&mut self, now: HostTime, sink: &mut dyn FnMut(Lane, &[u8]));
 }

@@ -1,4 +1,5 @@
-//! The scheduling of a frame thread for the thread that waits for its replies: stamps are no better than the thread that makes them.
+//! Copies the scheduling of a frame thread to the thread that waits for its replies: stamps are only as precise as the
+//! scheduling of the thread that takes them.
 #![allow(unsafe_code)]
 
 use std::os::unix::thread::JoinHandleExt;
@@ -6,10 +7,10 @@ use std::thread::JoinHandle;
 
 use crate::time::HostTime;
 
-/// How often the caller's scheduling is looked at.
+/// Interval between checks of the caller's scheduling.
 const EVERY_NS: i64 = 500_000_000;
 
-/// Makes a helper thread run as the thread that it works for does.
+/// Gives a helper thread the scheduling of the thread that it works for.
 #[derive(Debug)]
 pub(super) struct Follower {
     looked_at: HostTime,
@@ -21,8 +22,8 @@ impl Follower {
         Self { looked_at: HostTime(i64::MIN), given: None }
     }
 
-    /// Gives `thread` the policy and priority of the calling thread. Looks twice a second and changes something only when they have
-    /// changed. A refusal is no error: the thread then runs as it did, and stamps arrive later.
+    /// Gives `thread` the policy and priority of the calling thread. Checks twice a second, and changes something only
+    /// if they have changed. A refusal is not an error: the thread keeps its scheduling, and stamps arrive later.
     pub(super) fn follow<T>(&mut self, now: HostTime, thread: &JoinHandle<T>) {
         if self.looked_at.0 != i64::MIN && now.ns_since(self.looked_at) < EVERY_NS {
             return;

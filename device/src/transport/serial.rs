@@ -1,8 +1,9 @@
-//! Packets into COBS frames on a serial line: for control, slow panels and trigger boards.
+//! Carries packets as COBS frames on a serial line: for control, slow panels and trigger boards.
 //!
-//! One stream carries both lanes, a packet a frame. Control messages overtake planes that still wait, so they are late by at most
-//! one packet and what the driver has buffered, which is kept short. Nothing waits: bytes that the line does not take now are kept,
-//! and while a frame is kept no other is taken. An order to be dark cuts the packet that is under way and goes first.
+//! One stream carries both lanes, one packet per frame. Control messages overtake planes that still wait, so they are
+//! late by at most one packet and the driver's buffer, which is kept short. Nothing blocks: bytes that the line does
+//! not take now are kept, and while a frame is kept no other is accepted. An order to go dark cuts off the packet in
+//! transmission and goes first.
 
 mod reader;
 
@@ -21,15 +22,15 @@ use reader::{Reader, SharedClock};
 
 /// Bytes of control messages that may wait.
 const CONTROL_WAITING: usize = 4096;
-/// Bytes read in one call at most: bounds the time of `receive`.
+/// Maximum number of bytes read in one call: bounds the time of `receive`.
 const READ_AT_ONCE: usize = 16 * 1024;
-/// Parts of a second for which the kernel may have planes to send: not every driver can take back what it was given, and what it
-/// has is before an order to be dark.
+/// The kernel may hold planes for at most this fraction of a second. Not every driver can discard what it was given,
+/// and those bytes go out before an order to go dark.
 const AHEAD_PER_S: u32 = 50;
 /// Bits of a byte on the line: start, eight, stop.
 const BITS_PER_BYTE: u32 = 10;
 
-/// Which port, and how it is used.
+/// The port and its settings.
 #[derive(Clone, Debug)]
 pub struct SerialSettings {
     /// Device file: `/dev/ttyUSB0`, `/dev/serial/by-id/...`.
@@ -40,7 +41,7 @@ pub struct SerialSettings {
     pub frame_bytes: usize,
 }
 
-/// What has happened on the line.
+/// Counters of the line.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub struct SerialCounters {
     /// Bytes that the line took.
@@ -55,7 +56,7 @@ pub struct SerialCounters {
 pub struct SerialTransport {
     settings: SerialSettings,
     port: Option<Box<dyn SerialPort>>,
-    /// Reads the port; without it the port is read where it is polled, and what arrives is stamped late.
+    /// Reads the port on its own thread; without it `receive` reads the port, and arrivals are stamped late.
     reader: Option<Reader>,
     clock: SharedClock,
     deframer: Deframer<[u8; DEFRAMED]>,
@@ -65,7 +66,7 @@ pub struct SerialTransport {
     packets: usize,
     next_packet: usize,
     control: Vec<u8>,
-    /// Encoded bytes of the packet that has begun, from `control` or `data`, and how many are out.
+    /// Encoded bytes of the packet in transmission, from `control` or `data`, and how many of them are out.
     going: Option<(Lane, usize, usize)>,
     counters: SerialCounters,
 }
@@ -73,7 +74,7 @@ pub struct SerialTransport {
 const DEFRAMED: usize = packet_bytes(MAX_CONTROL_BYTES);
 
 impl SerialTransport {
-    /// Opens the port for this program alone.
+    /// Opens the port exclusively.
     ///
     /// # Errors
     /// Not found; no permission (with the group to join); in use by another program.
@@ -83,7 +84,7 @@ impl SerialTransport {
         Ok(serial)
     }
 
-    /// On a port that is open already (a pseudo-terminal) and never waits, see [`tty::never_wait`].
+    /// Uses a port that is already open (a pseudo-terminal) and never blocks, see [`tty::never_wait`].
     pub fn with_port(settings: SerialSettings, port: Box<dyn SerialPort>) -> Self {
         let mut serial = Self::closed(settings);
         serial.reader = Reader::start(&*port, serial.clock.clone());
@@ -109,7 +110,7 @@ impl SerialTransport {
         }
     }
 
-    /// What has happened so far.
+    /// The counters so far.
     pub fn counters(&self) -> SerialCounters {
         self.counters
     }
@@ -133,7 +134,7 @@ impl SerialTransport {
         TransportError::Unplugged { device: self.settings.path.clone() }
     }
 
-    /// Writes what the line takes now.
+    /// Writes as much as the line takes now.
     fn flush(&mut self) -> Result<(), TransportError> {
         loop {
             let (lane, at, end) = match self.going {
@@ -152,7 +153,7 @@ impl SerialTransport {
                 Lane::Control => &self.control[at..end],
                 Lane::Data => {
                     let ahead = (self.settings.baud / BITS_PER_BYTE / AHEAD_PER_S).max(1) as usize;
-                    // A driver that does not say what it holds takes what it will.
+                    // A driver that does not report the size of its backlog counts as empty.
                     let room = ahead.saturating_sub(port.bytes_to_write().unwrap_or(0) as usize);
                     if room == 0 {
                         return Ok(());
@@ -170,7 +171,7 @@ impl SerialTransport {
                     }
                     self.going = None;
                     match lane {
-                        // Messages that came while these were going out wait behind them.
+                        // Messages that arrived during this transmission wait behind it.
                         Lane::Control => drop(self.control.drain(..end)),
                         Lane::Data if self.next_packet == self.packets => {
                             (self.packets, self.next_packet) = (0, 0);
@@ -274,7 +275,7 @@ impl Transport for SerialTransport {
     }
 
     fn set_clock(&mut self, clock: Arc<dyn HostClock>) {
-        // A second clock would make the stamps before it worthless.
+        // A second clock would make earlier stamps worthless.
         let _ = self.clock.set(clock);
     }
 
@@ -282,15 +283,15 @@ impl Transport for SerialTransport {
         (self.packets, self.next_packet, self.going) = (0, 0, None);
         self.control.clear();
         if let Some(port) = &self.port {
-            // Where the driver cannot, what it holds is short.
+            // If the driver cannot, its backlog is short.
             let _ = port.clear(ClearBuffer::Output);
         }
-        // Ends what the device has of a packet, wherever it was cut.
+        // Ends the partial packet in the device, wherever it was cut.
         self.control.push(0);
     }
 
     fn reopen(&mut self) -> Result<(), TransportError> {
-        // The reader's handle, too, would keep the port from being opened again.
+        // The reader's handle would also prevent the port from being reopened.
         (self.port, self.reader) = (None, None);
         let path = &self.settings.path;
         let port = tty::open(path, self.settings.baud).map_err(|e| open_error(path, e))?;

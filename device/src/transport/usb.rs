@@ -1,9 +1,11 @@
-//! Packets into queued USB bulk transfers: several frames in flight, one transfer a frame, nothing ever waits.
+//! Carries packets in queued USB bulk transfers: several frames in flight, one transfer per frame, and nothing ever
+//! blocks.
 //!
-//! `send` and `receive` submit, and take what has completed; a thread of its own lets libusb deliver it, so that replies are stamped
-//! when they arrive. An order to be dark goes past everything else: the control lane is an endpoint of its own, and one of its transfers
-//! is kept for such an order. When an endpoint fails its transfers are taken back, then its halt is cleared, then the newest frame alone is sent again from its start;
-//! an endpoint that fails three times within a second costs the device a reset.
+//! `send` and `receive` submit transfers and take completed ones. A separate thread lets libusb deliver completions, so
+//! that replies are stamped when they arrive. An order to go dark overtakes everything else: the control lane has its
+//! own endpoint, and one of its transfers is reserved for such an order. When an endpoint fails, its transfers are
+//! cancelled, then its halt is cleared, then only the newest frame is sent again from its start. If an endpoint fails
+//! three times within a second, the device is reset.
 
 mod events;
 mod open;
@@ -20,7 +22,7 @@ use events::Events;
 pub use open::{memory_limit_mb, UsbSettings, UDEV_RULE};
 use ring::{pump, Ring, SharedClock, Status};
 
-/// Vendor number of the reference device: the test numbers of pid.codes, free for anybody, never to be sold.
+/// Vendor number of the reference device: the test numbers of pid.codes, free for everybody, but not for products.
 pub const VENDOR_ID: u16 = 0x1209;
 /// Product number of the reference device.
 pub const PRODUCT_ID: u16 = 0x000d;
@@ -39,18 +41,19 @@ const CONTROL_BYTES: usize = 512;
 const REPLY_DEPTH: usize = 8;
 /// Bytes of a reply transfer: a multiple of every packet size.
 const REPLY_BYTES: usize = 4096;
-/// Failures of an endpoint within [`STORM_NS`] that cost the device a reset.
+/// Number of failures of an endpoint within [`STORM_NS`] that cause a reset of the device.
 const STORM: usize = 3;
 const STORM_NS: i64 = 1_000_000_000;
 
-/// What has happened on the cable.
+/// Counters of the cable.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub struct UsbCounters {
-    /// Data transfers taken from the link, frames and SYNCs: at all times those carried, those lost and those under way.
+    /// Data transfers accepted from the link, frames and SYNCs: always the sum of those carried, lost and in flight.
     pub frames_taken: u64,
     /// Data transfers that arrived whole.
     pub frames_carried: u64,
-    /// Data transfers that did not, and were not sent again because a newer one was waiting or their medium was gone.
+    /// Data transfers that did not arrive whole and were not sent again, because a newer one was waiting or their
+    /// medium was gone.
     pub frames_lost: u64,
     /// Data transfers that were sent again from their start.
     pub frames_resent: u64,
@@ -66,19 +69,19 @@ pub struct UsbCounters {
     pub stuck: u64,
     /// Resets of the device.
     pub resets: u64,
-    /// Submissions refused for want of usbfs memory.
+    /// Submissions refused for lack of usbfs memory.
     pub out_of_memory: u64,
     /// Times that the device was opened.
     pub opened: u64,
 }
 
-/// One outgoing endpoint and its troubles.
+/// One outgoing endpoint and its error recovery.
 struct Outgoing {
     ring: Ring,
     endpoint: u8,
-    /// Transfers that only an order to be dark may use.
+    /// Number of transfers that are reserved for an order to go dark.
     kept_free: usize,
-    /// Length of what each slot carries, for sending it again.
+    /// Length of each slot's content, for sending it again.
     lengths: Vec<usize>,
     /// Slot submitted last.
     newest: Option<usize>,
@@ -88,7 +91,7 @@ struct Outgoing {
     failures: [HostTime; STORM],
 }
 
-/// Long before any instant that a caller may pass.
+/// Earlier than any instant that a caller may pass.
 const NEVER: HostTime = HostTime(i64::MIN);
 
 impl Outgoing {
@@ -143,7 +146,7 @@ impl Outgoing {
         Ok(())
     }
 
-    /// Notes a failure and begins recovery; `true` when there were too many of late.
+    /// Notes a failure and begins recovery; `true` if there were too many recently.
     fn fail(&mut self, now: HostTime) -> bool {
         if self.recovering {
             return false;
@@ -158,7 +161,7 @@ impl Outgoing {
 
 /// An open device.
 struct Open {
-    // Order matters: rings give their transfers back before the handle closes.
+    // The order matters: rings return their transfers before the handle closes.
     data: Outgoing,
     control: Outgoing,
     replies: Ring,
@@ -174,10 +177,10 @@ pub struct UsbTransport {
     name: String,
     counters: UsbCounters,
     reset_due: bool,
-    /// The next control message is an order to be dark.
+    /// The next control message is an order to go dark.
     urgent: bool,
     clock: SharedClock,
-    /// Lets libusb deliver; without it that is done where the link is polled.
+    /// Lets libusb deliver; without it polling the link does that.
     events: Option<Events>,
 }
 
@@ -217,7 +220,7 @@ impl UsbTransport {
         self.device.is_some()
     }
 
-    /// What has happened so far.
+    /// The counters so far.
     pub fn counters(&self) -> UsbCounters {
         self.counters
     }
@@ -229,7 +232,7 @@ impl UsbTransport {
             .map_or(0, |d| d.data.ring.in_flight() + d.control.ring.in_flight() + d.replies.in_flight())
     }
 
-    /// Frames that may be in flight: fewer than asked for when usbfs has too little memory.
+    /// Frames that may be in flight: fewer than requested if usbfs has too little memory.
     pub fn depth(&self) -> usize {
         self.device.as_ref().map_or(0, |d| d.data.lengths.len())
     }
@@ -270,7 +273,7 @@ impl UsbTransport {
         Ok(())
     }
 
-    /// Takes ended transfers of one endpoint and moves its recovery along. An error means that the device is gone.
+    /// Takes ended transfers of one endpoint and advances its recovery. An error means that the device is gone.
     fn repair(
         out: &mut Outgoing,
         is_data: bool,
@@ -306,14 +309,14 @@ impl UsbTransport {
             *reset_due |= out.fail(now);
         }
         if out.recovering && out.ring.in_flight() == 0 && !*reset_due {
-            // An endpoint that cannot be cleared will fail again, and again is a reset.
+            // An endpoint that cannot be cleared will fail again, which leads to a reset.
             if handle.clear_halt(out.endpoint) == Err(rusb::Error::NoDevice) {
                 return Err(rusb::Error::NoDevice);
             }
             out.recovering = false;
             out.progress_at = now;
             if let Some(slot) = out.newest.filter(|_| is_data) {
-                // The newest frame again, from its start; what it holds is known to be unsent.
+                // The newest frame is sent again, from its start; its slot is known to hold unsent content.
                 if out.ring.submit(slot, out.lengths[slot]).is_ok() {
                     counters.frames_resent += 1;
                     counters.frames_lost -= 1;
@@ -323,7 +326,7 @@ impl UsbTransport {
         Ok(())
     }
 
-    /// Resets the device: everything it knew of the link is lost, and the link greets it again.
+    /// Resets the device: it loses its whole state of the link, and the link greets it again.
     fn reset(&mut self) -> Result<(), TransportError> {
         let Some(device) = &mut self.device else { return Ok(()) };
         device.data.ring.cancel_all();
@@ -353,12 +356,12 @@ impl UsbTransport {
                 }
                 Ok(())
             }
-            // It came back as another device, or not at all: to be opened anew.
+            // It came back as another device, or not at all: it must be opened anew.
             Err(_) => Err(self.gone()),
         }
     }
 
-    /// Hands replies on, oldest first, and asks for more.
+    /// Passes replies on, oldest first, and submits new reads.
     fn replies(
         &mut self,
         now: HostTime,
@@ -366,7 +369,7 @@ impl UsbTransport {
     ) -> Result<(), TransportError> {
         let Some(device) = &mut self.device else { return Ok(()) };
         let mut gone = false;
-        // At most one round: a device that talks without end cannot keep this call from returning.
+        // At most one round: a device that sends without end cannot keep this call from returning.
         for _ in 0..REPLY_DEPTH {
             let Some(ended) = device.replies.take_ended() else { break };
             if ended.actual > 0 {
@@ -449,12 +452,12 @@ impl Transport for UsbTransport {
     }
 
     fn set_clock(&mut self, clock: Arc<dyn HostClock>) {
-        // A second clock would make the stamps before it worthless.
+        // A second clock would make earlier stamps worthless.
         let _ = self.clock.set(clock);
     }
 
     fn flush_output(&mut self) {
-        // Frames under way are passed by; no transfer of the control lane waits for them.
+        // Frames in flight stay; no transfer of the control lane waits for them.
         self.urgent = true;
     }
 
@@ -476,7 +479,7 @@ impl Transport for UsbTransport {
             replies_recovering: false,
             handle,
         };
-        // A host that was killed may have left half a packet in the device.
+        // A killed host may have left half a packet in the device.
         for endpoint in [DATA_OUT, CONTROL_OUT] {
             device
                 .handle

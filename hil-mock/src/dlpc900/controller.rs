@@ -1,4 +1,4 @@
-//! The emulated controller: a command at a time into its effect and its reply data, or an error code and its text.
+//! The emulated controller: executes one command at a time and returns its reply data, or an error code and its text.
 
 use std::collections::BTreeMap;
 
@@ -11,19 +11,19 @@ use super::patterns::{Patterns, Refusal};
 use super::registers::{is_loose, setting};
 use super::{Dlpc900Fault, Options};
 
-/// Time from the source setting to a locked source.
+/// Time from setting the source until it is locked.
 const LOCK_NS: i64 = 300_000_000;
 /// Most warnings kept.
 const MOST_WARNINGS: usize = 256;
 
-/// What the sequencer does.
+/// State of the sequencer.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Sequencer {
     /// Stopped.
     Stopped,
-    /// Paused after so many microseconds of the sequence.
+    /// Paused after this many microseconds of the sequence.
     Paused(u64),
-    /// Running since this instant, from so many microseconds into the sequence.
+    /// Running since this instant, from this many microseconds into the sequence.
     Running(HostTime, u64),
 }
 
@@ -36,7 +36,7 @@ pub(super) struct Controller {
     pub idle_since: Option<HostTime>,
     pub parked: bool,
     pub blocks_locked: bool,
-    /// Set by a fault: bits that join the hardware status.
+    /// Set by a fault: bits that are added to the hardware status.
     pub hardware_fault: u8,
     pub source_present: bool,
     source_set_at: HostTime,
@@ -81,10 +81,10 @@ impl Controller {
         }
     }
 
-    /// Does one command: the data of its reply (empty for a write), and whether it was refused.
+    /// Executes one command: returns the data of its reply (empty for a write), and whether it was refused.
     pub(super) fn execute(&mut self, now: HostTime, c: &Command<'_>) -> (Vec<u8>, bool) {
         self.settle(now);
-        // The two questions about the last error leave it as it is. Some programs ask them with the write flag.
+        // The two queries for the last error leave it unchanged. Some programs send them with the write flag.
         match c.opcode {
             Opcode::ERROR_CODE => return (vec![self.error], false),
             Opcode::ERROR_TEXT => {
@@ -116,7 +116,7 @@ impl Controller {
         }
     }
 
-    /// Brings the state up to `now`: a sequence that has run its passes stops.
+    /// Advances the state to `now`: a sequence that has completed its passes stops.
     pub(super) fn settle(&mut self, now: HostTime) {
         let pattern_mode = matches!(self.mode, DisplayMode::OnTheFly | DisplayMode::PreStored);
         if pattern_mode
@@ -140,7 +140,7 @@ impl Controller {
         }
     }
 
-    /// Why no light leaves the projector, if so.
+    /// Why no light leaves the projector, if none does.
     pub(super) fn dark_because(&self) -> Option<&'static str> {
         let leds = self.setting(Opcode::LED_ENABLE);
         match () {
@@ -219,7 +219,7 @@ impl Controller {
                 let n = (self.patterns.table().len() as u16).to_le_bytes();
                 [&n[..], &self.patterns.repeat.to_le_bytes()].concat()
             }
-            // 16 bytes, one u16 per depth; printed under both opcodes in the guide.
+            // 16 bytes, one u16 per depth; the guide prints it under both opcodes.
             Opcode::MIN_EXPOSURE => {
                 let least = |d| self.options.dmd.min_exposure_us(d).unwrap_or(0) as u16;
                 (1..=8).flat_map(|d| least(d).to_le_bytes()).collect()

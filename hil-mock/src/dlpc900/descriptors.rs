@@ -1,4 +1,4 @@
-//! What the emulated DLPC900 tells a USB host about itself.
+//! The USB descriptors of the emulated DLPC900.
 
 /// A vendor-defined usage with one 64-byte input and one 64-byte output report, no report ID.
 #[rustfmt::skip]

@@ -1,9 +1,9 @@
-//! A DLPC900 made of software: HID reports in, replies and light out, without I/O.
+//! A software DLPC900: HID reports in, replies and light out, without I/O.
 //!
-//! [`Dlpc900Model`] is a [`UsbDeviceModel`], so it can be plugged into libusb in-process or served over USB/IP. It keeps the
-//! controller's one-slot reply buffer, order rules, error codes, pattern table and image memory, decodes what is uploaded and
-//! tells what it would project. What programs in the field do against the guide without harm is done and noted in
-//! [`Dlpc900Model::warnings`]; [`Options::strict`] makes the order of commands binding.
+//! [`Dlpc900Model`] is a [`UsbDeviceModel`], so it can be plugged into libusb in-process or served over USB/IP. It has
+//! the controller's one-slot reply buffer, order rules, error codes, pattern table and image memory. It decodes uploads
+//! and reports what it would project. Deviations from the guide that programs in the field make without harm are
+//! accepted and noted in [`Dlpc900Model::warnings`]; [`Options::strict`] enforces the order of commands.
 
 mod controller;
 mod descriptors;
@@ -25,20 +25,20 @@ use controller::Controller;
 pub use controller::Sequencer;
 pub use port::VirtualHid;
 
-/// What kind of projector is emulated.
+/// The emulated projector.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Options {
     /// Mirror array.
     pub dmd: Dmd,
     /// Firmware.
     pub firmware: Version,
-    /// In which bytes of a pixel the planes stand.
+    /// The order of the planes in the bytes of a pixel.
     pub plane_order: PlaneOrder,
-    /// Refuse what the guide forbids but programs in the field get away with.
+    /// Refuse what the guide forbids but programs in the field do.
     pub strict: bool,
-    /// HID interfaces that enumerate, 1 or 2.
+    /// Number of HID interfaces, 1 or 2.
     pub interfaces: u8,
-    /// Least time between two reports from the host, nanoseconds; the cable's 1 ms is 1,000,000, 0 is as fast as they come.
+    /// Least time between two reports from the host, nanoseconds; the cable's 1 ms is 1,000,000; 0 is without limit.
     pub report_period_ns: i64,
     /// A video signal is connected.
     pub source_present: bool,
@@ -68,15 +68,15 @@ pub enum Dlpc900Fault {
     Refuse(Opcode, u8),
     /// The next reply is never made.
     LoseReply,
-    /// The next reply carries another sequence number, then the right one follows.
+    /// The next reply carries another sequence number; then the right one follows.
     StrayReply,
-    /// These bits join the hardware status until a mode switch or reset.
+    /// These bits are added to the hardware status until a mode switch or reset.
     Hardware(u8),
-    /// The video signal goes (false) or comes back.
+    /// The video signal disappears (false) or returns.
     Source(bool),
 }
 
-/// One executed command, for looking at what a program did.
+/// One executed command, for inspecting what a program did.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Executed {
     /// Flags byte.
@@ -96,7 +96,7 @@ const MOST_EXECUTED: usize = 4096;
 pub struct Dlpc900Model {
     controller: Controller,
     assembler: CommandAssembler,
-    /// Reports of the one reply that waits. The next command overwrites it, read or not.
+    /// Reports of the single waiting reply. The next command overwrites it, read or not.
     reply: VecDeque<[u8; REPORT_BYTES]>,
     configuration: Vec<u8>,
     executed: Vec<Executed>,
@@ -113,7 +113,7 @@ impl Default for Dlpc900Model {
 }
 
 impl Dlpc900Model {
-    /// A projector just switched on.
+    /// A projector that was just switched on.
     pub fn new(options: Options) -> Self {
         Self {
             configuration: descriptors::configuration(options.interfaces.clamp(1, 2)),
@@ -128,7 +128,7 @@ impl Dlpc900Model {
         }
     }
 
-    /// The host sends `data` to interrupt OUT endpoint `endpoint`: one report per 64 bytes, as the cable cuts it.
+    /// The host sends `data` to interrupt OUT endpoint `endpoint`: one report per 64 bytes, as the cable splits it.
     pub fn interrupt_out(&mut self, now: HostTime, endpoint: u8, data: &[u8]) {
         if endpoint != 0x01 {
             self.dropped_reports += 1;
@@ -198,7 +198,7 @@ impl Dlpc900Model {
         }
     }
 
-    /// What it is.
+    /// The configuration.
     pub fn options(&self) -> &Options {
         &self.controller.options
     }
@@ -208,7 +208,7 @@ impl Dlpc900Model {
         self.controller.mode
     }
 
-    /// What the sequencer does at `now`.
+    /// State of the sequencer at `now`.
     pub fn sequencer(&mut self, now: HostTime) -> Sequencer {
         self.controller.settle(now);
         self.controller.sequencer
@@ -219,8 +219,8 @@ impl Dlpc900Model {
         self.controller.patterns.table()
     }
 
-    /// The `place`-th pattern shown, when it is a plane (depth 1): its mirrors in the project's plane layout, flips and inversion
-    /// applied. For deeper patterns its least significant bit.
+    /// The `place`-th pattern shown, if it is a plane (depth 1): its mirrors in the project's plane layout, flips and
+    /// inversion applied. For deeper patterns its least significant bit.
     pub fn projected_plane(&self, place: usize) -> Option<Vec<u8>> {
         self.projected_bit(place, 0)
     }
@@ -276,18 +276,18 @@ impl Dlpc900Model {
         Some(out)
     }
 
-    /// The pattern lit at `now` and its place in the table; `None` while no light leaves.
+    /// The pattern lit at `now` and its place in the table; `None` while no light leaves the projector.
     pub fn showing(&mut self, now: HostTime) -> Option<(usize, LutEntry)> {
         self.controller.settle(now);
         self.controller.showing(now)
     }
 
-    /// Why no light leaves, if so.
+    /// Why no light leaves the projector, if none does.
     pub fn dark_because(&self) -> Option<&'static str> {
         self.controller.dark_because()
     }
 
-    /// What a program did against the guide, and every refusal, oldest first (at most 256).
+    /// Deviations of the program from the guide, and every refusal, oldest first (at most 256).
     pub fn warnings(&self) -> &[String] {
         &self.controller.warnings
     }
@@ -363,7 +363,7 @@ impl UsbDeviceModel for Dlpc900Model {
     /// The class requests of HID 1.11 section 7.2.
     fn control(&mut self, now: HostTime, setup: &Setup, data: &mut [u8]) -> Progress {
         match (setup.request_type, setup.request) {
-            // GET_REPORT: what waits, else an empty report.
+            // GET_REPORT: the waiting report, else an empty one.
             (0xa1, 0x01) => {
                 let report = self.interrupt_in(0x81).unwrap_or([0; REPORT_BYTES]);
                 let n = data.len().min(REPORT_BYTES);
@@ -422,7 +422,8 @@ impl UsbDeviceModel for Dlpc900Model {
     }
 
     fn bus_reset(&mut self, _now: HostTime) {
-        // Half a command and an unread reply are lost; the controller's own state is not. Programs reset the bus at their end.
+        // A half-received command and an unread reply are lost; the controller's own state is not. Programs reset the
+        // bus at their end.
         self.assembler.reset();
         self.reply.clear();
     }

@@ -1,4 +1,4 @@
-//! The pattern memory: LUT definitions and uploaded images into what the mirrors show.
+//! The pattern memory: computes from LUT definitions and uploaded images what the mirrors show.
 
 use std::collections::BTreeMap;
 
@@ -7,14 +7,14 @@ use dpm_device::dlpc900::lut::{
     check_entry, step_us, validate, DisplayMode, Dmd, Limits, LutEntry, MAX_IMAGES,
 };
 
-/// An error code of the controller and why.
+/// An error code of the controller and the reason.
 pub(super) type Refusal = (u8, String);
 
 fn refuse<T>(code: u8, why: impl ToString) -> Result<T, Refusal> {
     Err((code, why.to_string()))
 }
 
-/// An image on its way in.
+/// An image during its upload.
 struct Loading {
     secondary: bool,
     index: u16,
@@ -66,7 +66,7 @@ impl Patterns {
         self.shown_order.clear();
     }
 
-    /// Everything is forgotten (reset, mode switch).
+    /// Clears everything (reset, mode switch).
     pub(super) fn clear(&mut self) {
         *self = Self::new(self.dmd, self.order);
     }
@@ -106,14 +106,14 @@ impl Patterns {
             }
         }
         let images = if mode == DisplayMode::VideoPattern { 1 } else { MAX_IMAGES };
-        // A frame that the patterns do not fit is not refused: the sequencer aborts when it runs.
+        // Patterns that do not fit a frame are not refused: the sequencer aborts when it runs.
         let limits = Limits { dmd: self.dmd, images, frame_us: None };
         if let Err(e) = validate(&table, &limits) {
             return refuse(e.rule.error_code(), e);
         }
         let place = |t: &[LutEntry]| t.iter().map(|e| (e.depth, e.image, e.bit)).collect::<Vec<_>>();
         if place(&table) != place(&self.effective) {
-            // Other entries, depths, images or bits: what was uploaded no longer fits.
+            // Other entries, depths, images or bits: the earlier uploads no longer fit.
             self.images.clear();
             self.last_loaded = None;
         }
@@ -150,7 +150,7 @@ impl Patterns {
         }
     }
 
-    /// 0x1A2A / 0x1A2C. The text is a warning where the order is not what the guide asks for.
+    /// 0x1A2A / 0x1A2C. Returns a warning if the order is not that of the guide.
     pub(super) fn begin_image(&mut self, data: &[u8], secondary: bool) -> Result<Option<String>, Refusal> {
         let Some([i0, i1, total @ ..]) = data.first_chunk::<6>().filter(|_| data.len() == 6) else {
             return refuse(6, format!("an image load has 6 bytes, not {}", data.len()));
@@ -165,7 +165,7 @@ impl Patterns {
         if self.effective.is_empty() {
             return refuse(5, "images come after the LUT configuration");
         }
-        // The worst code is two bytes a pixel longer than raw.
+        // The worst encoding is two bytes a pixel longer than raw.
         let most = HEADER_BYTES + self.half_width() as usize * self.dmd.raster().height() as usize * 5;
         if total < HEADER_BYTES || total > most {
             return refuse(
@@ -211,7 +211,7 @@ impl Patterns {
         let bytes = &bytes[..count];
         let width = self.half_width();
         let height = self.dmd.raster().height();
-        // An empty last command is what programs send whose image is a multiple of 504 bytes.
+        // Programs send an empty last command if their image is a multiple of 504 bytes.
         let Some(l) = self.loading.as_mut().filter(|l| l.secondary == secondary) else {
             return if count == 0 { Ok(()) } else { refuse(5, "image data without an image load") };
         };
@@ -242,7 +242,7 @@ impl Patterns {
         }
         let index = l.index;
         if let Some(d) = l.decoder.as_ref().filter(|d| d.is_complete() && !l.stored) {
-            // What follows the end of the image is padding.
+            // Bytes after the end of the image are padding.
             self.images.insert((index, secondary), d.pixels().to_vec());
             l.stored = true;
         }
@@ -260,7 +260,7 @@ impl Patterns {
         Ok(())
     }
 
-    /// Whether every image that the table names is there; otherwise which is not.
+    /// The first image that the table names and that is missing, if any.
     pub(super) fn missing_image(&self) -> Option<u16> {
         let there = |i: u16| {
             self.images.contains_key(&(i, false))
@@ -269,7 +269,8 @@ impl Patterns {
         self.effective.iter().map(|e| e.image).find(|i| !there(*i))
     }
 
-    /// Plane `bit` of pattern `place` (0 = its least significant bit) in the project's plane layout; `None` when there is none.
+    /// Plane `bit` of pattern `place` (0 = its least significant bit) in the project's plane layout; `None` if there is
+    /// none.
     pub(super) fn plane(&self, place: usize, bit: u8) -> Option<Vec<u8>> {
         let e = *self.table().get(place)?;
         if bit >= e.depth {
@@ -293,7 +294,7 @@ impl Patterns {
         Some(out)
     }
 
-    /// How many patterns are shown before the sequence ends; `None` for ever.
+    /// Number of patterns shown before the sequence ends; `None` if it never ends.
     pub(super) fn patterns_to_show(&self, counts_patterns: bool) -> Option<u64> {
         match u64::from(self.repeat) {
             0 => None,
@@ -302,7 +303,7 @@ impl Patterns {
         }
     }
 
-    /// The pattern lit `elapsed_us` after the start, or `None` when it is dark or over; and whether it is over.
+    /// The pattern lit `elapsed_us` after the start, or `None` if it is dark or over; and whether it is over.
     pub(super) fn showing(&self, elapsed_us: u64, counts_patterns: bool) -> (Option<usize>, bool) {
         let table = self.table();
         let cycle: u64 = (0..table.len()).map(|i| step_us(&table, i)).sum();

@@ -1,4 +1,4 @@
-//! The emulator as a driver's cable without any USB, at virtual pace: time passes only when the driver waits.
+//! The emulator as a driver's cable without USB, at virtual pace: time passes only while the driver waits.
 
 use std::sync::{Arc, Mutex, PoisonError};
 use std::time::Duration;
@@ -25,7 +25,7 @@ impl VirtualHid {
         Self::starting_at(model, HostTime(0))
     }
 
-    /// A cable that is plugged in at instant `now`, for a controller that has been in use before.
+    /// A cable that is plugged in at instant `now`, for a controller that was used before.
     pub fn starting_at(model: Arc<Mutex<Dlpc900Model>>, now: HostTime) -> Self {
         Self { model, now }
     }

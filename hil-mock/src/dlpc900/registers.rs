@@ -24,7 +24,7 @@ pub(super) fn setting(opcode: Opcode, firmware: Version) -> Option<Vec<u8>> {
         Opcode::PWM_ENABLE => vec![0],
         Opcode::PWM_SETUP => vec![0; 6],
         Opcode::TRIG_OUT1 | Opcode::TRIG_OUT2 => vec![0; 5],
-        // A rising and a falling delay; firmware 6 put a byte before them and broke every older program.
+        // A rising and a falling delay; firmware 6 put a byte before them, which broke every older program.
         Opcode::RED_DELAY | Opcode::GREEN_DELAY | Opcode::BLUE_DELAY => {
             vec![0; if firmware.major >= 6 { 5 } else { 4 }]
         }
@@ -44,7 +44,7 @@ pub(super) fn setting(opcode: Opcode, firmware: Version) -> Option<Vec<u8>> {
     })
 }
 
-/// Settings whose length the sources leave open: any length from 1 to this many bytes is taken.
+/// Settings whose length the sources leave open: any length from 1 to this many bytes is accepted.
 pub(super) fn is_loose(opcode: Opcode) -> bool {
     matches!(
         opcode,

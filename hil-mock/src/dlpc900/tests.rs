@@ -1,4 +1,4 @@
-//! The emulator by golden bytes, and the driver against it.
+//! Tests of the emulator with golden bytes, and of the driver against it.
 
 use super::*;
 use dpm_device::dlpc900::command::Command;
@@ -16,7 +16,7 @@ fn small() -> Options {
     Options { dmd: Dmd::Dlp5500, ..Options::default() }
 }
 
-/// Sends one report that starts with `head` and gives the reply, if any.
+/// Sends one report that starts with `head` and returns the reply, if any.
 fn send(m: &mut Dlpc900Model, head: &[u8]) -> Option<[u8; 64]> {
     let mut report = [0; 64];
     report[..head.len()].copy_from_slice(head);
@@ -94,7 +94,7 @@ fn the_guides_on_the_fly_example_runs_and_its_order_is_kept() {
     let second = [0x01, 0x00, 0x90, 0x01, 0x00, 0x23, 0, 0, 0, 0, 0x00, 0x08];
     let size = (image.bytes.len() as u32).to_le_bytes();
     let init = [0, 0, size[0], size[1], size[2], size[3]];
-    // Nothing of a pattern in video mode, no image before the table, no start before either.
+    // No pattern commands in video mode, no image before the table, no start before either.
     assert_eq!(command(&mut m, T0, Opcode::LUT_DEFINITION, &first), 5);
     assert_eq!(command(&mut m, T0, Opcode::START_STOP, &[2]), 5);
     let early = HostTime(299_999_999);
@@ -120,7 +120,7 @@ fn the_guides_on_the_fly_example_runs_and_its_order_is_kept() {
     assert_eq!(m.projected_grey(1).unwrap()[..4], [0, 170, 85, 0]);
     let pgm = m.projected_pgm(0).unwrap();
     assert!(pgm.starts_with(b"P5\n1024 768\n255\n") && pgm.len() == 16 + 1024 * 768);
-    // 200 us red, 400 us green, again and again.
+    // 200 us red, 400 us green, repeatedly.
     let at = |m: &mut Dlpc900Model, us: i64| m.showing(T0.plus_ns(us * 1000)).map(|s| (s.0, s.1.leds));
     assert_eq!(
         [at(&mut m, 0), at(&mut m, 199), at(&mut m, 200), at(&mut m, 599), at(&mut m, 600)]
@@ -131,7 +131,7 @@ fn the_guides_on_the_fly_example_runs_and_its_order_is_kept() {
     assert_eq!(command(&mut m, T0, Opcode::DMD_PARK, &[1]), 5);
     assert_eq!(command(&mut m, T0, Opcode::START_STOP, &[0]), 0);
     assert_eq!(m.dark_because(), Some("sequencer stopped"));
-    // Flips and inversion change what is projected, not what is stored.
+    // Flips and inversion change the projection, not the stored data.
     assert_eq!(command(&mut m, T0, Opcode::FLIP_LONG, &[1]), 0);
     assert_eq!(m.projected_plane(0).unwrap()[0], 0x88);
     // Park: the table must be sent again; the image is still there.
@@ -172,12 +172,12 @@ fn bad_streams_numbers_and_states_get_the_controllers_codes() {
     data.resize(50, 0x55);
     assert_eq!(command(&mut m, T0, Opcode::BMP_DATA_PRIMARY, &data), 9, "no header");
     assert!(m.controller.error_text.contains("Spld"));
-    // Standby: nothing but the way back.
+    // Standby: only leaving it is allowed.
     assert_eq!(command(&mut m, T0, Opcode::POWER_MODE, &[1]), 0);
     assert_eq!(command(&mut m, T0, Opcode::DISPLAY_MODE, &[3]), 5);
     assert_eq!(m.dark_because(), Some("standby"));
     assert_eq!(command(&mut m, T0, Opcode::POWER_MODE, &[0]), 0);
-    // Reset: as switched on.
+    // Reset: the state after power-on.
     assert_eq!(command(&mut m, T0, Opcode::POWER_MODE, &[2]), 0);
     assert_eq!((m.mode(), m.table().len()), (DisplayMode::Video, 0));
 }
@@ -233,7 +233,8 @@ fn sequence(
     b.finish(repeat, PlaneOrder::default(), compression).unwrap()
 }
 
-/// Thirty noisy planes through every byte of the protocol, on one and two controllers, strictly checked, come out as they went in.
+/// Thirty noisy planes through every byte of the protocol, on one and two controllers, strictly checked, are projected
+/// unchanged.
 #[test]
 fn the_driver_uploads_what_the_emulator_projects() {
     for (dmd, compression) in [
@@ -265,7 +266,7 @@ fn the_driver_uploads_what_the_emulator_projects() {
         }
         assert_eq!(m.warnings(), [] as [String; 0]);
         assert!(m.showing(port.now()).is_some());
-        // Two passes of thirty times 1 ms, then it stops by itself.
+        // Two passes of thirty times 1 ms; then it stops by itself.
         let Sequencer::Running(since, 0) = m.sequencer(port.now()) else { panic!("running") };
         assert_eq!(m.showing(since.plus_ns(59_999_999)).unwrap().0, 29);
         assert_eq!(m.showing(since.plus_ns(60_000_000)), None);
@@ -289,7 +290,7 @@ fn every_bits_place_in_the_pixel_is_an_option_on_both_sides() {
         d.upload(&s, LedSetup::default(), &mut |_| ()).unwrap();
         let m = model.lock().unwrap();
         let agree: Vec<_> = (0..24).filter(|i| m.projected_plane(*i).unwrap() == planes[*i]).collect();
-        // Where they differ, planes 16 to 23 still agree and the other two groups change places.
+        // If they differ, planes 16 to 23 still agree, and the other two groups are swapped.
         assert_eq!(agree, if same { (0..24).collect::<Vec<_>>() } else { (16..24).collect() });
         if !same {
             assert!(m.projected_plane(0).unwrap() == planes[8]);
@@ -311,7 +312,7 @@ fn video_patterns_lock_or_say_that_they_do_not() {
     let (_, mut d) = driver(Options { source_present: false, ..Options::default() });
     let err = d.start_video_patterns(&video).unwrap_err();
     assert!(matches!(err, Dlpc900Error::NotLocked(_)), "{err}");
-    // Patterns longer than the frame: the sequencer aborts and the driver says so.
+    // Patterns longer than the frame: the sequencer aborts, and the driver reports it.
     let (_, mut d) = driver(Options { video_frame_us: 7000, ..Options::default() });
     let err = d.start_video_patterns(&video).unwrap_err();
     assert!(err.to_string().contains("sequencer abort"), "{err}");
@@ -341,7 +342,7 @@ fn rest_states_are_reached_dark_and_left_in_order() {
     assert!(matches!(d.idle().unwrap_err(), Dlpc900Error::Refused { code: 5, .. }));
     d.wake().unwrap();
     assert_eq!(model.lock().unwrap().warnings().iter().filter(|w| w.contains("3 s")).count(), 0);
-    // In video mode idle goes by way of a pattern mode.
+    // In video mode, idle first switches to a pattern mode.
     let (model, mut d) = driver(Options { strict: true, ..small() });
     d.idle().unwrap();
     assert_eq!(model.lock().unwrap().mode(), DisplayMode::OnTheFly);
@@ -399,7 +400,7 @@ fn locked_blocks_stay_dark_for_programs_that_do_not_know_the_erratum() {
 proptest! {
     #![proptest_config(ProptestConfig::with_cases(300))]
 
-    /// Whatever a program sends: no panic, at most one reply waiting, memory within the images that the table can hold.
+    /// Any input: no panic, at most one reply waiting, memory within the images that the table can hold.
     #[test]
     fn any_reports_are_survived(
         commands in prop::collection::vec((any::<u8>(), prop::sample::select(OPCODES.to_vec()), prop::collection::vec(any::<u8>(), 0..520)), 0..60),
@@ -417,13 +418,13 @@ proptest! {
     }
 }
 
-/// Every opcode with state behind it, and one that does not exist.
+/// Every opcode with a state, and one that does not exist.
 const OPCODES: [u16; 22] = [
     0x0100, 0x0101, 0x0200, 0x0201, 0x0205, 0x0206, 0x0609, 0x1100, 0x1a00, 0x1a07, 0x1a0c, 0x1a1b, 0x1a1d,
     0x1a24, 0x1a2a, 0x1a2b, 0x1a2c, 0x1a30, 0x1a31, 0x1a32, 0x1a34, 0xbeef,
 ];
 
-/// Sends a command as its reports and gives the first report of the reply.
+/// Sends a command as its reports and returns the first report of the reply.
 fn talk(m: &mut Dlpc900Model, flags: u8, sequence: u8, opcode: u16, data: &[u8]) -> Option<[u8; 64]> {
     for r in (Command { flags, sequence, opcode: Opcode(opcode), data }).reports().unwrap() {
         m.interrupt_out(T0, 0x01, &r);
@@ -431,8 +432,9 @@ fn talk(m: &mut Dlpc900Model, flags: u8, sequence: u8, opcode: u16, data: &[u8])
     m.interrupt_in(0x81)
 }
 
-/// The dialogue of the pyusb programs: every write wants a reply and is followed by a question for the error code, image data too;
-/// sequence numbers are constants; an image that is a multiple of 504 bytes ends in an empty data command; the header counts itself.
+/// The dialogue of the pyusb programs: every write wants a reply and is followed by a query for the error code, also
+/// for image data; sequence numbers are constants; an image that is a multiple of 504 bytes ends with an empty data
+/// command; the header's byte count includes the header.
 #[test]
 fn programs_that_ask_after_every_command_are_served() {
     let mut m = Dlpc900Model::new(small());
@@ -472,9 +474,9 @@ fn programs_that_ask_after_every_command_are_served() {
     assert_eq!(m.unread_replies(), 0);
 }
 
-/// The dialogue of the HID-library programs: image data without reply, patterns that are not cleared, the error code asked for by a
-/// write, stop sent twice, a second table configuration after the images, replies that nobody reads, and a header with the pixel
-/// format byte set.
+/// The dialogue of the HID-library programs: image data without reply, patterns that are not cleared, the error code
+/// queried by a write, stop sent twice, a second table configuration after the images, replies that nobody reads, and a
+/// header with the pixel format byte set.
 #[test]
 fn programs_that_never_read_and_configure_twice_are_served() {
     let mut m = Dlpc900Model::new(small());
@@ -497,7 +499,7 @@ fn programs_that_never_read_and_configure_twice_are_served() {
         assert_eq!(talk(&mut m, 0x00, 0, 0x1a2b, &data), None);
     }
     ok(talk(&mut m, 0x40, 0, 0x1a31, &[1, 0, 0, 0, 0, 0]));
-    // Three writes whose replies stay unread, then a question: its answer comes, nothing older.
+    // Three writes whose replies stay unread, then a query: only its own answer arrives.
     for _ in 0..3 {
         let wanted = Command { flags: 0x40, sequence: 9, opcode: Opcode::LED_ENABLE, data: &[8] };
         wanted.reports().unwrap().for_each(|r| m.interrupt_out(T0, 0x01, &r));

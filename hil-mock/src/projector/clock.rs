@@ -1,4 +1,4 @@
-//! True time into the ticks of a device's own clock, which runs at its own pace, and back.
+//! Converts true time to the ticks of a device's own clock, which runs at its own rate, and back.
 
 use dpm_device::time::{DeviceTicks, HostTime};
 

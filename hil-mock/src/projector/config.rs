@@ -1,4 +1,4 @@
-//! What kind of projector the mock is, and what it tells about its light.
+//! The properties of the mock projector, and its reports of light.
 
 use dpm_device::link::{Codec, DeviceState, LightLimits, MAX_FLASHES_PER_S, VERSION};
 use dpm_device::planes::Raster;
@@ -6,7 +6,7 @@ use dpm_device::time::HostTime;
 
 use super::DeviceClock;
 
-/// What kind of projector the mock is.
+/// The properties of the mock projector.
 #[derive(Clone, Copy, Debug)]
 pub struct MockConfig {
     /// Mirrors.
@@ -21,19 +21,19 @@ pub struct MockConfig {
     pub min_plane_ns: u32,
     /// From the start of a slot to the first photon (load and mirror settling), nanoseconds.
     pub settle_ns: u32,
-    /// Codecs that it reads, bits [`Codec::mask`]; raw always.
+    /// Codecs that it decodes, bits [`Codec::mask`]; raw always.
     pub codecs: u32,
     /// Serial number.
     pub serial: u64,
-    /// Firmware version that it claims.
+    /// Firmware version that it reports.
     pub firmware: u16,
-    /// Protocol version that it claims; another than [`VERSION`] makes it refuse every session.
+    /// Protocol version that it reports; any other than [`VERSION`] makes it refuse every session.
     pub version: u16,
     /// Flashes of the whole field a second above which it goes dark and latches; `None` switches the limiter off.
     pub flash_limit: Option<u8>,
-    /// How much light it makes at most, whatever the host asks for.
+    /// Its own limits on light, whatever the host requests.
     pub limits: LightLimits,
-    /// Light events kept for [`super::MockProjector::next_light`]; when full the oldest go and are counted.
+    /// Light events kept for [`super::MockProjector::next_light`]; when full, the oldest are dropped and counted.
     pub events_kept: usize,
 }
 

@@ -1,13 +1,13 @@
-//! A projector as a rig file describes it: sound, or with faults injected into what it receives.
+//! The projector of a rig file: without faults, or with faults injected into its input.
 
 use super::{FaultyProjector, MockConfig, MockProjector};
 use crate::faults::{FaultError, FaultPlan};
 use dpm_device::time::HostTime;
 use dpm_device::transport::{Lane, LinkDevice};
 
-/// A device that a cable can be served with: it says when it wants to live next.
+/// A device that can be served on a cable: it reports the time of its next own event.
 pub trait Served: LinkDevice {
-    /// When something happens next of which nobody tells it; `None` when nothing does.
+    /// Time of the next own event; `None` if there is none.
     fn next_due(&self) -> Option<HostTime>;
 }
 
@@ -23,19 +23,20 @@ impl Served for FaultyProjector {
     }
 }
 
-/// A [`MockProjector`], with a [`FaultPlan`] or without: one without costs nothing more.
+/// A [`MockProjector`], with or without a [`FaultPlan`]. Without one there is no additional cost.
 pub enum EmulatedProjector {
-    /// Gets every packet as it was sent.
+    /// Gets every packet unchanged.
     Sound(Box<MockProjector>),
-    /// Gets what the plan leaves of them.
+    /// Gets the packets after the plan's faults.
     Faulty(Box<FaultyProjector>),
 }
 
 impl EmulatedProjector {
-    /// A projector with the faults that `faults` names, in the mocks' notation; an empty text is none. Their times count from `start`; `seed` decides what they strike.
+    /// A projector with the faults that `faults` names, in the mocks' notation; an empty text means none. Their times
+    /// count from `start`; `seed` decides which packets they strike.
     ///
     /// # Errors
-    /// The text is no plan, or has a fault that means nothing to a projector.
+    /// The text is not a plan, or contains a fault that does not apply to a projector.
     pub fn new(setup: MockConfig, faults: &str, seed: u64, start: HostTime) -> Result<Self, FaultError> {
         let plan: FaultPlan = faults.parse()?;
         let projector = MockProjector::new(setup);

@@ -1,8 +1,8 @@
-//! A projector behind a bad cable, or one with bad habits: the one vocabulary of faults applied to the packets it gets.
+//! A projector behind a bad cable: applies the common vocabulary of faults to its packets.
 //!
-//! Knows `loss`, `corrupt`, `truncate`, `duplicate`, `reorder` (packets of the host), `stall` (nothing gets through until the window
-//! ends, then all that waited), `dropout` (nothing gets through either way), `reset` (power fails and comes back). What strikes which
-//! packet depends on seed and packet number only.
+//! Implements `loss`, `corrupt`, `truncate`, `duplicate`, `reorder` (packets of the host), `stall` (nothing gets
+//! through until the window ends, then everything that waited), `dropout` (nothing gets through in either direction),
+//! `reset` (power fails and returns). The choice of packets depends only on seed and packet number.
 
 use dpm_device::link::{Decoder, Header, Packet, PacketSink};
 use dpm_device::time::HostTime;
@@ -12,7 +12,7 @@ use super::MockProjector;
 use crate::faults::{FaultError, FaultKind, FaultPlan};
 use dpm_device::rng::Draws;
 
-/// Packets of a stalled host that wait; a host that obeys its credits has fewer under way.
+/// Packets of a stalled host that wait; a host that obeys its credits has fewer in flight.
 const STALLED_KEPT: usize = 512;
 
 /// A [`MockProjector`] and a [`FaultPlan`].
@@ -31,7 +31,7 @@ pub struct FaultyProjector {
     struck: u64,
 }
 
-/// Collects whole packets out of the stream, because faults strike packets.
+/// Reassembles whole packets from the stream, because faults strike packets.
 #[derive(Default)]
 struct Reassembly {
     header: Option<Header>,
@@ -56,7 +56,7 @@ impl PacketSink for Reassembly {
 }
 
 impl FaultyProjector {
-    /// Faults that this mock can commit.
+    /// Faults that this mock implements.
     pub const KNOWN: [FaultKind; 8] = [
         FaultKind::Loss,
         FaultKind::Corrupt,
@@ -71,7 +71,7 @@ impl FaultyProjector {
     /// `start` is the instant that the plan's times count from.
     ///
     /// # Errors
-    /// When the plan has a fault that means nothing to a projector.
+    /// When the plan has a fault that does not apply to a projector.
     pub fn new(
         projector: MockProjector,
         plan: FaultPlan,
@@ -100,7 +100,7 @@ impl FaultyProjector {
         &mut self.projector
     }
 
-    /// When the projector inside does something of which nobody tells it; `None` when nothing is to come.
+    /// Time of the next own event of the projector inside; `None` if there is none.
     pub fn next_due(&self) -> Option<HostTime> {
         self.projector.next_due()
     }
@@ -114,7 +114,7 @@ impl FaultyProjector {
         now.ns_since(self.start)
     }
 
-    /// What the clock alone brings about: the end of a stall, a reset.
+    /// Processes the events of the clock alone: the end of a stall, a reset.
     fn live(&mut self, now: HostTime) {
         let t = self.since_start(now);
         if self.plan.starts_within(FaultKind::Reset, self.checked_ns, t) {
@@ -258,7 +258,7 @@ mod tests {
         let (mut dark_from, mut longest) = (None, 0);
         for slot in 1..947u64 {
             let now = HostTime(rate.slot_start_ns(slot));
-            // An arming that is refused is tried again with the next slot.
+            // A refused ARM is tried again with the next slot.
             match link.poll(now, &mut cable) {
                 Ok(LinkState::Ready) => link.arm(0),
                 Ok(LinkState::Faulted) | Err(_) => link.arm(u32::MAX),
@@ -343,7 +343,7 @@ mod tests {
         let mut link = HostLink::new(LinkSettings { late_slots: 3, ..settings() });
         link.connect();
         let now = Cell::new(0i64);
-        // A clock that ticks with every look at it: virtual time.
+        // A clock that advances with every reading: virtual time.
         let clock = || {
             now.set(now.get() + 20_000);
             HostTime(now.get())

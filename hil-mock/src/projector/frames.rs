@@ -1,4 +1,4 @@
-//! Planes that arrive one by one into whole frames that wait to be lit, in a fixed set of buffers.
+//! Assembles planes into whole frames that wait to be lit, in a fixed set of buffers.
 
 use dpm_device::time::DeviceTicks;
 
@@ -11,7 +11,7 @@ pub(super) struct Assembling {
     pub received: u32,
     /// A plane was decoded against the base frame.
     pub uses_base: bool,
-    /// Buffer it is written to; `None` when the frame is refused and its planes are passed over.
+    /// Buffer it is written to; `None` if the frame is refused and its planes are skipped.
     pub buffer: Option<usize>,
 }
 
@@ -24,7 +24,7 @@ pub(super) struct Pending {
     pub buffer: usize,
 }
 
-/// A frame, where its planes are, and when its light ends by itself.
+/// A frame, the buffer of its planes, and the end of its light.
 #[derive(Clone, Copy, Debug)]
 pub(super) struct Held {
     pub frame: u32,
@@ -32,7 +32,7 @@ pub(super) struct Held {
     pub buffer: usize,
 }
 
-/// All buffers. `capacity` may wait; one is lit, one is being written, one may serve as the base of the next.
+/// All buffers. `capacity` frames may wait; one is lit, one is being written, one may serve as the base of the next.
 #[derive(Debug)]
 pub(super) struct FrameStore {
     buffers: Vec<Box<[u8]>>,
@@ -41,7 +41,7 @@ pub(super) struct FrameStore {
     capacity: usize,
     /// The frame on the mirrors.
     pub lit: Option<Held>,
-    /// The newest whole frame, lit or not: what kept planes refer to.
+    /// The newest whole frame, lit or not: kept planes refer to it.
     pub base: Option<Held>,
 }
 
@@ -57,7 +57,7 @@ impl FrameStore {
         }
     }
 
-    /// A buffer that nothing refers to. There always is one when no frame is being assembled.
+    /// A buffer that nothing refers to. One always exists while no frame is being assembled.
     pub(super) fn free_buffer(&self) -> usize {
         debug_assert!(self.assembling.is_none_or(|a| a.buffer.is_none()));
         (0..self.buffers.len())
@@ -101,8 +101,8 @@ impl FrameStore {
         self.pending.push(pending);
     }
 
-    /// Takes the newest frame due in or before `slot`, and tells how many older ones it replaces. Frames arrive in the order
-    /// of their numbers, so everything before it in the queue is older.
+    /// Takes the newest frame due in or before `slot`, and returns the number of older ones that it replaces. Frames
+    /// arrive in the order of their numbers, so every earlier one in the queue is older.
     pub(super) fn take_due(&mut self, slot: u64) -> Option<(Pending, u32)> {
         let newest = self.pending.iter().rposition(|p| p.slot <= slot)?;
         let due = self.pending[newest];
@@ -110,7 +110,7 @@ impl FrameStore {
         Some((due, newest as u32))
     }
 
-    /// Dark: nothing waits, nothing is lit, nothing can be referred to. Returns how many frames were thrown away.
+    /// Clears everything: no frame waits, is lit or can be referred to. Returns the number of dropped frames.
     pub(super) fn clear(&mut self) -> u32 {
         let thrown =
             self.pending.len() as u32 + u32::from(self.assembling.is_some_and(|a| a.buffer.is_some()));

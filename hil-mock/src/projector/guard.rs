@@ -1,10 +1,10 @@
-//! The device's own word on how much light there may be: what CONFIG asks for, and what its owner set, whatever the host says.
+//! The device's own limits on light: those of CONFIG, and those of its owner, which hold whatever the host requests.
 
 use dpm_device::link::{light_level, LightLimiter, LightLimits, LimitReached};
 use dpm_device::planes::{PlaneSchedule, Raster};
 use dpm_device::time::FrameRate;
 
-/// One set of limits and what counts against it.
+/// One set of limits and its counts.
 #[derive(Debug)]
 struct Counted {
     limits: LightLimits,
@@ -15,15 +15,15 @@ struct Counted {
 /// Counts the light of every slot.
 #[derive(Debug, Default)]
 pub(super) struct LightGuard {
-    /// Of the host, and of the device's owner.
+    /// The limits of the host, and those of the device's owner.
     counted: [Option<Counted>; 2],
     /// Level of the frame on the mirrors.
     level: u32,
 }
 
 impl LightGuard {
-    /// Slots of `rate` begin, under the host's limits and the owner's. What was counted under the same limits still counts: a host cannot
-    /// make a device forget by asking again.
+    /// Starts slots of `rate` under the host's limits and the owner's. Counts under unchanged limits are kept: a host
+    /// cannot clear them by another CONFIG.
     pub(super) fn configure(&mut self, rate: FrameRate, host: LightLimits, owner: LightLimits) {
         for (counted, limits) in self.counted.iter_mut().zip([host, owner]) {
             if counted.as_ref().is_none_or(|c| (c.limits, c.rate) != (limits, rate)) {
@@ -32,14 +32,15 @@ impl LightGuard {
         }
     }
 
-    /// `slots` slots have passed in the dark, uncounted until now.
+    /// Counts `slots` slots that have passed in the dark.
     pub(super) fn was_dark(&mut self, slots: u64) {
         for c in self.counted.iter_mut().flatten() {
             c.limiter.repeated(0, slots);
         }
     }
 
-    /// A slot is about to light `planes`, a frame that was not on the mirrors before. The rest in microseconds when it must not.
+    /// A slot is about to light `planes`, a frame that was not on the mirrors before. Returns the rest in microseconds
+    /// if it must not.
     pub(super) fn new_frame(
         &mut self,
         raster: Raster,

@@ -1,7 +1,8 @@
-//! Bit planes into light: what the eye's side of the mirrors receives from a frame, in code values.
+//! Computes the light of a frame from its bit planes, in code values.
 //!
-//! A plane of bit `b` is lit for one plane slot with an LED at `2^b / 255` of full. Summed over a channel's planes a pixel
-//! receives `code / 255` of the light of a full slot, where `code` is the number its bits spell: light **is** the code value.
+//! A plane of bit `b` is lit for one plane slot with an LED at `2^b / 255` of full. Summed over a channel's planes, a
+//! pixel receives `code / 255` of the light of a full slot, where `code` is the number that its bits form: light **is**
+//! the code value.
 
 use dpm_device::planes::{Channel, PlaneSchedule, Raster};
 
@@ -17,11 +18,12 @@ fn transpose(rows: &mut [u64; 8]) {
     }
 }
 
-/// Light of one frame for every mirror, rows top to bottom, red green blue code values 0..=255. `planes` are the frame's planes one
-/// after the other in the order of `schedule`. Planes of [`Channel::White`] light all three; a sum above full light stays full.
+/// Light of one frame for every mirror, rows top to bottom, red green blue code values 0..=255. `planes` holds the
+/// frame's planes one after the other in the order of `schedule`. Planes of [`Channel::White`] light all three
+/// channels; a sum above full light is clamped.
 ///
 /// # Panics
-/// When a slice has not the size that raster and schedule demand.
+/// When a slice does not have the size that raster and schedule demand.
 pub fn light_of_planes(raster: Raster, schedule: &PlaneSchedule, planes: &[u8], out: &mut [[u8; 3]]) {
     let plane_bytes = raster.plane_bytes();
     assert_eq!(planes.len(), plane_bytes * schedule.len(), "bytes of planes");
@@ -48,7 +50,7 @@ pub fn light_of_planes(raster: Raster, schedule: &PlaneSchedule, planes: &[u8], 
             for rows in &mut codes[..if has_white { 4 } else { 3 }] {
                 transpose(rows);
             }
-            // Now row `j` holds, in byte `c`, the code of the mirror that bit `j` of byte `c` moved: bit 7 is the leftmost.
+            // Now row `j` holds, in byte `c`, the code of the mirror at bit `j` of byte `c`: bit 7 is the leftmost.
             let bytes = codes.map(|rows| rows.map(u64::to_le_bytes));
             for (c, eight) in pixels.chunks_mut(8).enumerate() {
                 for (k, pixel) in eight.iter_mut().enumerate() {
@@ -63,7 +65,7 @@ pub fn light_of_planes(raster: Raster, schedule: &PlaneSchedule, planes: &[u8], 
     }
 }
 
-/// Light summed over slots: what a camera or an eye collects.
+/// Light summed over slots, as a camera or an eye collects it.
 #[derive(Clone, Debug)]
 pub struct Exposure {
     sum: Vec<[u32; 3]>,
@@ -120,7 +122,7 @@ mod tests {
     use dpm_device::planes::PlaneSpec;
     use proptest::prelude::*;
 
-    /// One bit at a time, as the words say it: the oracle.
+    /// One bit at a time, as the definition says: the oracle.
     fn bit_by_bit(raster: Raster, schedule: &PlaneSchedule, planes: &[u8]) -> Vec<[u8; 3]> {
         let mut out = vec![[0u8; 3]; raster.pixel_count()];
         for (k, spec) in schedule.planes().iter().enumerate() {

@@ -1,4 +1,4 @@
-//! Packets into changes of the projector's state: every check that stands between a byte and light.
+//! Applies packets to the projector's state, with every check between a byte and light.
 
 use dpm_device::link::{
     frame_newer, Assembly, Codec, Commit, ConfigRefusal, Echo, FaultCode, Header, HostMessage, MessageType,
@@ -25,12 +25,12 @@ pub(super) enum Incoming {
     },
 }
 
-/// How the bytes of a plane become its bits.
+/// Encoding of an arriving plane.
 #[derive(Debug)]
 pub(super) enum Form {
-    /// They are the bits; the number counts those written.
+    /// The bytes are the bits; the number counts those written.
     Raw { filled: usize },
-    /// Tokens, decoded as they come.
+    /// Tokens, decoded as they arrive.
     Rle { decoder: RleDecoder, failed: bool },
     /// One block, decoded when it is complete and intact; the number counts the bytes staged.
     Lz4 { staged: usize },
@@ -50,7 +50,7 @@ impl PacketSink for LaneSink<'_> {
     }
 
     fn payload(&mut self, bytes: &[u8]) {
-        // Taken out while it is worked on: it acts on the rest of the core.
+        // Taken out during processing, because it acts on the rest of the core.
         let mut incoming = std::mem::take(&mut self.core.incoming[self.lane as usize]);
         match &mut incoming {
             Incoming::Control(assembly) => assembly.push(bytes),
@@ -66,7 +66,7 @@ impl PacketSink for LaneSink<'_> {
         match std::mem::take(&mut self.core.incoming[self.lane as usize]) {
             Incoming::Control(assembly) if intact => self.core.control(&assembly),
             Incoming::Plane { plane, frame, buffer, form } if intact => {
-                // Only now: a header in front of damaged bits is no word of a host.
+                // Only now: an intact header in front of a damaged payload does not count as a sign of life.
                 self.core.last_heard = self.core.ticks();
                 self.core.plane_arrived(plane, frame, buffer, &form);
             }
@@ -79,7 +79,7 @@ impl Core {
     fn begin(&mut self, header: &Header, lane: Lane) -> Incoming {
         use MessageType::{FrameCommit, Plane, Sync};
         if matches!(header.kind, Plane | FrameCommit | Sync) && lane != Lane::Data {
-            // On another lane they could overtake the planes they speak of.
+            // On the control lane they could overtake the planes that they refer to.
             return self.ignore();
         }
         if header.kind == Plane {
@@ -96,7 +96,8 @@ impl Core {
         Incoming::Nothing
     }
 
-    /// True when an intact packet of `session` is of the open one, which feeds the watchdog; else as [`Core::is_ours`].
+    /// True if an intact packet of `session` belongs to the open one, which feeds the watchdog; else as
+    /// [`Core::is_ours`].
     fn heard(&mut self, session: u32) -> bool {
         let ours = self.is_ours(session);
         if ours {
@@ -105,7 +106,7 @@ impl Core {
         ours
     }
 
-    /// True when `session` is the open one; otherwise counts the packet, and lets the host know when there is none.
+    /// True if `session` is the open one; otherwise counts the packet, and informs the host if no session is open.
     fn is_ours(&mut self, session: u32) -> bool {
         if self.session == 0 {
             self.status_due = true;
@@ -159,7 +160,7 @@ impl Core {
     }
 
     fn plane_bytes_arrived(&mut self, plane: u8, frame: u32, buffer: usize, form: &mut Form, bytes: &[u8]) {
-        // Light may have ended while the plane was arriving: then the buffer is another frame's by now.
+        // Light may have ended while the plane was arriving: then the buffer belongs to another frame by now.
         if !self.is_assembling(frame, buffer) {
             return;
         }
@@ -214,7 +215,7 @@ impl Core {
         self.status.frames_refused = self.status.frames_refused.wrapping_add(1);
     }
 
-    /// Nothing more will come of the frame being assembled.
+    /// Drops the frame that is being assembled.
     fn give_up_frame(&mut self) {
         if self.store.assembling.take().is_some_and(|f| f.buffer.is_some()) {
             self.status.frames_incomplete = self.status.frames_incomplete.wrapping_add(1);
@@ -261,7 +262,7 @@ impl Core {
                 return;
             }
         };
-        // To go dark, any session will do.
+        // Orders to go dark are accepted from any session.
         match message {
             HostMessage::Hello(hello) => {
                 let version = self.setup.version;
@@ -316,7 +317,8 @@ impl Core {
         }
     }
 
-    /// The host says how many frames it has sent: those not seen were lost on the way and hold no buffer.
+    /// Accounts the number of frames that the host has sent: frames that were not seen were lost on the way and occupy
+    /// no buffer.
     fn account(&mut self, frames_sent: u32) {
         if frame_newer(frames_sent, self.status.frames_accounted) {
             self.status.frames_accounted = frames_sent;
@@ -325,7 +327,7 @@ impl Core {
     }
 
     fn commit(&mut self, header: &Header, commit: &Commit) {
-        // A frame whose light would end before it begins has a wrong field, and like every such message no effect.
+        // A frame whose light would end before it begins has a wrong field, and no effect, like every such message.
         if self.config.is_none() || !commit.ends_after(header.target_at) || !self.enter_frame(header) {
             self.ignore();
             return;
@@ -348,7 +350,7 @@ impl Core {
         self.schedule(&frame, commit.dark_from, buffer);
     }
 
-    /// True when every plane of the frame is in `buffer`, those that did not change copied from the base frame.
+    /// True if every plane of the frame is in `buffer`; unchanged planes are copied from the base frame.
     fn complete(&mut self, frame: &Assembling, buffer: usize, commit: &Commit) -> bool {
         let Some((config, _)) = self.config else { return false };
         let all = u32::MAX >> (32 - config.schedule.len());
@@ -366,7 +368,7 @@ impl Core {
         true
     }
 
-    /// A whole frame gets its slot, or is too late or too early.
+    /// Queues a whole frame for its slot, or drops it as too late or too early.
     fn schedule(&mut self, frame: &Assembling, dark_from: DeviceTicks, buffer: usize) {
         let Some((config, slots)) = self.config else { return };
         let lead = u64::from(self.setup.clock.tick_hz).saturating_mul(MAX_LEAD_S);

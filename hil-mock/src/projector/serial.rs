@@ -9,7 +9,7 @@ use dpm_device::transport::{Lane, LinkDevice};
 
 use super::MockProjector;
 
-/// Bytes of replies kept at most; more are dropped, as STATUS is absolute.
+/// Maximum number of bytes of replies kept; more are dropped, because STATUS is absolute.
 const REPLIES_KEPT: usize = 16 * 1024;
 /// Bytes read in one call at most.
 const READ_AT_ONCE: usize = 256 * 1024;
@@ -23,7 +23,7 @@ pub struct SerialProjector {
 }
 
 impl SerialProjector {
-    /// Puts `projector` on a line.
+    /// Connects `projector` to a line.
     pub fn new(projector: MockProjector) -> Self {
         let plane = projector.core.setup.raster.plane_bytes().max(MAX_CONTROL_BYTES);
         Self { deframer: Deframer::new(vec![0; packet_bytes(plane)]), projector, out: Vec::new() }
@@ -47,8 +47,9 @@ impl SerialProjector {
         });
     }
 
-    /// Bytes for the line; taken from the front as far as it takes them. While the line has not taken the last ones there are no new
-    /// ones: an older STATUS never keeps a newer one waiting, and an ECHO is stamped when it can leave.
+    /// Bytes for the line; the caller removes those that the line took from the front. While the line has not taken the
+    /// last ones, no new ones are made: an older STATUS never delays a newer one, and an ECHO is stamped when it can
+    /// leave.
     pub fn replies(&mut self, now: HostTime) -> &mut Vec<u8> {
         let Self { projector, out, .. } = self;
         if !out.is_empty() {
@@ -66,8 +67,8 @@ impl SerialProjector {
         out
     }
 
-    /// One round on a line that does not block: reads what is there, lives up to now, writes what the line takes. `Ok(false)` when
-    /// the line has ended. `clock` is read anew before everything that is delivered and before the answers.
+    /// One round on a non-blocking line: reads the input, advances to now, writes what the line takes. `Ok(false)` when
+    /// the line has ended. `clock` is read before each delivery and before the answers.
     pub fn serve(
         &mut self,
         clock: impl Fn() -> HostTime,

@@ -1,4 +1,4 @@
-//! The link's host side against the projector at virtual pace, over a clean and over a bad cable.
+//! Tests the link's host side against the projector at virtual pace, over a clean and over a bad cable.
 
 mod cable;
 mod codec;
@@ -129,7 +129,7 @@ impl<T: Transport> Rig<T> {
         self.link.send_frame(self.now, id, target, dark_from, planes, &mut self.cable)
     }
 
-    /// When slot `slot` begins, and long after: what ends light by itself has tests of its own.
+    /// The start of slot `slot`, and a `dark from` long after it: other tests cover the end of light.
     fn times(&self, slot: u64) -> (DeviceTicks, DeviceTicks) {
         let slots = self.link.slots().unwrap();
         (slots.start(slot), slots.dark_from(slot, LONG_NS))
@@ -144,7 +144,7 @@ impl<T: Transport> Rig<T> {
     }
 }
 
-/// The laws that every report must obey, whatever happened.
+/// The laws that every report must obey.
 fn laws(s: &Status, waiting: u32) {
     assert_eq!(s.slots, s.frames_lit + s.slots_repeated + s.slots_blank, "{s:?}");
     assert_eq!(
@@ -155,7 +155,7 @@ fn laws(s: &Status, waiting: u32) {
 }
 
 impl MockProjector {
-    /// Frames on their way to the light.
+    /// Frames in flight.
     pub(super) fn waiting(&self) -> u32 {
         let assembling = self.core.store.assembling.is_some_and(|a| a.buffer.is_some());
         self.core.store.waiting() as u32 + u32::from(assembling)
@@ -224,7 +224,7 @@ fn no_light_without_hello_config_and_arm() {
         assert_eq!(rig.step(id), SendOutcome::Dropped { reason: DropReason::NotStreaming });
         assert!(!rig.cable.device().is_lit());
     }
-    // A host that sends all the same is refused.
+    // A host that still sends is refused.
     let session = rig.cable.device().core.session;
     let header = Header { frame: 1, led_code: 7, ..Header::control(MessageType::Plane, session, 0) };
     rig.cable.send(rig.now, Lane::Data, &[Packet::new(header, &planes(1)[..9])]).unwrap();
@@ -244,7 +244,7 @@ fn silence_is_dark_at_the_watchdogs_tick_and_stays_dark() {
     }
     assert!(rig.cable.device().is_lit());
     let heard = rig.now;
-    // Killed: nothing is sent any more. A nanosecond before the bite the last frame still repeats.
+    // Killed: nothing is sent any more. A nanosecond before the watchdog expires, the last frame still repeats.
     let bite = heard.plus_ns(i64::from(WATCHDOG_US) * 1000);
     rig.cable.device_mut().advance_to(bite.plus_ns(-1));
     assert!(rig.cable.device().is_lit());
@@ -252,7 +252,7 @@ fn silence_is_dark_at_the_watchdogs_tick_and_stays_dark() {
     assert!(!rig.cable.device().is_lit());
     assert_eq!(rig.cable.device().status().faults, faults::WATCHDOG);
     rig.cable.device_mut().check_laws();
-    // A host that comes back and goes on sending changes nothing until it arms again, with acknowledgement.
+    // A host that returns and continues to send changes nothing until it arms again, with acknowledgement.
     rig.now = bite.plus_ns(1_000_000_000);
     rig.slot = rig.link.settings().rate.slot_at_ns(rig.now.0);
     rig.until(LinkState::Faulted);
@@ -315,7 +315,7 @@ fn the_newest_due_frame_wins_and_late_ones_are_dropped_unless_asked() {
         let s = rig.cable.device().status();
         assert_eq!((s.frames_superseded, s.frames_late), (1, u32::from(late_slots == 0)));
         assert_eq!(rig.cable.device().lit_frame(), Some(if late_slots == 0 { 2 } else { 3 }));
-        // And one so far ahead that it would never give its buffer back.
+        // And one so far ahead that it would occupy its buffer too long.
         assert_eq!(send(&mut rig, 4, k + 947 * 10), SendOutcome::Sent);
         assert_eq!(rig.cable.device().status().frames_refused, 1);
         rig.cable.device().check_laws();
@@ -326,7 +326,7 @@ fn the_newest_due_frame_wins_and_late_ones_are_dropped_unless_asked() {
 fn credit_is_what_the_buffers_hold() {
     let mut rig = clean(settings(), MockConfig { frame_buffers: 3, ..MockConfig::new(raster()) });
     rig.stream();
-    // Frames for a slot far away fill the buffers; the fourth has no credit; when light takes them, credit returns.
+    // Frames for a distant slot fill the buffers; the fourth has no credit; when they are lit, credit returns.
     let (target, dark_from) = rig.times(rig.slot + 100);
     for id in 0..5u64 {
         rig.poll().unwrap();

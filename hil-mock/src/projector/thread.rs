@@ -1,7 +1,7 @@
-//! A projector at the end of a cable between threads, for rigs that run at the pace of the wall clock.
+//! A projector at the end of a cable between threads, for rigs that run at real pace.
 //!
-//! The thread never decides *when* light falls: it asks the clock it is given and lets the state machine catch up, so an event's
-//! times are exact however late the thread runs; only packets that wait for it arrive late.
+//! The thread never decides *when* light falls: it reads its clock and lets the state machine catch up, so the times of
+//! events are exact however late the thread runs. Only packets that wait for the thread arrive late.
 
 use dpm_device::time::HostTime;
 use dpm_device::transport::inproc::DeviceEnd;
@@ -9,19 +9,19 @@ use dpm_device::transport::{Lane, LinkDevice};
 
 use super::Served;
 
-/// Longest rest of a thread for whose projector nothing is due.
+/// Longest sleep of a thread whose projector has no due event.
 const REST_NS: i64 = 1_000_000_000;
 
-/// Serves `cable` with `projector` until the host's end is gone. Sleeps between what arrives and what is due. `clock` gives the rig's
-/// time, the one that the host reads too; `witness` is called with it before anything that arrived is delivered, to let the projector
-/// live up to then and take its light.
+/// Serves `cable` with `projector` until the host's end is dropped. Sleeps between arrivals and due events. `clock`
+/// gives the rig's time, the one that the host reads too. `witness` is called with it before each delivery, to advance
+/// the projector to that time and take its light.
 pub fn serve_cable<P: Served>(
     projector: &mut P,
     mut cable: DeviceEnd,
     clock: impl Fn() -> HostTime,
     mut witness: impl FnMut(&mut P, HostTime) + Send,
 ) {
-    // What has arrived first: it may lie before now, and a projector does not live backwards.
+    // Arrived packets come first: they may be older than now, and a projector never goes back in time.
     while cable.serve(&clock, &mut Witnessed { projector, witness: &mut witness }) {
         witness(projector, clock());
         let limit = clock().plus_ns(REST_NS);
@@ -71,8 +71,8 @@ mod tests {
     use dpm_handoff::wake::WaitPolicy;
     use std::time::{Duration, Instant};
 
-    /// At the pace of the wall clock, over the rings: whatever the scheduler does, what is lit was sent and nothing is lost
-    /// without a reason.
+    /// At real pace, over the rings: whatever the scheduler does, every lit frame was sent, and nothing is lost without
+    /// a reason.
     #[test]
     fn frames_cross_between_threads() {
         let raster = Raster::new(64, 16).unwrap();
@@ -147,8 +147,9 @@ mod tests {
         assert!(mock.light_of_frame().is_some());
     }
 
-    /// Found in use, section 2b of the second look at latency: full frames, a host that polls once a slot, and the projector's clock was
-    /// 0.25 to 0.5 ms wrong. The device's clock is the host's own here, so what the map says can be compared with the truth.
+    /// Found in use, section 2b of the second look at latency: with full frames and a host that polls once a slot, the
+    /// map of the projector's clock was 0.25 to 0.5 ms wrong. The device's clock is the host's own here, so the map can
+    /// be compared with the truth.
     #[test]
     fn the_projectors_clock_is_right_while_frames_flow() {
         use dpm_device::clock_map::ClockMap;
@@ -180,7 +181,7 @@ mod tests {
         let (mut errors, mut sent) = (Vec::new(), 0u64);
         let deadline = Instant::now() + Duration::from_secs(60);
         while sent < 500 && Instant::now() < deadline {
-            // Once a slot, as a thread that has a frame to send does, and not again before the next.
+            // Once a slot, like a thread that has a frame to send, and not again before the next.
             match link.poll(clock(), &mut host).expect("in-process") {
                 LinkState::Ready => link.arm(0),
                 LinkState::Faulted => link.arm(dpm_device::link::faults::WATCHDOG),
@@ -210,7 +211,8 @@ mod tests {
         drop(host);
         thread.join().unwrap();
         errors.sort_unstable();
-        // Half a slot is 1000 us. A busy machine holds a thread up now and then; the shortest exchanges of four seconds do not know it.
+        // Half a slot is 1000 us. A busy machine delays a thread now and then; this does not affect the shortest
+        // exchanges of four seconds.
         let p50 = errors[errors.len() / 2];
         assert!(p50 < 20_000, "half of the time {p50} ns wrong or more");
     }
@@ -225,7 +227,7 @@ mod tests {
             let mut mock = MockProjector::new(MockConfig::new(raster));
             serve_cable(&mut mock, device, clock, |mock, now| mock.advance_to(now));
         });
-        // Asleep for a second by itself, in which it is woken.
+        // Its own sleep would last a second; it is woken during it.
         std::thread::sleep(Duration::from_millis(20));
         drop(host);
         let deadline = Instant::now() + Duration::from_secs(10);
@@ -235,7 +237,7 @@ mod tests {
         }
     }
 
-    /// What the thread costs while nothing happens: it sleeps, it does not look.
+    /// The cost of the thread while nothing happens: it sleeps and does not poll.
     #[cfg(target_os = "linux")]
     #[test]
     fn an_idle_projector_uses_no_processor() {

@@ -1,7 +1,8 @@
 //! The projector as a USB device: bulk endpoints for the two lanes and the replies, on top of the state machine.
 //!
-//! One vendor interface with three bulk endpoints, see docs/PROTOCOL.md section 1. The cable may be slower than the bus: bytes of
-//! the data lane are taken at a given rate, the rest is refused for now (NAK), as a device with a slow memory does.
+//! One vendor interface with three bulk endpoints, see docs/PROTOCOL.md section 1. The cable may be slower than the
+//! bus: bytes of the data lane are accepted at a given rate, and the rest is refused for now (NAK), as by a device with
+//! a slow memory.
 
 use std::collections::VecDeque;
 
@@ -18,9 +19,9 @@ pub const CONTROL_OUT: u8 = 0x02;
 /// Bulk IN endpoint of the replies.
 pub const REPLIES_IN: u8 = 0x82;
 
-/// Bytes of replies kept for a host that does not read; older ones go, as STATUS is absolute.
+/// Bytes of replies kept for a host that does not read; older ones are dropped, because STATUS is absolute.
 const REPLIES_KEPT: usize = 64 * 1024;
-/// Bytes that the data lane takes at once at a limited rate.
+/// Bytes that the data lane accepts at once at a limited rate.
 const FIFO_BYTES: i64 = 64 * 1024;
 
 /// A [`MockProjector`] on a USB cable.
@@ -39,7 +40,7 @@ pub struct UsbProjector {
 }
 
 impl UsbProjector {
-    /// Puts `projector` on a cable of `speed` (high or super). `bytes_per_second` limits the data lane.
+    /// Connects `projector` to a cable of `speed` (high or super). `bytes_per_second` limits the data lane.
     pub fn new(projector: MockProjector, speed: Speed, bytes_per_second: Option<u64>) -> Self {
         let (usb, packet, packet0) = match speed {
             Speed::Super => (0x0300u16, 1024u16, 9),
@@ -82,7 +83,7 @@ impl UsbProjector {
         self.bytes_per_second = limit;
     }
 
-    /// Bytes of the data lane that may be taken now.
+    /// Number of bytes that the data lane may accept now.
     fn take_room(&mut self, now: HostTime, wanted: usize) -> usize {
         let Some(rate) = self.bytes_per_second else { return wanted };
         let elapsed = if self.room_at.0 == i64::MIN { 0 } else { now.ns_since(self.room_at).max(0) };
@@ -162,7 +163,7 @@ impl UsbDeviceModel for UsbProjector {
 
     fn halt_cleared(&mut self, endpoint: u8) {
         if let Some(lane) = Self::lane(endpoint) {
-            // The device does not know the time of the request; its own is as far as it has lived.
+            // The device does not know the time of the request; it uses the time to which it has advanced.
             let now = self.projector.core.now;
             self.projector.end_of_transfer(now, lane);
         }

@@ -1,4 +1,4 @@
-//! Command-line words into moving bodies: what all mock trackers have in common.
+//! Parses moving bodies from the command line: the common part of all mock trackers.
 
 use clap::Args;
 use dpm_device::pose::Pose;

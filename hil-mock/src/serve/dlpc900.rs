@@ -1,4 +1,4 @@
-//! `hil-mock serve dlpc900`: arguments into an emulated projector controller on a USB/IP port.
+//! `hil-mock serve dlpc900`: an emulated projector controller on a USB/IP port.
 
 use super::usb::{offer, UsbArguments};
 use super::{complain, say};

@@ -28,23 +28,24 @@ pub(crate) enum Device {
     Vrpn(vrpn::VrpnArguments),
 }
 
-/// Writes a line to the standard output. A reader that has gone away (`hil-mock serve ... | head`) is no error: the device goes on.
+/// Writes a line to the standard output. It is not an error if the reader is gone (`hil-mock serve ... | head`): the
+/// device continues.
 fn say(line: Arguments<'_>) {
     let _ = writeln!(std::io::stdout().lock(), "{line}");
 }
 
-/// Writes a line to the standard error stream, whether anybody reads it or not.
+/// Writes a line to the standard error stream, and ignores errors.
 pub(crate) fn complain(line: Arguments<'_>) {
     let _ = writeln!(std::io::stderr().lock(), "{line}");
 }
 
-/// A time that ends: not NaN, not infinite, not negative.
+/// A finite time: not NaN, not infinite, not negative.
 fn seconds(text: &str) -> Result<f64, String> {
     let s = text.parse().ok().filter(|s: &f64| (0.0..=1e9).contains(s));
     s.ok_or_else(|| "write seconds from 0 to 1e9".to_owned())
 }
 
-/// Why `what` cannot be served on `address`, and what to do about it; `flag` chooses another port.
+/// Why `what` cannot be served on `address`, and the remedy; `flag` chooses another port.
 fn cannot_serve(what: &str, address: impl std::fmt::Display, e: &std::io::Error, flag: &str) -> String {
     use std::io::ErrorKind;
     let remedy = match e.kind() {
@@ -58,7 +59,7 @@ fn cannot_serve(what: &str, address: impl std::fmt::Display, e: &std::io::Error,
     format!("cannot serve {what} on {address}: {e}; {remedy}")
 }
 
-/// Why a serial port cannot be opened, and what to do about it.
+/// Why a serial port cannot be opened, and the remedy.
 fn cannot_open(path: &str, e: &serialport::Error) -> String {
     format!("cannot open {path}: {e}; {}", dpm_device::tty::refusal(e).remedy())
 }

@@ -1,4 +1,4 @@
-//! `hil-mock serve natnet`: arguments into a running NatNet server.
+//! `hil-mock serve natnet`: a running NatNet server.
 
 use super::bodies::{clock_from_now, TrackerArguments};
 use super::say;

@@ -1,4 +1,4 @@
-//! `hil-mock serve projector`: arguments into a bit-plane projector on a USB/IP port, a serial port or a pseudo-terminal.
+//! `hil-mock serve projector`: a bit-plane projector on a USB/IP port, a serial port or a pseudo-terminal.
 
 use std::error::Error;
 use std::fs::File;
@@ -130,7 +130,7 @@ fn serve_port(
     }
 }
 
-/// Light as it goes on and off, for other programs to read.
+/// A log of light going on and off, for other programs to read.
 struct LightLog {
     path: PathBuf,
     file: File,
@@ -144,7 +144,7 @@ impl LightLog {
         }
     }
 
-    /// Writes `change`, whose clock is `ahead_ns` behind CLOCK_MONOTONIC, a line in one piece, at once.
+    /// Writes `change`, whose clock is `ahead_ns` behind CLOCK_MONOTONIC, as one line in one piece, at once.
     fn write(&mut self, change: &LightChange, ahead_ns: i64) -> std::io::Result<()> {
         let light = change.frame.map_or_else(|| "dark".to_owned(), |frame| format!("lit {frame}"));
         let state = format!("{:?}", change.state).to_lowercase();
@@ -156,7 +156,7 @@ impl LightLog {
     }
 }
 
-/// Says once a second what has changed, and at once when light goes on or off.
+/// Reports changes once a second, and at once when light goes on or off.
 struct Report {
     due: HostTime,
     said: String,
@@ -168,9 +168,9 @@ struct Report {
 }
 
 impl Report {
-    /// Lets `projector` live up to `now`, whether or not a packet arrives, and tells of it. `now` was read just before.
+    /// Advances `projector` to `now`, whether or not a packet arrives, and reports. `now` was read immediately before.
     fn look(&mut self, now: HostTime, projector: &mut MockProjector) {
-        // What lies between the two readings only adds to it.
+        // The time between the two readings only increases it.
         self.ahead_ns = self.ahead_ns.min(monotonic::now_ns() - now.0);
         projector.advance_to(now);
         while let Some(change) = projector.next_change() {
@@ -208,7 +208,7 @@ impl Report {
         let Some(path) = &self.light else { return };
         let written = match projector.light_of_frame().filter(|_| lit) {
             Some(light) => write_ppm(path, raster, light),
-            // A picture of the last light would say that it is still there.
+            // A picture of the last light would suggest that it is still on.
             None if self.was_lit => write_ppm(path, raster, &vec![[0; 3]; raster.pixel_count()]),
             None => Ok(()),
         };
@@ -223,7 +223,7 @@ impl Report {
 fn write_ppm(path: &Path, raster: Raster, light: &[[u8; 3]]) -> std::io::Result<()> {
     let mut bytes = format!("P6\n{} {}\n255\n", raster.width(), raster.height()).into_bytes();
     bytes.extend(light.iter().flatten());
-    // Beside, then over the old one: a reader never sees half a picture.
+    // Written beside the old one, then renamed over it: a reader never sees half a picture.
     let beside = path.with_extension("part");
     std::fs::write(&beside, bytes)?;
     std::fs::rename(beside, path)

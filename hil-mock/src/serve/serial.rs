@@ -1,4 +1,4 @@
-//! `hil-mock serve serial`: arguments into a serial pose stream on a port or a new pseudo-terminal.
+//! `hil-mock serve serial`: a serial pose stream on a port or a new pseudo-terminal.
 
 use super::bodies::{clock_from_now, TrackerArguments};
 use super::{cannot_open, say};

@@ -1,4 +1,4 @@
-//! A USB device model on offer over USB/IP until stopped, with the faults of the cable played on time.
+//! Serves a USB device model over USB/IP until stopped, with the scheduled faults of the cable.
 
 use super::say;
 use clap::Args;
@@ -25,10 +25,10 @@ pub(super) struct UsbArguments {
     faults: FaultPlan,
 }
 
-/// How often the plan is looked at.
+/// Interval between checks of the plan.
 const TICK: Duration = Duration::from_millis(2);
 
-/// Offers `model` until the time is over. `look` is called every 2 ms with the model's clock.
+/// Serves `model` until the time is over. `look` is called every 2 ms with the model's clock.
 pub(super) fn offer(
     arguments: &UsbArguments,
     name: &str,

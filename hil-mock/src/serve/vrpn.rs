@@ -1,4 +1,4 @@
-//! `hil-mock serve vrpn`: arguments into a running VRPN server.
+//! `hil-mock serve vrpn`: a running VRPN server.
 
 use super::bodies::{clock_from_now, TrackerArguments};
 use super::say;

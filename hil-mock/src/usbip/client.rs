@@ -1,4 +1,4 @@
-//! The far end of USB/IP as a cable: a device of a USB/IP server driven without a kernel.
+//! The client end of USB/IP as a cable: drives a device of a USB/IP server without a kernel.
 
 use crossbeam::channel::{unbounded, RecvTimeoutError};
 use std::collections::BTreeMap;
@@ -78,11 +78,11 @@ impl RemoteCable {
         self.control(setup)
     }
 
-    /// A control transfer without OUT data, waited for.
+    /// A control transfer without OUT data; blocks until it completes.
     pub fn control(&self, setup: Setup) -> io::Result<Vec<u8>> {
         let (tx, rx) = unbounded();
         let done = Box::new(move |c: Completed| drop(tx.send((c.status, c.buffer, c.actual))));
-        // Names of our own requests lie beyond those that a front end gives.
+        // The identifiers of our own requests are beyond those that a front end uses.
         let request = Request {
             id: u64::MAX,
             endpoint: 0,
@@ -102,7 +102,7 @@ impl RemoteCable {
         }
     }
 
-    /// What the server said of it.
+    /// The server's record of the device.
     pub fn record(&self) -> &DeviceRecord {
         &self.record
     }
@@ -123,7 +123,7 @@ impl Shared {
         (request.done)(Completed { id: request.id, status, actual, buffer: request.buffer });
     }
 
-    /// The reader's life: completes transfers until the connection ends.
+    /// The reader's loop: completes transfers until the connection ends.
     fn read(&self, mut stream: TcpStream) {
         while self.message(&mut stream).is_ok() {}
         stream.cut();
@@ -168,7 +168,7 @@ impl Shared {
                 Self::end(request, status, actual);
             }
             Urb::Unlinked { seqnum, status } => {
-                // The unlink's number names its victim: see `cancel`.
+                // The unlink's number identifies its victim: see `cancel`.
                 let victim = self.lock().pending.remove(&(seqnum & !UNLINK));
                 if let Some(request) = victim {
                     let status = if status == 0 { Status::Ok } else { Status::Cancelled };
@@ -240,7 +240,7 @@ impl UsbCable for RemoteCable {
 
     fn clear_halt(&self, endpoint: u8) {
         let setup = Setup { request_type: 0x02, request: 1, value: 0, index: endpoint.into(), length: 0 };
-        // Refused means that there is no such endpoint or device: the next transfer says so.
+        // A refusal means that there is no such endpoint or device: the next transfer reports it.
         let _ = self.control(setup);
     }
 

@@ -1,4 +1,5 @@
-//! USB/IP: any device model offered to a kernel's `vhci_hcd` over TCP or a socket pair, and taken from a server without a kernel.
+//! USB/IP: serves any device model to a kernel's `vhci_hcd` over TCP or a socket pair, and uses a server's devices
+//! without a kernel.
 //!
 //! On the machine that is to see the device: `modprobe vhci-hcd`, then `usbip attach -r HOST -b 1-1`.
 

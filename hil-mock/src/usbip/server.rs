@@ -16,11 +16,11 @@ const SHORT_NOT_OK: u32 = 1;
 const ZERO_PACKET: u32 = 0x40;
 const EREMOTEIO: i32 = -121;
 const EINVAL: i32 = -22;
-/// Set in the names of zero-length packets; transfers' names are a session number and a u32.
+/// Set in the identifiers of zero-length packets; identifiers of transfers are a session number and a u32.
 const ZERO_PACKET_IDS: u64 = 1 << 63;
 static SESSIONS: AtomicU64 = AtomicU64::new(0);
 
-/// A device on offer.
+/// An exported device.
 #[derive(Clone)]
 pub struct Export {
     /// Bus identifier, such as `1-1`.
@@ -32,17 +32,17 @@ pub struct Export {
 }
 
 impl Export {
-    /// Offers `cable` as `bus_id`.
+    /// Exports `cable` as `bus_id`.
     pub fn new(bus_id: impl Into<String>, cable: Arc<dyn UsbCable>) -> Self {
         Self { bus_id: bus_id.into(), cable, in_use: Arc::default() }
     }
 
-    /// True while a client has it, and for a moment after that client has gone.
+    /// True while a client uses it, and briefly after that client is gone.
     pub fn is_in_use(&self) -> bool {
         self.in_use.load(Ordering::Acquire)
     }
 
-    /// What clients are told about it.
+    /// Its record for clients.
     pub fn record(&self) -> DeviceRecord {
         let d = self.cable.descriptors();
         let byte = |i: usize| d.get(i).copied().unwrap_or(0);
@@ -78,7 +78,7 @@ impl Link for TcpStream {
         self.try_clone()
     }
     fn cut(&self) {
-        // Already cut is cut.
+        // The stream may have been cut before.
         let _ = self.shutdown(Shutdown::Both);
     }
 }
@@ -114,14 +114,14 @@ impl Server {
                 let Ok(stream) = stream else { continue };
                 let exports = offered.lock().unwrap_or_else(PoisonError::into_inner).clone();
                 let connection = std::thread::Builder::new().name("usbip-serve".into()).spawn(move || {
-                    // Small messages must not wait for each other; a client that does not read is given up.
+                    // Small messages must not wait for each other; a client that does not read is dropped.
                     let _ = stream.set_nodelay(true);
                     let _ = stream.set_write_timeout(Some(Duration::from_secs(10)));
-                    // A client that breaks the protocol loses its connection; nobody else notices.
+                    // A client that violates the protocol loses its connection, without effect on others.
                     let _ = serve(stream, &exports);
                 });
                 if let Err(e) = connection {
-                    // Its stream is closed by now; the next one may find a thread.
+                    // Its stream is closed by now; the next client may find a thread.
                     let _ =
                         writeln!(std::io::stderr(), "a USB/IP client is turned away: no thread for it: {e}");
                 }
@@ -130,12 +130,13 @@ impl Server {
         Ok(Self { address, stop, exports })
     }
 
-    /// Offers other devices from now on (after an unplug: the same model on a new plug). Connections that exist go on.
+    /// Exports other devices from now on (after an unplug: the same model on a new plug). Existing connections
+    /// continue.
     pub fn set_exports(&self, exports: Vec<Export>) {
         *self.exports.lock().unwrap_or_else(PoisonError::into_inner) = exports;
     }
 
-    /// Where it listens.
+    /// The address on which it listens.
     pub fn address(&self) -> SocketAddr {
         self.address
     }
@@ -149,7 +150,7 @@ impl Drop for Server {
     }
 }
 
-/// Serves one connection to its end: a list, or an import and then URBs.
+/// Serves one connection until it ends: a list, or an import followed by URBs.
 pub fn serve<L: Link>(mut link: L, exports: &[Export]) -> io::Result<()> {
     match Operation::read(&mut link)? {
         Operation::List => {
@@ -173,7 +174,7 @@ pub fn serve<L: Link>(mut link: L, exports: &[Export]) -> io::Result<()> {
     }
 }
 
-/// Serves URBs of an import that was made elsewhere, to the end: for a socket that is handed to `vhci_hcd` directly.
+/// Serves URBs of an import that was made elsewhere, until it ends: for a socket that is passed to `vhci_hcd` directly.
 pub fn serve_imported<L: Link>(link: L, cable: Arc<dyn UsbCable>) -> io::Result<()> {
     Session::run(link, cable)
 }
@@ -186,12 +187,12 @@ struct Session<L> {
 
 struct State<L> {
     out: L,
-    /// Transfers that have not been answered, with the unlink that asked for each.
+    /// Unanswered transfers, with the unlink that requested the cancellation of each.
     pending: BTreeMap<u32, Option<u32>>,
 }
 
 impl<L: Link> Session<L> {
-    /// Name of a transfer on the plug, which outlives the session.
+    /// Identifier of a transfer on the plug, which outlives the session.
     fn id(&self, seqnum: u32) -> u64 {
         (self.number & 0x3fff_ffff) << 32 | u64::from(seqnum)
     }
@@ -200,7 +201,7 @@ impl<L: Link> Session<L> {
         self.state.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
-    /// Serves URBs on `link` until either side goes.
+    /// Serves URBs on `link` until either side closes.
     pub(crate) fn run(mut link: L, cable: Arc<dyn UsbCable>) -> io::Result<()> {
         let state = Mutex::new(State { out: link.another()?, pending: BTreeMap::new() });
         let number = SESSIONS.fetch_add(1, Ordering::Relaxed);
@@ -208,7 +209,7 @@ impl<L: Link> Session<L> {
         let on_gone = link.another()?;
         cable.on_unplug(Box::new(move || on_gone.cut()));
         let result = session.serve(&mut link, &cable);
-        // The client has gone: what it asked for is taken back.
+        // The client is gone: its transfers are cancelled.
         let left: Vec<_> = session.lock().pending.keys().copied().collect();
         for seqnum in left {
             cable.cancel(session.id(seqnum));
@@ -233,7 +234,7 @@ impl<L: Link> Session<L> {
                     let isochronous = packets != 0 && packets != u32::MAX;
                     let control = endpoint == 0;
                     if control {
-                        // The stack may ask for less or more than the request says; the buffer is what counts.
+                        // The stack may request less or more than the setup packet says; the buffer's length counts.
                         buffer.resize(usize::from(setup.length), 0);
                     }
                     if isochronous || self.lock().pending.insert(seqnum, None).is_some() {
@@ -266,7 +267,7 @@ impl<L: Link> Session<L> {
                                 buffer: Vec::new(),
                                 done: Box::new(|_| ()),
                             };
-                            // Refused only when the device has gone, which the next read reports.
+                            // Refused only if the device is gone, which the next read reports.
                             let _ = cable.submit(zero);
                         }
                     }
@@ -277,7 +278,7 @@ impl<L: Link> Session<L> {
                         Some(asked) => {
                             *asked = Some(seqnum);
                             drop(s);
-                            // Its completion, whichever it is, answers the unlink too.
+                            // Its completion, whatever its status, also answers the unlink.
                             cable.cancel(self.id(victim));
                         }
                         None => s.out.write_all(&Urb::Unlinked { seqnum, status: 0 }.encode())?,
@@ -313,7 +314,7 @@ impl<L: Link> Session<L> {
             result = result.and(s.out.write_all(&Urb::Unlinked { seqnum, status }.encode()));
         }
         if result.is_err() {
-            // The client does not read or has gone: the reader ends the session.
+            // The client does not read or is gone: the reader ends the session.
             s.out.cut();
         }
     }

@@ -1,4 +1,4 @@
-//! USB/IP by golden bytes, by its own client, and against clients that do not keep to the protocol.
+//! Tests USB/IP with golden bytes, with its own client, and with clients that violate the protocol.
 
 use super::wire::*;
 use super::*;
@@ -75,13 +75,13 @@ fn golden_list_import_submit_and_unlink() {
     link.read_exact(&mut answer).unwrap();
     assert_eq!(answer[..48], words(&[3, 7, 0, 0, 0, 0, 8, 0, 0, 0, 0, 0])[..]);
     assert_eq!(answer[48..], [18, 1, 0x10, 0x01, 0, 0, 0, 64]);
-    // Number 8 reads a reply that is not there; number 9 takes it back: only the unlink is answered, with -ECONNRESET.
+    // Number 8 reads a reply that is not there; number 9 cancels it: only the unlink is answered, with -ECONNRESET.
     link.write_all(&words(&[1, 8, 0x0001_0001, 1, 1, 0x0200, 64, 0, 0xffff_ffff, 1, 0, 0])).unwrap();
     link.write_all(&words(&[2, 9, 0x0001_0001, 0, 0, 8, 0, 0, 0, 0, 0, 0])).unwrap();
     let mut answer = [0; 48];
     link.read_exact(&mut answer).unwrap();
     assert_eq!(answer[..], words(&[4, 9, 0, 0, 0, (-104i32) as u32, 0, 0, 0, 0, 0, 0])[..]);
-    // Taking back what has ended: status 0.
+    // Cancelling a transfer that has ended: status 0.
     link.write_all(&words(&[2, 10, 0x0001_0001, 0, 0, 7, 0, 0, 0, 0, 0, 0])).unwrap();
     link.read_exact(&mut answer).unwrap();
     assert_eq!(answer[..], words(&[4, 10, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0])[..]);
@@ -130,7 +130,7 @@ fn commands_cross_and_stalls_cancels_and_unplugging_arrive() {
     assert_eq!(wait(&send(&b.cable, 1, 0x01, read.clone())).1, 64);
     let (status, n, reply) = wait(&send(&b.cable, 2, 0x81, vec![0; 64]));
     assert_eq!((status, n, &reply[..4]), (Status::Ok, 64, &[0xc0, 5, 1, 0][..]));
-    // A read that waits is taken back; the transfer after it is served.
+    // A waiting read is cancelled; the transfer after it is served.
     let waiting = send(&b.cable, 3, 0x81, vec![0; 64]);
     assert!(b.cable.cancel(3));
     assert_eq!(wait(&waiting).0, Status::Cancelled);
@@ -155,7 +155,7 @@ fn a_client_that_goes_leaves_nothing_running_and_the_next_one_gets_the_device() 
     let (plug, export) = dlpc900();
     let server = Server::start("127.0.0.1:0", vec![export]).unwrap();
     for round in 0..20 {
-        // The server frees the device when it has seen the connection end, a moment after the client let it go.
+        // The server frees the device when it has seen the connection end, shortly after the client closed it.
         let until = std::time::Instant::now() + Duration::from_secs(5);
         let cable = loop {
             match RemoteCable::import(server.address(), "1-1") {
@@ -199,7 +199,7 @@ fn nonsense_ends_its_own_connection_only() {
         s.set_read_timeout(Some(Duration::from_secs(5))).unwrap();
         s.write_all(&nonsense).unwrap();
         let mut rest = Vec::new();
-        // Closed by the server (or reset, as it left bytes unread), not left hanging.
+        // Closed by the server (or reset, because it left bytes unread), not left hanging.
         let end = s.read_to_end(&mut rest);
         assert!(end.is_ok() || end.is_err_and(|e| e.kind() == std::io::ErrorKind::ConnectionReset));
     }

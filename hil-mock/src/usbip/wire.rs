@@ -1,4 +1,4 @@
-//! USB/IP messages (version 1.1.1) into bytes and back. All numbers are big-endian.
+//! Encodes and decodes USB/IP messages (version 1.1.1). All numbers are big-endian.
 //!
 //! A connection starts with one operation: a list of devices, or the import of one. After an import the same connection carries
 //! URBs: 48-byte headers, followed by data for OUT submissions and IN returns. \[Linux Documentation/usb/usbip_protocol.rst\]
@@ -13,7 +13,7 @@ pub const VERSION: u16 = 0x0111;
 pub const URB_HEADER: usize = 48;
 /// Bytes of a device's record.
 pub const DEVICE_RECORD: usize = 312;
-/// Most bytes of one transfer that are accepted.
+/// Maximum number of bytes of one transfer.
 pub const MOST_BYTES: u32 = 64 << 20;
 
 const REQUEST_LIST: u16 = 0x8005;
@@ -21,7 +21,7 @@ const REPLY_LIST: u16 = 0x0005;
 const REQUEST_IMPORT: u16 = 0x8003;
 const REPLY_IMPORT: u16 = 0x0003;
 
-/// What a device is called and is, as the list and the import reply carry it.
+/// Names and properties of a device, as in the list and the import reply.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct DeviceRecord {
     /// Path on the exporting machine.
@@ -86,7 +86,7 @@ impl DeviceRecord {
     }
 }
 
-/// What a client wants first.
+/// The first request of a client.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub enum Operation {
     /// A list of devices.
@@ -112,7 +112,7 @@ impl Operation {
         }
     }
 
-    /// Reads one; anything else than the two is an error.
+    /// Reads one; anything but these two is an error.
     pub fn read(from: &mut impl Read) -> io::Result<Self> {
         let mut head = [0; 8];
         from.read_exact(&mut head)?;
@@ -208,7 +208,7 @@ pub enum Urb {
         is_in: bool,
         /// Kernel's transfer flags: 1 short is an error, 0x40 end with a zero-length packet.
         flags: u32,
-        /// Bytes to send or to ask for.
+        /// Bytes to send or to request.
         length: u32,
         /// Isochronous packets; 0 or -1 for everything else.
         packets: u32,
@@ -217,7 +217,7 @@ pub enum Urb {
         /// Setup packet of a control transfer.
         setup: Setup,
     },
-    /// Host to device: take a transfer back.
+    /// Host to device: cancel a transfer.
     Unlink {
         /// Its own number.
         seqnum: u32,
@@ -235,7 +235,7 @@ pub enum Urb {
         /// Bytes moved.
         actual: u32,
     },
-    /// Device to host: a transfer was taken back (-104) or had ended before (0).
+    /// Device to host: a transfer was cancelled (-104) or had ended before (0).
     Unlinked {
         /// The unlink's number.
         seqnum: u32,
@@ -284,7 +284,7 @@ impl Urb {
         b
     }
 
-    /// Reads the 48 bytes; refuses what no message has, before anything is allocated for it.
+    /// Reads the 48 bytes; refuses invalid values before anything is allocated for them.
     pub fn decode(b: &[u8; URB_HEADER]) -> io::Result<Self> {
         let at = |i: usize| u32_at(b, 4 * i);
         let seqnum = at(1);

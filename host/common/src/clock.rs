@@ -1,15 +1,15 @@
-//! The clock that all time of the rig comes from, and the one that a test or a virtual run sets by hand.
+//! The clock behind all time of the rig, and a manual clock for tests and virtual runs.
 //!
-//! Contract: `now` never goes back on one thread, and a value read on one thread and handed to another is not ahead of what
-//! the other reads (`std::time::Instant` is CLOCK_MONOTONIC on Linux: no leap seconds, no steps, slewed by NTP by at most
-//! 500 ppm; it stands still while the machine is suspended, so a resume looks like a tracker that has just come back).
-//! All threads of a rig must share one clock: epochs of two clocks have nothing to do with each other.
+//! Contract: `now` never goes back on one thread, and a value that is read on one thread and passed to another is not
+//! ahead of what the other reads. (`std::time::Instant` is CLOCK_MONOTONIC on Linux: no leap seconds, no steps, slewed
+//! by NTP by at most 500 ppm. It stands still while the machine is suspended, so a resume looks like a tracker that has
+//! just returned.) All threads of a rig must share one clock: the epochs of two clocks are unrelated.
 
 use dpm_device::time::HostTime;
 use std::sync::atomic::{AtomicI64, Ordering};
 use std::time::{Duration, Instant};
 
-/// No wait is longer than this, whatever a caller asks for: a mistake in a deadline must not hang a stage.
+/// Longest wait, whatever a caller requests: a mistake in a deadline must not hang a stage.
 pub(crate) const LONGEST_WAIT_NS: i64 = 1_000_000_000;
 
 /// A source of instants on the host's clock.
@@ -30,8 +30,9 @@ pub struct MonotonicClock {
 }
 
 impl MonotonicClock {
-    /// A clock that reads 0 now. The last `spin_ns` of a wait are spent in a loop on the clock, because a sleeping thread is woken
-    /// 50 us late and more (the kernel's timer slack); 0 sleeps to the end, for machines without a core to spare.
+    /// A clock that reads 0 now. It spends the last `spin_ns` of a wait in a busy loop, because a sleeping thread is
+    /// woken 50 us late or more (the kernel's timer slack). With 0 it sleeps to the end, for machines without a core to
+    /// spare.
     pub fn new(spin_ns: i64) -> Self {
         Self { epoch: Instant::now(), spin_ns: spin_ns.max(0) }
     }
@@ -46,7 +47,7 @@ impl MonotonicClock {
 
 impl Clock for MonotonicClock {
     fn now(&self) -> HostTime {
-        // 292 years until this saturates.
+        // This saturates after 292 years.
         HostTime(i64::try_from(self.epoch.elapsed().as_nanos()).unwrap_or(i64::MAX))
     }
 
@@ -69,8 +70,8 @@ impl Clock for MonotonicClock {
     }
 }
 
-/// A clock that stands still until it is moved. Waiting moves it: with one thread driving, a run at virtual pace takes no
-/// longer than its computations, and two runs are the same to the nanosecond.
+/// A clock that stands still until it is moved. Waiting moves it. With a single driving thread, a run at virtual pace
+/// takes no longer than its computations, and two runs are the same to the nanosecond.
 #[derive(Debug, Default)]
 pub struct ManualClock {
     now_ns: AtomicI64,
@@ -84,7 +85,8 @@ impl ManualClock {
 
     /// Moves the clock to `at`; it never goes back. Returns the time now.
     pub fn advance_to(&self, at: HostTime) -> HostTime {
-        // Acquire and release: what happened before the clock was moved is seen by whoever reads the new time.
+        // Acquire and release: a thread that reads the new time also sees everything that happened before the clock was
+        // moved.
         HostTime(self.now_ns.fetch_max(at.0, Ordering::AcqRel).max(at.0))
     }
 }
@@ -99,7 +101,7 @@ impl Clock for ManualClock {
     }
 }
 
-/// A stopwatch on wall time, for what a stage really took; at virtual pace too.
+/// A stopwatch on wall time, for the time that a stage really took, also at virtual pace.
 #[derive(Clone, Copy, Debug)]
 pub struct Stopwatch(Instant);
 

@@ -1,15 +1,16 @@
-//! Bytes into files that are either the old ones or the new ones, whenever the power goes.
+//! Writes files atomically: after a power failure a file has either its old or its new content.
 
 use crate::folder::{open_own_file, Folder, FolderError};
 use std::fs::{self, File};
 use std::io::{self, BufWriter, Read, Seek, Write};
 use std::path::{Path, PathBuf};
 
-/// Replaces `path` by what `write` writes: into a temporary file beside it, flushed to the disk, renamed over it, and the
-/// folder flushed too. A reader sees the old or the new content, never a part. Missing folders are made.
+/// Replaces `path` by the output of `write`. It writes a temporary file beside it, flushes it to the disk, renames it
+/// over `path`, and flushes the folder too. A reader sees the old or the new content, never a part. Missing folders are
+/// made.
 ///
 /// # Errors
-/// Those of the file system or of `write`, with the path in the message; the old file then stands untouched.
+/// Those of the file system or of `write`, with the path in the message; the old file is then unchanged.
 pub fn write_atomically(
     path: &Path,
     write: impl FnOnce(&mut BufWriter<&File>) -> io::Result<()>,
@@ -32,7 +33,8 @@ pub fn write_atomically(
     result.map_err(named)
 }
 
-/// Makes `folder` and sees that files can be written there: before the work whose result is to lie in it.
+/// Makes `folder` and checks that files can be written there. Call it before the work whose result will be written
+/// there.
 ///
 /// # Errors
 /// Those of the file system, with the folder in the message.
@@ -43,8 +45,8 @@ pub fn check_folder(folder: &Path) -> io::Result<()> {
     create_new(&trial).and_then(|_| fs::remove_file(&trial)).map_err(named)
 }
 
-/// Makes a file that was not there. A link of that name, which somebody may have planted in a shared folder, is not followed; what a
-/// killed process of the same number left is removed.
+/// Makes a new file. A link of that name, which somebody may have planted in a shared folder, is not followed; the
+/// remains of a killed process of the same number are removed.
 fn create_new(path: &Path) -> io::Result<File> {
     match File::create_new(path) {
         Err(e) if e.kind() == io::ErrorKind::AlreadyExists => {
@@ -71,17 +73,17 @@ fn write_and_rename(
     File::open(folder)?.sync_all()
 }
 
-/// Why a lock could not be had.
+/// Why a lock could not be taken.
 #[derive(Debug, thiserror::Error)]
 pub enum LockError {
-    /// Somebody else holds it.
+    /// Another process, or another lock in this one, holds it.
     #[error("{what} is in use by another dpm{}; stop that one first (lock file {})", .holder.map_or(String::new(), |p| format!(" (process {p})")), .path.display())]
     Held {
         /// What the lock protects.
         what: String,
         /// The lock file.
         path: PathBuf,
-        /// Process that holds it, where it said so.
+        /// Process that holds it, if the file names it.
         holder: Option<u32>,
     },
     /// The lock file cannot be made.
@@ -89,20 +91,20 @@ pub enum LockError {
     Io {
         /// What the lock protects.
         what: String,
-        /// Why.
+        /// The cause.
         source: FolderError,
     },
 }
 
-/// The right to use something alone, given back when dropped or when the process ends in whatever way.
+/// An exclusive lock. It is released when it is dropped, or when the process ends in any way.
 #[derive(Debug)]
 pub struct InstanceLock {
     _file: File,
 }
 
 impl InstanceLock {
-    /// Takes the lock file `path` for `what` (as messages name it); never waits. A missing folder is made. The file must be a plain one
-    /// of this user; a link is not followed.
+    /// Takes the lock file `path` for `what` (its name in messages); never blocks. A missing folder is made. The file
+    /// must be a regular one of this user; a link is not followed.
     ///
     /// # Errors
     /// [`LockError::Held`] when another process, or another lock in this one, has it.
@@ -115,7 +117,7 @@ impl InstanceLock {
         Self::lock(open_own_file(path).map_err(failed)?, path, what)
     }
 
-    /// As [`InstanceLock::take`], for the file `name` in a folder that was found to be ours.
+    /// As [`InstanceLock::take`], for the file `name` in a checked folder.
     ///
     /// # Errors
     /// As [`InstanceLock::take`].
@@ -202,8 +204,9 @@ mod tests {
         fs::remove_dir_all(dir).unwrap();
     }
 
-    /// Found in use, R7: root's run wrote its number into a file that nobody had linked from the place of the lock. Its kin: the
-    /// temporary files beside a report and the trial of a folder.
+    /// Found in use, R7: a run of root followed a link that somebody had planted in place of the lock file, and wrote
+    /// its number into the link's target. The same applies to the temporary files beside a report and to the test file
+    /// of a folder.
     #[test]
     fn r7_planted_links_are_never_written_through() {
         let dir = folder("links");

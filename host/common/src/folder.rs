@@ -1,8 +1,9 @@
-//! A folder that is ours: opened once, checked by what the open descriptor says, and used only through that descriptor.
+//! A folder that belongs to us: opened once, checked through the open descriptor, and used only through that
+//! descriptor.
 //!
-//! Folders with a known name in a place where others may write (the temporary folder) can be put there by others before we come. So
-//! a link is not followed, the owner and the mode are read from the open folder, and every file in it is opened relative to that
-//! descriptor: nobody can exchange the folder between the check and the use.
+//! Where others may write (the temporary folder), others can create a folder with a known name before we do. So a link
+//! is not followed, the owner and the mode are read from the open folder, and every file in it is opened relative to
+//! that descriptor. Nobody can exchange the folder between the check and the use.
 
 use crate::unix::{open_at, remove_at, rename_at, user, user_name};
 use std::fs::{self, DirBuilder, File, Metadata};
@@ -15,12 +16,12 @@ use std::sync::atomic::{AtomicU32, Ordering};
 /// Why a folder or a file in it is not used.
 #[derive(Debug, thiserror::Error)]
 pub enum FolderError {
-    /// The operating system's word.
+    /// An error of the operating system.
     #[error("{}: {source}", path.display())]
     Io {
         /// The folder or file.
         path: PathBuf,
-        /// Why.
+        /// The cause.
         source: io::Error,
     },
     /// It exists, but others could have put it there or can write to it.
@@ -28,19 +29,19 @@ pub enum FolderError {
     NotOurs {
         /// The folder or file.
         path: PathBuf,
-        /// What is wrong with it, and what to do.
+        /// The problem and the remedy.
         reason: String,
     },
 }
 
 impl FolderError {
-    /// True when there is nothing of that name.
+    /// True when nothing of that name exists.
     pub fn is_missing(&self) -> bool {
         matches!(self, Self::Io { source, .. } if source.kind() == io::ErrorKind::NotFound)
     }
 }
 
-/// Whose folder may be used.
+/// The accepted owners of a folder.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Owner {
     /// This process's user only.
@@ -119,7 +120,8 @@ impl Folder {
         self.owner
     }
 
-    /// A path to `name` in this very folder, for calls that take paths only (sockets), short enough for them.
+    /// A path to `name` in this folder, even if it was renamed, for calls that accept only paths (sockets); it is short
+    /// enough for them.
     pub fn path_to(&self, name: &str) -> PathBuf {
         let by_descriptor = PathBuf::from(format!("/proc/self/fd/{}", self.handle.as_raw_fd()));
         if by_descriptor.exists() {
@@ -134,7 +136,7 @@ impl Folder {
         move |source| FolderError::Io { path: path.clone(), source }
     }
 
-    /// Opens the file `name` for reading and writing; with `create` a missing one is made. Its content is as it was.
+    /// Opens the file `name` for reading and writing; with `create` a missing one is made. The content is unchanged.
     ///
     /// # Errors
     /// As [`check_file`]; those of the operating system.
@@ -145,7 +147,8 @@ impl Folder {
         Ok(file)
     }
 
-    /// The content of `name`, which must be a plain file of at most `most` bytes and of the folder's owner, root or this user.
+    /// The content of `name`, which must be a regular file of at most `most` bytes and belong to the folder's owner,
+    /// root or this user.
     ///
     /// # Errors
     /// As [`check_file`]; longer than `most`; those of the operating system.
@@ -160,15 +163,15 @@ impl Folder {
         Ok(bytes)
     }
 
-    /// Makes `bytes` the content of `name`, whole or not at all, and on the disk when it returns.
+    /// Replaces the content of `name` by `bytes`, atomically; the content is on the disk when this returns.
     ///
     /// # Errors
-    /// Those of the operating system; the old content then stands.
+    /// Those of the operating system; the old content is then unchanged.
     pub fn replace(&self, name: &str, bytes: &[u8]) -> Result<(), FolderError> {
         static NUMBER: AtomicU32 = AtomicU32::new(0);
         let number = NUMBER.fetch_add(1, Ordering::Relaxed);
         let temporary = format!(".new-{}-{number}", std::process::id());
-        // Left by a process of the same number that was killed.
+        // The file may remain from a killed process of the same number.
         let _ = remove_at(&self.handle, &temporary);
         let write = || -> io::Result<()> {
             let flags = libc::O_WRONLY | libc::O_CREAT | libc::O_EXCL;
@@ -196,7 +199,7 @@ impl Folder {
         }
     }
 
-    /// Names of what is in it, those that are UTF-8.
+    /// Names of its entries, those that are UTF-8.
     ///
     /// # Errors
     /// Those of the operating system.
@@ -224,7 +227,7 @@ fn link(path: &Path) -> FolderError {
     FolderError::NotOurs { path: path.into(), reason: reason.into() }
 }
 
-/// Checks that an open file is a plain one, has one name only, and belongs to this user, to root or to `owner`.
+/// Checks that an open file is a regular one, has only one name, and belongs to this user, to root or to `owner`.
 ///
 /// # Errors
 /// [`FolderError::NotOurs`].
@@ -242,8 +245,8 @@ pub(crate) fn check_file(file: &File, path: &Path, owner: u32) -> Result<(), Fol
     Err(FolderError::NotOurs { path: path.into(), reason })
 }
 
-/// Opens the plain file `path` of this user for a lock, making it where it is missing; a link is not followed and nothing is
-/// changed in it.
+/// Opens the regular file `path` of this user for a lock, and makes it if it is missing; a link is not followed, and
+/// the content is unchanged.
 ///
 /// # Errors
 /// As [`check_file`]; those of the operating system.

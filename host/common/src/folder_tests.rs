@@ -1,7 +1,7 @@
 use super::*;
 use std::os::unix::fs::{chown, symlink, PermissionsExt};
 
-/// An empty folder that goes with the test.
+/// An empty folder that is removed after the test.
 struct Place(PathBuf);
 
 impl Place {
@@ -21,7 +21,7 @@ impl Drop for Place {
 
 const NOBODY: u32 = 65534;
 
-/// Found in use, R7: a folder that somebody else made, or can write to, is refused whatever lies in it.
+/// Found in use, R7: a folder that somebody else made, or can write to, is refused whatever it contains.
 #[test]
 fn r7_only_a_folder_of_our_own_is_used() {
     let place = Place::new("whose");
@@ -52,7 +52,7 @@ fn r7_only_a_folder_of_our_own_is_used() {
     }
 }
 
-/// Found in use, R7: a link, a second name, a FIFO or a file of another user in the place of a lock file is not written to.
+/// Found in use, R7: a link, a second name, a FIFO or a file of another user in place of a lock file is not written to.
 #[test]
 fn r7_files_that_others_planted_are_refused_untouched() {
     let place = Place::new("planted");
@@ -96,7 +96,7 @@ fn a_file_is_replaced_whole_read_with_a_limit_and_removed() {
     assert_eq!(folder.read("a", 3).unwrap(), b"new");
     assert!(folder.read("a", 2).unwrap_err().to_string().contains("too long"));
     assert_eq!(folder.names().unwrap(), ["a"]);
-    // It is this very folder that is used, whatever its path says later.
+    // The same folder is used, even if its path names another one later.
     fs::rename(folder.path(), place.0.join("moved")).unwrap();
     folder.replace("b", b"").unwrap();
     assert!(place.0.join("moved/b").exists());

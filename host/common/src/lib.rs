@@ -1,4 +1,4 @@
-//! What several crates of the rig controller share: the clock, files and folders, stop flags, rotations.
+//! Code that several crates of the rig controller share: the clock, files and folders, stop flags, rotations.
 //!
 //! # Example: a clock that a test sets by hand
 //!

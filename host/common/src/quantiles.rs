@@ -1,4 +1,4 @@
-//! Values into their quantiles.
+//! Quantiles of values.
 
 /// Quantiles of an error.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
@@ -11,7 +11,7 @@ pub struct Quantiles {
 }
 
 impl Quantiles {
-    /// Of `values`, in any order; all 0 where there are none.
+    /// Of `values`, in any order; all 0 if there are none.
     pub fn of(mut values: Vec<f64>) -> Self {
         values.sort_by(f64::total_cmp);
         let n = values.len();

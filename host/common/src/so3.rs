@@ -1,8 +1,10 @@
-//! Rotation vectors into rotations and back, to rounding error everywhere.
+//! Converts rotation vectors to rotations and back, to rounding error everywhere.
 //!
-//! Conventions: world-from-body, and tangents on the left (in the world frame): `exp(w) * q` turns `q` by the world-space
-//! rotation vector `w`. The closed form divides by the angle, so below 1e-4 rad a series takes over; the logarithm uses `2 atan2(|v|, |w|)`, which keeps full precision at angle 0 and at pi where acos loses half the digits.
-//! Formulas: Solà, Deray, Atchuthan, "A micro Lie theory for state estimation in robotics", section IV and appendix.
+//! Conventions: world-from-body, and tangents on the left (in the world frame): `exp(w) * q` turns `q` by the
+//! world-space rotation vector `w`. The closed form divides by the angle, so a series replaces it below 1e-4 rad. The
+//! logarithm uses `2 atan2(|v|, |w|)`, which keeps full precision at angle 0 and at pi, where acos loses half the
+//! digits. Formulas: Solà, Deray, Atchuthan, "A micro Lie theory for state estimation in robotics", section IV and
+//! appendix.
 
 use glam::{DMat3, DQuat, DVec3};
 

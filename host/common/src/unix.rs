@@ -1,5 +1,5 @@
-//! Calls of the operating system that the standard library lacks: files relative to an open folder, who is at the other end of a
-//! socket, waiting for several descriptors, signals to a process.
+//! System calls that the standard library lacks: files relative to an open folder, the peer of a socket, waiting for
+//! several descriptors, signals to a process.
 #![allow(unsafe_code)]
 
 use std::ffi::CString;
@@ -29,8 +29,8 @@ fn text(name: &str) -> io::Result<CString> {
     CString::new(name).map_err(|e| io::Error::new(io::ErrorKind::InvalidInput, e))
 }
 
-/// Opens `name` in `folder` with `flags` of open(2), and `mode` where it is made. Links at the end of the path are not followed,
-/// and nothing waits (a FIFO of that name does not hold the caller up).
+/// Opens `name` in `folder` with `flags` of open(2), and `mode` if it is created. A link at the end of the path is not
+/// followed, and the call never blocks (a FIFO of that name does not hold up the caller).
 ///
 /// # Errors
 /// Those of openat(2).
@@ -74,10 +74,11 @@ fn checked(result: libc::c_int) -> io::Result<()> {
     Ok(())
 }
 
-/// Who is at the other end of a socket, as the kernel says it: for a client, who listened; for a server, who connected.
+/// The process at the other end of a socket, as the kernel reports it: for a client, the listener; for a server, the
+/// one that connected.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Peer {
-    /// Process; 0 where it is not visible from here (another PID namespace).
+    /// Process; 0 if it is not visible from here (another PID namespace).
     pub pid: i32,
     /// User.
     pub uid: u32,
@@ -115,7 +116,8 @@ pub fn send_signal(pid: i32, signal: libc::c_int) -> io::Result<()> {
     checked(unsafe { libc::kill(pid, signal) })
 }
 
-/// Waits until one of `descriptors` can be read from (or was hung up), at most `limit_ms` milliseconds. One flag for each.
+/// Waits until one of `descriptors` can be read from (or was hung up), at most `limit_ms` milliseconds. Sets one flag
+/// for each.
 ///
 /// # Errors
 /// Those of poll(2) but an interrupting signal, after which nothing can be read.
@@ -132,7 +134,7 @@ pub fn wait_readable(descriptors: &[RawFd], limit_ms: i32, ready: &mut Vec<bool>
     }
 }
 
-/// Nanoseconds of the clock that all processes of this boot share and nobody sets (CLOCK_MONOTONIC).
+/// Nanoseconds of the clock that all processes of this boot share and that nobody sets (CLOCK_MONOTONIC).
 pub fn monotonic_ns() -> u64 {
     let mut now = libc::timespec { tv_sec: 0, tv_nsec: 0 };
     // SAFETY: the place outlives the call, which cannot fail for this clock.
@@ -149,7 +151,7 @@ mod tests {
         let (a, b) = UnixStream::pair().unwrap();
         let here = Peer { pid: std::process::id() as i32, uid: user() };
         assert_eq!((peer(&a).unwrap(), peer(&b).unwrap()), (here, here));
-        // Groups, everybody and "not visible" are no process to signal.
+        // Groups, all processes and "not visible" do not name one process.
         for pid in [0, -1, i32::MIN] {
             assert_eq!(send_signal(pid, 0).unwrap_err().kind(), io::ErrorKind::InvalidInput);
         }

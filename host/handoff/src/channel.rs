@@ -1,13 +1,13 @@
 //! A bounded ring between two threads whose consumer can wait for the next value, and that ends when its producer does.
 //!
-//! [`crate::ring`] carries the values and [`crate::wake`] the waiting; what is added is the end: dropping the sender, in a panic
-//! too, closes the channel, so nobody waits for a stage that is gone.
+//! [`crate::ring`] carries the values, and [`crate::wake`] implements the waiting. This module adds the end: dropping
+//! the sender, also in a panic, closes the channel, so no consumer waits for a stage that is gone.
 
 use crate::ring::{ring, Consumer, Producer};
 use crate::sync::{Arc, AtomicBool, Ordering};
 use crate::wake::{WaitPolicy, Waiter, Waker};
 
-/// The side that puts values in. Dropping it closes the channel; what is inside can still be taken.
+/// The producer's side. Dropping it closes the channel; the consumer can still take the values inside.
 #[derive(Debug)]
 pub struct Sender<T> {
     ring: Producer<T>,
@@ -15,7 +15,7 @@ pub struct Sender<T> {
     closed: Arc<AtomicBool>,
 }
 
-/// The side that takes values out.
+/// The consumer's side.
 #[derive(Debug)]
 pub struct Receiver<T> {
     ring: Consumer<T>,
@@ -23,7 +23,8 @@ pub struct Receiver<T> {
     closed: Arc<AtomicBool>,
 }
 
-/// A channel for up to `capacity` values (at least 1) whose consumer waits by `policy`. All memory is taken now.
+/// A channel for up to `capacity` values (at least 1) whose consumer waits according to `policy`. Allocates all its
+/// memory here.
 pub fn channel<T: Send>(capacity: usize, policy: WaitPolicy) -> (Sender<T>, Receiver<T>) {
     let (producer, consumer) = ring(capacity);
     let waiter = Waiter::new(policy);
@@ -35,22 +36,22 @@ pub fn channel<T: Send>(capacity: usize, policy: WaitPolicy) -> (Sender<T>, Rece
 }
 
 impl<T> Sender<T> {
-    /// Hands `value` over and wakes the consumer if it sleeps.
+    /// Sends `value` and wakes the consumer if it sleeps.
     ///
     /// # Errors
-    /// The value, when there is no room.
+    /// The value, if there is no room.
     pub fn push(&mut self, value: T) -> Result<(), T> {
         self.ring.push(value)?;
         self.waker.wake();
         Ok(())
     }
 
-    /// Values put and not yet taken, at most.
+    /// Upper bound of the number of values sent and not yet taken.
     pub fn len(&self) -> usize {
         self.ring.len()
     }
 
-    /// True when everything put has been taken.
+    /// True when every value sent has been taken.
     pub fn is_empty(&self) -> bool {
         self.ring.is_empty()
     }
@@ -58,27 +59,27 @@ impl<T> Sender<T> {
 
 impl<T> Drop for Sender<T> {
     fn drop(&mut self) {
-        // Release: whoever sees the end sees every value put before it. (The fence of the last wake-up would do, so the model checker
-        // does not miss it; a push without one would need it.)
+        // Release: a consumer that sees the end sees every value sent before it. (The fence of the last wake-up would
+        // suffice, so the model checker does not miss this ordering; a push without a wake-up would need it.)
         self.closed.store(true, Ordering::Release);
         self.waker.wake();
     }
 }
 
 impl<T> Receiver<T> {
-    /// The oldest value, if there is one.
+    /// Takes the oldest value, if there is one.
     pub fn try_pop(&mut self) -> Option<T> {
         self.ring.pop()
     }
 
-    /// The oldest value; waits for one until the clock `now_ns` reaches `deadline_ns` or the channel is closed.
+    /// Takes the oldest value; waits for one until the clock `now_ns` reaches `deadline_ns` or the channel is closed.
     pub fn pop(&mut self, deadline_ns: i64, now_ns: impl FnMut() -> i64) -> Option<T> {
         let Self { ring, waiter, closed } = self;
         waiter.wait(deadline_ns, now_ns, || !ring.is_empty() || closed.load(Ordering::Acquire));
         ring.pop()
     }
 
-    /// Values waiting, at least.
+    /// Lower bound of the number of waiting values.
     pub fn len(&self) -> usize {
         self.ring.len()
     }
@@ -88,9 +89,9 @@ impl<T> Receiver<T> {
         self.ring.is_empty()
     }
 
-    /// True when the sender is gone and nothing is left: no value will come any more.
+    /// True when the sender is gone and no value is left: none will arrive any more.
     pub fn is_finished(&self) -> bool {
-        // In this order: the last value was put before the end.
+        // The order matters: the last value was sent before the end.
         self.closed.load(Ordering::Acquire) && self.ring.is_empty()
     }
 }
@@ -161,12 +162,12 @@ mod tests {
 mod loom_tests {
     use super::*;
 
-    /// The end is seen after the last value, never before it, and ends a wait.
+    /// The consumer sees the end after the last value, never before it, and the end stops a wait.
     #[test]
     fn loom_the_end_comes_after_the_last_value() {
         loom::model(|| {
             let (mut sender, mut receiver) = channel(2, WaitPolicy::Park);
-            // Not joined: loom takes an `unpark` that comes late for the end of the join.
+            // Not joined: loom mistakes a late `unpark` for the end of the join.
             loom::thread::spawn(move || sender.push(1u32).unwrap());
             assert_eq!(receiver.pop(i64::MAX, || 0), Some(1));
             assert_eq!(receiver.pop(i64::MAX, || 0), None);

@@ -1,14 +1,15 @@
-//! The newest value from one thread to another: a triple buffer.
+//! Passes the newest value from one thread to another: a triple buffer.
 //!
-//! Three cells: one being written, one being read, one in the middle. Publishing swaps the writer's cell with the middle one
-//! and marks it fresh; reading swaps the reader's cell with the middle one if it is fresh. Both are wait-free, a value is
-//! never torn, and a slow reader costs nobody anything: values it had no time for are overwritten, which is the point.
+//! There are three cells: one being written, one being read, and one in the middle. Publishing swaps the writer's cell
+//! with the middle one and marks it fresh; reading swaps the reader's cell with the middle one if it is fresh. Both are
+//! wait-free, and a value is never torn. A slow reader does not hold up the writer: newer values overwrite those that
+//! it had no time for, which is intended.
 #![allow(unsafe_code)]
 
 use crate::sync::{Arc, AtomicU8, Ordering, UnsafeCell};
 use crossbeam::utils::CachePadded;
 
-/// The middle cell holds a value the reader has not seen.
+/// Set when the middle cell holds a value that the reader has not seen.
 const FRESH: u8 = 0b100;
 const INDEX: u8 = 0b011;
 
@@ -19,8 +20,9 @@ struct Shared<T> {
     middle: CachePadded<AtomicU8>,
 }
 
-// SAFETY: a cell is accessed by the one side that owns its index at the time; ownership moves through `middle` with acquire
-// and release on both sides. Values cross threads, so T must be Send; no two threads ever share a reference to one.
+// SAFETY: a cell is accessed only by the side that owns its index at the time; ownership moves through `middle` with
+// acquire and release on both sides. Values cross threads, so T must be Send; two threads never share a reference to
+// one.
 unsafe impl<T: Send> Sync for Shared<T> {}
 
 /// The writing side.
@@ -45,32 +47,33 @@ pub fn latest<T: Clone + Send>(initial: T) -> (Publisher<T>, Reader<T>) {
 }
 
 impl<T> Publisher<T> {
-    /// Makes `value` the newest. The value displaced (an old one) is dropped here, on the writer's thread.
+    /// Makes `value` the newest. The value that it replaces (an old one) is dropped here, on the writer's thread.
     pub fn publish(&mut self, value: T) {
         self.publish_with(|cell| *cell = value);
     }
 
-    /// Makes what `write` leaves in the cell that it is given the newest value, without a copy. The cell holds some older value; nothing is
-    /// published if `write` panics.
+    /// Publishes a cell after `write` has modified it in place, without a copy. The cell holds some older value;
+    /// nothing is published if `write` panics.
     pub fn publish_with(&mut self, write: impl FnOnce(&mut T)) {
         self.shared.cells[usize::from(self.back)].with_mut(|cell| {
             // SAFETY: `back` belongs to this publisher alone until the swap below; `&mut self` excludes a second call.
             write(unsafe { &mut *cell });
         });
-        // Release: the write above is visible to whoever takes the cell. Acquire: the cell we get back is no longer being read.
+        // Release: the write above is visible to whoever takes the cell. Acquire: the cell that we get back is no
+        // longer being read.
         let before = self.shared.middle.swap(self.back | FRESH, Ordering::AcqRel);
         self.back = before & INDEX;
     }
 }
 
 impl<T> Reader<T> {
-    /// The newest value, and whether it is a new one since the last call.
+    /// The newest value, and whether it is new since the last call.
     pub fn latest(&mut self) -> (&T, bool) {
         // Relaxed: only a hint; the swap synchronises. FRESH is set by the other side and cleared only here, so a set bit
         // cannot vanish in between.
         let fresh = self.shared.middle.load(Ordering::Relaxed) & FRESH != 0;
         if fresh {
-            // Acquire: see the value in the cell we get. Release: our reads of the cell we give back are over.
+            // Acquire: see the value in the cell that we get. Release: our reads of the cell that we return are over.
             let before = self.shared.middle.swap(self.front, Ordering::AcqRel);
             self.front = before & INDEX;
         }
@@ -146,7 +149,7 @@ mod loom_tests {
         });
     }
 
-    /// What the publisher gets back must not be in the reader's hands.
+    /// The reader must not still hold the cell that the publisher gets back.
     #[test]
     fn loom_latest_survives_two_readings_of_one_value() {
         loom::model(|| {

@@ -1,4 +1,4 @@
-//! Values from one thread to another without locks, allocation or unbounded waiting.
+//! Passes values from one thread to another without locks, allocation or unbounded waiting.
 //!
 //! - [`latest`]: the newest value wins (poses). Wait-free on both sides.
 //! - [`ring`]: every value in order, bounded (frames, events); [`ring::exchange`] recycles buffers.
@@ -31,10 +31,10 @@
 //! assert_eq!(lit, [0, 1, 2]);
 //! ```
 //!
-//! A crate of its own so that the model checker builds in seconds:
-//! `RUSTFLAGS="--cfg loom" cargo test -p dpm-handoff --lib --target-dir target/loom loom_`
-//! runs every interleaving (and every reordering that the memory model allows) of the tests named `loom_*`. The cells report
-//! unsynchronised access there, so weakening any ordering of the slot or the ring fails a test.
+//! This is a separate crate, so that the model checker builds in seconds:
+//! `RUSTFLAGS="--cfg loom" cargo test -p dpm-handoff --lib --target-dir target/loom loom_` runs every interleaving (and
+//! every reordering that the memory model allows) of the tests named `loom_*`. The cells report unsynchronised access
+//! there, so weakening any ordering of the slot or the ring fails a test.
 
 pub mod channel;
 pub mod latest;

@@ -1,8 +1,8 @@
-//! Every value in order from one thread to another: a bounded ring, and a pair of rings that recycles buffers.
+//! Passes every value in order from one thread to another: a bounded ring, and a pair of rings that recycles buffers.
 //!
-//! Positions count values since the start and wrap; `position % capacity` is the cell. Only the producer writes `tail`, only
-//! the consumer writes `head`. Each side keeps its last look at the other's position, so that in steady state an operation
-//! touches one shared cache line.
+//! Positions count values since the start and wrap; `position % capacity` is the cell. Only the producer writes `tail`,
+//! only the consumer writes `head`. Each side caches its last reading of the other's position, so that in steady state
+//! an operation touches one shared cache line.
 #![allow(unsafe_code)]
 
 use crate::sync::{Arc, AtomicUsize, Ordering, UnsafeCell};
@@ -11,14 +11,15 @@ use std::mem::MaybeUninit;
 
 struct Shared<T> {
     cells: Box<[UnsafeCell<MaybeUninit<T>>]>,
-    /// Values ever taken.
+    /// Number of values ever taken.
     head: CachePadded<AtomicUsize>,
-    /// Values ever put.
+    /// Number of values ever put in.
     tail: CachePadded<AtomicUsize>,
 }
 
-// SAFETY: the cell at a position is touched by the producer before it stores a greater `tail` (release) and by the consumer
-// after it loads that (acquire), and the other way round through `head`. So accesses never overlap; values move, hence Send.
+// SAFETY: the producer accesses the cell at a position before it stores a greater `tail` (release), and the consumer
+// accesses it after it loads that `tail` (acquire), and the other way round through `head`. So accesses never overlap;
+// values move, hence Send.
 unsafe impl<T: Send> Sync for Shared<T> {}
 
 impl<T> Shared<T> {
@@ -41,7 +42,7 @@ impl<T> Drop for Shared<T> {
     }
 }
 
-/// The side that puts values in.
+/// The producer's side.
 pub struct Producer<T> {
     shared: Arc<Shared<T>>,
     tail: usize,
@@ -49,7 +50,7 @@ pub struct Producer<T> {
     capacity: usize,
 }
 
-/// The side that takes values out.
+/// The consumer's side.
 pub struct Consumer<T> {
     shared: Arc<Shared<T>>,
     head: usize,
@@ -68,7 +69,7 @@ impl<T> std::fmt::Debug for Consumer<T> {
     }
 }
 
-/// A ring for up to `capacity` values (at least 1; memory is taken now, and for the next power of two).
+/// A ring for up to `capacity` values (at least 1). Allocates its memory here, rounded up to the next power of two.
 pub fn ring<T: Send>(capacity: usize) -> (Producer<T>, Consumer<T>) {
     let capacity = capacity.max(1);
     let cells = (0..capacity.next_power_of_two()).map(|_| UnsafeCell::new(MaybeUninit::uninit())).collect();
@@ -84,7 +85,7 @@ pub fn ring<T: Send>(capacity: usize) -> (Producer<T>, Consumer<T>) {
 }
 
 impl<T> Producer<T> {
-    /// Puts a value in, or gives it back when the ring is full.
+    /// Puts a value in, or returns it if the ring is full.
     pub fn push(&mut self, value: T) -> Result<(), T> {
         if self.tail.wrapping_sub(self.head_seen) >= self.capacity {
             // Acquire: the consumer has moved the value out of the cell we are about to fill.
@@ -103,12 +104,12 @@ impl<T> Producer<T> {
         Ok(())
     }
 
-    /// Values put and not yet taken, at most; the consumer may be taking some right now.
+    /// Upper bound of the number of values put in and not yet taken; the consumer may be taking some right now.
     pub fn len(&self) -> usize {
         self.tail.wrapping_sub(self.shared.head.load(Ordering::Relaxed))
     }
 
-    /// True when everything put has been taken.
+    /// True when every value put in has been taken.
     pub fn is_empty(&self) -> bool {
         self.len() == 0
     }
@@ -125,7 +126,8 @@ impl<T> Consumer<T> {
             }
         }
         let value = self.shared.cell(self.head).with(|cell| {
-            // SAFETY: the position lies in [head, tail): initialised, the consumer's, and read once because head moves on.
+            // SAFETY: the position lies in [head, tail): the cell is initialised, belongs to the consumer, and is read
+            // once because head moves on.
             unsafe { (*cell).assume_init_read() }
         });
         self.head = self.head.wrapping_add(1);
@@ -134,7 +136,7 @@ impl<T> Consumer<T> {
         Some(value)
     }
 
-    /// Values waiting, at least; the producer may be putting more.
+    /// Lower bound of the number of waiting values; the producer may be adding more.
     pub fn len(&self) -> usize {
         self.shared.tail.load(Ordering::Relaxed).wrapping_sub(self.head)
     }
@@ -159,26 +161,26 @@ pub struct Drainer<T> {
     free: Producer<T>,
 }
 
-/// A fixed set of buffers that goes round: the filler takes a free one, fills and sends it, the drainer receives it and gives
-/// it back. Nothing is allocated after this call, and no more than these buffers are ever in flight.
+/// A fixed set of buffers that circulates: the filler takes a free one, fills and sends it; the drainer receives it and
+/// returns it. Nothing is allocated after this call, and no more than these buffers are ever in flight.
 pub fn exchange<T: Send>(buffers: Vec<T>) -> (Filler<T>, Drainer<T>) {
     let n = buffers.len();
     let (filled_in, filled_out) = ring(n);
     let (mut free_in, free_out) = ring(n);
     for buffer in buffers {
-        // The ring holds n: none is refused.
+        // The ring holds n, so none is refused.
         let _ = free_in.push(buffer);
     }
     (Filler { filled: filled_in, free: free_out }, Drainer { filled: filled_out, free: free_in })
 }
 
 impl<T> Filler<T> {
-    /// A buffer to fill; `None` while all are in flight (the stage behind is slow: skip this frame and count it).
+    /// A buffer to fill; `None` while all are in flight (the next stage is slow: skip this frame and count it).
     pub fn take_free(&mut self) -> Option<T> {
         self.free.pop()
     }
 
-    /// Hands a filled buffer on. An error (with the buffer) means that it never came from this exchange.
+    /// Sends a filled buffer. An error (with the buffer) means that the buffer is not one of this exchange.
     pub fn send(&mut self, buffer: T) -> Result<(), T> {
         self.filled.push(buffer)
     }
@@ -200,7 +202,7 @@ impl<T> Drainer<T> {
         self.filled.pop()
     }
 
-    /// The newest filled buffer; older ones go straight back and are counted. After a stall this leaves no backlog.
+    /// The newest filled buffer; older ones are returned at once and counted. After a stall this leaves no backlog.
     pub fn receive_newest(&mut self) -> Option<(T, usize)> {
         let mut newest = self.filled.pop()?;
         let mut skipped = 0;
@@ -211,12 +213,12 @@ impl<T> Drainer<T> {
         Some((newest, skipped))
     }
 
-    /// Returns an emptied buffer. An error (with the buffer) means that it never came from this exchange.
+    /// Returns an emptied buffer. An error (with the buffer) means that the buffer is not one of this exchange.
     pub fn give_back(&mut self, buffer: T) -> Result<(), T> {
         self.free.push(buffer)
     }
 
-    /// True when something waits.
+    /// True when a filled buffer waits.
     pub fn has_filled(&self) -> bool {
         !self.filled.is_empty()
     }
@@ -338,7 +340,7 @@ mod tests {
 mod loom_tests {
     use super::*;
 
-    /// A ring of one cell: each value is written where the last one was read, so both pairs of orderings carry weight.
+    /// A ring of one cell: each value is written where the last one was read, so both pairs of orderings matter.
     #[test]
     fn loom_ring_of_one_keeps_values_whole() {
         loom::model(|| {

@@ -1,25 +1,27 @@
-//! A thread that waits for a hand-off: bounded spinning first if the machine has cores to spare, then parking, never longer than a deadline.
+//! Lets a thread wait for a hand-off: bounded spinning first if the machine has cores to spare, then parking, never
+//! longer than a deadline.
 //!
-//! The waker pays one fence and one load when nobody is parked. What is waited for is a closure that looks at the hand-off
-//! itself, so a wake-up is only ever a hint and a spurious one is harmless.
+//! The waker pays one fence and one load if no thread is parked. The condition is a closure that checks the hand-off
+//! itself, so a wake-up is only a hint, and a spurious one is harmless.
 
 use crate::sync::{fence, thread, Arc, AtomicBool, Ordering};
 use crossbeam::utils::Backoff;
-// Of the standard library under the model checker, too: it only hands over who waits, and what it promises is not in question.
+// Taken from the standard library under the model checker too: it only passes on the waiting thread, and its guarantees
+// are not under test.
 use std::sync::OnceLock;
 #[cfg(not(loom))]
 use std::time::Duration;
 
-/// Looks between two readings of the clock. The pauses between them double from one to eight: with longer ones the waiting thread would
-/// notice late, and nobody contends with it.
+/// Checks between two readings of the clock. The pauses between them double from one to eight: with longer ones the
+/// waiting thread would notice late, and no other thread contends with it.
 const LOOKS: u32 = 4;
 
 /// How a stage waits.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum WaitPolicy {
-    /// Park at once: for machines with fewer cores than threads that must run.
+    /// Park at once: for machines with fewer cores than runnable threads.
     Park,
-    /// Look in a tight loop for this many nanoseconds, then park.
+    /// Spin for this many nanoseconds, then park.
     SpinThenPark {
         /// Nanoseconds of spinning.
         spin_ns: i64,
@@ -27,9 +29,9 @@ pub enum WaitPolicy {
 }
 
 impl WaitPolicy {
-    /// The policy for `stages` waiting threads on `cores` usable cores. Spinning only pays where every spinning stage has a core
-    /// of its own and one is left for everything else: otherwise it delays the very thread it waits for, and a spinning
-    /// real-time thread on a shared core runs into the kernel's throttling.
+    /// The policy for `stages` waiting threads on `cores` usable cores. Spinning only pays if every spinning stage has
+    /// its own core and one is left for everything else. Otherwise it delays the very thread that it waits for, and the
+    /// kernel throttles a spinning real-time thread on a shared core.
     pub const fn for_machine(cores: usize, stages: usize) -> Self {
         if cores > stages && cores > 2 {
             Self::SpinThenPark { spin_ns: 200_000 }
@@ -43,7 +45,7 @@ impl WaitPolicy {
 struct Shared {
     /// The waiting thread is about to park or has parked.
     parked: AtomicBool,
-    /// Who waits: the first thread that did.
+    /// The waiting thread: the first one that waited.
     thread: OnceLock<thread::Thread>,
 }
 
@@ -53,17 +55,18 @@ pub struct Waker {
     shared: Arc<Shared>,
 }
 
-/// The waiting side. May be made anywhere and moved to the thread that waits; from its first wait on it belongs there.
+/// The waiting side. It may be made anywhere and moved to the waiting thread; from its first wait on it belongs to that
+/// thread.
 #[derive(Debug)]
 pub struct Waiter {
     shared: Arc<Shared>,
     policy: WaitPolicy,
-    /// One thread waits: not shared between several.
+    /// Only one thread waits: this is not shared between several.
     _not_sync: std::marker::PhantomData<std::cell::Cell<()>>,
 }
 
 impl Waiter {
-    /// A waiter that nobody uses yet; hand [`Waiter::waker`] to whoever feeds it.
+    /// A new waiter; pass [`Waiter::waker`] to the producer.
     pub fn new(policy: WaitPolicy) -> Self {
         Self {
             shared: Arc::new(Shared { parked: AtomicBool::new(false), thread: OnceLock::new() }),
@@ -72,14 +75,14 @@ impl Waiter {
         }
     }
 
-    /// A waker for the thread that waits.
+    /// A waker for the waiting thread.
     pub fn waker(&self) -> Waker {
         Waker { shared: self.shared.clone() }
     }
 
-    /// Waits until `ready` says true or the clock `now_ns` reaches `deadline_ns`; returns what `ready` said last. `ready` is
-    /// asked at least once, even when the deadline has passed. A thread other than the first one that waited is woken by its
-    /// deadline only.
+    /// Waits until `ready` returns true or the clock `now_ns` reaches `deadline_ns`; returns the last result of
+    /// `ready`. `ready` is called at least once, even if the deadline has passed. A thread other than the first one
+    /// that waited is woken only by its deadline.
     pub fn wait(
         &self,
         deadline_ns: i64,
@@ -92,7 +95,7 @@ impl Waiter {
         if let WaitPolicy::SpinThenPark { spin_ns } = self.policy {
             let until = now_ns().saturating_add(spin_ns).min(deadline_ns);
             loop {
-                // The clock costs as much as many looks: it is read once in [`LOOKS`].
+                // Reading the clock costs as much as many checks, so it is read once in [`LOOKS`].
                 let backoff = Backoff::new();
                 for _ in 0..LOOKS {
                     if ready() {
@@ -111,10 +114,10 @@ impl Waiter {
             if left_ns <= 0 {
                 return ready();
             }
-            // Release: whoever sees the announcement sees who waits.
+            // Release: a waker that sees the announcement sees the waiting thread.
             self.shared.parked.store(true, Ordering::Release);
-            // Announce before looking; the waker publishes before it looks for the announcement. The two fences are in one
-            // total order, so at least one of the two sees the other and no wake-up is lost (Dekker).
+            // Announce before the check; the waker publishes before it checks for the announcement. The two fences are
+            // in one total order, so at least one of the two sees the other and no wake-up is lost (Dekker).
             fence(Ordering::SeqCst);
             if ready() {
                 self.shared.parked.store(false, Ordering::Relaxed);
@@ -138,8 +141,8 @@ impl Waker {
     pub fn wake(&self) {
         // Pairs with the fence in `wait`.
         fence(Ordering::SeqCst);
-        // Only the waiter writes the flag: a true that is left standing costs a needless unpark, which is no system call unless
-        // the thread sleeps. Acquire: see who waits; `unpark` and `park` synchronise the rest by themselves.
+        // Only the waiter writes the flag: a stale true costs a needless unpark, which makes no system call unless the
+        // thread sleeps. Acquire: see the waiting thread; `unpark` and `park` synchronise the rest themselves.
         if self.shared.parked.load(Ordering::Acquire) {
             if let Some(thread) = self.shared.thread.get() {
                 thread.unpark();
@@ -217,14 +220,15 @@ mod loom_tests {
     use super::*;
     use crate::latest::latest;
 
-    /// Without either fence, loom finds the schedule in which both sides miss each other and the waiter sleeps for ever.
+    /// Without either fence, loom finds the schedule in which both sides miss each other and the waiter sleeps for
+    /// ever.
     #[test]
     fn loom_no_wakeup_is_lost() {
         loom::model(|| {
             let (mut publisher, mut reader) = latest(0u32);
             let waiter = Waiter::new(WaitPolicy::Park);
             let waker = waiter.waker();
-            // Not joined: loom takes an `unpark` that comes late for the end of the join.
+            // Not joined: loom mistakes a late `unpark` for the end of the join.
             loom::thread::spawn(move || {
                 publisher.publish(1);
                 waker.wake();

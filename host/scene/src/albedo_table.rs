@@ -1,5 +1,6 @@
-//! An index of refraction into the directional albedo of its rough dielectric reflection: the share of light that the coat
-//! reflects and that the diffuse base therefore does not get. The GPU and the f64 reference read the same table.
+//! Tabulates the directional albedo of a rough dielectric reflection for one index of refraction: the share of light
+//! that the coat reflects and that the diffuse base therefore does not get. The GPU and the f64 reference read the same
+//! table.
 //!
 //! ```text
 //!     E(mu, alpha) = integral over the hemisphere of f_spec(v, l) (n.l) dl,  mu = n.v
@@ -20,7 +21,7 @@ pub const ALBEDO_NODES: usize = 32;
 /// The table of one index of refraction.
 #[derive(Clone, Debug, PartialEq)]
 pub struct AlbedoTable {
-    /// Index of refraction it was made for.
+    /// Its index of refraction.
     pub ior: f32,
     /// `directional[j * ALBEDO_NODES + i]`, node `i` of mu and `j` of alpha; 0..1.
     pub directional: Vec<f32>,
@@ -29,7 +30,7 @@ pub struct AlbedoTable {
 }
 
 impl AlbedoTable {
-    /// Integrates the table, a few hundredths of a second. `ior` below 1 or not finite is taken as 1.
+    /// Integrates the table, which takes a few hundredths of a second. An `ior` below 1 or not finite counts as 1.
     pub fn new(ior: f32) -> Self {
         let n = ALBEDO_NODES;
         let ior = if ior.is_finite() { ior.max(1.0) } else { 1.0 };
@@ -82,12 +83,14 @@ impl AlbedoTable {
     }
 }
 
-/// Most tables of a scene. Each takes a few hundredths of a second, so a file with ten thousand indices of refraction would take minutes.
+/// Maximum number of tables of a scene. Each takes a few hundredths of a second, so a file with ten thousand indices of
+/// refraction would take minutes.
 pub(crate) const MAX_TABLES: usize = 32;
 
-/// The indices of refraction of which a scene has tables and, for each of `iors`, which of them is its own. As many as there are different ones where
-/// they are at most [`MAX_TABLES`], in the order in which they first come; beyond that [`MAX_TABLES`] of them, spread evenly over the sorted indices, and each
-/// index has the nearest one. What is below 1 or not finite counts as 1.
+/// The indices of refraction for which a scene has tables, and for each of `iors` the index of its table. If there are
+/// at most [`MAX_TABLES`] different indices, each has its own table, in order of first occurrence. Otherwise
+/// [`MAX_TABLES`] of them, spread evenly over the sorted indices, have a table, and each index uses the nearest one. An
+/// index below 1 or not finite counts as 1.
 pub fn tabulated(iors: &[f32]) -> (Vec<f32>, Vec<usize>) {
     let sound = |ior: f32| if ior.is_finite() { ior.max(1.0) } else { 1.0 };
     let mut seen = std::collections::HashSet::new();
@@ -139,14 +142,14 @@ fn row_average(row: &[f32]) -> f64 {
         .sum()
 }
 
-/// Directional albedo of one coat: index of refraction `ior` >= 1, cosine `mu` 0..1, GGX width `alpha` 0..1. What a node of the table
-/// holds, within 1.5e-4.
+/// Directional albedo of one coat: index of refraction `ior` >= 1, cosine `mu` 0..1, GGX width `alpha` 0..1. A node of
+/// the table holds this value, within 1.5e-4.
 pub fn directional_albedo(ior: f64, mu: f64, alpha: f64) -> f64 {
     by_quadrature(ior, mu, alpha, &Quadrature::new(20, 10))
 }
 
-/// Unpolarised reflectance of a smooth dielectric interface from Fresnel's two amplitudes, by the cosines on either side of it.
-/// `ior` >= 1, `cos` 0..1.
+/// Unpolarised reflectance of a smooth dielectric interface from Fresnel's two amplitudes, by the cosines on both
+/// sides. `ior` >= 1, `cos` 0..1.
 fn fresnel(ior: f64, cos: f64) -> f64 {
     if ior == 1.0 {
         return 0.0;
@@ -157,10 +160,10 @@ fn fresnel(ior: f64, cos: f64) -> f64 {
     0.5 * (across * across + along * along)
 }
 
-/// Smith's height-correlated shadowing over masking, `G2 / G1(v)`, of the GGX distribution \[Heitz14\]: the weight of a direction that was
-/// drawn through a visible normal. Both cosines are above 0.
+/// Smith's height-correlated shadowing over masking, `G2 / G1(v)`, of the GGX distribution \[Heitz14\]: the weight of a
+/// direction that was sampled through a visible normal. Both cosines are above 0.
 fn shadowing(cos_v: f64, cos_l: f64, alpha: f64) -> f64 {
-    // 1 + 2 Lambda, with the tangent written by the cosine.
+    // 1 + 2 Lambda, with the tangent expressed by the cosine.
     let stretch = |c: f64| (c * c + alpha * alpha * (1.0 - c * c)).sqrt() / c;
     let (v, l) = (stretch(cos_v), stretch(cos_l));
     (1.0 + v) / (v + l)
@@ -168,12 +171,13 @@ fn shadowing(cos_v: f64, cos_l: f64, alpha: f64) -> f64 {
 
 /// `E` by quadrature over the visible normals: with `h` drawn from their density the integrand is `F G2 / G1`.
 ///
-/// In the stretched space of \[Dupuy23\] where visible normals are uniform over a spherical cap, `h` is given by its angle `beta` from
-/// the stretched `v` and its azimuth `psi` about it: there the integrand has neither cone nor root inside. There `v.h` depends on `beta`
-/// alone, so that the reflected direction is above the surface where the height of `h` lies between two roots of a quadratic equation:
-/// lower facets send light down at once, and of facets seen nearly edge on the level ones do. So an azimuth begins and ends in closed form,
-/// and the outer integral is split where either begins to differ from a half turn's end, each part with sin^2 as its variable because
-/// ends of the azimuth behave like square roots there.
+/// In the stretched space of \[Dupuy23\], visible normals are uniform over a spherical cap. There `h` is given by its
+/// angle `beta` from the stretched `v` and its azimuth `psi` about it, and the integrand has neither cone nor root
+/// inside. `v.h` depends on `beta` alone. So the reflected direction is above the surface where the height of `h` lies
+/// between two roots of a quadratic equation: lower facets reflect downwards, and so do level facets seen nearly edge
+/// on. The limits of the azimuth are therefore known in closed form. The outer integral is split where a limit begins
+/// to differ from the end of a half turn. Each part uses sin^2 as its variable, because the limits of the azimuth
+/// behave like square roots there.
 fn by_quadrature(ior: f64, mu: f64, alpha: f64, rule: &Quadrature) -> f64 {
     if alpha == 0.0 {
         return fresnel(ior, mu);
@@ -183,9 +187,9 @@ fn by_quadrature(ior: f64, mu: f64, alpha: f64, rule: &Quadrature) -> f64 {
     let stretched = DVec3::new(v.x * alpha, 0.0, v.z);
     let (v_std, scale) = (stretched.normalize(), stretched.length());
     let upward = DVec3::new(-v_std.z, 0.0, v_std.x);
-    // Heights of `h` on the ring at `beta`: middle and half of the range.
+    // Heights of `h` on the ring at `beta`: centre and half width of the range.
     let heights = |beta: f64| (v_std.z * beta.cos(), v_std.x * beta.sin());
-    // Those between which the reflected direction is above the surface; NaN: none.
+    // The heights between which the reflected direction is above the surface; NaN: none.
     let allowed = |beta: f64| {
         let half = scale * beta.cos();
         let sum = half + (half * half - mu * mu * alpha * alpha * (1.0 - alpha * alpha)).sqrt();
@@ -204,7 +208,7 @@ fn by_quadrature(ior: f64, mu: f64, alpha: f64, rule: &Quadrature) -> f64 {
             let cos = (height - middle) / half;
             if cos.is_nan() { 0.0 } else { cos.clamp(-1.0, 1.0) }.acos()
         };
-        // From straight above `v`, the highest, to below it. A ring all of one height is allowed as a whole.
+        // From directly above `v`, the highest, to below it. A ring of constant height is allowed as a whole.
         let (from, to) = if half > 0.0 { (azimuth(high), azimuth(low)) } else { (0.0, PI) };
         let (sin, cos) = beta.sin_cos();
         let mut sum = 0.0;
@@ -218,7 +222,7 @@ fn by_quadrature(ior: f64, mu: f64, alpha: f64, rule: &Quadrature) -> f64 {
                 sum += w * fresnel(ior, vh) * shadowing(v.z, l_z, alpha);
             }
         }
-        // Area of the cap swept: 4 sin cos dbeta dpsi of 2 pi (1 + v.z), both halves of the azimuth.
+        // Swept area of the cap: 4 sin cos dbeta dpsi of 2 pi (1 + v.z), both halves of the azimuth.
         sum * (to - from) * 4.0 * sin * cos / (PI * (1.0 + v_std.z))
     };
     let mut ends = [0.0, last, last, last];
@@ -236,7 +240,7 @@ fn by_quadrature(ior: f64, mu: f64, alpha: f64, rule: &Quadrature) -> f64 {
     sum
 }
 
-/// Where a continuous function changes sign between `a` and `b`, by bisection; `None` when its ends have one sign.
+/// Where a continuous function changes sign between `a` and `b`, by bisection; `None` if its ends have the same sign.
 fn root(mut a: f64, mut b: f64, f: impl Fn(f64) -> f64) -> Option<f64> {
     let sign = f(a) > 0.0;
     if (f(b) > 0.0) == sign {
@@ -335,7 +339,8 @@ mod tests {
     fn interpolation_error_is_bounded() {
         let rule = Quadrature::new(20, 10);
         let t = AlbedoTable::new(1.5);
-        // Toward grazing E depends on mu / alpha alone and no grid follows it; but the light that arrives there goes with mu.
+        // Toward grazing angles E depends on mu / alpha alone, and no grid resolves it; but the light that arrives
+        // there is proportional to mu.
         let (mut worst, mut weighed): (f64, f64) = (0.0, 0.0);
         for j in 0..40 {
             for i in 0..40 {
@@ -353,7 +358,7 @@ mod tests {
         assert!(worst < 2e-3 && weighed < 3e-4, "{worst} {weighed}");
     }
 
-    /// Found in use, a sibling of R10: every index of refraction had a table of its own, at a few hundredths of a second each.
+    /// Found in use, similar to R10: every index of refraction had its own table, at a few hundredths of a second each.
     #[test]
     fn the_number_of_tables_is_bounded_and_few_indices_have_their_own() {
         let (own, uses) = tabulated(&[1.5, 1.33, 1.5, f32::NAN, 2.4, 1.33]);

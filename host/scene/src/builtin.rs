@@ -1,8 +1,10 @@
-//! Nothing but code into the built-in scene: a glazed ceramic hare and a bronze bust under a lamp, the demo's two moving objects.
+//! Generates the built-in scene by code: a glazed ceramic hare and a bronze bust under a lamp, the demo's two moving
+//! objects.
 //!
-//! The hare (`bunny`, 0.20 m, rigid body 0) and the bust (`venus`, 0.30 m, rigid body 1) stand where the paper's figures stand: seen by a
-//! projector at (0, 0.10, 1.0) m that looks at (0, 0.03, -0.05) m with a horizontal field of 30 degrees. Both bodies have their origin in
-//! the middle, so a rotation turns them in place. The lamp and the sky exist only in the virtual world.
+//! The hare (`bunny`, 0.20 m, rigid body 0) and the bust (`venus`, 0.30 m, rigid body 1) are placed like the paper's
+//! figures, for a projector at (0, 0.10, 1.0) m that looks at (0, 0.03, -0.05) m with a horizontal field of 30 degrees.
+//! Both bodies have their origin in the middle, so a rotation turns them in place. The lamp and the sky exist only in
+//! the virtual world.
 
 use glam::{DAffine3, DVec3, Quat, Vec2, Vec3};
 
@@ -15,18 +17,18 @@ const BRONZE: u32 = 1;
 const PLINTH: u32 = 2;
 const LAMP: u32 = 3;
 
-/// Times the glaze repeats around the hare, and the patina around the bust.
+/// Number of repetitions of the glaze around the hare, and of the patina around the bust.
 const TILES_AROUND: f32 = 3.0;
 
-/// The built-in scene. Takes a fraction of a second; the same on every call.
+/// The built-in scene. Takes a fraction of a second; identical on every call.
 pub fn builtin() -> Scene {
-    // The figures are most of the work: one in a thread of its own, so that the demo starts sooner.
+    // The figures take most of the time: one is made in its own thread, so that the demo starts sooner.
     let (hare, bust) = std::thread::scope(|scope| {
         let other = std::thread::Builder::new().spawn_scoped(scope, hare_body);
         let bust = bust_body();
         let hare = match other {
             Ok(thread) => thread.join().unwrap_or_else(|panic| std::panic::resume_unwind(panic)),
-            // A system that gives no more threads makes it slower, not impossible.
+            // Without another thread this is slower, not impossible.
             Err(_) => hare_body(),
         };
         (hare, bust)
@@ -132,7 +134,8 @@ fn lamp() -> Body {
     }
 }
 
-/// Wraps a surface in cylinder coordinates about Y (one tile up every `tile_height` metres) and closes the seam by splitting vertices.
+/// Assigns cylindrical texture coordinates about Y (one tile every `tile_height` metres), and closes the seam by
+/// splitting vertices.
 fn textured_mesh(surface: Surface, tile_height: f32, material: impl Fn(Vec3) -> u32) -> TriangleMesh {
     let turn = |p: Vec3| p.x.atan2(p.z) / std::f32::consts::TAU + 0.5;
     let mut mesh = TriangleMesh {
@@ -178,7 +181,7 @@ fn blend(a: f32, b: f32, k: f32) -> f32 {
     a.min(b) - 0.25 * h * h * k
 }
 
-/// Takes `b` away from `a` with a rounded edge.
+/// Subtracts `b` from `a` with a rounded edge.
 fn carve(a: f32, b: f32, k: f32) -> f32 {
     -blend(-a, b, k)
 }
@@ -275,7 +278,7 @@ fn bust(p: Vec3) -> f32 {
     d.min(plinth)
 }
 
-/// Made once for all tests that look at it.
+/// Made once for all tests that use it.
 #[cfg(test)]
 pub(crate) static SHARED: std::sync::LazyLock<Scene> = std::sync::LazyLock::new(builtin);
 

@@ -1,4 +1,4 @@
-//! A latitude-longitude image file (PFM, Radiance RGBE, PNG, JPEG) into an [`Environment`].
+//! Reads a latitude-longitude image file (PFM, Radiance RGBE, PNG, JPEG) as an [`Environment`].
 
 use std::path::Path;
 
@@ -10,18 +10,19 @@ use super::limits::Limits;
 use super::load::contained;
 use super::{Environment, SceneError};
 
-/// Most texels of an environment: 8192 x 4096.
+/// Maximum number of texels of an environment: 8192 x 4096.
 const MAX_TEXELS: u64 = 1 << 25;
 
-/// Radiance beyond this is taken for damage; the sun's disc is near 10^5 times the sky.
+/// Radiance beyond this counts as damage; the sun's disc is near 10^5 times the sky.
 const MAX_RADIANCE: f32 = 1.0e9;
 
-/// Reads an environment image: `.pfm` (linear, "PF" or "Pf"), Radiance `.hdr` (linear), PNG or JPEG (sRGB, decoded to linear), told apart by
-/// their first bytes. Row 0 is up; the middle column looks along -Z turned by `rotation_rad` about +Y. Texels are multiplied by `scale`.
+/// Reads an environment image: `.pfm` (linear, "PF" or "Pf"), Radiance `.hdr` (linear), PNG or JPEG (sRGB, decoded to
+/// linear); the first bytes identify the format. Row 0 is up; the middle column looks along -Z turned by `rotation_rad`
+/// about +Y. Texels are multiplied by `scale`.
 ///
 /// # Errors
-/// [`SceneError::InFile`] for what cannot be read, is beyond 8192 x 4096 texels, or holds a value that is negative, not finite or
-/// beyond 10^9.
+/// [`SceneError::InFile`] if the file cannot be read, is larger than 8192 x 4096 texels, or holds a value that is
+/// negative, not finite or beyond 10^9.
 pub fn load_environment(path: &Path, rotation_rad: f32, scale: f32) -> Result<Environment, SceneError> {
     let limits = Limits::default();
     let owned = path.to_path_buf();
@@ -32,8 +33,8 @@ pub fn load_environment(path: &Path, rotation_rad: f32, scale: f32) -> Result<En
     contained(&limits, work).map_err(|e| e.in_file(path))
 }
 
-/// Bytes of the storage buffer that every Vulkan device binds (`maxStorageBufferRange` is at least 2^27), in which the renderer keeps an environment with
-/// 16 bytes for each texel and each row.
+/// Size of a storage buffer that every Vulkan device can bind (`maxStorageBufferRange` is at least 2^27), bytes. The
+/// renderer keeps an environment in such a buffer, with 16 bytes for each texel and each row.
 const RENDERED_BYTES: u64 = 1 << 27;
 
 /// True when the renderer can hold an environment of these sides on every device.
@@ -42,10 +43,11 @@ fn is_held(width: u32, height: u32) -> bool {
 }
 
 impl Environment {
-    /// The same environment as large as the renderer holds on every device, and what was done, in words, where it had to be scaled down. A projector
-    /// shows reflections of it at a few texels a degree at most, so nothing is lost that could be seen.
+    /// The same environment, scaled down if needed so that the renderer can hold it on every device, and a description
+    /// of the scaling if there was any. A projector shows reflections of it at a few texels a degree at most, so no
+    /// visible detail is lost.
     ///
-    /// A texel of the smaller picture is the mean over its part of the sphere of what the larger one holds there, so the light from all around
+    /// A texel of the smaller picture is the mean of the larger one over its part of the sphere, so the total light
     /// stays the same.
     pub fn fitted(self) -> (Self, Option<String>) {
         let (width, height, texels, rotation_rad) = match self {
@@ -54,7 +56,7 @@ impl Environment {
             }
             other => return (other, None),
         };
-        // The same shape where that is possible: both sides over the smallest factor that fits.
+        // The same aspect ratio if possible: both sides divided by the smallest factor that fits.
         let side = |side: u32, factor: f64| ((f64::from(side) / factor) as u32).max(1);
         let mut factor = 1.0;
         while !is_held(side(width, factor), side(height, factor)) {
@@ -69,12 +71,12 @@ impl Environment {
     }
 }
 
-/// Overlaps of `n` parts with the `m` parts beneath them, whose edges are where `edge` puts `k` of either number: for each of the `n` the first of the `m`
-/// and the sizes of the overlaps.
+/// Overlaps of `n` parts with the `m` parts beneath them, where `edge` gives the position of edge `k` for either
+/// number. Returns for each of the `n` parts the first of the `m` and the sizes of the overlaps.
 fn overlaps(n: u32, m: u32, edge: impl Fn(u32, u32) -> f64) -> Vec<(usize, Vec<f64>)> {
     let part = |k: u32| {
         let (from, to) = (edge(k, n), edge(k + 1, n));
-        // Whole numbers, so that no rounding leaves a part out.
+        // Integers, so that rounding leaves no part out.
         let first = (u64::from(k) * u64::from(m) / u64::from(n)) as u32;
         let last = ((u64::from(k) + 1) * u64::from(m)).div_ceil(u64::from(n)).min(u64::from(m)) as u32;
         let sizes = (first..last).map(|i| (edge(i + 1, m).min(to) - edge(i, m).max(from)).max(0.0));
@@ -83,10 +85,11 @@ fn overlaps(n: u32, m: u32, edge: impl Fn(u32, u32) -> f64) -> Vec<(usize, Vec<f
     (0..n).map(part).collect()
 }
 
-/// A latitude-longitude picture of `from` texels as one of `to`, no side larger: each texel the mean over its solid angle.
+/// Scales a latitude-longitude picture of `from` texels to `to`, with no side larger: each texel is the mean over its
+/// solid angle.
 fn box_filtered(texels: &[Vec3], from: (u32, u32), to: (u32, u32)) -> Vec<Vec3> {
     let columns = overlaps(to.0, from.0, |k, of| f64::from(k) / f64::from(of));
-    // Rows by the height on the unit sphere, in which equal steps are equal solid angles.
+    // Rows in terms of the height on the unit sphere, in which equal steps are equal solid angles.
     let height = |k: u32, of: u32| 1.0 - (std::f64::consts::PI * f64::from(k) / f64::from(of)).cos();
     let rows = overlaps(to.1, from.1, height);
     let width = from.0 as usize;
@@ -199,7 +202,7 @@ fn read_pfm(bytes: &[u8]) -> Result<Pixels, SceneError> {
     }
     let float = |i: usize| {
         let four = [rest[4 * i], rest[4 * i + 1], rest[4 * i + 2], rest[4 * i + 3]];
-        // The sign of the scale tells the order of the bytes; its size has no agreed meaning.
+        // The sign of the scale gives the byte order; its magnitude has no agreed meaning.
         if scale < 0.0 {
             f32::from_le_bytes(four)
         } else {
@@ -218,7 +221,7 @@ fn read_pfm(bytes: &[u8]) -> Result<Pixels, SceneError> {
     Ok((width, height, (0..texels).map(texel).collect()))
 }
 
-/// Radiance pictures \[Ward91\]: rows from the top, plain or run-length coded a component at a time.
+/// Radiance pictures \[Ward91\]: rows from the top, plain or with each component run-length coded.
 fn read_rgbe(bytes: &[u8]) -> Result<Pixels, SceneError> {
     let mut rest = bytes;
     let mut exposure = 1.0f32;
@@ -254,7 +257,7 @@ fn read_rgbe(bytes: &[u8]) -> Result<Pixels, SceneError> {
     let side = |s: &str| s.parse::<u32>().map_err(|_| header("gives a size that is not a number"));
     let (width, height) = (side(width)?, side(height)?);
     check_size(width, height)?;
-    // No coding of a row is shorter than one texel.
+    // No encoding of a row is shorter than one texel.
     if (rest.len() as u64) < 4 * u64::from(height) {
         return Err(SceneError::broken("image", "has fewer bytes than its size needs: it is cut off"));
     }
@@ -275,7 +278,7 @@ fn read_rgbe(bytes: &[u8]) -> Result<Pixels, SceneError> {
     Ok((width, height, texels))
 }
 
-/// Reads one row in whichever of the three codings it is.
+/// Reads one row in any of the three encodings.
 fn read_rgbe_row(rest: &mut &[u8], row: &mut [[u8; 4]]) -> Option<()> {
     let take = |rest: &mut &[u8], n: usize| -> Option<Vec<u8>> {
         let (head, tail) = rest.split_at_checked(n)?;
@@ -305,7 +308,8 @@ fn read_rgbe_row(rest: &mut &[u8], row: &mut [[u8; 4]]) -> Option<()> {
         }
         return Some(());
     }
-    // Plain texels; (1, 1, 1, n) repeats the texel before n times, each directly following one eight bits further up.
+    // Plain texels; (1, 1, 1, n) repeats the previous texel n times; each such code that directly follows another
+    // counts eight bits higher.
     let (mut x, mut shift) = (0, 0);
     while x < width {
         let texel: [u8; 4] = take(rest, 4)?.try_into().ok()?;
@@ -447,7 +451,7 @@ mod tests {
             .contains("sky.pfm"));
     }
 
-    /// Light from all around, and the light that falls on a plane that faces up: both are weighted by solid angle.
+    /// The total light, and the light on an upward-facing plane: both are weighted by solid angle.
     fn energies(texels: &[Vec3], width: usize) -> [f64; 2] {
         let height = texels.len() / width;
         let z = |k: usize| (std::f64::consts::PI * k as f64 / height as f64).cos();
@@ -460,8 +464,8 @@ mod tests {
         sums
     }
 
-    /// Found in use, R17: an environment of 8192 x 4096 took the run down. It is scaled down to what every device holds, says so, and keeps its light
-    /// to a millionth.
+    /// Found in use, R17: an environment of 8192 x 4096 crashed the run. It is scaled down to a size that every device
+    /// holds, with a note, and keeps its light to a millionth.
     #[test]
     fn large_environments_are_scaled_down_and_keep_their_light() {
         // Bright spots on a dim ground, as studios and suns are.
@@ -493,7 +497,7 @@ mod tests {
         );
         let after = energies(&texels, width as usize);
         assert!((after[0] / before[0] - 1.0).abs() < 1e-6, "{before:?} {after:?}");
-        // Up and down is moved by less than a row.
+        // The vertical shift is less than a row.
         assert!((after[1] - before[1]).abs() < before[0] * 1e-3, "{before:?} {after:?}");
         assert!(told.is_some_and(|t| t.contains("8192 x 4096") && t.contains(&format!("{width} x {height}"))));
         let small =

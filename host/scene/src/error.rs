@@ -1,9 +1,10 @@
-//! What can be wrong with a scene, a texture or a sky, told so that the operator knows which object and what to do.
+//! Errors of scenes, textures and skies. Their text tells the operator which object is affected and what to do.
 
 use std::path::PathBuf;
 use std::time::Duration;
 
-/// Why a file was not accepted. The text names the object ("accessor 3", "material 1 'glass'") and, where there is one, the remedy.
+/// Why a file was refused. The text names the object ("accessor 3", "material 1 'glass'") and, if there is one, the
+/// remedy.
 #[derive(Debug, thiserror::Error)]
 pub enum SceneError {
     /// The system could not read it.
@@ -14,33 +15,33 @@ pub enum SceneError {
     TooLarge {
         /// What was counted.
         what: String,
-        /// How much the file asks for.
+        /// The amount in the file.
         found: u64,
-        /// The greatest value taken.
+        /// The greatest accepted value.
         limit: u64,
-        /// What to do.
+        /// The remedy.
         remedy: &'static str,
     },
     /// It contradicts its own format.
     #[error("{object}: {problem}")]
     Broken {
-        /// Which part.
+        /// The affected part.
         object: String,
-        /// What is wrong there, and the remedy if it is not plain.
+        /// The problem, and the remedy unless it is obvious.
         problem: String,
     },
-    /// Well-formed, but asks for something this program does not do.
+    /// Well-formed, but requires something that this program does not support.
     #[error("{what} is not supported: {remedy}")]
     Unsupported {
         /// What the file needs.
         what: String,
-        /// What to do.
+        /// The remedy.
         remedy: String,
     },
-    /// The rig file names a node that is not there, or there several times.
+    /// The rig file names a node that does not exist, or exists several times.
     #[error("{problem} (nodes with a name: {known})")]
     Node {
-        /// Which name, and what is wrong.
+        /// The name and the problem.
         problem: String,
         /// Names to choose from.
         known: String,
@@ -48,10 +49,10 @@ pub enum SceneError {
     /// It took longer than [`super::Limits::time`].
     #[error("loading took longer than {0:?} and was stopped: simplify the file or raise the limit")]
     TimedOut(Duration),
-    /// A defect of the loader, contained.
+    /// A defect of the loader, caught.
     #[error("the loader failed on this file, which is a defect of this program: {0}")]
     Internal(String),
-    /// Any of the above, with the file it happened in.
+    /// Any of the above, with the affected file.
     #[error("{}: {problem}", path.display())]
     InFile {
         /// The file.
@@ -68,7 +69,7 @@ impl SceneError {
         Self::Broken { object: object.into(), problem: problem.into() }
     }
 
-    /// Something that is not done here.
+    /// Something that is not supported.
     pub(crate) fn unsupported(what: impl Into<String>, remedy: impl Into<String>) -> Self {
         Self::Unsupported { what: what.into(), remedy: remedy.into() }
     }

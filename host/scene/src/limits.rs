@@ -1,4 +1,5 @@
-//! The bounds on what a file may ask for, checked before anything of that size is allocated, and the flag that stops a load.
+//! Limits on what a file may request, checked before anything of that size is allocated, and the flag that stops a
+//! load.
 
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::Arc;
@@ -6,7 +7,7 @@ use std::time::Duration;
 
 use super::SceneError;
 
-/// Bounds on one scene file. The defaults fit the largest scenes a projector raster can make use of.
+/// Limits on one scene file. The defaults fit the largest scenes that a projector raster can make use of.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Limits {
     /// Bytes of any one file, and of all buffers together.
@@ -17,7 +18,8 @@ pub struct Limits {
     pub json_values: u64,
     /// Nodes, meshes, materials, accessors and so on: entries in any one list at the top of the file.
     pub objects: u64,
-    /// Triangles after every instance of a mesh is written out; of a short file fewer, a million and one for every two bytes.
+    /// Triangles after every instance of a mesh is expanded; for a short file fewer: a million, plus one for every two
+    /// bytes.
     pub triangles: u64,
     /// Texels of all decoded textures together.
     pub texels: u64,
@@ -49,14 +51,14 @@ impl Default for Limits {
 }
 
 impl Limits {
-    /// The bounds for a file of `bytes` bytes in all. Triangles cost time, and a short file may ask for any number of them by instances of a mesh: a million
-    /// are free, and more need bytes to stand for them.
+    /// The limits for a file of `bytes` bytes in all. Triangles cost time, and a short file may request any number of
+    /// them by instances of a mesh: a million are free, and more need bytes in the file.
     pub(crate) fn of_file(&self, bytes: u64) -> Self {
         Self { triangles: self.triangles.min(1_000_000 + bytes / 2), ..self.clone() }
     }
 }
 
-/// Tells a running load to stop. The thread that ran out of time looks at it between pieces of work, so it ends soon after.
+/// Stops a running load. The load checks it between pieces of work, so it ends soon after its time is up.
 #[derive(Clone, Debug, Default)]
 pub(crate) struct Cancel(Arc<AtomicBool>);
 
@@ -66,7 +68,7 @@ impl Cancel {
         self.0.store(true, Ordering::Relaxed);
     }
 
-    /// An error once asked to stop.
+    /// An error once a stop was requested.
     pub(crate) fn check(&self, limits: &Limits) -> Result<(), SceneError> {
         if self.0.load(Ordering::Relaxed) {
             return Err(SceneError::TimedOut(limits.time));

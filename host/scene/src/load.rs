@@ -1,4 +1,4 @@
-//! A path to a glTF file into a [`Scene`], with nothing that the file does able to take the caller down or hold it up.
+//! Loads a [`Scene`] from a glTF file, such that nothing in the file can crash or block the caller.
 
 use crossbeam::channel::{bounded, RecvTimeoutError};
 use std::path::Path;
@@ -6,15 +6,16 @@ use std::path::Path;
 use super::limits::{Cancel, Limits};
 use super::{gltf_file, Scene, SceneError};
 
-/// Which node of the file a rigid body of the rig file stands for. The node and all below it move as one.
+/// The node of the file for a rigid body of the rig file. The node and its descendants move as one.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct BodySelector {
     /// Name of the rigid body.
     pub name: String,
-    /// Name of the glTF node; must occur once. `None`: the node of the body's own name. When no body states its node and the file has
-    /// none of their names, the bodies stand for the first objects of the scene in order, and a warning says which for which.
+    /// Name of the glTF node; must occur once. `None`: the node with the body's own name. If no body states its node
+    /// and the file has none of their names, the bodies are the first objects of the scene in order, and a warning
+    /// lists the assignment.
     pub node: Option<String>,
-    /// False: nothing is projected on it, it is only seen in reflections and casts virtual shadows.
+    /// False: nothing is projected on it; it is only seen in reflections and casts virtual shadows.
     pub projected: bool,
 }
 
@@ -23,17 +24,18 @@ pub struct BodySelector {
 pub struct LoadOptions {
     /// Rigid bodies: the i-th becomes the body with `tracked == Some(i)`. Empty: the first two objects of the scene.
     pub bodies: Vec<BodySelector>,
-    /// Names of nodes (with all below) that exist only in the virtual world: lamps, surroundings.
+    /// Names of nodes (with their descendants) that exist only in the virtual world: lamps, surroundings.
     pub virtual_nodes: Vec<String>,
-    /// Bounds on size and time.
+    /// Limits on size and time.
     pub limits: Limits,
 }
 
 /// Reads a `.glb` or `.gltf` file.
 ///
 /// # Errors
-/// Whatever the file holds, the result is a scene or a [`SceneError::InFile`] that says what is wrong where, within
-/// [`Limits::time`]: the work is done in a thread of its own that is told to stop when time is up and whose panics end there.
+/// Whatever the file contains, the result is a scene or a [`SceneError::InFile`] that names the place and the problem,
+/// within [`Limits::time`]: a separate thread does the work. It is told to stop when time is up, and its panics are
+/// caught.
 pub fn load(path: &Path, options: &LoadOptions) -> Result<Scene, SceneError> {
     let (owned_path, owned_options) = (path.to_path_buf(), options.clone());
     let work = move |cancel: &Cancel| {
@@ -60,7 +62,7 @@ pub(super) fn contained<T: Send + 'static>(
     let cancel = Cancel::default();
     let (inside, (send, receive)) = (cancel.clone(), bounded(1));
     let helper = std::thread::Builder::new().name("scene-load".into()).spawn(move || {
-        // A panic in here is a broken scene, not a broken run.
+        // A panic here means a broken scene, not a broken run.
         dpm_common::stopping::expect_panics();
         let result = std::panic::catch_unwind(std::panic::AssertUnwindSafe(|| work(&inside))).unwrap_or_else(
             |panic| {

@@ -1,16 +1,17 @@
-//! Raw vertices and indices into a [`TriangleMesh`] that satisfies its promises: unit normals, finite tangents, no empty triangle.
+//! Repairs raw vertices and indices to a [`TriangleMesh`] that keeps its guarantees: unit normals, finite tangents, no
+//! empty triangle.
 
 use glam::{DAffine3, DMat3, DVec3, Vec3, Vec4};
 
 use super::TriangleMesh;
 
-/// Positions farther from the origin than this (metres) are taken as damage: beyond it f32 steps exceed 6 cm.
+/// Positions farther from the origin than this (metres) count as damage: beyond it f32 steps exceed 6 cm.
 pub const MAX_COORDINATE_M: f32 = 1.0e6;
 
 /// A triangle whose doubled area is below this times its longest edge squared has no usable normal.
 const MIN_RELATIVE_AREA: f64 = 1.0e-12;
 
-/// What [`TriangleMesh::drop_unusable`] removed.
+/// Counts of what [`TriangleMesh::drop_unusable`] removed.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub(crate) struct Dropped {
     /// Triangles with a corner that is NaN, infinite or beyond [`MAX_COORDINATE_M`].
@@ -38,7 +39,8 @@ impl TriangleMesh {
         (b - a).cross(c - a)
     }
 
-    /// Removes triangles that no ray could meaningfully hit (non-finite corners, no area), then the vertices that nothing uses any more.
+    /// Removes triangles that no ray could meaningfully hit (non-finite corners, no area), then the vertices that are
+    /// no longer used.
     pub(crate) fn drop_unusable(&mut self) -> Dropped {
         let mut dropped = Dropped::default();
         let mut keep = Vec::with_capacity(self.triangles.len());
@@ -98,7 +100,7 @@ impl TriangleMesh {
         }
     }
 
-    /// Gives every triangle its own three vertices with the face normal, as glTF asks for where a file has no normals.
+    /// Gives every triangle its own three vertices with the face normal, as glTF requires for a file without normals.
     pub(crate) fn split_into_flat_faces(&mut self) {
         let corners: Vec<u32> = self.triangles.iter().flatten().copied().collect();
         let normals = self
@@ -137,9 +139,10 @@ impl TriangleMesh {
         }
     }
 
-    /// Computes tangents from the texture coordinates: the tangent follows +u, the bitangent `w * n x t` follows -v (up in the image),
-    /// as glTF's normal maps have it. Faces around a vertex count by their angle there, in the way of \[Mikkelsen08\]; a vertex that
-    /// joins mirrored and unmirrored faces is split. Where the coordinates are degenerate, any unit vector across the normal is taken.
+    /// Computes tangents from the texture coordinates: the tangent follows +u, the bitangent `w * n x t` follows -v (up
+    /// in the image), as in glTF's normal maps. Faces around a vertex are weighted by their angle there, as in
+    /// \[Mikkelsen08\]; a vertex that joins mirrored and unmirrored faces is split. Where the coordinates are
+    /// degenerate, any unit vector perpendicular to the normal is used.
     pub(crate) fn generate_tangents(&mut self) {
         self.split_mirrored_vertices();
         let mut sum = vec![DVec3::ZERO; self.positions.len()];
@@ -169,7 +172,8 @@ impl TriangleMesh {
             .collect();
     }
 
-    /// Replaces tangents that are not finite, too short or along the normal; makes all of them unit length, across the normal, `w = +-1`.
+    /// Replaces tangents that are not finite, too short or parallel to the normal; makes all of them unit length,
+    /// perpendicular to the normal, `w = +-1`.
     pub(crate) fn repair_tangents(&mut self) {
         for (t, n) in self.tangents.iter_mut().zip(&self.normals) {
             let n = n.as_dvec3();
@@ -181,7 +185,7 @@ impl TriangleMesh {
         }
     }
 
-    /// Unit direction of +u on a face and the sign of its bitangent; `None` where the coordinates span no area.
+    /// Unit direction of +u on a face and the sign of its bitangent; `None` if the coordinates span no area.
     fn face_tangent(&self, t: [u32; 3]) -> Option<(DVec3, f32)> {
         let [p0, p1, p2] = t.map(|i| self.positions[i as usize].as_dvec3());
         let [w0, w1, w2] = t.map(|i| self.uvs[i as usize].as_dvec2());
@@ -219,7 +223,8 @@ impl TriangleMesh {
         }
     }
 
-    /// Appends `other` seen through `transform` (any invertible affine map; a mirroring one turns the winding so that outside stays outside).
+    /// Appends `other` transformed by `transform` (any invertible affine map; a mirroring one flips the winding so that
+    /// outside stays outside).
     pub(crate) fn append_transformed(&mut self, other: &TriangleMesh, transform: &DAffine3) {
         let base = self.positions.len() as u32;
         let linear = transform.matrix3;
@@ -239,7 +244,8 @@ impl TriangleMesh {
             let turned = (linear * t.truncate().as_dvec3()).normalize_or_zero();
             turned.as_vec3().extend(if mirrored { -t.w } else { t.w })
         }));
-        // A shear or an uneven scale leaves the tangent along the surface but may bend the interpolated normal against it.
+        // A shear or a non-uniform scale leaves the tangent along the surface but may tilt the interpolated normal
+        // against it.
         for (t, n) in self.tangents[first..].iter_mut().zip(&self.normals[first..]) {
             let across = t.truncate() - *n * n.dot(t.truncate());
             *t = across.try_normalize().unwrap_or_else(|| n.any_orthonormal_vector()).extend(t.w);
@@ -261,7 +267,8 @@ fn face_normal_of_tiny(mesh: &TriangleMesh, t: [u32; 3]) -> Vec3 {
     mesh.doubled_area_vector(t).try_normalize().map_or(Vec3::Y, DVec3::as_vec3)
 }
 
-/// The cofactor matrix: it carries area vectors, and so normals, through `m`, and unlike the inverse transpose it exists for every `m`.
+/// The cofactor matrix: it transforms area vectors, and so normals, by `m`, and unlike the inverse transpose it exists
+/// for every `m`.
 fn cofactor(m: DMat3) -> DMat3 {
     DMat3::from_cols(m.y_axis.cross(m.z_axis), m.z_axis.cross(m.x_axis), m.x_axis.cross(m.y_axis))
 }
@@ -354,7 +361,8 @@ mod tests {
                     );
                 }
             }
-            // The outside of the source is where its normals point; a map keeps a point off the surface on that side.
+            // The outside of the source is where its normals point; a map must keep a point off the surface on that
+            // side.
             let off_surface = map.transform_point3(DVec3::new(0.3, 0.3, 1.0)).as_vec3();
             assert!((off_surface - out.positions[0]).dot(out.normals[0]) > 0.0);
             // The bitangent still follows the image's up direction.

@@ -1,10 +1,11 @@
-//! A signed distance field into triangles: naive surface nets \[Gibson98\] with the vertices pulled onto the surface.
+//! Converts a signed distance field to triangles: naive surface nets \[Gibson98\] with the vertices moved onto the
+//! surface.
 
 use glam::{UVec3, Vec3};
 
 /// Vertices, their outward unit normals, and faces counter-clockwise seen from outside.
 pub(crate) struct Surface {
-    /// On the surface within a small share of a cell.
+    /// On the surface within a small fraction of a cell.
     pub positions: Vec<Vec3>,
     /// Unit gradients of the field.
     pub normals: Vec<Vec3>,
@@ -12,7 +13,8 @@ pub(crate) struct Surface {
     pub triangles: Vec<[u32; 3]>,
 }
 
-/// Polygonises the zero set of `field` (negative inside) in the box from `min` to `max` with cubic cells of edge `cell`.
+/// Polygonises the zero set of `field` (negative inside) in the box from `min` to `max` with cubic cells of edge
+/// `cell`.
 ///
 /// The surface must not touch the box. The result is closed: every edge belongs to two triangles, except where the surface
 /// passes twice through a cell, where four may meet.
@@ -55,7 +57,8 @@ pub(crate) fn surface_nets(field: &dyn Fn(Vec3) -> f32, min: Vec3, max: Vec3, ce
             for x in 1..nx - 1 {
                 let inside = value[at(x, y, z)] < 0.0;
                 for axis in 0..3 {
-                    // The four cells around the grid edge that leaves this sample along `axis`, counter-clockwise seen against it.
+                    // The four cells around the grid edge that leaves this sample along `axis`, counter-clockwise when
+                    // seen against it.
                     let (u, v) = ((axis + 1) % 3, (axis + 2) % 3);
                     let mut ahead = [x, y, z];
                     ahead[axis] += 1;
@@ -79,8 +82,8 @@ pub(crate) fn surface_nets(field: &dyn Fn(Vec3) -> f32, min: Vec3, max: Vec3, ce
     surface
 }
 
-/// Samples on a grid, x fastest. Blocks of samples that lie far from the surface by the field's own word get one value for all:
-/// only the sign counts there. `field` may be up to twice the true distance.
+/// Samples on a grid, x fastest. Blocks of samples that are far from the surface according to the field get one value
+/// for all, because only the sign counts there. `field` may be up to twice the true distance.
 fn sample_near_surface(field: &dyn Fn(Vec3) -> f32, min: Vec3, samples: UVec3, cell: f32) -> Vec<f32> {
     const BLOCK: u32 = 4;
     let half_diagonal = 0.5 * BLOCK as f32 * cell * 3f32.sqrt();
@@ -105,7 +108,7 @@ fn sample_near_surface(field: &dyn Fn(Vec3) -> f32, min: Vec3, samples: UVec3, c
     value
 }
 
-/// Mean of the crossings of the cell's twelve edges in cell units; `None` where all corners are on one side.
+/// Mean of the crossings of the cell's twelve edges in cell units; `None` if all corners are on one side.
 fn mean_crossing(value: impl Fn(u32, u32, u32) -> f32) -> Option<Vec3> {
     let (mut sum, mut count) = (Vec3::ZERO, 0);
     for axis in 0..3usize {

@@ -1,4 +1,4 @@
-//! Nothing but code into the textures of the built-in scene. All tile without a seam.
+//! Generates the textures of the built-in scene by code. All tile without a seam.
 
 use glam::{Vec2, Vec3};
 
@@ -65,7 +65,7 @@ fn srgb_image(linear: impl Fn(Vec2) -> Vec3) -> Texture {
     })
 }
 
-/// Tangent-space normals of a height field given in tiles; green points up in the image.
+/// Tangent-space normals of a height field in tile coordinates; green points up in the image.
 fn normal_map(height: impl Fn(Vec2) -> f32) -> Texture {
     let n = SIZE as usize;
     let at_centre = |i: usize| height((Vec2::new((i % n) as f32, (i / n) as f32) + 0.5) / SIZE as f32);

@@ -1,4 +1,5 @@
-//! Plain shapes and materials into small scenes: what the stability cases, the tests of the reference and the tests on the GPU look at.
+//! Simple shapes and materials for small scenes, which the stability cases, the tests of the reference and the tests on
+//! the GPU use.
 
 use crate::geometry::projector::ProjectorCamera;
 use crate::{
@@ -16,7 +17,7 @@ pub fn scene_of(mesh: TriangleMesh, material: Material) -> Scene {
     s
 }
 
-/// Adds a body at rest at the identity pose with a material of its own; returns its index.
+/// Adds a static body at the identity pose with its own material; returns its index.
 pub fn add(scene: &mut Scene, mut mesh: TriangleMesh, material: Material) -> usize {
     mesh.materials = vec![scene.materials.len() as u32; mesh.triangles.len()];
     scene.materials.push(material);
@@ -58,7 +59,8 @@ pub fn join(parts: impl IntoIterator<Item = TriangleMesh>) -> TriangleMesh {
     all
 }
 
-/// A closed sphere of 20 * 4^level triangles with the normals of its faces (so that shading and geometry agree) or of the sphere.
+/// A closed sphere of 20 * 4^level triangles with the normals of its faces (so that shading and geometry agree) or of
+/// the sphere.
 pub fn sphere(centre: Vec3, radius: f32, level: u32, smooth: bool) -> TriangleMesh {
     let g = (1.0 + 5f32.sqrt()) / 2.0;
     let mut p: Vec<Vec3> = Vec::new();
@@ -108,7 +110,7 @@ pub fn sphere(centre: Vec3, radius: f32, level: u32, smooth: bool) -> TriangleMe
     mesh(positions, normals, triangles)
 }
 
-/// One triangle with its face normal (any normal when it has no area).
+/// One triangle with its face normal (any normal if it has no area).
 pub fn triangle([a, b, c]: [Vec3; 3]) -> TriangleMesh {
     let n = (b - a).as_dvec3().cross((c - a).as_dvec3()).normalize_or(DVec3::Y).as_vec3();
     mesh(vec![a, b, c], vec![n; 3], vec![[0, 1, 2]])
@@ -134,12 +136,12 @@ pub fn diffuse(albedo: Vec3) -> Material {
     Material { base_color: albedo, metallic: 0.0, ior: 1.0, ..Material::default() }
 }
 
-/// Black and glowing on its front.
+/// Black, and emitting on its front.
 pub fn emitter(radiance: Vec3) -> Material {
     Material { emissive: radiance, ..diffuse(Vec3::ZERO) }
 }
 
-/// A light without a body and without an end to its range.
+/// A light without a body and with infinite range.
 pub fn light(kind: PunctualKind, position: Vec3, direction: Vec3, intensity: f32) -> PunctualLight {
     PunctualLight {
         kind,
@@ -151,12 +153,12 @@ pub fn light(kind: PunctualKind, position: Vec3, direction: Vec3, intensity: f32
     }
 }
 
-/// A light of no size.
+/// A light without extent.
 pub fn point_light(position: Vec3, intensity: f32) -> PunctualLight {
     light(PunctualKind::Point, position, Vec3::NEG_Y, intensity)
 }
 
-/// A white floor under 100,000 point lights by chance, a fifth of them black; and its radiance at the origin: the sum of
+/// A white floor under 100,000 random point lights, a fifth of them black; and its radiance at the origin: the sum of
 /// `I h / (pi r^3)` over all lights.
 pub fn floor_under_many_lights(seed: u64) -> (Scene, f64) {
     let mut scene = scene_of(floor(3.0, 0.0), diffuse(Vec3::ONE));
@@ -183,8 +185,8 @@ pub fn lamp_in_a_sphere(radius: f32, distance: f64) -> (Scene, ProjectorCamera) 
     (scene, camera)
 }
 
-/// A wide slab of two faces, clear all through, in even light. What is reflected inside comes out at the next face, so few paths outlive
-/// their depth.
+/// A wide slab of two faces, fully transparent, in even light. Light reflected inside leaves at the next face, so few
+/// paths exceed their depth.
 pub fn clear_slab(ior: f32, roughness: f32, thin_walled: bool) -> Scene {
     let glass =
         Material { transmission: 1.0, thin_walled, roughness, ior, metallic: 0.0, ..Material::default() };
@@ -208,7 +210,7 @@ pub fn camera(w: u32, h: u32, position: DVec3, look_at: DVec3) -> ProjectorCamer
     ProjectorCamera::look_at(Raster::new(w, h).unwrap(), position, look_at, up, 0.6).unwrap()
 }
 
-/// A small picture of smooth random colours between `low` and `high`, the same for the same seed.
+/// A small picture of smooth random colours between `low` and `high`, identical for the same seed.
 pub fn noise_texture(size: u32, seed: u64, low: u8, high: u8, srgb: bool) -> Texture {
     let mut random = Sampler::new(seed, 0);
     let mut value = || low + (random.uniform() * f64::from(high - low)) as u8;
@@ -224,7 +226,7 @@ pub fn noise_texture(size: u32, seed: u64, low: u8, high: u8, srgb: bool) -> Tex
     }
 }
 
-/// Adds a texture and refers to it, stretched and turned so that every part of the transform matters.
+/// Adds a texture and a reference to it, stretched and rotated so that every part of the transform matters.
 pub fn use_texture(scene: &mut Scene, texture: Texture) -> Option<TextureRef> {
     scene.textures.push(texture);
     Some(TextureRef {

@@ -1,10 +1,10 @@
-//! A [`Scene`] into what it contains, so that a plan can leave out the code that nothing in the scene needs.
+//! Determines what a [`Scene`] contains, so that a plan can leave out the code that nothing in the scene needs.
 
 use glam::Vec3;
 
 use super::{Environment, Scene, TextureRef};
 
-/// What the tracer has to be able to do for a scene. Materials that no triangle has do not count.
+/// The features that a scene requires of the tracer. Materials that no triangle has do not count.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub struct SceneFeatures {
     /// Triangles of all bodies.
@@ -13,7 +13,7 @@ pub struct SceneFeatures {
     pub emissive_triangles: usize,
     /// Point, spot and directional lights.
     pub punctual_lights: usize,
-    /// What surrounds the scene.
+    /// The surroundings.
     pub environment: EnvironmentFeature,
     /// Some material has a texture of any kind.
     pub textures: bool,
@@ -51,7 +51,7 @@ pub enum EnvironmentFeature {
 const DELTA_ROUGHNESS: f32 = 0.031_622_776;
 
 impl SceneFeatures {
-    /// Looks through the scene once; cost is proportional to its triangles.
+    /// Scans the scene once; the cost is proportional to its triangles.
     pub fn of(scene: &Scene) -> Self {
         let mut used = vec![0usize; scene.materials.len()];
         for &m in scene.bodies.iter().flat_map(|b| &b.mesh.materials) {
@@ -92,7 +92,7 @@ impl SceneFeatures {
             let [least_roughness, least_metallic] =
                 least_surface_factors(scene, m.metallic_roughness_texture);
             out.metals_only &= m.metallic * least_metallic == 1.0;
-            // A thin wall lets light straight through whatever its roughness.
+            // A thin wall transmits light straight whatever its roughness.
             out.delta_lobes |=
                 m.roughness * least_roughness < DELTA_ROUGHNESS || (transmits && m.thin_walled);
             out.double_sided |= m.double_sided;
@@ -101,7 +101,7 @@ impl SceneFeatures {
     }
 }
 
-/// Least factors of roughness and metallic anywhere in a texture; interpolation never goes below the least texel.
+/// Least factors of roughness and metallic anywhere in a texture; interpolation never gives less than the least texel.
 fn least_surface_factors(scene: &Scene, texture: Option<TextureRef>) -> [f32; 2] {
     let Some(t) = texture else { return [1.0; 2] };
     let least = scene.textures[t.texture as usize]

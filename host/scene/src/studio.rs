@@ -1,6 +1,7 @@
-//! Nothing into a photographer's studio: soft boxes in a dim room, for scenes that bring no light of their own.
+//! Generates a photographer's studio: soft boxes in a dim room, for scenes without light of their own.
 //!
-//! Even light shows no form, and a mirror in it shows nothing at all; a few large, soft boxes show both, and are easy to sample.
+//! Even light does not show shape, and a mirror in it is invisible; a few large, soft boxes show both, and are easy to
+//! sample.
 
 use super::Environment;
 use glam::Vec3;
@@ -39,7 +40,7 @@ fn smooth_step(from: f32, to: f32, x: f32) -> f32 {
     t * t * (3.0 - 2.0 * t)
 }
 
-/// What is seen in direction `d`, of unit length.
+/// The radiance from direction `d`, of unit length.
 fn radiance(d: Vec3) -> Vec3 {
     let room = if d.y < 0.0 {
         HORIZON.lerp(FLOOR, smooth_step(0.0, 0.35, -d.y))
@@ -60,7 +61,7 @@ fn radiance(d: Vec3) -> Vec3 {
     })
 }
 
-/// The studio. The mean radiance over the sphere is 0.25, as bright as the even light that scenes with lamps of their own get.
+/// The studio. Its mean radiance over the sphere is 0.25, equal to the even light of scenes with lamps of their own.
 pub fn studio() -> Environment {
     let texels = (0..HEIGHT).flat_map(|row| {
         let polar = (row as f32 + 0.5) / HEIGHT as f32 * std::f32::consts::PI;

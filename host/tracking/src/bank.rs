@@ -1,10 +1,10 @@
-//! Samples of many bodies to the filter of each.
+//! Passes samples of many bodies to the filter of each.
 
 use super::pose_filter::{PoseFilter, PoseFilterConfig, Verdict};
 use super::state::TrackState;
 use dpm_device::tracker::{BodyIndex, TrackerSample};
 
-/// One filter a tracked body, in the order of the rig file.
+/// One filter per tracked body, in the order of the rig file.
 #[derive(Clone, Debug)]
 pub struct PoseFilterBank {
     filters: Vec<PoseFilter>,
@@ -16,7 +16,7 @@ impl PoseFilterBank {
         Self { filters: configs.iter().map(|&c| PoseFilter::new(c)).collect() }
     }
 
-    /// Hands a sample to its body's filter; `None` when the rig file names no such body.
+    /// Passes a sample to its body's filter; `None` if the rig file names no such body.
     pub fn update(&mut self, sample: &TrackerSample) -> Option<Verdict> {
         Some(self.filters.get_mut(usize::from(sample.body.0))?.update(sample))
     }

@@ -1,4 +1,5 @@
-//! Closed-form motions through the mock tracker and the pose filter into errors at the instant of light, as a table.
+//! Measures errors at the instant of light: closed-form motions through the mock tracker and the pose filter, as a
+//! table.
 
 use super::pose_filter::{PoseFilter, PoseFilterConfig, Prediction};
 use dpm_common::quantiles::Quantiles;
@@ -18,8 +19,8 @@ pub(crate) struct EvaluationConfig {
     pub tracker: MockTrackerConfig,
     /// Frames per second.
     pub frame_rate: FrameRate,
-    /// From the latch of the pose to the middle of the exposure, ns: 2.8 ms by default, which is what the stage costs of the
-    /// rig file and half a slot come to.
+    /// From the latch of the pose to the middle of the exposure, ns: 2.8 ms by default, which is the sum of the rig
+    /// file's stage costs and half a slot.
     pub latch_to_light_ns: i64,
     /// Frames that are compared.
     pub frames: u64,
@@ -110,7 +111,7 @@ pub(crate) fn evaluate(
     Ok(errors)
 }
 
-/// A row of the table: what moves, and the error that must not be exceeded with 0.1 mm and 1 mrad of noise and without.
+/// A row of the table: a motion, and the maximum error with 0.1 mm and 1 mrad of noise and without.
 #[derive(Clone, Debug)]
 pub(crate) struct PredictionCase {
     /// As printed.
@@ -193,24 +194,24 @@ pub(crate) fn prediction_cases() -> Vec<PredictionCase> {
 }
 
 impl PredictionCase {
-    /// The 99th percentile that the case is about: mm or mrad.
+    /// The 99th percentile that the case judges: mm or mrad.
     pub(crate) fn p99(&self, errors: &PredictionErrors) -> f64 {
         1e3 * if self.rotates { errors.rotation_rad.p99 } else { errors.position_m.p99 }
     }
 }
 
-/// What became of a case.
+/// The results of a case.
 #[derive(Clone, Debug)]
 pub(crate) struct PredictionRow {
     /// The case.
     pub case: PredictionCase,
     /// With 0.1 mm and 1 mrad of noise.
     pub noisy: PredictionErrors,
-    /// The same by a filter that recalls nothing.
+    /// The same by a filter without recall.
     pub noisy_unrecalled: PredictionErrors,
     /// With a tenth of that noise.
     pub fine: PredictionErrors,
-    /// The same by a filter that recalls nothing.
+    /// The same by a filter without recall.
     pub fine_unrecalled: PredictionErrors,
     /// Without noise.
     pub quiet: PredictionErrors,
@@ -278,7 +279,8 @@ mod tests {
                 // Between two samples lie 2 ms, and everything is predicted to the frame's own light.
                 assert!(e.horizon_ns.0 >= 4_800_000 && e.horizon_ns.1 <= 6_800_000, "{:?}", e.horizon_ns);
             }
-            // At the noise that the models were found for, what is recalled does no harm; below it, it is the past's own error that shows.
+            // At the noise for which the models were optimised, recall does no harm; below it, the past's own error
+            // becomes visible.
             let (with, without) = (case.p99(noisy), case.p99(&row.noisy_unrecalled));
             assert!(with <= without, "{}: {with} with, {without} without what is recalled", case.name);
             let (with, without) = (case.p99(fine), case.p99(&row.fine_unrecalled));

@@ -1,11 +1,13 @@
-//! Noisy points on a manifold into position, velocity and acceleration: a bank of Kalman filters with mode mixing.
+//! Estimates position, velocity and acceleration from noisy points on a manifold: a bank of Kalman filters with mode
+//! mixing.
 //!
-//! A body that is still or coasts is best followed by a constant-velocity filter with a long memory; a body that turns
-//! needs one that models acceleration and forgets fast. No single process noise serves both, so several filters run side by
-//! side and are weighed by how well each foretold the last samples (interacting multiple models, Blom and Bar-Shalom 1988).
+//! A constant-velocity filter with a long memory is best for a body that is still or coasts; a body that turns needs a
+//! filter that models acceleration and forgets fast. No single process noise serves both. So several filters run in
+//! parallel, weighted by how well each predicted the last samples (interacting multiple models, Blom and Bar-Shalom
+//! 1988).
 //!
-//! Every axis of the tangent space has a bank of its own: a body that shuttles along x stays calm in y and z. The same code
-//! follows translations and, by way of [`Chart`], rotations.
+//! Every axis of the tangent space has its own bank: a body that shuttles along x stays calm in y and z. The same code
+//! handles translations and, through [`Chart`], rotations.
 
 use dpm_common::so3::{so3_between, so3_exp};
 use glam::{DQuat, DVec3};
@@ -14,7 +16,7 @@ use glam::{DQuat, DVec3};
 pub trait Chart {
     /// A point on it.
     type Point: Copy + std::fmt::Debug + PartialEq;
-    /// Tangents up to this length add up like vectors, nearly enough to fit curves to.
+    /// Tangents up to this length add up like vectors, with enough precision to fit curves to them.
     const FLAT: f64;
     /// The tangent that leads from `from` to `to`.
     fn between(from: Self::Point, to: Self::Point) -> DVec3;
@@ -115,9 +117,10 @@ impl Covariance {
         (new.repaired(), [k0, k1, k2])
     }
 
-    /// The least change upwards that makes rounding's victims possible again: an LDL^T factorisation from the acceleration down,
-    /// in which a negative conditional variance becomes zero by raising the variance it belongs to. Acts only when the prior
-    /// exceeds what the measurements leave by twelve orders of magnitude and more, where no digits are left to be right.
+    /// The smallest increase that makes a covariance valid again after rounding: an LDL^T factorisation from the
+    /// acceleration down, in which a negative conditional variance becomes zero by raising the variance it belongs to.
+    /// Acts only if the prior exceeds what the measurements leave by twelve orders of magnitude or more, where no
+    /// significant digits are left.
     fn repaired(mut self) -> Self {
         if self.aa <= 0.0 {
             (self.aa, self.va, self.pa) = (0.0, 0.0, 0.0);
@@ -126,7 +129,8 @@ impl Covariance {
         let conditional_v = self.vv - self.va * self.va * over_a;
         let link = self.pv - self.va * self.pa * over_a;
         if conditional_v <= 0.0 {
-            // Set anew, not by the difference: that has the rounding of what it is taken from, which may be far larger.
+            // Recomputed, not corrected by the difference: the difference has the rounding error of its operands, which
+            // may be far larger.
             self.vv = self.va * self.va * over_a;
             self.pv = self.va * self.pa * over_a;
         }
@@ -161,7 +165,7 @@ impl Covariance {
     }
 }
 
-/// Rows of the matrix that moves (p, v, a) on.
+/// Rows of the transition matrix of (p, v, a).
 struct Transition {
     p: [f64; 3],
     v: [f64; 3],
@@ -232,7 +236,7 @@ pub struct Kinematics<P> {
 }
 
 impl<P: Copy> Kinematics<P> {
-    /// A point that stands still, known to `variance` per axis.
+    /// A point at rest, known to `variance` per axis.
     pub(crate) fn held(point: P, variance: f64) -> Self {
         let covariance = [Covariance { pp: variance, ..Covariance::default() }; 3];
         Self { point, velocity: DVec3::ZERO, acceleration: DVec3::ZERO, covariance }
@@ -244,16 +248,17 @@ impl<P: Copy> Kinematics<P> {
     }
 }
 
-/// What a body did the last time that it came by here, over one step ([`super::recall`]).
+/// The motion of a body the last time that it passed this place, over one step ([`super::recall`]).
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Recalled {
-    /// Where it went beyond what its velocity at the step's begin makes, m or rad.
+    /// Its displacement beyond that of its velocity at the step's begin, m or rad.
     pub moved: DVec3,
-    /// How much faster it became, per second.
+    /// Its change of velocity, per second.
     pub faster: DVec3,
     /// Its mean acceleration over the horizon after the step, per second squared.
     pub acceleration: DVec3,
-    /// Axes along which there is any acceleration near by. Along the others the models know better, without the past's noise.
+    /// Axes along which there is an acceleration nearby. Along the others the models are better, without the noise of
+    /// the past.
     pub matters: [bool; 3],
 }
 
@@ -267,20 +272,20 @@ struct RecalledAxis {
 
 /// Number of filters in a bank.
 pub(crate) const MODES: usize = 5;
-/// The filter that moves on as the body did the last time; its model says how exactly it repeats itself. It takes part only
-/// while something is recalled.
+/// The filter that repeats the former motion; its model says how exactly the body repeats itself. It takes part only
+/// while a motion is recalled.
 pub(crate) const RECALLED: usize = 4;
 
-/// What a bank assumes of motion in general.
+/// A bank's assumptions about motion.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct ImmConfig {
     /// The models.
     pub models: [MotionModel; MODES],
-    /// Mean time a mode lasts, seconds: the chance to leave it within `h` is 1 - exp(-h / dwell).
+    /// Mean duration of a mode, seconds: the chance to leave it within `h` is 1 - exp(-h / dwell).
     pub dwell_s: [f64; MODES],
-    /// Of those who leave mode i, the share that goes to mode j; rows sum to 1, the diagonal is 0.
+    /// Of all transitions from mode i, the share to mode j; rows sum to 1, the diagonal is 0.
     pub leave_to: [[f64; MODES]; MODES],
-    /// While something is recalled: mean time after which any mode leaves for [`RECALLED`], seconds.
+    /// While a motion is recalled: mean time after which any mode changes to [`RECALLED`], seconds.
     pub recall_after_s: f64,
     /// Standard deviation of the acceleration that a coasting body may start with, m/s^2 or rad/s^2.
     pub onset_acceleration: f64,
@@ -360,11 +365,11 @@ impl AxisBank {
         }
     }
 
-    /// Mixes the modes and moves all of them `h` >= 0 seconds on.
+    /// Mixes the modes and propagates all of them by `h` >= 0 seconds.
     fn advance(&mut self, config: &ImmConfig, h: f64, recalled: Option<RecalledAxis>) {
         let mut moved = self.modes;
         let mut foretold = [0.0; MODES];
-        // A coasting mode knows nothing of the acceleration that a turn starts with; its zero is not knowledge.
+        // A coasting mode has no information on the acceleration at the start of a turn; its zero is not an estimate.
         let mut open = self.modes;
         for (source, model) in open.iter_mut().zip(&config.models) {
             if !model.accelerates {
@@ -398,7 +403,7 @@ impl AxisBank {
         self.probability = foretold;
     }
 
-    /// Takes in a measured offset of variance `r`.
+    /// Updates with a measured offset of variance `r`.
     fn update(&mut self, z: f64, r: f64) {
         let mut log_likelihood = [0.0; MODES];
         for (mode, log_l) in self.modes.iter_mut().zip(&mut log_likelihood) {
@@ -471,7 +476,7 @@ impl<C: Chart> Imm<C> {
         self.base = C::moved(self.base, DVec3::from_array(mean));
     }
 
-    /// Mixes the modes and moves all of them `h` >= 0 seconds on, [`RECALLED`] as in `recalled`.
+    /// Mixes the modes and propagates all of them by `h` >= 0 seconds, [`RECALLED`] according to `recalled`.
     pub fn advance(&mut self, config: &ImmConfig, h: f64, recalled: Option<Recalled>) {
         for (i, axis) in self.axes.iter_mut().enumerate() {
             let along = recalled.filter(|r| r.matters[i]).map(|r| RecalledAxis {
@@ -484,8 +489,8 @@ impl<C: Chart> Imm<C> {
         self.rebase();
     }
 
-    /// Squared Mahalanobis distance of a measurement of variance `r` (after [`Imm::advance`]): each axis by its most generous
-    /// mode, with `slack` metres or rad of standard deviation added for what no mode expects.
+    /// Squared Mahalanobis distance of a measurement of variance `r` (after [`Imm::advance`]): each axis by its most
+    /// tolerant mode, with `slack` metres or rad of standard deviation added for motion that no mode expects.
     pub(crate) fn distance_squared(&self, z: C::Point, r: f64, slack: f64) -> f64 {
         let z = C::between(self.base, z).to_array();
         let axis = |(bank, z): (&AxisBank, f64)| {
@@ -499,8 +504,8 @@ impl<C: Chart> Imm<C> {
         self.axes.iter().zip(z).map(axis).sum()
     }
 
-    /// Takes in a measurement of variance `r` >= 0 per axis at the instant that [`Imm::advance`] moved to. Returns the
-    /// normalised innovation squared of the mixture (3 degrees of freedom).
+    /// Updates with a measurement of variance `r` >= 0 per axis at the instant that [`Imm::advance`] propagated to.
+    /// Returns the normalised innovation squared of the mixture (3 degrees of freedom).
     pub fn update(&mut self, z: C::Point, r: f64) -> f64 {
         let z = C::between(self.base, z).to_array();
         let mut nis = 0.0;
@@ -521,7 +526,7 @@ mod tests {
     use super::*;
     use proptest::prelude::*;
 
-    /// Whatever leaves a mode arrives in another.
+    /// The shares of the transitions from a mode sum to one.
     #[test]
     fn shares_of_a_mode_sum_to_one() {
         let config = models_for(5.0);
@@ -534,8 +539,8 @@ mod tests {
     }
 
     proptest! {
-        /// The gain lies in [0, 1], a measurement never makes the position less certain, and what is left is no more than the
-        /// measurement's own variance: over 24 orders of magnitude either way.
+        /// The gain lies in [0, 1], a measurement never makes the position less certain, and the remaining variance is
+        /// no more than the measurement's own: over 24 orders of magnitude in either direction.
         #[test]
         fn gains_are_weights(p in -12f64..12.0, r in -12f64..12.0, v in -12f64..12.0, rho in -0.99f64..0.99) {
             let [p, r, v] = [p, r, v].map(|e| 10f64.powf(e));
@@ -547,7 +552,8 @@ mod tests {
             prop_assert!(after.pv * after.pv <= after.pp * after.vv * (1.0 + 1e-9));
         }
 
-        /// Two steps are one step of their sum, for the motion and for its noise (the noise exactly only without swing).
+        /// Two steps equal one step of their sum, for the motion and for its noise (the noise exactly only without
+        /// swing).
         #[test]
         fn transitions_compose(h1 in 0f64..0.05, h2 in 0f64..0.05, w in 0f64..30.0, x in prop::array::uniform3(-10f64..10.0)) {
             let model = MotionModel { accelerates: true, swing_rad_s: w, noise: 2.0 };

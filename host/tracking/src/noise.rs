@@ -1,9 +1,9 @@
-//! Samples into the tracker's noise: the part of each sample that no smooth motion explains.
+//! Estimates the tracker's noise from samples: the part of each sample that no smooth motion explains.
 //!
-//! A cubic divided difference of four samples vanishes for any motion of constant acceleration, whatever the spacing of the
-//! stamps. Scaled to unit weight it has the variance of one sample, and its median over a window shrugs off the few
-//! windows in which the acceleration jumped. Only noise that is white from sample to sample is seen; slow wander of a
-//! tracker's calibration is motion to this and to every other filter.
+//! A cubic divided difference of four samples vanishes for any motion of constant acceleration, whatever the spacing of
+//! the stamps. Scaled to unit weight it has the variance of one sample. Its median over a window ignores the few
+//! windows in which the acceleration jumped. Only noise that is white from sample to sample is measured; a slow wander
+//! of a tracker's calibration looks like motion to this and to every other filter.
 
 use super::imm::Chart;
 
@@ -26,8 +26,8 @@ pub(crate) struct NoiseEstimator<C: Chart> {
 }
 
 impl<C: Chart> NoiseEstimator<C> {
-    /// `prior` and `floor` are standard deviations in metres or rad: what is assumed until the window is half full, and the
-    /// least that is ever reported.
+    /// `prior` and `floor` are standard deviations in metres or rad: the assumed value until the window is half full,
+    /// and the least reported value.
     pub(crate) fn new(prior: f64, floor: f64) -> Self {
         Self {
             points: [None; 3],
@@ -45,15 +45,15 @@ impl<C: Chart> NoiseEstimator<C> {
         self.variance.max(self.floor)
     }
 
-    /// Forgets the last points (not the estimate): the next samples belong to another track.
+    /// Drops the last points (not the estimate): the next samples belong to another track.
     pub(crate) fn break_track(&mut self) {
         self.points = [None; 3];
     }
 
-    /// Takes in a sample captured at `at_ns`, later than the one before.
+    /// Adds a sample captured at `at_ns`, later than the previous one.
     pub(crate) fn push(&mut self, at_ns: i64, z: C::Point) {
         if let [Some((t0, p0)), Some((t1, p1)), Some((t2, p2))] = self.points {
-            // Seconds from the newest, exact in f64 for any gap a track survives.
+            // Seconds from the newest, exact in f64 for any gap that a track survives.
             let t = [t0, t1, t2].map(|t| (t - at_ns) as f64 * 1e-9);
             let t = [t[0], t[1], t[2], 0.0];
             // Weight of sample i in the divided difference: 1 / prod (t_i - t_j).

@@ -1,8 +1,9 @@
-//! Samples of one body into its motion: each sample is judged, the good ones feed two banks of Kalman filters.
+//! Estimates the motion of one body from its samples: each sample is judged, and the good ones feed two banks of Kalman
+//! filters.
 //!
-//! Three samples that agree with one another start a track; a sample far from where the track should be is set aside, and
-//! three that agree replace the track. So a teleport is taken over within three samples and never extrapolated across,
-//! and a burst of outliers changes nothing.
+//! Three samples that agree with one another start a track. A sample far from the predicted position is set aside, and
+//! three such samples that agree replace the track. So a teleport is accepted within three samples and never
+//! extrapolated across, and a burst of outliers changes nothing.
 
 use super::imm::{Imm, ImmConfig, Kinematics, MotionModel, Rotations, Translations};
 use super::noise::NoiseEstimator;
@@ -21,26 +22,26 @@ pub(crate) const ACQUIRE_SAMPLES: usize = 3;
 /// A quaternion whose norm differs from 1 by more is refused instead of normalised.
 const QUATERNION_TOLERANCE: f64 = 1e-3;
 
-/// A sample stamped later than this after its own arrival is refused: it would make every true one look old.
+/// A sample stamped later than this after its own arrival is refused: it would make every correct one look old.
 const FUTURE_TOLERANCE_NS: i64 = 1_000_000;
 
-/// Intervals between samples that are remembered to tell the tracker's rate.
+/// Number of recent intervals between samples from which the tracker's rate is measured.
 const INTERVALS: usize = 9;
-/// Intervals that must be known before the rate is believed.
+/// Number of intervals that must be known before the measured rate is used.
 const LEAST_INTERVALS: usize = 3;
-/// The slowest tracker whose rate is believed, ns between two samples: 10 Hz.
+/// The slowest rate that is accepted, as ns between two samples: 10 Hz.
 const LONGEST_PERIOD_NS: i64 = 100_000_000;
-/// A track goes on across a gap of so many half periods: two samples in a row may be missing, and the third may come late.
+/// A track survives a gap of this many half periods: two samples in a row may be missing, and the third may be late.
 const HALF_PERIODS_CARRIED: i64 = 7;
-/// The part of [`PoseFilterConfig::tracked_for_ns`] that is the rig's own latency, ns; a missing sample or two come on top.
+/// The part of [`PoseFilterConfig::tracked_for_ns`] for the rig's own latency, ns; a missing sample or two come on top.
 const OWN_LATENCY_NS: i64 = 6_000_000;
 
-/// Whether poses are carried on to the instant of light.
+/// Whether poses are predicted to the instant of light.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Prediction {
     /// Filtered and predicted.
     On,
-    /// The newest accepted pose is held as it came: what a rig without prediction would show, for comparison.
+    /// The newest accepted pose is held unchanged: the result of a rig without prediction, for comparison.
     Off,
 }
 
@@ -53,27 +54,27 @@ pub struct PoseFilterConfig {
     pub position_noise_m: f64,
     /// Standard deviation of a sample's rotation about one axis before it has been measured, rad, > 0.
     pub rotation_noise_rad: f64,
-    /// Measure the noise from the samples themselves instead of believing the two above for ever.
+    /// Measure the noise from the samples themselves instead of using the two values above permanently.
     pub measure_noise: bool,
-    /// Positions are followed by this.
+    /// Models for positions.
     pub position_models: ImmConfig,
-    /// Rotations are followed by this.
+    /// Models for rotations.
     pub rotation_models: ImmConfig,
     /// Samples further than this many standard deviations from the prediction are set aside.
     pub gate_sigmas: f64,
-    /// Fastest motion taken for real, m/s.
+    /// Fastest plausible motion, m/s.
     pub max_speed_m_s: f64,
-    /// Strongest acceleration taken for real, m/s^2.
+    /// Strongest plausible acceleration, m/s^2.
     pub max_acceleration_m_s2: f64,
-    /// Strongest angular acceleration taken for real, rad/s^2.
+    /// Strongest plausible angular acceleration, rad/s^2.
     pub max_angular_acceleration_rad_s2: f64,
-    /// Horizons up to this count as [`super::state::Freshness::Tracked`]: the rig's own latency and a missing sample or two, ns. With a tracker
-    /// below 500 Hz it is that of two periods, and at most `lost_after_ns`.
+    /// Horizons up to this count as [`super::state::Freshness::Tracked`]: the rig's own latency and a missing sample or
+    /// two, ns. With a tracker below 500 Hz it is that latency and two periods, at most `lost_after_ns`.
     pub tracked_for_ns: i64,
-    /// Longest time that motion is carried on without samples; then the body is lost, ns. A track may be older: it goes on with the
-    /// next sample if no more than two are missing, at the rate at which samples come.
+    /// Longest time for which motion is extrapolated without samples, ns; then the body is lost. A track may be older:
+    /// it continues with the next sample if no more than two are missing, at the measured rate.
     pub lost_after_ns: i64,
-    /// A body that moved and then delivers this many identical poses is reported stuck.
+    /// A body that moved and then delivers this many identical poses is reported as stuck.
     pub stuck_after: u32,
 }
 
@@ -97,10 +98,11 @@ impl Default for PoseFilterConfig {
     }
 }
 
-/// Models for bodies whose turns take about `acceleration` (m/s^2 or rad/s^2) and whose velocity changes in a good part of a
-/// second: coasting; steady acceleration; swinging at a hand's or a rocker's pace; a sharp manoeuvre, which bridges
-/// the onset of a turn; and what the body did the last time. The numbers were found by a random search over shuttles and swings of
-/// 1 to 3 Hz with 0.1 mm of noise at 500 Hz (the table in `docs/lab/PREDICTION.md`); densities scale with the square of the acceleration.
+/// Models for bodies whose turns take about `acceleration` (m/s^2 or rad/s^2) and whose velocity changes in a good part
+/// of a second: coasting; steady acceleration; swinging at the pace of a hand or a rocker; a sharp manoeuvre, which
+/// bridges the onset of a turn; and the body's motion the last time. The numbers were found by a random search over
+/// shuttles and swings of 1 to 3 Hz with 0.1 mm of noise at 500 Hz (the table in `docs/lab/PREDICTION.md`); densities
+/// scale with the square of the acceleration.
 pub fn models_for(acceleration: f64) -> ImmConfig {
     let a2 = acceleration * acceleration;
     let model = |accelerates, swing_rad_s, noise| MotionModel { accelerates, swing_rad_s, noise };
@@ -127,17 +129,17 @@ pub fn models_for(acceleration: f64) -> ImmConfig {
 }
 
 impl PoseFilterConfig {
-    /// The same without what a body did the last time ([`super::recall`]): for comparison.
+    /// The same without recall ([`super::recall`]): for comparison.
     #[cfg(test)]
     pub(crate) fn without_recall(mut self) -> Self {
-        // So long after that it never comes.
+        // So late that it never happens.
         self.position_models.recall_after_s = f64::INFINITY;
         self.rotation_models.recall_after_s = f64::INFINITY;
         self
     }
 
-    /// Settings for bodies that accelerate by about `acceleration` (m/s^2) and `angular_acceleration` (rad/s^2), and that are lost when no
-    /// sample has come for `lost_after_ms`, at least 1.
+    /// Settings for bodies that accelerate by about `acceleration` (m/s^2) and `angular_acceleration` (rad/s^2), and
+    /// that are lost if no sample has arrived for `lost_after_ms`, at least 1.
     pub fn for_bodies(acceleration: f64, angular_acceleration: f64, lost_after_ms: u32) -> Self {
         let lost_after_ns = i64::from(lost_after_ms.max(1)) * 1_000_000;
         let defaults = Self::default();
@@ -154,18 +156,18 @@ impl PoseFilterConfig {
     }
 }
 
-/// What became of a sample.
+/// The outcome of a sample.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Verdict {
-    /// Taken in.
+    /// Used.
     Accepted,
-    /// Taken in, and the body moves no more although it did and its noise has gone: the tracker repeats itself.
+    /// Used, but the body no longer moves although it did, and its noise is gone: the tracker repeats itself.
     Stuck,
-    /// Taken in; a track starts here, or the body is somewhere else than its track was.
+    /// Used; a track starts here, or the body is elsewhere than its track was.
     Acquired,
-    /// Agrees with no track yet; waits for others that agree with it.
+    /// Agrees with no track yet; waits for further samples that agree with it.
     SetAside,
-    /// The tracker says that it does not see the body.
+    /// The tracker reports that it does not see the body.
     Untracked,
     /// A component is not finite.
     NotFinite,
@@ -186,7 +188,7 @@ impl Verdict {
     }
 }
 
-/// How many samples met each fate since the start.
+/// Number of samples by verdict since the start.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 #[allow(missing_docs)] // one per Verdict, named after it
 pub(crate) struct PoseFilterCounters {
@@ -237,7 +239,8 @@ struct Track {
     moved_before_repeats: bool,
 }
 
-/// Follows one body. Allocates once and never blocks; one update costs a few microseconds, with a new point of the past ten more.
+/// Tracks one body. Allocates once and never blocks; one update costs a few microseconds, and ten more when it adds a
+/// new point of the past.
 #[derive(Clone, Debug)]
 pub struct PoseFilter {
     config: PoseFilterConfig,
@@ -252,8 +255,9 @@ pub struct PoseFilter {
     rate: Rate,
 }
 
-/// The time between two samples of a tracker, measured: what a rig file says of it may be wrong, and nothing else tells a tracker at
-/// 30 Hz, whose samples are all "late" by the measure of one at 500 Hz, from one that loses most of its samples.
+/// The measured time between two samples of a tracker. The rig file's value may be wrong. And only the rate
+/// distinguishes a tracker at 30 Hz, whose samples are all "late" by the standard of one at 500 Hz, from a tracker that
+/// loses most of its samples.
 #[derive(Clone, Copy, Debug, Default)]
 struct Rate {
     newest: Option<HostTime>,
@@ -275,8 +279,8 @@ impl Rate {
         }
     }
 
-    /// The median of the last intervals, which samples missing now and then do not move, at most [`LONGEST_PERIOD_NS`]; 0 while it is
-    /// not known. Nanoseconds.
+    /// The median of the last intervals, which occasional missing samples do not move, at most [`LONGEST_PERIOD_NS`],
+    /// nanoseconds; 0 while it is not known.
     fn period_ns(&self) -> i64 {
         if self.filled < LEAST_INTERVALS {
             return 0;
@@ -289,7 +293,7 @@ impl Rate {
 }
 
 impl PoseFilter {
-    /// A filter that has seen nothing.
+    /// A filter without samples.
     pub fn new(config: PoseFilterConfig) -> Self {
         Self {
             config,
@@ -305,7 +309,7 @@ impl PoseFilter {
         }
     }
 
-    /// Longest gap between two samples across which a track goes on, ns.
+    /// Longest gap between two samples that a track survives, ns.
     fn carried_for_ns(&self) -> i64 {
         self.config.lost_after_ns.max(HALF_PERIODS_CARRIED * self.rate.period_ns() / 2)
     }
@@ -320,19 +324,19 @@ impl PoseFilter {
         &self.config
     }
 
-    /// Fates of all samples so far.
+    /// Counts of all samples so far, by verdict.
     #[cfg(test)]
     pub(crate) fn counters(&self) -> PoseFilterCounters {
         self.counters
     }
 
-    /// Normalised innovation squared of the last accepted sample, position and rotation: mean 3 when the filter's
-    /// account of its own error is right.
+    /// Normalised innovation squared of the last accepted sample, position and rotation: its mean is 3 if the filter's
+    /// covariance is right.
     pub fn last_nis(&self) -> Option<[f64; 2]> {
         self.last_nis
     }
 
-    /// Judges a sample and takes it in when it is good. Any bits may come in.
+    /// Judges a sample and uses it if it is good. Any bits are accepted as input.
     pub fn update(&mut self, sample: &TrackerSample) -> Verdict {
         let verdict = match check(sample) {
             Ok(measured) => {
@@ -403,7 +407,7 @@ impl PoseFilter {
                 let (from_ns, to_ns) = (track.newest.at.0, z.at.0);
                 position.advance(&c.position_models, h, self.position_recall.between(from_ns, to_ns));
                 rotation.advance(&c.rotation_models, h, self.rotation_recall.between(from_ns, to_ns));
-                // What the strongest believable acceleration could do unseen counts as two standard deviations.
+                // The unseen effect of the strongest plausible acceleration counts as two standard deviations.
                 let slack = 0.25 * h * h;
                 let gate = c.gate_sigmas * c.gate_sigmas;
                 let inside = position.distance_squared(z.position, rp, slack * c.max_acceleration_m_s2)
@@ -468,7 +472,8 @@ impl PoseFilter {
         Verdict::Acquired
     }
 
-    /// Whether `z` continues the candidates: no faster than a body can move, and no sharper turn than it can take.
+    /// Whether `z` continues the candidates: no faster than the fastest plausible motion, and no sharper turn than the
+    /// strongest plausible one.
     fn agrees(&self, z: Measured, rp: f64) -> bool {
         let c = &self.config;
         let [.., previous, Some(last)] = self.candidates else {

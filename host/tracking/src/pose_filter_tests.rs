@@ -88,7 +88,7 @@ fn the_sign_of_a_quaternion_and_passing_pi_change_nothing() {
     assert_eq!(flipping.counters().accepted, 1997);
 }
 
-/// A step of acceleration: before it can be seen, at most a tau^2 / 2 is missed; afterwards it is followed.
+/// A step of acceleration: before it is visible, the error is at most a tau^2 / 2; afterwards it is tracked.
 #[test]
 fn an_acceleration_step_is_bounded_and_followed() {
     let a = 100.0;
@@ -170,7 +170,8 @@ fn drop_outs() {
     assert!((position(&back) - DVec3::new(0.0, 2.0, 0.0)).length() < 1e-6);
 }
 
-/// T6: one wild sample is ignored, a teleport is taken over by the third that agrees, and never extrapolated across.
+/// T6: one wild sample is ignored; a teleport is accepted with the third sample that agrees, and never extrapolated
+/// across.
 #[test]
 fn teleports_and_outliers() {
     let motion = |t: f64| (DVec3::new(0.5 * t, 0.0, 0.0), DQuat::IDENTITY);
@@ -188,11 +189,11 @@ fn teleports_and_outliers() {
         let light = at + 4 * MS;
         let predicted = position(&filter.predict(HostTime(light)).unwrap());
         let t = light as f64 * 1e-9;
-        // On the one track or on the other, nowhere between or beyond.
+        // On one track or on the other, not between or beyond.
         let off = (predicted - motion(t).0).length().min((predicted - elsewhere(t)).length());
         assert!(off < 1e-3, "{predicted} at sample {i}");
     }
-    // A burst of outliers, each elsewhere: the track survives it by prediction and takes up where it left.
+    // A burst of outliers, each elsewhere: the track survives it by prediction and continues where it was.
     let mut gauss = Gauss::new(3);
     let mut filter = fed(motion, 1000 * MS);
     for i in 1..50 {
@@ -242,12 +243,12 @@ fn bad_samples_have_no_effect() {
     }
     let c = filter.counters();
     assert_eq!((c.not_finite, c.not_unit, c.duplicate, c.out_of_order, c.from_future), (4, 4, 1, 2, 2));
-    // A quaternion off by rounding is normalised; sequence numbers that wrap or restart are no matter.
+    // A quaternion off by rounding is normalised; sequence numbers that wrap or restart do not matter.
     let mut odd = good;
     odd.pose.rotation_xyzw = [0.0, 0.0, 0.0, 0.9995];
     odd.sequence = 0;
     assert_eq!(filter.update(&odd), Verdict::Accepted);
-    // Stuck: the same pose again and again after motion.
+    // Stuck: the same pose repeats after motion.
     let mut verdict = Verdict::Accepted;
     for i in 2..9 {
         odd.captured_at = HostTime((1000 + 2 * i) * MS);
@@ -329,8 +330,8 @@ fn covariances_stay_positive_for_stiff_numbers() {
     }
 }
 
-/// Row 29, shortened: nothing accumulates per update, so what holds after 1e5 holds after
-/// 4e7. Norm, covariance and error do not creep.
+/// Row 29, shortened: nothing accumulates per update, so a result after 1e5 updates holds after 4e7. Norm, covariance
+/// and error do not creep.
 #[test]
 fn long_runs_do_not_drift() {
     let mut filter = PoseFilter::new(PoseFilterConfig::default());
@@ -351,8 +352,8 @@ fn long_runs_do_not_drift() {
     assert!((sigma[1] / sigma[0] - 1.0).abs() < 0.15, "{sigma:?}");
 }
 
-/// Row 28: the filter's own account of its error is right: the mean of the normalised innovation squared is 3 (99 % band of
-/// a chi-square over n samples), within the factor that mixing costs.
+/// Row 28: the filter's covariance is right: the mean of the normalised innovation squared is 3 (99 % band of a
+/// chi-square over n samples), within the factor that mixing costs.
 #[test]
 fn innovations_are_as_large_as_the_filter_says() {
     let mut filter =
@@ -375,8 +376,8 @@ fn innovations_are_as_large_as_the_filter_says() {
     }
 }
 
-/// 0.1 mm of noise: jitter at rest at most 1.5 times the input's, misplacement in motion at most 0.25 mm at p99. Without noise
-/// steady motion is followed to 0.02 mm, where holding the newest sample would be millimetres off.
+/// 0.1 mm of noise: jitter at rest at most 1.5 times the input's, error in motion at most 0.25 mm at p99. Without noise
+/// steady motion is tracked to 0.02 mm, where holding the newest sample would be millimetres off.
 #[test]
 fn jitter_and_misplacement() {
     let (noisy, quiet) = (EvaluationConfig::with_noise(1e-4, 1e-3), EvaluationConfig::with_noise(0.0, 0.0));
@@ -434,14 +435,14 @@ fn rows_of_the_mode_table_are_probabilities() {
     }
 }
 
-/// The matrix of tracker rates: whatever the rate, a track starts with the third sample, two missing samples in a row neither end it nor
-/// leave a mark, steady motion is exact at the horizon that this rate needs, and a teleport is taken over by the third sample. Nothing
-/// of this may depend on 500 Hz.
+/// All tracker rates: at any rate a track starts with the third sample, two missing samples in a row neither end it nor
+/// leave an error, steady motion is exact at the horizon that this rate needs, and a teleport is accepted with the
+/// third sample. None of this may depend on 500 Hz.
 #[test]
 fn every_tracker_rate_is_followed_alike() {
     for hz in [30, 60, 120, 500, 1000] {
         let period = 1_000_000_000 / hz;
-        // As a rig without `predict_ms` has it: 2 ms of latency, two periods, and 8 ms of lead and slots; at least 20 ms.
+        // As in a rig without `predict_ms`: 2 ms of latency, two periods, and 8 ms of lead and slots; at least 20 ms.
         let lost_after_ns = (2 * MS + 2 * period + 8 * MS).max(20 * MS);
         for lost_after_ns in [lost_after_ns, 20 * MS] {
             let what = format!("{hz} Hz, lost after {} ms", lost_after_ns / MS);
@@ -461,7 +462,7 @@ fn every_tracker_rate_is_followed_alike() {
             while verdicts.last() != Some(&Verdict::Acquired) {
                 verdicts.push(feed(&mut filter, k));
                 k += 1;
-                // With a `predict_ms` below the period the rate must be measured before samples are taken for neighbours.
+                // With a `predict_ms` below the period, the rate must be measured before samples count as neighbours.
                 let most =
                     if period <= lost_after_ns { ACQUIRE_SAMPLES } else { ACQUIRE_SAMPLES + LEAST_INTERVALS };
                 assert!(verdicts.len() <= most, "{what}: {verdicts:?}");
@@ -476,7 +477,7 @@ fn every_tracker_rate_is_followed_alike() {
                 let (p, q) = motion(at as f64 * 1e-9);
                 assert!((position(&predicted) - p).length() < 1e-5, "{what}");
                 assert!(so3_between(q, rotation(&predicted)).length() < 1e-4, "{what}");
-                // What this rate brings with it is no drop-out.
+                // Delays that are normal at this rate are not a drop-out.
                 assert_eq!(predicted.freshness, Freshness::Tracked, "{what}, {horizon_ns} ns ahead");
             }
             assert_eq!(
@@ -484,7 +485,7 @@ fn every_tracker_rate_is_followed_alike() {
                 Freshness::Lost,
                 "{what}"
             );
-            // Two samples in a row missing, again and again.
+            // Two samples in a row are missing, repeatedly.
             for _ in 0..20 {
                 k += 2;
                 assert_eq!(
@@ -514,13 +515,14 @@ fn every_tracker_rate_is_followed_alike() {
     }
 }
 
-/// The same through the mock tracker with noise: what is off at the instant of light grows with the horizon that the rate brings with
-/// it, but no frame is without a pose, and none is thrown.
+/// The same through the mock tracker with noise: the error at the instant of light grows with the horizon of the rate,
+/// but no frame is without a pose, and no error is wild.
 #[test]
 fn noisy_trackers_of_every_rate_are_followed() {
     let swing =
         MotionSpec::Sinusoid { direction: [1.0, 0.0, 0.0], peak_speed_m_s: 0.5, peak_acceleration_m_s2: 2.0 };
-    // 99th percentile allowed, metres: a period and a half of 2 m/s2, unforeseen, and what 0.1 mm of noise make of the rest.
+    // Maximum 99th percentile, metres: a period and a half of 2 m/s2, unforeseen, and the effect of 0.1 mm of noise on
+    // the rest.
     for hz in [30u32, 60, 120, 500, 1000] {
         let mut rig = EvaluationConfig::with_noise(1e-4, 1e-3);
         rig.tracker.rate = dpm_device::time::FrameRate::new(hz, 1).unwrap();

@@ -1,9 +1,10 @@
-//! The samples of a body that repeats itself into what it did the last time it came by here.
+//! Recalls the former motion of a body that repeats itself.
 //!
-//! A turn that begins at once is invisible until its deviation stands out of the noise, but machines, and many hands, turn where
-//! they turned before. The last seconds are kept, smoothed. When the body passes a place that it has passed before, at the same
-//! velocity and by the same way, what it did then is offered to the bank as one more model ([`super::imm`]), which believes it as far
-//! as it foretells the samples better than the others do. Without such a past nothing is offered, and nothing changes.
+//! A sudden turn is invisible until its deviation exceeds the noise, but machines, and many hands, turn where they
+//! turned before. The last seconds are kept, smoothed. When the body passes a place that it has passed before, at the
+//! same velocity and on the same path, its former motion is offered to the bank as one more model ([`super::imm`]). The
+//! bank weights it by how much better than the others it predicts the samples. Without such a past nothing is offered,
+//! and nothing changes.
 
 use super::imm::{Chart, Recalled};
 use super::smooth::{smoothed, Smoothed, MARGIN_NS};
@@ -11,7 +12,7 @@ use glam::DVec3;
 
 /// Samples kept to smooth from; at least [`MARGIN_NS`] to either side of a point, at [`SAMPLE_NS`].
 const SAMPLES: usize = 192;
-/// Samples closer than this to the last one kept are left out, ns: trackers above 1 kHz.
+/// Samples closer than this to the last one kept are skipped, ns: trackers above 1 kHz.
 const SAMPLE_NS: i64 = 900_000;
 /// Points of the past kept: five seconds at [`POINT_NS`].
 const POINTS: usize = 1280;
@@ -21,28 +22,30 @@ const POINT_NS: i64 = 3_500_000;
 const GAP_NS: i64 = 20_000_000;
 /// Points compared with the present for each sample: the whole past in 20 samples.
 const SCAN: usize = 64;
-/// No body is here again sooner than this, ns.
+/// Shortest period of a repetition, ns.
 const LEAST_LAG_NS: i64 = 300_000_000;
-/// The acceleration offered is the mean over this time, ns: about the horizon of a rig.
+/// The offered acceleration is the mean over this time, ns: about the horizon of a rig.
 const AHEAD_NS: i64 = 6_000_000;
-/// Points before and after an acceleration for which it matters: 60 ms.
+/// Number of points before and after an acceleration that count as near it: 60 ms.
 const NEAR: usize = 15;
-/// So many points in a row that fit no parabola are a jump; more are a motion too sharply bent for the tracker's rate.
+/// This many points in a row that fit no parabola are a jump; more are a motion too sharply bent for the tracker's
+/// rate.
 const UNFIT: usize = 7;
 /// An acceleration counts when it is this many times its own standard deviation.
 const SIGNIFICANT: f64 = 5.0;
-/// Passes over which the past is averaged at most. Each pass is laid over the last one by a lag that is itself measured, so long
-/// averages blur.
+/// Maximum number of passes over which the past is averaged. Each pass is aligned with the last one by a lag that is
+/// itself measured, so long averages blur.
 const PASSES: f64 = 3.0;
-/// A body must move so fast, in standard deviations of a sample per second, for its place to tell the time.
+/// Least speed at which a body's place determines the time, in standard deviations of a sample per second.
 const TELLING_SPEED: f64 = 1e3;
-/// The greatest shift in time between two passes before they count as different, s.
+/// The greatest shift in time between two passes that still count as the same, s.
 const SHIFT_S: f64 = 4e-3;
 /// Time constant with which the lag follows a change of pace, s.
 const FOLLOW_S: f64 = 0.04;
 /// Time constant of the misfit's mean, s.
 const MISFIT_S: f64 = 0.02;
-/// No sample counts as a greater misfit: from its start at a half, one wild sample every 2 ms does not lift the mean above 1.
+/// Upper limit of a sample's misfit: from its start at a half, one wild sample every 2 ms does not lift the mean above
+/// 1.
 const WORST_MISFIT: f64 = 5.0;
 
 /// A point of the past.
@@ -51,13 +54,13 @@ struct Point<P> {
     at_ns: i64,
     motion: Smoothed<P>,
     passes: f64,
-    /// Axes along which there is an acceleration near by.
+    /// Axes along which there is an acceleration nearby.
     matters: [bool; 3],
-    /// Axes along which it, or one shortly before it, is as exact as noise allows.
+    /// Axes along which it, or an acceleration shortly before it, is as exact as the noise allows.
     exact: [bool; 3],
 }
 
-/// What one body did in the last seconds, and which part of it it is repeating.
+/// The motion of one body in the last seconds, and which part of it the body is repeating.
 #[derive(Clone, Debug)]
 pub(crate) struct Recall<C: Chart> {
     /// Oldest first; `None` only before the first samples of a track.
@@ -77,7 +80,7 @@ pub(crate) struct Recall<C: Chart> {
 }
 
 impl<C: Chart> Recall<C> {
-    /// Knows nothing. Allocates all that it will ever need (about 0.2 MB).
+    /// An empty recall. Allocates all that it will ever need (about 0.2 MB).
     pub(crate) fn new() -> Self {
         Self {
             samples: [None; SAMPLES],
@@ -92,7 +95,7 @@ impl<C: Chart> Recall<C> {
         }
     }
 
-    /// How long ago the body was where it is now, ns; `None` if it is not known to repeat itself.
+    /// Time since the body was last where it is now, ns; `None` if it is not known to repeat itself.
     #[cfg(test)]
     pub(crate) fn lag_ns(&self) -> Option<i64> {
         self.lag_ns
@@ -104,7 +107,7 @@ impl<C: Chart> Recall<C> {
         self.lag_ns = None;
     }
 
-    /// What the body did after `from_ns` and up to `to_ns` the last time.
+    /// The body's motion between `from_ns` and `to_ns` the last time.
     pub(crate) fn between(&self, from_ns: i64, to_ns: i64) -> Option<Recalled> {
         let lag = self.lag_ns?;
         let then_ns = to_ns.saturating_sub(lag);
@@ -121,8 +124,8 @@ impl<C: Chart> Recall<C> {
         })
     }
 
-    /// Takes in a sample with `sigma` standard deviation per axis, captured after the ones before, and the motion that the bank
-    /// makes of it.
+    /// Adds a sample with `sigma` standard deviation per axis, captured after the previous ones, and the bank's
+    /// estimate of the motion.
     pub(crate) fn push(&mut self, at_ns: i64, z: C::Point, point: C::Point, velocity: DVec3, sigma: f64) {
         let [.., newest] = &self.samples;
         if newest.is_none_or(|(last_ns, _)| at_ns.saturating_sub(last_ns) >= SAMPLE_NS) {
@@ -218,8 +221,8 @@ impl<C: Chart> Recall<C> {
         self.written += 1;
     }
 
-    /// How far a point is from the way through a point of the past, squared and in tolerances, and how much later on that way it
-    /// is, s. Half a millisecond of clock is tolerated, and four standard deviations.
+    /// Distance of a point from the path through a point of the past, squared and in tolerances, and how much later on
+    /// that path it is, s. The tolerance is half a millisecond of clock and four standard deviations.
     fn mismatch(past: &Smoothed<C::Point>, point: C::Point, sigma: f64) -> (f64, f64) {
         let e = C::between(past.point, point);
         let speed2 = past.velocity.length_squared();
@@ -230,7 +233,7 @@ impl<C: Chart> Recall<C> {
         (across.length_squared() / (tolerance * tolerance), later)
     }
 
-    /// Keeps the lag, or gives it up when the body goes another way.
+    /// Updates the lag, or drops it if the body takes another path.
     fn follow(&mut self, then_ns: i64, since_s: f64, z: C::Point, sigma: f64) {
         let (Some(past), Some(lag)) = (self.at(then_ns), &mut self.lag_ns) else {
             self.lag_ns = None;
@@ -246,7 +249,7 @@ impl<C: Chart> Recall<C> {
         }
     }
 
-    /// Looks for the present in a part of the past; the next sample goes on from there.
+    /// Searches a part of the past for the present; the next sample continues the search.
     fn search(&mut self, at_ns: i64, point: C::Point, velocity: DVec3, sigma: f64) {
         let speed = velocity.length();
         let count = self.written - self.oldest();

@@ -1,4 +1,5 @@
-//! Laws of the recall: what repeats itself is found with its own period, what does not is left alone, and nobody is worse off.
+//! Laws of the recall: a repetition is found with its own period, other motion is left alone, and recall never makes
+//! the prediction worse.
 
 use super::super::evaluation::{evaluate, EvaluationConfig};
 use super::super::imm::Translations;
@@ -27,7 +28,7 @@ fn sine() -> MotionSpec {
     MotionSpec::Sinusoid { direction: [0.0, 1.0, 1.0], peak_speed_m_s: 0.5, peak_acceleration_m_s2: 5.0 }
 }
 
-/// The motion as the recall gets it: noisy samples, and position and velocity as a filter knows them.
+/// The recall's input: noisy samples, and position and velocity as a filter estimates them.
 struct Follower {
     motion: Motion,
     gauss: Gauss,
@@ -69,12 +70,12 @@ fn what_repeats_itself_is_found_with_its_own_period() {
             let off = lag - (lag + period_ns / 2) / period_ns * period_ns;
             assert!(off.abs() < 3_000_000, "{spec:?}: a lag of {lag} ns at {t}");
         }
-        // At rest no place tells the time, so a rest may cost it.
+        // At rest the place does not determine the time, so the recall may be lost.
         assert!(late < found, "{spec:?}: {late} samples without, {found} with");
     }
 }
 
-/// What is recalled of a turn is the turn: over the whole motion the error is a fraction of what knowing nothing costs.
+/// The recalled turn is the real one: over the whole motion the error is a fraction of the error without recall.
 #[test]
 fn what_is_recalled_is_what_happens() {
     for spec in [sine(), shuttle(0.15, 0.0)] {
@@ -113,7 +114,7 @@ fn bodies_at_rest_in_steady_motion_or_with_a_long_period_are_left_alone() {
         let mut body = Follower::new(&spec);
         for i in 0..7000 {
             body.see(i * STEP_NS);
-            // The way back passes the same places, the other way.
+            // The way back passes the same places in the other direction.
             assert_eq!(body.recall.lag_ns(), None, "{spec:?} at sample {i}");
         }
     }
@@ -134,7 +135,8 @@ fn slow_trackers_recall_nothing() {
     }
 }
 
-/// A body that turns where it always turned, until it goes straight on: the recall is given up before it has gone 3 cm further.
+/// A body that turns where it always turned, until it goes straight on: the recall is dropped before it has gone 3 cm
+/// further.
 #[test]
 fn another_way_is_noticed() {
     let mut body = Follower::new(&shuttle(0.15, 0.0));
@@ -157,7 +159,8 @@ fn another_way_is_noticed() {
     }
 }
 
-/// A single sample that is 3 mm off, which the gate of a fast body lets pass, ends no recall; it is off along the motion, across it, or both.
+/// A single sample that is 3 mm off, which the gate of a fast body accepts, does not end a recall; it is off along the
+/// motion, across it, or both.
 #[test]
 fn one_wild_sample_is_not_enough() {
     let mut body = Follower::new(&sine());
@@ -178,7 +181,7 @@ fn one_wild_sample_is_not_enough() {
     assert!(wild > 20, "{wild}");
 }
 
-/// Tracks at both ends of time, with what is left of the first one while the second goes on.
+/// Tracks at both ends of time, where the rest of the first one is present during the second.
 #[test]
 fn no_instant_is_out_of_range() {
     let mut recall = Recall::<Translations>::new();
@@ -203,7 +206,7 @@ fn gaps_end_a_recall_and_are_never_recalled() {
         t += STEP_NS;
     }
     assert!(body.recall.lag_ns().is_some());
-    // 0.2 s without samples: the track goes on with what comes then.
+    // 0.2 s without samples: the track continues with the next one.
     t += 200_000_000;
     body.recall.break_track();
     assert!(body.recall.lag_ns().is_none() && body.recall.between(t, t + STEP_NS).is_none());
@@ -264,7 +267,7 @@ fn mean(draw: impl Fn(u64) -> [f64; 2]) -> [f64; 2] {
     [0, 1].map(|i| all.iter().map(|d| d[i]).sum::<f64>() / 3.0)
 }
 
-/// To and fro at 0.5 m/s with turns of 5 m/s^2, this share of them elsewhere than 0.1 m from the middle.
+/// Back and forth at 0.5 m/s with turns of 5 m/s^2, this share of them elsewhere than 0.1 m from the middle.
 fn turns(seed: u64, share_elsewhere: f64) -> Vec<f64> {
     let mut random = Gauss::new(seed);
     let (mut end, mut way, mut turning) = (0.1, 1.0, false);
@@ -283,7 +286,7 @@ fn turns(seed: u64, share_elsewhere: f64) -> Vec<f64> {
     })
 }
 
-/// Stops 0.1 m to either side of the middle, and starts from there after 0.1 to 0.5 s: nobody knows when.
+/// Stops 0.1 m to either side of the middle, and starts again after a random 0.1 to 0.5 s.
 fn rests(seed: u64) -> Vec<f64> {
     let mut random = Gauss::new(seed);
     let (mut way, mut braking, mut rest) = (1.0, false, 0u32);
@@ -318,8 +321,9 @@ fn wandering(seed: u64, [lasts, strength, damping, pull]: [f64; 4]) -> Vec<f64> 
     })
 }
 
-/// Turns anywhere or half of the time where they were before, starts at any time, and accelerations that wander: at most 3 % worse than
-/// without. `cargo test -p dpm-tracking --lib bodies_that_do_not_repeat -- --nocapture` prints the table of `docs/lab/PREDICTION.md`.
+/// Turns anywhere, or half of the time where they were before, starts at any time, and accelerations that wander: at
+/// most 3 % worse than without. `cargo test -p dpm-tracking --lib bodies_that_do_not_repeat -- --nocapture` prints the
+/// table of `docs/lab/PREDICTION.md`.
 #[test]
 fn bodies_that_do_not_repeat_themselves_are_no_worse_off() {
     type Draw = dyn Fn(u64) -> Vec<f64>;
@@ -340,8 +344,8 @@ fn bodies_that_do_not_repeat_themselves_are_no_worse_off() {
     }
 }
 
-/// The target of the pace that the rig is judged at, for every way of moving so: 0.25 mm at the 99th percentile, from the first
-/// frame on and so with the passes of which nothing is known yet.
+/// The accuracy target at half a metre a second, for every motion at that pace: 0.25 mm at the 99th percentile, from
+/// the first frame on, and so including the passes for which there is no past yet.
 #[test]
 fn misplacement_at_half_a_metre_a_second() {
     let rig = EvaluationConfig::with_noise(SIGMA, 1e-3);

@@ -1,14 +1,15 @@
-//! Noisy points around an instant into position, velocity and acceleration there, without blurring the instants at which the
-//! acceleration jumps.
+//! Estimates position, velocity and acceleration at an instant from the noisy points around it, without blurring the
+//! instants at which the acceleration jumps.
 //!
-//! A parabola by least squares knows the more the more samples it has, as long as they lie on one parabola. So several windows are
-//! tried, from the one that knows most to the one that assumes least: around the instant, and to one side of it only, for instants
-//! just before or after a jump. Along each axis the first window is taken whose residuals are no larger than the noise.
+//! A least-squares parabola is the more precise the more samples it has, as long as they lie on one parabola. So
+//! several windows are tried, from the most precise to the one with the fewest assumptions: around the instant, and on
+//! one side of it only, for instants just before or after a jump. Along each axis the first window is used whose
+//! residuals are no larger than the noise.
 
 use super::imm::Chart;
 use glam::{DMat3, DVec3};
 
-/// Time on either side of a point that its windows reach, ns.
+/// Reach of a point's windows on either side, ns.
 pub(crate) const MARGIN_NS: i64 = 80_000_000;
 
 /// Time before and after the instant, ms.
@@ -24,12 +25,13 @@ const WINDOWS_MS: [[f64; 2]; 9] = [
     [10.0, 10.0],
 ];
 
-/// Fewer samples make no window.
+/// Least number of samples in a window.
 const LEAST_SAMPLES: usize = 6;
-/// Fewer samples within the margins on both sides, and turns fall between them: trackers under 150 Hz.
+/// Least number of samples within the margins on both sides. With fewer, turns fall between them: trackers under 150
+/// Hz.
 const LEAST_AROUND: usize = 24;
 
-/// Residuals this many standard deviations above what noise makes are no noise.
+/// Residuals that exceed those of the noise by this many standard deviations are not noise.
 const EXCESS: f64 = 2.0;
 
 /// A motion at one instant.
@@ -43,12 +45,13 @@ pub(crate) struct Smoothed<P> {
     pub acceleration: DVec3,
     /// Standard deviation of the acceleration along each axis.
     pub acceleration_sigma: DVec3,
-    /// Whether any window's residuals were noise; if not, the motion is bent too sharply for the tracker's rate.
+    /// Whether the residuals of any window were noise; if not, the motion is bent too sharply for the tracker's rate.
     pub fits: [bool; 3],
 }
 
-/// The motion at sample `middle` of `samples` (in order of time, capture in ns and point) of `sigma` standard deviation per axis, and
-/// its capture. `None` when there are too few of them, or a rotation so fast that its tangents are no vectors.
+/// The motion at sample `middle` of `samples` (in order of time, capture in ns and point) of `sigma` standard deviation
+/// per axis, and its capture. `None` if there are too few samples, or if a rotation is so fast that its tangents do not
+/// behave like vectors.
 pub(crate) fn smoothed<C: Chart>(
     samples: &[Option<(i64, C::Point)>],
     middle: usize,
@@ -66,7 +69,7 @@ pub(crate) fn smoothed<C: Chart>(
     for [before, after] in WINDOWS_MS {
         let near = |s: &Option<(i64, C::Point)>| {
             let (t, z) = (*s)?;
-            // Milliseconds: their fourth powers are still small numbers.
+            // Milliseconds, so that fourth powers stay small.
             let t = t.saturating_sub(at_ns) as f64 * 1e-6;
             (-before..=after).contains(&t).then(|| (t, C::between(origin, z)))
         };
@@ -100,7 +103,7 @@ pub(crate) fn smoothed<C: Chart>(
     Some((at_ns, motion))
 }
 
-/// A parabola of least squares along each axis.
+/// A least-squares parabola along each axis.
 #[derive(Clone, Copy, Debug)]
 struct Parabola {
     /// Factors of 1, t and t^2.
@@ -112,7 +115,7 @@ struct Parabola {
 }
 
 impl Parabola {
-    /// Through (t, y), and how many there were.
+    /// The parabola through the points (t, y), and their number.
     fn through(points: impl Iterator<Item = (f64, DVec3)>) -> Option<(Self, usize)> {
         let mut n = 0;
         let (mut s, mut d, mut total) = ([0.0; 5], [DVec3::ZERO; 3], DVec3::ZERO);
@@ -137,7 +140,7 @@ impl Parabola {
             let r = inverse.row(k);
             d[0] * r.x + d[1] * r.y + d[2] * r.z
         });
-        // Rounding leaves a little less than nothing of samples without noise.
+        // For samples without noise, rounding can make this slightly negative.
         let residual = (total - terms[0] * d[0] - terms[1] * d[1] - terms[2] * d[2]).max(DVec3::ZERO);
         Some((Self { terms, residual, curvature_variance: inverse.z_axis.z.max(0.0) }, n))
     }
@@ -179,8 +182,9 @@ mod tests {
         assert!((s.velocity - w).length() < 1e-10 && s.acceleration.length() < 1e-8, "{s:?}");
     }
 
-    /// Over many draws the errors are as large as said: the acceleration's against `acceleration_sigma`, which for the widest
-    /// window is that of a parabola through n equidistant samples, sqrt(720 / n^5) / dt^2.
+    /// Over many draws the errors are as large as stated: that of the acceleration is compared with
+    /// `acceleration_sigma`, which for the widest window is that of a parabola through n equidistant samples, sqrt(720
+    /// / n^5) / dt^2.
     #[test]
     fn the_error_of_an_acceleration_is_known() {
         let (sigma, mut gauss, mut sum) = (1e-4, Gauss::new(4), 0.0);
@@ -195,8 +199,8 @@ mod tests {
         assert!((0.8..1.3).contains(&sum), "{sum}");
     }
 
-    /// Up to a millisecond beside a jump of 5 m/s^2 the acceleration is that of its own side, at least half way: one wide window
-    /// would need 20 ms for that.
+    /// Up to a millisecond beside a jump of 5 m/s^2 the acceleration is closer to that of its own side than to that of
+    /// the other: one wide window would need 20 ms for that.
     #[test]
     fn a_jump_stays_where_it_is() {
         for offset_ms in [-30.0, -12.0, 12.0, 30.0] {

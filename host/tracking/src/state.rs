@@ -1,16 +1,16 @@
-//! The filter's belief as plain data: small enough for a latest-wins slot, and enough to predict without the filter.
+//! The filter's state as plain data: small enough for a latest-wins slot, and sufficient to predict without the filter.
 
 use super::imm::{Kinematics, Rotations, Translations};
 use dpm_device::pose::Pose;
 use dpm_device::time::HostTime;
 use glam::{DQuat, DVec3};
 
-/// How much a predicted pose is worth.
+/// Reliability of a predicted pose.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Freshness {
-    /// Samples arrive as they should.
+    /// Samples arrive regularly.
     Tracked,
-    /// Samples are missing; the last motion is carried on.
+    /// Samples are missing; the last motion is extrapolated.
     Predicted,
     /// Nothing recent is known: no light should fall on this body.
     Lost,
@@ -25,15 +25,16 @@ pub struct PosePrediction {
     pub linear_velocity_m_s: [f64; 3],
     /// World frame, rad/s.
     pub angular_velocity_rad_s: [f64; 3],
-    /// From the capture of the newest accepted sample to the instant asked for, before clamping; may be negative.
+    /// From the capture of the newest accepted sample to the requested instant, before clamping; may be negative.
     pub horizon_ns: i64,
-    /// Standard deviation of the position along the worst axis, by the filter's own account, metres.
+    /// Standard deviation of the position along the worst axis, according to the filter, metres.
     pub position_sigma_m: f64,
     /// Whether to show the body.
     pub freshness: Freshness,
 }
 
-/// The state of one track at the capture of its newest accepted sample. `Copy`: travels by value from the tracker's thread.
+/// The state of one track at the capture of its newest accepted sample. `Copy`: passed by value from the tracker's
+/// thread.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct TrackState {
     /// Capture of the newest accepted sample.
@@ -44,13 +45,13 @@ pub struct TrackState {
     pub rotation: Kinematics<DQuat>,
     /// Horizons up to this are normal operation.
     pub tracked_for_ns: i64,
-    /// Beyond this horizon the track is lost, and motion is carried no further.
+    /// Beyond this horizon the track is lost, and motion is not extrapolated further.
     pub lost_after_ns: i64,
 }
 
 impl TrackState {
-    /// The body at `at`. Constant acceleration, exact for constant velocity and constant angular velocity; the horizon is
-    /// clamped to plus or minus `lost_after_ns`, so that no old velocity carries a body out of the room.
+    /// The body at `at`. Assumes constant acceleration; exact for constant velocity and constant angular velocity. The
+    /// horizon is clamped to plus or minus `lost_after_ns`, so that no old velocity carries a body out of the room.
     pub fn predict(&self, at: HostTime) -> PosePrediction {
         let horizon_ns = at.ns_since(self.captured_at);
         let h = horizon_ns.clamp(-self.lost_after_ns, self.lost_after_ns) as f64 * 1e-9;

@@ -1,8 +1,8 @@
-//! The controller's image streams into pixels, byte by byte as they arrive.
+//! Decodes the controller's image streams, byte by byte as they arrive.
 
 use super::{Compression, ImageError, ImageHeader, HEADER_BYTES};
 
-/// What the decoder waits for next.
+/// What the decoder expects next.
 #[derive(Clone, Copy, Debug)]
 enum Expect {
     Control,
@@ -25,11 +25,12 @@ enum Counts {
     Copy,
 }
 
-/// Decodes a stream byte by byte, as it arrives. Memory is that of one image, allocated once from the size given, never from
-/// what the stream says.
+/// Decodes a stream byte by byte, as it arrives. Its memory is that of one image, allocated once from the size given,
+/// never from a size in the stream.
 ///
-/// Tolerated, as programs in the field differ: runs and literals that cross the end of a line, lines that end early (the rest is
-/// black), a missing end-of-line mark, anything after the end of the image. [`ImageDecoder::oddities`] counts what was tolerated.
+/// Some deviations are tolerated, because programs in the field differ: runs and literals that cross the end of a line,
+/// lines that end early (the rest is black), a missing end-of-line mark, anything after the end of the image.
+/// [`ImageDecoder::oddities`] counts them.
 #[derive(Clone, Debug)]
 pub struct ImageDecoder {
     compression: Compression,
@@ -67,7 +68,7 @@ impl ImageDecoder {
         })
     }
 
-    /// Takes the next bytes of the stream. After an error the decoder is of no further use.
+    /// Adds the next bytes of the stream. After an error the decoder is unusable.
     pub fn push(&mut self, bytes: &[u8]) -> Result<(), ImageError> {
         for (i, b) in bytes.iter().enumerate() {
             if matches!(self.expect, Expect::End) {
@@ -90,13 +91,13 @@ impl ImageDecoder {
         self.at
     }
 
-    /// How often something was tolerated that the guide does not allow.
+    /// Number of tolerated deviations from the guide.
     pub fn oddities(&self) -> u32 {
         self.oddities
     }
 
-    /// The stream is over: the pixels, 3 bytes each in the order written, rows from the top. A missing end mark is tolerated
-    /// when no pixel is missing.
+    /// Call at the end of the stream: returns the pixels, 3 bytes each in the order written, rows from the top. A
+    /// missing end mark is tolerated if no pixel is missing.
     pub fn finish(mut self) -> Result<Vec<u8>, ImageError> {
         if !self.is_complete() {
             if self.filled < self.pixels.len() {
@@ -196,7 +197,7 @@ impl ImageDecoder {
             return Err(ImageError::CopyWithoutLine { at: self.at });
         }
         let range = self.room(n)?;
-        // A copy that crosses the end of a line may read what it has just written, so it goes row by row.
+        // A copy that crosses the end of a line may read pixels that it has just written, so it proceeds row by row.
         let mut to = range.start;
         while to < range.end {
             let end = range.end.min(to + row);
@@ -221,7 +222,7 @@ impl ImageDecoder {
         }
     }
 
-    /// After the byte at `self.at`: padding goes on while the next one is not at a multiple of 4.
+    /// Expected after the byte at `self.at`: more padding while the next byte is not at a multiple of 4.
     fn padding(&self) -> Expect {
         if (self.at + 1).is_multiple_of(4) {
             Expect::Control

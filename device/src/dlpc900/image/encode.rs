@@ -1,4 +1,4 @@
-//! Rows of pixels into the controller's RLE and ERLE streams.
+//! Encodes rows of pixels as the controller's RLE and ERLE streams.
 
 use std::ops::Range;
 
@@ -16,7 +16,7 @@ const MOST_RLE: usize = 0xff;
 pub struct EncodedImage {
     /// Header and stream, padded to 4 bytes.
     pub bytes: Vec<u8>,
-    /// How it is written.
+    /// Its compression.
     pub compression: Compression,
 }
 
@@ -27,7 +27,7 @@ impl EncodedImage {
     }
 }
 
-/// Writes rows of pixels as one compression.
+/// Encodes rows of pixels with one compression.
 struct RowEncoder {
     compression: Compression,
     out: Vec<u8>,
@@ -89,8 +89,8 @@ impl RowEncoder {
         while at < row.len() {
             let run = run_ahead(&row[at..]);
             let copy = copy_at(at);
-            // Inside a literal, breaking it off costs a new head (2 to 3 bytes): only what saves more is worth it. A copy costs
-            // 3 bytes and a run 4, a literal pixel 3.
+            // Ending a literal costs a new head (2 to 3 bytes), so only a larger saving is worthwhile. A copy costs 3
+            // bytes and a run 4, a literal pixel 3.
             let open = literal_from < at;
             let (least_copy, least_run) = if open { (2, 3) } else { (1, 2) };
             if copy >= least_copy && copy + 1 >= run {
@@ -146,18 +146,18 @@ impl RowEncoder {
     }
 }
 
-/// How many pixels from the start equal the first.
+/// Number of pixels from the start that equal the first.
 fn run_ahead(row: &[Pixel]) -> usize {
     row.iter().take_while(|p| **p == row[0]).count()
 }
 
-/// How many pixels from the start equal those above.
+/// Number of pixels from the start that equal those above.
 fn equal_ahead(row: &[Pixel], above: &[Pixel]) -> usize {
     row.iter().zip(above).take_while(|(p, a)| p == a).count()
 }
 
-/// Encodes at most 24 planes of `raster` as the controller of `columns` wants them (all columns, or one half of a DMD with two
-/// controllers). With `compression` `None`, the smallest of RLE and ERLE (or raw, when neither saves anything) is taken.
+/// Encodes at most 24 planes of `raster` for the controller of `columns` (all columns, or one half of a DMD with two
+/// controllers). With `compression` `None`, uses the smaller of RLE and ERLE (or raw, if neither saves anything).
 pub fn encode(
     planes: &[&[u8]],
     raster: Raster,
@@ -188,7 +188,7 @@ pub fn encode(
         std::mem::swap(&mut row, &mut above);
     }
     let images = encoders.into_iter().map(|e| e.finish(width, height));
-    // At least one candidate; of equals the simpler coding wins.
+    // There is at least one candidate; of equals the simpler coding wins.
     let best = images.reduce(|a, b| if b.bytes.len() < a.bytes.len() { b } else { a });
     match best {
         Some(b) if compression.is_some() || b.bytes.len() < HEADER_BYTES + width * height * 3 => Ok(b),

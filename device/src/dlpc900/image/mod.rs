@@ -1,11 +1,12 @@
-//! 24 bit planes into the controller's compressed 24-bit image and back.
+//! Encodes 24 bit planes as the controller's compressed 24-bit image, and decodes it.
 //!
 //! An image is a 48-byte header and rows of 3-byte pixels, raw, run-length coded (RLE) or with copies from the line above (ERLE).
 //! RLE: `n p` repeats a pixel, `0 n` and n pixels are literal, `0 0` ends a line (then padding to 4 bytes), `0 1` the image.
 //! ERLE: lengths below 128 take one byte, others two (`n & 127 | 128`, `n >> 7`); `n p` repeats, `0 1 n` copies n pixels from the
 //! line above, `0 n` (n > 1) and n pixels are literal, `0 0` may end a line, `0 1 0` ends the image. \[DLPU018 section 2.4.4.3.6\]
 //!
-//! The guide's table 2-109 calls `0 0` the end of the image; its own example 2-110 and the field follow the reading above.
+//! The guide's table 2-109 calls `0 0` the end of the image; its own example 2-110 and programs in the field follow the
+//! reading above.
 
 mod decode;
 mod encode;
@@ -20,7 +21,7 @@ pub const HEADER_BYTES: usize = 48;
 /// First four bytes of the header.
 pub const SIGNATURE: [u8; 4] = *b"Spld";
 
-/// How the pixels are written.
+/// Compression of the pixels.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 #[repr(u8)]
 pub enum Compression {
@@ -44,8 +45,8 @@ impl Compression {
     }
 }
 
-/// In which order a pixel's three bytes hold planes 0-7, 8-15 and 16-23. The sources contradict each other; images of at most 8
-/// planes are the same but for the byte they stand in.
+/// The order in which a pixel's three bytes hold planes 0-7, 8-15 and 16-23. The sources contradict each other; images
+/// of at most 8 planes differ only in the byte that holds them.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub enum PlaneOrder {
     /// Bytes hold planes 16-23, 8-15, 0-7, as common open programs write them.
@@ -56,7 +57,7 @@ pub enum PlaneOrder {
 }
 
 impl PlaneOrder {
-    /// Which byte of a pixel holds the planes of group 0, 1 and 2.
+    /// The byte of a pixel that holds the planes of group 0, 1 and 2.
     const fn byte_of_group(self) -> [usize; 3] {
         match self {
             Self::Descending => [2, 1, 0],
@@ -68,7 +69,7 @@ impl PlaneOrder {
 /// Three bytes of a pixel in the order they are written, in bits 0..8, 8..16, 16..24.
 type Pixel = u32;
 
-/// What can be wrong with an image.
+/// Errors of an image.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, thiserror::Error)]
 pub enum ImageError {
     /// More than 24 planes.
@@ -135,7 +136,7 @@ pub struct ImageHeader {
     pub encoded_bytes: u32,
     /// Background colour, bytes as written (blue, green, red, 0).
     pub background: [u8; 4],
-    /// How the pixels are written.
+    /// Compression of the pixels.
     pub compression: Compression,
 }
 
@@ -154,7 +155,7 @@ impl ImageHeader {
         h
     }
 
-    /// Reads the bytes. Reserved bytes may be anything, as programs in the field differ in them.
+    /// Reads the bytes. Reserved bytes may have any value, because programs in the field differ in them.
     pub fn decode(h: &[u8; HEADER_BYTES]) -> Result<Self, ImageError> {
         let signature = [h[0], h[1], h[2], h[3]];
         if signature != SIGNATURE {
@@ -214,7 +215,7 @@ fn pixel_row(
     }
 }
 
-/// Turns a decoded image back into planes: plane `plane` of pixels as [`ImageDecoder::pixels`] holds them, in `out` with its rows at
+/// Extracts plane `plane` from decoded pixels as [`ImageDecoder::pixels`] holds them, into `out`, whose rows get it at
 /// `columns` of `raster`. Bits of other columns stay.
 pub fn extract_plane(
     pixels: &[u8],

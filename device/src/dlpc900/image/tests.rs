@@ -31,7 +31,7 @@ fn golden_erle_stream_of_the_guide_expands_as_it_should() {
     let (first, second) = golden_lines();
     let width = first.len();
     assert_eq!(width, 141);
-    // The example's second line ends early and its image with it: filled up here so that the image is whole.
+    // The example's second line ends early, and the image with it; it is filled up here so that the image is complete.
     let mut stream = GOLDEN_ERLE[..33].to_vec();
     stream.extend_from_slice(&[0x83, 0x01, 0, 0, 0, 0x00, 0x01, 0x00]);
     for chunk in [1, 2, 3, 7, 100] {
@@ -44,7 +44,7 @@ fn golden_erle_stream_of_the_guide_expands_as_it_should() {
         assert_eq!(d.oddities(), 0);
         assert_eq!(d.finish().unwrap(), [first.concat(), second.concat()].concat());
     }
-    // Cut where the example ends, the pixels that it does describe are there.
+    // When the stream is cut where the example ends, the pixels that it describes are there.
     let mut d = ImageDecoder::new(&header(141, 2, Compression::Erle), 141, 2).unwrap();
     d.push(&GOLDEN_ERLE[..33]).unwrap();
     assert_eq!(d.pixels()[..141 * 3], first.concat());
@@ -89,7 +89,7 @@ fn golden_header_bytes() {
     assert!(matches!(ImageHeader::decode(&bad), Err(ImageError::Signature(_))));
 }
 
-/// Every combination of one plane set: the three bytes of a pixel by the definition of the two orders.
+/// Every image with a single plane set: the three bytes of a pixel follow from the definition of the two orders.
 #[test]
 fn planes_stand_in_the_bytes_that_the_order_names() {
     let raster = Raster::new(9, 1).unwrap();
@@ -148,7 +148,7 @@ fn round_trip(
     image
 }
 
-/// The smallest of all is taken, and noise costs no more than its raw size and the heads of its literals.
+/// The smallest encoding is used, and noise costs no more than its raw size and the heads of its literals.
 #[test]
 fn noise_hardly_grows_and_full_hd_takes_well_under_a_second() {
     let raster = Raster::new(1920, 1080).unwrap();
@@ -202,13 +202,13 @@ fn tolerated_streams_are_counted_and_impossible_ones_refused() {
         let odd = d.oddities();
         d.finish().map(|p| (p, odd))
     };
-    // A run over the end of a line, no line ends.
+    // A run across the end of a line, no line ends.
     let over = decode_all(2, 2, Compression::Erle, &[4, 1, 1, 1, 0, 1, 0]);
     assert_eq!(over, Ok((vec![1; 12], 1)));
-    // A line that ends early is black behind.
+    // The rest of a line that ends early is black.
     let short = decode_all(2, 1, Compression::Erle, &[1, 9, 9, 9, 0, 0, 0, 1, 0]);
     assert_eq!(short, Ok((vec![9, 9, 9, 0, 0, 0], 1)));
-    // No end mark, but every pixel.
+    // No end mark, but all pixels.
     assert_eq!(decode_all(2, 1, Compression::Erle, &[2, 7, 7, 7]), Ok((vec![7; 6], 0)));
     // Anything after the end.
     assert!(decode_all(1, 1, Compression::Rle, &[1, 7, 7, 7, 0, 1, 99, 98]).is_ok());
@@ -255,7 +255,7 @@ proptest! {
         let erle = round_trip(&planes, raster, 0..width as usize, Some(Compression::Erle));
         let best = round_trip(&planes, raster, 0..width as usize, None);
         prop_assert_eq!(best.bytes.len(), raw.bytes.len().min(rle.bytes.len()).min(erle.bytes.len()));
-        // Two halves, as two controllers take them.
+        // Two halves, one for each controller.
         let middle = (width * split / 100) as usize;
         for half in [0..middle, middle..width as usize] {
             if !half.is_empty() { round_trip(&planes, raster, half, None); }

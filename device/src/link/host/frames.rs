@@ -1,4 +1,4 @@
-//! One frame's planes into packets: whole or not at all.
+//! Sends one frame's planes as packets: whole or not at all.
 
 use super::light::Shown;
 use super::{DropReason, HostLink, LinkState, SendOutcome, Verb};
@@ -12,16 +12,17 @@ use crate::time::{DeviceTicks, HostTime};
 use crate::transport::{Lane, SendError, Transport};
 
 impl HostLink {
-    /// Hands one frame to the medium, all of it or nothing. `planes` are the frame's planes one after the other in the
-    /// configured order, each [`crate::planes::Raster::plane_bytes`] long; raw planes go out as they lie, without a copy on this side. `frame_id`
-    /// must grow from frame to frame; the wire carries its low 32 bits. `target_at` is the instant of light on the device's
-    /// clock, usually [`SlotClock::start`](crate::link::slots::SlotClock::start) of the slot. From `dark_from` on, on the same clock, the
-    /// device shows nothing of this frame, even if it never hears from a host again; usually
-    /// [`SlotClock::dark_from`](crate::link::slots::SlotClock::dark_from). A device takes no frame whose light would end before it
-    /// begins, so a `dark_from` that does not lie after `target_at` is sent as one tick after it.
+    /// Hands one frame to the medium, all of it or nothing. `planes` holds the frame's planes one after the other in
+    /// the configured order, each [`crate::planes::Raster::plane_bytes`] long; raw planes are sent from there without a
+    /// copy on this side. `frame_id` must grow from frame to frame; the wire carries its low 32 bits. `target_at` is
+    /// the instant of light on the device's clock, usually [`SlotClock::start`](crate::link::slots::SlotClock::start)
+    /// of the slot. From `dark_from` on, on the same clock, the device shows nothing of this frame, even if it never
+    /// hears from a host again; usually [`SlotClock::dark_from`](crate::link::slots::SlotClock::dark_from). A device
+    /// refuses a frame whose light would end before it begins, so a `dark_from` that is not later than `target_at` is
+    /// sent as one tick after it.
     ///
     /// # Panics
-    /// When `planes` has not the configured size.
+    /// When `planes` does not have the configured size.
     pub fn send_frame(
         &mut self,
         now: HostTime,
@@ -65,7 +66,7 @@ impl HostLink {
         let plane_bytes = self.settings.raster.plane_bytes();
         let expected = plane_bytes * schedule.len();
         assert!(planes.len() == expected, "frame of {} bytes, configured {expected}", planes.len());
-        // Nothing may queue up behind or before an order to be dark.
+        // No frame may be queued before or behind an order to go dark.
         let darkens = self.rest.is_none() && self.verb.is_some_and(Verb::is_dark);
         if self.state != LinkState::Streaming || darkens {
             return Err(DropReason::NotStreaming);
@@ -154,7 +155,8 @@ impl HostLink {
         Ok(())
     }
 
-    /// Feeds the limiters with a frame that is about to be shown in the slot of `target_at`. An error while light rests.
+    /// Feeds the limiters with a frame that is about to be shown in the slot of `target_at`. Returns an error while
+    /// light rests.
     fn rests(
         &mut self,
         now: HostTime,
@@ -166,7 +168,8 @@ impl HostLink {
             return Err(reason);
         }
         let (raster, schedule) = (self.settings.raster, &self.settings.schedule);
-        // What was ordered decides what is seen, not what is sent: a frame that is not lit is no light, and no flash.
+        // Frames are sent even while an order keeps them dark. A frame that is not lit counts neither as light nor as a
+        // flash.
         let is_shown = self.ordered.is_none();
         let mut struck = None;
         if let Some(limiter) = &mut self.flash {
@@ -187,7 +190,7 @@ impl HostLink {
         }
         let Some((rest_us, reason)) = struck else { return Ok(()) };
         self.light.is_dark();
-        // Repeated by `poll` until the device confirms it, should it not get through now.
+        // If it does not get through now, `poll` repeats it until the device confirms it.
         let _ = self.give(now, Verb::Black, transport);
         self.rest = Some((now.plus_ns((rest_us * 1000) as i64), reason));
         Err(reason)

@@ -1,4 +1,4 @@
-//! Packets from the device into the newest of everything it says.
+//! Collects the device's packets: the newest message of each kind.
 
 use super::types::EchoSample;
 use crate::link::decoder::PacketSink;
@@ -9,10 +9,10 @@ use crate::time::HostTime;
 /// Echo answers kept for the caller.
 pub(super) const ECHOES_KEPT: usize = 16;
 
-/// Everything that arrives.
+/// The newest of everything that the device sent.
 #[derive(Debug)]
 pub(super) struct Inbox {
-    /// When the bytes that are being read arrived.
+    /// Arrival time of the bytes that are being read.
     pub arrived_at: HostTime,
     pub session: u32,
     pub assembly: Option<Assembly>,
@@ -22,7 +22,7 @@ pub(super) struct Inbox {
     pub device_forgot: bool,
     pub echoes: [Option<EchoSample>; ECHOES_KEPT],
     pub next_echo: usize,
-    /// When the newest exchange that was answered had begun.
+    /// Start of the newest answered exchange.
     pub echo_answered: HostTime,
     pub ignored: u64,
     pub damaged: u64,
@@ -52,7 +52,7 @@ impl PacketSink for Inbox {
         let header = *assembly.header();
         match DeviceMessage::parse(header.kind, assembly.payload()) {
             Ok(message) if header.session == self.session => self.apply(&message),
-            // The device lost its power or its memory: it answers, but knows nothing of this session.
+            // The device lost its power or its memory: it answers, but does not know this session.
             Ok(DeviceMessage::Status(_)) if header.session == 0 => {
                 self.device_forgot = true;
             }
@@ -89,7 +89,7 @@ impl Inbox {
         match message {
             DeviceMessage::Hello(h) => self.hello = Some(*h),
             DeviceMessage::Status(s) => {
-                // An older one that came late would take credit back.
+                // An older status that arrived late would take credit back.
                 if self.status.is_some_and(|last| last.now > s.now) {
                     self.ignored += 1;
                 } else {

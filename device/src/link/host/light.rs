@@ -1,10 +1,10 @@
-//! Frames with their slots into what they add to the light of the field, for the host's limiter.
+//! Computes what frames and their slots add to the light of the field, for the host's limiter.
 
 use crate::link::limits::{LightLimiter, LightLimits, LimitReached};
 use crate::link::slots::SlotClock;
 use crate::time::{DeviceTicks, FrameRate};
 
-/// How long the device may go on showing what it has after the host's order to go dark has left.
+/// How long the device may continue to show its frames after the host has sent the order to go dark.
 const OBEYED_WITHIN_MS: u32 = 50;
 
 /// What a slot shows.
@@ -12,7 +12,7 @@ const OBEYED_WITHIN_MS: u32 = 50;
 pub(super) enum Shown {
     /// A frame of this level.
     New(u32),
-    /// What is on the mirrors.
+    /// The frame on the mirrors.
     Same,
     /// Nothing.
     Nothing,
@@ -24,7 +24,7 @@ pub(super) struct LightCount {
     limiter: Option<LightLimiter>,
     /// Last slot counted in this session.
     slot: Option<u64>,
-    /// Level of the frame in it, and the first slot in which it is not lit again by itself.
+    /// Level of the frame in it, and the first slot in which that frame no longer repeats by itself.
     level: u32,
     over: u64,
 }
@@ -43,12 +43,12 @@ impl LightCount {
         self.level = 0;
     }
 
-    /// Slots are counted anew, from the dark. What was lit before still counts, as if no time had passed.
+    /// Slots are counted anew, from the dark. Earlier light still counts, as if no time had passed.
     pub(super) fn new_session(&mut self) {
         (self.slot, self.level) = (None, 0);
     }
 
-    /// A frame is to be sent for the slot that `target_at` lies in; the limit that its light would exceed.
+    /// Counts a frame for the slot that `target_at` lies in; returns the limit that its light would exceed.
     pub(super) fn slot(
         &mut self,
         clock: &SlotClock,
@@ -58,7 +58,7 @@ impl LightCount {
         let limiter = self.limiter.as_mut()?;
         let slot = clock.slot_at(target_at).unwrap_or(0);
         if let Some(last) = self.slot {
-            // Without a frame of its own a slot repeats the one before, until that one's light is over.
+            // A slot without a frame of its own repeats the previous one, until the light of that frame is over.
             let between = slot.saturating_sub(last + 1);
             let repeats = between.min(self.over.saturating_sub(last + 1));
             limiter.repeated(self.level, repeats);

@@ -1,4 +1,4 @@
-//! A device that says what it should not: answers to other sessions, old answers, answers never asked for.
+//! A device that sends unexpected messages: answers to other sessions, old answers, unsolicited answers.
 
 use super::*;
 use crate::link::{Codec, DeviceMessage, Fault, LightLimits, MessageType, Underrun};
@@ -116,7 +116,8 @@ fn u10_answers_to_others_old_answers_and_answers_never_asked_for_change_nothing(
     let (mut link, mut script) = streaming();
     let session = script.session;
     let ignored = link.counters().packets_ignored;
-    // Another session's wealth of credit, an older state, an echo from the future, a fault of an ARM that was not sent.
+    // A large credit of another session, an older state, an echo from the future, the refusal of an ARM that was not
+    // sent.
     script.say(session ^ 1, &DeviceMessage::Status(status(DeviceState::Armed, 50, 1000)));
     script.say(session, &DeviceMessage::Status(status(DeviceState::Configured, 3, 0)));
     let echo = Echo { host_sent_ns: 1 << 40, device_received: DeviceTicks(1), device_sent: DeviceTicks(2) };
@@ -169,7 +170,8 @@ fn credit_wraps_and_never_goes_below_zero() {
     assert_eq!(older, SendOutcome::Dropped { reason: DropReason::NotNewer });
 }
 
-/// A device 30 us away at the other end of a medium that stamps, or of one that does not. Its clock is the host's, a tick a nanosecond.
+/// A device 30 us away at the other end of a medium that either stamps arrivals or does not. Its clock is the host's, a
+/// tick a nanosecond.
 struct Distant {
     script: Script,
     stamps: bool,
@@ -212,7 +214,8 @@ impl Transport for Distant {
     }
 }
 
-/// Found in use, section 2b of the second look at latency: with replies stamped at the poll, the projector's clock was half a slot wrong.
+/// Found in use, section 2b of the second look at latency: with replies stamped at the poll, the map of the projector's
+/// clock was half a slot wrong.
 #[test]
 fn a_poll_that_comes_late_does_not_shift_the_map() {
     use crate::clock_map::ClockMap;
@@ -222,7 +225,7 @@ fn a_poll_that_comes_late_does_not_shift_the_map() {
         let mut map = ClockMap::new(1_000_000_000).unwrap();
         let mut worst = 0;
         for slot in 1..3000i64 {
-            // A frame's work, and every third poll a millisecond late on top of it.
+            // A frame's work, and in addition every third poll a millisecond late.
             let now = HostTime(slot * 1_055_966 + if slot % 3 == 0 { 1_000_000 } else { 0 });
             link.poll(now, &mut medium).unwrap();
             link.take_echoes(|e| {
@@ -241,7 +244,8 @@ fn a_poll_that_comes_late_does_not_shift_the_map() {
     assert!(worst_ns(false) > 400_000, "what the stamps are for: {} ns", worst_ns(false));
 }
 
-/// Found in use, R2: an order to be dark goes out once, whatever else waits, and is not weakened while it is not confirmed.
+/// Found in use, R2: an order to go dark goes out once, whatever else waits, and is not weakened while it is
+/// unconfirmed.
 #[test]
 fn an_order_to_be_dark_goes_first_once_and_is_not_replaced_by_a_weaker_one() {
     let (mut link, mut script) = streaming();
@@ -267,7 +271,7 @@ fn an_order_to_be_dark_goes_first_once_and_is_not_replaced_by_a_weaker_one() {
         link.command(HostTime(400), verb, &mut script).unwrap();
         assert_eq!((script.flushed, script.sent.last()), (flushed, Some(&kind)));
     }
-    // The word of whoever arms is newer than all of them.
+    // An ARM is newer than all of these orders.
     link.arm(0);
     link.command(HostTime(500), Verb::Black, &mut script).unwrap();
     assert_eq!(script.sent.last(), Some(&MessageType::Black));
@@ -284,7 +288,7 @@ fn full_frame_numbers_come_back_from_their_low_half() {
 }
 
 proptest! {
-    /// Whatever a device sends, in whatever state: no panic, no credit beyond what it granted, no light asked for.
+    /// Whatever a device sends, in any state: no panic, no credit beyond the granted one, no request for light.
     #[test]
     fn any_bytes_from_a_device_are_survived(
         pieces in prop::collection::vec((any::<bool>(), 1u8..14, prop::collection::vec(any::<u8>(), 0..120)), 0..40),

@@ -1,4 +1,4 @@
-//! What a host asks of a link, and what it hears from it: settings, states, errors, outcomes, counters.
+//! What a host requests of a link, and what it learns from it: settings, states, errors, outcomes, counters.
 
 use crate::link::header::VERSION;
 use crate::link::limits::{LightLimits, LimitReached};
@@ -16,7 +16,7 @@ pub enum Epoch {
     AfterHello(u64),
 }
 
-/// What a host asks of a device.
+/// The configuration that a host requests of a device.
 #[derive(Clone, Debug)]
 pub struct LinkSettings {
     /// Must be the device's raster.
@@ -27,7 +27,7 @@ pub struct LinkSettings {
     pub rate: FrameRate,
     /// Silence after which the device goes dark, microseconds, 1 to [`crate::link::MAX_WATCHDOG_US`].
     pub watchdog_us: u32,
-    /// What to light without a new frame.
+    /// What to show without a new frame.
     pub underrun: Underrun,
     /// Slots by which a frame may miss its target and still be lit.
     pub late_slots: u8,
@@ -39,27 +39,27 @@ pub struct LinkSettings {
     /// Flashes of the whole field a second above which the host darkens the projector for two seconds; `None` switches
     /// the limiter off.
     pub flash_limit: Option<u8>,
-    /// How much light there may be. The host goes dark before a limit is exceeded, and the device, which CONFIG tells of them, does so by
-    /// itself.
+    /// Limits on light. The host goes dark before a limit is exceeded. CONFIG passes the limits to the device, which
+    /// does the same by itself.
     pub limits: LightLimits,
 }
 
-/// Progress of a [`HostLink`](super::HostLink).
+/// State of a [`HostLink`](super::HostLink).
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum LinkState {
     /// Not connecting. [`super::HostLink::connect`] starts.
     Closed,
-    /// The medium is gone. Polling tries to get it back ten times a second; then a new session begins.
+    /// The medium is gone. Polling tries to reopen it ten times a second; then a new session begins.
     Lost,
-    /// HELLO is under way.
+    /// HELLO was sent and is not answered yet.
     Greeting,
-    /// CONFIG is under way.
+    /// CONFIG was sent and is not confirmed yet.
     Configuring,
     /// Configured and dark; waits for [`super::HostLink::arm`].
     Ready,
-    /// ARM is under way.
+    /// ARM was sent and is not confirmed yet.
     Arming,
-    /// Frames are taken.
+    /// The link accepts frames.
     Streaming,
     /// The device latched faults and is dark; [`super::HostLink::arm`] acknowledges.
     Faulted,
@@ -95,7 +95,7 @@ pub enum LinkError {
         planes: usize,
         /// Frame rate asked for.
         rate_hz: f64,
-        /// Time that leaves for a plane.
+        /// The resulting time per plane.
         plane_ns: u64,
         /// Time the device needs.
         min_plane_ns: u32,
@@ -115,7 +115,7 @@ pub enum LinkError {
     ArmRefused {
         /// Name of the transport.
         device: String,
-        /// Faults that stand in the way.
+        /// Faults that prevent it.
         faults: u32,
     },
     /// The medium failed.
@@ -138,14 +138,15 @@ pub enum DropReason {
     NotNewer,
     /// The picture flashed too much; the projector rests in the dark.
     FlashLimit,
-    /// With this frame a limit on light would have been exceeded, or one was, and the projector rests in the dark.
+    /// This frame would have exceeded a limit on light, or the projector rests in the dark after an earlier one would
+    /// have.
     LightLimit(LimitReached),
 }
 
 /// Fate of a frame handed to [`super::HostLink::send_frame`].
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum SendOutcome {
-    /// All of it is on its way.
+    /// All of it was sent.
     Sent,
     /// None of it was sent.
     Dropped {
@@ -172,13 +173,13 @@ pub struct LinkCounters {
     pub bytes_sent: u64,
     /// Of these, bytes of frames.
     pub frame_bytes_sent: u64,
-    /// Planes sent as they are.
+    /// Planes sent raw.
     pub planes_raw: u64,
-    /// Planes sent by a codec.
+    /// Planes sent compressed.
     pub planes_coded: u64,
     /// Planes not sent because they had not changed.
     pub planes_kept: u64,
-    /// Frames sent without reference to another.
+    /// Frames sent without reference to another frame.
     pub key_frames: u64,
     /// Intact packets from the device without effect: other session, out of order, malformed.
     pub packets_ignored: u64,
@@ -197,11 +198,12 @@ pub struct EchoSample {
     pub device_received_at: DeviceTicks,
     /// Answer left, device's clock.
     pub device_sent_at: DeviceTicks,
-    /// Answer arrived, host's clock: not when it was read, which may be much later, see [`crate::transport::Transport::receive`].
+    /// Answer arrived, host's clock: the arrival, not the reading, which may be much later; see
+    /// [`crate::transport::Transport::receive`].
     pub host_received_at: HostTime,
 }
 
-/// What a device in trouble or an operator can ask for at any time.
+/// The orders that can be sent at any time.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Verb {
     /// Dark and no longer armed.
@@ -224,12 +226,12 @@ impl Verb {
         }
     }
 
-    /// True for an order to be dark, which goes before everything that waits.
+    /// True for an order to go dark, which overtakes everything that waits.
     pub(super) const fn is_dark(self) -> bool {
         !matches!(self, Self::Freeze)
     }
 
-    /// How much an order forbids: one that has not been confirmed is not replaced by one that forbids less.
+    /// The strength of an order: an unconfirmed order is not replaced by a weaker one.
     pub(super) const fn strength(self) -> u8 {
         match self {
             Self::Freeze => 0,

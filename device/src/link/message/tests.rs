@@ -1,4 +1,4 @@
-//! Golden payloads, written by hand from docs/PROTOCOL.md, both ways, and refusal of everything near them.
+//! Golden payloads, written by hand from docs/PROTOCOL.md, encoded and decoded, and the refusal of malformed variants.
 
 use super::*;
 use crate::planes::Channel;

@@ -1,4 +1,4 @@
-//! What the control messages say, as values. docs/PROTOCOL.md section 4 lists the same fields as bytes.
+//! The contents of the control messages, as values. Section 4 of docs/PROTOCOL.md lists the same fields as bytes.
 
 use crate::link::limits::LightLimits;
 use crate::planes::{PlaneSchedule, Raster};
@@ -68,7 +68,7 @@ pub struct HostHello {
     pub codecs: u32,
 }
 
-/// HELLO from the device: what it is.
+/// HELLO from the device: its properties.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct DeviceHello {
     /// Protocol version the device will use; when it is outside the host's range, the session did not open.
@@ -93,7 +93,7 @@ pub struct DeviceHello {
     pub now: DeviceTicks,
 }
 
-/// What to light in a slot for which no new frame is whole.
+/// What to show in a slot for which no new frame is whole.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 #[repr(u8)]
 pub enum Underrun {
@@ -120,7 +120,7 @@ pub struct Config {
     pub late_slots: u8,
     /// Start of slot 0 on the device's clock.
     pub epoch: DeviceTicks,
-    /// How much light the device must not exceed, whatever is sent.
+    /// Limits on light that the device must not exceed, whatever is sent.
     pub limits: LightLimits,
 }
 
@@ -160,7 +160,7 @@ pub enum DeviceState {
     Configured = 2,
     /// May make light.
     Armed = 3,
-    /// Armed and told to be dark.
+    /// Armed, and dark by order.
     Black = 4,
     /// Armed and holding the frame that is lit.
     Frozen = 5,
@@ -204,18 +204,18 @@ pub struct Status {
     pub last_whole_frame: u32,
     /// Newest frame lit; meaningless while `frames_lit` is 0.
     pub last_lit_frame: u32,
-    /// When it was lit first, device's clock.
+    /// When that frame was first lit, device's clock.
     pub last_lit_at: DeviceTicks,
     /// The device's clock when this was written.
     pub now: DeviceTicks,
-    /// Slots that began while armed: `frames_lit + slots_repeated + slots_blank`.
+    /// Slots that began while armed, black or frozen: `frames_lit + slots_repeated + slots_blank`.
     pub slots: u32,
-    /// Frames of which anything arrived: `frames_lit + frames_incomplete + frames_late + frames_superseded + frames_refused` and
-    /// those still on their way to the light.
+    /// Frames of which anything arrived:
+    /// `frames_lit + frames_incomplete + frames_late + frames_superseded + frames_refused` and those in flight.
     pub frames_seen: u32,
     /// Frames lit.
     pub frames_lit: u32,
-    /// Slots that lit the frame before again.
+    /// Slots that repeated the previous frame.
     pub slots_repeated: u32,
     /// Dark slots.
     pub slots_blank: u32,
@@ -242,7 +242,7 @@ pub struct Status {
 /// ECHO. The host writes `host_sent_ns` and zeros; the device fills the rest in.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Echo {
-    /// Host's clock when the request left, nanoseconds; the device returns it unread.
+    /// Host's clock when the request left, nanoseconds; the device returns it unchanged.
     pub host_sent_ns: u64,
     /// Device's clock when the request arrived.
     pub device_received: DeviceTicks,
@@ -260,7 +260,7 @@ pub enum FaultCode {
     Version = 1,
     /// CONFIG refused; detail = [`ConfigRefusal`].
     Config = 2,
-    /// ARM refused: faults not acknowledged, or a cause is still there, or not configured.
+    /// ARM refused: faults not acknowledged, or a cause persists, or not configured.
     Arm = 3,
 }
 
@@ -276,7 +276,7 @@ pub enum ConfigRefusal {
     Rate = 3,
     /// The payload breaks a rule of the format.
     Format = 4,
-    /// The device does not count light, or not for so long.
+    /// The device does not count light, or not over such a long time.
     Limits = 5,
 }
 

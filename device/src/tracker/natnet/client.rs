@@ -1,6 +1,6 @@
-//! The conversation with a NatNet server: connecting, names, clock, frames in and samples out, all inside [`Tracker::poll`].
+//! The NatNet client: connecting, names, clock, frames in and samples out, all inside [`Tracker::poll`].
 //!
-//! Nothing here waits: a poll reads at most [`NatNetClient::MAX_DATAGRAMS_PER_POLL`] datagrams and sends what is due.
+//! Nothing here blocks: a poll reads at most [`NatNetClient::MAX_DATAGRAMS_PER_POLL`] datagrams and sends what is due.
 
 use super::clock::ServerClock;
 use super::frame::{decode_frame, FrameInfo, RigidBody};
@@ -16,30 +16,31 @@ use std::net::{Ipv4Addr, SocketAddrV4};
 use std::sync::Arc;
 
 const MS: i64 = 1_000_000;
-/// Between two attempts to connect.
+/// Interval between attempts to connect.
 const CONNECT_EVERY_NS: i64 = 250 * MS;
-/// Between two keep-alive messages (unicast servers stop after some seconds without).
+/// Interval between keep-alive messages (unicast servers stop after some seconds without).
 const KEEP_ALIVE_EVERY_NS: i64 = 250 * MS;
-/// Between two requests for model definitions, while names are missing.
+/// Interval between requests for model definitions, while names are missing.
 const MODELS_EVERY_NS: i64 = 1_000 * MS;
-/// A server that was silent for this long is connected to anew.
+/// The client reconnects to a server that was silent for this long.
 const SILENCE_NS: i64 = 2_000 * MS;
-/// A server that answers but sent no frame for this long is connected to anew as well.
+/// The client also reconnects to a server that answers but sent no frame for this long.
 const STARVED_NS: i64 = 1_000 * MS;
-/// A port that frames come from is held until it has been silent for this long; only then may another port take its place.
+/// A learned port is kept until it has been silent for this long; only then may another port replace it.
 const HOLD_PORT_NS: i64 = STARVED_NS;
-/// A port that is neither the command port nor a data port may send frames once these two have been silent for this long.
+/// If the command port and the data ports have sent no frame for this long, the client may accept frames from one other
+/// port.
 const LEARN_PORT_AFTER_NS: i64 = 300 * MS;
 /// Distinct refused ports remembered for the report.
 const MAX_STRANGE_PORTS: usize = 8;
 /// Distinct unknown body numbers remembered for the report.
 const MAX_STRANGERS: usize = 16;
 
-/// How to reach a NatNet server.
+/// Configuration of a NatNet client.
 #[derive(Clone, Debug)]
 pub struct NatNetConfig {
-    /// Address of the server; datagrams from elsewhere are dropped, and so are those from other ports of this address than the
-    /// server sends from (`docs/TRACKERS.md` has the rule).
+    /// Address of the server. Datagrams from elsewhere are dropped, and so are those from ports of this address that
+    /// the server does not send from (`docs/TRACKERS.md` has the rule).
     pub server: Ipv4Addr,
     /// Address of the interface to use; unspecified lets the system choose.
     pub local: Ipv4Addr,
@@ -49,10 +50,10 @@ pub struct NatNetConfig {
     pub command_port: u16,
     /// Port for frames, 1511 by convention.
     pub data_port: u16,
-    /// Bit stream to ask for; `None` takes what the server speaks. Unicast only, servers from 4.0.
+    /// Bit stream to request; `None` takes the server's. Unicast only, servers from 4.0.
     pub bitstream: Option<Version>,
-    /// Take arrival times from the kernel's stamps. Off when the host's clock is not this machine's (a virtual clock), whose
-    /// relation to the stamps means nothing; arrival is then the time of the poll.
+    /// Take arrival times from the kernel's stamps. Must be off if the host's clock is a virtual clock, which has no
+    /// relation to the stamps; the time of arrival is then the time of the poll.
     pub kernel_stamps: bool,
     /// The rig's bodies.
     pub bodies: Vec<BodyKey>,
@@ -74,7 +75,7 @@ impl NatNetConfig {
     }
 }
 
-/// Why no pose comes.
+/// Why no pose arrives.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub enum Silence {
     /// The server never answered.
@@ -83,13 +84,13 @@ pub enum Silence {
     Version(Version),
     /// The server answered once and then fell silent.
     WentSilent,
-    /// The server answers but no frame has come.
+    /// The server answers but no frame has arrived.
     NoFrames,
-    /// Frames come but none can be read.
+    /// Frames arrive but none can be read.
     Unreadable,
-    /// Frames come without any of the rig's bodies.
+    /// Frames arrive without any of the rig's bodies.
     NoKnownBody,
-    /// The bodies come, marked as not tracked.
+    /// The bodies arrive, marked as not tracked.
     NotTracked,
 }
 
@@ -98,18 +99,18 @@ pub struct NatNetClient {
     config: NatNetConfig,
     clock: Arc<dyn HostClock>,
     command: UdpPort,
-    /// Group socket, or the conventional unicast data port where it could be bound.
+    /// Group socket, or the conventional unicast data port if it could be bound.
     data: Option<UdpPort>,
     data_problem: Option<String>,
     gate: SampleGate,
     server: Option<msg::ServerInfo>,
     /// Version that the server announced last.
     announced: Option<Version>,
-    /// Version that frames are read as. It has the layout of the frames, whatever was announced.
+    /// Version that frames are decoded as. It has the layout of the frames, whatever was announced.
     version: Version,
     /// Whether the frame read last had section sizes.
     sized_frames: Option<bool>,
-    /// The server was asked anew what it speaks, because its frames contradict what it announced.
+    /// The server was asked again for its version, because its frames contradict the announced one.
     is_contradiction_asked: bool,
     /// Port other than the command port and the data ports that the server sends frames from, and the last frame from it.
     learned_port: Option<(u16, HostTime)>,
@@ -126,18 +127,18 @@ pub struct NatNetClient {
     server_clock: ServerClock,
     due: Due,
     heard_at: Option<HostTime>,
-    /// Last frame, or last connection where none came since.
+    /// Last frame, or last connection if none arrived since.
     frame_at: HostTime,
     frames: u64,
     connects_sent: u64,
     version_changes: u64,
     is_filtered: bool,
-    /// Bit stream asked for and not answered yet.
+    /// Bit stream that was requested and is not confirmed yet.
     asked: Option<Version>,
     refused: Option<Version>,
 }
 
-/// When to send what next.
+/// When to send each kind of message next.
 #[derive(Clone, Copy)]
 struct Due {
     connect: HostTime,
@@ -149,7 +150,7 @@ impl NatNetClient {
     /// Most datagrams read in one poll; more wait for the next.
     pub const MAX_DATAGRAMS_PER_POLL: usize = 64;
 
-    /// Opens the sockets; the server is looked for by polling. `clock` is the host's clock, the one `poll` is called with.
+    /// Opens the sockets; polling finds the server. `clock` is the host's clock, the one `poll` is called with.
     pub fn open(config: NatNetConfig, clock: Arc<dyn HostClock>) -> Result<Self, TrackerError> {
         let failed = |context: String| move |source| TrackerError::Io { context, source };
         let local = SocketAddrV4::new(config.local, 0);
@@ -175,7 +176,8 @@ impl NatNetClient {
                 )))?;
                 Some(port)
             }
-            // Servers differ in where they send unicast frames: to the socket that connected, or to the data port. Both are heard.
+            // Servers send unicast frames either to the socket that connected or to the data port. The client listens
+            // on both.
             None => match UdpPort::bind(SocketAddrV4::new(config.local, config.data_port), false) {
                 Ok(port) => Some(port),
                 Err(e) => {
@@ -226,22 +228,22 @@ impl NatNetClient {
         })
     }
 
-    /// What became of all that arrived.
+    /// Counters of all input, by outcome.
     pub fn counters(&self) -> &TrackerCounters {
         self.gate.counters()
     }
 
-    /// What the server said of itself, once it has.
+    /// The server's information, once it has arrived.
     pub fn server(&self) -> Option<&msg::ServerInfo> {
         self.server.as_ref()
     }
 
-    /// Version that frames are read as.
+    /// Version that frames are decoded as.
     pub fn version(&self) -> Version {
         self.version
     }
 
-    /// The version that the server announces, where its frames have the layout of another one.
+    /// The version that the server announces, if its frames have the layout of another one.
     pub fn contradicted(&self) -> Option<Version> {
         let (announced, sized) = (self.announced?, self.sized_frames?);
         (announced.has_section_sizes() != sized).then_some(announced)
@@ -262,7 +264,7 @@ impl NatNetClient {
         self.command.local().map_or(0, |a| a.port())
     }
 
-    /// Why no pose comes; `None` while poses come.
+    /// Why no pose arrives; `None` while poses arrive.
     pub fn silence(&self) -> Option<Silence> {
         let c = self.gate.counters();
         let quiet = self.heard_at.is_some_and(|h| self.clock.now().ns_since(h) > SILENCE_NS);
@@ -300,7 +302,7 @@ impl NatNetClient {
         if self.heard_at.is_some_and(|h| now.ns_since(h) > SILENCE_NS) && self.server.is_some() {
             self.forget_server(now);
         }
-        // A server that answers but sends no frames may have been restarted and forgotten this client.
+        // A server that answers but sends no frames may have restarted and lost this client.
         let starved = now.ns_since(self.frame_at) > STARVED_NS;
         if now >= self.due.connect && (self.server.is_none() || starved) {
             self.frame_at = now;
@@ -320,7 +322,7 @@ impl NatNetClient {
             self.send(port);
         }
         if self.server_clock.is_due(now) {
-            // The stamp is taken as late as possible: what lies between it and the wire counts as round trip.
+            // The stamp is taken as late as possible: the time between it and the wire counts as round trip.
             let t1 = self.clock.now();
             self.server_clock.note_sent(t1);
             msg::encode_echo_request(&mut self.out, t1.0 as u64);
@@ -351,12 +353,12 @@ impl NatNetClient {
         self.due = Due { connect: now, keep_alive: now, models: now };
     }
 
-    /// True while the server has not told its names.
+    /// True while the server has not sent its names.
     fn is_name_missing(&self) -> bool {
         self.models.is_empty()
     }
 
-    /// Bodies by the server's names where it knows them, by the rig file's numbers otherwise.
+    /// Finds bodies by the server's names if it sends them, else by the rig file's numbers.
     fn rebuild_lookup(&mut self) {
         self.lookup.clear();
         for (i, body) in self.config.bodies.iter().enumerate() {
@@ -418,9 +420,9 @@ impl NatNetClient {
         port != 0 && [self.config.command_port, self.config.data_port, announced].contains(&port)
     }
 
-    /// Whether a datagram from `port` of the server's address counts as the server's. Answers come from the command port alone. Frames
-    /// come from the command port or a data port; from one other port, learned from its first frame and held until it falls silent,
-    /// only while those send none.
+    /// Whether a datagram from `port` of the server's address counts as the server's. Answers come from the command
+    /// port alone. Frames come from the command port or a data port. While those send none, frames may come from one
+    /// other port, which is learned from its first frame and kept until it falls silent.
     fn may_send(&self, port: u16, is_frame: bool, at: HostTime) -> bool {
         if port == self.config.command_port || is_frame && self.is_trusted(port) {
             return true;
@@ -439,8 +441,8 @@ impl NatNetClient {
         match message {
             id::FRAME => self.on_frame(payload, at, sink),
             id::SERVER_INFO => self.on_server_info(payload, at),
-            // Which version the names are laid out in is a question of its own: a server that announces one version and sends frames
-            // of another may use either for them.
+            // The layout of the names is a separate question: a server that announces one version and sends frames of
+            // another may use either for its names.
             id::MODEL_DEF => match decode_models_that_fit(payload, self.version) {
                 Ok((models, _)) => {
                     self.models = models;
@@ -475,7 +477,8 @@ impl NatNetClient {
             self.version_changes += 1;
         }
         self.announced = Some(said);
-        // Frames are the better witness of their own layout: a server that says again what its frames contradict is not believed.
+        // The frames show their layout reliably: if the server again announces a version that its frames contradict,
+        // the client ignores it.
         if is_news || self.sized_frames.is_none_or(|sized| sized == said.has_section_sizes()) {
             self.version = said;
         }
@@ -502,7 +505,7 @@ impl NatNetClient {
         }
     }
 
-    /// The answer to a request; 0 means that the bit stream asked for comes from now on.
+    /// The answer to a request; 0 means that the requested bit stream follows from now on.
     fn on_response(&mut self, payload: &[u8], at: HostTime) -> Verdict {
         if let (Some(version), [0, 0, 0, 0]) = (self.asked.take(), payload) {
             self.version = version;
@@ -516,13 +519,15 @@ impl NatNetClient {
         let mut bodies = std::mem::take(&mut self.frame);
         let mut info = decode_frame(payload, self.version, &mut bodies);
         if info.is_err() {
-            // Frames have two layouts, with and without section sizes. If the other one fits, the stream was switched under us.
+            // Frames have two layouts, with and without section sizes. If the other one fits, the server switched the
+            // stream.
             let other = self.other_layout();
             info = decode_frame(payload, other, &mut bodies);
             if info.is_ok() {
                 self.version = other;
                 self.version_changes += u64::from(self.server.is_some());
-                // Ask once what the server speaks now. If it announces again what the frames contradict, the frames are followed.
+                // Ask once for the server's present version. If it again announces a version that the frames
+                // contradict, the client follows the frames.
                 if !std::mem::replace(&mut self.is_contradiction_asked, true) || at >= self.due.connect {
                     self.connect(at);
                 }
@@ -544,14 +549,14 @@ impl NatNetClient {
         verdict
     }
 
-    /// A version whose frames have the layout that the present one does not have: the announced one, where it does.
+    /// A version whose frames have the layout that the present one does not have: the announced one, if it does.
     fn other_layout(&self) -> Version {
         let sized = !self.version.has_section_sizes();
         let plain = if sized { Version::V4_1 } else { Version::V4_0 };
         self.announced.filter(|v| v.has_section_sizes() == sized).unwrap_or(plain)
     }
 
-    /// What a frame says besides poses.
+    /// Handles the flags of a frame.
     fn heed(&mut self, info: &FrameInfo, at: HostTime) {
         if info.params & FrameInfo::MODELS_CHANGED != 0 && at >= self.due.models {
             self.due.models = at.plus_ns(MODELS_EVERY_NS);
@@ -634,7 +639,7 @@ impl Tracker for NatNetClient {
                     Some(stamp) => {
                         let offset = *offset.get_or_insert_with(|| realtime_offset_ns(&*self.clock));
                         let stamped = HostTime(stamp.saturating_add(offset)).min(here);
-                        // A stamp from long ago is a stepped wall clock, not an arrival.
+                        // A very old stamp comes from a stepped wall clock, not from the arrival.
                         if here.ns_since(stamped) > 10_000 * MS {
                             here
                         } else {
@@ -646,19 +651,19 @@ impl Tracker for NatNetClient {
                 let frames = self.frames;
                 delivered += self.take_in(arrival, at, sink);
                 if !is_data && self.frames > frames {
-                    // This server streams to the command socket; what it may also send to the data port would only be copies.
+                    // This server streams to the command socket; frames on the data port would only be copies.
                     self.data = None;
                 }
             }
         }
         if is_crowded && before != foreign(self.gate.counters()) && !self.is_filtered {
-            // Strangers fill the queue: let the kernel throw them away from now on, uncounted.
+            // Other senders fill the queue: let the kernel drop their datagrams from now on, uncounted.
             self.is_filtered = true;
             let announced = self.server.as_ref().map_or(0, |s| s.data_port);
             let learned = self.learned_port.map_or(0, |(port, _)| port);
             let mut ports = [self.config.command_port, self.config.data_port, announced, learned];
             if before.1 == self.gate.counters().packets.foreign_port {
-                // All of them have other addresses; the port from which this server sends frames may still have to be learned.
+                // All of them have other addresses; this server's port for frames may still have to be learned.
                 ports = [0; 4];
             }
             let count = ports.iter().take_while(|p| **p != 0).count();
@@ -682,7 +687,7 @@ impl Tracker for NatNetClient {
     }
 }
 
-/// What [`super::report`] needs to know and nobody else.
+/// The internal state for [`super::report`].
 pub(super) struct Inside<'a> {
     pub config: &'a NatNetConfig,
     pub strangers: &'a [i32],

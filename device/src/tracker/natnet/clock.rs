@@ -1,4 +1,4 @@
-//! Echoes and frame stamps of a NatNet server into capture times on the host's clock.
+//! Computes capture times on the host's clock from echoes and frame stamps of a NatNet server.
 
 use super::frame::FrameInfo;
 use crate::clock_map::{ClockMap, ExchangeOutcome};
@@ -9,9 +9,9 @@ const MS: i64 = 1_000_000;
 const QUICK_PROBES: u32 = 20;
 const QUICK_PROBE_EVERY_NS: i64 = 5 * MS;
 const PROBE_EVERY_NS: i64 = 100 * MS;
-/// A transmission that seems to have taken longer than this means that the server's clock stepped.
+/// A transmission time above this means that the server's clock stepped.
 const WORST_TRANSPORT_NS: i64 = 500 * MS;
-/// A server's own latency above this is no latency but a stamp of something else.
+/// A server's own latency above this is implausible: the stamp means something else.
 const WORST_LATENCY_NS: i64 = 1_000 * MS;
 
 /// The clock of the server that a client is connected to.
@@ -55,7 +55,7 @@ impl ServerClock {
         self.doubts
     }
 
-    /// The server told the rate of its clock; 0 means that it has none.
+    /// Sets the rate of the server's clock; 0 means that it has none.
     pub(super) fn set_rate(&mut self, hz: u64, at: HostTime) {
         if hz != self.hz || self.map.is_none() {
             self.hz = hz;
@@ -63,7 +63,7 @@ impl ServerClock {
         }
     }
 
-    /// The server is gone: what comes back may be another.
+    /// The server is gone: the next one may be another.
     pub(super) fn forget(&mut self) {
         self.hz = 0;
         self.map = None;
@@ -75,12 +75,12 @@ impl ServerClock {
         (self.sent, self.due) = (0, at);
     }
 
-    /// True when an echo request is to be sent at `now`; [`ServerClock::note_sent`] must follow.
+    /// True when an echo request is due at `now`; [`ServerClock::note_sent`] must follow.
     pub(super) fn is_due(&self, now: HostTime) -> bool {
         self.map.is_some() && now >= self.due
     }
 
-    /// An echo request stamped `t1` is under way.
+    /// Notes that an echo request stamped `t1` was sent.
     pub(super) fn note_sent(&mut self, t1: HostTime) {
         let quick = self.sent < QUICK_PROBES;
         self.due = t1.plus_ns(if quick { QUICK_PROBE_EVERY_NS } else { PROBE_EVERY_NS });
@@ -89,8 +89,7 @@ impl ServerClock {
         self.next = (self.next + 1) % self.under_way.len();
     }
 
-    /// Takes in an answer; false when it answers no question of ours, or answers one again: an old or invented answer must not
-    /// move the clock.
+    /// Adds an answer; false if it matches no pending request: an old or forged answer must not move the clock.
     pub(super) fn on_echo(&mut self, stamp: u64, ticks: u64, at: HostTime) -> bool {
         let t1 = stamp as i64;
         let Some(slot) = self.under_way.iter_mut().find(|s| **s == Some(t1)) else {
@@ -102,15 +101,15 @@ impl ServerClock {
             let ticks = DeviceTicks(ticks);
             let outcome = map.add_exchange(HostTime(t1), ticks, ticks, at);
             if matches!(outcome, ExchangeOutcome::Contradicting | ExchangeOutcome::Stepped) {
-                // Find out quickly whether the clock stepped, and fill the new window quickly.
+                // Send echoes quickly, to find out whether the clock stepped and to fill the new window.
                 (self.sent, self.due) = (0, at);
             }
         }
         true
     }
 
-    /// Middle of the exposure of a frame that arrived `at`: through the map where there is one, otherwise arrival less the server's
-    /// own latency, which leaves out only the way through the network.
+    /// Middle of the exposure of a frame that arrived `at`: through the map if there is one, otherwise arrival less the
+    /// server's own latency, which leaves out only the network delay.
     pub(super) fn captured_at(&mut self, info: &FrameInfo, at: HostTime) -> HostTime {
         let has_stamps = info.mid_exposure != 0 && info.transmit >= info.mid_exposure && self.hz > 0;
         if !has_stamps {
@@ -125,7 +124,7 @@ impl ServerClock {
         else {
             return plain;
         };
-        // Sent after it arrived, or half a second under way: the server's clock is not what it was. Start its map anew.
+        // Sent after it arrived, or half a second in transit: the server's clock has changed. Restart its map.
         let transport_ns = at.ns_since(sent.at);
         if transport_ns < -sent.uncertainty_ns - MS || transport_ns > WORST_TRANSPORT_NS {
             self.doubts += 1;

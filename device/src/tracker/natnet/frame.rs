@@ -1,4 +1,4 @@
-//! A frame-of-data payload into rigid bodies and stamps, and back.
+//! Decodes and encodes frame-of-data payloads: rigid bodies and stamps.
 
 use super::wire::{begin, finish, id, Reader, Version, WireError};
 
@@ -18,7 +18,7 @@ pub struct RigidBody {
 }
 
 impl RigidBody {
-    /// Bytes on the wire in all versions spoken.
+    /// Bytes on the wire in all supported versions.
     pub const BYTES: usize = 38;
 
     /// True when the body was seen in this frame.
@@ -51,7 +51,7 @@ pub struct FrameInfo {
 impl FrameInfo {
     /// Bit of `params`: the server is recording.
     pub const RECORDING: u16 = 1;
-    /// Bit of `params`: model definitions changed, ask again.
+    /// Bit of `params`: model definitions changed, request them again.
     pub const MODELS_CHANGED: u16 = 2;
     /// Bit of `params`: live (set) or edit mode.
     pub const LIVE: u16 = 4;
@@ -74,7 +74,7 @@ pub struct LabeledMarker {
     pub residual: f32,
 }
 
-/// What the mock server puts into a frame.
+/// Content of a frame of the mock server.
 #[derive(Clone, Copy, Debug, Default)]
 pub struct FrameContent<'a> {
     /// Names and markers of the marker sets.
@@ -157,7 +157,8 @@ fn items(r: &mut Reader<'_>, what: &'static str, bytes: usize) -> Result<(), Wir
     r.take(n * bytes, what).map(drop)
 }
 
-/// Steps over one section: by its size where the version gives one (so unknown content does not matter), item by item otherwise.
+/// Skips one section: by its size if the version gives one (so unknown content does not matter), item by item
+/// otherwise.
 fn section<'a>(
     r: &mut Reader<'a>,
     version: Version,
@@ -166,7 +167,7 @@ fn section<'a>(
     mut item: impl FnMut(&mut Reader<'a>) -> Result<(), WireError>,
 ) -> Result<(), WireError> {
     if version.has_section_sizes() {
-        // Items of later versions may be of any size, so the count is only required not to be negative.
+        // Items of later versions may have any size, so the count is only required not to be negative.
         let at = r.at();
         let count = r.i32(what)?;
         if count < 0 {

@@ -1,4 +1,5 @@
-//! Every NatNet message against bytes written by hand from the layout, in both directions, and against bytes that lie.
+//! Compares every NatNet message with bytes written by hand from the layout, in both directions, and with inconsistent
+//! bytes.
 
 use super::frame::*;
 use super::messages::*;
@@ -6,7 +7,7 @@ use super::models::*;
 use super::wire::*;
 use proptest::prelude::*;
 
-/// Bytes of a text of hexadecimal pairs; blanks and line breaks are for the eye.
+/// Decodes a text of hexadecimal pairs; ignores blanks and line breaks.
 fn hex(text: &str) -> Vec<u8> {
     let digits: Vec<u8> = text.bytes().filter(|b| !b.is_ascii_whitespace()).collect();
     digits.chunks(2).map(|d| u8::from_str_radix(std::str::from_utf8(d).unwrap(), 16).unwrap()).collect()
@@ -202,7 +203,7 @@ fn every_truncation_and_every_extra_byte_is_an_error() {
 #[test]
 fn server_information() {
     let mut payload = b"Motive".to_vec();
-    // Motive leaves old bytes behind the zero.
+    // Motive leaves old bytes after the zero.
     payload.extend_from_slice(b"\0stale");
     payload.resize(256, 0);
     payload.extend(hex("03010002 04020000 809698 0000000000 e705 01 efff2a63"));

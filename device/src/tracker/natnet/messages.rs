@@ -1,4 +1,4 @@
-//! The conversation around the frames: connecting, server information, echo, requests, keep-alive.
+//! The messages besides frames: connecting, server information, echo, requests, keep-alive.
 
 use super::wire::{begin, finish, id, Reader, Version, WireError};
 
@@ -7,16 +7,16 @@ pub const NAME_BYTES: usize = 256;
 /// Payload of a server-information message since NatNet 3.0.
 pub const SERVER_INFO_BYTES: usize = 279;
 
-/// What a server says of itself.
+/// Information about a server.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct ServerInfo {
-    /// Name of the program, up to its first zero (Motive leaves stale bytes behind it).
+    /// Name of the program, up to its first zero (Motive leaves stale bytes after it).
     pub name: String,
     /// Version of the program.
     pub app_version: [u8; 4],
     /// Version of the bit stream: `major, minor, build, revision`.
     pub natnet_version: [u8; 4],
-    /// Rate of the clock behind mid-exposure and echo stamps, ticks per second. 0 when the server does not say.
+    /// Rate of the clock of the mid-exposure and echo stamps, ticks per second. 0 if the server does not say.
     pub clock_hz: u64,
     /// Port of the frames.
     pub data_port: u16,
@@ -25,7 +25,7 @@ pub struct ServerInfo {
 }
 
 impl ServerInfo {
-    /// Reads a server-information payload. Servers before 3.0 send fewer bytes; they are told apart by their version.
+    /// Reads a server-information payload. Servers before 3.0 send fewer bytes; their version distinguishes them.
     pub fn decode(payload: &[u8]) -> Result<Self, WireError> {
         let mut r = Reader::new(payload);
         let name = r.take(NAME_BYTES, "server name")?;
@@ -71,17 +71,17 @@ impl ServerInfo {
     }
 }
 
-/// What a client says when it connects. Clients in the wild send nothing, `Ping\0`, 264 or 270 bytes.
+/// A client's connect message. Clients in the field send nothing, `Ping\0`, 264 or 270 bytes.
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
 pub struct Connect {
     /// Name of the program, empty when it gives none.
     pub name: String,
-    /// Bit stream that it asks for (270-byte form only).
+    /// Requested bit stream (270-byte form only).
     pub bitstream: Option<Version>,
 }
 
 impl Connect {
-    /// Reads any of the four forms; what is shorter than 264 bytes has no content.
+    /// Reads any of the four forms; a message shorter than 264 bytes has no content.
     pub fn decode(payload: &[u8]) -> Self {
         if payload.len() < 264 {
             return Self::default();

@@ -1,8 +1,8 @@
-//! OptiTrack NatNet 3.0 to 4.2 over UDP: datagrams into samples, and (for the mock server) samples into datagrams.
+//! OptiTrack NatNet 3.0 to 4.2 over UDP: decodes datagrams into samples, and (for the mock server) encodes samples as
+//! datagrams.
 //!
-//! The layout is little-endian and unframed; what is known about it, and from where, stands in `docs/TRACKERS.md`.
-//! [`wire`] reads and writes single values, [`messages`] the handshake, [`frame`] poses, [`models`] names; [`client`] holds the
-//! conversation.
+//! The layout is little-endian and unframed; `docs/TRACKERS.md` describes the client's rules. [`wire`] reads and writes
+//! single values, [`messages`] the handshake, [`frame`] poses, [`models`] names; [`client`] runs the protocol.
 
 pub mod frame;
 pub mod messages;

@@ -1,9 +1,9 @@
-//! A model-definition payload into names and streaming numbers of rigid bodies, and back.
+//! Decodes and encodes model-definition payloads: names and streaming numbers of rigid bodies.
 
 use super::frame::put_floats;
 use super::wire::{begin, finish, id, Reader, Version, WireError};
 
-/// Most rigid bodies remembered from one message.
+/// Maximum number of rigid bodies kept from one message.
 pub const MAX_MODELS: usize = 1024;
 
 /// Name and number of a rigid body.
@@ -25,15 +25,15 @@ mod kind {
     pub(super) const CAMERA: i32 = 5;
 }
 
-/// The rigid bodies that a model-definition payload of `version` names, in its order. Later ones with a number that was already
-/// named are kept too: the caller decides about ambiguity.
+/// The rigid bodies in a model-definition payload of `version`, in its order. A later body with a number that was
+/// already used is kept too: the caller resolves the ambiguity.
 pub fn decode_models(payload: &[u8], version: Version) -> Result<Vec<BodyModel>, WireError> {
     read_models(payload, version).map(|(models, _)| models)
 }
 
-/// The rigid bodies of a model-definition payload, read in the layout that its bytes fit without a rest, and a version that has this
-/// layout. A server may announce one version and send another, so `first`, the version that is tried first, is only a guess. If no
-/// layout fits without a rest, the payload is read as `first`.
+/// The rigid bodies of a model-definition payload, read in the layout that its bytes fit without a remainder, and a
+/// version that has this layout. A server may announce one version and send another, so `first`, the version that is
+/// tried first, is only a guess. If no layout fits without a remainder, the payload is read as `first`.
 ///
 /// # Errors
 /// Those of [`decode_models`] for `first`.
@@ -106,7 +106,7 @@ fn read_models(payload: &[u8], version: Version) -> Result<(Vec<BodyModel>, bool
                 r.text("camera name")?;
                 r.take(4 * 7, "camera pose")?;
             }
-            // Without a size there is no way over an unknown definition; what came before it still counts.
+            // Without a size an unknown definition cannot be skipped; earlier definitions still count.
             _ => break,
         }
     }
@@ -140,7 +140,7 @@ fn rigid_body(r: &mut Reader<'_>, version: Version) -> Result<BodyModel, WireErr
     Ok(BodyModel { name, id })
 }
 
-/// A rigid body as the mock server describes it.
+/// A rigid body of the mock server.
 #[derive(Clone, Copy, Debug)]
 pub struct BodyDefinition<'a> {
     /// Name.

@@ -1,10 +1,10 @@
-//! The state of a NatNet client into one line for people: what works, or why nothing comes and what to try.
+//! Describes the state of a NatNet client in one line for people: what works, or why no pose arrives and what to try.
 
 use super::client::{NatNetClient, Silence};
 use std::fmt::Write;
 use std::net::Ipv4Addr;
 
-/// The line behind [`crate::tracker::Tracker::status`].
+/// The text of [`crate::tracker::Tracker::status`].
 pub(super) fn status(client: &NatNetClient) -> String {
     let inside = client.inside();
     let mut text = match client.server() {
@@ -65,7 +65,7 @@ fn refused_ports(client: &NatNetClient) -> Option<String> {
     })
 }
 
-/// What is behind [`crate::tracker::Tracker::warning`].
+/// The text of [`crate::tracker::Tracker::warning`].
 pub(super) fn warning(client: &NatNetClient) -> Option<String> {
     let mut all: Vec<String> = refused_ports(client).into_iter().collect();
     let elsewhere = client.counters().packets.foreign_source;

@@ -1,4 +1,4 @@
-//! Bytes into little-endian values and back, never past the end, never allocating on the word of a count.
+//! Reads and writes little-endian values, never past the end, and never allocates according to an unchecked count.
 
 use core::fmt;
 
@@ -12,13 +12,13 @@ pub struct Version {
 }
 
 impl Version {
-    /// Oldest version spoken.
+    /// Oldest supported version.
     pub const V3_0: Self = Self::new(3, 0);
-    /// First version with marker names in the model definitions and a bit stream that can be chosen.
+    /// First version with marker names in the model definitions and a selectable bit stream.
     pub const V4_0: Self = Self::new(4, 0);
     /// First version that gives each section its size in bytes.
     pub const V4_1: Self = Self::new(4, 1);
-    /// Newest version spoken.
+    /// Newest supported version.
     pub const V4_2: Self = Self::new(4, 2);
 
     /// `major.minor`.
@@ -26,7 +26,7 @@ impl Version {
         Self { major, minor }
     }
 
-    /// True for versions whose layout is known, and for later 4.x, whose sections can be skipped by size.
+    /// True for versions with a known layout, and for later 4.x versions, whose sections can be skipped by size.
     pub const fn is_spoken(self) -> bool {
         self.major == 3 || self.major == 4
     }
@@ -43,7 +43,7 @@ impl fmt::Display for Version {
     }
 }
 
-/// Why bytes are not what they claim to be. Offsets count from the start of the payload.
+/// Errors of decoding. Offsets count from the start of the payload.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, thiserror::Error)]
 pub enum WireError {
     /// The bytes end inside a value.
@@ -100,13 +100,13 @@ pub enum WireError {
         /// Bytes after the header.
         actual: usize,
     },
-    /// The word that ends a frame is missing: the frame has another layout than its version says.
+    /// The word that ends a frame is missing: the frame has another layout than that of its version.
     #[error("the frame does not end where version {version} says it does")]
     End {
-        /// The version the frame was read as.
+        /// The version that the frame was decoded as.
         version: Version,
     },
-    /// A version of which the layout is not known.
+    /// A version with an unknown layout.
     #[error("NatNet {0} is not spoken; 3.0 to 4.2 are")]
     Version(Version),
 }
@@ -122,7 +122,7 @@ impl<'a> Reader<'a> {
     /// Longest text accepted, its zero included.
     pub const MAX_TEXT: usize = 256;
 
-    /// At the start of `bytes`.
+    /// A cursor at the start of `bytes`.
     pub const fn new(bytes: &'a [u8]) -> Self {
         Self { bytes, at: 0 }
     }
@@ -191,7 +191,7 @@ impl<'a> Reader<'a> {
         Ok(out)
     }
 
-    /// A text up to and over its zero, without it.
+    /// Reads a text and its zero; returns it without the zero.
     pub fn text(&mut self, what: &'static str) -> Result<&'a [u8], WireError> {
         let rest = &self.bytes[self.at..];
         let window = &rest[..rest.len().min(Self::MAX_TEXT)];
@@ -200,7 +200,7 @@ impl<'a> Reader<'a> {
         Ok(&rest[..end])
     }
 
-    /// A count of items of at least `least_bytes` each, checked against what is left.
+    /// A count of items of at least `least_bytes` each, checked against the remaining bytes.
     pub fn count(&mut self, what: &'static str, least_bytes: usize) -> Result<usize, WireError> {
         let at = self.at;
         let count = self.i32(what)?;
@@ -210,7 +210,7 @@ impl<'a> Reader<'a> {
         }
     }
 
-    /// A size in bytes, checked against what is left.
+    /// A size in bytes, checked against the remaining bytes.
     pub fn size(&mut self, what: &'static str) -> Result<usize, WireError> {
         self.count(what, 1)
     }
@@ -242,7 +242,8 @@ pub const HEADER_BYTES: usize = 4;
 /// Largest datagram over IPv4.
 pub const MAX_DATAGRAM: usize = 65_507;
 
-/// Message number and payload of a datagram. Trailing bytes beyond the announced length are refused, as a datagram cut short is.
+/// Message number and payload of a datagram. Trailing bytes beyond the announced length are refused, and so is a
+/// truncated datagram.
 pub fn split(datagram: &[u8]) -> Result<(u16, &[u8]), WireError> {
     let mut r = Reader::new(datagram);
     let id = r.u16("message number")?;

@@ -1,5 +1,5 @@
-//! A serial port into samples: opens, listens, keeps the clock by echo, and opens again after an unplug, all inside
-//! [`Tracker::poll`], which never waits.
+//! The serial tracker: opens the port, reads samples, maps the clock by echoes, and reopens after an unplug, all inside
+//! [`Tracker::poll`], which never blocks.
 
 use super::wire::{SerialMessage, MAX_PACKET, VERSION};
 use crate::clock_map::{ClockMap, ExchangeOutcome};
@@ -13,27 +13,28 @@ use std::io::ErrorKind;
 use std::sync::Arc;
 
 const MS: i64 = 1_000_000;
-/// Between two attempts to open the port.
+/// Interval between attempts to open the port.
 const RETRY_EVERY_NS: i64 = 200 * MS;
 /// Bytes read in one poll: 90 ms of 921,600 baud, so a backlog is gone in a few polls.
 const MAX_BYTES_PER_POLL: usize = 8192;
 const QUICK_ECHOES: u32 = 20;
 const QUICK_ECHO_EVERY_NS: i64 = 10 * MS;
 const ECHO_EVERY_NS: i64 = 200 * MS;
-/// Samples are handed out once an echo came back within this time. What had waited in the port when it was opened (the kernel keeps
-/// more than can be thrown away) lies before the answer to the first echo, and delays it.
+/// Samples are passed on once an echo came back within this time. Bytes that had waited in the port when it was opened
+/// (the kernel keeps more than can be flushed) precede the answer to the first echo, and delay it.
 const SETTLED_ROUND_TRIP_NS: i64 = 50 * MS;
-/// A device that answers no echo is believed this long after the port was opened, as soon as the port is empty.
+/// If a device answers no echo, its samples are accepted this long after the port was opened, as soon as the port is
+/// empty.
 const SETTLED_AFTER_NS: i64 = 300 * MS;
 
-/// Which port, how fast, which bodies.
+/// Configuration of a serial tracker.
 #[derive(Clone, Debug)]
 pub struct SerialTrackerConfig {
     /// Device file.
     pub port: String,
-    /// Bits per second; means nothing to USB serial ports and pseudo-terminals.
+    /// Bits per second; irrelevant for USB serial ports and pseudo-terminals.
     pub baud: u32,
-    /// The rig's bodies: a body's `id` is its number on the wire, its place in the list where it has none.
+    /// The rig's bodies: a body's `id` is its number on the wire; without one its index in the list is.
     pub bodies: Vec<BodyKey>,
 }
 
@@ -59,7 +60,7 @@ pub struct SerialTracker {
     echoes: u32,
     opened: u64,
     opened_at: HostTime,
-    /// No sample that waited in the port can come any more.
+    /// No sample that waited in the port can arrive any more.
     is_settled: bool,
     problem: Option<String>,
 }
@@ -90,7 +91,7 @@ impl SerialTracker {
         })
     }
 
-    /// What became of all that arrived.
+    /// Counters of all input, by outcome.
     pub fn counters(&self) -> &TrackerCounters {
         self.gate.counters()
     }
@@ -108,10 +109,11 @@ impl SerialTracker {
     fn start_opening(&self, now: HostTime) -> State {
         let (send, receive) = crossbeam::channel::bounded(1);
         let (port, baud) = (self.config.port.clone(), self.config.baud);
-        // Opening a port can wait for its driver; one attempt at a time, elsewhere. Zero time-out: reads and writes never wait.
+        // Opening a port can block in its driver, so a helper thread does it, one attempt at a time. Zero timeout:
+        // reads and writes never block.
         let spawned = std::thread::Builder::new().name("serial-open".into()).spawn(move || {
             let opened = crate::tty::open(&port, baud);
-            // Nobody waits any more when the tracker was dropped; the port closes again.
+            // If the tracker was dropped, nobody receives this, and the port closes again.
             let _ = send.send(opened);
         });
         match spawned {
@@ -254,7 +256,7 @@ impl SerialTracker {
     }
 
     fn on_echo(&mut self, token: u64, ticks: u64, at: HostTime) -> Result<(), bool> {
-        // Only the answer to the question just asked; anything else is not evidence.
+        // Accept only the answer to the pending request; anything else proves nothing.
         let Some(t1) = self.echo_sent.filter(|t| t.0 as u64 == token) else { return Err(false) };
         self.echo_sent = None;
         self.is_settled |= at.ns_since(t1) <= SETTLED_ROUND_TRIP_NS;
@@ -270,7 +272,7 @@ impl SerialTracker {
 
     fn captured_at(&self, ticks: u64, at: HostTime) -> HostTime {
         let mapped = self.clock_map().and_then(|m| m.to_host(DeviceTicks(ticks)));
-        // A second on a serial line is a clock that stepped, not a transmission.
+        // A transmission time of a second means that the clock stepped.
         mapped.filter(|m| at.ns_since(m.at) < 1_000 * MS).map_or(at, |m| m.at.min(at))
     }
 
@@ -281,11 +283,11 @@ impl SerialTracker {
         }
         let State::Open(port) = &mut self.state else { return };
         if self.map.is_none() {
-            // The rate of the device's clock comes first.
+            // The rate of the device's clock must be known first.
             self.echo_due = now.plus_ns(ECHO_EVERY_NS);
             self.out.clear();
             SerialMessage::HelloRequest.encode(&mut self.out);
-            // Lost or not, the next one is due soon.
+            // If it is lost, the next one follows soon.
             let _ = port.write(&self.out);
             return;
         }
@@ -295,7 +297,7 @@ impl SerialTracker {
         self.out.clear();
         let t1 = self.clock.now();
         SerialMessage::EchoRequest { token: t1.0 as u64 }.encode(&mut self.out);
-        // A line that cannot take 16 bytes now gets none; half a request is noise that the device steps over.
+        // If the line cannot take 16 bytes now, send none; half a request is noise that the device skips.
         if port.write(&self.out).is_ok_and(|n| n == self.out.len()) {
             self.echo_sent = Some(t1);
         }

@@ -1,4 +1,5 @@
-//! Bytes of the serial pose stream into messages and back. Little-endian; each packet ends in the CRC-32C of what is before it.
+//! Encodes and decodes messages of the serial pose stream. Little-endian; each packet ends with the CRC-32C of the
+//! bytes before it.
 
 use crate::cobs::{self, encoded_bytes};
 use crate::link::crc32c;
@@ -11,7 +12,7 @@ pub const VERSION: u8 = 1;
 /// A message of the stream.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub enum SerialMessage {
-    /// Device to host: at start-up, when asked, and once a second.
+    /// Device to host: at start-up, on request, and once a second.
     Hello {
         /// Format version, [`VERSION`].
         version: u8,
@@ -37,11 +38,11 @@ pub enum SerialMessage {
         /// Metres; 0 for unknown.
         mean_error: f32,
     },
-    /// Host to device: say HELLO now.
+    /// Host to device: requests a HELLO.
     HelloRequest,
     /// Host to device.
     EchoRequest {
-        /// Comes back in the answer.
+        /// Returned in the answer.
         token: u64,
     },
     /// Device to host, at once.
@@ -61,13 +62,13 @@ mod kind {
     pub(super) const HELLO_REQUEST: u8 = 0x12;
 }
 
-/// Why a packet is none of the stream's.
+/// Why a packet does not belong to the stream.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, thiserror::Error)]
 pub enum SerialError {
     /// Too short for a CRC.
     #[error("a packet of {0} bytes")]
     Short(usize),
-    /// Damaged on the way, or not of this format (wrong baud rate).
+    /// Damaged in transit, or not of this format (wrong baud rate).
     #[error("checksum mismatch: noise, or the wrong baud rate?")]
     Crc,
     /// A kind or length of a later version.
@@ -112,7 +113,7 @@ impl SerialMessage {
         }
     }
 
-    /// Appends the packet, stuffed and ended, to `out`.
+    /// Appends the packet, stuffed and with its delimiter, to `out`.
     pub fn encode(&self, out: &mut Vec<u8>) {
         let mut packet = [0u8; MAX_PACKET];
         let mut n = 0;

@@ -1,5 +1,5 @@
-//! The conversation with a VRPN server: connecting, descriptions, clock by ping, poses into samples, all inside
-//! [`Tracker::poll`], which never waits.
+//! The VRPN client: connecting, descriptions, clock by ping, poses to samples, all inside [`Tracker::poll`], which
+//! never blocks.
 
 use super::wire::{self, system, type_name, Message, COOKIE, COOKIE_BYTES};
 use crate::clock_map::{ClockMap, ExchangeOutcome};
@@ -13,46 +13,46 @@ use std::sync::Arc;
 use std::time::Duration;
 
 const MS: i64 = 1_000_000;
-/// Bytes read in one poll, and room for what is not a whole message yet.
+/// Bytes read in one poll, and room for an incomplete message.
 const BUFFER_BYTES: usize = 64 * 1024;
-/// Between two attempts to connect.
+/// Interval between attempts to connect.
 const RETRY_EVERY_NS: i64 = 500 * MS;
-/// An attempt to connect takes no longer than this.
+/// Timeout of an attempt to connect.
 const CONNECT_TIMEOUT: Duration = Duration::from_millis(1000);
-/// A server from which nothing came for this long, pings unanswered, is left and connected to anew.
+/// The client disconnects from a server that sent nothing for this long, although it was pinged, and connects anew.
 const SILENCE_NS: i64 = 3_000 * MS;
 /// Pings: this many quickly, the rest slowly.
 const QUICK_PINGS: u32 = 20;
 const QUICK_PING_EVERY_NS: i64 = 10 * MS;
 const PING_EVERY_NS: i64 = 200 * MS;
-/// Senders and types remembered; numbers above are ignored.
+/// Maximum number of senders and types; higher numbers are ignored.
 const MAX_NUMBERS: usize = 256;
-/// Without pongs: length of the buckets in which the shortest delay is sought.
+/// Without pongs: length of the buckets over which the shortest delay is taken.
 const ONE_WAY_BUCKET_NS: i64 = 2_000 * MS;
 
-/// How to reach a VRPN server.
+/// Configuration of a VRPN client.
 #[derive(Clone, Debug)]
 pub struct VrpnConfig {
     /// `host` or `host:port`; the port is 3883 by convention.
     pub server: String,
-    /// Name of a tracker whose sensors are the rig's bodies: a body's `id` is its sensor, its place in `bodies` where it has none.
-    /// Trackers named like a body are understood as well, as Motive and Vicon name them.
+    /// Name of a tracker whose sensors are the rig's bodies: a body's `id` is its sensor; without one its index in
+    /// `bodies` is. Trackers with the name of a body are understood as well, as Motive and Vicon name them.
     pub tracker: String,
     /// The rig's bodies.
     pub bodies: Vec<BodyKey>,
 }
 
-/// What a sender's number stands for.
+/// Meaning of a sender's number.
 #[derive(Clone, Copy, PartialEq)]
 enum Sender {
     Unknown,
     /// The configured tracker: sensors are bodies.
     Tracker,
-    /// A tracker named like this body.
+    /// A tracker with the name of this body.
     Body(BodyIndex),
 }
 
-/// What a type's number stands for.
+/// Meaning of a type's number.
 #[derive(Clone, Copy, PartialEq)]
 enum Kind {
     Unknown,
@@ -84,7 +84,7 @@ pub struct VrpnClient {
     out: Vec<u8>,
     map: ClockMap,
     one_way: OneWay,
-    /// Our number of a name that the server has.
+    /// Our number for a name that the server has.
     ping_as: Option<i32>,
     ping_sent: Option<HostTime>,
     ping_due: HostTime,
@@ -94,7 +94,7 @@ pub struct VrpnClient {
     connections: u64,
 }
 
-/// The shortest arrival delay of the last seconds: what is left when nobody answers pings.
+/// The shortest arrival delay of the last seconds: the fallback if nobody answers pings.
 #[derive(Clone, Copy)]
 struct OneWay {
     bucket_ends: HostTime,
@@ -105,7 +105,7 @@ struct OneWay {
 impl OneWay {
     const EMPTY: Self = Self { bucket_ends: HostTime(i64::MIN), this: i64::MAX, before: i64::MAX };
 
-    /// Host minus device time, ns, too large by the shortest way through the network.
+    /// Host minus device time, ns; too large by the shortest network delay.
     fn note(&mut self, at: HostTime, device_ns: i64) -> i64 {
         if at >= self.bucket_ends {
             self.before = if self.bucket_ends == HostTime(i64::MIN) { i64::MAX } else { self.this };
@@ -147,12 +147,12 @@ impl VrpnClient {
         })
     }
 
-    /// What became of all that arrived.
+    /// Counters of all input, by outcome.
     pub fn counters(&self) -> &TrackerCounters {
         self.gate.counters()
     }
 
-    /// True while a greeted connection stands.
+    /// True while there is a connection with a valid greeting.
     pub fn is_connected(&self) -> bool {
         matches!(self.state, State::Open { greeted: true, .. })
     }
@@ -166,7 +166,7 @@ impl VrpnClient {
         let (send, receive) = crossbeam::channel::bounded(1);
         let server = self.config.server.clone();
         let abandoned = self.abandoned.clone();
-        // Name look-up and connecting wait without bound on their own terms, so they do it elsewhere; one attempt at a time.
+        // Name look-up and connecting can block without bound, so a helper thread does them; one attempt at a time.
         let spawned = std::thread::Builder::new().name("vrpn-connect".into()).spawn(move || {
             let result = connect(&server);
             if !abandoned.load(Ordering::Relaxed) {
@@ -193,7 +193,8 @@ impl VrpnClient {
         self.connections += 1;
         self.out.clear();
         self.out.extend_from_slice(&COOKIE);
-        // Our numbers: sender 0 is the tracker, 1 and on the bodies, type 0 the ping. A server answers pings to a name it has.
+        // Our numbers: sender 0 is the tracker, 1 and up are the bodies, type 0 is the ping. A server answers pings to
+        // a name that it has.
         let bodies = self.config.bodies.iter().map(|b| b.name.as_str()).take(MAX_NUMBERS - 1);
         for (number, name) in (0..).zip(std::iter::once(self.config.tracker.as_str()).chain(bodies)) {
             wire::put_description(&mut self.out, system::SENDER, number, name);
@@ -213,7 +214,7 @@ impl VrpnClient {
         let (State::Open { stream, greeted: true, .. }, Some(sender)) = (&self.state, self.ping_as) else {
             return Ok(());
         };
-        // One at a time, so that each pong is the answer to one ping; a lost one is given up after a second.
+        // One at a time, so that each pong answers one ping; a lost ping times out after a second.
         let waiting = self.ping_sent.is_some_and(|t| now.ns_since(t) < 1_000 * MS);
         if waiting || now < self.ping_due {
             return Ok(());
@@ -230,7 +231,7 @@ impl VrpnClient {
         stream.write_all(&self.out)
     }
 
-    /// Reads what is there, at most one buffer full; returns whether the other side is still there.
+    /// Reads the available input, at most one buffer full; returns whether the other side is still connected.
     fn fill(&mut self, now: HostTime) -> std::io::Result<bool> {
         let State::Open { stream, heard_at, .. } = &mut self.state else { return Ok(true) };
         while self.filled < self.buffer.len() {
@@ -356,7 +357,7 @@ impl VrpnClient {
         }
     }
 
-    /// Takes in a description.
+    /// Handles a description.
     fn learn(&mut self, message: &Message<'_>) -> Result<bool, wire::VrpnError> {
         let name = wire::described_name(message.payload)?;
         let Some(number) = usize::try_from(message.sender).ok().filter(|n| *n < MAX_NUMBERS) else {
@@ -390,7 +391,7 @@ impl VrpnClient {
     fn on_pong(&mut self, message: &Message<'_>, at: HostTime) {
         let Some(t1) = self.ping_sent.take() else { return };
         self.pongs += 1;
-        // A server that does not stamp its pongs cannot be timed by them.
+        // The pongs of a server that does not stamp them cannot be used for timing.
         if message.stamp_us() == 0 {
             return;
         }
@@ -403,7 +404,7 @@ impl VrpnClient {
         }
     }
 
-    /// The server's stamp on the host's clock: by pongs where it answers them, otherwise by the shortest delay seen.
+    /// The server's stamp on the host's clock: by pongs if it answers pings, otherwise by the shortest delay seen.
     fn captured_at(&mut self, message: &Message<'_>, at: HostTime) -> HostTime {
         let stamp = message.stamp_us();
         if stamp == 0 {

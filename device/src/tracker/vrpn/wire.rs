@@ -1,4 +1,4 @@
-//! Bytes into VRPN messages and back. All numbers are big-endian; payloads are padded to multiples of 8 bytes.
+//! Encodes and decodes VRPN messages. All numbers are big-endian; payloads are padded to multiples of 8 bytes.
 
 use crate::pose::Pose;
 
@@ -15,15 +15,15 @@ pub const PORT: u16 = 3883;
 
 /// Numbers of the system messages.
 pub mod system {
-    /// Describes a sender: the number stands in the sender field.
+    /// Describes a sender: the number is in the sender field.
     pub const SENDER: i32 = -1;
-    /// Describes a type: the number stands in the sender field.
+    /// Describes a type: the number is in the sender field.
     pub const TYPE: i32 = -2;
     /// Announces a UDP port.
     pub const UDP: i32 = -3;
     /// Asks for a log.
     pub const LOG: i32 = -4;
-    /// Says good-bye.
+    /// Ends the connection.
     pub const DISCONNECT: i32 = -5;
 }
 
@@ -31,16 +31,16 @@ pub mod system {
 pub mod type_name {
     /// A pose.
     pub const POS_QUAT: &str = "vrpn_Tracker Pos_Quat";
-    /// Are you there?
+    /// Ping.
     pub const PING: &str = "vrpn_Base ping_message";
-    /// I am.
+    /// The answer to a ping.
     pub const PONG: &str = "vrpn_Base pong_message";
 }
 
-/// Why bytes are no VRPN.
+/// Errors of decoding.
 #[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
 pub enum VrpnError {
-    /// The greeting is not one.
+    /// The greeting is not one of VRPN.
     #[error("the other side does not greet as VRPN does: {0:?}")]
     NotVrpn(String),
     /// Another major version.
@@ -77,7 +77,7 @@ pub fn check_cookie(bytes: &[u8; COOKIE_BYTES]) -> Result<(), VrpnError> {
 pub struct Message<'a> {
     /// Seconds of the sender's clock.
     pub seconds: u32,
-    /// Microseconds, 0 to 999,999 in honest messages.
+    /// Microseconds, 0 to 999,999 in valid messages.
     pub microseconds: u32,
     /// Number of the sending device; for descriptions, the number described.
     pub sender: i32,
@@ -100,7 +100,7 @@ fn be32(bytes: &[u8], at: usize) -> u32 {
     u32::from_be_bytes([bytes[at], bytes[at + 1], bytes[at + 2], bytes[at + 3]])
 }
 
-/// Splits the first message off `bytes`: the message and the bytes it takes, `None` when it is not all there yet.
+/// Splits the first message off `bytes`: returns the message and the bytes it takes, or `None` if it is incomplete.
 pub fn split(bytes: &[u8]) -> Result<Option<(Message<'_>, usize)>, VrpnError> {
     if bytes.len() < 4 {
         return Ok(None);

@@ -1,4 +1,4 @@
-//! A thread that reads a serial line and stamps what arrives, because nobody knows afterwards when it did.
+//! A thread that reads a serial line and stamps arrivals, because the time of arrival cannot be determined later.
 
 use std::io::ErrorKind;
 use std::sync::atomic::{AtomicBool, Ordering};
@@ -12,16 +12,16 @@ use serialport::SerialPort;
 use crate::time::{HostClock, HostTime};
 use crate::transport::priority::Follower;
 
-/// The clock that the transport was given, once it was.
+/// The transport's clock, once it was set.
 pub(super) type SharedClock = Arc<OnceLock<Arc<dyn HostClock>>>;
 
 /// Bytes of one chunk.
 const CHUNK_BYTES: usize = 1024;
 /// Chunks that may wait; then the kernel keeps the rest.
 const CHUNKS: usize = 32;
-/// The thread looks this often whether it shall end.
+/// How long the thread blocks before it checks whether to end.
 const PATIENCE: Duration = Duration::from_millis(20);
-/// Rest of a thread whose chunks nobody takes.
+/// Pause of the thread while its queue is full.
 const FULL: Duration = Duration::from_micros(500);
 
 /// Bytes that arrived together.
@@ -32,7 +32,7 @@ struct Chunk {
     bytes: [u8; CHUNK_BYTES],
 }
 
-/// What arrives on a line, stamped. Dropping it ends the thread, within [`PATIENCE`], and closes its handle on the port.
+/// The input of a line, stamped. Dropping it ends the thread, within [`PATIENCE`], and closes its handle on the port.
 pub(super) struct Reader {
     chunks: Consumer<Chunk>,
     ended: Arc<AtomicBool>,
@@ -42,7 +42,8 @@ pub(super) struct Reader {
 }
 
 impl Reader {
-    /// Reads from a second handle on `port`. `None` when the system has no handle or thread to give: then the caller reads by itself.
+    /// Reads from a second handle on `port`. `None` if the system provides no handle or thread: then the caller reads
+    /// by itself.
     pub(super) fn start(port: &dyn SerialPort, clock: SharedClock) -> Option<Self> {
         let mut line = port.try_clone().ok()?;
         line.set_timeout(PATIENCE).ok()?;
@@ -57,13 +58,13 @@ impl Reader {
         Some(Self { chunks, ended, stop, thread: Some(thread), follower: Follower::new() })
     }
 
-    /// Hands on what has arrived, with the instant of its arrival, or `now` where there is no clock. Returns the bytes handed on,
-    /// or `None` when the line has ended and everything was handed on before.
+    /// Passes on the input with the instant of its arrival, or `now` without a clock. Returns the number of bytes, or
+    /// `None` once the line has ended and everything was passed on.
     pub(super) fn take(&mut self, now: HostTime, sink: &mut dyn FnMut(HostTime, &[u8])) -> Option<usize> {
         if let Some(thread) = &self.thread {
             self.follower.follow(now, thread);
         }
-        // Before the chunks: those put in before the end are then seen.
+        // Read this before the chunks, so that chunks put in before the end are seen.
         let ended = self.ended.load(Ordering::Acquire);
         let mut bytes = 0;
         for _ in 0..CHUNKS {
@@ -79,7 +80,7 @@ impl Drop for Reader {
     fn drop(&mut self) {
         self.stop.store(true, Ordering::Relaxed);
         if let Some(thread) = self.thread.take() {
-            // It cannot panic on its own; were it to, there is nobody left to tell.
+            // The thread does not panic; if it did, nobody would be left to inform.
             let _ = thread.join();
         }
     }

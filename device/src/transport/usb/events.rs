@@ -1,4 +1,5 @@
-//! A thread that lets libusb deliver what has completed, so that replies are stamped when they arrive and not when they are looked for.
+//! A thread that lets libusb deliver completed transfers, so that replies are stamped on arrival and not when they are
+//! polled.
 
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::Arc;
@@ -10,9 +11,9 @@ use rusb::{Context, UsbContext};
 use crate::time::HostTime;
 use crate::transport::priority::Follower;
 
-/// Longest wait for an event; the thread is woken when it shall end.
+/// Longest wait for an event; the thread is woken when it must end.
 const PATIENCE: Duration = Duration::from_millis(100);
-/// Rest after an error of the event loop itself.
+/// Pause after an error of the event loop itself.
 const AFTER_ERROR: Duration = Duration::from_millis(1);
 
 /// The thread. Dropping it ends the thread.
@@ -24,7 +25,8 @@ pub(super) struct Events {
 }
 
 impl Events {
-    /// Handles the events of `context` from now on. `None` when the system has no thread to give: then the caller must.
+    /// Handles the events of `context` from now on. `None` if the system provides no thread: then the caller must do
+    /// it.
     pub(super) fn start(context: &Context) -> Option<Self> {
         let stop = Arc::new(AtomicBool::new(false));
         let (stopped, ours) = (stop.clone(), context.clone());
@@ -39,7 +41,7 @@ impl Events {
         Some(Self { context: context.clone(), stop, thread: Some(thread), follower: Follower::new() })
     }
 
-    /// Lets the thread run as the calling thread does.
+    /// Gives the thread the scheduling of the calling thread.
     pub(super) fn follow(&mut self, now: HostTime) {
         if let Some(thread) = &self.thread {
             self.follower.follow(now, thread);
@@ -52,7 +54,7 @@ impl Drop for Events {
         self.stop.store(true, Ordering::Release);
         self.context.interrupt_handle_events();
         if let Some(thread) = self.thread.take() {
-            // It cannot panic on its own; were it to, there is nobody left to tell.
+            // The thread does not panic; if it did, nobody would be left to inform.
             let _ = thread.join();
         }
     }

@@ -1,4 +1,4 @@
-//! A vendor, product and serial number into an open device, with reasons that say what to do when it cannot be had.
+//! Opens a device by vendor, product and serial number. Errors name the remedy.
 
 use std::time::{Duration, Instant};
 
@@ -8,13 +8,14 @@ use super::{CONTROL_BYTES, CONTROL_DEPTH, PRODUCT_ID, REPLY_BYTES, REPLY_DEPTH, 
 use crate::transport::TransportError;
 use crate::usb_help::node_of;
 
-/// The rule that lets the user at the machine open the reference device; `packaging/60-dpm.rules` has it with others.
+/// The rule that lets the user at the machine open the reference device; `packaging/60-dpm.rules` contains it among
+/// others.
 pub const UDEV_RULE: &str = r#"SUBSYSTEM=="usb", ATTR{idVendor}=="1209", ATTR{idProduct}=="000d", GROUP="dpm", MODE="0660", TAG+="uaccess""#;
 
-/// Right after hot-plug a device may not be ready to be claimed; it is for this long that claiming is tried.
+/// Right after hot-plug a device may not be ready to be claimed; claiming is retried for this long.
 const CLAIM_PATIENCE: Duration = Duration::from_millis(200);
 
-/// Which device, and how it is used.
+/// The device and its settings.
 #[derive(Clone, Debug)]
 pub struct UsbSettings {
     /// Vendor number.
@@ -25,8 +26,8 @@ pub struct UsbSettings {
     pub serial: Option<String>,
     /// Bytes of the largest frame on the wire, see [`crate::link::packet_bytes`].
     pub frame_bytes: usize,
-    /// Frames in flight, at least 1. One is on the cable while the others wait, so each more adds a frame of latency on a
-    /// link that is full.
+    /// Frames in flight, at least 1. One is on the cable while the others wait, so each additional one adds a frame of
+    /// latency on a full link.
     pub depth: usize,
     /// An endpoint that moves nothing for this long, though it has something to carry, is cleared, nanoseconds.
     pub stuck_after_ns: i64,
@@ -55,7 +56,7 @@ impl UsbSettings {
         let others = CONTROL_DEPTH * CONTROL_BYTES + REPLY_DEPTH * REPLY_BYTES;
         match memory_limit_mb() {
             None | Some(0) => self.depth.max(1),
-            // The limit is for all devices of the machine: half of it is what one may count on.
+            // The limit applies to all devices of the machine together, so use only half of it.
             Some(mb) => {
                 let bytes = ((mb as usize) << 20) / 2;
                 self.depth.clamp(1, (bytes.saturating_sub(others) / self.frame_bytes.max(1)).max(1))
@@ -63,7 +64,7 @@ impl UsbSettings {
         }
     }
 
-    /// What to set when usbfs cannot hold the frames asked for; `None` when it can.
+    /// The setting to change if usbfs cannot hold the requested frames; `None` if it can.
     pub fn memory_advice(&self) -> Option<String> {
         let limit = memory_limit_mb().filter(|mb| *mb > 0)?;
         if self.depth_within_limit() >= self.depth {
@@ -106,7 +107,7 @@ impl UsbSettings {
         Err(refused.unwrap_or(TransportError::NotFound { device: name }))
     }
 
-    /// `None` when it is another device of the same kind.
+    /// `None` if it is another device of the same kind.
     fn try_open(&self, device: &Device<Context>) -> Result<Option<DeviceHandle<Context>>, rusb::Error> {
         let handle = device.open()?;
         if let Some(serial) = &self.serial {
@@ -140,8 +141,8 @@ pub(super) fn context(name: &str) -> Result<Context, TransportError> {
     Context::new().map_err(|e| TransportError::of_usb("start libusb to look for", name.to_owned(), e))
 }
 
-/// Megabytes of transfers that the kernel allows in flight on all devices together; 0 means no limit. `None` where the kernel
-/// does not say.
+/// Megabytes of transfers that the kernel allows in flight on all devices together; 0 means no limit. `None` if the
+/// kernel does not report it.
 pub fn memory_limit_mb() -> Option<u32> {
     std::fs::read_to_string("/sys/module/usbcore/parameters/usbfs_memory_mb").ok()?.trim().parse().ok()
 }

@@ -1,11 +1,12 @@
-//! Buffers into queued bulk transfers of one endpoint and back: the only place that calls libusb's asynchronous functions, which
-//! rusb does not wrap.
+//! Queued bulk transfers of one endpoint: the only place that calls libusb's asynchronous functions, which rusb does
+//! not wrap.
 //!
-//! **Who owns what.** A [`Ring`] owns its transfers, their buffers and their completion flags, and keeps the device handle alive. From
-//! `libusb_submit_transfer` until the flag is raised, transfer and buffer belong to libusb and the kernel, and nothing here touches them; the
-//! flag is raised by the callback, which libusb runs exactly once per submitted transfer, on the thread that handles events ([`pump`], or
-//! the thread of `events`). After that they belong to the ring again. A ring that is dropped takes its transfers back first; if the kernel does not return one in time, its memory is
-//! leaked rather than freed under the kernel's hands.
+//! **Ownership.** A [`Ring`] owns its transfers, their buffers and their completion flags, and keeps the device handle
+//! alive. From `libusb_submit_transfer` until the flag is raised, transfer and buffer belong to libusb and the kernel,
+//! and nothing here touches them. The callback raises the flag. libusb runs it exactly once per submitted transfer, on
+//! the thread that handles events ([`pump`], or the thread of `events`). Afterwards transfer and buffer belong to the
+//! ring again. When a ring is dropped, it first cancels its transfers. If the kernel does not return one in time, its
+//! memory is leaked, because the kernel may still write to it.
 #![allow(unsafe_code)]
 
 use std::collections::VecDeque;
@@ -28,13 +29,13 @@ const TAKE_BACK: Duration = Duration::from_secs(2);
 pub(super) enum Status {
     /// By itself; perhaps short.
     Completed,
-    /// Taken back.
+    /// Cancelled.
     Cancelled,
     /// The endpoint is halted.
     Stall,
     /// The device is gone.
     NoDevice,
-    /// The device sent more than asked for.
+    /// The device sent more than requested.
     Overflow,
     /// Anything else: damaged on the cable, timed out.
     Error,
@@ -51,10 +52,10 @@ pub(super) struct Ended {
     pub at: Option<HostTime>,
 }
 
-/// The clock that the transport was given, once it was.
+/// The transport's clock, once it was set.
 pub(super) type SharedClock = Arc<OnceLock<Arc<dyn HostClock>>>;
 
-/// What the callback says about a transfer.
+/// The callback's record of a transfer.
 struct Mark {
     ended: AtomicBool,
     /// When; [`NO_TIME`] without a clock. Written before the flag is raised.
@@ -67,7 +68,7 @@ const NO_TIME: i64 = i64::MIN;
 struct Slot {
     transfer: *mut ffi::libusb_transfer,
     buffer: Box<[u8]>,
-    /// Written by the callback. Boxed: its address must not move while a transfer is under way.
+    /// Written by the callback. Boxed, because its address must not move while a transfer is in flight.
     mark: Box<Mark>,
     in_flight: bool,
 }
@@ -95,7 +96,7 @@ extern "system" fn on_ended(transfer: *mut ffi::libusb_transfer) {
     mark.ended.store(true, Ordering::Release);
 }
 
-/// Lets libusb deliver what has completed. Does not wait.
+/// Lets libusb deliver completed transfers. Does not block.
 pub(super) fn pump(context: &Context) -> Result<(), rusb::Error> {
     let none = libc::timeval { tv_sec: 0, tv_usec: 0 };
     // SAFETY: the context is alive for the borrow; libusb reads `none` only during the call; a null `completed` is allowed.
@@ -104,7 +105,8 @@ pub(super) fn pump(context: &Context) -> Result<(), rusb::Error> {
     result(rc)
 }
 
-/// A libusb return code as rusb's error; `Interrupted` is no error here: nothing was waited for.
+/// Converts a return code of libusb to rusb's error; `Interrupted` is not an error here, because nothing was waited
+/// for.
 fn result(rc: i32) -> Result<(), rusb::Error> {
     Err(match rc {
         0 | c::LIBUSB_ERROR_INTERRUPTED => return Ok(()),
@@ -230,17 +232,17 @@ impl Ring {
             NO_TIME => None,
             ns => Some(HostTime(ns)),
         };
-        // Cut at the buffer, whatever a device or a driver claims.
+        // Limited to the buffer, whatever a device or a driver claims.
         Some(Ended { slot, status, actual: (actual.max(0) as usize).min(s.buffer.len()), at })
     }
 
-    /// Asks for every transfer in flight back. They end later, through [`Ring::take_ended`].
+    /// Cancels every transfer in flight. They end later, through [`Ring::take_ended`].
     pub(super) fn cancel_all(&mut self) {
         for &slot in &self.order {
             let s = &self.slots[slot];
             if !s.mark.ended.load(Ordering::Acquire) {
-                // SAFETY: the transfer was submitted and its callback has not been seen to run; libusb answers NOT_FOUND when it ends
-                // in the meantime, which is as good.
+                // SAFETY: the transfer was submitted and its callback has not been seen to run. If it ends in the
+                // meantime, libusb answers NOT_FOUND, which is harmless.
                 unsafe { ffi::libusb_cancel_transfer(s.transfer) };
             }
         }

@@ -1,4 +1,4 @@
-//! A cable that does everything wrong, and bytes that nobody meant: only what was sent is ever lit.
+//! A cable with every kind of fault, and arbitrary bytes: only frames that were sent are ever lit.
 
 use super::*;
 
@@ -47,7 +47,7 @@ impl Transport for BadCable {
         now: HostTime,
         sink: &mut dyn FnMut(Lane, HostTime, &[u8]),
     ) -> Result<(), TransportError> {
-        // The way back is as bad.
+        // The other direction is as bad.
         self.inner.device_mut().advance_to(now);
         let (draws, per_mille) = (self.draws.stream(1), self.per_mille);
         let mut n = now.0 as u64 * 64;
@@ -68,7 +68,7 @@ impl Transport for BadCable {
 proptest! {
     #![proptest_config(ProptestConfig::with_cases(40))]
 
-    /// Whatever the cable does: what is lit is a frame that was sent, bit for bit; laws and credits hold; light returns.
+    /// Whatever the cable does: every lit frame was sent, bit for bit; laws and credits hold; light returns.
     #[test]
     fn a_bad_cable_never_lights_a_wrong_frame(seed in any::<u64>(), per_mille in 0u64..200, codecs in 0u32..16) {
         let r = Raster::new(64, 16).unwrap();

@@ -1,4 +1,4 @@
-//! Compacted planes light the same frames as raw ones, and save what they should.
+//! Compacted planes light the same frames as raw ones, and save the expected bytes.
 
 use super::*;
 use dpm_device::link::COMMIT_BYTES;
@@ -35,9 +35,9 @@ fn every_codec_saves_and_lights_the_same_frame() {
         }
         assert!(bytes < 40 * raw_frame * 3 / 4 + 5000, "{codecs:#b}: {bytes} of {}", 40 * raw_frame);
         if codecs == Codec::ALL {
-            // A cable that always has room is not worth LZ4's time: the quarter that only it makes shorter stays raw, too.
+            // A cable that always has room is not worth LZ4's time: the quarter that only LZ4 shortens stays raw, too.
             assert!(bytes < 40 * raw_frame * 60 / 100, "{bytes} of {}", 40 * raw_frame);
-            // A frame like the one before is a FRAME_COMMIT and nothing else.
+            // A frame equal to the previous one is only a FRAME_COMMIT.
             let planes = structured(r, 39);
             rig.step_with(40, &planes);
             let at = rig.link.counters().bytes_sent;
@@ -52,7 +52,7 @@ fn every_codec_saves_and_lights_the_same_frame() {
     }
 }
 
-/// A device that reads nothing but raw planes gets nothing else.
+/// A device that decodes only raw planes gets only raw planes.
 #[test]
 fn codecs_are_what_both_sides_know() {
     let r = Raster::new(64, 16).unwrap();

@@ -1,11 +1,11 @@
 //! `dark from`: a frame's light ends at its own tick, whatever the host does or fails to do.
 //!
-//! Found in use, R1: a host whose stages hung fed the watchdog on, and the last frame stayed lit without limit. R5: late frames
-//! were lit however old they were.
+//! Found in use, R1: a host whose stages hung continued to feed the watchdog, and the last frame stayed lit without
+//! limit. R5: late frames were lit however old they were.
 
 use super::*;
 
-/// Sends frame `id` for `slot` now, its light to end at `dark_from`.
+/// Sends frame `id` for `slot` now, with `dark_from` as the end of its light.
 fn send<T: Transport>(rig: &mut Rig<T>, id: u64, slot: u64, dark_from: DeviceTicks) {
     rig.poll().unwrap();
     let target = rig.link.slots().unwrap().start(slot);
@@ -13,7 +13,7 @@ fn send<T: Transport>(rig: &mut Rig<T>, id: u64, slot: u64, dark_from: DeviceTic
     assert_eq!(sent, SendOutcome::Sent, "frame {id}");
 }
 
-/// The mock lives up to `tick` (its clock is ideal) while the host goes on talking, as one does whose renderer hangs.
+/// Advances the mock to `tick` (its clock is ideal) while the host still talks, as one does whose renderer hangs.
 fn live(rig: &mut Rig<Direct<MockProjector>>, tick: u64) {
     while rig.now.0 + 1_000_000 < tick as i64 {
         rig.now = rig.now.plus_ns(1_000_000);
@@ -35,7 +35,7 @@ fn armed() -> (Rig<Direct<MockProjector>>, dpm_device::link::SlotClock) {
 fn light_ends_at_the_tick_and_not_with_the_slot_and_the_next_frame_lights() {
     let (mut rig, slots) = armed();
     let k = rig.slot + 2;
-    // In the middle of a slot, and never the host's doing: it goes on talking.
+    // In the middle of a slot, and not because of the host, which still talks.
     let dark = DeviceTicks((slots.start(k + 40).0 + slots.start(k + 41).0) / 2);
     send(&mut rig, 1, k, dark);
     live(&mut rig, slots.start(k).0);
@@ -50,7 +50,7 @@ fn light_ends_at_the_tick_and_not_with_the_slot_and_the_next_frame_lights() {
     assert!(!device.is_lit() && device.lit_frame().is_none() && device.lit_planes().is_none());
     assert_eq!(device.status().state, DeviceState::Armed, "no fault, and no ARM is needed");
     assert!(!device.status().lit);
-    // Every later slot is blank and counted so.
+    // Every later slot is blank and counts as blank.
     let before = device.status();
     live(&mut rig, slots.start(k + 60).0);
     let s = rig.cable.device().status();
@@ -81,7 +81,7 @@ fn a_newer_frame_replaces_it_without_a_gap_and_without_one_the_slot_is_blank() {
     assert!(!rig.cable.device().is_lit());
     let s = rig.cable.device().status();
     assert_eq!((s.frames_lit, s.slots_repeated), (2, 3), "{s:?}");
-    // A frame whose end is later than the next frame's: the next frame's counts.
+    // A frame whose light ends later than the next frame's: the next frame's end counts.
     send(&mut rig, 3, k + 7, slots.start(k + 100));
     send(&mut rig, 4, k + 8, slots.start(k + 9));
     live(&mut rig, slots.start(k + 8).0);
@@ -204,7 +204,8 @@ fn a_frame_that_ends_before_it_begins_has_a_wrong_field() {
     assert_eq!((s.frames_lit, s.lit), (2, false));
 }
 
-/// Found in use, R16 and its kind: what happens by itself is told with its own instant, however late somebody looks.
+/// Found in use, R16 and similar: the device's own events are reported with their own instants, however late they are
+/// polled.
 #[test]
 fn changes_of_light_and_state_carry_their_own_instants() {
     let (mut rig, slots) = armed();
@@ -214,7 +215,7 @@ fn changes_of_light_and_state_carry_their_own_instants() {
     assert_eq!(states, [DeviceState::Greeted, DeviceState::Configured, DeviceState::Armed]);
     let dark = DeviceTicks(slots.start(k + 3).0 + 777);
     send(&mut rig, 1, k, dark);
-    // Nobody looks for a second.
+    // No poll for a second.
     let heard = rig.now;
     rig.cable.device_mut().advance_to(heard.plus_ns(1_000_000_000));
     let bite = heard.plus_ns(i64::from(WATCHDOG_US) * 1000);
@@ -223,7 +224,7 @@ fn changes_of_light_and_state_carry_their_own_instants() {
     assert_eq!(next(), Some((dark.0 as i64, None, DeviceState::Armed, 0)));
     assert_eq!(next(), Some((bite.0, None, DeviceState::Faulted, faults::WATCHDOG)));
     assert_eq!(next(), None);
-    // And an order's is that of its arrival.
+    // The instant of an order is that of its arrival.
     let (mut rig, slots) = armed();
     let k = rig.slot + 2;
     send(&mut rig, 1, k, slots.start(k + 30));
@@ -236,8 +237,8 @@ fn changes_of_light_and_state_carry_their_own_instants() {
 proptest! {
     #![proptest_config(ProptestConfig::with_cases(64))]
 
-    /// Whatever frames come, late or early, and whatever is asked: light that is not frozen is always younger than its own end, on
-    /// a clock that is not the host's; and between events nothing changes that `next_due` did not announce.
+    /// For any frames, late or early, and any orders: light that is not frozen always ends by its own end, on a clock
+    /// that is not the host's; and between events nothing changes that `next_due` did not announce.
     #[test]
     fn no_light_outlives_its_frame(
         steps in prop::collection::vec((0u8..12, 0u64..6, 1u64..9_000_000, 1i64..4_000_000), 1..120),

@@ -1,10 +1,10 @@
-//! Limits on the amount of light, kept by the host, and by the device alone.
+//! Limits on light, kept by the host, and by the device alone.
 
 use super::*;
 use dpm_device::link::{light_level, FULL_LUMINANCE, FULL_WHITE_LEVEL};
 use proptest::prelude::*;
 
-/// A picture whose level is near `level`, 0 to 1: so many planes of the highest weights fully lit.
+/// A picture whose level is near `level`, 0 to 1: the planes of the highest weights are fully lit.
 fn picture(level: f64) -> Vec<u8> {
     let code = (level * 255.0).round() as u32;
     let schedule = PlaneSchedule::rgb24();
@@ -51,7 +51,7 @@ fn limited() -> LinkSettings {
     LinkSettings { limits: LIMITS, watchdog_us: 3_000_000, ..settings() }
 }
 
-/// Bright for so many slots, then dimmer for so many.
+/// Bright for a number of slots, then dimmer for a number.
 fn content(seed: u64, id: u64) -> f64 {
     let draws = Draws::new(seed);
     let period = 20 + draws.bits(0) % 400;
@@ -85,7 +85,7 @@ proptest! {
 
 #[test]
 fn a_device_keeps_the_limits_under_a_host_that_does_not() {
-    // Of the device's owner, and of a CONFIG from a host that then ignores them.
+    // Limits of the device's owner, and of a CONFIG from a host that then ignores them.
     for owner in [true, false] {
         let setup =
             MockConfig { limits: if owner { LIMITS } else { LightLimits::OFF }, ..MockConfig::new(raster()) };
@@ -116,7 +116,7 @@ fn a_device_keeps_the_limits_under_a_host_that_does_not() {
                 assert!(!rig.cable.device().is_lit());
                 struck += 1;
                 let at = rig.now;
-                // No ARM within the rest, acknowledged or not.
+                // ARM is refused during the rest, acknowledged or not.
                 rig.until(LinkState::Faulted);
                 rig.link.arm(faults::LIGHT_LIMIT);
                 rig.poll().unwrap();
@@ -176,8 +176,8 @@ fn light_within_the_limits_is_the_same_bit_for_bit() {
     assert!(off == run(LightLimits { mean_permille: 700, window_ms: 1000, full_white_ms: 500 }));
 }
 
-/// The limiters must not undo what the operator ordered: once, flashing content that went on behind a BLACK struck the flash limiter, whose
-/// rest then ended with an ARM.
+/// The limiters must not undo an order of the operator: once, flashing content that continued during BLACK triggered
+/// the flash limiter, whose rest then ended with an ARM.
 #[test]
 fn a_rest_of_the_limiters_never_ends_an_operators_black() {
     for verb in [Verb::Black, Verb::Freeze] {
@@ -203,7 +203,7 @@ fn a_rest_of_the_limiters_never_ends_an_operators_black() {
     }
 }
 
-/// What is frozen is light too.
+/// A frozen frame is light too.
 #[test]
 fn a_frozen_picture_is_counted_and_stays_dark_after_it_struck() {
     let mut rig = clean(limited(), MockConfig::new(raster()));

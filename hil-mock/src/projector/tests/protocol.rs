@@ -1,4 +1,5 @@
-//! What docs/PROTOCOL.md says where a reader of its first version had to guess (found in use, C, the eleven questions).
+//! Statements of docs/PROTOCOL.md where a reader of its first version had to guess (found in use, C, the eleven
+//! questions).
 
 use super::*;
 use dpm_device::link::{Commit, HostHello, HostMessage};
@@ -15,7 +16,7 @@ fn hello(session: u32, version: u16) -> Vec<u8> {
     packet(session, &HostMessage::Hello(hello))
 }
 
-/// Sessions and messages of all that the device has to say.
+/// Sessions and messages of all the device's replies.
 fn answers(mock: &mut MockProjector, now: HostTime) -> Vec<(u32, DeviceMessage)> {
     let mut all = Vec::new();
     mock.replies(now, &mut |_, bytes| {
@@ -56,7 +57,8 @@ fn armed() -> (Rig<Direct<MockProjector>>, u32) {
     (rig, session)
 }
 
-/// Question 1, found in use, R3 and C1: a HELLO of the present session changes nothing, one of another begins everything anew.
+/// Question 1, found in use, R3 and C1: a HELLO of the open session changes nothing; one of another session restarts
+/// everything.
 #[test]
 fn a_hello_of_the_present_session_is_only_answered() {
     let (mut rig, session) = armed();
@@ -77,7 +79,7 @@ fn a_hello_of_the_present_session_is_only_answered() {
         mock.receive(now, Lane::Data, &bytes);
     }
     assert_eq!(mock.status().frames_seen, before.frames_seen);
-    // Another number: dark, and all counters of the session at 0, those of its packets too.
+    // Another number: dark, and all counters of the session at 0, including those of its packets.
     mock.receive(now, Lane::Control, &hello(session ^ 5, 2));
     let s = mock.status();
     assert!(!mock.is_lit());
@@ -95,7 +97,7 @@ fn a_hello_of_the_present_session_is_only_answered() {
     assert!(rig.cable.device().is_lit());
 }
 
-/// Question 7: which session the device's own packets carry.
+/// Question 7: the session number of the device's own packets.
 #[test]
 fn a_refused_hello_is_answered_under_its_own_number() {
     let mut mock = MockProjector::new(MockConfig::new(raster()));
@@ -117,7 +119,7 @@ fn a_refused_hello_is_answered_under_its_own_number() {
     assert_eq!(last.last_plane, 0);
 }
 
-/// Question 2: what is whole is the base of the next frame, whatever becomes of it.
+/// Question 2: a whole frame is the base of the next one, whatever becomes of it.
 #[test]
 fn a_whole_frame_is_the_base_of_the_next_even_if_it_is_never_lit() {
     let s = LinkSettings { codecs: dpm_device::link::Codec::ALL, ..settings() };
@@ -148,7 +150,7 @@ fn a_whole_frame_is_the_base_of_the_next_even_if_it_is_never_lit() {
     assert_eq!(rig.cable.device().lit_planes(), Some(&picture[..]));
 }
 
-/// Questions 3 and 4: what STOP forgets and what goes on; which slots count.
+/// Questions 3 and 4: what STOP drops and what continues; which slots count.
 #[test]
 fn stop_forgets_frames_and_keeps_counters_and_slots_count_while_armed_black_or_frozen() {
     let (mut rig, session) = armed();
@@ -188,7 +190,7 @@ fn stop_forgets_frames_and_keeps_counters_and_slots_count_while_armed_black_or_f
     rig.link.arm(0);
     rig.until(LinkState::Streaming);
     rig.slot = rig.link.settings().rate.slot_at_ns(rig.now.0);
-    // Nothing is left to be lit, and the counters go on.
+    // No frame is left to be lit, and the counters continue.
     rig.idle(3);
     let again = rig.cable.device().status();
     assert!(!again.lit && again.slots > stopped.slots && again.frames_lit == stopped.frames_lit);
@@ -218,7 +220,7 @@ fn free_buffers_are_those_of_waiting_frames() {
         send(&mut rig, id, k + 50, 0);
     }
     assert_eq!(rig.cable.device().status().buffers_free, 0);
-    // One more half received: it takes no buffer, and what waits and what is lit stay as they are.
+    // One more, half received: it takes no buffer, and waiting and lit frames are unchanged.
     let half = frame(session, 6, far(k + 51), 6, 0);
     for bytes in &half[..12] {
         let now = rig.now;
@@ -250,7 +252,7 @@ fn a_target_anywhere_in_a_slot_means_that_slot() {
     }
 }
 
-/// The watchdog hears intact packets only: a header in front of damaged planes is no word of a host.
+/// Only intact packets feed the watchdog: an intact header in front of damaged planes does not.
 #[test]
 fn damaged_planes_do_not_feed_the_watchdog() {
     for damaged in [false, true] {
@@ -272,7 +274,7 @@ fn damaged_planes_do_not_feed_the_watchdog() {
     }
 }
 
-/// Question 11: on a line that takes little no STATUS waits behind another, and an ECHO's answer behind one at most.
+/// Question 11: on a slow line no STATUS waits behind another, and an ECHO's answer behind at most one.
 #[test]
 fn no_status_is_queued_behind_another() {
     use crate::projector::serial::SerialProjector;
@@ -287,7 +289,7 @@ fn no_status_is_queued_behind_another() {
         let now = now.plus_ns(slot * 1_055_966);
         assert_eq!(line.replies(now).len(), one);
     }
-    // Half of it, then the rest: only then there is one more, of now.
+    // Half of it, then the rest: only then there is one more STATUS, a present one.
     let now = now.plus_ns(40 * 1_055_966);
     line.replies(now).drain(..one / 2);
     assert_eq!(line.replies(now).len(), one - one / 2);

@@ -1,4 +1,4 @@
-//! Light that flashes and packets that arrive damaged end in the dark.
+//! Flashing light and damaged packets end in the dark.
 
 use super::*;
 
@@ -40,7 +40,7 @@ fn the_host_does_not_let_the_field_flash() {
     assert!(rests >= 2, "it strikes again after the rest: {rests}");
     let status = rig.cable.device().status();
     assert_eq!(status.faults, 0, "the host is before the device: {status:?}");
-    // A picture that is calm is never dropped.
+    // A picture that does not flash is never dropped.
     let s = LinkSettings { flash_limit: Some(3), ..settings() };
     let mut rig = clean(s, MockConfig::new(raster()));
     rig.stream();
@@ -68,7 +68,7 @@ fn a_device_does_not_trust_the_host_about_flashes() {
     assert!(flashes <= 5, "{flashes} flashes before it struck");
     assert!(!rig.cable.device().is_lit());
     let struck_at = rig.now;
-    // Not even with acknowledgement within two seconds.
+    // ARM is refused within two seconds, even with acknowledgement.
     rig.until(LinkState::Faulted);
     rig.link.arm(faults::FLASH_LIMIT);
     rig.poll().unwrap();

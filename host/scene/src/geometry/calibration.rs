@@ -1,8 +1,9 @@
-//! Pairs of world points and projector pixels into a calibrated projector, or into the reason why they do not determine one.
+//! Calibrates a projector from pairs of world points and pixels, or reports why they do not determine one.
 //!
-//! Direct linear transform with normalised coordinates (\[Hartley97\]), split into intrinsics and pose, then Levenberg-Marquardt on the
-//! reprojection error. With an inlier threshold, random samples of the pairs are tried first (\[Fischler81\]) so that wrong pairs are left
-//! out. Everything is computed in coordinates centred on the points and scaled to their spread: metres or millimetres give the same pixels.
+//! Direct linear transform with normalised coordinates (\[Hartley97\]), split into intrinsics and pose, then
+//! Levenberg-Marquardt on the reprojection error. With an inlier threshold, random samples of the pairs are tried first
+//! (\[Fischler81\]) to exclude wrong pairs. Everything is computed in coordinates centred on the points and scaled to
+//! their spread: metres and millimetres give the same pixels.
 
 use super::projector::ProjectorCamera;
 use super::refine::{refine, Pinhole, Refined};
@@ -23,7 +24,7 @@ pub struct Pair {
 /// How to calibrate.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct CalibrationOptions {
-    /// Pairs farther off than this many pixels are left out as wrong; `None`: all pairs are taken as right.
+    /// Pairs with an error of more than this many pixels are excluded as wrong; `None`: all pairs count as right.
     pub inlier_px: Option<f64>,
     /// Seed of the random samples.
     pub seed: u64,
@@ -35,7 +36,7 @@ impl Default for CalibrationOptions {
     }
 }
 
-/// A projector and how far to trust it.
+/// A projector and its accuracy.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Calibration {
     /// The result.
@@ -46,15 +47,16 @@ pub struct Calibration {
     pub max_px: f64,
     /// One standard deviation of the focal length as a share of it, from the residuals; 0 for exact data.
     pub focal_uncertainty: f64,
-    /// Ratio of the largest to the smallest singular value that the points must determine; 1e1..1e3 is usual, infinite is degenerate.
+    /// Ratio of the largest to the smallest singular value that the points must determine; 1e1..1e3 is usual, infinite
+    /// is degenerate.
     pub condition: f64,
     /// Which pairs were used.
     pub inliers: Vec<bool>,
-    /// What an operator should look at, one sentence each.
+    /// Warnings for the operator, one sentence each.
     pub warnings: Vec<String>,
 }
 
-/// Why the pairs give no projector.
+/// Why the pairs do not determine a projector.
 #[derive(Clone, Debug, PartialEq, Error)]
 pub enum CalibrationError {
     /// Under six pairs.
@@ -66,7 +68,7 @@ pub enum CalibrationError {
     /// The points leave the projector undetermined.
     #[error("calibration: degenerate: {what} (rank {rank} of {needed}, condition {condition:.1e}); add points that spread in depth")]
     Degenerate {
-        /// In words.
+        /// The reason, as text.
         what: &'static str,
         /// Independent directions found.
         rank: usize,
@@ -90,12 +92,12 @@ pub enum CalibrationError {
         /// The threshold.
         threshold_px: f64,
     },
-    /// The refinement did not settle.
+    /// The refinement did not converge.
     #[error("calibration: not converged after {iterations} steps (rms {rms_px:.3} px); the start or the pairs are wrong")]
     NotConverged {
         /// Steps made.
         iterations: usize,
-        /// Error then.
+        /// Error at that point.
         rms_px: f64,
     },
     /// The focal length is not determined by data of this quality.
@@ -103,7 +105,7 @@ pub enum CalibrationError {
     Uncertain(f64),
 }
 
-/// Singular values below this share of the largest are taken for zero: coordinates are f32 or text with 7 digits at best.
+/// Singular values below this fraction of the largest count as zero: coordinates are f32 or text with 7 digits at best.
 const RANK_TOLERANCE: f64 = 1e-7;
 
 /// A focal length less certain than this is refused.
@@ -212,7 +214,7 @@ impl Calibration {
         say(u > 5.0, format!("the focal length is uncertain by {u:.0} %: add points nearer and farther"));
     }
 
-    /// The calibration in an operator's words, one fact a line.
+    /// The calibration as text for an operator, one fact a line.
     pub fn summary(&self) -> Vec<String> {
         let c = &self.camera;
         let (w, h) = (f64::from(c.raster.width()), f64::from(c.raster.height()));
@@ -257,7 +259,7 @@ fn check_spread(pairs: &[Pair]) -> Result<(), CalibrationError> {
     let n = pairs.len().max(1) as f64;
     let centre = pairs.iter().map(|p| p.world).sum::<DVec3>() / n;
     let magnitude = pairs.iter().map(|p| p.world.abs().max_element()).fold(0.0, f64::max);
-    // Differences below the rounding of the coordinates themselves are none.
+    // Differences below the rounding of the coordinates themselves count as zero.
     let clean = |d: f64| if d.abs() < 4.0 * f64::EPSILON * magnitude { 0.0 } else { d };
     let (rank, condition) =
         spread((0..3).map(|a| pairs.iter().map(|p| clean(p.world[a] - centre[a])).collect()).collect());
@@ -287,7 +289,7 @@ fn linear(pairs: &[Pair]) -> Result<(Pinhole, f64), CalibrationError> {
         }
     }
     let s = svd(a);
-    // Twelve unknowns up to a scale: the last singular value is the misfit, the one before must not vanish.
+    // Twelve unknowns up to a scale: the last singular value is the misfit; the one before must not vanish.
     let rank = s.values.iter().filter(|v| **v > s.values[0] * RANK_TOLERANCE).count();
     let condition = if s.values[10] > 0.0 { s.values[0] / s.values[10] } else { f64::INFINITY };
     if rank < 11 {
@@ -333,7 +335,7 @@ fn linear(pairs: &[Pair]) -> Result<(Pinhole, f64), CalibrationError> {
     Ok((model, condition))
 }
 
-/// The largest set of pairs that one projector explains; the number found where it is too small.
+/// The largest set of pairs that one projector explains; if that is too small, the number of pairs found.
 fn consensus(pairs: &[Pair], threshold: f64, seed: u64) -> Result<Vec<bool>, usize> {
     let agree = |m: &Pinhole, factor: f64| -> Vec<bool> {
         (pairs.iter())
@@ -352,7 +354,8 @@ fn consensus(pairs: &[Pair], threshold: f64, seed: u64) -> Result<Vec<bool>, usi
         }
         let sample: Vec<Pair> = index[..take].iter().map(|i| pairs[*i]).collect();
         let Ok((mut model, _)) = linear(&sample) else { continue };
-        // Few points extrapolate badly: look wider first, then close in on what the larger set says.
+        // Few points extrapolate badly: use a wider threshold first, then narrow it with the projector of the larger
+        // set.
         for factor in [4.0, 2.0, 1.0] {
             let set = agree(&model, factor);
             let chosen: Vec<Pair> = pairs.iter().zip(&set).filter(|(_, i)| **i).map(|(p, _)| *p).collect();
@@ -372,7 +375,7 @@ fn consensus(pairs: &[Pair], threshold: f64, seed: u64) -> Result<Vec<bool>, usi
             }
         }
     }
-    // Half the pairs must agree, or chance could have made the set.
+    // Half the pairs must agree; otherwise the set could have formed by chance.
     if count(&best) < SAMPLE.max(pairs.len() / 2) {
         Err(count(&best))
     } else {

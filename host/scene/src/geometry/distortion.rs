@@ -1,18 +1,19 @@
-//! Lens distortion of the Brown-Conrady kind with rational radial terms and thin prism: straight rays into bent ones and back.
+//! Lens distortion of the Brown-Conrady kind with rational radial terms and thin prism: converts straight rays to bent
+//! ones and back.
 //!
-//! Coordinates are `x / z`, `y / z` before the focal length, x right and y down. Only the part of the lens around the axis where the
-//! distortion grows with the angle has an inverse: beyond it several rays share one pixel, and the answer is `None`.
+//! Coordinates are `x / z`, `y / z` before the focal length, x right and y down. Distortion is invertible only around
+//! the axis, where it grows with the angle: farther out several rays share one pixel, and the answer is `None`.
 
 use glam::DVec2;
 
 /// Coefficients in the customary order k1 k2 p1 p2 k3 k4 k5 k6 s1 s2 s3 s4; missing ones are 0.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub struct Distortion {
-    /// All twelve.
+    /// All twelve coefficients.
     pub c: [f64; 12],
 }
 
-/// Rays more than this far from the axis (x / z) are not looked at: 84 degrees.
+/// Rays farther than this from the axis (x / z) are not considered: 84 degrees.
 const WIDEST: f64 = 10.0;
 
 impl Distortion {
@@ -26,7 +27,7 @@ impl Distortion {
         Some(Self { c })
     }
 
-    /// True when nothing is bent.
+    /// True without distortion.
     pub(crate) fn is_none(&self) -> bool {
         self.c.iter().all(|c| *c == 0.0)
     }
@@ -49,7 +50,7 @@ impl Distortion {
         p * self.radial(r2) + tangential + prism
     }
 
-    /// Largest r up to which `r * radial(r^2)` grows, by scanning; the lens has no inverse beyond.
+    /// Largest r up to which `r * radial(r^2)` grows, by scanning; the lens is not invertible beyond it.
     pub(crate) fn valid_radius(&self) -> f64 {
         const STEPS: u32 = 4000;
         let mut last = 0.0;
@@ -76,13 +77,14 @@ impl Distortion {
         bent.is_finite().then_some(bent)
     }
 
-    /// The straight ray of a bent one, to 1e-12; `None` when no ray of the valid part of the lens goes there.
+    /// The straight ray of a bent one, to 1e-12; `None` if no ray of the valid part of the lens leads there.
     pub fn undistort(&self, bent: DVec2) -> Option<DVec2> {
         if self.is_none() {
             return bent.is_finite().then_some(bent);
         }
         let limit = self.valid_radius();
-        // The radial part alone is monotone up to the limit: bisect for the start, so that Newton cannot leave the right branch.
+        // The radial part alone is monotone up to the limit: bisection finds the start, so that Newton cannot leave the
+        // right branch.
         let target = bent.length();
         let (mut low, mut high) = (0.0, limit);
         if target.is_nan() || target > 1.5 * limit * self.radial(limit * limit) {

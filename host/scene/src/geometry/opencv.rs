@@ -1,7 +1,8 @@
-//! OpenCV FileStorage files (YAML 1.0 or XML) into a calibrated projector.
+//! Reads OpenCV FileStorage files (YAML 1.0 or XML) as a calibrated projector.
 //!
-//! `%YAML:1.0` is no valid YAML, and tools misspell and rename the entries; so this is a small tolerant reader of exactly the parts that
-//! calibrations use: matrices and numbers by name at any depth. Sizes are bounded by the text itself: nothing is allocated ahead of the data.
+//! `%YAML:1.0` is not valid YAML, and tools misspell and rename the entries. So this is a small tolerant reader of
+//! exactly the parts that calibrations use: matrices and numbers by name at any depth. The text itself bounds all
+//! sizes: nothing is allocated ahead of the data.
 
 use super::distortion::Distortion;
 use super::projector::{ProjectorCamera, ProjectorError};
@@ -13,7 +14,7 @@ use thiserror::Error;
 /// Largest accepted file, bytes.
 pub const MAX_BYTES: usize = 1 << 20;
 
-/// The unit of lengths in a file: it cannot be told from the numbers.
+/// The unit of lengths in a file; the numbers do not reveal it.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum LengthUnit {
     /// 1 m.
@@ -33,7 +34,7 @@ pub struct Matrix {
     pub data: Vec<f64>,
 }
 
-/// What a calibration file holds.
+/// The content of a calibration file.
 #[derive(Clone, Debug, PartialEq)]
 pub struct StoredCalibration {
     /// The projector, without its distortion.
@@ -44,7 +45,7 @@ pub struct StoredCalibration {
     pub found: Vec<String>,
 }
 
-/// Why a file gives no calibration.
+/// Why a file does not yield a calibration.
 #[derive(Clone, Debug, PartialEq, Error)]
 pub enum StorageError {
     /// Larger than [`MAX_BYTES`].
@@ -60,13 +61,13 @@ pub enum StorageError {
     Matrix {
         /// Its name.
         name: String,
-        /// What is wrong.
+        /// The problem.
         what: String,
     },
     /// A part is missing.
     #[error("calibration file: no {part}; looked for {names}; the file has {has}")]
     Missing {
-        /// What it is.
+        /// The missing part.
         part: &'static str,
         /// Names tried.
         names: &'static str,
@@ -78,7 +79,7 @@ pub enum StorageError {
     Value {
         /// Name of the entry.
         name: String,
-        /// What is wrong with it.
+        /// The problem.
         what: String,
     },
     /// The intrinsics are refused.
@@ -181,8 +182,8 @@ fn xml(text: &str) -> Result<BTreeMap<String, Matrix>, StorageError> {
     Ok(found)
 }
 
-/// Reads a calibration. `R` and `T` take points of the calibration's world (often the camera) into the projector's space:
-/// `x_proj = R x + T`, looking along +Z with y down, as OpenCV has it.
+/// Reads a calibration. `R` and `T` take points of the calibration's world (often the camera) into the projector's
+/// space: `x_proj = R x + T`, looking along +Z with y down, as in OpenCV.
 pub fn read(text: &str, raster: Raster, unit: LengthUnit) -> Result<StoredCalibration, StorageError> {
     let all = matrices(text)?;
     let mut found = Vec::new();
@@ -240,7 +241,7 @@ pub fn read(text: &str, raster: Raster, unit: LengthUnit) -> Result<StoredCalibr
     if off.iter().any(|v| v.abs() > 1e-3) || rotation.determinant() < 0.0 {
         return Err(value(&r_name, "is not a rotation (columns must be orthonormal, determinant +1)".into()));
     }
-    // Text carries few digits: make it a rotation again.
+    // Text has few digits, so make the matrix a rotation again.
     let x = rotation.x_axis.normalize();
     let y = (rotation.y_axis - x * x.dot(rotation.y_axis)).normalize();
     let rotation = DMat3::from_cols(x, y, x.cross(y));
@@ -275,7 +276,7 @@ pub fn read(text: &str, raster: Raster, unit: LengthUnit) -> Result<StoredCalibr
     let flip = DMat3::from_diagonal(DVec3::new(1.0, -1.0, -1.0));
     let pose =
         DAffine3::from_mat3_translation(rotation.transpose() * flip, -(rotation.transpose() * translation));
-    // OpenCV counts pixel centres as whole numbers, this project as halves.
+    // OpenCV puts pixel centres at whole numbers, this project at halves.
     let camera = ProjectorCamera::new(raster, pose, fx, fy, cx + 0.5, cy + 0.5)?;
     Ok(StoredCalibration { camera, distortion, found })
 }
@@ -300,7 +301,7 @@ mod tests {
         assert!((pixel - want).length() < 1e-9, "{pixel} {want}");
         assert_eq!(c.distortion.c[..3], [-0.1, 0.01, 0.0]);
         assert!(c.found.contains(&"rotation: roration".to_string()), "{:?}", c.found);
-        // In metres the projector is a thousand times farther.
+        // In metres the projector is a thousand times farther away.
         let m = read(YAML, raster(), LengthUnit::Metre).unwrap();
         assert!((m.camera.position() - c.camera.position() * 1000.0).length() < 1e-9);
     }

@@ -1,4 +1,4 @@
-//! A pinhole projector: pixels into rays and world points into pixels.
+//! A pinhole projector: converts pixels to rays and world points to pixels.
 //!
 //! Projector space looks along -Z with +X right and +Y up. Pixel coordinates run right and **down** from the raster's upper left
 //! corner; pixel `(i, j)` covers `i..i+1` by `j..j+1`, its centre is `(i + 0.5, j + 0.5)`.
@@ -10,9 +10,9 @@ use thiserror::Error;
 /// A half-line. `direction` is of unit length.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct DRay {
-    /// Where it starts, metres.
+    /// Its origin, metres.
     pub origin: DVec3,
-    /// Where it goes, unit.
+    /// Its direction, unit.
     pub direction: DVec3,
 }
 
@@ -22,7 +22,7 @@ pub enum ProjectorError {
     /// Position, target, up or angle is NaN or infinite.
     #[error("projector: {0} is not finite; give finite numbers")]
     NotFinite(&'static str),
-    /// The horizontal field of view leaves no picture.
+    /// The horizontal field of view is out of range.
     #[error("projector: horizontal field of view {0} deg is outside 0..180 (both excluded)")]
     FieldOfView(f64),
     /// Position and look_at coincide.
@@ -76,7 +76,7 @@ impl ProjectorCamera {
             return Err(ProjectorError::FieldOfView(hfov_rad.to_degrees()));
         }
         let back = (position - look_at).try_normalize().ok_or(ProjectorError::NoDirection)?;
-        // The sine of the angle between up and the axis: below 1e-9 the roll is decided by rounding.
+        // The sine of the angle between up and the axis: below 1e-9 rounding determines the roll.
         let side = up.normalize_or_zero().cross(back);
         if side.length() < 1e-9 {
             return Err(ProjectorError::NoUp);
@@ -109,7 +109,7 @@ impl ProjectorCamera {
         Ok(Self { raster, world_from_projector, fx, fy, cx, cy })
     }
 
-    /// Where the light comes from, world space.
+    /// The origin of the light, world space.
     pub fn position(&self) -> DVec3 {
         self.world_from_projector.translation
     }
@@ -132,7 +132,7 @@ impl ProjectorCamera {
     pub fn project(&self, world: DVec3) -> Option<DVec2> {
         let p = self.to_projector_space(world);
         let depth = -p.z;
-        // Nearer than 1e-12 of the lateral distance the quotient has no meaning (and would overflow at 0).
+        // If the depth is below 1e-12 of the lateral distance, the quotient is meaningless (and would overflow at 0).
         if depth.is_nan() || depth <= 1e-12 * p.x.abs().max(p.y.abs()).max(1e-290) {
             return None;
         }
@@ -140,7 +140,8 @@ impl ProjectorCamera {
         pixel.is_finite().then_some(pixel)
     }
 
-    /// Rows d(x)/dX and d(y)/dX of the projection at a world point, pixels per metre; `None` where [`Self::project`] is.
+    /// Rows d(x)/dX and d(y)/dX of the projection at a world point, pixels per metre; `None` if [`Self::project`]
+    /// returns `None`.
     pub fn jacobian(&self, world: DVec3) -> Option<[DVec3; 2]> {
         self.project(world)?;
         let p = self.to_projector_space(world);

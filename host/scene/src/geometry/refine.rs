@@ -1,4 +1,5 @@
-//! A roughly known pinhole and point pairs into the pinhole of least reprojection error: Levenberg-Marquardt (\[Marquardt63\]).
+//! Refines a roughly known pinhole to the least reprojection error of point pairs: Levenberg-Marquardt
+//! (\[Marquardt63\]).
 
 use super::calibration::Pair;
 use super::svd::{inverse_diagonal, solve_spd};
@@ -19,7 +20,7 @@ impl Pinhole {
         self.rotation * world + self.translation
     }
 
-    /// Distance in front along the axis.
+    /// Distance along the axis in front of the pinhole.
     pub(super) fn depth(&self, world: DVec3) -> f64 {
         self.local(world).z
     }
@@ -37,12 +38,13 @@ impl Pinhole {
         pairs.iter().map(|p| self.residual(p).length_squared()).sum()
     }
 
-    /// Moved by (focal 2, centre 2, rotation 3, translation 3).
+    /// The pinhole after a step of (focal 2, centre 2, rotation 3, translation 3).
     fn step(&self, d: &[f64]) -> Self {
-        // Focal lengths are stepped in their logarithm: they cannot turn negative, and 100 times too long is a distance of 4.6.
+        // Focal lengths are stepped in their logarithm: they cannot become negative, and an error of a factor 100 is a
+        // distance of 4.6.
         let turn = so3_exp(DVec3::new(d[4], d[5], d[6]));
         let rotation = DMat3::from_quat(turn) * self.rotation;
-        // Rounding would let the matrix drift from a rotation over many steps.
+        // Over many steps rounding would make the matrix drift from a rotation.
         let x = rotation.x_axis.normalize();
         let y = (rotation.y_axis - x * x.dot(rotation.y_axis)).normalize();
         Self {
@@ -74,13 +76,13 @@ impl Pinhole {
     }
 }
 
-/// What the refinement came to.
+/// The result of the refinement.
 pub(super) struct Refined {
     pub model: Pinhole,
     pub rms: f64,
     pub converged: bool,
     pub iterations: usize,
-    /// Standard deviation of the focal length over itself.
+    /// Relative standard deviation of the focal length.
     pub focal_uncertainty: f64,
 }
 
@@ -109,7 +111,7 @@ pub(super) fn refine(start: Pinhole, pairs: &[Pair]) -> Refined {
                 }
             }
         }
-        // Residuals at the rounding error of the coordinates: nothing is left to gain.
+        // Residuals are at the rounding error of the coordinates: no further gain is possible.
         if cost <= n * 1e-30 {
             converged = true;
             break;
@@ -129,7 +131,8 @@ pub(super) fn refine(start: Pinhole, pairs: &[Pair]) -> Refined {
             (model, cost) = (next, next_cost);
             damping = (damping * 0.2).max(1e-15);
             accepted = true;
-            // A step that is small although hardly damped is the end; small because of damping is not.
+            // A step that is small although hardly damped means convergence; one that is small because of damping does
+            // not.
             converged = gain < 1e-12 && length < 1e-7 && damping < 1e-2;
             break;
         }

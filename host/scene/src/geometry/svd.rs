@@ -1,7 +1,7 @@
 //! Small dense matrices: singular values by one-sided Jacobi rotations, and symmetric positive definite systems by Cholesky.
 //!
-//! One-sided Jacobi (\[Hestenes58\]) works on the matrix itself and not on its square, so that singular values are found down to
-//! rounding error of the largest one; that is what telling a degenerate calibration from a poor one needs.
+//! One-sided Jacobi (\[Hestenes58\]) works on the matrix itself and not on its square, so it finds singular values down
+//! to the rounding error of the largest one. This is needed to distinguish a degenerate calibration from a poor one.
 
 /// Columns of a matrix, all of one length.
 pub(super) type Columns = Vec<Vec<f64>>;
@@ -56,7 +56,7 @@ pub(crate) fn svd(mut columns: Columns) -> Svd {
     Svd { values, vectors }
 }
 
-/// Solves `A x = b` for a symmetric positive definite matrix in rows; `None` where it is not.
+/// Solves `A x = b` for a symmetric positive definite matrix in rows; `None` if it is not positive definite.
 pub(crate) fn solve_spd(a: &[Vec<f64>], b: &[f64]) -> Option<Vec<f64>> {
     let l = cholesky(a)?;
     let n = b.len();
@@ -72,7 +72,7 @@ pub(crate) fn solve_spd(a: &[Vec<f64>], b: &[f64]) -> Option<Vec<f64>> {
     x.iter().all(|v| v.is_finite()).then_some(x)
 }
 
-/// Diagonal of the inverse of a symmetric positive definite matrix; `None` where it is not.
+/// Diagonal of the inverse of a symmetric positive definite matrix; `None` if it is not positive definite.
 pub(crate) fn inverse_diagonal(a: &[Vec<f64>]) -> Option<Vec<f64>> {
     let n = a.len();
     (0..n)

@@ -1,9 +1,9 @@
-//! Buffer views and accessors into numbers; every bound is checked once, in 64 bits, before any byte is read.
+//! Reads numbers through buffer views and accessors; every bound is checked once, in 64 bits, before any byte is read.
 
 use super::super::{Limits, SceneError};
 use super::json::Item;
 
-/// How a component is stored.
+/// Storage type of a component.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(crate) enum Component {
     /// 5120.
@@ -56,7 +56,7 @@ struct View {
     stride: Option<u64>,
 }
 
-/// Where the elements of an accessor lie: `start + i * step` in a buffer.
+/// The place of an accessor's elements: `start + i * step` in a buffer.
 #[derive(Clone, Copy, Debug)]
 struct Run {
     buffer: usize,
@@ -82,7 +82,7 @@ pub(crate) struct Accessor {
     pub component: Component,
     /// Components of an element.
     pub dimensions: u64,
-    /// Integers stand for 0..1 or -1..1.
+    /// Integers represent 0..1 or -1..1.
     pub normalized: bool,
     /// Elements; at least 1.
     pub count: u64,
@@ -267,7 +267,7 @@ impl Data {
         Ok(sparse)
     }
 
-    /// `N` bytes at an element of a run. The run was checked, so they are there.
+    /// `N` bytes at an element of a run. The run was checked, so the bytes exist.
     fn bytes<const N: usize>(&self, run: Run, element: u64, offset: u64) -> [u8; N] {
         let at = (run.start + element * run.step + offset) as usize;
         let mut out = [0; N];
@@ -283,7 +283,7 @@ impl Data {
         }
     }
 
-    /// Where an element lies after sparse replacement; `None` reads as zero.
+    /// The place of an element after sparse replacement; `None` reads as zero.
     fn locate(&self, accessor: &Accessor, element: u64) -> Option<(Run, u64)> {
         if let Some(sparse) = accessor.sparse {
             let (mut low, mut high) = (0, sparse.count);
@@ -304,7 +304,8 @@ impl Data {
         self.locate(accessor, element).map_or(0, |(run, i)| self.unsigned(accessor.component, run, i))
     }
 
-    /// The first `N` components of an element as floats, integers scaled as `normalized` says. `element` must be below the count.
+    /// The first `N` components of an element as floats, integers scaled according to `normalized`. `element` must be
+    /// below the count.
     pub(super) fn floats<const N: usize>(&self, accessor: &Accessor, element: u64) -> [f32; N] {
         let Some((run, i)) = self.locate(accessor, element) else { return [0.0; N] };
         let scale = |x: f32, greatest: f32| if accessor.normalized { (x / greatest).max(-1.0) } else { x };

@@ -1,6 +1,8 @@
-//! The gate in front of the `gltf` crate: raw JSON in, refusals and warnings out. After it the crate's typed view cannot panic or lie.
+//! Validation before the `gltf` crate: checks raw JSON and yields refusals and warnings. Afterwards the crate's typed
+//! view can neither panic nor return wrong data.
 //!
-//! Here: version, extensions, the node tree, meshes. Materials, textures and lights are in [`super::check_look`], buffers in [`super::accessor`].
+//! This file checks version, extensions, the node tree and meshes. Materials, textures and lights are in
+//! [`super::check_look`], buffers in [`super::accessor`].
 
 use super::super::{Limits, SceneError};
 use super::accessor::{Component, Data};
@@ -8,7 +10,7 @@ use super::check_look::check_look;
 use super::instancing::{self, read_instances, Instances};
 use super::json::{shorten, Item};
 
-/// Extensions this program understands, or may ignore without showing something wrong.
+/// Extensions that this program understands, or may ignore without a wrong picture.
 const UNDERSTOOD: [&str; 12] = [
     instancing::NAME,
     "KHR_lights_punctual",
@@ -42,15 +44,15 @@ pub(super) struct Counts {
     pub lights: usize,
 }
 
-/// What is known of a document that passed.
+/// Results for a document that passed.
 pub(crate) struct Checked {
-    /// What is accepted but not reproduced.
+    /// Content that is accepted but not reproduced.
     pub warnings: Vec<String>,
-    /// Where the meshes of instanced nodes stand.
+    /// The places of the meshes of instanced nodes.
     pub instances: Instances,
 }
 
-/// Checks the whole document but its buffers.
+/// Checks the whole document except its buffers.
 pub(super) fn check(root: &Item, data: &Data, limits: &Limits) -> Result<Checked, SceneError> {
     let mut warnings = vec![];
     let list = |key, kind| root.list(key, kind, limits.objects);
@@ -83,7 +85,7 @@ pub(super) fn check(root: &Item, data: &Data, limits: &Limits) -> Result<Checked
     check_nodes(root, &nodes, &counts, &triangles, &instances, limits)?;
     let lost: Vec<String> = list_of_strings(root, "extensionsUsed")?
         .into_iter()
-        // Materials tell of theirs one by one.
+        // Materials report theirs individually.
         .filter(|name| !UNDERSTOOD.contains(name) && !name.contains("_materials_"))
         .map(shorten)
         .collect();
@@ -93,8 +95,8 @@ pub(super) fn check(root: &Item, data: &Data, limits: &Limits) -> Result<Checked
     Ok(Checked { warnings, instances })
 }
 
-/// Checks the version and what the file says it cannot do without. Comes before everything else: a file that needs Draco has no
-/// plain vertices, and that is what the operator should read.
+/// Checks the version and the required extensions. This comes first: a file that needs Draco has no plain vertices, and
+/// the operator should read that.
 pub(crate) fn check_asset(root: &Item) -> Result<(), SceneError> {
     let asset = root.object("asset")?.ok_or_else(|| root.error("has no 'asset': this is not glTF"))?;
     let version = asset.text("version")?.ok_or_else(|| asset.error("has no 'version'"))?;
@@ -203,7 +205,8 @@ fn check_mesh(
     Ok(triangles)
 }
 
-/// Checks types and counts of the attributes that are read; returns the number of vertices, `None` without positions.
+/// Checks types and counts of the attributes that are read; returns the number of vertices, or `None` without
+/// positions.
 fn check_attributes(
     primitive: &Item,
     attributes: &Item,
@@ -248,7 +251,8 @@ fn check_attributes(
     Ok(vertices.filter(|_| attributes.get("POSITION").is_some()).map(|v| v.0))
 }
 
-/// Checks that the nodes form trees of bounded depth, that transforms are numbers, and that all instances together stay within the limits.
+/// Checks that the nodes form trees of bounded depth, that transforms are finite, and that all instances together are
+/// within the limits.
 fn check_nodes(
     root: &Item,
     nodes: &[Item],
@@ -293,7 +297,7 @@ fn check_nodes(
         "use emissive surfaces or an environment image",
     )?;
 
-    // Every node is walked down to once from the nodes without parent; what is never reached hangs in a cycle.
+    // The walk reaches every node once from the nodes without parent; an unreached node is part of a cycle.
     let mut reached = 0;
     let mut walk: Vec<(usize, u32)> =
         (0..nodes.len()).filter(|&i| parent[i].is_none()).map(|i| (i, 1)).collect();

@@ -1,10 +1,10 @@
-//! The gate's second half: materials, textures, samplers, images and lights of the raw JSON.
+//! The second half of the validation: materials, textures, samplers, images and lights of the raw JSON.
 
 use super::super::{Limits, SceneError};
 use super::check::Counts;
 use super::json::{shorten, Item};
 
-/// Radiance factors and intensities beyond this are taken for damage.
+/// Radiance factors and intensities beyond this count as damage.
 const GREATEST_INTENSITY: f32 = 1.0e9;
 
 /// Extensions of materials that are reproduced.
@@ -15,7 +15,7 @@ const REPRODUCED: [&str; 4] = [
     "KHR_materials_volume",
 ];
 
-/// Checks everything about how surfaces look and how lights shine.
+/// Checks everything about the appearance of surfaces and the light of lamps.
 pub(crate) fn check_look(
     root: &Item,
     counts: &Counts,
@@ -78,7 +78,7 @@ fn small_whole(item: &Item, key: &str) -> Result<(), SceneError> {
     }
 }
 
-/// A number that must lie in a range; absent is fine.
+/// A number that must be in a range if present.
 fn ranged(item: &Item, key: &str, low: f32, high: f32) -> Result<(), SceneError> {
     match item.number(key)? {
         Some(x) if !(low..=high).contains(&x) => {
@@ -97,7 +97,7 @@ fn ranged_list<const N: usize>(item: &Item, key: &str, high: f32) -> Result<(), 
     }
 }
 
-/// Factors 0..1 that writers round to a little above 1 are clamped by the reader.
+/// The reader clamps factors 0..1 that writers round to slightly above 1.
 const UNIT: f32 = 1.001;
 
 fn check_material(material: &Item, counts: &Counts, warnings: &mut Vec<String>) -> Result<(), SceneError> {

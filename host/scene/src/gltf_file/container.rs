@@ -1,4 +1,4 @@
-//! A `.glb` or `.gltf` file into its JSON tree and its buffers; the only place that follows a URI.
+//! Splits a `.glb` or `.gltf` file into its JSON tree and its buffers; the only place that follows a URI.
 
 use std::io::Read;
 use std::path::{Component, Path, PathBuf};
@@ -44,7 +44,8 @@ pub(super) fn split(bytes: &[u8], limits: &Limits) -> Result<Container, SceneErr
             "unpack it and give the .glb or .gltf inside",
         ));
     }
-    // What begins like no JSON is another kind of file; only white space and a byte-order mark may come before it.
+    // A file that does not begin like JSON is of another kind; only white space and a byte-order mark may precede the
+    // JSON.
     let first = text.iter().find(|b| !b.is_ascii_whitespace() && ![0xef, 0xbb, 0xbf].contains(*b));
     if !matches!(first, Some(b'{' | b'[')) {
         return Err(SceneError::broken(
@@ -110,7 +111,7 @@ fn split_glb(bytes: &[u8]) -> Result<Chunks<'_>, SceneError> {
     Ok((&text[..end], binary))
 }
 
-/// Where side files may lie.
+/// The folder in which side files may lie.
 #[derive(Clone, Debug)]
 pub(super) struct Folder(PathBuf);
 
@@ -147,7 +148,7 @@ fn refused_uri(uri: &str) -> SceneError {
     )
 }
 
-/// Names that Windows takes for devices whatever follows the dot.
+/// Names that Windows treats as devices, whatever follows the dot.
 fn is_device_name(part: &str) -> bool {
     let stem = part.split('.').next().unwrap_or("").trim_end().to_ascii_uppercase();
     let numbered = |prefix| {
@@ -177,7 +178,7 @@ fn percent_decode(uri: &str) -> Result<String, SceneError> {
     String::from_utf8(out).map_err(|_| refused_uri(uri))
 }
 
-/// The bytes behind a URI: `data:` with base64, or a file in `folder`.
+/// The content of a URI: `data:` with base64, or a file in `folder`.
 pub(crate) fn fetch(uri: &str, folder: Option<&Folder>, limit: u64) -> Result<Vec<u8>, SceneError> {
     if let Some(rest) = uri.strip_prefix("data:") {
         let Some((head, payload)) = rest.split_once(',') else {

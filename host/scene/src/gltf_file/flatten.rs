@@ -1,4 +1,5 @@
-//! The node tree into rigid bodies: what a body of the rig file claims moves with it, everything else stands still.
+//! Flattens the node tree into rigid bodies: nodes that a body of the rig file claims move with it, all others are
+//! static.
 
 use std::collections::{BTreeMap, HashMap, HashSet};
 
@@ -17,7 +18,7 @@ use super::primitive::read_primitive;
 /// Bodies that [`choose_bodies`] makes movable when the rig file names none.
 const AUTO_BODIES: usize = 2;
 
-/// Which body a node belongs to: (index of the selector or none, exists only in the virtual world).
+/// The body that a node belongs to: (index of the selector or none, exists only in the virtual world).
 type Group = (Option<usize>, bool);
 
 /// Part of the tree still to be walked.
@@ -28,11 +29,11 @@ struct Step {
     is_virtual: bool,
 }
 
-/// What [`flatten`] gives.
+/// The result of [`flatten`].
 pub(crate) struct Flat {
     /// In the order of the selectors, fixed things last.
     pub bodies: Vec<Body>,
-    /// All of the file's lights that a scene uses.
+    /// All lights of the file that a scene uses.
     pub lights: Vec<PunctualLight>,
 }
 
@@ -109,7 +110,7 @@ pub(crate) fn choose_bodies(
     Ok(Claims { bodies, virtual_nodes })
 }
 
-/// The one node in `present`, whose names are `names`, that is called `name`.
+/// The only node named `name` in `present`; `names` holds the nodes' names.
 fn find_node(names: &[Option<&str>], present: &[usize], name: &str) -> Result<usize, SceneError> {
     let matching: Vec<usize> =
         present.iter().zip(names).filter(|(_, n)| **n == Some(name)).map(|(i, _)| *i).collect();
@@ -126,8 +127,8 @@ fn find_node(names: &[Option<&str>], present: &[usize], name: &str) -> Result<us
     Err(SceneError::Node { problem, known: if known.is_empty() { "none".into() } else { known.join(", ") } })
 }
 
-/// The first objects of the scene with a mesh become movable bodies, the given ones or, without any, two with the names of their nodes;
-/// lamps (all materials emit) become virtual.
+/// The first objects of the scene with a mesh become the given movable bodies, or, if none are given, two bodies with
+/// the names of their nodes; lamps (all materials emit) become virtual.
 fn choose_automatically(
     document: &gltf::Document,
     mut roots: Vec<usize>,
@@ -135,7 +136,7 @@ fn choose_automatically(
     given: &[BodySelector],
     warnings: &mut Vec<String>,
 ) -> Claims {
-    // Exporters like to wrap everything in one node: look inside it.
+    // Exporters often wrap everything in one node: look inside it.
     while let [only] = roots[..] {
         let Some(node) = document.nodes().nth(only) else { break };
         let below: Vec<usize> = node.children().map(|c| c.index()).collect();
@@ -194,7 +195,7 @@ fn choose_automatically(
     Claims { bodies, virtual_nodes }
 }
 
-/// A checked document and what was read of it.
+/// A checked document and its decoded parts.
 pub(super) struct Source<'a> {
     /// Nodes and meshes.
     pub document: &'a gltf::Document,
@@ -202,7 +203,7 @@ pub(super) struct Source<'a> {
     pub data: &'a Data,
     /// Materials and textures.
     pub look: &'a Look,
-    /// Where the meshes of instanced nodes stand.
+    /// The places of the meshes of instanced nodes.
     pub instances: &'a Instances,
 }
 
@@ -260,7 +261,7 @@ pub(super) fn flatten(
                         for place in places {
                             cancel.check(limits)?;
                             dropped.add(lost);
-                            // An instance may be scaled to nothing, to hide it.
+                            // An instance may be scaled to zero, to hide it.
                             let body_from_instance = body_from_node * *place;
                             if is_invertible(&body_from_instance) {
                                 into.append_transformed(&part, &body_from_instance);
@@ -284,7 +285,7 @@ pub(super) fn flatten(
 
     let mut bodies = vec![];
     let mut body_of_claim = vec![None; claims.bodies.len()];
-    // The map puts None first; fixed things shall come last, after the bodies in the order of the rig file.
+    // The map sorts None first; static things must come last, after the bodies in the order of the rig file.
     let (fixed, moving): (Vec<_>, Vec<_>) = meshes.into_iter().partition(|((claim, _), _)| claim.is_none());
     for ((claim, is_virtual), mut mesh) in moving.into_iter().chain(fixed) {
         dropped.add(mesh.drop_unusable());
@@ -352,7 +353,8 @@ fn is_invertible(map: &DAffine3) -> bool {
     map.is_finite() && m.determinant().abs() > 1e-12 * size && size > 1e-30
 }
 
-/// The rotation and translation of an affine map (columns made orthonormal from x on; a mirroring stays with the geometry).
+/// The rotation and translation of an affine map (columns orthonormalised, beginning with x; a mirroring stays in the
+/// geometry).
 fn rigid_part(map: &DAffine3) -> Option<DAffine3> {
     if !is_invertible(map) {
         return None;
@@ -366,7 +368,7 @@ fn rigid_part(map: &DAffine3) -> Option<DAffine3> {
     .then_some(rigid)
 }
 
-/// A light in the space of its body; `None` where its place is not finite.
+/// A light in the space of its body; `None` if its position is not finite.
 fn place_light(light: &gltf::khr_lights_punctual::Light, body_from_node: &DAffine3) -> Option<PunctualLight> {
     use gltf::khr_lights_punctual::Kind;
     let kind = match light.kind() {

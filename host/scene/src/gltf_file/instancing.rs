@@ -1,4 +1,5 @@
-//! EXT_mesh_gpu_instancing: a node whose mesh stands in many places, each with a translation, a rotation and a scale of its own.
+//! EXT_mesh_gpu_instancing: a node whose mesh appears in many places, each with its own translation, rotation and
+//! scale.
 
 use std::collections::HashMap;
 
@@ -11,7 +12,7 @@ use super::json::Item;
 /// Name of the extension.
 pub(super) const NAME: &str = "EXT_mesh_gpu_instancing";
 
-/// Node to where its mesh stands, node-from-instance, for all nodes that have the extension.
+/// Maps each node that has the extension to the places of its mesh, node-from-instance.
 pub(crate) type Instances = HashMap<usize, Vec<DAffine3>>;
 
 /// Reads the instances of all nodes.

@@ -1,4 +1,4 @@
-//! JSON text into a tree of bounded size and depth, and typed access to that tree with messages that name the place.
+//! Parses JSON text into a tree of bounded size and depth, with typed access whose error messages name the place.
 
 use std::cell::Cell;
 
@@ -93,7 +93,7 @@ impl<'de> Visitor<'de> for Tree<'_> {
     }
 }
 
-/// A JSON object with the words by which messages name it: "accessor 3", "material 1 'glass'".
+/// A JSON object with its name in messages: "accessor 3", "material 1 'glass'".
 #[derive(Clone)]
 pub(super) struct Item<'a> {
     map: &'a Map<String, Value>,
@@ -102,7 +102,7 @@ pub(super) struct Item<'a> {
 }
 
 impl<'a> Item<'a> {
-    /// Takes `value` as an object called `name`.
+    /// Interprets `value` as an object called `name`.
     pub(super) fn new(value: &'a Value, name: String) -> Result<Self, SceneError> {
         match value {
             Value::Object(map) => Ok(Self { map, name }),
@@ -115,7 +115,7 @@ impl<'a> Item<'a> {
         SceneError::broken(self.name.clone(), problem)
     }
 
-    /// The raw value, where present.
+    /// The raw value, if present.
     pub(super) fn get(&self, key: &str) -> Option<&'a Value> {
         self.map.get(key)
     }
@@ -138,7 +138,8 @@ impl<'a> Item<'a> {
         }
     }
 
-    /// The objects of a list; none where the key is absent. Each is called `kind` and its index, with its "name" if it has one.
+    /// The objects of a list; none if the key is absent. Each is called `kind` and its index, with its "name" if it has
+    /// one.
     pub(super) fn list(&self, key: &str, kind: &str, limit: u64) -> Result<Vec<Item<'a>>, SceneError> {
         let Some(value) = self.get(key) else { return Ok(vec![]) };
         let Value::Array(values) = value else { return Err(self.error(format!("'{key}' must be a list"))) };
@@ -161,7 +162,7 @@ impl<'a> Item<'a> {
             .collect()
     }
 
-    /// A whole number from 0.
+    /// A non-negative integer.
     pub(super) fn whole(&self, key: &str) -> Result<Option<u64>, SceneError> {
         self.get(key)
             .map(|v| {
@@ -237,7 +238,7 @@ impl<'a> Item<'a> {
     }
 }
 
-/// Text from a file, made fit for a message: one line, not long.
+/// Text from a file, shortened to one line for a message.
 pub(crate) fn shorten(text: &str) -> String {
     let mut out: String = text.chars().take(60).map(|c| if c.is_control() { '?' } else { c }).collect();
     if text.chars().nth(60).is_some() {

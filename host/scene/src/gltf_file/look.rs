@@ -1,4 +1,4 @@
-//! Checked glTF materials, textures and images into [`Material`] and [`Texture`].
+//! Converts checked glTF materials, textures and images to [`Material`] and [`Texture`].
 
 use std::collections::HashMap;
 use std::io::Cursor;
@@ -12,9 +12,9 @@ use super::accessor::Data;
 use super::container::{fetch, Folder};
 use super::json::Item;
 
-/// What [`read_look`] gives.
+/// The result of [`read_look`].
 pub(super) struct Look {
-    /// One for each material of the file, and glTF's default material after them.
+    /// One for each material of the file, followed by glTF's default material.
     pub materials: Vec<Material>,
     /// Set of texture coordinates that each material needs.
     pub uv_sets: Vec<u32>,
@@ -97,7 +97,7 @@ impl Reader<'_> {
             gltf::material::AlphaMode::Blend => Some(0.5),
         };
         let strength = m.emissive_strength().unwrap_or(1.0);
-        // 0 is the extension's word for "reflects everything"; it comes from converted files and is not physical.
+        // In the extension, 0 means "reflects everything"; it occurs in converted files and is not physical.
         let ior = m.ior().filter(|&i| i >= 1.0).unwrap_or(1.5);
         if m.ior() == Some(0.0) {
             warnings.push(format!("{}: ior 0 is read as 1.5", raw.name));
@@ -227,7 +227,7 @@ impl Reader<'_> {
     }
 }
 
-/// Decodes PNG or JPEG to 8-bit RGBA; its size is checked before anything is decoded.
+/// Decodes PNG or JPEG to 8-bit RGBA; checks its size before decoding.
 fn decode_image(
     item: &Item,
     bytes: &[u8],
@@ -268,7 +268,7 @@ fn decode_image(
     let mut memory = image::Limits::default();
     memory.max_image_width = Some(width);
     memory.max_image_height = Some(height);
-    // 16-bit RGBA is the widest that is decoded; the rest is room for the decoder's own tables.
+    // 16-bit RGBA is the widest decoded format; the rest is room for the decoder's own tables.
     memory.max_alloc = Some(u64::from(width) * u64::from(height) * 8 + (16 << 20));
     bounded.limits(memory);
     let rgba = bounded.decode().map_err(failed)?.into_rgba8();
@@ -289,7 +289,7 @@ fn plain_use(slot: &'static str, info: &gltf::texture::Info, srgb: bool) -> Use 
     }
 }
 
-/// The crate does not give the transform of a normal texture, so it is read from the JSON.
+/// The crate does not provide the transform of a normal texture, so it is read from the JSON.
 fn normal_use(normal: &gltf::material::NormalTexture, material: &Item) -> Result<Use, SceneError> {
     let transform = match material.object("normalTexture")? {
         Some(info) => info.extension("KHR_texture_transform")?,

@@ -1,4 +1,5 @@
-//! A glTF file into a [`Scene`]: container, check, then the `gltf` crate's typed view of what passed, look and geometry.
+//! Reads a glTF file as a [`Scene`]: container, check, then the `gltf` crate's typed view of the checked document, look
+//! and geometry.
 
 mod accessor;
 mod check;
@@ -21,10 +22,10 @@ use json::Item;
 
 pub(super) use container::read_file;
 
-/// Warnings of one kind of trouble in a hostile file are cut off at this many lines.
+/// Maximum number of warnings of one kind from a hostile file.
 const MAX_WARNINGS: usize = 100;
 
-/// Reads `bytes`, the content of a `.glb` or `.gltf` file; side files are looked for in the folder of `beside`.
+/// Reads `bytes`, the content of a `.glb` or `.gltf` file; side files are searched in the folder of `beside`.
 pub(super) fn read(
     bytes: &[u8],
     beside: Option<&Path>,
@@ -65,7 +66,7 @@ pub(super) fn read(
     })
 }
 
-/// The document without the parts that are read elsewhere or not at all, so that the crate never meets them.
+/// The document without the parts that are read elsewhere or not at all, so that the crate never sees them.
 fn reduced(tree: &Value) -> Value {
     let kept = [
         "asset",
@@ -95,7 +96,7 @@ fn reduced(tree: &Value) -> Value {
         let primitives = mesh.get_mut("primitives").and_then(Value::as_array_mut).into_iter().flatten();
         primitives.for_each(|p| strip(p, &["targets", "extras", "extensions"]));
     });
-    // Only which image is meant matters to the crate; the bytes are fetched here.
+    // The crate needs only the image's index; the bytes are fetched here.
     lists(&mut top, "images", &mut |image| *image = serde_json::json!({}));
     for list in ["scenes", "materials", "textures", "samplers"] {
         lists(&mut top, list, &mut |object| strip(object, &["extras"]));

@@ -1,4 +1,4 @@
-//! One checked primitive of a mesh into a [`TriangleMesh`] in the mesh's own space.
+//! Reads one checked primitive of a mesh as a [`TriangleMesh`] in the mesh's own space.
 
 use std::collections::HashMap;
 
@@ -10,8 +10,8 @@ use super::super::mesh::Dropped;
 use super::super::{SceneError, TriangleMesh};
 use super::accessor::{Accessor, Data};
 
-/// Reads a primitive's triangles with their material; only vertices that a triangle uses are decoded. `None` where there is nothing
-/// to see (points, lines, no positions), about which the check has warned.
+/// Reads a primitive's triangles with their material; decodes only vertices that a triangle uses. `None` if there is
+/// nothing to see (points, lines, no positions), about which the check has warned.
 pub(crate) fn read_primitive(
     primitive: &Primitive,
     data: &Data,
@@ -26,7 +26,7 @@ pub(crate) fn read_primitive(
     let faces: Vec<[u64; 3]> = match primitive.mode {
         Checked::Valid(Mode::Triangles) => corners.chunks_exact(3).map(|c| [c[0], c[1], c[2]]).collect(),
         Checked::Valid(Mode::TriangleStrip) => {
-            // Every other face of a strip is turned, so that all face the same way.
+            // Every second face of a strip is flipped, so that all face the same way.
             let face =
                 |(i, c): (usize, &[u64])| if i % 2 == 0 { [c[0], c[1], c[2]] } else { [c[1], c[0], c[2]] };
             corners.windows(3).enumerate().map(face).collect()
@@ -52,7 +52,7 @@ pub(crate) fn read_primitive(
         .collect();
     let floats3 = |a: &Accessor| used.iter().map(|&i| Vec3::from(data.floats::<3>(a, i))).collect::<Vec<_>>();
     let uvs = match attribute(Semantic::TexCoords(uv_set)) {
-        // A coordinate that is not a number would spoil whole pixels; zero spoils only the texture.
+        // A NaN texture coordinate would spoil whole pixels; zero spoils only the texture.
         Some(a) => used
             .iter()
             .map(|&i| Vec2::from(data.floats::<2>(a, i).map(|x| if x.is_finite() { x } else { 0.0 })))
@@ -64,7 +64,7 @@ pub(crate) fn read_primitive(
     let mut mesh = TriangleMesh {
         positions: floats3(positions),
         normals: normals.unwrap_or_else(|| vec![Vec3::ZERO; used.len()]),
-        // Tangents without normals mean nothing, as the format says.
+        // Tangents without normals have no meaning in glTF.
         tangents: match attribute(Semantic::Tangents).filter(|_| has_normals) {
             Some(a) => used.iter().map(|&i| Vec4::from(data.floats::<4>(a, i))).collect(),
             None => vec![],
