@@ -2,7 +2,7 @@
 
 use bytemuck::Zeroable;
 use dpm_lab::reference::Sampler;
-use dpm_render::compensation::{real_cosine, Compensation};
+use dpm_lab::twins::compensation::{real_cosine, Compensation};
 use dpm_render::gpu::{
     BindingKind, BindingSet, BindingTable, Buffer, CommandList, ComputePipeline, FrameFence, Gpu, MemoryKind,
 };

@@ -13,6 +13,7 @@
 //! ```
 
 pub mod bench;
+pub mod blue_noise;
 pub mod conformance;
 pub mod error;
 pub mod handoff_cost;
@@ -30,3 +31,4 @@ pub mod snapshot;
 mod sobol;
 pub mod stability;
 pub mod stamp;
+pub mod twins;

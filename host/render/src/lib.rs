@@ -19,7 +19,6 @@
 pub mod blue_noise;
 mod body_bvh;
 mod cluster;
-pub mod compensation;
 mod fill;
 mod frame_buffers;
 pub mod gpu;
@@ -28,7 +27,7 @@ mod memory;
 pub mod method;
 pub mod pack;
 mod passes;
-pub mod rate_map;
+pub mod rate_table;
 mod renderer;
 pub mod scene_data;
 mod scene_gpu;

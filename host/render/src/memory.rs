@@ -4,7 +4,7 @@
 use super::blue_noise;
 use super::fill::fill;
 use super::method::Method;
-use super::rate_map;
+use super::rate_table;
 use super::renderer::{RenderError, RendererSettings};
 use super::scene_gpu::table_buffer;
 use super::tiles::TILE;
@@ -170,7 +170,7 @@ impl SharedBuffers {
         Ok(Self {
             history: [history()?, history()?],
             rates: Buffer::from_slice(gpu, "shading rates", &vec![0u32; tiles as usize])?,
-            rate_table: Buffer::from_slice(gpu, "rate table", &rate_map::rate_table())?,
+            rate_table: Buffer::from_slice(gpu, "rate table", &rate_table::rate_table())?,
             noise: Buffer::from_slice(gpu, "blue noise", blue_noise::MASK)?,
             schedule_start: Buffer::from_slice(gpu, "schedule", &[start])?,
         })

@@ -3,12 +3,12 @@
 use super::rig_args::RigArgs;
 use super::watch::{print, watch};
 use dpm_device::regular_file;
+use dpm_lab::profile::compare::{compare, failed_gates, to_table};
 use dpm_lab::profile::profile_rig;
+use dpm_lab::profile::prometheus::{page, PageServer};
 use dpm_rig::failure::{Ended, Failure, FailureKind};
-use dpm_rig::telemetry::compare::{compare, failed_gates, to_table};
 use dpm_rig::telemetry::monitor::RunCounts;
 use dpm_rig::telemetry::profile::ProfileReport;
-use dpm_rig::telemetry::prometheus::{page, PageServer};
 use std::path::{Path, PathBuf};
 
 /// Length of a profile without `--seconds` or `--frames`, s.

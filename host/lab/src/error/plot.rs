@@ -2,8 +2,8 @@
 
 use super::figure3::{looks, Figure3Group, Figure3Row};
 use super::runs::{ErrorRow, GroupResult};
+use crate::profile::plots::{color, key, Stroke, SIZE};
 use crate::stamp::Stamp;
-use dpm_rig::telemetry::plots::{color, key, Stroke, SIZE};
 use plotters::coord::combinators::{LogCoord, WithKeyPoints};
 use plotters::prelude::*;
 

@@ -2,9 +2,9 @@
 
 use super::paint::{self, Canvas, Scale};
 use super::SnapshotImage;
+use crate::twins::rate_map::{estimate, PixelGuide, RateConstants};
 use dpm_device::planes::Raster;
 use dpm_render::method::Method;
-use dpm_render::rate_map::{estimate, PixelGuide, RateConstants};
 use dpm_render::{FrameSlot, Renderer};
 use dpm_rig::pictures::to_srgb;
 use dpm_shaders::structs::{Guide, History, Surface, NO_HIT};

@@ -6,7 +6,7 @@ use super::Case;
 use crate::reference::bsdf::Bsdf;
 use crate::reference::microfacet::fresnel_dielectric;
 use crate::reference::{Reference, Sampler, SurfacePoint};
-use dpm_render::compensation::Compensation;
+use crate::twins::compensation::Compensation;
 use dpm_scene::albedo_table::AlbedoTable;
 use dpm_scene::shapes::*;
 use dpm_scene::Material;

@@ -89,7 +89,7 @@ impl Interval {
     }
 
     /// Work, waiting or a sum.
-    pub(crate) const fn kind(self) -> IntervalKind {
+    pub const fn kind(self) -> IntervalKind {
         match self {
             Self::Tracker | Self::Plan | Self::Render | Self::Pack | Self::Link => IntervalKind::Work,
             Self::PoseWait | Self::PackWait | Self::LinkWait | Self::SlotWait => IntervalKind::Wait,

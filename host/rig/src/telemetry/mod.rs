@@ -1,15 +1,11 @@
 //! What a run tells about itself, read by threads that are not on the frame path.
 
-pub mod compare;
 pub mod interval;
 pub mod monitor;
 mod ordered;
-pub mod plots;
 pub mod profile;
 pub(crate) mod projector;
-pub mod prometheus;
 pub mod report;
 pub mod signed;
 pub mod slots;
 pub mod trace;
-pub mod v2log;

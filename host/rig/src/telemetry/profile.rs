@@ -246,27 +246,27 @@ impl Profiler {
     }
 
     /// The histogram of an interval, for V2 logs and plots.
-    pub(crate) fn histogram(&self, interval: Interval) -> &SignedHistogram {
+    pub fn histogram(&self, interval: Interval) -> &SignedHistogram {
         &self.tracks[interval as usize].whole
     }
 
     /// True when the figures of `interval` are no measurement, see [`Distribution::modelled`].
-    pub(crate) fn is_modelled(&self, interval: Interval) -> bool {
+    pub fn is_modelled(&self, interval: Interval) -> bool {
         !self.measured || interval == Interval::Tracker && self.tracker_modelled
     }
 
     /// True when stamps are readings of a clock.
-    pub(crate) fn is_measured(&self) -> bool {
+    pub fn is_measured(&self) -> bool {
         self.measured
     }
 
     /// Nominal frames a second.
-    pub(crate) fn rate(&self) -> FrameRate {
+    pub fn rate(&self) -> FrameRate {
         self.rate
     }
 
     /// Frames that were lit so far.
-    pub(crate) fn frames_lit(&self) -> u64 {
+    pub fn frames_lit(&self) -> u64 {
         self.frames_lit
     }
 

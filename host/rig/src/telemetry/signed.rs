@@ -7,7 +7,7 @@ const DIGITS: u8 = 3;
 
 /// Nanoseconds, early (negative) and not (zero and above).
 #[derive(Clone, Debug)]
-pub(crate) struct SignedHistogram {
+pub struct SignedHistogram {
     /// Magnitudes of the negative values.
     early: Histogram<u64>,
     /// Zero and positive values.
@@ -36,22 +36,22 @@ impl SignedHistogram {
     }
 
     /// Values taken in.
-    pub(crate) fn len(&self) -> u64 {
+    pub fn len(&self) -> u64 {
         self.early.len() + self.late.len()
     }
 
     /// True before the first value.
-    pub(crate) fn is_empty(&self) -> bool {
+    pub fn is_empty(&self) -> bool {
         self.len() == 0
     }
 
     /// Values below zero.
-    pub(crate) fn negative(&self) -> u64 {
+    pub fn negative(&self) -> u64 {
         self.early.len()
     }
 
     /// Values that were beyond the bound.
-    pub(crate) fn saturated(&self) -> u64 {
+    pub fn saturated(&self) -> u64 {
         self.saturated
     }
 
@@ -63,7 +63,7 @@ impl SignedHistogram {
     }
 
     /// The smallest value that at least the share `quantile` (0 to 1) of all values does not exceed, within 0.1 %; 0 without values.
-    pub(crate) fn value_at_quantile(&self, quantile: f64) -> i64 {
+    pub fn value_at_quantile(&self, quantile: f64) -> i64 {
         let all = self.len();
         if all == 0 {
             return 0;
@@ -79,7 +79,7 @@ impl SignedHistogram {
     }
 
     /// Arithmetic mean, within 0.1 %; 0 without values.
-    pub(crate) fn mean(&self) -> f64 {
+    pub fn mean(&self) -> f64 {
         let (early, late) = (self.early.len() as f64, self.late.len() as f64);
         if early + late == 0.0 {
             return 0.0;
@@ -88,7 +88,7 @@ impl SignedHistogram {
     }
 
     /// The smallest value, within 0.1 %; 0 without values.
-    pub(crate) fn min(&self) -> i64 {
+    pub fn min(&self) -> i64 {
         if self.early.is_empty() {
             signed(self.late.min())
         } else {
@@ -97,7 +97,7 @@ impl SignedHistogram {
     }
 
     /// The largest value, within 0.1 %; 0 without values.
-    pub(crate) fn max(&self) -> i64 {
+    pub fn max(&self) -> i64 {
         if self.late.is_empty() {
             -signed(self.early.min())
         } else {
@@ -106,12 +106,12 @@ impl SignedHistogram {
     }
 
     /// Magnitudes of the values below zero.
-    pub(crate) fn early(&self) -> &Histogram<u64> {
+    pub fn early(&self) -> &Histogram<u64> {
         &self.early
     }
 
     /// Values that are zero or above.
-    pub(crate) fn late(&self) -> &Histogram<u64> {
+    pub fn late(&self) -> &Histogram<u64> {
         &self.late
     }
 }

@@ -1,7 +1,7 @@
 //! Distributions into SVG plots, and the key that every plot has.
 
-use super::interval::{Interval, IntervalKind};
-use super::profile::Profiler;
+use dpm_rig::telemetry::interval::{Interval, IntervalKind};
+use dpm_rig::telemetry::profile::Profiler;
 use plotters::coord::Shift;
 use plotters::element::DashedPathElement;
 use plotters::prelude::*;
@@ -168,8 +168,8 @@ fn draw(
 
 #[cfg(test)]
 mod tests {
-    use super::super::interval::tests::frame;
     use super::*;
+    use crate::profile::fixture::frame;
     use dpm_device::time::FrameRate;
 
     /// The points of every polyline of a drawing.

@@ -1,7 +1,7 @@
 //! Histograms into an HdrHistogram log, version 2 encoding: what the HdrHistogram tools of every language read.
 
-use super::interval::Interval;
-use super::profile::Profiler;
+use dpm_rig::telemetry::interval::Interval;
+use dpm_rig::telemetry::profile::Profiler;
 use hdrhistogram::serialization::interval_log::{IntervalLogWriterBuilder, Tag};
 use hdrhistogram::serialization::V2DeflateSerializer;
 use std::io::{Error, Write};
@@ -10,7 +10,11 @@ use std::time::Duration;
 /// Writes one line per interval, tagged with its name, all covering `length` from the start of the run; values in nanoseconds,
 /// the column of largest values in milliseconds. The format holds no negative values: these have a line of their own, tagged
 /// `NAME.early`, with their magnitudes, where there are any.
-pub fn write_v2_log(writer: &mut impl Write, profiler: &Profiler, length: Duration) -> Result<(), Error> {
+pub(super) fn write_v2_log(
+    writer: &mut impl Write,
+    profiler: &Profiler,
+    length: Duration,
+) -> Result<(), Error> {
     let mut serializer = V2DeflateSerializer::new();
     let mut builder = IntervalLogWriterBuilder::new();
     builder
@@ -34,8 +38,8 @@ pub fn write_v2_log(writer: &mut impl Write, profiler: &Profiler, length: Durati
 
 #[cfg(test)]
 mod tests {
-    use super::super::interval::tests::frame;
     use super::*;
+    use crate::profile::fixture::frame;
     use dpm_device::time::FrameRate;
     use hdrhistogram::serialization::interval_log::{IntervalLogIterator, LogEntry};
     use hdrhistogram::serialization::Deserializer;

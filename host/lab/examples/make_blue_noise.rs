@@ -2,7 +2,8 @@
 
 use std::process::ExitCode;
 
-use dpm_render::blue_noise::{generate_mask, MASK};
+use dpm_lab::blue_noise::generate_mask;
+use dpm_render::blue_noise::MASK;
 
 fn main() -> ExitCode {
     let made = generate_mask();
@@ -11,7 +12,7 @@ fn main() -> ExitCode {
         println!("the committed masks {} what the generator makes", if same { "are" } else { "are not" });
         return if same { ExitCode::SUCCESS } else { ExitCode::FAILURE };
     }
-    let path = concat!(env!("CARGO_MANIFEST_DIR"), "/src/data/blue_noise_64x64x32x2.bin");
+    let path = concat!(env!("CARGO_MANIFEST_DIR"), "/../render/src/data/blue_noise_64x64x32x2.bin");
     match std::fs::write(path, made) {
         Ok(()) => ExitCode::SUCCESS,
         Err(e) => {

@@ -3,8 +3,8 @@
 //! Format: Prometheus text exposition, version 0.0.4. The server answers one request at a time with time limits, off the frame
 //! path; it is for a trusted network and says nothing but figures.
 
-use super::monitor::RunCounts;
-use super::profile::ProfileReport;
+use dpm_rig::telemetry::monitor::RunCounts;
+use dpm_rig::telemetry::profile::ProfileReport;
 use std::collections::BTreeMap;
 use std::fmt::Write as _;
 use std::io::{Read, Write};
@@ -170,8 +170,8 @@ fn answer(mut stream: TcpStream, page: &Mutex<String>) -> std::io::Result<()> {
 
 #[cfg(test)]
 mod tests {
-    use super::super::profile::Distribution;
     use super::*;
+    use dpm_rig::telemetry::profile::Distribution;
 
     fn get(address: SocketAddr, request: &[u8]) -> String {
         let mut stream = TcpStream::connect(address).unwrap();

@@ -7,7 +7,7 @@
 //! Two figures are gates: the share of slots without a frame of their own, raw, and the share of frames that were lit late. A comparison in
 //! which one of them got worse fails. What a viewer sees is the missed slots: a change that drops frames makes no other figure worse.
 
-use super::profile::ProfileReport;
+use dpm_rig::telemetry::profile::ProfileReport;
 use std::fmt::Write;
 
 /// Differences below this share of the value are the histogram's resolution, not a finding.
@@ -259,8 +259,8 @@ pub fn to_table(rows: &[Comparison], notes: &[String]) -> String {
 
 #[cfg(test)]
 mod tests {
-    use super::super::profile::Distribution;
     use super::*;
+    use dpm_rig::telemetry::profile::Distribution;
 
     fn noise(seed: &mut u64) -> f64 {
         *seed = seed.wrapping_mul(6_364_136_223_846_793_005).wrapping_add(1_442_695_040_888_963_407);

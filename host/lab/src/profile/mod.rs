@@ -1,5 +1,12 @@
 //! `dpm profile`: a rig at its true rate into distributions, logs, trace and plots.
 
+pub mod compare;
+pub mod plots;
+pub mod prometheus;
+mod v2log;
+
+use self::plots::percentiles;
+use self::v2log::write_v2_log;
 use dpm_common::files::write_atomically;
 use dpm_rig::config::RigConfig;
 use dpm_rig::failure::{Ended, Failure};
@@ -8,11 +15,9 @@ use dpm_rig::rig::Rig;
 use dpm_rig::run_rig::{cannot_write, check_output_folder, open_gpu, traced_raster};
 use dpm_rig::telemetry::interval::{Interval, IntervalKind};
 use dpm_rig::telemetry::monitor::RunMonitor;
-use dpm_rig::telemetry::plots::percentiles;
 use dpm_rig::telemetry::profile::ProfileReport;
 use dpm_rig::telemetry::report::{to_json, Report, MODELLED};
 use dpm_rig::telemetry::trace::write_trace;
-use dpm_rig::telemetry::v2log::write_v2_log;
 use serde::Serialize;
 use std::io::{Error, Write};
 use std::path::{Path, PathBuf};
@@ -210,5 +215,34 @@ mod tests {
         ] {
             assert_eq!(civil(days), date);
         }
+    }
+}
+
+#[cfg(test)]
+mod fixture {
+    use dpm_device::time::HostTime;
+    use dpm_rig::frame::FrameTimeline;
+
+    /// A frame whose stamps are `step` ns apart, but packing, which begins in the middle of its step. Packing worked for half of its step, the
+    /// link for a quarter. The light lasts for a step, with its centre after a quarter.
+    pub(super) fn frame(start: i64, step: i64) -> FrameTimeline {
+        let at = |k: i64| HostTime(start + k * step);
+        let mut t = FrameTimeline {
+            captured_at: at(0),
+            received_at: at(1),
+            latched_at: at(2),
+            submitted_at: at(3),
+            rendered_at: at(4),
+            packing_at: at(4).plus_ns(step / 2),
+            packed_at: at(5),
+            sent_at: at(6),
+            due_at: at(7),
+            lit_at: Some(at(8)),
+            centre_at: Some(at(8).plus_ns(step / 4)),
+            last_photon_at: Some(at(9)),
+            ..FrameTimeline::default()
+        };
+        (t.wall_ns[2], t.wall_ns[3]) = ((step / 2).unsigned_abs(), (step / 4).unsigned_abs());
+        t
     }
 }

@@ -1,32 +1,8 @@
-//! Tiles into shading rates, \[paper\] eq. 1 to 4: the table that the shader reads, and the shader's CPU twin, equal bit for bit.
+//! Tiles into shading rates, \[paper\] eq. 1 to 4: the CPU twin of `rate_map.comp`, equal bit for bit.
 //!
-//! `b_H` and `b_Q` are \[Yang19\]'s fits to the blur of a moving eye. They are tabulated in f64 because `pow` differs between devices;
-//! every comparison uses products of sums only, because division and root differ too.
+//! Every comparison uses products of sums only, because division and root differ between devices.
 
-use dpm_shaders::structs::{RATE_TABLE_OCTAVE, RATE_TABLE_OCTAVES};
-
-/// \[Yang19\] `b_H`: 1 at rest, falls with `v` pixels per frame.
-pub(crate) fn blur_half(v: f64) -> f64 {
-    (1.0 / (1.0 + (1.05 * v).powf(3.10))).powf(0.35)
-}
-
-/// \[Yang19\] `b_Q`: 2.13 at rest.
-pub(crate) fn blur_quarter(v: f64) -> f64 {
-    2.13 * (1.0 / (1.0 + (0.55 * v).powf(2.41))).powf(0.49)
-}
-
-/// Slowest tabulated speed, pixels per frame.
-const FIRST: f32 = 0.015_625;
-
-/// `[b_H, b_Q]` at `2^-6 * 2^(i / 1024)` read along the mantissa: entry `i` belongs to the float whose bits are `bits(2^-6) + (i << 13)`.
-pub fn rate_table() -> Vec<[f32; 2]> {
-    (0..RATE_TABLE_OCTAVE * RATE_TABLE_OCTAVES)
-        .map(|i| {
-            let v = f64::from(f32::from_bits(FIRST.to_bits() + (i << 13)));
-            [blur_half(v) as f32, blur_quarter(v) as f32]
-        })
-        .collect()
-}
+use dpm_render::rate_table::FIRST;
 
 /// The table read as the shader reads it.
 pub(crate) fn blur(table: &[[f32; 2]], v: f32) -> [f32; 2] {
@@ -248,6 +224,7 @@ fn combine([mut x, mut y]: [u32; 2], more_error_along_x: bool) -> Rate {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use dpm_render::rate_table::{blur_half, blur_quarter, rate_table};
 
     const PAPER: RateConstants = RateConstants { t: 0.0762, l: 0.363, degrees: [15.0, 30.0] };
 
