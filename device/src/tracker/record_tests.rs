@@ -37,7 +37,7 @@ fn keys(names: &[&str]) -> Vec<BodyKey> {
     names.iter().map(|n| BodyKey { name: (*n).to_owned(), id: None }).collect()
 }
 
-/// A path of its own for each test, removed at the end.
+/// A separate path for each test, removed at the end.
 struct Place(PathBuf);
 
 impl Place {

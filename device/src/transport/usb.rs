@@ -61,7 +61,7 @@ pub struct UsbCounters {
     pub stalls: u64,
     /// Transfers of which the device took only a part.
     pub short_writes: u64,
-    /// Replies longer than asked for.
+    /// Replies longer than requested.
     pub babbles: u64,
     /// Transfers damaged on the cable.
     pub bus_errors: u64,

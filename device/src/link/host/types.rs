@@ -91,9 +91,9 @@ pub enum LinkError {
     TooFast {
         /// Name of the transport.
         device: String,
-        /// Planes asked for.
+        /// Requested number of planes.
         planes: usize,
-        /// Frame rate asked for.
+        /// Requested frame rate.
         rate_hz: f64,
         /// The resulting time per plane.
         plane_ns: u64,
