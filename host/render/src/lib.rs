@@ -17,8 +17,6 @@
 //! ```
 
 pub mod blue_noise;
-mod body_bvh;
-mod cluster;
 mod fill;
 mod frame_buffers;
 pub mod gpu;

@@ -1,8 +1,8 @@
 //! A scene into the flat arrays that the shaders read: BVHs, vertices, materials, texels, lights, environment.
 
-use super::body_bvh::BodyBvh;
 use bytemuck::Zeroable;
 use dpm_scene::albedo_table::{tabulated, AlbedoTable, ALBEDO_NODES};
+use dpm_scene::bvh::BodyBvh;
 use dpm_scene::mesh::MAX_COORDINATE_M;
 use dpm_scene::{Environment, PunctualKind, Scene, TextureRef, Wrap};
 use dpm_shaders::structs::{

@@ -19,6 +19,7 @@
 
 pub mod albedo_table;
 pub mod builtin;
+pub mod bvh;
 mod environment;
 mod error;
 pub mod geometry;

@@ -358,10 +358,10 @@ fn better_place(bvh: &Bvh2, node: usize, stack: &mut Vec<(f32, u32)>, work: &mut
 
 #[cfg(test)]
 mod tests {
+    use super::super::{boxes_of, BodyBvh};
     use super::*;
-    use crate::body_bvh::{boxes_of, BodyBvh};
-    use dpm_scene::shapes::sphere;
-    use dpm_scene::{builtin, TriangleMesh};
+    use crate::shapes::sphere;
+    use crate::{builtin, TriangleMesh};
     use obvhs::bvh2::reinsertion::ReinsertionOptimizer;
     use obvhs::ploc::PlocBuilder;
     use obvhs::BvhBuildParams;

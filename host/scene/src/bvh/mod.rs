@@ -2,8 +2,10 @@
 //!
 //! The tree is built once in body space; a moving body changes only its entry in the top level.
 
-use super::cluster::{clustered, optimise, Work};
-use dpm_scene::TriangleMesh;
+mod cluster;
+
+use crate::TriangleMesh;
+use cluster::{clustered, optimise, Work};
 use glam::Vec3A;
 use obvhs::aabb::Aabb;
 use obvhs::bvh2::node::Bvh2Node;
@@ -14,7 +16,7 @@ use obvhs::triangle::Triangle;
 
 /// Entries of the traversal stack in `bvh.glsl`, besides eight in registers. A ray pushes at most one entry a level below the root, so a tree of one more level than
 /// this never overflows it.
-pub(crate) const TRAVERSAL_STACK: usize = 24;
+pub const TRAVERSAL_STACK: usize = 24;
 
 /// Most triangles of a leaf of the wide tree.
 const LEAF: u32 = 3;
@@ -28,7 +30,7 @@ const NODE_WORDS: usize = 5;
 
 /// A BVH ready for upload.
 #[derive(Clone, Debug, Default)]
-pub(crate) struct BodyBvh {
+pub struct BodyBvh {
     /// Five words of four u32 per node, as \[Ylitie17\] has them but for where children stand: the fifth u32 is a block, and the inner child in
     /// slot s is node 8 * block + s of this body. So the walk need not count bits to find it, and one u32 is an entry of its stack. Places
     /// whose slot holds triangles or nothing are zero. The root is node 0, in slot 0 of block 0.
@@ -38,9 +40,9 @@ pub(crate) struct BodyBvh {
 }
 
 impl BodyBvh {
-    /// Builds the tree; an empty mesh gives an empty tree. Coordinates are finite and at most [`dpm_scene::mesh::MAX_COORDINATE_M`]:
-    /// `scene_data` sees to it, and areas stay far below what f32 holds.
-    pub(crate) fn build(mesh: &TriangleMesh) -> Self {
+    /// Builds the tree; an empty mesh gives an empty tree. Coordinates are finite and at most [`crate::mesh::MAX_COORDINATE_M`]:
+    /// the loader sees to it, and areas stay far below what f32 holds.
+    pub fn build(mesh: &TriangleMesh) -> Self {
         if mesh.triangles.is_empty() {
             return Self::default();
         }
@@ -48,14 +50,14 @@ impl BodyBvh {
     }
 
     /// The tree over boxes, of which there is at least one.
-    pub(super) fn of_boxes(boxes: &[Aabb]) -> Self {
+    pub(crate) fn of_boxes(boxes: &[Aabb]) -> Self {
         // Clustering by area makes chains of triangles whose sizes grow geometrically. Halves by count never do.
         let walkable = |built: &Self| built.levels() <= TRAVERSAL_STACK + 1;
         Self::clustered(boxes).filter(walkable).unwrap_or_else(|| Self::halved(boxes))
     }
 
     /// Nodes of a tree over `boxes` boxes that may look for a better place, as a share of all.
-    pub(super) fn share(boxes: usize) -> f32 {
+    pub(crate) fn share(boxes: usize) -> f32 {
         (REINSERTED / boxes as f32).clamp(0.05, 1.0)
     }
 
@@ -112,7 +114,7 @@ impl From<CwBvh> for BodyBvh {
 }
 
 /// The boxes of a mesh's triangles, in their order.
-pub(super) fn boxes_of(mesh: &TriangleMesh) -> Vec<Aabb> {
+pub(crate) fn boxes_of(mesh: &TriangleMesh) -> Vec<Aabb> {
     let corner = |i: u32| Vec3A::from(mesh.positions[i as usize]);
     let triangle = |t: &[u32; 3]| Triangle { v0: corner(t[0]), v1: corner(t[1]), v2: corner(t[2]) }.aabb();
     mesh.triangles.iter().map(triangle).collect()
@@ -158,7 +160,7 @@ fn halves(bounds: &[Aabb]) -> Bvh2 {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use dpm_scene::shapes::{join, sphere, triangle};
+    use crate::shapes::{join, sphere, triangle};
     use glam::Vec3;
 
     /// Triangles at distances that grow by a factor: whatever merges neighbours by area makes a chain of them.
@@ -172,7 +174,7 @@ mod tests {
 
     #[test]
     fn the_shader_has_the_stack_that_is_counted_on() {
-        let text = include_str!("../../../shaders/glsl/bvh.glsl");
+        let text = include_str!("../../../../shaders/glsl/bvh.glsl");
         assert!(text.contains(&format!("const uint STACK_SIZE = {TRAVERSAL_STACK}u;")));
     }
 
