@@ -341,8 +341,23 @@ pub(crate) fn present<P: HidPort>(
             .name("dpm-dark".into())
             .spawn_scoped(scope, || word.make_dark_when_told(monitor))
             .map_err(|e| Failure::new(FailureKind::Device, format!("cannot start a thread: {e}")));
-        let result =
-            spawned.and_then(|_| watch_over(&mut d, open, show, seconds, &word, monitor, &mut report));
+        let result = spawned.and_then(|_| {
+            let mut watch = Watch {
+                d: &mut d,
+                open,
+                show,
+                word: &word,
+                monitor,
+                report: &mut report,
+                standing: None,
+                allowed: true,
+                lost: false,
+                is_torn: false,
+                spoken: 0,
+                looked: Stopwatch::start(),
+            };
+            watch.run(seconds)
+        });
         // Whatever happened: stopped, LEDs off, mirrors exercised. A controller that is gone cannot be told, and one that does not
         // answer is not asked again: the process must end.
         d.hurry();
@@ -498,134 +513,172 @@ fn standing_after(old: Option<Order>, new: Order) -> Option<Order> {
     Some(outweighing(old, new)).filter(|order| *order != Order::Arm)
 }
 
-fn watch_over<P: HidPort>(
-    d: &mut Dlpc900<P>,
-    open: &mut dyn FnMut() -> Result<Dlpc900<P>, Dlpc900Error>,
-    show: &Show,
-    seconds: Option<f64>,
-    word: &Word,
-    monitor: &RunMonitor,
-    report: &mut Dlpc900Report,
-) -> Result<(), Failure> {
-    let mut standing: Option<Order> = None;
-    let mut lost = false;
-    // A controller that is set up shows at once: not before the interlock says so.
-    if !monitor.light_allowed() {
-        // A run that was killed may have left it lit. One that rests refuses, and is dark.
-        match d.stop() {
-            Ok(()) | Err(Dlpc900Error::Refused { .. }) => {}
-            Err(e) => return Err(e.into()),
+/// A show on a controller: what was ordered, whether light is allowed, whether the controller is there.
+struct Watch<'a, P: HidPort> {
+    d: &'a mut Dlpc900<P>,
+    open: &'a mut dyn FnMut() -> Result<Dlpc900<P>, Dlpc900Error>,
+    show: &'a Show,
+    word: &'a Word,
+    monitor: &'a RunMonitor,
+    report: &'a mut Dlpc900Report,
+    /// What the operator ordered last and did not take back.
+    standing: Option<Order>,
+    /// The interlock was closed when it was looked at last.
+    allowed: bool,
+    /// The controller does not answer, or its cable is out.
+    lost: bool,
+    /// The last answer was lost to the other thread's command.
+    is_torn: bool,
+    /// How often the other thread had spoken to the controller before the last step.
+    spoken: u32,
+    looked: Stopwatch,
+}
+
+impl<P: HidPort> Watch<'_, P> {
+    /// Shows until `seconds` are over or a stop is asked for.
+    fn run(&mut self, seconds: Option<f64>) -> Result<(), Failure> {
+        self.wait_for_interlock()?;
+        match self.set_up() {
+            Err(Dlpc900Error::Stopped) => return Ok(()),
+            other => other?,
         }
-    }
-    while !monitor.light_allowed() && !monitor.stop_requested() {
-        monitor.set_projector(ProjectorHealth::InterlockOpen);
-        std::thread::sleep(STEP);
-    }
-    let mut allowed = true;
-    let set_up =
-        |d: &mut Dlpc900<P>, standing: &mut Option<Order>, allowed: &mut bool, report: &mut Dlpc900Report| {
-            let watch = Stopwatch::start();
-            *word.line.lock().unwrap_or_else(PoisonError::into_inner) = d.dark_line();
-            d.stop_when(Arc::clone(&word.stop));
-            // Before seconds go into an upload: out of the exercise that every run ends in, and of a sequence that a killed run left.
-            d.make_ready()?;
-            d.stop()?;
-            word.is_dark.store(true, Ordering::SeqCst);
-            let loaded = show.load(d);
-            word.is_dark.store(false, Ordering::SeqCst);
-            loaded?;
-            if let Some(order) = word.take() {
-                *standing = standing_after(*standing, order);
-            }
-            // It may have opened during the seconds of the upload.
-            let number;
-            (*allowed, number) = word.look_at_interlock(monitor);
-            // Nobody's order to be dark is answered by light, not even by that of one pattern.
-            match *standing {
-                _ if !*allowed => {}
-                Some(Order::Black | Order::Safe) => {}
-                Some(Order::Freeze) => d.start().and_then(|()| d.pause())?,
-                Some(Order::Arm) | None => d.start()?,
-            }
-            word.interlock_done.store(number, Ordering::SeqCst);
-            report.setup_s = watch.elapsed_ns() as f64 * 1e-9;
-            monitor.set_projector(if *allowed { health(*standing) } else { ProjectorHealth::InterlockOpen });
-            Ok(())
-        };
-    match set_up(d, &mut standing, &mut allowed, report) {
-        Err(Dlpc900Error::Stopped) => return Ok(()),
-        other => other?,
-    }
-    let mut is_torn = false;
-    let (shown, mut looked) = (Stopwatch::start(), Stopwatch::start());
-    while !monitor.stop_requested() && seconds.is_none_or(|s| shown.elapsed_ns() as f64 * 1e-9 < s) {
-        let order = word.order();
-        if let Some(order) = order {
-            standing = standing_after(standing, order);
+        let shown = Stopwatch::start();
+        let is_over = |shown: &Stopwatch| seconds.is_some_and(|s| shown.elapsed_ns() as f64 * 1e-9 >= s);
+        while !self.monitor.stop_requested() && !is_over(&shown) {
+            let order = self.word.order();
+            let step = self.step(order);
+            self.judge(step, order)?;
+            std::thread::sleep(STEP);
         }
-        let due = looked.elapsed_ns() >= LOOK_NS;
-        let was_allowed = allowed;
+        self.report.shown_s = shown.elapsed_ns() as f64 * 1e-9;
+        Ok(())
+    }
+
+    /// A controller that is set up shows at once, so this waits until the interlock allows light.
+    fn wait_for_interlock(&mut self) -> Result<(), Failure> {
+        if !self.monitor.light_allowed() {
+            // A run that was killed may have left it lit. A controller that rests refuses the command, and is dark.
+            match self.d.stop() {
+                Ok(()) | Err(Dlpc900Error::Refused { .. }) => {}
+                Err(e) => return Err(e.into()),
+            }
+        }
+        while !self.monitor.light_allowed() && !self.monitor.stop_requested() {
+            self.monitor.set_projector(ProjectorHealth::InterlockOpen);
+            std::thread::sleep(STEP);
+        }
+        Ok(())
+    }
+
+    /// Loads the show and starts it, unless an order or the interlock says otherwise.
+    fn set_up(&mut self) -> Result<(), Dlpc900Error> {
+        let watch = Stopwatch::start();
+        let word = self.word;
+        *word.line.lock().unwrap_or_else(PoisonError::into_inner) = self.d.dark_line();
+        self.d.stop_when(Arc::clone(&word.stop));
+        // Before seconds go into an upload: out of the exercise that every run ends in, and of a sequence that a killed run left.
+        self.d.make_ready()?;
+        self.d.stop()?;
+        word.is_dark.store(true, Ordering::SeqCst);
+        let loaded = self.show.load(self.d);
+        word.is_dark.store(false, Ordering::SeqCst);
+        loaded?;
+        if let Some(order) = word.take() {
+            self.standing = standing_after(self.standing, order);
+        }
+        // The interlock may have opened during the seconds of the upload.
         let number;
-        (allowed, number) = word.look_at_interlock(monitor);
-        // Open and closed again since the last look counts as well: the other thread has stopped the sequence.
-        let changed = allowed != was_allowed || number != word.interlock_done.load(Ordering::SeqCst);
-        if (changed || !allowed) && standing == Some(Order::Freeze) {
-            // What was held is dark now, and the operator's to show again.
-            standing = Some(Order::Black);
+        (self.allowed, number) = word.look_at_interlock(self.monitor);
+        // Nobody's order to be dark is answered by light, not even by that of one pattern.
+        match self.standing {
+            _ if !self.allowed => {}
+            Some(Order::Black | Order::Safe) => {}
+            Some(Order::Freeze) => self.d.start().and_then(|()| self.d.pause())?,
+            Some(Order::Arm) | None => self.d.start()?,
         }
-        let spoken = word.spoken.load(Ordering::SeqCst);
-        let step = match (lost, order) {
-            (true, _) if due && allowed => {
-                looked = Stopwatch::start();
-                open().and_then(|found| {
-                    *d = found;
-                    // It may have been without power.
-                    set_up(d, &mut standing, &mut allowed, report)?;
-                    (lost, report.came_back) = (false, report.came_back + 1);
-                    Ok(())
-                })
-            }
-            (true, _) => Ok(()),
-            (false, _) if changed => {
-                let wanted = if allowed { standing } else { Some(Order::Black) };
-                let health = if allowed { health(standing) } else { ProjectorHealth::InterlockOpen };
-                obey(d, wanted).map(|()| {
-                    word.interlock_done.store(number, Ordering::SeqCst);
-                    monitor.set_projector(health);
-                })
-            }
-            // What was ordered is done when it closes.
-            (false, _) if !allowed => Ok(()),
-            (false, Some(_)) => obey(d, standing).map(|()| monitor.set_projector(health(standing))),
-            (false, None) if due => {
-                looked = Stopwatch::start();
-                look(d, standing, word)
-            }
-            (false, None) => Ok(()),
-        };
+        word.interlock_done.store(number, Ordering::SeqCst);
+        self.report.setup_s = watch.elapsed_ns() as f64 * 1e-9;
+        self.monitor.set_projector(self.health());
+        Ok(())
+    }
+
+    fn health(&self) -> ProjectorHealth {
+        if self.allowed {
+            health(self.standing)
+        } else {
+            ProjectorHealth::InterlockOpen
+        }
+    }
+
+    /// Acts on `order`, on the interlock, and on what the controller says of itself.
+    fn step(&mut self, order: Option<Order>) -> Result<(), Dlpc900Error> {
+        if let Some(order) = order {
+            self.standing = standing_after(self.standing, order);
+        }
+        let was_allowed = self.allowed;
+        let number;
+        (self.allowed, number) = self.word.look_at_interlock(self.monitor);
+        // Open and closed again since the last look counts as well: the other thread has stopped the sequence.
+        let changed =
+            self.allowed != was_allowed || number != self.word.interlock_done.load(Ordering::SeqCst);
+        if (changed || !self.allowed) && self.standing == Some(Order::Freeze) {
+            // What was held is dark now, and the operator's to show again.
+            self.standing = Some(Order::Black);
+        }
+        self.spoken = self.word.spoken.load(Ordering::SeqCst);
+        let due = self.looked.elapsed_ns() >= LOOK_NS;
+        if self.lost {
+            return if due && self.allowed { self.come_back() } else { Ok(()) };
+        }
+        if changed {
+            let wanted = if self.allowed { self.standing } else { Some(Order::Black) };
+            obey(self.d, wanted)?;
+            self.word.interlock_done.store(number, Ordering::SeqCst);
+            self.monitor.set_projector(self.health());
+        } else if self.allowed && order.is_some() {
+            obey(self.d, self.standing)?;
+            self.monitor.set_projector(health(self.standing));
+        } else if self.allowed && due {
+            // What was ordered while the interlock was open is done when it closes.
+            self.looked = Stopwatch::start();
+            look(self.d, self.standing, self.word)?;
+        }
+        Ok(())
+    }
+
+    /// Looks for a controller that was lost, and sets it up anew: it may have been without power.
+    fn come_back(&mut self) -> Result<(), Dlpc900Error> {
+        self.looked = Stopwatch::start();
+        *self.d = (self.open)()?;
+        self.set_up()?;
+        self.lost = false;
+        self.report.came_back += 1;
+        Ok(())
+    }
+
+    /// What the outcome of a step means.
+    fn judge(&mut self, step: Result<(), Dlpc900Error>, order: Option<Order>) -> Result<(), Failure> {
         match step {
             Ok(()) => {
-                is_torn = false;
-                order.into_iter().for_each(|order| word.acted_on(order));
+                self.is_torn = false;
+                order.into_iter().for_each(|order| self.word.acted_on(order));
             }
             Err(Dlpc900Error::Stopped) => {}
             // The other thread spoke meanwhile and took the answer away: what is to be done is done in the next round. Not twice in a row.
             Err(Dlpc900Error::Port { source: PortError::Timeout, .. })
-                if !is_torn && word.spoken.load(Ordering::SeqCst) != spoken =>
+                if !self.is_torn && self.word.spoken.load(Ordering::SeqCst) != self.spoken =>
             {
-                is_torn = true;
+                self.is_torn = true;
             }
             // Right after it was plugged in it may still be without rights, in other hands, or silent.
-            Err(e) if is_gone(&e) || lost && matches!(e, Dlpc900Error::Port { .. }) => {
-                lost = true;
-                monitor.set_projector(ProjectorHealth::Lost);
+            Err(e) if is_gone(&e) || self.lost && matches!(e, Dlpc900Error::Port { .. }) => {
+                self.lost = true;
+                self.monitor.set_projector(ProjectorHealth::Lost);
             }
             Err(e) => return Err(e.into()),
         }
-        std::thread::sleep(STEP);
+        Ok(())
     }
-    report.shown_s = shown.elapsed_ns() as f64 * 1e-9;
-    Ok(())
 }
 
 fn obey<P: HidPort>(d: &mut Dlpc900<P>, standing: Option<Order>) -> Result<(), Dlpc900Error> {

@@ -26,6 +26,19 @@ impl Dropped {
         self.not_finite += other.not_finite;
         self.degenerate += other.degenerate;
     }
+
+    /// Says how many triangles are left out, and why.
+    pub(crate) fn warn(&self, warnings: &mut Vec<String>) {
+        if self.not_finite > 0 {
+            warnings.push(format!(
+                "{} triangles have corners that are not finite or beyond 1000 km and are left out",
+                self.not_finite
+            ));
+        }
+        if self.degenerate > 0 {
+            warnings.push(format!("{} triangles without area are left out", self.degenerate));
+        }
+    }
 }
 
 impl TriangleMesh {

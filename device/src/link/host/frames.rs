@@ -63,8 +63,7 @@ impl HostLink {
         transport: &mut dyn Transport,
     ) -> Result<(), DropReason> {
         let schedule = self.settings.schedule;
-        let plane_bytes = self.settings.raster.plane_bytes();
-        let expected = plane_bytes * schedule.len();
+        let expected = self.settings.raster.plane_bytes() * schedule.len();
         assert!(planes.len() == expected, "frame of {} bytes, configured {expected}", planes.len());
         // No frame may be queued before or behind an order to go dark.
         let darkens = self.rest.is_none() && self.verb.is_some_and(Verb::is_dark);
@@ -90,22 +89,27 @@ impl HostLink {
             None => [PlaneForm::Raw; MAX_PLANES],
         };
         let forms = &forms[..schedule.len()];
-        let kept =
-            forms.iter().enumerate().fold(
-                0u32,
-                |mask, (k, form)| {
-                    if *form == PlaneForm::Kept {
-                        mask | 1 << k
-                    } else {
-                        mask
-                    }
-                },
-            );
-        let is_key = !forms.iter().any(|f| matches!(f, PlaneForm::Kept | PlaneForm::Coded(Codec::XorRle, _)));
+        let bytes = self.send_packets(now, (frame, target_at, dark_from), planes, forms, transport)?;
+        self.count_sent(now, frame, planes, forms, bytes);
+        Ok(())
+    }
+
+    /// Hands the packets of a frame to the medium, the commit last: all of them or none. Returns their bytes on the wire.
+    fn send_packets(
+        &mut self,
+        now: HostTime,
+        (frame, target_at, dark_from): (u32, DeviceTicks, DeviceTicks),
+        planes: &[u8],
+        forms: &[PlaneForm],
+        transport: &mut dyn Transport,
+    ) -> Result<u64, DropReason> {
+        let plane_bytes = self.settings.raster.plane_bytes();
+        let is_kept = |form: &PlaneForm| *form == PlaneForm::Kept;
+        let kept = forms.iter().enumerate().fold(0u32, |mask, (k, f)| mask | u32::from(is_kept(f)) << k);
         let commit = HostMessage::Commit(Commit {
-            sent: u32::MAX >> (32 - schedule.len()) & !kept,
+            sent: u32::MAX >> (32 - forms.len()) & !kept,
             kept,
-            base_frame: if is_key { 0 } else { self.last_frame.unwrap_or(0) },
+            base_frame: if is_key(forms) { 0 } else { self.last_frame.unwrap_or(0) },
             frames_sent: self.frames_sent.wrapping_add(1),
             dark_from: dark_from.max(DeviceTicks(target_at.0.saturating_add(1))),
         });
@@ -116,7 +120,7 @@ impl HostLink {
         let last = Packet::new(Header { kind, ..header }, &payload[..n]);
         let mut packets = [last; MAX_PLANES + 1];
         let mut count = 0;
-        for (k, (spec, form)) in schedule.planes().iter().zip(forms).enumerate() {
+        for (k, (spec, form)) in self.settings.schedule.planes().iter().zip(forms).enumerate() {
             let (codec, bytes) = match (form, &self.compactor) {
                 (PlaneForm::Kept, _) => continue,
                 (PlaneForm::Coded(codec, n), Some(compactor)) => (*codec, compactor.coded(k, *n)),
@@ -129,12 +133,15 @@ impl HostLink {
         packets[count] = last;
         let packets = &packets[..=count];
         match transport.send(now, Lane::Data, packets) {
-            Ok(()) => {}
-            Err(SendError::Busy) => return Err(DropReason::LinkBusy),
-            Err(SendError::Failed(_)) => return Err(DropReason::LinkLost),
+            Ok(()) => Ok(packets.iter().map(|p| p.wire_bytes() as u64).sum()),
+            Err(SendError::Busy) => Err(DropReason::LinkBusy),
+            Err(SendError::Failed(_)) => Err(DropReason::LinkLost),
         }
+    }
+
+    /// A frame of `bytes` on the wire was sent: it is what the next one may be coded against.
+    fn count_sent(&mut self, now: HostTime, frame: u32, planes: &[u8], forms: &[PlaneForm], bytes: u64) {
         let c = &mut self.counters;
-        let bytes = packets.iter().map(|p| p.wire_bytes() as u64).sum::<u64>();
         c.bytes_sent += bytes;
         c.frame_bytes_sent += bytes;
         for form in forms {
@@ -144,7 +151,7 @@ impl HostLink {
                 PlaneForm::Coded(..) => &mut c.planes_coded,
             } += 1;
         }
-        c.key_frames += u64::from(is_key);
+        c.key_frames += u64::from(is_key(forms));
         self.key_due = false;
         if let Some(compactor) = &mut self.compactor {
             compactor.sent(planes);
@@ -152,7 +159,6 @@ impl HostLink {
         self.frames_sent = self.frames_sent.wrapping_add(1);
         self.last_frame = Some(frame);
         self.data_sent_at = now;
-        Ok(())
     }
 
     /// Feeds the limiters with a frame that is about to be shown in the slot of `target_at`. Returns an error while
@@ -195,4 +201,9 @@ impl HostLink {
         self.rest = Some((now.plus_ns((rest_us * 1000) as i64), reason));
         Err(reason)
     }
+}
+
+/// True when a frame of these planes can be shown without the one before it.
+fn is_key(forms: &[PlaneForm]) -> bool {
+    !forms.iter().any(|f| matches!(f, PlaneForm::Kept | PlaneForm::Coded(Codec::XorRle, _)))
 }

@@ -7,7 +7,7 @@
 use super::keys::Keys;
 use super::signals;
 use super::tell::{Teller, SHOWN_EVERY};
-use crossbeam::channel::{unbounded, RecvTimeoutError};
+use crossbeam::channel::{unbounded, Receiver, RecvTimeoutError};
 use dpm_common::files::{write_atomically, InstanceLock, LockError};
 use dpm_common::folder::{Folder, FolderError};
 use dpm_common::stopping;
@@ -88,7 +88,7 @@ pub(super) fn watch<T: Send + 'static>(
     signals::install()
         .map_err(|e| Failure::new(FailureKind::Device, format!("cannot handle signals: {e}")))?;
     let monitor = Arc::new(RunMonitor::default());
-    let mut keys = Keys::new();
+    let keys = Keys::new();
     // Before anything can make light.
     if let Some(interlock) = Interlock::of_config(&rig.safety.interlock, keys.is_some())? {
         monitor.set_interlock(interlock);
@@ -108,78 +108,22 @@ pub(super) fn watch<T: Send + 'static>(
             })
             .map_err(|e| Failure::new(FailureKind::Device, format!("cannot start a thread: {e}")))?
     };
-    let mut health = ProjectorHealth::Connecting;
-    let mut tracker_told = false;
-    let mut signal_told = false;
     if let Some(interlock) = monitor.interlock() {
         let now = if interlock.is_closed() { "closed" } else { "open" };
         teller.note(&format!("safety.interlock: light only while {}; it is {now}", interlock.what()));
     }
-    let keys_told = if keys.is_some() { "; keys b, f, s, a" } else { "" };
-    let listening = listen(&locks.runtime, &monitor, &orders);
-    let (control, mut status) = match listening {
-        Ok((socket, status)) => {
-            teller.note(&format!(
-                "control: dpm black | freeze | safe | arm --pid {}{keys_told}; socket {}",
-                std::process::id(),
-                socket.path().display()
-            ));
-            (Some(socket), Some(status))
-        }
-        Err(e) => {
-            teller.note(&format!("no control socket: {e}{keys_told}; signals USR1 (black) and USR2 (safe)"));
-            (None, None)
-        }
+    let (control, status) = open_control(&locks.runtime, &monitor, &orders, &mut teller, keys.is_some());
+    let mut watcher = Watcher {
+        monitor: &monitor,
+        orders: &orders,
+        teller,
+        keys,
+        status,
+        health: ProjectorHealth::Connecting,
+        tracker_told: false,
+        signal_told: false,
     };
-    let mut ticks = 0u32;
-    let result = loop {
-        match finished.recv_timeout(TICK) {
-            Ok(result) => break result,
-            Err(RecvTimeoutError::Timeout) => {
-                // Orders before everything that is told.
-                for key in keys.iter_mut().flat_map(Keys::pressed) {
-                    if monitor.interlock().is_some_and(|i| i.key_pressed(key)) {
-                        continue;
-                    }
-                    if let Some(order) = Order::from_key(key) {
-                        orders.give(order, By::Key);
-                        teller.note(&format!("key: {}", order.word()));
-                    }
-                }
-                if let Some(signal) = signals::received().filter(|_| !signal_told) {
-                    signal_told = true;
-                    monitor.request_stop();
-                    teller.note(&format!("{signal}: stopping"));
-                }
-                monitor.take_notes().iter().for_each(|note| teller.note(note));
-                if let Some(why) = monitor.gave_up() {
-                    // The projector has been told to go dark by a thread that does not hang.
-                    std::thread::sleep(DARK_WITHIN);
-                    teller.finish(monitor.projector(), monitor.counts());
-                    return Err(Failure::new(FailureKind::Device, why));
-                }
-                let now = monitor.projector();
-                if let Some(status) = &mut status {
-                    status.say(now, orders.kept());
-                }
-                if std::mem::replace(&mut health, now) != now {
-                    teller.note(&format!("projector: {now}"));
-                }
-                if let (false, Some(word)) = (tracker_told, monitor.tracker()) {
-                    tracker_told = true;
-                    teller.note(word);
-                }
-                ticks = ticks.wrapping_add(1);
-                if ticks.is_multiple_of(TICKS_SHOWN) {
-                    teller.tick(now, monitor.counts());
-                    show(&monitor.counts());
-                }
-            }
-            Err(RecvTimeoutError::Disconnected) => {
-                break Err(Failure::new(FailureKind::Device, "the run ended by a panic (see above)"))
-            }
-        }
-    };
+    let result = watcher.until_finished(&finished, &show)?;
     // A panic was already turned into the error above.
     let _ = worker.join();
     let result = match result {
@@ -189,6 +133,7 @@ pub(super) fn watch<T: Send + 'static>(
         )),
         result => result,
     };
+    let Watcher { mut teller, mut status, .. } = watcher;
     if let Some(status) = &mut status {
         // Whoever waits for a dark that came with the end sees it.
         status.say(monitor.projector(), orders.kept());
@@ -200,6 +145,116 @@ pub(super) fn watch<T: Send + 'static>(
     monitor.take_notes().iter().for_each(|note| teller.note(note));
     teller.finish(monitor.projector(), monitor.counts());
     result
+}
+
+/// Opens the control socket and the status file, and says how the rig can be ordered. Without them the run goes on.
+fn open_control(
+    runtime: &Result<Arc<Folder>, FolderError>,
+    monitor: &Arc<RunMonitor>,
+    orders: &Arc<Orders>,
+    teller: &mut Teller,
+    has_keys: bool,
+) -> (Option<ControlSocket>, Option<StatusFile>) {
+    let keys = if has_keys { "; keys b, f, s, a" } else { "" };
+    match listen(runtime, monitor, orders) {
+        Ok((socket, status)) => {
+            teller.note(&format!(
+                "control: dpm black | freeze | safe | arm --pid {}{keys}; socket {}",
+                std::process::id(),
+                socket.path().display()
+            ));
+            (Some(socket), Some(status))
+        }
+        Err(e) => {
+            teller.note(&format!("no control socket: {e}{keys}; signals USR1 (black) and USR2 (safe)"));
+            (None, None)
+        }
+    }
+}
+
+/// The thread that watches a run.
+struct Watcher<'a> {
+    monitor: &'a RunMonitor,
+    orders: &'a Orders,
+    teller: Teller,
+    keys: Option<Keys>,
+    status: Option<StatusFile>,
+    /// What the operator was last told of the projector.
+    health: ProjectorHealth,
+    tracker_told: bool,
+    signal_told: bool,
+}
+
+impl Watcher<'_> {
+    /// Watches until the run returns its result.
+    ///
+    /// # Errors
+    /// The run will never return: a thread of it hangs.
+    fn until_finished<T>(
+        &mut self,
+        finished: &Receiver<Result<T, Failure>>,
+        show: &impl Fn(&RunCounts),
+    ) -> Result<Result<T, Failure>, Failure> {
+        let mut ticks = 0u32;
+        loop {
+            match finished.recv_timeout(TICK) {
+                Ok(result) => return Ok(result),
+                Err(RecvTimeoutError::Timeout) => {}
+                Err(RecvTimeoutError::Disconnected) => {
+                    let told = "the run ended by a panic (see above)";
+                    return Ok(Err(Failure::new(FailureKind::Device, told)));
+                }
+            }
+            self.follow_orders();
+            self.monitor.take_notes().iter().for_each(|note| self.teller.note(note));
+            if let Some(why) = self.monitor.gave_up() {
+                // The projector has been told to go dark by a thread that does not hang.
+                std::thread::sleep(DARK_WITHIN);
+                self.teller.finish(self.monitor.projector(), self.monitor.counts());
+                return Err(Failure::new(FailureKind::Device, why));
+            }
+            self.tell_changes();
+            ticks = ticks.wrapping_add(1);
+            if ticks.is_multiple_of(TICKS_SHOWN) {
+                let counts = self.monitor.counts();
+                self.teller.tick(self.health, counts);
+                show(&counts);
+            }
+        }
+    }
+
+    /// Keys and signals. They come before everything that is only told.
+    fn follow_orders(&mut self) {
+        for key in self.keys.iter_mut().flat_map(Keys::pressed) {
+            if self.monitor.interlock().is_some_and(|i| i.key_pressed(key)) {
+                continue;
+            }
+            if let Some(order) = Order::from_key(key) {
+                self.orders.give(order, By::Key);
+                self.teller.note(&format!("key: {}", order.word()));
+            }
+        }
+        if let Some(signal) = signals::received().filter(|_| !self.signal_told) {
+            self.signal_told = true;
+            self.monitor.request_stop();
+            self.teller.note(&format!("{signal}: stopping"));
+        }
+    }
+
+    /// What is new of the projector and the tracker.
+    fn tell_changes(&mut self) {
+        let now = self.monitor.projector();
+        if let Some(status) = &mut self.status {
+            status.say(now, self.orders.kept());
+        }
+        if std::mem::replace(&mut self.health, now) != now {
+            self.teller.note(&format!("projector: {now}"));
+        }
+        if let (false, Some(word)) = (self.tracker_told, self.monitor.tracker()) {
+            self.tracker_told = true;
+            self.teller.note(word);
+        }
+    }
 }
 
 /// Reads what stands for the rig's projector, gives it to the run that is about to begin, and starts the thread that keeps orders.

@@ -6,6 +6,7 @@ mod ordered;
 pub mod profile;
 pub(crate) mod projector;
 pub mod report;
+mod report_table;
 pub mod signed;
 pub mod slots;
 pub mod trace;

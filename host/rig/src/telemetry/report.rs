@@ -6,7 +6,6 @@ use crate::failure::{Failure, FailureKind};
 use crate::plan::dark::DarkCause;
 use serde::ser::{Serialize, SerializeMap, Serializer};
 use std::collections::BTreeMap;
-use std::fmt::Write;
 use std::path::PathBuf;
 
 /// Percentiles of a quantity: the smallest value that at least that share of all values does not exceed.
@@ -302,163 +301,9 @@ impl Report {
     pub fn to_json(&self) -> String {
         to_json(self)
     }
-
-    /// The report as a table of at most 100 columns.
-    pub fn to_table(&self) -> String {
-        let mut rows: Vec<(String, String)> = Vec::new();
-        let mut row = |name: &str, text: String| rows.push((name.to_string(), text));
-        if self.slots > 0 || self.ordered_dark.values().any(|n| *n > 0) {
-            row("missed slots", self.missed_line());
-            for (name, slots) in self.missed_by_cause.iter().filter(|(_, n)| **n > 0) {
-                let told = if name == "standstill" { ", the machine itself stood still" } else { "" };
-                row(&format!("  {name}"), format!("{slots} slots{told}"));
-            }
-        }
-        for (reason, slots) in self.ordered_dark.iter().filter(|(_, n)| **n > 0) {
-            row(&format!("ordered: {reason}"), format!("{slots} slots more, neither missed nor lit"));
-        }
-        let dark = if self.frames_dark > 0 {
-            format!("{} dark on every body, ", self.frames_dark)
-        } else {
-            String::new()
-        };
-        let withheld = if self.frames_withheld > 0 {
-            format!(", {} not wanted", self.frames_withheld)
-        } else {
-            String::new()
-        };
-        row(
-            "frames",
-            format!(
-                "{} lit, {dark}{} dropped, {} late, {} repeated{withheld}",
-                self.frames_lit, self.frames_dropped, self.frames_late, self.frames_repeated
-            ),
-        );
-        for body in self.dark_by_body.iter().filter(|b| b.total() > 0) {
-            let causes = DarkCause::ALL.iter().filter(|c| body.of(**c) > 0);
-            let causes: Vec<String> =
-                causes.map(|c| format!("{} {}", c.name().replace('_', " "), body.of(*c))).collect();
-            row(&format!("  dark: {}", body.body), format!("{} frames: {}", body.total(), causes.join(", ")));
-        }
-        row(
-            "raster",
-            format!(
-                "{} x {}, {} planes, {:.3} frames/s ({} pace)",
-                self.raster[0], self.raster[1], self.planes, self.frame_rate_hz, self.pace
-            ),
-        );
-        let software = if self.software_gpu { " (software)" } else { "" };
-        row("GPU", format!("{}{software}", self.gpu));
-        row("method", self.method.to_string());
-        if let Some(error) = self.registration_error_px {
-            let how = if self.prediction { "predicted" } else { "prediction off" };
-            let at = self.registration_error_at.map_or(String::new(), |at| format!(", at {at}"));
-            row("registration error", format!("{} px ({how}{at})", percentiles(error)));
-        }
-        if let Some(error) = self.registration_error_unpredicted_px {
-            row("  without prediction", format!("{} px", percentiles(error)));
-        }
-        let latencies = [
-            ("motion to first photon", self.motion_to_first_photon_ms),
-            ("motion to centre of light", self.motion_to_light_centre_ms),
-            ("motion to last photon", self.motion_to_last_photon_ms),
-            ("lateness of light", self.lateness_ms),
-        ];
-        for (name, latency) in latencies {
-            let Some(latency) = latency else { continue };
-            let min = if latency.min < 0.0 { format!("min {:.3}  ", latency.min) } else { String::new() };
-            let modelled = if latency.modelled { " (modelled)" } else { "" };
-            row(name, format!("{min}{} ms{modelled}", percentiles(latency.spread)));
-        }
-        if latencies.iter().any(|(_, l)| l.is_some_and(|l| l.modelled)) {
-            row("  modelled", MODELLED.into());
-        }
-        for stage in &self.stages_ms {
-            row(
-                &format!("  {}", stage.stage),
-                format!("p50 {:.3}  p99 {:.3} ms", stage.ms.p50, stage.ms.p99),
-            );
-        }
-        row("wall time", format!("{:.2} s, {:.1} frames/s", self.wall_s, self.frames_per_wall_second));
-        if let Some(p) = &self.projector {
-            let [raw, coded, kept] = p.planes;
-            row("projector", format!("{}, {:.1} MB sent", p.name, p.sent_mb));
-            if let Some(bound) = p.clock_bound_ns {
-                row("  its clock", format!("known to {:.1} us", bound as f64 * 1e-3));
-            }
-            if coded + kept > 0 {
-                row("  planes", format!("{raw} raw, {coded} coded, {kept} unchanged and not sent"));
-            }
-            if let Some(d) = p.device {
-                let dropped = format!(
-                    "{} incomplete, {} too late, {} superseded, {} refused",
-                    d.incomplete, d.too_late, d.superseded, d.refused
-                );
-                row(
-                    "  its report",
-                    format!(
-                        "{} lit, {} repeated, {} blank slots; dropped {dropped}",
-                        d.lit, d.repeated, d.blank
-                    ),
-                );
-            }
-            if p.sessions > 1 || p.rearmed > 0 {
-                row(
-                    "  came back",
-                    format!(
-                        "{} times, armed again {} times after a fault",
-                        p.sessions.saturating_sub(1),
-                        p.rearmed
-                    ),
-                );
-            }
-        }
-        if let Some(rays) = self.mrays_per_s {
-            row("rays", format!("{rays:.2} million/s"));
-        }
-        if self.clipped > 0.0 {
-            let advice = "raise projector.max_intensity or lower render.exposure";
-            row("clipped", format!("{:.2} % of the light: {advice}", 100.0 * self.clipped));
-        }
-        if self.nan_pixels > 0 {
-            row("not a number", format!("{} pixels became black", self.nan_pixels));
-        }
-        if !self.light_hash.is_empty() {
-            row("hash of the light", self.light_hash.clone());
-        }
-        let width = rows.iter().map(|(name, _)| name.chars().count()).max().unwrap_or(0);
-        let mut out = String::new();
-        for (name, text) in &rows {
-            // Writing into a string cannot fail.
-            let _ = writeln!(out, "{name:width$}  {text}");
-        }
-        for warning in &self.warnings {
-            let _ = writeln!(out, "warning: {warning}");
-        }
-        for file in &self.files {
-            let _ = writeln!(out, "see {}", file.display());
-        }
-        out
-    }
 }
 
 impl Report {
-    /// The headline: raw missed slots first, what of them is the machine's second.
-    fn missed_line(&self) -> String {
-        let excused = if self.excused_by_standstill > 0 {
-            format!("; {} of them while the machine itself stood still", self.excused_by_standstill)
-        } else {
-            String::new()
-        };
-        let unknowable = if self.pace == "virtual" { "; at virtual pace no frame can be late" } else { "" };
-        format!(
-            "{} of {} ({:.3} %){excused}{unknowable}",
-            self.missed_slots,
-            self.slots,
-            100.0 * self.missed_share
-        )
-    }
-
     /// Refuses a run that lit nothing.
     ///
     /// # Errors
@@ -508,10 +353,6 @@ impl Report {
         let told: Vec<String> = causes.into_iter().map(|(_, told)| told).collect();
         Some(format!("no light fell on any body: {}", told.join("; ")))
     }
-}
-
-fn percentiles(s: Spread) -> String {
-    format!("p50 {:.3}  p99 {:.3}  p99.9 {:.3}  max {:.3}", s.p50, s.p99, s.p999, s.max)
 }
 
 /// Any report as one indented JSON object; numbers that are not finite become null.

@@ -215,123 +215,154 @@ pub(super) fn flatten(
     cancel: &Cancel,
     warnings: &mut Vec<String>,
 ) -> Result<Flat, SceneError> {
-    let Source { document, data, look, instances } = *source;
-    let claim_of: HashMap<usize, usize> =
-        claims.bodies.iter().enumerate().map(|(c, b)| (b.node, c)).collect();
-    let here = [DAffine3::IDENTITY];
-    let default_material = look.materials.len() - 1;
-    let mut rest = vec![DAffine3::IDENTITY; claims.bodies.len()];
-    let mut meshes: BTreeMap<Group, TriangleMesh> = BTreeMap::new();
-    let mut lights: Vec<(Option<usize>, PunctualLight)> = vec![];
-    let mut dropped = Dropped::default();
-    let mut walk: Vec<Step> = roots(document)
-        .into_iter()
-        .rev()
-        .map(|node| Step { node, world: DAffine3::IDENTITY, claim: None, is_virtual: false })
-        .collect();
-    while let Some(step) = walk.pop() {
-        cancel.check(limits)?;
-        let Some(node) = document.nodes().nth(step.node) else { continue };
-        let world = step.world * local_transform(&node);
-        let claimed_here = claim_of.get(&step.node).copied();
-        let claim = claimed_here.or(step.claim);
-        let is_virtual = match claimed_here {
-            Some(c) => !claims.bodies[c].projected,
-            None => step.is_virtual,
-        } || claims.virtual_nodes.binary_search(&step.node).is_ok();
-        if let Some(c) = claimed_here {
-            rest[c] = rigid_part(&world).ok_or_else(|| {
-                SceneError::broken(
-                    format!("body '{}'", claims.bodies[c].name),
-                    "its node has a scale of zero or a position beyond any room",
-                )
-            })?;
-        }
-        let body_from_node = claim.map_or(world, |c| rest[c].inverse() * world);
-        if let Some(mesh) = node.mesh() {
-            if is_invertible(&body_from_node) {
-                let into = meshes.entry((claim, is_virtual)).or_default();
-                let places = instances.get(&step.node).map_or(&here[..], Vec::as_slice);
-                for primitive in &document.as_json().meshes[mesh.index()].primitives {
-                    cancel.check(limits)?;
-                    let material = primitive.material.map_or(default_material, |m| m.value());
-                    if let Some((part, lost)) =
-                        read_primitive(primitive, data, material as u32, look.uv_sets[material])?
-                    {
-                        for place in places {
-                            cancel.check(limits)?;
-                            dropped.add(lost);
-                            // An instance may be scaled to zero, to hide it.
-                            let body_from_instance = body_from_node * *place;
-                            if is_invertible(&body_from_instance) {
-                                into.append_transformed(&part, &body_from_instance);
-                            }
-                        }
-                    }
-                }
-            } else {
-                warnings.push(format!(
-                    "node {} '{}' is scaled to nothing and is left out",
-                    step.node,
-                    node.name().unwrap_or("")
-                ));
+    let mut gatherer = Gatherer {
+        source,
+        claims,
+        limits,
+        cancel,
+        rest: vec![DAffine3::IDENTITY; claims.bodies.len()],
+        meshes: BTreeMap::new(),
+        lights: vec![],
+        dropped: Dropped::default(),
+    };
+    gatherer.walk(warnings)?;
+    gatherer.into_flat(warnings)
+}
+
+/// What is gathered on the walk through the tree.
+struct Gatherer<'a> {
+    source: &'a Source<'a>,
+    claims: &'a Claims,
+    limits: &'a Limits,
+    cancel: &'a Cancel,
+    /// By claim: world-from-body at rest.
+    rest: Vec<DAffine3>,
+    meshes: BTreeMap<Group, TriangleMesh>,
+    lights: Vec<(Option<usize>, PunctualLight)>,
+    dropped: Dropped,
+}
+
+impl Gatherer<'_> {
+    fn walk(&mut self, warnings: &mut Vec<String>) -> Result<(), SceneError> {
+        let claims = self.claims;
+        let claim_of: HashMap<usize, usize> =
+            claims.bodies.iter().enumerate().map(|(c, b)| (b.node, c)).collect();
+        let document = self.source.document;
+        let mut walk: Vec<Step> = roots(document)
+            .into_iter()
+            .rev()
+            .map(|node| Step { node, world: DAffine3::IDENTITY, claim: None, is_virtual: false })
+            .collect();
+        while let Some(step) = walk.pop() {
+            self.cancel.check(self.limits)?;
+            let Some(node) = document.nodes().nth(step.node) else { continue };
+            let world = step.world * local_transform(&node);
+            let claimed_here = claim_of.get(&step.node).copied();
+            let claim = claimed_here.or(step.claim);
+            let is_virtual = match claimed_here {
+                Some(c) => !claims.bodies[c].projected,
+                None => step.is_virtual,
+            } || claims.virtual_nodes.binary_search(&step.node).is_ok();
+            if let Some(c) = claimed_here {
+                self.rest[c] = rigid_part(&world).ok_or_else(|| {
+                    SceneError::broken(
+                        format!("body '{}'", claims.bodies[c].name),
+                        "its node has a scale of zero or a position beyond any room",
+                    )
+                })?;
             }
+            let body_from_node = claim.map_or(world, |c| self.rest[c].inverse() * world);
+            if let Some(mesh) = node.mesh() {
+                if is_invertible(&body_from_node) {
+                    self.add_mesh(mesh.index(), step.node, (claim, is_virtual), &body_from_node)?;
+                } else {
+                    let name = node.name().unwrap_or("");
+                    warnings
+                        .push(format!("node {} '{name}' is scaled to nothing and is left out", step.node));
+                }
+            }
+            if let Some(light) = node.light() {
+                self.lights.extend(place_light(&light, &body_from_node).map(|l| (claim, l)));
+            }
+            walk.extend(node.children().map(|c| Step { node: c.index(), world, claim, is_virtual }));
         }
-        if let Some(light) = node.light() {
-            lights.extend(place_light(&light, &body_from_node).map(|l| (claim, l)));
-        }
-        walk.extend(node.children().map(|c| Step { node: c.index(), world, claim, is_virtual }));
+        Ok(())
     }
 
-    let mut bodies = vec![];
-    let mut body_of_claim = vec![None; claims.bodies.len()];
-    // The map sorts None first; static things must come last, after the bodies in the order of the rig file.
-    let (fixed, moving): (Vec<_>, Vec<_>) = meshes.into_iter().partition(|((claim, _), _)| claim.is_none());
-    for ((claim, is_virtual), mut mesh) in moving.into_iter().chain(fixed) {
-        dropped.add(mesh.drop_unusable());
-        if mesh.triangles.is_empty() {
-            continue;
+    /// All primitives of a mesh, at each place of the node's instances.
+    fn add_mesh(
+        &mut self,
+        mesh: usize,
+        node: usize,
+        group: Group,
+        body_from_node: &DAffine3,
+    ) -> Result<(), SceneError> {
+        let Source { document, data, look, instances } = *self.source;
+        let into = self.meshes.entry(group).or_default();
+        let here = [DAffine3::IDENTITY];
+        let places = instances.get(&node).map_or(&here[..], Vec::as_slice);
+        for primitive in &document.as_json().meshes[mesh].primitives {
+            self.cancel.check(self.limits)?;
+            let material = primitive.material.map_or(look.materials.len() - 1, |m| m.value());
+            let Some((part, lost)) =
+                read_primitive(primitive, data, material as u32, look.uv_sets[material])?
+            else {
+                continue;
+            };
+            for place in places {
+                self.cancel.check(self.limits)?;
+                self.dropped.add(lost);
+                // An instance may be scaled to zero, to hide it.
+                let body_from_instance = *body_from_node * *place;
+                if is_invertible(&body_from_instance) {
+                    into.append_transformed(&part, &body_from_instance);
+                }
+            }
         }
-        let name = match (claim, is_virtual) {
-            (Some(c), _) => claims.bodies[c].name.clone(),
-            (None, false) => "static".into(),
-            (None, true) => "virtual".into(),
-        };
-        if let Some(c) = claim {
-            body_of_claim[c].get_or_insert(bodies.len() as u32);
+        Ok(())
+    }
+
+    /// Bodies of what was gathered.
+    fn into_flat(mut self, warnings: &mut Vec<String>) -> Result<Flat, SceneError> {
+        let claims = self.claims;
+        let mut bodies = vec![];
+        let mut body_of_claim = vec![None; claims.bodies.len()];
+        // The map sorts None first; static things must come last, after the bodies in the order of the rig file.
+        let (fixed, moving): (Vec<_>, Vec<_>) =
+            self.meshes.into_iter().partition(|((claim, _), _)| claim.is_none());
+        for ((claim, is_virtual), mut mesh) in moving.into_iter().chain(fixed) {
+            self.dropped.add(mesh.drop_unusable());
+            if mesh.triangles.is_empty() {
+                continue;
+            }
+            let name = match (claim, is_virtual) {
+                (Some(c), _) => claims.bodies[c].name.clone(),
+                (None, false) => "static".into(),
+                (None, true) => "virtual".into(),
+            };
+            if let Some(c) = claim {
+                body_of_claim[c].get_or_insert(bodies.len() as u32);
+            }
+            bodies.push(Body {
+                name,
+                tracked: claim.map(|c| c as u16),
+                projected: !is_virtual,
+                world_from_body_rest: claim.map_or(DAffine3::IDENTITY, |c| self.rest[c]),
+                mesh,
+            });
         }
-        let world_from_body_rest = claim.map_or(DAffine3::IDENTITY, |c| rest[c]);
-        bodies.push(Body {
-            name,
-            tracked: claim.map(|c| c as u16),
-            projected: !is_virtual,
-            world_from_body_rest,
-            mesh,
-        });
+        self.dropped.warn(warnings);
+        if bodies.is_empty() {
+            return Err(SceneError::broken("scene", "holds no usable triangle"));
+        }
+        if let Some((claim, _)) = claims.bodies.iter().zip(&body_of_claim).find(|(_, b)| b.is_none()) {
+            let name = format!("body '{}'", claim.name);
+            return Err(SceneError::broken(name, "its node holds no usable triangle"));
+        }
+        let of_body = |claim: Option<usize>| claim.and_then(|c| body_of_claim[c]);
+        let lights = self.lights.into_iter().map(|(claim, l)| PunctualLight { body: of_body(claim), ..l });
+        Ok(Flat { bodies, lights: lights.collect() })
     }
-    if dropped.not_finite > 0 {
-        warnings.push(format!(
-            "{} triangles have corners that are not finite or beyond 1000 km and are left out",
-            dropped.not_finite
-        ));
-    }
-    if dropped.degenerate > 0 {
-        warnings.push(format!("{} triangles without area are left out", dropped.degenerate));
-    }
-    if bodies.is_empty() {
-        return Err(SceneError::broken("scene", "holds no usable triangle"));
-    }
-    if let Some((claim, _)) = claims.bodies.iter().zip(&body_of_claim).find(|(_, b)| b.is_none()) {
-        return Err(SceneError::broken(
-            format!("body '{}'", claim.name),
-            "its node holds no usable triangle",
-        ));
-    }
-    let lights = lights
-        .into_iter()
-        .map(|(claim, light)| PunctualLight { body: claim.and_then(|c| body_of_claim[c]), ..light })
-        .collect();
-    Ok(Flat { bodies, lights })
 }
 
 fn local_transform(node: &gltf::Node) -> DAffine3 {

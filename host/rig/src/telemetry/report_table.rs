@@ -1,0 +1,176 @@
+//! The report as a table for people.
+
+use super::report::{Report, MODELLED};
+use crate::plan::dark::DarkCause;
+use crate::telemetry::projector::ProjectorReport;
+use crate::telemetry::report::Spread;
+
+impl Report {
+    /// The report as a table of at most 100 columns.
+    pub fn to_table(&self) -> String {
+        let mut table = Table::default();
+        self.slot_rows(&mut table);
+        self.frame_rows(&mut table);
+        self.set_up_rows(&mut table);
+        self.registration_rows(&mut table);
+        self.latency_rows(&mut table);
+        for stage in &self.stages_ms {
+            let text = format!("p50 {:.3}  p99 {:.3} ms", stage.ms.p50, stage.ms.p99);
+            table.row(&format!("  {}", stage.stage), text);
+        }
+        table.row("wall time", format!("{:.2} s, {:.1} frames/s", self.wall_s, self.frames_per_wall_second));
+        if let Some(projector) = &self.projector {
+            projector_rows(projector, &mut table);
+        }
+        self.light_rows(&mut table);
+        let warnings = self.warnings.iter().map(|warning| format!("warning: {warning}\n"));
+        let files = self.files.iter().map(|file| format!("see {}\n", file.display()));
+        std::iter::once(table.to_text()).chain(warnings).chain(files).collect()
+    }
+
+    fn slot_rows(&self, table: &mut Table) {
+        if self.slots > 0 || self.ordered_dark.values().any(|n| *n > 0) {
+            table.row("missed slots", self.missed_line());
+            for (name, slots) in self.missed_by_cause.iter().filter(|(_, n)| **n > 0) {
+                let told = if name == "standstill" { ", the machine itself stood still" } else { "" };
+                table.row(&format!("  {name}"), format!("{slots} slots{told}"));
+            }
+        }
+        for (reason, slots) in self.ordered_dark.iter().filter(|(_, n)| **n > 0) {
+            let text = format!("{slots} slots more, neither missed nor lit");
+            table.row(&format!("ordered: {reason}"), text);
+        }
+    }
+
+    fn frame_rows(&self, table: &mut Table) {
+        let some = |n: u64, text: String| if n > 0 { text } else { String::new() };
+        let dark = some(self.frames_dark, format!("{} dark on every body, ", self.frames_dark));
+        let withheld = some(self.frames_withheld, format!(", {} not wanted", self.frames_withheld));
+        table.row(
+            "frames",
+            format!(
+                "{} lit, {dark}{} dropped, {} late, {} repeated{withheld}",
+                self.frames_lit, self.frames_dropped, self.frames_late, self.frames_repeated
+            ),
+        );
+        for body in self.dark_by_body.iter().filter(|b| b.total() > 0) {
+            let causes = DarkCause::ALL.iter().filter(|c| body.of(**c) > 0);
+            let causes: Vec<String> =
+                causes.map(|c| format!("{} {}", c.name().replace('_', " "), body.of(*c))).collect();
+            let text = format!("{} frames: {}", body.total(), causes.join(", "));
+            table.row(&format!("  dark: {}", body.body), text);
+        }
+    }
+
+    fn set_up_rows(&self, table: &mut Table) {
+        let [width, height] = self.raster;
+        let (planes, hz, pace) = (self.planes, self.frame_rate_hz, self.pace);
+        table.row("raster", format!("{width} x {height}, {planes} planes, {hz:.3} frames/s ({pace} pace)"));
+        let software = if self.software_gpu { " (software)" } else { "" };
+        table.row("GPU", format!("{}{software}", self.gpu));
+        table.row("method", self.method.to_string());
+    }
+
+    fn registration_rows(&self, table: &mut Table) {
+        if let Some(error) = self.registration_error_px {
+            let how = if self.prediction { "predicted" } else { "prediction off" };
+            let at = self.registration_error_at.map_or(String::new(), |at| format!(", at {at}"));
+            table.row("registration error", format!("{} px ({how}{at})", percentiles(error)));
+        }
+        if let Some(error) = self.registration_error_unpredicted_px {
+            table.row("  without prediction", format!("{} px", percentiles(error)));
+        }
+    }
+
+    fn latency_rows(&self, table: &mut Table) {
+        let latencies = [
+            ("motion to first photon", self.motion_to_first_photon_ms),
+            ("motion to centre of light", self.motion_to_light_centre_ms),
+            ("motion to last photon", self.motion_to_last_photon_ms),
+            ("lateness of light", self.lateness_ms),
+        ];
+        for (name, latency) in latencies {
+            let Some(latency) = latency else { continue };
+            let min = if latency.min < 0.0 { format!("min {:.3}  ", latency.min) } else { String::new() };
+            let modelled = if latency.modelled { " (modelled)" } else { "" };
+            table.row(name, format!("{min}{} ms{modelled}", percentiles(latency.spread)));
+        }
+        if latencies.iter().any(|(_, l)| l.is_some_and(|l| l.modelled)) {
+            table.row("  modelled", MODELLED.into());
+        }
+    }
+
+    fn light_rows(&self, table: &mut Table) {
+        if let Some(rays) = self.mrays_per_s {
+            table.row("rays", format!("{rays:.2} million/s"));
+        }
+        if self.clipped > 0.0 {
+            let advice = "raise projector.max_intensity or lower render.exposure";
+            table.row("clipped", format!("{:.2} % of the light: {advice}", 100.0 * self.clipped));
+        }
+        if self.nan_pixels > 0 {
+            table.row("not a number", format!("{} pixels became black", self.nan_pixels));
+        }
+        if !self.light_hash.is_empty() {
+            table.row("hash of the light", self.light_hash.clone());
+        }
+    }
+
+    /// The headline: raw missed slots first, what of them is the machine's second.
+    fn missed_line(&self) -> String {
+        let excused = if self.excused_by_standstill > 0 {
+            format!("; {} of them while the machine itself stood still", self.excused_by_standstill)
+        } else {
+            String::new()
+        };
+        let unknowable = if self.pace == "virtual" { "; at virtual pace no frame can be late" } else { "" };
+        format!(
+            "{} of {} ({:.3} %){excused}{unknowable}",
+            self.missed_slots,
+            self.slots,
+            100.0 * self.missed_share
+        )
+    }
+}
+
+fn projector_rows(p: &ProjectorReport, table: &mut Table) {
+    let [raw, coded, kept] = p.planes;
+    table.row("projector", format!("{}, {:.1} MB sent", p.name, p.sent_mb));
+    if let Some(bound) = p.clock_bound_ns {
+        table.row("  its clock", format!("known to {:.1} us", bound as f64 * 1e-3));
+    }
+    if coded + kept > 0 {
+        table.row("  planes", format!("{raw} raw, {coded} coded, {kept} unchanged and not sent"));
+    }
+    if let Some(d) = p.device {
+        let text = format!(
+            "{} lit, {} repeated, {} blank slots; dropped {} incomplete, {} too late, {} superseded, {} refused",
+            d.lit, d.repeated, d.blank, d.incomplete, d.too_late, d.superseded, d.refused
+        );
+        table.row("  its report", text);
+    }
+    if p.sessions > 1 || p.rearmed > 0 {
+        let times = p.sessions.saturating_sub(1);
+        table.row("  came back", format!("{times} times, armed again {} times after a fault", p.rearmed));
+    }
+}
+
+/// Rows of a name and a text.
+#[derive(Default)]
+struct Table(Vec<(String, String)>);
+
+impl Table {
+    fn row(&mut self, name: &str, text: String) {
+        self.0.push((name.to_owned(), text));
+    }
+
+    /// One line a row, the texts below each other.
+    fn to_text(&self) -> String {
+        let width = self.0.iter().map(|(name, _)| name.chars().count()).max().unwrap_or(0);
+        self.0.iter().map(|(name, text)| format!("{name:width$}  {text}\n")).collect()
+    }
+}
+
+fn percentiles(s: Spread) -> String {
+    format!("p50 {:.3}  p99 {:.3}  p99.9 {:.3}  max {:.3}", s.p50, s.p99, s.p999, s.max)
+}
