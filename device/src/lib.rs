@@ -56,6 +56,7 @@ pub mod cobs;
 pub mod dlpc900;
 pub mod light;
 pub mod link;
+mod packet;
 pub mod planes;
 pub mod pose;
 #[cfg(feature = "std")]

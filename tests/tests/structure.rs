@@ -4,8 +4,17 @@
 use std::collections::{BTreeMap, BTreeSet};
 use std::path::{Path, PathBuf};
 
-/// The crates of the rig controller, folders of `host/`. The laboratory's reference and its stability cases still use each other's tests.
-const CRATES: [&str; 5] = ["common", "scene", "tracking", "render", "rig"];
+/// Crates whose folders are free of circles. The laboratory's reference and its stability cases still use each other's tests.
+const CRATES: [&str; 8] = [
+    "device",
+    "hil-mock",
+    "host/common",
+    "host/scene",
+    "host/tracking",
+    "host/render",
+    "host/rig",
+    "host/dpm",
+];
 
 fn root() -> PathBuf {
     Path::new(env!("CARGO_MANIFEST_DIR")).join("..")
@@ -63,11 +72,7 @@ fn undeclared(src: &Path, all: &[(PathBuf, String)]) -> Vec<PathBuf> {
 #[test]
 fn no_source_file_is_left_behind() {
     let mut left = Vec::new();
-    for krate in ["device", "hil-mock", "host/dpm", "host/handoff", "host/lab"]
-        .map(String::from)
-        .into_iter()
-        .chain(CRATES.map(|c| format!("host/{c}")))
-    {
+    for krate in CRATES.into_iter().chain(["host/handoff", "host/lab"]) {
         let src = root().join(krate).join("src");
         left.extend(undeclared(&src, &sources(&src)));
     }
@@ -125,7 +130,13 @@ fn arrows(src: &Path) -> Arrows {
             continue;
         }
         let used = all.entry(module.clone()).or_default();
-        used.extend(names_after(&code(&text), "crate::").filter(|name| *name != module).map(String::from));
+        let code = code(&text);
+        // From a file at the top of the crate, or from the root of a folder there, `super` is the crate.
+        let is_root =
+            below.components().count() == 1 || below.ends_with("mod.rs") && below.components().count() == 2;
+        let above = if is_root { "super::" } else { "super::super::" };
+        let named = names_after(&code, "crate::").chain(names_after(&code, above));
+        used.extend(named.filter(|name| *name != module).map(String::from));
     }
     // Items that the crate's root gives out are no modules.
     let modules: BTreeSet<String> = all.keys().cloned().collect();
@@ -163,8 +174,8 @@ fn circle(all: &Arrows) -> Option<Vec<String>> {
 #[test]
 fn no_circle_joins_the_folders_of_a_crate() {
     for krate in CRATES {
-        let all = arrows(&root().join("host").join(krate).join("src"));
-        assert_eq!(circle(&all), None, "host/{krate}");
+        let all = arrows(&root().join(krate).join("src"));
+        assert_eq!(circle(&all), None, "{krate}");
     }
 }
 

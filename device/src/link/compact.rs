@@ -10,7 +10,7 @@
 use lz4_flex::block::{compress_into_with_table, get_maximum_output_size, CompressTable};
 
 use super::codec::rle_encode;
-use super::header::Codec;
+use crate::packet::Codec;
 use crate::planes::{Raster, MAX_PLANES};
 
 /// Frames between two trials of all codecs on a plane.

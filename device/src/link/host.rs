@@ -10,16 +10,15 @@ mod light;
 mod types;
 
 use super::compact::Compactor;
-use super::decoder::Decoder;
 use super::flash::FlashLimiter;
-use super::header::{Codec, Header, Packet, VERSION};
 use super::limits::LimitReached;
 use super::message::{
     Config, ConfigRefusal, DeviceHello, DeviceState, Echo, Fault, FaultCode, HostHello, HostMessage, Status,
-    MAX_CONTROL_BYTES,
 };
 use super::session::SessionNumbers;
 use super::slots::SlotClock;
+use crate::packet::Decoder;
+use crate::packet::{Codec, Header, Packet, MAX_CONTROL_BYTES, VERSION};
 use crate::time::{DeviceTicks, HostTime};
 use crate::transport::{Lane, SendError, Transport, TransportError};
 use inbox::{Inbox, ECHOES_KEPT};

@@ -6,8 +6,8 @@
 
 mod types;
 
-use super::header::{u16_at, u32_at, u64_at, Header, MessageType};
 use super::limits::LightLimits;
+use crate::packet::{u16_at, u32_at, u64_at, Header, MessageType, MAX_CONTROL_BYTES};
 use crate::planes::{PlaneSchedule, PlaneSpec, Raster, MAX_PLANES};
 use crate::time::{DeviceTicks, FrameRate};
 pub use types::{
@@ -15,8 +15,6 @@ pub use types::{
     Status, Underrun, MAX_WATCHDOG_US,
 };
 
-/// Longest payload of any message except PLANE.
-pub const MAX_CONTROL_BYTES: usize = 96;
 /// Length of a CONFIG's payload before the LED codes of its planes.
 pub(super) const CONFIG_BYTES: usize = 40;
 /// Length of a FRAME_COMMIT's payload.

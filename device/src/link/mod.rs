@@ -8,10 +8,7 @@
 mod codec;
 #[cfg(feature = "std")]
 mod compact;
-mod crc;
-mod decoder;
 mod flash;
-mod header;
 #[cfg(feature = "std")]
 mod host;
 mod limits;
@@ -22,14 +19,13 @@ mod message;
 mod session;
 mod slots;
 
-pub use codec::{rle_encode, CodecError, RleDecoder};
-pub use crc::{crc32c, crc32c_append, crc32c_append_table};
-pub use decoder::{Decoder, DecoderCounters, PacketSink};
-pub use flash::{mean_luminance, FlashLimiter, FULL_LUMINANCE, HIGHEST_LIMIT, MAX_FLASHES_PER_S, REST_US};
-pub use header::{
-    frame_newer, packet_bytes, trailer_bytes, Codec, Header, HeaderError, MessageType, Packet, HEADER_BYTES,
-    MAGIC, MAX_PAYLOAD_BYTES, VERSION,
+pub use crate::packet::{
+    crc32c, crc32c_append, crc32c_append_table, frame_newer, packet_bytes, trailer_bytes, Codec, Decoder,
+    DecoderCounters, Header, HeaderError, MessageType, Packet, PacketSink, HEADER_BYTES, MAGIC,
+    MAX_CONTROL_BYTES, MAX_PAYLOAD_BYTES, VERSION,
 };
+pub use codec::{rle_encode, CodecError, RleDecoder};
+pub use flash::{mean_luminance, FlashLimiter, FULL_LUMINANCE, HIGHEST_LIMIT, MAX_FLASHES_PER_S, REST_US};
 #[cfg(feature = "std")]
 pub use host::{
     DropReason, EchoSample, Epoch, HostLink, LinkCounters, LinkError, LinkSettings, LinkState, SendOutcome,
@@ -42,8 +38,7 @@ pub use limits::{
 pub use measure::{measure, LinkMeasurement};
 pub use message::{
     faults, Assembly, Commit, Config, ConfigRefusal, DeviceHello, DeviceMessage, DeviceState, Echo, Fault,
-    FaultCode, HostHello, HostMessage, PayloadError, Status, Underrun, COMMIT_BYTES, MAX_CONTROL_BYTES,
-    MAX_WATCHDOG_US,
+    FaultCode, HostHello, HostMessage, PayloadError, Status, Underrun, COMMIT_BYTES, MAX_WATCHDOG_US,
 };
 #[cfg(feature = "std")]
 pub use session::SessionNumbers;

@@ -8,7 +8,7 @@ use dpm_handoff::ring::{exchange, ring, Consumer, Drainer, Filler, Producer};
 use dpm_handoff::wake::{WaitPolicy, Waiter, Waker};
 
 use super::{Lane, LinkDevice, SendError, Transport, TransportError};
-use crate::link::Packet;
+use crate::packet::Packet;
 use crate::time::HostTime;
 
 /// Calls the device as part of `send` and `receive`: nothing is copied or queued, and a run is a function of its
@@ -109,7 +109,7 @@ pub struct DeviceEnd {
 
 /// A cable between two threads with `depth` recycled buffers of `frame_bytes` each. Neither end locks, blocks or
 /// allocates. The device's thread waits in [`DeviceEnd::rest`] according to `policy`, and any arrival wakes it.
-/// `frame_bytes` is the size of the largest frame on the wire, see [`crate::link::packet_bytes`]. Two buffers keep both
+/// `frame_bytes` is the size of the largest frame on the wire, see [`crate::packet::packet_bytes`]. Two buffers keep both
 /// ends busy; more only make the caches colder.
 pub fn threaded(frame_bytes: usize, depth: usize, policy: WaitPolicy) -> (HostEnd, DeviceEnd) {
     // Written once, so that the pages are mapped before the first frame.

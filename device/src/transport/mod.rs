@@ -10,7 +10,7 @@ pub mod usb;
 
 use std::sync::Arc;
 
-use crate::link::Packet;
+use crate::packet::Packet;
 use crate::time::{HostClock, HostTime};
 
 /// The two independent streams of a link. Control never waits behind data.

@@ -14,7 +14,7 @@ use serialport::{ClearBuffer, SerialPort};
 
 use super::{Lane, SendError, Transport, TransportError};
 use crate::cobs::{encode, encoded_bytes, Deframer};
-use crate::link::{packet_bytes, Packet, MAX_CONTROL_BYTES};
+use crate::packet::{packet_bytes, Packet, MAX_CONTROL_BYTES};
 use crate::planes::MAX_PLANES;
 use crate::time::{HostClock, HostTime};
 use crate::tty::{self, Refusal};

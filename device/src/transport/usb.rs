@@ -16,7 +16,7 @@ use std::sync::{Arc, OnceLock};
 use rusb::{Context, DeviceHandle};
 
 use super::{Lane, SendError, Transport, TransportError};
-use crate::link::Packet;
+use crate::packet::Packet;
 use crate::time::{HostClock, HostTime};
 use events::Events;
 pub use open::{memory_limit_mb, UsbSettings, UDEV_RULE};

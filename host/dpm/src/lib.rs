@@ -3,3 +3,4 @@
 pub mod cli;
 mod dlpc900;
 mod run_dlpc900;
+pub mod signals;

@@ -4,7 +4,7 @@
 //! first frames of the rig's known motion over and over, three 8-bit patterns each (red, green, blue), whose bits the controller weighs
 //! itself. In video mode the light comes from whatever feeds its video input; this program sets it up and looks after it.
 
-use crate::cli::signals;
+use crate::signals;
 use dpm_common::clock::Stopwatch;
 use dpm_device::dlpc900::driver::{DarkLine, Dlpc900, Dlpc900Error, HidPort, PortError};
 use dpm_device::dlpc900::image::PlaneOrder;

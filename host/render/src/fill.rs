@@ -1,36 +1,12 @@
 //! Fills a device buffer with copies of one value, or changes some of its values; at set-up time and between frames of a check.
 
-use super::renderer::Renderer;
 use crate::gpu::{run_now, Buffer, Gpu, GpuError, MemoryKind};
 use bytemuck::Pod;
-use dpm_shaders::structs::History;
 use std::ops::Range;
 use std::sync::Arc;
 
-impl Renderer {
-    /// Changes what is kept of past frames at a range of pixels, in both buffers: for checks that something broken is forgotten. No frame
-    /// may be in flight.
-    ///
-    /// # Errors
-    /// Out of memory, device lost.
-    ///
-    /// # Panics
-    /// When the range lies beyond the raster, but not for a method without any: then nothing happens.
-    pub fn edit_history(
-        &self,
-        range: Range<usize>,
-        mut change: impl FnMut(&mut History),
-    ) -> Result<(), GpuError> {
-        if !self.settings.method.needs_history() {
-            return Ok(());
-        }
-        (self.resources.shared.history.iter())
-            .try_for_each(|buffer| edit(&self.gpu, buffer, range.clone(), &mut change))
-    }
-}
-
 /// Changes a stretch of a buffer's values through the host and waits.
-fn edit<T: Pod>(
+pub(super) fn edit<T: Pod>(
     gpu: &Arc<Gpu>,
     buffer: &Buffer,
     range: Range<usize>,

@@ -2,8 +2,8 @@
 
 use super::fill::fill;
 use super::memory::{BytesPerPixel, SharedBuffers};
-use super::renderer::{Output, RendererSettings};
 use super::scene_gpu::{table_buffer, SceneGpu};
+use super::settings::{Output, RendererSettings};
 use crate::gpu::{Buffer, Gpu, GpuError, MemoryKind};
 use crate::pack;
 use bytemuck::Zeroable;

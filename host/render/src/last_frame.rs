@@ -1,7 +1,7 @@
 //! What the last frame was drawn from, and whether the next one may rely on what it saw.
 
-use super::renderer::FrameInputs;
 use super::scene_data::BodyData;
+use super::settings::FrameInputs;
 use super::tiles::corners;
 use dpm_scene::geometry::projector::ProjectorCamera;
 use dpm_shaders::structs::{INSTANCE_EMPTY, NO_FRAME};

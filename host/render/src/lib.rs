@@ -27,12 +27,15 @@ pub mod pack;
 mod passes;
 pub mod rate_table;
 mod renderer;
+mod resources;
 pub mod scene_data;
 mod scene_gpu;
+mod settings;
 mod slot;
 pub mod tiles;
 
 pub use passes::PASSES;
-pub use renderer::{FrameInputs, Output, RenderError, Renderer, RendererSettings};
+pub use renderer::Renderer;
 pub use scene_data::Keep;
+pub use settings::{FrameInputs, Output, RenderError, RendererSettings};
 pub use slot::{FrameCost, FrameSlot};

@@ -5,8 +5,8 @@ use super::blue_noise;
 use super::fill::fill;
 use super::method::Method;
 use super::rate_table;
-use super::renderer::{RenderError, RendererSettings};
 use super::scene_gpu::table_buffer;
+use super::settings::{RasterTooLarge, RenderError, RendererSettings};
 use super::tiles::TILE;
 use crate::gpu::{Buffer, Gpu, GpuError, MemoryKind};
 use bytemuck::Zeroable;
@@ -68,47 +68,6 @@ impl BytesPerPixel {
         .rev()
         .max_by_key(|b| b.1)
         .unwrap_or(("code", 0))
-    }
-}
-
-/// A raster whose buffers are larger than a device binds at once.
-#[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
-#[error(
-    "a raster of {} x {} is too large for {device}: its {what} buffer takes {} MiB, and the device binds at most {} MiB at once \
-     ({most_pixels} pixels). {}",
-    raster.width(),
-    raster.height(),
-    mib(*needed),
-    mib(*limit),
-    remedy(*frugal_fits)
-)]
-pub struct RasterTooLarge {
-    /// The raster.
-    pub raster: Raster,
-    /// Name of the device.
-    pub device: String,
-    /// The largest of the buffers.
-    pub what: &'static str,
-    /// Its size, bytes.
-    pub needed: u64,
-    /// Largest buffer that the device binds, bytes.
-    pub limit: u64,
-    /// Largest number of pixels that this method can trace there.
-    pub most_pixels: u64,
-    /// Method `full` could trace this raster there.
-    pub frugal_fits: bool,
-}
-
-/// Mebibytes with one decimal, rounded up.
-fn mib(bytes: u64) -> String {
-    format!("{:.1}", (bytes as f64 / f64::from(1 << 20) * 10.0).ceil() / 10.0)
-}
-
-fn remedy(frugal_fits: bool) -> &'static str {
-    if frugal_fits {
-        "Trace a smaller raster (--raster WxH), or trace this one by a method without a history: --set render.method=full"
-    } else {
-        "Trace a smaller raster (--raster WxH)"
     }
 }
 

@@ -1,7 +1,7 @@
 //! The passes of a frame, one row each: what runs, when, over what, and which buffers it reads and writes.
 
-use super::renderer::RendererSettings;
 use super::scene_data::Keep;
+use super::settings::RendererSettings;
 use crate::pack;
 use dpm_shaders as shaders;
 use dpm_shaders::Shader;

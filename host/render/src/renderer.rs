@@ -1,107 +1,25 @@
 //! One frame on the GPU: surfaces, radiance, code values. `Renderer::create_slot` records the passes in their order.
 
+use super::fill;
 use super::frame_buffers::FrameBuffers;
 use super::last_frame::{LastFrame, Turn};
-use super::memory::{RasterTooLarge, SharedBuffers};
-use super::method::Method;
+use super::memory::SharedBuffers;
 use super::passes::{Grid, PASSES, TABLE};
-use super::scene_data::{world_bounds, Keep, SceneData, SceneDataError};
+use super::resources::Resources;
+use super::scene_data::{world_bounds, Keep, SceneData};
 use super::scene_gpu::SceneGpu;
+use super::settings::{FrameInputs, RenderError, RendererSettings};
 use super::slot::FrameSlot;
 use super::tiles::TileList;
 use crate::gpu::{
     BindingKind, BindingSet, BindingTable, CommandList, ComputePipeline, FrameFence, Gpu, GpuError, Recorder,
 };
 use crate::pack;
-use dpm_device::planes::{PlaneSchedule, Raster};
-use dpm_scene::geometry::projector::ProjectorCamera;
 use dpm_scene::Scene;
 use dpm_shaders::structs::{self as gpu_structs, Counters, Frame, Instance, Rows, Schedule, Surface};
-use glam::{DAffine3, DVec3, Vec3};
+use glam::{DAffine3, Vec3};
+use std::ops::Range;
 use std::sync::Arc;
-
-/// What does not change while a renderer lives.
-#[derive(Clone, Debug)]
-pub struct RendererSettings {
-    /// Raster traced.
-    pub raster: Raster,
-    /// Closest-hit rays of a path, primary included.
-    pub depth: u32,
-    /// Seed of the run.
-    pub seed: u32,
-    /// Limit on indirect contributions; `None`: off.
-    pub clamp_indirect: Option<f32>,
-    /// `pi * exposure / (albedo * max_intensity)`.
-    pub drive_gain: f32,
-    /// Radiance that the real surfaces show by themselves.
-    pub ambient: [f32; 3],
-    /// Ordinary camera (tests): radiance goes back along the primary ray and everything is lit.
-    pub camera_is_eye: bool,
-    /// Compile in what the scene does not need (tests).
-    pub leave_nothing_out: bool,
-    /// How rays are spent.
-    pub method: Method,
-    /// What comes back.
-    pub output: Output,
-}
-
-/// What a frame brings to the host.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum Output {
-    /// Code values, to be packed there.
-    Codes,
-    /// Bit planes, packed by the GPU.
-    Planes(PlaneSchedule),
-    /// Both: planes to be sent, code values to check the light against.
-    Both(PlaneSchedule),
-}
-
-impl Output {
-    /// The planes that the GPU packs.
-    pub(crate) fn schedule(&self) -> Option<&PlaneSchedule> {
-        match self {
-            Self::Codes => None,
-            Self::Planes(schedule) | Self::Both(schedule) => Some(schedule),
-        }
-    }
-}
-
-/// What changes from frame to frame. Small: it is written just before the GPU starts.
-#[derive(Clone, Copy, Debug)]
-pub struct FrameInputs<'a> {
-    /// Number of the frame.
-    pub frame: u32,
-    /// Samples per traced pixel where neither angle nor budget decides.
-    pub spp: u32,
-    /// Samples per lit pixel on average (method dpm).
-    pub budget_spp: f32,
-    /// Projector.
-    pub camera: &'a ProjectorCamera,
-    /// Eye, world.
-    pub eye: DVec3,
-    /// Gaze point, world.
-    pub gaze: DVec3,
-    /// Degrees by which all zones about the gaze grow: 0 while it is known.
-    pub widen_deg: f32,
-    /// world-from-body of every body of the scene, at the time of light.
-    pub poses: &'a [DAffine3],
-    /// Per tracked body: lost, no light falls on it. Bodies beyond the end are not lost.
-    pub lost: &'a [bool],
-}
-
-/// Why a renderer cannot be built.
-#[derive(Debug, thiserror::Error)]
-pub enum RenderError {
-    /// The GPU's word.
-    #[error(transparent)]
-    Gpu(#[from] GpuError),
-    /// The scene's.
-    #[error(transparent)]
-    Scene(#[from] SceneDataError),
-    /// The raster's.
-    #[error(transparent)]
-    Raster(#[from] RasterTooLarge),
-}
 
 /// Byte offsets in the dispatch arguments: four workgroups a tile, and one a tile in frames that decide rates.
 const PER_TILE_QUARTER: u64 = 0;
@@ -134,17 +52,6 @@ pub struct RendererPlan {
     settings: RendererSettings,
     keep: Keep,
     tracked: Vec<Option<u16>>,
-}
-
-/// What submissions read, held by the renderer and by every slot: it goes when the last submission is over, in whatever order they are
-/// dropped.
-pub(super) struct Resources {
-    // Dropped before the buffers they use.
-    /// One a row of [`TABLE`]; `None`: the method does not need it and it is not recorded.
-    pipelines: Vec<Option<ComputePipeline>>,
-    table: Arc<BindingTable>,
-    pub(super) shared: SharedBuffers,
-    scene: SceneGpu,
 }
 
 /// `tracked`: per body of the scene, which tracked body carries it.
@@ -398,6 +305,26 @@ impl Renderer {
         let lost = (0..inputs.poses.len()).map(|i| is_lost(&self.tracked, i, inputs.lost));
         self.last.becomes(inputs, slot.parity, lost);
         Ok(())
+    }
+
+    /// Changes what is kept of past frames at a range of pixels, in both buffers: for checks that something broken is forgotten. No frame
+    /// may be in flight.
+    ///
+    /// # Errors
+    /// Out of memory, device lost.
+    ///
+    /// # Panics
+    /// When the range lies beyond the raster, but not for a method without any: then nothing happens.
+    pub fn edit_history(
+        &self,
+        range: Range<usize>,
+        mut change: impl FnMut(&mut gpu_structs::History),
+    ) -> Result<(), GpuError> {
+        if !self.settings.method.needs_history() {
+            return Ok(());
+        }
+        (self.resources.shared.history.iter())
+            .try_for_each(|buffer| fill::edit(&self.gpu, buffer, range.clone(), &mut change))
     }
 
     /// Body `i` of the scene as the shaders have it. The projector is the origin: f32 is finest where the rays start.

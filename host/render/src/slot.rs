@@ -2,7 +2,7 @@
 
 use super::frame_buffers::FrameBuffers;
 use super::passes::PASSES;
-use super::renderer::Resources;
+use super::resources::Resources;
 use super::tiles::TileList;
 use crate::gpu::{BindingSet, CommandList, FrameFence, GpuError};
 use dpm_device::planes::Raster;

@@ -1,9 +1,9 @@
 //! Collects the device's packets: the newest message of each kind.
 
 use super::types::EchoSample;
-use crate::link::decoder::PacketSink;
-use crate::link::header::Header;
 use crate::link::message::{Assembly, DeviceHello, DeviceMessage, Fault, Status};
+use crate::packet::Header;
+use crate::packet::PacketSink;
 use crate::time::HostTime;
 
 /// Echo answers kept for the caller.

@@ -1,8 +1,8 @@
 //! What a host requests of a link, and what it learns from it: settings, states, errors, outcomes, counters.
 
-use crate::link::header::VERSION;
 use crate::link::limits::{LightLimits, LimitReached};
 use crate::link::message::{ConfigRefusal, DeviceState, HostMessage, Underrun};
+use crate::packet::VERSION;
 use crate::planes::{PlaneSchedule, Raster};
 use crate::time::{DeviceTicks, FrameRate, HostTime};
 use crate::transport::TransportError;

@@ -24,7 +24,7 @@ pub struct UsbSettings {
     pub product_id: u16,
     /// Serial number text; `None` takes the first device found.
     pub serial: Option<String>,
-    /// Bytes of the largest frame on the wire, see [`crate::link::packet_bytes`].
+    /// Bytes of the largest frame on the wire, see [`crate::packet::packet_bytes`].
     pub frame_bytes: usize,
     /// Frames in flight, at least 1. One is on the cable while the others wait, so each additional one adds a frame of
     /// latency on a full link.

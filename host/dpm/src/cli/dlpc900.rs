@@ -1,8 +1,8 @@
 //! `dpm dlpc900`: words into calls of the DLPC900 driver.
 
-use super::signals;
 use super::watch::{print, refuse_where_dark_stands};
 use crate::dlpc900::{sequence_of, status_text, PatternFileError, ShowAs};
+use crate::signals;
 use clap::ValueEnum;
 use dpm_device::dlpc900::driver::{Dlpc900, UploadProgress};
 use dpm_device::dlpc900::image::{Compression, PlaneOrder};

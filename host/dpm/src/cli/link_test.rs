@@ -1,8 +1,8 @@
 //! `dpm link-test RIG.toml`: what the link to the projector carries.
 
 use super::rig_args::RigArgs;
-use super::signals;
 use super::watch::{print, refuse_where_dark_stands, take_locks};
+use crate::signals;
 use dpm_common::stopping;
 use dpm_lab::conformance::{rules, Extent};
 use dpm_lab::link_test::{judge_projector, link_test, Content};

@@ -17,7 +17,6 @@ mod progress;
 mod record;
 mod rig_args;
 pub mod run;
-pub mod signals;
 mod snapshot;
 mod stability;
 mod tell;

@@ -1,8 +1,8 @@
 //! `dpm record OUT --rig RIG.toml`: what a rig's tracker says into a file, until the time is over, a signal comes or the disk is full.
 
 use super::rig_args::RigArgs;
-use super::signals;
 use super::watch::print;
+use crate::signals;
 use dpm_common::clock::{Clock, MonotonicClock};
 use dpm_device::tracker::record::Recorder;
 use dpm_device::tracker::{BodyKey, Tracker};

@@ -5,8 +5,8 @@
 //! nobody else.
 
 use super::keys::Keys;
-use super::signals;
 use super::tell::{Teller, SHOWN_EVERY};
+use crate::signals;
 use crossbeam::channel::{unbounded, Receiver, RecvTimeoutError};
 use dpm_common::files::{write_atomically, InstanceLock, LockError};
 use dpm_common::folder::{Folder, FolderError};

@@ -3,6 +3,9 @@
 use super::crc::crc32c;
 use crate::time::DeviceTicks;
 
+/// Longest payload of any message except PLANE.
+pub const MAX_CONTROL_BYTES: usize = 96;
+
 /// First four bytes of every packet: `D P M L` in the order sent.
 pub const MAGIC: [u8; 4] = *b"DPML";
 /// Version of the protocol that this code speaks.
@@ -288,15 +291,15 @@ pub const fn frame_newer(a: u32, b: u32) -> bool {
     a.wrapping_sub(b) as i32 > 0
 }
 
-pub(super) fn u16_at(b: &[u8], at: usize) -> u16 {
+pub(crate) fn u16_at(b: &[u8], at: usize) -> u16 {
     u16::from_le_bytes([b[at], b[at + 1]])
 }
 
-pub(super) fn u32_at(b: &[u8], at: usize) -> u32 {
+pub(crate) fn u32_at(b: &[u8], at: usize) -> u32 {
     u32::from_le_bytes([b[at], b[at + 1], b[at + 2], b[at + 3]])
 }
 
-pub(super) fn u64_at(b: &[u8], at: usize) -> u64 {
+pub(crate) fn u64_at(b: &[u8], at: usize) -> u64 {
     u64::from(u32_at(b, at)) | u64::from(u32_at(b, at + 4)) << 32
 }
 
