@@ -17,6 +17,7 @@ pub mod commit;
 pub mod files;
 pub mod folder;
 pub mod quantiles;
+pub mod realtime;
 pub mod so3;
 pub mod stopping;
 pub mod unix;

@@ -41,7 +41,6 @@ pub mod pack;
 pub mod pictures;
 pub mod pipeline;
 pub mod plan;
-pub mod realtime;
 mod render;
 pub mod rig;
 pub mod run_rig;

@@ -2,8 +2,8 @@
 
 use super::os;
 use super::watch::print;
+use dpm_common::realtime::{self, Refusal};
 use dpm_rig::failure::{Failure, FailureKind};
-use dpm_rig::realtime::{self, Refusal};
 use dpm_rig::telemetry::report::to_json;
 use std::fs;
 use std::path::PathBuf;

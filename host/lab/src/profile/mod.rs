@@ -82,7 +82,7 @@ fn summary(outcome: &RunOutcome, rig: &Rig, prepared: bool) -> Profile {
         ("pace", report.pace.to_owned()),
         ("raster", format!("{} x {}", report.raster[0], report.raster[1])),
         ("planes", report.planes.to_string()),
-        ("cores", dpm_rig::realtime::os::usable_cores().to_string()),
+        ("cores", dpm_common::realtime::os::usable_cores().to_string()),
         ("priority", rig.config.real_time.priority.to_string()),
     ]
     .map(|(key, value)| (key.to_owned(), value))

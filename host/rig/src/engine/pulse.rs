@@ -1,6 +1,6 @@
 //! Heartbeats: every thread of a run says by when it will say again that it is alive, and the supervisor looks whether it did.
 
-use crate::realtime::os::Standing;
+use dpm_common::realtime::os::Standing;
 use dpm_device::time::HostTime;
 use std::sync::atomic::{AtomicI32, AtomicI64, Ordering};
 

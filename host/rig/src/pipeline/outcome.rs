@@ -2,11 +2,11 @@
 
 use crate::light::collector::FrameRecord;
 use crate::light::recorder::LightFrame;
-use crate::realtime::standstill::Standstills;
 use crate::telemetry::profile::Profiler;
 use crate::telemetry::report::Report;
 use crate::telemetry::slots::SlotCounts;
 use crate::telemetry::trace::TracedFrame;
+use dpm_common::realtime::standstill::Standstills;
 
 /// What a run leaves behind.
 pub struct RunOutcome {

@@ -1,7 +1,7 @@
 //! What each stage asks of the operating system, from the rig file into granted rights and warnings, each once.
 
 use crate::config::RealTimeConfig;
-use crate::realtime::{enter_frame_path, os, Refusal, ThreadRights};
+use dpm_common::realtime::{enter_frame_path, os, Refusal, ThreadRights};
 use std::sync::Mutex;
 
 /// The mock projector's place in the list of cores, behind the stages.

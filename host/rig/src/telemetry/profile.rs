@@ -7,7 +7,7 @@ use super::signed::SignedHistogram;
 use super::slots::SlotCounts;
 use crate::frame::slots::{MissCause, OrderedDark};
 use crate::frame::FrameTimeline;
-use crate::realtime::standstill::Standstills;
+use dpm_common::realtime::standstill::Standstills;
 use dpm_device::time::{FrameRate, HostTime};
 use serde::{Deserialize, Serialize};
 use std::collections::BTreeMap;

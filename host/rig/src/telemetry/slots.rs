@@ -9,7 +9,7 @@
 use super::ordered::{DarkLog, DarkSpans};
 use crate::frame::slots::{MissCause, OrderedDark};
 use crate::frame::FrameTimeline;
-use crate::realtime::standstill::SeenStandstills;
+use dpm_common::realtime::standstill::SeenStandstills;
 use dpm_device::time::{FrameRate, HostTime};
 use std::collections::VecDeque;
 use std::sync::Arc;

@@ -1,7 +1,7 @@
 //! The ledger against runs whose every slot is known.
 
 use super::*;
-use crate::realtime::standstill::Standstills;
+use dpm_common::realtime::standstill::Standstills;
 
 const SLOT: i64 = 1_000_000;
 
@@ -164,7 +164,7 @@ fn a_week_of_misses_is_counted_exactly_in_bounded_memory() {
         let (kind, still) = (slot % 3, slot % 6 == 2);
         if still || kind == 1 && slot % 2 == 0 {
             let gap = due.plus_ns(if still { -SLOT } else { 3 * SLOT });
-            seen.note_for_test(gap, gap.plus_ns(SLOT / 2));
+            seen.note(gap, gap.plus_ns(SLOT / 2));
         }
         if kind == 2 {
             t.packed_at = due.plus_ns(SLOT);
@@ -222,7 +222,7 @@ fn jumps_are_counted_without_being_walked() {
 
 #[test]
 fn a_standstill_that_is_told_late_still_excuses_its_slot() {
-    let seen = Arc::new(SeenStandstills::asleep_for_test());
+    let seen = Arc::new(SeenStandstills::asleep());
     let mut ledger = SlotLedger::new(rate(), 0);
     ledger.excuse_by(seen.clone());
     for slot in 0..50 {
@@ -236,8 +236,8 @@ fn a_standstill_that_is_told_late_still_excuses_its_slot() {
     }
     // Nothing behind the missed slot is counted before it is decided.
     assert_eq!((ledger.counts().own, ledger.counts().missed_total()), (20, 0));
-    seen.note_for_test(begin(18), begin(49));
-    seen.wake_for_test(begin(49));
+    seen.note(begin(18), begin(49));
+    seen.wake(begin(49));
     ledger.settle();
     assert_eq!((ledger.counts().own, ledger.counts().excused()), (49, 1));
 }

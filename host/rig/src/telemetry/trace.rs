@@ -6,7 +6,7 @@
 
 use crate::frame::{FrameTimeline, Stage};
 use crate::plan::frame::FrameId;
-use crate::realtime::standstill::Standstills;
+use dpm_common::realtime::standstill::Standstills;
 use dpm_device::time::HostTime;
 use dpm_render::PASSES;
 use std::io::{Error, Write};

@@ -13,7 +13,7 @@ const SLICE_NS: u64 = 100_000;
 
 /// What a stage's thread asks for.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
-pub(crate) struct ThreadRights {
+pub struct ThreadRights {
     /// SCHED_FIFO priority, 1 to 99; 0 keeps the normal scheduler.
     pub priority: u32,
     /// Core to run on; `None` leaves it to the kernel.
@@ -34,7 +34,7 @@ pub struct Refusal {
 
 /// What a thread got.
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
-pub(crate) struct Granted {
+pub struct Granted {
     /// SCHED_FIFO priority in force; 0 is the normal scheduler.
     pub priority: u32,
     /// Core it is bound to.
@@ -44,7 +44,7 @@ pub(crate) struct Granted {
 }
 
 /// Asks for `rights` for the calling thread. Call once at the start of the thread: it allocates and makes system calls.
-pub(crate) fn enter_frame_path(rights: ThreadRights) -> Granted {
+pub fn enter_frame_path(rights: ThreadRights) -> Granted {
     let mut granted = Granted::default();
     // Sleeps end within a microsecond instead of 50; needs no right and does nothing under SCHED_FIFO.
     if let Err(refusal) = os::set_timer_slack_ns(1) {
@@ -71,6 +71,6 @@ pub(crate) fn enter_frame_path(rights: ThreadRights) -> Granted {
 
 /// How `stages` waiting threads should wait, given what the machine is and what was granted: the caller's wish if it has
 /// one, else by the count of usable cores.
-pub(crate) fn wait_policy(wish: Option<WaitPolicy>, stages: usize) -> WaitPolicy {
+pub fn wait_policy(wish: Option<WaitPolicy>, stages: usize) -> WaitPolicy {
     wish.unwrap_or_else(|| WaitPolicy::for_machine(os::usable_cores(), stages))
 }

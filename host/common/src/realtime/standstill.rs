@@ -9,7 +9,7 @@
 //! there is one thread on whatever core is free: it finds less, and excuses no stage that only waited for another.
 
 use super::os;
-use dpm_common::clock::Clock;
+use crate::clock::Clock;
 use dpm_device::time::HostTime;
 use std::collections::VecDeque;
 use std::sync::atomic::{AtomicBool, AtomicI64, Ordering};
@@ -27,7 +27,7 @@ const WAITING: usize = 64;
 
 /// An interval in which the control thread did not run although it should have.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub(crate) struct Gap {
+pub struct Gap {
     /// When it should have run.
     pub from: HostTime,
     /// When it ran.
@@ -56,7 +56,7 @@ pub struct Standstills {
 
 impl Standstills {
     /// Notes a step that should have ended at `due` and ended at `woke`.
-    pub(crate) fn note(&mut self, due: HostTime, woke: HostTime, threshold_ns: i64) {
+    pub fn note(&mut self, due: HostTime, woke: HostTime, threshold_ns: i64) {
         if woke.ns_since(due) <= threshold_ns {
             return;
         }
@@ -84,36 +84,35 @@ impl Standstills {
     }
 
     /// The newest gaps, in order.
-    pub(crate) fn gaps(&self) -> impl Iterator<Item = Gap> + '_ {
+    pub fn gaps(&self) -> impl Iterator<Item = Gap> + '_ {
         self.gaps.iter().copied()
     }
 
     /// Gaps of the whole run.
-    #[cfg(test)]
-    pub(crate) fn count(&self) -> u64 {
+    pub fn count(&self) -> u64 {
         self.past + self.gaps.len() as u64
     }
 
     /// Total length of all gaps of the run, ns.
-    pub(crate) fn total_ns(&self) -> i64 {
+    pub fn total_ns(&self) -> i64 {
         self.gaps.iter().map(|g| g.ns()).fold(self.past_ns, i64::saturating_add)
     }
 
     /// Longest gap of the run, ns; 0 without any.
-    pub(crate) fn longest_ns(&self) -> i64 {
+    pub fn longest_ns(&self) -> i64 {
         self.gaps.iter().map(|g| g.ns()).fold(self.past_longest_ns, i64::max)
     }
 
     /// True when the machine stood still at some instant of [`from`, `to`]: a frame in flight then is excused. Asked for instants before
     /// the gaps that are kept, it knows nothing.
-    pub(crate) fn touches(&self, from: HostTime, to: HostTime) -> bool {
+    pub fn touches(&self, from: HostTime, to: HostTime) -> bool {
         // The first gap that ends after `from` is the only one that can begin early enough.
         let first = self.gaps.partition_point(|g| g.to < from);
         self.gaps.get(first).is_some_and(|g| g.from <= to)
     }
 
     /// True when the machine stood still throughout [`from`, `to`].
-    pub(crate) fn covers(&self, from: HostTime, to: HostTime) -> bool {
+    pub fn covers(&self, from: HostTime, to: HostTime) -> bool {
         let first = self.gaps.partition_point(|g| g.to < to);
         self.gaps.get(first).is_some_and(|g| g.from <= from)
     }
@@ -121,7 +120,7 @@ impl Standstills {
 
 /// What the control threads have seen so far, for threads that are not on the frame path.
 #[derive(Debug)]
-pub(crate) struct SeenStandstills {
+pub struct SeenStandstills {
     all: Mutex<Standstills>,
     /// Per control thread: when it ran last, with everything before written down.
     awake_at: Vec<AtomicI64>,
@@ -134,36 +133,32 @@ impl SeenStandstills {
     }
 
     /// Known standstills, with nothing to come.
-    #[cfg(test)]
-    pub(crate) fn known(standstills: Standstills) -> Self {
+    pub fn known(standstills: Standstills) -> Self {
         Self { all: Mutex::new(standstills), awake_at: Vec::new() }
     }
 
     /// Every standstill that began before this instant is known.
-    pub(crate) fn through(&self) -> HostTime {
+    pub fn through(&self) -> HostTime {
         HostTime(self.awake_at.iter().map(|at| at.load(Ordering::Acquire)).min().unwrap_or(i64::MAX))
     }
 
     /// Looks at what is known. Short, please: control threads put off what they have to write meanwhile.
-    pub(crate) fn with<R>(&self, look: impl FnOnce(&Standstills) -> R) -> R {
+    pub fn with<R>(&self, look: impl FnOnce(&Standstills) -> R) -> R {
         look(&self.lock())
     }
 
     /// As if a control thread had told it.
-    #[cfg(test)]
-    pub(crate) fn note_for_test(&self, from: HostTime, to: HostTime) {
+    pub fn note(&self, from: HostTime, to: HostTime) {
         self.lock().note(from, to, 0);
     }
 
     /// One control thread, which has not run yet.
-    #[cfg(test)]
-    pub(crate) fn asleep_for_test() -> Self {
+    pub fn asleep() -> Self {
         Self::new(1)
     }
 
     /// It ran at this instant.
-    #[cfg(test)]
-    pub(crate) fn wake_for_test(&self, at: HostTime) {
+    pub fn wake(&self, at: HostTime) {
         self.awake_at[0].store(at.0, Ordering::Release);
     }
 
@@ -175,7 +170,7 @@ impl SeenStandstills {
 
 /// The running control threads.
 #[derive(Debug)]
-pub(crate) struct StandstillMonitor {
+pub struct StandstillMonitor {
     stop: Arc<AtomicBool>,
     seen: Arc<SeenStandstills>,
     threads: Vec<JoinHandle<()>>,
@@ -187,7 +182,7 @@ impl StandstillMonitor {
     ///
     /// # Errors
     /// The system's, when it has no more threads.
-    pub(crate) fn start(clock: Arc<dyn Clock>, threshold_ns: i64, above: u32) -> std::io::Result<Self> {
+    pub fn start(clock: Arc<dyn Clock>, threshold_ns: i64, above: u32) -> std::io::Result<Self> {
         let priority = if (1..99).contains(&above) && Self::is_granted(above + 1)? { above + 1 } else { 0 };
         let cores: Vec<Option<u32>> =
             if priority > 0 { os::allowed_core_list().into_iter().map(Some).collect() } else { Vec::new() };
@@ -214,17 +209,17 @@ impl StandstillMonitor {
 
     /// Control threads that run.
     #[cfg(test)]
-    pub(crate) fn threads(&self) -> usize {
+    pub fn threads(&self) -> usize {
         self.threads.len()
     }
 
     /// What they see, as they go on.
-    pub(crate) fn seen(&self) -> Arc<SeenStandstills> {
+    pub fn seen(&self) -> Arc<SeenStandstills> {
         self.seen.clone()
     }
 
     /// Ends the threads (within a step) and returns what they saw.
-    pub(crate) fn finish(mut self) -> Standstills {
+    pub fn finish(mut self) -> Standstills {
         self.stop.store(true, Ordering::Relaxed);
         for thread in self.threads.drain(..) {
             let _ = thread.join();
@@ -266,7 +261,7 @@ impl Drop for StandstillMonitor {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use dpm_common::clock::MonotonicClock;
+    use crate::clock::MonotonicClock;
     use std::sync::atomic::AtomicI64;
 
     /// A clock on which every hundredth wait takes 30 ms longer.

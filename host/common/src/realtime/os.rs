@@ -46,7 +46,7 @@ pub fn set_fifo_priority(priority: u32) -> Result<(), Refusal> {
 /// The SCHED_FIFO or SCHED_RR priority of the calling thread; 0 under the normal scheduler.
 #[cfg(test)]
 #[cfg(target_os = "linux")]
-pub(crate) fn real_time_priority() -> u32 {
+pub fn real_time_priority() -> u32 {
     // SAFETY: as in `set_fifo_priority`.
     let mut param: libc::sched_param = unsafe { std::mem::zeroed() };
     // SAFETY: pid 0 is the calling thread; `param` is written during the call only.
@@ -61,7 +61,7 @@ pub(crate) fn real_time_priority() -> u32 {
 
 /// Binds the calling thread to one core.
 #[cfg(target_os = "linux")]
-pub(crate) fn pin_to_core(core: u32) -> Result<(), Refusal> {
+pub fn pin_to_core(core: u32) -> Result<(), Refusal> {
     let what = format!("core {core}");
     let limit = libc::CPU_SETSIZE as u32;
     if core >= limit {
@@ -133,7 +133,7 @@ pub fn unlock_memory() {
 
 /// Lets sleeps of the calling thread end this many nanoseconds late at most, as far as the kernel batches timers.
 #[cfg(target_os = "linux")]
-pub(crate) fn set_timer_slack_ns(slack_ns: u64) -> Result<(), Refusal> {
+pub fn set_timer_slack_ns(slack_ns: u64) -> Result<(), Refusal> {
     // SAFETY: PR_SET_TIMERSLACK takes one integer.
     if unsafe { libc::prctl(libc::PR_SET_TIMERSLACK, slack_ns as libc::c_ulong, 0, 0, 0) } == 0 {
         return Ok(());
@@ -162,7 +162,7 @@ struct SchedAttr {
 /// Asks the normal scheduler for time slices of `slice_ns` (0.1 to 100 ms) for the calling thread, which keeps its niceness: a thread that
 /// wants little at a time comes before others that want much. Needs no right. Kernels before 6.12 have one slice for all and say nothing.
 #[cfg(target_os = "linux")]
-pub(crate) fn set_slice_ns(slice_ns: u64) -> Result<(), Refusal> {
+pub fn set_slice_ns(slice_ns: u64) -> Result<(), Refusal> {
     let size = std::mem::size_of::<SchedAttr>() as u32;
     let mut attr = SchedAttr::default();
     // SAFETY: pid 0 is the calling thread; `attr` has the `size` bytes that the kernel may write and outlives the calls.
@@ -184,7 +184,7 @@ pub(crate) fn set_slice_ns(slice_ns: u64) -> Result<(), Refusal> {
 /// The time slice of the calling thread under the normal scheduler, ns; 0 where the kernel has one for all threads.
 #[cfg(test)]
 #[cfg(target_os = "linux")]
-pub(crate) fn slice_ns() -> u64 {
+pub fn slice_ns() -> u64 {
     let size = std::mem::size_of::<SchedAttr>() as u32;
     let mut attr = SchedAttr::default();
     // SAFETY: as in `set_slice_ns`.
@@ -198,7 +198,7 @@ pub(crate) fn slice_ns() -> u64 {
 
 /// The cores that the calling thread may run on, in order.
 #[cfg(target_os = "linux")]
-pub(crate) fn allowed_core_list() -> Vec<u32> {
+pub fn allowed_core_list() -> Vec<u32> {
     // SAFETY: cpu_set_t is a bit array, for which all zero bits are valid and which is written during the call only.
     let set = unsafe {
         let mut set: libc::cpu_set_t = std::mem::zeroed();
@@ -213,14 +213,14 @@ pub(crate) fn allowed_core_list() -> Vec<u32> {
 
 /// The calling thread's number for the operating system.
 #[cfg(target_os = "linux")]
-pub(crate) fn thread_id() -> i32 {
+pub fn thread_id() -> i32 {
     // SAFETY: gettid takes no arguments and cannot fail.
     unsafe { libc::gettid() }
 }
 
 /// What a thread of this process is doing.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub(crate) struct Standing {
+pub struct Standing {
     /// It runs, or would if it got a core.
     pub ready: bool,
     /// Processor time that it has used, nanoseconds.
@@ -229,7 +229,7 @@ pub(crate) struct Standing {
 
 /// What the thread `id` of this process is doing; `None` where the kernel does not tell or the thread is gone. Allocates nothing.
 #[cfg(target_os = "linux")]
-pub(crate) fn standing_of(id: i32) -> Option<Standing> {
+pub fn standing_of(id: i32) -> Option<Standing> {
     let mut text = [0u8; 256];
     let stat = read_of_thread(id, "stat", &mut text)?;
     // The name, in brackets, may hold anything.
@@ -256,7 +256,7 @@ fn read_of_thread<'a>(id: i32, name: &str, text: &'a mut [u8]) -> Option<&'a str
 /// Nanoseconds of processor time the calling thread has used.
 #[cfg(test)]
 #[cfg(target_os = "linux")]
-pub(crate) fn thread_cpu_ns() -> i64 {
+pub fn thread_cpu_ns() -> i64 {
     let mut t = libc::timespec { tv_sec: 0, tv_nsec: 0 };
     // SAFETY: `t` is written during the call only.
     unsafe { libc::clock_gettime(libc::CLOCK_THREAD_CPUTIME_ID, &mut t) };
@@ -278,49 +278,49 @@ mod elsewhere {
     }
 
     /// Refused.
-    pub(crate) fn set_fifo_priority(_priority: u32) -> Result<(), Refusal> {
+    pub fn set_fifo_priority(_priority: u32) -> Result<(), Refusal> {
         Err(not_here("real-time priority"))
     }
     /// Always the normal scheduler.
-    pub(crate) fn real_time_priority() -> u32 {
+    pub fn real_time_priority() -> u32 {
         0
     }
     /// Refused.
-    pub(crate) fn pin_to_core(_core: u32) -> Result<(), Refusal> {
+    pub fn pin_to_core(_core: u32) -> Result<(), Refusal> {
         Err(not_here("binding to a core"))
     }
     /// Refused.
-    pub(crate) fn lock_memory() -> Result<(), Refusal> {
+    pub fn lock_memory() -> Result<(), Refusal> {
         Err(not_here("locking memory"))
     }
     /// Nothing to undo.
-    pub(crate) fn unlock_memory() {}
+    pub fn unlock_memory() {}
     /// Refused.
-    pub(crate) fn set_timer_slack_ns(_slack_ns: u64) -> Result<(), Refusal> {
+    pub fn set_timer_slack_ns(_slack_ns: u64) -> Result<(), Refusal> {
         Err(not_here("a shorter timer slack"))
     }
     /// Refused.
-    pub(crate) fn set_slice_ns(_slice_ns: u64) -> Result<(), Refusal> {
+    pub fn set_slice_ns(_slice_ns: u64) -> Result<(), Refusal> {
         Err(not_here("a shorter time slice"))
     }
     /// Unknown.
-    pub(crate) fn slice_ns() -> u64 {
+    pub fn slice_ns() -> u64 {
         0
     }
     /// Unknown.
-    pub(crate) fn allowed_core_list() -> Vec<u32> {
+    pub fn allowed_core_list() -> Vec<u32> {
         Vec::new()
     }
     /// Unknown.
-    pub(crate) fn thread_cpu_ns() -> i64 {
+    pub fn thread_cpu_ns() -> i64 {
         0
     }
     /// Unknown.
-    pub(crate) fn thread_id() -> i32 {
+    pub fn thread_id() -> i32 {
         0
     }
     /// Unknown.
-    pub(crate) fn standing_of(_id: i32) -> Option<super::Standing> {
+    pub fn standing_of(_id: i32) -> Option<super::Standing> {
         None
     }
 }
