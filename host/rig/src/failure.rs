@@ -113,3 +113,9 @@ impl From<dpm_device::tracker::record::RecordError> for Failure {
         }
     }
 }
+
+impl From<dpm_common::keys::ConfigErrors> for Failure {
+    fn from(errors: dpm_common::keys::ConfigErrors) -> Self {
+        Self::new(FailureKind::BadInput, errors)
+    }
+}

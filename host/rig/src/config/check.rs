@@ -1,9 +1,9 @@
 //! Contradictions between keys: each named at the key that somebody wrote, with what would resolve it.
 
-use super::read::{ConfigValue, Reader};
 use super::world::{EnvironmentConfig, GazeConfig, TrackerConfig};
 use super::{Pace, ProjectorBackend, Purpose, RigConfig};
 use crate::mock::{self, FaultError};
+use dpm_common::keys::read::{ConfigValue, Reader};
 use dpm_device::regular_file;
 use std::collections::HashMap;
 use std::path::{Path, PathBuf};

@@ -5,36 +5,33 @@
 //! declarations here.
 
 mod check;
-mod declare;
-mod error;
 mod method;
 mod prediction;
 mod projector;
-mod read;
 mod run;
 mod safety;
-mod source;
 mod world;
 
 #[cfg(test)]
 mod tests;
 
 pub(crate) use check::MAX_TRACKED;
-pub use error::{ConfigError, ConfigErrors, Origin};
+pub(crate) use dpm_common::keys::read::KeyDoc;
+pub(crate) use dpm_common::keys::source::VARIABLE_PREFIX;
+pub use dpm_common::keys::{ConfigError, ConfigErrors, Origin};
 pub use projector::*;
-pub(crate) use read::KeyDoc;
 pub use run::*;
 pub use safety::{
     InterlockConfig, InterlockSignal, KeyInterlockConfig, LimitsConfig, LineInterlockConfig,
     NoInterlockConfig, ProcessInterlockConfig,
 };
-pub(crate) use source::VARIABLE_PREFIX;
 pub use world::*;
 
 use crate::mock::MotionSpec;
-use declare::section;
+use dpm_common::keys::read::{Any, ConfigValue, Reader};
+use dpm_common::keys::source;
+use dpm_common::section;
 use dpm_device::regular_file;
-use read::{Any, ConfigValue, Reader};
 use std::path::Path;
 
 /// Largest accepted rig file in bytes.

@@ -1,8 +1,9 @@
 //! `[projector]`: what the light comes out of, where it stands, and how the program reaches it.
 
-use super::declare::{kinds, section, words};
-use super::read::{Any, ConfigValue, Limit, NotEmpty, Reader, Within};
-use super::source::{Node, Value};
+use dpm_common::keys::read::{Any, ConfigValue, Limit, NotEmpty, Reader, Within};
+use dpm_common::keys::source::{Node, Value};
+use dpm_common::keys::Rate;
+use dpm_common::{kinds, section, words};
 use dpm_device::dlpc900::lut::Dmd;
 use dpm_device::link::Codec;
 use dpm_device::planes::{PlaneSchedule, Raster};
@@ -263,22 +264,6 @@ words! {
     }
 }
 
-/// A bound on [`FrameRate`]: numerator and denominator.
-#[derive(Clone, Copy)]
-struct Rate(u32, u32);
-
-impl Limit<FrameRate> for Within<Rate> {
-    fn allows(&self, rate: &FrameRate) -> bool {
-        let at_least =
-            |a: (u32, u32), b: (u32, u32)| u64::from(a.0) * u64::from(b.1) >= u64::from(b.0) * u64::from(a.1);
-        let rate = (rate.num(), rate.den());
-        at_least(rate, (self.0 .0, self.0 .1)) && at_least((self.1 .0, self.1 .1), rate)
-    }
-    fn describe(&self) -> String {
-        format!("{} to {}", self.0 .0, self.1 .0)
-    }
-}
-
 /// One of a few numbers.
 pub(super) struct OneOf(pub &'static [u32]);
 
@@ -288,49 +273,5 @@ impl Limit<u32> for OneOf {
     }
     fn describe(&self) -> String {
         self.0.iter().map(u32::to_string).collect::<Vec<_>>().join(" or ")
-    }
-}
-
-impl ConfigValue for FrameRate {
-    fn kind() -> String {
-        "a whole number or a fraction in quotes".into()
-    }
-
-    fn read(node: &Node, reader: &mut Reader, key: &str) -> Option<Self> {
-        let parsed = match &node.value {
-            Value::Integer(i) => u32::try_from(*i).ok().and_then(|n| FrameRate::new(n, 1)),
-            Value::String(s) => {
-                let (num, den) = s.split_once('/').unwrap_or((s, "1"));
-                match (num.trim().parse(), den.trim().parse()) {
-                    (Ok(num), Ok(den)) => FrameRate::new(num, den),
-                    _ => None,
-                }
-            }
-            Value::Float(_) => {
-                let problem = "is a number with a decimal point, which no clock can keep exactly";
-                let remedy = "write a fraction, for example \"60000/1001\" for 59.94";
-                reader.refuse(&node.origin, key, problem, remedy);
-                return None;
-            }
-            _ => None,
-        };
-        if parsed.is_none() {
-            let shown = match &node.value {
-                Value::String(s) => format!("{s:?}"),
-                Value::Integer(i) => i.to_string(),
-                other => other.kind().into(),
-            };
-            let remedy = "write 947 or a fraction of two whole numbers above 0 such as \"60000/1001\"";
-            reader.refuse(&node.origin, key, format!("is {shown}, must be {}", Self::kind()), remedy);
-        }
-        parsed
-    }
-
-    fn show(&self) -> String {
-        if self.den() == 1 {
-            format!("\"{}\"", self.num())
-        } else {
-            format!("\"{}/{}\"", self.num(), self.den())
-        }
     }
 }

@@ -1,8 +1,8 @@
 //! `[render]`, `[real_time]`, `[run]`, `[output]` and `[safety]`: how the picture is made and how the program behaves.
 
-use super::declare::{section, words};
-use super::read::{Any, NotEmpty, Within};
 use super::safety::{InterlockConfig, LimitsConfig};
+use dpm_common::keys::read::{Any, NotEmpty, Within};
+use dpm_common::{section, words};
 use dpm_device::planes::Raster;
 use std::path::PathBuf;
 

@@ -1,8 +1,8 @@
 //! `[safety.limits]` and `[safety.interlock]`: how much light there may be, and who else must agree that there is any.
 
-use super::declare::{kinds, section, words};
-use super::read::{Any, NotEmpty, Reader, Within};
 use super::{Origin, ProjectorBackend, RigConfig};
+use dpm_common::keys::read::{Any, NotEmpty, Reader, Within};
+use dpm_common::{kinds, section, words};
 use dpm_device::link::{LightLimits, MAX_LIMIT_MS, MIN_LIMIT_MS};
 use dpm_device::tty::ControlSignal;
 use std::path::{Path, PathBuf};

@@ -1,9 +1,9 @@
 //! `[tracker]`, `[observer]`, `[scene]` and `[prediction]`: what moves, who looks, and what is to be seen.
 
-use super::declare::{kinds, section, words};
-use super::read::{Any, ConfigValue, NotEmpty, Reader, Within};
-use super::source::Node;
 use crate::mock::{Motion, MotionSpec};
+use dpm_common::keys::read::{Any, ConfigValue, NotEmpty, Reader, Within};
+use dpm_common::keys::source::Node;
+use dpm_common::{kinds, section, words};
 use dpm_device::pose::Pose;
 use std::path::PathBuf;
 

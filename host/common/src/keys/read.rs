@@ -10,14 +10,15 @@ use std::path::PathBuf;
 
 /// Collects what is wrong and remembers where every key was written.
 #[derive(Debug, Default)]
-pub(super) struct Reader {
+pub struct Reader {
+    /// What is wrong so far.
     pub errors: Vec<ConfigError>,
     written: BTreeMap<String, Origin>,
 }
 
 impl Reader {
     /// Adds an error about `key`, written at `origin`.
-    pub(super) fn refuse(
+    pub fn refuse(
         &mut self,
         origin: &Origin,
         key: &str,
@@ -33,7 +34,7 @@ impl Reader {
     }
 
     /// Where `key` was written: itself, else the innermost table around it, else [`Origin::Default`].
-    pub(crate) fn origin_of(&self, key: &str) -> Origin {
+    pub fn origin_of(&self, key: &str) -> Origin {
         let mut key = key;
         loop {
             if let Some(origin) = self.written.get(key) {
@@ -47,17 +48,17 @@ impl Reader {
     }
 
     /// True when somebody wrote `key` itself.
-    pub(crate) fn is_written(&self, key: &str) -> bool {
+    pub fn is_written(&self, key: &str) -> bool {
         self.written.contains_key(key)
     }
 
     /// Marks `key` as written at `origin`.
-    pub(super) fn mark(&mut self, key: &str, origin: &Origin) {
+    pub fn mark(&mut self, key: &str, origin: &Origin) {
         self.written.insert(key.to_string(), origin.clone());
     }
 
     /// The entries of a table, or an error and `None`.
-    pub(super) fn table<'n>(&mut self, node: &'n Node, key: &str) -> Option<&'n BTreeMap<String, Entry>> {
+    pub fn table<'n>(&mut self, node: &'n Node, key: &str) -> Option<&'n BTreeMap<String, Entry>> {
         match &node.value {
             Value::Table(table) => Some(table),
             other => {
@@ -68,7 +69,7 @@ impl Reader {
     }
 
     /// Refuses every key of `table` that is not in `known`, naming the nearest one that is.
-    pub(crate) fn unknown_keys(&mut self, table: &BTreeMap<String, Entry>, section: &str, known: &[&str]) {
+    pub fn unknown_keys(&mut self, table: &BTreeMap<String, Entry>, section: &str, known: &[&str]) {
         for (name, entry) in table {
             if known.contains(&name.as_str()) {
                 continue;
@@ -83,7 +84,7 @@ impl Reader {
 }
 
 /// `section.key`, or `key` at the top.
-pub(super) fn join(section: &str, key: &str) -> String {
+pub fn join(section: &str, key: &str) -> String {
     if section.is_empty() {
         key.to_string()
     } else {
@@ -131,7 +132,7 @@ pub struct KeyDoc {
 }
 
 /// A type that a key can have.
-pub(super) trait ConfigValue: Sized {
+pub trait ConfigValue: Sized {
     /// The type in words.
     fn kind() -> String;
     /// Reads a value; on failure leaves errors and returns `None`.
@@ -143,7 +144,7 @@ pub(super) trait ConfigValue: Sized {
 }
 
 /// What values a key allows beyond its type.
-pub(super) trait Limit<T> {
+pub trait Limit<T> {
     /// True when allowed.
     fn allows(&self, value: &T) -> bool;
     /// The allowed values in words.
@@ -151,7 +152,7 @@ pub(super) trait Limit<T> {
 }
 
 /// Every value of the type.
-pub(super) struct Any;
+pub struct Any;
 
 impl<T> Limit<T> for Any {
     fn allows(&self, _: &T) -> bool {
@@ -163,7 +164,7 @@ impl<T> Limit<T> for Any {
 }
 
 /// A closed interval; arrays and optional values are held to it element by element.
-pub(super) struct Within<T>(pub T, pub T);
+pub struct Within<T>(pub T, pub T);
 
 impl<T: PartialOrd + Display> Limit<T> for Within<T> {
     fn allows(&self, value: &T) -> bool {
@@ -202,7 +203,7 @@ impl<T: PartialOrd + Display, const N: usize> Limit<Option<[T; N]>> for Within<T
 }
 
 /// A string, path or list with something in it.
-pub(super) struct NotEmpty;
+pub struct NotEmpty;
 
 impl Limit<String> for NotEmpty {
     fn allows(&self, value: &String) -> bool {

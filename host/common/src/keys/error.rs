@@ -72,7 +72,7 @@ pub struct ConfigErrors(pub Vec<ConfigError>);
 
 impl ConfigErrors {
     /// The one error that a file which cannot be read gives.
-    pub(super) fn unreadable(path: &Path, problem: String, remedy: &str) -> Self {
+    pub fn unreadable(path: &Path, problem: String, remedy: &str) -> Self {
         Self(vec![ConfigError {
             origin: Origin::File { file: path.display().to_string().into(), line: 0, column: 0 },
             key: String::new(),
@@ -95,9 +95,3 @@ impl fmt::Display for ConfigErrors {
 }
 
 impl std::error::Error for ConfigErrors {}
-
-impl From<ConfigErrors> for crate::failure::Failure {
-    fn from(errors: ConfigErrors) -> Self {
-        Self::new(crate::failure::FailureKind::BadInput, errors)
-    }
-}

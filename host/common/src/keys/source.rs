@@ -6,23 +6,31 @@ use std::sync::Arc;
 use toml::de::{DeTable, DeValue};
 
 /// Prefix of environment variables that set a key: `DPM_SET_PROJECTOR__WIDTH=640` sets `projector.width`.
-pub(crate) const VARIABLE_PREFIX: &str = "DPM_SET_";
+pub const VARIABLE_PREFIX: &str = "DPM_SET_";
 
 /// A value and where it was written.
 #[derive(Clone, Debug)]
-pub(super) struct Node {
+pub struct Node {
+    /// The value.
     pub value: Value,
+    /// Where it was written.
     pub origin: Origin,
 }
 
 /// What TOML can say, as far as a rig file needs it.
 #[derive(Clone, Debug)]
-pub(super) enum Value {
+pub enum Value {
+    /// `true` or `false`.
     Bool(bool),
+    /// A whole number.
     Integer(i64),
+    /// A number with a decimal point.
     Float(f64),
+    /// Text in quotes.
     String(String),
+    /// Values in square brackets.
     Array(Vec<Node>),
+    /// Keys with values.
     Table(BTreeMap<String, Entry>),
     /// Dates and integers beyond 64 bits: no key takes them.
     Other(&'static str),
@@ -30,14 +38,16 @@ pub(super) enum Value {
 
 /// A key's value and where the key itself stands.
 #[derive(Clone, Debug)]
-pub(super) struct Entry {
+pub struct Entry {
+    /// Where the key was written.
     pub key_origin: Origin,
+    /// Its value.
     pub node: Node,
 }
 
 impl Value {
     /// The kind, as messages name it.
-    pub(super) fn kind(&self) -> &'static str {
+    pub fn kind(&self) -> &'static str {
         match self {
             Self::Bool(_) => "a boolean",
             Self::Integer(_) => "an integer",
@@ -72,7 +82,7 @@ impl<'a> Lines<'a> {
 }
 
 /// Parses TOML; every syntax error becomes one entry of `errors`, and what could be read is returned all the same.
-pub(super) fn parse(file: &str, text: &str, errors: &mut Vec<ConfigError>) -> Node {
+pub fn parse(file: &str, text: &str, errors: &mut Vec<ConfigError>) -> Node {
     let lines = Lines::new(file, text);
     let (table, problems) = DeTable::parse_recoverable(text);
     for problem in problems {
@@ -116,13 +126,7 @@ fn value_of(value: &DeValue<'_>, lines: &Lines<'_>) -> Value {
 
 /// Sets one key of the tree. `path` holds the parts of the dotted key; a part that is a number steps into an array.
 /// A text that is no TOML value is taken as a string, so that `render.method=paper` needs no quotes.
-pub(super) fn set(
-    root: &mut Node,
-    path: &[String],
-    text: &str,
-    origin: &Origin,
-    errors: &mut Vec<ConfigError>,
-) {
+pub fn set(root: &mut Node, path: &[String], text: &str, origin: &Origin, errors: &mut Vec<ConfigError>) {
     let mut refuse = |problem: String, remedy: &str| {
         errors.push(ConfigError {
             origin: origin.clone(),
@@ -198,14 +202,14 @@ fn stamp(node: &mut Node, origin: &Origin) {
 
 /// The dotted key that an environment variable sets; `None` when it is not one of ours.
 /// Two underscores part the levels, because keys contain single ones.
-pub(super) fn variable_path(name: &str) -> Option<Vec<String>> {
+pub fn variable_path(name: &str) -> Option<Vec<String>> {
     let rest = name.strip_prefix(VARIABLE_PREFIX)?;
     Some(rest.split("__").map(str::to_lowercase).collect())
 }
 
 impl Node {
     /// The same value in the `toml` crate's own type; `None` for what no key takes.
-    pub(crate) fn to_toml(&self) -> Option<toml::Value> {
+    pub fn to_toml(&self) -> Option<toml::Value> {
         Some(match &self.value {
             Value::Bool(b) => toml::Value::Boolean(*b),
             Value::Integer(i) => toml::Value::Integer(*i),

@@ -3,6 +3,7 @@
 /// Declares a section of the rig file: a struct with defaults, its reader and its part of the manual.
 ///
 /// `name: type = default, "unit", limit;` with doc comments that say what the key does and when to change it.
+#[macro_export]
 macro_rules! section {
     (
         $(#[doc = $section_doc:literal])*
@@ -31,13 +32,13 @@ macro_rules! section {
             pub(crate) const KEYS: &'static [&'static str] = &[$( stringify!($name) ),*];
 
             /// Reads the keys that are present over the defaults, ignoring `kind` and keys that are not its own.
-            pub(in crate::config) fn read_keys(
-                table: &std::collections::BTreeMap<String, $crate::config::source::Entry>,
-                reader: &mut $crate::config::read::Reader,
+            pub(crate) fn read_keys(
+                table: &std::collections::BTreeMap<String, $crate::keys::source::Entry>,
+                reader: &mut $crate::keys::read::Reader,
                 section: &str,
             ) -> Self {
                 #[allow(unused_imports)]
-                use $crate::config::read::{join, ConfigValue, Limit};
+                use $crate::keys::read::{join, ConfigValue, Limit};
                 #[allow(unused_mut)]
                 let mut out = Self::default();
                 let _ = (table, &reader, section);
@@ -65,9 +66,9 @@ macro_rules! section {
             }
 
             /// The section's keys for the manual.
-            pub(in crate::config) fn document(section: &str, out: &mut Vec<$crate::config::read::KeyDoc>) {
+            pub(crate) fn document(section: &str, out: &mut Vec<$crate::keys::read::KeyDoc>) {
                 #[allow(unused_imports)]
-                use $crate::config::read::{join, ConfigValue, KeyDoc, Limit};
+                use $crate::keys::read::{join, ConfigValue, KeyDoc, Limit};
                 let default = Self::default();
                 let _ = (&default, section, &out);
                 $(
@@ -89,13 +90,13 @@ macro_rules! section {
             }
         }
 
-        impl $crate::config::read::ConfigValue for $section {
+        impl $crate::keys::read::ConfigValue for $section {
             fn kind() -> String {
                 "a table".into()
             }
             fn read(
-                node: &$crate::config::source::Node,
-                reader: &mut $crate::config::read::Reader,
+                node: &$crate::keys::source::Node,
+                reader: &mut $crate::keys::read::Reader,
                 key: &str,
             ) -> Option<Self> {
                 let table = reader.table(node, key)?;
@@ -105,7 +106,7 @@ macro_rules! section {
             fn show(&self) -> String {
                 "{}".into()
             }
-            fn docs(key: &str, out: &mut Vec<$crate::config::read::KeyDoc>) {
+            fn docs(key: &str, out: &mut Vec<$crate::keys::read::KeyDoc>) {
                 Self::document(key, out);
             }
         }
@@ -113,6 +114,7 @@ macro_rules! section {
 }
 
 /// Declares a choice between words: `Variant = "word"`.
+#[macro_export]
 macro_rules! words {
     (
         $(#[doc = $enum_doc:literal])*
@@ -129,18 +131,18 @@ macro_rules! words {
             }
         }
 
-        impl $crate::config::read::ConfigValue for $name {
+        impl $crate::keys::read::ConfigValue for $name {
             fn kind() -> String {
                 [$( concat!("\"", $word, "\"") ),+].join(" | ")
             }
             fn read(
-                node: &$crate::config::source::Node,
-                reader: &mut $crate::config::read::Reader,
+                node: &$crate::keys::source::Node,
+                reader: &mut $crate::keys::read::Reader,
                 key: &str,
             ) -> Option<Self> {
                 match &node.value {
-                    $( $crate::config::source::Value::String(s) if s == $word => Some(Self::$variant), )+
-                    $crate::config::source::Value::String(s) => {
+                    $( $crate::keys::source::Value::String(s) if s == $word => Some(Self::$variant), )+
+                    $crate::keys::source::Value::String(s) => {
                         let problem = format!("is {s:?}, must be one of {}", Self::kind());
                         reader.refuse(&node.origin, key, problem, "");
                         None
@@ -160,6 +162,7 @@ macro_rules! words {
 }
 
 /// Declares a table whose key `kind` decides which other keys it takes: `Variant(Section) = "kind"`.
+#[macro_export]
 macro_rules! kinds {
     (
         $(#[doc = $enum_doc:literal])*
@@ -183,17 +186,17 @@ macro_rules! kinds {
             }
         }
 
-        impl $crate::config::read::ConfigValue for $name {
+        impl $crate::keys::read::ConfigValue for $name {
             fn kind() -> String {
                 "a table".into()
             }
             fn read(
-                node: &$crate::config::source::Node,
-                reader: &mut $crate::config::read::Reader,
+                node: &$crate::keys::source::Node,
+                reader: &mut $crate::keys::read::Reader,
                 key: &str,
             ) -> Option<Self> {
-                use $crate::config::read::join;
-                use $crate::config::source::Value;
+                use $crate::keys::read::join;
+                use $crate::keys::source::Value;
                 let table = reader.table(node, key)?;
                 let words: &[&str] = &[$( $word ),+];
                 let default = Self::default();
@@ -249,8 +252,8 @@ macro_rules! kinds {
             fn show(&self) -> String {
                 format!("{{ kind = {:?} }}", self.word())
             }
-            fn docs(key: &str, out: &mut Vec<$crate::config::read::KeyDoc>) {
-                use $crate::config::read::{join, KeyDoc};
+            fn docs(key: &str, out: &mut Vec<$crate::keys::read::KeyDoc>) {
+                use $crate::keys::read::{join, KeyDoc};
                 out.push(KeyDoc {
                     key: join(key, "kind"),
                     kind: [$( concat!("\"", $word, "\"") ),+].join(" | "),
@@ -264,5 +267,3 @@ macro_rules! kinds {
         }
     };
 }
-
-pub(super) use {kinds, section, words};
