@@ -202,8 +202,8 @@ pub(crate) fn run_dlpc900(config: &RigConfig, monitor: &RunMonitor) -> Result<Dl
         return Err(Failure::new(FailureKind::BadInput, told));
     }
     let mut warnings =
-        vec!["a DLPC900 has no watchdog: if this machine fails, or this program and the one that looks after it are killed, it goes on \
-              showing; `dpm dlpc900 idle` ends it".into()];
+        vec!["a DLPC900 has no watchdog: if this machine fails, or this program and its guard process are both killed, it continues \
+              to show its patterns; `dpm dlpc900 idle` ends that".into()];
     let (show, frames_loaded) = match backend.mode {
         Dlpc900Mode::Preloaded => {
             let (sequence, frames) = load(config, backend, dmd, &mut warnings, monitor)?;
@@ -240,12 +240,13 @@ fn load(
     let frames = if matches!(config.tracker, TrackerConfig::Mock(_)) {
         let wanted = if config.run.frames == 0 { most as u64 } else { config.run.frames };
         if wanted > most as u64 {
-            warnings.push(format!("the {} holds {most} frames; they are shown over and over", dmd.name()));
+            warnings.push(format!("the {} holds {most} frames; they are shown repeatedly", dmd.name()));
         }
         wanted.min(most as u64)
     } else {
         warnings.push(
-            "nothing that the tracker says reaches preloaded frames: one is shown, all bodies at rest".into(),
+            "the tracker has no effect on preloaded frames: a single frame with all bodies at rest is shown"
+                .into(),
         );
         1
     };

@@ -132,7 +132,7 @@ fn a_stage_that_hangs_is_replaced_and_does_nothing_when_it_wakes_up() {
         let back = hung.elapsed();
         // The making of pipelines takes what it takes on this machine; it must not be a matter of minutes.
         assert!(back < Duration::from_secs(60), "{name}: {back:?}");
-        run.wait_for_line(LONG, |line| line.contains("made anew"));
+        run.wait_for_line(LONG, |line| line.contains("are restarted"));
         drop(stopped);
         let before = far.status();
         far.until(LONG, "light goes on", &mut |s| s.frames_lit >= before.frames_lit + 20);

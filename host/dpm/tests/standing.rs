@@ -309,7 +309,7 @@ fn r8_another_users_word_is_not_taken_for_a_rigs() {
     let _ = child.wait();
     assert_eq!(code(&told), 3, "{}{}", out(&told), err(&told));
     assert!(
-        out(&told).contains("process 4242 of nobody") && out(&told).contains("nobody vouches"),
+        out(&told).contains("process 4242 of nobody") && out(&told).contains("says (unverified)"),
         "{}",
         out(&told)
     );

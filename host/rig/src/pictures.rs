@@ -65,14 +65,17 @@ pub fn pictures(
 ) -> Result<Pictures, GpuError> {
     let window = window(rig, light, records);
     if window.frames.is_empty() {
-        let why = "neither the tracker nor the frames tell where the bodies were";
+        let why = "the poses of the bodies are not known";
         return Ok(Pictures { light: mean(light), viewer: Err(why) });
     }
     let now = &window.frames[window.frames.len() - 1].1;
     let (eye, _) = rig.observer.eye_and_gaze(now);
     let light = integrate(rig, renderer, &rig.camera, eye, now, &window, |_, drive| drive)?;
     let Some(viewer_camera) = viewer_camera(rig, eye, now) else {
-        return Ok(Pictures { light, viewer: Err("the bodies are nowhere that an eye could look at") });
+        return Ok(Pictures {
+            light,
+            viewer: Err("a camera at the observer's eye cannot be aimed at the bodies"),
+        });
     };
     let projector = rig.camera.position();
     let max_intensity = rig.config.projector.max_intensity;

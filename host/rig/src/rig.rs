@@ -272,7 +272,7 @@ fn camera(
     let stored = opencv::read(&text, calibrated, unit).map_err(|e| wrong(e.to_string()))?;
     if stored.distortion != Distortion::default() {
         warnings.push(format!(
-            "projector.calibration: {}: its lens distortion is not compensated; light is off by as much as the lens bends",
+            "projector.calibration: {}: its lens distortion is not compensated and displaces the light",
             path.display()
         ));
     }

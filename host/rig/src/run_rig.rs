@@ -36,7 +36,7 @@ pub fn run_rig(config: &RigConfig, monitor: &Arc<RunMonitor>) -> Result<Ended<Re
     let has_light = matches!(config.projector.backend, ProjectorBackend::Mock(_));
     if output.images && !has_light {
         notes.push(
-            "output.images: the light of a projector outside is not seen, no pictures are written".into(),
+            "output.images: no pictures are written, because the light of a real projector cannot be observed".into(),
         );
     }
     if config.projector.planes == 8 {

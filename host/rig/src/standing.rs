@@ -195,7 +195,8 @@ impl OrderFile {
     /// part of the result says why a folder cannot be used; the file then keeps nothing.
     pub fn open(path: Option<PathBuf>, identity: Identity) -> (Self, Option<FolderError>, Option<Stands>) {
         let Some(path) = path else {
-            let source = io::Error::new(io::ErrorKind::NotFound, "this user has no home; set DPM_STATE_DIR");
+            let source =
+                io::Error::new(io::ErrorKind::NotFound, "this user has no home directory; set DPM_STATE_DIR");
             let error = FolderError::Io { path: "(no state folder)".into(), source };
             return (Self { identity, folder: None, path: PathBuf::new() }, Some(error), None);
         };
@@ -264,7 +265,7 @@ impl OrderFile {
 pub fn standing_in(path: &std::path::Path, identity: &Identity) -> Option<Stands> {
     let safe = |told: String| Some(Stands { order: Order::Safe, told });
     let unreadable =
-        |e: FolderError| safe(format!("counts as SAFE, for the state folder cannot be read: {e}"));
+        |e: FolderError| safe(format!("counts as SAFE, because the state folder cannot be read: {e}"));
     let folder = match Folder::open(path, Owner::OwnOrAnyForRoot) {
         Ok(folder) => folder,
         Err(e) if e.is_missing() => return None,
@@ -285,7 +286,7 @@ fn read(folder: &Folder, name: &str) -> Stands {
             return Err(format!("version {} is not known", content.version));
         }
         match Order::from_word(&content.order) {
-            Some(Order::Arm) | None => Err(format!("damaged: {:?} is no order that stands", content.order)),
+            Some(Order::Arm) | None => Err(format!("damaged: {:?} is not a standing order", content.order)),
             Some(order) => Ok((order, content)),
         }
     });
@@ -305,7 +306,7 @@ fn read(folder: &Folder, name: &str) -> Stands {
         Err(reason) => Stands {
             order: Order::Safe,
             told: format!(
-                "counts as SAFE, for {} cannot be read: {reason}",
+                "counts as SAFE, because {} cannot be read: {reason}",
                 folder.path().join(name).display()
             ),
         },

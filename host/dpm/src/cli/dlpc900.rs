@@ -239,8 +239,10 @@ pub(super) fn execute(args: &Dlpc900Args) -> Result<(), Failure> {
 /// Wakes a resting controller before it shows something. The mirrors need 3 s to leave the exercise.
 fn make_ready(d: &mut Dlpc900<UsbHid>) -> Result<(), Failure> {
     if d.make_ready()? {
-        let _ =
-            writeln!(std::io::stderr(), "the controller rested (exercise, park or standby); that is ended");
+        let _ = writeln!(
+            std::io::stderr(),
+            "the controller was at rest (exercise, park or standby) and is woken"
+        );
     }
     Ok(())
 }
@@ -265,7 +267,12 @@ fn guard(place: Option<UsbPlace>) -> Result<(), Failure> {
             Ok(d) => break d?,
             // The kernel releases the dead process's interface in its own time.
             Err(_) if std::time::Instant::now() < limit => std::thread::sleep(GUARD_STEP),
-            Err(e) => return Err(device(format!("{}: {e}; it goes on showing", describe(place)))),
+            Err(e) => {
+                return Err(device(format!(
+                    "{}: {e}; it could not be stopped and continues to show its patterns",
+                    describe(place)
+                )))
+            }
         }
     };
     d.stop()?;
@@ -293,8 +300,10 @@ impl Guard {
         match start() {
             Ok(child) => Self(Some(child)),
             Err(e) => {
-                let _ =
-                    writeln!(std::io::stderr(), "nothing looks after the DLPC900 if this run is killed: {e}");
+                let _ = writeln!(
+                    std::io::stderr(),
+                    "cannot start the process that stops the DLPC900 if this run is killed: {e}"
+                );
                 Self(None)
             }
         }

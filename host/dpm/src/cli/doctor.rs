@@ -121,7 +121,7 @@ fn vulkan(findings: &mut Vec<Finding>) -> bool {
     if devices.is_empty() {
         let remedy =
             "install the GPU vendor's driver, or software Vulkan: apt-get install mesa-vulkan-drivers";
-        findings.push(Finding::new("Vulkan", State::Missing, "a loader but no device", remedy));
+        findings.push(Finding::new("Vulkan", State::Missing, "found a Vulkan loader but no device", remedy));
     }
     usable
 }
@@ -161,8 +161,10 @@ fn right(name: &str, granted: &str, tried: Result<(), Refusal>) -> Finding {
 fn briefly(ask: fn() -> Result<(), Refusal>) -> Result<(), Refusal> {
     let refused = |reason: String| Err(Refusal { what: "a right".into(), reason, remedy: String::new() });
     match std::thread::Builder::new().spawn(ask) {
-        Ok(thread) => thread.join().unwrap_or_else(|_| refused("the thread that asked panicked".to_string())),
-        Err(e) => refused(format!("no thread to ask it: {e}")),
+        Ok(thread) => {
+            thread.join().unwrap_or_else(|_| refused("the thread that tested it panicked".to_string()))
+        }
+        Err(e) => refused(format!("cannot start a thread to test it: {e}")),
     }
 }
 
@@ -201,7 +203,7 @@ impl System {
             Finding::new(
                 name,
                 State::Warning,
-                format!("a thread that spins at real-time priority stands still {gap_ms:.0} ms in every {:.0} ms", period as f64 / 1e3),
+                format!("the kernel stops a spinning real-time thread for {gap_ms:.0} ms in every {:.0} ms", period as f64 / 1e3),
                 "on a machine for the rig alone: sysctl kernel.sched_rt_runtime_us=-1; else real_time.wait = \"park\"",
             )
         })

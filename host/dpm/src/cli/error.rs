@@ -80,7 +80,7 @@ fn budget(text: &str) -> Result<f64, String> {
     };
     value
         .filter(|v| (1.0 / 64.0..=4096.0).contains(v))
-        .ok_or_else(|| "write samples a pixel from 1/64 to 4096, for example 18 or 1/4".to_owned())
+        .ok_or_else(|| "write samples per pixel from 1/64 to 4096, for example 18 or 1/4".to_owned())
 }
 
 /// Subcommands of `dpm error`.

@@ -187,7 +187,7 @@ fn one_experiment<T: Kept>(out: &Path, sorted: &[T]) -> Result<(), Failure> {
         }
         if pair[0].name() == pair[1].name() {
             return told(
-                "are one group, measured twice (another device, commit or --ablation)",
+                "are the same group, measured twice (another device, commit or --ablation)",
                 &pair[0],
                 &pair[1],
             );

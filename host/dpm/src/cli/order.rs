@@ -26,7 +26,7 @@ pub(super) fn execute(args: &OrderArgs, order: Order) -> Result<(), Failure> {
     if order.is_dark() && args.pid.is_none() && !told.closed.is_empty() {
         let folders: Vec<_> = told.closed.iter().map(|f| f.display().to_string()).collect();
         text += &format!(
-            "not looked into, for they are other users': {}; root reaches all\n",
+            "not searched, because they belong to other users: {}; root can reach all\n",
             folders.join(", ")
         );
     }
@@ -44,7 +44,7 @@ pub(super) fn execute(args: &OrderArgs, order: Order) -> Result<(), Failure> {
 fn line(answer: &Answer) -> String {
     let Answer { pid, uid, rig, text, is_vouched_for, .. } = answer;
     let rig = if rig.is_empty() { "rig not told" } else { rig };
-    let says = if *is_vouched_for { "" } else { "says (nobody vouches for it): " };
+    let says = if *is_vouched_for { "" } else { "says (unverified): " };
     // The answer of another user's process could contain control characters.
     let line = format!("process {pid} of {}, {rig}: {says}{text}", user_name(*uid));
     line.chars().filter(|c| !c.is_control()).chain(['\n']).collect()

@@ -26,7 +26,7 @@ pub(crate) struct PlanArgs {
 
 fn saved(s: &Saving) -> String {
     let [low, high] = s.saved_middle_half_ms;
-    let told = if s.stands_out() { "" } else { ", not told from chance" };
+    let told = if s.stands_out() { "" } else { ", may be chance" };
     let cost = format!(
         "the part takes {:+.2} ms (middle half of the frames {low:+.2} to {high:+.2}{told})",
         s.saved_ms

@@ -106,7 +106,7 @@ pub(super) fn execute(args: &ProfileArgs) -> Result<(), Failure> {
     print(&if args.json { profile.to_json() + "\n" } else { profile.to_table() });
     if profile.frames_torn.unwrap_or(0) + profile.frames_reordered > 0 {
         let told = format!(
-            "{} lit frames held parts of another and {} came out of order",
+            "{} lit frames contained parts of another frame and {} came out of order",
             profile.frames_torn.unwrap_or(0),
             profile.frames_reordered
         );

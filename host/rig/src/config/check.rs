@@ -111,7 +111,7 @@ fn projector(rig: &RigConfig, reader: &mut Reader) {
         refuse(
             reader,
             &["projector.calibration"],
-            "the unit of its lengths is not told by the file".into(),
+            "the file does not state the unit of its lengths".into(),
             "set projector.calibration_unit to \"metre\" or \"millimetre\"".into(),
         );
     }
@@ -219,7 +219,10 @@ fn bodies(rig: &RigConfig, reader: &mut Reader) {
             refuse(
                 reader,
                 &[&format!("{key}.motion")],
-                format!("is given, with `tracker.kind` = {:?}, which tells the poses", rig.tracker.word()),
+                format!(
+                    "is given, with `tracker.kind` = {:?}, which reports the poses itself",
+                    rig.tracker.word()
+                ),
                 "remove it, set tracker.kind = \"mock\", or try the rig with --simulate".into(),
             );
         }
@@ -311,7 +314,7 @@ fn time(rig: &RigConfig, purpose: Purpose, reader: &mut Reader) {
     let mut cores = rig.real_time.affinity.clone();
     cores.sort_unstable();
     if let Some(&last) = cores.last().filter(|&&c| c >= 1024) {
-        let problem = format!("core {last} is none of 0 to 1023");
+        let problem = format!("core {last} is outside 0 to 1023");
         refuse(reader, &["real_time.affinity"], problem, String::new());
     }
     horizon(rig, reader);

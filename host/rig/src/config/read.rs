@@ -402,7 +402,7 @@ impl<T: ConfigValue> ConfigValue for Vec<T> {
     fn read(node: &Node, reader: &mut Reader, key: &str) -> Option<Self> {
         let Value::Array(items) = &node.value else { return wrong_kind(node, reader, key) };
         if items.len() > 1024 {
-            let problem = format!("has {} elements, may have 1024", items.len());
+            let problem = format!("has {} elements, must have at most 1024", items.len());
             reader.refuse(&node.origin, key, problem, "");
             return None;
         }

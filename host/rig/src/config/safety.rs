@@ -132,7 +132,7 @@ pub(super) fn check(rig: &RigConfig, reader: &mut Reader) {
     }
     if limits.full_white_s > 0.0 && limits.full_white_s < SHORTEST_S {
         let remedy = "at least 0.5 s, or 0 to switch it off";
-        refuse("safety.limits.full_white_s", "is too short to be told from a flash", remedy);
+        refuse("safety.limits.full_white_s", "is too short to be distinguished from a flash", remedy);
     }
     if !limits.limits().is_off() && matches!(rig.projector.backend, ProjectorBackend::Dlpc900(_)) {
         let key =

@@ -152,7 +152,7 @@ pub(super) fn set(
                     Some(i) => &mut items[i],
                     None => {
                         return refuse(
-                            format!("`{here}` has {len} elements; `{part}` is none of them"),
+                            format!("`{here}` has {len} elements, and `{part}` is not the index of one"),
                             "count from 0",
                         )
                     }

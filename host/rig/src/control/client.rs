@@ -77,13 +77,16 @@ fn list(folders: &[PathBuf]) -> String {
 }
 
 fn advice(order: Order) -> String {
-    let nothing = "; `dpm run` prints where its control socket is, DPM_RUNTIME_DIR names another folder";
+    let nothing =
+        "; `dpm run` prints the path of its control socket, and DPM_RUNTIME_DIR selects another folder";
     match order {
         Order::Arm => {
             let state = state_folder().map_or(String::new(), |f| format!(" in {}", f.display()));
             format!("; nothing was armed, and an order that stands{state} still stands: only a running rig can be armed{nothing}")
         }
-        _ => format!("; no light was darkened, and a rig that starts now is not held back{nothing}"),
+        _ => format!(
+            "; no light was darkened, and the order does not apply to a rig that starts later{nothing}"
+        ),
     }
 }
 
@@ -286,7 +289,7 @@ fn by_hand(order: Order, pid: u32) -> String {
         Order::Safe => format!(
             "look at the light, then `kill -USR2 {pid}`, `kill -KILL {pid}` or the projector's own switch"
         ),
-        Order::Freeze | Order::Arm => "look at the light and say it again".into(),
+        Order::Freeze | Order::Arm => "look at the light and give the order again".into(),
     }
 }
 
@@ -374,8 +377,8 @@ fn ask(place: &Place, order: Order) -> Option<Answer> {
             let said = StatusFile::read(&place.folder, place.pid).ok();
             if let Some(said) = said.filter(|s| s.at_ns > begin_ns && is_obeyed(order, s.health)) {
                 let how = match signalled {
-                    Some(_) => "by a signal, for its control thread does not answer",
-                    None => "as its state file says",
+                    Some(_) => "by a signal, because its control thread does not answer",
+                    None => "according to its state file",
                 };
                 let kept = said.standing.filter(|standing| standing.strength() >= order.strength());
                 if let (Some(kept), true) = (kept, order.is_dark()) {

@@ -220,7 +220,7 @@ fn answer_to(
     let is_done = is_obeyed(order, health);
     let kept = orders.outcome(ticket);
     if let (Order::Arm, Some(Kept::Not(why))) = (order, &kept) {
-        return Some(format!("not armed: what stands cannot be forgotten: {why}; projector {health}"));
+        return Some(format!("not armed: the standing order cannot be removed: {why}; projector {health}"));
     }
     let hope = if is_done { kept.is_none() && ago < KEPT_WITHIN } else { ago < OBEYED_WITHIN };
     if hope {
@@ -274,7 +274,7 @@ impl Client {
         let word = std::str::from_utf8(&self.word).ok().and_then(|w| Order::from_word(w.trim_end()));
         if word.is_none() {
             let known: Vec<_> = Order::ALL.iter().map(|(_, word)| *word).collect();
-            let _ = writeln!(self.stream, "unknown word; known: {}", known.join(", "));
+            let _ = writeln!(self.stream, "unknown order; known: {}", known.join(", "));
             return Err(io::ErrorKind::InvalidData.into());
         }
         Ok(word)

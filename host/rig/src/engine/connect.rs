@@ -20,8 +20,8 @@ pub enum ConnectError {
     Link(#[from] LinkError),
     /// The device does not answer.
     #[error(
-        "{device}: no projector got beyond {state:?} within {0} s; is it switched on, and the one that is meant (port, baud)? Check the \
-         cable, and switch it off and on",
+        "{device}: the projector did not come up within {0} s (state {state:?}); check that it is switched on, that it is the intended \
+         one (port, baud), and the cable, then switch it off and on",
         LIMIT_NS / 1_000_000_000
     )]
     Silent {

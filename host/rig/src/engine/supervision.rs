@@ -184,7 +184,10 @@ impl Supervision {
             facts.fail(PipelineError::KeepsFailing { last: trouble.into_error().to_string() });
             return Verdict::Abandon { hangs, remake: None };
         }
-        facts.monitor.note(format!("{}; the stages are made anew, dark meanwhile", trouble.in_words()));
+        facts.monitor.note(format!(
+            "{}; the stages are restarted, and the projector is dark meanwhile",
+            trouble.in_words()
+        ));
         self.made_by = now.plus_ns(MADE_WITHIN_NS);
         Verdict::Abandon { hangs, remake: Some(remake) }
     }
@@ -214,12 +217,12 @@ impl Supervision {
         self.facts.monitor.note(if is_slow {
             let every = stride as f64 / 1e3;
             format!(
-                "the renderer is slower than its slots: every {every:.1}th slot gets a frame, {:.1} of {hz:.1} a second; \
+                "the renderer is slower than its slots: one frame per {every:.1} slots, {:.1} of {hz:.1} per second; \
                  a smaller raster, fewer samples (render.spp) or another method make it faster",
                 hz / every
             )
         } else {
-            format!("the renderer keeps up: every slot of {hz:.1} a second gets a frame")
+            format!("the renderer keeps up: each of {hz:.1} slots per second gets a frame")
         });
     }
 }

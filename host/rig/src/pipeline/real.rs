@@ -156,8 +156,8 @@ fn tell_horizon(facts: &Facts) {
     if facts.rig.config.safety.predict_ms.is_none() {
         let ms = facts.predict_ns.load(Ordering::Relaxed) as f64 / 1e6;
         facts.monitor.note(format!(
-            "safety.predict_ms is left out: a body is carried on by prediction for {ms:.0} ms and the tracker's latency, which follows what \
-             frames need"
+            "safety.predict_ms is not set: prediction may extend a body's track for {ms:.0} ms plus the tracker's latency; the value follows \
+             the time that frames need"
         ));
     }
 }

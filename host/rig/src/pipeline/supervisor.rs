@@ -124,7 +124,7 @@ impl Supervisor {
             Ok((crew, port)) => {
                 // There is room: the link takes ports within a millisecond, and crews are seconds apart.
                 let _ = self.ports.push(port);
-                self.shared.facts.monitor.note("new stages are at work; the picture is back".into());
+                self.shared.facts.monitor.note("the stages are running again; the picture is back".into());
                 Shift::Works(crew)
             }
             Err(error) => {

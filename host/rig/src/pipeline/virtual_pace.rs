@@ -59,7 +59,7 @@ pub(super) fn run_at_virtual_pace(
     let mut now = HostTime(LISTEN_NS);
     let (lights_in, lights) = channel(LIGHTS, WaitPolicy::Park);
     let ProjectorBackend::Mock(mock) = &rig.config.projector.backend else {
-        let told = "real_time.pace = \"virtual\" takes the mock projector only";
+        let told = "real_time.pace = \"virtual\" works only with the mock projector";
         return Err(RigError::Unsupported(told.into()).into());
     };
     let (mock, recorder) = mock_projector(rig, mock, lights_in, options, gpu.is_none(), now)?;

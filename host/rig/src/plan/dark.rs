@@ -30,10 +30,10 @@ impl DarkCause {
     pub(crate) const fn told(self) -> &'static str {
         match self {
             Self::NeverSeen => "the tracker has never seen it",
-            Self::Silent => "the tracker has not told of it for longer than safety.predict_ms",
+            Self::Silent => "the tracker has not reported it for longer than safety.predict_ms",
             Self::BeyondHorizon => {
-                "the light falls later after its newest sample than safety.predict_ms allows (raise safety.predict_ms, or make \
-                 the way from the tracker to the light shorter)"
+                "the light falls later after its newest sample than safety.predict_ms allows (raise safety.predict_ms, or \
+                 reduce the latency from the tracker to the light)"
             }
         }
     }

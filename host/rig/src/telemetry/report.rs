@@ -316,7 +316,7 @@ impl Report {
             }
         }
         for (reason, slots) in self.ordered_dark.iter().filter(|(_, n)| **n > 0) {
-            row(&format!("ordered: {reason}"), format!("{slots} slots more, neither missed nor lit"));
+            row(&format!("ordered: {reason}"), format!("{slots} more slots, neither missed nor lit"));
         }
         let dark = if self.frames_dark > 0 {
             format!("{} dark on every body, ", self.frames_dark)
@@ -606,7 +606,7 @@ mod tests {
             lines[0].ends_with("84 of 22728 (0.370 %); 68 of them while the machine itself stood still"),
             "{table}"
         );
-        assert!(table.contains("1421 slots more, neither missed nor lit"), "{table}");
+        assert!(table.contains("1421 more slots, neither missed nor lit"), "{table}");
         assert!(lines.iter().all(|l| !l.starts_with("  plan") && !l.contains("safe")), "{table}");
         let json = report.to_json();
         let at = |key: &str| json.find(key).unwrap_or_else(|| panic!("{key}"));
