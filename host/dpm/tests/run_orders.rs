@@ -1,4 +1,5 @@
-//! `dpm run` as a process, on a projector behind a pseudo-terminal: orders from other processes and from its terminal, SIGTERM, SIGKILL.
+//! `dpm run` as a process, on a projector behind a pseudo-terminal: orders from other processes and from its
+//! terminal, SIGTERM, SIGKILL.
 #![allow(unsafe_code)]
 
 mod cli_common;

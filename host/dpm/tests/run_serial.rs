@@ -1,4 +1,5 @@
-//! `dpm run` on a projector behind a real serial line (a pseudo-terminal): light, reports, orders, faults, unplugging, the dark at the end.
+//! `dpm run` on a projector behind a real serial line (a pseudo-terminal): light, reports, orders, faults,
+//! unplugging, the dark at the end.
 
 mod link_common;
 

@@ -64,12 +64,12 @@ pub(crate) struct ErrorArgs {
     pub(super) json: bool,
 }
 
-/// Experiments from publications, and the table.
+/// Other experiments.
 #[derive(clap::ValueEnum, Clone, Copy, Debug)]
 enum Preset {
     /// Section 3 of the paper: one body in four materials, 5 to 30 samples per pixel, at rest and moving
     Figure3,
-    /// Every method on one body in four materials, at rest and moving, looked at directly and from the side
+    /// Every method on one body in four materials, at rest and moving, with the gaze on it and past it
     Table,
 }
 

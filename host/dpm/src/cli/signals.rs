@@ -79,7 +79,8 @@ fn set_timer(seconds: libc::time_t, microseconds: libc::suseconds_t) {
         it_interval: none,
         it_value: libc::timeval { tv_sec: seconds, tv_usec: microseconds },
     };
-    // SAFETY: the timer outlives the call. setitimer is a bare system call, which a handler may make, and valid values never fail.
+    // SAFETY: the timer outlives the call. setitimer is a bare system call, which a handler may make, and valid
+    // values never fail.
     unsafe { libc::setitimer(libc::ITIMER_REAL, &raw const timer, std::ptr::null_mut()) };
 }
 
@@ -123,8 +124,8 @@ pub(crate) fn ignore() -> io::Result<()> {
 }
 
 fn handle(signal: libc::c_int, handler: libc::sighandler_t) -> io::Result<()> {
-    // SAFETY: an all-zero sigaction is valid: no flags, an empty mask; the handlers touch atomics and make only calls that are
-    // async-signal-safe.
+    // SAFETY: an all-zero sigaction is valid: no flags, an empty mask. The handlers touch only atomics and make only
+    // async-signal-safe calls.
     let result = unsafe {
         let mut action: libc::sigaction = std::mem::zeroed();
         action.sa_sigaction = handler;

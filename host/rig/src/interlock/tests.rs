@@ -17,8 +17,8 @@ fn of(config: InterlockConfig) -> Interlock {
     Interlock::of_config(&config, true).unwrap().unwrap()
 }
 
-/// Waits until the interlock has the given state. Returns the processor time that this thread had meanwhile; a sleep
-/// of a millisecond counts as two at most.
+/// Waits until the interlock has the given state. Returns the time that this test's thread was served meanwhile: a
+/// sleep of a millisecond counts as two at most.
 fn becomes(interlock: &Interlock, closed: bool) -> Duration {
     let (begin, mut served) = (Instant::now(), Duration::ZERO);
     while interlock.is_closed() != closed {

@@ -18,7 +18,7 @@ const EVEN_SLOTS: i64 = 4;
 const WIDE_BINS: usize = 128;
 /// All bins.
 const BINS: usize = EVEN_BINS + WIDE_BINS;
-/// Width of a wide bin relative to its lower edge.
+/// Upper edge of a wide bin divided by its lower edge.
 const GROWTH: f64 = 1.08;
 /// A time longer than this many typical times (and than [`EVEN_SLOTS`]) was not work but a stall, and no lead helps
 /// against a stall ...
