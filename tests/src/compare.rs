@@ -1,25 +1,26 @@
-//! A picture of the GPU against the f64 reference, as demands: the same surfaces, the same light, errors that the variances explain.
+//! Compares a picture of the GPU with the f64 reference: it must have the same surfaces, the same light, and only
+//! errors that the variances explain.
 
 use dpm_lab::stability::gpu_compare::{self, Comparison};
 use dpm_lab::stability::gpu_shot::Shot;
 use dpm_render::gpu::Gpu;
 use std::sync::Arc;
 
-/// Draws `shot` with both tracers; the reference takes `spp` samples and drops none.
+/// Draws `shot` with both tracers. The reference takes `spp` samples and drops none.
 pub fn compare(gpu: &Arc<Gpu>, shot: &Shot<'_>, spp: u32) -> Comparison {
     let comparison = gpu_compare::compare(gpu, shot, spp);
     assert_eq!(comparison.reference.dropped_samples, 0);
     comparison
 }
 
-/// What tests demand of a comparison.
+/// The requirements of the tests on a comparison.
 pub trait Demands {
-    /// The same surfaces in all but `share` of the pixels (silhouettes, where rounding decides).
+    /// The surfaces are the same in all but `share` of the pixels (silhouettes, where rounding decides).
     fn assert_same_surfaces(&self, what: &str, share: f64);
-    /// Means that agree within `relative`, which their own noise must be able to judge, per channel.
+    /// The means of each channel agree within `relative`, and their own noise is small enough to judge that.
     fn assert_same_mean(&self, what: &str, relative: f64);
-    /// Per pixel and channel a difference within four sigma, but for as many as chance allows, and squares of all differences that are on
-    /// average what the variances say.
+    /// For each pixel and channel the difference is within four sigma, except for as many as chance permits. The
+    /// squares of all differences have the mean that the variances predict.
     fn assert_pixels_explained(&self, what: &str);
 }
 
@@ -52,7 +53,8 @@ impl Demands for Comparison {
     fn assert_pixels_explained(&self, what: &str) {
         let e = self.explained();
         assert!(e.exact <= 1.0, "{what}: a pixel without noise differs by {} times its rounding", e.exact);
-        // Student's t of 31 degrees of freedom is beyond 4 with probability 4e-4; rare bright samples make the tails heavier.
+        // Student's t of 31 degrees of freedom is beyond 4 with probability 4e-4, and rare bright samples make the
+        // tails heavier.
         let allowed = f64::max(2e-3 * e.values, 3.0);
         assert!(
             e.beyond.len() as f64 <= allowed,

@@ -1,5 +1,5 @@
-//! Any bytes into the two ends of a bit-plane link that is up: packets with right checksums, which a fuzzer would not guess, so that what lies
-//! behind the checksums is reached.
+//! Sends arbitrary bytes to both ends of a bit-plane link that is up. The bytes become packets with correct
+//! checksums, which a fuzzer would not guess, so that the code behind the checksums is reached.
 
 use dpm_device::link::{
     Codec, Epoch, Header, HostLink, LightLimits, LinkSettings, LinkState, MessageType, Packet,
@@ -11,12 +11,12 @@ use dpm_device::transport::inproc::Direct;
 use dpm_device::transport::{Lane, LinkDevice, SendError, Transport, TransportError};
 use hil_mock::projector::{MockConfig, MockProjector};
 
-/// A cable that remembers the session and what was sent, and may be told what arrives.
+/// A cable that records the session and what was sent, and that can be given replies.
 struct Cable {
     device: Direct<MockProjector>,
     session: u32,
     sent: Vec<MessageType>,
-    /// Replies in place of the device's own, once there are any.
+    /// Replies that replace the device's own, if there are any.
     inbound: Option<Vec<u8>>,
 }
 
@@ -49,7 +49,7 @@ impl Transport for Cable {
 
 const PLANES: usize = 3;
 
-/// A link that streams, and its clock.
+/// A link that is streaming, and its clock.
 fn streaming() -> (HostLink, Cable, HostTime) {
     let raster = Raster::new(16, 2).expect("a raster");
     let schedule = PlaneSchedule::mono8();
@@ -65,7 +65,7 @@ fn streaming() -> (HostLink, Cable, HostTime) {
         flash_limit: None,
         limits: LightLimits::OFF,
     };
-    // The same session each time: what a fuzzer finds must repeat.
+    // Always the same session, because a fuzzer's findings must be reproducible.
     let mut link = HostLink::with_sessions(settings, SessionNumbers::from_source(|| 1));
     let mock = MockProjector::new(MockConfig { events_kept: 0, ..MockConfig::new(raster) });
     let mut cable = Cable { device: Direct::new(mock), session: 0, sent: Vec::new(), inbound: None };
@@ -86,8 +86,8 @@ fn streaming() -> (HostLink, Cable, HostTime) {
     (link, cable, now)
 }
 
-/// Packets out of `bytes`, each with the checksums that belong to it: kind, codec, plane, frame, target, lane, time that passes, length,
-/// payload.
+/// Makes packets from `bytes`, each with correct checksums: kind, codec, plane, frame, target, lane, elapsed time,
+/// length, payload.
 fn packets(mut bytes: &[u8], session: u32, mut each: impl FnMut(i64, Lane, Vec<u8>)) {
     while let Some((&[kind, codec, plane, frame, target, how, wait, n], rest)) =
         bytes.split_first_chunk::<8>()
@@ -116,7 +116,8 @@ fn packets(mut bytes: &[u8], session: u32, mut each: impl FnMut(i64, Lane, Vec<u
     }
 }
 
-/// A projector that is armed hears anything: its counters stay consistent, its answers bounded, its credit kept.
+/// Sends arbitrary packets to an armed projector: its counters stay consistent, its answers are bounded, and its
+/// credit is kept.
 pub fn projector(bytes: &[u8]) {
     let (_, mut cable, mut now) = streaming();
     let session = cable.session;
@@ -136,7 +137,8 @@ pub fn projector(bytes: &[u8]) {
     });
 }
 
-/// A host that streams hears anything from its device: it grants itself no credit and never asks for light of its own accord.
+/// Sends arbitrary packets from the device to a streaming host: the host grants itself no credit and never requests
+/// light by itself.
 pub fn host_link(bytes: &[u8]) {
     let (mut link, mut cable, mut now) = streaming();
     let session = cable.session;

@@ -1,5 +1,5 @@
-//! Any bytes into every decoder that hears the outside: one entry for each, with the laws that hold whatever the bytes are. The fuzz
-//! targets in `fuzz/` and the test over the committed seeds call the same entries.
+//! Feeds arbitrary bytes to every decoder of external input. Each decoder has one entry, with the laws that hold for
+//! all bytes. The fuzz targets in `fuzz/` and the test over the committed seeds call the same entries.
 
 use dpm_device::cobs::{encode, encoded_bytes, Deframer};
 use dpm_device::dlpc900::command::{CommandAssembler, ReplyAssembler, REPORT_BYTES};
@@ -23,10 +23,10 @@ use dpm_scene::geometry::opencv;
 use hil_mock::usbip::wire as usbip;
 use std::path::Path;
 
-/// A decoder's entry.
+/// The entry of a decoder.
 pub type Entry = fn(&[u8]);
 
-/// Every entry with the name of its fuzz target and of its folder of seeds.
+/// Every entry with the name of its fuzz target, which is also the name of its folder of seeds.
 pub const ALL: [(&str, Entry); 13] = [
     ("link_stream", link_stream),
     ("link_rle", link_rle),
@@ -74,7 +74,7 @@ impl PacketSink for Heard {
     }
 }
 
-/// The bit-plane link's stream: what is found does not depend on how the stream is cut.
+/// The stream of the bit-plane link: what is found does not depend on how the stream is split.
 pub fn link_stream(bytes: &[u8]) {
     let (mut whole, mut cut) = (Heard::default(), Heard::default());
     let (mut a, mut b) = (Decoder::new(), Decoder::new());
@@ -84,7 +84,8 @@ pub fn link_stream(bytes: &[u8]) {
     assert_eq!(a.counters(), b.counters());
 }
 
-/// A plane of 64 bytes out of RLE: cut anywhere it decodes to the same, and what decodes can be coded again.
+/// A plane of 64 bytes in RLE: however it is split, it decodes to the same bytes, and decoded bytes can be encoded
+/// again.
 pub fn link_rle(bytes: &[u8]) {
     let (mut plane, mut again) = ([0u8; 64], [0u8; 64]);
     let (mut whole, mut cut) = (RleDecoder::new(), RleDecoder::new());
@@ -101,7 +102,7 @@ pub fn link_rle(bytes: &[u8]) {
     }
 }
 
-/// COBS frames: cut anywhere the same, and each comes out of its own encoding.
+/// COBS frames: the same however they are split, and each is recovered from its own encoding.
 pub fn cobs_stream(bytes: &[u8]) {
     let frames = |step: usize| {
         let mut deframer = Deframer::new([0u8; 128]);
@@ -122,7 +123,7 @@ pub fn cobs_stream(bytes: &[u8]) {
     }
 }
 
-/// HID reports of a DLPC900, both ways.
+/// HID reports of a DLPC900, in both directions.
 pub fn dlpc900_reports(bytes: &[u8]) {
     let (mut commands, mut replies) = (CommandAssembler::default(), ReplyAssembler::default());
     for report in bytes.chunks(REPORT_BYTES) {
@@ -131,7 +132,7 @@ pub fn dlpc900_reports(bytes: &[u8]) {
     }
 }
 
-/// A DLPC900 image of 8 x 4 pixels: what decodes has exactly their bytes.
+/// A DLPC900 image of 8 x 4 pixels: whatever decodes has exactly the bytes of that many pixels.
 pub fn dlpc900_image(bytes: &[u8]) {
     if let Ok(pixels) = image::decode(bytes, 8, 4) {
         assert_eq!(pixels.len(), 8 * 4 * 3);
@@ -153,7 +154,7 @@ pub fn natnet_datagram(bytes: &[u8]) {
     let _ = (decode_echo_request(payload), decode_echo_response(payload));
 }
 
-/// A VRPN stream: every message lies within it and comes out of its own encoding.
+/// A VRPN stream: every message lies within it and is recovered from its own encoding.
 pub fn vrpn_stream(mut bytes: &[u8]) {
     while let Ok(Some((message, taken))) = vrpn::split(bytes) {
         assert!(taken > 0 && taken <= bytes.len() && message.payload.len() <= taken);
@@ -166,7 +167,7 @@ pub fn vrpn_stream(mut bytes: &[u8]) {
     }
 }
 
-/// A packet of the serial pose stream: its own encoding is read as the same message again.
+/// A packet of the serial pose stream: its own encoding is read as the same message.
 pub fn serial_pose(bytes: &[u8]) {
     let encoded = |bytes: &[u8]| {
         let message = SerialMessage::decode(bytes).ok()?;
@@ -181,8 +182,8 @@ pub fn serial_pose(bytes: &[u8]) {
     assert_eq!(encoded(&frame.expect("one frame")), Some(first));
 }
 
-/// A tracker's recording, as it is and with its frames' checksums put right: it holds no more samples than its bytes can, and a file that ends
-/// early gives the beginning of what the whole one gives.
+/// A tracker's recording, unchanged and with its frames' checksums corrected. It has no more samples than its bytes
+/// can contain, and a truncated file gives the beginning of what the whole file gives.
 pub fn recording(bytes: &[u8]) {
     let read = |bytes: &[u8]| Recording::read_from(&mut &bytes[..], bytes.len() as u64, Path::new("seed"));
     let mut framed = b"dpm-track-0001\r\n".to_vec();
@@ -200,17 +201,17 @@ pub fn recording(bytes: &[u8]) {
         let Ok(whole) = read(bytes) else { continue };
         assert!(whole.samples.len() * SAMPLE_BYTES + whole.torn_bytes as usize <= bytes.len());
         if let Ok(part) = read(&bytes[..bytes.len() * 2 / 3]) {
-            // By their bits: what lies in a file need not be a number.
+            // Compared as text, because numbers in a file may be NaN.
             let text = |r: &Recording, n: usize| format!("{:?}{:?}", r.bodies, &r.samples[..n]);
             assert_eq!(text(&part, part.samples.len()), text(&whole, part.samples.len()));
         }
     }
 }
 
-/// USB/IP, both ends: what is read comes out of its own encoding.
+/// USB/IP, both ends: whatever is read is recovered from its own encoding.
 pub fn usbip_stream(bytes: &[u8]) {
     if let Ok(operation) = usbip::Operation::read(&mut &bytes[..]) {
-        // A name that is not text, or fills its 32 bytes without an end, is read as if it were one and names no device.
+        // A name that is not text, or that fills its 32 bytes without a terminator, is accepted and names no device.
         let is_text = !matches!(&operation, usbip::Operation::Import(id) if !id.is_ascii() || id.len() > 31);
         let again = usbip::Operation::read(&mut &operation.encode()[..]).ok();
         assert!(again == Some(operation) || !is_text);

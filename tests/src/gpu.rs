@@ -1,12 +1,13 @@
-//! The GPU under validation.
+//! Opens the GPU with validation.
 
 use dpm_render::gpu::{validation_messages, Gpu, GpuOptions};
 use std::sync::Arc;
 
-/// Opens the GPU with validation and synchronisation validation, runs the test, closes the GPU, and demands that validation said nothing.
+/// Opens the GPU with validation and synchronisation validation, runs the test, closes the GPU, and checks that
+/// validation reported nothing.
 ///
 /// # Panics
-/// Without a Vulkan driver (with the advice that `dpm doctor` gives), and when validation reported anything.
+/// There is no Vulkan driver (the message has the advice of `dpm doctor`), or validation reported something.
 pub fn with_gpu(test: impl FnOnce(&Arc<Gpu>)) {
     let gpu = Gpu::open(&GpuOptions { validation: true, device: None })
         .unwrap_or_else(|e| panic!("this test needs Vulkan: {e}"));

@@ -1,4 +1,4 @@
-//! What the end-to-end tests share: the GPU under validation, demands on pictures, rigs.
+//! Shared parts of the end-to-end tests: the GPU with validation, requirements on pictures, rigs.
 
 pub mod compare;
 pub mod conversations;

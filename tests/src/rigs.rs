@@ -1,4 +1,4 @@
-//! The demo rig made small, run through the whole pipeline.
+//! A small demo rig, run through the whole pipeline.
 
 use dpm_device::planes::Raster;
 use dpm_render::gpu::Gpu;
@@ -8,10 +8,10 @@ use dpm_rig::rig::Rig;
 use dpm_rig::telemetry::monitor::RunMonitor;
 use std::sync::Arc;
 
-/// The demo rig at `width` x `height` with settings `a.b=c` over it.
+/// The demo rig at `width` x `height`, with the settings `a.b=c` applied.
 ///
 /// # Panics
-/// When a setting is refused.
+/// A setting is refused.
 pub fn demo_rig(width: u32, height: u32, settings: &[&str]) -> Arc<Rig> {
     let flags = settings.iter().map(|s| (*s).to_owned()).collect();
     let config = RigConfig::demo(&Overrides { variables: vec![], flags }).unwrap_or_else(|e| panic!("{e}"));
@@ -22,7 +22,7 @@ pub fn demo_rig(width: u32, height: u32, settings: &[&str]) -> Arc<Rig> {
 /// Runs it for `frames` frames and keeps the last `keep` of them.
 ///
 /// # Panics
-/// When the run fails.
+/// The run fails.
 pub fn run(gpu: &Arc<Gpu>, rig: &Arc<Rig>, frames: u64, keep: usize) -> (RunOutcome, Arc<RunMonitor>) {
     let monitor = Arc::new(RunMonitor::default());
     let options = RunOptions { frames, keep_frames: keep, ..RunOptions::default() };

@@ -1,6 +1,8 @@
-//! Inside a closed sphere of albedo 1/2 and emission 1/2 the radiance is 1 everywhere: a leak or a self-hit shows at once.
+//! Inside a closed sphere of albedo 1/2 and emission 1/2 the radiance is 1 everywhere, so a leak or a
+//! self-intersection is visible at once.
 //!
-//! A path of depth d sees the first d terms of `sum 0.5^k`, so its mean is `1 - 0.5^d`: from every position, at every size.
+//! A path of depth d adds the first d terms of `sum 0.5^k`, so its mean is `1 - 0.5^d`, from every position and at
+//! every size.
 
 use dpm_lab::stability::estimate::pooled;
 use dpm_lab::stability::gpu_shot::{Picture, Shot};
@@ -13,7 +15,7 @@ fn lamp(double_sided: bool) -> Material {
     Material { emissive: Vec3::splat(0.5), double_sided, ..diffuse(Vec3::splat(0.5)) }
 }
 
-/// Every pixel met a surface, and the mean is that of a closed space at this depth.
+/// Checks that every pixel met a surface, and that the mean is that of a closed space at this depth.
 fn assert_closed(what: &str, picture: &Picture, depth: u32) {
     let missed = (0..picture.surfaces.len()).filter(|&i| !picture.hit(i)).count();
     assert_eq!(missed, 0, "{what}: rays that left the closed sphere");
@@ -46,7 +48,7 @@ fn depth_d_keeps_the_first_d_terms() {
 fn no_size_and_no_place_leaks() {
     with_gpu(|gpu| {
         for radius in [1e-3f32, 1.0, 1e4] {
-            // Baked at the origin; moved and turned by its pose, as the tracker does.
+            // Built at the origin, then moved and rotated by its pose, as the tracker does.
             let scene = scene_of(sphere(Vec3::ZERO, radius, 2, true), lamp(true));
             for distance in [0.0, 1.0, 1e4] {
                 let centre = DVec3::new(0.6, -0.48, 0.64) * distance;
@@ -68,7 +70,8 @@ fn no_size_and_no_place_leaks() {
 
 #[test]
 fn seen_from_outside_a_sphere_does_not_shine_through_itself() {
-    // Single-sided and lit from inside only: from outside it is black, however far it is. An inner lamp must not leak out.
+    // Single-sided and lit from inside only: from outside it is black at any distance. The lamp inside must not leak
+    // out.
     with_gpu(|gpu| {
         for (radius, distance) in [(1e-3f32, 1.0f64), (1.0, 1e3), (1e4, 1e5)] {
             let (scene, camera) = lamp_in_a_sphere(radius, distance);
@@ -84,7 +87,7 @@ fn seen_from_outside_a_sphere_does_not_shine_through_itself() {
 
 #[test]
 fn a_room_of_many_bodies_is_closed_too() {
-    // The same sphere cut into four bodies whose seams meet only in world space.
+    // The same sphere, divided into four bodies whose seams meet only in world space.
     with_gpu(|gpu| {
         let whole = sphere(Vec3::ZERO, 1.0, 2, true);
         let mut scene = Scene::default();
@@ -94,7 +97,7 @@ fn a_room_of_many_bodies_is_closed_too() {
             mesh.triangles = whole.triangles[part * n..(part + 1) * n].to_vec();
             add(&mut scene, mesh, lamp(true));
         }
-        // All parts share one pose: nothing may appear between them.
+        // All parts have the same pose, so no gap may appear between them.
         let pose =
             DAffine3::from_rotation_translation(DQuat::from_rotation_x(0.4), DVec3::new(0.2, 0.1, -0.3));
         let camera = camera(32, 24, DVec3::new(0.1, 0.2, 0.1), DVec3::NEG_Z);

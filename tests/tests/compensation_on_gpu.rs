@@ -1,4 +1,4 @@
-//! The compensation shader against its CPU twin, bit for bit, on radiance and surfaces that no scene would give it.
+//! Compares the compensation shader with its CPU twin, bit for bit, for radiance and surfaces that no scene produces.
 
 use bytemuck::Zeroable;
 use dpm_lab::reference::Sampler;
@@ -19,7 +19,7 @@ const WIDTH: u32 = 48;
 const HEIGHT: u32 = 32;
 const PIXELS: usize = (WIDTH * HEIGHT) as usize;
 
-/// All that the shader reads.
+/// Everything that the shader reads.
 struct Input {
     frame: Frame,
     instances: Vec<Instance>,
@@ -29,7 +29,7 @@ struct Input {
     radiance: Vec<[f32; 4]>,
 }
 
-/// Runs the shader alone, both ways in which it reads the scene: they agree.
+/// Runs the shader alone, in both ways in which it reads the scene, and checks that they agree.
 fn on_gpu(gpu: &Arc<Gpu>, input: &Input) -> (Vec<u32>, Counters) {
     let [storage, texel] = [false, true].map(|texel| on_gpu_through(gpu, input, texel));
     assert!(storage.0 == texel.0, "codes depend on how the scene is read");
@@ -37,7 +37,7 @@ fn on_gpu(gpu: &Arc<Gpu>, input: &Input) -> (Vec<u32>, Counters) {
     storage
 }
 
-/// Runs the shader alone. `texel`: the one that reads the scene through texel buffers.
+/// Runs the shader alone. `texel`: the variant that reads the scene through texel buffers.
 fn on_gpu_through(gpu: &Arc<Gpu>, input: &Input, texel: bool) -> (Vec<u32>, Counters) {
     let uploaded = |what: &str, bytes: &[u8]| {
         let mut buffer = Buffer::new(gpu, what, bytes.len(), MemoryKind::Upload).unwrap();
@@ -135,7 +135,7 @@ fn twin(input: &Input) -> (Vec<u32>, QuantiseCounts, u32) {
     (codes, counts, lit)
 }
 
-/// A turn about an axis as rows, with a shift that must not matter.
+/// The rows of a rotation about an axis, with a translation that must have no effect.
 fn rows(random: &mut Sampler) -> Rows {
     let mut u = || random.uniform() as f32 * 2.0 - 1.0;
     let q = glam::Quat::from_xyzw(u(), u(), u(), u()).normalize();
@@ -199,7 +199,8 @@ fn assert_same(gpu: &Arc<Gpu>, input: &Input) -> Counters {
         );
         assert_eq!(u64::from(counters.clipped_values), counts.clipped);
     } else {
-        // Real GPUs may round 1/x and the square root by an ulp or two: then a code may be the neighbour, rarely.
+        // Real GPUs may round 1/x and the square root by an ulp or two. Then, in rare cases, a code may differ by
+        // one.
         let near = |a: u32, b: u32| (0..3).all(|c| (a >> (8 * c) & 255).abs_diff(b >> (8 * c) & 255) <= 1);
         assert!(different.iter().all(|&(_, a, b)| near(a, b)) && different.len() < PIXELS / 100);
     }
@@ -213,7 +214,7 @@ fn codes_equal_the_twin_bit_for_bit() {
         for seed in 0..8 {
             let input = random_input(seed);
             let (codes, _, lit) = twin(&input);
-            // The comparison is worth something: most lit pixels are neither black nor full.
+            // The comparison is meaningful: most lit pixels are neither black nor full.
             let between = codes.iter().filter(|&&c| c & 255 > 0 && c & 255 < 255).count();
             assert!(lit > 1000 && between > 500, "{lit} {between}");
             assert_same(gpu, &input);

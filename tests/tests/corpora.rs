@@ -1,7 +1,8 @@
-//! Every decoder over its committed seeds, over every beginning of each, and over each with bits flipped and bytes repeated.
+//! Runs every decoder on its committed seeds, on every prefix of each, and on each with flipped bits and repeated
+//! bytes.
 //!
-//! Seeds are what the encoders make (`DPM_UPDATE_SEEDS=1 cargo test -p dpm-tests --test corpora` writes them) and what was added by
-//! hand: anything that a fuzzer finds goes into the folder of its target.
+//! The encoders make the seeds (`DPM_UPDATE_SEEDS=1 cargo test -p dpm-tests --test corpora` writes them); others are
+//! added by hand. Put anything that a fuzzer finds into the folder of its target.
 
 use dpm_device::cobs::{encode, encoded_bytes};
 use dpm_device::dlpc900::command::{Command, Opcode};
@@ -23,7 +24,7 @@ fn folder(target: &str) -> PathBuf {
     PathBuf::from(concat!(env!("CARGO_MANIFEST_DIR"), "/corpus")).join(target)
 }
 
-/// What the encoders make: target, name, bytes.
+/// The seeds that the encoders make: target, name, bytes.
 fn made() -> Vec<(&'static str, &'static str, Vec<u8>)> {
     let mut seeds = Vec::new();
     let mut payload = [0; MAX_CONTROL_BYTES];
@@ -95,7 +96,8 @@ fn made() -> Vec<(&'static str, &'static str, Vec<u8>)> {
     let unlink = usbip::Urb::Unlink { seqnum: 3, devid: 0x0001_0001, victim: 2 };
     let ended = usbip::Urb::Submitted { seqnum: 2, status: -104, actual: 7 };
     seeds.push(("usbip_stream", "urbs", [unlink.encode(), ended.encode()].concat()));
-    // Kind, codec, plane, frame, target, how, wait, length: a raw plane, an RLE one, a STOP, an ARM; a STATUS and an ECHO for the host.
+    // Kind, codec, plane, frame, target, how, wait, length: a raw plane, an RLE plane, a STOP, an ARM; a STATUS and
+    // an ECHO for the host.
     let script = |kind: MessageType, codec: u8, payload: &[u8]| {
         [&[kind as u8, codec, 0, 9, 20, 0, 10, payload.len() as u8][..], payload].concat()
     };
@@ -154,7 +156,7 @@ fn no_seed_and_nothing_near_one_breaks_a_decoder() {
     }
 }
 
-/// The seeds reach the decoders' insides: what the encoders make today is what the files hold.
+/// The seeds still exercise the decoders: the files contain what the encoders make today.
 #[test]
 fn the_seeds_are_what_the_encoders_make() {
     for (target, name, bytes) in made() {

@@ -1,21 +1,21 @@
-//! The documents held to the tree: every file that they link or name is there, what two of them call by name stands in the sources, and
-//! no line of prose is longer than 120 characters.
+//! Checks the documents against the tree: every file that they link or name exists, every name that they mention
+//! occurs in the sources, and no line of prose is longer than 120 characters.
 
 use std::collections::BTreeSet;
 use std::fs::read_to_string;
 use std::path::{Path, PathBuf};
 
-/// Longest line of prose, characters.
+/// Maximum length of a line of prose, characters.
 const MAX_CHARS: usize = 120;
 
 fn root() -> &'static Path {
     Path::new(concat!(env!("CARGO_MANIFEST_DIR"), "/.."))
 }
 
-/// What is built, or another's: nothing that a document may name.
+/// Folders that documents may not name, because they are generated or belong to others.
 const SKIPPED: [&str; 3] = ["target", "out", ".git"];
 
-/// Files and folders below `folder`, as paths from the root with `/` between.
+/// Files and folders below `folder`, as paths from the root, separated by `/`.
 fn tree(folder: &Path, found: &mut BTreeSet<String>) {
     for entry in std::fs::read_dir(folder).unwrap_or_else(|e| panic!("{}: {e}", folder.display())) {
         let path = entry.unwrap().path();
@@ -31,7 +31,7 @@ fn tree(folder: &Path, found: &mut BTreeSet<String>) {
     }
 }
 
-/// The documents that are written by hand, from the root; `docs/CONFIG.md` is written by a test.
+/// The hand-written documents, as paths from the root. A test generates `docs/CONFIG.md`.
 fn documents(tree: &BTreeSet<String>) -> Vec<&str> {
     let is_document = |path: &&str| {
         let is_ours = path.starts_with("docs/") || !path.contains('/');
@@ -40,7 +40,7 @@ fn documents(tree: &BTreeSet<String>) -> Vec<&str> {
     tree.iter().map(String::as_str).filter(is_document).collect()
 }
 
-/// What a line of a document is.
+/// The kind of a line of a document.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 enum Kind {
     Prose,
@@ -48,7 +48,7 @@ enum Kind {
     Code,
 }
 
-/// The lines of a document by kind. Indented lines are code unless they belong to a list.
+/// The lines of a document with their kinds. Indented lines are code unless they belong to a list.
 fn lines(text: &str) -> Vec<(Kind, &str)> {
     let (mut is_fenced, mut in_list) = (false, false);
     let mut all = Vec::new();
@@ -76,7 +76,7 @@ fn lines(text: &str) -> Vec<(Kind, &str)> {
     all
 }
 
-/// Numbers of the lines of prose that are too long. What has no blank cannot be broken.
+/// Numbers of the lines of prose that are too long. Lines without a blank cannot be broken.
 fn long_lines(text: &str) -> Vec<usize> {
     let is_long = |line: &str| line.chars().count() > MAX_CHARS && line.trim().contains(' ');
     let all = lines(text).into_iter().enumerate();
@@ -92,7 +92,7 @@ fn without_code(text: &str) -> (String, Vec<String>) {
     (kept, spans)
 }
 
-/// Targets of links and pictures, without those to other places: a path, and the heading after `#`; either may be empty.
+/// Targets of links and pictures, except external ones: a path, and the heading after `#`. Either may be empty.
 fn links(text: &str) -> Vec<(String, String)> {
     let (text, _) = without_code(text);
     let targets = text.split("](").skip(1).filter_map(|rest| rest.split(')').next());
@@ -101,7 +101,7 @@ fn links(text: &str) -> Vec<(String, String)> {
     parts.map(|(path, heading)| (path.to_owned(), heading.to_owned())).collect()
 }
 
-/// The headings of a document as links name them: small letters, digits, `-` for blanks.
+/// The headings of a document as link targets: lower-case letters, digits, and `-` for blanks.
 fn headings(text: &str) -> BTreeSet<String> {
     let of_line = |line: &str| {
         let kept =
@@ -112,7 +112,8 @@ fn headings(text: &str) -> BTreeSet<String> {
     prose.map(|(_, line)| of_line(line)).collect()
 }
 
-/// Code spans that name a file or a folder of the tree: whatever ends as a source file does, and whatever begins at a folder of the root.
+/// Code spans that name a file or a folder of the tree: whatever has the ending of a source file, and whatever begins
+/// with a folder of the root.
 fn named_paths(text: &str, tree: &BTreeSet<String>) -> Vec<String> {
     let (_, spans) = without_code(text);
     let is_path = |span: &str| span.chars().all(|c| c.is_ascii_alphanumeric() || "_./-".contains(c));
@@ -125,14 +126,14 @@ fn named_paths(text: &str, tree: &BTreeSet<String>) -> Vec<String> {
     spans.into_iter().filter(|s| is_path(s) && (is_source(s) || begins_at_root(s))).collect()
 }
 
-/// True when a path from the root, or the end of one, is in the tree.
+/// True if a path from the root, or the end of such a path, exists in the tree.
 fn is_there(path: &str, tree: &BTreeSet<String>) -> bool {
     let path = path.trim_start_matches("./").trim_end_matches('/');
     let end = format!("/{path}");
     tree.contains(path) || tree.iter().any(|t| t.ends_with(&end))
 }
 
-/// `folder` and a relative link from a file in it, as a path from the root; `None` where it leads out of the tree.
+/// A relative link from a file in `folder`, as a path from the root; `None` if it leads out of the tree.
 fn resolved(folder: &str, link: &str) -> Option<String> {
     let mut parts: Vec<&str> = folder.split('/').filter(|p| !p.is_empty()).collect();
     for part in link.split('/') {
@@ -205,7 +206,7 @@ fn every_source_file_that_a_document_names_exists() {
     assert!(missing.is_empty(), "named, but not there:\n{}", missing.join("\n"));
 }
 
-/// The page of the architecture once drew types that existed nowhere.
+/// The page on the architecture once showed types that existed nowhere.
 #[test]
 fn every_type_and_function_on_the_way_of_a_frame_stands_in_the_sources() {
     let tree = whole_tree();
@@ -225,7 +226,7 @@ fn no_line_of_prose_is_longer_than_a_review_can_bear() {
     let tree = whole_tree();
     let mut long = Vec::new();
     for document in documents(&tree) {
-        // Made from the declarations of the keys.
+        // It is generated from the declarations of the keys.
         if document != "docs/CONFIG.md" {
             long.extend(long_lines(&text_of(document)).into_iter().map(|n| format!("{document}:{n}")));
         }

@@ -1,4 +1,5 @@
-//! The whole rig against the mock projector and tracker: what was rendered is what falls, where the object is, when it is there.
+//! The whole rig with the mock projector and the mock tracker: the light is what was rendered, it falls where the
+//! object is, and it falls at the right time.
 
 use dpm_device::time::HostTime;
 use dpm_lab::sequence::draw;
@@ -12,7 +13,7 @@ use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
-/// Every frame by itself: no picture depends on former ones, so that a single one can be drawn again.
+/// Every frame independently: no picture depends on previous ones, so a single frame can be drawn again.
 const FULL: &str = "render.method=\"full\"";
 const REAL: &str = "real_time.pace=\"real\"";
 
@@ -26,7 +27,8 @@ fn the_light_is_the_rendered_picture_in_all_24_planes() {
         assert_eq!((r.frames_lit, r.frames_dropped, r.frames_late, r.planes), (40, 0, 0, 24));
         assert_eq!(monitor.counts().frames_planned, 40);
 
-        // Beside the pipeline's own comparison: the kept frames drawn again, one by one, with a renderer of their own.
+        // In addition to the pipeline's own comparison, the kept frames are drawn again, one by one, with a separate
+        // renderer.
         let mut renderer = Renderer::new(gpu, &rig.scene, renderer_settings(&rig)).unwrap();
         let mut slot = renderer.create_slot(false).unwrap();
         assert_eq!((outcome.light.len(), outcome.recent.len()), (12, 12));
@@ -45,7 +47,7 @@ fn the_light_is_the_rendered_picture_in_all_24_planes() {
                 (0..3).for_each(|c| levels[c][usize::from(fell[c])] = true);
             }
         }
-        // The comparison is worth something: there is light, in many levels, so every plane of every colour carries bits.
+        // The comparison is meaningful: there is light at many levels, so every plane of every colour has set bits.
         assert!(lit_pixels > 12 * 64 * 48 / 20, "{lit_pixels}");
         for (channel, seen) in levels.iter().enumerate() {
             for bit in 0..8 {
@@ -65,7 +67,7 @@ fn a_run_repeats_to_the_bit() {
             assert_eq!((outcome.light_mismatches, outcome.report.frames_lit), (0, 24), "{method}");
             outcome.report.light_hash
         };
-        // Both methods keep histories, which is where a race would show.
+        // Both methods keep histories, in which a race would be visible.
         let (dpm, paper) = ("render.method=\"dpm\"", "render.method=\"paper\"");
         let first = hash(dpm, "render.seed=7");
         assert_ne!(first, "0000000000000000");
@@ -75,7 +77,7 @@ fn a_run_repeats_to_the_bit() {
     });
 }
 
-/// What a report says but for wall time, which is the machine's.
+/// The content of a report except wall times, which depend on the machine.
 fn told(report: &Report) -> serde_json::Value {
     let mut json: serde_json::Value = serde_json::from_str(&report.to_json()).unwrap();
     let fields = json.as_object_mut().unwrap();
@@ -103,7 +105,8 @@ fn beside_others<T>(work: impl FnOnce() -> T) -> T {
     })
 }
 
-/// All that a run at virtual pace says, not the light alone, with samples and packets lost on the way, is the same on an idle machine and on a busy one.
+/// Everything that a run at virtual pace reports, not only the light, with samples and packets lost on the way, is
+/// the same on an idle machine and on a busy one.
 #[test]
 fn a_whole_report_repeats_on_a_busy_machine() {
     with_gpu(|gpu| {
@@ -119,7 +122,7 @@ fn a_whole_report_repeats_on_a_busy_machine() {
             assert_eq!(first, beside_others(once));
         }
     });
-    // More frames than the collector holds at once, faster than it looks.
+    // More frames than the collector can hold at once, faster than it reads them.
     let rig =
         demo_rig(16, 12, &["tracker.drop_out=0.1", "projector.backend={kind=\"mock\",faults=\"loss=0.02\"}"]);
     let once = || {
@@ -137,7 +140,7 @@ fn a_whole_report_repeats_on_a_busy_machine() {
 #[test]
 fn light_falls_where_the_object_is() {
     with_gpu(|gpu| {
-        // A quarter of a second at 1 m/s holds a whole crossing and a reversal at 8 m/s^2.
+        // A quarter of a second at 1 m/s contains a whole crossing and a reversal at 8 m/s^2.
         let rig = demo_rig(32, 24, &["render.spp=1"]);
         let (outcome, _) = run(gpu, &rig, 260, 0);
         let full_size = 1024.0 / 32.0;
@@ -146,7 +149,7 @@ fn light_falls_where_the_object_is() {
         let (p99, held_p99) = (error.p99 * full_size, held.p99 * full_size);
         assert!(p99 < 0.25, "99 % within {p99} px at 1024 x 768");
         assert!(held_p99 > 2.0 && held_p99 > 10.0 * p99, "without prediction {held_p99} px, with {p99} px");
-        // Switched off, the light itself is late, not only the report's second line.
+        // Without prediction the light itself is late, not only the second line of the report.
         let off = demo_rig(32, 24, &["render.spp=1", "prediction.on=false"]);
         let (outcome, _) = run(gpu, &off, 100, 0);
         let error = outcome.report.registration_error_px.expect("the mock tells the truth");

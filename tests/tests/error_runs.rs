@@ -1,4 +1,5 @@
-//! `dpm error` as a library: errors fall as theory says, a wrong sampler is caught, equal rays are equal.
+//! `dpm error` as a library: errors decrease as theory predicts, a wrong sampler is detected, and equal rays are
+//! equal.
 
 use dpm_device::planes::Raster;
 use dpm_lab::error::export::FrameIndex;
@@ -22,7 +23,8 @@ fn stage(settings: &[&str]) -> (Arc<Rig>, Arc<Gpu>) {
     (Arc::new(Rig::build(&config, Raster::new(40, 30)).unwrap_or_else(|e| panic!("{e}"))), gpu)
 }
 
-/// RMS difference of two runs by the square root of two: the noise, without any reference. Of single frames, and of the mean of all.
+/// The noise without a reference: the RMS difference of two runs divided by the square root of two. For single
+/// frames, and for the mean of all.
 fn noise(theatre: &Theatre, method: &Method, seeds: [u32; 2]) -> (f64, f64) {
     let [a, b] = seeds.map(|s| theatre.play(method, method.budget_spp, s, &mut |_, _| ()).unwrap().frames);
     let apart = |a: &[Vec3], b: &[Vec3]| rmse(a, b, |_| true) / 2f64.sqrt();
@@ -37,10 +39,11 @@ fn independent_samples_fall_by_half_an_order_an_order() {
         (noise(&theatre, &Method::full(2), [1, 2]), noise(&theatre, &Method::full(32), [3, 4]));
     let (slope, by_frames) = ((many / few).ln() / 16f64.ln(), (few_seen / few).ln() / 12f64.ln());
     println!("noise {few:.5} at 2, {many:.5} at 32 samples: slope {slope:.3}; {few_seen:.5} in 12 frames: slope {by_frames:.3}");
-    // A sampler whose samples repeat within a frame, or from frame to frame, has no such slope: tests/mutations/run makes both.
+    // A sampler whose samples repeat within a frame, or from frame to frame, does not have this slope;
+    // tests/mutations/run makes both.
     assert!((slope + 0.5).abs() < 0.06, "slope {slope} in samples");
     assert!((by_frames + 0.5).abs() < 0.06, "slope {by_frames} in frames");
-    // A sampler that repeats itself has no noise between its runs; whoever takes that for convergence must see it here.
+    // A sampler that repeats itself has no noise between its runs. This shows that zero noise is not convergence.
     assert_eq!(noise(&theatre, &Method::full(2), [5, 5]).0, 0.0);
     assert!(noise(&theatre, &Method::full(2), [5, 6]).0 > 0.5 * few);
 }
@@ -56,16 +59,16 @@ fn a_sampler_that_loses_light_is_told_from_one_that_does_not() {
             let seen = theatre.play(&Method::full(32), 32.0, s, &mut |_, _| ()).unwrap();
             eye_mean(&seen.frames, EYE_FRAMES)
         });
-        // The reference of the rig as it is, under one name: the second time it is read.
+        // The reference of the unchanged rig, under one name; the second time it is read from the cache.
         let reference = Reference::new(&theatre, 128, "as it is", &cache, &mut |_| ()).unwrap();
         (reference.bias(&eyes), reference.perceived(&eyes, &|_| true).1, cache)
     };
     let ((bias, chance), _, cache) = seen(&[], 1);
-    // Paths that end at the first surface lose what comes by way of others.
+    // Paths that end at the first surface lose indirect light.
     let ((biased, _), error, _) = seen(&["render.depth=2"], 3);
     std::fs::remove_dir_all(cache).unwrap();
     println!("bias {bias:.5} of chance {chance:.5}; with less light {biased:.5}");
-    // Squares are what is measured: twice what chance leaves of none are four of their standard deviations.
+    // Squares are measured, and twice the chance level corresponds to four of their standard deviations.
     assert!(bias < 2.0 * chance, "independent samples have no bias: {bias}, chance {chance}");
     assert!(biased > 2.0 * chance, "{biased}, chance {chance}");
     assert!(biased > 0.5 * error, "what is lost is bias, not noise: {biased} of {error}");
@@ -85,7 +88,8 @@ fn a_group_is_measured_at_equal_rays_and_tells_bias_from_noise() {
     assert_eq!(drawn.iter().filter(|d| *d == "reference").count(), 2);
     for r in &result.rows {
         assert!((r.rays_to_paper - 1.0).abs() < 0.05, "{}: {} of paper's rays", r.method, r.rays_to_paper);
-        // Squares of bias and noise add up to that of the error, as far as three standard deviations of the bias tell (a negative one is cut off).
+        // The squares of bias and noise add up to that of the error, within three standard deviations of the bias (a
+        // negative one is cut off).
         let parts = r.bias.powi(2) + r.noise.powi(2);
         let slack = (0.4 * r.perceived_rmse.powi(2)).max(3.0 * r.bias_floor.powi(2));
         assert!(
@@ -100,12 +104,13 @@ fn a_group_is_measured_at_equal_rays_and_tells_bias_from_noise() {
         assert!(r.gpu_ms > 0.0 || r.wall_ms > 0.0);
     }
     let full = result.rows.iter().find(|r| r.method == "full").unwrap();
-    // A sequence that goes on spreads a frame's samples, and the eye's frames, more evenly than chance does.
+    // A continuing sequence spreads the samples of a frame, and of the frames that the eye integrates, more evenly
+    // than chance.
     let sequence = result.rows.iter().find(|r| r.method == "sequence").unwrap();
     println!("full {:.5}, sequence {:.5}", full.perceived_rmse, sequence.perceived_rmse);
     assert!(sequence.noise < 0.97 * full.noise, "{} beside {}", sequence.noise, full.noise);
     assert!(sequence.bias < 0.5 * sequence.noise, "{} beside {}", sequence.bias, sequence.noise);
-    // All others are drawn at dpm's time too, and only they; more samples make less noise.
+    // All the others, and only they, are also drawn at dpm's time; more samples give less noise.
     for r in &result.rows {
         assert_eq!(r.equal_time.is_some(), is_other(&r.method), "{}", r.method);
         let [a, b] = r.runs_raw;
@@ -122,14 +127,15 @@ fn a_group_is_measured_at_equal_rays_and_tells_bias_from_noise() {
         }
     }
     assert!(full.bias < 0.5 * full.noise, "full is unbiased: {} beside {}", full.bias, full.noise);
-    // Stopped before the group was kept: reference and methods come from the cache, only times are taken again.
+    // Stopped before the group was kept: reference and methods come from the cache, and only the times are measured
+    // again.
     drawn.clear();
     let again = runs.measure(group, &mut |what| drawn.push(what.to_owned())).unwrap();
     let is_time = |what: &String| what == "times" || what.ends_with(AT_EQUAL_TIME);
     assert!(drawn.iter().all(is_time), "{drawn:?}");
     assert!((1..=1 + RACES).contains(&drawn.iter().filter(|what| *what == "times").count()), "{drawn:?}");
     assert_eq!(again.result.rows[1].perceived_rmse, full.perceived_rmse);
-    // Once the group is kept as a whole, its parts are not.
+    // When the group is kept as a whole, its parts are not.
     let parts = || {
         let entries = std::fs::read_dir(&cache).unwrap();
         entries.filter(|e| e.as_ref().unwrap().file_name().to_string_lossy().starts_with("part-")).count()
@@ -137,7 +143,7 @@ fn a_group_is_measured_at_equal_rays_and_tells_bias_from_noise() {
     assert_eq!(parts(), result.rows.len());
     measured.is_kept();
     assert_eq!(parts(), 0);
-    // The frames on disk are those that were measured: the mean of the last 31 of them is what the eye saw.
+    // The frames on disk are those that were measured: the eye sees the mean of the last 31 of them.
     let dir = cache.join("frames");
     runs.export(group, &result, &dir, &mut |_| ()).unwrap();
     let index: FrameIndex =
@@ -158,7 +164,7 @@ fn a_group_is_measured_at_equal_rays_and_tells_bias_from_noise() {
                 .for_each(|(m, v)| *m += f64::from(v) / EYE_FRAMES as f64);
         }
         for (&pixel, v) in again.pixels.iter().zip(eye) {
-            // Rows of the file run from the bottom.
+            // The rows of the file begin at the bottom.
             let (x, y) = (pixel as usize % 40, 29 - pixel as usize / 40);
             let at = &mean[(y * 40 + x) * 3..][..3];
             assert!(
@@ -168,7 +174,7 @@ fn a_group_is_measured_at_equal_rays_and_tells_bias_from_noise() {
         }
     }
     assert_eq!(frame("reference", 0), frame("reference", 48), "nothing moves");
-    // What metrics take for the time before the beginning is the truth, whatever the method.
+    // For the time before the beginning, metrics use the truth, whatever the method.
     assert!(index.methods.iter().all(|m| frame(&m.folder, 0) == frame("reference", 0)));
     assert!(index.methods.iter().all(|m| frame(&m.folder, 1) != frame("reference", 1)));
     std::fs::remove_dir_all(cache).unwrap();

@@ -1,4 +1,4 @@
-//! The steady state allocates nothing: a counting allocator watches every thread of the frame path.
+//! The steady state allocates nothing: a counting allocator checks every thread of the frame path.
 
 use counting_allocator::{Counting, Request};
 use dpm_rig::pipeline::on_frame_path;
@@ -7,18 +7,18 @@ use dpm_tests::rigs::{demo_rig, run};
 use std::cell::Cell;
 use std::sync::atomic::{AtomicU64, Ordering};
 
-/// Allocations and releases on the frame path so far.
+/// Allocations and releases on the frame path.
 static COUNTED: AtomicU64 = AtomicU64::new(0);
-/// Allocations anywhere: proof that the counter is in use.
+/// Allocations anywhere, as proof that the counter is in use.
 static ALL: AtomicU64 = AtomicU64::new(0);
-/// Print where the first few happened.
+/// Whether to print where the first few happened.
 static SHOWN: AtomicU64 = AtomicU64::new(0);
 
 thread_local! {
     static SHOWING: Cell<bool> = const { Cell::new(false) };
 }
 
-/// Touches atomics and thread-locals without destructors only; the trace is taken with counting switched off.
+/// Uses only atomics and thread-locals without destructors. The trace is taken while counting is off.
 fn watch(request: Request) {
     ALL.fetch_add(1, Ordering::Relaxed);
     if on_frame_path() && !SHOWING.get() {
@@ -54,7 +54,7 @@ fn the_steady_state_allocates_nothing() {
             assert_eq!(during, 0, "{settings:?}: allocations and releases on the frame path");
             assert!(ALL.load(Ordering::Relaxed) > all, "the allocator is not the one in use");
         }
-        // The probe itself: a box made here is not on the frame path.
+        // The probe itself: a box that is made here is not on the frame path.
         assert!(!on_frame_path());
     });
 }

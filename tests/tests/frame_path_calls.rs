@@ -1,8 +1,8 @@
-//! A hundred thousand frames through the whole pipeline at real pace: on the frame path nothing is allocated, and the kernel is asked
-//! for nothing but to wait, to wake and to tell the time.
+//! A hundred thousand frames through the whole pipeline at real pace: on the frame path nothing is allocated, and the
+//! only system calls are those that wait, wake and read the time.
 //!
-//! The kernel itself is the witness: a filter (seccomp) turns every other call of every thread into a signal, whose handler looks
-//! whether the thread is on the frame path, makes the call in its stead and goes on.
+//! The kernel itself checks this: a filter (seccomp) turns every other call of every thread into a signal. The
+//! signal's handler checks whether the thread is on the frame path, makes the call in its place and continues.
 #![cfg(all(target_os = "linux", target_arch = "x86_64"))]
 #![allow(unsafe_code)]
 
@@ -13,7 +13,7 @@ use dpm_tests::rigs::demo_rig;
 use std::sync::atomic::{AtomicI64, AtomicU64, Ordering};
 use std::sync::Arc;
 
-/// What a stage may ask of the kernel: to sleep, to be woken and to wake; the time, where it is not read without a call.
+/// Calls that a stage may make: to sleep, to be woken and to wake; and to read the time, where that requires a call.
 const LISTED: [i64; 5] = [
     libc::SYS_futex,
     libc::SYS_clock_nanosleep,
@@ -21,8 +21,9 @@ const LISTED: [i64; 5] = [
     libc::SYS_sched_yield,
     libc::SYS_clock_gettime,
 ];
-/// What the C library does while signals are held back, at the beginning and the end of a thread, and the return from a handler. None of it can
-/// stand in for a call that frames could make: memory comes by other calls, or through the allocator that counts.
+/// Calls that the C library makes while signals are blocked, at the beginning and the end of a thread, and the return
+/// from a handler. None of them could replace a call that a frame might make: memory comes from other calls, or from
+/// the counting allocator.
 const AROUND_THREADS: [i64; 11] = [
     libc::SYS_rt_sigreturn,
     libc::SYS_rt_sigprocmask,
@@ -31,14 +32,14 @@ const AROUND_THREADS: [i64; 11] = [
     libc::SYS_set_robust_list,
     libc::SYS_rseq,
     libc::SYS_madvise,
-    // The stack of a thread that nobody joins.
+    // The stack of a thread that is not joined.
     libc::SYS_munmap,
     libc::SYS_gettid,
     libc::SYS_exit,
     libc::SYS_exit_group,
 ];
 
-/// Calls that were neither, made anywhere and on the frame path; the numbers of the first few of the latter.
+/// Calls of neither kind, anywhere and on the frame path; and the numbers of the first few on the frame path.
 static ELSEWHERE: AtomicU64 = AtomicU64::new(0);
 static ON_THE_PATH: AtomicU64 = AtomicU64::new(0);
 static FIRST: [AtomicI64; 8] = [const { AtomicI64::new(-1) }; 8];
@@ -52,7 +53,7 @@ static ALLOCATOR: Counting = Counting::telling(|_| {
     }
 });
 
-// The one place from which the filter lets every call through: number and six arguments as a C function takes them.
+// The only place from which the filter permits every call: a C function that takes the number and six arguments.
 std::arch::global_asm!(
     "dpm_test_gate:",
     "mov rax, rdi",
@@ -72,9 +73,9 @@ extern "C" {
     static dpm_test_gate_end: u8;
 }
 
-/// Notes the call and makes it. Touches atomics and a thread-local without destructor only.
+/// Records the call and makes it. Uses only atomics and a thread-local without destructor.
 extern "C" fn on_call(_: libc::c_int, _: *mut libc::siginfo_t, context: *mut libc::c_void) {
-    // SAFETY: the kernel gives a handler with SA_SIGINFO its thread's context, which nobody else has.
+    // SAFETY: the kernel gives a handler with SA_SIGINFO its thread's context, to which nothing else has access.
     let registers = unsafe { &mut (*context.cast::<libc::ucontext_t>()).uc_mcontext.gregs };
     let number = registers[libc::REG_RAX as usize];
     if on_frame_path() {
@@ -86,7 +87,7 @@ extern "C" fn on_call(_: libc::c_int, _: *mut libc::siginfo_t, context: *mut lib
         ELSEWHERE.fetch_add(1, Ordering::Relaxed);
     }
     let argument = |register: i32| registers[register as usize];
-    // SAFETY: the very call that the thread was about to make.
+    // SAFETY: the same call that the thread was about to make.
     let result = unsafe {
         dpm_test_gate(
             number,
@@ -101,7 +102,7 @@ extern "C" fn on_call(_: libc::c_int, _: *mut libc::siginfo_t, context: *mut lib
     registers[libc::REG_RAX as usize] = result;
 }
 
-/// Puts the calling thread, and those that it makes from now on, under the filter.
+/// Puts the calling thread, and those that it creates from now on, under the filter.
 fn watch_calls() -> std::io::Result<()> {
     let op = |code: u32, jt: usize, jf: usize, k: u32| libc::sock_filter {
         code: code as u16,
@@ -127,8 +128,8 @@ fn watch_calls() -> std::io::Result<()> {
     }
     program.extend([end(libc::SECCOMP_RET_TRAP), end(libc::SECCOMP_RET_ALLOW)]);
     let filter = libc::sock_fprog { len: program.len() as u16, filter: program.as_mut_ptr() };
-    // SAFETY: plain integers, for which all zero bits are valid; the handler is what SA_SIGINFO asks for; `filter` points to `program`,
-    // and both outlive the calls.
+    // SAFETY: plain integers, for which all zero bits are valid; the handler has the form that SA_SIGINFO requires;
+    // `filter` points to `program`, and both outlive the calls.
     let rc = unsafe {
         let mut action: libc::sigaction = std::mem::zeroed();
         action.sa_sigaction = on_call as extern "C" fn(_, _, _) as usize;
@@ -148,7 +149,7 @@ fn watch_calls() -> std::io::Result<()> {
     }
 }
 
-/// Several rigs side by side, so that it takes seconds: 2800 frames a second is what a panel of eight planes can show.
+/// Several rigs in parallel, so that the test takes seconds: a panel of eight planes can show 2800 frames per second.
 const RIGS: u64 = 4;
 const FRAMES: u64 = 25_000;
 

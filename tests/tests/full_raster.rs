@@ -1,5 +1,6 @@
-//! Found in use, real pace at full raster: the projector's clock was a quarter to half a millisecond wrong while frames flowed, and registration
-//! twenty times worse than at virtual pace, where every test looked. Frames are prepared, so that a slow GPU takes no part.
+//! Found in use, real pace at full raster: the projector's clock was wrong by a quarter to half a millisecond while
+//! frames flowed, and registration was twenty times worse than at virtual pace, at which every test ran. Frames are
+//! prepared, so that a slow GPU has no influence.
 
 use dpm_rig::config::{Overrides, RigConfig};
 use dpm_rig::pipeline::{run_prepared, RunOptions, RunOutcome};
@@ -7,17 +8,18 @@ use dpm_rig::rig::Rig;
 use dpm_rig::telemetry::monitor::RunMonitor;
 use std::sync::Arc;
 
-/// Two seconds at 240 frames/s: half a slot of error, which is what a reply that is looked at a slot late costs, is 2 ms here, or 3 px.
+/// Two seconds at 240 frames/s. A reply that is read one slot late causes an error of half a slot, which is 2 ms
+/// here, or 3 px.
 const SLOTS: u64 = 480;
 
 fn run(pace: &str) -> RunOutcome {
     let flags = [
         format!("real_time.pace=\"{pace}\""),
-        // Noise of a tracker would hide what the clock does.
+        // Noise of a tracker would hide the effect of the clock.
         "tracker.noise_m=0".into(),
         "tracker.noise_rad=0".into(),
         "projector.frame_rate=240".into(),
-        // Steady motion, which prediction knows at any horizon: what is left is the clock's.
+        // Steady motion, which prediction knows at any horizon, so that only the clock's error remains.
         "scene.bodies.0.motion={ kind = \"translate\", speed_m_s = 1.0, amplitude_m = 4.0 }".into(),
     ];
     let config = RigConfig::demo(&Overrides { variables: vec![], flags: flags.into() });
@@ -34,7 +36,7 @@ fn run(pace: &str) -> RunOutcome {
 fn at_real_pace_and_full_raster_the_clock_is_right_and_light_lands_where_it_does_at_virtual_pace() {
     let ideal = run("virtual").report.registration_error_px.expect("light at virtual pace");
     let mut told = String::new();
-    // A machine that stands still itself in one run does not in each of three.
+    // The machine itself may stand still in one run, but not in each of three.
     for _ in 0..3 {
         let report = run("real").report;
         let clock = report.clock_error_ms.expect("light at real pace");
@@ -59,8 +61,8 @@ fn at_real_pace_and_full_raster_the_clock_is_right_and_light_lands_where_it_does
         );
         println!("{told}");
         let is_right = clock.spread.p99.abs() <= limit_ms && clock.spread.p50.abs() <= limit_ms;
-        // Frames that a busy machine made late are lit a slot and more behind the body: no clock can help them, so the law is about the others.
-        // A fiftieth of a pixel is 13 us at 1 m/s.
+        // Frames that a busy machine made late are lit a slot or more behind the body, whatever the clock, so the law
+        // concerns the others. A fiftieth of a pixel is 13 us at 1 m/s.
         let is_registered = in_time.p99 <= (2.0 * ideal.p99).max(0.02);
         if is_right && is_registered && bound_ns.is_some_and(|ns| ns > 0) {
             return;

@@ -1,4 +1,5 @@
-//! A gaze that the tracker no longer tells: held, then the zones of full quality grow until all of the picture is in them.
+//! A gaze that is no longer tracked is held; then the zones of full quality grow until they contain the whole
+//! picture.
 
 use dpm_render::{FrameInputs, Renderer, RendererSettings};
 use dpm_rig::pipeline::renderer_settings;
@@ -8,7 +9,8 @@ use dpm_tests::rigs::demo_rig;
 #[test]
 fn wider_zones_are_the_zones_of_a_rig_file_with_wider_angles() {
     with_gpu(|gpu| {
-        // Angles that cut through the small picture; no rate map and no checkerboard, so samples follow the zones alone.
+        // Angles that divide the small picture. There is no rate map and no checkerboard, so samples follow the zones
+        // alone.
         let rig = demo_rig(
             64,
             48,

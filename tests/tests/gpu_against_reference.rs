@@ -1,4 +1,5 @@
-//! The GPU's pictures against the f64 reference, as the rig sees them: rays from the projector, radiance toward the eye.
+//! Compares the GPU's pictures with the f64 reference, in the rig's geometry: rays from the projector, radiance
+//! toward the eye.
 
 use dpm_lab::reference::Sampler;
 use dpm_lab::stability::gpu_shot::Shot;
@@ -17,7 +18,7 @@ fn shot(scene: &Scene) -> Shot<'_> {
     Shot { eye: Some(DVec3::new(-0.9, 1.6, 2.2)), spp: 32, frames: 32, ..Shot::new(scene, camera) }
 }
 
-/// A pose that turns about all axes.
+/// A pose that is rotated about all axes.
 fn tilted(x: f64, y: f64, z: f64) -> DAffine3 {
     DAffine3::from_rotation_translation(
         DQuat::from_euler(glam::EulerRot::XYZ, 0.3, 0.8, -0.2),
@@ -151,11 +152,11 @@ fn holes_sides_and_a_thousand_lamps() {
             quad(Vec3::new(-0.8, 0.1, 0.5), Vec3::X * 0.8, Vec3::new(0.0, 0.7, -0.2)),
             sheet.clone(),
         );
-        // The same turned away from the projector: its back shows.
+        // The same, facing away from the projector: its back is visible.
         add(&mut scene, quad(Vec3::new(0.8, 0.1, 0.5), Vec3::X * -0.7, Vec3::new(0.0, 0.6, -0.2)), sheet);
-        // Single-sided and turned away: black, and it blocks light.
+        // Single-sided and facing away: black, and it blocks light.
         add(&mut scene, quad(Vec3::new(0.35, 0.05, -0.4), Vec3::X * -0.7, Vec3::Y * 0.5), diffuse(Vec3::ONE));
-        // 20,480 emissive triangles; the alias table must know them all.
+        // 20,480 emissive triangles; the alias table must contain them all.
         add(
             &mut scene,
             sphere(Vec3::ZERO, 0.25, 5, true),

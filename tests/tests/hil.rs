@@ -1,5 +1,6 @@
-//! USB through a real kernel: usbcore, usbfs and usbhid on one side, device models behind `vhci_hcd` on the other. `./x hil` boots a
-//! kernel for these tests; on a machine of one's own they run as root after `modprobe vhci-hcd`, with `--ignored`.
+//! USB through a real kernel: usbcore, usbfs and usbhid on one side, device models behind `vhci_hcd` on the other.
+//! `./x hil` boots a kernel for these tests. On your own machine run them as root after `modprobe vhci-hcd`, with
+//! `--ignored`.
 
 use std::os::fd::AsRawFd;
 use std::os::unix::net::UnixStream;
@@ -26,7 +27,7 @@ use hil_mock::usb_model::Speed;
 use hil_mock::usb_plug::{monotonic_clock, Clock, Fault, UsbCable, UsbPlug};
 use hil_mock::usbip::serve_imported;
 
-/// Where the kernel takes virtual devices.
+/// The kernel's interface for virtual devices.
 const VHCI: &str = "/sys/devices/platform/vhci_hcd.0";
 
 /// Attaches `plug` to a free port of the virtual controller, as `usbip attach` does after its import.
@@ -47,7 +48,7 @@ fn attach(plug: &UsbPlug) {
     std::thread::spawn(move || serve_imported(ours, cable));
 }
 
-/// Waits for what the kernel and udev-less device nodes take to appear.
+/// Waits for a result of the kernel, including device nodes without udev.
 fn within<T>(limit: Duration, what: &str, mut look: impl FnMut() -> Option<T>) -> T {
     let start = Instant::now();
     loop {
@@ -74,7 +75,7 @@ fn dlpc900_patterns_cross_the_kernel_and_the_hid_driver_is_detached() {
     let plug = UsbPlug::new(model.clone(), clock.clone());
     attach(&plug);
     within(ENUMERATION, "enumerated", || list().ok().filter(|l| l.len() == 1));
-    // The kernel's own HID driver has asked for the report descriptor and bound.
+    // The kernel's own HID driver has requested the report descriptor and is bound.
     within(ENUMERATION, "bound by usbhid", || {
         let entries = std::fs::read_dir("/sys/bus/usb/drivers/usbhid").ok()?;
         entries.filter_map(Result::ok).find(|e| e.file_name().to_string_lossy().contains(':'))
@@ -171,11 +172,12 @@ impl Rig {
         let start = Instant::now();
         loop {
             let now: HostTime = (self.clock)();
-            // What the link says about losing the device is in its state.
+            // The link's state records the loss of the device.
             let _ = self.link.poll(now, &mut self.usb);
             match self.link.state() {
                 LinkState::Ready => self.link.arm(0),
-                // An emulated kernel on a busy machine may pause for longer than the watchdog allows: going dark then is right.
+                // An emulated kernel on a busy machine may pause for longer than the watchdog permits; going dark is
+                // then correct.
                 LinkState::Faulted => self.link.arm(faults::WATCHDOG),
                 LinkState::Streaming => {
                     if let Some(slots) = self.link.slots() {

@@ -1,4 +1,5 @@
-//! Rasters at the limit of what a device binds at once: traced by every method whose own buffers fit, refused by name where they do not.
+//! Rasters at the limit of what a device can bind at once: every method whose own buffers fit can trace them, and the
+//! others are refused by name.
 
 use dpm_lab::sequence::{draw, poses_at};
 use dpm_render::{RenderError, Renderer, RendererSettings};
@@ -29,11 +30,11 @@ fn a_raster_is_traced_where_the_buffers_of_its_method_fit() {
                 (Ok(_), false) => panic!("{what} binds more than the device allows"),
                 (Err(e), _) => panic!("{what}: {e}"),
             };
-            // What is looked at afterwards fits too.
+            // The buffers that are read back afterwards fit too.
             let mut slot = renderer.create_slot(true).unwrap_or_else(|e| panic!("{what}: {e}"));
             let poses = poses_at(&rig, 0);
             let mut frame = |k| draw(&rig, &mut renderer, &mut slot, &poses, k, 1, 1.0).map(|c| c.counters());
-            // Both of the buffers that frames write in turn.
+            // Both of the buffers that frames write alternately.
             let counted = [frame(0).unwrap(), frame(1).unwrap()];
             for c in counted {
                 assert!(c.lit_pixels > width * height / 20 && c.samples > 0, "{what}: {c:?}");

@@ -1,5 +1,5 @@
-//! What a scene does not need is compiled away, and tables are read as suits the device. That may cost speed only: every pixel stays the
-//! same, bit for bit.
+//! What a scene does not need is compiled away, and tables are read in the way that suits the device. This may affect
+//! only the speed: every pixel stays the same, bit for bit.
 
 use dpm_lab::scene_plan::scene_plan;
 use dpm_lab::sequence::{draw, poses_at};
@@ -165,12 +165,12 @@ fn a_plan_tells_spare_code_from_parts_of_the_picture() {
         {
             let s = of(spare);
             assert!(s.pixels_identical && !s.changes_pictures && s.difference == 0.0, "{spare}: {s:?}");
-            // Rays that meet nothing are rays.
+            // Rays that hit nothing also count.
             let of_tiles = spare == "tiles without bodies" && s.without_rays < s.with_rays;
             assert!(of_tiles || s.without_rays == s.with_rays, "{spare} of {method}: {s:?}");
         }
         let parts: &[&str] = match method {
-            // The paper's filter begins beyond 15 degrees, where this picture is not.
+            // The paper's filter begins at 15 degrees, which is outside this picture.
             "dpm" => &["allocation by variance", "spatial filter taps"],
             _ => &["rate map", "checkerboard", "spp by angle", "history and reprojection"],
         };
@@ -180,7 +180,7 @@ fn a_plan_tells_spare_code_from_parts_of_the_picture() {
             assert!(s.changes_pictures && !s.pixels_identical && s.difference > 1e-4, "{part}: {s:?}");
             assert!(s.without_ms > 0.0 && s.with_ms > 0.0 && !s.is_wrong(), "{part}: {s:?}");
         }
-        // Parts that the scene calls for stand beside the scene without them.
+        // A scene with each of these parts is compared with the scene without it.
         for part in ["textures", "normal maps", "specular", "diffuse", "emissive", "environment"] {
             let s = of(part);
             assert!(s.changes_pictures && s.difference > 1e-4 && s.without_ms > 0.0, "{part}: {s:?}");
@@ -190,11 +190,11 @@ fn a_plan_tells_spare_code_from_parts_of_the_picture() {
             image.changes_pictures && image.difference < 0.6,
             "the same light by other samples: {image:?}"
         );
-        // What traces fewer pixels traces fewer rays; filters trace none.
+        // Tracing fewer pixels traces fewer rays; filters trace none.
         if method == "paper" {
             assert!(of("checkerboard").with_rays < 0.8 * of("checkerboard").without_rays);
             assert!(of("rate map").with_rays < of("rate map").without_rays);
-            // The same light, noisier: a pass that read what nobody wrote would be farther off.
+            // The same light with more noise; a pass that read unwritten memory would differ more.
             assert!(of("history and reprojection").difference < 0.6);
         }
         assert!(of("indirect light").with_rays > of("indirect light").without_rays);

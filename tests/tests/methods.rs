@@ -1,5 +1,6 @@
-//! The passes between tracing and light: energy is kept, and the method of this program beats independent samples at equal rays. That rates
-//! are the CPU's, nobody waits and broken histories are forgotten are stability cases (`tracer_extremes.rs` runs them).
+//! The passes between tracing and light: energy is conserved, and this program's method is better than independent
+//! samples at equal rays. Stability cases (run by `tracer_extremes.rs`) check that rates equal the CPU's, that no
+//! pixel waits forever, and that broken histories are forgotten.
 
 use dpm_device::planes::Raster;
 use dpm_lab::sequence::{eye_mean, rmse, Span, Theatre};
@@ -44,7 +45,7 @@ fn method(rig: &Rig, which: RenderMethod) -> Method {
     render.method = which;
     let mut method = render.to_method();
     method.paper.zone_spp = [4, 4, 2];
-    // The picture is small: angles that cut through it.
+    // The picture is small, so these angles divide it.
     method.paper.phi_h_deg = 5.0;
     method.paper.phi_q_deg = 10.0;
     method.paper.filter_from_deg = 6.0;
@@ -110,7 +111,8 @@ fn dpm_shows_a_body_at_one_metre_a_second_where_it_is() {
     let width = theatre.raster().width();
     let probes = theatre.probes();
     let at = |pixel: u32, body: usize| probes.iter().position(|p| p.pixel == pixel && p.body == body);
-    // [Lucas81]: the displacement along the motion that explains most of the difference, by the reference's own slopes.
+    // [Lucas81]: the displacement along the motion that explains most of the difference, using the reference's own
+    // slopes.
     let displacement = |picture: &[glam::Vec3]| {
         let (mut product, mut square) = (0.0f64, 0.0f64);
         for (i, p) in probes.iter().enumerate().filter(|(_, p)| p.body == 0 && p.pixel % width > 0) {
@@ -125,7 +127,7 @@ fn dpm_shows_a_body_at_one_metre_a_second_where_it_is() {
         assert!(square > 0.0, "the body has edges or highlights");
         product / square
     };
-    // The measure itself: the reference moved by one pixel is found one pixel away.
+    // Check of the measure itself: the reference moved by one pixel is found one pixel away.
     let moved: Vec<glam::Vec3> = probes
         .iter()
         .map(|p| at(p.pixel.wrapping_sub(1), p.body).map_or(glam::Vec3::NAN, |i| truth[i]))
@@ -137,8 +139,8 @@ fn dpm_shows_a_body_at_one_metre_a_second_where_it_is() {
     no_validation_messages();
 }
 
-/// Found in use: a run that did not repeat. Which of the slots in flight draws a frame is chance; what it shows is not, also where a body leaves tiles
-/// and comes back to them.
+/// Found in use: a run was not repeatable. Which of the slots in flight draws a frame is arbitrary, but its picture
+/// must not be, also where a body leaves tiles and returns to them.
 #[test]
 fn what_a_frame_shows_does_not_depend_on_the_slot_that_draws_it() {
     let (rig, gpu, _) = stage(Span { last_slot: 2, warm_up: 1, kept: 1 }, false);
@@ -154,7 +156,7 @@ fn what_a_frame_shows_does_not_depend_on_the_slot_that_draws_it() {
         let mut slots: Vec<_> = (0..4).map(|_| renderer.create_slot(false).unwrap()).collect();
         let mut poses = Vec::new();
         let frame = |k: usize| {
-            // By some four tiles to and fro, at rest for three frames at a time.
+            // Back and forth by about four tiles, at rest for three frames at a time.
             let x = 0.16 * ((k / 3) as f64 * 1.9).sin();
             let moved: Vec<_> = rest.iter().map(|m| DAffine3::from_translation(DVec3::X * x) * *m).collect();
             rig.scene_poses(&moved, &mut poses);

@@ -1,4 +1,5 @@
-//! The packing shader against the CPU's packer, byte for byte, at rasters of every alignment; and a rig that packs on the GPU.
+//! Compares the packing shader with the CPU's packer, byte for byte, at rasters of every alignment; and runs a rig
+//! that packs on the GPU.
 
 use dpm_device::planes::{Channel, PlaneSchedule, PlaneSpec, Raster};
 use dpm_lab::reference::Sampler;
@@ -16,7 +17,7 @@ fn on_gpu(gpu: &Arc<Gpu>, raster: Raster, schedule: PlaneSchedule, values: &[u32
     let len = pack::gpu::len_bytes(raster, &schedule);
     let mut codes = Buffer::new(gpu, "codes", values.len() * 4, MemoryKind::Upload).unwrap();
     codes.bytes_mut()[..values.len() * 4].copy_from_slice(bytemuck::cast_slice(values));
-    // What is not written would stay all ones and show.
+    // Words that are not written would stay all ones and be visible.
     let ones = vec![u32::MAX; len.div_ceil(4)];
     let planes = Buffer::from_slice(gpu, "planes", &ones).unwrap();
     let planes_host = Buffer::new(gpu, "planes", len, MemoryKind::Readback).unwrap();
@@ -49,7 +50,7 @@ fn on_gpu(gpu: &Arc<Gpu>, raster: Raster, schedule: PlaneSchedule, values: &[u32
 
 #[test]
 fn planes_of_gpu_and_cpu_are_the_same_bytes() {
-    // Two planes only, in an order of their own: most bits are shown by no plane.
+    // Only two planes, in an unusual order: most bits are in no plane.
     let odd = [PlaneSpec { channel: Channel::Blue, bit: 7 }, PlaneSpec { channel: Channel::Red, bit: 0 }];
     let schedules = [PlaneSchedule::rgb24(), PlaneSchedule::mono8(), PlaneSchedule::new(&odd).unwrap()];
     let sizes = [
@@ -69,7 +70,7 @@ fn planes_of_gpu_and_cpu_are_the_same_bytes() {
         let mut random = Sampler::new(77, 0);
         for (width, height) in sizes {
             let raster = Raster::new(width, height).unwrap();
-            // All 32 bits are random: the upper eight must not show.
+            // All 32 bits are random; the upper eight must have no effect.
             let codes: Vec<u32> = (0..raster.pixel_count()).map(|_| random.next_u64() as u32).collect();
             for schedule in schedules {
                 let mut expected = BitPlaneFrame::new(raster, schedule);
@@ -85,7 +86,7 @@ fn planes_of_gpu_and_cpu_are_the_same_bytes() {
 fn light_is_the_same_whoever_packs() {
     with_gpu(|gpu| {
         let light = |packer: &str| {
-            // 70 is no multiple of 8: rows end within a byte.
+            // 70 is not a multiple of 8, so rows end within a byte.
             let rig = demo_rig(70, 48, &[&format!("render.packer=\"{packer}\"")]);
             let (outcome, _) = run(gpu, &rig, 20, 0);
             assert_eq!((outcome.light_mismatches, outcome.report.frames_lit), (0, 20));

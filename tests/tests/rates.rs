@@ -1,5 +1,6 @@
-//! Found in use, C2, R5, R6 and R21: every frame rate with every tracker, with nothing but the defaults, at real pace. The light is compared with
-//! where the bodies truly were; frames are rendered up to 120 a second and prepared from 240 a second on.
+//! Found in use, C2, R5, R6 and R21: every frame rate with every tracker, with the defaults only, at real pace. The
+//! light is compared with the true positions of the bodies. Frames are rendered at up to 120 per second and prepared
+//! from 240 per second on.
 
 use dpm_render::gpu::Gpu;
 use dpm_rig::pipeline::{self, RunOptions, RunOutcome};
@@ -9,14 +10,14 @@ use dpm_tests::gpu::with_gpu;
 use dpm_tests::rigs::demo_rig;
 use std::sync::Arc;
 
-/// Frames a second and planes of each.
+/// Frames per second, and the number of planes of each.
 const RATES: [(u32, u32); 8] =
     [(24, 24), (30, 24), (60, 24), (100, 24), (120, 24), (240, 24), (947, 24), (2000, 8)];
-/// Samples of the tracker a second.
+/// Samples of the tracker per second.
 const TRACKERS: [u32; 4] = [30, 120, 500, 1000];
-/// From here on frames are prepared.
+/// From this rate on, frames are prepared.
 const PREPARED_FROM: u32 = 240;
-/// What is run of each, seconds.
+/// Duration of each run, seconds.
 const SECONDS: f64 = 0.8;
 
 fn rig(rate: u32, planes: u32, tracker: u32) -> Arc<Rig> {
@@ -43,11 +44,12 @@ fn run(gpu: Option<&Arc<Gpu>>, rig: &Arc<Rig>, rate: u32) -> RunOutcome {
     outcome.unwrap_or_else(|e| panic!("{rate} frames/s: {e}"))
 }
 
-/// What is wrong with a run; nothing if all is well.
+/// What is wrong with a run; `Ok` if nothing is.
 fn judged(outcome: &RunOutcome, rig: &Rig, rendered: bool) -> Result<(), String> {
     let report = &outcome.report;
     let shown = report.frames_lit + report.frames_dark;
-    // The first samples of a slow tracker come after the first frames: until there are enough of them to follow a body it is dark.
+    // The first samples of a slow tracker come after the first frames. A body is dark until there are enough samples
+    // to follow it.
     if report.frames_lit == 0 || 5 * report.frames_dark > 2 * shown {
         return Err(format!(
             "{} lit, {} dark: {:?}",
@@ -55,12 +57,12 @@ fn judged(outcome: &RunOutcome, rig: &Rig, rendered: bool) -> Result<(), String>
         ));
     }
     let Some(error) = report.registration_error_px else { return Err("no light to measure".into()) };
-    // Bodies that move at 1 m/s and turn; half of the time they move steadily, and prediction has no excuse.
+    // The bodies move at 1 m/s and turn. Half of the time they move steadily, where prediction must be accurate.
     let px_per_m = rig.camera.fx / 1.5;
     if error.p50 > 0.004 * px_per_m {
         return Err(format!("registration p50 {} px, {px_per_m} px are about a metre", error.p50));
     }
-    // No light is of poses that are older than prediction may carry them, and a slot.
+    // No light comes from poses that are older than the prediction time plus one slot.
     let oldest = report.motion_to_light_ms.map_or(0.0, |m| m.spread.max);
     let slot_ms = 1e3 / rig.rate().hz();
     if oldest > report.predict_ms + 2.0 * slot_ms {
@@ -73,7 +75,7 @@ fn judged(outcome: &RunOutcome, rig: &Rig, rendered: bool) -> Result<(), String>
     Ok(())
 }
 
-/// A shared machine may stand still in one run; not in each of three.
+/// A shared machine may stand still in one run, but not in each of three.
 fn holds(what: &str, mut run: impl FnMut() -> Result<(), String>) {
     let mut told = String::new();
     for _ in 0..3 {
@@ -105,7 +107,7 @@ fn every_frame_rate_lights_its_bodies_with_every_tracker_and_the_defaults() {
 fn a_renderer_slower_than_its_slots_lights_every_nth_slot_in_time() {
     with_gpu(|gpu| {
         holds("slow renderer", || {
-            // At 947 slots a second software Vulkan needs many slots for a frame.
+            // At 947 slots per second software Vulkan needs many slots for a frame.
             let rig = demo_rig(
                 96,
                 72,

@@ -1,4 +1,5 @@
-//! What comments and documents cite against `docs/REFERENCES.md`: nothing is cited that it does not list, nothing listed that nobody cites.
+//! Checks the citations in comments and documents against `docs/REFERENCES.md`: everything cited is listed, and
+//! everything listed is cited.
 
 use std::collections::BTreeSet;
 use std::fs::read_to_string;
@@ -22,8 +23,8 @@ fn files(folder: &Path, endings: &[&str]) -> Vec<PathBuf> {
     found
 }
 
-/// Keys in brackets in a text. Brackets with backslashes, which doc comments have around what is no link, cite whatever they hold, two
-/// with `;` between. Others cite when they hold letters and then two digits or more.
+/// Keys in brackets in a text. Brackets with backslashes, which doc comments use for text that is not a link, always
+/// cite; two keys are separated by `;`. Other brackets cite if they contain letters followed by two or more digits.
 fn cited(text: &str) -> Vec<String> {
     let mut keys = Vec::new();
     for (at, _) in text.match_indices('[') {

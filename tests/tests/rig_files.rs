@@ -1,4 +1,4 @@
-//! The rig files of the sources: each is accepted as it stands, and with the mocks in the place of its devices.
+//! The rig files of the sources: each is accepted unchanged, and with the mocks instead of its devices.
 
 use dpm_rig::config::{Overrides, Purpose, RigConfig};
 use std::path::Path;

@@ -1,5 +1,5 @@
-//! The house held to its plan: no file of the sources lies beside it, one file of the rig names the mocks, and no circle of imports joins
-//! the folders of a crate. What lies between crates Cargo keeps.
+//! Checks the structure of the sources: every file belongs to a module, only one file of the rig names the mocks, and
+//! no folders of a crate import each other in a circle. Cargo checks the dependencies between crates.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::path::{Path, PathBuf};
@@ -36,13 +36,13 @@ fn sources(folder: &Path) -> Vec<(PathBuf, String)> {
     all
 }
 
-/// The code of a file: without its comments, and without the module of tests at its end.
+/// The code of a file, without its comments and without the module of tests at its end.
 fn code(text: &str) -> String {
     let end = text.find("#[cfg(test)]\nmod ").unwrap_or(text.len());
     text[..end].lines().filter(|line| !line.trim_start().starts_with("//")).collect::<Vec<_>>().join("\n")
 }
 
-/// What follows `mark` in `text`, up to the end of the name.
+/// The names that follow `mark` in `text`.
 fn names_after<'a>(text: &'a str, mark: &'a str) -> impl Iterator<Item = &'a str> {
     text.split(mark).skip(1).map(|rest| {
         let end = rest.find(|c: char| c != '_' && !c.is_ascii_alphanumeric()).unwrap_or(rest.len());
@@ -50,7 +50,7 @@ fn names_after<'a>(text: &'a str, mark: &'a str) -> impl Iterator<Item = &'a str
     })
 }
 
-/// Files of `all`, sources of the folder `src`, that no module of it declares.
+/// Files of `all`, the sources in the folder `src`, that no module declares.
 fn undeclared(src: &Path, all: &[(PathBuf, String)]) -> Vec<PathBuf> {
     let mut declared: BTreeSet<PathBuf> = ["lib.rs", "main.rs"].map(|root| src.join(root)).into();
     for (path, text) in all {
@@ -61,7 +61,7 @@ fn undeclared(src: &Path, all: &[(PathBuf, String)]) -> Vec<PathBuf> {
         for name in names_after(text, "mod ") {
             declared.extend([inner.join(format!("{name}.rs")), inner.join(name).join("mod.rs")]);
         }
-        // Tests in a file beside the one that they test.
+        // Tests in a separate file beside the file that they test.
         for path in text.split("#[path = \"").skip(1).filter_map(|rest| rest.split('"').next()) {
             declared.extend([folder.join(path), inner.join(path)]);
         }
@@ -91,7 +91,8 @@ fn one_file_of_the_rig_names_the_mocks() {
     assert_eq!(naming, [PathBuf::from("mock.rs")]);
 }
 
-/// What no file of the engine may name in its code: threads, clocks, and ways to the outside. A medium comes in as a `Transport`.
+/// Names that no file of the engine may use in its code: threads, clocks, and I/O. A medium is passed in as a
+/// `Transport`.
 const OUTSIDE: [&str; 10] = [
     "std::thread",
     "SystemTime",
@@ -117,7 +118,7 @@ fn the_engine_has_no_thread_no_clock_and_no_io() {
     }
 }
 
-/// Modules at the top of a crate, and those whose names each uses.
+/// The modules at the top of a crate, and for each the modules whose names it uses.
 type Arrows = BTreeMap<String, BTreeSet<String>>;
 
 fn arrows(src: &Path) -> Arrows {
@@ -138,13 +139,13 @@ fn arrows(src: &Path) -> Arrows {
         let named = names_after(&code, "crate::").chain(names_after(&code, above));
         used.extend(named.filter(|name| *name != module).map(String::from));
     }
-    // Items that the crate's root gives out are no modules.
+    // Items that the crate's root re-exports are not modules.
     let modules: BTreeSet<String> = all.keys().cloned().collect();
     all.values_mut().for_each(|used| used.retain(|name| modules.contains(name)));
     all
 }
 
-/// A module that reaches itself, and the way.
+/// A module that depends on itself, and the path of the circle.
 fn circle(all: &Arrows) -> Option<Vec<String>> {
     fn walk<'a>(
         all: &'a Arrows,

@@ -1,5 +1,5 @@
-//! Rays, shapes, lights and histories at the edge of what numbers can hold: all stability cases on the GPU, under validation. And a lost body,
-//! which needs no numbers.
+//! Rays, shapes, lights and histories at the limits of number formats: all stability cases on the GPU, with
+//! validation. Also a lost body, for which there is no stability case.
 
 use dpm_lab::stability::gpu::cases;
 use dpm_lab::stability::gpu_shot::{Picture, Shot};
@@ -9,7 +9,7 @@ use dpm_scene::Material;
 use dpm_tests::gpu::with_gpu;
 use glam::{DVec3, Vec3};
 
-/// Every case, none left out: those that guard the newest code are among the slow ones.
+/// Every case, because those that guard the newest code are among the slow ones.
 #[test]
 fn every_case_passes_on_the_gpu() {
     with_gpu(|gpu| {
@@ -51,7 +51,7 @@ fn a_lost_body_gets_no_light_but_its_reflection_stays() {
         };
         assert!(on_ball(&there) > 50);
         assert_eq!(on_ball(&lost), 0, "no ray of the projector ends on a lost body");
-        // Mirrored in the floor it is red as before, wherever the floor was lit before.
+        // In the floor's reflection it is red as before, wherever the floor was lit before.
         let mut mirrored = 0;
         for i in 0..there.surfaces.len() {
             if there.lit(i) && there.surfaces[i].id >> 24 == 0 {

@@ -1,5 +1,6 @@
-//! Found in use, R21, the second half: where a renderer slower than its slots lights bodies that turn, against what its own predictor makes of the
-//! same samples offline at the same horizons. In a file of its own: nothing else runs beside it.
+//! Found in use, R21, the second half: compares where a renderer slower than its slots lights turning bodies with
+//! what its own predictor computes offline from the same samples at the same horizons. It is in a file of its own so
+//! that nothing else runs at the same time.
 
 use dpm_common::quantiles::Quantiles;
 use dpm_lab::offline::AgainstOffline;
@@ -9,7 +10,7 @@ use dpm_tests::gpu::with_gpu;
 use dpm_tests::rigs::demo_rig;
 use std::sync::Arc;
 
-/// Slots of 60 a second that are run: the demo's first body turns every 0.4 s.
+/// Number of slots of the run, at 60 per second. The demo's first body turns every 0.4 s.
 const SLOTS: u64 = 480;
 
 fn row(what: &str, q: &Quantiles) {
@@ -22,22 +23,22 @@ fn judged(outcome: &pipeline::RunOutcome, compared: &AgainstOffline) -> Result<(
     if compared.frames < 20 || compared.frames < lit {
         return Err(format!("{} of {lit} lit frames compared", compared.frames));
     }
-    // The bodies turn while they are looked at; a run without turns would be as good as its predictor whatever it did.
+    // The bodies turn during the measurement. In a run without turns, light and predictor would always agree.
     if compared.offline.p99 < 20.0 * compared.offline.p50.max(0.01) {
         return Err(format!("no turns: offline p50 {}, p99 {}", compared.offline.p50, compared.offline.p99));
     }
-    // The meter is the run's own.
+    // The value comes from the run's own meter.
     let told = report.registration_error_px.ok_or("no light")?;
     if (told.p99 / compared.run.p99 - 1.0).abs() > 0.02 {
         return Err(format!("the report says p99 {} px, these frames {} px", told.p99, compared.run.p99));
     }
-    // The other ratio is told only: which turns the frames of some seconds meet is chance.
+    // The other ratio is only printed, because it is chance which turns the frames of a few seconds meet.
     let [ratio, _] = compared.ratios();
     if ratio.is_nan() || ratio > 1.2 {
         return Err(format!("p99 is {ratio:.3} times the predictor's"));
     }
-    // What is steady is not hidden by the turns: a frame for another instant than its light's would be off by the way in between, always. Not judged
-    // on a machine so busy that a frame takes a fifth of a second.
+    // The turns do not hide steady errors: a frame for another instant than its light's would always be off by the
+    // motion in between. This is not judged on a machine so busy that a frame takes a fifth of a second.
     let is_starved = compared.horizon_ms.p50 > 200.0;
     if !is_starved && compared.run.p50 > 1.2 * compared.offline.p50 + 0.02 {
         return Err(format!("p50 {} px, offline {} px", compared.run.p50, compared.offline.p50));
@@ -50,7 +51,7 @@ fn turns_are_lit_where_the_same_predictor_has_them_offline() {
     with_gpu(|gpu| {
         let rig = demo_rig(320, 240, &["real_time.pace=\"real\"", "projector.frame_rate=\"60\""]);
         let mut told = String::new();
-        // A shared machine may stand still in one run; not in each of three.
+        // A shared machine may stand still in one run, but not in each of three.
         for _ in 0..3 {
             let options = RunOptions { slots: SLOTS, keep_frames: SLOTS as usize, ..RunOptions::default() };
             let monitor = Arc::new(RunMonitor::default());

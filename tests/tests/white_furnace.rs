@@ -1,4 +1,4 @@
-//! Everything in even light, on the GPU: no surface may create energy, and those that lose none must vanish.
+//! Objects in uniform light, on the GPU: no surface may create energy, and surfaces that lose none must be invisible.
 
 use dpm_lab::stability::estimate::pooled;
 use dpm_lab::stability::gpu_shot::Shot;
@@ -20,7 +20,7 @@ fn a_white_lambertian_sphere_vanishes_exactly() {
         let scene = furnace(diffuse(Vec3::ONE));
         let camera = camera(64, 48, DVec3::new(0.0, 0.0, 5.0), DVec3::ZERO);
         let shot = Shot { depth: 8, ..Shot::new(&scene, camera) };
-        // An ordinary camera: the sphere cannot be told from the sky.
+        // An ordinary camera: the sphere is indistinguishable from the sky.
         let picture = shot.draw(gpu);
         let hits = (0..picture.surfaces.len()).filter(|&i| picture.hit(i)).count();
         assert!(hits > 500 && hits < 64 * 48, "{hits}");
@@ -42,7 +42,7 @@ fn a_white_lambertian_sphere_vanishes_exactly() {
 
 #[test]
 fn a_corner_of_white_walls_is_one() {
-    // Paths bounce many times before they leave; Russian roulette ends none of them for long.
+    // Paths bounce many times before they leave, and Russian roulette ends none of them for a long time.
     with_gpu(|gpu| {
         let mut scene = scene_of(floor(1.0, 0.0), diffuse(Vec3::ONE));
         add(&mut scene, quad(Vec3::new(-1.0, 0.0, -1.0), Vec3::X * 2.0, Vec3::Y * 2.0), diffuse(Vec3::ONE));
@@ -83,8 +83,8 @@ fn a_coated_white_sphere_keeps_all_light() {
 
 #[test]
 fn single_scattering_metal_keeps_what_theory_says() {
-    // A distant sphere in parallel projection shows every cosine mu with weight 2 mu: its mean is the average albedo
-    // E_avg = 2 int E(mu) mu dmu of a perfect GGX mirror without multiple scattering.
+    // A distant sphere in parallel projection shows every cosine mu with weight 2 mu. Its mean is therefore the
+    // average albedo E_avg = 2 int E(mu) mu dmu of a perfect GGX mirror without multiple scattering.
     with_gpu(|gpu| {
         for (alpha, expected) in [(0.25f32, 0.882), (0.5, 0.700), (1.0, 0.409)] {
             let metal = Material { roughness: alpha.sqrt(), ..Material::default() };
@@ -116,7 +116,7 @@ fn clear_glass_in_even_light_vanishes() {
             let camera = camera(24, 24, DVec3::new(0.0, 3.0, 5.0), DVec3::ZERO);
             let picture = Shot { spp: 64, frames: 8, depth: 32, ..Shot::new(&scene, camera) }.draw(gpu);
             let (mean, sigma) = pooled(picture.lit_estimates().collect::<Vec<_>>(), 0);
-            // A thin wall takes its reflection from the table, and there are two of them.
+            // A thin wall takes its reflection from the table, and it has two surfaces.
             let tolerance = if thin_walled || roughness > 0.0 { 4e-3 } else { 1e-4 };
             assert!(sigma < 5e-3, "{sigma}");
             assert!(

@@ -1,7 +1,8 @@
-//! The Git work tree that a program is compiled in, into a text in its code.
+//! Embeds the commit of the Git work tree in the program.
 //!
-//! A macro and no build script: a build script that watches Git makes Cargo compile all of its package again at every commit; what this
-//! macro names as read is a matter of the one crate that uses it, the thin program at the end.
+//! This is a macro and not a build script. With a build script that watches Git, Cargo recompiles the whole package
+//! at every commit. Files that this macro names as read concern only the crate that uses it, which is the thin
+//! program at the end.
 
 use proc_macro::TokenStream;
 use std::path::{Path, PathBuf};
@@ -10,15 +11,15 @@ use std::process::Command;
 /// Digits of a commit that are kept.
 const DIGITS: usize = 12;
 
-/// The first twelve digits of the commit that is checked out, `-dirty` after them when tracked files differ from it and Git is there to say
-/// so; `unknown` where the sources are no Git work tree of their own (an unpacked archive). The argument is the way from the using
-/// package's folder to the top of the sources, as a string literal.
+/// The first twelve digits of the commit that is checked out, followed by `-dirty` if tracked files differ from it
+/// and Git is available to tell; `unknown` if the sources are not a Git work tree of their own (an unpacked archive).
+/// The argument is the path from the using package's folder to the top of the sources, as a string literal.
 #[proc_macro]
 pub fn commit(from_package_to_top: TokenStream) -> TokenStream {
     let way = from_package_to_top.to_string();
     let package = std::env::var_os("CARGO_MANIFEST_DIR").map(PathBuf::from).unwrap_or_default();
     let found = Found::at(&package.join(way.trim_matches('"')));
-    // Named as read, so that the using crate, and no other, is compiled again when they change.
+    // Named as read, so that only the using crate is recompiled when they change.
     let read: String = (found.read.iter().filter_map(|p| p.to_str()))
         .map(|path| format!("const _: &[u8] = include_bytes!({path:?});\n"))
         .collect();
@@ -26,7 +27,7 @@ pub fn commit(from_package_to_top: TokenStream) -> TokenStream {
     format!("{{ {read} {text:?} }}").parse().expect("a block of constants and a string literal")
 }
 
-/// What a folder tells of its commit.
+/// The commit of a folder.
 #[derive(Debug, PartialEq)]
 struct Found {
     text: String,
@@ -35,7 +36,8 @@ struct Found {
 }
 
 impl Found {
-    /// Of the work tree whose top is `top`. One farther up is another project's, in which the sources happen to lie.
+    /// For the work tree whose top is `top`. A work tree further up belongs to another project that happens to
+    /// contain the sources.
     fn at(top: &Path) -> Self {
         let unknown = Self { text: "unknown".to_owned(), read: Vec::new() };
         let Ok(top) = top.canonicalize() else { return unknown };
@@ -45,10 +47,10 @@ impl Found {
     }
 }
 
-/// The commit that is checked out at `top`, and the files that tell.
+/// The commit that is checked out at `top`, and the files that determine it.
 fn head(top: &Path) -> Option<(String, Vec<PathBuf>)> {
     let dot = top.join(".git");
-    // In a linked work tree and in a submodule `.git` is a file that names the folder.
+    // In a linked work tree and in a submodule, `.git` is a file that names the folder.
     let folder = match std::fs::read_to_string(&dot) {
         Ok(text) => top.join(text.strip_prefix("gitdir:")?.trim()),
         Err(_) => dot,
@@ -59,7 +61,7 @@ fn head(top: &Path) -> Option<(String, Vec<PathBuf>)> {
     let commit = match text.strip_prefix("ref:").map(str::trim) {
         None => text,
         Some(name) => {
-            // Branches live in the common folder, loose or packed.
+            // Branches are stored in the common folder, loose or packed.
             let common = std::fs::read_to_string(folder.join("commondir"))
                 .map_or(folder.clone(), |way| folder.join(way.trim()));
             let (loose, packed) = (common.join(name), common.join("packed-refs"));
@@ -73,13 +75,13 @@ fn head(top: &Path) -> Option<(String, Vec<PathBuf>)> {
             }
         }
     };
-    // Grows with every commit, also with the one that makes a packed branch a loose one.
+    // It grows with every commit, including the one that makes a packed branch a loose one.
     read.extend(Some(folder.join("logs/HEAD")).filter(|log| log.is_file()));
     let digits: String = commit.chars().take(DIGITS).collect();
     (digits.len() == DIGITS && digits.chars().all(|c| c.is_ascii_hexdigit())).then_some((digits, read))
 }
 
-/// Git says that tracked files differ from the commit.
+/// True if Git reports that tracked files differ from the commit.
 fn is_dirty(top: &Path) -> bool {
     let said = Command::new("git")
         .args(["--no-optional-locks", "status", "--porcelain", "--untracked-files=no"])
@@ -162,7 +164,7 @@ mod tests {
         let unknown = Found { text: "unknown".into(), read: Vec::new() };
         assert_eq!(Found::at(&root.0.join("unpacked")), unknown);
         assert_eq!(Found::at(&root.0.join("nowhere")), unknown);
-        // The folder itself has one; it is no work tree that Git knows, so nothing is said of changes.
+        // The folder itself has a commit, but it is not a work tree that Git knows, so nothing is said about changes.
         assert_eq!(Found::at(&root.0).text, "a".repeat(12));
     }
 
@@ -176,7 +178,8 @@ mod tests {
             done.is_ok_and(|d| d.status.success())
         };
         if !git(&["init", "-q"]) {
-            // Without Git there is nobody to ask: that the program is built all the same is what `unknown` is for.
+            // Without Git the check is impossible. The program is built nevertheless, which is the purpose of
+            // `unknown`.
             return;
         }
         root.write("tracked", "1");

@@ -1,4 +1,4 @@
-//! Picture files into DLPC900 patterns, and the controller's state into lines for the operator.
+//! Converts picture files to DLPC900 patterns, and the controller's state to text for the operator.
 
 use dpm_device::dlpc900::driver::Status;
 use dpm_device::dlpc900::image::{Compression, PlaneOrder};
@@ -9,21 +9,21 @@ use dpm_device::regular_file;
 use std::fmt::Write as _;
 use std::path::{Path, PathBuf};
 
-/// Why pictures make no sequence.
+/// Why pictures cannot be made into a sequence.
 #[derive(Debug, thiserror::Error)]
 pub(crate) enum PatternFileError {
     /// A file cannot be read.
     #[error("{}: {why}", path.display())]
     Read {
-        /// Which file.
+        /// Path of the file.
         path: PathBuf,
-        /// What the reader says.
+        /// The reader's message.
         why: String,
     },
-    /// A picture of the wrong size.
+    /// A picture has the wrong size.
     #[error("{}: {width} x {height} pixels, the {dmd} has {dmd_width} x {dmd_height}: scale the picture", path.display())]
     Size {
-        /// Which file.
+        /// Path of the file.
         path: PathBuf,
         /// Its width.
         width: u32,
@@ -44,25 +44,25 @@ pub(crate) enum PatternFileError {
 /// How pictures are shown.
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct ShowAs {
-    /// Bits per pattern, 1 to 8; the pictures' highest bits are taken (1: black below 128).
+    /// Bits per pattern, 1 to 8, taken from the pictures' highest bits (1: black below 128).
     pub depth: u8,
-    /// Time lit, microseconds; `None` for the shortest that the DMD can.
+    /// Exposure, microseconds; `None` for the shortest that the DMD supports.
     pub exposure_us: Option<u32>,
-    /// Time black after each, microseconds.
+    /// Dark time after each pattern, microseconds.
     pub dark_us: u32,
-    /// LEDs as the pattern table counts them: 1 red, 2 green, 4 blue.
+    /// LEDs as coded in the pattern table: 1 red, 2 green, 4 blue.
     pub leds: u8,
-    /// Each waits for an edge at TRIG_IN1.
+    /// Each pattern waits for an edge at TRIG_IN1.
     pub wait_trigger: bool,
     /// How often the sequence runs.
     pub repeat: Repeat,
-    /// In which bytes the planes stand.
+    /// The order of the bytes that contain the planes.
     pub order: PlaneOrder,
-    /// How images are coded; `None` for the smallest.
+    /// How images are coded; `None` for the smallest coding.
     pub compression: Option<Compression>,
 }
 
-/// Largest file of a picture that is read, bytes.
+/// Largest picture file that is read, bytes.
 const MAX_PICTURE_BYTES: u64 = 256 << 20;
 
 /// Reads a picture of exactly the DMD's size as grey values. The size is checked before pixels are decoded.
@@ -83,7 +83,7 @@ pub(crate) fn read_grey(path: &Path, dmd: Dmd) -> Result<Vec<u8>, PatternFileErr
     Ok(open()?.decode().map_err(|e| fail(e.to_string()))?.into_luma8().into_raw())
 }
 
-/// The `depth` highest bits of grey values as planes, least significant first.
+/// Converts the `depth` highest bits of grey values to planes, least significant first.
 pub(crate) fn planes_of(grey: &[u8], raster: Raster, depth: u8) -> Vec<Vec<u8>> {
     let depth = depth.clamp(1, 8);
     let plane = |bit: u8| {
@@ -124,7 +124,7 @@ pub(crate) fn sequence_of(
     Ok(builder.finish(show.repeat, show.order, show.compression)?)
 }
 
-/// The controller's state, one fact a line.
+/// The controller's state, one fact per line.
 pub(crate) fn status_text(status: &Status) -> String {
     let mut s = String::new();
     let raster = status.dmd.raster();

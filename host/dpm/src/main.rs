@@ -1,4 +1,4 @@
-//! The program `dpm`: words into calls of the library, with the commit that it is compiled from.
+//! The program `dpm`: passes the command line to the library, with the commit from which it was compiled.
 
 /// `DPM_COMMIT` at compile time (for packagers), else what Git says.
 const COMMIT: &str = match option_env!("DPM_COMMIT") {

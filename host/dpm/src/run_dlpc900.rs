@@ -1,8 +1,10 @@
-//! `dpm run` on a DLPC900: frames loaded before they are shown, or patterns cut out of a video signal; watched, and put to rest.
+//! `dpm run` on a DLPC900: frames that are loaded in advance, or patterns from a video signal. Supervises the
+//! controller and puts it to rest.
 //!
-//! USB carries seconds, not frames, to a DLPC900, so nothing that a tracker says while it runs reaches its light. Preloaded, it shows the
-//! first frames of the rig's known motion over and over, three 8-bit patterns each (red, green, blue), whose bits the controller weighs
-//! itself. In video mode the light comes from whatever feeds its video input; this program sets it up and looks after it.
+//! A frame takes seconds over USB to a DLPC900, so no tracker sample during the run affects its light. In preloaded
+//! mode it repeats the first frames of the rig's known motion, each with three 8-bit patterns (red, green, blue)
+//! whose bits the controller weights itself. In video mode the light comes from the source at its video input; this
+//! program sets up the controller and supervises it.
 
 use crate::signals;
 use dpm_common::clock::Stopwatch;
@@ -29,19 +31,20 @@ use std::sync::atomic::{AtomicBool, AtomicU32, AtomicU8, Ordering};
 use std::sync::{Arc, Mutex, PoisonError};
 use std::time::Duration;
 
-/// How often the run looks for orders, which the thread that makes dark has obeyed by then.
+/// How often the run checks for orders. The dark thread has already obeyed them by then.
 const STEP: Duration = Duration::from_millis(20);
-/// How often the thread that makes dark looks for orders, at the interlock and for the end.
+/// How often the dark thread checks for orders, the interlock and the end.
 const DARK_STEP: Duration = Duration::from_millis(2);
-/// How often a controller is told to be dark until the run has acted on it itself: a start of the run's that was under way may have
-/// followed the first word.
+/// How often a controller is ordered to be dark until the run itself has acted on the order. A start that was in
+/// progress may have followed the first order.
 const AGAIN_NS: u64 = 10_000_000;
-/// How long a controller may be in other hands at the start: those of the run before, or of what puts it to rest after a SIGKILL.
+/// How long another process may use the controller at the start: the previous run, or the process that puts the
+/// controller to rest after a SIGKILL.
 const BUSY_PATIENCE_NS: u64 = 5_000_000_000;
-/// How often the controller is asked how it is, and a lost one is looked for.
+/// How often to query the controller's state, and to search for a lost controller.
 const LOOK_NS: u64 = 200_000_000;
 
-/// What a run on a DLPC900 did.
+/// Report of a run on a DLPC900.
 #[derive(Clone, Debug, serde::Serialize)]
 pub(crate) struct Dlpc900Report {
     /// Version of the program.
@@ -50,26 +53,26 @@ pub(crate) struct Dlpc900Report {
     pub dmd: &'static str,
     /// "preloaded" or "video".
     pub mode: &'static str,
-    /// Frames loaded; null in video mode, whose frames come from elsewhere.
+    /// Frames loaded; null in video mode, in which the frames come from elsewhere.
     pub frames_loaded: Option<usize>,
-    /// Frames a second that the pattern table adds up to.
+    /// Frames per second according to the times in the pattern table.
     pub frame_rate_hz: f64,
     /// Patterns in the table.
     pub patterns: usize,
     /// Bytes of coded images loaded; null in video mode.
     pub image_bytes: Option<usize>,
-    /// Time that the set-up took, the last time, seconds.
+    /// Duration of the last set-up, seconds.
     pub setup_s: f64,
-    /// Times that the controller was lost and set up again.
+    /// How often the controller was lost and set up again.
     pub came_back: u64,
     /// Wall time from the start of the sequence to its end, seconds.
     pub shown_s: f64,
-    /// What the operator should know.
+    /// Warnings for the operator.
     pub warnings: Vec<String>,
 }
 
 impl Dlpc900Report {
-    /// The report for people.
+    /// The report as text.
     pub(crate) fn to_table(&self) -> String {
         let mut out = format!(
             "projector  {} ({}), {} patterns, {:.3} frames/s\nset up in  {:.2} s, shown for {:.2} s, came back {} times\n",
@@ -85,16 +88,16 @@ impl Dlpc900Report {
     }
 }
 
-/// What the controller is set up with.
+/// What the controller shows.
 pub(crate) enum Show {
-    /// Frames that are loaded.
+    /// Loaded frames.
     Preloaded(PatternSequence),
-    /// Patterns out of the video signal.
+    /// Patterns from the video signal.
     Video(VideoPatterns),
 }
 
 impl Show {
-    /// Loaded and stopped.
+    /// Loads it; the sequence is stopped afterwards.
     fn load<P: HidPort>(&self, d: &mut Dlpc900<P>) -> Result<(), Dlpc900Error> {
         match self {
             Self::Preloaded(sequence) => d.upload(sequence, LedSetup::default(), &mut |_| ()),
@@ -110,17 +113,17 @@ impl Show {
     }
 }
 
-/// Most frames of `planes` planes that a DMD's controller holds.
+/// Maximum number of frames of `planes` planes in the memory of a DMD's controller.
 pub(crate) fn frames_held(dmd: Dmd, planes: usize) -> usize {
     let images = (dmd.max_planes() as usize / IMAGE_PLANES).min(MAX_IMAGES);
     images * (IMAGE_PLANES / planes.max(1))
 }
 
-/// `frames` as a sequence that runs for ever: for each channel one pattern of its eight bits, all of a frame in `frame_us` us.
-/// `exposure_us`: time lit of each pattern, its whole share of the frame when `None`.
+/// Makes `frames` into a sequence that runs forever. Each channel is one pattern of its eight bits, and all patterns
+/// of a frame take `frame_us` us. `exposure_us`: exposure of each pattern; its whole share of the frame if `None`.
 ///
 /// # Errors
-/// The rule of the controller that they break.
+/// The controller's rule that they break.
 pub(crate) fn preload(
     dmd: Dmd,
     schedule: &PlaneSchedule,
@@ -166,10 +169,10 @@ pub(crate) fn preload(
     builder.finish(Repeat::Forever, PlaneOrder::default(), None)
 }
 
-/// Runs the rig of `config`, whose backend is a DLPC900, until its frames are over or `monitor` asks to stop.
+/// Runs the rig of `config`, whose backend is a DLPC900, until its frames are over or `monitor` requests a stop.
 ///
 /// # Errors
-/// Bad scene or rules of the controller broken (exit code 2), a controller that fails (3), no GPU (4).
+/// A bad scene or a broken rule of the controller (exit code 2), a controller that fails (3), or no GPU (4).
 pub(crate) fn run_dlpc900(config: &RigConfig, monitor: &RunMonitor) -> Result<Dlpc900Report, Failure> {
     let ProjectorBackend::Dlpc900(backend) = &config.projector.backend else {
         return Err(Failure::new(FailureKind::BadInput, "projector.backend.kind is not \"dlpc900\""));
@@ -187,7 +190,7 @@ pub(crate) fn run_dlpc900(config: &RigConfig, monitor: &RunMonitor) -> Result<Dl
             Err(source) => break Err(Dlpc900Error::Port { doing: describe(place), source }),
         }
     };
-    // Before minutes of rendering: is it there, and the one that is meant?
+    // Before minutes of rendering, check that the controller is connected and has the right DMD.
     let dmd = backend.panel.dmd();
     let found = open()?.dmd();
     if found != dmd {
@@ -199,8 +202,8 @@ pub(crate) fn run_dlpc900(config: &RigConfig, monitor: &RunMonitor) -> Result<Dl
         return Err(Failure::new(FailureKind::BadInput, told));
     }
     let mut warnings =
-        vec!["a DLPC900 has no watchdog: if this machine fails, or this program and the one that looks after it are killed, it goes on \
-              showing; `dpm dlpc900 idle` ends it".into()];
+        vec!["a DLPC900 has no watchdog: if this machine fails, or this program and its guard process are both killed, it continues \
+              to show its patterns; `dpm dlpc900 idle` ends that".into()];
     let (show, frames_loaded) = match backend.mode {
         Dlpc900Mode::Preloaded => {
             let (sequence, frames) = load(config, backend, dmd, &mut warnings, monitor)?;
@@ -223,7 +226,7 @@ pub(crate) fn run_dlpc900(config: &RigConfig, monitor: &RunMonitor) -> Result<Dl
     Ok(report)
 }
 
-/// Renders the frames that fit.
+/// Renders as many frames as fit.
 fn load(
     config: &RigConfig,
     backend: &Dlpc900Config,
@@ -237,12 +240,13 @@ fn load(
     let frames = if matches!(config.tracker, TrackerConfig::Mock(_)) {
         let wanted = if config.run.frames == 0 { most as u64 } else { config.run.frames };
         if wanted > most as u64 {
-            warnings.push(format!("the {} holds {most} frames; they are shown over and over", dmd.name()));
+            warnings.push(format!("the {} holds {most} frames; they are shown repeatedly", dmd.name()));
         }
         wanted.min(most as u64)
     } else {
         warnings.push(
-            "nothing that the tracker says reaches preloaded frames: one is shown, all bodies at rest".into(),
+            "the tracker has no effect on preloaded frames: a single frame with all bodies at rest is shown"
+                .into(),
         );
         1
     };
@@ -276,7 +280,7 @@ fn load(
     Ok((sequence, packed.len()))
 }
 
-/// One-bit patterns of the video's 24 planes, the frame shared out evenly.
+/// One-bit patterns of the video's 24 planes, which share the frame equally.
 fn video(config: &RigConfig, backend: &Dlpc900Config, dmd: Dmd) -> VideoPatterns {
     let rate = config.projector.frame_rate;
     let frame_hz = rate.hz().round() as u32;
@@ -297,10 +301,10 @@ fn video(config: &RigConfig, backend: &Dlpc900Config, dmd: Dmd) -> VideoPatterns
     }
 }
 
-/// Sets the controller up, obeys orders, looks after it for `seconds` (for ever when `None`), and puts it to rest.
+/// Sets up the controller, obeys orders, supervises it for `seconds` (forever if `None`), and puts it to rest.
 ///
 /// # Errors
-/// The controller refuses or fails. While it is unplugged there is no error: it is looked for, and set up again.
+/// The controller refuses or fails. It is no error if it is unplugged: the run searches for it and sets it up again.
 pub(crate) fn present<P: HidPort>(
     open: &mut dyn FnMut() -> Result<Dlpc900<P>, Dlpc900Error>,
     show: &Show,
@@ -331,11 +335,11 @@ pub(crate) fn present<P: HidPort>(
     };
     let word = Word::default();
     if let Some(order) = monitor.take_order() {
-        // What stands from before the run, or was ordered while it rendered: the controller is set up dark.
+        // An order that stood before the run, or came while it rendered: the controller is set up dark.
         word.waiting.store(order as u8, Ordering::Relaxed);
     }
     let (result, rested) = std::thread::scope(|scope| {
-        // Also when this unwinds: the scope waits for the other thread.
+        // Also during a panic: the scope waits for the other thread.
         let _over = Over(&word);
         let spawned = std::thread::Builder::new()
             .name("dpm-dark".into())
@@ -361,7 +365,7 @@ pub(crate) fn present<P: HidPort>(
         // Whatever happened: stopped, LEDs off, mirrors exercised. A controller that is gone cannot be told, and one that does not
         // answer is not asked again: the process must end.
         d.hurry();
-        // Half a command may have gone out before the stop; the first one after it may be lost with it.
+        // Half a command may have been sent before the stop. The next command may be lost with it.
         let stopped = d.stop().or_else(|e| if is_gone(&e) { Err(e) } else { d.stop() });
         word.is_dark.store(stopped.is_ok(), Ordering::SeqCst);
         let rested = if matches!(stopped, Err(Dlpc900Error::Port { .. })) { stopped } else { d.idle() };
@@ -379,30 +383,30 @@ fn is_gone(e: &Dlpc900Error) -> bool {
     matches!(e, Dlpc900Error::Port { source: PortError::Gone | PortError::NotFound, .. })
 }
 
-/// What the run's thread and the one that makes dark tell each other. The second one is there because the first may be inside a call
-/// of the cable for a second, in an upload for half a minute, or stopped.
+/// What the run's thread and the dark thread share. The dark thread exists because the run's thread may spend a
+/// second inside a USB call or half a minute in an upload, or may be stopped.
 #[derive(Default)]
 struct Word {
-    /// The run is to end; read by the driver too.
+    /// The run must end. The driver reads this too.
     stop: Arc<AtomicBool>,
     /// The run has ended.
     over: AtomicBool,
-    /// The order that the run has not acted on yet; 0 for none.
+    /// The order on which the run has not acted yet; 0 for none.
     waiting: AtomicU8,
-    /// How often the interlock opened or closed, as the thread that makes dark saw it: an odd number while it is open. So the run
+    /// Number of times that the dark thread saw the interlock open or close: odd while it is open. The run therefore
     /// misses no opening, however short.
     interlock: AtomicU32,
-    /// The number that the run has acted on.
+    /// The value of `interlock` on which the run has acted.
     interlock_done: AtomicU32,
-    /// How often the thread that makes dark has spoken. A command that hangs may lose its answer to that.
+    /// Number of commands of the dark thread. A command that is in progress may lose its answer to one of them.
     spoken: AtomicU32,
-    /// The run has stopped the sequence itself, for an upload or at its end, so nothing is lit, and a command from elsewhere would only
-    /// tear its own apart.
+    /// The run has stopped the sequence itself, for an upload or at its end. Nothing is lit, and a command from the
+    /// dark thread would only disturb the run's own.
     is_dark: AtomicBool,
     line: Mutex<Option<DarkLine>>,
 }
 
-/// Ends the thread that makes dark when it is dropped.
+/// Ends the dark thread when dropped.
 struct Over<'a>(&'a Word);
 
 impl Drop for Over<'_> {
@@ -412,14 +416,15 @@ impl Drop for Over<'_> {
 }
 
 impl Word {
-    /// Obeys what must be dark within milliseconds, and hands every order on to the run.
+    /// The dark thread: obeys within milliseconds whatever must be dark, and passes every order on to the run.
     fn make_dark_when_told(&self, monitor: &RunMonitor) {
         let (mut was_open, mut told) = (false, None::<Stopwatch>);
         while !self.over.load(Ordering::Acquire) {
             let mut is_due =
                 told.as_ref().is_some_and(|told| told.elapsed_ns() >= AGAIN_NS) && self.must_be_dark();
             if let Some(order) = monitor.take_order() {
-                // Before it is obeyed: the run must not take a sequence that stops for one that stopped by itself.
+                // Set before obeying, so that the run does not mistake the stopped sequence for one that stopped by
+                // itself.
                 let _ = self.waiting.fetch_update(Ordering::Relaxed, Ordering::Relaxed, |waiting| {
                     Some(outweighing(from_code(waiting), order) as u8)
                 });
@@ -427,7 +432,7 @@ impl Word {
             }
             let is_open = !monitor.light_allowed();
             if is_open != was_open {
-                // Before it is obeyed, as above.
+                // Set before obeying, as above.
                 self.interlock.fetch_add(1, Ordering::SeqCst);
                 was_open = is_open;
                 is_due |= is_open;
@@ -436,7 +441,7 @@ impl Word {
                 self.make_dark(false);
                 told = Some(Stopwatch::start());
             }
-            // The signal itself as well: the thread that hands it on may be the one that hangs.
+            // Also checks the signal directly, because the thread that passes it on may be the one that hangs.
             if signals::received().is_some() {
                 monitor.request_stop();
             }
@@ -447,7 +452,7 @@ impl Word {
         }
     }
 
-    /// A cable that fails is the run's to tell.
+    /// Orders the controller to be dark. The run reports a failing cable.
     fn make_dark(&self, leds_off: bool) {
         if self.is_dark.load(Ordering::SeqCst) {
             return;
@@ -458,38 +463,39 @@ impl Word {
         }
     }
 
-    /// A sequence that has stopped may have been stopped by the thread that makes dark, for a reason that the run has not acted on yet.
+    /// True if the dark thread may have stopped the sequence for a reason on which the run has not acted yet.
     fn is_waiting(&self) -> bool {
         self.waiting.load(Ordering::Relaxed) != 0
             || self.stop.load(Ordering::Relaxed)
             || self.interlock.load(Ordering::SeqCst) != self.interlock_done.load(Ordering::SeqCst)
     }
 
-    /// There is an order to be dark, or an open interlock, that the run has not acted on.
+    /// True if there is an order to be dark, or an open interlock, on which the run has not acted.
     fn must_be_dark(&self) -> bool {
         let number = self.interlock.load(Ordering::SeqCst);
         self.order().is_some_and(Order::is_dark)
             || !number.is_multiple_of(2) && number != self.interlock_done.load(Ordering::SeqCst)
     }
 
-    /// The run's look at the interlock: whether there may be light, and the number to note in `interlock_done` once that is acted on.
+    /// Reads the interlock for the run: whether light is permitted, and the number to store in `interlock_done` once
+    /// the run has acted.
     fn look_at_interlock(&self, monitor: &RunMonitor) -> (bool, u32) {
         let number = self.interlock.load(Ordering::SeqCst);
-        // While the other thread is still at its command to be dark, a start would be undone by it.
+        // While the dark thread is still sending its command, a start would be undone by it.
         (number.is_multiple_of(2) && monitor.light_allowed(), number)
     }
 
-    /// The order that was not acted on yet.
+    /// The order on which the run has not acted yet.
     fn order(&self) -> Option<Order> {
         from_code(self.waiting.load(Ordering::Relaxed))
     }
 
-    /// The run has acted on `order`; one that came meanwhile goes on waiting.
+    /// The run has acted on `order`. An order that came meanwhile remains.
     fn acted_on(&self, order: Order) {
         let _ = self.waiting.compare_exchange(order as u8, 0, Ordering::Relaxed, Ordering::Relaxed);
     }
 
-    /// The order that was not acted on yet, once.
+    /// Takes the order on which the run has not acted yet.
     fn take(&self) -> Option<Order> {
         from_code(self.waiting.swap(0, Ordering::Relaxed))
     }
@@ -499,7 +505,8 @@ fn from_code(code: u8) -> Option<Order> {
     Order::ALL.iter().map(|(order, _)| *order).find(|order| *order as u8 == code)
 }
 
-/// The one that holds when `new` is given while `old` stands: nothing but ARM takes SAFE back, and FREEZE brings no light back.
+/// The order that prevails when `new` is given while `old` stands: only ARM takes SAFE back, and FREEZE does not
+/// bring light back.
 fn outweighing(old: Option<Order>, new: Order) -> Order {
     match (old, new) {
         (Some(Order::Safe), Order::Black | Order::Freeze) => Order::Safe,
@@ -664,7 +671,8 @@ impl<P: HidPort> Watch<'_, P> {
                 order.into_iter().for_each(|order| self.word.acted_on(order));
             }
             Err(Dlpc900Error::Stopped) => {}
-            // The other thread spoke meanwhile and took the answer away: what is to be done is done in the next round. Not twice in a row.
+            // A command of the dark thread took the answer away. The step is repeated in the next round, but not
+            // twice in a row.
             Err(Dlpc900Error::Port { source: PortError::Timeout, .. })
                 if !self.is_torn && self.word.spoken.load(Ordering::SeqCst) != self.spoken =>
             {
@@ -683,9 +691,9 @@ impl<P: HidPort> Watch<'_, P> {
 
 fn obey<P: HidPort>(d: &mut Dlpc900<P>, standing: Option<Order>) -> Result<(), Dlpc900Error> {
     match standing {
-        // The controller knows one kind of dark without losing its table.
+        // The controller has only one kind of dark that keeps its table.
         Some(Order::Black | Order::Safe) => d.stop(),
-        // What is paused goes on from there, and pausing it again changes nothing.
+        // A paused sequence continues where it was paused; pausing it again has no effect.
         Some(Order::Freeze) => d.pause(),
         Some(Order::Arm) | None => d.start(),
     }
@@ -700,7 +708,7 @@ fn health(standing: Option<Order>) -> ProjectorHealth {
     }
 }
 
-/// A controller that stopped by itself, or complains, ends the run.
+/// Checks the controller. If it stopped by itself or reports a problem, the run ends.
 fn look<P: HidPort>(d: &mut Dlpc900<P>, standing: Option<Order>, word: &Word) -> Result<(), Dlpc900Error> {
     let status = d.status()?;
     match status.complaint() {

@@ -1,4 +1,4 @@
-//! A DLPC900 run against the emulator: what is shown, what orders do, and what happens when the cable is pulled.
+//! A DLPC900 run with the emulator: what is shown, the effect of orders, and what happens when the cable is pulled.
 
 use super::*;
 use dpm_device::dlpc900::command::Opcode;
@@ -46,12 +46,12 @@ fn a_frame_becomes_three_patterns_of_eight_bits_that_share_its_time() {
     for (dmd, planes, held) in [(Dmd::Dlp6500, 24, 16), (Dmd::Dlp6500, 8, 48), (Dmd::Dlp500yx, 24, 18)] {
         assert_eq!(frames_held(dmd, planes), held, "{dmd:?} {planes}");
     }
-    // A DLP6500 shows eight bits in 4046 us at least.
+    // A DLP6500 needs at least 4046 us for eight bits.
     let none: &[BitPlaneFrame] = &[];
     assert!(preload(Dmd::Dlp6500, &schedule, none, 10_000, None).is_err());
 }
 
-/// What the emulator projects is, grey value by grey value, what was packed; it runs, obeys, and is put to rest.
+/// The emulator projects what was packed, grey value by grey value. It runs, obeys, and is put to rest.
 #[test]
 fn loaded_frames_are_shown_bit_for_bit_and_put_to_rest() {
     let schedule = PlaneSchedule::rgb24();
@@ -101,7 +101,7 @@ fn loaded_frames_are_shown_bit_for_bit_and_put_to_rest() {
     assert_eq!(monitor.projector(), ProjectorHealth::Stopped);
 }
 
-/// Ends the run with the thread that watches it, should that fail, too.
+/// Ends the run if the observing thread fails.
 struct StopOnExit(Arc<RunMonitor>);
 
 impl Drop for StopOnExit {
@@ -110,7 +110,7 @@ impl Drop for StopOnExit {
     }
 }
 
-/// Lets what hangs go on with the thread that watches it, should that fail, too: a test that fails must end.
+/// Releases a hanging call if the observing thread fails, because a failing test must end.
 struct ReleaseOnExit(Arc<AtomicBool>);
 
 impl Drop for ReleaseOnExit {
@@ -119,7 +119,7 @@ impl Drop for ReleaseOnExit {
     }
 }
 
-/// A cable that can be cut: what stands at its other end is looked up each time it is opened.
+/// A cable that can be cut. The device at its other end is looked up each time it is opened.
 struct Cut {
     hid: VirtualHid,
     plugged: Arc<Mutex<Option<Arc<Mutex<Dlpc900Model>>>>>,
@@ -145,7 +145,8 @@ impl HidPort for Cut {
     }
 }
 
-/// Unplugged it is lost within a look, plugged in again it is set up from nothing, and what the operator said last still holds.
+/// After unplugging, the loss is noticed within one check. After plugging in again, the controller is set up from
+/// scratch, and the operator's last order still applies.
 #[test]
 fn a_controller_that_was_unplugged_is_set_up_again_as_the_operator_left_it() {
     let schedule = PlaneSchedule::mono8();
@@ -170,17 +171,18 @@ fn a_controller_that_was_unplugged_is_set_up_again_as_the_operator_left_it() {
             state
         };
         let long = Duration::from_secs(20);
-        // The sequencer runs before the set-up has had its last answer, and one that is unplugged before that ends the run.
+        // The sequencer runs before the set-up has received its last answer. Unplugging before that would end the
+        // run.
         until("set up", long, &|| watched.projector() == ProjectorHealth::Up);
         until("running", long, &|| matches!(sequencer(), Sequencer::Running(..)));
         for (order, stays_dark) in [(None, false), (Some(Order::Black), true)] {
             *socket.lock().unwrap() = None;
-            // It is looked at five times a second.
+            // It is checked five times per second.
             let noticed = || watched.projector() == ProjectorHealth::Lost;
             until("lost", Duration::from_millis(500), &noticed);
             order.into_iter().for_each(|o| watched.give_order(o));
             std::thread::sleep(Duration::from_millis(50));
-            // Another one, or the same without power meanwhile: it knows nothing.
+            // Another controller, or the same one after a loss of power: it knows nothing.
             *socket.lock().unwrap() = Some(model());
             let wanted = if stays_dark { ProjectorHealth::Black } else { ProjectorHealth::Up };
             until("taken up again", long, &|| watched.projector() == wanted);
@@ -189,7 +191,7 @@ fn a_controller_that_was_unplugged_is_set_up_again_as_the_operator_left_it() {
             let m = model.lock().unwrap();
             let mut codes = vec![0u32; DMD.raster().pixel_count()];
             unpack(&frames[2], &mut codes);
-            // A white plane comes back as the green bits.
+            // A white plane is read back as the green bits.
             let wanted = codes.iter().map(|c| (c >> 8) as u8);
             assert!(m.projected_grey(2).expect("a pattern").into_iter().eq(wanted), "loaded again");
         }
@@ -218,7 +220,7 @@ fn until(model: &Arc<Mutex<Dlpc900Model>>, what: &str, wanted: impl Fn(&mut Dlpc
     panic!("never {what}");
 }
 
-/// Something that a controller is told.
+/// A command for a controller.
 type Act = fn(&mut Dlpc900<VirtualHid>) -> Result<(), Dlpc900Error>;
 
 fn is_running(m: &mut Dlpc900Model) -> bool {
@@ -239,8 +241,9 @@ fn shows() -> [Show; 2] {
     [Show::Preloaded(preloaded), Show::Video(video)]
 }
 
-/// Found in use, O2: the second run on one controller was refused, because the first one had ended in the mirrors' exercise. Ten in a
-/// row, in both modes, and after everything else that a controller may be left in, by the rules of a controller that is strict.
+/// Found in use, O2: the second run on one controller was refused, because the first one had ended in the mirrors'
+/// exercise. The test makes ten runs in a row, in both modes and after every other state in which a controller may
+/// have been left, with a controller that enforces its rules strictly.
 #[test]
 fn a_rig_starts_again_whatever_the_controller_was_left_in() {
     for show in shows() {
@@ -251,7 +254,7 @@ fn a_rig_starts_again_whatever_the_controller_was_left_in() {
             Dlpc900::new(VirtualHid::starting_at(model.clone(), at))
         };
         for run in 0..14 {
-            // After the tenth run: rested by hand, parked, in standby, and killed while it showed.
+            // After the tenth run: put to rest by hand, parked, in standby, and killed while showing.
             let left: Option<Act> = match run {
                 10 => Some(Dlpc900::idle),
                 11 => Some(Dlpc900::park),
@@ -286,8 +289,8 @@ fn a_rig_starts_again_whatever_the_controller_was_left_in() {
     }
 }
 
-/// Found in use, O2: what is not allowed while the mirrors exercise, are parked or the controller sleeps is explained by that, not by
-/// the display mode.
+/// Found in use, O2: if a command is not permitted because the mirrors exercise or are parked, or the controller
+/// sleeps, the message says so and does not blame the display mode.
 #[test]
 fn a_refusal_names_the_remedy_for_the_state_that_the_controller_is_in() {
     let model = model();
@@ -310,7 +313,7 @@ fn a_refusal_names_the_remedy_for_the_state_that_the_controller_is_in() {
     assert!(told.contains("stop the sequence and select the right display mode"), "{told}");
 }
 
-/// A cable whose user can be made to hang inside its calls, as a thread that is stopped does, and that takes time for a report.
+/// A cable whose user can be made to hang inside its calls, like a stopped thread, and that needs time for a report.
 struct Sticky {
     hid: VirtualHid,
     stuck: Arc<AtomicBool>,
@@ -361,7 +364,7 @@ fn with_interlock(closed: bool) -> (Arc<RunMonitor>, Arc<AtomicBool>) {
     (Arc::new(monitor), flag)
 }
 
-/// Why it must be dark.
+/// Why the controller must be dark.
 #[derive(Clone, Copy, Debug, PartialEq)]
 enum Cause {
     Stop,
@@ -379,7 +382,7 @@ impl Cause {
     }
 }
 
-/// Waits until the run says so of its projector, at most 20 s.
+/// Waits until the run reports this state of its projector, at most 20 s.
 fn until_told(monitor: &RunMonitor, wanted: ProjectorHealth) {
     let watch = Stopwatch::start();
     while monitor.projector() != wanted {
@@ -388,15 +391,15 @@ fn until_told(monitor: &RunMonitor, wanted: ProjectorHealth) {
     }
 }
 
-/// Found in use, R2 on this device: a stop, SAFE, BLACK and an interlock that opens are obeyed within 50 ms also while the run's own
-/// thread hangs inside the cable, and no later word of that thread brings the light back.
+/// Found in use, R2 on this device: a stop, SAFE, BLACK and an opening interlock are obeyed within 50 ms even while
+/// the run's own thread hangs inside the cable, and no later command of that thread brings the light back.
 #[test]
 fn a_hanging_run_is_made_dark_within_50_ms() {
     let [show, _] = shows();
     let causes =
         [Cause::Stop, Cause::Ordered(Order::Safe), Cause::Ordered(Order::Black), Cause::InterlockOpens];
     for cause in causes {
-        // A machine that is busy with something else may be late; one of three tries must be in time.
+        // A busy machine may be late, so one of three tries must be in time.
         let mut took = Vec::new();
         for _ in 0..3 {
             let (model, stuck) = (model(), Arc::new(AtomicBool::new(false)));
@@ -407,7 +410,7 @@ fn a_hanging_run_is_made_dark_within_50_ms() {
             let observer = std::thread::spawn(move || {
                 let (_ends, _goes_on) = (StopOnExit(watched.clone()), ReleaseOnExit(hold.clone()));
                 until(&seen, "running", is_running);
-                // Up first: the start is acknowledged.
+                // Waits for Up first: the start is acknowledged.
                 until_told(&watched, ProjectorHealth::Up);
                 hold.store(true, Ordering::Relaxed);
                 while !held.load(Ordering::Relaxed) {
@@ -418,7 +421,8 @@ fn a_hanging_run_is_made_dark_within_50_ms() {
                 until(&seen, "dark", |m| m.dark_because().is_some());
                 let took_ms = watch.elapsed_ns() / 1_000_000;
                 hold.store(false, Ordering::Relaxed);
-                // The run goes on where it was: it must not take the stopped sequence for a failure, nor start it again.
+                // The run continues where it was. It must neither take the stopped sequence for a failure nor start
+                // it again.
                 for _ in 0..60 {
                     assert!(seen.lock().unwrap().dark_because().is_some(), "{cause:?}: lit again");
                     std::thread::sleep(Duration::from_millis(5));
@@ -447,8 +451,8 @@ fn a_hanging_run_is_made_dark_within_50_ms() {
     }
 }
 
-/// A cable over which, once, a start of the sequence is held back until the order to be dark that `cause` brings has passed it; the
-/// answer to that start then comes when `stuck` is cleared.
+/// A cable that holds back one start of the sequence until the dark order caused by `cause` has overtaken it. The
+/// answer to that start comes when `stuck` is cleared.
 struct LateStart {
     hid: VirtualHid,
     model: Arc<Mutex<Dlpc900Model>>,
@@ -457,12 +461,12 @@ struct LateStart {
     cause: Arc<dyn Fn() + Send + Sync>,
 }
 
-/// Times that the sequence was told to stop.
+/// Number of stop commands that it received.
 fn stops(m: &Dlpc900Model) -> usize {
     m.executed().iter().filter(|e| e.opcode == Opcode::START_STOP && e.data == [0]).count()
 }
 
-/// Times that it was told to start.
+/// Number of start commands that it received.
 fn starts(m: &Dlpc900Model) -> usize {
     m.executed().iter().filter(|e| e.opcode == Opcode::START_STOP && e.data == [2]).count()
 }
@@ -482,7 +486,7 @@ impl HidPort for LateStart {
         self.hid.write_report(report, timeout)
     }
     fn read_report(&mut self, report: &mut [u8; 64], timeout: Duration) -> Result<(), PortError> {
-        // For some 20 s at most, should the thread that clears it have failed before.
+        // At most about 20 s, in case the thread that clears it has failed.
         for _ in 0..20_000 {
             if !self.stuck.load(Ordering::SeqCst) {
                 break;
@@ -499,8 +503,8 @@ impl HidPort for LateStart {
     }
 }
 
-/// The awkward place: the order to be dark overtakes a start that is under way, and the run hangs when that start has arrived. The light
-/// that it makes ends within 50 ms.
+/// The worst case: the dark order overtakes a start that is in progress, and the run hangs after that start has
+/// arrived. The light that it causes ends within 50 ms.
 #[test]
 fn a_start_that_arrives_after_the_order_to_be_dark_lights_for_50_ms_at_most() {
     let [show, _] = shows();
@@ -551,8 +555,8 @@ fn a_start_that_arrives_after_the_order_to_be_dark_lights_for_50_ms_at_most() {
     }
 }
 
-/// Openings so short that the run itself may see none of them: it is dark each time, the run neither ends ("stopped by itself") nor
-/// stays dark, and what was frozen is dark until somebody arms.
+/// Openings so short that the run itself may not see them. The projector goes dark each time; the run neither ends
+/// ("stopped by itself") nor stays dark; and a frozen picture stays dark until somebody arms.
 #[test]
 fn an_interlock_that_opens_for_a_moment_is_dark_for_a_moment() {
     let [show, _] = shows();
@@ -588,7 +592,8 @@ fn an_interlock_that_opens_for_a_moment_is_dark_for_a_moment() {
     assert!(result.is_ok(), "{:?}", result.err().map(|e| e.to_string()));
 }
 
-/// Open before the start or during the upload: what a killed run left lit goes dark, and nothing is started until it closes.
+/// Open before the start or during the upload: light left by a killed run goes dark, and nothing is started until the
+/// interlock closes.
 #[test]
 fn nothing_is_started_while_the_interlock_is_open() {
     let [show, _] = shows();
@@ -624,7 +629,7 @@ fn nothing_is_started_while_the_interlock_is_open() {
         let mut open = || {
             let hid = VirtualHid::new(model.clone());
             let (stuck, is_inside) = (Arc::default(), Arc::default());
-            // Some seconds for the tens of thousands of reports of the upload.
+            // The tens of thousands of reports of the upload take some seconds.
             let report_time = Duration::from_micros(if opens_in_the_upload { 20 } else { 0 });
             Dlpc900::new(Sticky { hid, stuck, is_inside, report_time })
         };
@@ -635,7 +640,8 @@ fn nothing_is_started_while_the_interlock_is_open() {
     }
 }
 
-/// A stop in the middle of an upload, or of the three seconds that mirrors must exercise, ends the run at once and lights nothing.
+/// A stop in the middle of an upload, or of the three seconds of mirror exercise, ends the run at once and lights
+/// nothing.
 #[test]
 fn a_stop_is_heard_during_the_set_up() {
     let [show, _] = shows();
@@ -655,7 +661,7 @@ fn a_stop_is_heard_during_the_set_up() {
         let mut open = || {
             let hid = VirtualHid::new(model.clone());
             let (stuck, is_inside) = (Arc::default(), Arc::default());
-            // Some seconds for the whole upload.
+            // The whole upload takes some seconds.
             Dlpc900::new(Sticky { hid, stuck, is_inside, report_time: Duration::from_millis(1) })
         };
         let report = present(&mut open, &show, None, &monitor).unwrap();
@@ -668,7 +674,7 @@ fn a_stop_is_heard_during_the_set_up() {
     }
 }
 
-/// SAFE is taken back by ARM alone, FREEZE does not bring back light that was ordered off, and neither ends the run.
+/// Only ARM takes SAFE back, FREEZE does not bring back light that was ordered off, and neither ends the run.
 #[test]
 fn orders_outweigh_one_another() {
     use Order::{Arm, Black, Freeze, Safe};
@@ -702,7 +708,7 @@ fn orders_outweigh_one_another() {
                 );
                 std::thread::sleep(Duration::from_millis(1));
             }
-            // Longer than between two looks at the controller.
+            // Longer than the time between two checks of the controller.
             std::thread::sleep(Duration::from_millis(250));
             assert_eq!(watched.projector(), health, "{order:?}");
             let dark = seen.lock().unwrap().dark_because();

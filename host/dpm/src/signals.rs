@@ -1,8 +1,10 @@
-//! Signals and panics into the flags of [`dpm_common::stopping`], and a limit to how long the process lives after them.
+//! Turns signals and panics into the flags of [`dpm_common::stopping`], and limits how long the process lives after
+//! them.
 //!
-//! SIGINT, SIGTERM, SIGHUP and a panic ask for a stop: every thread sees that at once, the link's first of all. From then on a timer of
-//! the kernel runs, whose signal ends the process whichever of its threads hangs. SIGUSR1 is BLACK and SIGUSR2 is SAFE. No thread blocks
-//! any of these signals, so the kernel delivers them to one that is not stopped.
+//! SIGINT, SIGTERM, SIGHUP and a panic request a stop. Every thread sees the request at once, the link's first of
+//! all. A kernel timer then starts, whose signal ends the process whichever of its threads hangs. SIGUSR1 is BLACK
+//! and SIGUSR2 is SAFE. No thread blocks any of these signals, so the kernel can deliver them to a thread that is not
+//! stopped.
 #![allow(unsafe_code)]
 
 use dpm_common::stopping;
@@ -10,23 +12,23 @@ use std::io;
 use std::sync::atomic::{AtomicBool, AtomicU32, Ordering};
 use std::sync::Once;
 
-/// Signals that ask for an ordered stop. Supervisors send some of them twice, so the second changes nothing; the third ends the process
-/// on the spot (the projector's watchdog then makes it dark).
+/// Signals that request an orderly stop. Supervisors send some of them twice, so the second one has no effect. The
+/// third one ends the process at once (the projector's watchdog then makes it dark).
 const STOPS: [libc::c_int; 3] = [libc::SIGINT, libc::SIGTERM, libc::SIGHUP];
-/// From the first signal to the end of the process, microseconds: two seconds with a reserve for a busy machine.
+/// Time from the first signal to the end of the process, microseconds: two seconds with a reserve for a busy machine.
 const GONE_WITHIN_US: libc::suseconds_t = 800_000;
 const GONE_WITHIN_S: libc::time_t = 1;
-/// A run that has ended in order, dark and with all its threads at their end, is looked at this often while it writes its report and
-/// pictures after SIGINT, microseconds...
+/// After SIGINT, a run that has ended in order (dark, all threads ended) may write its report and pictures. It is
+/// checked this often, microseconds ...
 const FILES_STEP_US: libc::suseconds_t = 200_000;
-/// ...and this many times at most: ten seconds.
+/// ... and at most this many times: ten seconds.
 const FILES_STEPS: u32 = 50;
-/// Exit code after a panic, as Rust's own.
+/// Exit code after a panic, the same as Rust's own.
 const PANIC_CODE: libc::c_int = 101;
 
-/// The timer runs.
+/// The timer is running.
 static COUNTING: AtomicBool = AtomicBool::new(false);
-/// How often the timer has been given more time for files.
+/// How often the timer was extended for files.
 static EXTENDED: AtomicU32 = AtomicU32::new(0);
 
 extern "C" fn on_stop(signal: libc::c_int) {
@@ -45,15 +47,16 @@ extern "C" fn on_timer(_: libc::c_int) {
     const TOLD: &str =
         "error: the rig did not end in time after it was asked to stop; the process ends now, \
                         the projector goes dark by its watchdog\n";
-    // A person at the terminal waits for files, or presses the key twice more; a supervisor does not wait.
+    // A person at the terminal waits for files, or presses the key twice more. A supervisor does not wait.
     let waits = stopping::signal() == Some(libc::SIGINT) && stopping::is_writing_files();
     if waits && EXTENDED.fetch_add(1, Ordering::SeqCst) < FILES_STEPS {
         return set_timer(0, FILES_STEP_US);
     }
     let code = stopping::signal().map_or(PANIC_CODE, |signal| 128 + signal);
     let mut stderr = libc::pollfd { fd: libc::STDERR_FILENO, events: libc::POLLOUT, revents: 0 };
-    // SAFETY: poll, write and _exit are async-signal-safe; the arguments outlive the calls. It is asked first whether there is room: a
-    // pipe that nobody reads or a stopped terminal would hold the last thing up that still works.
+    // SAFETY: poll, write and _exit are async-signal-safe; the arguments outlive the calls. poll first checks that
+    // there is room, because a pipe without a reader or a stopped terminal would block the last code that still
+    // works.
     unsafe {
         if libc::poll(&raw mut stderr, 1, 0) == 1 && stderr.revents & libc::POLLOUT != 0 {
             libc::write(libc::STDERR_FILENO, TOLD.as_ptr().cast(), TOLD.len());
@@ -62,7 +65,7 @@ extern "C" fn on_timer(_: libc::c_int) {
     }
 }
 
-/// Starts the timer that ends the process, unless it runs. A signal handler may call it.
+/// Starts the timer that ends the process, unless it is running. May be called from a signal handler.
 fn start_timer(seconds: libc::time_t, microseconds: libc::suseconds_t) {
     if COUNTING.swap(true, Ordering::SeqCst) {
         return;
@@ -76,14 +79,15 @@ fn set_timer(seconds: libc::time_t, microseconds: libc::suseconds_t) {
         it_interval: none,
         it_value: libc::timeval { tv_sec: seconds, tv_usec: microseconds },
     };
-    // SAFETY: the timer outlives the call. setitimer is a bare system call, which a handler may make, and valid values never fail.
+    // SAFETY: the timer outlives the call. setitimer is a bare system call, which a handler may make, and valid
+    // values never fail.
     unsafe { libc::setitimer(libc::ITIMER_REAL, &raw const timer, std::ptr::null_mut()) };
 }
 
-/// Installs the handlers and the hook for panics; a system call that is interrupted goes on by itself.
+/// Installs the signal handlers and the panic hook. Interrupted system calls are restarted.
 ///
 /// # Errors
-/// The operating system's, which does not happen for these signals.
+/// An error of the operating system, which does not occur for these signals.
 pub fn install() -> io::Result<()> {
     for signal in STOPS {
         handle(signal, on_stop as *const () as libc::sighandler_t)?;
@@ -92,7 +96,7 @@ pub fn install() -> io::Result<()> {
         handle(signal, on_order as *const () as libc::sighandler_t)?;
     }
     handle(libc::SIGALRM, on_timer as *const () as libc::sighandler_t)?;
-    // From the background of a terminal, output and questions must not stop the process, and with it the light.
+    // Output or input from the background of a terminal must not stop the process, and with it the light.
     for signal in [libc::SIGTTOU, libc::SIGTTIN] {
         handle(signal, libc::SIG_IGN)?;
     }
@@ -101,7 +105,7 @@ pub fn install() -> io::Result<()> {
     HOOK.call_once(|| {
         let before = std::panic::take_hook();
         std::panic::set_hook(Box::new(move |panic| {
-            // Dark first: what follows writes to a stream that may take its time.
+            // Dark first, because what follows writes to a stream, which may take time.
             if stopping::note_panic() {
                 start_timer(GONE_WITHIN_S, GONE_WITHIN_US);
             }
@@ -111,17 +115,17 @@ pub fn install() -> io::Result<()> {
     Ok(())
 }
 
-/// Ignores those that ask for a stop: for a process that must outlive the one that they are meant for.
+/// Ignores the signals that request a stop, for a process that must outlive the one for which they are meant.
 ///
 /// # Errors
-/// The operating system's, which does not happen for these signals.
+/// An error of the operating system, which does not occur for these signals.
 pub(crate) fn ignore() -> io::Result<()> {
     STOPS.into_iter().try_for_each(|signal| handle(signal, libc::SIG_IGN))
 }
 
 fn handle(signal: libc::c_int, handler: libc::sighandler_t) -> io::Result<()> {
-    // SAFETY: an all-zero sigaction is valid: no flags, an empty mask; the handlers touch atomics and make only calls that are
-    // async-signal-safe.
+    // SAFETY: an all-zero sigaction is valid: no flags, an empty mask. The handlers touch only atomics and make only
+    // async-signal-safe calls.
     let result = unsafe {
         let mut action: libc::sigaction = std::mem::zeroed();
         action.sa_sigaction = handler;
@@ -135,7 +139,7 @@ fn handle(signal: libc::c_int, handler: libc::sighandler_t) -> io::Result<()> {
     Ok(())
 }
 
-/// A parent may have left signals blocked, and threads inherit that: none of ours may be.
+/// The parent process may have blocked signals, and threads inherit that. None of our signals may be blocked.
 fn unblock() -> io::Result<()> {
     // SAFETY: the set is made by sigemptyset before it is used, and outlives the calls.
     let result = unsafe {
@@ -152,7 +156,7 @@ fn unblock() -> io::Result<()> {
     Ok(())
 }
 
-/// The signal that asked for a stop, by name; `None` as long as none did.
+/// The name of the signal that requested a stop; `None` if there was none.
 pub(crate) fn received() -> Option<&'static str> {
     Some(match stopping::signal()? {
         libc::SIGINT => "SIGINT",

@@ -1,4 +1,4 @@
-//! The program as its users meet it: exit codes, where output goes, what errors say.
+//! The program from the user's point of view: exit codes, where output goes, what errors say.
 
 mod cli_common;
 
@@ -21,13 +21,13 @@ fn version_and_help_go_to_standard_output() {
 #[test]
 fn a_program_knows_its_commit_wherever_it_lies() {
     let known = out(&dpm(&["--version"], &[]));
-    // In another project's work tree, far from the one it was built in.
+    // In another project's work tree, far from the one in which it was built.
     let folder = std::env::temp_dir().join(format!("dpm-elsewhere-{}", std::process::id()));
     std::fs::create_dir_all(folder.join(".git")).unwrap();
     std::fs::write(folder.join(".git/HEAD"), "f".repeat(40)).unwrap();
     let program = folder.join("dpm");
     std::fs::copy(env!("CARGO_BIN_EXE_dpm"), &program).unwrap();
-    // A test beside this one that starts a program holds the copy open for writing until that program runs.
+    // Another test that starts a program keeps the copy open for writing until that program runs.
     let mut tries = 0;
     let there = loop {
         match command_of(&program, &["--version"]).current_dir(&folder).output() {
@@ -47,11 +47,11 @@ fn a_program_knows_its_commit_wherever_it_lies() {
         head.ok().filter(|h| h.status.success()).map(|h| String::from_utf8_lossy(&h.stdout).into_owned());
     let commit = commit.trim_end_matches("-dirty");
     match head {
-        // Packagers may say another.
+        // Packagers may set another commit.
         _ if option_env!("DPM_COMMIT").is_some() => {}
         _ if !std::path::Path::new(top).join(".git").exists() => assert_eq!(commit, "unknown"),
         Some(head) => assert_eq!(commit, &head[..12]),
-        // A work tree, but no Git to ask.
+        // A work tree without Git to ask.
         None => assert!(commit.len() == 12 && commit.chars().all(|c| c.is_ascii_hexdigit()), "{commit}"),
     }
 }
@@ -121,7 +121,7 @@ fn stability_without_vulkan_runs_what_it_can_and_says_what_it_could_not() {
     assert_eq!((&json["cases"][0]["verdict"], &json["cases"][0]["error"]), (&"not run".into(), &().into()));
     assert!(json["cases"][0]["note"].as_str().is_some_and(|n| n.contains("no Vulkan device")), "{json}");
     assert!(err(&output).contains("1 stability cases were not run"), "{}", err(&output));
-    // What needs no device is judged as ever.
+    // What needs no device is checked as usual.
     let output = dpm(&["stability", "--json", "--only", "quantiser-extremes"], &NO_DRIVER);
     assert_eq!(code(&output), 0, "{}", err(&output));
     let json: serde_json::Value = serde_json::from_str(&out(&output)).expect("one JSON object");

@@ -1,4 +1,5 @@
-//! `dpm profile` as its users meet it: without a GPU at the true rate, its files, and two profiles compared.
+//! `dpm profile` from the user's point of view: without a GPU at the true rate, its files, and the comparison of two
+//! profiles.
 
 mod cli_common;
 #[path = "cli_common/trace_check.rs"]
@@ -7,8 +8,9 @@ mod trace_check;
 use cli_common::{code, dpm, err, out, start, start_with, Folder, NO_DRIVER};
 use std::time::Duration;
 
-/// One second at the full rate and raster, without any Vulkan driver. Lateness is the machine's affair here (other tests run beside this
-/// one); what must hold on any machine is that everything is accounted for and no frame is torn, shown twice or out of order.
+/// One second at the full rate and raster, without any Vulkan driver. Lateness depends on the machine here, because
+/// other tests run at the same time. On any machine everything must be accounted for, and no frame may be torn, shown
+/// twice or out of order.
 #[test]
 fn without_rendering_every_slot_is_accounted_for_and_no_frame_is_torn() {
     let folder = Folder::new("profile");
@@ -31,7 +33,7 @@ fn without_rendering_every_slot_is_accounted_for_and_no_frame_is_torn() {
     let (lit, slots) = (count(&json["frames_lit"]), count(&json["slots"]));
     assert!(lit > 0 && lit + count(&json["frames_dropped"]) <= 947, "{lit} lit in a second: {json}");
     assert!(slots <= 947, "{slots} slots in a second");
-    // Raw: every slot without a frame of its own. Of these, and not taken off them, what the machine is to blame for.
+    // The raw number is every slot without a frame of its own. The part due to the machine is not subtracted from it.
     let missed = json["missed_by_cause"].as_object().expect("misses by cause");
     let all: u64 = missed.values().map(count).sum();
     assert_eq!(count(&json["missed_slots"]), all);
@@ -43,10 +45,11 @@ fn without_rendering_every_slot_is_accounted_for_and_no_frame_is_torn() {
     }
     // Every slot showed its own frame, or was missed.
     assert_eq!(lit - count(&json["frames_late"]) + all, slots, "{missed:?}");
-    // The bound of the projector's clock is in the report, the mock's too.
+    // The report contains the bound of the projector's clock, also for the mock.
     assert!(count(&json["projector"]["clock_bound_ns"]) > 0, "{}", json["projector"]);
     assert_eq!(json["profile"]["clock_error_bound_ns"], json["projector"]["clock_bound_ns"]);
-    // Real pace measures, but for the part of the mock tracker; a mock that lights on an ideal clock has no jitter to show.
+    // Real pace measures everything except the mock tracker's interval. A mock that lights on an ideal clock has no
+    // jitter.
     let interval = |name: &str| &json["profile"]["intervals_ms"][name];
     assert_eq!(json["motion_to_light_centre_ms"]["modelled"], false);
     assert_eq!(
@@ -82,13 +85,14 @@ fn without_rendering_every_slot_is_accounted_for_and_no_frame_is_torn() {
     assert!(table.lines().nth(1).is_some_and(|l| l.starts_with("missed slots, %")), "{table}");
 }
 
-/// Found in use (second look at latency, section 2): BLACK for 1.5 s was booked as 1478 late slots of the link, 26 % of a run of 6 s.
+/// Found in use (second look at latency, section 2): BLACK for 1.5 s was counted as 1478 late slots of the link, 26 %
+/// of a run of 6 s.
 #[test]
 fn slots_of_an_operators_black_are_not_late() {
     let folder = Folder::new("black");
     let args =
         ["profile", "--no-render", "--seconds", "6", "--raster", "64x48", "--json", "--out", folder.text()];
-    // The order stands for every rig of this state folder on such a projector, those of the tests beside this one included.
+    // The order applies to every rig of this state folder with such a projector, including those of other tests.
     let state = folder.path("state").display().to_string();
     let own = [("DPM_STATE_DIR", state.as_str())];
     let mut running = start_with(&args, &own);
@@ -107,17 +111,18 @@ fn slots_of_an_operators_black_are_not_late() {
     let black = count(&json["ordered_dark"]["black"]);
     assert!(black >= 1_400, "{black} slots of 1420 in 1.5 s");
     let (slots, missed) = (count(&json["slots"]), count(&json["missed_slots"]));
-    // Every slot of the run is in one place: BLACK's are no part of those in which a frame was wanted.
+    // Every slot of the run is in one class: BLACK's slots are not among those in which a frame was wanted.
     let ordered: u64 = json["ordered_dark"].as_object().expect("reasons").values().map(count).sum();
     assert!((5_600..=5_682).contains(&(slots + ordered)), "{slots} and {ordered}");
     assert_eq!(count(&json["frames_lit"]) - count(&json["frames_late"]) + missed, slots);
-    // Were BLACK's slots among the missed ones, these would be more than its 1400, whatever else this machine does.
+    // If BLACK's slots were among the missed ones, there would be more than its 1400, whatever else this machine
+    // does.
     assert!(missed < 1_000, "{missed} missed of {slots}: {}", json["missed_by_cause"]);
     // Not every slot has a frame on a busy machine.
     assert!(2 * count(&json["frames_withheld"]) >= black, "{} of {black}", json["frames_withheld"]);
 }
 
-/// Two kept profiles of runs that differ in nothing but the frames that they dropped.
+/// Two stored profiles of runs that differ only in the frames that they dropped.
 #[test]
 fn a_comparison_in_which_more_slots_are_missed_ends_with_1() {
     let folder = Folder::new("gate");
@@ -136,12 +141,12 @@ fn a_comparison_in_which_more_slots_are_missed_ends_with_1() {
     assert_eq!(code(&dpm(&["profile", "--compare", &after, &before], &[])), 0);
 }
 
-/// Software Vulkan at 947 fps: the GPU needs ten slots and more for a frame. Every frame comes late then, and is shown late, as fast
-/// as they come; and each can be followed through the GPU's passes to its light.
+/// Software Vulkan at 947 fps: the GPU needs ten slots or more for a frame. Every frame is then late and is shown
+/// late, as fast as frames come; and each can be followed through the GPU's passes to its light.
 #[test]
 fn a_gpu_too_slow_for_its_slots_shows_late_frames_not_none() {
     let folder = Folder::new("slow");
-    // Light this late falls behind any horizon that makes sense: without a longer one there would be none.
+    // Light this late falls behind any reasonable horizon; without a longer one there would be none.
     let args = ["profile", "--seconds", "2", "--raster", "64x48", "--json", "--out", folder.text()];
     let output = dpm(&[&args[..], &["--set", "safety.predict_ms=1000"]].concat(), &[]);
     assert_eq!(code(&output), 0, "{}", err(&output));
@@ -149,7 +154,7 @@ fn a_gpu_too_slow_for_its_slots_shows_late_frames_not_none() {
     let count = |key: &str| json[key].as_u64().unwrap_or_else(|| panic!("{key} in {json}"));
     assert!(count("frames_lit") > 0, "{json}");
     let (lit, dropped) = (count("frames_lit") + count("frames_dark"), count("frames_dropped"));
-    // A run whose every frame is late is no run without misses.
+    // A run whose every frame is late is not a run without misses.
     assert!(count("missed_slots") > count("slots") / 2, "{json}");
     assert!(lit >= 3 && lit >= dropped, "{lit} lit, {dropped} not");
     assert_eq!(count("frames_reordered"), 0);
@@ -160,7 +165,7 @@ fn a_gpu_too_slow_for_its_slots_shows_late_frames_not_none() {
     assert!(trace.contains(r#""name":"trace","cat":"gpu""#), "the GPU's passes lie in its slices");
 }
 
-/// A tracker that is not there leaves the rig dark, not the operator.
+/// A missing tracker leaves the rig dark, but informs the operator.
 #[test]
 fn bodies_that_were_never_seen_are_named_with_the_trackers_word_on_why() {
     let folder = Folder::new("unseen");
@@ -184,7 +189,7 @@ fn bodies_that_were_never_seen_are_named_with_the_trackers_word_on_why() {
     }
 }
 
-/// Long before the report: a run without an end says it after its first second, once, and goes on.
+/// A run without an end reports it after its first second, once, long before the report, and continues.
 #[test]
 fn a_tracker_that_does_not_speak_is_told_within_the_first_seconds_of_a_run() {
     let folder = Folder::new("silent");
@@ -204,7 +209,7 @@ fn a_tracker_that_does_not_speak_is_told_within_the_first_seconds_of_a_run() {
             of_tracker
         })
     });
-    // A line of counts a second: the run was at most a few seconds old, on a machine that does other things too.
+    // One line of counts per second: the run was at most a few seconds old, on a busy machine.
     assert!(lit.get() < 5 * 947, "{} frames were lit before it was told", lit.get());
     running.signal("TERM");
     let rest = running.rest_of_lines(Duration::from_secs(60));
@@ -218,7 +223,7 @@ fn what_is_no_profile_is_refused_with_its_name() {
     let output = dpm(&["profile", "--compare", &text, "/nonexistent/b.json"], &[]);
     assert_eq!((code(&output), out(&output).as_str()), (2, ""));
     assert!(err(&output).contains("a.json: not a profile.json of dpm profile"), "{}", err(&output));
-    // Any other JSON object, a report for example, is no profile without figures.
+    // Any other JSON object, for example a report, is not a profile without figures.
     let report = folder.write("report.json", "{\"frames_lit\": 3, \"slots\": 9}");
     assert_eq!(code(&dpm(&["profile", "--compare", &report, &report], &[])), 2);
     let output = dpm(&["profile", "--compare", "/nonexistent/a.json", &text], &[]);

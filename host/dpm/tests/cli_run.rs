@@ -1,6 +1,7 @@
-//! `dpm demo` and `dpm run` as their users meet them: report, files, hash of the light, bad input, signals, two at once.
+//! `dpm demo` and `dpm run` from the user's point of view: report, files, hash of the light, bad input, signals, two
+//! at once.
 //!
-//! Everything runs at a raster of 48 x 32, where software Vulkan takes milliseconds for a frame.
+//! Everything runs at a raster of 48 x 32, where software Vulkan needs milliseconds per frame.
 
 mod cli_common;
 
@@ -17,7 +18,7 @@ use std::time::{Duration, Instant};
 
 const SMALL: [&str; 5] = ["--json", "--raster", "48x32", "--frames", "6"];
 
-/// Runs a command at the small raster with its output in `folder`; gives the report.
+/// Runs a command at the small raster with its output in `folder`; returns the report.
 fn report(command: &[&str], folder: &Folder, more: &[&str]) -> serde_json::Value {
     let args = [command, &SMALL, &["--out", folder.text()], more].concat();
     let output = dpm(&args, &[("DPM_VALIDATION", "1")]);
@@ -136,7 +137,7 @@ fn bad_input_ends_with_2_and_names_the_place() {
 fn a_raster_beyond_the_machine_is_refused_not_attempted() {
     let folder = Folder::new("huge");
     let output = dpm(&["demo", "--raster", "8192x8192", "--frames", "1", "--out", folder.text()], &[]);
-    // A big GPU may be able to do it; software Vulkan is not.
+    // A large GPU may be able to do it; software Vulkan is not.
     if code(&output) != 0 {
         assert_eq!(code(&output), 2, "{}", err(&output));
         let told = err(&output);
@@ -171,12 +172,12 @@ fn a_setting_in_the_environment_reaches_the_run() {
     );
 }
 
-/// Found in use, R6 and C2: a rig whose light falls later than it may predict was black all the time, said that its frames were lit, and
-/// ended with 0.
+/// Found in use, R6 and C2: a rig whose light falls later than prediction may reach was black all the time, reported
+/// that its frames were lit, and ended with exit code 0.
 #[test]
 fn a_run_that_lights_nothing_ends_with_1_and_names_the_key() {
     let folder = Folder::new("nothing");
-    // The way from the tracker to the light takes 5 ms and more.
+    // The latency from the tracker to the light is at least 5 ms.
     let args = [&["demo"][..], &SMALL, &["--out", folder.text(), "--set", "safety.predict_ms=4"]].concat();
     let output = dpm(&args, &[]);
     assert_eq!(code(&output), 1, "{}", err(&output));
@@ -198,7 +199,7 @@ fn a_run_that_lights_nothing_ends_with_1_and_names_the_key() {
     assert!(json["motion_to_light_ms"].is_null() && json["registration_error_px"].is_null(), "{json}");
     assert!(err(&output).contains("raise safety.predict_ms"), "{}", err(&output));
 
-    // A tracker that is not there.
+    // A missing tracker.
     let rig = folder.write(
         "rig.toml",
         "[projector]\nframe_rate = 10\n[tracker]\nkind = \"serial\"\nport = \"/dev/nonexistent\"\n\
@@ -213,7 +214,7 @@ fn a_run_that_lights_nothing_ends_with_1_and_names_the_key() {
     assert!(err(&output).contains("the tracker has never seen it"), "{}", err(&output));
 }
 
-/// A run that would take hours is asked to stop: it reports on what it did and ends with 0. Meanwhile a second one is refused.
+/// A run that would take hours is stopped: it reports what it did and ends with 0. Meanwhile a second run is refused.
 #[test]
 fn signals_end_a_run_in_order_and_two_runs_do_not_share_a_folder() {
     let folder = Folder::new("signal");
@@ -228,7 +229,7 @@ fn signals_end_a_run_in_order_and_two_runs_do_not_share_a_folder() {
     let holder = format!("in use by another dpm (process {})", running.id());
     assert!(err(&second).contains(&holder), "{}", err(&second));
     let asked = Instant::now();
-    // Supervisors send two signals, too: the second must not cut the orderly end short.
+    // Supervisors also send two signals; the second must not interrupt the orderly end.
     running.signal("TERM");
     running.signal("HUP");
     let (status, report) = running.finish();
@@ -237,12 +238,13 @@ fn signals_end_a_run_in_order_and_two_runs_do_not_share_a_folder() {
     let report: serde_json::Value = serde_json::from_str(&report).expect("the report of what was done");
     let lit = report["frames_lit"].as_u64().expect("a count");
     assert!(lit > 0 && lit < 10_000_000, "{lit} frames");
-    // The rule is 500 ms until dark; the rest is pictures, report and the other tests on this machine.
+    // The limit is 500 ms until dark. The rest is for pictures, the report and the other tests on this machine.
     assert!(took < Duration::from_secs(20), "took {took:?}");
     assert!(folder.path("report.json").exists());
 }
 
-/// Found in use, R13: a report that could not be written at the end was lost. It is printed, and the exit code says that the file is missing; a folder that
+/// Found in use, R13: a report that could not be written at the end was lost. It is printed, and the exit code says
+/// that the file is missing. A folder that cannot be written is detected before the run, with pictures or without.
 /// cannot be written before the run stops it there, with pictures or without.
 #[test]
 fn a_report_that_cannot_be_written_is_printed_all_the_same() {
@@ -276,7 +278,8 @@ fn a_report_that_cannot_be_written_is_printed_all_the_same() {
     }
 }
 
-/// Found in use, R13: `bench` and `plan` took `--out` and ignored it; O12: `plan` said nothing of what a scene loses, and R17: of what is scaled down.
+/// Found in use, R13: `bench` and `plan` accepted `--out` and ignored it; O12: `plan` did not report what a scene
+/// loses; and R17: what is scaled down.
 #[test]
 fn plan_tells_what_a_run_would_tell_and_writes_where_it_is_asked_to() {
     let folder = Folder::new("plan");
@@ -305,7 +308,7 @@ fn plan_tells_what_a_run_would_tell_and_writes_where_it_is_asked_to() {
     }
 }
 
-/// Found in use, R18: a named pipe in the place of a file was waited for without end.
+/// Found in use, R18: a named pipe in the place of a file was awaited forever.
 #[test]
 fn pipes_and_devices_are_refused_at_once() {
     let folder = Folder::new("pipe");
@@ -328,7 +331,7 @@ fn pipes_and_devices_are_refused_at_once() {
     ];
     for args in cases {
         let output = dpm(args, &NO_DRIVER);
-        // Without a controller the upload may not come as far as the file.
+        // Without a controller the upload may not reach the file.
         if args[0] != "dlpc900" || err(&output).contains("pipe") {
             assert_eq!(code(&output), 2, "{args:?}: {}", err(&output));
             assert!(err(&output).contains("a named pipe"), "{args:?}: {}", err(&output));
@@ -339,8 +342,8 @@ fn pipes_and_devices_are_refused_at_once() {
     assert!(start.elapsed() < Duration::from_secs(120), "{:?}", start.elapsed());
 }
 
-/// Found in use, R11: with 8 planes every run at virtual pace ended with "frames of light differ from what was rendered"; R20: faults of the mock projector did
-/// nothing.
+/// Found in use, R11: with 8 planes every run at virtual pace ended with "frames of light differ from what was
+/// rendered"; R20: faults of the mock projector had no effect.
 #[test]
 fn eight_planes_are_checked_exactly_and_faults_are_applied() {
     let folder = Folder::new("planes");
@@ -370,7 +373,7 @@ fn eight_planes_are_checked_exactly_and_faults_are_applied() {
         lossy["light_hash"],
         "the same seed, the same faults"
     );
-    // And at real pace, where the projector has a thread of its own.
+    // Also at real pace, where the projector has a thread of its own.
     let faults = "projector.backend={kind=\"mock\",faults=\"loss=0.05\"}";
     let json = report(
         &["demo", "--pace", "real"],
@@ -391,11 +394,12 @@ fn eight_planes_are_checked_exactly_and_faults_are_applied() {
         ],
     );
     assert!(json["frames_dropped"].as_u64() > Some(0), "{json}");
-    // Found in use, O13: a hash of the light that nobody had computed.
+    // Found in use, O13: a hash of the light that nothing had computed.
     assert!(json.get("light_hash").is_none(), "{json}");
 }
 
-/// Found in use, O11: a rig of real devices could not be tried without them; O9: `--seconds` at real pace counted frames, however long they took.
+/// Found in use, O11: a rig of real devices could not be tried without them; O9: `--seconds` at real pace counted
+/// frames, however long they took.
 #[test]
 fn a_real_rig_runs_against_the_mocks_for_as_long_as_it_is_told() {
     let folder = Folder::new("simulate");
@@ -412,7 +416,8 @@ fn a_real_rig_runs_against_the_mocks_for_as_long_as_it_is_told() {
         assert_eq!(json["pace"], pace);
         let [lit, dropped] = ["frames_lit", "frames_dropped"].map(|k| json[k].as_u64().expect("a count"));
         assert!(lit > 0 && lit + dropped <= 40, "{json}");
-        // Two seconds of slots: frames that a slow machine cannot make are left out, not waited for.
+        // Two seconds of slots: frames that a slow machine cannot make are left out, and the run does not wait for
+        // them.
         let wall = json["wall_s"].as_f64().expect("a time");
         assert!(pace == "virtual" || wall < 60.0, "{wall} s");
     }
@@ -435,7 +440,7 @@ fn a_real_rig_runs_against_the_mocks_for_as_long_as_it_is_told() {
     assert_eq!(code(&output), 0, "{}", err(&output));
 }
 
-/// A NatNet server of one body, "bunny", that moves about `position_m`.
+/// A NatNet server of one body, "bunny", that moves around `position_m`.
 fn natnet(motion: &MotionSpec, position_m: [f64; 3]) -> NatNetHost {
     let epoch = Instant::now();
     let clock: Arc<dyn HostClock> = Arc::new(move || HostTime(epoch.elapsed().as_nanos() as i64));
@@ -459,14 +464,15 @@ fn natnet_rig(folder: &Folder, server: &NatNetHost, frame_rate: u32, safety: &st
     folder.write("rig.toml", &text)
 }
 
-/// Found in use, O4 and T17: a tracker that streams millimetres, or other axes, puts its bodies where no light can fall. The run says so, whether or not its poses are
-/// new enough for light.
+/// Found in use, O4 and T17: a tracker that streams millimetres, or other axes, puts its bodies where no light can
+/// fall. The run reports this, whether or not the poses are new enough for light.
 #[test]
 fn wrong_units_of_a_real_tracker_are_told_at_the_end_of_a_run() {
     let folder = Folder::new("units");
     let server = natnet(&MotionSpec::Still {}, [150.0, 0.0, 0.0]);
     let rig = natnet_rig(&folder, &server, 50, "");
-    // Hardly what a frame takes here: little is new enough to be lit, and before, what was not lit was not judged.
+    // Less than a frame usually takes here: little is new enough to be lit, and formerly what was not lit was not
+    // judged.
     let args = [
         "run",
         &rig,
@@ -488,7 +494,7 @@ fn wrong_units_of_a_real_tracker_are_told_at_the_end_of_a_run() {
     let warnings = json["warnings"].to_string();
     assert!(warnings.contains("\\\"bunny\\\"") && warnings.contains("streams metres"), "{warnings}");
     assert!(warnings.contains("150.000"), "{warnings}");
-    // Found in use, O8: no picture of a run with a real tracker, and no word about it.
+    // Found in use, O8: a run with a real tracker gave no picture and no message about it.
     if json["frames_lit"].as_u64() > Some(0) {
         assert!(folder.path("light.png").exists(), "{json}");
         assert!(folder.path("viewer.png").exists() || warnings.contains("viewer.png"), "{json}");
@@ -500,7 +506,7 @@ fn wrong_units_of_a_real_tracker_are_told_at_the_end_of_a_run() {
     }
 }
 
-/// A deployed rig: poses come over UDP from a NatNet server with a clock of its own, light leaves at real pace.
+/// A deployed rig: poses come over UDP from a NatNet server with its own clock, and light is emitted at real pace.
 #[test]
 fn a_rig_with_a_networked_tracker_lights_what_the_tracker_sees() {
     let folder = Folder::new("natnet");
@@ -508,14 +514,15 @@ fn a_rig_with_a_networked_tracker_lights_what_the_tracker_sees() {
     let rig = natnet_rig(&folder, &server, 10, "predict_ms = 500\n");
     let json = report(&["run", &rig], &folder, &["--set", "output.images=true"]);
     assert_eq!(json["pace"], "real");
-    // Found in use, O8: no picture of a run with a real tracker.
+    // Found in use, O8: a run with a real tracker gave no picture.
     for name in ["light.png", "viewer.png"] {
         assert!(folder.path(name).exists(), "{name}: {json}");
     }
     assert!(json["frames_lit"].as_u64() > Some(0), "{json}");
-    // The age of the newest sample is known only when samples came and the server's clock was understood.
+    // The age of the newest sample is known only if samples arrived and the server's clock was mapped.
     let latency = json["motion_to_light_ms"]["p50"].as_f64().expect("samples arrived");
-    // No sharper bound: software Vulkan compiles shaders in the first frames, and the other tests take the cores meanwhile.
+    // No tighter bound: software Vulkan compiles shaders in the first frames, and the other tests use the cores
+    // meanwhile.
     assert!(latency > 0.0 && latency < 60_000.0, "{latency} ms");
     assert!(json["registration_error_px"].is_null(), "nobody knows the truth about a real tracker");
 }

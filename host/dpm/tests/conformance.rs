@@ -1,5 +1,5 @@
-//! `dpm link-test --conformance` judged: a device written from docs/PROTOCOL.md alone keeps every rule, the same device made to break a rule breaks exactly
-//! what it was made to, and the mock projector keeps them all.
+//! Checks `dpm link-test --conformance`: a device written from docs/PROTOCOL.md alone keeps every rule; the same
+//! device made to break a rule is reported for exactly that rule; and the mock projector keeps them all.
 
 mod cli_common;
 mod peer;
@@ -50,13 +50,13 @@ fn a_device_written_from_the_document_keeps_every_rule() {
         .filter(|l| matches!(l.verdict, Verdict::NotJudged(_)))
         .map(|l| l.rule)
         .collect();
-    // It reads every codec; that rule has a device of its own below.
+    // It reads every codec; that rule has its own device below.
     assert_eq!(not_judged, ["lanes", "codec-unnamed"], "{}", judgement.to_table());
     let other = of_peer("without-lz4", &["codec-unnamed".to_owned()]);
     assert_eq!(other.lines[0].verdict, Verdict::Ok, "{}", other.to_table());
 }
 
-/// One device for each rule, which breaks it: the judge notices each. Several are judged at a time, as they mostly wait.
+/// One device per rule, which breaks it: the check detects each. Several run at a time, because they mostly wait.
 #[test]
 fn a_device_that_breaks_a_rule_fails_it() {
     let all: Vec<&str> = rules().map(|r| r.id).filter(|id| !NOT_ON_SERIAL.contains(id)).collect();
@@ -97,7 +97,8 @@ fn every_rule_has_a_name_of_its_own_and_a_section_of_the_document() {
     assert_eq!(listed, seen.len(), "the document lists rules that are none");
 }
 
-/// Found in use, as a new user: "no conformance run against my device". The program judges one on a serial line, and its exit code is the judgement.
+/// Found in use, as a new user: "no conformance run against my device". The program checks a device on a serial line,
+/// and its exit code is the result.
 #[test]
 fn the_program_prints_a_line_a_rule_and_its_exit_code_is_the_judgement() {
     let rig = concat!(env!("CARGO_MANIFEST_DIR"), "/../../rigs/demo.toml");

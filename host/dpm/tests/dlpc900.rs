@@ -1,4 +1,5 @@
-//! The program `dpm dlpc900` over its own libusb, preloaded with an in-process usbfs, against the emulator over USB/IP.
+//! The program `dpm dlpc900` with its own libusb and a preloaded in-process usbfs, connected to the emulator over
+//! USB/IP.
 
 mod cli_common;
 
@@ -42,7 +43,7 @@ impl Bench {
     }
 
     fn command(&self, words: &[&str]) -> Command {
-        // Words of `dpm` itself stand for themselves, everything else is a word of `dpm dlpc900`.
+        // Commands of `dpm` itself are passed as they are; everything else is a command of `dpm dlpc900`.
         let own = ["run", "safe", "arm"].contains(&words[0]);
         let words: Vec<&str> = (!own).then_some("dlpc900").into_iter().chain(words.iter().copied()).collect();
         let mut command = cli_common::command(&words);
@@ -50,7 +51,7 @@ impl Bench {
         command
     }
 
-    /// What leads a program to the emulated bus and keeps its locks and orders in this test's folder.
+    /// The variables that lead a program to the emulated bus and keep its locks and orders in this test's folder.
     fn variables(&self) -> [(&'static str, String); 5] {
         let deps = std::env::current_exe().unwrap().parent().unwrap().to_owned();
         let library = deps.join("libusbfs_fake.so");
@@ -64,7 +65,7 @@ impl Bench {
         ]
     }
 
-    /// Waits until the server has noticed that the program before has gone; at most 20 s.
+    /// Waits until the server has noticed that the previous program has ended; at most 20 s.
     fn until_free(&self) {
         for _ in 0..4000 {
             if !self.export.is_in_use() {
@@ -75,7 +76,7 @@ impl Bench {
         panic!("a program still has the device");
     }
 
-    /// A run of the rig file that goes on beside the test.
+    /// A run of the rig file that continues during the test.
     fn start(&self) -> Running {
         self.until_free();
         let variables = self.variables();
@@ -83,7 +84,7 @@ impl Bench {
         start_with(&["run", self.folder.join("rig.toml").to_str().unwrap()], &variables)
     }
 
-    /// Orders a running rig, which confirms it.
+    /// Gives an order to a running rig, which confirms it.
     fn order(&self, word: &str, run: &Running) {
         let told = self.dpm(&[word, "--pid", &run.id().to_string()]);
         let out = text(&told.stdout);
@@ -94,14 +95,14 @@ impl Bench {
         );
     }
 
-    /// Times that the sequence was started.
+    /// Number of times that the sequence was started.
     fn starts(&self) -> usize {
         let m = self.model.lock().unwrap();
         m.executed().iter().filter(|e| e.opcode == Opcode::START_STOP && e.data == [2]).count()
     }
 
     fn ok(&self, words: &[&str]) -> String {
-        // The server frees the device a moment after the program before has ended.
+        // The server frees the device a moment after the previous program has ended.
         let until = std::time::Instant::now() + std::time::Duration::from_secs(5);
         loop {
             let o = self.dpm(words);
@@ -204,7 +205,8 @@ fn mistakes_are_named_with_their_exit_codes() {
     );
 }
 
-/// A rig on a DLPC900: rendered, loaded, shown, put to rest; and what cannot be is said before anything is rendered.
+/// A rig on a DLPC900: rendered, loaded, shown, put to rest; and what is impossible is reported before anything is
+/// rendered.
 #[test]
 fn a_rig_shows_its_first_frames_over_and_over_and_puts_the_controller_to_rest() {
     let b = Bench::new("run", 1);
@@ -232,7 +234,7 @@ fn a_rig_shows_its_first_frames_over_and_over_and_puts_the_controller_to_rest() 
     let report: serde_json::Value = serde_json::from_str(&out).unwrap_or_else(|e| panic!("{e}: {out}"));
     assert_eq!((&report["frames_loaded"], &report["patterns"]), (&2.into(), &2.into()));
     assert!(report["warnings"].to_string().contains("no watchdog"), "{report}");
-    // Found in use, O2: and once more, although it was put to rest.
+    // Found in use, O2: it starts once more, although it was put to rest.
     b.ok(&["run", "rig.toml", "--frames", "2", "--json"]);
     let m = b.model.lock().unwrap();
     assert_eq!(m.dark_because(), Some("mirrors exercised"));
@@ -259,8 +261,9 @@ fn until_lit(b: &Bench, lit: bool) {
     panic!("never lit = {lit}: {:?}", b.model.lock().unwrap().dark_because());
 }
 
-/// Found in use, O2: the second run of a rig was refused, for ever. Two in a row, one after `dpm dlpc900 idle`, one after a SIGKILL;
-/// what was killed is put to rest although the device has no watchdog.
+/// Found in use, O2: the second run of a rig was refused, forever. The test makes two in a row, one after `dpm
+/// dlpc900 idle`, and one after a SIGKILL; a killed run's controller is put to rest although the device has no
+/// watchdog.
 #[test]
 fn a_rig_in_video_mode_runs_again_and_again() {
     let b = Bench::new("again", 1);
@@ -296,8 +299,8 @@ fn until_rested(b: &Bench) {
     panic!("not put to rest: {:?}", b.model.lock().unwrap().dark_because());
 }
 
-/// Found in use, R4, on this device, which latches nothing itself: SAFE of a run that was killed, and of one that ended in order, keeps
-/// the next one dark until somebody arms it; no other command makes light meanwhile.
+/// Found in use, R4, on this device, which latches nothing itself: SAFE of a run that was killed, and of one that
+/// ended in order, keeps the next run dark until somebody arms it. No other command makes light meanwhile.
 #[test]
 fn r4_safe_stands_over_restarts_until_somebody_arms() {
     let b = Bench::new("safe", 1);
@@ -317,7 +320,7 @@ fn r4_safe_stands_over_restarts_until_somebody_arms() {
         assert!(refused.status.code() == Some(3) && err.contains("SAFE stands since"), "{err}");
         let mut run = b.start();
         run.wait_for_line(long, |line| line.contains("SAFE stands since") && line.contains("dpm arm"));
-        // Set up, with all that a start needs.
+        // Set up, with everything that a start needs.
         run.wait_for_line(long, |line| line.contains("projector: dark, latched faults"));
         for _ in 0..100 {
             assert!(b.model.lock().unwrap().dark_because().is_some() && b.starts() == started);
@@ -334,7 +337,7 @@ fn r4_safe_stands_over_restarts_until_somebody_arms() {
         run.signal("TERM");
         assert_eq!(run.finish().0.code(), Some(0));
     }
-    // It is over: the next one lights by itself.
+    // The order is over: the next run lights by itself.
     until_rested(&b);
     let run = b.start();
     until_lit(&b, true);
@@ -342,8 +345,8 @@ fn r4_safe_stands_over_restarts_until_somebody_arms() {
     assert_eq!(run.finish().0.code(), Some(0));
 }
 
-/// SIGTERM: dark within 50 ms (in one of three tries, on a machine that others use too), the process gone within two seconds with exit
-/// code 0, also while the mirrors exercise before the start.
+/// SIGTERM: dark within 50 ms (in one of three attempts, on a shared machine), and the process ends within two
+/// seconds with exit code 0, also while the mirrors exercise before the start.
 #[test]
 fn sigterm_makes_it_dark_and_ends_the_process() {
     let b = Bench::new("term", 1);

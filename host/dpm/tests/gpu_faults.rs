@@ -1,4 +1,4 @@
-//! The program `dpm` on a GPU that fails: how it ends, what it says, that the projector is dark, and that nothing hangs.
+//! The program `dpm` on a GPU that fails: it ends with a clear message, the projector is dark, and nothing hangs.
 //!
 //! Found in use, R12 and R18.
 
@@ -10,10 +10,10 @@ use std::time::{Duration, Instant};
 use vulkan_faults::FaultLayer;
 
 const SMALL: [&str; 7] = ["demo", "--json", "--raster", "48x32", "--set", "output.images=false", "--out"];
-/// A bound for what must end: software Vulkan starts and translates shaders in it too, on a busy machine.
+/// A bound for runs that must end; it includes starting software Vulkan and translating shaders on a busy machine.
 const LIMIT: Duration = Duration::from_secs(90);
 
-/// Runs the demo for so many frames at virtual pace on a GPU that fails so.
+/// Runs the demo for this many frames at virtual pace on a GPU that fails as given.
 fn demo(layer: &FaultLayer, plan: &str, folder: &Folder, frames: &str) -> Output {
     let args = [&SMALL[..], &[folder.text(), "--frames", frames]].concat();
     let mut variables = layer.variables(plan);
@@ -26,7 +26,7 @@ fn demo(layer: &FaultLayer, plan: &str, folder: &Folder, frames: &str) -> Output
     output
 }
 
-/// The last line of what it said: the error.
+/// The last line of its output: the error.
 fn error(output: &Output) -> String {
     err(output).lines().filter(|l| l.starts_with("error:")).collect()
 }
@@ -36,7 +36,7 @@ fn light_hash(output: &Output) -> String {
     json["light_hash"].as_str().expect("a hash").to_owned()
 }
 
-/// A GPU that is lost again and again, and so is each that is opened in its place.
+/// A GPU that is lost again and again, and so is each one that is opened instead.
 #[test]
 fn a_gpu_that_is_lost_for_good_ends_the_run_clearly_and_nothing_more_is_submitted() {
     let (layer, folder) = (FaultLayer::new("lost").unwrap(), Folder::new("gpu-lost"));
@@ -47,7 +47,8 @@ fn a_gpu_that_is_lost_for_good_ends_the_run_clearly_and_nothing_more_is_submitte
         assert!(text.contains("lost") && text.contains("dmesg"), "{plan}: {text}");
         let events = layer.events();
         assert!(events.iter().any(|e| e.what == "lost"), "the plan struck: {events:?}");
-        // One thread waits for frames and another one submits them: what that one has begun cannot be taken back.
+        // One thread waits for frames and another one submits them, and a submission that has begun cannot be
+        // revoked.
         let count = |what: &dyn Fn(&vulkan_faults::Event) -> bool| events.iter().filter(|e| what(e)).count();
         let late = count(&|e| e.call == "submit-after-loss");
         assert!(late <= count(&|e| e.what == "lost"), "{plan}: {events:?}");
@@ -76,7 +77,7 @@ fn a_late_gpu_changes_no_light() {
     assert!(layer.events().iter().any(|e| e.what == "late"));
 }
 
-/// One of each kind of call that a start makes. (Each single call: `tests/vulkan-faults/tests/failing_calls.rs`.)
+/// One of each kind of call that a start makes. (`tests/vulkan-faults/tests/failing_calls.rs` has every single call.)
 #[test]
 fn a_start_that_finds_no_memory_or_no_device_is_refused_clearly() {
     let (layer, folder) = (FaultLayer::new("start").unwrap(), Folder::new("gpu-start"));
@@ -103,7 +104,7 @@ fn a_start_that_finds_no_memory_or_no_device_is_refused_clearly() {
 #[test]
 fn too_little_address_space_for_software_vulkan_is_refused_before_it_crashes() {
     let folder = Folder::new("gpu-space");
-    // Only where software Vulkan is what would be used.
+    // Only if software Vulkan would be used.
     let plain = dpm(&[&SMALL[..], &[folder.text(), "--frames", "1"]].concat(), &[]);
     assert_eq!(code(&plain), 0, "{}", err(&plain));
     let report: serde_json::Value = serde_json::from_str(&out(&plain)).expect("one JSON object");

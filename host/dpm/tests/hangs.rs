@@ -1,5 +1,5 @@
-//! Found in use, R1: any thread of a running rig may hang. The projector, which is no part of that process, is dark when the frame that it shows
-//! says so, and what hung is replaced where it can be.
+//! Found in use, R1: any thread of a running rig may hang. The projector, which is not part of that process, goes
+//! dark at the instant that its current frame carries, and what hangs is replaced if possible.
 #![cfg(target_os = "linux")]
 #![allow(unsafe_code)]
 
@@ -12,17 +12,17 @@ use link_common::{raster, served_time, Projector, PtyProjector};
 use std::time::{Duration, Instant};
 
 const LONG: Duration = Duration::from_secs(60);
-/// The rig's: three slots at 60 frames a second and the longest prediction are shorter.
+/// The rig's `safety.predict_ms`, which is longer than three slots at 60 frames per second.
 const PREDICT_MS: u64 = 100;
 const SLOT_MS: u64 = 17;
 
-/// A thread of another process that stands still for as long as this lives.
+/// A thread of another process that is stopped as long as this lives.
 struct Stopped {
     thread: i32,
 }
 
 impl Stopped {
-    /// Stops a thread where it is, as a debugger would.
+    /// Stops a thread immediately, as a debugger would.
     fn new(thread: i32) -> Option<Self> {
         let none = std::ptr::null_mut::<libc::c_void>();
         // SAFETY: ptrace and waitpid change nothing in this process; the status is written during the call.
@@ -40,11 +40,11 @@ impl Stopped {
 }
 
 impl Stopped {
-    /// Takes note of the thread's end: until whoever traces it does, the process is not gone for its parent.
+    /// Acknowledges the thread's end. Until the tracer does, the parent does not see the end of the process.
     fn reap(&self, process: u32) {
-        // The process's own end is its parent's to see.
+        // The process's own end is left to its parent.
         if self.thread as u32 != process {
-            // SAFETY: waitpid changes nothing but the status, which is not asked for.
+            // SAFETY: waitpid changes nothing but the status, which is not requested.
             unsafe { libc::waitpid(self.thread, std::ptr::null_mut(), libc::__WALL) };
         }
     }
@@ -53,7 +53,7 @@ impl Stopped {
 impl Drop for Stopped {
     fn drop(&mut self) {
         let none = std::ptr::null_mut::<libc::c_void>();
-        // SAFETY: as above; a thread that is gone is no harm.
+        // SAFETY: as above; it does no harm if the thread is gone.
         unsafe { libc::ptrace(libc::PTRACE_DETACH, self.thread, none, none) };
     }
 }
@@ -95,7 +95,7 @@ fn lit_run(path: &str, far: &PtyProjector) -> Running {
     run
 }
 
-/// Threads without which no frame comes to the light. (What a stop does while any thread hangs is `stop.rs`'s matter.)
+/// Threads without which no frame is lit. (`stop.rs` tests stopping while any thread hangs.)
 const NEEDED_FOR_LIGHT: [&str; 4] = ["dpm-plan", "dpm-pack", "dpm-link", "llvmpipe-0"];
 
 #[test]
@@ -107,7 +107,7 @@ fn whichever_thread_of_the_frames_way_hangs_light_ends_by_itself() {
         let Some((thread, _)) = all.iter().find(|(_, n)| n == name) else { panic!("{name}: {all:?}") };
         let stopped = Stopped::new(*thread).expect("it may be traced");
         let dark = served_time(name, || !far.is_lit());
-        // A frame that had been sent may still be lit for its own slot first.
+        // A frame that was already sent may still be lit for its own slot.
         let bound = Duration::from_millis(4 * SLOT_MS + PREDICT_MS + 20);
         assert!(dark <= bound, "{name}: dark after {dark:?}");
         run.signal("KILL");
@@ -116,7 +116,7 @@ fn whichever_thread_of_the_frames_way_hangs_light_ends_by_itself() {
     }
 }
 
-/// What hangs is abandoned, named and replaced; when it wakes up it changes nothing.
+/// A stage that hangs is abandoned, named and replaced; when it wakes up it has no effect.
 #[test]
 fn a_stage_that_hangs_is_replaced_and_does_nothing_when_it_wakes_up() {
     let (_folder, path, far) = rig("replaced");
@@ -130,9 +130,9 @@ fn a_stage_that_hangs_is_replaced_and_does_nothing_when_it_wakes_up() {
         let lit = far.status().frames_lit;
         far.until(LONG, "light again", &mut |s| s.lit && s.frames_lit > lit);
         let back = hung.elapsed();
-        // The making of pipelines takes what it takes on this machine; it must not be a matter of minutes.
+        // Making pipelines takes an unknown time on this machine, but must not take minutes.
         assert!(back < Duration::from_secs(60), "{name}: {back:?}");
-        run.wait_for_line(LONG, |line| line.contains("made anew"));
+        run.wait_for_line(LONG, |line| line.contains("are restarted"));
         drop(stopped);
         let before = far.status();
         far.until(LONG, "light goes on", &mut |s| s.frames_lit >= before.frames_lit + 20);
@@ -144,20 +144,20 @@ fn a_stage_that_hangs_is_replaced_and_does_nothing_when_it_wakes_up() {
     }
 }
 
-/// A picture is held only while somebody could replace it.
+/// A frozen picture is held only while something could replace it.
 #[test]
 fn a_frozen_picture_goes_dark_when_a_stage_hangs() {
     let (_folder, path, far) = rig("frozen");
     let run = lit_run(&path, &far);
     let told = dpm(&["freeze", "--pid", &run.id().to_string()], &[]);
     assert_eq!(code(&told), 0, "{}", err(&told));
-    // Longer than any frame's own word lasts.
+    // Longer than the light of any frame may last.
     std::thread::sleep(Duration::from_millis(4 * SLOT_MS + 2 * PREDICT_MS));
     assert!(far.is_lit(), "held");
     let (thread, _) = threads(run.id()).into_iter().find(|(_, n)| n == "dpm-plan").expect("it runs");
     let stopped = Stopped::new(thread).expect("it may be traced");
     let dark = served_time("dark", || !far.is_lit());
-    // What the stage had announced, 0.1 s more, and the supervisor's word that is missed.
+    // The stage's announcement, 0.1 s more, and the supervisor's confirmation that is missing.
     assert!(dark <= Duration::from_millis(500), "dark after {dark:?}");
     run.signal("KILL");
     stopped.reap(run.id());

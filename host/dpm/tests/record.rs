@@ -1,4 +1,4 @@
-//! `dpm record` as a program against mock trackers: what it writes is what was sent, and what `tracker.kind = "replay"` plays.
+//! `dpm record` as a program with mock trackers: it writes what was sent, and `tracker.kind = "replay"` plays it.
 
 mod cli_common;
 
@@ -81,7 +81,7 @@ fn told(output: &Output) -> String {
     String::from_utf8_lossy(&output.stderr).into_owned() + &String::from_utf8_lossy(&output.stdout)
 }
 
-/// All that a rig with `tracker.kind = "replay"` gets of the file, through the tracker that `dpm run` opens.
+/// Everything that a rig with `tracker.kind = "replay"` gets from the file, through the tracker that `dpm run` opens.
 fn replayed(folder: &Path, file: &str, start: HostTime) -> Vec<TrackerSample> {
     let text = format!(
         "[tracker]\nkind = \"replay\"\nfile = \"{file}\"\n\
@@ -95,8 +95,9 @@ fn replayed(folder: &Path, file: &str, start: HostTime) -> Vec<TrackerSample> {
     samples
 }
 
-/// Found in use, C9 and O5: no command made the recordings that `tracker.kind = "replay"` plays. From a NatNet server: each sample that
-/// was sent while it recorded, where the body truly was, and the replay gives the same samples, bit for bit.
+/// Found in use, C9 and O5: no command made the recordings that `tracker.kind = "replay"` plays. From a NatNet
+/// server: each sample that was sent during the recording is in it, where the body truly was, and the replay gives
+/// the same samples, bit for bit.
 #[test]
 fn a_recording_holds_what_was_sent_and_replay_gives_it_back() {
     let b = Bench::new("round", true);
@@ -105,7 +106,7 @@ fn a_recording_holds_what_was_sent_and_replay_gives_it_back() {
     let recording = b.read("a.dpmt");
     assert_eq!((recording.bodies.clone(), recording.torn_bytes), (vec!["Hare".into(), "Bust".into()], 0));
     assert!(told(&o).contains(&format!("{} samples of 2 bodies", recording.samples.len())), "{}", told(&o));
-    // 1,500 in 1.5 s, less the start of a program on a busy machine.
+    // 1,500 in 1.5 s, minus the start of a program on a busy machine.
     assert!(recording.samples.len() > 700, "{}", told(&o));
     let truth = source();
     let mut next = [None; 2];
@@ -134,7 +135,7 @@ fn a_recording_holds_what_was_sent_and_replay_gives_it_back() {
     assert_eq!(b.read("a.dpmt"), recording);
 }
 
-/// At most 100 ms are lost by a SIGKILL (in one of three tries, on a machine that others use too), and what is there can be played.
+/// At most 100 ms are lost by a SIGKILL (in one of three attempts, on a shared machine), and the rest can be played.
 #[test]
 fn a_killed_recording_lacks_its_last_tenth_of_a_second_at_most() {
     let b = Bench::new("kill", true);
@@ -158,11 +159,12 @@ fn a_killed_recording_lacks_its_last_tenth_of_a_second_at_most() {
     assert!(missing.iter().any(|ms| *ms <= 100), "{missing:?} ms are missing");
 }
 
-/// A full disk ends it at once, with the reason and exit code 3, and what was written before can be played. SIGTERM ends it well.
+/// A full disk ends the recording at once, with the reason and exit code 3, and what was written before can be
+/// played. SIGTERM ends it in order.
 #[test]
 fn a_full_disk_and_a_signal_end_a_recording_clearly() {
     let b = Bench::new("full", true);
-    // No file may grow beyond 32 KiB: to the writer the same as a disk without space.
+    // No file may grow beyond 32 KiB, which is the same as a full disk for the writer.
     let words = ["record", "a.dpmt", "--rig", "rig.toml", "--seconds", "60"];
     let started = Instant::now();
     let mut limited = cli_common::command_after("trap '' XFSZ; ulimit -f 32", &words);
@@ -188,8 +190,8 @@ fn a_full_disk_and_a_signal_end_a_recording_clearly() {
     assert_eq!(b.read("t.dpmt").torn_bytes, 0);
 }
 
-/// A tracker that says nothing is an error with the tracker's own word on why; so are a folder that is not there and the mock, which any
-/// rig has, works as well.
+/// A tracker that delivers nothing is an error with the tracker's own explanation, and so is a missing folder. The
+/// mock, which any rig has, can be recorded as well.
 #[test]
 fn silence_is_an_error_and_any_tracker_can_be_recorded() {
     let b = Bench::new("silent", false);

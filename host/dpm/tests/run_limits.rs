@@ -1,4 +1,5 @@
-//! Interlock and limits on a running rig at real pace: dark when somebody else says so, and light again only where nobody ordered otherwise.
+//! Interlock and limits on a running rig at real pace: dark when something else demands it, and light again only if
+//! nobody ordered otherwise.
 
 mod link_common;
 
@@ -52,7 +53,7 @@ fn an_open_interlock_is_dark_within_50_ms_and_a_closed_one_is_light_where_nobody
     for _ in 0..3 {
         lit();
         opens();
-        // BLACK, not SAFE: nothing is latched, and frames go on.
+        // BLACK, not SAFE: nothing is latched, and frames continue.
         far.until(LONG, "black", &mut |s| s.state == DeviceState::Black && s.faults == 0);
         stays_dark();
         // An ARM does not overrule it.
@@ -61,7 +62,7 @@ fn an_open_interlock_is_dark_within_50_ms_and_a_closed_one_is_light_where_nobody
         closed.store(true, Ordering::Relaxed);
         lit();
     }
-    // What was ordered before or meanwhile stands when it closes.
+    // An order that was given before or meanwhile stands when the interlock closes.
     for order in [Order::Black, Order::Freeze] {
         for before in [true, false] {
             lit();
@@ -83,7 +84,7 @@ fn an_open_interlock_is_dark_within_50_ms_and_a_closed_one_is_light_where_nobody
     }
     lit();
     opens();
-    // A projector that comes back while it is open stays dark.
+    // A projector that comes back while the interlock is open stays dark.
     far.unplug();
     std::thread::sleep(Duration::from_millis(150));
     far.plug_in();
@@ -117,7 +118,7 @@ fn a_run_whose_interlock_is_open_from_the_start_makes_no_light() {
 #[test]
 fn a_limit_darkens_the_run_by_name_counts_its_frames_and_lets_light_come_back() {
     let far = projector("limits");
-    // The moving pattern is about half lit: at a hundredth of full white the limit is reached at once.
+    // About half of the moving pattern is lit, so a limit of a hundredth of full white is reached at once.
     let flags =
         ["safety.limits.mean_level=0.01", "safety.limits.mean_window_s=0.5", "safety.flashes_per_second=0"];
     let run = start_with(&rig(&far.backend(""), &flags), 0, |_| {});
@@ -125,7 +126,7 @@ fn a_limit_darkens_the_run_by_name_counts_its_frames_and_lets_light_come_back() 
     served_time("told", || matches!(run.monitor.projector(), ProjectorHealth::Resting(_)));
     let told = run.monitor.projector().to_string();
     assert!(told.contains("safety.limits.mean_level"), "{told}");
-    // After the rest of two seconds it is tried again, and ends again.
+    // After the rest of two seconds the light returns and ends again.
     far.until(LONG, "armed again", &mut |s| s.state == DeviceState::Armed);
     far.until(LONG, "black again", &mut |s| s.state == DeviceState::Black);
     assert_eq!(far.status().faults, 0, "the host strikes before the projector");

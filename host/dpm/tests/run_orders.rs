@@ -1,4 +1,5 @@
-//! `dpm run` as a process, on a projector behind a pseudo-terminal: orders from other processes and from its terminal, SIGTERM, SIGKILL.
+//! `dpm run` as a process, on a projector behind a pseudo-terminal: orders from other processes and from its
+//! terminal, SIGTERM, SIGKILL.
 #![allow(unsafe_code)]
 
 mod cli_common;
@@ -44,7 +45,7 @@ fn another_process_darkens_freezes_and_arms_a_running_rig() {
     let lit = far.status().frames_lit;
     far.until(LONG, "light again", &mut |s| s.frames_lit >= lit + 3);
     run.signal("TERM");
-    // H6: dark within half a second; the rest is the other tests on this machine.
+    // H6: dark within half a second; the rest is for the other tests on this machine.
     let dark = far.until(Duration::from_secs(5), "dark", &mut |s| s.state == DeviceState::Configured);
     assert!(dark < Duration::from_millis(1500), "{dark:?}");
     let (status, report) = run.finish();
@@ -64,13 +65,14 @@ fn u15_a_killed_program_leaves_darkness_within_the_watchdog_and_the_next_one_lig
     run.signal("KILL");
     let killed = Instant::now();
     far.until(Duration::from_secs(5), "dark", &mut |s| !s.lit);
-    // The last packet was heard before the kill; 20 ms are this test's own looking and a shared machine.
+    // The last packet was received before the kill; 20 ms are for this test's own checks and a shared machine.
     assert!(killed.elapsed() < WATCHDOG + Duration::from_millis(20), "{:?}", killed.elapsed());
-    // Dark by what the last frame said or by the watchdog, whichever came first; the watchdog latches in any case.
+    // Dark by the last frame's own instant or by the watchdog, whichever came first; the watchdog latches in any
+    // case.
     far.until(Duration::from_secs(5), "the watchdog", &mut |s| s.faults == faults::WATCHDOG);
     let (status, _) = run.finish();
     assert_eq!(status.code(), None, "ended by the signal");
-    // Locks and sockets of the dead are no obstacle, nor is the latched watchdog.
+    // Locks and sockets of dead processes are no obstacle, nor is the latched watchdog.
     let run = start(&["run", &path]);
     far.until(LONG, "light of the next run", &mut |s| s.lit && s.faults == 0);
     run.signal("INT");
@@ -90,7 +92,7 @@ fn keys_on_its_terminal_are_orders() {
     let stdin = stdin.unwrap();
     drop(theirs);
     let descriptor = stdin.as_raw_fd();
-    // As a login shell leaves it: lines, echo, and Ctrl-C.
+    // The state that a login shell leaves: lines, echo, and Ctrl-C.
     // SAFETY: a zeroed termios is a valid place to write to, and the descriptor is open.
     unsafe {
         let mut line: libc::termios = std::mem::zeroed();
@@ -135,7 +137,7 @@ fn keys_on_its_terminal_are_orders() {
         std::thread::sleep(Duration::from_millis(5));
     };
     assert_eq!(status.code(), Some(0), "{status}");
-    // It left the terminal as it found it.
+    // It restored the terminal.
     // SAFETY: as above.
     let flags = unsafe {
         let mut line: libc::termios = std::mem::zeroed();
@@ -158,7 +160,7 @@ fn the_link_test_prints_one_object_and_leaves_darkness() {
     assert!(!far.is_lit() && far.status().frames_lit > 0);
 }
 
-/// Asked to stop in the middle, it goes dark at once, tells what it found, and ends with 0.
+/// A run that is stopped in the middle goes dark at once, reports what it found, and ends with 0.
 #[test]
 fn signals_end_the_link_test_in_the_dark() {
     for signal in ["INT", "TERM"] {

@@ -1,4 +1,5 @@
-//! `dpm run` on a projector behind a real serial line (a pseudo-terminal): light, reports, orders, faults, unplugging, the dark at the end.
+//! `dpm run` on a projector behind a real serial line (a pseudo-terminal): light, reports, orders, faults,
+//! unplugging, the dark at the end.
 
 mod link_common;
 
@@ -32,7 +33,7 @@ fn a_run_lights_whole_frames_reports_what_the_projector_said_and_ends_dark() {
         let s = far.status();
         assert_eq!(s.state, DeviceState::Configured, "disarmed");
         assert_eq!((s.payload_errors, s.header_errors, s.frames_incomplete), (0, 0, 0));
-        // What the report says is what the projector counted.
+        // The report contains what the projector counted.
         let p = report.projector.as_ref().expect("the link was used");
         let d = p.device.expect("an outside projector reports");
         assert_eq!((d.lit, report.frames_lit), (u64::from(s.frames_lit), u64::from(s.frames_lit)));
@@ -41,7 +42,7 @@ fn a_run_lights_whole_frames_reports_what_the_projector_said_and_ends_dark() {
         assert!(report.frames_lit > 60, "{report:?}");
         assert_eq!(u64::from(s.slots), d.lit + d.repeated + d.blank, "{d:?}");
         assert_eq!(p.sessions, 1);
-        // Nobody saw the light: no hash of it, and no cost of a mock.
+        // Nothing observed the light: there is no hash of it, and no cost of a mock.
         let json: serde_json::Value = serde_json::from_str(&report.to_json()).unwrap();
         assert!(json.get("light_hash").is_none(), "{json}");
         assert!(json["stages_ms"].get("light").is_none(), "{json}");
@@ -68,14 +69,14 @@ fn an_unplugged_projector_is_taken_up_again_dark_first() {
         s.frames_lit < 10 && s.state == DeviceState::Armed
     });
     assert!(back < Duration::from_secs(1), "U1: {back:?}");
-    // The last reports before the plug was pulled never came.
+    // The last reports before the plug was pulled never arrived.
     far.until(LONG, "light again", &mut |s| s.frames_lit >= 15);
     far.check_whole();
     let report = run.stop().unwrap_or_else(|e| panic!("{e}")).report;
     assert!(!far.is_lit());
     let p = report.projector.expect("the link was used");
     assert_eq!(p.sessions, 2);
-    // Both sessions' light is in the report.
+    // The light of both sessions is in the report.
     assert!(p.device.expect("reports").lit >= 20, "{p:?}");
     assert!(report.frames_dropped > 5, "what was made while it was away");
 }
@@ -92,7 +93,7 @@ fn orders_act_on_a_running_rig_until_they_are_taken_back() {
     obeyed(Order::Black, DeviceState::Black);
     assert!(!far.is_lit());
     let lit = far.status().frames_lit;
-    // It stays so over many frames, and over an unplugging.
+    // This holds over many frames, and over an unplugging.
     std::thread::sleep(Duration::from_millis(150));
     assert_eq!((far.status().frames_lit, far.is_lit()), (lit, false));
     assert_eq!(run.monitor.projector(), ProjectorHealth::Black);
@@ -128,15 +129,15 @@ fn faults_of_a_host_pass_and_those_of_a_projector_wait_for_the_operator() {
         far.look(&mut |m| {
             let now = dpm_device::time::HostTime(i64::MIN);
             m.set_faults(now, fault);
-            // The cause is gone, the fault stays latched.
+            // The cause is gone, but the fault stays latched.
             m.set_faults(now, 0);
         });
     };
-    // A host of the past was killed.
+    // An earlier host was killed.
     latch(faults::WATCHDOG);
     let run = start(&plain, 0);
     far.until(LONG, "light in spite of the last run's watchdog", &mut |s| s.frames_lit >= 5);
-    // Now this one falls silent for a moment, as far as the projector can tell.
+    // Now this host falls silent for a moment, as seen by the projector.
     latch(faults::WATCHDOG);
     let lit = far.status().frames_lit;
     far.until(LONG, "light after the watchdog", &mut |s| s.frames_lit >= lit + 5);
@@ -153,7 +154,7 @@ fn faults_of_a_host_pass_and_those_of_a_projector_wait_for_the_operator() {
     far.until(LONG, "light after the operator's word", &mut |s| s.frames_lit >= lit + 5);
     let report = run.stop().unwrap_or_else(|e| panic!("{e}")).report;
     assert_eq!(report.projector.expect("a link").rearmed, 1);
-    // A run does not start on a projector that was hot, unless it is told to.
+    // A run does not start on a projector that was hot, unless the rig file acknowledges it.
     latch(faults::OVER_TEMPERATURE);
     let refused = start(&plain, 10).end().err().expect("refused").to_string();
     assert!(refused.contains("latched faults: over-temperature"), "{refused}");
@@ -192,7 +193,7 @@ fn an_absent_a_taken_and_a_silent_port_are_told_apart() {
     let taken = told(&far.backend(""));
     assert!(taken.contains("in use by another program"), "{taken}");
     run.stop().unwrap_or_else(|e| panic!("{e}"));
-    // A line with nobody behind it.
+    // A line without a device.
     let (line, silent, _held) = hil_mock::serial_server::pseudo_terminal().unwrap();
     let quiet = told(&format!("{{ kind = \"serial\", port = {silent:?} }}"));
     assert!(quiet.contains("is it switched on") && quiet.contains("Check the cable"), "{quiet}");

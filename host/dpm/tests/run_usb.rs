@@ -1,4 +1,4 @@
-//! `dpm run` on a projector on USB: an unmodified libusb over an in-process usbfs.
+//! `dpm run` on a USB projector: an unmodified libusb with an in-process usbfs.
 
 mod link_common;
 
@@ -118,12 +118,13 @@ fn an_absent_a_denied_and_a_taken_projector_are_told_apart() {
     run.stop().unwrap_or_else(|e| panic!("{e}"));
     far.unplug();
     far.plug(Options { denied: true, ..Options::default() });
-    // A denied device does not tell its serial number: whoever asks for another one hears of it, too.
+    // An inaccessible device does not show its serial number, so its error is also reported to a user who asked for
+    // another one.
     let denied = told(r#"{ kind = "usb", serial_number = "none" }"#);
     assert!(denied.contains("permission denied") && denied.contains("60-dpm.rules"), "{denied}");
 }
 
-/// A cable that takes so many bytes a second carries so many frames, raw; the same frames compacted carry more.
+/// A cable of limited bytes per second carries a limited number of raw frames; the same frames compacted carry more.
 #[test]
 fn the_link_test_finds_the_rate_that_a_slow_cable_allows() {
     let far = UsbBench::new(0xa3, Options::default());
@@ -134,7 +135,8 @@ fn the_link_test_finds_the_rate_that_a_slow_cable_allows() {
         link_test(&rig, &Content::prepared(&rig, 4), 1.5, &|| false).unwrap_or_else(|e| panic!("{e}"));
     let [raw, auto] = &report.ways[..] else { panic!("{report:?}") };
     assert_eq!(raw.limited_by, "medium", "{raw:?}");
-    // Not faster than the cable, but for its FIFO of 64 KiB at the start; slower only by what a busy machine costs.
+    // Not faster than the cable, except for its FIFO of 64 KiB at the start; slower only by the delays of a busy
+    // machine.
     let fifo = 65_536.0 / frame as f64 / 1.5;
     assert!(raw.frames_per_s < 1.05 * (100.0 + fifo), "{raw:?}");
     assert!(raw.frames_per_s > 50.0, "{raw:?}");

@@ -1,4 +1,5 @@
-//! Orders that outlive the program, and whose rig it is: `dpm run` as a process on a projector behind a pseudo-terminal.
+//! Orders that outlive the program, and the ownership of rigs: `dpm run` as a process on a projector behind a
+//! pseudo-terminal.
 #![allow(unsafe_code)]
 
 mod cli_common;
@@ -60,7 +61,7 @@ impl Bench {
         run
     }
 
-    /// The one file of a standing order; none where nothing stands.
+    /// The only file of a standing order; `None` if no order stands.
     fn kept(&self) -> Option<PathBuf> {
         let files = fs::read_dir(&self.state).into_iter().flatten().filter_map(Result::ok).map(|e| e.path());
         let files: Vec<_> = files.filter(|p| p.extension().is_some_and(|e| e == "order")).collect();
@@ -83,7 +84,7 @@ impl Bench {
         out(&told)
     }
 
-    /// The next run says that `word` stands, stays dark over ten slots of its frames, and lights when it is told to.
+    /// The next run reports that `word` stands, stays dark over ten slots of its frames, and lights when it is armed.
     fn comes_up_dark_until_armed(&self, word: &str) {
         let mut run = self.start();
         run.wait_for_line(LONG, |line| line.contains(word) && line.contains("dpm arm"));
@@ -101,7 +102,7 @@ impl Bench {
         assert_eq!(self.kept(), None);
         run.signal("TERM");
         assert_eq!(run.finish().0.code(), Some(0));
-        // It is over: the next one lights by itself.
+        // The order is over: the next run lights by itself.
         let run = self.lit();
         run.signal("INT");
         assert_eq!(run.finish().0.code(), Some(0));
@@ -115,7 +116,7 @@ impl Bench {
     }
 }
 
-/// Found in use, R4: `dpm safe`, `kill -9`, `dpm run` brought the light back with nobody's word.
+/// Found in use, R4: `dpm safe`, `kill -9`, `dpm run` brought the light back without anybody's order.
 #[test]
 fn r4_safe_holds_over_kill_and_a_projector_without_power_until_somebody_arms() {
     let bench = Bench::new("safe");
@@ -138,7 +139,7 @@ fn r4_safe_that_only_the_projector_remembers_holds_too() {
     args.extend(["--set".into(), "safety.acknowledge_faults=true".into()]);
     let mut run = start_with(&args, &[("DPM_STATE_DIR", &state)]);
     run.wait_for_line(LONG, |line| line.contains("projector: dark, latched faults"));
-    // From now on it is known here, too, should the projector lose its power.
+    // From now on the host knows it too, should the projector lose its power.
     let begin = Instant::now();
     while bench.kept().is_none() {
         assert!(begin.elapsed() < LONG && !bench.far.is_lit());
@@ -150,7 +151,7 @@ fn r4_safe_that_only_the_projector_remembers_holds_too() {
     bench.comes_up_dark_until_armed("SAFE stands since");
 }
 
-/// Found in use, R4: a state file that cannot be read is SAFE.
+/// Found in use, R4: a state file that cannot be read counts as SAFE.
 #[test]
 fn r4_a_damaged_state_file_keeps_the_next_run_dark() {
     let bench = Bench::new("damaged");
@@ -162,7 +163,7 @@ fn r4_a_damaged_state_file_keeps_the_next_run_dark() {
     bench.comes_up_dark_until_armed("counts as SAFE");
 }
 
-/// Found in use, R4: BLACK of a run that died stands; an orderly end forgets it.
+/// Found in use, R4: BLACK of a run that died remains; an orderly end forgets it.
 #[test]
 fn r4_black_outlives_a_run_that_died_and_not_one_that_ended() {
     let bench = Bench::new("black");
@@ -181,7 +182,7 @@ fn r4_black_outlives_a_run_that_died_and_not_one_that_ended() {
     bench.comes_up_dark_until_armed("SAFE stands since");
 }
 
-/// Found in use, R4: without a folder to keep SAFE in, a real projector is not run.
+/// Found in use, R4: without a folder in which SAFE can be kept, a real projector is not run.
 #[test]
 fn r4_a_real_projector_without_a_state_folder_is_refused() {
     let bench = Bench::new("no-state");
@@ -196,7 +197,7 @@ fn r4_a_real_projector_without_a_state_folder_is_refused() {
     assert_eq!(bench.far.status().state, DeviceState::Idle);
 }
 
-/// Found in use, R9: a thousand silent clients of the same user held `dpm safe` up, and it said "delivered".
+/// Found in use, R9: a thousand silent clients of the same user delayed `dpm safe`, which then reported "delivered".
 #[test]
 fn r9_a_thousand_silent_connections_hold_no_emergency_up() {
     let bench = Bench::new("flood");
@@ -217,7 +218,7 @@ fn r9_a_thousand_silent_connections_hold_no_emergency_up() {
     assert!(told.contains("ok: projector dark") && told.contains("rig.toml"), "{told}");
     assert!(asked.elapsed() < Duration::from_secs(2), "{:?}", asked.elapsed());
     assert_eq!(bench.far.status().state, DeviceState::Faulted);
-    // Those that were cut off have come back.
+    // The disconnected clients have come back.
     silent.extend((0..500).map(|_| UnixStream::connect(&short).unwrap()));
     bench.order("arm", &run, 0);
     bench.far.until(LONG, "light", &mut |s| s.lit);
@@ -225,7 +226,8 @@ fn r9_a_thousand_silent_connections_hold_no_emergency_up() {
     assert_eq!(run.finish().0.code(), Some(0));
 }
 
-/// Found in use, R7: root's run wrote its process number into a file of its own that nobody had linked from the lock folder.
+/// Found in use, R7: root's run wrote its process id into a file of root to which the user nobody had placed a link
+/// in the lock folder.
 #[test]
 fn r7_a_lock_folder_of_others_and_planted_links_are_refused() {
     let bench = Bench::new("links");
@@ -233,7 +235,7 @@ fn r7_a_lock_folder_of_others_and_planted_links_are_refused() {
     fs::create_dir(&runtime).unwrap();
     let victim = bench._folder.path("victim");
     fs::write(&victim, b"precious").unwrap();
-    // The name of the lock, from a run that made it.
+    // The name of the lock, from a run that created it.
     let run = |wanted: &str| {
         let told = dpm(&["run", &bench.path], &[("DPM_RUNTIME_DIR", runtime.to_str().unwrap())]);
         assert_eq!(code(&told), 2, "{}{}", out(&told), err(&told));
@@ -283,7 +285,8 @@ fn impostor() {
     }
 }
 
-/// Found in use, R8: nobody answered in the place of root's rig, and root's `dpm black` ended with 0.
+/// Found in use, R8: a process of the user nobody answered in the place of root's rig, and root's `dpm black` ended
+/// with 0.
 #[test]
 fn r8_another_users_word_is_not_taken_for_a_rigs() {
     if !is_root() {
@@ -309,14 +312,14 @@ fn r8_another_users_word_is_not_taken_for_a_rigs() {
     let _ = child.wait();
     assert_eq!(code(&told), 3, "{}{}", out(&told), err(&told));
     assert!(
-        out(&told).contains("process 4242 of nobody") && out(&told).contains("nobody vouches"),
+        out(&told).contains("process 4242 of nobody") && out(&told).contains("says (unverified)"),
         "{}",
         out(&told)
     );
     assert!(err(&told).contains("reached no rig of user root"), "{}", err(&told));
 }
 
-/// Only a running rig can be armed, and whoever tries is told what still stands.
+/// Only a running rig can be armed, and the message says what still stands.
 #[test]
 fn without_a_running_rig_arm_clears_nothing() {
     let bench = Bench::new("arm");
@@ -327,7 +330,7 @@ fn without_a_running_rig_arm_clears_nothing() {
     assert_eq!(code(&told), 3);
     assert!(err(&told).contains("only a running rig can be armed"), "{}", err(&told));
     assert!(bench.kept().is_some());
-    // Nor does a command that would light without a rig that could be armed.
+    // A command that would light without a rig that could be armed does not light either.
     let told = dpm(&["link-test", &bench.path, "--prepared", "--for", "1"], &variables);
     assert_eq!(code(&told), 3, "{}", err(&told));
     assert!(err(&told).contains("SAFE stands since"), "{}", err(&told));

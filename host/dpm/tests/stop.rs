@@ -1,4 +1,4 @@
-//! Stop means dark, and the process is gone, whichever of its threads hangs: each is stopped by ptrace in turn.
+//! Stop means dark, and the process ends, whichever of its threads hangs: ptrace stops each of them in turn.
 #![allow(unsafe_code)]
 
 mod cli_common;
@@ -18,10 +18,10 @@ use std::time::{Duration, Instant};
 const LONG: Duration = Duration::from_secs(60);
 /// From the signal to the end of the process.
 const GONE: Duration = Duration::from_secs(2);
-/// The test's own looking, and a machine that does other things too.
+/// Time for the test's own checks, on a busy machine.
 const LOOKING: Duration = Duration::from_millis(20);
 
-/// A thread of another process that stands still until this is dropped. Its tracer must be the thread that made it.
+/// A thread of another process that is stopped until this is dropped. Only the thread that made this can trace it.
 struct Stopped {
     tid: i32,
 }
@@ -46,7 +46,7 @@ impl Stopped {
         Self { tid }
     }
 
-    /// Its end, where that has come. The process's own number is left to who started it.
+    /// Its end, if it has come. The process's own end is left to its parent.
     fn reap(&self, pid: u32) {
         if self.tid != pid as i32 {
             // SAFETY: a null status is allowed.
@@ -58,7 +58,7 @@ impl Stopped {
 impl Drop for Stopped {
     fn drop(&mut self) {
         let none = std::ptr::null_mut::<libc::c_void>();
-        // SAFETY: a request without addresses; it fails where the thread is gone.
+        // SAFETY: a request without addresses; it fails if the thread is gone.
         unsafe { libc::ptrace(libc::PTRACE_DETACH, self.tid, none, none) };
     }
 }
@@ -78,7 +78,7 @@ fn thread_of(pid: u32, name: &str) -> i32 {
     panic!("no thread {name} in {seen:?}");
 }
 
-/// Waits for the end of `run` while `stopped` is traced; the time that counts.
+/// Waits for the end of `run` while `stopped` is traced; returns the time that counts.
 fn gone(run: &mut Running, stopped: &Stopped) -> Duration {
     let pid = run.id();
     served_time("gone", || {
@@ -87,7 +87,8 @@ fn gone(run: &mut Running, stopped: &Stopped) -> Duration {
     })
 }
 
-/// Found in use, R2: with a stage that hung, SIGTERM and SIGINT left the frame lit, the process alive, and armed again.
+/// Found in use, R2: when a stage hung, SIGTERM and SIGINT left the frame lit and the process alive, and the
+/// projector was armed again.
 #[test]
 fn r2_whichever_thread_hangs_a_stop_is_dark_and_the_process_goes() {
     for (name, signal) in [
@@ -107,7 +108,7 @@ fn r2_whichever_thread_hangs_a_stop_is_dark_and_the_process_goes() {
         let stopped = Stopped::thread(run.id(), name);
         run.signal(signal);
         let dark = served_time("dark", || !far.is_lit());
-        // The link's own thread is the one that can tell the projector; without it the watchdog does.
+        // The link's own thread is the one that can send orders to the projector; without it the watchdog acts.
         let limit = if name == "dpm-link" { WATCHDOG } else { Duration::from_millis(50) };
         assert!(dark <= limit + LOOKING, "{name}: dark after {dark:?}");
         let left = gone(&mut run, &stopped);
@@ -118,7 +119,8 @@ fn r2_whichever_thread_hangs_a_stop_is_dark_and_the_process_goes() {
     }
 }
 
-/// Found in use, R9: an order is obeyed although the thread that hears orders hangs, and is said to be done because it was seen to be.
+/// Found in use, R9: an order is obeyed although the thread that receives orders hangs, and it is reported as obeyed
+/// because the state file confirmed it.
 #[test]
 fn r9_black_and_safe_need_no_control_thread() {
     let (_folder, path, far) = rig("deaf");
@@ -137,7 +139,7 @@ fn r9_black_and_safe_need_no_control_thread() {
         assert_eq!(code(&told), 0, "{}{}", out(&told), err(&told));
         far.until(LONG, "light", &mut |s| s.lit);
     }
-    // The whole process stands still: nothing is confirmed, and that is said.
+    // The whole process is stopped: nothing is confirmed, and the message says so.
     run.signal("STOP");
     let told = dpm(&["safe", "--pid", &pid], &[]);
     assert_eq!(code(&told), 3, "{}{}", out(&told), err(&told));
@@ -149,7 +151,7 @@ fn r9_black_and_safe_need_no_control_thread() {
     let _ = served_time("gone", || run.try_wait().is_some());
 }
 
-/// The disk that keeps orders hangs: dark all the same, and not said to be kept.
+/// The disk that keeps orders hangs: the projector goes dark all the same, and the order is not reported as kept.
 #[test]
 fn r4_an_order_is_obeyed_before_it_is_kept() {
     let (_folder, path, far) = rig("slow-disk");
@@ -168,7 +170,7 @@ fn r4_an_order_is_obeyed_before_it_is_kept() {
     run.finish();
 }
 
-/// A standard error stream that nobody reads holds up neither orders nor the end.
+/// A standard error stream without a reader delays neither orders nor the end.
 #[test]
 fn r2_a_stream_that_nobody_reads_holds_nothing_up() {
     let (_folder, path, far) = rig("unread");
@@ -202,7 +204,7 @@ fn r2_a_stream_that_nobody_reads_holds_nothing_up() {
     drop((reader, writer));
 }
 
-/// What the next test runs as a process of its own: a thread panics, and nothing else ends.
+/// The next test runs this as a process of its own: a thread panics, and nothing else ends.
 #[test]
 #[ignore = "a part of the test below"]
 fn panics_and_hangs() {
@@ -219,7 +221,8 @@ fn panics_and_hangs() {
     std::thread::sleep(LONG);
 }
 
-/// Found in use, R2, and its kin: a panic in any thread asks all others to stop, and a process that does not end by itself is ended, not with 0.
+/// Found in use, R2 and related: a panic in any thread stops all others, and a process that does not end by itself is
+/// ended, not with exit code 0.
 #[test]
 fn r2_a_panic_in_any_thread_is_a_stop() {
     let mut command = Command::new(std::env::current_exe().unwrap());

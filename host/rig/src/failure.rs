@@ -1,17 +1,17 @@
-//! Why a command ends: a kind that the caller can act on, its exit code, and a message for the operator.
+//! Why a command failed: a kind that the caller can act on, its exit code, and a message for the operator.
 
 use std::fmt;
 
 /// What an operator can do about a failure.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum FailureKind {
-    /// The command ran and what it checks does not hold.
+    /// The command ran, but a condition that it checks does not hold.
     CheckFailed,
-    /// A file, flag or setting is wrong.
+    /// A file, a flag or a setting is wrong.
     BadInput,
     /// A projector, tracker or the operating system refused.
     Device,
-    /// No usable Vulkan device.
+    /// There is no usable Vulkan device.
     NoGpu,
 }
 
@@ -27,12 +27,12 @@ impl FailureKind {
     }
 }
 
-/// The end of a command that did not do what it was asked to.
+/// Why a command did not do what it was asked to do.
 #[derive(Debug)]
 pub struct Failure {
     /// What can be done about it.
     pub kind: FailureKind,
-    /// What failed, on which object, and the next step; may have several lines.
+    /// What failed, on which object, and the next step. May have several lines.
     pub message: String,
 }
 
@@ -51,17 +51,17 @@ impl fmt::Display for Failure {
 
 impl std::error::Error for Failure {}
 
-/// The end of a command that has something to report, whether or not it did what it was asked to.
+/// The result of a command that has something to report, whether or not it succeeded.
 #[derive(Debug)]
 pub struct Ended<T> {
-    /// What it found. It is printed in any case.
+    /// What the command found. It is printed in any case.
     pub report: T,
-    /// Why the command fails all the same: a check that does not hold, a file that could not be written.
+    /// Why the command fails nevertheless: a check that does not hold, or a file that could not be written.
     pub failure: Option<Failure>,
 }
 
 impl<T> Ended<T> {
-    /// `failure` joins those that there are: the first one gives the kind, all give their messages.
+    /// Adds `failure` to earlier ones. The first failure determines the kind; the messages of all are kept.
     pub(crate) fn fail(&mut self, failure: Failure) {
         match &mut self.failure {
             Some(first) => {
@@ -72,7 +72,7 @@ impl<T> Ended<T> {
         }
     }
 
-    /// Keeps what `result` holds; its failure joins those that there are.
+    /// Returns the value of `result`. If it is a failure, adds it to the earlier ones and returns `None`.
     pub fn keep<R>(&mut self, result: Result<R, Failure>) -> Option<R> {
         result.map_err(|e| self.fail(e)).ok()
     }

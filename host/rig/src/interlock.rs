@@ -1,8 +1,9 @@
-//! Somebody else's word that there may be light: a process that lives, a contact that is closed, a key that is held down.
+//! An external permission for light: a process that lives, a contact that is closed, a key that is held down.
 //!
-//! A thread of its own asks every few milliseconds and notes when it last heard "yes". Whoever makes light asks [`Interlock::is_closed`], one
-//! atomic read and the clock: a "no", and equally a thread that hangs, fails or ends, is an open interlock. Open means BLACK at once;
-//! closed again means light again where the operator did not order otherwise. docs/SAFETY.md says what it is good for.
+//! A thread of its own asks every few milliseconds and records when it last got a "yes". Light depends on
+//! [`Interlock::is_closed`], which costs one atomic read and the clock. The interlock is open after a "no", and
+//! equally when its thread hangs, fails or ends. When it opens, the projector goes BLACK at once. When it closes,
+//! light returns unless the operator ordered otherwise. docs/SAFETY.md says what it is good for.
 
 mod contacts;
 
@@ -16,33 +17,34 @@ use std::time::Duration;
 
 /// How often the contact is asked.
 const ASK_EVERY: Duration = Duration::from_millis(5);
-/// A "yes" older than this is none: the thread that asks has fallen silent.
+/// A "yes" older than this does not count, because the asking thread has fallen silent.
 pub(crate) const SILENCE_NS: i64 = 100_000_000;
-/// Before any instant of the clock.
+/// Earlier than any instant of the clock.
 const NEVER: i64 = i64::MIN / 2;
 
 /// What decides whether there may be light.
 pub trait Contact: Send {
-    /// True while there may be. Errors and doubts are `false`. Should return within milliseconds; light is off after [`SILENCE_NS`] otherwise.
+    /// True while light is permitted. Errors and doubts are `false`. Should return within milliseconds; otherwise the
+    /// light goes off after [`SILENCE_NS`].
     fn is_closed(&mut self) -> bool;
 }
 
-/// What the asking thread and everybody else share.
+/// What the asking thread shares with all others.
 #[derive(Debug)]
 struct Shared {
     clock: MonotonicClock,
-    /// When the contact was found closed last; [`NEVER`] since it was found open.
+    /// When the contact was last found closed; [`NEVER`] since it was found open.
     closed_at: AtomicI64,
     keys: HeldKey,
     stop: AtomicBool,
 }
 
-/// A key of a terminal, which repeats while it is held.
+/// A key of a terminal, which auto-repeats while it is held.
 #[derive(Debug)]
 struct HeldKey {
-    /// When it came last.
+    /// When it was last received.
     at: AtomicI64,
-    /// It came at least twice, each time soon after the time before.
+    /// It was received at least twice, each time soon after the previous time.
     repeats: AtomicBool,
     release_ns: i64,
 }
@@ -58,7 +60,7 @@ impl HeldKey {
     }
 }
 
-/// An interlock and the thread that asks its contact, until it is dropped.
+/// An interlock and the thread that asks its contact. The thread ends when this is dropped.
 #[derive(Debug)]
 pub struct Interlock {
     shared: Arc<Shared>,
@@ -68,11 +70,11 @@ pub struct Interlock {
 }
 
 impl Interlock {
-    /// The interlock of a rig file; `None` where it has none. Returns when its contact was asked once, or did not answer in time. `has_keys`: keys of
-    /// the terminal will be passed to [`Interlock::key_pressed`].
+    /// The interlock of a rig file; `None` if it has none. Returns when its contact was asked once, or did not answer
+    /// in time. `has_keys`: keys of the terminal will be passed to [`Interlock::key_pressed`].
     ///
     /// # Errors
-    /// A key is wanted and there is no terminal; the system gives no thread.
+    /// The rig file names a key but there is no terminal; or the system cannot start a thread.
     pub fn of_config(config: &InterlockConfig, has_keys: bool) -> Result<Option<Self>, Failure> {
         let bad = |text: &str| Failure::new(FailureKind::BadInput, text);
         let (what, key, release_ms) = match config {
@@ -102,10 +104,10 @@ impl Interlock {
         Ok(Some(interlock))
     }
 
-    /// An interlock that asks `contact`; `what` names it in messages.
+    /// An interlock that asks `contact`; `what` is its name in messages.
     ///
     /// # Errors
-    /// The system gives no thread.
+    /// The system cannot start a thread.
     pub fn with_contact(what: &str, contact: impl Contact + 'static) -> Result<Self, Failure> {
         Self::start(what.to_owned(), None, 0, |_| Box::new(contact))
     }
@@ -135,7 +137,7 @@ impl Interlock {
                 // A panic of the contact ends the thread, and with it the light.
                 while !asking.stop.load(Ordering::Relaxed) {
                     let before = asking.clock.now().0;
-                    // As of before it was asked: an answer that took long is already old.
+                    // The time before asking counts: an answer that took long is already old.
                     let at = if contact.is_closed() { before } else { NEVER };
                     asking.closed_at.store(at, Ordering::Release);
                     let _ = asked.send(());
@@ -149,17 +151,17 @@ impl Interlock {
         Ok(Self { shared, key, what, thread: Some(thread) })
     }
 
-    /// True while there may be light: the contact said so within the last [`SILENCE_NS`]. Never waits.
+    /// True while light is permitted: the contact was found closed within the last [`SILENCE_NS`]. Never waits.
     pub fn is_closed(&self) -> bool {
         self.shared.clock.now().0 - self.shared.closed_at.load(Ordering::Acquire) <= SILENCE_NS
     }
 
-    /// What must be so, for messages: `process "laser-guard"`.
+    /// The condition for light, for messages: `process "laser-guard"`.
     pub fn what(&self) -> &str {
         &self.what
     }
 
-    /// A key came from the terminal. `true` when it is the interlock's own.
+    /// A key was pressed on the terminal. Returns `true` if it is the interlock's key.
     pub fn key_pressed(&self, key: u8) -> bool {
         let ours = self.key == Some(key);
         if ours {
@@ -172,7 +174,7 @@ impl Interlock {
 impl Drop for Interlock {
     fn drop(&mut self) {
         self.shared.stop.store(true, Ordering::Relaxed);
-        // A thread that hangs in its contact is left to the end of the process.
+        // A thread that hangs in its contact is left behind until the process ends.
         if let Some(thread) = self.thread.take().filter(|t| {
             let deadline = std::time::Instant::now() + Duration::from_millis(200);
             while !t.is_finished() && std::time::Instant::now() < deadline {

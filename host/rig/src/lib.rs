@@ -1,11 +1,11 @@
-//! The rig. **Follow one frame**: tracks, plan, render, pack, link, light.
+//! The rig. **Follow one frame** through its folders: tracks, plan, render, pack, link, light.
 //!
-//! See `docs/FRAME.md` for the way of a frame with its picture, and `docs/ARCHITECTURE.md` for one invariant per folder.
+//! `docs/FRAME.md` follows a frame in detail, with a picture. `docs/ARCHITECTURE.md` states one invariant per folder.
 //!
 //! # Example: twenty frames from motion to light
 //!
-//! The demo's rig with the mock tracker and the mock projector. Prepared frames take the renderer's place, so no GPU is needed;
-//! [`pipeline::run`] with a [`dpm_render::gpu::Gpu`] renders them.
+//! This runs the demo's rig with the mock tracker and the mock projector. Prepared frames replace the renderer, so no
+//! GPU is needed; [`pipeline::run`] with a [`dpm_render::gpu::Gpu`] renders them.
 //!
 //! ```
 //! use dpm_device::planes::Raster;

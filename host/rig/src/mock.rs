@@ -1,4 +1,5 @@
-//! The mock tracker and the mock projector as the rig takes them. This is the only file of the rig that names the crate `hil-mock`.
+//! The mock tracker and the mock projector, as the rig uses them. No other file of the rig names the crate
+//! `hil-mock`.
 
 use hil_mock::faults::FaultKind;
 use hil_mock::projector::FaultyProjector;
@@ -14,7 +15,7 @@ pub(crate) use hil_mock::tracker::{MockTracker, MockTrackerConfig, MockTrackerEr
 /// Checks `tracker.faults` of a rig file.
 ///
 /// # Errors
-/// Text that is no plan of faults, or faults that a tracker does not have.
+/// The text is not a list of faults, or a tracker does not have one of them.
 pub(crate) fn check_tracker_faults(text: &str) -> Result<(), FaultError> {
     check_faults(text, &TRACKER_FAULTS, "the mock tracker")
 }
@@ -22,7 +23,7 @@ pub(crate) fn check_tracker_faults(text: &str) -> Result<(), FaultError> {
 /// Checks `projector.backend.faults` of a rig file.
 ///
 /// # Errors
-/// Text that is no plan of faults, or faults that a projector does not have.
+/// The text is not a list of faults, or a projector does not have one of them.
 pub(crate) fn check_projector_faults(text: &str) -> Result<(), FaultError> {
     check_faults(text, &FaultyProjector::KNOWN, "the mock projector")
 }

@@ -1,35 +1,35 @@
-//! What an operator can ask of the projector; `docs/ORDERS.md` says what it means.
+//! The orders that an operator can give to the projector; `docs/ORDERS.md` defines them.
 
-/// What an operator can ask of the projector of a running rig.
+/// An order that an operator can give to the projector of a running rig.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 #[repr(u8)]
 pub enum Order {
-    /// Dark at once; frames go on being made.
+    /// Dark at once. Frames continue to be made.
     Black = 1,
     /// Hold the frame that is lit.
     Freeze = 2,
     /// Dark and latched.
     Safe = 3,
-    /// Light again, after any of these or after a fault.
+    /// Light again, after any of the other orders or after a fault.
     Arm = 4,
 }
 
 impl Order {
-    /// Every order with the word for it.
+    /// Every order with its name.
     pub const ALL: [(Self, &'static str); 4] =
         [(Self::Black, "black"), (Self::Freeze, "freeze"), (Self::Safe, "safe"), (Self::Arm, "arm")];
 
-    /// The word for it.
+    /// Its name.
     pub fn word(self) -> &'static str {
         Self::ALL.iter().find(|(order, _)| *order == self).map_or("", |(_, word)| word)
     }
 
-    /// True for the orders that make it dark.
+    /// True for the orders that make the projector dark.
     pub fn is_dark(self) -> bool {
         matches!(self, Self::Black | Self::Safe)
     }
 
-    /// How strong it is: what stands is replaced by what is as strong or stronger, and by ARM only.
+    /// Its strength. A standing order is replaced only by an order of equal or greater strength, or by ARM.
     pub(crate) fn strength(self) -> u8 {
         match self {
             Self::Arm => 0,
@@ -43,12 +43,12 @@ impl Order {
         Self::ALL.iter().map(|(order, _)| *order).find(|order| *order as u8 == code)
     }
 
-    /// The order that a key on the terminal of a run gives: the first letter of its word, small or capital.
+    /// The order that a key on the terminal of a run gives: the first letter of its name, in either case.
     pub fn from_key(key: u8) -> Option<Self> {
         Self::ALL.iter().find(|(_, w)| w.as_bytes()[0] == key.to_ascii_lowercase()).map(|(order, _)| *order)
     }
 
-    /// The order with this word.
+    /// The order with this name.
     pub(crate) fn from_word(word: &str) -> Option<Self> {
         Self::ALL.iter().find(|(_, w)| *w == word).map(|(order, _)| *order)
     }

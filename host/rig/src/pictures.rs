@@ -1,7 +1,9 @@
-//! Frames of light into what an eye saw: light added up over a window by an eye that follows each body.
+//! Converts frames of light into what an eye saw. The eye follows each body and integrates light over a window of
+//! time.
 //!
-//! For every pixel of the picture the surface point it shows at the last instant is carried back through the window with its body's true
-//! motion, and the light that fell on it in each frame is averaged. Motion blur of a following eye, lag and misregistration are all in it.
+//! Every pixel of the picture shows a surface point at the last instant. That point is carried back through the
+//! window with the true motion of its body, and the light that fell on it is averaged over all frames. The picture
+//! therefore contains the motion blur of a following eye, lag, and misregistration.
 
 use crate::light::recorder::LightFrame;
 use crate::light::FrameRecord;
@@ -12,21 +14,22 @@ use dpm_scene::geometry::projector::ProjectorCamera;
 use dpm_shaders::structs::NO_HIT;
 use glam::{DAffine3, DVec2, DVec3, Vec3};
 
-/// The two pictures of a run, linear, row by row, of the projector's raster.
+/// The two pictures of a run: linear values, row by row, at the projector's raster.
 pub struct Pictures {
-    /// Drive 0..1 that fell on the surface seen by each projector pixel. Where no pose is known, the mean light of each pixel of the raster.
+    /// Drive from 0 to 1 that fell on the surface seen by each projector pixel. Where no pose is known, it is the
+    /// mean light of each raster pixel.
     pub light: Vec<Vec3>,
-    /// Radiance that the observer saw, scene units, seen through a camera at the eye; or why there is none.
+    /// Radiance that the observer saw, in scene units, through a camera at the eye; or why it is missing.
     pub viewer: Result<Vec<Vec3>, &'static str>,
 }
 
-/// Frames of light with the poses of the tracked bodies at the middle of each.
+/// Frames of light with the poses of the tracked bodies in the middle of each frame.
 struct Window<'a> {
     frames: Vec<(&'a LightFrame, Vec<DAffine3>)>,
 }
 
-/// The frames of `light` whose poses are known: the true ones where the mock tracker tells them, else those that each frame was drawn for, which are where
-/// a real tracker and the prediction put the bodies.
+/// The frames of `light` whose poses are known. With the mock tracker they are the true poses. With a real tracker
+/// they are the poses that each frame was drawn for: measured, then predicted.
 fn window<'a>(rig: &Rig, light: &'a [LightFrame], records: &[FrameRecord]) -> Window<'a> {
     let half_slot = rig.rate().slot_len_ns(0) / 2;
     let drawn_for = |f: &LightFrame| {
@@ -38,7 +41,7 @@ fn window<'a>(rig: &Rig, light: &'a [LightFrame], records: &[FrameRecord]) -> Wi
     Window { frames: light.iter().filter_map(|f| Some((f, poses(f)?))).collect() }
 }
 
-/// Mean of the frames, pixel by pixel, 0..1.
+/// Mean of the frames for each pixel, 0 to 1.
 fn mean(light: &[LightFrame]) -> Vec<Vec3> {
     let mut sum = vec![Vec3::ZERO; light.first().map_or(0, |f| f.codes.len())];
     for frame in light {
@@ -49,10 +52,11 @@ fn mean(light: &[LightFrame]) -> Vec<Vec3> {
     sum.iter().map(|s| *s / (255.0 * light.len().max(1) as f32)).collect()
 }
 
-/// Makes both pictures from the last frames of light, of which there is at least one. `records` tell what those frames were drawn for.
+/// Makes both pictures from the last frames of light. There must be at least one frame. `records` says what each
+/// frame was drawn for.
 ///
 /// # Errors
-/// The GPU's.
+/// The GPU failed.
 pub fn pictures(
     rig: &Rig,
     renderer: &mut Renderer,
@@ -61,21 +65,24 @@ pub fn pictures(
 ) -> Result<Pictures, GpuError> {
     let window = window(rig, light, records);
     if window.frames.is_empty() {
-        let why = "neither the tracker nor the frames tell where the bodies were";
+        let why = "the poses of the bodies are not known";
         return Ok(Pictures { light: mean(light), viewer: Err(why) });
     }
     let now = &window.frames[window.frames.len() - 1].1;
     let (eye, _) = rig.observer.eye_and_gaze(now);
     let light = integrate(rig, renderer, &rig.camera, eye, now, &window, |_, drive| drive)?;
     let Some(viewer_camera) = viewer_camera(rig, eye, now) else {
-        return Ok(Pictures { light, viewer: Err("the bodies are nowhere that an eye could look at") });
+        return Ok(Pictures {
+            light,
+            viewer: Err("a camera at the observer's eye cannot be aimed at the bodies"),
+        });
     };
     let projector = rig.camera.position();
     let max_intensity = rig.config.projector.max_intensity;
     let albedo = rig.config.scene.surface_albedo;
     let ambient = Vec3::from_array(rig.config.scene.ambient.map(|v| v as f32));
     let viewer = integrate(rig, renderer, &viewer_camera, projector, now, &window, |seen, drive| {
-        // Radiance of a Lambertian surface under the projector's light.
+        // Radiance of a Lambertian surface in the projector's light.
         let to_projector = projector - seen.position;
         let d2 = to_projector.length_squared();
         let cos = seen.normal.dot(to_projector).abs() / d2.sqrt();
@@ -84,7 +91,7 @@ pub fn pictures(
     Ok(Pictures { light, viewer: Ok(viewer) })
 }
 
-/// A camera at the eye that frames what the projector lights.
+/// A camera at the eye whose frame encloses what the projector lights.
 fn viewer_camera(rig: &Rig, eye: DVec3, tracked: &[DAffine3]) -> Option<ProjectorCamera> {
     let mut poses = Vec::new();
     rig.scene_poses(tracked, &mut poses);
@@ -109,7 +116,7 @@ fn viewer_camera(rig: &Rig, eye: DVec3, tracked: &[DAffine3]) -> Option<Projecto
     ProjectorCamera::look_at(raster, eye, centre, DVec3::Y, horizontal.clamp(0.01, 3.0)).ok()
 }
 
-/// A point as the picture sees it at the last instant.
+/// The surface point that a picture pixel shows at the last instant.
 struct Seen {
     position: DVec3,
     normal: DVec3,
@@ -172,7 +179,7 @@ fn integrate(
     Ok(out)
 }
 
-/// Light at a raster position, bilinear between pixel centres, 0..1.
+/// Light at a position on the raster, interpolated bilinearly between pixel centres, 0 to 1.
 fn sample(frame: &LightFrame, width: u32, height: u32, at: DVec2) -> Vec3 {
     let (x, y) = (at.x - 0.5, at.y - 0.5);
     let (x0, y0) = (x.floor(), y.floor());

@@ -1,4 +1,4 @@
-//! A planned frame into work of the GPU, and its end.
+//! Submits a planned frame to the GPU and waits for its end.
 
 use crate::frame::job::FrameJob;
 use crate::frame::Stage;
@@ -11,7 +11,7 @@ use dpm_render::{FrameInputs, FrameSlot, Renderer};
 /// Starts the GPU on a planned frame.
 ///
 /// # Errors
-/// Device lost.
+/// The device was lost.
 pub(crate) fn submit(
     plan: &FramePlan,
     slot: &mut FrameSlot,
@@ -34,8 +34,8 @@ pub(crate) fn submit(
     )
 }
 
-/// Renders one frame that nobody sees: what drivers put off to the first one (translating shaders) is over before a slot waits for it.
-/// Returns the wall time that it took, nanoseconds.
+/// Renders one frame that is never shown, so that one-time work of the driver (translating shaders) is done before a
+/// slot depends on it. Returns the wall time that the frame took, in nanoseconds.
 ///
 /// # Errors
 /// The GPU did not finish within `timeout_ns`, or was lost.
@@ -55,12 +55,12 @@ pub(crate) fn warm_up(
     slot.wait(timeout_ns).map(|_| watch.elapsed_ns() as i64)
 }
 
-/// Longest wait for the GPU in one piece.
+/// The longest single wait for the GPU.
 const GPU_STEP_NS: u64 = 5_000_000;
 
-/// Waits for the GPU, if the job has one, in steps of 5 ms; `alive` is called before each.
+/// Waits for the GPU, if the job uses one, in steps of 5 ms. Calls `alive` before each step.
 ///
-/// False when it did not finish within `timeout_ns`.
+/// Returns false if the GPU did not finish within `timeout_ns`.
 ///
 /// # Errors
 /// The GPU was lost.
@@ -79,7 +79,7 @@ pub(crate) fn finish(job: &mut FrameJob, timeout_ns: u64, mut alive: impl FnMut(
     };
     let gpu: u64 = cost.pass_ns.iter().sum();
     job.note.cost = Some(cost);
-    // The fence's wait overlaps other frames; the GPU's own time is the stage's cost where it is known.
+    // The wait for the fence overlaps other frames. The stage's cost is the GPU's own time where that is known.
     job.note.timeline.wall_ns[Stage::Render as usize] = if gpu > 0 { gpu } else { watch.elapsed_ns() };
     Ok(true)
 }

@@ -1,4 +1,4 @@
-//! A checked configuration into the parts of a rig: scene, projector, bodies with their motions, tracker.
+//! Builds the parts of a rig from a checked configuration: scene, projector, bodies with their motions, tracker.
 
 use crate::config::{
     BodyConfig, BuiltinScene, CalibrationUnit, EnvironmentConfig, GazeConfig, RigConfig, TrackerConfig,
@@ -14,54 +14,54 @@ use dpm_scene::geometry::projector::{ProjectorCamera, ProjectorError};
 use dpm_scene::{BodySelector, Environment, LoadOptions, Scene, SceneError, SceneFeatures};
 use glam::{DAffine3, DQuat, DVec3, Vec3};
 
-/// Why a rig cannot be built from a configuration that is valid by itself.
+/// Why a rig cannot be built from a configuration that passed its own checks.
 #[derive(Debug, thiserror::Error)]
 pub enum RigError {
-    /// The scene.
+    /// The scene cannot be loaded.
     #[error(transparent)]
     Scene(#[from] SceneError),
-    /// The projector's pose or lens.
+    /// The projector's pose or lens is invalid.
     #[error(transparent)]
     Projector(#[from] ProjectorError),
-    /// A body's motion.
+    /// A body's motion is invalid.
     #[error("scene.bodies[{index}] \"{name}\": motion: {source}")]
     Motion {
         /// Index in the rig file.
         index: usize,
-        /// Its name.
+        /// The body's name.
         name: String,
         /// What is wrong.
         source: MotionError,
     },
-    /// A motion table that cannot be read.
+    /// A body's motion table cannot be read.
     #[error("scene.bodies[{index}] \"{name}\": motion: {message}")]
     MotionTable {
         /// Index in the rig file.
         index: usize,
-        /// Its name.
+        /// The body's name.
         name: String,
         /// What is wrong.
         message: String,
     },
-    /// The calibration file.
+    /// The calibration file cannot be used.
     #[error("projector.calibration: {path}: {message}")]
     Calibration {
-        /// Which file.
+        /// Path of the file.
         path: String,
         /// What is wrong.
         message: String,
     },
-    /// A name that no body has.
+    /// No body has this name.
     #[error("{key}: no body is named \"{name}\"; bodies: {known}")]
     UnknownBody {
         /// Configuration key.
         key: &'static str,
-        /// Name given.
+        /// The name that was given.
         name: String,
-        /// Names there are.
+        /// The names that exist.
         known: String,
     },
-    /// A kind of part that this build does not drive.
+    /// This build cannot drive a part of this kind.
     #[error("{0}")]
     Unsupported(String),
 }
@@ -71,13 +71,13 @@ pub enum RigError {
 pub struct RigBody {
     /// Name, as the tracker reports it.
     pub name: String,
-    /// Pose at rest.
+    /// Its pose at rest.
     pub rest: Pose,
-    /// How it truly moves; known only when the tracker is the mock.
+    /// Its true motion, which is known only with the mock tracker.
     pub motion: Option<Motion>,
 }
 
-/// Where the eye is and where it looks, given the poses of the tracked bodies.
+/// Where the eye is and where it looks, computed from the poses of the tracked bodies.
 #[derive(Clone, Debug)]
 pub struct Observer {
     position: DVec3,
@@ -101,7 +101,7 @@ impl Observer {
         Self { gaze: Gaze::Point(point), ..self }
     }
 
-    /// The tracked body without which the gaze is not known; `None` for a gaze that does not depend on a tracker.
+    /// The tracked body on which the gaze depends; `None` if the gaze does not depend on a tracker.
     pub(crate) fn gaze_body(&self) -> Option<usize> {
         match self.gaze {
             Gaze::Point(_) => None,
@@ -110,13 +110,14 @@ impl Observer {
         }
     }
 
-    /// By how much all zones about the gaze grow when its body was last seen `unseen_ns` ago, degrees: 0 while it is held, 180 at most.
+    /// How far all zones around the gaze grow when the gaze's body was last seen `unseen_ns` ago, in degrees: 0 while
+    /// the body is held, 180 at most.
     pub(crate) fn widening_deg(&self, unseen_ns: i64) -> f64 {
         let beyond_s = unseen_ns.saturating_sub(self.gaze_hold_ns).max(0) as f64 * 1e-9;
         (beyond_s * self.gaze_widen_deg_per_s).min(180.0)
     }
 
-    /// Eye and gaze point, world.
+    /// The eye and the gaze point, in world coordinates.
     pub fn eye_and_gaze(&self, world_from_body: &[DAffine3]) -> (DVec3, DVec3) {
         let carrier = self.carrier.and_then(|i| world_from_body.get(i));
         let eye = carrier.map_or(self.position, |m| m.transform_point3(self.eye_offset));
@@ -129,17 +130,17 @@ impl Observer {
     }
 }
 
-/// All that a run needs and that does not change while it runs.
+/// Everything that a run needs and that does not change during the run.
 pub struct Rig {
-    /// The configuration it was built from.
+    /// The configuration that the rig was built from.
     pub config: RigConfig,
-    /// What is to be seen.
+    /// The scene to be shown.
     pub scene: Scene,
-    /// The projector at the raster that is traced and projected.
+    /// The projector, at the raster that is traced and projected.
     pub camera: ProjectorCamera,
-    /// Tracked bodies in the order of the rig file.
+    /// The tracked bodies, in the order of the rig file.
     pub bodies: Vec<RigBody>,
-    /// The eye.
+    /// The observer's eye.
     pub observer: Observer,
 }
 
@@ -158,10 +159,11 @@ pub(crate) fn pose_of(m: &DAffine3) -> Pose {
 }
 
 impl Rig {
-    /// Builds the parts. `raster` replaces the projector's (software Vulkan); the field of view stays.
+    /// Builds the parts. `raster` replaces the projector's raster (for software Vulkan); the field of view stays the
+    /// same.
     ///
     /// # Errors
-    /// Whatever part cannot be built, with its key.
+    /// A part cannot be built. The error names its key.
     pub fn build(config: &RigConfig, raster: Option<Raster>) -> Result<Self, RigError> {
         let mut scene = load_scene(config)?;
         let features = SceneFeatures::of(&scene);
@@ -176,18 +178,18 @@ impl Rig {
         Ok(Self { config: config.clone(), scene, camera, bodies, observer })
     }
 
-    /// Frames a second.
+    /// Frames per second.
     pub fn rate(&self) -> FrameRate {
         self.config.projector.frame_rate
     }
 
-    /// True world-from-body of every tracked body at an instant; `None` unless the tracker is the mock.
+    /// The true world-from-body transform of every tracked body at an instant; `None` unless the tracker is the mock.
     pub fn true_poses(&self, t_ns: i64) -> Option<Vec<DAffine3>> {
         self.bodies.iter().map(|b| b.motion.as_ref().map(|m| affine(&m.pose_at(t_ns)))).collect()
     }
 
-    /// Spreads poses of tracked bodies over the bodies of the scene; what is not tracked stays at rest. Allocates nothing when
-    /// `out` has room.
+    /// Writes the pose of every body of the scene to `out`, taking `tracked` for the tracked bodies and the rest pose
+    /// for the others. Allocates nothing if `out` has enough capacity.
     pub fn scene_poses(&self, tracked: &[DAffine3], out: &mut Vec<DAffine3>) {
         out.clear();
         out.extend(self.scene.bodies.iter().map(|b| {
@@ -222,10 +224,12 @@ fn load_scene(config: &RigConfig) -> Result<Scene, SceneError> {
     dpm_scene::load(file, &options)
 }
 
-/// Radiance from all around for files with lamps; files bring no environment of their own.
+/// Radiance of the uniform environment for scene files that contain lights; such files have no environment of their
+/// own.
 const FILE_SCENE_RADIANCE: f32 = 0.25;
 
-/// The environment of the rig file, for a scene that has lights or has none; `None` keeps the scene's own (the built-in scene brings one).
+/// The environment that the rig file asks for, for a scene with or without lights. `None` keeps the scene's own; the
+/// built-in scene has one.
 fn environment(config: &RigConfig, has_lights: bool) -> Result<Option<Environment>, RigError> {
     let even = |[r, g, b]: [f64; 3]| Environment::Constant(Vec3::new(r as f32, g as f32, b as f32));
     Ok(match &config.scene.environment {
@@ -240,8 +244,8 @@ fn environment(config: &RigConfig, has_lights: bool) -> Result<Option<Environmen
     })
 }
 
-/// The projector's camera at `raster`, from its calibration or from position and direction; what is not reproduced goes to
-/// `warnings`.
+/// The projector's camera at `raster`, from its calibration or from its position and direction. Adds to `warnings`
+/// what the camera does not reproduce.
 fn camera(
     config: &RigConfig,
     raster: Raster,
@@ -268,12 +272,13 @@ fn camera(
     let stored = opencv::read(&text, calibrated, unit).map_err(|e| wrong(e.to_string()))?;
     if stored.distortion != Distortion::default() {
         warnings.push(format!(
-            "projector.calibration: {}: its lens distortion is not compensated; light is off by as much as the lens bends",
+            "projector.calibration: {}: its lens distortion is not compensated and displaces the light",
             path.display()
         ));
     }
     let c = stored.camera;
-    // The same view cut into other pixels. The camera's coordinates count from the raster's corner, so everything scales.
+    // This divides the same view into other pixels. The camera's coordinates start at the raster's corner, so
+    // everything scales.
     let scale_x = f64::from(raster.width()) / f64::from(calibrated.width());
     let scale_y = f64::from(raster.height()) / f64::from(calibrated.height());
     Ok(ProjectorCamera::new(
@@ -295,7 +300,8 @@ fn motion_spec(index: usize, body: &BodyConfig) -> Result<MotionSpec, RigError> 
     }
 }
 
-/// The paper's experiment: the first body moves to and fro at 1 m/s, the second turns in place, others stand.
+/// The paper's experiment: the first body moves back and forth at 1 m/s, the second rotates in place, and the others
+/// stand still.
 fn default_motion(index: usize) -> MotionSpec {
     match index {
         0 => MotionSpec::paper_translation(),
@@ -378,7 +384,7 @@ mod tests {
         let o = observer(&["observer.gaze={kind=\"tracked\",target=\"venus\"}", "observer.gaze_hold_ms=100"]);
         assert_eq!(o.gaze_body(), Some(1));
         let after = |ms: i64| o.widening_deg(ms * 1_000_000);
-        // 60 degrees a second from 100 ms on.
+        // 60 degrees per second, starting at 100 ms.
         assert_eq!([after(-5), after(0), after(100), after(600)], [0.0, 0.0, 0.0, 30.0]);
         assert_eq!(o.widening_deg(i64::MAX), 180.0);
     }

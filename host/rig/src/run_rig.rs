@@ -1,4 +1,4 @@
-//! `dpm run` and `dpm demo`: a rig from its configuration to its report and pictures.
+//! `dpm run` and `dpm demo`: from a configuration to a report and pictures.
 
 use super::pictures::{pictures, to_srgb};
 use crate::config::{ProjectorBackend, RigConfig};
@@ -18,25 +18,25 @@ use glam::Vec3;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
-/// Runs the rig until its frames are lit or `monitor` asks to stop; writes what `[output]` asks for.
+/// Runs the rig until all its frames are lit or `monitor` asks it to stop. Writes the files that `[output]` asks for.
 ///
 /// # Errors
-/// Bad scene or numbers (exit code 2), a device that fails (3), no GPU (4).
+/// A bad scene or bad numbers (exit code 2), a device that fails (3), or no GPU (4).
 ///
-/// What goes wrong after the run leaves the report as it is, so that nobody loses what was measured: see [`Ended`].
+/// A failure after the run does not discard the report, so no measurement is lost; see [`Ended`].
 pub fn run_rig(config: &RigConfig, monitor: &Arc<RunMonitor>) -> Result<Ended<Report>, Failure> {
-    // Not after the run whose report is to lie there.
+    // Checked before the run, because the run's report is written there.
     check_output_folder(&config.output.dir)?;
     let gpu = open_gpu(config)?;
     let mut notes = Vec::new();
     let raster = traced_raster(config, &gpu, &mut notes);
     let rig = Arc::new(Rig::build(config, raster)?);
     let output = &config.output;
-    // Pictures are made of the light itself, which only the mock sees.
+    // The pictures show the light itself, which only the mock observes.
     let has_light = matches!(config.projector.backend, ProjectorBackend::Mock(_));
     if output.images && !has_light {
         notes.push(
-            "output.images: the light of a projector outside is not seen, no pictures are written".into(),
+            "output.images: no pictures are written, because the light of a real projector cannot be observed".into(),
         );
     }
     if config.projector.planes == 8 {
@@ -88,11 +88,11 @@ pub fn run_rig(config: &RigConfig, monitor: &Arc<RunMonitor>) -> Result<Ended<Re
     Ok(ended)
 }
 
-/// Most lines that are told at the start; the report has all of them.
+/// The largest number of notes printed at the start. The report contains all of them.
 const TOLD: usize = 12;
 
-/// Tells what is known before the first frame: what is changed of the rig, what the scene loses, and bodies that have nothing to show. All of it stands in the
-/// report too, but that comes after the light.
+/// Prints what is known before the first frame: adjustments to the rig, parts of the scene that are dropped, and
+/// bodies that have nothing to show. The report contains the same notes, but it is written after the run.
 fn tell_at_the_start(rig: &Rig, notes: &[String], monitor: &RunMonitor) {
     let shown = |i: usize| rig.scene.bodies.iter().any(|b| b.tracked.map(usize::from) == Some(i));
     let known: Vec<&str> = rig.scene.bodies.iter().map(|b| b.name.as_str()).collect();
@@ -112,7 +112,7 @@ fn tell_at_the_start(rig: &Rig, notes: &[String], monitor: &RunMonitor) {
     }
 }
 
-/// Writes what the kept light allows of `light.png` and `viewer.png`; the files, and why one is missing.
+/// Writes `light.png` and `viewer.png` where the kept light allows it. Returns the files, and why one is missing.
 fn write_pictures(
     rig: &Rig,
     gpu: &Arc<Gpu>,
@@ -123,7 +123,7 @@ fn write_pictures(
         let why = "output.images: no frame was lit, so there is no light to make pictures of";
         return Ok((Vec::new(), Some(why.into())));
     }
-    // Only surfaces are asked of it, so the simplest method will do.
+    // The pictures need only the surfaces, so the simplest method is enough.
     let settings = RendererSettings { method: Method::full(1), ..pipeline::renderer_settings(rig) };
     let mut renderer = Renderer::new(gpu, &rig.scene, settings).map_err(PipelineError::from)?;
     let made = pictures(rig, &mut renderer, &outcome.light, &outcome.recent)
@@ -140,7 +140,7 @@ fn write_pictures(
     Ok((files, why_not))
 }
 
-/// Sees that files can be written into the folder of the output, before the work.
+/// Checks, before any work is done, that files can be written into the output folder.
 ///
 /// # Errors
 /// They cannot; the message names the folder.
@@ -149,10 +149,10 @@ pub fn check_output_folder(dir: &Path) -> Result<(), Failure> {
         .map_err(|e| Failure::new(FailureKind::BadInput, format!("{e}; choose another folder with --out")))
 }
 
-/// Opens the device that the rig file names.
+/// Opens the GPU that the rig file names.
 ///
 /// # Errors
-/// Exit code 4 with what to install.
+/// There is no such GPU (exit code 4); the message says what to install.
 pub fn open_gpu(config: &RigConfig) -> Result<Arc<Gpu>, Failure> {
     let options = GpuOptions {
         validation: std::env::var_os("DPM_VALIDATION").is_some(),
@@ -161,7 +161,7 @@ pub fn open_gpu(config: &RigConfig) -> Result<Arc<Gpu>, Failure> {
     Gpu::open(&options).map_err(|e| Failure::new(FailureKind::NoGpu, e))
 }
 
-/// Software Vulkan traces a smaller raster, and says so.
+/// The smaller raster that software Vulkan traces, with a note about it.
 pub fn traced_raster(config: &RigConfig, gpu: &Gpu, notes: &mut Vec<String>) -> Option<Raster> {
     let [width, height] = config.render.software_raster;
     let small = Raster::new(width, height)?;
@@ -170,7 +170,7 @@ pub fn traced_raster(config: &RigConfig, gpu: &Gpu, notes: &mut Vec<String>) -> 
         return None;
     }
     if !matches!(config.projector.backend, ProjectorBackend::Mock(_)) {
-        // A real panel has the mirrors that it has.
+        // A real panel has a fixed number of mirrors.
         notes.push(format!(
             "no GPU: software Vulkan ({}) traces all {} x {} mirrors of the projector, which is slow",
             gpu.summary().name,
@@ -203,7 +203,7 @@ fn save(dir: &Path, name: &str, rig: &Rig, linear: &[Vec3], scale: f32) -> Resul
     Ok(path)
 }
 
-/// A failure that says which file cannot be written, and why.
+/// A failure that names the file that cannot be written, and why.
 pub fn cannot_write(path: &Path, error: &dyn std::fmt::Display) -> Failure {
     Failure::new(
         FailureKind::BadInput,

@@ -1,8 +1,10 @@
-//! Orders that outlive the program: one small file for each projector, in a state folder. What cannot be read counts as SAFE.
+//! Orders that outlive the program: one small file per projector, in a state folder. A file that cannot be read
+//! counts as SAFE.
 //!
-//! SAFE stands until a person says `dpm arm` to a running rig, over restarts of the program, the service and the machine. BLACK and
-//! FREEZE stand as long as the run that they were given to; where that died without an orderly end, they stand as BLACK (there is no
-//! frame left to hold). `docs/ORDERS.md` says this to operators.
+//! SAFE stands until a person gives `dpm arm` to a running rig; it survives restarts of the program, the service and
+//! the machine. BLACK and FREEZE stand as long as the run that they were given to. If that run died without an
+//! orderly end, they stand as BLACK, because there is no frame left to hold. `docs/ORDERS.md` describes this for
+//! operators.
 
 use crate::config::ProjectorBackend;
 use crate::order::Order;
@@ -15,26 +17,26 @@ use std::time::{SystemTime, UNIX_EPOCH};
 
 /// Version of the files' content.
 const VERSION: u32 = 1;
-/// A file that is longer is damaged.
+/// A longer file is damaged.
 const MAX_BYTES: u64 = 4096;
-/// Ending of the files' names.
+/// File name extension.
 const ENDING: &str = ".order";
-/// Longest name of a file without its ending; beyond that it is cut and made different by a hash.
+/// The longest file name without its extension. A longer one is cut and made unique by a hash.
 const MAX_STEM: usize = 160;
 
-/// Which projector: what locks, standing orders and messages call it.
+/// Identifies a projector: its name in locks, standing orders and messages.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Identity {
     what: String,
-    /// What all projectors of the kind have in common in the names of their files.
+    /// The part of the file names that all projectors of this kind share.
     family: String,
-    /// What tells it from others of the kind; `None` where the rig file takes any.
+    /// What distinguishes it from others of the kind; `None` if the rig file accepts any.
     serial: Option<String>,
     is_mock: bool,
 }
 
 impl Identity {
-    /// The projector of a rig file.
+    /// The identity of the projector of a rig file.
     pub fn of(backend: &ProjectorBackend) -> Self {
         let or_any = |s: &Option<String>| s.clone().unwrap_or_else(|| "any".into());
         let (what, family, serial) = match backend {
@@ -46,7 +48,8 @@ impl Identity {
             ProjectorBackend::Serial(port) => {
                 ("projector on ".to_owned() + &port.port, "projector on".into(), Some(port.port.clone()))
             }
-            // It is told by its place on the bus, which is another one after every re-plug: an order for one holds for all.
+            // It is identified by its place on the bus, which changes with every re-plug, so an order for one applies
+            // to all.
             ProjectorBackend::Dlpc900(dlpc) => {
                 (format!("DLPC900 {}", or_any(&dlpc.device)), "DLPC900".into(), None)
             }
@@ -59,12 +62,12 @@ impl Identity {
         }
     }
 
-    /// As messages call it.
+    /// Its name in messages.
     pub fn what(&self) -> &str {
         &self.what
     }
 
-    /// True for the projector inside this process, which lights nothing.
+    /// True for the projector inside this process, which emits no light.
     pub fn is_mock(&self) -> bool {
         self.is_mock
     }
@@ -79,8 +82,8 @@ impl Identity {
         short(&format!("{}-{}", self.family, self.serial.as_deref().unwrap_or("any"))) + ENDING
     }
 
-    /// True when an order in the file `name` is for this projector: its own; the one for any of the kind; and where the rig file takes
-    /// any of the kind, the one for each of them.
+    /// True if an order in the file `name` applies to this projector: its own file; the file for any projector of the
+    /// kind; and, if the rig file accepts any projector of the kind, the file of each of them.
     fn is_meant_by(&self, name: &str) -> bool {
         let any = short(&format!("{}-any", self.family)) + ENDING;
         name == self.order_name()
@@ -97,12 +100,12 @@ impl fmt::Display for Identity {
     }
 }
 
-/// Letters and digits of `text`; what is between them as dashes.
+/// The letters and digits of `text`, with dashes in place of everything else.
 fn plain(text: &str) -> String {
     text.chars().map(|c| if c.is_ascii_alphanumeric() { c } else { '-' }).collect()
 }
 
-/// `stem` where it can be the name of a file, else its beginning and a hash of the whole (FNV-1a).
+/// Returns `stem` if it can be a file name, else its beginning and a hash of the whole (FNV-1a).
 fn short(stem: &str) -> String {
     if stem.len() <= MAX_STEM {
         return stem.to_owned();
@@ -117,14 +120,14 @@ fn short(stem: &str) -> String {
 pub enum By {
     /// A user, over the control socket.
     Socket {
-        /// As the kernel says it.
+        /// As reported by the kernel.
         uid: u32,
     },
     /// A key on the terminal of the run.
     Key,
     /// A signal.
     Signal,
-    /// The projector, which had it latched when the link came up.
+    /// The projector itself, which had it latched when the link came up.
     Projector,
 }
 
@@ -139,7 +142,7 @@ impl fmt::Display for By {
     }
 }
 
-/// Content of a file.
+/// Content of the file.
 #[derive(serde::Serialize, serde::Deserialize)]
 struct Content {
     version: u32,
@@ -159,14 +162,14 @@ pub struct Stands {
     pub told: String,
 }
 
-/// Where the files are: `$DPM_STATE_DIR`, else systemd's `$STATE_DIRECTORY`, else `/var/lib/dpm` for root, else `$XDG_STATE_HOME/dpm`
-/// or `~/.local/state/dpm`. `None` for a user without a home.
+/// The folder of the files: `$DPM_STATE_DIR`, else systemd's `$STATE_DIRECTORY`, else `/var/lib/dpm` for root, else
+/// `$XDG_STATE_HOME/dpm` or `~/.local/state/dpm`. `None` for a user without a home directory.
 pub fn state_folder() -> Option<PathBuf> {
     choose(&|name| std::env::var_os(name).filter(|v| !v.is_empty()).map(PathBuf::from), user() == 0)
 }
 
 fn choose(variable: &dyn Fn(&str) -> Option<PathBuf>, is_root: bool) -> Option<PathBuf> {
-    // Several folders are separated by colons; the first is the unit's own.
+    // Several folders are separated by colons; the first one is the unit's own.
     let systemd = || {
         let list = variable("STATE_DIRECTORY")?.into_os_string().into_string().ok()?;
         list.split(':').next().filter(|first| !first.is_empty()).map(PathBuf::from)
@@ -188,11 +191,12 @@ pub struct OrderFile {
 }
 
 impl OrderFile {
-    /// Opens the state folder `path`, which is made where it is missing, and reads what stands for `identity`. A folder that cannot be
-    /// used is the second part of the answer; the file then keeps nothing.
+    /// Opens the state folder `path`, creates it if it is missing, and reads what stands for `identity`. The second
+    /// part of the result says why a folder cannot be used; the file then keeps nothing.
     pub fn open(path: Option<PathBuf>, identity: Identity) -> (Self, Option<FolderError>, Option<Stands>) {
         let Some(path) = path else {
-            let source = io::Error::new(io::ErrorKind::NotFound, "this user has no home; set DPM_STATE_DIR");
+            let source =
+                io::Error::new(io::ErrorKind::NotFound, "this user has no home directory; set DPM_STATE_DIR");
             let error = FolderError::Io { path: "(no state folder)".into(), source };
             return (Self { identity, folder: None, path: PathBuf::new() }, Some(error), None);
         };
@@ -210,13 +214,13 @@ impl OrderFile {
         (Self { identity, folder, path }, error, stands)
     }
 
-    /// Where orders for this projector are kept.
+    /// The file in which orders for this projector are kept.
     pub(crate) fn path(&self) -> PathBuf {
         self.path.join(self.identity.order_name())
     }
 
-    /// Keeps `order`, which is on the disk when this returns; a weaker one must not replace a stronger one, which is the caller's part.
-    /// Gives the path of the file.
+    /// Keeps `order`; it is on the disk when this returns. The caller must not replace a stronger order by a weaker
+    /// one. Returns the path of the file.
     ///
     /// # Errors
     /// The state folder could not be used at the start, or cannot be written to now.
@@ -240,11 +244,11 @@ impl OrderFile {
         Ok(folder.path().join(name))
     }
 
-    /// Forgets every order for this projector; that is on the disk when this returns. Where nothing can be kept there is nothing to
-    /// forget.
+    /// Forgets every order for this projector; that is on the disk when this returns. If nothing can be kept, there
+    /// is nothing to forget.
     ///
     /// # Errors
-    /// Those of the operating system; an order then still stands.
+    /// An error of the operating system; an order then still stands.
     pub(crate) fn forget(&self) -> Result<(), FolderError> {
         let Some(folder) = &self.folder else { return Ok(()) };
         for name in folder.names()? {
@@ -256,12 +260,12 @@ impl OrderFile {
     }
 }
 
-/// What stands for `identity` in the state folder `path`. A missing folder holds nothing; one that cannot be read or trusted, and a file
-/// that is damaged or of a version that is not known, count as SAFE.
+/// What stands for `identity` in the state folder `path`. A missing folder contains nothing. A folder that cannot be
+/// read or trusted counts as SAFE, and so does a file that is damaged or has an unknown version.
 pub fn standing_in(path: &std::path::Path, identity: &Identity) -> Option<Stands> {
     let safe = |told: String| Some(Stands { order: Order::Safe, told });
     let unreadable =
-        |e: FolderError| safe(format!("counts as SAFE, for the state folder cannot be read: {e}"));
+        |e: FolderError| safe(format!("counts as SAFE, because the state folder cannot be read: {e}"));
     let folder = match Folder::open(path, Owner::OwnOrAnyForRoot) {
         Ok(folder) => folder,
         Err(e) if e.is_missing() => return None,
@@ -282,7 +286,7 @@ fn read(folder: &Folder, name: &str) -> Stands {
             return Err(format!("version {} is not known", content.version));
         }
         match Order::from_word(&content.order) {
-            Some(Order::Arm) | None => Err(format!("damaged: {:?} is no order that stands", content.order)),
+            Some(Order::Arm) | None => Err(format!("damaged: {:?} is not a standing order", content.order)),
             Some(order) => Ok((order, content)),
         }
     });
@@ -302,18 +306,19 @@ fn read(folder: &Folder, name: &str) -> Stands {
         Err(reason) => Stands {
             order: Order::Safe,
             told: format!(
-                "counts as SAFE, for {} cannot be read: {reason}",
+                "counts as SAFE, because {} cannot be read: {reason}",
                 folder.path().join(name).display()
             ),
         },
     }
 }
 
-/// `at` as 2026-03-01T12:00:00Z (proleptic Gregorian calendar, leap seconds not counted); before 1970 as 1970.
+/// `at` in the form 2026-03-01T12:00:00Z (proleptic Gregorian calendar, without leap seconds). Times before 1970 are
+/// shown as 1970.
 fn utc(at: SystemTime) -> String {
     let seconds = at.duration_since(UNIX_EPOCH).map_or(0, |d| d.as_secs());
     let (days, second) = (seconds / 86_400, seconds % 86_400);
-    // Days are counted from the first of March of the year 0: the leap day is then the last of its year.
+    // Days are counted from 1 March of the year 0, so that the leap day is the last day of its year.
     let days = days + 719_468;
     let (era, day) = (days / 146_097, days % 146_097);
     let year = (day - day / 1460 + day / 36_524 - day / 146_096) / 365;

@@ -45,7 +45,7 @@ fn r4_an_order_stands_until_it_is_forgotten() {
     fs::remove_dir_all(dir).unwrap();
 }
 
-/// Found in use, R4: what is there and cannot be understood is SAFE, whichever byte is wrong.
+/// Found in use, R4: a file that cannot be understood counts as SAFE, whichever byte is wrong.
 #[test]
 fn r4_whatever_cannot_be_read_counts_as_safe() {
     let dir = place("damaged");
@@ -58,7 +58,7 @@ fn r4_whatever_cannot_be_read_counts_as_safe() {
         assert_eq!(stands.order, Order::Safe, "{what}");
         assert!(stands.told.contains("counts as SAFE"), "{what}: {}", stands.told);
     };
-    // Cut off anywhere (its last byte is a line feed).
+    // Cut off anywhere (the last byte is a line feed).
     for n in 0..whole.len() - 1 {
         fs::write(&path, &whole[..n]).unwrap();
         is_safe(&format!("{n} bytes"));
@@ -108,11 +108,11 @@ fn an_order_for_any_projector_of_a_kind_is_for_each_and_the_other_way_round() {
     let serial = |port: &str| identity(&format!("{{ kind = \"serial\", port = {port:?} }}"));
     opened(&dir, &serial("/dev/ttyUSB0")).0.keep(Order::Safe, By::Key).unwrap();
     assert!(stands(&serial("/dev/ttyUSB0")) && !stands(&serial("/dev/ttyUSB1")));
-    // Longer than a name may be, and different only at the end.
+    // Longer than a file name may be, and different only at the end.
     let [long, longer] = ["x".repeat(400), "x".repeat(401)].map(|p| serial(&p));
     opened(&dir, &long).0.keep(Order::Safe, By::Key).unwrap();
     assert!(stands(&long) && !stands(&longer));
-    // Its place on the bus does not tell one DLPC900 from another.
+    // The place on the bus does not identify a DLPC900.
     let [one, two] = ["1:4", "1:5"].map(|place| {
         Identity::of(&ProjectorBackend::Dlpc900(crate::config::Dlpc900Config {
             device: Some(place.into()),

@@ -1,4 +1,4 @@
-//! The parts of the frame path that are not the GPU, under an allocator that counts: after construction nothing is allocated.
+//! The parts of the frame path except the GPU, with a counting allocator: after construction nothing is allocated.
 
 use counting_allocator::{requests_in, Counting};
 use dpm_common::clock::{Clock, ManualClock};
@@ -47,7 +47,7 @@ fn a_hundred_thousand_frames_allocate_nothing() {
             assert!(lead.typical_ns() <= lead.lead_ns());
             for body in 0..2 {
                 let captured_at = due.plus_ns(-4_000_000);
-                // A drop-out, an outlier and a duplicate now and then: the odd paths count too.
+                // An occasional drop-out, outlier and duplicate, so that the unusual paths are included.
                 let x = if frame % 1_000 == 7 { 50.0 } else { 1e-3 * (frame % 500) as f64 };
                 let sample = TrackerSample {
                     body: BodyIndex(body),

@@ -1,4 +1,4 @@
-//! A stage that stands still for 100 ms, at real pace: two frames later nothing of it is left.
+//! A stage that stalls for 100 ms, at real pace: two frames later the stall has no effect any more.
 
 use dpm_device::planes::Raster;
 use dpm_rig::config::{Overrides, RigConfig};
@@ -11,18 +11,18 @@ use std::time::Duration;
 
 const STALLED: u64 = 60;
 const FRAMES: u64 = 120;
-/// Slots of 10 ms: ten of them pass in the stall, and other tests on the machine do not matter.
+/// Slots of 10 ms: ten of them pass during the stall, and other tests on the machine have little effect.
 const SLOT_NS: i64 = 10_000_000;
 const STALL: Duration = Duration::from_millis(100);
 
-/// Frames lit after the stalled one, oldest first, and the stalled one's latch.
+/// Frames lit after the stalled one, oldest first, and the latch of the stalled one.
 fn run(stage: StallIn, watchdog_ms: u32) -> Vec<FrameRecord> {
     let set = |s: &str| s.to_owned();
     let flags = vec![
         set("real_time.pace=\"real\""),
         set("projector.frame_rate=\"100\""),
         format!("safety.watchdog_ms={watchdog_ms}"),
-        // Bodies are shown all through a stall: what is asked is how old their samples are.
+        // Bodies are shown throughout a stall; the test checks how old their samples are.
         "safety.predict_ms=500".to_owned(),
     ];
     let config = RigConfig::demo(&Overrides { variables: vec![], flags }).unwrap_or_else(|e| panic!("{e}"));
@@ -45,7 +45,7 @@ fn is_on_time(r: &FrameRecord) -> bool {
         && t.sent_at.ns_since(t.latched_at) < 4 * SLOT_NS
 }
 
-/// On a machine that stands still itself a run proves nothing: three are tried.
+/// If the machine itself stands still, a run proves nothing, so there are three attempts.
 fn holds(what: impl Fn() -> Result<(), String>) {
     let mut told = String::new();
     for _ in 0..3 {
@@ -63,7 +63,7 @@ fn a_stall_in_any_stage_leaves_no_backlog_two_frames_later() {
         holds(|| {
             let after = run(stage, 1_000);
             let lost = FRAMES - STALLED - 1 - after.len() as u64;
-            // What was under way when it happened, at most.
+            // At most the frames that were in flight when it happened.
             if lost > 4 {
                 return Err(format!("{stage:?}: {lost} frames after the stall were not lit"));
             }
@@ -77,8 +77,8 @@ fn a_stall_in_any_stage_leaves_no_backlog_two_frames_later() {
     }
 }
 
-/// Tracking stands still and the frames go on, each in its slot, with what is known. When it runs again, what the tracker has
-/// collected meanwhile is taken in at once: the next frame but one has a sample as new as ever.
+/// Tracking stalls while the frames continue, each in its slot, with the last known tracks. When tracking continues,
+/// it reads at once what the tracker has collected meanwhile: the next frame but one has a sample as recent as ever.
 #[test]
 fn a_stall_of_tracking_delays_no_frame_and_leaves_no_old_sample_two_frames_later() {
     holds(|| {
@@ -88,7 +88,7 @@ fn a_stall_of_tracking_delays_no_frame_and_leaves_no_old_sample_two_frames_later
         }
         let age = |r: &FrameRecord| r.timeline.latched_at.ns_since(r.timeline.captured_at);
         let old: Vec<u64> = after.iter().filter(|r| age(r) > SLOT_NS).map(|r| r.id.0).collect();
-        // It begins within the frame after the one that sets it off, and lasts ten slots.
+        // The stall begins within the frame after the one that triggers it, and lasts ten slots.
         let (Some(&first), Some(&last)) = (old.first(), old.last()) else {
             return Err("no frame was without new samples".to_owned());
         };
@@ -100,13 +100,13 @@ fn a_stall_of_tracking_delays_no_frame_and_leaves_no_old_sample_two_frames_later
     });
 }
 
-/// The device's watchdog bites during the stall of the link: light comes back by itself, and stays in time.
+/// The device's watchdog acts during the stall of the link. Light comes back by itself and stays in time.
 #[test]
 fn light_comes_back_after_a_silence_longer_than_the_watchdog() {
     holds(|| {
         let after = run(StallIn::Link, 50);
         let on_time = after.iter().filter(|r| is_on_time(r)).count();
-        // Arming takes a slot or two; half of what is left of the run is far more than that costs.
+        // Arming takes a slot or two; half of the remaining run is much more than that costs.
         let enough = on_time as u64 > (FRAMES - STALLED) / 2;
         enough.then_some(()).ok_or_else(|| format!("{on_time} of {} frames in time", after.len()))
     });

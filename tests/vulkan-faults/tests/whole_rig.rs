@@ -79,7 +79,7 @@ fn the_picture_comes_back_after_a_loss_and_after_a_submission_that_never_ends() 
         run.lit(20, BACK_WITHIN);
         println!("{plan}: 20 frames again after {:?}", struck.elapsed());
         let told = run.monitor.take_notes().join("\n");
-        assert!(told.contains("made anew") && told.contains(word), "{plan}: {told}");
+        assert!(told.contains("are restarted") && told.contains(word), "{plan}: {told}");
         let report = run.end().unwrap_or_else(|e| panic!("{plan}: {e}")).report;
         assert!(report.frames_lit >= 40, "{plan}: {}", report.frames_lit);
     }

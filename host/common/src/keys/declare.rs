@@ -1,8 +1,10 @@
-//! Declarations of keys into structs with defaults, their readers and their part of the manual: one place per key.
+//! Declares each key in one place; the macros generate structs with defaults, their readers and their part of the
+//! manual.
 
 /// Declares a section of the rig file: a struct with defaults, its reader and its part of the manual.
 ///
-/// `name: type = default, "unit", limit;` with doc comments that say what the key does and when to change it.
+/// The form is `name: type = default, "unit", limit;` with doc comments that say what the key does and when to change
+/// it.
 #[macro_export]
 macro_rules! section {
     (
@@ -31,7 +33,7 @@ macro_rules! section {
             #[allow(dead_code)]
             pub(crate) const KEYS: &'static [&'static str] = &[$( stringify!($name) ),*];
 
-            /// Reads the keys that are present over the defaults, ignoring `kind` and keys that are not its own.
+            /// Replaces the defaults by the keys that are present. Ignores `kind` and keys of other sections.
             pub(crate) fn read_keys(
                 table: &std::collections::BTreeMap<String, $crate::keys::source::Entry>,
                 reader: &mut $crate::keys::read::Reader,
@@ -161,7 +163,7 @@ macro_rules! words {
     };
 }
 
-/// Declares a table whose key `kind` decides which other keys it takes: `Variant(Section) = "kind"`.
+/// Declares a table whose key `kind` decides which other keys it accepts: `Variant(Section) = "kind"`.
 #[macro_export]
 macro_rules! kinds {
     (

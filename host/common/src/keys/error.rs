@@ -4,12 +4,12 @@ use std::fmt;
 use std::path::Path;
 use std::sync::Arc;
 
-/// Where a value comes from.
+/// Where a value was written.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub enum Origin {
-    /// Nobody wrote it: the default holds.
+    /// Not written: the default applies.
     Default,
-    /// A place in a file; line and column count from 1, the column in characters. Line 0 is the file as a whole.
+    /// A place in a file. Line and column count from 1, the column in characters. Line 0 is the file as a whole.
     File {
         /// Name of the file as the user gave it.
         file: Arc<str>,
@@ -40,11 +40,11 @@ impl fmt::Display for Origin {
 #[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
 #[error("{origin}: {}{problem}{}", key_prefix(.key), remedy_suffix(.remedy))]
 pub struct ConfigError {
-    /// Where it is written.
+    /// Where it was written.
     pub origin: Origin,
-    /// Dotted key, for example `projector.width`; empty when the mistake is not about one key.
+    /// Dotted key, for example `projector.width`; empty if the mistake does not concern a single key.
     pub key: String,
-    /// What is wrong, with the allowed range.
+    /// What is wrong, with the permitted range.
     pub problem: String,
     /// What to do; may be empty.
     pub remedy: String,
@@ -71,7 +71,7 @@ fn remedy_suffix(remedy: &str) -> String {
 pub struct ConfigErrors(pub Vec<ConfigError>);
 
 impl ConfigErrors {
-    /// The one error that a file which cannot be read gives.
+    /// The single error for a file that cannot be read.
     pub fn unreadable(path: &Path, problem: String, remedy: &str) -> Self {
         Self(vec![ConfigError {
             origin: Origin::File { file: path.display().to_string().into(), line: 0, column: 0 },

@@ -1,6 +1,7 @@
-//! A tree of values into typed sections: every key declared once, with its type, unit, default, range and advice.
+//! Reads a tree of values into typed sections. Every key is declared once, with its type, unit, default, range and
+//! advice.
 //!
-//! Errors are collected, never thrown: one run tells everything that is wrong with a file.
+//! Errors are collected, so that one run reports everything that is wrong with a file.
 
 use super::error::{ConfigError, Origin};
 use super::source::{Entry, Node, Value};
@@ -8,7 +9,7 @@ use std::collections::BTreeMap;
 use std::fmt::Display;
 use std::path::PathBuf;
 
-/// Collects what is wrong and remembers where every key was written.
+/// Collects errors and remembers where every key was written.
 #[derive(Debug, Default)]
 pub struct Reader {
     /// What is wrong so far.
@@ -33,7 +34,7 @@ impl Reader {
         });
     }
 
-    /// Where `key` was written: itself, else the innermost table around it, else [`Origin::Default`].
+    /// Where `key` was written: the key itself, else the innermost table around it, else [`Origin::Default`].
     pub fn origin_of(&self, key: &str) -> Origin {
         let mut key = key;
         loop {
@@ -47,7 +48,7 @@ impl Reader {
         }
     }
 
-    /// True when somebody wrote `key` itself.
+    /// True if `key` itself was written.
     pub fn is_written(&self, key: &str) -> bool {
         self.written.contains_key(key)
     }
@@ -68,7 +69,7 @@ impl Reader {
         }
     }
 
-    /// Refuses every key of `table` that is not in `known`, naming the nearest one that is.
+    /// Refuses every key of `table` that is not in `known`, and suggests the most similar known key.
     pub fn unknown_keys(&mut self, table: &BTreeMap<String, Entry>, section: &str, known: &[&str]) {
         for (name, entry) in table {
             if known.contains(&name.as_str()) {
@@ -92,7 +93,7 @@ pub fn join(section: &str, key: &str) -> String {
     }
 }
 
-/// The name in `known` that `name` is most likely a misspelling of: at most two letters or a third of them differ.
+/// The name in `known` of which `name` is most likely a misspelling: at most two letters or a third of them differ.
 fn nearest<'k>(name: &str, known: &[&'k str]) -> Option<&'k str> {
     let limit = (name.chars().count() / 3).max(if name.len() > 3 { 2 } else { 1 });
     known.iter().map(|k| (edit_distance(name, k), *k)).filter(|(d, _)| *d <= limit).min().map(|(_, k)| k)
@@ -119,11 +120,11 @@ fn edit_distance(a: &str, b: &str) -> usize {
 pub struct KeyDoc {
     /// Dotted key.
     pub key: String,
-    /// Type in words.
+    /// The type as text.
     pub kind: String,
-    /// Unit; empty where there is none.
+    /// The unit; empty if there is none.
     pub unit: &'static str,
-    /// Default as it would be written in the file.
+    /// The default, as written in the file.
     pub default: String,
     /// Allowed values.
     pub range: String,
@@ -133,21 +134,21 @@ pub struct KeyDoc {
 
 /// A type that a key can have.
 pub trait ConfigValue: Sized {
-    /// The type in words.
+    /// The type as text.
     fn kind() -> String;
-    /// Reads a value; on failure leaves errors and returns `None`.
+    /// Reads a value. On failure adds errors and returns `None`.
     fn read(node: &Node, reader: &mut Reader, key: &str) -> Option<Self>;
-    /// The value as the file would say it.
+    /// The value as written in the file.
     fn show(&self) -> String;
     /// Keys below this one, for tables.
     fn docs(_key: &str, _out: &mut Vec<KeyDoc>) {}
 }
 
-/// What values a key allows beyond its type.
+/// The values that a key permits beyond its type.
 pub trait Limit<T> {
-    /// True when allowed.
+    /// True if the value is permitted.
     fn allows(&self, value: &T) -> bool;
-    /// The allowed values in words.
+    /// The permitted values as text.
     fn describe(&self) -> String;
 }
 
@@ -163,7 +164,7 @@ impl<T> Limit<T> for Any {
     }
 }
 
-/// A closed interval; arrays and optional values are held to it element by element.
+/// A closed interval. It applies to each element of arrays and optional values.
 pub struct Within<T>(pub T, pub T);
 
 impl<T: PartialOrd + Display> Limit<T> for Within<T> {
@@ -202,7 +203,7 @@ impl<T: PartialOrd + Display, const N: usize> Limit<Option<[T; N]>> for Within<T
     }
 }
 
-/// A string, path or list with something in it.
+/// A non-empty string, path or list.
 pub struct NotEmpty;
 
 impl Limit<String> for NotEmpty {
@@ -245,7 +246,7 @@ fn wrong_kind<T: ConfigValue>(node: &Node, reader: &mut Reader, key: &str) -> Op
     None
 }
 
-/// The usual slips: a quoted number, a decimal point where a whole number is needed.
+/// Advice for frequent mistakes: a quoted number, or a decimal point in a whole number.
 fn remedy(value: &Value, wanted: &str) -> String {
     match value {
         Value::String(s) if wanted.contains("number") && s.trim().parse::<f64>().is_ok() => {
@@ -402,7 +403,7 @@ impl<T: ConfigValue> ConfigValue for Vec<T> {
     fn read(node: &Node, reader: &mut Reader, key: &str) -> Option<Self> {
         let Value::Array(items) = &node.value else { return wrong_kind(node, reader, key) };
         if items.len() > 1024 {
-            let problem = format!("has {} elements, may have 1024", items.len());
+            let problem = format!("has {} elements, must have at most 1024", items.len());
             reader.refuse(&node.origin, key, problem, "");
             return None;
         }

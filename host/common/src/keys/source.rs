@@ -1,4 +1,5 @@
-//! TOML text, environment variables and `--set` flags into one tree of values that know where they were written.
+//! Reads TOML text, environment variables and `--set` flags into one tree of values that remember where they were
+//! written.
 
 use super::error::{ConfigError, Origin};
 use std::collections::BTreeMap;
@@ -17,7 +18,7 @@ pub struct Node {
     pub origin: Origin,
 }
 
-/// What TOML can say, as far as a rig file needs it.
+/// The TOML types that a rig file needs.
 #[derive(Clone, Debug)]
 pub enum Value {
     /// `true` or `false`.
@@ -32,11 +33,11 @@ pub enum Value {
     Array(Vec<Node>),
     /// Keys with values.
     Table(BTreeMap<String, Entry>),
-    /// Dates and integers beyond 64 bits: no key takes them.
+    /// Dates, and integers beyond 64 bits. No key accepts them.
     Other(&'static str),
 }
 
-/// A key's value and where the key itself stands.
+/// A key's value, and where the key itself was written.
 #[derive(Clone, Debug)]
 pub struct Entry {
     /// Where the key was written.
@@ -46,7 +47,7 @@ pub struct Entry {
 }
 
 impl Value {
-    /// The kind, as messages name it.
+    /// The name of the type in messages.
     pub fn kind(&self) -> &'static str {
         match self {
             Self::Bool(_) => "a boolean",
@@ -60,7 +61,7 @@ impl Value {
     }
 }
 
-/// Finds lines and columns in a text.
+/// Converts offsets in a text to lines and columns.
 struct Lines<'a> {
     file: Arc<str>,
     text: &'a str,
@@ -81,7 +82,7 @@ impl<'a> Lines<'a> {
     }
 }
 
-/// Parses TOML; every syntax error becomes one entry of `errors`, and what could be read is returned all the same.
+/// Parses TOML. Every syntax error becomes one entry of `errors`; what could be read is returned.
 pub fn parse(file: &str, text: &str, errors: &mut Vec<ConfigError>) -> Node {
     let lines = Lines::new(file, text);
     let (table, problems) = DeTable::parse_recoverable(text);
@@ -124,8 +125,8 @@ fn value_of(value: &DeValue<'_>, lines: &Lines<'_>) -> Value {
     }
 }
 
-/// Sets one key of the tree. `path` holds the parts of the dotted key; a part that is a number steps into an array.
-/// A text that is no TOML value is taken as a string, so that `render.method=paper` needs no quotes.
+/// Sets one key of the tree. `path` contains the parts of the dotted key; a numeric part is an index into an array. A
+/// text that is not a TOML value counts as a string, so that `render.method=paper` needs no quotes.
 pub fn set(root: &mut Node, path: &[String], text: &str, origin: &Origin, errors: &mut Vec<ConfigError>) {
     let mut refuse = |problem: String, remedy: &str| {
         errors.push(ConfigError {
@@ -155,7 +156,7 @@ pub fn set(root: &mut Node, path: &[String], text: &str, origin: &Origin, errors
                     Some(i) => &mut items[i],
                     None => {
                         return refuse(
-                            format!("`{here}` has {len} elements; `{part}` is none of them"),
+                            format!("`{here}` has {len} elements, and `{part}` is not the index of one"),
                             "count from 0",
                         )
                     }
@@ -187,7 +188,7 @@ fn value_from_flag(text: &str, origin: &Origin) -> Value {
     }
 }
 
-/// Everything under a flag's value stands where the flag stands.
+/// Everything in a flag's value has the origin of the flag.
 fn stamp(node: &mut Node, origin: &Origin) {
     node.origin = origin.clone();
     match &mut node.value {
@@ -200,15 +201,15 @@ fn stamp(node: &mut Node, origin: &Origin) {
     }
 }
 
-/// The dotted key that an environment variable sets; `None` when it is not one of ours.
-/// Two underscores part the levels, because keys contain single ones.
+/// The dotted key that an environment variable sets; `None` if the variable is not one of ours. Two underscores
+/// separate the levels, because keys contain single ones.
 pub fn variable_path(name: &str) -> Option<Vec<String>> {
     let rest = name.strip_prefix(VARIABLE_PREFIX)?;
     Some(rest.split("__").map(str::to_lowercase).collect())
 }
 
 impl Node {
-    /// The same value in the `toml` crate's own type; `None` for what no key takes.
+    /// The same value in the `toml` crate's type; `None` for values that no key accepts.
     pub fn to_toml(&self) -> Option<toml::Value> {
         Some(match &self.value {
             Value::Bool(b) => toml::Value::Boolean(*b),

@@ -1,4 +1,4 @@
-//! The system calls behind [`super`]: Linux only; elsewhere every right is refused with a reason.
+//! The system calls behind [`super`], for Linux only. On other systems every right is refused with a reason.
 #![allow(unsafe_code)]
 
 use super::Refusal;
@@ -16,13 +16,13 @@ fn user() -> String {
     std::env::var("USER").ok().filter(|u| !u.is_empty()).unwrap_or_else(|| "@dpm".into())
 }
 
-/// Cores this process may run on (taskset and container limits count), at least 1.
+/// Cores that this process may run on (after taskset and container limits), at least 1.
 pub fn usable_cores() -> usize {
     std::thread::available_parallelism().map_or(1, usize::from)
 }
 
-/// Puts the calling thread under SCHED_FIFO with a priority from 1 to 99. Threads it makes later start under the normal
-/// scheduler, so that helpers do not inherit real-time rights by accident.
+/// Puts the calling thread under SCHED_FIFO with a priority from 1 to 99. Threads that it creates later start under
+/// the normal scheduler, so that helpers do not inherit real-time rights by accident.
 #[cfg(target_os = "linux")]
 pub fn set_fifo_priority(priority: u32) -> Result<(), Refusal> {
     let wanted = priority.clamp(1, 99);
@@ -96,7 +96,7 @@ fn allowed_cores() -> String {
     line.map_or_else(|| "unknown".into(), |l| l.trim().to_owned())
 }
 
-/// Keeps all pages of the process resident, those mapped later included, so that no page fault delays a frame.
+/// Keeps all pages of the process resident, including those mapped later, so that no page fault delays a frame.
 #[cfg(target_os = "linux")]
 pub fn lock_memory() -> Result<(), Refusal> {
     // With a finite limit MCL_FUTURE would make later allocations fail instead of this call, far from the cause.
@@ -131,7 +131,8 @@ pub fn unlock_memory() {
     unsafe { libc::munlockall() };
 }
 
-/// Lets sleeps of the calling thread end this many nanoseconds late at most, as far as the kernel batches timers.
+/// Sets the timer slack: sleeps of the calling thread end at most this many nanoseconds late through the kernel's
+/// batching of timers.
 #[cfg(target_os = "linux")]
 pub fn set_timer_slack_ns(slack_ns: u64) -> Result<(), Refusal> {
     // SAFETY: PR_SET_TIMERSLACK takes one integer.
@@ -159,8 +160,9 @@ struct SchedAttr {
     period: u64,
 }
 
-/// Asks the normal scheduler for time slices of `slice_ns` (0.1 to 100 ms) for the calling thread, which keeps its niceness: a thread that
-/// wants little at a time comes before others that want much. Needs no right. Kernels before 6.12 have one slice for all and say nothing.
+/// Requests time slices of `slice_ns` (0.1 to 100 ms) from the normal scheduler for the calling thread, which keeps
+/// its niceness. A thread that needs little time at once then comes before threads that need much. Needs no right.
+/// Kernels before 6.12 have one slice for all threads and ignore the request silently.
 #[cfg(target_os = "linux")]
 pub fn set_slice_ns(slice_ns: u64) -> Result<(), Refusal> {
     let size = std::mem::size_of::<SchedAttr>() as u32;
@@ -181,7 +183,8 @@ pub fn set_slice_ns(slice_ns: u64) -> Result<(), Refusal> {
     Err(refusal("a shorter time slice".into(), "allow sched_setattr in the sandbox".into()))
 }
 
-/// The time slice of the calling thread under the normal scheduler, ns; 0 where the kernel has one for all threads.
+/// The time slice of the calling thread under the normal scheduler, ns; 0 if the kernel has one slice for all
+/// threads.
 #[cfg(test)]
 #[cfg(target_os = "linux")]
 pub fn slice_ns() -> u64 {
@@ -211,7 +214,7 @@ pub fn allowed_core_list() -> Vec<u32> {
     (0..libc::CPU_SETSIZE as u32).filter(|&core| unsafe { libc::CPU_ISSET(core as usize, &set) }).collect()
 }
 
-/// The calling thread's number for the operating system.
+/// The calling thread's id in the operating system.
 #[cfg(target_os = "linux")]
 pub fn thread_id() -> i32 {
     // SAFETY: gettid takes no arguments and cannot fail.
@@ -221,18 +224,19 @@ pub fn thread_id() -> i32 {
 /// What a thread of this process is doing.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Standing {
-    /// It runs, or would if it got a core.
+    /// It runs, or is ready to run.
     pub ready: bool,
     /// Processor time that it has used, nanoseconds.
     pub ran_ns: i64,
 }
 
-/// What the thread `id` of this process is doing; `None` where the kernel does not tell or the thread is gone. Allocates nothing.
+/// What the thread `id` of this process is doing; `None` if the kernel does not say or the thread is gone. Allocates
+/// nothing.
 #[cfg(target_os = "linux")]
 pub fn standing_of(id: i32) -> Option<Standing> {
     let mut text = [0u8; 256];
     let stat = read_of_thread(id, "stat", &mut text)?;
-    // The name, in brackets, may hold anything.
+    // The name, in brackets, may contain any character.
     let state = stat.rsplit(')').next()?.split_whitespace().next()?;
     let ready = state == "R";
     let mut text = [0u8; 96];
@@ -240,7 +244,7 @@ pub fn standing_of(id: i32) -> Option<Standing> {
     Some(Standing { ready, ran_ns })
 }
 
-/// The beginning of a file that tells of the thread `id`.
+/// The beginning of a file about the thread `id`.
 #[cfg(target_os = "linux")]
 fn read_of_thread<'a>(id: i32, name: &str, text: &'a mut [u8]) -> Option<&'a str> {
     use std::io::{Read, Write};
@@ -331,7 +335,7 @@ pub use elsewhere::*;
 mod tests {
     use super::*;
 
-    /// On a thread of its own: rights stay with the thread.
+    /// Runs `f` on a thread of its own, because rights stay with the thread.
     fn apart<R: Send + 'static>(f: impl FnOnce() -> R + Send + 'static) -> R {
         std::thread::spawn(f).join().unwrap()
     }
@@ -402,7 +406,7 @@ mod tests {
         });
     }
 
-    /// Found in use, R1: the system tells a thread that sleeps or was stopped from one that waits for a core.
+    /// Found in use, R1: the system distinguishes a thread that sleeps or was stopped from one that waits for a core.
     #[test]
     fn the_system_tells_who_is_ready() {
         let this = standing_of(thread_id()).expect("Linux tells");

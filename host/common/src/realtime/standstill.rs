@@ -1,12 +1,13 @@
-//! Threads that do nothing but sleep and look at the clock, into the intervals in which the machine itself stood still.
+//! Detects when the machine itself stood still, with control threads that only sleep and read the clock.
 //!
 //! On a shared or virtual machine a core may stop for milliseconds through no fault of the program. Frames that were
-//! late in such an interval are reported apart. A control thread sleeps in short steps; a step that took longer than asked
-//! by more than a threshold is a gap.
+//! late in such an interval are reported separately. A control thread sleeps in short steps. A step that exceeds its
+//! length by more than a threshold is a gap.
 //!
-//! There is one on every core, above all stages: nothing but the kernel and what is below it can keep it from running, so that a
-//! gap is never the program's own work, and a core that stands still is found while the other ones run. Where that rank is refused
-//! there is one thread on whatever core is free: it finds less, and excuses no stage that only waited for another.
+//! There is one control thread on every core, with a rank above all stages. Only the kernel and what is below it can
+//! keep such a thread from running. A gap is therefore never the program's own work, and a core that stands still is
+//! detected while the others run. If that rank is refused, there is one thread on whichever core is free. It detects
+//! less, and does not excuse a stage that only waited for another one.
 
 use super::os;
 use crate::clock::Clock;
@@ -16,16 +17,16 @@ use std::sync::atomic::{AtomicBool, AtomicI64, Ordering};
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::thread::JoinHandle;
 
-/// Sleep of one step.
+/// Sleep time of one step.
 const STEP_NS: i64 = 500_000;
 
-/// The newest gaps are kept, older ones are only counted: half an hour at five a second.
+/// Number of newest gaps that are kept; older ones are only counted. It is half an hour at five per second.
 const KEPT: usize = 1 << 13;
 
-/// Gaps of one control thread that wait until it may write them down.
+/// Number of gaps that one control thread can hold until it may record them.
 const WAITING: usize = 64;
 
-/// An interval in which the control thread did not run although it should have.
+/// An interval in which the control thread should have run but did not.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Gap {
     /// When it should have run.
@@ -40,8 +41,8 @@ impl Gap {
     }
 }
 
-/// The gaps of a run: the newest one by one, disjoint and in order, and the number and length of all. What several control threads
-/// saw at once counts once.
+/// The gaps of a run: the newest ones individually, disjoint and in order, and the number and length of all. A gap
+/// that several control threads saw at once counts once.
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
 pub struct Standstills {
     /// At most [`KEPT`].
@@ -50,12 +51,12 @@ pub struct Standstills {
     past: u64,
     past_ns: i64,
     past_longest_ns: i64,
-    /// End of the last gap that is no longer kept: what lies before it is counted already.
+    /// End of the last gap that is no longer kept. Everything before it is counted already.
     past_to: Option<HostTime>,
 }
 
 impl Standstills {
-    /// Notes a step that should have ended at `due` and ended at `woke`.
+    /// Records a step that should have ended at `due` and ended at `woke`.
     pub fn note(&mut self, due: HostTime, woke: HostTime, threshold_ns: i64) {
         if woke.ns_since(due) <= threshold_ns {
             return;
@@ -64,7 +65,7 @@ impl Standstills {
         if gap.from >= gap.to {
             return;
         }
-        // It ends about now, so what it overlaps is at the end: gaps from `first` to `after` become one with it.
+        // It ends about now, so it overlaps only the last gaps. Gaps from `first` to `after` are merged with it.
         let after = self.gaps.partition_point(|g| g.from <= gap.to);
         let first = self.gaps.partition_point(|g| g.to < gap.from).min(after);
         if first < after {
@@ -88,7 +89,7 @@ impl Standstills {
         self.gaps.iter().copied()
     }
 
-    /// Gaps of the whole run.
+    /// Number of gaps of the whole run.
     pub fn count(&self) -> u64 {
         self.past + self.gaps.len() as u64
     }
@@ -98,15 +99,15 @@ impl Standstills {
         self.gaps.iter().map(|g| g.ns()).fold(self.past_ns, i64::saturating_add)
     }
 
-    /// Longest gap of the run, ns; 0 without any.
+    /// Longest gap of the run, ns; 0 if there is none.
     pub fn longest_ns(&self) -> i64 {
         self.gaps.iter().map(|g| g.ns()).fold(self.past_longest_ns, i64::max)
     }
 
-    /// True when the machine stood still at some instant of [`from`, `to`]: a frame in flight then is excused. Asked for instants before
-    /// the gaps that are kept, it knows nothing.
+    /// True if the machine stood still at some instant of [`from`, `to`]; a frame in flight at that time is excused.
+    /// For instants before the gaps that are kept it returns false.
     pub fn touches(&self, from: HostTime, to: HostTime) -> bool {
-        // The first gap that ends after `from` is the only one that can begin early enough.
+        // The first gap that ends at or after `from` is the only candidate that can begin early enough.
         let first = self.gaps.partition_point(|g| g.to < from);
         self.gaps.get(first).is_some_and(|g| g.from <= to)
     }
@@ -122,17 +123,17 @@ impl Standstills {
 #[derive(Debug)]
 pub struct SeenStandstills {
     all: Mutex<Standstills>,
-    /// Per control thread: when it ran last, with everything before written down.
+    /// Per control thread: when it last ran, with everything before that recorded.
     awake_at: Vec<AtomicI64>,
 }
 
 impl SeenStandstills {
-    /// Nothing seen yet by any of `threads` control threads.
+    /// For `threads` control threads that have seen nothing yet.
     fn new(threads: usize) -> Self {
         Self { all: Mutex::default(), awake_at: (0..threads).map(|_| AtomicI64::new(i64::MIN)).collect() }
     }
 
-    /// Known standstills, with nothing to come.
+    /// Known standstills, to which nothing is added.
     pub fn known(standstills: Standstills) -> Self {
         Self { all: Mutex::new(standstills), awake_at: Vec::new() }
     }
@@ -142,17 +143,17 @@ impl SeenStandstills {
         HostTime(self.awake_at.iter().map(|at| at.load(Ordering::Acquire)).min().unwrap_or(i64::MAX))
     }
 
-    /// Looks at what is known. Short, please: control threads put off what they have to write meanwhile.
+    /// Calls `look` with what is known. It must be short, because control threads cannot record anything meanwhile.
     pub fn with<R>(&self, look: impl FnOnce(&Standstills) -> R) -> R {
         look(&self.lock())
     }
 
-    /// As if a control thread had told it.
+    /// As if a control thread had reported it.
     pub fn note(&self, from: HostTime, to: HostTime) {
         self.lock().note(from, to, 0);
     }
 
-    /// One control thread, which has not run yet.
+    /// For one control thread, which has not run yet.
     pub fn asleep() -> Self {
         Self::new(1)
     }
@@ -162,7 +163,7 @@ impl SeenStandstills {
         self.awake_at[0].store(at.0, Ordering::Release);
     }
 
-    // What a thread that panicked left behind is whole: it is written in one piece.
+    // The data of a thread that panicked is consistent, because it is written in one piece.
     fn lock(&self) -> MutexGuard<'_, Standstills> {
         self.all.lock().unwrap_or_else(PoisonError::into_inner)
     }
@@ -177,11 +178,11 @@ pub struct StandstillMonitor {
 }
 
 impl StandstillMonitor {
-    /// Starts the control threads. Steps late by more than `threshold_ns` count (1 ms is a frame's length). `above` is the highest
-    /// SCHED_FIFO priority of the frame path, 0 for the normal scheduler.
+    /// Starts the control threads. Steps that are late by more than `threshold_ns` count (1 ms is a frame's length).
+    /// `above` is the highest SCHED_FIFO priority of the frame path, or 0 for the normal scheduler.
     ///
     /// # Errors
-    /// The system's, when it has no more threads.
+    /// The system cannot start a thread.
     pub fn start(clock: Arc<dyn Clock>, threshold_ns: i64, above: u32) -> std::io::Result<Self> {
         let priority = if (1..99).contains(&above) && Self::is_granted(above + 1)? { above + 1 } else { 0 };
         let cores: Vec<Option<u32>> =
@@ -201,24 +202,25 @@ impl StandstillMonitor {
         Ok(monitor)
     }
 
-    /// Whether a thread of this process may have that priority. Asked apart from the control threads: without it they are other ones.
+    /// Whether a thread of this process may have that priority. It is tried on a separate thread, because the answer
+    /// decides which control threads are started.
     fn is_granted(priority: u32) -> std::io::Result<bool> {
         let asked = std::thread::Builder::new().spawn(move || os::set_fifo_priority(priority).is_ok())?;
         Ok(asked.join().unwrap_or(false))
     }
 
-    /// Control threads that run.
+    /// Number of control threads.
     #[cfg(test)]
     pub fn threads(&self) -> usize {
         self.threads.len()
     }
 
-    /// What they see, as they go on.
+    /// What they see, updated as they run.
     pub fn seen(&self) -> Arc<SeenStandstills> {
         self.seen.clone()
     }
 
-    /// Ends the threads (within a step) and returns what they saw.
+    /// Ends the threads (within one step) and returns what they saw.
     pub fn finish(mut self) -> Standstills {
         self.stop.store(true, Ordering::Relaxed);
         for thread in self.threads.drain(..) {
@@ -228,18 +230,18 @@ impl StandstillMonitor {
     }
 }
 
-/// A control thread's life: the `number`th.
+/// The loop of control thread `number`.
 fn watch(clock: &dyn Clock, threshold_ns: i64, stop: &AtomicBool, seen: &SeenStandstills, number: usize) {
     let awake_at = &seen.awake_at[number];
     let mut waiting: Vec<Gap> = Vec::with_capacity(WAITING);
-    // Relaxed: a flag that guards no data.
+    // Relaxed: the flag guards no data.
     while !stop.load(Ordering::Relaxed) {
         let due = clock.now().plus_ns(STEP_NS);
         let woke = clock.wait_until(due);
         if woke.ns_since(due) > threshold_ns && waiting.len() < WAITING {
             waiting.push(Gap { from: due, to: woke });
         }
-        // Never waits for whoever looks: that thread has a lower rank, and may not run before this one sleeps.
+        // Never waits for a reader, which has a lower rank and may not run before this thread sleeps.
         if let (false, Ok(mut all)) = (waiting.is_empty(), seen.all.try_lock()) {
             waiting.drain(..).for_each(|gap| all.note(gap.from, gap.to, threshold_ns));
         }
@@ -304,7 +306,7 @@ mod tests {
 
     #[test]
     fn what_any_core_saw_counts_once() {
-        // As three control threads tell them: each in its order, one thread's between another's.
+        // As three control threads report them: each in its own order, interleaved with the others.
         let told = [(10, 20), (15, 30), (30, 31), (52, 55), (50, 60), (90, 95), (70, 80)];
         let mut all = Standstills::default();
         told.iter().for_each(|&(from, to)| all.note(HostTime(from), HostTime(to), 0));
@@ -313,19 +315,19 @@ mod tests {
         assert_eq!((all.count(), all.total_ns(), all.longest_ns()), (4, 46, 21));
         assert!(all.touches(HostTime(58), HostTime(59)) && !all.touches(HostTime(61), HostTime(69)));
         assert!(all.covers(HostTime(52), HostTime(60)) && !all.covers(HostTime(52), HostTime(61)));
-        // One that spans several swallows them.
+        // A gap that spans several others replaces them.
         all.note(HostTime(40), HostTime(85), 0);
         assert_eq!((all.count(), all.total_ns(), all.longest_ns()), (3, 71, 45));
     }
 
-    /// A week of five gaps a second, seen by two threads: memory stays what it was, number and length stay exact.
+    /// A week of five gaps per second, seen by two threads: memory stays constant, and number and length stay exact.
     #[test]
     fn a_week_of_gaps_is_counted_exactly_in_bounded_memory() {
         let mut all = Standstills::default();
         let seconds = 7 * 24 * 3600i64;
         for k in 0..5 * seconds {
             let from = HostTime(k * 200_000_000);
-            // The second thread sees the end of the same gap; every thousandth lasts longer.
+            // The second thread sees the end of the same gap. Every thousandth gap is longer.
             let length = if k % 1000 == 999 { 40_000_000 } else { 3_000_000 };
             all.note(from, from.plus_ns(length), 1_000_000);
             all.note(from.plus_ns(500_000), from.plus_ns(length + 500_000), 1_000_000);
@@ -347,14 +349,15 @@ mod tests {
         assert_eq!(seen.through(), HostTime(10));
     }
 
-    /// A thread above the stages and below the control threads holds one core for 20 ms: only where there are such ranks.
+    /// A thread above the stages and below the control threads occupies one core for 20 ms. Runs only where such
+    /// ranks are granted.
     #[cfg(target_os = "linux")]
     #[test]
     fn work_of_lower_rank_is_no_standstill() {
         let clock = Arc::new(MonotonicClock::new(0));
         let monitor = StandstillMonitor::start(clock, 5_000_000, 51).unwrap();
         if monitor.threads() != os::usable_cores() {
-            // The right is refused here: one thread, of no rank.
+            // The right is refused here: there is one thread, without a rank.
             assert_eq!(monitor.threads(), 1);
             return;
         }

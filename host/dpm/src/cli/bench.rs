@@ -14,15 +14,15 @@ use std::path::PathBuf;
 /// Flags of `dpm bench`.
 #[derive(clap::Args, Clone, Debug)]
 pub(crate) struct BenchArgs {
-    /// The rig file; the demo's when left out
+    /// The rig file; default: the built-in demo
     #[arg(value_name = "RIG.toml")]
     rig: Option<PathBuf>,
     #[command(flatten)]
     flags: RigArgs,
-    /// Frames measured a method; fewer when they take longer than 20 s
+    /// Frames to measure per method; fewer if they take longer than 20 s
     #[arg(long, value_name = "N", default_value_t = 20, value_parser = clap::value_parser!(u32).range(3..=100_000))]
     count: u32,
-    /// Only this method; may be given several times
+    /// Measure only this method; may be given several times
     #[arg(long, value_name = "NAME", value_parser = METHODS.map(RenderMethod::word))]
     method: Vec<String>,
     /// Print one JSON object

@@ -1,4 +1,4 @@
-//! `dpm dlpc900`: words into calls of the DLPC900 driver.
+//! `dpm dlpc900`: passes the command line to the DLPC900 driver.
 
 use super::watch::{print, refuse_where_dark_stands};
 use crate::dlpc900::{sequence_of, status_text, PatternFileError, ShowAs};
@@ -18,15 +18,15 @@ use std::path::PathBuf;
 use std::process::{Child, Stdio};
 use std::time::Duration;
 
-/// How long the controller of a run that was killed is tried to be opened.
+/// How long to try to open the controller of a run that was killed.
 const GUARD_PATIENCE: Duration = Duration::from_secs(5);
-/// Between two tries.
+/// Time between two tries.
 const GUARD_STEP: Duration = Duration::from_millis(5);
 
 /// Flags of `dpm dlpc900`.
 #[derive(clap::Args, Clone, Debug)]
 pub(crate) struct Dlpc900Args {
-    /// Which controller, as BUS:ADDRESS of lsusb; needed when several are plugged in
+    /// The controller, as BUS:ADDRESS in lsusb; needed if several are plugged in
     #[arg(long, value_name = "BUS:ADDRESS", global = true)]
     device: Option<UsbPlace>,
     #[command(subcommand)]
@@ -35,31 +35,31 @@ pub(crate) struct Dlpc900Args {
 
 #[derive(clap::Subcommand, Clone, Debug)]
 enum Action {
-    /// Say what the controller is and does
+    /// Show what the controller is and what it does
     Status,
-    /// Upload pictures as a pattern sequence (loaded and stopped; see --start)
+    /// Upload pictures as a pattern sequence; it stays stopped unless --start is given
     Upload(UploadArgs),
-    /// Set up patterns cut out of the video signal, and start them
+    /// Set up patterns from the video signal, and start them
     VideoPattern(VideoArgs),
     /// Start the loaded sequence
     Start,
-    /// Pause the sequence; start goes on from there
+    /// Pause the sequence; start continues it
     Pause,
     /// Stop the sequence
     Stop,
-    /// Exercise the mirrors 50/50 with the LEDs off, as they should be whenever nothing is shown
+    /// Exercise the mirrors 50/50 with the LEDs off, as recommended whenever nothing is shown
     Idle,
-    /// Leave the exercise (takes 3 s)
+    /// End the exercise (takes 3 s)
     LeaveIdle,
     /// Park the mirrors with the LEDs off
     Park,
-    /// Free the mirrors again; upload again afterwards
+    /// Unpark the mirrors; a new upload is needed afterwards
     Unpark,
-    /// Go to standby, two minutes before power is cut
+    /// Go to standby; required two minutes before power is cut
     Standby,
-    /// Come back from standby
+    /// Leave standby
     Wake,
-    /// Started by `dpm run`: puts the controller to rest when that run is killed
+    /// Started by `dpm run`: puts the controller to rest if that run is killed
     #[command(hide = true)]
     Guard,
 }
@@ -72,25 +72,25 @@ struct UploadArgs {
     /// Bits per pattern
     #[arg(long, default_value_t = 1, value_parser = clap::value_parser!(u8).range(1..=8))]
     depth: u8,
-    /// Time lit, microseconds; the shortest possible when not given
+    /// Exposure, microseconds; default: the shortest possible
     #[arg(long)]
     exposure_us: Option<u32>,
-    /// Time black after each pattern, microseconds
+    /// Dark time after each pattern, microseconds
     #[arg(long, default_value_t = 0)]
     dark_us: u32,
     /// LEDs lit
     #[arg(long, value_enum, default_value_t = Leds::White)]
     leds: Leds,
-    /// LED currents as the driver board counts them, 0 to 255 each
+    /// LED currents in units of the driver board, 0 to 255 each
     #[arg(long, value_name = "R,G,B", value_parser = three)]
     led_current: Option<[u8; 3]>,
     /// Each pattern waits for an edge at TRIG_IN1
     #[arg(long)]
     wait_trigger: bool,
-    /// Show the sequence this many times; for ever when not given
+    /// Show the sequence this many times; default: forever
     #[arg(long)]
     repeat: Option<u32>,
-    /// Which bytes of a pixel hold planes 0-7, 8-15, 16-23; matters for more than 8 planes an image
+    /// Which bytes of a pixel contain planes 0-7, 8-15, 16-23; matters for more than 8 planes per image
     #[arg(long, value_enum, default_value_t = Order::Descending)]
     plane_order: Order,
     /// How images are coded
@@ -112,7 +112,7 @@ struct VideoArgs {
     /// Patterns per frame, 1 bit each
     #[arg(long, default_value_t = 24, value_parser = clap::value_parser!(u8).range(1..=24))]
     patterns: u8,
-    /// Time lit, microseconds; the frame is shared out evenly when not given
+    /// Exposure, microseconds; default: an equal share of the frame
     #[arg(long)]
     exposure_us: Option<u32>,
     /// LEDs lit
@@ -141,9 +141,9 @@ impl Leds {
 
 #[derive(Clone, Copy, Debug, ValueEnum)]
 enum Order {
-    /// 16-23, 8-15, 0-7, as common open programs write them
+    /// 16-23, 8-15, 0-7, as usual in open programs
     Descending,
-    /// 16-23, 0-7, 8-15, as TI's program writes them
+    /// 16-23, 0-7, 8-15, as in TI's program
     BlueGreenRed,
 }
 
@@ -197,8 +197,8 @@ fn open(args: &Dlpc900Args) -> Result<Dlpc900<UsbHid>, Failure> {
 /// Runs the command.
 ///
 /// # Errors
-/// [`FailureKind::Device`] when the controller cannot be reached or refuses; [`FailureKind::BadInput`] when pictures or times
-/// break a rule, with the LUT entry and the rule.
+/// [`FailureKind::Device`] if the controller cannot be reached or refuses; [`FailureKind::BadInput`] if pictures or
+/// times break a rule, with the LUT entry and the rule.
 pub(super) fn execute(args: &Dlpc900Args) -> Result<(), Failure> {
     if let Action::Guard = args.action {
         return guard(args.device);
@@ -236,23 +236,25 @@ pub(super) fn execute(args: &Dlpc900Args) -> Result<(), Failure> {
     Ok(())
 }
 
-/// What rests is woken before it is to show something: the mirrors' exercise takes 3 s to leave.
+/// Wakes a resting controller before it shows something. The mirrors need 3 s to leave the exercise.
 fn make_ready(d: &mut Dlpc900<UsbHid>) -> Result<(), Failure> {
     if d.make_ready()? {
-        let _ =
-            writeln!(std::io::stderr(), "the controller rested (exercise, park or standby); that is ended");
+        let _ = writeln!(
+            std::io::stderr(),
+            "the controller was at rest (exercise, park or standby) and is woken"
+        );
     }
     Ok(())
 }
 
-/// Looks after a run that may die without a word: waits until the pipe that the run holds is closed. Nothing said through it means that
-/// the run was killed; its controller, which has no watchdog, is then put to rest.
+/// Watches a run that may be killed: waits until the pipe that the run holds is closed. If nothing was sent through
+/// it, the run was killed. Its controller, which has no watchdog, is then put to rest.
 ///
 /// # Errors
 /// The controller cannot be reached or refuses.
 fn guard(place: Option<UsbPlace>) -> Result<(), Failure> {
     let device = |e: String| Failure::new(FailureKind::Device, e);
-    // Whoever ends the run ends its group, its session or its service: this must outlive it.
+    // A stop of the run may go to its whole group, session or service. This process must survive it.
     signals::ignore().map_err(|e| device(format!("cannot ignore signals: {e}")))?;
     let mut said = Vec::new();
     let _ = std::io::stdin().lock().take(16).read_to_end(&mut said);
@@ -263,9 +265,14 @@ fn guard(place: Option<UsbPlace>) -> Result<(), Failure> {
     let mut d = loop {
         match UsbHid::open(place).map(Dlpc900::new) {
             Ok(d) => break d?,
-            // The kernel frees the dead process's interface in its own time.
+            // The kernel releases the dead process's interface in its own time.
             Err(_) if std::time::Instant::now() < limit => std::thread::sleep(GUARD_STEP),
-            Err(e) => return Err(device(format!("{}: {e}; it goes on showing", describe(place)))),
+            Err(e) => {
+                return Err(device(format!(
+                    "{}: {e}; it could not be stopped and continues to show its patterns",
+                    describe(place)
+                )))
+            }
         }
     };
     d.stop()?;
@@ -275,12 +282,12 @@ fn guard(place: Option<UsbPlace>) -> Result<(), Failure> {
     Ok(())
 }
 
-/// A process that looks after this one; see [`Action::Guard`]. It acts when this process ends, or drops this value, without
+/// A process that watches this one; see [`Action::Guard`]. It acts if this process ends, or drops this value, without
 /// [`Guard::dismiss`].
 pub(super) struct Guard(Option<Child>);
 
 impl Guard {
-    /// Starts it. Without one the run goes on, as it would have without this precaution.
+    /// Starts it. If that fails, the run continues without this precaution.
     pub(super) fn start(device: Option<&str>) -> Self {
         let start = || {
             let mut command = std::process::Command::new(std::env::current_exe()?);
@@ -293,14 +300,16 @@ impl Guard {
         match start() {
             Ok(child) => Self(Some(child)),
             Err(e) => {
-                let _ =
-                    writeln!(std::io::stderr(), "nothing looks after the DLPC900 if this run is killed: {e}");
+                let _ = writeln!(
+                    std::io::stderr(),
+                    "cannot start the process that stops the DLPC900 if this run is killed: {e}"
+                );
                 Self(None)
             }
         }
     }
 
-    /// Ends it: the run has ended by itself and has put the controller to rest.
+    /// Ends it, because the run has ended by itself and has put the controller to rest.
     pub(super) fn dismiss(self) {
         if let Some(mut child) = self.0 {
             let said = child.stdin.take().map(|mut pipe| pipe.write_all(b"over"));
@@ -334,7 +343,7 @@ fn execute_upload(d: &mut Dlpc900<UsbHid>, u: &UploadArgs) -> Result<(), Failure
     let bar = indicatif::ProgressBar::new(sequence.image_bytes() as u64);
     let leds = LedSetup { current: u.led_current, polarity: None };
     if u.start {
-        // Before the upload, which takes many seconds and would have been in vain.
+        // Done before the upload, which takes many seconds and would otherwise be in vain.
         make_ready(d)?;
     }
     d.upload(&sequence, leds, &mut |p: UploadProgress| bar.set_position(p.sent as u64))?;

@@ -1,4 +1,4 @@
-//! `dpm doctor`: what this machine can do, line by line, and what to do about what is missing.
+//! `dpm doctor`: what this machine can do, line by line, and how to fix what is missing.
 
 use super::os;
 use super::watch::print;
@@ -16,30 +16,30 @@ pub(crate) struct DoctorArgs {
     json: bool,
 }
 
-/// How bad a finding is.
+/// The severity of a finding.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, serde::Serialize)]
 #[serde(rename_all = "lowercase")]
 pub(super) enum State {
     /// As it should be.
     Ok,
-    /// Works, with a price.
+    /// Works, but at a cost.
     Warning,
     /// Something cannot be used.
     Missing,
-    /// Good to know.
+    /// Information.
     Info,
 }
 
 /// One finding.
 #[derive(Clone, Debug, serde::Serialize)]
 pub(crate) struct Finding {
-    /// What was looked at.
+    /// The subject.
     pub name: String,
-    /// How it is.
+    /// Its state.
     pub state: State,
     /// What was found.
     pub found: String,
-    /// What to do; empty when nothing is to be done.
+    /// What to do; empty if nothing is to be done.
     pub remedy: String,
 }
 
@@ -52,16 +52,16 @@ impl Finding {
 /// Everything that was found.
 #[derive(Debug, serde::Serialize)]
 pub(super) struct Findings {
-    /// True when the main job can run: a Vulkan device is there.
+    /// True if the main task can run, which needs a Vulkan device.
     pub can_render: bool,
-    /// Findings in the order in which a frame meets them.
+    /// Findings in the order of a frame's path.
     pub findings: Vec<Finding>,
 }
 
 /// Runs the command.
 ///
 /// # Errors
-/// [`FailureKind::NoGpu`] when there is no usable Vulkan device; everything else that is missing is only said.
+/// [`FailureKind::NoGpu`] if there is no usable Vulkan device. Everything else that is missing is only reported.
 pub(super) fn execute(args: &DoctorArgs) -> Result<(), Failure> {
     let system = System { root: PathBuf::from("/") };
     let mut findings = Vec::new();
@@ -88,7 +88,7 @@ pub(super) fn execute(args: &DoctorArgs) -> Result<(), Failure> {
     }
 }
 
-/// What `packaging/99-dpm-limits.conf` grants.
+/// The priority that `packaging/99-dpm-limits.conf` grants.
 const FRAME_PATH_PRIORITY: u32 = 80;
 
 fn vulkan(findings: &mut Vec<Finding>) -> bool {
@@ -121,7 +121,7 @@ fn vulkan(findings: &mut Vec<Finding>) -> bool {
     if devices.is_empty() {
         let remedy =
             "install the GPU vendor's driver, or software Vulkan: apt-get install mesa-vulkan-drivers";
-        findings.push(Finding::new("Vulkan", State::Missing, "a loader but no device", remedy));
+        findings.push(Finding::new("Vulkan", State::Missing, "found a Vulkan loader but no device", remedy));
     }
     usable
 }
@@ -147,7 +147,7 @@ fn simd() -> Finding {
     Finding::new("bit-plane packing", state, kernel.name(), remedy)
 }
 
-/// A right that was tried, on a thread that ended at once.
+/// The result of trying a right on a thread that ended at once.
 fn right(name: &str, granted: &str, tried: Result<(), Refusal>) -> Finding {
     match tried {
         Ok(()) => Finding::new(name, State::Ok, granted, ""),
@@ -157,12 +157,14 @@ fn right(name: &str, granted: &str, tried: Result<(), Refusal>) -> Finding {
     }
 }
 
-/// Runs `ask` on a thread that ends at once, so that this one keeps nothing.
+/// Runs `ask` on a thread that ends at once, so that this thread keeps nothing.
 fn briefly(ask: fn() -> Result<(), Refusal>) -> Result<(), Refusal> {
     let refused = |reason: String| Err(Refusal { what: "a right".into(), reason, remedy: String::new() });
     match std::thread::Builder::new().spawn(ask) {
-        Ok(thread) => thread.join().unwrap_or_else(|_| refused("the thread that asked panicked".to_string())),
-        Err(e) => refused(format!("no thread to ask it: {e}")),
+        Ok(thread) => {
+            thread.join().unwrap_or_else(|_| refused("the thread that tested it panicked".to_string()))
+        }
+        Err(e) => refused(format!("cannot start a thread to test it: {e}")),
     }
 }
 
@@ -172,7 +174,7 @@ fn lock_and_unlock() -> Result<(), Refusal> {
     Ok(())
 }
 
-/// The kernel's files under `/proc`, `/sys` and `/dev`, below a root that tests can replace.
+/// The kernel's files in `/proc`, `/sys` and `/dev`, below a root that tests can replace.
 struct System {
     root: PathBuf,
 }
@@ -182,7 +184,7 @@ impl System {
         Some(fs::read_to_string(self.root.join(path)).ok()?.trim().to_string())
     }
 
-    /// Names in a folder in order; empty when it is not there.
+    /// Sorted names in a folder; empty if it does not exist.
     fn names(&self, path: &str) -> Vec<String> {
         let Ok(entries) = fs::read_dir(self.root.join(path)) else { return Vec::new() };
         let mut names: Vec<String> = entries.filter_map(|e| e.ok()?.file_name().into_string().ok()).collect();
@@ -201,7 +203,7 @@ impl System {
             Finding::new(
                 name,
                 State::Warning,
-                format!("a thread that spins at real-time priority stands still {gap_ms:.0} ms in every {:.0} ms", period as f64 / 1e3),
+                format!("the kernel stops a spinning real-time thread for {gap_ms:.0} ms in every {:.0} ms", period as f64 / 1e3),
                 "on a machine for the rig alone: sysctl kernel.sched_rt_runtime_us=-1; else real_time.wait = \"park\"",
             )
         })
@@ -310,7 +312,8 @@ impl System {
     }
 }
 
-/// What a USB device is by its numbers, four hexadecimal digits each, if it is a projector that this program drives.
+/// The name of a USB device with these ids (four hexadecimal digits each), if it is a projector that this program
+/// drives.
 fn known_projector(vendor: &str, product: &str) -> Option<&'static str> {
     use dpm_device::{dlpc900::usb as dlpc900, transport::usb as link};
     let number = |text: &str| u16::from_str_radix(text, 16).ok();
@@ -387,7 +390,7 @@ mod tests {
         assert_eq!(system.throttling().unwrap().state, State::Ok);
     }
 
-    /// Found in use: the doctor looked for numbers that no projector of the link has.
+    /// Found in use: the doctor looked for USB ids that no projector of the link has.
     #[test]
     fn a_projector_is_known_by_the_numbers_that_its_driver_opens() {
         use dpm_device::{dlpc900::usb as dlpc900, transport::usb as link};
@@ -433,7 +436,7 @@ mod tests {
                 ("dev/bus/usb/001/001", ""),
             ],
         );
-        // The node is not there, which is as inaccessible as a barred one (also for root).
+        // The device node does not exist, which counts as inaccessible, like one without permission (also for root).
         let findings = system.usb();
         assert_eq!(findings[0].state, State::Missing);
         assert!(findings[0].remedy.contains("ATTR{idProduct}==\"c900\", TAG+=\"uaccess\""));

@@ -33,29 +33,30 @@ pub(crate) struct ErrorArgs {
     rig: Option<PathBuf>,
     #[command(flatten)]
     flags: RigArgs,
-    /// A small raster, few frames, three budgets: minutes on two cores without a GPU
+    /// Small raster, few frames, three budgets: takes minutes on two cores without a GPU
     #[arg(long)]
     quick: bool,
     /// Also measure dpm with each of its parts off in turn
     #[arg(long)]
     ablation: bool,
-    /// Samples a pixel of the paper's method where the eye looks, 1/64 to 4096, one a group: all methods get its rays; below 1, that
-    /// share of the rays of 1
+    /// Ray budgets, one group each: samples per pixel of the paper's method where the eye looks, 1/64 to 4096. All
+    /// methods get the same number of rays; below 1, that share of the rays of 1
     #[arg(long, value_name = "SPP,...", value_delimiter = ',', value_parser = budget)]
     budgets: Vec<f64>,
-    /// Samples a pixel of the reference
+    /// Samples per pixel of the reference
     #[arg(long, value_name = "SPP", value_parser = clap::value_parser!(u32).range(2..=65536))]
     reference_spp: Option<u32>,
-    /// Measure another experiment than methods at equal rays
+    /// Run another experiment than methods at equal rays
     #[arg(long, value_enum, conflicts_with_all = ["ablation", "budgets"])]
     preset: Option<Preset>,
-    /// List the groups with their numbers and measure nothing
+    /// List the groups with their numbers, and measure nothing
     #[arg(long)]
     pub(super) list: bool,
-    /// Measure this group only; `dpm error merge` joins them
+    /// Measure only this group; `dpm error merge` joins the groups
     #[arg(long, value_name = "N")]
     pub(super) index: Option<usize>,
-    /// Also write what the eye saw of every method and of the reference, frame by frame, for metrics of others: OUT/sequences
+    /// Also write what the eye saw, frame by frame, of every method and of the reference, for other metrics:
+    /// OUT/sequences
     #[arg(long, conflicts_with = "preset")]
     sequences: bool,
     /// Print one JSON object
@@ -63,12 +64,12 @@ pub(crate) struct ErrorArgs {
     pub(super) json: bool,
 }
 
-/// Experiments of others.
+/// Other experiments.
 #[derive(clap::ValueEnum, Clone, Copy, Debug)]
 enum Preset {
-    /// Section 3 of the paper: one body in four materials, 5 to 30 samples a pixel, standing and moving
+    /// Section 3 of the paper: one body in four materials, 5 to 30 samples per pixel, at rest and moving
     Figure3,
-    /// Every method on one body in four materials, standing and moving, looked at and looked past
+    /// Every method on one body in four materials, at rest and moving, with the gaze on it and past it
     Table,
 }
 
@@ -79,18 +80,18 @@ fn budget(text: &str) -> Result<f64, String> {
     };
     value
         .filter(|v| (1.0 / 64.0..=4096.0).contains(v))
-        .ok_or_else(|| "write samples a pixel from 1/64 to 4096, for example 18 or 1/4".to_owned())
+        .ok_or_else(|| "write samples per pixel from 1/64 to 4096, for example 18 or 1/4".to_owned())
 }
 
-/// What else `dpm error` does.
+/// Subcommands of `dpm error`.
 #[derive(clap::Subcommand, Clone, Debug)]
 enum ErrorCommand {
-    /// Join the groups that are measured in a folder into its tables and curves
+    /// Join the measured groups in a folder into tables and curves
     Merge {
         /// The folder
         #[arg(long, value_name = "DIR", default_value = "out/error")]
         out: PathBuf,
-        /// Print one JSON object: the groups of each experiment found, under the name of its report
+        /// Print one JSON object: the groups of each experiment, under the name of its report
         #[arg(long)]
         json: bool,
     },
@@ -126,10 +127,10 @@ pub(super) fn execute(args: &ErrorArgs) -> Result<(), Failure> {
     end(args, &out, &results)
 }
 
-/// Reports the whole experiment, or shows the group that `--index` names.
+/// Reports the whole experiment, or shows the group that `--index` selects.
 pub(super) fn end<T: Kept>(args: &ErrorArgs, out: &Path, groups: &[T]) -> Result<(), Failure> {
     if args.index.is_some() {
-        // One group of many is no report: those of the whole come from `merge`.
+        // One group is not a report; `merge` makes the reports of the whole.
         show(groups, args.json);
         return Ok(());
     }
@@ -177,7 +178,7 @@ pub(super) fn folder(args: &ErrorArgs) -> PathBuf {
     args.flags.out.clone().unwrap_or_else(|| own.into())
 }
 
-/// Names with their numbers. A rig file that cannot be run has no groups.
+/// The group names with their numbers. A rig file that cannot be run has no groups.
 pub(super) fn list(args: &ErrorArgs, names: impl Iterator<Item = String>) -> Result<(), Failure> {
     args.flags.rig_at_rest(args.rig.as_deref())?;
     if args.json {
@@ -190,7 +191,7 @@ pub(super) fn list(args: &ErrorArgs, names: impl Iterator<Item = String>) -> Res
     Ok(())
 }
 
-/// What `--index` names, or all.
+/// The groups that `--index` selects, or all.
 pub(super) fn chosen<T: Copy>(args: &ErrorArgs, all: &[T]) -> Result<Vec<T>, Failure> {
     match args.index {
         None => Ok(all.to_vec()),
@@ -206,7 +207,7 @@ pub(super) fn options(args: &ErrorArgs, out: &Path) -> ErrorOptions {
     ErrorOptions {
         extent: Extent {
             warm_up: if args.quick { 48 } else { 96 },
-            // 250 ms at 947 fps: 33 ms for the eye at the end, flicker down to 4 Hz.
+            // 250 ms at 947 fps: 33 ms for the eye at the end, and flicker down to 4 Hz.
             kept: 237,
             reference_spp: args.reference_spp.unwrap_or(if args.quick { 128 } else { 1000 }),
         },
@@ -215,10 +216,10 @@ pub(super) fn options(args: &ErrorArgs, out: &Path) -> ErrorOptions {
     }
 }
 
-/// The GPU, and the rig at the raster to measure at: small without a GPU or in a hurry.
+/// The GPU, and the rig at the raster of the measurement, which is small without a GPU or with `--quick`.
 pub(super) fn stage(args: &ErrorArgs) -> Result<(Arc<Gpu>, Rig), Failure> {
     let config = args.flags.rig_at_rest(args.rig.as_deref())?;
-    // Not after the minutes that the first reference takes.
+    // Checked before the first reference, which takes minutes.
     check_folder(&folder(args))
         .map_err(|e| Failure::new(FailureKind::BadInput, format!("{e}; choose another folder with --out")))?;
     let gpu = open_gpu(&config)?;
@@ -232,7 +233,7 @@ fn prepare(args: &ErrorArgs, out: &Path) -> Result<ErrorRuns, Failure> {
     Ok(ErrorRuns::new(Arc::new(rig), gpu, options(args, out)))
 }
 
-/// What a sequence costs beside the others, for the time that is left: sample frames, and as much for each frame as 3 samples take.
+/// Relative cost of a sequence, for the remaining time: sample frames, plus the time of 3 samples for each frame.
 pub(super) fn weight(what: &str, group: Group, extent: Extent, methods: usize) -> u64 {
     let frames = f64::from(extent.warm_up + extent.kept);
     let sequence = frames * (group.budget.max(1.0) + 3.0);
@@ -240,7 +241,7 @@ pub(super) fn weight(what: &str, group: Group, extent: Extent, methods: usize) -
         "reference" => EYE_FRAMES as f64 * f64::from(extent.reference_spp) / 2.0,
         "reference of every frame" => f64::from(extent.kept * extent.reference_spp),
         "times" => 40.0 / frames * sequence * methods as f64,
-        // About twice the samples, for the warm-up and the frames that the eye sees.
+        // About twice the samples, because of the warm-up and the frames that the eye sees.
         what if what.ends_with(AT_EQUAL_TIME) => {
             f64::from(extent.warm_up + EYE_FRAMES as u32) * (2.0 * group.budget.max(1.0) + 3.0)
         }
@@ -249,10 +250,11 @@ pub(super) fn weight(what: &str, group: Group, extent: Extent, methods: usize) -
     of as u64
 }
 
-/// Races of a group at most: one at equal rays, the others for equal time.
+/// Maximum number of races per group: one at equal rays, the others for equal time.
 const MOST_RACES: u64 = 1 + RACES as u64;
 
-/// All that is drawn of a group, without its reference: each method twice, the races, and each of the others twice at equal time.
+/// The cost of a group without its reference: each method twice, the races, and each of the others twice at equal
+/// time.
 pub(super) fn weight_of_methods(group: Group, extent: Extent, methods: usize) -> u64 {
     let of = |what: &str| weight(what, group, extent, methods);
     let others = contenders(&RenderConfig::default(), false).iter().filter(|c| is_other(c.name)).count();

@@ -1,4 +1,4 @@
-//! `dpm error --preset figure3`: settings of the experiment that are not measured yet, then its table and plot.
+//! `dpm error --preset figure3`: measures the settings that are missing, then writes table and plot.
 
 use super::error::{chosen, end, failure, folder, list, options, stage, ErrorArgs};
 use super::error_files::{known_or, Kept, Origin};
@@ -36,7 +36,7 @@ impl Kept for Figure3Group {
     }
 }
 
-/// Measures what is not measured yet and writes table and plot.
+/// Measures the settings that are missing, and writes table and plot.
 ///
 /// # Errors
 /// Bad rig or flags, no GPU, a folder that cannot be written.

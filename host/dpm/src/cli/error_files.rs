@@ -1,4 +1,4 @@
-//! Measured groups of `dpm error` in a folder: found again or measured and kept, joined, and reported.
+//! Groups of `dpm error` in a folder: reads them or measures and keeps them, joins them, and reports them.
 
 use super::watch::print;
 use dpm_common::files::write_atomically;
@@ -17,18 +17,18 @@ use serde_json::Value;
 use std::io::Write;
 use std::path::{Path, PathBuf};
 
-/// A measured group of an experiment, as it lies in a folder.
+/// A measured group of an experiment, as stored in a folder.
 pub(super) trait Kept: Serialize + DeserializeOwned {
-    /// What the names of its files begin with.
+    /// Prefix of its file names.
     const PREFIX: &'static str;
-    /// What the names of the experiment's reports begin with.
+    /// Prefix of the names of the experiment's reports.
     const REPORT: &'static str;
 
     /// Its name among the groups of the experiment.
     fn name(&self) -> String;
-    /// What it came from.
+    /// Its origin.
     fn origin(&self) -> Origin<'_>;
-    /// Groups are told in rising order of this.
+    /// Groups are listed in rising order of this.
     fn order(&self) -> (bool, bool, f64);
     /// The experiment's tables.
     fn markdown(groups: &[Self]) -> String;
@@ -38,13 +38,13 @@ pub(super) trait Kept: Serialize + DeserializeOwned {
     }
 }
 
-/// What a measured group came from.
+/// The origin of a measured group.
 pub(super) struct Origin<'a> {
-    /// Hash of all that it depends on.
+    /// Hash of everything that it depends on.
     pub key: &'a str,
-    /// With what it was measured.
+    /// How it was measured.
     pub stamp: &'a Stamp,
-    /// How much was drawn of it, where a group tells.
+    /// Its extent, if the group records it.
     pub extent: Option<Extent>,
 }
 
@@ -59,13 +59,14 @@ fn path_of<T: Kept>(out: &Path, group: &T) -> PathBuf {
     path::<T>(out, &group.name(), group.origin().key)
 }
 
-/// What an earlier run left of a group, when it was made from the same.
+/// The result of an earlier run for a group, if it was made from the same inputs.
 pub(super) fn known<T: Kept>(out: &Path, name: &str, key: &str) -> Option<T> {
     let bytes = regular_file::read(&path::<T>(out, name, key), MAX_GROUP_BYTES).ok()?;
     serde_json::from_slice(&bytes).ok().filter(|group: &T| group.origin().key == key)
 }
 
-/// What an earlier run left of a group, else what `measure` makes of it now, kept with a picture of what the eye saw where there is one.
+/// The result of an earlier run for a group, or else the result of `measure`, which is kept, with a picture of what
+/// the eye saw if there is one.
 pub(super) fn known_or<T: Kept>(
     out: &Path,
     name: &str,
@@ -118,8 +119,8 @@ fn object<T: Kept>(groups: &[T]) -> Value {
     serde_json::json!({ "groups": groups })
 }
 
-/// Joins what lies in a folder: groups of methods, settings of figure 3, cells of the table. Prints the tables, or one JSON object that has
-/// each experiment's under the name of its report.
+/// Joins the results in a folder: groups of methods, settings of figure 3, cells of the table. Prints the tables, or
+/// one JSON object that contains each experiment under the name of its report.
 pub(super) fn merge(out: &Path, json: bool) -> Result<(), Failure> {
     print(&merged(out, json)?);
     Ok(())
@@ -140,7 +141,7 @@ fn merged(out: &Path, json: bool) -> Result<String, Failure> {
     Ok(if json { to_json(&Value::Object(objects)) + "\n" } else { tables })
 }
 
-/// Writes the reports of an experiment, if anything of it was measured, and adds it to what is printed.
+/// Writes the reports of an experiment, if any part of it was measured, and adds it to the output.
 fn add<T: Kept>(
     out: &Path,
     groups: &[T],
@@ -167,8 +168,8 @@ fn joined<T: Kept>(out: &Path) -> Result<Vec<T>, Failure> {
     Ok(groups)
 }
 
-/// Groups of one configuration, raster, seed and extent, none of them twice: only those have curves in common. They may come from
-/// different devices and commits, which the tables tell.
+/// Checks that all groups have the same configuration, raster, seed and extent, and that none occurs twice; only such
+/// groups share curves. They may come from different devices and commits, which the tables show.
 fn one_experiment<T: Kept>(out: &Path, sorted: &[T]) -> Result<(), Failure> {
     let what = |g: &T| {
         let Origin { stamp, extent, .. } = g.origin();
@@ -186,7 +187,7 @@ fn one_experiment<T: Kept>(out: &Path, sorted: &[T]) -> Result<(), Failure> {
         }
         if pair[0].name() == pair[1].name() {
             return told(
-                "are one group, measured twice (another device, commit or --ablation)",
+                "are the same group, measured twice (another device, commit or --ablation)",
                 &pair[0],
                 &pair[1],
             );
@@ -195,7 +196,7 @@ fn one_experiment<T: Kept>(out: &Path, sorted: &[T]) -> Result<(), Failure> {
     Ok(())
 }
 
-/// Every measured file of an experiment in a folder, by name.
+/// All measured files of an experiment in a folder, by name.
 fn read_all<T: Kept>(out: &Path) -> Result<Vec<T>, Failure> {
     let Ok(entries) = std::fs::read_dir(out) else { return Ok(Vec::new()) };
     let mut paths: Vec<PathBuf> = entries
@@ -281,7 +282,7 @@ mod tests {
         made
     }
 
-    /// What must be the same in groups that are joined.
+    /// What must be equal in groups that are joined.
     const CHANGES: [fn(&mut GroupResult); 4] = [
         |g| g.stamp.config_hash = "d".into(),
         |g| g.stamp.raster = [9, 6],
@@ -340,7 +341,7 @@ mod tests {
         assert_eq!(joined, ["still-2", "still-18", "moving-0.5", "moving-64"]);
         let again = known_or::<GroupResult>(&out, "still-2", "false2", || panic!("it lies there"));
         assert_eq!(again.unwrap().group().budget, 2.0);
-        // Another key is another group, and so is what a file holds under a name that is not its own.
+        // Another key means another group, and so does a file whose content has another name.
         let mut measured = false;
         let other = known_or(&out, "still-2", "another", || {
             measured = true;

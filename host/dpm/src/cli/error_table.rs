@@ -1,4 +1,4 @@
-//! `dpm error --preset table`: settings of the table that are not measured yet, then the whole table.
+//! `dpm error --preset table`: measures the settings that are missing, then writes the whole table.
 
 use super::error::{
     chosen, end, failure, folder, list, options, stage, weight, weight_of_methods, ErrorArgs,
@@ -31,7 +31,7 @@ impl Kept for TableGroup {
     }
 }
 
-/// Measures what is not measured yet and writes the table.
+/// Measures the settings that are missing, and writes the table.
 ///
 /// # Errors
 /// Bad rig or flags, no GPU, a folder that cannot be written.

@@ -1,19 +1,22 @@
-//! Keys pressed on the terminal of a run. b black, f freeze, s safe and a arm are orders; another may be the interlock's.
+//! Keys pressed on the terminal of a run. b (black), f (freeze), s (safe) and a (arm) are orders; another key may
+//! belong to the interlock.
 #![allow(unsafe_code)]
 
-/// The terminal at the standard input, reading single keys without echo; as it was before when dropped. Signals stay signals.
+/// The terminal at the standard input, in a mode that reads single keys without echo. Dropping this restores the
+/// former mode. Signals remain signals.
 pub(super) struct Keys {
     before: libc::termios,
 }
 
-/// True when this process is in the terminal's foreground: from the background, reading or setting it would stop the process.
+/// True if this process is in the terminal's foreground. From the background, reading or setting the terminal would
+/// stop the process.
 fn is_in_foreground() -> bool {
     // SAFETY: both calls take plain numbers and fail with -1.
     unsafe { libc::tcgetpgrp(libc::STDIN_FILENO) == libc::getpgrp() }
 }
 
 impl Keys {
-    /// `None` when the standard input is no terminal, or not this process's.
+    /// `None` if the standard input is not a terminal, or another process is in its foreground.
     pub(super) fn new() -> Option<Self> {
         if !is_in_foreground() {
             return None;

@@ -1,4 +1,4 @@
-//! `dpm link-test RIG.toml`: what the link to the projector carries.
+//! `dpm link-test RIG.toml`: measures the throughput of the link to the projector.
 
 use super::rig_args::RigArgs;
 use super::watch::{print, refuse_where_dark_stands, take_locks};
@@ -26,20 +26,21 @@ pub(crate) struct LinkTestArgs {
     /// Send a moving pattern instead of pictures of the rig's scene; needs no GPU
     #[arg(long)]
     prepared: bool,
-    /// Different frames to send
+    /// Number of different frames to send
     #[arg(long, value_name = "N", default_value_t = 8, value_parser = clap::value_parser!(u32).range(1..=64))]
     count: u32,
-    /// Seconds for each way to send
+    /// Seconds per way of sending
     #[arg(long = "for", value_name = "S", default_value_t = 2, value_parser = clap::value_parser!(u32).range(1..=600))]
     way_seconds: u32,
-    /// Judge the projector by every rule of docs/PROTOCOL.md instead: one line a rule, exit code 1 where one is broken. It shows next to no
-    /// light, but for up to half a second of it in the rules on limits
+    /// Instead, check the projector against every rule of docs/PROTOCOL.md: one line per rule, exit code 1 if one is
+    /// broken. This shows almost no light, except for up to half a second in the rules on limits
     #[arg(long, conflicts_with_all = ["prepared", "count", "way_seconds"])]
     conformance: bool,
-    /// Judge this rule only; may stand several times
+    /// Check only this rule; may be given several times
     #[arg(long = "rule", value_name = "RULE", requires = "conformance")]
     rules: Vec<String>,
-    /// Let the projector's whole field flash for a second, for the rule on flashes. Nobody who is sensitive to flashes may look
+    /// For the rule on flashes, let the projector's whole field flash for a second. Nobody who is sensitive to
+    /// flashes may watch
     #[arg(long, requires = "conformance")]
     flashes: bool,
     /// Print one JSON object
@@ -47,7 +48,8 @@ pub(crate) struct LinkTestArgs {
     json: bool,
 }
 
-/// Measures and prints. The projector shows the frames meanwhile; a signal ends that in order: dark, with a report of what there is.
+/// Measures and prints. The projector shows the frames meanwhile. A signal ends the measurement in an orderly way:
+/// dark, and with a report of the results so far.
 ///
 /// # Errors
 /// Bad rig or flags, no GPU, no projector.

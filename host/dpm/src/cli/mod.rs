@@ -1,4 +1,4 @@
-//! Words into calls: the command line of `dpm`. One file per command, no logic of its own.
+//! The command line of `dpm`: one file per command, without logic of its own.
 
 mod bench;
 mod dlpc900;
@@ -44,60 +44,63 @@ Every key of the rig file can be set by --set a.b=c or by the environment variab
 
 #[derive(Debug, Subcommand)]
 enum Command {
-    /// Run the built-in scene of two moving objects against the embedded mock projector and tracker
+    /// Run the built-in scene of two moving objects with the mock projector and the mock tracker
     Demo(run::DemoArgs),
     /// Run a rig file
     Run(run::RunArgs),
-    /// Measure what the link to the projector carries of this rig's pictures, and the frame rate that allows
+    /// Measure how much of this rig's pictures the link to the projector can carry, and at which frame rate
     LinkTest(link_test::LinkTestArgs),
-    /// Make the projectors of all running rigs dark, or of one; the rigs go on
+    /// Make the projectors of all running rigs dark, or of one; the rigs continue to run
     ///
-    /// Dark until `dpm arm` or the orderly end of the run; a run that dies leaves it standing for the next one. Prints whose rigs were
-    /// reached and how each projector is. Exit code 0 only when every one confirmed. Where a rig does not answer within 20 ms the order
-    /// goes to it as the signal USR1, which needs no thread of it but its link's.
+    /// The projectors stay dark until `dpm arm` or the orderly end of the run. If a run dies, the order stands for
+    /// the next run. Prints the rigs that were reached and the state of each projector. Exit code 0 only if every
+    /// projector confirmed. If a rig does not answer within 20 ms, the order is sent to it as the signal USR1, which
+    /// needs only its link's thread.
     Black(order::OrderArgs),
-    /// Hold the frame that the projector of a running rig shows
+    /// Freeze the frame that the projector of a running rig shows
     ///
-    /// Until `dpm arm`, `dpm black` or `dpm safe`. Exit code 0 only when the projector confirmed.
+    /// The frame is held until `dpm arm`, `dpm black` or `dpm safe`. Exit code 0 only if the projector confirmed.
     Freeze(order::OrderArgs),
-    /// Make the projectors of all running rigs dark, or of one, and latch it over restarts until `dpm arm`
+    /// Make the projectors of all running rigs dark, or of one, and keep them dark over restarts until `dpm arm`
     ///
-    /// Latched in the projector and in the state folder: the next run of that projector, after a crash, a restart of the service or of the
-    /// machine, comes up dark. Exit code 0 only when every projector confirmed and the order is on the disk. Where a rig does not answer
-    /// within 20 ms the order goes to it as the signal USR2.
+    /// The order is latched in the projector and in the state folder. The next run of that projector comes up dark,
+    /// even after a crash or a restart of the service or the machine. Exit code 0 only if every projector confirmed
+    /// and the order is on the disk. If a rig does not answer within 20 ms, the order is sent to it as the signal
+    /// USR2.
     Safe(order::OrderArgs),
-    /// Let light through again after black, freeze, safe or a fault, which this acknowledges
+    /// Permit light again after black, freeze, safe or a fault; this acknowledges the fault
     ///
-    /// Only a running rig can be armed. What stands in the state folder is forgotten first, then the light comes. Where several rigs run,
-    /// name one with --pid.
+    /// Only a running rig can be armed. The order in the state folder is forgotten first; then the light returns. If
+    /// several rigs run, select one with --pid.
     #[command(visible_alias = "resume")]
     Arm(order::OrderArgs),
-    /// Record what a rig's tracker says into a file that `tracker.kind = "replay"` plays
+    /// Record the samples of a rig's tracker into a file that `tracker.kind = "replay"` plays
     Record(record::RecordArgs),
     /// Measure where the time between motion and light goes
     Profile(profile::ProfileArgs),
-    /// Say what this machine can do, and what to do about what is missing
+    /// Show what this machine can do, and how to fix what is missing
     Doctor(doctor::DoctorArgs),
     /// Run stiff and extreme cases: measured error against bound, with the oracle of each
     Stability(stability::StabilityArgs),
-    /// Write everything that one frame was made from as pictures: rates, errors, samples, history, motion, light
+    /// Write pictures of everything that one frame was made from: rates, errors, samples, history, motion, light
     Snapshot(snapshot::SnapshotArgs),
-    /// Measure rays, samples and milliseconds by pass of every method on this device
+    /// Measure rays, samples and milliseconds per pass of every method on this device
     Bench(bench::BenchArgs),
     /// Measure error against cost of every method: perceived error, bias, noise and flicker at equal rays
     Error(error::ErrorArgs),
-    /// Say what a rig needs of the renderer, what is left out, why, how, and with --measure what that saves
+    /// Show what a rig needs from the renderer, and what is left out, why and how; with --measure also the savings
     Plan(plan::PlanArgs),
     /// Control a DLPC900 projector (LightCrafter 6500 / 9000): status, patterns, rest
     Dlpc900(dlpc900::Dlpc900Args),
 }
 
-/// Runs the program with the process's arguments. `commit`: what it was compiled from, see [`dpm_common::commit::get`].
+/// Runs the program with the process's arguments. `commit`: the commit from which it was compiled, see
+/// [`dpm_common::commit::get`].
 pub fn main(commit: &'static str) -> ExitCode {
     dpm_common::commit::set(commit);
     // https://no-color.org: set and not empty.
     let plain = std::env::var_os("NO_COLOR").is_some_and(|v| !v.is_empty());
-    // Once in the life of the process; the parser keeps it for as long.
+    // Leaked once per process; the parser keeps it for as long.
     let version: &'static str = format!("{} ({commit})", env!("CARGO_PKG_VERSION")).leak();
     let command =
         Cli::command().version(version).color(if plain { ColorChoice::Never } else { ColorChoice::Auto });
@@ -105,7 +108,7 @@ pub fn main(commit: &'static str) -> ExitCode {
     let cli = match parsed {
         Ok(cli) => cli,
         Err(e) => {
-            // Help and version are such "errors" too, with exit code 0.
+            // Help and version are "errors" here too, with exit code 0.
             let _ = e.print();
             return ExitCode::from(u8::try_from(e.exit_code()).unwrap_or(2));
         }

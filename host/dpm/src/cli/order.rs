@@ -1,4 +1,4 @@
-//! `dpm black | freeze | safe | arm`: a word to a rig that runs.
+//! `dpm black | freeze | safe | arm`: an order to a running rig.
 
 use super::watch::print;
 use dpm_common::unix::{user, user_name};
@@ -9,12 +9,12 @@ use dpm_rig::order::Order;
 /// Flags of the four commands.
 #[derive(clap::Args, Clone, Debug)]
 pub(crate) struct OrderArgs {
-    /// Process of the rig; needed for freeze and arm when several run
+    /// Process of the rig; needed for freeze and arm if several rigs run
     #[arg(long, value_name = "N")]
     pid: Option<u32>,
 }
 
-/// Gives `order` and prints whose rigs it reached, what they answered, and which it did not reach.
+/// Gives `order`. Prints the rigs that it reached with their answers, and those that it did not reach.
 ///
 /// # Errors
 /// No rig runs, several do, or a projector has not confirmed that it obeyed (exit code 3).
@@ -26,7 +26,7 @@ pub(super) fn execute(args: &OrderArgs, order: Order) -> Result<(), Failure> {
     if order.is_dark() && args.pid.is_none() && !told.closed.is_empty() {
         let folders: Vec<_> = told.closed.iter().map(|f| f.display().to_string()).collect();
         text += &format!(
-            "not looked into, for they are other users': {}; root reaches all\n",
+            "not searched, because they belong to other users: {}; root can reach all\n",
             folders.join(", ")
         );
     }
@@ -44,8 +44,8 @@ pub(super) fn execute(args: &OrderArgs, order: Order) -> Result<(), Failure> {
 fn line(answer: &Answer) -> String {
     let Answer { pid, uid, rig, text, is_vouched_for, .. } = answer;
     let rig = if rig.is_empty() { "rig not told" } else { rig };
-    let says = if *is_vouched_for { "" } else { "says (nobody vouches for it): " };
-    // What a process of another user says could hold control characters.
+    let says = if *is_vouched_for { "" } else { "says (unverified): " };
+    // The answer of another user's process could contain control characters.
     let line = format!("process {pid} of {}, {rig}: {says}{text}", user_name(*uid));
     line.chars().filter(|c| !c.is_control()).chain(['\n']).collect()
 }

@@ -1,4 +1,5 @@
-//! Access rights to files, asked of the kernel and not guessed from mode bits; and an end of the process that waits for nothing.
+//! Access rights to files, as the kernel sees them rather than guessed from mode bits; and an end of the process that
+//! waits for nothing.
 #![allow(unsafe_code)]
 
 use std::ffi::CString;

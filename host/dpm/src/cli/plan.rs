@@ -1,4 +1,4 @@
-//! `dpm plan RIG.toml`: what a rig needs, what is left out, why, how, and what it saves.
+//! `dpm plan RIG.toml`: what a rig needs, what is left out, why and how, and what that saves.
 
 use super::rig_args::RigArgs;
 use super::watch::{check_out, print, write_out};
@@ -11,12 +11,12 @@ use std::path::PathBuf;
 /// Flags of `dpm plan`.
 #[derive(clap::Args, Clone, Debug)]
 pub(crate) struct PlanArgs {
-    /// The rig file; the built-in demo when left out
+    /// The rig file; default: the built-in demo
     #[arg(value_name = "RIG.toml")]
     rig: Option<PathBuf>,
     #[command(flatten)]
     flags: RigArgs,
-    /// Time frames with and without each part that can be put back or taken out, and compare their pixels
+    /// Time frames with and without each part that can be added or removed, and compare their pixels
     #[arg(long)]
     measure: bool,
     /// Print one JSON object
@@ -26,7 +26,7 @@ pub(crate) struct PlanArgs {
 
 fn saved(s: &Saving) -> String {
     let [low, high] = s.saved_middle_half_ms;
-    let told = if s.stands_out() { "" } else { ", not told from chance" };
+    let told = if s.stands_out() { "" } else { ", may be chance" };
     let cost = format!(
         "the part takes {:+.2} ms (middle half of the frames {low:+.2} to {high:+.2}{told})",
         s.saved_ms

@@ -1,4 +1,4 @@
-//! `dpm profile`: where the time between motion and light goes, and whether it got better.
+//! `dpm profile`: where the time between motion and light goes, and whether it improved.
 
 use super::rig_args::RigArgs;
 use super::watch::{print, watch};
@@ -14,28 +14,29 @@ use std::path::{Path, PathBuf};
 /// Length of a profile without `--seconds` or `--frames`, s.
 const SECONDS: f64 = 10.0;
 
-/// Largest profile.json that is read, bytes; those of a day have some tens of thousands.
+/// Largest profile.json that is read, bytes; a usual one has some tens of thousands.
 const MAX_PROFILE_BYTES: u64 = 64 << 20;
 
 /// Flags of `dpm profile`.
 #[derive(clap::Args, Clone, Debug)]
 pub(crate) struct ProfileArgs {
-    /// The rig file; the demo's rig without one
+    /// The rig file; default: the built-in demo
     #[arg(value_name = "RIG.toml")]
     rig: Option<PathBuf>,
     #[command(flatten)]
     flags: RigArgs,
-    /// Frames prepared ahead in place of rendered ones: hand-offs, packing and link at the true rate, without a GPU
+    /// Use prepared frames instead of rendered ones: measures hand-offs, packing and link at the true rate, without a
+    /// GPU
     #[arg(long)]
     no_render: bool,
     /// Print the report as one JSON object
     #[arg(long)]
     json: bool,
-    /// Serve the figures for Prometheus while running, for example on 127.0.0.1:9473
+    /// Serve the figures for Prometheus during the run, for example on 127.0.0.1:9473
     #[arg(long, value_name = "ADDR")]
     prometheus: Option<String>,
-    /// Compare two profile.json instead of running: what got better or worse, and whether beyond noise; ends with 1 when more
-    /// slots are missed, or more frames late
+    /// Compare two profile.json files instead of running: shows what improved or got worse, and whether beyond the
+    /// noise. Exit code 1 if the share of missed slots or late frames grew by more than the noise
     #[arg(long, num_args = 2, value_names = ["A.json", "B.json"], conflicts_with_all = ["rig", "no_render", "prometheus"])]
     compare: Vec<PathBuf>,
 }
@@ -43,7 +44,7 @@ pub(crate) struct ProfileArgs {
 /// Profiles a rig, or compares two profiles.
 ///
 /// # Errors
-/// Bad rig file, scene, address or profile; a device that fails; torn frames; a comparison whose gates got worse.
+/// Bad rig file, scene, address or profile; a device that fails; torn frames; a comparison in which a gate got worse.
 pub(super) fn execute(args: &ProfileArgs) -> Result<(), Failure> {
     if let [before, after] = args.compare.as_slice() {
         let (rows, notes) = compare(&read(before)?, &read(after)?);
@@ -61,7 +62,7 @@ pub(super) fn execute(args: &ProfileArgs) -> Result<(), Failure> {
         return Ok(());
     }
     let mut flags = args.flags.clone();
-    // In front, so that an explicit --set wins.
+    // Inserted first, so that an explicit --set overrides it.
     flags.set.splice(0..0, ["output.images=false".into(), "output.trace=true".into()]);
     flags.pace.get_or_insert_with(|| "real".into());
     flags.out.get_or_insert_with(|| "out/profile".into());
@@ -105,7 +106,7 @@ pub(super) fn execute(args: &ProfileArgs) -> Result<(), Failure> {
     print(&if args.json { profile.to_json() + "\n" } else { profile.to_table() });
     if profile.frames_torn.unwrap_or(0) + profile.frames_reordered > 0 {
         let told = format!(
-            "{} lit frames held parts of another and {} came out of order",
+            "{} lit frames contained parts of another frame and {} came out of order",
             profile.frames_torn.unwrap_or(0),
             profile.frames_reordered
         );

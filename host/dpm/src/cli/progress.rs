@@ -1,22 +1,22 @@
-//! Steps of known cost into a bar with the time that is left; where nobody watches a terminal, a line a part.
+//! Shows steps of known cost as a bar with the remaining time; if the output is not a terminal, as one line per part.
 
 use indicatif::{ProgressBar, ProgressStyle};
 use std::io::Write;
 use std::time::Instant;
 
-/// Work in parts (of which some may turn out to be done already), each of steps.
+/// Work in parts, each of which has steps. Some parts may turn out to be done already.
 pub(super) struct Progress {
     bar: ProgressBar,
     /// Position at the end of each part.
     ends: Vec<u64>,
     part: usize,
-    /// Cost of the step that runs.
+    /// Cost of the current step.
     running: u64,
     started: Instant,
 }
 
 impl Progress {
-    /// Parts of these costs, in any unit.
+    /// For parts of these costs, in any unit.
     pub(super) fn new(parts: &[u64]) -> Self {
         let sum = |end: &mut u64, part: &u64| {
             *end += part;
@@ -29,7 +29,7 @@ impl Progress {
         Self { bar, ends, part: 0, running: 0, started: Instant::now() }
     }
 
-    /// The step before is over, this one begins.
+    /// Ends the previous step and begins this one.
     pub(super) fn step(&mut self, what: &str, cost: u64) {
         let end = self.ends.get(self.part).copied().unwrap_or(0);
         self.bar.set_position((self.bar.position() + self.running).min(end));
@@ -37,7 +37,7 @@ impl Progress {
         self.bar.set_message(what.to_owned());
     }
 
-    /// A part is over, whatever its steps were thought to cost.
+    /// Ends a part, whatever the estimated costs of its steps were.
     pub(super) fn end_of_part(&mut self, name: &str) {
         let before = if self.part > 0 { self.ends[self.part - 1] } else { 0 };
         let end = self.ends.get(self.part).copied().unwrap_or(before);
@@ -48,7 +48,7 @@ impl Progress {
             let total = self.ends.last().copied().unwrap_or(end);
             let elapsed = self.started.elapsed().as_secs_f64();
             let left = elapsed * (total - end) as f64 / end as f64;
-            // Nobody may be listening.
+            // The stream may have no reader.
             let _ = writeln!(
                 std::io::stderr(),
                 "{name} done, {} of {}, {elapsed:.0} s, about {left:.0} s left",

@@ -1,4 +1,5 @@
-//! `dpm record OUT --rig RIG.toml`: what a rig's tracker says into a file, until the time is over, a signal comes or the disk is full.
+//! `dpm record OUT --rig RIG.toml`: records a rig's tracker into a file until the time is over, a signal arrives or
+//! the disk is full.
 
 use super::rig_args::RigArgs;
 use super::watch::print;
@@ -12,21 +13,22 @@ use std::io::Write;
 use std::path::PathBuf;
 use std::sync::Arc;
 
-/// Between two looks at the tracker, nanoseconds: what arrives in between is stamped when it is read where the kernel does not stamp it.
+/// Time between two polls of the tracker, nanoseconds. Unless the kernel stamps a packet, it is stamped when it is
+/// read.
 const POLL_EVERY_NS: i64 = 500_000;
-/// Between two lines about the progress, nanoseconds.
+/// Time between two lines of progress, nanoseconds.
 const SAY_EVERY_NS: i64 = 1_000_000_000;
 
 /// Flags of `dpm record`.
 #[derive(clap::Args, Clone, Debug)]
 pub(crate) struct RecordArgs {
-    /// The new file; one that is there already is not overwritten
+    /// The new file; an existing file is not overwritten
     #[arg(value_name = "OUT")]
     out: PathBuf,
     /// The rig file with the tracker and the bodies
     #[arg(long, value_name = "RIG.toml")]
     rig: PathBuf,
-    /// How long, in seconds; without it until a signal ends it
+    /// Duration in seconds; default: until a signal arrives
     #[arg(long, value_name = "S", value_parser = seconds)]
     seconds: Option<f64>,
     /// Set a key of the rig file, for example tracker.server=192.168.1.10; may be given several times
@@ -42,8 +44,8 @@ fn seconds(text: &str) -> Result<f64, String> {
 /// Records.
 ///
 /// # Errors
-/// Exit code 2: a bad rig file, an output that cannot be made. 3: the file could not be written to its end (what was written before can be
-/// played), or the tracker failed or delivered nothing, with its own word on why.
+/// Exit code 2: a bad rig file, or an output that cannot be created. 3: the file could not be written completely
+/// (what was written before can be played), or the tracker failed or delivered nothing, with its own explanation.
 pub(super) fn execute(args: &RecordArgs) -> Result<(), Failure> {
     let config = RigArgs { set: args.set.clone(), ..RigArgs::default() }.rig(Some(&args.rig))?;
     let rig = Rig::build(&config, None)?;

@@ -1,14 +1,14 @@
-//! Flags that every command with a rig takes, into a checked [`RigConfig`].
+//! The flags of every command that takes a rig, and how they become a checked [`RigConfig`].
 
 use dpm_rig::config::{Overrides, Purpose, RigConfig};
 use dpm_rig::control::set_rig_name;
 use dpm_rig::failure::{Failure, FailureKind};
 use std::path::{Path, PathBuf};
 
-/// Flags over the rig file. Each is a short form of `--set`.
+/// Flags that override the rig file. Each is a short form of `--set`.
 #[derive(clap::Args, Clone, Debug, Default)]
 pub(crate) struct RigArgs {
-    /// glTF 2.0 file (.glb or .gltf) to show in place of the rig's scene
+    /// glTF 2.0 file (.glb or .gltf) to show instead of the rig's scene
     #[arg(long, value_name = "FILE")]
     pub scene: Option<PathBuf>,
 
@@ -20,19 +20,19 @@ pub(crate) struct RigArgs {
     #[arg(long, value_name = "N", conflicts_with = "seconds")]
     pub frames: Option<u64>,
 
-    /// Seconds to run for: of the wall clock at real pace, of the rig's own clock at virtual pace
+    /// Seconds to run: of the wall clock at real pace, of the rig's own clock at virtual pace
     #[arg(long, value_name = "S")]
     pub seconds: Option<f64>,
 
-    /// What time is: real, the wall clock, or virtual, a clock that takes as long as the work does
+    /// Clock of the run: real (the wall clock) or virtual (a clock that advances one slot per frame)
     #[arg(long, value_name = "PACE", value_parser = ["real", "virtual"])]
     pub pace: Option<String>,
 
-    /// Run the rig file against the mocks: they take the place of its tracker and its projector, of whatever kind those are
+    /// Run with the mocks instead of the rig file's tracker and projector, whatever their kind
     #[arg(long)]
     pub simulate: bool,
 
-    /// Show the newest tracker sample as it is
+    /// Show the newest tracker sample without prediction
     #[arg(long)]
     pub no_prediction: bool,
 
@@ -46,7 +46,7 @@ pub(crate) struct RigArgs {
 }
 
 impl RigArgs {
-    /// The flags as texts for `--set`; what the user sets explicitly comes last and wins.
+    /// The flags as texts for `--set`. Explicit `--set` flags come last and override the others.
     fn flags(&self) -> Result<Vec<String>, Failure> {
         let mut flags = Vec::new();
         let quoted = |path: &Path| toml::Value::String(path.display().to_string()).to_string();
@@ -79,7 +79,8 @@ impl RigArgs {
         Ok(flags)
     }
 
-    /// Refuses the flags among `meaningless`, by their names in the command line, that `command` would accept and then ignore.
+    /// Refuses those of the flags `meaningless`, named as on the command line, that `command` would accept and then
+    /// ignore.
     ///
     /// # Errors
     /// One of them is given.
@@ -101,7 +102,8 @@ impl RigArgs {
         }
     }
 
-    /// Reads the rig file `path`, or the demo's when there is none, for a run: with the environment and these flags over it.
+    /// Reads the rig file `path`, or the demo's if there is none, for a run. The environment and these flags override
+    /// it.
     ///
     /// # Errors
     /// Every mistake in file, environment and flags.
@@ -109,7 +111,8 @@ impl RigArgs {
         self.rig_for(path, false)
     }
 
-    /// The same for a command that runs nothing, or as many frames as it knows itself: what the file says about the end of a run does not matter to it.
+    /// The same for a command that runs nothing, or that determines the number of frames itself: the end of a run in
+    /// the file does not matter.
     ///
     /// # Errors
     /// As [`RigArgs::rig`].
@@ -118,7 +121,7 @@ impl RigArgs {
     }
 
     fn rig_for(&self, path: Option<&Path>, at_rest: bool) -> Result<RigConfig, Failure> {
-        // Whoever gives orders to this process is told which rig it is.
+        // Clients that give orders to this process are informed which rig it is.
         path.into_iter().for_each(set_rig_name);
         let read = |flags: Vec<String>, at_rest: bool| {
             let overrides = Overrides::from_environment(flags);
@@ -130,7 +133,7 @@ impl RigArgs {
         };
         let mut flags = self.flags()?;
         if self.raster.is_some() {
-            // A calibration counts the pixels of the raster that the file says. Only without the flag is that to be seen.
+            // A calibration refers to the raster in the file, which is visible only without the flag.
             let without = Self { raster: None, ..self.clone() }.flags()?;
             let calibrated = read(without, true).ok().map(|rig| rig.projector);
             if let Some(p) = calibrated.filter(|p| p.calibration.is_some() && p.calibration_raster.is_none())
@@ -148,7 +151,7 @@ impl RigArgs {
     }
 }
 
-/// A side of a raster as the flag says it; range and zero are the configuration's business.
+/// A side of a raster, as given in the flag. The configuration checks its range.
 fn number(text: &str) -> Option<u64> {
     text.trim().parse().ok()
 }
@@ -183,7 +186,8 @@ mod tests {
         assert_eq!(rig.output.dir, Path::new("a \"b\""));
     }
 
-    /// Found in use, O9: `--seconds` counted frames, so a slow renderer ran for any time. Seconds are slots, whatever is made of them.
+    /// Found in use, O9: `--seconds` counted frames, so a slow renderer ran for an arbitrary time. Seconds are slots,
+    /// however many frames that makes.
     #[test]
     fn seconds_become_slots_at_the_rigs_own_rate() {
         let slots = |seconds: f64, set: &[&str]| {
@@ -230,14 +234,14 @@ mod tests {
             args.set = vec!["tracker.server=\"nowhere\"".into()];
             assert!(args.rig(Some(&path)).unwrap_err().message.contains("tracker.server"));
         }
-        // What runs nothing needs no end.
+        // A command that runs nothing needs no end.
         let still = RigArgs { simulate: true, pace: Some("virtual".into()), ..RigArgs::default() };
         assert!(still.rig(Some(&path)).unwrap_err().message.contains("never end"));
         assert_eq!(still.rig_at_rest(Some(&path)).unwrap().run.frames, 0);
         std::fs::remove_dir_all(dir).unwrap();
     }
 
-    /// Found in use, a sibling of R13: flags that a command accepted and ignored.
+    /// Found in use, a sibling of R13: commands accepted flags and ignored them.
     #[test]
     fn flags_without_a_meaning_are_refused_by_name() {
         let args = RigArgs { seconds: Some(1.0), ..RigArgs::default() };
@@ -263,14 +267,14 @@ mod tests {
         assert!(told(|a| a.scene = Some("no.glb".into())).contains("no.glb: No such file"));
     }
 
-    /// Found in use, O1: `--raster` cropped the view of a calibrated projector instead of cutting it into other pixels. Every point of the world falls on the
-    /// same place of the picture, whatever its pixels are.
+    /// Found in use, O1: `--raster` cropped the view of a calibrated projector instead of dividing it into other
+    /// pixels. Every point of the world falls on the same place in the picture, whatever its pixels are.
     #[test]
     fn a_calibrated_view_stays_when_its_raster_changes() {
         let dir = std::env::temp_dir().join(format!("dpm-calibrated-{}", std::process::id()));
         std::fs::create_dir_all(&dir).unwrap();
         let calibration = dir.join("procam.yml");
-        // Off the centre and not square, so that nothing falls on its own place by chance.
+        // Off-centre and not square, so that nothing falls on its own place by chance.
         let text = "%YAML:1.0\n---\nproj_K: !!opencv-matrix\n  rows: 3\n  cols: 3\n  dt: d\n  data: [ 1890., 0., 530.25, 0., 1910., 371.5, 0., 0., 1. ]\n\
                     R: !!opencv-matrix\n  rows: 3\n  cols: 3\n  dt: d\n  data: [ 1., 0., 0., 0., -1., 0., 0., 0., -1. ]\n\
                     T: !!opencv-matrix\n  rows: 3\n  cols: 1\n  dt: d\n  data: [ 0.02, 0.1, 1.1 ]\n";
@@ -303,7 +307,8 @@ mod tests {
                 seen += 1;
             }
             assert!(seen > 900, "{seen}");
-            // The corner of the picture is the corner of the panel: pixels are areas, and their centres lie half a pixel inside.
+            // The corner of the picture is the corner of the panel. Pixels are areas, and their centres lie half a
+            // pixel inside.
             let corner = |camera: &ProjectorCamera| camera.ray(glam::DVec2::ZERO).direction.normalize();
             assert!((corner(&full) - corner(&small)).length() < 1e-12);
         }

@@ -1,4 +1,4 @@
-//! `dpm run RIG.toml` and `dpm demo`: the rig from its file to light.
+//! `dpm run RIG.toml` and `dpm demo`: run a rig from its file to light.
 
 use super::dlpc900::Guard;
 use super::rig_args::RigArgs;
@@ -58,7 +58,8 @@ fn start(path: Option<&Path>, flags: &RigArgs, json: bool) -> Result<(), Failure
             rig,
             |_| {},
             move |rig, monitor| {
-                // Not before this instance has the controller's lock. A panic leaves without a word, as a SIGKILL does.
+                // Started only when this instance has the controller's lock. A panic ends without a message to the
+                // guard, like a SIGKILL.
                 let guard = Guard::start(device.as_deref());
                 let result = run_dlpc900(rig, monitor);
                 guard.dismiss();

@@ -10,15 +10,15 @@ use std::path::PathBuf;
 /// Flags of `dpm snapshot`.
 #[derive(clap::Args, Clone, Debug)]
 pub(crate) struct SnapshotArgs {
-    /// The rig file; the built-in demo when left out
+    /// The rig file; default: the built-in demo
     #[arg(value_name = "RIG.toml")]
     rig: Option<PathBuf>,
     #[command(flatten)]
     flags: RigArgs,
-    /// Which frame; those before it are played too, for histories to settle
+    /// Number of the frame; the frames before it are also played, so that histories settle
     #[arg(long, value_name = "N", default_value_t = 32)]
     frame: u32,
-    /// Pictures to write, separated by commas; all that the method has when left out
+    /// Pictures to write, separated by commas; default: all that the method has
     #[arg(long, value_name = "NAME", value_enum, value_delimiter = ',')]
     what: Vec<SnapshotImage>,
     /// Print the list of files as one JSON object

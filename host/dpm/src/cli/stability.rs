@@ -9,13 +9,13 @@ use dpm_rig::telemetry::report::to_json;
 /// Flags of `dpm stability`.
 #[derive(clap::Args, Clone, Debug)]
 pub(crate) struct StabilityArgs {
-    /// Only cases whose name contains this
+    /// Run only cases whose name contains this
     #[arg(long, value_name = "NAME")]
     only: Option<String>,
-    /// Seed of the random inputs; a failing case prints the one that replays it
+    /// Seed of the random inputs; a failing case prints the seed that reproduces it
     #[arg(long, default_value_t = SEED)]
     seed: u64,
-    /// So many seeds in a row, for each case; the first that fails is told, else the largest error
+    /// Number of consecutive seeds per case; prints the first failure, or else the largest error
     #[arg(long, value_name = "N", default_value_t = 1, value_parser = clap::value_parser!(u64).range(1..=1_000_000))]
     seeds: u64,
     /// Print one JSON object
@@ -33,7 +33,7 @@ fn line(c: &CaseResult) -> String {
     format!("{verdict}  {:<36} {error:>9} <= {:<7e} {:<11} {}\n", c.name, c.bound, c.unit, c.oracle)
 }
 
-/// Runs the cases; a failed one makes the command fail.
+/// Runs the cases; the command fails if one of them fails.
 pub(super) fn execute(args: &StabilityArgs) -> Result<(), Failure> {
     let mut all = cases();
     let device = gpu::open();

@@ -1,5 +1,5 @@
-//! Notes and progress of a run to the standard error stream, from a thread of its own: where nobody reads it or the terminal is
-//! stopped, that thread waits and the run goes on.
+//! Writes notes and progress of a run to the standard error stream, from a thread of its own. If nobody reads the
+//! stream or the terminal is stopped, that thread waits and the run continues.
 
 use crossbeam::channel::{bounded, Receiver, RecvTimeoutError, Sender};
 use dpm_rig::failure::{Failure, FailureKind};
@@ -12,7 +12,7 @@ use std::time::{Duration, Instant};
 
 /// Notes that wait for a reader; more are dropped.
 const WAITING: usize = 256;
-/// How long the end of a run waits for what is not yet told.
+/// How long the end of a run waits for notes that are not written yet.
 const END_WITHIN: Duration = Duration::from_millis(200);
 
 /// How often progress is shown.
@@ -23,7 +23,7 @@ enum Word {
     Tick(ProjectorHealth, RunCounts),
 }
 
-/// Says things without ever waiting.
+/// Writes notes without ever waiting.
 pub(super) struct Teller {
     words: Option<Sender<Word>>,
     over: Receiver<()>,
@@ -31,7 +31,7 @@ pub(super) struct Teller {
 }
 
 impl Teller {
-    /// For a run of `total` frames, or else `seconds` of time; 0 is no end.
+    /// For a run of `total` frames, or else `seconds` of time; 0 means without an end.
     ///
     /// # Errors
     /// No thread can be started (exit code 3).
@@ -41,7 +41,7 @@ impl Teller {
         let thread = std::thread::Builder::new()
             .name("dpm-tell".into())
             .spawn(move || {
-                // Dropped at the end of the thread, however that comes.
+                // Dropped at the end of the thread, whatever ends it.
                 let _ended = ended;
                 let mut progress = Progress::new(total, seconds);
                 let mut last = (ProjectorHealth::Connecting, RunCounts::default());
@@ -60,21 +60,21 @@ impl Teller {
         Ok(Self { words: Some(words), over, thread: Some(thread) })
     }
 
-    /// Says `text`, a line.
+    /// Writes `text` as one line.
     pub(super) fn note(&self, text: &str) {
         if let Some(words) = &self.words {
             let _ = words.try_send(Word::Note(text.to_owned()));
         }
     }
 
-    /// Shows how far the run is.
+    /// Shows the progress of the run.
     pub(super) fn tick(&self, health: ProjectorHealth, counts: RunCounts) {
         if let Some(words) = &self.words {
             let _ = words.try_send(Word::Tick(health, counts));
         }
     }
 
-    /// Says the rest, for a fifth of a second at most.
+    /// Writes the rest, for at most a fifth of a second.
     pub(super) fn finish(&mut self, health: ProjectorHealth, counts: RunCounts) {
         self.tick(health, counts);
         self.words = None;
@@ -89,25 +89,25 @@ impl Drop for Teller {
     fn drop(&mut self) {
         if self.thread.is_some() {
             self.words = None;
-            // What was noted before an error at the start.
+            // Writes what was noted before an error at the start.
             let _ = self.over.recv_timeout(END_WITHIN);
         }
     }
 }
 
-/// Frames a second over the last seconds.
+/// Frames per second over the last seconds.
 struct Rate {
-    /// The oldest is the one from which is counted.
+    /// The count starts at the oldest one.
     seen: VecDeque<(Duration, u64)>,
 }
 
-/// Time over which the rate is taken.
+/// Time over which the rate is averaged.
 const RATE_OVER: Duration = Duration::from_secs(2);
-/// Most readings of it: one a [`SHOWN_EVERY`], and one more.
+/// Maximum number of readings: one per [`SHOWN_EVERY`], and one more.
 const RATE_READINGS: usize = (RATE_OVER.as_millis() / SHOWN_EVERY.as_millis()) as usize + 1;
 
 impl Rate {
-    /// Takes in how many there were at `elapsed`; returns how many a second.
+    /// Records the count at `elapsed`; returns the rate per second.
     fn at(&mut self, elapsed: Duration, count: u64) -> f64 {
         while self.seen.len() >= RATE_READINGS || self.seen.len() > 1 && self.seen[1].0 + RATE_OVER <= elapsed
         {
@@ -124,12 +124,12 @@ impl Rate {
     }
 }
 
-/// The text of the bar: the projector's state first, then what the run does, at places that do not move.
+/// The text of the bar: the projector's state first, then the progress of the run, in columns that do not move.
 fn told(health: ProjectorHealth, counts: &RunCounts, total: u64, rate: f64) -> String {
     let of = if total > 0 { format!("/{total}") } else { String::new() };
     let lit = format!("{}{of}", counts.frames_lit);
     let mut text = format!("{:<10} {lit:>9} lit {rate:>7.1}/s", health.word());
-    // A picture that does not move has no rate that would mean anything, and no time that is left.
+    // A picture that does not move has no meaningful rate and no remaining time.
     if let ProjectorHealth::Up | ProjectorHealth::Connecting = health {
         let left = total.saturating_sub(counts.frames_done());
         if rate > 0.0 && left > 0 {
@@ -152,18 +152,18 @@ enum Shown {
 
 struct Progress {
     started: Instant,
-    /// Frames that the run was asked for; 0 for no end, or one in time.
+    /// Number of frames of the run; 0 for no end, or one in time.
     total: u64,
-    /// Seconds that the run was asked for; 0 for no end, or one in frames.
+    /// Seconds of the run; 0 for no end, or one in frames.
     seconds: f64,
-    /// When the first frame was planned: an end in time counts from there.
+    /// When the first frame was planned; an end in time counts from there.
     began: Option<Instant>,
     rate: Rate,
     shown: Shown,
 }
 
 impl Progress {
-    /// Towards `total` frames, or else `seconds` of time; 0 is no end.
+    /// For `total` frames, or else `seconds` of time; 0 means without an end.
     fn new(total: u64, seconds: f64) -> Self {
         let timed = total == 0 && seconds > 0.0;
         let shown = if std::io::stderr().is_terminal() {
@@ -183,7 +183,7 @@ impl Progress {
         Self { started: Instant::now(), total, seconds, began: None, rate, shown }
     }
 
-    /// How far the run is: frames, or milliseconds where its end is one in time.
+    /// The progress of the run: frames, or milliseconds if its end is in time.
     fn position(&mut self, counts: &RunCounts) -> u64 {
         if self.total == 0 && self.seconds > 0.0 {
             if counts.frames_planned > 0 {
@@ -215,7 +215,8 @@ impl Progress {
             }
             Shown::Lines { next } => {
                 if elapsed >= *next {
-                    // After a pause of this thread the next line comes a second later, not a burst of lines at once.
+                    // After a pause of this thread the next line follows a second later, not a burst of lines at
+                    // once.
                     *next = elapsed + Duration::from_secs(1);
                     let line = serde_json::json!({
                         "elapsed_s": (elapsed.as_secs_f64() * 1e3).round() / 1e3,
@@ -249,7 +250,7 @@ impl Progress {
 mod tests {
     use super::*;
 
-    /// Found in use, O13: "17.5505/s" and "17.476/s" one after the other, and while BLACK a line as if all were well.
+    /// Found in use, O13: "17.5505/s" was followed by "17.476/s", and during BLACK the line looked normal.
     #[test]
     fn the_line_says_how_the_projector_is_and_its_figures_stay_in_place() {
         use ProjectorHealth::{Black, Connecting, Faulted, Frozen, Lost, Stopped, Up};

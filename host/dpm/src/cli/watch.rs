@@ -1,8 +1,9 @@
-//! A running pipeline into a progress bar on a terminal, or one JSON line a second on anything else; and everything that can stop or
-//! darken it from outside: signals, keys, the control socket, orders that stand from before.
+//! Shows a running pipeline as a progress bar on a terminal, or as one JSON line per second elsewhere; and connects
+//! everything that can stop or darken it from outside: signals, keys, the control socket, orders that stand from
+//! before.
 //!
-//! The thread that watches writes nothing itself: a pipe that nobody reads or a stopped terminal holds up the thread that tells, and
-//! nobody else.
+//! The watching thread itself writes nothing. A pipe without a reader or a stopped terminal blocks only the thread
+//! that writes.
 
 use super::keys::Keys;
 use super::tell::{Teller, SHOWN_EVERY};
@@ -28,18 +29,18 @@ use std::path::Path;
 use std::sync::Arc;
 use std::time::Duration;
 
-/// How often keys, signals and the projector's health are looked at.
+/// How often to check keys, signals and the projector's state.
 const TICK: Duration = Duration::from_millis(5);
-/// Progress is shown at every so many ticks.
+/// Progress is shown once per this many ticks.
 const TICKS_SHOWN: u32 = (SHOWN_EVERY.as_millis() / TICK.as_millis()) as u32;
 
-/// How long the link is given to make the projector dark when the run itself will not return.
+/// If the run itself will not return, how long the link has to make the projector dark.
 const DARK_WITHIN: Duration = Duration::from_millis(500);
 
 /// Watches `run` (see [`watch`]), then prints the report to the standard output, as JSON or as a table.
 ///
 /// # Errors
-/// As [`watch`]; a run that lit nothing, after its report.
+/// As for [`watch`]; or, after its report, a run that lit nothing.
 pub(crate) fn run_and_report(
     rig: RigConfig,
     json: bool,
@@ -51,7 +52,7 @@ pub(crate) fn run_and_report(
     report.check_lit()
 }
 
-/// Writes the report of a command that makes no others as `name` into the folder that `--out` names, where it does.
+/// If `--out` names a folder, writes the report of a command without other files there, as `name`.
 ///
 /// # Errors
 /// The folder or the file cannot be written.
@@ -66,7 +67,7 @@ pub(super) fn write_out<T: serde::Serialize>(
     write_atomically(&path, |file| file.write_all(text.as_bytes())).map_err(|e| cannot_write(&path, &e))
 }
 
-/// Sees that files can be written into the folder that `--out` names, before the work.
+/// Checks, before any work is done, that files can be written into the folder that `--out` names.
 ///
 /// # Errors
 /// They cannot.
@@ -74,11 +75,11 @@ pub(super) fn check_out(out: Option<&Path>) -> Result<(), Failure> {
     out.map_or(Ok(()), check_output_folder)
 }
 
-/// Runs `run` while its progress is shown on the standard error stream, given to `show`, and signals become an ordered stop. The
-/// run itself has a thread of its own, so that this one stays free to watch.
+/// Runs `run` on a thread of its own. Meanwhile this thread shows its progress on the standard error stream, passes
+/// it to `show`, and turns signals into an orderly stop.
 ///
 /// # Errors
-/// What `run` returns; a device or output folder that another instance uses; a panic in the run.
+/// The error of `run`; a device or output folder that another instance uses; a panic in the run.
 pub(super) fn watch<T: Send + 'static>(
     rig: RigConfig,
     show: impl Fn(&RunCounts),
@@ -94,7 +95,7 @@ pub(super) fn watch<T: Send + 'static>(
         monitor.set_interlock(interlock);
     }
     let mut teller = Teller::start(rig.run.frames, rig.run.seconds)?;
-    // Before the run begins, so that it comes up dark where an order stands.
+    // Before the run begins, so that it comes up dark if an order stands.
     let orders = Arc::new(stand_by(&rig, &monitor, &teller)?);
     let (done, finished) = unbounded();
     let worker = {
@@ -103,7 +104,7 @@ pub(super) fn watch<T: Send + 'static>(
             .name("dpm-run".into())
             .spawn(move || {
                 let result = run(&rig, &monitor);
-                // The watcher is gone only when it panicked; then nobody wants the result.
+                // The watcher is gone only if it panicked; then the result is not needed.
                 let _ = done.send(result);
             })
             .map_err(|e| Failure::new(FailureKind::Device, format!("cannot start a thread: {e}")))?
@@ -135,7 +136,7 @@ pub(super) fn watch<T: Send + 'static>(
     };
     let Watcher { mut teller, mut status, .. } = watcher;
     if let Some(status) = &mut status {
-        // Whoever waits for a dark that came with the end sees it.
+        // A client that waits for a dark that came with the end sees it.
         status.say(monitor.projector(), orders.kept());
     }
     drop(control);
@@ -260,7 +261,7 @@ impl Watcher<'_> {
 /// Reads what stands for the rig's projector, gives it to the run that is about to begin, and starts the thread that keeps orders.
 ///
 /// # Errors
-/// The projector is real and the state folder cannot be used: an order could not be kept (exit code 2).
+/// The projector is real and the state folder cannot be used, so an order could not be kept (exit code 2).
 fn stand_by(rig: &RigConfig, monitor: &Arc<RunMonitor>, teller: &Teller) -> Result<Orders, Failure> {
     let identity = Identity::of(&rig.projector.backend);
     let (file, error, stands) = OrderFile::open(state_folder(), identity.clone());
@@ -279,14 +280,14 @@ fn stand_by(rig: &RigConfig, monitor: &Arc<RunMonitor>, teller: &Teller) -> Resu
         .map_err(|e| Failure::new(FailureKind::Device, format!("cannot start a thread: {e}")))
 }
 
-/// What the operator is told of an order that stands.
+/// The message to the operator about an order that stands.
 fn told_of(stands: &Stands) -> String {
     let word = if stands.order == Order::Safe { "SAFE" } else { "BLACK" };
     let pid = std::process::id();
     format!("projector: {word} stands {}; it stays dark until `dpm arm --pid {pid}` (or key a)", stands.told)
 }
 
-/// The control socket and the state file, in the runtime folder.
+/// Creates the control socket and the state file in the runtime folder.
 fn listen(
     runtime: &Result<Arc<Folder>, FolderError>,
     monitor: &Arc<RunMonitor>,
@@ -298,23 +299,23 @@ fn listen(
     Ok((socket.map_err(|e| e.to_string())?, status))
 }
 
-/// Writes to the standard output; a reader that has gone away (`dpm ... | head`) is no error.
+/// Writes to the standard output. It is no error if the reader has gone away (`dpm ... | head`).
 pub(super) fn print(text: &str) {
     let mut out = std::io::stdout().lock();
     let _ = out.write_all(text.as_bytes()).and_then(|()| out.flush());
 }
 
-/// What a run holds while it lasts.
+/// The locks that a run holds.
 pub(super) struct Locks {
     _held: Vec<InstanceLock>,
     /// The runtime folder, or why it is not used.
     runtime: Result<Arc<Folder>, FolderError>,
 }
 
-/// One lock for the projector and one for the folder that is written to.
+/// Takes one lock for the projector and one for the output folder.
 ///
 /// # Errors
-/// Another instance has one of them; the projector is real and the runtime folder cannot be trusted.
+/// Another instance holds one of them; or the projector is real and the runtime folder cannot be trusted.
 pub(super) fn take_locks(rig: &RigConfig) -> Result<Locks, Failure> {
     let or = |advice: &'static str| {
         move |e: LockError| match e {
@@ -346,10 +347,11 @@ pub(super) fn take_locks(rig: &RigConfig) -> Result<Locks, Failure> {
     Ok(Locks { _held: held, runtime })
 }
 
-/// Refuses light where SAFE stands for the projector of `identity`: for commands that light without a rig that could be armed.
+/// Fails if SAFE stands for the projector of `identity`. For commands that emit light without a rig that could be
+/// armed.
 ///
 /// # Errors
-/// What stands, since when and by whom (exit code 3).
+/// The standing order, since when and by whom (exit code 3).
 pub(super) fn refuse_where_dark_stands(identity: &Identity) -> Result<(), Failure> {
     let stands = state_folder().and_then(|folder| dpm_rig::standing::standing_in(&folder, identity));
     match stands {

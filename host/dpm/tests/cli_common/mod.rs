@@ -1,4 +1,4 @@
-//! The program in a process of its own, for the tests of the command line.
+//! Runs the program in a process of its own, for the tests of the command line.
 #![allow(dead_code)]
 
 use std::ffi::OsStr;
@@ -12,24 +12,25 @@ use std::time::{Duration, Instant};
 pub(crate) const NO_DRIVER: [(&str, &str); 2] =
     [("VK_ICD_FILENAMES", "/nonexistent.json"), ("VK_DRIVER_FILES", "/nonexistent.json")];
 
-/// A folder of this test program's own for locks, sockets and standing orders of the programs that it starts.
+/// A folder of this test program for locks, sockets and standing orders of the programs that it starts.
 pub(crate) fn own_folder(name: &str) -> PathBuf {
     PathBuf::from(env!("CARGO_TARGET_TMPDIR")).join(format!("dpm-{}", std::process::id())).join(name)
 }
 
-/// The program with arguments, in an environment without settings of ours. What this machine's own rigs keep is none of its business.
+/// The program with arguments, in an environment without our settings. It does not see what this machine's own rigs
+/// keep.
 pub(crate) fn command<S: AsRef<OsStr>>(args: &[S]) -> Command {
     command_of(env!("CARGO_BIN_EXE_dpm"), args)
 }
 
-/// The same after `preparation`, commands of the shell that set limits of the process.
+/// The same after `preparation`, which are shell commands that set limits of the process.
 pub(crate) fn command_after<S: AsRef<OsStr>>(preparation: &str, args: &[S]) -> Command {
     let line = format!("{preparation}; exec \"$0\" \"$@\"");
     let words = ["-c", &line, env!("CARGO_BIN_EXE_dpm")].map(OsStr::new);
     command_of("bash", &words.into_iter().chain(args.iter().map(AsRef::as_ref)).collect::<Vec<_>>())
 }
 
-/// The same of a copy of the program, or of another that starts it.
+/// The same with a copy of the program, or with another program that starts it.
 pub(crate) fn command_of<S: AsRef<OsStr>>(program: impl AsRef<OsStr>, args: &[S]) -> Command {
     let mut command = Command::new(program);
     command.args(args).env_remove("NO_COLOR").stdin(Stdio::null());
@@ -62,18 +63,18 @@ pub(crate) fn err(output: &Output) -> String {
     String::from_utf8_lossy(&output.stderr).into_owned()
 }
 
-/// A program that runs beside the test; killed when the test ends early.
+/// A program that runs during the test; it is killed if the test ends early.
 pub(crate) struct Running {
     child: Child,
     lines: Receiver<String>,
 }
 
-/// Starts the program and goes on.
+/// Starts the program and returns.
 pub(crate) fn start<S: AsRef<OsStr>>(args: &[S]) -> Running {
     start_with(args, &[])
 }
 
-/// Starts the program with more variables in its environment, and goes on.
+/// Starts the program with additional environment variables, and returns.
 pub(crate) fn start_with<S: AsRef<OsStr>>(args: &[S], variables: &[(&str, &str)]) -> Running {
     let mut command = command(args);
     command.envs(variables.iter().copied()).stdout(Stdio::piped()).stderr(Stdio::piped());
@@ -121,17 +122,17 @@ impl Running {
 
     /// Sends a signal by its name.
     pub(crate) fn signal(&self, name: &str) {
-        // The shell's own: a bare system has no program of that name.
+        // The shell's built-in kill, because a minimal system has no program of that name.
         let status = Command::new("sh").args(["-c", &format!("kill -s {name} {}", self.id())]).status();
         assert!(status.expect("a shell starts").success());
     }
 
-    /// Its end, where that has come.
+    /// Its end, if it has come.
     pub(crate) fn try_wait(&mut self) -> Option<ExitStatus> {
         self.child.try_wait().expect("our own child")
     }
 
-    /// Waits for the end; gives status and standard output.
+    /// Waits for the end; returns status and standard output.
     pub(crate) fn finish(mut self) -> (ExitStatus, String) {
         let mut text = String::new();
         let mut stdout = self.child.stdout.take().expect("piped");
@@ -147,7 +148,7 @@ impl Drop for Running {
     }
 }
 
-/// A folder that goes when the test is over.
+/// A folder that is deleted when the test is over.
 pub(crate) struct Folder(PathBuf, String);
 
 impl Folder {
@@ -170,7 +171,7 @@ impl Folder {
         self.0.join(name)
     }
 
-    /// Writes a file; gives its path.
+    /// Writes a file; returns its path.
     pub(crate) fn write(&self, name: &str, text: &str) -> String {
         let path = self.path(name);
         std::fs::write(&path, text).expect("the temporary folder can be written");

@@ -1,7 +1,8 @@
-//! A trace into the journeys of its frames, held to what the format and its viewers demand.
+//! Reads a trace into the paths of its frames, and checks the rules of the format and its viewers.
 //!
-//! "Trace Event Format" document: complete events ("X") on one track nest or follow each other; the points of a flow ("s", "t",
-//! "f") have the same category, name and id, lie inside the slices that they bind to, and begin and end once.
+//! "Trace Event Format" document: complete events ("X") on one track nest or follow each other; the points of a flow
+//! ("s", "t", "f") have the same category, name and id, lie inside the slices that they bind to, and begin and end
+//! once.
 
 use serde_json::Value;
 use std::collections::BTreeMap;
@@ -14,16 +15,16 @@ type Slice = (f64, f64, String, Option<u64>);
 pub(crate) struct Point {
     /// "s", "t" or "f".
     pub phase: String,
-    /// The frame's own slice there.
+    /// The frame's own slice at that point.
     pub slice: String,
-    /// When, microseconds.
+    /// Time, microseconds.
     pub at_us: f64,
 }
 
-/// The journey of each frame.
+/// The path of each frame.
 ///
 /// # Panics
-/// Where the trace breaks a rule of the format, or a flow touches the slice of another frame.
+/// The trace breaks a rule of the format, or a flow touches the slice of another frame.
 pub(crate) fn check(text: &str) -> BTreeMap<u64, Vec<Point>> {
     let events: Vec<Value> = serde_json::from_str(text).expect("valid JSON");
     let number = |e: &Value, key: &str| e[key].as_f64().unwrap_or_else(|| panic!("{key} missing in {e}"));
@@ -77,10 +78,10 @@ pub(crate) fn check(text: &str) -> BTreeMap<u64, Vec<Point>> {
     flows
 }
 
-/// Every journey leads from the sample to the light, forwards.
+/// Checks that every path leads forwards from the sample to the light.
 ///
 /// # Panics
-/// Where one does not.
+/// One does not.
 pub(crate) fn every_frame_can_be_followed(flows: &BTreeMap<u64, Vec<Point>>) {
     for (id, points) in flows {
         let names: Vec<&str> = points.iter().map(|p| p.slice.as_str()).collect();

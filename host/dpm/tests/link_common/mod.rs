@@ -1,4 +1,4 @@
-//! A rig with prepared frames on a projector that stands outside the pipeline: behind a pseudo-terminal or a USB cable.
+//! A rig with prepared frames on a projector outside the pipeline: behind a pseudo-terminal or a USB cable.
 #![allow(dead_code)]
 
 use dpm_device::link::Status;
@@ -24,7 +24,7 @@ pub(crate) fn raster() -> Raster {
     Raster::new(64, 32).unwrap()
 }
 
-/// The rig on `backend` (a TOML table), 8 planes at 100 frames a second.
+/// The rig with `backend` (a TOML table), 8 planes at 100 frames per second.
 pub(crate) fn rig(backend: &str, more: &[&str]) -> Arc<Rig> {
     let mut flags = vec![
         "real_time.pace=\"real\"".to_owned(),
@@ -38,8 +38,8 @@ pub(crate) fn rig(backend: &str, more: &[&str]) -> Arc<Rig> {
     Arc::new(Rig::build(&config, Some(raster())).unwrap_or_else(|e| panic!("{e}")))
 }
 
-/// Waits until `done`, at most 20 s, and gives the time that counts against a deadline: a sleep of a millisecond that took longer than two
-/// is time that a shared machine gave to others.
+/// Waits until `done`, at most 20 s, and returns the time that counts against a deadline. If a sleep of a millisecond
+/// took longer than two, the excess belongs to others on a shared machine and does not count.
 pub(crate) fn served_time(what: &str, mut done: impl FnMut() -> bool) -> Duration {
     let (start, mut counted) = (Instant::now(), Duration::ZERO);
     while !done() {
@@ -51,9 +51,9 @@ pub(crate) fn served_time(what: &str, mut done: impl FnMut() -> bool) -> Duratio
     counted
 }
 
-/// A projector that can be looked at while it works.
+/// A projector that can be observed while it works.
 pub(crate) trait Projector: Send + Sync {
-    /// Lets it live up to now and looks at it.
+    /// Advances it to now and observes it.
     fn look(&self, see: &mut dyn FnMut(&mut MockProjector));
 
     /// What it would report.
@@ -80,7 +80,7 @@ pub(crate) trait Projector: Send + Sync {
         });
     }
 
-    /// Waits until `done`, at most `limit`; gives the time it took.
+    /// Waits until `done`, at most `limit`; returns the time that it took.
     fn until(&self, limit: Duration, what: &str, done: &mut dyn FnMut(&Status) -> bool) -> Duration {
         let start = Instant::now();
         while !done(&self.status()) {
@@ -91,18 +91,18 @@ pub(crate) trait Projector: Send + Sync {
     }
 }
 
-/// A run on a thread of its own. It ends with the test.
+/// A run on a thread of its own. It ends together with the test.
 pub(crate) struct Running {
     pub monitor: Arc<RunMonitor>,
     thread: Option<JoinHandle<Result<RunOutcome, PipelineError>>>,
 }
 
-/// Starts `rig` for `frames` frames; 0 until it is stopped.
+/// Starts `rig` for `frames` frames; 0 runs until stopped.
 pub(crate) fn start(rig: &Arc<Rig>, frames: u64) -> Running {
     start_with(rig, frames, |_| {})
 }
 
-/// As [`start`], with a monitor that `prepare` has seen before the run.
+/// Like [`start`], with a monitor that `prepare` gets before the run.
 pub(crate) fn start_with(rig: &Arc<Rig>, frames: u64, prepare: impl FnOnce(&RunMonitor)) -> Running {
     let monitor = Arc::new(RunMonitor::default());
     prepare(&monitor);
@@ -118,7 +118,7 @@ impl Running {
         self.thread.take().expect("taken once").join().expect("no panic")
     }
 
-    /// Asks it to end, as a signal does.
+    /// Requests its end, as a signal does.
     pub(crate) fn stop(self) -> Result<RunOutcome, PipelineError> {
         self.monitor.request_stop();
         self.end()
@@ -134,7 +134,7 @@ impl Drop for Running {
     }
 }
 
-/// A projector behind a pseudo-terminal whose path stays the same when it is plugged in again.
+/// A projector behind a pseudo-terminal whose path stays the same when it is replugged.
 pub(crate) struct PtyProjector {
     pub path: PathBuf,
     device: Arc<Mutex<SerialProjector>>,
@@ -160,7 +160,7 @@ impl PtyProjector {
         )
     }
 
-    /// Pulls the plug. The projector keeps its power, and its light until the watchdog.
+    /// Pulls the plug. The projector keeps its power, and its light until the watchdog acts.
     pub(crate) fn unplug(&self) {
         if let Some((stop, thread)) = self.served.lock().unwrap().take() {
             stop.store(true, Ordering::Relaxed);
@@ -179,7 +179,7 @@ impl PtyProjector {
         let (master, slave) = TTYPort::pair().expect("a pseudo-terminal");
         let mut master = dpm_device::tty::never_wait(master).unwrap();
         let theirs = slave.name().unwrap();
-        // Holds the line open, and raw, between hosts; without the lock of the library's own handle.
+        // Keeps the line open and raw between hosts, without the lock of the library's own handle.
         let held = std::fs::OpenOptions::new().read(true).write(true).open(&theirs).unwrap();
         drop(slave);
         link(Path::new(&theirs), &self.path);

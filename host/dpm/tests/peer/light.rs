@@ -1,4 +1,4 @@
-//! Frames into light: slots, what is due, what ends by itself, and how much light that is.
+//! From frames to light: slots, which frame is due, what ends by itself, and how much light that is.
 
 use super::wire::{lz4, rle, u32_at, u64_at};
 use super::{Arriving, Config, Mode, Peer, Whole, BUFFERS, HEIGHT, HZ, PLANE, WIDTH};
@@ -17,7 +17,7 @@ impl Config {
     }
 }
 
-/// Flashes, slot by slot.
+/// Counts flashes, slot by slot.
 #[derive(Default)]
 pub(super) struct Flash {
     extreme: f64,
@@ -49,7 +49,7 @@ impl Flash {
     }
 }
 
-/// Limits on light, slot by slot.
+/// Applies the limits on light, slot by slot.
 #[derive(Default)]
 pub(super) struct Level {
     mean: Option<(f64, usize)>,
@@ -75,7 +75,7 @@ impl Level {
         self.pause = (100 * num).div_ceil(1000 * den).max(1);
     }
 
-    /// The rest, ticks, when a slot of `level` would exceed a limit.
+    /// The required rest in ticks if a slot of `level` would exceed a limit.
     fn slot(&mut self, level: f64, keeps_mean: bool, keeps_white: bool) -> Option<u64> {
         let mut rest = None;
         if let Some((most, window)) = self.mean {
@@ -118,7 +118,7 @@ impl Peer {
         }
     }
 
-    /// Makes `frame` the one that arrives; `false` for one that is over.
+    /// Starts to receive `frame`; `false` for a frame whose time is over.
     fn enter(&mut self, frame: u32, target: u64) -> bool {
         if let Some(a) = &self.arriving {
             if a.frame == frame {
@@ -250,7 +250,7 @@ impl Peer {
         self.waiting.push_back(whole);
     }
 
-    /// Everything that happens by itself up to now, in the order of time.
+    /// Performs everything that happens by itself up to now, in order of time.
     pub(super) fn advance(&mut self) {
         let now = self.now();
         while let Some(config) = self.config.clone() {
@@ -302,7 +302,7 @@ impl Peer {
         let slot = self.next_slot;
         self.next_slot += 1;
         self.say_status |= !self.breaks("status-slots");
-        // The newest that is due, or, where this device is to be wrong, the oldest.
+        // The newest frame that is due, or, if this device is to be wrong, the oldest.
         let due: Vec<usize> = (0..self.waiting.len()).filter(|i| self.waiting[*i].slot <= slot).collect();
         let mut taken: Vec<Whole> = Vec::new();
         if let Some(&last) = due.last() {

@@ -1,5 +1,5 @@
-//! A projector written from docs/PROTOCOL.md alone, on a pseudo-terminal: it shares no line with this project's own, and can be made to break
-//! any one rule, to see whether the judge notices.
+//! A projector written from docs/PROTOCOL.md alone, on a pseudo-terminal. It shares no line with this project's own
+//! implementation, and can be made to break any one rule, to test that the check detects it.
 #![allow(dead_code)]
 
 mod light;
@@ -16,7 +16,7 @@ use std::sync::Arc;
 use std::time::{Duration, Instant};
 use wire::{crc, packet, u16_at, u32_at, u64_at, unstuffed};
 
-/// A clock that divides no frame rate.
+/// A clock rate that no frame rate divides.
 const HZ: u64 = 921_600;
 const WIDTH: u16 = 40;
 const HEIGHT: u16 = 30;
@@ -44,7 +44,7 @@ struct Config {
     leds: Vec<u8>,
 }
 
-/// A frame while it arrives.
+/// A frame that is being received.
 struct Arriving {
     frame: u32,
     target: u64,
@@ -62,7 +62,7 @@ struct Whole {
     planes: Vec<Vec<u8>>,
 }
 
-/// Counters in the order of STATUS, from byte 40 on.
+/// Counters in the order of STATUS, from byte 40.
 #[derive(Clone, Copy, Default)]
 struct Counts {
     slots: u32,
@@ -128,7 +128,7 @@ impl Served {
     pub(crate) fn new(fault: &str) -> Self {
         let (mut ours, theirs) = TTYPort::pair().expect("a pseudo-terminal");
         let path = theirs.name().expect("its path");
-        // Held open, so that our end does not hang up between clients, but not claimed.
+        // Kept open so that our end does not hang up between clients, but without a claim.
         let other_end = OpenOptions::new()
             .read(true)
             .write(true)
@@ -181,7 +181,7 @@ impl Peer {
         Self {
             fault: fault.to_owned(),
             start: Instant::now(),
-            // One that does not read LZ4, for the rule on codecs that are not named.
+            // One that does not read LZ4, for the rule on codecs that the device does not name.
             codecs: match fault {
                 "codec-unnamed" | "without-lz4" => 7,
                 "hello-answer" => 14,
@@ -251,7 +251,7 @@ impl Peer {
         }
     }
 
-    /// Finds the packets in what one frame of the line carried.
+    /// Finds the packets in one frame of the line.
     fn packets(&mut self, mut b: &[u8]) {
         while !b.is_empty() {
             if b.len() < 32 {
@@ -378,7 +378,7 @@ impl Peer {
         }
     }
 
-    /// Going dark needs no session, unless this device is to be wrong about it.
+    /// Going dark needs no session, unless this device is to break that rule.
     fn any(&self, session: u32, rule: &str) -> bool {
         !self.breaks(rule) || session == self.session
     }

@@ -1,4 +1,4 @@
-//! Bytes: checksums, stuffing, packets, codecs. Written from docs/PROTOCOL.md, with nothing of this project's own code.
+//! Bytes: checksums, stuffing, packets, codecs. Written from docs/PROTOCOL.md, without this project's own code.
 
 /// CRC-32C, bit by bit.
 pub(super) fn crc(bytes: &[u8]) -> u32 {
@@ -63,7 +63,7 @@ fn stuffed(bytes: &[u8]) -> Vec<u8> {
     out
 }
 
-/// The bytes between two zeros of the line without their stuffing.
+/// The bytes between two zeros of the line, without their stuffing.
 pub(super) fn unstuffed(mut frame: &[u8]) -> Option<Vec<u8>> {
     let mut out = Vec::new();
     while let Some((&code, rest)) = frame.split_first() {

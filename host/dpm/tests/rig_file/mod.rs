@@ -9,7 +9,8 @@ use std::time::Duration;
 /// The watchdog that the rig asks of its projector.
 pub(crate) const WATCHDOG: Duration = Duration::from_millis(250);
 
-/// Words that run the rig file `path` with frames made ahead: real pace and all threads, no GPU. Its files go beside the rig file.
+/// Arguments that run the rig file `path` with prepared frames: real pace and all threads, no GPU. Its files go
+/// beside the rig file.
 pub(crate) fn run_words(path: &str) -> Vec<String> {
     let out = path.trim_end_matches("rig.toml").to_owned() + "out";
     ["profile", path, "--no-render", "--seconds", "1000", "--out", &out].map(str::to_owned).into()

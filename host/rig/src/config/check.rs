@@ -1,4 +1,4 @@
-//! Contradictions between keys: each named at the key that somebody wrote, with what would resolve it.
+//! Contradictions between keys. Each is reported at a key that was written, with what would resolve it.
 
 use super::world::{EnvironmentConfig, GazeConfig, TrackerConfig};
 use super::{Pace, ProjectorBackend, Purpose, RigConfig};
@@ -8,11 +8,13 @@ use dpm_device::regular_file;
 use std::collections::HashMap;
 use std::path::{Path, PathBuf};
 
-/// Most bodies that a rig tracks. It is the number of poses that a snapshot of the tracks has room for, and that of the bodies which the renderer tells apart.
+/// The maximum number of tracked bodies. It is the number of poses in a snapshot of the tracks, and the number of
+/// bodies that the renderer can distinguish.
 pub(crate) const MAX_TRACKED: usize = 256;
 
-/// Refuses several keys that contradict each other, at the first of them that somebody wrote. The message names all of them with their values, whichever it
-/// stands at: nobody must guess which other key takes part. Those with an empty value are named by `problem`.
+/// Refuses several keys that contradict each other, at the first of them that was written. The message names all of
+/// them with their values, so that nobody must guess which other key is involved. `problem` itself names the keys
+/// with an empty value.
 fn contradict(reader: &mut Reader, keys: &[(&str, String)], problem: &str, remedy: String) {
     let at = keys.iter().position(|(key, _)| reader.is_written(key)).unwrap_or(0);
     let (key, value) = &keys[at];
@@ -22,12 +24,12 @@ fn contradict(reader: &mut Reader, keys: &[(&str, String)], problem: &str, remed
     reader.refuse(&origin, key, format!("is {value}, with {}: {problem}", others.join(" and ")), remedy);
 }
 
-/// A value as the rig file would say it.
+/// A value as written in the rig file.
 fn shown(value: impl ConfigValue) -> String {
     value.show()
 }
 
-/// Refuses at the first of `keys` that somebody wrote.
+/// Refuses at the first of `keys` that was written.
 fn refuse(reader: &mut Reader, keys: &[&str], problem: String, remedy: String) {
     let key = keys.iter().find(|k| reader.is_written(k)).unwrap_or(&keys[0]);
     let origin = reader.origin_of(key);
@@ -109,7 +111,7 @@ fn projector(rig: &RigConfig, reader: &mut Reader) {
         refuse(
             reader,
             &["projector.calibration"],
-            "the unit of its lengths is not told by the file".into(),
+            "the file does not state the unit of its lengths".into(),
             "set projector.calibration_unit to \"metre\" or \"millimetre\"".into(),
         );
     }
@@ -217,7 +219,10 @@ fn bodies(rig: &RigConfig, reader: &mut Reader) {
             refuse(
                 reader,
                 &[&format!("{key}.motion")],
-                format!("is given, with `tracker.kind` = {:?}, which tells the poses", rig.tracker.word()),
+                format!(
+                    "is given, with `tracker.kind` = {:?}, which reports the poses itself",
+                    rig.tracker.word()
+                ),
                 "remove it, set tracker.kind = \"mock\", or try the rig with --simulate".into(),
             );
         }
@@ -309,14 +314,14 @@ fn time(rig: &RigConfig, purpose: Purpose, reader: &mut Reader) {
     let mut cores = rig.real_time.affinity.clone();
     cores.sort_unstable();
     if let Some(&last) = cores.last().filter(|&&c| c >= 1024) {
-        let problem = format!("core {last} is none of 0 to 1023");
+        let problem = format!("core {last} is outside 0 to 1023");
         refuse(reader, &["real_time.affinity"], problem, String::new());
     }
     horizon(rig, reader);
 }
 
-/// Times in `[safety]` and `[output]` that somebody wrote, against the frame's and the tracker's. What nobody wrote follows these by itself, so
-/// each problem names the key that was written first.
+/// Checks the times in `[safety]` and `[output]` that were written against the frame's and the tracker's. Times that
+/// were not written adapt to these by themselves, so each problem names first the key that was written.
 fn horizon(rig: &RigConfig, reader: &mut Reader) {
     let (frame_ms, rate) = (rig.frame_ms(), rig.projector.frame_rate.hz());
     // A DLPC900 has no watchdog.
@@ -371,10 +376,10 @@ fn horizon(rig: &RigConfig, reader: &mut Reader) {
     }
 }
 
-/// Makes the paths of input files relative to `base`, the rig file's folder, and refuses those that are not there.
+/// Makes the paths of input files relative to `base`, the rig file's folder, and refuses missing files.
 pub(super) fn resolve_files(rig: &mut RigConfig, base: &Path, reader: &mut Reader) {
     let mut input = |path: &mut PathBuf, key: &str| {
-        // What a flag or a variable says is relative to the working directory.
+        // A path from a flag or a variable is relative to the working directory.
         if path.is_relative() && matches!(reader.origin_of(key), super::Origin::File { .. }) {
             *path = base.join(&*path);
         }

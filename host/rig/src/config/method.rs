@@ -1,4 +1,4 @@
-//! `[render]` of the rig file into the renderer's method.
+//! Converts `[render]` of the rig file to the renderer's method.
 
 use super::{PaperConfig, RenderConfig, RenderMethod};
 use dpm_render::method::{Method, PaperConstants, SamplerKind, HISTORY_CAP};
@@ -30,7 +30,7 @@ impl RenderConfig {
 }
 
 impl PaperConfig {
-    /// The constants as the renderer takes them.
+    /// The constants in the renderer's type.
     fn to_constants(&self) -> PaperConstants {
         PaperConstants {
             t: self.t,

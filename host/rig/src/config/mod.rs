@@ -1,7 +1,7 @@
-//! A rig file, the environment and `--set` flags into a checked [`RigConfig`].
+//! Reads a rig file, the environment and `--set` flags into a checked [`RigConfig`].
 //!
 //! Defaults < file < environment (`DPM_SET_PROJECTOR__WIDTH=640`) < `--set projector.width=640`. All mistakes are
-//! reported at once, each with file, line and column. The keys are listed in `docs/CONFIG.md`, which is made from their
+//! reported at once, each with file, line and column. `docs/CONFIG.md` lists the keys; it is generated from their
 //! declarations here.
 
 mod check;
@@ -34,32 +34,32 @@ use dpm_common::section;
 use dpm_device::regular_file;
 use std::path::Path;
 
-/// Largest accepted rig file in bytes.
+/// Maximum size of a rig file in bytes.
 pub const MAX_FILE_BYTES: u64 = 1 << 20;
 
 /// The rig file that `dpm demo` runs.
 pub const DEMO_RIG: &str = include_str!("../../../../rigs/demo.toml");
 
 section! {
-    /// A whole rig. Every value is in its range and no two contradict each other.
+    /// A whole rig. Every value is in its range, and no two values contradict each other.
     pub struct RigConfig {
-        /// What the light comes out of.
+        /// The projector that emits the light.
         projector: ProjectorConfig = ProjectorConfig::default(), "", Any;
         /// Where poses come from.
         tracker: TrackerConfig = TrackerConfig::default(), "", Any;
-        /// The eye for which the picture is right.
+        /// The eye for which the picture is computed.
         observer: ObserverConfig = ObserverConfig::default(), "", Any;
-        /// What is to be seen.
+        /// What is shown.
         scene: SceneConfig = SceneConfig::default(), "", Any;
-        /// How radiance is found.
+        /// How radiance is computed.
         render: RenderConfig = RenderConfig::default(), "", Any;
         /// From samples to the pose at the time of light.
         prediction: PredictionConfig = PredictionConfig::default(), "", Any;
-        /// Time and the operating system.
+        /// Pace and rights from the operating system.
         real_time: RealTimeConfig = RealTimeConfig::default(), "", Any;
         /// How long to run.
         run: RunConfig = RunConfig::default(), "", Any;
-        /// What is written.
+        /// Which files are written.
         output: OutputConfig = OutputConfig::default(), "", Any;
         /// What happens when something fails.
         safety: SafetyConfig = SafetyConfig::default(), "", Any;
@@ -69,9 +69,9 @@ section! {
 /// Settings from outside the file.
 #[derive(Clone, Debug, Default)]
 pub struct Overrides {
-    /// Environment variables, name and value; those without [`VARIABLE_PREFIX`] are ignored.
+    /// Environment variables, name and value. Those without [`VARIABLE_PREFIX`] are ignored.
     pub variables: Vec<(String, String)>,
-    /// Texts `a.b=c` in the order given; later ones win.
+    /// Texts of the form `a.b=c`, in the order given. Later ones override earlier ones.
     pub flags: Vec<String>,
 }
 
@@ -110,16 +110,16 @@ impl Overrides {
     }
 }
 
-/// Shortest watchdog, and shortest time over which an eye adds up light, of a rig that names none, milliseconds.
+/// Minimum of the default watchdog, milliseconds.
 const DEFAULT_WATCHDOG_MS: u32 = 50;
 const DEFAULT_LIGHT_WINDOW_MS: f64 = 33.0;
 
-/// What a rig file is read for.
+/// The purpose for which a rig file is read.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub struct Purpose {
-    /// The mocks stand in for tracker and projector, of whatever kind they are: see [`RigConfig::simulate`].
+    /// The mocks replace tracker and projector, whatever their kind; see [`RigConfig::simulate`].
     pub simulate: bool,
-    /// Nothing runs: neither `run.frames` nor `run.seconds` must say when it ends.
+    /// Nothing runs, so the check does not ask for an end in `run.frames` or `run.seconds`.
     pub at_rest: bool,
 }
 
@@ -129,22 +129,22 @@ impl RigConfig {
         1e3 / self.projector.frame_rate.hz()
     }
 
-    /// Silence after which the projector goes dark by itself, microseconds: what `safety.watchdog_ms` says, else 50 ms or three frames,
-    /// whichever is longer.
+    /// Silence after which the projector goes dark by itself, microseconds: the value of `safety.watchdog_ms`, or
+    /// else 50 ms or three frames, whichever is longer.
     pub fn watchdog_us(&self) -> u32 {
         let three_frames = (3.0 * self.frame_ms()).ceil() as u32;
         let ms = self.safety.watchdog_ms.unwrap_or(DEFAULT_WATCHDOG_MS.max(three_frames));
         ms.saturating_mul(1000).min(dpm_device::link::MAX_WATCHDOG_US)
     }
 
-    /// Time over which an eye adds up light in pictures, milliseconds: what `output.light_window_ms` says, else 33 ms or a frame,
-    /// whichever is longer.
+    /// Time over which pictures integrate light, milliseconds: the value of `output.light_window_ms`, or else 33 ms
+    /// or one frame, whichever is longer.
     pub fn light_window_ms(&self) -> f64 {
         self.output.light_window_ms.unwrap_or(DEFAULT_LIGHT_WINDOW_MS.max(self.frame_ms()))
     }
 
-    /// Puts the mocks in the place of a tracker and a projector that are real ones (or a recording). The mock tracker reports as often as
-    /// the real one is said to, and moves bodies by `scene.bodies[].motion`, or as it does when that is left out.
+    /// Replaces a real tracker (or a recording) and a real projector by the mocks. The mock tracker has the sample
+    /// rate of the real one, and moves bodies by `scene.bodies[].motion`, or by its defaults if that is left out.
     pub fn simulate(&mut self) {
         if !matches!(self.tracker, TrackerConfig::Mock(_)) {
             let default = MockTrackerConfig::default();
@@ -156,7 +156,7 @@ impl RigConfig {
         }
     }
 
-    /// Slots that `run.seconds` comes to, at least one; 0 where it sets no limit.
+    /// Number of slots in `run.seconds`, at least one; 0 if there is no limit.
     pub fn slots_to_run(&self) -> u64 {
         if self.run.seconds > 0.0 {
             self.projector.frame_rate.slot_at_ns((self.run.seconds * 1e9) as i64).max(1)
@@ -168,8 +168,8 @@ impl RigConfig {
     /// Reads a rig file of at most [`MAX_FILE_BYTES`].
     ///
     /// # Errors
-    /// Every mistake at once: unreadable file, syntax, unknown keys, wrong types, values out of range, contradictions,
-    /// input files that are not there.
+    /// Every mistake at once: an unreadable file, syntax, unknown keys, wrong types, values out of range,
+    /// contradictions, missing input files.
     pub fn load(path: &Path, overrides: &Overrides) -> Result<Self, ConfigErrors> {
         Self::load_for(path, overrides, Purpose::default())
     }
@@ -180,7 +180,7 @@ impl RigConfig {
     /// As [`RigConfig::load`].
     pub fn load_for(path: &Path, overrides: &Overrides, purpose: Purpose) -> Result<Self, ConfigErrors> {
         let unreadable = |e: std::io::Error| {
-            // A path from the manual, given elsewhere than at the top of the sources, is the most frequent mistake.
+            // The most frequent mistake is a path from the manual that is used outside the top folder of the sources.
             let here = std::env::current_dir().ok().filter(|_| path.is_relative());
             let from =
                 here.map_or(String::new(), |here| format!("it was looked for in {}; ", here.display()));
@@ -202,7 +202,7 @@ impl RigConfig {
     /// The rig that `dpm demo` runs.
     ///
     /// # Errors
-    /// Mistakes in `overrides`, all at once.
+    /// All mistakes in `overrides` at once.
     pub fn demo(overrides: &Overrides) -> Result<Self, ConfigErrors> {
         Self::demo_for(overrides, Purpose::default())
     }
@@ -215,7 +215,7 @@ impl RigConfig {
         Self::parse_for("rigs/demo.toml", DEMO_RIG, Path::new(""), overrides, purpose)
     }
 
-    /// Reads a rig file's text. `name` stands in messages; input files are relative to `base`.
+    /// Reads a rig file's text. `name` is its name in messages; input files are relative to `base`.
     ///
     /// # Errors
     /// As [`RigConfig::load`].
@@ -237,16 +237,16 @@ impl RigConfig {
         let mut reader = Reader::default();
         let mut root = source::parse(name, text, &mut reader.errors);
         if !reader.errors.is_empty() {
-            // A half-read file would only add errors that are none.
+            // A half-read file would only add false errors.
             return Err(ConfigErrors(reader.errors));
         }
         overrides.apply(&mut root, &mut reader.errors);
         let rig = <Self as ConfigValue>::read(&root, &mut reader, "");
         let mut rig = rig.unwrap_or_default();
-        // What is wrong by itself would be reported again as a contradiction.
+        // A value that is wrong by itself would be reported again as a contradiction.
         if reader.errors.is_empty() {
             if purpose.simulate {
-                // The keys of the real parts are not used, and still must make sense.
+                // The keys of the replaced parts are not used, but must still make sense.
                 check::addresses(&rig, &mut reader);
                 rig.simulate();
             }
@@ -299,15 +299,17 @@ impl RigConfig {
 
 const MANUAL_HEAD: &str = "# The rig file
 
-Made from the declarations in `host/rig/src/config/`; `DPM_UPDATE_MANUAL=1 cargo test -p dpm-rig --lib manual` writes it anew.
+This page is generated from the declarations in `host/rig/src/config/`. To renew it, run
+`DPM_UPDATE_MANUAL=1 cargo test -p dpm-rig --lib manual`.
 
-A rig file is TOML. What it leaves out has the default. Over the file come environment variables
-(`DPM_SET_PROJECTOR__WIDTH=640` sets `projector.width`; two underscores part the levels) and over those the flag
-`--set projector.width=640`, which may stand several times; a number steps into a list (`--set scene.bodies.0.node=Hare`).
-All mistakes of a file are reported at once, each with line and column. Paths in a rig file are relative to its folder.
+A rig file is TOML. Keys that it leaves out have their defaults. Environment variables override the file
+(`DPM_SET_PROJECTOR__WIDTH=640` sets `projector.width`; two underscores separate the levels). The flag
+`--set projector.width=640` overrides both and may be given several times; a number is an index into a list
+(`--set scene.bodies.0.node=Hare`). All mistakes in a file are reported at once, each with line and column. Paths in a
+rig file are relative to its folder.
 ";
 
-/// The manual's table of what `scene.bodies[].motion` may hold.
+/// The manual's table of the possible contents of `scene.bodies[].motion`.
 fn motions() -> String {
     let mut out =
         "\n## `motion` of `[[scene.bodies]]`\n\n| `kind` | key | type | what it does |\n|---|---|---|---|\n"
@@ -327,7 +329,8 @@ fn motions() -> String {
     out
 }
 
-/// `projector.backend(usb)` into `[projector.backend]` with `kind = "usb"`; `scene.bodies[]` into `[[scene.bodies]]`.
+/// Formats `projector.backend(usb)` as `[projector.backend]` with `kind = "usb"`, and `scene.bodies[]` as
+/// `[[scene.bodies]]`.
 fn heading(table: &str) -> String {
     match (table.strip_suffix(')').and_then(|t| t.split_once('(')), table.strip_suffix("[]")) {
         (Some((table, kind)), _) => format!("`[{table}]` with `kind = \"{kind}\"`"),

@@ -1,10 +1,10 @@
-//! `[prediction]` of the rig file into the settings of the pose filter.
+//! Converts `[prediction]` of the rig file to the settings of the pose filter.
 
 use super::PredictionConfig;
 use dpm_tracking::{PoseFilterConfig, Prediction};
 
 impl PredictionConfig {
-    /// The filter of every body; a body is lost when no sample has come for `lost_after_ms`.
+    /// The filter of every body. A body is lost when no sample has arrived for `lost_after_ms`.
     pub(crate) fn to_filter(&self, lost_after_ms: u32) -> PoseFilterConfig {
         PoseFilterConfig {
             prediction: if self.on { Prediction::On } else { Prediction::Off },

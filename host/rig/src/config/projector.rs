@@ -1,4 +1,4 @@
-//! `[projector]`: what the light comes out of, where it stands, and how the program reaches it.
+//! `[projector]`: the projector, its position, and its connection.
 
 use dpm_common::keys::read::{Any, ConfigValue, Limit, NotEmpty, Reader, Within};
 use dpm_common::keys::source::{Node, Value};
@@ -11,39 +11,42 @@ use dpm_device::time::FrameRate;
 use std::path::PathBuf;
 
 section! {
-    /// The projector. Pixel (0, 0) is the upper left mirror as the projector throws it.
+    /// The projector. Pixel (0, 0) is the upper left mirror in the projected picture.
     pub struct ProjectorConfig {
         /// Mirrors in a row. Change it to the panel's size; every size from 1 on works.
         width: u32 = 1024, "px", Within(1, Raster::MAX_SIDE);
         /// Rows of mirrors.
         height: u32 = 768, "px", Within(1, Raster::MAX_SIDE);
-        /// Frames a second, a whole number or a fraction written as a string, for example "60000/1001". Change it to what the
-        /// projector is driven at.
+        /// Frames per second, as a whole number or as a fraction in a string, for example "60000/1001". Change it to
+        /// the rate at which the projector is driven.
         frame_rate: FrameRate = FrameRate::new(947, 1).expect("not zero"), "frames/s", Within(Rate(1, 1), Rate(100_000, 1));
-        /// Bit planes in a frame: 24 is eight bits of red, green and blue, 8 is eight bits of one white channel, which shows the green of the picture. Eight
-        /// planes leave a monochrome rig three times the frame rate.
+        /// Bit planes in a frame. 24 planes are eight bits of red, green and blue. 8 planes are eight bits of one
+        /// white channel, which shows the green of the picture; this gives a monochrome rig three times the frame
+        /// rate.
         planes: u32 = 24, "", OneOf(&[8, 24]);
-        /// Where the projector's lens stands in the world. Measure it, or give `calibration` instead.
+        /// Position of the projector's lens in the world. Measure it, or give `calibration` instead.
         position: [f64; 3] = [0.0, 0.35, 1.1], "m", Within(-1e6, 1e6);
-        /// The point in the world that the raster's centre shows.
+        /// The point in the world that the centre of the raster shows.
         look_at: [f64; 3] = [0.0, 0.1, 0.0], "m", Within(-1e6, 1e6);
-        /// The direction in the world that is up in the picture; need not be perpendicular to the view.
+        /// The direction in the world that is up in the picture. It need not be perpendicular to the view.
         up: [f64; 3] = [0.0, 1.0, 0.0], "", Within(-1e6, 1e6);
-        /// Full angle of view across the raster's width. Change it to the lens.
+        /// Full angle of view across the raster's width. Change it to match the lens.
         horizontal_fov_deg: f64 = 30.0, "deg", Within(0.1, 170.0);
-        /// A calibration file (OpenCV FileStorage XML or YAML) that takes the place of `position`, `look_at`, `up` and
+        /// A calibration file (OpenCV FileStorage XML or YAML) that replaces `position`, `look_at`, `up` and
         /// `horizontal_fov_deg`. Use it for every real rig.
         calibration: Option<PathBuf> = None, "", NotEmpty;
-        /// Unit of the lengths in the calibration file, which cannot be told from its numbers; required with `calibration`.
+        /// Unit of the lengths in the calibration file; its numbers do not show it. Required with `calibration`.
         calibration_unit: Option<CalibrationUnit> = None, "", Any;
-        /// Columns and rows whose pixels the calibration file counts; the projector's own when left out. The file's view is kept when `width` and
-        /// `height` are others, for example to trace fewer pixels (`--raster` sets it then).
+        /// Columns and rows of the raster that the calibration file refers to; the projector's own if left out. The
+        /// file's view is kept if `width` and `height` differ, for example to trace fewer pixels (`--raster` then
+        /// sets this key).
         calibration_raster: Option<[u32; 2]> = None, "px", Within(1, Raster::MAX_SIDE);
-        /// Radiant intensity of one pixel at full drive, in scene units: the scene's radiance 1 needs `pi * d^2 / albedo` at
-        /// distance d. Raise it when the report says that light is clipped, lower it when the picture uses few of its levels.
+        /// Radiant intensity of one pixel at full drive, in scene units. The scene's radiance 1 needs `pi * d^2 /
+        /// albedo` at distance d. Raise it if the report says that light is clipped; lower it if the picture uses few
+        /// of its levels.
         max_intensity: f64 = 8.0, "scene units/sr", Within(1e-6, 1e12);
-        /// Bit planes that the panel can show in a second; `frame_rate * planes` beyond it is refused. The default is a
-        /// 1024 x 768 panel at 44.0 us a plane, which is 947 frames of 24 planes.
+        /// Bit planes that the panel can show per second; a greater `frame_rate * planes` is refused. The default is
+        /// a 1024 x 768 panel at 44.0 us per plane, which is 947 frames of 24 planes.
         max_planes_per_second: u32 = 22_728, "planes/s", Within(1, 10_000_000);
         /// How the program reaches the projector.
         backend: ProjectorBackend = ProjectorBackend::default(), "", Any;
@@ -56,7 +59,7 @@ impl ProjectorConfig {
         Raster::new(self.width, self.height).expect("sides were checked when the configuration was read")
     }
 
-    /// The raster whose pixels the calibration file counts.
+    /// The raster that the calibration file refers to.
     pub fn calibrated_raster(&self) -> Raster {
         let own = self.raster();
         self.calibration_raster.map_or(own, |[w, h]| {
@@ -64,7 +67,7 @@ impl ProjectorConfig {
         })
     }
 
-    /// The planes of a frame in the order they are shown.
+    /// The planes of a frame in the order in which they are shown.
     pub fn schedule(&self) -> PlaneSchedule {
         if self.planes == 8 {
             PlaneSchedule::mono8()
@@ -75,9 +78,9 @@ impl ProjectorConfig {
 }
 
 kinds! {
-    /// The ways to a projector.
+    /// The connections to a projector.
     pub enum ProjectorBackend {
-        /// a projector made of software in this process.
+        /// a software projector in this process.
         Mock(MockProjectorConfig) = "mock",
         /// a bit-plane projector on USB.
         Usb(UsbProjectorConfig) = "usb",
@@ -92,13 +95,14 @@ kinds! {
 section! {
     /// The embedded mock projector.
     pub struct MockProjectorConfig {
-        /// How much faster than the host's its clock runs. Change it to see clock mapping at work.
+        /// How much faster its clock runs than the host's. Change it to test the clock mapping.
         clock_ppm: f64 = 0.0, "ppm", Within(-1000.0, 1000.0);
-        /// Frames it can hold before one is shown.
+        /// Frames that it can hold before one is shown.
         buffer_frames: u32 = 3, "frames", Within(2, 64);
-        /// Faults to inject, in the mocks' notation, for example "loss=0.01,dropout@1.5s+20ms"; empty for none. Times count from the start of the run.
+        /// Faults to inject, in the mocks' notation, for example "loss=0.01,dropout@1.5s+20ms"; empty for none. Times
+        /// count from the start of the run.
         faults: String = String::new(), "", Any;
-        /// How planes are compacted. Raw is fastest to a projector in this process.
+        /// How planes are compacted. Raw is fastest for a projector in this process.
         compaction: Compaction = Compaction::RAW, "", Any;
     }
 }
@@ -110,14 +114,14 @@ section! {
         vendor_id: u16 = dpm_device::transport::usb::VENDOR_ID, "", Any;
         /// USB product id.
         product_id: u16 = dpm_device::transport::usb::PRODUCT_ID, "", Any;
-        /// Serial number of the device; needed when several are plugged in.
+        /// Serial number of the device; needed if several are plugged in.
         serial_number: Option<String> = None, "", NotEmpty;
-        /// Frames queued at once. More bridge longer pauses of the host, and each adds a frame of latency to a link that is full;
-        /// together they must fit into the kernel's `usbfs_memory_mb`.
+        /// Frames queued at once. More frames bridge longer pauses of the host, and each adds a frame of latency to a
+        /// full link. Together they must fit into the kernel's `usbfs_memory_mb`.
         transfers_in_flight: u32 = 2, "frames", Within(1, 64);
-        /// How planes are compacted: "auto" takes for each plane what saves most of raw, RLE, XOR with the frame before + RLE and
-        /// LZ4, and does not send planes that did not change; a list allows only those. "raw" saves the host's time on a link that
-        /// carries every frame (`dpm link-test` says).
+        /// How planes are compacted. "auto" chooses for each plane the smallest of raw, RLE, XOR with the previous
+        /// frame + RLE, and LZ4, and does not send planes that have not changed. A list permits only those codecs.
+        /// "raw" saves the host's time on a link that can carry every frame (`dpm link-test` shows whether it can).
         compaction: Compaction = Compaction::Auto, "", Any;
     }
 }
@@ -127,7 +131,7 @@ section! {
     pub struct SerialProjectorConfig {
         /// Device file of the port.
         port: String = "/dev/ttyUSB0".into(), "", NotEmpty;
-        /// Bits a second on the wire.
+        /// Bits per second on the wire.
         baud: u32 = 921_600, "bit/s", Within(300, 20_000_000);
         /// How planes are compacted, as for kind = "usb".
         compaction: Compaction = Compaction::Auto, "", Any;
@@ -137,32 +141,32 @@ section! {
 section! {
     /// A TI DLPC900 evaluation module (LightCrafter 6500 and 9000). docs/DLPC900.md says what a rig does with it.
     pub struct Dlpc900Config {
-        /// The panel behind the controller; must have the projector's width and height.
+        /// The panel at the controller; it must have the projector's width and height.
         panel: Dlpc900Panel = Dlpc900Panel::Dlp6500, "", Any;
-        /// Where its patterns come from.
+        /// Source of its patterns.
         mode: Dlpc900Mode = Dlpc900Mode::Preloaded, "", Any;
         /// Its video input in mode "video".
         input: VideoInput = VideoInput::Hdmi, "", Any;
-        /// Which controller, as BUS:ADDRESS of `lsusb`; needed when several are plugged in.
+        /// The controller, as BUS:ADDRESS in `lsusb`; needed if several are plugged in.
         device: Option<String> = None, "", NotEmpty;
-        /// Light of each pattern; its whole share of the frame when left out.
+        /// Exposure of each pattern; its whole share of the frame if left out.
         exposure_us: Option<u32> = None, "us", Within(24, 2_000_000);
     }
 }
 
-/// Which codecs a link may use.
+/// The codecs that a link may use.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Compaction {
-    /// All that both sides know.
+    /// All that both sides support.
     Auto,
-    /// Those of this mask, bits [`Codec::mask`], and raw; only raw sends every plane of every frame.
+    /// Those of this mask, as bits of [`Codec::mask`], and raw. With raw alone every plane of every frame is sent.
     Only(u32),
 }
 
 impl Compaction {
     /// Every plane as it is.
     pub const RAW: Self = Self::Only(0);
-    /// Words for the codecs, as lists have them.
+    /// Names of the codecs in lists.
     const WORDS: [(&'static str, Codec); 4] =
         [("raw", Codec::Raw), ("rle", Codec::Rle), ("xor-rle", Codec::XorRle), ("lz4", Codec::Lz4)];
 }
@@ -230,7 +234,7 @@ words! {
 }
 
 impl Dlpc900Panel {
-    /// The panel as the driver knows it.
+    /// The panel in the driver's type.
     pub const fn dmd(self) -> Dmd {
         match self {
             Self::Dlp6500 => Dmd::Dlp6500,
@@ -243,9 +247,9 @@ impl Dlpc900Panel {
 }
 
 words! {
-    /// Where a DLPC900's patterns come from.
+    /// Source of a DLPC900's patterns.
     pub enum Dlpc900Mode {
-        /// The first frames of the known motion, rendered and loaded before they are shown over and over.
+        /// The first frames of the known motion, which are rendered and loaded in advance and then shown repeatedly.
         Preloaded = "preloaded",
         /// The 24 planes of a video signal that another program drives.
         Video = "video",

@@ -7,82 +7,84 @@ use dpm_device::planes::Raster;
 use std::path::PathBuf;
 
 section! {
-    /// How radiance is found.
+    /// How radiance is computed.
     pub struct RenderConfig {
-        /// Which method spends the rays; `effects` can switch each part of it.
+        /// Which method allocates the rays; `effects` can switch each of its parts.
         method: RenderMethod = RenderMethod::Dpm, "", Any;
-        /// Samples of a pixel where no angle-dependent count applies.
+        /// Samples per pixel where no angle-dependent count applies.
         spp: u32 = 2, "samples/px", Within(1, 4096);
-        /// Closest-hit rays of a path: 1 sees emission only, 2 direct light, 3 one bounce.
+        /// Closest-hit rays per path: 1 shows emission only, 2 direct light, 3 one bounce.
         depth: u32 = 3, "", Within(1, 64);
-        /// Raster traced and projected in place of the projector's when only software Vulkan is there. `--raster` sets it.
+        /// Raster that is traced and projected instead of the projector's if only software Vulkan is available.
+        /// `--raster` sets it.
         software_raster: [u32; 2] = [320, 240], "px", Within(1, Raster::MAX_SIDE);
-        /// Factor on radiance before it becomes light.
+        /// Factor by which radiance is multiplied before it becomes light.
         exposure: f64 = 1.0, "", Within(1e-6, 1e6);
         /// Seed of all random numbers of the picture.
         seed: u64 = 1, "", Any;
-        /// Largest luminance of a contribution after the second vertex; 0 is off. Removes fireflies at the cost of energy, which
-        /// the report names.
+        /// Largest luminance of a contribution after the second vertex; 0 is off. Removes fireflies at the cost of
+        /// energy.
         clamp_indirect: f64 = 0.0, "scene units", Within(0.0, 1e9);
-        /// The Vulkan device: its number in `dpm doctor` or a part of its name; the fastest kind when left out.
+        /// The Vulkan device: its number in `dpm doctor` or a part of its name; the fastest kind if left out.
         gpu: Option<String> = None, "", NotEmpty;
-        /// Who cuts the picture into bit planes.
+        /// Which processor packs the picture into bit planes.
         packer: Packer = Packer::Auto, "", Any;
         /// Constants of the paper.
         paper: PaperConfig = PaperConfig::default(), "", Any;
-        /// Parts of the method, each as the method has it when left out.
+        /// Parts of the method; a part that is left out is as the method defines it.
         effects: EffectsConfig = EffectsConfig::default(), "", Any;
     }
 }
 
 words! {
-    /// Ways to spend rays.
+    /// Methods of allocating rays.
     pub enum RenderMethod {
-        /// This program's own: the paper's with its open questions answered.
+        /// This program's own: the paper's method with its open questions answered.
         Dpm = "dpm",
-        /// The paper's.
+        /// The paper's method.
         Paper = "paper",
         /// \[Miyamoto22\], the second reference of \[paper\]: no shading rates, no spatial filter.
         Miyamoto = "miyamoto",
         /// Every pixel in every frame, independent samples, nothing reused.
         Full = "full",
-        /// Every pixel in every frame, nothing reused; each pixel goes on with one low-discrepancy sequence from frame to frame.
+        /// Every pixel in every frame, nothing reused; each pixel continues one low-discrepancy sequence from frame
+        /// to frame.
         Sequence = "sequence",
     }
 }
 
 section! {
-    /// The paper's constants; angles are measured at the eye from the gaze.
+    /// The paper's constants. Angles are measured at the eye, from the gaze.
     pub struct PaperConfig {
         /// Sensitivity threshold of equation 2.
         t: f64 = 0.0762, "", Within(0.0, 10.0);
         /// Background luminance of equation 2.
         l: f64 = 0.363, "scene units", Within(0.0, 1e6);
-        /// Full rate up to here, equation 4; also the inner bound of table 1.
+        /// Full rate up to this angle, equation 4; also the inner bound of table 1.
         phi_h_deg: f64 = 15.0, "deg", Within(0.0, 180.0);
-        /// Quarter rate from here, equation 4; also the outer bound of table 1.
+        /// Quarter rate from this angle, equation 4; also the outer bound of table 1.
         phi_q_deg: f64 = 30.0, "deg", Within(0.0, 180.0);
         /// Table 1: weight of the new frame inside phi_h, between, and outside phi_q.
         temporal_alpha: [f64; 3] = [0.2, 0.1, 0.05], "", Within(0.001, 1.0);
-        /// Table 1: samples of a pixel in the same three zones.
+        /// Table 1: samples per pixel in the same three zones.
         zone_spp: [u32; 3] = [18, 18, 2], "samples/px", Within(1, 4096);
-        /// The spatial filter blends in from here ...
+        /// Angle at which the spatial filter begins to blend in.
         filter_from_deg: f64 = 15.0, "deg", Within(0.0, 180.0);
-        /// ... to here.
+        /// Angle at which the spatial filter is fully blended in.
         filter_to_deg: f64 = 18.0, "deg", Within(0.0, 180.0);
     }
 }
 
 section! {
-    /// Switches of the method's parts.
+    /// Switches for the method's parts.
     pub struct EffectsConfig {
         /// Variable rate shading from scene information and visual field.
         rate_map: Option<bool> = None, "", Any;
         /// Every second block in every second frame.
         checkerboard: Option<bool> = None, "", Any;
-        /// Evenly spread samples (blue noise, or a sequence that goes on) in place of independent ones.
+        /// Evenly spread samples (blue noise, or a continuing sequence) instead of independent ones.
         blue_noise: Option<bool> = None, "", Any;
-        /// Reuse of former frames.
+        /// Reuse of previous frames.
         temporal_filter: Option<bool> = None, "", Any;
         /// Poisson-disk filter in the periphery.
         spatial_filter: Option<bool> = None, "", Any;
@@ -100,7 +102,7 @@ pub struct Effects {
     pub checkerboard: bool,
     /// Blue-noise sample offsets.
     pub blue_noise: bool,
-    /// Reuse of former frames.
+    /// Reuse of previous frames.
     pub temporal_filter: bool,
     /// Poisson-disk filter in the periphery.
     pub spatial_filter: bool,
@@ -130,9 +132,9 @@ impl RenderConfig {
 }
 
 words! {
-    /// Who cuts the picture into bit planes; the bytes are the same.
+    /// Which processor packs the picture into bit planes; the bytes are the same.
     pub enum Packer {
-        /// The GPU, or the CPU where Vulkan is software.
+        /// The GPU, or the CPU if Vulkan is software.
         Auto = "auto",
         /// The GPU, software or not.
         Gpu = "gpu",
@@ -142,11 +144,12 @@ words! {
 }
 
 words! {
-    /// What time is.
+    /// Which clock the run uses.
     pub enum Pace {
-        /// The wall clock: a slot lasts as long as it lasts.
+        /// The wall clock.
         Real = "real",
-        /// The rig's clock advances one slot a frame: deterministic, for machines too slow for the rate.
+        /// The rig's own clock, which advances one slot per frame: deterministic, and for machines that are too slow
+        /// for the rate.
         Virtual = "virtual",
     }
 }
@@ -154,51 +157,54 @@ words! {
 words! {
     /// How a thread waits for the next piece of work.
     pub enum Wait {
-        /// Burns its core: shortest hand-off.
+        /// Spins: the shortest hand-off, but occupies a core.
         Spin = "spin",
-        /// Sleeps: friendly to other threads.
+        /// Sleeps, and leaves the core to other threads.
         Park = "park",
-        /// Spins when there are cores to spare, else parks.
+        /// Spins if there are enough cores, else parks.
         Auto = "auto",
     }
 }
 
 section! {
-    /// Time and the operating system.
+    /// Pace and rights from the operating system.
     pub struct RealTimeConfig {
-        /// Real for rigs, virtual for results that repeat.
+        /// "real" for rigs, "virtual" for repeatable results.
         pace: Pace = Pace::Real, "", Any;
-        /// SCHED_FIFO priority of the frame path; 0 keeps the normal scheduler. Refused rights are one warning.
+        /// SCHED_FIFO priority of the frame path; 0 keeps the normal scheduler. If the right is refused, the run
+        /// warns once.
         priority: u32 = 50, "", Within(0, 99);
-        /// Cores for the frame path's threads, in the order of the stages; empty leaves it to the kernel.
+        /// Cores for the frame path's threads, in the order of the stages; an empty list leaves the choice to the
+        /// kernel.
         affinity: Vec<u32> = Vec::new(), "", Any;
         /// Keep all memory resident, so that no page fault delays a frame.
         lock_memory: bool = false, "", Any;
         /// How stages wait for each other.
         wait: Wait = Wait::Auto, "", Any;
-        /// What each stage is taken to cost at virtual pace.
+        /// Assumed cost of each stage at virtual pace.
         stage_costs_us: StageCostsConfig = StageCostsConfig::default(), "", Any;
     }
 }
 
 section! {
-    /// Modelled cost of each stage at virtual pace. Together with the tracker's latency they are the motion-to-light latency.
+    /// Modelled cost of each stage at virtual pace. Together with the tracker's latency they make up the
+    /// motion-to-light latency.
     pub struct StageCostsConfig {
-        /// Sample to pose.
+        /// From sample to pose.
         track: u32 = 20, "us", Within(0, 1_000_000);
-        /// Pose to plan.
+        /// From pose to plan.
         plan: u32 = 20, "us", Within(0, 1_000_000);
-        /// Plan to radiance.
+        /// From plan to radiance.
         render: u32 = 900, "us", Within(0, 1_000_000);
-        /// Radiance to bit planes.
+        /// From radiance to bit planes.
         pack: u32 = 300, "us", Within(0, 1_000_000);
-        /// Bit planes to the device.
+        /// From bit planes to the device.
         send: u32 = 1_000, "us", Within(0, 1_000_000);
     }
 }
 
 impl StageCostsConfig {
-    /// All stages from plan to send together, us: what a frame needs from latch to light.
+    /// Sum of the stages from plan to send, us: the time that a frame needs from latch to light.
     pub fn total(&self) -> u32 {
         self.plan + self.render + self.pack + self.send
     }
@@ -207,24 +213,25 @@ impl StageCostsConfig {
 section! {
     /// How long to run.
     pub struct RunConfig {
-        /// Frames to light; 0 runs until it is told to stop.
+        /// Frames to light; 0 runs until stopped.
         frames: u64 = 0, "frames", Any;
-        /// Seconds to run for, counted from the first frame: of the wall clock at real pace, however many frames that makes, and of the rig's own clock at
-        /// virtual pace; 0 is no limit.
+        /// Duration in seconds, counted from the first frame; 0 is no limit. At real pace these are seconds of the
+        /// wall clock, however many frames that makes; at virtual pace they are seconds of the rig's own clock.
         seconds: f64 = 0.0, "s", Within(0.0, 1e9);
     }
 }
 
 section! {
-    /// What is written.
+    /// Which files are written.
     pub struct OutputConfig {
-        /// Folder for images, report and trace; relative to the working directory.
+        /// Folder for images, report and trace, relative to the working directory.
         dir: PathBuf = PathBuf::from("out/run"), "", NotEmpty;
         /// Write `light.png` and `viewer.png` at the end.
         images: bool = false, "", Any;
         /// Write a Chrome trace of every frame.
         trace: bool = false, "", Any;
-        /// Time over which an eye adds up light in the images, at least a frame. Left out, it is 33 ms, or a frame where that is longer.
+        /// Time over which the images integrate light, as an eye does; at least one frame. If left out, it is 33 ms
+        /// or one frame, whichever is longer.
         light_window_ms: Option<f64> = None, "ms", Within(0.01, 10_000.0);
     }
 }
@@ -232,22 +239,25 @@ section! {
 section! {
     /// What happens when something fails.
     pub struct SafetyConfig {
-        /// The projector goes dark by itself when it hears nothing for this long, at least two frames. Left out, it is 50 ms, or three frames
-        /// where those are longer.
+        /// The projector goes dark by itself if it receives nothing for this long, at least two frames. If left out,
+        /// it is 50 ms or three frames, whichever is longer.
         watchdog_ms: Option<u32> = None, "ms", Within(1, 10_000);
-        /// A body is carried on by prediction for at most this long after the tracker's newest sample of it, up to the middle of the light; then
-        /// its light goes off. A frame that would be lit later than that and a slot is not sent. Left out, it follows the rig: the longer of
-        /// 20 ms and the tracker's latency, two of its samples, the time from latch to light and two slots together. What is written is
-        /// law: a rig whose frames take longer stays dark, and says so.
+        /// Prediction extends a body's track for at most this long, from the tracker's newest sample to the middle of
+        /// the light; then its light goes off. A frame that would be lit later than that plus one slot is not sent.
+        /// If left out, the value follows the rig: the sum of the tracker's latency, two of its samples, the time
+        /// from latch to light and two slots, and at least 20 ms. A value in the file is binding: a rig whose frames
+        /// take longer stays dark and reports it.
         predict_ms: Option<u32> = None, "ms", Within(0, 1_000);
-        /// General flashes of the whole picture in a second; beyond it the projector rests in the dark for two seconds. WCAG 2.3.1 allows 3; 0 is off.
+        /// Permitted general flashes of the whole picture per second; beyond this the projector rests in the dark for
+        /// two seconds. WCAG 2.3.1 allows 3; 0 is off.
         flashes_per_second: u32 = 3, "1/s", Within(0, 1_000);
-        /// The start of a run acknowledges heat, lamp, emergency stop and flashes that the projector has latched, too; else it refuses
-        /// to start and names them. Set it once, on the command line, when the cause is gone.
+        /// If set, the start of a run also acknowledges latched faults of heat, lamp, emergency stop and flashes.
+        /// Otherwise the run refuses to start and names them. Set it once, on the command line, when the cause is
+        /// gone.
         acknowledge_faults: bool = false, "", Any;
-        /// How much light there may be; docs/SAFETY.md says what that does for people and what it does not.
+        /// How much light is permitted; docs/SAFETY.md says what that does for people and what it does not.
         limits: LimitsConfig = LimitsConfig::default(), "", Any;
-        /// Who else must agree that there is light.
+        /// What else must permit light.
         interlock: InterlockConfig = InterlockConfig::default(), "", Any;
     }
 }

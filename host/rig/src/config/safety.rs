@@ -1,4 +1,4 @@
-//! `[safety.limits]` and `[safety.interlock]`: how much light there may be, and who else must agree that there is any.
+//! `[safety.limits]` and `[safety.interlock]`: how much light is permitted, and what else must permit it.
 
 use super::{Origin, ProjectorBackend, RigConfig};
 use dpm_common::keys::read::{Any, NotEmpty, Reader, Within};
@@ -11,21 +11,23 @@ const SHORTEST_S: f64 = MIN_LIMIT_MS as f64 / 1e3;
 const LONGEST_S: f64 = MAX_LIMIT_MS as f64 / 1e3;
 
 section! {
-    /// Limits on light. The host goes dark before one is exceeded, and the projector enforces the same by itself.
+    /// Limits on light. The host goes dark before a limit is exceeded, and the projector enforces the same limits by
+    /// itself.
     pub struct LimitsConfig {
-        /// Greatest mean level of the picture over `mean_window_s`, of full white, at least 0.001; 0 is off. The level is the mean drive
-        /// of the strongest of the three colours. What would exceed it is not dimmed: light goes off for a window's length.
+        /// Greatest mean level of the picture over `mean_window_s`, as a share of full white, at least 0.001; 0 is
+        /// off. The level is the mean drive of the strongest of the three colours. A picture that would exceed the
+        /// limit is not dimmed: the light goes off for a window's length.
         mean_level: f64 = 0.0, "", Within(0.0, 1.0);
         /// Length of every window over which the mean is taken.
         mean_window_s: f64 = 10.0, "s", Within(SHORTEST_S, LONGEST_S);
-        /// Longest time of full white (a level above 0.95, pauses below a tenth of a second included), 0.5 to 3600; 0 is off. Afterwards
-        /// light goes off for as long.
+        /// Longest time of full white (a level of 0.95 or more, including pauses below a tenth of a second), 0.5 to
+        /// 3600; 0 is off. Afterwards the light goes off for the same time.
         full_white_s: f64 = 0.0, "s", Within(0.0, LONGEST_S);
     }
 }
 
 impl LimitsConfig {
-    /// The limits as host and projector count them; each value is in its range once the configuration is accepted.
+    /// The limits in the units of host and projector. Each value is in its range once the configuration is accepted.
     pub fn limits(&self) -> LightLimits {
         // Rounded towards less light.
         let mean_permille = (self.mean_level * 1000.0 + 1e-9).floor() as u16;
@@ -38,9 +40,9 @@ impl LimitsConfig {
 }
 
 kinds! {
-    /// Who must agree, at every moment, that there is light.
+    /// What else must permit light at every moment.
     pub enum InterlockConfig {
-        /// nobody else: the operator's orders decide alone.
+        /// nothing else: only the operator's orders decide.
         None(NoInterlockConfig) = "none",
         /// a process of this machine must be alive.
         Process(ProcessInterlockConfig) = "process",
@@ -58,12 +60,13 @@ section! {
 }
 
 section! {
-    /// Light only while a process is alive; one that is stopped or a zombie is not. It must belong to this user or to root.
+    /// Light only while a process is alive. A stopped process or a zombie does not count. The process must belong to
+    /// this user or to root.
     pub struct ProcessInterlockConfig {
         /// Name of the process, as `ps -o comm` shows it. Give this or `pid_file`.
         name: Option<String> = None, "", NotEmpty;
-        /// File that holds the number of the process, as services write it; an absolute path. Only the process that was alive when the
-        /// file was read first counts, until the file is written anew.
+        /// File that contains the id of the process, as services write it; an absolute path. Only the process that
+        /// was alive when the file was first read counts, until the file is rewritten.
         pid_file: Option<PathBuf> = None, "", NotEmpty;
     }
 }
@@ -71,7 +74,8 @@ section! {
 section! {
     /// Light only while a contact is closed.
     pub struct LineInterlockConfig {
-        /// Serial port whose `signal` is the contact. Its RTS and DTR are raised and can feed it. Give this or `file`.
+        /// Serial port whose `signal` is the contact. Its RTS and DTR are raised and can feed the contact. Give this
+        /// or `file`.
         port: Option<String> = None, "", NotEmpty;
         /// Which input of the port.
         signal: InterlockSignal = InterlockSignal::Cts, "", Any;
@@ -81,18 +85,20 @@ section! {
 }
 
 section! {
-    /// Light only while a key is held down on the terminal that `dpm run` was started from. A terminal reports no release: light goes off when
-    /// the key's repetitions stay away for `release_ms`, and comes on with the second of them. For trying things out, not for protecting people.
+    /// Light only while a key is held down on the terminal from which `dpm run` was started. A terminal does not
+    /// report the release of a key: the light goes off when the key has not repeated for `release_ms`, and comes on
+    /// with its second repetition. This is for trying things out, not for protecting people.
     pub struct KeyInterlockConfig {
-        /// The key: one printable ASCII character that is no order (b, f, s and a are).
+        /// The key: one printable ASCII character that gives no order (b, f, s and a do).
         key: String = " ".into(), "", NotEmpty;
-        /// The key counts as released when it was not repeated for this long; longer than the keyboard's own time between repetitions.
+        /// The key counts as released when it has not repeated for this long. It must be longer than the keyboard's
+        /// repeat interval.
         release_ms: u32 = 100, "ms", Within(20, 1_000);
     }
 }
 
 words! {
-    /// Inputs of a serial port that are no data.
+    /// Control inputs of a serial port.
     pub enum InterlockSignal {
         /// Clear to send.
         Cts = "cts",
@@ -104,7 +110,7 @@ words! {
 }
 
 impl InterlockSignal {
-    /// The line as the port knows it.
+    /// The line in the port's own type.
     pub const fn line(self) -> ControlSignal {
         match self {
             Self::Cts => ControlSignal::Cts,
@@ -114,7 +120,7 @@ impl InterlockSignal {
     }
 }
 
-/// Contradictions within and with `[safety]`.
+/// Checks for contradictions in `[safety]` and with other sections.
 pub(super) fn check(rig: &RigConfig, reader: &mut Reader) {
     let mut refuse = |key: &str, problem: &str, remedy: &str| {
         let origin: Origin = reader.origin_of(key);
@@ -126,7 +132,7 @@ pub(super) fn check(rig: &RigConfig, reader: &mut Reader) {
     }
     if limits.full_white_s > 0.0 && limits.full_white_s < SHORTEST_S {
         let remedy = "at least 0.5 s, or 0 to switch it off";
-        refuse("safety.limits.full_white_s", "is too short to be told from a flash", remedy);
+        refuse("safety.limits.full_white_s", "is too short to be distinguished from a flash", remedy);
     }
     if !limits.limits().is_off() && matches!(rig.projector.backend, ProjectorBackend::Dlpc900(_)) {
         let key =

@@ -1,4 +1,4 @@
-//! Accepted and refused rig files.
+//! Rig files that are accepted and refused.
 
 use super::*;
 
@@ -11,7 +11,7 @@ fn with_flags(text: &str, flags: &[&str]) -> Result<RigConfig, ConfigErrors> {
     RigConfig::parse("rig.toml", text, Path::new("/nonexistent"), &Overrides { variables: vec![], flags })
 }
 
-/// text, line, column, key, part of the message.
+/// Text, line, column, key, part of the message.
 const BAD: &[(&str, usize, usize, &str, &str)] = &[
     // Syntax.
     ("[projector", 1, 11, "", "not valid TOML"),
@@ -132,7 +132,7 @@ const BAD: &[(&str, usize, usize, &str, &str)] = &[
     ("[safety.interlock]\nkind = \"key\"\nkey = \"no\"", 3, 7, "safety.interlock.key", "not one printable"),
     ("[output]\nlight_window_ms = 0", 2, 19, "output.light_window_ms", "ms"),
     ("[prediction]\ngate_sigma = 0.5", 2, 14, "prediction.gate_sigma", "must be 1 to 100"),
-    // Motions and faults, as the mock understands them.
+    // Motions and faults, in the mock's notation.
     (
         "[[scene.bodies]]\nname = \"a\"\nmotion = { kind = \"fly\" }",
         3,
@@ -280,7 +280,7 @@ const BAD: &[(&str, usize, usize, &str, &str)] = &[
         "less than two samples at tracker.rate_hz = 500",
     ),
     ("[tracker]\nrate_hz = 50\n[safety]\npredict_ms = 20", 4, 14, "safety.predict_ms", "at least 40 ms"),
-    // Found in use, O10: a first rig at an ordinary projector's rate, and the keys that it must change.
+    // Found in use, O10: a first rig at an ordinary projector's rate, and the keys that have to be changed.
     (
         "[projector]\nframe_rate = 30\n[safety]\nwatchdog_ms = 50",
         4,
@@ -498,8 +498,8 @@ fn an_unreadable_or_huge_file_is_one_error() {
     assert!(not_text.contains("cannot read"), "{not_text}");
 }
 
-/// Found in use, O10: an error about several keys named only the one at which it stood, and not always the one that had to be changed. Whichever key is
-/// written, the message names all that take part, with their values.
+/// Found in use, O10: an error about several keys named only the key at which it was reported, and not always the one
+/// that had to be changed. Whichever key is written, the message names all keys that are involved, with their values.
 #[test]
 fn contradictions_name_every_key_with_its_value() {
     for (text, parts) in [
@@ -544,7 +544,8 @@ fn contradictions_name_every_key_with_its_value() {
     }
 }
 
-/// As many bodies as the renderer's numbers of 8 bits tell apart, and the first one beyond is named.
+/// The renderer distinguishes as many bodies as an 8-bit number can. The first body beyond that is named in the
+/// error.
 #[test]
 fn two_hundred_and_fifty_six_bodies_are_the_most() {
     let bodies = |n: usize| {
@@ -556,7 +557,7 @@ fn two_hundred_and_fifty_six_bodies_are_the_most() {
     assert_eq!(dpm_render::scene_data::MAX_BODIES, 256);
 }
 
-/// Product code under `dir` as one text: without tests, and without the declarations and the checks of the keys themselves.
+/// Product code under `dir` as one text, without tests and without the declarations and checks of the keys.
 fn product_code(dir: &Path, out: &mut String) {
     for entry in std::fs::read_dir(dir).unwrap() {
         let path = entry.unwrap().path();
@@ -570,8 +571,8 @@ fn product_code(dir: &Path, out: &mut String) {
     }
 }
 
-/// Found in use, R20: a key of the manual that nothing reads. A field is read as `.name`; names that several sections declare must be read as often. What the
-/// check alone reads limits other keys.
+/// Found in use, R20: a key of the manual that nothing reads. A field is read as `.name`. A name that several
+/// sections declare must be read as often. Keys that only the check reads limit other keys.
 #[test]
 fn every_key_is_read_somewhere() {
     const LIMITS: [&str; 1] = ["projector.max_planes_per_second"];

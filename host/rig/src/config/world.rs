@@ -1,4 +1,4 @@
-//! `[tracker]`, `[observer]`, `[scene]` and `[prediction]`: what moves, who looks, and what is to be seen.
+//! `[tracker]`, `[observer]`, `[scene]` and `[prediction]`: what moves, who looks, and what is shown.
 
 use crate::mock::{Motion, MotionSpec};
 use dpm_common::keys::read::{Any, ConfigValue, NotEmpty, Reader, Within};
@@ -10,7 +10,7 @@ use std::path::PathBuf;
 kinds! {
     /// Where poses come from.
     pub enum TrackerConfig {
-        /// a tracker made of software in this process, fed by `scene.bodies[].motion`.
+        /// a software tracker in this process, driven by `scene.bodies[].motion`.
         Mock(MockTrackerConfig) = "mock",
         /// OptiTrack Motive or any other NatNet 3.0 to 4.2 server.
         Natnet(NatnetConfig) = "natnet",
@@ -27,11 +27,11 @@ kinds! {
 section! {
     /// The embedded mock tracker.
     pub struct MockTrackerConfig {
-        /// Samples a second.
+        /// Samples per second.
         rate_hz: u32 = 500, "Hz", Within(1, 10_000);
-        /// From mid-exposure to arrival at the host.
+        /// Time from mid-exposure to arrival at the host.
         latency_us: u32 = 2_000, "us", Within(0, 1_000_000);
-        /// Longest extra delay of a sample, evenly distributed.
+        /// Longest extra delay of a sample, uniformly distributed.
         jitter_us: u32 = 0, "us", Within(0, 1_000_000);
         /// Standard deviation of the reported position on each axis.
         noise_m: f64 = 0.0, "m", Within(0.0, 1.0);
@@ -51,7 +51,8 @@ section! {
     pub struct NatnetConfig {
         /// Address of the server.
         server: String = "127.0.0.1".into(), "", NotEmpty;
-        /// Address of the interface that hears it. Set it when the machine has several networks and no data arrive.
+        /// Address of the interface that receives the data. Set it if the machine has several networks and no data
+        /// arrive.
         local: String = "0.0.0.0".into(), "", NotEmpty;
         /// Multicast group; leave it out for unicast.
         multicast: Option<String> = None, "", NotEmpty;
@@ -59,7 +60,7 @@ section! {
         command_port: u16 = 1510, "", Within(1, u16::MAX);
         /// UDP port for frames.
         data_port: u16 = 1511, "", Within(1, u16::MAX);
-        /// Frames a second that the server is set to; used for drop-out detection only.
+        /// Frames per second that the server is set to; used for drop-out detection only.
         rate_hz: u32 = 500, "Hz", Within(1, 10_000);
     }
 }
@@ -71,7 +72,7 @@ section! {
         server: String = "127.0.0.1:3883".into(), "", NotEmpty;
         /// Name of the tracker on the server.
         tracker: String = "Tracker0".into(), "", NotEmpty;
-        /// Samples a second that the server is set to; used for drop-out detection only.
+        /// Samples per second that the server is set to; used for drop-out detection only.
         rate_hz: u32 = 500, "Hz", Within(1, 10_000);
     }
 }
@@ -81,15 +82,15 @@ section! {
     pub struct SerialTrackerConfig {
         /// Device file of the port.
         port: String = "/dev/ttyACM0".into(), "", NotEmpty;
-        /// Bits a second on the wire.
+        /// Bits per second on the wire.
         baud: u32 = 921_600, "bit/s", Within(300, 20_000_000);
-        /// Samples a second that the device is set to; used for drop-out detection only.
+        /// Samples per second that the device is set to; used for drop-out detection only.
         rate_hz: u32 = 500, "Hz", Within(1, 10_000);
     }
 }
 
 section! {
-    /// A recorded run.
+    /// A recording.
     pub struct ReplayConfig {
         /// The recording.
         file: PathBuf = PathBuf::new(), "", NotEmpty;
@@ -97,7 +98,7 @@ section! {
 }
 
 impl TrackerConfig {
-    /// Samples a second that are expected; `None` where only the recording knows.
+    /// Expected samples per second; `None` if only the recording knows.
     pub fn rate_hz(&self) -> Option<u32> {
         match self {
             Self::Mock(c) => Some(c.rate_hz),
@@ -110,19 +111,19 @@ impl TrackerConfig {
 }
 
 section! {
-    /// The eye for which the picture is right.
+    /// The eye for which the picture is computed.
     pub struct ObserverConfig {
-        /// Where the eye stands when no tracked body carries it.
+        /// Position of the eye if no tracked body carries it.
         position: [f64; 3] = [0.25, 0.35, 1.0], "m", Within(-1e6, 1e6);
         /// Name of the tracked body that carries the eye, for example tracked glasses; one of `scene.bodies[].name`.
         body: Option<String> = None, "", NotEmpty;
-        /// The eye in that body's space.
+        /// Position of the eye in that body's space.
         eye_offset: [f64; 3] = [0.0, 0.0, 0.0], "m", Within(-10.0, 10.0);
         /// Where the eye looks.
         gaze: GazeConfig = GazeConfig::default(), "", Any;
-        /// A gaze whose tracked body is no longer seen is held for so long where it was.
+        /// A gaze whose tracked body is no longer seen stays where it was for this long.
         gaze_hold_ms: u32 = 200, "ms", Within(0, 60_000);
-        /// From then on the zones of full quality grow at this rate about it, until it is seen again.
+        /// After that, the zones of full quality around the gaze grow at this rate until the body is seen again.
         gaze_widen_deg_per_s: f64 = 60.0, "deg/s", Within(0.0, 1e4);
     }
 }
@@ -162,28 +163,29 @@ section! {
 }
 
 section! {
-    /// What is to be seen.
+    /// What is shown.
     pub struct SceneConfig {
-        /// A glTF 2.0 file (`.glb` or `.gltf`); takes the place of `builtin`.
+        /// A glTF 2.0 file (`.glb` or `.gltf`); replaces `builtin`.
         file: Option<PathBuf> = None, "", NotEmpty;
-        /// A scene that is made by the program itself.
+        /// A scene that the program generates.
         builtin: BuiltinScene = BuiltinScene::Demo, "", Any;
-        /// Light from all around.
+        /// Light from the surroundings.
         environment: EnvironmentConfig = EnvironmentConfig::default(), "", Any;
         /// The rigid bodies that the tracker drives.
         bodies: Vec<BodyConfig> = Vec::new(), "", Any;
-        /// Nodes that exist only in the virtual world (lamps, surroundings): reflections and shadows see them, the
-        /// projector's light never falls on them.
+        /// Nodes that exist only in the virtual world (lamps, surroundings). They appear in reflections and shadows,
+        /// but the projector's light never falls on them.
         virtual_nodes: Vec<String> = Vec::new(), "", Any;
         /// Albedo of the real surfaces that the light falls on. Measure it; 0.8 is matt white paint.
         surface_albedo: f64 = 0.8, "", Within(0.01, 1.0);
-        /// Radiance that the real surfaces already send to the eye because of light in the room; subtracted from the picture.
+        /// Radiance that the real surfaces already send to the eye because of the light in the room. It is subtracted
+        /// from the picture.
         ambient: [f64; 3] = [0.0, 0.0, 0.0], "scene units", Within(0.0, 1e6);
     }
 }
 
 words! {
-    /// Scenes made by the program itself.
+    /// Scenes that the program generates.
     pub enum BuiltinScene {
         /// Two moving objects.
         Demo = "demo",
@@ -193,12 +195,12 @@ words! {
 kinds! {
     /// Light from infinitely far away.
     pub enum EnvironmentConfig {
-        /// what the built-in scene brings; for files, which bring none, a studio with soft boxes, or even light of 0.25 where the file
-        /// has lamps or emissive surfaces.
+        /// the environment of the built-in scene. Files have no environment: they get a studio with soft boxes, or
+        /// uniform light of 0.25 if they contain lamps or emissive surfaces.
         Auto(AutoEnvironmentConfig) = "auto",
-        /// soft boxes in a dim room, 0.25 in the mean.
+        /// soft boxes in a dim room, 0.25 on average.
         Studio(StudioEnvironmentConfig) = "studio",
-        /// the same radiance from everywhere.
+        /// the same radiance from all directions.
         Constant(ConstantEnvironmentConfig) = "constant",
         /// a latitude-longitude picture.
         Image(ImageEnvironmentConfig) = "image",
@@ -212,12 +214,12 @@ section! {
 }
 
 section! {
-    /// Soft boxes: key from the right in front (+X, +Y, +Z), fill from the left, rim from behind.
+    /// Soft boxes: key light from the front right (+X, +Y, +Z), fill light from the left, rim light from behind.
     pub struct StudioEnvironmentConfig {}
 }
 
 section! {
-    /// Even light.
+    /// Uniform light.
     pub struct ConstantEnvironmentConfig {
         /// Radiance, linear red, green, blue.
         radiance: [f64; 3] = [0.25, 0.25, 0.25], "scene units", Within(0.0, 1e6);
@@ -229,9 +231,9 @@ section! {
     pub struct ImageEnvironmentConfig {
         /// PFM or Radiance .hdr (linear), PNG or JPEG (sRGB).
         file: PathBuf = PathBuf::new(), "", NotEmpty;
-        /// Turn about the world's Y axis, counter-clockwise from above.
+        /// Rotation about the world's Y axis, counter-clockwise from above.
         rotation_deg: f64 = 0.0, "deg", Within(-360.0, 360.0);
-        /// Factor on the picture's values.
+        /// Factor for the picture's values.
         scale: f64 = 1.0, "", Within(0.0, 1e6);
     }
 }
@@ -241,12 +243,13 @@ section! {
     pub struct BodyConfig {
         /// Name under which the tracker reports it; required.
         name: String = String::new(), "", NotEmpty;
-        /// Number under which the tracker reports it, where it gives no names.
+        /// Number under which the tracker reports it, if the tracker has no names.
         id: Option<i64> = None, "", Within(0, i64::from(i32::MAX));
-        /// glTF node that it moves, with everything below; the body's name when left out.
+        /// glTF node that it moves, together with everything below; the body's name if left out.
         node: Option<String> = None, "", NotEmpty;
-        /// How it moves when the tracker is the mock, for example `{ kind = "translate", speed_m_s = 1.0 }`; the kinds stand below.
-        /// Left out, the first body goes to and fro at 1 m/s, the second turns in place and others stand still.
+        /// How it moves if the tracker is the mock, for example `{ kind = "translate", speed_m_s = 1.0 }`; the kinds
+        /// are listed below. If left out, the first body moves back and forth at 1 m/s, the second rotates in place,
+        /// and the others stand still.
         motion: MotionValue = MotionValue::default(), "", Any;
     }
 }
@@ -258,7 +261,7 @@ impl BodyConfig {
     }
 }
 
-/// The table that says how a body moves: a checked [`MotionSpec`]; `None` when the rig file says nothing.
+/// The table that says how a body moves: a checked [`MotionSpec`]; `None` if the rig file has none.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct MotionValue(pub Option<toml::Table>);
 
@@ -280,7 +283,7 @@ impl ConfigValue for MotionValue {
             },
             Err(e) => e.message().replace('\n', ", "),
         };
-        // The message names the field in backquotes; the error then stands where that field is written.
+        // The message names the field in backquotes. The error is then reported where that field is written.
         let field = problem.split('`').skip(1).step_by(2).find_map(|name| Some((name, entries.get(name)?)));
         let (origin, key) = match field {
             Some((name, entry)) => (&entry.key_origin, format!("{key}.{name}")),
@@ -298,17 +301,18 @@ impl ConfigValue for MotionValue {
 section! {
     /// From samples to the pose at the time of light.
     pub struct PredictionConfig {
-        /// Off shows the newest sample as it is: to see what prediction is worth.
+        /// Off shows the newest sample without prediction, for comparison.
         on: bool = true, "", Any;
-        /// Acceleration that bodies are expected to make: more follows quicker and lets more noise through.
+        /// Expected acceleration of the bodies. A larger value follows faster and passes more noise.
         acceleration: f64 = 5.0, "m/s^2", Within(1e-3, 1e4);
-        /// Angular acceleration that bodies are expected to make.
+        /// Expected angular acceleration of the bodies.
         angular_acceleration: f64 = 20.0, "rad/s^2", Within(1e-3, 1e5);
         /// Standard deviation of the tracker's position.
         noise_m: f64 = 1e-4, "m", Within(1e-9, 1.0);
         /// Standard deviation of the tracker's rotation.
         noise_rad: f64 = 1e-3, "rad", Within(1e-9, 1.0);
-        /// A sample farther from its prediction than this many standard deviations is held back until others agree with it.
+        /// A sample that deviates from its prediction by more than this many standard deviations is held back until
+        /// other samples confirm it.
         gate_sigma: f64 = 6.0, "", Within(1.0, 100.0);
     }
 }

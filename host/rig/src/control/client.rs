@@ -1,4 +1,4 @@
-//! The operator's end: an order to the rigs that run, and whether it was obeyed.
+//! The operator's end: gives an order to running rigs, and reports whether it was obeyed.
 
 use super::status_file::StatusFile;
 use super::{is_obeyed, runtime_path, socket_name, HEARD};
@@ -16,18 +16,18 @@ use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
-/// A rig that has not said by then that it heard BLACK or SAFE is sent a signal.
+/// A rig that has not confirmed the arrival of BLACK or SAFE by then is sent a signal.
 const HEARD_WITHIN: Duration = Duration::from_millis(20);
-/// After this an order counts as not confirmed.
+/// After this time an order counts as not confirmed.
 const ANSWERED_WITHIN: Duration = Duration::from_millis(2000);
-/// How often the second way is looked at.
+/// How often to read the state file.
 const LOOK: Duration = Duration::from_millis(5);
 /// Longest answer.
 const MAX_ANSWER: usize = 2048;
-/// Most rigs that one order goes to; this user's come first.
+/// Maximum number of rigs that one order goes to; this user's rigs come first.
 const MAX_RIGS: usize = 256;
 
-/// A rig that listens, as its socket says.
+/// A rig that listens, identified by its socket.
 #[derive(Clone, Debug)]
 pub(crate) struct Place {
     folder: Arc<Folder>,
@@ -35,36 +35,36 @@ pub(crate) struct Place {
     pub pid: u32,
     /// Its user.
     pub uid: u32,
-    /// It is this user's, or stands where only root can have put its folder (`/run/dpm` of a service). What another one says is passed on
-    /// as that user's word.
+    /// It belongs to this user, or is in a folder that only root can have created (`/run/dpm` of a service). Answers
+    /// of other rigs are reported as that user's claim.
     is_vouched_for: bool,
 }
 
-/// What a look for running rigs found.
+/// Result of a search for running rigs.
 #[derive(Debug, Default)]
 pub(crate) struct Search {
     /// Rigs that this user may give orders to.
     pub rigs: Vec<Place>,
-    /// Rigs and folders that it may not, with the reason.
+    /// Rigs and folders that it may not use, with the reason.
     pub refused: Vec<String>,
     /// Folders of other users, into which this one cannot look.
     pub closed: Vec<PathBuf>,
-    /// Where was looked.
+    /// Folders that were searched.
     pub looked: Vec<PathBuf>,
 }
 
 /// Why an order did not reach a rig.
 #[derive(Debug, thiserror::Error)]
 pub enum ControlError {
-    /// Nobody listens.
+    /// No rig listens.
     #[error("no running rig listens in {}{}", list(looked), advice(*order))]
     NoRig {
-        /// What was ordered.
+        /// The order.
         order: Order,
-        /// Where was looked.
+        /// Folders that were searched.
         looked: Vec<PathBuf>,
     },
-    /// Several rigs run, and only the dark is for all of them.
+    /// Several rigs run, and only BLACK and SAFE go to all of them.
     #[error("{} rigs are running (processes {}); name one with --pid", ids.len(), ids.iter().map(u32::to_string).collect::<Vec<_>>().join(", "))]
     Several {
         /// Their processes.
@@ -77,13 +77,16 @@ fn list(folders: &[PathBuf]) -> String {
 }
 
 fn advice(order: Order) -> String {
-    let nothing = "; `dpm run` prints where its control socket is, DPM_RUNTIME_DIR names another folder";
+    let nothing =
+        "; `dpm run` prints the path of its control socket, and DPM_RUNTIME_DIR selects another folder";
     match order {
         Order::Arm => {
             let state = state_folder().map_or(String::new(), |f| format!(" in {}", f.display()));
             format!("; nothing was armed, and an order that stands{state} still stands: only a running rig can be armed{nothing}")
         }
-        _ => format!("; no light was darkened, and a rig that starts now is not held back{nothing}"),
+        _ => format!(
+            "; no light was darkened, and the order does not apply to a rig that starts later{nothing}"
+        ),
     }
 }
 
@@ -94,18 +97,18 @@ pub struct Answer {
     pub pid: u32,
     /// Its user.
     pub uid: u32,
-    /// Its rig file; empty where it did not say so.
+    /// Its rig file; empty if it did not send it.
     pub rig: String,
-    /// What it said, or what is known without its word.
+    /// What it answered, or what is known without an answer.
     pub text: String,
-    /// The projector has obeyed, and the order is kept as it should be.
+    /// The projector has obeyed, and the order is kept as required.
     pub done: bool,
-    /// It is this user's or a service's; the word of another user's process proves nothing.
+    /// It belongs to this user or to a service; the answer of another user's process proves nothing.
     pub is_vouched_for: bool,
 }
 
-/// Folders in which rigs may listen: the one that DPM_RUNTIME_DIR names and no other; else this user's own and the service's, and those
-/// of other users, which root may use and others are told about.
+/// Folders in which rigs may listen. If DPM_RUNTIME_DIR is set: only that one. Otherwise: this user's own folder, the
+/// service's, and those of other users, which root may use and which are reported to others.
 fn folders() -> Vec<PathBuf> {
     let own = runtime_path();
     if std::env::var_os("DPM_RUNTIME_DIR").is_some_and(|dir| !dir.is_empty()) {
@@ -125,14 +128,14 @@ fn folders() -> Vec<PathBuf> {
     all
 }
 
-/// Looks for rigs in `folders`.
+/// Searches `folders` for rigs.
 fn search(folders: &[PathBuf]) -> Search {
     let mut found = Search::default();
     for path in folders {
         let folder = match Folder::open(path, Owner::OwnOrAnyForRoot) {
             Ok(folder) => Arc::new(folder),
             Err(e) => {
-                // The first is where this user's rigs are: what is wrong with that is always told.
+                // The first folder contains this user's rigs, so its problems are always reported.
                 let is_own = path == &folders[0];
                 match e {
                     _ if e.is_missing() => {}
@@ -142,7 +145,7 @@ fn search(folders: &[PathBuf]) -> Search {
                     {
                         found.closed.push(path.clone());
                     }
-                    // Another user's, or planted: told only where something in it would be a rig.
+                    // Another user's folder, or a planted one: reported only if it contains something like a rig.
                     _ => found.refused.extend(foreign(path, &e)),
                 }
                 if is_own {
@@ -172,7 +175,7 @@ fn search(folders: &[PathBuf]) -> Search {
     found
 }
 
-/// True where only root could make a folder.
+/// True if only root could create a folder there.
 fn is_made_by_root(folder: &Path) -> bool {
     let above = folder.parent().and_then(|above| fs::metadata(above).ok());
     above.is_some_and(|above| above.uid() == 0 && above.mode() & 0o022 == 0)
@@ -182,7 +185,7 @@ fn pid_of(name: &str) -> Option<u32> {
     name.strip_prefix("run-")?.strip_suffix(".sock")?.parse().ok()
 }
 
-/// Sockets of rigs in a folder that is not ours.
+/// Sockets of rigs in a folder that does not belong to this user.
 fn foreign(path: &Path, why: &FolderError) -> Option<String> {
     let entries = fs::read_dir(path).ok()?.filter_map(Result::ok).take(4096);
     let rigs: Vec<String> = entries
@@ -196,29 +199,29 @@ fn foreign(path: &Path, why: &FolderError) -> Option<String> {
     (!rigs.is_empty()).then(|| format!("{}: {why}", rigs.join(", ")))
 }
 
-/// What became of an order.
+/// The result of an order.
 #[derive(Debug)]
 pub struct Told {
-    /// Of every rig that was reached.
+    /// Answers of all rigs that were reached.
     pub answers: Vec<Answer>,
-    /// Rigs that were not.
+    /// Rigs that were not reached.
     pub refused: Vec<String>,
     /// Folders of other users, into which this one cannot look.
     pub closed: Vec<PathBuf>,
 }
 
 impl Told {
-    /// True when every rig that was reached has done it, and one of them is this user's or a service's.
+    /// True if every rig that was reached has obeyed, and one of them is this user's or a service's.
     pub fn is_done(&self) -> bool {
         self.answers.iter().all(|a| a.done) && self.answers.iter().any(|a| a.is_vouched_for)
     }
 }
 
-/// Gives `order` to the rig in process `pid`; without it to the one of this user that runs. BLACK and SAFE go to all that this user may
-/// give orders to: going dark needs no choice.
+/// Gives `order` to the rig in process `pid`, or without `pid` to the only running rig of this user. BLACK and SAFE
+/// go to all rigs that this user may give orders to, because going dark needs no choice.
 ///
 /// # Errors
-/// No rig runs there; several do and `order` lets light through.
+/// No rig runs there, or several do and `order` lets light through.
 pub fn tell(pid: Option<u32>, order: Order) -> Result<Told, ControlError> {
     tell_in(&folders(), pid, order)
 }
@@ -229,7 +232,8 @@ pub(super) fn tell_in(folders: &[PathBuf], pid: Option<u32>, order: Order) -> Re
         rigs.into_iter().filter(|place| pid.is_none_or(|pid| pid == place.pid)).collect();
     let none = || ControlError::NoRig { order, looked: looked.clone() };
     if !order.is_dark() && pid.is_none() {
-        // Light is let through by name only where there is a choice; sockets of the dead are none.
+        // An order that permits light requires a choice only between live rigs; sockets of dead processes do not
+        // count.
         rigs.retain(|place| connect(place).is_ok());
         if rigs.len() > 1 {
             return Err(ControlError::Several { ids: rigs.iter().map(|place| place.pid).collect() });
@@ -240,11 +244,11 @@ pub(super) fn tell_in(folders: &[PathBuf], pid: Option<u32>, order: Order) -> Re
     let asked = rigs.len();
     for (n, place) in rigs.iter().cloned().enumerate() {
         let sender = sender.clone();
-        // One that hangs holds up none of the others.
+        // A rig that hangs does not delay the others.
         let ask = move || {
             let _ = sender.send((n, ask(&place, order)));
         };
-        // Where no thread can be had, it is told below that nothing was delivered.
+        // If no thread can be started, the result below says that nothing was delivered.
         let _ = std::thread::Builder::new().name(format!("dpm-ask-{n}")).spawn(ask);
     }
     drop(sender);
@@ -258,7 +262,8 @@ pub(super) fn tell_in(folders: &[PathBuf], pid: Option<u32>, order: Order) -> Re
         .zip(told)
         .filter_map(|(place, answer)| {
             answer.unwrap_or_else(|| {
-                // Its socket takes no connection: not even a signal can be sent, for nobody vouches for its process.
+                // Its socket accepts no connection. A signal cannot be sent either, because the kernel confirms no
+                // process.
                 Some(Answer {
                     pid: place.pid,
                     uid: place.uid,
@@ -284,16 +289,16 @@ fn by_hand(order: Order, pid: u32) -> String {
         Order::Safe => format!(
             "look at the light, then `kill -USR2 {pid}`, `kill -KILL {pid}` or the projector's own switch"
         ),
-        Order::Freeze | Order::Arm => "look at the light and say it again".into(),
+        Order::Freeze | Order::Arm => "look at the light and give the order again".into(),
     }
 }
 
-/// Connects, and asks the kernel who listens there.
+/// Connects, and asks the kernel which process listens there.
 fn connect(place: &Place) -> io::Result<(UnixStream, Peer)> {
     let name = socket_name(place.pid);
     let stream = UnixStream::connect(place.folder.path_to(&name)).inspect_err(|e| {
         if e.kind() == io::ErrorKind::ConnectionRefused {
-            // Left by a process that was killed.
+            // Left by a killed process.
             let _ = place.folder.remove(&name);
             let _ = place.folder.remove(&super::state_name(place.pid));
         }
@@ -303,7 +308,7 @@ fn connect(place: &Place) -> io::Result<(UnixStream, Peer)> {
     Ok((stream, listener))
 }
 
-/// Whoever may write to a folder could listen in it: only the folder's own user is believed.
+/// Anyone who can write to a folder could listen in it, so only the folder's owner is trusted.
 fn check_listener(listener: Peer, place: &Place) -> io::Result<()> {
     if listener.uid == place.uid {
         return Ok(());
@@ -318,7 +323,7 @@ fn check_listener(listener: Peer, place: &Place) -> io::Result<()> {
     Err(io::Error::new(io::ErrorKind::PermissionDenied, told))
 }
 
-/// One rig's answer; `None` where no rig is.
+/// The answer of one rig; `None` if there is no rig.
 fn ask(place: &Place, order: Order) -> Option<Answer> {
     let answer = |rig: String, text: String, done: bool| {
         Some(Answer { pid: place.pid, uid: place.uid, rig, text, done, is_vouched_for: place.is_vouched_for })
@@ -361,19 +366,19 @@ fn ask(place: &Place, order: Order) -> Option<Answer> {
         }
         if !is_heard && signalled.is_none() && (!open || begin.elapsed() >= HEARD_WITHIN) {
             match signal {
-                // The kernel says that this process listens, and it does as long as the connection stands.
+                // The kernel confirms that this process listens, and it does while the connection stands.
                 Some(signal) => signalled = Some(send_signal(listener.pid, signal)),
                 None if !open => break,
                 None => {}
             }
         }
-        // A word that was heard and a signal are obeyed without the thread that answers.
+        // A confirmed order and a signal are obeyed without the thread that answers.
         if signalled.is_some() || is_heard && !open {
             let said = StatusFile::read(&place.folder, place.pid).ok();
             if let Some(said) = said.filter(|s| s.at_ns > begin_ns && is_obeyed(order, s.health)) {
                 let how = match signalled {
-                    Some(_) => "by a signal, for its control thread does not answer",
-                    None => "as its state file says",
+                    Some(_) => "by a signal, because its control thread does not answer",
+                    None => "according to its state file",
                 };
                 let kept = said.standing.filter(|standing| standing.strength() >= order.strength());
                 if let (Some(kept), true) = (kept, order.is_dark()) {
@@ -405,11 +410,11 @@ fn ask(place: &Place, order: Order) -> Option<Answer> {
 fn say(stream: &mut UnixStream, order: Order) -> io::Result<()> {
     stream.set_write_timeout(Some(HEARD_WITHIN))?;
     stream.set_read_timeout(Some(LOOK))?;
-    // In one piece: whoever hears the word may hang up at once.
+    // Written in one call, because the rig may disconnect as soon as it has the order.
     stream.write_all(format!("{}\n", order.word()).as_bytes())
 }
 
-/// Reads what has come, for [`LOOK`] at most. False when no more will come.
+/// Reads what has arrived, for [`LOOK`] at most. False if no more will come.
 fn more(stream: &mut UnixStream, text: &mut String) -> bool {
     let mut bytes = [0u8; 512];
     match stream.read(&mut bytes) {

@@ -9,7 +9,7 @@ fn place(name: &str) -> PathBuf {
     path
 }
 
-/// A rig that answers `clients` of its clients with `answer`, and tells what they said.
+/// A rig that gives `answer` to `clients` clients, and returns what they sent.
 fn rig(folder: &Path, pid: u32, clients: usize, answer: &'static str) -> JoinHandle<String> {
     let listener = UnixListener::bind(folder.join(socket_name(pid))).unwrap();
     std::thread::spawn(move || {
@@ -28,9 +28,9 @@ fn rig(folder: &Path, pid: u32, clients: usize, answer: &'static str) -> JoinHan
 #[test]
 fn with_several_rigs_only_the_dark_is_for_all_and_dead_sockets_go() {
     let dir = place("several");
-    // A process that was killed leaves its socket.
+    // A killed process leaves its socket.
     drop(UnixListener::bind(dir.join(socket_name(7))).unwrap());
-    // The look for who is there, then the order.
+    // The search for running rigs, then the order.
     let rigs = [8, 9].map(|pid| rig(&dir, pid, 2, "heard /x/rig.toml\nok: projector black\n"));
     let folders = [dir.clone()];
     let error = tell_in(&folders, None, Order::Arm).unwrap_err().to_string();
@@ -44,7 +44,7 @@ fn with_several_rigs_only_the_dark_is_for_all_and_dead_sockets_go() {
     fs::remove_dir_all(dir).unwrap();
 }
 
-/// Found in use, R8: whoever could listen in the folder was believed.
+/// Found in use, R8: any process that could listen in the folder was trusted.
 #[test]
 fn r8_only_the_folders_own_user_is_believed() {
     let dir = place("impostor");
@@ -53,7 +53,7 @@ fn r8_only_the_folders_own_user_is_believed() {
     check_listener(Peer { pid: 4242, uid: user() }, &own).unwrap();
     let told = check_listener(Peer { pid: 4242, uid: user() + 1 }, &own).unwrap_err().to_string();
     assert!(told.contains("in a folder of") && told.contains("is served by process 4242"), "{told}");
-    // What a process of another user says is no proof, whatever it says.
+    // The answer of another user's process proves nothing, whatever it says.
     let answer = Answer {
         pid: 1,
         uid: user() + 1,
@@ -70,12 +70,12 @@ fn r8_only_the_folders_own_user_is_believed() {
     fs::remove_dir_all(dir).unwrap();
 }
 
-/// Found in use, R9: "the order was delivered" was said of an order that nobody had read.
+/// Found in use, R9: the message "the order was delivered" was printed for an order that nobody had read.
 #[test]
 fn r9_what_is_not_confirmed_is_not_done() {
     let dir = place("silent");
     let folders = [dir.clone()];
-    // FREEZE has no signal, which this test's own process would not survive.
+    // FREEZE is not sent as a signal, which would kill this test's process.
     for (answer, wanted) in [
         ("", "perhaps not delivered, NOT confirmed"),
         ("heard /x\n", "delivered, NOT confirmed"),
@@ -93,7 +93,7 @@ fn r9_what_is_not_confirmed_is_not_done() {
     fs::remove_dir_all(dir).unwrap();
 }
 
-/// Found in use, R7: a runtime folder that is not ours is told, not used.
+/// Found in use, R7: a runtime folder that belongs to another user is reported, not used.
 #[test]
 fn r7_a_folder_that_others_can_write_to_is_named_and_not_used() {
     use std::os::unix::fs::PermissionsExt;

@@ -1,10 +1,11 @@
-//! Orders from another process for the rig that runs in this one.
+//! Orders from another process to the rig that runs in this one.
 //!
-//! A rig listens on a Unix socket `run-PID.sock` in the runtime folder, which must be ours (see [`dpm_common::folder`]). Both ends ask the
-//! kernel who is at the other one. A connection carries one word and a line feed. The first line of the answer, `heard` and the rig's
-//! file, comes at once; the second says how the projector is when it has obeyed and what is kept over restarts, or half a second later
-//! that it has not. Where the first line does not come, BLACK and SAFE go as a signal, which needs no thread of the rig but its link's,
-//! and the file `run-PID.state` says what became of it.
+//! A rig listens on a Unix socket `run-PID.sock` in the runtime folder, which must belong to this user (see
+//! [`dpm_common::folder`]). Both ends ask the kernel for the identity of the other one. A connection carries one word
+//! and a line feed. The first line of the answer, `heard` and the rig's file, comes at once. The second line comes
+//! when the projector has obeyed, and says how it is and what is kept over restarts; if the projector has not obeyed
+//! after half a second, the line says so. If the first line does not come, BLACK and SAFE are sent as a signal, which
+//! needs no thread of the rig except its link's. The file `run-PID.state` then shows the result.
 
 pub mod client;
 pub mod orders;
@@ -20,27 +21,28 @@ use std::os::unix::fs::MetadataExt;
 use std::path::{Path, PathBuf};
 use std::sync::OnceLock;
 
-/// Longest word with its line feed.
+/// Longest order with its line feed.
 const MAX_WORD: usize = 16;
-/// First word of the line that says that an order has arrived.
+/// First word of the line that confirms the arrival of an order.
 const HEARD: &str = "heard";
 
 static RIG: OnceLock<String> = OnceLock::new();
 
-/// Says which rig file this process runs, for whoever gives it orders; the first word counts.
+/// Sets the rig file of this process, for clients that give it orders. The first call counts.
 pub fn set_rig_name(path: &Path) {
     let path = std::fs::canonicalize(path).unwrap_or_else(|_| path.into());
     let name: String = path.display().to_string().chars().filter(|c| !c.is_control()).take(300).collect();
     let _ = RIG.set(name);
 }
 
-/// The rig file of this process, as it was said.
+/// The rig file of this process, as set.
 pub fn rig_name() -> &'static str {
     RIG.get().map_or("built-in demo", String::as_str)
 }
 
-/// Where the environment says that locks and control sockets of running rigs are: `$DPM_RUNTIME_DIR`; `$XDG_RUNTIME_DIR/dpm`, where
-/// that folder is this user's; `/run/dpm` for root, or where it is this user's; else `dpm-UID` in the temporary folder.
+/// The folder of the locks and control sockets of running rigs, from the environment: `$DPM_RUNTIME_DIR`;
+/// `$XDG_RUNTIME_DIR/dpm` if that folder belongs to this user; `/run/dpm` for root, or if it belongs to this user;
+/// else `dpm-UID` in the temporary folder.
 pub(crate) fn runtime_path() -> PathBuf {
     let variable = |name: &str| std::env::var_os(name).filter(|dir| !dir.is_empty()).map(PathBuf::from);
     choose(&variable, user(), &|path| std::fs::metadata(path).ok().map(|about| about.uid()))
@@ -57,7 +59,7 @@ fn choose(
         None => me == 0,
     };
     variable("DPM_RUNTIME_DIR")
-        // A shell that became another user by `su` still has the variable of the first.
+        // After `su` a shell still has the variable of the first user.
         .or_else(|| {
             variable("XDG_RUNTIME_DIR").filter(|dir| owner(dir) == Some(me)).map(|dir| dir.join("dpm"))
         })
@@ -66,10 +68,10 @@ fn choose(
         .unwrap_or_else(|| variable("TMPDIR").unwrap_or_else(|| "/tmp".into()).join(format!("dpm-{me}")))
 }
 
-/// The runtime folder of this process, made where it is missing.
+/// The runtime folder of this process; created if it is missing.
 ///
 /// # Errors
-/// It cannot be made, or is not ours.
+/// It cannot be created, or does not belong to this user.
 pub fn runtime_folder() -> Result<Folder, FolderError> {
     Folder::make(&runtime_path(), Owner::Own)
 }
@@ -82,7 +84,8 @@ fn state_name(pid: u32) -> String {
     format!("run-{pid}.state")
 }
 
-/// True when the projector is as `order` wants it. Dark is dark: a projector with latched faults is as black as an order can make it.
+/// True when the projector is in the state that `order` asks for. Latched faults and the end of a run are as dark as
+/// BLACK.
 pub(crate) fn is_obeyed(order: Order, health: ProjectorHealth) -> bool {
     use ProjectorHealth as H;
     match order {
@@ -113,7 +116,7 @@ mod tests {
         let owned = [("/run/user/7", 7), ("/run/dpm", 9)];
         assert_eq!(choose(&both, 7, &owned), Path::new("/x"));
         assert_eq!(choose(&xdg, 7, &owned), Path::new("/run/user/7/dpm"));
-        // Another user's, as after `su`.
+        // Another user's folder, as after `su`.
         assert_eq!(choose(&xdg, 8, &owned), Path::new("/tmp/dpm-8"));
         assert_eq!(choose(&xdg, 9, &owned), Path::new("/run/dpm"));
         assert_eq!(choose(&xdg, 0, &owned), Path::new("/run/dpm-0"));

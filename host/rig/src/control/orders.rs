@@ -1,8 +1,10 @@
-//! Orders to the rig of this process: to the light first, then to the disk, so that they outlive the program.
+//! Orders to the rig of this process. They go to the light first and then to the disk, so that they outlive the
+//! program.
 //!
-//! Whoever has an order (the control socket, a key) gives it here and goes on at once. A thread of its own writes it down, which may
-//! take as long as a disk takes, and gives ARM to the light only after what stood is forgotten. Orders that come as signals reach the
-//! light by themselves (see [`dpm_common::stopping`]); the thread only writes them down.
+//! A source of orders (the control socket, a key) gives its order here and continues at once. A separate thread
+//! writes the order down, which may take as long as a disk takes. It passes ARM to the light only after the standing
+//! order is forgotten. Orders that come as signals reach the light by themselves (see [`dpm_common::stopping`]); the
+//! thread only writes them down.
 
 use crate::order::Order;
 use crate::standing::{By, OrderFile, Stands};
@@ -13,25 +15,25 @@ use std::sync::{Arc, Condvar, Mutex, MutexGuard, PoisonError};
 use std::thread::JoinHandle;
 use std::time::Duration;
 
-/// How often it is looked for orders that came as signals.
+/// How often to check for orders that came as signals.
 const LOOK: Duration = Duration::from_millis(20);
-/// How long the end of a run waits for a disk.
+/// How long the end of a run waits for the disk.
 const END_WITHIN: Duration = Duration::from_millis(500);
 
-/// Names an order that was given, to ask what became of it.
+/// Identifies an order that was given, so that its result can be asked for.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
 pub struct Ticket(u64);
 
-/// What the disk has of an order.
+/// What happened to an order on the disk.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub(crate) enum Kept {
-    /// It stands over restarts, in this file.
+    /// It is kept over restarts, in this file.
     In(PathBuf),
-    /// What stood is forgotten (after ARM).
+    /// The standing order is forgotten (after ARM).
     Forgotten,
-    /// It does not stand over restarts, or (for ARM) what stood still does: why.
+    /// It is not kept over restarts, or (for ARM) the standing order is not forgotten; the reason.
     Not(String),
-    /// There is no state folder, which a rig whose projector is a mock may go without.
+    /// There is no state folder. A rig with a mock projector does not need one.
     Nowhere,
 }
 
@@ -40,9 +42,9 @@ struct Given {
     number: u64,
     order: Order,
     by: By,
-    /// Orders that had come as signals when it was given.
+    /// Number of orders that had come as signals when it was given.
     signals: u32,
-    /// It changes what stands; otherwise what is on the disk already, with who ordered it, stays.
+    /// It changes the standing order. Otherwise the file stays as it is, including who gave the order.
     changes: bool,
 }
 
@@ -52,12 +54,12 @@ struct State {
     newest: u64,
     /// The newest order, until the thread takes it.
     waiting: Option<Given>,
-    /// Orders up to this number have been dealt with.
+    /// Orders up to this number are settled.
     settled: u64,
     outcome: Option<Kept>,
-    /// What stands now, whether it could be written down or not.
+    /// The standing order, whether or not it could be written down.
     stands: Option<Order>,
-    /// The thread is to end.
+    /// The thread must end.
     closing: bool,
     closed: bool,
 }
@@ -66,13 +68,13 @@ struct State {
 struct Inner {
     monitor: Arc<RunMonitor>,
     file: OrderFile,
-    /// The folder can be written to.
+    /// The folder is writable.
     keeps: bool,
     state: Mutex<State>,
     changed: Condvar,
 }
 
-/// See the module's documentation. Dropped without [`Orders::end`], what stands goes on standing.
+/// See the module's documentation. If it is dropped without [`Orders::end`], the standing order remains.
 #[derive(Debug)]
 pub struct Orders {
     inner: Arc<Inner>,
@@ -80,8 +82,8 @@ pub struct Orders {
 }
 
 impl Orders {
-    /// Starts the thread. What `stands` is given to the light before this returns, so that a run that begins afterwards comes up dark.
-    /// `keeps` says that the file can be written.
+    /// Starts the thread. The standing order `stands` is given to the light before this returns, so that a later run
+    /// comes up dark. `keeps` says that the file can be written.
     ///
     /// # Errors
     /// The thread cannot be started.
@@ -103,7 +105,8 @@ impl Orders {
         Ok(Self { inner, thread: Some(thread) })
     }
 
-    /// Gives an order: to the light at once (ARM when nothing stands on the disk any more), then to the disk. Never waits for a disk.
+    /// Gives an order: to the light at once (ARM only when no order stands on the disk any more), then to the disk.
+    /// Never waits for the disk.
     pub fn give(&self, order: Order, by: By) -> Ticket {
         let mut state = self.inner.state();
         self.inner.absorb(&mut state);
@@ -112,32 +115,33 @@ impl Orders {
         ticket
     }
 
-    /// What the disk has of the order; `None` while that is being settled. Of orders that were given in quick succession the newest
-    /// one's answer stands for all.
+    /// What happened to the order on the disk; `None` while it is not settled. For orders in quick succession the
+    /// result of the newest one applies to all.
     pub(crate) fn outcome(&self, ticket: Ticket) -> Option<Kept> {
         let state = self.inner.state();
         state.outcome.clone().filter(|_| state.settled >= ticket.0)
     }
 
-    /// What stands now.
+    /// The standing order.
     #[cfg(test)]
     pub(crate) fn standing(&self) -> Option<Order> {
         self.inner.state().stands
     }
 
-    /// What stands now, once it stands over restarts too (or the rig goes without that, as a mock may).
+    /// The standing order, once it is kept over restarts (or the rig does without, as a mock may).
     pub fn kept(&self) -> Option<Order> {
         let state = self.inner.state();
         let is_kept = matches!(state.outcome, Some(Kept::In(_) | Kept::Nowhere));
         state.stands.filter(|_| is_kept && state.settled == state.newest)
     }
 
-    /// Ends the thread, waiting half a second at most. After an orderly end BLACK and FREEZE are forgotten, SAFE goes on standing.
+    /// Ends the thread; waits at most half a second. After an orderly end BLACK and FREEZE are forgotten, and SAFE
+    /// remains.
     pub fn end(mut self, orderly: bool) {
         let mut state = self.inner.state();
         self.inner.absorb(&mut state);
         if orderly && matches!(state.stands, Some(Order::Black | Order::Freeze)) {
-            // Nothing is armed by it: the run is over, and a monitor that was asked to stop lets no ARM through.
+            // This arms nothing: the run is over, and after a stop request the monitor lets no ARM through.
             self.inner.monitor.request_stop();
             self.inner.give(&mut state, Order::Arm, By::Signal);
         }
@@ -160,7 +164,7 @@ impl Drop for Orders {
 
 impl Inner {
     fn state(&self) -> MutexGuard<'_, State> {
-        // Nothing in here panics while it holds the lock; and an order must get through even so.
+        // Nothing panics while it holds this lock; and even then an order must get through.
         self.state.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
@@ -172,13 +176,14 @@ impl Inner {
         self.queue(state, order, by)
     }
 
-    /// For the disk. A stronger order that stands, or waits to be written, is not replaced by a weaker one.
+    /// Queues an order for the disk. A weaker order does not replace a stronger one that stands or waits to be
+    /// written.
     fn queue(&self, state: &mut State, order: Order, by: By) -> Ticket {
         let number = state.newest;
         let standing = state.stands.filter(|s| order != Order::Arm && s.strength() > order.strength());
         state.stands = if order == Order::Arm { state.stands } else { standing.or(Some(order)) };
         match &mut state.waiting {
-            // What waits is written down in its place: the same file, the same answer.
+            // The waiting order is written in its place: the same file, the same result.
             Some(waiting) if standing.is_some() && waiting.order != Order::Arm => waiting.number = number,
             waiting => {
                 let (order, changes) = standing.map_or((order, true), |standing| (standing, false));
@@ -188,7 +193,7 @@ impl Inner {
         Ticket(number)
     }
 
-    /// Orders that came to the light by themselves are written down like the others.
+    /// Orders that reached the light as signals are written down like the others.
     fn absorb(&self, state: &mut State) {
         let order = match stopping::take_order_to_keep() {
             0 => None,
@@ -226,13 +231,13 @@ impl Inner {
             state = self.state();
             self.absorb(&mut state);
             if given.order == Order::Arm && !matches!(outcome, Kept::Not(_)) {
-                // An order that came while the disk was at it is newer than this one.
+                // An order that came while the disk was busy is newer than this one.
                 if state.newest == given.number {
                     state.stands = None;
                     self.monitor.arm_unless_darkened(given.signals);
                 }
             }
-            // What has come meanwhile is answered when it is settled itself.
+            // Orders that came meanwhile get their result when they are settled themselves.
             state.settled = given.number;
             state.outcome = Some(outcome);
             self.changed.notify_all();
@@ -309,7 +314,7 @@ mod tests {
         let orders = rig.start();
         assert_eq!(rig.monitor.take_order(), None);
         let ticket = orders.give(Order::Safe, By::Key);
-        // The light has it before the disk can have.
+        // The light receives it before the disk can.
         assert_eq!(rig.monitor.take_order(), Some(Order::Safe));
         let Kept::In(path) = settled(&orders, ticket) else { panic!("not kept") };
         assert!(path.starts_with(&rig.dir));
@@ -337,10 +342,10 @@ mod tests {
             (Order::Freeze, false, Some(Order::Black)),
             (Order::Safe, false, Some(Order::Safe)),
         ] {
-            // The monitor of a run that is over stays stopped.
+            // The monitor of a finished run remains stopped.
             rig.monitor = Arc::default();
             let orders = rig.start();
-            // What stood has been given to the light.
+            // The standing order has been given to the light.
             assert_eq!(rig.monitor.dark_is_ordered(), rig.on_disk().is_some());
             let ticket = orders.give(order, By::Key);
             settled(&orders, ticket);
@@ -372,7 +377,7 @@ mod tests {
         let ticket = orders.give(Order::Safe, By::Key);
         settled(&orders, ticket);
         let _ = rig.monitor.take_order();
-        // Something in its place that no rename replaces and no unlink removes.
+        // An object in its place that no rename replaces and no unlink removes.
         let path = rig.dir.join(rig.identity.order_name());
         std::fs::remove_file(&path).unwrap();
         std::fs::create_dir(&path).unwrap();

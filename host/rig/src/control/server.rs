@@ -1,4 +1,4 @@
-//! The rig's end of the control socket: one thread that waits for no client.
+//! The rig's end of the control socket: one thread, which waits for no client.
 
 use super::orders::{Kept, Orders, Ticket};
 use super::{is_obeyed, rig_name, socket_name, HEARD, MAX_WORD};
@@ -18,17 +18,17 @@ use std::sync::Arc;
 use std::thread::JoinHandle;
 use std::time::{Duration, Instant};
 
-/// A client that has not said its word by then is cut off.
+/// A client that has not sent its order by then is disconnected.
 const PATIENCE: Duration = Duration::from_millis(200);
 /// How long an answer waits for the projector to obey.
 const OBEYED_WITHIN: Duration = Duration::from_millis(500);
 /// How long an answer waits for the disk.
 const KEPT_WITHIN: Duration = Duration::from_millis(1000);
-/// Most clients at a time. One more, and the oldest that has said nothing is cut off.
+/// Maximum number of clients. For one more, the oldest client that has sent nothing is disconnected.
 const CLIENTS: usize = 64;
-/// Clients taken in before it is looked at what they say.
+/// Number of clients accepted before reading what they sent.
 const AT_ONCE: usize = 16;
-/// How often it is looked whether the projector has obeyed.
+/// How often to check whether the projector has obeyed.
 const LOOK_MS: i32 = 1;
 
 /// Listens for orders until it is dropped.
@@ -41,10 +41,10 @@ pub struct ControlSocket {
 }
 
 impl ControlSocket {
-    /// Listens in `folder` under this process's number. Only this user and root may give orders.
+    /// Listens in `folder` under this process's id. Only this user and root may give orders.
     ///
     /// # Errors
-    /// The socket cannot be made there.
+    /// The socket cannot be created there.
     pub fn serve(
         folder: Arc<Folder>,
         monitor: Arc<RunMonitor>,
@@ -52,7 +52,7 @@ impl ControlSocket {
     ) -> Result<Self, FolderError> {
         let name = socket_name(std::process::id());
         let failed = |source| FolderError::Io { path: folder.path().join(&name), source };
-        // Left by a process of the same number that was killed.
+        // Left by a killed process with the same id.
         folder.remove(&name)?;
         let path = folder.path_to(&name);
         let listener = UnixListener::bind(&path).map_err(failed)?;
@@ -76,7 +76,7 @@ impl ControlSocket {
 impl Drop for ControlSocket {
     fn drop(&mut self) {
         self.stop.store(true, Ordering::Relaxed);
-        // Wakes the thread. Where that fails it ends with the process.
+        // Wakes the thread. If that fails, the thread ends with the process.
         let woken = UnixStream::connect(self.folder.path_to(&self.name)).is_ok();
         let _ = self.folder.remove(&self.name);
         if let Some(thread) = self.thread.take().filter(|_| woken) {
@@ -85,13 +85,13 @@ impl Drop for ControlSocket {
     }
 }
 
-/// A client, and how far it has come.
+/// A client and its progress.
 struct Client {
     stream: UnixStream,
     since: Instant,
     uid: u32,
     word: Vec<u8>,
-    /// Its order, once it has said it.
+    /// Its order, once received.
     given: Option<(Order, Ticket)>,
 }
 
@@ -113,12 +113,13 @@ impl Desk {
             let mut watched = vec![self.listener.as_raw_fd()];
             watched.extend(self.clients.iter().filter(|c| c.given.is_none()).map(|c| c.stream.as_raw_fd()));
             if wait_readable(&watched, limit, &mut ready).is_err() {
-                // Out of memory, for example: not in a tight loop.
+                // Out of memory, for example: avoid a tight loop.
                 std::thread::sleep(Duration::from_millis(10));
             }
             self.listen();
             loop {
-                // Whoever connects is heard before the next one is taken in, so that no flood of silent clients pushes out one that speaks.
+                // A client is read before the next one is accepted, so that no flood of silent clients displaces one
+                // that sends an order.
                 let all_taken = self.take_in();
                 self.listen();
                 if all_taken || self.stop.load(Ordering::Relaxed) {
@@ -129,13 +130,14 @@ impl Desk {
         }
     }
 
-    /// Takes in a few of the clients that wait; true when none is left.
+    /// Accepts a few of the waiting clients; true if none is left.
     fn take_in(&mut self) -> bool {
         for _ in 0..AT_ONCE {
             let stream = match self.listener.accept() {
                 Ok((stream, _)) => stream,
                 Err(e) if e.kind() == io::ErrorKind::ConnectionAborted => continue,
-                // None is left, or none can be taken for want of descriptors: the oldest silent one makes room.
+                // None is left, or none can be accepted for lack of descriptors: the oldest silent client is
+                // disconnected.
                 Err(e) => {
                     if e.kind() != io::ErrorKind::WouldBlock {
                         self.cut_off_the_oldest();
@@ -167,11 +169,12 @@ impl Desk {
 
     fn cut_off_the_oldest(&mut self) {
         let silent = self.clients.iter().position(|c| c.given.is_none());
-        // Where all wait for an answer, the orders of all have been given: the oldest one's client will see that nothing more comes.
+        // If all clients wait for an answer, the orders of all have been given. The oldest client will notice that
+        // the connection ends.
         self.clients.remove(silent.unwrap_or(0));
     }
 
-    /// Reads what clients have said, and gives their orders.
+    /// Reads what clients have sent, and gives their orders.
     fn listen(&mut self) {
         let Self { clients, orders, .. } = self;
         clients.retain_mut(|client| {
@@ -183,7 +186,7 @@ impl Desk {
                 Ok(Some(order)) => {
                     let by = By::Socket { uid: client.uid };
                     client.given = Some((order, orders.give(order, by)));
-                    // A client that has hung up has given its order all the same.
+                    // A client that has disconnected has given its order all the same.
                     let _ = writeln!(client.stream, "{HEARD} {}", rig_name());
                     true
                 }
@@ -205,7 +208,7 @@ impl Desk {
     }
 }
 
-/// The last line for an order that was given `ago`; `None` while there is hope for a better one.
+/// The last line for an order that was given `ago`; `None` while a better one is possible.
 fn answer_to(
     order: Order,
     ticket: Ticket,
@@ -217,7 +220,7 @@ fn answer_to(
     let is_done = is_obeyed(order, health);
     let kept = orders.outcome(ticket);
     if let (Order::Arm, Some(Kept::Not(why))) = (order, &kept) {
-        return Some(format!("not armed: what stands cannot be forgotten: {why}; projector {health}"));
+        return Some(format!("not armed: the standing order cannot be removed: {why}; projector {health}"));
     }
     let hope = if is_done { kept.is_none() && ago < KEPT_WITHIN } else { ago < OBEYED_WITHIN };
     if hope {
@@ -251,10 +254,10 @@ fn may_give_orders(client: u32, me: u32) -> bool {
 }
 
 impl Client {
-    /// The order, once the word is complete.
+    /// The order, once it has arrived completely.
     ///
     /// # Errors
-    /// It hung up, or said something else (which it is told).
+    /// The client disconnected, or sent something else (and is informed).
     fn read_word(&mut self) -> io::Result<Option<Order>> {
         let mut bytes = [0u8; MAX_WORD];
         while self.word.len() < MAX_WORD && !self.word.contains(&b'\n') {
@@ -271,7 +274,7 @@ impl Client {
         let word = std::str::from_utf8(&self.word).ok().and_then(|w| Order::from_word(w.trim_end()));
         if word.is_none() {
             let known: Vec<_> = Order::ALL.iter().map(|(_, word)| *word).collect();
-            let _ = writeln!(self.stream, "unknown word; known: {}", known.join(", "));
+            let _ = writeln!(self.stream, "unknown order; known: {}", known.join(", "));
             return Err(io::ErrorKind::InvalidData.into());
         }
         Ok(word)

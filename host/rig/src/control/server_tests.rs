@@ -6,7 +6,7 @@ use crate::telemetry::monitor::ProjectorHealth;
 use dpm_common::folder::Owner;
 use dpm_device::link::faults;
 
-/// Obeys like a link thread.
+/// Obeys orders as a link thread does.
 fn link(monitor: &Arc<RunMonitor>, stop: &Arc<AtomicBool>) -> JoinHandle<()> {
     let (monitor, stop) = (monitor.clone(), stop.clone());
     std::thread::spawn(move || {
@@ -26,7 +26,7 @@ fn link(monitor: &Arc<RunMonitor>, stop: &Arc<AtomicBool>) -> JoinHandle<()> {
     })
 }
 
-/// A rig that listens, and somebody who obeys.
+/// A rig that listens, and a thread that obeys.
 struct Rig {
     dir: PathBuf,
     monitor: Arc<RunMonitor>,
@@ -59,7 +59,7 @@ impl Rig {
         client::tell_in(&[self.dir.join("run")], None, order)
     }
 
-    /// Nobody obeys any more.
+    /// Ends the thread that obeys.
     fn stop_link(&mut self) {
         self.obeys.store(true, Ordering::Relaxed);
         if let Some(thread) = self.thread.take() {
@@ -80,21 +80,21 @@ impl Drop for Rig {
 fn every_order_is_obeyed_and_bad_clients_cost_nothing() {
     let mut rig = Rig::new("orders");
     assert_eq!(std::fs::metadata(rig.socket()).unwrap().permissions().mode() & 0o777, 0o600);
-    // One that says nothing, one that never ends, one that talks nonsense.
+    // One client is silent, one never ends its line, and one sends nonsense.
     let mut silent = UnixStream::connect(rig.socket()).unwrap();
     let mut endless = UnixStream::connect(rig.socket()).unwrap();
     let _ = endless.write_all(&[b'x'; 4096]);
     let mut nonsense = UnixStream::connect(rig.socket()).unwrap();
     nonsense.write_all(b"light!\n").unwrap();
     for (order, word) in Order::ALL {
-        // A FREEZE is none while it is black.
+        // A FREEZE has no effect while the projector is black.
         if order == Order::Freeze {
             assert!(rig.tell(Order::Arm).unwrap().is_done());
         }
         let told = rig.tell(order).unwrap();
         assert!(told.is_done() && told.answers.len() == 1, "{word}: {told:?}");
         assert_eq!((told.answers[0].pid, told.answers[0].uid), (std::process::id(), user()));
-        // Another test of this process may have read a rig file by now.
+        // Another test of this process may have set a rig file already.
         let names = ["built-in demo", crate::control::rig_name()];
         assert!(names.contains(&&*told.answers[0].rig), "{told:?}");
         assert_eq!(told.answers[0].text.contains("; kept in "), order != Order::Arm, "{told:?}");
@@ -105,7 +105,7 @@ fn every_order_is_obeyed_and_bad_clients_cost_nothing() {
     assert!(told.contains("known: black, freeze, safe, arm"), "{told}");
     silent.set_read_timeout(Some(Duration::from_secs(5))).unwrap();
     assert_eq!(silent.read(&mut [0; 8]).unwrap(), 0, "cut off");
-    // A projector that does not obey: the answer says so.
+    // If the projector does not obey, the answer says so.
     rig.stop_link();
     rig.monitor.set_projector(ProjectorHealth::Lost);
     for order in [Order::Black, Order::Arm] {
@@ -118,13 +118,13 @@ fn every_order_is_obeyed_and_bad_clients_cost_nothing() {
     assert!(rig.tell(Order::Black).unwrap_err().to_string().contains("no light was darkened"));
 }
 
-/// Found in use, R9: a thousand clients that say nothing held `dpm safe` up for ever.
+/// Found in use, R9: a thousand silent clients blocked `dpm safe` forever.
 #[test]
 fn r9_a_thousand_silent_clients_hold_no_order_up() {
     let rig = Rig::new("flood");
     let mut flood = Vec::new();
     for _ in 0..500 {
-        // Descriptors of this process, and of the other end in it, may be few.
+        // There may be too few descriptors for this process, which holds both ends.
         match UnixStream::connect(rig.socket()) {
             Ok(stream) => flood.push(stream),
             Err(_) => break,
@@ -138,7 +138,7 @@ fn r9_a_thousand_silent_clients_hold_no_order_up() {
         let told = rig.tell(order).unwrap();
         assert!(told.is_done(), "{told:?}");
         assert!(begin.elapsed() < Duration::from_millis(1500), "{:?}", begin.elapsed());
-        // More of them, of which those before are the oldest.
+        // More clients, of which the earlier ones are the oldest.
         flood.extend((0..100).map_while(|_| UnixStream::connect(rig.socket()).ok()));
     }
 }

@@ -1,5 +1,5 @@
-//! The projector's health as a small file that other processes of this user read: the second way to learn whether an order was obeyed,
-//! for the case that the thread of the control socket hangs.
+//! The projector's state as a small file that other processes of this user read. It is the second way to check
+//! whether an order was obeyed, in case the thread of the control socket hangs.
 
 use super::{state_name, HEARD};
 use crate::order::Order;
@@ -13,10 +13,10 @@ use std::sync::Arc;
 
 /// Longest file.
 const MAX_BYTES: u64 = 1024;
-/// A health that does not change is written again after this long, so that a reader sees that it is of now.
+/// An unchanged state is rewritten after this time, so that a reader can see that it is current.
 const AGAIN_NS: u64 = 40_000_000;
 
-/// Written by one process about itself; removed when dropped.
+/// A process writes it about itself; it is removed when this is dropped.
 #[derive(Debug)]
 pub struct StatusFile {
     folder: Arc<Folder>,
@@ -25,33 +25,33 @@ pub struct StatusFile {
     last: Option<(u64, ProjectorHealth, Option<Order>)>,
 }
 
-/// What the file said.
+/// Content of the file.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub(crate) struct Said {
     /// When it was written, nanoseconds of [`monotonic_ns`].
     pub at_ns: u64,
-    /// How the projector was then.
+    /// The projector's state at that time.
     pub health: ProjectorHealth,
-    /// The order that stood then, over restarts too.
+    /// The order that stood at that time and is kept over restarts.
     pub standing: Option<Order>,
     /// The rig's file.
     pub rig: String,
 }
 
-/// Everything but the rig, in a text whose length never changes.
+/// Everything except the rig, as text of a constant length.
 fn record(at_ns: u64, health: ProjectorHealth, standing: Option<Order>) -> String {
     let standing = standing.map_or("none", Order::word);
     format!("{at_ns:020} {:016x} {standing:6}\n", health.encode())
 }
 
 impl StatusFile {
-    /// Makes the file of this process in `folder`.
+    /// Creates the file of this process in `folder`.
     ///
     /// # Errors
-    /// Those of the operating system.
+    /// An error of the operating system.
     pub fn create(folder: Arc<Folder>, rig: &str) -> Result<Self, FolderError> {
         let name = state_name(std::process::id());
-        // Left by a process of the same number that was killed.
+        // Left by a killed process with the same id.
         folder.remove(&name)?;
         let file = folder.open_file(&name, true)?;
         let this = Self { name, file, last: None, folder };
@@ -63,7 +63,7 @@ impl StatusFile {
         Ok(this)
     }
 
-    /// Says how the projector is now. Off the frame path: a file system may take its time.
+    /// Writes the projector's state. Not for the frame path: a file system may take its time.
     pub fn say(&mut self, health: ProjectorHealth, standing: Option<Order>) {
         let now = monotonic_ns();
         let is_known =
@@ -72,7 +72,7 @@ impl StatusFile {
             return;
         }
         let record = record(now, health, standing);
-        // Twice: a reader that meets a write half done sees two different lines.
+        // Written twice: a reader during a half-done write sees two different lines.
         if self.file.write_all_at((record.clone() + &record).as_bytes(), 0).is_ok() {
             self.last = Some((now, health, standing));
         }
@@ -81,7 +81,7 @@ impl StatusFile {
     /// Reads the file of process `pid`.
     ///
     /// # Errors
-    /// It is not there, cannot be read, or is half written: look again.
+    /// It does not exist, cannot be read, or is half written (try again).
     pub(crate) fn read(folder: &Folder, pid: u32) -> Result<Said, FolderError> {
         let name = state_name(pid);
         let bytes = folder.read(&name, MAX_BYTES)?;

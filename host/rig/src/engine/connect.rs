@@ -1,4 +1,5 @@
-//! Brings the link up: handshake, configuration, clock, ARM. Before the first frame, so it may wait (bounded).
+//! Brings the link up: handshake, configuration, clock, ARM. This happens before the first frame, so it may wait for
+//! a bounded time.
 
 use crate::plan::link_time::LinkTime;
 use crate::telemetry::monitor::RunMonitor;
@@ -6,7 +7,7 @@ use dpm_device::link::{faults, EchoSample, HostLink, LinkError, LinkState, Verb}
 use dpm_device::time::{DeviceTicks, HostTime};
 use dpm_device::transport::Transport;
 
-/// Longest time that a device may take to answer.
+/// The longest time that a device may take to answer.
 const LIMIT_NS: i64 = 2_000_000_000;
 /// Clock exchanges before the first frame.
 const ECHOES: usize = 4;
@@ -14,55 +15,56 @@ const ECHOES: usize = 4;
 /// Why the projector did not come up.
 #[derive(Debug, thiserror::Error)]
 pub enum ConnectError {
-    /// The link's own word.
+    /// The link reported an error.
     #[error(transparent)]
     Link(#[from] LinkError),
-    /// It does not answer.
+    /// The device does not answer.
     #[error(
-        "{device}: no projector got beyond {state:?} within {0} s; is it switched on, and the one that is meant (port, baud)? Check the \
-         cable, and switch it off and on",
+        "{device}: the projector did not come up within {0} s (state {state:?}); check that it is switched on, that it is the intended \
+         one (port, baud), and the cable, then switch it off and on",
         LIMIT_NS / 1_000_000_000
     )]
     Silent {
         /// Name of the transport.
         device: String,
-        /// How far it came.
+        /// The state that the link reached.
         state: LinkState,
     },
-    /// A stop was asked for while the link came up.
+    /// A stop was requested while the link came up.
     #[error("stopped before the projector was up; nothing was lit")]
     Stopped,
 }
 
-/// Latched faults that say something about a host or a cable of the past. Starting a run acknowledges them; heat, lamp, emergency
-/// stop and flashes want the operator's word, and SAFE wants `dpm arm`.
+/// Latched faults that say something about an earlier host or cable. Starting a run acknowledges them. Heat, lamp,
+/// emergency stop and flashes require the operator's acknowledgement, and SAFE requires `dpm arm`.
 pub const ENDED_WITH_THE_LAST_RUN: u32 = faults::WATCHDOG | faults::CHECKSUM_STORM;
 
 /// Brings a link up, step by step: connects, learns the projector's clock, and arms.
 ///
-/// Latched faults in the mask `acknowledged` are acknowledged. Where the monitor says that BLACK, SAFE or a stop is ordered, the link comes up
-/// and does not arm: the order waits in the monitor for whoever takes the link over. A SAFE that the projector has latched itself counts as
-/// ordered, whatever is `acknowledged`, and the monitor learns of it.
+/// Latched faults in the mask `acknowledged` are acknowledged. If the monitor holds an order for BLACK, SAFE or a
+/// stop, the link comes up but does not arm, and the order stays in the monitor for whoever takes the link over. A
+/// SAFE that the projector itself has latched counts as ordered, whatever `acknowledged` contains, and the monitor is
+/// informed of it.
 pub(crate) struct Connecting {
     acknowledged: u32,
     begin: HostTime,
-    /// The exchange with the shortest way there and back, nanoseconds.
+    /// The exchange with the shortest round trip, and that round trip in nanoseconds.
     best: Option<(i64, EchoSample)>,
     echoes: usize,
     is_safe: bool,
 }
 
 impl Connecting {
-    /// Begins at `now`.
+    /// Begins to connect at `now`.
     pub(crate) fn begin(link: &mut HostLink, acknowledged: u32, now: HostTime) -> Self {
         link.connect();
         Self { acknowledged, begin: now, best: None, echoes: 0, is_safe: false }
     }
 
-    /// Goes on at `now`; `stop`: nobody wants light any more. `None` while the link is not up yet.
+    /// Continues at `now`. `stop`: light is no longer wanted. Returns `None` while the link is not up yet.
     ///
     /// # Errors
-    /// The device is missing, refuses, has latched other faults, or is silent.
+    /// The device is missing, refuses, has latched other faults, or is silent; or a stop was requested.
     pub(crate) fn step(
         &mut self,
         now: HostTime,
@@ -80,7 +82,7 @@ impl Connecting {
             }
         });
         if stop {
-            // Never armed after a stop was asked for, and dark if it was armed before.
+            // After a stop request the projector is never armed, and goes dark if it was armed before.
             let _ = link.command(now, Verb::Stop, transport);
             return Err(ConnectError::Stopped);
         }
@@ -104,7 +106,8 @@ impl Connecting {
             || stays_dark && matches!(state, LinkState::Ready | LinkState::Faulted);
         if let (true, Some((round_trip, echo)), Some(clock)) = (is_up, self.best, link.slots()) {
             if self.echoes >= ECHOES {
-                // The middle between the device's two stamps is that of the host's: what it did in between is no part of the way.
+                // The middle between the device's two stamps corresponds to the middle of the round trip. The time
+                // that the device held the request is not travel time.
                 let held = echo.device_sent_at.0.saturating_sub(echo.device_received_at.0);
                 let there = DeviceTicks(echo.device_received_at.0.saturating_add(held / 2));
                 let middle = echo.host_sent_at.plus_ns(round_trip / 2);
@@ -118,11 +121,11 @@ impl Connecting {
     }
 }
 
-/// Brings a link up as [`Connecting`] describes. `now` reads the clock and lets a little time pass with every call; `stop` says that nobody
-/// wants light any more.
+/// Brings a link up as [`Connecting`] describes. `now` reads the clock and lets a little time pass with every call.
+/// `stop` says that light is no longer wanted.
 ///
 /// # Errors
-/// The device is missing, refuses, has latched other faults, or is silent.
+/// The device is missing, refuses, has latched other faults, or is silent; or a stop was requested.
 pub fn connect(
     link: &mut HostLink,
     transport: &mut dyn Transport,

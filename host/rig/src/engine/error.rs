@@ -9,21 +9,21 @@ use dpm_render::RenderError;
 /// Why a run ended early or never began.
 #[derive(Debug, thiserror::Error)]
 pub enum PipelineError {
-    /// The rig.
+    /// The rig cannot be built.
     #[error(transparent)]
     Rig(#[from] RigError),
-    /// The tracker.
+    /// The tracker cannot be opened.
     #[error(transparent)]
     Tracker(#[from] SourceError),
-    /// The renderer.
+    /// The renderer cannot be made.
     #[error(transparent)]
     Render(#[from] RenderError),
-    /// The GPU, while running.
+    /// The GPU failed during the run.
     #[error("frame {frame}: {source}")]
     Gpu {
         /// Which frame.
         frame: u64,
-        /// What happened.
+        /// What failed.
         source: GpuError,
     },
     /// The GPU does not finish a frame.
@@ -31,31 +31,31 @@ pub enum PipelineError {
     GpuHangs {
         /// Which frame.
         frame: u64,
-        /// How long it was waited for.
+        /// How long the stage waited.
         ms: u64,
     },
-    /// A thread does not answer and cannot be replaced. The projector went dark by itself, or was told to.
+    /// A thread does not answer and cannot be replaced. The projector went dark by itself, or was ordered to.
     #[error("the {stage} thread has not answered for {} ms longer than it should: the run ends in the dark; start it again, and if it happens again report it with the rig file", super::pulse::HUNG_AFTER_NS / 1_000_000)]
     Hung {
         /// Which thread.
         stage: &'static str,
     },
-    /// Stages were made anew too often.
+    /// The stages were restarted too often.
     #[error(
         "more than {} failures within a minute, the last: {last}; the run ends in the dark",
         dpm_render::gpu::LossBudget::MOST
     )]
     KeepsFailing {
-        /// The last one.
+        /// The last failure.
         last: String,
     },
-    /// The projector.
+    /// The projector did not come up.
     #[error(transparent)]
     Connect(#[from] ConnectError),
-    /// A stage panicked: a programmer's mistake. The projector was told to go dark.
+    /// A stage panicked, which is a bug. The projector was ordered to go dark.
     #[error("the {0} stage stopped with a panic; this is a bug, please report it with the rig file")]
     Panicked(&'static str),
-    /// The system gave no thread.
+    /// The system could not start a thread.
     #[error("cannot start the {stage} thread: {source}")]
     Thread {
         /// Which stage.

@@ -1,6 +1,7 @@
-//! What the parts of the engine tell each other while they work, each from a thread of its own where there are threads.
+//! Facts that the parts of the engine share while they work, each in a thread of its own at real pace.
 //!
-//! Accesses are relaxed: each number stands for itself, and a reader that sees it a frame late decides as well.
+//! Accesses are relaxed: each number is independent of the others, and a reader that sees it a frame late decides
+//! equally well.
 
 use super::error::PipelineError;
 use super::options::RunOptions;
@@ -12,35 +13,36 @@ use dpm_device::time::HostTime;
 use std::sync::atomic::{AtomicBool, AtomicI64, AtomicU64, Ordering};
 use std::sync::{Arc, Mutex};
 
-/// What a projector outside this process needs to take a frame in and check it once the medium has all of it, nanoseconds. The host cannot
-/// measure it.
+/// Time that a projector outside this process needs to receive and check a frame after the medium has accepted all of
+/// it, nanoseconds. The host cannot measure it.
 pub(crate) const RECEIPT_NS: i64 = 500_000;
 
 /// Facts of a whole run.
 pub(crate) struct Facts {
     /// The rig.
     pub rig: Arc<Rig>,
-    /// What the operator orders and what the run tells.
+    /// Carries the operator's orders and the run's status.
     pub monitor: Arc<RunMonitor>,
-    /// What the run was asked for.
+    /// The run's options.
     pub options: RunOptions,
-    /// How long before its slot a frame is latched, the projector's receipt and the medium's travel not counted, nanoseconds.
+    /// How long before its slot a frame is latched, nanoseconds, not counting the projector's receipt and the
+    /// medium's travel.
     pub lead_ns: AtomicI64,
-    /// What most frames need from latch to sent, nanoseconds.
+    /// Time that most frames need from latch to sent, nanoseconds.
     pub typical_ns: AtomicI64,
-    /// Learned time from sent to light, nanoseconds (projectors outside this process).
+    /// Learned time from sent to light, nanoseconds (for projectors outside this process).
     pub travel_ns: AtomicI64,
-    /// When every stage was last found alive.
+    /// When all stages were last found alive.
     pub alive_at_ns: AtomicI64,
     /// Number of the next frame.
     pub next_frame: AtomicU64,
-    /// Slot after the last one that the run was asked to plan for; 0 while it is not known.
+    /// The slot after the last one to be planned; 0 while it is not known.
     pub end_slot: AtomicU64,
-    /// Slots from one planned frame to the next, in thousandths, as an average of the last frames.
+    /// Slots from one planned frame to the next, in thousandths, averaged over the last frames.
     pub stride_milli: AtomicU64,
-    /// Longest time for which a body is carried on by prediction, nanoseconds.
+    /// The longest time for which prediction may extend a body's track, nanoseconds.
     pub predict_ns: AtomicI64,
-    /// Every frame that the run was asked for is planned.
+    /// All frames of the run are planned.
     pub is_complete: AtomicBool,
     error: Mutex<Option<PipelineError>>,
 }
@@ -72,7 +74,7 @@ impl Facts {
         }
     }
 
-    /// The run ends, in the dark, with this error; the first one counts. Not on the frame path.
+    /// Ends the run in the dark with this error; the first error counts. Not for the frame path.
     pub(crate) fn fail(&self, error: PipelineError) {
         if let Ok(mut first) = self.error.lock() {
             first.get_or_insert(error);
@@ -85,14 +87,14 @@ impl Facts {
         self.error.lock().ok().and_then(|mut error| error.take())
     }
 
-    /// What each of plan, render, pack and link is taken to cost at virtual pace, nanoseconds.
+    /// The modelled costs of plan, render, pack and link at virtual pace, nanoseconds.
     pub(crate) fn modelled_costs(&self) -> [i64; 4] {
         let c = &self.rig.config.real_time.stage_costs_us;
         [c.plan, c.render, c.pack, c.send].map(|us| i64::from(us) * 1000)
     }
 }
 
-/// What the GPU has to do and how long it takes, shared by planning and packing.
+/// The GPU's queue and its time per frame, shared by planning and packing.
 #[derive(Debug, Default)]
 pub(crate) struct GpuPace {
     submitted: AtomicU64,
@@ -101,11 +103,11 @@ pub(crate) struct GpuPace {
 }
 
 impl GpuPace {
-    /// Share of a slot beyond which frames are begun one at a time: a GPU that needs longer than that would only queue them up, and each
-    /// would be drawn for poses that grow old in the queue.
+    /// Share of a slot beyond which frames are begun one at a time. A slower GPU would only queue frames up, and each
+    /// frame's poses would grow old in the queue.
     const SLOW: f64 = 0.9;
 
-    /// Of a GPU that took `frame_ns` for a frame while nobody was waiting.
+    /// For a GPU that took `frame_ns` for a frame while it was otherwise idle.
     pub(crate) fn new(frame_ns: i64) -> Self {
         Self { frame_ns: AtomicI64::new(frame_ns), ..Self::default() }
     }
@@ -115,12 +117,12 @@ impl GpuPace {
         self.submitted.fetch_add(1, Ordering::Relaxed);
     }
 
-    /// The GPU has finished a frame, for which it took `took_ns`.
+    /// The GPU has finished a frame, which took `took_ns`.
     pub(crate) fn finish(&self, took_ns: i64) {
         let before = self.frame_ns.load(Ordering::Relaxed);
         let mean = if before == 0 { took_ns } else { before + (took_ns - before) / 8 };
         self.frame_ns.store(mean, Ordering::Relaxed);
-        // Release: who sees the frame finished sees what it took.
+        // Release: a reader that sees the frame finished also sees its time.
         self.finished.fetch_add(1, Ordering::Release);
     }
 
@@ -136,17 +138,17 @@ impl GpuPace {
     }
 }
 
-/// Facts of one crew: of the stages that are made anew together.
+/// Facts of one crew, that is, of the stages that are restarted together.
 #[derive(Debug)]
 pub(crate) struct CrewFacts {
     /// The GPU.
     pub gpu: GpuPace,
-    /// Thousandths of a sample that a pixel gets on average.
+    /// Average samples per pixel, in thousandths.
     pub budget_milli: AtomicU64,
 }
 
 impl CrewFacts {
-    /// Of a crew that begins, on a GPU that took `frame_ns` for a frame while nobody was waiting.
+    /// For a crew that begins, on a GPU that took `frame_ns` for a frame while it was otherwise idle.
     pub(crate) fn new(rig: &Rig, frame_ns: i64) -> Self {
         let budget_milli = AtomicU64::new(u64::from(rig.config.render.spp) * 1000);
         Self { gpu: GpuPace::new(frame_ns), budget_milli }

@@ -1,7 +1,9 @@
-//! What the link thread does beside frames: the operator's orders, arming again after the dark, the projector's clock, its reports.
+//! What the link thread does besides sending frames: it obeys the operator's orders, arms again after a fault,
+//! follows the projector's clock, and reads the projector's reports.
 //!
-//! Light after a dark that nobody ordered comes back by itself only where the reason was the cable or the host: a new session after
-//! unplugging or a reset, the watchdog, damaged packets. Heat, lamp, emergency stop, flashes and SAFE wait for an ARM of the operator.
+//! If nobody ordered the dark, light comes back by itself only where the cause was the cable or the host: a new
+//! session after unplugging or a reset, the watchdog, damaged packets. Heat, lamp, emergency stop, flashes and SAFE
+//! wait for an ARM of the operator.
 
 use super::connect::ConnectError;
 use crate::frame::slots::OrderedDark;
@@ -21,36 +23,36 @@ use dpm_handoff::latest::Publisher;
 
 /// Faults after which light comes back without the operator.
 const PASSING: u32 = faults::WATCHDOG | faults::CHECKSUM_STORM;
-/// Shortest time between two such returns: a projector that faults again and again stays mostly dark.
+/// The shortest time between two such returns. A projector that keeps faulting stays mostly dark.
 const REARM_NS: i64 = 1_000_000_000;
-/// How often the planning thread learns the projector's clock anew.
+/// How often the planning thread gets a new map of the projector's clock.
 const RETIME_NS: i64 = 100_000_000;
-/// Exchanges that beat those of the handshake.
+/// The number of clock exchanges that give a better map than those of the handshake.
 const EXCHANGES: usize = 8;
 
 /// See the module's documentation.
 pub(crate) struct LinkKeeper {
     time: LinkTime,
-    /// Where planning learns the projector's clock; `None` before there is a crew.
+    /// Publishes the projector's clock to planning; `None` before there is a crew.
     times: Option<Publisher<LinkTime>>,
     retimed_at: HostTime,
     map: Option<ClockMap>,
     clock_bound_ns: Option<i64>,
     session: u64,
-    /// `time` is of this session.
+    /// `time` belongs to this session.
     is_timed: bool,
     reports: Option<StatusLight>,
-    /// What the operator ordered last and did not take back.
+    /// The operator's last order that was not taken back.
     standing: Option<Verb>,
     rearmed_at: HostTime,
     rearmed: u64,
-    /// The interlock was closed when it was asked last.
+    /// The interlock was closed at the last check.
     allowed: bool,
 }
 
 impl LinkKeeper {
-    /// For a link that has just come up with `time`. `lights`: where the projector's reports are all that is known of its light,
-    /// notes of it go there.
+    /// For a link that has just come up with `time`. `lights` receives notes of the projector's light if its reports
+    /// are the only source for them.
     pub(crate) fn new(time: LinkTime, link: &HostLink, lights: Option<Sender<LightNote>>) -> Self {
         Self {
             time,
@@ -68,23 +70,23 @@ impl LinkKeeper {
         }
     }
 
-    /// The projector's reports are all that is known of its light: it is outside this process.
+    /// True if the projector is outside this process, so that its reports are the only source for its light.
     pub(crate) fn has_reports(&self) -> bool {
         self.reports.is_some()
     }
 
-    /// From now on planning learns the projector's clock through `times`.
+    /// From now on planning receives the projector's clock through `times`.
     pub(crate) fn tell_times_to(&mut self, mut times: Publisher<LinkTime>) {
         times.publish(self.time);
         self.times = Some(times);
     }
 
-    /// Polls the link and does what is due. At virtual pace (`steady`) the projector's clock stays as the handshake found it. A picture is
-    /// held only while all stages are `alive`.
+    /// Polls the link and does what is due. At virtual pace (`steady`) the projector's clock stays as the handshake
+    /// found it. A frozen picture is held only while all stages are `alive`.
     ///
     /// # Errors
-    /// The link cannot come up again: another projector was plugged in, or it refuses. While the medium is gone, or the projector
-    /// refuses to be armed, there is no error: the run goes on in the dark.
+    /// The link cannot come up again: another projector was plugged in, or it refuses. It is no error if the medium
+    /// is gone or the projector refuses to be armed; the run then continues in the dark.
     pub(crate) fn poll(
         &mut self,
         now: HostTime,
@@ -108,7 +110,7 @@ impl LinkKeeper {
         if !steady {
             self.keep_time(now, link);
         }
-        // After a stop was asked for nothing lights the projector again, whoever orders it.
+        // After a stop request, no order lights the projector again.
         let stopping = monitor.stop_requested() || self.standing == Some(Verb::Stop);
         if !stopping {
             self.follow_interlock(now, monitor.light_allowed(), link, transport);
@@ -117,7 +119,7 @@ impl LinkKeeper {
             self.obey(now, order, link, transport);
         }
         if self.standing == Some(Verb::Freeze) && !alive {
-            // Nobody would replace the frame that is held, and nobody knows for how long.
+            // Nobody would replace the frozen frame, and nobody knows for how long.
             self.obey(now, Order::Black, link, transport);
         }
         if !stopping {
@@ -140,14 +142,14 @@ impl LinkKeeper {
         result
     }
 
-    /// The frame is on its way.
+    /// Records that the frame of `plan` was sent.
     pub(crate) fn sent(&mut self, plan: &FramePlan) {
         if let Some(reports) = &mut self.reports {
             reports.sent(plan.id.0 as u32, plan.slot);
         }
     }
 
-    /// How much earlier frames must leave than the host's own stages need, nanoseconds.
+    /// How much earlier frames must leave than the host's own stages require, nanoseconds.
     pub(crate) fn travel_ns(&self) -> i64 {
         self.reports.as_ref().map_or(0, StatusLight::travel_ns)
     }
@@ -158,7 +160,7 @@ impl LinkKeeper {
         let _ = link.command(now, Verb::Stop, transport);
     }
 
-    /// What was carried.
+    /// What the link carried.
     pub(crate) fn report(&self, link: &HostLink, name: &str) -> ProjectorReport {
         let c = link.counters();
         ProjectorReport {
@@ -174,7 +176,8 @@ impl LinkKeeper {
         }
     }
 
-    /// The interlock opens: BLACK at once. It closes: light again, unless the operator ordered otherwise meanwhile or before.
+    /// Follows the interlock. When it opens, orders BLACK at once. When it closes, light returns unless an order of
+    /// the operator stands.
     fn follow_interlock(
         &mut self,
         now: HostTime,
@@ -186,11 +189,11 @@ impl LinkKeeper {
             return;
         }
         if self.standing == Some(Verb::Freeze) {
-            // What was held is dark now and old when light may come back: that is for the operator to say.
+            // The frozen picture is dark now and will be old when light may return, so the operator must decide.
             self.standing = Some(Verb::Black);
         }
         if !allowed && !matches!(self.standing, Some(Verb::Stop | Verb::Safe)) {
-            // What does not get through now is repeated by the link.
+            // The link repeats a command that does not get through.
             let _ = link.command(now, Verb::Black, transport);
         } else if allowed && self.standing.is_none() && link.state() == LinkState::Streaming {
             link.arm(0);
@@ -200,12 +203,12 @@ impl LinkKeeper {
     fn obey(&mut self, now: HostTime, order: Order, link: &mut HostLink, transport: &mut dyn Transport) {
         let verb = match order {
             Order::Black => Verb::Black,
-            // Nothing is lit that could be held.
+            // Nothing is lit that could be frozen.
             Order::Freeze if !self.allowed => Verb::Black,
             Order::Freeze => Verb::Freeze,
             Order::Safe => Verb::Safe,
             Order::Arm if !self.allowed => {
-                // Light comes when the interlock closes; latched faults then still want to be acknowledged.
+                // Light returns when the interlock closes. Latched faults still have to be acknowledged then.
                 self.standing = None;
                 return;
             }
@@ -214,18 +217,19 @@ impl LinkKeeper {
                 return link.arm(link.status().map_or(0, |s| s.faults));
             }
         };
-        // What stands is not weakened by a later word: FREEZE after BLACK, or BLACK after SAFE.
+        // A weaker order does not replace a stronger one: FREEZE after BLACK, or BLACK after SAFE.
         if self.standing.is_some_and(|standing| rank(standing) > rank(verb)) {
             return;
         }
         self.standing = Some(verb);
-        // What does not get through now is repeated by the link; a medium that is gone is dark anyway.
+        // The link repeats a command that does not get through. If the medium is gone, the projector is dark anyway.
         let _ = link.command(now, verb, transport);
     }
 
-    /// A projector that came back, or stopped for a reason that has passed, is armed unless the operator wants it dark.
+    /// Arms a projector that came back, or that stopped for a reason that has passed, unless the operator wants it
+    /// dark.
     fn arm_again(&mut self, now: HostTime, link: &mut HostLink, steady: bool) {
-        // A rest after flashes ends by itself, and only by itself.
+        // A rest after flashes ends by itself and cannot be cut short.
         if self.standing.is_some() || !self.allowed || link.is_resting(now) {
             return;
         }
@@ -244,7 +248,7 @@ impl LinkKeeper {
         }
     }
 
-    /// Maps the projector's clock and tells the planning thread.
+    /// Maps the projector's clock and publishes it to the planning thread.
     fn keep_time(&mut self, now: HostTime, link: &mut HostLink) {
         let Some(hello) = link.device() else { return };
         if self.map.is_none() {
@@ -267,7 +271,7 @@ impl LinkKeeper {
             self.time.anchor = (ticks, mapped.at);
         } else {
             let mut time = LinkTime { clock, first: 0, anchor: (ticks, mapped.at) };
-            // The run goes on counting its slots.
+            // The run continues to count its slots.
             time.first = self.time.slot_after(time.host_of_slot(0));
             (self.time, self.is_timed) = (time, true);
         }
@@ -278,7 +282,7 @@ impl LinkKeeper {
     }
 }
 
-/// True when the device says that it is dark and will stay so, or cannot be asked.
+/// True when the device reports that it is dark and will stay so, or when it cannot be asked.
 pub(crate) fn is_dark(link: &HostLink) -> bool {
     matches!(link.state(), LinkState::Lost | LinkState::Closed)
         || link.status().is_some_and(|s| {
@@ -286,7 +290,7 @@ pub(crate) fn is_dark(link: &HostLink) -> bool {
         })
 }
 
-/// What stands gives way only to what is at least as strong.
+/// The strength of an order. A standing order yields only to one of at least equal strength.
 fn rank(verb: Verb) -> u8 {
     match verb {
         Verb::Freeze => 0,
@@ -296,7 +300,7 @@ fn rank(verb: Verb) -> u8 {
     }
 }
 
-/// Why no new picture is wanted: slots are no one's fault then.
+/// Why no new picture is wanted; slots without a frame then have no other cause.
 fn ordered_dark(
     now: HostTime,
     link: &HostLink,
@@ -333,10 +337,10 @@ fn health(link: &HostLink, standing: Option<Verb>) -> ProjectorHealth {
     match (link.state(), standing) {
         (LinkState::Lost | LinkState::Closed, _) => ProjectorHealth::Lost,
         (LinkState::Faulted, _) => ProjectorHealth::Faulted(link.status().map_or(0, |s| s.faults)),
-        // Not before the projector says so.
+        // Black only once the projector reports it.
         (_, Some(Verb::Black)) if !matches!(state, D::Armed | D::Frozen) => ProjectorHealth::Black,
         (_, Some(Verb::Freeze)) if state != D::Armed => ProjectorHealth::Frozen,
-        // A projector that came back without power has forgotten it; the host has not.
+        // A projector that lost power has forgotten SAFE; the host has not.
         (_, Some(Verb::Safe)) if state == D::Configured => ProjectorHealth::Faulted(faults::HOST_SAFE),
         (_, Some(Verb::Stop)) if is_dark(link) => ProjectorHealth::Stopped,
         (LinkState::Streaming, _) => ProjectorHealth::Up,

@@ -1,4 +1,4 @@
-//! When a packed frame is sent or left out, what is done beside frames, and how the light ends.
+//! Decides when a packed frame is sent or left out, does what is due between frames, and ends the light.
 
 use super::facts::Facts;
 use super::keeper::{is_dark, LinkKeeper};
@@ -17,53 +17,53 @@ use std::sync::Arc;
 
 use crate::plan::link_time::LinkTime;
 
-/// How often a link without credit looks for some, nanoseconds.
+/// How often a link without credit checks for new credit, nanoseconds.
 const CREDIT_STEP_NS: i64 = 50_000;
-/// A link with nothing to send looks after its device this often, nanoseconds.
+/// How often a link with nothing to send polls its device, nanoseconds.
 const IDLE_NS: i64 = 1_000_000;
-/// The same while an answer to a clock exchange is under way: how late it is looked at is how wrong the clock may be.
+/// The same while the answer to a clock exchange is pending. A late poll makes the clock wrong by as much.
 const ECHO_STEP_NS: i64 = 50_000;
-/// What getting a lost medium back may take, nanoseconds.
+/// Time that reopening a lost medium may take, nanoseconds.
 const REOPEN_NS: i64 = 2_000_000_000;
-/// The supervisor says at least this often that every stage is alive, or it is not believed, nanoseconds.
+/// The supervisor must confirm at least this often that every stage is alive, nanoseconds.
 const ALIVE_WITHIN_NS: i64 = 150_000_000;
-/// Between two looks at a projector that is to go dark, nanoseconds.
+/// Time between two checks of a projector that is going dark, nanoseconds.
 const DARK_STEP_NS: i64 = 1_000_000;
-/// Looks at a projector that is to go dark, at least: it may say that it is dark before the order arrives.
+/// The minimum number of checks: the projector may report that it is dark before the order arrives.
 const DARK_LOOKS: u32 = 4;
-/// Looks at a projector outside this process: STOP is repeated for 300 ms, and its watchdog does the rest.
+/// Number of checks of a projector outside this process: STOP is repeated for 300 ms, and its watchdog does the rest.
 const DARK_LOOKS_OUTSIDE: u32 = 300;
 
-/// What becomes of a frame that was offered.
+/// What happened to a frame that was offered.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(crate) enum Offer {
-    /// The device has no room for it: offer it again at this instant.
+    /// The device has no room for it. Offer it again at this instant.
     Again(HostTime),
-    /// It is on its way, or left out: its fate is in its note.
+    /// It was sent or left out; its note records which.
     Settled,
 }
 
-/// How far the end of the light has come.
+/// How far the light's end has progressed.
 #[derive(Clone, Copy, Debug)]
 enum Ending {
     /// The last frames are still lit.
     LastLight { until: HostTime },
-    /// STOP was sent, and the projector was looked at so often.
+    /// STOP was sent, and the projector was checked this many times.
     Stopped { looks: u32 },
 }
 
-/// The link and what is done beside frames.
+/// The link and the work between frames.
 pub(crate) struct LinkStage<P> {
     facts: Arc<Facts>,
     link: HostLink,
     keeper: LinkKeeper,
     lead: LeadEstimator,
     slot_ns: i64,
-    /// When the frame that is being offered was ready; `None` between frames.
+    /// When the frame being offered was ready; `None` between frames.
     ready_at: Option<HostTime>,
     /// Until when a frame last waited for room in the device.
     credit_until: HostTime,
-    /// How long the frame that is being offered waited for room, where it is to be learned from, nanoseconds.
+    /// How long the frame being offered waited for room, nanoseconds; `None` if the lead does not learn from it.
     waited_ns: Option<i64>,
     ending: Option<Ending>,
     looks: u32,
@@ -74,7 +74,7 @@ impl<P: Pace> LinkStage<P> {
     /// For a link that is up.
     pub(crate) fn new(facts: Arc<Facts>, link: HostLink, keeper: LinkKeeper, lead: LeadEstimator) -> Self {
         let slot_ns = facts.rig.rate().slot_len_ns(0);
-        // Where light is only reported of, the projector is outside this process.
+        // If light is known only from reports, the projector is outside this process.
         let looks = if keeper.has_reports() { DARK_LOOKS_OUTSIDE } else { DARK_LOOKS };
         Self {
             facts,
@@ -91,7 +91,7 @@ impl<P: Pace> LinkStage<P> {
         }
     }
 
-    /// From now on planning learns the projector's clock through `times`.
+    /// From now on planning receives the projector's clock through `times`.
     pub(crate) fn tell_times_to(&mut self, times: Publisher<LinkTime>) {
         self.keeper.tell_times_to(times);
     }
@@ -101,7 +101,7 @@ impl<P: Pace> LinkStage<P> {
         self.link.state() == LinkState::Streaming
     }
 
-    /// How long a frame may be waited for at `now` before the link wants to be polled, nanoseconds.
+    /// How long the caller may wait for a frame at `now` before the link must be polled, nanoseconds.
     pub(crate) fn rest_ns(&self, now: HostTime) -> i64 {
         if self.link.awaits_echo(now) {
             ECHO_STEP_NS
@@ -110,7 +110,7 @@ impl<P: Pace> LinkStage<P> {
         }
     }
 
-    /// How long one call may take beyond `step_ns`, which a step takes otherwise: a medium that is gone is opened anew.
+    /// How long one call may take: `step_ns`, or longer while a lost medium is being reopened.
     pub(crate) fn expected_ns(&self, step_ns: i64) -> i64 {
         match self.link.state() {
             LinkState::Lost => REOPEN_NS,
@@ -118,7 +118,7 @@ impl<P: Pace> LinkStage<P> {
         }
     }
 
-    /// Moves the link along and does what is due beside frames.
+    /// Polls the link and does what is due between frames.
     pub(crate) fn poll(&mut self, now: HostTime, transport: &mut dyn Transport) {
         let Self { facts, link, keeper, .. } = self;
         let alive = now.ns_since(HostTime(facts.alive_at_ns.load(Ordering::Relaxed))) <= ALIVE_WITHIN_NS;
@@ -129,7 +129,8 @@ impl<P: Pace> LinkStage<P> {
         }
     }
 
-    /// Offers a packed frame at `now`. `is_newest`: no other frame waits behind it. Say [`LinkStage::taken`] when it is settled.
+    /// Offers a packed frame at `now`. `is_newest`: no other frame waits behind it. Call [`LinkStage::taken`] when it
+    /// is settled.
     pub(crate) fn offer(
         &mut self,
         now: HostTime,
@@ -148,14 +149,14 @@ impl<P: Pace> LinkStage<P> {
             return Offer::Again(now.plus_ns(CREDIT_STEP_NS));
         }
         self.ready_at = None;
-        // What waited for room in the device, or behind a frame that did, was ready earlier.
+        // A frame that waited for room in the device, or behind a frame that did, was ready earlier.
         let queued_ns = self.credit_until.min(ready_at).ns_since(note.timeline.packed_at).max(0);
         if now > ready_at {
             self.credit_until = now;
         }
         self.waited_ns = Some(now.ns_since(ready_at) + queued_ns);
         if is_too_old(note, now, self.slot_ns) {
-            // It needed what it needed, and the next one should be begun earlier.
+            // The lead learns from this frame too: the next one should begin earlier.
             note.fate = Fate::TooOld;
             return Offer::Settled;
         }
@@ -170,8 +171,8 @@ impl<P: Pace> LinkStage<P> {
         Offer::Settled
     }
 
-    /// A settled frame left the stage at `now`: learns what it needed. Waiting for room in a device that is ahead does not ask for an
-    /// earlier start: that would only fill it more.
+    /// A settled frame left the stage at `now`; the lead learns the time that it needed. Time spent waiting for room
+    /// in the device does not count: an earlier start would only fill the device more.
     pub(crate) fn taken(&mut self, note: &mut FrameNote, now: HostTime) {
         note.timeline.sent_at = now;
         if let Some(waited_ns) = self.waited_ns.take() {
@@ -181,7 +182,7 @@ impl<P: Pace> LinkStage<P> {
         }
     }
 
-    /// A frame waits for room in the device at most until its slot begins.
+    /// True while a frame must wait for room in the device. It waits at most until its slot begins.
     fn waits_for_room(&self, now: HostTime, note: &FrameNote) -> bool {
         self.is_streaming()
             && self.link.credit() == 0
@@ -189,8 +190,9 @@ impl<P: Pace> LinkStage<P> {
             && !self.facts.monitor.stop_requested()
     }
 
-    /// Ends the light, step by step: the last frames' where the run came to its end, none where a stop was asked for. `last`: when the last
-    /// frame was sent. Returns when to be called again; `None` when the projector is dark, or was told often enough.
+    /// Ends the light, step by step: after the last frames' light if the run is complete, at once if a stop was
+    /// requested. `last`: when the last frame was sent. Returns when to call again; `None` when the projector is
+    /// dark, or was ordered often enough.
     pub(crate) fn end(
         &mut self,
         now: HostTime,
@@ -211,7 +213,8 @@ impl<P: Pace> LinkStage<P> {
                 Ending::Stopped { looks: 0 }
             }
             Ending::Stopped { looks } => {
-                // A line may still be busy with a frame: STOP is repeated by the link until the projector says that it is dark.
+                // The line may still be busy with a frame. The link repeats STOP until the projector reports that it
+                // is dark.
                 self.poll(now, transport);
                 Ending::Stopped { looks: looks + 1 }
             }
@@ -227,13 +230,14 @@ impl<P: Pace> LinkStage<P> {
         }
     }
 
-    /// What was carried over the medium `name`.
+    /// What the link carried over the medium `name`.
     pub(crate) fn report(&self, name: &str) -> ProjectorReport {
         self.keeper.report(&self.link, name)
     }
 }
 
-/// True when the poses of a frame that is sent at `now` will be older, once it is lit, than prediction may carry them and a slot more.
+/// True when the poses of a frame that is sent at `now` will be older, when it is lit, than the prediction time plus
+/// one slot.
 fn is_too_old(note: &FrameNote, now: HostTime, slot_ns: i64) -> bool {
     let lit_at = note.timeline.due_at.max(now);
     let oldest = note.plan.oldest_captured_at();
@@ -249,7 +253,8 @@ mod tests {
 
     const MS: i64 = 1_000_000;
 
-    /// Found in use, R5: what counts is how old the poses are when the light falls, in the frame's slot or, where that has begun, now.
+    /// Found in use, R5: what counts is the age of the poses when the light falls, which is in the frame's slot or,
+    /// if that has begun, now.
     #[test]
     fn a_frame_is_too_old_by_what_its_poses_will_be_when_it_is_lit() {
         let config = RigConfig::demo(&Overrides::default()).unwrap_or_else(|e| panic!("{e}"));

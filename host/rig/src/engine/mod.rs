@@ -1,14 +1,15 @@
-//! What decides in a run, free of threads, of clocks and of I/O of its own.
+//! The decisions of a run, without threads, clocks or I/O of their own.
 //!
-//! Each part takes an instant and what has happened, and gives back what is to be done and when it wants to be asked again:
+//! Each part takes an instant and what has happened. It returns what to do and when to ask again:
 //!
 //! - [`plan`]: which slot the next frame is for, and when its poses are read;
-//! - [`pack`]: how long the GPU is waited for, and which frame is left out;
-//! - [`link`]: when a frame is sent, what the operator ordered, the projector's clock, and how the light ends;
-//! - [`supervision`]: who has fallen silent, and what is made anew.
+//! - [`pack`]: how long to wait for the GPU, and which frame to leave out;
+//! - [`link`]: when a frame is sent, the operator's orders, the projector's clock, and how the light ends;
+//! - [`supervision`]: which thread has fallen silent, and what is restarted.
 //!
-//! They share [`facts::Facts`], which are atomics. At real pace `pipeline` gives each part a thread; at virtual pace one thread drives all of
-//! them under a clock that it moves. What differs between the two is [`pace::Pace`].
+//! The parts share [`facts::Facts`], which are atomics. At real pace `pipeline` gives each part a thread. At virtual
+//! pace one thread drives all parts under a clock that it moves. [`pace::Pace`] defines the differences between the
+//! two.
 
 pub(crate) mod connect;
 pub(crate) mod error;

@@ -1,43 +1,44 @@
-//! What a run is asked for besides what the rig file says.
+//! Options of a run that are not in the rig file.
 
-/// A thread of the host that a test may let stand still.
+/// A thread of the host that a test may stall.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum StallIn {
-    /// Samples into tracks.
+    /// From samples to tracks.
     Tracking,
-    /// Tracks into the poses of a frame.
+    /// From tracks to the poses of a frame.
     Plan,
-    /// Code values into bit planes; where there is a GPU, waiting for it too.
+    /// From code values to bit planes; with a GPU, also the wait for it.
     Pack,
-    /// Bit planes to the transport.
+    /// From bit planes to the transport.
     Link,
 }
 
-/// A stage that stands still once: for tests of what is left afterwards.
+/// A stage that stalls once, for tests of the recovery.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Stall {
-    /// Where.
+    /// The stage.
     pub stage: StallIn,
-    /// Before it works on this frame; tracking, which knows no frames: as soon as this one is planned.
+    /// It stalls before it works on this frame. Tracking, which has no frames, stalls as soon as this frame is
+    /// planned.
     pub frame: u64,
     /// For this long.
     pub length: std::time::Duration,
 }
 
-/// How a run differs from what the rig file says.
+/// How a run differs from the rig file.
 #[derive(Clone, Copy, Debug)]
 pub struct RunOptions {
-    /// Frames to plan; 0: until asked to stop.
+    /// Number of frames to plan; 0: until a stop is requested.
     pub frames: u64,
-    /// Slots to plan for, whether frames make it into them or not; 0: no limit.
+    /// Number of slots to plan for, whether or not frames meet them; 0: no limit.
     pub slots: u64,
     /// Frames of light (and their records) kept for pictures.
     pub keep_frames: usize,
     /// Compare the light with what was rendered, frame by frame.
     pub verify: bool,
-    /// Frames under way at once.
+    /// Frames in flight at once.
     pub in_flight: usize,
-    /// A stage that stands still once.
+    /// A stage that stalls once.
     pub stall: Option<Stall>,
 }
 

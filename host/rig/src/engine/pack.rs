@@ -1,4 +1,5 @@
-//! How long a rendered frame is waited for, what is learned from the time it took, and which frame is not worth packing any more.
+//! Decides how long to wait for a rendered frame and which frame is no longer worth packing, and learns from the
+//! GPU's times.
 
 use super::facts::{CrewFacts, Facts};
 use crate::frame::job::{Fate, FrameNote};
@@ -7,7 +8,7 @@ use dpm_device::time::HostTime;
 use std::sync::atomic::Ordering;
 use std::sync::Arc;
 
-/// What the GPU took for the last frames, and so how long the next is waited for.
+/// The GPU's times for the last frames, from which the next wait is derived.
 struct GpuTimes {
     recent: [i64; 64],
     count: usize,
@@ -25,7 +26,7 @@ impl GpuTimes {
         Self { recent: [0; 64], count: 0, last_done_at: HostTime(i64::MIN) }
     }
 
-    /// The GPU finished a frame; returns what it took for this one alone.
+    /// Records that the GPU finished a frame. Returns the time that it spent on this frame alone.
     fn finished(&mut self, submitted_at: HostTime, done_at: HostTime) -> i64 {
         let took = done_at.ns_since(submitted_at);
         self.recent[self.count % self.recent.len()] = took;
@@ -35,7 +36,8 @@ impl GpuTimes {
         alone
     }
 
-    /// How long a frame is waited for: four times the recent 99th percentile (of 64 frames the longest), at most two seconds.
+    /// How long to wait for a frame: four times the longest of the last 64 (their 99th percentile), at most two
+    /// seconds.
     fn limit_ns(&self) -> u64 {
         let longest = self.recent.iter().copied().max().unwrap_or(0);
         let limit = if self.count < Self::WARM { Self::LONGEST_NS } else { longest.saturating_mul(4) };
@@ -43,7 +45,7 @@ impl GpuTimes {
     }
 }
 
-/// What packing decides.
+/// The decisions of packing.
 pub(crate) struct PackStage {
     facts: Arc<Facts>,
     crew: Arc<CrewFacts>,
@@ -53,7 +55,7 @@ pub(crate) struct PackStage {
 }
 
 impl PackStage {
-    /// For a crew; `budget`: `None` if every frame gets the rays that the rig file asks for.
+    /// For a crew. `budget`: `None` if every frame gets the rays that the rig file asks for.
     pub(crate) fn new(facts: Arc<Facts>, crew: Arc<CrewFacts>, budget: Option<BudgetController>) -> Self {
         Self { facts, crew, times: GpuTimes::new(), budget, late_in_a_row: 0 }
     }
@@ -72,9 +74,10 @@ impl PackStage {
         }
     }
 
-    /// Whether the frame is to be packed at `now`. What waits behind a rendered frame is still being rendered: more late frames than were
-    /// under way are no stall. A GPU this slow has no newer frame that would be in time, and late frames are better than none while their
-    /// poses are young enough. `is_newest`: no other frame waits behind it.
+    /// Whether to pack the frame at `now`. `is_newest`: no other frame waits behind it. Frames behind a rendered one
+    /// are still being rendered, so more consecutive late frames than were in flight mean a slow GPU and not a stall.
+    /// Such a GPU has no newer frame that would be in time, and late frames are better than none while their poses
+    /// are recent enough.
     pub(crate) fn is_wanted(&mut self, note: &mut FrameNote, now: HostTime, is_newest: bool) -> bool {
         let is_rendered = note.cost.is_some();
         self.late_in_a_row = if is_late(note, now) { self.late_in_a_row + 1 } else { 0 };
@@ -83,12 +86,13 @@ impl PackStage {
     }
 }
 
-/// The frame's slot has begun.
+/// True when the frame's slot has begun.
 fn is_late(note: &FrameNote, now: HostTime) -> bool {
     now >= note.timeline.due_at
 }
 
-/// Leaves a frame out whose slot has begun while a newer one waits behind it: after a stall nothing queues up.
+/// Leaves a frame out if its slot has begun while a newer one waits behind it. This keeps frames from queueing after
+/// a stall.
 pub(crate) fn is_overtaken(note: &mut FrameNote, now: HostTime, is_newest: bool) -> bool {
     if note.fate == Fate::UnderWay && !is_newest && is_late(note, now) {
         note.fate = Fate::Overtaken;
@@ -106,7 +110,7 @@ mod tests {
         assert_eq!(times.limit_ns(), 2_000_000_000, "not warm yet");
         let at = |ms: i64| HostTime(ms * 1_000_000);
         for i in 0..40 {
-            // Two in flight: each is under way for 80 ms, of which 40 are its own.
+            // Two in flight: each takes 80 ms, of which 40 are its own.
             let alone = times.finished(at(40 * i), at(40 * i + 80));
             assert!(i == 0 || alone == 40_000_000, "{alone}");
         }

@@ -1,4 +1,4 @@
-//! Which slot the next frame is for, when its poses are read, and when the run has all frames that it was asked for.
+//! Decides which slot the next frame is for, when its poses are read, and when all frames of the run are planned.
 
 use super::facts::{CrewFacts, Facts};
 use super::pace::{modelled_ns, Pace};
@@ -13,21 +13,21 @@ use std::marker::PhantomData;
 use std::sync::atomic::Ordering;
 use std::sync::Arc;
 
-/// Time for which trackers are listened to before the first frame, so that the filters know the motion, nanoseconds.
+/// How long trackers are read before the first frame, so that the filters know the motion, nanoseconds.
 pub(crate) const LISTEN_NS: i64 = 150_000_000;
 
-/// The next frame: its slot, and when its poses are to be read.
+/// The next frame: its slot, and when to read its poses.
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct Latch {
     /// Number of the frame.
     pub id: u64,
-    /// The projector's slot that it is for.
+    /// The projector's slot for this frame.
     pub slot: u64,
-    /// When its poses are to be read.
+    /// When its poses are due to be read, by the lead alone.
     pub at: HostTime,
-    /// When that would have been, had nothing kept the frame from being begun: what is later than this is lateness of this thread.
+    /// The same, but not before the slot was chosen. Reading the poses later than this is lateness of this thread.
     pub due_at: HostTime,
-    /// How long before its slot that is, nanoseconds.
+    /// The lead: how long before the slot `at` is, nanoseconds.
     lead_ns: i64,
 }
 
@@ -45,12 +45,12 @@ pub(crate) struct PlanStage<P> {
 impl<P: Pace> PlanStage<P> {
     /// For a crew that begins at `now`.
     pub(crate) fn new(facts: Arc<Facts>, crew: Arc<CrewFacts>, time: &LinkTime, now: HostTime) -> Self {
-        // What the rig file says that stages cost: nothing is learned of this crew yet.
+        // The stage costs in the rig file, because nothing has been learned about this crew yet.
         let first_ns = modelled_ns(&facts) + P::LISTEN_NS;
         let next_slot = time.slot_after(now.plus_ns(first_ns));
         if facts.options.slots > 0 {
             let end = next_slot.saturating_add(facts.options.slots);
-            // The first crew decides; one that takes over keeps to it.
+            // The first crew decides; a crew that takes over keeps this end.
             let _ = facts.end_slot.compare_exchange(0, end, Ordering::Relaxed, Ordering::Relaxed);
         }
         let horizon = Horizon::of_rig(&facts.rig.config);
@@ -58,7 +58,7 @@ impl<P: Pace> PlanStage<P> {
         Self { facts, crew, horizon, slot_ns, next_slot, last_slot: None, pace: PhantomData }
     }
 
-    /// Everything that the run was asked for is planned.
+    /// True when everything that the run was asked for is planned.
     pub(crate) fn is_complete(&self) -> bool {
         let frames = self.facts.options.frames;
         let end = self.facts.end_slot.load(Ordering::Relaxed);
@@ -70,7 +70,7 @@ impl<P: Pace> PlanStage<P> {
         self.facts.next_frame.load(Ordering::Relaxed)
     }
 
-    /// A GPU that needs a slot or more for a frame gets them one at a time. False while it is busy.
+    /// A GPU that needs about a slot or more for a frame gets frames one at a time. False while it is busy.
     pub(crate) fn may_begin(&self) -> bool {
         !self.is_slow() || self.crew.gpu.in_flight() == 0
     }
@@ -79,7 +79,7 @@ impl<P: Pace> PlanStage<P> {
         self.crew.gpu.is_slow(self.slot_ns)
     }
 
-    /// Chooses the slot of the next frame at `now`. `None` when that lies beyond the end of the run.
+    /// Chooses the slot of the next frame at `now`. `None` if that slot lies beyond the end of the run.
     pub(crate) fn choose_slot(&mut self, time: &LinkTime, now: HostTime) -> Option<Latch> {
         let leads = P::leads(&self.facts, self.is_slow());
         self.next_slot = self.next_slot.max(time.slot_after(now.plus_ns(leads.needed_ns)));
@@ -96,7 +96,7 @@ impl<P: Pace> PlanStage<P> {
         })
     }
 
-    /// Plans the frame of `latch` from the newest tracks, read at `now`.
+    /// Plans the frame of `latch` from the newest tracks, which were read at `now`.
     pub(crate) fn plan(
         &mut self,
         latch: &Latch,
@@ -129,7 +129,7 @@ impl<P: Pace> PlanStage<P> {
         };
     }
 
-    /// The planned frame is on its way to the next stage.
+    /// The planned frame was passed to the next stage.
     pub(crate) fn submitted(&mut self, note: &mut FrameNote, now: HostTime) {
         let slot = note.plan.slot;
         note.timeline.submitted_at = now;
@@ -142,7 +142,7 @@ impl<P: Pace> PlanStage<P> {
         self.next_slot = slot + 1;
     }
 
-    /// Slots from the frame before to one for `slot`.
+    /// Slots from the previous frame to one for `slot`.
     fn stride(&self, slot: u64) -> u64 {
         slot.saturating_sub(self.last_slot.unwrap_or(slot.saturating_sub(1))).clamp(1, 1000)
     }

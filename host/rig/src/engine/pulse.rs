@@ -1,37 +1,38 @@
-//! Heartbeats: every thread of a run says by when it will say again that it is alive, and the supervisor looks whether it did.
+//! Heartbeats: every thread of a run announces by when it will report again, and the supervisor checks that it does.
 
 use dpm_common::realtime::os::Standing;
 use dpm_device::time::HostTime;
 use std::sync::atomic::{AtomicI32, AtomicI64, Ordering};
 
-/// Silence beyond what a thread had announced after which it counts as hung, nanoseconds.
+/// A thread counts as hung when it has been silent for this long beyond its announcement, nanoseconds.
 pub(crate) const HUNG_AFTER_NS: i64 = 100_000_000;
-/// Longest step of the supervisor that counts as observed silence. When the machine itself stood still, all threads did.
+/// The longest step of the supervisor that counts as observed silence. When the machine itself stood still, all
+/// threads did.
 const LONGEST_STEP_NS: i64 = 10_000_000;
 
-/// The heartbeat of one thread. Beating it is one relaxed store.
+/// The heartbeat of one thread. A beat is one relaxed store.
 #[derive(Debug)]
 pub(crate) struct Pulse {
-    /// What to call the thread.
+    /// Name of the thread.
     name: &'static str,
     /// By when it will beat again; `i64::MAX` before it began and after it ended.
     until_ns: AtomicI64,
-    /// Its number for the operating system; 0 before it began.
+    /// Its thread id in the operating system; 0 before it began.
     thread: AtomicI32,
 }
 
 impl Pulse {
-    /// Of a thread that has not begun yet.
+    /// For a thread that has not begun yet.
     pub(crate) const fn new(name: &'static str) -> Self {
         Self { name, until_ns: AtomicI64::new(i64::MAX), thread: AtomicI32::new(0) }
     }
 
-    /// What to call the thread.
+    /// Name of the thread.
     pub(crate) fn name(&self) -> &'static str {
         self.name
     }
 
-    /// The thread whose heartbeat this is, by its number for the operating system, has begun.
+    /// The thread with this id of the operating system has begun.
     pub(crate) fn begin(&self, thread: i32) {
         self.thread.store(thread, Ordering::Relaxed);
     }
@@ -41,7 +42,7 @@ impl Pulse {
         self.until_ns.store(now.0.saturating_add(expected_ns), Ordering::Relaxed);
     }
 
-    /// The thread has ended as it should: nobody waits for its next beat.
+    /// The thread has ended normally; no further beat is expected.
     pub(crate) fn end(&self) {
         self.until_ns.store(i64::MAX, Ordering::Relaxed);
     }
@@ -52,11 +53,12 @@ impl Pulse {
     }
 }
 
-/// Looks up what a thread is doing by its number; `None` where that is not known.
+/// Looks up what a thread is doing by its id; `None` if that is not known.
 pub(crate) type StandingOf = fn(i32) -> Option<Standing>;
 
-/// The supervisor's view of one thread: how long it has been silent beyond what it had announced. Time in which the thread was ready to
-/// run and got no core does not count: a thread that starves is late, not hung. One that runs without an end counts as silent.
+/// The supervisor's view of one thread: how long it has been silent beyond its announcement. Time in which the thread
+/// was ready to run but got no core does not count: a starved thread is late, not hung. A thread in an endless loop
+/// counts as silent.
 #[derive(Clone, Copy, Debug, Default)]
 pub(crate) struct Silence {
     silent_ns: i64,
@@ -64,10 +66,10 @@ pub(crate) struct Silence {
 }
 
 impl Silence {
-    /// Looks at `pulse` at `now`, `step_ns` after the last look. True when its thread is hung.
+    /// Checks `pulse` at `now`, `step_ns` after the last check. True when its thread is hung.
     pub(crate) fn observe(&mut self, pulse: &Pulse, now: HostTime, step_ns: i64, ask: StandingOf) -> bool {
         let overdue = pulse.is_overdue(now);
-        // Only threads in doubt are asked about.
+        // Only overdue threads are looked up.
         let standing = if overdue { ask(pulse.thread.load(Ordering::Relaxed)) } else { None };
         self.step(overdue, step_ns, standing)
     }
@@ -115,7 +117,7 @@ mod tests {
         assert_eq!(silence.silent_ns, LONGEST_STEP_NS);
         let starving = steps(|s| s.step(true, 2 * MS, Some(Standing { ready: true, ran_ns: 5 })));
         assert_eq!(starving, None);
-        // A thread that runs in a circle says nothing, either.
+        // A thread in an endless loop is silent, too.
         let mut ran_ns = 0;
         let circling = steps(|s| {
             ran_ns += 2 * MS;

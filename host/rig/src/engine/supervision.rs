@@ -1,10 +1,11 @@
-//! Who has fallen silent, and what is done about it.
+//! Detects which thread has fallen silent, and decides what to do.
 //!
-//! - A stage of the crew (tracking, plan, pack) that hangs, or a GPU that fails or does not finish: the crew is abandoned, so that nothing it
-//!   still does reaches the light, and a new one is made. The projector is dark meanwhile: every frame says itself from when on.
-//! - The link's thread or the collector hangs: nobody can take its place, so the run ends. The projector goes dark by its watchdog in the
-//!   first case, and is told to in the second.
-//! - A stage panics: a mistake of this program. The run ends in the dark.
+//! - A stage of the crew (tracking, plan, pack) hangs, or a GPU fails or does not finish: the crew is abandoned, so
+//!   that nothing it still does reaches the light, and a new one is made. Meanwhile the projector goes dark, because
+//!   every frame carries the instant at which its light ends.
+//! - The link's thread or the collector hangs: nobody can replace it, so the run ends. In the first case the watchdog
+//!   darkens the projector; in the second case the link does.
+//! - A stage panics: this is a bug. The run ends in the dark.
 
 use super::error::PipelineError;
 use super::facts::Facts;
@@ -14,9 +15,10 @@ use dpm_render::gpu::{AfterLoss, LossBudget};
 use std::sync::atomic::Ordering;
 use std::sync::Arc;
 
-/// How long a new crew may take to be made, nanoseconds: drivers translate shaders for it.
+/// How long it may take to make a new crew, nanoseconds: drivers translate shaders for it.
 const MADE_WITHIN_NS: i64 = 180_000_000_000;
-/// Slots from frame to frame, in thousandths, from which on the operator is told that the renderer is slower than its slots.
+/// The operator is informed that the renderer is slower than its slots from this many slots per frame on, in
+/// thousandths.
 const SLOW_MILLI: u64 = 1_500;
 
 /// What is wrong with a crew.
@@ -24,14 +26,14 @@ const SLOW_MILLI: u64 = 1_500;
 pub(crate) enum Trouble {
     /// A stage does not answer.
     Hung(&'static str),
-    /// A stage panicked: a programmer's mistake.
+    /// A stage panicked, which is a bug.
     Panicked(&'static str),
     /// The GPU failed or does not finish.
     Failed(PipelineError),
 }
 
 impl Trouble {
-    /// Threads of the crew may never return.
+    /// True if threads of the crew may never return.
     fn hangs(&self) -> bool {
         matches!(self, Self::Hung(_) | Self::Failed(PipelineError::GpuHangs { .. }))
     }
@@ -47,7 +49,7 @@ impl Trouble {
         }
     }
 
-    /// What happened, for the operator.
+    /// A description for the operator.
     fn in_words(&self) -> String {
         match self {
             Self::Hung(stage) => format!("the {stage} stage hangs and is abandoned"),
@@ -65,50 +67,51 @@ impl Trouble {
     }
 }
 
-/// How a new crew is to be made.
+/// How to make a new crew.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(crate) enum Remake {
-    /// With the GPU as it is.
+    /// With the same GPU.
     Crew,
-    /// With the GPU opened anew, or another one.
+    /// With the GPU reopened, or another one.
     CrewAndGpu,
 }
 
-/// What is to be done with a crew that is in trouble.
+/// What to do with a crew that is in trouble.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(crate) enum Verdict {
     /// The run ends; the crew ends by itself.
     End,
-    /// The crew is abandoned; `hangs`: its threads may never return. Then a new one is made, or with `None` the run ends.
+    /// The crew is abandoned; its threads may never return if `hangs`. Then a new crew is made, or with `None` the
+    /// run ends.
     Abandon {
         /// Threads are left behind.
         hangs: bool,
-        /// How the next crew is made.
+        /// How to make the next crew.
         remake: Option<Remake>,
     },
 }
 
-/// How the making of a new crew stands.
+/// The state of making a new crew.
 #[derive(Debug)]
 pub(crate) enum Making {
-    /// It goes on.
+    /// It is in progress.
     Waits,
     /// It ended with an error.
     Failed(PipelineError),
-    /// Whoever makes it ended with a panic.
+    /// The thread that makes it panicked.
     Panicked,
 }
 
-/// A thread that nobody can replace hangs.
+/// A thread that cannot be replaced hangs.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(crate) enum Irreplaceable {
-    /// The link's: nobody tells the projector anything any more.
+    /// The link's thread: nobody can send orders to the projector any more.
     Link,
-    /// The collector's, which would return from the run.
+    /// The collector's thread, which would return from the run.
     Collector,
 }
 
-/// The supervisor's mind.
+/// The supervisor's decisions.
 pub(crate) struct Supervision {
     facts: Arc<Facts>,
     losses: LossBudget,
@@ -120,7 +123,7 @@ pub(crate) struct Supervision {
 }
 
 impl Supervision {
-    /// Of a run that begins; `ask` is asked what a thread in doubt is doing.
+    /// For a run that begins. `ask` looks up what an overdue thread is doing.
     pub(crate) fn new(facts: Arc<Facts>, ask: StandingOf) -> Self {
         Self {
             facts,
@@ -133,7 +136,8 @@ impl Supervision {
         }
     }
 
-    /// Looks at the threads that nobody can replace, `step_ns` after the last look, and ends the run when one of them hangs.
+    /// Checks the threads that cannot be replaced, `step_ns` after the last check. Ends the run when one of them
+    /// hangs.
     pub(crate) fn watch(
         &mut self,
         link: &Pulse,
@@ -148,7 +152,8 @@ impl Supervision {
         }
         if self.collector.observe(collector, now, step_ns, self.ask) {
             let hung = PipelineError::Hung { stage: collector.name() };
-            // The link still makes the projector dark; but the thread that would return from the run is the one that hangs.
+            // The link still darkens the projector, but the thread that would return from the run is the one that
+            // hangs.
             self.facts.monitor.give_up(hung.to_string());
             self.facts.fail(hung);
             self.collector = Silence::default();
@@ -157,12 +162,12 @@ impl Supervision {
         None
     }
 
-    /// The crew was found at work at `now`.
+    /// The crew was found working at `now`.
     pub(crate) fn is_well(&self, now: HostTime) {
         self.facts.alive_at_ns.store(now.0, Ordering::Relaxed);
     }
 
-    /// What is to be done with a crew in `trouble`.
+    /// Decides what to do with a crew in `trouble`.
     pub(crate) fn judge(&mut self, trouble: Trouble, now: HostTime) -> Verdict {
         let facts = self.facts.clone();
         if let Trouble::Panicked(_) = trouble {
@@ -179,13 +184,16 @@ impl Supervision {
             facts.fail(PipelineError::KeepsFailing { last: trouble.into_error().to_string() });
             return Verdict::Abandon { hangs, remake: None };
         }
-        facts.monitor.note(format!("{}; the stages are made anew, dark meanwhile", trouble.in_words()));
+        facts.monitor.note(format!(
+            "{}; the stages are restarted, and the projector is dark meanwhile",
+            trouble.in_words()
+        ));
         self.made_by = now.plus_ns(MADE_WITHIN_NS);
         Verdict::Abandon { hangs, remake: Some(remake) }
     }
 
-    /// A new crew is not there yet. True when it is waited for; otherwise the run has ended, and `Making::Waits` means that whoever makes it
-    /// may hang in a driver.
+    /// A new crew is not ready yet. True while the run waits for it. Otherwise the run has ended, and `Making::Waits`
+    /// means that the thread that makes the crew may hang in a driver.
     pub(crate) fn waits_for(&self, making: Making, now: HostTime) -> bool {
         let error = match making {
             Making::Waits if now < self.made_by && !self.facts.monitor.stop_requested() => return true,
@@ -197,7 +205,7 @@ impl Supervision {
         false
     }
 
-    /// Says once when the renderer turns out slower than its slots, and when it is quick again.
+    /// Informs the operator once when the renderer becomes slower than its slots, and when it is fast again.
     fn tell_if_slow(&mut self) {
         let stride = self.facts.stride_milli.load(Ordering::Relaxed);
         let is_slow = stride >= SLOW_MILLI;
@@ -209,12 +217,12 @@ impl Supervision {
         self.facts.monitor.note(if is_slow {
             let every = stride as f64 / 1e3;
             format!(
-                "the renderer is slower than its slots: every {every:.1}th slot gets a frame, {:.1} of {hz:.1} a second; \
+                "the renderer is slower than its slots: one frame per {every:.1} slots, {:.1} of {hz:.1} per second; \
                  a smaller raster, fewer samples (render.spp) or another method make it faster",
                 hz / every
             )
         } else {
-            format!("the renderer keeps up: every slot of {hz:.1} a second gets a frame")
+            format!("the renderer keeps up: each of {hz:.1} slots per second gets a frame")
         });
     }
 }

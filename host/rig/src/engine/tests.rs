@@ -1,4 +1,4 @@
-//! The engine under a clock that the test moves: no thread runs, nobody sleeps.
+//! Tests of the engine under a clock that the test moves. No thread runs, and nobody sleeps.
 
 use super::connect::Connecting;
 use super::error::PipelineError;
@@ -36,7 +36,7 @@ fn rig(flags: &[&str]) -> Arc<Rig> {
     Arc::new(Rig::build(&config, Raster::new(16, 16)).unwrap_or_else(|e| panic!("{e}")))
 }
 
-/// A rig whose link to a mock is up, and the time.
+/// A rig whose link to a mock is up, and the current time.
 struct Bench {
     facts: Arc<Facts>,
     crew: Arc<CrewFacts>,
@@ -83,7 +83,7 @@ impl Bench {
         LinkStage::new(self.facts.clone(), link, keeper, self.lead.clone())
     }
 
-    /// Plans the next frame at the instant at which it wants to be planned.
+    /// Plans the next frame at the instant that planning asks for.
     fn planned<P: Pace>(&mut self, stage: &mut PlanStage<P>) -> Option<Box<FrameNote>> {
         let latch = stage.choose_slot(&self.time, self.now)?;
         self.now = self.now.max(latch.at);
@@ -152,7 +152,7 @@ fn a_run_by_slots_ends_at_its_last_slot_whether_frames_made_it_or_not() {
         last = note.plan.slot;
     }
     assert_eq!(last, first + 99);
-    // A crew that takes over keeps to the same end.
+    // A crew that takes over keeps the same end.
     assert!(bench.plan::<Real>().choose_slot(&bench.time, bench.now).is_none());
 }
 
@@ -161,7 +161,7 @@ fn at_virtual_pace_a_frame_is_latched_as_early_as_the_rig_file_says_that_its_sta
     let mut bench = bench(&[], RunOptions { frames: 20, ..RunOptions::default() });
     let mut stage = bench.plan::<Virtual>();
     let costs: i64 = bench.facts.modelled_costs().iter().sum();
-    // Whatever was learned of real time has no say.
+    // What was learned at real pace has no effect.
     bench.facts.lead_ns.store(123 * MS, Ordering::Relaxed);
     while let Some(note) = bench.planned(&mut stage) {
         let lead_ns = note.timeline.due_at.ns_since(note.timeline.latched_at);
@@ -180,7 +180,7 @@ fn packing_leaves_out_what_a_newer_frame_has_overtaken_but_shows_a_slow_gpus_lat
     assert!(stage.is_wanted(&mut note, due, true), "late, and the newest there is");
     assert!(!stage.is_wanted(&mut note, due, false));
     assert_eq!(note.fate, Fate::Overtaken);
-    // Rendered frames that are late one after the other are no stall, from the fifth of four in flight on.
+    // Consecutive late rendered frames are not a stall, from the fifth on with four in flight.
     let wanted: Vec<bool> = (0..8)
         .map(|_| {
             let mut note = bench.planned(&mut plan).expect("no end");
@@ -189,11 +189,12 @@ fn packing_leaves_out_what_a_newer_frame_has_overtaken_but_shows_a_slow_gpus_lat
             stage.is_wanted(&mut note, late, false)
         })
         .collect();
-    // The two late ones above count.
+    // The two late frames above count.
     assert_eq!(wanted, [false, false, true, true, true, true, true, true]);
 }
 
-/// A frame waits for a buffer of the projector, but not beyond the beginning of its slot; one that is overtaken or too old is not sent.
+/// A frame waits for a buffer of the projector, but not beyond the beginning of its slot. A frame that is overtaken
+/// or too old is not sent.
 #[test]
 fn a_frame_waits_for_room_until_its_slot_begins() {
     let mut bench = bench(&[], RunOptions::default());
@@ -201,12 +202,13 @@ fn a_frame_waits_for_room_until_its_slot_begins() {
     let mut stage = bench.link();
     let schedule = bench.facts.rig.config.projector.schedule();
     let planes = BitPlaneFrame::new(bench.facts.rig.camera.raster, schedule);
-    // The mock holds one frame beside the one that it shows: the second finds no room before the first is lit.
+    // The mock holds one frame besides the one on its mirrors, so the second frame finds no room before the first is
+    // lit.
     let begin = bench.now;
     let mut first = bench.planned(&mut plan).expect("no end");
     let at = bench.now;
     for ms in 0..at.ns_since(begin) / MS {
-        // The watchdog wants to hear of the host.
+        // The watchdog needs to hear from the host.
         stage.poll(begin.plus_ns(ms * MS), &mut bench.cable);
     }
     assert_eq!(stage.offer(at, &mut first, planes.bytes(), true, &mut bench.cable), Offer::Settled);
@@ -223,12 +225,12 @@ fn a_frame_waits_for_room_until_its_slot_begins() {
     }
     assert!(waits > 0 && second.is_sent(), "{waits} waits, {:?}", second.fate);
     assert!(now >= first.timeline.due_at, "the first frame made room when it was lit");
-    // Overtaken: its slot has begun and a newer one waits.
+    // Overtaken: its slot has begun, and a newer frame waits.
     let mut third = bench.planned(&mut plan).expect("no end");
     let late = third.timeline.due_at.plus_ns(MS);
     assert_eq!(stage.offer(late, &mut third, planes.bytes(), false, &mut bench.cable), Offer::Settled);
     assert_eq!(third.fate, Fate::Overtaken);
-    // Too old when it would be lit.
+    // It would be too old when lit.
     let mut fourth = bench.planned(&mut plan).expect("no end");
     let old_ns = fourth.plan.predict_ns + bench.slot_ns + 1;
     (fourth.plan.is_lit, fourth.plan.captured_at) = (true, late.plus_ns(-old_ns));
@@ -292,7 +294,7 @@ fn a_panic_and_a_failure_at_the_end_are_not_made_good() {
     let mut mind = supervision(&bench.facts);
     assert_eq!(mind.judge(Trouble::Panicked("plan"), HostTime(0)), Verdict::End);
     assert!(matches!(bench.facts.take_error(), Some(PipelineError::Panicked("plan"))));
-    // The run was asked to stop by that: no crew is made any more.
+    // The first failure requested a stop, so no further crew is made.
     let verdict = mind.judge(Trouble::Hung("plan"), HostTime(MS));
     assert_eq!(verdict, Verdict::Abandon { hangs: true, remake: None });
 }

@@ -1,7 +1,8 @@
-//! One frame on its way: what travels from thread to thread. Boxed once, recycled for ever.
+//! A frame in progress: what travels from thread to thread. It is boxed once and recycled.
 //!
-//! A frame is a big piece of memory and a small note. The memory goes straight back to planning when the link is done with it, so that few
-//! of them go round and stay in the caches; the note goes on to the collector, which may be slow.
+//! A frame consists of a large block of memory and a small note. The memory returns to planning as soon as the link
+//! has finished with it, so that a few blocks circulate and stay in the caches. The note goes on to the collector,
+//! which may be slow.
 
 use crate::frame::FrameTimeline;
 use crate::plan::frame::FramePlan;
@@ -14,30 +15,31 @@ use dpm_render::{FrameCost, FrameSlot};
 /// What became of a frame on the host.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub(crate) enum Fate {
-    /// Still under way.
+    /// Still in progress.
     #[default]
     UnderWay,
-    /// Its slot had begun and a newer frame was waiting behind it: left out, so that nothing queues up after a stall.
+    /// Left out: its slot had begun, and a newer frame was waiting behind it. This keeps frames from queueing after a
+    /// stall.
     Overtaken,
-    /// Its poses would have been older than `predict_ms` and one slot when it was lit: not sent.
+    /// Not sent: when lit, its poses would have been older than `predict_ms` plus one slot.
     TooOld,
-    /// It was still under way when the projector had been told to go dark.
+    /// It was still in progress when the projector was ordered to go dark.
     Stopped,
-    /// The link took it or did not.
+    /// It was handed to the link; this is the link's answer.
     Offered(SendOutcome),
 }
 
-/// A frame without its memory: what was planned and what happened to it.
+/// A frame without its memory: its plan, and what happened to it.
 pub(crate) struct FrameNote {
-    /// What it is to show, where and when.
+    /// What it shows, where and when.
     pub plan: FramePlan,
-    /// Planning waited for memory: a later stage held all of it.
+    /// Planning waited for memory, because a later stage held all of it.
     pub waited_for_memory: bool,
     /// When it should have been latched.
     pub latch_due_at: HostTime,
-    /// Stamps.
+    /// Its stamps.
     pub timeline: FrameTimeline,
-    /// What the GPU said about it; `None` when frames are prepared instead of rendered.
+    /// The GPU's statistics; `None` when frames are prepared instead of rendered.
     pub cost: Option<FrameCost>,
     /// Hash of the code values, to be compared with the light.
     pub code_hash: u64,
@@ -59,13 +61,13 @@ impl FrameNote {
         }
     }
 
-    /// Time that the GPU worked on it, nanoseconds; `None` where the device has no time stamps.
+    /// GPU time of the frame, nanoseconds; `None` if the device has no time stamps.
     pub(crate) fn gpu_ns(&self) -> Option<i64> {
         let ns: u64 = self.cost?.pass_ns.iter().sum();
         i64::try_from(ns).ok().filter(|&ns| ns > 0)
     }
 
-    /// True when the link took it.
+    /// True if the link accepted it.
     pub(crate) fn is_sent(&self) -> bool {
         self.fate == Fate::Offered(SendOutcome::Sent)
     }
@@ -81,9 +83,9 @@ pub(crate) struct FrameMemory {
 
 /// A frame and its memory.
 pub(crate) struct FrameJob {
-    /// Who it is.
+    /// The note.
     pub note: Box<FrameNote>,
-    /// Where it is.
+    /// The memory.
     pub memory: Box<FrameMemory>,
 }
 

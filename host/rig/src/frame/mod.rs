@@ -1,7 +1,8 @@
 //! A frame's identity and the stamps that travel with it from motion to light.
 //!
-//! At real pace the stamps are readings of the host's clock. At virtual pace they are the rig's clock, advanced by the modelled cost
-//! of each stage, so that a run repeats bit for bit; what the stages really took is kept apart in [`FrameTimeline::wall_ns`].
+//! At real pace the stamps are readings of the host's clock. At virtual pace they are readings of the rig's own
+//! clock, which advances by the modelled cost of each stage, so that a run repeats bit for bit. The measured times of
+//! the stages are kept apart in [`FrameTimeline::wall_ns`].
 
 pub(crate) mod job;
 pub(crate) mod slots;
@@ -14,23 +15,23 @@ pub(crate) const STAGES: [&str; 5] = ["plan", "render", "pack", "link", "light"]
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 #[repr(usize)]
 pub(crate) enum Stage {
-    /// Poses latched and predicted, uniforms written.
+    /// Latching and predicting poses, writing uniforms.
     Plan = 0,
-    /// Submission to the fence.
+    /// From submission to the fence.
     Render = 1,
-    /// Code values to bit planes.
+    /// From code values to bit planes.
     Pack = 2,
-    /// Bit planes to the transport.
+    /// From bit planes to the transport.
     Link = 3,
-    /// The mock projector's own work (receiving, checking, integrating); not part of a real rig.
+    /// The mock projector's own work (receiving, checking, integrating). It is not part of a real rig.
     Light = 4,
 }
 
-/// One stamp per boundary, host's clock, in the order in which they happen.
+/// One stamp per boundary, on the host's clock, in the order in which they happen.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub struct FrameTimeline {
-    /// Mid-exposure of the newest tracker sample that the frame used; the oldest among its lit bodies. Equal to `due_at`, as
-    /// `received_at` then is too, in a frame without any sample.
+    /// Mid-exposure of the newest tracker sample that the frame used; of the lit bodies, the one whose newest sample
+    /// is oldest. In a frame without any sample this and `received_at` equal `due_at`.
     pub captured_at: HostTime,
     /// When that sample reached the process.
     pub received_at: HostTime,
@@ -38,13 +39,13 @@ pub struct FrameTimeline {
     pub latched_at: HostTime,
     /// When the GPU was started.
     pub submitted_at: HostTime,
-    /// When the code values were there.
+    /// When the code values were available.
     pub rendered_at: HostTime,
-    /// When cutting them into bit planes began.
+    /// When packing into bit planes began.
     pub packing_at: HostTime,
-    /// When the bit planes were there.
+    /// When the bit planes were available.
     pub packed_at: HostTime,
-    /// When the transport had taken them.
+    /// When the transport had accepted them.
     pub sent_at: HostTime,
     /// When the frame's slot was due to start.
     pub due_at: HostTime,
@@ -60,12 +61,12 @@ pub struct FrameTimeline {
 }
 
 impl FrameTimeline {
-    /// True when a tracker's sample went into the frame, so that it makes sense to count from its exposure.
+    /// True if the frame used a tracker sample, so that intervals from its exposure are meaningful.
     pub(crate) fn has_sample(&self) -> bool {
         (self.captured_at, self.received_at) != (self.due_at, self.due_at)
     }
 
-    /// Takes away what the frame has of a sample: no light came of it.
+    /// Removes the sample's stamps, because no light resulted from the sample.
     pub(crate) fn without_sample(mut self) -> Self {
         (self.captured_at, self.received_at) = (self.due_at, self.due_at);
         self

@@ -1,7 +1,8 @@
 //! Why a slot got no frame of its own.
 //!
-//! A stall never shifts the phase: what was missed is counted by cause, and the next frame is for the next slot that can still be met.
-//! A slot in which the dark (or the stillness) was ordered is not missed: it has a reason of its own.
+//! A stall never shifts the phase. Missed slots are counted by cause, and the next frame is planned for the next slot
+//! that it can still meet. A slot in which darkness (or a still picture) was ordered is not a missed slot; it has its
+//! own reason.
 
 /// Why a slot got no frame of its own.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Hash)]
@@ -12,9 +13,9 @@ pub(crate) enum MissCause {
     Render,
     /// Packing took too long.
     Pack,
-    /// The link or the device took no frame, or nothing is known of the slot.
+    /// The link or the device accepted no frame, or nothing is known about the slot.
     Link,
-    /// No memory for another frame in flight: a later stage holds all buffers.
+    /// There was no memory for another frame, because a later stage held all buffers.
     Buffers,
     /// The machine itself stood still.
     Standstill,
@@ -50,9 +51,9 @@ pub(crate) enum OrderedDark {
     Safe,
     /// A rest that a limit on light demands, for example the limit on flashes.
     Rest,
-    /// The interlock is open: light is not allowed.
+    /// The interlock is open, so light is not allowed.
     Interlock,
-    /// The projector has a fault that waits for the operator: heat, lamp, emergency stop, flashes.
+    /// The projector has a fault that requires the operator: heat, lamp, emergency stop, flashes.
     Fault,
     /// The run was asked to end.
     Stop,

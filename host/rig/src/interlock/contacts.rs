@@ -1,4 +1,5 @@
-//! `[safety.interlock]` into something that can be asked: processes, control lines, files, held keys. What cannot be read is open.
+//! The contacts of `[safety.interlock]`: processes, control lines, files, held keys. A contact that cannot be read
+//! counts as open.
 
 use super::{Contact, Shared};
 use crate::config::InterlockConfig;
@@ -11,14 +12,14 @@ use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::time::{Duration, Instant, SystemTime};
 
-/// A process that is not there, and a port that cannot be opened, are looked for this often.
+/// How often to look for a missing process, and for a port that cannot be opened.
 const LOOK_EVERY: Duration = Duration::from_millis(100);
-/// Longest name of a process that the kernel keeps.
+/// The longest process name that the kernel keeps.
 const COMM_BYTES: usize = 15;
-/// Most bytes of a file that are read.
+/// The maximum number of bytes read from a file.
 const MOST_BYTES: u64 = 4096;
 
-/// The contact of a configuration that names one.
+/// The contact that a configuration names.
 pub(super) fn of(config: &InterlockConfig, shared: &Arc<Shared>) -> Box<dyn Contact> {
     match config {
         InterlockConfig::None(_) => Box::new(Nothing),
@@ -50,7 +51,7 @@ impl Contact for Nothing {
     }
 }
 
-/// Reads a small file without ever waiting for a writer of a named pipe.
+/// Reads a small file. Never waits for the writer of a named pipe.
 fn read_small(path: &Path) -> Option<(Vec<u8>, std::fs::Metadata)> {
     let file =
         OpenOptions::new().read(true).custom_flags(libc::O_NONBLOCK | libc::O_CLOEXEC).open(path).ok()?;
@@ -60,7 +61,7 @@ fn read_small(path: &Path) -> Option<(Vec<u8>, std::fs::Metadata)> {
     Some((bytes, meta))
 }
 
-/// A process: its number, and when it was started, which tells it from a later one of the same number.
+/// A process: its id, and its start time, which distinguishes it from a later process with the same id.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(super) struct Process {
     id: u32,
@@ -68,7 +69,7 @@ pub(super) struct Process {
 }
 
 impl Process {
-    /// The process `id`, if it runs and belongs to this user or to root.
+    /// The process `id`, if it is running and belongs to this user or to root.
     pub(super) fn find(id: u32) -> Option<Self> {
         let (stat, meta) = read_small(Path::new(&format!("/proc/{id}/stat")))?;
         // The owner of these files is the effective user of the process.
@@ -76,13 +77,13 @@ impl Process {
             return None;
         }
         let stat = String::from_utf8_lossy(&stat);
-        // The name in parentheses may itself hold parentheses and spaces.
+        // The name in parentheses may itself contain parentheses and spaces.
         let mut fields = stat.rsplit_once(')')?.1.split_whitespace();
-        // Stopped, traced, dead: whoever is so says nothing.
+        // A stopped, traced or dead process does not count as alive.
         if matches!(fields.next()?, "T" | "t" | "Z" | "X" | "x") {
             return None;
         }
-        // The state is field 3 of the line, the start field 22.
+        // The state is field 3 of the line, the start time is field 22.
         Some(Self { id, started: fields.nth(18)?.parse().ok()? })
     }
 
@@ -91,7 +92,7 @@ impl Process {
     }
 }
 
-/// This process's user, as the kernel shows it.
+/// This process's user, as reported by the kernel.
 fn own_user() -> u32 {
     std::fs::metadata("/proc/self").map_or(u32::MAX, |m| m.uid())
 }
@@ -135,10 +136,10 @@ impl Contact for ByName {
     }
 }
 
-/// The process whose number a file holds.
+/// The process whose id a file contains.
 struct ByPidFile {
     file: PathBuf,
-    /// What the file said, when it was written, and who that was then.
+    /// The id in the file, when the file was written, and which process that was then.
     seen: Option<(u32, Option<SystemTime>, Process)>,
 }
 
@@ -154,7 +155,7 @@ impl Contact for ByPidFile {
         let Some(process) = Process::find(id) else { return false };
         let written = meta.modified().ok();
         match self.seen {
-            // Another process has got the number since the file was written.
+            // The file is unchanged, so the process must be the same; otherwise another process has got the id.
             Some((same, at, first)) if same == id && at == written => process == first,
             _ => {
                 self.seen = Some((id, written, process));
@@ -181,7 +182,7 @@ impl Contact for Line {
         }
         match self.open.as_mut().map(ControlLine::is_raised) {
             Some(Ok(raised)) => raised,
-            // Unplugged; opened again when it is back.
+            // Unplugged; reopened when it is back.
             Some(Err(_)) => {
                 self.open = None;
                 false
@@ -191,7 +192,7 @@ impl Contact for Line {
     }
 }
 
-/// A file that holds "1".
+/// A file that contains "1".
 struct One(PathBuf);
 
 impl Contact for One {
@@ -200,7 +201,7 @@ impl Contact for One {
     }
 }
 
-/// The key that [`super::Interlock::key_pressed`] is told of.
+/// The key that is passed to [`super::Interlock::key_pressed`].
 struct Key(Arc<Shared>);
 
 impl Contact for Key {

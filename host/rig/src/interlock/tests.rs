@@ -17,7 +17,8 @@ fn of(config: InterlockConfig) -> Interlock {
     Interlock::of_config(&config, true).unwrap().unwrap()
 }
 
-/// Waits until the interlock is as said; the time that this thread was served meanwhile: a sleep of a millisecond counts as two at most.
+/// Waits until the interlock has the given state. Returns the time that this test's thread was served meanwhile: a
+/// sleep of a millisecond counts as two at most.
 fn becomes(interlock: &Interlock, closed: bool) -> Duration {
     let (begin, mut served) = (Instant::now(), Duration::ZERO);
     while interlock.is_closed() != closed {
@@ -58,17 +59,17 @@ fn a_process_closes_it_while_it_lives_and_runs() {
     std::fs::write(&file, format!("{}\n", child.id())).unwrap();
     becomes(&interlock, true);
     stays(&interlock, true);
-    // A process that is stopped cannot say anything.
+    // A stopped process cannot confirm anything.
     signal(&child, "-STOP");
     assert!(becomes(&interlock, false) < Duration::from_millis(50));
     signal(&child, "-CONT");
     becomes(&interlock, true);
-    // Killed, and not even buried: a zombie does not live.
+    // Killed but not yet reaped: a zombie does not count as alive.
     child.kill().unwrap();
     assert!(becomes(&interlock, false) < Duration::from_millis(50));
     child.wait().unwrap();
     stays(&interlock, false);
-    // Another one, with the file written anew.
+    // Another process, with the file rewritten.
     let mut child = sleeper();
     std::fs::write(&file, child.id().to_string()).unwrap();
     becomes(&interlock, true);
@@ -81,7 +82,7 @@ fn a_process_closes_it_while_it_lives_and_runs() {
 
 #[test]
 fn a_process_is_found_by_its_name_and_looked_for_again() {
-    // A name that only this test has: the program under another file name.
+    // A process name that only this test uses: the program under another file name.
     let dir = folder("name");
     let program = dir.join(format!("dg{}", std::process::id()));
     std::os::unix::fs::symlink("/bin/sleep", &program).unwrap();
@@ -117,7 +118,7 @@ fn a_file_closes_it_while_it_holds_a_one() {
     }
     std::fs::remove_file(&file).unwrap();
     becomes(&interlock, false);
-    // A pipe that nobody writes to, and a folder: nothing hangs, nothing is closed.
+    // A pipe without a writer, and a folder: nothing hangs, and nothing counts as closed.
     assert!(Command::new("mkfifo").arg(&file).status().unwrap().success());
     stays(&interlock, false);
     drop(interlock);
@@ -139,7 +140,7 @@ fn a_key_closes_it_while_it_repeats() {
     let interlock = of(InterlockConfig::Key(key.clone()));
     assert!(!interlock.key_pressed(b'x'), "another key");
     assert!(interlock.key_pressed(b' '));
-    // Once is a touch, not a hold: a keyboard repeats after half a second only.
+    // One press is not a hold. A keyboard starts to repeat only after half a second.
     stays(&interlock, false);
     let mut was_closed = false;
     for _ in 0..30 {
@@ -149,13 +150,13 @@ fn a_key_closes_it_while_it_repeats() {
     }
     assert!(was_closed);
     becomes(&interlock, false);
-    // Without a terminal it is refused, with what else there is.
+    // Without a terminal it is refused, and the message names the alternatives.
     let told = Interlock::of_config(&InterlockConfig::Key(key), false).unwrap_err().to_string();
     assert!(told.contains("safety.interlock") && told.contains("terminal"), "{told}");
     assert!(Interlock::of_config(&InterlockConfig::None(NoInterlockConfig {}), false).unwrap().is_none());
 }
 
-/// Closed; hangs or panics when it is told to.
+/// A contact that is closed, and hangs or panics on request.
 struct Fails(Arc<AtomicI64>);
 
 impl Contact for Fails {

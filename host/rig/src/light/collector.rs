@@ -1,4 +1,5 @@
-//! Finished frames and light into a report. Runs on its own thread, off the frame path: it may allocate.
+//! Combines finished frames and light into a report. It runs on its own thread beside the frame path, so it may
+//! allocate.
 
 use crate::config::{Pace, ProjectorBackend, TrackerConfig};
 use crate::frame::job::{Fate, FrameNote};
@@ -30,10 +31,11 @@ use hdrhistogram::Histogram;
 use std::collections::VecDeque;
 use std::sync::Arc;
 
-/// Sent frames that may wait for their light; beyond this the oldest count as never lit, once no light is left to look at.
+/// Sent frames that may wait for their light. Beyond this number the oldest count as never lit, once no unread light
+/// is left.
 const MAX_PENDING: usize = 256;
 
-/// What is kept of one lit frame for pictures.
+/// The record of one lit frame, kept for pictures.
 #[derive(Clone, Debug)]
 pub struct FrameRecord {
     /// Which frame.
@@ -42,13 +44,13 @@ pub struct FrameRecord {
     pub slot: u64,
     /// Its stamps.
     pub timeline: FrameTimeline,
-    /// world-from-body of the tracked bodies that it was drawn for.
+    /// world-from-body of the tracked bodies for which it was drawn.
     pub tracked_poses: Vec<DAffine3>,
     /// The same without prediction.
     pub sampled_poses: Vec<DAffine3>,
-    /// Why no light fell on each tracked body; `None` where it did.
+    /// Per tracked body: why no light fell on it; `None` if light fell on it.
     pub dark: Vec<Option<DarkCause>>,
-    /// Eye, world.
+    /// The eye in world coordinates.
     pub eye: DVec3,
     /// Hash of its code values.
     pub code_hash: u64,
@@ -56,9 +58,9 @@ pub struct FrameRecord {
     pub pass_ns: [u64; PASSES.len()],
 }
 
-/// Where the collector finds what it counts.
+/// The inputs of the collector.
 pub(crate) struct Inbox {
-    /// Frames that the link is done with.
+    /// Frames that the link has finished with.
     pub done: Receiver<Box<FrameNote>>,
     /// What the projector did in each slot.
     pub lights: Receiver<LightNote>,
@@ -67,7 +69,7 @@ pub(crate) struct Inbox {
 /// Counts and distributions of a run.
 pub(crate) struct Collector {
     rig: Arc<Rig>,
-    /// Light of a frame that the link has not said yet that it sent.
+    /// Light of a frame that the link has not yet reported as sent.
     held: Option<LightNote>,
     meter: RegistrationMeter,
     placement: Placement,
@@ -76,44 +78,44 @@ pub(crate) struct Collector {
     pub recent: VecDeque<FrameRecord>,
     keep: usize,
     verify: bool,
-    /// Frames are prepared: their light does not depend on what the tracker sees.
+    /// Frames are prepared, so their light does not depend on what the tracker sees.
     prepared: bool,
-    /// Something is lit that no tracker tells of.
+    /// Something is lit that is not tracked.
     has_still_light: bool,
     dark_bodies: DarkBodies,
     lit: u64,
     /// Lit frames in which every body was dark.
     dark: u64,
     dropped: u64,
-    /// Frames not lit because no new picture was wanted.
+    /// Frames that were not lit because no new picture was wanted.
     withheld: u64,
     late: u64,
     repeated: u64,
     too_old: u64,
-    /// Slots without a frame of their own.
+    /// What happened in each slot.
     pub slots: SlotLedger,
-    /// Lit frames with parts of another (looked for in prepared frames only).
+    /// Lit frames with parts of another frame (checked for prepared frames only).
     pub torn: u64,
     /// Frames lit after a newer one, or twice.
     pub reordered: u64,
     last_lit: Option<u32>,
-    /// The newest frame that the link is done with, low 32 bits.
+    /// The newest frame that the link has finished with, low 32 bits.
     newest: Option<u32>,
-    /// Slots in which the frame before was shown again, until the last planned one is known to be later.
+    /// Slots in which the previous frame was repeated. They wait until a later slot is known to be planned.
     repeats: VecDeque<u64>,
-    /// The last planned slot of the frames that the link is done with.
+    /// The last planned slot among the frames that the link has finished with.
     last_planned: Option<u64>,
-    /// Lit frames whose light was not what was rendered.
+    /// Lit frames whose light differed from what was rendered.
     pub light_mismatches: u64,
     /// Intervals of every lit frame.
     pub profiler: Profiler,
-    /// The last lit frames, for a trace, oldest first.
+    /// The last lit frames for a trace, oldest first.
     pub traced: VecDeque<TracedFrame>,
     trace_frames: usize,
     registration: Histogram<u64>,
-    /// The same of the frames that were lit in their own slot.
+    /// The same for frames that were lit in their own slot.
     registration_in_time: Histogram<u64>,
-    /// True beginning of a slot, as the mock in this process saw it, less what the host took it for.
+    /// True beginning of a slot, as observed by the mock in this process, minus the host's estimate.
     clock_error: SignedHistogram,
     unpredicted: Histogram<u64>,
     stages: Vec<Histogram<u64>>,
@@ -127,7 +129,8 @@ pub(crate) struct Collector {
     invalid_samples: u64,
 }
 
-/// Frames in a trace, the last ones of a run: half a minute at 947 fps, some 60 MB; viewers do not like more.
+/// Number of frames in a trace, the last ones of a run: half a minute at 947 fps, about 60 MB. Viewers cannot handle
+/// much more.
 const MAX_TRACED: usize = 30_000;
 
 /// Registration is counted in millionths of a pixel.
@@ -138,11 +141,11 @@ fn histogram() -> Histogram<u64> {
 }
 
 impl Collector {
-    /// Keeps the last `keep` lit frames; `verify`: compares hashes of code values and light.
+    /// Keeps the last `keep` lit frames. `verify`: compares hashes of code values and light.
     pub(crate) fn new(rig: Arc<Rig>, keep: usize, verify: bool) -> Self {
         let meter = RegistrationMeter::new(&rig);
         let measured = rig.config.real_time.pace == Pace::Real;
-        // A tenth of a known run, but enough frames for a 99th percentile.
+        // A tenth of a run of known length, but enough frames for a 99th percentile.
         let frames = rig.config.run.frames.max(rig.config.slots_to_run());
         let batch_frames = (frames / 10).clamp(100, 10_000);
         let is_mock_tracker = matches!(rig.config.tracker, TrackerConfig::Mock(_));
@@ -197,7 +200,8 @@ impl Collector {
         }
     }
 
-    /// Says that frames are prepared, and what is seen of the machine's standstills. To be called before the first frame.
+    /// States whether frames are prepared, and gives access to the machine's standstills. Call it before the first
+    /// frame.
     pub(crate) fn about(mut self, prepared: bool, standstills: Option<Arc<SeenStandstills>>) -> Self {
         self.prepared = prepared;
         if let Some(seen) = standstills {
@@ -206,9 +210,9 @@ impl Collector {
         self
     }
 
-    /// The run is over and everything is known: what became of every slot.
+    /// The run is over and everything is known. Returns what happened in every slot.
     pub(crate) fn finish(&mut self, monitor: &RunMonitor) -> SlotCounts {
-        // What was sent and never lit is dropped.
+        // Frames that were sent but never lit count as dropped.
         while !self.pending.is_empty() {
             self.drop_oldest(monitor);
         }
@@ -216,8 +220,9 @@ impl Collector {
         self.slots.finish()
     }
 
-    /// Takes the frames that the link is done with, and light, as far as they have come; gives the notes back to `free`. `alive` is called for
-    /// every note: a long backlog on a busy machine takes seconds. True when both are over.
+    /// Reads the frames that the link has finished with, and their light, as far as both have arrived. Returns the
+    /// notes to `free`. Calls `alive` for every note, because a long backlog takes seconds on a busy machine. True
+    /// when both inputs have ended.
     pub(crate) fn look(
         &mut self,
         inbox: &mut Inbox,
@@ -225,16 +230,16 @@ impl Collector {
         monitor: &RunMonitor,
         alive: &mut dyn FnMut(),
     ) -> bool {
-        // Asked before looking: what came before the end is taken first.
+        // Checked before reading: what arrived before the end must be read first.
         let over = inbox.done.is_finished() && inbox.lights.is_finished();
         self.slots.read_orders(monitor.dark());
         loop {
             let light = self.held.take().or_else(|| inbox.lights.try_pop());
-            // After the light was taken: of the frames before it all has been said.
+            // Read after the light: all frames before that light have been reported by then.
             self.take_finished(&mut inbox.done, free, monitor, alive);
-            // Lit before the link's thread came to say that it was sent.
+            // The frame was lit, but the link's thread has not reported it as sent yet.
             let unknown = |f: u32| self.newest.is_none_or(|n| frame_newer(f, n));
-            // Or in a slot that those still to be taken were planned for.
+            // Or its slot is later than the slots of frames that are still to be read.
             let ahead =
                 |slot: u64| !inbox.done.is_empty() && self.last_planned.is_none_or(|last| last < slot);
             match light {
@@ -246,7 +251,7 @@ impl Collector {
                     if self.pending.len() < MAX_PENDING || inbox.done.is_empty() {
                         break;
                     }
-                    // Frames are finished behind as many that no light is told of.
+                    // More frames are waiting than may wait, and there is no light for the oldest.
                     self.drop_oldest(monitor);
                 }
             }
@@ -257,8 +262,8 @@ impl Collector {
         over
     }
 
-    /// Takes finished frames until no more can wait for their light: what they wait for is looked at before others are taken, however long
-    /// this thread stood still.
+    /// Reads finished frames until no more may wait for their light. Light is checked before more frames are read,
+    /// however long this thread stood still.
     fn take_finished(
         &mut self,
         done: &mut Receiver<Box<FrameNote>>,
@@ -280,7 +285,8 @@ impl Collector {
         }
     }
 
-    /// A frame will never be lit: nobody wanted it, or it is dropped. What was under way when the run ended is dropped.
+    /// Counts a frame that will never be lit: it was not wanted, or it was dropped. Frames in flight at the end of
+    /// the run count as dropped.
     fn count_unlit(&mut self, timeline: &FrameTimeline, monitor: &RunMonitor) {
         match self.slots.ordered_dark(timeline.due_at) {
             None | Some(OrderedDark::Stop) => {
@@ -309,7 +315,7 @@ impl Collector {
         }
     }
 
-    /// No light fell anywhere although the frame was lit.
+    /// True if the frame was lit but its light fell nowhere.
     fn is_dark(&self, record: &FrameRecord) -> bool {
         let nothing_tracked = record.dark.is_empty() || record.dark.iter().any(Option::is_none);
         !self.prepared && !self.has_still_light && !nothing_tracked
@@ -327,13 +333,14 @@ impl Collector {
         self.nan_values += u64::from(c.nan_values);
         self.invalid_samples += u64::from(c.invalid_samples);
         for (histogram, &ns) in self.passes.iter_mut().zip(&cost.pass_ns) {
-            // 0: the pass was left out of this frame, or the device has no time stamps. It is no measurement.
+            // 0 is not a measurement: the frame skipped the pass, or the device has no time stamps.
             if ns > 0 {
                 histogram.saturating_record(ns);
             }
         }
         for stage in [Stage::Plan, Stage::Render, Stage::Pack, Stage::Link] {
-            // 0: the frame was left out before this stage, or there is no such stage: prepared frames are not rendered.
+            // 0: the frame was left out before this stage, or there is no such stage (prepared frames are not
+            // rendered).
             let ns = job.timeline.wall_ns[stage as usize];
             if ns > 0 {
                 self.stages[stage as usize].saturating_record(ns);
@@ -383,7 +390,7 @@ impl Collector {
                 if self.last_planned.is_some_and(|last| slot < last) {
                     self.repeated += 1;
                 } else if self.repeats.len() < MAX_PENDING {
-                    // After the last frame the projector repeats it until it is told to stop: no fault.
+                    // After the last frame the projector repeats it until it is ordered to stop. That is not a fault.
                     self.repeats.push_back(slot);
                 }
             }
@@ -394,11 +401,11 @@ impl Collector {
                 self.reordered += u64::from(self.last_lit.is_some_and(|last| !frame_newer(frame, last)));
                 self.last_lit = Some(frame);
                 let Some(at) = self.pending.iter().position(|r| r.id.0 as u32 == frame) else {
-                    // Given up for dropped long ago: whose slot this was, it was not this frame's.
+                    // The frame was counted as dropped long ago, so this slot does not count as its own.
                     self.slots.nothing_new(slot, begin, note.unseen);
                     return;
                 };
-                // Frames before it were lit without being told one by one, or overtaken and will never be lit.
+                // Earlier frames were lit without a report of their own, or were overtaken and will never be lit.
                 for k in 0..at {
                     if k >= note.unseen as usize {
                         self.drop_oldest(monitor);
@@ -425,7 +432,7 @@ impl Collector {
                 }
                 self.measure_registration(note, &record, late);
                 self.measure_clock(note, &record);
-                // No light fell on a body: there is no way from its motion to light.
+                // If no light fell on any body, there is no interval from motion to light.
                 let is_dark = self.is_dark(&record);
                 let stamps = if is_dark { record.timeline.without_sample() } else { record.timeline };
                 self.profiler.lit(&stamps, slot, late);
@@ -451,8 +458,9 @@ impl Collector {
         }
     }
 
-    /// When the slot of this light truly began, against when the host believed that it would. Only the mock in this process knows: what is
-    /// known of another projector's light comes from the host's own map of its clock, which agrees with itself.
+    /// Measures when the slot of this light truly began, compared with the host's estimate. Only the mock in this
+    /// process can tell. For another projector the time of light comes from the host's own map of its clock, so the
+    /// comparison would be meaningless.
     fn measure_clock(&mut self, note: &LightNote, record: &FrameRecord) {
         let knows = matches!(self.rig.config.projector.backend, ProjectorBackend::Mock(_));
         if knows && self.rig.config.real_time.pace == Pace::Real {
@@ -463,7 +471,8 @@ impl Collector {
         }
     }
 
-    /// Where the light of each point fell against where the point was at the middle of the exposure, on the bodies that were lit.
+    /// Measures, on the lit bodies, where the light of each point fell and where the point was at the middle of the
+    /// exposure.
     fn measure_registration(&mut self, note: &LightNote, record: &FrameRecord, late: bool) {
         let at = measured_at(note.event.first_photon_at, note.event.last_photon_at);
         let Some(truth) = self.rig.true_poses(at.0) else { return };
@@ -484,7 +493,7 @@ impl Collector {
         }
     }
 
-    /// Fills what the run measured into a report.
+    /// Writes the measurements of the run into a report.
     pub(crate) fn fill(&self, report: &mut Report) {
         let spread = |h: &Histogram<u64>, unit: f64| {
             (!h.is_empty()).then(|| Spread {
@@ -559,13 +568,13 @@ mod tests {
 
     const SLOT_NS: i64 = 1_000_000;
 
-    /// Lit, dropped and missed of frames that were all sent, and of which those are lit that `lit` says, when the collector finds them all at
-    /// once; and slots in which another was repeated.
+    /// Frames lit, dropped and missed, and slots with a repeated frame, when all frames were sent, `lit` says which
+    /// of them were lit, and the collector finds them all at once.
     fn counted(frames: u64, lit: impl Fn(u64) -> bool) -> [u64; 4] {
         collected(frames, lit, &mut || ())
     }
 
-    /// The same; `alive` is called for every sign of life of the collector.
+    /// The same; calls `alive` for every sign of life of the collector.
     fn collected(frames: u64, lit: impl Fn(u64) -> bool, alive: &mut dyn FnMut()) -> [u64; 4] {
         let config = RigConfig::demo(&Overrides::default()).unwrap_or_else(|e| panic!("{e}"));
         let rig = Arc::new(Rig::build(&config, Raster::new(16, 16)).unwrap_or_else(|e| panic!("{e}")));
@@ -602,22 +611,24 @@ mod tests {
         [collector.lit, collector.dropped, missed, collector.repeated]
     }
 
-    /// Found by reading: of frames that were finished while the collector had no core, those beyond 256 counted as dropped although their light had
-    /// been told, and repeats that were told behind the last frame did not count: the counts of a run at virtual pace were the machine's.
+    /// Found by reading: of frames that were finished while the collector had no core, those beyond 256 counted as
+    /// dropped although their light had been reported, and repeats that were reported behind the last frame did not
+    /// count. The counts of a run at virtual pace therefore depended on the machine.
     #[test]
     fn a_collector_that_stood_still_counts_what_it_would_have_counted() {
         let many = 3 * MAX_PENDING as u64 + 7;
         assert_eq!(counted(many, |_| true), [many, 0, 0, 0]);
-        // What is shown in the last slot may be shown for as long as nobody says stop.
+        // The picture in the last slot may be shown until the projector is ordered to stop.
         assert_eq!(counted(many, |_| false), [0, many, many, many - 1]);
         let (odd, even) = (many / 2, many - many / 2);
         assert_eq!(counted(many, |k| k % 2 == 1), [odd, even, even, even - 1]);
-        // Nothing but light that is told late, behind more frames than can wait.
+        // Only late light, behind more frames than may wait.
         let late = many - MAX_PENDING as u64 - 10;
         assert_eq!(counted(many, |k| k >= late), [many - late, late, late, late]);
     }
 
-    /// Found in use: on a busy machine a backlog of thousands of notes takes seconds, in which the collector is alive.
+    /// Found in use: on a busy machine a backlog of thousands of notes takes seconds, in which the collector is
+    /// alive.
     #[test]
     fn every_note_of_a_backlog_is_a_sign_of_life() {
         let mut signs = 0;

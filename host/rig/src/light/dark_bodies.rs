@@ -1,21 +1,22 @@
-//! Bodies on which no light fell although their frames were lit: counted by cause, and told to the operator once an episode.
+//! Bodies on which no light fell although their frames were lit. They are counted by cause, and reported to the
+//! operator once per episode.
 //!
-//! Beside the frame path: it may allocate.
+//! This runs beside the frame path, so it may allocate.
 
 use crate::plan::dark::DarkCause;
 use crate::telemetry::report::DarkBody;
 use dpm_device::time::HostTime;
 
-/// An episode begins when a body has been dark for so long, and ends when it has been lit for so long: a sample that is lost now and then is
-/// nothing to tell.
+/// An episode begins when a body has been dark for this long, and ends when it has been lit for this long. An
+/// occasional lost sample is not reported.
 const EPISODE_NS: i64 = 100_000_000;
 
 #[derive(Clone, Debug, Default)]
 struct Body {
     frames: [u64; DarkCause::ALL.len()],
-    /// Since when it has been dark, or lit, without a break.
+    /// Since when it has been dark, or lit, without interruption.
     since: Option<(HostTime, bool)>,
-    /// Since when the episode that was told lasts.
+    /// Since when the reported episode lasts.
     told: Option<HostTime>,
 }
 
@@ -31,8 +32,8 @@ impl DarkBodies {
         Self { bodies: vec![Body::default(); bodies] }
     }
 
-    /// A frame was lit at `at`, with or without light on each body. `note` gets the number of a body whose episode began or ended, and what
-    /// is to be told of it.
+    /// A frame was lit at `at`, with or without light on each body. Calls `note` with the number of a body whose
+    /// episode began or ended, and with the message about it.
     pub(crate) fn lit(
         &mut self,
         dark: &[Option<DarkCause>],
@@ -88,13 +89,14 @@ mod tests {
     use super::*;
     use DarkCause::{BeyondHorizon, NeverSeen, Silent};
 
-    /// Found in use, R6: bodies were black for minutes without a word. Every frame counts, and an episode is one note at its beginning and one
-    /// at its end, however often a body flickers within.
+    /// Found in use, R6: bodies were black for minutes without any message. Every frame counts. An episode gives one
+    /// note at its beginning and one at its end, however often a body flickers in between.
     #[test]
     fn every_dark_frame_counts_and_an_episode_is_told_once() {
         let mut bodies = DarkBodies::new(2);
         let mut notes = Vec::new();
-        // 100 frames a second. The first body: dark from 1 s to 3 s, with single lit frames in between; then single dark frames.
+        // 100 frames per second. The first body is dark from 1 s to 3 s, with single lit frames in between, and later
+        // in single frames.
         for k in 0..600i64 {
             let at = HostTime(k * 10_000_000);
             let first = match k {

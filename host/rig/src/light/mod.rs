@@ -1,4 +1,5 @@
-//! What the projector lit, beside what was planned: notes of light, where it fell, and what a run's report says of it.
+//! What the projector lit, compared with the plan: notes of light, where it fell, and what the report of a run says
+//! about it.
 
 pub(crate) mod collector;
 mod dark_bodies;

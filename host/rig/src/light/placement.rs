@@ -1,13 +1,14 @@
-//! Where the tracker says the bodies are into a warning about one that never is where the projector's light can fall: millimetres taken for
-//! metres, axes exchanged, a camera calibrated against another origin.
+//! Warns about a body that the tracker never reports where the projector's light can fall: the tracker may send
+//! millimetres instead of metres, exchange axes, or have another origin than the camera calibration.
 
 use dpm_scene::geometry::projector::ProjectorCamera;
 use glam::{DAffine3, DVec3};
 
-/// Frames for which the tracker had told of a body before it is judged. Not the frames for which it was new enough to be lit: a rig whose frames take longer than
-/// `safety.predict_ms` lights nothing, and wrong units are to be told all the same.
+/// Number of frames with a reported body before the body is judged. Frames in which the body was too old to be lit
+/// count as well: a rig whose frames take longer than `safety.predict_ms` lights nothing, but must still report wrong
+/// units.
 const ENOUGH: u64 = 50;
-/// Points of a body that are looked at, at most.
+/// Maximum number of points of a body that are checked.
 const POINTS: usize = 8;
 
 #[derive(Clone, Copy, Debug, Default)]
@@ -17,7 +18,7 @@ struct Body {
     last: DVec3,
 }
 
-/// Looks at every frame, off the frame path.
+/// Checks every frame, beside the frame path.
 #[derive(Clone, Debug)]
 pub(crate) struct Placement {
     bodies: Vec<Body>,
@@ -29,8 +30,8 @@ impl Placement {
         Self { bodies: vec![Body::default(); bodies] }
     }
 
-    /// A frame for world-from-body `poses`, which for those that are `seen` are where the tracker saw them last. `points` of each body, in its own space, say
-    /// how large it is.
+    /// Checks a frame. `poses` are the world-from-body poses; those of `seen` bodies are where the tracker saw them
+    /// last. `points` of each body, in its own space, give its size.
     pub(crate) fn observe(
         &mut self,
         camera: &ProjectorCamera,
@@ -80,8 +81,8 @@ mod tests {
     use crate::config::{Overrides, RigConfig};
     use crate::rig::Rig;
 
-    /// Found in use, O4; T17: positions in millimetres, mirrored axes and exchanged axes are told of; true ones, at the edge and for a short while wrong
-    /// ones are not.
+    /// Found in use, O4; T17: positions in millimetres, mirrored axes and exchanged axes are reported. Correct
+    /// positions, positions at the edge, and positions that are wrong for a short time are not.
     #[test]
     fn wrong_units_and_axes_are_told() {
         let config = RigConfig::demo(&Overrides::default()).unwrap_or_else(|e| panic!("{e}"));
@@ -96,15 +97,15 @@ mod tests {
             }
             placement.warnings(&names)
         };
-        // The rig's frame: where the projector stands and looks.
+        // The rig's geometry: where the projector is and where it looks.
         let (from, depth) = (rig.camera.position(), rig.camera.to_projector_space(true_pose.translation).z);
         assert_eq!(told(&|p| p, true, 1000), [] as [String; 0]);
-        // Behind the projector, as a flipped axis has it.
+        // Behind the projector, as with a flipped axis.
         let behind = |p: DVec3| 2.0 * from - p;
         let warning = told(&behind, true, ENOUGH);
         assert_eq!(warning.len(), 1);
         assert!(warning[0].contains("\"hare\"") && warning[0].contains("streams metres"), "{}", warning[0]);
-        // Sideways by three times its distance.
+        // Sideways by three times the depth.
         assert_eq!(told(&|p| p + DVec3::X * 3.0 * depth.abs(), true, ENOUGH).len(), 1);
         // Too short to be judged; not tracked at all.
         assert_eq!(told(&behind, true, ENOUGH - 1).len(), 0);

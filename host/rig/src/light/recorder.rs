@@ -1,6 +1,7 @@
-//! Light events of the mock projector into notes for the telemetry, and the last frames of light for pictures.
+//! Converts light events of the mock projector into notes for the telemetry, and keeps the last frames of light for
+//! pictures.
 //!
-//! Runs where the mock runs: in the link thread at virtual pace, in the mock's own thread at real pace.
+//! It runs where the mock runs: in the link thread at virtual pace, in the mock's own thread at real pace.
 
 use crate::frame::job::hash_codes;
 use crate::mock::{EmulatedProjector, MockProjector, Served};
@@ -15,19 +16,19 @@ use std::collections::VecDeque;
 /// What the projector did in one slot.
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct LightNote {
-    /// The event.
+    /// The light event.
     pub event: LightEvent,
-    /// Hash of the light as code values; 0 when not asked for.
+    /// Hash of the light as code values; 0 if not requested.
     pub hash: u64,
-    /// Parts of it are of another frame (prepared frames only).
+    /// Parts of it belong to another frame (prepared frames only).
     pub torn: bool,
-    /// Wall time that the mock took for it, nanoseconds; 0 for a projector outside this process.
+    /// Wall time that the mock needed for it, nanoseconds; 0 for a projector outside this process.
     pub wall_ns: u64,
-    /// Frames lit since the note before of which only the number is known.
+    /// Frames lit since the previous note of which only the number is known.
     pub unseen: u32,
 }
 
-/// One frame of light as it fell.
+/// One frame of light as it was emitted.
 #[derive(Clone, Debug)]
 pub struct LightFrame {
     /// Low 32 bits of the frame's number.
@@ -38,15 +39,15 @@ pub struct LightFrame {
     pub codes: Vec<[u8; 3]>,
 }
 
-/// Watches a mock projector.
+/// Records the light of a mock projector.
 pub(crate) struct LightRecorder {
     /// `None` after [`LightRecorder::close`].
     notes: Option<Sender<LightNote>>,
-    /// Notes that found no room.
+    /// Notes for which there was no room.
     pub notes_lost: u64,
     keep: usize,
     hash: bool,
-    /// Lit planes carry marks in this schedule.
+    /// Lit planes carry marks, in this schedule.
     marks: Option<PlaneSchedule>,
     frames: VecDeque<LightFrame>,
     /// Hash over all light in order.
@@ -54,8 +55,9 @@ pub(crate) struct LightRecorder {
 }
 
 impl LightRecorder {
-    /// Notes go to `notes`; the last `keep` frames of light stay; `hash`: hash every frame of light; `marks`: the
-    /// planes, in this order, are of [`crate::pack::prepared`] and are looked at for parts of other frames.
+    /// Sends notes to `notes` and keeps the last `keep` frames of light. `hash`: hashes every frame of light.
+    /// `marks`: the planes, in this order, come from [`crate::pack::prepared`] and are checked for parts of other
+    /// frames.
     pub(crate) fn new(
         notes: Sender<LightNote>,
         keep: usize,
@@ -73,7 +75,7 @@ impl LightRecorder {
         }
     }
 
-    /// Lets the mock live up to `now`, one slot at a time, and notes all light.
+    /// Advances the mock to `now`, one slot at a time, and records all light.
     pub(crate) fn advance(&mut self, mock: &mut EmulatedProjector, now: HostTime) {
         use dpm_device::transport::LinkDevice;
         while let Some(due) = mock.next_due().filter(|&due| due <= now) {
@@ -107,12 +109,12 @@ impl LightRecorder {
         }
     }
 
-    /// The hash of all light in order, in hexadecimal digits; `None` where it was not asked for.
+    /// The hash of all light in order, in hexadecimal digits; `None` if not requested.
     pub(crate) fn hash(&self) -> Option<String> {
         self.hash.then(|| format!("{:016x}", self.light_hash))
     }
 
-    /// No more light will be noted: whoever takes the notes comes to their end.
+    /// Ends the notes: their receiver comes to the end.
     pub(crate) fn close(&mut self) {
         self.notes = None;
     }
@@ -130,7 +132,7 @@ impl LightRecorder {
     }
 }
 
-/// Keeps a copy of `light`; the oldest frame's memory is used again when `limit` are kept.
+/// Keeps a copy of `light`. When `limit` frames are kept, the oldest frame's memory is reused.
 fn keep(frames: &mut VecDeque<LightFrame>, limit: usize, event: &LightEvent, light: &[[u8; 3]]) {
     if limit == 0 {
         return;

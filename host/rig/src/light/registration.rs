@@ -1,4 +1,5 @@
-//! Where the light of a body's points fell against where the points were, in pixels of the projector.
+//! Registration: the distance between where the light of a body's points fell and where the points were, in pixels of
+//! the projector.
 
 use crate::rig::Rig;
 use dpm_device::time::HostTime;
@@ -8,7 +9,8 @@ use glam::{DAffine3, DVec3};
 /// Points on each body at which registration is measured.
 const POINTS_PER_BODY: usize = 48;
 
-/// The instant of a frame's light at which registration is measured, the middle of its exposure, from its first photon and its last.
+/// The instant at which registration of a frame is measured: the middle of its exposure, between its first and its
+/// last photon.
 pub fn measured_at(first_photon_at: HostTime, last_photon_at: HostTime) -> HostTime {
     first_photon_at.plus_ns(last_photon_at.ns_since(first_photon_at) / 2)
 }
@@ -16,7 +18,7 @@ pub fn measured_at(first_photon_at: HostTime, last_photon_at: HostTime) -> HostT
 /// Points spread over the tracked bodies of a rig.
 pub struct RegistrationMeter {
     camera: ProjectorCamera,
-    /// By tracked body, in its own space, metres.
+    /// Per tracked body: points in its own space, metres.
     points: Vec<Vec<DVec3>>,
 }
 
@@ -26,13 +28,13 @@ impl RegistrationMeter {
         Self { camera: rig.camera, points: (0..rig.bodies.len()).map(|i| points_of(rig, i)).collect() }
     }
 
-    /// By tracked body: its points, in its own space, metres.
+    /// Per tracked body: its points in its own space, metres.
     pub fn points(&self) -> &[Vec<DVec3>] {
         &self.points
     }
 
-    /// For each point of tracked body `body` how far apart the picture has it for the world-from-body poses `used` and `truth`, pixels. Points
-    /// that one of them puts behind the projector are left out.
+    /// For each point of the tracked body `body`: how far apart the world-from-body poses `used` and `truth` place it
+    /// in the picture, pixels. Points that either pose places behind the projector are left out.
     pub fn errors<'a>(
         &'a self,
         body: usize,

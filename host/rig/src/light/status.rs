@@ -1,7 +1,9 @@
-//! STATUS reports of a projector outside this process into the light notes that a mock would have made, as far as they tell it.
+//! Converts STATUS reports of a projector outside this process into light notes like a mock's, as far as the reports
+//! contain the information.
 //!
-//! Counters are absolute and reports may be merged or lost. A report that follows after one slot tells everything about it. One that
-//! covers several slots tells how many were lit, repeated and dark, and the frame lit last: the others are handed on as numbers.
+//! Counters are absolute, and reports may be merged or lost. A report that covers one slot tells everything about it.
+//! A report that covers several slots tells how many were lit, repeated and dark, and which frame was lit last; the
+//! other frames are passed on as a number.
 
 use crate::light::recorder::LightNote;
 use crate::plan::link_time::LinkTime;
@@ -10,14 +12,14 @@ use dpm_device::light::{LightEvent, LightKind};
 use dpm_device::link::Status;
 use dpm_handoff::channel::Sender;
 
-/// Slots of one report that are told one by one: a second of silence at 1 kHz.
+/// Maximum number of slots of one report for which single notes are made: a second of silence at 1 kHz.
 const MOST_SLOTS: u32 = 1024;
 /// Frames whose slot is remembered until their light is reported.
 const REMEMBERED: usize = 64;
-/// Longest travel of a frame that is believed, nanoseconds.
+/// The longest travel of a frame that is considered plausible, nanoseconds.
 const LONGEST_TRAVEL_NS: i64 = 500_000_000;
 
-/// Reads one session's reports after the other.
+/// Reads the reports of one session after the other.
 #[derive(Debug)]
 pub(crate) struct StatusLight {
     lights: Sender<LightNote>,
@@ -29,7 +31,7 @@ pub(crate) struct StatusLight {
 }
 
 impl StatusLight {
-    /// Notes go to `lights`; those that find no room are lost, as a mock's are.
+    /// Sends notes to `lights`. Notes for which there is no room are lost, as a mock's are.
     pub(crate) fn new(lights: Sender<LightNote>) -> Self {
         Self {
             lights,
@@ -41,7 +43,7 @@ impl StatusLight {
         }
     }
 
-    /// What was counted so far.
+    /// The counts so far.
     pub(crate) fn counts(&self) -> DeviceCounts {
         self.counts
     }
@@ -51,19 +53,19 @@ impl StatusLight {
         self.before = None;
     }
 
-    /// Frame number `frame` is on its way to `slot`.
+    /// Frame number `frame` was sent for `slot`.
     pub(crate) fn sent(&mut self, frame: u32, slot: u64) {
         self.planned[self.next % REMEMBERED] = (frame, slot);
         self.next = (self.next + 1) % REMEMBERED;
     }
 
-    /// How much earlier than the host believed a frame must be sent to be lit in its slot, nanoseconds: rises at once when frames
-    /// are lit late, falls slowly while they are not.
+    /// How much earlier than the host's estimate a frame must be sent to be lit in its slot, nanoseconds. It rises at
+    /// once when frames are lit late, and falls slowly while they are not.
     pub(crate) fn travel_ns(&self) -> i64 {
         self.travel_ns
     }
 
-    /// Takes in a report. `time` tells slots and instants.
+    /// Reads a report. `time` converts slots and instants.
     pub(crate) fn observe(&mut self, status: &Status, time: &LinkTime) {
         let before = self.before.replace(*status);
         if before == Some(*status) {
@@ -92,7 +94,7 @@ impl StatusLight {
         self.notes(status, newest, [slots, lit, repeated], time);
     }
 
-    /// One note for each slot of the report whose fate is known, in order.
+    /// Makes one note for each slot of the report whose result is known, in order.
     fn notes(&mut self, status: &Status, newest: u64, [slots, lit, repeated]: [u32; 3], time: &LinkTime) {
         let lit_slot = if lit > 0 { time.slot_at(status.last_lit_at) } else { None };
         let first = (newest + 1).saturating_sub(u64::from(slots.min(MOST_SLOTS)));
@@ -129,7 +131,7 @@ impl StatusLight {
         };
         let late_ns = time.host_of_slot(lit_slot).ns_since(time.host_of_slot(planned)).max(0);
         self.travel_ns = if late_ns > 0 {
-            // Half of it: frames that are on their way already are late by as much.
+            // Half of it, because frames that are already on their way are late by the same amount.
             (self.travel_ns + late_ns / 2).min(LONGEST_TRAVEL_NS)
         } else {
             self.travel_ns - self.travel_ns / 1024
@@ -145,7 +147,8 @@ mod tests {
     use dpm_handoff::channel::{channel, Receiver};
     use dpm_handoff::wake::WaitPolicy;
 
-    /// Slots of a millisecond on a microsecond clock that began with the host's; the run's slot 100 is the clock's slot 0.
+    /// Slots of a millisecond on a microsecond clock that began with the host's clock. The run's slot 100 is the
+    /// clock's slot 0.
     fn time() -> LinkTime {
         let rate = FrameRate::new(1000, 1).unwrap();
         let clock = SlotClock::new(DeviceTicks(0), 1_000_000, rate).unwrap();
@@ -167,7 +170,7 @@ mod tests {
         }
     }
 
-    /// A reader of reports, and where its notes arrive.
+    /// A reader of reports, and the receiver of its notes.
     struct Reader(StatusLight, Receiver<LightNote>);
 
     fn reader() -> Reader {
@@ -189,7 +192,7 @@ mod tests {
         assert_eq!(told(&mut light, &status(5_100, [1, 0, 0], (7, 5_000))), [(105, Lit, Some(7), 0)]);
         assert_eq!(told(&mut light, &status(6_100, [1, 1, 0], (7, 5_000))), [(106, Repeated, None, 0)]);
         assert_eq!(told(&mut light, &status(7_100, [1, 1, 1], (7, 5_000))), [(107, Blank, None, 0)]);
-        // The same report again says nothing new.
+        // The same report again has no news.
         assert_eq!(told(&mut light, &status(7_100, [1, 1, 1], (7, 5_000))), []);
         light.0.observe(&status(8_100, [2, 1, 1], (9, 8_000)), &time());
         let event = light.1.try_pop().unwrap().event;
@@ -200,7 +203,7 @@ mod tests {
     fn a_merged_report_is_told_as_far_as_it_goes() {
         use LightKind::{Lit, Repeated};
         let mut light = reader();
-        // Slots 1 to 5: three lit, the last of them in slot 4, and two repeated.
+        // Slots 1 to 5: three were lit, the last of them in slot 4, and two repeated.
         let notes = told(&mut light, &status(5_900, [3, 2, 0], (12, 4_000)));
         assert_eq!(notes.iter().filter(|n| n.1 == Lit).collect::<Vec<_>>(), [&(104, Lit, Some(12), 2)]);
         assert_eq!(notes.iter().filter(|n| n.1 == Repeated).count(), 2);
@@ -209,7 +212,7 @@ mod tests {
         light.0.new_session();
         told(&mut light, &status(1_100, [1, 0, 0], (13, 1_000)));
         assert_eq!((light.0.counts().lit, light.0.counts().lit_unseen), (4, 2));
-        // Counters that wrapped, and a silence of a day: bounded work.
+        // Counters that wrapped, and a silence of a day: the work is bounded.
         told(&mut light, &status(86_400_000_000, [u32::MAX, 0, 0], (14, 86_400_000_000)));
         assert_eq!(light.0.counts().lit, 4 + u64::from(u32::MAX - 1));
     }

@@ -1,4 +1,4 @@
-//! Code values of a finished frame into bit planes.
+//! Packs the code values of a finished frame into bit planes.
 
 pub mod prepared;
 
@@ -8,7 +8,7 @@ use dpm_common::clock::Stopwatch;
 use dpm_render::pack::{self, Kernel, Shown};
 use prepared::PreparedFrames;
 
-/// Packs the finished GPU's code values into planes; a job without GPU takes its code values from `prepared`.
+/// Packs the code values of a finished frame into planes. A job without GPU takes its code values from `prepared`.
 pub(crate) fn pack(job: &mut FrameJob, kernel: Kernel, verify: bool, prepared: &mut Option<PreparedFrames>) {
     let FrameJob { note, memory } = job;
     let watch = Stopwatch::start();

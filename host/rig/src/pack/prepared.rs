@@ -1,20 +1,20 @@
-//! Frames prepared ahead in place of rendered ones: a pattern that moves from frame to frame, each frame marked with its number, so
-//! that whoever sees the planes can tell whether they all belong to one frame.
+//! Frames that are prepared in advance and replace rendered ones. A pattern moves from frame to frame, and each frame
+//! is marked with its number, so that an observer of the planes can check that they all belong to one frame.
 
 use dpm_device::planes::{Channel, PlaneSchedule, Raster};
 use dpm_render::pack::{self, BitPlaneFrame, Kernel};
 
-/// Positions of the pattern.
+/// Number of positions of the pattern.
 const POSITIONS: usize = 4;
-/// Pixels by which the pattern moves from frame to frame: whole bytes of a plane.
+/// Pixels by which the pattern moves per frame; they fill whole bytes of a plane.
 const STEP: usize = 8;
-/// Every how many rows the first pixel carries the frame's number.
+/// The first pixel of every so many rows carries the frame's number.
 const MARK_ROWS: usize = 16;
 /// Bits of a code value, and of the number in a mark.
 const MARK_BITS: u32 = 0x00ff_ffff;
 
-/// Code values `0x00BBGGRR` of a picture, and a little more of it: each frame is the picture from a pixel further on. One picture takes no more
-/// of the caches than a renderer's output does, and more than a core has for itself.
+/// Code values `0x00BBGGRR` of one picture, and some more: each frame is the picture shifted by [`STEP`] pixels. A
+/// single picture occupies as much of the caches as a renderer's output, and more than a core's own cache.
 #[derive(Clone, Debug)]
 pub struct PreparedFrames {
     raster: Raster,
@@ -22,7 +22,8 @@ pub struct PreparedFrames {
 }
 
 impl PreparedFrames {
-    /// A pattern of ramps that moves by 8 pixels a frame and always sends out about the same light, so that it never flashes.
+    /// A pattern of ramps that moves by 8 pixels per frame and always emits about the same light, so that it never
+    /// flashes.
     pub fn new(raster: Raster) -> Self {
         let width = raster.width();
         let pixels = raster.pixel_count() + STEP * (POSITIONS - 1);
@@ -40,20 +41,20 @@ impl PreparedFrames {
     pub fn pack(&mut self, kernel: Kernel, id: u64, planes: &mut BitPlaneFrame) {
         let rows = MARK_ROWS * self.raster.width() as usize;
         let codes = self.frame(id);
-        // Marks of other positions stay where they are: lone pixels like any other.
+        // Marks of other positions remain; they are isolated pixels like any others.
         codes.iter_mut().step_by(rows).for_each(|code| *code = id as u32 & MARK_BITS);
         pack::pack(kernel, codes, planes);
     }
 }
 
-/// A ramp in each channel, in a different direction each.
+/// A ramp in each channel, each in a different direction.
 fn pattern(x: u32, y: u32) -> u32 {
     let (r, g, b) = (x & 0xff, (x ^ y) & 0xff, (x + 2 * y) & 0xff);
     r | g << 8 | b << 16
 }
 
-/// True when every mark in `planes` (one after the other, in the order of `schedule`) is the number of frame `id`: no plane, and no
-/// part of one, is of another frame.
+/// True if every mark in `planes` (one after the other, in the order of `schedule`) is the number of frame `id`: then
+/// no plane, and no part of a plane, belongs to another frame.
 pub fn is_whole(raster: Raster, schedule: &PlaneSchedule, planes: &[u8], id: u32) -> bool {
     let rows = MARK_ROWS * raster.row_bytes();
     planes.chunks_exact(raster.plane_bytes()).zip(schedule.planes()).all(|(plane, spec)| {
@@ -83,7 +84,7 @@ mod tests {
                 assert!(is_whole(raster, &schedule, a.bytes(), id));
                 let in_mark = if schedule.len() == 24 { MARK_BITS } else { 0xff00 };
                 assert_eq!(is_whole(raster, &schedule, a.bytes(), other), (id ^ other) & in_mark == 0);
-                // One plane whose bit differs, from its 17th row on: the upper half is of the right frame.
+                // One plane whose bit differs from its 17th row on; its upper part belongs to the right frame.
                 for (k, spec) in schedule.planes().iter().enumerate() {
                     let mut torn = a.bytes().to_vec();
                     let half = k * raster.plane_bytes() + 16 * raster.row_bytes();
@@ -97,7 +98,7 @@ mod tests {
         }
     }
 
-    /// About the same light in every frame: nothing that a limiter of flashes would stop.
+    /// Every frame emits about the same light, so a flash limiter stops none of them.
     #[test]
     fn the_pattern_moves_and_sends_out_the_same_light() {
         let raster = Raster::new(1024, 768).unwrap();

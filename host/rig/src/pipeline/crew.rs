@@ -1,7 +1,9 @@
-//! Tracking, planning and packing as one crew: started together, watched by the supervisor, and abandoned together when one of them hangs.
+//! Tracking, planning and packing as one crew: started together, watched by the supervisor, and abandoned together
+//! when one of them hangs.
 //!
-//! A crew owns everything that it works with and hands frames to the link through a [`Port`]. Abandoning it is dropping the port's other
-//! end: whatever its threads still do when they wake up, none of it reaches the link, and so none of it reaches the light.
+//! A crew owns everything that it works with and passes frames to the link through a [`Port`]. To abandon it, the
+//! other end of the port is dropped. Whatever its threads still do when they wake up cannot reach the link, and so
+//! cannot reach the light.
 
 use super::parts::CrewParts;
 use super::threads::{
@@ -24,27 +26,27 @@ use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
 use std::sync::{Arc, Mutex};
 use std::thread::JoinHandle;
 
-/// Places of the stages in [`CrewState::pulses`].
+/// Indices of the stages in [`CrewState::pulses`].
 pub(super) const TRACKING: usize = 0;
 /// See [`TRACKING`].
 pub(super) const PLAN: usize = 1;
 /// See [`TRACKING`].
 pub(super) const PACK: usize = 2;
 
-/// Where the link's thread finds the frames of a crew, and gives their memory back.
+/// Where the link's thread receives the frames of a crew and returns their memory.
 pub(super) struct Port {
     pub(super) jobs: Receiver<FrameJob>,
     pub(super) free: Sender<Box<FrameMemory>>,
-    /// Where the crew learns the projector's clock.
+    /// Publishes the projector's clock to the crew.
     pub(super) times: Publisher<LinkTime>,
 }
 
-/// The collector's way to give notes back to whichever crew works now. Not on the frame path: it may lock.
+/// The way by which the collector returns notes to the current crew. Not for the frame path: it may lock.
 #[derive(Clone, Default)]
 pub(crate) struct NotesBack(Arc<Mutex<Option<Sender<Box<FrameNote>>>>>);
 
 impl NotesBack {
-    /// Gives one back; one that belongs to a crew of the past may end in the present one.
+    /// Returns a note. A note of a former crew may go to the current one.
     pub(super) fn push(&self, note: Box<FrameNote>) {
         if let Ok(mut to) = self.0.lock() {
             if let Some(to) = to.as_mut() {
@@ -62,22 +64,22 @@ impl NotesBack {
 
 /// What the threads of one crew share.
 pub(super) struct CrewState {
-    /// Nothing that this crew does counts any more.
+    /// The crew is abandoned; nothing it does has an effect any more.
     pub(super) is_abandoned: AtomicBool,
     pub(super) tracking_over: AtomicBool,
-    /// The frame that is being planned.
+    /// Number of the frame that is being planned.
     pub(super) planning: AtomicU64,
-    /// What planning and packing tell each other.
+    /// What planning and packing share.
     pub(super) facts: Arc<CrewFacts>,
     pub(super) pulses: [Pulse; 3],
-    /// By stage: its thread has returned, not panicked.
+    /// Per stage: its thread has returned without a panic.
     pub(super) returned: [AtomicBool; 3],
-    /// Why planning or packing cannot go on.
+    /// Why planning or packing cannot continue.
     failure: Mutex<Option<PipelineError>>,
 }
 
 impl CrewState {
-    /// The crew cannot go on.
+    /// Records that the crew cannot continue.
     pub(super) fn fail(&self, error: PipelineError) {
         if let Ok(mut first) = self.failure.lock() {
             first.get_or_insert(error);
@@ -99,10 +101,11 @@ pub(super) struct Crew {
 }
 
 impl Crew {
-    /// Starts the threads; frames come out of the port. Notes travel from here to the collector and back through `notes_back`.
+    /// Starts the threads. Frames come out of the port. Notes travel from here to the collector and back through
+    /// `notes_back`.
     ///
     /// # Errors
-    /// The system gives no thread.
+    /// The system cannot start a thread.
     pub(super) fn start(
         shared: &Arc<Shared>,
         parts: CrewParts,
@@ -113,7 +116,7 @@ impl Crew {
         let policy = policy(rig);
         let facts = Arc::new(CrewFacts::new(rig, frame_ns));
         let stage = PackStage::new(shared.facts.clone(), facts.clone(), budget);
-        // Room for everything there is: no stage ever finds the next one's channel full.
+        // There is room for all of them: no stage ever finds the next one's channel full.
         let jobs = memory.len();
         let (mut free_in, free) = channel(jobs, policy);
         let (to_pack_in, to_pack_out) = channel(jobs, policy);
@@ -141,7 +144,7 @@ impl Crew {
         let gpu_waker = gpu_free.waker();
         let named = |name: &'static str| std::thread::Builder::new().name(format!("dpm-{name}"));
         let refused = |stage| move |source| PipelineError::Thread { stage, source };
-        // A stage that returns or panics drops its senders, which ends the next one: nobody waits for ever.
+        // A stage that returns or panics drops its senders, which ends the next stage: nobody waits forever.
         let tracking = {
             let (shared, state) = (shared.clone(), state.clone());
             named("tracking")
@@ -177,7 +180,7 @@ impl Crew {
         Ok((crew, Port { jobs: to_link_out, free: free_in, times }))
     }
 
-    /// Looks at the crew, `step_ns` after the last look.
+    /// Checks the crew, `step_ns` after the last check.
     pub(super) fn trouble(&mut self, now: HostTime, step_ns: i64) -> Option<Trouble> {
         let failure = self.state.failure.lock().ok().and_then(|mut f| f.take());
         if let Some(error) = failure {
@@ -196,7 +199,7 @@ impl Crew {
         None
     }
 
-    /// Nothing that this crew does counts any more. Its threads end when they come to see it, or with the process.
+    /// Abandons the crew. Its threads end when they notice it, or with the process.
     pub(super) fn abandon(self) {
         self.state.is_abandoned.store(true, Ordering::Relaxed);
         self.state.tracking_over.store(true, Ordering::Release);
@@ -207,7 +210,8 @@ impl Crew {
         self.tracking.is_finished() && self.others.iter().all(JoinHandle::is_finished)
     }
 
-    /// Takes what is left when all threads have ended: what the tracker says of bodies that were never seen, or which stage panicked.
+    /// Collects the result when all threads have ended: what the tracker reports about bodies that were never seen,
+    /// or which stage panicked.
     pub(super) fn join(self) -> Result<Option<String>, &'static str> {
         let names = ["plan", "pack"];
         for (thread, name) in self.others.into_iter().zip(names) {
@@ -217,7 +221,7 @@ impl Crew {
     }
 }
 
-/// Calls its function when dropped, during a panic too.
+/// Calls its function when dropped, also during a panic.
 pub(super) struct OnExit<F: FnMut()>(pub(super) F);
 
 impl<F: FnMut()> Drop for OnExit<F> {

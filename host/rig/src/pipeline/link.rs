@@ -1,4 +1,5 @@
-//! Packed frames over the cable into light, at real pace: the link's thread, and the mock projector's where it is in this process.
+//! From packed frames to light at real pace: the link's thread, and the mock projector's thread if it is in this
+//! process.
 
 use super::crew::Port;
 use super::rights::Rights;
@@ -21,19 +22,19 @@ use std::panic::{catch_unwind, AssertUnwindSafe};
 use std::sync::atomic::Ordering;
 use std::time::Duration;
 
-/// How long frames that are still under way after the dark are waited for, to be counted, nanoseconds.
+/// After the dark, how long frames that are still in flight are awaited in order to count them, nanoseconds.
 const CLEARED_WITHIN_NS: u64 = 300_000_000;
-/// Between two looks at frames that are still under way after the dark, nanoseconds.
+/// Time between two checks for such frames, nanoseconds.
 const CLEAR_STEP_NS: i64 = 1_000_000;
 
-/// The link thread's own: what decides, and the medium.
+/// The link thread's state: the deciding part and the medium.
 pub(super) struct Line {
     pub(super) stage: LinkStage<Real>,
     pub(super) medium: Box<dyn Transport>,
 }
 
-/// Sends the frames of whichever crew works, then tells the projector to go dark: at once when a stop was asked for, after the last frames'
-/// light when the run has all that it was asked for. A panic in here ends in the dark, too.
+/// Sends the frames of the current crew, then orders the projector to go dark: at once if a stop was requested, after
+/// the last frames' light if the run is complete. A panic in this thread also ends in the dark.
 pub(super) fn link_thread(
     shared: &Shared,
     mut line: Line,
@@ -52,22 +53,22 @@ pub(super) fn link_thread(
     desk.clear(shared);
     shared.link_pulse.end();
     let report = line.stage.report(line.medium.name());
-    // Unplugs: a projector's thread ends, and with it the notes of its light.
+    // This unplugs the cable: a mock projector's thread ends, and with it the notes of its light.
     drop(line);
     shared.is_link_over.store(true, Ordering::Release);
     report
 }
 
-/// Where the link's thread gets its frames and where it puts what is left of them.
+/// Where the link's thread receives its frames and returns their parts.
 struct Desk {
     ports: Receiver<Port>,
-    /// Frames of the crew that works, and the way back for their memory.
+    /// Frames of the current crew, and the way back for their memory.
     crew: Option<(Receiver<FrameJob>, Sender<Box<FrameMemory>>)>,
     done: Sender<Box<FrameNote>>,
 }
 
 impl Desk {
-    /// True when no frame will come any more, unless from another crew.
+    /// True when no frame will come any more, except from another crew.
     fn is_finished(&self) -> bool {
         self.crew.as_ref().is_none_or(|(jobs, _)| jobs.is_finished())
     }
@@ -77,7 +78,7 @@ impl Desk {
         self.crew.as_ref().is_none_or(|(jobs, _)| jobs.is_empty())
     }
 
-    /// The next frame, waited for at most `limit_ns`.
+    /// The next frame; waits at most `limit_ns`.
     fn next(&mut self, limit_ns: i64) -> Option<FrameJob> {
         match &mut self.crew {
             Some((jobs, _)) => pop_within(jobs, limit_ns),
@@ -88,17 +89,17 @@ impl Desk {
         }
     }
 
-    /// The frame's memory goes back to the crew, its note on to the collector. False when nobody collects.
+    /// Returns the frame's memory to the crew and passes its note to the collector. False if there is no collector.
     fn finish(&mut self, job: FrameJob) -> bool {
         let FrameJob { note, memory } = job;
         if let Some((_, free)) = &mut self.crew {
-            // A crew that is gone needs no memory back.
+            // A crew that is gone needs no memory.
             let _ = free.push(memory);
         }
         self.done.push(note).is_ok()
     }
 
-    /// The projector is dark: what is still under way is counted as not sent. Waits for the crew's end, but not for long.
+    /// The projector is dark. Counts frames that are still in flight as not sent. Waits briefly for the crew's end.
     fn clear(&mut self, shared: &Shared) {
         let watch = Stopwatch::start();
         while !self.is_finished() && watch.elapsed_ns() < CLEARED_WITHIN_NS {
@@ -112,11 +113,11 @@ impl Desk {
 }
 
 impl Line {
-    /// Sends frames until no more will come or a stop is asked for.
+    /// Sends frames until no more will come or a stop is requested.
     fn serve(&mut self, shared: &Shared, desk: &mut Desk) {
         while !shared.facts.monitor.stop_requested() {
             if let Some(port) = desk.ports.try_pop() {
-                // The frames of the crew before are dropped where they are.
+                // Frames of the former crew are dropped.
                 desk.crew = Some((port.jobs, port.free));
                 self.stage.tell_times_to(port.times);
             }
@@ -132,17 +133,17 @@ impl Line {
                     }
                 }
                 None if desk.is_finished() && shared.facts.is_complete.load(Ordering::Acquire) => return,
-                // Feeds the device's watchdog while nothing is to be sent.
+                // Polling feeds the device's watchdog while there is nothing to send.
                 None => self.stage.poll(now, self.medium.as_mut()),
             }
         }
     }
 
-    /// Brings one frame to the medium, or leaves it out.
+    /// Sends one frame, or leaves it out.
     fn take(&mut self, shared: &Shared, job: &mut FrameJob, is_newest: bool) {
         let FrameJob { note, memory } = job;
         let clock = &shared.clock;
-        // Getting a lost medium back allocates; the rig is dark then.
+        // Reopening a lost medium allocates, but the rig is dark then.
         enter_frame_path(note.plan.id.0 >= WARM_UP_FRAMES && self.stage.is_streaming());
         may_stall(&shared.facts, StallIn::Link, note.plan.id.0);
         let watch = Stopwatch::start();
@@ -156,7 +157,7 @@ impl Line {
         self.stage.taken(note, clock.now());
     }
 
-    /// The last frames' light where the run came to its end, then dark.
+    /// Waits for the last frames' light if the run is complete, then goes dark.
     fn go_dark(&mut self, shared: &Shared) {
         let last = shared.clock.now();
         let mut now = last;
@@ -167,7 +168,8 @@ impl Line {
     }
 }
 
-/// The mock projector at real pace, until the cable is unplugged. Its light, and its recorder for what is kept of it.
+/// The mock projector at real pace, until the cable is unplugged. Returns its recorder, which has the light that was
+/// kept.
 pub(super) fn device_thread(
     end: DeviceEnd,
     mut mock: EmulatedProjector,
@@ -175,7 +177,8 @@ pub(super) fn device_thread(
     clock: MonotonicClock,
     rights: &Rights,
 ) -> LightRecorder {
-    // Real hardware has no scheduling jitter, so the mock asks for the highest priority. If that is refused, the stages say so.
+    // Real hardware has no scheduling jitter, so the mock asks for the highest priority. If that is refused, the
+    // stages report it.
     rights.enter_projector();
     let _ = set_timer_slack_ns(1);
     serve_cable(&mut mock, end, || clock.now(), |mock, now| recorder.advance(mock, now));

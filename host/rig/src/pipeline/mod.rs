@@ -1,4 +1,5 @@
-//! Threads and hand-offs of a run: tracking, plan and render, pack, link, and beside the frame path the collector and the supervisor.
+//! The threads and hand-offs of a run: tracking, plan and render, pack, link, and beside the frame path the collector
+//! and the supervisor.
 //!
 //! ```text
 //!  tracking --[latest]--> plan+render --[channel]--> pack --[channel]--> link --[notes]--> collector
@@ -7,11 +8,11 @@
 //!                            +---------------------------------[notes]-----------------------+
 //! ```
 //!
-//! What is decided is [`crate::engine`]'s; here it is driven: by a thread for each stage at real pace (`real.rs`), by one thread and a clock of
-//! its own at virtual pace (`virtual_pace.rs`).
+//! [`crate::engine`] makes the decisions, and this folder drives it. At real pace each stage has a thread
+//! (`real.rs`); at virtual pace one thread moves a clock of its own (`virtual_pace.rs`).
 //!
-//! One frame is one [`crate::frame::job::FrameJob`]: memory and a note, boxed once and recycled. In the steady state no stage allocates, locks or
-//! logs, and every wait is bounded. All hand-offs are those of `dpm_handoff`.
+//! One frame is one [`crate::frame::job::FrameJob`]: memory and a note, boxed once and recycled. In the steady state
+//! no stage allocates, locks or logs, and every wait is bounded. All hand-offs are those of `dpm_handoff`.
 
 mod crew;
 mod link;

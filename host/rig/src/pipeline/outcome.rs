@@ -1,4 +1,4 @@
-//! How a run may differ from its rig file, what it leaves behind, and why it may end early.
+//! The results of a run.
 
 use crate::light::collector::FrameRecord;
 use crate::light::recorder::LightFrame;
@@ -8,23 +8,23 @@ use crate::telemetry::slots::SlotCounts;
 use crate::telemetry::trace::TracedFrame;
 use dpm_common::realtime::standstill::Standstills;
 
-/// What a run leaves behind.
+/// The results of a run.
 pub struct RunOutcome {
     /// Measurements.
     pub report: Report,
     /// The last lit frames, oldest first.
     pub recent: Vec<FrameRecord>,
-    /// Their light, oldest first.
+    /// The light of these frames, oldest first.
     pub light: Vec<LightFrame>,
     /// Lit frames whose light was not what was rendered.
     pub light_mismatches: u64,
     /// Distributions of every interval.
     pub profiler: Profiler,
-    /// Slots by what became of them.
+    /// Slots by what happened in them.
     pub slots: SlotCounts,
-    /// Slots in which a frame was wanted and those missed, of equal batches of consecutive slots.
+    /// For equal batches of consecutive slots: slots in which a frame was wanted, and those of them that were missed.
     pub slot_batches: Vec<(u64, u64)>,
-    /// Lit frames with parts of another frame (looked for in prepared frames only).
+    /// Lit frames that contain parts of another frame (checked for prepared frames only).
     pub frames_torn: u64,
     /// Frames lit after a newer one, or twice.
     pub frames_reordered: u64,

@@ -1,4 +1,5 @@
-//! What a run works with: the tracker, the renderer, the memory of frames, and the projector at the other end of the cable.
+//! What a run needs: the tracker, the renderer, the memory of frames, and the projector at the other end of the
+//! cable.
 
 use super::settings::{budget_controller, output, renderer_settings};
 use crate::config::{MockProjectorConfig, RenderMethod};
@@ -19,27 +20,29 @@ use dpm_render::pack::{BitPlaneFrame, Kernel};
 use dpm_render::{RenderError, Renderer, RendererSettings};
 use std::sync::Arc;
 
-/// How long the first frame may take, for which drivers translate shaders, nanoseconds: minutes on a slow machine that does other things too.
+/// How long the first frame may take, nanoseconds. Drivers translate shaders for it, which takes minutes on a slow,
+/// busy machine.
 pub(super) const FIRST_FRAME_TIMEOUT_NS: u64 = 180_000_000_000;
 
-/// What tracking, plan and pack work with.
+/// What tracking, plan and pack need.
 pub(super) struct CrewParts {
     pub(super) tracking: TrackingStage,
     /// `None` if frames are prepared.
     pub(super) renderer: Option<Renderer>,
     pub(super) prepared: Option<PreparedFrames>,
-    /// How planes are packed if the GPU has not done it.
+    /// How to pack planes if the GPU does not.
     pub(super) kernel: Kernel,
     /// `None` if every frame gets the rays that the rig file asks for.
     pub(super) budget: Option<BudgetController>,
-    /// What frames are made in.
+    /// Memory for the frames.
     pub(super) memory: Vec<FrameMemory>,
-    /// What a frame took while nobody was waiting for it, nanoseconds; 0 if that was not measured.
+    /// Time that a frame took while the GPU was otherwise idle, nanoseconds; 0 if not measured.
     pub(super) frame_ns: i64,
 }
 
 impl CrewParts {
-    /// Without a GPU frames are prepared. Trackers outside this process stamp their packets with `clock`.
+    /// Without a GPU, frames are prepared instead of rendered. Trackers outside this process stamp their packets with
+    /// `clock`.
     ///
     /// # Errors
     /// The tracker cannot be opened, or the GPU refuses.
@@ -69,9 +72,10 @@ impl CrewParts {
         })
     }
 
-    /// Makes the parts ready for real pace: they draw two frames that nobody sees, so that what drivers put off to the first one is over
-    /// before a slot waits for it, and the second tells how long a frame takes. From then on the ray budget follows the time that frames take,
-    /// which it must not at virtual pace: there pictures do not depend on how fast the machine is.
+    /// Prepares the parts for real pace. They draw two frames that are never shown: the first one absorbs one-time
+    /// work of the driver before a slot depends on it, and the second one measures the time of a frame. From then on
+    /// the ray budget follows the frame times. At virtual pace it must not, because there the pictures may not depend
+    /// on the machine's speed.
     ///
     /// # Errors
     /// The GPU does not finish, or is lost.
@@ -90,14 +94,14 @@ impl CrewParts {
     }
 }
 
-/// Memory for a frame in the making, with its slot on the GPU if one renders.
+/// Memory for one frame, with its slot on the GPU if a GPU renders.
 fn frame_memory(rig: &Rig, renderer: Option<&mut Renderer>) -> Result<FrameMemory, PipelineError> {
     let gpu = renderer.map(|renderer| renderer.create_slot(false)).transpose().map_err(RenderError::from)?;
     Ok(FrameMemory { gpu, planes: BitPlaneFrame::new(rig.camera.raster, rig.config.projector.schedule()) })
 }
 
-/// The mock projector that the rig file describes by `mock`, dark, and who watches its light and tells it to `lights`. `marked`: frames carry
-/// marks to be looked for. Times of injected faults count from `start`.
+/// The mock projector that the rig file describes in `mock`, dark, with a recorder that reports its light to
+/// `lights`. `marked`: frames carry marks to be checked. Times of injected faults count from `start`.
 ///
 /// # Errors
 /// The rig file injects faults that no projector has.

@@ -1,4 +1,4 @@
-//! `[projector.backend]` into an open medium, and the rig file into what is asked of the link over it.
+//! Opens the medium of `[projector.backend]`, and derives the link's settings from the rig file.
 
 use crate::config::{Compaction, Pace, ProjectorBackend, RigConfig};
 use crate::engine::connect::ConnectError;
@@ -8,26 +8,27 @@ use dpm_device::transport::serial::{SerialSettings, SerialTransport};
 use dpm_device::transport::usb::{UsbSettings, UsbTransport};
 use dpm_device::transport::Transport;
 
-/// From the handshake to slot 0.
+/// Time from the handshake to slot 0.
 const EPOCH_NS: u64 = 5_000_000;
 
-/// A way to a projector outside this process.
+/// A connection to a projector outside this process.
 pub struct Medium {
     /// The open medium.
     pub transport: Box<dyn Transport>,
-    /// What the operator should know, for example a limit of the kernel that leaves room for fewer frames than asked for.
+    /// Warnings for the operator, for example a kernel limit that leaves room for fewer frames than requested.
     pub warnings: Vec<String>,
 }
 
-/// Bytes of the largest frame of `planes` planes on the wire.
+/// Bytes on the wire of the largest frame of `planes` planes.
 pub fn frame_bytes(raster: Raster, planes: usize) -> usize {
     packet_bytes(raster.plane_bytes()) * planes + packet_bytes(COMMIT_BYTES)
 }
 
-/// Opens the medium of a bit-plane projector on USB or a serial port; `None` for the other backends, which have none.
+/// Opens the medium of a bit-plane projector on USB or a serial port. `None` for the other backends, which have none.
 ///
 /// # Errors
-/// Not found; no permission, with the rule or group that gives it; in use by another program.
+/// The device was not found; there is no permission (the message names the rule or group that grants it); or another
+/// program uses it.
 pub fn open(config: &RigConfig, raster: Raster) -> Result<Option<Medium>, ConnectError> {
     let frame_bytes = frame_bytes(raster, config.projector.schedule().len());
     let failed = |e| ConnectError::from(LinkError::Transport(e));
@@ -53,7 +54,7 @@ pub fn open(config: &RigConfig, raster: Raster) -> Result<Option<Medium>, Connec
     })
 }
 
-/// Codecs that the rig file allows on its link, bits [`Codec::mask`].
+/// Codecs that the rig file allows on its link, as bits of [`Codec::mask`].
 pub(crate) fn codecs(backend: &ProjectorBackend) -> u32 {
     let compaction = match backend {
         ProjectorBackend::Mock(c) => &c.compaction,
@@ -67,7 +68,7 @@ pub(crate) fn codecs(backend: &ProjectorBackend) -> u32 {
     }
 }
 
-/// Flashes a second that the host lets through; `None` when the limiter is off.
+/// Number of flashes per second that the host permits; `None` if the limiter is off.
 pub(crate) fn flash_limit(config: &RigConfig) -> Option<u8> {
     match config.safety.flashes_per_second {
         0 => None,
@@ -75,7 +76,7 @@ pub(crate) fn flash_limit(config: &RigConfig) -> Option<u8> {
     }
 }
 
-/// What the rig asks of its projector.
+/// The link settings for the rig's projector.
 pub fn link_settings(config: &RigConfig, raster: Raster) -> LinkSettings {
     LinkSettings {
         raster,
@@ -83,7 +84,7 @@ pub fn link_settings(config: &RigConfig, raster: Raster) -> LinkSettings {
         rate: config.projector.frame_rate,
         watchdog_us: config.watchdog_us(),
         underrun: Underrun::Repeat,
-        // At real pace a late frame is better than none; at virtual pace none is late.
+        // At real pace a late frame is better than none. At virtual pace no frame is late.
         late_slots: if config.real_time.pace == Pace::Virtual { 0 } else { 255 },
         epoch: Epoch::AfterHello(EPOCH_NS),
         codecs: codecs(&config.projector.backend),

@@ -1,4 +1,5 @@
-//! A run at real pace: a thread for each stage, the link, the supervisor and the mock projector; the caller's collects.
+//! A run at real pace: a thread each for the stages, the link, the supervisor and the mock projector. The caller's
+//! thread collects.
 
 use super::crew::{Crew, NotesBack, OnExit, Port};
 use super::link::{device_thread, link_thread, Line};
@@ -38,18 +39,21 @@ use std::sync::{Arc, Mutex};
 use std::thread::JoinHandle;
 use std::time::Duration;
 
-/// Buffers of the cable to a projector in this process: one is filled while another is read, and one for a projector that is late.
+/// Buffers of the cable to a projector in this process: one is being filled, one is being read, and one is spare for
+/// a late projector.
 const CABLE_BUFFERS: usize = 3;
-/// A step of a control thread that ends this late is a standstill of the machine, nanoseconds.
+/// A step of a control thread that ends this late counts as a standstill of the machine, nanoseconds.
 const STANDSTILL_NS: i64 = 1_000_000;
-/// Time between two polls of a link that comes up, nanoseconds.
+/// Time between two polls of a link that is coming up, nanoseconds.
 const CONNECT_STEP_NS: i64 = 200_000;
-/// What the collector may take for one look, and for one note, nanoseconds. It is the only thread here that runs behind all others, it
-/// allocates, and no light depends on it: without it frames run out of notes and the light ends by itself.
+/// Time that the collector may take for one pass, and for one note, nanoseconds. It is the only thread here with a
+/// lower rank than all others, it allocates, and no light depends on it: without it frames run out of notes, and the
+/// light ends by itself.
 const LOOK_NS: i64 = 5_000_000_000;
-/// Time between two looks of the collector. It is not woken for every frame: that would cost the frame path two system calls a frame.
+/// Time between two passes of the collector. It is not woken for every frame, which would cost the frame path two
+/// system calls per frame.
 const REST: Duration = Duration::from_millis(2);
-/// How long threads are waited for that have nothing left to do.
+/// How long the end of a run waits for threads that have nothing left to do.
 const END_WITHIN: Duration = Duration::from_secs(1);
 
 pub(super) fn run_at_real_pace(
@@ -58,7 +62,7 @@ pub(super) fn run_at_real_pace(
     options: RunOptions,
     monitor: &Arc<RunMonitor>,
 ) -> Result<Ran, PipelineError> {
-    // A spinning thread on a machine with fewer cores than stages delays the very stages it waits for.
+    // On a machine with fewer cores than stages, a spinning thread delays the very stages that it waits for.
     let clock = MonotonicClock::new(if usable_cores() > STAGE_THREADS { 50_000 } else { 0 });
     let parts = crew_parts(rig, gpu, options, clock)?;
     let (lights_in, lights) = channel(LIGHTS, WaitPolicy::Park);
@@ -97,7 +101,7 @@ pub(super) fn run_at_real_pace(
 
     let maker = maker(rig, gpu.cloned(), options, clock);
     let (threads, mut inbox, notes_back) = Threads::start(&shared, parts, line, maker, lights)?;
-    // A panic up to the end of this function ends the light.
+    // A panic before the end of this function ends the light.
     let stop_on_panic = OnExit(|| {
         if std::thread::panicking() {
             monitor.request_stop();
@@ -134,7 +138,7 @@ fn crew_parts(
     CrewParts::new(rig, gpu, options, Arc::new(move || clock.now()))?.at_real_pace(rig)
 }
 
-/// Makes crews that take over. A GPU that failed is opened anew, with the options of the one before.
+/// Makes crews that take over. A GPU that failed is reopened with the same options.
 fn maker(rig: &Arc<Rig>, gpu: Option<Arc<Gpu>>, options: RunOptions, clock: MonotonicClock) -> Maker {
     let rig = rig.clone();
     let gpu = Mutex::new(gpu);
@@ -147,25 +151,25 @@ fn maker(rig: &Arc<Rig>, gpu: Option<Arc<Gpu>>, options: RunOptions, clock: Mono
     })
 }
 
-/// Says how long bodies are carried on by prediction where the rig file leaves it open.
+/// Reports how long prediction may extend a body's track if the rig file leaves it open.
 fn tell_horizon(facts: &Facts) {
     if facts.rig.config.safety.predict_ms.is_none() {
         let ms = facts.predict_ns.load(Ordering::Relaxed) as f64 / 1e6;
         facts.monitor.note(format!(
-            "safety.predict_ms is left out: a body is carried on by prediction for {ms:.0} ms and the tracker's latency, which follows what \
-             frames need"
+            "safety.predict_ms is not set: prediction may extend a body's track for {ms:.0} ms plus the tracker's latency; the value follows \
+             the time that frames need"
         ));
     }
 }
 
-/// The way to the projector, and what is at its other end.
+/// The connection to the projector, and what is at its other end.
 struct FarEnd {
     medium: Box<dyn Transport>,
     /// The thread of a mock in this process.
     device: Option<JoinHandle<LightRecorder>>,
-    /// Where reports of light go that nobody in this process sees.
+    /// Receives reports of light from a projector outside this process.
     lights: Option<Sender<LightNote>>,
-    /// What the operator should know about the medium.
+    /// Warnings about the medium for the operator.
     warnings: Vec<String>,
 }
 
@@ -198,12 +202,12 @@ fn open_far_end(
         RigError::Unsupported(format!("projector.backend.kind = {word:?} takes no frames over a link"))
     })?;
     let (mut transport, warnings) = (medium.transport, medium.warnings);
-    // Replies are stamped when they arrive, not when they are looked for.
+    // Replies are stamped when they arrive, not when they are read.
     transport.set_clock(Arc::new(move || clock.now()));
     Ok(FarEnd { medium: transport, device: None, lights: Some(lights), warnings })
 }
 
-/// The recorder of the mock's thread, which ends when its cable is unplugged.
+/// Returns the recorder of the mock's thread, which ends when its cable is unplugged.
 fn recorder_of(device: JoinHandle<LightRecorder>) -> Result<LightRecorder, PipelineError> {
     match join_within(device, END_WITHIN) {
         Some(ended) => ended.map_err(|_| PipelineError::Panicked("mock projector")),
@@ -211,17 +215,17 @@ fn recorder_of(device: JoinHandle<LightRecorder>) -> Result<LightRecorder, Pipel
     }
 }
 
-/// The threads of a run but for the collector's.
+/// The threads of a run except the collector's.
 struct Threads {
     link: JoinHandle<ProjectorReport>,
     supervisor: JoinHandle<Option<String>>,
 }
 
-/// What the threads left behind.
+/// What the threads returned.
 struct Ended {
-    /// `None` when the link's thread hangs.
+    /// `None` if the link's thread hangs.
     carried: Option<ProjectorReport>,
-    /// What the tracker says of bodies that were never seen.
+    /// What the tracker reports about bodies that were never seen.
     unseen: Option<String>,
 }
 
@@ -253,7 +257,7 @@ impl Threads {
             supervisor.run(crew)
         })
         .inspect_err(|_| {
-            // Nobody would watch: the link ends, and with it the light.
+            // Nobody would supervise the link, so it ends, and with it the light.
             shared.facts.monitor.request_stop();
         })?;
         Ok((Self { link, supervisor }, Inbox { done, lights }, notes_back))
@@ -266,7 +270,7 @@ impl Threads {
     }
 }
 
-/// Collects until the run is over, or until nobody can end it any more.
+/// Collects until the run is over, or until nothing can end it any more.
 fn collect(shared: &Shared, collector: &mut Collector, inbox: &mut Inbox, notes_back: &NotesBack) {
     let pulse = &shared.collector_pulse;
     pulse.begin(thread_id());
@@ -282,7 +286,7 @@ fn collect(shared: &Shared, collector: &mut Collector, inbox: &mut Inbox, notes_
     pulse.end();
 }
 
-/// A thread of the run.
+/// Starts a thread of the run.
 fn spawn<T: Send + 'static>(
     stage: &'static str,
     work: impl FnOnce() -> T + Send + 'static,

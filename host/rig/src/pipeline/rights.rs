@@ -1,13 +1,13 @@
-//! What each stage asks of the operating system, from the rig file into granted rights and warnings, each once.
+//! What each stage requests from the operating system: granted rights, and one warning per refusal.
 
 use crate::config::RealTimeConfig;
 use dpm_common::realtime::{enter_frame_path, os, Refusal, ThreadRights};
 use std::sync::Mutex;
 
-/// The mock projector's place in the list of cores, behind the stages.
+/// The mock projector's index in the list of cores, after the stages.
 const PROJECTOR: usize = 4;
 
-/// Rights of a run's threads. Locked memory is given back at the end.
+/// Rights of a run's threads. Locked memory is unlocked at the end.
 pub(super) struct Rights {
     priority: u32,
     cores: Vec<u32>,
@@ -34,7 +34,8 @@ impl Rights {
         }
     }
 
-    /// Asks for the rights of the calling thread, the `stage`th of the frame path. Call before its first frame.
+    /// Requests the rights of the calling thread, which is stage number `stage` of the frame path. Call it before the
+    /// first frame.
     pub(super) fn enter(&self, stage: usize) {
         let core = self.cores.get(stage).copied();
         let granted = enter_frame_path(ThreadRights { priority: self.priority, core });
@@ -47,20 +48,20 @@ impl Rights {
         }
     }
 
-    /// The same for the mock projector's thread: it stands for a machine of its own, so no stage may hold it up.
+    /// The same for the mock projector's thread. It represents a separate machine, so no stage may delay it.
     pub(super) fn enter_projector(&self) {
         let above = self.highest_priority();
-        // A refusal is told by the stages, which ask for nearly the same.
+        // The stages report a refusal, because they request nearly the same.
         let core = self.cores.get(PROJECTOR).copied();
         let _ = enter_frame_path(ThreadRights { priority: above, core });
     }
 
-    /// The same for the supervisor, whom no stage may hold up, and who needs next to nothing.
+    /// The same for the supervisor, which no stage may delay, and which needs very little time.
     pub(super) fn enter_supervisor(&self) {
         let _ = enter_frame_path(ThreadRights { priority: self.highest_priority(), core: None });
     }
 
-    /// The highest priority that any thread of the run asks for; 0 under the normal scheduler.
+    /// The highest priority that any thread of the run requests; 0 under the normal scheduler.
     pub(super) fn highest_priority(&self) -> u32 {
         if self.priority > 0 {
             (self.priority + 1).min(99)
@@ -69,7 +70,7 @@ impl Rights {
         }
     }
 
-    /// What was refused, in words.
+    /// The refusals as text.
     pub(super) fn warnings(&self) -> Vec<String> {
         self.refusals.lock().map(|r| r.iter().map(Refusal::to_string).collect()).unwrap_or_default()
     }

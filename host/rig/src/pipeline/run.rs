@@ -1,4 +1,4 @@
-//! One run from its rig to its report.
+//! One run, from a rig to a report.
 
 use super::outcome::RunOutcome;
 use super::real::run_at_real_pace;
@@ -19,13 +19,13 @@ use dpm_render::gpu::Gpu;
 use std::sync::atomic::Ordering;
 use std::sync::Arc;
 
-/// Light events between the projector and the collector: eight seconds at 947 Hz.
+/// Capacity for light events between the projector and the collector: eight seconds at 947 Hz.
 pub(super) const LIGHTS: usize = 8192;
 
-/// Runs the rig until `options.frames` are planned or `monitor` asks to stop. The projector ends dark.
+/// Runs the rig until `options.frames` are planned or `monitor` requests a stop. The projector ends dark.
 ///
 /// # Errors
-/// See [`PipelineError`]; whatever happens, the projector was told to go dark or its watchdog does it.
+/// See [`PipelineError`]. Whatever happens, the projector is ordered to go dark, or its watchdog darkens it.
 pub fn run(
     rig: Arc<Rig>,
     gpu: &Arc<Gpu>,
@@ -35,11 +35,11 @@ pub fn run(
     run_from(rig, Some(gpu), options, monitor)
 }
 
-/// Like [`run`] with prepared frames in place of rendered ones: no GPU takes part. Every frame that is lit is looked at for parts
-/// of another frame.
+/// Like [`run`] with prepared frames instead of rendered ones, without a GPU. Every lit frame is checked for parts of
+/// another frame.
 ///
 /// # Errors
-/// As [`run`], without those of the GPU.
+/// As for [`run`], except those of the GPU.
 pub fn run_prepared(
     rig: Arc<Rig>,
     options: RunOptions,
@@ -62,12 +62,12 @@ fn run_from(
     Ok(ran.into_outcome(&rig, gpu))
 }
 
-/// What is left when the light of a run is over.
+/// What remains when the light of a run is over.
 pub(super) struct Ran {
     pub(super) facts: Arc<Facts>,
     pub(super) collector: Collector,
     pub(super) slots: SlotCounts,
-    /// `None` for a projector outside this process, whose light nobody sees.
+    /// `None` for a projector outside this process, whose light cannot be observed.
     pub(super) recorder: Option<LightRecorder>,
     pub(super) carried: ProjectorReport,
     pub(super) wall_s: f64,

@@ -1,4 +1,5 @@
-//! What a run works with, from the rig file: the renderer's settings, the first guess of the lead, the budget's limits.
+//! Settings of a run, from the rig file: the renderer's settings, the first guess of the lead, the limits of the ray
+//! budget.
 
 use crate::config::Packer;
 use crate::engine::facts::RECEIPT_NS;
@@ -11,28 +12,30 @@ use dpm_render::{Output, RendererSettings};
 
 /// Longest reserve in the lead, nanoseconds.
 const RESERVE_NS: i64 = 528_000;
-/// Spare time in the first guess of the lead, of what a frame took while nobody was waiting: a quarter.
+/// Spare time in the first guess of the lead, as a divisor of the time of an undisturbed frame: a quarter.
 const GUESS_SPARE: i64 = 4;
 
-/// The time from latch to sent that the rig file states, nanoseconds.
+/// The modelled time from latch to sent in the rig file, nanoseconds.
 fn modelled_ns(rig: &Rig) -> i64 {
     i64::from(rig.config.real_time.stage_costs_us.total()) * 1000
 }
 
-/// How early frames are latched, learned from what the rig file states and from the `frame_ns` that a frame took while nobody was waiting.
+/// Estimates how early frames are latched. The first guess comes from the rig file and from `frame_ns`, the time of
+/// an undisturbed frame.
 pub(super) fn lead_estimator(rig: &Rig, link: &HostLink, frame_ns: i64) -> LeadEstimator {
     let slot_ns = rig.rate().slot_len_ns(0);
-    // Sent earlier, a frame would find no room in the device, whose word of a free buffer takes part of a slot.
+    // Sending earlier is useless: the device has no free buffer, and its credit message takes part of a slot to
+    // arrive.
     let held = link.device().map_or(1, |hello| i64::from(hello.frame_buffers));
     let longest_wait_ns = (held * slot_ns - slot_ns / 2 - RECEIPT_NS).max(0);
-    // In reserve: what a core does beside frames, and lends to others, is mostly shorter than half a millisecond.
+    // The reserve: interruptions of a core by other work are mostly shorter than half a millisecond.
     let reserve_ns = (slot_ns / 2).min(RESERVE_NS);
     let rendered_ns = frame_ns + frame_ns / GUESS_SPARE;
     LeadEstimator::new(slot_ns, modelled_ns(rig).max(rendered_ns), reserve_ns, longest_wait_ns)
 }
 
-/// Holds the GPU's time inside the slot by spending fewer samples: thousandths of a sample a pixel, from what the rig file asks for down
-/// to an eighth of it.
+/// Keeps the GPU's time inside the slot by reducing samples. The unit is thousandths of a sample per pixel; the range
+/// is from what the rig file asks for down to an eighth of it.
 pub(super) fn budget_controller(rig: &Rig) -> Option<BudgetController> {
     let full = u64::from(rig.config.render.spp) * 1000;
     let config = BudgetConfig {
@@ -63,7 +66,7 @@ pub fn renderer_settings(rig: &Rig) -> RendererSettings {
     }
 }
 
-/// What the rig file wants back from `gpu`; with `check` the code values in any case.
+/// What the rig file wants to read back from `gpu`; with `check`, the code values in any case.
 pub fn output(rig: &Rig, gpu: &Gpu, check: bool) -> Output {
     let packs = match rig.config.render.packer {
         Packer::Auto => !gpu.summary().software,

@@ -1,4 +1,5 @@
-//! The supervisor's thread, which no stage can hold up: looks at every other thread and does what [`Supervision`] decides.
+//! The supervisor's thread, which no stage can delay. It checks every other thread and carries out what
+//! [`Supervision`] decides.
 
 use super::crew::{Crew, NotesBack, Port};
 use super::parts::CrewParts;
@@ -13,50 +14,50 @@ use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::Arc;
 use std::time::Duration;
 
-/// Between two looks.
+/// Time between two checks.
 const LOOK: Duration = Duration::from_millis(2);
-/// How long threads that should end are waited for when the link is over, nanoseconds.
+/// When the link is over, how long to wait for threads that should end, nanoseconds.
 const END_WITHIN_NS: u64 = 1_000_000_000;
 
-/// Threads of a run were left behind because they hang: the process must not wait for them when it ends.
+/// Hung threads of a run were left behind; the process must not wait for them when it ends.
 static LEFT_BEHIND: AtomicBool = AtomicBool::new(false);
 
-/// True when a run of this process left threads behind that hang. Whoever ends the process must not run destructors that could wait for
-/// them (`_exit`, not `exit`).
+/// True when a run of this process left hung threads behind. The end of the process must not run destructors that
+/// could wait for them (`_exit`, not `exit`).
 pub fn has_left_threads_behind() -> bool {
     LEFT_BEHIND.load(Ordering::Relaxed)
 }
 
-/// Notes that threads are left behind.
+/// Records that threads are left behind.
 pub(super) fn leave_behind() {
     LEFT_BEHIND.store(true, Ordering::Relaxed);
 }
 
-/// Makes what a new crew works with. Runs on a thread of its own.
+/// Makes the parts of a new crew. Runs on a thread of its own.
 pub(super) type Maker = Arc<dyn Fn(Remake) -> Result<CrewParts, PipelineError> + Send + Sync>;
 
-/// The supervisor's own.
+/// The supervisor's state.
 pub(super) struct Supervisor {
     pub(super) shared: Arc<Shared>,
     pub(super) mind: Supervision,
-    /// Where the link learns of a new crew.
+    /// Informs the link of a new crew.
     pub(super) ports: Sender<Port>,
     pub(super) notes_back: NotesBack,
     pub(super) maker: Maker,
 }
 
-/// Who works.
+/// Who is working.
 enum Shift {
     /// A crew.
     Works(Crew),
-    /// Nobody; a crew is being made.
+    /// Nobody; a new crew is being made.
     IsMade(Receiver<Result<CrewParts, PipelineError>>),
-    /// Nobody, and nobody will.
+    /// Nobody, and no crew will follow.
     Over,
 }
 
 impl Supervisor {
-    /// Watches until the link is over. Returns what the tracker says of bodies that were never seen.
+    /// Supervises until the link is over. Returns what the tracker reports about bodies that were never seen.
     pub(super) fn run(mut self, crew: Crew) -> Option<String> {
         let shared = self.shared.clone();
         let clock = shared.clock.sleeping();
@@ -80,7 +81,7 @@ impl Supervisor {
         self.end(shift)
     }
 
-    /// One look at whoever works.
+    /// One check of the current shift.
     fn look(&mut self, shift: Shift, now: HostTime, step_ns: i64) -> Shift {
         match shift {
             Shift::Works(mut crew) => match crew.trouble(now, step_ns) {
@@ -100,14 +101,14 @@ impl Supervisor {
         }
     }
 
-    /// No new crew is there yet.
+    /// No new crew is ready yet.
     fn waits(
         &self,
         result: Receiver<Result<CrewParts, PipelineError>>,
         making: Making,
         now: HostTime,
     ) -> Shift {
-        // Whoever makes it may hang in a driver.
+        // The thread that makes the crew may hang in a driver.
         let may_hang = matches!(making, Making::Waits);
         if self.mind.waits_for(making, now) {
             return Shift::IsMade(result);
@@ -121,9 +122,9 @@ impl Supervisor {
     fn begin(&mut self, parts: CrewParts) -> Shift {
         match Crew::start(&self.shared, parts, &self.notes_back) {
             Ok((crew, port)) => {
-                // There is room: the link takes ports within a millisecond, and crews come seconds apart.
+                // There is room: the link takes ports within a millisecond, and crews are seconds apart.
                 let _ = self.ports.push(port);
-                self.shared.facts.monitor.note("new stages are at work; the picture is back".into());
+                self.shared.facts.monitor.note("the stages are running again; the picture is back".into());
                 Shift::Works(crew)
             }
             Err(error) => {
@@ -133,7 +134,7 @@ impl Supervisor {
         }
     }
 
-    /// Abandons a crew that is in trouble and has a new one made, if that can help.
+    /// Abandons a crew that is in trouble and starts making a new one, if that can help.
     fn replace(&mut self, crew: Crew, trouble: Trouble, now: HostTime) -> Shift {
         let (hangs, remake) = match self.mind.judge(trouble, now) {
             Verdict::End => return Shift::Works(crew),
@@ -158,7 +159,7 @@ impl Supervisor {
         }
     }
 
-    /// Waits a little for the threads that should end now.
+    /// Waits briefly for the threads that should end now.
     fn end(self, shift: Shift) -> Option<String> {
         let Shift::Works(crew) = shift else { return None };
         crew.state.tracking_over.store(true, Ordering::Release);
@@ -178,7 +179,7 @@ impl Supervisor {
     }
 }
 
-/// Waits for the end of a thread for at most `limit`; `None` when it goes on.
+/// Waits at most `limit` for the end of a thread; `None` if it is still running.
 pub(super) fn join_within<T>(
     thread: std::thread::JoinHandle<T>,
     limit: Duration,

@@ -1,4 +1,4 @@
-//! What the stages of a run do in their threads at real pace: tracking, planning and packing. (`link.rs` has the link's thread.)
+//! The threads of tracking, planning and packing at real pace. (`link.rs` has the link's thread.)
 
 use super::crew::{CrewState, PACK, PLAN, TRACKING};
 use super::rights::Rights;
@@ -34,7 +34,8 @@ thread_local! {
     static ON_FRAME_PATH: Cell<bool> = const { Cell::new(false) };
 }
 
-/// True while the calling thread works on frames in the steady state: a counting allocator may demand that nothing is allocated.
+/// True while the calling thread works on frames in the steady state. A counting allocator may then demand that
+/// nothing is allocated.
 pub fn on_frame_path() -> bool {
     ON_FRAME_PATH.with(Cell::get)
 }
@@ -43,42 +44,42 @@ pub(super) fn enter_frame_path(inside: bool) {
     ON_FRAME_PATH.with(|c| c.set(inside));
 }
 
-/// Frames until the steady state, in which nothing is allocated any more.
+/// Frames until the steady state, in which nothing is allocated.
 pub(super) const WARM_UP_FRAMES: u64 = 16;
-/// Reads of the tracker until its buffers have grown.
+/// Reads of the tracker until its buffers have grown to their final size.
 pub(super) const WARM_UP_STEPS: u32 = 64;
-/// Frames that may be between planning and the collector's books: a quarter of a second at 947 Hz.
+/// Frames that may be between planning and the collector: a quarter of a second at 947 Hz.
 pub(super) const NOTES: usize = 256;
 /// Tracking, plan, pack, link, and the mock projector.
 pub(super) const STAGE_THREADS: usize = 5;
-/// Longest wait for another stage before it is looked whether the run goes on, nanoseconds.
+/// How long a stage waits for another one before it checks whether the run continues, nanoseconds.
 const WAIT_NS: i64 = 20_000_000;
-/// What a step of a stage may take beside its waits before anybody wonders, nanoseconds.
+/// Time that a step of a stage may take besides its waits, nanoseconds.
 pub(super) const STEP_NS: i64 = 20_000_000;
-/// What a poll of a tracker may take, nanoseconds: some have to be opened or connected to anew.
+/// Time that a poll of a tracker may take, nanoseconds: some trackers must be reopened or reconnected.
 const POLL_NS: i64 = 200_000_000;
-/// Between two polls of a tracker.
+/// Time between two polls of a tracker.
 const POLL_REST: Duration = Duration::from_micros(200);
-/// How long frames that the GPU still works on are waited for at the end, nanoseconds.
+/// At the end, how long to wait for frames that the GPU still works on, nanoseconds.
 const RELEASED_WITHIN_NS: u64 = 30_000_000_000;
 
-/// Everything that the threads of a run share, whichever crew works.
+/// What all threads of a run share, whichever crew works.
 pub(super) struct Shared {
-    /// What the parts of the engine tell each other.
+    /// Facts that the parts of the engine share.
     pub(super) facts: Arc<Facts>,
     pub(super) clock: MonotonicClock,
     /// The projector's clock as the handshake found it.
     pub(super) time: LinkTime,
     /// The link's thread has ended, and the projector is dark.
     pub(super) is_link_over: AtomicBool,
-    /// A thread that nobody can replace hangs: whoever can still end the run does not wait for the others.
+    /// A thread that cannot be replaced hangs, so the run ends without waiting for the others.
     pub(super) is_broken: AtomicBool,
     pub(super) link_pulse: Pulse,
     pub(super) collector_pulse: Pulse,
     pub(super) rights: Arc<Rights>,
 }
 
-/// Stands still where the run's options say so.
+/// Stalls if the run's options ask for it.
 pub(super) fn may_stall(facts: &Facts, stage: StallIn, frame: u64) {
     if let Some(stall) = facts.options.stall.filter(|s| (s.stage, s.frame) == (stage, frame)) {
         std::thread::sleep(stall.length);
@@ -95,7 +96,7 @@ pub(super) fn policy(rig: &Rig) -> WaitPolicy {
     wait_policy(wish, STAGE_THREADS)
 }
 
-/// The next value, waited for at most `limit_ns`.
+/// The next value; waits at most `limit_ns`.
 pub(super) fn pop_within<T>(from: &mut Receiver<T>, limit_ns: i64) -> Option<T> {
     from.try_pop().or_else(|| {
         let watch = Stopwatch::start();
@@ -117,7 +118,7 @@ pub(super) fn tracking_thread(
     let mut steps = 0u32;
     let mut planned = 0;
     while !crew.tracking_over.load(Ordering::Acquire) {
-        // Each frame once, also those that were planned while this thread slept.
+        // Every frame once, including those that were planned while this thread slept.
         let planning = crew.planning.load(Ordering::Relaxed);
         while planned < planning {
             planned += 1;
@@ -135,8 +136,8 @@ pub(super) fn tracking_thread(
     stage.never_seen(&facts.rig)
 }
 
-/// Takes what the tracker has to say by `now`. A tracker that fails is told by the freshness of its tracks: light goes off by itself, and the
-/// report says why.
+/// Reads what the tracker has reported by `now`. The failure of a tracker shows in the age of its tracks: the light
+/// goes off by itself, and the report says why.
 pub(super) fn read_tracker(
     facts: &Facts,
     stage: &mut TrackingStage,
@@ -145,7 +146,8 @@ pub(super) fn read_tracker(
 ) {
     let _ = stage.step(now, latest);
     if stage.is_silence_due(now) {
-        // Off the frame path for once: a body is dark for want of samples, and the operator should not learn it from the report.
+        // Leaves the frame path once: a body is dark for lack of samples, and the operator should not have to wait
+        // for the report.
         enter_frame_path(false);
         if let Some(word) = stage.not_seen_yet(&facts.rig) {
             facts.monitor.tell_of_tracker(word);
@@ -153,7 +155,7 @@ pub(super) fn read_tracker(
     }
 }
 
-/// Where planning finds what it works with.
+/// The inputs of planning.
 pub(super) struct PlanInbox {
     pub(super) latest: Reader<TrackSnapshot>,
     pub(super) time: Reader<LinkTime>,
@@ -163,7 +165,7 @@ pub(super) struct PlanInbox {
     pub(super) gpu_free: Waiter,
 }
 
-/// Latches, plans and submits frames until the run has all that it was asked for, or the crew is dismissed.
+/// Latches, plans and submits frames until all frames of the run are planned, or the crew is dismissed.
 pub(super) fn plan_thread(
     shared: &Shared,
     crew: &CrewState,
@@ -187,13 +189,13 @@ pub(super) fn plan_thread(
         facts.is_complete.store(true, Ordering::Release);
     }
     pulse.end();
-    // Packing comes to its end, too.
+    // This also ends packing.
     drop(desk);
     let Some(renderer) = renderer else { return };
     let watch = Stopwatch::start();
     while crew.facts.gpu.in_flight() > 0 {
         if watch.elapsed_ns() > RELEASED_WITHIN_NS {
-            // The GPU may read what the renderer owns for as long as it likes: it is never freed.
+            // The GPU may read the renderer's memory for an unknown time, so the memory is never freed.
             std::mem::forget(renderer);
             return;
         }
@@ -201,17 +203,17 @@ pub(super) fn plan_thread(
     }
 }
 
-/// The planning thread's own.
+/// The planning thread's state.
 struct PlanDesk<'a> {
     shared: &'a Shared,
     crew: &'a CrewState,
     stage: PlanStage<Real>,
     inbox: PlanInbox,
     to_pack: Sender<FrameJob>,
-    /// What came back last is taken first: it is the warmest in the caches.
+    /// The memory that came back last is taken first, because most of it is still in the caches.
     #[allow(clippy::vec_box)] // The box is what travels between the threads.
     hottest: Vec<Box<FrameMemory>>,
-    /// The last look at the memory that came back found none.
+    /// No memory had come back at the last check.
     waited: bool,
 }
 
@@ -223,7 +225,7 @@ impl<'a> PlanDesk<'a> {
         Self { shared, crew, stage, inbox, to_pack, hottest, waited: false }
     }
 
-    /// Memory and a note for the next frame, waited for at most [`WAIT_NS`].
+    /// Memory and a note for the next frame; waits at most [`WAIT_NS`] for each.
     fn memory(&mut self) -> Option<FrameJob> {
         while let Some(memory) = self.inbox.free.try_pop() {
             self.hottest.push(memory);
@@ -240,7 +242,7 @@ impl<'a> PlanDesk<'a> {
         Some(FrameJob { note, memory: self.hottest.pop()? })
     }
 
-    /// Waits for a GPU that gets its frames one at a time, at most [`WAIT_NS`]. False while it is busy.
+    /// Waits at most [`WAIT_NS`] for a GPU that gets its frames one at a time. False while it is busy.
     fn gpu_is_free(&mut self) -> bool {
         let (clock, stage) = (self.shared.clock, &self.stage);
         stage.may_begin() || {
@@ -249,7 +251,7 @@ impl<'a> PlanDesk<'a> {
         }
     }
 
-    /// One frame, if there is memory for it. `None` when the crew cannot go on.
+    /// Plans and submits one frame, if there is memory for it. `None` if the crew cannot continue.
     fn frame(&mut self, renderer: Option<&mut Renderer>) -> Option<()> {
         if !self.gpu_is_free() {
             return Some(());
@@ -281,7 +283,7 @@ impl<'a> PlanDesk<'a> {
         self.to_pack.push(job).ok()
     }
 
-    /// Waits until it is time to read the poses; returns when that was.
+    /// Waits until the poses should be read; returns the time.
     fn wait_for(&self, latch: &Latch) -> HostTime {
         let (clock, pulse) = (self.shared.clock, &self.crew.pulses[PLAN]);
         pulse.beat(latch.at.max(clock.now()), WAIT_NS + STEP_NS);
@@ -291,14 +293,14 @@ impl<'a> PlanDesk<'a> {
     }
 }
 
-/// Where packing finds its work.
+/// The inputs of packing.
 pub(super) struct PackInbox {
     pub(super) jobs: Receiver<FrameJob>,
     /// Wakes planning where it waits for the GPU.
     pub(super) gpu_waker: Waker,
 }
 
-/// Waits for rendered frames and cuts them into planes until no more come.
+/// Waits for rendered frames and packs them into planes until no more come.
 pub(super) fn pack_thread(
     shared: &Shared,
     crew: &CrewState,
@@ -323,7 +325,7 @@ pub(super) fn pack_thread(
             break;
         }
         let now = clock.now();
-        // A prepared frame is there when it is planned: what follows is waiting for the packer.
+        // A prepared frame is ready when it is planned. The time after that is spent waiting for the packer.
         job.note.timeline.rendered_at = job.note.timeline.submitted_at;
         if job.memory.gpu.is_some() {
             job.note.timeline.rendered_at = now;
@@ -343,10 +345,10 @@ pub(super) fn pack_thread(
     pulse.end();
 }
 
-/// Waits for the GPU to finish a frame, at most `limit_ns`; `alive` is called before each wait.
+/// Waits at most `limit_ns` for the GPU to finish a frame; calls `alive` before each wait.
 ///
 /// # Errors
-/// It does not finish in time, or it was lost.
+/// The GPU does not finish in time, or was lost.
 pub(super) fn rendered(job: &mut FrameJob, limit_ns: u64, alive: impl FnMut()) -> Result<(), PipelineError> {
     let frame = job.note.plan.id.0;
     match crate::render::finish(job, limit_ns, alive) {
@@ -356,7 +358,7 @@ pub(super) fn rendered(job: &mut FrameJob, limit_ns: u64, alive: impl FnMut()) -
     }
 }
 
-/// The next job, or `None` when no more will come; `alive` is called before each wait.
+/// The next job, or `None` if no more will come; calls `alive` before each wait.
 fn next(from: &mut Receiver<FrameJob>, alive: impl Fn()) -> Option<FrameJob> {
     loop {
         alive();

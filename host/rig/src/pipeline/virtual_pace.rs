@@ -1,5 +1,5 @@
-//! A run at virtual pace: one thread drives every part of the engine under a clock that it moves. Each stage takes what the rig file says that
-//! it costs, so a run is a function of its inputs, however fast or busy the machine is.
+//! A run at virtual pace. One thread drives every part of the engine under a clock that it moves. Each stage takes
+//! the modelled cost in the rig file, so a run is a function of its inputs, however fast or busy the machine is.
 
 use super::parts::{mock_projector, CrewParts, FIRST_FRAME_TIMEOUT_NS};
 use super::projector;
@@ -42,9 +42,9 @@ use std::panic::{catch_unwind, AssertUnwindSafe};
 use std::sync::atomic::Ordering;
 use std::sync::Arc;
 
-/// A frame that the GPU has not finished by then is given up, and the run with it, nanoseconds.
+/// A frame that the GPU has not finished after this time is given up, and the run with it, nanoseconds.
 const GPU_TIMEOUT_NS: u64 = 20_000_000_000;
-/// Time between two polls of a link that comes up, nanoseconds.
+/// Time between two polls of a link that is coming up, nanoseconds.
 const CONNECT_STEP_NS: i64 = 50_000;
 
 pub(super) fn run_at_virtual_pace(
@@ -53,13 +53,13 @@ pub(super) fn run_at_virtual_pace(
     options: RunOptions,
     monitor: &Arc<RunMonitor>,
 ) -> Result<Ran, PipelineError> {
-    // Only trackers without a clock of their own are allowed at virtual pace.
+    // Virtual pace permits only trackers without a clock of their own.
     let mut parts = CrewParts::new(rig, gpu, options, Arc::new(|| HostTime(0)))?;
-    // The link comes up just before the first frame, so that nobody waits for the filters.
+    // The link comes up just before the first frame. The filters need the time before that.
     let mut now = HostTime(LISTEN_NS);
     let (lights_in, lights) = channel(LIGHTS, WaitPolicy::Park);
     let ProjectorBackend::Mock(mock) = &rig.config.projector.backend else {
-        let told = "real_time.pace = \"virtual\" takes the mock projector only";
+        let told = "real_time.pace = \"virtual\" works only with the mock projector";
         return Err(RigError::Unsupported(told.into()).into());
     };
     let (mock, recorder) = mock_projector(rig, mock, lights_in, options, gpu.is_none(), now)?;
@@ -120,7 +120,7 @@ pub(super) fn run_at_virtual_pace(
     })
 }
 
-/// All parts of a run, and the time.
+/// All parts of a run, and its clock.
 struct World {
     facts: Arc<Facts>,
     plan: PlanStage<Virtual>,
@@ -132,9 +132,10 @@ struct World {
     now: HostTime,
     /// When the last frame was sent.
     sent_at: HostTime,
-    /// What plan, render, pack and link cost, nanoseconds.
+    /// Modelled costs of plan, render, pack and link, nanoseconds.
     costs: [i64; 4],
-    /// A sample that arrives later than this before the latch is no pose yet, nanoseconds.
+    /// Modelled cost of tracking, nanoseconds: a sample that arrives later than this before the latch is not used
+    /// yet.
     track_ns: i64,
     latest: (Publisher<TrackSnapshot>, Reader<TrackSnapshot>),
     parts: CrewParts,
@@ -144,18 +145,19 @@ struct World {
     free: Vec<Box<FrameMemory>>,
     #[allow(clippy::vec_box)]
     notes: RefCell<Vec<Box<FrameNote>>>,
-    /// Frames that the GPU works on, oldest first.
+    /// Frames in progress on the GPU, oldest first.
     under_way: VecDeque<FrameJob>,
     /// `None` when no frame will be finished any more.
     done: Option<Sender<Box<FrameNote>>>,
     collector: Collector,
     inbox: Inbox,
-    /// The stage that works, for the word on a panic.
+    /// The stage that is working, for the message about a panic.
     at_work: &'static str,
 }
 
 impl World {
-    /// Runs until all frames are lit or a stop is asked for, then goes dark. A failure or a panic ends in the dark, too.
+    /// Runs until all frames are lit or a stop is requested, then goes dark. A failure or a panic also ends in the
+    /// dark.
     fn run(&mut self) {
         let served = catch_unwind(AssertUnwindSafe(|| self.serve()));
         enter_frame_path(false);
@@ -193,7 +195,7 @@ impl World {
         Ok(())
     }
 
-    /// Latches the next frame and starts the GPU on it. False when the run has all that it was asked for.
+    /// Latches the next frame and starts the GPU on it. False when all frames of the run are planned.
     fn begin(&mut self, memory: Box<FrameMemory>) -> Result<bool, PipelineError> {
         self.at_work = "plan";
         let id = self.plan.next_frame();
@@ -231,7 +233,7 @@ impl World {
         Ok(true)
     }
 
-    /// Waits for the GPU, packs the frame and brings it to the projector.
+    /// Waits for the GPU, packs the frame and sends it to the projector.
     fn finish(&mut self, job: &mut FrameJob) -> Result<(), PipelineError> {
         let frame = job.note.plan.id.0;
         enter_frame_path(frame >= WARM_UP_FRAMES);
@@ -267,7 +269,7 @@ impl World {
         self.sent_at = now;
     }
 
-    /// The link is done with a frame: its memory is free again, its note is the collector's.
+    /// The link has finished with a frame: returns its memory, and passes its note to the collector.
     fn release(&mut self, job: FrameJob) {
         enter_frame_path(false);
         self.free.push(job.memory);
@@ -278,13 +280,13 @@ impl World {
         self.collect();
     }
 
-    /// The projector lives up to `now`. Everybody is alive: nobody can be late.
+    /// Advances the projector to `now`. No thread can be late here, so all count as alive.
     fn live(&mut self, now: HostTime) {
         self.facts.alive_at_ns.store(now.0, Ordering::Relaxed);
         self.recorder.advance(self.cable.device_mut(), now);
     }
 
-    /// The last frames' light where the run came to its end, then dark.
+    /// Waits for the last frames' light if the run is complete, then goes dark.
     fn go_dark(&mut self) {
         let (last, mut now) = (self.sent_at, self.sent_at);
         while let Some(at) = self.link.end(now, last, &mut self.cable) {
@@ -293,7 +295,8 @@ impl World {
         }
     }
 
-    /// Frames that are still under way are counted as not sent. Their memory is not freed before the GPU is done with it.
+    /// Counts frames that are still in flight as not sent. Their memory is not freed before the GPU has finished with
+    /// it.
     fn clear(&mut self) {
         while let Some(mut job) = self.under_way.pop_front() {
             job.note.fate = Fate::Stopped;
@@ -304,7 +307,8 @@ impl World {
         }
     }
 
-    /// The GPU does not finish `job`, or is lost. It may read what frames and the renderer own for as long as it likes: they are never freed.
+    /// The GPU does not finish `job`, or is lost. It may read the memory of frames and renderer for an unknown time,
+    /// so that memory is never freed.
     fn abandon(&mut self, job: FrameJob) {
         leave_behind();
         std::mem::forget((job, std::mem::take(&mut self.under_way), self.parts.renderer.take()));

@@ -1,17 +1,18 @@
-//! Measured frame times into a ray budget that keeps the frame inside its slot.
+//! Adjusts the ray budget to measured frame times, so that a frame stays inside its slot.
 //!
-//! Work in logarithms: x = ln(rays), e = ln(wanted time / measured time). Around the set point a slow integral follows the
-//! load; it is compared with what the measured frame was given, not with what is asked for by now, so that frames in
-//! flight are not answered twice (Smith's predictor with a pure delay). Beyond the limit the budget falls at once by the whole
-//! excess. The way down is fast because a late frame is seen; the way up is slow because a slightly poorer one is not, and
-//! because a loop whose gain may be wrong by 5 and whose delay may be 3 frames is only free of oscillation when slow.
+//! The controller works in logarithms: x = ln(rays), e = ln(wanted time / measured time). Around the set point a slow
+//! integral follows the load. The integral compares each measurement with the budget that the measured frame had, not
+//! with the current budget, so frames in flight are not corrected twice (Smith's predictor with a pure delay). Beyond
+//! the limit the budget falls at once by the whole excess. The budget falls fast because a late frame is visible. It
+//! rises slowly because a slightly poorer frame is not visible, and because a loop whose gain may be wrong by 5 and
+//! whose delay may be 3 frames must be slow to be free of oscillation.
 
-/// Settings of a [`BudgetController`]. Times in nanoseconds.
+/// Settings of a [`BudgetController`]. Times are in nanoseconds.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct BudgetConfig {
     /// Length of a slot, > 0.
     pub slot_ns: i64,
-    /// Share of the slot aimed at, 0 to 1: the rest absorbs jitter.
+    /// Share of the slot that the controller aims at, 0 to 1; the rest absorbs jitter.
     pub aim: f64,
     /// Share of the slot beyond which the budget falls at once; above `aim`.
     pub limit: f64,
@@ -29,7 +30,7 @@ pub enum BudgetError {
     /// The slot has no length.
     #[error("the slot's length is {0} ns; it must be above 0")]
     Slot(i64),
-    /// Shares out of order.
+    /// The shares are out of order.
     #[error("aim {aim} and limit {limit} must satisfy 0 < aim < limit <= 1")]
     Shares {
         /// Given.
@@ -37,7 +38,7 @@ pub enum BudgetError {
         /// Given.
         limit: f64,
     },
-    /// Ray counts out of order.
+    /// The ray counts are out of order.
     #[error("min_rays {min} and max_rays {max} must satisfy 1 <= min_rays <= max_rays")]
     Rays {
         /// Given.
@@ -47,24 +48,25 @@ pub enum BudgetError {
     },
 }
 
-/// Share of the error that the slow path takes back each frame. A loop with a delay of d frames approaches without overshoot
-/// while its gain stays below d^d / (d + 1)^(d + 1); 0.02 times a plant five times too steep is under the 0.105 of d = 3.
+/// Share of the error that the slow path corrects in each frame. A loop with a delay of d frames approaches without
+/// overshoot while its gain stays below d^d / (d + 1)^(d + 1). A share of 0.02 on a plant that is five times too
+/// steep stays below the 0.105 of d = 3.
 const SLOW: f64 = 0.02;
 
-/// The slow path takes no error for larger than this (a factor of 20), so that an idle GPU does not make it jump.
+/// The slow path limits the error to this (a factor of 20), so that an idle GPU does not make it jump.
 const SLOW_CLAMP: f64 = 3.0;
 
-/// Each fast step that did not suffice makes the next one steeper by this, up to [`STEEPEST`]: most of the time may be
-/// spent on what does not depend on rays.
+/// Each fast step that was not enough makes the next one steeper by this factor, up to [`STEEPEST`], because most of
+/// the time may go to work that does not depend on rays.
 const STEEPEN: f64 = 1.6;
 const STEEPEST: f64 = 6.0;
 
-/// Holds the frame slot by scaling the number of rays.
+/// Keeps frames inside their slot by scaling the number of rays.
 #[derive(Clone, Debug)]
 pub struct BudgetController {
     config: BudgetConfig,
     ln_rays: f64,
-    /// Excess of the last measurement over the limit's aim (negative e), 0 when it was inside.
+    /// Excess of the last measurement (the negative of e); 0 when it was within the limit.
     last_excess: f64,
     steepness: f64,
     ignored: u64,
@@ -99,8 +101,8 @@ impl BudgetController {
         (self.ln_rays.exp().round() as u64).clamp(self.config.min_rays, self.config.max_rays)
     }
 
-    /// Takes in the time of a finished frame and the rays it had been given. Measurements may be late and out of order;
-    /// times that cannot be (0, negative) and frames of 0 rays are ignored and counted.
+    /// Takes the time of a finished frame and the rays that it had. Measurements may be late and out of order.
+    /// Impossible times (0, negative) and frames of 0 rays are ignored and counted.
     pub fn measured(&mut self, rays: u64, frame_ns: i64) {
         if rays == 0 || frame_ns <= 0 {
             self.ignored += 1;
@@ -110,13 +112,14 @@ impl BudgetController {
         let error = (self.config.aim * slot_ns / frame_ns as f64).ln();
         let ln_given = (rays as f64).ln();
         let excess = if frame_ns as f64 > self.config.limit * slot_ns { -error } else { 0.0 };
-        // The milder of two in a row: a single hiccup of the machine costs nothing.
+        // Takes the milder of two consecutive measurements, so that a single hiccup of the machine has no effect.
         let confirmed = excess.min(self.last_excess);
         self.last_excess = excess;
         if confirmed > 0.0 {
             let wanted = ln_given - confirmed * self.steepness;
             if wanted < self.ln_rays {
-                // A frame that already had no more than is asked for now, and still was late: steeper next time.
+                // A frame was late although it already had no more rays than the current budget: the next step is
+                // steeper.
                 if ln_given <= self.ln_rays + 1e-3 && self.cuts > 0 {
                     self.steepness = (self.steepness * STEEPEN).min(STEEPEST);
                 }
@@ -132,13 +135,13 @@ impl BudgetController {
         self.ln_rays = self.ln_rays.clamp(low, high);
     }
 
-    /// True when the fewest rays are asked for: if frames are still late, rays are not the reason.
+    /// True when the budget is at its minimum: if frames are still late, rays are not the reason.
     #[cfg(test)]
     pub(crate) fn is_at_minimum(&self) -> bool {
         self.rays() == self.config.min_rays
     }
 
-    /// Measurements that could not be, and cuts made.
+    /// The number of impossible measurements, and the number of cuts.
     #[cfg(test)]
     pub(crate) fn counters(&self) -> (u64, u64) {
         (self.ignored, self.cuts)
@@ -164,7 +167,7 @@ mod tests {
         }
     }
 
-    /// time = fixed + unit * (rays / 1e5)^gain, seen `delay` frames later.
+    /// time = fixed + unit * (rays / 1e5)^gain, observed `delay` frames later.
     struct Plant {
         gain: f64,
         fixed: f64,
@@ -178,7 +181,7 @@ mod tests {
             self.fixed + self.unit * (rays as f64 / 1e5).powf(self.gain)
         }
 
-        /// One frame; returns its time.
+        /// Simulates one frame; returns its time.
         fn frame(&mut self, controller: &mut BudgetController, jitter: f64) -> f64 {
             let rays = controller.rays();
             let time = self.time(rays) * jitter;
@@ -194,15 +197,16 @@ mod tests {
     proptest! {
         #![proptest_config(ProptestConfig::with_cases(300))]
 
-        /// Over a plant whose gain is wrong by 5 either way, with 1 to 3 frames of delay and loads that jump by up to 1e3
-        /// either way: late for a bounded number of frames, then never again, then still.
+        /// For a plant whose gain is wrong by 5 either way, with delays of 1 to 3 frames and load jumps of up to 1e3
+        /// either way, frames are late for a bounded number of frames, then never again, and then the budget is
+        /// steady.
         #[test]
         fn holds_the_slot_without_oscillation(
             ln_gain in -1.6f64..1.6, delay in 1usize..=3, fixed in 0f64..0.4, jump in -6.9f64..6.9,
         ) {
             let gain = ln_gain.exp();
             let mut controller = BudgetController::new(config()).unwrap();
-            // The first load fits at 1e5 rays; after the jump some budget inside the bounds still fits.
+            // The first load fits at 1e5 rays. After the jump some budget inside the bounds still fits.
             let reach = gain * (10_000f64).ln() * 0.95;
             let jump = jump.clamp(-1e9, reach);
             let mut plant = Plant { gain, fixed: fixed * SLOT, unit: (0.8 - fixed) * SLOT, flight: VecDeque::new(), delay };
@@ -218,7 +222,8 @@ mod tests {
                     last_late = frame;
                 }
             }
-            // Seen after `delay`, confirmed one frame later, answered; a flat plant needs several answers.
+            // The jump is observed after `delay`, confirmed one frame later, then corrected. A flat plant needs
+            // several corrections.
             let answers = 1.0 + (1.0 / gain).max(1.0) * 4.0;
             prop_assert!(f64::from(late) <= answers * (delay as f64 + 2.0) + 2.0, "late for {late} frames");
             prop_assert!(last_late < 200, "late again at frame {last_late}");
@@ -234,7 +239,8 @@ mod tests {
                 "settled at {time} of the slot");
         }
 
-        /// Jitter of 5 % and a hiccup now and then: the budget stays within 10 % of its place, and few frames are late.
+        /// With 5 % jitter and an occasional hiccup the budget stays within 10 % of its place, and few frames are
+        /// late.
         #[test]
         fn hiccups_and_jitter_leave_it_alone(seed in 0u64..1000, delay in 1usize..=3) {
             let mut controller = BudgetController::new(config()).unwrap();
@@ -252,7 +258,7 @@ mod tests {
             }
         }
 
-        /// Whatever is measured, the budget is a number inside its bounds.
+        /// Whatever is measured, the budget is a number within its bounds.
         #[test]
         fn any_measurement(m in prop::collection::vec((any::<u64>(), any::<i64>()), 0..200)) {
             let mut controller = BudgetController::new(config()).unwrap();

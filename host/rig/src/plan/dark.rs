@@ -3,13 +3,13 @@
 /// Why a body is dark in a frame.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Hash)]
 pub enum DarkCause {
-    /// The tracker has not told of the body since the run began.
+    /// The tracker has not reported the body since the run began.
     NeverSeen,
-    /// The newest sample of the body was too old already when the frame's poses were taken: the tracker has fallen silent, or has lost the
-    /// body.
+    /// The newest sample of the body was already too old when the frame's poses were taken: the tracker has fallen
+    /// silent, or has lost the body.
     Silent,
-    /// The tracker tells of the body, but the light of the frame falls later after the newest sample than `safety.predict_ms` allows
-    /// to predict.
+    /// The tracker reports the body, but the frame's light falls later after the newest sample than
+    /// `safety.predict_ms` allows.
     BeyondHorizon,
 }
 
@@ -17,7 +17,7 @@ impl DarkCause {
     /// All causes, in the order of their counters.
     pub(crate) const ALL: [Self; 3] = [Self::NeverSeen, Self::Silent, Self::BeyondHorizon];
 
-    /// As in reports.
+    /// The name in reports.
     pub(crate) const fn name(self) -> &'static str {
         match self {
             Self::NeverSeen => "never_seen",
@@ -26,14 +26,14 @@ impl DarkCause {
         }
     }
 
-    /// What the operator is told of it, after the name of the body.
+    /// What the operator reads after the name of the body.
     pub(crate) const fn told(self) -> &'static str {
         match self {
             Self::NeverSeen => "the tracker has never seen it",
-            Self::Silent => "the tracker has not told of it for longer than safety.predict_ms",
+            Self::Silent => "the tracker has not reported it for longer than safety.predict_ms",
             Self::BeyondHorizon => {
-                "the light falls later after its newest sample than safety.predict_ms allows (raise safety.predict_ms, or make \
-                 the way from the tracker to the light shorter)"
+                "the light falls later after its newest sample than safety.predict_ms allows (raise safety.predict_ms, or \
+                 reduce the latency from the tracker to the light)"
             }
         }
     }

@@ -1,4 +1,5 @@
-//! The newest tracks and a slot into the plan of one frame: poses at the time of light, the eye, and when the light must be off.
+//! Plans one frame from the newest tracks and a slot: poses at the time of light, the eye, and when the light must be
+//! off.
 
 use super::dark::DarkCause;
 use super::link_time::LinkTime;
@@ -12,51 +13,52 @@ use glam::{DAffine3, DVec3};
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, PartialOrd, Ord, Hash)]
 pub struct FrameId(pub u64);
 
-/// What one frame is to show, where, and for how long. Made by [`FramePlan::fill`] when the poses are latched; the renderer draws it, the link
-/// sends its planes for its slot, and the collector compares the light with it.
+/// What one frame shows, where, and for how long. [`FramePlan::fill`] makes it when the poses are latched. The
+/// renderer draws it, the link sends its planes for its slot, and the collector compares the light with it.
 #[derive(Clone, Debug)]
 pub(crate) struct FramePlan {
     /// Which frame.
     pub id: FrameId,
-    /// The projector's slot that it is for.
+    /// The projector's slot for this frame.
     pub slot: u64,
     /// Start of that slot on the host's clock.
     pub due_at: HostTime,
     /// Start of that slot on the projector's clock.
     pub target_at: DeviceTicks,
-    /// From this instant of the projector's clock on there must be no light of it.
+    /// From this instant of the projector's clock on, the frame must emit no light.
     pub dark_from: DeviceTicks,
-    /// Longest time for which a body is carried on by prediction, nanoseconds.
+    /// The longest time for which prediction may extend a body's track, nanoseconds.
     pub predict_ns: i64,
-    /// Mid-exposure of the oldest newest sample among the lit bodies, else among all; `due_at` without any sample.
+    /// The oldest mid-exposure among the newest samples of the lit bodies, or of all bodies if none is lit; `due_at`
+    /// without any sample.
     pub captured_at: HostTime,
     /// When that sample reached the process.
     pub received_at: HostTime,
-    /// At least one body is lit, so that `captured_at` is the age of light.
+    /// At least one body is lit, so `captured_at` is the age of the light.
     pub is_lit: bool,
-    /// By tracked body: predicted world-from-body.
+    /// Per tracked body: predicted world-from-body.
     pub tracked_poses: Vec<DAffine3>,
-    /// By tracked body: the same without prediction, where the newest sample put it.
+    /// Per tracked body: the pose of the newest sample, without prediction.
     pub sampled_poses: Vec<DAffine3>,
-    /// By tracked body: the tracker has seen it so far.
+    /// Per tracked body: whether the tracker has reported it since the run began.
     pub seen: Vec<bool>,
-    /// By tracked body: why it is dark, `None` when it is lit.
+    /// Per tracked body: why it is dark; `None` if it is lit.
     pub dark: Vec<Option<DarkCause>>,
-    /// By tracked body: no light falls on it.
+    /// Per tracked body: no light falls on it.
     pub lost: Vec<bool>,
-    /// By body of the scene: world-from-body.
+    /// Per body of the scene: world-from-body.
     pub scene_poses: Vec<DAffine3>,
-    /// Eye, world, metres.
+    /// The eye in world coordinates, metres.
     pub eye: DVec3,
-    /// Gaze point, world, metres.
+    /// The gaze point in world coordinates, metres.
     pub gaze: DVec3,
-    /// Degrees by which the zones about a gaze that is no longer tracked have grown.
+    /// Degrees by which the zones around a gaze have grown that is no longer tracked.
     pub widen_deg: f32,
-    /// Thousandths of a sample that a pixel gets on average.
+    /// Average samples per pixel, in thousandths.
     pub budget_milli: u64,
 }
 
-/// What planning knows besides the newest tracks.
+/// Inputs of planning besides the newest tracks.
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct PlanInputs<'a> {
     /// The projector's slots.
@@ -65,20 +67,20 @@ pub(crate) struct PlanInputs<'a> {
     pub id: u64,
     /// The slot that the frame is planned for.
     pub slot: u64,
-    /// Slots until the next frame is expected: a renderer slower than its slots plans for every n-th.
+    /// Slots until the next frame is expected; a renderer slower than its slots plans for every n-th slot.
     pub stride: u64,
-    /// Longest time for which a body is carried on by prediction, nanoseconds (`safety.predict_ms`).
+    /// The longest time for which prediction may extend a body's track, nanoseconds (`safety.predict_ms`).
     pub predict_ns: i64,
-    /// Age up to which the newest sample of a tracker that works may be when it is read, nanoseconds.
+    /// Maximum age of the newest sample of a working tracker when it is read, nanoseconds.
     pub fresh_ns: i64,
-    /// Thousandths of a sample that a pixel gets on average.
+    /// Average samples per pixel, in thousandths.
     pub budget_milli: u64,
     /// Now.
     pub now: HostTime,
 }
 
 impl FramePlan {
-    /// A plan of nothing, with room for what `rig` has.
+    /// An empty plan with room for the bodies of `rig`.
     pub(crate) fn empty(rig: &Rig) -> Self {
         let bodies = rig.bodies.len();
         Self {
@@ -104,8 +106,8 @@ impl FramePlan {
         }
     }
 
-    /// Plans a frame: poses at the middle of the slot's exposure, eye, gaze, and the instant from which its light must be off. `snapshot` is
-    /// the newest there is. Allocates nothing in the steady state.
+    /// Plans a frame: the poses at the middle of the slot's exposure, the eye, the gaze, and the instant from which
+    /// its light must be off. `snapshot` is the newest one. Allocates nothing in the steady state.
     pub(crate) fn fill(&mut self, rig: &Rig, snapshot: &TrackSnapshot, inputs: &PlanInputs<'_>) {
         let &PlanInputs { slots, id, slot, stride, predict_ns, .. } = inputs;
         (self.id, self.slot) = (FrameId(id), slot);
@@ -124,7 +126,7 @@ impl FramePlan {
         });
     }
 
-    /// Every tracked body: where it will be at `middle`, and whether light may fall on it there.
+    /// For every tracked body: where it will be at `middle`, and whether light may fall on it there.
     fn place_bodies(
         &mut self,
         rig: &Rig,
@@ -137,7 +139,7 @@ impl FramePlan {
         self.seen.clear();
         self.dark.clear();
         self.lost.clear();
-        // Of the bodies that are lit; of those that are dark only where none is lit.
+        // The oldest among the lit bodies; the oldest among the dark ones is used only if none is lit.
         let mut oldest: [Option<(HostTime, HostTime)>; 2] = [None; 2];
         for (i, body) in rig.bodies.iter().enumerate() {
             let track = snapshot.tracks.get(i).copied().flatten();
@@ -147,7 +149,7 @@ impl FramePlan {
                     let sampled = state.predict(state.captured_at);
                     let used = state.predict(middle);
                     let dark = (used.freshness == Freshness::Lost).then(|| {
-                        // The tracker does its part, but the light is further away than prediction may reach.
+                        // The tracker works, but the light is further away than prediction may reach.
                         let speaks = inputs.now.ns_since(state.captured_at) <= inputs.fresh_ns;
                         if speaks {
                             DarkCause::BeyondHorizon
@@ -162,21 +164,22 @@ impl FramePlan {
                     let pose = if rig.config.prediction.on { used.pose } else { sampled.pose };
                     (affine(&pose), affine(&sampled.pose), dark)
                 }
-                // Never seen: nothing may be lit.
+                // The body was never seen, so nothing may be lit.
                 None => (affine(&body.rest), affine(&body.rest), Some(DarkCause::NeverSeen)),
             };
             self.tracked_poses.push(pose);
             self.sampled_poses.push(sampled);
             self.dark.push(dark);
             self.lost.push(dark.is_some());
-            // Where the tracker saw it last is where the tracker says that it is, whether or not that is new enough for light.
+            // A seen body has a known pose, whether or not its sample is new enough for light.
             self.seen.push(track.is_some());
         }
         self.is_lit = oldest[0].is_some();
         (self.captured_at, self.received_at) = oldest[0].or(oldest[1]).unwrap_or((self.due_at, self.due_at));
     }
 
-    /// Capture of the oldest newest sample among the bodies that are lit; `None` when all are dark: what is dark has no age.
+    /// The capture time of the newest sample, oldest among the lit bodies; `None` when all bodies are dark, because a
+    /// dark body has no age of light.
     pub(crate) fn oldest_captured_at(&self) -> Option<HostTime> {
         self.is_lit.then_some(self.captured_at)
     }

@@ -1,18 +1,19 @@
-//! How far ahead of its newest sample a body may be shown: `safety.predict_ms`, or what the rig needs where nobody wrote it.
+//! How far ahead of its newest sample a body may be shown: `safety.predict_ms`, or what the rig needs if the file
+//! does not set it.
 
 use crate::config::RigConfig;
 
-/// Shortest horizon of a rig that does not name its own, nanoseconds.
+/// The shortest horizon of a rig that does not set its own, nanoseconds.
 const SHORTEST_NS: i64 = 20_000_000;
-/// Longest horizon of any rig, nanoseconds: the largest value of the key.
+/// The longest horizon of any rig, nanoseconds: the largest value of the key.
 pub(crate) const LONGEST_NS: i64 = 1_000_000_000;
 
 /// The rule for one rig.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(crate) struct Horizon {
-    /// What the rig file says; that is law.
+    /// The value in the rig file, which is binding.
     written_ns: Option<i64>,
-    /// Between two samples of the tracker, nanoseconds.
+    /// Time between two samples of the tracker, nanoseconds.
     period_ns: i64,
     slot_ns: i64,
 }
@@ -22,15 +23,17 @@ impl Horizon {
     pub(crate) fn of_rig(config: &RigConfig) -> Self {
         Self {
             written_ns: config.safety.predict_ms.map(|ms| i64::from(ms) * 1_000_000),
-            // A recording knows no rate; its samples are no rarer than those of the slowest trackers.
+            // A recording has no known rate. Its samples are assumed to be no rarer than those of the slowest
+            // trackers.
             period_ns: 1_000_000_000 / i64::from(config.tracker.rate_hz().unwrap_or(30).max(1)),
             slot_ns: config.projector.frame_rate.slot_len_ns(0),
         }
     }
 
-    /// Longest time for which a body is carried on by prediction, nanoseconds: what the rig file says, else the longer of 20 ms and the
-    /// tracker's latency, two of its samples, the lead and two slots together. `lead_ns`: how long before its slot a frame is latched;
-    /// `latency_ns`: from the capture of a sample to its arrival.
+    /// The longest time for which prediction may extend a body's track, nanoseconds. It is the rig file's value if
+    /// there is one. Otherwise it is the sum of the tracker's latency, two of its samples, the lead and two slots,
+    /// and at least 20 ms. `lead_ns`: how long before its slot a frame is latched. `latency_ns`: from the capture of
+    /// a sample to its arrival.
     pub(crate) fn predict_ns(&self, lead_ns: i64, latency_ns: i64) -> i64 {
         self.written_ns.unwrap_or_else(|| {
             let needed = latency_ns
@@ -41,7 +44,7 @@ impl Horizon {
         })
     }
 
-    /// Age that the newest sample of a tracker that works has at most when it is read, nanoseconds.
+    /// The maximum age of the newest sample of a working tracker when it is read, nanoseconds.
     pub(crate) fn fresh_ns(&self, latency_ns: i64) -> i64 {
         latency_ns.saturating_add(3 * self.period_ns)
     }
@@ -60,7 +63,7 @@ mod tests {
 
     const MS: i64 = 1_000_000;
 
-    /// Found in use, R6 and C2: at 60 frames/s 20 ms are less than the way of any frame.
+    /// Found in use, R6 and C2: at 60 frames/s, 20 ms are less than any frame needs from tracker to light.
     #[test]
     fn a_rig_that_names_no_horizon_has_one_that_its_frames_can_keep() {
         let fast = horizon(&["projector.frame_rate=947", "tracker.rate_hz=500"]);

@@ -1,44 +1,49 @@
-//! Measured times from latch to sent into how early a frame must be begun, and when its slot must be given up.
+//! Learns from the measured times between latch and sent how early a frame must begin, and when its slot must be
+//! given up.
 //!
-//! A histogram whose counts are halved now and then: quantiles over the last seconds. One long stall moves a quantile by one
-//! frame in thousands and is forgotten; a maximum, or a mean, would carry it into every frame after. What comes less often than
-//! the histogram remembers (an interrupt, a core lent to another machine) is met by a reserve.
+//! The estimator keeps a histogram whose counts are halved from time to time: quantiles over the last seconds. One
+//! long stall moves a quantile by one frame in thousands and is forgotten; a maximum or a mean would carry it into
+//! every later frame. A reserve covers events that are rarer than the histogram's memory (an interrupt, a core lent
+//! to another machine).
 //!
-//! Bins are a 32nd of a slot wide up to four slots and grow by a twelfth from there on, up to several seconds: a renderer that needs many slots
-//! for a frame has a lead too, and its frames are planned for slots that they can make.
+//! Bins are a 32nd of a slot wide up to four slots. From there on each is a twelfth wider than the one before: a
+//! renderer that needs many slots for a frame also needs a lead, and its frames are planned for slots that they can
+//! meet.
 
 /// Bins of equal width, each a 32nd of a slot.
 const EVEN_BINS: usize = 128;
-/// Slots that they span.
+/// Slots that the even bins span.
 const EVEN_SLOTS: i64 = 4;
-/// Bins beyond them, each longer by [`GROWTH`]: 4 slots times 1.08^128 are 80,000 slots.
+/// Bins beyond them, each longer by [`GROWTH`]: 4 slots times 1.08^128 are about 76,000 slots.
 const WIDE_BINS: usize = 128;
-/// All of them.
+/// All bins.
 const BINS: usize = EVEN_BINS + WIDE_BINS;
-/// Width of a wide bin by its lower edge.
+/// Upper edge of a wide bin divided by its lower edge.
 const GROWTH: f64 = 1.08;
-/// What took longer than this many typical times (or than [`EVEN_SLOTS`]) was no work but a stall, against which no lead helps ...
+/// A time longer than this many typical times (and than [`EVEN_SLOTS`]) was not work but a stall, and no lead helps
+/// against a stall ...
 const STALL_TIMES: i64 = 4;
-/// ... unless so many come one after the other: then the work has become that long.
+/// ... unless this many occur in a row: then the work itself has become that long.
 const STALLS_IN_A_ROW: u32 = 8;
-/// Counts are halved after about this many nanoseconds: the past weighs as much as the last two seconds ...
+/// Counts are halved after about this many nanoseconds, so that the past weighs as much as the last two seconds ...
 const MEMORY_NS: i64 = 2_163_000_000;
 /// ... but never after more frames than this, and never after fewer than [`FEW`].
 const HALVE_AFTER: u32 = 2048;
-/// Share of frames that must be sent before their slot, in ten thousandths.
+/// Share of frames that must be sent before their slot, in 1/10,000.
 const IN_TIME: u64 = 9_995;
-/// Share of frames that need no longer than what a slot is given up for.
+/// Share of frames, in 1/10,000, whose time decides when a slot is given up.
 const TYPICAL: u64 = 9_000;
-/// Frames below which the first guess counts as well.
+/// With fewer frames than this the first guess also counts.
 const FEW: u32 = 256;
-/// The same for frames that need longer than a slot: at a few a second the first guess would stay for too long.
+/// The same for frames that take longer than a slot: at a few frames per second the first guess would otherwise last
+/// too long.
 const FEW_SLOW: u32 = 32;
 
 /// Quantiles of the time from latch to sent.
 #[derive(Clone, Debug)]
 pub struct LeadEstimator {
     bins: [u32; BINS],
-    /// Upper edges, nanoseconds.
+    /// Upper edges of the bins, nanoseconds.
     edges: [i64; BINS],
     total: u32,
     since_halved: u32,
@@ -52,8 +57,9 @@ pub struct LeadEstimator {
 }
 
 impl LeadEstimator {
-    /// For slots of `slot_ns` > 0. `first_guess_ns` is the lead until enough frames are measured, `reserve_ns` >= 0 is added to what is
-    /// measured. No lead is longer by more than `longest_wait_ns` than what a typical frame needs: sent earlier, it would find no room in the device.
+    /// For slots of `slot_ns` > 0. `first_guess_ns` is the lead until enough frames are measured. `reserve_ns` >= 0
+    /// is added to the measured time. The lead exceeds the time of a typical frame by at most `longest_wait_ns`; a
+    /// frame sent earlier would find no room in the device.
     pub fn new(slot_ns: i64, first_guess_ns: i64, reserve_ns: i64, longest_wait_ns: i64) -> Self {
         let slot_ns = slot_ns.max(1);
         let bin_ns = (slot_ns * EVEN_SLOTS / EVEN_BINS as i64).max(1);
@@ -79,7 +85,8 @@ impl LeadEstimator {
         }
     }
 
-    /// Takes in what one frame needed from the instant at which it should have been latched until it was sent, nanoseconds.
+    /// Records the time of one frame from the instant at which it should have been latched until it was sent,
+    /// nanoseconds.
     pub fn measured(&mut self, needed_ns: i64) {
         let needed_ns = needed_ns.max(0);
         let usual = (self.slot_ns * EVEN_SLOTS).max(self.typical_ns().saturating_mul(STALL_TIMES));
@@ -101,7 +108,7 @@ impl LeadEstimator {
             (MEMORY_NS / self.typical_ns().max(self.slot_ns)).clamp(i64::from(FEW), i64::from(HALVE_AFTER));
         if i64::from(self.since_halved) >= remembered {
             self.since_halved = 0;
-            // Rounded down: what happened once is forgotten.
+            // Rounded down, so that a single event is forgotten.
             self.bins.iter_mut().for_each(|n| *n /= 2);
             self.total = self.bins.iter().sum();
         }
@@ -116,7 +123,7 @@ impl LeadEstimator {
         lead.min(self.needed_ns().saturating_add(self.longest_wait_ns))
     }
 
-    /// What most frames need, or are believed to while nothing was measured.
+    /// The time that most frames need; the first guess while nothing has been measured.
     fn needed_ns(&self) -> i64 {
         if self.total == 0 {
             self.first_guess_ns
@@ -125,12 +132,12 @@ impl LeadEstimator {
         }
     }
 
-    /// What most frames need: a slot that begins earlier than this from now is given up for the next.
+    /// The time that most frames need: a slot that begins earlier than this from now is given up for the next one.
     pub fn typical_ns(&self) -> i64 {
         self.needed_ns().min(self.lead_ns())
     }
 
-    /// Frames that took longer than any lead could mend.
+    /// Frames that took so long that no lead could have helped.
     #[cfg(test)]
     pub(crate) fn stalls(&self) -> u64 {
         self.stalls
@@ -161,7 +168,7 @@ mod tests {
         LeadEstimator::new(SLOT, 2 * SLOT, 0, 2 * SLOT)
     }
 
-    /// A reproducible number from 0 to 1.
+    /// A reproducible number between 0 and 1.
     fn noise(i: u64) -> f64 {
         (i.wrapping_mul(0x9e37_79b9_7f4a_7c15) >> 11) as f64 / (1u64 << 53) as f64
     }
@@ -177,7 +184,7 @@ mod tests {
         assert!(e.typical_ns() <= e.lead_ns() && e.typical_ns() >= 300_000);
     }
 
-    /// All of the last frames but one in two thousand are covered, at any steady load.
+    /// At any steady load, the lead covers all of the last frames except one in two thousand.
     #[test]
     fn the_lead_covers_what_it_promises() {
         let mut e = estimator();
@@ -202,7 +209,7 @@ mod tests {
                 without.measured(ns);
             }
             let (lead, bare) = (with.lead_ns(), without.lead_ns());
-            // No frame waits in the device for longer than there is room for it.
+            // No frame waits in the device for longer than the device has room for it.
             assert!(bare >= ns && (bare..=bare + SLOT / 4).contains(&lead), "{lead}, {bare}");
             assert_eq!(
                 with.typical_ns(),
@@ -219,14 +226,14 @@ mod tests {
             e.measured(300_000 + (noise(i) * 1e5) as i64);
         }
         let before = (e.lead_ns(), e.typical_ns());
-        // 100 ms: the frame in hand and those behind it.
+        // 100 ms: the frame in progress and those behind it.
         for waiting in [100_000_000, 99_000_000, 98_000_000] {
             e.measured(waiting);
         }
         assert_eq!(((e.lead_ns(), e.typical_ns()), e.stalls()), (before, 3));
     }
 
-    /// Load that comes is answered within a second; load that went is forgotten within some seconds.
+    /// The lead follows a rising load within a second and forgets a past load within some seconds.
     #[test]
     fn a_changed_load_is_followed() {
         let mut e = estimator();
@@ -239,7 +246,8 @@ mod tests {
         assert!(e.lead_ns() < 400_000, "{}", e.lead_ns());
     }
 
-    /// Found in use, R21: a renderer that needs many slots for a frame has a lead that it can keep, from its first frames on.
+    /// Found in use, R21: a renderer that needs many slots for a frame gets a lead that it can keep, from its first
+    /// frames on.
     #[test]
     fn a_renderer_slower_than_its_slots_has_a_lead_that_it_can_keep() {
         let slot = 16_666_667;
@@ -251,7 +259,7 @@ mod tests {
         let late = (1000..2000).filter(|&i| needs(i) > e.lead_ns()).count();
         assert!(late <= 30, "{late} of 1000 beyond a lead of {} ns", e.lead_ns());
         assert!(e.lead_ns() < 85_000_000, "{} ns for needs of at most 72 ms", e.lead_ns());
-        // Quicker again: what it took before is forgotten within half a minute at 60 frames a second.
+        // Faster again: the old times are forgotten within half a minute at 60 frames per second.
         for _ in 0..1800 {
             e.measured(10_000_000);
         }

@@ -1,15 +1,17 @@
-//! The instant at which a frame's light has its centre.
+//! The instant of the centre of a frame's light.
 //!
-//! The planes of a frame are lit one after the other for equal times, each with the intensity of its bit. So the light of a frame in which
-//! the high bits come first is over, for the most part, long before the middle of its exposure. An eye that follows a body sees the
-//! picture where the centre of the light puts it.
+//! The planes of a frame are lit one after the other for equal times, each with the intensity of its bit. If the high
+//! bits come first, most of the light is over long before the middle of the exposure. An eye that follows a body sees
+//! the picture where the centre of the light puts it.
 
 use dpm_device::planes::PlaneSchedule;
 
-/// From the first photon to the centre of the light, nanoseconds, of a frame whose planes share `exposure_ns` >= 0 equally: the mean of the
-/// middles of the planes, each weighted with its intensity `2^bit`. Rounded down; 0 for a negative exposure.
+/// Time from the first photon to the centre of the light of a frame whose planes share `exposure_ns` >= 0 equally, in
+/// nanoseconds. It is the mean of the middles of the planes, each weighted with its intensity `2^bit`. Rounded down;
+/// 0 for a negative exposure.
 ///
-/// Every code value of every channel is taken to be white: what a picture is made of shifts the centre of each pixel for itself.
+/// The function assumes white, with every bit of every channel set. The actual code value shifts the centre of each
+/// pixel.
 pub(crate) fn centre_ns(schedule: &PlaneSchedule, exposure_ns: i64) -> i64 {
     let (mut weights, mut moments) = (0i128, 0i128);
     for (i, plane) in schedule.planes().iter().enumerate() {
@@ -19,7 +21,8 @@ pub(crate) fn centre_ns(schedule: &PlaneSchedule, exposure_ns: i64) -> i64 {
         moments += weight * (2 * i as i128 + 1);
     }
     let halves = 2 * schedule.len() as i128;
-    // At least one plane of at least weight 1: the divisor is above 0, and the quotient lies inside the exposure.
+    // There is at least one plane of weight 1 or more, so the divisor is above 0 and the quotient lies inside the
+    // exposure.
     (i128::from(exposure_ns.max(0)) * moments / (halves * weights)) as i64
 }
 
@@ -35,8 +38,8 @@ mod tests {
         assert_eq!((centre_ns(&PlaneSchedule::rgb24(), SLOT) + 500) / 1000, 194);
     }
 
-    /// A schedule and its mirror image have centres that lie at equal distances from the middle; equal weights have theirs in the middle; and
-    /// every centre lies inside the exposure.
+    /// The centres of a schedule and of its mirror image lie at equal distances from the middle. With equal weights
+    /// the centre is the middle. Every centre lies inside the exposure.
     #[test]
     fn centres_obey_the_symmetry_of_the_order() {
         for schedule in [PlaneSchedule::rgb24(), PlaneSchedule::mono8()] {
@@ -45,7 +48,7 @@ mod tests {
             let mirrored = PlaneSchedule::new(&planes).unwrap();
             for exposure in [0, 1, 7, SLOT, 1_000_000_000_000] {
                 let (a, b) = (centre_ns(&schedule, exposure), centre_ns(&mirrored, exposure));
-                // Each is rounded down by less than 1 ns.
+                // Each value is rounded down by less than 1 ns.
                 assert!((exposure - 1..=exposure).contains(&(a + b)), "{a} + {b} of {exposure}");
                 assert!((0..=exposure).contains(&a));
             }

@@ -1,4 +1,4 @@
-//! Slots of the projector into instants of the host's clock, and back.
+//! Converts between the projector's slots and instants of the host's clock.
 
 use dpm_device::link::SlotClock;
 use dpm_device::time::{DeviceTicks, HostTime};
@@ -8,14 +8,15 @@ use dpm_device::time::{DeviceTicks, HostTime};
 pub struct LinkTime {
     /// Slots on the device's clock.
     pub clock: SlotClock,
-    /// Number in the run of the clock's slot 0: a device that comes back begins a new clock, the run goes on counting.
+    /// The run's number for slot 0 of this clock. A device that comes back starts a new clock, but the run continues
+    /// to count.
     pub first: u64,
-    /// An instant of the device's clock, and the host's reading then.
+    /// An instant of the device's clock, and the host's reading at that instant.
     pub anchor: (DeviceTicks, HostTime),
 }
 
 impl LinkTime {
-    /// Start of a slot on the device's clock; of the clock's first slot for those before it.
+    /// Start of a slot on the device's clock. For slots before the clock's first slot: the start of the first one.
     pub(crate) fn start(&self, slot: u64) -> DeviceTicks {
         self.clock.start(slot.saturating_sub(self.first))
     }
@@ -25,8 +26,8 @@ impl LinkTime {
         self.clock.slot_at(ticks).map(|k| self.first.saturating_add(k))
     }
 
-    /// From when the light of a frame must be off that is planned for `stride` slots from `slot` on and whose poses may be carried on for
-    /// `predict_ns`: the end of those slots plus the longer of `predict_ns` and three slots.
+    /// When the light of a frame must be off that is planned for `stride` slots from `slot` on, and whose poses may
+    /// be predicted for `predict_ns`: the end of those slots plus the longer of `predict_ns` and three slots.
     pub(crate) fn dark_from(&self, slot: u64, stride: u64, predict_ns: i64) -> DeviceTicks {
         let last = slot.saturating_sub(self.first).saturating_add(stride.max(1) - 1);
         self.clock.dark_from(last, predict_ns.max(0) as u64)
@@ -37,7 +38,7 @@ impl LinkTime {
         self.host_of(self.start(slot))
     }
 
-    /// A reading of the device's clock on the host's, at the nominal rate.
+    /// Converts a reading of the device's clock to the host's, at the nominal rate.
     pub(crate) fn host_of(&self, ticks: DeviceTicks) -> HostTime {
         let delta = i128::from(ticks.0) - i128::from(self.anchor.0 .0);
         let ns = delta * 1_000_000_000 / i128::from(self.clock.tick_hz());

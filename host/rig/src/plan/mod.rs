@@ -1,4 +1,5 @@
-//! What is decided before a frame is drawn: how early it is begun, how far poses are predicted, how many rays it may cost.
+//! Decisions before a frame is drawn: how early it begins, how far poses are predicted, and how many rays it may
+//! cost.
 
 pub mod budget;
 pub mod dark;

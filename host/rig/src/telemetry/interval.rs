@@ -1,6 +1,6 @@
-//! The stamps of a frame into named intervals: work apart from waiting, and the totals that matter.
+//! Converts the stamps of a frame into named intervals: work, waiting, and the totals that matter.
 //!
-//! `docs/LATENCY.md` defines each stamp, whose clock it is on and how far to trust it.
+//! `docs/LATENCY.md` defines each stamp, its clock, and how far it can be trusted.
 
 use crate::frame::{FrameTimeline, Stage};
 
@@ -9,48 +9,49 @@ use crate::frame::{FrameTimeline, Stage};
 pub enum IntervalKind {
     /// Something is computed or moved.
     Work,
-    /// The frame lies in a hand-off.
+    /// The frame waits in a hand-off.
     Wait,
-    /// A sum over others.
+    /// A sum of other intervals.
     Total,
 }
 
-/// A named part of a frame's way.
+/// A named part of a frame's path.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Hash)]
 #[repr(usize)]
 pub enum Interval {
-    /// Mid-exposure of the tracker to arrival in this process.
+    /// From the tracker's mid-exposure to arrival in this process.
     Tracker = 0,
-    /// Arrival to the latch that used it: the sample's age on top of the tracker's latency.
+    /// From arrival to the latch that used the sample: the sample's age in addition to the tracker's latency.
     PoseWait,
-    /// Latch to the GPU's start.
+    /// From the latch to the GPU's start.
     Plan,
-    /// The GPU's start to code values.
+    /// From the GPU's start to code values.
     Render,
-    /// Code values to the packer's start.
+    /// From code values to the packer's start.
     PackWait,
-    /// Code values to bit planes.
+    /// From code values to bit planes.
     Pack,
-    /// Bit planes to the link's start.
+    /// From bit planes to the link's start.
     LinkWait,
-    /// Bit planes to the transport.
+    /// From bit planes to the transport.
     Link,
-    /// Taken by the transport to the slot's due time: what was left of the slot before.
+    /// From acceptance by the transport to the slot's due time: the rest of the slot before.
     SlotWait,
-    /// Due time to first photon. Negative: lit before it was due, by the error of the clock's map.
+    /// From due time to first photon. It is negative if the frame was lit before it was due, through the error of the
+    /// clock's map.
     Lateness,
-    /// Latch to first photon.
+    /// From the latch to the first photon.
     LatchToFirstPhoton,
-    /// Mid-exposure of the tracker to first photon.
+    /// From the tracker's mid-exposure to the first photon.
     MotionToFirstPhoton,
-    /// Mid-exposure of the tracker to the centre of the light.
+    /// From the tracker's mid-exposure to the centre of the light.
     MotionToCentre,
-    /// Mid-exposure of the tracker to last photon.
+    /// From the tracker's mid-exposure to the last photon.
     MotionToLastPhoton,
 }
 
 impl Interval {
-    /// All, in the order in which a frame passes them.
+    /// All intervals, in the order in which a frame passes them.
     pub const ALL: [Self; 14] = [
         Self::Tracker,
         Self::PoseWait,
@@ -68,7 +69,7 @@ impl Interval {
         Self::MotionToLastPhoton,
     ];
 
-    /// As in reports.
+    /// The name in reports.
     pub const fn name(self) -> &'static str {
         match self {
             Self::Tracker => "tracker",
@@ -101,18 +102,20 @@ impl Interval {
         }
     }
 
-    /// Length in nanoseconds; negative where a stamp lies before its predecessor (a clock's error, or a frame sent after it
-    /// was due). `None` when the frame was not lit and the interval ends with light, and when it has no sample and the interval begins with
-    /// one.
+    /// Length in nanoseconds. It is negative where a stamp lies before its predecessor (an error of the clock, or a
+    /// frame sent after it was due). `None` if the interval ends with light and the frame was not lit, and if the
+    /// interval begins with a sample and the frame has none.
     ///
-    /// `measured` says whether the stamps are readings of a clock. At virtual pace they are modelled: there the whole of the
+    /// `measured` says whether the stamps are readings of a clock. At virtual pace they are modelled: the whole of
+    /// the link then counts as work, and nothing waits.
     /// link counts as work and nothing waits.
     pub(crate) fn of(self, t: &FrameTimeline, measured: bool) -> Option<i64> {
         let sample = t.has_sample().then_some((t.captured_at, t.received_at));
         let captured = || sample.map(|s| s.0);
         let link = t.sent_at.ns_since(t.packed_at);
-        // The thread's own time in sending. It ends with the stamp and lies inside the whole; the clock that measured it was read apart,
-        // so it is held to the whole: the two parts then add up, and neither is negative where the whole is not.
+        // The thread's own time for sending. It ends with the stamp and lies inside the whole. It was measured with
+        // another clock, so it is limited to the whole: the two parts then add up, and neither is negative unless the
+        // whole is.
         let sending = if measured {
             i64::try_from(t.wall_ns[Stage::Link as usize]).unwrap_or(i64::MAX).min(link.max(0))
         } else {
@@ -143,8 +146,8 @@ pub(crate) mod tests {
     use crate::frame::STAGES;
     use dpm_device::time::HostTime;
 
-    /// A frame whose stamps are `step` ns apart, but packing, which begins in the middle of its step; link worked for a quarter of its
-    /// step. Its light lasts for a step, with its centre after a quarter.
+    /// A frame whose stamps are `step` ns apart, except that packing begins in the middle of its step and the link
+    /// worked for a quarter of its step. Its light lasts for one step, with its centre after a quarter.
     pub(crate) fn frame(start: i64, step: i64) -> FrameTimeline {
         let at = |k: i64| HostTime(start + k * step);
         let mut wall_ns = [0; STAGES.len()];
@@ -167,7 +170,7 @@ pub(crate) mod tests {
         }
     }
 
-    /// Work and waits from sample to light add up to motion to first photon, measured or modelled.
+    /// Work and waits from sample to light add up to motion to first photon, whether measured or modelled.
     #[test]
     fn the_parts_add_up_to_the_whole() {
         for measured in [true, false] {
@@ -203,7 +206,7 @@ pub(crate) mod tests {
         assert_eq!(Interval::Link.of(&t, true), Some(2));
     }
 
-    /// A frame for bodies that nobody has told of is not the fastest of all frames.
+    /// A frame for bodies without any report is not the fastest of all frames.
     #[test]
     fn a_frame_without_a_sample_has_no_way_from_one() {
         let t = frame(0, 1_000).without_sample();

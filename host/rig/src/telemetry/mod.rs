@@ -1,4 +1,4 @@
-//! What a run tells about itself, read by threads that are not on the frame path.
+//! Telemetry of a run, read by threads that are not on the frame path.
 
 pub mod interval;
 pub mod monitor;

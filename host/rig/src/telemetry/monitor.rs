@@ -1,5 +1,5 @@
-//! Counters that a running pipeline keeps and a watching thread reads, and the operator's wishes the other way: stop, and the verbs of
-//! a projector.
+//! Counters that a running pipeline maintains and an observing thread reads, and in the other direction the
+//! operator's requests: a stop, and orders for the projector.
 
 use super::ordered::DarkLog;
 use crate::interlock::Interlock;
@@ -11,24 +11,24 @@ use std::fmt;
 use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
 use std::sync::{Mutex, OnceLock, PoisonError};
 
-/// Notes that wait for the watching thread; further ones are only counted.
+/// Notes that wait for the observing thread; further ones are only counted.
 const NOTES: usize = 64;
 
-/// How the projector is, as the link knows it.
+/// The projector's state, as the link knows it.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub enum ProjectorHealth {
-    /// Handshake under way.
+    /// The handshake is in progress.
     #[default]
     Connecting,
     /// It takes frames.
     Up,
-    /// The medium is gone; it is tried again ten times a second.
+    /// The medium is gone; the link tries to reopen it ten times a second.
     Lost,
     /// Dark; these faults (bits of [`faults`]) are latched.
     Faulted(u32),
-    /// Dark because the operator said so.
+    /// Dark by order of the operator.
     Black,
-    /// Holds a frame because the operator said so.
+    /// Holds a frame by order of the operator.
     Frozen,
     /// Dark at the end of the run.
     Stopped,
@@ -39,7 +39,7 @@ pub enum ProjectorHealth {
 }
 
 impl ProjectorHealth {
-    /// As a number, for an atomic or a file.
+    /// The state as a number, for an atomic or a file.
     pub(crate) const fn encode(self) -> u64 {
         match self {
             Self::Connecting => 0,
@@ -55,7 +55,7 @@ impl ProjectorHealth {
         }
     }
 
-    /// Undoes [`ProjectorHealth::encode`].
+    /// Reverses [`ProjectorHealth::encode`].
     pub(crate) const fn decode(code: u64) -> Self {
         match code & 0xff {
             1 => Self::Up,
@@ -73,7 +73,8 @@ impl ProjectorHealth {
 }
 
 impl ProjectorHealth {
-    /// The state in one word of at most ten letters, in capitals where no picture moves although frames are made.
+    /// The state as one word of at most ten letters. It is in capitals if the picture does not move although frames
+    /// are made.
     pub const fn word(self) -> &'static str {
         match self {
             Self::Connecting => "connecting",
@@ -116,20 +117,20 @@ impl fmt::Display for ProjectorHealth {
     }
 }
 
-/// Shared between a run and whoever watches it. Accesses to numbers and flags are relaxed: the numbers are for display, and the
-/// stop flag guards no data.
+/// Shared between a run and its observers. Accesses to numbers and flags are relaxed: the numbers are for display,
+/// and the stop flag guards no data.
 #[derive(Debug, Default)]
 pub struct RunMonitor {
     stop: AtomicBool,
-    /// The newest order not yet taken; 0 for none. An ARM carries in its upper half how many orders had come as signals when it was
-    /// asked for, so that a BLACK or SAFE that came since is not undone by it.
+    /// The newest order that was not yet taken; 0 for none. The upper half of an ARM contains the number of orders
+    /// that had come as signals when the ARM was requested, so that it does not undo a later BLACK or SAFE.
     order: AtomicU64,
     /// The projector had SAFE latched when the link came up.
     found_safe: AtomicBool,
     projector: AtomicU64,
     /// Written at most once.
     tracker: OnceLock<String>,
-    /// Why the run will never return, written at most once.
+    /// Why the run will never return; written at most once.
     gave_up: OnceLock<String>,
     /// Written at most once, before there is light.
     interlock: OnceLock<Interlock>,
@@ -143,7 +144,8 @@ pub struct RunMonitor {
     slots_missed: AtomicU64,
     /// When no new picture was wanted, and why.
     dark: DarkLog,
-    /// What the collector has to tell the operator. Neither the threads of the frame path nor those that make orders take this lock.
+    /// The collector's messages for the operator. Neither the threads of the frame path nor those that make orders
+    /// take this lock.
     notes: Mutex<Notes>,
 }
 
@@ -153,46 +155,47 @@ struct Notes {
     left_out: u64,
 }
 
-/// What the counters said at one moment.
+/// The counters at one moment.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, serde::Serialize)]
 pub struct RunCounts {
-    /// Frames planned so far.
+    /// Frames planned.
     pub frames_planned: u64,
-    /// Frames lit so far, with light on at least one body.
+    /// Frames lit, with light on at least one body.
     pub frames_lit: u64,
-    /// Frames that the projector lit so far in which every body was dark.
+    /// Frames that the projector lit in which every body was dark.
     pub frames_dark: u64,
-    /// Frames dropped so far.
+    /// Frames dropped.
     pub frames_dropped: u64,
-    /// Frames so far that were not lit because no new picture was wanted.
+    /// Frames that were not lit because no new picture was wanted.
     pub frames_withheld: u64,
-    /// Frames lit late so far.
+    /// Frames lit late.
     pub frames_late: u64,
-    /// Slots so far in which a frame of their own was wanted.
+    /// Slots in which a frame of their own was wanted.
     pub slots: u64,
     /// Of these, slots without one.
     pub slots_missed: u64,
 }
 
 impl RunCounts {
-    /// Planned frames whose fate is known.
+    /// Planned frames whose result is known.
     pub fn frames_done(&self) -> u64 {
         self.frames_lit + self.frames_dark + self.frames_dropped + self.frames_withheld
     }
 }
 
 impl RunMonitor {
-    /// Asks the run for an ordered stop: dark, flush, report.
+    /// Requests an orderly stop of the run: dark, flush, report.
     pub fn request_stop(&self) {
         self.stop.store(true, Ordering::Relaxed);
     }
 
-    /// True when an ordered stop was asked for, here, by a signal or by a panic. The frame path polls this once a frame.
+    /// True when a stop was requested, through this monitor, by a signal or by a panic. The frame path polls this
+    /// once per frame.
     pub fn stop_requested(&self) -> bool {
         self.stop.load(Ordering::Relaxed) || stopping::is_stopping()
     }
 
-    /// Gives the projector an order; one that was not yet taken is replaced. SAFE is never replaced but by ARM.
+    /// Gives the projector an order, which replaces one that was not yet taken. Only ARM replaces SAFE.
     pub fn give_order(&self, order: Order) {
         match order {
             Order::Arm => self.arm_unless_darkened(stopping::orders()),
@@ -202,14 +205,14 @@ impl RunMonitor {
         }
     }
 
-    /// Gives ARM, which has no effect where more than `since` orders have come as signals when it is taken: they are newer than the
-    /// wish for light.
+    /// Gives ARM. It has no effect if more than `since` orders have come as signals by the time it is taken, because
+    /// they are newer than the request for light.
     pub(crate) fn arm_unless_darkened(&self, since: u32) {
         self.order.store(Order::Arm as u64 | u64::from(since) << 32, Ordering::Relaxed);
     }
 
-    /// The newest order, once; of two that wait the one that makes it darker. The link thread asks with every poll. After a stop was
-    /// asked for there is no ARM and no FREEZE any more.
+    /// Takes the newest order, once; of two waiting orders, the darker one. The link thread asks with every poll.
+    /// After a stop request there is no ARM and no FREEZE.
     pub fn take_order(&self) -> Option<Order> {
         let signalled = Order::from_code(stopping::take_order());
         let own = match self.order.load(Ordering::Relaxed) {
@@ -225,7 +228,8 @@ impl RunMonitor {
         (order.is_dark() || !self.stop_requested()).then_some(order)
     }
 
-    /// True when BLACK or SAFE has been ordered and not yet been taken, or a stop: a link that comes up does not arm.
+    /// True when a stop was requested, or BLACK or SAFE was ordered and not yet taken: a link that comes up then does
+    /// not arm.
     pub fn dark_is_ordered(&self) -> bool {
         let waiting = |code: u8| Order::from_code(code).is_some_and(Order::is_dark);
         self.stop_requested()
@@ -233,7 +237,8 @@ impl RunMonitor {
             || waiting(self.order.load(Ordering::Relaxed) as u8)
     }
 
-    /// Says that the projector had SAFE latched when the link came up: it stands until ARM like one that was ordered here.
+    /// Records that the projector had SAFE latched when the link came up. It stands until ARM, like a SAFE that was
+    /// ordered here.
     pub(crate) fn find_safe(&self) {
         self.found_safe.store(true, Ordering::Relaxed);
         self.give_order(Order::Safe);
@@ -244,17 +249,18 @@ impl RunMonitor {
         self.found_safe.swap(false, Ordering::Relaxed)
     }
 
-    /// Says how the projector is.
+    /// Sets the projector's state.
     pub fn set_projector(&self, health: ProjectorHealth) {
         self.projector.store(health.encode(), Ordering::Relaxed);
     }
 
-    /// How the projector is.
+    /// The projector's state.
     pub fn projector(&self) -> ProjectorHealth {
         ProjectorHealth::decode(self.projector.load(Ordering::Relaxed))
     }
 
-    /// Makes light depend on `interlock`, for the whole run. A second one is dropped: set it before the run begins.
+    /// Makes light depend on `interlock` for the whole run. A second interlock is dropped. Set it before the run
+    /// begins.
     pub fn set_interlock(&self, interlock: Interlock) {
         let _ = self.interlock.set(interlock);
     }
@@ -264,22 +270,25 @@ impl RunMonitor {
         self.interlock.get()
     }
 
-    /// True while there may be light: there is no interlock, or it is closed. Never waits; the link thread asks with every poll.
+    /// True while light is permitted: there is no interlock, or it is closed. Never waits; the link thread asks with
+    /// every poll.
     pub fn light_allowed(&self) -> bool {
         self.interlock.get().is_none_or(Interlock::is_closed)
     }
 
-    /// Says, once in a run, which bodies the tracker has not seen a second after its start, why and what to do. Off the frame path.
+    /// Reports, once per run, which bodies the tracker has not seen one second after its start, why, and what to do.
+    /// Not for the frame path.
     pub(crate) fn tell_of_tracker(&self, word: String) {
         let _ = self.tracker.set(word);
     }
 
-    /// What was said of the tracker; `None` while there is nothing to say.
+    /// The message about the tracker; `None` if there is none.
     pub fn tracker(&self) -> Option<&str> {
         self.tracker.get().map(String::as_str)
     }
 
-    /// The thread that would return from the run hangs: whoever waits for it should not. The projector was told to go dark.
+    /// Records that the thread that would return from the run hangs, so nobody should wait for it. The projector was
+    /// ordered to go dark.
     pub(crate) fn give_up(&self, why: String) {
         let _ = self.gave_up.set(why);
     }
@@ -294,12 +303,12 @@ impl RunMonitor {
         self.frames_planned.fetch_add(1, Ordering::Relaxed);
     }
 
-    /// When no new picture was wanted: told by the link's thread, read by the collector.
+    /// When no new picture was wanted: written by the link's thread, read by the collector.
     pub(crate) fn dark(&self) -> &DarkLog {
         &self.dark
     }
 
-    /// Tells the operator something. Not from the frame path: it takes a lock.
+    /// Sends the operator a message. Not for the frame path: it takes a lock.
     pub(crate) fn note(&self, text: String) {
         let mut notes = self.notes.lock().unwrap_or_else(PoisonError::into_inner);
         if notes.waiting.len() < NOTES {
@@ -309,7 +318,7 @@ impl RunMonitor {
         }
     }
 
-    /// What the operator has to be told, once each, oldest first.
+    /// Takes the messages for the operator, oldest first. Each is returned once.
     pub fn take_notes(&self) -> Vec<String> {
         let mut notes = self.notes.lock().unwrap_or_else(PoisonError::into_inner);
         let mut all: Vec<String> = notes.waiting.drain(..).collect();
@@ -320,13 +329,14 @@ impl RunMonitor {
         all
     }
 
-    /// Says how many slots are decided so far in which a frame was wanted, and how many of these were missed.
+    /// Sets how many of the slots decided so far wanted a frame, and how many of these were missed.
     pub(crate) fn set_slots(&self, wanted: u64, missed: u64) {
         self.slots.store(wanted, Ordering::Relaxed);
         self.slots_missed.store(missed, Ordering::Relaxed);
     }
 
-    /// Counts a frame whose light left the projector, whether every body was `dark` in it, and whether it came after its slot.
+    /// Counts a frame whose light left the projector. `dark`: every body was dark in it. `late`: it came after its
+    /// slot.
     pub(crate) fn count_lit(&self, dark: bool, late: bool) {
         let frames = if dark { &self.frames_dark } else { &self.frames_lit };
         frames.fetch_add(1, Ordering::Relaxed);
@@ -345,7 +355,7 @@ impl RunMonitor {
         self.frames_withheld.fetch_add(1, Ordering::Relaxed);
     }
 
-    /// The counters now; each is exact, together they are a moment apart.
+    /// The counters now. Each is exact, but they are not read at the same instant.
     pub fn counts(&self) -> RunCounts {
         RunCounts {
             frames_planned: self.frames_planned.load(Ordering::Relaxed),
@@ -384,7 +394,7 @@ mod tests {
         assert_eq!(monitor.take_order(), Some(Order::Arm));
     }
 
-    /// Found in use, R2: the projector was armed again three times after the run had been told to stop.
+    /// Found in use, R2: the projector was armed again three times after a stop had been requested.
     #[test]
     fn r2_nothing_arms_or_holds_light_after_a_stop_was_asked_for() {
         let monitor = RunMonitor::default();
@@ -411,7 +421,7 @@ mod tests {
         monitor.find_safe();
         assert_eq!((monitor.take_found_safe(), monitor.take_found_safe()), (true, false));
         assert_eq!(monitor.take_order(), Some(Order::Safe));
-        // As if one more order had come as a signal since this ARM was asked for.
+        // As if one more order had come as a signal since this ARM was requested.
         monitor.arm_unless_darkened(stopping::orders().wrapping_sub(1));
         assert_eq!(monitor.take_order(), None);
     }

@@ -1,24 +1,28 @@
-//! When no new picture was wanted: from the link's thread, which knows the orders, to the collector, which judges slots.
+//! Intervals in which no new picture was wanted. The link's thread, which knows the orders, writes them; the
+//! collector, which judges slots, reads them.
 
 use crate::frame::slots::OrderedDark;
 use dpm_device::time::HostTime;
 use std::collections::VecDeque;
 use std::sync::atomic::{AtomicI64, AtomicU64, AtomicU8, Ordering};
 
-/// Changes that the reader may lag behind: it looks every few milliseconds, and the link's thread tells at most one a poll.
+/// Number of changes by which the reader may lag behind. It reads every few milliseconds, and the link's thread
+/// writes at most one change per poll.
 const CHANGES: usize = 256;
-/// Spans that are remembered. Slots are judged as their light is told, so only the last ones are ever asked for.
+/// Number of intervals that are remembered. Slots are judged when their light is reported, so only the last ones are
+/// ever needed.
 const SPANS: usize = 256;
-/// After the order is taken back, slots without light are the order's as long as this, or this many slots, if no frame is lit earlier: the
-/// projector has to be armed, and what was under way has been refused.
+/// After an order is taken back, slots without light still belong to the order for this time, or for [`RETURN_SLOTS`]
+/// slots if that is longer, unless a frame is lit earlier: the projector has to be armed, and frames that were in
+/// flight were refused.
 const RETURN_NS: i64 = 250_000_000;
 /// See [`RETURN_NS`].
 const RETURN_SLOTS: i64 = 4;
 
-/// What is wanted, as it changes: written by one thread, which neither waits nor allocates, and read by one other.
+/// The log of changes. One thread writes it without waiting or allocating, and one other thread reads it.
 #[derive(Debug)]
 pub(crate) struct DarkLog {
-    /// The instant of a change and its code; change `n` is in place `n % CHANGES`.
+    /// The instant of a change and its code; change `n` is at index `n % CHANGES`.
     changes: [(AtomicI64, AtomicU8); CHANGES],
     /// Changes written so far.
     written: AtomicU64,
@@ -36,7 +40,8 @@ fn code(wanted: Option<OrderedDark>) -> u8 {
 }
 
 impl DarkLog {
-    /// Says at `now` why no new picture is wanted, `None` when one is. Only a change is kept. To be called from one thread at a time.
+    /// States at `now` why no new picture is wanted, or `None` when one is wanted. Only a change is recorded. Call it
+    /// from one thread at a time.
     pub(crate) fn tell(&self, now: HostTime, reason: Option<OrderedDark>) {
         // Relaxed: this thread is the only writer.
         let written = self.written.load(Ordering::Relaxed);
@@ -48,16 +53,16 @@ impl DarkLog {
         let (at, told) = place(written);
         at.store(now.0, Ordering::Relaxed);
         told.store(code(reason), Ordering::Relaxed);
-        // Release: whoever sees the new count sees the change.
+        // Release: a reader that sees the new count also sees the change.
         self.written.store(written + 1, Ordering::Release);
     }
 
-    /// Hands the changes since `seen` to `take`, oldest first, and moves `seen` on. Changes that were overwritten meanwhile are left
-    /// out.
+    /// Passes the changes since `seen` to `take`, oldest first, and advances `seen`. Changes that were overwritten
+    /// meanwhile are skipped.
     pub(crate) fn news(&self, seen: &mut u64, mut take: impl FnMut(HostTime, Option<OrderedDark>)) {
         // Acquire: see `tell`.
         let written = self.written.load(Ordering::Acquire);
-        // One place is left to the writer, who may be at the next change.
+        // One place is left to the writer, which may be writing the next change.
         for n in (*seen).max(written.saturating_sub(CHANGES as u64 - 1))..written {
             let (at, told) = &self.changes[(n % CHANGES as u64) as usize];
             let code = told.load(Ordering::Relaxed);
@@ -79,9 +84,9 @@ struct Span {
 #[derive(Clone, Debug)]
 pub(crate) struct DarkSpans {
     spans: VecDeque<Span>,
-    /// Changes of the log that are taken in.
+    /// Number of changes of the log that have been read.
     seen: u64,
-    /// The last span is still open.
+    /// The last interval is still open.
     open: bool,
     /// When the last order was taken back, until light is back.
     returning_from: Option<HostTime>,
@@ -100,7 +105,7 @@ impl DarkSpans {
         }
     }
 
-    /// Takes in what the log has to tell.
+    /// Reads the news of the log.
     pub(super) fn read(&mut self, log: &DarkLog) {
         let mut seen = self.seen;
         log.news(&mut seen, |at, reason| self.change(at, reason));
@@ -119,7 +124,7 @@ impl DarkSpans {
             }
             last.to = if reason.is_some() { at } else { back_by };
         } else if let Some(last) = self.spans.back_mut() {
-            // A new order while light was still on its way back.
+            // A new order came while light was still returning.
             last.to = last.to.min(at);
         }
         self.open = reason.is_some();
@@ -132,7 +137,7 @@ impl DarkSpans {
         }
     }
 
-    /// A frame was lit in the slot that begins at `begin`: light is back.
+    /// A frame was lit in the slot that begins at `begin`, so light is back.
     pub(super) fn lit(&mut self, begin: HostTime) {
         if let (Some(_), Some(last)) = (self.returning_from.filter(|s| begin >= *s), self.spans.back_mut()) {
             last.to = last.to.min(begin);
@@ -140,14 +145,14 @@ impl DarkSpans {
         }
     }
 
-    /// Why no new picture was wanted in the slot that begins at `begin`; `None` where one was. Slots have to be asked for in the order in
-    /// which their light is told.
+    /// Why no new picture was wanted in the slot that begins at `begin`; `None` if one was wanted. Ask for slots in
+    /// the order in which their light is reported.
     pub(crate) fn reason_at(&self, begin: HostTime) -> Option<OrderedDark> {
         let end = begin.plus_ns(self.slot_ns);
         self.spans.iter().rev().find(|s| s.from < end && begin < s.to).map(|s| s.reason)
     }
 
-    /// The reason that holds all of `from` to `to`, if a single one does.
+    /// The reason that applies to all of `from` to `to`, if there is a single one.
     pub(crate) fn reason_throughout(&self, from: HostTime, to: HostTime) -> Option<OrderedDark> {
         self.spans.iter().rev().find(|s| s.from <= from && to <= s.to).map(|s| s.reason)
     }
@@ -197,7 +202,7 @@ mod tests {
         spans.change(ms(20), Some(Safe));
         assert_eq!(spans.reason_at(ms(18)), Some(Black));
         assert_eq!(spans.reason_at(ms(20)), Some(Safe));
-        // Taken back: what is dark until the first frame is the order's, and what comes after it is not.
+        // Taken back: darkness until the first frame belongs to the order, and later darkness does not.
         spans.change(ms(30), None);
         assert_eq!(spans.reason_at(ms(33)), Some(Safe));
         spans.lit(ms(29));
@@ -214,7 +219,7 @@ mod tests {
         spans.change(ms(20), None);
         assert_eq!(spans.reason_at(ms(20 + RETURN_NS / 1_000_000 - 1)), Some(Frozen));
         assert_eq!(spans.reason_at(ms(20 + RETURN_NS / 1_000_000)), None);
-        // At 10 frames a second a quarter of a second is too short for four frames.
+        // At 10 frames per second, a quarter of a second is too short for four frames.
         let mut slow = DarkSpans::new(100 * SLOT);
         slow.change(ms(10), Some(Frozen));
         slow.change(ms(20), None);

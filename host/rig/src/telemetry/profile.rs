@@ -1,4 +1,5 @@
-//! Finished frames into distributions: one signed histogram per interval, batches for the noise of every figure.
+//! Collects finished frames into distributions: one signed histogram per interval, and batches that show the noise of
+//! every figure.
 //!
 //! Recording allocates nothing. A profiler belongs to one thread, beside the frame path.
 
@@ -12,21 +13,22 @@ use dpm_device::time::{FrameRate, HostTime};
 use serde::{Deserialize, Serialize};
 use std::collections::BTreeMap;
 
-/// Longest time told apart, ns; longer ones are counted as saturated.
+/// The longest time that is resolved, ns; longer ones are counted as saturated.
 const LONGEST_NS: u64 = 10_000_000_000;
-/// Batches kept. A run that has more keeps every second of them, then every fourth and so on, so that they are spread evenly over all of it.
+/// Number of batches kept. A longer run keeps every second batch, then every fourth and so on, so that they are
+/// spread evenly over the run.
 const MAX_BATCHES: usize = 1024;
 
-/// One interval's distribution, with its signs.
+/// The distribution of one interval, with signs.
 #[derive(Clone, Debug)]
 struct Track {
     whole: SignedHistogram,
     batch: SignedHistogram,
     /// Median and 99 % of each batch kept, ms.
     batches: Vec<(f64, f64)>,
-    /// Every so many batches one is kept.
+    /// One of this many batches is kept.
     stride: u64,
-    /// Batches that ended.
+    /// Number of batches that have ended.
     ended: u64,
 }
 
@@ -94,16 +96,16 @@ impl Track {
     }
 }
 
-/// What a distribution says, milliseconds. Every figure has its sign.
+/// Figures of a distribution, milliseconds. Every figure has its sign.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
 pub struct Distribution {
     /// "work", "wait" or "total".
     pub kind: String,
-    /// It is no measurement of this machine, but follows from numbers of the rig file: every interval at virtual pace
-    /// (`real_time.stage_costs_us`), and the interval of a mock tracker.
+    /// True if the interval was not measured on this machine but follows from numbers in the rig file: every interval
+    /// at virtual pace (`real_time.stage_costs_us`), and the interval of a mock tracker.
     #[serde(default)]
     pub modelled: bool,
-    /// Frames.
+    /// Number of frames.
     pub count: u64,
     /// Arithmetic mean.
     pub mean: f64,
@@ -125,10 +127,10 @@ pub struct Distribution {
     pub p9999: f64,
     /// Largest.
     pub max: f64,
-    /// Frames in which the interval was negative: an interval that ends before it begins, for example a frame that was lit before it was
-    /// due.
+    /// Frames in which the interval was negative, that is, ended before it began; for example a frame that was lit
+    /// before it was due.
     pub negative: u64,
-    /// Frames beyond 10 s either way: counted as 10 s.
+    /// Frames beyond 10 s in either direction, counted as 10 s.
     pub saturated: u64,
     /// Median of each batch of consecutive frames, for the noise of the figures above.
     pub batch_p50: Vec<f64>,
@@ -136,10 +138,10 @@ pub struct Distribution {
     pub batch_p99: Vec<f64>,
 }
 
-/// What a profiling run found, as `profile.json` keeps it. What older programs did not write may be left out in a file.
+/// Results of a profiling run, as stored in `profile.json`. A file may omit what older programs did not write.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
 pub struct ProfileReport {
-    /// What ran, for whoever compares two of them: machine, GPU, raster, pace and so on.
+    /// What ran, for comparing two runs: machine, GPU, raster, pace and so on.
     pub setup: BTreeMap<String, String>,
     /// Nominal frames per second.
     pub frame_rate_hz: f64,
@@ -152,7 +154,7 @@ pub struct ProfileReport {
     /// `missed_slots` as a share of `slots`, 0 to 1.
     #[serde(default)]
     pub missed_share: f64,
-    /// Missed slots whose frame was under way while the machine itself stood still.
+    /// Missed slots whose frame was in flight while the machine itself stood still.
     #[serde(default)]
     pub excused_by_standstill: u64,
     /// Missed slots by cause.
@@ -160,20 +162,20 @@ pub struct ProfileReport {
     /// Slots in which no new picture was wanted, by reason; they are not among `slots`.
     #[serde(default)]
     pub ordered_dark: BTreeMap<String, u64>,
-    /// `slots` and `missed_slots` of equal batches of consecutive slots, for the noise of the share.
+    /// `slots` and `missed_slots` of equal batches of consecutive slots, to show the noise of the share.
     #[serde(default)]
     pub missed_batches: Vec<(u64, u64)>,
-    /// Frames that the projector lit, dark ones among them.
+    /// Frames that the projector lit, including dark ones.
     pub frames_lit: u64,
-    /// Frames lit after the slot they were planned for.
+    /// Frames lit after the slot that they were planned for.
     pub frames_late: u64,
-    /// First photon against the exact slot times of consecutive frames, early (negative) or late; absent where a mock lights on an ideal
-    /// clock and there is nothing to measure.
+    /// First photon relative to the exact slot times of consecutive frames, early (negative) or late. Absent if a
+    /// mock lights on an ideal clock, so that there is nothing to measure.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub jitter_ms: Option<Distribution>,
     /// Every interval by name.
     pub intervals_ms: BTreeMap<String, Distribution>,
-    /// Error of the clock mapping, ns: half the shortest round trip and drift, as its estimator bounds it.
+    /// Error bound of the clock mapping, ns: half the shortest round trip plus drift, as its estimator computes it.
     pub clock_error_bound_ns: Option<i64>,
     /// Time in which the machine stood still, ns, and the longest such interval.
     pub standstill_ns: (i64, i64),
@@ -184,7 +186,7 @@ pub struct ProfileReport {
 pub struct Profiler {
     rate: FrameRate,
     measured: bool,
-    /// The tracker's part is a constant of the rig file.
+    /// The tracker's interval is a constant of the rig file.
     tracker_modelled: bool,
     /// The projector lights on an ideal clock.
     ideal_light: bool,
@@ -198,8 +200,8 @@ pub struct Profiler {
 }
 
 impl Profiler {
-    /// `measured`: stamps are readings of a clock (real pace). A batch is `batch_frames` consecutive frames: about a tenth of the
-    /// run, at least 100 for a 99th percentile.
+    /// `measured`: stamps are readings of a clock (real pace). A batch is `batch_frames` consecutive frames. It
+    /// should be about a tenth of the run, and at least 100 frames for a 99th percentile.
     pub fn new(rate: FrameRate, measured: bool, batch_frames: u64) -> Self {
         Self {
             rate,
@@ -216,13 +218,13 @@ impl Profiler {
         }
     }
 
-    /// Says which devices are mocks: what they would show of themselves is a constant of the rig file.
+    /// Sets which devices are mocks. Their own intervals are constants of the rig file.
     pub(crate) fn with_mocks(mut self, tracker: bool, projector: bool) -> Self {
         (self.tracker_modelled, self.ideal_light) = (tracker, projector);
         self
     }
 
-    /// Takes in a frame that was lit in `slot`. `late`: it was planned for an earlier one.
+    /// Records a frame that was lit in `slot`. `late`: it was planned for an earlier one.
     pub fn lit(&mut self, timeline: &FrameTimeline, slot: u64, late: bool) {
         self.frames_lit += 1;
         self.frames_late += u64::from(late);
@@ -250,7 +252,7 @@ impl Profiler {
         &self.tracks[interval as usize].whole
     }
 
-    /// True when the figures of `interval` are no measurement, see [`Distribution::modelled`].
+    /// True if the figures of `interval` are not measured, see [`Distribution::modelled`].
     pub fn is_modelled(&self, interval: Interval) -> bool {
         !self.measured || interval == Interval::Tracker && self.tracker_modelled
     }
@@ -260,17 +262,17 @@ impl Profiler {
         self.measured
     }
 
-    /// Nominal frames a second.
+    /// Nominal frames per second.
     pub fn rate(&self) -> FrameRate {
         self.rate
     }
 
-    /// Frames that were lit so far.
+    /// Number of frames lit so far.
     pub fn frames_lit(&self) -> u64 {
         self.frames_lit
     }
 
-    /// The report so far, with what became of the slots. Setup and clock are the caller's to fill.
+    /// The report so far, with the results of the slots. The caller fills in setup and clock.
     pub fn report(
         &self,
         slots: &SlotCounts,
@@ -300,12 +302,12 @@ impl Profiler {
     }
 }
 
-/// Missed slots by the name of the cause, all causes.
+/// Missed slots by the name of the cause, for all causes.
 pub(crate) fn missed_by_cause(slots: &SlotCounts) -> BTreeMap<String, u64> {
     MissCause::ALL.iter().map(|c| (c.name().to_owned(), slots.missed[*c as usize])).collect()
 }
 
-/// Slots in which no new picture was wanted by the name of the reason, all reasons.
+/// Slots in which no new picture was wanted, by the name of the reason, for all reasons.
 pub(crate) fn ordered_dark(slots: &SlotCounts) -> BTreeMap<String, u64> {
     OrderedDark::ALL.iter().map(|r| (r.name().to_owned(), slots.ordered[*r as usize])).collect()
 }
@@ -358,11 +360,12 @@ mod tests {
         assert!((report.intervals_ms["motion_to_centre"].p50 - 4.125).abs() < 0.01);
         assert!((report.intervals_ms["motion_to_last_photon"].p50 - 4.5).abs() < 0.01);
         assert_eq!((report.frames_lit, report.frames_late), (1000, 10));
-        // Raw first: every slot without a frame of its own, then the machine's part of them.
+        // The raw number comes first: every slot without a frame of its own, then the part due to the machine.
         assert_eq!((report.slots, report.missed_slots, report.excused_by_standstill), (1000, 10, 6));
         assert_eq!((report.missed_share, report.ordered_dark["black"]), (0.01, 77));
         assert_eq!(report.standstill_ns, (4_000_000, 2_000_000));
-        // Light came 8 steps after the slot's start, so jitter is the change of 8 steps, up as often as down.
+        // Light came 8 steps after the slot's start, so jitter is the change of 8 steps, upwards as often as
+        // downwards.
         let jitter = report.jitter_ms.unwrap();
         assert!(jitter.max > 1.0 && jitter.min < -1.0 && jitter.count == 999);
         assert!((300..700).contains(&jitter.negative), "{}", jitter.negative);
@@ -416,7 +419,7 @@ mod tests {
         assert_eq!(modelled(Profiler::new(rate, false, 100).with_mocks(true, true)), (true, true, false));
     }
 
-    /// Ten thousand batches: memory stays, and the batches kept are spread over the whole run.
+    /// Ten thousand batches: memory stays constant, and the batches kept are spread over the whole run.
     #[test]
     fn batches_of_a_long_run_are_thinned_out_evenly() {
         let mut track = Track::new();

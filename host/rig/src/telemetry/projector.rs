@@ -1,26 +1,27 @@
-//! What the projector and its link did in a run, as the report tells it.
+//! What the projector and its link did in a run, for the report.
 
-/// What the link carried in a run, for its report.
+/// What the link carried in a run.
 #[derive(Clone, Debug, PartialEq, serde::Serialize)]
 pub struct ProjectorReport {
     /// Name of the medium.
     pub name: String,
-    /// Sessions opened: 1 and one for every time that the projector came back.
+    /// Sessions opened: 1, plus one for every time that the projector came back.
     pub sessions: u64,
     /// Times that light came back after the watchdog or damaged packets.
     pub rearmed: u64,
     /// Megabytes handed to the medium, 10^6 bytes each.
     pub sent_mb: f64,
-    /// Planes sent as they are, by a codec, and not at all because they had not changed.
+    /// Planes sent raw, sent through a codec, and not sent because they had not changed.
     pub planes: [u64; 3],
-    /// Frames not sent: link not up, no buffer in the projector, no room on the medium, medium lost, flashes, limits on light.
+    /// Frames not sent: link not up, no buffer in the projector, no room on the medium, medium lost, limit on
+    /// flashes, limits on light.
     pub not_sent: [u64; 6],
-    /// What the projector reported; null for the mock in this process, whose light is seen itself.
+    /// What the projector reported; null for the mock in this process, whose light is observed directly.
     pub device: Option<DeviceCounts>,
-    /// Greatest error of the mapping from the projector's clock to the host's, as the newest exchange bounds it, nanoseconds; null at virtual pace,
-    /// and where no exchange was heard.
+    /// Greatest error of the mapping from the projector's clock to the host's, as bounded by the newest exchange,
+    /// nanoseconds. Null at virtual pace, and if there was no exchange.
     pub clock_bound_ns: Option<i64>,
-    /// From sent to light in time, as learned from the reports, milliseconds; null for the mock in this process.
+    /// Learned time from sent to light, milliseconds; null for the mock in this process.
     pub travel_ms: Option<f64>,
 }
 
@@ -29,9 +30,9 @@ pub struct ProjectorReport {
 pub struct DeviceCounts {
     /// Frames lit.
     pub lit: u64,
-    /// Of these, frames whose report was merged into a later one: whether they were late is not known.
+    /// Of these, frames whose report was merged into a later one, so it is not known whether they were late.
     pub lit_unseen: u64,
-    /// Slots that showed the frame before again, those after the last frame included.
+    /// Slots that repeated the previous frame, including those after the last frame.
     pub repeated: u64,
     /// Dark slots while armed.
     pub blank: u64,
@@ -39,9 +40,10 @@ pub struct DeviceCounts {
     pub incomplete: u64,
     /// Whole frames dropped because their slot was over.
     pub too_late: u64,
-    /// Whole frames dropped because a newer one was due too.
+    /// Whole frames dropped because a newer one was due as well.
     pub superseded: u64,
-    /// Frames refused: the projector was told to be dark, was ahead of its memory, or did not believe the target.
+    /// Frames refused: the projector was ordered to be dark, the frame exceeded its memory, or its target was
+    /// implausible.
     pub refused: u64,
     /// Damaged packets that it received.
     pub damaged_packets: u64,

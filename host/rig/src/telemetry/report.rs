@@ -1,4 +1,4 @@
-//! What a run was like: one JSON object for programs, one short table for people.
+//! The report of a run: one JSON object for programs, one short table for people.
 
 use super::projector::ProjectorReport;
 use super::signed::SignedHistogram;
@@ -22,18 +22,18 @@ pub struct Spread {
 }
 
 impl Spread {
-    /// Percentiles of `values`, which are reordered; values that are not finite are left out. `None` when none is left.
+    /// Percentiles of `values`, which are reordered. Values that are not finite are left out. `None` if none remain.
     #[cfg(test)]
     pub(crate) fn of(values: &mut Vec<f64>) -> Option<Self> {
         values.retain(|v| v.is_finite());
         values.sort_unstable_by(f64::total_cmp);
         let last = values.len().checked_sub(1)?;
-        // Nearest rank: the ceil(n q / 1000)-th value, counted from 1, in whole numbers.
+        // Nearest rank: the ceil(n q / 1000)-th value, counted from 1, in integers.
         let at = |per_mille: usize| values[(values.len() * per_mille).div_ceil(1000).saturating_sub(1)];
         Some(Self { p50: at(500), p99: at(990), p999: at(999), max: values[last] })
     }
 
-    /// Percentiles of a histogram of nanoseconds, in milliseconds. `None` when it is empty.
+    /// Percentiles of a histogram of nanoseconds, in milliseconds. `None` if it is empty.
     #[cfg(test)]
     pub(crate) fn ms_of_ns(histogram: &hdrhistogram::Histogram<u64>) -> Option<Self> {
         let ms = |ns: u64| ns as f64 / 1e6;
@@ -46,7 +46,7 @@ impl Spread {
     }
 }
 
-/// What stands beside a number that virtual pace cannot know.
+/// The label of a number that is not measured at virtual pace.
 pub const MODELLED: &str = "from real_time.stage_costs_us, not measured";
 
 /// Percentiles of a time that may be negative, and whether it is a measurement.
@@ -57,7 +57,7 @@ pub struct Latency {
     pub spread: Spread,
     /// Smallest, milliseconds.
     pub min: f64,
-    /// True at virtual pace: the costs of the stages are constants of the rig file there.
+    /// True at virtual pace, where the costs of the stages are constants of the rig file.
     pub modelled: bool,
     /// Where a modelled number comes from.
     #[serde(skip_serializing_if = "Option::is_none")]
@@ -65,7 +65,7 @@ pub struct Latency {
 }
 
 impl Latency {
-    /// Percentiles of a histogram of nanoseconds; `None` when it is empty.
+    /// Percentiles of a histogram of nanoseconds; `None` if it is empty.
     pub(crate) fn of(histogram: &SignedHistogram, modelled: bool) -> Option<Self> {
         let ms = |ns: i64| ns as f64 * 1e-6;
         (!histogram.is_empty()).then(|| Self {
@@ -95,16 +95,16 @@ impl std::ops::Deref for Latency {
 pub struct DarkBody {
     /// Its name in the rig file.
     pub body: String,
-    /// Frames in which the tracker had never told of it.
+    /// Frames in which the tracker had never reported it.
     pub never_seen: u64,
-    /// Frames in which its newest sample was too old already when the poses were taken.
+    /// Frames in which its newest sample was already too old when the poses were taken.
     pub silent: u64,
     /// Frames whose light fell later after the newest sample than `safety.predict_ms` allows.
     pub beyond_horizon: u64,
 }
 
 impl DarkBody {
-    /// Of one cause.
+    /// The frames of one cause.
     pub(crate) fn of(&self, cause: DarkCause) -> u64 {
         match cause {
             DarkCause::NeverSeen => self.never_seen,
@@ -113,7 +113,7 @@ impl DarkBody {
         }
     }
 
-    /// Of all causes.
+    /// The frames of all causes.
     pub(crate) fn total(&self) -> u64 {
         DarkCause::ALL.iter().map(|cause| self.of(*cause)).sum()
     }
@@ -128,75 +128,75 @@ pub struct StageTime {
     pub ms: Spread,
 }
 
-/// The report of a run, as `--json` prints it and `report.json` keeps it.
+/// The report of a run, as printed by `--json` and stored in `report.json`.
 #[derive(Clone, Debug, PartialEq, serde::Serialize)]
 pub struct Report {
     /// Version of the program.
     pub version: &'static str,
-    /// Commit that it was compiled from, see [`dpm_common::commit::get`].
+    /// The commit that it was compiled from, see [`dpm_common::commit::get`].
     pub commit: &'static str,
-    /// Slots, from the first planned frame to the last, in which a frame of their own was wanted.
+    /// Slots in which a frame of their own was wanted, from the first planned frame to the last.
     pub slots: u64,
     /// Of these, slots without one, whatever the cause.
     pub missed_slots: u64,
     /// `missed_slots` as a share of `slots`, 0 to 1.
     pub missed_share: f64,
-    /// Missed slots whose frame was under way while the machine itself stood still.
+    /// Missed slots whose frame was in flight while the machine itself stood still.
     pub excused_by_standstill: u64,
     /// Missed slots by cause.
     pub missed_by_cause: BTreeMap<String, u64>,
-    /// Slots in which no new picture was wanted, by reason: they are not among `slots`.
+    /// Slots in which no new picture was wanted, by reason. They are not among `slots`.
     pub ordered_dark: BTreeMap<String, u64>,
     /// Frames whose light left the projector, with light on at least one body. Prepared frames always have light.
     pub frames_lit: u64,
     /// Frames that the projector lit in which every body was dark.
     pub frames_dark: u64,
-    /// Bodies that were dark in some of all these frames, by cause.
+    /// Bodies that were dark in some of these frames, by cause.
     pub dark_by_body: Vec<DarkBody>,
-    /// The run was asked to stop before it had all that it was started for.
+    /// The run was stopped before it was complete.
     pub stopped: bool,
-    /// Frames that were planned and never lit.
+    /// Frames that were planned but never lit.
     pub frames_dropped: u64,
     /// Frames that were not lit because no new picture was wanted.
     pub frames_withheld: u64,
-    /// Frames lit after the slot they were planned for.
+    /// Frames lit after the slot that they were planned for.
     pub frames_late: u64,
-    /// Slots in which the former frame was shown again.
+    /// Slots in which the previous frame was shown again.
     pub frames_repeated: u64,
-    /// Frames not sent because their poses would have been older than `safety.predict_ms` and a slot when they were lit.
+    /// Frames not sent because their poses would have been older than `safety.predict_ms` plus one slot when lit.
     pub frames_too_old: u64,
-    /// Slots from one planned frame to the next, on average at the end: 1 where the renderer keeps up.
+    /// Average number of slots from one planned frame to the next, at the end: 1 if the renderer keeps up.
     pub slots_per_frame: f64,
-    /// Longest time for which a body was carried on by prediction, milliseconds, at the end.
+    /// The longest time for which prediction may extend a body's track, at the end, milliseconds.
     pub predict_ms: f64,
     /// Columns and rows traced and projected.
     pub raster: [u32; 2],
     /// Bit planes in a frame.
     pub planes: u32,
-    /// Nominal rate, frames a second.
+    /// Nominal rate, frames per second.
     pub frame_rate_hz: f64,
     /// "real" or "virtual".
     pub pace: &'static str,
-    /// Name of the Vulkan device; "none" when nothing was rendered.
+    /// Name of the Vulkan device; "none" if nothing was rendered.
     pub gpu: String,
-    /// True when that device is the CPU.
+    /// True if that device is the CPU.
     pub software_gpu: bool,
-    /// Method that spent the rays.
+    /// The method that allocated the rays.
     pub method: &'static str,
     /// Whether poses were predicted to the time of light.
     pub prediction: bool,
     /// Distance in projector pixels between where the light of a surface point fell and where that point was at that
     /// instant; null without ground truth.
     pub registration_error_px: Option<Spread>,
-    /// The same if the newest sample had been used as it was.
+    /// The same with the newest sample in place of the prediction.
     pub registration_error_unpredicted_px: Option<Spread>,
-    /// The same of frames that were lit in their own slot: what is left when lateness is not counted.
+    /// The same for frames that were lit in their own slot, so that lateness does not contribute.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub registration_error_in_time_px: Option<Spread>,
-    /// True beginning of a slot less what the host took it for, as the mock in this process saw it at real pace.
+    /// True beginning of a slot minus the host's estimate, as observed by the mock in this process at real pace.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub clock_error_ms: Option<Latency>,
-    /// The instant of the light at which the registration was measured.
+    /// The instant of the light at which registration was measured.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub registration_error_at: Option<&'static str>,
     /// From the tracker's mid-exposure to the frame's first photon, milliseconds.
@@ -205,27 +205,28 @@ pub struct Report {
     pub motion_to_light_centre_ms: Option<Latency>,
     /// From the tracker's mid-exposure to the frame's last photon, milliseconds.
     pub motion_to_last_photon_ms: Option<Latency>,
-    /// The same as `motion_to_first_photon_ms`, under the name that it had before there were three of them.
+    /// The same as `motion_to_first_photon_ms`, under its former name.
     pub motion_to_light_ms: Option<Latency>,
-    /// From the instant for which a frame was due to its first photon, milliseconds; negative: lit before it was due.
+    /// From the instant when a frame was due to its first photon, milliseconds; negative if it was lit before it was
+    /// due.
     pub lateness_ms: Option<Latency>,
     /// Wall time of each stage.
     #[serde(serialize_with = "stages_as_map")]
     pub stages_ms: Vec<StageTime>,
-    /// Frames lit in a second of wall time.
+    /// Frames lit per second of wall time.
     pub frames_per_wall_second: f64,
-    /// Camera rays and all rays traced, in millions a second of render time; null when nothing was rendered.
+    /// Camera rays and all rays traced, in millions per second of render time; null if nothing was rendered.
     pub mrays_per_s: Option<f64>,
-    /// Share of lit channel values that the projector was too weak for, 0 to 1.
+    /// Share of lit channel values that exceeded the projector's power, 0 to 1.
     pub clipped: f64,
-    /// Pixels that were not a number and became black.
+    /// Pixels that were not a number and were made black.
     pub nan_pixels: u64,
-    /// Hash of all light; the same for the same seed at virtual pace. Absent where nobody saw the light.
+    /// Hash of all light; the same for the same seed at virtual pace. Absent if nobody observed the light.
     #[serde(skip_serializing_if = "String::is_empty")]
     pub light_hash: String,
-    /// What the link to the projector carried, and what the projector said.
+    /// What the link to the projector carried, and what the projector reported.
     pub projector: Option<ProjectorReport>,
-    /// What the operator should know.
+    /// Warnings for the operator.
     pub warnings: Vec<String>,
     /// Files written.
     pub files: Vec<PathBuf>,
@@ -242,7 +243,7 @@ fn stages_as_map<S: Serializer>(stages: &[StageTime], serializer: S) -> Result<S
 }
 
 impl Default for Report {
-    /// A run that did nothing.
+    /// The report of a run that did nothing.
     fn default() -> Self {
         Self {
             version: env!("CARGO_PKG_VERSION"),
@@ -312,8 +313,8 @@ impl Report {
         self.nothing_lit().map_or(Ok(()), |told| Err(Failure::new(FailureKind::CheckFailed, told)))
     }
 
-    /// Why the run lit nothing, with the largest cause first and what to do; `None` when it did light something, when it was stopped before it
-    /// planned a frame, or when no picture was wanted from its beginning to its end.
+    /// Why the run lit nothing, with the largest cause first, and what to do. `None` if it lit something, if it was
+    /// stopped before it planned a frame, or if no picture was wanted throughout.
     pub(crate) fn nothing_lit(&self) -> Option<String> {
         let planned = self.frames_dark + self.frames_dropped;
         let ordered: u64 = self.ordered_dark.values().sum();
@@ -426,8 +427,8 @@ mod tests {
         assert!(report.to_table().contains("320 x 240"));
     }
 
-    /// The first figure of the table is every slot without a frame of its own; what the machine is to blame for comes second, and what the
-    /// operator ordered is in neither.
+    /// The first figure of the table is every slot without a frame of its own. The part due to the machine comes
+    /// second. Slots that the operator ordered to be dark are in neither.
     #[test]
     fn the_headline_is_the_raw_share() {
         let report = Report {
@@ -446,7 +447,7 @@ mod tests {
             lines[0].ends_with("84 of 22728 (0.370 %); 68 of them while the machine itself stood still"),
             "{table}"
         );
-        assert!(table.contains("1421 slots more, neither missed nor lit"), "{table}");
+        assert!(table.contains("1421 more slots, neither missed nor lit"), "{table}");
         assert!(lines.iter().all(|l| !l.starts_with("  plan") && !l.contains("safe")), "{table}");
         let json = report.to_json();
         let at = |key: &str| json.find(key).unwrap_or_else(|| panic!("{key}"));
@@ -454,7 +455,8 @@ mod tests {
         assert!(at("\"missed_share\"") < at("\"excused_by_standstill\""));
     }
 
-    /// Found in use, R6 and C2: a rig that was black all the time said that its frames were lit, and ended with 0.
+    /// Found in use, R6 and C2: a rig that was black all the time reported that its frames were lit, and ended with
+    /// exit code 0.
     #[test]
     fn a_run_that_lit_nothing_says_why_with_the_largest_cause_first() {
         let dark = |body: &str, never_seen, silent, beyond_horizon| DarkBody {
@@ -483,13 +485,13 @@ mod tests {
             .nothing_lit()
             .unwrap()
             .contains("9 frames were made and never lit, most for the cause \"link\""));
-        // One lit frame is enough; and who wanted the dark, or nothing, got it.
+        // One lit frame is enough. It is also no failure if the dark was ordered, or no frames were requested.
         assert_eq!(Report { frames_lit: 1, ..report }.nothing_lit(), None);
         assert_eq!(Report { frames_withheld: 500, ..Report::default() }.nothing_lit(), None);
         let ordered_dark: BTreeMap<String, u64> = [("safe".into(), 300)].into();
         assert_eq!(Report { frames_dropped: 4, ordered_dark, ..Report::default() }.nothing_lit(), None);
         assert_eq!(Report { stopped: true, ..Report::default() }.nothing_lit(), None);
-        // A second in which the machine stood still lit nothing, too.
+        // If the machine stood still for the whole run, nothing was lit either.
         assert!(Report::default().nothing_lit().unwrap().starts_with("no frame was planned"));
     }
 }

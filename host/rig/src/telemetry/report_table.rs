@@ -37,7 +37,7 @@ impl Report {
             }
         }
         for (reason, slots) in self.ordered_dark.iter().filter(|(_, n)| **n > 0) {
-            let text = format!("{slots} slots more, neither missed nor lit");
+            let text = format!("{slots} more slots, neither missed nor lit");
             table.row(&format!("ordered: {reason}"), text);
         }
     }

@@ -1,11 +1,12 @@
-//! A histogram of signed times: HdrHistogram holds no negative values, so there are two of them, and the sign is never lost.
+//! A histogram of signed times. HdrHistogram cannot hold negative values, so there are two of them, and the sign is
+//! kept.
 
 use hdrhistogram::Histogram;
 
-/// Three digits: values are told apart by 0.1 % of themselves.
+/// Three digits: values are resolved to 0.1 %.
 const DIGITS: u8 = 3;
 
-/// Nanoseconds, early (negative) and not (zero and above).
+/// Nanoseconds: early values (negative) and late ones (zero and above).
 #[derive(Clone, Debug)]
 pub struct SignedHistogram {
     /// Magnitudes of the negative values.
@@ -17,17 +18,17 @@ pub struct SignedHistogram {
 }
 
 impl SignedHistogram {
-    /// Tells values between `-longest_ns` and `longest_ns` apart; those beyond count as the bound and are counted as saturated.
-    /// `longest_ns` below 2 is taken for 2.
+    /// Resolves values between `-longest_ns` and `longest_ns`. Values beyond count as the bound and are counted as
+    /// saturated. A `longest_ns` below 2 is replaced by 2.
     pub(crate) fn new(longest_ns: u64) -> Self {
         let longest_ns = longest_ns.max(2);
-        // The bounds of HdrHistogram begin at 1, which is its unit: a 0 is kept as 0.
+        // The bounds of HdrHistogram begin at 1, which is its unit; a 0 is kept as 0.
         let half =
             || Histogram::new_with_bounds(1, longest_ns, DIGITS).expect("1 and at least 2 are in range");
         Self { early: half(), late: half(), longest_ns, saturated: 0 }
     }
 
-    /// Takes a value in.
+    /// Records a value.
     pub(crate) fn record(&mut self, ns: i64) {
         let magnitude = ns.unsigned_abs();
         self.saturated += u64::from(magnitude > self.longest_ns);
@@ -35,7 +36,7 @@ impl SignedHistogram {
         half.saturating_record(magnitude.min(self.longest_ns));
     }
 
-    /// Values taken in.
+    /// Number of recorded values.
     pub fn len(&self) -> u64 {
         self.early.len() + self.late.len()
     }
@@ -45,12 +46,12 @@ impl SignedHistogram {
         self.len() == 0
     }
 
-    /// Values below zero.
+    /// Number of values below zero.
     pub fn negative(&self) -> u64 {
         self.early.len()
     }
 
-    /// Values that were beyond the bound.
+    /// Number of values beyond the bound.
     pub fn saturated(&self) -> u64 {
         self.saturated
     }
@@ -62,7 +63,8 @@ impl SignedHistogram {
         self.saturated = 0;
     }
 
-    /// The smallest value that at least the share `quantile` (0 to 1) of all values does not exceed, within 0.1 %; 0 without values.
+    /// The smallest value that at least the share `quantile` (0 to 1) of all values does not exceed, within 0.1 %; 0
+    /// without values.
     pub fn value_at_quantile(&self, quantile: f64) -> i64 {
         let all = self.len();
         if all == 0 {
@@ -118,7 +120,8 @@ impl SignedHistogram {
 
 /// The value of a rank from 1 to the number of values.
 fn at_rank(histogram: &Histogram<u64>, rank: u64) -> u64 {
-    // Half a rank less: the library rounds the share up to the next rank, and the division must not carry it over one.
+    // Half a rank less: the library rounds the share up to the next rank, and the division must not move it past a
+    // rank.
     histogram.value_at_quantile((rank as f64 - 0.5) / histogram.len() as f64)
 }
 
@@ -148,7 +151,8 @@ mod tests {
     }
 
     proptest! {
-        /// Quantiles, mean and ends are those of the sorted values, whatever their signs, within the histogram's resolution.
+        /// Quantiles, mean and extremes equal those of the sorted values, whatever their signs, within the
+        /// histogram's resolution.
         #[test]
         fn it_tells_what_the_sorted_values_tell(
             mut values in prop::collection::vec(-2_000_000i64..2_000_000, 1..300),

@@ -1,10 +1,11 @@
-//! What a projector showed slot by slot, and what became of each frame, into slots without a frame of their own and their causes.
+//! Classifies every slot of a run from what the projector showed in it and what happened to its frame.
 //!
-//! Every slot from the first frame that was planned to the last one is exactly one of these: it showed a frame of its own; it was missed,
-//! for one cause; or no new picture was wanted in it, for one reason. Slots of which the projector told nothing are missed.
+//! Every slot from the first planned frame to the last belongs to exactly one class: it showed a frame of its own; it
+//! was missed, for one cause; or no new picture was wanted in it, for one reason. Slots that the projector did not
+//! report are missed.
 //!
-//! A slot is decided as soon as its light, its frame and the machine's standstills are known, and then only counted. The window of slots
-//! that are not decided has a fixed length, so a run may last for months.
+//! A slot is decided as soon as its light, its frame and the machine's standstills are known, and is then only
+//! counted. The window of undecided slots has a fixed length, so a run may last for months.
 
 use super::ordered::{DarkLog, DarkSpans};
 use crate::frame::slots::{MissCause, OrderedDark};
@@ -14,42 +15,42 @@ use dpm_device::time::{FrameRate, HostTime};
 use std::collections::VecDeque;
 use std::sync::Arc;
 
-/// Most slots that wait for their decision; the oldest is decided by what is known when another one comes.
+/// Maximum number of undecided slots. When another one comes, the oldest is decided with what is known.
 const WINDOW: usize = 8192;
-/// Slots that are judged one by one where a stall skipped many at once; more than these are judged together.
+/// If a stall skipped at most this many slots, they are judged one by one; more are judged together.
 const ONE_BY_ONE: u64 = 1 << 20;
-/// Batches kept; twice as many slots go into each when there are more.
+/// Maximum number of batches; when there are more, twice as many slots go into each.
 const MAX_BATCHES: usize = 64;
-/// Slots of a batch at first.
+/// Initial number of slots per batch.
 const BATCH_SLOTS: u64 = 128;
 
-/// What is known of a slot.
+/// What is known about a slot.
 #[derive(Clone, Copy, Debug, Default)]
 struct Entry {
     light: Light,
-    /// Why its frame may not have made it, and when that frame was latched.
+    /// Why its frame may have missed the slot, and when that frame was latched.
     trouble: Option<(MissCause, HostTime)>,
 }
 
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 enum Light {
-    /// Nothing was told so far.
+    /// Nothing was reported yet.
     #[default]
     Untold,
     /// The frame that was planned for it.
     Own,
-    /// Dark, the frame before, or a frame that was planned for an earlier slot.
+    /// Dark, the previous frame, or a frame that was planned for an earlier slot.
     NothingNew,
 }
 
-/// Slots by what became of them.
+/// Number of slots by class.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub struct SlotCounts {
     /// Slots that showed a frame of their own.
     pub own: u64,
-    /// Slots that did not although they should have, by cause.
+    /// Slots that should have shown a frame of their own but did not, by cause.
     pub missed: [u64; MissCause::ALL.len()],
-    /// Slots in which no new picture was wanted, by reason; none of the others.
+    /// Slots in which no new picture was wanted, by reason. They are in neither of the other classes.
     pub ordered: [u64; OrderedDark::ALL.len()],
 }
 
@@ -59,22 +60,22 @@ impl SlotCounts {
         self.own + self.missed_total()
     }
 
-    /// Missed slots of every cause.
+    /// Missed slots of all causes.
     pub(crate) fn missed_total(&self) -> u64 {
         self.missed.iter().sum()
     }
 
-    /// Missed slots as a share of those in which a frame was wanted, 0 to 1; 0 where none was.
+    /// Missed slots as a share of those in which a frame was wanted, 0 to 1; 0 if there were none.
     pub(crate) fn missed_share(&self) -> f64 {
         self.missed_total() as f64 / self.wanted().max(1) as f64
     }
 
-    /// Missed slots whose frame was under way while the machine itself stood still.
+    /// Missed slots whose frame was in flight while the machine itself stood still.
     pub(crate) fn excused(&self) -> u64 {
         self.missed[MissCause::Standstill as usize]
     }
 
-    /// Slots of every reason in which no new picture was wanted.
+    /// Slots of all reasons in which no new picture was wanted.
     #[cfg(test)]
     pub(crate) fn ordered_total(&self) -> u64 {
         self.ordered.iter().sum()
@@ -99,7 +100,7 @@ impl SlotCounts {
     }
 }
 
-/// Consecutive slots in which a frame was wanted, and how many of them were missed: for the spread of the share.
+/// Consecutive slots in which a frame was wanted, and how many of them were missed, to show the spread of the share.
 #[derive(Clone, Debug)]
 struct Batches {
     all: Vec<(u64, u64)>,
@@ -130,17 +131,17 @@ impl Batches {
 #[derive(Clone, Debug)]
 pub(crate) struct SlotLedger {
     rate: FrameRate,
-    /// How long before its slot a frame is begun, for slots that had none.
+    /// How long before its slot a frame begins, for slots that had none.
     lead_ns: i64,
-    /// What is seen of the machine's standstills; `None` where nobody looks.
+    /// The machine's standstills; `None` if they are not monitored.
     seen: Option<Arc<SeenStandstills>>,
     spans: DarkSpans,
     first_planned: Option<u64>,
     last_planned: Option<u64>,
     newest_light: Option<u64>,
-    /// A slot and its beginning, from which those of other slots follow.
+    /// A slot and its beginning, from which the beginnings of other slots follow.
     reference: (u64, HostTime),
-    /// The first slot that is not decided.
+    /// The first undecided slot.
     base: u64,
     window: VecDeque<Entry>,
     counts: SlotCounts,
@@ -148,7 +149,7 @@ pub(crate) struct SlotLedger {
 }
 
 impl SlotLedger {
-    /// For slots of `rate`. A frame is begun about `lead_ns` before its slot.
+    /// For slots of `rate`. A frame begins about `lead_ns` before its slot.
     pub(crate) fn new(rate: FrameRate, lead_ns: i64) -> Self {
         Self {
             rate,
@@ -166,23 +167,23 @@ impl SlotLedger {
         }
     }
 
-    /// Missed slots are held against what is seen there. To be called before the first slot.
+    /// Compares missed slots with these standstills. Call it before the first slot.
     pub(crate) fn excuse_by(&mut self, seen: Arc<SeenStandstills>) {
         self.seen = Some(seen);
     }
 
-    /// Learns what was ordered.
+    /// Reads the orders.
     pub(crate) fn read_orders(&mut self, log: &DarkLog) {
         self.spans.read(log);
     }
 
-    /// Why no new picture was wanted in the slot that begins at `begin`; `None` where one was.
+    /// Why no new picture was wanted in the slot that begins at `begin`; `None` if one was wanted.
     pub(crate) fn ordered_dark(&self, begin: HostTime) -> Option<OrderedDark> {
         self.spans.reason_at(begin)
     }
 
-    /// A frame for `slot` came to the end of the host's part of its way. `refused`: the link did not take
-    /// it. `waited_for_memory`: planning could not begin earlier because a later stage held all buffers.
+    /// A frame for `slot` reached the end of the host's part of its path. `refused`: the link did not accept it.
+    /// `waited_for_memory`: planning could not begin earlier because a later stage held all buffers.
     pub(crate) fn planned(
         &mut self,
         slot: u64,
@@ -213,20 +214,20 @@ impl SlotLedger {
         }
     }
 
-    /// The frame that was planned for `slot`, which begins at `begin`, was lit in it. The last `unseen` slots before it of which nothing
-    /// else was told showed frames of which only the number is known; they are taken for their own.
+    /// The frame that was planned for `slot`, which begins at `begin`, was lit in it. The last `unseen` unreported
+    /// slots before it showed frames of which only the number is known; each counts as having shown its own frame.
     pub(crate) fn own(&mut self, slot: u64, begin: HostTime, unseen: u32) {
         self.told(slot, begin, Light::Own, unseen);
         self.spans.lit(begin);
     }
 
-    /// The projector had nothing new in `slot`, which began at `begin`, or a frame that was meant for an earlier slot. `unseen` as in
-    /// [`SlotLedger::own`].
+    /// The projector showed nothing new in `slot`, which began at `begin`, or a frame that was meant for an earlier
+    /// slot. `unseen` as in [`SlotLedger::own`].
     pub(crate) fn nothing_new(&mut self, slot: u64, begin: HostTime, unseen: u32) {
         self.told(slot, begin, Light::NothingNew, unseen);
     }
 
-    /// Decides what can be decided. To be called now and then.
+    /// Decides what can be decided. Call it regularly.
     pub(crate) fn settle(&mut self) {
         let through = self.seen.as_ref().map_or(HostTime(i64::MAX), |seen| seen.through());
         while let (Some(front), Some(last)) = (self.window.front(), self.last_planned) {
@@ -234,7 +235,7 @@ impl SlotLedger {
             let known = match front.light {
                 Light::Own => true,
                 Light::NothingNew => self.begin_of(slot) <= through,
-                // Light is told in order: what was passed over will not be told any more.
+                // Light is reported in order, so a slot that was passed over will not be reported any more.
                 Light::Untold => {
                     self.newest_light.is_some_and(|newest| newest > slot) && self.begin_of(slot) <= through
                 }
@@ -246,7 +247,7 @@ impl SlotLedger {
         }
     }
 
-    /// Counts so far: all slots that are decided.
+    /// Counts of all slots that are decided so far.
     pub(crate) fn counts(&self) -> SlotCounts {
         self.counts
     }
@@ -259,7 +260,7 @@ impl SlotLedger {
         self.counts
     }
 
-    /// Slots in which a frame was wanted, and those of them that were missed, of equal batches of consecutive slots.
+    /// For equal batches of consecutive slots: slots in which a frame was wanted, and those of them that were missed.
     pub(crate) fn batches(&self) -> &[(u64, u64)] {
         &self.batches.all
     }
@@ -269,7 +270,7 @@ impl SlotLedger {
         self.base.saturating_add(self.window.len() as u64)
     }
 
-    /// The window begins at `slot`, where the run begins.
+    /// Starts the window at `slot`, where the run begins.
     fn begin_at(&mut self, slot: u64) {
         if self.window.is_empty() || self.end() <= slot || self.base > slot.saturating_add(WINDOW as u64) {
             self.window.clear();
@@ -284,7 +285,7 @@ impl SlotLedger {
         self.base = slot;
     }
 
-    /// When a slot begins, from the newest one of which it is known.
+    /// When a slot begins, computed from the newest slot whose beginning is known.
     fn begin_of(&self, slot: u64) -> HostTime {
         let (known, begin) = self.reference;
         let ns = self.rate.slot_start_ns(slot).saturating_sub(self.rate.slot_start_ns(known));
@@ -320,14 +321,14 @@ impl SlotLedger {
     }
 
     fn told(&mut self, slot: u64, begin: HostTime, light: Light, unseen: u32) {
-        // What it shows far behind the last planned slot is not of the run, unless planning goes on, which then tells of it. And no
-        // projector has a say in how much memory or time is spent here.
+        // Light far beyond the last planned slot does not belong to the run, unless planning continues, which then
+        // covers it. A projector also must not decide how much memory or time is spent here.
         let newest = self.last_planned.unwrap_or(slot).saturating_add(WINDOW as u64);
         if slot > newest || slot < self.base {
             return;
         }
         if self.first_planned.is_none() {
-            // Before the first frame: nothing counts yet, but its note may come after its light.
+            // Before the first frame nothing counts yet, but its note may come after its light.
             if self.window.is_empty() || slot >= self.end().saturating_add(WINDOW as u64) {
                 self.window.clear();
                 self.base = slot;
@@ -365,14 +366,15 @@ impl SlotLedger {
         if let Some(reason) = self.spans.reason_at(begin) {
             return Judgement::Ordered(reason);
         }
-        // A frame that was sent in time and not lit is the link's, and so is a slot of which nothing is known.
+        // If a frame was sent in time and not lit, the link is the cause; the same holds for a slot about which
+        // nothing is known.
         let (cause, since) = entry.trouble.unwrap_or((MissCause::Link, begin));
         let under_way = since.min(begin.plus_ns(-self.lead_ns));
         let stood_still = self.seen.as_ref().is_some_and(|seen| seen.with(|s| s.touches(under_way, begin)));
         Judgement::Missed(if stood_still { MissCause::Standstill } else { cause })
     }
 
-    /// The slots from the window's beginning to `end`, of which nothing is known but that they were skipped.
+    /// Judges the slots from the window's beginning to `end`, of which only is known that they were skipped.
     fn judged_together(&self, end: u64, trouble: Option<(MissCause, HostTime)>) -> Judgement {
         let (from, to) = (self.begin_of(self.base), self.begin_of(end));
         if let Some(reason) = self.spans.reason_throughout(from, to) {
@@ -394,7 +396,7 @@ impl SlotLedger {
     }
 }
 
-/// The part of a late frame's way that took longest.
+/// The part of a late frame's path that took longest.
 fn slowest(t: &FrameTimeline) -> MissCause {
     let parts = [
         (MissCause::Plan, t.submitted_at.ns_since(t.latched_at)),

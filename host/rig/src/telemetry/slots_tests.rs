@@ -1,4 +1,4 @@
-//! The ledger against runs whose every slot is known.
+//! Tests of the ledger with runs in which every slot is known.
 
 use super::*;
 use dpm_common::realtime::standstill::Standstills;
@@ -40,8 +40,8 @@ fn ledger(gaps: &[(i64, i64)]) -> SlotLedger {
     ledger
 }
 
-/// Slots 10 to 19: 12 never planned, 13 not taken, 15 sent 2 slots late, 17 lost by the device; before them 9, and behind them 20 and
-/// 21, which nobody planned.
+/// Slots 10 to 19: 12 was never planned, 13 not accepted, 15 sent 2 slots late, 17 lost by the device. Before them
+/// comes 9; after them 20 and 21, which were not planned.
 fn ten_slots(mut ledger: SlotLedger) -> SlotCounts {
     ledger.nothing_new(9, begin(9), 0);
     for slot in [10, 11, 13, 14, 15, 16, 17, 18, 19] {
@@ -66,14 +66,16 @@ fn every_missed_slot_of_the_run_has_one_cause() {
     assert_eq!((counts.wanted(), counts.own, counts.missed_total(), counts.ordered_total()), (10, 6, 4, 0));
     assert_eq!((of(&counts, MissCause::Buffers), of(&counts, MissCause::Link)), (1, 3));
     assert_eq!((counts.excused(), counts.missed_share()), (0, 0.4));
-    // The machine stood still while the frame of slot 15 was under way, and nothing else: raw it is missed all the same.
+    // The machine stood still only while the frame of slot 15 was in flight. In the raw number the slot is missed all
+    // the same.
     let counts = ten_slots(ledger(&[(14 * SLOT + 10, 15 * SLOT - 10)]));
     assert_eq!((of(&counts, MissCause::Buffers), of(&counts, MissCause::Link), counts.excused()), (1, 2, 1));
     assert_eq!(counts.missed_total(), 4);
     assert_eq!(SlotLedger::new(rate(), 0).finish(), SlotCounts::default());
 }
 
-/// Found in use: a run whose every frame is late, or whose light nobody tells of, has no slot of its own and is no run without misses.
+/// Found in use: a run whose every frame is late, or whose light nobody reports, has no slot with its own frame; it
+/// is not a run without misses.
 #[test]
 fn slots_of_which_nothing_good_is_known_are_missed() {
     let mut late = ledger(&[]);
@@ -87,7 +89,8 @@ fn slots_of_which_nothing_good_is_known_are_missed() {
     assert_eq!((silent.finish().missed[MissCause::Link as usize], silent.counts().wanted()), (100, 100));
 }
 
-/// Slots whose light was told as a number only are taken for their own, those before a report for which there is no number are not.
+/// Slots whose light was reported only as a number count as showing their own frames. Slots before a report that has
+/// no number for them do not.
 #[test]
 fn a_merged_report_covers_the_slots_before_it() {
     let mut ledger = ledger(&[]);
@@ -101,7 +104,7 @@ fn a_merged_report_covers_the_slots_before_it() {
     assert_eq!((counts.own, counts.missed[MissCause::Link as usize]), (7, 1));
 }
 
-/// Found in use (second look at latency, section 2): an operator's BLACK was booked as lateness of the link.
+/// Found in use (second look at latency, section 2): an operator's BLACK was counted as lateness of the link.
 #[test]
 fn ordered_dark_is_neither_missed_nor_lit() {
     let log = DarkLog::default();
@@ -116,7 +119,7 @@ fn ordered_dark_is_neither_missed_nor_lit() {
         ledger.read_orders(&log);
         let dark = (500..1_203).contains(&slot);
         ledger.planned(slot, &frame(slot, -100), dark, false);
-        // While it is latched, the projector tells of no slot.
+        // While it is latched, the projector reports no slot.
         match slot {
             900..1_200 => ordered += 1,
             _ if dark => {
@@ -134,12 +137,13 @@ fn ordered_dark_is_neither_missed_nor_lit() {
     let counts = ledger.finish();
     assert_eq!((counts.own, counts.ordered_total(), counts.missed_total()), (own, ordered, 1));
     let of = |reason: OrderedDark| counts.ordered[reason as usize];
-    // The slot in which SAFE was ordered is BLACK's no more.
+    // The slot in which SAFE was ordered no longer belongs to BLACK.
     assert_eq!((of(OrderedDark::Black), of(OrderedDark::Safe)), (400, 303));
     assert_eq!((counts.wanted(), counts.missed_share()), (own + 1, 1.0 / (own + 1) as f64));
 }
 
-/// A week at 15 slots a second with ten misses and five standstills a second: memory stays bounded, and every cause is exact to the end.
+/// A week at 15 slots per second with ten misses and five standstills per second: memory stays bounded, and every
+/// cause is exact to the end.
 #[test]
 fn a_week_of_misses_is_counted_exactly_in_bounded_memory() {
     let rate = FrameRate::new(15, 1).unwrap();
@@ -156,11 +160,12 @@ fn a_week_of_misses_is_counted_exactly_in_bounded_memory() {
         (t.latched_at, t.due_at) = (due.plus_ns(-2 * SLOT), due);
         (t.submitted_at, t.rendered_at, t.packing_at) = (t.latched_at, t.latched_at, t.latched_at);
         (t.packed_at, t.sent_at) = (due.plus_ns(-SLOT), due.plus_ns(-100));
-        // An hour of BLACK a day.
+        // An hour of BLACK per day.
         let hour = slot / (3600 * 15) % 24;
         log.tell(due, (hour == 3).then_some(OrderedDark::Black));
         ledger.read_orders(&log);
-        // Of three slots one is lit, one is refused, and of the third the frame comes late: half of these while the machine stands still.
+        // Of every three slots one is lit, one is refused, and the frame of the third is late; half of the late ones
+        // fall into standstills.
         let (kind, still) = (slot % 3, slot % 6 == 2);
         if still || kind == 1 && slot % 2 == 0 {
             let gap = due.plus_ns(if still { -SLOT } else { 3 * SLOT });
@@ -200,7 +205,8 @@ fn a_week_of_misses_is_counted_exactly_in_bounded_memory() {
     assert!((missed as f64 / wanted as f64 / exact.missed_share() - 1.0).abs() < 1e-3);
 }
 
-/// A process that is stopped for a day, and a projector that tells of slots in a thousand years: bounded time, nothing lost.
+/// A process that is stopped for a day, and a projector that reports slots a thousand years ahead: time is bounded,
+/// nothing is lost.
 #[test]
 fn jumps_are_counted_without_being_walked() {
     let mut ledger = ledger(&[]);
@@ -234,7 +240,7 @@ fn a_standstill_that_is_told_late_still_excuses_its_slot() {
         }
         ledger.settle();
     }
-    // Nothing behind the missed slot is counted before it is decided.
+    // Nothing after the missed slot is counted before that slot is decided.
     assert_eq!((ledger.counts().own, ledger.counts().missed_total()), (20, 0));
     seen.note(begin(18), begin(49));
     seen.wake(begin(49));

@@ -1,8 +1,9 @@
-//! Frames into a Chrome trace that opens in Perfetto: one track per thread, GPU and device, and an arrow that follows each frame.
+//! Writes frames as a Chrome trace for Perfetto: one track per thread, GPU and device, and an arrow that follows each
+//! frame.
 //!
-//! Format: the JSON array form of the "Trace Event Format" document. Slices are complete events ("X"); the journey of frame n is
-//! a flow of id n ("s", "t", "f" with `bp: e`), whose points lie inside the slices they bind to. Slices on one track must
-//! nest or follow each other, so frames in flight together are spread over lanes.
+//! The format is the JSON array form of the "Trace Event Format" document. Slices are complete events ("X"). The path
+//! of frame n is a flow with id n ("s", "t", "f" with `bp: e`), whose points lie inside the slices that they bind to.
+//! Slices on one track must nest or follow each other, so frames that are in flight together are spread over lanes.
 
 use crate::frame::{FrameTimeline, Stage};
 use crate::plan::frame::FrameId;
@@ -37,10 +38,11 @@ const TRACKS: [(Track, u32, &str); 6] = [
     (Track::Light, DEVICE, "projector: light"),
 ];
 
-/// Lanes of a track; more frames in flight than this share the last one's start and are clipped to it.
+/// Lanes per track. If more frames are in flight, they share the last lane, and each is clipped to begin there when
+/// the one before ends.
 const LANES: usize = 8;
 
-/// A frame's way as the trace shows it.
+/// A frame's path, as shown by the trace.
 #[derive(Clone, Debug)]
 pub(crate) struct FrameTrace<'a> {
     /// Which frame.
@@ -49,7 +51,7 @@ pub(crate) struct FrameTrace<'a> {
     pub slot: u64,
     /// Stamps.
     pub timeline: &'a FrameTimeline,
-    /// Last photon; `None` when the device does not say.
+    /// Last photon; `None` if the device does not report it.
     pub last_photon_at: Option<HostTime>,
     /// Name and length of each GPU pass, ns, in order; may be empty.
     pub passes: &'a [(&'a str, u64)],
@@ -66,7 +68,7 @@ pub struct TracedFrame {
     pub timeline: FrameTimeline,
     /// Last photon.
     pub last_photon_at: HostTime,
-    /// GPU time of each of [`PASSES`], ns; 0 where the device does not say.
+    /// GPU time of each of [`PASSES`], ns; 0 if the device does not report it.
     pub pass_ns: [u64; PASSES.len()],
 }
 
@@ -92,7 +94,8 @@ pub fn write_trace(out: impl Write, frames: &[TracedFrame], standstills: &Stands
     trace.finish().map(|_| ())
 }
 
-/// Writes a trace event by event. Call [`TraceWriter::finish`]; a trace cut off before still opens, as the format allows.
+/// Writes a trace event by event. Call [`TraceWriter::finish`] at the end; a trace that was cut off still opens, as
+/// the format permits.
 #[derive(Debug)]
 pub(crate) struct TraceWriter<W: Write> {
     out: W,
@@ -100,7 +103,7 @@ pub(crate) struct TraceWriter<W: Write> {
     first: bool,
 }
 
-/// A slice as placed.
+/// A placed slice.
 struct Placed {
     pid: u32,
     tid: u32,
@@ -156,7 +159,7 @@ impl<W: Write> TraceWriter<W> {
                 _ => "t",
             };
             let binding = if i == last { r#","bp":"e""# } else { "" };
-            // The middle of the slice: inside it whatever the rounding.
+            // The middle of the slice, so that it lies inside whatever the rounding.
             let at = Micros(place.from + (place.to - place.from) / 2);
             self.event(format_args!(
                 r#"{{"ph":"{ph}","name":"frame","cat":"frame","id":{},"pid":{},"tid":{},"ts":{at}{binding}}}"#,
@@ -166,7 +169,8 @@ impl<W: Write> TraceWriter<W> {
         Ok(())
     }
 
-    /// Marks an instant that concerns everything: a missed slot, a standstill, a lost body. `name` must need no escaping.
+    /// Marks an instant that concerns all tracks: a missed slot, a standstill, a lost body. `name` must not require
+    /// escaping.
     pub(crate) fn mark(&mut self, name: &str, at: HostTime) -> Result<(), Error> {
         let plain: String = name.chars().filter(|c| !c.is_control() && !matches!(c, '"' | '\\')).collect();
         self.event(format_args!(
@@ -186,7 +190,7 @@ impl<W: Write> TraceWriter<W> {
     fn passes(&mut self, gpu: &Placed, passes: &[(&str, u64)]) -> Result<(), Error> {
         let mut from = gpu.from;
         for (name, ns) in passes {
-            // Children lie inside their parent: time stamps of another clock may claim a little more.
+            // Children must lie inside their parent; time stamps of another clock may exceed it a little.
             let to = from.saturating_add(i64::try_from(*ns).unwrap_or(i64::MAX)).min(gpu.to);
             if to > from {
                 self.event(format_args!(
@@ -202,7 +206,7 @@ impl<W: Write> TraceWriter<W> {
         Ok(())
     }
 
-    /// Places a slice on the first lane that is free and writes it.
+    /// Places a slice on the first free lane and writes it.
     fn slice(
         &mut self,
         track: Track,
@@ -241,7 +245,7 @@ fn tid(track: Track, lane: usize) -> u32 {
     (10 * (track as usize + 1) + lane) as u32
 }
 
-/// Nanoseconds as microseconds with three decimals, without a detour through floating point.
+/// Nanoseconds as microseconds with three decimals, without floating point.
 struct Micros(i64);
 
 impl std::fmt::Display for Micros {

@@ -1,4 +1,4 @@
-//! Traces of frames in flight together against a checker of the format.
+//! Checks traces of frames in flight together against the rules of the format.
 
 use super::super::interval::tests::frame;
 use super::*;
@@ -27,7 +27,7 @@ fn trace(frames: &[(FrameTimeline, Vec<(&str, u64)>)]) -> String {
 
 #[test]
 fn every_lit_frame_can_be_followed_from_sample_to_light() {
-    // 947 fps with 3 ms from sample to light: three frames under way on every track.
+    // 947 fps with 3 ms from sample to light: three frames in flight on every track.
     let frames: Vec<_> = (0..200)
         .map(|k| {
             (frame(k * 1_055_966, 400_000), vec![("trace", 150_000), ("filter", 100_000), ("pack", 900_000)])

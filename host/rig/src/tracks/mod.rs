@@ -1,4 +1,4 @@
-//! What the tracker says, into the tracks of all bodies.
+//! From the tracker's samples to the tracks of all bodies.
 
 mod source;
 mod stage;

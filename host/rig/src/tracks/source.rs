@@ -1,4 +1,4 @@
-//! `[tracker]` of the rig file into the tracker itself, ready to be polled.
+//! Opens the tracker of `[tracker]` in the rig file, ready to be polled.
 
 use crate::config::{MockTrackerConfig as MockKeys, TrackerConfig};
 use crate::mock::{FaultError, FaultPlan, MockTracker, MockTrackerConfig, MockTrackerError, Motion};
@@ -12,36 +12,36 @@ use dpm_device::tracker::{BodyKey, Tracker, TrackerError};
 use std::net::Ipv4Addr;
 use std::sync::Arc;
 
-/// Why there is no tracker.
+/// Why the tracker cannot be opened.
 #[derive(Debug, thiserror::Error)]
 pub enum SourceError {
-    /// The mock's numbers.
+    /// The mock's settings are invalid.
     #[error("tracker: {0}")]
     Mock(#[from] MockTrackerError),
-    /// The mock's faults.
+    /// The mock's faults are invalid.
     #[error("tracker.faults: {0}")]
     Faults(#[from] FaultError),
-    /// An address that is none. The configuration's check finds it first.
+    /// An invalid address. The check of the configuration finds it first.
     #[error("{key}: {text:?} is not an IPv4 address such as 192.168.1.10")]
     Address {
         /// Key of the rig file.
         key: &'static str,
-        /// What stands there.
+        /// The invalid text.
         text: String,
     },
-    /// The recording.
+    /// The recording cannot be used.
     #[error("tracker.file: {0}")]
     Recording(#[from] RecordError),
-    /// The device or the network.
+    /// The device or the network cannot be opened.
     #[error("tracker: {0}")]
     Tracker(#[from] TrackerError),
 }
 
-/// The tracker of `rig`, which polls are stamped by `clock`. Time 0 of the mock's motions is instant 0 of the host's clock; a recording starts
-/// at `start`.
+/// Opens the tracker of `rig`; its polls are stamped with `clock`. Time 0 of the mock's motions is instant 0 of the
+/// host's clock; a recording starts at `start`.
 ///
 /// # Errors
-/// Its address, file or numbers are wrong.
+/// Its address, file or settings are wrong.
 pub fn open_for(
     rig: &Rig,
     clock: Arc<dyn HostClock>,
@@ -57,12 +57,12 @@ pub fn open_for(
     open(&rig.config.tracker, keys, motions, clock, start)
 }
 
-/// Opens the tracker. `bodies` are the rig's in their order; `motions` are how they truly move, which only the mock needs; `clock` is the
-/// clock that polls are stamped with; a recording starts at `start`. Network and serial trackers connect while they are
-/// polled, and again after every loss: that nobody answers yet is no error.
+/// Opens the tracker. `bodies` are the rig's bodies in their order. `motions` are their true motions, which only the
+/// mock needs. `clock` is the clock that stamps polls. A recording starts at `start`. Network and serial trackers
+/// connect while they are polled, and reconnect after every loss, so it is no error if nothing answers yet.
 ///
 /// # Errors
-/// Numbers, addresses or files that cannot be used; a socket that the system refuses.
+/// Settings, addresses or files cannot be used, or the system refuses a socket.
 pub(crate) fn open(
     config: &TrackerConfig,
     bodies: Vec<BodyKey>,
@@ -97,10 +97,10 @@ pub(crate) fn open(
     })
 }
 
-/// The mock tracker of bodies that move by `motions`.
+/// The mock tracker for bodies that move by `motions`.
 fn mock(c: &MockKeys, motions: Vec<Motion>) -> Result<MockTracker, SourceError> {
     let mut faults = c.faults.clone();
-    // `drop_out` is one more fault.
+    // `drop_out` is an additional fault.
     if c.drop_out > 0.0 {
         let separator = if faults.trim().is_empty() { "" } else { "," };
         faults.push_str(&format!("{separator}loss={}", c.drop_out));

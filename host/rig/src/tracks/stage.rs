@@ -1,4 +1,4 @@
-//! What has arrived from the tracker, into the tracks of all bodies: the first stage of a frame.
+//! The first stage of a frame: puts newly arrived samples into the tracks of all bodies.
 
 use crate::config::{TrackerConfig, MAX_TRACKED};
 use crate::rig::Rig;
@@ -7,46 +7,47 @@ use dpm_device::tracker::{BodyIndex, Tracker, TrackerError};
 use dpm_handoff::latest::Publisher;
 use dpm_tracking::{PoseFilterBank, TrackState};
 
-/// What the tracking stage knows, for the latest-wins slot.
+/// The tracking stage's result, for the latest-wins slot.
 #[derive(Clone, Debug)]
 pub struct TrackSnapshot {
-    /// Everything that arrived up to here is in.
+    /// Everything that arrived up to this instant is included.
     pub through: HostTime,
-    /// By body: its track and when the newest sample arrived.
+    /// Per body: its track, and when the newest sample arrived.
     pub tracks: Vec<Option<(TrackState, HostTime)>>,
-    /// From mid-exposure of the tracker to the arrival of a sample, the longest of the last samples, nanoseconds.
+    /// Time from the tracker's mid-exposure to the arrival of a sample, the longest among the last samples,
+    /// nanoseconds.
     pub latency_ns: i64,
 }
 
 impl TrackSnapshot {
-    /// Nothing is known of `bodies` bodies.
+    /// A snapshot in which nothing is known of `bodies` bodies.
     pub fn empty(bodies: usize) -> Self {
         Self { through: HostTime(i64::MIN), tracks: vec![None; bodies.min(MAX_TRACKED)], latency_ns: 0 }
     }
 }
 
-/// Samples into tracks.
+/// Puts samples into tracks.
 pub struct TrackingStage {
     tracker: Box<dyn Tracker>,
     bank: PoseFilterBank,
     received_at: Vec<HostTime>,
     bodies: usize,
-    /// Longest latency of the last samples; it fades by 1/1024 a sample.
+    /// The longest latency of the last samples; it decays by 1/1024 per sample.
     latency_ns: i64,
-    /// First step, `None` before it.
+    /// Time of the first step; `None` before it.
     began_at: Option<HostTime>,
-    /// It was looked at whether all bodies are seen.
+    /// The check whether all bodies were seen has been made.
     looked: bool,
 }
 
-/// Longest time for which any rig carries a body on by prediction, milliseconds.
+/// The longest time for which any rig may extend a body's track by prediction, milliseconds.
 pub(crate) const MAX_PREDICT_MS: u32 = 1_000;
 
-/// Time within which every body should have been seen once: a tracker that is there speaks within milliseconds, and one that has to be
-/// connected to anew within half a second.
+/// Time within which every body should have been seen once. A working tracker reports within milliseconds, and one
+/// that must be reconnected within half a second.
 const SEEN_WITHIN_NS: i64 = 1_000_000_000;
 
-/// What to look at first where a tracker does not tell of a body.
+/// What the operator should check first if a tracker does not report a body.
 const fn remedy(tracker: &TrackerConfig) -> &'static str {
     match tracker {
         TrackerConfig::Mock(_) => "`tracker.faults` and `tracker.drop_out` may silence the mock",
@@ -66,8 +67,8 @@ const fn remedy(tracker: &TrackerConfig) -> &'static str {
 impl TrackingStage {
     /// A stage for the rig's bodies.
     pub fn new(rig: &Rig, tracker: Box<dyn Tracker>) -> Self {
-        // How long a body is shown without samples is decided for every frame, see [`crate::plan::frame::plan`]; the filter only needs to know for how long
-        // a track is worth going on with.
+        // Each frame decides how long a body is shown without samples, see [`crate::plan::frame::plan`]. The filter
+        // only needs to know how long a track is worth keeping.
         let longest_ms = rig.config.safety.predict_ms.unwrap_or(MAX_PREDICT_MS);
         let config = rig.config.prediction.to_filter(longest_ms);
         let bodies = rig.bodies.len().min(MAX_TRACKED);
@@ -82,10 +83,10 @@ impl TrackingStage {
         }
     }
 
-    /// Takes what has arrived by `now` and publishes the tracks.
+    /// Reads what has arrived by `now` and publishes the tracks.
     ///
     /// # Errors
-    /// The tracker is gone; what is known stays published.
+    /// The tracker is gone; the tracks that are known stay published.
     pub fn step(&mut self, now: HostTime, latest: &mut Publisher<TrackSnapshot>) -> Result<(), TrackerError> {
         self.began_at.get_or_insert(now);
         let Self { tracker, bank, received_at, latency_ns, .. } = self;
@@ -115,7 +116,7 @@ impl TrackingStage {
         self.bank.state(BodyIndex(body as u16)).is_none()
     }
 
-    /// True once in a run: a second after the first step, when some body was not seen by then. Allocates nothing.
+    /// True once per run: one second after the first step, if some body has not been seen by then. Allocates nothing.
     pub(crate) fn is_silence_due(&mut self, now: HostTime) -> bool {
         let due = self.began_at.is_some_and(|began| now.ns_since(began) >= SEEN_WITHIN_NS);
         if self.looked || !due {
@@ -125,12 +126,13 @@ impl TrackingStage {
         (0..self.bodies).any(|body| self.is_unseen(body))
     }
 
-    /// The bodies that were not seen so far, which are dark, the tracker's word on why, and what to do; `None` when all of them were.
+    /// Names the bodies that have not been seen yet and are therefore dark, the tracker's explanation, and what to
+    /// do. `None` if all were seen.
     pub(crate) fn not_seen_yet(&self, rig: &Rig) -> Option<String> {
         self.unseen(rig, "has not seen", "and no light falls there until it does")
     }
 
-    /// The same at the end of a run, and what else the tracker has to say.
+    /// The same at the end of a run, with any other message of the tracker.
     pub(crate) fn never_seen(&self, rig: &Rig) -> Option<String> {
         let unseen = self.unseen(rig, "never saw", "so no light fell there");
         unseen.into_iter().chain(self.tracker.warning()).reduce(|a, b| format!("{a}; {b}"))
@@ -157,7 +159,7 @@ mod tests {
     use dpm_device::tracker::TrackerSample;
     use dpm_handoff::latest::latest;
 
-    /// Tells of the bodies below a number, at every poll.
+    /// Reports the bodies below a number at every poll.
     struct Speaks {
         of: u16,
     }
