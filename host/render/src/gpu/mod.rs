@@ -1,6 +1,6 @@
 //! Vulkan, and the only place that names it: a device, buffers, compute pipelines, and command lists recorded once.
 //!
-//! Everything here runs headless on any Vulkan 1.1 device with scalar block layout, software ones included.
+//! Everything here runs headless on any Vulkan 1.2 device with scalar block layout, software ones included.
 //!
 //! A device may be lost, or hang. Then every call fails at once, everything can be dropped without waiting, and [`Gpu::reopen`] gives a
 //! device to go on with: make the renderer and its slots anew on that one

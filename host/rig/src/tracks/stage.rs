@@ -67,7 +67,7 @@ const fn remedy(tracker: &TrackerConfig) -> &'static str {
 impl TrackingStage {
     /// A stage for the rig's bodies.
     pub fn new(rig: &Rig, tracker: Box<dyn Tracker>) -> Self {
-        // Each frame decides how long a body is shown without samples, see [`crate::plan::frame::plan`]. The filter
+        // Each frame decides how long a body is shown without samples, see [`crate::plan::frame::FramePlan::fill`]. The filter
         // only needs to know how long a track is worth keeping.
         let longest_ms = rig.config.safety.predict_ms.unwrap_or(MAX_PREDICT_MS);
         let config = rig.config.prediction.to_filter(longest_ms);
