@@ -20,8 +20,8 @@ vec2 environment_position(vec3 d) {
 }
 
 vec3 environment_radiance(vec3 d) {
-    if (ENVIRONMENT_KIND == 0u) return vec3(0.0);
-    if (ENVIRONMENT_KIND == 1u) return frame.environment;
+    if (ENVIRONMENT_KIND == ENVIRONMENT_NONE) return vec3(0.0);
+    if (ENVIRONMENT_KIND == ENVIRONMENT_CONSTANT) return frame.environment;
     vec2 uv = environment_position(d);
     uint x = min(uint(uv.x * float(frame.environment_width)), frame.environment_width - 1u);
     uint y = min(uint(uv.y * float(frame.environment_height)), frame.environment_height - 1u);
@@ -30,8 +30,8 @@ vec3 environment_radiance(vec3 d) {
 
 // Solid-angle pdf of the environment's own sampling (without the choice of the environment among lights).
 float environment_pdf(vec3 d, vec3 n) {
-    if (ENVIRONMENT_KIND == 0u) return 0.0;
-    if (ENVIRONMENT_KIND == 1u) return max(dot(n, d), 0.0) / PI;
+    if (ENVIRONMENT_KIND == ENVIRONMENT_NONE) return 0.0;
+    if (ENVIRONMENT_KIND == ENVIRONMENT_CONSTANT) return max(dot(n, d), 0.0) / PI;
     uint w = frame.environment_width, h = frame.environment_height;
     vec2 uv = environment_position(d);
     uint x = min(uint(uv.x * float(w)), w - 1u);
@@ -51,7 +51,7 @@ LightSample sample_environment(vec3 n, vec2 u) {
     r.pdf = 0.0;
     r.radiance = vec3(0.0);
     r.to_light = n;
-    if (ENVIRONMENT_KIND == 1u) {
+    if (ENVIRONMENT_KIND == ENVIRONMENT_CONSTANT) {
         mat3 to_world = frame_around(n);
         float radius = sqrt(u.x), phi = 2.0 * PI * u.y;
         float z = sqrt(max(1.0 - u.x, 0.0));
@@ -59,7 +59,7 @@ LightSample sample_environment(vec3 n, vec2 u) {
         r.pdf = z / PI;
         r.radiance = frame.environment;
         r.valid = r.pdf > 1e-7;
-    } else if (ENVIRONMENT_KIND == 2u) {
+    } else if (ENVIRONMENT_KIND == ENVIRONMENT_MAP) {
         uint w = frame.environment_width, h = frame.environment_height;
         uint lo = 0u, hi = h - 1u;
         while (lo < hi) {
@@ -99,7 +99,7 @@ LightSample sample_light(vec3 p, vec3 n, float u_pick, vec2 u) {
     r.radiance = vec3(0.0);
     r.to_light = n;
     float to_environment = frame.environment_select;
-    if (ENVIRONMENT_KIND != 0u && u_pick < to_environment) {
+    if (ENVIRONMENT_KIND != ENVIRONMENT_NONE && u_pick < to_environment) {
         r = sample_environment(n, u);
         r.pdf *= to_environment;
         if (r.valid) r.radiance /= r.pdf;

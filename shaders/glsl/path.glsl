@@ -87,7 +87,7 @@ bool advance_path(inout Path path, Sampler rng, inout uint rays) {
     hit.t = INFINITY;
     rays++;
     if (!trace_ray(origin, next.direction, 0u, false, hit)) {
-        if (ENVIRONMENT_KIND != 0u) {
+        if (ENVIRONMENT_KIND != ENVIRONMENT_NONE) {
             float light_pdf = next.delta ? 0.0 : environment_pdf(next.direction, s.n) * frame.environment_select;
             float weight = next.delta ? 1.0 : balance(next.pdf, light_pdf);
             path.radiance += limit_indirect(path.throughput * environment_radiance(next.direction) * weight, vertex);

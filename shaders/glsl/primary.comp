@@ -12,11 +12,6 @@ layout(set = 0, binding = B_TILES, scalar) readonly buffer Tiles { uint tiles[];
 layout(set = 0, binding = B_SURFACES, scalar) writeonly buffer Surfaces { Surface surfaces[]; };
 layout(set = 0, binding = B_GUIDES, scalar) writeonly buffer Guides { Guide guides[]; };
 
-// What the passes between tracing and light need; 0: they are not recorded.
-layout(constant_id = 11) const bool HAS_GUIDES = true;
-// Radiance is filtered without the surface's albedo.
-layout(constant_id = 12) const bool HAS_DEMODULATION = true;
-
 // Reflectance of the look for white light from everywhere, roughly: what varies over a texture but not over the light. Light from below the
 // surface itself is lost, however the shading normal leans: that share of a cosine lobe is (1 - cos) / 2 of the angle between the normals.
 vec3 demodulation(Hit hit, vec3 toward) {

@@ -1,7 +1,5 @@
-// Random numbers in groups of four. Which sequence: a specialization constant.
+// Random numbers in groups of four. The specialization constant SAMPLER says from which sequence they come.
 #include "noise.glsl"
-
-layout(constant_id = 10) const uint SAMPLER = 0u; // 0 independent, 1 one point set a frame shifted by blue noise, 2 one sequence a surface point, 3 one sequence a pixel
 
 struct Sampler {
     uint seed;  // of the path's sequence
@@ -42,7 +40,7 @@ uvec4 sobol_4d(uint index, uint group, uint seed) {
 
 // Four numbers of dimension group `group` of this path.
 vec4 sample_4d(Sampler s, uint group) {
-    if (SAMPLER == 0u) {
+    if (SAMPLER == SAMPLER_INDEPENDENT) {
         uint state = hash_u32(s.seed + hash_u32(s.index + hash_u32(group + 0x9e3779b9u)));
         uvec4 x;
         for (int i = 0; i < 4; i++) {
@@ -55,7 +53,7 @@ vec4 sample_4d(Sampler s, uint group) {
     }
     uvec4 x = sobol_4d(s.index, group, s.seed);
     vec4 u = vec4(to_unit(x.x), to_unit(x.y), to_unit(x.z), to_unit(x.w));
-    if (SAMPLER == 1u) {
+    if (SAMPLER == SAMPLER_BLUE_NOISE) {
         // Every dimension reads the mask at an offset of its own, so that dimensions are independent.
         for (int i = 0; i < 4; i++) {
             uint h = hash_u32(group * 4u + uint(i) + 1u);

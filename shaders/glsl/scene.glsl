@@ -6,18 +6,6 @@
 #include "generated.glsl"
 #include "tables.glsl"
 
-// What the scene needs; the host sets these before the first frame so that the rest is compiled away.
-layout(constant_id = 0) const bool HAS_TEXTURES = true;
-layout(constant_id = 1) const bool HAS_NORMAL_MAPS = true;
-layout(constant_id = 2) const bool HAS_ALPHA_MASK = true;
-layout(constant_id = 3) const bool HAS_TRANSMISSION = true;
-layout(constant_id = 4) const bool HAS_SPECULAR = true;
-layout(constant_id = 5) const bool HAS_EMISSIVE = true;
-layout(constant_id = 6) const bool HAS_PUNCTUAL = true;
-layout(constant_id = 7) const uint ENVIRONMENT_KIND = 2u; // 0 none, 1 constant, 2 map
-layout(constant_id = 8) const bool HAS_CLAMP = true;
-layout(constant_id = 9) const bool HAS_DIFFUSE = true;
-
 // A storage block although it is small: Mesa's software Vulkan builds a shader anew for every value of a uniform block that a branch
 // or loop reads, which took 15 ms of every frame. Read once where every lane is active: elsewhere software Vulkan reads lane by lane.
 layout(set = 0, binding = B_FRAME, scalar) readonly buffer FrameBlock { Frame frame_block; };

@@ -33,11 +33,11 @@ void main() {
     vec3 toward = normalize((camera_is_eye ? frame.projector_position : frame.eye_position) - p);
     Point first = shading_point(hit, toward);
     Sampler rng = Sampler(frame.seed, 0u, pixel);
-    if (SAMPLER == 0u) {
+    if (SAMPLER == SAMPLER_INDEPENDENT) {
         rng.seed = hash_u32(item.pixel + hash_u32(frame.frame + hash_u32(frame.seed)));
-    } else if (SAMPLER == 1u) {
+    } else if (SAMPLER == SAMPLER_BLUE_NOISE) {
         rng.seed = hash_u32(frame.frame + hash_u32(frame.seed));
-    } else if (SAMPLER == 3u) {
+    } else if (SAMPLER == SAMPLER_PIXEL_SEQUENCE) {
         // The pixel's own sequence goes on where the last frame left it. A count by angle is the same in every frame.
         rng.seed = hash_u32(item.pixel + hash_u32(frame.seed));
         rng.index = (frame.flags & FRAME_SPP_BY_ANGLE) != 0u ? frame.drawn * item.spp : frame.first_sample;

@@ -1,7 +1,7 @@
 //! GLSL sources, committed SPIR-V, and the one definition of every struct and constant shared with the GPU.
 //!
-//! `glsl/generated.glsl` and `glsl/tables.glsl` are written from [`structs`] by `cargo run -p dpm-shaders --bin build-shaders`, which also runs `glslc`;
-//! tests fail when either is stale, so users need no shader compiler.
+//! `glsl/generated.glsl` and `glsl/tables.glsl` are written from [`structs`] and [`specialization`] by
+//! `cargo run -p dpm-shaders --bin build-shaders`, which also runs `glslc`. Tests fail when either is stale, so users need no shader compiler.
 //!
 //! # Example
 //!
@@ -24,6 +24,7 @@
 //! ```
 
 pub mod generate;
+pub mod specialization;
 #[cfg(test)]
 mod spirv_layout_tests;
 pub mod structs;

@@ -31,6 +31,7 @@ pub mod rate_table;
 mod renderer;
 pub mod scene_data;
 mod scene_gpu;
+mod scene_needs;
 mod slot;
 pub mod tiles;
 

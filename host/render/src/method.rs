@@ -1,19 +1,19 @@
 //! How a frame spends its rays: a method of the rig file with its switches, as the renderer needs it.
 
-use dpm_shaders::structs as gpu;
+use dpm_shaders::{specialization as ids, structs as gpu};
 
 /// Where random numbers come from.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 #[repr(u32)]
 pub enum SamplerKind {
     /// Independent for every path.
-    Independent = 0,
+    Independent = gpu::SAMPLER_INDEPENDENT,
     /// One point set a frame, shifted at every pixel by blue noise.
-    BlueNoise = 1,
+    BlueNoise = gpu::SAMPLER_BLUE_NOISE,
     /// One low-discrepancy sequence a surface point, continued over frames; its place is kept in the history.
-    Continued = 2,
+    Continued = gpu::SAMPLER_CONTINUED,
     /// One low-discrepancy sequence a pixel, continued over frames; needs no history.
-    PixelSequence = 3,
+    PixelSequence = gpu::SAMPLER_PIXEL_SEQUENCE,
 }
 
 /// The constants of the paper's method \[paper\]; angles are measured at the eye from the gaze.
@@ -118,6 +118,16 @@ impl Method {
     /// The pass `spatial` is recorded.
     pub fn needs_spatial(&self) -> bool {
         self.dpm || self.spatial
+    }
+
+    /// Specialization constants that the method decides, each as id and value.
+    pub(crate) fn constants(&self) -> [(u32, u32); 4] {
+        [
+            (ids::SAMPLER, self.sampler as u32),
+            (ids::HAS_GUIDES, u32::from(self.needs_guides())),
+            (ids::HAS_DEMODULATION, u32::from(self.dpm)),
+            (ids::HAS_FILTER, u32::from(self.spatial)),
+        ]
     }
 
     /// `FRAME_*` bits.

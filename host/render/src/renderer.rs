@@ -221,14 +221,8 @@ impl Renderer {
             })
             .collect();
         let table = BindingTable::new(gpu, &kinds)?;
-        let method = &settings.method;
-        let mut constants = needs.constants().to_vec();
-        constants.extend([
-            (10, method.sampler as u32),
-            (11, u32::from(method.needs_guides())),
-            (12, u32::from(method.dpm)),
-            (13, u32::from(method.spatial)),
-        ]);
+        let mut constants = needs.constants();
+        constants.extend(settings.method.constants());
         let pipelines = (TABLE.iter())
             .map(|pass| {
                 let wanted = (pass.when)(&settings, keep);

@@ -1,6 +1,7 @@
 //! A scene into the flat arrays that the shaders read: BVHs, vertices, materials, texels, lights, environment.
 
 use super::body_bvh::BodyBvh;
+pub use super::scene_needs::SceneNeeds;
 use bytemuck::Zeroable;
 use dpm_scene::albedo_table::{tabulated, AlbedoTable, ALBEDO_NODES};
 use dpm_scene::mesh::MAX_COORDINATE_M;
@@ -96,81 +97,6 @@ pub struct SceneData {
     pub albedo: Vec<AlbedoCell>,
     /// What the scene needs.
     pub needs: SceneNeeds,
-}
-
-/// What of the tracer the scene needs: the specialization constants.
-#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
-pub struct SceneNeeds {
-    /// Any texture.
-    pub textures: bool,
-    /// Any normal map.
-    pub normal_maps: bool,
-    /// Any material with a hole.
-    pub alpha_mask: bool,
-    /// Any light passing through.
-    pub transmission: bool,
-    /// Any reflection lobe: metal, or an index other than 1.
-    pub specular: bool,
-    /// Any diffuse lobe.
-    pub diffuse: bool,
-    /// Any emissive triangle.
-    pub emissive: bool,
-    /// Any punctual light.
-    pub punctual: bool,
-    /// 0 none, 1 constant, 2 map.
-    pub environment_kind: u32,
-    /// The firefly clamp is on.
-    pub clamp: bool,
-}
-
-impl SceneNeeds {
-    /// What either of both needs. The kind of environment stays this scene's: another kind reads tables that it does not have.
-    pub(crate) fn with(self, other: Self) -> Self {
-        Self {
-            textures: self.textures || other.textures,
-            normal_maps: self.normal_maps || other.normal_maps,
-            alpha_mask: self.alpha_mask || other.alpha_mask,
-            transmission: self.transmission || other.transmission,
-            specular: self.specular || other.specular,
-            diffuse: self.diffuse || other.diffuse,
-            emissive: self.emissive || other.emissive,
-            punctual: self.punctual || other.punctual,
-            environment_kind: self.environment_kind,
-            clamp: self.clamp || other.clamp,
-        }
-    }
-
-    /// Everything in: for proving that leaving out changes nothing.
-    pub fn everything(self) -> Self {
-        Self {
-            textures: true,
-            normal_maps: true,
-            alpha_mask: true,
-            transmission: true,
-            specular: true,
-            diffuse: true,
-            emissive: true,
-            punctual: true,
-            clamp: true,
-            ..self
-        }
-    }
-
-    /// Specialization constants of `scene.glsl`.
-    pub fn constants(&self) -> [(u32, u32); 10] {
-        [
-            (0, u32::from(self.textures)),
-            (1, u32::from(self.normal_maps)),
-            (2, u32::from(self.alpha_mask)),
-            (3, u32::from(self.transmission)),
-            (4, u32::from(self.specular)),
-            (5, u32::from(self.emissive)),
-            (6, u32::from(self.punctual)),
-            (7, self.environment_kind),
-            (8, u32::from(self.clamp)),
-            (9, u32::from(self.diffuse)),
-        ]
-    }
 }
 
 /// What stays in although nothing needs it: for measuring what leaving it out saves. No pixel may change.
@@ -482,7 +408,9 @@ impl SceneData {
         let mean = match &scene.environment {
             Environment::Constant(c) => {
                 self.environment_constant = bounded(*c);
-                self.needs.environment_kind = u32::from(c.max_element() > 0.0);
+                let lit = c.max_element() > 0.0;
+                self.needs.environment_kind =
+                    if lit { gpu::ENVIRONMENT_CONSTANT } else { gpu::ENVIRONMENT_NONE };
                 luminance(bounded(*c))
             }
             Environment::Equirect { width, height, texels, rotation_rad } => {
@@ -490,11 +418,12 @@ impl SceneData {
                 self.environment_rotation = *rotation_rad;
                 self.environment_constant = Vec3::ONE;
                 let mean = self.tabulate_environment(*width as usize, *height as usize, texels);
-                self.needs.environment_kind = if mean > 0.0 { 2 } else { 0 };
+                self.needs.environment_kind =
+                    if mean > 0.0 { gpu::ENVIRONMENT_MAP } else { gpu::ENVIRONMENT_NONE };
                 mean
             }
         };
-        if self.needs.environment_kind == 0 {
+        if self.needs.environment_kind == gpu::ENVIRONMENT_NONE {
             return;
         }
         let power = 4.0 * std::f32::consts::PI.powi(2) * radius * radius * mean;
