@@ -65,6 +65,9 @@ bool tile_pixel(uint tile, out uvec2 pixel) {
     return pixel.x < frame.width && pixel.y < frame.height;
 }
 
+// Whether a raster position is a pixel of the picture.
+bool on_raster(ivec2 q) { return all(greaterThanEqual(q, ivec2(0))) && all(lessThan(q, ivec2(frame.width, frame.height))); }
+
 // Reflectance of the surface itself, by which method dpm divides radiance.
 vec3 albedo_of(Guide g) { return vec3(unpackHalf2x16(g.albedo_rg), unpackHalf2x16(g.albedo_b).x); }
 

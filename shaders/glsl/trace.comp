@@ -2,6 +2,7 @@
 #version 460
 #extension GL_GOOGLE_include_directive : require
 #include "path.glsl"
+#include "moments.glsl"
 
 layout(local_size_x = 64) in;
 
@@ -9,8 +10,8 @@ layout(set = 0, binding = B_SCHEDULE, scalar) readonly buffer ScheduleBlock { Sc
 layout(set = 0, binding = B_WORK, scalar) readonly buffer Work { WorkItem work[]; };
 // rgb mean of the samples, w their number.
 layout(set = 0, binding = B_RADIANCE, scalar) writeonly buffer Radiance { vec4 radiance_out[]; };
-// Per pixel (method dpm): sum of squared luminance of the samples; 1 where chance chose nothing, so that one sample tells all.
-layout(set = 0, binding = B_FILTERED, scalar) writeonly buffer FilteredBlock { Filtered filtered[]; };
+// Method dpm: `Moments` of the samples. The buffer holds the history's picture from the pass accumulate on.
+layout(set = 0, binding = B_FILTERED, scalar) writeonly buffer MomentsBlock { Filtered moments[]; };
 
 void main() {
     // Read before lanes part. There is an item: without one no workgroup is dispatched.
@@ -71,7 +72,7 @@ void main() {
         }
     } while (left > 0u);
     radiance_out[item.pixel] = vec4(count > 0u ? sum / float(count) : vec3(0.0), float(count));
-    if (dpm) filtered[item.pixel] = Filtered(vec3(sum_squares, exact ? 1.0 : 0.0, 0.0), 0.0);
+    if (dpm) moments[item.pixel] = pack_moments(Moments(sum_squares, exact));
     COUNT(rays, rays)
     COUNT(samples, count + invalid)
     COUNT_RARE(invalid_samples, invalid)

@@ -194,7 +194,8 @@ gpu_structs! {
 
     /// A pixel's light before the spatial filter.
     struct Filtered {
-        /// Radiance, divided by the albedo where the method does so; right after tracing (method dpm): x is the sum of squared luminances.
+        /// Radiance, divided by the albedo where the method does so. Between the passes trace and accumulate of method dpm this holds
+        /// `Moments` instead (`moments.glsl`).
         light: [f32; 3],
         /// Variance of its luminance.
         variance: f32,

@@ -227,7 +227,9 @@ impl Renderer {
             .map(|pass| {
                 let wanted = (pass.when)(&settings, keep);
                 let constants = pass.constants(&constants, &settings);
-                wanted.then(|| ComputePipeline::new(&table, (pass.shader)(texel), &constants)).transpose()
+                wanted
+                    .then(|| ComputePipeline::new(&table, pass.shader(&settings.method, texel), &constants))
+                    .transpose()
             })
             .collect::<Result<Vec<_>, _>>()?;
         let decides_rates =
