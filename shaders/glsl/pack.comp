@@ -1,5 +1,6 @@
-// Code values into the bit planes that a DMD shows: the CPU's `pack`, byte for byte. One invocation makes four neighbouring bytes of every
-// plane: a 32 x 32 bit matrix, one code value a row, is transposed.
+// Code values into the bit planes that a DMD shows. Equals the CPU's `pack` byte for byte.
+//
+// One invocation makes four neighbouring bytes of every plane: it transposes a 32 x 32 bit matrix that has one code value in each row.
 #version 460
 #extension GL_GOOGLE_include_directive : require
 #extension GL_EXT_scalar_block_layout : require
@@ -10,7 +11,7 @@ layout(local_size_x = 64) in;
 layout(set = 0, binding = B_CODES, scalar) readonly buffer Codes { uint codes[]; };
 layout(set = 0, binding = B_PLANES, scalar) writeonly buffer Planes { uint planes[]; };
 
-// Exchanges the upper bits of one row with the lower bits of a row further down.
+// Exchanges the upper bits of a row with the lower bits of the row `j` further down.
 #define EXCHANGE(j, mask) for (uint k = 0u; k < 32u; k++) { if ((k & j) == 0u) { uint t = ((a[k] >> j) ^ a[k + j]) & mask; a[k] ^= t << j; a[k + j] ^= t; } }
 
 #define STORE(bit, word) { uint plane = (word >> ((bit & 3u) * 8u)) & 0xffu; if (plane != 255u) planes[plane * words + at] = a[bit]; }
@@ -25,7 +26,7 @@ void main() {
     for (uint j = 0u; j < 4u; j++) {
         uint byte_ = at * 4u + j;
         uint row = byte_ / row_bytes, column = (byte_ - row * row_bytes) * 8u;
-        // The leftmost of eight pixels is the highest bit; what lies beyond the row, or the plane, is dark.
+        // The leftmost of eight pixels is the highest bit. Pixels beyond the row or the plane are dark.
         for (uint x = 0u; x < 8u; x++)
             a[j * 8u + 7u - x] = byte_ < plane_bytes && column + x < PLANE_WIDTH ? codes[row * PLANE_WIDTH + column + x] : 0u;
     }

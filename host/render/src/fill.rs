@@ -1,4 +1,4 @@
-//! Fills a device buffer with copies of one value, or changes some of its values; at set-up time and between frames of a check.
+//! Fills a device buffer with copies of one value at set-up, or changes some of its values between the frames of a check.
 
 use super::renderer::Renderer;
 use crate::gpu::{run_now, Buffer, Gpu, GpuError, MemoryKind};
@@ -8,14 +8,13 @@ use std::ops::Range;
 use std::sync::Arc;
 
 impl Renderer {
-    /// Changes what is kept of past frames at a range of pixels, in both buffers: for checks that something broken is forgotten. No frame
-    /// may be in flight.
+    /// Changes the histories of a range of pixels in both buffers, for checks that a broken history is dropped. No frame may be in flight.
     ///
     /// # Errors
     /// Out of memory, device lost.
     ///
     /// # Panics
-    /// When the range lies beyond the raster, but not for a method without any: then nothing happens.
+    /// If the range is beyond the raster. For a method without a history nothing happens.
     pub fn edit_history(
         &self,
         range: Range<usize>,
@@ -29,7 +28,7 @@ impl Renderer {
     }
 }
 
-/// Changes a stretch of a buffer's values through the host and waits.
+/// Changes a range of a buffer's values on the host, and waits.
 fn edit<T: Pod>(
     gpu: &Arc<Gpu>,
     buffer: &Buffer,

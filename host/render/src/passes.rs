@@ -1,4 +1,4 @@
-//! The passes of a frame, one row each: what runs, when, over what, and which buffers it reads and writes.
+//! The passes of a frame, one row each: what runs, when, over what, and the buffers that it reads and writes.
 
 use super::method::Method;
 use super::renderer::RendererSettings;
@@ -9,11 +9,11 @@ use dpm_shaders::Shader;
 
 /// One pass of a frame.
 pub(super) struct Pass {
-    /// As in reports.
+    /// Name in reports.
     pub name: &'static str,
-    /// What runs.
+    /// The shader that runs.
     pub code: Code,
-    /// Whether the pass is recorded. What the method does without is not.
+    /// Whether the pass is recorded: a pass that the method does not need is not.
     pub when: fn(&RendererSettings, Keep) -> bool,
     /// How many workgroups run.
     pub grid: Grid,
@@ -48,9 +48,9 @@ pub(super) struct Kernel {
 /// How many workgroups of a pass run.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(super) enum Grid {
-    /// Four a listed tile.
+    /// Four for each listed tile.
     Tiles,
-    /// One a listed tile, in frames that decide rates.
+    /// One for each listed tile, in frames that decide rates.
     Rates,
     /// As many as the pass `schedule` asked for.
     Work,
@@ -176,7 +176,7 @@ pub(super) const TABLE: [Pass; 9] = [
     },
 ];
 
-/// Names of the passes whose ends are stamped, in order; the last is the copying of what the host reads.
+/// Names of the passes whose ends have time stamps, in order. The last one copies what the host reads.
 pub const PASSES: &[&str] = &{
     let mut names = ["readback"; TABLE.len() + 1];
     let mut i = 0;
@@ -209,7 +209,7 @@ impl Pass {
         (self.code.kernel(method.dpm).shader)(texel)
     }
 
-    /// Specialization constants: `shared` with every pass that reads the scene; packing has its own.
+    /// Specialization constants. Passes that read the scene have the `shared` ones, and packing has its own.
     pub(super) fn constants(&self, shared: &[(u32, u32)], settings: &RendererSettings) -> Vec<(u32, u32)> {
         match (self.grid, settings.output.schedule()) {
             (Grid::Planes, Some(schedule)) => pack::gpu::constants(settings.raster, schedule).to_vec(),
@@ -224,7 +224,7 @@ mod tests {
     use dpm_shaders::structs::BINDINGS;
     use std::collections::{BTreeSet, HashMap};
 
-    /// What no pass writes: the host fills it, at the start or before a frame.
+    /// Buffers that no pass writes. The host fills them, at the start or before a frame.
     const INPUTS: [&str; 15] = [
         "B_FRAME",
         "B_INSTANCES",

@@ -13,12 +13,13 @@ macro_rules! scene_needs {
         }
 
         impl SceneNeeds {
-            /// What either of both needs. The kind of environment stays this scene's, because another kind reads tables that it does not have.
+            /// What this scene or the other needs. The kind of environment stays this scene's, because another kind reads tables that it does not
+            /// have.
             pub(crate) fn with(self, other: Self) -> Self {
                 Self { $($field: self.$field || other.$field,)* ..self }
             }
 
-            /// Everything in: for proving that leaving out changes nothing.
+            /// Everything, to show that leaving code out changes nothing.
             pub fn everything(self) -> Self {
                 Self { $($field: true,)* ..self }
             }
@@ -32,23 +33,23 @@ macro_rules! scene_needs {
 }
 
 scene_needs! {
-    /// Any texture.
+    /// A material has a texture.
     textures => HAS_TEXTURES,
-    /// Any normal map.
+    /// A material has a normal map.
     normal_maps => HAS_NORMAL_MAPS,
-    /// Any material with a hole.
+    /// A material has holes.
     alpha_mask => HAS_ALPHA_MASK,
-    /// Any light passing through.
+    /// A material lets light through.
     transmission => HAS_TRANSMISSION,
-    /// Any reflection lobe: metal, or an index other than 1.
+    /// A material has a specular lobe: it is metallic, or its index of refraction is not 1.
     specular => HAS_SPECULAR,
-    /// Any diffuse lobe.
+    /// A material has a diffuse lobe.
     diffuse => HAS_DIFFUSE,
-    /// Any emissive triangle.
+    /// A triangle emits light.
     emissive => HAS_EMISSIVE,
-    /// Any punctual light.
+    /// There is a punctual light.
     punctual => HAS_PUNCTUAL,
-    /// The firefly clamp is on.
+    /// The luminance of indirect contributions is limited.
     clamp => HAS_CLAMP,
 }
 
