@@ -1,8 +1,10 @@
-// The material model of docs/RENDERING.md: evaluate, pdf, sample.
+// The material model of docs/RENDERING.md: its value, its pdf, and samples of it.
 
-const float DELTA_ALPHA = 1e-3; // below: a mirror
+// A surface with a smaller alpha is a mirror.
+const float DELTA_ALPHA = 1e-3;
 
-// Unpolarised Fresnel reflectance at a dielectric; `eta` = index beyond / index on this side. 1 at total reflection, exactly 0 for eta = 1.
+// Unpolarised Fresnel reflectance of a dielectric. `eta` is the index beyond the surface over the index on this side. The result is 1 at total
+// reflection, and exactly 0 for eta = 1.
 float fresnel_dielectric(float eta, float cosine) {
     float c = clamp(cosine, 0.0, 1.0);
     float g2 = eta * eta - 1.0 + c * c;
@@ -21,7 +23,7 @@ vec3 fresnel_schlick(vec3 f0, float cosine) {
 }
 
 float ggx_d(float alpha, vec3 n, vec3 h) {
-    // The sine by the cross product: 1 - (n.h)^2 would cancel near the peak of a small alpha.
+    // The sine comes from the cross product, because 1 - (n.h)^2 would cancel near the peak of a small alpha.
     float a2 = alpha * alpha;
     float nh = clamp(dot(n, h), 0.0, 1.0);
     vec3 c = cross(n, h);
@@ -43,7 +45,7 @@ mat3 frame_around(vec3 n) {
     return mat3(vec3(1.0 + s * n.x * n.x * a, s * b, -s * n.x), vec3(b, s + n.y * n.y * a, -n.y), n);
 }
 
-// Visible normals of GGX by the spherical cap [Dupuy23]; local frame, z is the normal, v.z > 0.
+// A visible normal of GGX by the spherical cap [Dupuy23]. In the local frame, in which z is the normal and v.z > 0.
 vec3 sample_visible_normal(vec3 v, float alpha, vec2 u) {
     vec3 w = normalize(vec3(alpha * v.xy, v.z));
     float phi = 2.0 * PI * u.x;
@@ -56,18 +58,18 @@ vec3 sample_visible_normal(vec3 v, float alpha, vec2 u) {
 }
 
 struct Lobes {
-    float specular; // probabilities, sum 1 (all 0: absorbs)
+    float specular; // Probabilities of the three lobes. Their sum is 1, or 0 if the surface absorbs everything.
     float diffuse;
     float transmit;
-    float albedo_v; // E(n.v)
-    float average;  // E_avg
-    float eta;      // beyond / this side
+    float albedo_v; // E(n.v).
+    float average;  // E_avg.
+    float eta;      // Index beyond the surface over the index on this side.
     float dielectric;
 };
 
 bool mirror_like(Point s) { return s.alpha < DELTA_ALPHA; }
 
-// Where the coat's albedo is looked up: a mirror reflects by Fresnel's law, which is row 0 of the table.
+// The alpha for which the coat's albedo is looked up. A mirror reflects by Fresnel's law, which is row 0 of the table.
 float coat_alpha(Point s) { return mirror_like(s) ? 0.0 : s.alpha; }
 
 Lobes lobes_of(Point s) {
@@ -80,7 +82,7 @@ Lobes lobes_of(Point s) {
     l.average = 0.0;
     float specular = 0.0, diffuse = 0.0, transmit = 0.0;
     if (inside) {
-        // Facets of a rough surface may transmit where the mean surface reflects totally.
+        // The facets of a rough surface may transmit light where the mean surface reflects it totally.
         float f = clamp(fresnel_dielectric(l.eta, nv), 0.05, mirror_like(s) ? 1.0 : 0.95);
         specular = f * l.dielectric + s.metallic;
         transmit = (1.0 - f) * l.dielectric * s.transmission;
@@ -104,7 +106,7 @@ Lobes lobes_of(Point s) {
     return l;
 }
 
-// Value times |n.l| and pdf of the non-delta lobes for direction l.
+// Value times |n.l|, and pdf, of the lobes that are not delta functions, for the direction `l`.
 void evaluate(Point s, Lobes q, vec3 l, out vec3 value, out float pdf) {
     value = vec3(0.0);
     pdf = 0.0;
@@ -140,7 +142,7 @@ void evaluate(Point s, Lobes q, vec3 l, out vec3 value, out float pdf) {
             float denominator = vh + q.eta * lh;
             float jacobian = q.eta * q.eta * abs(lh) / max(denominator * denominator, 1e-20);
             float f = fresnel_dielectric(q.eta, vh);
-            // Radiance shrinks by 1 / eta^2 on entering the denser side.
+            // Radiance that crosses the surface toward the viewer is scaled by 1 / eta^2.
             value += s.base * (q.dielectric * s.transmission * (1.0 - f) * d * vh * jacobian / ((1.0 + lv + ll) * nv * q.eta * q.eta));
             pdf += q.transmit * d * vh * jacobian / ((1.0 + lv) * nv);
         }
@@ -149,11 +151,11 @@ void evaluate(Point s, Lobes q, vec3 l, out vec3 value, out float pdf) {
 
 struct BsdfSample {
     vec3 direction;
-    vec3 weight; // f |n.l| / pdf
-    float pdf;   // solid angle, all non-delta lobes; unused for delta
+    vec3 weight; // f |n.l| / pdf.
+    float pdf;   // Over solid angle, of all lobes that are not delta functions. Not used for delta functions.
     bool delta;
     bool valid;
-    bool below;  // went through the surface
+    bool below;  // The direction goes through the surface.
 };
 
 BsdfSample sample_bsdf(Point s, Lobes q, float u_lobe, vec2 u) {
@@ -181,7 +183,7 @@ BsdfSample sample_bsdf(Point s, Lobes q, float u_lobe, vec2 u) {
         vec3 h = sample_visible_normal(v, s.alpha, u);
         r.direction = to_world * reflect(-v, h);
     } else if (u_lobe < q.specular + q.diffuse || !HAS_TRANSMISSION || q.transmit <= 0.0) {
-        // Cosine-weighted by the projected disk.
+        // Weighted by the cosine, by projection of a disk.
         float radius = sqrt(u.x), phi = 2.0 * PI * u.y;
         r.direction = to_world * vec3(radius * cos(phi), radius * sin(phi), sqrt(max(1.0 - u.x, 0.0)));
     } else {
@@ -195,7 +197,7 @@ BsdfSample sample_bsdf(Point s, Lobes q, float u_lobe, vec2 u) {
         }
         vec3 h = mirror ? vec3(0.0, 0.0, 1.0) : sample_visible_normal(v, s.alpha, u);
         vec3 l = refract(-v, h, 1.0 / q.eta);
-        if (dot(l, l) < 0.5) return r; // total reflection: the specular lobe carries it
+        if (dot(l, l) < 0.5) return r; // Total reflection. The specular lobe has it.
         r.direction = to_world * l;
         if (mirror) {
             float f = fresnel_dielectric(q.eta, nv);
@@ -205,7 +207,7 @@ BsdfSample sample_bsdf(Point s, Lobes q, float u_lobe, vec2 u) {
             return r;
         }
     }
-    // A facet may send light to the wrong side: that is lost, and is no sample of the lobe on that side.
+    // A facet may send light to the wrong side. That light is lost, and is no sample of the lobe on that side.
     if ((dot(r.direction, s.n) < 0.0) != r.below) return r;
     vec3 value;
     evaluate(s, q, r.direction, value, r.pdf);

@@ -1,7 +1,8 @@
-// Two-level ray traversal: a short list of rigid bodies, each with a compressed wide BVH ([Ylitie17], 80-byte nodes of eight children;
-// render/body_bvh.rs says where children stand).
+// Traversal of rays in two levels: a short list of rigid bodies, each with a compressed wide BVH ([Ylitie17]) with nodes of 80 bytes and eight
+// children. `BodyBvh` of the host builds it and lays out the children.
 //
-// Nodes and triangles are read through NODE and TRI: texel buffers on software Vulkan (twice as fast there), storage buffers on GPUs.
+// Nodes and triangles are read through NODE and TRI: from texel buffers on software Vulkan, where that is twice as fast, and from storage buffers
+// on GPUs.
 #ifdef TEXEL_TABLES
 layout(set = 0, binding = B_NODES, rgba32ui) uniform readonly uimageBuffer node_texels;
 layout(set = 0, binding = B_TRIANGLES, rgba32f) uniform readonly imageBuffer triangle_texels;
@@ -15,34 +16,36 @@ layout(set = 0, binding = B_TRIANGLES, scalar) readonly buffer TriangleBlock { v
 #endif
 
 #ifdef ALPHA_TEST
-// Defined by the shader that includes this: is the surface there at this point?
+// Defined by the shader that includes this file: whether the surface has no hole at this point.
 bool alpha_present(uint instance, uint triangle, vec2 barycentric);
 #endif
 
 struct Hit {
-    uint id;          // as in Surface: which body, and its triangle in BVH order; NO_HIT: nothing was met
-    vec2 barycentric; // weights of vertices 1 and 2
+    uint id;          // As in Surface: the body, and its triangle in BVH order; NO_HIT: nothing was hit.
+    vec2 barycentric; // Weights of vertices 1 and 2.
     float t;
 };
 
 uint instance_of(uint id) { return id >> 24u; }
 uint triangle_of(uint id) { return id & 0xffffffu; }
 
-const uint STACK_SIZE = 24u; // one entry per level; an 8-wide tree of 2^24 triangles is at most about 20 deep
+// Entries of the stack, one per level. A tree of 2^24 triangles with eight children a node is at most about 20 levels deep.
+const uint STACK_SIZE = 24u;
 
 vec4 unpack_bytes(uint x) {
     return vec4(x & 255u, (x >> 8u) & 255u, (x >> 16u) & 255u, x >> 24u);
 }
 
-// Hit mask of four children of a node, as [Ylitie17] lays it out: internal children in the top byte by octant order, triangles in the low 24 bits.
+// Hit mask of four children of a node, in the layout of [Ylitie17]: inner children in the top byte in the order of octants, triangles in the low
+// 24 bits.
 uint half_node_hits(uint meta, uint octant4, vec3 step_inverse, vec3 base_near, vec3 base_far, float t_max,
                     uint near_x, uint far_x, uint near_y, uint far_y, uint near_z, uint far_z) {
     uint is_inner = (meta & (meta << 1u)) & 0x10101010u;
     uint inner_mask = (is_inner >> 4u) * 0xffu;
     uint bit_index = (meta ^ (octant4 & inner_mask)) & 0x1f1f1f1fu;
     uint child_bits = (meta >> 5u) & 0x07070707u;
-    // Bit patterns of floats that are not negative have the order of the floats; a negative entry counts as 0, a negative exit as a miss. As
-    // integers minimum and maximum are one instruction each, where floats would need more for NaN.
+    // The bit patterns of floats that are not negative have the order of the floats. A negative entry counts as 0, and a negative exit is a miss.
+    // The minimum and maximum of integers are one instruction each. Those of floats would need more, because of NaN.
     ivec4 enter = max(max(floatBitsToInt(unpack_bytes(near_x) * step_inverse.x + base_near.x), floatBitsToInt(unpack_bytes(near_y) * step_inverse.y + base_near.y)),
                       max(floatBitsToInt(unpack_bytes(near_z) * step_inverse.z + base_near.z), ivec4(0)));
     ivec4 leave = min(min(floatBitsToInt(unpack_bytes(far_x) * step_inverse.x + base_far.x), floatBitsToInt(unpack_bytes(far_y) * step_inverse.y + base_far.y)),
@@ -55,7 +58,7 @@ uint half_node_hits(uint meta, uint octant4, vec3 step_inverse, vec3 base_near, 
     return hits;
 }
 
-// Which children of a node the ray enters.
+// The children of a node that the ray enters.
 uint node_hits(vec3 origin, vec3 inverse, bvec3 negative, uint octant4, float t_max, uvec4 n0, uvec4 n1, uint node) {
     uvec4 nx = NODE(node + 2u);
     uvec4 ny = NODE(node + 3u);
@@ -63,7 +66,7 @@ uint node_hits(vec3 origin, vec3 inverse, bvec3 negative, uint octant4, float t_
     vec3 scale = vec3(uintBitsToFloat((n0.w & 255u) << 23u), uintBitsToFloat(((n0.w >> 8u) & 255u) << 23u), uintBitsToFloat(((n0.w >> 16u) & 255u) << 23u));
     vec3 step_inverse = scale * inverse;
     vec3 base = (uintBitsToFloat(n0.xyz) - origin) * inverse;
-    // Planes move apart by their rounding, so that a ray that runs in the plane between two children enters both.
+    // The planes are moved apart by their rounding, so that a ray in the plane between two children enters both.
     vec3 slack = (abs(base) + 255.0 * abs(step_inverse)) * 3.0e-7;
     vec3 base_near = base - slack, base_far = base + slack;
     uvec2 near_x = negative.x ? nx.zw : nx.xy, far_x = negative.x ? nx.xy : nx.zw;
@@ -73,17 +76,17 @@ uint node_hits(vec3 origin, vec3 inverse, bvec3 negative, uint octant4, float t_
          | half_node_hits(n1.w, octant4, step_inverse, base_near, base_far, t_max, near_x.y, far_x.y, near_y.y, far_y.y, near_z.y, far_z.y);
 }
 
-// Rays in the space of one body, with a basis perpendicular to the direction for the triangle test.
+// A ray in the space of one body, with a basis perpendicular to its direction for the triangle test.
 struct LocalRay {
     vec3 origin;
     vec3 direction;
     vec3 inverse;
     vec3 u;
     vec3 v;
-    float length2; // of the direction, squared
+    float length2; // Squared length of the direction.
 };
 
-// A zero component would make 0 * inf in the slab test: a tiny one of the same sign gives the same hits.
+// A component of zero would give 0 * inf in the slab test. A tiny one of the same sign gives the same hits.
 vec3 safe_direction(vec3 direction) {
     return vec3(abs(direction.x) < 1e-18 ? (direction.x < 0.0 ? -1e-18 : 1e-18) : direction.x,
                      abs(direction.y) < 1e-18 ? (direction.y < 0.0 ? -1e-18 : 1e-18) : direction.y,
@@ -96,7 +99,7 @@ LocalRay local_ray(vec3 origin, vec3 direction) {
     r.direction = direction;
     r.length2 = dot(direction, direction);
     r.inverse = 1.0 / safe_direction(direction);
-    // [Duff17] branchless basis.
+    // The basis of [Duff17], without branches.
     vec3 d = normalize(direction);
     float s = d.z < 0.0 ? -1.0 : 1.0;
     float a = -1.0 / (s + d.z);
@@ -106,8 +109,8 @@ LocalRay local_ray(vec3 origin, vec3 direction) {
     return r;
 }
 
-// Watertight triangle test: every vertex is mapped to the plane across the ray by the same operations, and the three edge functions are
-// exactly antisymmetric in their vertices, so a ray through a shared edge is inside at least one of the two triangles.
+// A watertight triangle test. Every vertex is mapped to the plane across the ray by the same operations, and the three edge functions are exactly
+// antisymmetric in their vertices. So a ray through a shared edge is inside at least one of the two triangles.
 bool intersect_triangle(LocalRay r, uint row, float t_min, float t_max, out float t, out vec2 barycentric) {
     vec3 p0 = TRI(row).xyz - r.origin;
     vec3 p1 = TRI(row + 1u).xyz - r.origin;
@@ -118,21 +121,21 @@ bool intersect_triangle(LocalRay r, uint row, float t_min, float t_max, out floa
     precise float w0 = b.x * c.y - b.y * c.x;
     precise float w1 = c.x * a.y - c.y * a.x;
     precise float w2 = a.x * b.y - a.y * b.x;
-    // Signs by bits, a negative zero being none: one instruction a minimum or maximum, as above. Nothing returns early: that would be two more
-    // masks for software Vulkan to carry.
+    // The signs are tested by bits, for which a minimum or maximum is one instruction, as above. A negative zero has no sign. Nothing returns early,
+    // because that would add two masks on software Vulkan.
     uvec3 bits = floatBitsToUint(vec3(w0, w1, w2));
     bool negative = max(bits.x, max(bits.y, bits.z)) > 0x80000000u;
     bool positive = max(int(bits.x), max(int(bits.y), int(bits.z))) > 0;
     float area = w0 + w1 + w2;
     float inverse_area = 1.0 / area;
-    // Depth along the (possibly not unit) direction.
+    // Depth along the direction, whose length may differ from 1.
     float along = (w0 * dot(p0, r.direction) + w1 * dot(p1, r.direction) + w2 * dot(p2, r.direction)) * inverse_area;
     t = along / r.length2;
     barycentric = vec2(w1, w2) * inverse_area;
     return !(negative && positive) && area != 0.0 && t > t_min && t < t_max;
 }
 
-// Slab test against a body's world bounds.
+// Slab test against the world bounds of a body.
 bool enters_bounds(vec3 origin, vec3 inverse, vec3 lower, vec3 upper, float t_max) {
     vec3 t0 = (lower - origin) * inverse;
     vec3 t1 = (upper - origin) * inverse;
@@ -142,7 +145,8 @@ bool enters_bounds(vec3 origin, vec3 inverse, vec3 lower, vec3 upper, float t_ma
     return enter <= leave;
 }
 
-// The next body from `first` on, with any of `mask` bits (mask 0: all), whose bounds the ray enters before `t_max`; the number of bodies if none.
+// The next body from `first` on that has any of the bits of `mask` (0: all) and whose bounds the ray enters before `t_max`. The number of bodies if
+// there is none.
 uint next_body(uint first, vec3 origin, vec3 inverse, uint mask, float t_max) {
     uint i = first;
     bool enters = false;
@@ -157,26 +161,26 @@ uint next_body(uint first, vec3 origin, vec3 inverse, uint mask, float t_max) {
     return i;
 }
 
-// A ray on its way through the bodies.
+// The state of a ray on its way through the bodies.
 struct Traversal {
     vec3 origin;
     vec3 direction;
     vec3 inverse;
-    uint mask;      // bodies with any of these bits; 0: all
-    bool any_hit;   // stops at the first surface
-    Hit hit;        // the nearest so far; `t` limits the ray
-    uint body;      // the one that is being traversed
-    uint next;      // the one after it; the number of bodies: there is none
+    uint mask;      // Bodies with any of these bits are traversed; 0: all.
+    bool any_hit;   // The ray stops at the first surface.
+    Hit hit;        // The nearest hit so far. Its `t` limits the ray.
+    uint body;      // The body that is being traversed.
+    uint next;      // The body after it; the number of bodies: there is none.
     LocalRay local;
     uint node_base;
     uint triangle_base;
     uint octant;
-    uint group;     // children still to open: their block in the upper 24 bits, which of its slots in the lower 8, nearest first; 0: none
+    uint group;     // Children to open: their block in the upper 24 bits, slots of the block in the lower 8 with the nearest highest; 0: none.
     uvec2 triangles;
-    uvec4 newest;   // groups that wait, newest first; software Vulkan writes an array of its own lane by lane, but these are registers
+    uvec4 newest;   // Groups that wait, newest first. These are registers; software Vulkan would write a private array lane by lane.
     uvec4 older;
-    uint displaced; // a group for which they have no room: it goes to `traversal_stack` before another node is opened
-    uint depth;     // groups in `traversal_stack`
+    uint displaced; // A group that no longer fits in them. It goes to `traversal_stack` before another node is opened.
+    uint depth;     // Groups in `traversal_stack`.
 };
 
 uint traversal_stack[STACK_SIZE];
@@ -196,7 +200,7 @@ void begin_ray(inout Traversal t, vec3 origin, vec3 direction, uint mask, bool a
     t.next = next_body(0u, origin, t.inverse, mask, t_max);
 }
 
-// Goes on to the next body. There must be one.
+// Continues with the next body. There must be one.
 void enter_next_body(inout Traversal t) {
     t.body = min(t.next, max(frame.instance_count, 1u) - 1u);
     t.next = next_body(t.body + 1u, t.origin, t.inverse, t.mask, t.hit.t);
@@ -206,7 +210,7 @@ void enter_next_body(inout Traversal t) {
     t.triangle_base = instance_at(t.body).triangle_offset;
     bvec3 negative = lessThan(t.local.inverse, vec3(0.0));
     t.octant = (negative.x ? 0u : 4u) | (negative.y ? 0u : 2u) | (negative.z ? 0u : 1u);
-    t.group = 1u << t.octant; // the root
+    t.group = 1u << t.octant; // The root.
     t.newest = uvec4(0u);
     t.older = uvec4(0u);
 }
@@ -215,10 +219,10 @@ bool at_triangles(Traversal t) { return t.triangles.y != 0u; }
 
 bool at_node(Traversal t) { return t.group != 0u && t.displaced == 0u && !at_triangles(t); }
 
-// Any surface was enough and there is one, or neither this body nor another has anything left.
+// The ray needed only one surface and has it, or nothing is left in this body and no other follows.
 bool at_end(Traversal t) { return t.any_hit && t.hit.id != NO_HIT || t.group == 0u && t.depth == 0u && t.next >= frame.instance_count; }
 
-// What is needed once in many nodes: room in the registers, a group that waited longest, or the next body.
+// Steps that are needed once in many nodes: room in the registers, the group that waited longest, or the next body.
 void go_on(inout Traversal t) {
     if (t.displaced != 0u) {
         traversal_stack[min(t.depth++, STACK_SIZE - 1u)] = t.displaced;
@@ -230,7 +234,7 @@ void go_on(inout Traversal t) {
     }
 }
 
-// Opens one node: its children and triangles that the ray meets come next.
+// Opens one node. The children and triangles that the ray meets come next.
 void open_node(inout Traversal t) {
     uint bit = uint(findMSB(t.group & 255u));
     uint rest = t.group & ~(1u << bit);
@@ -271,10 +275,10 @@ void test_triangle(inout Traversal t) {
     t.group = over ? 0u : t.group;
 }
 
-// Traces one ray through all bodies that have any of `mask` bits (mask 0: all). ANY_HIT: stops at the first surface.
-// Returns true on a hit; `hit.t` must hold the largest distance on entry.
+// Traces one ray through all bodies that have any of the bits of `mask` (0: all). With `any_hit` it stops at the first surface. On entry `hit.t` is
+// the largest distance. Returns whether there is a hit.
 //
-// Every loop tests at its end: software Vulkan runs the body of a loop that tests at its start once more with no lane active.
+// Every loop tests at its end, because software Vulkan runs the body of a loop that tests at its start once more with no lane active.
 bool trace_ray(vec3 origin, vec3 direction, uint mask, bool any_hit, inout Hit hit) {
     Traversal t;
     begin_ray(t, origin, direction, mask, any_hit, hit.t);

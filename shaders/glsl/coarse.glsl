@@ -1,20 +1,21 @@
-// Coarse pixels: which block a pixel belongs to, whether it is traced this frame, and through which of its pixels the ray goes.
+// Coarse pixels: the block of a pixel, whether the block is traced this frame, and the pixel of the block through which its ray goes.
 layout(set = 0, binding = B_RATES, scalar) readonly buffer Rates { uint rates[]; };
 
-// Pixels per coarse pixel, x and y: 1, 2 or 4. Tiles are multiples of it, so blocks never straddle tiles.
+// Width and height of a coarse pixel: 1, 2 or 4 pixels. The size of a tile is a multiple of them, so a block lies in one tile.
 uvec2 block_size(uvec2 pixel) {
     if ((frame.flags & FRAME_RATE_MAP) == 0u) return uvec2(1u);
     uint rate = rates[(pixel.y >> 4u) * frame.tiles_x + (pixel.x >> 4u)];
     return uvec2(1u << (rate & 3u), 1u << ((rate >> 2u) & 3u));
 }
 
+// With the checkerboard, every second block is traced in every second frame.
 bool is_traced_block(uvec2 pixel, uvec2 size) {
     if ((frame.flags & FRAME_CHECKERBOARD) == 0u) return true;
     uvec2 block = pixel / size;
     return ((block.x + block.y + frame.drawn) & 1u) == 0u;
 }
 
-// A random pixel of the block; when nothing is lit there, the next lit one. The same answer for every pixel of the block.
+// A random pixel of the block, or the next lit one after it. The answer is the same for every pixel of the block.
 uvec2 traced_pixel(uvec2 pixel, uvec2 size) {
     uint n = size.x * size.y;
     uvec2 origin = pixel / size * size;

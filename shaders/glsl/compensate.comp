@@ -1,4 +1,4 @@
-// Radiance into code values: compensation for distance, angle and albedo of the real surface, then quantisation.
+// Radiance into code values: compensation for the distance, angle and albedo of the real surface, then quantisation.
 #version 460
 #extension GL_GOOGLE_include_directive : require
 #extension GL_EXT_scalar_block_layout : require
@@ -9,7 +9,7 @@ layout(local_size_x = 8, local_size_y = 8) in;
 layout(set = 0, binding = B_SHOWN, scalar) readonly buffer Shown { vec4 shown[]; };
 layout(set = 0, binding = B_CODES, scalar) writeonly buffer Codes { uint codes[]; };
 
-// floor(255 v + 0.5) in f32 without contraction: bit for bit the CPU's `quantise`.
+// floor(255 v + 0.5) in f32 without contraction. Equals the CPU's `quantise` bit for bit.
 uint quantise(float v, inout uint nans, inout uint clipped) {
     uint bits = floatBitsToUint(v);
     if ((bits & 0x7fffffffu) > 0x7f800000u) {
@@ -26,11 +26,12 @@ uint quantise(float v, inout uint nans, inout uint clipped) {
     return uint(shifted);
 }
 
-// |cos| between the smooth normal and the pixel's ray, without contraction and with no quotient but 1/x: bit for bit the CPU's `real_cosine`.
+// Absolute cosine between the smooth normal and the pixel's ray. There is no contraction, and no quotient but 1 / x, so it equals the CPU's
+// `real_cosine` bit for bit.
 float real_cosine(vec4 rows[3], vec3 n0, vec3 n1, vec3 n2, vec2 b, vec2 raster) {
     precise float w = (1.0 - b.x) - b.y;
     precise vec3 n = (n0 * w + n1 * b.x) + n2 * b.y;
-    // The ray times fx fy: its length is divided out below.
+    // The ray times fx fy. Its length is divided out below.
     precise vec3 d = vec3((raster.x - frame.intrinsics.z) * frame.intrinsics.y, (frame.intrinsics.w - raster.y) * frame.intrinsics.x, -(frame.intrinsics.x * frame.intrinsics.y));
     precise float dot_ = 0.0, nn = 0.0, dd = 0.0;
     for (int i = 0; i < 3; i++) {
@@ -41,7 +42,7 @@ float real_cosine(vec4 rows[3], vec3 n0, vec3 n1, vec3 n2, vec2 b, vec2 raster) 
         dd = dd + di * di;
     }
     precise float squared = nn * dd;
-    if (!(squared > 0.0)) return 0.0; // opposite normals that cancel
+    if (!(squared > 0.0)) return 0.0; // Opposite normals cancel.
     precise float inverse = 1.0 / sqrt(squared);
     precise float cosine = abs(dot_) * inverse;
     return cosine;
@@ -59,7 +60,7 @@ void main() {
         uint instance = surface.id >> 24u;
         TriangleRef ref = triangle_ref_at(instance_at(instance).triangle_offset + (surface.id & 0xffffffu));
         vec2 b = surface.barycentric;
-        // The real surface is smooth: its normal is the interpolated one, without the look's normal map.
+        // The real surface is smooth, so its normal is the interpolated one, without the normal map of the look.
         float cosine = real_cosine(instance_at(instance).world_from_object, vertex_at(ref.vertices.x).normal, vertex_at(ref.vertices.y).normal,
                                    vertex_at(ref.vertices.z).normal, b, vec2(pixel) + 0.5);
         precise float geometry = (surface.distance * surface.distance) * (1.0 / max(cosine, 1e-3));

@@ -1,13 +1,14 @@
-// How much a pixel's samples are worth (method dpm).
+// How much a further sample of a pixel is worth (method dpm).
 
-// What comes into view gets a good start: its first samples serve it for all of its life.
+// Factor for a point that has just come into view. Its first samples serve all frames to come.
 const float GOOD_START = 4.0;
 
-// Frames of a history that halve what a further sample is worth: about half of the eye's own 31, for early samples serve in all frames to come.
+// A history of this many frames halves the worth of a further sample. It is about half of the eye's own 31 frames, because early samples serve all
+// frames to come.
 const float ENOUGH_FRAMES = 16.0;
 
-// Standard deviation of a sample [Neyman34], lowered by what the history already holds: a surface point that has just come into view is behind
-// the others. In units of 1 / 256; a floor keeps every pixel alive. Nothing where chance has no part.
+// Standard deviation of a sample [Neyman34], divided by what the history already holds, so that a surface point that has just come into view
+// catches up. In units of 1 / 256. A lower limit gives every pixel a sample now and then. A deterministic pixel has no importance.
 uint importance_of(History h) {
     if ((h.flags & HISTORY_EXACT) != 0u) return 0u;
     float sigma = h.weight > 0.0 ? sqrt(max(h.variance, 0.0)) : 1.0;

@@ -1,37 +1,37 @@
-// Light sampling: emissive triangles, punctual lights and the environment, one chosen by power.
+// Light sampling: one of the emissive triangles, the punctual lights and the environment is chosen by power.
 
 layout(set = 0, binding = B_LIGHTS, scalar) readonly buffer Lights { Light lights[]; };
-// Rows of (r, g, b, conditional cdf), then one row of marginal cdf values in x.
+// Rows of (r, g, b, conditional cdf), then one row with the marginal cdf in x.
 layout(set = 0, binding = B_ENVIRONMENT, scalar) readonly buffer EnvironmentBlock { vec4 environment_texels[]; };
 
 struct LightSample {
-    vec3 to_light;  // not unit: surface point to light point (or a far point)
-    vec3 radiance;  // over pdf
-    float pdf;      // solid angle; 0 for lights that cannot be hit
+    vec3 to_light;  // From the surface point to the light's point, or to a far point. Not of unit length.
+    vec3 radiance;  // Divided by the pdf.
+    float pdf;      // Over solid angle; 0 for lights that no ray can hit.
     bool valid;
     bool finite_distance;
 };
 
 vec2 environment_position(vec3 d) {
-    // Row 0 is up; the middle column looks along -Z turned by the rotation about +Y.
+    // Row 0 is up. The middle column looks along -Z, turned by the rotation about +Y.
     float azimuth = atan(d.x, -d.z) + frame.environment_rotation;
     float u = azimuth / (2.0 * PI) + 0.5;
     return vec2(u - floor(u), acos(clamp(d.y, -1.0, 1.0)) / PI);
 }
 
 vec3 environment_radiance(vec3 d) {
-    if (ENVIRONMENT_KIND == 0u) return vec3(0.0);
-    if (ENVIRONMENT_KIND == 1u) return frame.environment;
+    if (ENVIRONMENT_KIND == ENVIRONMENT_NONE) return vec3(0.0);
+    if (ENVIRONMENT_KIND == ENVIRONMENT_CONSTANT) return frame.environment;
     vec2 uv = environment_position(d);
     uint x = min(uint(uv.x * float(frame.environment_width)), frame.environment_width - 1u);
     uint y = min(uint(uv.y * float(frame.environment_height)), frame.environment_height - 1u);
     return environment_texels[y * frame.environment_width + x].rgb;
 }
 
-// Solid-angle pdf of the environment's own sampling (without the choice of the environment among lights).
+// Pdf over solid angle with which sample_environment finds the direction `d`, without the choice of the environment among the lights.
 float environment_pdf(vec3 d, vec3 n) {
-    if (ENVIRONMENT_KIND == 0u) return 0.0;
-    if (ENVIRONMENT_KIND == 1u) return max(dot(n, d), 0.0) / PI;
+    if (ENVIRONMENT_KIND == ENVIRONMENT_NONE) return 0.0;
+    if (ENVIRONMENT_KIND == ENVIRONMENT_CONSTANT) return max(dot(n, d), 0.0) / PI;
     uint w = frame.environment_width, h = frame.environment_height;
     vec2 uv = environment_position(d);
     uint x = min(uint(uv.x * float(w)), w - 1u);
@@ -51,7 +51,7 @@ LightSample sample_environment(vec3 n, vec2 u) {
     r.pdf = 0.0;
     r.radiance = vec3(0.0);
     r.to_light = n;
-    if (ENVIRONMENT_KIND == 1u) {
+    if (ENVIRONMENT_KIND == ENVIRONMENT_CONSTANT) {
         mat3 to_world = frame_around(n);
         float radius = sqrt(u.x), phi = 2.0 * PI * u.y;
         float z = sqrt(max(1.0 - u.x, 0.0));
@@ -59,7 +59,7 @@ LightSample sample_environment(vec3 n, vec2 u) {
         r.pdf = z / PI;
         r.radiance = frame.environment;
         r.valid = r.pdf > 1e-7;
-    } else if (ENVIRONMENT_KIND == 2u) {
+    } else if (ENVIRONMENT_KIND == ENVIRONMENT_MAP) {
         uint w = frame.environment_width, h = frame.environment_height;
         uint lo = 0u, hi = h - 1u;
         while (lo < hi) {
@@ -90,7 +90,7 @@ LightSample sample_environment(vec3 n, vec2 u) {
     return r;
 }
 
-// Chooses a light for the point and samples it; `pdf` and `radiance` include the choice.
+// Chooses a light for the point and samples it. `pdf` and `radiance` include the choice.
 LightSample sample_light(vec3 p, vec3 n, float u_pick, vec2 u) {
     LightSample r;
     r.valid = false;
@@ -99,7 +99,7 @@ LightSample sample_light(vec3 p, vec3 n, float u_pick, vec2 u) {
     r.radiance = vec3(0.0);
     r.to_light = n;
     float to_environment = frame.environment_select;
-    if (ENVIRONMENT_KIND != 0u && u_pick < to_environment) {
+    if (ENVIRONMENT_KIND != ENVIRONMENT_NONE && u_pick < to_environment) {
         r = sample_environment(n, u);
         r.pdf *= to_environment;
         if (r.valid) r.radiance /= r.pdf;
@@ -119,7 +119,7 @@ LightSample sample_light(vec3 p, vec3 n, float u_pick, vec2 u) {
         vec3 p0 = TRI(row).xyz;
         vec3 e1 = TRI(row + 1u).xyz - p0, e2 = TRI(row + 2u).xyz - p0;
         float su = sqrt(u.x);
-        vec2 b = vec2(su * (1.0 - u.y), u.y * su); // uniform over the triangle
+        vec2 b = vec2(su * (1.0 - u.y), u.y * su); // Uniform over the triangle.
         vec3 q = transform_point(instance_at(carrier).world_from_object, p0 + b.x * e1 + b.y * e2);
         vec3 scaled_normal = transform_vector(instance_at(carrier).world_from_object, cross(e1, e2));
         float area = 0.5 * length(scaled_normal);
@@ -165,7 +165,7 @@ LightSample sample_light(vec3 p, vec3 n, float u_pick, vec2 u) {
         float distance_ = sqrt(d2);
         float falloff = 1.0 / d2;
         if (lights[index].range < 1.0e30) {
-            // KHR_lights_punctual's smooth window.
+            // The smooth window of KHR_lights_punctual.
             float x = distance_ / lights[index].range;
             x *= x;
             falloff *= clamp(1.0 - x * x, 0.0, 1.0);
@@ -181,7 +181,7 @@ LightSample sample_light(vec3 p, vec3 n, float u_pick, vec2 u) {
     return r;
 }
 
-// Solid-angle pdf with which sample_light would have found this emissive hit from p.
+// Pdf over solid angle with which sample_light would have found this point of an emissive triangle from `p`.
 float emissive_pdf(uint light, uint instance, uint triangle, vec3 p, vec3 q, vec3 g) {
     uint row = (instance_at(instance).triangle_offset + triangle) * 3u;
     vec3 p0 = TRI(row).xyz;

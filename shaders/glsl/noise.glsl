@@ -1,4 +1,4 @@
-// Blue noise in space and time: one value per pixel, frame and channel, 0..1.
+// Blue noise in space and time: one value between 0 and 1 for each pixel, frame and channel.
 layout(set = 0, binding = B_NOISE, scalar) readonly buffer Noise { uint noise_bytes[]; };
 
 float blue_noise(uvec2 pixel, uint frame_number, uint channel) {

@@ -1,5 +1,6 @@
-// Code values into the bit planes that a DMD shows: the CPU's `pack`, byte for byte. One invocation makes four neighbouring bytes of every
-// plane: a 32 x 32 bit matrix, one code value a row, is transposed.
+// Code values into the bit planes that a DMD shows. Equals the CPU's `pack` byte for byte.
+//
+// One invocation makes four neighbouring bytes of every plane: it transposes a 32 x 32 bit matrix that has one code value in each row.
 #version 460
 #extension GL_GOOGLE_include_directive : require
 #extension GL_EXT_scalar_block_layout : require
@@ -10,24 +11,14 @@ layout(local_size_x = 64) in;
 layout(set = 0, binding = B_CODES, scalar) readonly buffer Codes { uint codes[]; };
 layout(set = 0, binding = B_PLANES, scalar) writeonly buffer Planes { uint planes[]; };
 
-layout(constant_id = 14) const uint WIDTH = 1u;
-layout(constant_id = 15) const uint HEIGHT = 1u;
-// Which plane shows each bit of a code value, four bits a word; 255: none does.
-layout(constant_id = 20) const uint PLANE_OF_BITS_0 = 0xffffffffu;
-layout(constant_id = 21) const uint PLANE_OF_BITS_4 = 0xffffffffu;
-layout(constant_id = 22) const uint PLANE_OF_BITS_8 = 0xffffffffu;
-layout(constant_id = 23) const uint PLANE_OF_BITS_12 = 0xffffffffu;
-layout(constant_id = 24) const uint PLANE_OF_BITS_16 = 0xffffffffu;
-layout(constant_id = 25) const uint PLANE_OF_BITS_20 = 0xffffffffu;
-
-// Exchanges the upper bits of one row with the lower bits of a row further down.
+// Exchanges the upper bits of a row with the lower bits of the row `j` further down.
 #define EXCHANGE(j, mask) for (uint k = 0u; k < 32u; k++) { if ((k & j) == 0u) { uint t = ((a[k] >> j) ^ a[k + j]) & mask; a[k] ^= t << j; a[k + j] ^= t; } }
 
 #define STORE(bit, word) { uint plane = (word >> ((bit & 3u) * 8u)) & 0xffu; if (plane != 255u) planes[plane * words + at] = a[bit]; }
 
 void main() {
-    uint row_bytes = (WIDTH + 7u) / 8u;
-    uint plane_bytes = row_bytes * HEIGHT;
+    uint row_bytes = (PLANE_WIDTH + 7u) / 8u;
+    uint plane_bytes = row_bytes * PLANE_HEIGHT;
     uint words = (plane_bytes + 3u) / 4u;
     uint at = gl_GlobalInvocationID.x;
     if (at >= words) return;
@@ -35,9 +26,9 @@ void main() {
     for (uint j = 0u; j < 4u; j++) {
         uint byte_ = at * 4u + j;
         uint row = byte_ / row_bytes, column = (byte_ - row * row_bytes) * 8u;
-        // The leftmost of eight pixels is the highest bit; what lies beyond the row, or the plane, is dark.
+        // The leftmost of eight pixels is the highest bit. Pixels beyond the row or the plane are dark.
         for (uint x = 0u; x < 8u; x++)
-            a[j * 8u + 7u - x] = byte_ < plane_bytes && column + x < WIDTH ? codes[row * WIDTH + column + x] : 0u;
+            a[j * 8u + 7u - x] = byte_ < plane_bytes && column + x < PLANE_WIDTH ? codes[row * PLANE_WIDTH + column + x] : 0u;
     }
     EXCHANGE(16u, 0x0000ffffu)
     EXCHANGE(8u, 0x00ff00ffu)

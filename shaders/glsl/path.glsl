@@ -1,4 +1,4 @@
-// One path: from a surface point toward the eye, backwards through the scene. Depth and weights as docs/RENDERING.md says.
+// One path, from a surface point that the eye sees backwards through the scene to the lights. docs/RENDERING.md has its depth and its weights.
 #include "scene.glsl"
 #define ALPHA_TEST
 #include "bvh.glsl"
@@ -17,24 +17,24 @@ vec3 limit_indirect(vec3 contribution, uint vertex) {
     return contribution;
 }
 
-// Balance heuristic without overflow; 0 when both are 0.
+// The balance heuristic, without overflow. It is 0 if both densities are 0.
 float balance(float a, float b) {
     if (!(a > 0.0)) return 0.0;
     return finite(a) ? a / (a + b) : 1.0;
 }
 
-// A path on its way.
+// A path that is being traced.
 struct Path {
-    Point at;        // its newest vertex
-    uint vertex;     // 1 is the first surface point
+    Point at;        // Its newest vertex.
+    uint vertex;     // Number of that vertex; 1 is the first surface point.
     vec3 throughput;
     vec3 radiance;
-    bool exact;      // chance has chosen nothing yet: every sample of the pixel is this one
+    bool exact;      // No random choice was made yet, so every sample of the pixel is equal to this one.
 };
 
 Path begin_path(Point first) { return Path(first, 1u, vec3(1.0), first.emitted, true); }
 
-// Lights the newest vertex and goes on to the next one. False: the path is at its end, its radiance complete.
+// Adds the light that reaches the newest vertex and continues to the next one. False: the path has ended, and its radiance is complete.
 bool advance_path(inout Path path, Sampler rng, inout uint rays) {
     Point s = path.at;
     uint vertex = path.vertex;
@@ -43,10 +43,10 @@ bool advance_path(inout Path path, Sampler rng, inout uint rays) {
     if (vertex >= frame.depth || black) return false;
     Lobes lobes = lobes_of(s);
     bool only_delta = mirror_like(s) && lobes.diffuse <= 0.0;
-    // One way on only, and before roulette.
+    // There is only one way to continue, and no Russian roulette yet.
     path.exact = path.exact && only_delta && lobes.transmit <= 0.0 && vertex < 3u;
-    // Where the light and the next direction are chosen matters most: they share a group of four. Its first two dimensions are the most
-    // even; without light samples the next direction has them, and the choice of its lobe the third.
+    // The point on the light and the next direction matter most, so they share a group of four dimensions. Its first two dimensions are the most
+    // evenly distributed. Without light samples the next direction takes these, and the choice of its lobe takes the third.
     vec4 u_direction = sample_4d(rng, vertex * 2u - 2u);
     vec4 u_choice = sample_4d(rng, vertex * 2u - 1u);
     bool no_light = frame.environment_select == 0.0 && frame.light_count == 0u;
@@ -87,7 +87,7 @@ bool advance_path(inout Path path, Sampler rng, inout uint rays) {
     hit.t = INFINITY;
     rays++;
     if (!trace_ray(origin, next.direction, 0u, false, hit)) {
-        if (ENVIRONMENT_KIND != 0u) {
+        if (ENVIRONMENT_KIND != ENVIRONMENT_NONE) {
             float light_pdf = next.delta ? 0.0 : environment_pdf(next.direction, s.n) * frame.environment_select;
             float weight = next.delta ? 1.0 : balance(next.pdf, light_pdf);
             path.radiance += limit_indirect(path.throughput * environment_radiance(next.direction) * weight, vertex);

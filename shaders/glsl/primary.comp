@@ -1,4 +1,4 @@
-// Tiles into surfaces and guides: what each projector pixel's ray meets, whether the eye sees that point, how it moves and how large it looks.
+// Pixels into surfaces and guides: what the projector's ray of each pixel meets, whether the eye sees that point, how it moves and how large it looks.
 #version 460
 #extension GL_GOOGLE_include_directive : require
 #include "scene.glsl"
@@ -12,13 +12,8 @@ layout(set = 0, binding = B_TILES, scalar) readonly buffer Tiles { uint tiles[];
 layout(set = 0, binding = B_SURFACES, scalar) writeonly buffer Surfaces { Surface surfaces[]; };
 layout(set = 0, binding = B_GUIDES, scalar) writeonly buffer Guides { Guide guides[]; };
 
-// What the passes between tracing and light need; 0: they are not recorded.
-layout(constant_id = 11) const bool HAS_GUIDES = true;
-// Radiance is filtered without the surface's albedo.
-layout(constant_id = 12) const bool HAS_DEMODULATION = true;
-
-// Reflectance of the look for white light from everywhere, roughly: what varies over a texture but not over the light. Light from below the
-// surface itself is lost, however the shading normal leans: that share of a cosine lobe is (1 - cos) / 2 of the angle between the normals.
+// Reflectance of the look for uniform white light, approximately. It varies with the texture but not with the light. Light from below the surface
+// itself is lost, whatever the direction of the shading normal: that share of a cosine lobe is (1 - cos) / 2 of the angle between the normals.
 vec3 demodulation(Hit hit, vec3 toward) {
     Point s = shading_point(hit, toward);
     float nv = dot(s.n, s.v);
@@ -29,30 +24,30 @@ vec3 demodulation(Hit hit, vec3 toward) {
     return clamp(mix(e + (1.0 - e) * above * s.base, metal, s.metallic), 0.02, 1.0);
 }
 
-// Method dpm: every fourth frame a block of pixels asks for all that it could take from the last.
+// Method dpm: in every fourth frame a block of 8 x 8 pixels traces all its rays, and takes nothing from the last frame.
 bool asks_anew(uvec2 pixel) {
     return (frame.flags & FRAME_DPM) == 0u || frame.history_frame == NO_FRAME || (((pixel.x >> 3u) + 2u * (pixel.y >> 3u) + frame.drawn) & 3u) == 0u;
 }
 
-// Method dpm: no light fell on anything here in the last frame, nor as near as anything can have moved since. What only another body or the
-// eye's own motion uncovers there may wait for the block's turn.
+// Method dpm: in the last frame nothing was lit in this pixel or within two pixels of it, which is as far as a surface can have moved since.
+// Surface that only another body's or the eye's motion uncovers here may wait for the block's turn.
 bool still_dark(uvec2 pixel) {
     if (!HAS_GUIDES || (frame.flags & FRAME_STEADY) == 0u || asks_anew(pixel)) return false;
     bool dark = true;
     for (int i = 0; i < 25 && dark; i++) {
         ivec2 q = ivec2(pixel) + ivec2(i % 5, i / 5) - 2;
-        // Anything may come in over the picture's border.
+        // Anything may enter over the border of the raster.
         bool inside = all(greaterThanEqual(q, ivec2(0))) && all(lessThan(q, ivec2(frame.width, frame.height)));
         dark = inside && former_at(uint(q.y) * frame.width + uint(q.x)).frame != frame.history_frame;
     }
     return dark;
 }
 
-// Method dpm: the eye has seen this body here in the last frame, and all around; every fourth frame it is looked at again all the same. Light
-// that the eye does not see is no fault, so what comes between inside a surface may wait for that; at borders nothing waits.
+// Method dpm: in the last frame the eye saw this body here and everywhere around. Then the ray to the eye is traced in every fourth frame only.
+// Light that the eye does not see is harmless, so an object that comes between the eye and the surface may wait. Nothing waits at borders.
 bool still_seen(uvec2 pixel, uint instance, vec2 before) {
     if (asks_anew(pixel)) return false;
-    // Whatever jumps may stand anywhere.
+    // A surface that jumps may be anywhere.
     vec2 motion = abs(vec2(pixel) + 0.5 - before);
     if (!(max(motion.x, motion.y) < 4.0)) return false;
     ivec2 corner = ivec2(floor(clamp(before, vec2(-4.0), vec2(frame.width, frame.height) + 4.0)));
@@ -88,7 +83,7 @@ void main() {
             vec2 before = HAS_GUIDES ? project(transform_point(instance_at(instance).previous_world_from_object, o)) : vec2(0.0);
             vec3 g = transform_normal(instance_at(instance).world_from_object, object_normal(instance, triangle));
             vec3 to_eye = frame.eye_position - p;
-            // The eye must be on the side that the projector lights.
+            // The eye must be on the same side of the surface as the projector.
             float projector_side = -dot(g, direction), eye_side = dot(g, to_eye);
             bool lit = projector_side * eye_side > 0.0;
             if (lit && !(HAS_GUIDES && still_seen(pixel, instance, before))) {
@@ -104,7 +99,7 @@ void main() {
                 guide.motion = vec2(pixel) + 0.5 - before;
                 vec3 to_projector = -p;
                 float l_p = length(to_projector), l_e = length(to_eye);
-                // [paper] eq. 3; capped where the light grazes.
+                // [paper] eq. 3, limited where the light falls at a grazing angle.
                 guide.size = min((abs(eye_side) / max(l_e * l_e, 1e-12)) * (l_p * l_p / max(abs(dot(g, to_projector)), 1e-6)), 1e3);
                 vec3 to_gaze = frame.gaze_point - frame.eye_position;
                 float c = dot(-to_eye, to_gaze) / max(l_e * length(to_gaze), 1e-12);

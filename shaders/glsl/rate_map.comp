@@ -1,6 +1,6 @@
-// Tiles into shading rates: [paper] eq. 1 to 4 per 16 x 16 tile and axis. Twin of render/rate_map.rs, bit for bit.
+// Tiles into shading rates: [paper] eq. 1 to 4 for each tile of 16 x 16 pixels and each axis. Equals host/lab/src/twins/rate_map.rs bit for bit.
 //
-// Every comparison is written with products of sums only: division, root and power are not the same on every device.
+// Every comparison uses products of sums only, because division, root and power differ between devices.
 #version 460
 #extension GL_GOOGLE_include_directive : require
 #include "scene.glsl"
@@ -11,7 +11,7 @@ layout(set = 0, binding = B_TILES, scalar) readonly buffer Tiles { uint tiles[];
 layout(set = 0, binding = B_RATES, scalar) writeonly buffer Rates { uint rates[]; };
 layout(set = 0, binding = B_RATE_TABLE, scalar) readonly buffer RateTable { vec2 rate_table[]; };
 
-// One row of a tile: what its pixels add to the tile's decision.
+// What the pixels of one row of a tile contribute to the tile's rate.
 struct Row {
     float luminance_sum;
     float square_x, square_y;
@@ -23,7 +23,7 @@ struct Row {
 shared Row rows_[16];
 
 uint full_half_quarter(vec2 b, float square, float pairs, float size, float tau, float lit) {
-    // b E d >= tau with E^2 = square / pairs and tau = threshold / lit.
+    // b E d >= tau, with E^2 = square / pairs and tau = threshold / lit.
     precise float error = square * (size * size) * (lit * lit);
     precise float threshold = (tau * tau) * pairs;
     precise float half_ = (b.x * b.x) * error;
@@ -33,7 +33,7 @@ uint full_half_quarter(vec2 b, float square, float pairs, float size, float tau,
     return 1u;
 }
 
-// b_H and b_Q of [Yang19] by table: linear in v between entries that are 2^-10 of an octave apart; (1, 2.13) at rest.
+// b_H and b_Q of [Yang19] from a table: linear in v between entries that are 2^-10 of an octave apart, and (1, 2.13) at rest.
 vec2 blur(float v) {
     if (v < 0.015625) {
         precise vec2 low = vec2(1.0, 2.13) + (rate_table[0] - vec2(1.0, 2.13)) * (v * 64.0);
@@ -48,7 +48,7 @@ vec2 blur(float v) {
     return r;
 }
 
-// What the pixel showed last, and whether it is lit; -1 when nothing is known.
+// Luminance that the pixel showed in the last frame, -1 if nothing is known, and whether the pixel is lit.
 float known_luminance(uint x, uint y, out bool lit) {
     lit = false;
     if (x >= frame.width || y >= frame.height) return 0.0;
@@ -61,17 +61,15 @@ float known_luminance(uint x, uint y, out bool lit) {
     return h.weight > 0.0 ? l : -1.0;
 }
 
-void main() {
-    uint tile = tiles[gl_WorkGroupID.x];
-    uvec2 origin = uvec2(tile % frame.tiles_x, tile / frame.tiles_x) * 16u;
-    uint y = origin.y + gl_LocalInvocationID.x;
+// What row `y` of the tile at `origin` contributes.
+Row read_row(uvec2 origin, uint y) {
     Row r = Row(0.0, 0.0, 0.0, INFINITY, INFINITY, 0.0, 180.0, 0u, 0u, 0u, 0u);
     for (uint i = 0u; i < 16u; i++) {
         uint x = origin.x + i;
         bool lit, lit_left = false, lit_above = false;
         float l = known_luminance(x, y, lit);
         if (!lit) continue;
-        // Unknown, negative or not finite: the tile is rendered at full rate.
+        // A tile with a value that is unknown, negative or not finite is traced at full rate.
         if (!(l >= 0.0) || !finite(l)) r.odd++;
         precise float sum = r.luminance_sum + l;
         r.luminance_sum = sum;
@@ -93,7 +91,7 @@ void main() {
                 r.pairs_x++;
             }
         }
-        if (gl_LocalInvocationID.x > 0u) {
+        if (y > origin.y) {
             float above = known_luminance(x, y - 1u, lit_above);
             if (lit_above) {
                 precise float d = (l - above) * 0.5;
@@ -103,9 +101,11 @@ void main() {
             }
         }
     }
-    rows_[gl_LocalInvocationID.x] = r;
-    barrier();
-    if (gl_LocalInvocationID.x != 0u) return;
+    return r;
+}
+
+// The sums over all rows of the tile.
+Row sum_rows() {
     Row t = rows_[0];
     for (uint i = 1u; i < 16u; i++) {
         Row o = rows_[i];
@@ -124,28 +124,38 @@ void main() {
         t.pairs_y += o.pairs_y;
         t.odd += o.odd;
     }
-    uint rate = 0u;
-    if (t.lit > 0u) {
-        uint by_angle = t.angle <= frame.zone_degrees.x ? 0u : (t.angle > frame.zone_degrees.y ? 2u : 1u);
-        uint rx = 0u, ry = 0u;
-        if (t.odd == 0u) {
-            float lit = float(t.lit);
-            precise float mean = t.luminance_sum + frame.rate_l * lit;
-            precise float tau = frame.rate_t * mean;
-            rx = full_half_quarter(blur(t.speed_x), t.square_x, float(max(t.pairs_x, 1u)), t.size, tau, lit);
-            ry = full_half_quarter(blur(t.speed_y), t.square_y, float(max(t.pairs_y, 1u)), t.size, tau, lit);
-        }
-        rx = max(rx, by_angle);
-        ry = max(ry, by_angle);
-        // Allowed are 1x1 1x2 2x1 2x2 2x4 4x2.
-        if (rx == 2u && ry == 0u) rx = 1u;
-        if (ry == 2u && rx == 0u) ry = 1u;
-        if (rx == 2u && ry == 2u) {
-            precise float ex = t.square_x * float(max(t.pairs_y, 1u));
-            precise float ey = t.square_y * float(max(t.pairs_x, 1u));
-            if (ex > ey) rx = 1u; else ry = 1u;
-        }
-        rate = rx | (ry << 2u);
+    return t;
+}
+
+// The rate of a tile with the sums `t`: log2 of a coarse pixel's width in bits 0 and 1, of its height in bits 2 and 3.
+uint rate_of(Row t) {
+    if (t.lit == 0u) return 0u;
+    uint by_angle = t.angle <= frame.zone_degrees.x ? 0u : (t.angle > frame.zone_degrees.y ? 2u : 1u);
+    uint rx = 0u, ry = 0u;
+    if (t.odd == 0u) {
+        float lit = float(t.lit);
+        precise float mean = t.luminance_sum + frame.rate_l * lit;
+        precise float tau = frame.rate_t * mean;
+        rx = full_half_quarter(blur(t.speed_x), t.square_x, float(max(t.pairs_x, 1u)), t.size, tau, lit);
+        ry = full_half_quarter(blur(t.speed_y), t.square_y, float(max(t.pairs_y, 1u)), t.size, tau, lit);
     }
-    rates[tile] = rate;
+    rx = max(rx, by_angle);
+    ry = max(ry, by_angle);
+    // The allowed rates are 1x1, 1x2, 2x1, 2x2, 2x4 and 4x2.
+    if (rx == 2u && ry == 0u) rx = 1u;
+    if (ry == 2u && rx == 0u) ry = 1u;
+    if (rx == 2u && ry == 2u) {
+        precise float ex = t.square_x * float(max(t.pairs_y, 1u));
+        precise float ey = t.square_y * float(max(t.pairs_x, 1u));
+        if (ex > ey) rx = 1u; else ry = 1u;
+    }
+    return rx | (ry << 2u);
+}
+
+void main() {
+    uint tile = tiles[gl_WorkGroupID.x];
+    uvec2 origin = uvec2(tile % frame.tiles_x, tile / frame.tiles_x) * 16u;
+    rows_[gl_LocalInvocationID.x] = read_row(origin, origin.y + gl_LocalInvocationID.x);
+    barrier();
+    if (gl_LocalInvocationID.x == 0u) rates[tile] = rate_of(sum_rows());
 }

@@ -1,18 +1,16 @@
-// Random numbers in groups of four. Which sequence: a specialization constant.
+// Random numbers in groups of four. The specialization constant SAMPLER says from which sequence they come.
 #include "noise.glsl"
 
-layout(constant_id = 10) const uint SAMPLER = 0u; // 0 independent, 1 one point set a frame shifted by blue noise, 2 one sequence a surface point, 3 one sequence a pixel
-
 struct Sampler {
-    uint seed;  // of the path's sequence
-    uint index; // in the sequence
+    uint seed;  // Of the path's sequence.
+    uint index; // Of the sample in the sequence.
     uvec2 pixel;
 };
 
-// [0, 1) always: 24 bits, so rounding never gives 1.
+// Always below 1: with 24 bits nothing is rounded.
 float to_unit(uint x) { return float(x >> 8u) * (1.0 / 16777216.0); }
 
-// The twin of host/lab/src/sobol.rs, bit for bit.
+// Owen scrambling by a hash. Equals host/lab/src/sobol.rs bit for bit.
 uint owen_scramble(uint x, uint seed) {
     x = bitfieldReverse(x);
     x += seed;
@@ -40,13 +38,13 @@ uvec4 sobol_4d(uint index, uint group, uint seed) {
                  owen_scramble(x.z, mix_seed(key, 3u)), owen_scramble(x.w, mix_seed(key, 4u)));
 }
 
-// Four numbers of dimension group `group` of this path.
+// Four random numbers: the dimensions of group `group` of this path.
 vec4 sample_4d(Sampler s, uint group) {
-    if (SAMPLER == 0u) {
+    if (SAMPLER == SAMPLER_INDEPENDENT) {
         uint state = hash_u32(s.seed + hash_u32(s.index + hash_u32(group + 0x9e3779b9u)));
         uvec4 x;
         for (int i = 0; i < 4; i++) {
-            // PCG output permutation over a linear congruential state.
+            // The output permutation of PCG over a linear congruential state.
             state = state * 747796405u + 2891336453u;
             uint word = ((state >> ((state >> 28u) + 4u)) ^ state) * 277803737u;
             x[i] = (word >> 22u) ^ word;
@@ -55,8 +53,8 @@ vec4 sample_4d(Sampler s, uint group) {
     }
     uvec4 x = sobol_4d(s.index, group, s.seed);
     vec4 u = vec4(to_unit(x.x), to_unit(x.y), to_unit(x.z), to_unit(x.w));
-    if (SAMPLER == 1u) {
-        // Every dimension reads the mask at an offset of its own, so that dimensions are independent.
+    if (SAMPLER == SAMPLER_BLUE_NOISE) {
+        // Every dimension reads the mask at its own offset, so that the dimensions are independent.
         for (int i = 0; i < 4; i++) {
             uint h = hash_u32(group * 4u + uint(i) + 1u);
             u[i] += blue_noise(s.pixel + uvec2(h & 63u, (h >> 6u) & 63u), frame.drawn + ((h >> 12u) & 31u), uint(i));

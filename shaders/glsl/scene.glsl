@@ -1,4 +1,4 @@
-// Bindings and small helpers that every tracing shader uses.
+// Bindings and small functions that most shaders use.
 #extension GL_EXT_scalar_block_layout : require
 #extension GL_GOOGLE_include_directive : require
 #extension GL_KHR_shader_subgroup_basic : require
@@ -6,32 +6,20 @@
 #include "generated.glsl"
 #include "tables.glsl"
 
-// What the scene needs; the host sets these before the first frame so that the rest is compiled away.
-layout(constant_id = 0) const bool HAS_TEXTURES = true;
-layout(constant_id = 1) const bool HAS_NORMAL_MAPS = true;
-layout(constant_id = 2) const bool HAS_ALPHA_MASK = true;
-layout(constant_id = 3) const bool HAS_TRANSMISSION = true;
-layout(constant_id = 4) const bool HAS_SPECULAR = true;
-layout(constant_id = 5) const bool HAS_EMISSIVE = true;
-layout(constant_id = 6) const bool HAS_PUNCTUAL = true;
-layout(constant_id = 7) const uint ENVIRONMENT_KIND = 2u; // 0 none, 1 constant, 2 map
-layout(constant_id = 8) const bool HAS_CLAMP = true;
-layout(constant_id = 9) const bool HAS_DIFFUSE = true;
-
-// A storage block although it is small: Mesa's software Vulkan builds a shader anew for every value of a uniform block that a branch
-// or loop reads, which took 15 ms of every frame. Read once where every lane is active: elsewhere software Vulkan reads lane by lane.
+// A storage block, although it is small. Mesa's software Vulkan compiles a shader again for every value of a uniform block that a branch or loop
+// reads, which took 15 ms of every frame. The block is read once, where every lane is active, because elsewhere software Vulkan reads lane by lane.
 layout(set = 0, binding = B_FRAME, scalar) readonly buffer FrameBlock { Frame frame_block; };
 Frame frame = frame_block;
 layout(set = 0, binding = B_COUNTERS, scalar) buffer CountersBlock { Counters counters; };
 
 const float PI = 3.14159265358979;
 const float INFINITY = 3.0e38;
-// Frames over which the eye takes the mean: 33 ms at 947 fps.
+// The eye averages over this many frames: 33 ms at 947 fps.
 const float EYE_FRAMES = 31.0;
-// Weight of a frame in the mean that tells how far a history lags behind.
+// Weight of a frame in the mean that measures how far a history lags.
 const float LAG_WEIGHT = 0.0625;
 
-// Samples that a pixel gets in a frame on average (method dpm): lengths of histories are told in such frames.
+// Samples that a pixel gets in a frame on average (method dpm). The lengths of histories are given in such frames.
 float samples_a_frame() { return max(frame.budget_spp, 0.5); }
 
 vec3 transform_point(vec4 rows[3], vec3 p) {
@@ -42,27 +30,27 @@ vec3 transform_vector(vec4 rows[3], vec3 v) {
     return vec3(dot(rows[0].xyz, v), dot(rows[1].xyz, v), dot(rows[2].xyz, v));
 }
 
-// For rigid transforms the inverse transpose of the linear part is itself.
+// All transforms are rigid, so the inverse transpose of the linear part is the linear part itself.
 vec3 transform_normal(vec4 rows[3], vec3 n) { return normalize(transform_vector(rows, n)); }
 
 float luminance(vec3 c) { return dot(c, vec3(0.2126, 0.7152, 0.0722)); }
 
-// min/max/clamp with NaN are undefined in GLSL, so finiteness is tested by bits.
+// GLSL does not define min, max and clamp of NaN, so whether a value is finite is tested by its bits.
 bool finite(float x) { return (floatBitsToUint(x) & 0x7f800000u) != 0x7f800000u; }
 bool finite3(vec3 v) { return finite(v.x) && finite(v.y) && finite(v.z); }
 
-// Adds a lane's count to a counter with one atomic per subgroup.
+// Adds the counts of all lanes to a counter, with one atomic operation per subgroup.
 #define COUNT(counter, value) { uint total_ = subgroupAdd(value); if (subgroupElect() && total_ != 0u) atomicAdd(counters.counter, total_); }
-// The same for what is nearly always 0: a sum over the lanes costs software Vulkan half as much as a node of the walk.
+// The same for counts that are nearly always 0. It avoids a sum over the lanes, which costs software Vulkan half as much as a node of the traversal.
 #define COUNT_RARE(counter, value) { if ((value) != 0u) atomicAdd(counters.counter, value); }
 
-// World direction of the unit ray through a raster position (pixel centres at half integers).
+// Unit direction, in world space, of the ray through a raster position. Pixel centres are at half integers.
 vec3 projector_direction(vec2 raster) {
     vec3 d = vec3((raster.x - frame.intrinsics.z) / frame.intrinsics.x, -(raster.y - frame.intrinsics.w) / frame.intrinsics.y, -1.0);
     return normalize(transform_vector(frame.world_from_projector, d));
 }
 
-// Raster position of a point; the projector is the origin.
+// Raster position of a point. The projector is the origin of all coordinates.
 vec2 project(vec3 p) {
     vec3 q = vec3(dot(vec3(frame.world_from_projector[0].x, frame.world_from_projector[1].x, frame.world_from_projector[2].x), p),
                   dot(vec3(frame.world_from_projector[0].y, frame.world_from_projector[1].y, frame.world_from_projector[2].y), p),
@@ -71,18 +59,21 @@ vec2 project(vec3 p) {
     return vec2(frame.intrinsics.z + frame.intrinsics.x * q.x / depth, frame.intrinsics.w - frame.intrinsics.y * q.y / depth);
 }
 
-// The pixel of this invocation: four 8 x 8 workgroups a tile of the list. False outside the raster.
+// The pixel of this invocation. Each tile of the list has four workgroups of 8 x 8 pixels. False outside the raster.
 bool tile_pixel(uint tile, out uvec2 pixel) {
     pixel = uvec2(tile % frame.tiles_x, tile / frame.tiles_x) * 16u + uvec2(gl_WorkGroupID.x & 1u, (gl_WorkGroupID.x >> 1u) & 1u) * 8u + gl_LocalInvocationID.xy;
     return pixel.x < frame.width && pixel.y < frame.height;
 }
 
-// Reflectance of the surface itself, by which method dpm divides radiance.
+// Whether a raster position is a pixel of the picture.
+bool on_raster(ivec2 q) { return all(greaterThanEqual(q, ivec2(0))) && all(lessThan(q, ivec2(frame.width, frame.height))); }
+
+// Reflectance of the surface. Method dpm divides radiance by it before it is stored and filtered.
 vec3 albedo_of(Guide g) { return vec3(unpackHalf2x16(g.albedo_rg), unpackHalf2x16(g.albedo_b).x); }
 
 bool is_lit(Surface s) { return s.id != NO_HIT && s.distance > 0.0; }
 
-// Unit vector to 2 x 16 bits on the octahedron and back.
+// A unit vector into 2 x 16 bits on the octahedron, and back.
 uint encode_normal(vec3 n) {
     n /= max(abs(n.x) + abs(n.y) + abs(n.z), 1e-12);
     vec2 e = n.z >= 0.0 ? n.xy : (1.0 - abs(n.yx)) * vec2(n.x >= 0.0 ? 1.0 : -1.0, n.y >= 0.0 ? 1.0 : -1.0);
@@ -97,7 +88,7 @@ vec3 decode_normal(uint bits) {
 }
 
 uint hash_u32(uint x) {
-    // A full-avalanche 32-bit mix.
+    // A mix in which every bit of the result depends on every bit of `x`.
     x ^= x >> 16u;
     x *= 0x21f0aaadu;
     x ^= x >> 15u;
@@ -106,8 +97,8 @@ uint hash_u32(uint x) {
     return x;
 }
 
-// Which zone of [paper] table 1 an angle lies in.
+// The zone of [paper] table 1 in which an angle from the gaze lies.
 uint zone_of(float degrees_) { return degrees_ <= frame.zone_degrees.x ? 0u : degrees_ <= frame.zone_degrees.y ? 1u : 2u; }
 
-// How far a point is in the periphery: 0 where the spatial filter of [paper] begins, 1 where it is whole.
+// How far in the periphery a point is: 0 where the spatial filter of [paper] begins, 1 where it replaces the picture.
 float periphery(float angle) { return clamp((angle - frame.filter_degrees.x) / max(frame.filter_degrees.y - frame.filter_degrees.x, 1e-6), 0.0, 1.0); }

@@ -1,24 +1,24 @@
-// A hit into a shading point: position, normals, material at that point.
+// A hit into a shading point: its position, its normals, and the material there.
 
 layout(set = 0, binding = B_TEXTURES, scalar) readonly buffer Textures { TextureInfo textures[]; };
 layout(set = 0, binding = B_TEXELS, scalar) readonly buffer Texels { uvec2 texels[]; };
 
 struct Point {
-    vec3 p;         // world
-    vec3 g;         // geometric normal on the side of v
-    vec3 n;         // shading normal on the side of v
-    vec3 v;         // unit, toward where we look from
-    bool front;     // v is on the outside
+    vec3 p;         // Position, world space.
+    vec3 g;         // Geometric normal on the side of v.
+    vec3 n;         // Shading normal on the side of v.
+    vec3 v;         // Unit direction toward the viewer, or toward the vertex before.
+    bool front;     // v is on the outside.
     vec3 base;
     float metallic;
-    float alpha;    // GGX
+    float alpha;    // Roughness of GGX.
     float ior;
     float transmission;
-    vec3 emitted;   // radiance toward v
+    vec3 emitted;   // Radiance toward v.
     uint flags;
     uint table;
-    uint light;     // index in the light table
-    float offset;   // safe distance to leave the surface
+    uint light;     // Index in the light table.
+    float offset;   // Distance from the surface at which a new ray starts.
 };
 
 uint wrap_texel(int x, uint size, uint mode) {
@@ -38,7 +38,7 @@ vec4 texel(TextureInfo info, int x, int y) {
 vec4 sample_texture(TextureUse use, vec2 uv) {
     TextureInfo info = textures[use.texture];
     vec2 st = vec2(dot(use.row_u, vec3(uv, 1.0)), dot(use.row_v, vec3(uv, 1.0))) * vec2(info.width, info.height);
-    // Coordinates far outside (or not finite) must not overflow the integer conversion.
+    // Coordinates that are very large or not finite must not overflow the conversion to integers.
     st = clamp(st, vec2(-1.0e6), vec2(1.0e6));
     if ((info.flags & 32u) != 0u) return texel(info, int(floor(st.x)), int(floor(st.y)));
     st -= 0.5;
@@ -62,7 +62,7 @@ bool alpha_present(uint instance, uint triangle, vec2 barycentric) {
     return a >= cutoff;
 }
 
-// Position of a hit in the body's space.
+// Position of a hit, in the body's space.
 vec3 object_position(uint instance, uint triangle, vec2 b) {
     uint row = (instance_at(instance).triangle_offset + triangle) * 3u;
     vec3 p0 = TRI(row).xyz;
@@ -75,17 +75,17 @@ vec3 object_normal(uint instance, uint triangle) {
     return normalize(cross(TRI(row + 1u).xyz - p0, TRI(row + 2u).xyz - p0));
 }
 
-// A distance that clears the rounding of the hit position and of the transforms into and out of the body's space.
+// A distance larger than the rounding of the hit's position and of the transforms into the body's space and back.
 float surface_offset(vec3 p, uint instance) {
     return 1.9e-6 * (max(abs(p.x), max(abs(p.y), abs(p.z))) + instance_at(instance).extent);
 }
 
-// E of docs/RENDERING.md: nodes at (i / 31)^2 of alpha and of mu. Rows of cells between two alphas, in a row the cells between two mus; after
-// the last row E_avg, between two alphas.
+// The albedo E of docs/RENDERING.md, with nodes at (i / 31)^2 of alpha and of mu. A row has the cells between two alphas, and each of its cells lies
+// between two mus. The row after the last has E_avg, with cells between two alphas.
 const uint ALBEDO_CELLS = ALBEDO_TABLE_SIZE - 1u;
 uint albedo_row(uint table, uint row) { return (table * ALBEDO_TABLE_SIZE + row) * ALBEDO_CELLS; }
 
-// Where alpha or mu lies among the nodes: lower node, and how far beyond it.
+// The place of alpha or mu among the nodes: the lower node, and the distance beyond it.
 void albedo_position(float v, out uint node, out float beyond) {
     float x = sqrt(clamp(v, 0.0, 1.0)) * float(ALBEDO_CELLS);
     node = min(uint(x), ALBEDO_CELLS - 1u);
@@ -145,7 +145,7 @@ Point shading_point(Hit hit, vec3 v) {
     }
     float nv = dot(n, v);
     if (nv < 1e-3) {
-        // Bent to the nearest direction that v is just above.
+        // The normal is bent to the nearest direction for which v is just above the surface.
         vec3 across = n - nv * v;
         float l2 = dot(across, across);
         n = l2 > 1e-12 ? across * (sqrt(1.0 - 1e-6) * inversesqrt(l2)) + 1e-3 * v : s.g;

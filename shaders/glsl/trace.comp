@@ -1,26 +1,46 @@
-// Work items into radiance toward the eye: `spp` paths from the surface of each pixel that is to be traced.
+// Work items into radiance toward the eye: `spp` paths from the surface point of each listed pixel.
 #version 460
 #extension GL_GOOGLE_include_directive : require
 #include "path.glsl"
+#include "moments.glsl"
 
 layout(local_size_x = 64) in;
 
 layout(set = 0, binding = B_SCHEDULE, scalar) readonly buffer ScheduleBlock { Schedule schedule; };
 layout(set = 0, binding = B_WORK, scalar) readonly buffer Work { WorkItem work[]; };
-// rgb mean of the samples, w their number.
+// Mean of the samples in rgb, and their number in w.
 layout(set = 0, binding = B_RADIANCE, scalar) writeonly buffer Radiance { vec4 radiance_out[]; };
-// Per pixel (method dpm): sum of squared luminance of the samples; 1 where chance chose nothing, so that one sample tells all.
-layout(set = 0, binding = B_FILTERED, scalar) writeonly buffer FilteredBlock { Filtered filtered[]; };
+// Method dpm: `Moments` of the samples. The buffer holds the history's picture from the pass accumulate on.
+layout(set = 0, binding = B_FILTERED, scalar) writeonly buffer MomentsBlock { Filtered moments[]; };
+
+// The place in the random sequence from which the pixel's samples go on.
+Sampler begin_sampler(WorkItem item, uvec2 pixel) {
+    Sampler rng = Sampler(frame.seed, 0u, pixel);
+    if (SAMPLER == SAMPLER_INDEPENDENT) {
+        rng.seed = hash_u32(item.pixel + hash_u32(frame.frame + hash_u32(frame.seed)));
+    } else if (SAMPLER == SAMPLER_BLUE_NOISE) {
+        rng.seed = hash_u32(frame.frame + hash_u32(frame.seed));
+    } else if (SAMPLER == SAMPLER_PIXEL_SEQUENCE) {
+        // The pixel's own sequence continues where the last frame left it. A number of samples by angle is the same in every frame.
+        rng.seed = hash_u32(item.pixel + hash_u32(frame.seed));
+        rng.index = (frame.flags & FRAME_SPP_BY_ANGLE) != 0u ? frame.drawn * item.spp : frame.first_sample;
+    } else {
+        History h = history_at(item.pixel);
+        rng.seed = h.seed;
+        rng.index = h.index;
+    }
+    return rng;
+}
 
 void main() {
-    // Read before lanes part. There is an item: without one no workgroup is dispatched.
+    // This is read while all lanes are active. There is at least one item, because otherwise no workgroup is dispatched.
     uint items = schedule.items;
     WorkItem item = work[min(gl_GlobalInvocationID.x, items - 1u)];
     if (gl_GlobalInvocationID.x >= items) return;
     Surface surface = surface_at(item.pixel);
     uvec2 pixel = uvec2(item.pixel % frame.width, item.pixel / frame.width);
     if (surface.id == NO_HIT) {
-        // Only an ordinary camera asks for the background.
+        // Only an ordinary camera traces the background.
         radiance_out[item.pixel] = vec4(environment_radiance(projector_direction(vec2(pixel) + 0.5)), 1.0);
         return;
     }
@@ -32,31 +52,18 @@ void main() {
     vec3 p = transform_point(instance_at(instance_of(hit.id)).world_from_object, object_position(instance_of(hit.id), triangle_of(hit.id), hit.barycentric));
     vec3 toward = normalize((camera_is_eye ? frame.projector_position : frame.eye_position) - p);
     Point first = shading_point(hit, toward);
-    Sampler rng = Sampler(frame.seed, 0u, pixel);
-    if (SAMPLER == 0u) {
-        rng.seed = hash_u32(item.pixel + hash_u32(frame.frame + hash_u32(frame.seed)));
-    } else if (SAMPLER == 1u) {
-        rng.seed = hash_u32(frame.frame + hash_u32(frame.seed));
-    } else if (SAMPLER == 3u) {
-        // The pixel's own sequence goes on where the last frame left it. A count by angle is the same in every frame.
-        rng.seed = hash_u32(item.pixel + hash_u32(frame.seed));
-        rng.index = (frame.flags & FRAME_SPP_BY_ANGLE) != 0u ? frame.drawn * item.spp : frame.first_sample;
-    } else {
-        History h = history_at(item.pixel);
-        rng.seed = h.seed;
-        rng.index = h.index;
-    }
+    Sampler rng = begin_sampler(item, pixel);
     vec3 sum = vec3(0.0);
     float sum_squares = 0.0;
     uint count = 0u, invalid = 0u;
     bool dpm = (frame.flags & FRAME_DPM) != 0u, exact = false;
     uint rays = 0u;
-    // A lane whose path ends begins its next sample at once, while its neighbours are still on their way.
+    // A lane whose path ends begins its next sample at once, while the paths of its neighbours continue.
     Path path = begin_path(first);
     uint left = item.spp;
     do {
         if (!advance_path(path, rng, rays)) {
-            // A sample that is not finite counts as absent.
+            // A sample that is not finite is dropped.
             bool valid = finite3(path.radiance);
             vec3 l = valid ? path.radiance : vec3(0.0);
             float y = luminance(l);
@@ -71,7 +78,7 @@ void main() {
         }
     } while (left > 0u);
     radiance_out[item.pixel] = vec4(count > 0u ? sum / float(count) : vec3(0.0), float(count));
-    if (dpm) filtered[item.pixel] = Filtered(vec3(sum_squares, exact ? 1.0 : 0.0, 0.0), 0.0);
+    if (dpm) moments[item.pixel] = pack_moments(Moments(sum_squares, exact));
     COUNT(rays, rays)
     COUNT(samples, count + invalid)
     COUNT_RARE(invalid_samples, invalid)

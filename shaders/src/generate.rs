@@ -1,6 +1,6 @@
 //! Rust types into GLSL text, and a hash that tells whether committed SPIR-V belongs to the sources.
 
-use crate::structs;
+use crate::{specialization, structs};
 
 /// A type that can be a member of a shared struct.
 pub trait GlslType {
@@ -71,7 +71,9 @@ pub const SOBOL_BITS: usize = 16;
 
 /// The text of `glsl/generated.glsl`.
 pub fn generated_glsl() -> String {
-    let mut out = String::from("// Written by build-shaders from shaders/src/structs.rs. Do not edit.\n\n");
+    let mut out = String::from(
+        "// Written by build-shaders from shaders/src/structs.rs and shaders/src/specialization.rs. Do not edit.\n\n",
+    );
     for (name, value) in structs::CONSTANTS.iter().chain(structs::BINDINGS) {
         out.push_str(&format!("#define {name} {value}u\n"));
     }
@@ -86,6 +88,10 @@ pub fn generated_glsl() -> String {
     };
     out.push_str(&sobol_rows().each_ref().map(dimension).join(", "));
     out.push_str(")\n");
+    out.push_str("\n// The host sets these before the first frame. What they switch off is compiled away.\n");
+    for constant in specialization::ALL {
+        out.push_str(&constant.glsl());
+    }
     out.push('\n');
     out.push_str(&structs::glsl());
     out

@@ -1,7 +1,7 @@
 //! GLSL sources, committed SPIR-V, and the one definition of every struct and constant shared with the GPU.
 //!
-//! `glsl/generated.glsl` and `glsl/tables.glsl` are written from [`structs`] by `cargo run -p dpm-shaders --bin build-shaders`, which also runs `glslc`;
-//! tests fail when either is stale, so users need no shader compiler.
+//! `glsl/generated.glsl` and `glsl/tables.glsl` are written from [`structs`] and [`specialization`] by
+//! `cargo run -p dpm-shaders --bin build-shaders`, which also runs `glslc`. Tests fail when either is stale, so users need no shader compiler.
 //!
 //! # Example
 //!
@@ -24,6 +24,7 @@
 //! ```
 
 pub mod generate;
+pub mod specialization;
 #[cfg(test)]
 mod spirv_layout_tests;
 pub mod structs;
@@ -77,16 +78,24 @@ table_shaders! {
     PRIMARY = "primary";
     /// Path tracing.
     TRACE = "trace";
-    /// History carried to where its surface point is now.
-    REPROJECT = "reproject";
+    /// Histories moved to the pixels in which their surface points are now (method dpm).
+    REPROJECT_POINT = "reproject_point";
+    /// Histories fetched bilinearly where each surface point was (methods paper and miyamoto).
+    REPROJECT_BILINEAR = "reproject_bilinear";
     /// Shading rates per tile.
     RATE_MAP = "rate_map";
-    /// Which pixels are traced, with how many samples.
-    SCHEDULE = "schedule";
-    /// New samples into the history.
-    ACCUMULATE = "accumulate";
-    /// Spatial filter of the picture.
-    SPATIAL = "spatial";
+    /// Samples of each pixel from a budget (method dpm).
+    SCHEDULE_BUDGET = "schedule_budget";
+    /// Samples of one pixel in each coarse pixel (the methods of others).
+    SCHEDULE_BLOCKS = "schedule_blocks";
+    /// New samples into the history, each counted once (method dpm).
+    ACCUMULATE_SAMPLES = "accumulate_samples";
+    /// A new frame into the history, with a weight (methods paper and miyamoto).
+    ACCUMULATE_FRAMES = "accumulate_frames";
+    /// Spatial filter of the picture by local linear regression (method dpm).
+    SPATIAL_REGRESSION = "spatial_regression";
+    /// Spatial filter of the picture by a Poisson disk (methods paper and miyamoto).
+    SPATIAL_DISK = "spatial_disk";
     /// Compensation for distance, angle and albedo, then quantisation to code values.
     COMPENSATE = "compensate";
 }

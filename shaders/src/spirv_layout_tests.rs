@@ -1,7 +1,8 @@
-//! Offsets and strides that the committed SPIR-V uses against those of the Rust structs.
+//! Offsets, strides and specialization constants of the committed SPIR-V against those that are declared in Rust.
 //!
 //! Optimised SPIR-V has no names, so blocks are found by their bindings: each holds an array of one shared struct, or one struct.
 
+use crate::specialization;
 use crate::structs::{self, layout, BINDINGS};
 use std::collections::{BTreeSet, HashMap};
 
@@ -22,6 +23,10 @@ struct Module {
     strides: HashMap<u32, u32>,
     /// Struct type and member to the offset.
     offsets: HashMap<(u32, u32), u32>,
+    /// Specialization constant to its id.
+    constant_ids: HashMap<u32, u32>,
+    /// Specialization constant to its type in GLSL and its default.
+    constants: HashMap<u32, (&'static str, u32)>,
 }
 
 /// Reads a module; only the instructions needed here, by their numbers in the SPIR-V specification.
@@ -39,7 +44,11 @@ fn parse(spirv: &[u8]) -> Module {
             28 | 29 => drop(module.arrays.insert(w[0], w[1])),
             30 => drop(module.structs.insert(w[0], w[1..].to_vec())),
             32 => drop(module.pointers.insert(w[0], w[2])),
+            48 => drop(module.constants.insert(w[1], ("bool", 1))),
+            49 => drop(module.constants.insert(w[1], ("bool", 0))),
+            50 => drop(module.constants.insert(w[1], ("uint", w[2]))),
             59 => drop(module.variables.insert(w[1], w[0])),
+            71 if w[1] == 1 => drop(module.constant_ids.insert(w[0], w[2])),
             71 if w[1] == 6 => drop(module.strides.insert(w[0], w[2])),
             71 if w[1] == 33 => drop(module.bindings.insert(w[0], w[2])),
             72 if w[2] == 35 => drop(module.offsets.insert((w[0], w[1]), w[3])),
@@ -140,4 +149,32 @@ fn a_wrong_offset_is_found() {
     let at = words.windows(pattern.len()).position(|w| w == pattern).expect("the decoration is there");
     words[at + 16] ^= 4;
     assert_eq!(parse(&words).offsets[&(id, member)], offset ^ 4);
+}
+
+#[test]
+fn every_constant_has_the_id_the_type_and_the_default_of_its_declaration() {
+    let mut used = BTreeSet::new();
+    for shader in crate::ALL {
+        let module = parse(shader.spirv);
+        for (constant, &id) in &module.constant_ids {
+            let declared = &specialization::ALL[id as usize];
+            let found = module.constants[constant];
+            let expected = (declared.glsl_type, declared.default);
+            assert_eq!(found, expected, "{} {}", shader.name, declared.name);
+            used.insert(id);
+        }
+    }
+    let unused: Vec<_> =
+        specialization::ALL.iter().filter(|c| !used.contains(&c.id)).map(|c| c.name).collect();
+    assert!(unused.is_empty(), "no shader uses {unused:?}");
+}
+
+#[test]
+fn only_the_generated_file_declares_constants() {
+    let glsl = std::path::Path::new(env!("CARGO_MANIFEST_DIR")).join("glsl");
+    for entry in std::fs::read_dir(glsl).expect("the folder of shaders") {
+        let path = entry.expect("a file").path();
+        let declares = std::fs::read_to_string(&path).expect("a text").contains("constant_id");
+        assert_eq!(declares, path.ends_with("generated.glsl"), "{}", path.display());
+    }
 }

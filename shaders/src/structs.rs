@@ -194,7 +194,8 @@ gpu_structs! {
 
     /// A pixel's light before the spatial filter.
     struct Filtered {
-        /// Radiance, divided by the albedo where the method does so; right after tracing (method dpm): x is the sum of squared luminances.
+        /// Radiance, divided by the albedo where the method does so. Between the passes trace and accumulate of method dpm this holds
+        /// `Moments` instead (`moments.glsl`).
         light: [f32; 3],
         /// Variance of its luminance.
         variance: f32,
@@ -405,6 +406,13 @@ pub const CONSTANTS: &[(&str, u32)] = &[
     ("NOISE_SIZE", NOISE_SIZE),
     ("NOISE_FRAMES", NOISE_FRAMES),
     ("ALBEDO_TABLE_SIZE", ALBEDO_TABLE_SIZE),
+    ("ENVIRONMENT_NONE", ENVIRONMENT_NONE),
+    ("ENVIRONMENT_CONSTANT", ENVIRONMENT_CONSTANT),
+    ("ENVIRONMENT_MAP", ENVIRONMENT_MAP),
+    ("SAMPLER_INDEPENDENT", SAMPLER_INDEPENDENT),
+    ("SAMPLER_BLUE_NOISE", SAMPLER_BLUE_NOISE),
+    ("SAMPLER_CONTINUED", SAMPLER_CONTINUED),
+    ("SAMPLER_PIXEL_SEQUENCE", SAMPLER_PIXEL_SEQUENCE),
 ];
 /// A pixel that met nothing.
 pub const NO_HIT: u32 = u32::MAX;
@@ -466,6 +474,20 @@ pub const NOISE_SIZE: u32 = 64;
 pub const NOISE_FRAMES: u32 = 32;
 /// Side of the directional-albedo table.
 pub const ALBEDO_TABLE_SIZE: u32 = 32;
+/// The surroundings are black.
+pub const ENVIRONMENT_NONE: u32 = 0;
+/// The same radiance comes from every direction.
+pub const ENVIRONMENT_CONSTANT: u32 = 1;
+/// Radiance comes from a map of directions.
+pub const ENVIRONMENT_MAP: u32 = 2;
+/// Random numbers are independent for every path.
+pub const SAMPLER_INDEPENDENT: u32 = 0;
+/// One point set a frame, shifted at every pixel by blue noise.
+pub const SAMPLER_BLUE_NOISE: u32 = 1;
+/// One sequence a surface point, continued over frames.
+pub const SAMPLER_CONTINUED: u32 = 2;
+/// One sequence a pixel, continued over frames.
+pub const SAMPLER_PIXEL_SEQUENCE: u32 = 3;
 
 /// A table that shaders read by `{reader}_at(i)`: elements of whole rows of four words.
 pub(crate) struct Table {

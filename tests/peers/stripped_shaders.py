@@ -15,18 +15,19 @@ import sys
 import tempfile
 
 GLSL = pathlib.Path(__file__).resolve().parents[2] / "shaders/glsl"
-# constant_id: value for a rig that needs nothing. The environment is constant (1); something must light the scene.
-LEAN = {0: "false", 1: "false", 2: "false", 3: "false", 4: "false", 5: "false", 6: "false", 7: "1", 8: "false", 9: "true",
-        10: "0", 11: "true", 12: "false", 13: "false"}
+# Values for a rig that needs nothing. The environment is constant (1), because something must light the scene.
+LEAN = {"HAS_TEXTURES": "false", "HAS_NORMAL_MAPS": "false", "HAS_ALPHA_MASK": "false", "HAS_TRANSMISSION": "false", "HAS_SPECULAR": "false",
+        "HAS_EMISSIVE": "false", "HAS_PUNCTUAL": "false", "ENVIRONMENT_KIND": "1", "HAS_CLAMP": "false", "HAS_DIFFUSE": "true", "SAMPLER": "0",
+        "HAS_GUIDES": "true", "HAS_DEMODULATION": "false", "HAS_FILTER": "false"}
 SHADERS = [("trace", ["-DTEXEL_TABLES"]), ("trace", []), ("primary", ["-DTEXEL_TABLES"]), ("primary", []),
-           ("reproject", []), ("accumulate", []), ("spatial", []), ("compensate", [])]
+           ("reproject_point", []), ("accumulate_samples", []), ("spatial_regression", []), ("compensate", [])]
 CONSTANT = re.compile(r"layout\(constant_id = (\d+)\) const (\w+) (\w+) = \w+;")
 
 
 def delete(match):
-    if int(match[1]) not in LEAN:
+    if match[3] not in LEAN:
         return match[0]
-    return f"const {match[2]} {match[3]} = {LEAN[int(match[1])]}{'u' if match[2] == 'uint' else ''};"
+    return f"const {match[2]} {match[3]} = {LEAN[match[3]]}{'u' if match[2] == 'uint' else ''};"
 
 
 def instructions(module):
@@ -46,7 +47,8 @@ def main():
         for source in GLSL.iterdir():
             (stripped / source.name).write_text(CONSTANT.sub(delete, source.read_text()))
         module = lambda name: str(pathlib.Path(folder) / name)
-        values = " ".join(f"{k}:{v}" for k, v in LEAN.items())
+        ids = {name: number for number, _, name in CONSTANT.findall((GLSL / "generated.glsl").read_text())}
+        values = " ".join(f"{ids[name]}:{value}" for name, value in LEAN.items())
         print("| shader | all in | specialised | deleted |\n|---|---:|---:|---:|")
         for name, defines in SHADERS:
             for glsl, out in ((GLSL, "all.spv"), (stripped, "deleted.spv")):

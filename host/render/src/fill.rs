@@ -1,11 +1,11 @@
-//! Fills a device buffer with copies of one value, or changes some of its values; at set-up time and between frames of a check.
+//! Fills a device buffer with copies of one value at set-up, or changes some of its values between the frames of a check.
 
 use crate::gpu::{run_now, Buffer, Gpu, GpuError, MemoryKind};
 use bytemuck::Pod;
 use std::ops::Range;
 use std::sync::Arc;
 
-/// Changes a stretch of a buffer's values through the host and waits.
+/// Changes a range of a buffer's values on the host, and waits.
 pub(super) fn edit<T: Pod>(
     gpu: &Arc<Gpu>,
     buffer: &Buffer,

@@ -1,4 +1,4 @@
-//! The memory of one frame in flight, on both sides, and which of it each binding of the shaders means.
+//! The memory of one frame in flight, on the GPU and on the host, and the buffer of each binding of the shaders.
 
 use super::fill::fill;
 use super::memory::{BytesPerPixel, SharedBuffers};
@@ -10,7 +10,7 @@ use bytemuck::Zeroable;
 use dpm_shaders::structs::{Counters, Frame, Guide, Instance, Schedule, Surface, NO_HIT};
 use std::sync::Arc;
 
-/// What one frame in flight needs for itself.
+/// The buffers of one frame in flight.
 pub(super) struct FrameBuffers {
     pub frame: Buffer,
     pub instances: Buffer,
@@ -21,31 +21,31 @@ pub(super) struct FrameBuffers {
     pub surfaces: Buffer,
     pub radiance: Buffer,
     pub codes: Buffer,
-    /// `None`: only the planes come back.
+    /// `None`: the host reads only the planes.
     pub codes_host: Option<Buffer>,
     pub planes: Buffer,
-    /// `None`: only the code values come back.
+    /// `None`: the host reads only the code values.
     pub planes_host: Option<Buffer>,
-    /// Bytes of all planes.
+    /// Bytes of all planes together.
     pub plane_bytes: usize,
     pub guides: Buffer,
     pub schedule: Buffer,
     pub work: Buffer,
-    /// The history's picture.
+    /// The history's picture. In method dpm the pass `trace` leaves `Moments` here, which the pass `accumulate` reads before it writes the picture.
     pub filtered: Buffer,
-    /// The picture after the spatial filter.
+    /// The picture after the spatial filter. In method dpm the pass `reproject` leaves shifts here, which the pass `accumulate` reads.
     pub filtered_shown: Buffer,
-    /// Copies for looking at, where they were asked for.
+    /// Copies for debugging, if they were asked for.
     pub debug_host: Option<DebugBuffers>,
-    /// Sizes of those that grow with the raster.
+    /// Sizes of the buffers that grow with the raster.
     pub each: BytesPerPixel,
 }
 
-/// Copies for looking at.
+/// Copies for debugging.
 pub(super) struct DebugBuffers {
     pub shown: Buffer,
     pub surfaces: Buffer,
-    /// `None` for the methods that do without; so below.
+    /// `None` for the methods that do not need it, and so below.
     pub guides: Option<Buffer>,
     pub history: Option<Buffer>,
     pub prior: Option<Buffer>,
@@ -54,8 +54,7 @@ pub(super) struct DebugBuffers {
 }
 
 impl FrameBuffers {
-    /// Memory for a scene of `bodies` bodies and a raster of `tiles` tiles; `debug` adds the copies for looking at. Tiles that are never traced
-    /// read as nothing hit and black from the start.
+    /// Memory for a scene of `bodies` bodies and a raster of `tiles` tiles. `debug` adds the copies for debugging.
     ///
     /// # Errors
     /// Out of memory.
@@ -70,7 +69,7 @@ impl FrameBuffers {
         let size = |what, bytes, kind| Buffer::new(gpu, what, bytes, kind);
         let table = |what, bytes, kind| table_buffer(gpu, what, bytes, kind);
         let each = BytesPerPixel::of(&settings.method);
-        // What the method does without is bound all the same, but as small as can be.
+        // A buffer that the method does not need is bound all the same, but is as small as possible.
         let with = |what, each: usize| table(what, (pixels * each).max(16), Device);
         let packed = settings.output.schedule();
         let plane_bytes = packed.map_or(4, |schedule| pack::gpu::len_bytes(settings.raster, schedule));
@@ -102,7 +101,7 @@ impl FrameBuffers {
         })
     }
 
-    /// Makes tiles that are never traced read as nothing hit and black.
+    /// Fills the buffers so that tiles that are never traced have no hit and are black.
     ///
     /// # Errors
     /// The GPU's own.
@@ -118,7 +117,7 @@ impl FrameBuffers {
         fill(gpu, self.shown(settings), &[0f32; 4], pixels)
     }
 
-    /// The picture that is shown: that of the last pass before compensation that the method has.
+    /// The picture that is shown: that of the method's last pass before the pass `compensate`.
     pub(super) fn shown(&self, settings: &RendererSettings) -> &Buffer {
         if settings.method.needs_spatial() {
             &self.filtered_shown
@@ -129,7 +128,7 @@ impl FrameBuffers {
         }
     }
 
-    /// The buffer that the binding `name` means in frames that write history `parity`.
+    /// The buffer of the binding `name`, in frames that write the history buffer `parity`.
     pub(super) fn of<'a>(
         &'a self,
         name: &str,

@@ -1,4 +1,4 @@
-//! What the last frame was drawn from, and whether the next one may rely on what it saw.
+//! The inputs of the last frame, and whether the next frame may rely on what that one found.
 
 use super::scene_data::BodyData;
 use super::settings::FrameInputs;
@@ -7,44 +7,44 @@ use dpm_scene::geometry::projector::ProjectorCamera;
 use dpm_shaders::structs::{INSTANCE_EMPTY, NO_FRAME};
 use glam::{DAffine3, DVec3};
 
-/// So far may a body's corners move on the picture from one frame to the next, in pixels and along each axis, before every pixel asks anew:
-/// half a pixel less than as far as `still_dark` of `primary.comp` looks about itself.
+/// Maximum motion of a body's corners along each axis of the raster, in pixels, for a frame to count as steady. It is half a pixel less than the
+/// distance to which `still_dark` of `primary.comp` looks.
 pub(crate) const STEADY_PX: f64 = 1.5;
 
-/// So far may the eye, and what is behind the projector, metres.
+/// The same limit for the eye and for corners behind the projector, metres.
 pub(crate) const STEADY_M: f64 = 5e-3;
 
-/// Place of a frame among those that were drawn. Whatever is done in turns from frame to frame (the checkerboard, the rates of every second
-/// frame, the questions that each block asks in every fourth frame, the slices of blue noise) goes by this one count. The numbers of frames
-/// will not do: a rig that draws every second slot has even numbers only, and half of the turns would never come.
+/// Place of a frame among those that were drawn. Everything that alternates from frame to frame uses this one count: the checkerboard, the rates of
+/// every second frame, the rays that each block traces in every fourth frame, and the slices of blue noise. The numbers of frames do not serve for
+/// this, because a rig that draws every second slot has even numbers only, and half of the turns would never come.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub(super) struct Turn {
-    /// Frames drawn before it, wraps.
+    /// Number of frames drawn before it; wraps.
     pub(super) drawn: u32,
-    /// Samples a pixel that those frames took together, wraps.
+    /// Samples that those frames took together in a pixel; wraps.
     pub(super) first_sample: u32,
 }
 
 /// The frame that the history holds.
 pub(super) struct LastFrame {
-    /// Its number; `NO_FRAME` before the first.
+    /// Its number; `NO_FRAME` before the first frame.
     pub(super) frame: u32,
-    /// Which of the two history buffers it wrote.
+    /// The one of the two history buffers that it wrote.
     pub(super) parity: usize,
-    /// Place of the next frame in the order of those drawn, and the samples a pixel that all before it took.
+    /// The turn of the next frame.
     turn: Turn,
-    /// Per body: world-from-body.
+    /// world-from-body of each body.
     pub(super) poses: Vec<DAffine3>,
-    /// Per body: lost.
+    /// Whether each body is lost.
     lost: Vec<bool>,
-    /// Of the projector.
+    /// Position of the projector.
     pub(super) origin: DVec3,
     eye: DVec3,
     camera: Option<ProjectorCamera>,
 }
 
 impl LastFrame {
-    /// None yet, of a scene with so many bodies.
+    /// No frame yet, for a scene with this number of bodies.
     pub(super) fn none(bodies: usize) -> Self {
         Self {
             frame: NO_FRAME,
@@ -58,8 +58,8 @@ impl LastFrame {
         }
     }
 
-    /// Nothing has jumped, come or gone since: light can have moved by [`STEADY_PX`] at most, but for what another body or the eye's own
-    /// motion uncovers.
+    /// Whether nothing has jumped, was lost or was found since the last frame. Then light has moved by [`STEADY_PX`] at most, except on surface that
+    /// another body's or the eye's motion uncovers.
     pub(super) fn is_steady(
         &self,
         bodies: &[BodyData],
@@ -85,7 +85,8 @@ impl LastFrame {
             })
     }
 
-    /// The place of the frame with this number. Numbers that do not go up have begun anew (a run after its warm-up), and so do the turns.
+    /// The turn of the frame with this number. A number that is not larger than the last one begins a new run (after a warm-up), and the turns begin
+    /// again with it.
     pub(super) fn turn_of(&self, frame: u32) -> Turn {
         if self.frame != NO_FRAME && frame > self.frame {
             self.turn
@@ -94,7 +95,7 @@ impl LastFrame {
         }
     }
 
-    /// This one is the last from now on. Allocates nothing.
+    /// Makes this frame the last one. Allocates nothing.
     pub(super) fn becomes(
         &mut self,
         inputs: &FrameInputs<'_>,
@@ -130,7 +131,7 @@ mod tests {
         ProjectorCamera::look_at(raster, DVec3::Z, DVec3::ZERO, DVec3::Y, 0.6).unwrap()
     }
 
-    /// A box of 20 cm a metre away, then the same at `pose`, seen from `eye`, lost or not.
+    /// Whether the frame is steady after a box of 20 cm at a distance of 1 m moved to `pose`, seen from `eye`, lost or not.
     fn steady_with(pose: DAffine3, eye: DVec3, lost: bool) -> bool {
         let body = BodyData::of_20_cm();
         let camera = camera();

@@ -30,6 +30,7 @@ mod renderer;
 mod resources;
 pub mod scene_data;
 mod scene_gpu;
+mod scene_needs;
 mod settings;
 mod slot;
 pub mod tiles;

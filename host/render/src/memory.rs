@@ -1,5 +1,5 @@
-//! A raster and a method into the memory that grows with them: how large each buffer is, whether the device can hold it, and what outlives
-//! a frame.
+//! The memory that a raster and a method need: how large each buffer is, whether the device can bind it, and what is kept from frame to
+//! frame.
 
 use super::blue_noise;
 use super::fill::fill;
@@ -14,29 +14,29 @@ use dpm_device::planes::Raster;
 use dpm_shaders::structs::{Filtered, Guide, History, Schedule, Surface, WorkItem, NO_FRAME};
 use std::sync::Arc;
 
-/// Bytes a pixel of every buffer that grows with the raster; 0 where the method does without.
+/// Bytes a pixel of every buffer that grows with the raster; 0 if the method does not need the buffer.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(super) struct BytesPerPixel {
-    /// What is known of the surface point that the pixel shows; there are two such buffers, written in turn.
+    /// What is known of the pixel's surface point. There are two such buffers, which frames write in turns.
     pub history: usize,
-    /// Motion, apparent size, angle, albedo.
+    /// Motion, apparent size, angle and albedo.
     pub guides: usize,
-    /// What every pixel's ray met.
+    /// What each pixel's ray hit.
     pub surfaces: usize,
-    /// What was traced.
+    /// The radiance that was traced.
     pub radiance: usize,
     /// The history's picture.
     pub filtered: usize,
     /// The filtered picture.
     pub shown: usize,
-    /// What the tracer is to do.
+    /// The work list of the tracer.
     pub work: usize,
     /// Code values.
     pub codes: usize,
 }
 
 impl BytesPerPixel {
-    /// Those of `method`.
+    /// The bytes of `method`.
     pub(crate) fn of(method: &Method) -> Self {
         let when = |wanted: bool, bytes: usize| if wanted { bytes } else { 0 };
         Self {
@@ -51,7 +51,7 @@ impl BytesPerPixel {
         }
     }
 
-    /// Name and bytes a pixel of the buffer that is the first to be too large.
+    /// Name and bytes a pixel of the largest buffer.
     fn largest(&self) -> (&'static str, usize) {
         [
             ("history", self.history),
@@ -64,14 +64,14 @@ impl BytesPerPixel {
             ("code", self.codes),
         ]
         .into_iter()
-        // The first of equals.
+        // Of equal ones the first.
         .rev()
         .max_by_key(|b| b.1)
         .unwrap_or(("code", 0))
     }
 }
 
-/// Refuses a raster that cannot be traced by `method` on a device that binds buffers of at most `limit` bytes.
+/// Refuses a raster that `method` cannot trace on a device that binds buffers of at most `limit` bytes.
 ///
 /// # Errors
 /// The buffer that is too large, and what to do.
@@ -99,14 +99,14 @@ pub(super) fn check_raster(
     })
 }
 
-/// Memory that outlives a frame.
+/// Memory that is kept from frame to frame.
 pub(super) struct SharedBuffers {
-    /// Two, one entry a pixel each: frames write them in turn and read the other.
+    /// Two buffers with one entry a pixel. Frames write them in turns, and read the other.
     pub history: [Buffer; 2],
     pub rates: Buffer,
     pub rate_table: Buffer,
     pub noise: Buffer,
-    /// What the schedule starts from.
+    /// The schedule at the start of a frame.
     pub schedule_start: Buffer,
 }
 

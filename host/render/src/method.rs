@@ -1,39 +1,39 @@
-//! How a frame spends its rays: a method of the rig file with its switches, as the renderer needs it.
+//! How a frame spends its rays: a method of the rig file with its switches, in the form that the renderer needs.
 
-use dpm_shaders::structs as gpu;
+use dpm_shaders::{specialization as ids, structs as gpu};
 
 /// Where random numbers come from.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 #[repr(u32)]
 pub enum SamplerKind {
-    /// Independent for every path.
-    Independent = 0,
-    /// One point set a frame, shifted at every pixel by blue noise.
-    BlueNoise = 1,
-    /// One low-discrepancy sequence a surface point, continued over frames; its place is kept in the history.
-    Continued = 2,
-    /// One low-discrepancy sequence a pixel, continued over frames; needs no history.
-    PixelSequence = 3,
+    /// They are independent for every path.
+    Independent = gpu::SAMPLER_INDEPENDENT,
+    /// Each frame has one point set, shifted at every pixel by blue noise.
+    BlueNoise = gpu::SAMPLER_BLUE_NOISE,
+    /// Each surface point has one low-discrepancy sequence, continued over frames. The history keeps the place in it.
+    Continued = gpu::SAMPLER_CONTINUED,
+    /// Each pixel has one low-discrepancy sequence, continued over frames. It needs no history.
+    PixelSequence = gpu::SAMPLER_PIXEL_SEQUENCE,
 }
 
-/// The constants of the paper's method \[paper\]; angles are measured at the eye from the gaze.
+/// The constants of the paper's method \[paper\]. Angles are at the eye, from the gaze.
 #[derive(Clone, Debug, PartialEq)]
 pub struct PaperConstants {
     /// Sensitivity threshold of equation 2.
     pub t: f64,
     /// Background luminance of equation 2, scene units.
     pub l: f64,
-    /// Full rate up to here, degrees, equation 4; also the inner bound of table 1.
+    /// The full rate is kept up to this angle, degrees (equation 4). Also the inner bound of table 1.
     pub phi_h_deg: f64,
-    /// Quarter rate from here, degrees, equation 4; also the outer bound of table 1.
+    /// The quarter rate begins at this angle, degrees (equation 4). Also the outer bound of table 1.
     pub phi_q_deg: f64,
-    /// Table 1: weight of the new frame inside `phi_h_deg`, between the two, and outside `phi_q_deg`; above 0, at most 1.
+    /// Table 1: weight of the new frame inside `phi_h_deg`, between the two, and outside `phi_q_deg`. Above 0, at most 1.
     pub temporal_alpha: [f64; 3],
     /// Table 1: samples of a pixel in the same three zones.
     pub zone_spp: [u32; 3],
-    /// The spatial filter blends in from this angle on, degrees.
+    /// The spatial filter is blended in from this angle on, degrees.
     pub filter_from_deg: f64,
-    /// From this angle on, degrees, nothing but the filtered picture is seen.
+    /// From this angle on, degrees, only the filtered picture is shown.
     pub filter_to_deg: f64,
 }
 
@@ -56,34 +56,34 @@ impl Default for PaperConstants {
 /// A method with all switches resolved.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Method {
-    /// This program's own method (history counts samples, demodulated) instead of the paper's.
+    /// This program's own method instead of the paper's. Its history counts samples, and is stored without the albedo.
     pub dpm: bool,
-    /// Rays by importance (dpm) or shading rates per tile (paper).
+    /// Rays go by importance (dpm), or by shading rates per tile (paper).
     pub rate_map: bool,
-    /// Half of the coarse pixels a frame (not dpm).
+    /// Half of the coarse pixels are traced in a frame (not dpm).
     pub checkerboard: bool,
-    /// Random numbers.
+    /// Where random numbers come from.
     pub sampler: SamplerKind,
-    /// Former frames are blended in.
+    /// Earlier frames are blended in.
     pub temporal: bool,
     /// The picture is filtered in space.
     pub spatial: bool,
-    /// Samples by visual angle (not dpm).
+    /// The number of samples depends on the visual angle (not dpm).
     pub spp_by_angle: bool,
-    /// Samples per lit pixel and frame that dpm may spend; also the count where no other rule applies.
+    /// Samples that dpm may spend on average in a lit pixel and frame. Also the number of samples where no other rule applies.
     pub budget_spp: f32,
-    /// Frames' worth of samples that dpm's history may weigh.
+    /// Most frames' worth of samples in dpm's history.
     pub history_cap: f32,
     /// The paper's constants.
     pub paper: PaperConstants,
 }
 
-/// Frames' worth of samples in dpm's history: long enough that the eye's own 31 frames are not the limit; what it lags behind when the
-/// light changes is measured and made up for.
+/// Most frames' worth of samples in dpm's history. It is long enough that the eye's own 31 frames are not the limit. The lag that it causes when
+/// the light changes is measured and corrected.
 pub const HISTORY_CAP: f32 = 96.0;
 
 impl Method {
-    /// The paper's predecessor \[Nomoto20\]: every pixel, independent samples, nothing kept.
+    /// The paper's predecessor \[Nomoto20\]: every pixel is traced with independent samples, and nothing is kept.
     pub fn full(spp: u32) -> Self {
         Self {
             dpm: false,
@@ -99,25 +99,35 @@ impl Method {
         }
     }
 
-    /// A history is kept: for blending, because not every pixel is traced in every frame, or for the spatial pass, which reads what the
-    /// history shows.
+    /// Whether a history is kept: to blend frames, because not every pixel is traced in every frame, or for the pass `spatial`, which reads the
+    /// history's picture.
     pub fn needs_history(&self) -> bool {
         self.dpm || self.temporal || self.rate_map || self.checkerboard || self.spatial
     }
 
-    /// The pass `rate_map` is recorded.
+    /// Whether the pass `rate_map` is recorded.
     pub fn needs_rates(&self) -> bool {
         self.rate_map && !self.dpm
     }
 
-    /// Motion, size, angle and albedo of every pixel are written: for the history, for the filters, or to choose samples.
+    /// Whether motion, size, angle and albedo of every pixel are written: for the history, for the filters, or to choose samples.
     pub(crate) fn needs_guides(&self) -> bool {
         self.needs_history() || self.needs_spatial() || self.spp_by_angle
     }
 
-    /// The pass `spatial` is recorded.
+    /// Whether the pass `spatial` is recorded.
     pub fn needs_spatial(&self) -> bool {
         self.dpm || self.spatial
+    }
+
+    /// Specialization constants that the method decides, each as id and value.
+    pub(crate) fn constants(&self) -> [(u32, u32); 4] {
+        [
+            (ids::SAMPLER, self.sampler as u32),
+            (ids::HAS_GUIDES, u32::from(self.needs_guides())),
+            (ids::HAS_DEMODULATION, u32::from(self.dpm)),
+            (ids::HAS_FILTER, u32::from(self.spatial)),
+        ]
     }
 
     /// `FRAME_*` bits.

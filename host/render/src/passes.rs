@@ -1,5 +1,6 @@
-//! The passes of a frame, one row each: what runs, when, over what, and which buffers it reads and writes.
+//! The passes of a frame, one row each: what runs, when, over what, and the buffers that it reads and writes.
 
+use super::method::Method;
 use super::scene_data::Keep;
 use super::settings::RendererSettings;
 use crate::pack;
@@ -8,19 +9,38 @@ use dpm_shaders::Shader;
 
 /// One pass of a frame.
 pub(super) struct Pass {
-    /// As in reports.
+    /// Name in reports.
     pub name: &'static str,
-    /// The shader; `true` asks for the one that reads tables through texel buffers.
-    pub shader: fn(bool) -> Shader,
-    /// Whether the pass is recorded. What the method does without is not.
+    /// The shader that runs.
+    pub code: Code,
+    /// Whether the pass is recorded: a pass that the method does not need is not.
     pub when: fn(&RendererSettings, Keep) -> bool,
     /// How many workgroups run.
     pub grid: Grid,
-    /// Buffers that an earlier pass of this frame, or the frame before, has written and that this pass reads. Inputs that no pass writes are
-    /// not listed: the frame's constants, the tiles, the scene, the noise and the table of rates.
+}
+
+/// The shader of a pass.
+pub(super) enum Code {
+    /// Every method runs this one.
+    OfAll(Kernel),
+    /// Method `dpm` has its own.
+    ByMethod {
+        /// The shader of method `dpm`.
+        dpm: Kernel,
+        /// The shader of the methods of others.
+        others: Kernel,
+    },
+}
+
+/// A shader with the buffers that it uses.
+pub(super) struct Kernel {
+    /// The shader; `true` asks for the one that reads tables through texel buffers.
+    pub shader: fn(bool) -> Shader,
+    /// Buffers that an earlier pass of this frame, or the frame before, has written and that this shader reads. Inputs that no pass writes
+    /// are not listed: the frame's constants, the tiles, the scene, the noise and the table of rates.
     #[cfg_attr(not(test), allow(dead_code))]
     pub reads: &'static [&'static str],
-    /// Buffers that this pass writes.
+    /// Buffers that this shader writes.
     #[cfg_attr(not(test), allow(dead_code))]
     pub writes: &'static [&'static str],
 }
@@ -28,9 +48,9 @@ pub(super) struct Pass {
 /// How many workgroups of a pass run.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(super) enum Grid {
-    /// Four a listed tile.
+    /// Four for each listed tile.
     Tiles,
-    /// One a listed tile, in frames that decide rates.
+    /// One for each listed tile, in frames that decide rates.
     Rates,
     /// As many as the pass `schedule` asked for.
     Work,
@@ -42,79 +62,121 @@ pub(super) enum Grid {
 pub(super) const TABLE: [Pass; 9] = [
     Pass {
         name: "primary",
-        shader: |texel| shaders::PRIMARY.reading(texel),
+        code: Code::OfAll(Kernel {
+            shader: |texel| shaders::PRIMARY.reading(texel),
+            reads: &["B_COUNTERS", "B_FORMER"],
+            writes: &["B_SURFACES", "B_COUNTERS", "B_GUIDES"],
+        }),
         when: |_, _| true,
         grid: Grid::Tiles,
-        reads: &["B_COUNTERS", "B_FORMER"],
-        writes: &["B_SURFACES", "B_COUNTERS", "B_GUIDES"],
     },
     Pass {
         name: "reproject",
-        shader: |texel| shaders::REPROJECT.reading(texel),
+        code: Code::ByMethod {
+            dpm: Kernel {
+                shader: |texel| shaders::REPROJECT_POINT.reading(texel),
+                reads: &["B_SURFACES", "B_GUIDES", "B_SCHEDULE", "B_FORMER"],
+                writes: &["B_HISTORY", "B_SCHEDULE", "B_SHOWN"],
+            },
+            others: Kernel {
+                shader: |texel| shaders::REPROJECT_BILINEAR.reading(texel),
+                reads: &["B_SURFACES", "B_GUIDES", "B_FORMER"],
+                writes: &["B_HISTORY"],
+            },
+        },
         when: |s, _| s.method.needs_history(),
         grid: Grid::Tiles,
-        reads: &["B_SURFACES", "B_GUIDES", "B_SCHEDULE", "B_FORMER"],
-        writes: &["B_HISTORY", "B_SCHEDULE", "B_SHOWN"],
     },
     Pass {
         name: "rate map",
-        shader: |texel| shaders::RATE_MAP.reading(texel),
+        code: Code::OfAll(Kernel {
+            shader: |texel| shaders::RATE_MAP.reading(texel),
+            reads: &["B_SURFACES", "B_GUIDES", "B_HISTORY"],
+            writes: &["B_RATES"],
+        }),
         when: |s, keep| s.method.needs_rates() || keep.rate_map && s.method.needs_history(),
         grid: Grid::Rates,
-        reads: &["B_SURFACES", "B_GUIDES", "B_HISTORY"],
-        writes: &["B_RATES"],
     },
     Pass {
         name: "schedule",
-        shader: |texel| shaders::SCHEDULE.reading(texel),
+        code: Code::ByMethod {
+            dpm: Kernel {
+                shader: |texel| shaders::SCHEDULE_BUDGET.reading(texel),
+                reads: &["B_SURFACES", "B_HISTORY", "B_SCHEDULE"],
+                writes: &["B_RADIANCE", "B_SCHEDULE", "B_WORK"],
+            },
+            others: Kernel {
+                shader: |texel| shaders::SCHEDULE_BLOCKS.reading(texel),
+                reads: &["B_SURFACES", "B_GUIDES", "B_RATES", "B_SCHEDULE"],
+                writes: &["B_RADIANCE", "B_SCHEDULE", "B_WORK"],
+            },
+        },
         when: |_, _| true,
         grid: Grid::Tiles,
-        reads: &["B_SURFACES", "B_GUIDES", "B_HISTORY", "B_RATES", "B_SCHEDULE"],
-        writes: &["B_RADIANCE", "B_SCHEDULE", "B_WORK"],
     },
     Pass {
         name: "trace",
-        shader: |texel| shaders::TRACE.reading(texel),
+        code: Code::OfAll(Kernel {
+            shader: |texel| shaders::TRACE.reading(texel),
+            reads: &["B_SURFACES", "B_COUNTERS", "B_HISTORY", "B_SCHEDULE", "B_WORK"],
+            writes: &["B_RADIANCE", "B_COUNTERS", "B_FILTERED"],
+        }),
         when: |_, _| true,
         grid: Grid::Work,
-        reads: &["B_SURFACES", "B_COUNTERS", "B_HISTORY", "B_SCHEDULE", "B_WORK"],
-        writes: &["B_RADIANCE", "B_COUNTERS", "B_FILTERED"],
     },
     Pass {
         name: "accumulate",
-        shader: |texel| shaders::ACCUMULATE.reading(texel),
+        code: Code::ByMethod {
+            dpm: Kernel {
+                shader: |texel| shaders::ACCUMULATE_SAMPLES.reading(texel),
+                reads: &["B_SURFACES", "B_RADIANCE", "B_GUIDES", "B_HISTORY", "B_FILTERED", "B_SHOWN"],
+                writes: &["B_HISTORY", "B_FILTERED"],
+            },
+            others: Kernel {
+                shader: |texel| shaders::ACCUMULATE_FRAMES.reading(texel),
+                reads: &["B_SURFACES", "B_RADIANCE", "B_GUIDES", "B_HISTORY", "B_RATES"],
+                writes: &["B_HISTORY", "B_FILTERED"],
+            },
+        },
         when: |s, _| s.method.needs_history(),
         grid: Grid::Tiles,
-        reads: &["B_SURFACES", "B_RADIANCE", "B_GUIDES", "B_HISTORY", "B_RATES", "B_FILTERED", "B_SHOWN"],
-        writes: &["B_HISTORY", "B_FILTERED"],
     },
     Pass {
         name: "spatial",
-        shader: |texel| shaders::SPATIAL.reading(texel),
+        code: Code::ByMethod {
+            dpm: Kernel {
+                shader: |texel| shaders::SPATIAL_REGRESSION.reading(texel),
+                reads: &["B_SURFACES", "B_GUIDES", "B_HISTORY", "B_FILTERED"],
+                writes: &["B_SHOWN"],
+            },
+            others: Kernel {
+                shader: |texel| shaders::SPATIAL_DISK.reading(texel),
+                reads: &["B_SURFACES", "B_GUIDES", "B_HISTORY", "B_FILTERED"],
+                writes: &["B_SHOWN"],
+            },
+        },
         when: |s, _| s.method.needs_spatial(),
         grid: Grid::Tiles,
-        reads: &["B_SURFACES", "B_GUIDES", "B_HISTORY", "B_FILTERED"],
-        writes: &["B_SHOWN"],
     },
     Pass {
         name: "compensate",
-        shader: |texel| shaders::COMPENSATE.reading(texel),
+        code: Code::OfAll(Kernel {
+            shader: |texel| shaders::COMPENSATE.reading(texel),
+            reads: &["B_SURFACES", "B_COUNTERS", "B_SHOWN"],
+            writes: &["B_CODES", "B_COUNTERS"],
+        }),
         when: |_, _| true,
         grid: Grid::Tiles,
-        reads: &["B_SURFACES", "B_COUNTERS", "B_SHOWN"],
-        writes: &["B_CODES", "B_COUNTERS"],
     },
     Pass {
         name: "pack",
-        shader: |_| shaders::PACK,
+        code: Code::OfAll(Kernel { shader: |_| shaders::PACK, reads: &["B_CODES"], writes: &["B_PLANES"] }),
         when: |s, _| s.output.schedule().is_some(),
         grid: Grid::Planes,
-        reads: &["B_CODES"],
-        writes: &["B_PLANES"],
     },
 ];
 
-/// Names of the passes whose ends are stamped, in order; the last is the copying of what the host reads.
+/// Names of the passes whose ends have time stamps, in order. The last one copies what the host reads.
 pub const PASSES: &[&str] = &{
     let mut names = ["readback"; TABLE.len() + 1];
     let mut i = 0;
@@ -125,8 +187,29 @@ pub const PASSES: &[&str] = &{
     names
 };
 
+impl Code {
+    /// What method `dpm` runs, or the methods of others.
+    fn kernel(&self, is_dpm: bool) -> &Kernel {
+        match self {
+            Self::OfAll(kernel) => kernel,
+            Self::ByMethod { dpm, others } => {
+                if is_dpm {
+                    dpm
+                } else {
+                    others
+                }
+            }
+        }
+    }
+}
+
 impl Pass {
-    /// Specialisation constants: `shared` with every pass that reads the scene; packing has its own.
+    /// The shader of a method; `texel` asks for the one that reads tables through texel buffers.
+    pub(super) fn shader(&self, method: &Method, texel: bool) -> Shader {
+        (self.code.kernel(method.dpm).shader)(texel)
+    }
+
+    /// Specialization constants. Passes that read the scene have the `shared` ones, and packing has its own.
     pub(super) fn constants(&self, shared: &[(u32, u32)], settings: &RendererSettings) -> Vec<(u32, u32)> {
         match (self.grid, settings.output.schedule()) {
             (Grid::Planes, Some(schedule)) => pack::gpu::constants(settings.raster, schedule).to_vec(),
@@ -141,7 +224,7 @@ mod tests {
     use dpm_shaders::structs::BINDINGS;
     use std::collections::{BTreeSet, HashMap};
 
-    /// What no pass writes: the host fills it, at the start or before a frame.
+    /// Buffers that no pass writes. The host fills them, at the start or before a frame.
     const INPUTS: [&str; 15] = [
         "B_FRAME",
         "B_INSTANCES",
@@ -224,12 +307,18 @@ mod tests {
         })
     }
 
+    /// The shaders that each of the methods may run, in their order.
+    fn kernels(is_dpm: bool) -> impl Iterator<Item = (&'static str, &'static Kernel)> {
+        static PASSES: [Pass; TABLE.len()] = TABLE;
+        PASSES.iter().map(move |pass| (pass.name, pass.code.kernel(is_dpm)))
+    }
+
     #[test]
     fn every_row_says_what_its_shader_reads_and_writes() {
-        for pass in &TABLE {
+        for (_, kernel) in kernels(true).chain(kernels(false)) {
             for texel in [true, false] {
-                let shader = (pass.shader)(texel);
-                let listed = [pass.reads, pass.writes].map(|names| names.iter().copied().collect());
+                let shader = (kernel.shader)(texel);
+                let listed = [kernel.reads, kernel.writes].map(|names| names.iter().copied().collect());
                 let [loads, stores] = loads_and_stores(&shader);
                 assert_eq!([loads, stores], listed, "{}: [reads, writes]", shader.name);
             }
@@ -240,13 +329,34 @@ mod tests {
     #[test]
     fn nothing_is_read_before_it_is_written() {
         let kept = ["B_COUNTERS", "B_SCHEDULE", "B_FORMER", "B_RATES"];
-        let mut written: BTreeSet<&str> = kept.into();
-        for pass in &TABLE {
-            for name in pass.reads {
-                // The history's pass is left out together with all that read what it writes.
-                assert!(written.contains(name), "{} reads {name}", pass.name);
+        for is_dpm in [true, false] {
+            let mut written: BTreeSet<&str> = kept.into();
+            for (pass, kernel) in kernels(is_dpm) {
+                for name in kernel.reads {
+                    // The history's pass is left out together with all that read what it writes.
+                    assert!(written.contains(name), "{pass} reads {name}");
+                }
+                written.extend(kernel.writes);
             }
-            written.extend(pass.writes);
         }
+    }
+
+    /// A shader that no method runs would be dead, and one that a row names twice is likely a slip.
+    #[test]
+    fn every_shader_belongs_to_one_pass() {
+        let mut named = Vec::new();
+        for pass in &TABLE {
+            named.push(pass.code.kernel(true));
+            if let Code::ByMethod { others, .. } = &pass.code {
+                named.push(others);
+            }
+        }
+        let names = |texel| named.iter().map(move |kernel| (kernel.shader)(texel).name);
+        let mut found: Vec<_> = names(true).chain(names(false)).collect();
+        found.sort_unstable();
+        found.dedup();
+        let mut all: Vec<_> = shaders::ALL.iter().map(|shader| shader.name).collect();
+        all.sort_unstable();
+        assert_eq!(found, all);
     }
 }

@@ -1,4 +1,4 @@
-//! One frame on the GPU: surfaces, radiance, code values. `Renderer::create_slot` records the passes in their order.
+//! One frame on the GPU, from surfaces over radiance to code values. `Renderer::create_slot` records the passes in their order.
 
 use super::fill;
 use super::frame_buffers::FrameBuffers;
@@ -21,31 +21,31 @@ use glam::{DAffine3, Vec3};
 use std::ops::Range;
 use std::sync::Arc;
 
-/// Byte offsets in the dispatch arguments: four workgroups a tile, and one a tile in frames that decide rates.
+/// Byte offsets in the dispatch arguments: of four workgroups a tile, and of one workgroup a tile in frames that decide rates.
 const PER_TILE_QUARTER: u64 = 0;
 const PER_TILE_RATES: u64 = 16;
-/// The pass whose end is the state of the history before the frame's samples.
+/// After this pass the history is what it is before the frame's samples.
 const REPROJECT: &str = "reproject";
 
-/// Draws frames of one scene. Owns what it needs: a thread may keep it, and may be left alone with it when the GPU hangs.
+/// Draws the frames of one scene. It owns all that it needs, so a thread that hangs with the GPU can be abandoned together with it.
 pub struct Renderer {
     pub(super) resources: Arc<Resources>,
     data: Arc<SceneData>,
     pub(super) settings: RendererSettings,
     keep: Keep,
-    /// Per body of the scene: which tracked body carries it.
+    /// For each body of the scene the tracked body that carries it.
     tracked: Vec<Option<u16>>,
     /// The pass that decides rates is recorded.
     decides_rates: bool,
-    /// What the history holds: the last frame submitted and its poses.
+    /// The last frame that was submitted and its poses, which is what the history holds.
     last: LastFrame,
-    /// The tiles that were active when shading rates were decided last. All others have the full rate.
+    /// The tiles that were active when shading rates were last decided. All others have the full rate.
     rated: Vec<bool>,
     pub(super) gpu: Arc<Gpu>,
 }
 
-/// What a renderer is made from, without a device: to be kept beside one, so that it can be made anew on another device without the scene
-/// being looked at again. Cheap to clone.
+/// What a renderer is made from, without a device. It is kept so that the renderer can be made again on another device without preparing the
+/// scene again. Cheap to clone.
 #[derive(Clone)]
 pub struct RendererPlan {
     data: Arc<SceneData>,
@@ -54,7 +54,7 @@ pub struct RendererPlan {
     tracked: Vec<Option<u16>>,
 }
 
-/// `tracked`: per body of the scene, which tracked body carries it.
+/// `tracked`: for each body of the scene the tracked body that carries it.
 fn is_lost(tracked: &[Option<u16>], body: usize, lost: &[bool]) -> bool {
     tracked[body].is_some_and(|t| lost.get(usize::from(t)).copied().unwrap_or(false))
 }
@@ -70,7 +70,7 @@ fn rows(m: &DAffine3) -> Rows {
 }
 
 impl Renderer {
-    /// Uploads the scene and compiles the passes it needs.
+    /// Uploads the scene and compiles the passes that it needs.
     ///
     /// # Errors
     /// The scene is too large, or the GPU's own.
@@ -78,7 +78,7 @@ impl Renderer {
         Self::keeping(gpu, scene, settings, Keep::default())
     }
 
-    /// The same with `keep` in whether the rig needs it or not: for measuring what leaving it out saves.
+    /// The same, but with all of `keep`, whether the rig needs it or not. This measures what leaving it out saves.
     ///
     /// # Errors
     /// As [`Renderer::new`].
@@ -118,7 +118,7 @@ impl Renderer {
             needs = needs.everything();
         }
         use BindingKind::{Storage, Texel};
-        // Second bindings of one buffer, as texels, are for shaders that read tables so: devices bind a limited number.
+        // The second bindings of a buffer, as texels, are bound only for shaders that read tables so, because devices bind a limited number.
         let kinds: Vec<_> = gpu_structs::BINDINGS
             .iter()
             .filter(|(name, _)| texel || !name.ends_with("_ROWS"))
@@ -128,19 +128,15 @@ impl Renderer {
             })
             .collect();
         let table = BindingTable::new(gpu, &kinds)?;
-        let method = &settings.method;
-        let mut constants = needs.constants().to_vec();
-        constants.extend([
-            (10, method.sampler as u32),
-            (11, u32::from(method.needs_guides())),
-            (12, u32::from(method.dpm)),
-            (13, u32::from(method.spatial)),
-        ]);
+        let mut constants = needs.constants();
+        constants.extend(settings.method.constants());
         let pipelines = (TABLE.iter())
             .map(|pass| {
                 let wanted = (pass.when)(&settings, keep);
                 let constants = pass.constants(&constants, &settings);
-                wanted.then(|| ComputePipeline::new(&table, (pass.shader)(texel), &constants)).transpose()
+                wanted
+                    .then(|| ComputePipeline::new(&table, pass.shader(&settings.method, texel), &constants))
+                    .transpose()
             })
             .collect::<Result<Vec<_>, _>>()?;
         let decides_rates =
@@ -160,7 +156,7 @@ impl Renderer {
         })
     }
 
-    /// Interpolated normal of a surface in its body's space, without the normal map.
+    /// Interpolated normal of a surface, in its body's space and without the normal map.
     pub fn shading_normal(&self, surface: &Surface) -> Vec3 {
         let body = &self.data.bodies[(surface.id >> 24) as usize];
         let reference = &self.data.refs[(body.triangle_offset + (surface.id & 0x00ff_ffff)) as usize];
@@ -169,7 +165,7 @@ impl Renderer {
         (n[0] * (1.0 - u - v) + n[1] * u + n[2] * v).normalize_or_zero()
     }
 
-    /// Memory and commands for one frame in flight. `debug` also brings radiance and surfaces to the host.
+    /// Memory and commands for one frame in flight. With `debug` the host can also read radiance and surfaces.
     ///
     /// # Errors
     /// Out of memory.
@@ -207,7 +203,8 @@ impl Renderer {
         })
     }
 
-    /// The frame, in the order of [`TABLE`], with a barrier after each pass. A pass that the method does not need is not recorded; its stamp is.
+    /// Records the frame in the order of [`TABLE`], with a barrier after each pass. Of a pass that the method does not need only the time stamp is
+    /// recorded.
     fn record_passes(&self, r: &mut Recorder<'_>, set: &BindingSet, b: &FrameBuffers, parity: usize) {
         let (resources, raster) = (&self.resources, self.settings.raster);
         r.clear(&b.counters);
@@ -225,7 +222,7 @@ impl Renderer {
                 r.barrier();
             }
             r.stamp();
-            // What the history was before this frame's samples.
+            // The history before this frame's samples.
             let prior = b.debug_host.as_ref().and_then(|d| d.prior.as_ref());
             if let (REPROJECT, Some(prior)) = (pass.name, prior) {
                 r.copy(&resources.shared.history[parity], prior, raster.pixel_count() * b.each.history);
@@ -234,7 +231,7 @@ impl Renderer {
         }
     }
 
-    /// What the host reads, and the copies for looking at.
+    /// Records the copies that the host reads, those for debugging included.
     fn record_readback(&self, r: &mut Recorder<'_>, b: &FrameBuffers, parity: usize, tiles: usize) {
         let (shared, pixels) = (&self.resources.shared, self.settings.raster.pixel_count());
         if let Some(planes_host) = &b.planes_host {
@@ -263,11 +260,11 @@ impl Renderer {
     /// Writes the inputs and starts the GPU. Allocates nothing.
     ///
     /// # Errors
-    /// Device lost or given up, [`GpuError::InFlight`] when the slot's last frame was not waited for to its end. The next frame begins as if
-    /// this one had not been.
+    /// The device is lost or was given up, or [`GpuError::InFlight`] if the slot's last frame was not waited for to its end. The next frame is
+    /// drawn as if this one had not been submitted.
     ///
     /// # Panics
-    /// When there are fewer poses than bodies: a programmer's mistake.
+    /// If there are fewer poses than bodies, which is a mistake of the caller.
     pub fn submit(&mut self, slot: &mut FrameSlot, inputs: &FrameInputs<'_>) -> Result<(), GpuError> {
         assert_eq!(inputs.poses.len(), self.data.bodies.len(), "one pose per body");
         slot.fence.check_free()?;
@@ -282,11 +279,11 @@ impl Renderer {
             );
         }
         let turn = self.last.turn_of(inputs.frame);
-        // Four 8 x 8 workgroups a tile; rates are decided in every second frame drawn, one workgroup a tile. The checkerboard goes by the
-        // same count, so that both of its halves are traced at one rate.
+        // A tile has four workgroups of 8 x 8 pixels, and one workgroup in the pass that decides rates, which runs in every second frame that is
+        // drawn. The checkerboard uses the same count of frames, so that both of its halves are traced at one rate.
         let decides_rates = self.decides_rates && turn.drawn.is_multiple_of(2);
-        // A tile that is left loses its rate, whichever slot's turn it is: a body that comes back to it would else find a rate of long ago in one
-        // slot and none in another, and a run would not repeat.
+        // A tile that is left loses its rate, whichever slot is used. Otherwise a body that comes back to the tile would find an old rate in one
+        // slot and none in another, and a run could not be repeated.
         let left = if decides_rates { &self.rated[..] } else { &[] };
         let tile_count = slot.tile_list.write(left, bytemuck::cast_slice_mut(slot.buffers.tiles.bytes_mut()));
         let rate_tiles = if decides_rates { tile_count } else { 0 };
@@ -327,7 +324,7 @@ impl Renderer {
             .try_for_each(|buffer| fill::edit(&self.gpu, buffer, range.clone(), &mut change))
     }
 
-    /// Body `i` of the scene as the shaders have it. The projector is the origin: f32 is finest where the rays start.
+    /// Body `i` of the scene for the shaders. The projector is the origin, because f32 is finest where the rays start.
     fn instance(&self, i: usize, inputs: &FrameInputs<'_>) -> Instance {
         let (body, pose) = (&self.data.bodies[i], &inputs.poses[i]);
         let shift = DAffine3::from_translation(-inputs.camera.position());
@@ -335,7 +332,7 @@ impl Renderer {
         let before = self.last.poses.get(i).copied().unwrap_or(*pose);
         let previous = DAffine3::from_translation(-self.last.origin) * before;
         let (lower, upper) = world_bounds(&world_from_object, body.bounds_min, body.bounds_max);
-        // Bounds grow by the rounding of the transforms.
+        // The bounds grow by the rounding of the transforms.
         let slack = (lower.abs().max(upper.abs()).max_element() + f64::from(body.extent)) * 1e-6;
         Instance {
             world_from_object: rows(&world_from_object),
@@ -349,7 +346,7 @@ impl Renderer {
             } else {
                 &previous
             }),
-            // What is lost still casts virtual shadows where it was last, but gets no light.
+            // A lost body still casts virtual shadows at its last place, but no light falls on it.
             flags: if is_lost(&self.tracked, i, inputs.lost) {
                 body.flags & !gpu_structs::INSTANCE_PROJECTED
             } else {
@@ -400,7 +397,7 @@ impl Renderer {
             environment_width: self.data.environment_size[0],
             environment_height: self.data.environment_size[1],
             environment_rotation: self.data.environment_rotation,
-            // An even sky is found as well by the directions that the surface's own reflection chooses: a ray to it tells nothing new.
+            // The directions of BSDF sampling find a uniform sky equally well, so it needs no light samples.
             environment_select: if method.dpm && self.data.environment_size == [0, 0] {
                 0.0
             } else {

@@ -1,22 +1,23 @@
-//! A scene into the flat arrays that the shaders read: BVHs, vertices, materials, texels, lights, environment.
+//! A scene into the flat arrays that the shaders read: BVHs, vertices, materials, texels, lights and the environment.
 
+pub use super::scene_needs::SceneNeeds;
 use bytemuck::Zeroable;
 use dpm_scene::albedo_table::{tabulated, AlbedoTable, ALBEDO_NODES};
 use dpm_scene::bvh::BodyBvh;
 use dpm_scene::mesh::MAX_COORDINATE_M;
-use dpm_scene::{Environment, PunctualKind, Scene, TextureRef, Wrap};
+use dpm_scene::{Environment, PunctualKind, Scene, TextureRef, TriangleMesh, Wrap};
 use dpm_shaders::structs::{
     self as gpu, AlbedoCell, Light, Material, TextureInfo, TextureUse, TriangleRef, Vertex,
 };
 use glam::{DAffine3, Vec3};
 
-/// Most bodies a scene may have, those that never move included: their number has 8 bits of a word that it shares with the triangle.
+/// Most bodies that a scene may have, those that never move included. The number of a body has 8 bits of a word that it shares with the triangle.
 pub const MAX_BODIES: usize = 256;
 
-/// A solid with a smaller index is drawn as a thin wall: its refraction would be a spike that f32 cannot carry.
+/// A solid with a smaller index of refraction is drawn as a thin wall, because the peak of its refraction is too narrow for f32.
 const STRAIGHT_BELOW_IOR: f32 = 1.001;
 
-/// Where one body's data lie, and its bounds in body space.
+/// Where the data of one body are, and its bounds in body space.
 #[derive(Clone, Debug)]
 pub struct BodyData {
     /// First node.
@@ -33,7 +34,7 @@ pub struct BodyData {
     pub extent: f32,
 }
 
-/// What the shader reads of an albedo table: the cells between nodes, row after row, then those between two averages.
+/// The cells of an albedo table as the shader reads them: those between nodes, row after row, then those between two averages.
 fn albedo_cells(table: &AlbedoTable) -> Vec<AlbedoCell> {
     let n = ALBEDO_NODES;
     let mut cells = Vec::with_capacity((n - 1) * n);
@@ -82,15 +83,15 @@ pub struct SceneData {
     pub texels: Vec<[u32; 2]>,
     /// Emissive triangles and punctual lights with their alias table.
     pub lights: Vec<Light>,
-    /// Map texels with conditional cdf, then the marginal cdf.
+    /// Texels of the map with the conditional cdf, then the marginal cdf.
     pub environment: Vec<[f32; 4]>,
-    /// Width and height of the map; 0 when constant.
+    /// Width and height of the map; 0 if the environment is constant.
     pub environment_size: [u32; 2],
     /// Constant radiance.
     pub environment_constant: Vec3,
     /// Rotation about +Y.
     pub environment_rotation: f32,
-    /// Probability of sampling the environment.
+    /// Probability that a light sample goes to the environment.
     pub environment_select: f32,
     /// Tables of directional albedo.
     pub albedo: Vec<AlbedoCell>,
@@ -98,101 +99,26 @@ pub struct SceneData {
     pub needs: SceneNeeds,
 }
 
-/// What of the tracer the scene needs: the specialization constants.
-#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
-pub struct SceneNeeds {
-    /// Any texture.
-    pub textures: bool,
-    /// Any normal map.
-    pub normal_maps: bool,
-    /// Any material with a hole.
-    pub alpha_mask: bool,
-    /// Any light passing through.
-    pub transmission: bool,
-    /// Any reflection lobe: metal, or an index other than 1.
-    pub specular: bool,
-    /// Any diffuse lobe.
-    pub diffuse: bool,
-    /// Any emissive triangle.
-    pub emissive: bool,
-    /// Any punctual light.
-    pub punctual: bool,
-    /// 0 none, 1 constant, 2 map.
-    pub environment_kind: u32,
-    /// The firefly clamp is on.
-    pub clamp: bool,
-}
-
-impl SceneNeeds {
-    /// What either of both needs. The kind of environment stays this scene's: another kind reads tables that it does not have.
-    pub(crate) fn with(self, other: Self) -> Self {
-        Self {
-            textures: self.textures || other.textures,
-            normal_maps: self.normal_maps || other.normal_maps,
-            alpha_mask: self.alpha_mask || other.alpha_mask,
-            transmission: self.transmission || other.transmission,
-            specular: self.specular || other.specular,
-            diffuse: self.diffuse || other.diffuse,
-            emissive: self.emissive || other.emissive,
-            punctual: self.punctual || other.punctual,
-            environment_kind: self.environment_kind,
-            clamp: self.clamp || other.clamp,
-        }
-    }
-
-    /// Everything in: for proving that leaving out changes nothing.
-    pub fn everything(self) -> Self {
-        Self {
-            textures: true,
-            normal_maps: true,
-            alpha_mask: true,
-            transmission: true,
-            specular: true,
-            diffuse: true,
-            emissive: true,
-            punctual: true,
-            clamp: true,
-            ..self
-        }
-    }
-
-    /// Specialization constants of `scene.glsl`.
-    pub fn constants(&self) -> [(u32, u32); 10] {
-        [
-            (0, u32::from(self.textures)),
-            (1, u32::from(self.normal_maps)),
-            (2, u32::from(self.alpha_mask)),
-            (3, u32::from(self.transmission)),
-            (4, u32::from(self.specular)),
-            (5, u32::from(self.emissive)),
-            (6, u32::from(self.punctual)),
-            (7, self.environment_kind),
-            (8, u32::from(self.clamp)),
-            (9, u32::from(self.diffuse)),
-        ]
-    }
-}
-
-/// What stays in although nothing needs it: for measuring what leaving it out saves. No pixel may change.
+/// What is kept although nothing needs it. This measures what leaving it out saves. No pixel may change.
 #[derive(Clone, Copy, Debug, Default)]
 pub struct Keep {
     /// Code of the tracer.
     pub needs: SceneNeeds,
-    /// The pass that decides shading rates, for methods with a history; nobody reads what it decides.
+    /// The pass that decides shading rates, for methods with a history. Nothing reads its rates.
     pub rate_map: bool,
-    /// Tiles that no body touches.
+    /// The tiles that no body touches.
     pub every_tile: bool,
-    /// Rays of method dpm to pixels with no light in the last frame, nor near them; what another body's motion uncovers there is lit up to three
-    /// frames earlier with it.
+    /// The rays of method dpm to pixels that were not lit in the last frame, nor near a lit pixel. With them a surface that another body's motion
+    /// uncovers there is lit up to three frames earlier.
     pub every_pixel: bool,
-    /// Tables in storage, as on a GPU, where software Vulkan would read texel buffers.
+    /// Tables in storage buffers, as on a GPU, where software Vulkan would read texel buffers.
     pub storage_tables: bool,
 }
 
 /// Why a scene cannot be drawn.
 #[derive(Debug, thiserror::Error)]
 pub enum SceneDataError {
-    /// Too many bodies.
+    /// There are too many bodies.
     #[error("the scene has {tracked} tracked bodies and {fixed} that never move (what no body claims, lamps); all together may be {MAX_BODIES}. \
              Name fewer in scene.bodies: what is not named is one body that never moves")]
     TooManyBodies {
@@ -201,10 +127,10 @@ pub enum SceneDataError {
         /// The others.
         fixed: usize,
     },
-    /// A body too large for its index.
+    /// A body has more triangles than its index can count.
     #[error("body \"{0}\" has {1} triangles; at most 16 million fit. Simplify it")]
     TooManyTriangles(String, usize),
-    /// A corner that arithmetic cannot hold.
+    /// A vertex is too far away for f32.
     #[error("body \"{0}\" has a vertex at {1} m; coordinates are finite and at most {MAX_COORDINATE_M:e} m. Check the file's unit")]
     TooFar(String, f32),
 }
@@ -222,7 +148,7 @@ fn texture_use(t: Option<TextureRef>) -> TextureUse {
     let Some(t) = t else {
         return TextureUse { texture: gpu::NO_TEXTURE, row_u: [1.0, 0.0, 0.0], row_v: [0.0, 1.0, 0.0] };
     };
-    // KHR_texture_transform: uv' = translation * rotation * scale * uv, rotation counter-clockwise with v down.
+    // KHR_texture_transform: uv' = translation * rotation * scale * uv. The rotation is counter-clockwise, with v down.
     let (s, c) = t.rotation.sin_cos();
     TextureUse {
         texture: t.texture,
@@ -231,8 +157,8 @@ fn texture_use(t: Option<TextureRef>) -> TextureUse {
     }
 }
 
-/// Largest radiance or intensity that is uploaded: its square times any count of samples is far below what f32 holds, and it is far above
-/// what any projector can show.
+/// Largest radiance or intensity that is uploaded. Its square times any number of samples is far below the largest f32, and it is far above what
+/// any projector can show.
 const BRIGHTEST: f32 = 1e12;
 
 fn bounded(light: Vec3) -> Vec3 {
@@ -247,7 +173,7 @@ impl SceneData {
     /// Flattens `scene`; builds one BVH per body.
     ///
     /// # Errors
-    /// More bodies or triangles than the packed hit record can name.
+    /// There are more bodies or triangles than the packed hit record can name, or a vertex is too far away.
     pub fn build(scene: &Scene) -> Result<Self, SceneDataError> {
         let mut data = Self::default();
         if scene.bodies.len() > MAX_BODIES {
@@ -367,7 +293,22 @@ impl SceneData {
         if bvh.order.len() >= 1 << 24 {
             return Err(SceneDataError::TooManyTriangles(body.name.clone(), bvh.order.len()));
         }
+        self.bodies.push(self.body_data(body));
         let vertex_base = self.vertices.len() as u32;
+        self.vertices.extend((0..mesh.positions.len()).map(|i| Vertex {
+            normal: mesh.normals[i].into(),
+            uv: mesh.uvs[i].into(),
+            tangent: mesh.tangents[i].into(),
+            reserved: [0; 3],
+        }));
+        self.add_triangles(scene, index, mesh, &bvh, vertex_base, powers);
+        self.nodes.extend_from_slice(&bvh.nodes);
+        Ok(())
+    }
+
+    /// Where the data of a body that comes next will lie, and its bounds.
+    fn body_data(&self, body: &dpm_scene::Body) -> BodyData {
+        let mesh = &body.mesh;
         let mut flags = 0;
         if body.projected {
             flags |= gpu::INSTANCE_PROJECTED;
@@ -383,22 +324,26 @@ impl SceneData {
         if mesh.positions.is_empty() {
             (lower, upper) = (Vec3::ZERO, Vec3::ZERO);
         }
-        self.bodies.push(BodyData {
+        BodyData {
             node_offset: (self.nodes.len() / 5) as u32,
             triangle_offset: self.refs.len() as u32,
             bounds_min: lower,
             bounds_max: upper,
             flags,
             extent: lower.abs().max(upper.abs()).max_element(),
-        });
-        for i in 0..mesh.positions.len() {
-            self.vertices.push(Vertex {
-                normal: mesh.normals[i].into(),
-                uv: mesh.uvs[i].into(),
-                tangent: mesh.tangents[i].into(),
-                reserved: [0; 3],
-            });
         }
+    }
+
+    /// Triangles in the order of the tree. Those that emit light become lights, with their power in `powers`.
+    fn add_triangles(
+        &mut self,
+        scene: &Scene,
+        index: usize,
+        mesh: &TriangleMesh,
+        bvh: &BodyBvh,
+        vertex_base: u32,
+        powers: &mut Vec<f32>,
+    ) {
         let mut emitter_of = std::collections::HashMap::new();
         for (place, &t) in bvh.order.iter().enumerate() {
             let corners = mesh.triangles[t as usize];
@@ -408,7 +353,7 @@ impl SceneData {
             let m = &scene.materials[material as usize];
             let mut light = gpu::NO_LIGHT;
             if m.emissive.max_element() > 0.0 {
-                // A triangle that stands in several places of the tree is one light.
+                // A triangle that is in several places of the tree is one light.
                 light = *emitter_of.entry(t).or_insert_with(|| {
                     let sides = if m.double_sided { 2.0 } else { 1.0 };
                     let area = 0.5 * (p[1] - p[0]).cross(p[2] - p[0]).length();
@@ -430,11 +375,9 @@ impl SceneData {
                 reserved: [0; 3],
             });
         }
-        self.nodes.extend_from_slice(&bvh.nodes);
-        Ok(())
     }
 
-    /// Radius about the origin that holds all bodies at rest.
+    /// Radius around the origin within which all bodies are at rest.
     fn scene_radius(&self, scene: &Scene) -> f32 {
         let mut radius = 0.0f64;
         for (body, data) in scene.bodies.iter().zip(&self.bodies) {
@@ -451,7 +394,7 @@ impl SceneData {
             let (kind, power, scale, offset) = match l.kind {
                 PunctualKind::Point => (gpu::LIGHT_POINT, 4.0 * PI * intensity, 0.0, 0.0),
                 PunctualKind::Spot { inner, outer } => {
-                    // KHR_lights_punctual: linear in the cosine between the cones, then squared.
+                    // KHR_lights_punctual: linear in the cosine between the two cones, then squared.
                     let scale = 1.0 / (inner.cos() - outer.cos()).max(0.001);
                     (gpu::LIGHT_SPOT, 2.0 * PI * (1.0 - outer.cos()) * intensity, scale, -outer.cos() * scale)
                 }
@@ -482,7 +425,9 @@ impl SceneData {
         let mean = match &scene.environment {
             Environment::Constant(c) => {
                 self.environment_constant = bounded(*c);
-                self.needs.environment_kind = u32::from(c.max_element() > 0.0);
+                let lit = c.max_element() > 0.0;
+                self.needs.environment_kind =
+                    if lit { gpu::ENVIRONMENT_CONSTANT } else { gpu::ENVIRONMENT_NONE };
                 luminance(bounded(*c))
             }
             Environment::Equirect { width, height, texels, rotation_rad } => {
@@ -490,11 +435,12 @@ impl SceneData {
                 self.environment_rotation = *rotation_rad;
                 self.environment_constant = Vec3::ONE;
                 let mean = self.tabulate_environment(*width as usize, *height as usize, texels);
-                self.needs.environment_kind = if mean > 0.0 { 2 } else { 0 };
+                self.needs.environment_kind =
+                    if mean > 0.0 { gpu::ENVIRONMENT_MAP } else { gpu::ENVIRONMENT_NONE };
                 mean
             }
         };
-        if self.needs.environment_kind == 0 {
+        if self.needs.environment_kind == gpu::ENVIRONMENT_NONE {
             return;
         }
         let power = 4.0 * std::f32::consts::PI.powi(2) * radius * radius * mean;
@@ -502,7 +448,7 @@ impl SceneData {
             if light_power > 0.0 { (power / (power + light_power)).clamp(0.2, 0.8) } else { 1.0 };
     }
 
-    /// Fills texels with conditional cdf and the marginal cdf; returns the mean luminance over the sphere.
+    /// Tabulates the texels with the conditional cdf, and the marginal cdf. Returns the mean luminance over the sphere.
     fn tabulate_environment(&mut self, width: usize, height: usize, texels: &[Vec3]) -> f32 {
         let mut row_sums = Vec::with_capacity(height);
         self.environment.clear();
@@ -531,7 +477,7 @@ impl SceneData {
         (total / 2.0) as f32
     }
 
-    /// \[Vose91\]: any light in constant time, with probability proportional to its power.
+    /// The alias table of \[Vose91\], which finds a light in constant time, with a probability proportional to its power.
     fn make_alias_table(&mut self, powers: &[f32]) {
         let n = powers.len();
         let total: f64 = powers.iter().map(|&p| f64::from(p)).sum();

@@ -12,34 +12,34 @@ use glam::{DAffine3, DVec3};
 pub struct RendererSettings {
     /// Raster traced.
     pub raster: Raster,
-    /// Closest-hit rays of a path, primary included.
+    /// Most closest-hit rays of a path, the primary ray included.
     pub depth: u32,
     /// Seed of the run.
     pub seed: u32,
-    /// Limit on indirect contributions; `None`: off.
+    /// Limit on the luminance of indirect contributions; `None`: there is no limit.
     pub clamp_indirect: Option<f32>,
     /// `pi * exposure / (albedo * max_intensity)`.
     pub drive_gain: f32,
-    /// Radiance that the real surfaces show by themselves.
+    /// Radiance of the real surfaces without the projector.
     pub ambient: [f32; 3],
-    /// Ordinary camera (tests): radiance goes back along the primary ray and everything is lit.
+    /// The camera is an ordinary one (tests): radiance returns along the primary ray, and everything is lit.
     pub camera_is_eye: bool,
-    /// Compile in what the scene does not need (tests).
+    /// Code that the scene does not need is compiled in, too (tests).
     pub leave_nothing_out: bool,
-    /// How rays are spent.
+    /// How a frame spends its rays.
     pub method: Method,
-    /// What comes back.
+    /// What the host reads back.
     pub output: Output,
 }
 
 /// What a frame brings to the host.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Output {
-    /// Code values, to be packed there.
+    /// Code values, which the host packs.
     Codes,
     /// Bit planes, packed by the GPU.
     Planes(PlaneSchedule),
-    /// Both: planes to be sent, code values to check the light against.
+    /// Both: planes to send, and code values to check the light against.
     Both(PlaneSchedule),
 }
 
@@ -53,30 +53,30 @@ impl Output {
     }
 }
 
-/// What changes from frame to frame. Small: it is written just before the GPU starts.
+/// What changes from frame to frame. It is small, because it is written just before the GPU starts.
 #[derive(Clone, Copy, Debug)]
 pub struct FrameInputs<'a> {
     /// Number of the frame.
     pub frame: u32,
-    /// Samples per traced pixel where neither angle nor budget decides.
+    /// Samples of a traced pixel, where neither the angle nor a budget decides them.
     pub spp: u32,
-    /// Samples per lit pixel on average (method dpm).
+    /// Average number of samples of a lit pixel (method dpm).
     pub budget_spp: f32,
-    /// Projector.
+    /// The projector.
     pub camera: &'a ProjectorCamera,
-    /// Eye, world.
+    /// Position of the eye, world space.
     pub eye: DVec3,
-    /// Gaze point, world.
+    /// Gaze point, world space.
     pub gaze: DVec3,
-    /// Degrees by which all zones about the gaze grow: 0 while it is known.
+    /// Degrees by which all zones around the gaze grow. 0 while the gaze is known.
     pub widen_deg: f32,
-    /// world-from-body of every body of the scene, at the time of light.
+    /// world-from-body of every body of the scene, at the time at which the frame is shown.
     pub poses: &'a [DAffine3],
-    /// Per tracked body: lost, no light falls on it. Bodies beyond the end are not lost.
+    /// For each tracked body whether it is lost, so that no light falls on it. Bodies beyond the end are not lost.
     pub lost: &'a [bool],
 }
 
-/// A raster whose buffers are larger than a device binds at once.
+/// A raster that has a buffer larger than the device can bind.
 #[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
 #[error(
     "a raster of {} x {} is too large for {device}: its {what} buffer takes {} MiB, and the device binds at most {} MiB at once \
@@ -92,28 +92,28 @@ pub struct RasterTooLarge {
     pub raster: Raster,
     /// Name of the device.
     pub device: String,
-    /// The largest of the buffers.
+    /// Name of the largest buffer.
     pub what: &'static str,
     /// Its size, bytes.
     pub needed: u64,
-    /// Largest buffer that the device binds, bytes.
+    /// Largest buffer that the device can bind, bytes.
     pub limit: u64,
-    /// Largest number of pixels that this method can trace there.
+    /// Most pixels that this method can trace on the device.
     pub most_pixels: u64,
-    /// Method `full` could trace this raster there.
+    /// Method `full` could trace this raster on the device.
     pub frugal_fits: bool,
 }
 
 /// Why a renderer cannot be built.
 #[derive(Debug, thiserror::Error)]
 pub enum RenderError {
-    /// The GPU's word.
+    /// The GPU failed.
     #[error(transparent)]
     Gpu(#[from] GpuError),
-    /// The scene's.
+    /// The scene cannot be drawn.
     #[error(transparent)]
     Scene(#[from] SceneDataError),
-    /// The raster's.
+    /// The raster is too large.
     #[error(transparent)]
     Raster(#[from] RasterTooLarge),
 }

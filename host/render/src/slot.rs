@@ -1,4 +1,4 @@
-//! One frame in flight: its memory on both sides, what it cost, and what can be read back.
+//! One frame in flight: its memory on the GPU and on the host, what it cost, and what can be read back.
 
 use super::frame_buffers::FrameBuffers;
 use super::passes::PASSES;
@@ -12,9 +12,9 @@ use std::sync::Arc;
 /// What a frame cost.
 #[derive(Clone, Copy, Debug, Default)]
 pub struct FrameCost {
-    /// Rays, samples and mishaps.
+    /// What the shaders counted: [`Counters`] as words.
     pub counters: [u32; size_of::<Counters>() / 4],
-    /// GPU time of each pass of [`PASSES`], nanoseconds; 0 where the device has no time stamps.
+    /// GPU time of each pass of [`PASSES`], nanoseconds; 0 if the device has no time stamps.
     pub pass_ns: [u64; PASSES.len()],
 }
 
@@ -25,10 +25,10 @@ impl FrameCost {
     }
 }
 
-/// The memory of one frame in flight. Moves between threads: the render thread fills and submits it, the pack thread waits and reads. It
-/// keeps alive what its submission reads, so it may outlive its renderer. Dropping it waits for the submission as [`FrameFence`] does.
+/// The memory of one frame in flight. It moves between threads: one fills and submits it, another waits for it and reads it. It keeps alive what its
+/// submission reads, so it may outlive its renderer. Dropping it waits for the submission as [`FrameFence`] does.
 pub struct FrameSlot {
-    // Dropped first: it waits until the GPU no longer uses the rest.
+    // Dropped first, because it waits until the GPU no longer uses the rest.
     pub(super) fence: FrameFence,
     /// One for each of the two history buffers that a frame may write.
     pub(super) lists: [CommandList; 2],
@@ -36,28 +36,28 @@ pub struct FrameSlot {
     pub(super) buffers: FrameBuffers,
     pub(super) tile_list: TileList,
     pub(super) raster: Raster,
-    /// Which of the lists ran last.
+    /// The list that ran last.
     pub(super) parity: usize,
     pub(super) stamps: [u64; PASSES.len() + 1],
-    // Dropped last: pipelines and buffers that the submission uses.
+    // Dropped last, because the submission uses these pipelines and buffers.
     pub(super) _resources: Arc<Resources>,
 }
 
 impl FrameSlot {
-    /// Waits at most `timeout_ns` for the frame, then tells what it cost. Allocates nothing.
+    /// Waits at most `timeout_ns` for the frame, and returns what it cost. Allocates nothing.
     ///
     /// # Errors
-    /// Timeout (still running: wait again, or give the device up), or device lost or given up.
+    /// A timeout, after which the frame is still being drawn: wait again, or give the device up. Or the device is lost or was given up.
     pub fn wait(&mut self, timeout_ns: u64) -> Result<FrameCost, GpuError> {
         self.fence.wait(timeout_ns)?;
         Ok(self.cost())
     }
 
-    /// Waits at most `wait_ns` for the frame: what it cost, or `None` while it is still being made. To be called again until it is done; a
-    /// thread that has to give signs of life does so in between. Allocates nothing.
+    /// Waits at most `wait_ns` for the frame. Returns what it cost, or `None` while it is still being drawn. Call it again until the frame is done; a
+    /// thread that has to show that it is alive does so in between. Allocates nothing.
     ///
     /// # Errors
-    /// Device lost or given up: the frame will never be there.
+    /// The device is lost or was given up, so the frame will never be finished.
     pub fn poll_done(&mut self, wait_ns: u64) -> Result<Option<FrameCost>, GpuError> {
         Ok(if self.fence.poll(wait_ns)? { Some(self.cost()) } else { None })
     }
@@ -77,40 +77,40 @@ impl FrameSlot {
         cost
     }
 
-    /// Code values 0x00BBGGRR, row by row; empty when the renderer's output is planes alone. Valid after [`FrameSlot::wait`].
+    /// Code values 0x00BBGGRR, row by row. Empty if the renderer's output is planes only. Valid after [`FrameSlot::wait`].
     pub fn codes(&self) -> &[u32] {
         self.buffers.codes_host.as_ref().map_or(&[], |codes| codes.read(self.raster.pixel_count()))
     }
 
-    /// Bit planes as [`crate::pack::gpu`] lays them out; `None` unless the renderer packs. Valid after [`FrameSlot::wait`].
+    /// Bit planes in the layout of [`crate::pack::gpu`]; `None` unless the renderer packs. Valid after [`FrameSlot::wait`].
     pub fn planes(&self) -> Option<&[u8]> {
         self.buffers.planes_host.as_ref().map(|planes| planes.read(self.buffers.plane_bytes))
     }
 
-    /// Mean radiance and sample count of every pixel; only with `debug` at creation.
+    /// The picture before compensation, as radiance. Only with `debug` at creation.
     pub fn radiance(&self) -> Option<&[[f32; 4]]> {
         self.buffers.debug_host.as_ref().map(|d| d.shown.read(self.raster.pixel_count()))
     }
 
-    /// What each pixel's ray met; only with `debug` at creation.
+    /// What each pixel's ray hit. Only with `debug` at creation.
     pub fn surfaces(&self) -> Option<&[Surface]> {
         self.buffers.debug_host.as_ref().map(|d| d.surfaces.read(self.raster.pixel_count()))
     }
 
-    /// Noise-free facts of each lit pixel; only with `debug` at creation and for methods that use them.
+    /// Motion, apparent size, angle and albedo of each lit pixel. Only with `debug` at creation, and for methods that use them.
     pub fn guides(&self) -> Option<&[Guide]> {
         let guides = self.buffers.debug_host.as_ref()?.guides.as_ref()?;
         Some(guides.read(self.raster.pixel_count()))
     }
 
-    /// History after this frame; only with `debug` at creation and for methods that keep one.
+    /// The history after this frame. Only with `debug` at creation, and for methods that keep one.
     pub fn history(&self) -> Option<&[History]> {
         let history = self.buffers.debug_host.as_ref()?.history.as_ref()?;
         Some(history.read(self.raster.pixel_count()))
     }
 
-    /// Luminance that each pixel's history had before this frame's samples, -1 where none; only with `debug` at creation and for methods
-    /// that keep a history.
+    /// Luminance of each pixel's history before this frame's samples, -1 where there is none. Only with `debug` at creation, and for methods that
+    /// keep a history.
     pub fn prior_luminance(&self) -> Option<Vec<f32>> {
         self.buffers.debug_host.as_ref()?.prior.as_ref().map(|prior| {
             let known = |h: &History| {
@@ -125,12 +125,12 @@ impl FrameSlot {
         })
     }
 
-    /// Samples taken at each pixel this frame, w of the radiance; only with `debug` at creation.
+    /// Mean of the samples of each pixel in this frame, and their number as the fourth value. Only with `debug` at creation.
     pub fn traced(&self) -> Option<&[[f32; 4]]> {
         self.buffers.debug_host.as_ref().map(|d| d.traced.read(self.raster.pixel_count()))
     }
 
-    /// Shading rate of every tile, log2 of the coarse pixel's sides in bits 0..1 and 2..3; only with `debug` at creation.
+    /// Shading rate of every tile: log2 of the coarse pixel's sides in bits 0..1 and 2..3. Only with `debug` at creation.
     pub fn rates(&self) -> Option<&[u32]> {
         self.buffers.debug_host.as_ref().map(|d| d.rates.read(self.tile_list.len()))
     }

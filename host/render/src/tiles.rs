@@ -1,4 +1,4 @@
-//! Poses into the tiles worth tracing: those that some body's bounds may touch.
+//! Poses into the tiles to trace: those that the bounds of a body may touch.
 
 use super::scene_data::{world_bounds, BodyData};
 use dpm_scene::geometry::projector::ProjectorCamera;
@@ -13,7 +13,7 @@ pub const TILE: u32 = 16;
 pub(crate) struct TileList {
     tiles_x: u32,
     tiles_y: u32,
-    /// A walk over all tiles in large steps: software Vulkan splits a grid in two halves, which should cost alike.
+    /// All tiles, in an order with large steps. Software Vulkan splits a grid into two halves, which should cost the same.
     order: Vec<u32>,
     active: Vec<bool>,
     previous: Vec<bool>,
@@ -42,7 +42,7 @@ impl TileList {
         self.tiles_x
     }
 
-    /// Marks the tiles that the bodies may touch. `only`: bodies to look at (all bits of `flags_mask` set). Allocates nothing.
+    /// Marks the tiles that may be touched by the bodies with all bits of `flags_mask`. Allocates nothing.
     pub(crate) fn update(
         &mut self,
         camera: &ProjectorCamera,
@@ -74,7 +74,7 @@ impl TileList {
                     from = from.min(pixel);
                     to = to.max(pixel);
                 }
-                // Partly behind the projector: the projected box has no bounds.
+                // A box that is partly behind the projector has no bounds on the raster.
                 None => {
                     let (world_lower, world_upper) = world_bounds(pose, body.bounds_min, body.bounds_max);
                     if !behind(camera, world_lower, world_upper) {
@@ -97,13 +97,13 @@ impl TileList {
         }
     }
 
-    /// The tiles that are active now, row by row.
+    /// Which tiles are active now, row by row.
     pub(crate) fn active(&self) -> &[bool] {
         &self.active
     }
 
-    /// Writes the tiles that are active now, were at the last update (those must be cleared) or are `wanted` to `out`; returns how many.
-    /// `wanted` may be empty.
+    /// Writes to `out` the tiles that are active now, those that were active at the last update, which must be cleared, and those that are `wanted`.
+    /// Returns their number. `wanted` may be empty.
     pub(crate) fn write(&self, wanted: &[bool], out: &mut [u32]) -> u32 {
         let mut n = 0;
         for &tile in &self.order {
@@ -163,7 +163,7 @@ mod tests {
                 assert!(tiles[..n].contains(&tile), "{p}");
             }
         }
-        // When the body is gone its tiles come once more, to be cleared, then no more.
+        // After the body has left, its tiles are listed once more, to be cleared, and then no more.
         list.update(&camera, &[], &[], 1);
         assert_eq!(list.write(&[], &mut tiles) as usize, n);
         list.update(&camera, &[], &[], 1);

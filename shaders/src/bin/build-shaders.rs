@@ -6,8 +6,20 @@ use std::path::Path;
 use std::process::{Command, ExitCode};
 
 /// Sources that read tables: each is built twice.
-const WITH_TABLES: &[&str] =
-    &["primary", "trace", "reproject", "rate_map", "schedule", "accumulate", "spatial", "compensate"];
+const WITH_TABLES: &[&str] = &[
+    "primary",
+    "trace",
+    "reproject_point",
+    "reproject_bilinear",
+    "rate_map",
+    "schedule_budget",
+    "schedule_blocks",
+    "accumulate_samples",
+    "accumulate_frames",
+    "spatial_regression",
+    "spatial_disk",
+    "compensate",
+];
 
 /// Output stem, source, extra defines.
 fn variants() -> Vec<(String, String, Option<&'static str>)> {

@@ -1,16 +1,16 @@
 //! Whether software Vulkan fits into what the process may use of its address space.
 //!
-//! Software Vulkan compiles shaders and keeps stacks and heaps for its threads. Where a limit (`ulimit -v`) denies it that, Mesa's does not
-//! report an error, so the limit is looked at before. How the program ends otherwise is a matter of chance: by a crash inside Mesa, by an abort
-//! for want of memory, or by a panic and exit code 3. Measured with Mesa 22.3 and the demo at 160 x 120, as a whole process: 2 threads fail
-//! at 900 MB and run at 1,000 MB; 8 fail at 1,400 MB and run at 1,600 MB; 16 fail at 1,400 MB and run at 1,600 MB.
+//! Software Vulkan compiles shaders and keeps stacks and heaps for its threads. If a limit (`ulimit -v`) leaves too little for that, Mesa does
+//! not report an error, so the limit is checked before. Otherwise the program would end at random by a crash inside Mesa, by an abort when memory
+//! runs out, or by a panic and exit code 3. Measured with Mesa 22.3 and the demo at 160 x 120, as a whole process: 2 threads fail at 900 MB and
+//! run at 1,000 MB; 8 fail at 1,400 MB and run at 1,600 MB; 16 fail at 1,400 MB and run at 1,600 MB.
 
 use super::error::GpuError;
 use std::sync::Arc;
 
-/// What software Vulkan takes without its threads, bytes.
+/// What software Vulkan needs without its threads, bytes.
 const BASE: u64 = 1 << 30;
-/// And for each of its threads: stack, heap, and the code of shaders in the making.
+/// What each of its threads needs: a stack, a heap, and room for the shader that it compiles.
 const PER_THREAD: u64 = 96 << 20;
 /// Most threads that it starts.
 const MOST_THREADS: usize = 32;
@@ -18,7 +18,7 @@ const MOST_THREADS: usize = 32;
 /// The limit is too small.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(super) struct Shortage {
-    /// What would be needed, the process's present use included, bytes.
+    /// What is needed, the present use of the process included, bytes.
     needed: u64,
     /// What is allowed, bytes.
     limit: u64,
@@ -35,7 +35,7 @@ impl Shortage {
     }
 }
 
-/// What buffers may take beside software Vulkan itself, bytes; `None` where there is no limit.
+/// What buffers may use beside software Vulkan itself, bytes; `None` if there is no limit.
 ///
 /// # Errors
 /// Not even software Vulkan itself fits.
@@ -73,7 +73,7 @@ fn limit() -> Option<u64> {
     }
 }
 
-/// What the process uses of its address space, bytes; 0 where the system does not tell.
+/// Address space that the process uses, bytes; 0 if the system does not report it.
 fn in_use() -> u64 {
     // SAFETY: a plain query.
     let page = unsafe { libc::sysconf(libc::_SC_PAGESIZE) }.max(0) as u64;

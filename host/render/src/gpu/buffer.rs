@@ -10,11 +10,11 @@ use std::sync::Arc;
 /// Where a buffer lives and who touches it.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum MemoryKind {
-    /// Read and written by shaders only; filled once at creation.
+    /// Read and written by shaders only. Filled once at creation.
     Device,
-    /// Written by the host every frame, read by shaders; mapped for its whole life.
+    /// Written by the host in every frame and read by shaders. Mapped for its whole life.
     Upload,
-    /// Written by shaders, read by the host; mapped, cached where possible.
+    /// Written by shaders and read by the host. Mapped, and cached if possible.
     Readback,
 }
 
@@ -106,7 +106,7 @@ impl Buffer {
         Ok(())
     }
 
-    /// With the view through which shaders read it. The buffer has texel usage.
+    /// Adds the view through which shaders read it. The buffer has texel usage.
     fn viewed_as_texels(mut self, float: bool) -> Result<Self, GpuError> {
         let format = if float { vk::Format::R32G32B32A32_SFLOAT } else { vk::Format::R32G32B32A32_UINT };
         let info =
@@ -191,7 +191,7 @@ impl Buffer {
         let coherent = P::HOST_VISIBLE | P::HOST_COHERENT;
         let wishes: &[P] = match kind {
             MemoryKind::Device => &[P::DEVICE_LOCAL, P::empty()],
-            // Host memory that the GPU reads across the bus: the newest pose is a few hundred bytes.
+            // Host memory, which the GPU reads across the bus. The newest poses are a few hundred bytes.
             MemoryKind::Upload => &[coherent],
             MemoryKind::Readback => &[
                 P::from_raw(P::HOST_VISIBLE.as_raw() | P::HOST_COHERENT.as_raw() | P::HOST_CACHED.as_raw()),

@@ -18,10 +18,10 @@ pub struct CommandList {
 }
 
 impl CommandList {
-    /// Records what `record` asks for; at most `max_stamps` time stamps.
+    /// Records the commands of `record`, with at most `max_stamps` time stamps.
     ///
     /// # Errors
-    /// Vulkan's.
+    /// A call of Vulkan failed.
     pub fn record(
         gpu: &Arc<Gpu>,
         max_stamps: u32,
@@ -54,7 +54,7 @@ impl CommandList {
         }
     }
 
-    /// Time stamps of the last finished run, in nanoseconds since the first of them; fills and returns how many there are.
+    /// Fills in the time stamps of the last finished run, in nanoseconds since the first of them, and returns their number.
     /// Allocates nothing.
     pub(crate) fn stamps_ns(&self, out: &mut [u64]) -> usize {
         let Some(queries) = self.queries.filter(|_| !self.gpu.is_lost()) else { return 0 };
@@ -74,7 +74,7 @@ impl CommandList {
         n
     }
 
-    /// Runs the list; `fence` is signalled when it is done. A device that is lost or was given up is not asked.
+    /// Runs the list. `fence` is signalled when it is done. A device that is lost or was given up is not used.
     ///
     /// # Errors
     /// Device lost or given up, [`GpuError::InFlight`] when the fence's last submission was not waited for to its end, out of memory in
@@ -88,7 +88,7 @@ impl CommandList {
         // SAFETY: the fence is unsignalled and unused: `wait` consumed its last run.
         unsafe {
             gpu.device.reset_fences(&[fence.fence]).on(gpu, "resetting a fence")?;
-            // Another thread may have learned meanwhile that the device is lost.
+            // Another thread may have noticed meanwhile that the device is lost.
             gpu.alive("submitting a frame")?;
             gpu.device.queue_submit(*queue, &info, fence.fence).on(gpu, "submitting a frame")?;
         }
@@ -154,7 +154,7 @@ impl Recorder<'_> {
         }
     }
 
-    /// What was written so far is seen by all that follows (shaders, indirect arguments, copies).
+    /// Makes everything written so far visible to what follows: shaders, indirect arguments and copies.
     pub fn barrier(&mut self) {
         use vk::{AccessFlags as A, PipelineStageFlags as S};
         let barrier = vk::MemoryBarrier::default()
@@ -171,7 +171,7 @@ impl Recorder<'_> {
         self.pipeline_barrier(stages, stages | S::DRAW_INDIRECT, barrier);
     }
 
-    /// What was written is seen by the host after the fence.
+    /// Makes everything written so far visible to the host after the fence.
     pub fn barrier_to_host(&mut self) {
         use vk::{AccessFlags as A, PipelineStageFlags as S};
         let barrier = vk::MemoryBarrier::default()
@@ -232,10 +232,10 @@ impl Recorder<'_> {
     }
 }
 
-/// How long the end of a submission is waited for when its memory is to be freed. After that the device is given up, and keeps it.
+/// How long to wait for the end of a submission before its memory is freed. After that the device is given up and keeps the memory.
 const LAST_WAIT_NS: u64 = 2_000_000_000;
 
-/// Tells when a submission is done. Dropping it waits for the submission, at most 2 s, and not at all when the device is lost or given up.
+/// Signals when a submission is done. Dropping it waits for the submission, at most 2 s, and not at all if the device is lost or was given up.
 pub struct FrameFence {
     fence: vk::Fence,
     pending: bool,
@@ -244,7 +244,7 @@ pub struct FrameFence {
 
 impl FrameFence {
     /// # Errors
-    /// Vulkan's.
+    /// A call of Vulkan failed.
     pub fn new(gpu: &Arc<Gpu>) -> Result<Self, GpuError> {
         gpu.alive("making a fence")?;
         // SAFETY: valid create info; destroyed in Drop.
@@ -253,8 +253,7 @@ impl FrameFence {
         Ok(Self { fence, pending: false, gpu: gpu.clone() })
     }
 
-    /// Waits at most `timeout_ns` for the last submission; returns at once when there is none. May be called again after a timeout, as often
-    /// as one likes: a wait that is cut into pieces is the same wait.
+    /// Waits at most `timeout_ns` for the last submission. Returns at once if there is none. May be called again after a timeout as often as needed.
     ///
     /// # Errors
     /// [`GpuError::Timeout`] (the submission is still pending), or device lost or given up.
@@ -266,10 +265,10 @@ impl FrameFence {
         Err(GpuError::Timeout { device, waited_ms: timeout_ns / 1_000_000 })
     }
 
-    /// The same with false for a timeout. Allocates nothing.
+    /// The same, but returns false after a timeout. Allocates nothing.
     ///
     /// # Errors
-    /// Device lost or given up: for ever, what it was to signal does not become valid any more.
+    /// The device is lost or was given up. This is final: the results of the submission will never be valid.
     pub(crate) fn poll(&mut self, timeout_ns: u64) -> Result<bool, GpuError> {
         self.gpu.alive("waiting for a frame")?;
         if !self.pending {
@@ -282,7 +281,7 @@ impl FrameFence {
                 Ok(true)
             }
             Err(vk::Result::TIMEOUT) => Ok(false),
-            // Still pending for all that is known, unless the device is lost, which it remembers.
+            // The submission may still be pending, unless the device is lost, which the device remembers.
             Err(e) => Err(e).on(&self.gpu, "waiting for a frame"),
         }
     }
@@ -313,10 +312,10 @@ impl Drop for FrameFence {
     }
 }
 
-/// Records, runs and waits: for loading, never on the frame path. A device that does not finish is given up.
+/// Records, runs and waits. It is used for loading, and never on the way of a frame. A device that does not finish is given up.
 ///
 /// # Errors
-/// Vulkan's, or [`GpuError::Timeout`].
+/// A call of Vulkan failed, or [`GpuError::Timeout`].
 pub(crate) fn run_now(gpu: &Arc<Gpu>, record: impl FnOnce(&mut Recorder<'_>)) -> Result<(), GpuError> {
     let list = CommandList::record(gpu, 0, record)?;
     let mut fence = FrameFence::new(gpu)?;
@@ -328,7 +327,7 @@ pub(crate) fn run_now(gpu: &Arc<Gpu>, record: impl FnOnce(&mut Recorder<'_>)) ->
     done
 }
 
-/// Copies now and waits: for loading, never on the frame path.
+/// Copies now and waits. It is used for loading, and never on the way of a frame.
 pub(super) fn copy_now(gpu: &Arc<Gpu>, from: &Buffer, to: &Buffer, bytes: usize) -> Result<(), GpuError> {
     run_now(gpu, |r| r.copy(from, to, bytes))
 }

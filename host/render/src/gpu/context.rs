@@ -9,7 +9,7 @@ use std::sync::atomic::{AtomicU64, AtomicU8, Ordering};
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError, TryLockError};
 use std::time::{Duration, Instant};
 
-/// How long the copies of a first start are waited for, nanoseconds: a slow machine may do other things too.
+/// How long to wait for the copies of a first start, nanoseconds. A slow machine may be busy with other things.
 const FIRST_SETUP_WAIT_NS: u64 = 60_000_000_000;
 /// Longest wait for a queue that another thread submits to.
 const QUEUE_WAIT: Duration = Duration::from_secs(2);
@@ -81,10 +81,9 @@ unsafe extern "system" fn on_message(
 
 /// An open device. Shared by everything made from it; closed when the last of them is gone.
 ///
-/// Once a device [is lost](Gpu::is_lost) nothing is asked of it any more: every call that would use it fails at once. A device that its
-/// driver calls lost is closed as any other. One that was [given up](Gpu::give_up) because it did not finish may go on using all that it
-/// was given, for as long as it likes: nothing is taken from it, and its memory stays taken until the process ends
-/// ([`memory_given_up`] tells how much).
+/// Once a device [is lost](Gpu::is_lost) it is not used any more: every call that would use it fails at once. A device that its driver reports as
+/// lost is closed as any other. A device that was [given up](Gpu::give_up) because it did not finish may continue to use everything that it was
+/// given. So nothing of it is freed, and its memory stays allocated until the process ends ([`memory_given_up`] returns how much).
 pub struct Gpu {
     pub(super) device: ash::Device,
     queue: Mutex<vk::Queue>,
@@ -107,24 +106,24 @@ pub struct Gpu {
     setup_wait_ns: u64,
 }
 
-/// How a device is.
+/// The state of a device.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 #[repr(u8)]
 enum State {
-    /// It works, as far as is known.
+    /// It works, as far as the program knows.
     Well,
-    /// Its driver says that it is lost: nothing runs on it, and all that was made from it may be destroyed.
+    /// Its driver reports that it is lost. Nothing runs on it, and everything made from it may be destroyed.
     Lost,
-    /// It did not finish in time: it may be using everything it was given.
+    /// It did not finish in time, and may still use everything that it was given.
     GivenUp,
 }
 
-/// Which device it is, over several lists of the same machine.
+/// Identifies a device in several lists of the same machine.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub(super) struct DeviceId {
     uuid: [u8; vk::UUID_SIZE],
     name: String,
-    /// Several may be the same in all of this (software Vulkan): which of them, in the order of the list.
+    /// Several devices may agree in all of this (software Vulkan). This is the place among them, in the order of the list.
     twin: usize,
 }
 
@@ -134,7 +133,7 @@ impl std::fmt::Debug for Gpu {
     }
 }
 
-/// Memory of devices that were given up: it stays taken until the process ends.
+/// Memory of devices that were given up. It stays allocated until the process ends.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub struct MemoryGivenUp {
     /// How many devices were given up so far.
@@ -190,7 +189,7 @@ fn version_text(v: u32) -> String {
     format!("{}.{}.{}", vk::api_version_major(v), vk::api_version_minor(v), vk::api_version_patch(v))
 }
 
-/// The error of a call that is not for any device yet.
+/// The error of a call that does not concern a device yet.
 fn without_device(operation: &'static str) -> impl Fn(vk::Result) -> GpuError {
     move |result| GpuError::from_result(result, operation, &"the Vulkan loader".into(), 0)
 }
@@ -270,7 +269,7 @@ fn compute_family(instance: &ash::Instance, physical: vk::PhysicalDevice) -> Opt
     // SAFETY: plain query.
     let families = unsafe { instance.get_physical_device_queue_family_properties(physical) };
     let compute = |f: &vk::QueueFamilyProperties| f.queue_flags.contains(vk::QueueFlags::COMPUTE);
-    // A family without graphics is not disturbed by a desktop.
+    // A queue family without graphics does not share its time with a desktop.
     families
         .iter()
         .position(|f| {
@@ -280,7 +279,7 @@ fn compute_family(instance: &ash::Instance, physical: vk::PhysicalDevice) -> Opt
         .map(|i| i as u32)
 }
 
-/// What a device is, and its identity.
+/// Describes a device, with its identity.
 fn summarise(instance: &ash::Instance, physical: vk::PhysicalDevice) -> (DeviceSummary, [u8; vk::UUID_SIZE]) {
     let mut driver = vk::PhysicalDeviceDriverProperties::default();
     let mut subgroup = vk::PhysicalDeviceSubgroupProperties::default();
@@ -347,7 +346,7 @@ fn candidates(instance: &ash::Instance) -> Result<Vec<Candidate>, GpuError> {
     Ok(found)
 }
 
-/// Those that the options allow, best first: discrete before integrated before virtual before software.
+/// The devices that the options allow, best first: discrete before integrated before virtual before software.
 fn usable(instance: &ash::Instance, mut all: Vec<Candidate>, options: &GpuOptions) -> Vec<Candidate> {
     all.retain(|c| {
         c.summary.refused.is_none()
@@ -459,7 +458,7 @@ impl Gpu {
         }))
     }
 
-    /// What this device is.
+    /// Describes this device.
     pub fn summary(&self) -> &DeviceSummary {
         &self.summary
     }
@@ -502,7 +501,7 @@ impl Gpu {
 
 /// Results with the device and the operation in their errors.
 pub(super) trait On<T> {
-    /// A loss is remembered by the device.
+    /// The device remembers a loss.
     fn on(self, gpu: &Gpu, operation: &'static str) -> Result<T, GpuError>;
 }
 
@@ -518,14 +517,14 @@ impl<T> On<T> for Result<T, vk::Result> {
 }
 
 impl Gpu {
-    /// True once the driver called the device lost or [`Gpu::give_up`] was called: every use of it fails from then on, and
-    /// [`Gpu::reopen`] is the way on.
+    /// True once the driver reported the device as lost, or [`Gpu::give_up`] was called. Every use of it fails from then on, and
+    /// [`Gpu::reopen`] opens another.
     pub fn is_lost(&self) -> bool {
         self.state() != State::Well
     }
 
-    /// Gives up a device that does not finish: nothing is submitted to it or waited for any more, and nothing of it is freed, so that
-    /// dropping what was made from it returns at once. Calling it again changes nothing.
+    /// Gives up a device that does not finish. Nothing is submitted to it or waited for any more, and nothing of it is freed, so dropping what was
+    /// made from it returns at once. Calling it again changes nothing.
     pub fn give_up(&self) {
         if self.becomes(State::GivenUp) {
             let bytes = self.held_bytes.load(Ordering::Relaxed);
@@ -547,7 +546,7 @@ impl Gpu {
         }
     }
 
-    /// Changes a device that is well; what is wrong with it first stays. True when it did.
+    /// Changes the state of a device that works, and returns whether it did. The first fault of a device stays.
     fn becomes(&self, state: State) -> bool {
         let well = State::Well as u8;
         self.state.compare_exchange(well, state as u8, Ordering::AcqRel, Ordering::Acquire).is_ok()
@@ -568,13 +567,13 @@ impl Gpu {
         self.state() == State::GivenUp
     }
 
-    /// The queue, for one submission. Only one thread submits on the frame path, so it is free there.
+    /// The queue, for one submission. Only one thread submits frames, so it is free for them.
     pub(super) fn queue(&self) -> Result<MutexGuard<'_, vk::Queue>, GpuError> {
         let begin = Instant::now();
         loop {
             match self.queue.try_lock() {
                 Ok(queue) => return Ok(queue),
-                // A handle cannot be left half changed by a thread that panicked.
+                // A thread that panicked cannot have left a handle half changed.
                 Err(TryLockError::Poisoned(queue)) => return Ok(PoisonError::into_inner(queue)),
                 Err(TryLockError::WouldBlock) => {}
             }
@@ -588,10 +587,10 @@ impl Gpu {
         }
     }
 
-    /// Memory for a buffer is about to be taken.
+    /// Checks whether there is room, before memory for a buffer is allocated.
     ///
     /// # Errors
-    /// [`GpuError::AddressSpace`]: software Vulkan would crash for want of what is left.
+    /// [`GpuError::AddressSpace`]: without the rest of the address space software Vulkan would crash.
     pub(super) fn takes(&self, bytes: u64) -> Result<(), GpuError> {
         let held = self.held_bytes.load(Ordering::Relaxed);
         if let Some(most) = self.most_bytes.filter(|most| held.saturating_add(bytes) > *most) {
@@ -600,7 +599,7 @@ impl Gpu {
         Ok(())
     }
 
-    /// Memory of a buffer was taken, or freed.
+    /// Counts memory of a buffer that was allocated or freed.
     pub(super) fn holds(&self, more_bytes: u64, fewer_bytes: u64) {
         self.held_bytes.fetch_add(more_bytes, Ordering::Relaxed);
         self.held_bytes.fetch_sub(fewer_bytes, Ordering::Relaxed);

@@ -17,7 +17,7 @@ pub enum GpuError {
          mesa-vulkan-drivers); VK_ICD_FILENAMES and VK_DRIVER_FILES, if set, must name existing files"
     )]
     NoDriver(String),
-    /// Drivers exist but no device will do.
+    /// There are drivers, but no usable device.
     #[error("no usable Vulkan device. Found: {found}. Needed: {needed}")]
     NoDevice {
         /// Devices and why each was refused.
@@ -25,7 +25,7 @@ pub enum GpuError {
         /// What dpm needs.
         needed: String,
     },
-    /// The process may not use as much address space as software Vulkan takes, which would crash for want of it.
+    /// The process may not use as much address space as software Vulkan needs, which would crash without it.
     #[error(
         "{device} runs on the CPU and needs {needed_mib} MiB of address space, but this process is limited to {limit_mib} MiB \
          (RLIMIT_AS). Raise the limit (`ulimit -v unlimited`; as a service: LimitAS=infinity), or use a hardware GPU"
@@ -68,7 +68,7 @@ pub enum GpuError {
         /// Allowed.
         limit: u64,
     },
-    /// The wait ended before the GPU did. Not a loss: wait again, or give the device up ([`super::Gpu::give_up`]).
+    /// The wait ended before the GPU had finished. The device is not lost: wait again, or give it up ([`super::Gpu::give_up`]).
     #[error(
         "{device} did not finish within {waited_ms} ms. It is too slow for this scene (lower render.spp or the raster), or it hangs \
          (see the kernel's log: dmesg)"
@@ -76,10 +76,10 @@ pub enum GpuError {
     Timeout {
         /// Which device.
         device: Arc<str>,
-        /// For how long it was waited.
+        /// How long the wait was.
         waited_ms: u64,
     },
-    /// The driver says that the device is lost; everything made from it is dead.
+    /// The driver reports that the device is lost. Nothing that was made from it works any more.
     #[error(
         "{device} was lost while {operation}: its driver gave it up (reset, unplugged, switched off, or a fault; the kernel's log tells \
          more: dmesg). It must be opened anew"
@@ -90,7 +90,7 @@ pub enum GpuError {
         /// Which device.
         device: Arc<str>,
     },
-    /// The program gave the device up because it did not finish: nothing is asked of it any more.
+    /// The program gave the device up because it did not finish. The device is not used any more.
     #[error(
         "{device} was given up because it did not finish what it was given, and is not used for {operation}; see the kernel's log \
          (dmesg). It must be opened anew"
@@ -101,13 +101,13 @@ pub enum GpuError {
         /// Which device.
         device: Arc<str>,
     },
-    /// What the slot was submitted for last is not over.
+    /// The slot's last submission has not ended.
     #[error("a frame was submitted to {device} while the one before it in the same memory is still being made; wait for that first")]
     InFlight {
         /// Which device.
         device: Arc<str>,
     },
-    /// A lost device does not come back, and there is no other one.
+    /// A lost device could not be opened again, and there is no other one.
     #[error("{device} was lost and there is no other device to go on with: {tried}. Look at the kernel's log (dmesg), then start again")]
     NoneLeft {
         /// The device that was lost.
@@ -176,7 +176,7 @@ impl GpuError {
         }
     }
 
-    /// The device is gone, and [`super::Gpu::reopen`] is what may help. False for a mere timeout, after which the caller may wait on.
+    /// Whether the device is gone, so that only [`super::Gpu::reopen`] may help. False for a timeout, after which the caller may continue to wait.
     pub fn is_loss(&self) -> bool {
         matches!(self, Self::DeviceLost { .. } | Self::GivenUp { .. })
     }
@@ -186,7 +186,7 @@ impl GpuError {
 mod tests {
     use super::*;
 
-    /// Found in use, R12: what an operator reads when a GPU fails. Every message names the device and what was being done.
+    /// Found in use (R12): when a GPU fails, every message names the device and the operation.
     #[test]
     fn every_failure_names_device_and_operation_and_only_a_loss_is_one() {
         let device: Arc<str> = "Some GPU".into();

@@ -2,9 +2,9 @@
 
 use dpm_device::time::HostTime;
 
-/// Counts the losses of a GPU: so many within so long are answered by opening a device anew, one more ends the attempt.
+/// Counts the losses of a GPU. After a few losses within some time a device is opened again. One more loss ends the run.
 ///
-/// Time is the injected clock's. After a pause of `within_ns` the whole allowance is there again.
+/// The caller gives the time. After a pause of `within_ns` without losses all of them are allowed again.
 #[derive(Clone, Debug)]
 pub struct LossBudget {
     /// When the last losses happened, oldest first: at most `most` of them.
@@ -17,27 +17,27 @@ pub struct LossBudget {
 /// What to do about a loss.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum AfterLoss {
-    /// Open a device anew.
+    /// Open a device again.
     OpenAnew,
-    /// It was lost too often: stay dark and end with a clear message.
+    /// The GPU was lost too often: stay dark, and end with a clear message.
     GiveUp,
 }
 
 impl LossBudget {
-    /// Three losses a minute are survived: a GPU that is lost more often will not hold a picture.
+    /// Allows three losses a minute. A GPU that is lost more often is of no use.
     pub const MOST: usize = 3;
     /// A minute, nanoseconds.
     pub(crate) const WITHIN_NS: i64 = 60_000_000_000;
 
-    /// Survives `most` losses within any `within_ns` nanoseconds.
+    /// Allows `most` losses within any `within_ns` nanoseconds.
     pub(crate) fn new(most: usize, within_ns: i64) -> Self {
         Self { recent: Vec::with_capacity(most), most, within_ns, total: 0 }
     }
 
-    /// A loss at `now`: what to do about it. Allocates nothing.
+    /// What to do about a loss at `now`. Allocates nothing.
     pub fn lost(&mut self, now: HostTime) -> AfterLoss {
         self.total = self.total.saturating_add(1);
-        // A clock that ran backwards counts as no time at all.
+        // If the clock ran backwards, no time has passed.
         self.recent.retain(|&at| now.ns_since(at) < self.within_ns);
         if self.recent.len() >= self.most {
             return AfterLoss::GiveUp;

@@ -2,11 +2,10 @@
 //!
 //! Everything here runs headless on any Vulkan 1.2 device with scalar block layout, software ones included.
 //!
-//! A device may be lost, or hang. Then every call fails at once, everything can be dropped without waiting, and [`Gpu::reopen`] gives a
-//! device to go on with: make the renderer and its slots anew on that one
-//! ([`crate::Renderer::from_plan`]). [`LossBudget`] says when to stop trying. Drivers' calls that do
-//! not return (a submission, the making of a device) can be left only with their thread, and such a process should end by `_exit`: what
-//! drivers run at an orderly exit may wait for the very threads that hang.
+//! A device may be lost, or hang. Then every call fails at once, and everything can be dropped without waiting. [`Gpu::reopen`] opens a device
+//! on which the renderer and its slots can be made again ([`crate::Renderer::from_plan`]). [`LossBudget`] decides when to stop trying. A call of a
+//! driver that does not return (a submission, the creation of a device) can only be abandoned together with its thread. Such a process should end
+//! by `_exit`, because what drivers run at an orderly exit may wait for the threads that hang.
 #![allow(unsafe_code)]
 
 mod address_space;

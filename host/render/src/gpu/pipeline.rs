@@ -14,7 +14,7 @@ pub enum BindingKind {
     Uniform,
     /// Storage buffer.
     Storage,
-    /// Storage texel buffer: what the driver reads by image instructions.
+    /// Storage texel buffer, which the driver reads by image instructions.
     Texel,
 }
 
@@ -28,7 +28,7 @@ impl BindingKind {
     }
 }
 
-/// The layout of set 0: which binding is of which kind.
+/// The layout of set 0: the kind of each binding.
 pub struct BindingTable {
     layout: vk::DescriptorSetLayout,
     pipeline_layout: vk::PipelineLayout,
@@ -38,7 +38,7 @@ pub struct BindingTable {
 
 impl BindingTable {
     /// # Errors
-    /// Vulkan's.
+    /// A call of Vulkan failed.
     pub fn new(gpu: &Arc<Gpu>, bindings: &[(u32, BindingKind)]) -> Result<Arc<Self>, GpuError> {
         let entries: Vec<_> = bindings
             .iter()
@@ -82,7 +82,7 @@ impl Drop for BindingTable {
     }
 }
 
-/// Buffers bound to a table. Holds no buffer: the owner keeps them alive as long as the GPU may use them.
+/// Buffers bound to a table. It does not hold the buffers. Their owner keeps them alive as long as the GPU may use them.
 pub struct BindingSet {
     pub(super) set: vk::DescriptorSet,
     pool: vk::DescriptorPool,
@@ -93,10 +93,10 @@ impl BindingSet {
     /// Binds every entry of the table.
     ///
     /// # Errors
-    /// Vulkan's.
+    /// A call of Vulkan failed.
     ///
     /// # Panics
-    /// When an entry of the table is missing from `buffers`: a programmer's mistake.
+    /// If an entry of the table is missing from `buffers`, which is a mistake of the caller.
     pub fn new(table: &Arc<BindingTable>, buffers: &[(u32, &Buffer)]) -> Result<Self, GpuError> {
         let gpu = &table.gpu;
         let count = |kind| table.bindings.iter().filter(|b| b.1 == kind).count() as u32;
@@ -158,10 +158,10 @@ pub struct ComputePipeline {
 }
 
 impl ComputePipeline {
-    /// Compiles `shader` with constants `(id, value as 32 bits)`; booleans are 0 and 1.
+    /// Compiles `shader` with specialization constants `(id, value as 32 bits)`. Booleans are 0 and 1.
     ///
     /// # Errors
-    /// Vulkan's.
+    /// A call of Vulkan failed.
     pub fn new(
         table: &Arc<BindingTable>,
         shader: Shader,

@@ -1,4 +1,4 @@
-//! The way on after a loss: the same device opened anew, or another one.
+//! After a loss: opens the same device again, or another one.
 
 use super::commands::run_now;
 use super::context::{DeviceId, Gpu};
@@ -9,22 +9,22 @@ use std::time::{Duration, Instant};
 
 /// A device that has not opened and run an empty submission within this time does not come back.
 const COMES_BACK_WITHIN: Duration = Duration::from_secs(2);
-/// Time between two attempts on the same device: drivers need a moment to reset one.
+/// Time between two attempts on the same device. Drivers need a moment to reset a device.
 const BETWEEN: Duration = Duration::from_millis(100);
-/// How long copies at set-up are waited for on a device that was opened anew, nanoseconds.
+/// How long to wait for copies at set-up on a device that was opened again, nanoseconds.
 const SETUP_WAIT_NS: u64 = 2_000_000_000;
 /// Most devices that are tried.
 const MOST_TRIED: usize = 8;
 
 impl Gpu {
-    /// Opens a device in place of this one, which is given up unless its driver called it lost: the same device first, again and again for
-    /// 2 s, then, best first, the others that the options of [`Gpu::open`] allow, 2 s each. Open means that an empty submission ran. Another
-    /// device is told in the log, and by the summary of what is returned.
+    /// Opens a device in place of this one, which is given up unless its driver reported it as lost. The same device is tried first, repeatedly
+    /// for 2 s. Then the others that the options of [`Gpu::open`] allow are tried, best first, for 2 s each. A device counts as open after an empty
+    /// submission ran on it. The log and the summary of the result name the device if it is another one.
     ///
-    /// The caller waits for at most 2 s a device, and 2 s for the list of them. A driver that does not return from a call costs a thread, which stays behind.
+    /// The caller waits for at most 2 s a device, and 2 s for the list of devices. A driver that does not return from a call keeps a thread for ever.
     ///
     /// # Errors
-    /// [`GpuError::NoneLeft`] with what was tried.
+    /// [`GpuError::NoneLeft`] with the devices that were tried.
     pub fn reopen(&self) -> Result<Arc<Gpu>, GpuError> {
         self.give_up();
         let none_left = |tried: &[String]| GpuError::NoneLeft {
@@ -60,7 +60,7 @@ impl Gpu {
         Err(none_left(&told))
     }
 
-    /// This device anew, tried until it works or its time is over.
+    /// Opens this device again: tries until it works, or until its time is over.
     fn same_again(&self) -> Result<Arc<Gpu>, GpuError> {
         let begin = Instant::now();
         loop {
@@ -69,7 +69,7 @@ impl Gpu {
                     Ok(gpu) => return Ok(gpu),
                     Err(error) => error,
                 };
-            // An attempt without time enough would only say that it had none.
+            // An attempt with too little time would only report a timeout.
             if begin.elapsed() + 2 * BETWEEN >= COMES_BACK_WITHIN {
                 return Err(error);
             }
@@ -88,7 +88,7 @@ impl Gpu {
     }
 }
 
-/// What `work` gives, if it does so within `limit`. What comes later is dropped where it was made.
+/// The result of `work`, if it comes within `limit`. A later result is dropped in its own thread.
 fn within<T: Send + 'static>(
     limit: Duration,
     what: &'static str,

@@ -4,9 +4,17 @@
 
 use super::{source_bit, BitPlaneFrame, CODE_BITS};
 use dpm_device::planes::{PlaneSchedule, Raster};
+use dpm_shaders::specialization as ids;
 
-/// First specialization constant of the table of planes, four planes a constant.
-const FIRST_TABLE_CONSTANT: u32 = 20;
+/// The constants that hold the planes of four bits of a code value each, from the lowest bits on.
+const PLANES_OF_FOUR_BITS: [u32; CODE_BITS / 4] = [
+    ids::PLANE_OF_BITS_0,
+    ids::PLANE_OF_BITS_4,
+    ids::PLANE_OF_BITS_8,
+    ids::PLANE_OF_BITS_12,
+    ids::PLANE_OF_BITS_16,
+    ids::PLANE_OF_BITS_20,
+];
 /// No plane shows the bit.
 const NO_PLANE: u32 = 0xff;
 /// Words of a plane that a workgroup writes.
@@ -33,10 +41,9 @@ pub fn constants(raster: Raster, schedule: &PlaneSchedule) -> Vec<(u32, u32)> {
     for (plane, &spec) in schedule.planes().iter().enumerate() {
         plane_of_bit[source_bit(spec) as usize] = plane as u32;
     }
-    let mut all = vec![(14, raster.width()), (15, raster.height())];
-    for (i, four) in plane_of_bit.chunks(4).enumerate() {
-        let word = four.iter().rev().fold(0, |word, plane| word << 8 | plane);
-        all.push((FIRST_TABLE_CONSTANT + i as u32, word));
+    let mut all = vec![(ids::PLANE_WIDTH, raster.width()), (ids::PLANE_HEIGHT, raster.height())];
+    for (id, four) in PLANES_OF_FOUR_BITS.into_iter().zip(plane_of_bit.chunks(4)) {
+        all.push((id, four.iter().rev().fold(0, |word, plane| word << 8 | plane)));
     }
     all
 }

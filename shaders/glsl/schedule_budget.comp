@@ -1,0 +1,37 @@
+// How many samples each pixel gets this frame: a budget is shared out in proportion to the pixels' importance (method dpm).
+//
+// Fractions of a sample are rounded by blue noise in time.
+#version 460
+#extension GL_GOOGLE_include_directive : require
+#include "work_list.glsl"
+#include "noise.glsl"
+#include "importance.glsl"
+
+layout(local_size_x = 8, local_size_y = 8) in;
+
+// No pixel gets more than this many times the budget of an average pixel, or of one sample where the budget is smaller.
+const float LARGEST_SHARE = 16.0;
+
+uint samples_of(uvec2 pixel, uint at) {
+    if (!is_lit(surface_at(at))) return 0u;
+    History h = history_at(at);
+    float share = frame.budget_spp;
+    if ((frame.flags & FRAME_ALLOCATE) != 0u) share *= float(importance_of(h)) / max(float(schedule.importance), 1.0) * float(schedule.lit);
+    // No pixel waits longer than two or three frames.
+    share = clamp(share, min(0.5, 0.5 * frame.budget_spp), LARGEST_SHARE * max(frame.budget_spp, 1.0));
+    float one = min(1.0, 2.0 * frame.budget_spp);
+    // The light of a deterministic pixel takes one sample, and the tracer stops there. The others are for a pixel that has just stopped being
+    // deterministic. A new point is traced at once, because its own light is better than a guess.
+    if ((h.flags & HISTORY_EXACT) != 0u) share = max(one, 2.0 * frame.budget_spp);
+    else if (h.index == 0u) share = max(share, one);
+    float whole = floor(share);
+    return uint(whole) + (blue_noise(pixel, frame.drawn, 0u) < share - whole ? 1u : 0u);
+}
+
+void main() {
+    uvec2 pixel;
+    bool inside = tile_pixel(tiles[gl_WorkGroupID.x >> 2u], pixel);
+    uint at = pixel.y * frame.width + pixel.x;
+    uint spp = !inside ? 0u : camera_is_eye() ? samples_of_camera(at) : samples_of(pixel, at);
+    list_work(at, inside, spp);
+}
