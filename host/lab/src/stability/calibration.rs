@@ -18,7 +18,7 @@ pub(super) fn cases() -> Vec<Case> {
         Case::new("calibration-covariance", "60 times 0.5 px of noise", "mean of (error / stated deviation)^2, either way", "ratio", 2.0, covariance),
         Case::new("calibration-wrong-start", "focal length 100 times and a hundredth", "the same minimum, or not converged", "faults", 0.0, wrong_start),
         Case::new("calibration-units", "metres, millimetres, 1e6 with an offset of 1e6", "same focal length", "relative", 1e-6, units),
-        Case::new("calibration-wide-field", "132 deg of field", "truth, and a warning", "relative", 1e-8, wide),
+        Case::new("calibration-wide-field", "132 deg of field", "truth, with a warning", "relative", 1e-8, wide),
         Case::new("distortion-without-inverse", "r (1 - r^2 / 2) beyond its turning point, NaN, 1e300", "no answer instead of a wrong one", "faults", 0.0, no_inverse),
         Case::new("distortion-round-trip", "radial, tangential, rational and prism terms to 40 deg", "undistort inverts distort", "tangent", 1e-10, round_trip),
         Case::new("projection-near-plane", "depth +-0, 1e-300, 1e-9, behind, NaN, 1e300", "no answer or finite", "faults", 0.0, near_plane),

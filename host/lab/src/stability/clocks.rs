@@ -10,7 +10,7 @@ pub(super) fn cases() -> Vec<Case> {
     vec![
         Case::new(
             "clock-skew-and-drift",
-            "+-200 ppm, drifting 1 ppm/s, ways of 15 us + exponential 8 us, 10 exchanges a second",
+            "+-200 ppm, drifting 1 ppm/s, delays of 15 us + exponential 8 us, 10 exchanges a second",
             "truth of the simulation, 99th percentile after 3 s",
             "us",
             10.0,
@@ -18,7 +18,7 @@ pub(super) fn cases() -> Vec<Case> {
         ),
         Case::new(
             "clock-bound-is-honest",
-            "1 % stalls of 5 ms, ways 40 us there and 300 us back, half of the exchanges lost",
+            "1 % stalls of 5 ms, delays of 40 us there and 300 us back, half of the exchanges lost",
             "error beyond the stated bound",
             "ns",
             0.0,
@@ -35,7 +35,7 @@ pub(super) fn cases() -> Vec<Case> {
         Case::new(
             "clock-never-goes-back",
             "stamps in order across steps, stalls and refits",
-            "later stamp, later time",
+            "a later stamp gives a later time",
             "violations",
             0.0,
             monotone,
@@ -66,7 +66,7 @@ pub(super) fn cases() -> Vec<Case> {
         ),
         Case::new(
             "clock-impossible-exchanges",
-            "received before sent, answered before seen, ends of the range",
+            "received before sent, answered before received, ends of the range",
             "refused; the map does not move",
             "faults",
             0.0,

@@ -136,7 +136,7 @@ pub(crate) const CASES: &[GpuCase] = &[
     GpuCase(
         "gpu-firefly-limit",
         "limits of 0.002, 0.02 and 1e30",
-        "what is left is below it; removes and counts, never adds; out of reach it changes nothing",
+        "the rest is below the limit; the limit removes and counts light, and never adds any; a limit out of reach changes nothing",
         "faults",
         0.0,
         firefly_limit,

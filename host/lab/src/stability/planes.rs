@@ -61,7 +61,7 @@ pub(super) fn cases() -> Vec<Case> {
         Case::new(
             "slots-947-fps-for-400-days",
             "947 fps, 24,000/1001 fps, 1 fps: starts, lengths, inverse",
-            "i128 rationals: within 1 ns for ever",
+            "i128 rationals: within 1 ns without drift",
             "ns",
             1.0,
             slots,

@@ -26,7 +26,7 @@ pub(super) fn cases() -> Vec<Case> {
         Case::new(
             "predictor-constant-velocity",
             "1 m/s without noise, 5 ms ahead",
-            "closed form, over the way covered",
+            "closed form, relative to the distance covered",
             "relative",
             1e-6,
             constant_velocity,
@@ -34,7 +34,7 @@ pub(super) fn cases() -> Vec<Case> {
         Case::new(
             "predictor-constant-spin",
             "100 rad/s about a slanted axis without noise, 5 ms ahead",
-            "closed form, over the angle covered",
+            "closed form, relative to the angle covered",
             "relative",
             1e-6,
             constant_spin,
@@ -50,7 +50,7 @@ pub(super) fn cases() -> Vec<Case> {
         Case::new(
             "predictor-acceleration-step",
             "0 to 100 m/s^2 at once, 5 ms ahead",
-            "half a tau^2 with tau from the last sample, over it",
+            "half a tau^2 with tau from the last sample; the error as a ratio to it",
             "ratio",
             1.5,
             acceleration_step,
@@ -106,7 +106,7 @@ pub(super) fn cases() -> Vec<Case> {
         Case::new(
             "predictor-horizon",
             "0, 5, 50, 1000 ms and negative without samples",
-            "error grows; motion stops at the limit; Lost is said",
+            "the stated error grows; motion stops at the limit; the state becomes Lost",
             "faults",
             0.0,
             horizon,

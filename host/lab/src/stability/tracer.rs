@@ -62,7 +62,7 @@ pub(super) fn cases() -> Vec<Case> {
         Case::new(
             "tracer-self-hits-and-leaks",
             "spheres of radius 1e-6 to 1e6 m at up to 1e5 m, new rays on both sides",
-            "no ray hits what it leaves, none gets out",
+            "no ray hits the surface that it leaves, none escapes",
             "share",
             0.0,
             self_hits,
