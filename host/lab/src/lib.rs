@@ -30,3 +30,4 @@ pub mod snapshot;
 mod sobol;
 pub mod stability;
 pub mod stamp;
+mod statistics;
