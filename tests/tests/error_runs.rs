@@ -3,7 +3,7 @@
 
 use dpm_device::planes::Raster;
 use dpm_lab::error::export::FrameIndex;
-use dpm_lab::error::plan::Group;
+use dpm_lab::error::plan::Setting;
 use dpm_lab::error::reference::Reference;
 use dpm_lab::error::runs::{is_other, ErrorOptions, ErrorRuns, Extent, AT_EQUAL_TIME, EYE_FRAMES, RACES};
 use dpm_lab::sequence::{eye_mean, rmse, Span, Theatre};
@@ -15,12 +15,12 @@ use dpm_rig::run_rig::open_gpu;
 use glam::Vec3;
 use std::sync::Arc;
 
-fn stage(settings: &[&str]) -> (Arc<Rig>, Arc<Gpu>) {
+fn stage(settings: &[&str]) -> (Rig, Arc<Gpu>) {
     let gaze = "observer.gaze={kind=\"point\",point=[-0.1,0.0,0.0]}";
     let flags = [gaze].iter().chain(settings).map(|s| (*s).to_owned()).collect();
     let config = RigConfig::demo(&Overrides { variables: vec![], flags }).unwrap_or_else(|e| panic!("{e}"));
     let gpu = open_gpu(&config).unwrap_or_else(|e| panic!("{e}"));
-    (Arc::new(Rig::build(&config, Raster::new(40, 30)).unwrap_or_else(|e| panic!("{e}"))), gpu)
+    (Rig::build(&config, Raster::new(40, 30)).unwrap_or_else(|e| panic!("{e}")), gpu)
 }
 
 /// The noise without a reference: the RMS difference of two runs divided by the square root of two. For single
@@ -34,7 +34,7 @@ fn noise(theatre: &Theatre, method: &Method, seeds: [u32; 2]) -> (f64, f64) {
 #[test]
 fn independent_samples_fall_by_half_an_order_an_order() {
     let (rig, gpu) = stage(&[]);
-    let theatre = Theatre::frozen(rig, gpu, Span { last_slot: 60, warm_up: 0, kept: 12 }).unwrap();
+    let theatre = Theatre::frozen(Arc::new(rig), gpu, Span { last_slot: 60, warm_up: 0, kept: 12 }).unwrap();
     let ((few, few_seen), (many, _)) =
         (noise(&theatre, &Method::full(2), [1, 2]), noise(&theatre, &Method::full(32), [3, 4]));
     let (slope, by_frames) = ((many / few).ln() / 16f64.ln(), (few_seen / few).ln() / 12f64.ln());
@@ -53,7 +53,8 @@ fn a_sampler_that_loses_light_is_told_from_one_that_does_not() {
     let seen = |settings: &[&str], seed: u32| {
         let (rig, gpu) = stage(settings);
         let theatre =
-            Theatre::frozen(rig, gpu, Span { last_slot: 60, warm_up: 0, kept: EYE_FRAMES as u32 }).unwrap();
+            Theatre::frozen(Arc::new(rig), gpu, Span { last_slot: 60, warm_up: 0, kept: EYE_FRAMES as u32 })
+                .unwrap();
         let cache = std::env::temp_dir().join(format!("dpm-bias-{}", std::process::id()));
         let eyes = [seed, seed + 1].map(|s| {
             let seen = theatre.play(&Method::full(32), 32.0, s, &mut |_, _| ()).unwrap();
@@ -80,10 +81,9 @@ fn a_group_is_measured_at_equal_rays_and_tells_bias_from_noise() {
     let cache = std::env::temp_dir().join(format!("dpm-error-{}", std::process::id()));
     let extent = Extent { warm_up: 8, kept: 48, reference_spp: 16 };
     let options = ErrorOptions { extent, ablation: false, cache: cache.clone() };
-    let runs = ErrorRuns::new(rig, gpu, options);
-    let group = Group { moving: false, budget: 4.0 };
+    let runs = ErrorRuns::new(rig, gpu, Setting::plain(false, 4.0), options);
     let mut drawn = Vec::new();
-    let measured = runs.measure(group, &mut |what| drawn.push(what.to_owned())).unwrap();
+    let measured = runs.measure(&mut |what| drawn.push(what.to_owned())).unwrap();
     let result = measured.result.clone();
     assert_eq!(drawn.iter().filter(|d| *d == "reference").count(), 2);
     for r in &result.rows {
@@ -130,7 +130,7 @@ fn a_group_is_measured_at_equal_rays_and_tells_bias_from_noise() {
     // Stopped before the group was kept: reference and methods come from the cache, and only the times are measured
     // again.
     drawn.clear();
-    let again = runs.measure(group, &mut |what| drawn.push(what.to_owned())).unwrap();
+    let again = runs.measure(&mut |what| drawn.push(what.to_owned())).unwrap();
     let is_time = |what: &String| what == "times" || what.ends_with(AT_EQUAL_TIME);
     assert!(drawn.iter().all(is_time), "{drawn:?}");
     assert!((1..=1 + RACES).contains(&drawn.iter().filter(|what| *what == "times").count()), "{drawn:?}");
@@ -145,7 +145,7 @@ fn a_group_is_measured_at_equal_rays_and_tells_bias_from_noise() {
     assert_eq!(parts(), 0);
     // The frames on disk are those that were measured: the eye sees the mean of the last 31 of them.
     let dir = cache.join("frames");
-    runs.export(group, &result, &dir, &mut |_| ()).unwrap();
+    runs.export(&result, &dir, &mut |_| ()).unwrap();
     let index: FrameIndex =
         serde_json::from_slice(&std::fs::read(dir.join("sequence.json")).unwrap()).unwrap();
     assert!((index.frame_rate_hz - 947.0).abs() < 1.0 && index.pixels_per_degree > 0.1);

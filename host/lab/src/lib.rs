@@ -31,4 +31,5 @@ pub mod snapshot;
 mod sobol;
 pub mod stability;
 pub mod stamp;
+mod statistics;
 pub mod twins;

@@ -1,21 +1,17 @@
 //! `dpm error`: error against cost of every method, as tables and curves.
 
-use super::error_files::{known, known_or, merge, report, show, Kept, Origin};
-use super::progress::Progress;
+use super::error_experiments::run;
+use super::error_files::merge;
 use super::rig_args::RigArgs;
 use super::watch::print;
 use dpm_common::files::check_folder;
 use dpm_device::planes::Raster;
-use dpm_lab::error::plan::{contenders, groups, Group};
-use dpm_lab::error::plot::{curves, Cost};
-use dpm_lab::error::report::{csv, markdown};
-use dpm_lab::error::runs::{
-    is_other, ErrorOptions, ErrorRunError, ErrorRuns, Extent, GroupResult, AT_EQUAL_TIME, EYE_FRAMES, RACES,
-};
+use dpm_lab::error::figure3::Figure3Group;
+use dpm_lab::error::plan::Setting;
+use dpm_lab::error::runs::{ErrorOptions, Extent, GroupResult};
+use dpm_lab::error::table::TableGroup;
 use dpm_render::gpu::Gpu;
-use dpm_rig::config::RenderConfig;
 use dpm_rig::failure::{Failure, FailureKind};
-use dpm_rig::pipeline::PipelineError;
 use dpm_rig::rig::Rig;
 use dpm_rig::run_rig::open_gpu;
 use dpm_rig::telemetry::report::to_json;
@@ -58,7 +54,7 @@ pub(crate) struct ErrorArgs {
     /// Also write what the eye saw, frame by frame, of every method and of the reference, for other metrics:
     /// OUT/sequences
     #[arg(long, conflicts_with = "preset")]
-    sequences: bool,
+    pub(super) sequences: bool,
     /// Print one JSON object
     #[arg(long)]
     pub(super) json: bool,
@@ -106,69 +102,19 @@ pub(super) fn execute(args: &ErrorArgs) -> Result<(), Failure> {
         return merge(out, *json);
     }
     args.flags.refuse("dpm error", &["--frames", "--seconds", "--no-prediction"])?;
-    match args.preset {
-        Some(Preset::Figure3) => return super::error_figure3::figure3(args),
-        Some(Preset::Table) => return super::error_table::table(args),
-        None => {}
-    }
     let budgets = match (&args.budgets[..], args.quick) {
         ([], true) => vec![2.0, 6.0, 18.0],
         ([], false) => vec![0.25, 0.5, 1.0, 2.0, 4.0, 9.0, 18.0, 36.0, 64.0],
         (given, _) => given.to_vec(),
     };
-    let all = groups(&budgets);
-    if args.list {
-        return list(args, all.iter().map(Group::name));
-    }
-    let chosen = chosen(args, &all)?;
-    let out = folder(args);
-    let runs = prepare(args, &out)?;
-    let results = measure(&runs, &chosen, args, &out)?;
-    end(args, &out, &results)
-}
-
-/// Reports the whole experiment, or shows the group that `--index` selects.
-pub(super) fn end<T: Kept>(args: &ErrorArgs, out: &Path, groups: &[T]) -> Result<(), Failure> {
-    if args.index.is_some() {
-        // One group is not a report; `merge` makes the reports of the whole.
-        show(groups, args.json);
-        return Ok(());
-    }
-    report(out, groups, args.json)
-}
-
-impl Kept for GroupResult {
-    const PREFIX: &'static str = "group";
-    const REPORT: &'static str = "error";
-
-    fn name(&self) -> String {
-        self.group().name()
-    }
-
-    fn origin(&self) -> Origin<'_> {
-        Origin { key: &self.key, stamp: &self.stamp, extent: Some(self.extent) }
-    }
-
-    fn order(&self) -> (bool, bool, f64) {
-        let group = self.group();
-        (false, group.moving, group.budget)
-    }
-
-    fn markdown(groups: &[Self]) -> String {
-        markdown(groups)
-    }
-
-    fn reports(groups: &[Self]) -> Result<Vec<(String, String)>, String> {
-        let mut all = vec![(".csv".to_owned(), csv(groups))];
-        for (moving, motion) in [(false, "still"), (true, "moving")] {
-            for (cost, name) in [(Cost::Rays, "rays"), (Cost::GpuMs, "ms")] {
-                all.push((format!("-{motion}-{name}.svg"), curves(groups, moving, cost)?));
-            }
-        }
-        Ok(all)
+    match args.preset {
+        Some(Preset::Figure3) => run::<Figure3Group>(args, &Setting::of_figure3()),
+        Some(Preset::Table) => run::<TableGroup>(args, &Setting::of_table()),
+        None => run::<GroupResult>(args, &Setting::at_budgets(&budgets)),
     }
 }
 
+/// Where groups and reports lie.
 pub(super) fn folder(args: &ErrorArgs) -> PathBuf {
     let own = match args.preset {
         Some(Preset::Figure3) => "out/figure3",
@@ -226,85 +172,4 @@ pub(super) fn stage(args: &ErrorArgs) -> Result<(Arc<Gpu>, Rig), Failure> {
     let small = args.flags.raster.is_none() && (args.quick || gpu.summary().software);
     let raster = if small { Raster::new(80, 60) } else { None };
     Ok((gpu, Rig::build(&config, raster)?))
-}
-
-fn prepare(args: &ErrorArgs, out: &Path) -> Result<ErrorRuns, Failure> {
-    let (gpu, rig) = stage(args)?;
-    Ok(ErrorRuns::new(Arc::new(rig), gpu, options(args, out)))
-}
-
-/// Relative cost of a sequence, for the remaining time: sample frames, plus the time of 3 samples for each frame.
-pub(super) fn weight(what: &str, group: Group, extent: Extent, methods: usize) -> u64 {
-    let frames = f64::from(extent.warm_up + extent.kept);
-    let sequence = frames * (group.budget.max(1.0) + 3.0);
-    let of = match what {
-        "reference" => EYE_FRAMES as f64 * f64::from(extent.reference_spp) / 2.0,
-        "reference of every frame" => f64::from(extent.kept * extent.reference_spp),
-        "times" => 40.0 / frames * sequence * methods as f64,
-        // About twice the samples, because of the warm-up and the frames that the eye sees.
-        what if what.ends_with(AT_EQUAL_TIME) => {
-            f64::from(extent.warm_up + EYE_FRAMES as u32) * (2.0 * group.budget.max(1.0) + 3.0)
-        }
-        _ => sequence,
-    };
-    of as u64
-}
-
-/// Maximum number of races per group: one at equal rays, the others for equal time.
-const MOST_RACES: u64 = 1 + RACES as u64;
-
-/// The cost of a group without its reference: each method twice, the races, and each of the others twice at equal
-/// time.
-pub(super) fn weight_of_methods(group: Group, extent: Extent, methods: usize) -> u64 {
-    let of = |what: &str| weight(what, group, extent, methods);
-    let others = contenders(&RenderConfig::default(), false).iter().filter(|c| is_other(c.name)).count();
-    2 * methods as u64 * of("") + MOST_RACES * of("times") + 2 * others as u64 * of(AT_EQUAL_TIME)
-}
-
-fn measure(
-    runs: &ErrorRuns,
-    chosen: &[Group],
-    args: &ErrorArgs,
-    out: &Path,
-) -> Result<Vec<GroupResult>, Failure> {
-    let extent = options(args, out).extent;
-    let methods = runs.methods();
-    let sequences = |group: Group| out.join("sequences").join(group.name());
-    let total = |group: Group, first: bool| {
-        let of = |what: &str| weight(what, group, extent, methods);
-        let reference = if first { 2 * of("reference") } else { 0 };
-        let every = if group.moving { of("reference of every frame") } else { 0 };
-        let measured = if known::<GroupResult>(out, &group.name(), &runs.key(group)).is_some() {
-            0
-        } else {
-            weight_of_methods(group, extent, methods) + reference
-        };
-        measured + if args.sequences { methods as u64 * of("") + every } else { 0 }
-    };
-    let first = |k: usize| chosen[..k].iter().all(|g| g.moving != chosen[k].moving);
-    let totals: Vec<u64> = chosen.iter().enumerate().map(|(k, &g)| total(g, first(k))).collect();
-    let mut progress = Progress::new(&totals);
-    let mut results = Vec::new();
-    for &group in chosen {
-        let name = group.name();
-        let mut each =
-            |what: &str| progress.step(&format!("{name} {what}"), weight(what, group, extent, methods));
-        let result = known_or(out, &name, &runs.key(group), || {
-            let measured = runs.measure(group, &mut each).map_err(failure)?;
-            Ok((measured.result.clone(), Some(measured)))
-        })?;
-        if args.sequences {
-            runs.export(group, &result, &sequences(group), &mut each).map_err(failure)?;
-        }
-        progress.end_of_part(&name);
-        results.push(result);
-    }
-    Ok(results)
-}
-
-pub(super) fn failure(error: ErrorRunError) -> Failure {
-    match error {
-        ErrorRunError::Render(e) => PipelineError::from(e).into(),
-        other => Failure::new(FailureKind::BadInput, other),
-    }
 }

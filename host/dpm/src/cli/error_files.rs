@@ -1,73 +1,42 @@
-//! Groups of `dpm error` in a folder: reads them or measures and keeps them, joins them, and reports them.
+//! Measured groups of `dpm error` in a folder: found again or measured and kept, joined, and reported. What differs from experiment to
+//! experiment is in `error_experiments.rs`.
 
+use super::error_experiments::{Experiment, Origin};
 use super::watch::print;
 use dpm_common::files::write_atomically;
 use dpm_device::regular_file;
 use dpm_lab::error::figure3::Figure3Group;
-use dpm_lab::error::runs::{Extent, GroupResult, Measured};
+use dpm_lab::error::plan::Setting;
+use dpm_lab::error::runs::{GroupResult, Measured};
 use dpm_lab::error::sheet::{stack, strip};
 use dpm_lab::error::table::TableGroup;
 use dpm_lab::snapshot::paint::Canvas;
-use dpm_lab::stamp::Stamp;
 use dpm_rig::failure::{Failure, FailureKind};
 use dpm_rig::telemetry::report::to_json;
-use serde::de::DeserializeOwned;
-use serde::Serialize;
 use serde_json::Value;
 use std::io::Write;
 use std::path::{Path, PathBuf};
 
-/// A measured group of an experiment, as stored in a folder.
-pub(super) trait Kept: Serialize + DeserializeOwned {
-    /// Prefix of its file names.
-    const PREFIX: &'static str;
-    /// Prefix of the names of the experiment's reports.
-    const REPORT: &'static str;
-
-    /// Its name among the groups of the experiment.
-    fn name(&self) -> String;
-    /// Its origin.
-    fn origin(&self) -> Origin<'_>;
-    /// Groups are listed in rising order of this.
-    fn order(&self) -> (bool, bool, f64);
-    /// The experiment's tables.
-    fn markdown(groups: &[Self]) -> String;
-    /// The experiment's other reports: name and text.
-    fn reports(_groups: &[Self]) -> Result<Vec<(String, String)>, String> {
-        Ok(Vec::new())
-    }
-}
-
-/// The origin of a measured group.
-pub(super) struct Origin<'a> {
-    /// Hash of everything that it depends on.
-    pub key: &'a str,
-    /// How it was measured.
-    pub stamp: &'a Stamp,
-    /// Its extent, if the group records it.
-    pub extent: Option<Extent>,
-}
-
 /// Largest file of a group that is read, bytes; real ones have some hundred thousand.
 const MAX_GROUP_BYTES: u64 = 1 << 30;
 
-fn path<T: Kept>(out: &Path, name: &str, key: &str) -> PathBuf {
+fn path<T: Experiment>(out: &Path, name: &str, key: &str) -> PathBuf {
     out.join(format!("{}-{name}-{key}.json", T::PREFIX))
 }
 
-fn path_of<T: Kept>(out: &Path, group: &T) -> PathBuf {
-    path::<T>(out, &group.name(), group.origin().key)
+fn path_of<T: Experiment>(out: &Path, group: &T) -> PathBuf {
+    path::<T>(out, &group.setting().name(), group.origin().key)
 }
 
 /// The result of an earlier run for a group, if it was made from the same inputs.
-pub(super) fn known<T: Kept>(out: &Path, name: &str, key: &str) -> Option<T> {
+pub(super) fn known<T: Experiment>(out: &Path, name: &str, key: &str) -> Option<T> {
     let bytes = regular_file::read(&path::<T>(out, name, key), MAX_GROUP_BYTES).ok()?;
     serde_json::from_slice(&bytes).ok().filter(|group: &T| group.origin().key == key)
 }
 
 /// The result of an earlier run for a group, or else the result of `measure`, which is kept, with a picture of what
 /// the eye saw if there is one.
-pub(super) fn known_or<T: Kept>(
+pub(super) fn known_or<T: Experiment>(
     out: &Path,
     name: &str,
     key: &str,
@@ -89,13 +58,13 @@ pub(super) fn known_or<T: Kept>(
 }
 
 /// Writes the tables, curves and pictures of an experiment, and prints the tables or one JSON object.
-pub(super) fn report<T: Kept>(out: &Path, groups: &[T], json: bool) -> Result<(), Failure> {
+pub(super) fn report<T: Experiment>(out: &Path, groups: &[T], json: bool) -> Result<(), Failure> {
     write_reports(out, groups)?;
     show(groups, json);
     Ok(())
 }
 
-fn write_reports<T: Kept>(out: &Path, groups: &[T]) -> Result<(), Failure> {
+fn write_reports<T: Experiment>(out: &Path, groups: &[T]) -> Result<(), Failure> {
     let file = |end: &str| out.join(format!("{}{end}", T::REPORT));
     write(&file(".json"), &to_json(&object(groups)))?;
     write(&file(".md"), &T::markdown(groups))?;
@@ -111,11 +80,11 @@ fn write_reports<T: Kept>(out: &Path, groups: &[T]) -> Result<(), Failure> {
 }
 
 /// Prints one JSON object or the tables.
-pub(super) fn show<T: Kept>(groups: &[T], json: bool) {
+pub(super) fn show<T: Experiment>(groups: &[T], json: bool) {
     print(&if json { to_json(&object(groups)) + "\n" } else { T::markdown(groups) });
 }
 
-fn object<T: Kept>(groups: &[T]) -> Value {
+fn object<T: Experiment>(groups: &[T]) -> Value {
     serde_json::json!({ "groups": groups })
 }
 
@@ -142,7 +111,7 @@ fn merged(out: &Path, json: bool) -> Result<String, Failure> {
 }
 
 /// Writes the reports of an experiment, if any part of it was measured, and adds it to the output.
-fn add<T: Kept>(
+fn add<T: Experiment>(
     out: &Path,
     groups: &[T],
     objects: &mut serde_json::Map<String, Value>,
@@ -158,11 +127,12 @@ fn add<T: Kept>(
 }
 
 /// All groups of an experiment in a folder, in their order.
-fn joined<T: Kept>(out: &Path) -> Result<Vec<T>, Failure> {
+fn joined<T: Experiment>(out: &Path) -> Result<Vec<T>, Failure> {
     let mut groups = read_all::<T>(out)?;
     groups.sort_by(|a, b| {
-        let ((a1, a2, a3), (b1, b2, b3)) = (a.order(), b.order());
-        (a1, a2).cmp(&(b1, b2)).then(a3.total_cmp(&b3))
+        let (a, b) = (a.setting(), b.setting());
+        let order = |s: &Setting| (s.aside, s.moving, s.look);
+        order(&a).cmp(&order(&b)).then(a.budget.total_cmp(&b.budget))
     });
     one_experiment(out, &groups)?;
     Ok(groups)
@@ -170,7 +140,7 @@ fn joined<T: Kept>(out: &Path) -> Result<Vec<T>, Failure> {
 
 /// Checks that all groups have the same configuration, raster, seed and extent, and that none occurs twice; only such
 /// groups share curves. They may come from different devices and commits, which the tables show.
-fn one_experiment<T: Kept>(out: &Path, sorted: &[T]) -> Result<(), Failure> {
+fn one_experiment<T: Experiment>(out: &Path, sorted: &[T]) -> Result<(), Failure> {
     let what = |g: &T| {
         let Origin { stamp, extent, .. } = g.origin();
         (stamp.config_hash.clone(), stamp.raster, stamp.seed, extent)
@@ -185,7 +155,7 @@ fn one_experiment<T: Kept>(out: &Path, sorted: &[T]) -> Result<(), Failure> {
             let why = "are of different experiments (configuration, raster, seed, frames or samples of the reference)";
             return told(why, &pair[0], &pair[1]);
         }
-        if pair[0].name() == pair[1].name() {
+        if pair[0].setting().name() == pair[1].setting().name() {
             return told(
                 "are the same group, measured twice (another device, commit or --ablation)",
                 &pair[0],
@@ -197,7 +167,7 @@ fn one_experiment<T: Kept>(out: &Path, sorted: &[T]) -> Result<(), Failure> {
 }
 
 /// All measured files of an experiment in a folder, by name.
-fn read_all<T: Kept>(out: &Path) -> Result<Vec<T>, Failure> {
+fn read_all<T: Experiment>(out: &Path) -> Result<Vec<T>, Failure> {
     let Ok(entries) = std::fs::read_dir(out) else { return Ok(Vec::new()) };
     let mut paths: Vec<PathBuf> = entries
         .filter_map(|e| Some(e.ok()?.path()))
@@ -233,7 +203,8 @@ fn write(path: &Path, text: &str) -> Result<(), Failure> {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use dpm_lab::error::runs::ErrorRow;
+    use dpm_lab::error::runs::{ErrorRow, Extent};
+    use dpm_lab::stamp::Stamp;
 
     fn group(moving: bool, budget: f64, change: impl FnOnce(&mut GroupResult)) -> GroupResult {
         let row = ErrorRow {
@@ -332,15 +303,16 @@ mod tests {
         let out = std::env::temp_dir().join(format!("dpm-error-files-{}", std::process::id()));
         let keep = |moving, budget| {
             let made = group(moving, budget, |_| ());
-            known_or(&out, &made.name(), &made.key.clone(), || Ok((made, None))).unwrap()
+            known_or(&out, &made.setting().name(), &made.key.clone(), || Ok((made, None))).unwrap()
         };
         for (moving, budget) in [(true, 0.5), (false, 18.0), (false, 2.0), (true, 64.0)] {
             keep(moving, budget);
         }
-        let joined: Vec<String> = joined::<GroupResult>(&out).unwrap().iter().map(Kept::name).collect();
+        let joined: Vec<String> =
+            joined::<GroupResult>(&out).unwrap().iter().map(|g| g.setting().name()).collect();
         assert_eq!(joined, ["still-2", "still-18", "moving-0.5", "moving-64"]);
         let again = known_or::<GroupResult>(&out, "still-2", "false2", || panic!("it lies there"));
-        assert_eq!(again.unwrap().group().budget, 2.0);
+        assert_eq!(again.unwrap().setting().budget, 2.0);
         // Another key means another group, and so does a file whose content has another name.
         let mut measured = false;
         let other = known_or(&out, "still-2", "another", || {
@@ -359,7 +331,7 @@ mod tests {
     fn a_folder_of_several_experiments_is_one_json_object_with_what_each_report_holds() {
         let out = std::env::temp_dir().join(format!("dpm-error-merged-{}", std::process::id()));
         let made = group(false, 2.0, |_| ());
-        known_or(&out, &made.name(), &made.key.clone(), || Ok((made, None))).unwrap();
+        known_or(&out, &made.setting().name(), &made.key.clone(), || Ok((made, None))).unwrap();
         let alone: Value = serde_json::from_str(&merged(&out, true).unwrap()).unwrap();
         assert_eq!(alone.as_object().unwrap().keys().collect::<Vec<_>>(), ["error"]);
         let cell = TableGroup {
@@ -368,7 +340,7 @@ mod tests {
             aside: false,
             result: group(true, 18.0, |_| ()),
         };
-        known_or(&out, &cell.name(), &cell.result.key.clone(), || Ok((cell, None))).unwrap();
+        known_or(&out, &cell.setting().name(), &cell.result.key.clone(), || Ok((cell, None))).unwrap();
         // The whole text is one value: from_str refuses anything after it.
         let both: Value = serde_json::from_str(&merged(&out, true).unwrap()).unwrap();
         assert_eq!(both.as_object().unwrap().len(), 2);

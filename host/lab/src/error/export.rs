@@ -7,7 +7,7 @@
 //! the first frame, as if it had stood there for ever: with a method's own, one frame's noise, which no eye ever sees by itself at such
 //! rates, would be judged for a quarter of a second.
 
-use super::plan::{file_word, Group};
+use super::plan::file_word;
 use super::runs::{ErrorRunError, ErrorRuns, GroupResult};
 use crate::metrics::white_of;
 use crate::sequence::Theatre;
@@ -67,16 +67,15 @@ impl ErrorRuns {
     /// The renderer's; `dir` cannot be written.
     pub fn export(
         &self,
-        group: Group,
         result: &GroupResult,
         dir: &Path,
         each: &mut dyn FnMut(&str),
     ) -> Result<(), ErrorRunError> {
         let extent = self.options.extent;
-        let reference = self.reference(group, each)?;
+        let reference = self.reference(each)?;
         let mut index = FrameIndex {
             stamp: self.stamp.clone(),
-            group: group.name(),
+            group: self.setting.name(),
             frame_rate_hz: 1e9 / self.rig.rate().slot_len_ns(0).max(1) as f64,
             frames: LEAD_IN + extent.kept,
             lead_in: LEAD_IN,
@@ -86,10 +85,10 @@ impl ErrorRuns {
             reference: "reference".into(),
             methods: Vec::new(),
         };
-        let theatre = self.theatre(group, extent.warm_up, extent.kept)?;
+        let theatre = self.theatre(extent.warm_up, extent.kept)?;
         index.pixels_per_degree = theatre.pixels_per_degree().unwrap_or(0.0);
-        let truth = if group.moving {
-            let truth = self.theatre(group, 0, extent.kept)?;
+        let truth = if self.setting.moving {
+            let truth = self.theatre(0, extent.kept)?;
             let method = Method { sampler: SamplerKind::BlueNoise, ..Method::full(extent.reference_spp) };
             each("reference of every frame");
             truth.play(&method, extent.reference_spp as f32, 0x9e37_0002, &mut |_, _| ())?.frames
@@ -99,7 +98,7 @@ impl ErrorRuns {
         };
         let before = truth.first().map_or(&[][..], Vec::as_slice);
         write_frames(&dir.join(&index.reference), &theatre, before, &truth)?;
-        for (contender, row) in self.contenders(group).iter().zip(&result.rows) {
+        for (contender, row) in self.contenders().iter().zip(&result.rows) {
             each(contender.name);
             let seen =
                 theatre.play(&contender.method, row.spp as f32, self.stamp.seed as u32, &mut |_, _| ())?;

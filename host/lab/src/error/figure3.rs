@@ -4,61 +4,20 @@
 //! \[paper\] asks whether an eye that follows a body at 947 fps still integrates frames: its author rated the noise of each condition. Here
 //! the noise is what two runs of independent samples do not share after 31 frames on every point of that body.
 
-use super::reference::{mean_of, Reference};
+use super::plan::Setting;
+use super::reference::mean_of;
 use super::report::stamps;
-use super::runs::{ErrorOptions, ErrorRunError, EYE_FRAMES, LAST_SLOT};
+use super::runs::{key_of, ErrorOptions, ErrorRunError, ErrorRuns, EYE_FRAMES};
 use crate::median::median_ms;
-use crate::sequence::{eye_mean, rmse, Span, Theatre};
-use crate::stamp::{Fnv, Stamp};
-use dpm_render::gpu::Gpu;
+use crate::sequence::{eye_mean, rmse};
+use crate::stamp::Stamp;
 use dpm_render::method::Method;
-use dpm_rig::rig::Rig;
-use dpm_scene::Material;
 use glam::Vec3;
 use serde::{Deserialize, Serialize};
 use std::fmt::Write as _;
-use std::sync::Arc;
 
 /// Samples a pixel of \[paper\] section 3.
 pub const SPP: [u32; 5] = [5, 10, 15, 20, 30];
-
-/// The four reflections: names and looks, the diffuse ones first. \[paper\] gives no numbers; these are the scenes' that rebuild it.
-pub(crate) fn looks() -> [Material; 4] {
-    let of = |name: &str, color: [u8; 3], metallic, roughness| Material {
-        name: name.into(),
-        base_color: Vec3::from_array(color.map(|c| f32::from(c) / 255.0)),
-        metallic,
-        roughness,
-        ..Material::default()
-    };
-    [
-        of("diffuse", [191, 140, 102], 0.0, 1.0),
-        of("glossy", [191, 140, 102], 0.0, 0.25),
-        of("rough-metal", [242, 163, 138], 1.0, 0.35),
-        of("mirror", [242, 237, 224], 1.0, 0.02),
-    ]
-}
-
-/// One condition without its samples: a material, standing or moving.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub struct Setting {
-    /// Index into [`looks`].
-    pub look: usize,
-    /// Bodies move as the rig file says.
-    pub moving: bool,
-}
-
-impl Setting {
-    /// All, standing ones first.
-    pub fn all() -> Vec<Self> {
-        [false, true].into_iter().flat_map(|moving| (0..4).map(move |look| Self { look, moving })).collect()
-    }
-
-    /// Name for files and people.
-    pub fn name(self) -> String {
-        format!("{}-{}", looks()[self.look].name, if self.moving { "moving" } else { "still" })
-    }
-}
 
 /// One condition of the experiment.
 #[derive(Clone, Debug, Serialize, Deserialize)]
@@ -97,70 +56,29 @@ pub struct Figure3Group {
 impl Figure3Group {
     /// Its setting.
     pub fn setting(&self) -> Setting {
-        let of = |r: &Figure3Row| {
-            let look = looks().iter().position(|l| l.name == r.material).unwrap_or(0);
-            Setting { look, moving: r.moving }
-        };
-        self.rows.first().map_or(Setting { look: 0, moving: false }, of)
+        let (material, moving) = self.rows.first().map_or(("", false), |r| (&r.material, r.moving));
+        Setting::of_material(material, moving, false)
     }
 }
 
-/// A rig whose first tracked body is made of one of [`looks`].
-pub(super) fn dressed(mut rig: Rig, look: usize) -> (Rig, usize) {
-    let body = rig.scene.bodies.iter().position(|b| b.tracked == Some(0)).unwrap_or(0);
-    let material = rig.scene.materials.len() as u32;
-    rig.scene.materials.push(looks()[look].clone());
-    if let Some(b) = rig.scene.bodies.get_mut(body) {
-        b.mesh.materials.fill(material);
-    }
-    (rig, body)
-}
-
-/// Names all that a setting's result depends on.
-pub fn key(stamp: &Stamp, setting: Setting, options: &ErrorOptions, spp: &[u32]) -> String {
-    let mut hash = Fnv::default();
-    // Writing into a hash cannot fail.
-    let _ = write!(hash, "figure 3 {stamp:?}{setting:?}{:?}{spp:?}{}", looks(), options.extent.reference_spp);
-    hash.text()
-}
-
-/// Measures a setting at all samples. `each` is called before every sequence with its name.
+/// Measures a setting at all samples of [`SPP`]. `each` is called before every sequence with its name.
 ///
 /// # Errors
 /// The renderer's; nothing of the body is lit; the cache cannot be written.
-pub fn measure(
-    rig: Rig,
-    gpu: &Arc<Gpu>,
-    setting: Setting,
-    options: &ErrorOptions,
-    spp: &[u32],
-    each: &mut dyn FnMut(&str),
-) -> Result<Figure3Group, ErrorRunError> {
-    let stamp = Stamp::new(&rig, gpu.summary());
-    let (rig, body) = dressed(rig, setting.look);
-    let seed = rig.config.render.seed as u32;
-    let span = Span { last_slot: LAST_SLOT, warm_up: 0, kept: EYE_FRAMES as u32 };
-    let make = if setting.moving { Theatre::new } else { Theatre::frozen };
-    let theatre = make(Arc::new(rig), gpu.clone(), span)?;
-    let on_body = |i: usize| theatre.probes()[i].body == body;
-    let probes = (0..theatre.probes().len()).filter(|&i| on_body(i)).count();
-    if probes == 0 {
+pub fn measure(runs: &ErrorRuns, each: &mut dyn FnMut(&str)) -> Result<Figure3Group, ErrorRunError> {
+    let setting = runs.setting;
+    let seed = runs.stamp.seed as u32;
+    let theatre = runs.theatre(0, EYE_FRAMES as u32)?;
+    let on_body = |i: usize| theatre.probes()[i].body == runs.body;
+    let probes: Vec<usize> = (0..theatre.probes().len()).filter(|&i| on_body(i)).collect();
+    if probes.is_empty() {
         return Err(ErrorRunError::NothingLit);
     }
-    let what = format!(
-        "figure 3 {}{:?}{:?}{}{}",
-        stamp.config_hash,
-        stamp.raster,
-        looks()[setting.look],
-        setting.moving,
-        span.last_slot
-    );
-    let reference = Reference::new(&theatre, options.extent.reference_spp, &what, &options.cache, each)?;
-    let seen: Vec<Vec3> =
-        (0..theatre.probes().len()).filter(|&i| on_body(i)).map(|i| reference.eye[i]).collect();
+    let reference = runs.reference(each)?;
+    let seen: Vec<Vec3> = probes.iter().map(|&i| reference.eye[i]).collect();
     let mean = mean_of(&seen).max(f64::MIN_POSITIVE);
     let mut rows = Vec::new();
-    for &spp in spp {
+    for spp in SPP {
         let method = Method::full(spp);
         let mut play = |seed: u32| {
             each(&format!("{spp} spp"));
@@ -170,7 +88,7 @@ pub fn measure(
         let eyes = [0, 1].map(|i: usize| eye_mean(&runs[i].frames, EYE_FRAMES));
         let single = |i: usize| runs[i].frames.last().map_or(0.0, |f| rmse(f, &reference.last, on_body));
         rows.push(Figure3Row {
-            material: looks()[setting.look].name.clone(),
+            material: setting.material().unwrap_or_default(),
             moving: setting.moving,
             spp,
             perceived: reference.perceived(&eyes, &on_body).1 / mean,
@@ -181,12 +99,17 @@ pub fn measure(
     }
     let halves = rmse(&reference.halves[0], &reference.halves[1], on_body);
     Ok(Figure3Group {
-        key: key(&stamp, setting, options, spp),
-        stamp,
-        probes,
+        key: key(&runs.stamp, setting, &runs.options),
+        stamp: runs.stamp.clone(),
+        probes: probes.len(),
         reference_error: 0.5 * halves / mean,
         rows,
     })
+}
+
+/// Names all that a setting's result depends on.
+pub fn key(stamp: &Stamp, setting: Setting, options: &ErrorOptions) -> String {
+    key_of(stamp, setting, options, &format!("figure 3 {SPP:?}"))
 }
 
 /// What the two findings of \[paper\] section 3 are here.
@@ -284,6 +207,7 @@ pub fn csv(groups: &[Figure3Group]) -> String {
 
 #[cfg(test)]
 mod tests {
+    use super::super::plan::looks;
     use super::*;
 
     fn group(look: usize, moving: bool, perceived: [f64; 2]) -> Figure3Group {
@@ -327,12 +251,5 @@ mod tests {
             .lines()
             .nth(1)
             .is_some_and(|l| l.starts_with("\"a 'device'\",\"d\",c,h,1,diffuse,still,5,")));
-    }
-
-    #[test]
-    fn settings_have_names_of_their_own() {
-        let names: std::collections::BTreeSet<String> =
-            Setting::all().into_iter().map(Setting::name).collect();
-        assert_eq!(names.len(), 8);
     }
 }

@@ -1,7 +1,14 @@
-//! What is compared with what: methods, ablations, and the groups of equal rays they are measured in.
+//! What is compared with what: methods, ablations, and the settings they are measured in.
+//!
+//! Three experiments share these settings. The first measures every method on the rig as it is, at several budgets of rays. The table does
+//! so at one budget, with the first tracked body in four materials, looked at and looked past. The third is the preliminary experiment of
+//! \[paper\] section 3: one method at rising samples, on one body in four materials.
 
 use dpm_render::method::{Method, SamplerKind};
 use dpm_rig::config::{EffectsConfig, RenderConfig, RenderMethod};
+use dpm_rig::rig::Rig;
+use dpm_scene::Material;
+use glam::{DQuat, DVec3, Vec3};
 
 /// A method to be measured.
 #[derive(Clone, Debug)]
@@ -64,26 +71,122 @@ pub(crate) fn file_word(name: &str) -> String {
     name.chars().map(|c| if c.is_ascii_alphanumeric() { c } else { '_' }).collect()
 }
 
-/// One group: all methods at the rays that `paper` takes.
+/// Samples of \[paper\] table 1 where the eye looks.
+pub(crate) const BUDGET: f64 = 18.0;
+/// Angle at the eye between the middle of the picture and the gaze that looks past it, degrees.
+pub(crate) const ASIDE_DEG: f64 = 27.0;
+
+/// The four reflections: names and looks, the diffuse ones first. \[paper\] gives no numbers; these are the scenes' that rebuild it.
+pub(crate) fn looks() -> [Material; 4] {
+    let of = |name: &str, color: [u8; 3], metallic, roughness| Material {
+        name: name.into(),
+        base_color: Vec3::from_array(color.map(|c| f32::from(c) / 255.0)),
+        metallic,
+        roughness,
+        ..Material::default()
+    };
+    [
+        of("diffuse", [191, 140, 102], 0.0, 1.0),
+        of("glossy", [191, 140, 102], 0.0, 0.25),
+        of("rough-metal", [242, 163, 138], 1.0, 0.35),
+        of("mirror", [242, 237, 224], 1.0, 0.02),
+    ]
+}
+
+/// One condition of an experiment: bodies, gaze and budget.
 #[derive(Clone, Copy, Debug, PartialEq)]
-pub struct Group {
+pub struct Setting {
+    /// The first tracked body is made of this one of four materials; `None`: of what its file says.
+    pub look: Option<usize>,
     /// Bodies move as the rig file says; else they stand where the last frame has them.
     pub moving: bool,
-    /// Samples of a pixel of `paper` where the eye looks; below 1: that share of the rays that 1 takes.
+    /// The eye looks past the picture, so that all of it lies beyond the paper's outer zone, where its filter is fully in.
+    pub aside: bool,
+    /// Samples of a pixel of `paper` where the eye looks, whose rays all methods get; below 1: that share of the rays that 1 takes.
     pub budget: f64,
 }
 
-impl Group {
+impl Setting {
+    /// The rig as its file has it, looked at.
+    pub fn plain(moving: bool, budget: f64) -> Self {
+        Self { look: None, moving, aside: false, budget }
+    }
+
+    /// The first tracked body in the material of this name.
+    pub(super) fn of_material(material: &str, moving: bool, aside: bool) -> Self {
+        let look = looks().iter().position(|l| l.name == material).unwrap_or(0);
+        Self { look: Some(look), moving, aside, budget: BUDGET }
+    }
+
+    /// Name of the material, where the experiment gives one.
+    pub(super) fn material(self) -> Option<String> {
+        self.look.map(|look| looks()[look].name.clone())
+    }
+
+    /// How bodies move, in a word.
+    pub(super) fn motion(self) -> &'static str {
+        if self.moving {
+            "moving"
+        } else {
+            "still"
+        }
+    }
+
     /// Name for files and people.
-    pub fn name(&self) -> String {
-        format!("{}-{}", if self.moving { "moving" } else { "still" }, self.budget)
+    pub fn name(self) -> String {
+        let (motion, aside) = (self.motion(), if self.aside { "-aside" } else { "" });
+        match self.material() {
+            Some(material) => format!("{material}-{motion}{aside}"),
+            None => format!("{motion}-{}{aside}", self.budget),
+        }
+    }
+
+    /// A rig in this setting, and the body that is looked at.
+    pub(super) fn apply(self, mut rig: Rig) -> (Rig, usize) {
+        let body = rig.scene.bodies.iter().position(|b| b.tracked == Some(0)).unwrap_or(0);
+        if let Some(look) = self.look {
+            let material = rig.scene.materials.len() as u32;
+            rig.scene.materials.push(looks()[look].clone());
+            if let Some(b) = rig.scene.bodies.get_mut(body) {
+                b.mesh.materials.fill(material);
+            }
+        }
+        if self.aside {
+            let (eye, _) = rig.observer.eye_and_gaze(&[]);
+            let middle = DVec3::from_array(rig.config.projector.look_at);
+            rig.observer = rig.observer.clone().looking_at(past(eye, middle));
+        }
+        (rig, body)
+    }
+
+    /// Settings of all methods at several budgets, in the order of their numbers: standing ones first.
+    pub fn at_budgets(budgets: &[f64]) -> Vec<Self> {
+        let of = |moving| budgets.iter().map(move |&budget| Self::plain(moving, budget));
+        of(false).chain(of(true)).collect()
+    }
+
+    /// Settings of the table: looked at first, standing before moving.
+    pub fn of_table() -> Vec<Self> {
+        [false, true].into_iter().flat_map(Self::in_all_materials).collect()
+    }
+
+    /// Settings of figure 3: standing ones first.
+    pub fn of_figure3() -> Vec<Self> {
+        Self::in_all_materials(false).collect()
+    }
+
+    fn in_all_materials(aside: bool) -> impl Iterator<Item = Self> {
+        let of = move |moving| (0..looks().len()).map(move |look| (look, moving));
+        let all = of(false).chain(of(true));
+        all.map(move |(look, moving)| Self { look: Some(look), moving, aside, budget: BUDGET })
     }
 }
 
-/// All groups in the order of their numbers: standing ones first.
-pub fn groups(budgets: &[f64]) -> Vec<Group> {
-    let of = |moving| budgets.iter().map(move |&budget| Group { moving, budget });
-    of(false).chain(of(true)).collect()
+/// Where an eye at `eye` looks that turns its gaze up by [`ASIDE_DEG`] from `middle`.
+fn past(eye: DVec3, middle: DVec3) -> DVec3 {
+    let ahead = middle - eye;
+    let axis = ahead.cross(DVec3::Y).try_normalize().unwrap_or(DVec3::X);
+    eye + DQuat::from_axis_angle(axis, ASIDE_DEG.to_radians()) * ahead
 }
 
 #[cfg(test)]
@@ -107,5 +210,26 @@ mod tests {
                 assert!(a.name != b.name && a.method != b.method, "{} and {}", a.name, b.name);
             }
         }
+    }
+    #[test]
+    fn settings_have_names_of_their_own() {
+        for (all, count) in
+            [(Setting::at_budgets(&[0.25, 18.0]), 4), (Setting::of_table(), 16), (Setting::of_figure3(), 8)]
+        {
+            let names: std::collections::BTreeSet<String> = all.into_iter().map(Setting::name).collect();
+            assert_eq!(names.len(), count);
+        }
+    }
+
+    #[test]
+    fn an_eye_that_looks_past_turns_up_by_the_angle_and_keeps_its_distance() {
+        let (eye, middle) = (DVec3::new(0.15, 0.12, 1.0), DVec3::new(0.0, 0.03, -0.05));
+        let gaze = past(eye, middle);
+        let (to, from) = (gaze - eye, middle - eye);
+        assert!((to.angle_between(from).to_degrees() - ASIDE_DEG).abs() < 1e-9);
+        assert!((to.length() / from.length() - 1.0).abs() < 1e-12);
+        assert!(gaze.y > middle.y);
+        // Straight down there is no upward, but a gaze all the same.
+        assert!(past(DVec3::Y, DVec3::ZERO).is_finite());
     }
 }

@@ -1,6 +1,7 @@
 //! Measured groups into curves: error against cost, both logarithmic, with the Pareto front.
 
-use super::figure3::{looks, Figure3Group, Figure3Row};
+use super::figure3::{Figure3Group, Figure3Row};
+use super::plan::looks;
 use super::runs::{ErrorRow, GroupResult};
 use crate::profile::plots::{color, key, Stroke, SIZE};
 use crate::stamp::Stamp;

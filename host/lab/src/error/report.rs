@@ -1,5 +1,6 @@
 //! Measured groups into what people read: CSV, and Markdown tables at equal rays, at equal time and at equal error.
 
+use super::plan::Setting;
 use super::runs::{is_other, ErrorRow, GroupResult, DPM};
 use super::verdict::{equal_time_table, runs_text, table, time_text, verdict};
 use crate::stamp::Stamp;
@@ -78,54 +79,78 @@ pub(super) fn stamps<'a>(all: impl Iterator<Item = &'a Stamp>) -> String {
     text
 }
 
-/// All rows as a Markdown table, with the stamps above and the best of the others beside dpm below.
+/// What counts as flicker: in the periphery where the eye looks past, else everywhere.
+fn flicker(setting: Setting, row: &ErrorRow) -> f64 {
+    row.flicker_periphery.filter(|_| setting.aside).unwrap_or(row.flicker)
+}
+
+/// All rows as Markdown: see [`tables`].
 pub fn markdown(groups: &[GroupResult]) -> String {
-    let mut text = stamps(groups.iter().map(|g| &g.stamp));
-    text += "| motion | budget | method | rays/frame | rays / paper | ms a frame (middle half) | single RMSE | perceived RMSE as measured | two runs | less the reference's own | bias | of chance | noise | mean | FLIP | flicker | perceived / paper |\n";
-    text += "|---|---:|---|---:|---:|---|---:|---:|---|---:|---:|---:|---:|---:|---:|---:|---:|\n";
-    for r in groups.iter().flat_map(|g| &g.rows) {
-        let _ = writeln!(
-            text,
-            "| {} | {} | {} | {:.0} | {:.3} | {} | {:.4} | {:.5} | {} | {:.5} | {:.5} | {:.5} | {:.5} | {:+.2} % | {:.4} | {:.5} | {:.2} |",
-            if r.moving { "moving" } else { "still" },
-            r.budget,
-            r.method,
-            r.rays,
-            r.rays_to_paper,
-            time_text(r),
-            r.single_rmse,
-            r.perceived_rmse_raw,
-            runs_text(r.runs_raw),
-            r.perceived_rmse,
-            r.bias,
-            r.bias_floor,
-            r.noise,
-            100.0 * r.mean_shift,
-            r.flip,
-            r.flicker,
-            r.ratio_to_paper
-        );
+    tables(&groups.iter().map(|g| (g.setting(), g)).collect::<Vec<_>>())
+}
+
+/// All rows as Markdown tables, with the stamps above, and dpm beside the best of the others below.
+pub(super) fn tables(groups: &[(Setting, &GroupResult)]) -> String {
+    let mut text = stamps(groups.iter().map(|(_, g)| &g.stamp));
+    text += "| group | method | rays/frame | rays / paper | ms a frame (middle half) | single RMSE | perceived RMSE as measured | two runs | less the reference's own | bias | of chance | noise | mean | FLIP | flicker | perceived / paper | perceived / best other | flicker / least other |\n";
+    text += "|---|---|---:|---:|---|---:|---:|---|---:|---:|---:|---:|---:|---:|---:|---:|---:|---:|\n";
+    for &(setting, g) in groups {
+        let best = best_other(g).map_or(f64::NAN, |r| r.perceived_rmse);
+        let least = least_flicker(g, |r| flicker(setting, r));
+        for r in &g.rows {
+            text += &row(setting, r, best, least);
+        }
     }
     text.push('\n');
-    text += &equal_time_table(groups.iter().map(|g| (g.group().name(), g)));
+    text += &equal_time_table(groups.iter().map(|(s, g)| (s.name(), *g)));
     text.push('\n');
-    text += &equal_cost(groups);
-    text.push('\n');
+    // Curves over budgets, where there are more than one.
+    let plain: Vec<&GroupResult> = groups.iter().filter(|(s, _)| s.look.is_none()).map(|(_, g)| *g).collect();
+    if !plain.is_empty() {
+        text += &equal_cost(&plain);
+        text.push('\n');
+    }
     let verdicts: Vec<_> =
-        groups.iter().filter_map(|g| verdict(g.group().name(), g, &|r| r.flicker)).collect();
+        groups.iter().filter_map(|(s, g)| verdict(s.name(), g, &|r| flicker(*s, r))).collect();
     text += &table(&verdicts);
-    text.push('\n');
-    for g in groups {
+    text += "\n| group | reference error | mean radiance | probes |\n|---|---:|---:|---:|\n";
+    for (setting, g) in groups {
+        // Writing into a string cannot fail.
         let _ = writeln!(
             text,
-            "{}: reference error {:.5}, mean radiance {:.4}, {} probes.",
-            g.group().name(),
+            "| {} | {:.5} | {:.4} | {} |",
+            setting.name(),
             g.reference_error,
             g.mean,
             g.probes
         );
     }
     text
+}
+
+/// One row of the first table; `best` and `least` are the least error and flicker of the other methods.
+fn row(setting: Setting, r: &ErrorRow, best: f64, least: f64) -> String {
+    format!(
+        "| {} | {} | {:.0} | {:.3} | {} | {:.4} | {:.5} | {} | {:.5} | {:.5} | {:.5} | {:.5} | {:+.2} % | {:.4} | {:.5} | {:.2} | {:.2} | {:.2} |\n",
+        setting.name(),
+        r.method,
+        r.rays,
+        r.rays_to_paper,
+        time_text(r),
+        r.single_rmse,
+        r.perceived_rmse_raw,
+        runs_text(r.runs_raw),
+        r.perceived_rmse,
+        r.bias,
+        r.bias_floor,
+        r.noise,
+        100.0 * r.mean_shift,
+        r.flip,
+        flicker(setting, r),
+        r.ratio_to_paper,
+        r.perceived_rmse / best,
+        flicker(setting, r) / least,
+    )
 }
 
 /// Time of a frame, ms: the GPU's, or until its light is known where the device has no time stamps.
@@ -186,7 +211,7 @@ pub(crate) fn on_curve(points: &[(f64, f64)], x: f64) -> Option<Reading> {
 }
 
 /// Every method against every point of `paper`: its error at paper's time, and its time at paper's error, read off its curve.
-fn equal_cost(groups: &[GroupResult]) -> String {
+fn equal_cost(groups: &[&GroupResult]) -> String {
     let rows = || groups.iter().flat_map(|g| &g.rows);
     let mut text = String::from(
         "| motion | budget of paper | method | error / paper at equal time | time / paper at equal error |\n|---|---:|---|---:|---:|\n",

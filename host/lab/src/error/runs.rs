@@ -7,7 +7,7 @@
 //! Equal rays are not equal time, so the other methods are drawn once more with as many samples as fill the time of a frame of dpm.
 
 use super::parts::Part;
-use super::plan::{contenders, paper_at, Contender, Group};
+use super::plan::{contenders, looks, paper_at, Contender, Setting};
 use super::reference::{mean_of, Reference};
 use crate::metrics::error::compare;
 use crate::metrics::flicker::TileSeries;
@@ -161,10 +161,10 @@ pub struct GroupResult {
 }
 
 impl GroupResult {
-    /// What was measured.
-    pub fn group(&self) -> Group {
+    /// What was measured, of a rig as its file has it.
+    pub fn setting(&self) -> Setting {
         let (moving, budget) = self.rows.first().map_or((false, 0.0), |r| (r.moving, r.budget));
-        Group { moving, budget }
+        Setting::plain(moving, budget)
     }
 }
 
@@ -207,90 +207,73 @@ pub enum ErrorRunError {
     Io(#[from] std::io::Error),
 }
 
-/// Draws and compares the groups of one rig.
+/// Names all that the result of a setting depends on; `more` is what the experiment depends on beside.
+pub fn key_of(stamp: &Stamp, setting: Setting, options: &ErrorOptions, more: &str) -> String {
+    let (o, mut hash) = (options, Fnv::default());
+    let look = setting.look.map(|look| looks()[look].clone());
+    // Writing into a hash cannot fail.
+    let _ = write!(hash, "{stamp:?}{setting:?}{look:?}{:?}{}{more}", o.extent, o.ablation);
+    hash.text()
+}
+
+/// Draws and compares the methods in one setting of a rig.
 pub struct ErrorRuns {
     pub(super) rig: Arc<Rig>,
     gpu: Arc<Gpu>,
     pub(super) options: ErrorOptions,
     pub(super) stamp: Stamp,
-    /// What was changed in the rig beside its file.
-    variant: String,
-    /// Names all of the rig that the reference depends on.
-    scene: String,
+    /// What is measured.
+    pub setting: Setting,
+    /// The body that is looked at.
+    pub(super) body: usize,
 }
 
 impl ErrorRuns {
-    /// Ready to measure `rig` on `gpu`.
-    pub fn new(rig: Arc<Rig>, gpu: Arc<Gpu>, options: ErrorOptions) -> Self {
-        let scene = Stamp::new(&rig, gpu.summary()).config_hash;
-        Self::variant(rig, gpu, options, String::new(), scene)
-    }
-
-    /// The same for a rig that was changed beside its file: `variant` says how, `scene` names all of it that the reference depends on.
-    pub(crate) fn variant(
-        rig: Arc<Rig>,
-        gpu: Arc<Gpu>,
-        options: ErrorOptions,
-        variant: String,
-        scene: String,
-    ) -> Self {
+    /// Ready to measure `rig` in `setting` on `gpu`.
+    pub fn new(rig: Rig, gpu: Arc<Gpu>, setting: Setting, options: ErrorOptions) -> Self {
         let stamp = Stamp::new(&rig, gpu.summary());
-        Self { rig, gpu, options, stamp, variant, scene }
+        let (rig, body) = setting.apply(rig);
+        Self { rig: Arc::new(rig), gpu, options, stamp, setting, body }
     }
 
-    /// How many methods a group has.
-    pub fn methods(&self) -> usize {
-        contenders(&self.rig.config.render, self.options.ablation).len()
-    }
-
-    /// Names all that a group's result depends on.
-    pub fn key(&self, group: Group) -> String {
-        let (o, mut hash) = (&self.options, Fnv::default());
-        // Writing into a hash cannot fail.
-        let _ = write!(hash, "{:?}{group:?}{:?}{}{}", self.stamp, o.extent, o.ablation, self.variant);
-        hash.text()
-    }
-
-    /// The group's sequence: its last `warm_up` and `kept` frames.
-    pub(super) fn theatre(&self, group: Group, warm_up: u32, kept: u32) -> Result<Theatre, RenderError> {
+    /// The setting's sequence: its last `warm_up` and `kept` frames.
+    pub(super) fn theatre(&self, warm_up: u32, kept: u32) -> Result<Theatre, RenderError> {
         let span = Span { last_slot: LAST_SLOT, warm_up, kept };
-        let make = if group.moving { Theatre::new } else { Theatre::frozen };
+        let make = if self.setting.moving { Theatre::new } else { Theatre::frozen };
         make(self.rig.clone(), self.gpu.clone(), span)
     }
 
-    /// The methods of a group; `paper` has the samples of the group's budget.
-    pub(super) fn contenders(&self, group: Group) -> Vec<Contender> {
+    /// The methods; `paper` has the samples of the setting's budget.
+    pub(super) fn contenders(&self) -> Vec<Contender> {
         let mut all = contenders(&self.rig.config.render, self.options.ablation);
-        all[0].method = paper_at(&all[0].method, group.budget.max(1.0));
+        all[0].method = paper_at(&all[0].method, self.setting.budget.max(1.0));
         all
     }
 
-    /// The group's reference, from the cache where it lies there. What it converges to depends neither on the methods' seed nor on how
-    /// long the methods run.
-    pub(super) fn reference(
-        &self,
-        group: Group,
-        each: &mut dyn FnMut(&str),
-    ) -> Result<Reference, ErrorRunError> {
-        let (o, stamp) = (&self.options, &self.stamp);
-        let what = format!("{}{:?}{}{}", self.scene, stamp.raster, group.moving, LAST_SLOT);
-        let short = self.theatre(group, 0, EYE_FRAMES as u32)?;
+    /// The setting's reference, from the cache where it lies there. What it converges to depends neither on the methods' seed nor on how
+    /// long the methods run, nor on what the eye looks at.
+    pub(super) fn reference(&self, each: &mut dyn FnMut(&str)) -> Result<Reference, ErrorRunError> {
+        let (o, stamp, setting) = (&self.options, &self.stamp, self.setting);
+        let look = setting.look.map(|look| format!(" {:?}", looks()[look])).unwrap_or_default();
+        let what = format!("{}{look}{:?}{}{LAST_SLOT}", stamp.config_hash, stamp.raster, setting.moving);
+        let short = self.theatre(0, EYE_FRAMES as u32)?;
         Reference::new(&short, o.extent.reference_spp, &what, &o.cache, each)
     }
 
-    /// Measures all methods of a group at the rays of `paper`. `each` is called before every sequence with its name. Methods that an
+    /// Measures all methods at the rays of `paper`. `each` is called before every sequence with its name. Methods that an
     /// earlier call has measured before it was stopped are not drawn again.
     ///
     /// # Errors
     /// The renderer's; nothing lit; the cache cannot be written.
-    pub fn measure(&self, group: Group, each: &mut dyn FnMut(&str)) -> Result<Measured, ErrorRunError> {
-        let (o, key) = (&self.options, self.key(group));
-        let theatre = self.theatre(group, o.extent.warm_up, o.extent.kept)?;
+    pub fn measure(&self, each: &mut dyn FnMut(&str)) -> Result<Measured, ErrorRunError> {
+        let o = &self.options;
+        let key = key_of(&self.stamp, self.setting, o, "");
+        let theatre = self.theatre(o.extent.warm_up, o.extent.kept)?;
         if theatre.probes().is_empty() {
             return Err(ErrorRunError::NothingLit);
         }
-        let reference = self.reference(group, each)?;
-        let contenders = self.contenders(group);
+        let reference = self.reference(each)?;
+        let contenders = self.contenders();
         let parts: Vec<Part> = (contenders.iter().map(|c| Part::new(&o.cache, &key, c.name))).collect();
         let (mut rows, mut eyes): (Vec<ErrorRow>, Vec<_>) = (Vec::new(), Vec::new());
         let mut wanted = None;
@@ -299,10 +282,10 @@ impl ErrorRuns {
                 Some(known) => known,
                 None => {
                     let spp = match wanted {
-                        None => group.budget.max(1.0) as f32,
-                        Some(rays) => self.spp_for(group, &contender.method, rays)?,
+                        None => self.setting.budget.max(1.0) as f32,
+                        Some(rays) => self.spp_for(&contender.method, rays)?,
                     };
-                    let measured = self.row(&theatre, group, contender, spp, wanted, &reference, each)?;
+                    let measured = self.row(&theatre, contender, spp, wanted, &reference, each)?;
                     part.write(&measured)?;
                     measured
                 }
@@ -310,9 +293,9 @@ impl ErrorRuns {
             let rays = match wanted {
                 Some(rays) => rays,
                 // `paper` takes no less than one sample a coarse pixel: a smaller budget is a share of what that takes.
-                None if group.budget < 1.0 => {
-                    let base = self.rays_at(group, &Method::full(1), 0.0)?;
-                    base + group.budget * (row.rays - base)
+                None if self.setting.budget < 1.0 => {
+                    let base = self.rays_at(&Method::full(1), 0.0)?;
+                    base + self.setting.budget * (row.rays - base)
                 }
                 None => row.rays,
             };
@@ -330,7 +313,7 @@ impl ErrorRuns {
         for (row, time) in rows.iter_mut().zip(&times) {
             (row.gpu_ms, row.wall_ms, row.middle_half_ms) = (time.gpu_ms, time.wall_ms, time.middle_half_ms);
         }
-        self.at_equal_time(&theatre, group, &contenders, &times, &mut rows, &reference, each)?;
+        self.at_equal_time(&theatre, &contenders, &times, &mut rows, &reference, each)?;
         let result = GroupResult {
             stamp: self.stamp.clone(),
             key,
@@ -352,7 +335,6 @@ impl ErrorRuns {
     fn at_equal_time(
         &self,
         theatre: &Theatre,
-        group: Group,
         contenders: &[Contender],
         times: &[FrameTime],
         rows: &mut [ErrorRow],
@@ -395,7 +377,7 @@ impl ErrorRuns {
             let method = with_samples(&contenders[i].method, spp as f32);
             // Only what the eye sees at the end is wanted.
             let warm_up = if method.needs_history() { self.options.extent.warm_up } else { 0 };
-            let short = self.theatre(group, warm_up, EYE_FRAMES as u32)?;
+            let short = self.theatre(warm_up, EYE_FRAMES as u32)?;
             let mut play = |seed: u32| {
                 each(&format!("{name}{AT_EQUAL_TIME}"));
                 let seen = short.play(&method, spp as f32, seed, &mut |_, _| ())?;
@@ -415,16 +397,16 @@ impl ErrorRuns {
     }
 
     /// Rays of a frame with so many samples, from a short sequence.
-    fn rays_at(&self, group: Group, method: &Method, spp: f32) -> Result<f64, RenderError> {
+    fn rays_at(&self, method: &Method, spp: f32) -> Result<f64, RenderError> {
         const FRAMES: u32 = 6;
-        let short = self.theatre(group, FRAMES, FRAMES)?;
+        let short = self.theatre(FRAMES, FRAMES)?;
         Ok(short.play(method, spp, 77, &mut |_, _| ())?.rays as f64 / f64::from(FRAMES))
     }
 
     /// Samples with which a method takes `rays` a frame: a frame without samples tells the fixed part, a short sequence the rest.
-    fn spp_for(&self, group: Group, method: &Method, rays: f64) -> Result<f32, RenderError> {
+    fn spp_for(&self, method: &Method, rays: f64) -> Result<f32, RenderError> {
         const TRIAL: f32 = 4.0;
-        let (base, trial) = (self.rays_at(group, method, 0.0)?, self.rays_at(group, method, TRIAL)?);
+        let (base, trial) = (self.rays_at(method, 0.0)?, self.rays_at(method, TRIAL)?);
         Ok(corrected(TRIAL, base, trial, rays).max(least_spp(method)))
     }
 
@@ -432,7 +414,6 @@ impl ErrorRuns {
     fn row(
         &self,
         theatre: &Theatre,
-        group: Group,
         contender: &Contender,
         mut spp: f32,
         wanted: Option<f64>,
@@ -468,13 +449,12 @@ impl ErrorRuns {
             a = play(spp, seed)?;
         }
         let b = play(spp, seed.wrapping_add(1_000_003))?;
-        self.compare(theatre, group, contender, spp, [a, b], reference)
+        self.compare(theatre, contender, spp, [a, b], reference)
     }
 
     fn compare(
         &self,
         theatre: &Theatre,
-        group: Group,
         contender: &Contender,
         spp: f32,
         runs: [Seen; 2],
@@ -503,8 +483,8 @@ impl ErrorRuns {
         let both = |of: &dyn Fn(&Seen) -> u64| 0.5 * (of(a) + of(b)) as f64 / frames;
         let row = ErrorRow {
             method: contender.name.to_owned(),
-            moving: group.moving,
-            budget: group.budget,
+            moving: self.setting.moving,
+            budget: self.setting.budget,
             spp: f64::from(spp),
             rays: both(&|s| s.rays),
             rays_to_paper: 1.0,

@@ -83,8 +83,7 @@ impl<'a> Reference<'a> {
         }
     }
 
-    /// The acceleration structure, for tests that compare it with brute force.
-    #[cfg(test)]
+    /// The acceleration structure.
     pub(crate) fn bvh(&self) -> &Bvh {
         &self.bvh
     }

@@ -1,6 +1,6 @@
 //! Hard cases of projecting, lens distortion and projector calibration.
 
-use super::Case;
+use super::CpuCase;
 use crate::reference::Sampler;
 use dpm_device::planes::Raster;
 use dpm_scene::geometry::calibration::{calibrate, recalibrate, CalibrationError, CalibrationOptions, Pair};
@@ -9,24 +9,85 @@ use dpm_scene::geometry::projector::ProjectorCamera;
 use glam::{DVec2, DVec3};
 
 /// The cases.
-pub(super) fn cases() -> Vec<Case> {
-    vec![
-        Case::new("calibration-exact-data", "6 to 40 exact pairs, lens shift outside the raster", "truth", "relative", 1e-9, exact),
-        Case::new("calibration-degenerate", "5 pairs, one point, a line, a plane, two views of five points, a cubic through the projector, NaN", "refused with the rank", "faults", 0.0, degenerate),
-        Case::new("calibration-nearly-planar", "relief of 1e-4 with 1 px of noise", "refused or marked uncertain", "faults", 0.0, nearly_planar),
-        Case::new("calibration-outliers", "30 % wrong pairs, 1 px of noise", "truth", "relative", 5e-2, outliers),
-        Case::new("calibration-covariance", "60 times 0.5 px of noise", "mean of (error / stated deviation)^2, either way", "ratio", 2.0, covariance),
-        Case::new("calibration-wrong-start", "focal length 100 times and a hundredth", "the same minimum, or not converged", "faults", 0.0, wrong_start),
-        Case::new("calibration-units", "metres, millimetres, 1e6 with an offset of 1e6", "same focal length", "relative", 1e-6, units),
-        Case::new("calibration-wide-field", "132 deg of field", "truth, and a warning", "relative", 1e-8, wide),
-        Case::new("distortion-without-inverse", "r (1 - r^2 / 2) beyond its turning point, NaN, 1e300", "no answer instead of a wrong one", "faults", 0.0, no_inverse),
-        Case::new("distortion-round-trip", "radial, tangential, rational and prism terms to 40 deg", "undistort inverts distort", "tangent", 1e-10, round_trip),
-        Case::new("projection-near-plane", "depth +-0, 1e-300, 1e-9, behind, NaN, 1e300", "no answer or finite", "faults", 0.0, near_plane),
-    ]
-}
+pub(super) const CASES: &[CpuCase] = &[
+    CpuCase(
+        "calibration-exact-data",
+        "7 to 40 exact pairs, lens shift outside the raster",
+        "truth",
+        "relative",
+        1e-9,
+        exact,
+    ),
+    CpuCase(
+        "calibration-degenerate",
+        "0 and 5 pairs, one point, one pixel, a line, a plane, two views of five points, a cubic through the projector, NaN",
+        "refused with the rank",
+        "faults",
+        0.0,
+        degenerate,
+    ),
+    CpuCase(
+        "calibration-nearly-planar",
+        "relief of 1e-4 with 1 px of noise",
+        "refused or marked uncertain",
+        "faults",
+        0.0,
+        nearly_planar,
+    ),
+    CpuCase("calibration-outliers", "30 % wrong pairs, 1 px of noise", "truth", "relative", 5e-2, outliers),
+    CpuCase(
+        "calibration-covariance",
+        "60 times 0.5 px of noise",
+        "mean of (error / stated deviation)^2, either way",
+        "ratio",
+        2.0,
+        covariance,
+    ),
+    CpuCase(
+        "calibration-wrong-start",
+        "focal length 100 times and a hundredth",
+        "the same minimum, or not converged",
+        "faults",
+        0.0,
+        wrong_start,
+    ),
+    CpuCase(
+        "calibration-units",
+        "metres, millimetres, 1e6 with an offset of 1e6",
+        "same focal length",
+        "relative",
+        1e-6,
+        units,
+    ),
+    CpuCase("calibration-wide-field", "132 deg of field", "truth, with a warning", "relative", 1e-8, wide),
+    CpuCase(
+        "distortion-without-inverse",
+        "r (1 - r^2 / 2) beyond its turning point, NaN, 1e300",
+        "no answer instead of a wrong one",
+        "faults",
+        0.0,
+        no_inverse,
+    ),
+    CpuCase(
+        "distortion-round-trip",
+        "radial, tangential, rational and prism terms to 40 deg",
+        "undistort inverts distort",
+        "tangent",
+        1e-10,
+        round_trip,
+    ),
+    CpuCase(
+        "projection-near-plane",
+        "depth +-0, 1e-300, 1e-9, behind, NaN, 1e300",
+        "no answer or finite",
+        "faults",
+        0.0,
+        near_plane,
+    ),
+];
 
 /// A projector with lens shift: its axis leaves below the raster.
-pub(crate) fn truth() -> ProjectorCamera {
+pub(super) fn truth() -> ProjectorCamera {
     let raster = Raster::new(1024, 768).expect("sides within 1..8192");
     let at = DVec3::new(0.4, 1.1, 2.2);
     let mut c = ProjectorCamera::look_at(raster, at, DVec3::new(0.0, 0.2, 0.1), DVec3::Y, 0.6)
@@ -37,13 +98,13 @@ pub(crate) fn truth() -> ProjectorCamera {
 }
 
 /// Points in a unit cube before it.
-pub(crate) fn cloud(n: usize, seed: u64) -> Vec<DVec3> {
+pub(super) fn cloud(n: usize, seed: u64) -> Vec<DVec3> {
     let mut s = Sampler::new(seed, 9);
     (0..n).map(|_| DVec3::new(s.uniform() - 0.5, s.uniform() - 0.3, s.uniform() - 0.5)).collect()
 }
 
 /// The points with their pixels, with normal noise.
-pub(crate) fn pairs(c: &ProjectorCamera, points: &[DVec3], noise_px: f64, seed: u64) -> Vec<Pair> {
+pub(super) fn pairs(c: &ProjectorCamera, points: &[DVec3], noise_px: f64, seed: u64) -> Vec<Pair> {
     let mut s = Sampler::new(seed, 1);
     let mut normal = || {
         let (u, v) = (1.0 - s.uniform(), s.uniform());
@@ -57,7 +118,7 @@ pub(crate) fn pairs(c: &ProjectorCamera, points: &[DVec3], noise_px: f64, seed: 
 }
 
 /// How far two projectors are apart: rotation, intrinsics by focal length, position.
-pub(crate) fn off(a: &ProjectorCamera, b: &ProjectorCamera) -> f64 {
+pub(super) fn off(a: &ProjectorCamera, b: &ProjectorCamera) -> f64 {
     let rotation = (a.world_from_projector.matrix3 - b.world_from_projector.matrix3).to_cols_array();
     let rotation = rotation.iter().fold(0.0f64, |m, x| m.max(x.abs()));
     let intrinsics = [(a.fx, b.fx), (a.fy, b.fy), (a.cx, b.cx), (a.cy, b.cy)];
@@ -90,7 +151,12 @@ fn degenerate(seed: u64) -> f64 {
     let refuse =
         |points: &[DVec3]| calibrate(c.raster, &pairs(&c, points, 0.0, 0), &Default::default()).err();
     let mut faults = 0u32;
-    faults += u32::from(!matches!(refuse(&base[..5]), Some(CalibrationError::TooFew(5))));
+    for n in [0, 5] {
+        faults += u32::from(refuse(&base[..n]) != Some(CalibrationError::TooFew(n)));
+    }
+    let one_pixel: Vec<Pair> = base.iter().map(|p| Pair { world: *p, pixel: DVec2::ONE }).collect();
+    let refused = calibrate(c.raster, &one_pixel, &Default::default()).err();
+    faults += u32::from(!matches!(refused, Some(CalibrationError::Degenerate { rank: 0, .. })));
     for (points, want) in [(vec![base[0]; 30], 0), (line, 1), (plane, 2)] {
         let named = matches!(refuse(&points), Some(CalibrationError::Degenerate { rank, condition, .. }) if rank == want && condition > 1e6);
         faults += u32::from(!named);

@@ -1,79 +1,77 @@
 //! Hard cases of mapping a device's clock onto the host's.
 
-use super::Case;
+use super::CpuCase;
 use crate::reference::Sampler;
 use dpm_device::clock_map::{ClockMap, ExchangeOutcome};
 use dpm_device::time::{DeviceTicks, HostTime};
 
 /// The cases.
-pub(super) fn cases() -> Vec<Case> {
-    vec![
-        Case::new(
-            "clock-skew-and-drift",
-            "+-200 ppm, drifting 1 ppm/s, ways of 15 us + exponential 8 us, 10 exchanges a second",
-            "truth of the simulation, 99th percentile after 3 s",
-            "us",
-            10.0,
-            skew,
-        ),
-        Case::new(
-            "clock-bound-is-honest",
-            "1 % stalls of 5 ms, ways 40 us there and 300 us back, half of the exchanges lost",
-            "error beyond the stated bound",
-            "ns",
-            0.0,
-            honest_bound,
-        ),
-        Case::new(
-            "clock-steps",
-            "+-3 ms, +-1 h, restart from 0",
-            "exchanges until noticed; re-locked within 1 s",
-            "exchanges",
-            5.0,
-            steps,
-        ),
-        Case::new(
-            "clock-never-goes-back",
-            "stamps in order across steps, stalls and refits",
-            "later stamp, later time",
-            "violations",
-            0.0,
-            monotone,
-        ),
-        Case::new(
-            "clock-tick-wrap",
-            "32-bit ticks at 48 MHz over 6 wraps; 64-bit ticks across 2^64",
-            "truth",
-            "us",
-            10.0,
-            wraps,
-        ),
-        Case::new(
-            "clock-frequencies",
-            "1 Hz to 1e12 Hz accepted; 0 and 1e13 refused; counters of 8 and 65 bits refused",
-            "i128; a tick at 1 Hz",
-            "faults",
-            0.0,
-            frequencies,
-        ),
-        Case::new(
-            "clock-400-days",
-            "exchanges for a minute after 400 days of uptime at 10 GHz",
-            "truth",
-            "us",
-            10.0,
-            uptime,
-        ),
-        Case::new(
-            "clock-impossible-exchanges",
-            "received before sent, answered before seen, ends of the range",
-            "refused; the map does not move",
-            "faults",
-            0.0,
-            impossible,
-        ),
-    ]
-}
+pub(super) const CASES: &[CpuCase] = &[
+    CpuCase(
+        "clock-skew-and-drift",
+        "+-200 ppm, drifting 1 ppm/s, delays of 15 us + exponential 8 us, 10 exchanges a second",
+        "truth of the simulation, 99th percentile after 3 s",
+        "us",
+        10.0,
+        skew,
+    ),
+    CpuCase(
+        "clock-bound-is-honest",
+        "1 % stalls of 5 ms, delays of 40 us there and 300 us back, half of the exchanges lost",
+        "error beyond the stated bound",
+        "ns",
+        0.0,
+        honest_bound,
+    ),
+    CpuCase(
+        "clock-steps",
+        "+-3 ms, +-1 h, restart from 0",
+        "exchanges until noticed; re-locked within 1 s",
+        "exchanges",
+        5.0,
+        steps,
+    ),
+    CpuCase(
+        "clock-never-goes-back",
+        "stamps in order across steps, stalls and refits",
+        "a later stamp gives a later time",
+        "violations",
+        0.0,
+        monotone,
+    ),
+    CpuCase(
+        "clock-tick-wrap",
+        "32-bit ticks at 48 MHz over 6 wraps; 64-bit ticks across 2^64",
+        "truth",
+        "us",
+        10.0,
+        wraps,
+    ),
+    CpuCase(
+        "clock-frequencies",
+        "1 Hz to 1e12 Hz accepted; 0 and 1e13 refused; counters of 8 and 65 bits refused",
+        "i128; a tick at 1 Hz",
+        "faults",
+        0.0,
+        frequencies,
+    ),
+    CpuCase(
+        "clock-400-days",
+        "exchanges for a minute after 400 days of uptime at 10 GHz",
+        "truth",
+        "us",
+        10.0,
+        uptime,
+    ),
+    CpuCase(
+        "clock-impossible-exchanges",
+        "received before sent, answered before received, ends of the range",
+        "refused; the map does not move",
+        "faults",
+        0.0,
+        impossible,
+    ),
+];
 
 /// A device clock: ticks at a host time, by exact integers but for the drift.
 #[derive(Clone, Copy)]

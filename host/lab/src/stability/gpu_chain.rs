@@ -17,7 +17,7 @@ const SCENES: u64 = 17;
 pub(crate) const CASES: &[GpuCase] = &[
     GpuCase(
         "gpu-random-scenes-pixels",
-        "17 scenes by chance: shapes, poses, all materials, textures, lights, skies",
+        "17 random scenes: shapes, poses, all materials, textures, lights, skies",
         "f64 tracer: pixels beyond 4 sigma by those that chance allows",
         "ratio",
         1.0,
@@ -34,7 +34,7 @@ pub(crate) const CASES: &[GpuCase] = &[
     GpuCase(
         "gpu-random-scenes-surfaces",
         "the same",
-        "f64 tracer: pixels that see something else",
+        "f64 tracer: pixels that see another surface",
         "share",
         1e-2,
         |gpu, seed| worst(gpu, seed).2,

@@ -38,7 +38,7 @@ pub(crate) const CASES: &[GpuCase] = &[
     GpuCase(
         "gpu-eye-looks-again",
         "a plate that glides and jumps between the eye and a floor, out of the projector's light, all frames drawn or every fourth, method dpm",
-        "where every pixel asks the eye in every frame: nothing seen is dark, nothing hidden is lit for more than three frames, nor at all where it glides",
+        "the picture with an eye ray for every pixel in every frame: nothing seen is dark; nothing hidden is lit for more than three frames, and not at all where it glides",
         "frames over 3",
         0.0,
         looks_again,
@@ -46,7 +46,7 @@ pub(crate) const CASES: &[GpuCase] = &[
     GpuCase(
         "gpu-dark-stays-dark",
         "a ball and a turning plate that glide; a tile that a fast shadow hides wholly; method dpm",
-        "where every pixel asks in every frame: what glides is lit there and nowhere else, by less than 0.7 of the rays; nothing seen is dark for more than three frames",
+        "the picture of `full`: gliding surfaces are lit there and nowhere else, with less than 0.7 of the rays; nothing seen is dark for more than three frames",
         "frames over 3",
         0.0,
         stays_dark,

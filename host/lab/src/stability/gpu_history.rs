@@ -38,7 +38,7 @@ pub(crate) const CASES: &[GpuCase] = &[
     ),
     GpuCase(
         "gpu-step-input",
-        "a light that comes down at once by 3 m, every method without shading rates, a quarter of a second later",
+        "a light that drops by 3 m in one step, every method without shading rates, a quarter of a second later",
         "closed form, in steps of 8-bit codes",
         "codes",
         1.0,
@@ -70,7 +70,7 @@ pub(crate) const CASES: &[GpuCase] = &[
     ),
     GpuCase(
         "gpu-nobody-waits",
-        "24 frames of method paper at mixed rates with checkerboard, all drawn, and every second one dropped",
+        "24 frames of method paper at mixed rates with checkerboard, all drawn, or every second one dropped",
         "every block is traced in every second frame",
         "frames over 2",
         0.0,
@@ -86,7 +86,7 @@ pub(crate) const CASES: &[GpuCase] = &[
     ),
     GpuCase(
         "gpu-noise-free-is-exact",
-        "a mirror ball that crosses the picture under an uneven sky, method dpm, one sample asked for and four",
+        "a mirror ball that crosses the picture under an uneven sky, method dpm, one sample requested, and four",
         "each frame as drawn without a history, one sample a lit pixel",
         "radiance",
         1e-5,
@@ -94,16 +94,16 @@ pub(crate) const CASES: &[GpuCase] = &[
     ),
     GpuCase(
         "gpu-chance-comes-in",
-        "a matte ball that passes a standing mirror ball, method dpm, two samples asked for",
-        "a pixel that begins to mirror it takes four in that frame and counts none of before; one that ends is exact at once",
+        "a matte ball that passes a standing mirror ball, method dpm, two samples requested",
+        "a pixel that begins to mirror it takes four samples in that frame and drops its earlier ones; a pixel that ceases to is exact at once",
         "faults",
         0.0,
         chance_comes_in,
     ),
     GpuCase(
         "gpu-new-points-at-once",
-        "a matte ball that crosses the picture under an uneven sky, method dpm, one sample asked for",
-        "a point never seen before has a sample in its first frame, whatever the others' noise",
+        "a matte ball that crosses the picture under an uneven sky, method dpm, one sample requested",
+        "a point never seen before gets a sample in its first frame, whatever the noise elsewhere",
         "faults",
         0.0,
         new_points,

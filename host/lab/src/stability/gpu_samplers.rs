@@ -18,8 +18,8 @@ use std::sync::Arc;
 pub(crate) const CASES: &[GpuCase] = &[
     GpuCase(
         "gpu-noise-falls",
-        "independent samples, blue noise and sequences that go on, of surface points and of pixels: 1 and 16 samples a frame, 1 and 64 frames",
-        "closed form: by the root of their number, independent samples neither faster nor slower",
+        "independent samples, blue noise and continued sequences, of surface points and of pixels: 1 and 16 samples a frame, 1 and 64 frames",
+        "closed form: noise falls with the square root of their number; for independent samples neither faster nor slower",
         "ratio",
         1.15,
         noise_falls,
@@ -27,7 +27,7 @@ pub(crate) const CASES: &[GpuCase] = &[
     GpuCase(
         "gpu-samplers-agree",
         "the same in 64 frames of 4 samples: means of pixels and of the picture",
-        "independent samples: difference by what chance allows",
+        "independent samples: the difference relative to chance",
         "ratio",
         1.0,
         samplers_agree,

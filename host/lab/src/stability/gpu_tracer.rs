@@ -1,6 +1,6 @@
 //! Light transport on the GPU: closed forms, conservation, and lights and sizes at the edge of f32.
 
-use super::estimate::pooled;
+use super::estimate::{pooled, Estimate};
 use super::gpu::GpuCase;
 use super::gpu_compare::compare;
 use super::gpu_shot::{Picture, Shot};
@@ -15,8 +15,8 @@ use std::sync::Arc;
 pub(crate) const CASES: &[GpuCase] = &[
     GpuCase(
         "gpu-furnace-convex",
-        "white Lambertian sphere in even light, 64 bounces",
-        "closed form: 1 in every pixel",
+        "white Lambertian sphere in even light, 64 bounces, before a camera and in the rig",
+        "closed form: 1 in every pixel, in the rig where the eye sees the sphere and 0 elsewhere",
         "radiance",
         2e-6,
         furnace_convex,
@@ -31,7 +31,7 @@ pub(crate) const CASES: &[GpuCase] = &[
     ),
     GpuCase(
         "gpu-closed-sphere",
-        "albedo and emission 1/2 inside spheres of 1 mm to 10 km, up to 10 km off the origin",
+        "albedo and emission 1/2 inside spheres of 1 mm to 10 km, up to 10 km off the origin, whole or cut into four bodies, depths of 1 to 12",
         "closed form: 1 - 2^-depth, every ray hits",
         "sigma",
         4.0,
@@ -44,6 +44,14 @@ pub(crate) const CASES: &[GpuCase] = &[
         "excess",
         2e-3,
         energy,
+    ),
+    GpuCase(
+        "gpu-coated-diffuse-conserves",
+        "white base under coats of ior 1.1, 1.5 and 2.4, roughness 0, 0.1 and 0.6",
+        "closed form: albedo 1",
+        "albedo",
+        2e-3,
+        coated,
     ),
     GpuCase(
         "gpu-single-scatter-loss",
@@ -68,6 +76,14 @@ pub(crate) const CASES: &[GpuCase] = &[
         "radiance",
         2e-3,
         near_one,
+    ),
+    GpuCase(
+        "gpu-clear-glass",
+        "clear slabs of index 1.0005, 1.5 and 2.4 in even light: solid or thin-walled, smooth or of roughness 0.6",
+        "closed form: 1, to 1e-4 where solid and smooth, else to the 4e-3 of the albedo table",
+        "ratio",
+        1.0,
+        clear_glass,
     ),
     GpuCase(
         "gpu-sphere-light-form-factor",
@@ -136,7 +152,7 @@ pub(crate) const CASES: &[GpuCase] = &[
     GpuCase(
         "gpu-firefly-limit",
         "limits of 0.002, 0.02 and 1e30",
-        "what is left is below it; removes and counts, never adds; out of reach it changes nothing",
+        "the rest is below the limit; the limit removes and counts light, and never adds any; a limit out of reach changes nothing",
         "faults",
         0.0,
         firefly_limit,
@@ -152,12 +168,24 @@ fn furnace(material: Material, level: u32) -> Scene {
 fn furnace_convex(gpu: &Arc<Gpu>, seed: u64) -> f64 {
     let scene = furnace(diffuse(Vec3::ONE), 2);
     let camera = camera(48, 36, DVec3::new(0.0, 0.0, 5.0), DVec3::ZERO);
-    let picture = Shot { depth: 64, seed: seed as u32, ..Shot::new(&scene, camera) }.draw(gpu);
-    let hits = (0..picture.surfaces.len()).filter(|&i| picture.hit(i)).count();
-    if hits < 200 || picture.invalid_samples() > 0 {
+    let shot = Shot { depth: 64, seed: seed as u32, ..Shot::new(&scene, camera) };
+    let seen = shot.draw(gpu);
+    let rig = Shot { eye: Some(DVec3::new(2.0, 1.0, 5.0)), ..shot }.draw(gpu);
+    let count =
+        |p: &Picture, of: fn(&Picture, usize) -> bool| (0..p.surfaces.len()).filter(|&i| of(p, i)).count();
+    let (hits, lit) = (count(&seen, Picture::hit), count(&rig, Picture::lit));
+    let counted = rig.counters[0].lit_pixels as usize == lit;
+    if hits < 200
+        || !(100..hits).contains(&lit)
+        || !counted
+        || seen.invalid_samples() + rig.invalid_samples() > 0
+    {
         return f64::NAN;
     }
-    picture.estimates.iter().flat_map(|e| e.mean).map(|m| (m - 1.0).abs()).fold(0.0, f64::max)
+    let off = |e: &Estimate, expected: f64| e.mean.iter().map(|m| (m - expected).abs()).fold(0.0, f64::max);
+    let before_camera = seen.estimates.iter().map(|e| off(e, 1.0));
+    let in_rig = rig.estimates.iter().enumerate().map(|(i, e)| off(e, if rig.lit(i) { 1.0 } else { 0.0 }));
+    before_camera.chain(in_rig).fold(0.0, f64::max)
 }
 
 fn furnace_corner(gpu: &Arc<Gpu>, seed: u64) -> f64 {
@@ -173,30 +201,68 @@ fn furnace_corner(gpu: &Arc<Gpu>, seed: u64) -> f64 {
     ((mean - 1.0).abs() - 1e-6).max(0.0) / sigma
 }
 
+/// What shines as brightly as half of what it reflects: inside a closed space of it the radiance is `1 - 2^-depth`.
+fn half_lamp() -> Material {
+    Material { emissive: Vec3::splat(0.5), double_sided: true, ..diffuse(Vec3::splat(0.5)) }
+}
+
+/// Sigmas between what is seen inside a closed space of [`half_lamp`] and its closed form; infinite where a ray gets out.
+fn off_closed(gpu: &Arc<Gpu>, shot: &Shot) -> f64 {
+    let picture = shot.draw(gpu);
+    if picture.invalid_samples() > 0 || (0..picture.surfaces.len()).any(|i| !picture.hit(i)) {
+        return f64::INFINITY;
+    }
+    let (mean, sigma) = pooled(&picture.estimates, 1);
+    // Emission alone has no noise.
+    ((mean - (1.0 - 0.5f64.powi(shot.depth as i32))).abs() - 1e-6).max(0.0) / sigma.max(1e-9)
+}
+
 fn closed_sphere(gpu: &Arc<Gpu>, seed: u64) -> f64 {
-    let lamp = Material { emissive: Vec3::splat(0.5), double_sided: true, ..diffuse(Vec3::splat(0.5)) };
+    let seed = seed as u32;
     let mut worst: f64 = 0.0;
     for (radius, distance) in [(1e-3f32, 0.0), (1e-3, 1e4), (1.0, 0.0), (1.0, 1e4), (1e4, 0.0), (1e4, 1e4)] {
         // Baked at the origin; moved and turned by its pose, as the tracker does.
-        let scene = scene_of(sphere(Vec3::ZERO, radius, 2, true), lamp.clone());
+        let scene = scene_of(sphere(Vec3::ZERO, radius, 2, true), half_lamp());
         let centre = DVec3::new(0.6, -0.48, 0.64) * distance;
         let turn = DQuat::from_euler(glam::EulerRot::XYZ, 0.3, 1.1, -0.7);
         let inside = |v: DVec3| centre + v * f64::from(radius);
         let camera = camera(24, 24, inside(DVec3::new(0.31, -0.2, 0.11)), inside(DVec3::new(-0.1, 0.9, 0.3)));
         let poses = vec![DAffine3::from_rotation_translation(turn, centre)];
-        let shot = Shot { frames: 8, depth: 10, poses, seed: seed as u32, ..Shot::new(&scene, camera) };
-        let picture = shot.draw(gpu);
-        if picture.invalid_samples() > 0 || (0..picture.surfaces.len()).any(|i| !picture.hit(i)) {
-            return f64::INFINITY;
-        }
-        let (mean, sigma) = pooled(&picture.estimates, 1);
-        worst = worst.max(((mean - (1.0 - 0.5f64.powi(10))).abs() - 1e-6).max(0.0) / sigma);
+        let shot = Shot { frames: 8, depth: 10, poses, seed, ..Shot::new(&scene, camera) };
+        worst = worst.max(off_closed(gpu, &shot));
     }
-    worst
+    let scene = scene_of(sphere(Vec3::ZERO, 2.0, 1, false), half_lamp());
+    let camera = camera(32, 24, DVec3::new(0.3, -0.2, 0.1), DVec3::NEG_Z);
+    for depth in [1, 2, 3, 12] {
+        worst = worst.max(off_closed(gpu, &Shot { frames: 8, depth, seed, ..Shot::new(&scene, camera) }));
+    }
+    worst.max(cut_sphere(gpu, seed))
+}
+
+/// A closed sphere that is cut into four bodies, whose seams meet in world space only.
+fn cut_sphere(gpu: &Arc<Gpu>, seed: u32) -> f64 {
+    let whole = sphere(Vec3::ZERO, 1.0, 2, true);
+    let mut scene = Scene::default();
+    for part in whole.triangles.chunks(whole.triangles.len() / 4) {
+        let mut mesh = whole.clone();
+        mesh.triangles = part.to_vec();
+        add(&mut scene, mesh, half_lamp());
+    }
+    let pose = DAffine3::from_rotation_translation(DQuat::from_rotation_x(0.4), DVec3::new(0.2, 0.1, -0.3));
+    let poses = vec![pose; scene.bodies.len()];
+    let camera = camera(32, 24, DVec3::new(0.1, 0.2, 0.1), DVec3::NEG_Z);
+    off_closed(gpu, &Shot { frames: 8, depth: 8, poses, seed, ..Shot::new(&scene, camera) })
 }
 
 fn energy(gpu: &Arc<Gpu>, seed: u64) -> f64 {
-    let looks = [(0.0, 0.0, true), (1.0, 0.0, true), (0.0, 1.0, true), (0.0, 1.0, false), (0.5, 0.5, false)];
+    let looks = [
+        (0.0, 0.0, true),
+        (1.0, 0.0, true),
+        (0.0, 1.0, true),
+        (0.0, 1.0, false),
+        (0.5, 0.5, false),
+        (0.3, 0.5, true),
+    ];
     let mut worst: f64 = 0.0;
     for roughness in [0.0, 1e-4, 1e-3, 0.0317, 0.5, 1.0] {
         for (metallic, transmission, thin_walled) in looks {
@@ -219,11 +285,32 @@ fn energy(gpu: &Arc<Gpu>, seed: u64) -> f64 {
                 let hit =
                     (0..picture.surfaces.len()).filter(|&i| picture.hit(i)).map(|i| &picture.estimates[i]);
                 let (mean, sigma) = pooled(hit, 0);
+                if mean < 0.1 {
+                    // Black creates no energy either.
+                    return f64::INFINITY;
+                }
                 worst = worst.max(mean - 1.0 - 4.0 * sigma);
             }
         }
     }
     worst
+}
+
+fn coated(gpu: &Arc<Gpu>, seed: u64) -> f64 {
+    let mut worst: f64 = 0.0;
+    for ior in [1.1, 1.5, 2.4] {
+        for roughness in [0.0, 0.1, 0.6] {
+            let scene = furnace(Material { ior, roughness, ..diffuse(Vec3::ONE) }, 2);
+            let camera = camera(32, 32, DVec3::new(0.0, 0.0, 5.0), DVec3::ZERO);
+            let shot = Shot { spp: 64, frames: 8, depth: 2, seed: seed as u32, ..Shot::new(&scene, camera) };
+            let (mean, sigma) = pooled(shot.draw(gpu).lit_estimates().collect::<Vec<_>>(), 1);
+            if sigma > 2e-3 {
+                return f64::NAN;
+            }
+            worst = worst.max((mean - 1.0).abs() - 4.0 * sigma);
+        }
+    }
+    worst.max(0.0)
 }
 
 fn single_scatter(gpu: &Arc<Gpu>, seed: u64) -> f64 {
@@ -272,6 +359,30 @@ fn near_one(gpu: &Arc<Gpu>, seed: u64) -> f64 {
         let shot = Shot { spp: 32, frames: 8, depth: 16, seed: seed as u32, ..Shot::new(&scene, camera) };
         let (mean, sigma) = pooled(shot.draw(gpu).lit_estimates().collect::<Vec<_>>(), 0);
         worst = worst.max((mean - 1.0).abs() - 4.0 * sigma);
+    }
+    worst.max(0.0)
+}
+
+fn clear_glass(gpu: &Arc<Gpu>, seed: u64) -> f64 {
+    let mut worst: f64 = 0.0;
+    for (thin_walled, ior, roughness) in [
+        (false, 1.5, 0.0),
+        (false, 2.4, 0.0),
+        (true, 1.5, 0.0),
+        (false, 1.0005, 0.0),
+        (true, 1.5, 0.6),
+        (false, 1.0005, 0.6),
+    ] {
+        let scene = clear_slab(ior, roughness, thin_walled);
+        let camera = camera(24, 24, DVec3::new(0.0, 3.0, 5.0), DVec3::ZERO);
+        let shot = Shot { spp: 64, frames: 8, depth: 32, seed: seed as u32, ..Shot::new(&scene, camera) };
+        let (mean, sigma) = pooled(shot.draw(gpu).lit_estimates().collect::<Vec<_>>(), 0);
+        if sigma > 5e-3 {
+            return f64::NAN;
+        }
+        // A thin wall takes its reflection from the table, and there are two of them.
+        let tolerance = if thin_walled || roughness > 0.0 { 4e-3 } else { 1e-4 };
+        worst = worst.max(((mean - 1.0).abs() - 4.0 * sigma) / tolerance);
     }
     worst.max(0.0)
 }
@@ -471,8 +582,7 @@ fn firefly_limit(gpu: &Arc<Gpu>, seed: u64) -> f64 {
     let mut faults = free.radiance.iter().zip(&loose.radiance).filter(|(a, b)| a != b).count() as u32;
     faults += free.counters[0].clamped_samples + loose.counters[0].clamped_samples;
     faults += u32::from(tight.counters[0].clamped_samples <= 100);
-    let added =
-        |(a, b): &(&super::estimate::Estimate, &super::estimate::Estimate)| a.mean[1] > b.mean[1] + 1e-6;
+    let added = |(a, b): &(&Estimate, &Estimate)| a.mean[1] > b.mean[1] + 1e-6;
     faults += tight.estimates.iter().zip(&free.estimates).filter(added).count() as u32;
     // Of paths that end at their third vertex a sample of a light and a hit are indirect, neither beyond the limit; without one some are.
     let (two, three, beyond) = (draw(2, None), draw(3, Some(0.002)), draw(3, None));

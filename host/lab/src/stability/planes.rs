@@ -1,6 +1,6 @@
 //! Hard cases of quantising, bit planes and frame slots.
 
-use super::Case;
+use super::CpuCase;
 use crate::reference::Sampler;
 use dpm_device::link::SlotClock;
 use dpm_device::planes::{Channel, PlaneSchedule, PlaneSpec, Raster};
@@ -8,82 +8,80 @@ use dpm_device::time::{DeviceTicks, FrameRate};
 use dpm_render::pack::{pack, quantise, unpack, BitPlaneFrame, Kernel};
 
 /// The cases.
-pub(super) fn cases() -> Vec<Case> {
-    vec![
-        Case::new(
-            "planes-all-code-values",
-            "every value of every channel, all 24 planes",
-            "unpack(pack(x)) = x",
-            "pixels",
-            0.0,
-            all_codes,
-        ),
-        Case::new(
-            "planes-odd-rasters",
-            "widths 1 to 67, 511, 513, 1023 and a row of 8192, every kernel",
-            "bit for bit the plain loop; padding 0",
-            "frames",
-            0.0,
-            odd_rasters,
-        ),
-        Case::new(
-            "planes-light-of-a-value",
-            "sum of plane bits times LED weight 2^bit / 255",
-            "code / 255",
-            "light",
-            1e-15,
-            light_of_value,
-        ),
-        Case::new(
-            "quantiser-extremes",
-            "NaN, -1, 2, infinities, denormals, +-0, the value just below 1",
-            "0, 255 or the nearest; NaN black and counted",
-            "faults",
-            0.0,
-            quantiser_extremes,
-        ),
-        Case::new(
-            "quantiser-rounding",
-            "1,000,001 values of 0..1",
-            "half a step",
-            "LSB",
-            0.5 + 2e-5,
-            quantiser_rounding,
-        ),
-        Case::new(
-            "quantiser-dither-mean",
-            "4096 even offsets, values across 0..1",
-            "mean over frames = value",
-            "LSB",
-            2e-3,
-            dither_mean,
-        ),
-        Case::new(
-            "slots-947-fps-for-400-days",
-            "947 fps, 24,000/1001 fps, 1 fps: starts, lengths, inverse",
-            "i128 rationals: within 1 ns for ever",
-            "ns",
-            1.0,
-            slots,
-        ),
-        Case::new(
-            "slots-beyond-2-to-the-53",
-            "slots 2^32, 2^53, 2^63, missed runs of up to 1e6",
-            "i128: floor; no slot lost or doubled",
-            "faults",
-            0.0,
-            far_slots,
-        ),
-        Case::new(
-            "slots-on-the-device-clock",
-            "tick rates 1 kHz to 4 GHz, epoch near the wrap, slot 2^53",
-            "i128: within a tick; slot_at inverts start",
-            "ticks",
-            1.0,
-            device_slots,
-        ),
-    ]
-}
+pub(super) const CASES: &[CpuCase] = &[
+    CpuCase(
+        "planes-all-code-values",
+        "every value of every channel, all 24 planes",
+        "unpack(pack(x)) = x",
+        "pixels",
+        0.0,
+        all_codes,
+    ),
+    CpuCase(
+        "planes-odd-rasters",
+        "widths 1 to 67, 511, 513, 1023 and a row of 8192, every kernel",
+        "bit for bit the plain loop; padding 0",
+        "frames",
+        0.0,
+        odd_rasters,
+    ),
+    CpuCase(
+        "planes-light-of-a-value",
+        "sum of plane bits times LED weight 2^bit / 255",
+        "code / 255",
+        "light",
+        1e-15,
+        light_of_value,
+    ),
+    CpuCase(
+        "quantiser-extremes",
+        "NaN, -1, 2, infinities, denormals, +-0, the value just below 1",
+        "0, 255 or the nearest; NaN black and counted",
+        "faults",
+        0.0,
+        quantiser_extremes,
+    ),
+    CpuCase(
+        "quantiser-rounding",
+        "1,000,001 values of 0..1",
+        "half a step",
+        "LSB",
+        0.5 + 2e-5,
+        quantiser_rounding,
+    ),
+    CpuCase(
+        "quantiser-dither-mean",
+        "4096 even offsets, values across 0..1",
+        "mean over frames = value",
+        "LSB",
+        2e-3,
+        dither_mean,
+    ),
+    CpuCase(
+        "slots-947-fps-for-400-days",
+        "947 fps, 24,000/1001 fps, 1 fps: starts, lengths, inverse",
+        "i128 rationals: within 1 ns without drift",
+        "ns",
+        1.0,
+        slots,
+    ),
+    CpuCase(
+        "slots-beyond-2-to-the-53",
+        "slots 2^32, 2^53, 2^63, missed runs of up to 1e6",
+        "i128: floor; no slot lost or doubled",
+        "faults",
+        0.0,
+        far_slots,
+    ),
+    CpuCase(
+        "slots-on-the-device-clock",
+        "tick rates 1 kHz to 4 GHz, epoch near the wrap, slot 2^53",
+        "i128: within a tick; slot_at inverts start",
+        "ticks",
+        1.0,
+        device_slots,
+    ),
+];
 
 fn raster(w: u32, h: u32) -> Raster {
     Raster::new(w, h).expect("sides within 1..8192")

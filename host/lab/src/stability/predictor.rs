@@ -1,8 +1,8 @@
 //! Hard cases of following and predicting rigid bodies.
 
-use super::statistics::Mean;
-use super::Case;
+use super::CpuCase;
 use crate::reference::Sampler;
+use crate::statistics::Mean;
 use dpm_common::so3::{so3_between, so3_exp, so3_log};
 use dpm_device::pose::Pose;
 use dpm_device::time::HostTime;
@@ -13,114 +13,105 @@ use dpm_tracking::{Freshness, PoseFilter, PoseFilterConfig, PosePrediction, Verd
 use glam::{DQuat, DVec3};
 
 /// The cases.
-pub(super) fn cases() -> Vec<Case> {
-    vec![
-        Case::new(
-            "predictor-at-rest",
-            "a still body, 0.1 mm of noise at 500 Hz, predicted 5 ms ahead",
-            "jitter of the prediction over that of the input",
-            "ratio",
-            1.5,
-            at_rest,
-        ),
-        Case::new(
-            "predictor-constant-velocity",
-            "1 m/s without noise, 5 ms ahead",
-            "closed form, over the way covered",
-            "relative",
-            1e-6,
-            constant_velocity,
-        ),
-        Case::new(
-            "predictor-constant-spin",
-            "100 rad/s about a slanted axis without noise, 5 ms ahead",
-            "closed form, over the angle covered",
-            "relative",
-            1e-6,
-            constant_spin,
-        ),
-        Case::new(
-            "predictor-screw",
-            "1 m/s along and 6 turns/s about an axis off the origin, 2 ms ahead",
-            "closed form",
-            "m",
-            2e-4,
-            screw,
-        ),
-        Case::new(
-            "predictor-acceleration-step",
-            "0 to 100 m/s^2 at once, 5 ms ahead",
-            "half a tau^2 with tau from the last sample, over it",
-            "ratio",
-            1.5,
-            acceleration_step,
-        ),
-        Case::new(
-            "predictor-half-turns-and-signs",
-            "angles of pi, 2 pi - 1e-9, 1e-9; q and -q in turn",
-            "exp and log: closed form; prediction continuous",
-            "rad",
-            1e-6,
-            half_turns,
-        ),
-        Case::new(
-            "predictor-bad-stamps",
-            "dt 0, 1 ns, negative, 10 s; stamps of the future; NaN, norm 2",
-            "refused or restarted; every prediction finite",
-            "faults",
-            0.0,
-            bad_stamps,
-        ),
-        Case::new(
-            "predictor-covariance-extremes",
-            "R 1e-24 to 1e24 against priors of 1e12; 0; 100,000 updates",
-            "least eigenvalue over trace, negative part",
-            "share",
-            1e-12,
-            covariance,
-        ),
-        Case::new(
-            "predictor-outlier-burst",
-            "50 samples 100 m off, then the truth",
-            "error after 10 true samples",
-            "m",
-            1e-3,
-            outliers,
-        ),
-        Case::new(
-            "predictor-innovations",
-            "0.1 mm of noise, slow motion",
-            "mean normalised innovation 3, within a factor 1.6",
-            "ratio",
-            1.6,
-            innovations,
-        ),
-        Case::new(
-            "predictor-a-day",
-            "100,000 samples stamped after 24 h and 400 days",
-            "quaternion norm, prediction against truth",
-            "error",
-            1e-6,
-            a_day,
-        ),
-        Case::new(
-            "predictor-horizon",
-            "0, 5, 50, 1000 ms and negative without samples",
-            "error grows; motion stops at the limit; Lost is said",
-            "faults",
-            0.0,
-            horizon,
-        ),
-        Case::new(
-            "predictor-jitter-of-stamps",
-            "2 ms steps of +-100 %",
-            "closed form",
-            "m",
-            1e-6,
-            stamp_jitter,
-        ),
-    ]
-}
+pub(super) const CASES: &[CpuCase] = &[
+    CpuCase(
+        "predictor-at-rest",
+        "a still body, 0.1 mm of noise at 500 Hz, predicted 5 ms ahead",
+        "jitter of the prediction over that of the input",
+        "ratio",
+        1.5,
+        at_rest,
+    ),
+    CpuCase(
+        "predictor-constant-velocity",
+        "1 m/s without noise, 5 ms ahead",
+        "closed form, relative to the distance covered",
+        "relative",
+        1e-6,
+        constant_velocity,
+    ),
+    CpuCase(
+        "predictor-constant-spin",
+        "100 rad/s about a slanted axis without noise, 5 ms ahead",
+        "closed form, relative to the angle covered",
+        "relative",
+        1e-6,
+        constant_spin,
+    ),
+    CpuCase(
+        "predictor-screw",
+        "1 m/s along and 6 turns/s about an axis off the origin, 2 ms ahead",
+        "closed form",
+        "m",
+        2e-4,
+        screw,
+    ),
+    CpuCase(
+        "predictor-acceleration-step",
+        "0 to 100 m/s^2 at once, 5 ms ahead",
+        "half a tau^2 with tau from the last sample; the error as a ratio to it",
+        "ratio",
+        1.5,
+        acceleration_step,
+    ),
+    CpuCase(
+        "predictor-half-turns-and-signs",
+        "angles of pi, 2 pi - 1e-9, 1e-9; q and -q in turn",
+        "exp and log: closed form; prediction continuous",
+        "rad",
+        1e-6,
+        half_turns,
+    ),
+    CpuCase(
+        "predictor-bad-stamps",
+        "dt 0, 1 ns, negative, 10 s; stamps of the future; NaN, norm 2",
+        "refused or restarted; every prediction finite",
+        "faults",
+        0.0,
+        bad_stamps,
+    ),
+    CpuCase(
+        "predictor-covariance-extremes",
+        "R 1e-24 to 1e24 against priors of 1e12; 0; 100,000 updates",
+        "least eigenvalue over trace, negative part",
+        "share",
+        1e-12,
+        covariance,
+    ),
+    CpuCase(
+        "predictor-outlier-burst",
+        "50 samples 100 m off, then the truth",
+        "error after 10 true samples",
+        "m",
+        1e-3,
+        outliers,
+    ),
+    CpuCase(
+        "predictor-innovations",
+        "0.1 mm of noise, slow motion",
+        "mean normalised innovation 3, within a factor 1.6",
+        "ratio",
+        1.6,
+        innovations,
+    ),
+    CpuCase(
+        "predictor-a-day",
+        "100,000 samples stamped after 24 h and 400 days",
+        "quaternion norm, prediction against truth",
+        "error",
+        1e-6,
+        a_day,
+    ),
+    CpuCase(
+        "predictor-horizon",
+        "0, 5, 50, 1000 ms and negative without samples",
+        "the stated error grows; motion stops at the limit; the state becomes Lost",
+        "faults",
+        0.0,
+        horizon,
+    ),
+    CpuCase("predictor-jitter-of-stamps", "2 ms steps of +-100 %", "closed form", "m", 1e-6, stamp_jitter),
+];
 
 const STEP_NS: i64 = 2_000_000;
 

@@ -1,11 +1,11 @@
 //! Hard cases of scattering: every lobe's energy, reciprocity and sampler, Fresnel's law, and what the reference shares with the GPU (the albedo
 //! table, compensation).
 
-use super::statistics::{test_directions, DirectionTest, Mean};
-use super::Case;
+use super::CpuCase;
 use crate::reference::bsdf::Bsdf;
 use crate::reference::microfacet::fresnel_dielectric;
 use crate::reference::{Reference, Sampler, SurfacePoint};
+use crate::statistics::{test_directions, DirectionTest, Mean};
 use crate::twins::compensation::Compensation;
 use dpm_scene::albedo_table::AlbedoTable;
 use dpm_scene::shapes::*;
@@ -14,31 +14,30 @@ use glam::{DVec3, Vec3};
 use std::f64::consts::PI;
 
 /// The cases.
-pub(crate) fn cases() -> Vec<Case> {
-    vec![
-        Case::new("tracer-energy-of-every-lobe", "roughness 0, 1e-4, 1e-3, 0.5, 1; ior 1 to 2.4; metal, coat, thin, solid; down to grazing 89.99 deg", "albedo at most 1", "excess", 1e-2, energy),
-        Case::new("tracer-single-scatter-loss", "white rough metal, alpha 0.25, 0.5, 1", "directional albedo 0.882, 0.700, 0.409 on average", "albedo", 3e-3, single_scatter),
-        Case::new("tracer-coated-diffuse-conserves", "white base under coats of ior 1 to 2.4", "closed form: albedo 1", "albedo", 5e-3, coated),
-        Case::new("tracer-reciprocity", "random pairs of directions, reflection and refraction", "f(a, b) = f(b, a), with the square of the index where refracted", "relative", 1e-7, reciprocity),
-        Case::new("tracer-samplers-chi-square", "all lobes, 150,000 samples each", "probability p that chance fits one of n lobes worse: 1e-4 / (n p)", "ratio", 1.0, chi_square),
-        Case::new("tracer-density-integrates-to-one", "all lobes", "integral of the density = share not absorbed", "share", 6e-3, density_integral),
-        Case::new("tracer-fresnel", "ior 0.2 to 2.4, 1, 1 + 1e-7, 1 + 1e-12, edge of total reflection", "Fresnel's equations", "reflectance", 1e-12, fresnel),
-        Case::new("tracer-grazing-and-zero-vectors", "directions at 90 deg, denormal cosines, u = 0 and 1 - 2^-53", "finite, not negative", "faults", 0.0, grazing),
-        Case::new("albedo-table-f32", "0..1 in both, ior 1.0001 to 3", "f64 look-up", "albedo", 2e-6, albedo_f32),
-        Case::new("compensation-extremes", "cos 0 and 1e-38, distance 0 and 1e18, radiance NaN, infinite, negative, denormal", "0..1, never NaN; NaN becomes black", "faults", 0.0, compensation_extremes),
-        Case::new("compensation-f32", "distance 1 mm to 50 m, cos 1 to 1e-3", "f64", "relative", 6e-7, compensation_f32),
-    ]
-}
+pub(super) const CASES: &[CpuCase] = &[
+        CpuCase("tracer-energy-of-every-lobe", "roughness 0, 1e-4, 1e-3, 0.5, 1; ior 1 to 2.4; metal, coat, thin, solid; from both sides, down to grazing 89.99 deg", "albedo at most 1", "excess", 1e-2, energy),
+        CpuCase("tracer-single-scatter-loss", "white rough metal, alpha 0.25, 0.5, 1", "directional albedo 0.882, 0.700, 0.409 on average", "albedo", 3e-3, single_scatter),
+        CpuCase("tracer-coated-diffuse-conserves", "white base under coats of ior 1 to 2.4", "closed form: albedo 1", "albedo", 5e-3, coated),
+        CpuCase("tracer-reciprocity", "random pairs of directions, reflection and refraction", "f(a, b) = f(b, a), with the square of the index where refracted", "relative", 1e-7, reciprocity),
+        CpuCase("tracer-samplers-chi-square", "all lobes, 150,000 samples each", "probability p that chance fits one of n lobes worse: 1e-4 / (n p)", "ratio", 1.0, chi_square),
+        CpuCase("tracer-samples-carry-their-density", "all lobes, 20,000 samples each", "density and value of a sample are those of its direction", "relative", 1e-7, own_density),
+        CpuCase("tracer-density-integrates-to-one", "all lobes", "integral of the density = share not absorbed", "share", 6e-3, density_integral),
+        CpuCase("tracer-fresnel", "ior 0.2 to 2.4, 1, 1 + 1e-7, 1 + 1e-12, edge of total reflection", "Fresnel's equations", "reflectance", 1e-12, fresnel),
+        CpuCase("tracer-grazing-and-zero-vectors", "directions at 90 deg, denormal cosines, u = 0 and 1 - 2^-53", "finite, not negative", "faults", 0.0, grazing),
+        CpuCase("albedo-table-f32", "0..1 in both, ior 1.0001 to 3", "f64 look-up", "albedo", 2e-6, albedo_f32),
+        CpuCase("compensation-extremes", "cos 0 and 1e-38, distance 0 and 1e18, radiance NaN, infinite, negative, denormal", "0..1, never NaN; NaN becomes black", "faults", 0.0, compensation_extremes),
+        CpuCase("compensation-f32", "distance 1 mm to 50 m, cos 1 to 1e-3", "f64", "relative", 6e-7, compensation_f32),
+];
 
 /// The point in the middle of a patch of the material.
-pub(crate) fn patch(material: &Material) -> SurfacePoint {
+fn patch(material: &Material) -> SurfacePoint {
     let s = scene_of(floor(1.0, 0.0), material.clone());
     let point = Reference::new(&s, &[]).trace(DVec3::new(0.1, 1.0, 0.2), -DVec3::Y, 9.0, false);
     point.expect("the patch lies below")
 }
 
 /// A white material of every kind.
-pub(crate) fn look(roughness: f32, metallic: f32, transmission: f32, thin_walled: bool) -> Material {
+fn look(roughness: f32, metallic: f32, transmission: f32, thin_walled: bool) -> Material {
     Material { roughness, metallic, transmission, thin_walled, ..Material::default() }
 }
 
@@ -46,6 +45,7 @@ fn viewing(mu: f64) -> DVec3 {
     DVec3::new((1.0 - mu * mu).max(0.0).sqrt(), mu, 0.0)
 }
 
+/// Directional albedo of a patch seen at cosine `mu`, from behind where that is negative.
 fn albedo_of(material: &Material, table: &AlbedoTable, mu: f64, n: u32, seed: u64) -> Mean {
     let point = patch(material);
     let mut mean = Mean::default();
@@ -74,13 +74,16 @@ fn energy(seed: u64) -> f64 {
         for roughness in [0.0, 1e-4, 1e-3, 0.0317, 0.5, 1.0] {
             for (metallic, transmission, thin_walled) in LOOKS {
                 let m = Material { ior, ..look(roughness, metallic, transmission, thin_walled) };
-                for mu in [1.0, 0.3, 1.745e-4] {
+                for mu in [1.0, 0.3, 1.745e-4, -1.0, -0.3, -1.745e-4] {
                     // So many that a lobe which loses a hundredth of them does lose one: else its deviation would count as 0.
                     let a = albedo_of(&m, &table, mu, 2000, seed);
                     if a.mean() < 0.0 {
                         return f64::INFINITY;
                     }
-                    worst = worst.max(a.mean() - 5.0 * a.standard_error() - 1.0);
+                    // Radiance grows by the square of the index on the way into a solid from its outside; the power does not.
+                    let into = !thin_walled && transmission > 0.0 && mu < 0.0;
+                    let growth = if into { f64::from(ior * ior) } else { 1.0 };
+                    worst = worst.max((a.mean() - 5.0 * a.standard_error()) / growth - 1.0);
                 }
             }
         }
@@ -121,7 +124,7 @@ fn coated(seed: u64) -> f64 {
 }
 
 /// A direction not quite in the plane, on the side of `up`.
-pub(crate) fn direction(u: [f64; 2], up: f64) -> DVec3 {
+fn direction(u: [f64; 2], up: f64) -> DVec3 {
     let (y, phi) = (0.02 + 0.98 * u[0], 2.0 * PI * u[1]);
     let r = (1.0 - y * y).sqrt();
     DVec3::new(r * phi.cos(), y * up, r * phi.sin())
@@ -157,14 +160,17 @@ fn reciprocity(seed: u64) -> f64 {
     worst
 }
 
-/// Significance and integral error of every lobe's sampler.
-fn direction_tests(seed: u64, samples: u32) -> Vec<super::statistics::DirectionTest> {
+/// Of every lobe's sampler: how well its density fits it, and the largest relative difference of a sample's own density and value from
+/// those of its direction.
+fn direction_tests(seed: u64, samples: u32) -> Vec<(DirectionTest, f64)> {
     let looks = [
         (0.5f32, 1.0f32, 0.0f32, true, 0.9f64),
         (0.7, 1.0, 0.0, true, 0.15),
+        (1.0, 1.0, 0.0, true, 0.5),
         (0.6, 0.0, 0.0, true, 0.6),
         (0.7, 0.0, 1.0, false, 0.7),
         (0.8, 0.3, 0.6, false, -0.6),
+        (0.0, 0.0, 0.0, true, 0.5),
     ];
     looks
         .into_iter()
@@ -174,8 +180,17 @@ fn direction_tests(seed: u64, samples: u32) -> Vec<super::statistics::DirectionT
             let (p, table) = (patch(&m), AlbedoTable::new(m.ior));
             let bsdf = Bsdf::new(&p, &table, viewing(mu)).expect("front, or both sides");
             let mut s = Sampler::new(seed, 1);
-            let mut draw = || Some(bsdf.sample(s.uniform(), s.uniform2(), s.uniform())?.l);
-            test_directions(samples, &mut draw, &|l| bsdf.evaluate(l).pdf)
+            let mut apart: f64 = 0.0;
+            // A mirror has no density: its samples count as absorbed.
+            let mut draw = || {
+                let sample = bsdf.sample(s.uniform(), s.uniform2(), s.uniform())?;
+                let (pdf, value) = (sample.pdf?, bsdf.evaluate(sample.l));
+                let of_value = (value.f_cos - sample.weight * pdf).abs().max_element();
+                apart = apart.max((value.pdf / pdf - 1.0).abs()).max(of_value / value.f_cos.max_element());
+                Some(sample.l)
+            };
+            let test = test_directions(samples, &mut draw, &|l| bsdf.evaluate(l).pdf);
+            (test, apart)
         })
         .collect()
 }
@@ -184,11 +199,15 @@ fn chi_square(seed: u64) -> f64 {
     let tests = direction_tests(seed, 150_000);
     // The least of n values of p is below p / n with probability p at most.
     let any = |t: &DirectionTest| 1e-4 / (tests.len() as f64 * t.p_value.max(1e-300));
-    tests.iter().map(any).fold(0.0, f64::max)
+    tests.iter().map(|(t, _)| any(t)).fold(0.0, f64::max)
+}
+
+fn own_density(seed: u64) -> f64 {
+    direction_tests(seed, 20_000).iter().map(|(_, apart)| *apart).fold(0.0, f64::max)
 }
 
 fn density_integral(seed: u64) -> f64 {
-    direction_tests(seed, 60_000).iter().map(|t| t.integral_error.abs()).fold(0.0, f64::max)
+    direction_tests(seed, 60_000).iter().map(|(t, _)| t.integral_error.abs()).fold(0.0, f64::max)
 }
 
 fn fresnel(_: u64) -> f64 {
@@ -210,6 +229,18 @@ fn fresnel(_: u64) -> f64 {
     }
     for c in [0.0, 1e-9, 0.3, 1.0] {
         worst = worst.max(fresnel_dielectric(1.0, c));
+    }
+    // At normal incidence d^2 / (2 + d)^2, to full precision although the textbook's form has lost half of its digits.
+    let next = 1.0 + 1e-7f64;
+    let exact = (next - 1.0).powi(2) / (next + 1.0).powi(2);
+    worst = worst.max(1e-3 * (fresnel_dielectric(next, 1.0) / exact - 1.0).abs());
+    // Beyond normal incidence there is nothing; the edge of total reflection is approached like a square root, without a step.
+    worst = worst.max((fresnel_dielectric(1.5, 1.0 + 1e-9) - fresnel_dielectric(1.5, 1.0)).abs());
+    let edge = (1.0 - 1.0 / (1.5f64 * 1.5)).sqrt();
+    for d in [1e-4, 1e-8, 1e-12] {
+        let below = fresnel_dielectric(1.0 / 1.5, edge + d);
+        let smooth = below < 1.0 && 1.0 - below < 20.0 * d.sqrt();
+        worst = worst.max(if smooth { 1.0 - fresnel_dielectric(1.0 / 1.5, edge - d) } else { 1.0 });
     }
     // Just above 1 the reflectance goes with (n - 1)^2 at every angle; 1e-7 of the relative error counts.
     for c in [0.3, 0.6, 0.9, 1.0] {

