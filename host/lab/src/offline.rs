@@ -29,7 +29,7 @@ pub enum OfflineError {
 }
 
 /// The tracker and the filters of a rig, one step at a time.
-pub struct OfflinePredictor {
+pub(crate) struct OfflinePredictor {
     stage: TrackingStage,
     publisher: Publisher<TrackSnapshot>,
     reader: Reader<TrackSnapshot>,
@@ -40,7 +40,7 @@ impl OfflinePredictor {
     ///
     /// # Errors
     /// As [`open_for`].
-    pub fn new(rig: &Rig) -> Result<Self, SourceError> {
+    pub(crate) fn new(rig: &Rig) -> Result<Self, SourceError> {
         let tracker = open_for(rig, std::sync::Arc::new(|| HostTime(0)), HostTime(0))?;
         let stage = TrackingStage::new(rig, tracker);
         let (publisher, reader) = latest(TrackSnapshot::empty(rig.bodies.len()));
@@ -51,17 +51,17 @@ impl OfflinePredictor {
     ///
     /// # Errors
     /// The tracker is gone.
-    pub fn latch(&mut self, at: HostTime) -> Result<(), TrackerError> {
+    pub(crate) fn latch(&mut self, at: HostTime) -> Result<(), TrackerError> {
         self.stage.step(at, &mut self.publisher)
     }
 
     /// Capture of the newest sample of tracked body `body` that was latched last; `None` before its first samples.
-    pub fn captured_at(&mut self, body: usize) -> Option<HostTime> {
+    pub(crate) fn captured_at(&mut self, body: usize) -> Option<HostTime> {
         Some(self.reader.latest().0.tracks.get(body).copied().flatten()?.0.captured_at)
     }
 
     /// World-from-body of tracked body `body` at `at` by what was latched last; `None` before its first samples.
-    pub fn predict(&mut self, body: usize, at: HostTime) -> Option<DAffine3> {
+    pub(crate) fn predict(&mut self, body: usize, at: HostTime) -> Option<DAffine3> {
         let (state, _) = self.reader.latest().0.tracks.get(body).copied().flatten()?;
         Some(affine(&state.predict(at).pose))
     }

@@ -46,7 +46,7 @@ pub fn set_fifo_priority(priority: u32) -> Result<(), Refusal> {
 /// The SCHED_FIFO or SCHED_RR priority of the calling thread; 0 under the normal scheduler.
 #[cfg(test)]
 #[cfg(target_os = "linux")]
-pub fn real_time_priority() -> u32 {
+pub(crate) fn real_time_priority() -> u32 {
     // SAFETY: as in `set_fifo_priority`.
     let mut param: libc::sched_param = unsafe { std::mem::zeroed() };
     // SAFETY: pid 0 is the calling thread; `param` is written during the call only.
@@ -61,7 +61,7 @@ pub fn real_time_priority() -> u32 {
 
 /// Binds the calling thread to one core.
 #[cfg(target_os = "linux")]
-pub fn pin_to_core(core: u32) -> Result<(), Refusal> {
+pub(crate) fn pin_to_core(core: u32) -> Result<(), Refusal> {
     let what = format!("core {core}");
     let limit = libc::CPU_SETSIZE as u32;
     if core >= limit {
@@ -164,7 +164,7 @@ struct SchedAttr {
 /// its niceness. A thread that needs little time at once then comes before threads that need much. Needs no right.
 /// Kernels before 6.12 have one slice for all threads and ignore the request silently.
 #[cfg(target_os = "linux")]
-pub fn set_slice_ns(slice_ns: u64) -> Result<(), Refusal> {
+pub(crate) fn set_slice_ns(slice_ns: u64) -> Result<(), Refusal> {
     let size = std::mem::size_of::<SchedAttr>() as u32;
     let mut attr = SchedAttr::default();
     // SAFETY: pid 0 is the calling thread; `attr` has the `size` bytes that the kernel may write and outlives the calls.
@@ -187,7 +187,7 @@ pub fn set_slice_ns(slice_ns: u64) -> Result<(), Refusal> {
 /// threads.
 #[cfg(test)]
 #[cfg(target_os = "linux")]
-pub fn slice_ns() -> u64 {
+pub(crate) fn slice_ns() -> u64 {
     let size = std::mem::size_of::<SchedAttr>() as u32;
     let mut attr = SchedAttr::default();
     // SAFETY: as in `set_slice_ns`.
@@ -201,7 +201,7 @@ pub fn slice_ns() -> u64 {
 
 /// The cores that the calling thread may run on, in order.
 #[cfg(target_os = "linux")]
-pub fn allowed_core_list() -> Vec<u32> {
+pub(crate) fn allowed_core_list() -> Vec<u32> {
     // SAFETY: cpu_set_t is a bit array, for which all zero bits are valid and which is written during the call only.
     let set = unsafe {
         let mut set: libc::cpu_set_t = std::mem::zeroed();
@@ -260,7 +260,7 @@ fn read_of_thread<'a>(id: i32, name: &str, text: &'a mut [u8]) -> Option<&'a str
 /// Nanoseconds of processor time the calling thread has used.
 #[cfg(test)]
 #[cfg(target_os = "linux")]
-pub fn thread_cpu_ns() -> i64 {
+pub(crate) fn thread_cpu_ns() -> i64 {
     let mut t = libc::timespec { tv_sec: 0, tv_nsec: 0 };
     // SAFETY: `t` is written during the call only.
     unsafe { libc::clock_gettime(libc::CLOCK_THREAD_CPUTIME_ID, &mut t) };
@@ -286,11 +286,11 @@ mod elsewhere {
         Err(not_here("real-time priority"))
     }
     /// Always the normal scheduler.
-    pub fn real_time_priority() -> u32 {
+    pub(crate) fn real_time_priority() -> u32 {
         0
     }
     /// Refused.
-    pub fn pin_to_core(_core: u32) -> Result<(), Refusal> {
+    pub(crate) fn pin_to_core(_core: u32) -> Result<(), Refusal> {
         Err(not_here("binding to a core"))
     }
     /// Refused.
@@ -304,19 +304,19 @@ mod elsewhere {
         Err(not_here("a shorter timer slack"))
     }
     /// Refused.
-    pub fn set_slice_ns(_slice_ns: u64) -> Result<(), Refusal> {
+    pub(crate) fn set_slice_ns(_slice_ns: u64) -> Result<(), Refusal> {
         Err(not_here("a shorter time slice"))
     }
     /// Unknown.
-    pub fn slice_ns() -> u64 {
+    pub(crate) fn slice_ns() -> u64 {
         0
     }
     /// Unknown.
-    pub fn allowed_core_list() -> Vec<u32> {
+    pub(crate) fn allowed_core_list() -> Vec<u32> {
         Vec::new()
     }
     /// Unknown.
-    pub fn thread_cpu_ns() -> i64 {
+    pub(crate) fn thread_cpu_ns() -> i64 {
         0
     }
     /// Unknown.

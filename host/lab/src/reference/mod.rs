@@ -8,11 +8,11 @@
 //! the geometric normal, thousands of times the error and, in a scene of metres, a picometre: too little to see, so the bit patterns of
 //! \[Waechter19\], which single precision needs, would add nothing here.
 
-pub mod bsdf;
+pub(crate) mod bsdf;
 pub mod bvh;
 mod image;
 mod light;
-pub mod microfacet;
+pub(crate) mod microfacet;
 mod path;
 mod surface;
 mod texture;

@@ -2,7 +2,7 @@
 //!
 //! True poses, no tracker and no link: frame N is drawn after the N frames before it, so histories are what they are in a run.
 
-pub mod glyphs;
+pub(crate) mod glyphs;
 pub mod paint;
 pub mod views;
 

@@ -32,7 +32,7 @@ impl Estimate {
 }
 
 /// Mean of pixel estimates and its standard error, one channel.
-pub fn pooled<'a>(pixels: impl IntoIterator<Item = &'a Estimate>, channel: usize) -> (f64, f64) {
+pub(crate) fn pooled<'a>(pixels: impl IntoIterator<Item = &'a Estimate>, channel: usize) -> (f64, f64) {
     let (mut n, mut sum, mut variance) = (0.0, 0.0, 0.0);
     for p in pixels {
         n += 1.0;

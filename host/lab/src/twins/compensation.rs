@@ -50,7 +50,7 @@ impl Compensation {
     }
 
     /// The same in f64.
-    pub fn drive_f64(&self, radiance: [f64; 3], distance: f64, cos: f64) -> [f64; 3] {
+    pub(crate) fn drive_f64(&self, radiance: [f64; 3], distance: f64, cos: f64) -> [f64; 3] {
         let geometry = distance * distance / cos.abs().max(LEAST_COS);
         std::array::from_fn(|c| {
             let v = (radiance[c] - f64::from(self.ambient[c])) * (f64::from(self.gain[c]) * geometry);

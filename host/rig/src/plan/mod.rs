@@ -6,5 +6,5 @@ pub mod dark;
 pub mod frame;
 pub mod horizon;
 pub mod lead;
-pub mod light_centre;
+pub(crate) mod light_centre;
 pub(crate) mod link_time;

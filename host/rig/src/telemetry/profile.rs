@@ -258,7 +258,7 @@ impl Profiler {
     }
 
     /// True when stamps are readings of a clock.
-    pub fn is_measured(&self) -> bool {
+    pub(crate) fn is_measured(&self) -> bool {
         self.measured
     }
 

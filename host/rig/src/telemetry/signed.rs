@@ -52,7 +52,7 @@ impl SignedHistogram {
     }
 
     /// Number of values beyond the bound.
-    pub fn saturated(&self) -> u64 {
+    pub(crate) fn saturated(&self) -> u64 {
         self.saturated
     }
 

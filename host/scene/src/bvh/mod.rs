@@ -16,7 +16,7 @@ use obvhs::triangle::Triangle;
 
 /// Entries of the traversal stack in `bvh.glsl`, besides eight in registers. A ray pushes at most one entry a level below the root, so a tree of one more level than
 /// this never overflows it.
-pub const TRAVERSAL_STACK: usize = 24;
+pub(crate) const TRAVERSAL_STACK: usize = 24;
 
 /// Most triangles of a leaf of the wide tree.
 const LEAF: u32 = 3;
