@@ -211,7 +211,7 @@ impl StandstillMonitor {
 
     /// Number of control threads.
     #[cfg(test)]
-    pub fn threads(&self) -> usize {
+    pub(crate) fn threads(&self) -> usize {
         self.threads.len()
     }
 

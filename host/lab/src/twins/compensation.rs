@@ -21,7 +21,7 @@ impl Compensation {
     /// `albedo`: diffuse reflectance of the real surface, above 0 to 1. `max_intensity`: the projector's greatest radiant intensity
     /// in scene units per steradian, above 0. `ambient`: radiance the surface shows without the projector, not negative.
     /// `None` where one of them is out of range.
-    pub fn new(albedo: [f64; 3], max_intensity: [f64; 3], ambient: [f64; 3]) -> Option<Self> {
+    pub(crate) fn new(albedo: [f64; 3], max_intensity: [f64; 3], ambient: [f64; 3]) -> Option<Self> {
         let mut gain = [0.0; 3];
         for c in 0..3 {
             let (rho, i, a) = (albedo[c], max_intensity[c], ambient[c]);
@@ -38,7 +38,7 @@ impl Compensation {
 
     /// Drive 0..1 per channel for the radiance wanted toward the eye. `distance`: projector to surface, metres. `cos`: between the
     /// smooth normal and the direction to the projector, either sign. NaN gives 0.
-    pub fn drive(&self, radiance: [f32; 3], distance: f32, cos: f32) -> [f32; 3] {
+    pub(crate) fn drive(&self, radiance: [f32; 3], distance: f32, cos: f32) -> [f32; 3] {
         self.unlimited_drive(radiance, distance, cos)
             .map(|v| if v.is_nan() { 0.0 } else { v.clamp(0.0, 1.0) })
     }

@@ -55,7 +55,7 @@ pub struct Rate {
 
 impl Rate {
     /// As the shader stores it.
-    pub fn code(self) -> u32 {
+    pub(crate) fn code(self) -> u32 {
         self.x | (self.y << 2)
     }
 }

@@ -29,7 +29,7 @@ impl RegistrationMeter {
     }
 
     /// Per tracked body: its points in its own space, metres.
-    pub fn points(&self) -> &[Vec<DVec3>] {
+    pub(crate) fn points(&self) -> &[Vec<DVec3>] {
         &self.points
     }
 

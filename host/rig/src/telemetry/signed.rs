@@ -37,7 +37,7 @@ impl SignedHistogram {
     }
 
     /// Number of recorded values.
-    pub fn len(&self) -> u64 {
+    pub(crate) fn len(&self) -> u64 {
         self.early.len() + self.late.len()
     }
 
@@ -47,7 +47,7 @@ impl SignedHistogram {
     }
 
     /// Number of values below zero.
-    pub fn negative(&self) -> u64 {
+    pub(crate) fn negative(&self) -> u64 {
         self.early.len()
     }
 
@@ -81,7 +81,7 @@ impl SignedHistogram {
     }
 
     /// Arithmetic mean, within 0.1 %; 0 without values.
-    pub fn mean(&self) -> f64 {
+    pub(crate) fn mean(&self) -> f64 {
         let (early, late) = (self.early.len() as f64, self.late.len() as f64);
         if early + late == 0.0 {
             return 0.0;
@@ -90,7 +90,7 @@ impl SignedHistogram {
     }
 
     /// The smallest value, within 0.1 %; 0 without values.
-    pub fn min(&self) -> i64 {
+    pub(crate) fn min(&self) -> i64 {
         if self.early.is_empty() {
             signed(self.late.min())
         } else {
@@ -99,7 +99,7 @@ impl SignedHistogram {
     }
 
     /// The largest value, within 0.1 %; 0 without values.
-    pub fn max(&self) -> i64 {
+    pub(crate) fn max(&self) -> i64 {
         if self.late.is_empty() {
             -signed(self.early.min())
         } else {
