@@ -78,7 +78,7 @@ impl Bench {
         PlanStage::new(self.facts.clone(), self.crew.clone(), &self.time, self.now)
     }
 
-    fn link(&mut self) -> LinkStage<Real> {
+    fn link<P: Pace>(&mut self) -> LinkStage<P> {
         let (link, keeper) = self.link.take().expect("once");
         LinkStage::new(self.facts.clone(), link, keeper, self.lead.clone())
     }
@@ -199,7 +199,7 @@ fn packing_leaves_out_what_a_newer_frame_has_overtaken_but_shows_a_slow_gpus_lat
 fn a_frame_waits_for_room_until_its_slot_begins() {
     let mut bench = bench(&[], RunOptions::default());
     let mut plan = bench.plan::<Real>();
-    let mut stage = bench.link();
+    let mut stage = bench.link::<Real>();
     let schedule = bench.facts.rig.config.projector.schedule();
     let planes = BitPlaneFrame::new(bench.facts.rig.camera.raster, schedule);
     // The mock holds one frame besides the one on its mirrors, so the second frame finds no room before the first is
@@ -239,28 +239,34 @@ fn a_frame_waits_for_room_until_its_slot_begins() {
     assert_eq!(fourth.fate, Fate::TooOld);
 }
 
+/// How long after the last frame the projector is told to be dark, nanoseconds; `None`: never.
+fn told_after<P: Pace>(stopped: bool) -> Option<i64> {
+    let mut bench = bench(&[], RunOptions::default());
+    let mut stage = bench.link::<P>();
+    let last = bench.now;
+    if stopped {
+        bench.facts.monitor.request_stop();
+    }
+    let (mut now, mut told_at) = (last, None);
+    while let Some(at) = stage.end(now, last, &mut bench.cable) {
+        assert!(at > now && at.ns_since(now) <= MS);
+        let is_armed = bench.cable.device_mut().projector().status().state == DeviceState::Armed;
+        if told_at.is_none() && !is_armed {
+            told_at = Some(now);
+        }
+        now = at;
+    }
+    assert!(now.ns_since(last) < 20 * MS, "it comes to an end");
+    told_at.map(|at| at.ns_since(last))
+}
+
 #[test]
 fn a_run_that_ends_shows_its_last_frames_and_one_that_is_stopped_is_dark_at_once() {
-    for stopped in [false, true] {
-        let mut bench = bench(&[], RunOptions::default());
-        let mut stage = bench.link();
-        let last = bench.now;
-        if stopped {
-            bench.facts.monitor.request_stop();
-        }
-        let (mut now, mut told_at) = (last, None);
-        while let Some(at) = stage.end(now, last, &mut bench.cable) {
-            assert!(at > now && at.ns_since(now) <= MS);
-            if told_at.is_none() && bench.cable.device_mut().projector().status().state != DeviceState::Armed
-            {
-                told_at = Some(now);
-            }
-            now = at;
-        }
-        let told_after = told_at.expect("the projector is told").ns_since(last);
-        assert_eq!(told_after, if stopped { 0 } else { 10 * MS }, "stopped: {stopped}");
-        assert!(now.ns_since(last) < 20 * MS, "and it comes to an end");
-    }
+    assert_eq!(told_after::<Real>(true), Some(0));
+    assert_eq!(told_after::<Virtual>(true), Some(0));
+    assert_eq!(told_after::<Real>(false), Some(10 * MS));
+    let slot_ns = rig(&[]).rate().slot_len_ns(0);
+    assert_eq!(told_after::<Virtual>(false), Some(2 * slot_ns), "to the nanosecond: a run repeats");
 }
 
 fn supervision(facts: &Arc<Facts>) -> Supervision {

@@ -3,6 +3,7 @@
 
 use super::settings::{budget_controller, output, renderer_settings};
 use crate::config::{MockProjectorConfig, RenderMethod};
+use crate::engine::connect::{connect, ENDED_WITH_THE_LAST_RUN};
 use crate::engine::error::PipelineError;
 use crate::engine::options::RunOptions;
 use crate::frame::job::FrameMemory;
@@ -11,9 +12,13 @@ use crate::mock::{DeviceClock, EmulatedProjector, MockConfig};
 use crate::pack::prepared::PreparedFrames;
 use crate::pipeline::projector;
 use crate::plan::budget::BudgetController;
+use crate::plan::link_time::LinkTime;
 use crate::rig::{Rig, RigError};
+use crate::telemetry::monitor::RunMonitor;
 use crate::tracks::{open_for, TrackingStage};
+use dpm_device::link::HostLink;
 use dpm_device::time::{HostClock, HostTime};
+use dpm_device::transport::Transport;
 use dpm_handoff::channel::Sender;
 use dpm_render::gpu::Gpu;
 use dpm_render::pack::{BitPlaneFrame, Kernel};
@@ -123,4 +128,20 @@ pub(super) fn mock_projector(
     let marks = marked.then(|| config.projector.schedule());
     let recorder = LightRecorder::new(lights, options.keep_frames, options.verify, marks);
     Ok((emulated, recorder))
+}
+
+/// Brings the link to the rig's projector up. `now` reads the clock and lets a little time pass with every call.
+///
+/// # Errors
+/// See [`connect`].
+pub(super) fn bring_up(
+    rig: &Rig,
+    medium: &mut dyn Transport,
+    monitor: &RunMonitor,
+    now: &mut dyn FnMut() -> HostTime,
+) -> Result<(HostLink, LinkTime), PipelineError> {
+    let mut link = HostLink::new(projector::link_settings(&rig.config, rig.camera.raster));
+    let acknowledged = if rig.config.safety.acknowledge_faults { u32::MAX } else { ENDED_WITH_THE_LAST_RUN };
+    let time = connect(&mut link, medium, acknowledged, monitor, now, &|| monitor.stop_requested())?;
+    Ok((link, time))
 }

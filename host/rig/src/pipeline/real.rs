@@ -3,7 +3,7 @@
 
 use super::crew::{Crew, NotesBack, OnExit, Port};
 use super::link::{device_thread, link_thread, Line};
-use super::parts::{mock_projector, CrewParts};
+use super::parts::{bring_up, mock_projector, CrewParts};
 use super::projector;
 use super::rights::Rights;
 use super::run::{Ran, LIGHTS};
@@ -11,7 +11,6 @@ use super::settings::lead_estimator;
 use super::supervisor::{join_within, Maker, Supervisor};
 use super::threads::{policy, Shared, NOTES, STAGE_THREADS};
 use crate::config::ProjectorBackend;
-use crate::engine::connect::{connect, ENDED_WITH_THE_LAST_RUN};
 use crate::engine::error::PipelineError;
 use crate::engine::facts::Facts;
 use crate::engine::keeper::LinkKeeper;
@@ -27,7 +26,6 @@ use crate::telemetry::projector::ProjectorReport;
 use dpm_common::clock::{Clock, MonotonicClock, Stopwatch};
 use dpm_common::realtime::os::{standing_of, thread_id, usable_cores};
 use dpm_common::realtime::standstill::StandstillMonitor;
-use dpm_device::link::HostLink;
 use dpm_device::transport::inproc::threaded;
 use dpm_device::transport::Transport;
 use dpm_handoff::channel::{channel, Sender};
@@ -71,16 +69,9 @@ pub(super) fn run_at_real_pace(
         StandstillMonitor::start(Arc::new(clock.sleeping()), STANDSTILL_NS, rights.highest_priority()).ok();
     let watch = Stopwatch::start();
     let mut far = open_far_end(rig, lights_in, options, gpu.is_none(), clock, &rights)?;
-    let mut link = HostLink::new(projector::link_settings(&rig.config, rig.camera.raster));
-    let acknowledged = if rig.config.safety.acknowledge_faults { u32::MAX } else { ENDED_WITH_THE_LAST_RUN };
-    let time = connect(
-        &mut link,
-        far.medium.as_mut(),
-        acknowledged,
-        monitor,
-        &mut || clock.wait_until(clock.now().plus_ns(CONNECT_STEP_NS)),
-        &|| monitor.stop_requested(),
-    )?;
+    let (link, time) = bring_up(rig, far.medium.as_mut(), monitor, &mut || {
+        clock.wait_until(clock.now().plus_ns(CONNECT_STEP_NS))
+    })?;
     let lead = lead_estimator(rig, &link, parts.frame_ns);
     let facts = Arc::new(Facts::new(rig.clone(), monitor.clone(), options, &lead, clock.now()));
     tell_horizon(&facts);

@@ -1,14 +1,12 @@
 //! A run at virtual pace. One thread drives every part of the engine under a clock that it moves. Each stage takes
 //! the modelled cost in the rig file, so a run is a function of its inputs, however fast or busy the machine is.
 
-use super::parts::{mock_projector, CrewParts, FIRST_FRAME_TIMEOUT_NS};
-use super::projector;
+use super::parts::{bring_up, mock_projector, CrewParts, FIRST_FRAME_TIMEOUT_NS};
 use super::run::{Ran, LIGHTS};
 use super::settings::lead_estimator;
 use super::supervisor::leave_behind;
 use super::threads::{enter_frame_path, may_stall, read_tracker, rendered, NOTES, WARM_UP_FRAMES};
 use crate::config::ProjectorBackend;
-use crate::engine::connect::{connect, ENDED_WITH_THE_LAST_RUN};
 use crate::engine::error::PipelineError;
 use crate::engine::facts::{CrewFacts, Facts};
 use crate::engine::keeper::LinkKeeper;
@@ -28,7 +26,6 @@ use crate::telemetry::monitor::RunMonitor;
 use crate::tracks::TrackSnapshot;
 use dpm_common::clock::Stopwatch;
 use dpm_common::realtime::standstill::Standstills;
-use dpm_device::link::HostLink;
 use dpm_device::time::HostTime;
 use dpm_device::transport::inproc::Direct;
 use dpm_device::transport::Transport;
@@ -65,14 +62,10 @@ pub(super) fn run_at_virtual_pace(
     let (mock, recorder) = mock_projector(rig, mock, lights_in, options, gpu.is_none(), now)?;
     let mut cable = Direct::new(mock);
     let watch = Stopwatch::start();
-    let mut link = HostLink::new(projector::link_settings(&rig.config, rig.camera.raster));
-    let acknowledged = if rig.config.safety.acknowledge_faults { u32::MAX } else { ENDED_WITH_THE_LAST_RUN };
-    let mut clock = || {
+    let (link, time) = bring_up(rig, &mut cable, monitor, &mut || {
         now = now.plus_ns(CONNECT_STEP_NS);
         now
-    };
-    let time =
-        connect(&mut link, &mut cable, acknowledged, monitor, &mut clock, &|| monitor.stop_requested())?;
+    })?;
     let lead = lead_estimator(rig, &link, 0);
     let facts = Arc::new(Facts::new(rig.clone(), monitor.clone(), options, &lead, now));
     let crew = Arc::new(CrewFacts::new(rig, 0));
