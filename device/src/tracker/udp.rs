@@ -21,6 +21,62 @@ pub struct Arrival {
     pub cut: bool,
 }
 
+/// What a client needs of a UDP socket. [`UdpPort`] is one of the operating system; a simulator brings its own.
+pub trait Datagrams: Send {
+    /// Stores the oldest waiting datagram in `buffer`; `None` if none waits. Never blocks.
+    ///
+    /// # Errors
+    /// Those of the operating system.
+    fn receive(&self, buffer: &mut [u8]) -> io::Result<Option<Arrival>>;
+
+    /// Sends one datagram.
+    ///
+    /// # Errors
+    /// Those of the operating system.
+    fn send(&self, bytes: &[u8], to: SocketAddrV4) -> io::Result<()>;
+
+    /// From now on datagrams of other senders are dropped before they are queued; without `ports` all ports of
+    /// `source` may send.
+    ///
+    /// # Errors
+    /// The system has no such filter.
+    fn keep_only(&self, source: Ipv4Addr, ports: &[u16]) -> io::Result<()>;
+
+    /// Reverses [`Datagrams::keep_only`].
+    ///
+    /// # Errors
+    /// Those of the operating system.
+    fn keep_all(&self) -> io::Result<()>;
+
+    /// The address that the socket is bound to.
+    ///
+    /// # Errors
+    /// Those of the operating system.
+    fn local(&self) -> io::Result<SocketAddrV4>;
+}
+
+impl Datagrams for UdpPort {
+    fn receive(&self, buffer: &mut [u8]) -> io::Result<Option<Arrival>> {
+        Self::receive(self, buffer)
+    }
+
+    fn send(&self, bytes: &[u8], to: SocketAddrV4) -> io::Result<()> {
+        Self::send(self, bytes, to)
+    }
+
+    fn keep_only(&self, source: Ipv4Addr, ports: &[u16]) -> io::Result<()> {
+        Self::keep_only(self, source, ports)
+    }
+
+    fn keep_all(&self) -> io::Result<()> {
+        Self::keep_all(self)
+    }
+
+    fn local(&self) -> io::Result<SocketAddrV4> {
+        Self::local(self)
+    }
+}
+
 /// A non-blocking IPv4 UDP socket.
 pub struct UdpPort {
     socket: UdpSocket,

@@ -12,7 +12,7 @@ use dpm_common::folder::{Folder, FolderError, Owner};
 use dpm_common::unix::{user, user_name};
 use std::fmt;
 use std::io;
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 use std::time::{SystemTime, UNIX_EPOCH};
 
 /// Version of the files' content.
@@ -182,11 +182,63 @@ fn choose(variable: &dyn Fn(&str) -> Option<PathBuf>, is_root: bool) -> Option<P
         .or_else(|| absolute("HOME").map(|dir| dir.join(".local/state/dpm")))
 }
 
+/// The folder of the files, as far as this module needs it: the file system's, or that of a simulator.
+pub trait StateFolder: fmt::Debug + Send + Sync {
+    /// Its path, for messages.
+    fn path(&self) -> &Path;
+
+    /// Names of its entries.
+    ///
+    /// # Errors
+    /// Those of the operating system.
+    fn names(&self) -> Result<Vec<String>, FolderError>;
+
+    /// The content of `name`, at most `most` bytes.
+    ///
+    /// # Errors
+    /// It is longer, or not a file of this user; those of the operating system.
+    fn read(&self, name: &str, most: u64) -> Result<Vec<u8>, FolderError>;
+
+    /// Replaces the content of `name`, atomically; it is on the disk when this returns.
+    ///
+    /// # Errors
+    /// Those of the operating system; the old content is then unchanged.
+    fn replace(&self, name: &str, bytes: &[u8]) -> Result<(), FolderError>;
+
+    /// Removes `name`, which may be missing; it is gone from the disk when this returns.
+    ///
+    /// # Errors
+    /// Those of the operating system.
+    fn remove(&self, name: &str) -> Result<(), FolderError>;
+}
+
+impl StateFolder for Folder {
+    fn path(&self) -> &Path {
+        Self::path(self)
+    }
+
+    fn names(&self) -> Result<Vec<String>, FolderError> {
+        Self::names(self)
+    }
+
+    fn read(&self, name: &str, most: u64) -> Result<Vec<u8>, FolderError> {
+        Self::read(self, name, most)
+    }
+
+    fn replace(&self, name: &str, bytes: &[u8]) -> Result<(), FolderError> {
+        Self::replace(self, name, bytes)
+    }
+
+    fn remove(&self, name: &str) -> Result<(), FolderError> {
+        Self::remove(self, name)
+    }
+}
+
 /// The file of one projector.
 #[derive(Debug)]
 pub struct OrderFile {
     identity: Identity,
-    folder: Option<Folder>,
+    folder: Option<Box<dyn StateFolder>>,
     path: PathBuf,
 }
 
@@ -201,17 +253,23 @@ impl OrderFile {
             return (Self { identity, folder: None, path: PathBuf::new() }, Some(error), None);
         };
         let stands = standing_in(&path, &identity);
-        let usable = Folder::make(&path, Owner::OwnOrAnyForRoot).and_then(|folder| {
-            let trial = format!(".trial-{}", std::process::id());
-            folder.replace(&trial, b"")?;
-            folder.remove(&trial)?;
-            Ok(folder)
-        });
-        let (folder, error) = match usable {
-            Ok(folder) => (Some(folder), None),
-            Err(e) => (None, Some(e)),
-        };
-        (Self { identity, folder, path }, error, stands)
+        match Folder::make(&path, Owner::OwnOrAnyForRoot) {
+            Ok(folder) => {
+                let (file, error) = Self::in_folder(Box::new(folder), identity);
+                (file, error, stands)
+            }
+            Err(e) => (Self { identity, folder: None, path }, Some(e), stands),
+        }
+    }
+
+    /// The file in `folder`, if a trial shows that files can be written there.
+    pub(crate) fn in_folder(folder: Box<dyn StateFolder>, identity: Identity) -> (Self, Option<FolderError>) {
+        let path = folder.path().to_owned();
+        let trial = format!(".trial-{}", std::process::id());
+        match folder.replace(&trial, b"").and_then(|()| folder.remove(&trial)) {
+            Ok(()) => (Self { identity, folder: Some(folder), path }, None),
+            Err(e) => (Self { identity, folder: None, path }, Some(e)),
+        }
     }
 
     /// The file in which orders for this projector are kept.
@@ -262,24 +320,30 @@ impl OrderFile {
 
 /// What stands for `identity` in the state folder `path`. A missing folder contains nothing. A folder that cannot be
 /// read or trusted counts as SAFE, and so does a file that is damaged or has an unknown version.
-pub fn standing_in(path: &std::path::Path, identity: &Identity) -> Option<Stands> {
-    let safe = |told: String| Some(Stands { order: Order::Safe, told });
-    let unreadable =
-        |e: FolderError| safe(format!("counts as SAFE, because the state folder cannot be read: {e}"));
-    let folder = match Folder::open(path, Owner::OwnOrAnyForRoot) {
-        Ok(folder) => folder,
-        Err(e) if e.is_missing() => return None,
-        Err(e) => return unreadable(e),
-    };
-    let names = match folder.names() {
-        Ok(names) => names,
-        Err(e) => return unreadable(e),
-    };
-    let mine = names.iter().filter(|name| identity.is_meant_by(name));
-    mine.map(|name| read(&folder, name)).max_by_key(|stands| stands.order.strength())
+pub fn standing_in(path: &Path, identity: &Identity) -> Option<Stands> {
+    match Folder::open(path, Owner::OwnOrAnyForRoot) {
+        Ok(folder) => standing_in_folder(&folder, identity),
+        Err(e) if e.is_missing() => None,
+        Err(e) => Some(unreadable(&e)),
+    }
 }
 
-fn read(folder: &Folder, name: &str) -> Stands {
+/// The same for a folder that is open.
+pub(crate) fn standing_in_folder(folder: &dyn StateFolder, identity: &Identity) -> Option<Stands> {
+    let names = match folder.names() {
+        Ok(names) => names,
+        Err(e) => return Some(unreadable(&e)),
+    };
+    let mine = names.iter().filter(|name| identity.is_meant_by(name));
+    mine.map(|name| read(folder, name)).max_by_key(|stands| stands.order.strength())
+}
+
+fn unreadable(e: &FolderError) -> Stands {
+    let told = format!("counts as SAFE, because the state folder cannot be read: {e}");
+    Stands { order: Order::Safe, told }
+}
+
+fn read(folder: &dyn StateFolder, name: &str) -> Stands {
     let parsed = folder.read(name, MAX_BYTES).map_err(|e| e.to_string()).and_then(|bytes| {
         let content: Content = serde_json::from_slice(&bytes).map_err(|e| format!("damaged: {e}"))?;
         if content.version != VERSION {

@@ -10,7 +10,7 @@ use super::wire::{id, split, Version, MAX_DATAGRAM};
 use crate::clock_map::ClockMap;
 use crate::pose::Pose;
 use crate::time::{HostClock, HostTime};
-use crate::tracker::udp::{realtime_offset_ns, Arrival, UdpPort};
+use crate::tracker::udp::{realtime_offset_ns, Arrival, Datagrams, UdpPort};
 use crate::tracker::{BodyIndex, BodyKey, SampleGate, Tracker, TrackerCounters, TrackerError, TrackerSample};
 use std::net::{Ipv4Addr, SocketAddrV4};
 use std::sync::Arc;
@@ -98,9 +98,9 @@ pub enum Silence {
 pub struct NatNetClient {
     config: NatNetConfig,
     clock: Arc<dyn HostClock>,
-    command: UdpPort,
+    command: Box<dyn Datagrams>,
     /// Group socket, or the conventional unicast data port if it could be bound.
-    data: Option<UdpPort>,
+    data: Option<Box<dyn Datagrams>>,
     data_problem: Option<String>,
     gate: SampleGate,
     server: Option<msg::ServerInfo>,
@@ -186,6 +186,19 @@ impl NatNetClient {
                 }
             },
         };
+        let data = data.map(|port| -> Box<dyn Datagrams> { Box::new(port) });
+        let client = Self::with_ports(config, clock, Box::new(command), data);
+        Ok(Self { data_problem, ..client })
+    }
+
+    /// A client on sockets that are already open: `command` for requests and their answers, `data` for frames that the
+    /// server does not send there.
+    pub fn with_ports(
+        config: NatNetConfig,
+        clock: Arc<dyn HostClock>,
+        command: Box<dyn Datagrams>,
+        data: Option<Box<dyn Datagrams>>,
+    ) -> Self {
         let now = clock.now();
         let mut lookup: Vec<(i32, BodyIndex)> = Vec::with_capacity(config.bodies.len());
         for (i, body) in config.bodies.iter().enumerate() {
@@ -194,13 +207,13 @@ impl NatNetClient {
             }
         }
         lookup.sort_unstable_by_key(|(id, _)| *id);
-        Ok(Self {
+        Self {
             gate: SampleGate::new(config.bodies.len()),
             config,
             clock,
             command,
             data,
-            data_problem,
+            data_problem: None,
             server: None,
             announced: None,
             version: Version::V3_0,
@@ -225,7 +238,7 @@ impl NatNetClient {
             asked: None,
             is_filtered: false,
             refused: None,
-        })
+        }
     }
 
     /// Counters of all input, by outcome.
@@ -344,7 +357,7 @@ impl NatNetClient {
         self.learned_port = None;
         if std::mem::take(&mut self.is_filtered) {
             // The next server may send from other ports.
-            for port in std::iter::once(&self.command).chain(&self.data) {
+            for port in [&self.command].into_iter().chain(&self.data) {
                 let _ = port.keep_all();
             }
         }
@@ -624,7 +637,7 @@ impl Tracker for NatNetClient {
             let alone = is_data || self.data.is_none();
             let mut share = if alone { budget } else { Self::MAX_DATAGRAMS_PER_POLL / 2 };
             while share > 0 && budget > 0 {
-                let port = if is_data { self.data.as_ref() } else { Some(&self.command) };
+                let port = if is_data { self.data.as_deref() } else { Some(&*self.command) };
                 let Some(port) = port else { break };
                 let arrival = port.receive(&mut self.buffer).map_err(|source| TrackerError::Io {
                     context: "NatNet: receiving failed; is the network interface still up?".into(),
@@ -667,7 +680,7 @@ impl Tracker for NatNetClient {
                 ports = [0; 4];
             }
             let count = ports.iter().take_while(|p| **p != 0).count();
-            for port in std::iter::once(&self.command).chain(&self.data) {
+            for port in [&self.command].into_iter().chain(&self.data) {
                 let _ = port.keep_only(self.config.server, &ports[..count]);
             }
         }

@@ -37,8 +37,10 @@ pub(crate) enum Kept {
     Nowhere,
 }
 
+/// An order on its way to the disk.
 #[derive(Debug)]
-struct Given {
+pub(crate) struct Given {
+    /// Number of the order.
     number: u64,
     order: Order,
     by: By,
@@ -46,19 +48,145 @@ struct Given {
     signals: u32,
     /// It changes the standing order. Otherwise the file stays as it is, including who gave the order.
     changes: bool,
+    /// What became of the order before it.
+    before: Option<Kept>,
 }
 
-#[derive(Debug, Default)]
-struct State {
+impl Given {
+    /// Writes the order down, or forgets what stands. This may take as long as the disk takes.
+    pub(crate) fn write(&self, file: &OrderFile, keeps: bool) -> Kept {
+        match &self.before {
+            Some(kept @ Kept::In(_)) if !self.changes => return kept.clone(),
+            _ if !keeps => return Kept::Nowhere,
+            _ => {}
+        }
+        let done = match self.order {
+            Order::Arm => file.forget().map(|()| Kept::Forgotten),
+            order => file.keep(order, self.by).map(Kept::In),
+        };
+        done.unwrap_or_else(|e| Kept::Not(e.to_string()))
+    }
+}
+
+/// Decides what becomes of orders: which one stands, which is written next, and when ARM reaches the light. It has no
+/// thread and no file.
+#[derive(Debug)]
+pub(crate) struct Desk {
+    monitor: Arc<RunMonitor>,
     /// Number of the newest order.
     newest: u64,
-    /// The newest order, until the thread takes it.
+    /// The newest order, until it is taken to be written.
     waiting: Option<Given>,
     /// Orders up to this number are settled.
     settled: u64,
     outcome: Option<Kept>,
     /// The standing order, whether or not it could be written down.
     stands: Option<Order>,
+}
+
+impl Desk {
+    /// For a run that begins while `stands` stands in `path`. The light receives that order before this returns, so
+    /// that the link comes up dark.
+    pub(crate) fn new(monitor: Arc<RunMonitor>, stands: Option<&Stands>, path: PathBuf) -> Self {
+        let stands = stands.map(|s| s.order);
+        stands.into_iter().for_each(|order| monitor.give_order(order));
+        let outcome = stands.map(|_| Kept::In(path));
+        Self { monitor, newest: 0, waiting: None, settled: 0, outcome, stands }
+    }
+
+    /// Gives an order: to the light at once (ARM only when no order stands on the disk any more), then to the disk.
+    pub(crate) fn give(&mut self, order: Order, by: By) -> Ticket {
+        self.absorb();
+        self.newest += 1;
+        if order != Order::Arm {
+            self.monitor.give_order(order);
+        }
+        self.queue(order, by)
+    }
+
+    /// Queues an order for the disk. A weaker order does not replace a stronger one that stands or waits to be
+    /// written.
+    fn queue(&mut self, order: Order, by: By) -> Ticket {
+        let number = self.newest;
+        let standing = self.stands.filter(|s| order != Order::Arm && s.strength() > order.strength());
+        self.stands = if order == Order::Arm { self.stands } else { standing.or(Some(order)) };
+        match &mut self.waiting {
+            // The waiting order is written in its place: the same file, the same result.
+            Some(waiting) if standing.is_some() && waiting.order != Order::Arm => waiting.number = number,
+            waiting => {
+                let (order, changes) = standing.map_or((order, true), |standing| (standing, false));
+                let signals = stopping::orders();
+                *waiting = Some(Given { number, order, by, signals, changes, before: None });
+            }
+        }
+        Ticket(number)
+    }
+
+    /// Orders that reached the light as signals are written down like the others.
+    fn absorb(&mut self) {
+        let order = match stopping::take_order_to_keep() {
+            0 => None,
+            stopping::BLACK => Some(Order::Black),
+            _ => Some(Order::Safe),
+        };
+        if let Some(order) = order {
+            self.newest += 1;
+            self.queue(order, By::Signal);
+        }
+        if self.monitor.take_found_safe() && self.stands != Some(Order::Safe) {
+            self.newest += 1;
+            self.queue(Order::Safe, By::Projector);
+        }
+    }
+
+    /// The next order to be written; pass the result to [`Desk::settle`].
+    pub(crate) fn next(&mut self) -> Option<Given> {
+        self.absorb();
+        let given = self.waiting.take()?;
+        Some(Given { before: self.outcome.take(), ..given })
+    }
+
+    /// `given` was written with this outcome.
+    pub(crate) fn settle(&mut self, given: &Given, outcome: Kept) {
+        self.absorb();
+        if given.order == Order::Arm && !matches!(outcome, Kept::Not(_)) {
+            // An order that came while the disk was busy is newer than this one.
+            if self.newest == given.number {
+                self.stands = None;
+                self.monitor.arm_unless_darkened(given.signals);
+            }
+        }
+        // Orders that came meanwhile get their result when they are settled themselves.
+        self.settled = given.number;
+        self.outcome = Some(outcome);
+    }
+
+    /// The run ends. After an `orderly` end BLACK and FREEZE are to be forgotten, and SAFE remains.
+    pub(crate) fn end(&mut self, orderly: bool) {
+        self.absorb();
+        if orderly && matches!(self.stands, Some(Order::Black | Order::Freeze)) {
+            // This arms nothing: the run is over, and after a stop request the monitor lets no ARM through.
+            self.monitor.request_stop();
+            self.give(Order::Arm, By::Signal);
+        }
+    }
+
+    /// What happened to the order on the disk; `None` while it is not settled. For orders in quick succession the
+    /// result of the newest one applies to all.
+    pub(crate) fn outcome(&self, ticket: Ticket) -> Option<Kept> {
+        self.outcome.clone().filter(|_| self.settled >= ticket.0)
+    }
+
+    /// The standing order, once it is kept over restarts (or the rig does without, as a mock may).
+    pub(crate) fn kept(&self) -> Option<Order> {
+        let is_kept = matches!(self.outcome, Some(Kept::In(_) | Kept::Nowhere));
+        self.stands.filter(|_| is_kept && self.settled == self.newest)
+    }
+}
+
+#[derive(Debug)]
+struct State {
+    desk: Desk,
     /// The thread must end.
     closing: bool,
     closed: bool,
@@ -66,7 +194,6 @@ struct State {
 
 #[derive(Debug)]
 struct Inner {
-    monitor: Arc<RunMonitor>,
     file: OrderFile,
     /// The folder is writable.
     keeps: bool,
@@ -93,11 +220,9 @@ impl Orders {
         keeps: bool,
         stands: Option<&Stands>,
     ) -> std::io::Result<Self> {
-        let stands = stands.map(|s| s.order);
-        stands.into_iter().for_each(|order| monitor.give_order(order));
-        let state =
-            Mutex::new(State { stands, outcome: stands.map(|_| Kept::In(file.path())), ..State::default() });
-        let inner = Arc::new(Inner { monitor, file, keeps, state, changed: Condvar::new() });
+        let desk = Desk::new(monitor, stands, file.path());
+        let state = Mutex::new(State { desk, closing: false, closed: false });
+        let inner = Arc::new(Inner { file, keeps, state, changed: Condvar::new() });
         let thread = std::thread::Builder::new().name("dpm-orders".into()).spawn({
             let inner = inner.clone();
             move || inner.write_down()
@@ -108,9 +233,7 @@ impl Orders {
     /// Gives an order: to the light at once (ARM only when no order stands on the disk any more), then to the disk.
     /// Never waits for the disk.
     pub fn give(&self, order: Order, by: By) -> Ticket {
-        let mut state = self.inner.state();
-        self.inner.absorb(&mut state);
-        let ticket = self.inner.give(&mut state, order, by);
+        let ticket = self.inner.state().desk.give(order, by);
         self.inner.changed.notify_all();
         ticket
     }
@@ -118,33 +241,25 @@ impl Orders {
     /// What happened to the order on the disk; `None` while it is not settled. For orders in quick succession the
     /// result of the newest one applies to all.
     pub(crate) fn outcome(&self, ticket: Ticket) -> Option<Kept> {
-        let state = self.inner.state();
-        state.outcome.clone().filter(|_| state.settled >= ticket.0)
+        self.inner.state().desk.outcome(ticket)
     }
 
     /// The standing order.
     #[cfg(test)]
     pub(crate) fn standing(&self) -> Option<Order> {
-        self.inner.state().stands
+        self.inner.state().desk.stands
     }
 
     /// The standing order, once it is kept over restarts (or the rig does without, as a mock may).
     pub fn kept(&self) -> Option<Order> {
-        let state = self.inner.state();
-        let is_kept = matches!(state.outcome, Some(Kept::In(_) | Kept::Nowhere));
-        state.stands.filter(|_| is_kept && state.settled == state.newest)
+        self.inner.state().desk.kept()
     }
 
     /// Ends the thread; waits at most half a second. After an orderly end BLACK and FREEZE are forgotten, and SAFE
     /// remains.
     pub fn end(mut self, orderly: bool) {
         let mut state = self.inner.state();
-        self.inner.absorb(&mut state);
-        if orderly && matches!(state.stands, Some(Order::Black | Order::Freeze)) {
-            // This arms nothing: the run is over, and after a stop request the monitor lets no ARM through.
-            self.inner.monitor.request_stop();
-            self.inner.give(&mut state, Order::Arm, By::Signal);
-        }
+        state.desk.end(orderly);
         state.closing = true;
         self.inner.changed.notify_all();
         let waited = self.inner.changed.wait_timeout_while(state, END_WITHIN, |state| !state.closed);
@@ -168,53 +283,10 @@ impl Inner {
         self.state.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
-    fn give(&self, state: &mut State, order: Order, by: By) -> Ticket {
-        state.newest += 1;
-        if order != Order::Arm {
-            self.monitor.give_order(order);
-        }
-        self.queue(state, order, by)
-    }
-
-    /// Queues an order for the disk. A weaker order does not replace a stronger one that stands or waits to be
-    /// written.
-    fn queue(&self, state: &mut State, order: Order, by: By) -> Ticket {
-        let number = state.newest;
-        let standing = state.stands.filter(|s| order != Order::Arm && s.strength() > order.strength());
-        state.stands = if order == Order::Arm { state.stands } else { standing.or(Some(order)) };
-        match &mut state.waiting {
-            // The waiting order is written in its place: the same file, the same result.
-            Some(waiting) if standing.is_some() && waiting.order != Order::Arm => waiting.number = number,
-            waiting => {
-                let (order, changes) = standing.map_or((order, true), |standing| (standing, false));
-                *waiting = Some(Given { number, order, by, signals: stopping::orders(), changes });
-            }
-        }
-        Ticket(number)
-    }
-
-    /// Orders that reached the light as signals are written down like the others.
-    fn absorb(&self, state: &mut State) {
-        let order = match stopping::take_order_to_keep() {
-            0 => None,
-            stopping::BLACK => Some(Order::Black),
-            _ => Some(Order::Safe),
-        };
-        if let Some(order) = order {
-            state.newest += 1;
-            self.queue(state, order, By::Signal);
-        }
-        if self.monitor.take_found_safe() && state.stands != Some(Order::Safe) {
-            state.newest += 1;
-            self.queue(state, Order::Safe, By::Projector);
-        }
-    }
-
     fn write_down(&self) {
         let mut state = self.state();
         loop {
-            self.absorb(&mut state);
-            let Some(given) = state.waiting.take() else {
+            let Some(given) = state.desk.next() else {
                 if state.closing {
                     break;
                 }
@@ -222,39 +294,14 @@ impl Inner {
                 state = waited.unwrap_or_else(PoisonError::into_inner).0;
                 continue;
             };
-            let before = state.outcome.take();
             drop(state);
-            let outcome = match before {
-                Some(kept @ Kept::In(_)) if !given.changes => kept,
-                _ => self.settle(&given),
-            };
+            let outcome = given.write(&self.file, self.keeps);
             state = self.state();
-            self.absorb(&mut state);
-            if given.order == Order::Arm && !matches!(outcome, Kept::Not(_)) {
-                // An order that came while the disk was busy is newer than this one.
-                if state.newest == given.number {
-                    state.stands = None;
-                    self.monitor.arm_unless_darkened(given.signals);
-                }
-            }
-            // Orders that came meanwhile get their result when they are settled themselves.
-            state.settled = given.number;
-            state.outcome = Some(outcome);
+            state.desk.settle(&given, outcome);
             self.changed.notify_all();
         }
         state.closed = true;
         self.changed.notify_all();
-    }
-
-    fn settle(&self, given: &Given) -> Kept {
-        if !self.keeps {
-            return Kept::Nowhere;
-        }
-        let done = match given.order {
-            Order::Arm => self.file.forget().map(|()| Kept::Forgotten),
-            order => self.file.keep(order, given.by).map(Kept::In),
-        };
-        done.unwrap_or_else(|e| Kept::Not(e.to_string()))
     }
 }
 

@@ -23,6 +23,8 @@ mod real;
 mod rights;
 mod run;
 mod settings;
+#[cfg(feature = "stepped")]
+pub mod stepped;
 mod supervisor;
 mod threads;
 mod virtual_pace;

@@ -53,11 +53,11 @@ pub(super) const NOTES: usize = 256;
 /// Tracking, plan, pack, link, and the mock projector.
 pub(super) const STAGE_THREADS: usize = 5;
 /// How long a stage waits for another one before it checks whether the run continues, nanoseconds.
-const WAIT_NS: i64 = 20_000_000;
+pub(super) const WAIT_NS: i64 = 20_000_000;
 /// Time that a step of a stage may take besides its waits, nanoseconds.
 pub(super) const STEP_NS: i64 = 20_000_000;
 /// Time that a poll of a tracker may take, nanoseconds: some trackers must be reopened or reconnected.
-const POLL_NS: i64 = 200_000_000;
+pub(super) const POLL_NS: i64 = 200_000_000;
 /// Time between two polls of a tracker.
 const POLL_REST: Duration = Duration::from_micros(200);
 /// At the end, how long to wait for frames that the GPU still works on, nanoseconds.

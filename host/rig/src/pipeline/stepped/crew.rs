@@ -1,0 +1,428 @@
+//! Tracking, plan and pack, and the GPU between them.
+
+use super::line::Line;
+use super::{Machine, Part, Rendered, Takes, NEVER};
+use crate::engine::error::PipelineError;
+use crate::engine::facts::{CrewFacts, Facts};
+use crate::engine::pace::Real;
+use crate::engine::pack::PackStage;
+use crate::engine::plan::{Latch, PlanStage};
+use crate::engine::pulse::{Pulse, Silence};
+use crate::engine::supervision::Trouble;
+use crate::frame::job::{FrameJob, FrameMemory, FrameNote};
+use crate::pack::prepared::PreparedFrames;
+use crate::pipeline::parts::CrewParts;
+use crate::pipeline::threads::{POLL_NS, STEP_NS, WAIT_NS};
+use crate::plan::link_time::LinkTime;
+use crate::rig::Rig;
+use crate::tracks::{TrackSnapshot, TrackingStage};
+use dpm_device::time::HostTime;
+use dpm_device::tracker::Tracker;
+use dpm_handoff::latest::{latest, Publisher, Reader};
+use dpm_render::gpu::GpuError;
+use dpm_render::pack::{BitPlaneFrame, Kernel};
+use std::cell::RefCell;
+use std::collections::VecDeque;
+use std::sync::atomic::Ordering;
+use std::sync::Arc;
+
+/// Time between two polls of a tracker, nanoseconds.
+const POLL_REST_NS: i64 = 200_000;
+/// A tracker that has nothing to read is still polled this often, nanoseconds: it reconnects and maps clocks.
+const POLL_AT_LEAST_NS: i64 = 5_000_000;
+
+impl CrewParts {
+    /// For a run without a GPU of this process: the frames are prepared, and the simulated GPU took `frame_ns`.
+    pub(super) fn stepped(rig: &Rig, tracker: Box<dyn Tracker>, in_flight: usize, frame_ns: i64) -> Self {
+        let memory = || FrameMemory {
+            gpu: None,
+            planes: BitPlaneFrame::new(rig.camera.raster, rig.config.projector.schedule()),
+        };
+        Self {
+            tracking: TrackingStage::new(rig, tracker),
+            renderer: None,
+            prepared: Some(PreparedFrames::new(rig.camera.raster)),
+            kernel: Kernel::best(),
+            budget: None,
+            memory: (0..in_flight.max(2)).map(|_| memory()).collect(),
+            frame_ns,
+        }
+    }
+}
+
+/// What planning is doing.
+enum Planning {
+    /// It looks for memory, and for a slot.
+    Free { at: HostTime },
+    /// It waits for the instant at which poses are read.
+    Latched { at: HostTime, latch: Latch, job: FrameJob },
+    /// It plans and submits.
+    Submits { at: HostTime, job: FrameJob },
+    /// It never returns, or has ended.
+    Gone,
+}
+
+/// What packing is doing.
+enum Packing {
+    /// It waits for the oldest frame that the GPU has, at most until `until`; `None`: there is none.
+    Waits { until: Option<HostTime>, limit_ns: u64 },
+    /// It packs.
+    Packs { at: HostTime, job: FrameJob },
+    Gone,
+}
+
+/// A frame that the GPU has.
+struct OnGpu {
+    job: FrameJob,
+    done_at: HostTime,
+    lost: Option<GpuError>,
+}
+
+/// The stages that are restarted together.
+pub(super) struct Crew {
+    facts: Arc<CrewFacts>,
+    tracking: TrackingStage,
+    tracking_at: HostTime,
+    publisher: Publisher<TrackSnapshot>,
+    reader: Reader<TrackSnapshot>,
+    times: Reader<LinkTime>,
+    plan: PlanStage<Real>,
+    planning: Planning,
+    waited: bool,
+    #[allow(clippy::vec_box)] // The boxes travel with the frames.
+    free: Vec<Box<FrameMemory>>,
+    gpu: VecDeque<OnGpu>,
+    gpu_free_at: HostTime,
+    pack: PackStage,
+    packing: Packing,
+    prepared: PreparedFrames,
+    /// Code values of a frame in which all bodies are dark.
+    black: Vec<u32>,
+    kernel: Kernel,
+    pulses: [Pulse; 3],
+    silences: [Silence; 3],
+    failure: Option<PipelineError>,
+    panicked: Option<&'static str>,
+    in_flight: usize,
+}
+
+impl Crew {
+    /// Starts a crew whose frames go to `line`.
+    pub(super) fn new(
+        facts: &Arc<Facts>,
+        parts: CrewParts,
+        time: LinkTime,
+        line: &mut Line,
+        now: HostTime,
+    ) -> Self {
+        let crew = Arc::new(CrewFacts::new(&facts.rig, parts.frame_ns));
+        let (publisher, reader) = latest(TrackSnapshot::empty(facts.rig.bodies.len()));
+        let (times_in, mut times) = latest(time);
+        line.stage.tell_times_to(times_in);
+        let time = *times.latest().0;
+        let in_flight = parts.memory.len();
+        Self {
+            plan: PlanStage::new(facts.clone(), crew.clone(), &time, now),
+            pack: PackStage::new(facts.clone(), crew.clone(), parts.budget),
+            facts: crew,
+            tracking: parts.tracking,
+            tracking_at: now,
+            publisher,
+            reader,
+            times,
+            planning: Planning::Free { at: now },
+            waited: false,
+            free: parts.memory.into_iter().map(Box::new).collect(),
+            gpu: VecDeque::new(),
+            gpu_free_at: now,
+            packing: Packing::Waits { until: None, limit_ns: 0 },
+            prepared: parts.prepared.unwrap_or_else(|| PreparedFrames::new(facts.rig.camera.raster)),
+            black: vec![0; facts.rig.camera.raster.pixel_count()],
+            kernel: parts.kernel,
+            pulses: [Pulse::new("tracking"), Pulse::new("plan"), Pulse::new("pack")],
+            silences: Default::default(),
+            failure: None,
+            panicked: None,
+            in_flight,
+        }
+    }
+
+    /// Frames in progress.
+    pub(super) fn in_flight(&self) -> usize {
+        self.in_flight - self.free.len()
+    }
+
+    pub(super) fn due(&self) -> HostTime {
+        let plan = match &self.planning {
+            Planning::Free { at } | Planning::Latched { at, .. } | Planning::Submits { at, .. } => *at,
+            Planning::Gone => NEVER,
+        };
+        let pack = match &self.packing {
+            Packing::Packs { at, .. } => *at,
+            Packing::Waits { until: Some(until), .. } => {
+                self.gpu.front().map_or(NEVER, |on| on.done_at).min(*until)
+            }
+            Packing::Waits { until: None, .. } => NEVER,
+            Packing::Gone => NEVER,
+        };
+        self.tracking_at.min(plan).min(pack)
+    }
+
+    /// Memory of a frame that the link has finished with.
+    pub(super) fn returned(&mut self, memory: Box<FrameMemory>, now: HostTime) {
+        self.free.push(memory);
+        self.wake_plan(now);
+    }
+
+    fn wake_plan(&mut self, now: HostTime) {
+        if let Planning::Free { at } = &mut self.planning {
+            *at = now.min(*at);
+        }
+    }
+
+    /// True when no frame will come from this crew any more.
+    pub(super) fn is_finished(&self) -> bool {
+        matches!(self.planning, Planning::Gone)
+            && self.gpu.is_empty()
+            && !matches!(self.packing, Packing::Packs { .. })
+    }
+
+    /// Frames that are still in progress, when nobody wants them any more.
+    pub(super) fn take_under_way(&mut self) -> Vec<FrameJob> {
+        let mut all: Vec<_> = self.gpu.drain(..).map(|on| on.job).collect();
+        if let Packing::Packs { job, .. } = std::mem::replace(&mut self.packing, Packing::Gone) {
+            all.push(job);
+        }
+        if let Planning::Submits { job, .. } = std::mem::replace(&mut self.planning, Planning::Gone) {
+            all.push(job);
+        }
+        self.tracking_at = NEVER;
+        self.pulses.iter().for_each(Pulse::end);
+        all
+    }
+
+    /// The run ends; the crew's threads end by themselves.
+    pub(super) fn ends(&mut self) {
+        (self.failure, self.panicked) = (None, None);
+        self.planning = Planning::Gone;
+        self.pulses.iter().for_each(Pulse::end);
+    }
+
+    /// Checks the crew, `step_ns` after the last check.
+    pub(super) fn trouble(&mut self, now: HostTime, step_ns: i64) -> Option<Trouble> {
+        if let Some(error) = self.failure.take() {
+            return Some(Trouble::Failed(error));
+        }
+        if let Some(stage) = self.panicked.take() {
+            return Some(Trouble::Panicked(stage));
+        }
+        for (pulse, silence) in self.pulses.iter().zip(&mut self.silences) {
+            if silence.observe(pulse, now, step_ns, |_| None) {
+                return Some(Trouble::Hung(pulse.name()));
+            }
+        }
+        None
+    }
+
+    pub(super) fn advance<M: Machine>(
+        &mut self,
+        now: HostTime,
+        facts: &Arc<Facts>,
+        machine: &mut M,
+        notes: &RefCell<Vec<Box<FrameNote>>>,
+        line: &mut Line,
+    ) {
+        if self.tracking_at <= now {
+            self.track(now, facts, machine);
+        }
+        self.plan(now, facts, machine, notes);
+        self.pack(now, facts, machine, line);
+    }
+
+    fn track<M: Machine>(&mut self, now: HostTime, facts: &Arc<Facts>, machine: &mut M) {
+        self.pulses[0].beat(now, POLL_NS);
+        match machine.takes(Part::Tracking, facts.next_frame.load(Ordering::Relaxed), now) {
+            Takes::Ns(ns) => {
+                let read_at = now.plus_ns(ns);
+                crate::pipeline::threads::read_tracker(
+                    facts,
+                    &mut self.tracking,
+                    &mut self.publisher,
+                    now,
+                );
+                let next = machine.next_sample_at(now).min(now.plus_ns(POLL_AT_LEAST_NS));
+                self.tracking_at = next.max(read_at.plus_ns(POLL_REST_NS));
+            }
+            Takes::Forever => self.tracking_at = NEVER,
+            Takes::Panics => {
+                self.tracking_at = NEVER;
+                self.panicked = Some("tracking");
+            }
+        }
+    }
+
+    fn plan<M: Machine>(
+        &mut self,
+        now: HostTime,
+        facts: &Arc<Facts>,
+        machine: &mut M,
+        notes: &RefCell<Vec<Box<FrameNote>>>,
+    ) {
+        match std::mem::replace(&mut self.planning, Planning::Gone) {
+            Planning::Free { at } if at <= now => self.planning = self.choose(now, facts, notes),
+            Planning::Latched { at, latch, job } if at <= now => {
+                self.planning = self.latch(now, facts, machine, &latch, job);
+            }
+            Planning::Submits { at, mut job } if at <= now => {
+                self.facts.gpu.submit();
+                self.plan.submitted(&mut job.note, now);
+                let begin = self.gpu_free_at.max(now);
+                let (done_at, lost) = match machine.renders(job.note.plan.id.0, begin) {
+                    Rendered::After(ns) => (begin.plus_ns(ns), None),
+                    Rendered::Never => (NEVER, None),
+                    Rendered::Lost(ns, error) => (begin.plus_ns(ns), Some(error)),
+                };
+                self.gpu_free_at = done_at;
+                self.gpu.push_back(OnGpu { job, done_at, lost });
+                if let Packing::Waits { until: None, .. } = self.packing {
+                    self.wait_for_gpu(now);
+                }
+                self.pulses[1].beat(now, WAIT_NS + STEP_NS);
+                self.planning = Planning::Free { at: now };
+            }
+            other => self.planning = other,
+        }
+    }
+
+    /// Looks for memory and chooses the next frame's slot.
+    fn choose(
+        &mut self,
+        now: HostTime,
+        facts: &Arc<Facts>,
+        notes: &RefCell<Vec<Box<FrameNote>>>,
+    ) -> Planning {
+        if facts.monitor.stop_requested() || self.plan.is_complete() {
+            if self.plan.is_complete() {
+                facts.is_complete.store(true, Ordering::Release);
+            }
+            self.pulses[1].end();
+            return Planning::Gone;
+        }
+        self.pulses[1].beat(now, WAIT_NS + STEP_NS);
+        let later = Planning::Free { at: now.plus_ns(WAIT_NS) };
+        if !self.plan.may_begin() {
+            return later;
+        }
+        self.waited |= self.free.is_empty();
+        let Some(memory) = self.free.pop() else { return later };
+        let Some(mut note) = notes.borrow_mut().pop() else {
+            self.free.push(memory);
+            return later;
+        };
+        note.waited_for_memory = std::mem::take(&mut self.waited);
+        let time = *self.times.latest().0;
+        let Some(latch) = self.plan.choose_slot(&time, now) else {
+            self.free.push(memory);
+            notes.borrow_mut().push(note);
+            return later;
+        };
+        let at = latch.at.max(now);
+        self.pulses[1].beat(at, WAIT_NS + STEP_NS);
+        Planning::Latched { at, latch, job: FrameJob { note, memory } }
+    }
+
+    /// Reads the poses and plans the frame.
+    fn latch<M: Machine>(
+        &mut self,
+        now: HostTime,
+        facts: &Arc<Facts>,
+        machine: &mut M,
+        latch: &Latch,
+        mut job: FrameJob,
+    ) -> Planning {
+        self.pulses[1].beat(now, STEP_NS);
+        let _ = facts;
+        match machine.takes(Part::Plan, latch.id, now) {
+            Takes::Ns(ns) => {
+                let time = *self.times.latest().0;
+                let snapshot = self.reader.latest().0;
+                self.plan.plan(latch, &mut job.note, &time, snapshot, now);
+                job.note.cost = None;
+                Planning::Submits { at: now.plus_ns(ns), job }
+            }
+            Takes::Forever => Planning::Gone,
+            Takes::Panics => {
+                self.panicked = Some("plan");
+                Planning::Gone
+            }
+        }
+    }
+
+    /// Packing turns to the oldest frame that the GPU has.
+    fn wait_for_gpu(&mut self, now: HostTime) {
+        // While it waits it reports in time; so nothing is overdue.
+        self.pulses[2].end();
+        let limit_ns = self.pack.limit_ns();
+        let until = (!self.gpu.is_empty()).then(|| now.plus_ns(limit_ns as i64));
+        self.packing = Packing::Waits { until, limit_ns };
+    }
+
+    fn pack<M: Machine>(
+        &mut self,
+        now: HostTime,
+        facts: &Arc<Facts>,
+        machine: &mut M,
+        line: &mut Line,
+    ) {
+        match std::mem::replace(&mut self.packing, Packing::Gone) {
+            Packing::Packs { at, mut job } if at <= now => {
+                job.note.timeline.packed_at = now;
+                line.take_in(job, now);
+                self.wait_for_gpu(now);
+            }
+            Packing::Waits { until: Some(until), limit_ns } => {
+                let is_done = self.gpu.front().is_some_and(|on| on.done_at <= now);
+                if is_done {
+                    self.rendered(now, facts, machine);
+                } else if until <= now {
+                    self.pulses[2].end();
+                    let frame = self.gpu.front().map_or(0, |on| on.job.note.plan.id.0);
+                    self.failure =
+                        Some(PipelineError::GpuHangs { frame, ms: limit_ns / 1_000_000 });
+                } else {
+                    self.packing = Packing::Waits { until: Some(until), limit_ns };
+                }
+            }
+            other => self.packing = other,
+        }
+    }
+
+    /// The GPU has finished its oldest frame, or was lost with it.
+    fn rendered<M: Machine>(&mut self, now: HostTime, facts: &Arc<Facts>, machine: &mut M) {
+        let Some(OnGpu { mut job, lost, .. }) = self.gpu.pop_front() else { return };
+        let frame = job.note.plan.id.0;
+        if let Some(source) = lost {
+            self.failure = Some(PipelineError::Gpu { frame, source });
+            return;
+        }
+        self.pulses[2].beat(now, WAIT_NS + STEP_NS);
+        job.note.cost = Some(Default::default());
+        job.note.timeline.rendered_at = now;
+        self.pack.rendered(&job.note, now);
+        self.wake_plan(now);
+        job.note.timeline.packing_at = now;
+        if self.pack.is_wanted(&mut job.note, now, self.gpu.is_empty()) {
+            let FrameJob { note, memory } = &mut job;
+            if note.plan.is_lit || facts.rig.bodies.is_empty() {
+                self.prepared.pack(self.kernel, note.plan.id.0, &mut memory.planes);
+            } else {
+                dpm_render::pack::pack(self.kernel, &self.black, &mut memory.planes);
+            }
+        }
+        match machine.takes(Part::Pack, frame, now) {
+            Takes::Ns(ns) => self.packing = Packing::Packs { at: now.plus_ns(ns), job },
+            Takes::Forever => {}
+            Takes::Panics => self.panicked = Some("pack"),
+        }
+    }
+}
