@@ -4,7 +4,7 @@
 //! the address that connected, at the conventional data port of its host, or both). It sends its names before it
 //! streams to an endpoint, because some clients mistake whatever arrives next for the answer to their request.
 
-use crate::faults::{FaultError, FaultKind};
+use crate::faults::{FaultError, FaultKind, FaultPlan};
 use crate::report_queue::ReportQueue;
 use crate::tracker::SampleSource;
 use dpm_device::time::HostTime;
@@ -183,6 +183,21 @@ impl NatNetServer {
             return Err(NatNetServerError::TooMany(count));
         }
         Ok(server)
+    }
+
+    /// From now on the server has these faults, with times relative to the source's start.
+    ///
+    /// # Errors
+    /// A fault that this server does not implement; the former faults remain.
+    pub fn set_faults(&mut self, faults: FaultPlan) -> Result<(), FaultError> {
+        faults.check_supported(&NATNET_FAULTS, "the NatNet server")?;
+        self.source.set_faults(faults);
+        Ok(())
+    }
+
+    /// The server begins at `now`: what was captured before is never sent.
+    pub fn begin_at(&mut self, now: HostTime) {
+        let _ = self.queue.take_due(&self.source, now);
     }
 
     /// Number of clients that get frames.

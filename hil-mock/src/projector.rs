@@ -306,6 +306,14 @@ impl MockProjector {
         (self.core.counters_due, self.core.counted_before) = (false, DecoderCounters::default());
     }
 
+    /// The projector's clock jumps forward by `ticks`.
+    pub fn shift_clock(&mut self, now: HostTime, ticks: u64) {
+        self.advance_to(now);
+        let clock = &mut self.core.setup.clock;
+        clock.start_ticks = clock.start_ticks.saturating_add(ticks);
+        self.advance_to(now);
+    }
+
     /// Power fails and comes back: dark, no session, no memory, the clock starts again.
     pub fn power_cycle(&mut self, now: HostTime) {
         self.advance_to(now);

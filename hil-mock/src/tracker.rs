@@ -144,6 +144,11 @@ impl SampleSource {
         &self.config
     }
 
+    /// Replaces the faults. Samples are functions of their number, so those without a fault do not change.
+    pub(crate) fn set_faults(&mut self, faults: FaultPlan) {
+        self.config.faults = faults;
+    }
+
     /// Number of bodies.
     pub fn body_count(&self) -> usize {
         self.bodies.len()

@@ -210,6 +210,11 @@ impl<M: Machine> SteppedRun<M> {
         self.medium.as_mut()
     }
 
+    /// True while the link comes up.
+    pub fn is_connecting(&self) -> bool {
+        matches!(self.phase, Phase::Connects { .. })
+    }
+
     /// True once the link is up.
     pub fn is_running(&self) -> bool {
         matches!(self.phase, Phase::Runs(_))

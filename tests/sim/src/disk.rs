@@ -1,0 +1,71 @@
+//! The disk that keeps standing orders: in memory, with faults.
+
+use crate::cable::lock;
+use dpm_common::folder::FolderError;
+use dpm_rig::standing::StateFolder;
+use std::collections::BTreeMap;
+use std::io;
+use std::path::Path;
+use std::sync::{Arc, Mutex};
+
+/// Content and faults of the disk.
+#[derive(Debug, Default)]
+pub struct Disk {
+    files: BTreeMap<String, Vec<u8>>,
+    /// Writing fails: the disk is full, or was mounted read-only.
+    pub refuses: bool,
+    /// How much longer a write takes, nanoseconds.
+    pub late_ns: i64,
+}
+
+impl Disk {
+    /// The power fails while `name` is written: old or new content remains, never half of it; with `torn` a stray file
+    /// of the writer remains too.
+    pub fn tear(&mut self) {
+        self.files.insert(".new-1-1".into(), b"{\"vers".to_vec());
+    }
+}
+
+/// A folder of the disk.
+#[derive(Clone, Debug)]
+pub struct SimFolder(pub Arc<Mutex<Disk>>);
+
+const PATH: &str = "/simulated/state";
+
+fn refused(name: &str) -> FolderError {
+    FolderError::Io { path: Path::new(PATH).join(name), source: io::Error::other("no space left on device") }
+}
+
+impl StateFolder for SimFolder {
+    fn path(&self) -> &Path {
+        Path::new(PATH)
+    }
+
+    fn names(&self) -> Result<Vec<String>, FolderError> {
+        Ok(lock(&self.0).files.keys().cloned().collect())
+    }
+
+    fn read(&self, name: &str, most: u64) -> Result<Vec<u8>, FolderError> {
+        let disk = lock(&self.0);
+        let bytes = disk.files.get(name).filter(|bytes| bytes.len() as u64 <= most);
+        bytes.cloned().ok_or_else(|| refused(name))
+    }
+
+    fn replace(&self, name: &str, bytes: &[u8]) -> Result<(), FolderError> {
+        let mut disk = lock(&self.0);
+        if disk.refuses {
+            return Err(refused(name));
+        }
+        disk.files.insert(name.into(), bytes.into());
+        Ok(())
+    }
+
+    fn remove(&self, name: &str) -> Result<(), FolderError> {
+        let mut disk = lock(&self.0);
+        if disk.refuses {
+            return Err(refused(name));
+        }
+        disk.files.remove(name);
+        Ok(())
+    }
+}

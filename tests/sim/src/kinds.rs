@@ -1,0 +1,237 @@
+//! The kinds of faults, and the states of the rig in which they strike.
+
+/// What the rig is doing, as an operator would say.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Hash)]
+#[repr(usize)]
+pub enum State {
+    /// No process runs, or it prepares its GPU.
+    Dark,
+    /// The link comes up.
+    Arming,
+    /// Frames are shown.
+    Running,
+    /// The medium is gone.
+    RePlugging,
+    /// The operator ordered BLACK or FREEZE.
+    FrozenOrBlack,
+    /// A stop was asked for.
+    ShuttingDown,
+    /// The projector has latched a fault, or light rests.
+    Faulted,
+}
+
+impl State {
+    /// All states.
+    pub const ALL: [Self; 7] = [
+        Self::Dark,
+        Self::Arming,
+        Self::Running,
+        Self::RePlugging,
+        Self::FrozenOrBlack,
+        Self::ShuttingDown,
+        Self::Faulted,
+    ];
+
+    /// As printed.
+    pub fn word(self) -> &'static str {
+        ["dark", "arming", "running", "re-plug", "frozen/black", "shutdown", "faulted"][self as usize]
+    }
+}
+
+/// Declares the kinds with their names and texts.
+macro_rules! kinds {
+    ($($(#[doc = $doc:literal])+ $kind:ident,)+) => {
+        /// A kind of fault. The letters and numbers are those of docs/FAILURES.md; X are kinds that were found later.
+        #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Hash)]
+        #[repr(usize)]
+        pub enum Kind { $($(#[doc = $doc])+ $kind,)+ }
+
+        impl Kind {
+            /// All kinds.
+            pub const ALL: &'static [Self] = &[$(Self::$kind),+];
+
+            /// What it is.
+            pub fn text(self) -> &'static str {
+                match self { $(Self::$kind => concat!($($doc),+).trim_ascii(),)+ }
+            }
+        }
+    };
+}
+
+kinds! {
+    /// The tracker loses two or three samples.
+    T1,
+    /// The tracker is silent for 0.1 to 2 s.
+    T2,
+    /// The tracker is intermittent.
+    T3,
+    /// The tracker repeats one pose under new numbers.
+    T4,
+    /// The tracker reports that it does not see the body.
+    T5,
+    /// A pose jumps.
+    T6,
+    /// Coordinates are NaN, infinite or huge.
+    T7,
+    /// Quaternions have a wrong length or the other sign.
+    T8,
+    /// Datagrams arrive twice.
+    T9,
+    /// Datagrams overtake each other or are late.
+    T10,
+    /// The tracker's program restarts: numbers and clock begin anew.
+    T11,
+    /// The body has another name and number.
+    T12,
+    /// Datagrams are cut short or damaged.
+    T13,
+    /// The server's protocol version changes.
+    T14,
+    /// The tracker's rate changes, or samples arrive in bursts.
+    T15,
+    /// Strangers send to the host's socket.
+    T16,
+    /// The tracker reports millimetres.
+    T17,
+    /// A serial tracker's line is noisy or unplugged.
+    T18,
+    /// The projector is unplugged.
+    U1,
+    /// It is unplugged with frames on the cable.
+    U2,
+    /// An endpoint is halted for 1 to 300 ms.
+    U3,
+    /// The cable is slower than the frames.
+    U4,
+    /// Transfers end too early.
+    U5,
+    /// Replies are damaged or too long.
+    U6,
+    /// Packets are damaged or lost.
+    U7,
+    /// The projector forgets everything.
+    U8,
+    /// Another projector, with another panel, is in its place.
+    U9,
+    /// Old replies arrive again.
+    U10,
+    /// The projector's clock jumps.
+    U11,
+    /// The projector is too hot, its lamp fails, or its emergency stop is pressed.
+    U12,
+    /// Another host speaks to the projector.
+    U13,
+    /// The port may not be opened.
+    U14,
+    /// The program is killed.
+    U15,
+    /// There is no GPU at the next start.
+    G1,
+    /// The GPU's memory does not suffice at the next start.
+    G2,
+    /// The GPU's memory does not suffice for a new scene.
+    G3,
+    /// The GPU is lost.
+    G4,
+    /// The GPU never finishes a frame.
+    G5,
+    /// One dispatch takes 0.3 to 1.5 s.
+    G6,
+    /// A frame is late.
+    G7,
+    /// Pixels are NaN.
+    G8,
+    /// A cache of shaders is damaged.
+    G9,
+    /// The disk is full or slow.
+    H1,
+    /// The program is killed while it writes an order down.
+    H2,
+    /// The machine is suspended, or its wall clock is set.
+    H3,
+    /// A stage stalls for 1 ms to 1 s.
+    H4,
+    /// A stage panics.
+    H5,
+    /// The program is asked to stop, once or twice.
+    H6,
+    /// The rig file is wrong at the next start.
+    H7,
+    /// The stages wake late: no real-time priority.
+    H8,
+    /// The machine has one core for everything.
+    H9,
+    /// No descriptors are left.
+    H10,
+    /// A second instance is started.
+    H11,
+    /// Counts, offsets or strides of a scene near the limits of integers.
+    F1,
+    /// Accessors of a scene beyond their buffers.
+    F2,
+    /// Nodes of a scene in a circle.
+    F3,
+    /// Indices beyond the vertices; vertices that are NaN.
+    F4,
+    /// A million copies of a mesh.
+    F5,
+    /// A texture that decompresses to gigabytes.
+    F6,
+    /// Addresses outside the scene's folder.
+    F7,
+    /// Data addresses and containers that lie about their length.
+    F8,
+    /// Required extensions that nobody knows.
+    F9,
+    /// Lights, cameras and matrices that are no numbers.
+    F10,
+    /// A flood of datagrams.
+    N1,
+    /// Datagrams of the greatest size.
+    N2,
+    /// A client of the control socket that sends a byte a second.
+    N3,
+    /// A control message that announces gigabytes.
+    N4,
+    /// A storm of connections to the control socket.
+    N5,
+    /// Old datagrams of the tracker arrive again.
+    N6,
+    /// Forged datagrams with the tracker's address.
+    N7,
+    /// A stage never returns.
+    X1,
+    /// A stage never returns, and then a stop is asked for.
+    X2,
+    /// SAFE, then the program is killed.
+    X3,
+    /// The program is restarted in order while the projector stays on.
+    X4,
+    /// Orders in quick succession.
+    X5,
+    /// The program is stopped and continued (SIGSTOP).
+    X6,
+    /// The tracker falls silent while the GPU hangs.
+    X7,
+}
+
+const FILES: &str = "scenes are read only when the program starts, before any light";
+
+impl Kind {
+    /// Why this kind cannot strike in `state`; `None` if it can.
+    pub fn impossible(self, state: State) -> Option<&'static str> {
+        use Kind as K;
+        match self {
+            K::T18 => Some("the simulated tracker is on the network; serial trackers: device/src/tracker/serial"),
+            K::G3 => Some("no scene is loaded while the rig runs"),
+            K::G9 => Some("the program keeps no cache of shaders"),
+            K::F1 | K::F2 | K::F3 | K::F4 | K::F5 | K::F6 | K::F7 | K::F8 | K::F9 | K::F10 => {
+                (state != State::Dark).then_some(FILES)
+            }
+            K::H7 | K::G1 | K::G2 => {
+                (state != State::Dark).then_some("it strikes only when the program starts")
+            }
+            _ => None,
+        }
+    }
+}

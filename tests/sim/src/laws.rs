@@ -1,0 +1,487 @@
+//! The laws that hold whatever happens. They are judged from the light itself, and from what the person ordered; of
+//! the program they believe only which frame it sent with which planes, and what it tells the operator.
+
+use crate::cable::lock;
+use crate::machine::{hash, Beneath, Sent};
+use crate::net::motion;
+use crate::plan::Setup;
+use crate::process::{Exit, Process};
+use dpm_device::light::{LightEvent, LightKind};
+use dpm_device::link::{frame_newer, DeviceState};
+use dpm_rig::order::Order;
+use dpm_rig::pipeline::stepped::{SteppedEnd, StoredOrder};
+use dpm_rig::control::orders::Ticket;
+use dpm_rig::rig::Rig;
+use dpm_rig::telemetry::monitor::{ProjectorHealth, RunCounts};
+use hil_mock::motion::Motion;
+use hil_mock::projector::LightChange;
+use std::sync::{Arc, Mutex};
+
+const MS: i64 = 1_000_000;
+const S: i64 = 1_000 * MS;
+/// Frames that are remembered after they were sent.
+const REMEMBERED: usize = 1024;
+/// An order to go dark is carried out within this time when nothing is wrong ...
+const DARK_WITHIN_NS: i64 = 50 * MS;
+/// ... and within this time otherwise: the watchdog has done it by then.
+const DARK_AT_LAST_NS: i64 = 300 * MS;
+/// Light returns within this time after all causes are gone.
+const LIT_WITHIN_NS: i64 = S;
+/// The body's greatest speed and acceleration, in metres and seconds.
+const SPEED: f64 = 0.3;
+const ACCELERATION: f64 = 1.0;
+
+/// A broken law.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct Broken {
+    /// True time, nanoseconds.
+    pub at: i64,
+    /// Which, and how.
+    pub told: String,
+}
+
+/// An order that keeps the projector dark, or its picture still.
+#[derive(Clone, Copy, Debug)]
+struct Standing {
+    order: Order,
+    since: i64,
+    ticket: Ticket,
+    /// It is kept over restarts.
+    kept: bool,
+    /// The process that it was given to has ended.
+    is_orphan: bool,
+}
+
+/// See the module's documentation. All instants are true time.
+pub struct Laws {
+    /// The first broken law.
+    pub broken: Option<Broken>,
+    slot_ns: i64,
+    watchdog_ns: i64,
+    predict_ns: Option<i64>,
+    rate_hz: u32,
+    is_quick: bool,
+    motion: Option<Motion>,
+    sent: Vec<Sent>,
+    /// The greatest distance between slots of frames sent lately.
+    stride_ns: i64,
+    last_due: i64,
+    process: u64,
+    last_lit: Option<(u64, u32)>,
+    /// The frame on the mirrors.
+    showing: Option<Sent>,
+    is_lit: bool,
+    lit_since: i64,
+    dark_since: i64,
+    /// When a frame with light on the body was lit last.
+    good_at: i64,
+    good_frames: u64,
+    /// Good frames at each of the last ticks.
+    ticks: [u64; 11],
+    tick: usize,
+    standing: Option<Standing>,
+    stopped_at: Option<i64>,
+    died_at: Option<i64>,
+    started_at: i64,
+    starts_in_calm: u32,
+    hot_since: Option<i64>,
+    disturbed_at: i64,
+    lies_until: i64,
+    clock_moved_at: i64,
+    rested_until: i64,
+    /// Since then the light has been gone without a word to the operator.
+    wordless_since: i64,
+    /// The worst age of a pose at its first photon, as a share of what is allowed, in thousandths.
+    pub worst_age_milli: i64,
+    /// The longest time from calm to light.
+    pub slowest_return_ns: i64,
+}
+
+impl Laws {
+    /// The laws for `rig`.
+    pub fn new(rig: &Arc<Rig>, setup: &Setup) -> Self {
+        let slot_ns = S / i64::from(setup.rate_hz);
+        Self {
+            broken: None,
+            slot_ns,
+            watchdog_ns: i64::from(rig.config.watchdog_us()) * 1000,
+            predict_ns: setup.predict_ms.map(|ms| i64::from(ms) * MS),
+            rate_hz: setup.rate_hz,
+            is_quick: setup.render_milli < 800,
+            motion: motion(1.0).ok(),
+            sent: vec![Sent::default(); REMEMBERED],
+            stride_ns: slot_ns,
+            last_due: 0,
+            process: 0,
+            last_lit: None,
+            showing: None,
+            is_lit: false,
+            lit_since: 0,
+            dark_since: 0,
+            good_at: 0,
+            good_frames: 0,
+            ticks: [0; 11],
+            tick: 0,
+            standing: None,
+            stopped_at: None,
+            died_at: None,
+            started_at: 0,
+            starts_in_calm: 0,
+            hot_since: None,
+            disturbed_at: 0,
+            lies_until: 0,
+            clock_moved_at: -S,
+            rested_until: 0,
+            wordless_since: 0,
+            worst_age_milli: 0,
+            slowest_return_ns: 0,
+        }
+    }
+
+    /// A law is broken; the first one counts.
+    pub fn fail(&mut self, at: i64, told: String) {
+        self.broken.get_or_insert(Broken { at, told });
+    }
+
+    /// Something was disturbed: what follows is not judged as peace for a while.
+    pub fn disturbed(&mut self, t: i64) {
+        self.disturbed_at = t;
+        self.starts_in_calm = 0;
+    }
+
+    /// Until then the tracker may report what is not true.
+    pub fn lies_until(&mut self, t: i64) {
+        self.lies_until = self.lies_until.max(t);
+    }
+
+    /// The projector's or the host's clock moved.
+    pub fn clock_moved(&mut self, t: i64) {
+        self.clock_moved_at = self.clock_moved_at.max(t);
+    }
+
+    /// The projector has a cause for a fault.
+    pub fn hot(&mut self, t: i64) {
+        self.hot_since = Some(t);
+    }
+
+    /// The program was asked to stop.
+    pub fn asked_to_stop(&mut self, t: i64) {
+        self.stopped_at.get_or_insert(t);
+    }
+
+    /// The program was killed.
+    pub fn died(&mut self, t: i64) {
+        self.died_at = Some(t);
+    }
+
+    /// The program starts.
+    pub fn started(&mut self, t: i64) {
+        (self.stopped_at, self.died_at) = (None, None);
+        self.started_at = t;
+        self.starts_in_calm += 1;
+        self.process += 1;
+        if self.starts_in_calm > 4 {
+            self.fail(t, "the program was started four times although nothing is wrong".into());
+        }
+    }
+
+    /// True while the person wants it dark, or still.
+    pub fn has_standing_order(&self) -> bool {
+        self.standing.is_some()
+    }
+
+    /// The person ordered something.
+    pub fn ordered(&mut self, order: Order, ticket: Ticket, t: i64) {
+        if order == Order::Arm {
+            (self.standing, self.hot_since) = (None, None);
+            return;
+        }
+        let strength = |o: Order| [Order::Freeze, Order::Black, Order::Safe].iter().position(|x| *x == o);
+        if self.standing.is_some_and(|s| strength(s.order) > strength(order)) {
+            return;
+        }
+        let since = self.standing.filter(|s| s.order == order).map_or(t, |s| s.since);
+        self.standing = Some(Standing { order, since, ticket, kept: false, is_orphan: false });
+    }
+
+    /// What stands when `process` ends, in whatever way.
+    pub fn order_at_exit(&mut self, process: &Process, _: i64) {
+        let Some(standing) = &mut self.standing else { return };
+        standing.kept |= process.orders.outcome(standing.ticket) == Some(StoredOrder::Kept);
+        standing.is_orphan = true;
+        if !standing.kept {
+            // Nobody promised that it outlives the program.
+            self.standing = None;
+        }
+    }
+
+    /// The program has ended by itself.
+    pub fn exited(&mut self, exit: &Exit, counts: &RunCounts, end: Option<&SteppedEnd>, t: i64) {
+        self.died_at = Some(t);
+        if let (Exit::InOrder, Some(standing)) = (exit, self.standing) {
+            if standing.order != Order::Safe {
+                // BLACK and FREEZE stand as long as the run.
+                self.standing = None;
+            }
+        }
+        if let (Exit::InOrder, Some(_)) = (exit, end) {
+            // A frame that was begun is in one of the results, or was still being made.
+            let open = counts.frames_planned.abs_diff(counts.frames_done());
+            if open > 8 {
+                self.fail(t, format!("{open} frames have no result: {counts:?}"));
+            }
+        }
+    }
+
+    fn is_frozen(&self) -> bool {
+        self.standing.is_some_and(|s| s.order == Order::Freeze && !s.is_orphan)
+    }
+
+    fn remember(&mut self, beneath: &Arc<Mutex<Beneath>>) {
+        let mut beneath = lock(beneath);
+        while let Some(sent) = beneath.sent.pop_front() {
+            let stride = (sent.due_at - self.last_due).clamp(self.slot_ns, S);
+            self.last_due = sent.due_at;
+            self.stride_ns = stride.max(self.stride_ns - self.stride_ns / 16);
+            let place = sent.frame as usize % REMEMBERED;
+            self.sent[place] = sent;
+        }
+    }
+
+    /// Light went on or off.
+    pub fn change(&mut self, change: &LightChange, _: i64) {
+        let at = change.at.0;
+        match (self.is_lit, change.frame.is_some()) {
+            (false, true) => {
+                (self.is_lit, self.lit_since) = (true, at);
+                self.must_be_dark(at, "light goes on");
+            }
+            (true, false) => {
+                self.must_be_dark(at - 1, "light goes off only now");
+                (self.is_lit, self.dark_since) = (false, at);
+                self.showing = None;
+            }
+            _ => {}
+        }
+        if change.state == DeviceState::Faulted {
+            self.rested_until = self.rested_until.max(at);
+        }
+    }
+
+    /// Light at `at` is against the law if it was to be dark by then.
+    fn must_be_dark(&mut self, at: i64, what: &str) {
+        let peaceful = |since: i64, disturbed: i64| since - disturbed > 2 * S;
+        let allowed = |since: i64, me: &Self| {
+            if peaceful(since, me.disturbed_at.min(since)) && me.disturbed_at <= since {
+                DARK_WITHIN_NS
+            } else {
+                DARK_AT_LAST_NS.max(me.watchdog_ns + 50 * MS)
+            }
+        };
+        if let Some(s) = self.standing.filter(|s| s.order != Order::Freeze) {
+            let late = at - s.since;
+            if late > allowed(s.since, self) {
+                let how = if s.is_orphan { ", which was kept over a restart" } else { "" };
+                self.fail(at, format!("{what} {} ms after {}{how}", late / MS, s.order.word().to_uppercase()));
+            }
+        }
+        if let Some(since) = self.stopped_at {
+            if at - since > allowed(since, self) {
+                self.fail(at, format!("{what} {} ms after a stop was asked for", (at - since) / MS));
+            }
+        }
+        if let Some(since) = self.died_at {
+            if at - since > self.watchdog_ns + self.slot_ns + 2 * MS {
+                self.fail(at, format!("{what} {} ms after the program died", (at - since) / MS));
+            }
+        }
+        if let Some(since) = self.hot_since {
+            if at - since > self.slot_ns + MS {
+                self.fail(at, format!("{what} {} ms after a fault that waits for a person", (at - since) / MS));
+            }
+        }
+    }
+
+    /// What the mirrors showed in a slot. `planes`: those on the mirrors.
+    pub fn light(
+        &mut self,
+        event: &LightEvent,
+        planes: Option<&[u8]>,
+        lag: i64,
+        beneath: &Arc<Mutex<Beneath>>,
+        _: u64,
+    ) {
+        let at = event.first_photon_at.0;
+        if event.kind == LightKind::Blank {
+            return;
+        }
+        self.must_be_dark(at, "a slot is lit");
+        if event.kind == LightKind::Repeated {
+            return self.held_too_long(at, lag);
+        }
+        self.remember(beneath);
+        let Some(frame) = event.frame else { return };
+        let sent = self.sent[frame as usize % REMEMBERED].clone();
+        if sent.frame != frame || sent.process != self.process {
+            return self.fail(at, format!("frame {frame} is lit, and this process has not sent it lately"));
+        }
+        if let Some((_, last)) = self.last_lit.filter(|(process, _)| *process == self.process) {
+            if !frame_newer(frame, last) {
+                return self.fail(at, format!("frame {frame} is lit after frame {last}"));
+            }
+        }
+        self.last_lit = Some((self.process, frame));
+        if planes.map(hash) != Some(sent.hash) {
+            return self.fail(at, format!("frame {frame} is lit with other planes than were sent"));
+        }
+        self.judge_pose(&sent, at, event.last_photon_at.0, lag);
+        if sent.captured_at.is_some() {
+            self.good_at = at;
+            self.good_frames += 1;
+            self.wordless_since = at;
+        }
+        self.showing = Some(sent);
+    }
+
+    /// A frame is shown again.
+    fn held_too_long(&mut self, at: i64, lag: i64) {
+        let Some(sent) = &self.showing else { return };
+        if self.is_frozen() || at - self.clock_moved_at < 4 * S {
+            return;
+        }
+        let predict_ns = self.predict_ns.unwrap_or(sent.predict_ns).max(3 * self.slot_ns);
+        let held = at - lag - sent.due_at;
+        let allowed = predict_ns + 2 * self.stride_ns + self.slot_ns + 2 * MS;
+        if held > allowed {
+            let frame = sent.frame;
+            self.fail(
+                at,
+                format!("frame {frame} is still lit {} ms after its slot; {} ms are allowed", held / MS, allowed / MS),
+            );
+        }
+    }
+
+    /// How old the poses are at the first photon, and how far the light is from the body.
+    fn judge_pose(&mut self, sent: &Sent, at: i64, last: i64, lag: i64) {
+        let Some(captured_at) = sent.captured_at else { return };
+        if at - self.clock_moved_at < 4 * S {
+            return;
+        }
+        let age = at - lag - captured_at;
+        let predict_ns = self.predict_ns.unwrap_or(sent.predict_ns);
+        // The clocks are known to a fraction of a millisecond only.
+        let allowed = predict_ns + self.slot_ns + MS;
+        self.worst_age_milli = self.worst_age_milli.max(age * 1000 / allowed);
+        if age > allowed {
+            let frame = sent.frame;
+            return self.fail(
+                at,
+                format!("frame {frame}: poses are {} ms old at the first photon; {} ms are allowed", age / MS, allowed / MS),
+            );
+        }
+        if at < self.lies_until + S || at - self.started_at < S {
+            return;
+        }
+        let Some(motion) = &self.motion else { return };
+        let truth = motion.pose_at((at + last) / 2).position_m;
+        let off = truth.iter().zip(sent.position).map(|(a, b)| (a - b) * (a - b)).sum::<f64>().sqrt();
+        let (age_s, late_s) = (age as f64 * 1e-9, (at - lag - sent.due_at).max(0) as f64 * 1e-9);
+        let peace = at - self.disturbed_at > 2 * S;
+        // The filter's error: noise in peace; a wrong speed after a gap.
+        let slack = if peace { 0.003 } else { 0.004 + 2.0 * SPEED * age_s };
+        let allowed = slack + 0.5 * ACCELERATION * age_s * age_s + SPEED * (late_s + 0.001);
+        if off > allowed {
+            let frame = sent.frame;
+            self.fail(
+                at,
+                format!("frame {frame}: the light is {:.1} mm off the body; {:.1} mm are allowed", off * 1e3, allowed * 1e3),
+            );
+        }
+    }
+
+    /// True when the light has been steady lately.
+    pub fn is_lit_well(&self, t: i64) -> bool {
+        t - self.good_at < 2 * self.stride_ns + 30 * MS
+    }
+
+    /// What no event triggers. `calm_for`: how long nothing has been wrong, negative if something is. `crew`: when the
+    /// last crew was ready, and how many there were.
+    pub fn tick(
+        &mut self,
+        t: i64,
+        calm_for: i64,
+        process: Option<&mut Process>,
+        crew: (i64, u64),
+        longest: usize,
+    ) {
+        if self.is_lit {
+            self.must_be_dark(t, "it is lit");
+        }
+        if longest > 400 {
+            self.fail(t, format!("{longest} transfers wait on the cable"));
+        }
+        self.tick = (self.tick + 1) % self.ticks.len();
+        let before = std::mem::replace(&mut self.ticks[self.tick], self.good_frames);
+        let is_in_peace = calm_for > 2 * S && t - self.good_at < S && t - self.disturbed_at > 3 * S;
+        if is_in_peace && self.is_quick && t - crew.0 > 3 * S && t - self.started_at > 4 * S {
+            let frames = self.good_frames - before;
+            // Ten ticks are a second, and the window is eleven; a tenth may be missing.
+            if frames * 10 < u64::from(self.rate_hz) * 9 {
+                self.fail(t, format!("{frames} good frames in 1.1 s of peace at {} per second", self.rate_hz));
+            }
+        }
+        let health = process.as_ref().map(|p| p.health());
+        if matches!(health, Some(ProjectorHealth::Resting(_))) {
+            self.rested_until = t;
+        }
+        self.words(t, process);
+        self.light_is_due(t, calm_for, crew.0, health);
+    }
+
+    /// Every second of darkness has its reason.
+    fn words(&mut self, t: i64, process: Option<&mut Process>) {
+        let Some(process) = process else {
+            self.wordless_since = t;
+            return;
+        };
+        let has_word = !process.monitor.take_notes().is_empty()
+            || process.health() != ProjectorHealth::Up
+            || !process.run.is_running()
+            || process.is_stopping;
+        if has_word || process.monitor.tracker().is_some() {
+            // A word stands until there is light again.
+            self.wordless_since = i64::MAX;
+        }
+        if self.wordless_since == i64::MAX && t - self.good_at < 200 * MS {
+            self.wordless_since = t;
+        }
+        if self.wordless_since != i64::MAX && t - self.wordless_since.max(self.good_at) > 1_500 * MS {
+            self.fail(t, "no light for 1.5 s, the projector is called up, and no note says why".into());
+        }
+    }
+
+    /// Light must be back soon after all causes are gone.
+    fn light_is_due(&mut self, t: i64, calm_for: i64, crew_ready: i64, health: Option<ProjectorHealth>) {
+        if calm_for < 0 || t - self.good_at < 200 * MS {
+            if calm_for >= 0 && t - self.good_at < 200 * MS {
+                self.starts_in_calm = 0;
+            }
+            return;
+        }
+        let calm_since = t - calm_for;
+        // What the law does not count: the GPU's own time, the service manager's second, a rest after flashes.
+        let begin = calm_since.max(crew_ready).max(self.rested_until + 2 * S);
+        let begin = begin.max(self.started_at + 300 * MS);
+        let slow = 4 * self.stride_ns + 12 * self.slot_ns;
+        // A hang shows after the limit for the GPU; a new process greets its projector for up to two seconds.
+        let hidden = 3 * S + 500 * MS;
+        let late = t - begin;
+        self.slowest_return_ns = self.slowest_return_ns.max(late);
+        if late > LIT_WITHIN_NS + hidden + slow {
+            self.fail(
+                t,
+                format!("no light {:.1} s after all causes were gone; the projector is {health:?}", calm_for as f64 * 1e-9),
+            );
+        }
+    }
+}

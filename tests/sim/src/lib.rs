@@ -1,0 +1,20 @@
+//! A simulated world around the rig: the real engine, tracking, link, orders and projector model, on one thread, under
+//! one clock, from one seed. Everything else is made up, and hostile.
+//!
+//! Reading order: [`kinds`] names the faults and the states in which they strike; [`plan`] draws episodes from a seed;
+//! [`world`] has the clock and moves everything; [`strike`] turns a fault into what happens in the world; [`laws`]
+//! judges after every event; [`life`] runs one seed, and shrinks it if a law was broken.
+
+pub mod cable;
+pub mod dice;
+pub mod disk;
+pub mod kinds;
+pub mod laws;
+pub mod life;
+pub mod machine;
+pub mod net;
+pub mod plan;
+pub mod process;
+pub mod strike;
+pub mod table;
+pub mod world;

@@ -1,0 +1,258 @@
+//! The host's machine: how long its stages take, and what its GPU does.
+
+use crate::cable::lock;
+use crate::dice::Dice;
+use crate::net::{Net, SimSocket};
+use dpm_device::time::{HostClock, HostTime};
+use dpm_device::tracker::natnet::client::{NatNetClient, NatNetConfig};
+use dpm_device::tracker::{BodyKey, Tracker};
+use dpm_render::gpu::{GpuError, MemoryPool};
+use dpm_rig::pipeline::stepped::{Machine, Part, Rendered, SentFrame, Takes};
+use std::collections::VecDeque;
+use std::net::Ipv4Addr;
+use std::sync::atomic::{AtomicI64, Ordering};
+use std::sync::{Arc, Mutex};
+
+/// Quantiles of a stage's time in microseconds: of 50, 90, 99 and 99.9 percent of the steps, and the greatest.
+/// Measured by `dpm profile` at real pace, see docs/lab/SIMULATOR.md.
+type Quantiles = [i64; 5];
+
+const PLAN_US: Quantiles = [18, 31, 62, 240, 900];
+const PACK_US: Quantiles = [70, 96, 180, 420, 1_200];
+const LINK_US: Quantiles = [45, 70, 130, 380, 1_100];
+const TRACKING_US: Quantiles = [6, 11, 40, 120, 600];
+const COLLECTOR_US: Quantiles = [20, 60, 300, 2_000, 9_000];
+
+/// Draws a time from quantiles, in nanoseconds.
+fn drawn(dice: &mut Dice, quantiles: Quantiles) -> i64 {
+    let at = dice.between(0, 999_999);
+    let steps = [(0, 500_000), (500_000, 900_000), (900_000, 990_000), (990_000, 999_000), (999_000, 1_000_000)];
+    let mut low = quantiles[0] / 2;
+    for ((from, to), high) in steps.into_iter().zip(quantiles) {
+        if at < to {
+            return 1000 * low + 1000 * (high - low) * (at - from) / (to - from);
+        }
+        low = high;
+    }
+    1000 * low
+}
+
+/// A fault that the next step of a stage meets.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Trap {
+    /// It stalls for so many nanoseconds.
+    Stalls(i64),
+    /// It never returns.
+    Hangs,
+    /// It panics.
+    Panics,
+}
+
+/// A fault that the next frame meets on the GPU.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum GpuTrap {
+    /// The frame takes so many nanoseconds longer.
+    Late(i64),
+    /// It never finishes.
+    Hangs,
+    /// The device is lost.
+    Lost,
+}
+
+/// A fault that the next opening of the GPU meets.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum OpenTrap {
+    /// There is no device.
+    Absent,
+    /// Its memory does not suffice.
+    OutOfMemory,
+}
+
+/// What the link accepted, for the oracles.
+#[derive(Clone, Debug, Default)]
+pub struct Sent {
+    /// Low 32 bits of its number.
+    pub frame: u32,
+    /// Which process sent it.
+    pub process: u64,
+    /// Instants of the host's clock.
+    pub sent_at: i64,
+    /// Begin of its slot on the host's clock.
+    pub due_at: i64,
+    /// Mid-exposure of its oldest pose; `None` if it is dark.
+    pub captured_at: Option<i64>,
+    /// The prediction that it was allowed.
+    pub predict_ns: i64,
+    /// Position of the body for which it was drawn.
+    pub position: [f64; 3],
+    /// A hash of its planes.
+    pub hash: u64,
+}
+
+/// A hash of planes that is cheap enough for every frame.
+pub fn hash(planes: &[u8]) -> u64 {
+    planes.chunks(8).fold(0x9e37_79b9_7f4a_7c15, |h: u64, chunk| {
+        let mut word = [0; 8];
+        word[..chunk.len()].copy_from_slice(chunk);
+        let h = (h ^ u64::from_le_bytes(word)).wrapping_mul(0xff51_afd7_ed55_8ccd);
+        h ^ h >> 29
+    })
+}
+
+/// State of the machine, shared by the world and the run.
+#[derive(Debug)]
+pub struct Beneath {
+    dice: Dice,
+    /// Traps by stage.
+    pub traps: Vec<(Part, Trap)>,
+    /// Traps of the GPU's next frames.
+    pub gpu_traps: VecDeque<GpuTrap>,
+    /// Traps of the GPU's next openings.
+    pub open_traps: VecDeque<OpenTrap>,
+    /// Number of the process.
+    pub process: u64,
+    /// Stages take longer by this factor, in thousandths.
+    pub load_milli: i64,
+    /// The GPU's time of a usual frame, nanoseconds.
+    pub frame_ns: i64,
+    /// Frames that were sent and not looked at yet.
+    pub sent: VecDeque<Sent>,
+    /// When the last crew was ready, host's clock.
+    pub crew_ready_at: i64,
+    /// How often a crew was made.
+    pub crews: u64,
+}
+
+impl Beneath {
+    /// A machine whose GPU takes `frame_ns` for a frame.
+    pub fn new(seed: u64, frame_ns: i64) -> Self {
+        Self {
+            dice: Dice::new(seed, 0x6d61),
+            traps: Vec::new(),
+            gpu_traps: VecDeque::new(),
+            open_traps: VecDeque::new(),
+            process: 0,
+            load_milli: 1000,
+            frame_ns,
+            sent: VecDeque::new(),
+            crew_ready_at: 0,
+            crews: 0,
+        }
+    }
+
+    /// A new process does not meet the traps of the old one.
+    pub fn new_process(&mut self) {
+        self.process += 1;
+        self.traps.clear();
+        self.gpu_traps.clear();
+    }
+}
+
+/// The run's view of the machine.
+pub struct SimMachine {
+    /// The machine.
+    pub beneath: Arc<Mutex<Beneath>>,
+    /// The tracker's network.
+    pub net: Arc<Mutex<Net>>,
+    /// Host's clock now.
+    pub clock: Arc<AtomicI64>,
+    /// True time minus the host's clock.
+    pub lag: Arc<AtomicI64>,
+}
+
+fn device() -> Arc<str> {
+    "simulated GPU".into()
+}
+
+impl Machine for SimMachine {
+    fn takes(&mut self, part: Part, _: u64, _: HostTime) -> Takes {
+        let mut beneath = lock(&self.beneath);
+        let quantiles = match part {
+            Part::Tracking => TRACKING_US,
+            Part::Plan => PLAN_US,
+            Part::Pack => PACK_US,
+            Part::Link => LINK_US,
+            Part::Collector => COLLECTOR_US,
+        };
+        let load_milli = beneath.load_milli;
+        let ns = drawn(&mut beneath.dice, quantiles) * load_milli / 1000;
+        if !beneath.traps.is_empty() {
+            if let Some(i) = beneath.traps.iter().position(|(of, _)| *of == part) {
+                return match beneath.traps.remove(i).1 {
+                    Trap::Stalls(more) => Takes::Ns(ns + more),
+                    Trap::Hangs => Takes::Forever,
+                    Trap::Panics => Takes::Panics,
+                };
+            }
+        }
+        Takes::Ns(ns)
+    }
+
+    fn renders(&mut self, _: u64, _: HostTime) -> Rendered {
+        let mut beneath = lock(&self.beneath);
+        let spread = beneath.dice.between(900, 1_100);
+        let ns = beneath.frame_ns * spread / 1000 * beneath.load_milli.min(2_000) / 1000;
+        match beneath.gpu_traps.pop_front() {
+            None => Rendered::After(ns),
+            Some(GpuTrap::Late(more)) => Rendered::After(ns + more),
+            Some(GpuTrap::Hangs) => Rendered::Never,
+            Some(GpuTrap::Lost) => {
+                Rendered::Lost(ns, GpuError::DeviceLost { operation: "rendering", device: device() })
+            }
+        }
+    }
+
+    fn makes_crew(&mut self, with_gpu: bool, now: HostTime) -> (i64, Result<i64, GpuError>) {
+        let mut beneath = lock(&self.beneath);
+        let takes_ns = if with_gpu { beneath.dice.between(80, 700) } else { beneath.dice.between(5, 40) };
+        let takes_ns = takes_ns * 1_000_000;
+        beneath.crew_ready_at = now.0 + takes_ns;
+        beneath.crews += 1;
+        let made = match with_gpu.then(|| beneath.open_traps.pop_front()).flatten() {
+            None => Ok(beneath.frame_ns),
+            Some(OpenTrap::Absent) => {
+                Err(GpuError::NoDevice { found: "none".into(), needed: "one".into() })
+            }
+            Some(OpenTrap::OutOfMemory) => Err(GpuError::OutOfMemory {
+                operation: "making a buffer".into(),
+                device: device(),
+                pool: MemoryPool::Device,
+                needed_mib: Some(1),
+                heap_mib: 1,
+            }),
+        };
+        (takes_ns, made)
+    }
+
+    fn opens_tracker(&mut self, _: HostTime) -> Box<dyn Tracker> {
+        lock(&self.net).new_socket();
+        let bodies = vec![BodyKey { name: "a".into(), id: Some(1) }];
+        let config = NatNetConfig {
+            local: Ipv4Addr::new(10, 0, 0, 1),
+            ..NatNetConfig::unicast(Ipv4Addr::new(10, 0, 0, 2), bodies)
+        };
+        let clock = self.clock.clone();
+        let clock: Arc<dyn HostClock> = Arc::new(move || HostTime(clock.load(Ordering::Relaxed)));
+        Box::new(NatNetClient::with_ports(config, clock, Box::new(SimSocket(self.net.clone())), None))
+    }
+
+    fn next_sample_at(&self, _: HostTime) -> HostTime {
+        HostTime(lock(&self.net).next_arrival().saturating_sub(self.lag.load(Ordering::Relaxed)))
+    }
+
+    fn sent(&mut self, frame: &SentFrame<'_>) {
+        let mut beneath = lock(&self.beneath);
+        let process = beneath.process;
+        let position = frame.poses.first().map_or([0.0; 3], |pose| pose.translation.to_array());
+        beneath.sent.push_back(Sent {
+            frame: frame.frame,
+            process,
+            sent_at: frame.sent_at.0,
+            due_at: frame.due_at.0,
+            captured_at: frame.captured_at.map(|at| at.0),
+            predict_ns: frame.predict_ns,
+            position,
+            hash: hash(frame.planes),
+        });
+    }
+}

@@ -1,0 +1,208 @@
+//! `dpm-sim`: hours of rig, with every fault, in minutes.
+
+use dpm_sim::life::{live, shrink, Lived, Order};
+use dpm_sim::table::Table;
+use std::collections::{BTreeMap, BTreeSet};
+use std::process::ExitCode;
+use std::time::Instant;
+
+const HELP: &str = "\
+dpm-sim: a simulated world around the rig, with every fault in every state
+
+  --hours H       simulated hours; default 0.2
+  --seed N        first seed; default: a fresh one, which is printed
+  --rate HZ       frames per second of every life; default: each seed's own
+  --life S        simulated seconds of each seed; default 120
+  --until EVENT   stop the (single) seed at this event and print what happened
+  --without LIST  numbers of faults that do not strike, as a shrunk seed names them
+  --minutes M     end after so many minutes of real time
+  --table FILE    write the table of kinds and states there, as Markdown
+  --loud          print everything that happens
+  --no-shrink     do not shrink a seed that breaks a law
+  --json          the last line is a JSON object
+";
+
+struct Wish {
+    hours: f64,
+    seed: Option<u64>,
+    rate: Option<u32>,
+    life_s: f64,
+    until: Option<u64>,
+    without: BTreeSet<u32>,
+    minutes: Option<f64>,
+    table: Option<String>,
+    is_loud: bool,
+    shrinks: bool,
+    json: bool,
+}
+
+fn wish() -> Result<Wish, String> {
+    let mut wish = Wish {
+        hours: 0.2,
+        seed: None,
+        rate: None,
+        life_s: 120.0,
+        until: None,
+        without: BTreeSet::new(),
+        minutes: None,
+        table: None,
+        is_loud: false,
+        shrinks: true,
+        json: false,
+    };
+    let mut args = std::env::args().skip(1);
+    while let Some(arg) = args.next() {
+        let mut value = || args.next().ok_or_else(|| format!("{arg} needs a value\n\n{HELP}"));
+        fn number<T: std::str::FromStr>(text: &str) -> Result<T, String> {
+            text.parse().map_err(|_| format!("{text:?} is no number that fits here"))
+        }
+        match arg.as_str() {
+            "--hours" => wish.hours = number(&value()?)?,
+            "--seed" => wish.seed = Some(number(&value()?)?),
+            "--rate" => wish.rate = Some(number(&value()?)?),
+            "--life" => wish.life_s = number(&value()?)?,
+            "--until" => wish.until = Some(number(&value()?)?),
+            "--without" => {
+                for word in value()?.split(',').filter(|word| !word.is_empty()) {
+                    wish.without.insert(number(word)?);
+                }
+            }
+            "--minutes" => wish.minutes = Some(number(&value()?)?),
+            "--table" => wish.table = Some(value()?),
+            "--loud" => wish.is_loud = true,
+            "--no-shrink" => wish.shrinks = false,
+            "--json" => wish.json = true,
+            "--help" | "-h" => return Err(HELP.into()),
+            other => return Err(format!("unknown argument {other:?}\n\n{HELP}")),
+        }
+    }
+    let is_number = |x: f64| x.is_finite() && x > 0.0;
+    if !is_number(wish.hours) || !is_number(wish.life_s) || wish.rate == Some(0) {
+        return Err("--hours, --life and --rate must be greater than 0".into());
+    }
+    Ok(wish)
+}
+
+/// A seed that nobody has chosen.
+fn fresh() -> u64 {
+    use std::hash::{BuildHasher, Hasher};
+    std::hash::RandomState::new().build_hasher().finish() >> 16
+}
+
+/// What a campaign has seen.
+#[derive(Default)]
+struct Sum {
+    length_ns: i64,
+    table: Table,
+    failures: Vec<String>,
+    by_rate: BTreeMap<u32, (i64, f64, u64)>,
+    worst_age_milli: i64,
+    slowest_return_ns: i64,
+    lives: u64,
+}
+
+fn report(lived: &Lived, order: &Order, shrinks: bool) -> Result<String, String> {
+    let Some(broken) = &lived.broken else { return Ok(String::new()) };
+    println!("seed {}: {} (at {:.3} s)", order.seed, broken.told, broken.at as f64 * 1e-9);
+    let (small, least) =
+        if shrinks { shrink(order, broken.at, &lived.faults)? } else { (order.clone(), lived.clone()) };
+    let told = least.broken.as_ref().map_or("", |broken| broken.told.as_str());
+    println!("  {:?}", least.setup);
+    least.story.iter().rev().take(40).rev().for_each(|line| println!("  {line}"));
+    let without: Vec<String> = small.without.iter().map(u32::to_string).collect();
+    let rate = order.rate_hz.map_or(String::new(), |hz| format!(" --rate {hz}"));
+    println!("  LAW: {told}");
+    println!(
+        "  again: --seed {}{rate} --life {:.0} --hours 0.0001 --loud --without {}",
+        order.seed,
+        (least.length_ns as f64 * 1e-9).ceil() + 1.0,
+        if without.is_empty() { "\"\"".into() } else { without.join(",") }
+    );
+    Ok(told.to_owned())
+}
+
+fn run() -> Result<bool, String> {
+    let wish = wish()?;
+    let first = wish.seed.unwrap_or_else(fresh);
+    println!("seeds from {first}");
+    let begin = Instant::now();
+    let mut sum = Sum::default();
+    let mut seed = first;
+    while (sum.length_ns as f64) < wish.hours * 3.6e12
+        && wish.minutes.is_none_or(|m| begin.elapsed().as_secs_f64() < m * 60.0)
+    {
+        let order = Order {
+            seed,
+            length_ns: (wish.life_s * 1e9) as i64,
+            rate_hz: wish.rate,
+            without: wish.without.clone(),
+            until: wish.until,
+            is_loud: wish.is_loud,
+        };
+        let watch = Instant::now();
+        let lived = live(&order)?;
+        let took = watch.elapsed().as_secs_f64();
+        let entry = sum.by_rate.entry(lived.setup.rate_hz).or_default();
+        *entry = (entry.0 + lived.length_ns, entry.1 + took, entry.2 + lived.table.total());
+        sum.length_ns += lived.length_ns;
+        sum.table.add(&lived.table);
+        sum.worst_age_milli = sum.worst_age_milli.max(lived.worst_age_milli);
+        sum.slowest_return_ns = sum.slowest_return_ns.max(lived.slowest_return_ns);
+        sum.lives += 1;
+        if lived.broken.is_some() {
+            let told = report(&lived, &order, wish.shrinks && wish.until.is_none())?;
+            sum.failures.push(format!("{seed}: {told}"));
+        }
+        if wish.until.is_some() {
+            lived.story.iter().for_each(|line| println!("{line}"));
+            println!("event {} at {:.9} s, trace {:016x}", lived.events, lived.length_ns as f64 * 1e-9, lived.trace);
+            break;
+        }
+        if wish.is_loud {
+            println!("trace {:016x}", lived.trace);
+        }
+        seed = seed.wrapping_add(1);
+    }
+    for (rate, (ns, took, faults)) in &sum.by_rate {
+        let hours = *ns as f64 / 3.6e12;
+        println!(
+            "{rate:>5} frames/s: {hours:.2} h in {took:.0} s, {:.2} h a minute, {faults} faults, {:.0} a minute",
+            hours / took * 60.0,
+            *faults as f64 / took * 60.0
+        );
+    }
+    let hours = sum.length_ns as f64 / 3.6e12;
+    let below = sum.table.cells_below(1000);
+    println!(
+        "{hours:.2} h in {} lives, {} faults, {} laws broken; cells below 1000: {below}; oldest pose {:.0} % of what is \
+         allowed; slowest return of light {:.2} s; {:.0} s of real time",
+        sum.lives,
+        sum.table.total(),
+        sum.failures.len(),
+        sum.worst_age_milli as f64 / 10.0,
+        sum.slowest_return_ns as f64 * 1e-9,
+        begin.elapsed().as_secs_f64()
+    );
+    if let Some(path) = &wish.table {
+        std::fs::write(path, sum.table.to_markdown()).map_err(|e| format!("{path}: {e}"))?;
+    }
+    if wish.json {
+        println!(
+            "{{\"hours\": {hours:.4}, \"faults\": {}, \"failures\": {}, \"cells_below_1000\": {below}, \"seed\": {first}}}",
+            sum.table.total(),
+            sum.failures.len()
+        );
+    }
+    Ok(sum.failures.is_empty())
+}
+
+fn main() -> ExitCode {
+    match run() {
+        Ok(true) => ExitCode::SUCCESS,
+        Ok(false) => ExitCode::from(1),
+        Err(told) => {
+            eprintln!("{told}");
+            ExitCode::from(2)
+        }
+    }
+}

@@ -1,0 +1,337 @@
+//! The tracker's server and the network between it and the host.
+
+use crate::cable::lock;
+use crate::dice::Dice;
+use dpm_device::time::{FrameRate, HostTime};
+use dpm_device::tracker::natnet::wire::Version;
+use dpm_device::tracker::udp::{Arrival, Datagrams};
+use dpm_device::pose::Pose;
+use hil_mock::motion::{Motion, MotionSpec};
+use hil_mock::natnet_server::{NatNetServer, NatNetServerConfig, Streaming, UnicastTo};
+use hil_mock::tracker::{MockTrackerConfig, SampleSource};
+use std::collections::VecDeque;
+use std::io;
+use std::net::{Ipv4Addr, SocketAddrV4};
+use std::sync::{Arc, Mutex};
+
+/// The server's address.
+pub const SERVER: SocketAddrV4 = SocketAddrV4::new(Ipv4Addr::new(10, 0, 0, 2), 1510);
+/// The host's command socket.
+const CLIENT: SocketAddrV4 = SocketAddrV4::new(Ipv4Addr::new(10, 0, 0, 1), 40_000);
+/// Datagrams that the host's socket holds.
+const QUEUED: usize = 2_000;
+
+/// What the server sends.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct ServerKind {
+    /// Samples per second.
+    pub rate_hz: u32,
+    /// Name of the first body.
+    pub name: String,
+    /// Its streaming number.
+    pub number: i32,
+    /// 4.1, or 3.0.
+    pub is_old: bool,
+    /// Positions in millimetres.
+    pub millimetres: bool,
+}
+
+/// How the network behaves at present.
+#[derive(Clone, Copy, Debug, Default)]
+pub struct NetFaults {
+    /// Nothing gets through in either direction.
+    pub cut: bool,
+    /// The server's machine is off.
+    pub away: bool,
+    /// Everything from the server waits until this is false again.
+    pub held: bool,
+    /// Share of datagrams that old ones follow.
+    pub replay: f64,
+    /// Extra delay of datagrams from the server, at most.
+    pub late_ns: i64,
+    /// Datagrams of strangers per millisecond.
+    pub flood: i64,
+    /// They carry the server's address.
+    pub forged: bool,
+    /// They have the greatest size.
+    pub huge: bool,
+    /// The host opens no sockets.
+    pub no_sockets: bool,
+}
+
+/// The server, the network and the host's socket.
+pub struct Net {
+    /// True time.
+    pub now: i64,
+    server: NatNetServer,
+    kind: ServerKind,
+    seed: u64,
+    /// Faults of samples, and when each is over.
+    windows: Vec<(i64, String)>,
+    /// The last restart of the server, as a fault.
+    restart: Option<String>,
+    /// The faults.
+    pub faults: NetFaults,
+    to_host: VecDeque<(i64, SocketAddrV4, Vec<u8>)>,
+    held: Vec<Vec<u8>>,
+    old: Vec<u8>,
+    travel_ns: i64,
+    flooded_at: i64,
+    dice: Dice,
+    spare: Vec<Vec<u8>>,
+    /// Datagrams that were thrown away because the socket was full.
+    pub overrun: u64,
+}
+
+/// The true motion of the body, at time 0 of the world and `scale` times as large: to and fro by 0.3 m/s at most.
+///
+/// # Errors
+/// The motion is none, which is a mistake in this program.
+pub fn motion(scale: f64) -> Result<Motion, String> {
+    let spec = MotionSpec::Sinusoid {
+        direction: [1.0, 0.0, 0.0],
+        peak_speed_m_s: 0.3 * scale,
+        peak_acceleration_m_s2: 1.0 * scale,
+    };
+    let rest = Pose { position_m: [0.0, 0.1 * scale, 0.0], ..Pose::IDENTITY };
+    Motion::new(&spec, rest).map_err(|e| e.to_string())
+}
+
+fn server(kind: &ServerKind, seed: u64) -> Result<NatNetServer, String> {
+    let config = MockTrackerConfig {
+        seed,
+        rate: FrameRate::new(kind.rate_hz, 1).ok_or("a rate of 0")?,
+        position_noise_m: 0.000_1,
+        rotation_noise_rad: 0.000_3,
+        latency_ns: 3_000_000,
+        latency_jitter_ns: 300_000,
+        ..Default::default()
+    };
+    let motion = motion(if kind.millimetres { 1000.0 } else { 1.0 })?;
+    let source = SampleSource::new(config, vec![motion]).map_err(|e| e.to_string())?;
+    let config = NatNetServerConfig {
+        bodies: vec![(kind.name.clone(), kind.number)],
+        version: if kind.is_old { Version::V3_0 } else { Version::V4_1 },
+        streaming: Streaming::Unicast(UnicastTo::CommandSocket),
+        ..NatNetServerConfig::new(&["a"])
+    };
+    NatNetServer::new(config, source).map_err(|e| e.to_string())
+}
+
+impl Net {
+    /// A server of this kind.
+    ///
+    /// # Errors
+    /// The server's settings are wrong, which is a mistake in this program.
+    pub fn new(seed: u64, kind: ServerKind) -> Result<Self, String> {
+        Ok(Self {
+            now: 0,
+            server: server(&kind, seed)?,
+            kind,
+            seed,
+            windows: Vec::new(),
+            restart: None,
+            faults: NetFaults::default(),
+            to_host: VecDeque::new(),
+            held: Vec::new(),
+            old: Vec::new(),
+            travel_ns: 150_000,
+            flooded_at: 0,
+            dice: Dice::new(seed, 0x6e65),
+            spare: Vec::new(),
+            overrun: 0,
+        })
+    }
+
+    /// What the server is at present.
+    pub fn kind(&self) -> &ServerKind {
+        &self.kind
+    }
+
+    /// Adds a fault of the mock tracker, in its notation, that is over at `until`; its window begins now.
+    ///
+    /// # Errors
+    /// It is none, which is a mistake in this program.
+    pub fn strike(&mut self, fault: &str, until: i64) -> Result<(), String> {
+        let now = self.now;
+        self.windows.retain(|(end, _)| *end + 2_000_000_000 > now);
+        self.windows.push((until, fault.to_owned()));
+        self.plan()
+    }
+
+    fn plan(&mut self) -> Result<(), String> {
+        let texts: Vec<&str> =
+            self.windows.iter().map(|(_, text)| text.as_str()).chain(self.restart.as_deref()).collect();
+        let plan = texts.join(",");
+        let parsed = plan.parse().map_err(|e| format!("{plan}: {e}"))?;
+        self.server.set_faults(parsed).map_err(|e| e.to_string())
+    }
+
+    /// Another server takes the place of this one: restarted, renamed, of another version, with another rate. Its
+    /// clock and its frame numbers begin anew.
+    ///
+    /// # Errors
+    /// As [`Net::new`].
+    pub fn replace(&mut self, kind: ServerKind) -> Result<(), String> {
+        self.server = server(&kind, self.seed)?;
+        self.restart = Some(format!("reset@{}ns", self.now));
+        self.server.begin_at(HostTime(self.now));
+        self.kind = kind;
+        self.plan()
+    }
+
+    /// When something happens here next.
+    pub fn due(&self) -> i64 {
+        let server = if self.faults.away { i64::MAX } else { self.server.next_due().0 };
+        let flood = if self.faults.flood > 0 { self.flooded_at + 1_000_000 } else { i64::MAX };
+        server.max(self.now).min(flood.max(self.now))
+    }
+
+    /// When the next datagram reaches the host.
+    pub fn next_arrival(&self) -> i64 {
+        let front = self.to_host.front().map_or(i64::MAX, |d| d.0);
+        if self.faults.away {
+            return front;
+        }
+        front.min(self.server.next_due().0.max(self.now) + self.travel_ns)
+    }
+
+    /// Advances to `now`.
+    pub fn advance(&mut self, now: i64) {
+        self.now = now;
+        if !self.held.is_empty() && !self.faults.held {
+            for bytes in std::mem::take(&mut self.held) {
+                self.deliver(bytes);
+            }
+        }
+        if !self.faults.away && self.server.next_due().0 <= now {
+            let mut sent = Vec::new();
+            let spare = &mut self.spare;
+            self.server.stream(HostTime(now), &mut |bytes, _| {
+                let mut copy: Vec<u8> = spare.pop().unwrap_or_default();
+                copy.extend_from_slice(bytes);
+                sent.push(copy);
+            });
+            sent.into_iter().for_each(|bytes| self.from_server(bytes));
+        }
+        if self.faults.flood > 0 && self.flooded_at + 1_000_000 <= now {
+            self.flooded_at = now;
+            for _ in 0..self.faults.flood {
+                self.stranger();
+            }
+        }
+    }
+
+    fn stranger(&mut self) {
+        let len = if self.faults.huge { 65_000 } else { self.dice.between(0, 300) as usize };
+        let mut bytes: Vec<u8> = self.spare.pop().unwrap_or_default();
+        if self.faults.forged && !self.old.is_empty() && self.dice.happens(0.7) {
+            bytes.extend_from_slice(&self.old);
+            let at = self.dice.bits() as usize % bytes.len();
+            bytes[at] ^= self.dice.bits() as u8;
+        } else {
+            bytes.resize(len, 0x5a);
+        }
+        let ip = if self.faults.forged { *SERVER.ip() } else { Ipv4Addr::new(10, 0, 0, 77) };
+        let from = SocketAddrV4::new(ip, 5_000 + (self.dice.bits() % 3) as u16);
+        self.push(self.now + self.travel_ns, from, bytes);
+    }
+
+    fn from_server(&mut self, bytes: Vec<u8>) {
+        if self.faults.cut {
+            return;
+        }
+        if self.faults.held {
+            if self.held.len() < 200 {
+                self.held.push(bytes);
+            }
+            return;
+        }
+        self.deliver(bytes);
+    }
+
+    fn deliver(&mut self, bytes: Vec<u8>) {
+        let late = if self.faults.late_ns > 0 { self.dice.between(0, self.faults.late_ns) } else { 0 };
+        let at = self.now + self.travel_ns + late;
+        if self.faults.replay > 0.0 && self.dice.happens(self.faults.replay) && !self.old.is_empty() {
+            let again = self.old.clone();
+            self.push(at, SERVER, again);
+        }
+        // The first datagram that is seen, and seldom a newer one.
+        if self.old.is_empty() || self.dice.happens(0.01) {
+            self.old.clear();
+            self.old.extend_from_slice(&bytes);
+        }
+        self.push(at, SERVER, bytes);
+    }
+
+    fn push(&mut self, at: i64, from: SocketAddrV4, bytes: Vec<u8>) {
+        if self.to_host.len() >= QUEUED {
+            self.overrun += 1;
+            return;
+        }
+        let place = self.to_host.partition_point(|d| d.0 <= at);
+        self.to_host.insert(place, (at, from, bytes));
+    }
+
+    fn receive(&mut self, buffer: &mut [u8]) -> Option<Arrival> {
+        let (at, ..) = self.to_host.front()?;
+        if *at > self.now {
+            return None;
+        }
+        let (_, from, mut bytes) = self.to_host.pop_front()?;
+        let len = bytes.len().min(buffer.len());
+        buffer[..len].copy_from_slice(&bytes[..len]);
+        let arrival = Arrival { len, from, kernel_ns: None, cut: bytes.len() > buffer.len() };
+        bytes.clear();
+        if self.spare.len() < 64 {
+            self.spare.push(bytes);
+        }
+        Some(arrival)
+    }
+
+    fn from_host(&mut self, bytes: &[u8]) {
+        if self.faults.cut || self.faults.away {
+            return;
+        }
+        // The request arrives at once and its answers travel both ways' time.
+        let mut answers = Vec::new();
+        let now = HostTime(self.now + self.travel_ns);
+        self.server.on_datagram(bytes, CLIENT, now, &mut |answer, _| answers.push(answer.to_vec()));
+        for answer in answers {
+            let at = self.now + 2 * self.travel_ns;
+            self.push(at, SERVER, answer);
+        }
+    }
+
+    /// The socket is new: nothing waits in it.
+    pub fn new_socket(&mut self) {
+        self.to_host.clear();
+    }
+}
+
+/// The host's socket.
+pub struct SimSocket(pub Arc<Mutex<Net>>);
+
+impl Datagrams for SimSocket {
+    fn receive(&self, buffer: &mut [u8]) -> io::Result<Option<Arrival>> {
+        Ok(lock(&self.0).receive(buffer))
+    }
+
+    fn send(&self, bytes: &[u8], _: SocketAddrV4) -> io::Result<()> {
+        lock(&self.0).from_host(bytes);
+        Ok(())
+    }
+
+    fn keep_only(&self, _: Ipv4Addr, _: &[u16]) -> io::Result<()> {
+        Err(io::Error::other("no filter"))
+    }
+
+    fn keep_all(&self) -> io::Result<()> {
+        Ok(())
+    }
+
+    fn local(&self) -> io::Result<SocketAddrV4> {
+        Ok(CLIENT)
+    }
+}

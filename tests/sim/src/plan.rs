@@ -1,0 +1,150 @@
+//! What a seed plans: the rig, and one episode of faults after the other.
+
+use crate::dice::Dice;
+use crate::kinds::{Kind, State};
+
+/// The rates at which rigs run, frames per second.
+pub const RATES: [u32; 6] = [24, 60, 120, 240, 947, 2000];
+
+/// The rig of one life.
+#[derive(Clone, Debug)]
+pub struct Setup {
+    /// The seed of everything.
+    pub seed: u64,
+    /// Frames per second.
+    pub rate_hz: u32,
+    /// Planes of a frame.
+    pub planes: u32,
+    /// Samples of the tracker per second.
+    pub tracker_hz: u32,
+    /// `safety.predict_ms`, if the rig file sets it.
+    pub predict_ms: Option<u32>,
+    /// GPU time of a frame in thousandths of a slot.
+    pub render_milli: i64,
+    /// Error of the projector's clock, parts per billion.
+    pub clock_ppb: i32,
+    /// Nanoseconds for a byte on the cable.
+    pub ns_per_byte: i64,
+    /// Travel time of the cable.
+    pub travel_ns: i64,
+}
+
+impl Setup {
+    /// The rig that `seed` describes; `rate_hz` overrides its rate.
+    pub fn of(seed: u64, rate_hz: Option<u32>) -> Self {
+        let mut dice = Dice::new(seed, 0x5e7);
+        let drawn = dice.one_of(&RATES);
+        let rate_hz = rate_hz.unwrap_or(drawn);
+        let slot_us = 1_000_000 / i64::from(rate_hz);
+        let tracker_hz = dice.one_of(&[120, 120, 120, 60, 240]);
+        // A renderer of most rigs keeps up; that of every fourth needs up to three slots.
+        let is_slow = dice.happens(0.25) && rate_hz <= 240;
+        let render_milli = if is_slow { dice.between(950, 3_000) } else { dice.between(100, 700) };
+        let planes = if rate_hz > 947 || dice.happens(0.7) { 8 } else { 24 };
+        // What a frame needs from sample to light, twice; else the rig would be dark by its own file.
+        let needed_ms = (2 * (3 + 2_000 / i64::from(tracker_hz)) + 8 * slot_us / 1000 + 20)
+            + slot_us * render_milli / 1_000_000 * 4;
+        let predict_ms = dice.happens(0.3).then(|| dice.between(needed_ms, 2 * needed_ms) as u32);
+        Self {
+            seed,
+            rate_hz,
+            planes,
+            tracker_hz,
+            predict_ms,
+            render_milli,
+            clock_ppb: dice.between(-80_000, 80_000) as i32,
+            ns_per_byte: dice.between(2, 40),
+            travel_ns: dice.between(30, 250) * 1_000,
+        }
+    }
+}
+
+/// One fault of an episode.
+#[derive(Clone, Copy, Debug)]
+pub struct Planned {
+    /// Its number in the life: what shrinking names.
+    pub number: u32,
+    /// Which.
+    pub kind: Kind,
+    /// How long after the state was reached, nanoseconds.
+    pub after_ns: i64,
+    /// Seed of its details.
+    pub seed: u64,
+}
+
+/// Some faults in one state.
+#[derive(Clone, Debug)]
+pub struct Episode {
+    /// The state in which they strike.
+    pub state: State,
+    /// How the rig is brought there.
+    pub way: u64,
+    /// The faults, one to four.
+    pub faults: Vec<Planned>,
+    /// How long the rig runs in peace before it, nanoseconds.
+    pub rest_ns: i64,
+    /// How long after the last fault a person clears up, nanoseconds.
+    pub person_ns: i64,
+}
+
+/// The endless row of a life's episodes.
+pub struct Episodes {
+    dice: Dice,
+    cells: Vec<(State, Kind)>,
+    next: u32,
+}
+
+impl Episodes {
+    /// The episodes of `seed`.
+    pub fn new(seed: u64) -> Self {
+        Self { dice: Dice::new(seed, 0xe915), cells: Vec::new(), next: 0 }
+    }
+
+    /// The next pair of state and kind: each comes once before any comes again.
+    fn cell(&mut self) -> (State, Kind) {
+        if self.cells.is_empty() {
+            for state in State::ALL {
+                let possible = Kind::ALL.iter().filter(|kind| kind.impossible(state).is_none());
+                self.cells.extend(possible.map(|kind| (state, *kind)));
+            }
+            for i in (1..self.cells.len()).rev() {
+                let j = self.dice.bits() as usize % (i + 1);
+                self.cells.swap(i, j);
+            }
+        }
+        self.cells.pop().unwrap_or((State::Running, Kind::T1))
+    }
+
+    /// The next episode.
+    pub fn next_episode(&mut self) -> Episode {
+        let (state, first) = self.cell();
+        let count = [1, 1, 1, 2, 2, 3, 4][self.dice.bits() as usize % 7];
+        // States that pass quickly are struck quickly.
+        let longest = match state {
+            State::Arming => 6_000_000,
+            State::ShuttingDown => 4_000_000,
+            State::RePlugging | State::Dark => 60_000_000,
+            _ => 150_000_000,
+        };
+        let mut faults = Vec::new();
+        for i in 0..count {
+            let mut kind = first;
+            if i > 0 {
+                kind = self.dice.one_of(Kind::ALL);
+                if kind.impossible(state).is_some() {
+                    continue;
+                }
+            }
+            let after_ns = if i == 0 { longest / 20 } else { self.dice.between(0, longest) };
+            faults.push(Planned { number: self.next, kind, after_ns, seed: self.dice.bits() });
+            self.next += 1;
+        }
+        Episode {
+            state,
+            way: self.dice.bits(),
+            faults,
+            rest_ns: self.dice.between(20, 250) * 1_000_000,
+            person_ns: self.dice.between(5, 200) * 1_000_000,
+        }
+    }
+}

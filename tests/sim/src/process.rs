@@ -1,0 +1,123 @@
+//! The rig's process: it starts, runs, ends, is killed, and is started again by the service manager.
+
+use crate::cable::{lock, Cable, HostEnd};
+use crate::disk::{Disk, SimFolder};
+use crate::machine::SimMachine;
+use dpm_device::time::HostTime;
+use dpm_rig::failure::{Failure, FailureKind};
+use dpm_rig::pipeline::stepped::{SteppedEnd, SteppedOrders, SteppedRun};
+use dpm_rig::rig::Rig;
+use dpm_rig::standing::Identity;
+use dpm_rig::telemetry::monitor::{ProjectorHealth, RunMonitor};
+use std::sync::{Arc, Mutex};
+
+/// How often the thread that writes orders down looks for new ones, nanoseconds.
+const ORDERS_NS: i64 = 20_000_000;
+/// How long the disk takes to write an order, nanoseconds.
+const DISK_NS: i64 = 2_000_000;
+
+/// How a process ended.
+#[derive(Debug)]
+pub enum Exit {
+    /// In order, as it was asked to.
+    InOrder,
+    /// With an error of the projector, or a bug: the service manager starts it again.
+    Again(String),
+    /// With an error that a new start does not cure.
+    ForGood(String),
+}
+
+/// A process that runs.
+pub struct Process {
+    /// The run.
+    pub run: SteppedRun<SimMachine>,
+    /// Its monitor.
+    pub monitor: Arc<RunMonitor>,
+    /// Its orders.
+    pub orders: SteppedOrders,
+    disk: Arc<Mutex<Disk>>,
+    orders_due: i64,
+    run_due: i64,
+    /// A stop was asked for.
+    pub is_stopping: bool,
+}
+
+impl Process {
+    /// Starts the program at `now` (host's clock).
+    ///
+    /// # Errors
+    /// It ends before there is a run.
+    pub fn start(
+        rig: &Arc<Rig>,
+        cable: &Arc<Mutex<Cable>>,
+        disk: &Arc<Mutex<Disk>>,
+        machine: SimMachine,
+        now: i64,
+    ) -> Result<Self, Exit> {
+        let monitor = Arc::new(RunMonitor::default());
+        let identity = Identity::of(&rig.config.projector.backend);
+        let orders = SteppedOrders::begin(Box::new(SimFolder(disk.clone())), identity, monitor.clone())
+            .map_err(Exit::ForGood)?;
+        let medium = HostEnd::open(cable).map_err(|e| Exit::Again(e.to_string()))?;
+        let run =
+            SteppedRun::begin(rig.clone(), monitor.clone(), Box::new(medium), machine, HostTime(now));
+        let disk = disk.clone();
+        Ok(Self { run, monitor, orders, disk, orders_due: now, run_due: now, is_stopping: false })
+    }
+
+    /// When it does something next, host's clock.
+    pub fn due(&self) -> i64 {
+        self.run_due.min(self.orders_due)
+    }
+
+    /// Does what is due at `now`.
+    pub fn step(&mut self, now: i64) {
+        if self.orders_due <= now {
+            let disk_ns = DISK_NS + lock(&self.disk).late_ns;
+            let next = self.orders.step(HostTime(now), disk_ns);
+            self.orders_due = next.map_or(now + ORDERS_NS, |at| at.0.max(now + 1));
+        }
+        if self.run_due <= now {
+            self.run_due = self.run.step(HostTime(now)).0;
+        }
+    }
+
+    /// An order waits: the thread that writes it down wakes at `now`.
+    pub fn wake_orders(&mut self, now: i64) {
+        self.orders_due = self.orders_due.min(now);
+    }
+
+    /// Asks it to stop.
+    pub fn ask_to_stop(&mut self) {
+        self.is_stopping = true;
+        self.monitor.request_stop();
+    }
+
+    /// The projector, as the link knows it.
+    pub fn health(&self) -> ProjectorHealth {
+        self.monitor.projector()
+    }
+
+    /// True when the run is over.
+    pub fn is_over(&self) -> bool {
+        self.run.is_over()
+    }
+
+    /// The process ends after its run.
+    pub fn exit(mut self) -> (Exit, Option<Box<SteppedEnd>>) {
+        let mut end = self.run.end();
+        let error = end.as_mut().and_then(|end| end.error.take());
+        self.orders.end(error.is_none());
+        let exit = match error {
+            None => Exit::InOrder,
+            Some(error) => {
+                let told = error.to_string();
+                match Failure::from(error).kind {
+                    FailureKind::BadInput | FailureKind::NoGpu => Exit::ForGood(told),
+                    _ => Exit::Again(told),
+                }
+            }
+        };
+        (exit, end)
+    }
+}

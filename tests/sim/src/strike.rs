@@ -1,0 +1,441 @@
+//! What a fault of each kind does to the world, and how it is undone.
+
+use crate::cable::{lock, CableFaults};
+use crate::dice::Dice;
+use crate::kinds::Kind;
+use crate::machine::{GpuTrap, OpenTrap, Trap};
+use crate::net::{NetFaults, ServerKind};
+use crate::world::{projector_of, server_kind, Action, Undo, World, MS, S};
+use dpm_device::link::{faults, HostLink, SessionNumbers};
+use dpm_device::link::Packet;
+use dpm_device::planes::Raster;
+use dpm_device::time::HostTime;
+use dpm_device::transport::{Lane, LinkDevice, SendError, Transport, TransportError};
+use dpm_rig::order::Order;
+use dpm_rig::pipeline::projector::link_settings;
+use dpm_rig::pipeline::stepped::Part;
+
+/// A transport that keeps what is sent: the words of a second host.
+#[derive(Default)]
+struct Words(Vec<u8>);
+
+impl Transport for Words {
+    fn send(&mut self, _: HostTime, _: Lane, packets: &[Packet<'_>]) -> Result<(), SendError> {
+        for packet in packets {
+            packet.parts().into_iter().for_each(|part| self.0.extend_from_slice(part));
+        }
+        Ok(())
+    }
+
+    fn receive(
+        &mut self,
+        _: HostTime,
+        _: &mut dyn FnMut(Lane, HostTime, &[u8]),
+    ) -> Result<(), TransportError> {
+        Ok(())
+    }
+
+    fn name(&self) -> &str {
+        "second host"
+    }
+}
+
+const STAGES: [Part; 5] = [Part::Tracking, Part::Plan, Part::Pack, Part::Link, Part::Collector];
+
+impl World {
+    /// A fault of `kind` strikes; `seed` decides its details.
+    pub(crate) fn strike(&mut self, kind: Kind, seed: u64) {
+        let mut dice = Dice::new(seed, 0x57);
+        use Kind as K;
+        match kind {
+            K::T1 | K::T2 | K::T3 | K::T4 | K::T5 | K::T6 | K::T7 | K::T8 | K::T9 | K::T10 => {
+                self.strike_samples(kind, &mut dice);
+            }
+            K::T11 | K::T12 | K::T14 | K::T15 | K::T17 => self.strike_server(kind, &mut dice),
+            K::T13 | K::T16 | K::N1 | K::N2 | K::N6 | K::N7 => self.strike_net(kind, &mut dice),
+            K::U1 | K::U2 | K::U9 | K::U14 => self.strike_plug(kind, &mut dice),
+            K::U3 | K::U4 | K::U5 | K::U6 | K::U7 | K::U10 => self.strike_cable(kind, &mut dice),
+            K::U8 | K::U11 | K::U12 | K::U13 => self.strike_projector(kind, &mut dice),
+            K::G1 | K::G2 | K::G4 | K::G5 | K::G6 | K::G7 | K::G8 => self.strike_gpu(kind, &mut dice),
+            K::U15 | K::H2 | K::H6 | K::X2 | K::X3 | K::X4 | K::X5 | K::X6 | K::H3 | K::H5 | K::X1 | K::X7 => {
+                self.strike_process(kind, &mut dice);
+            }
+            K::H1 | K::H4 | K::H8 | K::H9 | K::H10 | K::H11 | K::N3 | K::N4 | K::N5 => {
+                self.strike_host(kind, &mut dice);
+            }
+            K::H7 | K::F1 | K::F2 | K::F3 | K::F4 | K::F5 | K::F6 | K::F7 | K::F8 | K::F9 | K::F10 => {
+                self.bad_file = true;
+                self.lasts(kind, dice.between(100, 1_500) * MS, Undo::File);
+            }
+            K::T18 | K::G3 | K::G9 => self.lasts(kind, MS, Undo::Nothing),
+        }
+    }
+
+    fn strike_samples(&mut self, kind: Kind, dice: &mut Dice) {
+        use Kind as K;
+        let period_us = 1_000_000 / i64::from(self.setup.tracker_hz);
+        let at = self.t / 1000;
+        let long_us = dice.decades(20, 1_500) * 1000;
+        let (fault, us) = match kind {
+            K::T1 => ("dropout", dice.between(1, 3) * period_us),
+            K::T2 => ("dropout", 100_000 + long_us),
+            K::T3 => ("dropout", dice.between(10, 60) * 1000),
+            K::T4 => ("stuck", long_us),
+            K::T5 => ("invalid=1", long_us),
+            K::T6 => ("jump=3", 0),
+            K::T7 => ("nan=0.5", long_us),
+            K::T8 => (dice.one_of(&["norm=0.5", "flip=0.5"]), long_us),
+            K::T9 => ("duplicate=0.5", long_us),
+            _ => (dice.one_of(&["reorder=0.5", "slow=30ms"]), long_us),
+        };
+        let text = match kind {
+            K::T6 => format!("{fault}@{at}us"),
+            K::T3 => format!("{fault}@{at}us+{us}us/{}us", 3 * us),
+            _ => format!("{fault}@{at}us+{us}us"),
+        };
+        let lasts_us = if kind == K::T3 { 12 * us } else { us };
+        let until = self.t + lasts_us * 1000 + 40 * MS;
+        if kind == K::T3 {
+            // A window that repeats would repeat for ever.
+            for round in 0..4 {
+                let from = at + 3 * us * round;
+                self.strike_sample(&format!("dropout@{from}us+{us}us"), until);
+            }
+        } else {
+            self.strike_sample(&text, until);
+        }
+        if matches!(kind, K::T4 | K::T6 | K::T10) {
+            self.laws.lies_until(until);
+        }
+        self.lasts(kind, lasts_us * 1000 + 40 * MS, Undo::Nothing);
+    }
+
+    fn strike_sample(&mut self, text: &str, until: i64) {
+        let struck = lock(&self.net).strike(text, until);
+        if let Err(e) = struck {
+            self.laws.fail(self.t, format!("mistake of the simulator: {e}"));
+        }
+    }
+
+    fn strike_server(&mut self, kind: Kind, dice: &mut Dice) {
+        use Kind as K;
+        let own = server_kind(&self.setup);
+        let lasts_ns = dice.between(50, 1_500) * MS;
+        let other = match kind {
+            K::T11 => own,
+            K::T12 => ServerKind { name: "stranger".into(), number: 9, ..own },
+            K::T14 => ServerKind { is_old: true, ..own },
+            K::T15 => ServerKind { rate_hz: dice.one_of(&[100, 200, 500, 1000]), ..own },
+            _ => ServerKind { millimetres: true, ..own },
+        };
+        if kind == K::T15 && dice.happens(0.5) {
+            lock(&self.net).faults.held = true;
+            return self.lasts(kind, dice.between(20, 400) * MS, Undo::Net);
+        }
+        self.replace_server(other);
+        self.laws.lies_until(self.t + lasts_ns + S);
+        self.lasts(kind, lasts_ns, Undo::Server);
+    }
+
+    fn replace_server(&mut self, kind: ServerKind) {
+        let replaced = lock(&self.net).replace(kind);
+        if let Err(e) = replaced {
+            self.laws.fail(self.t, format!("mistake of the simulator: {e}"));
+        }
+    }
+
+    fn strike_net(&mut self, kind: Kind, dice: &mut Dice) {
+        use Kind as K;
+        let lasts_ns = dice.between(20, 600) * MS;
+        if kind == K::T13 {
+            let at = self.t / 1000;
+            let what = dice.one_of(&["truncate=0.5", "corrupt=0.5", "truncate=1", "loss=0.7"]);
+            let text = format!("{what}@{at}us+{}us", lasts_ns / 1000);
+            self.strike_sample(&text, self.t + lasts_ns);
+            self.laws.lies_until(self.t + lasts_ns);
+            return self.lasts(kind, lasts_ns, Undo::Nothing);
+        }
+        let mut net = lock(&self.net);
+        let faults = &mut net.faults;
+        match kind {
+            K::T16 => faults.flood = dice.between(1, 5),
+            K::N1 => faults.flood = dice.between(20, 100),
+            K::N2 => (faults.flood, faults.huge) = (1, true),
+            K::N7 => (faults.flood, faults.forged) = (dice.between(1, 10), true),
+            _ => faults.replay = 0.5,
+        }
+        drop(net);
+        let short_ns = if matches!(kind, K::N1 | K::N2) { lasts_ns / 4 } else { lasts_ns };
+        self.laws.lies_until(self.t + short_ns);
+        self.lasts(kind, short_ns, Undo::Net);
+    }
+
+    fn strike_plug(&mut self, kind: Kind, dice: &mut Dice) {
+        use Kind as K;
+        let lasts_ns = dice.decades(20, 2_500) * MS;
+        if kind == K::U14 {
+            lock(&self.cable).faults.denied = true;
+            self.lasts(kind, lasts_ns, Undo::Cable);
+            if !dice.happens(0.7) {
+                return;
+            }
+        }
+        if kind == K::U9 && self.aside.is_none() {
+            if let Ok(other) = projector_of(&self.setup, Raster::new(32, 24), self.t) {
+                self.pull();
+                let own = std::mem::replace(&mut self.projector, other);
+                self.aside = Some(own);
+                lock(&self.cable).push_in();
+                return self.lasts(kind, lasts_ns, Undo::Projector);
+            }
+        }
+        self.pull();
+        self.lasts(kind, lasts_ns, Undo::Plug);
+    }
+
+    fn pull(&mut self) {
+        lock(&self.cable).pull();
+        self.projector.bus_reset(HostTime(self.t));
+        self.see_light();
+    }
+
+    fn strike_cable(&mut self, kind: Kind, dice: &mut Dice) {
+        use Kind as K;
+        let lasts_ns = dice.decades(2, 1_500) * MS;
+        let mut cable = lock(&self.cable);
+        let f = &mut cable.faults;
+        match kind {
+            K::U3 => f.stalled = true,
+            K::U4 => f.slow_milli = dice.decades(2_000, 400_000),
+            K::U5 => f.short = dice.one_of(&[0.01, 0.1, 0.5]),
+            K::U6 => f.babble = dice.one_of(&[0.01, 0.1, 0.5]),
+            K::U10 => f.stale = 0.5,
+            _ => {
+                f.corrupt = dice.one_of(&[0.0001, 0.001, 0.01, 0.1]);
+                f.loss = dice.one_of(&[0.0, 0.001, 0.01, 0.1]);
+                f.twice = dice.one_of(&[0.0, 0.01, 0.1]);
+            }
+        }
+        drop(cable);
+        self.lasts(kind, lasts_ns, Undo::Cable);
+    }
+
+    fn strike_projector(&mut self, kind: Kind, dice: &mut Dice) {
+        use Kind as K;
+        let now = HostTime(self.t);
+        match kind {
+            K::U8 => {
+                self.projector.power_cycle(now);
+                self.see_light();
+                self.lasts(kind, MS, Undo::Nothing);
+            }
+            K::U11 => {
+                self.projector.shift_clock(now, dice.decades(10_000, 3_000_000_000) as u64);
+                self.see_light();
+                self.laws.clock_moved(self.t);
+                self.lasts(kind, MS, Undo::Nothing);
+            }
+            K::U12 => {
+                let bits = dice.one_of(&[faults::OVER_TEMPERATURE, faults::LAMP, faults::EMERGENCY_STOP]);
+                self.projector.set_faults(now, bits);
+                self.see_light();
+                self.laws.hot(self.t);
+                self.lasts(kind, dice.between(5, 800) * MS, Undo::Heat);
+            }
+            _ => {
+                let rounds = dice.between(1, 6) as u32;
+                self.again(kind, dice.bits(), rounds);
+                self.lasts(kind, i64::from(rounds) * 10 * MS, Undo::Nothing);
+            }
+        }
+    }
+
+    fn strike_gpu(&mut self, kind: Kind, dice: &mut Dice) {
+        use Kind as K;
+        let slot_ns = S / i64::from(self.setup.rate_hz);
+        let mut beneath = lock(&self.beneath);
+        let mut lasts_ns = 100 * MS;
+        match kind {
+            K::G1 => beneath.open_traps.push_back(OpenTrap::Absent),
+            K::G2 => beneath.open_traps.push_back(OpenTrap::OutOfMemory),
+            K::G4 => beneath.gpu_traps.push_back(GpuTrap::Lost),
+            K::G5 => beneath.gpu_traps.push_back(GpuTrap::Hangs),
+            K::G6 => {
+                let ns = dice.between(300, 1_500) * MS;
+                beneath.gpu_traps.push_back(GpuTrap::Late(ns));
+                lasts_ns += ns;
+            }
+            K::G7 => beneath.gpu_traps.push_back(GpuTrap::Late(slot_ns * dice.between(1, 4))),
+            _ => {}
+        }
+        if matches!(kind, K::G1 | K::G2) {
+            lasts_ns = dice.between(500, 1_500) * MS;
+        }
+        drop(beneath);
+        self.lasts(kind, lasts_ns, Undo::Traps);
+    }
+
+    fn trap(&mut self, part: Part, trap: Trap) {
+        lock(&self.beneath).traps.push((part, trap));
+    }
+
+    fn strike_process(&mut self, kind: Kind, dice: &mut Dice) {
+        use Kind as K;
+        let stage = dice.one_of(&STAGES);
+        let soon = self.t + dice.between(1, 300) * MS;
+        match kind {
+            K::U15 => self.kill(),
+            K::H2 | K::X3 => {
+                self.give(dice.one_of(&[Order::Safe, Order::Black]));
+                let after_ns = if kind == K::H2 { dice.between(0, 3_000_000) } else { dice.between(5, 60) * MS };
+                if dice.happens(0.3) {
+                    lock(&self.disk).tear();
+                }
+                self.plan(self.t + after_ns, Action::Kill);
+            }
+            K::H3 => {
+                let ns = dice.decades(50, 3_000) * MS;
+                self.frozen_until = self.t + ns;
+                self.lag_by(ns);
+                self.laws.clock_moved(self.t + ns);
+                return self.lasts(kind, ns, Undo::Nothing);
+            }
+            K::X6 => {
+                let ns = dice.decades(5, 2_000) * MS;
+                self.frozen_until = self.frozen_until.max(self.t + ns);
+                return self.lasts(kind, ns, Undo::Nothing);
+            }
+            K::H5 => self.trap(stage, Trap::Panics),
+            K::H6 => {
+                self.ask_to_stop();
+                if dice.happens(0.5) {
+                    self.plan(soon, Action::Stop);
+                }
+            }
+            K::X1 => self.trap(stage, Trap::Hangs),
+            K::X2 => {
+                self.trap(stage, Trap::Hangs);
+                self.plan(soon, Action::Stop);
+            }
+            K::X4 => self.ask_to_stop(),
+            K::X5 => {
+                for k in 0..dice.between(2, 8) {
+                    let order = dice.one_of(&[Order::Black, Order::Freeze, Order::Safe, Order::Arm]);
+                    self.plan(self.t + k * dice.between(0, 20) * MS, Action::Give(order));
+                }
+            }
+            _ => {
+                lock(&self.beneath).gpu_traps.push_back(GpuTrap::Hangs);
+                let (at, us) = (self.t / 1000, dice.between(500, 2_000) * 1000);
+                self.strike_sample(&format!("dropout@{at}us+{us}us"), self.t + us * 1000);
+                return self.lasts(kind, us * 1000, Undo::Traps);
+            }
+        }
+        self.lasts(kind, 320 * MS, Undo::Traps);
+    }
+
+    fn strike_host(&mut self, kind: Kind, dice: &mut Dice) {
+        use Kind as K;
+        let lasts_ns = dice.decades(20, 1_500) * MS;
+        match kind {
+            K::H1 => {
+                let mut disk = lock(&self.disk);
+                disk.refuses = dice.happens(0.6);
+                disk.late_ns = if disk.refuses { 0 } else { dice.decades(10, 2_000) * MS };
+                drop(disk);
+                if dice.happens(0.7) {
+                    self.give(dice.one_of(&[Order::Safe, Order::Black, Order::Freeze]));
+                }
+                self.lasts(kind, lasts_ns, Undo::Disk);
+            }
+            K::H4 => {
+                let ns = dice.decades(1, 1_000) * MS;
+                let stage = dice.one_of(&STAGES);
+                self.trap(stage, Trap::Stalls(ns));
+                self.lasts(kind, ns + 20 * MS, Undo::Traps);
+            }
+            K::H10 => {
+                lock(&self.cable).faults.denied = true;
+                self.lasts(kind, lasts_ns, Undo::Cable);
+            }
+            // The lock refuses it before it does anything.
+            K::H11 => self.lasts(kind, MS, Undo::Nothing),
+            _ => {
+                let milli = match kind {
+                    K::H9 => dice.between(3_000, 8_000),
+                    K::H8 => dice.between(1_500, 4_000),
+                    _ => dice.between(1_200, 2_500),
+                };
+                lock(&self.beneath).load_milli = milli;
+                self.lasts(kind, lasts_ns, Undo::Load);
+            }
+        }
+    }
+
+    /// Another step of a fault that has several.
+    pub(crate) fn again(&mut self, kind: Kind, seed: u64, rounds: u32) {
+        if rounds == 0 {
+            return;
+        }
+        // The second host greets the projector, under a session of its own.
+        let settings = link_settings(&self.rig.config, self.rig.camera.raster);
+        let mut number = (seed as u32) ^ rounds;
+        let sessions = SessionNumbers::from_source(move || {
+            number = number.wrapping_mul(1_664_525).wrapping_add(1_013_904_223);
+            number
+        });
+        let mut link = HostLink::with_sessions(settings, sessions);
+        let mut words = Words::default();
+        link.connect();
+        let _ = link.poll(HostTime(self.t), &mut words);
+        if lock(&self.cable).plugged {
+            self.projector.receive(HostTime(self.t), Lane::Control, &words.0);
+            self.see_light();
+        }
+        self.plan(self.t + 10 * MS, Action::Again(kind, seed, rounds - 1));
+    }
+
+    pub(crate) fn undo(&mut self, undo: &Undo) {
+        match undo {
+            Undo::Nothing => {}
+            Undo::Net => lock(&self.net).faults = NetFaults::default(),
+            Undo::Server => {
+                let own = server_kind(&self.setup);
+                self.replace_server(own);
+                self.laws.lies_until(self.t + S);
+            }
+            Undo::Cable => lock(&self.cable).faults = CableFaults::default(),
+            Undo::Plug => {
+                let mut cable = lock(&self.cable);
+                if !cable.plugged {
+                    cable.push_in();
+                }
+            }
+            Undo::Projector => {
+                if let Some(own) = self.aside.take() {
+                    self.pull();
+                    self.projector = own;
+                    self.projector.advance_to(HostTime(self.t));
+                    self.see_light();
+                    lock(&self.cable).push_in();
+                }
+            }
+            Undo::Heat => {
+                self.projector.set_faults(HostTime(self.t), 0);
+                self.see_light();
+            }
+            Undo::Disk => {
+                let mut disk = lock(&self.disk);
+                (disk.refuses, disk.late_ns) = (false, 0);
+            }
+            Undo::Load => lock(&self.beneath).load_milli = 1000,
+            Undo::Traps => {
+                let mut beneath = lock(&self.beneath);
+                beneath.traps.clear();
+                beneath.gpu_traps.clear();
+                beneath.open_traps.clear();
+            }
+            Undo::File => self.bad_file = false,
+        }
+    }
+}

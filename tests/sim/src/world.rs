@@ -1,0 +1,697 @@
+//! The clock, and everything that it moves: process, cable, projector, tracker, disk, service manager and person.
+
+use crate::cable::{lock, Cable};
+use crate::disk::Disk;
+use crate::kinds::{Kind, State};
+use crate::laws::Laws;
+use crate::machine::{Beneath, SimMachine};
+use crate::net::{Net, ServerKind};
+use crate::plan::{Episode, Setup};
+use crate::process::{Exit, Process};
+use crate::table::Table;
+use dpm_device::link::faults;
+use dpm_device::planes::Raster;
+use dpm_device::time::HostTime;
+use dpm_device::transport::LinkDevice;
+use dpm_rig::config::{Overrides, RigConfig};
+use dpm_rig::order::Order;
+use dpm_rig::rig::Rig;
+use dpm_rig::telemetry::monitor::ProjectorHealth;
+use hil_mock::projector::{DeviceClock, MockConfig, MockProjector};
+use std::cmp::Reverse;
+use std::collections::{BinaryHeap, VecDeque};
+use std::path::Path;
+use std::sync::atomic::{AtomicI64, Ordering};
+use std::sync::{Arc, Mutex};
+
+/// A millisecond in nanoseconds.
+pub const MS: i64 = 1_000_000;
+/// A second in nanoseconds.
+pub const S: i64 = 1_000 * MS;
+/// Interval of the checks that no event triggers.
+const TICK_NS: i64 = 100 * MS;
+/// The service manager starts a failed program again after this time.
+const RESTART_NS: i64 = S;
+/// It gives up after this many starts ...
+const STARTS: usize = 5;
+/// ... within this time.
+const STARTS_WITHIN_NS: i64 = 60 * S;
+/// How often a person who clears up looks again.
+const PERSON_NS: i64 = 300 * MS;
+/// Mirrors of the simulated projector.
+pub const RASTER: (u32, u32) = (16, 12);
+
+/// What happens at a planned instant.
+#[derive(Clone, Debug)]
+pub enum Action {
+    /// A fault strikes.
+    Strike(Kind, u64),
+    /// A fault ends.
+    End(usize),
+    /// The person gives an order.
+    Give(Order),
+    /// The program is asked to stop.
+    Stop,
+    /// The program is killed.
+    Kill,
+    /// The person clears up.
+    ClearUp,
+    /// Another step of a fault that has several: the second host speaks, the plug wiggles.
+    Again(Kind, u64, u32),
+    /// The next episode begins.
+    Episode,
+    /// The faults of the episode strike although its state was not reached.
+    Overdue(u32),
+}
+
+/// How a fault is undone.
+#[derive(Clone, Debug)]
+pub enum Undo {
+    /// It ends by itself.
+    Nothing,
+    /// The network is as it should be.
+    Net,
+    /// The first server comes back.
+    Server,
+    /// The cable is as it should be.
+    Cable,
+    /// The plug is pushed in.
+    Plug,
+    /// The projector that belongs here is plugged in again.
+    Projector,
+    /// The causes of its faults are gone.
+    Heat,
+    /// The disk is as it should be.
+    Disk,
+    /// The machine is as quick as before.
+    Load,
+    /// What no stage has met by now, none will meet.
+    Traps,
+    /// The rig file is right again.
+    File,
+}
+
+/// A fault that lasts.
+#[derive(Clone, Debug)]
+pub struct Active {
+    /// Which.
+    pub kind: Kind,
+    /// How it ends.
+    pub undo: Undo,
+}
+
+/// Everything.
+pub struct World {
+    /// True time, nanoseconds.
+    pub t: i64,
+    /// The rig.
+    pub setup: Setup,
+    pub(crate) rig: Arc<Rig>,
+    pub(crate) cable: Arc<Mutex<Cable>>,
+    pub(crate) net: Arc<Mutex<Net>>,
+    pub(crate) beneath: Arc<Mutex<Beneath>>,
+    pub(crate) disk: Arc<Mutex<Disk>>,
+    clock: Arc<AtomicI64>,
+    lag: Arc<AtomicI64>,
+    pub(crate) projector: MockProjector,
+    /// The projector that belongs here, while another one is in its place.
+    pub(crate) aside: Option<MockProjector>,
+    pub(crate) process: Option<Process>,
+    /// The process does not run until then (stopped, or the machine is suspended).
+    pub(crate) frozen_until: i64,
+    restart_at: i64,
+    starts: VecDeque<i64>,
+    /// Nobody starts the program but a person.
+    pub(crate) needs_person: bool,
+    /// The rig file, or a scene, is wrong.
+    pub(crate) bad_file: bool,
+    actions: BinaryHeap<Reverse<(i64, u64)>>,
+    planned: Vec<Option<Action>>,
+    free: Vec<usize>,
+    next_action: u64,
+    /// Faults that last, by number.
+    pub(crate) active: Vec<Option<Active>>,
+    episode: Option<(Episode, bool)>,
+    episodes_begun: u32,
+    /// When the last fault ended, or the person last did something.
+    pub(crate) calm_since: i64,
+    /// A person is clearing up since.
+    clearing_since: Option<i64>,
+    tick_at: i64,
+    /// The laws.
+    pub laws: Laws,
+    /// Kinds by state.
+    pub table: Table,
+    /// Events so far.
+    pub events: u64,
+    /// A hash of all that happened.
+    pub trace: u64,
+    /// The last things that happened, for a person.
+    pub story: VecDeque<String>,
+    /// Print what happens.
+    pub is_loud: bool,
+}
+
+fn rig_of(setup: &Setup) -> Result<Rig, String> {
+    let predict = setup.predict_ms.map_or(String::new(), |ms| format!("[safety]\npredict_ms = {ms}\n"));
+    let text = format!(
+        "[tracker]\nkind = \"natnet\"\nserver = \"10.0.0.2\"\nlocal = \"10.0.0.1\"\nrate_hz = {}\n\
+         [projector]\nwidth = {}\nheight = {}\nplanes = {}\nframe_rate = {}\nbackend = {{ kind = \"usb\" }}\n\
+         [[scene.bodies]]\nname = \"a\"\n{predict}",
+        setup.tracker_hz, RASTER.0, RASTER.1, setup.planes, setup.rate_hz
+    );
+    let config = RigConfig::parse("simulated.toml", &text, Path::new(""), &Overrides::default())
+        .map_err(|e| e.to_string())?;
+    Rig::build(&config, None).map_err(|e| e.to_string())
+}
+
+/// A projector as it left the factory.
+pub(crate) fn projector_of(setup: &Setup, raster: Option<Raster>, now: i64) -> Result<MockProjector, String> {
+    let own = Raster::new(RASTER.0, RASTER.1).ok_or("no raster")?;
+    let mut config = MockConfig::new(raster.unwrap_or(own));
+    config.events_kept = 64;
+    config.clock = DeviceClock {
+        skew_ppb: setup.clock_ppb,
+        power_on_at: HostTime(now),
+        start_ticks: (setup.seed % 7) * 1_000_000_000,
+        ..DeviceClock::IDEAL
+    };
+    Ok(MockProjector::new(config))
+}
+
+impl World {
+    /// The world of `setup`, with the program about to be started.
+    ///
+    /// # Errors
+    /// The rig cannot be built, which is a mistake in this program.
+    pub fn new(setup: Setup) -> Result<Self, String> {
+        let rig = Arc::new(rig_of(&setup)?);
+        let kind = server_kind(&setup);
+        let slot_ns = S / i64::from(setup.rate_hz);
+        let seed = setup.seed;
+        let cable = Cable::new(seed, setup.ns_per_byte, setup.travel_ns);
+        let laws = Laws::new(&rig, &setup);
+        Ok(Self {
+            t: 0,
+            cable: Arc::new(Mutex::new(cable)),
+            net: Arc::new(Mutex::new(Net::new(seed, kind)?)),
+            beneath: Arc::new(Mutex::new(Beneath::new(seed, slot_ns * setup.render_milli / 1000))),
+            disk: Arc::default(),
+            clock: Arc::default(),
+            lag: Arc::default(),
+            projector: projector_of(&setup, None, 0)?,
+            aside: None,
+            process: None,
+            frozen_until: 0,
+            restart_at: 10 * MS,
+            starts: VecDeque::new(),
+            needs_person: false,
+            bad_file: false,
+            actions: BinaryHeap::new(),
+            planned: Vec::new(),
+            free: Vec::new(),
+            next_action: 0,
+            active: Vec::new(),
+            episode: None,
+            episodes_begun: 0,
+            calm_since: 0,
+            clearing_since: None,
+            tick_at: TICK_NS,
+            laws,
+            table: Table::default(),
+            events: 0,
+            trace: seed,
+            story: VecDeque::new(),
+            is_loud: false,
+            rig,
+            setup,
+        })
+    }
+
+    /// The host's clock now.
+    pub fn host(&self) -> i64 {
+        self.t - self.lag.load(Ordering::Relaxed)
+    }
+
+    pub(crate) fn lag_by(&mut self, more: i64) {
+        let lag = self.lag.load(Ordering::Relaxed) + more;
+        self.lag.store(lag, Ordering::Relaxed);
+        lock(&self.cable).host_lag = lag;
+    }
+
+    /// What the rig is doing.
+    pub fn state(&self) -> State {
+        let Some(process) = &self.process else { return State::Dark };
+        if process.is_stopping {
+            return State::ShuttingDown;
+        }
+        if !process.run.is_running() {
+            return if process.run.is_connecting() { State::Arming } else { State::Dark };
+        }
+        match process.health() {
+            ProjectorHealth::Up => State::Running,
+            ProjectorHealth::Lost => State::RePlugging,
+            ProjectorHealth::Black | ProjectorHealth::Frozen | ProjectorHealth::InterlockOpen => {
+                State::FrozenOrBlack
+            }
+            ProjectorHealth::Faulted(_) | ProjectorHealth::Resting(_) => State::Faulted,
+            ProjectorHealth::Connecting | ProjectorHealth::Stopped => State::Arming,
+        }
+    }
+
+    /// Records something in the trace's hash.
+    pub fn fold(&mut self, what: u64, value: u64) {
+        let x = (self.trace ^ what.wrapping_mul(0x9e37_79b9_7f4a_7c15)).wrapping_add(value);
+        self.trace = (x ^ x >> 31).wrapping_mul(0xbf58_476d_1ce4_e5b9).rotate_left(17);
+    }
+
+    /// Notes something for a person.
+    pub fn tell(&mut self, text: impl FnOnce() -> String) {
+        let text = format!("{:>12.6} s  #{}  {}", self.t as f64 * 1e-9, self.events, text());
+        if self.is_loud {
+            println!("{text}");
+        }
+        if self.story.len() >= 400 {
+            self.story.pop_front();
+        }
+        self.story.push_back(text);
+    }
+
+    /// Plans `action` for true time `at`.
+    pub fn plan(&mut self, at: i64, action: Action) {
+        let place = self.free.pop().unwrap_or_else(|| {
+            self.planned.push(None);
+            self.planned.len() - 1
+        });
+        self.planned[place] = Some(action);
+        // Actions of one instant keep their order: the upper half counts them.
+        self.next_action += 1;
+        self.actions.push(Reverse((at, self.next_action << 24 | place as u64)));
+    }
+
+    /// The instant of the next event.
+    fn due(&self) -> i64 {
+        let process = self.process.as_ref().map_or(i64::MAX, |p| {
+            p.due().saturating_add(self.lag.load(Ordering::Relaxed)).max(self.frozen_until)
+        });
+        let projector = self.projector.next_due().map_or(i64::MAX, |due| due.0);
+        let action = self.actions.peek().map_or(i64::MAX, |Reverse((at, _))| *at);
+        process
+            .min(projector)
+            .min(action)
+            .min(lock(&self.cable).due())
+            .min(lock(&self.net).due())
+            .min(self.restart_at)
+            .min(self.tick_at)
+            .max(self.t)
+    }
+
+    /// Moves everything to the next event. Returns false when a law is broken.
+    pub fn step(&mut self) -> bool {
+        self.t = self.due();
+        self.events += 1;
+        let host = self.host();
+        self.clock.store(host, Ordering::Relaxed);
+        {
+            let mut net = lock(&self.net);
+            if net.due() <= self.t {
+                net.advance(self.t);
+            }
+            net.now = self.t;
+        }
+        lock(&self.cable).now = self.t;
+        self.act();
+        self.move_projector();
+        self.move_process();
+        if self.restart_at <= self.t {
+            self.start();
+        }
+        if self.tick_at <= self.t {
+            self.tick();
+        }
+        self.watch_episode();
+        self.laws.broken.is_none()
+    }
+
+    fn act(&mut self) {
+        while let Some(Reverse((at, place))) = self.actions.peek().copied() {
+            if at > self.t {
+                break;
+            }
+            self.actions.pop();
+            let place = (place & 0xff_ffff) as usize;
+            let Some(action) = self.planned[place].take() else { continue };
+            self.free.push(place);
+            match action {
+                Action::Strike(kind, seed) => self.strike_now(kind, seed),
+                Action::End(number) => self.end(number),
+                Action::Give(order) => self.give(order),
+                Action::Stop => self.ask_to_stop(),
+                Action::Kill => self.kill(),
+                Action::ClearUp => self.clear_up(),
+                Action::Again(kind, seed, round) => self.again(kind, seed, round),
+                Action::Episode => {}
+                Action::Overdue(episode) => self.overdue(episode),
+            }
+        }
+    }
+
+    fn strike_now(&mut self, kind: Kind, seed: u64) {
+        let state = self.state();
+        self.table.count(kind, state);
+        self.fold(1, kind as u64 * 8 + state as u64);
+        self.tell(|| format!("{kind:?} strikes while {}: {}", state.word(), kind.text()));
+        self.laws.disturbed(self.t);
+        self.strike(kind, seed);
+    }
+
+    /// A fault begins that ends after `ns`.
+    pub(crate) fn lasts(&mut self, kind: Kind, ns: i64, undo: Undo) {
+        let number = self.active.iter().position(Option::is_none).unwrap_or_else(|| {
+            self.active.push(None);
+            self.active.len() - 1
+        });
+        self.active[number] = Some(Active { kind, undo });
+        self.plan(self.t + ns, Action::End(number));
+    }
+
+    fn end(&mut self, number: usize) {
+        let Some(active) = self.active[number].take() else { return };
+        self.tell(|| format!("{:?} is over", active.kind));
+        // Another fault of the same kind may still last.
+        self.undo(&active.undo);
+        self.calm_since = self.t;
+        self.laws.disturbed(self.t);
+    }
+
+    /// No fault lasts.
+    pub fn is_quiet(&self) -> bool {
+        self.active.iter().all(Option::is_none)
+    }
+
+    fn move_projector(&mut self) {
+        while let Some(due) = self.projector.next_due().filter(|due| due.0 <= self.t) {
+            self.projector.advance_to(due);
+            self.see_light();
+        }
+        loop {
+            let arrived = lock(&self.cable).arrived();
+            let Some(transfer) = arrived else { break };
+            self.projector.receive(HostTime(self.t), transfer.lane, &transfer.bytes);
+            if transfer.cut {
+                self.projector.end_of_transfer(HostTime(self.t), transfer.lane);
+            }
+            lock(&self.cable).recycle(transfer.bytes);
+        }
+        self.projector.advance_to(HostTime(self.t));
+        self.see_light();
+        let mut cable = lock(&self.cable);
+        if cable.plugged {
+            self.projector.replies(HostTime(self.t), &mut |_, packet| cable.reply(packet));
+        }
+    }
+
+    /// Judges the light that the projector has made.
+    pub(crate) fn see_light(&mut self) {
+        while let Some(change) = self.projector.next_change() {
+            self.fold(2, change.at.0 as u64 ^ u64::from(change.frame.unwrap_or(u32::MAX)) << 32);
+            self.laws.change(&change, self.t);
+        }
+        while let Some(event) = self.projector.next_light() {
+            let lag = self.lag.load(Ordering::Relaxed);
+            self.fold(3, event.slot ^ u64::from(event.frame.unwrap_or(u32::MAX)) << 32);
+            let planes = self.projector.lit_planes();
+            self.laws.light(&event, planes, lag, &self.beneath, self.events);
+        }
+    }
+
+    fn move_process(&mut self) {
+        if self.t < self.frozen_until {
+            return;
+        }
+        let host = self.host();
+        let Some(process) = &mut self.process else { return };
+        if process.due() > host {
+            return;
+        }
+        process.step(host);
+        if process.is_over() {
+            self.exit();
+        }
+    }
+
+    fn exit(&mut self) {
+        let Some(process) = self.process.take() else { return };
+        self.laws.order_at_exit(&process, self.t);
+        let was_asked = process.is_stopping;
+        let counts = process.monitor.counts();
+        let (exit, end) = process.exit();
+        self.laws.exited(&exit, &counts, end.as_deref(), self.t);
+        self.fold(4, self.t as u64);
+        self.tell(|| format!("the program ends: {exit:?}"));
+        match exit {
+            // The service manager does not start it again; whoever asked for the stop does.
+            Exit::InOrder => self.needs_person = true,
+            Exit::ForGood(_) => self.needs_person = true,
+            Exit::Again(_) if was_asked => self.needs_person = true,
+            Exit::Again(_) => self.restart_at = self.t + RESTART_NS,
+        }
+    }
+
+    /// The program is killed: nothing of it does anything any more.
+    pub(crate) fn kill(&mut self) {
+        let Some(process) = self.process.take() else { return };
+        self.laws.order_at_exit(&process, self.t);
+        self.laws.died(self.t);
+        self.frozen_until = self.frozen_until.min(self.t);
+        self.tell(|| "the program is killed".into());
+        self.restart_at = self.t + RESTART_NS;
+    }
+
+    fn start(&mut self) {
+        self.restart_at = i64::MAX;
+        if self.process.is_some() {
+            return;
+        }
+        while self.starts.front().is_some_and(|at| self.t - at > STARTS_WITHIN_NS) {
+            self.starts.pop_front();
+        }
+        if self.starts.len() >= STARTS {
+            self.tell(|| "the service manager gives up: too many starts".into());
+            self.needs_person = true;
+            return;
+        }
+        self.starts.push_back(self.t);
+        lock(&self.beneath).new_process();
+        if std::mem::take(&mut self.bad_file) {
+            self.tell(|| "the program refuses the rig file".into());
+            self.needs_person = true;
+            return;
+        }
+        let machine = SimMachine {
+            beneath: self.beneath.clone(),
+            net: self.net.clone(),
+            clock: self.clock.clone(),
+            lag: self.lag.clone(),
+        };
+        let host = self.host();
+        self.laws.started(self.t);
+        match Process::start(&self.rig, &self.cable, &self.disk, machine, host) {
+            Ok(process) => {
+                self.tell(|| "the program starts".into());
+                self.process = Some(process);
+            }
+            Err(exit) => {
+                self.tell(|| format!("the program does not start: {exit:?}"));
+                match exit {
+                    Exit::ForGood(_) => self.needs_person = true,
+                    _ => self.restart_at = self.t + RESTART_NS,
+                }
+            }
+        }
+    }
+
+    /// A person starts the program, whatever the service manager thinks of it.
+    pub(crate) fn start_by_hand(&mut self) {
+        self.starts.clear();
+        self.needs_person = false;
+        self.restart_at = self.t;
+    }
+
+    pub(crate) fn give(&mut self, order: Order) {
+        let host = self.host();
+        if self.t < self.frozen_until {
+            return;
+        }
+        let Some(process) = &mut self.process else { return };
+        let ticket = process.orders.give(order, dpm_rig::standing::By::Socket { uid: 1000 });
+        process.wake_orders(host);
+        self.laws.ordered(order, ticket, self.t);
+        self.fold(5, order as u64);
+        self.tell(|| format!("a person orders {}", order.word()));
+    }
+
+    pub(crate) fn ask_to_stop(&mut self) {
+        if self.t < self.frozen_until {
+            return;
+        }
+        if let Some(process) = &mut self.process {
+            process.ask_to_stop();
+            self.laws.asked_to_stop(self.t);
+            self.tell(|| "the program is asked to stop".into());
+        }
+    }
+
+    /// A person looks what is wrong, and does what only a person may do. Looks again until all is well.
+    fn clear_up(&mut self) {
+        if !self.is_quiet() || self.t < self.frozen_until {
+            return self.plan(self.t + 50 * MS, Action::ClearUp);
+        }
+        self.clearing_since.get_or_insert(self.t);
+        let latched = self.projector.status().faults;
+        let wants_arm = match &self.process {
+            None => {
+                if self.needs_person {
+                    self.tell(|| "a person starts the program".into());
+                    self.start_by_hand();
+                    self.calm_since = self.t;
+                }
+                false
+            }
+            Some(process) => match process.health() {
+                ProjectorHealth::Black | ProjectorHealth::Frozen | ProjectorHealth::InterlockOpen => true,
+                ProjectorHealth::Faulted(bits) => bits & faults::WATCHDOG == 0 || latched & !faults::WATCHDOG != 0,
+                _ => self.laws.has_standing_order(),
+            },
+        };
+        if wants_arm {
+            self.give(Order::Arm);
+            self.calm_since = self.t;
+            if self.clearing_since.is_some_and(|since| self.t - since > 8 * S) {
+                let health = self.process.as_ref().map(|p| p.health());
+                self.laws.fail(self.t, format!("a person ordered ARM for 8 s and nothing helps: {health:?}"));
+            }
+        }
+        let is_well = self.process.is_some() && !wants_arm && self.state() == State::Running;
+        if is_well {
+            self.clearing_since = None;
+        } else {
+            self.plan(self.t + PERSON_NS, Action::ClearUp);
+        }
+    }
+
+    /// True when nobody but the program has to do anything, so that light is due soon.
+    pub fn is_calm(&self) -> bool {
+        self.is_quiet()
+            && self.clearing_since.is_none()
+            && !self.needs_person
+            && !self.laws.has_standing_order()
+            && self.t >= self.frozen_until
+            && self.projector.status().faults & !(faults::WATCHDOG | faults::CHECKSUM_STORM) == 0
+    }
+
+    fn tick(&mut self) {
+        self.tick_at = self.t + TICK_NS;
+        let calm_for = if self.is_calm() && self.episode.is_none() { self.t - self.calm_since } else { -1 };
+        if calm_for < 0 {
+            self.calm_since = self.calm_since.max(self.t);
+        }
+        let (crew_ready, crews) = {
+            let beneath = lock(&self.beneath);
+            (beneath.crew_ready_at, beneath.crews)
+        };
+        let lag = self.lag.load(Ordering::Relaxed);
+        let longest = lock(&self.cable).longest;
+        self.laws.tick(self.t, calm_for, self.process.as_mut(), (crew_ready + lag, crews), longest);
+        let host = self.host();
+        self.fold(6, host as u64);
+    }
+
+    /// Brings the rig into the state of `episode`; its faults strike when it is there.
+    pub fn begin(&mut self, episode: Episode) {
+        use crate::kinds::State as St;
+        let way = episode.way;
+        let state = episode.state;
+        self.episodes_begun += 1;
+        let number = self.episodes_begun;
+        self.laws.disturbed(self.t);
+        match state {
+            St::Running => {}
+            St::Dark => {
+                if way % 3 == 0 {
+                    self.ask_to_stop();
+                } else {
+                    self.kill();
+                }
+            }
+            St::Arming => {
+                self.kill();
+                self.restart_at = self.t + 100 * MS;
+            }
+            St::RePlugging => self.strike(Kind::U1, way),
+            St::FrozenOrBlack => self.give(if way % 2 == 0 { Order::Black } else { Order::Freeze }),
+            St::ShuttingDown => self.ask_to_stop(),
+            St::Faulted => {
+                if way % 2 == 0 {
+                    self.strike(Kind::U12, way);
+                } else {
+                    self.give(Order::Safe);
+                }
+            }
+        }
+        self.episode = Some((episode, false));
+        self.plan(self.t + 4 * S, Action::Overdue(number));
+    }
+
+    /// True when the next episode may begin.
+    pub fn is_ready(&self) -> bool {
+        self.episode.is_none()
+            && self.clearing_since.is_none()
+            && self.is_calm()
+            && self.state() == State::Running
+            && self.laws.is_lit_well(self.t)
+    }
+
+    fn overdue(&mut self, number: u32) {
+        if number == self.episodes_begun && matches!(self.episode, Some((_, false))) {
+            self.begin_faults();
+        }
+    }
+
+    fn watch_episode(&mut self) {
+        if let Some((episode, false)) = &self.episode {
+            if self.state() == episode.state {
+                self.begin_faults();
+            }
+        }
+    }
+
+    fn begin_faults(&mut self) {
+        let Some((episode, begun)) = &mut self.episode else { return };
+        *begun = true;
+        let faults = episode.faults.clone();
+        let person_ns = episode.person_ns;
+        let mut last = self.t;
+        for fault in faults {
+            let at = self.t + fault.after_ns;
+            last = last.max(at);
+            self.plan(at, Action::Strike(fault.kind, fault.seed));
+        }
+        self.episode = None;
+        self.clearing_since = None;
+        // Until the person has looked, nothing is called calm.
+        self.clearing_since = Some(last + person_ns);
+        self.plan(last + person_ns, Action::ClearUp);
+    }
+}
+
+/// The server that belongs to the rig.
+pub(crate) fn server_kind(setup: &Setup) -> ServerKind {
+    ServerKind {
+        rate_hz: setup.tracker_hz,
+        name: "a".into(),
+        number: 1,
+        is_old: false,
+        millimetres: false,
+    }
+}
