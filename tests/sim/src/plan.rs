@@ -44,7 +44,7 @@ impl Setup {
         // What a frame needs from sample to light, twice; else the rig would be dark by its own file.
         let needed_ms = (2 * (3 + 2_000 / i64::from(tracker_hz)) + 8 * slot_us / 1000 + 20)
             + slot_us * render_milli / 1_000_000 * 4;
-        let predict_ms = dice.happens(0.3).then(|| dice.between(needed_ms, 2 * needed_ms) as u32);
+        let predict_ms = dice.happens(0.3).then(|| dice.between(needed_ms, 2 * needed_ms).min(1_000) as u32);
         Self {
             seed,
             rate_hz,

@@ -16,6 +16,9 @@ const ORDERS_NS: i64 = 20_000_000;
 /// How long the disk takes to write an order, nanoseconds.
 const DISK_NS: i64 = 2_000_000;
 
+/// A program that was asked to stop ends after this time, whatever hangs, nanoseconds.
+const STOPPED_NS: i64 = 2_000_000_000;
+
 /// How a process ended.
 #[derive(Debug)]
 pub enum Exit {
@@ -40,6 +43,8 @@ pub struct Process {
     run_due: i64,
     /// A stop was asked for.
     pub is_stopping: bool,
+    /// It ends by then even if its threads hang, host's clock.
+    end_by: i64,
 }
 
 impl Process {
@@ -62,12 +67,12 @@ impl Process {
         let run =
             SteppedRun::begin(rig.clone(), monitor.clone(), Box::new(medium), machine, HostTime(now));
         let disk = disk.clone();
-        Ok(Self { run, monitor, orders, disk, orders_due: now, run_due: now, is_stopping: false })
+        Ok(Self { run, monitor, orders, disk, orders_due: now, run_due: now, is_stopping: false, end_by: i64::MAX })
     }
 
     /// When it does something next, host's clock.
     pub fn due(&self) -> i64 {
-        self.run_due.min(self.orders_due)
+        self.run_due.min(self.orders_due).min(self.end_by)
     }
 
     /// Does what is due at `now`.
@@ -88,7 +93,8 @@ impl Process {
     }
 
     /// Asks it to stop.
-    pub fn ask_to_stop(&mut self) {
+    pub fn ask_to_stop(&mut self, now: i64) {
+        self.end_by = self.end_by.min(now + STOPPED_NS);
         self.is_stopping = true;
         self.monitor.request_stop();
     }
@@ -98,9 +104,9 @@ impl Process {
         self.monitor.projector()
     }
 
-    /// True when the run is over.
-    pub fn is_over(&self) -> bool {
-        self.run.is_over()
+    /// True when the process ends: the run is over, or it was asked to stop and two seconds have passed.
+    pub fn is_over(&self, now: i64) -> bool {
+        self.run.is_over() || now >= self.end_by
     }
 
     /// The process ends after its run.
@@ -109,6 +115,7 @@ impl Process {
         let error = end.as_mut().and_then(|end| end.error.take());
         self.orders.end(error.is_none());
         let exit = match error {
+            None if end.is_none() => Exit::Again("ended although threads hang".into()),
             None => Exit::InOrder,
             Some(error) => {
                 let told = error.to_string();

@@ -40,6 +40,8 @@ impl Transport for Words {
     }
 }
 
+/// A GPU that does not finish is given up after this time at the latest: two seconds, and the frames before it.
+const GPU_FOUND_NS: i64 = 2_300 * MS;
 const STAGES: [Part; 5] = [Part::Tracking, Part::Plan, Part::Pack, Part::Link, Part::Collector];
 
 impl World {
@@ -185,6 +187,7 @@ impl World {
                 self.pull();
                 let own = std::mem::replace(&mut self.projector, other);
                 self.aside = Some(own);
+                self.laws.acknowledged();
                 lock(&self.cable).push_in();
                 return self.lasts(kind, lasts_ns, Undo::Projector);
             }
@@ -227,6 +230,9 @@ impl World {
             K::U8 => {
                 self.projector.power_cycle(now);
                 self.see_light();
+                if self.projector.status().faults == 0 {
+                    self.laws.acknowledged();
+                }
                 self.lasts(kind, MS, Undo::Nothing);
             }
             K::U11 => {
@@ -259,7 +265,10 @@ impl World {
             K::G1 => beneath.open_traps.push_back(OpenTrap::Absent),
             K::G2 => beneath.open_traps.push_back(OpenTrap::OutOfMemory),
             K::G4 => beneath.gpu_traps.push_back(GpuTrap::Lost),
-            K::G5 => beneath.gpu_traps.push_back(GpuTrap::Hangs),
+            K::G5 => {
+                beneath.gpu_traps.push_back(GpuTrap::Hangs);
+                lasts_ns = GPU_FOUND_NS;
+            }
             K::G6 => {
                 let ns = dice.between(300, 1_500) * MS;
                 beneath.gpu_traps.push_back(GpuTrap::Late(ns));
@@ -276,6 +285,11 @@ impl World {
     }
 
     fn trap(&mut self, part: Part, trap: Trap) {
+        // The collector may be busy for five seconds; the frame path reports fifty times a second.
+        let found_ns = if part == Part::Collector { 5_300 * MS } else { 300 * MS };
+        if trap == Trap::Hangs {
+            self.laws.hidden_until(self.t + found_ns);
+        }
         lock(&self.beneath).traps.push((part, trap));
     }
 
@@ -326,6 +340,7 @@ impl World {
             }
             _ => {
                 lock(&self.beneath).gpu_traps.push_back(GpuTrap::Hangs);
+                self.laws.hidden_until(self.t + GPU_FOUND_NS);
                 let (at, us) = (self.t / 1000, dice.between(500, 2_000) * 1000);
                 self.strike_sample(&format!("dropout@{at}us+{us}us"), self.t + us * 1000);
                 return self.lasts(kind, us * 1000, Undo::Traps);

@@ -107,6 +107,10 @@ pub struct World {
     /// The rig.
     pub setup: Setup,
     pub(crate) rig: Arc<Rig>,
+    /// The same, started by a person who acknowledges the projector's faults.
+    rig_by_hand: Arc<Rig>,
+    /// The next start is a person's.
+    by_hand: bool,
     pub(crate) cable: Arc<Mutex<Cable>>,
     pub(crate) net: Arc<Mutex<Net>>,
     pub(crate) beneath: Arc<Mutex<Beneath>>,
@@ -152,12 +156,12 @@ pub struct World {
     pub is_loud: bool,
 }
 
-fn rig_of(setup: &Setup) -> Result<Rig, String> {
-    let predict = setup.predict_ms.map_or(String::new(), |ms| format!("[safety]\npredict_ms = {ms}\n"));
+fn rig_of(setup: &Setup, acknowledges: bool) -> Result<Rig, String> {
+    let predict = setup.predict_ms.map_or(String::new(), |ms| format!("predict_ms = {ms}\n"));
     let text = format!(
         "[tracker]\nkind = \"natnet\"\nserver = \"10.0.0.2\"\nlocal = \"10.0.0.1\"\nrate_hz = {}\n\
          [projector]\nwidth = {}\nheight = {}\nplanes = {}\nframe_rate = {}\nbackend = {{ kind = \"usb\" }}\n\
-         [[scene.bodies]]\nname = \"a\"\n{predict}",
+         [[scene.bodies]]\nname = \"a\"\n[safety]\nacknowledge_faults = {acknowledges}\n{predict}",
         setup.tracker_hz, RASTER.0, RASTER.1, setup.planes, setup.rate_hz
     );
     let config = RigConfig::parse("simulated.toml", &text, Path::new(""), &Overrides::default())
@@ -185,7 +189,8 @@ impl World {
     /// # Errors
     /// The rig cannot be built, which is a mistake in this program.
     pub fn new(setup: Setup) -> Result<Self, String> {
-        let rig = Arc::new(rig_of(&setup)?);
+        let rig = Arc::new(rig_of(&setup, false)?);
+        let rig_by_hand = Arc::new(rig_of(&setup, true)?);
         let kind = server_kind(&setup);
         let slot_ns = S / i64::from(setup.rate_hz);
         let seed = setup.seed;
@@ -224,6 +229,8 @@ impl World {
             story: VecDeque::new(),
             is_loud: false,
             rig,
+            rig_by_hand,
+            by_hand: false,
             setup,
         })
     }
@@ -435,7 +442,7 @@ impl World {
             return;
         }
         process.step(host);
-        if process.is_over() {
+        if process.is_over(host) {
             self.exit();
         }
     }
@@ -483,6 +490,11 @@ impl World {
         }
         self.starts.push_back(self.t);
         lock(&self.beneath).new_process();
+        let by_hand = std::mem::take(&mut self.by_hand);
+        self.laws.started(self.t, self.is_calm());
+        if by_hand {
+            self.laws.acknowledged();
+        }
         if std::mem::take(&mut self.bad_file) {
             self.tell(|| "the program refuses the rig file".into());
             self.needs_person = true;
@@ -495,8 +507,8 @@ impl World {
             lag: self.lag.clone(),
         };
         let host = self.host();
-        self.laws.started(self.t);
-        match Process::start(&self.rig, &self.cable, &self.disk, machine, host) {
+        let rig = if by_hand { self.rig_by_hand.clone() } else { self.rig.clone() };
+        match Process::start(&rig, &self.cable, &self.disk, machine, host) {
             Ok(process) => {
                 self.tell(|| "the program starts".into());
                 self.process = Some(process);
@@ -514,7 +526,7 @@ impl World {
     /// A person starts the program, whatever the service manager thinks of it.
     pub(crate) fn start_by_hand(&mut self) {
         self.starts.clear();
-        self.needs_person = false;
+        (self.needs_person, self.by_hand) = (false, true);
         self.restart_at = self.t;
     }
 
@@ -535,8 +547,9 @@ impl World {
         if self.t < self.frozen_until {
             return;
         }
+        let host = self.host();
         if let Some(process) = &mut self.process {
-            process.ask_to_stop();
+            process.ask_to_stop(host);
             self.laws.asked_to_stop(self.t);
             self.tell(|| "the program is asked to stop".into());
         }
@@ -602,9 +615,26 @@ impl World {
         };
         let lag = self.lag.load(Ordering::Relaxed);
         let longest = lock(&self.cable).longest;
-        self.laws.tick(self.t, calm_for, self.process.as_mut(), (crew_ready + lag, crews), longest);
+        let is_frozen = self.t < self.frozen_until;
+        self.laws.tick(self.t, calm_for, self.process.as_mut(), (crew_ready + lag, crews), longest, is_frozen);
         let host = self.host();
         self.fold(6, host as u64);
+        if self.is_loud {
+            self.tell_state();
+        }
+    }
+
+    /// What the program tells about itself, for a person.
+    fn tell_state(&mut self) {
+        let device = self.projector.status();
+        let Some(process) = &self.process else { return };
+        let (health, counts, carried) = (process.health(), process.monitor.counts(), process.run.carried());
+        let tracker = process.run.tracker_status();
+        self.tell(|| {
+            format!("  .. {health:?}, {counts:?}; device {:?}, lit {}, late {}, superseded {}, refused {}; {:?}; {tracker}",
+                device.state, device.frames_lit, device.frames_late, device.frames_superseded, device.frames_refused,
+                carried.map(|c| (c.not_sent, c.clock_bound_ns, c.travel_ms)))
+        });
     }
 
     /// Brings the rig into the state of `episode`; its faults strike when it is there.

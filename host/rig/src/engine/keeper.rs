@@ -25,6 +25,8 @@ use dpm_handoff::latest::Publisher;
 const PASSING: u32 = faults::WATCHDOG | faults::CHECKSUM_STORM;
 /// The shortest time between two such returns. A projector that keeps faulting stays mostly dark.
 const REARM_NS: i64 = 1_000_000_000;
+/// A correction of the map beyond this is a step of one of the clocks (a machine that was suspended), nanoseconds.
+const STEP_NS: i64 = 2_000_000;
 /// How often the planning thread gets a new map of the projector's clock.
 const RETIME_NS: i64 = 100_000_000;
 /// The number of clock exchanges that give a better map than those of the handshake.
@@ -142,10 +144,10 @@ impl LinkKeeper {
         result
     }
 
-    /// Records that the frame of `plan` was sent.
-    pub(crate) fn sent(&mut self, plan: &FramePlan) {
+    /// Records that the frame of `plan` was sent at `now`.
+    pub(crate) fn sent(&mut self, plan: &FramePlan, now: HostTime) {
         if let Some(reports) = &mut self.reports {
-            reports.sent(plan.id.0 as u32, plan.slot);
+            reports.sent(plan.id.0 as u32, plan.slot, now);
         }
     }
 
@@ -267,6 +269,10 @@ impl LinkKeeper {
             let due = self.retimed_at.0 == i64::MIN || now.ns_since(self.retimed_at) >= RETIME_NS;
             if !due || map.exchanges() < EXCHANGES {
                 return;
+            }
+            let stepped_ns = mapped.at.ns_since(self.time.host_of(ticks)).abs();
+            if let Some(reports) = self.reports.as_mut().filter(|_| stepped_ns > STEP_NS) {
+                reports.clock_was_wrong();
             }
             self.time.anchor = (ticks, mapped.at);
         } else {

@@ -164,7 +164,7 @@ impl<P: Pace> LinkStage<P> {
         let outcome = self.link.send_frame(now, plan.id.0, plan.target_at, plan.dark_from, planes, transport);
         note.fate = Fate::Offered(outcome);
         if outcome == SendOutcome::Sent {
-            self.keeper.sent(plan);
+            self.keeper.sent(plan, now);
         } else {
             self.waited_ns = None;
         }

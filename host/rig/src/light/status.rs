@@ -10,6 +10,7 @@ use crate::plan::link_time::LinkTime;
 use crate::telemetry::projector::DeviceCounts;
 use dpm_device::light::{LightEvent, LightKind};
 use dpm_device::link::Status;
+use dpm_device::time::HostTime;
 use dpm_handoff::channel::Sender;
 
 /// Maximum number of slots of one report for which single notes are made: a second of silence at 1 kHz.
@@ -18,6 +19,18 @@ const MOST_SLOTS: u32 = 1024;
 const REMEMBERED: usize = 64;
 /// The longest travel of a frame that is considered plausible, nanoseconds.
 const LONGEST_TRAVEL_NS: i64 = 500_000_000;
+/// Frames whose arrival bounds the travel from above.
+const ARRIVALS: usize = 16;
+
+/// A frame that was sent.
+#[derive(Clone, Copy, Debug)]
+struct SentFrame {
+    /// Low 32 bits of its number.
+    frame: u32,
+    /// Its slot.
+    slot: u64,
+    at: HostTime,
+}
 
 /// Reads the reports of one session after the other.
 #[derive(Debug)]
@@ -25,9 +38,12 @@ pub(crate) struct StatusLight {
     lights: Sender<LightNote>,
     before: Option<Status>,
     counts: DeviceCounts,
-    planned: [(u32, u64); REMEMBERED],
+    sent: [Option<SentFrame>; REMEMBERED],
     next: usize,
     travel_ns: i64,
+    /// Upper bounds of the travel of the last frames, nanoseconds, and how many there are.
+    arrivals: [i64; ARRIVALS],
+    arrived: usize,
 }
 
 impl StatusLight {
@@ -37,9 +53,11 @@ impl StatusLight {
             lights,
             before: None,
             counts: DeviceCounts::default(),
-            planned: [(0, u64::MAX); REMEMBERED],
+            sent: [None; REMEMBERED],
             next: 0,
             travel_ns: 0,
+            arrivals: [0; ARRIVALS],
+            arrived: 0,
         }
     }
 
@@ -53,14 +71,21 @@ impl StatusLight {
         self.before = None;
     }
 
-    /// Frame number `frame` was sent for `slot`.
-    pub(crate) fn sent(&mut self, frame: u32, slot: u64) {
-        self.planned[self.next % REMEMBERED] = (frame, slot);
+    /// Frame number `frame` was sent for `slot` at `at`.
+    pub(crate) fn sent(&mut self, frame: u32, slot: u64, at: HostTime) {
+        self.sent[self.next % REMEMBERED] = Some(SentFrame { frame, slot, at });
         self.next = (self.next + 1) % REMEMBERED;
     }
 
+    /// The map of the projector's clock was wrong until now, and with it all that was learned from it.
+    pub(crate) fn clock_was_wrong(&mut self) {
+        self.sent = [None; REMEMBERED];
+        (self.travel_ns, self.arrived) = (0, 0);
+    }
+
     /// How much earlier than the host's estimate a frame must be sent to be lit in its slot, nanoseconds. It rises at
-    /// once when frames are lit late, and falls slowly while they are not.
+    /// once when a frame that was sent in time is lit late. It falls slowly while none is, and at once when the last
+    /// frames are known to have arrived sooner.
     pub(crate) fn travel_ns(&self) -> i64 {
         self.travel_ns
     }
@@ -86,6 +111,11 @@ impl StatusLight {
         c.refused += u64::from(of(|s| s.frames_refused));
         c.damaged_packets += u64::from(of(|s| s.header_errors)) + u64::from(of(|s| s.payload_errors));
         let Some(newest) = time.slot_at(status.now) else { return };
+        let whole = (before.map(|s| s.last_whole_frame) != Some(status.last_whole_frame))
+            .then_some(status.last_whole_frame);
+        if let Some(frame) = whole {
+            self.arrived(frame, status, time);
+        }
         if lit > 0 {
             if let Some(slot) = time.slot_at(status.last_lit_at) {
                 self.follow(status.last_lit_frame, slot, time);
@@ -125,17 +155,36 @@ impl StatusLight {
         }
     }
 
+    fn sent_frame(&self, frame: u32) -> Option<SentFrame> {
+        self.sent.iter().flatten().find(|sent| sent.frame == frame).copied()
+    }
+
+    /// `frame` had arrived when the report was made.
+    fn arrived(&mut self, frame: u32, status: &Status, time: &LinkTime) {
+        let Some(sent) = self.sent_frame(frame) else { return };
+        self.arrivals[self.arrived % ARRIVALS] = time.host_of(status.now).ns_since(sent.at).max(0);
+        self.arrived += 1;
+        if self.arrived >= ARRIVALS {
+            let longest = self.arrivals.iter().copied().max().unwrap_or(LONGEST_TRAVEL_NS);
+            self.travel_ns = self.travel_ns.min(longest);
+        }
+    }
+
+    /// `frame` was lit in `lit_slot`.
     fn follow(&mut self, frame: u32, lit_slot: u64, time: &LinkTime) {
-        let Some(&(_, planned)) = self.planned.iter().find(|p| p.0 == frame && p.1 != u64::MAX) else {
+        let Some(sent) = self.sent_frame(frame) else { return };
+        if lit_slot <= sent.slot {
+            self.travel_ns -= self.travel_ns / 1024;
             return;
-        };
-        let late_ns = time.host_of_slot(lit_slot).ns_since(time.host_of_slot(planned)).max(0);
-        self.travel_ns = if late_ns > 0 {
-            // Half of it, because frames that are already on their way are late by the same amount.
-            (self.travel_ns + late_ns / 2).min(LONGEST_TRAVEL_NS)
-        } else {
-            self.travel_ns - self.travel_ns / 1024
-        };
+        }
+        // It had not arrived when the slot before the one in which it was lit began. That tells nothing about the
+        // travel of a frame that the host itself sent too late.
+        let (missed_at, lit_at) = (time.host_of_slot(lit_slot - 1), time.host_of_slot(lit_slot));
+        let at_least_ns = missed_at.ns_since(sent.at);
+        if at_least_ns >= 0 {
+            let between_ns = at_least_ns + lit_at.ns_since(missed_at) / 2;
+            self.travel_ns = self.travel_ns.max(between_ns).min(LONGEST_TRAVEL_NS);
+        }
     }
 }
 
@@ -143,7 +192,7 @@ impl StatusLight {
 mod tests {
     use super::*;
     use dpm_device::link::{DeviceMessage, MessageType, SlotClock};
-    use dpm_device::time::{DeviceTicks, FrameRate, HostTime};
+    use dpm_device::time::{DeviceTicks, FrameRate};
     use dpm_handoff::channel::{channel, Receiver};
     use dpm_handoff::wake::WaitPolicy;
 
@@ -217,19 +266,44 @@ mod tests {
         assert_eq!(light.0.counts().lit, 4 + u64::from(u32::MAX - 1));
     }
 
+    /// A frame that was sent at `sent_us` for `slot` and lit in `lit_slot`, with a report in the middle of that slot.
+    fn lit_in(reader: &mut Reader, k: u32, sent_us: i64, slot: u64, lit_slot: u64) {
+        let at = (lit_slot - 100) * 1_000;
+        reader.0.sent(k, slot, HostTime(sent_us * 1_000));
+        let report = Status { last_whole_frame: k, ..status(at + 500, [k, 0, 0], (k, at)) };
+        told(reader, &report);
+    }
+
     #[test]
-    fn travel_follows_late_frames_and_forgets_slowly() {
+    fn travel_rises_with_frames_that_are_lit_late_although_they_were_sent_in_time() {
         let mut light = reader();
-        light.0.sent(7, 101);
-        told(&mut light, &status(5_100, [1, 0, 0], (7, 5_000)));
-        assert_eq!(light.0.travel_ns(), 2_000_000, "half of four slots");
-        light.0.sent(8, 106);
-        told(&mut light, &status(6_100, [2, 0, 0], (8, 6_000)));
-        assert_eq!(light.0.travel_ns(), 2_000_000 - 2_000_000 / 1024);
-        for k in 0..2000u32 {
-            light.0.sent(9 + k, 0);
-            told(&mut light, &status(7_100 + u64::from(k), [3 + k, 0, 0], (9 + k, 7_000)));
-        }
+        // Sent 200 us before slot 105 and lit in slot 108: it had not arrived 2.2 ms later.
+        lit_in(&mut light, 1, 4_800, 105, 108);
+        assert_eq!(light.0.travel_ns(), 2_700_000);
+        lit_in(&mut light, 2, 6_000, 109, 109);
+        assert_eq!(light.0.travel_ns(), 2_700_000 - 2_700_000 / 1024);
+        // A frame that the host sent after its slot had begun tells nothing.
+        let before = light.0.travel_ns();
+        lit_in(&mut light, 3, 9_900, 105, 110);
+        assert_eq!(light.0.travel_ns(), before);
+        lit_in(&mut light, 4, 1_000, 112, 2_000);
         assert_eq!(light.0.travel_ns(), LONGEST_TRAVEL_NS);
+    }
+
+    /// Found by the simulator: after a slow cable, or a machine that was suspended for 75 ms, frames left 150 ms early
+    /// for a minute, so that their poses were too old and everything was dark.
+    #[test]
+    fn travel_is_forgotten_when_frames_arrive_sooner_or_the_clock_was_wrong() {
+        let mut light = reader();
+        lit_in(&mut light, 1, 4_800, 105, 305);
+        assert!(light.0.travel_ns() > 190_000_000);
+        for k in 0..ARRIVALS as u64 {
+            lit_in(&mut light, 2 + k as u32, 205_900 + 1_000 * k as i64, 306 + k, 306 + k);
+        }
+        assert!(light.0.travel_ns() <= 1_600_000, "{}", light.0.travel_ns());
+        lit_in(&mut light, 90, 220_000, 330, 430);
+        assert!(light.0.travel_ns() > 90_000_000);
+        light.0.clock_was_wrong();
+        assert_eq!(light.0.travel_ns(), 0);
     }
 }

@@ -147,6 +147,12 @@ impl Crew {
         }
     }
 
+    /// What the tracker's client says of itself.
+    pub(super) fn tracker_status(&self) -> String {
+        let time = self.tracking.newest();
+        format!("{}; newest {time:?}", self.tracking.status())
+    }
+
     /// Frames in progress.
     pub(super) fn in_flight(&self) -> usize {
         self.in_flight - self.free.len()

@@ -180,6 +180,8 @@ struct Running {
     collector: Collector,
     collector_pulse: Pulse,
     collect_at: HostTime,
+    /// Everything is collected.
+    is_collected: bool,
     inbox: Inbox,
     notes: RefCell<Vec<Box<FrameNote>>>,
     /// Nothing can end the run in order any more.
@@ -233,6 +235,14 @@ impl<M: Machine> SteppedRun<M> {
         match &self.phase {
             Phase::Runs(run) => Some(run.line.stage.report(self.medium.name())),
             _ => None,
+        }
+    }
+
+    /// What the tracker's client says of itself; empty before the link is up.
+    pub fn tracker_status(&self) -> String {
+        match &self.phase {
+            Phase::Runs(run) => run.crew.as_ref().map_or(String::new(), Crew::tracker_status),
+            _ => String::new(),
         }
     }
 
@@ -355,6 +365,7 @@ impl Running {
             collector: Collector::new(rig.clone(), 0, false).about(false, None),
             collector_pulse: Pulse::new("collector"),
             collect_at: now.plus_ns(COLLECT_NS),
+            is_collected: false,
             inbox: Inbox { done, lights },
             notes: RefCell::new((0..NOTES).map(|_| Box::new(FrameNote::new(&rig))).collect()),
             is_broken: false,
@@ -400,7 +411,7 @@ impl Running {
         // What the link has not told by now, it will not tell.
         let is_last = self.line.is_over();
         if collector.look(inbox, &free, &facts.monitor, &mut || ()) || is_last {
-            self.collect_at = NEVER;
+            (self.collect_at, self.is_collected) = (NEVER, true);
             pulse.end();
         }
     }
@@ -455,7 +466,7 @@ impl Running {
     }
 
     fn is_over(&self) -> bool {
-        self.is_broken || self.line.is_over() && self.collect_at == NEVER
+        self.is_broken || self.line.is_over() && self.is_collected
     }
 
     fn finish(mut self: Box<Self>, medium: &dyn Transport) -> SteppedEnd {
