@@ -31,6 +31,8 @@ pub use types::{
 const RETRY_NS: i64 = 20_000_000;
 /// Interval between attempts to reopen a lost medium.
 const REOPEN_NS: i64 = 100_000_000;
+/// A device that has said nothing to this session for this long, and for two of its watchdog's times, is greeted again.
+const SILENT_NS: i64 = 500_000_000;
 /// Interval of the first echoes of a session, which are frequent so that the clock is known soon.
 const FAST_ECHO_NS: i64 = 2_000_000;
 /// Number of fast echoes.
@@ -230,6 +232,10 @@ impl HostLink {
             // Only a new HELLO helps; the caller decides whether to arm again.
             self.connect();
         }
+        if self.is_left_alone(now) {
+            // The device listens to another host, or its answers do not arrive: no frame can be lit any more.
+            self.connect();
+        }
         if self.rest.is_some_and(|(end, _)| now >= end) && self.state == LinkState::Streaming {
             self.rest = None;
             // An order of the operator outlasts any rest.
@@ -243,6 +249,16 @@ impl HostLink {
         self.exchange_clocks(now, transport)?;
         self.request(now, transport)?;
         Ok(self.state)
+    }
+
+    /// True if the device has fallen silent. An order to go dark that is not confirmed is repeated instead.
+    fn is_left_alone(&self, now: HostTime) -> bool {
+        let heard_at = self.inbox.heard_at;
+        let silent_ns = SILENT_NS.max(2_000 * i64::from(self.settings.watchdog_us));
+        self.state != LinkState::Greeting
+            && self.verb.is_none()
+            && heard_at.0 != i64::MIN
+            && now.ns_since(heard_at) > silent_ns
     }
 
     fn receive(&mut self, now: HostTime, transport: &mut dyn Transport) -> Result<(), TransportError> {

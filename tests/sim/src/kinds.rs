@@ -222,7 +222,9 @@ impl Kind {
     pub fn impossible(self, state: State) -> Option<&'static str> {
         use Kind as K;
         match self {
-            K::T18 => Some("the simulated tracker is on the network; serial trackers: device/src/tracker/serial"),
+            K::T18 => {
+                Some("the simulated tracker is on the network; serial trackers: device/src/tracker/serial")
+            }
             K::G3 => Some("no scene is loaded while the rig runs"),
             K::G9 => Some("the program keeps no cache of shaders"),
             K::F1 | K::F2 | K::F3 | K::F4 | K::F5 | K::F6 | K::F7 | K::F8 | K::F9 | K::F10 => {

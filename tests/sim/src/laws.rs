@@ -8,9 +8,9 @@ use crate::plan::Setup;
 use crate::process::{Exit, Process};
 use dpm_device::light::{LightEvent, LightKind};
 use dpm_device::link::{frame_newer, DeviceState};
+use dpm_rig::control::orders::Ticket;
 use dpm_rig::order::Order;
 use dpm_rig::pipeline::stepped::{SteppedEnd, StoredOrder};
-use dpm_rig::control::orders::Ticket;
 use dpm_rig::rig::Rig;
 use dpm_rig::telemetry::monitor::{ProjectorHealth, RunCounts};
 use hil_mock::motion::Motion;
@@ -308,7 +308,10 @@ impl Laws {
             let late = at - s.since;
             if late > allowed(s.since, self) {
                 let how = if s.is_orphan { ", which was kept over a restart" } else { "" };
-                self.fail(at, format!("{what} {} ms after {}{how}", late / MS, s.order.word().to_uppercase()));
+                self.fail(
+                    at,
+                    format!("{what} {} ms after {}{how}", late / MS, s.order.word().to_uppercase()),
+                );
             }
         }
         if let Some(since) = self.stopped_at {
@@ -323,7 +326,10 @@ impl Laws {
         }
         if let Some(since) = self.hot_since {
             if at - since > self.slot_ns + MS {
-                self.fail(at, format!("{what} {} ms after a fault that waits for a person", (at - since) / MS));
+                self.fail(
+                    at,
+                    format!("{what} {} ms after a fault that waits for a person", (at - since) / MS),
+                );
             }
         }
     }
@@ -383,7 +389,11 @@ impl Laws {
             let frame = sent.frame;
             self.fail(
                 at,
-                format!("frame {frame} is still lit {} ms after its slot; {} ms are allowed", held / MS, allowed / MS),
+                format!(
+                    "frame {frame} is still lit {} ms after its slot; {} ms are allowed",
+                    held / MS,
+                    allowed / MS
+                ),
             );
         }
     }
@@ -403,7 +413,11 @@ impl Laws {
             let frame = sent.frame;
             return self.fail(
                 at,
-                format!("frame {frame}: poses are {} ms old at the first photon; {} ms are allowed", age / MS, allowed / MS),
+                format!(
+                    "frame {frame}: poses are {} ms old at the first photon; {} ms are allowed",
+                    age / MS,
+                    allowed / MS
+                ),
             );
         }
         if at < self.lies_until + S || at - self.started_at < S {
@@ -421,7 +435,11 @@ impl Laws {
             let frame = sent.frame;
             self.fail(
                 at,
-                format!("frame {frame}: the light is {:.1} mm off the body; {:.1} mm are allowed", off * 1e3, allowed * 1e3),
+                format!(
+                    "frame {frame}: the light is {:.1} mm off the body; {:.1} mm are allowed",
+                    off * 1e3,
+                    allowed * 1e3
+                ),
             );
         }
     }
@@ -456,7 +474,10 @@ impl Laws {
             let frames = self.good_frames - before;
             // Ten ticks are a second, and the window is eleven; a tenth may be missing.
             if frames * 10 < u64::from(self.rate_hz) * 9 {
-                self.fail(t, format!("{frames} good frames in 1.1 s of peace at {} per second", self.rate_hz));
+                self.fail(
+                    t,
+                    format!("{frames} good frames in 1.1 s of peace at {} per second", self.rate_hz),
+                );
             }
         }
         let health = process.as_ref().map(|p| p.health());
@@ -511,7 +532,10 @@ impl Laws {
         if late > LIT_WITHIN_NS + slow {
             self.fail(
                 t,
-                format!("no light {:.1} s after all causes were gone; the projector is {health:?}", calm_for as f64 * 1e-9),
+                format!(
+                    "no light {:.1} s after all causes were gone; the projector is {health:?}",
+                    calm_for as f64 * 1e-9
+                ),
             );
         }
     }

@@ -26,7 +26,8 @@ const COLLECTOR_US: Quantiles = [20, 60, 300, 2_000, 9_000];
 /// Draws a time from quantiles, in nanoseconds.
 fn drawn(dice: &mut Dice, quantiles: Quantiles) -> i64 {
     let at = dice.between(0, 999_999);
-    let steps = [(0, 500_000), (500_000, 900_000), (900_000, 990_000), (990_000, 999_000), (999_000, 1_000_000)];
+    let steps =
+        [(0, 500_000), (500_000, 900_000), (900_000, 990_000), (990_000, 999_000), (999_000, 1_000_000)];
     let mut low = quantiles[0] / 2;
     for ((from, to), high) in steps.into_iter().zip(quantiles) {
         if at < to {
@@ -210,9 +211,7 @@ impl Machine for SimMachine {
         beneath.crews += 1;
         let made = match with_gpu.then(|| beneath.open_traps.pop_front()).flatten() {
             None => Ok(beneath.frame_ns),
-            Some(OpenTrap::Absent) => {
-                Err(GpuError::NoDevice { found: "none".into(), needed: "one".into() })
-            }
+            Some(OpenTrap::Absent) => Err(GpuError::NoDevice { found: "none".into(), needed: "one".into() }),
             Some(OpenTrap::OutOfMemory) => Err(GpuError::OutOfMemory {
                 operation: "making a buffer".into(),
                 device: device(),

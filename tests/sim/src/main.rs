@@ -155,7 +155,12 @@ fn run() -> Result<bool, String> {
         }
         if wish.until.is_some() {
             lived.story.iter().for_each(|line| println!("{line}"));
-            println!("event {} at {:.9} s, trace {:016x}", lived.events, lived.length_ns as f64 * 1e-9, lived.trace);
+            println!(
+                "event {} at {:.9} s, trace {:016x}",
+                lived.events,
+                lived.length_ns as f64 * 1e-9,
+                lived.trace
+            );
             break;
         }
         if wish.is_loud {

@@ -2,10 +2,10 @@
 
 use crate::cable::lock;
 use crate::dice::Dice;
+use dpm_device::pose::Pose;
 use dpm_device::time::{FrameRate, HostTime};
 use dpm_device::tracker::natnet::wire::Version;
 use dpm_device::tracker::udp::{Arrival, Datagrams};
-use dpm_device::pose::Pose;
 use hil_mock::motion::{Motion, MotionSpec};
 use hil_mock::natnet_server::{NatNetServer, NatNetServerConfig, Streaming, UnicastTo};
 use hil_mock::tracker::{MockTrackerConfig, SampleSource};

@@ -64,10 +64,18 @@ impl Process {
         let orders = SteppedOrders::begin(Box::new(SimFolder(disk.clone())), identity, monitor.clone())
             .map_err(Exit::ForGood)?;
         let medium = HostEnd::open(cable).map_err(|e| Exit::Again(e.to_string()))?;
-        let run =
-            SteppedRun::begin(rig.clone(), monitor.clone(), Box::new(medium), machine, HostTime(now));
+        let run = SteppedRun::begin(rig.clone(), monitor.clone(), Box::new(medium), machine, HostTime(now));
         let disk = disk.clone();
-        Ok(Self { run, monitor, orders, disk, orders_due: now, run_due: now, is_stopping: false, end_by: i64::MAX })
+        Ok(Self {
+            run,
+            monitor,
+            orders,
+            disk,
+            orders_due: now,
+            run_due: now,
+            is_stopping: false,
+            end_by: i64::MAX,
+        })
     }
 
     /// When it does something next, host's clock.

@@ -6,8 +6,8 @@ use crate::kinds::Kind;
 use crate::machine::{GpuTrap, OpenTrap, Trap};
 use crate::net::{NetFaults, ServerKind};
 use crate::world::{projector_of, server_kind, Action, Undo, World, MS, S};
-use dpm_device::link::{faults, HostLink, SessionNumbers};
 use dpm_device::link::Packet;
+use dpm_device::link::{faults, HostLink, SessionNumbers};
 use dpm_device::planes::Raster;
 use dpm_device::time::HostTime;
 use dpm_device::transport::{Lane, LinkDevice, SendError, Transport, TransportError};
@@ -59,7 +59,18 @@ impl World {
             K::U3 | K::U4 | K::U5 | K::U6 | K::U7 | K::U10 => self.strike_cable(kind, &mut dice),
             K::U8 | K::U11 | K::U12 | K::U13 => self.strike_projector(kind, &mut dice),
             K::G1 | K::G2 | K::G4 | K::G5 | K::G6 | K::G7 | K::G8 => self.strike_gpu(kind, &mut dice),
-            K::U15 | K::H2 | K::H6 | K::X2 | K::X3 | K::X4 | K::X5 | K::X6 | K::H3 | K::H5 | K::X1 | K::X7 => {
+            K::U15
+            | K::H2
+            | K::H6
+            | K::X2
+            | K::X3
+            | K::X4
+            | K::X5
+            | K::X6
+            | K::H3
+            | K::H5
+            | K::X1
+            | K::X7 => {
                 self.strike_process(kind, &mut dice);
             }
             K::H1 | K::H4 | K::H8 | K::H9 | K::H10 | K::H11 | K::N3 | K::N4 | K::N5 => {
@@ -124,19 +135,20 @@ impl World {
         let own = server_kind(&self.setup);
         let lasts_ns = dice.between(50, 1_500) * MS;
         let other = match kind {
-            K::T11 => own,
-            K::T12 => ServerKind { name: "stranger".into(), number: 9, ..own },
-            K::T14 => ServerKind { is_old: true, ..own },
-            K::T15 => ServerKind { rate_hz: dice.one_of(&[100, 200, 500, 1000]), ..own },
-            _ => ServerKind { millimetres: true, ..own },
+            K::T11 => own.clone(),
+            K::T12 => ServerKind { name: "stranger".into(), number: 9, ..own.clone() },
+            K::T14 => ServerKind { is_old: true, ..own.clone() },
+            K::T15 => ServerKind { rate_hz: dice.one_of(&[100, 200, 500, 1000]), ..own.clone() },
+            _ => ServerKind { millimetres: true, ..own.clone() },
         };
         if kind == K::T15 && dice.happens(0.5) {
             lock(&self.net).faults.held = true;
             return self.lasts(kind, dice.between(20, 400) * MS, Undo::Net);
         }
+        let undo = if other == own { Undo::Nothing } else { Undo::Server };
         self.replace_server(other);
         self.laws.lies_until(self.t + lasts_ns + S);
-        self.lasts(kind, lasts_ns, Undo::Server);
+        self.lasts(kind, lasts_ns, undo);
     }
 
     fn replace_server(&mut self, kind: ServerKind) {
@@ -301,7 +313,8 @@ impl World {
             K::U15 => self.kill(),
             K::H2 | K::X3 => {
                 self.give(dice.one_of(&[Order::Safe, Order::Black]));
-                let after_ns = if kind == K::H2 { dice.between(0, 3_000_000) } else { dice.between(5, 60) * MS };
+                let after_ns =
+                    if kind == K::H2 { dice.between(0, 3_000_000) } else { dice.between(5, 60) * MS };
                 if dice.happens(0.3) {
                     lock(&self.disk).tear();
                 }

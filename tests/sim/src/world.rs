@@ -573,7 +573,9 @@ impl World {
             }
             Some(process) => match process.health() {
                 ProjectorHealth::Black | ProjectorHealth::Frozen | ProjectorHealth::InterlockOpen => true,
-                ProjectorHealth::Faulted(bits) => bits & faults::WATCHDOG == 0 || latched & !faults::WATCHDOG != 0,
+                ProjectorHealth::Faulted(bits) => {
+                    bits & faults::WATCHDOG == 0 || latched & !faults::WATCHDOG != 0
+                }
                 _ => self.laws.has_standing_order(),
             },
         };
@@ -616,7 +618,14 @@ impl World {
         let lag = self.lag.load(Ordering::Relaxed);
         let longest = lock(&self.cable).longest;
         let is_frozen = self.t < self.frozen_until;
-        self.laws.tick(self.t, calm_for, self.process.as_mut(), (crew_ready + lag, crews), longest, is_frozen);
+        self.laws.tick(
+            self.t,
+            calm_for,
+            self.process.as_mut(),
+            (crew_ready + lag, crews),
+            longest,
+            is_frozen,
+        );
         let host = self.host();
         self.fold(6, host as u64);
         if self.is_loud {
@@ -717,11 +726,5 @@ impl World {
 
 /// The server that belongs to the rig.
 pub(crate) fn server_kind(setup: &Setup) -> ServerKind {
-    ServerKind {
-        rate_hz: setup.tracker_hz,
-        name: "a".into(),
-        number: 1,
-        is_old: false,
-        millimetres: false,
-    }
+    ServerKind { rate_hz: setup.tracker_hz, name: "a".into(), number: 1, is_old: false, millimetres: false }
 }

@@ -20,6 +20,8 @@ pub(super) struct Inbox {
     pub status: Option<Status>,
     pub fault: Option<Fault>,
     pub device_forgot: bool,
+    /// Arrival of the newest message of this session.
+    pub heard_at: HostTime,
     pub echoes: [Option<EchoSample>; ECHOES_KEPT],
     pub next_echo: usize,
     /// Start of the newest answered exchange.
@@ -71,6 +73,7 @@ impl Inbox {
             status: None,
             fault: None,
             device_forgot: false,
+            heard_at: HostTime(i64::MIN),
             echoes: [None; ECHOES_KEPT],
             next_echo: 0,
             echo_answered: HostTime(i64::MIN),
@@ -86,6 +89,7 @@ impl Inbox {
     }
 
     fn apply(&mut self, message: &DeviceMessage) {
+        self.heard_at = self.arrived_at;
         match message {
             DeviceMessage::Hello(h) => self.hello = Some(*h),
             DeviceMessage::Status(s) => {

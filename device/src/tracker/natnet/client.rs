@@ -25,9 +25,9 @@ const MODELS_EVERY_NS: i64 = 1_000 * MS;
 /// The client reconnects to a server that was silent for this long.
 const SILENCE_NS: i64 = 2_000 * MS;
 /// The client also reconnects to a server that answers but sent no frame for this long.
-const STARVED_NS: i64 = 1_000 * MS;
+const STARVED_NS: i64 = 300 * MS;
 /// A learned port is kept until it has been silent for this long; only then may another port replace it.
-const HOLD_PORT_NS: i64 = STARVED_NS;
+const HOLD_PORT_NS: i64 = 1_000 * MS;
 /// If the command port and the data ports have sent no frame for this long, the client may accept frames from one other
 /// port.
 const LEARN_PORT_AFTER_NS: i64 = 300 * MS;

@@ -65,9 +65,15 @@ enum Planning {
 /// What packing is doing.
 enum Packing {
     /// It waits for the oldest frame that the GPU has, at most until `until`; `None`: there is none.
-    Waits { until: Option<HostTime>, limit_ns: u64 },
+    Waits {
+        until: Option<HostTime>,
+        limit_ns: u64,
+    },
     /// It packs.
-    Packs { at: HostTime, job: FrameJob },
+    Packs {
+        at: HostTime,
+        job: FrameJob,
+    },
     Gone,
 }
 
@@ -250,12 +256,7 @@ impl Crew {
         match machine.takes(Part::Tracking, facts.next_frame.load(Ordering::Relaxed), now) {
             Takes::Ns(ns) => {
                 let read_at = now.plus_ns(ns);
-                crate::pipeline::threads::read_tracker(
-                    facts,
-                    &mut self.tracking,
-                    &mut self.publisher,
-                    now,
-                );
+                crate::pipeline::threads::read_tracker(facts, &mut self.tracking, &mut self.publisher, now);
                 let next = machine.next_sample_at(now).min(now.plus_ns(POLL_AT_LEAST_NS));
                 self.tracking_at = next.max(read_at.plus_ns(POLL_REST_NS));
             }
@@ -373,13 +374,7 @@ impl Crew {
         self.packing = Packing::Waits { until, limit_ns };
     }
 
-    fn pack<M: Machine>(
-        &mut self,
-        now: HostTime,
-        facts: &Arc<Facts>,
-        machine: &mut M,
-        line: &mut Line,
-    ) {
+    fn pack<M: Machine>(&mut self, now: HostTime, facts: &Arc<Facts>, machine: &mut M, line: &mut Line) {
         match std::mem::replace(&mut self.packing, Packing::Gone) {
             Packing::Packs { at, mut job } if at <= now => {
                 job.note.timeline.packed_at = now;
@@ -393,8 +388,7 @@ impl Crew {
                 } else if until <= now {
                     self.pulses[2].end();
                     let frame = self.gpu.front().map_or(0, |on| on.job.note.plan.id.0);
-                    self.failure =
-                        Some(PipelineError::GpuHangs { frame, ms: limit_ns / 1_000_000 });
+                    self.failure = Some(PipelineError::GpuHangs { frame, ms: limit_ns / 1_000_000 });
                 } else {
                     self.packing = Packing::Waits { until: Some(until), limit_ns };
                 }

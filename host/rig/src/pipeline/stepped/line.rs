@@ -17,13 +17,24 @@ use std::sync::atomic::Ordering;
 
 enum Doing {
     /// It waits for a frame, at most until `at`.
-    Waits { at: HostTime },
+    Waits {
+        at: HostTime,
+    },
     /// It is busy with a frame before it offers it.
-    Busy { at: HostTime, job: FrameJob },
+    Busy {
+        at: HostTime,
+        job: FrameJob,
+    },
     /// It has offered the frame, and offers it again.
-    Offers { at: HostTime, job: FrameJob },
+    Offers {
+        at: HostTime,
+        job: FrameJob,
+    },
     /// It ends the light. `last`: when the last frame was sent.
-    Ends { at: HostTime, last: HostTime },
+    Ends {
+        at: HostTime,
+        last: HostTime,
+    },
     /// It never returns.
     Hangs,
     Over,

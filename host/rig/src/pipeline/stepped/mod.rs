@@ -149,9 +149,17 @@ pub struct SteppedEnd {
 
 enum Phase {
     /// The GPU and the first frame are prepared.
-    Prepares { until: HostTime, made: Result<i64, GpuError> },
+    Prepares {
+        until: HostTime,
+        made: Result<i64, GpuError>,
+    },
     /// The link comes up.
-    Connects { connecting: Connecting, link: Box<HostLink>, at: HostTime, frame_ns: i64 },
+    Connects {
+        connecting: Connecting,
+        link: Box<HostLink>,
+        at: HostTime,
+        frame_ns: i64,
+    },
     Runs(Box<Running>),
     Over(Option<Box<SteppedEnd>>),
 }
@@ -330,9 +338,7 @@ impl<M: Machine> SteppedRun<M> {
         let stop = self.monitor.stop_requested();
         match connecting.step(now, &mut link, self.medium.as_mut(), &self.monitor, stop) {
             Err(e) => Self::failed(e.into()),
-            Ok(None) => {
-                Phase::Connects { connecting, link, at: now.plus_ns(CONNECT_STEP_NS), frame_ns }
-            }
+            Ok(None) => Phase::Connects { connecting, link, at: now.plus_ns(CONNECT_STEP_NS), frame_ns },
             Ok(Some(time)) => Phase::Runs(Box::new(Running::new(self, *link, time, frame_ns, now))),
         }
     }
@@ -400,7 +406,13 @@ impl Running {
     fn collect<M: Machine>(&mut self, now: HostTime, machine: &mut M) {
         self.collect_at = match machine.takes(Part::Collector, 0, now) {
             Takes::Ns(ns) => now.plus_ns(COLLECT_NS + ns),
-            Takes::Forever | Takes::Panics => NEVER,
+            Takes::Forever => NEVER,
+            Takes::Panics => {
+                // This thread would return from the run: the run ends, and nothing more is collected.
+                self.facts.fail(PipelineError::Panicked("collector"));
+                self.is_collected = true;
+                NEVER
+            }
         };
         let Self { collector, collector_pulse: pulse, inbox, notes, facts, .. } = self;
         pulse.beat(now, COLLECT_WITHIN_NS);

@@ -2,7 +2,7 @@
 
 use crate::control::orders::{Desk, Given, Kept, Ticket};
 use crate::order::Order;
-use crate::standing::{standing_in_folder, By, Identity, OrderFile, StateFolder, Stands};
+use crate::standing::{standing_in_folder, By, Identity, OrderFile, Stands, StateFolder};
 use crate::telemetry::monitor::RunMonitor;
 use dpm_device::time::HostTime;
 use std::sync::Arc;
