@@ -53,6 +53,11 @@ pub trait Datagrams: Send {
     /// # Errors
     /// Those of the operating system.
     fn local(&self) -> io::Result<SocketAddrV4>;
+
+    /// What `clock` shows now minus the clock of [`Arrival::kernel_ns`], nanoseconds.
+    fn realtime_offset_ns(&self, clock: &dyn HostClock) -> i64 {
+        realtime_offset_ns(clock)
+    }
 }
 
 impl Datagrams for UdpPort {

@@ -225,12 +225,18 @@ impl Laws {
         if self.standing.is_some_and(|s| strength(s.order) > strength(order)) {
             return;
         }
+        if self.is_frozen() {
+            self.thawed_at = t;
+        }
         let since = self.standing.filter(|s| s.order == order).map_or(t, |s| s.since);
         self.standing = Some(Standing { order, since, ticket, kept: false, is_orphan: false });
     }
 
     /// What stands when `process` ends, in whatever way.
-    pub fn order_at_exit(&mut self, process: &Process, _: i64) {
+    pub fn order_at_exit(&mut self, process: &Process, t: i64) {
+        if self.is_frozen() {
+            self.thawed_at = t;
+        }
         let Some(standing) = &mut self.standing else { return };
         standing.kept |= process.orders.outcome(standing.ticket) == Some(StoredOrder::Kept);
         standing.is_orphan = true;
@@ -436,9 +442,15 @@ impl Laws {
             self.fail(
                 at,
                 format!(
-                    "frame {frame}: the light is {:.1} mm off the body; {:.1} mm are allowed",
+                    "frame {frame}: the light is {:.1} mm off the body; {:.1} mm are allowed; poses are {:.1} ms old, light \
+                     is {:.1} ms after its slot; x is {:.4} and should be {:.4}, slots {:.3}",
                     off * 1e3,
-                    allowed * 1e3
+                    allowed * 1e3,
+                    age_s * 1e3,
+                    late_s * 1e3,
+                    sent.position[0],
+                    truth[0],
+                    self.slot_ns as f64 * 1e-6
                 ),
             );
         }

@@ -3,7 +3,7 @@
 use crate::cable::lock;
 use crate::dice::Dice;
 use dpm_device::pose::Pose;
-use dpm_device::time::{FrameRate, HostTime};
+use dpm_device::time::{FrameRate, HostClock, HostTime};
 use dpm_device::tracker::natnet::wire::Version;
 use dpm_device::tracker::udp::{Arrival, Datagrams};
 use hil_mock::motion::{Motion, MotionSpec};
@@ -63,6 +63,10 @@ pub struct NetFaults {
 pub struct Net {
     /// True time.
     pub now: i64,
+    /// True time minus the host's clock.
+    pub host_lag: i64,
+    /// The host's wall clock minus true time.
+    pub wall_ahead: i64,
     server: NatNetServer,
     kind: ServerKind,
     seed: u64,
@@ -72,7 +76,8 @@ pub struct Net {
     restart: Option<String>,
     /// The faults.
     pub faults: NetFaults,
-    to_host: VecDeque<(i64, SocketAddrV4, Vec<u8>)>,
+    /// Arrival, and the stamp that the host's kernel gives it; sender; bytes.
+    to_host: VecDeque<(i64, i64, SocketAddrV4, Vec<u8>)>,
     held: Vec<Vec<u8>>,
     old: Vec<u8>,
     travel_ns: i64,
@@ -126,6 +131,8 @@ impl Net {
     pub fn new(seed: u64, kind: ServerKind) -> Result<Self, String> {
         Ok(Self {
             now: 0,
+            host_lag: 0,
+            wall_ahead: 1_800_000_000_000_000_000,
             server: server(&kind, seed)?,
             kind,
             seed,
@@ -271,7 +278,7 @@ impl Net {
             return;
         }
         let place = self.to_host.partition_point(|d| d.0 <= at);
-        self.to_host.insert(place, (at, from, bytes));
+        self.to_host.insert(place, (at, at + self.wall_ahead, from, bytes));
     }
 
     fn receive(&mut self, buffer: &mut [u8]) -> Option<Arrival> {
@@ -279,10 +286,10 @@ impl Net {
         if *at > self.now {
             return None;
         }
-        let (_, from, mut bytes) = self.to_host.pop_front()?;
+        let (_, stamp, from, mut bytes) = self.to_host.pop_front()?;
         let len = bytes.len().min(buffer.len());
         buffer[..len].copy_from_slice(&bytes[..len]);
-        let arrival = Arrival { len, from, kernel_ns: None, cut: bytes.len() > buffer.len() };
+        let arrival = Arrival { len, from, kernel_ns: Some(stamp), cut: bytes.len() > buffer.len() };
         bytes.clear();
         if self.spare.len() < 64 {
             self.spare.push(bytes);
@@ -329,6 +336,11 @@ impl Datagrams for SimSocket {
 
     fn keep_all(&self) -> io::Result<()> {
         Ok(())
+    }
+
+    fn realtime_offset_ns(&self, _: &dyn HostClock) -> i64 {
+        let net = lock(&self.0);
+        -net.host_lag - net.wall_ahead
     }
 
     fn local(&self) -> io::Result<SocketAddrV4> {

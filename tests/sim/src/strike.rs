@@ -320,6 +320,11 @@ impl World {
                 }
                 self.plan(self.t + after_ns, Action::Kill);
             }
+            K::H3 if dice.happens(0.3) => {
+                // Nothing of the rig reads the wall clock, but the kernel stamps datagrams with it.
+                lock(&self.net).wall_ahead += dice.between(-3_600, 3_600) * S;
+                return self.lasts(kind, MS, Undo::Nothing);
+            }
             K::H3 => {
                 let ns = dice.decades(50, 3_000) * MS;
                 self.frozen_until = self.t + ns;
@@ -451,6 +456,9 @@ impl World {
             Undo::Heat => {
                 self.projector.set_faults(HostTime(self.t), 0);
                 self.see_light();
+                if let Some(own) = &mut self.aside {
+                    own.set_faults(HostTime(self.t), 0);
+                }
             }
             Undo::Disk => {
                 let mut disk = lock(&self.disk);

@@ -244,6 +244,7 @@ impl World {
         let lag = self.lag.load(Ordering::Relaxed) + more;
         self.lag.store(lag, Ordering::Relaxed);
         lock(&self.cable).host_lag = lag;
+        lock(&self.net).host_lag = lag;
     }
 
     /// What the rig is doing.

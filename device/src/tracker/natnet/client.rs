@@ -10,12 +10,14 @@ use super::wire::{id, split, Version, MAX_DATAGRAM};
 use crate::clock_map::ClockMap;
 use crate::pose::Pose;
 use crate::time::{HostClock, HostTime};
-use crate::tracker::udp::{realtime_offset_ns, Arrival, Datagrams, UdpPort};
+use crate::tracker::udp::{Arrival, Datagrams, UdpPort};
 use crate::tracker::{BodyIndex, BodyKey, SampleGate, Tracker, TrackerCounters, TrackerError, TrackerSample};
 use std::net::{Ipv4Addr, SocketAddrV4};
 use std::sync::Arc;
 
 const MS: i64 = 1_000_000;
+/// A client that was not polled for this long does not know when unstamped datagrams arrived.
+const AWAY_NS: i64 = 20 * MS;
 /// Interval between attempts to connect.
 const CONNECT_EVERY_NS: i64 = 250 * MS;
 /// Interval between keep-alive messages (unicast servers stop after some seconds without).
@@ -133,6 +135,9 @@ pub struct NatNetClient {
     connects_sent: u64,
     version_changes: u64,
     is_filtered: bool,
+    polled_at: Option<HostTime>,
+    /// The arrival of the datagram that is being read is known.
+    is_arrival_known: bool,
     /// Bit stream that was requested and is not confirmed yet.
     asked: Option<Version>,
     refused: Option<Version>,
@@ -237,6 +242,8 @@ impl NatNetClient {
             version_changes: 0,
             asked: None,
             is_filtered: false,
+            polled_at: None,
+            is_arrival_known: true,
             refused: None,
         }
     }
@@ -588,7 +595,7 @@ impl NatNetClient {
         at: HostTime,
         sink: &mut dyn FnMut(&TrackerSample),
     ) -> usize {
-        let captured_at = self.server_clock.captured_at(info, at);
+        let captured_at = self.server_clock.captured_at(info, at, self.is_arrival_known);
         let mut delivered = 0;
         for body in bodies {
             let Ok(found) = self.lookup.binary_search_by_key(&body.id, |(id, _)| *id) else {
@@ -628,6 +635,9 @@ enum Verdict {
 impl Tracker for NatNetClient {
     fn poll(&mut self, now: HostTime, sink: &mut dyn FnMut(&TrackerSample)) -> Result<usize, TrackerError> {
         self.housekeeping(now);
+        // What arrived while nobody read has an unknown arrival, unless the kernel stamped it.
+        let was_away = self.polled_at.is_some_and(|at| now.ns_since(at) > AWAY_NS);
+        self.polled_at = Some(now);
         let foreign = |c: &TrackerCounters| (c.packets.foreign_source, c.packets.foreign_port);
         let before = foreign(self.gate.counters());
         let (mut delivered, mut budget, mut offset) = (0, Self::MAX_DATAGRAMS_PER_POLL, None);
@@ -648,9 +658,11 @@ impl Tracker for NatNetClient {
                 is_crowded |= share == 0;
                 budget -= 1;
                 let here = self.clock.now();
+                self.is_arrival_known = !was_away;
                 let at = match arrival.kernel_ns.filter(|_| self.config.kernel_stamps) {
                     Some(stamp) => {
-                        let offset = *offset.get_or_insert_with(|| realtime_offset_ns(&*self.clock));
+                        self.is_arrival_known = true;
+                        let offset = *offset.get_or_insert_with(|| port.realtime_offset_ns(&*self.clock));
                         let stamped = HostTime(stamp.saturating_add(offset)).min(here);
                         // A very old stamp comes from a stepped wall clock, not from the arrival.
                         if here.ns_since(stamped) > 10_000 * MS {

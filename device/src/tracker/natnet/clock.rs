@@ -109,8 +109,9 @@ impl ServerClock {
     }
 
     /// Middle of the exposure of a frame that arrived `at`: through the map if there is one, otherwise arrival less the
-    /// server's own latency, which leaves out only the network delay.
-    pub(super) fn captured_at(&mut self, info: &FrameInfo, at: HostTime) -> HostTime {
+    /// server's own latency, which leaves out only the network delay. An arrival that is not known (`is_known`: the
+    /// datagram may have waited in its socket) contradicts nothing.
+    pub(super) fn captured_at(&mut self, info: &FrameInfo, at: HostTime, is_known: bool) -> HostTime {
         let has_stamps = info.mid_exposure != 0 && info.transmit >= info.mid_exposure && self.hz > 0;
         if !has_stamps {
             return at;
@@ -126,7 +127,7 @@ impl ServerClock {
         };
         // Sent after it arrived, or half a second in transit: the server's clock has changed. Restart its map.
         let transport_ns = at.ns_since(sent.at);
-        if transport_ns < -sent.uncertainty_ns - MS || transport_ns > WORST_TRANSPORT_NS {
+        if transport_ns < -sent.uncertainty_ns - MS || is_known && transport_ns > WORST_TRANSPORT_NS {
             self.doubts += 1;
             self.restart(at);
             return plain;

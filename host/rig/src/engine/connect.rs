@@ -48,6 +48,8 @@ pub const ENDED_WITH_THE_LAST_RUN: u32 = faults::WATCHDOG | faults::CHECKSUM_STO
 pub(crate) struct Connecting {
     acknowledged: u32,
     begin: HostTime,
+    /// The session to which the exchanges belong: a projector that lost power starts its clock anew.
+    session: u64,
     /// The exchange with the shortest round trip, and that round trip in nanoseconds.
     best: Option<(i64, EchoSample)>,
     echoes: usize,
@@ -58,7 +60,8 @@ impl Connecting {
     /// Begins to connect at `now`.
     pub(crate) fn begin(link: &mut HostLink, acknowledged: u32, now: HostTime) -> Self {
         link.connect();
-        Self { acknowledged, begin: now, best: None, echoes: 0, is_safe: false }
+        let session = link.counters().sessions;
+        Self { acknowledged, begin: now, session, best: None, echoes: 0, is_safe: false }
     }
 
     /// Continues at `now`. `stop`: light is no longer wanted. Returns `None` while the link is not up yet.
@@ -74,6 +77,10 @@ impl Connecting {
         stop: bool,
     ) -> Result<Option<LinkTime>, ConnectError> {
         let state = link.poll(now, transport)?;
+        if link.counters().sessions != self.session {
+            self.session = link.counters().sessions;
+            (self.best, self.echoes) = (None, 0);
+        }
         link.take_echoes(|e| {
             self.echoes += 1;
             let round_trip = e.host_received_at.ns_since(e.host_sent_at);

@@ -16,6 +16,9 @@ use std::sync::Arc;
 /// How long trackers are read before the first frame, so that the filters know the motion, nanoseconds.
 pub(crate) const LISTEN_NS: i64 = 150_000_000;
 
+/// No frame is planned for a slot that is further ahead than the lead and this time, nanoseconds.
+const FAR_NS: i64 = 1_000_000_000;
+
 /// The next frame: its slot, and when to read its poses.
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct Latch {
@@ -82,7 +85,11 @@ impl<P: Pace> PlanStage<P> {
     /// Chooses the slot of the next frame at `now`. `None` if that slot lies beyond the end of the run.
     pub(crate) fn choose_slot(&mut self, time: &LinkTime, now: HostTime) -> Option<Latch> {
         let leads = P::leads(&self.facts, self.is_slow());
-        self.next_slot = self.next_slot.max(time.slot_after(now.plus_ns(leads.needed_ns)));
+        let first = time.slot_after(now.plus_ns(leads.needed_ns));
+        // A slot far ahead was chosen by a map of the projector's clock that has since been corrected.
+        let ahead = self.next_slot.saturating_sub(first) as i64;
+        let is_ahead = ahead.saturating_mul(self.slot_ns) > leads.lead_ns.saturating_add(FAR_NS);
+        self.next_slot = if is_ahead { first } else { self.next_slot.max(first) };
         if self.is_complete() {
             return None;
         }
