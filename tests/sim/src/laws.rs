@@ -96,6 +96,8 @@ pub struct Laws {
     rested_until: i64,
     /// A hang has been found by then.
     hidden_until: i64,
+    /// The operator was told that the body is dark, and not yet that it has light again.
+    is_told: bool,
     /// Since then the light has been gone without a word to the operator.
     wordless_since: i64,
     /// The worst age of a pose at its first photon, as a share of what is allowed, in thousandths.
@@ -143,6 +145,7 @@ impl Laws {
             thawed_at: -S,
             rested_until: 0,
             hidden_until: 0,
+            is_told: false,
             wordless_since: 0,
             worst_age_milli: 0,
             slowest_return_ns: 0,
@@ -199,7 +202,7 @@ impl Laws {
     pub fn started(&mut self, t: i64, is_calm: bool) {
         (self.stopped_at, self.died_at) = (None, None);
         self.started_at = t;
-        self.crews = 1;
+        (self.crews, self.is_told) = (1, false);
         self.starts_in_calm += u32::from(is_calm);
         self.process += 1;
         if self.starts_in_calm > 4 {
@@ -360,6 +363,12 @@ impl Laws {
         self.remember(beneath);
         let Some(frame) = event.frame else { return };
         let sent = self.sent[frame as usize % REMEMBERED].clone();
+        // A frame of the process before may still wait in the projector until its watchdog bites.
+        let is_old = sent.process + 1 == self.process && at - self.started_at < self.watchdog_ns + self.slot_ns;
+        if sent.frame == frame && is_old {
+            self.showing = Some(sent);
+            return;
+        }
         if sent.frame != frame || sent.process != self.process {
             return self.fail(at, format!("frame {frame} is lit, and this process has not sent it lately"));
         }
@@ -510,7 +519,12 @@ impl Laws {
             // It cannot say anything.
             self.wordless_since = t;
         }
-        let has_word = !process.monitor.take_notes().is_empty()
+        let notes = process.monitor.take_notes();
+        for note in &notes {
+            self.is_told = note.contains("is dark:") || self.is_told && !note.contains("has light again");
+        }
+        let has_word = !notes.is_empty()
+            || self.is_told
             || process.health() != ProjectorHealth::Up
             || !process.run.is_running()
             || process.is_stopping;
@@ -521,7 +535,7 @@ impl Laws {
         if self.wordless_since == i64::MAX && t - self.good_at < 200 * MS {
             self.wordless_since = t;
         }
-        if self.wordless_since != i64::MAX && t - self.wordless_since.max(self.good_at) > 1_500 * MS {
+        if self.wordless_since != i64::MAX && t > self.hidden_until + 500 * MS && t - self.wordless_since.max(self.good_at) > 1_500 * MS {
             self.fail(t, "no light for 1.5 s, the projector is called up, and no note says why".into());
         }
     }

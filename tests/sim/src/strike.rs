@@ -248,9 +248,9 @@ impl World {
                 self.lasts(kind, MS, Undo::Nothing);
             }
             K::U11 => {
-                self.projector.shift_clock(now, dice.decades(10_000, 3_000_000_000) as u64);
+self.laws.clock_moved(self.t);
+                                self.projector.shift_clock(now, dice.decades(10_000, 3_000_000_000) as u64);
                 self.see_light();
-                self.laws.clock_moved(self.t);
                 self.lasts(kind, MS, Undo::Nothing);
             }
             K::U12 => {
@@ -280,11 +280,13 @@ impl World {
             K::G5 => {
                 beneath.gpu_traps.push_back(GpuTrap::Hangs);
                 lasts_ns = GPU_FOUND_NS;
+                self.laws.hidden_until(self.t + GPU_FOUND_NS);
             }
             K::G6 => {
                 let ns = dice.between(300, 1_500) * MS;
                 beneath.gpu_traps.push_back(GpuTrap::Late(ns));
                 lasts_ns += ns;
+                self.laws.hidden_until(self.t + lasts_ns);
             }
             K::G7 => beneath.gpu_traps.push_back(GpuTrap::Late(slot_ns * dice.between(1, 4))),
             _ => {}

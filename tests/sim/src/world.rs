@@ -156,15 +156,18 @@ pub struct World {
     pub is_loud: bool,
 }
 
+/// The folder of the scene.
+const ASSETS: &str = concat!(env!("CARGO_MANIFEST_DIR"), "/assets");
+
 fn rig_of(setup: &Setup, acknowledges: bool) -> Result<Rig, String> {
     let predict = setup.predict_ms.map_or(String::new(), |ms| format!("predict_ms = {ms}\n"));
     let text = format!(
         "[tracker]\nkind = \"natnet\"\nserver = \"10.0.0.2\"\nlocal = \"10.0.0.1\"\nrate_hz = {}\n\
          [projector]\nwidth = {}\nheight = {}\nplanes = {}\nframe_rate = {}\nbackend = {{ kind = \"usb\" }}\n\
-         [[scene.bodies]]\nname = \"a\"\n[safety]\nacknowledge_faults = {acknowledges}\n{predict}",
+         [scene]\nfile = \"triangle.gltf\"\n[[scene.bodies]]\nname = \"a\"\n[safety]\nacknowledge_faults = {acknowledges}\n{predict}",
         setup.tracker_hz, RASTER.0, RASTER.1, setup.planes, setup.rate_hz
     );
-    let config = RigConfig::parse("simulated.toml", &text, Path::new(""), &Overrides::default())
+    let config = RigConfig::parse("simulated.toml", &text, Path::new(ASSETS), &Overrides::default())
         .map_err(|e| e.to_string())?;
     Rig::build(&config, None).map_err(|e| e.to_string())
 }
@@ -611,6 +614,9 @@ impl World {
         let calm_for = if self.is_calm() && self.episode.is_none() { self.t - self.calm_since } else { -1 };
         if calm_for < 0 {
             self.calm_since = self.calm_since.max(self.t);
+        }
+        if !self.is_quiet() {
+            self.laws.disturbed(self.t);
         }
         let (crew_ready, crews) = {
             let beneath = lock(&self.beneath);

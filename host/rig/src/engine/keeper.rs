@@ -72,6 +72,11 @@ impl LinkKeeper {
         }
     }
 
+    /// The projector's slots on the host's clock.
+    pub(crate) fn time(&self) -> &LinkTime {
+        &self.time
+    }
+
     /// True if the projector is outside this process, so that its reports are the only source for its light.
     pub(crate) fn has_reports(&self) -> bool {
         self.reports.is_some()
