@@ -233,8 +233,11 @@ impl HostLink {
             self.connect();
         }
         if self.is_left_alone(now) {
-            // The device listens to another host, or its answers do not arrive: no frame can be lit any more.
+            // The device listens to another host, or its answers do not arrive: no frame can be lit any more. An order
+            // to go dark that it has not confirmed stays in force.
+            let unconfirmed = self.verb.filter(|verb| verb.is_dark());
             self.connect();
+            self.verb = unconfirmed;
         }
         if self.rest.is_some_and(|(end, _)| now >= end) && self.state == LinkState::Streaming {
             self.rest = None;
@@ -251,14 +254,11 @@ impl HostLink {
         Ok(self.state)
     }
 
-    /// True if the device has fallen silent. An order to go dark that is not confirmed is repeated instead.
+    /// True if the device has fallen silent.
     fn is_left_alone(&self, now: HostTime) -> bool {
         let heard_at = self.inbox.heard_at;
         let silent_ns = SILENT_NS.max(2_000 * i64::from(self.settings.watchdog_us));
-        self.state != LinkState::Greeting
-            && self.verb.is_none()
-            && heard_at.0 != i64::MIN
-            && now.ns_since(heard_at) > silent_ns
+        self.state != LinkState::Greeting && heard_at.0 != i64::MIN && now.ns_since(heard_at) > silent_ns
     }
 
     fn receive(&mut self, now: HostTime, transport: &mut dyn Transport) -> Result<(), TransportError> {

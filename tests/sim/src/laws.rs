@@ -364,7 +364,8 @@ impl Laws {
         let Some(frame) = event.frame else { return };
         let sent = self.sent[frame as usize % REMEMBERED].clone();
         // A frame of the process before may still wait in the projector until its watchdog bites.
-        let is_old = sent.process + 1 == self.process && at - self.started_at < self.watchdog_ns + self.slot_ns;
+        let is_old =
+            sent.process + 1 == self.process && at - self.started_at < self.watchdog_ns + self.slot_ns;
         if sent.frame == frame && is_old {
             self.showing = Some(sent);
             return;
@@ -535,7 +536,10 @@ impl Laws {
         if self.wordless_since == i64::MAX && t - self.good_at < 200 * MS {
             self.wordless_since = t;
         }
-        if self.wordless_since != i64::MAX && t > self.hidden_until + 500 * MS && t - self.wordless_since.max(self.good_at) > 1_500 * MS {
+        if self.wordless_since != i64::MAX
+            && t > self.hidden_until + 500 * MS
+            && t - self.wordless_since.max(self.good_at) > 1_500 * MS
+        {
             self.fail(t, "no light for 1.5 s, the projector is called up, and no note says why".into());
         }
     }

@@ -18,6 +18,7 @@ dpm-sim: a simulated world around the rig, with every fault in every state
   --minutes M     end after so many minutes of real time
   --table FILE    write the table of kinds and states there, as Markdown
   --loud          print everything that happens
+  --first         end with the first seed that breaks a law
   --no-shrink     do not shrink a seed that breaks a law
   --json          the last line is a JSON object
 ";
@@ -32,6 +33,7 @@ struct Wish {
     minutes: Option<f64>,
     table: Option<String>,
     is_loud: bool,
+    is_first: bool,
     shrinks: bool,
     json: bool,
 }
@@ -47,6 +49,7 @@ fn wish() -> Result<Wish, String> {
         minutes: None,
         table: None,
         is_loud: false,
+        is_first: false,
         shrinks: true,
         json: false,
     };
@@ -70,6 +73,7 @@ fn wish() -> Result<Wish, String> {
             "--minutes" => wish.minutes = Some(number(&value()?)?),
             "--table" => wish.table = Some(value()?),
             "--loud" => wish.is_loud = true,
+            "--first" => wish.is_first = true,
             "--no-shrink" => wish.shrinks = false,
             "--json" => wish.json = true,
             "--help" | "-h" => return Err(HELP.into()),
@@ -152,6 +156,9 @@ fn run() -> Result<bool, String> {
         if lived.broken.is_some() {
             let told = report(&lived, &order, wish.shrinks && wish.until.is_none())?;
             sum.failures.push(format!("{seed}: {told}"));
+            if wish.is_first {
+                break;
+            }
         }
         if wish.until.is_some() {
             lived.story.iter().for_each(|line| println!("{line}"));

@@ -248,8 +248,8 @@ impl World {
                 self.lasts(kind, MS, Undo::Nothing);
             }
             K::U11 => {
-self.laws.clock_moved(self.t);
-                                self.projector.shift_clock(now, dice.decades(10_000, 3_000_000_000) as u64);
+                self.laws.clock_moved(self.t);
+                self.projector.shift_clock(now, dice.decades(10_000, 3_000_000_000) as u64);
                 self.see_light();
                 self.lasts(kind, MS, Undo::Nothing);
             }
@@ -450,6 +450,7 @@ self.laws.clock_moved(self.t);
                 if let Some(own) = self.aside.take() {
                     self.pull();
                     self.projector = own;
+                    self.laws.acknowledged();
                     self.projector.advance_to(HostTime(self.t));
                     self.see_light();
                     lock(&self.cable).push_in();
