@@ -48,8 +48,8 @@ impl Draws {
     /// Standard normal by Box-Muller; uses indices `2 * index` and `2 * index + 1`.
     pub fn normal(self, index: u64) -> f64 {
         // 1 - u is in (0, 1], so the logarithm is finite; largest magnitude 8.6.
-        let radius = (-2.0 * (1.0 - self.unit(2 * index)).ln()).sqrt();
-        radius * (core::f64::consts::TAU * self.unit(2 * index + 1)).cos()
+        let radius = (-2.0 * libm::log(1.0 - self.unit(2 * index))).sqrt();
+        radius * libm::cos(core::f64::consts::TAU * self.unit(2 * index + 1))
     }
 
     /// Three independent standard normals; uses normals `3 * index` to `3 * index + 2`.

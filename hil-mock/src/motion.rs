@@ -264,7 +264,7 @@ impl Part {
 /// Sine and cosine of `2 pi t / period`, and the angular frequency in rad/s.
 fn phase(t_ns: i64, period_ns: i64) -> (f64, f64, f64) {
     let angle = core::f64::consts::TAU * (t_ns.rem_euclid(period_ns) as f64 / period_ns as f64);
-    (angle.sin(), angle.cos(), core::f64::consts::TAU / (period_ns as f64 * 1e-9))
+    (libm::sin(angle), libm::cos(angle), core::f64::consts::TAU / (period_ns as f64 * 1e-9))
 }
 
 /// Position and speed on the line. One cycle from its middle: half a stretch, a turn, a stretch back, a turn, half a stretch.
@@ -292,7 +292,7 @@ fn line_at(t_ns: i64, speed: f64, half_stretch_ns: i64, turn_ns: i64, rest_ns: i
 }
 
 fn rotate_about(axis: [f64; 3], angle: f64, rate: f64, pivot: [f64; 3], pose: &mut Pose, twist: &mut Twist) {
-    let (sin, cos) = (0.5 * angle).sin_cos();
+    let (sin, cos) = libm::sincos(0.5 * angle);
     let q = [axis[0] * sin, axis[1] * sin, axis[2] * sin, cos];
     let arm = rotate(q, sub(pose.position_m, pivot));
     let omega = scale(axis, rate);
@@ -368,8 +368,8 @@ pub(crate) fn rotate(q: [f64; 4], v: [f64; 3]) -> [f64; 3] {
 /// The quaternion of the rotation by the vector `r` (axis times angle, radians), exact at 0 too.
 pub(crate) fn from_rotation_vector(r: [f64; 3]) -> [f64; 4] {
     let angle = (r[0] * r[0] + r[1] * r[1] + r[2] * r[2]).sqrt();
-    let k = if angle > 1e-9 { (0.5 * angle).sin() / angle } else { 0.5 };
-    [r[0] * k, r[1] * k, r[2] * k, (0.5 * angle).cos()]
+    let k = if angle > 1e-9 { libm::sin(0.5 * angle) / angle } else { 0.5 };
+    [r[0] * k, r[1] * k, r[2] * k, libm::cos(0.5 * angle)]
 }
 
 #[cfg(test)]

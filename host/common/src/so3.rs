@@ -13,8 +13,8 @@ pub fn so3_exp(w: DVec3) -> DQuat {
     let angle = w.length();
     let half = 0.5 * angle;
     // sin(angle / 2) / angle, which is 1/2 at 0.
-    let scale = if angle < 1e-4 { 0.5 - angle * angle / 48.0 } else { half.sin() / angle };
-    DQuat::from_xyzw(w.x * scale, w.y * scale, w.z * scale, half.cos())
+    let scale = if angle < 1e-4 { 0.5 - angle * angle / 48.0 } else { libm::sin(half) / angle };
+    DQuat::from_xyzw(w.x * scale, w.y * scale, w.z * scale, libm::cos(half))
 }
 
 /// The rotation vector of a unit quaternion, rad, length at most pi. `q` and `-q` give the same vector, except at exactly
@@ -27,7 +27,7 @@ pub fn so3_log(q: DQuat) -> DVec3 {
         // angle / s = 2 / w to second order.
         return v * (2.0 / w);
     }
-    v * (2.0 * s.atan2(w) / s)
+    v * (2.0 * libm::atan2(s, w) / s)
 }
 
 /// The world-space rotation vector that leads from `from` to `to` along the shorter way.

@@ -192,12 +192,12 @@ impl MotionModel {
         }
         let w = self.swing_rad_s;
         let x = w * h;
-        let (sin, cos) = x.sin_cos();
+        let (sin, cos) = libm::sincos(x);
         // (1 - cos x) / w^2 by the half angle: no cancellation; both quotients have their limits at w = 0.
         let (first, second) = if x.abs() < 1e-8 {
             (h, 0.5 * h * h)
         } else {
-            let half = (0.5 * x).sin();
+            let half = libm::sin(0.5 * x);
             (sin / w, 2.0 * half * half / (w * w))
         };
         Transition { p: [1.0, first, second], v: [0.0, cos, first], a: [0.0, -w * sin, cos] }
@@ -356,9 +356,9 @@ impl AxisBank {
         if i == RECALLED && !recalls {
             return config.leave_to[i][j];
         }
-        let stays = (-h / config.dwell_s[i]).exp();
+        let stays = libm::exp(-h / config.dwell_s[i]);
         let among = if i == j { stays } else { (1.0 - stays) * config.leave_to[i][j] };
-        match (recalls && i != RECALLED, (-h / config.recall_after_s).exp()) {
+        match (recalls && i != RECALLED, libm::exp(-h / config.recall_after_s)) {
             (true, stays) if j == RECALLED => 1.0 - stays,
             (true, stays) => among * stays,
             (false, _) => among,
@@ -409,7 +409,7 @@ impl AxisBank {
         for (mode, log_l) in self.modes.iter_mut().zip(&mut log_likelihood) {
             let innovation = z - mode.offset;
             let s = (mode.covariance.pp + r).max(f64::MIN_POSITIVE);
-            *log_l = -0.5 * (innovation * innovation / s + s.ln());
+            *log_l = -0.5 * (innovation * innovation / s + libm::log(s));
             let (covariance, [kp, kv, ka]) = mode.covariance.updated(r);
             mode.covariance = covariance;
             mode.offset += innovation * kp;
@@ -420,7 +420,7 @@ impl AxisBank {
         let best = possible.map(|(l, _)| *l).fold(f64::NEG_INFINITY, f64::max);
         let mut total = 0.0;
         for (p, log_l) in self.probability.iter_mut().zip(log_likelihood) {
-            *p = if *p > 0.0 { *p * (log_l - best).exp() } else { 0.0 };
+            *p = if *p > 0.0 { *p * libm::exp(log_l - best) } else { 0.0 };
             total += *p;
         }
         if total > 0.0 && total.is_finite() {

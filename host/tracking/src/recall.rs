@@ -240,10 +240,10 @@ impl<C: Chart> Recall<C> {
             return;
         };
         let (across, later) = Self::mismatch(&past.motion, z, sigma);
-        *lag = lag.saturating_sub(((1.0 - (-since_s / FOLLOW_S).exp()) * later * 1e9) as i64);
+        *lag = lag.saturating_sub(((1.0 - libm::exp(-since_s / FOLLOW_S)) * later * 1e9) as i64);
         let shift = later / SHIFT_S;
         let misfit = (across + shift * shift).min(WORST_MISFIT);
-        self.misfit += (1.0 - (-since_s / MISFIT_S).exp()) * (misfit - self.misfit);
+        self.misfit += (1.0 - libm::exp(-since_s / MISFIT_S)) * (misfit - self.misfit);
         if self.misfit > 1.0 {
             self.lag_ns = None;
         }
