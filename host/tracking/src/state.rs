@@ -55,8 +55,8 @@ impl TrackState {
     pub fn predict(&self, at: HostTime) -> PosePrediction {
         let horizon_ns = at.ns_since(self.captured_at);
         let h = horizon_ns.clamp(-self.lost_after_ns, self.lost_after_ns) as f64 * 1e-9;
-        let position = self.position.point_at::<Translations>(h);
-        let rotation = self.rotation.point_at::<Rotations>(h);
+        let position = self.position.point_after::<Translations>(h);
+        let rotation = self.rotation.point_after::<Rotations>(h);
         let freshness = if horizon_ns > self.lost_after_ns {
             Freshness::Lost
         } else if horizon_ns > self.tracked_for_ns {

@@ -56,6 +56,7 @@ pub fn live(order: &Order) -> Result<Lived, String> {
     let setup = Setup::of(order.seed, order.rate_hz);
     let mut world = World::new(setup.clone())?;
     world.is_loud = order.is_loud;
+    world.laws.is_loud = order.is_loud;
     let mut episodes = Episodes::new(order.seed);
     let mut faults = Vec::new();
     let mut next = episodes.next_episode();

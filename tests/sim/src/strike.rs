@@ -331,12 +331,14 @@ impl World {
                 let ns = dice.decades(50, 3_000) * MS;
                 self.frozen_until = self.t + ns;
                 self.lag_by(ns);
+                self.laws.pauses(self.t, ns);
                 self.laws.clock_moved(self.t + ns);
                 return self.lasts(kind, ns, Undo::Nothing);
             }
             K::X6 => {
                 let ns = dice.decades(5, 2_000) * MS;
                 self.frozen_until = self.frozen_until.max(self.t + ns);
+                self.laws.pauses(self.t, ns);
                 return self.lasts(kind, ns, Undo::Nothing);
             }
             K::H5 => self.trap(stage, Trap::Panics),

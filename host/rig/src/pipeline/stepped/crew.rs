@@ -156,7 +156,14 @@ impl Crew {
     /// What the tracker's client says of itself.
     pub(super) fn tracker_status(&self) -> String {
         let time = self.tracking.newest();
-        format!("{}; newest {time:?}", self.tracking.status())
+        let plan = match &self.planning {
+            Planning::Free { at } => format!("free at {}", at.0),
+            Planning::Latched { at, latch, .. } => format!("latched {latch:?} at {}", at.0),
+            Planning::Submits { at, .. } => format!("submits at {}", at.0),
+            Planning::Gone => "gone".into(),
+        };
+        let (free, gpu) = (self.free.len(), self.gpu.len());
+        format!("{}; newest {time:?}; plan {plan}, {free} free, {gpu} on the GPU", self.tracking.status())
     }
 
     /// Frames in progress.
