@@ -2,9 +2,11 @@
 //! only system calls are those that wait, wake and read the time. The frames are prepared, and the mock projector is in
 //! this process; tests/tests/frame_path_vulkan.rs and its neighbours hold the law with drivers, cables and sockets.
 #![cfg(all(target_os = "linux", target_arch = "x86_64"))]
+#![allow(unsafe_code)]
 
 mod frame_law;
 
+use dpm_handoff::path::{self, Lock, Place};
 use dpm_rig::pipeline::{run_prepared, RunOptions};
 use dpm_rig::telemetry::monitor::RunMonitor;
 use dpm_tests::rigs::demo_rig;
@@ -37,4 +39,39 @@ fn a_hundred_thousand_frames_only_wait_and_wake() {
     });
     assert_eq!(planned, RIGS * FRAMES);
     frame_law::seen().check(&[], &[]);
+    what_breaks_the_law_is_seen();
+}
+
+/// The watch itself: an allocation, a lock and a system call of our own on the frame path, each planted here, fail the
+/// check; those of a library do not count as ours, but only what is listed for it passes.
+fn what_breaks_the_law_is_seen() {
+    let fails = |named: &[(&str, &[&str])], libraries: &[(Place, &[&str])]| {
+        std::panic::catch_unwind(|| frame_law::seen().check(named, libraries)).is_err()
+    };
+    let on_the_path = |plant: &(dyn Fn() + Sync)| {
+        std::thread::scope(|scope| {
+            scope.spawn(|| {
+                path::enter(true);
+                plant();
+                path::enter(false);
+            });
+        });
+    };
+    let getpid: [&str; 1] = ["getpid"];
+    let call = || {
+        // SAFETY: takes no arguments.
+        let _ = unsafe { libc::getpid() };
+    };
+    assert!(!fails(&[], &[]));
+    on_the_path(&|| path::within(Place::Vulkan, call));
+    assert!(fails(&[], &[]) && fails(&[("other", &getpid)], &[]) && !fails(&[], &[(Place::Vulkan, &getpid)]));
+    on_the_path(&call);
+    assert!(fails(&[], &[(Place::Vulkan, &getpid)]), "a system call of our own");
+    let named = || fails(&[("other", &["getpid", "memory"])], &[(Place::Vulkan, &getpid)]);
+    on_the_path(&|| drop(std::hint::black_box(Box::new(1u64))));
+    assert!(fails(&[("other", &getpid)], &[(Place::Vulkan, &getpid)]), "an allocation");
+    assert!(!named());
+    let lock = Lock::new(());
+    on_the_path(&|| drop(lock.lock()));
+    assert!(named(), "a lock");
 }

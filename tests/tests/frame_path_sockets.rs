@@ -8,13 +8,16 @@ mod link_common;
 
 use dpm_device::time::{FrameRate, HostClock, HostTime};
 use dpm_handoff::path::Place;
+use dpm_rig::config::{Overrides, RigConfig};
+use dpm_rig::rig::Rig;
 use hil_mock::motion::{Motion, MotionSpec};
 use hil_mock::natnet_host::NatNetHost;
 use hil_mock::natnet_server::{NatNetServer, NatNetServerConfig, Streaming, UnicastTo};
 use hil_mock::projector::MockConfig;
 use hil_mock::tracker::{MockTrackerConfig, SampleSource};
-use link_common::{raster, rig, start, Projector, PtyProjector};
+use link_common::{raster, start, Projector, PtyProjector};
 use std::net::{Ipv4Addr, SocketAddrV4};
+use std::path::Path;
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
@@ -26,8 +29,7 @@ const TRACKING: [&str; 2] = ["recvmsg", "sendto"];
 
 /// A server of the demo's bodies at 500 Hz.
 fn natnet() -> NatNetHost {
-    let config =
-        NatNetServerConfig { data_port: 0, ..NatNetServerConfig::new(&["bunny", "venus"]) };
+    let config = NatNetServerConfig { data_port: 0, ..NatNetServerConfig::new(&["bunny", "venus"]) };
     let still = || Motion::new(&MotionSpec::Still {}, dpm_device::pose::Pose::IDENTITY).expect("no motion");
     let tracker = MockTrackerConfig { rate: FrameRate::new(500, 1).expect("a rate"), ..Default::default() };
     let source = SampleSource::new(tracker, vec![still(), still()]).expect("a source");
@@ -38,16 +40,24 @@ fn natnet() -> NatNetHost {
     NatNetHost::start(server, streaming, SocketAddrV4::new(Ipv4Addr::LOCALHOST, 0), clock).expect("a socket")
 }
 
+/// A rig of 100 frames per second with the projector `backend` and the server's poses.
+fn rig(backend: &str, command_port: u16) -> Arc<Rig> {
+    let text = format!(
+        "[projector]\nframe_rate = 100\nplanes = 8\nbackend = {backend}\n[tracker]\nkind = \"natnet\"\n\
+         server = \"127.0.0.1\"\nlocal = \"127.0.0.1\"\ncommand_port = {command_port}\n[safety]\nwatchdog_ms = 1000\n\
+         [[scene.bodies]]\nname = \"bunny\"\n[[scene.bodies]]\nname = \"venus\"\n"
+    );
+    let config = RigConfig::parse("rig.toml", &text, Path::new(""), &Overrides::default());
+    let config = config.unwrap_or_else(|e| panic!("{e}"));
+    Arc::new(Rig::build(&config, Some(raster())).unwrap_or_else(|e| panic!("{e}")))
+}
+
 #[test]
 fn frames_on_a_serial_line_and_poses_from_a_socket_make_named_calls_only() {
     frame_law::watch();
     let server = natnet();
     let far = PtyProjector::new("frame-law", MockConfig::new(raster()));
-    let tracker = format!(
-        "tracker={{ kind = \"natnet\", server = \"127.0.0.1\", command_port = {} }}",
-        server.address().port()
-    );
-    let run = start(&rig(&far.backend(""), &[&tracker]), 0);
+    let run = start(&rig(&far.backend(""), server.address().port()), 0);
     far.until(Duration::from_secs(30), "light", &mut |s| s.frames_lit >= 300);
     let report = run.stop().unwrap_or_else(|e| panic!("{e}")).report;
     assert!(server.frames_sent() > 300);

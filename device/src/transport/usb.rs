@@ -395,7 +395,8 @@ impl UsbTransport {
         }
         if device.replies_recovering && device.replies.in_flight() == 0 && !gone {
             device.replies_recovering = false;
-            gone = within(Place::Libusb, || device.handle.clear_halt(REPLIES_IN)) == Err(rusb::Error::NoDevice);
+            gone =
+                within(Place::Libusb, || device.handle.clear_halt(REPLIES_IN)) == Err(rusb::Error::NoDevice);
             for slot in 0..REPLY_DEPTH {
                 gone = gone || device.replies.submit(slot, REPLY_BYTES).is_err();
             }

@@ -58,6 +58,13 @@ pub fn within<T>(library: Place, call: impl FnOnce() -> T) -> T {
     call()
 }
 
+/// Leaves the frame path for the time of a call: for a test that stands in for the kernel.
+pub fn beside<T>(call: impl FnOnce() -> T) -> T {
+    let _back = Back(place());
+    enter(false);
+    call()
+}
+
 /// Returns to a place, also in a panic.
 struct Back(Place);
 
@@ -108,6 +115,7 @@ mod tests {
         assert_eq!(within(Place::Libusb, || within(Place::Vulkan, place)), Place::Libusb);
         let panicked = std::panic::catch_unwind(|| within(Place::Libusb, || panic!("of a library")));
         assert_eq!((panicked.is_err(), place()), (true, Place::Own));
+        assert_eq!((within(Place::Libusb, || beside(place)), place()), (Place::Beside, Place::Own));
         enter(false);
         assert_eq!(place(), Place::Beside);
         for (i, place) in Place::ALL.into_iter().enumerate() {

@@ -101,9 +101,7 @@ fn stage() -> usize {
     }
     let mut name = [0u8; 16];
     // SAFETY: the kernel writes at most 16 bytes.
-    unsafe {
-        dpm_test_gate(libc::SYS_prctl, libc::PR_GET_NAME.into(), name.as_mut_ptr() as i64, 0, 0, 0, 0)
-    };
+    unsafe { dpm_test_gate(libc::SYS_prctl, libc::PR_GET_NAME.into(), name.as_mut_ptr() as i64, 0, 0, 0, 0) };
     let end = name.iter().position(|b| *b == 0).unwrap_or(name.len());
     let found = STAGES.iter().position(|s| name[..end].strip_prefix(b"dpm-") == Some(s.as_bytes()));
     let stage = found.unwrap_or(STAGES.len() - 1);
