@@ -21,8 +21,7 @@ pub(super) fn page(flight: &Flight) -> String {
         zero.0 as f64 * 1e-9
     );
     let _ = writeln!(text, "The trace beside this page has {} frames.\n\nWhat happened", flight.frames.len());
-    let mut lines: Vec<(HostTime, String)> =
-        flight.remarks.iter().map(|(at, remark)| (*at, remark.to_string())).collect();
+    let mut lines = remarks(&flight.remarks);
     lines.extend(flight.standstills.iter().map(|gap| {
         (gap.from, format!("the machine stood still for {:.3} ms", gap.to.ns_since(gap.from) as f64 * 1e-6))
     }));
@@ -48,6 +47,25 @@ pub(super) fn page(flight: &Flight) -> String {
         row(&mut text, frame, zero, missed(frame.slot));
     }
     text
+}
+
+/// A line for each remark; consecutive slots that were missed for one cause share a line.
+fn remarks(all: &[(HostTime, Remark)]) -> Vec<(HostTime, String)> {
+    let mut lines = Vec::new();
+    let mut rest = all.iter().peekable();
+    while let Some((at, remark)) = rest.next() {
+        let Remark::Missed(first, cause) = *remark else {
+            lines.push((*at, remark.to_string()));
+            continue;
+        };
+        let mut last = first;
+        while rest.next_if(|(_, next)| *next == Remark::Missed(last + 1, cause)).is_some() {
+            last += 1;
+        }
+        let slots = format!("slots {first} to {last} missed: {}", cause.name());
+        lines.push((*at, if first == last { remark.to_string() } else { slots }));
+    }
+    lines
 }
 
 fn ms(at: HostTime, zero: HostTime) -> f64 {

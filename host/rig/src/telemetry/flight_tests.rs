@@ -59,7 +59,7 @@ fn a_miss_is_told_with_the_frames_around_it() {
     assert_eq!(count(&dir), 2);
     let page = std::fs::read_to_string(dir.join("flight-00.txt")).unwrap();
     assert!(
-        page.contains("3 missed slots, the first at 5.0") && page.contains("slot 501 missed: render"),
+        page.contains("3 missed slots, the first at 5.0") && page.contains("slots 500 to 502 missed: render"),
         "{page}"
     );
     let marked: Vec<&str> = page.lines().filter(|l| l.starts_with('*')).collect();
