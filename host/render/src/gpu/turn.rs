@@ -20,7 +20,8 @@ impl Turn {
     pub(super) fn take(&self) -> Option<Held<'_>> {
         // What the thread before did to the queue happened before this.
         let was_taken = self.taken.swap(true, Ordering::Acquire);
-        (!was_taken).then_some(Held(self))
+        // Not `then_some`: a value that is made and not returned would end the turn of the other thread.
+        (!was_taken).then(|| Held(self))
     }
 }
 
