@@ -145,7 +145,7 @@ fn where_frames_pass_no_lock_is_named_but_the_one_that_counts() {
             let code = code(&text);
             let locks =
                 |word: &&str| code.split(|c: char| c != '_' && !c.is_alphanumeric()).any(|w| w == *word);
-            if !below.contains("tests") && ["Mutex", "RwLock", "Condvar"].iter().any(|w| locks(&w)) {
+            if !below.contains("tests") && ["Mutex", "RwLock", "Condvar"].iter().any(locks) {
                 naming.push(below);
             }
         }
