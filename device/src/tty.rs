@@ -86,17 +86,20 @@ pub fn refusal(e: &serialport::Error) -> Refusal {
 }
 
 /// Makes an open port (for example of a pseudo-terminal) non-blocking: reads and writes transfer as much as is possible
-/// now, or fail with [`io::ErrorKind::WouldBlock`] or [`io::ErrorKind::TimedOut`].
+/// now, or fail with [`io::ErrorKind::WouldBlock`] or [`io::ErrorKind::TimedOut`]. Programs that this one starts do not
+/// inherit the port: one that did would keep the line open after it was closed here.
 ///
 /// # Errors
 /// The operating system's.
 pub fn never_wait(mut port: TTYPort) -> io::Result<Box<dyn SerialPort>> {
     port.set_timeout(Duration::ZERO)?;
     let descriptor = port.as_raw_fd();
-    // SAFETY: two calls on a descriptor that `port` owns and keeps open; their arguments and results are plain numbers.
+    // SAFETY: calls on a descriptor that `port` owns and keeps open; their arguments and results are plain numbers.
     let set = unsafe {
         let flags = libc::fcntl(descriptor, libc::F_GETFL);
-        flags >= 0 && libc::fcntl(descriptor, libc::F_SETFL, flags | libc::O_NONBLOCK) >= 0
+        flags >= 0
+            && libc::fcntl(descriptor, libc::F_SETFL, flags | libc::O_NONBLOCK) >= 0
+            && libc::fcntl(descriptor, libc::F_SETFD, libc::FD_CLOEXEC) >= 0
     };
     if set {
         Ok(Box::new(port))
@@ -152,6 +155,22 @@ impl ControlLine {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    /// Found in use: a program that was started while a pseudo-terminal was open kept it open, so that its other end
+    /// never hung up.
+    #[test]
+    fn a_port_is_not_inherited_by_programs_that_are_started() {
+        let (ours, theirs) = TTYPort::pair().expect("a pseudo-terminal");
+        let port = never_wait(ours).expect("set");
+        let mut child = std::process::Command::new("sleep").arg("30").spawn().expect("a program");
+        drop(port);
+        let mut theirs = never_wait(theirs).expect("set");
+        let hung_up = matches!(io::Read::read(&mut theirs, &mut [0; 1]), Ok(0))
+            || io::Read::read(&mut theirs, &mut [0; 1]).is_err_and(|e| e.kind() != io::ErrorKind::TimedOut);
+        let _ = child.kill();
+        let _ = child.wait();
+        assert!(hung_up);
+    }
 
     #[test]
     fn what_is_no_port_is_told_from_what_is_not_there() {

@@ -122,6 +122,40 @@ fn the_engine_has_no_thread_no_clock_and_no_io() {
     }
 }
 
+/// Crates through which frames pass.
+const ON_THE_WAY: [&str; 6] =
+    ["device", "host/handoff", "host/common", "host/tracking", "host/render", "host/rig"];
+/// The files in them that name a lock of the standard library, and why no frame waits for it. All others use
+/// `dpm_handoff::path::Lock`, which counts where it is locked on the frame path; the tests of the frame path
+/// (`tests/tests/frame_law/`) demand that it never is.
+const LOCKS: [(&str, &str); 5] = [
+    ("device/src/dlpc900/driver.rs", "a projector that takes no frames of this path"),
+    ("host/handoff/src/path.rs", "the lock that counts"),
+    ("host/common/src/realtime/standstill.rs", "control threads and the collector"),
+    ("host/render/src/gpu/context.rs", "messages of the validation layer, which no rig loads"),
+    ("host/rig/src/control/orders.rs", "threads that serve clients"),
+];
+
+#[test]
+fn where_frames_pass_no_lock_is_named_but_the_one_that_counts() {
+    let mut naming = Vec::new();
+    for krate in ON_THE_WAY {
+        for (path, text) in sources(&root().join(krate).join("src")) {
+            let below = path.strip_prefix(root()).expect("below it").to_string_lossy().into_owned();
+            let code = code(&text);
+            let locks =
+                |word: &&str| code.split(|c: char| c != '_' && !c.is_alphanumeric()).any(|w| w == *word);
+            if !below.contains("tests") && ["Mutex", "RwLock", "Condvar"].iter().any(locks) {
+                naming.push(below);
+            }
+        }
+    }
+    naming.sort();
+    let mut listed: Vec<&str> = LOCKS.iter().map(|(path, _)| *path).collect();
+    listed.sort_unstable();
+    assert_eq!(naming, listed);
+}
+
 /// The modules at the top of a crate, and for each the modules whose names it uses.
 type Arrows = BTreeMap<String, BTreeSet<String>>;
 

@@ -13,6 +13,7 @@ mod ring;
 
 use std::sync::{Arc, OnceLock};
 
+use dpm_handoff::path::{within, Place};
 use rusb::{Context, DeviceHandle};
 
 use super::{Lane, SendError, Transport, TransportError};
@@ -310,7 +311,7 @@ impl UsbTransport {
         }
         if out.recovering && out.ring.in_flight() == 0 && !*reset_due {
             // An endpoint that cannot be cleared will fail again, which leads to a reset.
-            if handle.clear_halt(out.endpoint) == Err(rusb::Error::NoDevice) {
+            if within(Place::Libusb, || handle.clear_halt(out.endpoint)) == Err(rusb::Error::NoDevice) {
                 return Err(rusb::Error::NoDevice);
             }
             out.recovering = false;
@@ -341,7 +342,7 @@ impl UsbTransport {
         }
         self.reset_due = false;
         self.counters.resets += 1;
-        let reset = device.handle.reset();
+        let reset = within(Place::Libusb, || device.handle.reset());
         match reset {
             Ok(()) => {
                 for out in [&mut device.data, &mut device.control] {
@@ -394,7 +395,8 @@ impl UsbTransport {
         }
         if device.replies_recovering && device.replies.in_flight() == 0 && !gone {
             device.replies_recovering = false;
-            gone = device.handle.clear_halt(REPLIES_IN) == Err(rusb::Error::NoDevice);
+            gone =
+                within(Place::Libusb, || device.handle.clear_halt(REPLIES_IN)) == Err(rusb::Error::NoDevice);
             for slot in 0..REPLY_DEPTH {
                 gone = gone || device.replies.submit(slot, REPLY_BYTES).is_err();
             }

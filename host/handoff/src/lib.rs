@@ -4,6 +4,7 @@
 //! - [`ring`]: every value in order, bounded (frames, events); [`ring::exchange`] recycles buffers.
 //! - [`wake`]: waiting for either, spinning and then parking, always with a deadline.
 //! - [`channel`]: a ring whose consumer can wait for the next value, and that ends when its producer does.
+//! - [`path`]: which thread works on frames, and whose code it runs.
 //!
 //! # Example
 //!
@@ -38,6 +39,7 @@
 
 pub mod channel;
 pub mod latest;
+pub mod path;
 pub mod ring;
 mod sync;
 pub mod wake;

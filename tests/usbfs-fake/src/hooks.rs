@@ -6,8 +6,10 @@ use std::ffi::{c_char, c_int, c_ulong, c_void, CStr, CString};
 use std::mem::size_of;
 use std::os::unix::ffi::OsStrExt;
 use std::path::PathBuf;
-use std::sync::atomic::{AtomicBool, AtomicI32, Ordering};
+use std::sync::atomic::{AtomicBool, AtomicI32, AtomicU64, Ordering};
 use std::sync::{Arc, Mutex};
+
+use dpm_handoff::path;
 
 use crate::bus::{self, lock};
 use crate::file::OpenFile;
@@ -430,9 +432,25 @@ pub(crate) extern "C" fn ioctl(fd: c_int, request: c_ulong, argument: *mut c_voi
     if !is_ours(fd) || (request >> 8) & 0xff != c_ulong::from(b'U') {
         return raw::ioctl(fd, request, argument);
     }
-    let Some(file) = lock(&FILES).get(&fd).cloned() else { return fail(libc::EBADF) };
-    // SAFETY: `argument` is what libusb passes for this request.
-    unsafe { file.ioctl(request as u8, argument) }.unwrap_or_else(fail)
+    if path::place() == path::Place::Libusb {
+        IOCTLS[usize::from(request as u8)].fetch_add(1, Ordering::Relaxed);
+    }
+    // From here on this is the kernel.
+    path::beside(|| {
+        let Some(file) = lock(&FILES).get(&fd).cloned() else { return fail(libc::EBADF) };
+        // SAFETY: `argument` is what libusb passes for this request.
+        unsafe { file.ioctl(request as u8, argument) }.unwrap_or_else(fail)
+    })
+}
+
+/// Requests that libusb made on the frame path, by number.
+static IOCTLS: [AtomicU64; 256] = [const { AtomicU64::new(0) }; 256];
+
+/// Requests to usbfs that libusb made on the frame path: each with the number of its name in `linux/usbdevice_fs.h`,
+/// and how often.
+pub fn ioctls_on_frame_path() -> Vec<(u8, u64)> {
+    let counted = IOCTLS.iter().enumerate().map(|(number, n)| (number as u8, n.load(Ordering::Relaxed)));
+    counted.filter(|(_, n)| *n > 0).collect()
 }
 
 /// `close(2)`.

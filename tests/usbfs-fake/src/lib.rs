@@ -15,4 +15,4 @@ mod remote;
 mod udev;
 
 pub use bus::{plug_in, set_memory_limit_mb, Options, Socket};
-pub use hooks::root_folder;
+pub use hooks::{ioctls_on_frame_path, root_folder};

@@ -15,6 +15,7 @@ use std::sync::atomic::{AtomicBool, AtomicI64, Ordering};
 use std::sync::{Arc, OnceLock};
 use std::time::{Duration, Instant};
 
+use dpm_handoff::path::{within, Place};
 use rusb::constants as c;
 use rusb::ffi;
 use rusb::{Context, DeviceHandle, UsbContext};
@@ -100,8 +101,9 @@ extern "system" fn on_ended(transfer: *mut ffi::libusb_transfer) {
 pub(super) fn pump(context: &Context) -> Result<(), rusb::Error> {
     let none = libc::timeval { tv_sec: 0, tv_usec: 0 };
     // SAFETY: the context is alive for the borrow; libusb reads `none` only during the call; a null `completed` is allowed.
-    let rc =
-        unsafe { ffi::libusb_handle_events_timeout_completed(context.as_raw(), &none, std::ptr::null_mut()) };
+    let rc = within(Place::Libusb, || unsafe {
+        ffi::libusb_handle_events_timeout_completed(context.as_raw(), &none, std::ptr::null_mut())
+    });
     result(rc)
 }
 
@@ -190,7 +192,7 @@ impl Ring {
         s.mark.ended.store(false, Ordering::Relaxed);
         // SAFETY: transfer and buffer belong to this ring (not in flight); the buffer holds `len` bytes; both and the mark stay where
         // they are until the callback has run, see the module's documentation. A timeout of 0 means none.
-        let rc = unsafe {
+        let rc = within(Place::Libusb, || unsafe {
             ffi::libusb_fill_bulk_transfer(
                 s.transfer,
                 self.handle.as_raw(),
@@ -202,7 +204,7 @@ impl Ring {
                 0,
             );
             ffi::libusb_submit_transfer(s.transfer)
-        };
+        });
         result(rc)?;
         s.in_flight = true;
         self.order.push_back(slot);
@@ -243,7 +245,7 @@ impl Ring {
             if !s.mark.ended.load(Ordering::Acquire) {
                 // SAFETY: the transfer was submitted and its callback has not been seen to run. If it ends in the
                 // meantime, libusb answers NOT_FOUND, which is harmless.
-                unsafe { ffi::libusb_cancel_transfer(s.transfer) };
+                within(Place::Libusb, || unsafe { ffi::libusb_cancel_transfer(s.transfer) });
             }
         }
     }

@@ -5,6 +5,7 @@ use super::context::{Gpu, On as _};
 use super::error::GpuError;
 use super::pipeline::{BindingSet, ComputePipeline};
 use ash::vk;
+use dpm_handoff::path::{within, Place};
 use std::sync::Arc;
 
 /// A list of passes that the GPU runs in order. Recorded once; each submission runs it again.
@@ -60,9 +61,9 @@ impl CommandList {
         let Some(queries) = self.queries.filter(|_| !self.gpu.is_lost()) else { return 0 };
         let n = (self.stamps as usize).min(out.len());
         // SAFETY: the queries were written by the last submission, whose fence the caller waited for.
-        let ok = unsafe {
+        let ok = within(Place::Vulkan, || unsafe {
             self.gpu.device.get_query_pool_results(queries, 0, &mut out[..n], vk::QueryResultFlags::TYPE_64)
-        };
+        });
         if ok.is_err() || n == 0 {
             return 0;
         }
@@ -84,14 +85,15 @@ impl CommandList {
         fence.check_free()?;
         let buffers = [self.buffer];
         let info = [vk::SubmitInfo::default().command_buffers(&buffers)];
-        let queue = gpu.queue()?;
+        let (queue, _turn) = gpu.queue()?;
         // SAFETY: the fence is unsignalled and unused: `wait` consumed its last run.
-        unsafe {
-            gpu.device.reset_fences(&[fence.fence]).on(gpu, "resetting a fence")?;
-            // Another thread may have noticed meanwhile that the device is lost.
-            gpu.alive("submitting a frame")?;
-            gpu.device.queue_submit(*queue, &info, fence.fence).on(gpu, "submitting a frame")?;
-        }
+        within(Place::Vulkan, || unsafe { gpu.device.reset_fences(&[fence.fence]) })
+            .on(gpu, "resetting a fence")?;
+        // Another thread may have noticed meanwhile that the device is lost.
+        gpu.alive("submitting a frame")?;
+        // SAFETY: the same, and the turn at the queue is this thread's.
+        within(Place::Vulkan, || unsafe { gpu.device.queue_submit(queue, &info, fence.fence) })
+            .on(gpu, "submitting a frame")?;
         fence.pending = true;
         Ok(())
     }
@@ -275,7 +277,10 @@ impl FrameFence {
             return Ok(true);
         }
         // SAFETY: the fence is alive.
-        match unsafe { self.gpu.device.wait_for_fences(&[self.fence], true, timeout_ns) } {
+        let done = within(Place::Vulkan, || unsafe {
+            self.gpu.device.wait_for_fences(&[self.fence], true, timeout_ns)
+        });
+        match done {
             Ok(()) => {
                 self.pending = false;
                 Ok(true)

@@ -2,16 +2,17 @@
 
 use super::address_space;
 use super::error::GpuError;
+use super::turn::{Held, Turn};
 use ash::{ext, khr, vk};
 use std::ffi::{c_void, CStr, CString};
 use std::mem::ManuallyDrop;
 use std::sync::atomic::{AtomicU64, AtomicU8, Ordering};
-use std::sync::{Arc, Mutex, MutexGuard, PoisonError, TryLockError};
+use std::sync::{Arc, Mutex};
 use std::time::{Duration, Instant};
 
 /// How long to wait for the copies of a first start, nanoseconds. A slow machine may be busy with other things.
 const FIRST_SETUP_WAIT_NS: u64 = 60_000_000_000;
-/// Longest wait for a queue that another thread submits to.
+/// Longest wait for another thread's turn at the queue.
 const QUEUE_WAIT: Duration = Duration::from_secs(2);
 
 /// How to open the GPU.
@@ -86,7 +87,9 @@ unsafe extern "system" fn on_message(
 /// given. So nothing of it is freed, and its memory stays allocated until the process ends ([`memory_given_up`] returns how much).
 pub struct Gpu {
     pub(super) device: ash::Device,
-    queue: Mutex<vk::Queue>,
+    queue: vk::Queue,
+    /// Whose turn it is to submit.
+    turn: Turn,
     pub(super) queue_family: u32,
     pub(super) memory: vk::PhysicalDeviceMemoryProperties,
     pub(super) limits: vk::PhysicalDeviceLimits,
@@ -442,7 +445,8 @@ impl Gpu {
         };
         Ok(Arc::new(Self {
             device,
-            queue: Mutex::new(queue),
+            queue,
+            turn: Turn::default(),
             queue_family,
             memory,
             limits,
@@ -567,23 +571,27 @@ impl Gpu {
         self.state() == State::GivenUp
     }
 
-    /// The queue, for one submission. Only one thread submits frames, so it is free for them.
-    pub(super) fn queue(&self) -> Result<MutexGuard<'_, vk::Queue>, GpuError> {
+    /// The queue, for one submission: as long as the turn is held. In a rig one thread submits, so the turn is free.
+    pub(super) fn queue(&self) -> Result<(vk::Queue, Held<'_>), GpuError> {
+        let turn = self.turn.take().map_or_else(|| self.wait_for_turn(), Ok)?;
+        Ok((self.queue, turn))
+    }
+
+    /// Waits for another thread's submission: one of an abandoned crew, or of another renderer in a test.
+    #[cold]
+    fn wait_for_turn(&self) -> Result<Held<'_>, GpuError> {
         let begin = Instant::now();
         loop {
-            match self.queue.try_lock() {
-                Ok(queue) => return Ok(queue),
-                // A thread that panicked cannot have left a handle half changed.
-                Err(TryLockError::Poisoned(queue)) => return Ok(PoisonError::into_inner(queue)),
-                Err(TryLockError::WouldBlock) => {}
-            }
-            // Another thread may be in a call of the driver that does not return.
+            // The other thread may be in a call of the driver that does not return.
             self.alive("submitting")?;
             if begin.elapsed() >= QUEUE_WAIT {
                 let waited_ms = QUEUE_WAIT.as_millis() as u64;
                 return Err(GpuError::Timeout { device: self.name.clone(), waited_ms });
             }
             std::thread::sleep(Duration::from_micros(200));
+            if let Some(turn) = self.turn.take() {
+                return Ok(turn);
+            }
         }
     }
 

@@ -16,6 +16,7 @@ mod error;
 mod loss;
 mod pipeline;
 mod reopen;
+mod turn;
 
 pub use buffer::{Buffer, MemoryKind};
 pub(crate) use commands::run_now;

@@ -230,6 +230,9 @@ section! {
         images: bool = false, "", Any;
         /// Write a Chrome trace of every frame.
         trace: bool = false, "", Any;
+        /// Record what every stage did around each missed slot, from two seconds before it: a trace `flight-NN.json`
+        /// and a page `flight-NN.txt` in `dir`, 32 of each at most. Frames are recorded beside their path.
+        flight_recorder: bool = false, "", Any;
         /// Time over which the images integrate light, as an eye does; at least one frame. If left out, it is 33 ms
         /// or one frame, whichever is longer.
         light_window_ms: Option<f64> = None, "ms", Within(0.01, 10_000.0);

@@ -10,8 +10,9 @@ use crate::plan::lead::LeadEstimator;
 use crate::rig::Rig;
 use crate::telemetry::monitor::RunMonitor;
 use dpm_device::time::HostTime;
+use dpm_handoff::path::Lock;
 use std::sync::atomic::{AtomicBool, AtomicI64, AtomicU64, Ordering};
-use std::sync::{Arc, Mutex};
+use std::sync::Arc;
 
 /// Time that a projector outside this process needs to receive and check a frame after the medium has accepted all of
 /// it, nanoseconds. The host cannot measure it.
@@ -44,7 +45,7 @@ pub(crate) struct Facts {
     pub predict_ns: AtomicI64,
     /// All frames of the run are planned.
     pub is_complete: AtomicBool,
-    error: Mutex<Option<PipelineError>>,
+    error: Lock<Option<PipelineError>>,
 }
 
 impl Facts {
@@ -70,7 +71,7 @@ impl Facts {
             stride_milli: AtomicU64::new(1000),
             predict_ns: AtomicI64::new(predict_ns),
             is_complete: AtomicBool::new(false),
-            error: Mutex::new(None),
+            error: Lock::new(None),
         }
     }
 

@@ -13,6 +13,7 @@ use crate::plan::dark::DarkCause;
 use crate::plan::frame::FrameId;
 use crate::plan::light_centre::centre_ns;
 use crate::rig::Rig;
+use crate::telemetry::flight::FlightRecorder;
 use crate::telemetry::interval::Interval;
 use crate::telemetry::monitor::RunMonitor;
 use crate::telemetry::profile::{missed_by_cause, ordered_dark, Profiler};
@@ -112,6 +113,11 @@ pub(crate) struct Collector {
     /// The last lit frames for a trace, oldest first.
     pub traced: VecDeque<TracedFrame>,
     trace_frames: usize,
+    /// `None` unless the rig file asks for it.
+    flights: Option<FlightRecorder>,
+    standstills: Option<Arc<SeenStandstills>>,
+    /// What the operator should know about the files of the flight recorder.
+    flights_told: Option<String>,
     registration: Histogram<u64>,
     /// The same for frames that were lit in their own slot.
     registration_in_time: Histogram<u64>,
@@ -184,6 +190,9 @@ impl Collector {
             profiler,
             traced: VecDeque::new(),
             trace_frames,
+            flights: None,
+            standstills: None,
+            flights_told: None,
             registration: histogram(),
             registration_in_time: histogram(),
             clock_error: SignedHistogram::new(1_000_000_000),
@@ -204,8 +213,19 @@ impl Collector {
     /// frame.
     pub(crate) fn about(mut self, prepared: bool, standstills: Option<Arc<SeenStandstills>>) -> Self {
         self.prepared = prepared;
-        if let Some(seen) = standstills {
-            self.slots.excuse_by(seen);
+        if let Some(seen) = &standstills {
+            self.slots.excuse_by(seen.clone());
+        }
+        self.standstills = standstills;
+        let output = &self.rig.config.output;
+        if output.flight_recorder {
+            match FlightRecorder::new(self.rig.rate().slot_len_ns(0), &output.dir) {
+                Ok(recorder) => {
+                    self.flights = Some(recorder);
+                    self.slots.keep_misses();
+                }
+                Err(e) => self.flights_told = Some(format!("output.flight_recorder: not started: {e}")),
+            }
         }
         self
     }
@@ -217,7 +237,21 @@ impl Collector {
             self.drop_oldest(monitor);
         }
         self.slots.read_orders(monitor.dark());
-        self.slots.finish()
+        let counts = self.slots.finish();
+        self.record_misses(monitor);
+        if let Some(flights) = self.flights.take() {
+            self.flights_told = flights.finish(self.standstills.as_deref());
+        }
+        counts
+    }
+
+    /// Passes the misses that were found to the flight recorder.
+    fn record_misses(&mut self, monitor: &RunMonitor) {
+        let Some(flights) = &mut self.flights else { return };
+        while let Some((slot, begin, cause)) = self.slots.next_miss() {
+            flights.missed(slot, begin, cause);
+        }
+        flights.look(monitor, self.standstills.as_deref());
     }
 
     /// Reads the frames that the link has finished with, and their light, as far as both have arrived. Returns the
@@ -257,6 +291,7 @@ impl Collector {
             }
         }
         self.slots.settle();
+        self.record_misses(monitor);
         let slots = self.slots.counts();
         monitor.set_slots(slots.wanted(), slots.missed_total());
         over
@@ -323,6 +358,9 @@ impl Collector {
 
     fn finished(&mut self, job: &FrameNote, monitor: &RunMonitor) {
         self.newest = Some(job.plan.id.0 as u32);
+        if let Some(flights) = &mut self.flights {
+            flights.frame(job);
+        }
         let cost = job.cost.unwrap_or_default();
         let c = cost.counters();
         self.rays += u64::from(c.rays);
@@ -425,6 +463,9 @@ impl Collector {
                     self.slots.nothing_new(slot, begin, note.unseen);
                 } else {
                     self.slots.own(slot, begin, note.unseen);
+                }
+                if let Some(flights) = &mut self.flights {
+                    flights.lit(record.id, begin, last_photon_at);
                 }
                 self.count_lit(&record, begin, late, monitor);
                 if self.verify && note.hash != record.code_hash {
@@ -545,6 +586,7 @@ impl Collector {
                 self.invalid_samples, self.samples
             ));
         }
+        report.warnings.extend(self.flights_told.clone());
         let names: Vec<String> = self.rig.bodies.iter().map(|b| b.name.clone()).collect();
         report.warnings.extend(self.placement.warnings(&names));
         if self.light_mismatches > 0 {

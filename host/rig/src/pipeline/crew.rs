@@ -21,9 +21,10 @@ use dpm_common::realtime::os::standing_of;
 use dpm_device::time::HostTime;
 use dpm_handoff::channel::{channel, Receiver, Sender};
 use dpm_handoff::latest::{latest, Publisher};
+use dpm_handoff::path::Lock;
 use dpm_handoff::wake::{WaitPolicy, Waiter};
 use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
-use std::sync::{Arc, Mutex};
+use std::sync::Arc;
 use std::thread::JoinHandle;
 
 /// Indices of the stages in [`CrewState::pulses`].
@@ -43,7 +44,7 @@ pub(super) struct Port {
 
 /// The way by which the collector returns notes to the current crew. Not for the frame path: it may lock.
 #[derive(Clone, Default)]
-pub(crate) struct NotesBack(Arc<Mutex<Option<Sender<Box<FrameNote>>>>>);
+pub(crate) struct NotesBack(Arc<Lock<Option<Sender<Box<FrameNote>>>>>);
 
 impl NotesBack {
     /// Returns a note. A note of a former crew may go to the current one.
@@ -75,7 +76,7 @@ pub(super) struct CrewState {
     /// Per stage: its thread has returned without a panic.
     pub(super) returned: [AtomicBool; 3],
     /// Why planning or packing cannot continue.
-    failure: Mutex<Option<PipelineError>>,
+    failure: Lock<Option<PipelineError>>,
 }
 
 impl CrewState {
@@ -136,7 +137,7 @@ impl Crew {
             facts: facts.clone(),
             pulses: [Pulse::new("tracking"), Pulse::new("plan"), Pulse::new("pack")],
             returned: [const { AtomicBool::new(false) }; 3],
-            failure: Mutex::new(None),
+            failure: Lock::new(None),
         });
         let (publisher, reader) = latest(TrackSnapshot::empty(rig.bodies.len()));
         let (times, time) = latest(shared.time);

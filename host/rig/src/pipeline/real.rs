@@ -29,11 +29,12 @@ use dpm_common::realtime::standstill::StandstillMonitor;
 use dpm_device::transport::inproc::threaded;
 use dpm_device::transport::Transport;
 use dpm_handoff::channel::{channel, Sender};
+use dpm_handoff::path::Lock;
 use dpm_handoff::wake::WaitPolicy;
 use dpm_render::gpu::Gpu;
 use dpm_render::RenderError;
 use std::sync::atomic::{AtomicBool, Ordering};
-use std::sync::{Arc, Mutex};
+use std::sync::Arc;
 use std::thread::JoinHandle;
 use std::time::Duration;
 
@@ -132,7 +133,7 @@ fn crew_parts(
 /// Makes crews that take over. A GPU that failed is reopened with the same options.
 fn maker(rig: &Arc<Rig>, gpu: Option<Arc<Gpu>>, options: RunOptions, clock: MonotonicClock) -> Maker {
     let rig = rig.clone();
-    let gpu = Mutex::new(gpu);
+    let gpu = Lock::new(gpu);
     Arc::new(move |remake| {
         let mut gpu = gpu.lock().map_err(|_| PipelineError::Panicked("remake"))?;
         if let (Some(old), Remake::CrewAndGpu) = (gpu.as_mut(), remake) {

@@ -2,7 +2,7 @@
 
 use crate::config::RealTimeConfig;
 use dpm_common::realtime::{enter_frame_path, os, Refusal, ThreadRights};
-use std::sync::Mutex;
+use dpm_handoff::path::Lock;
 
 /// The mock projector's index in the list of cores, after the stages.
 const PROJECTOR: usize = 4;
@@ -12,7 +12,7 @@ pub(super) struct Rights {
     priority: u32,
     cores: Vec<u32>,
     locked: bool,
-    refusals: Mutex<Vec<Refusal>>,
+    refusals: Lock<Vec<Refusal>>,
 }
 
 impl Rights {
@@ -30,7 +30,7 @@ impl Rights {
             priority: config.priority,
             cores: config.affinity.clone(),
             locked,
-            refusals: Mutex::new(refusals),
+            refusals: Lock::new(refusals),
         }
     }
 

@@ -22,26 +22,22 @@ use dpm_common::realtime::wait_policy;
 use dpm_device::time::HostTime;
 use dpm_handoff::channel::{Receiver, Sender};
 use dpm_handoff::latest::{Publisher, Reader};
+use dpm_handoff::path::{self, Place};
 use dpm_handoff::wake::{WaitPolicy, Waiter, Waker};
 use dpm_render::pack::Kernel;
 use dpm_render::Renderer;
-use std::cell::Cell;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::Arc;
 use std::time::Duration;
 
-thread_local! {
-    static ON_FRAME_PATH: Cell<bool> = const { Cell::new(false) };
-}
-
-/// True while the calling thread works on frames in the steady state. A counting allocator may then demand that
-/// nothing is allocated.
+/// True while the calling thread works on frames in the steady state and is in no call of a library. A counting
+/// allocator may then demand that nothing is allocated.
 pub fn on_frame_path() -> bool {
-    ON_FRAME_PATH.with(Cell::get)
+    path::place() == Place::Own
 }
 
 pub(super) fn enter_frame_path(inside: bool) {
-    ON_FRAME_PATH.with(|c| c.set(inside));
+    path::enter(inside);
 }
 
 /// Frames until the steady state, in which nothing is allocated.

@@ -1,5 +1,7 @@
 //! Telemetry of a run, read by threads that are not on the frame path.
 
+pub(crate) mod flight;
+mod flight_page;
 pub mod interval;
 pub mod monitor;
 mod ordered;

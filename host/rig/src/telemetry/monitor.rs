@@ -6,10 +6,11 @@ use crate::interlock::Interlock;
 use crate::order::Order;
 use dpm_common::stopping;
 use dpm_device::link::{faults, LimitReached};
+use dpm_handoff::path::Lock;
 use std::collections::VecDeque;
 use std::fmt;
 use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
-use std::sync::{Mutex, OnceLock, PoisonError};
+use std::sync::{OnceLock, PoisonError};
 
 /// Notes that wait for the observing thread; further ones are only counted.
 const NOTES: usize = 64;
@@ -146,7 +147,7 @@ pub struct RunMonitor {
     dark: DarkLog,
     /// The collector's messages for the operator. Neither the threads of the frame path nor those that make orders
     /// take this lock.
-    notes: Mutex<Notes>,
+    notes: Lock<Notes>,
 }
 
 #[derive(Debug, Default)]

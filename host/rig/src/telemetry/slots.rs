@@ -146,7 +146,15 @@ pub(crate) struct SlotLedger {
     window: VecDeque<Entry>,
     counts: SlotCounts,
     batches: Batches,
+    /// The misses that were found since they were last read; `None` if nobody reads them.
+    found: Option<VecDeque<Miss>>,
 }
+
+/// A missed slot, its beginning and the cause.
+pub(crate) type Miss = (u64, HostTime, MissCause);
+
+/// Misses that may wait to be read; the collector reads them every few milliseconds.
+const FOUND: usize = 1024;
 
 impl SlotLedger {
     /// For slots of `rate`. A frame begins about `lead_ns` before its slot.
@@ -164,12 +172,32 @@ impl SlotLedger {
             window: VecDeque::with_capacity(WINDOW),
             counts: SlotCounts::default(),
             batches: Batches { all: Vec::with_capacity(MAX_BATCHES), length: BATCH_SLOTS, now: (0, 0) },
+            found: None,
         }
     }
 
     /// Compares missed slots with these standstills. Call it before the first slot.
     pub(crate) fn excuse_by(&mut self, seen: Arc<SeenStandstills>) {
         self.seen = Some(seen);
+    }
+
+    /// Keeps every missed slot until [`SlotLedger::next_miss`] takes it.
+    pub(crate) fn keep_misses(&mut self) {
+        self.found = Some(VecDeque::with_capacity(FOUND));
+    }
+
+    /// The oldest miss that was found and not taken yet.
+    pub(crate) fn next_miss(&mut self) -> Option<Miss> {
+        self.found.as_mut()?.pop_front()
+    }
+
+    fn find(&mut self, slot: u64, judgement: Judgement) {
+        let begin = self.begin_of(slot);
+        if let (Some(found), Judgement::Missed(cause)) = (&mut self.found, judgement) {
+            if found.len() < FOUND {
+                found.push_back((slot, begin, cause));
+            }
+        }
     }
 
     /// Reads the orders.
@@ -307,6 +335,7 @@ impl SlotLedger {
             let skipped = keep_from - self.base;
             if skipped > ONE_BY_ONE {
                 let judgement = self.judged_together(keep_from, trouble);
+                self.find(self.base, judgement);
                 self.count(judgement, skipped);
                 self.base = keep_from;
             }
@@ -355,6 +384,7 @@ impl SlotLedger {
             return;
         }
         let judgement = self.judged(slot, entry);
+        self.find(slot, judgement);
         self.count(judgement, 1);
     }
 

@@ -140,13 +140,20 @@ impl<W: Write> TraceWriter<W> {
             self.slice(Track::Tracker, "sample", t.captured_at, t.received_at, frame)?,
             self.slice(Track::Plan, "latch and submit", t.latched_at, t.submitted_at, frame)?,
         ];
-        let gpu = self.slice(Track::Gpu, "render", t.submitted_at, t.rendered_at, frame)?;
-        self.passes(&gpu, frame.passes)?;
-        journey.push(gpu);
-        journey.push(self.slice(Track::Pack, "pack", t.packing_at, t.packed_at, frame)?);
-        let sending = i64::try_from(t.wall_ns[Stage::Link as usize]).unwrap_or(i64::MAX);
-        let link_began = t.sent_at.plus_ns(-sending).max(t.packed_at);
-        journey.push(self.slice(Track::Link, "send", link_began, t.sent_at, frame)?);
+        // A stamp of zero: the frame never got there.
+        if t.rendered_at != HostTime(0) {
+            let gpu = self.slice(Track::Gpu, "render", t.submitted_at, t.rendered_at, frame)?;
+            self.passes(&gpu, frame.passes)?;
+            journey.push(gpu);
+        }
+        if t.packed_at != HostTime(0) {
+            journey.push(self.slice(Track::Pack, "pack", t.packing_at, t.packed_at, frame)?);
+        }
+        if t.sent_at != HostTime(0) {
+            let sending = i64::try_from(t.wall_ns[Stage::Link as usize]).unwrap_or(i64::MAX);
+            let link_began = t.sent_at.plus_ns(-sending).max(t.packed_at);
+            journey.push(self.slice(Track::Link, "send", link_began, t.sent_at, frame)?);
+        }
         if let Some(lit_at) = t.lit_at {
             let end = frame.last_photon_at.unwrap_or(lit_at.plus_ns(1_000));
             journey.push(self.slice(Track::Light, "light", lit_at, end, frame)?);
