@@ -280,7 +280,16 @@ pub fn standing_in(path: &std::path::Path, identity: &Identity) -> Option<Stands
 }
 
 fn read(folder: &Folder, name: &str) -> Stands {
-    let parsed = folder.read(name, MAX_BYTES).map_err(|e| e.to_string()).and_then(|bytes| {
+    stands_in(
+        folder.read(name, MAX_BYTES).map_err(|e| e.to_string()),
+        &folder.path().join(name).display().to_string(),
+    )
+}
+
+/// What the bytes of a file say, or why there are none. `path` is its name in messages.
+#[doc(hidden)]
+pub fn stands_in(bytes: Result<Vec<u8>, String>, path: &str) -> Stands {
+    let parsed = bytes.and_then(|bytes| {
         let content: Content = serde_json::from_slice(&bytes).map_err(|e| format!("damaged: {e}"))?;
         if content.version != VERSION {
             return Err(format!("version {} is not known", content.version));
@@ -305,10 +314,7 @@ fn read(folder: &Folder, name: &str) -> Stands {
         }
         Err(reason) => Stands {
             order: Order::Safe,
-            told: format!(
-                "counts as SAFE, because {} cannot be read: {reason}",
-                folder.path().join(name).display()
-            ),
+            told: format!("counts as SAFE, because {path} cannot be read: {reason}"),
         },
     }
 }

@@ -33,6 +33,19 @@ pub fn load_environment(path: &Path, rotation_rad: f32, scale: f32) -> Result<En
     contained(&limits, work).map_err(|e| e.in_file(path))
 }
 
+/// Reads an environment image from memory.
+///
+/// # Errors
+/// As [`load_environment`], without the path.
+pub fn load_environment_bytes(
+    bytes: &[u8],
+    rotation_rad: f32,
+    scale: f32,
+) -> Result<Environment, SceneError> {
+    let bytes = bytes.to_vec();
+    contained(&Limits::default(), move |_| decode_environment(&bytes, rotation_rad, scale))
+}
+
 /// Size of a storage buffer that every Vulkan device can bind (`maxStorageBufferRange` is at least 2^27), bytes. The
 /// renderer keeps an environment in such a buffer, with 16 bytes for each texel and each row.
 const RENDERED_BYTES: u64 = 1 << 27;

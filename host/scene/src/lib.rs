@@ -36,7 +36,7 @@ mod studio;
 use glam::{DAffine3, Vec2, Vec3, Vec4};
 
 pub use builtin::builtin;
-pub use environment::load_environment;
+pub use environment::{load_environment, load_environment_bytes};
 pub use error::SceneError;
 pub use limits::Limits;
 pub use load::{load, load_bytes, BodySelector, LoadOptions};
