@@ -1,17 +1,11 @@
-//! Files: scenes and environments. No bytes make the reader panic, and none take more memory or time than the limits.
+//! Files: scenes and environments. No bytes make the reader panic. The readers run in the thread of the caller, not in
+//! the one that the program gives them, so that a panic and a loop without end are seen as such.
 
-use dpm_scene::{load_bytes, load_environment_bytes, Limits, LoadOptions, SceneError};
-use std::time::Duration;
-
-/// Limits that a file of a fuzzer can reach.
-fn small() -> LoadOptions {
-    let limits = Limits { time: Duration::from_secs(5), ..Limits::default() };
-    LoadOptions { limits, ..LoadOptions::default() }
-}
+use dpm_scene::{decode_environment, load_bytes_here, LoadOptions, SceneError};
 
 /// A glTF file as it is.
 pub fn gltf(bytes: &[u8]) {
-    match load_bytes(bytes, &small()) {
+    match load_bytes_here(bytes, &LoadOptions::default()) {
         Ok(scene) => assert!(!scene.bodies.is_empty()),
         Err(e @ (SceneError::Internal(_) | SceneError::TimedOut(_))) => panic!("{e}"),
         Err(e) => assert!(!e.to_string().is_empty()),
@@ -43,7 +37,7 @@ pub fn container(document: &[u8], binary: &[u8]) -> Vec<u8> {
 
 /// An environment of any format: whatever is read has as many texels as it says, and light that is a number.
 pub fn environment(bytes: &[u8]) {
-    match load_environment_bytes(bytes, 0.5, 2.0) {
+    match decode_environment(bytes, 0.5, 2.0) {
         Ok(dpm_scene::Environment::Equirect { width, height, texels, .. }) => {
             assert_eq!(texels.len(), width as usize * height as usize);
             assert!(texels.iter().all(|t| t.is_finite() && t.min_element() >= 0.0));

@@ -33,19 +33,6 @@ pub fn load_environment(path: &Path, rotation_rad: f32, scale: f32) -> Result<En
     contained(&limits, work).map_err(|e| e.in_file(path))
 }
 
-/// Reads an environment image from memory.
-///
-/// # Errors
-/// As [`load_environment`], without the path.
-pub fn load_environment_bytes(
-    bytes: &[u8],
-    rotation_rad: f32,
-    scale: f32,
-) -> Result<Environment, SceneError> {
-    let bytes = bytes.to_vec();
-    contained(&Limits::default(), move |_| decode_environment(&bytes, rotation_rad, scale))
-}
-
 /// Size of a storage buffer that every Vulkan device can bind (`maxStorageBufferRange` is at least 2^27), bytes. The
 /// renderer keeps an environment in such a buffer, with 16 bytes for each texel and each row.
 const RENDERED_BYTES: u64 = 1 << 27;
@@ -123,7 +110,9 @@ fn box_filtered(texels: &[Vec3], from: (u32, u32), to: (u32, u32)) -> Vec<Vec3> 
     out
 }
 
-fn decode_environment(bytes: &[u8], rotation_rad: f32, scale: f32) -> Result<Environment, SceneError> {
+/// [`load_environment`] of bytes, in this thread: for fuzzers.
+#[doc(hidden)]
+pub fn decode_environment(bytes: &[u8], rotation_rad: f32, scale: f32) -> Result<Environment, SceneError> {
     if !(rotation_rad.is_finite() && scale.is_finite() && scale >= 0.0) {
         return Err(SceneError::broken(
             "environment",
