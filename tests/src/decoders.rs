@@ -371,8 +371,10 @@ pub fn clock_map(bytes: &[u8]) {
         let step = i64::from(wait) * i64::from(wait) * 50_000 + 1;
         now += step.min(i64::try_from(half_wrap / 4).unwrap_or(i64::MAX)).max(1);
         rest = after;
-        let unit = i64::try_from(half_wrap / 4096).unwrap_or(i64::MAX).min(20_000).max(1);
-        let (there, inside, back) = (i64::from(a) * unit, i64::from(b) * unit / 8, i64::from(c) * unit);
+        let unit = i64::try_from(half_wrap / 4096).unwrap_or(i64::MAX).clamp(1, 20_000);
+        // No cable is without delay: the drift of the clocks while the device answers is shorter.
+        let [there, back] = [a, c].map(|n| (i64::from(n) + 1) * unit);
+        let inside = i64::from(b) * unit / 8;
         let t4 = now + there + inside + back;
         if is_honest {
             // A counter that wraps within a round trip tells nothing.

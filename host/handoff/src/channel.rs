@@ -175,4 +175,14 @@ mod loom_tests {
             assert!(receiver.is_finished());
         });
     }
+
+    /// A consumer that has taken nothing yet does not take the end for the end of the values.
+    #[test]
+    fn loom_finished_means_that_nothing_is_left() {
+        loom::model(|| {
+            let (mut sender, receiver) = channel(1, WaitPolicy::Park);
+            loom::thread::spawn(move || sender.push(1u32).unwrap());
+            assert!(!receiver.is_finished(), "a value is left");
+        });
+    }
 }

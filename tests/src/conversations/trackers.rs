@@ -61,29 +61,36 @@ impl Laws {
     }
 }
 
-/// A connection in memory: what the test wrote for the client, and what the client wrote.
+#[derive(Default)]
+struct Line {
+    to_client: VecDeque<u8>,
+    from_client: Vec<u8>,
+    is_closed: bool,
+}
+
+/// A connection in memory, whose far end is the test.
 #[derive(Clone, Default)]
-struct Memory(Arc<Mutex<(VecDeque<u8>, Vec<u8>, bool)>>);
+struct Memory(Arc<Mutex<Line>>);
 
 impl Memory {
     fn say(&self, bytes: &[u8]) {
-        self.0.lock().expect("no panic").0.extend(bytes);
+        self.0.lock().expect("no panic").to_client.extend(bytes);
     }
 
     fn heard(&self) -> Vec<u8> {
-        std::mem::take(&mut self.0.lock().expect("no panic").1)
+        std::mem::take(&mut self.0.lock().expect("no panic").from_client)
     }
 
     fn close(&self) {
-        self.0.lock().expect("no panic").2 = true;
+        self.0.lock().expect("no panic").is_closed = true;
     }
 }
 
 impl Read for Memory {
     fn read(&mut self, into: &mut [u8]) -> io::Result<usize> {
         let mut inside = self.0.lock().expect("no panic");
-        match inside.0.read(into)? {
-            0 if inside.2 => Ok(0),
+        match inside.to_client.read(into)? {
+            0 if inside.is_closed => Ok(0),
             0 => Err(io::ErrorKind::WouldBlock.into()),
             n => Ok(n),
         }
@@ -92,7 +99,7 @@ impl Read for Memory {
 
 impl Write for Memory {
     fn write(&mut self, bytes: &[u8]) -> io::Result<usize> {
-        self.0.lock().expect("no panic").1.extend_from_slice(bytes);
+        self.0.lock().expect("no panic").from_client.extend_from_slice(bytes);
         Ok(bytes.len())
     }
 
