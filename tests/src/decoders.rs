@@ -1,6 +1,8 @@
 //! Feeds arbitrary bytes to every decoder of external input. Each decoder has one entry, with the laws that hold for
 //! all bytes. The fuzz targets in `fuzz/` and the test over the committed seeds call the same entries.
 
+use crate::conversations::{link, trackers, usb};
+use dpm_device::clock_map::{ClockMap, ExchangeOutcome};
 use dpm_device::cobs::{encode, encoded_bytes, Deframer};
 use dpm_device::dlpc900::command::{CommandAssembler, ReplyAssembler, REPORT_BYTES};
 use dpm_device::dlpc900::image;
@@ -8,6 +10,7 @@ use dpm_device::link::crc32c;
 use dpm_device::link::{
     rle_encode, Assembly, Decoder, DeviceMessage, Header, HostMessage, PacketSink, RleDecoder,
 };
+use dpm_device::time::{DeviceTicks, HostTime};
 use dpm_device::tracker::natnet::frame::{decode_frame, RigidBody};
 use dpm_device::tracker::natnet::messages::{
     decode_echo_request, decode_echo_response, request_text, ServerInfo,
@@ -19,15 +22,20 @@ use dpm_device::tracker::record::{Recording, SAMPLE_BYTES};
 use dpm_device::tracker::serial::wire::SerialMessage;
 use dpm_device::tracker::vrpn::wire as vrpn;
 use dpm_rig::config::{Overrides, RigConfig};
+use dpm_rig::control::{server, status_file};
+use dpm_rig::order::Order;
+use dpm_rig::standing;
 use dpm_scene::geometry::opencv;
+use hil_mock::faults::FaultPlan;
 use hil_mock::usbip::wire as usbip;
+use std::io::{self, Read, Write};
 use std::path::Path;
 
 /// The entry of a decoder.
 pub type Entry = fn(&[u8]);
 
 /// Every entry with the name of its fuzz target, which is also the name of its folder of seeds.
-pub const ALL: [(&str, Entry); 13] = [
+pub const ALL: [(&str, Entry); 30] = [
     ("link_stream", link_stream),
     ("link_rle", link_rle),
     ("cobs_stream", cobs_stream),
@@ -39,8 +47,25 @@ pub const ALL: [(&str, Entry); 13] = [
     ("texts", texts),
     ("recording", recording),
     ("usbip_stream", usbip_stream),
-    ("projector", crate::conversations::projector),
-    ("host_link", crate::conversations::host_link),
+    ("clock_map", clock_map),
+    ("control_words", control_words),
+    ("settings", settings),
+    ("projector", link::projector),
+    ("projector_hello", link::projector_hello),
+    ("host_link", link::host_link),
+    ("host_hello", link::host_hello),
+    ("natnet_client", trackers::natnet_client),
+    ("natnet_server", trackers::natnet_server),
+    ("vrpn_client", trackers::vrpn_client),
+    ("vrpn_server", trackers::vrpn_server),
+    ("serial_client", trackers::serial_client),
+    ("serial_device", trackers::serial_device),
+    ("dlpc900_driver", usb::dlpc900_driver),
+    ("dlpc900_controller", usb::dlpc900_controller),
+    ("usbip_server", usb::usbip_server),
+    ("gltf", crate::files::gltf),
+    ("gltf_parts", crate::files::gltf_parts),
+    ("environment", crate::files::environment),
 ];
 
 #[derive(Default)]
@@ -235,4 +260,158 @@ pub fn texts(bytes: &[u8]) {
         assert!(!errors.to_string().is_empty());
     }
     let _ = opencv::matrices(text);
+}
+
+/// The environment and the flags that set keys, and the plans of faults. A plan is recovered from its own text.
+pub fn settings(bytes: &[u8]) {
+    let Ok(text) = std::str::from_utf8(bytes) else { return };
+    if let Ok(plan) = text.parse::<FaultPlan>() {
+        assert_eq!(plan.to_string().parse::<FaultPlan>(), Ok(plan));
+    }
+    let mut overrides = Overrides::default();
+    for line in text.lines() {
+        match line.strip_prefix('$').and_then(|line| line.split_once('=')) {
+            Some((name, value)) => overrides.variables.push((format!("DPM_SET_{name}"), value.into())),
+            None => overrides.flags.push(line.into()),
+        }
+    }
+    if let Err(errors) = RigConfig::parse("seed.toml", "", Path::new("/nonexistent"), &overrides) {
+        assert!(!errors.to_string().is_empty());
+    }
+}
+
+/// A client of the control socket, whose bytes come in pieces of a length and are read as they come.
+struct Client<'a> {
+    rest: &'a [u8],
+    piece: usize,
+    is_dry: bool,
+    told: usize,
+}
+
+impl Read for Client<'_> {
+    fn read(&mut self, into: &mut [u8]) -> io::Result<usize> {
+        self.is_dry = !self.is_dry;
+        if self.is_dry && self.piece < 8 {
+            return Err(io::ErrorKind::WouldBlock.into());
+        }
+        let n = self.rest.len().min(self.piece).min(into.len());
+        into[..n].copy_from_slice(&self.rest[..n]);
+        self.rest = &self.rest[n..];
+        Ok(n)
+    }
+}
+
+impl Write for Client<'_> {
+    fn write(&mut self, bytes: &[u8]) -> io::Result<usize> {
+        self.told += bytes.len();
+        Ok(bytes.len())
+    }
+
+    fn flush(&mut self) -> io::Result<()> {
+        Ok(())
+    }
+}
+
+/// What other processes say of a projector: an order on the control socket, a state file, and the file of a standing
+/// order. An order is one of the four words and nothing else, however it is split; whatever a standing order's file
+/// holds, it stands for darkness, and for SAFE unless it is whole.
+pub fn control_words(bytes: &[u8]) {
+    for piece in [1, 3, 16] {
+        let mut client = Client { rest: bytes, piece, is_dry: false, told: 0 };
+        let mut word = Vec::new();
+        let order = loop {
+            match server::read_word(&mut client, &mut word) {
+                Ok(None) => {}
+                Ok(Some(order)) => break Some(order),
+                Err(_) => break None,
+            }
+        };
+        assert!(word.len() <= 16 && client.told <= 200);
+        let line = bytes[..bytes.len().min(16)].split_inclusive(|b| *b == b'\n').next().unwrap_or_default();
+        // A word is read by pieces, and what came with its line feed is part of it.
+        if let Some(order) = order {
+            assert!(word.starts_with(order.word().as_bytes()), "{order:?} from {word:?}");
+        } else if let Some(exact) = Order::ALL.iter().find(|(_, w)| line == format!("{w}\n").as_bytes()) {
+            assert!(bytes.len() > line.len(), "{} was not heard", exact.1);
+        }
+    }
+    if let Some(said) = status_file::parse(&String::from_utf8_lossy(bytes)) {
+        assert!(said.rig.len() <= 3 * bytes.len() && !said.health.to_string().is_empty());
+    }
+    let stands = standing::stands_in(Ok(bytes.to_vec()), "a file");
+    assert!(matches!(stands.order, Order::Black | Order::Safe), "{stands:?}");
+    assert!(stands.order == Order::Safe || bytes.trim_ascii().ends_with(b"}"), "{stands:?}");
+    assert!(!stands.told.contains('\n') || stands.told.starts_with("counts as SAFE"));
+}
+
+/// The map of a device's clock: stamps of any device give instants in order and a bound that is none below 0, and where
+/// the device's clock is honest (a rate within 200 ppm and delays of any length), the true error lies inside the bound.
+pub fn clock_map(bytes: &[u8]) {
+    let Some((&[rate, bits, skew, how], mut rest)) = bytes.split_first_chunk::<4>() else { return };
+    let ticks_per_second =
+        [1, 1000, 1_000_000, 10_000_000, 1_000_000_000, 1_000_000_000_000][usize::from(rate % 6)];
+    let bits = [16, 24, 32, 48, 64][usize::from(bits % 5)];
+    let mut map = ClockMap::with_bits(ticks_per_second, bits).expect("a clock");
+    let mut now: i64 = 1_000_000_000_000;
+    let mut last = HostTime(i64::MIN);
+    // Ticks of an honest device at host time `t`; its clock began some time before.
+    let began = u128::from(how) << 40;
+    let ppb = (i128::from(skew) - 128) * 1500;
+    let ticks_at = |t: i64| {
+        let device = i128::from(t) + i128::from(t) * ppb / 1_000_000_000;
+        DeviceTicks(
+            (began as i128 + device * i128::from(ticks_per_second) / 1_000_000_000) as u64
+                & (u64::MAX >> (64 - bits)),
+        )
+    };
+    let is_honest = how & 1 == 0;
+    while let Some((&[a, b, c, wait], after)) = rest.split_first_chunk::<4>() {
+        // A wrap of the counter must not pass between two exchanges.
+        let half_wrap = (1u128 << (bits - 1)) * 1_000_000_000 / u128::from(ticks_per_second);
+        let step = i64::from(wait) * i64::from(wait) * 50_000 + 1;
+        now += step.min(i64::try_from(half_wrap / 4).unwrap_or(i64::MAX)).max(1);
+        rest = after;
+        let unit = i64::try_from(half_wrap / 4096).unwrap_or(i64::MAX).clamp(1, 20_000);
+        // No cable is without delay: the drift of the clocks while the device answers is shorter.
+        let [there, back] = [a, c].map(|n| (i64::from(n) + 1) * unit);
+        let inside = i64::from(b) * unit / 8;
+        let t4 = now + there + inside + back;
+        if is_honest {
+            // A counter that wraps within a round trip tells nothing.
+            if half_wrap < 10_000_000 {
+                break;
+            }
+            let outcome = map.add_exchange(
+                HostTime(now),
+                ticks_at(now + there),
+                ticks_at(now + there + inside),
+                HostTime(t4),
+            );
+            // A counter of whole ticks, slower than the delays, is honest too.
+            let tick_ns = 1_000_000_000 / ticks_per_second as i64 + 1;
+            assert!(tick_ns > 1000 || outcome == ExchangeOutcome::Used, "{outcome:?}");
+            if let (true, Some(mapped)) = (tick_ns <= 1000, map.to_host(ticks_at(now + there))) {
+                let error = mapped.at.0 - (now + there);
+                assert!(error.abs() <= mapped.uncertainty_ns + tick_ns, "{error} ns, bound {mapped:?}");
+            }
+        } else {
+            let stamp = rest.split_first_chunk::<16>();
+            let Some((stamps, after)) = stamp else { break };
+            rest = after;
+            let [rx, tx] = [&stamps[..8], &stamps[8..]]
+                .map(|s| DeviceTicks(u64::from_le_bytes([s[0], s[1], s[2], s[3], s[4], s[5], s[6], s[7]])));
+            let steps = map.steps();
+            let outcome = map.add_exchange(HostTime(now), rx, tx, HostTime(t4));
+            assert_eq!(map.steps() != steps, outcome == ExchangeOutcome::Stepped);
+            for ticks in [rx, tx, DeviceTicks(0)] {
+                if let Some(mapped) = map.map_forward(ticks) {
+                    assert!(mapped.at >= last && mapped.uncertainty_ns >= 0, "{mapped:?}");
+                    last = mapped.at;
+                }
+            }
+        }
+        assert!(map.exchanges() <= 64 && map.is_ready() == map.to_device(HostTime(now)).is_some());
+        assert!(map.min_round_trip_ns().is_none_or(|ns| ns >= 0));
+        now = t4;
+    }
 }

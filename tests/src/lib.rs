@@ -3,5 +3,6 @@
 pub mod compare;
 pub mod conversations;
 pub mod decoders;
+pub mod files;
 pub mod gpu;
 pub mod rigs;

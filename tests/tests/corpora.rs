@@ -4,6 +4,10 @@
 //! The encoders make the seeds (`DPM_UPDATE_SEEDS=1 cargo test -p dpm-tests --test corpora` writes them); others are
 //! added by hand. Put anything that a fuzzer finds into the folder of its target.
 
+#[path = "../../host/scene/tests/common/mod.rs"]
+mod common;
+
+use common::{png, tetrahedra, with_image};
 use dpm_device::cobs::{encode, encoded_bytes};
 use dpm_device::dlpc900::command::{Command, Opcode};
 use dpm_device::dlpc900::image::{self, Compression, PlaneOrder};
@@ -118,6 +122,76 @@ fn made() -> Vec<(&'static str, &'static str, Vec<u8>)> {
     seeds.push(("host_link", "answers", answers));
     let rig = b"[projector]\nframe_rate = \"60000/1001\"\n[[scene.bodies]]\nname = \"a\"\n".to_vec();
     seeds.push(("texts", "rig.toml", rig));
+    seeds.extend(dpm_tests::conversations::recorded());
+    seeds.extend(words());
+    seeds.extend(files());
+    seeds
+}
+
+/// Words of other processes, settings, and the stamps of an honest clock and of one that steps.
+fn words() -> Vec<(&'static str, &'static str, Vec<u8>)> {
+    let mut seeds = Vec::new();
+    for (name, word) in [("black", "black\n"), ("arm", "arm\r\n"), ("long", "frozen-frozen-frozen\n")] {
+        seeds.push(("control_words", name, word.into()));
+    }
+    let line = "00000000000000000007 0000000000000000 none  \n";
+    seeds.push(("control_words", "state", format!("{line}{line}heard /etc/dpm/rig.toml\n").into()));
+    let order = r#"{"version":1,"order":"freeze","at":"2026-01-01T00:00:00Z","by":"a key","process":7,"projector":"x"}"#;
+    seeds.push(("control_words", "order", format!("{order}\n").into()));
+    seeds.push((
+        "settings",
+        "flags",
+        b"render.spp=4\nprojector.width = 640\n$RENDER__SPP=8\nrun.frames=1".to_vec(),
+    ));
+    seeds.push(("settings", "plan", b"loss=0.1@2..5,jump@3,stall=0.2@1,seed=7".to_vec()));
+    // Rate, bits, skew, how; then the time there, inside, back, and before.
+    let honest: Vec<u8> = (0..40u8).flat_map(|k| [k % 7, 1, k % 5, 20]).collect();
+    seeds.push(("clock_map", "honest", [&[2, 4, 200, 6][..], &honest].concat()));
+    seeds.push(("clock_map", "wrapping", [&[2, 0, 100, 8][..], &honest].concat()));
+    let stamps =
+        |k: u64| [k * 2_000_000, k * 2_000_000 + 5 + (k / 6) * 90_000_000].map(u64::to_le_bytes).concat();
+    let stepping: Vec<u8> = (0..12).flat_map(|k| [&[1, 1, 1, 6][..], &stamps(k)].concat()).collect();
+    seeds.push(("clock_map", "any", [&[2, 4, 0, 1][..], &stepping].concat()));
+    seeds
+}
+
+/// A scene with a texture and an environment of each format, as small as they get.
+fn files() -> Vec<(&'static str, &'static str, Vec<u8>)> {
+    let mut seeds = Vec::new();
+    let texels = [[200, 100, 50, 255]; 4];
+    for (name, file) in [("plain", tetrahedra()), ("texture", with_image(&png(2, 2, &texels)))] {
+        seeds.push(("gltf", name, file.bytes()));
+        let text = serde_json::to_vec(&file.json).unwrap();
+        seeds.push(("gltf_parts", name, [&text[..], &[0], &file.bin].concat()));
+    }
+    let lit = r#"{"asset":{"version":"2.0"},"extensionsUsed":["KHR_lights_punctual"],"extensions":{"KHR_lights_punctual":
+        {"lights":[{"type":"spot","spot":{"outerConeAngle":0.4},"intensity":7}]}},"scenes":[{"nodes":[0]}],"nodes":[{"children":[1,2],
+        "scale":[1,2,1]},{"extensions":{"KHR_lights_punctual":{"light":0}}},{"mesh":0,"rotation":[0,0,0,1]}],"meshes":[{"primitives":
+        [{"attributes":{"POSITION":0},"mode":5,"material":0}]}],"materials":[{"emissiveFactor":[1,1,1],"extensions":{
+        "KHR_materials_transmission":{"transmissionFactor":0.5},"KHR_materials_ior":{"ior":1.4}}}],"accessors":[{"bufferView":0,
+        "componentType":5126,"type":"VEC3","count":4}],"bufferViews":[{"buffer":0,"byteLength":48}],"buffers":[{"byteLength":48}]}"#;
+    seeds.push(("gltf_parts", "lit", [lit.as_bytes(), &[0], &tetrahedra().bin[..48]].concat()));
+    let floats = |v: &[f32]| v.iter().flat_map(|x| x.to_le_bytes()).collect::<Vec<_>>();
+    let pfm = [&b"PF\n2 1\n-1.0\n"[..], &floats(&[0.5, 1.0, 2.0, 0.0, 3.0, 4.0])].concat();
+    seeds.push(("environment", "pfm", pfm));
+    let rgbe = [&b"#?RADIANCE\nFORMAT=32-bit_rle_rgbe\n\n-Y 1 +X 2\n"[..], &[128, 64, 32, 129, 1, 2, 3, 120]]
+        .concat();
+    seeds.push(("environment", "hdr", rgbe));
+    let runs: Vec<u8> = std::iter::once([2, 2, 0, 8])
+        .chain([[136, 7, 0, 0]; 4].map(|r| [r[0], r[1], 136, 9]))
+        .flatten()
+        .collect();
+    seeds.push((
+        "environment",
+        "hdr_runs",
+        [&b"#?RADIANCE\nFORMAT=32-bit_rle_rgbe\n\n-Y 2 +X 8\n"[..], &runs].concat(),
+    ));
+    seeds.push(("environment", "png", png(2, 2, &texels)));
+    let mut jpeg = std::io::Cursor::new(Vec::new());
+    ::image::RgbImage::from_pixel(8, 8, ::image::Rgb([9, 80, 200]))
+        .write_to(&mut jpeg, ::image::ImageFormat::Jpeg)
+        .unwrap();
+    seeds.push(("environment", "jpeg", jpeg.into_inner()));
     seeds
 }
 

@@ -2,8 +2,8 @@
 //! remedy.
 
 use std::sync::atomic::{AtomicBool, Ordering};
-use std::sync::{Arc, Mutex, PoisonError, TryLockError};
-use std::time::Duration;
+use std::sync::{Arc, Mutex, OnceLock, PoisonError, TryLockError};
+use std::time::{Duration, Instant};
 
 use super::command::{
     Command, Malformed, Opcode, ReplyAssembler, TooLong, MAX_BMP_BYTES, MAX_REPLY_DATA, REPORT_BYTES,
@@ -39,6 +39,12 @@ pub trait HidPort {
     /// Waits. Simulated ports advance their own time.
     fn pause(&mut self, time: Duration) {
         std::thread::sleep(time);
+    }
+
+    /// The time since a fixed instant, by the clock that pauses and timeouts go by. Simulated ports have their own.
+    fn now(&self) -> Duration {
+        static BEGIN: OnceLock<Instant> = OnceLock::new();
+        BEGIN.get_or_init(Instant::now).elapsed()
     }
 
     /// A second way to send reports over the same cable from another thread. It works even while this thread hangs
@@ -585,22 +591,21 @@ impl<P: HidPort> Dlpc900<P> {
         Ok(())
     }
 
-    /// Polls until `done` or until `most` has passed.
+    /// Polls until `done` or until `most` has passed, in which a question that nobody answers counts with its timeout.
     fn wait(
         &mut self,
         most: Duration,
         done: impl Fn(&mut Self) -> Result<bool, Dlpc900Error>,
     ) -> Result<bool, Dlpc900Error> {
-        let mut waited = Duration::ZERO;
+        let begin = self.port.now();
         loop {
             if done(self)? {
                 return Ok(true);
             }
-            if waited >= most {
+            if self.port.now().saturating_sub(begin) >= most {
                 return Ok(false);
             }
             self.pause_for(POLL)?;
-            waited += POLL;
         }
     }
 

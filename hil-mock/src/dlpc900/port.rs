@@ -66,6 +66,10 @@ impl HidPort for VirtualHid {
         self.now = self.now.plus_ns(time.as_nanos() as i64);
     }
 
+    fn now(&self) -> Duration {
+        Duration::from_nanos(self.now.0.max(0).unsigned_abs())
+    }
+
     fn second_line(&self) -> Option<Box<dyn SecondLine>> {
         Some(Box::new(self.clone()))
     }

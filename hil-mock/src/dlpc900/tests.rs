@@ -2,13 +2,14 @@
 
 use super::*;
 use dpm_device::dlpc900::command::Command;
-use dpm_device::dlpc900::driver::{Dlpc900, Dlpc900Error, PortError};
+use dpm_device::dlpc900::driver::{Dlpc900, Dlpc900Error, HidPort, PortError};
 use dpm_device::dlpc900::image::{encode, Compression};
 use dpm_device::dlpc900::sequence::{
     LedSetup, Pattern, PatternSequence, Receiver, Repeat, SequenceBuilder, VideoPatterns,
 };
 use proptest::prelude::*;
 use std::sync::{Arc, Mutex};
+use std::time::Duration;
 
 const T0: HostTime = HostTime(1_000_000_000);
 
@@ -509,4 +510,41 @@ fn programs_that_never_read_and_configure_twice_are_served() {
     assert!(m.projected_plane(0).unwrap() == planes[0]);
     assert!(m.showing(T0.plus_ns(1)).is_some());
     assert_eq!(m.warnings(), [] as [String; 0]);
+}
+
+/// A cable on which the controller answers so many reports and then nothing.
+struct Silent {
+    hid: VirtualHid,
+    answers: u32,
+}
+
+impl HidPort for Silent {
+    fn write_report(&mut self, report: &[u8; REPORT_BYTES], timeout: Duration) -> Result<(), PortError> {
+        HidPort::write_report(&mut self.hid, report, timeout)
+    }
+    fn read_report(&mut self, report: &mut [u8; REPORT_BYTES], timeout: Duration) -> Result<(), PortError> {
+        if self.answers == 0 {
+            self.hid.pause(timeout);
+            return Err(PortError::Timeout);
+        }
+        self.answers -= 1;
+        self.hid.read_report(report, timeout)
+    }
+    fn pause(&mut self, time: Duration) {
+        self.hid.pause(time);
+    }
+    fn now(&self) -> Duration {
+        HidPort::now(&self.hid)
+    }
+}
+
+/// A question that nobody answers takes a second of the five that waking may take.
+#[test]
+fn a_controller_that_falls_silent_as_it_wakes_is_given_up_in_time() {
+    let hid = VirtualHid::new(Arc::new(Mutex::new(Dlpc900Model::default())));
+    // The firmware, the DMD, and that the order to wake has arrived.
+    let mut driver = Dlpc900::new(Silent { hid, answers: 3 }).unwrap();
+    assert!(driver.wake().is_err());
+    let took = HidPort::now(&driver.into_port());
+    assert!(took > Duration::from_secs(1) && took < Duration::from_secs(15), "{took:?}");
 }

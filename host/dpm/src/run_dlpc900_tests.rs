@@ -143,6 +143,9 @@ impl HidPort for Cut {
     fn pause(&mut self, time: Duration) {
         self.hid.pause(time);
     }
+    fn now(&self) -> Duration {
+        HidPort::now(&self.hid)
+    }
 }
 
 /// After unplugging, the loss is noticed within one check. After plugging in again, the controller is set up from
@@ -343,6 +346,9 @@ impl HidPort for Sticky {
     fn pause(&mut self, time: Duration) {
         self.hid.pause(time);
     }
+    fn now(&self) -> Duration {
+        HidPort::now(&self.hid)
+    }
     fn second_line(&self) -> Option<Box<dyn dpm_device::dlpc900::driver::SecondLine>> {
         self.hid.second_line()
     }
@@ -497,6 +503,9 @@ impl HidPort for LateStart {
     }
     fn pause(&mut self, time: Duration) {
         self.hid.pause(time);
+    }
+    fn now(&self) -> Duration {
+        HidPort::now(&self.hid)
     }
     fn second_line(&self) -> Option<Box<dyn dpm_device::dlpc900::driver::SecondLine>> {
         self.hid.second_line()

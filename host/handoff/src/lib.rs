@@ -35,7 +35,7 @@
 //! This is a separate crate, so that the model checker builds in seconds:
 //! `RUSTFLAGS="--cfg loom" cargo test -p dpm-handoff --lib --target-dir target/loom loom_` runs every interleaving (and
 //! every reordering that the memory model allows) of the tests named `loom_*`. The cells report unsynchronised access
-//! there, so weakening any ordering of the slot or the ring fails a test.
+//! there. `tests/mutations/orderings` weakens every ordering, one by one, and sees that a test fails.
 
 pub mod channel;
 pub mod latest;

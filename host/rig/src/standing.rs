@@ -344,7 +344,16 @@ fn unreadable(e: &FolderError) -> Stands {
 }
 
 fn read(folder: &dyn StateFolder, name: &str) -> Stands {
-    let parsed = folder.read(name, MAX_BYTES).map_err(|e| e.to_string()).and_then(|bytes| {
+    stands_in(
+        folder.read(name, MAX_BYTES).map_err(|e| e.to_string()),
+        &folder.path().join(name).display().to_string(),
+    )
+}
+
+/// What the bytes of a file say, or why there are none. `path` is its name in messages.
+#[doc(hidden)]
+pub fn stands_in(bytes: Result<Vec<u8>, String>, path: &str) -> Stands {
+    let parsed = bytes.and_then(|bytes| {
         let content: Content = serde_json::from_slice(&bytes).map_err(|e| format!("damaged: {e}"))?;
         if content.version != VERSION {
             return Err(format!("version {} is not known", content.version));
@@ -369,10 +378,7 @@ fn read(folder: &dyn StateFolder, name: &str) -> Stands {
         }
         Err(reason) => Stands {
             order: Order::Safe,
-            told: format!(
-                "counts as SAFE, because {} cannot be read: {reason}",
-                folder.path().join(name).display()
-            ),
+            told: format!("counts as SAFE, because {path} cannot be read: {reason}"),
         },
     }
 }

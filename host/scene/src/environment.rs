@@ -110,7 +110,9 @@ fn box_filtered(texels: &[Vec3], from: (u32, u32), to: (u32, u32)) -> Vec<Vec3> 
     out
 }
 
-fn decode_environment(bytes: &[u8], rotation_rad: f32, scale: f32) -> Result<Environment, SceneError> {
+/// [`load_environment`] of bytes, in this thread: for fuzzers.
+#[doc(hidden)]
+pub fn decode_environment(bytes: &[u8], rotation_rad: f32, scale: f32) -> Result<Environment, SceneError> {
     if !(rotation_rad.is_finite() && scale.is_finite() && scale >= 0.0) {
         return Err(SceneError::broken(
             "environment",

@@ -36,9 +36,13 @@ mod studio;
 use glam::{DAffine3, Vec2, Vec3, Vec4};
 
 pub use builtin::builtin;
+#[doc(hidden)]
+pub use environment::decode_environment;
 pub use environment::load_environment;
 pub use error::SceneError;
 pub use limits::Limits;
+#[doc(hidden)]
+pub use load::load_bytes_here;
 pub use load::{load, load_bytes, BodySelector, LoadOptions};
 pub use stats::SceneFeatures;
 pub use studio::studio;

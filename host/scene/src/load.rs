@@ -54,6 +54,12 @@ pub fn load_bytes(bytes: &[u8], options: &LoadOptions) -> Result<Scene, SceneErr
     contained(&options.limits, move |cancel| gltf_file::read(&bytes, None, &owned_options, cancel))
 }
 
+/// [`load_bytes`] in this thread, where a panic is a panic and nothing stops it when time is up: for fuzzers.
+#[doc(hidden)]
+pub fn load_bytes_here(bytes: &[u8], options: &LoadOptions) -> Result<Scene, SceneError> {
+    gltf_file::read(bytes, None, options, &Cancel::default())
+}
+
 /// Runs `work` in a helper thread for at most `limits.time`.
 pub(super) fn contained<T: Send + 'static>(
     limits: &Limits,

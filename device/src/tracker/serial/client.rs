@@ -6,7 +6,9 @@ use crate::clock_map::{ClockMap, ExchangeOutcome};
 use crate::cobs::Deframer;
 use crate::pose::Pose;
 use crate::time::{DeviceTicks, HostClock, HostTime};
-use crate::tracker::{BodyIndex, BodyKey, SampleGate, Tracker, TrackerCounters, TrackerError, TrackerSample};
+use crate::tracker::{
+    BodyIndex, BodyKey, SampleGate, Stream, Tracker, TrackerCounters, TrackerError, TrackerSample,
+};
 use crossbeam::channel::{Receiver, TryRecvError};
 use serialport::SerialPort;
 use std::io::ErrorKind;
@@ -41,7 +43,7 @@ pub struct SerialTrackerConfig {
 enum State {
     Idle { retry_at: HostTime },
     Opening(Receiver<serialport::Result<Box<dyn SerialPort>>>),
-    Open(Box<dyn SerialPort>),
+    Open(Box<dyn Stream>),
 }
 
 /// A tracker on a serial port.
@@ -91,6 +93,19 @@ impl SerialTracker {
         })
     }
 
+    /// A tracker whose port is open already: a conversation in memory, where a test writes the device's part. If it is
+    /// lost, the tracker opens `config.port` like any other.
+    pub fn over(
+        config: SerialTrackerConfig,
+        clock: Arc<dyn HostClock>,
+        port: Box<dyn Stream>,
+    ) -> Result<Self, TrackerError> {
+        let now = clock.now();
+        let mut this = Self::open(config, clock)?;
+        this.begin(port, now);
+        Ok(this)
+    }
+
     /// Counters of all input, by outcome.
     pub fn counters(&self) -> &TrackerCounters {
         self.gate.counters()
@@ -122,7 +137,7 @@ impl SerialTracker {
         }
     }
 
-    fn begin(&mut self, port: Box<dyn SerialPort>, now: HostTime) {
+    fn begin(&mut self, port: Box<dyn Stream>, now: HostTime) {
         self.deframer.reset();
         (self.map, self.ticks_per_second) = (None, 0);
         (self.echo_sent, self.echo_due, self.echoes) = (None, now, 0);
@@ -310,7 +325,7 @@ impl Tracker for SerialTracker {
             State::Idle { retry_at } if now >= *retry_at => self.state = self.start_opening(now),
             State::Idle { .. } => {}
             State::Opening(result) => match result.try_recv() {
-                Ok(Ok(port)) => self.begin(port, now),
+                Ok(Ok(port)) => self.begin(Box::new(port), now),
                 Ok(Err(error)) => {
                     let remedy = crate::tty::refusal(&error).remedy();
                     self.lose(now, format!("cannot open {}: {error}; {remedy}", self.config.port));

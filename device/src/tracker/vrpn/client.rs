@@ -4,9 +4,11 @@
 use super::wire::{self, system, type_name, Message, COOKIE, COOKIE_BYTES};
 use crate::clock_map::{ClockMap, ExchangeOutcome};
 use crate::time::{DeviceTicks, HostClock, HostTime};
-use crate::tracker::{BodyIndex, BodyKey, SampleGate, Tracker, TrackerCounters, TrackerError, TrackerSample};
+use crate::tracker::{
+    BodyIndex, BodyKey, SampleGate, Stream, Tracker, TrackerCounters, TrackerError, TrackerSample,
+};
 use crossbeam::channel::{Receiver, TryRecvError};
-use std::io::{ErrorKind, Read, Write};
+use std::io::ErrorKind;
 use std::net::{SocketAddr, TcpStream, ToSocketAddrs};
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::Arc;
@@ -66,7 +68,7 @@ enum State {
     /// A helper thread connects.
     Connecting(Receiver<std::io::Result<TcpStream>>),
     /// Connected; the cookie may still be missing.
-    Open { stream: TcpStream, greeted: bool, heard_at: HostTime },
+    Open { stream: Box<dyn Stream>, greeted: bool, heard_at: HostTime },
 }
 
 /// A VRPN client for a fixed set of bodies.
@@ -147,6 +149,20 @@ impl VrpnClient {
         })
     }
 
+    /// A client whose connection stands already: a conversation in memory, where a test writes the server's part. If it
+    /// is lost, the client connects to `config.server` like any other.
+    pub fn over(
+        config: VrpnConfig,
+        clock: Arc<dyn HostClock>,
+        stream: Box<dyn Stream>,
+    ) -> Result<Self, TrackerError> {
+        let now = clock.now();
+        let mut this = Self::open(config, clock)?;
+        this.begin(stream, now)
+            .map_err(|source| TrackerError::Io { context: "VRPN: cannot greet the server".into(), source })?;
+        Ok(this)
+    }
+
     /// Counters of all input, by outcome.
     pub fn counters(&self) -> &TrackerCounters {
         self.gate.counters()
@@ -179,9 +195,7 @@ impl VrpnClient {
         }
     }
 
-    fn begin(&mut self, stream: TcpStream, now: HostTime) -> std::io::Result<()> {
-        stream.set_nonblocking(true)?;
-        stream.set_nodelay(true)?;
+    fn begin(&mut self, mut stream: Box<dyn Stream>, now: HostTime) -> std::io::Result<()> {
         self.filled = 0;
         self.senders.fill(Sender::Unknown);
         self.kinds.fill(Kind::Unknown);
@@ -200,7 +214,7 @@ impl VrpnClient {
             wire::put_description(&mut self.out, system::SENDER, number, name);
         }
         wire::put_description(&mut self.out, system::TYPE, 0, type_name::PING);
-        (&stream).write_all(&self.out)?;
+        stream.write_all(&self.out)?;
         self.state = State::Open { stream, greeted: false, heard_at: now };
         Ok(())
     }
@@ -211,7 +225,8 @@ impl VrpnClient {
     }
 
     fn ping(&mut self, now: HostTime) -> std::io::Result<()> {
-        let (State::Open { stream, greeted: true, .. }, Some(sender)) = (&self.state, self.ping_as) else {
+        let (State::Open { stream, greeted: true, .. }, Some(sender)) = (&mut self.state, self.ping_as)
+        else {
             return Ok(());
         };
         // One at a time, so that each pong answers one ping; a lost ping times out after a second.
@@ -226,7 +241,6 @@ impl VrpnClient {
         let message =
             Message { seconds: 0, microseconds: 0, sender, kind: 0, sequence: self.pings, payload: &[] };
         wire::put(&mut self.out, &message);
-        let mut stream = stream;
         self.ping_sent = Some(self.clock.now());
         stream.write_all(&self.out)
     }
@@ -445,6 +459,12 @@ impl VrpnClient {
     }
 }
 
+/// Nothing waits for the server, and pings are not held back to be sent together.
+fn without_waiting(stream: &TcpStream) -> std::io::Result<()> {
+    stream.set_nonblocking(true)?;
+    stream.set_nodelay(true)
+}
+
 fn connect(server: &str) -> std::io::Result<TcpStream> {
     let text = server.trim_start_matches("tcp://");
     let addresses: Vec<SocketAddr> = match text.to_socket_addrs() {
@@ -468,7 +488,8 @@ impl Tracker for VrpnClient {
             State::Idle { .. } => {}
             State::Connecting(result) => match result.try_recv() {
                 Ok(Ok(stream)) => {
-                    if let Err(error) = self.begin(stream, now) {
+                    let begun = without_waiting(&stream).and_then(|()| self.begin(Box::new(stream), now));
+                    if let Err(error) = begun {
                         self.lose(now, error.to_string());
                     }
                 }

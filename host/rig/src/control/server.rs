@@ -254,31 +254,36 @@ fn may_give_orders(client: u32, me: u32) -> bool {
 }
 
 impl Client {
-    /// The order, once it has arrived completely.
-    ///
-    /// # Errors
-    /// The client disconnected, or sent something else (and is informed).
     fn read_word(&mut self) -> io::Result<Option<Order>> {
-        let mut bytes = [0u8; MAX_WORD];
-        while self.word.len() < MAX_WORD && !self.word.contains(&b'\n') {
-            let room = MAX_WORD - self.word.len();
-            match self.stream.read(&mut bytes[..room]) {
-                Ok(0) if self.word.is_empty() => return Err(io::ErrorKind::UnexpectedEof.into()),
-                Ok(0) => break,
-                Ok(n) => self.word.extend_from_slice(&bytes[..n]),
-                Err(e) if e.kind() == io::ErrorKind::WouldBlock => return Ok(None),
-                Err(e) if e.kind() == io::ErrorKind::Interrupted => {}
-                Err(e) => return Err(e),
-            }
-        }
-        let word = std::str::from_utf8(&self.word).ok().and_then(|w| Order::from_word(w.trim_end()));
-        if word.is_none() {
-            let known: Vec<_> = Order::ALL.iter().map(|(_, word)| *word).collect();
-            let _ = writeln!(self.stream, "unknown order; known: {}", known.join(", "));
-            return Err(io::ErrorKind::InvalidData.into());
-        }
-        Ok(word)
+        read_word(&mut self.stream, &mut self.word)
     }
+}
+
+/// The order on `stream`, once it has arrived completely; `word` holds what has arrived before.
+///
+/// # Errors
+/// The client disconnected, or sent something else (and is informed).
+#[doc(hidden)]
+pub fn read_word(stream: &mut (impl Read + Write), word: &mut Vec<u8>) -> io::Result<Option<Order>> {
+    let mut bytes = [0u8; MAX_WORD];
+    while word.len() < MAX_WORD && !word.contains(&b'\n') {
+        let room = MAX_WORD - word.len();
+        match stream.read(&mut bytes[..room]) {
+            Ok(0) if word.is_empty() => return Err(io::ErrorKind::UnexpectedEof.into()),
+            Ok(0) => break,
+            Ok(n) => word.extend_from_slice(&bytes[..n]),
+            Err(e) if e.kind() == io::ErrorKind::WouldBlock => return Ok(None),
+            Err(e) if e.kind() == io::ErrorKind::Interrupted => {}
+            Err(e) => return Err(e),
+        }
+    }
+    let order = std::str::from_utf8(word).ok().and_then(|w| Order::from_word(w.trim_end()));
+    if order.is_none() {
+        let known: Vec<_> = Order::ALL.iter().map(|(_, word)| *word).collect();
+        let _ = writeln!(stream, "unknown order; known: {}", known.join(", "));
+        return Err(io::ErrorKind::InvalidData.into());
+    }
+    Ok(order)
 }
 
 #[cfg(test)]

@@ -26,8 +26,9 @@ pub struct StatusFile {
 }
 
 /// Content of the file.
+#[doc(hidden)]
 #[derive(Clone, Debug, PartialEq, Eq)]
-pub(crate) struct Said {
+pub struct Said {
     /// When it was written, nanoseconds of [`monotonic_ns`].
     pub at_ns: u64,
     /// The projector's state at that time.
@@ -92,7 +93,9 @@ impl StatusFile {
     }
 }
 
-fn parse(text: &str) -> Option<Said> {
+/// What a file says; `None` if it is half written.
+#[doc(hidden)]
+pub fn parse(text: &str) -> Option<Said> {
     let mut lines = text.lines();
     let (first, second) = (lines.next()?, lines.next()?);
     let rig = lines.next()?.strip_prefix(HEARD)?.trim_start().to_owned();

@@ -1,0 +1,4 @@
+//! Bytes of a fuzzer into packets with right checksums to a host from its first word on.
+#![no_main]
+
+libfuzzer_sys::fuzz_target!(|bytes: &[u8]| dpm_tests::conversations::link::host_hello(bytes));

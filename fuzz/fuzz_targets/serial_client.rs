@@ -1,0 +1,4 @@
+//! Bytes of a fuzzer into the messages of a serial tracker's device.
+#![no_main]
+
+libfuzzer_sys::fuzz_target!(|bytes: &[u8]| dpm_tests::conversations::trackers::serial_client(bytes));

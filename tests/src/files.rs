@@ -1,0 +1,49 @@
+//! Files: scenes and environments. No bytes make the reader panic. The readers run in the thread of the caller, not in
+//! the one that the program gives them, so that a panic and a loop without end are seen as such.
+
+use dpm_scene::{decode_environment, load_bytes_here, LoadOptions, SceneError};
+
+/// A glTF file as it is.
+pub fn gltf(bytes: &[u8]) {
+    match load_bytes_here(bytes, &LoadOptions::default()) {
+        Ok(scene) => assert!(!scene.bodies.is_empty()),
+        Err(e @ (SceneError::Internal(_) | SceneError::TimedOut(_))) => panic!("{e}"),
+        Err(e) => assert!(!e.to_string().is_empty()),
+    }
+}
+
+/// A glTF file from its document and, after the first zero, its binary chunk: the container is right.
+pub fn gltf_parts(bytes: &[u8]) {
+    let (document, binary) = match bytes.iter().position(|b| *b == 0) {
+        Some(at) => (&bytes[..at], &bytes[at + 1..]),
+        None => (bytes, &[][..]),
+    };
+    gltf(&container(document, binary));
+}
+
+/// A GLB container around a document and a binary chunk.
+pub fn container(document: &[u8], binary: &[u8]) -> Vec<u8> {
+    let chunk = |kind: &[u8; 4], bytes: &[u8], pad: u8| {
+        let mut padded = bytes.to_vec();
+        padded.resize(bytes.len().next_multiple_of(4), pad);
+        [&(padded.len() as u32).to_le_bytes()[..], kind, &padded].concat()
+    };
+    let mut body = chunk(b"JSON", document, b' ');
+    if !binary.is_empty() {
+        body.extend(chunk(b"BIN\0", binary, 0));
+    }
+    [&b"glTF\x02\0\0\0"[..], &(body.len() as u32 + 12).to_le_bytes(), &body].concat()
+}
+
+/// An environment of any format: whatever is read has as many texels as it says, and light that is a number.
+pub fn environment(bytes: &[u8]) {
+    match decode_environment(bytes, 0.5, 2.0) {
+        Ok(dpm_scene::Environment::Equirect { width, height, texels, .. }) => {
+            assert_eq!(texels.len(), width as usize * height as usize);
+            assert!(texels.iter().all(|t| t.is_finite() && t.min_element() >= 0.0));
+        }
+        Ok(_) => {}
+        Err(e @ (SceneError::Internal(_) | SceneError::TimedOut(_))) => panic!("{e}"),
+        Err(e) => assert!(!e.to_string().is_empty()),
+    }
+}
