@@ -1,0 +1,71 @@
+//! Seeds that once broke a law, shrunk to what they need, and what a life has to be besides lawful: the same every time.
+
+use dpm_sim::life::{live, Lived, Order};
+use std::collections::BTreeSet;
+
+fn order(seed: u64, rate_hz: Option<u32>, seconds: i64) -> Order {
+    let length_ns = seconds * 1_000_000_000;
+    Order { seed, length_ns, rate_hz, without: BTreeSet::new(), until: None, is_loud: false }
+}
+
+fn lived(order: &Order) -> Lived {
+    live(order).unwrap_or_else(|e| panic!("{e}"))
+}
+
+/// Each of these broke a law when it was found; the comment says which.
+#[test]
+fn what_once_broke_a_law_keeps_them_all() {
+    let found = [
+        // A machine suspended for 75 ms: the learned travel rose to 150 ms, everything was dark for a minute.
+        (104, Some(947), 27),
+        // Another host greeted the projector: it was called up, and stayed dark for ever.
+        (106, Some(947), 40),
+        // The tracker's program restarted: asked for frames again only after a second.
+        (103, Some(947), 18),
+        // The projector lost power while the link came up: planned by its old clock, seconds ahead.
+        (5008, None, 40),
+        (5054, None, 56),
+        // SAFE while another host had the projector: never confirmed, never told.
+        (6050, None, 5),
+        // The first frame of a link, late: lit a slot later than its age allowed.
+        (5197, None, 41),
+        // Noise that looked like an acceleration, extrapolated for 50 ms.
+        (8163, None, 50),
+    ];
+    for (seed, rate_hz, seconds) in found {
+        let lived = lived(&order(seed, rate_hz, seconds));
+        assert_eq!(
+            lived.broken,
+            None,
+            "seed {seed}: {:#?}",
+            lived.story.iter().rev().take(12).collect::<Vec<_>>()
+        );
+        assert!(lived.table.total() > 0, "seed {seed} has no faults");
+    }
+}
+
+#[test]
+fn the_same_seed_is_the_same_life_and_another_is_not() {
+    let (a, b) = (lived(&order(77, Some(120), 20)), lived(&order(77, Some(120), 20)));
+    assert_eq!((a.trace, a.events, a.faults.clone()), (b.trace, b.events, b.faults));
+    assert_ne!(a.trace, lived(&order(78, Some(120), 20)).trace);
+    assert!(a.events > 10_000, "{}", a.events);
+}
+
+#[test]
+fn a_fault_that_is_dropped_does_not_strike() {
+    let all = lived(&order(5, Some(60), 20));
+    let first: BTreeSet<u32> = all.faults.iter().copied().take(1).collect();
+    let without = lived(&Order { without: first, ..order(5, Some(60), 20) });
+    assert!(without.trace != all.trace && without.broken.is_none());
+}
+
+/// With nothing wrong, the rig shows nearly every slot a frame of its own, at every rate.
+#[test]
+fn a_life_without_faults_is_light() {
+    for rate_hz in dpm_sim::plan::RATES {
+        let quiet = Order { without: (0..10_000).collect(), ..order(3, Some(rate_hz), 10) };
+        let lived = lived(&quiet);
+        assert_eq!((lived.broken, lived.table.total()), (None, 0), "{rate_hz}");
+    }
+}
