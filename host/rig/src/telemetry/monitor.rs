@@ -196,12 +196,14 @@ impl RunMonitor {
         self.stop.load(Ordering::Relaxed) || stopping::is_stopping()
     }
 
-    /// Gives the projector an order, which replaces one that was not yet taken. Only ARM replaces SAFE.
+    /// Gives the projector an order, which replaces one that was not yet taken, unless that one is stronger. ARM
+    /// replaces every order.
     pub fn give_order(&self, order: Order) {
         match order {
             Order::Arm => self.arm_unless_darkened(stopping::orders()),
             _ => drop(self.order.fetch_update(Ordering::Relaxed, Ordering::Relaxed, |waiting| {
-                (waiting as u8 != Order::Safe as u8).then_some(order as u64)
+                let stays = Order::from_code(waiting as u8).is_some_and(|w| w.strength() > order.strength());
+                (!stays).then_some(order as u64)
             })),
         }
     }
@@ -384,7 +386,11 @@ mod tests {
             monitor.give_order(order);
             assert_eq!((monitor.take_order(), monitor.take_order()), (Some(order), None));
         }
+        // Found by the simulator: FREEZE right after BLACK left the light on.
         monitor.give_order(Order::Black);
+        monitor.give_order(Order::Freeze);
+        assert_eq!(monitor.take_order(), Some(Order::Black));
+        monitor.give_order(Order::Arm);
         monitor.give_order(Order::Freeze);
         assert_eq!(monitor.take_order(), Some(Order::Freeze));
         monitor.give_order(Order::Safe);
