@@ -219,7 +219,7 @@ impl Net {
                 copy.extend_from_slice(bytes);
                 sent.push(copy);
             });
-            sent.into_iter().for_each(|bytes| self.from_server(bytes));
+            sent.into_iter().for_each(|bytes| self.server_sends(bytes));
         }
         if self.faults.flood > 0 && self.flooded_at + 1_000_000 <= now {
             self.flooded_at = now;
@@ -244,7 +244,7 @@ impl Net {
         self.push(self.now + self.travel_ns, from, bytes);
     }
 
-    fn from_server(&mut self, bytes: Vec<u8>) {
+    fn server_sends(&mut self, bytes: Vec<u8>) {
         if self.faults.cut {
             return;
         }
@@ -297,7 +297,7 @@ impl Net {
         Some(arrival)
     }
 
-    fn from_host(&mut self, bytes: &[u8]) {
+    fn host_sends(&mut self, bytes: &[u8]) {
         if self.faults.cut || self.faults.away {
             return;
         }
@@ -326,7 +326,7 @@ impl Datagrams for SimSocket {
     }
 
     fn send(&self, bytes: &[u8], _: SocketAddrV4) -> io::Result<()> {
-        lock(&self.0).from_host(bytes);
+        lock(&self.0).host_sends(bytes);
         Ok(())
     }
 

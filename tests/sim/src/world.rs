@@ -664,7 +664,7 @@ impl World {
         match state {
             St::Running => {}
             St::Dark => {
-                if way % 3 == 0 {
+                if way.is_multiple_of(3) {
                     self.ask_to_stop();
                 } else {
                     self.kill();
@@ -675,10 +675,10 @@ impl World {
                 self.restart_at = self.t + 100 * MS;
             }
             St::RePlugging => self.strike(Kind::U1, way),
-            St::FrozenOrBlack => self.give(if way % 2 == 0 { Order::Black } else { Order::Freeze }),
+            St::FrozenOrBlack => self.give(if way.is_multiple_of(2) { Order::Black } else { Order::Freeze }),
             St::ShuttingDown => self.ask_to_stop(),
             St::Faulted => {
-                if way % 2 == 0 {
+                if way.is_multiple_of(2) {
                     self.strike(Kind::U12, way);
                 } else {
                     self.give(Order::Safe);

@@ -1,7 +1,7 @@
 //! Tracking, plan and pack, and the GPU between them.
 
 use super::line::Line;
-use super::{Machine, Part, Rendered, Takes, NEVER};
+use super::{Machine, Notes, Part, Rendered, Takes, NEVER};
 use crate::engine::error::PipelineError;
 use crate::engine::facts::{CrewFacts, Facts};
 use crate::engine::pace::Real;
@@ -9,7 +9,7 @@ use crate::engine::pack::PackStage;
 use crate::engine::plan::{Latch, PlanStage};
 use crate::engine::pulse::{Pulse, Silence};
 use crate::engine::supervision::Trouble;
-use crate::frame::job::{FrameJob, FrameMemory, FrameNote};
+use crate::frame::job::{FrameJob, FrameMemory};
 use crate::pack::prepared::PreparedFrames;
 use crate::pipeline::parts::CrewParts;
 use crate::pipeline::threads::{POLL_NS, STEP_NS, WAIT_NS};
@@ -21,7 +21,6 @@ use dpm_device::tracker::Tracker;
 use dpm_handoff::latest::{latest, Publisher, Reader};
 use dpm_render::gpu::GpuError;
 use dpm_render::pack::{BitPlaneFrame, Kernel};
-use std::cell::RefCell;
 use std::collections::VecDeque;
 use std::sync::atomic::Ordering;
 use std::sync::Arc;
@@ -248,7 +247,7 @@ impl Crew {
         now: HostTime,
         facts: &Arc<Facts>,
         machine: &mut M,
-        notes: &RefCell<Vec<Box<FrameNote>>>,
+        notes: &Notes,
         line: &mut Line,
     ) {
         if self.tracking_at <= now {
@@ -275,17 +274,11 @@ impl Crew {
         }
     }
 
-    fn plan<M: Machine>(
-        &mut self,
-        now: HostTime,
-        facts: &Arc<Facts>,
-        machine: &mut M,
-        notes: &RefCell<Vec<Box<FrameNote>>>,
-    ) {
+    fn plan<M: Machine>(&mut self, now: HostTime, facts: &Arc<Facts>, machine: &mut M, notes: &Notes) {
         match std::mem::replace(&mut self.planning, Planning::Gone) {
             Planning::Free { at } if at <= now => self.planning = self.choose(now, facts, notes),
             Planning::Latched { at, latch, job } if at <= now => {
-                self.planning = self.latch(now, facts, machine, &latch, job);
+                self.planning = self.latch(now, machine, &latch, job);
             }
             Planning::Submits { at, mut job } if at <= now => {
                 self.facts.gpu.submit();
@@ -309,12 +302,7 @@ impl Crew {
     }
 
     /// Looks for memory and chooses the next frame's slot.
-    fn choose(
-        &mut self,
-        now: HostTime,
-        facts: &Arc<Facts>,
-        notes: &RefCell<Vec<Box<FrameNote>>>,
-    ) -> Planning {
+    fn choose(&mut self, now: HostTime, facts: &Arc<Facts>, notes: &Notes) -> Planning {
         if facts.monitor.stop_requested() || self.plan.is_complete() {
             if self.plan.is_complete() {
                 facts.is_complete.store(true, Ordering::Release);
@@ -349,13 +337,11 @@ impl Crew {
     fn latch<M: Machine>(
         &mut self,
         now: HostTime,
-        facts: &Arc<Facts>,
         machine: &mut M,
         latch: &Latch,
         mut job: FrameJob,
     ) -> Planning {
         self.pulses[1].beat(now, STEP_NS);
-        let _ = facts;
         match machine.takes(Part::Plan, latch.id, now) {
             Takes::Ns(ns) => {
                 let time = *self.times.latest().0;

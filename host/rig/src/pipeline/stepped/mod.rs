@@ -164,6 +164,10 @@ enum Phase {
     Over(Option<Box<SteppedEnd>>),
 }
 
+/// Notes that wait for a frame.
+#[allow(clippy::vec_box)] // The boxes travel with the frames.
+type Notes = RefCell<Vec<Box<FrameNote>>>;
+
 /// See the module's documentation.
 pub struct SteppedRun<M> {
     machine: M,
@@ -191,7 +195,7 @@ struct Running {
     /// Everything is collected.
     is_collected: bool,
     inbox: Inbox,
-    notes: RefCell<Vec<Box<FrameNote>>>,
+    notes: Notes,
     /// Nothing can end the run in order any more.
     is_broken: bool,
 }
@@ -459,10 +463,9 @@ impl Running {
     fn remake<M: Machine>(&mut self, now: HostTime, machine: &mut M) {
         match self.making.take() {
             None => {}
-            Some((at, made)) if at > now => {
-                if self.mind.waits_for(Making::Waits, now) {
-                    self.making = Some((at, made));
-                }
+            Some(unfinished) if unfinished.0 > now => {
+                let waits = self.mind.waits_for(Making::Waits, now);
+                self.making = waits.then_some(unfinished);
             }
             Some((_, Err(e))) => {
                 self.mind.waits_for(Making::Failed(PipelineError::Render(e.into())), now);
