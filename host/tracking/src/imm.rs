@@ -308,6 +308,13 @@ pub struct ImmConfig {
     pub initial_velocity: f64,
 }
 
+impl ImmConfig {
+    /// The greatest acceleration that a body is believed to repeat, m/s^2 or rad/s^2: twenty times the expected one.
+    pub(crate) fn greatest_recalled(&self) -> f64 {
+        24.0 * self.onset_acceleration
+    }
+}
+
 /// One filter on one axis. Its position is an offset from the bank's common base point.
 #[derive(Clone, Copy, Debug, Default)]
 struct AxisMode {

@@ -405,8 +405,10 @@ impl PoseFilter {
                 let mut position = track.position;
                 let mut rotation = track.rotation;
                 let (from_ns, to_ns) = (track.newest.at.0, z.at.0);
-                position.advance(&c.position_models, h, self.position_recall.between(from_ns, to_ns));
-                rotation.advance(&c.rotation_models, h, self.rotation_recall.between(from_ns, to_ns));
+                let (models, turns) = (&c.position_models, &c.rotation_models);
+                let (most, most_turn) = (models.greatest_recalled(), turns.greatest_recalled());
+                position.advance(models, h, self.position_recall.between(from_ns, to_ns, most));
+                rotation.advance(turns, h, self.rotation_recall.between(from_ns, to_ns, most_turn));
                 // The unseen effect of the strongest plausible acceleration counts as two standard deviations.
                 let slack = 0.25 * h * h;
                 let gate = c.gate_sigmas * c.gate_sigmas;

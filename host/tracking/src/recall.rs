@@ -54,6 +54,8 @@ struct Point<P> {
     at_ns: i64,
     motion: Smoothed<P>,
     passes: f64,
+    /// The first point of a track: between it and the point before it, nothing is known.
+    begins: bool,
     /// Axes along which there is an acceleration nearby.
     matters: [bool; 3],
     /// Axes along which it, or an acceleration shortly before it, is as exact as the noise allows.
@@ -68,6 +70,8 @@ pub(crate) struct Recall<C: Chart> {
     /// A ring: point `i` lies at `i` modulo [`POINTS`].
     points: Box<[Option<Point<C::Point>>]>,
     written: usize,
+    /// The next point is the first one of a track.
+    begins: bool,
     /// Points since the last acceleration along each axis.
     calm: [usize; 3],
     /// Points since the last one that fitted along each axis.
@@ -86,6 +90,7 @@ impl<C: Chart> Recall<C> {
             samples: [None; SAMPLES],
             points: vec![None; POINTS].into_boxed_slice(),
             written: 0,
+            begins: true,
             calm: [usize::MAX; 3],
             unfit: [0; 3],
             scanned: 0,
@@ -105,10 +110,12 @@ impl<C: Chart> Recall<C> {
     pub(crate) fn break_track(&mut self) {
         self.samples = [None; SAMPLES];
         self.lag_ns = None;
+        self.begins = true;
     }
 
-    /// The body's motion between `from_ns` and `to_ns` the last time.
-    pub(crate) fn between(&self, from_ns: i64, to_ns: i64) -> Option<Recalled> {
+    /// The body's motion between `from_ns` and `to_ns` the last time; `None` if its acceleration was beyond `most`, per
+    /// second squared. A tracker that jumped, or whose clock did, leaves such a past.
+    pub(crate) fn between(&self, from_ns: i64, to_ns: i64, most: f64) -> Option<Recalled> {
         let lag = self.lag_ns?;
         let then_ns = to_ns.saturating_sub(lag);
         let from = self.at(from_ns.saturating_sub(lag))?.motion;
@@ -116,10 +123,14 @@ impl<C: Chart> Recall<C> {
         let later = self.at(then_ns.saturating_add(AHEAD_NS))?.motion;
         let (h, ahead) = ((to_ns - from_ns) as f64 * 1e-9, AHEAD_NS as f64 * 1e-9);
         let bent = C::between(to.point, later.point) - to.velocity * ahead;
+        let (faster, acceleration) = (to.velocity - from.velocity, bent * (2.0 / (ahead * ahead)));
+        if acceleration.length() > most || faster.length() > most * h {
+            return None;
+        }
         Some(Recalled {
             moved: C::between(from.point, to.point) - from.velocity * h,
-            faster: to.velocity - from.velocity,
-            acceleration: bent * (2.0 / (ahead * ahead)),
+            faster,
+            acceleration,
             matters: [0, 1, 2].map(|axis| matters[axis] && exact[axis]),
         })
     }
@@ -165,7 +176,7 @@ impl<C: Chart> Recall<C> {
         }
         let (a, b) = (self.get(low)?, self.get(low + 1)?);
         let gap = b.at_ns.saturating_sub(a.at_ns);
-        if gap > GAP_NS || t_ns < a.at_ns {
+        if b.begins || gap > GAP_NS || t_ns < a.at_ns {
             return None;
         }
         let (since, until) = ((t_ns - a.at_ns) as f64 * 1e-9, (b.at_ns - t_ns) as f64 * 1e-9);
@@ -194,7 +205,8 @@ impl<C: Chart> Recall<C> {
         };
         let Some(middle) = self.samples.iter().rposition(|s| s.is_some_and(|(t, _)| due(t))) else { return };
         let Some((at_ns, motion)) = smoothed::<C>(&self.samples, middle, sigma) else { return };
-        let mut new = Point { at_ns, motion, passes: 1.0, matters: [false; 3], exact: [true; 3] };
+        let begins = std::mem::take(&mut self.begins);
+        let mut new = Point { at_ns, motion, passes: 1.0, begins, matters: [false; 3], exact: [true; 3] };
         for axis in 0..3 {
             self.calm[axis] = self.calm[axis].saturating_add(1);
             if motion.acceleration[axis].abs() > SIGNIFICANT * motion.acceleration_sigma[axis] {

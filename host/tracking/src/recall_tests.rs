@@ -84,7 +84,7 @@ fn what_is_recalled_is_what_happens() {
         for i in 0..4500i64 {
             let t = i * STEP_NS;
             body.see(t);
-            let Some(recalled) = body.recall.between(t, t + STEP_NS) else { continue };
+            let Some(recalled) = body.recall.between(t, t + STEP_NS, f64::INFINITY) else { continue };
             n += 1;
             let at = |t: i64| {
                 let (pose, twist) = body.motion.state_at(t);
@@ -191,7 +191,7 @@ fn no_instant_is_out_of_range() {
             let t = begin + i * STEP_NS;
             let p = velocity * ((i % 200) as f64 * 2e-3);
             recall.push(t, p, p, velocity, SIGMA);
-            let _ = recall.between(t, t.saturating_add(STEP_NS));
+            let _ = recall.between(t, t.saturating_add(STEP_NS), f64::INFINITY);
         }
         recall.break_track();
     }
@@ -209,11 +209,13 @@ fn gaps_end_a_recall_and_are_never_recalled() {
     // 0.2 s without samples: the track continues with the next one.
     t += 200_000_000;
     body.recall.break_track();
-    assert!(body.recall.lag_ns().is_none() && body.recall.between(t, t + STEP_NS).is_none());
+    assert!(body.recall.lag_ns().is_none() && body.recall.between(t, t + STEP_NS, f64::INFINITY).is_none());
     let gap = t - 200_000_000..t;
     while t < 6_000_000_000 {
         body.see(t);
-        if let (Some(lag), true) = (body.recall.lag_ns(), body.recall.between(t, t + STEP_NS).is_some()) {
+        if let (Some(lag), true) =
+            (body.recall.lag_ns(), body.recall.between(t, t + STEP_NS, f64::INFINITY).is_some())
+        {
             assert!(!gap.contains(&(t - lag)), "{t} recalls the gap");
         }
         t += STEP_NS;

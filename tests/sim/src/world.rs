@@ -141,6 +141,8 @@ pub struct World {
     pub(crate) calm_since: i64,
     /// A person is clearing up since.
     clearing_since: Option<i64>,
+    /// A person has ordered ARM again and again since.
+    arming_since: Option<i64>,
     tick_at: i64,
     /// The laws.
     pub laws: Laws,
@@ -224,6 +226,7 @@ impl World {
             episodes_begun: 0,
             calm_since: 0,
             clearing_since: None,
+            arming_since: None,
             tick_at: TICK_NS,
             laws,
             table: Table::default(),
@@ -578,7 +581,9 @@ impl World {
             Some(process) => match process.health() {
                 ProjectorHealth::Black | ProjectorHealth::Frozen | ProjectorHealth::InterlockOpen => true,
                 ProjectorHealth::Faulted(bits) => {
-                    bits & faults::WATCHDOG == 0 || latched & !faults::WATCHDOG != 0
+                    bits & faults::WATCHDOG == 0
+                        || latched & !faults::WATCHDOG != 0
+                        || self.laws.has_standing_order()
                 }
                 _ => self.laws.has_standing_order(),
             },
@@ -586,10 +591,14 @@ impl World {
         if wants_arm {
             self.give(Order::Arm);
             self.calm_since = self.t;
-            if self.clearing_since.is_some_and(|since| self.t - since > 8 * S) {
+            let since = *self.arming_since.get_or_insert(self.t);
+            if self.t - since > 8 * S {
                 let health = self.process.as_ref().map(|p| p.health());
                 self.laws.fail(self.t, format!("a person ordered ARM for 8 s and nothing helps: {health:?}"));
             }
+        }
+        if !wants_arm {
+            self.arming_since = None;
         }
         let is_well = self.process.is_some() && !wants_arm && self.state() == State::Running;
         if is_well {
@@ -724,7 +733,6 @@ impl World {
             self.plan(at, Action::Strike(fault.kind, fault.seed));
         }
         self.episode = None;
-        self.clearing_since = None;
         // Until the person has looked, nothing is called calm.
         self.clearing_since = Some(last + person_ns);
         self.plan(last + person_ns, Action::ClearUp);
