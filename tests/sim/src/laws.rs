@@ -91,8 +91,9 @@ pub struct Laws {
     disturbed_at: i64,
     lies_until: i64,
     clock_moved_at: i64,
-    /// When ARM was ordered after FREEZE.
+    /// When ARM was ordered after FREEZE. ARM reaches the light when the disk has forgotten the standing order.
     thawed_at: i64,
+    slow_disk_until: i64,
     rested_until: i64,
     /// A hang has been found by then.
     hidden_until: i64,
@@ -145,6 +146,7 @@ impl Laws {
             lies_until: 0,
             clock_moved_at: -S,
             thawed_at: -S,
+            slow_disk_until: 0,
             rested_until: 0,
             hidden_until: 0,
             is_told: false,
@@ -174,6 +176,11 @@ impl Laws {
     /// A fault that the program must find by itself has been found by then.
     pub fn hidden_until(&mut self, t: i64) {
         self.hidden_until = self.hidden_until.max(t);
+    }
+
+    /// Until then the disk may still be busy with an order.
+    pub fn slow_disk_until(&mut self, t: i64) {
+        self.slow_disk_until = self.slow_disk_until.max(t);
     }
 
     /// The program does not run for `ns`, so it finds everything that much later.
@@ -404,6 +411,9 @@ impl Laws {
 
     /// A frame is shown again.
     fn held_too_long(&mut self, at: i64, lag: i64) {
+        if at < self.slow_disk_until {
+            return;
+        }
         let Some(sent) = &self.showing else { return };
         if self.is_frozen() || at - self.clock_moved_at < 4 * S || at - self.thawed_at < DARK_AT_LAST_NS {
             return;

@@ -379,7 +379,10 @@ impl World {
                 let mut disk = lock(&self.disk);
                 disk.refuses = dice.happens(0.6);
                 disk.late_ns = if disk.refuses { 0 } else { dice.decades(10, 2_000) * MS };
+                // An order that waits, one that is written, and the ARM after them.
+                let busy_ns = lasts_ns + 3 * disk.late_ns;
                 drop(disk);
+                self.laws.slow_disk_until(self.t + busy_ns);
                 if dice.happens(0.7) {
                     self.give(dice.one_of(&[Order::Safe, Order::Black, Order::Freeze]));
                 }
