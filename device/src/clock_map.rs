@@ -92,7 +92,8 @@ impl Skew {
     fn error_at(&self, device_ns: i64) -> i64 {
         let age_s = (device_ns - self.at_ns).unsigned_abs() / 1_000_000_000 + 1;
         let wander = MAX_WANDER_PPB_PER_S.saturating_mul(age_s as i64);
-        self.error_ppb.saturating_add(wander).min(MAX_SKEW_PPB)
+        // The true rate lies within the plausible ones, and so no farther from this one than the farther of their ends.
+        self.error_ppb.saturating_add(wander).min(MAX_SKEW_PPB.saturating_add(self.ppb.saturating_abs()))
     }
 }
 

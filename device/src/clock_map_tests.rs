@@ -234,3 +234,31 @@ fn four_hundred_days_lose_no_nanosecond() {
     assert_eq!(map.steps(), 0);
     assert!(map.to_host(DeviceTicks(0)).unwrap().uncertainty_ns > 0);
 }
+
+/// Delays of milliseconds over half a second would allow any rate: such a slope must not count as better known than the
+/// plausible rates are.
+#[test]
+fn the_bound_is_honest_for_delays_that_are_long_and_lopsided() {
+    for seed in 0..20_000 {
+        let mut w = World::new(seed);
+        w.frequency = 1_000_000_000;
+        w.skew_ppb = (w.uniform() - 0.5) * 400_000.0;
+        let mut map = ClockMap::new(w.frequency).unwrap();
+        let mut t = S;
+        for _ in 0..30 {
+            t += (w.uniform() * w.uniform() * 0.6 * S as f64) as i64;
+            let long = if w.uniform() < 0.5 { 5e6 } else { 1e5 };
+            let (there, back) = ((w.uniform() * long) as i64 + 20_000, (w.uniform() * long) as i64 + 20_000);
+            let rx = w.ticks_at(t + there);
+            let outcome = map.add_exchange(HostTime(t), rx, rx, HostTime(t + there + back));
+            assert_eq!(outcome, ExchangeOutcome::Used, "world {seed}");
+            for later in [0, 50_000_000, 500_000_000] {
+                let at = t + there + later;
+                let mapped = map.to_host(w.ticks_at(at)).unwrap();
+                let error = (mapped.at.0 - at).abs();
+                assert!(error <= mapped.uncertainty_ns, "world {seed}: {error} ns, bound {mapped:?}");
+            }
+            t += there + back;
+        }
+    }
+}
