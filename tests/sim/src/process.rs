@@ -121,7 +121,10 @@ impl Process {
     pub fn exit(mut self) -> (Exit, Option<Box<SteppedEnd>>) {
         let mut end = self.run.end();
         let error = end.as_mut().and_then(|end| end.error.take());
-        self.orders.end(error.is_none());
+        // A program whose threads hang is ended from outside: it forgets no order.
+        if end.is_some() {
+            self.orders.end(error.is_none());
+        }
         let exit = match error {
             None if end.is_none() => Exit::Again("ended although threads hang".into()),
             None => Exit::InOrder,
