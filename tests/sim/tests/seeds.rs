@@ -29,6 +29,10 @@ fn what_once_broke_a_law_keeps_them_all() {
         (6050, None, 5),
         // The first frame of a link, late: lit a slot later than its age allowed.
         (5197, None, 41),
+        // The projector lost power while it was plugged in again: a frame planned by its old clock was lit 1.5 s later.
+        (4_001_269, Some(60), 12),
+        // A jump, recalled as an acceleration when the body came to the same place again.
+        (1_000_159, None, 10),
         // Noise that looked like an acceleration, extrapolated for 50 ms.
         (8163, None, 50),
     ];

@@ -145,6 +145,11 @@ impl<P: Pace> LinkStage<P> {
             None => *self.ready_at.insert(now),
             Some(ready_at) => ready_at,
         };
+        if self.is_of_another_clock(note) {
+            note.fate = Fate::Overtaken;
+            self.ready_at = None;
+            return Offer::Settled;
+        }
         if self.waits_for_room(now, note) {
             return Offer::Again(now.plus_ns(CREDIT_STEP_NS));
         }
@@ -180,6 +185,13 @@ impl<P: Pace> LinkStage<P> {
             self.facts.lead_ns.store(self.lead.lead_ns(), Ordering::Relaxed);
             self.facts.typical_ns.store(self.lead.typical_ns(), Ordering::Relaxed);
         }
+    }
+
+    /// True if the frame was planned by a clock of the projector that has since started anew, or whose map was wrong by
+    /// more than a slot: it would be lit at another time than it was drawn for.
+    fn is_of_another_clock(&self, note: &FrameNote) -> bool {
+        let meant_at = self.keeper.time().host_of(note.plan.target_at);
+        meant_at.ns_since(note.plan.due_at).abs() > self.slot_ns
     }
 
     /// When a frame that is sent at `now` will be lit: in its slot, or in the first one that begins after it arrives.
