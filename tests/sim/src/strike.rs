@@ -217,6 +217,7 @@ impl World {
     fn strike_cable(&mut self, kind: Kind, dice: &mut Dice) {
         use Kind as K;
         let lasts_ns = dice.decades(2, 1_500) * MS;
+        let lasts_ns = if kind == K::U3 { lasts_ns.min(300 * MS) } else { lasts_ns };
         let mut cable = lock(&self.cable);
         let f = &mut cable.faults;
         match kind {
