@@ -178,6 +178,18 @@ impl Rig {
         Ok(Self { config: config.clone(), scene, camera, bodies, observer })
     }
 
+    /// The projector of a rig alone, without scene, bodies or calibration: for light that nothing is traced for.
+    ///
+    /// # Errors
+    /// The projector's place or view makes no camera.
+    pub fn of_projector(config: &RigConfig) -> Result<Self, RigError> {
+        let mut config = config.clone();
+        config.keep_projector();
+        let camera = camera(&config, config.projector.raster(), &mut Vec::new())?;
+        let observer = observer(&config, &[])?;
+        Ok(Self { config, scene: Scene::default(), camera, bodies: Vec::new(), observer })
+    }
+
     /// Frames per second.
     pub fn rate(&self) -> FrameRate {
         self.config.projector.frame_rate

@@ -3,5 +3,6 @@
 mod source;
 mod stage;
 
+pub(crate) use source::NoTracker;
 pub use source::{open_for, SourceError};
 pub use stage::{TrackSnapshot, TrackingStage};
