@@ -39,6 +39,7 @@ pub mod light;
 mod mock;
 pub mod order;
 pub mod pack;
+pub mod pattern;
 pub mod pictures;
 pub mod pipeline;
 pub mod plan;

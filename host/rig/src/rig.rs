@@ -193,6 +193,20 @@ impl Rig {
         Ok(Self { config: config.clone(), scene, camera, bodies, observer, drive })
     }
 
+    /// The projector of a rig alone, without scene, bodies or calibration: for light that nothing is traced for.
+    ///
+    /// # Errors
+    /// The projector's place or view makes no camera.
+    pub fn of_projector(config: &RigConfig) -> Result<Self, RigError> {
+        let mut config = config.clone();
+        config.keep_projector();
+        let raster = config.projector.raster();
+        let camera = camera(&config, raster)?;
+        let observer = observer(&config, &[])?;
+        let (scene, bodies) = (Scene::default(), Vec::new());
+        Ok(Self { config, scene, camera, bodies, observer, drive: Drive::default() })
+    }
+
     /// Frames per second.
     pub fn rate(&self) -> FrameRate {
         self.config.projector.frame_rate
