@@ -30,7 +30,7 @@
 
 pub mod config;
 pub mod control;
-mod drive;
+pub mod drive;
 mod engine;
 pub mod failure;
 pub mod frame;

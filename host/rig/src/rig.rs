@@ -3,7 +3,7 @@
 use crate::config::{
     BodyConfig, BuiltinScene, CalibrationUnit, EnvironmentConfig, GazeConfig, RigConfig, TrackerConfig,
 };
-use crate::drive::{albedo_of, drive};
+use crate::drive::{albedo_of, drive, DriveError};
 use crate::mock::{Motion, MotionError, MotionSpec};
 use dpm_device::planes::Raster;
 use dpm_device::pose::Pose;
@@ -53,13 +53,8 @@ pub enum RigError {
         message: String,
     },
     /// A file that describes the projector's light cannot be used.
-    #[error("{key}: {message}")]
-    Light {
-        /// Configuration key.
-        key: &'static str,
-        /// What is wrong.
-        message: String,
-    },
+    #[error(transparent)]
+    Drive(#[from] DriveError),
     /// No body has this name.
     #[error("{key}: no body is named \"{name}\"; bodies: {known}")]
     UnknownBody {
