@@ -154,13 +154,13 @@ impl ProjectorCamera {
     }
 
     /// Full horizontal angle of the raster, radians.
-    pub(crate) fn horizontal_fov(&self) -> f64 {
+    pub fn horizontal_fov(&self) -> f64 {
         let w = f64::from(self.raster.width());
         (self.cx / self.fx).atan() + ((w - self.cx) / self.fx).atan()
     }
 
     /// Full vertical angle of the raster, radians.
-    pub(crate) fn vertical_fov(&self) -> f64 {
+    pub fn vertical_fov(&self) -> f64 {
         let h = f64::from(self.raster.height());
         (self.cy / self.fy).atan() + ((h - self.cy) / self.fy).atan()
     }
