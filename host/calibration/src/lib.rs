@@ -11,4 +11,5 @@ mod least_squares;
 pub mod model;
 pub mod pinhole;
 pub mod pivot;
+pub mod projector;
 pub mod trajectory;

@@ -4,7 +4,7 @@
 //! space of this project (along -Z, y up). Pixels count from the raster's upper left corner: the centre of the first
 //! pixel is (0.5, 0.5). OpenCV counts from that centre, so its `cx` is smaller by 0.5.
 
-use dpm_common::so3::{hat, so3_exp};
+use dpm_common::so3::so3_exp;
 use dpm_device::planes::Raster;
 use dpm_scene::geometry::projector::{ProjectorCamera, ProjectorError};
 use glam::{DAffine3, DMat2, DMat3, DQuat, DVec2, DVec3};
@@ -214,16 +214,6 @@ fn distort_by_lens(n: DVec2) -> [DVec2; 5] {
         DVec2::new(r2 + 2.0 * n.x * n.x, xy),
         n * r2 * r2 * r2,
     ]
-}
-
-/// Turns a pose into the matrix that takes its body's points into the world.
-pub fn affine(rotation: DQuat, position: DVec3) -> DAffine3 {
-    DAffine3::from_rotation_translation(rotation, position)
-}
-
-/// The derivative of `exp(w) v` by `w` at 0.
-pub(crate) fn by_turn(v: DVec3) -> DMat3 {
-    -hat(v)
 }
 
 #[cfg(test)]

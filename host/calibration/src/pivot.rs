@@ -3,7 +3,7 @@
 //! Every pose says `position + rotation * tip = place`: linear in tip and place. What is not turned is not seen, so the
 //! turns must be large enough about two axes.
 
-use crate::dense::{inverse_spd, svd};
+use crate::dense::svd;
 use crate::trajectory::{Stamped, POSITION_NOISE_M, ROTATION_NOISE_RAD};
 use glam::{DMat3, DVec3};
 use thiserror::Error;
@@ -144,13 +144,6 @@ pub(crate) fn trace(m: &DMat3) -> f64 {
     m.x_axis.x + m.y_axis.y + m.z_axis.z
 }
 
-/// Inverse of a symmetric matrix; `None` if it is not positive definite.
-pub(crate) fn inverse3(m: &DMat3) -> Option<DMat3> {
-    let inverse = inverse_spd(&(0..3).map(|i| m.row(i).to_array().to_vec()).collect::<Vec<_>>())?;
-    let column = |i: usize| DVec3::new(inverse[i][0], inverse[i][1], inverse[i][2]);
-    Some(DMat3::from_cols(column(0), column(1), column(2)))
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -189,7 +182,7 @@ mod tests {
             let got = wand(2000, DVec3::splat(0.4), 1.0, seed).solve().unwrap();
             let e = got.tip - TIP;
             assert!(e.length() < 5e-5, "{e}");
-            ratio += e.dot(inverse3(&got.covariance).unwrap() * e) / 3.0;
+            ratio += e.dot((got.covariance.inverse() * e)) / 3.0;
         }
         // Chi squared with 180 degrees of freedom, over 180.
         let mean = ratio / runs as f64;
