@@ -12,4 +12,6 @@ pub mod model;
 pub mod pinhole;
 pub mod pivot;
 pub mod projector;
+pub mod rehearsal;
+pub mod sensor;
 pub mod trajectory;

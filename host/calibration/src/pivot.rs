@@ -182,7 +182,7 @@ mod tests {
             let got = wand(2000, DVec3::splat(0.4), 1.0, seed).solve().unwrap();
             let e = got.tip - TIP;
             assert!(e.length() < 5e-5, "{e}");
-            ratio += e.dot((got.covariance.inverse() * e)) / 3.0;
+            ratio += e.dot(got.covariance.inverse() * e) / 3.0;
         }
         // Chi squared with 180 degrees of freedom, over 180.
         let mean = ratio / runs as f64;

@@ -12,7 +12,9 @@ mod uncertainty;
 pub use fit::Priors;
 pub(crate) use fit::{fit, spread_of, Fit};
 pub use refusal::Refusal;
+pub(crate) use solve::check_result;
 pub use solve::{relocate, solve, Solved};
+pub(crate) use uncertainty::percentile;
 pub use uncertainty::{predict, Predicted, Volume};
 
 use crate::model::ProjectorModel;

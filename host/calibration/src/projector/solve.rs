@@ -3,7 +3,7 @@
 use super::fit::{Task, OFFSET};
 use super::refusal::{check_distance, check_up};
 use super::uncertainty::{percentile, predict, Predicted, Volume};
-use super::{fit, middle, misses, spread_of, Fit, Options, Priors, Refusal, Sight};
+use super::{fit, middle, misses, spread_of, Fit, Known, Options, Priors, Refusal, Sight};
 use crate::model::{ProjectorModel, INTRINSICS};
 use crate::pinhole::{calibrate, CalibrationError, CalibrationOptions, Pair};
 use dpm_common::so3::so3_log;
@@ -218,14 +218,7 @@ fn judge(
 ) -> Result<Solved, Refusal> {
     let model = &fitted.model;
     let used = sights.iter().zip(&inliers).filter(|(_, i)| **i).map(|(s, _)| model.local(s.world).z);
-    let depths: Vec<f64> = used.collect();
-    let mean = depths.iter().sum::<f64>() / depths.len() as f64;
-    let range = percentile(depths.clone(), 1.0) - percentile(depths, 0.0);
-    check_distance(mean, options.known.distance_m)?;
-    if range < LEAST_DEPTH * mean {
-        return Err(Refusal::OneDepth { share: 100.0 * range / mean });
-    }
-    check_up(model.world_from_projector().matrix3.y_axis, options.known.up)?;
+    let (mean, range) = check_result(raster, model, &used.collect::<Vec<_>>(), &options.known)?;
     if fitted.offset_s.abs() > MOST_OFFSET_S {
         return Err(Refusal::TimeShifted { offset_ms: 1e3 * fitted.offset_s });
     }
@@ -243,6 +236,27 @@ fn judge(
         solved.notes.push(format!("the depths differ by {share:.0} % of the distance only; 25 % are good"));
     }
     Ok(solved)
+}
+
+/// Judges a projector by the depths of its points, and by what is known of its place. Gives the mean of the depths and
+/// their range.
+pub(crate) fn check_result(
+    raster: Raster,
+    model: &ProjectorModel,
+    depths: &[f64],
+    known: &Known,
+) -> Result<(f64, f64), Refusal> {
+    let mean = depths.iter().sum::<f64>() / depths.len().max(1) as f64;
+    let range = percentile(depths.to_vec(), 1.0) - percentile(depths.to_vec(), 0.0);
+    check_distance(mean, known.distance_m)?;
+    if range < LEAST_DEPTH * mean {
+        return Err(Refusal::OneDepth { share: 100.0 * range / mean });
+    }
+    check_up(model.world_from_projector().matrix3.y_axis, known.up)?;
+    if !model.lens_is_invertible(raster) {
+        return Err(Refusal::LensFolds);
+    }
+    Ok((mean, range))
 }
 
 fn judge_uncertainty(
