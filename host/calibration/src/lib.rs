@@ -6,6 +6,7 @@
 //! [`light`] how bright a code value is where. [`file`] keeps the results, and [`rehearsal`] judges all of it against a
 //! drawn truth. No module reads a device: samples come in, numbers or reasons come out.
 
+pub mod body;
 mod dense;
 mod least_squares;
 pub mod model;

@@ -110,8 +110,7 @@ impl Hand {
         let half = 0.5 * (volume.high - volume.low);
         let tau = std::f64::consts::TAU;
         let waves = [0, 1, 2].map(|axis| {
-            [[0.85, u(0.22, 0.36)], [0.4, u(0.45, 0.75)]]
-                .map(|[a, f]| [a * half[axis], tau * f, u(0.0, tau)])
+            [[0.85, u(0.22, 0.36)], [0.4, u(0.45, 0.75)]].map(|[a, f]| [a * half[axis], tau * f, u(0.0, tau)])
         });
         let turns = [0; 3].map(|_| [u(0.35, 0.6), tau * u(0.2, 0.5), u(0.0, tau)]);
         Self { waves, turns, rest: so3_exp(DVec3::new(u(-1.0, 1.0), u(-1.0, 1.0), u(-1.0, 1.0))) }
