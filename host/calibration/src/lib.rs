@@ -9,6 +9,7 @@
 pub mod body;
 mod dense;
 mod least_squares;
+pub mod light;
 pub mod model;
 pub mod pinhole;
 pub mod pivot;

@@ -19,8 +19,8 @@ pub struct Block {
 }
 
 impl Block {
-    /// The instant of a sample by the sensor's clock, relative to `base_ns`.
-    pub(super) fn at(&self, index: usize, base_ns: i64) -> f64 {
+    /// The instant of a sample by the sensor's clock, nanoseconds after `base_ns`.
+    pub fn at(&self, index: usize, base_ns: i64) -> f64 {
         self.start_ns.saturating_sub(base_ns) as f64 + index as f64 * self.interval_ns
     }
 }
