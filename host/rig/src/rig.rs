@@ -8,7 +8,6 @@ use dpm_device::planes::Raster;
 use dpm_device::pose::Pose;
 use dpm_device::regular_file;
 use dpm_device::time::FrameRate;
-use dpm_scene::geometry::distortion::Distortion;
 use dpm_scene::geometry::opencv::{self, LengthUnit};
 use dpm_scene::geometry::projector::{ProjectorCamera, ProjectorError};
 use dpm_scene::{BodySelector, Environment, LoadOptions, Scene, SceneError, SceneFeatures};
@@ -172,7 +171,7 @@ impl Rig {
         scene.environment = fitted;
         scene.warnings.extend(told.map(|t| format!("scene.environment: {t}")));
         let raster = raster.unwrap_or_else(|| config.projector.raster());
-        let camera = camera(config, raster, &mut scene.warnings)?;
+        let camera = camera(config, raster)?;
         let bodies = rig_bodies(config, &scene)?;
         let observer = observer(config, &bodies)?;
         Ok(Self { config: config.clone(), scene, camera, bodies, observer })
@@ -244,13 +243,8 @@ fn environment(config: &RigConfig, has_lights: bool) -> Result<Option<Environmen
     })
 }
 
-/// The projector's camera at `raster`, from its calibration or from its position and direction. Adds to `warnings`
-/// what the camera does not reproduce.
-fn camera(
-    config: &RigConfig,
-    raster: Raster,
-    warnings: &mut Vec<String>,
-) -> Result<ProjectorCamera, RigError> {
+/// The projector's camera at `raster`, from its calibration or from its position and direction.
+fn camera(config: &RigConfig, raster: Raster) -> Result<ProjectorCamera, RigError> {
     let p = &config.projector;
     let Some(path) = &p.calibration else {
         return Ok(ProjectorCamera::look_at(
@@ -270,25 +264,7 @@ fn camera(
     let text = regular_file::read_text(path, opencv::MAX_BYTES as u64).map_err(|e| wrong(e.to_string()))?;
     let calibrated = p.calibrated_raster();
     let stored = opencv::read(&text, calibrated, unit).map_err(|e| wrong(e.to_string()))?;
-    if stored.distortion != Distortion::default() {
-        warnings.push(format!(
-            "projector.calibration: {}: its lens distortion is not compensated and displaces the light",
-            path.display()
-        ));
-    }
-    let c = stored.camera;
-    // This divides the same view into other pixels. The camera's coordinates start at the raster's corner, so
-    // everything scales.
-    let scale_x = f64::from(raster.width()) / f64::from(calibrated.width());
-    let scale_y = f64::from(raster.height()) / f64::from(calibrated.height());
-    Ok(ProjectorCamera::new(
-        raster,
-        c.world_from_projector,
-        c.fx * scale_x,
-        c.fy * scale_y,
-        c.cx * scale_x,
-        c.cy * scale_y,
-    )?)
+    Ok(stored.camera.at_raster(raster))
 }
 
 fn motion_spec(index: usize, body: &BodyConfig) -> Result<MotionSpec, RigError> {

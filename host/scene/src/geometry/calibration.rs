@@ -5,6 +5,7 @@
 //! (\[Fischler81\]) to exclude wrong pairs. Everything is computed in coordinates centred on the points and scaled to
 //! their spread: metres and millimetres give the same pixels.
 
+use super::lens::Lens;
 use super::projector::ProjectorCamera;
 use super::refine::{refine, Pinhole, Refined};
 use super::svd::{svd, Columns};
@@ -421,6 +422,7 @@ impl Normalisation {
             fy: m.focal.y / self.pixel_scale,
             cx: m.centre.x / self.pixel_scale + self.pixel_centre.x,
             cy: m.centre.y / self.pixel_scale + self.pixel_centre.y,
+            lens: Lens::default(),
         }
     }
 
