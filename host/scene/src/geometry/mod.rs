@@ -2,7 +2,6 @@
 
 pub mod calibration;
 pub mod lens;
-pub mod opencv;
 pub mod projector;
 mod refine;
 mod svd;
