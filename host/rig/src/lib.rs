@@ -28,6 +28,7 @@
 //! # }
 //! ```
 
+mod calibrated;
 pub mod config;
 pub mod control;
 mod engine;

@@ -368,23 +368,7 @@ fn the_largest_texts_are_read_in_a_moment() {
 }
 
 /// By the public example of Christie: Z is up and Y is forward.
-const MPCDI: &str = r#"<?xml version="1.0" encoding="utf-8"?>
-<MPCDI profile="sl" geometry="2" color="1" date="2018-11-16 19:30:11" version="2.0">
-  <display><buffer id="b">
-    <region id="left &amp; low" xResolution="1400" yResolution="1050" x="0" y="0" xsize="1" ysize="1">
-      <frustum><yaw>-45</yaw><pitch>30</pitch><roll>0</roll>
-        <rightAngle>26.5</rightAngle><leftAngle>-26.5</leftAngle><upAngle>30</upAngle><downAngle>-5</downAngle></frustum>
-      <coordinateFrame><posx>1</posx><posy>-1</posy><posz>-0.5</posz>
-        <yawx>0</yawx><yawy>0</yawy><yawz>-1</yawz><pitchx>1</pitchx><pitchy>0</pitchy><pitchz>0</pitchz>
-        <rollx>0</rollx><rolly>1</rolly><rollz>0</rollz></coordinateFrame>
-    </region>
-  </buffer></display>
-  <files><fileset region="left &amp; low">
-    <geometryWarpFile><geometricUnit>m</geometricUnit><path></path></geometryWarpFile>
-    <distortionMap><path></path></distortionMap>
-  </fileset></files>
-</MPCDI>
-"#;
+const MPCDI: &str = include_str!("../../../../tests/assets/mpcdi/shader_lamp.mpcdi.xml");
 
 #[test]
 fn a_region_of_mpcdi_looks_where_its_angles_say() {
