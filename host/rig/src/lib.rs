@@ -31,6 +31,7 @@
 mod calibrated;
 pub mod config;
 pub mod control;
+mod drive;
 mod engine;
 pub mod failure;
 pub mod frame;

@@ -2,10 +2,12 @@
 
 use crate::calibrated::calibrated_camera;
 use crate::config::{BodyConfig, BuiltinScene, EnvironmentConfig, GazeConfig, RigConfig, TrackerConfig};
+use crate::drive::{albedo_of, drive};
 use crate::mock::{Motion, MotionError, MotionSpec};
 use dpm_device::planes::Raster;
 use dpm_device::pose::Pose;
 use dpm_device::time::FrameRate;
+use dpm_render::drive::Drive;
 use dpm_scene::geometry::projector::{ProjectorCamera, ProjectorError};
 use dpm_scene::{BodySelector, Environment, LoadOptions, Scene, SceneError, SceneFeatures};
 use glam::{DAffine3, DQuat, DVec3, Vec3};
@@ -47,6 +49,14 @@ pub enum RigError {
         /// What is wrong.
         message: String,
     },
+    /// A file that describes the projector's light cannot be used.
+    #[error("{key}: {message}")]
+    Light {
+        /// Configuration key.
+        key: &'static str,
+        /// What is wrong.
+        message: String,
+    },
     /// No body has this name.
     #[error("{key}: no body is named \"{name}\"; bodies: {known}")]
     UnknownBody {
@@ -67,8 +77,11 @@ pub enum RigError {
 pub struct RigBody {
     /// Name, as the tracker reports it.
     pub name: String,
-    /// Its pose at rest.
+    /// Pose of its mesh at rest.
     pub rest: Pose,
+    /// From the mesh's space to that of the body that the tracker reports; the identity with the mock tracker, which
+    /// reports the mesh.
+    pub mesh_to_body: DAffine3,
     /// Its true motion, which is known only with the mock tracker.
     pub motion: Option<Motion>,
 }
@@ -138,6 +151,8 @@ pub struct Rig {
     pub bodies: Vec<RigBody>,
     /// The observer's eye.
     pub observer: Observer,
+    /// From radiance to code values.
+    pub drive: Drive,
 }
 
 /// A rigid transform from a pose.
@@ -171,7 +186,8 @@ impl Rig {
         let camera = camera(config, raster, &mut scene.warnings)?;
         let bodies = rig_bodies(config, &scene)?;
         let observer = observer(config, &bodies)?;
-        Ok(Self { config: config.clone(), scene, camera, bodies, observer })
+        let drive = drive(config, &scene, raster)?;
+        Ok(Self { config: config.clone(), scene, camera, bodies, observer, drive })
     }
 
     /// Frames per second.
@@ -179,7 +195,12 @@ impl Rig {
         self.config.projector.frame_rate
     }
 
-    /// The true world-from-body transform of every tracked body at an instant; `None` unless the tracker is the mock.
+    /// Albedo of the real surface of a body of the scene.
+    pub(crate) fn albedo_of(&self, body: usize) -> [f64; 3] {
+        albedo_of(&self.config, self.scene.bodies.get(body).and_then(|b| b.tracked))
+    }
+
+    /// The true world-from-mesh transform of every tracked body at an instant; `None` unless the tracker is the mock.
     pub fn true_poses(&self, t_ns: i64) -> Option<Vec<DAffine3>> {
         self.bodies.iter().map(|b| b.motion.as_ref().map(|m| affine(&m.pose_at(t_ns)))).collect()
     }
@@ -191,13 +212,6 @@ impl Rig {
         out.extend(self.scene.bodies.iter().map(|b| {
             b.tracked.and_then(|i| tracked.get(usize::from(i))).copied().unwrap_or(b.world_from_body_rest)
         }));
-    }
-
-    /// `pi * exposure / (albedo * max_intensity)`.
-    pub(crate) fn drive_gain(&self) -> f32 {
-        let c = &self.config;
-        (std::f64::consts::PI * c.render.exposure / (c.scene.surface_albedo * c.projector.max_intensity))
-            as f32
     }
 }
 
@@ -309,7 +323,11 @@ fn rig_bodies(config: &RigConfig, scene: &Scene) -> Result<Vec<RigBody>, RigErro
             } else {
                 None
             };
-            Ok(RigBody { name, rest, motion })
+            let mesh_to_body = match named.get(i) {
+                Some(body) if !mock => body.mesh_to_body.to_affine().unwrap_or(DAffine3::IDENTITY),
+                _ => DAffine3::IDENTITY,
+            };
+            Ok(RigBody { name, rest, mesh_to_body, motion })
         })
         .collect()
 }

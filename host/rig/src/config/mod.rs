@@ -10,6 +10,7 @@ mod prediction;
 mod projector;
 mod run;
 mod safety;
+mod values;
 mod world;
 
 #[cfg(test)]
@@ -25,6 +26,7 @@ pub use safety::{
     InterlockConfig, InterlockSignal, KeyInterlockConfig, LimitsConfig, LineInterlockConfig,
     NoInterlockConfig, ProcessInterlockConfig,
 };
+pub use values::{Axes, PerChannel};
 pub use world::*;
 
 use crate::mock::MotionSpec;

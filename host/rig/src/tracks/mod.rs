@@ -2,6 +2,7 @@
 
 mod source;
 mod stage;
+mod tracker_frame;
 
 pub use source::{open_for, SourceError};
 pub use stage::{TrackSnapshot, TrackingStage};
