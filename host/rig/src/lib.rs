@@ -30,6 +30,7 @@
 
 pub mod config;
 pub mod control;
+mod drive;
 mod engine;
 pub mod failure;
 pub mod frame;
@@ -38,6 +39,7 @@ pub mod light;
 mod mock;
 pub mod order;
 pub mod pack;
+pub mod pattern;
 pub mod pictures;
 pub mod pipeline;
 pub mod plan;

@@ -9,6 +9,7 @@ mod refine;
 
 use crate::dense::{svd, Columns};
 use dpm_device::planes::Raster;
+use dpm_scene::geometry::lens::Lens;
 use dpm_scene::geometry::projector::ProjectorCamera;
 use glam::{DMat3, DVec2, DVec3};
 use refine::{refine, Pinhole, Refined};
@@ -423,6 +424,7 @@ impl Normalisation {
             fy: m.focal.y / self.pixel_scale,
             cx: m.centre.x / self.pixel_scale + self.pixel_centre.x,
             cy: m.centre.y / self.pixel_scale + self.pixel_centre.y,
+            lens: Lens::default(),
         }
     }
 
