@@ -4,7 +4,7 @@ use crate::config::{
     BodyConfig, BuiltinScene, CalibrationUnit, EnvironmentConfig, GazeConfig, RigConfig, TrackerConfig,
 };
 use crate::mock::{Motion, MotionError, MotionSpec};
-use dpm_device::planes::Raster;
+use dpm_device::planes::{PlaneSchedule, Raster};
 use dpm_device::pose::Pose;
 use dpm_device::regular_file;
 use dpm_device::time::FrameRate;
@@ -142,6 +142,8 @@ pub struct Rig {
     pub bodies: Vec<RigBody>,
     /// The observer's eye.
     pub observer: Observer,
+    /// The planes of a frame in the order in which they are shown.
+    pub schedule: PlaneSchedule,
 }
 
 /// A rigid transform from a pose.
@@ -175,7 +177,8 @@ impl Rig {
         let camera = camera(config, raster, &mut scene.warnings)?;
         let bodies = rig_bodies(config, &scene)?;
         let observer = observer(config, &bodies)?;
-        Ok(Self { config: config.clone(), scene, camera, bodies, observer })
+        let schedule = config.projector.schedule();
+        Ok(Self { config: config.clone(), scene, camera, bodies, observer, schedule })
     }
 
     /// The projector of a rig alone, without scene, bodies or calibration: for light that nothing is traced for.
@@ -187,7 +190,8 @@ impl Rig {
         config.keep_projector();
         let camera = camera(&config, config.projector.raster(), &mut Vec::new())?;
         let observer = observer(&config, &[])?;
-        Ok(Self { config, scene: Scene::default(), camera, bodies: Vec::new(), observer })
+        let schedule = config.projector.schedule();
+        Ok(Self { config, scene: Scene::default(), camera, bodies: Vec::new(), observer, schedule })
     }
 
     /// Frames per second.
