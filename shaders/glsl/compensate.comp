@@ -26,13 +26,37 @@ uint quantise(float v, inout uint nans, inout uint clipped) {
     return uint(shifted);
 }
 
-// Absolute cosine between the smooth normal and the pixel's ray. There is no contraction, and no quotient but 1 / x, so it equals the CPU's
+// The same where the light is not proportional to the code value: the code whose light is nearest. `optics` begins with the thresholds of each
+// channel, which grow; the code is the number of thresholds after the first that `v` reaches. Equals the CPU's `code_of` bit for bit.
+uint quantise_by_response(float v, uint channel, inout uint nans, inout uint clipped) {
+    uint bits = floatBitsToUint(v);
+    if ((bits & 0x7fffffffu) > 0x7f800000u) {
+        nans++;
+        return 0u;
+    }
+    if (v > 1.0) clipped++;
+    uint code = 0u;
+    for (uint step_ = RESPONSE_CODES / 2u; step_ > 0u; step_ >>= 1u)
+        if (v >= optics[channel * RESPONSE_CODES + code + step_]) code += step_;
+    return code;
+}
+
+// The pixel's ray before the pose, of any length. Without a lens it is times fx fy, because then no quotient is needed.
+vec3 ray_of(uvec2 pixel) {
+    if (LENS != LENS_NONE) {
+        vec2 straight = straight_ray(ivec2(pixel));
+        return vec3(straight.x, -straight.y, -1.0);
+    }
+    vec2 raster = vec2(pixel) + 0.5;
+    precise vec3 d = vec3((raster.x - frame.intrinsics.z) * frame.intrinsics.y, (frame.intrinsics.w - raster.y) * frame.intrinsics.x, -(frame.intrinsics.x * frame.intrinsics.y));
+    return d;
+}
+
+// Absolute cosine between the smooth normal and a ray of the projector. There is no contraction, and no quotient but 1 / x, so it equals the CPU's
 // `real_cosine` bit for bit.
-float real_cosine(vec4 rows[3], vec3 n0, vec3 n1, vec3 n2, vec2 b, vec2 raster) {
+float real_cosine(vec4 rows[3], vec3 n0, vec3 n1, vec3 n2, vec2 b, vec3 d) {
     precise float w = (1.0 - b.x) - b.y;
     precise vec3 n = (n0 * w + n1 * b.x) + n2 * b.y;
-    // The ray times fx fy. Its length is divided out below.
-    precise vec3 d = vec3((raster.x - frame.intrinsics.z) * frame.intrinsics.y, (frame.intrinsics.w - raster.y) * frame.intrinsics.x, -(frame.intrinsics.x * frame.intrinsics.y));
     precise float dot_ = 0.0, nn = 0.0, dd = 0.0;
     for (int i = 0; i < 3; i++) {
         precise float ni = (rows[i].x * n.x + rows[i].y * n.y) + rows[i].z * n.z;
@@ -62,10 +86,19 @@ void main() {
         vec2 b = surface.barycentric;
         // The real surface is smooth, so its normal is the interpolated one, without the normal map of the look.
         float cosine = real_cosine(instance_at(instance).world_from_object, vertex_at(ref.vertices.x).normal, vertex_at(ref.vertices.y).normal,
-                                   vertex_at(ref.vertices.z).normal, b, vec2(pixel) + 0.5);
+                                   vertex_at(ref.vertices.z).normal, b, ray_of(pixel));
         precise float geometry = (surface.distance * surface.distance) * (1.0 / max(cosine, 1e-3));
-        precise vec3 drive = (shown[index].rgb - frame.ambient) * (frame.drive_gain * geometry);
-        code = quantise(drive.r, nans, clipped) | (quantise(drive.g, nans, clipped) << 8u) | (quantise(drive.b, nans, clipped) << 16u);
+        precise vec3 drive = (shown[index].rgb - frame.ambient) * (instance_at(instance).drive_gain * geometry);
+        if (HAS_FLAT_FIELD) {
+            uint at = frame.flat_field_at + 3u * index;
+            precise vec3 even = drive * vec3(optics[at], optics[at + 1u], optics[at + 2u]);
+            drive = even;
+        }
+        if (HAS_RESPONSE) {
+            for (uint c = 0u; c < 3u; c++) code |= quantise_by_response(drive[c], c, nans, clipped) << (8u * c);
+        } else {
+            code = quantise(drive.r, nans, clipped) | (quantise(drive.g, nans, clipped) << 8u) | (quantise(drive.b, nans, clipped) << 16u);
+        }
         lit = 1u;
     }
     codes[index] = code;

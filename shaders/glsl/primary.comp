@@ -66,7 +66,7 @@ void main() {
     uvec2 pixel;
     if (!tile_pixel(tiles[gl_WorkGroupID.x >> 2u], pixel)) return;
     Surface surface = Surface(NO_HIT, vec2(0.0), 0.0);
-    vec3 direction = projector_direction(vec2(pixel) + 0.5);
+    vec3 direction = pixel_direction(pixel);
     bool camera_is_eye = (frame.flags & FRAME_CAMERA_IS_EYE) != 0u;
     uint mask = camera_is_eye ? 0u : INSTANCE_PROJECTED;
     Hit hit;

@@ -44,11 +44,56 @@ bool finite3(vec3 v) { return finite(v.x) && finite(v.y) && finite(v.z); }
 // The same for counts that are nearly always 0. It avoids a sum over the lanes, which costs software Vulkan half as much as a node of the traversal.
 #define COUNT_RARE(counter, value) { if ((value) != 0u) atomicAdd(counters.counter, value); }
 
-// Unit direction, in world space, of the ray through a raster position. Pixel centres are at half integers.
-vec3 projector_direction(vec2 raster) {
-    vec3 d = vec3((raster.x - frame.intrinsics.z) / frame.intrinsics.x, -(raster.y - frame.intrinsics.w) / frame.intrinsics.y, -1.0);
-    return normalize(transform_vector(frame.world_from_projector, d));
+// What differs from pixel to pixel and does not change while the rig runs: thresholds of the response, flat field, straight rays.
+layout(set = 0, binding = B_OPTICS, scalar) readonly buffer Optics { float optics[]; };
+
+// The straight ray of a pixel's centre: x / z to the right and y / z down, before the lens.
+vec2 straight_ray(ivec2 pixel) {
+    uint at = frame.rays_at + 2u * (uint(pixel.y) * frame.width + uint(pixel.x));
+    return vec2(optics[at], optics[at + 1u]);
 }
+
+// Unit direction, in world space, of a straight ray of the projector.
+vec3 direction_of(vec2 straight) { return normalize(transform_vector(frame.world_from_projector, vec3(straight.x, -straight.y, -1.0))); }
+
+// The straight ray of a raster position without a lens.
+vec2 unbent_ray(vec2 raster) { return vec2((raster.x - frame.intrinsics.z) / frame.intrinsics.x, (raster.y - frame.intrinsics.w) / frame.intrinsics.y); }
+
+// Unit direction, in world space, of the ray through a pixel's centre.
+vec3 pixel_direction(uvec2 pixel) { return direction_of(LENS == LENS_NONE ? unbent_ray(vec2(pixel) + 0.5) : straight_ray(ivec2(pixel))); }
+
+// The same through any raster position. Pixel centres are at half integers. Between them the straight rays of a lens are interpolated, and half a
+// pixel around the raster they are continued.
+vec3 projector_direction(vec2 raster) {
+    if (LENS == LENS_NONE) return direction_of(unbent_ray(raster));
+    vec2 p = raster - 0.5;
+    ivec2 last = ivec2(frame.width, frame.height) - 1;
+    ivec2 from = clamp(ivec2(floor(p)), ivec2(0), max(last - 1, ivec2(0))), to = min(from + 1, last);
+    vec2 part = p - vec2(from);
+    vec2 upper = mix(straight_ray(from), straight_ray(ivec2(to.x, from.y)), part.x);
+    vec2 lower = mix(straight_ray(ivec2(from.x, to.y)), straight_ray(to), part.x);
+    return direction_of(mix(upper, lower, part.y));
+}
+
+// The bent ray of a straight one, by OpenCV's definitions.
+vec2 bend(vec2 p) {
+    float r2 = dot(p, p);
+    if (LENS == LENS_FISHEYE) {
+        float r = sqrt(r2), angle = atan(r), a2 = angle * angle;
+        vec4 k = frame.lens[0];
+        float bent = angle * (1.0 + a2 * (k.x + a2 * (k.y + a2 * (k.z + a2 * k.w))));
+        return r > 1e-6 ? p * (bent / r) : p;
+    }
+    vec4 k = frame.lens[0], rational = frame.lens[1], prism = frame.lens[2];
+    float radial = (1.0 + r2 * (k.x + r2 * (k.y + r2 * rational.x))) / (1.0 + r2 * (rational.y + r2 * (rational.z + r2 * rational.w)));
+    vec2 tangential = vec2(2.0 * k.z * p.x * p.y + k.w * (r2 + 2.0 * p.x * p.x), k.z * (r2 + 2.0 * p.y * p.y) + 2.0 * k.w * p.x * p.y);
+    vec2 q = p * radial + tangential + r2 * (prism.xz + r2 * prism.yw);
+    vec3 t = vec3(dot(frame.lens_tilt[0].xyz, vec3(q, 1.0)), dot(frame.lens_tilt[1].xyz, vec3(q, 1.0)), dot(frame.lens_tilt[2].xyz, vec3(q, 1.0)));
+    return t.xy / max(t.z, 1e-6);
+}
+
+// A raster position that no pixel and no neighbourhood of one reaches.
+const vec2 NOWHERE = vec2(-1e6);
 
 // Raster position of a point. The projector is the origin of all coordinates.
 vec2 project(vec3 p) {
@@ -56,7 +101,11 @@ vec2 project(vec3 p) {
                   dot(vec3(frame.world_from_projector[0].y, frame.world_from_projector[1].y, frame.world_from_projector[2].y), p),
                   dot(vec3(frame.world_from_projector[0].z, frame.world_from_projector[1].z, frame.world_from_projector[2].z), p));
     float depth = max(-q.z, 1e-9);
-    return vec2(frame.intrinsics.z + frame.intrinsics.x * q.x / depth, frame.intrinsics.w - frame.intrinsics.y * q.y / depth);
+    if (LENS == LENS_NONE) return vec2(frame.intrinsics.z + frame.intrinsics.x * q.x / depth, frame.intrinsics.w - frame.intrinsics.y * q.y / depth);
+    vec2 straight = vec2(q.x, -q.y) / depth;
+    // Farther out the lens folds back onto the raster.
+    if (!(dot(straight, straight) <= frame.lens_limit * frame.lens_limit)) return NOWHERE;
+    return frame.intrinsics.zw + frame.intrinsics.xy * bend(straight);
 }
 
 // The pixel of this invocation. Each tile of the list has four workgroups of 8 x 8 pixels. False outside the raster.

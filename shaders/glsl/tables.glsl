@@ -6,18 +6,19 @@
 #ifdef TEXEL_TABLES
 layout(set = 0, binding = B_INSTANCES, rgba32ui) uniform readonly uimageBuffer instance_rows;
 Instance instance_at(uint i) {
-    uvec4 r0 = imageLoad(instance_rows, int(i) * 12 + 0);
-    uvec4 r1 = imageLoad(instance_rows, int(i) * 12 + 1);
-    uvec4 r2 = imageLoad(instance_rows, int(i) * 12 + 2);
-    uvec4 r3 = imageLoad(instance_rows, int(i) * 12 + 3);
-    uvec4 r4 = imageLoad(instance_rows, int(i) * 12 + 4);
-    uvec4 r5 = imageLoad(instance_rows, int(i) * 12 + 5);
-    uvec4 r6 = imageLoad(instance_rows, int(i) * 12 + 6);
-    uvec4 r7 = imageLoad(instance_rows, int(i) * 12 + 7);
-    uvec4 r8 = imageLoad(instance_rows, int(i) * 12 + 8);
-    uvec4 r9 = imageLoad(instance_rows, int(i) * 12 + 9);
-    uvec4 r10 = imageLoad(instance_rows, int(i) * 12 + 10);
-    uvec4 r11 = imageLoad(instance_rows, int(i) * 12 + 11);
+    uvec4 r0 = imageLoad(instance_rows, int(i) * 13 + 0);
+    uvec4 r1 = imageLoad(instance_rows, int(i) * 13 + 1);
+    uvec4 r2 = imageLoad(instance_rows, int(i) * 13 + 2);
+    uvec4 r3 = imageLoad(instance_rows, int(i) * 13 + 3);
+    uvec4 r4 = imageLoad(instance_rows, int(i) * 13 + 4);
+    uvec4 r5 = imageLoad(instance_rows, int(i) * 13 + 5);
+    uvec4 r6 = imageLoad(instance_rows, int(i) * 13 + 6);
+    uvec4 r7 = imageLoad(instance_rows, int(i) * 13 + 7);
+    uvec4 r8 = imageLoad(instance_rows, int(i) * 13 + 8);
+    uvec4 r9 = imageLoad(instance_rows, int(i) * 13 + 9);
+    uvec4 r10 = imageLoad(instance_rows, int(i) * 13 + 10);
+    uvec4 r11 = imageLoad(instance_rows, int(i) * 13 + 11);
+    uvec4 r12 = imageLoad(instance_rows, int(i) * 13 + 12);
     return Instance(vec4[3](vec4(uintBitsToFloat(r0.x), uintBitsToFloat(r0.y), uintBitsToFloat(r0.z), uintBitsToFloat(r0.w)), vec4(uintBitsToFloat(r1.x), uintBitsToFloat(r1.y), uintBitsToFloat(r1.z), uintBitsToFloat(r1.w)), vec4(uintBitsToFloat(r2.x), uintBitsToFloat(r2.y), uintBitsToFloat(r2.z), uintBitsToFloat(r2.w))),
         vec4[3](vec4(uintBitsToFloat(r3.x), uintBitsToFloat(r3.y), uintBitsToFloat(r3.z), uintBitsToFloat(r3.w)), vec4(uintBitsToFloat(r4.x), uintBitsToFloat(r4.y), uintBitsToFloat(r4.z), uintBitsToFloat(r4.w)), vec4(uintBitsToFloat(r5.x), uintBitsToFloat(r5.y), uintBitsToFloat(r5.z), uintBitsToFloat(r5.w))),
         vec3(uintBitsToFloat(r6.x), uintBitsToFloat(r6.y), uintBitsToFloat(r6.z)),
@@ -28,7 +29,9 @@ Instance instance_at(uint i) {
         r11.x,
         r11.y,
         uintBitsToFloat(r11.z),
-        r11.w);
+        r11.w,
+        vec3(uintBitsToFloat(r12.x), uintBitsToFloat(r12.y), uintBitsToFloat(r12.z)),
+        r12.w);
 }
 #else
 layout(set = 0, binding = B_INSTANCES, scalar) readonly buffer instance_block { Instance instance_table[]; };
@@ -43,7 +46,9 @@ Instance instance_at(uint i) {
         instance_table[i].flags,
         instance_table[i].body,
         instance_table[i].extent,
-        instance_table[i].reserved);
+        instance_table[i].reserved,
+        instance_table[i].drive_gain,
+        instance_table[i].reserved_too);
 }
 #endif
 

@@ -41,7 +41,7 @@ void main() {
     uvec2 pixel = uvec2(item.pixel % frame.width, item.pixel / frame.width);
     if (surface.id == NO_HIT) {
         // Only an ordinary camera traces the background.
-        radiance_out[item.pixel] = vec4(environment_radiance(projector_direction(vec2(pixel) + 0.5)), 1.0);
+        radiance_out[item.pixel] = vec4(environment_radiance(pixel_direction(pixel)), 1.0);
         return;
     }
     Hit hit;

@@ -78,6 +78,12 @@ specialization_constants! {
     HAS_DEMODULATION: bool = true;
     /// The picture is filtered in space.
     HAS_FILTER: bool = true;
+    /// How the projector's lens bends rays, as `LENS_*`.
+    LENS: uint = 0;
+    /// The projector's light is not proportional to the code value.
+    HAS_RESPONSE: bool = false;
+    /// The projector's pixels are not equally bright.
+    HAS_FLAT_FIELD: bool = false;
     /// Width of the bit planes, pixels.
     PLANE_WIDTH: uint = 1;
     /// Height of the bit planes, pixels.

@@ -81,8 +81,6 @@ gpu_structs! {
         tiles_x: u32,
         /// Limit on the luminance of indirect contributions; infinite: off.
         clamp_indirect: f32,
-        /// drive = radiance * this * l_P^2 / cos: pi * exposure / (albedo * max_intensity).
-        drive_gain: f32,
         /// Ambient radiance that the surface already shows, subtracted before compensation.
         ambient: [f32; 3],
         /// Lights in the alias table.
@@ -126,6 +124,16 @@ gpu_structs! {
         drawn: u32,
         /// How many samples a pixel those frames took together, wraps: where a sequence that belongs to a pixel goes on.
         first_sample: u32,
+        /// Lens of kind `LENS_BROWN`: k1 k2 p1 p2 k3 k4 k5 k6 s1 s2 s3 s4. Of kind `LENS_FISHEYE`: k1 k2 k3 k4.
+        lens: [[f32; 4]; 3],
+        /// Rows of the matrix by which a bent ray meets a tilted panel, and 0.
+        lens_tilt: Rows,
+        /// Straight rays farther than this from the axis (`r / z`) have no pixel.
+        lens_limit: f32,
+        /// First element of the straight rays, two numbers a pixel, in the table of optics.
+        rays_at: u32,
+        /// First element of the flat field, three numbers a pixel, in the table of optics.
+        flat_field_at: u32,
     }
 
     /// What is known of a pixel without noise.
@@ -225,6 +233,10 @@ gpu_structs! {
         extent: f32,
         /// 0.
         reserved: u32,
+        /// drive = radiance * this * l_P^2 / cos, per channel: pi * exposure * white / (albedo * max_intensity).
+        drive_gain: [f32; 3],
+        /// 0.
+        reserved_too: u32,
     }
 
     /// Attributes of one vertex.
@@ -409,6 +421,10 @@ pub const CONSTANTS: &[(&str, u32)] = &[
     ("ENVIRONMENT_NONE", ENVIRONMENT_NONE),
     ("ENVIRONMENT_CONSTANT", ENVIRONMENT_CONSTANT),
     ("ENVIRONMENT_MAP", ENVIRONMENT_MAP),
+    ("LENS_NONE", LENS_NONE),
+    ("LENS_BROWN", LENS_BROWN),
+    ("LENS_FISHEYE", LENS_FISHEYE),
+    ("RESPONSE_CODES", RESPONSE_CODES),
     ("SAMPLER_INDEPENDENT", SAMPLER_INDEPENDENT),
     ("SAMPLER_BLUE_NOISE", SAMPLER_BLUE_NOISE),
     ("SAMPLER_CONTINUED", SAMPLER_CONTINUED),
@@ -480,6 +496,15 @@ pub const ENVIRONMENT_NONE: u32 = 0;
 pub const ENVIRONMENT_CONSTANT: u32 = 1;
 /// Radiance comes from a map of directions.
 pub const ENVIRONMENT_MAP: u32 = 2;
+/// The lens does not bend rays.
+pub const LENS_NONE: u32 = 0;
+/// Radial, tangential, thin prism, and a tilted panel.
+pub const LENS_BROWN: u32 = 1;
+/// A fisheye.
+pub const LENS_FISHEYE: u32 = 2;
+/// Code values of a channel: the table of optics begins with so many thresholds for each of three channels if the light is not proportional
+/// to the code value.
+pub const RESPONSE_CODES: u32 = 256;
 /// Random numbers are independent for every path.
 pub const SAMPLER_INDEPENDENT: u32 = 0;
 /// One point set a frame, shifted at every pixel by blue noise.
@@ -572,6 +597,7 @@ pub const BINDINGS: &[(&str, u32)] = &[
     ("B_HISTORY_ROWS", 29),
     ("B_FILTERED_ROWS", 30),
     ("B_FORMER", 31),
+    ("B_OPTICS", 32),
 ];
 
 impl Surface {

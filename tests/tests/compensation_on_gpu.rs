@@ -2,14 +2,17 @@
 
 use bytemuck::Zeroable;
 use dpm_lab::reference::Sampler;
-use dpm_lab::twins::compensation::{real_cosine, Compensation};
+use dpm_lab::twins::compensation::{ray_of, real_cosine, Compensation};
+use dpm_render::drive::Response;
 use dpm_render::gpu::{
     BindingKind, BindingSet, BindingTable, Buffer, CommandList, ComputePipeline, FrameFence, Gpu, MemoryKind,
 };
 use dpm_render::pack::{quantise, QuantiseCounts};
 use dpm_render::scene_data::SceneNeeds;
+use dpm_shaders::specialization as ids;
 use dpm_shaders::structs::{
-    Counters, Frame, Instance, Rows, Surface, TriangleRef, Vertex, BINDINGS, NO_HIT, TEXEL_BINDINGS,
+    Counters, Frame, Instance, Rows, Surface, TriangleRef, Vertex, BINDINGS, LENS_BROWN, LENS_NONE, NO_HIT,
+    TEXEL_BINDINGS,
 };
 use dpm_tests::gpu::with_gpu;
 use std::mem::size_of;
@@ -27,6 +30,35 @@ struct Input {
     vertices: Vec<Vertex>,
     surfaces: Vec<Surface>,
     radiance: Vec<[f32; 4]>,
+    optics: Optics,
+}
+
+/// What differs from pixel to pixel, if it does.
+#[derive(Default)]
+struct Optics {
+    response: Option<Response>,
+    flat_field: Option<Vec<[f32; 3]>>,
+    straight: Option<Vec<[f32; 2]>>,
+}
+
+impl Optics {
+    /// The table that the shader reads, with the places of its parts written into `frame`, and the constants that compile them in.
+    fn table(&self, frame: &mut Frame) -> (Vec<f32>, [(u32, u32); 3]) {
+        let mut table = vec![0.0; 4];
+        if let Some(response) = &self.response {
+            table = (0..3).flat_map(|c| *response.thresholds(c)).collect();
+        }
+        frame.flat_field_at = table.len() as u32;
+        table.extend(self.flat_field.iter().flatten().flatten());
+        frame.rays_at = table.len() as u32;
+        table.extend(self.straight.iter().flatten().flatten());
+        let constants = [
+            (ids::LENS, if self.straight.is_some() { LENS_BROWN } else { LENS_NONE }),
+            (ids::HAS_RESPONSE, u32::from(self.response.is_some())),
+            (ids::HAS_FLAT_FIELD, u32::from(self.flat_field.is_some())),
+        ];
+        (table, constants)
+    }
 }
 
 /// Runs the shader alone, in both ways in which it reads the scene, and checks that they agree.
@@ -53,7 +85,10 @@ fn on_gpu_through(gpu: &Arc<Gpu>, input: &Input, texel: bool) -> (Vec<u32>, Coun
     let device = |what, bytes| Buffer::new(gpu, what, bytes, MemoryKind::Device).unwrap();
     let host = |what, bytes| Buffer::new(gpu, what, bytes, MemoryKind::Readback).unwrap();
     let unused = rows("unused", &[0; 16]);
-    let frame = uploaded("frame", bytemuck::bytes_of(&input.frame));
+    let mut frame = input.frame;
+    let (optics, optics_constants) = input.optics.table(&mut frame);
+    let frame = uploaded("frame", bytemuck::bytes_of(&frame));
+    let optics = uploaded("optics", bytemuck::cast_slice(&optics));
     let instances = rows("instances", bytemuck::cast_slice(&input.instances));
     let refs = rows("refs", bytemuck::cast_slice(&input.refs));
     let vertices = rows("vertices", bytemuck::cast_slice(&input.vertices));
@@ -64,18 +99,18 @@ fn on_gpu_through(gpu: &Arc<Gpu>, input: &Input, texel: bool) -> (Vec<u32>, Coun
     let counters = device("counters", size_of::<Counters>());
     let codes_host = host("codes", PIXELS * 4);
     let counters_host = host("counters", size_of::<Counters>());
-    let kinds: Vec<_> = BINDINGS
-        .iter()
+    let bound = || BINDINGS.iter().filter(|(name, _)| texel || !name.ends_with("_ROWS"));
+    let kinds: Vec<_> = bound()
         .map(|&(name, binding)| {
             let of_rows = texel && TEXEL_BINDINGS.contains(&name);
             (binding, if of_rows { BindingKind::Texel } else { BindingKind::Storage })
         })
         .collect();
     let table = BindingTable::new(gpu, &kinds).unwrap();
-    let constants = SceneNeeds::default().everything().constants();
+    let mut constants = SceneNeeds::default().everything().constants();
+    constants.extend(optics_constants);
     let pipeline = ComputePipeline::new(&table, dpm_shaders::COMPENSATE.reading(texel), &constants).unwrap();
-    let buffers: Vec<(u32, &Buffer)> = BINDINGS
-        .iter()
+    let buffers: Vec<(u32, &Buffer)> = bound()
         .map(|&(name, binding)| {
             let buffer = match name {
                 "B_FRAME" => &frame,
@@ -87,6 +122,7 @@ fn on_gpu_through(gpu: &Arc<Gpu>, input: &Input, texel: bool) -> (Vec<u32>, Coun
                 "B_SHOWN" => &radiance,
                 "B_CODES" => &codes,
                 "B_COUNTERS" => &counters,
+                "B_OPTICS" => &optics,
                 _ => &unused,
             };
             (binding, buffer)
@@ -111,7 +147,6 @@ fn on_gpu_through(gpu: &Arc<Gpu>, input: &Input, texel: bool) -> (Vec<u32>, Coun
 
 /// The same on the CPU.
 fn twin(input: &Input) -> (Vec<u32>, QuantiseCounts, u32) {
-    let k = Compensation { gain: [input.frame.drive_gain; 3], ambient: input.frame.ambient };
     let mut lit = 0;
     let drive: Vec<[f32; 4]> = (0..PIXELS)
         .map(|i| {
@@ -123,15 +158,26 @@ fn twin(input: &Input) -> (Vec<u32>, QuantiseCounts, u32) {
             let instance = &input.instances[(s.id >> 24) as usize];
             let corners = input.refs[(instance.triangle_offset + (s.id & 0xff_ffff)) as usize].vertices;
             let normals = corners.map(|v| input.vertices[v as usize].normal);
-            let at = [(i as u32 % WIDTH) as f32 + 0.5, (i as u32 / WIDTH) as f32 + 0.5];
-            let cos = real_cosine(&instance.world_from_object, normals, s.barycentric, &input.frame, at);
+            let straight = input.optics.straight.as_ref().map(|rays| rays[i]);
+            let ray = ray_of(&input.frame, [i as u32 % WIDTH, i as u32 / WIDTH], straight);
+            let cos = real_cosine(&instance.world_from_object, normals, s.barycentric, &input.frame, ray);
             let [r, g, b, _] = input.radiance[i];
-            let [r, g, b] = k.unlimited_drive([r, g, b], s.distance, cos);
-            [r, g, b, 0.0]
+            let k = Compensation { gain: instance.drive_gain, ambient: input.frame.ambient };
+            let mut drive = k.unlimited_drive([r, g, b], s.distance, cos);
+            if let Some(flat_field) = &input.optics.flat_field {
+                (0..3).for_each(|c| drive[c] *= flat_field[i][c]);
+            }
+            [drive[0], drive[1], drive[2], 0.0]
         })
         .collect();
     let mut codes = vec![0; PIXELS];
     let counts = quantise(&drive, None, &mut codes);
+    if let Some(response) = &input.optics.response {
+        for (code, drive) in codes.iter_mut().zip(&drive) {
+            let [r, g, b] = [0, 1, 2].map(|c| u32::from(response.code_of(c, drive[c])));
+            *code = r | g << 8 | b << 16;
+        }
+    }
     (codes, counts, lit)
 }
 
@@ -150,6 +196,7 @@ fn random_input(seed: u64) -> Input {
         .map(|i| Instance {
             world_from_object: rows(&mut random),
             triangle_offset: i * 8,
+            drive_gain: [0.3, 0.3 + 0.01 * i as f32, 0.3],
             ..Zeroable::zeroed()
         })
         .collect();
@@ -178,11 +225,10 @@ fn random_input(seed: u64) -> Input {
         width: WIDTH,
         height: HEIGHT,
         tiles_x: WIDTH.div_ceil(16),
-        drive_gain: 0.3,
         ambient: [0.05, 0.0, 0.01],
         ..Zeroable::zeroed()
     };
-    Input { frame, instances, refs, vertices, surfaces, radiance }
+    Input { frame, instances, refs, vertices, surfaces, radiance, optics: Optics::default() }
 }
 
 fn assert_same(gpu: &Arc<Gpu>, input: &Input) -> Counters {
@@ -218,6 +264,31 @@ fn codes_equal_the_twin_bit_for_bit() {
             let between = codes.iter().filter(|&&c| c & 255 > 0 && c & 255 < 255).count();
             assert!(lit > 1000 && between > 500, "{lit} {between}");
             assert_same(gpu, &input);
+        }
+    });
+}
+
+#[test]
+fn lens_response_and_flat_field_equal_the_twin_bit_for_bit() {
+    with_gpu(|gpu| {
+        let plain = twin(&random_input(11)).0;
+        for parts in 1..8u32 {
+            let mut input = random_input(11);
+            let mut random = Sampler::new(u64::from(parts), 9);
+            let mut u = || random.uniform() as f32;
+            input.optics = Optics {
+                response: (parts & 1 > 0)
+                    .then(|| Response::gamma([2.2, 1.0, 0.7], [0.01, 0.0, 0.002]).unwrap()),
+                flat_field: (parts & 2 > 0)
+                    .then(|| (0..PIXELS).map(|_| [1.0 + u(), 1.0 + u(), 1.0 + u()]).collect()),
+                straight: (parts & 4 > 0).then(|| (0..PIXELS).map(|_| [u() - 0.5, u() - 0.5]).collect()),
+            };
+            // What is no number must stay black behind each part as well.
+            (0..PIXELS).step_by(17).for_each(|i| input.radiance[i][i % 3] = f32::NAN);
+            let counters = assert_same(gpu, &input);
+            assert!(counters.nan_values > 10, "{parts}");
+            let different = twin(&input).0.iter().zip(&plain).filter(|(a, b)| a != b).count();
+            assert!(different > PIXELS / 3, "part {parts} changes {different} codes");
         }
     });
 }

@@ -162,6 +162,7 @@ impl FrameBuffers {
             "B_SCHEDULE" => &self.schedule,
             "B_WORK" => &self.work,
             "B_NOISE" => &shared.noise,
+            "B_OPTICS" => &shared.optics,
             "B_FILTERED" | "B_FILTERED_ROWS" => &self.filtered,
             "B_SHOWN" => self.shown(settings),
             "B_PLANES" => &self.planes,

@@ -17,12 +17,14 @@
 //! ```
 
 pub mod blue_noise;
+pub mod drive;
 mod fill;
 mod frame_buffers;
 pub mod gpu;
 mod last_frame;
 mod memory;
 pub mod method;
+mod optics;
 pub mod pack;
 mod passes;
 pub mod rate_table;

@@ -4,6 +4,7 @@
 use super::blue_noise;
 use super::fill::fill;
 use super::method::Method;
+use super::optics::OpticsLayout;
 use super::rate_table;
 use super::scene_gpu::table_buffer;
 use super::settings::{RasterTooLarge, RenderError, RendererSettings};
@@ -106,6 +107,8 @@ pub(super) struct SharedBuffers {
     pub rates: Buffer,
     pub rate_table: Buffer,
     pub noise: Buffer,
+    /// Response, flat field and rays of the projector's pixels.
+    pub optics: Buffer,
     /// The schedule at the start of a frame.
     pub schedule_start: Buffer,
 }
@@ -118,6 +121,7 @@ impl SharedBuffers {
     pub(crate) fn new(gpu: &Arc<Gpu>, settings: &RendererSettings) -> Result<Self, RenderError> {
         let raster = settings.raster;
         check_raster(raster, &settings.method, gpu.max_buffer_bytes(), &gpu.summary().name)?;
+        let optics = OpticsLayout::new(raster, &settings.drive, settings.lens.as_ref());
         let pixels = if settings.method.needs_history() { raster.pixel_count() } else { 1 };
         let history = || -> Result<Buffer, GpuError> {
             let buffer = table_buffer(gpu, "history", pixels * size_of::<History>(), MemoryKind::Device)?;
@@ -130,6 +134,11 @@ impl SharedBuffers {
             history: [history()?, history()?],
             rates: Buffer::from_slice(gpu, "shading rates", &vec![0u32; tiles as usize])?,
             rate_table: Buffer::from_slice(gpu, "rate table", &rate_table::rate_table())?,
+            optics: Buffer::from_slice(
+                gpu,
+                "optics",
+                &optics.table(&settings.drive, settings.lens.as_ref()),
+            )?,
             noise: Buffer::from_slice(gpu, "blue noise", blue_noise::MASK)?,
             schedule_start: Buffer::from_slice(gpu, "schedule", &[start])?,
         })

@@ -225,7 +225,7 @@ mod tests {
     use std::collections::{BTreeSet, HashMap};
 
     /// Buffers that no pass writes. The host fills them, at the start or before a frame.
-    const INPUTS: [&str; 15] = [
+    const INPUTS: [&str; 16] = [
         "B_FRAME",
         "B_INSTANCES",
         "B_NODES",
@@ -241,6 +241,7 @@ mod tests {
         "B_TILES",
         "B_RATE_TABLE",
         "B_NOISE",
+        "B_OPTICS",
     ];
 
     /// Names of the buffers that a shader loads from and stores to, as its SPIR-V says: every pointer is followed back to the variable that it

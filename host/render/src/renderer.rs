@@ -4,6 +4,7 @@ use super::fill;
 use super::frame_buffers::FrameBuffers;
 use super::last_frame::{LastFrame, Turn};
 use super::memory::SharedBuffers;
+use super::optics::OpticsLayout;
 use super::passes::{Grid, PASSES, TABLE};
 use super::resources::Resources;
 use super::scene_data::{world_bounds, Keep, SceneData};
@@ -15,6 +16,7 @@ use crate::gpu::{
     BindingKind, BindingSet, BindingTable, CommandList, ComputePipeline, FrameFence, Gpu, GpuError, Recorder,
 };
 use crate::pack;
+use bytemuck::Zeroable;
 use dpm_scene::Scene;
 use dpm_shaders::structs::{self as gpu_structs, Counters, Frame, Instance, Rows, Schedule, Surface};
 use glam::{DAffine3, Vec3};
@@ -41,6 +43,9 @@ pub struct Renderer {
     last: LastFrame,
     /// The tiles that were active when shading rates were last decided. All others have the full rate.
     rated: Vec<bool>,
+    /// Copied into every slot.
+    tile_list: TileList,
+    optics: OpticsLayout,
     pub(super) gpu: Arc<Gpu>,
 }
 
@@ -130,6 +135,8 @@ impl Renderer {
         let table = BindingTable::new(gpu, &kinds)?;
         let mut constants = needs.constants();
         constants.extend(settings.method.constants());
+        let optics = OpticsLayout::new(settings.raster, &settings.drive, settings.lens.as_ref());
+        constants.extend(optics.constants());
         let pipelines = (TABLE.iter())
             .map(|pass| {
                 let wanted = (pass.when)(&settings, keep);
@@ -142,7 +149,8 @@ impl Renderer {
         let decides_rates =
             TABLE.iter().zip(&pipelines).any(|(pass, p)| pass.grid == Grid::Rates && p.is_some());
         let last = LastFrame::none(tracked.len());
-        let rated = vec![false; TileList::new(settings.raster.width(), settings.raster.height()).len()];
+        let tile_list = TileList::new(settings.raster, settings.lens.as_ref());
+        let rated = vec![false; tile_list.len()];
         Ok(Self {
             resources: Arc::new(Resources { pipelines, table, shared, scene: scene_gpu }),
             data,
@@ -152,17 +160,23 @@ impl Renderer {
             decides_rates,
             last,
             rated,
+            tile_list,
+            optics,
             gpu: gpu.clone(),
         })
     }
 
     /// Interpolated normal of a surface, in its body's space and without the normal map.
     pub fn shading_normal(&self, surface: &Surface) -> Vec3 {
-        let body = &self.data.bodies[(surface.id >> 24) as usize];
-        let reference = &self.data.refs[(body.triangle_offset + (surface.id & 0x00ff_ffff)) as usize];
         let [u, v] = surface.barycentric;
-        let n = reference.vertices.map(|i| Vec3::from_array(self.data.vertices[i as usize].normal));
+        let n = self.corners(surface).map(|i| Vec3::from_array(self.data.vertices[i as usize].normal));
         (n[0] * (1.0 - u - v) + n[1] * u + n[2] * v).normalize_or_zero()
+    }
+
+    /// Indices of the corners of a surface's triangle, among the vertices of all bodies in their order.
+    pub fn corners(&self, surface: &Surface) -> [u32; 3] {
+        let body = &self.data.bodies[(surface.id >> 24) as usize];
+        self.data.refs[(body.triangle_offset + (surface.id & 0x00ff_ffff)) as usize].vertices
     }
 
     /// Memory and commands for one frame in flight. With `debug` the host can also read radiance and surfaces.
@@ -171,7 +185,7 @@ impl Renderer {
     /// Out of memory.
     pub fn create_slot(&self, debug: bool) -> Result<FrameSlot, GpuError> {
         let (gpu, resources, settings) = (&self.gpu, &self.resources, &self.settings);
-        let tile_list = TileList::new(settings.raster.width(), settings.raster.height());
+        let tile_list = self.tile_list.clone();
         let buffers = FrameBuffers::new(gpu, settings, (self.data.bodies.len(), tile_list.len()), debug)?;
         buffers.clear(gpu, settings)?;
         let set_of = |parity| {
@@ -355,6 +369,8 @@ impl Renderer {
             body: i as u32,
             extent: body.extent,
             reserved: 0,
+            drive_gain: self.settings.drive.gain_of(i),
+            reserved_too: 0,
         }
     }
 
@@ -371,7 +387,7 @@ impl Renderer {
         let c = inputs.camera;
         let steady = !self.keep.every_pixel
             && self.last.is_steady(&self.data.bodies, inputs, |i| is_lost(&self.tracked, i, inputs.lost));
-        Frame {
+        let mut frame = Frame {
             projector_position: [0.0; 3],
             seed: self.settings.seed,
             world_from_projector: rows(&DAffine3::from_mat3(c.world_from_projector.matrix3)),
@@ -387,8 +403,7 @@ impl Renderer {
             tile_count,
             tiles_x,
             clamp_indirect: self.settings.clamp_indirect.unwrap_or(f32::MAX),
-            drive_gain: self.settings.drive_gain,
-            ambient: self.settings.ambient,
+            ambient: self.settings.drive.ambient,
             light_count: self.data.lights.len() as u32,
             flags: method.flags()
                 | if self.settings.camera_is_eye { gpu_structs::FRAME_CAMERA_IS_EYE } else { 0 }
@@ -418,6 +433,9 @@ impl Renderer {
             pixel_size: (1.0 / c.fx) as f32,
             drawn: turn.drawn,
             first_sample: turn.first_sample,
-        }
+            ..Frame::zeroed()
+        };
+        self.optics.describe(c, &mut frame);
+        frame
     }
 }

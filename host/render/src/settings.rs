@@ -1,5 +1,6 @@
 //! What a renderer is made with, what a frame is drawn from, and why neither may work.
 
+use super::drive::Drive;
 use super::method::Method;
 use super::scene_data::SceneDataError;
 use crate::gpu::GpuError;
@@ -18,10 +19,10 @@ pub struct RendererSettings {
     pub seed: u32,
     /// Limit on the luminance of indirect contributions; `None`: there is no limit.
     pub clamp_indirect: Option<f32>,
-    /// `pi * exposure / (albedo * max_intensity)`.
-    pub drive_gain: f32,
-    /// Radiance of the real surfaces without the projector.
-    pub ambient: [f32; 3],
+    /// From radiance to code values.
+    pub drive: Drive,
+    /// The projector, if its lens bends rays. Frames are then drawn with the same intrinsics and the same lens.
+    pub lens: Option<ProjectorCamera>,
     /// The camera is an ordinary one (tests): radiance returns along the primary ray, and everything is lit.
     pub camera_is_eye: bool,
     /// Code that the scene does not need is compiled in, too (tests).

@@ -1,9 +1,11 @@
 //! Poses into the tiles to trace: those that the bounds of a body may touch.
 
 use super::scene_data::{world_bounds, BodyData};
+use dpm_device::planes::Raster;
 use dpm_scene::geometry::projector::ProjectorCamera;
 use dpm_shaders::structs::INSTANCE_EMPTY;
 use glam::{DAffine3, DVec2, DVec3};
+use std::sync::Arc;
 
 /// Side of a tile in pixels (\[paper\] section 2.1).
 pub const TILE: u32 = 16;
@@ -17,11 +19,17 @@ pub(crate) struct TileList {
     order: Vec<u32>,
     active: Vec<bool>,
     previous: Vec<bool>,
+    /// With a lens: bounds of the straight rays of each tile.
+    straight: Option<Arc<Vec<Bounds>>>,
 }
 
+/// A rectangle: lower and upper corner.
+type Bounds = (DVec2, DVec2);
+
 impl TileList {
-    /// A list for a raster of `width` x `height` pixels.
-    pub(crate) fn new(width: u32, height: u32) -> Self {
+    /// A list for a raster. `lens`: the projector, if its lens bends rays.
+    pub(crate) fn new(raster: Raster, lens: Option<&ProjectorCamera>) -> Self {
+        let (width, height) = (raster.width(), raster.height());
         let (tiles_x, tiles_y) = (width.div_ceil(TILE), height.div_ceil(TILE));
         let n = (tiles_x * tiles_y) as usize;
         let mut step = (n as f64 * 0.618) as usize | 1;
@@ -29,7 +37,11 @@ impl TileList {
             step += 2;
         }
         let order = (0..n).map(|i| ((i * step) % n) as u32).collect();
-        Self { tiles_x, tiles_y, order, active: vec![false; n], previous: vec![false; n] }
+        let straight = lens.filter(|camera| !camera.lens.is_pinhole()).map(|camera| {
+            let of = |tile: usize| straight_bounds(camera, tile as u32 % tiles_x, tile as u32 / tiles_x);
+            Arc::new((0..n).map(of).collect())
+        });
+        Self { tiles_x, tiles_y, order, active: vec![false; n], previous: vec![false; n], straight }
     }
 
     /// Number of tiles of the raster.
@@ -69,10 +81,10 @@ impl TileList {
         let (lower, upper) = (body.bounds_min.as_dvec3(), body.bounds_max.as_dvec3());
         let (mut from, mut to) = (DVec2::INFINITY, DVec2::NEG_INFINITY);
         for p in corners(lower, upper) {
-            match camera.project(pose.transform_point3(p)) {
-                Some(pixel) => {
-                    from = from.min(pixel);
-                    to = to.max(pixel);
+            match camera.straight_of_world(pose.transform_point3(p)) {
+                Some(straight) => {
+                    from = from.min(straight);
+                    to = to.max(straight);
                 }
                 // A box that is partly behind the projector has no bounds on the raster.
                 None => {
@@ -84,6 +96,14 @@ impl TileList {
                 }
             }
         }
+        // Lines are straight before the lens, so there the box lies between its corners. Behind a lens it may bulge.
+        if let Some(straight) = &self.straight {
+            for (active, (lower, upper)) in self.active.iter_mut().zip(straight.iter()) {
+                *active |= from.cmple(*upper).all() && to.cmpge(*lower).all();
+            }
+            return;
+        }
+        let (from, to) = (camera.pixel_of_bent(from), camera.pixel_of_bent(to));
         let clamp = |v: f64, n: u32| (v / f64::from(TILE)).floor().clamp(-1.0, f64::from(n)) as i64;
         // One pixel of margin for rounding.
         let x0 = clamp(from.x - 1.0, self.tiles_x).max(0);
@@ -117,6 +137,28 @@ impl TileList {
     }
 }
 
+/// Bounds of the straight rays of a tile and one pixel around it, from positions on its edge, because the rays of an area lie between
+/// those of its edge.
+fn straight_bounds(camera: &ProjectorCamera, tile_x: u32, tile_y: u32) -> Bounds {
+    let (x0, y0) = (f64::from(tile_x * TILE) - 1.0, f64::from(tile_y * TILE) - 1.0);
+    let side = f64::from(TILE + 2);
+    let (mut lower, mut upper) = (DVec2::INFINITY, DVec2::NEG_INFINITY);
+    for i in 0..=TILE + 2 {
+        let t = f64::from(i);
+        for (x, y) in [(t, 0.0), (t, side), (0.0, t), (side, t)] {
+            match camera.straight_of_pixel(DVec2::new(x0 + x, y0 + y)) {
+                Some(straight) => {
+                    lower = lower.min(straight);
+                    upper = upper.max(straight);
+                }
+                // A tile reaches beyond the raster, where the lens may end. Such a tile is always traced.
+                None => return (DVec2::NEG_INFINITY, DVec2::INFINITY),
+            }
+        }
+    }
+    (lower, upper)
+}
+
 /// The whole box is behind the projector.
 fn behind(camera: &ProjectorCamera, lower: DVec3, upper: DVec3) -> bool {
     corners(lower, upper).all(|p| camera.to_projector_space(p).z >= 0.0)
@@ -141,7 +183,6 @@ fn gcd(a: usize, b: usize) -> usize {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use dpm_device::planes::Raster;
 
     #[test]
     fn every_tile_that_a_point_of_the_body_falls_into_is_active() {
@@ -150,7 +191,7 @@ mod tests {
             ProjectorCamera::look_at(raster, DVec3::new(0.0, 0.1, 1.0), DVec3::ZERO, DVec3::Y, 0.6).unwrap();
         let body = BodyData::of_20_cm();
         let pose = DAffine3::from_rotation_y(0.7);
-        let mut list = TileList::new(250, 130);
+        let mut list = TileList::new(raster, None);
         list.update(&camera, &[body], &[pose], 1);
         let mut tiles = vec![0; list.len()];
         let n = list.write(&[], &mut tiles) as usize;

@@ -30,6 +30,7 @@
 
 pub mod config;
 pub mod control;
+pub mod drive;
 mod engine;
 pub mod failure;
 pub mod frame;

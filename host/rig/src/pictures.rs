@@ -7,12 +7,17 @@
 
 use crate::light::recorder::LightFrame;
 use crate::light::FrameRecord;
+use crate::pipeline::renderer_settings;
 use crate::rig::Rig;
-use dpm_render::gpu::GpuError;
-use dpm_render::{FrameInputs, Renderer};
+use dpm_device::planes::Raster;
+use dpm_render::drive::Drive;
+use dpm_render::gpu::{Gpu, GpuError};
+use dpm_render::method::Method;
+use dpm_render::{FrameInputs, RenderError, Renderer, RendererSettings};
 use dpm_scene::geometry::projector::ProjectorCamera;
 use dpm_shaders::structs::NO_HIT;
 use glam::{DAffine3, DVec2, DVec3, Vec3};
+use std::sync::Arc;
 
 /// The two pictures of a run: linear values, row by row, at the projector's raster.
 pub struct Pictures {
@@ -59,10 +64,10 @@ fn mean(light: &[LightFrame]) -> Vec<Vec3> {
 /// The GPU failed.
 pub fn pictures(
     rig: &Rig,
-    renderer: &mut Renderer,
+    gpu: &Arc<Gpu>,
     light: &[LightFrame],
     records: &[FrameRecord],
-) -> Result<Pictures, GpuError> {
+) -> Result<Pictures, RenderError> {
     let window = window(rig, light, records);
     if window.frames.is_empty() {
         let why = "the poses of the bodies are not known";
@@ -70,7 +75,10 @@ pub fn pictures(
     }
     let now = &window.frames[window.frames.len() - 1].1;
     let (eye, _) = rig.observer.eye_and_gaze(now);
-    let light = integrate(rig, renderer, &rig.camera, eye, now, &window, |_, drive| drive)?;
+    // The pictures need only the surfaces, so the simplest method is enough.
+    let settings = |lens| RendererSettings { method: Method::full(1), lens, ..renderer_settings(rig) };
+    let mut renderer = Renderer::new(gpu, &rig.scene, settings(renderer_settings(rig).lens))?;
+    let light = integrate(rig, &mut renderer, &rig.camera, eye, now, &window, |_, drive| drive)?;
     let Some(viewer_camera) = viewer_camera(rig, eye, now) else {
         return Ok(Pictures {
             light,
@@ -78,15 +86,19 @@ pub fn pictures(
         });
     };
     let projector = rig.camera.position();
-    let max_intensity = rig.config.projector.max_intensity;
-    let albedo = rig.config.scene.surface_albedo;
+    let intensity = Vec3::from_array(rig.config.projector.max_intensity.0.map(|v| v as f32));
+    // The viewer's camera has no lens.
+    if !rig.camera.lens.is_pinhole() {
+        renderer = Renderer::new(gpu, &rig.scene, settings(None))?;
+    }
     let ambient = Vec3::from_array(rig.config.scene.ambient.map(|v| v as f32));
-    let viewer = integrate(rig, renderer, &viewer_camera, projector, now, &window, |seen, drive| {
+    let viewer = integrate(rig, &mut renderer, &viewer_camera, projector, now, &window, |seen, drive| {
         // Radiance of a Lambertian surface in the projector's light.
         let to_projector = projector - seen.position;
         let d2 = to_projector.length_squared();
         let cos = seen.normal.dot(to_projector).abs() / d2.sqrt();
-        ambient + drive * (albedo / std::f64::consts::PI * max_intensity * cos / d2) as f32
+        let albedo = Vec3::from_array(rig.albedo_of(seen.body).map(|a| a as f32));
+        ambient + drive * albedo * intensity * (cos / (std::f64::consts::PI * d2)) as f32
     })?;
     Ok(Pictures { light, viewer: Ok(viewer) })
 }
@@ -118,6 +130,8 @@ fn viewer_camera(rig: &Rig, eye: DVec3, tracked: &[DAffine3]) -> Option<Projecto
 
 /// The surface point that a picture pixel shows at the last instant.
 struct Seen {
+    /// Body of the scene.
+    body: usize,
     position: DVec3,
     normal: DVec3,
 }
@@ -167,11 +181,11 @@ fn integrate(
         let in_body = poses[body].inverse().transform_point3(position);
         let normal =
             poses[body].transform_vector3(renderer.shading_normal(surface).as_dvec3()).normalize_or_zero();
-        let seen = Seen { position, normal };
+        let seen = Seen { body, position, normal };
         let mut sum = Vec3::ZERO;
         for ((frame, _), all) in window.frames.iter().zip(&window_poses) {
             if let Some(p) = rig.camera.project(all[body].transform_point3(in_body)) {
-                sum += sample(frame, rig.camera.raster.width(), rig.camera.raster.height(), p);
+                sum += sample(&rig.drive, frame, rig.camera.raster, p);
             }
         }
         out[i] = shade(&seen, sum / window.frames.len() as f32);
@@ -180,7 +194,8 @@ fn integrate(
 }
 
 /// Light at a position on the raster, interpolated bilinearly between pixel centres, 0 to 1.
-fn sample(frame: &LightFrame, width: u32, height: u32, at: DVec2) -> Vec3 {
+fn sample(drive: &Drive, frame: &LightFrame, raster: Raster, at: DVec2) -> Vec3 {
+    let (width, height) = (raster.width(), raster.height());
     let (x, y) = (at.x - 0.5, at.y - 0.5);
     let (x0, y0) = (x.floor(), y.floor());
     let (fx, fy) = ((x - x0) as f32, (y - y0) as f32);
@@ -188,8 +203,8 @@ fn sample(frame: &LightFrame, width: u32, height: u32, at: DVec2) -> Vec3 {
         if x < 0.0 || y < 0.0 || x >= f64::from(width) || y >= f64::from(height) {
             return Vec3::ZERO;
         }
-        let c = frame.codes[y as usize * width as usize + x as usize];
-        Vec3::new(f32::from(c[0]), f32::from(c[1]), f32::from(c[2])) / 255.0
+        let pixel = y as usize * width as usize + x as usize;
+        Vec3::from_array(drive.light_of(frame.codes[pixel], pixel))
     };
     let top = texel(x0, y0).lerp(texel(x0 + 1.0, y0), fx);
     let bottom = texel(x0, y0 + 1.0).lerp(texel(x0 + 1.0, y0 + 1.0), fx);

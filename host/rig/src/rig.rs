@@ -3,12 +3,13 @@
 use crate::config::{
     BodyConfig, BuiltinScene, CalibrationUnit, EnvironmentConfig, GazeConfig, RigConfig, TrackerConfig,
 };
+use crate::drive::{albedo_of, drive, DriveError};
 use crate::mock::{Motion, MotionError, MotionSpec};
 use dpm_device::planes::{PlaneSchedule, Raster};
 use dpm_device::pose::Pose;
 use dpm_device::regular_file;
 use dpm_device::time::FrameRate;
-use dpm_scene::geometry::distortion::Distortion;
+use dpm_render::drive::Drive;
 use dpm_scene::geometry::opencv::{self, LengthUnit};
 use dpm_scene::geometry::projector::{ProjectorCamera, ProjectorError};
 use dpm_scene::{BodySelector, Environment, LoadOptions, Scene, SceneError, SceneFeatures};
@@ -51,6 +52,9 @@ pub enum RigError {
         /// What is wrong.
         message: String,
     },
+    /// A file that describes the projector's light cannot be used.
+    #[error(transparent)]
+    Drive(#[from] DriveError),
     /// No body has this name.
     #[error("{key}: no body is named \"{name}\"; bodies: {known}")]
     UnknownBody {
@@ -71,8 +75,11 @@ pub enum RigError {
 pub struct RigBody {
     /// Name, as the tracker reports it.
     pub name: String,
-    /// Its pose at rest.
+    /// Pose of its mesh at rest.
     pub rest: Pose,
+    /// From the mesh's space to that of the body that the tracker reports; the identity with the mock tracker, which
+    /// reports the mesh.
+    pub mesh_to_body: DAffine3,
     /// Its true motion, which is known only with the mock tracker.
     pub motion: Option<Motion>,
 }
@@ -144,6 +151,8 @@ pub struct Rig {
     pub observer: Observer,
     /// The planes of a frame in the order in which they are shown.
     pub schedule: PlaneSchedule,
+    /// From radiance to code values.
+    pub drive: Drive,
 }
 
 /// A rigid transform from a pose.
@@ -174,11 +183,12 @@ impl Rig {
         scene.environment = fitted;
         scene.warnings.extend(told.map(|t| format!("scene.environment: {t}")));
         let raster = raster.unwrap_or_else(|| config.projector.raster());
-        let camera = camera(config, raster, &mut scene.warnings)?;
+        let camera = camera(config, raster)?;
         let bodies = rig_bodies(config, &scene)?;
         let observer = observer(config, &bodies)?;
+        let drive = drive(config, &scene, raster)?;
         let schedule = config.projector.schedule();
-        Ok(Self { config: config.clone(), scene, camera, bodies, observer, schedule })
+        Ok(Self { config: config.clone(), scene, camera, bodies, observer, schedule, drive })
     }
 
     /// The projector of a rig alone, without scene, bodies or calibration: for light that nothing is traced for.
@@ -188,10 +198,12 @@ impl Rig {
     pub fn of_projector(config: &RigConfig) -> Result<Self, RigError> {
         let mut config = config.clone();
         config.keep_projector();
-        let camera = camera(&config, config.projector.raster(), &mut Vec::new())?;
+        let raster = config.projector.raster();
+        let camera = camera(&config, raster)?;
         let observer = observer(&config, &[])?;
-        let schedule = config.projector.schedule();
-        Ok(Self { config, scene: Scene::default(), camera, bodies: Vec::new(), observer, schedule })
+        let (scene, bodies) = (Scene::default(), Vec::new());
+        let (schedule, drive) = (config.projector.schedule(), Drive::default());
+        Ok(Self { config, scene, camera, bodies, observer, schedule, drive })
     }
 
     /// Frames per second.
@@ -199,7 +211,12 @@ impl Rig {
         self.config.projector.frame_rate
     }
 
-    /// The true world-from-body transform of every tracked body at an instant; `None` unless the tracker is the mock.
+    /// Albedo of the real surface of a body of the scene.
+    pub(crate) fn albedo_of(&self, body: usize) -> [f64; 3] {
+        albedo_of(&self.config, self.scene.bodies.get(body).and_then(|b| b.tracked))
+    }
+
+    /// The true world-from-mesh transform of every tracked body at an instant; `None` unless the tracker is the mock.
     pub fn true_poses(&self, t_ns: i64) -> Option<Vec<DAffine3>> {
         self.bodies.iter().map(|b| b.motion.as_ref().map(|m| affine(&m.pose_at(t_ns)))).collect()
     }
@@ -211,13 +228,6 @@ impl Rig {
         out.extend(self.scene.bodies.iter().map(|b| {
             b.tracked.and_then(|i| tracked.get(usize::from(i))).copied().unwrap_or(b.world_from_body_rest)
         }));
-    }
-
-    /// `pi * exposure / (albedo * max_intensity)`.
-    pub(crate) fn drive_gain(&self) -> f32 {
-        let c = &self.config;
-        (std::f64::consts::PI * c.render.exposure / (c.scene.surface_albedo * c.projector.max_intensity))
-            as f32
     }
 }
 
@@ -260,13 +270,8 @@ fn environment(config: &RigConfig, has_lights: bool) -> Result<Option<Environmen
     })
 }
 
-/// The projector's camera at `raster`, from its calibration or from its position and direction. Adds to `warnings`
-/// what the camera does not reproduce.
-fn camera(
-    config: &RigConfig,
-    raster: Raster,
-    warnings: &mut Vec<String>,
-) -> Result<ProjectorCamera, RigError> {
+/// The projector's camera at `raster`, from its calibration or from its position and direction.
+fn camera(config: &RigConfig, raster: Raster) -> Result<ProjectorCamera, RigError> {
     let p = &config.projector;
     let Some(path) = &p.calibration else {
         return Ok(ProjectorCamera::look_at(
@@ -286,25 +291,7 @@ fn camera(
     let text = regular_file::read_text(path, opencv::MAX_BYTES as u64).map_err(|e| wrong(e.to_string()))?;
     let calibrated = p.calibrated_raster();
     let stored = opencv::read(&text, calibrated, unit).map_err(|e| wrong(e.to_string()))?;
-    if stored.distortion != Distortion::default() {
-        warnings.push(format!(
-            "projector.calibration: {}: its lens distortion is not compensated and displaces the light",
-            path.display()
-        ));
-    }
-    let c = stored.camera;
-    // This divides the same view into other pixels. The camera's coordinates start at the raster's corner, so
-    // everything scales.
-    let scale_x = f64::from(raster.width()) / f64::from(calibrated.width());
-    let scale_y = f64::from(raster.height()) / f64::from(calibrated.height());
-    Ok(ProjectorCamera::new(
-        raster,
-        c.world_from_projector,
-        c.fx * scale_x,
-        c.fy * scale_y,
-        c.cx * scale_x,
-        c.cy * scale_y,
-    )?)
+    Ok(stored.camera.at_raster(raster))
 }
 
 fn motion_spec(index: usize, body: &BodyConfig) -> Result<MotionSpec, RigError> {
@@ -356,7 +343,11 @@ fn rig_bodies(config: &RigConfig, scene: &Scene) -> Result<Vec<RigBody>, RigErro
             } else {
                 None
             };
-            Ok(RigBody { name, rest, motion })
+            let mesh_to_body = match named.get(i) {
+                Some(body) if !mock => body.mesh_to_body.to_affine().unwrap_or(DAffine3::IDENTITY),
+                _ => DAffine3::IDENTITY,
+            };
+            Ok(RigBody { name, rest, mesh_to_body, motion })
         })
         .collect()
 }

@@ -12,8 +12,7 @@ use crate::tracks::SourceError;
 use dpm_common::files::{check_folder, write_atomically};
 use dpm_device::planes::Raster;
 use dpm_render::gpu::{validation_messages, Gpu, GpuError, GpuOptions};
-use dpm_render::method::Method;
-use dpm_render::{RenderError, Renderer, RendererSettings};
+use dpm_render::RenderError;
 use glam::Vec3;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
@@ -123,11 +122,7 @@ fn write_pictures(
         let why = "output.images: no frame was lit, so there is no light to make pictures of";
         return Ok((Vec::new(), Some(why.into())));
     }
-    // The pictures need only the surfaces, so the simplest method is enough.
-    let settings = RendererSettings { method: Method::full(1), ..pipeline::renderer_settings(rig) };
-    let mut renderer = Renderer::new(gpu, &rig.scene, settings).map_err(PipelineError::from)?;
-    let made = pictures(rig, &mut renderer, &outcome.light, &outcome.recent)
-        .map_err(|e| Failure::from(PipelineError::Render(e.into())))?;
+    let made = pictures(rig, gpu, &outcome.light, &outcome.recent).map_err(PipelineError::from)?;
     let mut files = vec![save(dir, "light.png", rig, &made.light, 1.0)?];
     let why_not = match &made.viewer {
         Ok(viewer) => {

@@ -148,10 +148,10 @@ pub fn decode_environment(bytes: &[u8], rotation_rad: f32, scale: f32) -> Result
     Ok(Environment::Equirect { width, height, texels, rotation_rad })
 }
 
-type Pixels = (u32, u32, Vec<Vec3>);
+pub(crate) type Pixels = (u32, u32, Vec<Vec3>);
 
 /// Checks the sides before anything is allocated; returns the number of texels.
-fn check_size(width: u32, height: u32) -> Result<usize, SceneError> {
+pub(crate) fn check_size(width: u32, height: u32) -> Result<usize, SceneError> {
     let texels = u64::from(width) * u64::from(height);
     if texels == 0 {
         return Err(SceneError::broken(
@@ -184,7 +184,7 @@ fn line<'a>(rest: &mut &'a [u8]) -> Result<&'a str, SceneError> {
     Ok(text.trim_end_matches('\r'))
 }
 
-fn read_pfm(bytes: &[u8]) -> Result<Pixels, SceneError> {
+pub(crate) fn read_pfm(bytes: &[u8]) -> Result<Pixels, SceneError> {
     let mut rest = bytes;
     let channels = if line(&mut rest)?.trim_end() == "PF" { 3 } else { 1 };
     let size = line(&mut rest)?;

@@ -25,6 +25,7 @@ mod error;
 pub mod geometry;
 mod gltf_file;
 mod limits;
+mod linear_picture;
 mod load;
 pub mod mesh;
 mod polygonise;
@@ -41,6 +42,7 @@ pub use environment::decode_environment;
 pub use environment::load_environment;
 pub use error::SceneError;
 pub use limits::Limits;
+pub use linear_picture::{load_linear_picture, LinearPicture};
 #[doc(hidden)]
 pub use load::load_bytes_here;
 pub use load::{load, load_bytes, BodySelector, LoadOptions};

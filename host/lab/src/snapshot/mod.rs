@@ -9,8 +9,7 @@ pub mod views;
 use super::sequence::{draw, poses_at};
 use dpm_common::files::{check_folder, write_atomically};
 use dpm_device::time::HostTime;
-use dpm_render::method::Method;
-use dpm_render::{FrameSlot, Keep, RenderError, Renderer, RendererSettings};
+use dpm_render::{FrameSlot, Keep, RenderError, Renderer};
 use dpm_rig::config::RigConfig;
 use dpm_rig::failure::{Failure, FailureKind};
 use dpm_rig::light::recorder::LightFrame;
@@ -219,10 +218,7 @@ fn viewer(
     gpu: &std::sync::Arc<dpm_render::gpu::Gpu>,
     light: &[LightFrame],
 ) -> Result<Result<Canvas, String>, Failure> {
-    // Only surfaces are asked of it, so the simplest method will do.
-    let settings = RendererSettings { method: Method::full(1), ..renderer_settings(rig) };
-    let mut renderer = Renderer::new(gpu, &rig.scene, settings).map_err(gpu_failure)?;
-    let made = pictures(rig, &mut renderer, light, &[]).map_err(gpu_failure)?;
+    let made = pictures(rig, gpu, light, &[]).map_err(gpu_failure)?;
     Ok(match made.viewer {
         Ok(viewer) => {
             let white = viewer.iter().fold(0.0f32, |m, v| m.max(v.max_element())).max(1e-9);

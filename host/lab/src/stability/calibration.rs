@@ -2,9 +2,9 @@
 
 use super::CpuCase;
 use crate::reference::Sampler;
+use dpm_calibration::pinhole::{calibrate, recalibrate, CalibrationError, CalibrationOptions, Pair};
 use dpm_device::planes::Raster;
-use dpm_scene::geometry::calibration::{calibrate, recalibrate, CalibrationError, CalibrationOptions, Pair};
-use dpm_scene::geometry::distortion::Distortion;
+use dpm_scene::geometry::lens::Lens;
 use dpm_scene::geometry::projector::ProjectorCamera;
 use glam::{DVec2, DVec3};
 
@@ -254,7 +254,7 @@ fn wide(seed: u64) -> f64 {
 }
 
 fn no_inverse(_: u64) -> f64 {
-    let Some(d) = Distortion::new(&[-0.5]) else { return f64::NAN };
+    let Ok(d) = Lens::opencv(&[-0.5, 0.0, 0.0, 0.0]) else { return f64::NAN };
     let mut faults = 0u32;
     for beyond in [0.9, 1.5, 20.0, 1e300, f64::INFINITY, f64::NAN] {
         faults += u32::from(d.distort(DVec2::X * beyond).is_some());
@@ -266,7 +266,7 @@ fn no_inverse(_: u64) -> f64 {
         !d.undistort(DVec2::X * 0.54)
             .is_some_and(|p| (p.x * (1.0 - 0.5 * p.x * p.x) - 0.54).abs() < 1e-9 && p.x < 0.8165),
     );
-    faults += u32::from(Distortion::new(&[f64::INFINITY]).is_some());
+    faults += u32::from(Lens::opencv(&[f64::INFINITY, 0.0, 0.0, 0.0]).is_ok());
     f64::from(faults)
 }
 
@@ -276,7 +276,7 @@ fn round_trip(_: u64) -> f64 {
         vec![-0.2, 0.05, 0.001, -0.002, -0.004],
         vec![0.3, 0.1, 0.0, 0.0, 0.0, 0.1, 0.02, 0.0, 0.001, 0.0, -0.001, 0.0],
     ] {
-        let Some(d) = Distortion::new(&c) else { return f64::NAN };
+        let Ok(d) = Lens::opencv(&c) else { return f64::NAN };
         for i in -10..=10 {
             for j in -10..=10 {
                 let p = DVec2::new(f64::from(i), f64::from(j)) * 0.06;

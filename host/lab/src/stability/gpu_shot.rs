@@ -1,6 +1,7 @@
 //! A scene and a camera into frames drawn by the GPU, as plain numbers.
 
 use super::estimate::Estimate;
+use dpm_render::drive::Drive;
 use dpm_render::gpu::Gpu;
 use dpm_render::method::Method;
 use dpm_render::scene_data::Keep;
@@ -85,14 +86,14 @@ impl<'a> Shot<'a> {
     }
 
     /// The renderer's settings.
-    pub(crate) fn settings(&self) -> RendererSettings {
+    pub fn settings(&self) -> RendererSettings {
         RendererSettings {
             raster: self.camera.raster,
             depth: self.depth,
             seed: self.seed,
             clamp_indirect: self.clamp_indirect,
-            drive_gain: self.drive_gain,
-            ambient: self.ambient,
+            drive: Drive { ambient: self.ambient, ..Drive::even(self.drive_gain) },
+            lens: (!self.camera.lens.is_pinhole()).then_some(self.camera),
             camera_is_eye: self.eye.is_none(),
             leave_nothing_out: self.leave_nothing_out,
             method: self.method.clone().unwrap_or_else(|| Method::full(self.spp)),

@@ -72,24 +72,33 @@ impl Compensation {
     }
 }
 
-/// `|cos|` between the smooth normal of a surface and the ray of a pixel, in the shader's operations and order. `rows`: the body's
-/// world-from-object; `normals`: of the triangle's corners; `raster`: pixel centre. 0 where the normals cancel.
+/// The ray of a pixel's centre before the pose, of any length, in the shader's operations. `straight`: the pixel's straight ray where the
+/// projector has a lens.
+pub fn ray_of(frame: &Frame, pixel: [u32; 2], straight: Option<[f32; 2]>) -> [f32; 3] {
+    if let Some([x, y]) = straight {
+        return [x, -y, -1.0];
+    }
+    let [x, y] = pixel.map(|v| v as f32 + 0.5);
+    let [fx, fy, cx, cy] = frame.intrinsics;
+    [(x - cx) * fy, (cy - y) * fx, -(fx * fy)]
+}
+
+/// `|cos|` between the smooth normal of a surface and a ray of the projector, in the shader's operations and order. `rows`: the body's
+/// world-from-object; `normals`: of the triangle's corners; `ray`: of [`ray_of`]. 0 where the normals cancel.
 pub fn real_cosine(
     rows: &Rows,
     normals: [[f32; 3]; 3],
     barycentric: [f32; 2],
     frame: &Frame,
-    raster: [f32; 2],
+    ray: [f32; 3],
 ) -> f32 {
     let [b1, b2] = barycentric;
     let w = (1.0 - b1) - b2;
     let n: [f32; 3] = std::array::from_fn(|k| (normals[0][k] * w + normals[1][k] * b1) + normals[2][k] * b2);
-    let [fx, fy, cx, cy] = frame.intrinsics;
-    let d = [(raster[0] - cx) * fy, (cy - raster[1]) * fx, -(fx * fy)];
     let turn = |row: &[f32; 4], v: [f32; 3]| (row[0] * v[0] + row[1] * v[1]) + row[2] * v[2];
     let (mut dot, mut nn, mut dd) = (0.0f32, 0.0f32, 0.0f32);
     for (row, projector_row) in rows.iter().zip(&frame.world_from_projector) {
-        let (ni, di) = (turn(row, n), turn(projector_row, d));
+        let (ni, di) = (turn(row, n), turn(projector_row, ray));
         dot += ni * di;
         nn += ni * ni;
         dd += di * di;

@@ -1,7 +1,7 @@
 //! Contradictions between keys. Each is reported at a key that was written, with what would resolve it.
 
 use super::world::{EnvironmentConfig, GazeConfig, TrackerConfig};
-use super::{Pace, ProjectorBackend, Purpose, RigConfig};
+use super::{Pace, ProjectorBackend, Purpose, ResponseConfig, RigConfig};
 use crate::mock::{self, FaultError};
 use dpm_common::keys::read::{ConfigValue, Reader};
 use dpm_device::regular_file;
@@ -43,7 +43,27 @@ pub(super) fn check(rig: &RigConfig, purpose: Purpose, reader: &mut Reader) {
     time(rig, purpose, reader);
     faults(rig, reader);
     addresses(rig, reader);
+    transforms(rig, reader);
     super::safety::check(rig, reader);
+}
+
+fn transforms(rig: &RigConfig, reader: &mut Reader) {
+    let mut check = |key: String, is_good: bool, both: bool| {
+        if !is_good {
+            let problem = "is a quaternion of length zero".to_owned();
+            refuse(reader, &[&format!("{key}.rotation")], problem, "no rotation is [0, 0, 0, 1]".into());
+        } else if both && reader.is_written(&format!("{key}.rotation_deg")) {
+            let problem = "is given twice: here and by `rotation`".to_owned();
+            refuse(reader, &[&format!("{key}.rotation_deg")], problem, "remove one of the two".into());
+        }
+    };
+    if let Some((transform, _)) = rig.tracker.frame() {
+        check("tracker.transform".into(), transform.pose().is_some(), transform.rotation.is_some());
+    }
+    for (i, body) in rig.scene.bodies.iter().enumerate() {
+        let pose = &body.mesh_to_body;
+        check(format!("scene.bodies.{i}.mesh_to_body"), pose.to_affine().is_some(), pose.rotation.is_some());
+    }
 }
 
 pub(super) fn addresses(rig: &RigConfig, reader: &mut Reader) {
@@ -396,6 +416,12 @@ pub(super) fn resolve_files(rig: &mut RigConfig, base: &Path, reader: &mut Reade
     }
     if let Some(file) = &mut rig.projector.calibration {
         input(file, "projector.calibration");
+    }
+    if let Some(file) = &mut rig.projector.flat_field {
+        input(file, "projector.flat_field");
+    }
+    if let ResponseConfig::Table(table) = &mut rig.projector.response {
+        input(&mut table.file, "projector.response.file");
     }
     if let EnvironmentConfig::Image(image) = &mut rig.scene.environment {
         input(&mut image.file, "scene.environment.file");

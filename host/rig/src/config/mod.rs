@@ -10,6 +10,7 @@ mod prediction;
 mod projector;
 mod run;
 mod safety;
+mod values;
 mod world;
 
 #[cfg(test)]
@@ -25,6 +26,7 @@ pub use safety::{
     InterlockConfig, InterlockSignal, KeyInterlockConfig, LimitsConfig, LineInterlockConfig,
     NoInterlockConfig, ProcessInterlockConfig,
 };
+pub use values::{Axes, PerChannel};
 pub use world::*;
 
 use crate::mock::MotionSpec;
@@ -166,6 +168,7 @@ impl RigConfig {
         self.tracker = TrackerConfig::default();
         self.observer = ObserverConfig::default();
         (self.projector.calibration, self.projector.calibration_unit) = (None, None);
+        (self.projector.flat_field, self.projector.response) = (None, ResponseConfig::default());
         let output = &mut self.output;
         (output.images, output.trace, output.flight_recorder) = (false, false, false);
     }

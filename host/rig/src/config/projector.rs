@@ -1,5 +1,6 @@
 //! `[projector]`: the projector, its position, and its connection.
 
+use super::values::{Each, PerChannel};
 use dpm_common::keys::read::{Any, ConfigValue, Limit, NotEmpty, Reader, Within};
 use dpm_common::keys::source::{Node, Value};
 use dpm_common::keys::Rate;
@@ -41,10 +42,19 @@ section! {
         /// file's view is kept if `width` and `height` differ, for example to trace fewer pixels (`--raster` then
         /// sets this key).
         calibration_raster: Option<[u32; 2]> = None, "px", Within(1, Raster::MAX_SIDE);
-        /// Radiant intensity of one pixel at full drive, in scene units. The scene's radiance 1 needs `pi * d^2 /
-        /// albedo` at distance d. Raise it if the report says that light is clipped; lower it if the picture uses few
-        /// of its levels.
-        max_intensity: f64 = 8.0, "scene units/sr", Within(1e-6, 1e12);
+        /// Radiant intensity of one pixel at full drive, in scene units: one number, or one for each channel. The
+        /// scene's radiance 1 needs `pi * d^2 / albedo` at distance d. Raise it if the report says that light is
+        /// clipped; lower it if the picture uses few of its levels.
+        max_intensity: PerChannel = PerChannel([8.0; 3]), "scene units/sr", Each(1e-6, 1e12);
+        /// How much light a code value gives. Binary planes of calibrated LEDs are linear; a display's are not.
+        response: ResponseConfig = ResponseConfig::default(), "", Any;
+        /// A picture of a white field, as measured on a surface at an even distance (linear PNG with 8 or 16 bits, or
+        /// PFM; its size need not be the raster's). Pixels that are darker than the brightest one are driven harder,
+        /// so that an even picture is even; `max_intensity` is that of the brightest.
+        flat_field: Option<PathBuf> = None, "", NotEmpty;
+        /// Time by which light falls later than the projector reports. Set it if a check shows that light trails the
+        /// motion whatever the tracker.
+        latency_us: u32 = 0, "us", Within(0, 200_000);
         /// Bit planes that the panel can show per second; a greater `frame_rate * planes` is refused. The default is
         /// a 1024 x 768 panel at 44.0 us per plane, which is 947 frames of 24 planes.
         max_planes_per_second: u32 = 22_728, "planes/s", Within(1, 10_000_000);
@@ -74,6 +84,43 @@ impl ProjectorConfig {
         } else {
             PlaneSchedule::rgb24()
         }
+    }
+}
+
+kinds! {
+    /// How much light a code value gives.
+    pub enum ResponseConfig {
+        /// in proportion to the code value.
+        Linear(LinearResponseConfig) = "linear",
+        /// a power of the code value.
+        Gamma(GammaResponseConfig) = "gamma",
+        /// as measured.
+        Table(TableResponseConfig) = "table",
+    }
+    default Linear
+}
+
+section! {
+    /// Light in proportion to the code value.
+    pub struct LinearResponseConfig {}
+}
+
+section! {
+    /// Light is `black + (1 - black) * (code / 255) ^ gamma`, as a share of full light.
+    pub struct GammaResponseConfig {
+        /// The power: one number, or one for each channel. 2.2 for most displays.
+        gamma: PerChannel = PerChannel([2.2; 3]), "", Each(0.1, 10.0);
+        /// Light at code 0 as a share of full light: one number, or one for each channel.
+        black: PerChannel = PerChannel([0.0; 3]), "", Each(0.0, 0.5);
+    }
+}
+
+section! {
+    /// Light as measured.
+    pub struct TableResponseConfig {
+        /// A text file of 256 lines with the light of each code value, from 0 on, in any unit: one number for all
+        /// channels, or red, green and blue, separated by commas or blanks. Required.
+        file: PathBuf = PathBuf::new(), "", NotEmpty;
     }
 }
 

@@ -20,6 +20,9 @@ section! {
         software_raster: [u32; 2] = [320, 240], "px", Within(1, Raster::MAX_SIDE);
         /// Factor by which radiance is multiplied before it becomes light.
         exposure: f64 = 1.0, "", Within(1e-6, 1e6);
+        /// White balance: how much red, green and blue the scene's white has. Lower a channel in which white surfaces
+        /// look tinted.
+        white: [f64; 3] = [1.0, 1.0, 1.0], "", Within(1e-3, 1e3);
         /// Seed of all random numbers of the picture.
         seed: u64 = 1, "", Any;
         /// Largest luminance of a contribution after the second vertex; 0 is off. Removes fireflies at the cost of

@@ -1,10 +1,12 @@
 //! `[tracker]`, `[observer]`, `[scene]` and `[prediction]`: what moves, who looks, and what is shown.
 
+use super::values::{Axes, Each, PerChannel};
 use crate::mock::{Motion, MotionSpec};
 use dpm_common::keys::read::{Any, ConfigValue, NotEmpty, Reader, Within};
 use dpm_common::keys::source::Node;
 use dpm_common::{kinds, section, words};
 use dpm_device::pose::Pose;
+use glam::{DAffine3, DQuat, DVec3};
 use std::path::PathBuf;
 
 kinds! {
@@ -22,6 +24,61 @@ kinds! {
         Replay(ReplayConfig) = "replay",
     }
     default Mock
+}
+
+section! {
+    /// A rigid motion.
+    pub struct PoseConfig {
+        /// Where its origin goes.
+        position: [f64; 3] = [0.0; 3], "m", Within(-1e6, 1e6);
+        /// Rotations about x, then y, then z.
+        rotation_deg: [f64; 3] = [0.0; 3], "deg", Within(-360.0, 360.0);
+        /// The rotation as a quaternion x, y, z, w instead; its length does not matter.
+        rotation: Option<[f64; 4]> = None, "", Within(-1e6, 1e6);
+    }
+}
+
+impl PoseConfig {
+    /// The motion; `None` if the quaternion is zero, which the check refuses.
+    pub fn to_affine(&self) -> Option<DAffine3> {
+        let rotation = match self.rotation {
+            Some(q) => {
+                let q = DQuat::from_array(q);
+                (q.length() > 1e-12).then(|| q.normalize())?
+            }
+            None => {
+                let [x, y, z] = self.rotation_deg.map(f64::to_radians);
+                DQuat::from_rotation_z(z) * DQuat::from_rotation_y(y) * DQuat::from_rotation_x(x)
+            }
+        };
+        Some(DAffine3::from_rotation_translation(rotation, DVec3::from_array(self.position)))
+    }
+}
+
+section! {
+    /// From the tracker's coordinates to the world's: `world = rotation * axes(scale * tracker) + position`.
+    pub struct TrackerTransformConfig {
+        /// Length of the tracker's unit: 0.001 for millimetres.
+        scale: f64 = 1.0, "m", Within(1e-6, 1e3);
+        /// The tracker's axes along the world's x, y and z. A tracker whose z points up, with x to the right, has
+        /// "x z -y". An odd number of exchanges and signs mirrors, for a left-handed tracker.
+        axes: Axes = Axes::default(), "", Any;
+        /// Where the tracker's origin is in the world.
+        position: [f64; 3] = [0.0; 3], "m", Within(-1e6, 1e6);
+        /// Rotations about the world's x, then y, then z, after the exchange of axes.
+        rotation_deg: [f64; 3] = [0.0; 3], "deg", Within(-360.0, 360.0);
+        /// The rotation as a quaternion x, y, z, w instead; its length does not matter.
+        rotation: Option<[f64; 4]> = None, "", Within(-1e6, 1e6);
+    }
+}
+
+impl TrackerTransformConfig {
+    /// The rigid part; `None` if the quaternion is zero, which the check refuses.
+    pub fn pose(&self) -> Option<DAffine3> {
+        let pose =
+            PoseConfig { position: self.position, rotation_deg: self.rotation_deg, rotation: self.rotation };
+        pose.to_affine()
+    }
 }
 
 section! {
@@ -62,6 +119,11 @@ section! {
         data_port: u16 = 1511, "", Within(1, u16::MAX);
         /// Frames per second that the server is set to; used for drop-out detection only.
         rate_hz: u32 = 500, "Hz", Within(1, 10_000);
+        /// From the tracker's coordinates to the world's.
+        transform: TrackerTransformConfig = TrackerTransformConfig::default(), "", Any;
+        /// Time by which a sample is older than its time stamp says. `dpm calibrate latency` measures it. Negative if
+        /// stamps are too old.
+        latency_us: i64 = 0, "us", Within(-200_000, 200_000);
     }
 }
 
@@ -74,6 +136,11 @@ section! {
         tracker: String = "Tracker0".into(), "", NotEmpty;
         /// Samples per second that the server is set to; used for drop-out detection only.
         rate_hz: u32 = 500, "Hz", Within(1, 10_000);
+        /// From the tracker's coordinates to the world's.
+        transform: TrackerTransformConfig = TrackerTransformConfig::default(), "", Any;
+        /// Time by which a sample is older than its time stamp says. `dpm calibrate latency` measures it. Negative if
+        /// stamps are too old.
+        latency_us: i64 = 0, "us", Within(-200_000, 200_000);
     }
 }
 
@@ -86,6 +153,11 @@ section! {
         baud: u32 = 921_600, "bit/s", Within(300, 20_000_000);
         /// Samples per second that the device is set to; used for drop-out detection only.
         rate_hz: u32 = 500, "Hz", Within(1, 10_000);
+        /// From the tracker's coordinates to the world's.
+        transform: TrackerTransformConfig = TrackerTransformConfig::default(), "", Any;
+        /// Time by which a sample is older than its time stamp says. `dpm calibrate latency` measures it. Negative if
+        /// stamps are too old.
+        latency_us: i64 = 0, "us", Within(-200_000, 200_000);
     }
 }
 
@@ -94,10 +166,27 @@ section! {
     pub struct ReplayConfig {
         /// The recording.
         file: PathBuf = PathBuf::new(), "", NotEmpty;
+        /// From the tracker's coordinates to the world's.
+        transform: TrackerTransformConfig = TrackerTransformConfig::default(), "", Any;
+        /// Time by which a sample is older than its time stamp says. `dpm calibrate latency` measures it. Negative if
+        /// stamps are too old.
+        latency_us: i64 = 0, "us", Within(-200_000, 200_000);
     }
 }
 
 impl TrackerConfig {
+    /// From the tracker's coordinates to the world's, and by how many microseconds samples are older than they say. The
+    /// mock knows the world.
+    pub fn frame(&self) -> Option<(&TrackerTransformConfig, i64)> {
+        match self {
+            Self::Mock(_) => None,
+            Self::Natnet(c) => Some((&c.transform, c.latency_us)),
+            Self::Vrpn(c) => Some((&c.transform, c.latency_us)),
+            Self::Serial(c) => Some((&c.transform, c.latency_us)),
+            Self::Replay(c) => Some((&c.transform, c.latency_us)),
+        }
+    }
+
     /// Expected samples per second; `None` if only the recording knows.
     pub fn rate_hz(&self) -> Option<u32> {
         match self {
@@ -176,8 +265,9 @@ section! {
         /// Nodes that exist only in the virtual world (lamps, surroundings). They appear in reflections and shadows,
         /// but the projector's light never falls on them.
         virtual_nodes: Vec<String> = Vec::new(), "", Any;
-        /// Albedo of the real surfaces that the light falls on. Measure it; 0.8 is matt white paint.
-        surface_albedo: f64 = 0.8, "", Within(0.01, 1.0);
+        /// Albedo of the real surfaces that the light falls on: one number, or one for each channel. Measure it; 0.8
+        /// is matt white paint.
+        surface_albedo: PerChannel = PerChannel([0.8; 3]), "", Each(0.01, 1.0);
         /// Radiance that the real surfaces already send to the eye because of the light in the room. It is subtracted
         /// from the picture.
         ambient: [f64; 3] = [0.0, 0.0, 0.0], "scene units", Within(0.0, 1e6);
@@ -247,6 +337,12 @@ section! {
         id: Option<i64> = None, "", Within(0, i64::from(i32::MAX));
         /// glTF node that it moves, together with everything below; the body's name if left out.
         node: Option<String> = None, "", NotEmpty;
+        /// Where its mesh is in the space of the body that the tracker reports: mesh-to-body. A real tracker's pivot and
+        /// axes are seldom those of the glTF node. `dpm calibrate body` measures it. The mock tracker reports the mesh
+        /// itself and ignores it.
+        mesh_to_body: PoseConfig = PoseConfig::default(), "", Any;
+        /// Albedo of its real surface, if it differs from `scene.surface_albedo`: one number, or one for each channel.
+        albedo: Option<PerChannel> = None, "", Each(0.01, 1.0);
         /// How it moves if the tracker is the mock, for example `{ kind = "translate", speed_m_s = 1.0 }`; the kinds
         /// are listed below. If left out, the first body moves back and forth at 1 m/s, the second rotates in place,
         /// and the others stand still.

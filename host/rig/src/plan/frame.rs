@@ -36,9 +36,9 @@ pub(crate) struct FramePlan {
     pub received_at: HostTime,
     /// At least one body is lit, so `captured_at` is the age of the light.
     pub is_lit: bool,
-    /// Per tracked body: predicted world-from-body.
+    /// Per tracked body: predicted world-from-mesh.
     pub tracked_poses: Vec<DAffine3>,
-    /// Per tracked body: the pose of the newest sample, without prediction.
+    /// Per tracked body: world-from-mesh by the newest sample, without prediction.
     pub sampled_poses: Vec<DAffine3>,
     /// Per tracked body: whether the tracker has reported it since the run began.
     pub seen: Vec<bool>,
@@ -113,9 +113,12 @@ impl FramePlan {
         (self.id, self.slot) = (FrameId(id), slot);
         (self.predict_ns, self.budget_milli) = (predict_ns, inputs.budget_milli);
         self.target_at = slots.start(slot);
-        self.dark_from = slots.dark_from(slot, stride, predict_ns);
+        // Light falls later than the projector's clock says by this much.
+        let late_ns = i64::from(rig.config.projector.latency_us) * 1000;
+        self.dark_from = slots.dark_from(slot, stride, predict_ns - late_ns);
         self.due_at = slots.host_of_slot(slot);
-        let middle = self.due_at.plus_ns(slots.host_of_slot(slot + 1).ns_since(self.due_at) / 2);
+        let half_slot = slots.host_of_slot(slot + 1).ns_since(self.due_at) / 2;
+        let middle = self.due_at.plus_ns(half_slot + late_ns);
         self.place_bodies(rig, snapshot, inputs, middle);
         rig.scene_poses(&self.tracked_poses, &mut self.scene_poses);
         (self.eye, self.gaze) = rig.observer.eye_and_gaze(&self.tracked_poses);
@@ -162,7 +165,7 @@ impl FramePlan {
                         *oldest = Some((state.captured_at, received_at));
                     }
                     let pose = if rig.config.prediction.on { used.pose } else { sampled.pose };
-                    (affine(&pose), affine(&sampled.pose), dark)
+                    (affine(&pose) * body.mesh_to_body, affine(&sampled.pose) * body.mesh_to_body, dark)
                 }
                 // The body was never seen, so nothing may be lit.
                 None => (affine(&body.rest), affine(&body.rest), Some(DarkCause::NeverSeen)),

@@ -2,6 +2,7 @@
 
 mod source;
 mod stage;
+mod tracker_frame;
 
 pub(crate) use source::NoTracker;
 pub use source::{open_for, SourceError};

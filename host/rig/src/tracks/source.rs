@@ -200,7 +200,7 @@ mod tests {
         let server = NatnetConfig { server: "motive.lab".into(), ..NatnetConfig::default() };
         assert!(told(TrackerConfig::Natnet(server))
             .contains("tracker.server: \"motive.lab\" is not an IPv4 address"));
-        let missing = ReplayConfig { file: "/nonexistent/run.dpmt".into() };
+        let missing = ReplayConfig { file: "/nonexistent/run.dpmt".into(), ..ReplayConfig::default() };
         assert!(told(TrackerConfig::Replay(missing)).contains("/nonexistent/run.dpmt"));
     }
 }

@@ -1,5 +1,6 @@
 //! The first stage of a frame: puts newly arrived samples into the tracks of all bodies.
 
+use super::tracker_frame::TrackerFrame;
 use crate::config::{TrackerConfig, MAX_TRACKED};
 use crate::rig::Rig;
 use dpm_device::time::HostTime;
@@ -32,6 +33,8 @@ pub struct TrackingStage {
     bank: PoseFilterBank,
     received_at: Vec<HostTime>,
     bodies: usize,
+    /// From the tracker's coordinates to the world's; `None` if they are the same.
+    frame: Option<TrackerFrame>,
     /// The longest latency of the last samples; it decays by 1/1024 per sample.
     latency_ns: i64,
     /// Time of the first step; `None` before it.
@@ -77,6 +80,7 @@ impl TrackingStage {
             bank: PoseFilterBank::new(&vec![config; bodies]),
             received_at: vec![HostTime(0); bodies],
             bodies,
+            frame: TrackerFrame::of(&rig.config.tracker),
             latency_ns: 0,
             began_at: None,
             looked: false,
@@ -89,8 +93,16 @@ impl TrackingStage {
     /// The tracker is gone; the tracks that are known stay published.
     pub fn step(&mut self, now: HostTime, latest: &mut Publisher<TrackSnapshot>) -> Result<(), TrackerError> {
         self.began_at.get_or_insert(now);
-        let Self { tracker, bank, received_at, latency_ns, .. } = self;
+        let Self { tracker, bank, received_at, latency_ns, frame, .. } = self;
         let result = tracker.poll(now, &mut |sample| {
+            let in_world;
+            let sample = match frame {
+                None => sample,
+                Some(frame) => {
+                    in_world = frame.apply(sample);
+                    &in_world
+                }
+            };
             if let Some(verdict) = bank.update(sample) {
                 if verdict.is_accepted() {
                     if let Some(at) = received_at.get_mut(usize::from(sample.body.0)) {

@@ -1,8 +1,5 @@
 //! Space in f64: rigid motions (SE(3)), cameras and their calibration.
 
-pub mod calibration;
-pub mod distortion;
+pub mod lens;
 pub mod opencv;
 pub mod projector;
-mod refine;
-mod svd;

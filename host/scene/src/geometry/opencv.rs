@@ -4,7 +4,7 @@
 //! exactly the parts that calibrations use: matrices and numbers by name at any depth. The text itself bounds all
 //! sizes: nothing is allocated ahead of the data.
 
-use super::distortion::Distortion;
+use super::lens::{Lens, LensError};
 use super::projector::{ProjectorCamera, ProjectorError};
 use dpm_device::planes::Raster;
 use glam::{DAffine3, DMat3, DVec3};
@@ -37,10 +37,8 @@ pub struct Matrix {
 /// The content of a calibration file.
 #[derive(Clone, Debug, PartialEq)]
 pub struct StoredCalibration {
-    /// The projector, without its distortion.
+    /// The projector with its lens.
     pub camera: ProjectorCamera,
-    /// Its lens distortion.
-    pub distortion: Distortion,
     /// Names under which the parts were found, for the operator.
     pub found: Vec<String>,
 }
@@ -253,32 +251,20 @@ pub fn read(text: &str, raster: Raster, unit: LengthUnit) -> Result<StoredCalibr
         LengthUnit::Millimetre => 1e-3,
     };
     let translation = DVec3::from_slice(&t.data) * metres;
-    let distortion = match distortion {
-        None => Distortion::default(),
-        Some((name, d)) => {
-            if !matches!(d.data.len(), 4 | 5 | 8 | 12 | 14) {
-                return Err(value(
-                    &name,
-                    format!("has {} numbers; 4, 5, 8, 12 or 14 are known", d.data.len()),
-                ));
-            }
-            if d.data.iter().skip(12).any(|v| *v != 0.0) {
-                return Err(value(
-                    &name,
-                    "has a tilted sensor, which is not supported: calibrate without it".into(),
-                ));
-            }
-            let used = &d.data[..d.data.len().min(12)];
-            Distortion::new(used).ok_or_else(|| value(&name, "is not finite".into()))?
-        }
+    let lens = match distortion {
+        None => Lens::default(),
+        Some((name, d)) => Lens::opencv(&d.data).map_err(|e| match e {
+            LensError::Count(n) => value(&name, format!("has {n} numbers; 4, 5, 8, 12 or 14 are known")),
+            other => value(&name, format!("is not a lens: {other}")),
+        })?,
     };
     // x_proj = R x + T in +Z, y down; ours looks along -Z, y up.
     let flip = DMat3::from_diagonal(DVec3::new(1.0, -1.0, -1.0));
     let pose =
         DAffine3::from_mat3_translation(rotation.transpose() * flip, -(rotation.transpose() * translation));
     // OpenCV puts pixel centres at whole numbers, this project at halves.
-    let camera = ProjectorCamera::new(raster, pose, fx, fy, cx + 0.5, cy + 0.5)?;
-    Ok(StoredCalibration { camera, distortion, found })
+    let camera = ProjectorCamera::new(raster, pose, fx, fy, cx + 0.5, cy + 0.5)?.with_lens(lens)?;
+    Ok(StoredCalibration { camera, found })
 }
 
 #[cfg(test)]
@@ -297,9 +283,13 @@ mod tests {
         let c = read(YAML, raster(), LengthUnit::Millimetre).unwrap();
         // x_proj = R x + T by hand: (0.5, 0.2, 2) -> (-0.2, 0.5, 2) + (0.1, 0.2, 0.3) = (-0.1, 0.7, 2.3).
         let pixel = c.camera.project(DVec3::new(0.5, 0.2, 2.0)).unwrap();
-        let want = DVec2::new(1200.0 * -0.1 / 2.3 + 512.0, 1100.0 * 0.7 / 2.3 + 384.0);
+        let (x, y) = (-0.1 / 2.3, 0.7 / 2.3);
+        let r2: f64 = x * x + y * y;
+        let radial = 1.0 - 0.1 * r2 + 0.01 * r2 * r2;
+        let want = DVec2::new(1200.0 * x * radial + 512.0, 1100.0 * y * radial + 384.0);
         assert!((pixel - want).length() < 1e-9, "{pixel} {want}");
-        assert_eq!(c.distortion.c[..3], [-0.1, 0.01, 0.0]);
+        let lens = Lens::opencv(&[-0.1, 0.01, 0.0, 0.0, 0.0]).unwrap();
+        assert_eq!(c.camera.lens.model(), lens.model());
         assert!(c.found.contains(&"rotation: roration".to_string()), "{:?}", c.found);
         // In metres the projector is a thousand times farther away.
         let m = read(YAML, raster(), LengthUnit::Metre).unwrap();
@@ -324,7 +314,7 @@ mod tests {
         );
         let p = DVec3::new(0.5, 0.2, 2.0);
         assert!((a.camera.project(p).unwrap() - b.camera.project(p).unwrap()).length() < 1e-9);
-        assert_eq!(a.distortion, b.distortion);
+        assert_eq!(a.camera.lens, b.camera.lens);
     }
 
     #[test]

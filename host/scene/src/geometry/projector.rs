@@ -1,8 +1,9 @@
-//! A pinhole projector: converts pixels to rays and world points to pixels.
+//! A projector with its lens: converts pixels to rays and world points to pixels.
 //!
 //! Projector space looks along -Z with +X right and +Y up. Pixel coordinates run right and **down** from the raster's upper left
 //! corner; pixel `(i, j)` covers `i..i+1` by `j..j+1`, its centre is `(i + 0.5, j + 0.5)`.
 
+use super::lens::{Lens, LensError};
 use dpm_device::planes::Raster;
 use glam::{DAffine3, DMat3, DVec2, DVec3};
 use thiserror::Error;
@@ -34,9 +35,15 @@ pub enum ProjectorError {
     /// A focal length is zero, negative or not finite.
     #[error("projector: focal lengths {0} x {1} px must be finite and above 0")]
     Focal(f64, f64),
+    /// The lens cannot be inverted over the raster.
+    #[error("projector: {0}")]
+    Lens(#[from] LensError),
 }
 
-/// A calibrated pinhole projector without lens distortion.
+/// Positions on each side of the raster at which a lens must have an inverse.
+const BORDER_STEPS: u32 = 64;
+
+/// A calibrated projector.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct ProjectorCamera {
     /// Size of the mirror array.
@@ -51,6 +58,8 @@ pub struct ProjectorCamera {
     pub cx: f64,
     /// Row at which the optical axis leaves, pixels from the upper edge.
     pub cy: f64,
+    /// How its lens bends rays between the pinhole and the focal lengths.
+    pub lens: Lens,
 }
 
 impl ProjectorCamera {
@@ -106,7 +115,31 @@ impl ProjectorCamera {
         if !(fx.is_finite() && fy.is_finite() && fx > 0.0 && fy > 0.0) {
             return Err(ProjectorError::Focal(fx, fy));
         }
-        Ok(Self { raster, world_from_projector, fx, fy, cx, cy })
+        Ok(Self { raster, world_from_projector, fx, fy, cx, cy, lens: Lens::default() })
+    }
+
+    /// The same projector with another lens.
+    ///
+    /// # Errors
+    /// [`ProjectorError::Lens`] if the lens cannot be inverted over the whole raster and a pixel around it.
+    pub fn with_lens(self, lens: Lens) -> Result<Self, ProjectorError> {
+        let (w, h) = (f64::from(self.raster.width()), f64::from(self.raster.height()));
+        let border = (0..=BORDER_STEPS).flat_map(|i| {
+            let t = f64::from(i) / f64::from(BORDER_STEPS);
+            let (x, y) = (-1.0 + t * (w + 2.0), -1.0 + t * (h + 2.0));
+            [DVec2::new(x, -1.0), DVec2::new(x, h + 1.0), DVec2::new(-1.0, y), DVec2::new(w + 1.0, y)]
+        });
+        let lens =
+            lens.usable_over(border.map(|p| self.bent_of_pixel(p)), |bent| self.pixel_of_bent(bent))?;
+        Ok(Self { lens, ..self })
+    }
+
+    /// The view of this projector divided into the pixels of another raster.
+    pub fn at_raster(&self, raster: Raster) -> Self {
+        // Pixel coordinates start at the raster's corner, so everything scales.
+        let x = f64::from(raster.width()) / f64::from(self.raster.width());
+        let y = f64::from(raster.height()) / f64::from(self.raster.height());
+        Self { raster, fx: self.fx * x, fy: self.fy * y, cx: self.cx * x, cy: self.cy * y, ..*self }
     }
 
     /// The origin of the light, world space.
@@ -114,9 +147,27 @@ impl ProjectorCamera {
         self.world_from_projector.translation
     }
 
-    /// The ray that leaves through a pixel position.
+    /// The bent ray (`x / z`, `y / z` behind the lens, y down) of a pixel position.
+    pub fn bent_of_pixel(&self, pixel: DVec2) -> DVec2 {
+        DVec2::new((pixel.x - self.cx) / self.fx, (pixel.y - self.cy) / self.fy)
+    }
+
+    /// The pixel position of a bent ray.
+    pub fn pixel_of_bent(&self, bent: DVec2) -> DVec2 {
+        DVec2::new(self.cx + self.fx * bent.x, self.cy + self.fy * bent.y)
+    }
+
+    /// The straight ray (`x / z`, `y / z` in front of the lens, y down) of a pixel position; `None` where the lens has none,
+    /// which is never on the raster of [`Self::with_lens`].
+    pub fn straight_of_pixel(&self, pixel: DVec2) -> Option<DVec2> {
+        self.lens.undistort(self.bent_of_pixel(pixel))
+    }
+
+    /// The ray that leaves through a pixel position. Its direction is NaN where no ray does, far outside the raster of a
+    /// lens that folds.
     pub fn ray(&self, pixel: DVec2) -> DRay {
-        let d = DVec3::new((pixel.x - self.cx) / self.fx, (self.cy - pixel.y) / self.fy, -1.0);
+        let straight = self.straight_of_pixel(pixel).unwrap_or(DVec2::NAN);
+        let d = DVec3::new(straight.x, -straight.y, -1.0);
         DRay {
             origin: self.position(),
             direction: self.world_from_projector.transform_vector3(d).normalize(),
@@ -130,14 +181,19 @@ impl ProjectorCamera {
 
     /// Pixel position of a world point; `None` when the point is beside or behind the projector. May lie outside the raster.
     pub fn project(&self, world: DVec3) -> Option<DVec2> {
+        let pixel = self.pixel_of_bent(self.lens.distort(self.straight_of_world(world)?)?);
+        pixel.is_finite().then_some(pixel)
+    }
+
+    /// The straight ray (`x / z`, `y / z`, y down) to a world point; `None` when the point is beside or behind the projector.
+    pub fn straight_of_world(&self, world: DVec3) -> Option<DVec2> {
         let p = self.to_projector_space(world);
         let depth = -p.z;
         // If the depth is below 1e-12 of the lateral distance, the quotient is meaningless (and would overflow at 0).
         if depth.is_nan() || depth <= 1e-12 * p.x.abs().max(p.y.abs()).max(1e-290) {
             return None;
         }
-        let pixel = DVec2::new(self.cx + self.fx * p.x / depth, self.cy - self.fy * p.y / depth);
-        pixel.is_finite().then_some(pixel)
+        Some(DVec2::new(p.x / depth, -p.y / depth))
     }
 
     /// Rows d(x)/dX and d(y)/dX of the projection at a world point, pixels per metre; `None` if [`Self::project`]
@@ -146,23 +202,29 @@ impl ProjectorCamera {
         self.project(world)?;
         let p = self.to_projector_space(world);
         let depth = -p.z;
-        let in_projector = [
-            DVec3::new(self.fx / depth, 0.0, self.fx * p.x / (depth * depth)),
-            DVec3::new(0.0, -self.fy / depth, -self.fy * p.y / (depth * depth)),
+        let straight = [
+            DVec3::new(1.0 / depth, 0.0, p.x / (depth * depth)),
+            DVec3::new(0.0, -1.0 / depth, -p.y / (depth * depth)),
         ];
-        Some(in_projector.map(|row| self.world_from_projector.matrix3 * row))
+        let lens = self.lens.jacobian(self.straight_of_world(world)?);
+        let row = |f: f64, by_x: f64, by_y: f64| {
+            self.world_from_projector.matrix3 * ((straight[0] * by_x + straight[1] * by_y) * f)
+        };
+        Some([row(self.fx, lens.x_axis.x, lens.y_axis.x), row(self.fy, lens.x_axis.y, lens.y_axis.y)])
     }
 
-    /// Full horizontal angle of the raster, radians.
-    pub(crate) fn horizontal_fov(&self) -> f64 {
+    /// Full horizontal angle of the raster along the row of the axis, radians.
+    pub fn horizontal_fov(&self) -> f64 {
         let w = f64::from(self.raster.width());
-        (self.cx / self.fx).atan() + ((w - self.cx) / self.fx).atan()
+        let at = |x: f64| self.straight_of_pixel(DVec2::new(x, self.cy)).map_or(f64::NAN, |p| p.x.atan());
+        at(w) - at(0.0)
     }
 
-    /// Full vertical angle of the raster, radians.
-    pub(crate) fn vertical_fov(&self) -> f64 {
+    /// Full vertical angle of the raster along the column of the axis, radians.
+    pub fn vertical_fov(&self) -> f64 {
         let h = f64::from(self.raster.height());
-        (self.cy / self.fy).atan() + ((h - self.cy) / self.fy).atan()
+        let at = |y: f64| self.straight_of_pixel(DVec2::new(self.cx, y)).map_or(f64::NAN, |p| p.y.atan());
+        at(h) - at(0.0)
     }
 }
 
@@ -232,6 +294,35 @@ mod tests {
             let d = (c.project(p + axis * h).unwrap() - c.project(p - axis * h).unwrap()) / (2.0 * h);
             assert!((d - DVec2::new(j[0].dot(axis), j[1].dot(axis))).length() < 1e-5 * c.fx);
         }
+    }
+
+    #[test]
+    fn a_lens_bends_between_pinhole_and_pixels() {
+        let straight = camera();
+        let lens = Lens::opencv(&[-0.1, 0.02, 1e-3, -2e-3, 0.0]).unwrap();
+        let c = straight.with_lens(lens).unwrap();
+        // By hand, off the axis to the right and down.
+        let at = DVec2::new(0.2, 0.1);
+        let r2 = 0.05;
+        let radial = 1.0 + r2 * (-0.1 + r2 * 0.02);
+        let bent =
+            at * radial + DVec2::new(2e-3 * 0.02 - 2e-3 * (r2 + 0.08), 1e-3 * (r2 + 0.02) - 4e-3 * 0.02);
+        let world = c.world_from_projector.transform_point3(DVec3::new(0.2, -0.1, -1.0) * 3.0);
+        let want = DVec2::new(c.cx + c.fx * bent.x, c.cy + c.fy * bent.y);
+        assert!((c.project(world).unwrap() - want).length() < 1e-9);
+        for (x, y) in [(0.0, 0.0), (640.0, 480.0), (123.4, 56.7), (-1.0, 481.0)] {
+            let r = c.ray(DVec2::new(x, y));
+            assert!((c.project(r.origin + r.direction * 2.0).unwrap() - DVec2::new(x, y)).length() < 1e-8);
+        }
+        let h = 1e-6;
+        let j = c.jacobian(world).unwrap();
+        for axis in [DVec3::X, DVec3::Y, DVec3::Z] {
+            let d = (c.project(world + axis * h).unwrap() - c.project(world - axis * h).unwrap()) / (2.0 * h);
+            assert!((d - DVec2::new(j[0].dot(axis), j[1].dot(axis))).length() < 1e-5 * c.fx);
+        }
+        // A raster that reaches beyond the fold of the lens is refused, with the pixel.
+        let folding = straight.with_lens(Lens::opencv(&[-9.0, 0.0, 0.0, 0.0]).unwrap());
+        assert!(matches!(folding, Err(ProjectorError::Lens(LensError::Folds { .. }))), "{folding:?}");
     }
 
     #[test]

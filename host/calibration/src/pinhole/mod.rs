@@ -5,11 +5,14 @@
 //! (\[Fischler81\]) to exclude wrong pairs. Everything is computed in coordinates centred on the points and scaled to
 //! their spread: metres and millimetres give the same pixels.
 
-use super::projector::ProjectorCamera;
-use super::refine::{refine, Pinhole, Refined};
-use super::svd::{svd, Columns};
+mod refine;
+
+use crate::dense::{svd, Columns};
 use dpm_device::planes::Raster;
+use dpm_scene::geometry::lens::Lens;
+use dpm_scene::geometry::projector::ProjectorCamera;
 use glam::{DMat3, DVec2, DVec3};
+use refine::{refine, Pinhole, Refined};
 use thiserror::Error;
 
 /// A point of the world and the pixel position that lights it.
@@ -421,6 +424,7 @@ impl Normalisation {
             fy: m.focal.y / self.pixel_scale,
             cx: m.centre.x / self.pixel_scale + self.pixel_centre.x,
             cy: m.centre.y / self.pixel_scale + self.pixel_centre.y,
+            lens: Lens::default(),
         }
     }
 

@@ -1,0 +1,159 @@
+//! What the rig file says of surfaces and of the projector's light, as the renderer's [`Drive`].
+
+use crate::config::{ResponseConfig, RigConfig, TableResponseConfig};
+use dpm_device::planes::Raster;
+use dpm_device::regular_file;
+use dpm_render::drive::{Drive, Response};
+use dpm_scene::Scene;
+use std::path::Path;
+use std::sync::Arc;
+
+/// Largest table of a response, bytes.
+const MAX_TABLE_BYTES: u64 = 1 << 20;
+/// Largest picture of a flat field, bytes.
+const MAX_PICTURE_BYTES: u64 = 256 << 20;
+/// Pixels darker than this share of the brightest cannot be compensated.
+const LEAST_BRIGHTNESS: f32 = 0.02;
+
+/// A file that describes the projector's light cannot be used.
+#[derive(Clone, Debug, thiserror::Error)]
+#[error("{key}: {message}")]
+pub struct DriveError {
+    /// Configuration key.
+    pub key: &'static str,
+    /// What is wrong.
+    pub message: String,
+}
+
+/// Surfaces and projector of the rig file at a raster.
+///
+/// # Errors
+/// A file cannot be used; the error names its key.
+pub(crate) fn drive(config: &RigConfig, scene: &Scene, raster: Raster) -> Result<Drive, DriveError> {
+    let gain_with = |albedo: [f64; 3]| -> [f32; 3] {
+        let (intensity, white) = (config.projector.max_intensity.0, config.render.white);
+        std::array::from_fn(|c| {
+            // The product of exposure and white is exact where white is 1.
+            let wanted = std::f64::consts::PI * (config.render.exposure * white[c]);
+            (wanted / (albedo[c] * intensity[c])) as f32
+        })
+    };
+    let differs = config.scene.bodies.iter().any(|b| b.albedo.is_some());
+    let gain_of_body = if differs {
+        scene.bodies.iter().map(|b| gain_with(albedo_of(config, b.tracked))).collect()
+    } else {
+        Vec::new()
+    };
+    Ok(Drive {
+        gain: gain_with(config.scene.surface_albedo.0),
+        gain_of_body,
+        ambient: config.scene.ambient.map(|v| v as f32),
+        response: response(&config.projector.response)?,
+        flat_field: config.projector.flat_field.as_deref().map(|f| flat_field(f, raster)).transpose()?,
+    })
+}
+
+/// Albedo of the real surface of a body of the scene, by the tracked body that carries it.
+pub(crate) fn albedo_of(config: &RigConfig, tracked: Option<u16>) -> [f64; 3] {
+    let own = tracked.and_then(|i| config.scene.bodies.get(usize::from(i))?.albedo);
+    own.unwrap_or(config.scene.surface_albedo).0
+}
+
+fn response(config: &ResponseConfig) -> Result<Option<Response>, DriveError> {
+    let wrong = |message: String| DriveError { key: "projector.response", message };
+    Ok(match config {
+        ResponseConfig::Linear(_) => None,
+        ResponseConfig::Gamma(c) => {
+            Some(Response::gamma(c.gamma.0, c.black.0).map_err(|e| wrong(e.to_string()))?)
+        }
+        ResponseConfig::Table(TableResponseConfig { file }) => {
+            let told = |e: &dyn std::fmt::Display| wrong(format!("{}: {e}", file.display()));
+            let text = regular_file::read_text(file, MAX_TABLE_BYTES).map_err(|e| told(&e))?;
+            let light = table(&text).map_err(|e| told(&e))?;
+            Some(Response::new(&light).map_err(|e| told(&e))?)
+        }
+    })
+}
+
+/// Light of each channel and code value from 256 lines of one or three numbers.
+fn table(text: &str) -> Result<[[f64; 256]; 3], String> {
+    let mut light = [[0.0; 256]; 3];
+    let lines = text.lines().enumerate().filter(|(_, l)| !l.trim().is_empty() && !l.trim().starts_with('#'));
+    let mut code = 0;
+    for (number, line) in lines {
+        let words: Vec<&str> = line.split([',', ' ', '\t', ';']).filter(|w| !w.is_empty()).collect();
+        let values: Vec<f64> = words.iter().filter_map(|w| w.parse().ok()).collect();
+        let row = match values[..] {
+            [all] if words.len() == 1 => [all; 3],
+            [r, g, b] if words.len() == 3 => [r, g, b],
+            _ => return Err(format!("line {}: {line:?} is not one number or three", number + 1)),
+        };
+        if code == 256 {
+            return Err(format!("line {}: there are more than 256 lines of numbers", number + 1));
+        }
+        (0..3).for_each(|c| light[c][code] = row[c]);
+        code += 1;
+    }
+    if code < 256 {
+        return Err(format!(
+            "has {code} lines of numbers; 256 are needed, one for each code value from 0 on"
+        ));
+    }
+    Ok(light)
+}
+
+/// One over the relative brightness of each pixel and channel, from a linear picture of a white field of any size.
+fn flat_field(path: &Path, raster: Raster) -> Result<Arc<Vec<[f32; 3]>>, DriveError> {
+    let wrong = |message: String| DriveError {
+        key: "projector.flat_field",
+        message: format!("{}: {message}", path.display()),
+    };
+    let bytes = regular_file::read(path, MAX_PICTURE_BYTES).map_err(|e| wrong(e.to_string()))?;
+    let picture = dpm_scene::load_linear_picture(&bytes).map_err(|e| wrong(e.to_string()))?;
+    let mut brightest = [0.0f32; 3];
+    for texel in &picture.texels {
+        for c in 0..3 {
+            if !texel[c].is_finite() || texel[c] < 0.0 {
+                return Err(wrong(format!("holds {}, which is no brightness", texel[c])));
+            }
+            brightest[c] = brightest[c].max(texel[c]);
+        }
+    }
+    if brightest.contains(&0.0) {
+        return Err(wrong("is black in one channel; take a picture of a white field".into()));
+    }
+    let (width, height) = (raster.width(), raster.height());
+    let mut inverse = Vec::with_capacity(raster.pixel_count());
+    for y in 0..height {
+        for x in 0..width {
+            let at = [(x as f32 + 0.5) / width as f32, (y as f32 + 0.5) / height as f32];
+            let even: [f32; 3] = std::array::from_fn(|c| picture.at(at)[c] / brightest[c]);
+            if even.iter().any(|v| *v < LEAST_BRIGHTNESS) {
+                return Err(wrong(format!(
+                    "pixel ({x}, {y}) has less than {:.0} % of the brightest pixel's light, which cannot be \
+                     compensated; was the whole field lit?",
+                    100.0 * LEAST_BRIGHTNESS
+                )));
+            }
+            inverse.push(even.map(|v| 1.0 / v));
+        }
+    }
+    Ok(Arc::new(inverse))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn tables_have_a_line_for_each_code_value() {
+        let one: String = (0..256).map(|i| format!("{i}\n")).collect();
+        assert_eq!(table(&format!("# light\n\n{one}")).unwrap()[2][255], 255.0);
+        let three: String = (0..256).map(|i| format!("{i}, {}\t{}\n", 2 * i, 3 * i)).collect();
+        assert_eq!(table(&three).unwrap().map(|c| c[10]), [10.0, 20.0, 30.0]);
+        assert!(table("1\n2\n").unwrap_err().contains("has 2 lines"));
+        assert!(table(&format!("{one}256")).unwrap_err().contains("more than 256"));
+        assert!(table("1 2\n").unwrap_err().starts_with("line 1"));
+        assert!(table("1 2 x 3\n").unwrap_err().starts_with("line 1"));
+    }
+}
