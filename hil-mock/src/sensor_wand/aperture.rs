@@ -19,7 +19,7 @@ pub(super) fn covered(raster: Raster, plane: &[u8], centre: [f64; 2], radius: f6
         inside && plane[y as usize * raster.row_bytes() + x as usize / 8] << (x % 8) & 0x80 != 0
     };
     let outside = |at: f64, count: u32| !(-radius..=f64::from(count) + radius).contains(&at);
-    if !(radius <= MAX_RADIUS) || outside(u, raster.width()) || outside(v, raster.height()) {
+    if !(0.0..=MAX_RADIUS).contains(&radius) || outside(u, raster.width()) || outside(v, raster.height()) {
         return 0.0;
     }
     if radius < 0.1 {

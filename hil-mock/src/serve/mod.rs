@@ -24,7 +24,7 @@ pub(crate) enum Device {
     /// Bit-plane projector: a USB device over USB/IP, or on a serial port or pseudo-terminal
     Projector(projector::ProjectorArguments),
     /// Tracked wand with a light sensor in the beam of a bit-plane projector: projector, NatNet server and sensor in one
-    SensorWand(sensor_wand::SensorWandArguments),
+    SensorWand(Box<sensor_wand::SensorWandArguments>),
     /// Serial pose stream on a port or a pseudo-terminal
     Serial(serial::SerialArguments),
     /// VRPN server: poses over TCP
