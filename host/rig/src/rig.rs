@@ -4,7 +4,7 @@ use crate::calibrated::{calibrated_camera, CameraFileError};
 use crate::config::{BodyConfig, BuiltinScene, EnvironmentConfig, GazeConfig, RigConfig, TrackerConfig};
 use crate::drive::{albedo_of, drive, DriveError};
 use crate::mock::{Motion, MotionError, MotionSpec};
-use dpm_device::planes::Raster;
+use dpm_device::planes::{PlaneSchedule, Raster};
 use dpm_device::pose::Pose;
 use dpm_device::time::FrameRate;
 use dpm_render::drive::Drive;
@@ -141,6 +141,8 @@ pub struct Rig {
     pub bodies: Vec<RigBody>,
     /// The observer's eye.
     pub observer: Observer,
+    /// The planes of a frame in the order in which they are shown.
+    pub schedule: PlaneSchedule,
     /// From radiance to code values.
     pub drive: Drive,
 }
@@ -177,7 +179,8 @@ impl Rig {
         let bodies = rig_bodies(config, &scene)?;
         let observer = observer(config, &bodies)?;
         let drive = drive(config, &scene, raster)?;
-        Ok(Self { config: config.clone(), scene, camera, bodies, observer, drive })
+        let schedule = config.projector.schedule();
+        Ok(Self { config: config.clone(), scene, camera, bodies, observer, schedule, drive })
     }
 
     /// The projector of a rig alone, without scene, bodies or calibration: for light that nothing is traced for.
@@ -191,7 +194,8 @@ impl Rig {
         let camera = camera(&config, raster, &mut Vec::new())?;
         let observer = observer(&config, &[])?;
         let (scene, bodies) = (Scene::default(), Vec::new());
-        Ok(Self { config, scene, camera, bodies, observer, drive: Drive::default() })
+        let (schedule, drive) = (config.projector.schedule(), Drive::default());
+        Ok(Self { config, scene, camera, bodies, observer, schedule, drive })
     }
 
     /// Frames per second.
