@@ -39,6 +39,11 @@ impl MonotonicClock {
 }
 
 impl MonotonicClock {
+    /// The same clock with another length of the busy loop at the end of a wait; see [`MonotonicClock::new`].
+    pub fn spinning(self, spin_ns: i64) -> Self {
+        Self { spin_ns: spin_ns.max(0), ..self }
+    }
+
     /// The same clock for a thread that must not spin.
     pub fn sleeping(self) -> Self {
         Self { spin_ns: 0, ..self }

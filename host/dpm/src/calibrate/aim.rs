@@ -27,7 +27,7 @@ impl Aim {
 }
 
 impl PatternSource for Aim {
-    fn picture(&self, _: u64) -> u64 {
+    fn picture(&self, _: u64, _: u64) -> u64 {
         self.at.load(Ordering::Relaxed)
     }
 

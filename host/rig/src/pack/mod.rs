@@ -28,7 +28,7 @@ pub(crate) fn pack(job: &mut FrameJob, kernel: Kernel, verify: bool, pictures: &
     }
     match pictures {
         Some(Pictures::Marked(prepared)) => prepared.pack(kernel, note.plan.id.0, &mut memory.planes),
-        Some(Pictures::Drawn(painter)) => painter.pack(kernel, note.plan.id.0, memory),
+        Some(Pictures::Drawn(painter)) => painter.pack(kernel, (note.plan.id.0, note.plan.slot), memory),
         None => return,
     }
     note.timeline.wall_ns[Stage::Pack as usize] = watch.elapsed_ns();

@@ -5,14 +5,15 @@ use dpm_device::planes::{Channel, PlaneSchedule, Raster};
 use dpm_render::pack::{self, BitPlaneFrame, Kernel};
 use std::sync::Arc;
 
-/// Gives the picture of every frame of a run that renders nothing. What it gives depends on the frame's number and on
-/// nothing else, so a crew of threads that takes over goes on with the same pictures.
+/// Gives the picture of every frame of a run that renders nothing. What it gives depends on the frame's number and slot
+/// and on nothing else, so a crew of threads that takes over goes on with the same pictures.
 ///
 /// It is called on the way of a frame: it must not allocate, lock or wait.
 pub trait PatternSource: Send + Sync {
-    /// The number of the picture that frame `frame` shows. Frames with equal numbers show equal planes, so their
-    /// planes are drawn once and kept. By default every frame has a picture of its own.
-    fn picture(&self, frame: u64) -> u64 {
+    /// The number of the picture that frame `frame` shows in slot `slot` of the projector. Frames with equal numbers
+    /// show equal planes, so their planes are drawn once and kept. By default every frame has a picture of its own.
+    /// What must be known to the microsecond goes by slots: a frame that misses its own leaves no gap in the numbers.
+    fn picture(&self, frame: u64, _slot: u64) -> u64 {
         frame
     }
 
@@ -82,8 +83,8 @@ impl PatternPainter {
     }
 
     /// The planes of frame `frame` into its memory, which may hold them from a former frame.
-    pub(crate) fn pack(&mut self, kernel: Kernel, frame: u64, memory: &mut FrameMemory) {
-        let picture = self.source.picture(frame);
+    pub(crate) fn pack(&mut self, kernel: Kernel, (frame, slot): (u64, u64), memory: &mut FrameMemory) {
+        let picture = self.source.picture(frame, slot);
         if memory.picture != Some(picture) {
             self.draw(kernel, picture, &mut memory.planes);
             memory.picture = Some(picture);

@@ -10,7 +10,7 @@ mod show;
 mod tests;
 
 pub use flash::{flashes, shortest_hold_ms};
-pub use run::run_pattern;
+pub use run::{run_pattern, run_pattern_stamped};
 pub use show::PatternShow;
 
 use dpm_device::planes::{Channel, PlaneSchedule, Raster};

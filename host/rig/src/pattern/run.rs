@@ -8,6 +8,8 @@ use crate::pipeline::{self, RunOptions};
 use crate::rig::Rig;
 use crate::telemetry::monitor::RunMonitor;
 use crate::telemetry::report::Report;
+use dpm_common::clock::MonotonicClock;
+use dpm_device::time::HostTime;
 use std::sync::Arc;
 
 /// Shows the pictures of `source` on the projector of `config` until its run is over or `monitor` asks for a stop.
@@ -31,6 +33,22 @@ pub fn run_pattern(
         ended.fail(Failure::new(FailureKind::CheckFailed, told));
     }
     Ok(ended)
+}
+
+/// The same, with the slot and the first photon of each lit frame, the last `most` of them, on `clock`.
+///
+/// # Errors
+/// As [`run_pattern`].
+pub fn run_pattern_stamped(
+    config: &RigConfig,
+    source: Arc<dyn PatternSource>,
+    (clock, most): (MonotonicClock, usize),
+    monitor: &Arc<RunMonitor>,
+) -> Result<Vec<(u64, HostTime)>, Failure> {
+    let rig = Arc::new(Rig::of_projector(config)?);
+    let options = RunOptions { keep_records: most, clock: Some(clock), ..RunOptions::default() };
+    let outcome = pipeline::run_pattern(rig, source, options, monitor)?;
+    Ok(outcome.recent.iter().filter_map(|r| Some((r.slot, r.timeline.lit_at?))).collect())
 }
 
 impl From<PatternError> for Failure {

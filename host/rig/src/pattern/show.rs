@@ -99,7 +99,7 @@ impl PatternShow {
 }
 
 impl PatternSource for PatternShow {
-    fn picture(&self, frame: u64) -> u64 {
+    fn picture(&self, frame: u64, _: u64) -> u64 {
         if let Some(step) = self.only {
             return u64::from(step);
         }

@@ -213,12 +213,12 @@ fn what_does_not_fit_is_refused_by_name() {
 #[test]
 fn a_step_is_held_for_its_time_and_the_only_step_for_ever() {
     let gray = show(Pattern::Gray { axis: Axis::Rows }, raster(64, 4), 1000, None).unwrap();
-    let seen: Vec<u64> = (0..5).map(|s| gray.picture(947 * s + 946)).collect();
+    let seen: Vec<u64> = (0..5).map(|s| gray.picture(947 * s + 946, 0)).collect();
     assert_eq!(seen, [0, 1, 2, 3, 0]);
     let only = show(Pattern::Gray { axis: Axis::Rows }, raster(64, 4), 1000, Some(3)).unwrap();
-    assert!((0..10_000).all(|frame| only.picture(frame) == 3) && only.pictures() == (3..4));
+    assert!((0..10_000).all(|frame| only.picture(frame, 0) == 3) && only.pictures() == (3..4));
     let counter = show(Pattern::Counter, raster(64, 48), 1000, None).unwrap();
-    assert_eq!(counter.picture((1 << 32) + 5), 5);
+    assert_eq!(counter.picture((1 << 32) + 5, 0), 5);
 }
 
 /// Gray code never puts full light against none, so it may be stepped as fast as frames go; stripes of a narrow
@@ -277,7 +277,7 @@ fn light_is_the_pattern(source: Arc<dyn PatternSource>, rig: &Arc<Rig>, frames: 
     let mut planes = BitPlaneFrame::new(raster, schedule);
     let mut codes = vec![0; raster.pixel_count()];
     for light in &outcome.light {
-        painter.draw(Kernel::Scalar, source.picture(u64::from(light.frame)), &mut planes);
+        painter.draw(Kernel::Scalar, source.picture(u64::from(light.frame), 0), &mut planes);
         dpm_render::pack::unpack(&planes, &mut codes);
         let mut wanted: Vec<[u8; 3]> =
             codes.iter().map(|c| [*c as u8, (c >> 8) as u8, (c >> 16) as u8]).collect();

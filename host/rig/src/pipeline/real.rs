@@ -61,7 +61,8 @@ pub(super) fn run_at_real_pace(
     monitor: &Arc<RunMonitor>,
 ) -> Result<Ran, PipelineError> {
     // On a machine with fewer cores than stages, a spinning thread delays the very stages that it waits for.
-    let clock = MonotonicClock::new(if usable_cores() > STAGE_THREADS { 50_000 } else { 0 });
+    let spin_ns = if usable_cores() > STAGE_THREADS { 50_000 } else { 0 };
+    let clock = options.clock.map_or_else(|| MonotonicClock::new(spin_ns), |clock| clock.spinning(spin_ns));
     let parts = crew_parts(rig, origin, options, clock)?;
     let (lights_in, lights) = channel(LIGHTS, WaitPolicy::Park);
     let rights = Arc::new(Rights::new(&rig.config.real_time));
@@ -87,8 +88,9 @@ pub(super) fn run_at_real_pace(
         collector_pulse: Pulse::new("collector"),
         rights: rights.clone(),
     });
-    let mut collector = Collector::new(rig.clone(), options.keep_frames, options.verify)
-        .about(origin.gpu().is_none(), standstill.as_ref().map(StandstillMonitor::seen));
+    let mut collector =
+        Collector::new(rig.clone(), options.keep_frames.max(options.keep_records), options.verify)
+            .about(origin.gpu().is_none(), standstill.as_ref().map(StandstillMonitor::seen));
 
     let maker = maker(rig, origin.clone(), options, clock);
     let (threads, mut inbox, notes_back) = Threads::start(&shared, parts, line, maker, lights)?;
