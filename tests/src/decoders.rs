@@ -10,6 +10,7 @@ use dpm_device::link::crc32c;
 use dpm_device::link::{
     rle_encode, Assembly, Decoder, DeviceMessage, Header, HostMessage, PacketSink, RleDecoder,
 };
+use dpm_device::planes::Raster;
 use dpm_device::sensor::wire::{SensorMessage, MAX_FRAME, MAX_PACKET, MAX_SAMPLES};
 use dpm_device::time::{DeviceTicks, HostTime};
 use dpm_device::tracker::natnet::frame::{decode_frame, RigidBody};
@@ -26,7 +27,7 @@ use dpm_rig::config::{Overrides, RigConfig};
 use dpm_rig::control::{server, status_file};
 use dpm_rig::order::Order;
 use dpm_rig::standing;
-use dpm_scene::geometry::opencv;
+use dpm_scene::camera_files::{self, Form, LengthUnit, LensKind, ReadOptions, StorageError};
 use hil_mock::faults::FaultPlan;
 use hil_mock::usbip::wire as usbip;
 use std::io::{self, Read, Write};
@@ -279,14 +280,37 @@ pub fn usbip_stream(bytes: &[u8]) {
     }
 }
 
-/// A rig file and a calibration file.
+/// A rig file and a calibration file. What a calibration file yields is finite, and its export has no fault of form.
 pub fn texts(bytes: &[u8]) {
+    calibrations(bytes);
     let Ok(text) = std::str::from_utf8(bytes) else { return };
     if let Err(errors) = RigConfig::parse("seed.toml", text, Path::new("/nonexistent"), &Overrides::default())
     {
         assert!(!errors.to_string().is_empty());
     }
-    let _ = opencv::matrices(text);
+}
+
+fn calibrations(bytes: &[u8]) {
+    let raster = Raster::new(64, 48).expect("not zero");
+    for lens in [LensKind::Auto, LensKind::Fisheye] {
+        let options = ReadOptions { raster, unit: LengthUnit::Metre, lens, region: None };
+        let stored = match camera_files::read(bytes, &options) {
+            Ok(stored) => stored,
+            Err(refused) => {
+                assert!(!refused.to_string().is_empty());
+                continue;
+            }
+        };
+        let camera = stored.camera;
+        assert!(camera.world_from_projector.is_finite() && camera.fx > 0.0 && camera.fy > 0.0);
+        for form in [Form::Xml, Form::Yaml, Form::Json] {
+            let text = camera_files::export(&camera, form);
+            let again = camera_files::read(text.as_bytes(), &ReadOptions { lens: LensKind::Auto, ..options });
+            use StorageError::{Matrix, Missing, Syntax, UnknownForm};
+            let bad_form = matches!(again, Err(Matrix { .. } | Missing { .. } | Syntax { .. } | UnknownForm));
+            assert!(!bad_form, "{again:?} of {text}");
+        }
+    }
 }
 
 /// The environment and the flags that set keys, and the plans of faults. A plan is recovered from its own text.

@@ -139,10 +139,25 @@ fn made() -> Vec<(&'static str, &'static str, Vec<u8>)> {
     seeds.push(("host_link", "answers", answers));
     let rig = b"[projector]\nframe_rate = \"60000/1001\"\n[[scene.bodies]]\nname = \"a\"\n".to_vec();
     seeds.push(("texts", "rig.toml", rig));
+    seeds.extend(calibrations());
     seeds.extend(dpm_tests::conversations::recorded());
     seeds.extend(words());
     seeds.extend(files());
     seeds
+}
+
+/// Calibration files as OpenCV writes them, and one of MPCDI.
+fn calibrations() -> Vec<(&'static str, &'static str, Vec<u8>)> {
+    let of = |name| {
+        let assets = PathBuf::from(concat!(env!("CARGO_MANIFEST_DIR"), "/assets"));
+        std::fs::read(assets.join(name)).expect("an asset")
+    };
+    vec![
+        ("texts", "opencv.xml", of("opencv/fisheye.xml")),
+        ("texts", "opencv.yml", of("opencv/tilted14.yml")),
+        ("texts", "opencv.json", of("opencv/brown5.json")),
+        ("texts", "mpcdi.xml", of("mpcdi/shader_lamp.mpcdi.xml")),
+    ]
 }
 
 /// Words of other processes, settings, and the stamps of an honest clock and of one that steps.

@@ -8,6 +8,7 @@
 
 pub mod body;
 mod dense;
+pub mod file;
 mod least_squares;
 pub mod light;
 pub mod model;

@@ -6,6 +6,7 @@
 
 use dpm_common::so3::so3_exp;
 use dpm_device::planes::Raster;
+use dpm_scene::geometry::lens::Lens;
 use dpm_scene::geometry::projector::{ProjectorCamera, ProjectorError};
 use glam::{DAffine3, DMat2, DMat3, DQuat, DVec2, DVec3};
 
@@ -73,6 +74,14 @@ impl ProjectorModel {
     pub fn pinhole(&self, raster: Raster) -> Result<ProjectorCamera, ProjectorError> {
         let (f, c) = (self.focal, self.centre);
         ProjectorCamera::new(raster, self.world_from_projector(), f.x, f.y, c.x, c.y)
+    }
+
+    /// The projector of a raster.
+    ///
+    /// # Errors
+    /// [`ProjectorError::Lens`] if the lens cannot be inverted over the raster, and those of [`ProjectorCamera::new`].
+    pub fn camera(&self, raster: Raster) -> Result<ProjectorCamera, ProjectorError> {
+        self.pinhole(raster)?.with_lens(Lens::opencv(&self.lens)?)
     }
 
     /// Where the light comes from, world space.
@@ -144,48 +153,10 @@ impl ProjectorModel {
     pub fn about(&self, origin: DVec3) -> Self {
         Self { translation: self.local(origin), origin, ..*self }
     }
-
-    /// Whether the lens keeps the order of the raster's points: its derivative does not vanish or turn over, from the
-    /// axis to each point of the border. A lens that folds cannot be inverted.
-    pub fn lens_is_invertible(&self, raster: Raster) -> bool {
-        let (w, h) = (f64::from(raster.width()), f64::from(raster.height()));
-        let border = (0..64).map(|i| {
-            let s = f64::from(i % 16) / 16.0;
-            match i / 16 {
-                0 => DVec2::new(s * w, 0.0),
-                1 => DVec2::new(w, s * h),
-                2 => DVec2::new((1.0 - s) * w, h),
-                _ => DVec2::new(0.0, (1.0 - s) * h),
-            }
-        });
-        border.into_iter().all(|pixel| self.reaches(pixel))
-    }
-
-    /// Whether some straight direction is bent to `pixel` before the lens folds.
-    fn reaches(&self, pixel: DVec2) -> bool {
-        let goal = (pixel - self.centre) / self.focal;
-        let mut n = DVec2::ZERO;
-        // By continuation along the way from the axis: Newton's method alone could step over a fold.
-        const PARTS: u32 = 32;
-        for part in 1..=PARTS {
-            let target = goal * (f64::from(part) / f64::from(PARTS));
-            for _ in 0..20 {
-                let slope = distort_slope(&self.lens, n);
-                if slope.determinant() <= 0.02 {
-                    return false;
-                }
-                n += slope.inverse() * (target - distort(&self.lens, n));
-            }
-            if (distort(&self.lens, n) - target).length() > 1e-9 {
-                return false;
-            }
-        }
-        true
-    }
 }
 
 /// The direction (x / z, y / z) after the lens.
-pub fn distort(&[k1, k2, p1, p2, k3]: &[f64; 5], n: DVec2) -> DVec2 {
+fn distort(&[k1, k2, p1, p2, k3]: &[f64; 5], n: DVec2) -> DVec2 {
     let r2 = n.length_squared();
     let radial = 1.0 + r2 * (k1 + r2 * (k2 + r2 * k3));
     let xy = n.x * n.y;
@@ -262,15 +233,15 @@ pub(crate) mod tests {
     }
 
     #[test]
-    fn without_a_lens_it_is_the_projector_of_the_scene() {
-        let model = ProjectorModel { lens: [0.0; 5], ..example() };
-        let camera = model.pinhole(Raster::new(1024, 768).unwrap()).unwrap();
+    fn it_is_the_projector_of_the_scene() {
+        let model = example();
+        let camera = model.camera(Raster::new(1024, 768).unwrap()).unwrap();
         for i in 0..20 {
             let s = f64::from(i);
             let p = DVec3::new((0.7 * s).sin() * 0.3, (1.1 * s).cos() * 0.2, (1.9 * s).sin() * 0.3);
             assert!((camera.project(p).unwrap() - model.project(p).unwrap()).length() < 1e-9);
         }
-        let back = ProjectorModel::from_camera(&camera, [0.0; 5], DVec3::ZERO);
+        let back = ProjectorModel::from_camera(&camera, model.lens, DVec3::ZERO);
         assert!((back.position() - model.position()).length() < 1e-12);
         assert!((model.about(DVec3::ONE).position() - model.position()).length() < 1e-12);
     }
@@ -278,8 +249,9 @@ pub(crate) mod tests {
     #[test]
     fn a_lens_that_folds_inside_the_raster_is_seen() {
         let raster = Raster::new(1024, 768).unwrap();
-        assert!(example().lens_is_invertible(raster));
+        example().camera(raster).unwrap();
         // The radius r (1 + k1 r^2) turns back at r = 1 / sqrt(-3 k1); the far corner lies at about 0.53.
-        assert!(!ProjectorModel { lens: [-2.0, 0.0, 0.0, 0.0, 0.0], ..example() }.lens_is_invertible(raster));
+        let folded = ProjectorModel { lens: [-2.0, 0.0, 0.0, 0.0, 0.0], ..example() };
+        assert!(matches!(folded.camera(raster), Err(ProjectorError::Lens(_))));
     }
 }

@@ -28,6 +28,7 @@
 //! # }
 //! ```
 
+pub mod calibrated;
 pub mod config;
 pub mod control;
 pub mod drive;

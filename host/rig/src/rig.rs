@@ -1,16 +1,13 @@
 //! Builds the parts of a rig from a checked configuration: scene, projector, bodies with their motions, tracker.
 
-use crate::config::{
-    BodyConfig, BuiltinScene, CalibrationUnit, EnvironmentConfig, GazeConfig, RigConfig, TrackerConfig,
-};
+use crate::calibrated::{calibrated_camera, measured, measured_camera, CameraFileError};
+use crate::config::{BodyConfig, BuiltinScene, EnvironmentConfig, GazeConfig, RigConfig, TrackerConfig};
 use crate::drive::{albedo_of, drive, DriveError};
 use crate::mock::{Motion, MotionError, MotionSpec};
 use dpm_device::planes::{PlaneSchedule, Raster};
 use dpm_device::pose::Pose;
-use dpm_device::regular_file;
 use dpm_device::time::FrameRate;
 use dpm_render::drive::Drive;
-use dpm_scene::geometry::opencv::{self, LengthUnit};
 use dpm_scene::geometry::projector::{ProjectorCamera, ProjectorError};
 use dpm_scene::{BodySelector, Environment, LoadOptions, Scene, SceneError, SceneFeatures};
 use glam::{DAffine3, DQuat, DVec3, Vec3};
@@ -45,13 +42,8 @@ pub enum RigError {
         message: String,
     },
     /// The calibration file cannot be used.
-    #[error("projector.calibration: {path}: {message}")]
-    Calibration {
-        /// Path of the file.
-        path: String,
-        /// What is wrong.
-        message: String,
-    },
+    #[error(transparent)]
+    Calibration(#[from] CameraFileError),
     /// A file that describes the projector's light cannot be used.
     #[error(transparent)]
     Drive(#[from] DriveError),
@@ -153,6 +145,9 @@ pub struct Rig {
     pub schedule: PlaneSchedule,
     /// From radiance to code values.
     pub drive: Drive,
+    /// How much older the tracker's samples are than they say, if it was measured, nanoseconds. It takes the place of
+    /// `tracker.latency_us`.
+    pub latency_ns: Option<i64>,
 }
 
 /// A rigid transform from a pose.
@@ -183,12 +178,24 @@ impl Rig {
         scene.environment = fitted;
         scene.warnings.extend(told.map(|t| format!("scene.environment: {t}")));
         let raster = raster.unwrap_or_else(|| config.projector.raster());
-        let camera = camera(config, raster)?;
-        let bodies = rig_bodies(config, &scene)?;
+        let measured = measured(config)?;
+        let camera = match &measured.projector {
+            Some(section) => measured_camera(section, config, raster)?,
+            None => camera(config, raster, &mut scene.warnings)?,
+        };
+        let mut bodies = rig_bodies(config, &scene)?;
+        // The mock tracker reports the mesh itself.
+        for body in bodies.iter_mut().filter(|b| b.motion.is_none()) {
+            if let Some(section) = measured.bodies.get(&body.name) {
+                body.mesh_to_body = section.mesh_to_body.to_affine();
+            }
+        }
         let observer = observer(config, &bodies)?;
-        let drive = drive(config, &scene, raster)?;
+        let drive = drive(config, &measured, &scene, raster)?;
+        let latency_ns = measured.latency.map(|l| (l.latency_us * 1e3).round() as i64);
         let schedule = config.projector.schedule();
-        Ok(Self { config: config.clone(), scene, camera, bodies, observer, schedule, drive })
+        let config = config.clone();
+        Ok(Self { config, scene, camera, bodies, observer, schedule, drive, latency_ns })
     }
 
     /// The projector of a rig alone, without scene, bodies or calibration: for light that nothing is traced for.
@@ -199,11 +206,11 @@ impl Rig {
         let mut config = config.clone();
         config.keep_projector();
         let raster = config.projector.raster();
-        let camera = camera(&config, raster)?;
+        let camera = camera(&config, raster, &mut Vec::new())?;
         let observer = observer(&config, &[])?;
         let (scene, bodies) = (Scene::default(), Vec::new());
         let (schedule, drive) = (config.projector.schedule(), Drive::default());
-        Ok(Self { config, scene, camera, bodies, observer, schedule, drive })
+        Ok(Self { config, scene, camera, bodies, observer, schedule, drive, latency_ns: None })
     }
 
     /// Frames per second.
@@ -270,8 +277,13 @@ fn environment(config: &RigConfig, has_lights: bool) -> Result<Option<Environmen
     })
 }
 
-/// The projector's camera at `raster`, from its calibration or from its position and direction.
-fn camera(config: &RigConfig, raster: Raster) -> Result<ProjectorCamera, RigError> {
+/// The projector's camera at `raster`, from its calibration or from its position and direction. Adds to `warnings` what
+/// was not read of the calibration.
+fn camera(
+    config: &RigConfig,
+    raster: Raster,
+    warnings: &mut Vec<String>,
+) -> Result<ProjectorCamera, RigError> {
     let p = &config.projector;
     let Some(path) = &p.calibration else {
         return Ok(ProjectorCamera::look_at(
@@ -282,16 +294,7 @@ fn camera(config: &RigConfig, raster: Raster) -> Result<ProjectorCamera, RigErro
             p.horizontal_fov_deg.to_radians(),
         )?);
     };
-    let wrong = |message: String| RigError::Calibration { path: path.display().to_string(), message };
-    let unit = match p.calibration_unit {
-        Some(CalibrationUnit::Metre) => LengthUnit::Metre,
-        Some(CalibrationUnit::Millimetre) => LengthUnit::Millimetre,
-        None => return Err(wrong("projector.calibration_unit is missing".into())),
-    };
-    let text = regular_file::read_text(path, opencv::MAX_BYTES as u64).map_err(|e| wrong(e.to_string()))?;
-    let calibrated = p.calibrated_raster();
-    let stored = opencv::read(&text, calibrated, unit).map_err(|e| wrong(e.to_string()))?;
-    Ok(stored.camera.at_raster(raster))
+    Ok(calibrated_camera(p, path, raster, warnings)?)
 }
 
 fn motion_spec(index: usize, body: &BodyConfig) -> Result<MotionSpec, RigError> {

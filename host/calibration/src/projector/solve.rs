@@ -253,7 +253,7 @@ pub(crate) fn check_result(
         return Err(Refusal::OneDepth { share: 100.0 * range / mean });
     }
     check_up(model.world_from_projector().matrix3.y_axis, known.up)?;
-    if !model.lens_is_invertible(raster) {
+    if model.camera(raster).is_err() {
         return Err(Refusal::LensFolds);
     }
     Ok((mean, range))
@@ -267,7 +267,7 @@ fn judge_uncertainty(
     options: &Options,
     volume: &Volume,
 ) -> Result<Solved, Refusal> {
-    if !fitted.model.lens_is_invertible(raster) {
+    if fitted.model.camera(raster).is_err() {
         return Err(Refusal::LensFolds);
     }
     // The residuals of few points say little of the noise: what is expected counts as ten more of them.
