@@ -97,7 +97,7 @@ fn each_plane_has_its_level_in_its_time() {
     for (t, found) in samples(&mut wand, &slot) {
         let plane = (t - 3.0 * SLOT_NS as f64) / (SLOT_NS as f64 / 24.0);
         let into = plane.rem_euclid(1.0) * SLOT_NS as f64 / 24.0;
-        let on = plane >= 0.0 && plane as usize / 2 % 2 == 0;
+        let on = plane >= 0.0 && (plane as usize / 2).is_multiple_of(2);
         // After a few of the amplifier's 1.6 ns.
         if plane < 0.0 || into > 40.0 {
             let wanted = if on { level } else { 0.0 };

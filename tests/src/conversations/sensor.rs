@@ -106,15 +106,7 @@ fn hello(how: u8, rest: &mut &[u8]) -> SensorHello {
     }
 }
 
-/// A board whose converter gives what a script says, and whose line has room for so many bytes.
-struct Board<'a> {
-    now: u64,
-    running: bool,
-    heard: &'a [u8],
-    room: usize,
-    line: Vec<u8>,
-}
-
+/// A converter that gives so many samples, each as high as the clock; whether it samples comes first.
 struct BoardAdc<'a>(&'a mut bool, u64, usize);
 struct BoardUart<'a, 'b>(&'a mut &'b [u8], &'a mut Vec<u8>, usize);
 struct BoardClock(u64);
@@ -169,7 +161,7 @@ pub fn sensor_device(bytes: &[u8]) {
         gains_milli: [1000, 2000, 0, 0, 0, 0, 0, 0],
     };
     let mut sensor: Sensor<2048> = Sensor::new(identity);
-    let mut board = Board { now: 1, running: false, heard: &[], room: 0, line: Vec::new() };
+    let (mut now, mut running, mut line) = (1u64, false, Vec::new());
     let mut deframer = Deframer::new([0u8; MAX_PACKET]);
     let mut after = None::<BlockHead>;
     for step in Script(bytes) {
@@ -191,19 +183,18 @@ pub fn sensor_device(bytes: &[u8]) {
         if let (true, Some(byte)) = (step.how & 0x40 != 0, said.last_mut()) {
             *byte ^= step.how;
         }
-        board.now += 1 + step.wait_ns as u64 / 1000;
-        (board.heard, board.room) = (&said, usize::from(step.how & 0x3f) * 32);
+        now += 1 + step.wait_ns as u64 / 1000;
+        let mut heard = &said[..];
         loop {
-            let mut adc = BoardAdc(&mut board.running, board.now, usize::from(step.how) * 2);
-            let mut uart = BoardUart(&mut board.heard, &mut board.line, board.room);
-            sensor.step(&mut adc, &mut uart, &mut BoardClock(board.now));
-            assert_eq!(sensor.is_running(), board.running);
-            if board.heard.is_empty() {
+            let mut adc = BoardAdc(&mut running, now, usize::from(step.how) * 2);
+            let mut uart = BoardUart(&mut heard, &mut line, usize::from(step.how & 0x3f) * 32);
+            sensor.step(&mut adc, &mut uart, &mut BoardClock(now));
+            assert_eq!(sensor.is_running(), running);
+            if heard.is_empty() {
                 break;
             }
         }
-        board.heard = &[];
-        deframer.push(&std::mem::take(&mut board.line), &mut |packet| match SensorMessage::decode(packet)
+        deframer.push(&std::mem::take(&mut line), &mut |packet| match SensorMessage::decode(packet)
             .expect("its own")
         {
             SensorMessage::Samples(head, levels) => {
