@@ -63,13 +63,13 @@ fn light(next: Next) -> f64 {
 fn curves_are_those_of_the_channels_and_never_fall() {
     for seed in 0..10 {
         let got = read(2e-4, seed, light).solve().unwrap();
-        for channel in 0..3 {
-            assert!((got.intensity[channel] - FULL[channel]).abs() < 2e-3);
+        for (channel, full) in FULL.into_iter().enumerate() {
+            assert!((got.intensity[channel] - full).abs() < 2e-3);
             assert_eq!((got.curves[channel][0], got.curves[channel][CURVE_POINTS - 1]), (0.0, 1.0));
             assert!(got.curves[channel].windows(2).all(|w| w[0] <= w[1]));
             for i in 0..=100 {
                 let code = f64::from(i) / 100.0;
-                let off = got.level(channel, code) * 1.002 - FULL[channel] * truth(channel, code);
+                let off = got.level(channel, code) * 1.002 - full * truth(channel, code);
                 assert!(off.abs() < 2e-3, "{channel} {code}: {off}");
             }
         }

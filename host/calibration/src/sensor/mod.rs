@@ -8,12 +8,16 @@ mod code;
 mod decode;
 mod fit;
 mod lock;
+mod problem;
+mod session;
+mod start;
 mod stripes;
 
 pub use code::{Code, CodeError, Role, PLANES};
 pub use decode::{decode, DecodeError, Decoded, Frame};
 pub use fit::{solve, Brightness, SensorError, Settings, Solution};
 pub use lock::{Block, Lock};
+pub use session::{Coverage, Session};
 
 /// When the projector shows which frame, by the host's clock. All planes of a frame are equally long, and no pause
 /// divides frames.

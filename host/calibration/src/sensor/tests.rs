@@ -69,7 +69,7 @@ fn samples_that_show_no_code_are_refused_by_name() {
     let only_noise = get(&block(&|i| noise.unit(i as u64) as f32));
     assert!(matches!(only_noise, DecodeError::NoLock { .. }), "{only_noise}");
     // Light that goes on and off with the planes, but carries no code.
-    let blink = get(&block(&|i| f32::from(u8::from((i as f64 * 1e4 / 44_000.0) as u64 % 2 == 0))));
+    let blink = get(&block(&|i| f32::from(u8::from(((i as f64 * 1e4 / 44_000.0) as u64).is_multiple_of(2)))));
     assert!(matches!(blink, DecodeError::NoFrames { .. }), "{blink}");
     let slow = [Block { start_ns: 0, interval_ns: 4e4, levels: vec![0.0; 1000] }];
     assert!(matches!(get(&slow), DecodeError::TooSlow { .. }));
