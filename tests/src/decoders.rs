@@ -1,7 +1,7 @@
 //! Feeds arbitrary bytes to every decoder of external input. Each decoder has one entry, with the laws that hold for
 //! all bytes. The fuzz targets in `fuzz/` and the test over the committed seeds call the same entries.
 
-use crate::conversations::{link, trackers, usb};
+use crate::conversations::{link, sensor, trackers, usb};
 use dpm_device::clock_map::{ClockMap, ExchangeOutcome};
 use dpm_device::cobs::{encode, encoded_bytes, Deframer};
 use dpm_device::dlpc900::command::{CommandAssembler, ReplyAssembler, REPORT_BYTES};
@@ -10,6 +10,8 @@ use dpm_device::link::crc32c;
 use dpm_device::link::{
     rle_encode, Assembly, Decoder, DeviceMessage, Header, HostMessage, PacketSink, RleDecoder,
 };
+use dpm_device::planes::Raster;
+use dpm_device::sensor::wire::{SensorMessage, MAX_FRAME, MAX_PACKET, MAX_SAMPLES};
 use dpm_device::time::{DeviceTicks, HostTime};
 use dpm_device::tracker::natnet::frame::{decode_frame, RigidBody};
 use dpm_device::tracker::natnet::messages::{
@@ -25,7 +27,7 @@ use dpm_rig::config::{Overrides, RigConfig};
 use dpm_rig::control::{server, status_file};
 use dpm_rig::order::Order;
 use dpm_rig::standing;
-use dpm_scene::geometry::opencv;
+use dpm_scene::camera_files::{self, Form, LengthUnit, LensKind, ReadOptions, StorageError};
 use hil_mock::faults::FaultPlan;
 use hil_mock::usbip::wire as usbip;
 use std::io::{self, Read, Write};
@@ -35,7 +37,7 @@ use std::path::Path;
 pub type Entry = fn(&[u8]);
 
 /// Every entry with the name of its fuzz target, which is also the name of its folder of seeds.
-pub const ALL: [(&str, Entry); 30] = [
+pub const ALL: [(&str, Entry); 33] = [
     ("link_stream", link_stream),
     ("link_rle", link_rle),
     ("cobs_stream", cobs_stream),
@@ -44,6 +46,7 @@ pub const ALL: [(&str, Entry); 30] = [
     ("natnet_datagram", natnet_datagram),
     ("vrpn_stream", vrpn_stream),
     ("serial_pose", serial_pose),
+    ("sensor_packet", sensor_packet),
     ("texts", texts),
     ("recording", recording),
     ("usbip_stream", usbip_stream),
@@ -60,6 +63,8 @@ pub const ALL: [(&str, Entry); 30] = [
     ("vrpn_server", trackers::vrpn_server),
     ("serial_client", trackers::serial_client),
     ("serial_device", trackers::serial_device),
+    ("sensor_client", sensor::sensor_client),
+    ("sensor_device", sensor::sensor_device),
     ("dlpc900_driver", usb::dlpc900_driver),
     ("dlpc900_controller", usb::dlpc900_controller),
     ("usbip_server", usb::usbip_server),
@@ -207,6 +212,29 @@ pub fn serial_pose(bytes: &[u8]) {
     assert_eq!(encoded(&frame.expect("one frame")), Some(first));
 }
 
+/// A packet of a light sensor, as it is and with its checksum corrected: a block has as many levels as it says, none above
+/// what its bits hold, and its own encoding is read as the same message.
+pub fn sensor_packet(bytes: &[u8]) {
+    let sealed = [bytes, &crc32c(bytes).to_le_bytes()].concat();
+    for packet in [bytes, &sealed] {
+        let Ok(message) = SensorMessage::decode(packet) else { continue };
+        if let SensorMessage::Samples(head, levels) = &message {
+            assert!((1..=MAX_SAMPLES).contains(&levels.len()) && levels.iter().count() == levels.len());
+            assert!(levels.iter().all(|level| level <= levels.bits().highest()));
+            assert!(head.ticks_of(levels.len() - 1).1 < 1 << 16);
+        }
+        let mut frame = [0; MAX_FRAME];
+        let n = message.encode(&mut frame).expect("room for every message");
+        let mut deframer = Deframer::new([0u8; MAX_PACKET]);
+        let mut back = None;
+        deframer.push(&frame[..n], &mut |f| back = Some(f.to_vec()));
+        let again = back.expect("one frame");
+        let mut second = [0; MAX_FRAME];
+        let m = SensorMessage::decode(&again).expect("own encoding").encode(&mut second).expect("room");
+        assert_eq!(frame[..n], second[..m]);
+    }
+}
+
 /// A tracker's recording, unchanged and with its frames' checksums corrected. It has no more samples than its bytes
 /// can contain, and a truncated file gives the beginning of what the whole file gives.
 pub fn recording(bytes: &[u8]) {
@@ -252,14 +280,37 @@ pub fn usbip_stream(bytes: &[u8]) {
     }
 }
 
-/// A rig file and a calibration file.
+/// A rig file and a calibration file. What a calibration file yields is finite, and its export has no fault of form.
 pub fn texts(bytes: &[u8]) {
+    calibrations(bytes);
     let Ok(text) = std::str::from_utf8(bytes) else { return };
     if let Err(errors) = RigConfig::parse("seed.toml", text, Path::new("/nonexistent"), &Overrides::default())
     {
         assert!(!errors.to_string().is_empty());
     }
-    let _ = opencv::matrices(text);
+}
+
+fn calibrations(bytes: &[u8]) {
+    let raster = Raster::new(64, 48).expect("not zero");
+    for lens in [LensKind::Auto, LensKind::Fisheye] {
+        let options = ReadOptions { raster, unit: LengthUnit::Metre, lens, region: None };
+        let stored = match camera_files::read(bytes, &options) {
+            Ok(stored) => stored,
+            Err(refused) => {
+                assert!(!refused.to_string().is_empty());
+                continue;
+            }
+        };
+        let camera = stored.camera;
+        assert!(camera.world_from_projector.is_finite() && camera.fx > 0.0 && camera.fy > 0.0);
+        for form in [Form::Xml, Form::Yaml, Form::Json] {
+            let text = camera_files::export(&camera, form);
+            let again = camera_files::read(text.as_bytes(), &ReadOptions { lens: LensKind::Auto, ..options });
+            use StorageError::{Matrix, Missing, Syntax, UnknownForm};
+            let bad_form = matches!(again, Err(Matrix { .. } | Missing { .. } | Syntax { .. } | UnknownForm));
+            assert!(!bad_form, "{again:?} of {text}");
+        }
+    }
 }
 
 /// The environment and the flags that set keys, and the plans of faults. A plan is recovered from its own text.

@@ -13,6 +13,7 @@ use dpm_device::dlpc900::command::{Command, Opcode};
 use dpm_device::dlpc900::image::{self, Compression, PlaneOrder};
 use dpm_device::link::{rle_encode, Commit, Header, HostMessage, MessageType, Packet, MAX_CONTROL_BYTES};
 use dpm_device::planes::Raster;
+use dpm_device::sensor::wire::{BlockHead, LevelBits, Levels, SensorMessage, MAX_FRAME};
 use dpm_device::time::DeviceTicks;
 use dpm_device::tracker::natnet::frame::{encode_frame, FrameContent, FrameInfo, RigidBody};
 use dpm_device::tracker::natnet::messages::{encode_echo_response, encode_request};
@@ -91,6 +92,22 @@ fn made() -> Vec<(&'static str, &'static str, Vec<u8>)> {
     SerialMessage::Hello { version: 1, bodies: 2, ticks_per_second: 1_000_000 }.encode(&mut out);
     let mut deframer = dpm_device::cobs::Deframer::new([0u8; 128]);
     deframer.push(&out, &mut |f| seeds.push(("serial_pose", "hello", f.to_vec())));
+    let head = BlockHead {
+        sequence: 3,
+        first: 1000,
+        period: 10 << 16,
+        lost: 1,
+        gain: 1,
+        cut_below: false,
+        cut_above: true,
+    };
+    let levels = [0, 5, 4095, 800, 17];
+    let mut frame = [0; MAX_FRAME];
+    for (name, bits) in [("twelve", LevelBits::Twelve), ("sixteen", LevelBits::Sixteen)] {
+        let block = SensorMessage::Samples(head, Levels::Values(bits, &levels));
+        let n = block.encode(&mut frame).expect("room");
+        deframer.push(&frame[..n], &mut |f| seeds.push(("sensor_packet", name, f.to_vec())));
+    }
     // Frames of a recording without their checksums: a header with one body, a frame of one sample.
     let header = [&7i64.to_le_bytes()[..], &1u16.to_le_bytes(), b"\x04hare"].concat();
     let sample: Vec<u8> = (0..SAMPLE_BYTES as u8).collect();
@@ -122,10 +139,25 @@ fn made() -> Vec<(&'static str, &'static str, Vec<u8>)> {
     seeds.push(("host_link", "answers", answers));
     let rig = b"[projector]\nframe_rate = \"60000/1001\"\n[[scene.bodies]]\nname = \"a\"\n".to_vec();
     seeds.push(("texts", "rig.toml", rig));
+    seeds.extend(calibrations());
     seeds.extend(dpm_tests::conversations::recorded());
     seeds.extend(words());
     seeds.extend(files());
     seeds
+}
+
+/// Calibration files as OpenCV writes them, and one of MPCDI.
+fn calibrations() -> Vec<(&'static str, &'static str, Vec<u8>)> {
+    let of = |name| {
+        let assets = PathBuf::from(concat!(env!("CARGO_MANIFEST_DIR"), "/assets"));
+        std::fs::read(assets.join(name)).expect("an asset")
+    };
+    vec![
+        ("texts", "opencv.xml", of("opencv/fisheye.xml")),
+        ("texts", "opencv.yml", of("opencv/tilted14.yml")),
+        ("texts", "opencv.json", of("opencv/brown5.json")),
+        ("texts", "mpcdi.xml", of("mpcdi/shader_lamp.mpcdi.xml")),
+    ]
 }
 
 /// Words of other processes, settings, and the stamps of an honest clock and of one that steps.

@@ -4,5 +4,7 @@
 //! [`wire`] has the messages, [`device`] the sensor's side for firmware; neither needs an operating system or
 //! allocates. [`client`] is the host's side: it opens the port, maps the sensor's clock, and counts what is lost.
 
+#[cfg(feature = "serial")]
+pub mod client;
 pub mod device;
 pub mod wire;

@@ -28,9 +28,10 @@
 //! # }
 //! ```
 
+pub mod calibrated;
 pub mod config;
 pub mod control;
-mod drive;
+pub mod drive;
 mod engine;
 pub mod failure;
 pub mod frame;

@@ -1,16 +1,13 @@
 //! Builds the parts of a rig from a checked configuration: scene, projector, bodies with their motions, tracker.
 
-use crate::config::{
-    BodyConfig, BuiltinScene, CalibrationUnit, EnvironmentConfig, GazeConfig, RigConfig, TrackerConfig,
-};
-use crate::drive::{albedo_of, drive};
+use crate::calibrated::{calibrated_camera, CameraFileError};
+use crate::config::{BodyConfig, BuiltinScene, EnvironmentConfig, GazeConfig, RigConfig, TrackerConfig};
+use crate::drive::{albedo_of, drive, DriveError};
 use crate::mock::{Motion, MotionError, MotionSpec};
-use dpm_device::planes::Raster;
+use dpm_device::planes::{PlaneSchedule, Raster};
 use dpm_device::pose::Pose;
-use dpm_device::regular_file;
 use dpm_device::time::FrameRate;
 use dpm_render::drive::Drive;
-use dpm_scene::geometry::opencv::{self, LengthUnit};
 use dpm_scene::geometry::projector::{ProjectorCamera, ProjectorError};
 use dpm_scene::{BodySelector, Environment, LoadOptions, Scene, SceneError, SceneFeatures};
 use glam::{DAffine3, DQuat, DVec3, Vec3};
@@ -45,21 +42,11 @@ pub enum RigError {
         message: String,
     },
     /// The calibration file cannot be used.
-    #[error("projector.calibration: {path}: {message}")]
-    Calibration {
-        /// Path of the file.
-        path: String,
-        /// What is wrong.
-        message: String,
-    },
+    #[error(transparent)]
+    Calibration(#[from] CameraFileError),
     /// A file that describes the projector's light cannot be used.
-    #[error("{key}: {message}")]
-    Light {
-        /// Configuration key.
-        key: &'static str,
-        /// What is wrong.
-        message: String,
-    },
+    #[error(transparent)]
+    Drive(#[from] DriveError),
     /// No body has this name.
     #[error("{key}: no body is named \"{name}\"; bodies: {known}")]
     UnknownBody {
@@ -154,6 +141,8 @@ pub struct Rig {
     pub bodies: Vec<RigBody>,
     /// The observer's eye.
     pub observer: Observer,
+    /// The planes of a frame in the order in which they are shown.
+    pub schedule: PlaneSchedule,
     /// From radiance to code values.
     pub drive: Drive,
 }
@@ -186,11 +175,12 @@ impl Rig {
         scene.environment = fitted;
         scene.warnings.extend(told.map(|t| format!("scene.environment: {t}")));
         let raster = raster.unwrap_or_else(|| config.projector.raster());
-        let camera = camera(config, raster)?;
+        let camera = camera(config, raster, &mut scene.warnings)?;
         let bodies = rig_bodies(config, &scene)?;
         let observer = observer(config, &bodies)?;
         let drive = drive(config, &scene, raster)?;
-        Ok(Self { config: config.clone(), scene, camera, bodies, observer, drive })
+        let schedule = config.projector.schedule();
+        Ok(Self { config: config.clone(), scene, camera, bodies, observer, schedule, drive })
     }
 
     /// The projector of a rig alone, without scene, bodies or calibration: for light that nothing is traced for.
@@ -201,10 +191,11 @@ impl Rig {
         let mut config = config.clone();
         config.keep_projector();
         let raster = config.projector.raster();
-        let camera = camera(&config, raster)?;
+        let camera = camera(&config, raster, &mut Vec::new())?;
         let observer = observer(&config, &[])?;
         let (scene, bodies) = (Scene::default(), Vec::new());
-        Ok(Self { config, scene, camera, bodies, observer, drive: Drive::default() })
+        let (schedule, drive) = (config.projector.schedule(), Drive::default());
+        Ok(Self { config, scene, camera, bodies, observer, schedule, drive })
     }
 
     /// Frames per second.
@@ -271,8 +262,13 @@ fn environment(config: &RigConfig, has_lights: bool) -> Result<Option<Environmen
     })
 }
 
-/// The projector's camera at `raster`, from its calibration or from its position and direction.
-fn camera(config: &RigConfig, raster: Raster) -> Result<ProjectorCamera, RigError> {
+/// The projector's camera at `raster`, from its calibration or from its position and direction. Adds to `warnings` what
+/// was not read of the calibration.
+fn camera(
+    config: &RigConfig,
+    raster: Raster,
+    warnings: &mut Vec<String>,
+) -> Result<ProjectorCamera, RigError> {
     let p = &config.projector;
     let Some(path) = &p.calibration else {
         return Ok(ProjectorCamera::look_at(
@@ -283,16 +279,7 @@ fn camera(config: &RigConfig, raster: Raster) -> Result<ProjectorCamera, RigErro
             p.horizontal_fov_deg.to_radians(),
         )?);
     };
-    let wrong = |message: String| RigError::Calibration { path: path.display().to_string(), message };
-    let unit = match p.calibration_unit {
-        Some(CalibrationUnit::Metre) => LengthUnit::Metre,
-        Some(CalibrationUnit::Millimetre) => LengthUnit::Millimetre,
-        None => return Err(wrong("projector.calibration_unit is missing".into())),
-    };
-    let text = regular_file::read_text(path, opencv::MAX_BYTES as u64).map_err(|e| wrong(e.to_string()))?;
-    let calibrated = p.calibrated_raster();
-    let stored = opencv::read(&text, calibrated, unit).map_err(|e| wrong(e.to_string()))?;
-    Ok(stored.camera.at_raster(raster))
+    Ok(calibrated_camera(p, path, raster, warnings)?)
 }
 
 fn motion_spec(index: usize, body: &BodyConfig) -> Result<MotionSpec, RigError> {

@@ -20,6 +20,7 @@
 pub mod albedo_table;
 pub mod builtin;
 pub mod bvh;
+pub mod camera_files;
 mod environment;
 mod error;
 pub mod geometry;

@@ -7,6 +7,8 @@ files again; nothing is random. For every lens model there are:
 - MODEL.csv: world points [m] and the pixels to which cv2.projectPoints or cv2.fisheye.projectPoints takes them.
   The pixels are OpenCV's, with the centres of the pixels at whole numbers. The points lie at 0.6 to 2.6 m and their
   pixels cover the raster up to its edges.
+- MODEL.triangles.csv: triangles of some twelve pixels all over the raster and in depth. A line has the three corners in
+  the world [m], and the six pixels to which OpenCV takes the corners and the middles of the edges, going around.
 """
 
 import pathlib
@@ -86,6 +88,24 @@ def points(model, rotation, translation, coefficients):
     return world, got
 
 
+def triangles(model, rotation, translation, coefficients):
+    """Corners in the world (n x 3 x 3) and the outlines that OpenCV sees (n x 6 x 2)."""
+    centres = np.array([[x, y] for y in np.linspace(12, SIZE[1] - 13, 5) for x in np.linspace(12, SIZE[0] - 13, 7)])
+    index = np.arange(len(centres))
+    # Every triangle is turned and tilted otherwise, and moved by less than a pixel.
+    centres = centres + np.column_stack([(index * 0.618) % 1.0, (index * 0.414) % 1.0])
+    angles = index[:, None] * 0.37 + np.array([0.0, 2.1, 4.2])
+    pixels = centres[:, None, :] + 8.0 * np.stack([np.cos(angles), np.sin(angles)], axis=2)
+    rays = rays_of(model, pixels.reshape(-1, 2), coefficients)
+    depth = (0.6 + 2.0 * ((index * 11) % 35) / 34.0)[:, None] * (1.0 + 0.01 * np.cos(angles * 3.0 + index[:, None]))
+    in_camera = np.column_stack([rays, np.ones(len(rays))]) * depth.reshape(-1, 1)
+    corners = np.round((in_camera - translation) @ rotation, 6).reshape(-1, 3, 3)
+    middles = (corners + np.roll(corners, -1, axis=1)) / 2.0
+    around = np.stack([corners, middles], axis=2).reshape(-1, 3)
+    outline = project(model, around, rotation, translation, coefficients)
+    return corners, outline.reshape(-1, 6, 2)
+
+
 def write(path, model, vector, translation, coefficients):
     """One calibration file in OpenCV's own form."""
     storage = cv2.FileStorage(str(path), cv2.FILE_STORAGE_WRITE)
@@ -114,6 +134,11 @@ def main():
         for (x, y, z), (u, v) in zip(world, pixels):
             lines.append(f"{x:.6f},{y:.6f},{z:.6f},{u:.9f},{v:.9f}")
         (HERE / f"{model}.csv").write_text("\n".join(lines) + "\n")
+        lines = ["x0_m,y0_m,z0_m,x1_m,y1_m,z1_m,x2_m,y2_m,z2_m," + ",".join(f"u{i}_px,v{i}_px" for i in range(6))]
+        for corners, outline in zip(*triangles(model, rotation, translation, coefficients)):
+            numbers = [f"{v:.6f}" for v in corners.ravel()] + [f"{v:.5f}" for v in outline.ravel()]
+            lines.append(",".join(numbers))
+        (HERE / f"{model}.triangles.csv").write_text("\n".join(lines) + "\n")
 
 
 if __name__ == "__main__":

@@ -1,7 +1,7 @@
 //! Contradictions between keys. Each is reported at a key that was written, with what would resolve it.
 
 use super::world::{EnvironmentConfig, GazeConfig, TrackerConfig};
-use super::{Pace, ProjectorBackend, Purpose, ResponseConfig, RigConfig};
+use super::{Pace, ProjectorBackend, ProjectorConfig, Purpose, ResponseConfig, RigConfig};
 use crate::mock::{self, FaultError};
 use dpm_common::keys::read::{ConfigValue, Reader};
 use dpm_device::regular_file;
@@ -127,14 +127,7 @@ fn projector(rig: &RigConfig, reader: &mut Reader) {
             format!("at most {most} frames/s of {} planes", p.planes),
         );
     }
-    if p.calibration.is_some() && p.calibration_unit.is_none() {
-        refuse(
-            reader,
-            &["projector.calibration"],
-            "the file does not state the unit of its lengths".into(),
-            "set projector.calibration_unit to \"metre\" or \"millimetre\"".into(),
-        );
-    }
+    calibration(p, reader);
     if p.calibration.is_some() {
         for key in ["position", "look_at", "up", "horizontal_fov_deg"] {
             let key = format!("projector.{key}");
@@ -393,6 +386,38 @@ fn horizon(rig: &RigConfig, reader: &mut Reader) {
             ),
             format!("leave it out, or write at least {:.0} ms and what rendering takes", (1.5 * frame_ms).ceil()),
         );
+    }
+}
+
+/// The keys that say how to read the calibration file.
+fn calibration(p: &ProjectorConfig, reader: &mut Reader) {
+    if p.calibration.is_none() {
+        for key in ["calibration_lens", "calibration_region", "calibration_camera"] {
+            let key = format!("projector.{key}");
+            if reader.is_written(&key) {
+                let problem = "says how to read a calibration file, but there is none".to_owned();
+                refuse(reader, &[&key], problem, "set projector.calibration or remove this key".into());
+            }
+        }
+        return;
+    }
+    if p.calibration_unit.is_none() {
+        refuse(
+            reader,
+            &["projector.calibration"],
+            "the file does not state the unit of its lengths".into(),
+            "set projector.calibration_unit to \"metre\" or \"millimetre\"".into(),
+        );
+    }
+    let Some(camera) = &p.calibration_camera else { return };
+    let key = "projector.calibration_camera.rotation";
+    if camera.to_affine().is_none() {
+        let problem = "is a quaternion of length zero".to_owned();
+        refuse(reader, &[key], problem, "no rotation is [0, 0, 0, 1]".into());
+    } else if camera.rotation.is_some() && reader.is_written("projector.calibration_camera.rotation_deg") {
+        let problem = "is given twice: here and by `rotation`".to_owned();
+        let key = "projector.calibration_camera.rotation_deg";
+        refuse(reader, &[key], problem, "remove one of the two".into());
     }
 }
 

@@ -167,7 +167,9 @@ impl RigConfig {
         self.scene = SceneConfig::default();
         self.tracker = TrackerConfig::default();
         self.observer = ObserverConfig::default();
-        (self.projector.calibration, self.projector.calibration_unit) = (None, None);
+        let projector = &mut self.projector;
+        (projector.calibration, projector.calibration_unit) = (None, None);
+        (projector.calibration_camera, projector.calibration_region) = (None, None);
         (self.projector.flat_field, self.projector.response) = (None, ResponseConfig::default());
         let output = &mut self.output;
         (output.images, output.trace, output.flight_recorder) = (false, false, false);

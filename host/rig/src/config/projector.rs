@@ -1,6 +1,7 @@
 //! `[projector]`: the projector, its position, and its connection.
 
 use super::values::{Each, PerChannel};
+use super::world::PoseConfig;
 use dpm_common::keys::read::{Any, ConfigValue, Limit, NotEmpty, Reader, Within};
 use dpm_common::keys::source::{Node, Value};
 use dpm_common::keys::Rate;
@@ -9,6 +10,8 @@ use dpm_device::dlpc900::lut::Dmd;
 use dpm_device::link::Codec;
 use dpm_device::planes::{PlaneSchedule, Raster};
 use dpm_device::time::FrameRate;
+use dpm_scene::camera_files::LensKind;
+use glam::DAffine3;
 use std::path::PathBuf;
 
 section! {
@@ -33,11 +36,20 @@ section! {
         up: [f64; 3] = [0.0, 1.0, 0.0], "", Within(-1e6, 1e6);
         /// Full angle of view across the raster's width. Change it to match the lens.
         horizontal_fov_deg: f64 = 30.0, "deg", Within(0.1, 170.0);
-        /// A calibration file (OpenCV FileStorage XML or YAML) that replaces `position`, `look_at`, `up` and
-        /// `horizontal_fov_deg`. Use it for every real rig.
+        /// A calibration file that replaces `position`, `look_at`, `up` and `horizontal_fov_deg`: OpenCV FileStorage
+        /// XML, YAML or JSON (also as mapamok, procam-calibration and ROS name the entries), or the XML of MPCDI with
+        /// profile sl. If the file names a raster, it must have this one's shape; the view is scaled. Use it for every
+        /// real rig.
         calibration: Option<PathBuf> = None, "", NotEmpty;
         /// Unit of the lengths in the calibration file; its numbers do not show it. Required with `calibration`.
         calibration_unit: Option<CalibrationUnit> = None, "", Any;
+        /// Model of the lens in the calibration file. "auto" takes the file's word (`fisheye_model`,
+        /// `distortion_model`); four coefficients without a word are k1 k2 p1 p2. "fisheye" is OpenCV's `cv::fisheye`.
+        calibration_lens: CalibrationLens = CalibrationLens::Auto, "", Any;
+        /// The region of an MPCDI file that is this projector; needed if the file has several.
+        calibration_region: Option<String> = None, "", NotEmpty;
+        /// Pose in the world of the camera that made the calibration file.
+        calibration_camera: Option<CalibrationCameraConfig> = None, "", Any;
         /// Columns and rows of the raster that the calibration file refers to; the projector's own if left out. The
         /// file's view is kept if `width` and `height` differ, for example to trace fewer pixels (`--raster` then
         /// sets this key).
@@ -254,6 +266,28 @@ impl ConfigValue for Compaction {
     }
 }
 
+section! {
+    /// Pose in the world of the camera that made the calibration file: the inverse of the camera's `rvec` and `tvec`.
+    pub struct CalibrationCameraConfig {
+        /// Position in the world of the camera that made the calibration file. The table `calibration_camera` is
+        /// required if the file's origin is that camera, as with procam-calibration, and refused otherwise.
+        position: [f64; 3] = [0.0; 3], "m", Within(-1e6, 1e6);
+        /// Turns that camera's axes (x right, y down, z ahead, as in OpenCV) to the world's: rotations about the
+        /// world's x, then y, then z.
+        rotation_deg: [f64; 3] = [0.0; 3], "deg", Within(-360.0, 360.0);
+        /// The rotation as a quaternion x, y, z, w instead; its length does not matter.
+        rotation: Option<[f64; 4]> = None, "", Within(-1e6, 1e6);
+    }
+}
+
+impl CalibrationCameraConfig {
+    /// World-from-camera; `None` if the quaternion is zero, which the check refuses.
+    pub fn to_affine(&self) -> Option<DAffine3> {
+        let (position, rotation_deg, rotation) = (self.position, self.rotation_deg, self.rotation);
+        PoseConfig { position, rotation_deg, rotation }.to_affine()
+    }
+}
+
 words! {
     /// Units of length.
     pub enum CalibrationUnit {
@@ -261,6 +295,26 @@ words! {
         Metre = "metre",
         /// 0.001 m.
         Millimetre = "millimetre",
+    }
+}
+
+words! {
+    /// Models of a lens in a calibration file.
+    pub enum CalibrationLens {
+        /// As the file says.
+        Auto = "auto",
+        /// OpenCV's fisheye.
+        Fisheye = "fisheye",
+    }
+}
+
+impl CalibrationLens {
+    /// What the reader of the file is told.
+    pub const fn lens(self) -> LensKind {
+        match self {
+            Self::Auto => LensKind::Auto,
+            Self::Fisheye => LensKind::Fisheye,
+        }
     }
 }
 

@@ -320,6 +320,13 @@ const BAD: &[(&str, usize, usize, &str, &str)] = &[
         "set projector.calibration_unit",
     ),
     (
+        "[projector]\ncalibration_lens = \"fisheye\"",
+        2,
+        20,
+        "projector.calibration_lens",
+        "set projector.calibration or remove",
+    ),
+    (
         "[projector]\ncalibration_unit = \"inch\"",
         2,
         20,

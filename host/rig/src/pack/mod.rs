@@ -33,7 +33,6 @@ pub(crate) fn pack(job: &mut FrameJob, kernel: Kernel, verify: bool, pictures: &
     }
     note.timeline.wall_ns[Stage::Pack as usize] = watch.elapsed_ns();
     if let (true, Some(Pictures::Drawn(painter))) = (verify, pictures) {
-        let shown = Shown::by(memory.planes.schedule());
-        note.code_hash = hash_codes(painter.shown_by(&memory.planes).iter().map(|&c| shown.light(c)));
+        note.code_hash = hash_codes(painter.light_of(&memory.planes).iter().copied());
     }
 }

@@ -1,7 +1,7 @@
 //! Pictures that are a function of the frame's number, and take the place of a renderer's.
 
 use crate::frame::job::FrameMemory;
-use dpm_device::planes::Raster;
+use dpm_device::planes::{Channel, PlaneSchedule, Raster};
 use dpm_render::pack::{self, BitPlaneFrame, Kernel};
 use std::sync::Arc;
 
@@ -14,6 +14,12 @@ pub trait PatternSource: Send + Sync {
     /// planes are drawn once and kept. By default every frame has a picture of its own.
     fn picture(&self, frame: u64) -> u64 {
         frame
+    }
+
+    /// The planes that it draws for; `None` for the rig's own. Codes that need planes of equal light have
+    /// [`PlaneSchedule::equal24`].
+    fn schedule(&self) -> Option<PlaneSchedule> {
+        None
     }
 
     /// Draws picture `picture` completely: as code values by [`Canvas::codes`], or plane by plane by
@@ -84,10 +90,30 @@ impl PatternPainter {
         }
     }
 
-    /// The code values that `planes` show, for a comparison with the light. The next picture is drawn anew.
-    pub(crate) fn shown_by(&mut self, planes: &BitPlaneFrame) -> &[u32] {
+    /// The light of `planes` as code values, for a comparison with the light that was made. The next picture is drawn
+    /// anew.
+    pub(crate) fn light_of(&mut self, planes: &BitPlaneFrame) -> &[u32] {
         self.drawn = None;
-        pack::unpack(planes, &mut self.codes);
+        self.codes.fill(0);
+        let (width, row_bytes) = (self.raster.width() as usize, self.raster.row_bytes());
+        for (k, spec) in planes.schedule().planes().iter().enumerate() {
+            let shifts: &[u32] = match spec.channel {
+                Channel::Red => &[0],
+                Channel::Green => &[8],
+                Channel::Blue => &[16],
+                Channel::White => &[0, 8, 16],
+            };
+            let rows = planes.plane(k).chunks_exact(row_bytes).zip(self.codes.chunks_exact_mut(width));
+            for (row, codes) in rows {
+                for (x, code) in codes.iter_mut().enumerate() {
+                    let light = u32::from(row[x / 8] >> (7 - x % 8) & 1) << spec.bit;
+                    for shift in shifts {
+                        let sum = ((*code >> shift & 0xff) + light).min(0xff);
+                        *code = *code & !(0xff << shift) | sum << shift;
+                    }
+                }
+            }
+        }
         &self.codes
     }
 }

@@ -17,7 +17,7 @@ use crate::plan::link_time::LinkTime;
 use crate::rig::{Rig, RigError};
 use crate::telemetry::monitor::RunMonitor;
 use crate::tracks::{open_for, NoTracker, TrackingStage};
-use dpm_device::link::HostLink;
+use dpm_device::link::{HostLink, LinkSettings};
 use dpm_device::time::{HostClock, HostTime};
 use dpm_device::tracker::Tracker;
 use dpm_device::transport::Transport;
@@ -143,7 +143,7 @@ impl CrewParts {
 /// Memory for one frame, with its slot on the GPU if a GPU renders.
 fn frame_memory(rig: &Rig, renderer: Option<&mut Renderer>) -> Result<FrameMemory, PipelineError> {
     let gpu = renderer.map(|renderer| renderer.create_slot(false)).transpose().map_err(RenderError::from)?;
-    let planes = BitPlaneFrame::new(rig.camera.raster, rig.config.projector.schedule());
+    let planes = BitPlaneFrame::new(rig.camera.raster, rig.schedule);
     Ok(FrameMemory { gpu, planes, picture: None })
 }
 
@@ -167,7 +167,7 @@ pub(super) fn mock_projector(
     setup.flash_limit = projector::flash_limit(config);
     let emulated = EmulatedProjector::new(setup, &mock.faults, config.render.seed, start)
         .map_err(|e| RigError::Unsupported(format!("projector.backend.faults: {e}")))?;
-    let marks = marked.then(|| config.projector.schedule());
+    let marks = marked.then_some(rig.schedule);
     let recorder = LightRecorder::new(lights, options.keep_frames, options.verify, marks);
     Ok((emulated, recorder))
 }
@@ -182,7 +182,8 @@ pub(super) fn bring_up(
     monitor: &RunMonitor,
     now: &mut dyn FnMut() -> HostTime,
 ) -> Result<(HostLink, LinkTime), PipelineError> {
-    let mut link = HostLink::new(projector::link_settings(&rig.config, rig.camera.raster));
+    let settings = projector::link_settings(&rig.config, rig.camera.raster);
+    let mut link = HostLink::new(LinkSettings { schedule: rig.schedule, ..settings });
     let acknowledged = if rig.config.safety.acknowledge_faults { u32::MAX } else { ENDED_WITH_THE_LAST_RUN };
     let time = connect(&mut link, medium, acknowledged, monitor, now, &|| monitor.stop_requested())?;
     Ok((link, time))

@@ -177,7 +177,7 @@ fn open_far_end(
     let backend = &config.projector.backend;
     if let ProjectorBackend::Mock(mock) = backend {
         let (mock, recorder) = mock_projector(rig, mock, lights, options, marked, clock.now())?;
-        let frame_bytes = projector::frame_bytes(raster, config.projector.schedule().len());
+        let frame_bytes = projector::frame_bytes(raster, rig.schedule.len());
         let (host_end, device_end) = threaded(frame_bytes, CABLE_BUFFERS, policy(rig));
         let rights = rights.clone();
         let device =

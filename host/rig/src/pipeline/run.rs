@@ -60,6 +60,12 @@ pub fn run_pattern(
     options: RunOptions,
     monitor: &Arc<RunMonitor>,
 ) -> Result<RunOutcome, PipelineError> {
+    let rig = match source.schedule() {
+        Some(schedule) if schedule != rig.schedule => {
+            Arc::new(Rig { schedule, ..Rig::of_projector(&rig.config)? })
+        }
+        _ => rig,
+    };
     run_from(rig, &Origin::Pattern(source), options, monitor)
 }
 
@@ -97,7 +103,7 @@ impl Ran {
         let gpu = origin.gpu();
         let mut report = Report {
             raster: [rig.camera.raster.width(), rig.camera.raster.height()],
-            planes: config.projector.schedule().len() as u32,
+            planes: rig.schedule.len() as u32,
             frame_rate_hz: rig.rate().hz(),
             pace: config.real_time.pace.word(),
             gpu: gpu.map_or_else(|| "none".into(), |gpu| gpu.summary().name.clone()),

@@ -35,7 +35,7 @@ impl CrewParts {
     pub(super) fn stepped(rig: &Rig, tracker: Box<dyn Tracker>, in_flight: usize, frame_ns: i64) -> Self {
         let memory = || FrameMemory {
             gpu: None,
-            planes: BitPlaneFrame::new(rig.camera.raster, rig.config.projector.schedule()),
+            planes: BitPlaneFrame::new(rig.camera.raster, rig.schedule),
             picture: None,
         };
         Self {
