@@ -1,4 +1,5 @@
-//! A light sensor at the tip of a tracked wand, moved through coded planes of light, into lens, pose, tip and latency.
+//! A light sensor at the tip of a tracked wand, moved through coded planes of light (\[Lee04\]), into lens, pose, tip and
+//! latency.
 //!
 //! [`Code`] says which pixels of which plane of which frame are lit; [`decode`] finds the planes and the number of each
 //! frame in the samples of the sensor; [`solve`] fits what the sensor must have seen. The sensor's own clock serves only
