@@ -44,7 +44,7 @@ impl Session {
         self.poses.push(pose);
     }
 
-    /// Finds the frames in all samples so far; see [`decode`].
+    /// Finds the frames in all samples so far; see [`decode()`].
     ///
     /// # Errors
     /// Each reason of [`super::DecodeError`].
@@ -52,7 +52,7 @@ impl Session {
         decode(&self.code, &self.settings.timing, &self.blocks, sensor_minus_host_ns)
     }
 
-    /// Solves from decoded frames and all poses so far; see [`solve`].
+    /// Solves from decoded frames and all poses so far; see [`solve()`].
     ///
     /// # Errors
     /// Each reason of [`super::SensorError`].
