@@ -1,5 +1,6 @@
 //! The program `dpm`: the rig controller and its tools on the command line.
 
+pub mod calibrate;
 pub mod cli;
 mod dlpc900;
 mod pattern_dlpc900;

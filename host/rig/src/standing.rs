@@ -385,7 +385,7 @@ pub fn stands_in(bytes: Result<Vec<u8>, String>, path: &str) -> Stands {
 
 /// `at` in the form 2026-03-01T12:00:00Z (proleptic Gregorian calendar, without leap seconds). Times before 1970 are
 /// shown as 1970.
-fn utc(at: SystemTime) -> String {
+pub fn utc(at: SystemTime) -> String {
     let seconds = at.duration_since(UNIX_EPOCH).map_or(0, |d| d.as_secs());
     let (days, second) = (seconds / 86_400, seconds % 86_400);
     // Days are counted from 1 March of the year 0, so that the leap day is the last day of its year.

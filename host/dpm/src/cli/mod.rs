@@ -1,6 +1,7 @@
 //! The command line of `dpm`: one file per command, without logic of its own.
 
 mod bench;
+mod calibrate;
 mod dlpc900;
 mod doctor;
 mod error;
@@ -76,6 +77,8 @@ enum Command {
     Arm(order::OrderArgs),
     /// Show a pattern on a rig's projector, for aiming, focusing and calibrating, or write it as PNG files
     Pattern(pattern::PatternArgs),
+    /// Measure what a rig needs to know: wand, projector, bodies, latency, light
+    Calibrate(calibrate::CalibrateArgs),
     /// Record the samples of a rig's tracker into a file that `tracker.kind = "replay"` plays
     Record(record::RecordArgs),
     /// Measure where the time between motion and light goes
@@ -140,6 +143,7 @@ fn dispatch(command: &Command) -> Result<(), Failure> {
         Command::Safe(args) => order::execute(args, Order::Safe),
         Command::Arm(args) => order::execute(args, Order::Arm),
         Command::Pattern(args) => pattern::execute(args),
+        Command::Calibrate(args) => calibrate::execute(args),
         Command::Record(args) => record::execute(args),
         Command::Profile(args) => profile::execute(args),
         Command::Doctor(args) => doctor::execute(args),

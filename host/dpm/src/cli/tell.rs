@@ -31,11 +31,11 @@ pub(super) struct Teller {
 }
 
 impl Teller {
-    /// For a run of `total` frames, or else `seconds` of time; 0 means without an end.
+    /// For a run of `total` frames, or else `seconds` of time; 0 means without an end. A quiet one writes notes only.
     ///
     /// # Errors
     /// No thread can be started (exit code 3).
-    pub(super) fn start(total: u64, seconds: f64) -> Result<Self, Failure> {
+    pub(super) fn start(total: u64, seconds: f64, is_quiet: bool) -> Result<Self, Failure> {
         let (words, heard) = bounded(WAITING);
         let (ended, over) = bounded::<()>(1);
         let thread = std::thread::Builder::new()
@@ -48,13 +48,16 @@ impl Teller {
                 while let Ok(word) = heard.recv() {
                     match word {
                         Word::Note(text) => progress.note(&text),
+                        Word::Tick(..) if is_quiet => {}
                         Word::Tick(health, counts) => {
                             last = (health, counts);
                             progress.tick(health, counts);
                         }
                     }
                 }
-                progress.finish(last.0, last.1);
+                if !is_quiet {
+                    progress.finish(last.0, last.1);
+                }
             })
             .map_err(|e| Failure::new(FailureKind::Device, format!("cannot start a thread: {e}")))?;
         Ok(Self { words: Some(words), over, thread: Some(thread) })

@@ -85,16 +85,36 @@ pub(super) fn watch<T: Send + 'static>(
     show: impl Fn(&RunCounts),
     run: impl FnOnce(&RigConfig, &Arc<RunMonitor>) -> Result<T, Failure> + Send + 'static,
 ) -> Result<T, Failure> {
+    watch_with(rig, Keys::new(), false, show, run)
+}
+
+/// The same for a run that talks to the operator itself: keys are not read, and no progress is shown.
+///
+/// # Errors
+/// As [`watch`].
+pub(super) fn watch_quietly<T: Send + 'static>(
+    rig: RigConfig,
+    run: impl FnOnce(&RigConfig, &Arc<RunMonitor>) -> Result<T, Failure> + Send + 'static,
+) -> Result<T, Failure> {
+    watch_with(rig, None, true, |_| {}, run)
+}
+
+fn watch_with<T: Send + 'static>(
+    rig: RigConfig,
+    keys: Option<Keys>,
+    is_quiet: bool,
+    show: impl Fn(&RunCounts),
+    run: impl FnOnce(&RigConfig, &Arc<RunMonitor>) -> Result<T, Failure> + Send + 'static,
+) -> Result<T, Failure> {
     let locks = take_locks(&rig)?;
     signals::install()
         .map_err(|e| Failure::new(FailureKind::Device, format!("cannot handle signals: {e}")))?;
     let monitor = Arc::new(RunMonitor::default());
-    let keys = Keys::new();
     // Before anything can make light.
     if let Some(interlock) = Interlock::of_config(&rig.safety.interlock, keys.is_some())? {
         monitor.set_interlock(interlock);
     }
-    let mut teller = Teller::start(rig.run.frames, rig.run.seconds)?;
+    let mut teller = Teller::start(rig.run.frames, rig.run.seconds, is_quiet)?;
     // Before the run begins, so that it comes up dark if an order stands.
     let orders = Arc::new(stand_by(&rig, &monitor, &teller)?);
     let (done, finished) = unbounded();

@@ -5,5 +5,5 @@ mod stage;
 mod tracker_frame;
 
 pub(crate) use source::NoTracker;
-pub use source::{open_for, SourceError};
+pub use source::{open_for, open_in_world, SourceError};
 pub use stage::{TrackSnapshot, TrackingStage};

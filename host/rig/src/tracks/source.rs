@@ -1,6 +1,7 @@
 //! Opens the tracker of `[tracker]` in the rig file, ready to be polled.
 
-use crate::config::{MockTrackerConfig as MockKeys, TrackerConfig};
+use super::tracker_frame::TrackerFrame;
+use crate::config::{MockTrackerConfig as MockKeys, RigConfig, TrackerConfig};
 use crate::mock::{FaultError, FaultPlan, MockTracker, MockTrackerConfig, MockTrackerError, Motion};
 use crate::rig::Rig;
 use dpm_device::time::{FrameRate, HostClock, HostTime};
@@ -68,6 +69,44 @@ pub fn open_for(
     let keys = rig.bodies.iter().enumerate().map(key).collect();
     let motions = rig.bodies.iter().filter_map(|b| b.motion.clone()).collect();
     open(&rig.config.tracker, keys, motions, clock, start)
+}
+
+/// Opens the tracker of a rig file for bodies that need not be the rig's, such as a wand. Poses are in the rig's world.
+/// Their times are the tracker's own: `tracker.latency_us` is not applied. The mock in this process has no such bodies.
+///
+/// # Errors
+/// Its address, file or settings are wrong.
+pub fn open_in_world(
+    config: &RigConfig,
+    bodies: Vec<BodyKey>,
+    clock: Arc<dyn HostClock>,
+) -> Result<Box<dyn Tracker>, SourceError> {
+    let tracker = open(&config.tracker, bodies, Vec::new(), clock, HostTime(0))?;
+    Ok(match TrackerFrame::of(&config.tracker, Some(0)) {
+        None => tracker,
+        Some(frame) => Box::new(InWorld { tracker, frame }),
+    })
+}
+
+/// A tracker whose poses are in the world.
+struct InWorld {
+    tracker: Box<dyn Tracker>,
+    frame: TrackerFrame,
+}
+
+impl Tracker for InWorld {
+    fn poll(&mut self, now: HostTime, sink: &mut dyn FnMut(&TrackerSample)) -> Result<usize, TrackerError> {
+        let Self { tracker, frame } = self;
+        tracker.poll(now, &mut |sample| sink(&frame.apply(sample)))
+    }
+
+    fn name(&self) -> &str {
+        self.tracker.name()
+    }
+
+    fn status(&self) -> String {
+        self.tracker.status()
+    }
 }
 
 /// Opens the tracker. `bodies` are the rig's bodies in their order. `motions` are their true motions, which only the

@@ -1,0 +1,174 @@
+//! `dpm calibrate body`: where the mesh is in a tracked body, by touching known points of it with the tip of the wand, and then
+//! by wandering over its surface.
+
+use super::dialogue::Dialogue;
+use super::poses::Poses;
+use super::results::Results;
+use dpm_calibration::body::{tip_in_body, wander, Session, Surface, Touch};
+use dpm_calibration::file::{BodySection, Pose};
+use dpm_calibration::trajectory::{Stamped, Trajectory};
+use dpm_common::clock::MonotonicClock;
+use dpm_rig::config::RigConfig;
+use dpm_rig::failure::{Failure, FailureKind};
+use dpm_scene::{Body, Scene};
+use glam::{DAffine3, DVec3};
+use std::time::Duration;
+
+/// How the operator works.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Ways {
+    /// Seconds for which the tip wanders over the surface; 0 for touched points only.
+    pub wander_s: f64,
+    /// Radius of the wand's round tip, metres.
+    pub tip_radius_m: f64,
+}
+
+/// The outermost points of a mesh along each axis, with words for them.
+fn outermost(points: &[DVec3]) -> Vec<(&'static str, DVec3)> {
+    let far = |axis: DVec3| points.iter().copied().max_by(|a, b| a.dot(axis).total_cmp(&b.dot(axis)));
+    [
+        ("the topmost point (+y)", DVec3::Y),
+        ("the point farthest to the right (+x)", DVec3::X),
+        ("the point farthest to the left (-x)", -DVec3::X),
+        ("the foremost point (+z)", DVec3::Z),
+        ("the hindmost point (-z)", -DVec3::Z),
+        ("the lowest point (-y)", -DVec3::Y),
+    ]
+    .into_iter()
+    .filter_map(|(words, axis)| Some((words, far(axis)?)))
+    .collect()
+}
+
+/// The bodies of a scene that the tracked body `name` carries.
+fn carried<'a>(config: &RigConfig, scene: &'a Scene, name: &str) -> Result<Vec<&'a Body>, Failure> {
+    let index = config.scene.bodies.iter().position(|b| b.name == name).ok_or_else(|| {
+        let names: Vec<&str> = config.scene.bodies.iter().map(|b| b.name.as_str()).collect();
+        let told = format!("no body is named \"{name}\" in the rig file; bodies: {}", names.join(", "));
+        Failure::new(FailureKind::BadInput, told)
+    })?;
+    Ok(scene.bodies.iter().filter(|b| b.tracked == Some(index as u16)).collect())
+}
+
+/// Touches points, wanders, and writes the place of the mesh.
+///
+/// # Errors
+/// The tracker fails (exit code 3), or the touched points do not tell the place (2, with what to do).
+pub fn calibrate(
+    config: &RigConfig,
+    scene: &Scene,
+    (wand, tip): (&str, DVec3),
+    name: &str,
+    ways: Ways,
+    results: &mut Results,
+    dialogue: &Dialogue,
+) -> Result<String, Failure> {
+    let bodies = carried(config, scene, name)?;
+    let points: Vec<DVec3> =
+        bodies.iter().flat_map(|b| b.mesh.positions.iter().map(|p| p.as_dvec3())).collect();
+    let poses = Poses::start(config, &[wand.to_owned(), name.to_owned()], MonotonicClock::new(0))?;
+    poses.wait_until_seen()?;
+    let (touched, count) = touch(&poses, tip, &points, dialogue)?;
+    let mut place = (touched, format!("{count} touched points"));
+    let mut told = format!("touched points: residual {:.2} mm rms", 1e3 * place.0 .1);
+    if ways.wander_s > 0.0 {
+        dialogue.ask(&format!(
+            "Now move the tip over the whole body for {:.0} s without lifting it. Press Enter to begin.",
+            ways.wander_s
+        ))?;
+        poses.take();
+        std::thread::sleep(Duration::from_secs_f64(ways.wander_s));
+        let triangles = bodies.iter().flat_map(|b| {
+            b.mesh.triangles.iter().map(|t| t.map(|i| b.mesh.positions[i as usize].as_dvec3()))
+        });
+        let tips = tips_in_body(&poses.take(), tip);
+        let found = wander(&Surface::new(triangles), &tips, ways.tip_radius_m, &place.0 .0)
+            .map_err(|e| Failure::new(FailureKind::BadInput, e))?;
+        place = ((found.mesh_to_body, found.residual_m), format!("{} points of a wandering tip", found.used));
+        told += &format!(
+            "\nwandering: residual {:.2} mm rms of {} points; least certain direction known to {:.2} mm",
+            1e3 * found.residual_m,
+            found.used,
+            1e3 * found.weakest_m
+        );
+    }
+    let ((motion, residual_m), data) = place;
+    let provenance = results.provenance(config, name, data, "rigid motion by least squares");
+    let section = BodySection { mesh_to_body: Pose::new(&motion), residual_m, provenance };
+    results.file.bodies.insert(name.to_owned(), section);
+    Ok(told)
+}
+
+/// Touches points of the mesh until the operator is content. Returns the place with its residual, and the number of points.
+fn touch(
+    poses: &Poses,
+    tip: DVec3,
+    points: &[DVec3],
+    dialogue: &Dialogue,
+) -> Result<((DAffine3, f64), usize), Failure> {
+    let named = outermost(points);
+    let mut session = Session::new(named.iter().map(|(_, p)| *p).collect());
+    let mut count = 0;
+    dialogue.tell(
+        "Touch the points of the body that are asked for with the tip of the wand, hold it there and press Enter. The axes are\n\
+         those of the mesh. At least 4 points are needed. s: another point; d: done; or type x y z in metres for a point of\n\
+         your own.",
+    );
+    let mut skipped = 0;
+    loop {
+        let suggested = named.get((count + skipped) % named.len().max(1));
+        let (words, at) = suggested.copied().unwrap_or(("a point", DVec3::ZERO));
+        let [x, y, z] = at.to_array();
+        let answer =
+            dialogue.ask(&format!("point {}: {words}, at ({x:.4}, {y:.4}, {z:.4}) m:", count + 1))?;
+        let numbers: Vec<f64> = answer.split_whitespace().filter_map(|w| w.parse().ok()).collect();
+        let mesh = match (answer.as_str(), &numbers[..]) {
+            ("s" | "S", _) => {
+                skipped += 1;
+                continue;
+            }
+            ("d" | "D", _) => match session.solve() {
+                Ok(t) => return Ok(((t.mesh_to_body, t.residual_m), count)),
+                Err(why) => {
+                    dialogue.tell(&format!("not yet: {why}"));
+                    continue;
+                }
+            },
+            ("", _) => at,
+            (_, &[x, y, z]) => DVec3::new(x, y, z),
+            _ => {
+                dialogue.tell("press Enter, s or d, or type three numbers");
+                continue;
+            }
+        };
+        match tip_in_body(tip, &together(&poses.hold())) {
+            Ok(contact) => {
+                session.add(Touch { mesh, body: contact.body });
+                count += 1;
+                match session.solve() {
+                    Ok(t) => dialogue.tell(&format!("residual {:.2} mm rms", 1e3 * t.residual_m)),
+                    Err(why) => dialogue.tell(&why.to_string()),
+                }
+            }
+            Err(why) => dialogue.tell(&why.to_string()),
+        }
+    }
+}
+
+/// Poses of the wand with the body's pose at the same instants.
+fn together(poses: &[Vec<Stamped>]) -> Vec<(Stamped, Stamped)> {
+    let [wand, body] = poses else { return Vec::new() };
+    let path = Trajectory::new(body);
+    let at = |w: &Stamped| {
+        let moving = path.at(w.stamp_ns, 0.0)?;
+        let body = Stamped { stamp_ns: w.stamp_ns, position: moving.position, rotation: moving.rotation };
+        Some((*w, body))
+    };
+    wand.iter().filter_map(at).collect()
+}
+
+/// Places of the tip in the body's frame.
+fn tips_in_body(poses: &[Vec<Stamped>], tip: DVec3) -> Vec<DVec3> {
+    let in_body =
+        |(wand, body): (Stamped, Stamped)| body.rotation.conjugate() * (wand.place(tip) - body.position);
+    together(poses).into_iter().map(in_body).collect()
+}

@@ -1,0 +1,10 @@
+//! `dpm calibrate`: the operator's side of calibration. The solvers are in the crate `dpm-calibration`; here the tracker is
+//! read, crosses are shown, the operator is told what to do next, and results go into the calibration file.
+
+pub mod aim;
+pub mod body;
+pub mod dialogue;
+pub mod poses;
+pub mod projector;
+pub mod results;
+pub mod wand;

@@ -1,0 +1,73 @@
+//! The calibration file of a rig: where it lies, what is in it already, and how new parts get into it.
+
+use dpm_calibration::file::{self, CalibrationFile, Provenance};
+use dpm_rig::config::RigConfig;
+use dpm_rig::failure::{Failure, FailureKind};
+use dpm_rig::standing::{utc, Identity};
+use std::path::{Path, PathBuf};
+use std::time::SystemTime;
+
+/// Name of the file if neither a flag nor the rig file names one.
+const USUAL_NAME: &str = "calibration.toml";
+
+/// A calibration file that grows part by part.
+pub struct Results {
+    path: PathBuf,
+    /// What it holds; empty if there is none yet.
+    pub file: CalibrationFile,
+}
+
+impl Results {
+    /// The file that `named` names, or else the rig file, or else `calibration.toml` beside the rig file.
+    ///
+    /// # Errors
+    /// There is one that cannot be read.
+    pub fn open(named: Option<&Path>, rig: &Path, config: &RigConfig) -> Result<Self, Failure> {
+        let beside = rig.with_file_name(USUAL_NAME);
+        let path = named.map(Path::to_path_buf).or(config.calibration.file.clone()).unwrap_or(beside);
+        let file = if path.exists() {
+            file::load(&path).map_err(|e| Failure::new(FailureKind::BadInput, e))?
+        } else {
+            CalibrationFile::new()
+        };
+        Ok(Self { path, file })
+    }
+
+    /// A file beside it for what an interrupted command has measured so far.
+    pub fn progress(&self, what: &str) -> PathBuf {
+        let mut name = self.path.file_name().unwrap_or_default().to_os_string();
+        name.push(format!(".{what}.part"));
+        self.path.with_file_name(name)
+    }
+
+    /// Writes it; what was there before is kept. Returns what to tell the operator.
+    ///
+    /// # Errors
+    /// It cannot be written.
+    pub fn save(&self, config: &RigConfig) -> Result<String, Failure> {
+        let kept = file::save(&self.file, &self.path).map_err(|e| Failure::new(FailureKind::BadInput, e))?;
+        let mut told = format!("written: {}", self.path.display());
+        if let Some(old) = kept {
+            told += &format!(" (the one before is kept as {})", old.display());
+        }
+        if config.calibration.file.is_none() {
+            told += &format!(
+                "\nname it in the rig file:\n[calibration]\nfile = {:?}",
+                self.path.display().to_string()
+            );
+        }
+        Ok(told)
+    }
+
+    /// Where the numbers of a part come from.
+    pub fn provenance(&self, config: &RigConfig, device: &str, data: String, method: &str) -> Provenance {
+        let projector = Identity::of(&config.projector.backend);
+        Provenance {
+            date: utc(SystemTime::now()),
+            device: if device.is_empty() { projector.to_string() } else { device.to_owned() },
+            data,
+            commit: dpm_common::commit::get().to_owned(),
+            method: method.to_owned(),
+        }
+    }
+}
