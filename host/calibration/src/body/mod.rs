@@ -1,5 +1,5 @@
 //! The place of a mesh in its tracked body's frame, T_BM: from points of the mesh that the wand's tip touched
-//! ([`touch`]), and from a tip that wandered over its surface ([`wander`]).
+//! ([`Session`]), and from a tip that wandered over its surface ([`wander()`]).
 //!
 //! Everything is measured in the body's frame: the tip in the world, brought back by the pose of the body at the same
 //! instant. So the body may move meanwhile.

@@ -63,13 +63,13 @@ fn light(next: Next) -> f64 {
 fn curves_are_those_of_the_channels_and_never_fall() {
     for seed in 0..10 {
         let got = read(2e-4, seed, light).solve().unwrap();
-        for channel in 0..3 {
-            assert!((got.intensity[channel] - FULL[channel]).abs() < 2e-3);
+        for (channel, full) in FULL.into_iter().enumerate() {
+            assert!((got.intensity[channel] - full).abs() < 2e-3);
             assert_eq!((got.curves[channel][0], got.curves[channel][CURVE_POINTS - 1]), (0.0, 1.0));
             assert!(got.curves[channel].windows(2).all(|w| w[0] <= w[1]));
             for i in 0..=100 {
                 let code = f64::from(i) / 100.0;
-                let off = got.level(channel, code) * 1.002 - FULL[channel] * truth(channel, code);
+                let off = got.level(channel, code) * 1.002 - full * truth(channel, code);
                 assert!(off.abs() < 2e-3, "{channel} {code}: {off}");
             }
         }
@@ -151,4 +151,16 @@ fn a_sweep_that_leaves_the_border_out_is_refused() {
     let mut shaded = sweep(5000, 1.0, false);
     shaded.iter_mut().for_each(|b| b.level *= (1.0 - b.pixel.x / 1000.0).max(0.0));
     assert!(matches!(flat_field(raster, &shaded, None), Err(FlatError::Dark { .. })));
+}
+
+#[test]
+fn the_table_for_a_rig_file_has_a_rising_line_for_each_code() {
+    let channels = read(1e-5, 1, light).solve().unwrap();
+    let raster = Raster::new(1024, 768).unwrap();
+    let text = LightModel { channels, flat: FlatField::even(raster) }.response_table();
+    let rows: Vec<Vec<f64>> =
+        text.lines().map(|l| l.split(' ').map(|v| v.parse().unwrap()).collect()).collect();
+    assert!(rows.len() == 256 && rows.iter().all(|r| r.len() == 3));
+    assert!(rows.windows(2).all(|w| (0..3).all(|c| w[0][c] <= w[1][c])));
+    assert!((0..3).all(|c| (rows[255][c] - FULL[c]).abs() < 3e-3 && rows[0][c] < 3e-3));
 }

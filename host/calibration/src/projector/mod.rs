@@ -9,10 +9,11 @@ mod refusal;
 mod solve;
 mod uncertainty;
 
+pub(crate) use fit::spread_of;
 pub use fit::Priors;
-pub(crate) use fit::{fit, spread_of, Fit};
+use fit::{fit, Fit};
 pub use refusal::Refusal;
-pub(crate) use solve::check_result;
+pub(crate) use solve::{check_result, look_for_motion};
 pub use solve::{relocate, solve, Solved};
 pub(crate) use uncertainty::percentile;
 pub use uncertainty::{predict, Predicted, Volume};

@@ -175,7 +175,7 @@ fn fit_inliers(
 }
 
 /// Whether the points before some instant agree with each other, those after it too, but not both together.
-fn look_for_motion(raster: Raster, sights: &[Sight], options: &Options) -> Option<Refusal> {
+pub(crate) fn look_for_motion(raster: Raster, sights: &[Sight], options: &Options) -> Option<Refusal> {
     let n = sights.len();
     let accept = 3.0 * options.aim_px.max(0.3);
     let splits = (6..n.saturating_sub(3)).step_by((n / 40).max(1));

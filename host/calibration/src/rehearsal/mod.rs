@@ -204,4 +204,6 @@ fn level_error(truth: &Truth, got: &LightModel) -> f64 {
 }
 
 #[cfg(test)]
+mod refusal_tests;
+#[cfg(test)]
 mod tests;

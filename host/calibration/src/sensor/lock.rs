@@ -5,6 +5,7 @@
 //! windows is the difference of the two clocks.
 
 use super::decode::DecodeError;
+use dpm_device::sensor::wire::{BlockHead, PERIOD_ONE};
 use std::f64::consts::TAU;
 
 /// Consecutive samples of the sensor.
@@ -19,6 +20,19 @@ pub struct Block {
 }
 
 impl Block {
+    /// From a block of the serial protocol. `ticks_per_second` is that of the sensor's HELLO; levels of different gain
+    /// settings are brought to one unit by `gain`. `None` for a clock that cannot be.
+    pub fn from_wire(head: &BlockHead, levels: &[u16], ticks_per_second: u32, gain: f64) -> Option<Self> {
+        let per_second = i128::from(ticks_per_second);
+        let start_ns =
+            i64::try_from((i128::from(head.first) * 1_000_000_000).checked_div(per_second)?).ok()?;
+        let interval_ns = f64::from(head.period) / f64::from(PERIOD_ONE) * 1e9 / f64::from(ticks_per_second);
+        let scale = 1.0 / gain;
+        let sound = scale.is_finite() && scale > 0.0 && interval_ns > 0.0;
+        let levels = levels.iter().map(|l| (f64::from(*l) * scale) as f32).collect();
+        sound.then_some(Self { start_ns, interval_ns, levels })
+    }
+
     /// The instant of a sample by the sensor's clock, nanoseconds after `base_ns`.
     pub fn at(&self, index: usize, base_ns: i64) -> f64 {
         self.start_ns.saturating_sub(base_ns) as f64 + index as f64 * self.interval_ns

@@ -1,19 +1,24 @@
-//! A light sensor at the tip of a tracked wand, moved through coded planes of light, into lens, pose, tip and latency.
+//! A light sensor at the tip of a tracked wand, moved through coded planes of light (\[Lee04\]), into lens, pose, tip and
+//! latency.
 //!
-//! [`Code`] says which pixels of which plane of which frame are lit; [`decode`] finds the planes and the number of each
-//! frame in the samples of the sensor; [`solve`] fits what the sensor must have seen. The sensor's own clock serves only
+//! [`Code`] says which pixels of which plane of which frame are lit; [`decode()`] finds the planes and the number of each
+//! frame in the samples of the sensor; [`solve()`] fits what the sensor must have seen. The sensor's own clock serves only
 //! to tell the planes apart: a level belongs to a plane of a frame, and the projector says when that plane was lit.
 
 mod code;
 mod decode;
 mod fit;
 mod lock;
+mod problem;
+mod session;
+mod start;
 mod stripes;
 
 pub use code::{Code, CodeError, Role, PLANES};
 pub use decode::{decode, DecodeError, Decoded, Frame};
 pub use fit::{solve, Brightness, SensorError, Settings, Solution};
 pub use lock::{Block, Lock};
+pub use session::{Coverage, Session};
 
 /// When the projector shows which frame, by the host's clock. All planes of a frame are equally long, and no pause
 /// divides frames.

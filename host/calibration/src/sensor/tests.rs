@@ -69,7 +69,7 @@ fn samples_that_show_no_code_are_refused_by_name() {
     let only_noise = get(&block(&|i| noise.unit(i as u64) as f32));
     assert!(matches!(only_noise, DecodeError::NoLock { .. }), "{only_noise}");
     // Light that goes on and off with the planes, but carries no code.
-    let blink = get(&block(&|i| f32::from(u8::from((i as f64 * 1e4 / 44_000.0) as u64 % 2 == 0))));
+    let blink = get(&block(&|i| f32::from(u8::from(((i as f64 * 1e4 / 44_000.0) as u64).is_multiple_of(2)))));
     assert!(matches!(blink, DecodeError::NoFrames { .. }), "{blink}");
     let slow = [Block { start_ns: 0, interval_ns: 4e4, levels: vec![0.0; 1000] }];
     assert!(matches!(get(&slow), DecodeError::TooSlow { .. }));
@@ -78,4 +78,26 @@ fn samples_that_show_no_code_are_refused_by_name() {
         Block { start_ns: i64::MAX, interval_ns: 1e4, levels: vec![0.0, 1.0, 0.0] },
     ];
     decode(&code, &timing, &bad, 0).unwrap_err();
+}
+
+#[test]
+fn a_block_of_the_wire_keeps_its_instants_and_its_unit() {
+    use dpm_device::sensor::wire::{BlockHead, PERIOD_ONE};
+    let head = BlockHead {
+        sequence: 0,
+        first: 48_000_000 * 3600,
+        period: 480 * PERIOD_ONE + PERIOD_ONE / 2,
+        lost: 0,
+        gain: 0,
+        cut_below: false,
+        cut_above: false,
+    };
+    let block = Block::from_wire(&head, &[0, 100, 4095], 48_000_000, 2.0).unwrap();
+    assert_eq!((block.start_ns, block.levels.as_slice()), (3_600_000_000_000, &[0.0f32, 50.0, 2047.5][..]));
+    let (ticks, rest) = head.ticks_of(2);
+    let ns = (ticks as f64 + f64::from(rest) / f64::from(PERIOD_ONE)) / 48e6 * 1e9;
+    assert!((block.at(2, 0) - ns).abs() < 1e-3);
+    assert!(Block::from_wire(&head, &[1], 0, 1.0).is_none());
+    assert!(Block::from_wire(&head, &[1], 48_000_000, 0.0).is_none());
+    assert!(Block::from_wire(&BlockHead { first: u64::MAX, ..head }, &[1], 1, 1.0).is_none());
 }

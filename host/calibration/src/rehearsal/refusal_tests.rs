@@ -1,0 +1,144 @@
+//! Sweeps that would give a wrong projector: refused by name, from ten seconds of samples.
+
+use super::photodiode::record;
+use super::tracker::Tracker;
+use super::truth::{Bias, Hand, Truth};
+use crate::projector::{Known, Priors, Refusal};
+use crate::sensor::{Code, Decoded, Role, SensorError, Session, Settings, Solution, Timing, PLANES};
+use crate::trajectory::Stamped;
+use glam::{DQuat, DVec2, DVec3};
+
+const TIMING: Timing = Timing { frame_zero_ns: 1_000_000_123, frame_ns: 1_055_966.2 };
+
+struct Sweep {
+    truth: Truth,
+    code: Code,
+    session: Session,
+    decoded: Decoded,
+    poses: Vec<Stamped>,
+}
+
+fn settings(truth: &Truth) -> Settings {
+    Settings {
+        timing: TIMING,
+        tip: truth.tip,
+        tip_sigma_m: 1e-4,
+        aperture_m: 3e-3,
+        priors: Priors::many_points(truth.raster),
+        known: Known { distance_m: None, up: Some(DVec3::Y) },
+        volume: truth.volume,
+        seed: 1,
+    }
+}
+
+fn sweep(seed: u64, seconds: f64) -> Sweep {
+    let truth = Truth::draw(seed);
+    let code = Code::new(truth.raster).unwrap();
+    let hand = Hand::sweeping(&truth.volume, seed);
+    let tracker = Tracker { seed, latency_ns: truth.latency_ns, bias: Bias::None };
+    let poses = tracker.wand(&hand, truth.tip, DVec3::ZERO, 38.0, 42.0 + seconds);
+    let mut session = Session::new(code.clone(), settings(&truth));
+    for block in record(&truth, &code, &TIMING, &hand, [40.0, 40.0 + seconds], seed) {
+        session.add_samples(block);
+    }
+    let decoded = session.decode(truth.sensor_offset_ns).unwrap();
+    Sweep { truth, code, session, decoded, poses }
+}
+
+impl Sweep {
+    /// Solves from poses that were changed.
+    fn with(&self, change: impl Fn(usize, &mut Stamped)) -> Result<Solution, SensorError> {
+        self.with_tip(self.truth.tip, change)
+    }
+
+    /// The same, for a wand whose tip came out elsewhere.
+    fn with_tip(&self, tip: DVec3, change: impl Fn(usize, &mut Stamped)) -> Result<Solution, SensorError> {
+        let mut session = Session::new(self.code.clone(), Settings { tip, ..settings(&self.truth) });
+        for (i, pose) in self.poses.iter().enumerate() {
+            let mut pose = *pose;
+            change(i, &mut pose);
+            session.add_pose(pose);
+        }
+        session.solve(&self.decoded)
+    }
+}
+
+#[test]
+fn sweeps_with_a_fault_are_refused_by_name() {
+    let sweep = sweep(5, 10.0);
+    sweep.with(|_, _| {}).unwrap();
+    // A left-handed tracker: places, turns and the wand's own frame are mirrored.
+    let tip = sweep.truth.tip * DVec3::new(-1.0, 1.0, 1.0);
+    let mirrored = sweep.with_tip(tip, |_, p| {
+        p.position.x = -p.position.x;
+        p.rotation = DQuat::from_xyzw(p.rotation.x, -p.rotation.y, -p.rotation.z, p.rotation.w);
+    });
+    assert_eq!(mirrored.unwrap_err(), SensorError::Projector(Refusal::Mirrored));
+    let z_up = sweep.with(|_, p| {
+        let turn = DQuat::from_rotation_x(std::f64::consts::FRAC_PI_2);
+        (p.position, p.rotation) = (turn * p.position, turn * p.rotation);
+    });
+    assert_eq!(
+        z_up.unwrap_err(),
+        SensorError::Projector(Refusal::AxesExchanged { found: "Z", expected: "Y" })
+    );
+    let late = sweep.with(|_, p| p.stamp_ns += 300_000_000).unwrap_err();
+    assert!(matches!(late, SensorError::LatencyAtBound { ms } if (250.0..350.0).contains(&ms)), "{late}");
+    let half = sweep.poses.len() / 2;
+    let moved = sweep.with(|i, p| p.position.x += if i > half { 0.02 } else { 0.0 }).unwrap_err();
+    assert!(matches!(moved, SensorError::Projector(Refusal::Moved { .. })), "{moved}");
+    let flat = sweep.with(|_, p| p.position.z = 0.0).unwrap_err();
+    assert!(matches!(flat, SensorError::Projector(_) | SensorError::DoesNotFit { .. }), "{flat}");
+    let unit = sweep.with_tip(1000.0 * sweep.truth.tip, |_, p| p.position *= 1000.0).unwrap_err();
+    assert!(matches!(unit, SensorError::Projector(Refusal::WrongUnit { factor: 1000.0, .. })), "{unit}");
+    let gone = sweep.with(|_, p| p.stamp_ns += 1_000_000_000_000).unwrap_err();
+    assert!(matches!(gone, SensorError::TooFew { frames: 0, .. }), "{gone}");
+}
+
+#[test]
+fn a_sweep_says_what_it_has_not_seen() {
+    let short = sweep(6, 3.0);
+    let coverage = short.session.coverage(&short.decoded);
+    assert!(coverage.frames > 1000 && coverage.share < 0.85, "{coverage:?}");
+    assert!(short.session.advice(&short.decoded).contains("move the sensor to pixel"));
+    // The emptiest cell is indeed one that hardly any frame has seen.
+    let near = |f: &crate::sensor::Frame| {
+        let seconds = 1e-9 * (TIMING.instant(f.number, 12.0).0 as f64);
+        let tip = Hand::sweeping(&short.truth.volume, 6).at(seconds).0;
+        short
+            .truth
+            .projector
+            .project(tip)
+            .is_some_and(|p| (p - coverage.emptiest).abs().cmplt(DVec2::new(60.0, 60.0)).all())
+    };
+    assert!(short.decoded.frames.iter().filter(|f| near(f)).count() < 20);
+    let mut session = Session::new(short.code.clone(), settings(&short.truth));
+    short.poses.iter().for_each(|p| session.add_pose(*p));
+    assert!(session.decode(0).is_err());
+}
+
+/// The decoder's frames are numbered by the identity, and their levels are those of the code at the tip's true place.
+#[test]
+fn decoded_frames_are_those_that_were_shown() {
+    let sweep = sweep(7, 4.0);
+    assert!((sweep.decoded.lock.drift_ppm - 1e6 * sweep.truth.sensor_drift).abs() < 0.05);
+    assert!(sweep.decoded.identity_percent > 99.9);
+    let hand = Hand::sweeping(&sweep.truth.volume, 7);
+    let (mut right, mut all) = (0, 0);
+    for frame in &sweep.decoded.frames {
+        for plane in 2..PLANES - 2 {
+            let (Role::Column { width } | Role::Row { width }) = sweep.code.role(plane) else { continue };
+            let (ns, _) = TIMING.instant(frame.number, plane as f64 + 0.5);
+            let pixel = sweep.truth.projector.project(hand.at(1e-9 * ns as f64).0).unwrap();
+            let (off, on) = frame.references(plane);
+            let level = (f64::from(frame.levels[plane]) - off) / (on - off);
+            let lit = sweep.code.lit(frame.number, plane, pixel.x as u32, pixel.y as u32);
+            // Stripes that the aperture resolves.
+            if width >= 16 {
+                all += 1;
+                right += u32::from((level > 0.5) == lit);
+            }
+        }
+    }
+    assert!(all > 10_000 && f64::from(right) > 0.99 * f64::from(all), "{right} of {all}");
+}
