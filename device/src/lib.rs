@@ -63,6 +63,7 @@ pub mod pose;
 pub mod regular_file;
 #[cfg(feature = "std")]
 pub mod rng;
+pub mod sensor;
 pub mod time;
 #[cfg(feature = "std")]
 pub mod tracker;

@@ -104,6 +104,7 @@ pub const MAX_PLANES: usize = 32;
 pub struct PlaneSchedule {
     planes: [PlaneSpec; MAX_PLANES],
     len: u8,
+    repeats: bool,
 }
 
 impl PlaneSchedule {
@@ -120,7 +121,37 @@ impl PlaneSchedule {
         }
         let mut all = [PlaneSpec { channel: Channel::White, bit: 0 }; MAX_PLANES];
         all[..planes.len()].copy_from_slice(planes);
-        Some(Self { planes: all, len: planes.len() as u8 })
+        Some(Self { planes: all, len: planes.len() as u8, repeats: false })
+    }
+
+    /// Planes in the order given, of which several may have the same channel and bit: for codes that need planes of equal
+    /// light. `None` as for [`PlaneSchedule::new`], or if a mirror that is on in every plane would send out more light
+    /// than full white in one of the channels.
+    pub fn with_repeats(planes: &[PlaneSpec]) -> Option<Self> {
+        if planes.is_empty() || planes.len() > MAX_PLANES || planes.iter().any(|p| p.bit > 7) {
+            return None;
+        }
+        let light = |channel| {
+            let lights = |p: &&PlaneSpec| p.channel == channel || p.channel == Channel::White;
+            planes.iter().filter(lights).map(|p| 1u32 << p.bit).sum::<u32>()
+        };
+        if [Channel::Red, Channel::Green, Channel::Blue].into_iter().any(|channel| light(channel) > 255) {
+            return None;
+        }
+        let mut all = [PlaneSpec { channel: Channel::White, bit: 0 }; MAX_PLANES];
+        all[..planes.len()].copy_from_slice(planes);
+        let repeats = planes.iter().enumerate().any(|(i, p)| planes[..i].contains(p));
+        Some(Self { planes: all, len: planes.len() as u8, repeats })
+    }
+
+    /// 24 planes of equal white light, each at 8 / 255 of full: three quarters of full white if all are on.
+    pub fn equal24() -> Self {
+        Self::with_repeats(&[PlaneSpec { channel: Channel::White, bit: 3 }; 24]).expect("192 of 255")
+    }
+
+    /// Two planes have the same channel and bit.
+    pub const fn has_repeats(&self) -> bool {
+        self.repeats
     }
 
     /// 24 planes: for each bit from 7 down to 0 red, green, blue. Interleaving the colours keeps the

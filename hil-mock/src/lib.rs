@@ -39,6 +39,7 @@ pub mod natnet_host;
 pub mod natnet_server;
 pub mod projector;
 pub mod report_queue;
+pub mod sensor_wand;
 pub mod serial_server;
 pub mod tracker;
 pub mod usb_model;

@@ -29,7 +29,7 @@ use dpm_device::time::{DeviceTicks, HostTime};
 use dpm_device::transport::{Lane, LinkDevice};
 
 pub use clock::DeviceClock;
-pub use config::{LightChange, MockConfig};
+pub use config::{LightChange, MockConfig, Shown};
 pub use dpm_device::light::{LightEvent, LightKind};
 pub use emulated::{EmulatedProjector, Served};
 pub use faulty::FaultyProjector;
@@ -98,6 +98,8 @@ struct Core {
     incoming: [receive::Incoming; 2],
     events: VecDeque<LightEvent>,
     events_lost: u64,
+    shown: VecDeque<Shown>,
+    shown_lost: u64,
     /// The instant of the present event: `now`, or the exact instant of the device's own events.
     at: HostTime,
     changes: VecDeque<LightChange>,
@@ -185,6 +187,8 @@ impl MockProjector {
                 incoming: Default::default(),
                 events: VecDeque::with_capacity(setup.events_kept),
                 events_lost: 0,
+                shown: VecDeque::with_capacity(setup.shown_kept),
+                shown_lost: 0,
                 at: HostTime(i64::MIN),
                 changes: VecDeque::with_capacity(CHANGES_KEPT),
                 before: (false, DeviceState::Idle),
@@ -205,6 +209,24 @@ impl MockProjector {
     /// The oldest light event not yet taken.
     pub fn next_light(&mut self) -> Option<LightEvent> {
         self.core.events.pop_front()
+    }
+
+    /// The oldest lit slot that is over and was not yet taken. None is kept unless [`MockConfig::shown_kept`] says so.
+    pub fn next_shown(&mut self) -> Option<Shown> {
+        let core = &mut self.core;
+        core.shown.front().filter(|shown| shown.event.last_photon_at <= core.now)?;
+        core.shown.pop_front()
+    }
+
+    /// Up to here everything that was shown is known and has been, or can be, taken.
+    pub fn shown_until(&self) -> HostTime {
+        let waiting = self.core.shown.iter().find(|shown| shown.event.last_photon_at > self.core.now);
+        waiting.map_or(self.core.now, |shown| shown.event.first_photon_at.min(self.core.now))
+    }
+
+    /// Lit slots that were dropped before they were taken.
+    pub fn shown_lost(&self) -> u64 {
+        self.core.shown_lost
     }
 
     /// Number of light events that were replaced by newer ones before they were taken.
@@ -487,6 +509,9 @@ impl Core {
             return;
         }
         self.before = now;
+        if let Some(shown) = self.shown.back_mut().filter(|_| !self.lit_now) {
+            shown.event.last_photon_at = shown.event.last_photon_at.min(self.at);
+        }
         let settle = if self.lit_now { i64::from(self.setup.settle_ns) } else { 0 };
         if self.changes.len() >= CHANGES_KEPT {
             self.changes.pop_front();
@@ -649,6 +674,25 @@ impl Core {
         if self.setup.events_kept > 0 {
             self.events.push_back(event);
         }
+        if self.setup.shown_kept > 0 && kind != LightKind::Blank {
+            self.keep_shown(event, clock.instant_of(end));
+        }
+    }
+
+    /// Keeps a lit slot with its planes.
+    fn keep_shown(&mut self, event: LightEvent, planes_end_at: HostTime) {
+        let (Some(held), Some((config, _))) = (self.store.lit, self.config.as_ref()) else { return };
+        let before = self.shown.back().filter(|_| event.kind == LightKind::Repeated);
+        let planes = before.map_or_else(
+            || self.store.bytes(held.buffer)[..config.raster.plane_bytes() * config.schedule.len()].into(),
+            |shown| shown.planes.clone(),
+        );
+        let shown = Shown { event, planes_end_at, schedule: config.schedule, planes };
+        if self.shown.len() >= self.setup.shown_kept {
+            self.shown.pop_front();
+            self.shown_lost += 1;
+        }
+        self.shown.push_back(shown);
     }
 
     /// Goes dark and drops every frame in flight.

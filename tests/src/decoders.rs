@@ -1,7 +1,7 @@
 //! Feeds arbitrary bytes to every decoder of external input. Each decoder has one entry, with the laws that hold for
 //! all bytes. The fuzz targets in `fuzz/` and the test over the committed seeds call the same entries.
 
-use crate::conversations::{link, trackers, usb};
+use crate::conversations::{link, sensor, trackers, usb};
 use dpm_device::clock_map::{ClockMap, ExchangeOutcome};
 use dpm_device::cobs::{encode, encoded_bytes, Deframer};
 use dpm_device::dlpc900::command::{CommandAssembler, ReplyAssembler, REPORT_BYTES};
@@ -10,6 +10,8 @@ use dpm_device::link::crc32c;
 use dpm_device::link::{
     rle_encode, Assembly, Decoder, DeviceMessage, Header, HostMessage, PacketSink, RleDecoder,
 };
+use dpm_device::planes::Raster;
+use dpm_device::sensor::wire::{SensorMessage, MAX_FRAME, MAX_PACKET, MAX_SAMPLES};
 use dpm_device::time::{DeviceTicks, HostTime};
 use dpm_device::tracker::natnet::frame::{decode_frame, RigidBody};
 use dpm_device::tracker::natnet::messages::{
@@ -35,7 +37,7 @@ use std::path::Path;
 pub type Entry = fn(&[u8]);
 
 /// Every entry with the name of its fuzz target, which is also the name of its folder of seeds.
-pub const ALL: [(&str, Entry); 30] = [
+pub const ALL: [(&str, Entry); 33] = [
     ("link_stream", link_stream),
     ("link_rle", link_rle),
     ("cobs_stream", cobs_stream),
@@ -44,6 +46,7 @@ pub const ALL: [(&str, Entry); 30] = [
     ("natnet_datagram", natnet_datagram),
     ("vrpn_stream", vrpn_stream),
     ("serial_pose", serial_pose),
+    ("sensor_packet", sensor_packet),
     ("texts", texts),
     ("recording", recording),
     ("usbip_stream", usbip_stream),
@@ -60,6 +63,8 @@ pub const ALL: [(&str, Entry); 30] = [
     ("vrpn_server", trackers::vrpn_server),
     ("serial_client", trackers::serial_client),
     ("serial_device", trackers::serial_device),
+    ("sensor_client", sensor::sensor_client),
+    ("sensor_device", sensor::sensor_device),
     ("dlpc900_driver", usb::dlpc900_driver),
     ("dlpc900_controller", usb::dlpc900_controller),
     ("usbip_server", usb::usbip_server),
@@ -205,6 +210,29 @@ pub fn serial_pose(bytes: &[u8]) {
     let mut frame = None;
     deframer.push(&first, &mut |f| frame = Some(f.to_vec()));
     assert_eq!(encoded(&frame.expect("one frame")), Some(first));
+}
+
+/// A packet of a light sensor, as it is and with its checksum corrected: a block has as many levels as it says, none above
+/// what its bits hold, and its own encoding is read as the same message.
+pub fn sensor_packet(bytes: &[u8]) {
+    let sealed = [bytes, &crc32c(bytes).to_le_bytes()].concat();
+    for packet in [bytes, &sealed] {
+        let Ok(message) = SensorMessage::decode(packet) else { continue };
+        if let SensorMessage::Samples(head, levels) = &message {
+            assert!((1..=MAX_SAMPLES).contains(&levels.len()) && levels.iter().count() == levels.len());
+            assert!(levels.iter().all(|level| level <= levels.bits().highest()));
+            assert!(head.ticks_of(levels.len() - 1).1 < 1 << 16);
+        }
+        let mut frame = [0; MAX_FRAME];
+        let n = message.encode(&mut frame).expect("room for every message");
+        let mut deframer = Deframer::new([0u8; MAX_PACKET]);
+        let mut back = None;
+        deframer.push(&frame[..n], &mut |f| back = Some(f.to_vec()));
+        let again = back.expect("one frame");
+        let mut second = [0; MAX_FRAME];
+        let m = SensorMessage::decode(&again).expect("own encoding").encode(&mut second).expect("room");
+        assert_eq!(frame[..n], second[..m]);
+    }
 }
 
 /// A tracker's recording, unchanged and with its frames' checksums corrected. It has no more samples than its bytes

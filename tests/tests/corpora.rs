@@ -13,6 +13,7 @@ use dpm_device::dlpc900::command::{Command, Opcode};
 use dpm_device::dlpc900::image::{self, Compression, PlaneOrder};
 use dpm_device::link::{rle_encode, Commit, Header, HostMessage, MessageType, Packet, MAX_CONTROL_BYTES};
 use dpm_device::planes::Raster;
+use dpm_device::sensor::wire::{BlockHead, LevelBits, Levels, SensorMessage, MAX_FRAME};
 use dpm_device::time::DeviceTicks;
 use dpm_device::tracker::natnet::frame::{encode_frame, FrameContent, FrameInfo, RigidBody};
 use dpm_device::tracker::natnet::messages::{encode_echo_response, encode_request};
@@ -91,6 +92,22 @@ fn made() -> Vec<(&'static str, &'static str, Vec<u8>)> {
     SerialMessage::Hello { version: 1, bodies: 2, ticks_per_second: 1_000_000 }.encode(&mut out);
     let mut deframer = dpm_device::cobs::Deframer::new([0u8; 128]);
     deframer.push(&out, &mut |f| seeds.push(("serial_pose", "hello", f.to_vec())));
+    let head = BlockHead {
+        sequence: 3,
+        first: 1000,
+        period: 10 << 16,
+        lost: 1,
+        gain: 1,
+        cut_below: false,
+        cut_above: true,
+    };
+    let levels = [0, 5, 4095, 800, 17];
+    let mut frame = [0; MAX_FRAME];
+    for (name, bits) in [("twelve", LevelBits::Twelve), ("sixteen", LevelBits::Sixteen)] {
+        let block = SensorMessage::Samples(head, Levels::Values(bits, &levels));
+        let n = block.encode(&mut frame).expect("room");
+        deframer.push(&frame[..n], &mut |f| seeds.push(("sensor_packet", name, f.to_vec())));
+    }
     // Frames of a recording without their checksums: a header with one body, a frame of one sample.
     let header = [&7i64.to_le_bytes()[..], &1u16.to_le_bytes(), b"\x04hare"].concat();
     let sample: Vec<u8> = (0..SAMPLE_BYTES as u8).collect();

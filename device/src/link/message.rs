@@ -136,6 +136,9 @@ fn write_echo(w: &mut Writer<'_>, e: &Echo) {
     w.u64(e.host_sent_ns).u64(e.device_received.0).u64(e.device_sent.0);
 }
 
+/// Flag of CONFIG: an LED code may stand there several times.
+const CODES_REPEAT: u8 = 1;
+
 impl Config {
     fn parse(p: &[u8]) -> Result<Self, PayloadError> {
         let kind = MessageType::Config;
@@ -166,7 +169,11 @@ impl Config {
         }
         Ok(Self {
             raster: raster(kind, p, 0)?,
-            schedule: PlaneSchedule::new(&specs[..count]).ok_or(field("led codes"))?,
+            schedule: match p[19] & CODES_REPEAT {
+                0 => PlaneSchedule::new(&specs[..count]),
+                _ => PlaneSchedule::with_repeats(&specs[..count]),
+            }
+            .ok_or(field("led codes"))?,
             rate: FrameRate::new(u32_at(p, 4), u32_at(p, 8)).ok_or(field("frame rate"))?,
             watchdog_us,
             underrun: match p[17] {
@@ -183,7 +190,8 @@ impl Config {
     fn write(&self, w: &mut Writer<'_>) {
         w.u16(self.raster.width() as u16).u16(self.raster.height() as u16);
         w.u32(self.rate.num()).u32(self.rate.den()).u32(self.watchdog_us);
-        w.u8(self.schedule.len() as u8).u8(self.underrun as u8).u8(self.late_slots).u8(0);
+        w.u8(self.schedule.len() as u8).u8(self.underrun as u8).u8(self.late_slots);
+        w.u8(if self.schedule.has_repeats() { CODES_REPEAT } else { 0 });
         w.u16(self.limits.mean_permille).u16(0).u64(self.epoch.0);
         w.u32(self.limits.window_ms).u32(self.limits.full_white_ms);
         for plane in self.schedule.planes() {

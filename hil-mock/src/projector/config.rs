@@ -1,8 +1,10 @@
 //! The properties of the mock projector, and its reports of light.
 
+use dpm_device::light::LightEvent;
 use dpm_device::link::{Codec, DeviceState, LightLimits, MAX_FLASHES_PER_S, VERSION};
-use dpm_device::planes::Raster;
+use dpm_device::planes::{PlaneSchedule, Raster};
 use dpm_device::time::HostTime;
+use std::sync::Arc;
 
 use super::DeviceClock;
 
@@ -35,6 +37,23 @@ pub struct MockConfig {
     pub limits: LightLimits,
     /// Light events kept for [`super::MockProjector::next_light`]; when full, the oldest are dropped and counted.
     pub events_kept: usize,
+    /// Lit slots that are kept with their planes for [`super::MockProjector::next_shown`]; when full, the oldest are
+    /// dropped and counted. Each holds a frame.
+    pub shown_kept: usize,
+}
+
+/// A lit slot that is over: what was on the mirrors, and when.
+#[derive(Clone, Debug)]
+pub struct Shown {
+    /// When, and which frame. Its last photon is that of the light that really fell.
+    pub event: LightEvent,
+    /// When the last plane would have ended had nothing cut the light short: the planes share the time from the first
+    /// photon to here equally.
+    pub planes_end_at: HostTime,
+    /// The order of the planes.
+    pub schedule: PlaneSchedule,
+    /// The planes, one after the other.
+    pub planes: Arc<[u8]>,
 }
 
 impl MockConfig {
@@ -55,6 +74,7 @@ impl MockConfig {
             flash_limit: Some(MAX_FLASHES_PER_S),
             limits: LightLimits::OFF,
             events_kept: 4096,
+            shown_kept: 0,
         }
     }
 }

@@ -29,6 +29,9 @@ pub fn light_of_planes(raster: Raster, schedule: &PlaneSchedule, planes: &[u8], 
     assert_eq!(planes.len(), plane_bytes * schedule.len(), "bytes of planes");
     assert_eq!(out.len(), raster.pixel_count(), "pixels of light");
     let (row_bytes, width) = (raster.row_bytes(), raster.width() as usize);
+    if schedule.has_repeats() {
+        return light_of_repeats(raster, schedule, planes, out);
+    }
     let has_white = schedule.planes().iter().any(|p| p.channel == Channel::White);
     for (y, row) in out.chunks_exact_mut(width).enumerate() {
         for (run, pixels) in row.chunks_mut(64).enumerate() {
@@ -59,6 +62,24 @@ pub fn light_of_planes(raster: Raster, schedule: &PlaneSchedule, planes: &[u8], 
                     if has_white {
                         *pixel = pixel.map(|p| p.saturating_add(code(3)));
                     }
+                }
+            }
+        }
+    }
+}
+
+/// The same for a schedule in which a bit of a channel may have several planes: plane by plane.
+fn light_of_repeats(raster: Raster, schedule: &PlaneSchedule, planes: &[u8], out: &mut [[u8; 3]]) {
+    out.fill([0; 3]);
+    for (spec, plane) in schedule.planes().iter().zip(planes.chunks_exact(raster.plane_bytes())) {
+        let rows = plane.chunks_exact(raster.row_bytes()).zip(out.chunks_exact_mut(raster.width() as usize));
+        for (row, pixels) in rows {
+            let is_lit = |x: &usize| row[x / 8] << (x % 8) & 0x80 != 0;
+            for (_, pixel) in pixels.iter_mut().enumerate().filter(|(x, _)| is_lit(x)) {
+                let add = |c: &mut u8| *c = c.saturating_add(1 << spec.bit);
+                match spec.channel {
+                    Channel::White => pixel.iter_mut().for_each(add),
+                    channel => add(&mut pixel[channel as usize]),
                 }
             }
         }

@@ -4,6 +4,7 @@ mod bodies;
 mod dlpc900;
 mod natnet;
 mod projector;
+mod sensor_wand;
 mod serial;
 mod usb;
 mod vrpn;
@@ -22,6 +23,8 @@ pub(crate) enum Device {
     Natnet(natnet::NatNetArguments),
     /// Bit-plane projector: a USB device over USB/IP, or on a serial port or pseudo-terminal
     Projector(projector::ProjectorArguments),
+    /// Tracked wand with a light sensor in the beam of a bit-plane projector: projector, NatNet server and sensor in one
+    SensorWand(Box<sensor_wand::SensorWandArguments>),
     /// Serial pose stream on a port or a pseudo-terminal
     Serial(serial::SerialArguments),
     /// VRPN server: poses over TCP
@@ -70,6 +73,7 @@ pub(crate) fn run(device: Device) -> Result<(), Box<dyn Error>> {
         Device::Dlpc900(arguments) => dlpc900::run(&arguments),
         Device::Natnet(arguments) => natnet::run(&arguments),
         Device::Projector(arguments) => projector::run(&arguments),
+        Device::SensorWand(arguments) => sensor_wand::run(&arguments),
         Device::Serial(arguments) => serial::run(&arguments),
         Device::Vrpn(arguments) => vrpn::run(&arguments),
     }

@@ -5,7 +5,7 @@ use std::fs::File;
 use std::io::Write;
 use std::path::{Path, PathBuf};
 use std::sync::{Arc, Mutex, PoisonError};
-use std::time::{Duration, Instant};
+use std::time::Duration;
 
 use clap::{Args, ValueEnum};
 use dpm_device::link::faults;
@@ -15,11 +15,12 @@ use dpm_device::transport::LinkDevice;
 use hil_mock::monotonic;
 use hil_mock::projector::serial::SerialProjector;
 use hil_mock::projector::usb::UsbProjector;
-use hil_mock::projector::{LightChange, MockConfig, MockProjector};
+use hil_mock::projector::{LightChange, MockConfig, MockProjector, Shown};
 use hil_mock::serial_server::pseudo_terminal;
 use hil_mock::usb_model::Speed;
+use hil_mock::usb_plug::{monotonic_clock, Clock};
 
-use super::usb::{offer, UsbArguments};
+use super::usb::{offer_by, UsbArguments};
 use super::{cannot_open, complain, say};
 
 /// Arguments of `hil-mock serve projector`.
@@ -69,12 +70,50 @@ fn raster(text: &str) -> Result<Raster, String> {
     raster.ok_or_else(|| format!("write it as 1024x768, each side 1 to {}", Raster::MAX_SIDE))
 }
 
+impl ProjectorArguments {
+    /// The mirrors.
+    pub(super) fn raster(&self) -> Raster {
+        self.raster
+    }
+}
+
+/// Something that sees the projector's light in the same process.
+pub(super) trait Beside {
+    /// Slots that were shown since the last call, and the instant up to which nothing else was.
+    fn see(&mut self, shown: Vec<Shown>, until: HostTime) -> Result<(), Box<dyn Error>>;
+}
+
+/// Nothing sees it.
+struct Nobody;
+
+impl Beside for Nobody {
+    fn see(&mut self, _: Vec<Shown>, _: HostTime) -> Result<(), Box<dyn Error>> {
+        Ok(())
+    }
+}
+
 /// Serves until the time is over or the port fails.
 pub(super) fn run(arguments: &ProjectorArguments) -> Result<(), Box<dyn Error>> {
+    run_beside(arguments, 0, monotonic_clock(), &mut Nobody)
+}
+
+/// What was shown since the last call.
+fn shown_by(projector: &mut MockProjector) -> (Vec<Shown>, HostTime) {
+    (std::iter::from_fn(|| projector.next_shown()).collect(), projector.shown_until())
+}
+
+/// The same by a given clock, with something that sees the light; `shown_kept` slots are kept for it.
+pub(super) fn run_beside(
+    arguments: &ProjectorArguments,
+    shown_kept: usize,
+    clock: Clock,
+    beside: &mut dyn Beside,
+) -> Result<(), Box<dyn Error>> {
     let projector = MockProjector::new(MockConfig {
         frame_buffers: arguments.buffers,
         serial: arguments.serial_number,
         events_kept: 0,
+        shown_kept,
         ..MockConfig::new(arguments.raster)
     });
     let log = arguments.light_log.as_deref().map(LightLog::create).transpose()?;
@@ -87,7 +126,7 @@ pub(super) fn run(arguments: &ProjectorArguments) -> Result<(), Box<dyn Error>> 
         ahead_ns: i64::MAX,
     };
     if let Some(port) = &arguments.port {
-        return serve_port(arguments, port, projector, &mut report);
+        return serve_port(arguments, port, projector, &mut report, &clock, beside);
     }
     let speed = match arguments.speed {
         SpeedWord::High => Speed::High,
@@ -95,10 +134,18 @@ pub(super) fn run(arguments: &ProjectorArguments) -> Result<(), Box<dyn Error>> 
     };
     let model = Arc::new(Mutex::new(UsbProjector::new(projector, speed, arguments.bytes_per_second)));
     let watched = model.clone();
-    offer(&arguments.usb, "bit-plane projector", model, move |clock| {
+    let mut failed = Ok(());
+    offer_by(&arguments.usb, "bit-plane projector", model, clock, |clock| {
         let mut model = watched.lock().unwrap_or_else(PoisonError::into_inner);
         report.look(clock(), model.projector());
-    })
+        let (shown, until) = shown_by(model.projector());
+        // The cable need not wait for what sees the light.
+        drop(model);
+        if failed.is_ok() {
+            failed = beside.see(shown, until);
+        }
+    })?;
+    failed
 }
 
 fn serve_port(
@@ -106,6 +153,8 @@ fn serve_port(
     port: &str,
     projector: MockProjector,
     report: &mut Report,
+    clock: &Clock,
+    beside: &mut dyn Beside,
 ) -> Result<(), Box<dyn Error>> {
     let (mut line, path, _other_end) = if port == "pty" {
         let (line, path, other_end) = pseudo_terminal()?;
@@ -116,16 +165,17 @@ fn serve_port(
     };
     say(format_args!("bit-plane projector on {path}"));
     let mut device = SerialProjector::new(projector);
-    let start = Instant::now();
     loop {
-        let now = HostTime(start.elapsed().as_nanos() as i64);
+        let now = clock();
         if arguments.usb.seconds.is_some_and(|s| now.0 as f64 >= s * 1e9) {
             return Ok(());
         }
-        if !device.serve(|| HostTime(start.elapsed().as_nanos() as i64), &mut line)? {
+        if !device.serve(|| clock(), &mut line)? {
             return Err(format!("{path} failed: unplugged? Check cable and adapter").into());
         }
-        report.look(HostTime(start.elapsed().as_nanos() as i64), device.projector());
+        report.look(clock(), device.projector());
+        let (shown, until) = shown_by(device.projector());
+        beside.see(shown, until)?;
         std::thread::sleep(Duration::from_micros(500));
     }
 }

@@ -33,11 +33,21 @@ pub(super) fn offer(
     arguments: &UsbArguments,
     name: &str,
     model: Arc<Mutex<dyn UsbDeviceModel>>,
+    look: impl FnMut(&dyn Fn() -> dpm_device::time::HostTime),
+) -> Result<(), Box<dyn Error>> {
+    offer_by(arguments, name, model, monotonic_clock(), look)
+}
+
+/// The same by a given clock.
+pub(super) fn offer_by(
+    arguments: &UsbArguments,
+    name: &str,
+    model: Arc<Mutex<dyn UsbDeviceModel>>,
+    clock: Clock,
     mut look: impl FnMut(&dyn Fn() -> dpm_device::time::HostTime),
 ) -> Result<(), Box<dyn Error>> {
     let plan = &arguments.faults;
     plan.check_supported(&[FaultKind::Unplug, FaultKind::Stall, FaultKind::Slow], "a USB cable")?;
-    let clock: Clock = monotonic_clock();
     let new_plug = || UsbPlug::new(model.clone(), clock.clone());
     let export = |plug: &UsbPlug| vec![Export::new("1-1", Arc::new(plug.clone()))];
     let mut plug = new_plug();

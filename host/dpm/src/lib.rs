@@ -2,5 +2,6 @@
 
 pub mod cli;
 mod dlpc900;
+mod pattern_dlpc900;
 mod run_dlpc900;
 pub mod signals;

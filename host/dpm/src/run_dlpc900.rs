@@ -44,6 +44,11 @@ const BUSY_PATIENCE_NS: u64 = 5_000_000_000;
 /// How often to query the controller's state, and to search for a lost controller.
 const LOOK_NS: u64 = 200_000_000;
 
+/// What every report on a DLPC900 says.
+pub(crate) const NO_WATCHDOG: &str =
+    "a DLPC900 has no watchdog: if this machine fails, or this program and its guard process are both killed, it continues \
+     to show its patterns; `dpm dlpc900 idle` ends that";
+
 /// Report of a run on a DLPC900.
 #[derive(Clone, Debug, serde::Serialize)]
 pub(crate) struct Dlpc900Report {
@@ -180,30 +185,11 @@ pub(crate) fn run_dlpc900(config: &RigConfig, monitor: &RunMonitor) -> Result<Dl
     let place = backend.device.as_deref().map(str::parse::<UsbPlace>).transpose();
     let place =
         place.map_err(|e| Failure::new(FailureKind::BadInput, format!("projector.backend.device: {e}")))?;
-    let waited = Stopwatch::start();
-    let mut open = || loop {
-        match UsbHid::open(place) {
-            Ok(port) => break Dlpc900::new(port),
-            Err(PortError::Busy) if waited.elapsed_ns() < BUSY_PATIENCE_NS && !monitor.stop_requested() => {
-                std::thread::sleep(STEP);
-            }
-            Err(source) => break Err(Dlpc900Error::Port { doing: describe(place), source }),
-        }
-    };
+    let mut open = opener(place, monitor);
     // Before minutes of rendering, check that the controller is connected and has the right DMD.
+    check_panel(&mut open, backend)?;
     let dmd = backend.panel.dmd();
-    let found = open()?.dmd();
-    if found != dmd {
-        let told = format!(
-            "projector.backend.panel = {:?}, the controller drives a {}",
-            backend.panel.word(),
-            found.name()
-        );
-        return Err(Failure::new(FailureKind::BadInput, told));
-    }
-    let mut warnings =
-        vec!["a DLPC900 has no watchdog: if this machine fails, or this program and its guard process are both killed, it continues \
-              to show its patterns; `dpm dlpc900 idle` ends that".into()];
+    let mut warnings = vec![NO_WATCHDOG.to_owned()];
     let (show, frames_loaded) = match backend.mode {
         Dlpc900Mode::Preloaded => {
             let (sequence, frames) = load(config, backend, dmd, &mut warnings, monitor)?;
@@ -224,6 +210,43 @@ pub(crate) fn run_dlpc900(config: &RigConfig, monitor: &RunMonitor) -> Result<Dl
     report.frames_loaded = frames_loaded;
     report.warnings = warnings;
     Ok(report)
+}
+
+/// Opens the controller at `place`, and waits a while for another process that still uses it.
+pub(crate) fn opener(
+    place: Option<UsbPlace>,
+    monitor: &RunMonitor,
+) -> impl FnMut() -> Result<Dlpc900<UsbHid>, Dlpc900Error> + '_ {
+    let waited = Stopwatch::start();
+    move || loop {
+        match UsbHid::open(place) {
+            Ok(port) => break Dlpc900::new(port),
+            Err(PortError::Busy) if waited.elapsed_ns() < BUSY_PATIENCE_NS && !monitor.stop_requested() => {
+                std::thread::sleep(STEP);
+            }
+            Err(source) => break Err(Dlpc900Error::Port { doing: describe(place), source }),
+        }
+    }
+}
+
+/// Checks that the controller is connected and drives the DMD that the rig file names.
+///
+/// # Errors
+/// It is not, or does not.
+pub(crate) fn check_panel(
+    open: &mut dyn FnMut() -> Result<Dlpc900<UsbHid>, Dlpc900Error>,
+    backend: &Dlpc900Config,
+) -> Result<(), Failure> {
+    let found = open()?.dmd();
+    if found == backend.panel.dmd() {
+        return Ok(());
+    }
+    let told = format!(
+        "projector.backend.panel = {:?}, the controller drives a {}",
+        backend.panel.word(),
+        found.name()
+    );
+    Err(Failure::new(FailureKind::BadInput, told))
 }
 
 /// Renders as many frames as fit.

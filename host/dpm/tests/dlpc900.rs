@@ -44,7 +44,7 @@ impl Bench {
 
     fn command(&self, words: &[&str]) -> Command {
         // Commands of `dpm` itself are passed as they are; everything else is a command of `dpm dlpc900`.
-        let own = ["run", "safe", "arm"].contains(&words[0]);
+        let own = ["run", "pattern", "safe", "arm"].contains(&words[0]);
         let words: Vec<&str> = (!own).then_some("dlpc900").into_iter().chain(words.iter().copied()).collect();
         let mut command = cli_common::command(&words);
         command.current_dir(&self.folder).envs(self.variables());
@@ -243,6 +243,33 @@ fn a_rig_shows_its_first_frames_over_and_over_and_puts_the_controller_to_rest() 
 }
 
 /// A rig in video mode, which renders nothing.
+/// Each step of a Gray code is one pattern of the controller, which shows them in turn for the time that they are held.
+#[test]
+fn a_pattern_is_uploaded_shown_and_ends_at_rest() {
+    let b = Bench::new("pattern", 1);
+    let text = "[projector]\nwidth = 1024\nheight = 768\nframe_rate = 60\n[projector.backend]\nkind = \"dlpc900\"\npanel = \"dlp5500\"\n";
+    std::fs::write(b.folder.join("rig.toml"), text).unwrap();
+    let out = b.ok(&["pattern", "gray-rows", "rig.toml", "--hold-ms", "250", "--seconds", "0.2", "--json"]);
+    let json: serde_json::Value = serde_json::from_str(&out).unwrap_or_else(|e| panic!("{e}: {out}"));
+    assert_eq!((&json["patterns"], &json["frames_loaded"]), (&20.into(), &20.into()), "{out}");
+    {
+        let m = b.model.lock().unwrap();
+        for step in 0..20 {
+            let grey = m.projected_grey(step).unwrap();
+            let gray = |y: usize| (y ^ y >> 1) >> (9 - step / 2) & 1;
+            let wanted = |y: usize| if gray(y) != step % 2 { 255 } else { 0 };
+            assert!(
+                grey.chunks_exact(1024).enumerate().all(|(y, row)| row.iter().all(|&p| p == wanted(y))),
+                "{step}"
+            );
+        }
+        assert_eq!(m.dark_because(), Some("mirrors exercised"));
+    }
+    let counter = b.dpm(&["pattern", "counter", "rig.toml"]);
+    let err = String::from_utf8_lossy(&counter.stderr).into_owned();
+    assert!(counter.status.code() == Some(2) && err.contains("cannot count frames; add --step"), "{err}");
+}
+
 fn video_rig(b: &Bench) {
     let text = "[projector]\nwidth = 1024\nheight = 768\nframe_rate = 60\nplanes = 8\n\
                 backend = { kind = \"dlpc900\", panel = \"dlp5500\", mode = \"video\" }\n\

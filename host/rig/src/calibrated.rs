@@ -1,12 +1,21 @@
 //! A calibration file into the projector's camera.
 
 use crate::config::{CalibrationUnit, ProjectorConfig};
-use crate::rig::RigError;
 use dpm_device::planes::Raster;
 use dpm_device::regular_file;
 use dpm_scene::camera_files::{self, Frame, LengthUnit, ReadOptions};
 use dpm_scene::geometry::projector::ProjectorCamera;
 use std::path::Path;
+
+/// The calibration file cannot be used.
+#[derive(Clone, Debug, thiserror::Error)]
+#[error("projector.calibration: {path}: {message}")]
+pub struct CameraFileError {
+    /// Path of the file.
+    pub path: String,
+    /// What is wrong.
+    pub message: String,
+}
 
 /// The projector that the file at `path` describes, at `raster`. Adds to `warnings` what was not read of the file.
 ///
@@ -17,8 +26,8 @@ pub(crate) fn calibrated_camera(
     path: &Path,
     raster: Raster,
     warnings: &mut Vec<String>,
-) -> Result<ProjectorCamera, RigError> {
-    let wrong = |message: String| RigError::Calibration { path: path.display().to_string(), message };
+) -> Result<ProjectorCamera, CameraFileError> {
+    let wrong = |message: String| CameraFileError { path: path.display().to_string(), message };
     let unit = match p.calibration_unit {
         Some(CalibrationUnit::Metre) => LengthUnit::Metre,
         Some(CalibrationUnit::Millimetre) => LengthUnit::Millimetre,

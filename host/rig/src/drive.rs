@@ -1,7 +1,6 @@
 //! What the rig file says of surfaces and of the projector's light, as the renderer's [`Drive`].
 
 use crate::config::{ResponseConfig, RigConfig, TableResponseConfig};
-use crate::rig::RigError;
 use dpm_device::planes::Raster;
 use dpm_device::regular_file;
 use dpm_render::drive::{Drive, Response};
@@ -16,11 +15,21 @@ const MAX_PICTURE_BYTES: u64 = 256 << 20;
 /// Pixels darker than this share of the brightest cannot be compensated.
 const LEAST_BRIGHTNESS: f32 = 0.02;
 
+/// A file that describes the projector's light cannot be used.
+#[derive(Clone, Debug, thiserror::Error)]
+#[error("{key}: {message}")]
+pub struct DriveError {
+    /// Configuration key.
+    pub key: &'static str,
+    /// What is wrong.
+    pub message: String,
+}
+
 /// Surfaces and projector of the rig file at a raster.
 ///
 /// # Errors
 /// A file cannot be used; the error names its key.
-pub(crate) fn drive(config: &RigConfig, scene: &Scene, raster: Raster) -> Result<Drive, RigError> {
+pub(crate) fn drive(config: &RigConfig, scene: &Scene, raster: Raster) -> Result<Drive, DriveError> {
     let gain_with = |albedo: [f64; 3]| -> [f32; 3] {
         let (intensity, white) = (config.projector.max_intensity.0, config.render.white);
         std::array::from_fn(|c| {
@@ -50,8 +59,8 @@ pub(crate) fn albedo_of(config: &RigConfig, tracked: Option<u16>) -> [f64; 3] {
     own.unwrap_or(config.scene.surface_albedo).0
 }
 
-fn response(config: &ResponseConfig) -> Result<Option<Response>, RigError> {
-    let wrong = |message: String| RigError::Light { key: "projector.response", message };
+fn response(config: &ResponseConfig) -> Result<Option<Response>, DriveError> {
+    let wrong = |message: String| DriveError { key: "projector.response", message };
     Ok(match config {
         ResponseConfig::Linear(_) => None,
         ResponseConfig::Gamma(c) => {
@@ -94,8 +103,8 @@ fn table(text: &str) -> Result<[[f64; 256]; 3], String> {
 }
 
 /// One over the relative brightness of each pixel and channel, from a linear picture of a white field of any size.
-fn flat_field(path: &Path, raster: Raster) -> Result<Arc<Vec<[f32; 3]>>, RigError> {
-    let wrong = |message: String| RigError::Light {
+fn flat_field(path: &Path, raster: Raster) -> Result<Arc<Vec<[f32; 3]>>, DriveError> {
+    let wrong = |message: String| DriveError {
         key: "projector.flat_field",
         message: format!("{}: {message}", path.display()),
     };

@@ -28,10 +28,10 @@
 //! # }
 //! ```
 
-mod calibrated;
+pub mod calibrated;
 pub mod config;
 pub mod control;
-mod drive;
+pub mod drive;
 mod engine;
 pub mod failure;
 pub mod frame;
@@ -40,6 +40,7 @@ pub mod light;
 mod mock;
 pub mod order;
 pub mod pack;
+pub mod pattern;
 pub mod pictures;
 pub mod pipeline;
 pub mod plan;

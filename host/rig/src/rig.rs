@@ -1,10 +1,10 @@
 //! Builds the parts of a rig from a checked configuration: scene, projector, bodies with their motions, tracker.
 
-use crate::calibrated::calibrated_camera;
+use crate::calibrated::{calibrated_camera, CameraFileError};
 use crate::config::{BodyConfig, BuiltinScene, EnvironmentConfig, GazeConfig, RigConfig, TrackerConfig};
-use crate::drive::{albedo_of, drive};
+use crate::drive::{albedo_of, drive, DriveError};
 use crate::mock::{Motion, MotionError, MotionSpec};
-use dpm_device::planes::Raster;
+use dpm_device::planes::{PlaneSchedule, Raster};
 use dpm_device::pose::Pose;
 use dpm_device::time::FrameRate;
 use dpm_render::drive::Drive;
@@ -42,21 +42,11 @@ pub enum RigError {
         message: String,
     },
     /// The calibration file cannot be used.
-    #[error("projector.calibration: {path}: {message}")]
-    Calibration {
-        /// Path of the file.
-        path: String,
-        /// What is wrong.
-        message: String,
-    },
+    #[error(transparent)]
+    Calibration(#[from] CameraFileError),
     /// A file that describes the projector's light cannot be used.
-    #[error("{key}: {message}")]
-    Light {
-        /// Configuration key.
-        key: &'static str,
-        /// What is wrong.
-        message: String,
-    },
+    #[error(transparent)]
+    Drive(#[from] DriveError),
     /// No body has this name.
     #[error("{key}: no body is named \"{name}\"; bodies: {known}")]
     UnknownBody {
@@ -151,6 +141,8 @@ pub struct Rig {
     pub bodies: Vec<RigBody>,
     /// The observer's eye.
     pub observer: Observer,
+    /// The planes of a frame in the order in which they are shown.
+    pub schedule: PlaneSchedule,
     /// From radiance to code values.
     pub drive: Drive,
 }
@@ -187,7 +179,23 @@ impl Rig {
         let bodies = rig_bodies(config, &scene)?;
         let observer = observer(config, &bodies)?;
         let drive = drive(config, &scene, raster)?;
-        Ok(Self { config: config.clone(), scene, camera, bodies, observer, drive })
+        let schedule = config.projector.schedule();
+        Ok(Self { config: config.clone(), scene, camera, bodies, observer, schedule, drive })
+    }
+
+    /// The projector of a rig alone, without scene, bodies or calibration: for light that nothing is traced for.
+    ///
+    /// # Errors
+    /// The projector's place or view makes no camera.
+    pub fn of_projector(config: &RigConfig) -> Result<Self, RigError> {
+        let mut config = config.clone();
+        config.keep_projector();
+        let raster = config.projector.raster();
+        let camera = camera(&config, raster, &mut Vec::new())?;
+        let observer = observer(&config, &[])?;
+        let (scene, bodies) = (Scene::default(), Vec::new());
+        let (schedule, drive) = (config.projector.schedule(), Drive::default());
+        Ok(Self { config, scene, camera, bodies, observer, schedule, drive })
     }
 
     /// Frames per second.
@@ -271,7 +279,7 @@ fn camera(
             p.horizontal_fov_deg.to_radians(),
         )?);
     };
-    calibrated_camera(p, path, raster, warnings)
+    Ok(calibrated_camera(p, path, raster, warnings)?)
 }
 
 fn motion_spec(index: usize, body: &BodyConfig) -> Result<MotionSpec, RigError> {

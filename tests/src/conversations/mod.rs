@@ -3,6 +3,7 @@
 //! reached; what a conversation patches in stands at its head.
 
 pub mod link;
+pub mod sensor;
 pub mod trackers;
 pub mod usb;
 
@@ -63,7 +64,7 @@ impl HostClock for Moved {
 /// Conversations as scripts of the entries, with the target and a name of each: what real ends say to each other, or
 /// what leads through the states of one end. `tests/tests/corpora.rs` writes them down as seeds.
 pub fn recorded() -> Vec<(&'static str, &'static str, Vec<u8>)> {
-    [trackers::recorded(), usb::recorded(), link::recorded()].concat()
+    [trackers::recorded(), usb::recorded(), link::recorded(), sensor::recorded()].concat()
 }
 
 /// `N` bytes from the front of `bytes`, zeros where it has no more.

@@ -25,7 +25,7 @@ use std::net::{Ipv4Addr, SocketAddr, SocketAddrV4, UdpSocket};
 use std::sync::{Arc, Mutex};
 
 /// When every conversation begins: not at zero, so that an instant before it exists.
-const BEGIN_NS: i64 = 10_000_000_000;
+pub(super) const BEGIN_NS: i64 = 10_000_000_000;
 
 fn bodies() -> Vec<BodyKey> {
     vec![BodyKey { name: "hare".into(), id: None }, BodyKey { name: "bust".into(), id: Some(2) }]
@@ -70,14 +70,14 @@ struct Line {
 
 /// A connection in memory, whose far end is the test.
 #[derive(Clone, Default)]
-struct Memory(Arc<Mutex<Line>>);
+pub(super) struct Memory(Arc<Mutex<Line>>);
 
 impl Memory {
-    fn say(&self, bytes: &[u8]) {
+    pub(super) fn say(&self, bytes: &[u8]) {
         self.0.lock().expect("no panic").to_client.extend(bytes);
     }
 
-    fn heard(&self) -> Vec<u8> {
+    pub(super) fn heard(&self) -> Vec<u8> {
         std::mem::take(&mut self.0.lock().expect("no panic").from_client)
     }
 

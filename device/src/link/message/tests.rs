@@ -74,6 +74,33 @@ fn golden_messages_of_the_host() {
     host(HostMessage::Safe, MessageType::Safe, "");
 }
 
+/// Planes of equal light: a flag permits what is refused without it, and no mirror may become brighter than white.
+#[test]
+fn an_led_code_may_repeat_only_where_the_flag_says_so() {
+    let equal = [PlaneSpec { channel: Channel::White, bit: 6 }; 3];
+    let config = Config {
+        raster: Raster::new(8, 8).unwrap(),
+        schedule: PlaneSchedule::with_repeats(&equal).unwrap(),
+        rate: FrameRate::new(60, 1).unwrap(),
+        watchdog_us: 1,
+        underrun: Underrun::Repeat,
+        late_slots: 0,
+        epoch: DeviceTicks(0),
+        limits: LightLimits::OFF,
+    };
+    let mut out = [0; MAX_CONTROL_BYTES];
+    let (kind, n) = HostMessage::Config(config).write(&mut out);
+    assert_eq!(out[16..20], [3, 0, 0, 1]);
+    assert_eq!(HostMessage::parse(kind, &out[..n]), Ok(HostMessage::Config(config)));
+    out[19] = 0;
+    assert!(HostMessage::parse(kind, &out[..n]).is_err(), "a code twice without the flag");
+    (out[19], out[40]) = (1, 0x37);
+    assert!(HostMessage::parse(kind, &out[..n]).is_err(), "128 + 64 + 64 of 255");
+    assert!(PlaneSchedule::with_repeats(&[equal[0]; 4]).is_none());
+    assert!(PlaneSchedule::equal24().has_repeats() && !PlaneSchedule::rgb24().has_repeats());
+    assert_eq!(PlaneSchedule::with_repeats(PlaneSchedule::rgb24().planes()), Some(PlaneSchedule::rgb24()));
+}
+
 #[test]
 fn golden_messages_of_the_device() {
     device(

@@ -10,6 +10,7 @@ mod keys;
 mod link_test;
 mod order;
 mod os;
+mod pattern;
 mod plan;
 mod profile;
 mod progress;
@@ -73,6 +74,8 @@ enum Command {
     /// several rigs run, select one with --pid.
     #[command(visible_alias = "resume")]
     Arm(order::OrderArgs),
+    /// Show a pattern on a rig's projector, for aiming, focusing and calibrating, or write it as PNG files
+    Pattern(pattern::PatternArgs),
     /// Record the samples of a rig's tracker into a file that `tracker.kind = "replay"` plays
     Record(record::RecordArgs),
     /// Measure where the time between motion and light goes
@@ -136,6 +139,7 @@ fn dispatch(command: &Command) -> Result<(), Failure> {
         Command::Freeze(args) => order::execute(args, Order::Freeze),
         Command::Safe(args) => order::execute(args, Order::Safe),
         Command::Arm(args) => order::execute(args, Order::Arm),
+        Command::Pattern(args) => pattern::execute(args),
         Command::Record(args) => record::execute(args),
         Command::Profile(args) => profile::execute(args),
         Command::Doctor(args) => doctor::execute(args),

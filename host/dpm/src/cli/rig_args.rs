@@ -108,7 +108,7 @@ impl RigArgs {
     /// # Errors
     /// Every mistake in file, environment and flags.
     pub(super) fn rig(&self, path: Option<&Path>) -> Result<RigConfig, Failure> {
-        self.rig_for(path, false)
+        self.rig_for(path, Purpose::default())
     }
 
     /// The same for a command that runs nothing, or that determines the number of frames itself: the end of a run in
@@ -117,15 +117,30 @@ impl RigArgs {
     /// # Errors
     /// As [`RigArgs::rig`].
     pub(crate) fn rig_at_rest(&self, path: Option<&Path>) -> Result<RigConfig, Failure> {
-        self.rig_for(path, true)
+        self.rig_for(path, Purpose { at_rest: true, ..Purpose::default() })
     }
 
-    fn rig_for(&self, path: Option<&Path>, at_rest: bool) -> Result<RigConfig, Failure> {
+    /// Reads the rig file `path` for a command that uses nothing but its projector, until it is stopped: the end of a
+    /// run in the file does not matter, and what the scene and the tracker are does not either. `at_rest`: nothing
+    /// runs.
+    ///
+    /// # Errors
+    /// As [`RigArgs::rig`].
+    pub(super) fn rig_of_projector(&self, path: &Path, at_rest: bool) -> Result<RigConfig, Failure> {
+        let purpose = Purpose { at_rest, projector_only: true, ..Purpose::default() };
+        let mut endless = self.clone();
+        if self.frames.is_none() && self.seconds.is_none() {
+            endless.set.splice(0..0, ["run.frames=0".to_owned(), "run.seconds=0.0".to_owned()]);
+        }
+        endless.rig_for(Some(path), purpose)
+    }
+
+    fn rig_for(&self, path: Option<&Path>, purpose: Purpose) -> Result<RigConfig, Failure> {
         // Clients that give orders to this process are informed which rig it is.
         path.into_iter().for_each(set_rig_name);
         let read = |flags: Vec<String>, at_rest: bool| {
             let overrides = Overrides::from_environment(flags);
-            let purpose = Purpose { simulate: self.simulate, at_rest };
+            let purpose = Purpose { simulate: self.simulate, at_rest, ..purpose };
             match path {
                 Some(path) => RigConfig::load_for(path, &overrides, purpose),
                 None => RigConfig::demo_for(&overrides, purpose),
@@ -141,13 +156,13 @@ impl RigArgs {
                 flags.insert(0, format!("projector.calibration_raster=[{}, {}]", p.width, p.height));
             }
         }
-        let Some(seconds) = self.seconds else { return Ok(read(flags, at_rest)?) };
+        let Some(seconds) = self.seconds else { return Ok(read(flags, purpose.at_rest)?) };
         if !(seconds > 0.0 && seconds <= 1e9) {
             let told = format!("--seconds {seconds:?}: must be above 0 and at most 1e9");
             return Err(Failure::new(FailureKind::BadInput, told));
         }
         flags.extend(["run.frames=0".to_owned(), format!("run.seconds={seconds:?}")]);
-        Ok(read(flags, at_rest)?)
+        Ok(read(flags, purpose.at_rest)?)
     }
 }
 

@@ -2,8 +2,8 @@
 
 use super::CpuCase;
 use crate::reference::Sampler;
+use dpm_calibration::pinhole::{calibrate, recalibrate, CalibrationError, CalibrationOptions, Pair};
 use dpm_device::planes::Raster;
-use dpm_scene::geometry::calibration::{calibrate, recalibrate, CalibrationError, CalibrationOptions, Pair};
 use dpm_scene::geometry::lens::Lens;
 use dpm_scene::geometry::projector::ProjectorCamera;
 use glam::{DVec2, DVec3};

@@ -3,8 +3,8 @@
 
 use crate::reference::Sampler;
 use crate::stability::calibration::{cloud, off, pairs, truth};
+use dpm_calibration::pinhole::*;
 use dpm_device::planes::Raster;
-use dpm_scene::geometry::calibration::*;
 use dpm_scene::geometry::projector::ProjectorCamera;
 use glam::{DVec2, DVec3};
 

@@ -123,6 +123,8 @@ pub struct Purpose {
     pub simulate: bool,
     /// Nothing runs, so the check does not ask for an end in `run.frames` or `run.seconds`.
     pub at_rest: bool,
+    /// Only the projector is used; see [`RigConfig::keep_projector`].
+    pub projector_only: bool,
 }
 
 impl RigConfig {
@@ -156,6 +158,21 @@ impl RigConfig {
         if !matches!(self.projector.backend, ProjectorBackend::Mock(_)) {
             self.projector.backend = ProjectorBackend::default();
         }
+    }
+
+    /// Forgets everything that says what light is drawn: scene, tracker, observer and the projector's calibration, so
+    /// that none of them has to exist. Pictures, traces and the flight recorder of a run tell of those, so none is
+    /// written.
+    pub fn keep_projector(&mut self) {
+        self.scene = SceneConfig::default();
+        self.tracker = TrackerConfig::default();
+        self.observer = ObserverConfig::default();
+        let projector = &mut self.projector;
+        (projector.calibration, projector.calibration_unit) = (None, None);
+        (projector.calibration_camera, projector.calibration_region) = (None, None);
+        (self.projector.flat_field, self.projector.response) = (None, ResponseConfig::default());
+        let output = &mut self.output;
+        (output.images, output.trace, output.flight_recorder) = (false, false, false);
     }
 
     /// Number of slots in `run.seconds`, at least one; 0 if there is no limit.
@@ -251,6 +268,9 @@ impl RigConfig {
                 // The keys of the replaced parts are not used, but must still make sense.
                 check::addresses(&rig, &mut reader);
                 rig.simulate();
+            }
+            if purpose.projector_only {
+                rig.keep_projector();
             }
             check::check(&rig, purpose, &mut reader);
             check::resolve_files(&mut rig, base, &mut reader);

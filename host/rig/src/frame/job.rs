@@ -79,6 +79,8 @@ pub(crate) struct FrameMemory {
     pub gpu: Option<FrameSlot>,
     /// Bit planes.
     pub planes: BitPlaneFrame,
+    /// The picture of a pattern that the planes hold; `None` for every other content.
+    pub picture: Option<u64>,
 }
 
 /// A frame and its memory.

@@ -454,7 +454,7 @@ impl Collector {
                 let Some(mut record) = self.pending.pop_front() else { return };
                 let last_photon_at = note.event.last_photon_at;
                 let exposure_ns = last_photon_at.ns_since(begin);
-                let centre_at = begin.plus_ns(centre_ns(&self.rig.config.projector.schedule(), exposure_ns));
+                let centre_at = begin.plus_ns(centre_ns(&self.rig.schedule, exposure_ns));
                 record.timeline.lit_at = Some(begin);
                 record.timeline.centre_at = Some(centre_at);
                 record.timeline.last_photon_at = Some(last_photon_at);

@@ -112,7 +112,7 @@ impl Crew {
         parts: CrewParts,
         notes_back: &NotesBack,
     ) -> Result<(Self, Port), PipelineError> {
-        let CrewParts { tracking, renderer, prepared, kernel, budget, memory, frame_ns } = parts;
+        let CrewParts { tracking, renderer, pictures, kernel, budget, memory, frame_ns } = parts;
         let rig = &shared.facts.rig;
         let policy = policy(rig);
         let facts = Arc::new(CrewFacts::new(rig, frame_ns));
@@ -172,7 +172,7 @@ impl Crew {
             named("pack")
                 .spawn(move || {
                     let inbox = PackInbox { jobs: to_pack_out, gpu_waker };
-                    pack_thread(&shared, &state, stage, kernel, prepared, inbox, to_link_in);
+                    pack_thread(&shared, &state, stage, kernel, pictures, inbox, to_link_in);
                     state.returned[PACK].store(true, Ordering::Release);
                 })
                 .map_err(refused("pack"))?

@@ -10,14 +10,16 @@ use crate::frame::job::FrameMemory;
 use crate::light::recorder::{LightNote, LightRecorder};
 use crate::mock::{DeviceClock, EmulatedProjector, MockConfig};
 use crate::pack::prepared::PreparedFrames;
+use crate::pack::source::{PatternPainter, PatternSource, Pictures};
 use crate::pipeline::projector;
 use crate::plan::budget::BudgetController;
 use crate::plan::link_time::LinkTime;
 use crate::rig::{Rig, RigError};
 use crate::telemetry::monitor::RunMonitor;
-use crate::tracks::{open_for, TrackingStage};
-use dpm_device::link::HostLink;
+use crate::tracks::{open_for, NoTracker, TrackingStage};
+use dpm_device::link::{HostLink, LinkSettings};
 use dpm_device::time::{HostClock, HostTime};
+use dpm_device::tracker::Tracker;
 use dpm_device::transport::Transport;
 use dpm_handoff::channel::Sender;
 use dpm_render::gpu::Gpu;
@@ -29,12 +31,48 @@ use std::sync::Arc;
 /// busy machine.
 pub(super) const FIRST_FRAME_TIMEOUT_NS: u64 = 180_000_000_000;
 
+/// Where the pictures of a run come from.
+#[derive(Clone)]
+pub(super) enum Origin {
+    /// A GPU traces them.
+    Gpu(Arc<Gpu>),
+    /// They are prepared and marked.
+    Prepared,
+    /// They are patterns: nothing is traced, and no tracker is asked.
+    Pattern(Arc<dyn PatternSource>),
+}
+
+impl Origin {
+    /// The GPU, if there is one.
+    pub(super) fn gpu(&self) -> Option<&Arc<Gpu>> {
+        match self {
+            Self::Gpu(gpu) => Some(gpu),
+            _ => None,
+        }
+    }
+
+    /// The frames carry marks, by which torn light is found.
+    pub(super) fn is_marked(&self) -> bool {
+        matches!(self, Self::Prepared)
+    }
+
+    /// What gives the pictures if no GPU does.
+    fn pictures(&self, raster: dpm_device::planes::Raster) -> Option<Pictures> {
+        match self {
+            Self::Gpu(_) => None,
+            Self::Prepared => Some(Pictures::Marked(PreparedFrames::new(raster))),
+            Self::Pattern(source) => Some(Pictures::Drawn(PatternPainter::new(source.clone(), raster))),
+        }
+    }
+}
+
 /// What tracking, plan and pack need.
 pub(super) struct CrewParts {
     pub(super) tracking: TrackingStage,
-    /// `None` if frames are prepared.
+    /// `None` if nothing is rendered.
     pub(super) renderer: Option<Renderer>,
-    pub(super) prepared: Option<PreparedFrames>,
+    /// `None` if a GPU renders.
+    pub(super) pictures: Option<Pictures>,
     /// How to pack planes if the GPU does not.
     pub(super) kernel: Kernel,
     /// `None` if every frame gets the rays that the rig file asks for.
@@ -46,14 +84,13 @@ pub(super) struct CrewParts {
 }
 
 impl CrewParts {
-    /// Without a GPU, frames are prepared instead of rendered. Trackers outside this process stamp their packets with
-    /// `clock`.
+    /// Trackers outside this process stamp their packets with `clock`.
     ///
     /// # Errors
     /// The tracker cannot be opened, or the GPU refuses.
     pub(super) fn new(
         rig: &Rig,
-        gpu: Option<&Arc<Gpu>>,
+        origin: &Origin,
         options: RunOptions,
         clock: Arc<dyn HostClock>,
     ) -> Result<Self, PipelineError> {
@@ -61,15 +98,19 @@ impl CrewParts {
             output: output(rig, gpu, options.verify),
             ..renderer_settings(rig)
         };
-        let mut renderer = gpu.map(|gpu| Renderer::new(gpu, &rig.scene, settings(gpu))).transpose()?;
-        let tracker = open_for(rig, clock, HostTime(0))?;
+        let mut renderer =
+            origin.gpu().map(|gpu| Renderer::new(gpu, &rig.scene, settings(gpu))).transpose()?;
+        let tracker: Box<dyn Tracker> = match origin {
+            Origin::Pattern(_) => Box::new(NoTracker),
+            _ => open_for(rig, clock, HostTime(0))?,
+        };
         let memory = (0..options.in_flight.max(2))
             .map(|_| frame_memory(rig, renderer.as_mut()))
             .collect::<Result<_, _>>()?;
         Ok(Self {
             tracking: TrackingStage::new(rig, tracker),
             renderer,
-            prepared: gpu.is_none().then(|| PreparedFrames::new(rig.camera.raster)),
+            pictures: origin.pictures(rig.camera.raster),
             kernel: Kernel::best(),
             budget: None,
             memory,
@@ -102,7 +143,8 @@ impl CrewParts {
 /// Memory for one frame, with its slot on the GPU if a GPU renders.
 fn frame_memory(rig: &Rig, renderer: Option<&mut Renderer>) -> Result<FrameMemory, PipelineError> {
     let gpu = renderer.map(|renderer| renderer.create_slot(false)).transpose().map_err(RenderError::from)?;
-    Ok(FrameMemory { gpu, planes: BitPlaneFrame::new(rig.camera.raster, rig.config.projector.schedule()) })
+    let planes = BitPlaneFrame::new(rig.camera.raster, rig.schedule);
+    Ok(FrameMemory { gpu, planes, picture: None })
 }
 
 /// The mock projector that the rig file describes in `mock`, dark, with a recorder that reports its light to
@@ -125,7 +167,7 @@ pub(super) fn mock_projector(
     setup.flash_limit = projector::flash_limit(config);
     let emulated = EmulatedProjector::new(setup, &mock.faults, config.render.seed, start)
         .map_err(|e| RigError::Unsupported(format!("projector.backend.faults: {e}")))?;
-    let marks = marked.then(|| config.projector.schedule());
+    let marks = marked.then_some(rig.schedule);
     let recorder = LightRecorder::new(lights, options.keep_frames, options.verify, marks);
     Ok((emulated, recorder))
 }
@@ -140,7 +182,8 @@ pub(super) fn bring_up(
     monitor: &RunMonitor,
     now: &mut dyn FnMut() -> HostTime,
 ) -> Result<(HostLink, LinkTime), PipelineError> {
-    let mut link = HostLink::new(projector::link_settings(&rig.config, rig.camera.raster));
+    let settings = projector::link_settings(&rig.config, rig.camera.raster);
+    let mut link = HostLink::new(LinkSettings { schedule: rig.schedule, ..settings });
     let acknowledged = if rig.config.safety.acknowledge_faults { u32::MAX } else { ENDED_WITH_THE_LAST_RUN };
     let time = connect(&mut link, medium, acknowledged, monitor, now, &|| monitor.stop_requested())?;
     Ok((link, time))

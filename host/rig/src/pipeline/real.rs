@@ -3,7 +3,7 @@
 
 use super::crew::{Crew, NotesBack, OnExit, Port};
 use super::link::{device_thread, link_thread, Line};
-use super::parts::{bring_up, mock_projector, CrewParts};
+use super::parts::{bring_up, mock_projector, CrewParts, Origin};
 use super::projector;
 use super::rights::Rights;
 use super::run::{Ran, LIGHTS};
@@ -31,7 +31,6 @@ use dpm_device::transport::Transport;
 use dpm_handoff::channel::{channel, Sender};
 use dpm_handoff::path::Lock;
 use dpm_handoff::wake::WaitPolicy;
-use dpm_render::gpu::Gpu;
 use dpm_render::RenderError;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::Arc;
@@ -57,19 +56,19 @@ const END_WITHIN: Duration = Duration::from_secs(1);
 
 pub(super) fn run_at_real_pace(
     rig: &Arc<Rig>,
-    gpu: Option<&Arc<Gpu>>,
+    origin: &Origin,
     options: RunOptions,
     monitor: &Arc<RunMonitor>,
 ) -> Result<Ran, PipelineError> {
     // On a machine with fewer cores than stages, a spinning thread delays the very stages that it waits for.
     let clock = MonotonicClock::new(if usable_cores() > STAGE_THREADS { 50_000 } else { 0 });
-    let parts = crew_parts(rig, gpu, options, clock)?;
+    let parts = crew_parts(rig, origin, options, clock)?;
     let (lights_in, lights) = channel(LIGHTS, WaitPolicy::Park);
     let rights = Arc::new(Rights::new(&rig.config.real_time));
     let standstill =
         StandstillMonitor::start(Arc::new(clock.sleeping()), STANDSTILL_NS, rights.highest_priority()).ok();
     let watch = Stopwatch::start();
-    let mut far = open_far_end(rig, lights_in, options, gpu.is_none(), clock, &rights)?;
+    let mut far = open_far_end(rig, lights_in, options, origin.is_marked(), clock, &rights)?;
     let (link, time) = bring_up(rig, far.medium.as_mut(), monitor, &mut || {
         clock.wait_until(clock.now().plus_ns(CONNECT_STEP_NS))
     })?;
@@ -89,9 +88,9 @@ pub(super) fn run_at_real_pace(
         rights: rights.clone(),
     });
     let mut collector = Collector::new(rig.clone(), options.keep_frames, options.verify)
-        .about(gpu.is_none(), standstill.as_ref().map(StandstillMonitor::seen));
+        .about(origin.gpu().is_none(), standstill.as_ref().map(StandstillMonitor::seen));
 
-    let maker = maker(rig, gpu.cloned(), options, clock);
+    let maker = maker(rig, origin.clone(), options, clock);
     let (threads, mut inbox, notes_back) = Threads::start(&shared, parts, line, maker, lights)?;
     // A panic before the end of this function ends the light.
     let stop_on_panic = OnExit(|| {
@@ -123,29 +122,30 @@ pub(super) fn run_at_real_pace(
 
 fn crew_parts(
     rig: &Rig,
-    gpu: Option<&Arc<Gpu>>,
+    origin: &Origin,
     options: RunOptions,
     clock: MonotonicClock,
 ) -> Result<CrewParts, PipelineError> {
-    CrewParts::new(rig, gpu, options, Arc::new(move || clock.now()))?.at_real_pace(rig)
+    CrewParts::new(rig, origin, options, Arc::new(move || clock.now()))?.at_real_pace(rig)
 }
 
 /// Makes crews that take over. A GPU that failed is reopened with the same options.
-fn maker(rig: &Arc<Rig>, gpu: Option<Arc<Gpu>>, options: RunOptions, clock: MonotonicClock) -> Maker {
+fn maker(rig: &Arc<Rig>, origin: Origin, options: RunOptions, clock: MonotonicClock) -> Maker {
     let rig = rig.clone();
-    let gpu = Lock::new(gpu);
+    let origin = Lock::new(origin);
     Arc::new(move |remake| {
-        let mut gpu = gpu.lock().map_err(|_| PipelineError::Panicked("remake"))?;
-        if let (Some(old), Remake::CrewAndGpu) = (gpu.as_mut(), remake) {
+        let mut origin = origin.lock().map_err(|_| PipelineError::Panicked("remake"))?;
+        if let (Origin::Gpu(old), Remake::CrewAndGpu) = (&mut *origin, remake) {
             *old = old.reopen().map_err(RenderError::from)?;
         }
-        crew_parts(&rig, gpu.as_ref(), options, clock)
+        crew_parts(&rig, &origin, options, clock)
     })
 }
 
 /// Reports how long prediction may extend a body's track if the rig file leaves it open.
 fn tell_horizon(facts: &Facts) {
-    if facts.rig.config.safety.predict_ms.is_none() {
+    // Without a body there is nothing to predict.
+    if facts.rig.config.safety.predict_ms.is_none() && !facts.rig.bodies.is_empty() {
         let ms = facts.predict_ns.load(Ordering::Relaxed) as f64 / 1e6;
         facts.monitor.note(format!(
             "safety.predict_ms is not set: prediction may extend a body's track for {ms:.0} ms plus the tracker's latency; the value follows \
@@ -177,7 +177,7 @@ fn open_far_end(
     let backend = &config.projector.backend;
     if let ProjectorBackend::Mock(mock) = backend {
         let (mock, recorder) = mock_projector(rig, mock, lights, options, marked, clock.now())?;
-        let frame_bytes = projector::frame_bytes(raster, config.projector.schedule().len());
+        let frame_bytes = projector::frame_bytes(raster, rig.schedule.len());
         let (host_end, device_end) = threaded(frame_bytes, CABLE_BUFFERS, policy(rig));
         let rights = rights.clone();
         let device =

@@ -1,6 +1,7 @@
 //! One run, from a rig to a report.
 
 use super::outcome::RunOutcome;
+use super::parts::Origin;
 use super::real::run_at_real_pace;
 use super::virtual_pace::run_at_virtual_pace;
 use crate::config::Pace;
@@ -9,6 +10,7 @@ use crate::engine::facts::Facts;
 use crate::engine::options::RunOptions;
 use crate::light::collector::Collector;
 use crate::light::recorder::LightRecorder;
+use crate::pack::source::PatternSource;
 use crate::rig::Rig;
 use crate::telemetry::monitor::RunMonitor;
 use crate::telemetry::projector::ProjectorReport;
@@ -32,7 +34,7 @@ pub fn run(
     options: RunOptions,
     monitor: &Arc<RunMonitor>,
 ) -> Result<RunOutcome, PipelineError> {
-    run_from(rig, Some(gpu), options, monitor)
+    run_from(rig, &Origin::Gpu(gpu.clone()), options, monitor)
 }
 
 /// Like [`run`] with prepared frames instead of rendered ones, without a GPU. Every lit frame is checked for parts of
@@ -45,21 +47,40 @@ pub fn run_prepared(
     options: RunOptions,
     monitor: &Arc<RunMonitor>,
 ) -> Result<RunOutcome, PipelineError> {
-    run_from(rig, None, RunOptions { verify: false, ..options }, monitor)
+    run_from(rig, &Origin::Prepared, RunOptions { verify: false, ..options }, monitor)
+}
+
+/// Shows the pictures of `source`, without a GPU and without a tracker, whatever the rig's tracker is.
+///
+/// # Errors
+/// As for [`run`], except those of the GPU and of the tracker.
+pub fn run_pattern(
+    rig: Arc<Rig>,
+    source: Arc<dyn PatternSource>,
+    options: RunOptions,
+    monitor: &Arc<RunMonitor>,
+) -> Result<RunOutcome, PipelineError> {
+    let rig = match source.schedule() {
+        Some(schedule) if schedule != rig.schedule => {
+            Arc::new(Rig { schedule, ..Rig::of_projector(&rig.config)? })
+        }
+        _ => rig,
+    };
+    run_from(rig, &Origin::Pattern(source), options, monitor)
 }
 
 fn run_from(
     rig: Arc<Rig>,
-    gpu: Option<&Arc<Gpu>>,
+    origin: &Origin,
     options: RunOptions,
     monitor: &Arc<RunMonitor>,
 ) -> Result<RunOutcome, PipelineError> {
     let ran = match rig.config.real_time.pace {
         // Hashing every frame costs a millisecond at full size, which only virtual pace can afford.
-        Pace::Real => run_at_real_pace(&rig, gpu, RunOptions { verify: false, ..options }, monitor),
-        Pace::Virtual => run_at_virtual_pace(&rig, gpu, options, monitor),
+        Pace::Real => run_at_real_pace(&rig, origin, RunOptions { verify: false, ..options }, monitor),
+        Pace::Virtual => run_at_virtual_pace(&rig, origin, options, monitor),
     }?;
-    Ok(ran.into_outcome(&rig, gpu))
+    Ok(ran.into_outcome(&rig, origin))
 }
 
 /// What remains when the light of a run is over.
@@ -76,17 +97,22 @@ pub(super) struct Ran {
 }
 
 impl Ran {
-    fn into_outcome(self, rig: &Rig, gpu: Option<&Arc<Gpu>>) -> RunOutcome {
+    fn into_outcome(self, rig: &Rig, origin: &Origin) -> RunOutcome {
         let Self { facts, mut collector, slots, recorder, carried, wall_s, standstills, warnings } = self;
         let config = &rig.config;
+        let gpu = origin.gpu();
         let mut report = Report {
             raster: [rig.camera.raster.width(), rig.camera.raster.height()],
-            planes: config.projector.schedule().len() as u32,
+            planes: rig.schedule.len() as u32,
             frame_rate_hz: rig.rate().hz(),
             pace: config.real_time.pace.word(),
             gpu: gpu.map_or_else(|| "none".into(), |gpu| gpu.summary().name.clone()),
             software_gpu: gpu.is_some_and(|gpu| gpu.summary().software),
-            method: if gpu.is_some() { config.render.method.word() } else { "prepared" },
+            method: match origin {
+                Origin::Gpu(_) => config.render.method.word(),
+                Origin::Prepared => "prepared",
+                Origin::Pattern(_) => "pattern",
+            },
             prediction: config.prediction.on,
             light_hash: recorder.as_ref().and_then(LightRecorder::hash).unwrap_or_default(),
             projector: Some(carried),

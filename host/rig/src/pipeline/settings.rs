@@ -73,7 +73,7 @@ pub fn output(rig: &Rig, gpu: &Gpu, check: bool) -> Output {
         Packer::Gpu => true,
         Packer::Cpu => false,
     };
-    let schedule = rig.config.projector.schedule();
+    let schedule = rig.schedule;
     match (packs, check) {
         (false, _) => Output::Codes,
         (true, false) => Output::Planes(schedule),

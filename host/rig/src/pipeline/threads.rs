@@ -12,7 +12,7 @@ use crate::engine::plan::{Latch, PlanStage};
 use crate::engine::pulse::Pulse;
 use crate::frame::job::{FrameJob, FrameMemory, FrameNote};
 use crate::frame::Stage;
-use crate::pack::prepared::PreparedFrames;
+use crate::pack::source::Pictures;
 use crate::plan::link_time::LinkTime;
 use crate::rig::Rig;
 use crate::tracks::{TrackSnapshot, TrackingStage};
@@ -302,7 +302,7 @@ pub(super) fn pack_thread(
     crew: &CrewState,
     mut stage: PackStage,
     kernel: Kernel,
-    mut prepared: Option<PreparedFrames>,
+    mut pictures: Option<Pictures>,
     inbox: PackInbox,
     mut to_link: Sender<FrameJob>,
 ) {
@@ -330,7 +330,7 @@ pub(super) fn pack_thread(
         }
         job.note.timeline.packing_at = now;
         if stage.is_wanted(&mut job.note, now, jobs.is_empty()) {
-            crate::pack::pack(&mut job, kernel, facts.options.verify, &mut prepared);
+            crate::pack::pack(&mut job, kernel, facts.options.verify, &mut pictures);
         }
         job.note.timeline.packed_at = clock.now();
         if to_link.push(job).is_err() || crew.is_abandoned.load(Ordering::Relaxed) {

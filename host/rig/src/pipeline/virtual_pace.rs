@@ -1,7 +1,7 @@
 //! A run at virtual pace. One thread drives every part of the engine under a clock that it moves. Each stage takes
 //! the modelled cost in the rig file, so a run is a function of its inputs, however fast or busy the machine is.
 
-use super::parts::{bring_up, mock_projector, CrewParts, FIRST_FRAME_TIMEOUT_NS};
+use super::parts::{bring_up, mock_projector, CrewParts, Origin, FIRST_FRAME_TIMEOUT_NS};
 use super::run::{Ran, LIGHTS};
 use super::settings::lead_estimator;
 use super::supervisor::leave_behind;
@@ -32,7 +32,6 @@ use dpm_device::transport::Transport;
 use dpm_handoff::channel::{channel, Sender};
 use dpm_handoff::latest::{latest, Publisher, Reader};
 use dpm_handoff::wake::WaitPolicy;
-use dpm_render::gpu::Gpu;
 use std::cell::RefCell;
 use std::collections::VecDeque;
 use std::panic::{catch_unwind, AssertUnwindSafe};
@@ -46,12 +45,12 @@ const CONNECT_STEP_NS: i64 = 50_000;
 
 pub(super) fn run_at_virtual_pace(
     rig: &Arc<Rig>,
-    gpu: Option<&Arc<Gpu>>,
+    origin: &Origin,
     options: RunOptions,
     monitor: &Arc<RunMonitor>,
 ) -> Result<Ran, PipelineError> {
     // Virtual pace permits only trackers without a clock of their own.
-    let mut parts = CrewParts::new(rig, gpu, options, Arc::new(|| HostTime(0)))?;
+    let mut parts = CrewParts::new(rig, origin, options, Arc::new(|| HostTime(0)))?;
     // The link comes up just before the first frame. The filters need the time before that.
     let mut now = HostTime(LISTEN_NS);
     let (lights_in, lights) = channel(LIGHTS, WaitPolicy::Park);
@@ -59,7 +58,7 @@ pub(super) fn run_at_virtual_pace(
         let told = "real_time.pace = \"virtual\" works only with the mock projector";
         return Err(RigError::Unsupported(told.into()).into());
     };
-    let (mock, recorder) = mock_projector(rig, mock, lights_in, options, gpu.is_none(), now)?;
+    let (mock, recorder) = mock_projector(rig, mock, lights_in, options, origin.is_marked(), now)?;
     let mut cable = Direct::new(mock);
     let watch = Stopwatch::start();
     let (link, time) = bring_up(rig, &mut cable, monitor, &mut || {
@@ -90,7 +89,7 @@ pub(super) fn run_at_virtual_pace(
         under_way: VecDeque::with_capacity(frames),
         done: Some(done),
         collector: Collector::new(rig.clone(), options.keep_frames, options.verify)
-            .about(gpu.is_none(), None),
+            .about(origin.gpu().is_none(), None),
         inbox: Inbox { done: finished, lights },
         at_work: "plan",
         parts,
@@ -236,7 +235,7 @@ impl World {
         let rendered_at = job.note.timeline.submitted_at.plus_ns(self.costs[1]);
         (job.note.timeline.rendered_at, job.note.timeline.packing_at) = (rendered_at, rendered_at);
         if self.pack.is_wanted(&mut job.note, rendered_at, true) {
-            crate::pack::pack(job, self.parts.kernel, self.facts.options.verify, &mut self.parts.prepared);
+            crate::pack::pack(job, self.parts.kernel, self.facts.options.verify, &mut self.parts.pictures);
         }
         job.note.timeline.packed_at = rendered_at.plus_ns(self.costs[2]);
         self.send(job);

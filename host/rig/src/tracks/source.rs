@@ -8,7 +8,7 @@ use dpm_device::tracker::natnet::client::{NatNetClient, NatNetConfig};
 use dpm_device::tracker::record::{RecordError, Replay};
 use dpm_device::tracker::serial::client::{SerialTracker, SerialTrackerConfig};
 use dpm_device::tracker::vrpn::client::{VrpnClient, VrpnConfig};
-use dpm_device::tracker::{BodyKey, Tracker, TrackerError};
+use dpm_device::tracker::{BodyKey, Tracker, TrackerError, TrackerSample};
 use std::net::Ipv4Addr;
 use std::sync::Arc;
 
@@ -35,6 +35,19 @@ pub enum SourceError {
     /// The device or the network cannot be opened.
     #[error("tracker: {0}")]
     Tracker(#[from] TrackerError),
+}
+
+/// The tracker of a run that tracks nothing.
+pub(crate) struct NoTracker;
+
+impl Tracker for NoTracker {
+    fn poll(&mut self, _: HostTime, _: &mut dyn FnMut(&TrackerSample)) -> Result<usize, TrackerError> {
+        Ok(0)
+    }
+
+    fn name(&self) -> &str {
+        "none"
+    }
 }
 
 /// Opens the tracker of `rig`; its polls are stamped with `clock`. Time 0 of the mock's motions is instant 0 of the

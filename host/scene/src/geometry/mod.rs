@@ -1,7 +1,4 @@
-//! Space in f64: rigid motions (SE(3)), cameras and their calibration.
+//! Space in f64: rigid motions (SE(3)), cameras, lenses and calibration files.
 
-pub mod calibration;
 pub mod lens;
 pub mod projector;
-mod refine;
-mod svd;

@@ -214,14 +214,14 @@ impl ProjectorCamera {
     }
 
     /// Full horizontal angle of the raster along the row of the axis, radians.
-    pub(crate) fn horizontal_fov(&self) -> f64 {
+    pub fn horizontal_fov(&self) -> f64 {
         let w = f64::from(self.raster.width());
         let at = |x: f64| self.straight_of_pixel(DVec2::new(x, self.cy)).map_or(f64::NAN, |p| p.x.atan());
         at(w) - at(0.0)
     }
 
     /// Full vertical angle of the raster along the column of the axis, radians.
-    pub(crate) fn vertical_fov(&self) -> f64 {
+    pub fn vertical_fov(&self) -> f64 {
         let h = f64::from(self.raster.height());
         let at = |y: f64| self.straight_of_pixel(DVec2::new(self.cx, y)).map_or(f64::NAN, |p| p.y.atan());
         at(h) - at(0.0)

@@ -35,12 +35,13 @@ impl CrewParts {
     pub(super) fn stepped(rig: &Rig, tracker: Box<dyn Tracker>, in_flight: usize, frame_ns: i64) -> Self {
         let memory = || FrameMemory {
             gpu: None,
-            planes: BitPlaneFrame::new(rig.camera.raster, rig.config.projector.schedule()),
+            planes: BitPlaneFrame::new(rig.camera.raster, rig.schedule),
+            picture: None,
         };
         Self {
             tracking: TrackingStage::new(rig, tracker),
             renderer: None,
-            prepared: Some(PreparedFrames::new(rig.camera.raster)),
+            pictures: None,
             kernel: Kernel::best(),
             budget: None,
             memory: (0..in_flight.max(2)).map(|_| memory()).collect(),
@@ -141,7 +142,7 @@ impl Crew {
             gpu: VecDeque::new(),
             gpu_free_at: now,
             packing: Packing::Waits { until: None, limit_ns: 0 },
-            prepared: parts.prepared.unwrap_or_else(|| PreparedFrames::new(facts.rig.camera.raster)),
+            prepared: PreparedFrames::new(facts.rig.camera.raster),
             black: vec![0; facts.rig.camera.raster.pixel_count()],
             kernel: parts.kernel,
             pulses: [Pulse::new("tracking"), Pulse::new("plan"), Pulse::new("pack")],

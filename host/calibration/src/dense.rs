@@ -4,7 +4,7 @@
 //! to the rounding error of the largest one. This is needed to distinguish a degenerate calibration from a poor one.
 
 /// Columns of a matrix, all of one length.
-pub(super) type Columns = Vec<Vec<f64>>;
+pub(crate) type Columns = Vec<Vec<f64>>;
 
 /// Singular values, descending, and the right singular vector of each.
 pub(crate) struct Svd {
@@ -83,7 +83,19 @@ pub(crate) fn inverse_diagonal(a: &[Vec<f64>]) -> Option<Vec<f64>> {
         .collect()
 }
 
-fn cholesky(a: &[Vec<f64>]) -> Option<Vec<Vec<f64>>> {
+/// Inverse of a symmetric positive definite matrix in rows; `None` if it is not positive definite.
+pub(crate) fn inverse_spd(a: &[Vec<f64>]) -> Option<Vec<Vec<f64>>> {
+    let n = a.len();
+    (0..n)
+        .map(|i| {
+            let unit: Vec<f64> = (0..n).map(|j| f64::from(u8::from(i == j))).collect();
+            solve_spd(a, &unit)
+        })
+        .collect()
+}
+
+/// The lower triangle L with `L L^T = A`, in rows; `None` if `A` is not positive definite.
+pub(crate) fn cholesky(a: &[Vec<f64>]) -> Option<Vec<Vec<f64>>> {
     let n = a.len();
     let mut l = vec![vec![0.0; n]; n];
     for i in 0..n {

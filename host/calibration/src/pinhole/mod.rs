@@ -5,12 +5,14 @@
 //! (\[Fischler81\]) to exclude wrong pairs. Everything is computed in coordinates centred on the points and scaled to
 //! their spread: metres and millimetres give the same pixels.
 
-use super::lens::Lens;
-use super::projector::ProjectorCamera;
-use super::refine::{refine, Pinhole, Refined};
-use super::svd::{svd, Columns};
+mod refine;
+
+use crate::dense::{svd, Columns};
 use dpm_device::planes::Raster;
+use dpm_scene::geometry::lens::Lens;
+use dpm_scene::geometry::projector::ProjectorCamera;
 use glam::{DMat3, DVec2, DVec3};
+use refine::{refine, Pinhole, Refined};
 use thiserror::Error;
 
 /// A point of the world and the pixel position that lights it.

@@ -1,8 +1,8 @@
 //! Refines a roughly known pinhole to the least reprojection error of point pairs: Levenberg-Marquardt
 //! (\[Marquardt63\]).
 
-use super::calibration::Pair;
-use super::svd::{inverse_diagonal, solve_spd};
+use super::Pair;
+use crate::dense::{inverse_diagonal, solve_spd};
 use dpm_common::so3::{hat, so3_exp};
 use glam::{DMat3, DVec2, DVec3};
 

@@ -1,0 +1,127 @@
+//! Pictures that are a function of the frame's number, and take the place of a renderer's.
+
+use crate::frame::job::FrameMemory;
+use dpm_device::planes::{Channel, PlaneSchedule, Raster};
+use dpm_render::pack::{self, BitPlaneFrame, Kernel};
+use std::sync::Arc;
+
+/// Gives the picture of every frame of a run that renders nothing. What it gives depends on the frame's number and on
+/// nothing else, so a crew of threads that takes over goes on with the same pictures.
+///
+/// It is called on the way of a frame: it must not allocate, lock or wait.
+pub trait PatternSource: Send + Sync {
+    /// The number of the picture that frame `frame` shows. Frames with equal numbers show equal planes, so their
+    /// planes are drawn once and kept. By default every frame has a picture of its own.
+    fn picture(&self, frame: u64) -> u64 {
+        frame
+    }
+
+    /// The planes that it draws for; `None` for the rig's own. Codes that need planes of equal light have
+    /// [`PlaneSchedule::equal24`].
+    fn schedule(&self) -> Option<PlaneSchedule> {
+        None
+    }
+
+    /// Draws picture `picture` completely: as code values by [`Canvas::codes`], or plane by plane by
+    /// [`Canvas::planes`].
+    fn draw(&self, picture: u64, canvas: &mut Canvas<'_>);
+}
+
+/// Where a [`PatternSource`] draws one frame.
+pub struct Canvas<'a> {
+    raster: Raster,
+    kernel: Kernel,
+    codes: &'a mut [u32],
+    /// The code values are those of this picture already.
+    is_filled: bool,
+    planes: &'a mut BitPlaneFrame,
+}
+
+impl Canvas<'_> {
+    /// Columns and rows.
+    pub fn raster(&self) -> Raster {
+        self.raster
+    }
+
+    /// Draws by code values `0x00BBGGRR`, row after row. `fill` must write every one of them; it is not called if
+    /// the last picture drawn was this one. The values are then cut into planes, as a renderer's are.
+    pub fn codes(&mut self, fill: impl FnOnce(&mut [u32])) {
+        if !self.is_filled {
+            fill(self.codes);
+        }
+        pack::pack(self.kernel, self.codes, self.planes);
+    }
+
+    /// Draws by the planes themselves, which hold some former picture. All planes may differ; padding bits must
+    /// be 0.
+    pub fn planes(&mut self) -> &mut BitPlaneFrame {
+        self.planes
+    }
+}
+
+/// Draws the frames of one crew.
+pub struct PatternPainter {
+    source: Arc<dyn PatternSource>,
+    raster: Raster,
+    codes: Vec<u32>,
+    /// The picture that `codes` was last drawn for.
+    drawn: Option<u64>,
+}
+
+impl PatternPainter {
+    /// For frames of `raster`.
+    pub fn new(source: Arc<dyn PatternSource>, raster: Raster) -> Self {
+        Self { source, raster, codes: vec![0; raster.pixel_count()], drawn: None }
+    }
+
+    /// Draws picture `picture` into `planes`.
+    pub fn draw(&mut self, kernel: Kernel, picture: u64, planes: &mut BitPlaneFrame) {
+        let is_filled = self.drawn.replace(picture) == Some(picture);
+        let (raster, codes) = (self.raster, &mut self.codes[..]);
+        self.source.draw(picture, &mut Canvas { raster, kernel, codes, is_filled, planes });
+    }
+
+    /// The planes of frame `frame` into its memory, which may hold them from a former frame.
+    pub(crate) fn pack(&mut self, kernel: Kernel, frame: u64, memory: &mut FrameMemory) {
+        let picture = self.source.picture(frame);
+        if memory.picture != Some(picture) {
+            self.draw(kernel, picture, &mut memory.planes);
+            memory.picture = Some(picture);
+        }
+    }
+
+    /// The light of `planes` as code values, for a comparison with the light that was made. The next picture is drawn
+    /// anew.
+    pub(crate) fn light_of(&mut self, planes: &BitPlaneFrame) -> &[u32] {
+        self.drawn = None;
+        self.codes.fill(0);
+        let (width, row_bytes) = (self.raster.width() as usize, self.raster.row_bytes());
+        for (k, spec) in planes.schedule().planes().iter().enumerate() {
+            let shifts: &[u32] = match spec.channel {
+                Channel::Red => &[0],
+                Channel::Green => &[8],
+                Channel::Blue => &[16],
+                Channel::White => &[0, 8, 16],
+            };
+            let rows = planes.plane(k).chunks_exact(row_bytes).zip(self.codes.chunks_exact_mut(width));
+            for (row, codes) in rows {
+                for (x, code) in codes.iter_mut().enumerate() {
+                    let light = u32::from(row[x / 8] >> (7 - x % 8) & 1) << spec.bit;
+                    for shift in shifts {
+                        let sum = ((*code >> shift & 0xff) + light).min(0xff);
+                        *code = *code & !(0xff << shift) | sum << shift;
+                    }
+                }
+            }
+        }
+        &self.codes
+    }
+}
+
+/// Where the frames of a run without a GPU come from.
+pub(crate) enum Pictures {
+    /// Marked frames, by which torn light is found.
+    Marked(super::prepared::PreparedFrames),
+    /// Patterns.
+    Drawn(PatternPainter),
+}
