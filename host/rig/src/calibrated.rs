@@ -1,16 +1,20 @@
-//! A calibration file into the projector's camera.
+//! Calibration files into parts of a rig: files of other programs into the projector's camera, and what `dpm calibrate`
+//! measured into camera, bodies, latency and light.
 
-use crate::config::{CalibrationUnit, ProjectorConfig};
+use crate::config::{CalibrationUnit, ProjectorConfig, RigConfig};
+use dpm_calibration::file::{self, CalibrationFile, LightSection, ProjectorSection};
 use dpm_device::planes::Raster;
 use dpm_device::regular_file;
 use dpm_scene::camera_files::{self, Frame, LengthUnit, ReadOptions};
 use dpm_scene::geometry::projector::ProjectorCamera;
 use std::path::Path;
 
-/// The calibration file cannot be used.
+/// A calibration file cannot be used.
 #[derive(Clone, Debug, thiserror::Error)]
-#[error("projector.calibration: {path}: {message}")]
+#[error("{key}: {path}: {message}")]
 pub struct CameraFileError {
+    /// Configuration key.
+    pub key: &'static str,
     /// Path of the file.
     pub path: String,
     /// What is wrong.
@@ -27,7 +31,11 @@ pub(crate) fn calibrated_camera(
     raster: Raster,
     warnings: &mut Vec<String>,
 ) -> Result<ProjectorCamera, CameraFileError> {
-    let wrong = |message: String| CameraFileError { path: path.display().to_string(), message };
+    let wrong = |message: String| CameraFileError {
+        key: "projector.calibration",
+        path: path.display().to_string(),
+        message,
+    };
     let unit = match p.calibration_unit {
         Some(CalibrationUnit::Metre) => LengthUnit::Metre,
         Some(CalibrationUnit::Millimetre) => LengthUnit::Millimetre,
@@ -63,11 +71,72 @@ pub(crate) fn calibrated_camera(
     Ok(camera.at_raster(raster))
 }
 
+/// What `dpm calibrate` measured, if the rig file names it.
+///
+/// # Errors
+/// The file was changed since the configuration was checked, and cannot be read any more.
+pub(crate) fn measured(config: &RigConfig) -> Result<CalibrationFile, CameraFileError> {
+    let Some(path) = &config.calibration.file else { return Ok(CalibrationFile::new()) };
+    file::load(path).map_err(|e| CameraFileError {
+        key: "calibration.file",
+        path: path.display().to_string(),
+        message: e.to_string(),
+    })
+}
+
+/// The measured projector at the rig's raster, and then at the one that is traced.
+///
+/// # Errors
+/// It was measured at a raster of another shape.
+pub(crate) fn measured_camera(
+    section: &ProjectorSection,
+    config: &RigConfig,
+    raster: Raster,
+) -> Result<ProjectorCamera, CameraFileError> {
+    let wrong = |message: String| CameraFileError {
+        key: "calibration.file",
+        path: config.calibration.file.as_ref().map_or_else(String::new, |f| f.display().to_string()),
+        message,
+    };
+    let own = config.projector.raster();
+    let [width, height] = section.size;
+    if u64::from(width) * u64::from(own.height()) != u64::from(height) * u64::from(own.width()) {
+        return Err(wrong(format!(
+            "the projector was measured with {width} x {height} pixels, and the rig has {} x {}, which is another shape; \
+             measure again, or correct projector.width and projector.height",
+            own.width(),
+            own.height()
+        )));
+    }
+    Ok(section.camera().map_err(|e| wrong(e.to_string()))?.at_raster(raster))
+}
+
+/// Light of each code value of each channel by the measured curves, black level included.
+pub(crate) fn measured_response(light: &LightSection) -> [[f64; 256]; 3] {
+    std::array::from_fn(|channel| {
+        // A projector without colour has one curve.
+        let curve = light.curves.get(channel).or(light.curves.first()).map_or(&[][..], Vec::as_slice);
+        std::array::from_fn(|code| {
+            let at = code as f64 / 255.0 * curve.len().saturating_sub(1) as f64;
+            let value = |i: usize| curve.get(i).or(curve.last()).copied().unwrap_or(0.0);
+            let (low, share) = (at as usize, at.fract());
+            light.black + (1.0 - light.black) * ((1.0 - share) * value(low) + share * value(low + 1))
+        })
+    })
+}
+
 #[cfg(test)]
 mod tests {
+    use super::CalibrationFile;
     use crate::config::{Overrides, RigConfig};
     use crate::rig::Rig;
+    use dpm_calibration::file::{
+        BodySection, LatencySection, LightSection, Pose, ProjectorSection, Provenance,
+    };
+    use dpm_calibration::model::ProjectorModel;
     use dpm_device::planes::Raster;
+    use dpm_scene::geometry::projector::ProjectorCamera;
+    use glam::{DAffine3, DQuat};
     use glam::{DVec2, DVec3};
     use std::path::{Path, PathBuf};
 
@@ -184,5 +253,90 @@ mod tests {
         };
         assert!((at("left & low").unwrap().camera.position() - DVec3::new(1.0, -1.0, -0.5)).length() < 1e-12);
         assert!(at("right").err().unwrap().contains("left & low"));
+    }
+
+    /// A rig with a NatNet tracker and the demo's bodies, and the file that `dpm calibrate` would have written.
+    fn measured_rig(file: &CalibrationFile, name: &str, keys: &[&str]) -> Result<Rig, String> {
+        let path = std::env::temp_dir().join(format!("dpm-measured-{}-{name}.toml", std::process::id()));
+        dpm_calibration::file::save(file, &path).unwrap();
+        let text = format!(
+            "[tracker]\nkind = \"natnet\"\n[real_time]\npace = \"real\"\n[run]\nseconds = 1\n[calibration]\nfile = {:?}\n\
+             [[scene.bodies]]\nname = \"bunny\"\n[[scene.bodies]]\nname = \"venus\"\n",
+            path.display().to_string()
+        );
+        let flags = keys.iter().map(|k| (*k).to_owned()).collect();
+        let overrides = Overrides { variables: vec![], flags };
+        let config =
+            RigConfig::parse("rig.toml", &text, Path::new(""), &overrides).map_err(|e| e.to_string())?;
+        Rig::build(&config, None).map_err(|e| e.to_string())
+    }
+
+    fn measured_file() -> CalibrationFile {
+        let raster = Raster::new(1024, 768).unwrap();
+        let camera =
+            ProjectorCamera::look_at(raster, DVec3::new(0.1, 0.6, 1.5), DVec3::ZERO, DVec3::Y, 0.6).unwrap();
+        let model = ProjectorModel::from_camera(&camera, [-0.1, 0.02, 0.0, 0.0, 0.0], DVec3::ZERO);
+        let mut file = CalibrationFile::new();
+        file.projector = Some(ProjectorSection::new(raster, &model, 0.2, 0.1, Provenance::default()));
+        let motion =
+            DAffine3::from_rotation_translation(DQuat::from_rotation_x(0.3), DVec3::new(0.01, 0.0, 0.02));
+        let body = BodySection {
+            mesh_to_body: Pose::new(&motion),
+            residual_m: 1e-4,
+            provenance: Provenance::default(),
+        };
+        file.bodies.insert("venus".into(), body);
+        file.latency =
+            Some(LatencySection { latency_us: 2500.0, sigma_us: 5.0, provenance: Provenance::default() });
+        file.light = Some(LightSection {
+            size: [1024, 768],
+            curves: vec![vec![0.0, 0.25, 1.0]; 3],
+            intensity: vec![0.25, 0.5, 0.25],
+            black: 0.01,
+            ambient: 0.0,
+            flat_field: [1.0, 0.0, 0.0, -0.2, 0.0, 0.0],
+            uncertainty: 0.01,
+            provenance: Provenance::default(),
+        });
+        file
+    }
+
+    #[test]
+    fn what_was_measured_is_in_the_rig() {
+        let file = measured_file();
+        let rig = measured_rig(&file, "all", &[]).unwrap();
+        let camera = file.projector.as_ref().unwrap().camera().unwrap();
+        let point = DVec3::new(0.2, 0.1, 0.1);
+        assert!((rig.camera.project(point).unwrap() - camera.project(point).unwrap()).length() < 1e-9);
+        assert!(!rig.camera.lens.is_pinhole());
+        assert_eq!(rig.bodies[0].mesh_to_body, DAffine3::IDENTITY);
+        assert!((rig.bodies[1].mesh_to_body.translation - DVec3::new(0.01, 0.0, 0.02)).length() < 1e-12);
+        assert_eq!(rig.latency_ns, Some(2_500_000));
+        // Half of full code gives a quarter of the light and the black level; green is twice as bright as the others.
+        let drive = &rig.drive;
+        let at = |x: usize, codes| drive.light_of(codes, 384 * 1024 + x);
+        assert!((at(512, [128; 3])[0] - (0.01 + 0.99 * 0.253)).abs() < 2e-3, "{:?}", at(512, [128; 3]));
+        assert!((at(0, [255; 3])[1] - 0.8).abs() < 2e-3);
+        assert!((drive.gain[0] / drive.gain[1] - 2.0).abs() < 1e-5);
+    }
+
+    #[test]
+    fn what_is_given_twice_or_has_another_shape_is_refused() {
+        let file = measured_file();
+        let told = |keys: &[&str]| measured_rig(&file, "twice", keys).err().unwrap();
+        for key in [
+            "projector.position=[0, 1, 2]",
+            "tracker.latency_us=20",
+            "scene.bodies.1.mesh_to_body.position=[0, 0, 0]",
+            "projector.response.kind=\"gamma\"",
+        ] {
+            let name = key.split('=').next().unwrap();
+            let told = told(&[key]);
+            assert!(told.contains("calibration.file") && told.contains("twice"), "{name}: {told}");
+        }
+        assert!(told(&["projector.height=640"]).contains("1024 x 768"));
+        let mut broken = file.clone();
+        broken.latency.as_mut().unwrap().latency_us = 1.0;
+        assert_eq!(measured_rig(&broken, "once", &[]).unwrap().latency_ns, Some(1000));
     }
 }

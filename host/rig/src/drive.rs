@@ -1,10 +1,13 @@
 //! What the rig file says of surfaces and of the projector's light, as the renderer's [`Drive`].
 
+use crate::calibrated::measured_response;
 use crate::config::{ResponseConfig, RigConfig, TableResponseConfig};
+use dpm_calibration::file::{CalibrationFile, LightSection};
 use dpm_device::planes::Raster;
 use dpm_device::regular_file;
 use dpm_render::drive::{Drive, Response};
 use dpm_scene::Scene;
+use glam::DVec2;
 use std::path::Path;
 use std::sync::Arc;
 
@@ -29,9 +32,20 @@ pub struct DriveError {
 ///
 /// # Errors
 /// A file cannot be used; the error names its key.
-pub(crate) fn drive(config: &RigConfig, scene: &Scene, raster: Raster) -> Result<Drive, DriveError> {
+pub(crate) fn drive(
+    config: &RigConfig,
+    measured: &CalibrationFile,
+    scene: &Scene,
+    raster: Raster,
+) -> Result<Drive, DriveError> {
+    let shares = measured.light.as_ref().map_or(vec![], |light| light.intensity.clone());
     let gain_with = |albedo: [f64; 3]| -> [f32; 3] {
-        let (intensity, white) = (config.projector.max_intensity.0, config.render.white);
+        let mut intensity = config.projector.max_intensity.0;
+        if let [r, g, b] = shares[..] {
+            // `max_intensity` is that of a channel on average.
+            intensity = [0, 1, 2].map(|c| intensity[c] * 3.0 * [r, g, b][c]);
+        }
+        let white = config.render.white;
         std::array::from_fn(|c| {
             // The product of exposure and white is exact where white is 1.
             let wanted = std::f64::consts::PI * (config.render.exposure * white[c]);
@@ -44,13 +58,49 @@ pub(crate) fn drive(config: &RigConfig, scene: &Scene, raster: Raster) -> Result
     } else {
         Vec::new()
     };
+    let (response, flat_field) = match &measured.light {
+        Some(light) => measured_light(light, raster)?,
+        None => {
+            let field = config.projector.flat_field.as_deref().map(|f| flat_field(f, raster)).transpose()?;
+            (response(&config.projector.response)?, field)
+        }
+    };
     Ok(Drive {
         gain: gain_with(config.scene.surface_albedo.0),
         gain_of_body,
         ambient: config.scene.ambient.map(|v| v as f32),
-        response: response(&config.projector.response)?,
-        flat_field: config.projector.flat_field.as_deref().map(|f| flat_field(f, raster)).transpose()?,
+        response,
+        flat_field,
     })
+}
+
+/// One over the relative brightness of each pixel and channel.
+type FlatField = Arc<Vec<[f32; 3]>>;
+
+/// Response and flat field as `dpm calibrate light` measured them.
+fn measured_light(
+    light: &LightSection,
+    raster: Raster,
+) -> Result<(Option<Response>, Option<FlatField>), DriveError> {
+    let wrong = |message: String| DriveError { key: "calibration.file", message };
+    let response = Response::new(&measured_response(light)).map_err(|e| wrong(e.to_string()))?;
+    let model = light.model().ok_or_else(|| wrong("light.size is no raster".into()))?;
+    let [width, height] = light.size.map(f64::from);
+    let (columns, rows) = (f64::from(raster.width()), f64::from(raster.height()));
+    let mut inverse = Vec::with_capacity(raster.pixel_count());
+    for y in 0..raster.height() {
+        for x in 0..raster.width() {
+            let at = DVec2::new((f64::from(x) + 0.5) / columns * width, (f64::from(y) + 0.5) / rows * height);
+            let share = model.flat.at(at);
+            if share < f64::from(LEAST_BRIGHTNESS) {
+                return Err(wrong(format!(
+                    "light.flat_field is {share:.3} at pixel ({x}, {y}); measure again"
+                )));
+            }
+            inverse.push([(1.0 / share) as f32; 3]);
+        }
+    }
+    Ok((Some(response), Some(Arc::new(inverse))))
 }
 
 /// Albedo of the real surface of a body of the scene, by the tracked body that carries it.
@@ -103,7 +153,7 @@ fn table(text: &str) -> Result<[[f64; 256]; 3], String> {
 }
 
 /// One over the relative brightness of each pixel and channel, from a linear picture of a white field of any size.
-fn flat_field(path: &Path, raster: Raster) -> Result<Arc<Vec<[f32; 3]>>, DriveError> {
+fn flat_field(path: &Path, raster: Raster) -> Result<FlatField, DriveError> {
     let wrong = |message: String| DriveError {
         key: "projector.flat_field",
         message: format!("{}: {message}", path.display()),

@@ -1,6 +1,6 @@
 //! Builds the parts of a rig from a checked configuration: scene, projector, bodies with their motions, tracker.
 
-use crate::calibrated::{calibrated_camera, CameraFileError};
+use crate::calibrated::{calibrated_camera, measured, measured_camera, CameraFileError};
 use crate::config::{BodyConfig, BuiltinScene, EnvironmentConfig, GazeConfig, RigConfig, TrackerConfig};
 use crate::drive::{albedo_of, drive, DriveError};
 use crate::mock::{Motion, MotionError, MotionSpec};
@@ -145,6 +145,9 @@ pub struct Rig {
     pub schedule: PlaneSchedule,
     /// From radiance to code values.
     pub drive: Drive,
+    /// How much older the tracker's samples are than they say, if it was measured, nanoseconds. It takes the place of
+    /// `tracker.latency_us`.
+    pub latency_ns: Option<i64>,
 }
 
 /// A rigid transform from a pose.
@@ -175,12 +178,24 @@ impl Rig {
         scene.environment = fitted;
         scene.warnings.extend(told.map(|t| format!("scene.environment: {t}")));
         let raster = raster.unwrap_or_else(|| config.projector.raster());
-        let camera = camera(config, raster, &mut scene.warnings)?;
-        let bodies = rig_bodies(config, &scene)?;
+        let measured = measured(config)?;
+        let camera = match &measured.projector {
+            Some(section) => measured_camera(section, config, raster)?,
+            None => camera(config, raster, &mut scene.warnings)?,
+        };
+        let mut bodies = rig_bodies(config, &scene)?;
+        // The mock tracker reports the mesh itself.
+        for body in bodies.iter_mut().filter(|b| b.motion.is_none()) {
+            if let Some(section) = measured.bodies.get(&body.name) {
+                body.mesh_to_body = section.mesh_to_body.to_affine();
+            }
+        }
         let observer = observer(config, &bodies)?;
-        let drive = drive(config, &scene, raster)?;
+        let drive = drive(config, &measured, &scene, raster)?;
+        let latency_ns = measured.latency.map(|l| (l.latency_us * 1e3).round() as i64);
         let schedule = config.projector.schedule();
-        Ok(Self { config: config.clone(), scene, camera, bodies, observer, schedule, drive })
+        let config = config.clone();
+        Ok(Self { config, scene, camera, bodies, observer, schedule, drive, latency_ns })
     }
 
     /// The projector of a rig alone, without scene, bodies or calibration: for light that nothing is traced for.
@@ -195,7 +210,7 @@ impl Rig {
         let observer = observer(&config, &[])?;
         let (scene, bodies) = (Scene::default(), Vec::new());
         let (schedule, drive) = (config.projector.schedule(), Drive::default());
-        Ok(Self { config, scene, camera, bodies, observer, schedule, drive })
+        Ok(Self { config, scene, camera, bodies, observer, schedule, drive, latency_ns: None })
     }
 
     /// Frames per second.

@@ -30,7 +30,7 @@ fn shown(value: impl ConfigValue) -> String {
 }
 
 /// Refuses at the first of `keys` that was written.
-fn refuse(reader: &mut Reader, keys: &[&str], problem: String, remedy: String) {
+pub(super) fn refuse(reader: &mut Reader, keys: &[&str], problem: String, remedy: String) {
     let key = keys.iter().find(|k| reader.is_written(k)).unwrap_or(&keys[0]);
     let origin = reader.origin_of(key);
     reader.refuse(&origin, key, problem, remedy);
@@ -442,6 +442,9 @@ pub(super) fn resolve_files(rig: &mut RigConfig, base: &Path, reader: &mut Reade
     if let Some(file) = &mut rig.projector.calibration {
         input(file, "projector.calibration");
     }
+    if let Some(file) = &mut rig.calibration.file {
+        input(file, "calibration.file");
+    }
     if let Some(file) = &mut rig.projector.flat_field {
         input(file, "projector.flat_field");
     }
@@ -453,5 +456,8 @@ pub(super) fn resolve_files(rig: &mut RigConfig, base: &Path, reader: &mut Reade
     }
     if let TrackerConfig::Replay(replay) = &mut rig.tracker {
         input(&mut replay.file, "tracker.file");
+    }
+    if reader.errors.is_empty() {
+        super::calibration::check(rig, reader);
     }
 }

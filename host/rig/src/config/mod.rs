@@ -4,6 +4,7 @@
 //! reported at once, each with file, line and column. `docs/CONFIG.md` lists the keys; it is generated from their
 //! declarations here.
 
+mod calibration;
 mod check;
 mod method;
 mod prediction;
@@ -16,6 +17,7 @@ mod world;
 #[cfg(test)]
 mod tests;
 
+pub use calibration::CalibrationConfig;
 pub(crate) use check::MAX_TRACKED;
 pub(crate) use dpm_common::keys::read::KeyDoc;
 pub(crate) use dpm_common::keys::source::VARIABLE_PREFIX;
@@ -53,6 +55,8 @@ section! {
         observer: ObserverConfig = ObserverConfig::default(), "", Any;
         /// What is shown.
         scene: SceneConfig = SceneConfig::default(), "", Any;
+        /// What `dpm calibrate` measured.
+        calibration: CalibrationConfig = CalibrationConfig::default(), "", Any;
         /// How radiance is computed.
         render: RenderConfig = RenderConfig::default(), "", Any;
         /// From samples to the pose at the time of light.
@@ -167,6 +171,7 @@ impl RigConfig {
         self.scene = SceneConfig::default();
         self.tracker = TrackerConfig::default();
         self.observer = ObserverConfig::default();
+        self.calibration = CalibrationConfig::default();
         let projector = &mut self.projector;
         (projector.calibration, projector.calibration_unit) = (None, None);
         (projector.calibration_camera, projector.calibration_region) = (None, None);

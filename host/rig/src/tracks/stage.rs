@@ -80,7 +80,7 @@ impl TrackingStage {
             bank: PoseFilterBank::new(&vec![config; bodies]),
             received_at: vec![HostTime(0); bodies],
             bodies,
-            frame: TrackerFrame::of(&rig.config.tracker),
+            frame: TrackerFrame::of(&rig.config.tracker, rig.latency_ns),
             latency_ns: 0,
             began_at: None,
             looked: false,

@@ -20,14 +20,15 @@ pub(crate) struct TrackerFrame {
 }
 
 impl TrackerFrame {
-    /// What the rig file says; `None` if samples are used as they are.
-    pub(crate) fn of(config: &TrackerConfig) -> Option<Self> {
+    /// What the rig file says; `None` if samples are used as they are. `latency_ns` was measured and takes the place of
+    /// `tracker.latency_us`.
+    pub(crate) fn of(config: &TrackerConfig, latency_ns: Option<i64>) -> Option<Self> {
         let (transform, latency_us) = config.frame()?;
         let frame = Self {
             world_from_axes: transform.pose().unwrap_or(DAffine3::IDENTITY),
             axes: transform.axes.matrix(),
             scale: transform.scale,
-            latency_ns: latency_us * 1000,
+            latency_ns: latency_ns.unwrap_or(latency_us * 1000),
         };
         let plain = frame.world_from_axes == DAffine3::IDENTITY
             && frame.axes == DMat3::IDENTITY
@@ -72,7 +73,7 @@ mod tests {
         let text = "[tracker]\nkind = \"natnet\"\n[real_time]\npace = \"real\"\n[run]\nseconds = 1\n";
         let config =
             RigConfig::parse("rig.toml", text, Path::new(""), &overrides).unwrap_or_else(|e| panic!("{e}"));
-        TrackerFrame::of(&config.tracker)
+        TrackerFrame::of(&config.tracker, None)
     }
 
     fn sample(position_m: [f64; 3], rotation: DQuat) -> TrackerSample {

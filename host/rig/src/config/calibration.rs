@@ -1,0 +1,56 @@
+//! `[calibration]`: what `dpm calibrate` measured.
+
+use super::check::refuse;
+use super::RigConfig;
+use dpm_calibration::file::{self, CalibrationFile};
+use dpm_common::keys::read::{NotEmpty, Reader};
+use dpm_common::section;
+use std::path::PathBuf;
+
+section! {
+    /// What `dpm calibrate` measured.
+    pub struct CalibrationConfig {
+        /// The file that `dpm calibrate` writes. Each part that it has takes the place of keys of this file: the
+        /// projector's lens and pose of `projector.position`, `look_at`, `up`, `horizontal_fov_deg` and `calibration`;
+        /// bodies of `scene.bodies[].mesh_to_body`; the latency of `tracker.latency_us`; light of
+        /// `projector.response` and `projector.flat_field`, and of the channels' shares of `projector.max_intensity`.
+        file: Option<PathBuf> = None, "", NotEmpty;
+    }
+}
+
+/// Refuses a calibration file that cannot be read, and keys that are given twice.
+pub(super) fn check(rig: &RigConfig, reader: &mut Reader) {
+    let Some(path) = &rig.calibration.file else { return };
+    let measured = match file::load(path) {
+        Ok(measured) => measured,
+        Err(e) => {
+            let remedy = "measure again with `dpm calibrate`, or remove the key".to_owned();
+            return refuse(reader, &["calibration.file"], e.to_string(), remedy);
+        }
+    };
+    for key in taken(rig, &measured).into_iter().filter(|key| reader.is_written(key)).collect::<Vec<_>>() {
+        let problem = "is given twice: here and by `calibration.file`".to_owned();
+        refuse(reader, &[&key], problem, "remove it; the calibration file has the measured value".into());
+    }
+}
+
+/// Keys whose place the parts of the file take.
+fn taken(rig: &RigConfig, measured: &CalibrationFile) -> Vec<String> {
+    let mut keys = Vec::new();
+    if measured.projector.is_some() {
+        let names = ["position", "look_at", "up", "horizontal_fov_deg", "calibration"];
+        keys.extend(names.map(|name| format!("projector.{name}")));
+    }
+    for (i, body) in rig.scene.bodies.iter().enumerate() {
+        if measured.bodies.contains_key(&body.name) {
+            keys.push(format!("scene.bodies.{i}.mesh_to_body"));
+        }
+    }
+    if measured.latency.is_some() && rig.tracker.frame().is_some() {
+        keys.push("tracker.latency_us".into());
+    }
+    if measured.light.is_some() {
+        keys.extend(["projector.response", "projector.flat_field"].map(str::to_owned));
+    }
+    keys
+}
