@@ -54,13 +54,11 @@ impl Entries {
         if !self.add_name(name) {
             return;
         }
-        match number(word) {
-            Some(value) => self.numbers.entry(name.into()).or_insert(value),
-            None => {
-                self.texts.entry(name.into()).or_insert_with(|| word.trim_matches('"').into());
-                return;
-            }
-        };
+        if let Some(value) = number(word) {
+            self.numbers.entry(name.into()).or_insert(value);
+        } else {
+            self.texts.entry(name.into()).or_insert_with(|| word.trim_matches('"').into());
+        }
     }
 
     /// Notes a name. False for the nameless members of a sequence.

@@ -146,8 +146,8 @@ fn attribute(mut attributes: &str, name: &str) -> Option<String> {
 /// Length of the tag at the start of `text`, from `<` to `>`. Comments and `CDATA` end where they end.
 fn end_of_tag(text: &str) -> Option<usize> {
     for (start, end) in [("<!--", "-->"), ("<![CDATA[", "]]>"), ("<?", "?>")] {
-        if text.starts_with(start) {
-            return Some(text[start.len()..].find(end)? + start.len() + end.len());
+        if let Some(inside) = text.strip_prefix(start) {
+            return Some(inside.find(end)? + start.len() + end.len());
         }
     }
     let mut quote = None;
