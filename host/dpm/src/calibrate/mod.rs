@@ -7,4 +7,5 @@ pub mod dialogue;
 pub mod poses;
 pub mod projector;
 pub mod results;
+pub mod sensor;
 pub mod wand;

@@ -7,7 +7,7 @@ use crate::calibrate::dialogue::Dialogue;
 use crate::calibrate::poses::Poses;
 use crate::calibrate::projector::{aim_by_hand, keep, solve_file, told_of, Points};
 use crate::calibrate::results::Results;
-use crate::calibrate::{body, wand};
+use crate::calibrate::{body, sensor, wand};
 use dpm_calibration::projector::{Known, Options};
 use dpm_calibration::rehearsal::{rehearse_with, Bias};
 use dpm_common::clock::MonotonicClock;
@@ -79,6 +79,18 @@ struct ProjectorArgs {
     /// Direction of the world that points up (x, y or z); catches exchanged axes of a projector that stands upright
     #[arg(long, value_name = "AXIS", value_parser = axis)]
     up: Option<DVec3>,
+    /// Serial port of the wand's light sensor: move the wand through coded light in place of aiming by hand
+    #[arg(long, value_name = "PORT", conflicts_with = "points")]
+    sensor: Option<String>,
+    /// Bits per second of the sensor's port
+    #[arg(long, value_name = "BAUD", default_value_t = 3_000_000, requires = "sensor")]
+    sensor_baud: u32,
+    /// Seconds of motion with the sensor
+    #[arg(long, value_name = "S", default_value_t = 30.0, value_parser = seconds, requires = "sensor")]
+    seconds: f64,
+    /// Diameter of the sensor's aperture, millimetres
+    #[arg(long, value_name = "MM", default_value_t = 3.0, value_parser = seconds, requires = "sensor")]
+    aperture: f64,
     /// Show nothing and ask for nothing: solve the points of a file, "x y z column row" a line, metres and pixels
     #[arg(long, value_name = "FILE")]
     points: Option<PathBuf>,
@@ -219,6 +231,9 @@ fn projector(args: &ProjectorArgs) -> Result<(), Failure> {
     let (config, mut results) = args.common.open()?;
     let raster = config.projector.raster();
     let known = Known { distance_m: args.distance, up: args.up };
+    if let Some(port) = &args.sensor {
+        return projector_by_sensor(args, port, known, &config, results);
+    }
     let options = Options { known, ..Options::by_hand(raster) };
     let solved = match &args.points {
         Some(path) => solve_file(path, raster, options)?,
@@ -227,18 +242,42 @@ fn projector(args: &ProjectorArgs) -> Result<(), Failure> {
             let mut points = Points::resume(results.progress("projector"))?;
             let poses = Poses::start(&config, &[args.common.wand.clone()], MonotonicClock::new(0))?;
             poses.wait_until_seen()?;
-            let solved = watch_quietly(config.clone(), move |config, monitor| {
+            watch_quietly(config.clone(), move |config, monitor| {
                 while_aiming(config, monitor, |aim, dialogue| {
                     let solved = aim_by_hand((raster, options), tip, &mut points, (&poses, aim), dialogue)?;
                     points.forget();
                     Ok(solved)
                 })
-            })?;
-            solved
+            })?
         }
     };
     keep(&mut results, &config, &solved);
     print(&format!("{}\n{}\n", told_of(&solved), results.save(&config)?));
+    Ok(())
+}
+
+fn projector_by_sensor(
+    args: &ProjectorArgs,
+    port: &str,
+    known: Known,
+    config: &RigConfig,
+    mut results: Results,
+) -> Result<(), Failure> {
+    let tip = tip_of(&results)?;
+    let sigma = results.file.wand.as_ref().map_or(1e-3, |wand| wand.tip_sigma_m);
+    let setup = sensor::Setup {
+        port: port.to_owned(),
+        baud: args.sensor_baud,
+        wand: args.common.wand.clone(),
+        seconds: args.seconds,
+        aperture_m: 1e-3 * args.aperture,
+        known,
+    };
+    let solution = watch_quietly(config.clone(), move |config, monitor| {
+        sensor::calibrate(config, &setup, (tip, sigma), monitor)
+    })?;
+    sensor::keep(&mut results, config, &args.common.wand, &solution);
+    print(&format!("{}\n{}\n", sensor::told_of(&solution), results.save(config)?));
     Ok(())
 }
 
