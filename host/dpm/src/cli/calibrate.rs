@@ -64,6 +64,9 @@ struct Common {
 struct WandArgs {
     #[command(flatten)]
     common: Common,
+    /// The tip measured with a ruler, millimetres in the wand's body, instead of turning; the light sensor refines it
+    #[arg(long, value_name = "X,Y,Z", value_parser = three, allow_hyphen_values = true)]
+    tip: Option<DVec3>,
     /// Seconds of turning
     #[arg(long, value_name = "S", default_value_t = 15.0, value_parser = seconds)]
     seconds: f64,
@@ -153,6 +156,15 @@ enum BiasWord {
 /// Bias of the tracker in rehearsals that have one, metres along an axis.
 const BIAS_M: f64 = 5e-5;
 
+fn three(text: &str) -> Result<DVec3, String> {
+    let parts: Result<Vec<f64>, _> = text.split(',').map(|n| n.trim().parse()).collect();
+    let numbers = parts.ok().and_then(|n| <[f64; 3]>::try_from(n).ok());
+    let within = numbers.filter(|n| n.iter().all(|v| v.abs() <= 1e4));
+    within
+        .map(DVec3::from_array)
+        .ok_or_else(|| "write three numbers of millimetres, such as 10,-5,120".into())
+}
+
 fn seconds(text: &str) -> Result<f64, String> {
     let s = text.parse().ok().filter(|s: &f64| *s > 0.0 && *s <= 3600.0);
     s.ok_or_else(|| "write seconds, above 0 and at most 3600".into())
@@ -205,9 +217,14 @@ pub(super) fn execute(args: &CalibrateArgs) -> Result<(), Failure> {
     match &args.what {
         What::Wand(args) => {
             let (config, mut results) = args.common.open()?;
-            let dialogue = Dialogue::start(|| false)?;
             let name = &args.common.wand;
-            let told = wand::calibrate(&config, name, args.seconds, &mut results, &dialogue)?;
+            let told = match args.tip {
+                Some(tip) => wand::by_ruler(&config, name, 1e-3 * tip, &mut results),
+                None => {
+                    let dialogue = Dialogue::start(|| false)?;
+                    wand::calibrate(&config, name, args.seconds, &mut results, &dialogue)?
+                }
+            };
             print(&format!("{told}\n{}\n", results.save(&config)?));
             Ok(())
         }
