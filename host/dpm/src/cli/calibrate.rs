@@ -257,7 +257,8 @@ fn projector(args: &ProjectorArgs) -> Result<(), Failure> {
         None => {
             let tip = tip_of(&results)?;
             let mut points = Points::resume(results.progress("projector"))?;
-            let poses = Poses::start(&config, &[args.common.wand.clone()], MonotonicClock::new(0))?;
+            let poses =
+                Poses::start(&config, std::slice::from_ref(&args.common.wand), MonotonicClock::new(0))?;
             poses.wait_until_seen()?;
             watch_quietly(config.clone(), move |config, monitor| {
                 while_aiming(config, monitor, |aim, dialogue| {

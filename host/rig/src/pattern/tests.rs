@@ -55,7 +55,7 @@ fn gray_codes_of_neighbours_differ_in_one_bit_and_decode_to_the_column() {
                 }
                 assert_eq!(number_of_gray(code), i, "{axis:?} {i} of {count}");
                 if let Some(before) = before.replace(code) {
-                    assert_eq!((code ^ before as u32).count_ones(), 1);
+                    assert_eq!((code ^ before).count_ones(), 1);
                 }
             }
         }
