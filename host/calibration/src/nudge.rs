@@ -94,7 +94,7 @@ impl Nudges {
             self.before.remove(0);
         }
         self.before.push(self.now);
-        self.now = self.now * step;
+        self.now *= step;
     }
 
     /// Takes the last motion back; false if there is none.

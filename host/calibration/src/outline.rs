@@ -14,6 +14,11 @@ const MOST_OF_EDGE: f64 = 512.0;
 /// What lies nearer to an edge than this share of its surface does not hide it.
 const CLEAR: f64 = 0.01;
 
+/// Two corners by the bits of their coordinates, the smaller first.
+type EdgeKey = [[u64; 3]; 2];
+/// The ends of an edge, and the normals of the faces that meet there.
+type Faces = ([DVec3; 2], Vec<DVec3>);
+
 struct Edge {
     ends: [DVec3; 2],
     /// Unit normals of the faces that meet here; twice the same at the border of an open mesh.
@@ -32,7 +37,7 @@ impl Outline {
     /// From triangles, counter-clockwise seen from outside, in the mesh's frame, metres. Corners at the same place are
     /// the same corner.
     pub fn new(triangles: &[[DVec3; 3]]) -> Self {
-        let mut faces: HashMap<[[u64; 3]; 2], ([DVec3; 2], Vec<DVec3>)> = HashMap::new();
+        let mut faces: HashMap<EdgeKey, Faces> = HashMap::new();
         // Adding 0 makes -0 and 0 the same.
         let key = |p: DVec3| p.to_array().map(|v| (v + 0.0).to_bits());
         for [a, b, c] in triangles {
