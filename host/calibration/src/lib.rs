@@ -4,14 +4,18 @@
 //! tip of the wand, [`projector`] lens and pose from points that were aimed at by hand, [`sensor`] the same (with tip
 //! and latency) from a light sensor that moves through coded planes, [`body`] the place of a mesh in its tracked body,
 //! [`light`] how bright a code value is where. [`mod@file`] keeps the results, and [`rehearsal`] judges all of it against a
-//! drawn truth. No module reads a device: samples come in, numbers or reasons come out.
+//! drawn truth. [`check`] judges all of it by light on a body, and [`nudge`] corrects it by hand while the [`outline`] of a
+//! body is shown. No module reads a device: samples come in, numbers or reasons come out.
 
 pub mod body;
+pub mod check;
 mod dense;
 pub mod file;
 mod least_squares;
 pub mod light;
 pub mod model;
+pub mod nudge;
+pub mod outline;
 pub mod pinhole;
 pub mod pivot;
 pub mod projector;

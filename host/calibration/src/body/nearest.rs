@@ -73,6 +73,43 @@ impl Surface {
         (self.nodes[here].count, self.nodes[here].first) = (0, child);
     }
 
+    /// Whether a triangle cuts the straight way between two points, further than `clear_m` metres from its end `to`. So
+    /// a point of the surface is not hidden by the triangles that it belongs to.
+    pub fn hides(&self, from: DVec3, to: DVec3, clear_m: f64) -> bool {
+        let way = to - from;
+        let length = way.length();
+        if length.is_nan() || length <= clear_m {
+            return false;
+        }
+        let last = 1.0 - clear_m / length;
+        let inverse = way.recip();
+        let mut stack = vec![0];
+        while let Some(index) = stack.pop() {
+            let Some(node) = self.nodes.get(index) else { continue };
+            let (a, b) = ((node.low - from) * inverse, (node.high - from) * inverse);
+            // Rust's min and max pass over the NaN of a box whose plane the way lies in.
+            let enter = (0..3).fold(0.0, |t: f64, k| t.max(a[k].min(b[k])));
+            let leave = (0..3).fold(last, |t: f64, k| t.min(a[k].max(b[k])));
+            if enter > leave {
+                continue;
+            }
+            if node.count == 0 {
+                stack.extend([index + 1, node.first]);
+                continue;
+            }
+            let part = &self.triangles[node.first..node.first + node.count];
+            if part.iter().any(|t| cuts(t, from, way).is_some_and(|s| (0.0..last).contains(&s))) {
+                return true;
+            }
+        }
+        false
+    }
+
+    /// Length of the diagonal of the box around it, metres; 0 when it is empty.
+    pub fn extent_m(&self) -> f64 {
+        self.nodes.first().map_or(0.0, |n| n.low.distance(n.high))
+    }
+
     pub(super) fn nearest(&self, to: DVec3) -> Option<Nearest> {
         let mut best: Option<Nearest> = None;
         let mut stack = vec![0];
@@ -100,6 +137,18 @@ impl Surface {
         }
         best
     }
+}
+
+/// Where the line `from + s way` cuts a triangle (Möller and Trumbore, 1997); `None` where it does not.
+fn cuts([a, b, c]: &[DVec3; 3], from: DVec3, way: DVec3) -> Option<f64> {
+    let (ab, ac) = (*b - *a, *c - *a);
+    let across = way.cross(ac);
+    let inverse = ab.dot(across).recip();
+    let at = from - *a;
+    let (u, turned) = (at.dot(across) * inverse, at.cross(ab));
+    let v = way.dot(turned) * inverse;
+    // A way along the triangle has an infinite inverse, and numbers that fail these tests.
+    (u >= 0.0 && v >= 0.0 && u + v <= 1.0).then(|| ac.dot(turned) * inverse)
 }
 
 /// The nearest point of a triangle (Ericson, Real-Time Collision Detection, 5.1.5).

@@ -39,14 +39,31 @@ fn outermost(points: &[DVec3]) -> Vec<(&'static str, DVec3)> {
     .collect()
 }
 
-/// The bodies of a scene that the tracked body `name` carries.
-fn carried<'a>(config: &RigConfig, scene: &'a Scene, name: &str) -> Result<Vec<&'a Body>, Failure> {
-    let index = config.scene.bodies.iter().position(|b| b.name == name).ok_or_else(|| {
+/// The place of the tracked body `name` in the rig file.
+pub(super) fn index_of(config: &RigConfig, name: &str) -> Result<usize, Failure> {
+    config.scene.bodies.iter().position(|b| b.name == name).ok_or_else(|| {
         let names: Vec<&str> = config.scene.bodies.iter().map(|b| b.name.as_str()).collect();
         let told = format!("no body is named \"{name}\" in the rig file; bodies: {}", names.join(", "));
         Failure::new(FailureKind::BadInput, told)
-    })?;
+    })
+}
+
+/// The bodies of a scene that the tracked body `name` carries.
+pub(super) fn carried<'a>(
+    config: &RigConfig,
+    scene: &'a Scene,
+    name: &str,
+) -> Result<Vec<&'a Body>, Failure> {
+    let index = index_of(config, name)?;
     Ok(scene.bodies.iter().filter(|b| b.tracked == Some(index as u16)).collect())
+}
+
+/// The triangles of bodies.
+pub(super) fn triangles_of(bodies: &[&Body]) -> Vec<[DVec3; 3]> {
+    let of = |b: &Body| -> Vec<[DVec3; 3]> {
+        b.mesh.triangles.iter().map(|t| t.map(|i| b.mesh.positions[i as usize].as_dvec3())).collect()
+    };
+    bodies.iter().flat_map(|b| of(b)).collect()
 }
 
 /// Touches points, wanders, and writes the place of the mesh.
@@ -77,9 +94,7 @@ pub fn calibrate(
         ))?;
         poses.take();
         std::thread::sleep(Duration::from_secs_f64(ways.wander_s));
-        let triangles = bodies.iter().flat_map(|b| {
-            b.mesh.triangles.iter().map(|t| t.map(|i| b.mesh.positions[i as usize].as_dvec3()))
-        });
+        let triangles = triangles_of(&bodies);
         let tips = tips_in_body(&poses.take(), tip);
         let found = wander(&Surface::new(triangles), &tips, ways.tip_radius_m, &place.0 .0)
             .map_err(|e| Failure::new(FailureKind::BadInput, e))?;

@@ -3,7 +3,10 @@
 
 pub mod aim;
 pub mod body;
+pub mod check;
 pub mod dialogue;
+pub mod nudge;
+pub mod outline;
 pub mod poses;
 pub mod projector;
 pub mod results;

@@ -2,11 +2,12 @@
 
 use dpm_calibration::trajectory::Stamped;
 use dpm_common::clock::{Clock, MonotonicClock};
+use dpm_common::so3::{so3_between, so3_exp};
 use dpm_device::tracker::BodyKey;
 use dpm_rig::config::{RigConfig, TrackerConfig};
 use dpm_rig::failure::{Failure, FailureKind};
 use dpm_rig::tracks::open_in_world;
-use glam::DVec3;
+use glam::{DAffine3, DQuat, DVec3};
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::{Arc, Mutex, PoisonError};
 use std::time::Duration;
@@ -19,6 +20,10 @@ const MOST: usize = 4_000_000;
 const HOLD: Duration = Duration::from_millis(700);
 /// A tip that moves further than this while it is held, metres, is not held.
 const HELD_M: f64 = 1.5e-3;
+/// A body that moves further than this, metres, does not lie still.
+const STILL_M: f64 = 5e-4;
+/// A body that turns further than this, radians, does not lie still.
+const STILL_RAD: f64 = 5e-3;
 /// Fewest poses of a held point.
 const FEWEST_HELD: usize = 20;
 
@@ -139,6 +144,39 @@ impl Drop for Poses {
     }
 }
 
+/// Where a body was while it lay still: the mean over the poses.
+///
+/// # Errors
+/// Too few poses, or a body that moved; one sentence for the operator.
+pub fn still(name: &str, poses: &[Stamped]) -> Result<DAffine3, String> {
+    if poses.len() < FEWEST_HELD {
+        return Err(format!(
+            "the tracker reported \"{name}\" only {} times in {} ms; is it in view?",
+            poses.len(),
+            HOLD.as_millis()
+        ));
+    }
+    let mean = |part: &[Stamped]| {
+        let n = part.len().max(1) as f64;
+        let first = part.first().map_or(DQuat::IDENTITY, |p| p.rotation);
+        // Turns of a body that lies still are small, so their mean is that of their rotation vectors.
+        let turn = part.iter().map(|p| so3_between(first, p.rotation)).sum::<DVec3>() / n;
+        (part.iter().map(|p| p.position).sum::<DVec3>() / n, so3_exp(turn) * first)
+    };
+    let (first, second) = poses.split_at(poses.len() / 2);
+    let (first, second) = (mean(first), mean(second));
+    let (moved, turned) = ((first.0 - second.0).length(), so3_between(first.1, second.1).length());
+    if moved > STILL_M || turned > STILL_RAD {
+        return Err(format!(
+            "\"{name}\" moved by {:.1} mm and {:.2} degrees; hold it still and try again",
+            1e3 * moved,
+            turned.to_degrees()
+        ));
+    }
+    let (position, rotation) = mean(poses);
+    Ok(DAffine3::from_rotation_translation(rotation, position))
+}
+
 /// Where a tip was while it was held: the mean over the poses.
 ///
 /// # Errors
@@ -163,7 +201,6 @@ pub fn held(tip: DVec3, poses: &[Stamped]) -> Result<DVec3, String> {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use glam::DQuat;
 
     fn at(position: DVec3) -> Stamped {
         Stamped { stamp_ns: 0, position, rotation: DQuat::from_rotation_z(std::f64::consts::FRAC_PI_2) }
@@ -177,6 +214,10 @@ mod tests {
         assert!((place - DVec3::new(0.0, 0.1, 0.0)).length() < 1e-5, "{place}");
         let moving: Vec<Stamped> = (0..100).map(|i| at(DVec3::X * 1e-4 * f64::from(i))).collect();
         assert!(held(tip, &moving).unwrap_err().contains("moved by 5.0 mm"));
+        assert!(super::still("box", &moving).unwrap_err().contains("\"box\" moved by 5.0 mm"));
+        assert!(super::still("box", &still[..5]).unwrap_err().contains("only 5 times"));
+        let lies = super::still("box", &still).unwrap();
+        assert!((lies.transform_point3(tip) - place).length() < 1e-12);
         assert!(held(tip, &still[..5]).unwrap_err().contains("only 5 times"));
     }
 }

@@ -3,6 +3,7 @@
 use dpm_calibration::file::{self, CalibrationFile, Provenance};
 use dpm_rig::config::RigConfig;
 use dpm_rig::failure::{Failure, FailureKind};
+use dpm_rig::rig::Rig;
 use dpm_rig::standing::{utc, Identity};
 use std::path::{Path, PathBuf};
 use std::time::SystemTime;
@@ -31,6 +32,16 @@ impl Results {
             CalibrationFile::new()
         };
         Ok(Self { path, file })
+    }
+
+    /// The rig as it runs with what this file holds, whether or not the rig file names it yet.
+    ///
+    /// # Errors
+    /// The rig cannot be built.
+    pub fn rig(&self, config: &RigConfig) -> Result<Rig, Failure> {
+        let mut config = config.clone();
+        config.calibration.file = self.path.exists().then(|| self.path.clone());
+        Ok(Rig::build(&config, None)?)
     }
 
     /// A file beside it for what an interrupted command has measured so far.

@@ -1,5 +1,6 @@
 //! `dpm calibrate ...`: measures what a rig needs to know, and writes it into the calibration file.
 
+use super::calibrate_light::{check, nudge, CheckArgs, NudgeArgs};
 use super::rig_args::RigArgs;
 use super::watch::{print, watch_quietly};
 use crate::calibrate::aim::Aim;
@@ -13,6 +14,7 @@ use dpm_calibration::rehearsal::{rehearse_with, Bias};
 use dpm_common::clock::MonotonicClock;
 use dpm_rig::config::RigConfig;
 use dpm_rig::failure::{Failure, FailureKind};
+use dpm_rig::pack::source::PatternSource;
 use dpm_rig::pattern::run_pattern;
 use dpm_rig::rig::Rig;
 use dpm_rig::telemetry::monitor::RunMonitor;
@@ -37,6 +39,10 @@ enum What {
     Projector(ProjectorArgs),
     /// Find where a mesh is in its tracked body: touch known points of it, then wander over its surface
     Body(BodyArgs),
+    /// Measure how far light is from where it belongs on a tracked body, and say what to measure again
+    Check(CheckArgs),
+    /// Move a body's mesh or the projector by hand while outlines are shown
+    Nudge(NudgeArgs),
     /// Write lens and pose of the rig's projector as a file of OpenCV (.xml, .yml or .json)
     Export(ExportArgs),
     /// Run the whole calibration in simulation, against truths that it does not know, and print its errors
@@ -45,7 +51,7 @@ enum What {
 
 /// What every measurement needs.
 #[derive(clap::Args, Clone, Debug)]
-struct Common {
+pub(super) struct Common {
     /// The rig file with tracker and projector
     #[arg(value_name = "RIG.toml")]
     rig: PathBuf,
@@ -54,7 +60,7 @@ struct Common {
     file: Option<PathBuf>,
     /// Name of the wand in the tracking software
     #[arg(long, value_name = "NAME", default_value = "wand")]
-    wand: String,
+    pub(super) wand: String,
     /// Set a key of the rig file, for example tracker.server=192.168.1.10; may be given several times
     #[arg(long = "set", value_name = "KEY=VALUE")]
     set: Vec<String>,
@@ -191,7 +197,7 @@ fn axis(text: &str) -> Result<DVec3, String> {
 
 impl Common {
     /// The rig file, of which tracker and projector are used, and its calibration file.
-    fn open(&self) -> Result<(RigConfig, Results), Failure> {
+    pub(super) fn open(&self) -> Result<(RigConfig, Results), Failure> {
         let args = RigArgs { set: self.set.clone(), ..RigArgs::default() };
         let mut config = args.rig_at_rest(Some(&self.rig))?;
         // A pattern runs until it is stopped.
@@ -202,7 +208,7 @@ impl Common {
 }
 
 /// The tip of the wand by a former `dpm calibrate wand`.
-fn tip_of(results: &Results) -> Result<DVec3, Failure> {
+pub(super) fn tip_of(results: &Results) -> Result<DVec3, Failure> {
     let told = "the tip of the wand is not known yet: run `dpm calibrate wand` first";
     let wand = results.file.wand.as_ref().ok_or_else(|| Failure::new(FailureKind::BadInput, told))?;
     Ok(DVec3::from_array(wand.tip))
@@ -239,6 +245,8 @@ pub(super) fn execute(args: &CalibrateArgs) -> Result<(), Failure> {
             print(&format!("{told}\n{}\n", results.save(&config)?));
             Ok(())
         }
+        What::Check(args) => check(args),
+        What::Nudge(args) => nudge(args),
         What::Export(args) => write_opencv(args),
         What::Rehearse(args) => rehearse(args),
     }
@@ -305,13 +313,23 @@ fn while_aiming<T>(
     monitor: &Arc<RunMonitor>,
     work: impl FnOnce(&Aim, &Dialogue) -> Result<T, Failure>,
 ) -> Result<T, Failure> {
-    let aim = Arc::new(Aim::default());
+    while_showing(config, monitor, Arc::new(Aim::default()), work)
+}
+
+/// Runs the projector with the pictures of `source` while `work` talks to the operator; the projector is dark
+/// afterwards.
+pub(super) fn while_showing<S: PatternSource + 'static, T>(
+    config: &RigConfig,
+    monitor: &Arc<RunMonitor>,
+    source: Arc<S>,
+    work: impl FnOnce(&S, &Dialogue) -> Result<T, Failure>,
+) -> Result<T, Failure> {
     let stopped = Arc::clone(monitor);
     let dialogue = Dialogue::start(move || stopped.stop_requested())?;
     std::thread::scope(|scope| {
-        let shown = Arc::clone(&aim);
+        let shown = Arc::clone(&source);
         let runs = scope.spawn(move || run_pattern(config, shown, monitor));
-        let result = work(&aim, &dialogue);
+        let result = work(&source, &dialogue);
         monitor.request_stop();
         let ended = runs.join().unwrap_or_else(|_| {
             Err(Failure::new(FailureKind::Device, "the projector's thread ended by a panic (see above)"))
