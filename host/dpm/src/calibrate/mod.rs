@@ -4,8 +4,11 @@
 pub mod aim;
 pub mod body;
 pub mod dialogue;
+pub mod levels;
+pub mod light;
 pub mod poses;
 pub mod projector;
+pub mod recorder;
 pub mod results;
 pub mod sensor;
 pub mod wand;

@@ -1,13 +1,15 @@
 //! `dpm calibrate ...`: measures what a rig needs to know, and writes it into the calibration file.
 
+use super::calibrate_light::{LatencyArgs, LightArgs};
 use super::rig_args::RigArgs;
 use super::watch::{print, watch_quietly};
 use crate::calibrate::aim::Aim;
 use crate::calibrate::dialogue::Dialogue;
 use crate::calibrate::poses::Poses;
 use crate::calibrate::projector::{aim_by_hand, keep, solve_file, told_of, Points};
+use crate::calibrate::recorder::Port;
 use crate::calibrate::results::Results;
-use crate::calibrate::{body, sensor, wand};
+use crate::calibrate::{body, light, sensor, wand};
 use dpm_calibration::projector::{Known, Options};
 use dpm_calibration::rehearsal::{rehearse_with, Bias};
 use dpm_common::clock::MonotonicClock;
@@ -37,6 +39,10 @@ enum What {
     Projector(ProjectorArgs),
     /// Find where a mesh is in its tracked body: touch known points of it, then wander over its surface
     Body(BodyArgs),
+    /// Find how bright code values are, by the light sensor at rest in the beam, and the flat field from a sweep of it
+    Light(LightArgs),
+    /// Find the latency alone, with a light sensor and the projector of the calibration file
+    Latency(LatencyArgs),
     /// Write lens and pose of the rig's projector as a file of OpenCV (.xml, .yml or .json)
     Export(ExportArgs),
     /// Run the whole calibration in simulation, against truths that it does not know, and print its errors
@@ -45,7 +51,7 @@ enum What {
 
 /// What every measurement needs.
 #[derive(clap::Args, Clone, Debug)]
-struct Common {
+pub(super) struct Common {
     /// The rig file with tracker and projector
     #[arg(value_name = "RIG.toml")]
     rig: PathBuf,
@@ -54,7 +60,7 @@ struct Common {
     file: Option<PathBuf>,
     /// Name of the wand in the tracking software
     #[arg(long, value_name = "NAME", default_value = "wand")]
-    wand: String,
+    pub(super) wand: String,
     /// Set a key of the rig file, for example tracker.server=192.168.1.10; may be given several times
     #[arg(long = "set", value_name = "KEY=VALUE")]
     set: Vec<String>,
@@ -85,6 +91,9 @@ struct ProjectorArgs {
     /// Bits per second of the sensor's port
     #[arg(long, value_name = "BAUD", default_value_t = 3_000_000, requires = "sensor")]
     sensor_baud: u32,
+    /// Gain setting of the sensor
+    #[arg(long, value_name = "N", default_value_t = 0, requires = "sensor")]
+    gain: u8,
     /// Seconds of motion with the sensor
     #[arg(long, value_name = "S", default_value_t = 30.0, value_parser = seconds, requires = "sensor")]
     seconds: f64,
@@ -153,7 +162,7 @@ enum BiasWord {
 /// Bias of the tracker in rehearsals that have one, metres along an axis.
 const BIAS_M: f64 = 5e-5;
 
-fn seconds(text: &str) -> Result<f64, String> {
+pub(super) fn seconds(text: &str) -> Result<f64, String> {
     let s = text.parse().ok().filter(|s: &f64| *s > 0.0 && *s <= 3600.0);
     s.ok_or_else(|| "write seconds, above 0 and at most 3600".into())
 }
@@ -179,7 +188,7 @@ fn axis(text: &str) -> Result<DVec3, String> {
 
 impl Common {
     /// The rig file, of which tracker and projector are used, and its calibration file.
-    fn open(&self) -> Result<(RigConfig, Results), Failure> {
+    pub(super) fn open(&self) -> Result<(RigConfig, Results), Failure> {
         let args = RigArgs { set: self.set.clone(), ..RigArgs::default() };
         let mut config = args.rig_at_rest(Some(&self.rig))?;
         // A pattern runs until it is stopped.
@@ -190,7 +199,7 @@ impl Common {
 }
 
 /// The tip of the wand by a former `dpm calibrate wand`.
-fn tip_of(results: &Results) -> Result<DVec3, Failure> {
+pub(super) fn tip_of(results: &Results) -> Result<DVec3, Failure> {
     let told = "the tip of the wand is not known yet: run `dpm calibrate wand` first";
     let wand = results.file.wand.as_ref().ok_or_else(|| Failure::new(FailureKind::BadInput, told))?;
     Ok(DVec3::from_array(wand.tip))
@@ -222,6 +231,8 @@ pub(super) fn execute(args: &CalibrateArgs) -> Result<(), Failure> {
             print(&format!("{told}\n{}\n", results.save(&config)?));
             Ok(())
         }
+        What::Light(args) => args.execute(),
+        What::Latency(args) => args.execute(),
         What::Export(args) => write_opencv(args),
         What::Rehearse(args) => rehearse(args),
     }
@@ -266,8 +277,7 @@ fn projector_by_sensor(
     let tip = tip_of(&results)?;
     let sigma = results.file.wand.as_ref().map_or(1e-3, |wand| wand.tip_sigma_m);
     let setup = sensor::Setup {
-        port: port.to_owned(),
-        baud: args.sensor_baud,
+        port: Port { path: port.to_owned(), baud: args.sensor_baud, gain: args.gain },
         wand: args.common.wand.clone(),
         seconds: args.seconds,
         aperture_m: 1e-3 * args.aperture,
@@ -277,6 +287,8 @@ fn projector_by_sensor(
         sensor::calibrate(config, &setup, (tip, sigma), monitor)
     })?;
     sensor::keep(&mut results, config, &args.common.wand, &solution);
+    // `dpm calibrate light` makes the flat field of it.
+    light::save_sweep(&results.sweep(), &solution.brightness)?;
     print(&format!("{}\n{}\n", sensor::told_of(&solution), results.save(config)?));
     Ok(())
 }
