@@ -2,7 +2,7 @@
 //! when, to the levels that its converter samples.
 //!
 //! The wand's motion, its tip, the projector's place and lens are true and known only here. [`SensorWand`] has no clock
-//! and no I/O: light and time are arguments, so it also runs at virtual time inside a test. [`line`] serves it on a
+//! and no I/O: light and time are arguments, so it also runs at virtual time inside a test. [`mod@line`] serves it on a
 //! serial port.
 
 mod aperture;

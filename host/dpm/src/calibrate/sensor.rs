@@ -152,7 +152,7 @@ fn record(
     let clock = MonotonicClock::new(0);
     let stopped = Arc::clone(monitor);
     let dialogue = Dialogue::start(move || stopped.stop_requested())?;
-    let poses = Poses::start(config, &[setup.wand.clone()], clock)?;
+    let poses = Poses::start(config, std::slice::from_ref(&setup.wand), clock)?;
     let recorder = Recorder::start(&setup.port, clock)?;
     poses.wait_until_seen()?;
     let source = Arc::new(CodeSource(code.clone()));

@@ -8,10 +8,27 @@ use dpm_calibration::pivot::Pivot;
 use dpm_common::clock::MonotonicClock;
 use dpm_rig::config::RigConfig;
 use dpm_rig::failure::{Failure, FailureKind};
+use glam::DVec3;
 use std::time::{Duration, Instant};
 
 /// Time between two lines of advice.
 const ADVISE_EVERY: Duration = Duration::from_secs(2);
+
+/// How well a ruler tells the tip, metres along an axis.
+const RULER_M: f64 = 2e-3;
+
+/// Keeps a tip that was measured with a ruler.
+pub fn by_ruler(config: &RigConfig, name: &str, tip: DVec3, results: &mut Results) -> String {
+    results.file.wand = Some(WandSection {
+        tip: tip.to_array(),
+        tip_sigma_m: RULER_M * 3f64.sqrt(),
+        provenance: results.provenance(config, name, "typed in".into(), "ruler"),
+    });
+    format!(
+        "tip taken as known to {:.0} mm; aiming by hand needs it better: turn the wand about its tip for that",
+        1e3 * RULER_M
+    )
+}
 
 /// Collects poses of the body `name` for `seconds` and writes the tip.
 ///

@@ -70,6 +70,9 @@ pub(super) struct Common {
 struct WandArgs {
     #[command(flatten)]
     common: Common,
+    /// The tip measured with a ruler, millimetres in the wand's body, instead of turning; the light sensor refines it
+    #[arg(long, value_name = "X,Y,Z", value_parser = three, allow_hyphen_values = true)]
+    tip: Option<DVec3>,
     /// Seconds of turning
     #[arg(long, value_name = "S", default_value_t = 15.0, value_parser = seconds)]
     seconds: f64,
@@ -162,6 +165,15 @@ enum BiasWord {
 /// Bias of the tracker in rehearsals that have one, metres along an axis.
 const BIAS_M: f64 = 5e-5;
 
+fn three(text: &str) -> Result<DVec3, String> {
+    let parts: Result<Vec<f64>, _> = text.split(',').map(|n| n.trim().parse()).collect();
+    let numbers = parts.ok().and_then(|n| <[f64; 3]>::try_from(n).ok());
+    let within = numbers.filter(|n| n.iter().all(|v| v.abs() <= 1e4));
+    within
+        .map(DVec3::from_array)
+        .ok_or_else(|| "write three numbers of millimetres, such as 10,-5,120".into())
+}
+
 pub(super) fn seconds(text: &str) -> Result<f64, String> {
     let s = text.parse().ok().filter(|s: &f64| *s > 0.0 && *s <= 3600.0);
     s.ok_or_else(|| "write seconds, above 0 and at most 3600".into())
@@ -214,9 +226,14 @@ pub(super) fn execute(args: &CalibrateArgs) -> Result<(), Failure> {
     match &args.what {
         What::Wand(args) => {
             let (config, mut results) = args.common.open()?;
-            let dialogue = Dialogue::start(|| false)?;
             let name = &args.common.wand;
-            let told = wand::calibrate(&config, name, args.seconds, &mut results, &dialogue)?;
+            let told = match args.tip {
+                Some(tip) => wand::by_ruler(&config, name, 1e-3 * tip, &mut results),
+                None => {
+                    let dialogue = Dialogue::start(|| false)?;
+                    wand::calibrate(&config, name, args.seconds, &mut results, &dialogue)?
+                }
+            };
             print(&format!("{told}\n{}\n", results.save(&config)?));
             Ok(())
         }
@@ -251,7 +268,8 @@ fn projector(args: &ProjectorArgs) -> Result<(), Failure> {
         None => {
             let tip = tip_of(&results)?;
             let mut points = Points::resume(results.progress("projector"))?;
-            let poses = Poses::start(&config, &[args.common.wand.clone()], MonotonicClock::new(0))?;
+            let poses =
+                Poses::start(&config, std::slice::from_ref(&args.common.wand), MonotonicClock::new(0))?;
             poses.wait_until_seen()?;
             watch_quietly(config.clone(), move |config, monitor| {
                 while_aiming(config, monitor, |aim, dialogue| {

@@ -1,7 +1,5 @@
 //! Options of a run that are not in the rig file.
 
-use dpm_common::clock::MonotonicClock;
-
 /// A thread of the host that a test may stall.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum StallIn {
@@ -38,8 +36,6 @@ pub struct RunOptions {
     pub keep_frames: usize,
     /// Records of lit frames that are kept, if more than that.
     pub keep_records: usize,
-    /// The host's clock at real pace, for stamps that others compare with theirs; `None`: one of the run's own.
-    pub clock: Option<MonotonicClock>,
     /// Compare the light with what was rendered, frame by frame.
     pub verify: bool,
     /// Frames in flight at once.
@@ -50,15 +46,6 @@ pub struct RunOptions {
 
 impl Default for RunOptions {
     fn default() -> Self {
-        Self {
-            frames: 0,
-            slots: 0,
-            keep_frames: 0,
-            keep_records: 0,
-            clock: None,
-            verify: true,
-            in_flight: 4,
-            stall: None,
-        }
+        Self { frames: 0, slots: 0, keep_frames: 0, keep_records: 0, verify: true, in_flight: 4, stall: None }
     }
 }

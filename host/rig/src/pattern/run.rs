@@ -26,7 +26,7 @@ pub fn run_pattern(
     let rig = Arc::new(Rig::of_projector(config)?);
     let options =
         RunOptions { frames: config.run.frames, slots: config.slots_to_run(), ..RunOptions::default() };
-    let mut outcome = pipeline::run_pattern(rig, source, options, monitor)?;
+    let mut outcome = pipeline::run_pattern(rig, source, None, options, monitor)?;
     let mut ended = Ended::from(std::mem::take(&mut outcome.report));
     if outcome.light_mismatches > 0 {
         let told = format!("{} frames of light differ from the pattern", outcome.light_mismatches);
@@ -46,8 +46,8 @@ pub fn run_pattern_stamped(
     monitor: &Arc<RunMonitor>,
 ) -> Result<Vec<(u64, HostTime)>, Failure> {
     let rig = Arc::new(Rig::of_projector(config)?);
-    let options = RunOptions { keep_records: most, clock: Some(clock), ..RunOptions::default() };
-    let outcome = pipeline::run_pattern(rig, source, options, monitor)?;
+    let options = RunOptions { keep_records: most, ..RunOptions::default() };
+    let outcome = pipeline::run_pattern(rig, source, Some(clock), options, monitor)?;
     Ok(outcome.recent.iter().filter_map(|r| Some((r.slot, r.timeline.lit_at?))).collect())
 }
 

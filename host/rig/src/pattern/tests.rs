@@ -55,7 +55,7 @@ fn gray_codes_of_neighbours_differ_in_one_bit_and_decode_to_the_column() {
                 }
                 assert_eq!(number_of_gray(code), i, "{axis:?} {i} of {count}");
                 if let Some(before) = before.replace(code) {
-                    assert_eq!((code ^ before as u32).count_ones(), 1);
+                    assert_eq!((code ^ before).count_ones(), 1);
                 }
             }
         }
@@ -268,7 +268,7 @@ fn rig_of_projector(more: &[&str]) -> (RigConfig, Arc<Rig>) {
 /// source gives.
 fn light_is_the_pattern(source: Arc<dyn PatternSource>, rig: &Arc<Rig>, frames: u64) {
     let options = RunOptions { frames, keep_frames: frames as usize, ..RunOptions::default() };
-    let outcome = run_pipeline(rig.clone(), source.clone(), options, &Arc::new(RunMonitor::default()))
+    let outcome = run_pipeline(rig.clone(), source.clone(), None, options, &Arc::new(RunMonitor::default()))
         .unwrap_or_else(|e| panic!("{e}"));
     assert_eq!((outcome.report.frames_lit, outcome.light_mismatches), (frames, 0), "{:?}", outcome.report);
     assert_eq!((outcome.report.method, outcome.light.len() as u64), ("pattern", frames));

@@ -17,6 +17,7 @@ use crate::plan::link_time::LinkTime;
 use crate::rig::{Rig, RigError};
 use crate::telemetry::monitor::RunMonitor;
 use crate::tracks::{open_for, NoTracker, TrackingStage};
+use dpm_common::clock::MonotonicClock;
 use dpm_device::link::{HostLink, LinkSettings};
 use dpm_device::time::{HostClock, HostTime};
 use dpm_device::tracker::Tracker;
@@ -39,7 +40,17 @@ pub(super) enum Origin {
     /// They are prepared and marked.
     Prepared,
     /// They are patterns: nothing is traced, and no tracker is asked.
-    Pattern(Arc<dyn PatternSource>),
+    Pattern(Arc<dyn PatternSource>, Option<MonotonicClock>),
+}
+
+impl Origin {
+    /// The clock that stamps the run at real pace, if others compare its stamps with theirs.
+    pub(super) fn clock(&self) -> Option<MonotonicClock> {
+        match self {
+            Self::Pattern(_, clock) => *clock,
+            Self::Gpu(_) | Self::Prepared => None,
+        }
+    }
 }
 
 impl Origin {
@@ -61,7 +72,7 @@ impl Origin {
         match self {
             Self::Gpu(_) => None,
             Self::Prepared => Some(Pictures::Marked(PreparedFrames::new(raster))),
-            Self::Pattern(source) => Some(Pictures::Drawn(PatternPainter::new(source.clone(), raster))),
+            Self::Pattern(source, _) => Some(Pictures::Drawn(PatternPainter::new(source.clone(), raster))),
         }
     }
 }
@@ -101,7 +112,7 @@ impl CrewParts {
         let mut renderer =
             origin.gpu().map(|gpu| Renderer::new(gpu, &rig.scene, settings(gpu))).transpose()?;
         let tracker: Box<dyn Tracker> = match origin {
-            Origin::Pattern(_) => Box::new(NoTracker),
+            Origin::Pattern(..) => Box::new(NoTracker),
             _ => open_for(rig, clock, HostTime(0))?,
         };
         let memory = (0..options.in_flight.max(2))

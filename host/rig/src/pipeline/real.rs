@@ -62,7 +62,7 @@ pub(super) fn run_at_real_pace(
 ) -> Result<Ran, PipelineError> {
     // On a machine with fewer cores than stages, a spinning thread delays the very stages that it waits for.
     let spin_ns = if usable_cores() > STAGE_THREADS { 50_000 } else { 0 };
-    let clock = options.clock.map_or_else(|| MonotonicClock::new(spin_ns), |clock| clock.spinning(spin_ns));
+    let clock = origin.clock().map_or_else(|| MonotonicClock::new(spin_ns), |clock| clock.spinning(spin_ns));
     let parts = crew_parts(rig, origin, options, clock)?;
     let (lights_in, lights) = channel(LIGHTS, WaitPolicy::Park);
     let rights = Arc::new(Rights::new(&rig.config.real_time));

@@ -16,6 +16,7 @@ use crate::telemetry::monitor::RunMonitor;
 use crate::telemetry::projector::ProjectorReport;
 use crate::telemetry::report::Report;
 use crate::telemetry::slots::SlotCounts;
+use dpm_common::clock::MonotonicClock;
 use dpm_common::realtime::standstill::Standstills;
 use dpm_render::gpu::Gpu;
 use std::sync::atomic::Ordering;
@@ -57,6 +58,7 @@ pub fn run_prepared(
 pub fn run_pattern(
     rig: Arc<Rig>,
     source: Arc<dyn PatternSource>,
+    clock: Option<MonotonicClock>,
     options: RunOptions,
     monitor: &Arc<RunMonitor>,
 ) -> Result<RunOutcome, PipelineError> {
@@ -66,7 +68,7 @@ pub fn run_pattern(
         }
         _ => rig,
     };
-    run_from(rig, &Origin::Pattern(source), options, monitor)
+    run_from(rig, &Origin::Pattern(source, clock), options, monitor)
 }
 
 fn run_from(
@@ -111,7 +113,7 @@ impl Ran {
             method: match origin {
                 Origin::Gpu(_) => config.render.method.word(),
                 Origin::Prepared => "prepared",
-                Origin::Pattern(_) => "pattern",
+                Origin::Pattern(..) => "pattern",
             },
             prediction: config.prediction.on,
             light_hash: recorder.as_ref().and_then(LightRecorder::hash).unwrap_or_default(),
