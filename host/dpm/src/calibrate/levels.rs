@@ -92,6 +92,8 @@ impl Levels {
                     ));
                 }
             }
+            // The second that the limiter looks at may begin anywhere, and so may the levels.
+            hold += hold / 8;
         }
         Ok(Self { steps, hold, channels, rate, mean })
     }

@@ -101,7 +101,9 @@ struct Bench {
 const SENSOR_MINUS_HOST_NS: i64 = 77_000_000_000;
 
 fn block_of(sample: SensorSample, scale: f64) -> Block {
-    let level = (f64::from(sample.level) * scale) as f32;
+    // The light of the room, a twentieth of 4095, does not fade.
+    let room = 0.05 * 4095.0;
+    let level = (room + (f64::from(sample.level) - room) * scale) as f32;
     let start_ns = sample.ticks as i64 * 1000 + SENSOR_MINUS_HOST_NS;
     Block { start_ns, interval_ns: 1e4, levels: vec![level] }
 }
