@@ -184,7 +184,7 @@ pub fn solve(
         }
     }
     let whites: Vec<Steady> =
-        readings.iter().filter(|(run, _)| levels.step_of(**run) % 2 == 0).map(|(_, r)| *r).collect();
+        readings.iter().filter(|(run, _)| levels.step_of(**run).is_multiple_of(2)).map(|(_, r)| *r).collect();
     let ambient = room.ambient.level;
     let white = whites.iter().map(|r| r.level).sum::<f64>() / whites.len().max(1) as f64;
     let mut session = Session::new(levels.channels);
