@@ -116,6 +116,8 @@ fn the_program_serves_projector_tracker_and_sensor() {
             "64x48",
             "--command-port",
             "0",
+            "--body",
+            "hare:-0.1,0,0.25",
             "--seconds",
             "20",
         ])
@@ -123,6 +125,8 @@ fn the_program_serves_projector_tracker_and_sensor() {
         .spawn()
         .unwrap();
     let mut lines = BufReader::new(child.stdout.take().unwrap()).lines().map_while(Result::ok);
+    let tracker = lines.find(|l| l.starts_with("NatNet on ")).expect("named");
+    assert!(tracker.ends_with("body 1: wand, body 2: hare"), "{tracker}");
     let sensor = lines.find_map(|l| l.strip_prefix("light sensor on ").map(str::to_owned)).expect("named");
     let clock = clock();
     let mut client = SensorClient::open(config(&sensor), clock.clone()).unwrap();
@@ -143,6 +147,10 @@ fn the_program_serves_projector_tracker_and_sensor() {
         (["--aperture-mm", "0"], "`aperture_m`"),
         (["--motion", "{}"], "--motion"),
         (["--focal", "0"], "--focal 0"),
+        (["--droop", "2"], "`droop`"),
+        (["--body", "hare"], "NAME:X,Y,Z"),
+        (["--body", "hare:1,2"], "3 numbers"),
+        (["--body", "wand:1,2,3"], "the wand's own name"),
     ] {
         let output = Command::new(env!("CARGO_BIN_EXE_hil-mock"))
             .args(["serve", "sensor-wand", "--seconds", "0", "--command-port", "0"])

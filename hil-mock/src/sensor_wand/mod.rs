@@ -57,6 +57,9 @@ pub struct SensorWandConfig {
     pub noise: f64,
     /// Light of a dark mirror as a share of that of a lit one.
     pub leak: f64,
+    /// Share of its light that the LED loses in planes of bit 7, as LEDs do at high currents; planes of lower bits lose
+    /// half as much for each bit.
+    pub droop: f64,
     /// How much darker the picture is at its corners, as a share: the loss grows with the square of the distance from the
     /// centre.
     pub vignetting: f64,
@@ -89,6 +92,7 @@ impl SensorWandConfig {
             flicker_hz: 100.0,
             noise: 0.0033,
             leak: 0.001,
+            droop: 0.0,
             vignetting: 0.15,
             obstructed: 0.0,
             obstruction_ns: 40_000_000,
@@ -171,6 +175,7 @@ impl SensorWand {
             ("flicker", c.flicker),
             ("noise", c.noise),
             ("leak", c.leak),
+            ("droop", c.droop),
             ("vignetting", c.vignetting),
             ("obstructed", c.obstructed),
         ] {
@@ -332,7 +337,8 @@ impl Scene {
             Channel::White => 1.0,
             channel => c.colours[channel as usize],
         };
-        let led = colour * f64::from(1u32 << spec.bit) / 255.0;
+        let current = f64::from(1u32 << spec.bit);
+        let led = colour * current / 255.0 * (1.0 - c.droop * current / 128.0);
         let off_x = pixel[0] / f64::from(raster.width()) - 0.5;
         let off_y = pixel[1] / f64::from(raster.height()) - 0.5;
         let flat = (1.0 - c.vignetting * 2.0 * (off_x * off_x + off_y * off_y)).max(0.0);

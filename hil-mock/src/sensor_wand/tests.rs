@@ -28,6 +28,7 @@ fn clean() -> SensorWandConfig {
         ambient: 0.0,
         noise: 0.0,
         leak: 0.0,
+        droop: 0.0,
         vignetting: 0.0,
         clock_ppm: 0.0,
         start_ticks: 0,
@@ -106,6 +107,27 @@ fn each_plane_has_its_level_in_its_time() {
         }
     }
     assert!(seen[0] > 350 && seen[1] > 45, "{seen:?}");
+}
+
+#[test]
+fn an_led_droops_at_high_currents() {
+    let light = |droop: f64, bit: u8| {
+        let config = SensorWandConfig { droop, responsivity: 1.0, ..clean() };
+        let mut wand = SensorWand::new(config, still(), raster()).unwrap();
+        let plane = PlaneSpec { channel: Channel::White, bit };
+        let slot = Shown {
+            schedule: dpm_device::planes::PlaneSchedule::new(&[plane]).unwrap(),
+            planes: vec![0xff; raster().plane_bytes()].into(),
+            ..shown(3 * SLOT_NS, |_, _, _| true)
+        };
+        f64::from(samples(&mut wand, &slot).last().unwrap().1)
+    };
+    for (bit, lost) in [(7, 0.1), (6, 0.05), (5, 0.025), (0, 0.1 / 128.0)] {
+        let (full, less) = (light(0.0, bit), light(0.1, bit));
+        assert!((full * (1.0 - lost) - less).abs() <= 1.0, "bit {bit}: {full} {less}");
+    }
+    let config = SensorWandConfig { droop: 1.1, ..clean() };
+    assert_eq!(SensorWand::new(config, still(), raster()).unwrap_err().field, "droop");
 }
 
 #[test]

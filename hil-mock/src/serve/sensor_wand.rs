@@ -20,6 +20,8 @@ use std::sync::Arc;
 
 /// Lit slots that may wait for the wand: a frame of 1024 x 768 has 2.4 MB.
 const SHOWN_KEPT: usize = 64;
+/// The wand's name in the tracker.
+const WAND: &str = "wand";
 /// The motion of a hand that wanders through the beam.
 const WANDER: &str = r#"{"kind":"together","parts":[
     {"kind":"sinusoid","direction":[1,0,0],"peak_speed_m_s":0.35,"peak_acceleration_m_s2":0.9},
@@ -46,6 +48,9 @@ pub(crate) struct SensorWandArguments {
     /// The sensor in the space of the wand's body, metres; it looks along +z
     #[arg(long, value_name = "X,Y,Z", default_value = "0.01,-0.005,0.12", value_parser = three, allow_hyphen_values = true)]
     tip: [f64; 3],
+    /// A body that the tracker reports beside the wand, at rest, as NAME:X,Y,Z in metres; may be repeated
+    #[arg(long = "body", value_name = "NAME:X,Y,Z", value_parser = body, allow_hyphen_values = true)]
+    bodies: Vec<(String, [f64; 3])>,
     /// Place of the projector, which looks along -z, metres
     #[arg(long, value_name = "X,Y,Z", default_value = "0,0,1.4", value_parser = three, allow_hyphen_values = true)]
     projector_at: [f64; 3],
@@ -70,6 +75,12 @@ pub(crate) struct SensorWandArguments {
     /// Noise of a sample as a share of the converter's range
     #[arg(long, default_value_t = 0.0033)]
     noise: f64,
+    /// Share of the converter's range that full white fills at 1 m, at the first gain
+    #[arg(long, default_value_t = 10.52)]
+    responsivity: f64,
+    /// Share of its light that the projector's LED loses in planes of bit 7; half as much for each lower bit
+    #[arg(long, default_value_t = 0.0)]
+    droop: f64,
     /// Light of the room as a share of the converter's range
     #[arg(long, default_value_t = 0.05)]
     ambient: f64,
@@ -115,6 +126,15 @@ fn five(text: &str) -> Result<[f64; 5], String> {
     numbers(text)
 }
 
+fn body(text: &str) -> Result<(String, [f64; 3]), String> {
+    let (name, place) = text.rsplit_once(':').ok_or("write NAME:X,Y,Z")?;
+    match name {
+        "" => Err("the body needs a name".into()),
+        WAND => Err(format!("\"{WAND}\" is the wand's own name")),
+        _ => Ok((name.to_owned(), three(place)?)),
+    }
+}
+
 impl SensorWandArguments {
     fn motion(&self) -> Result<Motion, Box<dyn Error>> {
         let spec: MotionSpec = serde_json::from_str(self.motion.as_deref().unwrap_or(WANDER))
@@ -137,6 +157,8 @@ impl SensorWandArguments {
             samples_per_second: self.samples,
             clock_ppm: self.clock_ppm,
             noise: self.noise,
+            responsivity: self.responsivity,
+            droop: self.droop,
             ambient: self.ambient,
             flicker: self.flicker,
             obstructed: self.obstructed,
@@ -155,14 +177,22 @@ impl SensorWandArguments {
             latency_ns: (self.tracker_latency_ms * 1e6) as i64,
             ..Default::default()
         };
-        let source = SampleSource::new(config, vec![motion])?;
+        let (mut names, mut motions) = (vec![WAND], vec![motion]);
+        for (name, position_m) in &self.bodies {
+            names.push(name);
+            motions.push(Motion::still(Pose { position_m: *position_m, ..Pose::IDENTITY })?);
+        }
+        let source = SampleSource::new(config, motions)?;
         let data_port = self.command_port.checked_add(1).ok_or("--command-port: at most 65534")?;
-        let config = NatNetServerConfig { data_port, ..NatNetServerConfig::new(&["wand"]) };
+        let config = NatNetServerConfig { data_port, ..NatNetServerConfig::new(&names) };
         let streaming = config.streaming;
         let address = SocketAddrV4::new(Ipv4Addr::LOCALHOST, self.command_port);
         let host = NatNetHost::start(NatNetServer::new(config, source)?, streaming, address, clock)
             .map_err(|e| cannot_serve("NatNet", address, &e, "--command-port"))?;
-        say(format_args!("NatNet on {}, data port {data_port}, body 1: wand", host.address()));
+        let bodies: Vec<String> =
+            names.iter().enumerate().map(|(i, name)| format!("body {}: {name}", i + 1)).collect();
+        let bodies = bodies.join(", ");
+        say(format_args!("NatNet on {}, data port {data_port}, {bodies}", host.address()));
         Ok(host)
     }
 }

@@ -22,7 +22,7 @@ pub(super) struct Found {
 }
 
 /// The projector's pace, known from its own clock: 947 frames a second.
-const TIMING: Timing = Timing { frame_zero_ns: 1_000_000_123, frame_ns: 1_055_966.2 };
+pub(super) const TIMING: Timing = Timing { frame_zero_ns: 1_000_000_123, frame_ns: 1_055_966.2 };
 /// Seconds of turning about the tip, and of the sweep.
 const PIVOT_S: f64 = 20.0;
 const SWEEP_S: [f64; 2] = [40.0, 70.0];

@@ -204,6 +204,8 @@ fn level_error(truth: &Truth, got: &LightModel) -> f64 {
 }
 
 #[cfg(test)]
+mod latency_tests;
+#[cfg(test)]
 mod refusal_tests;
 #[cfg(test)]
 mod tests;

@@ -118,15 +118,21 @@ pub enum SensorError {
         /// Residual, pixels.
         px: f64,
     },
+    /// The light is not where a known projector puts it.
+    #[error("sensor: the light is {px:.1} px away from where the calibrated projector puts it: projector or tracker were moved, or the tip is another one; run `dpm calibrate projector` again")]
+    OtherProjector {
+        /// Residual, pixels.
+        px: f64,
+    },
 }
 
 /// Fewest frames.
-const FEWEST: usize = 500;
+pub(super) const FEWEST: usize = 500;
 /// Beyond this an offset is no latency, seconds.
 pub(super) const MOST_LATENCY_S: f64 = 0.05;
 pub(super) const MOST_LATENCY_SIGMA_US: f64 = 100.0;
 /// Blocks over which scores are summed, seconds.
-const BLOCK_S: f64 = 0.1;
+pub(super) const BLOCK_S: f64 = 0.1;
 
 /// Finds the projector, the tip and the latency.
 ///
@@ -143,18 +149,27 @@ pub fn solve(
         let seconds = (2 * FEWEST - seen.len()) as f64 * 1e-9 * settings.timing.frame_ns;
         return Err(SensorError::TooFew { frames: seen.len(), seconds: seconds.max(1.0) });
     }
-    let middle = (PLANES / 2) as f64;
-    let plane_s = 1e-9 * settings.timing.frame_ns / PLANES as f64;
-    let times = std::array::from_fn(|p| (p as f64 + decoded.centre - middle) * plane_s);
+    let times = times(decoded, settings);
     let tip_sigma = settings.tip_sigma_m.max(1e-4);
-    let problem = Problem { code, path, settings, times, tip_sigma };
+    let problem = Problem { code, path, settings, times, tip_sigma, is_held: false };
     let start = start(&problem, &seen)?;
     let (state, equations, rms_level) = refine(&problem, start, &seen)?;
     finish(&problem, &state, &equations, &seen, rms_level)
 }
 
+/// Time of a level within its plane, less that of the frame's middle, seconds, by plane.
+pub(super) fn times(decoded: &Decoded, settings: &Settings) -> [f64; PLANES] {
+    let middle = (PLANES / 2) as f64;
+    let plane_s = 1e-9 * settings.timing.frame_ns / PLANES as f64;
+    std::array::from_fn(|p| (p as f64 + decoded.centre - middle) * plane_s)
+}
+
 /// Fits the levels: wide stripes first, since a start that is wrong by a stripe would lock to the wrong one.
-fn refine(problem: &Problem, start: State, seen: &[Seen]) -> Result<(State, Equations, f64), SensorError> {
+pub(super) fn refine(
+    problem: &Problem,
+    start: State,
+    seen: &[Seen],
+) -> Result<(State, Equations, f64), SensorError> {
     let few: Vec<Seen> = thin(seen, 3000).map(Seen::copy).collect();
     let mut state = start;
     let mut sigma = 0.15;
@@ -255,7 +270,7 @@ fn finish(
 
 /// Inverse of the second derivatives, times the covariance of the scores by block and of the expectations, times the
 /// inverse again.
-fn sandwich(
+pub(super) fn sandwich(
     equations: &Equations,
     expected: &Equations,
     scores: &[(i64, [f64; UNKNOWNS])],

@@ -8,6 +8,7 @@
 mod code;
 mod decode;
 mod fit;
+mod latency;
 mod lock;
 mod problem;
 mod session;
@@ -17,6 +18,7 @@ mod stripes;
 pub use code::{Code, CodeError, Role, PLANES};
 pub use decode::{decode, DecodeError, Decoded, Frame};
 pub use fit::{solve, Brightness, SensorError, Settings, Solution};
+pub use latency::{solve_latency, Latency};
 pub use lock::{Block, Lock};
 pub use session::{Coverage, Session};
 

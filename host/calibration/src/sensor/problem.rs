@@ -67,6 +67,8 @@ pub(super) struct Problem<'a> {
     /// Time of a level within its plane, less that of the frame's middle, seconds, by plane.
     pub times: [f64; PLANES],
     pub tip_sigma: f64,
+    /// Lens and pose stay what they are.
+    pub is_held: bool,
 }
 
 impl Problem<'_> {
@@ -81,7 +83,9 @@ impl Problem<'_> {
         let mut rows = [[0.0; UNKNOWNS]; 2];
         let mut moving = DVec2::ZERO;
         for k in 0..2 {
-            rows[k][..PARAMETERS].copy_from_slice(&at.by_parameters[k]);
+            if !self.is_held {
+                rows[k][..PARAMETERS].copy_from_slice(&at.by_parameters[k]);
+            }
             rows[k][TIP..LATENCY].copy_from_slice(&(to_body * at.by_point[k]).to_array());
             moving[k] = at.by_point[k].dot(velocity);
             rows[k][LATENCY] = moving[k];
@@ -92,7 +96,11 @@ impl Problem<'_> {
     }
 
     pub(super) fn expect(&self, s: &State, all: &mut Equations) {
-        self.settings.priors.apply(&s.model, all);
+        match self.is_held {
+            // What is held has no equation: one that says nothing keeps the matrix regular.
+            true => (0..PARAMETERS).for_each(|i| all.expect(i, 0.0, 1.0)),
+            false => self.settings.priors.apply(&s.model, all),
+        }
         (0..3).for_each(|i| all.expect(TIP + i, s.tip[i] - self.settings.tip[i], self.tip_sigma));
         all.expect(LATENCY, s.latency_s, 0.1);
         all.expect(DRIFT, s.drift, 1e-4);

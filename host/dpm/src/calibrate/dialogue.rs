@@ -3,10 +3,32 @@
 use crossbeam::channel::{unbounded, Receiver, RecvTimeoutError};
 use dpm_rig::failure::{Failure, FailureKind};
 use std::io::{BufRead, Write};
+use std::sync::{Mutex, PoisonError};
 use std::time::Duration;
 
 /// Longest line that is read; the rest of it is left out.
 const LONGEST_LINE: u64 = 4096;
+
+/// The lines of the standard input. One thread reads them for all dialogues of the program, since a reader that waits
+/// cannot be called back and would take a line from the next one.
+static READER: Mutex<Option<Receiver<String>>> = Mutex::new(None);
+
+fn read_lines() -> Result<Receiver<String>, Failure> {
+    let (send, lines) = unbounded();
+    let read = move || loop {
+        let mut line = String::new();
+        let mut input = std::io::Read::take(std::io::stdin().lock(), LONGEST_LINE);
+        match input.read_line(&mut line) {
+            Ok(n) if n > 0 && send.send(line.trim().to_owned()).is_ok() => {}
+            _ => return,
+        }
+    };
+    std::thread::Builder::new()
+        .name("dpm-dialogue".into())
+        .spawn(read)
+        .map_err(|e| Failure::new(FailureKind::Device, format!("cannot start a thread: {e}")))?;
+    Ok(lines)
+}
 
 /// The operator at the standard input and output.
 pub struct Dialogue {
@@ -20,19 +42,11 @@ impl Dialogue {
     /// # Errors
     /// No thread can be started (exit code 3).
     pub fn start(is_stopped: impl Fn() -> bool + Send + 'static) -> Result<Self, Failure> {
-        let (send, lines) = unbounded();
-        let read = move || loop {
-            let mut line = String::new();
-            let mut input = std::io::Read::take(std::io::stdin().lock(), LONGEST_LINE);
-            match input.read_line(&mut line) {
-                Ok(n) if n > 0 && send.send(line.trim().to_owned()).is_ok() => {}
-                _ => return,
-            }
+        let mut reader = READER.lock().unwrap_or_else(PoisonError::into_inner);
+        let lines = match &*reader {
+            Some(lines) => lines.clone(),
+            None => reader.insert(read_lines()?).clone(),
         };
-        std::thread::Builder::new()
-            .name("dpm-dialogue".into())
-            .spawn(read)
-            .map_err(|e| Failure::new(FailureKind::Device, format!("cannot start a thread: {e}")))?;
         Ok(Self { lines, is_stopped: Box::new(is_stopped) })
     }
 

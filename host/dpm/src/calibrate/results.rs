@@ -51,6 +51,13 @@ impl Results {
         self.path.with_file_name(name)
     }
 
+    /// A file beside it in which the last sweep of the light sensor has left its brightness, for the flat field.
+    pub fn sweep(&self) -> PathBuf {
+        let mut name = self.path.file_name().unwrap_or_default().to_os_string();
+        name.push(".sweep");
+        self.path.with_file_name(name)
+    }
+
     /// Writes it; what was there before is kept. Returns what to tell the operator.
     ///
     /// # Errors

@@ -3,36 +3,24 @@
 
 use super::dialogue::Dialogue;
 use super::poses::Poses;
+use super::recorder::{timing_of, wait_until_up, while_shown, Lights, Port, Recorder};
 use super::results::Results;
 use dpm_calibration::file::{LatencySection, ProjectorSection, WandSection};
+use dpm_calibration::model::ProjectorModel;
 use dpm_calibration::projector::{Known, Priors, Volume};
-use dpm_calibration::sensor::{decode, solve, Block, Code, Settings, Solution, Timing, PLANES};
+use dpm_calibration::sensor::{
+    decode, solve, solve_latency, Block, Code, Decoded, Latency, Settings, Solution, PLANES,
+};
 use dpm_calibration::trajectory::{Stamped, Trajectory};
-use dpm_common::clock::{Clock, MonotonicClock};
+use dpm_common::clock::MonotonicClock;
 use dpm_device::planes::PlaneSchedule;
-use dpm_device::sensor::client::{SensorClient, SensorConfig};
-use dpm_device::sensor::wire::PERIOD_ONE;
-use dpm_device::time::HostTime;
 use dpm_rig::config::RigConfig;
 use dpm_rig::failure::{Failure, FailureKind};
 use dpm_rig::pack::source::{Canvas, PatternSource};
-use dpm_rig::pattern::run_pattern_stamped;
-use dpm_rig::telemetry::monitor::{ProjectorHealth, RunMonitor};
+use dpm_rig::telemetry::monitor::RunMonitor;
 use glam::DVec3;
-use std::sync::atomic::{AtomicBool, Ordering};
-use std::sync::{Arc, Mutex, PoisonError};
+use std::sync::Arc;
 use std::time::{Duration, Instant};
-
-/// Time between two polls of the sensor, nanoseconds.
-const POLL_EVERY_NS: i64 = 1_000_000;
-/// Samples in a block.
-const BLOCK: u16 = 250;
-/// Most samples that are kept: ten minutes at 100 kS/s.
-const MOST_SAMPLES: usize = 60_000_000;
-/// How long the projector and the sensor may take until both work.
-const READY_WITHIN: Duration = Duration::from_secs(10);
-/// Slots whose light falls later than the others say by more than this, nanoseconds, are left out of the timing.
-const LATE_NS: f64 = 100_000.0;
 
 /// Shows the sensor's code. Only the bit of identity differs from frame to frame, so there are two pictures.
 struct CodeSource(Code);
@@ -66,10 +54,8 @@ impl PatternSource for CodeSource {
 /// What is measured with.
 #[derive(Clone, Debug)]
 pub struct Setup {
-    /// Serial port of the sensor.
-    pub port: String,
-    /// Bits per second of the port.
-    pub baud: u32,
+    /// The sensor.
+    pub port: Port,
     /// Name of the wand in the tracking software.
     pub wand: String,
     /// Seconds of motion.
@@ -80,92 +66,20 @@ pub struct Setup {
     pub known: Known,
 }
 
-/// A sensor that is read by a thread of its own until this is dropped.
-struct Recorder {
-    shared: Arc<Mutex<Recorded>>,
-    is_over: Arc<AtomicBool>,
-    thread: Option<std::thread::JoinHandle<()>>,
-}
-
-#[derive(Default)]
-struct Recorded {
-    blocks: Vec<Block>,
-    samples: usize,
-    /// The sensor's clock less the host's, nanoseconds, once it is known.
-    sensor_minus_host_ns: Option<i64>,
-    saturated: usize,
-    status: String,
-}
-
-impl Recorder {
-    fn start(setup: &Setup, clock: MonotonicClock) -> Result<Self, Failure> {
-        let config = SensorConfig {
-            port: setup.port.clone(),
-            baud: setup.baud,
-            gain: 0,
-            block: BLOCK,
-            samples_per_second: 0,
-        };
-        let sleeping = clock.sleeping();
-        let mut client = SensorClient::open(config, Arc::new(move || sleeping.now()))
-            .map_err(|e| Failure::new(FailureKind::BadInput, e))?;
-        let shared = Arc::new(Mutex::new(Recorded::default()));
-        let (to, is_over) = (Arc::clone(&shared), Arc::new(AtomicBool::new(false)));
-        let over = Arc::clone(&is_over);
-        let work = move || {
-            let mut fresh = Vec::new();
-            while !over.load(Ordering::Relaxed) {
-                let now = sleeping.now();
-                client.poll(now, &mut |block| {
-                    fresh.push((block.head, block.levels.iter().map(f32::from).collect()))
-                });
-                let tick_ns = client.hello().map_or(0.0, |h| 1e9 / f64::from(h.ticks_per_second.max(1)));
-                let mut shared = to.lock().unwrap_or_else(PoisonError::into_inner);
-                for (head, levels) in fresh.drain(..) {
-                    let levels: Vec<f32> = levels;
-                    let start_ns = (head.first as f64 * tick_ns) as i64;
-                    if let Some(at) = client.sampled_at(&head, 0) {
-                        shared.sensor_minus_host_ns = Some(start_ns - at.at.0);
-                    }
-                    shared.saturated += usize::from(head.cut_above);
-                    if shared.samples < MOST_SAMPLES {
-                        shared.samples += levels.len();
-                        let interval_ns = f64::from(head.period) / f64::from(PERIOD_ONE) * tick_ns;
-                        shared.blocks.push(Block { start_ns, interval_ns, levels });
-                    }
-                }
-                shared.status = client.status();
-                drop(shared);
-                sleeping.wait_until(now.plus_ns(POLL_EVERY_NS));
-            }
-        };
-        let thread = std::thread::Builder::new()
-            .name("dpm-sensor".into())
-            .spawn(work)
-            .map_err(|e| Failure::new(FailureKind::Device, format!("cannot start a thread: {e}")))?;
-        Ok(Self { shared, is_over, thread: Some(thread) })
-    }
-
-    fn locked(&self) -> std::sync::MutexGuard<'_, Recorded> {
-        self.shared.lock().unwrap_or_else(PoisonError::into_inner)
-    }
-}
-
-impl Drop for Recorder {
-    fn drop(&mut self) {
-        self.is_over.store(true, Ordering::Relaxed);
-        if let Some(thread) = self.thread.take() {
-            let _ = thread.join();
-        }
-    }
-}
-
 /// Everything that was recorded while the wand moved.
 struct Recording {
     blocks: Vec<Block>,
     sensor_minus_host_ns: i64,
     poses: Vec<Stamped>,
-    lights: Vec<(u64, HostTime)>,
+    lights: Lights,
+}
+
+/// What was recorded, ready for a solver.
+struct Sweep {
+    code: Code,
+    decoded: Decoded,
+    path: Trajectory,
+    settings: Settings,
 }
 
 /// Shows the code, records, and solves. `tip` comes from `dpm calibrate wand`.
@@ -175,19 +89,47 @@ struct Recording {
 pub fn calibrate(
     config: &RigConfig,
     setup: &Setup,
-    (tip, tip_sigma_m): (DVec3, f64),
+    tip: (DVec3, f64),
     monitor: &Arc<RunMonitor>,
 ) -> Result<Solution, Failure> {
-    let refused = |e: &dyn std::fmt::Display| Failure::new(FailureKind::BadInput, e.to_string());
+    let sweep = sweep(config, setup, tip, monitor)?;
+    solve(&sweep.code, &sweep.decoded, &sweep.path, &sweep.settings).map_err(refused)
+}
+
+/// Shows the code, records, and finds the latency of the projector `model`, which is known.
+///
+/// # Errors
+/// As [`calibrate`].
+pub fn latency(
+    config: &RigConfig,
+    setup: &Setup,
+    tip: (DVec3, f64),
+    model: &ProjectorModel,
+    monitor: &Arc<RunMonitor>,
+) -> Result<Latency, Failure> {
+    let sweep = sweep(config, setup, tip, monitor)?;
+    solve_latency(&sweep.code, &sweep.decoded, &sweep.path, &sweep.settings, model).map_err(refused)
+}
+
+fn refused(error: impl std::fmt::Display) -> Failure {
+    Failure::new(FailureKind::BadInput, error.to_string())
+}
+
+fn sweep(
+    config: &RigConfig,
+    setup: &Setup,
+    (tip, tip_sigma_m): (DVec3, f64),
+    monitor: &Arc<RunMonitor>,
+) -> Result<Sweep, Failure> {
     let raster = config.projector.raster();
-    let code = Code::new(raster).map_err(|e| refused(&e))?;
+    let code = Code::new(raster).map_err(refused)?;
     let recording = record(config, setup, &code, monitor)?;
     let timing = timing_of(&recording.lights)?;
     let decoded =
-        decode(&code, &timing, &recording.blocks, recording.sensor_minus_host_ns).map_err(|e| refused(&e))?;
+        decode(&code, &timing, &recording.blocks, recording.sensor_minus_host_ns).map_err(refused)?;
     let path = Trajectory::new(&recording.poses);
     let tips = recording.poses.iter().map(|p| p.place(tip));
-    let volume = Volume::around(tips).ok_or_else(|| refused(&"the wand was not tracked"))?;
+    let volume = Volume::around(tips).ok_or_else(|| refused("the wand was not tracked"))?;
     let settings = Settings {
         timing,
         tip,
@@ -198,7 +140,7 @@ pub fn calibrate(
         volume,
         seed: 1,
     };
-    solve(&code, &decoded, &path, &settings).map_err(|e| refused(&e))
+    Ok(Sweep { code, decoded, path, settings })
 }
 
 fn record(
@@ -211,128 +153,54 @@ fn record(
     let stopped = Arc::clone(monitor);
     let dialogue = Dialogue::start(move || stopped.stop_requested())?;
     let poses = Poses::start(config, std::slice::from_ref(&setup.wand), clock)?;
-    let recorder = Recorder::start(setup, clock)?;
+    let recorder = Recorder::start(&setup.port, clock)?;
     poses.wait_until_seen()?;
-    let frames = (config.projector.frame_rate.hz() * (setup.seconds + 60.0)) as usize;
     let source = Arc::new(CodeSource(code.clone()));
-    std::thread::scope(|scope| {
-        let runs = scope.spawn(|| run_pattern_stamped(config, source, (clock, frames), monitor));
-        let moved = (|| {
-            wait_until_ready(monitor, &recorder)?;
-            dialogue.tell(&format!(
-                "Move the wand through the whole beam for {:.0} s, sensor towards the projector, near and far, at 0.2 to 0.8 m/s,\n\
-                 and turn it a little all the time.",
-                setup.seconds
-            ));
-            dialogue.ask("Press Enter to begin.")?;
-            poses.take();
-            take_blocks(&recorder);
-            let (begin, mut told) = (Instant::now(), 0);
-            let mut path = Vec::new();
-            while begin.elapsed().as_secs_f64() < setup.seconds && !monitor.stop_requested() {
-                std::thread::sleep(Duration::from_millis(50));
-                path.extend(poses.take().into_iter().flatten());
-                let second = begin.elapsed().as_secs() / 5;
-                if second > told {
-                    told = second;
-                    let shared = recorder.locked();
-                    let (samples, clipped) = (shared.samples, shared.saturated);
-                    dialogue.tell(&format!(
-                        "{:3} s: {samples} samples, {} poses{}",
-                        5 * second,
-                        path.len(),
-                        match clipped {
-                            0 => String::new(),
-                            n => format!("; {n} blocks are saturated: turn the sensor's gain down"),
-                        }
-                    ));
-                }
-            }
-            let blocks = take_blocks(&recorder);
-            let shared = recorder.locked();
-            let sensor_minus_host_ns = shared.sensor_minus_host_ns.ok_or_else(|| {
-                Failure::new(
-                    FailureKind::Device,
-                    format!("the sensor's clock was never mapped: {}", shared.status),
-                )
-            })?;
-            Ok((blocks, sensor_minus_host_ns, path))
-        })();
-        monitor.request_stop();
-        let ended = runs.join().unwrap_or_else(|_| {
-            Err(Failure::new(FailureKind::Device, "the projector's thread ended by a panic (see above)"))
-        });
-        match (moved, ended) {
-            (Ok((blocks, sensor_minus_host_ns, poses)), Ok(lights)) => {
-                Ok(Recording { blocks, sensor_minus_host_ns, poses, lights })
-            }
-            (_, Err(failure)) | (Err(failure), _) => Err(failure),
-        }
-    })
-}
-
-fn take_blocks(recorder: &Recorder) -> Vec<Block> {
-    let mut shared = recorder.locked();
-    shared.samples = 0;
-    std::mem::take(&mut shared.blocks)
-}
-
-/// Waits until the projector is up and the sensor's clock is mapped.
-fn wait_until_ready(monitor: &RunMonitor, recorder: &Recorder) -> Result<(), Failure> {
-    let begin = Instant::now();
-    loop {
-        let is_up = monitor.projector() == ProjectorHealth::Up;
-        let shared = recorder.locked();
-        if is_up && shared.sensor_minus_host_ns.is_some() {
-            return Ok(());
-        }
-        if begin.elapsed() > READY_WITHIN || monitor.stop_requested() {
-            let told = match is_up {
-                true => format!("the light sensor does not answer: {}", shared.status),
-                false => format!("the projector is not up: {}", monitor.projector()),
-            };
-            return Err(Failure::new(FailureKind::Device, told));
-        }
-        drop(shared);
-        std::thread::sleep(Duration::from_millis(20));
-    }
-}
-
-/// When the slots begin, by a line through the first photons of all lit frames. Frames whose light came late are left out.
-fn timing_of(lights: &[(u64, HostTime)]) -> Result<Timing, Failure> {
-    let few = || {
-        let told = format!(
-            "only {} frames were lit; is the link fast enough? `dpm link-test` measures it",
-            lights.len()
-        );
-        Failure::new(FailureKind::Device, told)
+    let moved = || {
+        wait_until_up(monitor)?;
+        recorder.wait_until_mapped(monitor)?;
+        dialogue.tell(&format!(
+            "Move the wand through the whole beam for {:.0} s, sensor towards the projector, near and far, at 0.2 to 0.8 m/s,\n\
+             and turn it a little all the time.",
+            setup.seconds
+        ));
+        dialogue.ask("Press Enter to begin.")?;
+        poses.take();
+        recorder.take();
+        let path = follow(setup.seconds, &poses, &recorder, &dialogue, monitor);
+        let blocks = recorder.take().into_iter().map(|timed| timed.block).collect();
+        Ok((blocks, recorder.sensor_minus_host_ns()?, path))
     };
-    let mut used: Vec<(f64, f64)> = Vec::with_capacity(lights.len());
-    let Some(&(slot_0, at_0)) = lights.first() else { return Err(few()) };
-    used.extend(lights.iter().map(|(slot, at)| (*slot as f64 - slot_0 as f64, at.ns_since(at_0) as f64)));
-    let mut line = (0.0, 0.0);
-    for _ in 0..3 {
-        if used.len() < 100 {
-            return Err(few());
-        }
-        line = line_through(&used);
-        used.retain(|(x, y)| (y - line.0 - line.1 * x).abs() < LATE_NS);
-    }
-    let frame_zero_ns = at_0.0 + (line.0 - line.1 * slot_0 as f64).round() as i64;
-    Ok(Timing { frame_zero_ns, frame_ns: line.1 })
+    let ((blocks, sensor_minus_host_ns, poses), lights) =
+        while_shown(config, source, (clock, setup.seconds), monitor, moved)?;
+    Ok(Recording { blocks, sensor_minus_host_ns, poses, lights })
 }
 
-/// Offset and slope by least squares.
-fn line_through(points: &[(f64, f64)]) -> (f64, f64) {
-    let n = points.len() as f64;
-    let (mx, my) = points.iter().fold((0.0, 0.0), |(a, b), (x, y)| (a + x / n, b + y / n));
-    let (mut xx, mut xy) = (0.0, 0.0);
-    for (x, y) in points {
-        xx += (x - mx) * (x - mx);
-        xy += (x - mx) * (y - my);
+/// Collects poses for `seconds`, and says every five how it goes.
+fn follow(
+    seconds: f64,
+    poses: &Poses,
+    recorder: &Recorder,
+    dialogue: &Dialogue,
+    monitor: &RunMonitor,
+) -> Vec<Stamped> {
+    let (begin, mut told) = (Instant::now(), 0);
+    let mut path = Vec::new();
+    while begin.elapsed().as_secs_f64() < seconds && !monitor.stop_requested() {
+        std::thread::sleep(Duration::from_millis(50));
+        path.extend(poses.take().into_iter().flatten());
+        let fives = begin.elapsed().as_secs() / 5;
+        if fives > told {
+            told = fives;
+            let (samples, clipped) = recorder.counts();
+            let clipped = match clipped {
+                0 => String::new(),
+                n => format!("; {n} blocks are saturated: turn the sensor's gain down"),
+            };
+            dialogue.tell(&format!("{:3} s: {samples} samples, {} poses{clipped}", 5 * fives, path.len()));
+        }
     }
-    let slope = if xx > 0.0 { xy / xx } else { 0.0 };
-    (my - slope * mx, slope)
+    path
 }
 
 /// What the operator is told of a solution.
@@ -376,6 +244,26 @@ pub fn keep(results: &mut Results, config: &RigConfig, wand: &str, s: &Solution)
     });
 }
 
+/// What the operator is told of a latency.
+pub fn told_of_latency(l: &Latency) -> String {
+    format!(
+        "latency {:.3} ms, known to {:.3} ms; residual {:.3} px rms of {} frames",
+        1e-6 * l.latency_ns as f64,
+        1e-6 * l.sigma_ns,
+        l.rms_px,
+        l.frames
+    )
+}
+
+/// Puts a latency into the results.
+pub fn keep_latency(results: &mut Results, config: &RigConfig, wand: &str, l: &Latency) {
+    let data = format!("{} frames of a light sensor on \"{wand}\"", l.frames);
+    let method = "levels of coded planes by least squares, lens and pose held";
+    let provenance = results.provenance(config, "", data, method);
+    let (latency_us, sigma_us) = (1e-3 * l.latency_ns as f64, 1e-3 * l.sigma_ns);
+    results.file.latency = Some(LatencySection { latency_us, sigma_us, provenance });
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -404,18 +292,5 @@ mod tests {
                 }
             }
         }
-    }
-
-    #[test]
-    fn timing_is_the_line_of_the_frames_that_came_in_time() {
-        let frame_ns = 1_055_966.2;
-        let at = |slot: u64| HostTime(5_000_000_000 + (slot as f64 * frame_ns) as i64);
-        let mut lights: Vec<(u64, HostTime)> =
-            (1000..9000).filter(|s| s % 7 != 0).map(|s| (s, at(s))).collect();
-        lights[100].1 = lights[100].1.plus_ns(900_000);
-        let timing = timing_of(&lights).unwrap();
-        assert!((timing.frame_ns - frame_ns).abs() < 1e-3, "{}", timing.frame_ns);
-        assert!((timing.instant(5000, 0.0).0 - at(5000).0).abs() < 300);
-        assert!(timing_of(&lights[..50]).is_err());
     }
 }

@@ -1,14 +1,16 @@
 //! `dpm calibrate ...`: measures what a rig needs to know, and writes it into the calibration file.
 
-use super::calibrate_light::{check, nudge, CheckArgs, NudgeArgs};
+use super::calibrate_check::{check, nudge, CheckArgs, NudgeArgs};
+use super::calibrate_light::{LatencyArgs, LightArgs};
 use super::rig_args::RigArgs;
 use super::watch::{print, watch_quietly};
 use crate::calibrate::aim::Aim;
 use crate::calibrate::dialogue::Dialogue;
 use crate::calibrate::poses::Poses;
 use crate::calibrate::projector::{aim_by_hand, keep, solve_file, told_of, Points};
+use crate::calibrate::recorder::Port;
 use crate::calibrate::results::Results;
-use crate::calibrate::{body, sensor, wand};
+use crate::calibrate::{body, light, sensor, wand};
 use dpm_calibration::projector::{Known, Options};
 use dpm_calibration::rehearsal::{rehearse_with, Bias};
 use dpm_common::clock::MonotonicClock;
@@ -43,6 +45,10 @@ enum What {
     Check(CheckArgs),
     /// Move a body's mesh or the projector by hand while outlines are shown
     Nudge(NudgeArgs),
+    /// Find how bright code values are, by the light sensor at rest in the beam, and the flat field from a sweep of it
+    Light(LightArgs),
+    /// Find the latency alone, with a light sensor and the projector of the calibration file
+    Latency(LatencyArgs),
     /// Write lens and pose of the rig's projector as a file of OpenCV (.xml, .yml or .json)
     Export(ExportArgs),
     /// Run the whole calibration in simulation, against truths that it does not know, and print its errors
@@ -94,6 +100,9 @@ struct ProjectorArgs {
     /// Bits per second of the sensor's port
     #[arg(long, value_name = "BAUD", default_value_t = 3_000_000, requires = "sensor")]
     sensor_baud: u32,
+    /// Gain setting of the sensor
+    #[arg(long, value_name = "N", default_value_t = 0, requires = "sensor")]
+    gain: u8,
     /// Seconds of motion with the sensor
     #[arg(long, value_name = "S", default_value_t = 30.0, value_parser = seconds, requires = "sensor")]
     seconds: f64,
@@ -171,7 +180,7 @@ fn three(text: &str) -> Result<DVec3, String> {
         .ok_or_else(|| "write three numbers of millimetres, such as 10,-5,120".into())
 }
 
-fn seconds(text: &str) -> Result<f64, String> {
+pub(super) fn seconds(text: &str) -> Result<f64, String> {
     let s = text.parse().ok().filter(|s: &f64| *s > 0.0 && *s <= 3600.0);
     s.ok_or_else(|| "write seconds, above 0 and at most 3600".into())
 }
@@ -247,6 +256,8 @@ pub(super) fn execute(args: &CalibrateArgs) -> Result<(), Failure> {
         }
         What::Check(args) => check(args),
         What::Nudge(args) => nudge(args),
+        What::Light(args) => args.execute(),
+        What::Latency(args) => args.execute(),
         What::Export(args) => write_opencv(args),
         What::Rehearse(args) => rehearse(args),
     }
@@ -292,8 +303,7 @@ fn projector_by_sensor(
     let tip = tip_of(&results)?;
     let sigma = results.file.wand.as_ref().map_or(1e-3, |wand| wand.tip_sigma_m);
     let setup = sensor::Setup {
-        port: port.to_owned(),
-        baud: args.sensor_baud,
+        port: Port { path: port.to_owned(), baud: args.sensor_baud, gain: args.gain },
         wand: args.common.wand.clone(),
         seconds: args.seconds,
         aperture_m: 1e-3 * args.aperture,
@@ -303,6 +313,8 @@ fn projector_by_sensor(
         sensor::calibrate(config, &setup, (tip, sigma), monitor)
     })?;
     sensor::keep(&mut results, config, &args.common.wand, &solution);
+    // `dpm calibrate light` makes the flat field of it.
+    light::save_sweep(&results.sweep(), &solution.brightness)?;
     print(&format!("{}\n{}\n", sensor::told_of(&solution), results.save(config)?));
     Ok(())
 }

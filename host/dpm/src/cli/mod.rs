@@ -2,6 +2,7 @@
 
 mod bench;
 mod calibrate;
+mod calibrate_check;
 mod calibrate_light;
 mod dlpc900;
 mod doctor;

@@ -1,0 +1,269 @@
+//! Full-field levels of each channel in turn: which slot shows which level, and what a sensor at rest makes of them.
+//!
+//! Every level stands between two of full white, its references, so that a slow change of the light is divided out. The
+//! levels go round and round, so a level is a function of the slot alone, whenever the measurement begins.
+
+use super::recorder::Timed;
+use dpm_calibration::light::{steady, Channels, Next, Session, Steady};
+use dpm_calibration::sensor::{Block, Timing};
+use dpm_device::link::{mean_luminance, FlashLimiter, FULL_LUMINANCE};
+use dpm_device::planes::{Channel, PlaneSchedule, Raster};
+use dpm_device::time::{FrameRate, HostTime};
+use dpm_render::pack::{pack, BitPlaneFrame, Kernel};
+use dpm_rig::pack::source::{Canvas, PatternSource};
+use std::collections::BTreeMap;
+
+/// Codes of a channel that are shown, code 0 not counted.
+pub const CODES: u32 = 32;
+/// A level stands for this long at least, seconds, and for so many frames.
+const HOLD_S: f64 = 0.25;
+const HOLD_FRAMES: u64 = 80;
+/// Longest time for a level, seconds: the limiter looks back for one second.
+const LONGEST_HOLD_S: f64 = 2.0;
+/// At both ends of a level so much is left out, seconds: the clocks are known to a millisecond or two.
+const MARGIN_S: f64 = 0.01;
+/// A frame counts when this share of it was sampled.
+const LEAST_SAMPLED: f64 = 0.98;
+/// References before and after a level agree within this share.
+const MOST_DRIFT: f64 = 0.03;
+
+/// What a step shows: the code of each of red, green and blue.
+#[derive(Clone, Copy, Debug, PartialEq)]
+struct Step {
+    what: Next,
+    code: u32,
+}
+
+/// The order of the levels.
+#[derive(Clone, Debug)]
+pub struct Levels {
+    steps: Vec<Step>,
+    hold: u64,
+    channels: usize,
+    rate: FrameRate,
+    mean: f64,
+}
+
+impl Levels {
+    /// Levels for the planes of a projector: white alone, or red, green and blue, `codes` of each. They are held for as long
+    /// as the limit of `flashes` a second demands (`None` for no limit).
+    ///
+    /// # Errors
+    /// Planes of which no level can be measured, or a limit that no hold keeps; one sentence.
+    pub fn new(
+        schedule: &PlaneSchedule,
+        rate: FrameRate,
+        flashes: Option<u8>,
+        codes: u32,
+    ) -> Result<Self, String> {
+        let has = |channel| schedule.planes().iter().any(|p| p.channel == channel);
+        let colours = [Channel::Red, Channel::Green, Channel::Blue].map(has);
+        let channels = match (has(Channel::White), colours) {
+            (true, [false, false, false]) => 1,
+            (false, [true, true, true]) => 3,
+            _ => return Err(
+                "the projector's planes are neither red, green and blue nor white alone; their levels do \
+                            not add up by channel, so no response can be measured"
+                    .into(),
+            ),
+        };
+        let white = 0x00ff_ffff;
+        let mut levels = vec![Step { what: Next::Black, code: 0 }];
+        for channel in 0..channels {
+            levels.extend((1..=codes).rev().map(|i| {
+                let value = (255 * i + codes / 2) / codes;
+                let code = if channels == 1 { value * 0x01_0101 } else { value << (8 * channel) };
+                Step { what: Next::Code { channel, code: f64::from(value) / 255.0 }, code }
+            }));
+        }
+        let reference = Step { what: Next::White, code: white };
+        let steps: Vec<Step> = levels.into_iter().flat_map(|level| [reference, level]).collect();
+        let light: Vec<u32> = steps.iter().map(|s| luminance(schedule, s.code)).collect();
+        let mean = light.iter().map(|l| f64::from(*l)).sum::<f64>()
+            / (light.len() as f64 * f64::from(FULL_LUMINANCE));
+        let slots = |s: f64| (s * rate.hz()).ceil() as u64;
+        let mut hold = slots(HOLD_S).max(HOLD_FRAMES);
+        if let Some(limit) = flashes {
+            while flashes_too_often(&light, hold, rate, limit) {
+                hold += hold / 10;
+                if hold > slots(LONGEST_HOLD_S).max(2 * HOLD_FRAMES) {
+                    return Err(format!(
+                        "levels would flash more often than {limit} times a second, however long they stand"
+                    ));
+                }
+            }
+            // The second that the limiter looks at may begin anywhere, and so may the levels.
+            hold += hold / 8;
+        }
+        Ok(Self { steps, hold, channels, rate, mean })
+    }
+
+    /// Time for which every level is shown at least once, whenever it begins, seconds.
+    pub fn seconds(&self) -> f64 {
+        (self.steps.len() as u64 + 2) as f64 * self.hold as f64 / self.rate.hz()
+    }
+
+    /// Time for which a level stands, seconds.
+    pub fn hold_s(&self) -> f64 {
+        self.hold as f64 / self.rate.hz()
+    }
+
+    /// Mean light over full white.
+    pub fn mean(&self) -> f64 {
+        self.mean
+    }
+
+    /// Levels, references not counted.
+    pub fn count(&self) -> usize {
+        self.steps.len() / 2
+    }
+
+    /// The run of equal slots that a slot belongs to; the step is its remainder.
+    fn run_of(&self, slot: u64) -> u64 {
+        slot / self.hold
+    }
+
+    fn step_of(&self, run: u64) -> usize {
+        (run % self.steps.len() as u64) as usize
+    }
+}
+
+impl PatternSource for Levels {
+    fn picture(&self, _: u64, slot: u64) -> u64 {
+        self.step_of(self.run_of(slot)) as u64
+    }
+
+    fn draw(&self, picture: u64, canvas: &mut Canvas<'_>) {
+        let code = self.steps[picture as usize % self.steps.len()].code;
+        canvas.codes(|codes| codes.fill(code));
+    }
+}
+
+/// Mean light of a full field, as the limiter sees it.
+fn luminance(schedule: &PlaneSchedule, code: u32) -> u32 {
+    // Every pixel is the same, so a small raster has the light of a large one.
+    let Some(raster) = Raster::new(8, 1) else { return 0 };
+    let mut planes = BitPlaneFrame::new(raster, *schedule);
+    pack(Kernel::Scalar, &[code; 8], &mut planes);
+    mean_luminance(raster, schedule, planes.bytes())
+}
+
+/// True if levels of light, each for `hold` slots, over and over, break the limit.
+fn flashes_too_often(light: &[u32], hold: u64, rate: FrameRate, limit: u8) -> bool {
+    let mut limiter = FlashLimiter::new(rate, limit);
+    let mut around = light.iter().chain(light).flat_map(|l| std::iter::repeat_n(*l, hold as usize));
+    around.any(|l| limiter.observe(l))
+}
+
+/// Frequency of the lamps, and the light without the projector.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Room {
+    /// Twice that of the mains, hertz.
+    pub flicker_hz: f64,
+    /// The light.
+    pub ambient: Steady,
+}
+
+/// What was sampled while levels were shown, into curves and brightness. `lit` are the slots that were lit.
+///
+/// # Errors
+/// What the readings lack, or why they are no levels of a projector; one sentence with what to do.
+pub fn solve(
+    levels: &Levels,
+    timing: &Timing,
+    lit: &[(u64, HostTime)],
+    samples: &[Timed],
+    room: Room,
+) -> Result<Channels, String> {
+    let runs = by_run(levels, timing, lit, samples);
+    let mut readings = BTreeMap::new();
+    for (run, frames) in &runs {
+        // The first and the last run may be cut off.
+        if frames.len() as u64 * 2 > levels.hold {
+            readings.insert(*run, steady(frames, room.flicker_hz).map_err(|e| e.to_string())?);
+        }
+    }
+    let whites: Vec<Steady> =
+        readings.iter().filter(|(run, _)| levels.step_of(**run).is_multiple_of(2)).map(|(_, r)| *r).collect();
+    let ambient = room.ambient.level;
+    let white = whites.iter().map(|r| r.level).sum::<f64>() / whites.len().max(1) as f64;
+    let mut session = Session::new(levels.channels);
+    let mut seen = vec![false; levels.steps.len()];
+    let add = |session: &mut Session, what, r| session.add(what, r).map_err(|e| e.to_string());
+    add(&mut session, Next::Ambient, room.ambient)?;
+    for (run, reading) in readings.iter().filter(|(run, _)| levels.step_of(**run) % 2 == 1) {
+        let around = run.checked_sub(1).and_then(|b| readings.get(&b)).zip(readings.get(&(run + 1)));
+        let Some((before, after)) = around else { continue };
+        let reference = 0.5 * (before.level + after.level);
+        if (before.level - after.level).abs() > MOST_DRIFT * (reference - ambient).abs() {
+            return Err(format!(
+                "full white changed by {:.1} % within {:.1} s: do not move or shade the sensor, let the projector warm \
+                 up, and switch off whatever adapts its light",
+                100.0 * (before.level - after.level).abs() / (reference - ambient).abs(),
+                2.0 * levels.hold_s()
+            ));
+        }
+        // Ambient light has no part in the projector's drift.
+        let scale = (white - ambient) / (reference - ambient);
+        let level = ambient + (reading.level - ambient) * scale;
+        let step = levels.step_of(*run);
+        seen[step] = true;
+        add(&mut session, levels.steps[step].what, Steady { level, ..*reading })?;
+    }
+    let missed = seen.iter().skip(1).step_by(2).filter(|seen| !**seen).count();
+    if missed > 0 {
+        return Err(format!(
+            "{missed} of {} levels were not seen whole: frames were dark or samples were lost; look at `dpm link-test`, \
+             at the limits of light, and at the sensor's cable",
+            levels.count()
+        ));
+    }
+    let sigma = whites.iter().map(|r| r.sigma).fold(0.0, f64::max);
+    add(&mut session, Next::White, Steady { level: white, sigma, flicker: 0.0 })?;
+    session.solve().map_err(|e| e.to_string())
+}
+
+/// The mean level of each lit frame that was sampled whole, by run. Planes come and go far faster than lamps flicker, so
+/// whole frames only are looked at.
+fn by_run(
+    levels: &Levels,
+    timing: &Timing,
+    lit: &[(u64, HostTime)],
+    samples: &[Timed],
+) -> BTreeMap<u64, Vec<Block>> {
+    let margin = (MARGIN_S * levels.rate.hz()).ceil().max(2.0) as u64;
+    let is_inside = |slot: u64| (margin..levels.hold.saturating_sub(margin)).contains(&(slot % levels.hold));
+    // Slot by slot, the time that was sampled and the integral of the level over it, in frames.
+    let mut sums: BTreeMap<u64, (f64, f64)> =
+        lit.iter().map(|(slot, _)| *slot).filter(|slot| is_inside(*slot)).map(|s| (s, (0.0, 0.0))).collect();
+    for Timed { block, sensor_minus_host_ns } in samples {
+        let Some(offset) = sensor_minus_host_ns else { continue };
+        let since = block.start_ns.saturating_sub(*offset).saturating_sub(timing.frame_zero_ns) as f64;
+        let length = block.interval_ns / timing.frame_ns;
+        // A sample stands for the time around it.
+        for (i, level) in block.levels.iter().enumerate() {
+            let from = since / timing.frame_ns + (i as f64 - 0.5) * length;
+            if !(from >= 0.0 && length > 0.0 && length < 1.0) {
+                continue;
+            }
+            let slot = from.floor() as u64;
+            let beyond = (from + length - (slot + 1) as f64).max(0.0);
+            for (slot, part) in [(slot, length - beyond), (slot + 1, beyond)] {
+                if let Some(sum) = sums.get_mut(&slot).filter(|_| part > 0.0) {
+                    *sum = (sum.0 + part, sum.1 + part * f64::from(*level));
+                }
+            }
+        }
+    }
+    let mut runs: BTreeMap<u64, Vec<Block>> = BTreeMap::new();
+    for (slot, (time, integral)) in sums.into_iter().filter(|(_, (time, _))| *time >= LEAST_SAMPLED) {
+        let start_ns = timing.instant(slot, 0.0).0;
+        let block = Block { start_ns, interval_ns: timing.frame_ns, levels: vec![(integral / time) as f32] };
+        runs.entry(levels.run_of(slot)).or_default().push(block);
+    }
+    runs
+}
+
+#[cfg(test)]
+#[path = "levels_tests.rs"]
+mod tests;

@@ -1,0 +1,275 @@
+//! The light sensor while the projector shows something: its samples on the host's clock, and when frames were lit.
+
+use dpm_calibration::sensor::{Block, Timing};
+use dpm_common::clock::{Clock, MonotonicClock};
+use dpm_device::sensor::client::{SensorClient, SensorConfig};
+use dpm_device::sensor::wire::PERIOD_ONE;
+use dpm_device::time::HostTime;
+use dpm_rig::config::RigConfig;
+use dpm_rig::failure::{Failure, FailureKind};
+use dpm_rig::pack::source::PatternSource;
+use dpm_rig::pattern::run_pattern_stamped;
+use dpm_rig::telemetry::monitor::{ProjectorHealth, RunMonitor};
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::sync::{Arc, Mutex, PoisonError};
+use std::time::{Duration, Instant};
+
+/// Time between two polls of the sensor, nanoseconds.
+const POLL_EVERY_NS: i64 = 1_000_000;
+/// Samples in a block.
+const BLOCK: u16 = 250;
+/// Most samples that are kept: ten minutes at 100 kS/s.
+const MOST_SAMPLES: usize = 60_000_000;
+/// How long the projector and the sensor may take until both work.
+const READY_WITHIN: Duration = Duration::from_secs(10);
+/// Slots whose light falls later than the others say by more than this, nanoseconds, are left out of the timing.
+const LATE_NS: f64 = 100_000.0;
+
+/// Where the sensor is.
+#[derive(Clone, Debug)]
+pub struct Port {
+    /// Its serial port.
+    pub path: String,
+    /// Bits per second of the port.
+    pub baud: u32,
+    /// Its gain setting, 0 for the first.
+    pub gain: u8,
+}
+
+/// A sensor that is read by a thread of its own until this is dropped.
+pub struct Recorder {
+    shared: Arc<Mutex<Recorded>>,
+    is_over: Arc<AtomicBool>,
+    thread: Option<std::thread::JoinHandle<()>>,
+}
+
+/// A block and where its clock was.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Timed {
+    /// The samples, on the sensor's clock.
+    pub block: Block,
+    /// The sensor's clock less the host's when it came, nanoseconds; `None` before the clock was mapped.
+    pub sensor_minus_host_ns: Option<i64>,
+}
+
+#[derive(Default)]
+struct Recorded {
+    blocks: Vec<Timed>,
+    samples: usize,
+    /// The sensor's clock less the host's, nanoseconds, once it is known.
+    sensor_minus_host_ns: Option<i64>,
+    saturated: usize,
+    status: String,
+}
+
+impl Recorder {
+    /// Begins to read the sensor. `clock` stamps what it says.
+    ///
+    /// # Errors
+    /// A setting that no sensor takes (exit code 2), or no thread can be started (3).
+    pub fn start(port: &Port, clock: MonotonicClock) -> Result<Self, Failure> {
+        let config = SensorConfig {
+            port: port.path.clone(),
+            baud: port.baud,
+            gain: port.gain,
+            block: BLOCK,
+            samples_per_second: 0,
+        };
+        let sleeping = clock.sleeping();
+        let mut client = SensorClient::open(config, Arc::new(move || sleeping.now()))
+            .map_err(|e| Failure::new(FailureKind::BadInput, e))?;
+        let shared = Arc::new(Mutex::new(Recorded::default()));
+        let (to, is_over) = (Arc::clone(&shared), Arc::new(AtomicBool::new(false)));
+        let over = Arc::clone(&is_over);
+        let work = move || {
+            let mut fresh = Vec::new();
+            while !over.load(Ordering::Relaxed) {
+                let now = sleeping.now();
+                client.poll(now, &mut |block| {
+                    fresh.push((block.head, block.levels.iter().map(f32::from).collect()))
+                });
+                let tick_ns = client.hello().map_or(0.0, |h| 1e9 / f64::from(h.ticks_per_second.max(1)));
+                let mut shared = to.lock().unwrap_or_else(PoisonError::into_inner);
+                for (head, levels) in fresh.drain(..) {
+                    let levels: Vec<f32> = levels;
+                    let start_ns = (head.first as f64 * tick_ns) as i64;
+                    if let Some(at) = client.sampled_at(&head, 0) {
+                        shared.sensor_minus_host_ns = Some(start_ns - at.at.0);
+                    }
+                    shared.saturated += usize::from(head.cut_above);
+                    if shared.samples < MOST_SAMPLES {
+                        shared.samples += levels.len();
+                        let interval_ns = f64::from(head.period) / f64::from(PERIOD_ONE) * tick_ns;
+                        let sensor_minus_host_ns = shared.sensor_minus_host_ns;
+                        let block = Block { start_ns, interval_ns, levels };
+                        shared.blocks.push(Timed { block, sensor_minus_host_ns });
+                    }
+                }
+                shared.status = client.status();
+                drop(shared);
+                sleeping.wait_until(now.plus_ns(POLL_EVERY_NS));
+            }
+        };
+        let thread = std::thread::Builder::new()
+            .name("dpm-sensor".into())
+            .spawn(work)
+            .map_err(|e| Failure::new(FailureKind::Device, format!("cannot start a thread: {e}")))?;
+        Ok(Self { shared, is_over, thread: Some(thread) })
+    }
+
+    fn locked(&self) -> std::sync::MutexGuard<'_, Recorded> {
+        self.shared.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+
+    /// Takes what has been sampled since the last call.
+    pub fn take(&self) -> Vec<Timed> {
+        let mut shared = self.locked();
+        (shared.samples, shared.saturated) = (0, 0);
+        std::mem::take(&mut shared.blocks)
+    }
+
+    /// Samples, and blocks of them that are saturated, since the last [`Recorder::take`].
+    pub fn counts(&self) -> (usize, usize) {
+        let shared = self.locked();
+        (shared.samples, shared.saturated)
+    }
+
+    /// The sensor's clock less the host's, nanoseconds.
+    ///
+    /// # Errors
+    /// It was never mapped; the message has the sensor's own words.
+    pub fn sensor_minus_host_ns(&self) -> Result<i64, Failure> {
+        let shared = self.locked();
+        let told = || format!("the sensor's clock was never mapped: {}", shared.status);
+        shared.sensor_minus_host_ns.ok_or_else(|| Failure::new(FailureKind::Device, told()))
+    }
+
+    /// Waits until the sensor's clock is mapped.
+    ///
+    /// # Errors
+    /// It is not within ten seconds, or `monitor` asks for a stop.
+    pub fn wait_until_mapped(&self, monitor: &RunMonitor) -> Result<(), Failure> {
+        let is_mapped = || self.locked().sensor_minus_host_ns.is_some();
+        wait_for(monitor, is_mapped, || format!("the light sensor does not answer: {}", self.locked().status))
+    }
+}
+
+/// Waits until the projector is up.
+///
+/// # Errors
+/// It is not within ten seconds, or `monitor` asks for a stop.
+pub fn wait_until_up(monitor: &RunMonitor) -> Result<(), Failure> {
+    let is_up = || monitor.projector() == ProjectorHealth::Up;
+    wait_for(monitor, is_up, || format!("the projector is not up: {}", monitor.projector()))
+}
+
+fn wait_for(
+    monitor: &RunMonitor,
+    is_there: impl Fn() -> bool,
+    why: impl Fn() -> String,
+) -> Result<(), Failure> {
+    let begin = Instant::now();
+    while !is_there() {
+        if begin.elapsed() > READY_WITHIN || monitor.stop_requested() {
+            return Err(Failure::new(FailureKind::Device, why()));
+        }
+        std::thread::sleep(Duration::from_millis(20));
+    }
+    Ok(())
+}
+
+/// Slot and first photon of each lit frame.
+pub type Lights = Vec<(u64, HostTime)>;
+
+/// Shows `source` while `work` goes on, for `seconds` at most and as long again as an operator may take; the projector is
+/// dark afterwards. Gives what `work` gives and what was lit, on `clock`.
+///
+/// # Errors
+/// The projector fails, or else what `work` says.
+pub fn while_shown<T>(
+    config: &RigConfig,
+    source: Arc<dyn PatternSource>,
+    (clock, seconds): (MonotonicClock, f64),
+    monitor: &Arc<RunMonitor>,
+    work: impl FnOnce() -> Result<T, Failure>,
+) -> Result<(T, Lights), Failure> {
+    let frames = (config.projector.frame_rate.hz() * (seconds + 60.0)) as usize;
+    std::thread::scope(|scope| {
+        let runs = scope.spawn(|| run_pattern_stamped(config, source, (clock, frames), monitor));
+        let worked = work();
+        monitor.request_stop();
+        let ended = runs.join().unwrap_or_else(|_| {
+            Err(Failure::new(FailureKind::Device, "the projector's thread ended by a panic (see above)"))
+        });
+        match (worked, ended) {
+            (Ok(value), Ok(lights)) => Ok((value, lights)),
+            // A projector that failed is the reason why the work ended.
+            (_, Err(failure)) | (Err(failure), _) => Err(failure),
+        }
+    })
+}
+
+impl Drop for Recorder {
+    fn drop(&mut self) {
+        self.is_over.store(true, Ordering::Relaxed);
+        if let Some(thread) = self.thread.take() {
+            let _ = thread.join();
+        }
+    }
+}
+/// When the slots begin, by a line through the first photons of all lit frames. Frames whose light came late are left out.
+///
+/// # Errors
+/// Too few frames were lit.
+pub fn timing_of(lights: &[(u64, HostTime)]) -> Result<Timing, Failure> {
+    let few = || {
+        let told = format!(
+            "only {} frames were lit; is the link fast enough? `dpm link-test` measures it",
+            lights.len()
+        );
+        Failure::new(FailureKind::Device, told)
+    };
+    let mut used: Vec<(f64, f64)> = Vec::with_capacity(lights.len());
+    let Some(&(slot_0, at_0)) = lights.first() else { return Err(few()) };
+    used.extend(lights.iter().map(|(slot, at)| (*slot as f64 - slot_0 as f64, at.ns_since(at_0) as f64)));
+    let mut line = (0.0, 0.0);
+    for _ in 0..3 {
+        if used.len() < 100 {
+            return Err(few());
+        }
+        line = line_through(&used);
+        used.retain(|(x, y)| (y - line.0 - line.1 * x).abs() < LATE_NS);
+    }
+    let frame_zero_ns = at_0.0 + (line.0 - line.1 * slot_0 as f64).round() as i64;
+    Ok(Timing { frame_zero_ns, frame_ns: line.1 })
+}
+
+/// Offset and slope by least squares.
+fn line_through(points: &[(f64, f64)]) -> (f64, f64) {
+    let n = points.len() as f64;
+    let (mx, my) = points.iter().fold((0.0, 0.0), |(a, b), (x, y)| (a + x / n, b + y / n));
+    let (mut xx, mut xy) = (0.0, 0.0);
+    for (x, y) in points {
+        xx += (x - mx) * (x - mx);
+        xy += (x - mx) * (y - my);
+    }
+    let slope = if xx > 0.0 { xy / xx } else { 0.0 };
+    (my - slope * mx, slope)
+}
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn timing_is_the_line_of_the_frames_that_came_in_time() {
+        let frame_ns = 1_055_966.2;
+        let at = |slot: u64| HostTime(5_000_000_000 + (slot as f64 * frame_ns) as i64);
+        let mut lights: Vec<(u64, HostTime)> =
+            (1000..9000).filter(|s| s % 7 != 0).map(|s| (s, at(s))).collect();
+        lights[100].1 = lights[100].1.plus_ns(900_000);
+        let timing = timing_of(&lights).unwrap();
+        assert!((timing.frame_ns - frame_ns).abs() < 1e-3, "{}", timing.frame_ns);
+        assert!((timing.instant(5000, 0.0).0 - at(5000).0).abs() < 300);
+        assert!(timing_of(&lights[..50]).is_err());
+    }
+}
