@@ -22,7 +22,9 @@ fn on_gpu(gpu: &Arc<Gpu>, raster: Raster, schedule: PlaneSchedule, values: &[u32
     let planes = Buffer::from_slice(gpu, "planes", &ones).unwrap();
     let planes_host = Buffer::new(gpu, "planes", len, MemoryKind::Readback).unwrap();
     let unused = Buffer::new(gpu, "unused", 16, MemoryKind::Device).unwrap();
-    let kinds: Vec<_> = BINDINGS.iter().map(|&(_, binding)| (binding, BindingKind::Storage)).collect();
+    // As the renderer on a GPU: devices bind a limited number, and second bindings as texels are for software Vulkan.
+    let bound = || BINDINGS.iter().filter(|(name, _)| !name.ends_with("_ROWS"));
+    let kinds: Vec<_> = bound().map(|&(_, binding)| (binding, BindingKind::Storage)).collect();
     let table = BindingTable::new(gpu, &kinds).unwrap();
     let constants = pack::gpu::constants(raster, &schedule);
     let pipeline = ComputePipeline::new(&table, dpm_shaders::PACK, &constants).unwrap();
@@ -31,7 +33,7 @@ fn on_gpu(gpu: &Arc<Gpu>, raster: Raster, schedule: PlaneSchedule, values: &[u32
         "B_PLANES" => &planes,
         _ => &unused,
     };
-    let buffers: Vec<_> = BINDINGS.iter().map(|&(name, binding)| (binding, buffer_of(name))).collect();
+    let buffers: Vec<_> = bound().map(|&(name, binding)| (binding, buffer_of(name))).collect();
     let set = BindingSet::new(&table, &buffers).unwrap();
     let list = CommandList::record(gpu, 0, |r| {
         r.dispatch(&pipeline, &set, pack::gpu::workgroups(raster));
