@@ -3,7 +3,7 @@
 
 use super::dialogue::Dialogue;
 use super::levels::{self, Levels, Room};
-use super::recorder::{timing_of, wait_until_up, while_shown, Port, Recorder, Timed};
+use super::recorder::{timing_of, wait_until_up, while_stamped, Port, Recorder, Timed};
 use super::results::Results;
 use dpm_calibration::file::LightSection;
 use dpm_calibration::light::{flat_field, steady, Channels, FlatField, LightModel};
@@ -62,7 +62,7 @@ pub fn measure(
         wait_until_up(monitor)?;
         watch(&levels, &recorder, &dialogue, monitor)
     };
-    let (samples, lights) = while_shown(config, shown, (clock, seconds), monitor, read)?;
+    let (samples, lights) = while_stamped(config, shown, (clock, seconds), monitor, read)?;
     let timing = timing_of(&lights)?;
     levels::solve(&levels, &timing, &lights, &samples, Room { flicker_hz, ambient }).map_err(refused)
 }

@@ -14,4 +14,5 @@ pub mod projector;
 pub mod recorder;
 pub mod results;
 pub mod sensor;
+pub mod shown;
 pub mod wand;

@@ -120,7 +120,7 @@ impl Stage {
 ///
 /// # Errors
 /// The input ended, or the result cannot be written.
-pub fn while_shown(
+pub fn nudge(
     stage: &Stage,
     (poses, outlines): (&Poses, &Outlines),
     nudges: &mut Nudges,

@@ -1,9 +1,9 @@
 //! The light sensor while the projector shows something: its samples on the host's clock, and when frames were lit.
 
+use super::shown::while_shown;
 use dpm_calibration::sensor::{Block, Timing};
 use dpm_common::clock::{Clock, MonotonicClock};
 use dpm_device::sensor::client::{SensorClient, SensorConfig};
-use dpm_device::sensor::wire::PERIOD_ONE;
 use dpm_device::time::HostTime;
 use dpm_rig::config::RigConfig;
 use dpm_rig::failure::{Failure, FailureKind};
@@ -86,22 +86,22 @@ impl Recorder {
             while !over.load(Ordering::Relaxed) {
                 let now = sleeping.now();
                 client.poll(now, &mut |block| {
-                    fresh.push((block.head, block.levels.iter().map(f32::from).collect()))
+                    fresh.push((block.head, block.levels.iter().collect::<Vec<u16>>()))
                 });
-                let tick_ns = client.hello().map_or(0.0, |h| 1e9 / f64::from(h.ticks_per_second.max(1)));
+                let ticks_per_second = client.hello().map_or(0, |h| h.ticks_per_second);
                 let mut shared = to.lock().unwrap_or_else(PoisonError::into_inner);
                 for (head, levels) in fresh.drain(..) {
-                    let levels: Vec<f32> = levels;
-                    let start_ns = (head.first as f64 * tick_ns) as i64;
+                    // The gain does not change while this runs.
+                    let Some(block) = Block::from_wire(&head, &levels, ticks_per_second, 1.0) else {
+                        continue;
+                    };
                     if let Some(at) = client.sampled_at(&head, 0) {
-                        shared.sensor_minus_host_ns = Some(start_ns - at.at.0);
+                        shared.sensor_minus_host_ns = Some(block.start_ns - at.at.0);
                     }
                     shared.saturated += usize::from(head.cut_above);
                     if shared.samples < MOST_SAMPLES {
                         shared.samples += levels.len();
-                        let interval_ns = f64::from(head.period) / f64::from(PERIOD_ONE) * tick_ns;
                         let sensor_minus_host_ns = shared.sensor_minus_host_ns;
-                        let block = Block { start_ns, interval_ns, levels };
                         shared.blocks.push(Timed { block, sensor_minus_host_ns });
                     }
                 }
@@ -181,12 +181,12 @@ fn wait_for(
 /// Slot and first photon of each lit frame.
 pub type Lights = Vec<(u64, HostTime)>;
 
-/// Shows `source` while `work` goes on, for `seconds` at most and as long again as an operator may take; the projector is
-/// dark afterwards. Gives what `work` gives and what was lit, on `clock`.
+/// Shows `source` for `seconds` at most, and as long again as an operator may take, while `work` goes on. Gives what `work`
+/// gives and what was lit, on `clock`.
 ///
 /// # Errors
-/// The projector fails, or else what `work` says.
-pub fn while_shown<T>(
+/// As [`while_shown`].
+pub fn while_stamped<T>(
     config: &RigConfig,
     source: Arc<dyn PatternSource>,
     (clock, seconds): (MonotonicClock, f64),
@@ -194,19 +194,7 @@ pub fn while_shown<T>(
     work: impl FnOnce() -> Result<T, Failure>,
 ) -> Result<(T, Lights), Failure> {
     let frames = (config.projector.frame_rate.hz() * (seconds + 60.0)) as usize;
-    std::thread::scope(|scope| {
-        let runs = scope.spawn(|| run_pattern_stamped(config, source, (clock, frames), monitor));
-        let worked = work();
-        monitor.request_stop();
-        let ended = runs.join().unwrap_or_else(|_| {
-            Err(Failure::new(FailureKind::Device, "the projector's thread ended by a panic (see above)"))
-        });
-        match (worked, ended) {
-            (Ok(value), Ok(lights)) => Ok((value, lights)),
-            // A projector that failed is the reason why the work ended.
-            (_, Err(failure)) | (Err(failure), _) => Err(failure),
-        }
-    })
+    while_shown(monitor, || run_pattern_stamped(config, source, (clock, frames), monitor), work)
 }
 
 impl Drop for Recorder {
@@ -217,6 +205,7 @@ impl Drop for Recorder {
         }
     }
 }
+
 /// When the slots begin, by a line through the first photons of all lit frames. Frames whose light came late are left out.
 ///
 /// # Errors
@@ -256,6 +245,7 @@ fn line_through(points: &[(f64, f64)]) -> (f64, f64) {
     let slope = if xx > 0.0 { xy / xx } else { 0.0 };
     (my - slope * mx, slope)
 }
+
 #[cfg(test)]
 mod tests {
     use super::*;

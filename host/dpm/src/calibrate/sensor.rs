@@ -3,7 +3,7 @@
 
 use super::dialogue::Dialogue;
 use super::poses::Poses;
-use super::recorder::{timing_of, wait_until_up, while_shown, Lights, Port, Recorder};
+use super::recorder::{timing_of, wait_until_up, while_stamped, Lights, Port, Recorder};
 use super::results::Results;
 use dpm_calibration::file::{LatencySection, ProjectorSection, WandSection};
 use dpm_calibration::model::ProjectorModel;
@@ -172,7 +172,7 @@ fn record(
         Ok((blocks, recorder.sensor_minus_host_ns()?, path))
     };
     let ((blocks, sensor_minus_host_ns, poses), lights) =
-        while_shown(config, source, (clock, setup.seconds), monitor, moved)?;
+        while_stamped(config, source, (clock, setup.seconds), monitor, moved)?;
     Ok(Recording { blocks, sensor_minus_host_ns, poses, lights })
 }
 

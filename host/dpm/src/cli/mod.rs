@@ -2,8 +2,6 @@
 
 mod bench;
 mod calibrate;
-mod calibrate_check;
-mod calibrate_light;
 mod dlpc900;
 mod doctor;
 mod error;

@@ -1,40 +1,25 @@
 //! `dpm calibrate light` and `dpm calibrate latency`: what a light sensor tells once the projector is known.
 
-use super::calibrate::{seconds, tip_of, Common};
-use super::watch::{print, watch_quietly};
+use super::{numbers, seconds, tip_and_sigma, Common, SensorArgs};
 use crate::calibrate::light::{self, FlatSource};
-use crate::calibrate::recorder::Port;
 use crate::calibrate::results::Results;
 use crate::calibrate::sensor;
+use crate::cli::watch::{print, watch_quietly};
 use dpm_calibration::projector::Known;
 use dpm_calibration::sensor::Brightness;
 use dpm_rig::config::RigConfig;
 use dpm_rig::failure::{Failure, FailureKind};
 use glam::DVec3;
 
-/// The sensor.
-#[derive(clap::Args, Clone, Debug)]
-struct SensorArgs {
-    /// Serial port of the wand's light sensor
-    #[arg(long, value_name = "PORT")]
-    sensor: String,
-    /// Bits per second of the sensor's port
-    #[arg(long, value_name = "BAUD", default_value_t = 3_000_000)]
-    sensor_baud: u32,
-    /// Gain setting of the sensor
-    #[arg(long, value_name = "N", default_value_t = 0)]
-    gain: u8,
-    /// Diameter of the sensor's aperture, millimetres
-    #[arg(long, value_name = "MM", default_value_t = 3.0, value_parser = seconds)]
-    aperture: f64,
-}
-
 #[derive(clap::Args, Clone, Debug)]
 pub(super) struct LightArgs {
     #[command(flatten)]
     common: Common,
+    /// Serial port of the wand's light sensor
+    #[arg(long, value_name = "PORT")]
+    sensor: String,
     #[command(flatten)]
-    sensor: SensorArgs,
+    sensor_args: SensorArgs,
     /// Measure the flat field anew by moving the sensor through the beam for so many seconds, before it is put down; without
     /// this the last sweep of `dpm calibrate projector --sensor` serves
     #[arg(long, value_name = "S", value_parser = seconds)]
@@ -51,40 +36,19 @@ pub(super) struct LightArgs {
 pub(super) struct LatencyArgs {
     #[command(flatten)]
     common: Common,
+    /// Serial port of the wand's light sensor
+    #[arg(long, value_name = "PORT")]
+    sensor: String,
     #[command(flatten)]
-    sensor: SensorArgs,
+    sensor_args: SensorArgs,
     /// Seconds of motion
     #[arg(long, value_name = "S", default_value_t = 10.0, value_parser = seconds)]
     seconds: f64,
 }
 
 fn direction(text: &str) -> Result<DVec3, String> {
-    let numbers: Option<Vec<f64>> = text.split(',').map(|n| n.trim().parse().ok()).collect();
-    let three: Option<[f64; 3]> = numbers.and_then(|n| n.try_into().ok());
-    let direction = three.and_then(|n| DVec3::from_array(n).try_normalize());
+    let direction = numbers(text).and_then(|n: [f64; 3]| DVec3::from_array(n).try_normalize());
     direction.ok_or_else(|| "write three numbers with commas between them, not all 0".into())
-}
-
-impl SensorArgs {
-    fn port(&self) -> Port {
-        Port { path: self.sensor.clone(), baud: self.sensor_baud, gain: self.gain }
-    }
-
-    fn setup(&self, common: &Common, seconds: f64) -> sensor::Setup {
-        sensor::Setup {
-            port: self.port(),
-            wand: common.wand.clone(),
-            seconds,
-            aperture_m: 1e-3 * self.aperture,
-            known: Known::default(),
-        }
-    }
-}
-
-/// The tip of the wand and its standard deviation.
-fn tip_and_sigma(results: &Results) -> Result<(DVec3, f64), Failure> {
-    let sigma = results.file.wand.as_ref().map_or(1e-3, |wand| wand.tip_sigma_m);
-    Ok((tip_of(results)?, sigma))
 }
 
 impl LightArgs {
@@ -94,7 +58,7 @@ impl LightArgs {
             Some(seconds) => Some(self.sweep(&config, &results, seconds)?),
             None => light::load_sweep(&results.sweep())?,
         };
-        let (port, flicker_hz) = (self.sensor.port(), 2.0 * f64::from(self.mains));
+        let (port, flicker_hz) = (self.sensor_args.port(&self.sensor), 2.0 * f64::from(self.mains));
         let channels = watch_quietly(config.clone(), move |config, monitor| {
             light::measure(config, &port, flicker_hz, monitor)
         })?;
@@ -106,7 +70,7 @@ impl LightArgs {
 
     fn sweep(&self, config: &RigConfig, results: &Results, seconds: f64) -> Result<Vec<Brightness>, Failure> {
         let tip = tip_and_sigma(results)?;
-        let setup = self.sensor.setup(&self.common, seconds);
+        let setup = self.sensor_args.setup(&self.sensor, &self.common, seconds, Known::default());
         let solution = watch_quietly(config.clone(), move |config, monitor| {
             sensor::calibrate(config, &setup, tip, monitor)
         })?;
@@ -136,7 +100,7 @@ impl LatencyArgs {
             bad("the projector's lens has more than five coefficients; run `dpm calibrate projector`")
         })?;
         let tip = tip_and_sigma(&results)?;
-        let setup = self.sensor.setup(&self.common, self.seconds);
+        let setup = self.sensor_args.setup(&self.sensor, &self.common, self.seconds, Known::default());
         let latency = watch_quietly(config.clone(), move |config, monitor| {
             sensor::latency(config, &setup, tip, &model, monitor)
         })?;

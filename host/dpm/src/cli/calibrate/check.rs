@@ -1,12 +1,13 @@
 //! `dpm calibrate check` and `dpm calibrate nudge`: light on a body, measured and moved.
 
-use super::calibrate::{tip_of, while_showing, Common};
-use super::watch::{print, watch_quietly};
+use super::projector::while_showing;
+use super::{tip_of, Common};
 use crate::calibrate::aim::Aim;
 use crate::calibrate::check::{judge, measure, RealBench, Target};
-use crate::calibrate::nudge::{check_known, help, keep, while_shown, Moved, Stage};
+use crate::calibrate::nudge::{self, check_known, help, keep, Moved, Stage};
 use crate::calibrate::outline::Outlines;
 use crate::calibrate::poses::Poses;
+use crate::cli::watch::{print, watch_quietly};
 use dpm_common::clock::MonotonicClock;
 use dpm_rig::failure::{Failure, FailureKind};
 use std::sync::Arc;
@@ -100,7 +101,7 @@ pub(super) fn nudge(args: &NudgeArgs) -> Result<(), Failure> {
                 keep(&mut results, config, &moved, motion);
                 results.save(config)
             };
-            while_shown(&stage, (&poses, outlines), &mut stage.nudges(step_m), ask, save)
+            nudge::nudge(&stage, (&poses, outlines), &mut stage.nudges(step_m), ask, save)
         })
     })?;
     print(&format!("{told}\n"));

@@ -1,0 +1,135 @@
+//! `dpm calibrate projector`: by hand, from a file of points, or by the wand's light sensor.
+
+use super::{seconds, tip_and_sigma, tip_of, Common, SensorArgs};
+use crate::calibrate::aim::Aim;
+use crate::calibrate::dialogue::Dialogue;
+use crate::calibrate::poses::Poses;
+use crate::calibrate::projector::{aim_by_hand, keep, solve_file, told_of, Points};
+use crate::calibrate::results::Results;
+use crate::calibrate::shown::while_shown;
+use crate::calibrate::{light, sensor};
+use crate::cli::watch::{print, watch_quietly};
+use dpm_calibration::projector::{Known, Options, Solved};
+use dpm_common::clock::MonotonicClock;
+use dpm_rig::config::RigConfig;
+use dpm_rig::failure::Failure;
+use dpm_rig::pack::source::PatternSource;
+use dpm_rig::pattern::run_pattern;
+use dpm_rig::telemetry::monitor::RunMonitor;
+use glam::DVec3;
+use std::path::PathBuf;
+use std::sync::Arc;
+
+#[derive(clap::Args, Clone, Debug)]
+pub(super) struct ProjectorArgs {
+    #[command(flatten)]
+    common: Common,
+    /// Distance from the lens to the middle of the points by a tape measure, metres; catches wrong units
+    #[arg(long, value_name = "M", value_parser = metres)]
+    distance: Option<f64>,
+    /// Direction of the world that points up (x, y or z); catches exchanged axes of a projector that stands upright
+    #[arg(long, value_name = "AXIS", value_parser = axis)]
+    up: Option<DVec3>,
+    /// Serial port of the wand's light sensor: move the wand through coded light in place of aiming by hand
+    #[arg(long, value_name = "PORT", conflicts_with = "points")]
+    sensor: Option<String>,
+    #[command(flatten)]
+    sensor_args: SensorArgs,
+    /// Seconds of motion with the sensor
+    #[arg(long, value_name = "S", default_value_t = 30.0, value_parser = seconds, requires = "sensor")]
+    seconds: f64,
+    /// Show nothing and ask for nothing: solve the points of a file, "x y z column row" a line, metres and pixels
+    #[arg(long, value_name = "FILE")]
+    points: Option<PathBuf>,
+}
+
+fn metres(text: &str) -> Result<f64, String> {
+    super::number(text, "metres", 0.01, 1000.0)
+}
+
+fn axis(text: &str) -> Result<DVec3, String> {
+    match text {
+        "x" => Ok(DVec3::X),
+        "y" => Ok(DVec3::Y),
+        "z" => Ok(DVec3::Z),
+        _ => Err("write x, y or z".into()),
+    }
+}
+
+impl ProjectorArgs {
+    /// Measures lens and pose.
+    ///
+    /// # Errors
+    /// As [`super::execute`].
+    pub(super) fn execute(&self) -> Result<(), Failure> {
+        let (config, results) = self.common.open()?;
+        let raster = config.projector.raster();
+        let known = Known { distance_m: self.distance, up: self.up };
+        let options = Options { known, ..Options::by_hand(raster) };
+        match (&self.sensor, &self.points) {
+            (Some(port), _) => self.by_sensor(port, known, &config, results),
+            (None, Some(path)) => told(results, &config, &solve_file(path, raster, options)?),
+            (None, None) => self.by_hand(options, &config, results),
+        }
+    }
+
+    fn by_hand(&self, options: Options, config: &RigConfig, results: Results) -> Result<(), Failure> {
+        let (raster, tip) = (config.projector.raster(), tip_of(&results)?);
+        let mut points = Points::resume(results.progress("projector"))?;
+        let poses = Poses::start(config, std::slice::from_ref(&self.common.wand), MonotonicClock::new(0))?;
+        poses.wait_until_seen()?;
+        let (solved, points) = watch_quietly(config.clone(), move |config, monitor| {
+            while_showing(config, monitor, Arc::new(Aim::default()), |aim, dialogue| {
+                let solved = aim_by_hand((raster, options), tip, &mut points, (&poses, aim), dialogue)?;
+                Ok((solved, points))
+            })
+        })?;
+        told(results, config, &solved)?;
+        // Not before the result is written: until then the points are all there is.
+        points.forget();
+        Ok(())
+    }
+
+    fn by_sensor(
+        &self,
+        port: &str,
+        known: Known,
+        config: &RigConfig,
+        mut results: Results,
+    ) -> Result<(), Failure> {
+        let tip = tip_and_sigma(&results)?;
+        let setup = self.sensor_args.setup(port, &self.common, self.seconds, known);
+        let solution = watch_quietly(config.clone(), move |config, monitor| {
+            sensor::calibrate(config, &setup, tip, monitor)
+        })?;
+        sensor::keep(&mut results, config, &self.common.wand, &solution);
+        // `dpm calibrate light` makes the flat field of it.
+        light::save_sweep(&results.sweep(), &solution.brightness)?;
+        print(&format!("{}\n{}\n", sensor::told_of(&solution), results.save(config)?));
+        Ok(())
+    }
+}
+
+/// Writes a projector and says how good it is.
+fn told(mut results: Results, config: &RigConfig, solved: &Solved) -> Result<(), Failure> {
+    keep(&mut results, config, solved);
+    print(&format!("{}\n{}\n", told_of(solved), results.save(config)?));
+    Ok(())
+}
+
+/// Shows the pictures of `source` while `work` talks to the operator.
+///
+/// # Errors
+/// As [`while_shown`].
+pub(super) fn while_showing<S: PatternSource + 'static, T>(
+    config: &RigConfig,
+    monitor: &Arc<RunMonitor>,
+    source: Arc<S>,
+    work: impl FnOnce(&S, &Dialogue) -> Result<T, Failure>,
+) -> Result<T, Failure> {
+    let stopped = Arc::clone(monitor);
+    let dialogue = Dialogue::start(move || stopped.stop_requested())?;
+    let shown = Arc::clone(&source);
+    let run = || run_pattern(config, shown, monitor);
+    Ok(while_shown(monitor, run, || work(&source, &dialogue))?.0)
+}
