@@ -450,9 +450,9 @@ impl Laws {
             return self.fail(
                 at,
                 format!(
-                    "frame {frame}: poses are {} ms old at the first photon; {} ms are allowed",
-                    age / MS,
-                    allowed / MS
+                    "frame {frame}: poses are {:.2} ms old at the first photon; {:.2} ms are allowed",
+                    age as f64 * 1e-6,
+                    allowed as f64 * 1e-6
                 ),
             );
         }
