@@ -149,6 +149,42 @@ impl PlaneSchedule {
         Self::with_repeats(&[PlaneSpec { channel: Channel::White, bit: 3 }; 24]).expect("192 of 255")
     }
 
+    /// 24 planes of equal light: red, green, blue eight times, each at 16 / 255 of full, which is 128 of 255 if all are on.
+    pub fn equal_rgb24() -> Self {
+        let channels = [Channel::Red, Channel::Green, Channel::Blue];
+        let planes: [PlaneSpec; 24] = std::array::from_fn(|i| PlaneSpec { channel: channels[i % 3], bit: 4 });
+        Self::with_repeats(&planes).expect("128 of 255 in each channel")
+    }
+
+    /// 8 white planes of equal light, each at 16 / 255 of full.
+    pub fn equal_mono8() -> Self {
+        Self::with_repeats(&[PlaneSpec { channel: Channel::White, bit: 4 }; 8]).expect("128 of 255")
+    }
+
+    /// Number of planes of each channel, if they all give the same light and grey can come only from how many of them a
+    /// mirror is on in: one white channel, or red, green and blue with at most 8 planes each. `None` for other schedules.
+    pub fn equal_planes(&self) -> Option<u8> {
+        let count = |channel| self.planes().iter().filter(|p| p.channel == channel).count();
+        let (first, white) = (self.planes()[0], count(Channel::White));
+        let each = if white > 0 { white } else { count(Channel::Red) };
+        let is_even = if white > 0 {
+            white == self.len() && white <= 24
+        } else {
+            each <= 8 && count(Channel::Green) == each && count(Channel::Blue) == each
+        };
+        let is_equal = self.planes().iter().all(|p| p.bit == first.bit);
+        (each > 1 && is_even && is_equal).then_some(each as u8)
+    }
+
+    /// Light of a channel when all planes are on, as a code value: 255 for binary planes of eight bits.
+    pub fn full_light(&self) -> u32 {
+        let light = |channel| {
+            let lights = |p: &&PlaneSpec| p.channel == channel || p.channel == Channel::White;
+            self.planes().iter().filter(lights).map(|p| 1u32 << p.bit).sum::<u32>().min(255)
+        };
+        [Channel::Red, Channel::Green, Channel::Blue].into_iter().map(light).max().unwrap_or(0)
+    }
+
     /// Two planes have the same channel and bit.
     pub const fn has_repeats(&self) -> bool {
         self.repeats

@@ -1,7 +1,7 @@
 //! Contradictions between keys. Each is reported at a key that was written, with what would resolve it.
 
 use super::world::{EnvironmentConfig, GazeConfig, TrackerConfig};
-use super::{Pace, ProjectorBackend, ProjectorConfig, Purpose, ResponseConfig, RigConfig};
+use super::{Pace, PlaneWeights, ProjectorBackend, ProjectorConfig, Purpose, ResponseConfig, RigConfig};
 use crate::mock::{self, FaultError};
 use dpm_common::keys::read::{ConfigValue, Reader};
 use dpm_device::regular_file;
@@ -183,6 +183,17 @@ fn projector(rig: &RigConfig, reader: &mut Reader) {
                 format!("set projector.width = {} and projector.height = {}", panel.width(), panel.height()),
             );
         }
+    }
+    if matches!(p.backend, ProjectorBackend::Dlpc900(_)) && p.weights == PlaneWeights::Equal {
+        contradict(
+            reader,
+            &[
+                ("projector.weights", format!("{:?}", p.weights.word())),
+                ("projector.backend.kind", format!("{:?}", p.backend.word())),
+            ],
+            "a DLPC900 weights the bits of loaded frames itself",
+            "leave `projector.weights` out".into(),
+        );
     }
     if matches!(p.backend, ProjectorBackend::Dlpc900(_)) && num > 120 * den {
         contradict(

@@ -28,6 +28,10 @@ section! {
         /// white channel, which shows the green of the picture; this gives a monochrome rig three times the frame
         /// rate.
         planes: u32 = 24, "", OneOf(&[8, 24]);
+        /// How much light the planes of a channel give: "binary" halves it from plane to plane, so that their bits are the
+        /// code value; "equal" gives every plane the same, and shows grey as a halftone of mirrors and planes. Change it
+        /// if the projector lights all planes alike. Equal planes give 128 / 255 of a full white.
+        weights: PlaneWeights = PlaneWeights::Binary, "", Any;
         /// Position of the projector's lens in the world. Measure it, or give `calibration` instead.
         position: [f64; 3] = [0.0, 0.35, 1.1], "m", Within(-1e6, 1e6);
         /// The point in the world that the centre of the raster shows.
@@ -91,10 +95,11 @@ impl ProjectorConfig {
 
     /// The planes of a frame in the order in which they are shown.
     pub fn schedule(&self) -> PlaneSchedule {
-        if self.planes == 8 {
-            PlaneSchedule::mono8()
-        } else {
-            PlaneSchedule::rgb24()
+        match (self.planes, self.weights) {
+            (8, PlaneWeights::Binary) => PlaneSchedule::mono8(),
+            (8, PlaneWeights::Equal) => PlaneSchedule::equal_mono8(),
+            (_, PlaneWeights::Binary) => PlaneSchedule::rgb24(),
+            (_, PlaneWeights::Equal) => PlaneSchedule::equal_rgb24(),
         }
     }
 }
@@ -285,6 +290,16 @@ impl CalibrationCameraConfig {
     pub fn to_affine(&self) -> Option<DAffine3> {
         let (position, rotation_deg, rotation) = (self.position, self.rotation_deg, self.rotation);
         PoseConfig { position, rotation_deg, rotation }.to_affine()
+    }
+}
+
+words! {
+    /// How much light the planes of a channel give.
+    pub enum PlaneWeights {
+        /// Half as much from plane to plane.
+        Binary = "binary",
+        /// All the same.
+        Equal = "equal",
     }
 }
 

@@ -538,6 +538,10 @@ fn contradictions_name_every_key_with_its_value() {
                 "`projector.backend.panel` = \"dlp6500\"",
             ],
         ),
+        (
+            "[projector]\nframe_rate = 60\nwidth = 1920\nheight = 1080\nweights = \"equal\"\n[projector.backend]\nkind = \"dlpc900\"",
+            &["`projector.backend.kind` = \"dlpc900\"", "weights the bits of loaded frames itself"],
+        ),
         ("[render.paper]\nphi_q_deg = 3", &["phi_q_deg`: is 3.0", "`render.paper.phi_h_deg` = 15.0"]),
         (
             "[[scene.bodies]]\nname = \"a\"\n[[scene.bodies]]\nname = \"a\"\nnode = \"b\"",
