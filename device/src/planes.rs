@@ -193,21 +193,28 @@ impl PlaneSchedule {
     /// 24 planes: for each bit from 7 down to 0 red, green, blue. Interleaving the colours keeps the
     /// colour fields of a moving edge one plane slot (44 us) apart instead of a third of a frame.
     pub fn rgb24() -> Self {
-        let mut planes = [PlaneSpec { channel: Channel::Red, bit: 0 }; 24];
-        for (i, p) in planes.iter_mut().enumerate() {
-            p.bit = 7 - (i / 3) as u8;
-            p.channel = [Channel::Red, Channel::Green, Channel::Blue][i % 3];
-        }
-        Self::new(&planes).expect("24 distinct planes")
+        Self::rgb24_in(Self::DESCENDING).expect("24 distinct planes")
     }
 
     /// 8 planes of one white channel, bit 7 first.
     pub fn mono8() -> Self {
-        let mut planes = [PlaneSpec { channel: Channel::White, bit: 0 }; 8];
-        for (i, p) in planes.iter_mut().enumerate() {
-            p.bit = 7 - i as u8;
-        }
-        Self::new(&planes).expect("8 distinct planes")
+        Self::mono8_in(Self::DESCENDING).expect("8 distinct planes")
+    }
+
+    /// The bits of a code value from the most significant down.
+    pub const DESCENDING: [u8; 8] = [7, 6, 5, 4, 3, 2, 1, 0];
+
+    /// 24 planes: for each of `bits` in turn red, green, blue. `None` if a bit occurs twice or is above 7.
+    pub fn rgb24_in(bits: [u8; 8]) -> Option<Self> {
+        let channels = [Channel::Red, Channel::Green, Channel::Blue];
+        let planes: [PlaneSpec; 24] =
+            std::array::from_fn(|i| PlaneSpec { channel: channels[i % 3], bit: bits[i / 3] });
+        Self::new(&planes)
+    }
+
+    /// 8 planes of one white channel that show `bits` in turn. `None` as for [`PlaneSchedule::rgb24_in`].
+    pub fn mono8_in(bits: [u8; 8]) -> Option<Self> {
+        Self::new(&bits.map(|bit| PlaneSpec { channel: Channel::White, bit }))
     }
 
     /// The planes in order.
