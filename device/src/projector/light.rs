@@ -4,7 +4,7 @@
 //! pixel receives `code / 255` of the light of a full slot, where `code` is the number that its bits form: light **is**
 //! the code value.
 
-use dpm_device::planes::{Channel, PlaneSchedule, Raster};
+use crate::planes::{Channel, PlaneSchedule, Raster};
 
 /// Eight rows of 64 bits, read as eight 8 x 8 bit matrices side by side, one in each byte: transposes all of them, so that bit `i` of
 /// byte `c` of row `j` becomes bit `j` of byte `c` of row `i` (block swaps of 4, 2 and 1 bits \[HackersDelight\] 7-3).
@@ -140,7 +140,7 @@ impl Exposure {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use dpm_device::planes::PlaneSpec;
+    use crate::planes::PlaneSpec;
     use proptest::prelude::*;
 
     /// One bit at a time, as the definition says: the oracle.
