@@ -31,7 +31,7 @@ pub use clock::DeviceClock;
 pub use config::{FirmwareConfig, LightChange, Shown};
 use frames::FrameStore;
 use guard::LightGuard;
-pub use light::{light_of_planes, Exposure};
+pub use light::{gather_bits, light_of_planes, Exposure};
 pub use thread::{serve_cable, Served};
 
 /// Echo answers that may wait; later requests are dropped, as a busy device would.
@@ -88,6 +88,10 @@ struct Core {
     /// Buffer for an arriving LZ4 block.
     staging: Vec<u8>,
     lit_now: bool,
+    /// The panel takes no new frame now; see [`ProjectorFirmware::panel_busy`].
+    panel_busy: bool,
+    /// What the slots before the last one's new frame showed, while the panel has not taken that frame.
+    untaken: Option<LightKind>,
     last_seen_frame: Option<u32>,
     status: Status,
     credit_violations: u64,
@@ -177,6 +181,8 @@ impl ProjectorFirmware {
                 store: FrameStore::new(setup.frame_buffers as usize, frame_bytes),
                 staging: vec![0; setup.raster.plane_bytes()],
                 lit_now: false,
+                panel_busy: false,
+                untaken: None,
                 last_seen_frame: None,
                 status: NO_STATUS,
                 credit_violations: 0,
@@ -347,6 +353,30 @@ impl ProjectorFirmware {
         self.advance_to(now);
     }
 
+    /// Corrects the clock, so that it stays with what paces a panel: the vertical blanks of a display. The new clock must
+    /// not read less at `now` than the old one, and slots that have begun stay as they are.
+    pub fn discipline(&mut self, now: HostTime, clock: DeviceClock) {
+        self.advance_to(now);
+        self.core.setup.clock = clock;
+    }
+
+    /// For a panel that takes a frame some time after the slot has begun, and may be late: true from the moment at which
+    /// a frame is handed to it until it has taken it. A slot that begins meanwhile takes no new frame. If what the panel
+    /// is busy with is the new frame of the slot before, then that slot showed what it showed before, and the frame is
+    /// lit one slot later. STATUS waits while it is open which of the two is true. Every frame that the panel has taken
+    /// is so reported in the slot in which it was really shown.
+    pub fn panel_busy(&mut self, busy: bool) {
+        self.core.panel_busy = busy;
+        if !busy {
+            self.core.untaken = None;
+        }
+    }
+
+    /// True if a STATUS waits because the panel has not taken the newest frame.
+    pub fn is_unsettled(&self) -> bool {
+        self.core.panel_busy && self.core.untaken.is_some()
+    }
+
     /// Power fails and comes back: dark, no session, no memory, the clock starts again.
     pub fn power_cycle(&mut self, now: HostTime) {
         self.advance_to(now);
@@ -420,7 +450,8 @@ impl LinkDevice for ProjectorFirmware {
         while let Some(echo) = self.core.echoes.pop_front() {
             send(session, &DeviceMessage::Echo(Echo { device_sent: now_ticks, ..echo }));
         }
-        if std::mem::take(&mut self.core.status_due) {
+        let may_tell = !(self.core.panel_busy && self.core.untaken.is_some());
+        if may_tell && std::mem::take(&mut self.core.status_due) {
             let status = self.core.status_now(&self.decoders);
             send(session, &DeviceMessage::Status(status));
         }
@@ -541,6 +572,7 @@ impl Core {
     fn end_light(&mut self) {
         self.lit_now = false;
         self.store.lit = None;
+        self.untaken = None;
         self.status_due = true;
     }
 
@@ -582,6 +614,7 @@ impl Core {
         }
         self.mode = Mode::Disarmed;
         self.lit_now = false;
+        self.untaken = None;
         let thrown = self.store.clear();
         self.status.frames_refused = self.status.frames_refused.wrapping_add(thrown);
         self.status_due = true;

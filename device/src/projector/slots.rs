@@ -15,7 +15,11 @@ impl Core {
         self.next_slot += 1;
         self.status.slots = self.status.slots.wrapping_add(1);
         self.status_due = true;
-        let mut due = self.store.take_due(slot);
+        if self.panel_busy && self.untaken.is_some() && self.lit_now {
+            return self.lit_a_slot_later(slots, slot, start);
+        }
+        // What a busy panel cannot take waits for the next slot.
+        let mut due = if self.panel_busy { None } else { self.store.take_due(slot) };
         if let Some((_, superseded)) =
             due.filter(|(frame, _)| self.mode == Mode::Normal && frame.dark_from <= start)
         {
@@ -83,9 +87,37 @@ impl Core {
                 }
             }
         };
+        let before = if self.lit_now { LightKind::Repeated } else { LightKind::Blank };
+        self.untaken = (kind == LightKind::Lit).then_some(before);
         self.lit_now = kind != LightKind::Blank;
         self.note_light(slots, slot, kind);
         let luminance = if self.lit_now { self.luminance } else { 0 };
+        if self.flash.as_mut().is_some_and(|f| f.observe(luminance)) {
+            self.rest(start, u64::from(REST_US));
+            self.latch(faults::FLASH_LIMIT);
+        }
+    }
+
+    /// The panel did not take the frame of the slot before: that slot showed what was there before, and this one shows
+    /// the frame. Its light ends when it was meant to end.
+    fn lit_a_slot_later(&mut self, slots: &SlotClock, slot: u64, start: DeviceTicks) {
+        let before = self.untaken.unwrap_or(LightKind::Blank);
+        if before == LightKind::Repeated {
+            self.status.slots_repeated = self.status.slots_repeated.wrapping_add(1);
+        } else {
+            self.status.slots_blank = self.status.slots_blank.wrapping_add(1);
+        }
+        self.status.last_lit_at = start;
+        if let Some(event) = self.events.back_mut() {
+            (event.kind, event.frame) = (before, None);
+        }
+        self.note_light(slots, slot, LightKind::Lit);
+        // The light of the late frame counts once more than it falls: a limit is reached too early rather than too late.
+        if let Some(rest_us) = self.guard.same_frame() {
+            self.rest(start, rest_us);
+            self.latch(faults::LIGHT_LIMIT);
+        }
+        let luminance = self.luminance;
         if self.flash.as_mut().is_some_and(|f| f.observe(luminance)) {
             self.rest(start, u64::from(REST_US));
             self.latch(faults::FLASH_LIMIT);

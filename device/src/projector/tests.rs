@@ -4,6 +4,7 @@ mod cable;
 mod codec;
 mod dark;
 mod limits;
+mod panel;
 mod protocol;
 mod safety;
 
