@@ -99,6 +99,32 @@ pub fn cards() -> Vec<PathBuf> {
     all
 }
 
+/// Opens the card at `card`, or, without one, the first that has the connector `connector`, or a display at any.
+///
+/// # Errors
+/// No such card; or as [`Card::open`].
+pub fn open_for(card: Option<&Path>, connector: Option<&str>) -> Result<Box<dyn Kms>, KmsError> {
+    if let Some(path) = card {
+        return Ok(Box::new(Card::open(path)?));
+    }
+    let all = cards();
+    let mut first_error = None;
+    for path in &all {
+        let fits = |c: &Connector| match connector {
+            Some(name) => c.name == name,
+            None => c.is_connected,
+        };
+        match Card::look(path).and_then(|mut card| card.connectors()) {
+            Ok(connectors) if all.len() == 1 || connectors.iter().any(fits) => {
+                return Ok(Box::new(Card::open(path)?));
+            }
+            Ok(_) => {}
+            Err(e) => first_error = first_error.or(Some(e)),
+        }
+    }
+    Err(first_error.unwrap_or_else(|| KmsError::NoCard("/dev/dri/card*".into())))
+}
+
 impl Card {
     /// Opens the card at `path` and takes its displays.
     ///
@@ -106,20 +132,19 @@ impl Card {
     /// No such card, no right to open it, another program that drives its displays, or a driver without atomic mode
     /// setting or monotonic stamps.
     pub fn open(path: &Path) -> Result<Self, KmsError> {
-        let card = Self::look(path)?;
-        let name = card.name();
         let limit = Instant::now() + MASTER_PATIENCE;
-        while let Err(e) = card.node.acquire_master_lock() {
-            if e.raw_os_error() == Some(libc::EINVAL) {
-                // Already ours: the first to open a card has its displays.
-                break;
+        loop {
+            // Whoever opens a card that nobody drives may drive it; without special rights only then.
+            let card = Self::look(path)?;
+            if card.node.acquire_master_lock().is_ok() {
+                return Ok(card);
             }
             if Instant::now() >= limit {
-                return Err(KmsError::InUse(name));
+                return Err(KmsError::InUse(card.name()));
             }
+            drop(card);
             std::thread::sleep(STEP.saturating_mul(20));
         }
-        Ok(card)
     }
 
     /// Opens the card at `path` to look at it, whoever drives its displays.

@@ -114,7 +114,7 @@ impl FramePlan {
         (self.predict_ns, self.budget_milli) = (predict_ns, inputs.budget_milli);
         self.target_at = slots.start(slot);
         // Light falls later than the projector's clock says by this much.
-        let late_ns = i64::from(rig.config.projector.latency_us) * 1000;
+        let late_ns = rig.config.projector.light_delay_ns();
         self.dark_from = slots.dark_from(slot, stride, predict_ns - late_ns);
         self.due_at = slots.host_of_slot(slot);
         let half_slot = slots.host_of_slot(slot + 1).ns_since(self.due_at) / 2;
