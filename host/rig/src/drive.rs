@@ -38,6 +38,7 @@ pub(crate) fn drive(
     scene: &Scene,
     raster: Raster,
 ) -> Result<Drive, DriveError> {
+    let full_light = config.projector.schedule().full_light();
     let shares = measured.light.as_ref().map_or(vec![], |light| light.intensity.clone());
     let gain_with = |albedo: [f64; 3]| -> [f32; 3] {
         let mut intensity = config.projector.max_intensity.0;
@@ -45,6 +46,8 @@ pub(crate) fn drive(
             // `max_intensity` is that of a channel on average.
             intensity = [0, 1, 2].map(|c| intensity[c] * 3.0 * [r, g, b][c]);
         }
+        // Planes of equal light do not reach full white together.
+        let intensity = intensity.map(|full| full * (f64::from(full_light) / 255.0));
         let white = config.render.white;
         std::array::from_fn(|c| {
             // The product of exposure and white is exact where white is 1.

@@ -1,7 +1,10 @@
 //! Contradictions between keys. Each is reported at a key that was written, with what would resolve it.
 
 use super::world::{EnvironmentConfig, GazeConfig, TrackerConfig};
-use super::{DisplayEncoding, Pace, ProjectorBackend, ProjectorConfig, Purpose, ResponseConfig, RigConfig};
+use super::{
+    DisplayEncoding, Pace, PlaneWeights, ProjectorBackend, ProjectorConfig, Purpose, ResponseConfig,
+    RigConfig,
+};
 use crate::mock::{self, FaultError};
 use dpm_common::keys::read::{ConfigValue, Reader};
 use dpm_device::regular_file;
@@ -206,6 +209,29 @@ fn projector(rig: &RigConfig, reader: &mut Reader) {
                 "set projector.planes = 24".into(),
             );
         }
+        if display.encoding == DisplayEncoding::Rgb8 && p.weights == PlaneWeights::Equal {
+            contradict(
+                reader,
+                &[
+                    ("projector.weights", format!("{:?}", p.weights.word())),
+                    ("projector.backend.encoding", shown(display.encoding)),
+                    ("projector.backend.kind", format!("{:?}", p.backend.word())),
+                ],
+                "the bits of a code value have binary weights",
+                "leave `projector.weights` out, or use encoding = \"planes24\"".into(),
+            );
+        }
+    }
+    if matches!(p.backend, ProjectorBackend::Dlpc900(_)) && p.weights == PlaneWeights::Equal {
+        contradict(
+            reader,
+            &[
+                ("projector.weights", format!("{:?}", p.weights.word())),
+                ("projector.backend.kind", format!("{:?}", p.backend.word())),
+            ],
+            "a DLPC900 weights the bits of loaded frames itself",
+            "leave `projector.weights` out".into(),
+        );
     }
     if matches!(p.backend, ProjectorBackend::Dlpc900(_)) && num > 120 * den {
         contradict(

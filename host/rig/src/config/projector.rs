@@ -1,6 +1,6 @@
 //! `[projector]`: the projector, its position, and its connection.
 
-use super::values::{Each, PerChannel};
+use super::values::{BitOrder, Each, PerChannel};
 use super::world::PoseConfig;
 use dpm_common::keys::read::{Any, ConfigValue, Limit, NotEmpty, Reader, Within};
 use dpm_common::keys::source::{Node, Value};
@@ -28,6 +28,15 @@ section! {
         /// white channel, which shows the green of the picture; this gives a monochrome rig three times the frame
         /// rate.
         planes: u32 = 24, "", OneOf(&[8, 24]);
+        /// How much light the planes of a channel give: "binary" halves it from plane to plane, so that their bits are the
+        /// code value; "equal" gives every plane the same, and shows grey as a halftone of mirrors and planes. Change it
+        /// if the projector lights all planes alike. Equal planes give 128 / 255 of a full white.
+        weights: PlaneWeights = PlaneWeights::Binary, "", Any;
+        /// The order in which a frame shows the bits of a code value, from its first plane on; red, green and blue in
+        /// turn for each bit. The light of "7 6 5 4 3 2 1 0" is over soonest. "0 2 4 6 7 5 3 1" puts most of it into
+        /// the middle of the frame, which smears a moving picture by a quarter less. Has no effect on planes of equal
+        /// weights.
+        plane_order: BitOrder = BitOrder::default(), "", Any;
         /// Position of the projector's lens in the world. Measure it, or give `calibration` instead.
         position: [f64; 3] = [0.0, 0.35, 1.1], "m", Within(-1e6, 1e6);
         /// The point in the world that the centre of the raster shows.
@@ -89,6 +98,11 @@ impl ProjectorConfig {
         })
     }
 
+    /// True for a projector that shows the code value of a pixel for the whole frame, not its bits one after the other.
+    pub fn holds_code_values(&self) -> bool {
+        matches!(&self.backend, ProjectorBackend::Display(display) if display.encoding == DisplayEncoding::Rgb8)
+    }
+
     /// From the start of a slot on the projector's clock to the light of its frame, nanoseconds: `latency_us`, and for a
     /// display the time until the vertical blank and until the middle row.
     pub fn light_delay_ns(&self) -> i64 {
@@ -105,10 +119,17 @@ impl ProjectorConfig {
 
     /// The planes of a frame in the order in which they are shown.
     pub fn schedule(&self) -> PlaneSchedule {
-        if self.planes == 8 {
-            PlaneSchedule::mono8()
-        } else {
-            PlaneSchedule::rgb24()
+        let BitOrder(bits) = self.plane_order;
+        let binary = match self.planes {
+            8 => PlaneSchedule::mono8_in(bits),
+            _ => PlaneSchedule::rgb24_in(bits),
+        };
+        match (self.planes, self.weights) {
+            (8, PlaneWeights::Equal) => PlaneSchedule::equal_mono8(),
+            (_, PlaneWeights::Equal) => PlaneSchedule::equal_rgb24(),
+            (_, PlaneWeights::Binary) => {
+                binary.expect("the order was checked when the configuration was read")
+            }
         }
     }
 }
@@ -342,6 +363,16 @@ impl CalibrationCameraConfig {
     pub fn to_affine(&self) -> Option<DAffine3> {
         let (position, rotation_deg, rotation) = (self.position, self.rotation_deg, self.rotation);
         PoseConfig { position, rotation_deg, rotation }.to_affine()
+    }
+}
+
+words! {
+    /// How much light the planes of a channel give.
+    pub enum PlaneWeights {
+        /// Half as much from plane to plane.
+        Binary = "binary",
+        /// All the same.
+        Equal = "equal",
     }
 }
 

@@ -538,6 +538,10 @@ fn contradictions_name_every_key_with_its_value() {
                 "`projector.backend.panel` = \"dlp6500\"",
             ],
         ),
+        (
+            "[projector]\nframe_rate = 60\nwidth = 1920\nheight = 1080\nweights = \"equal\"\n[projector.backend]\nkind = \"dlpc900\"",
+            &["`projector.backend.kind` = \"dlpc900\"", "weights the bits of loaded frames itself"],
+        ),
         ("[render.paper]\nphi_q_deg = 3", &["phi_q_deg`: is 3.0", "`render.paper.phi_h_deg` = 15.0"]),
         (
             "[[scene.bodies]]\nname = \"a\"\n[[scene.bodies]]\nname = \"a\"\nnode = \"b\"",
@@ -658,11 +662,13 @@ fn the_light_of_a_display_is_later_than_its_slots() {
     assert_eq!((display.encoding, display.commit_us), (DisplayEncoding::Rgb8, 4_000));
     // 16 ms, 4 ms, and half of a sixtieth of a second.
     assert_eq!(rig.projector.light_delay_ns(), 20_000_000 + 8_333_333);
+    assert!(rig.projector.holds_code_values());
     let usb = parsed(&["projector.backend={kind=\"usb\"}"]).unwrap_or_else(|e| panic!("{e}"));
     assert_eq!(usb.projector.light_delay_ns(), 16_000_000);
     for (key, names) in [
         ("projector.backend.mode=\"1920\"", "projector.backend.mode"),
         ("projector.backend={kind=\"display\",encoding=\"planes24\"}", "projector.planes = 24"),
+        ("projector.weights=\"equal\"", "projector.weights"),
         ("projector.backend.commit_us=1", "projector.backend.commit_us"),
         ("real_time.pace=\"virtual\"", "runs on its own clock"),
     ] {
