@@ -98,6 +98,25 @@ impl ProjectorConfig {
         })
     }
 
+    /// True for a projector that shows the code value of a pixel for the whole frame, not its bits one after the other.
+    pub fn holds_code_values(&self) -> bool {
+        matches!(&self.backend, ProjectorBackend::Display(display) if display.encoding == DisplayEncoding::Rgb8)
+    }
+
+    /// From the start of a slot on the projector's clock to the light of its frame, nanoseconds: `latency_us`, and for a
+    /// display the time until the vertical blank and until the middle row.
+    pub fn light_delay_ns(&self) -> i64 {
+        let own_ns = match &self.backend {
+            // The blank comes `commit_us` and half of the time without rows later, the middle row half of the rows after it:
+            // together half a frame, whatever the mode.
+            ProjectorBackend::Display(display) => {
+                i64::from(display.commit_us) * 1000 + self.frame_rate.slot_len_ns(0) / 2
+            }
+            _ => 0,
+        };
+        i64::from(self.latency_us) * 1000 + own_ns
+    }
+
     /// The planes of a frame in the order in which they are shown.
     pub fn schedule(&self) -> PlaneSchedule {
         let BitOrder(bits) = self.plane_order;
@@ -122,6 +141,8 @@ kinds! {
         Linear(LinearResponseConfig) = "linear",
         /// a power of the code value.
         Gamma(GammaResponseConfig) = "gamma",
+        /// the curve of sRGB (IEC 61966-2-1), which most displays follow in their factory setting.
+        Srgb(SrgbResponseConfig) = "srgb",
         /// as measured.
         Table(TableResponseConfig) = "table",
     }
@@ -144,6 +165,11 @@ section! {
 }
 
 section! {
+    /// Light by the curve of sRGB.
+    pub struct SrgbResponseConfig {}
+}
+
+section! {
     /// Light as measured.
     pub struct TableResponseConfig {
         /// A text file of 256 lines with the light of each code value, from 0 on, in any unit: one number for all
@@ -163,6 +189,8 @@ kinds! {
         Serial(SerialProjectorConfig) = "serial",
         /// a TI DLPC900 evaluation module, driven by its USB HID commands.
         Dlpc900(Dlpc900Config) = "dlpc900",
+        /// a display: any projector or monitor on HDMI or DisplayPort.
+        Display(DisplayConfig) = "display",
     }
     default Mock
 }
@@ -226,6 +254,40 @@ section! {
         device: Option<String> = None, "", NotEmpty;
         /// Exposure of each pattern; its whole share of the frame if left out.
         exposure_us: Option<u32> = None, "us", Within(24, 2_000_000);
+    }
+}
+
+section! {
+    /// A display on a graphics card of this machine, which shows nothing else meanwhile. docs/DISPLAY.md says how to set
+    /// it up. Nothing of it has been tried on real hardware yet.
+    pub struct DisplayConfig {
+        /// The connector, as `dpm display` lists them, for example "HDMI-A-1"; the only one with a display if left out.
+        connector: Option<String> = None, "", NotEmpty;
+        /// The mode: a size and a rate that the display offers, or a timing of one's own, as in "138.51 1920 1968 2000
+        /// 2080 1080 1083 1088 1111 +hsync -vsync" (MHz, row, frame, pulses). `projector.width`, `height` and
+        /// `frame_rate` must be exactly the mode's; `dpm display` prints what to write.
+        mode: String = "1920x1080@60".into(), "", NotEmpty;
+        /// What the bits of a pixel mean.
+        encoding: DisplayEncoding = DisplayEncoding::Rgb8, "", Any;
+        /// The graphics card's device file; the first with such a connector if left out.
+        card: Option<PathBuf> = None, "", NotEmpty;
+        /// How long before its vertical blank a frame is chosen and written. Raise it if the report counts repeated
+        /// frames although frames were there in time.
+        commit_us: u32 = 4_000, "us", Within(100, 35_000);
+        /// Properties of the connector without which bits are shown although they may be lost, for example ["Broadcast
+        /// RGB"]. Name one only after you have measured that bits arrive.
+        without: Vec<String> = Vec::new(), "", Any;
+    }
+}
+
+words! {
+    /// What the bits of a display's pixel mean.
+    pub enum DisplayEncoding {
+        /// Code values: the display shows grey by itself. `projector.response` says how much light a code value gives.
+        Rgb8 = "rgb8",
+        /// The 24 planes of a frame, in the order in which a DLPC900 shows the bits of a pixel: green 0 to 7, red 0 to 7,
+        /// blue 0 to 7.
+        Planes24 = "planes24",
     }
 }
 

@@ -2,7 +2,7 @@
 //! off.
 
 use super::dark::DarkCause;
-use super::light_centre::centre_ns;
+use super::light_centre::centre_for;
 use super::link_time::LinkTime;
 use crate::rig::{affine, Rig};
 use crate::tracks::TrackSnapshot;
@@ -115,11 +115,12 @@ impl FramePlan {
         (self.predict_ns, self.budget_milli) = (predict_ns, inputs.budget_milli);
         self.target_at = slots.start(slot);
         // Light falls later than the projector's clock says by this much.
-        let late_ns = i64::from(rig.config.projector.latency_us) * 1000;
+        let late_ns = rig.config.projector.light_delay_ns();
         self.dark_from = slots.dark_from(slot, stride, predict_ns - late_ns);
         self.due_at = slots.host_of_slot(slot);
         let exposure_ns = slots.host_of_slot(slot + 1).ns_since(self.due_at);
-        let centre = self.due_at.plus_ns(centre_ns(&rig.schedule, exposure_ns) + late_ns);
+        let centre =
+            self.due_at.plus_ns(centre_for(&rig.config.projector, &rig.schedule, exposure_ns) + late_ns);
         self.place_bodies(rig, snapshot, inputs, centre);
         rig.scene_poses(&self.tracked_poses, &mut self.scene_poses);
         (self.eye, self.gaze) = rig.observer.eye_and_gaze(&self.tracked_poses);

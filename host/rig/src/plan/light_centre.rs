@@ -4,6 +4,7 @@
 //! bits come first, most of the light is over long before the middle of the exposure. An eye that follows a body sees
 //! the picture where the centre of the light puts it.
 
+use crate::config::ProjectorConfig;
 use dpm_device::planes::PlaneSchedule;
 
 /// Time from the first photon to the centre of the light of a frame whose planes share `exposure_ns` >= 0 equally, in
@@ -23,6 +24,16 @@ pub(crate) fn centre_ns(schedule: &PlaneSchedule, exposure_ns: i64) -> i64 {
     // There is at least one plane of weight 1 or more, so the divisor is above 0 and the quotient lies inside the
     // exposure.
     (i128::from(exposure_ns.max(0)) * moments / (halves * weights)) as i64
+}
+
+/// The same for the projector of a rig file. A display that is given code values shows all bits at once, for the whole
+/// frame.
+pub(crate) fn centre_for(projector: &ProjectorConfig, schedule: &PlaneSchedule, exposure_ns: i64) -> i64 {
+    if projector.holds_code_values() {
+        exposure_ns.max(0) / 2
+    } else {
+        centre_ns(schedule, exposure_ns)
+    }
 }
 
 /// The middle of plane `i` lies so many half planes after the first photon.
