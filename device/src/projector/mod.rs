@@ -31,7 +31,7 @@ pub use clock::DeviceClock;
 pub use config::{FirmwareConfig, LightChange, Shown};
 use frames::FrameStore;
 use guard::LightGuard;
-pub use light::{gather_bits, light_of_planes, Exposure};
+pub use light::{gather_bits, light_of_planes, Exposure, Run};
 pub use thread::{serve_cable, Served};
 
 /// Echo answers that may wait; later requests are dropped, as a busy device would.

@@ -51,14 +51,22 @@ impl PixelMap {
     /// # Panics
     /// When `planes` or `pixels` is shorter than the raster demands.
     pub fn write(&self, raster: Raster, planes: &[u8], pixels: &mut [u8], pitch: usize) {
-        gather_bits(raster, self.places[..self.planes].iter().copied(), planes, |y, x, run| {
+        let has_white = self.places[..self.planes].iter().any(|(channel, _)| *channel == Channel::White);
+        gather_bits(raster, &self.places[..self.planes], planes, |y, x, run| {
             let at = y * pitch + 4 * x;
-            for (out, &[red, green, blue, white]) in
-                pixels[at..at + 4 * run.len()].chunks_exact_mut(4).zip(run)
-            {
+            let out = &mut pixels[at..at + 4 * run.pixels];
+            let [red, green, blue, white] = run.channels;
+            // Loops of a fixed length over whole words, which the compiler turns into vector code.
+            let mut words = [0u32; 64];
+            for i in 0..64 {
                 // Planes of white light add to all three.
-                let add = |code: u8| code.saturating_add(white);
-                out.copy_from_slice(&[add(blue), add(green), add(red), 0]);
+                let white = if has_white { white[i] } else { 0 };
+                let [red, green, blue] =
+                    [red[i], green[i], blue[i]].map(|code| u32::from(code.saturating_add(white)));
+                words[i] = blue | green << 8 | red << 16;
+            }
+            for (out, word) in out.chunks_exact_mut(4).zip(words) {
+                out.copy_from_slice(&word.to_le_bytes());
             }
         });
     }

@@ -120,7 +120,8 @@ impl ProjectorConfig {
             // The blank comes `commit_us` and half of the time without rows later, the middle row half of the rows after it:
             // together half a frame, whatever the mode.
             ProjectorBackend::Display(display) => {
-                i64::from(display.commit_us) * 1000 + self.frame_rate.slot_len_ns(0) / 2
+                let frame_ns = self.frame_rate.slot_len_ns(0);
+                display.commit_ns(frame_ns) + frame_ns / 2
             }
             _ => 0,
         };
@@ -281,12 +282,21 @@ section! {
         encoding: DisplayEncoding = DisplayEncoding::Rgb8, "", Any;
         /// The graphics card's device file; the first with such a connector if left out.
         card: Option<PathBuf> = None, "", NotEmpty;
-        /// How long before its vertical blank a frame is chosen and written. Raise it if the report counts repeated
-        /// frames although frames were there in time.
-        commit_us: u32 = 4_000, "us", Within(100, 35_000);
+        /// How long before its vertical blank a frame is chosen and written. Half a frame and at most 8000 if left out.
+        /// Raise it if the report counts repeated frames although frames were there in time; each microsecond is one
+        /// of latency.
+        commit_us: Option<u32> = None, "us", Within(100, 35_000);
         /// Properties of the connector without which bits are shown although they may be lost, for example ["Broadcast
         /// RGB"]. Name one only after you have measured that bits arrive.
         without: Vec<String> = Vec::new(), "", Any;
+    }
+}
+
+impl DisplayConfig {
+    /// From the choice of a frame to its vertical blank, without the half of the blank that is added to it, nanoseconds;
+    /// `frame_ns`: time of a frame.
+    pub fn commit_ns(&self, frame_ns: i64) -> i64 {
+        self.commit_us.map_or((frame_ns / 2).min(8_000_000), |us| i64::from(us) * 1000)
     }
 }
 

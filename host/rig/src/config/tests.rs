@@ -659,9 +659,9 @@ fn the_light_of_a_display_is_later_than_its_slots() {
     };
     let rig = parsed(&[]).unwrap_or_else(|e| panic!("{e}"));
     let ProjectorBackend::Display(display) = &rig.projector.backend else { panic!("a display") };
-    assert_eq!((display.encoding, display.commit_us), (DisplayEncoding::Rgb8, 4_000));
-    // 16 ms, 4 ms, and half of a sixtieth of a second.
-    assert_eq!(rig.projector.light_delay_ns(), 20_000_000 + 8_333_333);
+    assert_eq!((display.encoding, display.commit_us), (DisplayEncoding::Rgb8, None));
+    // 16 ms, 8 ms, and half of a sixtieth of a second.
+    assert_eq!(rig.projector.light_delay_ns(), 24_000_000 + 8_333_333);
     assert!(rig.projector.holds_code_values());
     let usb = parsed(&["projector.backend={kind=\"usb\"}"]).unwrap_or_else(|e| panic!("{e}"));
     assert_eq!(usb.projector.light_delay_ns(), 16_000_000);

@@ -84,7 +84,7 @@ pub fn display_settings(
             DisplayEncoding::Planes24 => Encoding::Planes24,
         },
         without: display.without.clone(),
-        commit_ns: i64::from(display.commit_us) * 1000,
+        commit_ns: display.commit_ns(projector.frame_rate.slot_len_ns(0)),
         raster,
         schedule: projector.schedule(),
         rate: projector.frame_rate,
