@@ -4,7 +4,7 @@
 //! pixel receives `code / 255` of the light of a full slot, where `code` is the number that its bits form: light **is**
 //! the code value.
 
-use dpm_device::planes::{Channel, PlaneSchedule, Raster};
+use crate::planes::{Channel, PlaneSchedule, Raster};
 
 /// Eight rows of 64 bits, read as eight 8 x 8 bit matrices side by side, one in each byte: transposes all of them, so that bit `i` of
 /// byte `c` of row `j` becomes bit `j` of byte `c` of row `i` (block swaps of 4, 2 and 1 bits \[HackersDelight\] 7-3).
@@ -25,21 +25,46 @@ fn transpose(rows: &mut [u64; 8]) {
 /// # Panics
 /// When a slice does not have the size that raster and schedule demand.
 pub fn light_of_planes(raster: Raster, schedule: &PlaneSchedule, planes: &[u8], out: &mut [[u8; 3]]) {
-    let plane_bytes = raster.plane_bytes();
-    assert_eq!(planes.len(), plane_bytes * schedule.len(), "bytes of planes");
+    assert_eq!(planes.len(), raster.plane_bytes() * schedule.len(), "bytes of planes");
     assert_eq!(out.len(), raster.pixel_count(), "pixels of light");
-    let (row_bytes, width) = (raster.row_bytes(), raster.width() as usize);
     if schedule.has_repeats() {
         return light_of_repeats(raster, schedule, planes, out);
     }
+    let width = raster.width() as usize;
     let has_white = schedule.planes().iter().any(|p| p.channel == Channel::White);
-    for (y, row) in out.chunks_exact_mut(width).enumerate() {
-        for (run, pixels) in row.chunks_mut(64).enumerate() {
+    let places = schedule.planes().iter().map(|spec| (spec.channel, spec.bit));
+    gather_bits(raster, places, planes, |y, x, codes| {
+        for (pixel, &[red, green, blue, white]) in out[y * width + x..].iter_mut().zip(codes) {
+            *pixel = [red, green, blue];
+            if has_white {
+                *pixel = pixel.map(|p| p.saturating_add(white));
+            }
+        }
+    });
+}
+
+/// Gathers the bits of planes into one byte for each channel of each mirror. `planes` holds planes one after the other,
+/// and the `k`-th of `places` says which bit of which channel the `k`-th plane is; no two are the same, and bits without
+/// a plane are 0. `run` gets the row, the column of the first mirror, and up to 64 mirrors from there on as red, green,
+/// blue and white, in the order of reading.
+///
+/// # Panics
+/// When `planes` is shorter than raster and places demand.
+pub fn gather_bits(
+    raster: Raster,
+    places: impl Iterator<Item = (Channel, u8)> + Clone,
+    planes: &[u8],
+    mut run: impl FnMut(usize, usize, &[[u8; 4]]),
+) {
+    let (row_bytes, width) = (raster.row_bytes(), raster.width() as usize);
+    for y in 0..raster.height() as usize {
+        for x in (0..width).step_by(64) {
             // Eight bytes of every plane: row `bit` of its channel's matrices.
-            let n = pixels.len().div_ceil(8);
-            let at = y * row_bytes + run * 8;
+            let pixels = (width - x).min(64);
+            let n = pixels.div_ceil(8);
+            let at = y * row_bytes + x / 8;
             let mut codes = [[0u64; 8]; 4];
-            for (spec, plane) in schedule.planes().iter().zip(planes.chunks_exact(plane_bytes)) {
+            for ((channel, bit), plane) in places.clone().zip(planes.chunks_exact(raster.plane_bytes())) {
                 let word = match plane[at..at + n].first_chunk::<8>() {
                     Some(eight) => u64::from_le_bytes(*eight),
                     None => {
@@ -48,22 +73,16 @@ pub fn light_of_planes(raster: Raster, schedule: &PlaneSchedule, planes: &[u8], 
                         u64::from_le_bytes(tail)
                     }
                 };
-                codes[spec.channel as usize][spec.bit as usize] = word;
+                codes[channel as usize][usize::from(bit & 7)] = word;
             }
-            for rows in &mut codes[..if has_white { 4 } else { 3 }] {
-                transpose(rows);
-            }
+            codes.iter_mut().for_each(transpose);
             // Now row `j` holds, in byte `c`, the code of the mirror at bit `j` of byte `c`: bit 7 is the leftmost.
             let bytes = codes.map(|rows| rows.map(u64::to_le_bytes));
-            for (c, eight) in pixels.chunks_mut(8).enumerate() {
-                for (k, pixel) in eight.iter_mut().enumerate() {
-                    let code = |channel: usize| bytes[channel][7 - k][c];
-                    *pixel = [code(0), code(1), code(2)];
-                    if has_white {
-                        *pixel = pixel.map(|p| p.saturating_add(code(3)));
-                    }
-                }
+            let mut gathered = [[0u8; 4]; 64];
+            for (i, pixel) in gathered[..pixels].iter_mut().enumerate() {
+                *pixel = [0, 1, 2, 3].map(|channel: usize| bytes[channel][7 - i % 8][i / 8]);
             }
+            run(y, x, &gathered[..pixels]);
         }
     }
 }
@@ -140,7 +159,7 @@ impl Exposure {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use dpm_device::planes::PlaneSpec;
+    use crate::planes::PlaneSpec;
     use proptest::prelude::*;
 
     /// One bit at a time, as the definition says: the oracle.
