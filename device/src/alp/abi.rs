@@ -23,6 +23,9 @@ pub(super) const APPS_FPGA_TEMPERATURE: i32 = 2051;
 pub(super) const PCB_TEMPERATURE: i32 = 2052;
 pub(super) const DEV_DISPLAY_HEIGHT: i32 = 2057;
 pub(super) const DEV_DISPLAY_WIDTH: i32 = 2058;
+pub(super) const MAX_DDC_FPGA_TEMPERATURE: i32 = 2145;
+pub(super) const MAX_APPS_FPGA_TEMPERATURE: i32 = 2146;
+pub(super) const MAX_PCB_TEMPERATURE: i32 = 2147;
 pub(super) const USB_DISCONNECT_BEHAVIOUR: i32 = 2078;
 pub(super) const USB_RESET: i32 = 2;
 
@@ -39,10 +42,10 @@ pub(super) const MAX_PICTURE_TIME: i32 = 2213;
 // Properties of the projection.
 pub(super) const PROJ_QUEUE_MODE: i32 = 2314;
 pub(super) const PROJ_SEQUENCE_QUEUE: i32 = 1;
-pub(super) const PROJ_QUEUE_ID: i32 = 2315;
 pub(super) const PROJ_QUEUE_MAX_AVAIL: i32 = 2316;
 pub(super) const PROJ_PROGRESS: i32 = 2318;
 pub(super) const PROJ_RESET_QUEUE: i32 = 2319;
+pub(super) const PROJ_ABORT_SEQUENCE: i32 = 2320;
 pub(super) const PROJ_ABORT_FRAME: i32 = 2321;
 pub(super) const PROJ_ABORT_ASYNC: i32 = 2345;
 pub(super) const PROJ_STATE: i32 = 2400;

@@ -43,6 +43,8 @@ pub struct AlpFacts {
     pub shortest_us: i32,
     /// Longest time of a plane, microseconds.
     pub longest_us: i32,
+    /// The highest temperatures that it recommends; older devices name none.
+    pub hottest: Temperatures,
 }
 
 /// Temperatures in degrees Celsius; `None` where the device has no sensor.
@@ -59,7 +61,18 @@ pub struct Temperatures {
 impl Temperatures {
     /// The hottest.
     pub fn highest(&self) -> Option<f64> {
-        [self.driver, self.application, self.board].into_iter().flatten().reduce(f64::max)
+        self.all().into_iter().flatten().reduce(f64::max)
+    }
+
+    /// By how much the hottest sensor exceeds its limit, degrees; negative below it. The limit is `limit`, or what `recommended` says of the
+    /// sensor. `None` without a sensor that has a limit.
+    pub fn excess(&self, recommended: &Self, limit: Option<f64>) -> Option<f64> {
+        let pairs = self.all().into_iter().zip(recommended.all());
+        pairs.filter_map(|(now, most)| Some(now? - limit.or(most)?)).reduce(f64::max)
+    }
+
+    fn all(&self) -> [Option<f64>; 3] {
+        [self.driver, self.application, self.board]
     }
 }
 
@@ -70,8 +83,12 @@ pub struct Progress {
     pub is_idle: bool,
     /// Sequences that wait.
     pub waiting: u32,
-    /// Pictures left in the present run.
+    /// Number in the queue of what is shown.
+    pub queue_id: u32,
+    /// Pictures left in the present run, the present one included.
     pub pictures_left: u32,
+    /// Pictures of it that are over.
+    pub pictures_done: u32,
     /// Time of each, microseconds.
     pub picture_us: u32,
 }
@@ -91,11 +108,11 @@ pub struct Showing {
     pub runs: u32,
 }
 
-/// A sequence that was started: its frame (`None` is the dark picture), and its number in the queue where that is needed.
+/// A sequence that was started: its frame (`None` is the dark picture), and the time of its runs in microseconds.
 #[derive(Clone, Copy, Debug)]
 struct Started {
     frame: Option<usize>,
-    queue_id: Option<i32>,
+    us: i64,
 }
 
 /// An ALP that this process has allocated. Dropping it makes it dark and frees it.
@@ -110,6 +127,9 @@ pub struct Alp {
     dark: Option<u32>,
     frames: Vec<Vec<u32>>,
     timing: Option<FrameTiming>,
+    /// Time of each sequence of a frame with all its runs, microseconds.
+    times_us: Vec<i64>,
+    slot_us: i64,
     runs: u32,
     started: VecDeque<Started>,
 }
@@ -149,11 +169,24 @@ impl Alp {
             queue: 0,
             shortest_us: 0,
             longest_us: 0,
+            hottest: Temperatures::default(),
         };
-        let (frames, started) = (Vec::new(), VecDeque::new());
+        let (frames, times_us, started) = (Vec::new(), Vec::new(), VecDeque::new());
         // From here on dropping it frees the device, whatever fails.
-        let mut alp =
-            Self { library, id, name, facts, pause, dark: None, frames, timing: None, runs: 1, started };
+        let mut alp = Self {
+            library,
+            id,
+            name,
+            facts,
+            pause,
+            dark: None,
+            frames,
+            timing: None,
+            times_us,
+            slot_us: 0,
+            runs: 1,
+            started,
+        };
         alp.set_up()?;
         Ok(alp)
     }
@@ -178,6 +211,11 @@ impl Alp {
         let queue = self.called("AlpProjInquire(ALP_PROJ_QUEUE_MAX_AVAIL)", queue)?;
         let panel = abi::panel_name(dmd_type);
         self.facts = AlpFacts { serial, version, panel, raster, free_memory, queue, ..self.facts.clone() };
+        self.facts.hottest = self.celsius([
+            abi::MAX_DDC_FPGA_TEMPERATURE,
+            abi::MAX_APPS_FPGA_TEMPERATURE,
+            abi::MAX_PCB_TEMPERATURE,
+        ]);
         let dark = self.allocate(1)?;
         self.dark = Some(dark);
         let ask = |what| self.called("AlpSeqInquire", self.library.seq_inquire(self.id, dark, what));
@@ -293,6 +331,7 @@ impl Alp {
         self.runs = showing.runs.clamp(1, MAX_RUNS);
         let is_one = timing.parts.len() == 1;
         let zero = vec![0; self.facts.raster.plane_bytes()];
+        let runs = self.runs as i32;
         for _ in 0..showing.frames {
             self.frames.push(Vec::with_capacity(timing.parts.len()));
             for Part { planes, picture_us, .. } in &timing.parts {
@@ -301,7 +340,6 @@ impl Alp {
                 self.set_picture_time(sequence, *picture_us)?;
                 if is_one {
                     self.write(sequence, *planes, &zero)?;
-                    let runs = self.runs as i32;
                     let set = self.library.seq_control(self.id, sequence, abi::SEQ_REPEAT, runs);
                     self.called("AlpSeqControl(ALP_SEQ_REPEAT)", set)?;
                 }
@@ -309,6 +347,12 @@ impl Alp {
         }
         // A frame and its dark picture are at most as many entries as these; nothing is allocated while frames are shown.
         self.started.reserve(4 * showing.frames * (timing.parts.len() + 1));
+        let time_of = |part: &Part| {
+            let pictures = part.planes as i64 + i64::from(is_one);
+            pictures * i64::from(part.picture_us) * i64::from(if is_one { self.runs } else { 1 })
+        };
+        self.times_us = timing.parts.iter().map(time_of).collect();
+        self.slot_us = showing.rate.slot_len_ns(0) / 1000;
         self.timing = Some(timing);
         Ok(())
     }
@@ -333,6 +377,35 @@ impl Alp {
         Ok((MEASURED_FRAMES as usize * planes * zero.len()) as f64 * 1e9 / ns as f64)
     }
 
+    /// From the order that shows a frame to its first picture, nanoseconds, and how uncertain that is: from the progress of frame 0, which
+    /// must be dark. The device has no clock that could be read.
+    ///
+    /// # Errors
+    /// A device that refuses a call.
+    pub fn measure_start(&mut self, clock: &dyn Fn() -> HostTime) -> Result<(i64, i64), AlpError> {
+        let (mut low, mut high) = (0, 0);
+        for _ in 0..MEASURED_FRAMES {
+            let ordered = clock();
+            self.show(0)?;
+            let (mut not_before, mut not_after) = (0, clock().ns_since(ordered) + self.slot_us * 1000);
+            for _ in 0..LOOKS {
+                let before = clock().ns_since(ordered);
+                let progress = self.progress()?;
+                if progress.is_idle {
+                    break;
+                }
+                let picture_ns = i64::from(progress.picture_us) * 1000;
+                let done = i64::from(progress.pictures_done);
+                not_before = not_before.max(before - (done + 1) * picture_ns);
+                not_after = not_after.min(clock().ns_since(ordered) - done * picture_ns);
+            }
+            low = low.max(not_before);
+            high = high.max(not_after);
+            self.settle();
+        }
+        Ok((low.midpoint(high.max(low)), (high - low).max(0) / 2))
+    }
+
     /// Refuses frames that the cable cannot carry.
     ///
     /// # Errors
@@ -351,6 +424,19 @@ impl Alp {
             hz,
             most_hz: bytes_per_s / frame_bytes,
         })
+    }
+
+    /// The shortest share of a plane in a frame's time that the panel can show in this way, nanoseconds: what a frame needs at least,
+    /// divided by its planes.
+    pub fn shortest_share_ns(&self, showing: &Showing) -> u32 {
+        let AlpFacts { shortest_us, longest_us, .. } = self.facts;
+        let any = FrameRate::new(100_000_000, 1).expect("not zero");
+        match FrameTiming::new(&showing.schedule, showing.weights, any, shortest_us, longest_us) {
+            Err(Misfit::TooFast { most_hz, .. }) => {
+                (1e9 / most_hz / showing.schedule.len() as f64).ceil() as u32
+            }
+            _ => 0,
+        }
     }
 
     /// Frames that memory was taken for.
@@ -377,33 +463,48 @@ impl Alp {
         self.write(self.frames[frame][at], plane - parts[at].first, bytes)
     }
 
-    /// Shows a frame once everything that was started before is over: at once, if nothing is.
+    /// Shows a frame as soon as what was started before is over, or after the picture that is on the mirrors if that would take longer than
+    /// a quarter of a slot: the light of a late frame ends early, and no delay adds up.
     ///
     /// # Errors
     /// The device refuses, or is gone.
     pub fn show(&mut self, frame: usize) -> Result<(), AlpError> {
-        let before = self.started.back().and_then(|started| started.queue_id);
+        let before = self.progress()?;
+        let is_late = !before.is_idle && self.left_us(&before) > self.slot_us / 4;
+        if is_late && before.waiting > 0 {
+            self.drop_waiting()?;
+        }
         for part in 0..self.frames[frame].len() {
-            self.start(self.frames[frame][part], Some(frame))?;
+            let us = self.times_us[part];
+            self.start(self.frames[frame][part], Some(frame), us)?;
         }
         if self.frames[frame].len() > 1 {
-            self.start(self.dark.expect("set up"), None)?;
+            self.start(self.dark.expect("set up"), None, i64::from(self.facts.shortest_us))?;
         }
-        if self.runs > 1 {
-            let id = self.library.proj_inquire(self.id, abi::PROJ_QUEUE_ID);
-            let id = self.called("AlpProjInquire(ALP_PROJ_QUEUE_ID)", id)?;
-            self.started.back_mut().expect("just started").queue_id = Some(id);
-            if let Some(before) = before {
-                // The older frame gives way after its present picture. It may be over already, which is answered with a refusal.
-                let _ = self.library.proj_control(self.id, abi::PROJ_ABORT_FRAME, before);
-            }
+        if !before.is_idle && (is_late || self.runs > 1) {
+            // In the last picture of a run, the next run may begin before the order arrives: then it ends after one picture.
+            let after_picture = is_late || before.pictures_left <= 1;
+            let how = if after_picture { abi::PROJ_ABORT_FRAME } else { abi::PROJ_ABORT_SEQUENCE };
+            // What was shown before may be over by now, or may be ending by an earlier order: then the device refuses, and all is well.
+            let _ = self.library.proj_control(self.id, how, before.queue_id as i32);
         }
         Ok(())
     }
 
-    fn start(&mut self, sequence: u32, frame: Option<usize>) -> Result<(), AlpError> {
+    /// Time until the present run and all that waits are over, microseconds.
+    fn left_us(&self, progress: &Progress) -> i64 {
+        let present = i64::from(progress.pictures_left) * i64::from(progress.picture_us);
+        let waiting = self.started.iter().rev().take(progress.waiting as usize);
+        present + waiting.map(|started| started.us).sum::<i64>()
+    }
+
+    fn drop_waiting(&mut self) -> Result<(), AlpError> {
+        self.projection("AlpProjControl(ALP_PROJ_RESET_QUEUE)", abi::PROJ_RESET_QUEUE, abi::DEFAULT)
+    }
+
+    fn start(&mut self, sequence: u32, frame: Option<usize>, us: i64) -> Result<(), AlpError> {
         self.called("AlpProjStart", self.library.proj_start(self.id, sequence))?;
-        self.started.push_back(Started { frame, queue_id: None });
+        self.started.push_back(Started { frame, us });
         Ok(())
     }
 
@@ -420,7 +521,15 @@ impl Alp {
         let left = waiting as usize + usize::from(!is_idle);
         let over = self.started.len().saturating_sub(left);
         self.started.drain(..over);
-        Ok(Progress { is_idle, waiting, pictures_left: raw.pictures, picture_us: raw.picture_us })
+        let pictures_done = raw.pictures_of_run.saturating_sub(raw.pictures);
+        Ok(Progress {
+            is_idle,
+            waiting,
+            queue_id: raw.queue_id,
+            pictures_left: raw.pictures,
+            pictures_done,
+            picture_us: raw.picture_us,
+        })
     }
 
     /// Whether a frame was shown or waited when [`Alp::progress`] was last asked, or was started since.
@@ -435,8 +544,8 @@ impl Alp {
     /// The device refuses, or is gone.
     pub fn darken(&mut self) -> Result<(), AlpError> {
         let Some(dark) = self.dark else { return Ok(()) };
-        self.projection("AlpProjControl(ALP_PROJ_RESET_QUEUE)", abi::PROJ_RESET_QUEUE, abi::DEFAULT)?;
-        self.start(dark, None)?;
+        self.drop_waiting()?;
+        self.start(dark, None, i64::from(self.facts.shortest_us))?;
         if self.library.proj_control(self.id, abi::PROJ_ABORT_FRAME, abi::DEFAULT) == Err(abi::NOT_IDLE) {
             // Another end is already asked for.
             self.projection("AlpProjControl(ALP_PROJ_ABORT_ASYNC)", abi::PROJ_ABORT_ASYNC, abi::DEFAULT)?;
@@ -446,12 +555,14 @@ impl Alp {
 
     /// Its temperatures now.
     pub fn temperatures(&self) -> Temperatures {
+        self.celsius([abi::DDC_FPGA_TEMPERATURE, abi::APPS_FPGA_TEMPERATURE, abi::PCB_TEMPERATURE])
+    }
+
+    fn celsius(&self, what: [i32; 3]) -> Temperatures {
+        // One unit is 1/256 of a degree. A sensor that the device lacks is refused.
         let of = |what| self.library.dev_inquire(self.id, what).ok().map(|raw| f64::from(raw) / 256.0);
-        Temperatures {
-            driver: of(abi::DDC_FPGA_TEMPERATURE),
-            application: of(abi::APPS_FPGA_TEMPERATURE),
-            board: of(abi::PCB_TEMPERATURE),
-        }
+        let [driver, application, board] = what.map(of);
+        Temperatures { driver, application, board }
     }
 
     /// Waits until nothing is shown, for a tenth of a second at most.

@@ -159,15 +159,36 @@ pub struct FakeAlp {
     plane_bytes: usize,
 }
 
-/// The symbol `name` of the library in this process.
-fn symbol<T>(name: &str) -> libloading::Symbol<'static, T> {
-    static LIBRARY: OnceLock<libloading::Library> = OnceLock::new();
-    let library = LIBRARY.get_or_init(|| {
-        // SAFETY: the library is this crate; it runs nothing when it is opened.
-        unsafe { libloading::Library::new(library()) }.unwrap_or_else(|e| panic!("{e}"))
+/// The functions above in the library that the program under test has opened.
+struct Functions {
+    add: unsafe extern "C" fn(*const u8, usize, i32) -> i32,
+    plan: unsafe extern "C" fn(i32, *const u8, usize) -> i32,
+    set_time: extern "C" fn(i32, i64),
+    set_celsius: extern "C" fn(i32, f64),
+    witness: unsafe extern "C" fn(i32, *mut Witness),
+    shown: unsafe extern "C" fn(i32, *mut ShownHeader, *mut u8, usize),
+}
+
+fn functions() -> &'static Functions {
+    static OPEN: OnceLock<(Functions, libloading::Library)> = OnceLock::new();
+    let (functions, _) = OPEN.get_or_init(|| {
+        // SAFETY: the library is this crate, which runs nothing when it is opened; the names are those of functions of this file, with their
+        // types; the library stays open as long as the process lives.
+        unsafe {
+            let library = libloading::Library::new(library()).unwrap_or_else(|e| panic!("{e}"));
+            let missing = |e: libloading::Error| -> ! { panic!("{e}") };
+            let functions = Functions {
+                add: *library.get(b"fake_alp_add").unwrap_or_else(|e| missing(e)),
+                plan: *library.get(b"fake_alp_plan").unwrap_or_else(|e| missing(e)),
+                set_time: *library.get(b"fake_alp_set_time").unwrap_or_else(|e| missing(e)),
+                set_celsius: *library.get(b"fake_alp_set_celsius").unwrap_or_else(|e| missing(e)),
+                witness: *library.get(b"fake_alp_witness").unwrap_or_else(|e| missing(e)),
+                shown: *library.get(b"fake_alp_shown").unwrap_or_else(|e| missing(e)),
+            };
+            (functions, library)
+        }
     });
-    // SAFETY: every caller below names a function of this file with its type.
-    unsafe { library.get(name.as_bytes()) }.unwrap_or_else(|e| panic!("{name}: {e}"))
+    functions
 }
 
 impl FakeAlp {
@@ -189,9 +210,8 @@ impl FakeAlp {
 
     fn add(settings: &str, is_virtual: bool) -> Self {
         let plane_bytes = Settings::parse(settings).unwrap_or_else(|e| panic!("{e}")).plane_bytes();
-        let add = symbol::<unsafe extern "C" fn(*const u8, usize, i32) -> i32>("fake_alp_add");
         // SAFETY: pointer and length are of one slice.
-        let number = unsafe { add(settings.as_ptr(), settings.len(), i32::from(is_virtual)) };
+        let number = unsafe { (functions().add)(settings.as_ptr(), settings.len(), i32::from(is_virtual)) };
         assert!(number > 0, "fake-alp: {settings:?}");
         Self { number, plane_bytes }
     }
@@ -206,38 +226,34 @@ impl FakeAlp {
     /// # Panics
     /// When the plan is not understood.
     pub fn plan(&self, plan: &str) {
-        let set = symbol::<unsafe extern "C" fn(i32, *const u8, usize) -> i32>("fake_alp_plan");
         // SAFETY: pointer and length are of one slice.
-        assert_eq!(unsafe { set(self.number, plan.as_ptr(), plan.len()) }, 0, "fake-alp: {plan:?}");
+        let code = unsafe { (functions().plan)(self.number, plan.as_ptr(), plan.len()) };
+        assert_eq!(code, 0, "fake-alp: {plan:?}");
     }
 
     /// Moves the clock of a device at virtual pace. It never goes back.
     pub fn set_time(&self, ns: i64) {
-        let set = symbol::<extern "C" fn(i32, i64)>("fake_alp_set_time");
-        set(self.number, ns);
+        (functions().set_time)(self.number, ns);
     }
 
     /// Sets its temperature.
     pub fn set_celsius(&self, celsius: f64) {
-        let set = symbol::<extern "C" fn(i32, f64)>("fake_alp_set_celsius");
-        set(self.number, celsius);
+        (functions().set_celsius)(self.number, celsius);
     }
 
     /// What it says of itself.
     pub fn witness(&self) -> Witness {
         let mut all = Witness::default();
-        let ask = symbol::<unsafe extern "C" fn(i32, *mut Witness)>("fake_alp_witness");
         // SAFETY: the pointer is to a local of the type that the call fills.
-        unsafe { ask(self.number, &mut all) };
+        unsafe { (functions().witness)(self.number, &mut all) };
         all
     }
 
     /// The oldest picture that was shown and not yet taken.
     pub fn next_shown(&self) -> Option<Shown> {
         let (mut header, mut plane) = (ShownHeader::default(), vec![0; self.plane_bytes]);
-        let take = symbol::<unsafe extern "C" fn(i32, *mut ShownHeader, *mut u8, usize)>("fake_alp_shown");
         // SAFETY: both pointers are to locals, and the length is that of the plane.
-        unsafe { take(self.number, &mut header, plane.as_mut_ptr(), plane.len()) };
+        unsafe { (functions().shown)(self.number, &mut header, plane.as_mut_ptr(), plane.len()) };
         (header.is_there != 0).then(|| Shown {
             from_ns: header.from_ns,
             until_ns: header.until_ns,

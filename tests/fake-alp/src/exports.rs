@@ -125,6 +125,7 @@ unsafe extern "C" fn AlpDevInquire(id: u32, what: i32, to: *mut i32) -> i32 {
             DDC_FPGA_TEMPERATURE | APPS_FPGA_TEMPERATURE | PCB_TEMPERATURE => {
                 (settings.celsius * 256.0) as i32
             }
+            2145..=2147 => 85 * 256,
             DISPLAY_HEIGHT => settings.height as i32,
             DISPLAY_WIDTH => settings.width as i32,
             USB_DISCONNECT_BEHAVIOUR => panel.disconnect,

@@ -144,7 +144,8 @@ fn darkness_comes_within_a_plane_and_drops_what_waits() {
         let end = lit(&fake).last().unwrap().until_ns;
         let longest = if weights == Weights::Binary { 128 * 78_000 } else { 1_112_000 };
         assert!(end <= ordered_at + longest, "{} ns after the order", end - ordered_at);
-        assert_eq!((fake.witness().is_lit, fake.witness().refusals), (0, 0));
+        // The second frame has asked for the end of the first one, and only one end can be asked for.
+        assert!(fake.witness().is_lit == 0 && fake.witness().refusals <= 1);
     }
 }
 
