@@ -253,6 +253,11 @@ impl ProjectorFirmware {
         self.core.store.lit.map(|h| h.frame)
     }
 
+    /// Counts the frames that were lit; `None` while it is dark. A number stands for one frame's planes.
+    pub fn lit_generation(&self) -> Option<u64> {
+        (self.core.lit_now && self.core.store.lit.is_some()).then_some(self.core.generation)
+    }
+
     /// The planes on the mirrors, one after the other in the configured order.
     pub fn lit_planes(&self) -> Option<&[u8]> {
         let held = self.core.store.lit?;

@@ -2,9 +2,10 @@
 
 use super::watch::{print, refuse_where_dark_stands};
 use crate::dlpc900::{sequence_of, status_text, PatternFileError, ShowAs};
+use crate::rest_dlpc900::put_to_rest;
 use crate::signals;
 use clap::ValueEnum;
-use dpm_device::dlpc900::driver::{Dlpc900, UploadProgress};
+use dpm_device::dlpc900::driver::{Dlpc900, Dlpc900Error, UploadProgress};
 use dpm_device::dlpc900::image::{Compression, PlaneOrder};
 use dpm_device::dlpc900::lut::{led, LutEntry};
 use dpm_device::dlpc900::sequence::{LedSetup, Receiver, Repeat, VideoPatterns};
@@ -16,12 +17,6 @@ use std::io::{Read, Write};
 use std::os::unix::process::CommandExt;
 use std::path::PathBuf;
 use std::process::{Child, Stdio};
-use std::time::Duration;
-
-/// How long to try to open the controller of a run that was killed.
-const GUARD_PATIENCE: Duration = Duration::from_secs(5);
-/// Time between two tries.
-const GUARD_STEP: Duration = Duration::from_millis(5);
 
 /// Flags of `dpm dlpc900`.
 #[derive(clap::Args, Clone, Debug)]
@@ -261,22 +256,12 @@ fn guard(place: Option<UsbPlace>) -> Result<(), Failure> {
     if !said.is_empty() {
         return Ok(());
     }
-    let limit = std::time::Instant::now() + GUARD_PATIENCE;
-    let mut d = loop {
-        match UsbHid::open(place).map(Dlpc900::new) {
-            Ok(d) => break d?,
-            // The kernel releases the dead process's interface in its own time.
-            Err(_) if std::time::Instant::now() < limit => std::thread::sleep(GUARD_STEP),
-            Err(e) => {
-                return Err(device(format!(
-                    "{}: {e}; it could not be stopped and continues to show its patterns",
-                    describe(place)
-                )))
-            }
-        }
+    let mut open = || {
+        let port = UsbHid::open(place);
+        Dlpc900::new(port.map_err(|source| Dlpc900Error::Port { doing: describe(place), source })?)
     };
-    d.stop()?;
-    d.idle()?;
+    put_to_rest(&mut open)
+        .map_err(|e| device(format!("{e}; it could not be stopped and continues to show its patterns")))?;
     let _ =
         writeln!(std::io::stderr(), "the run was killed: its DLPC900 is stopped and exercises its mirrors");
     Ok(())
