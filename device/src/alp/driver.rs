@@ -299,6 +299,24 @@ impl Alp {
         })
     }
 
+    /// Refuses a panel of another size than the rig's.
+    ///
+    /// # Errors
+    /// With both sizes.
+    pub fn check_raster(&self, raster: Raster) -> Result<(), AlpError> {
+        let found = self.facts.raster;
+        if found == raster {
+            return Ok(());
+        }
+        Err(AlpError::Raster {
+            device: self.name.clone(),
+            found_width: found.width(),
+            found_height: found.height(),
+            width: raster.width(),
+            height: raster.height(),
+        })
+    }
+
     /// Refuses what the panel, its memory or its queue cannot do.
     ///
     /// # Errors

@@ -12,6 +12,7 @@ use super::driver::{Alp, AlpFacts, Showing};
 use super::error::AlpError;
 use super::projector::{AlpProjector, MEMORY_SPARE};
 use crate::packet::Packet;
+use crate::planes::Raster;
 use crate::projector::Served;
 use crate::time::{HostClock, HostTime};
 use crate::transport::inproc::{threaded, DeviceEnd, HostEnd};
@@ -35,6 +36,8 @@ pub struct AlpSettings {
     pub library: Option<PathBuf>,
     /// Serial number of the device; 0 is the first one.
     pub number: i32,
+    /// The mirrors that the rig file names.
+    pub raster: Raster,
     /// How frames are shown.
     pub showing: Showing,
     /// Temperature above which it goes dark; what the device recommends, if left out.
@@ -184,6 +187,7 @@ impl AlpTransport {
 fn open_device(settings: &AlpSettings) -> Result<(AlpProjector, AlpWelcome), AlpError> {
     let clock = || settings.clock.now();
     let mut alp = Alp::open(settings.library.as_deref(), settings.number)?;
+    alp.check_raster(settings.raster)?;
     let mut showing = settings.showing;
     // As many frames as its memory holds, down to one that waits.
     let planes = showing.schedule.len() + 1;

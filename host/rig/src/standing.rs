@@ -48,6 +48,10 @@ impl Identity {
             ProjectorBackend::Serial(port) => {
                 ("projector on ".to_owned() + &port.port, "projector on".into(), Some(port.port.clone()))
             }
+            ProjectorBackend::Alp(alp) => {
+                let number = Some(alp.device_number).filter(|n| *n > 0).map(|n| n.to_string());
+                (format!("ALP {}", or_any(&number)), "ALP".into(), number)
+            }
             // It is identified by its place on the bus, which changes with every re-plug, so an order for one applies
             // to all.
             ProjectorBackend::Dlpc900(dlpc) => {

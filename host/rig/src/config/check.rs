@@ -1,7 +1,9 @@
 //! Contradictions between keys. Each is reported at a key that was written, with what would resolve it.
 
 use super::world::{EnvironmentConfig, GazeConfig, TrackerConfig};
-use super::{Pace, ProjectorBackend, ProjectorConfig, Purpose, ResponseConfig, RigConfig};
+use super::{
+    AlpConfig, AlpWeights, Pace, ProjectorBackend, ProjectorConfig, Purpose, ResponseConfig, RigConfig,
+};
 use crate::mock::{self, FaultError};
 use dpm_common::keys::read::{ConfigValue, Reader};
 use dpm_device::regular_file;
@@ -184,6 +186,9 @@ fn projector(rig: &RigConfig, reader: &mut Reader) {
             );
         }
     }
+    if let ProjectorBackend::Alp(alp) = &p.backend {
+        check_alp(p, alp, reader);
+    }
     if matches!(p.backend, ProjectorBackend::Dlpc900(_)) && num > 120 * den {
         contradict(
             reader,
@@ -193,6 +198,30 @@ fn projector(rig: &RigConfig, reader: &mut Reader) {
             ],
             "a DLPC900 shows at most 120 frames/s of 24 planes",
             "lower `projector.frame_rate` to 120 or choose another backend".into(),
+        );
+    }
+}
+
+/// An ALP has one picture time for each sequence, so binary weights take a sequence for each plane. What the panel, its memory and its cable
+/// hold is known when it is opened.
+fn check_alp(p: &ProjectorConfig, alp: &AlpConfig, reader: &mut Reader) {
+    if alp.weights != AlpWeights::Binary {
+        return;
+    }
+    let weights = ("projector.backend.weights", shown(alp.weights));
+    if p.planes != 8 {
+        contradict(
+            reader,
+            &[weights, ("projector.planes", shown(p.planes))],
+            "binary weights are for the eight planes of one channel",
+            "set projector.planes = 8, or projector.backend.weights = \"equal\"".into(),
+        );
+    } else if alp.slots_per_sequence > 1 {
+        contradict(
+            reader,
+            &[("projector.backend.slots_per_sequence", shown(alp.slots_per_sequence)), weights],
+            "a frame of binary weights is several sequences, which the device does not repeat as one",
+            "set projector.backend.slots_per_sequence = 1, or projector.backend.weights = \"equal\"".into(),
         );
     }
 }

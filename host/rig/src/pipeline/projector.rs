@@ -1,12 +1,16 @@
 //! Opens the medium of `[projector.backend]`, and derives the link's settings from the rig file.
 
-use crate::config::{Compaction, Pace, ProjectorBackend, RigConfig};
+use crate::config::{AlpConfig, AlpWeights, Compaction, Pace, ProjectorBackend, RigConfig};
 use crate::engine::connect::ConnectError;
+use dpm_device::alp::{AlpSettings, AlpTransport, Showing};
 use dpm_device::link::{packet_bytes, Codec, Epoch, LinkError, LinkSettings, Underrun, COMMIT_BYTES};
 use dpm_device::planes::Raster;
+use dpm_device::time::HostClock;
 use dpm_device::transport::serial::{SerialSettings, SerialTransport};
 use dpm_device::transport::usb::{UsbSettings, UsbTransport};
-use dpm_device::transport::Transport;
+use dpm_device::transport::{Transport, TransportError};
+use dpm_handoff::wake::WaitPolicy;
+use std::sync::Arc;
 
 /// Time from the handshake to slot 0.
 const EPOCH_NS: u64 = 5_000_000;
@@ -24,12 +28,34 @@ pub fn frame_bytes(raster: Raster, planes: usize) -> usize {
     packet_bytes(raster.plane_bytes()) * planes + packet_bytes(COMMIT_BYTES)
 }
 
-/// Opens the medium of a bit-plane projector on USB or a serial port. `None` for the other backends, which have none.
+/// What a projector needs whose firmware runs in this process.
+#[derive(Clone)]
+pub struct Surroundings {
+    /// The clock of the run.
+    pub clock: Arc<dyn HostClock>,
+    /// Called first in the projector's thread, for its rights.
+    pub enter: Arc<dyn Fn() + Send + Sync>,
+    /// How that thread waits.
+    pub wait: WaitPolicy,
+}
+
+impl Surroundings {
+    /// A thread without special rights that parks.
+    pub fn plain(clock: Arc<dyn HostClock>) -> Self {
+        Self { clock, enter: Arc::new(|| ()), wait: WaitPolicy::Park }
+    }
+}
+
+/// Opens the medium of a bit-plane projector on USB or a serial port, or of an ALP. `None` for the other backends, which have none.
 ///
 /// # Errors
 /// The device was not found; there is no permission (the message names the rule or group that grants it); or another
 /// program uses it.
-pub fn open(config: &RigConfig, raster: Raster) -> Result<Option<Medium>, ConnectError> {
+pub fn open(
+    config: &RigConfig,
+    raster: Raster,
+    surroundings: &Surroundings,
+) -> Result<Option<Medium>, ConnectError> {
     let frame_bytes = frame_bytes(raster, config.projector.schedule().len());
     let failed = |e| ConnectError::from(LinkError::Transport(e));
     Ok(match &config.projector.backend {
@@ -50,8 +76,48 @@ pub fn open(config: &RigConfig, raster: Raster) -> Result<Option<Medium>, Connec
             let transport = Box::new(SerialTransport::open(settings).map_err(failed)?);
             Some(Medium { transport, warnings: Vec::new() })
         }
+        ProjectorBackend::Alp(alp) => Some(open_alp(config, alp, frame_bytes, surroundings)?),
         ProjectorBackend::Mock(_) | ProjectorBackend::Dlpc900(_) => None,
     })
+}
+
+fn open_alp(
+    config: &RigConfig,
+    alp: &AlpConfig,
+    frame_bytes: usize,
+    surroundings: &Surroundings,
+) -> Result<Medium, ConnectError> {
+    let schedule = config.projector.schedule();
+    let opened = AlpTransport::open(AlpSettings {
+        library: alp.library.clone(),
+        number: alp.device_number as i32,
+        raster: config.projector.raster(),
+        showing: Showing {
+            schedule,
+            weights: alp.weights.weights(),
+            rate: config.projector.frame_rate,
+            frames: alp.frames_in_flight as usize,
+            runs: alp.slots_per_sequence,
+        },
+        max_celsius: alp.max_celsius,
+        frame_bytes,
+        clock: surroundings.clock.clone(),
+        enter: surroundings.enter.clone(),
+        wait: surroundings.wait,
+    });
+    let transport = opened.map_err(|e| {
+        let device = "projector.backend".to_owned();
+        ConnectError::from(LinkError::Transport(TransportError::Unsuitable { device, why: e.to_string() }))
+    })?;
+    let mut warnings: Vec<String> = transport.welcome().map(ToString::to_string).into_iter().collect();
+    if alp.weights == AlpWeights::Equal {
+        warnings.push(format!(
+            "projector.backend.weights = \"equal\": the {} planes are lit equally long, so levels are right only if the light source is dimmed from \
+             plane to plane (docs/ALP.md)",
+            schedule.len()
+        ));
+    }
+    Ok(Medium { transport: Box::new(transport), warnings })
 }
 
 /// Codecs that the rig file allows on its link, as bits of [`Codec::mask`].
@@ -60,7 +126,8 @@ pub(crate) fn codecs(backend: &ProjectorBackend) -> u32 {
         ProjectorBackend::Mock(c) => &c.compaction,
         ProjectorBackend::Usb(c) => &c.compaction,
         ProjectorBackend::Serial(c) => &c.compaction,
-        ProjectorBackend::Dlpc900(_) => return Codec::Raw.mask(),
+        // An ALP's firmware runs in this process: nothing is saved by compacting.
+        ProjectorBackend::Alp(_) | ProjectorBackend::Dlpc900(_) => return Codec::Raw.mask(),
     };
     match compaction {
         Compaction::Auto => Codec::ALL,
