@@ -132,6 +132,8 @@ pub struct Alp {
     slot_us: i64,
     runs: u32,
     started: VecDeque<Started>,
+    /// Nothing with light was started since it went dark.
+    is_dark: bool,
 }
 
 impl std::fmt::Debug for Alp {
@@ -186,6 +188,7 @@ impl Alp {
             slot_us: 0,
             runs: 1,
             started,
+            is_dark: true,
         };
         alp.set_up()?;
         Ok(alp)
@@ -523,6 +526,7 @@ impl Alp {
     fn start(&mut self, sequence: u32, frame: Option<usize>, us: i64) -> Result<(), AlpError> {
         self.called("AlpProjStart", self.library.proj_start(self.id, sequence))?;
         self.started.push_back(Started { frame, us });
+        self.is_dark &= frame.is_none();
         Ok(())
     }
 
@@ -561,13 +565,14 @@ impl Alp {
     /// # Errors
     /// The device refuses, or is gone.
     pub fn darken(&mut self) -> Result<(), AlpError> {
-        let Some(dark) = self.dark else { return Ok(()) };
+        let Some(dark) = self.dark.filter(|_| !self.is_dark) else { return Ok(()) };
         self.drop_waiting()?;
         self.start(dark, None, i64::from(self.facts.shortest_us))?;
         if self.library.proj_control(self.id, abi::PROJ_ABORT_FRAME, abi::DEFAULT) == Err(abi::NOT_IDLE) {
             // Another end is already asked for.
             self.projection("AlpProjControl(ALP_PROJ_ABORT_ASYNC)", abi::PROJ_ABORT_ASYNC, abi::DEFAULT)?;
         }
+        self.is_dark = true;
         Ok(())
     }
 

@@ -4,6 +4,7 @@ mod bench;
 mod calibrate;
 mod dlpc900;
 mod doctor;
+mod doctor_alp;
 mod error;
 mod error_experiments;
 mod error_files;
