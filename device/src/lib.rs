@@ -51,6 +51,8 @@
 //! ```
 #![cfg_attr(not(feature = "std"), no_std)]
 
+#[cfg(feature = "alp")]
+pub mod alp;
 pub mod clock_map;
 pub mod cobs;
 pub mod dlpc900;

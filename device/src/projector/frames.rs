@@ -92,6 +92,10 @@ impl FrameStore {
         self.pending.len() + usize::from(self.assembling.is_some_and(|a| a.buffer.is_some()))
     }
 
+    pub(super) fn pending(&self) -> &[Pending] {
+        &self.pending
+    }
+
     pub(super) fn free(&self) -> usize {
         self.capacity - self.pending.len()
     }

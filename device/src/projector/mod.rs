@@ -7,6 +7,7 @@
 //! CONFIG and ARM, goes dark and latches when the host falls silent, and lights a frame only after every bit of it has
 //! arrived.
 
+mod ahead;
 mod clock;
 mod config;
 mod frames;
@@ -27,6 +28,7 @@ use crate::time::{DeviceTicks, HostTime};
 use crate::transport::{Lane, LinkDevice};
 
 pub use crate::light::{LightEvent, LightKind};
+pub use ahead::WaitingFrame;
 pub use clock::DeviceClock;
 pub use config::{FirmwareConfig, LightChange, Shown};
 use frames::FrameStore;

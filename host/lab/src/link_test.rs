@@ -15,7 +15,8 @@ use dpm_render::{RenderError, Renderer};
 use dpm_rig::config::{Compaction, ProjectorBackend, RigConfig};
 use dpm_rig::failure::{Failure, FailureKind};
 use dpm_rig::pack::prepared::PreparedFrames;
-use dpm_rig::pipeline::{connect, projector, renderer_settings, PipelineError, ENDED_WITH_THE_LAST_RUN};
+use dpm_rig::pipeline::projector::{self, Surroundings};
+use dpm_rig::pipeline::{connect, renderer_settings, PipelineError, ENDED_WITH_THE_LAST_RUN};
 use dpm_rig::rig::Rig;
 use dpm_rig::telemetry::monitor::RunMonitor;
 use hil_mock::projector::{serve_cable, EmulatedProjector, MockConfig};
@@ -139,8 +140,10 @@ enum Far {
 
 impl Far {
     fn open(config: &RigConfig, raster: Raster, clock: MonotonicClock) -> Result<Self, Failure> {
-        if let Some(mut medium) = projector::open(config, raster).map_err(PipelineError::from)? {
-            medium.transport.set_clock(std::sync::Arc::new(move || clock.now()));
+        let clock_of = || std::sync::Arc::new(move || clock.now());
+        let around = Surroundings::plain(clock_of());
+        if let Some(mut medium) = projector::open(config, raster, &around).map_err(PipelineError::from)? {
+            medium.transport.set_clock(clock_of());
             return Ok(Self::Outside(medium.transport));
         }
         let ProjectorBackend::Mock(mock) = &config.projector.backend else {

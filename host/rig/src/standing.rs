@@ -52,6 +52,10 @@ impl Identity {
                 let name = or_any(&display.connector);
                 (format!("display {name}"), "display".into(), display.connector.clone())
             }
+            ProjectorBackend::Alp(alp) => {
+                let number = Some(alp.device_number).filter(|n| *n > 0).map(|n| n.to_string());
+                (format!("ALP {}", or_any(&number)), "ALP".into(), number)
+            }
             // It is identified by its place on the bus, which changes with every re-plug, so an order for one applies
             // to all.
             ProjectorBackend::Dlpc900(dlpc) => {

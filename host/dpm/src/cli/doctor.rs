@@ -1,7 +1,9 @@
 //! `dpm doctor`: what this machine can do, line by line, and how to fix what is missing.
 
 use super::display::{self, Seen};
+use super::doctor_alp;
 use super::os;
+use super::rig_args::RigArgs;
 use super::watch::print;
 use dpm_common::realtime::{self, Refusal};
 use dpm_display::kms::Connector;
@@ -13,6 +15,11 @@ use std::path::PathBuf;
 /// Flags of `dpm doctor`.
 #[derive(clap::Args, Clone, Debug)]
 pub(crate) struct DoctorArgs {
+    /// A rig file: its ALP, if it has one, is opened and asked whether it can show the rig's frames
+    #[arg(value_name = "RIG.toml")]
+    rig: Option<PathBuf>,
+    #[command(flatten)]
+    flags: RigArgs,
     /// Print one JSON object
     #[arg(long)]
     json: bool,
@@ -46,7 +53,7 @@ pub(crate) struct Finding {
 }
 
 impl Finding {
-    fn new(name: &str, state: State, found: impl Into<String>, remedy: impl Into<String>) -> Self {
+    pub(super) fn new(name: &str, state: State, found: impl Into<String>, remedy: impl Into<String>) -> Self {
         Self { name: name.into(), state, found: found.into(), remedy: remedy.into() }
     }
 }
@@ -79,6 +86,10 @@ pub(super) fn execute(args: &DoctorArgs) -> Result<(), Failure> {
     findings.extend(system.usb());
     findings.push(system.serial_ports());
     findings.extend(displays(&display::look()));
+    findings.push(doctor_alp::libraries(&system.root));
+    if let Some(rig) = &args.rig {
+        findings.extend(doctor_alp::device(&args.flags.rig_of_projector(rig, true)?));
+    }
     let all = Findings { can_render, findings };
     print(&if args.json { to_json(&all) + "\n" } else { table(&all.findings) });
     if all.can_render {

@@ -5,6 +5,7 @@ mod calibrate;
 mod display;
 mod dlpc900;
 mod doctor;
+mod doctor_alp;
 mod error;
 mod error_experiments;
 mod error_files;

@@ -2,8 +2,8 @@
 
 use super::world::{EnvironmentConfig, GazeConfig, TrackerConfig};
 use super::{
-    DisplayEncoding, Pace, PlaneWeights, ProjectorBackend, ProjectorConfig, Purpose, ResponseConfig,
-    RigConfig,
+    AlpConfig, AlpWeights, DisplayEncoding, Pace, PlaneWeights, ProjectorBackend, ProjectorConfig, Purpose,
+    ResponseConfig, RigConfig,
 };
 use crate::mock::{self, FaultError};
 use dpm_common::keys::read::{ConfigValue, Reader};
@@ -222,6 +222,9 @@ fn projector(rig: &RigConfig, reader: &mut Reader) {
             );
         }
     }
+    if let ProjectorBackend::Alp(alp) = &p.backend {
+        check_alp(p, alp, reader);
+    }
     if matches!(p.backend, ProjectorBackend::Dlpc900(_)) && p.weights == PlaneWeights::Equal {
         contradict(
             reader,
@@ -242,6 +245,39 @@ fn projector(rig: &RigConfig, reader: &mut Reader) {
             ],
             "a DLPC900 shows at most 120 frames/s of 24 planes",
             "lower `projector.frame_rate` to 120 or choose another backend".into(),
+        );
+    }
+}
+
+/// An ALP has one picture time for each sequence, so binary weights take a sequence for each plane. What the panel, its memory and its cable
+/// hold is known when it is opened.
+fn check_alp(p: &ProjectorConfig, alp: &AlpConfig, reader: &mut Reader) {
+    if alp.weights != AlpWeights::Binary {
+        return;
+    }
+    let weights = ("projector.backend.weights", shown(alp.weights));
+    if p.weights == PlaneWeights::Equal {
+        contradict(
+            reader,
+            &[weights, ("projector.weights", shown(p.weights))],
+            "halftones need planes of equal light",
+            "set projector.backend.weights = \"equal\", or leave projector.weights out".into(),
+        );
+        return;
+    }
+    if p.planes != 8 {
+        contradict(
+            reader,
+            &[weights, ("projector.planes", shown(p.planes))],
+            "binary weights are for the eight planes of one channel",
+            "set projector.planes = 8, or projector.backend.weights = \"equal\"".into(),
+        );
+    } else if alp.slots_per_sequence > 1 {
+        contradict(
+            reader,
+            &[("projector.backend.slots_per_sequence", shown(alp.slots_per_sequence)), weights],
+            "a frame of binary weights is several sequences, which the device does not repeat as one",
+            "set projector.backend.slots_per_sequence = 1, or projector.backend.weights = \"equal\"".into(),
         );
     }
 }

@@ -6,6 +6,7 @@ use dpm_common::keys::read::{Any, ConfigValue, Limit, NotEmpty, Reader, Within};
 use dpm_common::keys::source::{Node, Value};
 use dpm_common::keys::Rate;
 use dpm_common::{kinds, section, words};
+use dpm_device::alp::Weights;
 use dpm_device::dlpc900::lut::Dmd;
 use dpm_device::link::Codec;
 use dpm_device::planes::{PlaneSchedule, Raster};
@@ -108,7 +109,7 @@ impl ProjectorConfig {
     /// equal light are lit by LEDs that are dimmed for the bits of a code value.
     pub fn full_light(&self) -> u32 {
         match &self.backend {
-            ProjectorBackend::Display(_) => 255,
+            ProjectorBackend::Display(_) | ProjectorBackend::Alp(_) => 255,
             _ => self.schedule().full_light(),
         }
     }
@@ -198,6 +199,8 @@ kinds! {
         Usb(UsbProjectorConfig) = "usb",
         /// a bit-plane projector on a serial port.
         Serial(SerialProjectorConfig) = "serial",
+        /// a ViALUX ALP-4 or ALP-5, driven by the vendor's library that its user has installed.
+        Alp(AlpConfig) = "alp",
         /// a TI DLPC900 evaluation module, driven by its USB HID commands.
         Dlpc900(Dlpc900Config) = "dlpc900",
         /// a display: any projector or monitor on HDMI or DisplayPort.
@@ -265,6 +268,46 @@ section! {
         device: Option<String> = None, "", NotEmpty;
         /// Exposure of each pattern; its whole share of the frame if left out.
         exposure_us: Option<u32> = None, "us", Within(24, 2_000_000);
+    }
+}
+
+section! {
+    /// A ViALUX ALP-4 or ALP-5. docs/ALP.md says how it is set up, and what was never tried on hardware.
+    pub struct AlpConfig {
+        /// The vendor's library, for example "/usr/lib/x86_64-linux-gnu/libalp44.so". The newest one that the system has, if left out.
+        library: Option<PathBuf> = None, "", NotEmpty;
+        /// Serial number of the device; 0 is the first one that is found.
+        device_number: u32 = 0, "", Within(0, 2_147_483_647);
+        /// How long the planes of a frame are lit. With "equal" write `projector.weights` = "equal", so that grey is
+        /// made of equal planes, or dim the light source from plane to plane.
+        weights: AlpWeights = AlpWeights::Equal, "", Any;
+        /// Slots for which a frame is lit if the host is late with the next one. The device shows it so often by itself, and no longer:
+        /// it is also the longest time of light after the host has died.
+        slots_per_sequence: u32 = 1, "slots", Within(1, 3);
+        /// Frames that may wait in the device's memory; fewer, if it holds fewer.
+        frames_in_flight: u32 = 4, "frames", Within(1, 60);
+        /// Temperature of any of its sensors above which it goes dark; what the device recommends, if left out.
+        max_celsius: Option<f64> = None, "degC", Within(0.0, 150.0);
+    }
+}
+
+words! {
+    /// How the planes of a frame share its time on an ALP.
+    pub enum AlpWeights {
+        /// All are lit equally long.
+        Equal = "equal",
+        /// By their bits, with a constant light source: `projector.planes` = 8 only.
+        Binary = "binary",
+    }
+}
+
+impl AlpWeights {
+    /// The weights in the driver's type.
+    pub const fn weights(self) -> Weights {
+        match self {
+            Self::Equal => Weights::Equal,
+            Self::Binary => Weights::Binary,
+        }
     }
 }
 

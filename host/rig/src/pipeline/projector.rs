@@ -1,12 +1,14 @@
 //! Opens the medium of `[projector.backend]`, and derives the link's settings from the rig file.
 
 use crate::config::{
-    Compaction, DisplayConfig, DisplayEncoding, Pace, ProjectorBackend, ResponseConfig, RigConfig,
+    AlpConfig, AlpWeights, Compaction, DisplayConfig, DisplayEncoding, Pace, ProjectorBackend,
+    ResponseConfig, RigConfig,
 };
 use crate::engine::connect::ConnectError;
+use dpm_device::alp::{AlpSettings, AlpTransport, Showing};
 use dpm_device::link::{packet_bytes, Codec, Epoch, LinkError, LinkSettings, Underrun, COMMIT_BYTES};
 use dpm_device::planes::Raster;
-use dpm_device::time::DeviceTicks;
+use dpm_device::time::{DeviceTicks, HostClock};
 use dpm_device::transport::serial::{SerialSettings, SerialTransport};
 use dpm_device::transport::usb::{UsbSettings, UsbTransport};
 use dpm_device::transport::{Transport, TransportError};
@@ -16,6 +18,7 @@ use dpm_display::mode::ModeWish;
 use dpm_display::set_up::DisplaySettings;
 use dpm_display::transport::DisplayTransport;
 use dpm_handoff::wake::WaitPolicy;
+use dpm_render::pack::Halftone;
 use std::sync::Arc;
 
 /// Time from the handshake to slot 0.
@@ -34,12 +37,34 @@ pub fn frame_bytes(raster: Raster, planes: usize) -> usize {
     packet_bytes(raster.plane_bytes()) * planes + packet_bytes(COMMIT_BYTES)
 }
 
+/// What a projector needs whose firmware runs in this process.
+#[derive(Clone)]
+pub struct Surroundings {
+    /// The clock of the run.
+    pub clock: Arc<dyn HostClock>,
+    /// Called first in the projector's thread, for its rights.
+    pub enter: Arc<dyn Fn() + Send + Sync>,
+    /// How that thread waits.
+    pub wait: WaitPolicy,
+}
+
+impl Surroundings {
+    /// A thread without special rights that parks.
+    pub fn plain(clock: Arc<dyn HostClock>) -> Self {
+        Self { clock, enter: Arc::new(|| ()), wait: WaitPolicy::Park }
+    }
+}
+
 /// Opens the medium of a bit-plane projector on USB or a serial port. `None` for the other backends, which have none.
 ///
 /// # Errors
 /// The device was not found; there is no permission (the message names the rule or group that grants it); or another
 /// program uses it.
-pub fn open(config: &RigConfig, raster: Raster) -> Result<Option<Medium>, ConnectError> {
+pub fn open(
+    config: &RigConfig,
+    raster: Raster,
+    surroundings: &Surroundings,
+) -> Result<Option<Medium>, ConnectError> {
     let frame_bytes = frame_bytes(raster, config.projector.schedule().len());
     let failed = |e| ConnectError::from(LinkError::Transport(e));
     Ok(match &config.projector.backend {
@@ -61,6 +86,7 @@ pub fn open(config: &RigConfig, raster: Raster) -> Result<Option<Medium>, Connec
             Some(Medium { transport, warnings: Vec::new() })
         }
         ProjectorBackend::Display(display) => Some(open_display(config, display, raster).map_err(failed)?),
+        ProjectorBackend::Alp(alp) => Some(open_alp(config, alp, frame_bytes, surroundings)?),
         ProjectorBackend::Mock(_) | ProjectorBackend::Dlpc900(_) => None,
     })
 }
@@ -117,13 +143,55 @@ fn open_display(
     Ok(Medium { transport: Box::new(transport), warnings })
 }
 
+fn open_alp(
+    config: &RigConfig,
+    alp: &AlpConfig,
+    frame_bytes: usize,
+    surroundings: &Surroundings,
+) -> Result<Medium, ConnectError> {
+    let schedule = config.projector.schedule();
+    let opened = AlpTransport::open(AlpSettings {
+        library: alp.library.clone(),
+        number: alp.device_number as i32,
+        raster: config.projector.raster(),
+        showing: Showing {
+            schedule,
+            weights: alp.weights.weights(),
+            rate: config.projector.frame_rate,
+            frames: alp.frames_in_flight as usize,
+            runs: alp.slots_per_sequence,
+        },
+        max_celsius: alp.max_celsius,
+        frame_bytes,
+        clock: surroundings.clock.clone(),
+        enter: surroundings.enter.clone(),
+        wait: surroundings.wait,
+    });
+    let transport = opened.map_err(|e| {
+        let device = "projector.backend".to_owned();
+        ConnectError::from(LinkError::Transport(TransportError::Unsuitable { device, why: e.to_string() }))
+    })?;
+    let mut warnings: Vec<String> = transport.welcome().map(ToString::to_string).into_iter().collect();
+    if alp.weights == AlpWeights::Equal && Halftone::of(&schedule).is_none() {
+        warnings.push(format!(
+            "projector.backend.weights = \"equal\": the {} planes are lit equally long, so levels are right only if the light source is dimmed from \
+             plane to plane; `projector.weights` = \"equal\" shows grey without that (docs/ALP.md)",
+            schedule.len()
+        ));
+    }
+    Ok(Medium { transport: Box::new(transport), warnings })
+}
+
 /// Codecs that the rig file allows on its link, as bits of [`Codec::mask`].
 pub(crate) fn codecs(backend: &ProjectorBackend) -> u32 {
     let compaction = match backend {
         ProjectorBackend::Mock(c) => &c.compaction,
         ProjectorBackend::Usb(c) => &c.compaction,
         ProjectorBackend::Serial(c) => &c.compaction,
-        ProjectorBackend::Dlpc900(_) | ProjectorBackend::Display(_) => return Codec::Raw.mask(),
+        // The firmware of a display and of an ALP runs in this process: nothing is saved by compacting.
+        ProjectorBackend::Dlpc900(_) | ProjectorBackend::Display(_) | ProjectorBackend::Alp(_) => {
+            return Codec::Raw.mask()
+        }
     };
     match compaction {
         Compaction::Auto => Codec::ALL,

@@ -195,7 +195,13 @@ fn open_far_end(
             warnings: Vec::new(),
         });
     }
-    let medium = projector::open(config, raster)?.ok_or_else(|| {
+    let its_rights = rights.clone();
+    let surroundings = projector::Surroundings {
+        clock: Arc::new(move || clock.now()),
+        enter: Arc::new(move || its_rights.enter_projector()),
+        wait: policy(rig),
+    };
+    let medium = projector::open(config, raster, &surroundings)?.ok_or_else(|| {
         let word = backend.word();
         RigError::Unsupported(format!("projector.backend.kind = {word:?} takes no frames over a link"))
     })?;
