@@ -20,7 +20,7 @@ shared uint rests;
 uvec2 noise_of(uvec2 pixel, uint channel) {
     // The mask has two channels; the third of a frame is the first, half a mask aside.
     uint x = (pixel.x + (channel >> 1u) * (NOISE_SIZE / 2u)) % NOISE_SIZE;
-    uint texel = ((frame.frame % NOISE_FRAMES) * NOISE_SIZE + pixel.y % NOISE_SIZE) * NOISE_SIZE + x;
+    uint texel = ((frame.drawn % NOISE_FRAMES) * NOISE_SIZE + pixel.y % NOISE_SIZE) * NOISE_SIZE + x;
     uint pair = (noise_bytes[texel >> 1u] >> ((texel & 1u) * 16u)) & 0xffffu;
     uvec2 values = uvec2(pair & 255u, pair >> 8u);
     return (channel & 1u) == 0u ? values : values.yx;
@@ -46,7 +46,7 @@ uint share_out(uint code, uvec2 pixel, uint channel) {
     keys[i] = key;
     atomicAdd(rests, rest);
     barrier();
-    uint extra = (rests + ((frame.frame & 1u) == 0u ? 63u : 191u)) / 255u;
+    uint extra = (rests + ((frame.drawn & 1u) == 0u ? 63u : 191u)) / 255u;
     uint before = 0u;
     for (uint k = 0u; k < 64u; k++) before += keys[k] > key ? 1u : 0u;
     uint ones = code * HALFTONE_PLANES / 255u + (key > 0u && before < extra ? 1u : 0u);

@@ -38,7 +38,7 @@ pub(crate) fn drive(
     scene: &Scene,
     raster: Raster,
 ) -> Result<Drive, DriveError> {
-    let full_light = config.projector.schedule().full_light();
+    let full_light = config.projector.full_light();
     let shares = measured.light.as_ref().map_or(vec![], |light| light.intensity.clone());
     let gain_with = |albedo: [f64; 3]| -> [f32; 3] {
         let mut intensity = config.projector.max_intensity.0;

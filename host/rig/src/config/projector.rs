@@ -30,7 +30,8 @@ section! {
         planes: u32 = 24, "", OneOf(&[8, 24]);
         /// How much light the planes of a channel give: "binary" halves it from plane to plane, so that their bits are the
         /// code value; "equal" gives every plane the same, and shows grey as a halftone of mirrors and planes. Change it
-        /// if the projector lights all planes alike. Equal planes give 128 / 255 of a full white.
+        /// if the projector lights all planes alike: a DLPC900 that shows the bits of a video signal, or an ALP. On a
+        /// bit-plane projector equal planes together give 128 / 255 of full white.
         weights: PlaneWeights = PlaneWeights::Binary, "", Any;
         /// The order in which a frame shows the bits of a code value, from its first plane on; red, green and blue in
         /// turn for each bit. The light of "7 6 5 4 3 2 1 0" is over soonest. "0 2 4 6 7 5 3 1" puts most of it into
@@ -101,6 +102,15 @@ impl ProjectorConfig {
     /// True for a projector that shows the code value of a pixel for the whole frame, not its bits one after the other.
     pub fn holds_code_values(&self) -> bool {
         matches!(&self.backend, ProjectorBackend::Display(display) if display.encoding == DisplayEncoding::Rgb8)
+    }
+
+    /// Light of a mirror that is on in all planes, as a code value of which 255 is full light. It is less where planes of
+    /// equal light are lit by LEDs that are dimmed for the bits of a code value.
+    pub fn full_light(&self) -> u32 {
+        match &self.backend {
+            ProjectorBackend::Display(_) => 255,
+            _ => self.schedule().full_light(),
+        }
     }
 
     /// From the start of a slot on the projector's clock to the light of its frame, nanoseconds: `latency_us`, and for a
