@@ -672,7 +672,7 @@ fn the_light_of_a_display_is_later_than_its_slots() {
         ("projector.backend.commit_us=1", "projector.backend.commit_us"),
         ("real_time.pace=\"virtual\"", "runs on its own clock"),
     ] {
-        let told = parsed(&[key, "projector.planes=8"]).err().expect("refused").to_string();
+        let told = parsed(&[key, "projector.planes=8"]).expect_err("refused").to_string();
         assert!(told.contains(names), "{told}");
     }
 }
