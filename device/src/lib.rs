@@ -55,6 +55,8 @@ pub mod clock_map;
 pub mod cobs;
 pub mod dlpc900;
 pub mod light;
+#[cfg(feature = "serial")]
+mod line;
 pub mod link;
 mod packet;
 pub mod planes;
