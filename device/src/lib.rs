@@ -62,6 +62,8 @@ mod packet;
 pub mod planes;
 pub mod pose;
 #[cfg(feature = "std")]
+pub mod projector;
+#[cfg(feature = "std")]
 pub mod regular_file;
 #[cfg(feature = "std")]
 pub mod rng;

@@ -149,6 +149,42 @@ impl PlaneSchedule {
         Self::with_repeats(&[PlaneSpec { channel: Channel::White, bit: 3 }; 24]).expect("192 of 255")
     }
 
+    /// 24 planes of equal light: red, green, blue eight times, each at 16 / 255 of full, which is 128 of 255 if all are on.
+    pub fn equal_rgb24() -> Self {
+        let channels = [Channel::Red, Channel::Green, Channel::Blue];
+        let planes: [PlaneSpec; 24] = std::array::from_fn(|i| PlaneSpec { channel: channels[i % 3], bit: 4 });
+        Self::with_repeats(&planes).expect("128 of 255 in each channel")
+    }
+
+    /// 8 white planes of equal light, each at 16 / 255 of full.
+    pub fn equal_mono8() -> Self {
+        Self::with_repeats(&[PlaneSpec { channel: Channel::White, bit: 4 }; 8]).expect("128 of 255")
+    }
+
+    /// Number of planes of each channel, if they all give the same light and grey can come only from how many of them a
+    /// mirror is on in: one white channel, or red, green and blue with at most 8 planes each. `None` for other schedules.
+    pub fn equal_planes(&self) -> Option<u8> {
+        let count = |channel| self.planes().iter().filter(|p| p.channel == channel).count();
+        let (first, white) = (self.planes()[0], count(Channel::White));
+        let each = if white > 0 { white } else { count(Channel::Red) };
+        let is_even = if white > 0 {
+            white == self.len() && white <= 24
+        } else {
+            each <= 8 && count(Channel::Green) == each && count(Channel::Blue) == each
+        };
+        let is_equal = self.planes().iter().all(|p| p.bit == first.bit);
+        (each > 1 && is_even && is_equal).then_some(each as u8)
+    }
+
+    /// Light of a channel when all planes are on, as a code value: 255 for binary planes of eight bits.
+    pub fn full_light(&self) -> u32 {
+        let light = |channel| {
+            let lights = |p: &&PlaneSpec| p.channel == channel || p.channel == Channel::White;
+            self.planes().iter().filter(lights).map(|p| 1u32 << p.bit).sum::<u32>().min(255)
+        };
+        [Channel::Red, Channel::Green, Channel::Blue].into_iter().map(light).max().unwrap_or(0)
+    }
+
     /// Two planes have the same channel and bit.
     pub const fn has_repeats(&self) -> bool {
         self.repeats
@@ -157,21 +193,28 @@ impl PlaneSchedule {
     /// 24 planes: for each bit from 7 down to 0 red, green, blue. Interleaving the colours keeps the
     /// colour fields of a moving edge one plane slot (44 us) apart instead of a third of a frame.
     pub fn rgb24() -> Self {
-        let mut planes = [PlaneSpec { channel: Channel::Red, bit: 0 }; 24];
-        for (i, p) in planes.iter_mut().enumerate() {
-            p.bit = 7 - (i / 3) as u8;
-            p.channel = [Channel::Red, Channel::Green, Channel::Blue][i % 3];
-        }
-        Self::new(&planes).expect("24 distinct planes")
+        Self::rgb24_in(Self::DESCENDING).expect("24 distinct planes")
     }
 
     /// 8 planes of one white channel, bit 7 first.
     pub fn mono8() -> Self {
-        let mut planes = [PlaneSpec { channel: Channel::White, bit: 0 }; 8];
-        for (i, p) in planes.iter_mut().enumerate() {
-            p.bit = 7 - i as u8;
-        }
-        Self::new(&planes).expect("8 distinct planes")
+        Self::mono8_in(Self::DESCENDING).expect("8 distinct planes")
+    }
+
+    /// The bits of a code value from the most significant down.
+    pub const DESCENDING: [u8; 8] = [7, 6, 5, 4, 3, 2, 1, 0];
+
+    /// 24 planes: for each of `bits` in turn red, green, blue. `None` if a bit occurs twice or is above 7.
+    pub fn rgb24_in(bits: [u8; 8]) -> Option<Self> {
+        let channels = [Channel::Red, Channel::Green, Channel::Blue];
+        let planes: [PlaneSpec; 24] =
+            std::array::from_fn(|i| PlaneSpec { channel: channels[i % 3], bit: bits[i / 3] });
+        Self::new(&planes)
+    }
+
+    /// 8 planes of one white channel that show `bits` in turn. `None` as for [`PlaneSchedule::rgb24_in`].
+    pub fn mono8_in(bits: [u8; 8]) -> Option<Self> {
+        Self::new(&bits.map(|bit| PlaneSpec { channel: Channel::White, bit }))
     }
 
     /// The planes in order.

@@ -112,22 +112,26 @@ layout(constant_id = 14) const uint LENS = 0u;
 layout(constant_id = 15) const bool HAS_RESPONSE = false;
 // The projector's pixels are not equally bright.
 layout(constant_id = 16) const bool HAS_FLAT_FIELD = false;
+// Planes of equal light of each channel.
+layout(constant_id = 17) const uint HALFTONE_PLANES = 8u;
+// They are white, and show the green code value.
+layout(constant_id = 18) const bool HALFTONE_WHITE = false;
 // Width of the bit planes, pixels.
-layout(constant_id = 17) const uint PLANE_WIDTH = 1u;
+layout(constant_id = 19) const uint PLANE_WIDTH = 1u;
 // Height of the bit planes, pixels.
-layout(constant_id = 18) const uint PLANE_HEIGHT = 1u;
+layout(constant_id = 20) const uint PLANE_HEIGHT = 1u;
 // Which planes show bits 0 to 3 of a code value, a byte each from the lowest on; 255: none does.
-layout(constant_id = 19) const uint PLANE_OF_BITS_0 = 4294967295u;
+layout(constant_id = 21) const uint PLANE_OF_BITS_0 = 4294967295u;
 // The same for bits 4 to 7.
-layout(constant_id = 20) const uint PLANE_OF_BITS_4 = 4294967295u;
+layout(constant_id = 22) const uint PLANE_OF_BITS_4 = 4294967295u;
 // The same for bits 8 to 11.
-layout(constant_id = 21) const uint PLANE_OF_BITS_8 = 4294967295u;
+layout(constant_id = 23) const uint PLANE_OF_BITS_8 = 4294967295u;
 // The same for bits 12 to 15.
-layout(constant_id = 22) const uint PLANE_OF_BITS_12 = 4294967295u;
+layout(constant_id = 24) const uint PLANE_OF_BITS_12 = 4294967295u;
 // The same for bits 16 to 19.
-layout(constant_id = 23) const uint PLANE_OF_BITS_16 = 4294967295u;
+layout(constant_id = 25) const uint PLANE_OF_BITS_16 = 4294967295u;
 // The same for bits 20 to 23.
-layout(constant_id = 24) const uint PLANE_OF_BITS_20 = 4294967295u;
+layout(constant_id = 26) const uint PLANE_OF_BITS_20 = 4294967295u;
 
 struct Frame {
     vec3 projector_position;

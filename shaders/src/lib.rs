@@ -98,6 +98,8 @@ table_shaders! {
     SPATIAL_DISK = "spatial_disk";
     /// Compensation for distance, angle and albedo, then quantisation to code values.
     COMPENSATE = "compensate";
+    /// Code values into halftones, for planes of equal light.
+    HALFTONE = "halftone";
 }
 
 /// Code values into bit planes.

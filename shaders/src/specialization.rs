@@ -84,6 +84,10 @@ specialization_constants! {
     HAS_RESPONSE: bool = false;
     /// The projector's pixels are not equally bright.
     HAS_FLAT_FIELD: bool = false;
+    /// Planes of equal light of each channel.
+    HALFTONE_PLANES: uint = 8;
+    /// They are white, and show the green code value.
+    HALFTONE_WHITE: bool = false;
     /// Width of the bit planes, pixels.
     PLANE_WIDTH: uint = 1;
     /// Height of the bit planes, pixels.

@@ -3,50 +3,23 @@
 
 use dpm_device::planes::{Channel, PlaneSchedule, PlaneSpec, Raster};
 use dpm_lab::reference::Sampler;
-use dpm_render::gpu::{
-    BindingKind, BindingSet, BindingTable, Buffer, CommandList, ComputePipeline, FrameFence, Gpu, MemoryKind,
-};
+use dpm_render::gpu::{Buffer, Gpu};
 use dpm_render::pack::{self, BitPlaneFrame, Kernel};
-use dpm_shaders::structs::BINDINGS;
-use dpm_tests::gpu::with_gpu;
+use dpm_tests::gpu::{run_shader, uploaded, with_gpu};
 use dpm_tests::rigs::{demo_rig, run};
 use std::sync::Arc;
 
 /// Runs the shader alone.
 fn on_gpu(gpu: &Arc<Gpu>, raster: Raster, schedule: PlaneSchedule, values: &[u32]) -> BitPlaneFrame {
     let len = pack::gpu::len_bytes(raster, &schedule);
-    let mut codes = Buffer::new(gpu, "codes", values.len() * 4, MemoryKind::Upload).unwrap();
-    codes.bytes_mut()[..values.len() * 4].copy_from_slice(bytemuck::cast_slice(values));
+    let codes = uploaded(gpu, "codes", bytemuck::cast_slice(values));
     // Words that are not written would stay all ones and be visible.
-    let ones = vec![u32::MAX; len.div_ceil(4)];
-    let planes = Buffer::from_slice(gpu, "planes", &ones).unwrap();
-    let planes_host = Buffer::new(gpu, "planes", len, MemoryKind::Readback).unwrap();
-    let unused = Buffer::new(gpu, "unused", 16, MemoryKind::Device).unwrap();
-    // As the renderer on a GPU: devices bind a limited number, and second bindings as texels are for software Vulkan.
-    let bound = || BINDINGS.iter().filter(|(name, _)| !name.ends_with("_ROWS"));
-    let kinds: Vec<_> = bound().map(|&(_, binding)| (binding, BindingKind::Storage)).collect();
-    let table = BindingTable::new(gpu, &kinds).unwrap();
-    let constants = pack::gpu::constants(raster, &schedule);
-    let pipeline = ComputePipeline::new(&table, dpm_shaders::PACK, &constants).unwrap();
-    let buffer_of = |name| match name {
-        "B_CODES" => &codes,
-        "B_PLANES" => &planes,
-        _ => &unused,
-    };
-    let buffers: Vec<_> = bound().map(|&(name, binding)| (binding, buffer_of(name))).collect();
-    let set = BindingSet::new(&table, &buffers).unwrap();
-    let list = CommandList::record(gpu, 0, |r| {
-        r.dispatch(&pipeline, &set, pack::gpu::workgroups(raster));
-        r.barrier();
-        r.copy(&planes, &planes_host, len);
-        r.barrier_to_host();
-    })
-    .unwrap();
-    let mut fence = FrameFence::new(gpu).unwrap();
-    list.submit(&mut fence).unwrap();
-    fence.wait(20_000_000_000).unwrap();
+    let planes = Buffer::from_slice(gpu, "planes", &vec![u32::MAX; len.div_ceil(4)]).unwrap();
+    let shader = (dpm_shaders::PACK, &pack::gpu::constants(raster, &schedule)[..]);
+    let buffers = [("B_CODES", &codes), ("B_PLANES", &planes)];
+    let bytes = run_shader(gpu, shader, pack::gpu::workgroups(raster), &buffers, ("B_PLANES", len));
     let mut frame = BitPlaneFrame::new(raster, schedule);
-    pack::gpu::take(planes_host.read(len), &mut frame);
+    pack::gpu::take(&bytes, &mut frame);
     frame
 }
 
@@ -54,7 +27,13 @@ fn on_gpu(gpu: &Arc<Gpu>, raster: Raster, schedule: PlaneSchedule, values: &[u32
 fn planes_of_gpu_and_cpu_are_the_same_bytes() {
     // Only two planes, in an unusual order: most bits are in no plane.
     let odd = [PlaneSpec { channel: Channel::Blue, bit: 7 }, PlaneSpec { channel: Channel::Red, bit: 0 }];
-    let schedules = [PlaneSchedule::rgb24(), PlaneSchedule::mono8(), PlaneSchedule::new(&odd).unwrap()];
+    let schedules = [
+        PlaneSchedule::rgb24(),
+        PlaneSchedule::mono8(),
+        PlaneSchedule::new(&odd).unwrap(),
+        PlaneSchedule::equal_rgb24(),
+        PlaneSchedule::equal24(),
+    ];
     let sizes = [
         (1, 1),
         (7, 3),

@@ -312,13 +312,18 @@ pub struct Dlpc900<P> {
 }
 
 impl<P: HidPort> Dlpc900<P> {
-    /// Greets the controller: reads its firmware and DMD.
+    /// Greets the controller: reads its firmware and DMD. It asks a second time if the first question gets no answer: a
+    /// program that was killed may have left half a command, which takes the first one with it, or a pending read,
+    /// which takes the answer.
     pub fn new(port: P) -> Result<Self, Dlpc900Error> {
         let firmware = Version { major: 0, minor: 0, patch: 0 };
         let (dmd, tag, counters) = (Dmd::Dlp6500, String::new(), Counters::default());
         let (turn, stop, timeout) = (Arc::default(), None, TIMEOUT);
         let mut this = Self { port, turn, stop, timeout, sequence: 0, firmware, dmd, tag, counters };
-        let version = this.read(Opcode::VERSION, &[])?;
+        let version = match this.read(Opcode::VERSION, &[]) {
+            Err(Dlpc900Error::Port { source: PortError::Timeout, .. }) => this.read(Opcode::VERSION, &[])?,
+            other => other?,
+        };
         let bytes = version.first_chunk::<4>().ok_or_else(|| short(Opcode::VERSION, &version, 4))?;
         this.firmware = Version::from_bytes(*bytes);
         let hardware = this.read(Opcode::HARDWARE_ID, &[])?;

@@ -57,6 +57,14 @@ pub enum TransportError {
         /// Name of the device.
         device: String,
     },
+    /// The device cannot be used as the rig file says.
+    #[error("{device}: {why}")]
+    Unsuitable {
+        /// Name of the device.
+        device: String,
+        /// What is wrong, and what to do.
+        why: String,
+    },
     /// libusb reports an error.
     #[cfg(feature = "usb")]
     #[error("cannot {doing} {device}: {source}; {}", crate::usb_help::remedy(*.source))]

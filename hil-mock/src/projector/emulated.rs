@@ -1,21 +1,9 @@
 //! The projector of a rig file: without faults, or with faults injected into its input.
 
-use super::{FaultyProjector, MockConfig, MockProjector};
+use super::{FaultyProjector, MockConfig, MockProjector, Served};
 use crate::faults::{FaultError, FaultPlan};
 use dpm_device::time::HostTime;
 use dpm_device::transport::{Lane, LinkDevice};
-
-/// A device that can be served on a cable: it reports the time of its next own event.
-pub trait Served: LinkDevice {
-    /// Time of the next own event; `None` if there is none.
-    fn next_due(&self) -> Option<HostTime>;
-}
-
-impl Served for MockProjector {
-    fn next_due(&self) -> Option<HostTime> {
-        Self::next_due(self)
-    }
-}
 
 impl Served for FaultyProjector {
     fn next_due(&self) -> Option<HostTime> {

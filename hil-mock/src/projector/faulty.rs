@@ -215,6 +215,15 @@ mod tests {
     use dpm_device::transport::inproc::Direct;
     use std::cell::Cell;
 
+    /// The laws that every report of a projector must obey.
+    fn check_laws(mock: &MockProjector) {
+        let s = mock.status();
+        assert_eq!(s.slots, s.frames_lit + s.slots_repeated + s.slots_blank, "{s:?}");
+        let ended =
+            s.frames_lit + s.frames_incomplete + s.frames_late + s.frames_superseded + s.frames_refused;
+        assert_eq!(s.frames_seen, ended + mock.in_flight(), "{s:?}");
+    }
+
     fn raster() -> Raster {
         Raster::new(32, 8).unwrap()
     }
@@ -270,7 +279,7 @@ mod tests {
                 link.send_frame(now, slot, target, dark_from, &planes(slot), &mut cable);
             }
             let mock = cable.device_mut().projector();
-            mock.check_laws();
+            check_laws(mock);
             assert_eq!(mock.credit_violations(), 0);
             while let Some(e) = mock.next_light() {
                 lit.extend(e.frame);

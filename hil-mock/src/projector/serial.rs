@@ -25,7 +25,7 @@ pub struct SerialProjector {
 impl SerialProjector {
     /// Connects `projector` to a line.
     pub fn new(projector: MockProjector) -> Self {
-        let plane = projector.core.setup.raster.plane_bytes().max(MAX_CONTROL_BYTES);
+        let plane = projector.raster().plane_bytes().max(MAX_CONTROL_BYTES);
         Self { deframer: Deframer::new(vec![0; packet_bytes(plane)]), projector, out: Vec::new() }
     }
 
@@ -107,4 +107,81 @@ impl SerialProjector {
 
 fn later(e: &std::io::Error) -> bool {
     matches!(e.kind(), ErrorKind::WouldBlock | ErrorKind::TimedOut | ErrorKind::Interrupted)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::projector::MockConfig;
+    use dpm_device::link::{
+        DeviceMessage, Epoch, HostLink, LightLimits, LinkSettings, LinkState, MessageType, SendOutcome,
+        Underrun,
+    };
+    use dpm_device::planes::{PlaneSchedule, Raster};
+    use dpm_device::time::{DeviceTicks, FrameRate};
+    use dpm_device::transport::inproc::Direct;
+
+    /// A projector that has been sent one frame over a cable without length, and the time.
+    fn with_one_frame() -> (MockProjector, HostTime) {
+        let raster = Raster::new(20, 3).unwrap();
+        let mut link = HostLink::new(LinkSettings {
+            raster,
+            schedule: PlaneSchedule::rgb24(),
+            rate: FrameRate::new(947, 1).unwrap(),
+            watchdog_us: 50_000,
+            underrun: Underrun::Repeat,
+            late_slots: 0,
+            epoch: Epoch::At(DeviceTicks(0)),
+            codecs: 0,
+            flash_limit: None,
+            limits: LightLimits::OFF,
+        });
+        let mut cable = Direct::new(MockProjector::new(MockConfig::new(raster)));
+        link.connect();
+        for ms in 0..200 {
+            let now = HostTime(ms * 1_000_000);
+            match link.poll(now, &mut cable).expect("handshake") {
+                LinkState::Ready => link.arm(0),
+                LinkState::Streaming => {
+                    let slots = link.slots().unwrap();
+                    let slot = slots.slot_at(DeviceTicks(now.0 as u64)).unwrap() + 2;
+                    let planes = vec![0x40; raster.plane_bytes() * 24];
+                    let (target, dark_from) = (slots.start(slot), slots.dark_from(slot, 60_000_000_000));
+                    let sent = link.send_frame(now, 1, target, dark_from, &planes, &mut cable);
+                    assert_eq!(sent, SendOutcome::Sent);
+                    return (cable.into_device(), now);
+                }
+                _ => {}
+            }
+        }
+        panic!("still {:?}", link.state());
+    }
+
+    /// Question 11: on a slow line no STATUS waits behind another, and an ECHO's answer behind at most one.
+    #[test]
+    fn no_status_is_queued_behind_another() {
+        let (projector, now) = with_one_frame();
+        let mut line = SerialProjector::new(projector);
+        let one = line.replies(now).len();
+        assert!((100..300).contains(&one), "{one} bytes");
+        // Nothing is taken for forty slots.
+        for slot in 1..40 {
+            let now = now.plus_ns(slot * 1_055_966);
+            assert_eq!(line.replies(now).len(), one);
+        }
+        // Half of it, then the rest: only then there is one more STATUS, a present one.
+        let now = now.plus_ns(40 * 1_055_966);
+        line.replies(now).drain(..one / 2);
+        assert_eq!(line.replies(now).len(), one - one / 2);
+        line.replies(now).clear();
+        let fresh = line.replies(now).clone();
+        let mut packet = Vec::new();
+        dpm_device::cobs::Deframer::new([0; 256]).push(&fresh, &mut |frame| packet = frame.to_vec());
+        let DeviceMessage::Status(status) =
+            DeviceMessage::parse(MessageType::Status, &packet[32..128]).unwrap()
+        else {
+            unreachable!()
+        };
+        assert_eq!(status.now, line.projector().clock().ticks_at(now));
+    }
 }

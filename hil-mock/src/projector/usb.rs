@@ -59,7 +59,7 @@ impl UsbProjector {
             }
         }
         configuration[2] = configuration.len() as u8;
-        let serial = format!("{:016x}", projector.core.setup.serial);
+        let serial = format!("{:016x}", projector.serial());
         Self {
             projector,
             speed,
@@ -164,7 +164,7 @@ impl UsbDeviceModel for UsbProjector {
     fn halt_cleared(&mut self, endpoint: u8) {
         if let Some(lane) = Self::lane(endpoint) {
             // The device does not know the time of the request; it uses the time to which it has advanced.
-            let now = self.projector.core.now;
+            let now = self.projector.now();
             self.projector.end_of_transfer(now, lane);
         }
     }

@@ -16,6 +16,7 @@ pub mod clock;
 pub mod commit;
 pub mod files;
 pub mod folder;
+pub mod guardian;
 pub mod keys;
 pub mod quantiles;
 pub mod realtime;

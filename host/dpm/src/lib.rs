@@ -4,5 +4,6 @@ pub mod calibrate;
 pub mod cli;
 mod dlpc900;
 mod pattern_dlpc900;
+mod rest_dlpc900;
 mod run_dlpc900;
 pub mod signals;

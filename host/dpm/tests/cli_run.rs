@@ -56,7 +56,7 @@ fn the_demo_prints_one_object_with_the_agreed_keys_and_leaves_its_files() {
         assert_eq!(json[key]["modelled"], true, "{key}");
         assert_eq!(json[key]["source"], "from real_time.stage_costs_us, not measured", "{key}");
     }
-    assert_eq!(json["registration_error_at"], "mid-exposure");
+    assert_eq!(json["registration_error_at"], "light centre");
     assert_eq!(
         (&json["frames_dark"], &json["slots"], &json["missed_slots"]),
         (&0.into(), &6.into(), &0.into())

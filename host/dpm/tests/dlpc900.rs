@@ -285,7 +285,8 @@ fn until_lit(b: &Bench, lit: bool) {
         }
         std::thread::sleep(std::time::Duration::from_millis(5));
     }
-    panic!("never lit = {lit}: {:?}", b.model.lock().unwrap().dark_because());
+    let said = std::fs::read_to_string(b.folder.join("said")).unwrap_or_default();
+    panic!("never lit = {lit}: {:?}\n{said}", b.model.lock().unwrap().dark_because());
 }
 
 /// Found in use, O2: the second run of a rig was refused, forever. The test makes two in a row, one after `dpm
@@ -297,7 +298,9 @@ fn a_rig_in_video_mode_runs_again_and_again() {
     video_rig(&b);
     b.ok(&["run", "rig.toml", "--seconds", "0.2"]);
     assert_eq!(b.model.lock().unwrap().dark_because(), Some("mirrors exercised"));
-    let mut run = b.command(&["run", "rig.toml"]).stderr(std::process::Stdio::null()).spawn().unwrap();
+    // Its guard process writes there too, and says what it could not do.
+    let said = std::fs::File::create(b.folder.join("said")).unwrap();
+    let mut run = b.command(&["run", "rig.toml"]).stderr(said).spawn().unwrap();
     until_lit(&b, true);
     run.kill().unwrap();
     run.wait().unwrap();

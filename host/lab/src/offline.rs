@@ -5,7 +5,7 @@ use dpm_common::quantiles::Quantiles;
 use dpm_device::time::HostTime;
 use dpm_device::tracker::TrackerError;
 use dpm_handoff::latest::{latest, Publisher, Reader};
-use dpm_rig::light::registration::{measured_at, RegistrationMeter};
+use dpm_rig::light::registration::RegistrationMeter;
 use dpm_rig::light::FrameRecord;
 use dpm_rig::rig::{affine, Rig};
 use dpm_rig::tracks::{open_for, SourceError, TrackSnapshot, TrackingStage};
@@ -108,10 +108,7 @@ impl AgainstOffline {
         let slot_ns = rig.rate().slot_len_ns(0);
         let (mut run, mut offline, mut horizon_ms, mut behind_ms) = (vec![], vec![], vec![], vec![]);
         let (mut by_first, mut by_middle, mut first_by_middle) = (vec![], vec![], vec![]);
-        let lit = |record: &FrameRecord| {
-            let t = &record.timeline;
-            Some(measured_at(t.lit_at?, t.last_photon_at?))
-        };
+        let lit = |record: &FrameRecord| record.timeline.centre_at;
         let mut frames = 0;
         for (i, record) in records.iter().enumerate() {
             let Some(at) = lit(record) else { continue };

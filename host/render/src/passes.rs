@@ -59,7 +59,7 @@ pub(super) enum Grid {
 }
 
 /// Every pass, in the order in which they run. Between two of them lies a barrier.
-pub(super) const TABLE: [Pass; 9] = [
+pub(super) const TABLE: [Pass; 10] = [
     Pass {
         name: "primary",
         code: Code::OfAll(Kernel {
@@ -169,6 +169,16 @@ pub(super) const TABLE: [Pass; 9] = [
         grid: Grid::Tiles,
     },
     Pass {
+        name: "halftone",
+        code: Code::OfAll(Kernel {
+            shader: |texel| shaders::HALFTONE.reading(texel),
+            reads: &["B_CODES"],
+            writes: &["B_CODES"],
+        }),
+        when: |s, _| s.halftone.is_some(),
+        grid: Grid::Tiles,
+    },
+    Pass {
         name: "pack",
         code: Code::OfAll(Kernel { shader: |_| shaders::PACK, reads: &["B_CODES"], writes: &["B_PLANES"] }),
         when: |s, _| s.output.schedule().is_some(),
@@ -209,11 +219,14 @@ impl Pass {
         (self.code.kernel(method.dpm).shader)(texel)
     }
 
-    /// Specialization constants. Passes that read the scene have the `shared` ones, and packing has its own.
+    /// Specialization constants. Passes that read the scene have the `shared` ones and those of halftones; packing has its own.
     pub(super) fn constants(&self, shared: &[(u32, u32)], settings: &RendererSettings) -> Vec<(u32, u32)> {
         match (self.grid, settings.output.schedule()) {
             (Grid::Planes, Some(schedule)) => pack::gpu::constants(settings.raster, schedule).to_vec(),
-            _ => shared.to_vec(),
+            _ => {
+                let halftone = settings.halftone.into_iter().flat_map(pack::Halftone::constants);
+                shared.iter().copied().chain(halftone).collect()
+            }
         }
     }
 }

@@ -4,6 +4,7 @@ use super::drive::Drive;
 use super::method::Method;
 use super::scene_data::SceneDataError;
 use crate::gpu::GpuError;
+use crate::pack::Halftone;
 use dpm_device::planes::{PlaneSchedule, Raster};
 use dpm_scene::geometry::projector::ProjectorCamera;
 use glam::{DAffine3, DVec3};
@@ -29,6 +30,8 @@ pub struct RendererSettings {
     pub leave_nothing_out: bool,
     /// How a frame spends its rays.
     pub method: Method,
+    /// The planes give equal light: code values are made into halftones. `None`: grey comes from the planes' light.
+    pub halftone: Option<Halftone>,
     /// What the host reads back.
     pub output: Output,
 }
@@ -36,7 +39,7 @@ pub struct RendererSettings {
 /// What a frame brings to the host.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Output {
-    /// Code values, which the host packs.
+    /// Code values or halftones, which the host packs.
     Codes,
     /// Bit planes, packed by the GPU.
     Planes(PlaneSchedule),

@@ -38,6 +38,7 @@ pub(crate) fn drive(
     scene: &Scene,
     raster: Raster,
 ) -> Result<Drive, DriveError> {
+    let full_light = config.projector.full_light();
     let shares = measured.light.as_ref().map_or(vec![], |light| light.intensity.clone());
     let gain_with = |albedo: [f64; 3]| -> [f32; 3] {
         let mut intensity = config.projector.max_intensity.0;
@@ -45,6 +46,8 @@ pub(crate) fn drive(
             // `max_intensity` is that of a channel on average.
             intensity = [0, 1, 2].map(|c| intensity[c] * 3.0 * [r, g, b][c]);
         }
+        // Planes of equal light do not reach full white together.
+        let intensity = intensity.map(|full| full * (f64::from(full_light) / 255.0));
         let white = config.render.white;
         std::array::from_fn(|c| {
             // The product of exposure and white is exact where white is 1.
@@ -116,6 +119,10 @@ fn response(config: &ResponseConfig) -> Result<Option<Response>, DriveError> {
         ResponseConfig::Gamma(c) => {
             Some(Response::gamma(c.gamma.0, c.black.0).map_err(|e| wrong(e.to_string()))?)
         }
+        ResponseConfig::Srgb(_) => {
+            let light = [std::array::from_fn(|code| srgb_light(code as f64 / 255.0)); 3];
+            Some(Response::new(&light).map_err(|e| wrong(e.to_string()))?)
+        }
         ResponseConfig::Table(TableResponseConfig { file }) => {
             let told = |e: &dyn std::fmt::Display| wrong(format!("{}: {e}", file.display()));
             let text = regular_file::read_text(file, MAX_TABLE_BYTES).map_err(|e| told(&e))?;
@@ -123,6 +130,15 @@ fn response(config: &ResponseConfig) -> Result<Option<Response>, DriveError> {
             Some(Response::new(&light).map_err(|e| told(&e))?)
         }
     })
+}
+
+/// Light of a code value of sRGB, both as shares of the greatest (IEC 61966-2-1).
+fn srgb_light(code: f64) -> f64 {
+    if code <= 0.04045 {
+        code / 12.92
+    } else {
+        ((code + 0.055) / 1.055).powf(2.4)
+    }
 }
 
 /// Light of each channel and code value from 256 lines of one or three numbers.
@@ -194,6 +210,16 @@ fn flat_field(path: &Path, raster: Raster) -> Result<FlatField, DriveError> {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    /// The standard's two branches meet, and mid grey gives a fifth of the light.
+    #[test]
+    fn srgb_is_the_standards_curve() {
+        assert_eq!((srgb_light(0.0), srgb_light(1.0)), (0.0, 1.0));
+        assert!((srgb_light(0.04045) - srgb_light(0.040_450_1)).abs() < 1e-6);
+        assert!((srgb_light(0.5) - 0.214_041_14).abs() < 1e-8);
+        let config = ResponseConfig::Srgb(crate::config::SrgbResponseConfig {});
+        assert!(response(&config).unwrap().is_some());
+    }
 
     #[test]
     fn tables_have_a_line_for_each_code_value() {

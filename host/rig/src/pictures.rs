@@ -8,6 +8,7 @@
 use crate::light::recorder::LightFrame;
 use crate::light::FrameRecord;
 use crate::pipeline::renderer_settings;
+use crate::plan::light_centre::centre_ns;
 use crate::rig::Rig;
 use dpm_device::planes::Raster;
 use dpm_render::drive::Drive;
@@ -28,7 +29,7 @@ pub struct Pictures {
     pub viewer: Result<Vec<Vec3>, &'static str>,
 }
 
-/// Frames of light with the poses of the tracked bodies in the middle of each frame.
+/// Frames of light with the poses of the tracked bodies at the centre of each frame's light.
 struct Window<'a> {
     frames: Vec<(&'a LightFrame, Vec<DAffine3>)>,
 }
@@ -36,13 +37,13 @@ struct Window<'a> {
 /// The frames of `light` whose poses are known. With the mock tracker they are the true poses. With a real tracker
 /// they are the poses that each frame was drawn for: measured, then predicted.
 fn window<'a>(rig: &Rig, light: &'a [LightFrame], records: &[FrameRecord]) -> Window<'a> {
-    let half_slot = rig.rate().slot_len_ns(0) / 2;
+    let to_centre = centre_ns(&rig.schedule, rig.rate().slot_len_ns(0));
     let drawn_for = |f: &LightFrame| {
         let record = records.iter().find(|r| r.id.0 as u32 == f.frame)?;
         Some(record.tracked_poses.clone())
     };
     let poses =
-        |f: &LightFrame| rig.true_poses(f.first_photon_at.plus_ns(half_slot).0).or_else(|| drawn_for(f));
+        |f: &LightFrame| rig.true_poses(f.first_photon_at.plus_ns(to_centre).0).or_else(|| drawn_for(f));
     Window { frames: light.iter().filter_map(|f| Some((f, poses(f)?))).collect() }
 }
 

@@ -48,6 +48,10 @@ impl Identity {
             ProjectorBackend::Serial(port) => {
                 ("projector on ".to_owned() + &port.port, "projector on".into(), Some(port.port.clone()))
             }
+            ProjectorBackend::Display(display) => {
+                let name = or_any(&display.connector);
+                (format!("display {name}"), "display".into(), display.connector.clone())
+            }
             // It is identified by its place on the bus, which changes with every re-plug, so an order for one applies
             // to all.
             ProjectorBackend::Dlpc900(dlpc) => {

@@ -19,6 +19,7 @@ const WITH_TABLES: &[&str] = &[
     "spatial_regression",
     "spatial_disk",
     "compensate",
+    "halftone",
 ];
 
 /// Output stem, source, extra defines.

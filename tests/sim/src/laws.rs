@@ -450,9 +450,12 @@ impl Laws {
             return self.fail(
                 at,
                 format!(
-                    "frame {frame}: poses are {} ms old at the first photon; {} ms are allowed",
-                    age / MS,
-                    allowed / MS
+                    "frame {frame}: poses are {:.2} ms old at the first photon; {:.2} ms are allowed; its slot began {:.2} ms \
+                     after it was sent, its light {:.2} ms",
+                    age as f64 * 1e-6,
+                    allowed as f64 * 1e-6,
+                    (sent.due_at - sent.sent_at) as f64 * 1e-6,
+                    (at - lag - sent.sent_at) as f64 * 1e-6
                 ),
             );
         }

@@ -42,6 +42,8 @@ impl Transport for Words {
 
 /// A GPU that does not finish is given up after this time at the latest: two seconds after the frames before it, of which one may have taken two.
 const GPU_FOUND_NS: i64 = 4_000 * MS;
+/// The same for a frame of the next crew: the time in which that crew is made, and two seconds.
+const GPU_AGAIN_NS: i64 = 3_000 * MS;
 const STAGES: [Part; 5] = [Part::Tracking, Part::Plan, Part::Pack, Part::Link, Part::Collector];
 
 impl World {
@@ -280,8 +282,10 @@ impl World {
             K::G4 => beneath.gpu_traps.push_back(GpuTrap::Lost),
             K::G5 => {
                 beneath.gpu_traps.push_back(GpuTrap::Hangs);
-                lasts_ns = GPU_FOUND_NS;
-                self.laws.hidden_until(self.t + GPU_FOUND_NS);
+                // Frames that hang one after the other are found one after the other, each by a crew of its own.
+                self.gpu_hangs_until = (self.gpu_hangs_until + GPU_AGAIN_NS).max(self.t + GPU_FOUND_NS);
+                lasts_ns = self.gpu_hangs_until - self.t;
+                self.laws.hidden_until(self.gpu_hangs_until);
             }
             K::G6 => {
                 let ns = dice.between(300, 1_500) * MS;

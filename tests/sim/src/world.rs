@@ -123,6 +123,8 @@ pub struct World {
     pub(crate) process: Option<Process>,
     /// The process does not run until then (stopped, or the machine is suspended).
     pub(crate) frozen_until: i64,
+    /// By when every frame that hangs on the GPU will have been found.
+    pub(crate) gpu_hangs_until: i64,
     restart_at: i64,
     starts: VecDeque<i64>,
     /// Nobody starts the program but a person.
@@ -213,6 +215,7 @@ impl World {
             aside: None,
             process: None,
             frozen_until: 0,
+            gpu_hangs_until: 0,
             restart_at: 10 * MS,
             starts: VecDeque::new(),
             needs_person: false,

@@ -35,6 +35,12 @@ fn what_once_broke_a_law_keeps_them_all() {
         (1_000_159, None, 10),
         // Noise that looked like an acceleration, extrapolated for 50 ms.
         (8163, None, 50),
+        // A GPU that hung while it was warming up: dark for two seconds without a word.
+        (5_006_128, None, 23),
+        // Three frames hung on the GPU, one behind the other; the law expected light before the third could be found.
+        (5_004_738, None, 21),
+        // A frame that was sent 0.07 ms before the next slot began, and was counted as one that arrives in time.
+        (5_007_078, None, 42),
     ];
     for (seed, rate_hz, seconds) in found {
         let lived = lived(&order(seed, rate_hz, seconds));

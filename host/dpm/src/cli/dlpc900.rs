@@ -2,9 +2,11 @@
 
 use super::watch::{print, refuse_where_dark_stands};
 use crate::dlpc900::{sequence_of, status_text, PatternFileError, ShowAs};
+use crate::rest_dlpc900::put_to_rest;
 use crate::signals;
 use clap::ValueEnum;
-use dpm_device::dlpc900::driver::{Dlpc900, UploadProgress};
+use dpm_common::guardian::{self, Guardian};
+use dpm_device::dlpc900::driver::{Dlpc900, Dlpc900Error, UploadProgress};
 use dpm_device::dlpc900::image::{Compression, PlaneOrder};
 use dpm_device::dlpc900::lut::{led, LutEntry};
 use dpm_device::dlpc900::sequence::{LedSetup, Receiver, Repeat, VideoPatterns};
@@ -12,16 +14,9 @@ use dpm_device::dlpc900::usb::{describe, list, UsbHid, UsbPlace};
 use dpm_rig::config::{Dlpc900Config, ProjectorBackend};
 use dpm_rig::failure::{Failure, FailureKind};
 use dpm_rig::standing::Identity;
-use std::io::{Read, Write};
-use std::os::unix::process::CommandExt;
+use std::io::Write;
 use std::path::PathBuf;
-use std::process::{Child, Stdio};
-use std::time::Duration;
-
-/// How long to try to open the controller of a run that was killed.
-const GUARD_PATIENCE: Duration = Duration::from_secs(5);
-/// Time between two tries.
-const GUARD_STEP: Duration = Duration::from_millis(5);
+use std::process::Stdio;
 
 /// Flags of `dpm dlpc900`.
 #[derive(clap::Args, Clone, Debug)]
@@ -256,27 +251,15 @@ fn guard(place: Option<UsbPlace>) -> Result<(), Failure> {
     let device = |e: String| Failure::new(FailureKind::Device, e);
     // A stop of the run may go to its whole group, session or service. This process must survive it.
     signals::ignore().map_err(|e| device(format!("cannot ignore signals: {e}")))?;
-    let mut said = Vec::new();
-    let _ = std::io::stdin().lock().take(16).read_to_end(&mut said);
-    if !said.is_empty() {
+    if !guardian::outlived() {
         return Ok(());
     }
-    let limit = std::time::Instant::now() + GUARD_PATIENCE;
-    let mut d = loop {
-        match UsbHid::open(place).map(Dlpc900::new) {
-            Ok(d) => break d?,
-            // The kernel releases the dead process's interface in its own time.
-            Err(_) if std::time::Instant::now() < limit => std::thread::sleep(GUARD_STEP),
-            Err(e) => {
-                return Err(device(format!(
-                    "{}: {e}; it could not be stopped and continues to show its patterns",
-                    describe(place)
-                )))
-            }
-        }
+    let mut open = || {
+        let port = UsbHid::open(place);
+        Dlpc900::new(port.map_err(|source| Dlpc900Error::Port { doing: describe(place), source })?)
     };
-    d.stop()?;
-    d.idle()?;
+    put_to_rest(&mut open)
+        .map_err(|e| device(format!("{e}; it could not be stopped and continues to show its patterns")))?;
     let _ =
         writeln!(std::io::stderr(), "the run was killed: its DLPC900 is stopped and exercises its mirrors");
     Ok(())
@@ -284,21 +267,21 @@ fn guard(place: Option<UsbPlace>) -> Result<(), Failure> {
 
 /// A process that watches this one; see [`Action::Guard`]. It acts if this process ends, or drops this value, without
 /// [`Guard::dismiss`].
-pub(super) struct Guard(Option<Child>);
+pub(super) struct Guard(Option<Guardian>);
 
 impl Guard {
     /// Starts it. If that fails, the run continues without this precaution.
     pub(super) fn start(device: Option<&str>) -> Self {
         let start = || {
             let mut command = std::process::Command::new(std::env::current_exe()?);
-            command.args(["dlpc900", "guard"]).stdin(Stdio::piped()).stdout(Stdio::null());
+            command.args(["dlpc900", "guard"]).stdout(Stdio::null());
             if let Some(place) = device {
                 command.args(["--device", place]);
             }
-            command.process_group(0).spawn()
+            Guardian::start(command)
         };
         match start() {
-            Ok(child) => Self(Some(child)),
+            Ok(guardian) => Self(Some(guardian)),
             Err(e) => {
                 let _ = writeln!(
                     std::io::stderr(),
@@ -311,11 +294,8 @@ impl Guard {
 
     /// Ends it, because the run has ended by itself and has put the controller to rest.
     pub(super) fn dismiss(self) {
-        if let Some(mut child) = self.0 {
-            let said = child.stdin.take().map(|mut pipe| pipe.write_all(b"over"));
-            if let Some(Ok(())) = said {
-                let _ = child.wait();
-            }
+        if let Some(guardian) = self.0 {
+            guardian.dismiss();
         }
     }
 }

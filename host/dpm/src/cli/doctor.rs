@@ -1,8 +1,10 @@
 //! `dpm doctor`: what this machine can do, line by line, and how to fix what is missing.
 
+use super::display::{self, Seen};
 use super::os;
 use super::watch::print;
 use dpm_common::realtime::{self, Refusal};
+use dpm_display::kms::Connector;
 use dpm_rig::failure::{Failure, FailureKind};
 use dpm_rig::telemetry::report::to_json;
 use std::fs;
@@ -76,6 +78,7 @@ pub(super) fn execute(args: &DoctorArgs) -> Result<(), Failure> {
     findings.extend(system.clock());
     findings.extend(system.usb());
     findings.push(system.serial_ports());
+    findings.extend(displays(&display::look()));
     let all = Findings { can_render, findings };
     print(&if args.json { to_json(&all) + "\n" } else { table(&all.findings) });
     if all.can_render {
@@ -145,6 +148,44 @@ fn simd() -> Finding {
         _ => (State::Ok, ""),
     };
     Finding::new("bit-plane packing", state, kernel.name(), remedy)
+}
+
+/// The displays that `projector.backend.kind = "display"` could drive.
+fn displays(all: &[Seen]) -> Vec<Finding> {
+    const UNTRIED: &str = "a display as projector has not been tried on real hardware yet (docs/DISPLAY.md)";
+    let mut findings = Vec::new();
+    for Seen { path, is_in_use, connectors } in all {
+        let name = format!("displays of {}", path.display());
+        let connectors = match connectors {
+            Ok(connectors) => connectors,
+            Err(e) => {
+                findings.push(Finding::new(&name, State::Info, "cannot be used", e.to_string()));
+                continue;
+            }
+        };
+        let answer = |c: &&Connector| c.is_connected;
+        let told: Vec<String> = connectors
+            .iter()
+            .filter(answer)
+            .map(|c| {
+                let mode = c.modes.first().map_or_else(|| "no mode".into(), ToString::to_string);
+                format!("{} ({mode})", c.name)
+            })
+            .collect();
+        let found = if told.is_empty() { "none answers".into() } else { told.join(", ") };
+        let remedy = if *is_in_use {
+            "another program drives them: a rig needs a bare console (Ctrl+Alt+F3)"
+        } else if told.is_empty() {
+            "plug one in and switch it on; `dpm display` lists connectors"
+        } else {
+            UNTRIED
+        };
+        findings.push(Finding::new(&name, State::Info, found, remedy));
+    }
+    if findings.is_empty() {
+        findings.push(Finding::new("displays", State::Info, "no graphics card that can set modes", ""));
+    }
+    findings
 }
 
 /// The result of trying a right on a thread that ended at once.

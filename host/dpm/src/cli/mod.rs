@@ -2,6 +2,7 @@
 
 mod bench;
 mod calibrate;
+mod display;
 mod dlpc900;
 mod doctor;
 mod error;
@@ -97,6 +98,8 @@ enum Command {
     Plan(plan::PlanArgs),
     /// Control a DLPC900 projector (LightCrafter 6500 / 9000): status, patterns, rest
     Dlpc900(dlpc900::Dlpc900Args),
+    /// List the displays that can serve as projectors, and what to write in a rig file for each mode
+    Display(display::DisplayArgs),
 }
 
 /// Runs the program with the process's arguments. `commit`: the commit from which it was compiled, see
@@ -118,6 +121,9 @@ pub fn main(commit: &'static str) -> ExitCode {
             return ExitCode::from(u8::try_from(e.exit_code()).unwrap_or(2));
         }
     };
+    if let Some(command) = display::guardian_command() {
+        dpm_display::transport::set_guardian(command);
+    }
     let code = match dispatch(&cli.command) {
         Ok(()) => 0,
         Err(failure) => {
@@ -153,5 +159,6 @@ fn dispatch(command: &Command) -> Result<(), Failure> {
         Command::Error(args) => error::execute(args),
         Command::Plan(args) => plan::execute(args),
         Command::Dlpc900(args) => dlpc900::execute(args),
+        Command::Display(args) => display::execute(args),
     }
 }

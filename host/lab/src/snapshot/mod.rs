@@ -9,7 +9,7 @@ pub mod views;
 use super::sequence::{draw, poses_at};
 use dpm_common::files::{check_folder, write_atomically};
 use dpm_device::time::HostTime;
-use dpm_render::{FrameSlot, Keep, RenderError, Renderer};
+use dpm_render::{FrameSlot, Keep, RenderError, Renderer, RendererSettings};
 use dpm_rig::config::RigConfig;
 use dpm_rig::failure::{Failure, FailureKind};
 use dpm_rig::light::recorder::LightFrame;
@@ -145,8 +145,9 @@ pub fn snapshot(
     let raster = rig.camera.raster;
     // What surfaces are like is of interest out of the light too.
     let keep = Keep { every_pixel: true, ..Keep::default() };
-    let mut renderer =
-        Renderer::keeping(&gpu, &rig.scene, renderer_settings(&rig), keep).map_err(gpu_failure)?;
+    // The views show code values, whatever the planes make of them.
+    let settings = RendererSettings { halftone: None, ..renderer_settings(&rig) };
+    let mut renderer = Renderer::keeping(&gpu, &rig.scene, settings, keep).map_err(gpu_failure)?;
     let mut slot = renderer.create_slot(true).map_err(gpu_failure)?;
     let wanted: Vec<_> =
         SnapshotImage::ALL.into_iter().filter(|i| what.is_empty() || what.contains(i)).collect();

@@ -97,6 +97,7 @@ impl<'a> Shot<'a> {
             camera_is_eye: self.eye.is_none(),
             leave_nothing_out: self.leave_nothing_out,
             method: self.method.clone().unwrap_or_else(|| Method::full(self.spp)),
+            halftone: None,
             output: Output::Codes,
         }
     }

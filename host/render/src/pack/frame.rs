@@ -1,6 +1,6 @@
 //! The bit planes of one frame in one piece of memory, made once and filled again and again.
 
-use super::source_bit;
+use super::source_bits;
 use dpm_device::planes::{PlaneSchedule, Raster, MAX_PLANES};
 
 /// One cache line.
@@ -21,10 +21,7 @@ pub struct BitPlaneFrame {
 impl BitPlaneFrame {
     /// A dark frame. This is the only place that allocates.
     pub fn new(raster: Raster, schedule: PlaneSchedule) -> Self {
-        let mut source_bits = [0; MAX_PLANES];
-        for (bit, &plane) in source_bits.iter_mut().zip(schedule.planes()) {
-            *bit = source_bit(plane) as u8;
-        }
+        let source_bits = source_bits(&schedule);
         let len = raster.plane_bytes() * schedule.len();
         Self { raster, schedule, source_bits, lines: vec![Line([0; 64]); len.div_ceil(64)] }
     }

@@ -2,7 +2,7 @@
 //!
 //! The planes that it writes start on a word each; everything else is as [`super::pack`] does it, byte for byte.
 
-use super::{source_bit, BitPlaneFrame, CODE_BITS};
+use super::{source_bits, BitPlaneFrame, CODE_BITS};
 use dpm_device::planes::{PlaneSchedule, Raster};
 use dpm_shaders::specialization as ids;
 
@@ -38,8 +38,8 @@ pub fn workgroups(raster: Raster) -> [u32; 3] {
 /// Specialization constants of the pass.
 pub fn constants(raster: Raster, schedule: &PlaneSchedule) -> Vec<(u32, u32)> {
     let mut plane_of_bit = [NO_PLANE; CODE_BITS];
-    for (plane, &spec) in schedule.planes().iter().enumerate() {
-        plane_of_bit[source_bit(spec) as usize] = plane as u32;
+    for (plane, bit) in source_bits(schedule).into_iter().enumerate().take(schedule.len()) {
+        plane_of_bit[usize::from(bit)] = plane as u32;
     }
     let mut all = vec![(ids::PLANE_WIDTH, raster.width()), (ids::PLANE_HEIGHT, raster.height())];
     for (id, four) in PLANES_OF_FOUR_BITS.into_iter().zip(plane_of_bit.chunks(4)) {

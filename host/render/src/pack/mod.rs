@@ -4,15 +4,17 @@
 
 mod frame;
 pub mod gpu;
+mod halftone;
 mod quantise;
 mod scalar;
 #[cfg(target_arch = "x86_64")]
 mod simd;
 
 pub use frame::BitPlaneFrame;
+pub use halftone::{halftone, Halftone};
 pub use quantise::{quantise, QuantiseCounts};
 
-use dpm_device::planes::{Channel, PlaneSchedule, PlaneSpec};
+use dpm_device::planes::{Channel, PlaneSchedule, PlaneSpec, MAX_PLANES};
 
 /// Pixels that a kernel packs at once.
 const BLOCK_PIXELS: usize = 512;
@@ -93,19 +95,41 @@ pub(crate) const fn source_bit(plane: PlaneSpec) -> u32 {
     channel + plane.bit as u32
 }
 
-/// What a schedule's planes show of a code value: the light of a mirror, which is what the projector sends out for it.
+/// For each plane of `schedule` the bit of a pixel's word that it shows. The words are code values; for planes of equal
+/// light they are what [`halftone`] makes of code values, in which each plane of a channel has a bit of its own.
+pub fn source_bits(schedule: &PlaneSchedule) -> [u8; MAX_PLANES] {
+    let mut bits = [0; MAX_PLANES];
+    let mut before = [0u8; 4];
+    for (bit, &plane) in bits.iter_mut().zip(schedule.planes()) {
+        let number = &mut before[plane.channel as usize];
+        *bit = match (schedule.equal_planes(), plane.channel) {
+            (None, _) => source_bit(plane) as u8,
+            (Some(_), Channel::White) => *number,
+            (Some(_), channel) => 8 * channel as u8 + *number,
+        };
+        *number += 1;
+    }
+    bits
+}
+
+/// What a schedule's planes show of a pixel's word: the light of a mirror, which is what the projector sends out for it.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Shown {
     /// Bits of the code value that planes of their own colour show.
     coloured: u32,
     /// Bits of the green code value that white planes show.
     white: u32,
+    /// Planes of equal light: the word is a halftone's.
+    halftone: Option<Halftone>,
+    /// The bit that each of them has.
+    bit: u8,
 }
 
 impl Shown {
     /// That of `schedule`.
     pub fn by(schedule: &PlaneSchedule) -> Self {
-        let mut shown = Self { coloured: 0, white: 0 };
+        let (halftone, bit) = (Halftone::of(schedule), schedule.planes()[0].bit);
+        let mut shown = Self { coloured: 0, white: 0, halftone, bit };
         for &plane in schedule.planes() {
             match plane.channel {
                 Channel::White => shown.white |= 1 << plane.bit,
@@ -115,9 +139,13 @@ impl Shown {
         shown
     }
 
-    /// The light of a mirror with the code value `code`, `0x00BBGGRR`, as code values of red, green and blue: white planes light all three, and a sum
+    /// The light of a mirror with the word `code`, `0x00BBGGRR`, as code values of red, green and blue: white planes light all three, and a sum
     /// above full light stays full.
     pub fn light(self, code: u32) -> u32 {
+        if let Some(halftone) = self.halftone {
+            let [r, g, b] = halftone.ones(code).map(|ones| (ones << self.bit).min(0xff));
+            return r | g << 8 | b << 16;
+        }
         let own = code & self.coloured;
         let white = code >> 8 & self.white;
         if white == 0 {
@@ -128,7 +156,7 @@ impl Shown {
     }
 }
 
-/// Code values `0x00BBGGRR`, row after row, into the planes of `frame`; bits 24 to 31 are ignored, padding bits become 0.
+/// Code values `0x00BBGGRR` (for planes of equal light the words that [`halftone`] makes of them), row after row, into the planes of `frame`; bits 24 to 31 are ignored, padding bits become 0.
 /// A `kernel` that this CPU cannot run is replaced by [`Kernel::best`].
 ///
 /// # Panics
@@ -156,8 +184,7 @@ pub fn unpack(frame: &BitPlaneFrame, codes: &mut [u32]) {
     let raster = frame.raster();
     assert_eq!(codes.len(), raster.pixel_count(), "code values for a raster of {raster:?}");
     codes.fill(0);
-    for (i, &spec) in frame.schedule().planes().iter().enumerate() {
-        let bit = source_bit(spec);
+    for (i, bit) in frame.source_bits().into_iter().enumerate().take(frame.schedule().len()) {
         let rows = frame.plane(i).chunks_exact(raster.row_bytes());
         for (row, pixels) in rows.zip(codes.chunks_exact_mut(raster.width() as usize)) {
             for (byte, eight) in row.iter().zip(pixels.chunks_mut(8)) {

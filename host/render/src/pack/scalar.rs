@@ -1,12 +1,10 @@
 //! The packer in plain Rust: the definition that all others are compared with.
 
-use super::{source_bit, BitPlaneFrame};
+use super::BitPlaneFrame;
 
 pub(super) fn pack(codes: &[u32], frame: &mut BitPlaneFrame) {
     let raster = frame.raster();
-    let schedule = *frame.schedule();
-    for (i, &spec) in schedule.planes().iter().enumerate() {
-        let bit = source_bit(spec);
+    for (i, bit) in frame.source_bits().into_iter().enumerate().take(frame.schedule().len()) {
         let rows = frame.plane_mut(i).chunks_exact_mut(raster.row_bytes());
         for (row, pixels) in rows.zip(codes.chunks_exact(raster.width() as usize)) {
             for (byte, eight) in row.iter_mut().zip(pixels.chunks(8)) {

@@ -1,10 +1,14 @@
 //! Contradictions between keys. Each is reported at a key that was written, with what would resolve it.
 
 use super::world::{EnvironmentConfig, GazeConfig, TrackerConfig};
-use super::{Pace, ProjectorBackend, ProjectorConfig, Purpose, ResponseConfig, RigConfig};
+use super::{
+    DisplayEncoding, Pace, PlaneWeights, ProjectorBackend, ProjectorConfig, Purpose, ResponseConfig,
+    RigConfig,
+};
 use crate::mock::{self, FaultError};
 use dpm_common::keys::read::{ConfigValue, Reader};
 use dpm_device::regular_file;
+use dpm_display::mode::ModeWish;
 use std::collections::HashMap;
 use std::path::{Path, PathBuf};
 
@@ -183,6 +187,51 @@ fn projector(rig: &RigConfig, reader: &mut Reader) {
                 format!("set projector.width = {} and projector.height = {}", panel.width(), panel.height()),
             );
         }
+    }
+    if let ProjectorBackend::Display(display) = &p.backend {
+        if let Err(e) = display.mode.parse::<ModeWish>() {
+            refuse(
+                reader,
+                &["projector.backend.mode"],
+                e.to_string(),
+                "`dpm display` lists the modes".into(),
+            );
+        }
+        if display.encoding == DisplayEncoding::Planes24 && p.planes != 24 {
+            contradict(
+                reader,
+                &[
+                    ("projector.planes", shown(p.planes)),
+                    ("projector.backend.encoding", shown(display.encoding)),
+                    ("projector.backend.kind", format!("{:?}", p.backend.word())),
+                ],
+                "a pixel carries 24 planes",
+                "set projector.planes = 24".into(),
+            );
+        }
+        if display.encoding == DisplayEncoding::Rgb8 && p.weights == PlaneWeights::Equal {
+            contradict(
+                reader,
+                &[
+                    ("projector.weights", format!("{:?}", p.weights.word())),
+                    ("projector.backend.encoding", shown(display.encoding)),
+                    ("projector.backend.kind", format!("{:?}", p.backend.word())),
+                ],
+                "the bits of a code value have binary weights",
+                "leave `projector.weights` out, or use encoding = \"planes24\"".into(),
+            );
+        }
+    }
+    if matches!(p.backend, ProjectorBackend::Dlpc900(_)) && p.weights == PlaneWeights::Equal {
+        contradict(
+            reader,
+            &[
+                ("projector.weights", format!("{:?}", p.weights.word())),
+                ("projector.backend.kind", format!("{:?}", p.backend.word())),
+            ],
+            "a DLPC900 weights the bits of loaded frames itself",
+            "leave `projector.weights` out".into(),
+        );
     }
     if matches!(p.backend, ProjectorBackend::Dlpc900(_)) && num > 120 * den {
         contradict(

@@ -28,7 +28,7 @@ pub use safety::{
     InterlockConfig, InterlockSignal, KeyInterlockConfig, LimitsConfig, LineInterlockConfig,
     NoInterlockConfig, ProcessInterlockConfig,
 };
-pub use values::{Axes, PerChannel};
+pub use values::{Axes, BitOrder, PerChannel};
 pub use world::*;
 
 use crate::mock::MotionSpec;

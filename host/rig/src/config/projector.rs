@@ -1,6 +1,6 @@
 //! `[projector]`: the projector, its position, and its connection.
 
-use super::values::{Each, PerChannel};
+use super::values::{BitOrder, Each, PerChannel};
 use super::world::PoseConfig;
 use dpm_common::keys::read::{Any, ConfigValue, Limit, NotEmpty, Reader, Within};
 use dpm_common::keys::source::{Node, Value};
@@ -28,6 +28,16 @@ section! {
         /// white channel, which shows the green of the picture; this gives a monochrome rig three times the frame
         /// rate.
         planes: u32 = 24, "", OneOf(&[8, 24]);
+        /// How much light the planes of a channel give: "binary" halves it from plane to plane, so that their bits are the
+        /// code value; "equal" gives every plane the same, and shows grey as a halftone of mirrors and planes. Change it
+        /// if the projector lights all planes alike: a DLPC900 that shows the bits of a video signal, or an ALP. On a
+        /// bit-plane projector equal planes together give 128 / 255 of full white.
+        weights: PlaneWeights = PlaneWeights::Binary, "", Any;
+        /// The order in which a frame shows the bits of a code value, from its first plane on; red, green and blue in
+        /// turn for each bit. The light of "7 6 5 4 3 2 1 0" is over soonest. "0 2 4 6 7 5 3 1" puts most of it into
+        /// the middle of the frame, which smears a moving picture by a quarter less. Has no effect on planes of equal
+        /// weights.
+        plane_order: BitOrder = BitOrder::default(), "", Any;
         /// Position of the projector's lens in the world. Measure it, or give `calibration` instead.
         position: [f64; 3] = [0.0, 0.35, 1.1], "m", Within(-1e6, 1e6);
         /// The point in the world that the centre of the raster shows.
@@ -89,12 +99,48 @@ impl ProjectorConfig {
         })
     }
 
+    /// True for a projector that shows the code value of a pixel for the whole frame, not its bits one after the other.
+    pub fn holds_code_values(&self) -> bool {
+        matches!(&self.backend, ProjectorBackend::Display(display) if display.encoding == DisplayEncoding::Rgb8)
+    }
+
+    /// Light of a mirror that is on in all planes, as a code value of which 255 is full light. It is less where planes of
+    /// equal light are lit by LEDs that are dimmed for the bits of a code value.
+    pub fn full_light(&self) -> u32 {
+        match &self.backend {
+            ProjectorBackend::Display(_) => 255,
+            _ => self.schedule().full_light(),
+        }
+    }
+
+    /// From the start of a slot on the projector's clock to the light of its frame, nanoseconds: `latency_us`, and for a
+    /// display the time until the vertical blank and until the middle row.
+    pub fn light_delay_ns(&self) -> i64 {
+        let own_ns = match &self.backend {
+            // The blank comes `commit_us` and half of the time without rows later, the middle row half of the rows after it:
+            // together half a frame, whatever the mode.
+            ProjectorBackend::Display(display) => {
+                let frame_ns = self.frame_rate.slot_len_ns(0);
+                display.commit_ns(frame_ns) + frame_ns / 2
+            }
+            _ => 0,
+        };
+        i64::from(self.latency_us) * 1000 + own_ns
+    }
+
     /// The planes of a frame in the order in which they are shown.
     pub fn schedule(&self) -> PlaneSchedule {
-        if self.planes == 8 {
-            PlaneSchedule::mono8()
-        } else {
-            PlaneSchedule::rgb24()
+        let BitOrder(bits) = self.plane_order;
+        let binary = match self.planes {
+            8 => PlaneSchedule::mono8_in(bits),
+            _ => PlaneSchedule::rgb24_in(bits),
+        };
+        match (self.planes, self.weights) {
+            (8, PlaneWeights::Equal) => PlaneSchedule::equal_mono8(),
+            (_, PlaneWeights::Equal) => PlaneSchedule::equal_rgb24(),
+            (_, PlaneWeights::Binary) => {
+                binary.expect("the order was checked when the configuration was read")
+            }
         }
     }
 }
@@ -106,6 +152,8 @@ kinds! {
         Linear(LinearResponseConfig) = "linear",
         /// a power of the code value.
         Gamma(GammaResponseConfig) = "gamma",
+        /// the curve of sRGB (IEC 61966-2-1), which most displays follow in their factory setting.
+        Srgb(SrgbResponseConfig) = "srgb",
         /// as measured.
         Table(TableResponseConfig) = "table",
     }
@@ -128,6 +176,11 @@ section! {
 }
 
 section! {
+    /// Light by the curve of sRGB.
+    pub struct SrgbResponseConfig {}
+}
+
+section! {
     /// Light as measured.
     pub struct TableResponseConfig {
         /// A text file of 256 lines with the light of each code value, from 0 on, in any unit: one number for all
@@ -147,6 +200,8 @@ kinds! {
         Serial(SerialProjectorConfig) = "serial",
         /// a TI DLPC900 evaluation module, driven by its USB HID commands.
         Dlpc900(Dlpc900Config) = "dlpc900",
+        /// a display: any projector or monitor on HDMI or DisplayPort.
+        Display(DisplayConfig) = "display",
     }
     default Mock
 }
@@ -210,6 +265,49 @@ section! {
         device: Option<String> = None, "", NotEmpty;
         /// Exposure of each pattern; its whole share of the frame if left out.
         exposure_us: Option<u32> = None, "us", Within(24, 2_000_000);
+    }
+}
+
+section! {
+    /// A display on a graphics card of this machine, which shows nothing else meanwhile. docs/DISPLAY.md says how to set
+    /// it up. Nothing of it has been tried on real hardware yet.
+    pub struct DisplayConfig {
+        /// The connector, as `dpm display` lists them, for example "HDMI-A-1"; the only one with a display if left out.
+        connector: Option<String> = None, "", NotEmpty;
+        /// The mode: a size and a rate that the display offers, or a timing of one's own, as in "138.51 1920 1968 2000
+        /// 2080 1080 1083 1088 1111 +hsync -vsync" (MHz, row, frame, pulses). `projector.width`, `height` and
+        /// `frame_rate` must be exactly the mode's; `dpm display` prints what to write.
+        mode: String = "1920x1080@60".into(), "", NotEmpty;
+        /// What the bits of a pixel mean.
+        encoding: DisplayEncoding = DisplayEncoding::Rgb8, "", Any;
+        /// The graphics card's device file; the first with such a connector if left out.
+        card: Option<PathBuf> = None, "", NotEmpty;
+        /// How long before its vertical blank a frame is chosen and written. Half a frame and at most 8000 if left out.
+        /// Raise it if the report counts repeated frames although frames were there in time; each microsecond is one
+        /// of latency.
+        commit_us: Option<u32> = None, "us", Within(100, 35_000);
+        /// Properties of the connector without which bits are shown although they may be lost, for example ["Broadcast
+        /// RGB"]. Name one only after you have measured that bits arrive.
+        without: Vec<String> = Vec::new(), "", Any;
+    }
+}
+
+impl DisplayConfig {
+    /// From the choice of a frame to its vertical blank, without the half of the blank that is added to it, nanoseconds;
+    /// `frame_ns`: time of a frame.
+    pub fn commit_ns(&self, frame_ns: i64) -> i64 {
+        self.commit_us.map_or((frame_ns / 2).min(8_000_000), |us| i64::from(us) * 1000)
+    }
+}
+
+words! {
+    /// What the bits of a display's pixel mean.
+    pub enum DisplayEncoding {
+        /// Code values: the display shows grey by itself. `projector.response` says how much light a code value gives.
+        Rgb8 = "rgb8",
+        /// The 24 planes of a frame, in the order in which a DLPC900 shows the bits of a pixel: green 0 to 7, red 0 to 7,
+        /// blue 0 to 7.
+        Planes24 = "planes24",
     }
 }
 
@@ -285,6 +383,16 @@ impl CalibrationCameraConfig {
     pub fn to_affine(&self) -> Option<DAffine3> {
         let (position, rotation_deg, rotation) = (self.position, self.rotation_deg, self.rotation);
         PoseConfig { position, rotation_deg, rotation }.to_affine()
+    }
+}
+
+words! {
+    /// How much light the planes of a channel give.
+    pub enum PlaneWeights {
+        /// Half as much from plane to plane.
+        Binary = "binary",
+        /// All the same.
+        Equal = "equal",
     }
 }
 

@@ -538,6 +538,10 @@ fn contradictions_name_every_key_with_its_value() {
                 "`projector.backend.panel` = \"dlp6500\"",
             ],
         ),
+        (
+            "[projector]\nframe_rate = 60\nwidth = 1920\nheight = 1080\nweights = \"equal\"\n[projector.backend]\nkind = \"dlpc900\"",
+            &["`projector.backend.kind` = \"dlpc900\"", "weights the bits of loaded frames itself"],
+        ),
         ("[render.paper]\nphi_q_deg = 3", &["phi_q_deg`: is 3.0", "`render.paper.phi_h_deg` = 15.0"]),
         (
             "[[scene.bodies]]\nname = \"a\"\n[[scene.bodies]]\nname = \"a\"\nnode = \"b\"",
@@ -642,4 +646,33 @@ fn the_manual_is_up_to_date() {
         written == manual,
         "docs/CONFIG.md is stale: DPM_UPDATE_MANUAL=1 cargo test -p dpm-rig --lib manual"
     );
+}
+
+/// The template of a display is a rig, and its light is later than its slots: by the time until the blank and until the
+/// middle row, and by the projector's own latency.
+#[test]
+fn the_light_of_a_display_is_later_than_its_slots() {
+    const RIG: &str = include_str!("../../../../rigs/display.toml");
+    let parsed = |keys: &[&str]| {
+        let flags = keys.iter().map(|k| (*k).to_owned()).collect();
+        RigConfig::parse("rigs/display.toml", RIG, Path::new(""), &Overrides { variables: vec![], flags })
+    };
+    let rig = parsed(&[]).unwrap_or_else(|e| panic!("{e}"));
+    let ProjectorBackend::Display(display) = &rig.projector.backend else { panic!("a display") };
+    assert_eq!((display.encoding, display.commit_us), (DisplayEncoding::Rgb8, None));
+    // 16 ms, 8 ms, and half of a sixtieth of a second.
+    assert_eq!(rig.projector.light_delay_ns(), 24_000_000 + 8_333_333);
+    assert!(rig.projector.holds_code_values());
+    let usb = parsed(&["projector.backend={kind=\"usb\"}"]).unwrap_or_else(|e| panic!("{e}"));
+    assert_eq!(usb.projector.light_delay_ns(), 16_000_000);
+    for (key, names) in [
+        ("projector.backend.mode=\"1920\"", "projector.backend.mode"),
+        ("projector.backend={kind=\"display\",encoding=\"planes24\"}", "projector.planes = 24"),
+        ("projector.weights=\"equal\"", "projector.weights"),
+        ("projector.backend.commit_us=1", "projector.backend.commit_us"),
+        ("real_time.pace=\"virtual\"", "runs on its own clock"),
+    ] {
+        let told = parsed(&[key, "projector.planes=8"]).err().expect("refused").to_string();
+        assert!(told.contains(names), "{told}");
+    }
 }

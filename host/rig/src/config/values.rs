@@ -2,6 +2,7 @@
 
 use dpm_common::keys::read::{ConfigValue, Limit, Reader};
 use dpm_common::keys::source::{Node, Value};
+use dpm_device::planes::PlaneSchedule;
 use glam::{DMat3, DVec3};
 
 /// Red, green and blue; written as one number for all of them, or as three.
@@ -46,6 +47,48 @@ impl Limit<Option<PerChannel>> for Each {
     }
     fn describe(&self) -> String {
         Limit::<PerChannel>::describe(self)
+    }
+}
+
+/// The order in which a frame shows the bits of a code value.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct BitOrder(pub [u8; 8]);
+
+impl Default for BitOrder {
+    fn default() -> Self {
+        Self(PlaneSchedule::DESCENDING)
+    }
+}
+
+impl ConfigValue for BitOrder {
+    fn kind() -> String {
+        "a string of eight bits".into()
+    }
+
+    fn read(node: &Node, reader: &mut Reader, key: &str) -> Option<Self> {
+        let bits = match &node.value {
+            Value::String(text) => text
+                .split([' ', ','])
+                .filter(|w| !w.is_empty())
+                .map(|w| w.parse().ok())
+                .collect::<Option<Vec<u8>>>(),
+            _ => None,
+        };
+        let order = bits.and_then(|bits| <[u8; 8]>::try_from(bits).ok());
+        let valid = order.filter(|order| PlaneSchedule::mono8_in(*order).is_some()).map(Self);
+        if valid.is_none() {
+            reader.refuse(
+                &node.origin,
+                key,
+                "must name each of the bits 0 to 7 once",
+                "write for example \"0 2 4 6 7 5 3 1\", which puts most of the light into the middle of the frame",
+            );
+        }
+        valid
+    }
+
+    fn show(&self) -> String {
+        format!("{:?}", self.0.map(|bit| bit.to_string()).join(" "))
     }
 }
 

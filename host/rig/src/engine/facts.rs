@@ -43,6 +43,8 @@ pub(crate) struct Facts {
     pub stride_milli: AtomicU64,
     /// The longest time for which prediction may extend a body's track, nanoseconds.
     pub predict_ns: AtomicI64,
+    /// Since when packing has been waiting for the GPU to finish a frame; `i64::MAX` while it does not wait.
+    pub gpu_since_ns: AtomicI64,
     /// All frames of the run are planned.
     pub is_complete: AtomicBool,
     error: Lock<Option<PipelineError>>,
@@ -70,6 +72,7 @@ impl Facts {
             end_slot: AtomicU64::new(0),
             stride_milli: AtomicU64::new(1000),
             predict_ns: AtomicI64::new(predict_ns),
+            gpu_since_ns: AtomicI64::new(i64::MAX),
             is_complete: AtomicBool::new(false),
             error: Lock::new(None),
         }

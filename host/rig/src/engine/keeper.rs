@@ -54,8 +54,8 @@ pub(crate) struct LinkKeeper {
 
 impl LinkKeeper {
     /// For a link that has just come up with `time`. `lights` receives notes of the projector's light if its reports
-    /// are the only source for them.
-    pub(crate) fn new(time: LinkTime, link: &HostLink, lights: Option<Sender<LightNote>>) -> Self {
+    /// are the only source for them; light falls so many nanoseconds after the start of its slot.
+    pub(crate) fn new(time: LinkTime, link: &HostLink, lights: Option<(Sender<LightNote>, i64)>) -> Self {
         Self {
             time,
             times: None,
@@ -64,7 +64,7 @@ impl LinkKeeper {
             clock_bound_ns: None,
             session: link.counters().sessions,
             is_timed: true,
-            reports: lights.map(StatusLight::new),
+            reports: lights.map(|(lights, delay_ns)| StatusLight::new(lights, delay_ns)),
             standing: None,
             rearmed_at: HostTime(i64::MIN),
             rearmed: 0,

@@ -197,7 +197,7 @@ impl<P: Pace> LinkStage<P> {
     /// When a frame that is sent at `now` will be lit: in its slot, or in the first one that begins after it arrives.
     fn lit_at(&self, note: &FrameNote, now: HostTime) -> HostTime {
         let due_at = note.timeline.due_at;
-        let arrives_at = now.plus_ns(self.keeper.travel_ns());
+        let arrives_at = now.plus_ns(self.keeper.travel_ns() + P::RECEIPT_NS);
         if arrives_at <= due_at {
             return due_at;
         }

@@ -24,6 +24,8 @@ pub(crate) trait Pace: Send + 'static {
     const LISTEN_NS: i64;
     /// Whether the projector's clock is followed during the run. Otherwise it stays as the handshake found it.
     const FOLLOWS_CLOCK: bool;
+    /// From the last byte of a frame that the medium has carried until the projector can light it, nanoseconds.
+    const RECEIPT_NS: i64;
 
     /// How early frames begin. `is_slow`: the GPU needs about a slot or more for each.
     fn leads(facts: &Facts, is_slow: bool) -> Leads;
@@ -44,6 +46,7 @@ pub(crate) enum Real {}
 impl Pace for Real {
     const LISTEN_NS: i64 = super::plan::LISTEN_NS;
     const FOLLOWS_CLOCK: bool = true;
+    const RECEIPT_NS: i64 = RECEIPT_NS;
 
     /// Frames begin early enough to survive a bad moment, so there is time to catch up afterwards. A slot is given up
     /// only when a frame of typical duration would miss it. A renderer that is slower than its slots cannot catch up;
@@ -66,6 +69,7 @@ pub(crate) enum Virtual {}
 impl Pace for Virtual {
     const LISTEN_NS: i64 = 0;
     const FOLLOWS_CLOCK: bool = false;
+    const RECEIPT_NS: i64 = 0;
 
     fn leads(facts: &Facts, _: bool) -> Leads {
         let lead_ns = modelled_ns(facts);

@@ -57,12 +57,20 @@ pub(crate) struct PackStage {
 impl PackStage {
     /// For a crew. `budget`: `None` if every frame gets the rays that the rig file asks for.
     pub(crate) fn new(facts: Arc<Facts>, crew: Arc<CrewFacts>, budget: Option<BudgetController>) -> Self {
-        Self { facts, crew, times: GpuTimes::new(), budget, late_in_a_row: 0 }
+        let this = Self { facts, crew, times: GpuTimes::new(), budget, late_in_a_row: 0 };
+        this.wait_is_over();
+        this
     }
 
-    /// How long the GPU may take for the next frame, nanoseconds.
-    pub(crate) fn limit_ns(&self) -> u64 {
+    /// From `now` on packing waits for the GPU to finish a frame. Returns how long it may take, nanoseconds.
+    pub(crate) fn wait_from(&self, now: HostTime) -> u64 {
+        self.facts.gpu_since_ns.store(now.0, Ordering::Relaxed);
         self.times.limit_ns()
+    }
+
+    /// Packing waits for no frame of the GPU.
+    pub(crate) fn wait_is_over(&self) {
+        self.facts.gpu_since_ns.store(i64::MAX, Ordering::Relaxed);
     }
 
     /// The GPU finished a frame at `now`.

@@ -20,6 +20,9 @@ const MADE_WITHIN_NS: i64 = 180_000_000_000;
 /// The operator is informed that the renderer is slower than its slots from this many slots per frame on, in
 /// thousandths.
 const SLOW_MILLI: u64 = 1_500;
+/// The operator is informed that a frame stays on the GPU after this time, nanoseconds. A GPU that is still warming up
+/// is given up later than that.
+const STAYS_AFTER_NS: i64 = 1_000_000_000;
 
 /// What is wrong with a crew.
 #[derive(Debug)]
@@ -120,6 +123,8 @@ pub(crate) struct Supervision {
     ask: StandingOf,
     made_by: HostTime,
     told_slow: bool,
+    /// Since when the GPU has had the frame of which the operator was last informed.
+    told_of_ns: i64,
 }
 
 impl Supervision {
@@ -133,6 +138,7 @@ impl Supervision {
             ask,
             made_by: HostTime(i64::MAX),
             told_slow: false,
+            told_of_ns: i64::MAX,
         }
     }
 
@@ -146,6 +152,7 @@ impl Supervision {
         step_ns: i64,
     ) -> Option<Irreplaceable> {
         self.tell_if_slow();
+        self.tell_if_gpu_stays(now);
         if self.link.observe(link, now, step_ns, self.ask) {
             self.facts.fail(PipelineError::Hung { stage: link.name() });
             return Some(Irreplaceable::Link);
@@ -170,6 +177,7 @@ impl Supervision {
     /// Decides what to do with a crew in `trouble`.
     pub(crate) fn judge(&mut self, trouble: Trouble, now: HostTime) -> Verdict {
         let facts = self.facts.clone();
+        facts.gpu_since_ns.store(i64::MAX, Ordering::Relaxed);
         if let Trouble::Panicked(_) = trouble {
             facts.fail(trouble.into_error());
             return Verdict::End;
@@ -203,6 +211,20 @@ impl Supervision {
         };
         self.facts.fail(error);
         false
+    }
+
+    /// Informs the operator, once for each frame, that the GPU has had a frame for long.
+    fn tell_if_gpu_stays(&mut self, now: HostTime) {
+        let since_ns = self.facts.gpu_since_ns.load(Ordering::Relaxed);
+        if since_ns == self.told_of_ns || now.0.saturating_sub(since_ns) < STAYS_AFTER_NS {
+            return;
+        }
+        self.told_of_ns = since_ns;
+        self.facts.monitor.note(
+            "the GPU has worked on one frame for a second, and nothing new is lit meanwhile; after two seconds it is \
+             given up and opened again"
+                .into(),
+        );
     }
 
     /// Informs the operator once when the renderer becomes slower than its slots, and when it is fast again.

@@ -294,6 +294,28 @@ fn a_crew_in_trouble_is_made_anew_three_times_a_minute_and_the_fourth_ends_the_r
     assert!(bench.facts.monitor.stop_requested());
 }
 
+/// A GPU that is still warming up may take two seconds for a frame. The operator does not wait that long for a word,
+/// and hears of each frame once.
+#[test]
+fn a_frame_that_stays_on_the_gpu_for_a_second_is_told_once() {
+    let bench = bench(&[], RunOptions::default());
+    let mut mind = supervision(&bench.facts);
+    let crew = Arc::new(CrewFacts::new(&bench.facts.rig, 0));
+    let stage = PackStage::new(bench.facts.clone(), crew, None);
+    let (link, collector) = (Pulse::new("link"), Pulse::new("collector"));
+    let mut told = |now_ms: i64| {
+        mind.watch(&link, &collector, HostTime(now_ms * MS), 2 * MS);
+        bench.facts.monitor.take_notes().iter().filter(|note| note.contains("the GPU has worked")).count()
+    };
+    assert_eq!(told(90_000), 0, "nothing was submitted");
+    stage.wait_from(HostTime(100_000 * MS));
+    assert_eq!((told(100_999), told(101_000), told(101_002), told(101_900)), (0, 1, 0, 0));
+    stage.wait_is_over();
+    assert_eq!(told(200_000), 0, "it was finished");
+    stage.wait_from(HostTime(300_000 * MS));
+    assert_eq!(told(301_500), 1, "the next one is another matter");
+}
+
 #[test]
 fn a_panic_and_a_failure_at_the_end_are_not_made_good() {
     let bench = bench(&[], RunOptions::default());

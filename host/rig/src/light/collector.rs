@@ -8,10 +8,10 @@ use crate::frame::{FrameTimeline, Stage, STAGES};
 use crate::light::dark_bodies::DarkBodies;
 use crate::light::placement::Placement;
 use crate::light::recorder::LightNote;
-use crate::light::registration::{measured_at, RegistrationMeter};
+use crate::light::registration::RegistrationMeter;
 use crate::plan::dark::DarkCause;
 use crate::plan::frame::FrameId;
-use crate::plan::light_centre::centre_ns;
+use crate::plan::light_centre::{centre_for, lights_of_planes};
 use crate::rig::Rig;
 use crate::telemetry::flight::FlightRecorder;
 use crate::telemetry::interval::Interval;
@@ -35,6 +35,8 @@ use std::sync::Arc;
 /// Sent frames that may wait for their light. Beyond this number the oldest count as never lit, once no unread light
 /// is left.
 const MAX_PENDING: usize = 256;
+/// Every so many frames are followed plane by plane.
+const FOLLOWED_EVERY: u64 = 16;
 
 /// The record of one lit frame, kept for pictures.
 #[derive(Clone, Debug)]
@@ -121,6 +123,10 @@ pub(crate) struct Collector {
     registration: Histogram<u64>,
     /// The same for frames that were lit in their own slot.
     registration_in_time: Histogram<u64>,
+    /// What an eye sees that follows a point, of some frames: how far the light lies from it, and how far it is spread.
+    followed: [Histogram<u64>; 2],
+    /// The true poses at each plane of a frame.
+    truths: Vec<Vec<(DAffine3, f64)>>,
     /// True beginning of a slot, as observed by the mock in this process, minus the host's estimate.
     clock_error: SignedHistogram,
     unpredicted: Histogram<u64>,
@@ -195,6 +201,8 @@ impl Collector {
             flights_told: None,
             registration: histogram(),
             registration_in_time: histogram(),
+            followed: [histogram(), histogram()],
+            truths: Vec::new(),
             clock_error: SignedHistogram::new(1_000_000_000),
             unpredicted: histogram(),
             stages: STAGES.iter().map(|_| histogram()).collect(),
@@ -454,7 +462,8 @@ impl Collector {
                 let Some(mut record) = self.pending.pop_front() else { return };
                 let last_photon_at = note.event.last_photon_at;
                 let exposure_ns = last_photon_at.ns_since(begin);
-                let centre_at = begin.plus_ns(centre_ns(&self.rig.schedule, exposure_ns));
+                let centre_at =
+                    begin.plus_ns(centre_for(&self.rig.config.projector, &self.rig.schedule, exposure_ns));
                 record.timeline.lit_at = Some(begin);
                 record.timeline.centre_at = Some(centre_at);
                 record.timeline.last_photon_at = Some(last_photon_at);
@@ -471,7 +480,10 @@ impl Collector {
                 if self.verify && note.hash != record.code_hash {
                     self.light_mismatches += 1;
                 }
-                self.measure_registration(note, &record, late);
+                self.measure_registration(&record, late);
+                if record.id.0.is_multiple_of(FOLLOWED_EVERY) {
+                    self.follow(&record);
+                }
                 self.measure_clock(note, &record);
                 // If no light fell on any body, there is no interval from motion to light.
                 let is_dark = self.is_dark(&record);
@@ -512,10 +524,10 @@ impl Collector {
         }
     }
 
-    /// Measures, on the lit bodies, where the light of each point fell and where the point was at the middle of the
-    /// exposure.
-    fn measure_registration(&mut self, note: &LightNote, record: &FrameRecord, late: bool) {
-        let at = measured_at(note.event.first_photon_at, note.event.last_photon_at);
+    /// Measures, on the lit bodies, where the light of each point fell and where the point was at the centre of
+    /// that light.
+    fn measure_registration(&mut self, record: &FrameRecord, late: bool) {
+        let Some(at) = record.timeline.centre_at else { return };
         let Some(truth) = self.rig.true_poses(at.0) else { return };
         let counted = |px: f64| (px * PER_PIXEL).round() as u64;
         for (i, truth) in truth.iter().enumerate() {
@@ -530,6 +542,31 @@ impl Collector {
             }
             for px in self.meter.errors(i, &record.sampled_poses[i], truth) {
                 self.unpredicted.saturating_record(counted(px));
+            }
+        }
+    }
+
+    /// Measures where the light of each plane fell on the lit bodies, as seen by an eye that follows them.
+    fn follow(&mut self, record: &FrameRecord) {
+        let FrameTimeline { lit_at: Some(lit_at), last_photon_at: Some(last), .. } = record.timeline else {
+            return;
+        };
+        for truths in &mut self.truths {
+            truths.clear();
+        }
+        self.truths.resize_with(record.tracked_poses.len(), Vec::new);
+        for (middle_ns, weight) in lights_of_planes(&self.rig.schedule, last.ns_since(lit_at)) {
+            let Some(poses) = self.rig.true_poses(lit_at.plus_ns(middle_ns).0) else { return };
+            self.truths.iter_mut().zip(poses).for_each(|(truths, pose)| truths.push((pose, weight)));
+        }
+        let counted = |px: f64| (px * PER_PIXEL).round() as u64;
+        for (i, truths) in self.truths.iter().enumerate() {
+            if record.dark.get(i).copied().flatten().is_some() {
+                continue;
+            }
+            for seen in self.meter.followed(i, &record.tracked_poses[i], truths) {
+                self.followed[0].saturating_record(counted(seen.offset_px));
+                self.followed[1].saturating_record(counted(seen.smear_px));
             }
         }
     }
@@ -561,9 +598,11 @@ impl Collector {
         report.frames_too_old = self.too_old;
         report.registration_error_px = spread(&self.registration, PER_PIXEL);
         report.registration_error_in_time_px = spread(&self.registration_in_time, PER_PIXEL);
+        [report.followed_offset_px, report.followed_smear_px] =
+            self.followed.each_ref().map(|seen| spread(seen, PER_PIXEL));
         report.clock_error_ms = Latency::of(&self.clock_error, false);
         report.registration_error_unpredicted_px = spread(&self.unpredicted, PER_PIXEL);
-        report.registration_error_at = report.registration_error_px.map(|_| "mid-exposure");
+        report.registration_error_at = report.registration_error_px.map(|_| "light centre");
         let latency = |interval| Latency::of(self.profiler.histogram(interval), !self.profiler.is_measured());
         report.motion_to_first_photon_ms = latency(Interval::MotionToFirstPhoton);
         report.motion_to_light_centre_ms = latency(Interval::MotionToCentre);

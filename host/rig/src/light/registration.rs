@@ -2,17 +2,22 @@
 //! the projector.
 
 use crate::rig::Rig;
-use dpm_device::time::HostTime;
 use dpm_scene::geometry::projector::ProjectorCamera;
-use glam::{DAffine3, DVec3};
+use glam::{DAffine3, DVec2, DVec3};
 
 /// Points on each body at which registration is measured.
 const POINTS_PER_BODY: usize = 48;
 
-/// The instant at which registration of a frame is measured: the middle of its exposure, between its first and its
-/// last photon.
-pub fn measured_at(first_photon_at: HostTime, last_photon_at: HostTime) -> HostTime {
-    first_photon_at.plus_ns(last_photon_at.ns_since(first_photon_at) / 2)
+/// Of the points, every so many are followed plane by plane.
+const FOLLOWED_EVERY: usize = 8;
+
+/// Where the light of a frame's planes fell, as an eye sees it that follows a point of the body. Pixels.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub(crate) struct Followed {
+    /// Distance from the point to the mean of the light.
+    pub offset_px: f64,
+    /// Root mean square distance of the light from its mean.
+    pub smear_px: f64,
 }
 
 /// Points spread over the tracked bodies of a rig.
@@ -45,6 +50,30 @@ impl RegistrationMeter {
         points.iter().filter_map(move |p| {
             let at = |m: &DAffine3| self.camera.project(m.transform_point3(*p));
             Some((at(used)? - at(truth)?).length())
+        })
+    }
+
+    /// For some points of the tracked body `body`, which the planes all show where `used` places it: where their light
+    /// fell. `truths` gives the true world-from-body pose at the middle of each plane, and the plane's intensity.
+    pub(crate) fn followed<'a>(
+        &'a self,
+        body: usize,
+        used: &'a DAffine3,
+        truths: &'a [(DAffine3, f64)],
+    ) -> impl Iterator<Item = Followed> + 'a {
+        let points = self.points.get(body).map_or(&[][..], Vec::as_slice);
+        points.iter().step_by(FOLLOWED_EVERY).filter_map(move |p| {
+            let shown = self.camera.project(used.transform_point3(*p))?;
+            let (mut weights, mut sum, mut squares) = (0.0, DVec2::ZERO, 0.0);
+            for (truth, weight) in truths {
+                let off = shown - self.camera.project(truth.transform_point3(*p))?;
+                weights += weight;
+                sum += off * *weight;
+                squares += off.length_squared() * weight;
+            }
+            let mean = sum / weights;
+            let smear_px = (squares / weights - mean.length_squared()).max(0.0).sqrt();
+            (weights > 0.0).then_some(Followed { offset_px: mean.length(), smear_px })
         })
     }
 }

@@ -36,6 +36,8 @@ struct SentFrame {
 #[derive(Debug)]
 pub(crate) struct StatusLight {
     lights: Sender<LightNote>,
+    /// From the start of a slot to its light, nanoseconds.
+    light_delay_ns: i64,
     before: Option<Status>,
     counts: DeviceCounts,
     sent: [Option<SentFrame>; REMEMBERED],
@@ -47,10 +49,12 @@ pub(crate) struct StatusLight {
 }
 
 impl StatusLight {
-    /// Sends notes to `lights`. Notes for which there is no room are lost, as a mock's are.
-    pub(crate) fn new(lights: Sender<LightNote>) -> Self {
+    /// Sends notes to `lights`. Notes for which there is no room are lost, as a mock's are. Light falls `light_delay_ns`
+    /// after the start of its slot.
+    pub(crate) fn new(lights: Sender<LightNote>, light_delay_ns: i64) -> Self {
         Self {
             lights,
+            light_delay_ns,
             before: None,
             counts: DeviceCounts::default(),
             sent: [None; REMEMBERED],
@@ -148,8 +152,8 @@ impl StatusLight {
                 frame,
                 kind,
                 lit_at: start,
-                first_photon_at: time.host_of(start),
-                last_photon_at: time.host_of(time.start(slot + 1)),
+                first_photon_at: time.host_of(start).plus_ns(self.light_delay_ns),
+                last_photon_at: time.host_of(time.start(slot + 1)).plus_ns(self.light_delay_ns),
             };
             let _ = self.lights.push(LightNote { event, hash: 0, torn: false, wall_ns: 0, unseen: told });
         }
@@ -224,7 +228,7 @@ mod tests {
 
     fn reader() -> Reader {
         let (lights, notes) = channel(4096, WaitPolicy::Park);
-        Reader(StatusLight::new(lights), notes)
+        Reader(StatusLight::new(lights, 0), notes)
     }
 
     fn told(Reader(light, notes): &mut Reader, s: &Status) -> Vec<(u64, LightKind, Option<u32>, u32)> {

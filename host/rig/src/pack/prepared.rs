@@ -1,7 +1,7 @@
 //! Frames that are prepared in advance and replace rendered ones. A pattern moves from frame to frame, and each frame
 //! is marked with its number, so that an observer of the planes can check that they all belong to one frame.
 
-use dpm_device::planes::{Channel, PlaneSchedule, Raster};
+use dpm_device::planes::{PlaneSchedule, Raster};
 use dpm_render::pack::{self, BitPlaneFrame, Kernel};
 
 /// Number of positions of the pattern.
@@ -57,13 +57,8 @@ fn pattern(x: u32, y: u32) -> u32 {
 /// no plane, and no part of a plane, belongs to another frame.
 pub fn is_whole(raster: Raster, schedule: &PlaneSchedule, planes: &[u8], id: u32) -> bool {
     let rows = MARK_ROWS * raster.row_bytes();
-    planes.chunks_exact(raster.plane_bytes()).zip(schedule.planes()).all(|(plane, spec)| {
-        let channel = match spec.channel {
-            Channel::Red => 0,
-            Channel::Green | Channel::White => 8,
-            Channel::Blue => 16,
-        };
-        let expected = (id >> (channel + u32::from(spec.bit)) & 1) as u8;
+    planes.chunks_exact(raster.plane_bytes()).zip(pack::source_bits(schedule)).all(|(plane, bit)| {
+        let expected = (id >> bit & 1) as u8;
         plane.iter().step_by(rows).all(|byte| byte >> 7 == expected)
     })
 }

@@ -2,7 +2,7 @@
 
 use crate::frame::job::FrameMemory;
 use dpm_device::planes::{Channel, PlaneSchedule, Raster};
-use dpm_render::pack::{self, BitPlaneFrame, Kernel};
+use dpm_render::pack::{self, BitPlaneFrame, Halftone, Kernel};
 use std::sync::Arc;
 
 /// Gives the picture of every frame of a run that renders nothing. What it gives depends on the frame's number and slot
@@ -33,6 +33,9 @@ pub struct Canvas<'a> {
     raster: Raster,
     kernel: Kernel,
     codes: &'a mut [u32],
+    /// For halftones.
+    words: &'a mut [u32],
+    picture: u64,
     /// The code values are those of this picture already.
     is_filled: bool,
     planes: &'a mut BitPlaneFrame,
@@ -50,7 +53,13 @@ impl Canvas<'_> {
         if !self.is_filled {
             fill(self.codes);
         }
-        pack::pack(self.kernel, self.codes, self.planes);
+        match Halftone::of(self.planes.schedule()) {
+            None => pack::pack(self.kernel, self.codes, self.planes),
+            Some(halftone) => {
+                pack::halftone(halftone, self.raster, self.picture as u32, self.codes, self.words);
+                pack::pack(self.kernel, self.words, self.planes);
+            }
+        }
     }
 
     /// Draws by the planes themselves, which hold some former picture. All planes may differ; padding bits must
@@ -65,6 +74,7 @@ pub struct PatternPainter {
     source: Arc<dyn PatternSource>,
     raster: Raster,
     codes: Vec<u32>,
+    words: Vec<u32>,
     /// The picture that `codes` was last drawn for.
     drawn: Option<u64>,
 }
@@ -72,14 +82,20 @@ pub struct PatternPainter {
 impl PatternPainter {
     /// For frames of `raster`.
     pub fn new(source: Arc<dyn PatternSource>, raster: Raster) -> Self {
-        Self { source, raster, codes: vec![0; raster.pixel_count()], drawn: None }
+        Self {
+            source,
+            raster,
+            codes: vec![0; raster.pixel_count()],
+            words: vec![0; raster.pixel_count()],
+            drawn: None,
+        }
     }
 
     /// Draws picture `picture` into `planes`.
     pub fn draw(&mut self, kernel: Kernel, picture: u64, planes: &mut BitPlaneFrame) {
         let is_filled = self.drawn.replace(picture) == Some(picture);
-        let (raster, codes) = (self.raster, &mut self.codes[..]);
-        self.source.draw(picture, &mut Canvas { raster, kernel, codes, is_filled, planes });
+        let (raster, codes, words) = (self.raster, &mut self.codes[..], &mut self.words[..]);
+        self.source.draw(picture, &mut Canvas { raster, kernel, codes, words, picture, is_filled, planes });
     }
 
     /// The planes of frame `frame` into its memory, which may hold them from a former frame.

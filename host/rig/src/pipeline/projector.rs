@@ -1,12 +1,22 @@
 //! Opens the medium of `[projector.backend]`, and derives the link's settings from the rig file.
 
-use crate::config::{Compaction, Pace, ProjectorBackend, RigConfig};
+use crate::config::{
+    Compaction, DisplayConfig, DisplayEncoding, Pace, ProjectorBackend, ResponseConfig, RigConfig,
+};
 use crate::engine::connect::ConnectError;
 use dpm_device::link::{packet_bytes, Codec, Epoch, LinkError, LinkSettings, Underrun, COMMIT_BYTES};
 use dpm_device::planes::Raster;
+use dpm_device::time::DeviceTicks;
 use dpm_device::transport::serial::{SerialSettings, SerialTransport};
 use dpm_device::transport::usb::{UsbSettings, UsbTransport};
-use dpm_device::transport::Transport;
+use dpm_device::transport::{Transport, TransportError};
+use dpm_display::card::open_for;
+use dpm_display::encoding::Encoding;
+use dpm_display::mode::ModeWish;
+use dpm_display::set_up::DisplaySettings;
+use dpm_display::transport::DisplayTransport;
+use dpm_handoff::wake::WaitPolicy;
+use std::sync::Arc;
 
 /// Time from the handshake to slot 0.
 const EPOCH_NS: u64 = 5_000_000;
@@ -50,8 +60,61 @@ pub fn open(config: &RigConfig, raster: Raster) -> Result<Option<Medium>, Connec
             let transport = Box::new(SerialTransport::open(settings).map_err(failed)?);
             Some(Medium { transport, warnings: Vec::new() })
         }
+        ProjectorBackend::Display(display) => Some(open_display(config, display, raster).map_err(failed)?),
         ProjectorBackend::Mock(_) | ProjectorBackend::Dlpc900(_) => None,
     })
+}
+
+/// What a rig file says of its display.
+///
+/// # Errors
+/// The mode is none; the check of the rig file has refused it.
+pub fn display_settings(
+    config: &RigConfig,
+    display: &DisplayConfig,
+    raster: Raster,
+) -> Result<DisplaySettings, TransportError> {
+    let no_mode = |why: String| TransportError::Unsuitable { device: "projector.backend.mode".into(), why };
+    let projector = &config.projector;
+    Ok(DisplaySettings {
+        connector: display.connector.clone(),
+        mode: display.mode.parse::<ModeWish>().map_err(|e| no_mode(e.to_string()))?,
+        encoding: match display.encoding {
+            DisplayEncoding::Rgb8 => Encoding::Rgb8,
+            DisplayEncoding::Planes24 => Encoding::Planes24,
+        },
+        without: display.without.clone(),
+        commit_ns: display.commit_ns(projector.frame_rate.slot_len_ns(0)),
+        raster,
+        schedule: projector.schedule(),
+        rate: projector.frame_rate,
+    })
+}
+
+fn open_display(
+    config: &RigConfig,
+    display: &DisplayConfig,
+    raster: Raster,
+) -> Result<Medium, TransportError> {
+    let settings = display_settings(config, display, raster)?;
+    let (card, connector) = (display.card.clone(), display.connector.clone());
+    let opener = Arc::new(move || open_for(card.as_deref(), connector.as_deref()));
+    // Blanks are milliseconds apart: no thread needs to spin for them. The panel stands for another machine, so no stage may
+    // delay it.
+    let priority = config.real_time.priority;
+    let above = if priority > 0 { (priority + 1).min(99) } else { 0 };
+    let transport = DisplayTransport::open(opener, settings, WaitPolicy::Park, above)?;
+    let mut warnings = transport.warnings().to_vec();
+    warnings.push("a display as projector has not been tried on real hardware yet (docs/DISPLAY.md)".into());
+    let is_linear = matches!(config.projector.response, ResponseConfig::Linear(_));
+    if display.encoding == DisplayEncoding::Rgb8 && is_linear {
+        warnings.push(
+            "projector.response is \"linear\", which no display's code values are: grey will be too bright; write \
+             response = { kind = \"srgb\" }, or measure it"
+                .into(),
+        );
+    }
+    Ok(Medium { transport: Box::new(transport), warnings })
 }
 
 /// Codecs that the rig file allows on its link, as bits of [`Codec::mask`].
@@ -60,7 +123,7 @@ pub(crate) fn codecs(backend: &ProjectorBackend) -> u32 {
         ProjectorBackend::Mock(c) => &c.compaction,
         ProjectorBackend::Usb(c) => &c.compaction,
         ProjectorBackend::Serial(c) => &c.compaction,
-        ProjectorBackend::Dlpc900(_) => return Codec::Raw.mask(),
+        ProjectorBackend::Dlpc900(_) | ProjectorBackend::Display(_) => return Codec::Raw.mask(),
     };
     match compaction {
         Compaction::Auto => Codec::ALL,
@@ -86,7 +149,11 @@ pub fn link_settings(config: &RigConfig, raster: Raster) -> LinkSettings {
         underrun: Underrun::Repeat,
         // At real pace a late frame is better than none. At virtual pace no frame is late.
         late_slots: if config.real_time.pace == Pace::Virtual { 0 } else { 255 },
-        epoch: Epoch::AfterHello(EPOCH_NS),
+        // The slots of a display are its vertical blanks, which its clock counts from 0.
+        epoch: match config.projector.backend {
+            ProjectorBackend::Display(_) => Epoch::At(DeviceTicks(0)),
+            _ => Epoch::AfterHello(EPOCH_NS),
+        },
         codecs: codecs(&config.projector.backend),
         flash_limit: flash_limit(config),
         limits: config.safety.limits.limits(),

@@ -76,7 +76,11 @@ pub(super) fn run_at_real_pace(
     let lead = lead_estimator(rig, &link, parts.frame_ns);
     let facts = Arc::new(Facts::new(rig.clone(), monitor.clone(), options, &lead, clock.now()));
     tell_horizon(&facts);
-    let keeper = LinkKeeper::new(time, &link, far.lights);
+    let keeper = LinkKeeper::new(
+        time,
+        &link,
+        far.lights.map(|lights| (lights, rig.config.projector.light_delay_ns())),
+    );
     let line = Line { stage: LinkStage::new(facts.clone(), link, keeper, lead), medium: far.medium };
     let shared = Arc::new(Shared {
         facts: facts.clone(),

@@ -8,6 +8,7 @@ use crate::plan::lead::LeadEstimator;
 use crate::rig::Rig;
 use dpm_device::link::HostLink;
 use dpm_render::gpu::Gpu;
+use dpm_render::pack::Halftone;
 use dpm_render::{Output, RendererSettings};
 
 /// Longest reserve in the lead, nanoseconds.
@@ -62,6 +63,7 @@ pub fn renderer_settings(rig: &Rig) -> RendererSettings {
         camera_is_eye: false,
         leave_nothing_out: false,
         method: r.to_method(),
+        halftone: Halftone::of(&rig.schedule),
         output: Output::Codes,
     }
 }

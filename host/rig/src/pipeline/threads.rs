@@ -316,11 +316,12 @@ pub(super) fn pack_thread(
         let frame = job.note.plan.id.0;
         enter_frame_path(frame >= WARM_UP_FRAMES);
         may_stall(facts, StallIn::Pack, frame);
-        if let Err(failure) = rendered(&mut job, stage.limit_ns(), alive) {
+        if let Err(failure) = rendered(&mut job, stage.wait_from(clock.now()), alive) {
             crew.fail(failure);
             break;
         }
         let now = clock.now();
+        stage.wait_is_over();
         // A prepared frame is ready when it is planned. The time after that is spent waiting for the packer.
         job.note.timeline.rendered_at = job.note.timeline.submitted_at;
         if job.memory.gpu.is_some() {

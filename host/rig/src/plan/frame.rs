@@ -2,6 +2,7 @@
 //! off.
 
 use super::dark::DarkCause;
+use super::light_centre::centre_for;
 use super::link_time::LinkTime;
 use crate::rig::{affine, Rig};
 use crate::tracks::TrackSnapshot;
@@ -106,7 +107,7 @@ impl FramePlan {
         }
     }
 
-    /// Plans a frame: the poses at the middle of the slot's exposure, the eye, the gaze, and the instant from which
+    /// Plans a frame: the poses at the centre of the slot's light, the eye, the gaze, and the instant from which
     /// its light must be off. `snapshot` is the newest one. Allocates nothing in the steady state.
     pub(crate) fn fill(&mut self, rig: &Rig, snapshot: &TrackSnapshot, inputs: &PlanInputs<'_>) {
         let &PlanInputs { slots, id, slot, stride, predict_ns, .. } = inputs;
@@ -114,28 +115,29 @@ impl FramePlan {
         (self.predict_ns, self.budget_milli) = (predict_ns, inputs.budget_milli);
         self.target_at = slots.start(slot);
         // Light falls later than the projector's clock says by this much.
-        let late_ns = i64::from(rig.config.projector.latency_us) * 1000;
+        let late_ns = rig.config.projector.light_delay_ns();
         self.dark_from = slots.dark_from(slot, stride, predict_ns - late_ns);
         self.due_at = slots.host_of_slot(slot);
-        let half_slot = slots.host_of_slot(slot + 1).ns_since(self.due_at) / 2;
-        let middle = self.due_at.plus_ns(half_slot + late_ns);
-        self.place_bodies(rig, snapshot, inputs, middle);
+        let exposure_ns = slots.host_of_slot(slot + 1).ns_since(self.due_at);
+        let centre =
+            self.due_at.plus_ns(centre_for(&rig.config.projector, &rig.schedule, exposure_ns) + late_ns);
+        self.place_bodies(rig, snapshot, inputs, centre);
         rig.scene_poses(&self.tracked_poses, &mut self.scene_poses);
         (self.eye, self.gaze) = rig.observer.eye_and_gaze(&self.tracked_poses);
         self.widen_deg = rig.observer.gaze_body().map_or(0.0, |body| {
             let track = snapshot.tracks.get(body).copied().flatten();
-            let unseen_ns = track.map_or(i64::MAX, |(state, _)| middle.ns_since(state.captured_at));
+            let unseen_ns = track.map_or(i64::MAX, |(state, _)| centre.ns_since(state.captured_at));
             rig.observer.widening_deg(unseen_ns) as f32
         });
     }
 
-    /// For every tracked body: where it will be at `middle`, and whether light may fall on it there.
+    /// For every tracked body: where it will be at `centre`, and whether light may fall on it there.
     fn place_bodies(
         &mut self,
         rig: &Rig,
         snapshot: &TrackSnapshot,
         inputs: &PlanInputs<'_>,
-        middle: HostTime,
+        centre: HostTime,
     ) {
         self.tracked_poses.clear();
         self.sampled_poses.clear();
@@ -150,7 +152,7 @@ impl FramePlan {
                 Some((state, received_at)) => {
                     let state = TrackState { lost_after_ns: inputs.predict_ns, ..state };
                     let sampled = state.predict(state.captured_at);
-                    let used = state.predict(middle);
+                    let used = state.predict(centre);
                     let dark = (used.freshness == Freshness::Lost).then(|| {
                         // The tracker works, but the light is further away than prediction may reach.
                         let speaks = inputs.now.ns_since(state.captured_at) <= inputs.fresh_ns;

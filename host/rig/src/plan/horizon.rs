@@ -16,6 +16,8 @@ pub(crate) struct Horizon {
     /// Time between two samples of the tracker, nanoseconds.
     period_ns: i64,
     slot_ns: i64,
+    /// From the start of a slot to its light, nanoseconds.
+    light_delay_ns: i64,
 }
 
 impl Horizon {
@@ -27,19 +29,21 @@ impl Horizon {
             // trackers.
             period_ns: 1_000_000_000 / i64::from(config.tracker.rate_hz().unwrap_or(30).max(1)),
             slot_ns: config.projector.frame_rate.slot_len_ns(0),
+            light_delay_ns: config.projector.light_delay_ns(),
         }
     }
 
     /// The longest time for which prediction may extend a body's track, nanoseconds. It is the rig file's value if
-    /// there is one. Otherwise it is the sum of the tracker's latency, two of its samples, the lead and two slots,
-    /// and at least 20 ms. `lead_ns`: how long before its slot a frame is latched. `latency_ns`: from the capture of
+    /// there is one. Otherwise it is the sum of the tracker's latency, two of its samples, the lead, two slots, and the
+    /// time from a slot to its light, and at least 20 ms. `lead_ns`: how long before its slot a frame is latched. `latency_ns`: from the capture of
     /// a sample to its arrival.
     pub(crate) fn predict_ns(&self, lead_ns: i64, latency_ns: i64) -> i64 {
         self.written_ns.unwrap_or_else(|| {
             let needed = latency_ns
                 .saturating_add(2 * self.period_ns)
                 .saturating_add(lead_ns)
-                .saturating_add(2 * self.slot_ns);
+                .saturating_add(2 * self.slot_ns)
+                .saturating_add(self.light_delay_ns);
             needed.clamp(SHORTEST_NS, LONGEST_NS)
         })
     }

@@ -4,6 +4,7 @@
 //! bits come first, most of the light is over long before the middle of the exposure. An eye that follows a body sees
 //! the picture where the centre of the light puts it.
 
+use crate::config::ProjectorConfig;
 use dpm_device::planes::PlaneSchedule;
 
 /// Time from the first photon to the centre of the light of a frame whose planes share `exposure_ns` >= 0 equally, in
@@ -17,13 +18,40 @@ pub(crate) fn centre_ns(schedule: &PlaneSchedule, exposure_ns: i64) -> i64 {
     for (i, plane) in schedule.planes().iter().enumerate() {
         let weight = 1i128 << plane.bit;
         weights += weight;
-        // The middle of plane i lies (2 i + 1) half planes after the first photon.
-        moments += weight * (2 * i as i128 + 1);
+        moments += weight * halves_of(i);
     }
     let halves = 2 * schedule.len() as i128;
     // There is at least one plane of weight 1 or more, so the divisor is above 0 and the quotient lies inside the
     // exposure.
     (i128::from(exposure_ns.max(0)) * moments / (halves * weights)) as i64
+}
+
+/// The same for the projector of a rig file. A display that is given code values shows all bits at once, for the whole
+/// frame.
+pub(crate) fn centre_for(projector: &ProjectorConfig, schedule: &PlaneSchedule, exposure_ns: i64) -> i64 {
+    if projector.holds_code_values() {
+        exposure_ns.max(0) / 2
+    } else {
+        centre_ns(schedule, exposure_ns)
+    }
+}
+
+/// The middle of plane `i` lies so many half planes after the first photon.
+const fn halves_of(i: usize) -> i128 {
+    2 * i as i128 + 1
+}
+
+/// The light of each plane: the time from the first photon to its middle in nanoseconds, rounded down, and its intensity
+/// `2^bit`. The planes share `exposure_ns` equally.
+pub(crate) fn lights_of_planes(
+    schedule: &PlaneSchedule,
+    exposure_ns: i64,
+) -> impl Iterator<Item = (i64, f64)> + '_ {
+    let halves = 2 * schedule.len() as i128;
+    schedule.planes().iter().enumerate().map(move |(i, plane)| {
+        let middle = i128::from(exposure_ns.max(0)) * halves_of(i) / halves;
+        (middle as i64, f64::from(1u32 << plane.bit))
+    })
 }
 
 #[cfg(test)]
@@ -36,6 +64,18 @@ mod tests {
     #[test]
     fn the_order_of_rgb24_has_its_centre_at_194_us() {
         assert_eq!((centre_ns(&PlaneSchedule::rgb24(), SLOT) + 500) / 1000, 194);
+    }
+
+    #[test]
+    fn the_centre_is_the_mean_of_the_planes_lights() {
+        for schedule in [PlaneSchedule::rgb24(), PlaneSchedule::mono8(), PlaneSchedule::equal24()] {
+            let (mut sum, mut weights) = (0.0, 0.0);
+            for (middle, weight) in lights_of_planes(&schedule, SLOT) {
+                sum += middle as f64 * weight;
+                weights += weight;
+            }
+            assert!((sum / weights - centre_ns(&schedule, SLOT) as f64).abs() <= 1.0);
+        }
     }
 
     /// The centres of a schedule and of its mirror image lie at equal distances from the middle. With equal weights

@@ -193,6 +193,14 @@ pub struct Report {
     /// The same for frames that were lit in their own slot, so that lateness does not contribute.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub registration_error_in_time_px: Option<Spread>,
+    /// Distance from a surface point to the mean of the light that it should have had, plane by plane, each with its
+    /// intensity and at its own instant: what an eye sees that follows the point. Of every 16th frame; null without
+    /// ground truth.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub followed_offset_px: Option<Spread>,
+    /// Root mean square distance of that light from its mean: by how much the planes' motion smears it.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub followed_smear_px: Option<Spread>,
     /// True beginning of a slot minus the host's estimate, as observed by the mock in this process at real pace.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub clock_error_ms: Option<Latency>,
@@ -276,6 +284,8 @@ impl Default for Report {
             registration_error_px: None,
             registration_error_unpredicted_px: None,
             registration_error_in_time_px: None,
+            followed_offset_px: None,
+            followed_smear_px: None,
             clock_error_ms: None,
             registration_error_at: None,
             motion_to_first_photon_ms: None,

@@ -80,6 +80,12 @@ impl Report {
         if let Some(error) = self.registration_error_unpredicted_px {
             table.row("  without prediction", format!("{} px", percentiles(error)));
         }
+        if let Some(offset) = self.followed_offset_px {
+            table.row("  seen by a following eye", format!("{} px", percentiles(offset)));
+        }
+        if let Some(smear) = self.followed_smear_px {
+            table.row("    smeared by", format!("{} px (root mean square)", percentiles(smear)));
+        }
     }
 
     fn latency_rows(&self, table: &mut Table) {

@@ -363,9 +363,12 @@ impl Crew {
     fn wait_for_gpu(&mut self, now: HostTime) {
         // While it waits it reports in time; so nothing is overdue.
         self.pulses[2].end();
-        let limit_ns = self.pack.limit_ns();
-        let until = (!self.gpu.is_empty()).then(|| now.plus_ns(limit_ns as i64));
-        self.packing = Packing::Waits { until, limit_ns };
+        if self.gpu.is_empty() {
+            self.packing = Packing::Waits { until: None, limit_ns: 0 };
+            return;
+        }
+        let limit_ns = self.pack.wait_from(now);
+        self.packing = Packing::Waits { until: Some(now.plus_ns(limit_ns as i64)), limit_ns };
     }
 
     fn pack<M: Machine>(&mut self, now: HostTime, facts: &Arc<Facts>, machine: &mut M, line: &mut Line) {
@@ -400,6 +403,7 @@ impl Crew {
             return;
         }
         self.pulses[2].beat(now, WAIT_NS + STEP_NS);
+        self.pack.wait_is_over();
         job.note.cost = Some(Default::default());
         job.note.timeline.rendered_at = now;
         self.pack.rendered(&job.note, now);

@@ -362,7 +362,7 @@ impl Running {
         let facts = Arc::new(Facts::new(rig.clone(), monitor, options, &lead, now));
         let (lights_in, lights) = channel::<LightNote>(LIGHTS, WaitPolicy::Park);
         let (done_in, done) = channel(2 * NOTES, WaitPolicy::Park);
-        let keeper = LinkKeeper::new(time, &link, Some(lights_in));
+        let keeper = LinkKeeper::new(time, &link, Some((lights_in, rig.config.projector.light_delay_ns())));
         let stage = LinkStage::new(facts.clone(), link, keeper, lead);
         let mut line = Line::new(stage, done_in, now);
         let tracker = run.machine.opens_tracker(now);

@@ -4,7 +4,7 @@ use super::*;
 
 /// A cable that loses, damages, repeats and swaps packets.
 struct BadCable {
-    inner: Direct<MockProjector>,
+    inner: Direct<ProjectorFirmware>,
     draws: Draws,
     sent: u64,
     per_mille: u64,
@@ -72,7 +72,7 @@ proptest! {
     #[test]
     fn a_bad_cable_never_lights_a_wrong_frame(seed in any::<u64>(), per_mille in 0u64..200, codecs in 0u32..16) {
         let r = Raster::new(64, 16).unwrap();
-        let mock = MockProjector::new(MockConfig::new(r));
+        let mock = ProjectorFirmware::new(FirmwareConfig::new(r));
         let cable =
             BadCable { inner: Direct::new(mock), draws: Draws::new(seed), sent: 0, per_mille: 0, held: None };
         let s = LinkSettings { raster: r, codecs, late_slots: 2, ..settings() };
@@ -116,7 +116,7 @@ proptest! {
         messages in prop::collection::vec((1u8..14, any::<u32>(), prop::collection::vec(any::<u8>(), 0..70), any::<bool>()), 0..60),
         armed in any::<bool>(),
     ) {
-        let mut rig = clean(settings(), MockConfig::new(raster()));
+        let mut rig = clean(settings(), FirmwareConfig::new(raster()));
         if armed {
             rig.stream();
         }

@@ -1,11 +1,11 @@
 //! Applies packets to the projector's state, with every check between a byte and light.
 
-use dpm_device::link::{
+use crate::link::{
     frame_newer, Assembly, Codec, Commit, ConfigRefusal, Echo, FaultCode, Header, HostMessage, MessageType,
     PacketSink, RleDecoder,
 };
-use dpm_device::time::DeviceTicks;
-use dpm_device::transport::Lane;
+use crate::time::DeviceTicks;
+use crate::transport::Lane;
 
 use super::frames::{Assembling, Held, Pending};
 use super::{Core, Mode, ECHOES_KEPT, MAX_LEAD_S};
@@ -282,7 +282,7 @@ impl Core {
                 return;
             }
             HostMessage::Stop => return self.disarm(),
-            HostMessage::Safe => return self.latch(dpm_device::link::faults::HOST_SAFE),
+            HostMessage::Safe => return self.latch(crate::link::faults::HOST_SAFE),
             HostMessage::Black if self.mode != Mode::Disarmed => {
                 self.mode = Mode::Black;
                 self.lit_now = false;

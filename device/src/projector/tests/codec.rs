@@ -1,14 +1,14 @@
 //! Compacted planes light the same frames as raw ones, and save the expected bytes.
 
 use super::*;
-use dpm_device::link::COMMIT_BYTES;
+use crate::link::COMMIT_BYTES;
 
 #[test]
 fn every_codec_saves_and_lights_the_same_frame() {
     let r = Raster::new(64, 16).unwrap();
     let raw_frame = (24 * (32 + r.plane_bytes() + 4) + 32 + COMMIT_BYTES + 4) as u64;
     for codecs in [0, Codec::Rle.mask(), Codec::XorRle.mask(), Codec::Lz4.mask(), Codec::ALL] {
-        let mut rig = clean(LinkSettings { raster: r, codecs, ..settings() }, MockConfig::new(r));
+        let mut rig = clean(LinkSettings { raster: r, codecs, ..settings() }, FirmwareConfig::new(r));
         rig.stream();
         let before = rig.link.counters().bytes_sent;
         for id in 0..40 {
@@ -58,7 +58,7 @@ fn codecs_are_what_both_sides_know() {
     let r = Raster::new(64, 16).unwrap();
     let mut rig = clean(
         LinkSettings { raster: r, codecs: Codec::ALL, ..settings() },
-        MockConfig { codecs: 0, ..MockConfig::new(r) },
+        FirmwareConfig { codecs: 0, ..FirmwareConfig::new(r) },
     );
     rig.stream();
     for id in 0..20 {

@@ -1,8 +1,8 @@
 //! The device's own limits on light: those of CONFIG, and those of its owner, which hold whatever the host requests.
 
-use dpm_device::link::{light_level, LightLimiter, LightLimits, LimitReached};
-use dpm_device::planes::{PlaneSchedule, Raster};
-use dpm_device::time::FrameRate;
+use crate::link::{light_level, LightLimiter, LightLimits, LimitReached};
+use crate::planes::{PlaneSchedule, Raster};
+use crate::time::FrameRate;
 
 /// One set of limits and its counts.
 #[derive(Debug)]

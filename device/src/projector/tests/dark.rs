@@ -14,7 +14,7 @@ fn send<T: Transport>(rig: &mut Rig<T>, id: u64, slot: u64, dark_from: DeviceTic
 }
 
 /// Advances the mock to `tick` (its clock is ideal) while the host still talks, as one does whose renderer hangs.
-fn live(rig: &mut Rig<Direct<MockProjector>>, tick: u64) {
+fn live(rig: &mut Rig<Direct<ProjectorFirmware>>, tick: u64) {
     while rig.now.0 + 1_000_000 < tick as i64 {
         rig.now = rig.now.plus_ns(1_000_000);
         rig.poll().unwrap();
@@ -24,8 +24,8 @@ fn live(rig: &mut Rig<Direct<MockProjector>>, tick: u64) {
     rig.cable.device().check_laws();
 }
 
-fn armed() -> (Rig<Direct<MockProjector>>, dpm_device::link::SlotClock) {
-    let mut rig = clean(LinkSettings { late_slots: 100, ..settings() }, MockConfig::new(raster()));
+fn armed() -> (Rig<Direct<ProjectorFirmware>>, crate::link::SlotClock) {
+    let mut rig = clean(LinkSettings { late_slots: 100, ..settings() }, FirmwareConfig::new(raster()));
     rig.stream();
     let slots = rig.link.slots().unwrap();
     (rig, slots)
@@ -172,7 +172,7 @@ fn a_frame_that_ends_before_it_begins_has_a_wrong_field() {
             let payload = &bytes[plane * plane_bytes..(plane + 1) * plane_bytes];
             rig.cable.send(rig.now, Lane::Data, &[Packet::new(header, payload)]).unwrap();
         }
-        let commit = dpm_device::link::Commit {
+        let commit = crate::link::Commit {
             sent: (1 << 24) - 1,
             kept: 0,
             base_frame: 0,
@@ -180,7 +180,7 @@ fn a_frame_that_ends_before_it_begins_has_a_wrong_field() {
             dark_from,
         };
         let mut payload = [0; MAX_CONTROL_BYTES];
-        let (kind, n) = dpm_device::link::HostMessage::Commit(commit).write(&mut payload);
+        let (kind, n) = crate::link::HostMessage::Commit(commit).write(&mut payload);
         let commit = Packet::new(Header { kind, ..header }, &payload[..n]);
         rig.cable.send(rig.now, Lane::Data, &[commit]).unwrap();
         rig.cable.device().check_laws();
@@ -247,7 +247,7 @@ proptest! {
     ) {
         let clock = DeviceClock { tick_hz: 27_000_000, skew_ppb, ..DeviceClock::IDEAL };
         let s = LinkSettings { late_slots, watchdog_us: 10_000_000, ..settings() };
-        let mut rig = clean(s, MockConfig { clock, ..MockConfig::new(raster()) });
+        let mut rig = clean(s, FirmwareConfig { clock, ..FirmwareConfig::new(raster()) });
         rig.stream();
         let slots = rig.link.slots().unwrap();
         let mut ends = std::collections::HashMap::new();

@@ -2,7 +2,7 @@
 //! questions).
 
 use super::*;
-use dpm_device::link::{Commit, HostHello, HostMessage};
+use crate::link::{Commit, HostHello, HostMessage};
 
 /// A packet of a host.
 fn packet(session: u32, message: &HostMessage) -> Vec<u8> {
@@ -17,7 +17,7 @@ fn hello(session: u32, version: u16) -> Vec<u8> {
 }
 
 /// Sessions and messages of all the device's replies.
-fn answers(mock: &mut MockProjector, now: HostTime) -> Vec<(u32, DeviceMessage)> {
+fn answers(mock: &mut ProjectorFirmware, now: HostTime) -> Vec<(u32, DeviceMessage)> {
     let mut all = Vec::new();
     mock.replies(now, &mut |_, bytes| {
         let header = Header::decode(bytes[..32].try_into().unwrap()).unwrap();
@@ -50,8 +50,8 @@ fn frame(
     all
 }
 
-fn armed() -> (Rig<Direct<MockProjector>>, u32) {
-    let mut rig = clean(settings(), MockConfig::new(raster()));
+fn armed() -> (Rig<Direct<ProjectorFirmware>>, u32) {
+    let mut rig = clean(settings(), FirmwareConfig::new(raster()));
     rig.stream();
     let session = rig.cable.device().core.session;
     (rig, session)
@@ -100,7 +100,7 @@ fn a_hello_of_the_present_session_is_only_answered() {
 /// Question 7: the session number of the device's own packets.
 #[test]
 fn a_refused_hello_is_answered_under_its_own_number() {
-    let mut mock = MockProjector::new(MockConfig::new(raster()));
+    let mut mock = ProjectorFirmware::new(FirmwareConfig::new(raster()));
     for (open, asked) in [(0, 77), (9, 78)] {
         if open != 0 {
             mock.receive(HostTime(1), Lane::Control, &hello(open, 2));
@@ -122,8 +122,8 @@ fn a_refused_hello_is_answered_under_its_own_number() {
 /// Question 2: a whole frame is the base of the next one, whatever becomes of it.
 #[test]
 fn a_whole_frame_is_the_base_of_the_next_even_if_it_is_never_lit() {
-    let s = LinkSettings { codecs: dpm_device::link::Codec::ALL, ..settings() };
-    let mut rig = clean(s, MockConfig::new(raster()));
+    let s = LinkSettings { codecs: crate::link::Codec::ALL, ..settings() };
+    let mut rig = clean(s, FirmwareConfig::new(raster()));
     rig.stream();
     rig.idle(20);
     let picture = planes(7);
@@ -140,7 +140,7 @@ fn a_whole_frame_is_the_base_of_the_next_even_if_it_is_never_lit() {
     }
     let s = rig.cable.device().status();
     assert_eq!((s.frames_late, s.frames_refused, s.frames_incomplete), (1, 1, 0));
-    let commit = dpm_device::link::packet_bytes(dpm_device::link::COMMIT_BYTES) as u64;
+    let commit = crate::link::packet_bytes(crate::link::COMMIT_BYTES) as u64;
     let before = rig.link.counters().frame_bytes_sent;
     let (target, dark_from) = rig.times(rig.slot + 3);
     // A refusal makes the host send a key frame; without another poll it does not know yet.
@@ -205,7 +205,7 @@ fn free_buffers_are_those_of_waiting_frames() {
     let k = rig.slot + 2;
     let slots = rig.link.slots().unwrap();
     let far = |k| (slots.start(k), slots.dark_from(k, LONG_NS));
-    let send = |rig: &mut Rig<Direct<MockProjector>>, id: u32, slot: u64, without: usize| {
+    let send = |rig: &mut Rig<Direct<ProjectorFirmware>>, id: u32, slot: u64, without: usize| {
         for bytes in frame(session, id, far(slot), id, without) {
             let now = rig.now;
             rig.cable.device_mut().receive(now, Lane::Data, &bytes);
@@ -272,34 +272,4 @@ fn damaged_planes_do_not_feed_the_watchdog() {
         let faults = rig.cable.device().status().faults;
         assert_eq!(faults, if damaged { faults::WATCHDOG } else { 0 });
     }
-}
-
-/// Question 11: on a slow line no STATUS waits behind another, and an ECHO's answer behind at most one.
-#[test]
-fn no_status_is_queued_behind_another() {
-    use crate::projector::serial::SerialProjector;
-    let (mut rig, _) = armed();
-    rig.step(1);
-    let now = rig.now;
-    let mut line = SerialProjector::new(rig.cable.into_device());
-    let one = line.replies(now).len();
-    assert!((100..300).contains(&one), "{one} bytes");
-    // Nothing is taken for forty slots.
-    for slot in 1..40 {
-        let now = now.plus_ns(slot * 1_055_966);
-        assert_eq!(line.replies(now).len(), one);
-    }
-    // Half of it, then the rest: only then there is one more STATUS, a present one.
-    let now = now.plus_ns(40 * 1_055_966);
-    line.replies(now).drain(..one / 2);
-    assert_eq!(line.replies(now).len(), one - one / 2);
-    line.replies(now).clear();
-    let fresh = line.replies(now).clone();
-    let mut packet = Vec::new();
-    dpm_device::cobs::Deframer::new([0; 256]).push(&fresh, &mut |frame| packet = frame.to_vec());
-    let DeviceMessage::Status(status) = DeviceMessage::parse(MessageType::Status, &packet[32..128]).unwrap()
-    else {
-        unreachable!()
-    };
-    assert_eq!(status.now, line.projector().clock().ticks_at(now));
 }

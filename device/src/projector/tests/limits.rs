@@ -1,7 +1,7 @@
 //! Limits on light, kept by the host, and by the device alone.
 
 use super::*;
-use dpm_device::link::{light_level, FULL_LUMINANCE, FULL_WHITE_LEVEL};
+use crate::link::{light_level, FULL_LUMINANCE, FULL_WHITE_LEVEL};
 use proptest::prelude::*;
 
 /// A picture whose level is near `level`, 0 to 1: the planes of the highest weights are fully lit.
@@ -20,7 +20,7 @@ fn picture(level: f64) -> Vec<u8> {
 }
 
 /// Level of every slot so far, as the mock lit it.
-fn watch(rig: &mut Rig<Direct<MockProjector>>, levels: &mut Vec<u32>) {
+fn watch(rig: &mut Rig<Direct<ProjectorFirmware>>, levels: &mut Vec<u32>) {
     let mock = rig.cable.device_mut();
     while let Some(event) = mock.next_light() {
         let level = match event.kind {
@@ -68,7 +68,7 @@ proptest! {
 
     #[test]
     fn whatever_is_shown_the_host_keeps_every_window_and_the_device_never_has_to(seed in any::<u64>()) {
-        let setup = MockConfig { flash_limit: None, ..MockConfig::new(raster()) };
+        let setup = FirmwareConfig { flash_limit: None, ..FirmwareConfig::new(raster()) };
         let mut rig = clean(limited(), setup);
         rig.stream();
         let mut levels = Vec::new();
@@ -87,15 +87,16 @@ proptest! {
 fn a_device_keeps_the_limits_under_a_host_that_does_not() {
     // Limits of the device's owner, and of a CONFIG from a host that then ignores them.
     for owner in [true, false] {
-        let setup =
-            MockConfig { limits: if owner { LIMITS } else { LightLimits::OFF }, ..MockConfig::new(raster()) };
+        let setup = FirmwareConfig {
+            limits: if owner { LIMITS } else { LightLimits::OFF },
+            ..FirmwareConfig::new(raster())
+        };
         let mut rig = clean(LinkSettings { watchdog_us: 10_000_000, ..settings() }, setup);
         rig.stream();
         if !owner {
             let session = rig.cable.device().core.session;
             let Some((config, _)) = rig.cable.device().core.config else { panic!("configured") };
-            let config =
-                dpm_device::link::HostMessage::Config(dpm_device::link::Config { limits: LIMITS, ..config });
+            let config = crate::link::HostMessage::Config(crate::link::Config { limits: LIMITS, ..config });
             let mut payload = [0; MAX_CONTROL_BYTES];
             let (kind, n) = config.write(&mut payload);
             let packet = Packet::new(Header::control(kind, session, 0), &payload[..n]);
@@ -138,7 +139,7 @@ fn asking_anew_does_not_make_a_device_forget() {
     // Half a window of light, a new CONFIG with the same limits, and the other half.
     let mut rig = clean(
         LinkSettings { watchdog_us: 10_000_000, ..settings() },
-        MockConfig { limits: LIMITS, ..MockConfig::new(raster()) },
+        FirmwareConfig { limits: LIMITS, ..FirmwareConfig::new(raster()) },
     );
     let mut levels = Vec::new();
     for session in 0..20u64 {
@@ -157,8 +158,10 @@ fn asking_anew_does_not_make_a_device_forget() {
 #[test]
 fn light_within_the_limits_is_the_same_bit_for_bit() {
     let run = |limits: LightLimits| {
-        let mut rig =
-            clean(LinkSettings { limits, ..settings() }, MockConfig { limits, ..MockConfig::new(raster()) });
+        let mut rig = clean(
+            LinkSettings { limits, ..settings() },
+            FirmwareConfig { limits, ..FirmwareConfig::new(raster()) },
+        );
         rig.stream();
         let mut lit = Vec::new();
         for id in 0..3000u64 {
@@ -182,7 +185,7 @@ fn light_within_the_limits_is_the_same_bit_for_bit() {
 fn a_rest_of_the_limiters_never_ends_an_operators_black() {
     for verb in [Verb::Black, Verb::Freeze] {
         let s = LinkSettings { flash_limit: Some(3), limits: LIMITS, watchdog_us: 10_000_000, ..settings() };
-        let mut rig = clean(s, MockConfig::new(raster()));
+        let mut rig = clean(s, FirmwareConfig::new(raster()));
         rig.stream();
         for id in 0..20 {
             rig.step_with(id, &picture(0.3));
@@ -206,7 +209,7 @@ fn a_rest_of_the_limiters_never_ends_an_operators_black() {
 /// A frozen frame is light too.
 #[test]
 fn a_frozen_picture_is_counted_and_stays_dark_after_it_struck() {
-    let mut rig = clean(limited(), MockConfig::new(raster()));
+    let mut rig = clean(limited(), FirmwareConfig::new(raster()));
     rig.stream();
     for id in 0..100 {
         rig.step_with(id, &picture(0.8));

@@ -4,7 +4,7 @@
 //! pixel receives `code / 255` of the light of a full slot, where `code` is the number that its bits form: light **is**
 //! the code value.
 
-use dpm_device::planes::{Channel, PlaneSchedule, Raster};
+use crate::planes::{Channel, PlaneSchedule, Raster, MAX_PLANES};
 
 /// Eight rows of 64 bits, read as eight 8 x 8 bit matrices side by side, one in each byte: transposes all of them, so that bit `i` of
 /// byte `c` of row `j` becomes bit `j` of byte `c` of row `i` (block swaps of 4, 2 and 1 bits \[HackersDelight\] 7-3).
@@ -18,6 +18,17 @@ fn transpose(rows: &mut [u64; 8]) {
     }
 }
 
+/// Eight rows of eight bytes: byte `c` of row `j` becomes byte `j` of row `c` (block swaps of 4, 2 and 1 bytes).
+fn transpose_bytes(rows: &mut [u64; 8]) {
+    for (step, mask) in [(4, 0x0000_0000_ffff_ffff), (2, 0x0000_ffff_0000_ffff), (1, 0x00ff_00ff_00ff_00ff)] {
+        for i in (0..8).filter(|i| i & step == 0) {
+            let t = ((rows[i] >> (8 * step)) ^ rows[i + step]) & mask;
+            rows[i + step] ^= t;
+            rows[i] ^= t << (8 * step);
+        }
+    }
+}
+
 /// Light of one frame for every mirror, rows top to bottom, red green blue code values 0..=255. `planes` holds the
 /// frame's planes one after the other in the order of `schedule`. Planes of [`Channel::White`] light all three
 /// channels; a sum above full light is clamped.
@@ -25,45 +36,88 @@ fn transpose(rows: &mut [u64; 8]) {
 /// # Panics
 /// When a slice does not have the size that raster and schedule demand.
 pub fn light_of_planes(raster: Raster, schedule: &PlaneSchedule, planes: &[u8], out: &mut [[u8; 3]]) {
-    let plane_bytes = raster.plane_bytes();
-    assert_eq!(planes.len(), plane_bytes * schedule.len(), "bytes of planes");
+    assert_eq!(planes.len(), raster.plane_bytes() * schedule.len(), "bytes of planes");
     assert_eq!(out.len(), raster.pixel_count(), "pixels of light");
-    let (row_bytes, width) = (raster.row_bytes(), raster.width() as usize);
     if schedule.has_repeats() {
         return light_of_repeats(raster, schedule, planes, out);
     }
+    let width = raster.width() as usize;
     let has_white = schedule.planes().iter().any(|p| p.channel == Channel::White);
-    for (y, row) in out.chunks_exact_mut(width).enumerate() {
-        for (run, pixels) in row.chunks_mut(64).enumerate() {
+    let mut places = [(Channel::Red, 0); MAX_PLANES];
+    for (place, spec) in places.iter_mut().zip(schedule.planes()) {
+        *place = (spec.channel, spec.bit);
+    }
+    gather_bits(raster, &places[..schedule.len()], planes, |y, x, run| {
+        let [red, green, blue, white] = run.channels;
+        let out = &mut out[y * width + x..][..run.pixels];
+        for ((pixel, red), (green, blue)) in out.iter_mut().zip(red).zip(green.iter().zip(blue)) {
+            *pixel = [*red, *green, *blue];
+        }
+        if has_white {
+            for (pixel, white) in out.iter_mut().zip(white) {
+                *pixel = pixel.map(|p| p.saturating_add(*white));
+            }
+        }
+    });
+}
+
+/// Up to 64 mirrors of a row, in the order of reading.
+#[derive(Debug)]
+pub struct Run<'a> {
+    /// How many; what follows them in the channels has no meaning.
+    pub pixels: usize,
+    /// Their red, green, blue and white.
+    pub channels: [&'a [u8; 64]; 4],
+}
+
+/// Gathers the bits of planes into one byte for each channel of each mirror. `planes` holds planes one after the other,
+/// and the `k`-th of `places` says which bit of which channel the `k`-th plane is; no two are the same, and bits without
+/// a plane are 0. `sink` gets the row, the column of the first mirror, and the mirrors from there on. Runs follow each
+/// other in the order of reading.
+///
+/// # Panics
+/// When `planes` is shorter than raster and places demand.
+pub fn gather_bits(
+    raster: Raster,
+    places: &[(Channel, u8)],
+    planes: &[u8],
+    mut sink: impl FnMut(usize, usize, Run<'_>),
+) {
+    let (plane_bytes, row_bytes, width) = (raster.plane_bytes(), raster.row_bytes(), raster.width() as usize);
+    let is_used = [Channel::Red, Channel::Green, Channel::Blue, Channel::White]
+        .map(|channel| places.iter().any(|(used, _)| *used == channel));
+    let mut gathered = [[0u8; 64]; 4];
+    for y in 0..raster.height() as usize {
+        for x in (0..width).step_by(64) {
             // Eight bytes of every plane: row `bit` of its channel's matrices.
-            let n = pixels.len().div_ceil(8);
-            let at = y * row_bytes + run * 8;
+            let pixels = (width - x).min(64);
+            let n = pixels.div_ceil(8);
+            let at = y * row_bytes + x / 8;
             let mut codes = [[0u64; 8]; 4];
-            for (spec, plane) in schedule.planes().iter().zip(planes.chunks_exact(plane_bytes)) {
-                let word = match plane[at..at + n].first_chunk::<8>() {
+            for (k, (channel, bit)) in places.iter().enumerate() {
+                let bytes = &planes[k * plane_bytes + at..][..n];
+                let word = match bytes.first_chunk::<8>() {
                     Some(eight) => u64::from_le_bytes(*eight),
                     None => {
                         let mut tail = [0u8; 8];
-                        tail[..n].copy_from_slice(&plane[at..at + n]);
+                        tail[..n].copy_from_slice(bytes);
                         u64::from_le_bytes(tail)
                     }
                 };
-                codes[spec.channel as usize][spec.bit as usize] = word;
+                codes[*channel as usize][usize::from(bit & 7)] = word;
             }
-            for rows in &mut codes[..if has_white { 4 } else { 3 }] {
+            for ((rows, out), _) in codes.iter_mut().zip(&mut gathered).zip(is_used).filter(|(_, used)| *used)
+            {
                 transpose(rows);
-            }
-            // Now row `j` holds, in byte `c`, the code of the mirror at bit `j` of byte `c`: bit 7 is the leftmost.
-            let bytes = codes.map(|rows| rows.map(u64::to_le_bytes));
-            for (c, eight) in pixels.chunks_mut(8).enumerate() {
-                for (k, pixel) in eight.iter_mut().enumerate() {
-                    let code = |channel: usize| bytes[channel][7 - k][c];
-                    *pixel = [code(0), code(1), code(2)];
-                    if has_white {
-                        *pixel = pixel.map(|p| p.saturating_add(code(3)));
-                    }
+                // Now row `j` holds, in byte `c`, the code of the mirror at bit `j` of byte `c`: bit 7 is the leftmost.
+                rows.reverse();
+                transpose_bytes(rows);
+                for (eight, row) in out.chunks_exact_mut(8).zip(rows) {
+                    eight.copy_from_slice(&row.to_le_bytes());
                 }
             }
+            let [red, green, blue, white] = &gathered;
+            sink(y, x, Run { pixels, channels: [red, green, blue, white] });
         }
     }
 }
@@ -140,7 +194,7 @@ impl Exposure {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use dpm_device::planes::PlaneSpec;
+    use crate::planes::PlaneSpec;
     use proptest::prelude::*;
 
     /// One bit at a time, as the definition says: the oracle.

@@ -4,19 +4,20 @@ mod cable;
 mod codec;
 mod dark;
 mod limits;
+mod panel;
 mod protocol;
 mod safety;
 
 use super::*;
-use dpm_device::link::{
+use crate::link::{
     DropReason, Epoch, HostLink, LightLimits, LinkError, LinkSettings, LinkState, MessageType, SendOutcome,
-    Verb,
+    Underrun, Verb,
 };
-use dpm_device::planes::PlaneSchedule;
-use dpm_device::rng::Draws;
-use dpm_device::time::FrameRate;
-use dpm_device::transport::inproc::Direct;
-use dpm_device::transport::{SendError, Transport, TransportError};
+use crate::planes::PlaneSchedule;
+use crate::rng::Draws;
+use crate::time::FrameRate;
+use crate::transport::inproc::Direct;
+use crate::transport::{SendError, Transport, TransportError};
 use proptest::prelude::*;
 
 const WATCHDOG_US: u32 = 50_000;
@@ -83,10 +84,10 @@ struct Rig<T> {
     slot: u64,
 }
 
-fn clean(settings: LinkSettings, setup: MockConfig) -> Rig<Direct<MockProjector>> {
+fn clean(settings: LinkSettings, setup: FirmwareConfig) -> Rig<Direct<ProjectorFirmware>> {
     Rig {
         link: HostLink::new(settings),
-        cable: Direct::new(MockProjector::new(setup)),
+        cable: Direct::new(ProjectorFirmware::new(setup)),
         now: HostTime(0),
         slot: 0,
     }
@@ -154,21 +155,15 @@ fn laws(s: &Status, waiting: u32) {
     );
 }
 
-impl MockProjector {
-    /// Frames in flight.
-    pub(super) fn waiting(&self) -> u32 {
-        let assembling = self.core.store.assembling.is_some_and(|a| a.buffer.is_some());
-        self.core.store.waiting() as u32 + u32::from(assembling)
-    }
-
+impl ProjectorFirmware {
     pub(super) fn check_laws(&self) {
-        laws(&self.status(), self.waiting());
+        laws(&self.status(), self.in_flight());
     }
 }
 
 #[test]
 fn light_is_the_code_values_of_the_frame_at_its_slot() {
-    let mut rig = clean(settings(), MockConfig::new(raster()));
+    let mut rig = clean(settings(), FirmwareConfig::new(raster()));
     rig.stream();
     let mut sent = Vec::new();
     let mut lit = 0;
@@ -213,7 +208,7 @@ fn light_is_the_code_values_of_the_frame_at_its_slot() {
 
 #[test]
 fn no_light_without_hello_config_and_arm() {
-    let mut rig = clean(settings(), MockConfig::new(raster()));
+    let mut rig = clean(settings(), FirmwareConfig::new(raster()));
     // Planes at a device that was never greeted.
     let header = Header { frame: 1, ..Header::control(MessageType::Plane, 5, 0) };
     rig.cable.send(rig.now, Lane::Data, &[Packet::new(header, &planes(1)[..9])]).unwrap();
@@ -237,7 +232,7 @@ fn no_light_without_hello_config_and_arm() {
 
 #[test]
 fn silence_is_dark_at_the_watchdogs_tick_and_stays_dark() {
-    let mut rig = clean(settings(), MockConfig::new(raster()));
+    let mut rig = clean(settings(), FirmwareConfig::new(raster()));
     rig.stream();
     for id in 0..20 {
         rig.step(id);
@@ -274,7 +269,7 @@ fn silence_is_dark_at_the_watchdogs_tick_and_stays_dark() {
 #[test]
 fn a_missing_frame_repeats_or_blanks_by_policy() {
     for (underrun, kind) in [(Underrun::Repeat, LightKind::Repeated), (Underrun::Blank, LightKind::Blank)] {
-        let mut rig = clean(LinkSettings { underrun, ..settings() }, MockConfig::new(raster()));
+        let mut rig = clean(LinkSettings { underrun, ..settings() }, FirmwareConfig::new(raster()));
         rig.stream();
         for id in 0..6 {
             rig.step(id);
@@ -293,7 +288,7 @@ fn a_missing_frame_repeats_or_blanks_by_policy() {
 #[test]
 fn the_newest_due_frame_wins_and_late_ones_are_dropped_unless_asked() {
     for late_slots in [0u8, 3] {
-        let mut rig = clean(LinkSettings { late_slots, ..settings() }, MockConfig::new(raster()));
+        let mut rig = clean(LinkSettings { late_slots, ..settings() }, FirmwareConfig::new(raster()));
         rig.stream();
         let slots = rig.link.slots().unwrap();
         let send = |rig: &mut Rig<_>, id, slot| {
@@ -324,7 +319,7 @@ fn the_newest_due_frame_wins_and_late_ones_are_dropped_unless_asked() {
 
 #[test]
 fn credit_is_what_the_buffers_hold() {
-    let mut rig = clean(settings(), MockConfig { frame_buffers: 3, ..MockConfig::new(raster()) });
+    let mut rig = clean(settings(), FirmwareConfig { frame_buffers: 3, ..FirmwareConfig::new(raster()) });
     rig.stream();
     // Frames for a distant slot fill the buffers; the fourth has no credit; when they are lit, credit returns.
     let (target, dark_from) = rig.times(rig.slot + 100);
@@ -346,10 +341,10 @@ fn credit_is_what_the_buffers_hold() {
 
 #[test]
 fn verbs_darken_hold_and_latch() {
-    let mut rig = clean(settings(), MockConfig::new(raster()));
+    let mut rig = clean(settings(), FirmwareConfig::new(raster()));
     rig.stream();
     let mut id = 0;
-    let mut run = |rig: &mut Rig<Direct<MockProjector>>, n| {
+    let mut run = |rig: &mut Rig<Direct<ProjectorFirmware>>, n| {
         for _ in 0..n {
             id += 1;
             rig.step(id);
@@ -393,7 +388,7 @@ fn verbs_darken_hold_and_latch() {
 
 #[test]
 fn a_present_fault_cannot_be_acknowledged_away() {
-    let mut rig = clean(settings(), MockConfig::new(raster()));
+    let mut rig = clean(settings(), FirmwareConfig::new(raster()));
     rig.stream();
     for id in 0..5 {
         rig.step(id);
@@ -411,7 +406,7 @@ fn a_present_fault_cannot_be_acknowledged_away() {
 
 #[test]
 fn a_device_that_lost_its_power_is_greeted_again_and_stays_dark() {
-    let mut rig = clean(settings(), MockConfig::new(raster()));
+    let mut rig = clean(settings(), FirmwareConfig::new(raster()));
     rig.stream();
     for id in 0..5 {
         rig.step(id);
@@ -428,7 +423,7 @@ fn a_device_that_lost_its_power_is_greeted_again_and_stays_dark() {
 
 #[test]
 fn impossible_rigs_are_refused_by_name() {
-    let check = |s: LinkSettings, setup: MockConfig| {
+    let check = |s: LinkSettings, setup: FirmwareConfig| {
         let mut rig = clean(s, setup);
         rig.link.connect();
         let _ = rig.poll();
@@ -436,15 +431,15 @@ fn impossible_rigs_are_refused_by_name() {
         assert_eq!(rig.link.state(), LinkState::Closed);
         result.unwrap_err().to_string()
     };
-    let big = MockConfig::new(Raster::new(1024, 768).unwrap());
+    let big = FirmwareConfig::new(Raster::new(1024, 768).unwrap());
     assert!(check(settings(), big).contains("1024x768 mirrors, the rig is configured for 20x3"));
     let fast = LinkSettings { rate: FrameRate::new(1000, 1).unwrap(), ..settings() };
-    let text = check(fast, MockConfig::new(raster()));
+    let text = check(fast, FirmwareConfig::new(raster()));
     assert!(
         text.contains("24 planes at 1000.000 Hz leave 41666 ns for a plane, the mirrors need 43220 ns"),
         "{text}"
     );
-    let old = MockConfig { version: 9, ..MockConfig::new(raster()) };
+    let old = FirmwareConfig { version: 9, ..FirmwareConfig::new(raster()) };
     let text = check(settings(), old);
     assert!(text.contains("version 9, this program 2"), "{text}");
 }
@@ -458,7 +453,7 @@ fn a_skewed_clock_lights_on_its_own_slots() {
         power_on_at: HostTime(-5),
     };
     let s = LinkSettings { epoch: Epoch::AfterHello(2_000_000), late_slots: 8, ..settings() };
-    let mut rig = clean(s, MockConfig { clock, ..MockConfig::new(raster()) });
+    let mut rig = clean(s, FirmwareConfig { clock, ..FirmwareConfig::new(raster()) });
     rig.stream();
     let slots = rig.link.slots().unwrap();
     let mut last = None;
@@ -506,7 +501,7 @@ fn the_documents_example_makes_light() {
         })
         .collect();
     let [hello, config, arm, plane, commit, stop] = &packets[..] else { panic!("{} packets", packets.len()) };
-    let mut mock = MockProjector::new(MockConfig::new(Raster::new(16, 1).unwrap()));
+    let mut mock = ProjectorFirmware::new(FirmwareConfig::new(Raster::new(16, 1).unwrap()));
     let mut states = Vec::new();
     for control in [hello, config, arm] {
         mock.receive(HostTime(0), Lane::Control, control);

@@ -1,6 +1,6 @@
 //! Converts true time to the ticks of a device's own clock, which runs at its own rate, and back.
 
-use dpm_device::time::{DeviceTicks, HostTime};
+use crate::time::{DeviceTicks, HostTime};
 
 /// A free-running counter: `start_ticks` at `power_on_at`, then `tick_hz * (1 + skew_ppb / 1e9)` ticks a second.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]

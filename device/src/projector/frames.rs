@@ -1,6 +1,6 @@
 //! Assembles planes into whole frames that wait to be lit, in a fixed set of buffers.
 
-use dpm_device::time::DeviceTicks;
+use crate::time::DeviceTicks;
 
 /// A frame of which something has arrived.
 #[derive(Clone, Copy, Debug)]
@@ -87,9 +87,9 @@ impl FrameStore {
         target[at..at + len].copy_from_slice(&source[at..at + len]);
     }
 
-    #[cfg(test)]
-    pub(super) fn waiting(&self) -> usize {
-        self.pending.len()
+    /// Frames that wait, and the one that is arriving.
+    pub(super) fn in_flight(&self) -> usize {
+        self.pending.len() + usize::from(self.assembling.is_some_and(|a| a.buffer.is_some()))
     }
 
     pub(super) fn free(&self) -> usize {
@@ -112,8 +112,7 @@ impl FrameStore {
 
     /// Clears everything: no frame waits, is lit or can be referred to. Returns the number of dropped frames.
     pub(super) fn clear(&mut self) -> u32 {
-        let thrown =
-            self.pending.len() as u32 + u32::from(self.assembling.is_some_and(|a| a.buffer.is_some()));
+        let thrown = self.in_flight() as u32;
         self.assembling = None;
         self.pending.clear();
         self.lit = None;

@@ -3,11 +3,23 @@
 //! The thread never decides *when* light falls: it reads its clock and lets the state machine catch up, so the times of
 //! events are exact however late the thread runs. Only packets that wait for the thread arrive late.
 
-use dpm_device::time::HostTime;
-use dpm_device::transport::inproc::DeviceEnd;
-use dpm_device::transport::{Lane, LinkDevice};
+use crate::time::HostTime;
+use crate::transport::inproc::DeviceEnd;
+use crate::transport::{Lane, LinkDevice};
 
-use super::Served;
+use super::ProjectorFirmware;
+
+/// A device that can be served on a cable: it reports the time of its next own event.
+pub trait Served: LinkDevice {
+    /// Time of the next own event; `None` if there is none.
+    fn next_due(&self) -> Option<HostTime>;
+}
+
+impl Served for ProjectorFirmware {
+    fn next_due(&self) -> Option<HostTime> {
+        Self::next_due(self)
+    }
+}
 
 /// Longest sleep of a thread whose projector has no due event.
 const REST_NS: i64 = 1_000_000_000;
@@ -60,14 +72,14 @@ impl<P: Served, W: FnMut(&mut P, HostTime) + Send> LinkDevice for Witnessed<'_, 
 
 #[cfg(test)]
 mod tests {
-    use super::super::{LightKind, MockConfig, MockProjector};
+    use super::super::{FirmwareConfig, LightKind, ProjectorFirmware};
     use super::*;
-    use dpm_device::link::{
+    use crate::link::{
         packet_bytes, Epoch, HostLink, LightLimits, LinkSettings, LinkState, Underrun, COMMIT_BYTES,
     };
-    use dpm_device::planes::{PlaneSchedule, Raster};
-    use dpm_device::time::{DeviceTicks, FrameRate};
-    use dpm_device::transport::inproc::threaded;
+    use crate::planes::{PlaneSchedule, Raster};
+    use crate::time::{DeviceTicks, FrameRate};
+    use crate::transport::inproc::threaded;
     use dpm_handoff::wake::WaitPolicy;
     use std::time::{Duration, Instant};
 
@@ -81,7 +93,7 @@ mod tests {
         let start = Instant::now();
         let clock = move || HostTime(start.elapsed().as_nanos() as i64);
         let thread = std::thread::spawn(move || {
-            let mut mock = MockProjector::new(MockConfig::new(raster));
+            let mut mock = ProjectorFirmware::new(FirmwareConfig::new(raster));
             let mut lit = Vec::new();
             serve_cable(&mut mock, device, clock, |mock, now| {
                 mock.advance_to(now);
@@ -124,7 +136,7 @@ mod tests {
                         &planes,
                         &mut host,
                     );
-                    if outcome == dpm_device::link::SendOutcome::Sent {
+                    if outcome == crate::link::SendOutcome::Sent {
                         sent += 1;
                     }
                 }
@@ -140,7 +152,7 @@ mod tests {
         let s = mock.status();
         assert_eq!(lit.len() as u32, s.frames_lit);
         assert!(lit.windows(2).all(|w| w[0] < w[1]) && !lit.is_empty());
-        assert_eq!(s.frames_lit + s.frames_superseded + s.frames_late + mock.waiting(), 40, "{s:?}");
+        assert_eq!(s.frames_lit + s.frames_superseded + s.frames_late + mock.in_flight(), 40, "{s:?}");
         assert_eq!((s.payload_errors, s.header_errors, mock.credit_violations()), (0, 0, 0));
         let last = *lit.last().unwrap() as u8;
         assert!(mock.lit_planes().unwrap().iter().all(|&b| b == last));
@@ -152,14 +164,15 @@ mod tests {
     /// be compared with the truth.
     #[test]
     fn the_projectors_clock_is_right_while_frames_flow() {
-        use dpm_device::clock_map::ClockMap;
+        use crate::clock_map::ClockMap;
         let raster = Raster::new(1024, 768).unwrap();
         let frame_bytes = packet_bytes(raster.plane_bytes()) * 24 + packet_bytes(COMMIT_BYTES);
         let (mut host, device) = threaded(frame_bytes, 2, WaitPolicy::Park);
         let start = Instant::now();
         let clock = move || HostTime(start.elapsed().as_nanos() as i64);
         let thread = std::thread::spawn(move || {
-            let mut mock = MockProjector::new(MockConfig { events_kept: 0, ..MockConfig::new(raster) });
+            let mut mock =
+                ProjectorFirmware::new(FirmwareConfig { events_kept: 0, ..FirmwareConfig::new(raster) });
             serve_cable(&mut mock, device, clock, |mock, now| mock.advance_to(now));
         });
         let rate = FrameRate::new(500, 1).unwrap();
@@ -184,13 +197,13 @@ mod tests {
             // Once a slot, like a thread that has a frame to send, and not again before the next.
             match link.poll(clock(), &mut host).expect("in-process") {
                 LinkState::Ready => link.arm(0),
-                LinkState::Faulted => link.arm(dpm_device::link::faults::WATCHDOG),
+                LinkState::Faulted => link.arm(crate::link::faults::WATCHDOG),
                 LinkState::Streaming => {
                     let slots = link.slots().unwrap();
                     let slot = slots.slot_at(DeviceTicks(clock().0 as u64)).unwrap() + 2;
                     let (target, dark_from) = (slots.start(slot), slots.dark_from(slot, 100_000_000));
                     let outcome = link.send_frame(clock(), sent, target, dark_from, &planes, &mut host);
-                    sent += u64::from(outcome == dpm_device::link::SendOutcome::Sent);
+                    sent += u64::from(outcome == crate::link::SendOutcome::Sent);
                 }
                 _ => {}
             }
@@ -224,7 +237,7 @@ mod tests {
         let start = Instant::now();
         let clock = move || HostTime(start.elapsed().as_nanos() as i64);
         let thread = std::thread::spawn(move || {
-            let mut mock = MockProjector::new(MockConfig::new(raster));
+            let mut mock = ProjectorFirmware::new(FirmwareConfig::new(raster));
             serve_cable(&mut mock, device, clock, |mock, now| mock.advance_to(now));
         });
         // Its own sleep would last a second; it is woken during it.
@@ -254,7 +267,7 @@ mod tests {
         let thread = std::thread::spawn(move || {
             let id = std::fs::read_link("/proc/thread-self").unwrap();
             give.send(id.file_name().unwrap().to_str().unwrap().to_owned()).unwrap();
-            let mut mock = MockProjector::new(MockConfig::new(raster));
+            let mut mock = ProjectorFirmware::new(FirmwareConfig::new(raster));
             serve_cable(&mut mock, device, clock, |mock, now| mock.advance_to(now));
         });
         let id = take.recv().unwrap();

@@ -15,7 +15,7 @@ fn flashing(id: u64, half_period: u64) -> Vec<u8> {
 #[test]
 fn the_host_does_not_let_the_field_flash() {
     let s = LinkSettings { flash_limit: Some(3), watchdog_us: 3_000_000, ..settings() };
-    let mut rig = clean(s, MockConfig::new(raster()));
+    let mut rig = clean(s, FirmwareConfig::new(raster()));
     rig.stream();
     // 10 Hz: half a period is 47 slots.
     let mut dark_since = None;
@@ -42,7 +42,7 @@ fn the_host_does_not_let_the_field_flash() {
     assert_eq!(status.faults, 0, "the host is before the device: {status:?}");
     // A picture that does not flash is never dropped.
     let s = LinkSettings { flash_limit: Some(3), ..settings() };
-    let mut rig = clean(s, MockConfig::new(raster()));
+    let mut rig = clean(s, FirmwareConfig::new(raster()));
     rig.stream();
     for id in 0..3000 {
         assert_eq!(rig.step(id), SendOutcome::Sent);
@@ -51,7 +51,8 @@ fn the_host_does_not_let_the_field_flash() {
 
 #[test]
 fn a_device_does_not_trust_the_host_about_flashes() {
-    let mut rig = clean(LinkSettings { watchdog_us: 10_000_000, ..settings() }, MockConfig::new(raster()));
+    let mut rig =
+        clean(LinkSettings { watchdog_us: 10_000_000, ..settings() }, FirmwareConfig::new(raster()));
     rig.stream();
     let mut flashes = 0;
     let mut was_bright = false;
@@ -80,7 +81,7 @@ fn a_device_does_not_trust_the_host_about_flashes() {
 
 #[test]
 fn a_storm_of_damage_ends_the_light() {
-    let mut rig = clean(settings(), MockConfig::new(raster()));
+    let mut rig = clean(settings(), FirmwareConfig::new(raster()));
     rig.stream();
     for id in 0..10 {
         rig.step(id);

@@ -1,19 +1,19 @@
-//! The properties of the mock projector, and its reports of light.
+//! The properties of a projector, and its reports of light.
 
-use dpm_device::light::LightEvent;
-use dpm_device::link::{Codec, DeviceState, LightLimits, MAX_FLASHES_PER_S, VERSION};
-use dpm_device::planes::{PlaneSchedule, Raster};
-use dpm_device::time::HostTime;
+use crate::light::LightEvent;
+use crate::link::{Codec, DeviceState, LightLimits, MAX_FLASHES_PER_S, VERSION};
+use crate::planes::{PlaneSchedule, Raster};
+use crate::time::HostTime;
 use std::sync::Arc;
 
 use super::DeviceClock;
 
-/// The properties of the mock projector.
+/// The properties of a projector.
 #[derive(Clone, Copy, Debug)]
-pub struct MockConfig {
+pub struct FirmwareConfig {
     /// Mirrors.
     pub raster: Raster,
-    /// Most planes of a frame, 1 to [`dpm_device::planes::MAX_PLANES`].
+    /// Most planes of a frame, 1 to [`crate::planes::MAX_PLANES`].
     pub max_planes: u8,
     /// Whole frames that can wait, 1 to 64.
     pub frame_buffers: u8,
@@ -35,9 +35,9 @@ pub struct MockConfig {
     pub flash_limit: Option<u8>,
     /// Its own limits on light, whatever the host requests.
     pub limits: LightLimits,
-    /// Light events kept for [`super::MockProjector::next_light`]; when full, the oldest are dropped and counted.
+    /// Light events kept for [`super::ProjectorFirmware::next_light`]; when full, the oldest are dropped and counted.
     pub events_kept: usize,
-    /// Lit slots that are kept with their planes for [`super::MockProjector::next_shown`]; when full, the oldest are
+    /// Lit slots that are kept with their planes for [`super::ProjectorFirmware::next_shown`]; when full, the oldest are
     /// dropped and counted. Each holds a frame.
     pub shown_kept: usize,
 }
@@ -56,7 +56,7 @@ pub struct Shown {
     pub planes: Arc<[u8]>,
 }
 
-impl MockConfig {
+impl FirmwareConfig {
     /// A panel of `raster` with 24-plane memory for four waiting frames, an ideal clock, and mirrors that show a plane in
     /// 43.22 us (32,552 loads a second and 12.5 us of reset, as a DLP7000 does).
     pub fn new(raster: Raster) -> Self {

@@ -1,0 +1,19 @@
+//! A bit-plane projector whose panel is a display: any projector or monitor on HDMI or DisplayPort, driven through the
+//! kernel's mode setting (KMS).
+//!
+//! A display is the firmware of [`dpm_device::projector`] with the vertical blanks as its clock: one slot of the link is one
+//! blank. [`mode`] says what a mode is, [`set_up`] chooses connector, mode and properties or says why not, [`encoding`] puts
+//! planes into pixels, [`pacer`] follows the blanks, [`panel`] is the state machine, and [`transport`] its thread at the end
+//! of an in-process cable. [`kms`] is what is asked of the kernel, [`card`] the kernel, [`fake`] the one of tests.
+//!
+//! **Nothing of this has run on real hardware yet.**
+
+pub mod card;
+pub mod encoding;
+pub mod fake;
+pub mod kms;
+pub mod mode;
+pub mod pacer;
+pub mod panel;
+pub mod set_up;
+pub mod transport;

@@ -1,0 +1,277 @@
+//! Code values into halftones, for planes of equal light.
+//!
+//! Displays that carry one bit a plane, and sequences with one exposure time for all planes, give no plane more light
+//! than another. Grey is then the number of planes in which a mirror is on. `k` planes give a mirror `k + 1` levels;
+//! what is lost by that is shared out over each block of 8 x 8 mirrors and over time:
+//!
+//! - A mirror of code value `c` is on in `floor(c k / 255)` planes of its channel, or in one more. The number of mirrors
+//!   with one more is that which gives the block its mean; two frames, an even and an odd one, round it by different
+//!   amounts. So the mean level of a block differs by at most `0.75 * 255 / (64 k)` in a frame and by at most
+//!   `0.25 * 255 / (64 k)` over two frames: with 8 planes by 0.38 and 0.13 levels of 255.
+//! - Which mirrors have one more is decided by the remainder plus blue noise in space and time (\[Wolfe22\]), so what
+//!   remains of the pattern has no low frequencies.
+//! - The planes in which a mirror is on are spread evenly over the frame, and begin at a plane that blue noise chooses.
+//!   So all planes of an even field give equal light.
+//!
+//! Everything is integer arithmetic, so `shaders/glsl/halftone.comp` gives the same words.
+
+use crate::blue_noise;
+use dpm_device::planes::{Channel, PlaneSchedule, Raster};
+use dpm_shaders::specialization as ids;
+
+/// Mirrors in a row of a block.
+const SIDE: usize = 8;
+/// What is added to the sum of a block's remainders before it is divided by 255, in even and in odd frames: a quarter
+/// and three quarters.
+const ROUNDING: [u32; 2] = [63, 191];
+
+/// How planes of equal light show grey.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct Halftone {
+    /// Planes of each channel: 2 to 8, or to 24 if there is only white.
+    pub planes: u32,
+    /// All planes are white. They show the green code value.
+    pub white: bool,
+}
+
+impl Halftone {
+    /// That of `schedule`; `None` if its planes do not give equal light.
+    pub fn of(schedule: &PlaneSchedule) -> Option<Self> {
+        let white = schedule.planes()[0].channel == Channel::White;
+        schedule.equal_planes().map(|planes| Self { planes: planes.into(), white })
+    }
+
+    /// Specialization constants of the pass.
+    pub(crate) fn constants(self) -> [(u32, u32); 2] {
+        [(ids::HALFTONE_PLANES, self.planes), (ids::HALFTONE_WHITE, self.white.into())]
+    }
+
+    /// Where each channel's bits begin in a word, and where its code value begins.
+    fn channels(self) -> &'static [(u32, u32)] {
+        if self.white {
+            &[(0, 8)]
+        } else {
+            &[(0, 0), (8, 8), (16, 16)]
+        }
+    }
+
+    /// Number of planes of red, green and blue that light a mirror with the word `word`.
+    pub(super) fn ones(self, word: u32) -> [u32; 3] {
+        let all = (1u32 << self.planes) - 1;
+        match self.white {
+            true => [(word & all).count_ones(); 3],
+            false => [0, 8, 16].map(|at| (word >> at & all).count_ones()),
+        }
+    }
+}
+
+/// A pixel's value of the blue noise for a channel's remainders, and for the plane at which it begins.
+fn noise(x: usize, y: usize, frame: u32, channel: usize) -> [u32; 2] {
+    // The mask has two channels; the third of a frame is the first, half a mask aside.
+    let x = (x + (channel >> 1) * (blue_noise::SIZE / 2)) % blue_noise::SIZE;
+    let slice = frame as usize % blue_noise::FRAMES;
+    let at = (slice * blue_noise::SIZE + y % blue_noise::SIZE) * blue_noise::SIZE + x;
+    [channel & 1, channel & 1 ^ 1].map(|c| u32::from(blue_noise::MASK[2 * at + c]))
+}
+
+/// The bits of `ones` of `planes` planes, spread evenly, from plane `phase` on.
+fn spread(ones: u32, planes: u32, phase: u32) -> u32 {
+    // `p -> p * ones` runs through the residues evenly, so exactly `ones` of them are below `ones`, whatever the phase.
+    (0..planes).fold(0, |word, p| word | u32::from((p * ones + phase) % planes < ones) << p)
+}
+
+/// Code values `0x00BBGGRR` of frame number `frame`, row after row, into words in which each plane of a channel has a
+/// bit; see the module. `words` are overwritten.
+///
+/// # Panics
+/// When `codes` or `words` do not hold exactly one value per pixel of `raster`.
+pub fn halftone(halftone: Halftone, raster: Raster, frame: u32, codes: &[u32], words: &mut [u32]) {
+    assert_eq!(
+        (codes.len(), words.len()),
+        (raster.pixel_count(), raster.pixel_count()),
+        "pixels of {raster:?}"
+    );
+    words.fill(0);
+    let (width, height) = (raster.width() as usize, raster.height() as usize);
+    for (channel, &(bits_at, code_at)) in halftone.channels().iter().enumerate() {
+        for y in (0..height).step_by(SIDE) {
+            for x in (0..width).step_by(SIDE) {
+                let block = Block { halftone, channel, at: [x, y], raster, frame };
+                block.share_out(codes, code_at, words, bits_at);
+            }
+        }
+    }
+}
+
+/// A channel of 8 x 8 mirrors; fewer at the right and lower edge.
+struct Block {
+    halftone: Halftone,
+    channel: usize,
+    at: [usize; 2],
+    raster: Raster,
+    frame: u32,
+}
+
+impl Block {
+    fn share_out(&self, codes: &[u32], code_at: u32, words: &mut [u32], bits_at: u32) {
+        let width = self.raster.width() as usize;
+        let [right, lower] = [width, self.raster.height() as usize];
+        let mut keys = [0u16; SIDE * SIDE];
+        let mut sum = 0;
+        let pixels = || {
+            (0..SIDE * SIDE)
+                .map(|i| (i, self.at[0] + i % SIDE, self.at[1] + i / SIDE))
+                .filter(|&(_, x, y)| x < right && y < lower)
+        };
+        let code = |x: usize, y: usize| codes[y * width + x] >> code_at & 0xff;
+        for (i, x, y) in pixels() {
+            let rest = code(x, y) * self.halftone.planes % 255;
+            sum += rest;
+            if rest > 0 {
+                let [threshold, _] = noise(x, y, self.frame, self.channel);
+                // Unique, and above 0: the number of the mirror decides between equals.
+                keys[i] = ((rest + threshold) << 6 | i as u32) as u16;
+            }
+        }
+        let extra = (sum + ROUNDING[self.frame as usize & 1]) / 255;
+        for (i, x, y) in pixels() {
+            let before = keys.iter().filter(|&&key| key > keys[i]).count() as u32;
+            let ones = code(x, y) * self.halftone.planes / 255 + u32::from(keys[i] > 0 && before < extra);
+            let [_, begin] = noise(x, y, self.frame, self.channel);
+            words[y * width + x] |=
+                spread(ones, self.halftone.planes, begin % self.halftone.planes) << bits_at;
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::super::{pack, BitPlaneFrame, Kernel, Shown};
+    use super::*;
+    use proptest::prelude::*;
+
+    /// The words of an even field.
+    fn even(schedule: &PlaneSchedule, raster: Raster, number: u32, code: u32) -> Vec<u32> {
+        let mut words = vec![u32::MAX; raster.pixel_count()];
+        halftone(
+            Halftone::of(schedule).unwrap(),
+            raster,
+            number,
+            &vec![code; raster.pixel_count()],
+            &mut words,
+        );
+        words
+    }
+
+    fn schedules() -> [PlaneSchedule; 3] {
+        [PlaneSchedule::equal_rgb24(), PlaneSchedule::equal_mono8(), PlaneSchedule::equal24()]
+    }
+
+    #[test]
+    fn only_planes_of_equal_light_are_halftoned() {
+        assert_eq!([PlaneSchedule::rgb24(), PlaneSchedule::mono8()].map(|s| Halftone::of(&s)), [None, None]);
+        let planes = schedules().map(|s| Halftone::of(&s).map(|h| (h.planes, h.white)));
+        assert_eq!(planes, [Some((8, false)), Some((8, true)), Some((24, true))]);
+    }
+
+    /// Dark stays dark and full stays full, whatever the noise; and between them every plane has its share: an even
+    /// field is equally bright in all of them, to a tenth of its light.
+    #[test]
+    fn every_plane_of_an_even_field_gives_the_same_light() {
+        let raster = Raster::new(64, 64).unwrap();
+        for schedule in schedules() {
+            for (code, share) in
+                [(0, 0.0), (0xff_ffff, 1.0), (0x80_8080, 128.0 / 255.0), (0x21_2121, 33.0 / 255.0)]
+            {
+                let words = even(&schedule, raster, 7, code);
+                let mut frame = BitPlaneFrame::new(raster, schedule);
+                pack(Kernel::best(), &words, &mut frame);
+                for plane in 0..schedule.len() {
+                    let on: u32 = frame.plane(plane).iter().map(|byte| byte.count_ones()).sum();
+                    let is = f64::from(on) / raster.pixel_count() as f64;
+                    assert!(
+                        (is - share).abs() <= 0.1 * share.min(1.0 - share),
+                        "plane {plane}: {is} of {share}"
+                    );
+                }
+            }
+        }
+    }
+
+    /// What is left of the pattern has no low frequencies: sums over 16 x 16 mirrors of an even field differ from one
+    /// another by no more than the rounding of their four blocks, where mirrors that draw independently would differ by
+    /// dozens.
+    #[test]
+    fn an_even_field_is_even() {
+        let raster = Raster::new(64, 64).unwrap();
+        for (code, number) in (1..255).step_by(11).zip(0..) {
+            let words = even(&PlaneSchedule::equal_mono8(), raster, number, code << 8);
+            let sum = |x: usize, y: usize| {
+                (0..256).map(|i| words[(y + i / 16) * 64 + x + i % 16].count_ones()).sum::<u32>()
+            };
+            let sums: Vec<u32> = (0..16).map(|i| sum(i % 4 * 16, i / 4 * 16)).collect();
+            assert!(sums.iter().max().unwrap() - sums.iter().min().unwrap() <= 4, "{code}: {sums:?}");
+        }
+    }
+
+    proptest! {
+        #![proptest_config(ProptestConfig::with_cases(64))]
+        /// The law of the module, for any picture: each mirror has one of its two nearest levels, each block its mean.
+        #[test]
+        fn every_block_keeps_its_mean(width in 1u32..40, height in 1u32..20, seed in any::<u64>(), number in 0u32..1_000_000, kind in 0usize..3) {
+            let raster = Raster::new(width, height).unwrap();
+            let schedule = schedules()[kind];
+            let how = Halftone::of(&schedule).unwrap();
+            let mut state = seed;
+            let codes: Vec<u32> = (0..raster.pixel_count()).map(|_| {
+                state = state.wrapping_mul(6_364_136_223_846_793_005).wrapping_add(1_442_695_040_888_963_407);
+                (state >> 40) as u32
+            }).collect();
+            let frames = [number & !1, number | 1].map(|number| {
+                let mut words = vec![0; codes.len()];
+                halftone(how, raster, number, &codes, &mut words);
+                words
+            });
+            let level = |word: u32, channel: usize| how.ones(word)[channel];
+            for (channel, &(_, code_at)) in how.channels().iter().enumerate() {
+                let wanted = |i: usize| (codes[i] >> code_at & 0xff) * how.planes;
+                for words in &frames {
+                    for (i, word) in words.iter().enumerate() {
+                        let (is, low) = (level(*word, channel), wanted(i) / 255);
+                        prop_assert!(is == low || is == low + 1 && wanted(i) % 255 != 0, "{is} for {}", wanted(i));
+                    }
+                }
+                for (by, bx) in (0..height.div_ceil(8)).flat_map(|by| (0..width.div_ceil(8)).map(move |bx| (by, bx))) {
+                    let pixels: Vec<usize> = (0..64).map(|k| (bx * 8 + k % 8, by * 8 + k / 8))
+                        .filter(|&(x, y)| x < width && y < height)
+                        .map(|(x, y)| (y * width + x) as usize).collect();
+                    let exact = pixels.iter().map(|&i| f64::from(wanted(i)) / 255.0).sum::<f64>();
+                    let is = frames.each_ref().map(|words| pixels.iter().map(|&i| f64::from(level(words[i], channel))).sum::<f64>());
+                    for is in is {
+                        prop_assert!((is - exact).abs() <= 0.75, "{is} of {exact} in a frame");
+                    }
+                    prop_assert!((is[0] + is[1] - 2.0 * exact).abs() <= 0.5, "{is:?} of {exact} in two frames");
+                }
+            }
+        }
+
+        /// What the recorder takes for the light of a word is what the planes give.
+        #[test]
+        fn light_of_a_word_is_that_of_its_planes(word in any::<u32>(), kind in 0usize..3) {
+            let schedule = schedules()[kind];
+            let raster = Raster::new(1, 1).unwrap();
+            let mut frame = BitPlaneFrame::new(raster, schedule);
+            pack(Kernel::Scalar, &[word], &mut frame);
+            let mut light = [0u32; 3];
+            for (i, plane) in schedule.planes().iter().enumerate() {
+                let on = u32::from(frame.plane(i)[0] >> 7) << plane.bit;
+                match plane.channel {
+                    Channel::White => light.iter_mut().for_each(|l| *l += on),
+                    channel => light[channel as usize] += on,
+                }
+            }
+            let told = Shown::by(&schedule).light(word);
+            prop_assert_eq!([0, 8, 16].map(|at| told >> at & 0xff), light);
+        }
+    }
+}

@@ -1,0 +1,70 @@
+// Code values into halftones, for planes of equal light: words in which each plane of a channel has a bit. Equals the CPU's `halftone` bit for
+// bit, which says how and why.
+//
+// One workgroup is a block of 8 x 8 pixels.
+#version 460
+#extension GL_GOOGLE_include_directive : require
+#extension GL_EXT_scalar_block_layout : require
+#include "scene.glsl"
+
+layout(local_size_x = 8, local_size_y = 8) in;
+
+layout(set = 0, binding = B_CODES, scalar) buffer Codes { uint codes[]; };
+layout(set = 0, binding = B_NOISE, scalar) readonly buffer Noise { uint noise_bytes[]; };
+layout(set = 0, binding = B_TILES, scalar) readonly buffer Tiles { uint tiles[]; };
+
+shared uint keys[64];
+shared uint rests;
+
+// A pixel's value of the blue noise for a channel's remainders, and for the plane at which it begins.
+uvec2 noise_of(uvec2 pixel, uint channel) {
+    // The mask has two channels; the third of a frame is the first, half a mask aside.
+    uint x = (pixel.x + (channel >> 1u) * (NOISE_SIZE / 2u)) % NOISE_SIZE;
+    uint texel = ((frame.drawn % NOISE_FRAMES) * NOISE_SIZE + pixel.y % NOISE_SIZE) * NOISE_SIZE + x;
+    uint pair = (noise_bytes[texel >> 1u] >> ((texel & 1u) * 16u)) & 0xffffu;
+    uvec2 values = uvec2(pair & 255u, pair >> 8u);
+    return (channel & 1u) == 0u ? values : values.yx;
+}
+
+// The bits of `ones` of the planes, spread evenly, from plane `phase` on.
+uint spread(uint ones, uint phase) {
+    uint word = 0u;
+    for (uint p = 0u; p < HALFTONE_PLANES; p++)
+        if ((p * ones + phase) % HALFTONE_PLANES < ones) word |= 1u << p;
+    return word;
+}
+
+// The bits of a channel with the code value `code`. All invocations of the workgroup call it; outside the raster `code` is 0.
+uint share_out(uint code, uvec2 pixel, uint channel) {
+    uint i = gl_LocalInvocationIndex;
+    uint rest = code * HALFTONE_PLANES % 255u;
+    uvec2 noise = noise_of(pixel, channel);
+    // Unique, and above 0: the number of the mirror decides between equals.
+    uint key = rest > 0u ? ((rest + noise.x) << 6u) | i : 0u;
+    if (i == 0u) rests = 0u;
+    barrier();
+    keys[i] = key;
+    atomicAdd(rests, rest);
+    barrier();
+    uint extra = (rests + ((frame.drawn & 1u) == 0u ? 63u : 191u)) / 255u;
+    uint before = 0u;
+    for (uint k = 0u; k < 64u; k++) before += keys[k] > key ? 1u : 0u;
+    uint ones = code * HALFTONE_PLANES / 255u + (key > 0u && before < extra ? 1u : 0u);
+    // The next channel writes the same memory.
+    barrier();
+    return spread(ones, noise.y % HALFTONE_PLANES);
+}
+
+void main() {
+    uvec2 pixel;
+    bool inside = tile_pixel(tiles[gl_WorkGroupID.x >> 2u], pixel);
+    uint index = pixel.y * frame.width + pixel.x;
+    uint code = inside ? codes[index] : 0u;
+    uint word;
+    if (HALFTONE_WHITE) {
+        word = share_out((code >> 8u) & 255u, pixel, 0u);
+    } else {
+        word = share_out(code & 255u, pixel, 0u) | (share_out((code >> 8u) & 255u, pixel, 1u) << 8u) | (share_out((code >> 16u) & 255u, pixel, 2u) << 16u);
+    }
+    if (inside) codes[index] = word;
+}

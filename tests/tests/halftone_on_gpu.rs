@@ -1,0 +1,110 @@
+//! Compares the halftoning shader with its CPU twin, bit for bit; and judges the light of a rig whose planes give equal
+//! light against that of one whose planes are binary.
+
+use bytemuck::Zeroable;
+use dpm_device::planes::{PlaneSchedule, Raster};
+use dpm_lab::reference::Sampler;
+use dpm_render::blue_noise;
+use dpm_render::gpu::{Buffer, Gpu};
+use dpm_render::pack::{halftone, Halftone};
+use dpm_rig::light::recorder::LightFrame;
+use dpm_shaders::specialization as ids;
+use dpm_shaders::structs::Frame;
+use dpm_tests::gpu::{run_shader, uploaded, with_gpu};
+use dpm_tests::rigs::{demo_rig, run};
+use std::sync::Arc;
+
+/// Runs the shader alone over all tiles of the raster.
+fn on_gpu(gpu: &Arc<Gpu>, how: Halftone, raster: Raster, number: u32, codes: &[u32]) -> Vec<u32> {
+    let (tiles_x, tiles_y) = (raster.width().div_ceil(16), raster.height().div_ceil(16));
+    let frame = Frame {
+        drawn: number,
+        width: raster.width(),
+        height: raster.height(),
+        tiles_x,
+        tile_count: tiles_x * tiles_y,
+        ..Frame::zeroed()
+    };
+    let tiles: Vec<u32> = (0..tiles_x * tiles_y).collect();
+    let frame = uploaded(gpu, "frame", bytemuck::bytes_of(&frame));
+    let tiles = uploaded(gpu, "tiles", bytemuck::cast_slice(&tiles));
+    let noise = uploaded(gpu, "noise", blue_noise::MASK);
+    let words = Buffer::from_slice(gpu, "codes", codes).unwrap();
+    let constants = [(ids::HALFTONE_PLANES, how.planes), (ids::HALFTONE_WHITE, how.white.into())];
+    let buffers = [("B_FRAME", &frame), ("B_TILES", &tiles), ("B_NOISE", &noise), ("B_CODES", &words)];
+    let through = |texel| {
+        let shader = dpm_shaders::HALFTONE.reading(texel);
+        let len = codes.len() * 4;
+        run_shader(gpu, (shader, &constants), [4 * tiles_x * tiles_y, 1, 1], &buffers, ("B_CODES", len))
+    };
+    bytemuck::pod_collect_to_vec(&through(false))
+}
+
+#[test]
+fn halftones_of_gpu_and_cpu_are_the_same_bits() {
+    let sizes = [(1, 1), (8, 8), (9, 5), (31, 33), (64, 48), (100, 37), (257, 19)];
+    with_gpu(|gpu| {
+        let mut random = Sampler::new(78, 0);
+        for (i, (width, height)) in sizes.into_iter().enumerate() {
+            let raster = Raster::new(width, height).unwrap();
+            let noise: Vec<u32> =
+                (0..raster.pixel_count()).map(|_| random.next_u64() as u32 & 0xff_ffff).collect();
+            // Even fields, in which every mirror of a block has the same remainder.
+            let even = vec![0x80_7f01; raster.pixel_count()];
+            for (codes, number) in [(&noise, i as u32), (&even, 1_000_003)] {
+                for schedule in
+                    [PlaneSchedule::equal_rgb24(), PlaneSchedule::equal_mono8(), PlaneSchedule::equal24()]
+                {
+                    let how = Halftone::of(&schedule).expect("planes of equal light");
+                    let mut expected = vec![0; codes.len()];
+                    halftone(how, raster, number, codes, &mut expected);
+                    let got = on_gpu(gpu, how, raster, number, codes);
+                    assert!(got == expected, "{width} x {height}, {how:?}");
+                }
+            }
+        }
+    });
+}
+
+/// Sums of 8 x 8 mirrors, block after block, of each channel.
+fn block_sums(raster: Raster, codes: &[[u8; 3]]) -> Vec<[u32; 3]> {
+    let (width, columns) = (raster.width() as usize, raster.width() as usize / 8);
+    let mut sums = vec![[0; 3]; columns * (raster.height() as usize / 8)];
+    for (i, code) in codes.iter().enumerate() {
+        let sum = &mut sums[i / width / 8 * columns + i % width / 8];
+        (0..3).for_each(|c| sum[c] += u32::from(code[c]));
+    }
+    sums
+}
+
+/// In the light of the whole chain the mean level of 8 x 8 mirrors is that of binary planes, to 0.38 levels of 255 in
+/// every frame. Equal planes give 128 / 255 of full white, so their projector is that much brighter here. The bodies stand
+/// still, because the centres of the two kinds of light are not at the same instant.
+#[test]
+fn light_of_equal_planes_is_that_of_binary_ones() {
+    with_gpu(|gpu| {
+        let light = |flags: &[&str]| {
+            let still = [0, 1].map(|i| format!("scene.bodies.{i}.motion={{kind=\"still\"}}"));
+            let flags = [&still.each_ref().map(String::as_str)[..], flags].concat();
+            let rig = demo_rig(128, 96, &flags);
+            let (outcome, _) = run(gpu, &rig, 24, 24);
+            assert_eq!((outcome.light_mismatches, outcome.report.frames_lit), (0, 24));
+            let sums = |frame: &LightFrame| block_sums(rig.camera.raster, &frame.codes);
+            outcome.light.iter().map(sums).collect::<Vec<_>>()
+        };
+        let binary = light(&["projector.max_intensity=8"]);
+        let bright = format!("projector.max_intensity={}", 8.0 * 255.0 / 128.0);
+        let equal = light(&["projector.weights=\"equal\"", &bright]);
+        let (mut worst, mut lit) = (0.0f64, 0);
+        for (a, b) in binary.iter().flatten().zip(equal.iter().flatten()) {
+            for c in 0..3 {
+                let [a, b] = [f64::from(a[c]), f64::from(b[c]) * 255.0 / 128.0].map(|sum| sum / 64.0);
+                worst = worst.max((a - b).abs());
+                lit += u32::from(a > 0.0);
+            }
+        }
+        assert!(lit > 1_000, "{lit} blocks are lit");
+        // A projector's brightness that is not exactly twice another's may round single code values otherwise.
+        assert!(worst <= 0.40, "{worst} levels");
+    });
+}
