@@ -68,6 +68,8 @@ pub mod regular_file;
 #[cfg(feature = "std")]
 pub mod rng;
 pub mod sensor;
+#[cfg(feature = "std")]
+mod stream;
 pub mod time;
 #[cfg(feature = "std")]
 pub mod tracker;

@@ -1,8 +1,8 @@
 //! A serial port that a client keeps open: it is opened beside the client, read without waiting, and opened again after an
 //! unplug. With it comes the pacing of the echoes that map a device's clock.
 
+use crate::stream::Stream;
 use crate::time::HostTime;
-use crate::tracker::Stream;
 use crossbeam::channel::{Receiver, TryRecvError};
 use serialport::SerialPort;
 
@@ -152,7 +152,7 @@ impl EchoPace {
 
     /// Whether something may be asked now.
     pub(crate) fn is_due(&self, now: HostTime) -> bool {
-        !self.sent.is_some_and(|t| now.ns_since(t) < ECHO_LOST_NS) && now >= self.due
+        now >= self.due && self.sent.is_none_or(|t| now.ns_since(t) >= ECHO_LOST_NS)
     }
 
     /// Asks for nothing until the usual interval has passed.
