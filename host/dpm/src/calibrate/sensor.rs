@@ -219,6 +219,9 @@ fn record(
     recording.and_then(|recording| Ok((recording, Showing::of(&lights, rate)?)))
 }
 
+/// Samples and poses.
+type Collected = (Vec<Block>, Vec<Stamped>);
+
 /// What a sweep goes on with.
 struct Sweeping<'a> {
     poses: &'a Poses,
@@ -235,7 +238,7 @@ impl Sweeping<'_> {
         frame_ns: f64,
         mut pace: Pace<'_>,
         monitor: &RunMonitor,
-    ) -> Result<Paced<(Vec<Block>, Vec<Stamped>)>, Failure> {
+    ) -> Result<Paced<Collected>, Failure> {
         let (begin, mut told) = (Instant::now(), 0);
         let (mut path, mut blocks) = (Vec::new(), Vec::new());
         let mut coverage = Coverage::new(self.code.clone());
