@@ -57,6 +57,8 @@ pub mod clock_map;
 pub mod cobs;
 pub mod dlpc900;
 pub mod light;
+#[cfg(feature = "serial")]
+mod line;
 pub mod link;
 mod packet;
 pub mod planes;
@@ -68,6 +70,8 @@ pub mod regular_file;
 #[cfg(feature = "std")]
 pub mod rng;
 pub mod sensor;
+#[cfg(feature = "std")]
+mod stream;
 pub mod time;
 #[cfg(feature = "std")]
 pub mod tracker;

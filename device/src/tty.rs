@@ -108,6 +108,11 @@ pub fn never_wait(mut port: TTYPort) -> io::Result<Box<dyn SerialPort>> {
     }
 }
 
+/// True if a port that never waits has nothing to give or no room now.
+pub fn would_wait(e: &io::Error) -> bool {
+    matches!(e.kind(), io::ErrorKind::TimedOut | io::ErrorKind::WouldBlock | io::ErrorKind::Interrupted)
+}
+
 /// An input of a serial port that is read as a switch, not as data.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum ControlSignal {

@@ -32,6 +32,7 @@
 
 pub mod dlpc900;
 pub mod faults;
+pub mod hand;
 pub mod monotonic;
 pub mod motion;
 mod motion_spec;

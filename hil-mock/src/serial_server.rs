@@ -8,10 +8,10 @@ use dpm_device::cobs::Deframer;
 use dpm_device::time::{HostClock, HostTime};
 use dpm_device::tracker::serial::wire::{SerialMessage, MAX_PACKET, VERSION};
 use dpm_device::tracker::BodyIndex;
-use dpm_device::tty::never_wait;
+use dpm_device::tty::{never_wait, would_wait};
 use serialport::{SerialPort, TTYPort};
 use std::fs::{File, OpenOptions};
-use std::io::{self, ErrorKind, Read, Write};
+use std::io::{self, Read, Write};
 use std::os::unix::fs::OpenOptionsExt;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::Arc;
@@ -195,14 +195,14 @@ fn run(
     while !stop.load(Ordering::Relaxed) {
         match port.read(&mut buffer) {
             Ok(n) => device.on_bytes(&buffer[..n], clock.now(), &mut out),
-            Err(e) if is_patient(&e) => {}
+            Err(e) if would_wait(&e) => {}
             Err(e) => return Err(e),
         }
         device.report(clock.now(), &mut out);
         while !out.is_empty() {
             match port.write(&out) {
                 Ok(n) => drop(out.drain(..n)),
-                Err(e) if is_patient(&e) => break,
+                Err(e) if would_wait(&e) => break,
                 Err(e) => return Err(e),
             }
         }
@@ -214,8 +214,4 @@ fn run(
         std::thread::sleep(Duration::from_nanos(wait_ns as u64));
     }
     Ok(())
-}
-
-fn is_patient(e: &io::Error) -> bool {
-    matches!(e.kind(), ErrorKind::TimedOut | ErrorKind::WouldBlock | ErrorKind::Interrupted)
 }

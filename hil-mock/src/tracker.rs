@@ -4,12 +4,14 @@
 //! that poll at different instants see the same samples.
 
 use crate::faults::{FaultError, FaultKind, FaultPlan};
+use crate::hand::Hand;
 use crate::motion::{add, from_rotation_vector, multiply, normalize4, scale, Motion, Twist};
 use dpm_device::pose::Pose;
 use dpm_device::rng::Draws;
 use dpm_device::time::{FrameRate, HostTime};
 use dpm_device::tracker::{BodyIndex, SampleGate, Tracker, TrackerCounters, TrackerError, TrackerSample};
 use std::collections::VecDeque;
+use std::sync::Arc;
 
 /// Configuration of the mock tracker. All randomness follows from `seed`.
 #[derive(Clone, Debug)]
@@ -95,6 +97,8 @@ pub const TRACKER_FAULTS: [FaultKind; 13] = [
 pub struct SampleSource {
     config: MockTrackerConfig,
     bodies: Vec<Motion>,
+    /// The body that a hand holds, in place of its motion.
+    hand: Option<(BodyIndex, Arc<Hand>)>,
     draws: Draws,
 }
 
@@ -136,7 +140,14 @@ impl SampleSource {
             }
         }
         let draws = Draws::new(config.seed).stream(0x7261_636b);
-        Ok(Self { config, bodies, draws })
+        Ok(Self { config, bodies, hand: None, draws })
+    }
+
+    /// Puts `body` into a hand. Its samples then also depend on what the hand was told, and those that are captured before
+    /// an order stay the same.
+    pub fn held_by(mut self, body: BodyIndex, hand: Arc<Hand>) -> Self {
+        self.hand = Some((body, hand));
+        self
     }
 
     /// The configuration.
@@ -161,10 +172,13 @@ impl SampleSource {
 
     /// True pose of `body` at `t_ns` after the start; `None` for an unknown body.
     pub fn true_pose(&self, body: BodyIndex, t_ns: i64) -> Option<Pose> {
-        Some(self.bodies.get(usize::from(body.0))?.pose_at(t_ns))
+        match &self.hand {
+            Some((held, hand)) if *held == body => Some(hand.pose_at(t_ns)),
+            _ => Some(self.bodies.get(usize::from(body.0))?.pose_at(t_ns)),
+        }
     }
 
-    /// True velocity of `body` at `t_ns` after the start.
+    /// True velocity of `body` at `t_ns` after the start, by its motion alone: what a hand does to it is not in it.
     pub fn true_twist(&self, body: BodyIndex, t_ns: i64) -> Option<Twist> {
         Some(self.bodies.get(usize::from(body.0))?.twist_at(t_ns))
     }

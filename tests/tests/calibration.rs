@@ -1,11 +1,13 @@
 //! `dpm calibrate` as an operator uses it, with the projector, the tracker and the light sensor in a process of their own.
 
 use dpm_calibration::file::{self, CalibrationFile};
-use glam::DVec3;
+use glam::{DAffine3, DQuat, DVec3};
 use hil_mock::sensor_wand::ProjectorOptics;
-use std::io::{BufRead, BufReader, Write};
+use std::io::{Read, Write};
 use std::path::{Path, PathBuf};
-use std::process::{Child, Command, Output, Stdio};
+use std::process::{Child, ChildStdin, Command, Output, Stdio};
+use std::sync::mpsc::{channel, Receiver};
+use std::time::{Duration, Instant};
 
 /// A program of this workspace that the build of all tests has made.
 fn program(name: &str) -> PathBuf {
@@ -34,9 +36,8 @@ impl Folder {
         std::fs::write(self.0.join(name), text).unwrap();
     }
 
-    /// Runs `dpm` here with a line on its standard input.
-    fn dpm(&self, arguments: &[&str]) -> Output {
-        let mut child = Command::new(program("dpm"))
+    fn spawn(&self, arguments: &[&str]) -> Child {
+        Command::new(program("dpm"))
             .args(arguments)
             .current_dir(&self.0)
             .env("DPM_RUNTIME_DIR", self.0.join("run"))
@@ -45,7 +46,17 @@ impl Folder {
             .stdout(Stdio::piped())
             .stderr(Stdio::piped())
             .spawn()
-            .unwrap();
+            .unwrap()
+    }
+
+    /// Runs `dpm` here, to talk with it.
+    fn talk(&self, arguments: &[&str]) -> Talk {
+        Talk::with(self.spawn(arguments))
+    }
+
+    /// Runs `dpm` here with a line on its standard input.
+    fn dpm(&self, arguments: &[&str]) -> Output {
+        let mut child = self.spawn(arguments);
         let mut input = child.stdin.take().unwrap();
         input.write_all(b"\n").unwrap();
         let output = child.wait_with_output().unwrap();
@@ -68,39 +79,134 @@ fn text(output: &Output) -> String {
     String::from_utf8_lossy(&output.stdout).into_owned() + &String::from_utf8_lossy(&output.stderr)
 }
 
+/// A program that one talks with, killed with this.
+struct Talk {
+    child: Child,
+    input: ChildStdin,
+    heard: Receiver<Vec<u8>>,
+    text: String,
+    /// What was read by [`Talk::until`] so far.
+    read: usize,
+}
+
+/// Longer than any answer takes on a machine with other work.
+const PATIENCE: Duration = Duration::from_secs(120);
+
+impl Talk {
+    fn with(mut child: Child) -> Self {
+        let input = child.stdin.take().unwrap();
+        let (send, heard) = channel();
+        let outputs: [Option<Box<dyn Read + Send>>; 2] = [
+            child.stdout.take().map(|o| Box::new(o) as Box<dyn Read + Send>),
+            child.stderr.take().map(|e| Box::new(e) as Box<dyn Read + Send>),
+        ];
+        for mut output in outputs.into_iter().flatten() {
+            let send = send.clone();
+            std::thread::spawn(move || {
+                let mut bytes = [0; 4096];
+                while let Ok(n @ 1..) = output.read(&mut bytes) {
+                    if send.send(bytes[..n].to_vec()).is_err() {
+                        return;
+                    }
+                }
+            });
+        }
+        Self { child, input, heard, text: String::new(), read: 0 }
+    }
+
+    /// Reads on until `words` come; gives what came before them.
+    fn until(&mut self, words: &str) -> String {
+        self.until_one(&[words]).1
+    }
+
+    /// Reads on until one of several comes; gives its number and what came before it.
+    fn until_one(&mut self, words: &[&str]) -> (usize, String) {
+        let begin = Instant::now();
+        loop {
+            let fresh = &self.text[self.read..];
+            let found = words.iter().enumerate().filter_map(|(i, w)| Some((fresh.find(w)?, i))).min();
+            if let Some((at, which)) = found {
+                let before = fresh[..at].to_owned();
+                self.read += at + words[which].len();
+                return (which, before);
+            }
+            let left = PATIENCE.saturating_sub(begin.elapsed());
+            match self.heard.recv_timeout(left) {
+                Ok(bytes) => self.text += &String::from_utf8_lossy(&bytes),
+                Err(why) => panic!("none of {words:?} came ({why}):\n{}", self.text),
+            }
+        }
+    }
+
+    fn say(&mut self, line: &str) {
+        self.input.write_all(format!("{line}\n").as_bytes()).unwrap();
+        self.input.flush().unwrap();
+    }
+
+    /// Waits for the end: the exit code and all that was said.
+    fn end(mut self) -> (Option<i32>, String) {
+        while let Ok(bytes) = self.heard.recv_timeout(PATIENCE) {
+            self.text += &String::from_utf8_lossy(&bytes);
+        }
+        let code = self.child.wait().unwrap().code();
+        (code, std::mem::take(&mut self.text))
+    }
+}
+
+impl Drop for Talk {
+    fn drop(&mut self) {
+        let _ = self.child.kill();
+        let _ = self.child.wait();
+    }
+}
+
 /// `hil-mock serve sensor-wand`, ended with this.
 struct Mock {
-    child: Child,
+    talk: Talk,
     projector: String,
     sensor: String,
 }
 
 impl Mock {
     fn start(arguments: &[&str]) -> Self {
-        let mut child = Command::new(program("hil-mock"))
-            .args(["serve", "sensor-wand", "--port", "pty"])
+        let child = Command::new(program("hil-mock"))
+            .args(["serve", "sensor-wand", "--port", "pty", "--orders"])
             .args(arguments)
+            .stdin(Stdio::piped())
             .stdout(Stdio::piped())
             .spawn()
             .unwrap();
-        let mut lines = BufReader::new(child.stdout.take().unwrap()).lines();
-        let mut after = |words: &str| loop {
-            let line = lines.next().expect("the mock says where its ports are").unwrap();
-            if let Some(path) = line.strip_prefix(words) {
-                return path.trim().to_owned();
-            }
+        let mut talk = Talk::with(child);
+        let mut after = |words: &str| {
+            talk.until(words);
+            talk.until("\n").trim().to_owned()
         };
         let sensor = after("light sensor on ");
         let projector = after("bit-plane projector on ");
-        std::thread::spawn(move || lines.for_each(drop));
-        Self { child, projector, sensor }
+        Self { talk, projector, sensor }
     }
-}
 
-impl Drop for Mock {
-    fn drop(&mut self) {
-        let _ = self.child.kill();
-        let _ = self.child.wait();
+    /// Gives an order to the hand with the wand, again while it cannot be followed, and waits until the hand is there.
+    fn order(&mut self, order: &str) {
+        loop {
+            self.talk.say(order);
+            // A pattern is lit some frames after the question.
+            if self.talk.until_one(&["the tip is at", "the wand", "there is no light"]).0 < 2 {
+                return;
+            }
+            std::thread::sleep(Duration::from_millis(50));
+        }
+    }
+
+    fn rig(&self, width: u32, height: u32, rate: u32, command_port: u16) -> String {
+        format!(
+            "[projector]\nwidth = {width}\nheight = {height}\nframe_rate = \"{rate}\"\n\
+             backend = {{ kind = \"serial\", port = \"{}\" }}\n\
+             [tracker]\nkind = \"natnet\"\ncommand_port = {command_port}\ndata_port = {}\n\
+             [real_time]\npace = \"real\"\n",
+            self.projector,
+            command_port + 1
+        )
     }
 }
 
@@ -115,16 +221,7 @@ fn a_wand_with_a_sensor_finds_lens_pose_tip_and_latency() {
     let mock =
         Mock::start(&["--raster", "128x96", "--focal", "225", "--command-port", "15710", "--seed", "7"]);
     let folder = Folder::new("sensor");
-    folder.write(
-        "rig.toml",
-        &format!(
-            "[projector]\nwidth = 128\nheight = 96\nframe_rate = \"48\"\n\
-             backend = {{ kind = \"serial\", port = \"{}\" }}\n\
-             [tracker]\nkind = \"natnet\"\ncommand_port = 15710\ndata_port = 15711\n\
-             [real_time]\npace = \"real\"\n",
-            mock.projector
-        ),
-    );
+    folder.write("rig.toml", &mock.rig(128, 96, 48, 15710));
     let ruler = folder.dpm(&["calibrate", "wand", "rig.toml", "--tip", "11,-4,119"]);
     assert!(ruler.status.success(), "{}", text(&ruler));
     let solved =
@@ -204,4 +301,225 @@ fn points_become_a_projector_that_the_rig_uses_and_flat_ones_are_refused() {
         let off = (is.x - should[0]).hypot(is.y - should[1]);
         assert!(off < 0.5, "{world:?}: {off} px");
     }
+}
+
+/// Where the mesh truly is in the body, which only the hand with the wand knows.
+fn mesh_in_body() -> DAffine3 {
+    DAffine3::from_rotation_translation(
+        DQuat::from_rotation_y(0.2) * DQuat::from_rotation_x(-0.1),
+        DVec3::new(0.02, -0.01, 0.03),
+    )
+}
+
+const BODY_AT: DVec3 = DVec3::new(0.03, 0.02, 0.05);
+
+/// The numbers in the last brackets of a question.
+fn place_in(question: &str) -> DVec3 {
+    let inside = question.rsplit('(').next().unwrap().split(')').next().unwrap();
+    let numbers: Vec<f64> = inside.split(',').map(|n| n.trim().parse().unwrap()).collect();
+    DVec3::from_slice(&numbers)
+}
+
+fn words(p: DVec3) -> String {
+    format!("{} {} {}", p.x, p.y, p.z)
+}
+
+/// Touches the points of the mesh that are asked for.
+fn touch_body(folder: &Folder, mock: &mut Mock, points: usize) -> Talk {
+    let mut dpm = folder.talk(&["calibrate", "body", "rig.toml", "--body", "bunny", "--wander", "0"]);
+    for _ in 0..points {
+        dpm.until("\npoint ");
+        let mesh = place_in(&dpm.until(" m:"));
+        mock.order(&format!("touch bunny {}", words(mesh_in_body().transform_point3(mesh))));
+        dpm.say("");
+        dpm.until_one(&["noted", "residual"]);
+    }
+    dpm
+}
+
+/// Holds the tip into each dot, then to the point of the body that was meant.
+fn check_light(folder: &Folder, mock: &mut Mock, points: usize) -> (Option<i32>, String) {
+    let count = points.to_string();
+    let mut dpm = folder.talk(&["calibrate", "check", "rig.toml", "--points", &count, "--limit", "1.5"]);
+    for _ in 0..points {
+        dpm.until(", at ");
+        let place = mesh_in_body().transform_point3(place_in(&dpm.until(" of the mesh: tip into the dot:")));
+        // The dot of the point before may still be shown for some frames.
+        std::thread::sleep(Duration::from_millis(300));
+        mock.order(&format!("dot {}", words(BODY_AT + place)));
+        dpm.say("");
+        dpm.until("now touch this point of the body:");
+        mock.order(&format!("touch bunny {}", words(place)));
+        dpm.say("");
+    }
+    dpm.end()
+}
+
+/// How far light on the body falls from where it belongs, pixels: by the calibration file, and by the mock's own optics.
+fn errors(file: &CalibrationFile, truth: &ProjectorOptics) -> Vec<f64> {
+    let camera = file.projector.as_ref().unwrap().camera().unwrap();
+    let mesh_to_body = file.bodies["bunny"].mesh_to_body.to_affine();
+    let mut errors: Vec<f64> = (0..27u32)
+        .map(|i| {
+            let part = |k: u32| f64::from(i / k % 3) - 1.0;
+            let mesh = 0.08 * DVec3::new(part(1), part(3), part(9));
+            let should =
+                truth.pixel_of((BODY_AT + mesh_in_body().transform_point3(mesh)).to_array()).unwrap();
+            let is = camera.project(BODY_AT + mesh_to_body.transform_point3(mesh)).unwrap();
+            (is.x - should[0]).hypot(is.y - should[1])
+        })
+        .collect();
+    errors.sort_by(f64::total_cmp);
+    errors
+}
+
+/// The whole chain, in the order of the manual's page, against lens, pose, tip, place of the mesh, latency and droop that
+/// only the mock and the hand know.
+#[test]
+fn from_a_wand_to_checked_light() {
+    let port = 15720;
+    let port_word = port.to_string();
+    let mut mock = Mock::start(&[
+        "--raster",
+        "256x192",
+        "--focal",
+        "450",
+        "--command-port",
+        &port_word,
+        "--seed",
+        "3",
+        "--droop",
+        "0.1",
+        "--body",
+        &format!("bunny:{}", words(BODY_AT).replace(' ', ",")),
+    ]);
+    let folder = Folder::new("chain");
+    let tail = "[[scene.bodies]]\nname = \"bunny\"\n";
+    folder.write("rig.toml", &(mock.rig(256, 192, 90, port) + tail));
+    let sensor = mock.sensor.clone();
+
+    mock.order("pivot 0 0 0.1");
+    let mut dpm = folder.talk(&["calibrate", "wand", "rig.toml", "--seconds", "4"]);
+    dpm.until("to begin.");
+    dpm.say("");
+    let (code, told) = dpm.end();
+    assert_eq!(code, Some(0), "{told}");
+
+    mock.order("wander");
+    let mut dpm =
+        folder.talk(&["calibrate", "projector", "rig.toml", "--sensor", &sensor, "--seconds", "12"]);
+    dpm.until("to begin.");
+    dpm.say("");
+    let (code, told) = dpm.end();
+    assert_eq!(code, Some(0), "{told}");
+
+    let mut dpm = touch_body(&folder, &mut mock, 4);
+    dpm.say("d");
+    let (code, told) = dpm.end();
+    assert_eq!(code, Some(0), "{told}");
+
+    mock.order("wander");
+    let mut dpm = folder.talk(&["calibrate", "latency", "rig.toml", "--sensor", &sensor, "--seconds", "7"]);
+    dpm.until("to begin.");
+    dpm.say("");
+    let (code, told) = dpm.end();
+    assert_eq!(code, Some(0), "{told}");
+
+    mock.order("tip 0 0 0");
+    let mut dpm = folder.talk(&[
+        "calibrate",
+        "light",
+        "rig.toml",
+        "--sensor",
+        &sensor,
+        "--gain",
+        "6",
+        "--codes",
+        "4",
+        "--set",
+        "projector.frame_rate=160",
+    ]);
+    dpm.until("to begin.");
+    dpm.say("");
+    let (code, told) = dpm.end();
+    assert_eq!(code, Some(0), "{told}");
+
+    let (code, told) = check_light(&folder, &mut mock, 2);
+    assert_eq!(code, Some(0), "{told}");
+    assert!(told.contains("no error is larger"), "{told}");
+
+    let file = folder.calibration();
+    let errors = errors(&file, &truth(256, 192, 450.0));
+    let predicted = file.projector.as_ref().unwrap().predicted_p99_px;
+    println!(
+        "light off by {:.3} px median, {:.3} px at most; {predicted:.3} px predicted",
+        errors[13], errors[26]
+    );
+    // A pixel of this raster is 3 mm wide.
+    assert!(errors[26] < 0.5 && errors[26] < 2.0 * predicted, "{errors:?}, predicted {predicted}");
+    let late = file.latency.unwrap();
+    assert!(late.latency_us.abs() < 500.0, "{late:?}");
+    let light = file.light.unwrap().model().unwrap();
+    for (channel, colour) in [0.35, 0.4, 0.25].into_iter().enumerate() {
+        let intensity = light.channels.intensity[channel];
+        assert!((intensity - colour).abs() < 0.01, "channel {channel}: {intensity}");
+        // Code 128 is the plane of bit 7 alone, which loses a tenth.
+        let half = light.channels.level(channel, 128.0 / 255.0) / light.channels.level(channel, 1.0);
+        let plane = |bit: u32| f64::from(1u32 << bit) * (1.0 - 0.1 * f64::from(1u32 << bit) / 128.0);
+        let should = plane(7) / (0..8).map(plane).sum::<f64>();
+        assert!((half - should).abs() < 0.01, "channel {channel}: {half}, {should}");
+    }
+}
+
+#[test]
+fn a_mesh_that_was_moved_by_hand_is_found_by_the_next_check() {
+    let port = 15730;
+    let body = format!("bunny:{}", words(BODY_AT).replace(' ', ","));
+    let port_word = port.to_string();
+    let mut mock = Mock::start(&[
+        "--raster",
+        "256x192",
+        "--focal",
+        "450",
+        "--command-port",
+        &port_word,
+        "--body",
+        &body,
+    ]);
+    let folder = Folder::new("nudge");
+    folder.write("rig.toml", &(mock.rig(256, 192, 60, port) + "[[scene.bodies]]\nname = \"bunny\"\n"));
+    let truth = truth(256, 192, 450.0);
+    let points: String = (0..64u32)
+        .map(|i| {
+            let part = |k: u32| f64::from(i / k % 4) / 3.0 - 0.5;
+            let world = [0.5 * part(1), 0.4 * part(4), 0.6 * part(16)];
+            let [x, y] = truth.pixel_of(world).unwrap();
+            format!("{} {} {} {x} {y}\n", world[0], world[1], world[2])
+        })
+        .collect();
+    folder.write("points.txt", &points);
+    for arguments in [
+        &["calibrate", "wand", "rig.toml", "--tip", "10,-5,120"][..],
+        &["calibrate", "projector", "rig.toml", "--points", "points.txt"],
+    ] {
+        let output = folder.dpm(arguments);
+        assert!(output.status.success(), "{}", text(&output));
+    }
+    // An interrupted session goes on where it stopped.
+    drop(touch_body(&folder, &mut mock, 2));
+    let mut dpm = touch_body(&folder, &mut mock, 2);
+    dpm.say("d");
+    let (code, told) = dpm.end();
+    assert_eq!(code, Some(0), "{told}");
+    assert!(told.contains("Going on with 2 points"), "{told}");
+    let mut dpm = folder.talk(&["calibrate", "nudge", "rig.toml", "--body", "bunny", "--step", "20"]);
+    dpm.until("degrees:");
+    dpm.say("xxXxw");
+    dpm.until("written");
+    dpm.say("q");
+    let (code, told) = dpm.end();
+    assert_eq!(code, Some(0), "{told}");
+    let (code, told) = check_light(&folder, &mut mock, 2);
+    assert_eq!(code, Some(1), "{told}");
+    assert!(told.contains("the mesh in the body"), "{told}");
 }

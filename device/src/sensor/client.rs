@@ -7,20 +7,14 @@ use super::wire::{
 };
 use crate::clock_map::{ClockMap, Mapped};
 use crate::cobs::Deframer;
+use crate::line::{EchoPace, Line, Polled};
 use crate::time::{DeviceTicks, HostClock, HostTime};
 use crate::tracker::Stream;
-use crossbeam::channel::{Receiver, TryRecvError};
-use serialport::SerialPort;
-use std::io::ErrorKind;
 use std::sync::Arc;
 
 const MS: i64 = 1_000_000;
-/// Interval between attempts to open the port.
-const RETRY_EVERY_NS: i64 = 200 * MS;
 /// Bytes read in one poll: 50 ms of 3,000,000 baud.
 const MAX_BYTES_PER_POLL: usize = 16 * 1024;
-const QUICK_ECHOES: u32 = 20;
-const QUICK_ECHO_EVERY_NS: i64 = 10 * MS;
 const ECHO_EVERY_NS: i64 = 100 * MS;
 /// An order that was not answered is given again after this time.
 const ORDER_EVERY_NS: i64 = 200 * MS;
@@ -74,12 +68,6 @@ pub struct SensorCounters {
     pub opened: u64,
 }
 
-enum State {
-    Idle { retry_at: HostTime },
-    Opening(Receiver<serialport::Result<Box<dyn SerialPort>>>),
-    Open(Box<dyn Stream>),
-}
-
 /// How far the sensor is set up.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 enum Phase {
@@ -96,20 +84,17 @@ enum Phase {
 pub struct SensorClient {
     config: SensorConfig,
     clock: Arc<dyn HostClock>,
-    state: State,
+    line: Line,
     phase: Phase,
     order_due: HostTime,
     deframer: Deframer<[u8; MAX_PACKET]>,
     buffer: Vec<u8>,
     hello: Option<SensorHello>,
     map: Option<ClockMap>,
-    echo_sent: Option<HostTime>,
-    echo_due: HostTime,
-    echoes: u32,
+    echo: EchoPace,
     /// Number of the next block, and the sensor's own losses so far.
     expected: Option<(u32, u32)>,
     counters: SensorCounters,
-    problem: Option<String>,
 }
 
 impl SensorClient {
@@ -128,21 +113,18 @@ impl SensorClient {
             ));
         }
         Ok(Self {
+            line: Line::new(&config.port, config.baud),
             config,
             clock,
-            state: State::Idle { retry_at: HostTime(i64::MIN) },
             phase: Phase::Stopping,
             order_due: HostTime(i64::MIN),
             deframer: Deframer::new([0; MAX_PACKET]),
             buffer: vec![0; MAX_BYTES_PER_POLL],
             hello: None,
             map: None,
-            echo_sent: None,
-            echo_due: HostTime(i64::MIN),
-            echoes: 0,
+            echo: EchoPace::new(ECHO_EVERY_NS),
             expected: None,
             counters: SensorCounters::default(),
-            problem: None,
         })
     }
 
@@ -157,7 +139,8 @@ impl SensorClient {
     ) -> Result<Self, String> {
         let now = clock.now();
         let mut this = Self::open(config, clock)?;
-        this.begin(port, now);
+        this.line.take_over(port);
+        this.begin(now);
         Ok(this)
     }
 
@@ -173,7 +156,7 @@ impl SensorClient {
 
     /// True while it streams.
     pub fn is_running(&self) -> bool {
-        matches!(self.state, State::Open(_)) && self.phase == Phase::Running
+        self.line.is_open() && self.phase == Phase::Running
     }
 
     /// Why the sensor does not do what it is asked for; `None` if it does, or has not said yet.
@@ -203,19 +186,10 @@ impl SensorClient {
 
     /// Reads what has arrived by `now` and passes blocks to `sink`, oldest first; returns their number.
     pub fn poll(&mut self, now: HostTime, sink: &mut dyn FnMut(SensorBlock<'_>)) -> usize {
-        match &self.state {
-            State::Idle { retry_at } if now >= *retry_at => self.state = self.start_opening(now),
-            State::Idle { .. } => {}
-            State::Opening(result) => match result.try_recv() {
-                Ok(Ok(port)) => self.begin(Box::new(port), now),
-                Ok(Err(error)) => {
-                    let remedy = crate::tty::refusal(&error).remedy();
-                    self.lose(now, format!("cannot open {}: {error}; {remedy}", self.config.port));
-                }
-                Err(TryRecvError::Empty) => {}
-                Err(TryRecvError::Disconnected) => self.lose(now, "the opening thread ended".into()),
-            },
-            State::Open(_) => return self.listen(now, sink),
+        match self.line.poll(now) {
+            Polled::Closed => {}
+            Polled::Opened => self.begin(now),
+            Polled::Open => return self.listen(now, sink),
         }
         0
     }
@@ -223,12 +197,11 @@ impl SensorClient {
     /// Counters and the reason for silence in one line.
     pub fn status(&self) -> String {
         let c = self.counters;
-        let is_open = matches!(self.state, State::Open(_));
-        let mut text = format!("{} {}", self.config.port, if is_open { "open" } else { "not open" });
-        if let Some(problem) = &self.problem {
-            text.push_str(&format!("; {problem}"));
+        let mut text = self.line.status();
+        if let Some(hello) = &self.hello {
+            text.push_str(&format!(" to \"{}\"", hello.name_text()));
         }
-        match (is_open, self.hello, self.phase) {
+        match (self.line.is_open(), self.hello, self.phase) {
             (true, None, _) if c.malformed > 0 => {
                 text.push_str("; only noise is heard: is the baud rate right?")
             }
@@ -243,56 +216,16 @@ impl SensorClient {
         text
     }
 
-    fn start_opening(&self, now: HostTime) -> State {
-        let (send, receive) = crossbeam::channel::bounded(1);
-        let (port, baud) = (self.config.port.clone(), self.config.baud);
-        // Opening a port can block in its driver, so a helper thread does it, one attempt at a time.
-        let spawned = std::thread::Builder::new().name("sensor-open".into()).spawn(move || {
-            // If the client was dropped, nobody receives this, and the port closes again.
-            let _ = send.send(crate::tty::open(&port, baud));
-        });
-        match spawned {
-            Ok(_) => State::Opening(receive),
-            Err(_) => State::Idle { retry_at: now.plus_ns(RETRY_EVERY_NS) },
-        }
-    }
-
-    fn begin(&mut self, port: Box<dyn Stream>, now: HostTime) {
+    fn begin(&mut self, now: HostTime) {
         self.deframer.reset();
         (self.hello, self.map, self.expected) = (None, None, None);
-        (self.echo_sent, self.echo_due, self.echoes) = (None, now, 0);
+        self.echo.begin(now);
         (self.phase, self.order_due) = (Phase::Stopping, now);
         self.counters.opened += 1;
-        self.problem = None;
-        self.state = State::Open(port);
-    }
-
-    fn lose(&mut self, now: HostTime, why: String) {
-        self.problem = Some(why);
-        self.state = State::Idle { retry_at: now.plus_ns(RETRY_EVERY_NS) };
     }
 
     fn listen(&mut self, now: HostTime, sink: &mut dyn FnMut(SensorBlock<'_>)) -> usize {
-        let State::Open(port) = &mut self.state else { return 0 };
-        let n = match port.read(&mut self.buffer) {
-            Ok(0) => {
-                self.lose(now, format!("{} was unplugged: check cable and supply", self.config.port));
-                return 0;
-            }
-            Ok(n) => n,
-            Err(e)
-                if matches!(
-                    e.kind(),
-                    ErrorKind::TimedOut | ErrorKind::WouldBlock | ErrorKind::Interrupted
-                ) =>
-            {
-                0
-            }
-            Err(e) => {
-                self.lose(now, format!("{}: {e}", self.config.port));
-                return 0;
-            }
-        };
+        let Some(n) = self.line.read(now, &mut self.buffer) else { return 0 };
         let at = self.clock.now();
         let before = self.counters.blocks;
         let (buffer, mut deframer) = (
@@ -302,7 +235,7 @@ impl SensorClient {
         deframer.push(&buffer[..n], &mut |packet| self.take_in(SensorMessage::decode(packet), at, sink));
         (self.buffer, self.deframer) = (buffer, deframer);
         self.give_orders(now);
-        self.echo(now);
+        self.ask_for_echo(now);
         (self.counters.blocks - before) as usize
     }
 
@@ -357,7 +290,7 @@ impl SensorClient {
         let is_same = self.hello.is_some_and(|before| before.ticks_per_second == hello.ticks_per_second);
         if !is_same || self.map.is_none() {
             self.map = ClockMap::new(u64::from(hello.ticks_per_second)).ok();
-            (self.echoes, self.echo_due) = (0, at);
+            self.echo.hurry(at);
         }
         self.hello = Some(hello);
         let next = match (self.phase, hello.running) {
@@ -402,36 +335,30 @@ impl SensorClient {
 
     /// True if the line took the whole message. Half a message is noise that the sensor skips.
     fn send(&mut self, message: &SensorMessage<'_>) -> bool {
-        let State::Open(port) = &mut self.state else { return false };
         let mut frame = [0; MAX_FRAME];
         let Some(n) = message.encode(&mut frame) else { return false };
-        port.write(&frame[..n]).is_ok_and(|sent| sent == n)
+        self.line.write(&frame[..n])
     }
 
     fn on_echo(&mut self, token: u64, ticks: u64, at: HostTime) {
-        // Accept only the answer to the pending request; anything else proves nothing.
-        let Some(t1) = self.echo_sent.filter(|t| t.0 as u64 == token) else {
+        let Some(t1) = self.echo.answered(token) else {
             self.counters.unsupported += 1;
             return;
         };
-        self.echo_sent = None;
         if let Some(map) = &mut self.map {
             let ticks = DeviceTicks(ticks);
             let _ = map.add_exchange(t1, ticks, ticks, at);
         }
     }
 
-    fn echo(&mut self, now: HostTime) {
-        let waiting = self.echo_sent.is_some_and(|t| now.ns_since(t) < 500 * MS);
-        if waiting || now < self.echo_due || self.map.is_none() {
+    fn ask_for_echo(&mut self, now: HostTime) {
+        if !self.echo.is_due(now) || self.map.is_none() {
             return;
         }
-        let quick = self.echoes < QUICK_ECHOES;
-        self.echo_due = now.plus_ns(if quick { QUICK_ECHO_EVERY_NS } else { ECHO_EVERY_NS });
-        self.echoes = self.echoes.saturating_add(1);
+        self.echo.ask(now);
         let t1 = self.clock.now();
         if self.send(&SensorMessage::EchoRequest { token: t1.0 as u64 }) {
-            self.echo_sent = Some(t1);
+            self.echo.asked(t1);
         }
     }
 }

@@ -11,14 +11,8 @@ pub mod vrpn;
 pub use gate::{PacketCounters, SampleCounters, SampleGate, TrackerCounters};
 
 use crate::pose::Pose;
+pub use crate::stream::Stream;
 use crate::time::HostTime;
-use std::io::{Read, Write};
-
-/// What a tracker's bytes come over: a socket, a port, or a conversation in memory. Reads and writes MUST NOT block;
-/// what is not there yet is [`std::io::ErrorKind::WouldBlock`].
-pub trait Stream: Read + Write + Send {}
-
-impl<T: Read + Write + Send> Stream for T {}
 
 /// Index of a tracked body in the order the rig file names them.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Hash)]

@@ -7,14 +7,14 @@ use dpm_device::sensor::wire::{MAX_GAINS, PERIOD_ONE};
 use dpm_device::time::{HostClock, HostTime};
 use serialport::SerialPort;
 use std::collections::VecDeque;
-use std::io::{self, ErrorKind};
+use std::io;
 use std::sync::atomic::{AtomicBool, AtomicU8, Ordering};
 use std::sync::{Arc, Mutex, PoisonError};
 use std::thread::JoinHandle;
 use std::time::Duration;
 
 /// Gain of the settings, in thousandths.
-const GAINS_MILLI: [u32; MAX_GAINS] = [1000, 2000, 4000, 8000, 16_000, 32_000, 0, 0];
+const GAINS_MILLI: [u32; MAX_GAINS] = [1000, 2000, 4000, 8000, 16_000, 32_000, 300, 0];
 /// Samples that may wait for the line's thread: 0.6 s at 100,000 a second. Later ones are dropped, as by a converter
 /// whose memory is full.
 const WAITING: usize = 1 << 16;
@@ -102,14 +102,7 @@ impl PortUart<'_> {
     fn count(&mut self, done: io::Result<usize>) -> usize {
         match done {
             Ok(n) => n,
-            Err(e)
-                if matches!(
-                    e.kind(),
-                    ErrorKind::TimedOut | ErrorKind::WouldBlock | ErrorKind::Interrupted
-                ) =>
-            {
-                0
-            }
+            Err(e) if dpm_device::tty::would_wait(&e) => 0,
             Err(e) => {
                 self.error.get_or_insert(e);
                 0

@@ -9,14 +9,17 @@ mod aperture;
 pub mod line;
 mod optics;
 
+use crate::hand::Hand;
 use crate::motion::Motion;
 use crate::projector::Shown;
 use dpm_device::planes::{Channel, PlaneSpec, Raster};
+use dpm_device::pose::Pose;
 use dpm_device::rng::Draws;
 use dpm_device::sensor::wire::LevelBits;
 use dpm_device::time::HostTime;
 pub use optics::ProjectorOptics;
 use optics::{dot, length, minus, place, rotate};
+use std::sync::Arc;
 
 /// The wand, its sensor, and what disturbs it.
 #[derive(Clone, Debug, PartialEq)]
@@ -135,6 +138,8 @@ pub struct SensorWand {
 struct Scene {
     config: SensorWandConfig,
     motion: Motion,
+    /// What moves the wand in place of `motion`.
+    hand: Option<Arc<Hand>>,
     raster: Raster,
     draws: Draws,
 }
@@ -194,7 +199,13 @@ impl SensorWand {
         }
         let draws = Draws::new(config.seed).stream(0x7761_6e64);
         let converter = Converter { gain: 1.0, next: 0, signal: 0.0, at_ns: 0.0 };
-        Ok(Self { scene: Scene { config, motion, raster, draws }, converter })
+        Ok(Self { scene: Scene { config, motion, hand: None, raster, draws }, converter })
+    }
+
+    /// Puts the wand into a hand, which moves it in place of its motion.
+    pub fn held_by(mut self, hand: Arc<Hand>) -> Self {
+        self.scene.hand = Some(hand);
+        self
     }
 
     /// The settings.
@@ -225,7 +236,7 @@ impl SensorWand {
 
     /// Where the sensor truly is at an instant.
     pub fn sensor_at(&self, t_ns: i64) -> [f64; 3] {
-        place(&self.scene.motion.pose_at(t_ns), self.scene.config.tip_m)
+        place(&self.scene.pose_at(t_ns), self.scene.config.tip_m)
     }
 
     /// The place on the raster whose light truly hits the sensor at an instant; `None` outside the lens's view.
@@ -301,6 +312,10 @@ impl Converter {
 }
 
 impl Scene {
+    fn pose_at(&self, t_ns: i64) -> Pose {
+        self.hand.as_ref().map_or_else(|| self.motion.pose_at(t_ns), |hand| hand.pose_at(t_ns))
+    }
+
     fn period_ticks(&self) -> u32 {
         self.config.ticks_per_second / self.config.samples_per_second
     }
@@ -320,7 +335,7 @@ impl Scene {
         if self.draws.stream(2).happens(index as u64, c.obstructed) {
             return 0.0;
         }
-        let pose = self.motion.pose_at(t_ns);
+        let pose = self.pose_at(t_ns);
         let sensor = place(&pose, c.tip_m);
         let Some(pixel) = c.optics.pixel_of(sensor) else { return 0.0 };
         let towards = minus(c.optics.pose.position_m, sensor);

@@ -86,11 +86,53 @@ impl ProjectorOptics {
         let [[fx, fy], [cx, cy]] = [self.focal_px, self.centre_px];
         Some([fx * bent_x + cx, fy * bent_y + cy])
     }
+
+    /// The point of the world that a place on the raster lights, at the depth of `near`: on the plane through `near` that is
+    /// parallel to the projector's raster. `None` where the lens lights nothing there.
+    pub fn lit_near(&self, pixel: [f64; 2], near: [f64; 3]) -> Option<[f64; 3]> {
+        let across = [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0]].map(|v| rotate(self.pose.rotation_xyzw, v));
+        let depth = -self.inward(near)[2];
+        let step = 1e-6 * depth;
+        let mut at = near;
+        for _ in 0..50 {
+            let here = self.pixel_of(at)?;
+            let off = [pixel[0] - here[0], pixel[1] - here[1]];
+            if off[0].hypot(off[1]) < 1e-6 {
+                return Some(at);
+            }
+            let slope = |k: usize| {
+                let beside: [f64; 3] = std::array::from_fn(|i| at[i] + step * across[k][i]);
+                self.pixel_of(beside).map(|p| [(p[0] - here[0]) / step, (p[1] - here[1]) / step])
+            };
+            let (a, b) = (slope(0)?, slope(1)?);
+            let determinant = a[0] * b[1] - a[1] * b[0];
+            let right = (off[0] * b[1] - off[1] * b[0]) / determinant;
+            let up = (a[0] * off[1] - a[1] * off[0]) / determinant;
+            at = std::array::from_fn(|i| at[i] + right * across[0][i] + up * across[1][i]);
+        }
+        None
+    }
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn a_pixel_lights_the_point_that_falls_on_it() {
+        let half = std::f64::consts::FRAC_1_SQRT_2;
+        let pose = Pose { position_m: [0.2, 0.1, -0.3], rotation_xyzw: [0.0, half, 0.0, half] };
+        let brown = [-0.06, 0.02, 0.0005, -0.0003, 0.0];
+        let optics = ProjectorOptics { pose, brown, ..ProjectorOptics::along_z([0.0; 3], 1800.0, 1024, 768) };
+        for pixel in [[3.0, 5.0], [512.0, 384.0], [1000.0, 700.5]] {
+            let near = [-1.1, 0.05, -0.25];
+            let at = optics.lit_near(pixel, near).expect("inside the lens's view");
+            let back = optics.pixel_of(at).expect("ahead");
+            assert!((back[0] - pixel[0]).hypot(back[1] - pixel[1]) < 1e-5, "{back:?}");
+            assert!((optics.inward(at)[2] - optics.inward(near)[2]).abs() < 1e-9);
+        }
+        assert_eq!(optics.lit_near([1e9, 0.0], [-1.0, 0.0, 0.0]), None);
+    }
 
     #[test]
     fn points_of_a_pinhole_fall_where_the_formula_says() {

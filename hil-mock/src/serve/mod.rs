@@ -3,6 +3,7 @@
 mod bodies;
 mod dlpc900;
 mod natnet;
+mod orders;
 mod projector;
 mod sensor_wand;
 mod serial;

@@ -1,10 +1,13 @@
 //! `hil-mock serve sensor-wand`: a projector, a tracked wand with a light sensor in its beam, and the wand's tracker.
 
+use super::orders::Orders;
 use super::projector::{run_beside, Beside, ProjectorArguments};
 use super::{cannot_open, cannot_serve, say};
 use clap::Args;
 use dpm_device::pose::Pose;
 use dpm_device::time::{FrameRate, HostClock, HostTime};
+use dpm_device::tracker::BodyIndex;
+use hil_mock::hand::Hand;
 use hil_mock::motion::{Motion, MotionSpec};
 use hil_mock::natnet_host::NatNetHost;
 use hil_mock::natnet_server::{NatNetServer, NatNetServerConfig};
@@ -24,9 +27,9 @@ const SHOWN_KEPT: usize = 64;
 const WAND: &str = "wand";
 /// The motion of a hand that wanders through the beam.
 const WANDER: &str = r#"{"kind":"together","parts":[
-    {"kind":"sinusoid","direction":[1,0,0],"peak_speed_m_s":0.35,"peak_acceleration_m_s2":0.9},
-    {"kind":"sinusoid","direction":[0,1,0],"peak_speed_m_s":0.27,"peak_acceleration_m_s2":0.83},
-    {"kind":"sinusoid","direction":[0,0,1],"peak_speed_m_s":0.2,"peak_acceleration_m_s2":0.43},
+    {"kind":"sinusoid","direction":[1,0,0],"peak_speed_m_s":0.5,"peak_acceleration_m_s2":0.86},
+    {"kind":"sinusoid","direction":[0,1,0],"peak_speed_m_s":0.37,"peak_acceleration_m_s2":0.67},
+    {"kind":"sinusoid","direction":[0,0,1],"peak_speed_m_s":0.24,"peak_acceleration_m_s2":0.43},
     {"kind":"sway","axis":[1,0.2,0],"peak_rate_rad_s":0.8,"peak_acceleration_rad_s2":2.1},
     {"kind":"sway","axis":[0,1,0.3],"peak_rate_rad_s":0.7,"peak_acceleration_rad_s2":1.7}]}"#;
 
@@ -42,6 +45,9 @@ pub(crate) struct SensorWandArguments {
     /// Motion of the wand: a JSON object as in a rig file; default: a hand that wanders through the beam
     #[arg(long, value_name = "MOTION")]
     motion: Option<String>,
+    /// Move the wand by orders from the standard input, one a line; it moves by --motion until the first one
+    #[arg(long)]
+    orders: bool,
     /// Place about which the wand moves, metres
     #[arg(long, value_name = "X,Y,Z", default_value = "0,0,0", value_parser = three, allow_hyphen_values = true)]
     wand_at: [f64; 3],
@@ -142,13 +148,17 @@ impl SensorWandArguments {
         Ok(Motion::new(&spec, Pose { position_m: self.wand_at, ..Pose::IDENTITY })?)
     }
 
-    fn wand(&self, motion: Motion) -> Result<SensorWand, Box<dyn Error>> {
+    fn optics(&self) -> Result<ProjectorOptics, Box<dyn Error>> {
         let raster = self.projector.raster();
         if !(self.focal > 1.0 && self.focal < 1e6) {
             return Err(format!("--focal {}: must be above 1 and below 1e6 px", self.focal).into());
         }
         let straight =
             ProjectorOptics::along_z(self.projector_at, self.focal, raster.width(), raster.height());
+        Ok(ProjectorOptics { brown: self.lens, ..straight })
+    }
+
+    fn wand(&self, motion: Motion) -> Result<SensorWand, Box<dyn Error>> {
         let config = SensorWandConfig {
             seed: self.seed,
             tip_m: self.tip,
@@ -162,12 +172,17 @@ impl SensorWandArguments {
             ambient: self.ambient,
             flicker: self.flicker,
             obstructed: self.obstructed,
-            ..SensorWandConfig::new(ProjectorOptics { brown: self.lens, ..straight })
+            ..SensorWandConfig::new(self.optics()?)
         };
-        Ok(SensorWand::new(config, motion, raster)?)
+        Ok(SensorWand::new(config, motion, self.projector.raster())?)
     }
 
-    fn tracker(&self, motion: Motion, clock: Arc<dyn HostClock>) -> Result<NatNetHost, Box<dyn Error>> {
+    fn tracker(
+        &self,
+        motion: Motion,
+        hand: Option<Arc<Hand>>,
+        clock: Arc<dyn HostClock>,
+    ) -> Result<NatNetHost, Box<dyn Error>> {
         let rate = FrameRate::new(self.tracker_rate, 1).ok_or("--tracker-rate: must be above 0")?;
         let config = MockTrackerConfig {
             seed: self.seed,
@@ -182,7 +197,10 @@ impl SensorWandArguments {
             names.push(name);
             motions.push(Motion::still(Pose { position_m: *position_m, ..Pose::IDENTITY })?);
         }
-        let source = SampleSource::new(config, motions)?;
+        let mut source = SampleSource::new(config, motions)?;
+        if let Some(hand) = hand {
+            source = source.held_by(BodyIndex(0), hand);
+        }
         let data_port = self.command_port.checked_add(1).ok_or("--command-port: at most 65534")?;
         let config = NatNetServerConfig { data_port, ..NatNetServerConfig::new(&names) };
         let streaming = config.streaming;
@@ -204,6 +222,8 @@ struct Wand {
     line: SensorLine,
     tracker: NatNetHost,
     path: String,
+    clock: Clock,
+    orders: Option<Orders>,
 }
 
 impl Beside for Wand {
@@ -218,6 +238,9 @@ impl Beside for Wand {
             shown.iter().for_each(|shown| wand.shine(shown, sink));
             wand.dark(until, sink);
         });
+        if let Some(orders) = &mut self.orders {
+            orders.follow(&shown, (self.clock)());
+        }
         Ok(())
     }
 }
@@ -230,8 +253,12 @@ pub(super) fn run(arguments: &SensorWandArguments) -> Result<(), Box<dyn Error>>
         Arc::new(move || clock())
     };
     let motion = arguments.motion()?;
-    let wand = arguments.wand(motion.clone())?;
-    let tracker = arguments.tracker(motion, host_clock.clone())?;
+    let mut wand = arguments.wand(motion.clone())?;
+    let hand = arguments.orders.then(|| Arc::new(Hand::new(motion.clone(), arguments.tip)));
+    if let Some(hand) = &hand {
+        wand = wand.held_by(hand.clone());
+    }
+    let tracker = arguments.tracker(motion, hand.clone(), host_clock.clone())?;
     let (port, path, _other_end) = match &arguments.sensor_port {
         Some(path) => {
             let port = dpm_device::tty::open(path, arguments.sensor_baud);
@@ -245,6 +272,12 @@ pub(super) fn run(arguments: &SensorWandArguments) -> Result<(), Box<dyn Error>>
     let queue = Arc::new(SampleQueue::default());
     let line = SensorLine::start(&wand, queue.clone(), port, host_clock)?;
     say(format_args!("light sensor on {path}"));
-    let mut beside = Wand { wand, queue, line, tracker, path };
+    say(format_args!("its --gain 0 to 5 amplify 1, 2, 4, 8, 16, 32 times, 6 by 0.3 for full white"));
+    let start = |hand| {
+        let (optics, width) = (arguments.optics()?, arguments.projector.raster().width());
+        Orders::start(hand, optics, width, arguments.bodies.clone()).map_err(Box::<dyn Error>::from)
+    };
+    let orders = hand.map(start).transpose()?;
+    let mut beside = Wand { wand, queue, line, tracker, path, clock: clock.clone(), orders };
     run_beside(&arguments.projector, SHOWN_KEPT, clock, &mut beside)
 }

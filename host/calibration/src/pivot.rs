@@ -139,8 +139,8 @@ fn refuse_a_moved_tip(off: &[DVec3], tip: DVec3) -> Result<(), PivotError> {
     Ok(())
 }
 
-/// Sum of the diagonal.
-pub(crate) fn trace(m: &DMat3) -> f64 {
+/// Sum of the diagonal of a covariance: the square of the length of a standard deviation.
+pub fn trace(m: &DMat3) -> f64 {
     m.x_axis.x + m.y_axis.y + m.z_axis.z
 }
 

@@ -87,7 +87,7 @@ pub enum TouchError {
         slid_mm: f64,
     },
     /// Fewer than four.
-    #[error("body: {0} touched points are too few, 4 are needed; touch more points of the mesh, far apart")]
+    #[error("body: touched points: {0}; at least 4 are needed, far apart")]
     TooFew(usize),
     /// A coordinate is NaN or infinite.
     #[error("body: touched point {0} is not finite; remove it")]

@@ -2,6 +2,7 @@
 
 use crate::light::{Channels, FlatField, LightModel, CURVE_POINTS};
 use crate::model::ProjectorModel;
+use crate::projector::Predicted;
 use dpm_device::planes::Raster;
 use dpm_scene::geometry::lens::Lens;
 use dpm_scene::geometry::projector::{ProjectorCamera, ProjectorError};
@@ -104,7 +105,7 @@ pub struct ProjectorSection {
 }
 
 impl ProjectorSection {
-    /// From a solver's result.
+    /// From a solver's result, for a tracker without bias.
     pub fn new(
         raster: Raster,
         model: &ProjectorModel,
@@ -123,6 +124,15 @@ impl ProjectorSection {
             residual_px,
             provenance,
         }
+    }
+
+    /// The same for a tracker whose reports are off by `bias_m`, root mean square along one axis.
+    pub fn assuming(mut self, predicted: &Predicted, bias_m: f64) -> Self {
+        let camera = self.world_from_projector.to_affine();
+        let distance = camera.translation.distance(predicted.worst).max(1e-6);
+        self.predicted_p99_px = predicted.with_bias(bias_m, self.focal[0].max(self.focal[1]) / distance);
+        self.assumed_bias_m = bias_m;
+        self
     }
 
     /// As a camera of the scene, at the raster it was measured with.

@@ -24,19 +24,6 @@ pub struct LightModel {
 }
 
 impl LightModel {
-    /// The text of a table for `projector.response` of a rig file: a line for each of 256 code values, with the light of
-    /// the first three channels over full white, darkness included.
-    pub fn response_table(&self) -> String {
-        let line = |code: u32| {
-            // The darkness of all channels is that of the picture: each bears its part.
-            let black =
-                |c: usize| self.channels.black * self.channels.intensity.get(c).copied().unwrap_or(0.0);
-            let level = |c: usize| black(c) + self.channels.level(c, f64::from(code) / 255.0);
-            format!("{:.6} {:.6} {:.6}\n", level(0), level(1), level(2))
-        };
-        (0..256).map(line).collect()
-    }
-
     /// Light of one channel at a code of 0 to 1, without darkness, over full white in the middle of the raster.
     pub fn level(&self, channel: usize, code: f64, pixel: DVec2) -> f64 {
         self.flat.at(pixel) * self.channels.level(channel, code)

@@ -40,6 +40,11 @@ pub enum SteadyError {
 
 /// Constant, then cosine and sine of the flicker and of its double.
 const TERMS: usize = 5;
+/// Fewest samples.
+const FEWEST: f64 = 20.0;
+/// Frames that last as long as a period of the flicker, or twice as long, show it as a constant. The constant takes it then,
+/// and is right, because such frames have it averaged out.
+const RIDGE: f64 = 1e-3;
 /// A change over a reading that is no longer noise, as a share of the level.
 const MOST_CHANGE: f64 = 0.02;
 
@@ -63,7 +68,7 @@ pub fn steady(blocks: &[Block], flicker_hz: f64) -> Result<Steady, SteadyError> 
         count += 1.0;
     }
     let need_s = 2.0 / flicker_hz;
-    if last_s < 0.99 * need_s || count < 50.0 {
+    if last_s < 0.99 * need_s || count < FEWEST {
         return Err(SteadyError::TooShort { have_ms: 1e3 * last_s, need_ms: 1e3 * need_s });
     }
     let row = |s: f64| {
@@ -78,6 +83,7 @@ pub fn steady(blocks: &[Block], flicker_hz: f64) -> Result<Steady, SteadyError> 
             row.iter().enumerate().for_each(|(j, b)| square[i][j] += a * b);
         }
     }
+    (1..TERMS).for_each(|i| square[i][i] += RIDGE);
     let too_short = SteadyError::TooShort { have_ms: 1e3 * last_s, need_ms: 1e3 * need_s };
     let x = solve_spd(&square, &right).ok_or(too_short)?;
     let (mut squares, mut halves) = (0.0, [[0.0; 2]; 2]);

@@ -152,15 +152,3 @@ fn a_sweep_that_leaves_the_border_out_is_refused() {
     shaded.iter_mut().for_each(|b| b.level *= (1.0 - b.pixel.x / 1000.0).max(0.0));
     assert!(matches!(flat_field(raster, &shaded, None), Err(FlatError::Dark { .. })));
 }
-
-#[test]
-fn the_table_for_a_rig_file_has_a_rising_line_for_each_code() {
-    let channels = read(1e-5, 1, light).solve().unwrap();
-    let raster = Raster::new(1024, 768).unwrap();
-    let text = LightModel { channels, flat: FlatField::even(raster) }.response_table();
-    let rows: Vec<Vec<f64>> =
-        text.lines().map(|l| l.split(' ').map(|v| v.parse().unwrap()).collect()).collect();
-    assert!(rows.len() == 256 && rows.iter().all(|r| r.len() == 3));
-    assert!(rows.windows(2).all(|w| (0..3).all(|c| w[0][c] <= w[1][c])));
-    assert!((0..3).all(|c| (rows[255][c] - FULL[c]).abs() < 3e-3 && rows[0][c] < 3e-3));
-}

@@ -49,7 +49,7 @@ pub(super) fn calibrate(truth: &Truth, seed: u64, bias: Bias) -> Result<Found, S
     let blocks = record(truth, &code, &TIMING, &hand, SWEEP_S, seed);
     // Echo tells the difference of the clocks to some milliseconds; even a second would do.
     let offset_ns = truth.sensor_offset_ns.saturating_add(250_000_000);
-    let decoded = decode(&code, &TIMING, &blocks, offset_ns).map_err(|e| e.to_string())?;
+    let decoded = decode(&code, &TIMING, &blocks, offset_ns, &|slot| slot).map_err(|e| e.to_string())?;
     let settings = Settings {
         timing: TIMING,
         tip: tip.tip,

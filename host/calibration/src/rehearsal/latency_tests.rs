@@ -21,7 +21,7 @@ fn latency(truth: &Truth, known: &ProjectorModel, seed: u64, late_ns: i64) -> Re
     let mut poses: Vec<Stamped> = tracker.wand(&hand, truth.tip, middle, SWEEP_S[0] - 1.0, SWEEP_S[1] + 1.0);
     poses.iter_mut().for_each(|p| p.stamp_ns += late_ns);
     let blocks = record(truth, &code, &TIMING, &hand, SWEEP_S, seed);
-    let decoded = decode(&code, &TIMING, &blocks, truth.sensor_offset_ns).expect("lit");
+    let decoded = decode(&code, &TIMING, &blocks, truth.sensor_offset_ns, &|slot| slot).expect("lit");
     let settings = Settings {
         timing: TIMING,
         // Half a millimetre off, as a pivot may be.

@@ -29,6 +29,8 @@ pub struct Draw {
     pub seed: u64,
     /// Errors of the light at points of bodies over the volume, pixels.
     pub errors_px: Vec<f64>,
+    /// The same for bodies that move at [`SPEED_M_S`], beyond what their prediction adds, pixels.
+    pub moving_px: Vec<f64>,
     /// Their 99th percentile.
     pub p99_px: f64,
     /// Upper bound of that by the solvers' covariance, which knows of no bias of the tracker.
@@ -64,6 +66,9 @@ pub struct Rehearsal {
     pub draws: usize,
     /// Error of the light over all points of all draws, pixels of 1024 x 768.
     pub error_px: Percentiles,
+    /// The same on bodies that move at 1 m/s in any direction, if their poses are predicted without error: what
+    /// calibration adds to prediction.
+    pub moving_px: Percentiles,
     /// Error of the latency, microseconds.
     pub latency_error_us: Largest,
     /// Error of a level over the channel's full light.
@@ -111,11 +116,13 @@ pub fn rehearse_one(seed: u64, bias: Bias) -> Result<Draw, RehearsalError> {
     let refused = |why: String| RehearsalError { seed, why };
     let truth = Truth::draw(seed);
     let found = bench::calibrate(&truth, seed, bias).map_err(refused)?;
-    let errors_px = light_errors(&truth, &found.sensor, &found.bodies, seed);
+    let errors_px = light_errors(&truth, &found.sensor, &found.bodies, seed, 0.0);
+    let moving_px = light_errors(&truth, &found.sensor, &found.bodies, seed, SPEED_M_S);
     Ok(Draw {
         seed,
         p99_px: percentile(errors_px.clone(), 0.99),
         errors_px,
+        moving_px,
         predicted_p99_px: predicted(&truth, &found.sensor, &found.bodies),
         latency_error_us: 1e-3 * (found.sensor.latency_ns as f64 - truth.latency_ns),
         level_error: level_error(&truth, &found.light),
@@ -126,13 +133,17 @@ pub fn rehearse_one(seed: u64, bias: Bias) -> Result<Draw, RehearsalError> {
 impl Rehearsal {
     /// Sums up draws.
     pub fn of(draws: &[Draw], bias: Bias) -> Self {
-        let all: Vec<f64> = draws.iter().flat_map(|d| d.errors_px.iter().copied()).collect();
+        let of = |errors: &dyn Fn(&Draw) -> &[f64]| {
+            let all: Vec<f64> = draws.iter().flat_map(|d| errors(d).iter().copied()).collect();
+            Percentiles { p50: percentile(all.clone(), 0.5), p99: percentile(all, 0.99) }
+        };
         let largest = |f: &dyn Fn(&Draw) -> f64| Largest { max: draws.iter().map(f).fold(0.0, f64::max) };
         let median = |f: &dyn Fn(&Draw) -> f64| percentile(draws.iter().map(f).collect(), 0.5);
         let covered = draws.iter().filter(|d| d.predicted_p99_px >= d.p99_px).count();
         Self {
             draws: draws.len(),
-            error_px: Percentiles { p50: percentile(all.clone(), 0.5), p99: percentile(all, 0.99) },
+            error_px: of(&|d| &d.errors_px),
+            moving_px: of(&|d| &d.moving_px),
             latency_error_us: largest(&|d| d.latency_error_us.abs()),
             level_error: largest(&|d| d.level_error),
             covered: covered as f64 / draws.len().max(1) as f64,
@@ -143,13 +154,17 @@ impl Rehearsal {
     }
 }
 
+/// Speed of the bodies that move, metres a second.
+pub const SPEED_M_S: f64 = 1.0;
 /// Half the size of a body's mesh, metres.
 const MESH_M: f64 = 0.08;
 const POINTS: usize = 2000;
 
 /// Distances between the pixels that are lit and those that should be, for points of bodies that lie anywhere in the
-/// volume, turned in any way.
-fn light_errors(truth: &Truth, got: &Solution, bodies: &[Touched], seed: u64) -> Vec<f64> {
+/// volume, turned in any way, and move at `speed_m_s` in any direction. A wrong latency lights them where they were or will
+/// be.
+fn light_errors(truth: &Truth, got: &Solution, bodies: &[Touched], seed: u64, speed_m_s: f64) -> Vec<f64> {
+    let late_s = 1e-9 * (got.latency_ns as f64 - truth.latency_ns);
     let mut s = Sampler::new(seed, 0xe4404);
     let mut cube = || DVec3::new(s.uniform(), s.uniform(), s.uniform());
     let size = DVec2::new(f64::from(truth.raster.width()), f64::from(truth.raster.height()));
@@ -158,11 +173,12 @@ fn light_errors(truth: &Truth, got: &Solution, bodies: &[Touched], seed: u64) ->
         let world = truth.volume.low + cube() * (truth.volume.high - truth.volume.low);
         let mesh = (2.0 * cube() - 1.0) * MESH_M;
         let turn = DMat3::from_quat(dpm_common::so3::so3_exp((2.0 * cube() - 1.0) * 1.8));
+        let motion = (2.0 * cube() - 1.0).normalize_or(DVec3::X) * (speed_m_s * late_s);
         let body = i % bodies.len();
         // The pose of the body that puts this point of its mesh there.
         let in_body = truth.mesh_to_body[body].transform_point3(mesh);
         let pose = DAffine3::from_mat3_translation(turn, world - turn * in_body);
-        let lit = pose.transform_point3(bodies[body].mesh_to_body.transform_point3(mesh));
+        let lit = pose.transform_point3(bodies[body].mesh_to_body.transform_point3(mesh)) + motion;
         let (Some(should), Some(is)) = (truth.projector.project(world), got.model.project(lit)) else {
             continue;
         };

@@ -4,8 +4,10 @@ use super::photodiode::record;
 use super::tracker::Tracker;
 use super::truth::{Bias, Hand, Truth};
 use crate::projector::{Known, Priors, Refusal};
-use crate::sensor::{Code, Decoded, Role, SensorError, Session, Settings, Solution, Timing, PLANES};
-use crate::trajectory::Stamped;
+use crate::sensor::{
+    decode, solve, Block, Code, Coverage, Decoded, Role, SensorError, Settings, Solution, Timing, PLANES,
+};
+use crate::trajectory::{Stamped, Trajectory};
 use glam::{DQuat, DVec2, DVec3};
 
 const TIMING: Timing = Timing { frame_zero_ns: 1_000_000_123, frame_ns: 1_055_966.2 };
@@ -13,7 +15,7 @@ const TIMING: Timing = Timing { frame_zero_ns: 1_000_000_123, frame_ns: 1_055_96
 struct Sweep {
     truth: Truth,
     code: Code,
-    session: Session,
+    blocks: Vec<Block>,
     decoded: Decoded,
     poses: Vec<Stamped>,
 }
@@ -37,12 +39,9 @@ fn sweep(seed: u64, seconds: f64) -> Sweep {
     let hand = Hand::sweeping(&truth.volume, seed);
     let tracker = Tracker { seed, latency_ns: truth.latency_ns, bias: Bias::None };
     let poses = tracker.wand(&hand, truth.tip, DVec3::ZERO, 38.0, 42.0 + seconds);
-    let mut session = Session::new(code.clone(), settings(&truth));
-    for block in record(&truth, &code, &TIMING, &hand, [40.0, 40.0 + seconds], seed) {
-        session.add_samples(block);
-    }
-    let decoded = session.decode(truth.sensor_offset_ns).unwrap();
-    Sweep { truth, code, session, decoded, poses }
+    let blocks = record(&truth, &code, &TIMING, &hand, [40.0, 40.0 + seconds], seed);
+    let decoded = decode(&code, &TIMING, &blocks, truth.sensor_offset_ns, &|slot| slot).unwrap();
+    Sweep { truth, code, blocks, decoded, poses }
 }
 
 impl Sweep {
@@ -53,13 +52,10 @@ impl Sweep {
 
     /// The same, for a wand whose tip came out elsewhere.
     fn with_tip(&self, tip: DVec3, change: impl Fn(usize, &mut Stamped)) -> Result<Solution, SensorError> {
-        let mut session = Session::new(self.code.clone(), Settings { tip, ..settings(&self.truth) });
-        for (i, pose) in self.poses.iter().enumerate() {
-            let mut pose = *pose;
-            change(i, &mut pose);
-            session.add_pose(pose);
-        }
-        session.solve(&self.decoded)
+        let mut poses = self.poses.clone();
+        poses.iter_mut().enumerate().for_each(|(i, pose)| change(i, pose));
+        let settings = Settings { tip, ..settings(&self.truth) };
+        solve(&self.code, &self.decoded, &Trajectory::new(&poses), &settings)
     }
 }
 
@@ -98,9 +94,13 @@ fn sweeps_with_a_fault_are_refused_by_name() {
 #[test]
 fn a_sweep_says_what_it_has_not_seen() {
     let short = sweep(6, 3.0);
-    let coverage = short.session.coverage(&short.decoded);
-    assert!(coverage.frames > 1000 && coverage.share < 0.85, "{coverage:?}");
-    assert!(short.session.advice(&short.decoded).contains("move the sensor to pixel"));
+    let mut coverage = Coverage::new(short.code.clone());
+    // Second by second, as a recorder hands them over.
+    let seen: usize =
+        short.blocks.chunks(100).map(|part| coverage.add(TIMING.frame_ns, part).unwrap_or(0)).sum();
+    assert!(seen > 1000 && seen <= short.decoded.frames.len() + 6, "{seen}");
+    assert!(coverage.share() < 0.85, "{coverage:?}");
+    assert!(coverage.advice().contains("near and far"), "{}", coverage.advice());
     // The emptiest cell is indeed one that hardly any frame has seen.
     let near = |f: &crate::sensor::Frame| {
         let seconds = 1e-9 * (TIMING.instant(f.number, 12.0).0 as f64);
@@ -109,12 +109,10 @@ fn a_sweep_says_what_it_has_not_seen() {
             .truth
             .projector
             .project(tip)
-            .is_some_and(|p| (p - coverage.emptiest).abs().cmplt(DVec2::new(60.0, 60.0)).all())
+            .is_some_and(|p| (p - coverage.emptiest()).abs().cmplt(DVec2::new(60.0, 60.0)).all())
     };
     assert!(short.decoded.frames.iter().filter(|f| near(f)).count() < 20);
-    let mut session = Session::new(short.code.clone(), settings(&short.truth));
-    short.poses.iter().for_each(|p| session.add_pose(*p));
-    assert!(session.decode(0).is_err());
+    assert!(coverage.add(TIMING.frame_ns, &[]).is_err());
 }
 
 /// The decoder's frames are numbered by the identity, and their levels are those of the code at the tip's true place.

@@ -37,6 +37,10 @@ fn with_white_noise_the_light_is_within_a_quarter_of_a_pixel() {
     assert_eq!(got.draws, 20);
     assert!(got.error_px.p50 <= 0.1 && got.error_px.p99 <= 0.25, "{:?}", got.error_px);
     assert!(got.latency_error_us.max <= 50.0, "{:?}", got.latency_error_us);
+    // Motion adds what the error of the latency moves a body, at about 1.6 pixels a millimetre, and no more.
+    let by_latency = 1.7 * SPEED_M_S * 1e-3 * got.latency_error_us.max;
+    assert!(got.moving_px.p99 <= 0.25 && got.moving_px.p99 <= got.error_px.p99 + by_latency, "{got:?}");
+    assert!(got.moving_px != got.error_px, "the latency is not known exactly");
     assert!(got.level_error.max <= 0.01, "{:?}", got.level_error);
     assert!(got.covered >= 0.98 && got.predicted_over_true <= 3.0, "{got:?}");
 }

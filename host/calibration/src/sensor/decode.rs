@@ -98,6 +98,8 @@ struct Planes {
     centre: f64,
 }
 
+/// The clocks of host and sensor are mapped to each other within this time, nanoseconds.
+const CLOCKS_NS: f64 = 1e10;
 /// Longest recording, planes: an hour.
 const MOST_PLANES: i64 = 100_000_000;
 /// A frame is used when its contrast reaches this share of the usual one.
@@ -105,8 +107,8 @@ const LEAST_CONTRAST: f64 = 0.15;
 /// References at both ends of a frame agree within this share of the contrast.
 const AGREE: f64 = 0.2;
 
-/// Decodes a recording. `sensor_minus_host_ns` is the rough difference of the two clocks, known to ten seconds: the
-/// identity repeats after half a minute.
+/// Decodes a recording. `sensor_minus_host_ns` is the rough difference of the two clocks, known to ten seconds. `shown`
+/// tells which frame's picture each slot showed: the slot's own, unless that frame was late or never came.
 ///
 /// # Errors
 /// Each reason of [`DecodeError`].
@@ -115,11 +117,25 @@ pub fn decode(
     timing: &Timing,
     blocks: &[Block],
     sensor_minus_host_ns: i64,
+    shown: &dyn Fn(u64) -> u64,
 ) -> Result<Decoded, DecodeError> {
+    let Seen { lock, planes, start } = seen(timing.frame_ns / PLANES as f64, blocks)?;
+    let whole = frames_from(&planes, start);
+    let numbered = number((code, shown), timing, &lock, &planes, start, whole, sensor_minus_host_ns)?;
+    Ok(Decoded { lock, centre: planes.centre, ..numbered })
+}
+
+/// Where the planes and the frames are in samples.
+struct Seen {
+    lock: Lock,
+    planes: Planes,
+    start: usize,
+}
+
+fn seen(plane_ns: f64, blocks: &[Block]) -> Result<Seen, DecodeError> {
     if let Some(bad) = blocks.iter().position(|b| !b.levels.iter().all(|l| l.is_finite())) {
         return Err(DecodeError::NotFinite(bad));
     }
-    let plane_ns = timing.frame_ns / PLANES as f64;
     let slowest = blocks.iter().map(|b| b.interval_ns).fold(0.0, f64::max);
     let per_plane = plane_ns / slowest;
     if blocks.iter().all(|b| b.levels.is_empty()) {
@@ -133,9 +149,16 @@ pub fn decode(
     let lock = lock(blocks, plane_ns)?;
     let planes = average(blocks, &lock, slowest)?;
     let start = find_start(&planes)?;
-    let whole = frames_from(&planes, start);
-    let numbered = number(code, timing, &lock, &planes, start, whole, sensor_minus_host_ns)?;
-    Ok(Decoded { lock, centre: planes.centre, ..numbered })
+    Ok(Seen { lock, planes, start })
+}
+
+/// The frames in samples; each with its place among them instead of its number.
+///
+/// # Errors
+/// As [`decode`], but for the identity.
+pub(super) fn frames_seen(plane_ns: f64, blocks: &[Block]) -> Result<Vec<Frame>, DecodeError> {
+    let Seen { planes, start, .. } = seen(plane_ns, blocks)?;
+    Ok(frames_from(&planes, start))
 }
 
 /// Averages the samples inside each plane, away from its borders.
@@ -229,9 +252,9 @@ fn frames_from(planes: &Planes, start: usize) -> Vec<Frame> {
     (0..count).filter_map(at).collect()
 }
 
-/// Numbers frames by their identity.
+/// Numbers frames by their identity: of the numbers that the clocks allow, the one whose identities are those seen.
 fn number(
-    code: &Code,
+    (code, shown): (&Code, &dyn Fn(u64) -> u64),
     timing: &Timing,
     lock: &Lock,
     planes: &Planes,
@@ -240,30 +263,35 @@ fn number(
     sensor_minus_host_ns: i64,
 ) -> Result<Decoded, DecodeError> {
     let bit = |f: &Frame| f.levels[PLANES - 2] > f.levels[PLANES - 1];
-    let told: Vec<(u64, bool)> = frames.iter().take(1000).map(|f| (f.number, bit(f))).collect();
-    let agree = |shift: u64| told.iter().filter(|(i, b)| code.identity(shift + i) == *b).count();
+    let told: Vec<(usize, bool)> = frames.iter().take(1000).map(|f| (f.number as usize, bit(f))).collect();
+    let n = told.len();
+    let Some(span) = told.last().map(|(i, _)| i + 1) else {
+        return Err(DecodeError::NoIdentity { percent: 0.0 });
+    };
+    let sensor_ns =
+        lock.base_ns as f64 + lock.border_ns + (planes.first as f64 + start as f64) * lock.plane_ns;
+    let host_ns = sensor_ns - sensor_minus_host_ns as f64 - timing.frame_zero_ns as f64;
+    let reach = ((CLOCKS_NS / timing.frame_ns) as u64).min(IDENTITY_PERIOD / 2);
+    let low = (host_ns / timing.frame_ns - reach as f64).max(0.0) as u64;
+    let tried = 2 * reach as usize + 1;
+    let identities: Vec<bool> =
+        (low..low + (tried + span) as u64).map(|slot| code.identity(shown(slot))).collect();
     let (mut best, mut second) = ((0, 0), 0);
-    for shift in 0..IDENTITY_PERIOD {
-        let count = agree(shift);
+    for shift in 0..tried {
+        let count = told.iter().filter(|(i, b)| identities.get(shift + i) == Some(b)).count();
         if count > best.0 {
             (second, best) = (best.0, (count, shift));
         } else {
             second = second.max(count);
         }
     }
-    let n = told.len();
-    let percent = 100.0 * best.0 as f64 / n.max(1) as f64;
-    if n < 60 || percent < 95.0 || 100 * second > 85 * n {
+    let percent = 100.0 * best.0 as f64 / n as f64;
+    if n < 60 || percent < 90.0 || 100 * second > 85 * n {
         return Err(DecodeError::NoIdentity { percent });
     }
-    // Of the frames with this identity, the one that the clocks put here.
-    let sensor_ns =
-        lock.base_ns as f64 + lock.border_ns + (planes.first as f64 + start as f64) * lock.plane_ns;
-    let host_ns = sensor_ns - sensor_minus_host_ns as f64 - timing.frame_zero_ns as f64;
-    let rounds = ((host_ns / timing.frame_ns - best.1 as f64) / IDENTITY_PERIOD as f64).round().max(0.0);
-    let first = best.1 + rounds as u64 * IDENTITY_PERIOD;
+    let first = low + best.1 as u64;
     frames.iter_mut().for_each(|f| f.number += first);
-    let right = frames.iter().filter(|f| code.identity(f.number) == bit(f)).count();
+    let right = frames.iter().filter(|f| code.identity(shown(f.number)) == bit(f)).count();
     let whole = planes.levels.len().saturating_sub(start) / PLANES;
     let noise = noise(&frames);
     Ok(Decoded {

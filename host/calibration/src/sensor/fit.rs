@@ -10,7 +10,7 @@
 
 use super::code::{Code, PLANES};
 use super::decode::Decoded;
-use super::problem::{Problem, Seen, State, LATENCY, TIP, UNKNOWNS};
+use super::problem::{Problem, Seen, Sighting, State, LATENCY, TIP, UNKNOWNS};
 use super::start::{prepare, start, thin, why_no_fit};
 use super::Timing;
 use crate::dense::inverse_spd;
@@ -144,24 +144,59 @@ pub fn solve(
     path: &Trajectory,
     settings: &Settings,
 ) -> Result<Solution, SensorError> {
-    let seen = prepare(code, decoded, path, settings);
-    if seen.len() < FEWEST {
-        let seconds = (2 * FEWEST - seen.len()) as f64 * 1e-9 * settings.timing.frame_ns;
-        return Err(SensorError::TooFew { frames: seen.len(), seconds: seconds.max(1.0) });
-    }
-    let times = times(decoded, settings);
-    let tip_sigma = settings.tip_sigma_m.max(1e-4);
-    let problem = Problem { code, path, settings, times, tip_sigma, is_held: false };
+    let (problem, seen) = set_up(code, decoded, (path, settings), false)?;
     let start = start(&problem, &seen)?;
     let (state, equations, rms_level) = refine(&problem, start, &seen)?;
     finish(&problem, &state, &equations, &seen, rms_level)
 }
 
-/// Time of a level within its plane, less that of the frame's middle, seconds, by plane.
-pub(super) fn times(decoded: &Decoded, settings: &Settings) -> [f64; PLANES] {
-    let middle = (PLANES / 2) as f64;
+/// The frames that can be used and what they are fitted with. `is_held`: lens and pose stay what they are.
+pub(super) fn set_up<'a>(
+    code: &'a Code,
+    decoded: &Decoded,
+    (path, settings): (&'a Trajectory, &'a Settings),
+    is_held: bool,
+) -> Result<(Problem<'a>, Vec<Seen>), SensorError> {
+    let seen = prepare(code, decoded, path, settings);
+    if seen.len() < FEWEST {
+        let seconds = (2 * FEWEST - seen.len()) as f64 * 1e-9 * settings.timing.frame_ns;
+        return Err(SensorError::TooFew { frames: seen.len(), seconds: seconds.max(1.0) });
+    }
+    // Time of a level within its plane, less that of the frame's middle.
     let plane_s = 1e-9 * settings.timing.frame_ns / PLANES as f64;
-    std::array::from_fn(|p| (p as f64 + decoded.centre - middle) * plane_s)
+    let times = std::array::from_fn(|p| (p as f64 + decoded.centre - (PLANES / 2) as f64) * plane_s);
+    let tip_sigma = settings.tip_sigma_m.max(1e-4);
+    Ok((Problem { code, path, settings, times, tip_sigma, is_held }, seen))
+}
+
+/// Scores summed by block of time, and how far each frame alone would move its pixel.
+#[derive(Default)]
+pub(super) struct Scores {
+    pub by_block: Vec<(i64, [f64; UNKNOWNS])>,
+    squares_px: f64,
+    count: f64,
+}
+
+impl Scores {
+    /// Adds a frame that is seen at `at`.
+    pub(super) fn add(&mut self, problem: &Problem, at: &Sighting, frame: &Seen, sigma: f64) {
+        let sums = problem.frame(at, frame, sigma, 0.0);
+        let block = (frame.from_middle_s / BLOCK_S).floor() as i64;
+        let score = sums.score(at);
+        match self.by_block.last_mut().filter(|(b, _)| *b == block) {
+            Some((_, sum)) => sum.iter_mut().zip(&score).for_each(|(a, b)| *a += b),
+            None => self.by_block.push((block, score)),
+        }
+        for k in (0..2).filter(|k| sums.gg[*k] > 1.0) {
+            self.squares_px += (sums.gr[k] / sums.gg[k]).powi(2);
+            self.count += 1.0;
+        }
+    }
+
+    /// Root mean square of the frames' own steps along one axis, pixels.
+    pub(super) fn rms_px(&self) -> f64 {
+        (self.squares_px / self.count.max(1.0)).sqrt()
+    }
 }
 
 /// Fits the levels: wide stripes first, since a start that is wrong by a stripe would lock to the wrong one.
@@ -206,20 +241,11 @@ fn finish(
 ) -> Result<Solution, SensorError> {
     let settings = problem.settings;
     let sigma = rms_level.clamp(0.005, 0.15);
-    let mut scores: Vec<(i64, [f64; UNKNOWNS])> = Vec::new();
-    let (mut brightness, mut depths, mut misses) = (Vec::new(), Vec::new(), Vec::new());
+    let (mut scores, mut brightness, mut depths) = (Scores::default(), Vec::new(), Vec::new());
     let position = state.model.position();
     for frame in seen {
         let Some(at) = problem.sight(state, frame) else { continue };
-        let sums = problem.frame(&at, frame, sigma, 0.0);
-        let block = (frame.from_middle_s / BLOCK_S).floor() as i64;
-        let score = sums.score(&at);
-        match scores.last_mut().filter(|(b, _)| *b == block) {
-            Some((_, sum)) => sum.iter_mut().zip(&score).for_each(|(a, b)| *a += b),
-            None => scores.push((block, score)),
-        }
-        // The step of this frame alone, in pixels.
-        (0..2).filter(|k| sums.gg[*k] > 1.0).for_each(|k| misses.push((sums.gr[k] / sums.gg[k]).powi(2)));
+        scores.add(problem, &at, frame, sigma);
         let shift = (1e9 * (state.latency_s + state.drift * frame.from_middle_s)) as i64;
         let Some(pose) = problem.path.at(frame.instant.0 + shift, 0.0) else { continue };
         let tip = pose.position + pose.rotation * state.tip;
@@ -232,14 +258,15 @@ fn finish(
             level: frame.contrast,
         });
     }
-    let rms_px = (misses.iter().sum::<f64>() / misses.len().max(1) as f64).sqrt();
+    let rms_px = scores.rms_px();
     if rms_px > 2.5 {
         return Err(why_no_fit(problem, seen, state, rms_px));
     }
     check_result(problem.code.raster(), &state.model, &depths, &settings.known)?;
     let mut expected = Equations::new(UNKNOWNS);
     problem.expect(state, &mut expected);
-    let covariance = sandwich(equations, &expected, &scores).ok_or(Refusal::NotConverged { rms_px })?;
+    let covariance =
+        sandwich(equations, &expected, &scores.by_block).ok_or(Refusal::NotConverged { rms_px })?;
     if state.latency_s.abs() > 0.9 * MOST_LATENCY_S {
         return Err(SensorError::LatencyAtBound { ms: 1e3 * state.latency_s });
     }

@@ -6,21 +6,21 @@
 //! to tell the planes apart: a level belongs to a plane of a frame, and the projector says when that plane was lit.
 
 mod code;
+mod coverage;
 mod decode;
 mod fit;
 mod latency;
 mod lock;
 mod problem;
-mod session;
 mod start;
 mod stripes;
 
 pub use code::{Code, CodeError, Role, PLANES};
+pub use coverage::Coverage;
 pub use decode::{decode, DecodeError, Decoded, Frame};
 pub use fit::{solve, Brightness, SensorError, Settings, Solution};
 pub use latency::{solve_latency, Latency};
 pub use lock::{Block, Lock};
-pub use session::{Coverage, Session};
 
 /// When the projector shows which frame, by the host's clock. All planes of a frame are equally long, and no pause
 /// divides frames.

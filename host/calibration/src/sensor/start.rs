@@ -142,25 +142,41 @@ pub(super) fn why_no_fit(problem: &Problem, seen: &[Seen], state: &State, px: f6
 
 /// A state that is good to a pixel: from the pixels of the bits, with tip and latency free.
 pub(super) fn start(problem: &Problem, seen: &[Seen]) -> Result<State, SensorError> {
+    let (state, px) = from_bits(problem, seen, pinhole(problem, seen)?)?;
+    if px > MOST_START_PX {
+        return Err(why_no_fit(problem, seen, &state, px));
+    }
+    Ok(state)
+}
+
+/// Frames that suffice for a start.
+const FEW: usize = 1500;
+/// Beyond this median, pixels, a start is none.
+pub(super) const MOST_START_PX: f64 = 6.0;
+
+/// Fits the pixels of the bits from a model, the tip of the pivot and no latency. Gives the state and the median distance
+/// that is left, pixels.
+pub(super) fn from_bits(
+    problem: &Problem,
+    seen: &[Seen],
+    model: ProjectorModel,
+) -> Result<(State, f64), SensorError> {
     let settings = problem.settings;
-    let mut state = State {
-        model: pinhole(problem, seen)?,
-        tip: settings.tip,
-        latency_s: 0.0,
-        drift: 0.0,
-        radius_m: 0.5 * settings.aperture_m,
-    };
-    let few: Vec<Seen> = thin(seen, 1500).map(Seen::copy).collect();
+    let radius_m = 0.5 * settings.aperture_m;
+    let mut state = State { model, tip: settings.tip, latency_s: 0.0, drift: 0.0, radius_m };
+    let few: Vec<Seen> = thin(seen, FEW).map(Seen::copy).collect();
     for sigma_px in [6.0, 1.5] {
         let equations = |s: &State| problem.of_bits(s, &few, sigma_px);
         let cost = |s: &State| equations(s).map_or(f64::INFINITY, |e| e.cost);
         let found = descend(state, 40, equations, cost, |s: &State, d: &[f64]| s.step(d));
         state = found.ok_or(Refusal::NotConverged { rms_px: f64::INFINITY })?.state;
     }
-    let miss = |s: &Seen| problem.sight(&state, s).map(|at| (at.pixel - s.pixel).length());
-    let px = percentile(few.iter().filter_map(miss).collect(), 0.5);
-    if px > 6.0 {
-        return Err(why_no_fit(problem, seen, &state, px));
-    }
-    Ok(state)
+    let px = miss(problem, &state, &few);
+    Ok((state, px))
+}
+
+/// The median distance between the pixels of the bits and where a state sees them.
+pub(super) fn miss(problem: &Problem, state: &State, seen: &[Seen]) -> f64 {
+    let one = |s: &Seen| problem.sight(state, s).map(|at| (at.pixel - s.pixel).length());
+    percentile(seen.iter().filter_map(one).collect(), 0.5)
 }

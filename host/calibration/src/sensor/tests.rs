@@ -61,7 +61,7 @@ fn samples_that_show_no_code_are_refused_by_name() {
     let block = |level: &dyn Fn(usize) -> f32| {
         [Block { start_ns: 0, interval_ns: 1e4, levels: (0..300_000).map(level).collect() }]
     };
-    let get = |blocks: &[Block]| decode(&code, &timing, blocks, 0).unwrap_err();
+    let get = |blocks: &[Block]| decode(&code, &timing, blocks, 0, &|slot| slot).unwrap_err();
     assert_eq!(get(&[]), DecodeError::NoSamples);
     assert_eq!(get(&block(&|_| 0.7)), DecodeError::NoLight);
     assert_eq!(get(&block(&|i| if i == 9 { f32::NAN } else { 0.0 })), DecodeError::NotFinite(0));
@@ -77,7 +77,7 @@ fn samples_that_show_no_code_are_refused_by_name() {
         Block { start_ns: i64::MIN, interval_ns: 1e4, levels: vec![0.0, 1.0] },
         Block { start_ns: i64::MAX, interval_ns: 1e4, levels: vec![0.0, 1.0, 0.0] },
     ];
-    decode(&code, &timing, &bad, 0).unwrap_err();
+    decode(&code, &timing, &bad, 0, &|slot| slot).unwrap_err();
 }
 
 #[test]

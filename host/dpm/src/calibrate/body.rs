@@ -2,6 +2,7 @@
 //! by wandering over its surface.
 
 use super::dialogue::Dialogue;
+use super::lines::Lines;
 use super::poses::Poses;
 use super::results::Results;
 use dpm_calibration::body::{tip_in_body, wander, Session, Surface, Touch};
@@ -84,7 +85,9 @@ pub fn calibrate(
         bodies.iter().flat_map(|b| b.mesh.positions.iter().map(|p| p.as_dvec3())).collect();
     let poses = Poses::start(config, &[wand.to_owned(), name.to_owned()], MonotonicClock::new(0))?;
     poses.wait_until_seen()?;
-    let (touched, count) = touch(&poses, tip, &points, dialogue)?;
+    let progress = results.progress(&format!("body-{}", file_word(name)));
+    let mut touches = Lines::resume(progress)?;
+    let (touched, count) = touch(&poses, tip, &points, &mut touches, dialogue)?;
     let mut place = (touched, format!("{count} touched points"));
     let mut told = format!("touched points: residual {:.2} mm rms", 1e3 * place.0 .1);
     if ways.wander_s > 0.0 {
@@ -110,7 +113,15 @@ pub fn calibrate(
     let provenance = results.provenance(config, name, data, "rigid motion by least squares");
     let section = BodySection { mesh_to_body: Pose::new(&motion), residual_m, provenance };
     results.file.bodies.insert(name.to_owned(), section);
+    told += &format!("\n{}", results.save(config)?);
+    // Not before the result is written: until then the touches are all there is.
+    touches.forget();
     Ok(told)
+}
+
+/// A body's name as a part of a file's.
+fn file_word(name: &str) -> String {
+    name.chars().map(|c| if c.is_alphanumeric() { c } else { '_' }).collect()
 }
 
 /// Touches points of the mesh until the operator is content. Returns the place with its residual, and the number of points.
@@ -118,23 +129,38 @@ fn touch(
     poses: &Poses,
     tip: DVec3,
     points: &[DVec3],
+    touches: &mut Lines<6>,
     dialogue: &Dialogue,
 ) -> Result<((DAffine3, f64), usize), Failure> {
     let named = outermost(points);
     let mut session = Session::new(named.iter().map(|(_, p)| *p).collect());
-    let mut count = 0;
+    for line in touches.lines() {
+        let [mesh, body] = [0, 3].map(|i| DVec3::from_slice(&line[i..i + 3]));
+        session.add(Touch { mesh, body });
+    }
+    let mut count = touches.lines().len();
     dialogue.tell(
         "Touch the points of the body that are asked for with the tip of the wand, hold it there and press Enter. The axes are\n\
          those of the mesh. At least 4 points are needed. s: another point; d: done; or type x y z in metres for a point of\n\
          your own.",
     );
+    if count > 0 {
+        let told = format!(
+            "Going on with {count} points of {}; delete that file to begin anew.",
+            touches.path().display()
+        );
+        dialogue.tell(&told);
+    }
     let mut skipped = 0;
     loop {
-        let suggested = named.get((count + skipped) % named.len().max(1));
-        let (words, at) = suggested.copied().unwrap_or(("a point", DVec3::ZERO));
-        let [x, y, z] = at.to_array();
-        let answer =
-            dialogue.ask(&format!("point {}: {words}, at ({x:.4}, {y:.4}, {z:.4}) m:", count + 1))?;
+        let suggested = named.get(count + skipped).copied();
+        let question = match suggested {
+            Some((words, DVec3 { x, y, z })) => {
+                format!("point {}: {words}, at ({x:.4}, {y:.4}, {z:.4}) m:", count + 1)
+            }
+            None => format!("point {}: x y z of a point of your own, or d:", count + 1),
+        };
+        let answer = dialogue.ask(&question)?;
         let numbers: Vec<f64> = answer.split_whitespace().filter_map(|w| w.parse().ok()).collect();
         let mesh = match (answer.as_str(), &numbers[..]) {
             ("s" | "S", _) => {
@@ -148,8 +174,8 @@ fn touch(
                     continue;
                 }
             },
-            ("", _) => at,
             (_, &[x, y, z]) => DVec3::new(x, y, z),
+            ("", _) if suggested.is_some() => suggested.map_or(DVec3::ZERO, |(_, at)| at),
             _ => {
                 dialogue.tell("press Enter, s or d, or type three numbers");
                 continue;
@@ -158,10 +184,13 @@ fn touch(
         match tip_in_body(tip, &together(&poses.hold())) {
             Ok(contact) => {
                 session.add(Touch { mesh, body: contact.body });
+                let (m, b) = (mesh, contact.body);
+                touches.push([m.x, m.y, m.z, b.x, b.y, b.z])?;
                 count += 1;
                 match session.solve() {
                     Ok(t) => dialogue.tell(&format!("residual {:.2} mm rms", 1e3 * t.residual_m)),
-                    Err(why) => dialogue.tell(&why.to_string()),
+                    Err(why) if count >= 4 => dialogue.tell(&why.to_string()),
+                    Err(_) => dialogue.tell(&format!("noted; {} more at least", 4 - count)),
                 }
             }
             Err(why) => dialogue.tell(&why.to_string()),

@@ -16,6 +16,8 @@ use std::fmt::Write;
 
 /// A body that has moved further than this since its light was placed, metres, gets its light anew.
 const MOVED_M: f64 = 5e-4;
+/// Light that misses by more than this, pixels, makes one ask whether the tip was in it.
+const FAR_PX: f64 = 30.0;
 
 /// A body as the rig would light it.
 pub struct Target {
@@ -260,6 +262,9 @@ fn told_of_point(offset: &Offset) -> String {
         }
         None => told += "; the projector's part alone",
     }
+    if offset.projector.length() > FAR_PX {
+        told += "\nthe tip was far from where this light should fall: was it in the dot? If not, end by d and check again";
+    }
     told
 }
 
@@ -319,7 +324,11 @@ pub fn judge(
 /// The errors that the calibration file predicts.
 fn predicted(file: &CalibrationFile, body: &str) -> String {
     let projector = file.projector.as_ref().map_or("the projector was not calibrated".into(), |p| {
-        format!("light within {:.2} px (99th percentile)", p.predicted_p99_px)
+        let bias = 1e3 * p.assumed_bias_m;
+        format!(
+            "light within {:.2} px (99th percentile, for a tracker bias of {bias:.2} mm)",
+            p.predicted_p99_px
+        )
     });
     let body = file.bodies.get(body).map_or(format!("\"{body}\" was not calibrated"), |b| {
         format!("\"{body}\" with a residual of {:.2} mm", 1e3 * b.residual_m)

@@ -4,26 +4,29 @@
 //! levels go round and round, so a level is a function of the slot alone, whenever the measurement begins.
 
 use super::recorder::Timed;
+use super::showing::Showing;
 use dpm_calibration::light::{steady, Channels, Next, Session, Steady};
-use dpm_calibration::sensor::{Block, Timing};
+use dpm_calibration::sensor::Block;
 use dpm_device::link::{mean_luminance, FlashLimiter, FULL_LUMINANCE};
 use dpm_device::planes::{Channel, PlaneSchedule, Raster};
-use dpm_device::time::{FrameRate, HostTime};
+use dpm_device::time::FrameRate;
 use dpm_render::pack::{pack, BitPlaneFrame, Kernel};
 use dpm_rig::pack::source::{Canvas, PatternSource};
 use std::collections::BTreeMap;
 
-/// Codes of a channel that are shown, code 0 not counted.
-pub const CODES: u32 = 32;
 /// A level stands for this long at least, seconds, and for so many frames.
 const HOLD_S: f64 = 0.25;
-const HOLD_FRAMES: u64 = 80;
+const HOLD_FRAMES: u64 = 40;
 /// Longest time for a level, seconds: the limiter looks back for one second.
 const LONGEST_HOLD_S: f64 = 2.0;
+/// Full white.
+const WHITE: u32 = 0x00ff_ffff;
 /// At both ends of a level so much is left out, seconds: the clocks are known to a millisecond or two.
 const MARGIN_S: f64 = 0.01;
 /// A frame counts when this share of it was sampled.
 const LEAST_SAMPLED: f64 = 0.98;
+/// A level counts when so many of its slots were seen whole with a frame of their own.
+const LEAST_FRAMES: usize = 24;
 /// References before and after a level agree within this share.
 const MOST_DRIFT: f64 = 0.03;
 
@@ -40,7 +43,9 @@ pub struct Levels {
     steps: Vec<Step>,
     hold: u64,
     channels: usize,
+    schedule: PlaneSchedule,
     rate: FrameRate,
+    flashes: Option<u8>,
     mean: f64,
 }
 
@@ -67,7 +72,6 @@ impl Levels {
                     .into(),
             ),
         };
-        let white = 0x00ff_ffff;
         let mut levels = vec![Step { what: Next::Black, code: 0 }];
         for channel in 0..channels {
             levels.extend((1..=codes).rev().map(|i| {
@@ -76,11 +80,21 @@ impl Levels {
                 Step { what: Next::Code { channel, code: f64::from(value) / 255.0 }, code }
             }));
         }
-        let reference = Step { what: Next::White, code: white };
+        Self::of(levels, channels, schedule, rate, flashes)
+    }
+
+    fn of(
+        levels: Vec<Step>,
+        channels: usize,
+        schedule: &PlaneSchedule,
+        rate: FrameRate,
+        flashes: Option<u8>,
+    ) -> Result<Self, String> {
+        let reference = Step { what: Next::White, code: WHITE };
         let steps: Vec<Step> = levels.into_iter().flat_map(|level| [reference, level]).collect();
         let light: Vec<u32> = steps.iter().map(|s| luminance(schedule, s.code)).collect();
         let mean = light.iter().map(|l| f64::from(*l)).sum::<f64>()
-            / (light.len() as f64 * f64::from(FULL_LUMINANCE));
+            / (light.len().max(1) as f64 * f64::from(FULL_LUMINANCE));
         let slots = |s: f64| (s * rate.hz()).ceil() as u64;
         let mut hold = slots(HOLD_S).max(HOLD_FRAMES);
         if let Some(limit) = flashes {
@@ -95,7 +109,24 @@ impl Levels {
             // The second that the limiter looks at may begin anywhere, and so may the levels.
             hold += hold / 8;
         }
-        Ok(Self { steps, hold, channels, rate, mean })
+        Ok(Self { steps, hold, channels, schedule: *schedule, rate, flashes, mean })
+    }
+
+    /// Those of the levels that `readings` lacks; `None` if it has all.
+    ///
+    /// # Errors
+    /// As [`Levels::new`].
+    pub fn missing(&self, readings: &Readings) -> Result<Option<Self>, String> {
+        let lacks = |s: &&Step| !readings.of.contains_key(&s.code);
+        let levels: Vec<Step> = self.levels().filter(lacks).copied().collect();
+        if levels.is_empty() {
+            return Ok(None);
+        }
+        Self::of(levels, self.channels, &self.schedule, self.rate, self.flashes).map(Some)
+    }
+
+    fn levels(&self) -> impl Iterator<Item = &Step> {
+        self.steps.iter().skip(1).step_by(2)
     }
 
     /// Time for which every level is shown at least once, whenever it begins, seconds.
@@ -164,78 +195,109 @@ pub struct Room {
     pub ambient: Steady,
 }
 
-/// What was sampled while levels were shown, into curves and brightness. `lit` are the slots that were lit.
-///
-/// # Errors
-/// What the readings lack, or why they are no levels of a projector; one sentence with what to do.
-pub fn solve(
-    levels: &Levels,
-    timing: &Timing,
-    lit: &[(u64, HostTime)],
-    samples: &[Timed],
-    room: Room,
-) -> Result<Channels, String> {
-    let runs = by_run(levels, timing, lit, samples);
-    let mut readings = BTreeMap::new();
-    for (run, frames) in &runs {
-        // The first and the last run may be cut off.
-        if frames.len() as u64 * 2 > levels.hold {
-            readings.insert(*run, steady(frames, room.flicker_hz).map_err(|e| e.to_string())?);
+/// Levels that were read so far, in one or more passes.
+#[derive(Clone, Debug, Default)]
+pub struct Readings {
+    /// By code: what it is, and its level as if full white had been what it was in the first pass.
+    of: BTreeMap<u32, (Next, Steady)>,
+    /// Full white of the first pass.
+    white: Option<Steady>,
+}
+
+impl Readings {
+    /// Adds what was sampled while `levels` were shown.
+    ///
+    /// # Errors
+    /// Why the samples are no levels of a projector; one sentence with what to do.
+    pub fn add(
+        &mut self,
+        levels: &Levels,
+        showing: &Showing,
+        samples: &[Timed],
+        room: Room,
+    ) -> Result<(), String> {
+        let mut readings = BTreeMap::new();
+        for (run, frames) in by_run(levels, showing, samples) {
+            // The first and the last run may be cut off.
+            if frames.len() >= LEAST_FRAMES {
+                readings.insert(run, steady(&frames, room.flicker_hz).map_err(|e| e.to_string())?);
+            }
         }
+        let whites: Vec<Steady> = readings
+            .iter()
+            .filter(|(run, _)| levels.step_of(**run).is_multiple_of(2))
+            .map(|(_, r)| *r)
+            .collect();
+        if whites.is_empty() {
+            return Ok(());
+        }
+        let ambient = room.ambient.level;
+        let white = self.white.get_or_insert_with(|| Steady {
+            level: whites.iter().map(|r| r.level).sum::<f64>() / whites.len() as f64,
+            sigma: whites.iter().map(|r| r.sigma).fold(0.0, f64::max),
+            flicker: 0.0,
+        });
+        for (run, reading) in readings.iter().filter(|(run, _)| levels.step_of(**run) % 2 == 1) {
+            let around = run.checked_sub(1).and_then(|b| readings.get(&b)).zip(readings.get(&(run + 1)));
+            let Some((before, after)) = around else { continue };
+            let reference = 0.5 * (before.level + after.level);
+            if (before.level - after.level).abs() > MOST_DRIFT * (reference - ambient).abs() {
+                return Err(format!(
+                    "full white changed by {:.1} % within {:.1} s: do not move or shade the sensor, let the projector \
+                     warm up, and switch off whatever adapts its light",
+                    100.0 * (before.level - after.level).abs() / (reference - ambient).abs(),
+                    2.0 * levels.hold_s()
+                ));
+            }
+            // Ambient light has no part in the projector's drift.
+            let scale = (white.level - ambient) / (reference - ambient);
+            let level = ambient + (reading.level - ambient) * scale;
+            let step = levels.steps[levels.step_of(*run)];
+            self.of.insert(step.code, (step.what, Steady { level, ..*reading }));
+        }
+        Ok(())
     }
-    let whites: Vec<Steady> =
-        readings.iter().filter(|(run, _)| levels.step_of(**run).is_multiple_of(2)).map(|(_, r)| *r).collect();
-    let ambient = room.ambient.level;
-    let white = whites.iter().map(|r| r.level).sum::<f64>() / whites.len().max(1) as f64;
-    let mut session = Session::new(levels.channels);
-    let mut seen = vec![false; levels.steps.len()];
-    let add = |session: &mut Session, what, r| session.add(what, r).map_err(|e| e.to_string());
-    add(&mut session, Next::Ambient, room.ambient)?;
-    for (run, reading) in readings.iter().filter(|(run, _)| levels.step_of(**run) % 2 == 1) {
-        let around = run.checked_sub(1).and_then(|b| readings.get(&b)).zip(readings.get(&(run + 1)));
-        let Some((before, after)) = around else { continue };
-        let reference = 0.5 * (before.level + after.level);
-        if (before.level - after.level).abs() > MOST_DRIFT * (reference - ambient).abs() {
+
+    /// Levels that were read.
+    pub fn count(&self) -> usize {
+        self.of.len()
+    }
+
+    /// Curves and brightness of the channels of `levels`, all of which must have been read.
+    ///
+    /// # Errors
+    /// What the readings lack, or why they are no levels of a projector; one sentence with what to do.
+    pub fn solve(&self, levels: &Levels, room: Room) -> Result<Channels, String> {
+        let missed = levels.levels().filter(|s| !self.of.contains_key(&s.code)).count();
+        let Some(white) = self.white.filter(|_| missed == 0) else {
             return Err(format!(
-                "full white changed by {:.1} % within {:.1} s: do not move or shade the sensor, let the projector warm \
-                 up, and switch off whatever adapts its light",
-                100.0 * (before.level - after.level).abs() / (reference - ambient).abs(),
-                2.0 * levels.hold_s()
+                "{missed} of {} levels were not seen whole: frames were dark or samples were lost; look at `dpm \
+                 link-test`, at the limits of light, and at the sensor's cable",
+                levels.count()
             ));
+        };
+        let mut session = Session::new(levels.channels);
+        let all = [(Next::Ambient, room.ambient), (Next::White, white)];
+        for (what, reading) in all.iter().chain(self.of.values()) {
+            session.add(*what, *reading).map_err(|e| e.to_string())?;
         }
-        // Ambient light has no part in the projector's drift.
-        let scale = (white - ambient) / (reference - ambient);
-        let level = ambient + (reading.level - ambient) * scale;
-        let step = levels.step_of(*run);
-        seen[step] = true;
-        add(&mut session, levels.steps[step].what, Steady { level, ..*reading })?;
+        session.solve().map_err(|e| e.to_string())
     }
-    let missed = seen.iter().skip(1).step_by(2).filter(|seen| !**seen).count();
-    if missed > 0 {
-        return Err(format!(
-            "{missed} of {} levels were not seen whole: frames were dark or samples were lost; look at `dpm link-test`, \
-             at the limits of light, and at the sensor's cable",
-            levels.count()
-        ));
-    }
-    let sigma = whites.iter().map(|r| r.sigma).fold(0.0, f64::max);
-    add(&mut session, Next::White, Steady { level: white, sigma, flicker: 0.0 })?;
-    session.solve().map_err(|e| e.to_string())
 }
 
 /// The mean level of each lit frame that was sampled whole, by run. Planes come and go far faster than lamps flicker, so
 /// whole frames only are looked at.
-fn by_run(
-    levels: &Levels,
-    timing: &Timing,
-    lit: &[(u64, HostTime)],
-    samples: &[Timed],
-) -> BTreeMap<u64, Vec<Block>> {
+fn by_run(levels: &Levels, showing: &Showing, samples: &[Timed]) -> BTreeMap<u64, Vec<Block>> {
+    let timing = &showing.timing;
     let margin = (MARGIN_S * levels.rate.hz()).ceil().max(2.0) as u64;
-    let is_inside = |slot: u64| (margin..levels.hold.saturating_sub(margin)).contains(&(slot % levels.hold));
+    let is_inside = |slot: &u64| {
+        let in_run = (margin..levels.hold.saturating_sub(margin)).contains(&(slot % levels.hold));
+        // A frame that came late may show the level before.
+        in_run && levels.run_of(showing.made_for(*slot)) == levels.run_of(*slot)
+    };
     // Slot by slot, the time that was sampled and the integral of the level over it, in frames.
     let mut sums: BTreeMap<u64, (f64, f64)> =
-        lit.iter().map(|(slot, _)| *slot).filter(|slot| is_inside(*slot)).map(|s| (s, (0.0, 0.0))).collect();
+        showing.fresh().filter(is_inside).map(|s| (s, (0.0, 0.0))).collect();
     for Timed { block, sensor_minus_host_ns } in samples {
         let Some(offset) = sensor_minus_host_ns else { continue };
         let since = block.start_ns.saturating_sub(*offset).saturating_sub(timing.frame_zero_ns) as f64;

@@ -1,14 +1,18 @@
 //! The order of the levels as a law, and the way from samples of the mock's sensor to curves.
 
 use super::*;
+use dpm_calibration::sensor::Timing;
 use dpm_device::light::{LightEvent, LightKind};
 use dpm_device::pose::Pose;
 use dpm_device::time::DeviceTicks;
+use dpm_device::time::HostTime;
 use dpm_rig::pack::source::PatternPainter;
 use hil_mock::motion::Motion;
 use hil_mock::projector::Shown;
 use hil_mock::sensor_wand::{ProjectorOptics, SensorSample, SensorWand, SensorWandConfig};
 use std::sync::Arc;
+
+const CODES: u32 = 32;
 
 fn rate() -> FrameRate {
     FrameRate::new(947, 1).unwrap()
@@ -91,11 +95,18 @@ fn planes_without_channels_are_refused_by_name() {
 /// What the mock's sensor samples while the levels are shown once and a bit, from a slot that begins anywhere.
 struct Bench {
     levels: Levels,
-    timing: Timing,
+    showing: Showing,
     lit: Vec<(u64, HostTime)>,
     samples: Vec<Timed>,
     room: Room,
     config: SensorWandConfig,
+}
+
+/// One pass alone.
+fn solve(levels: &Levels, showing: &Showing, samples: &[Timed], room: Room) -> Result<Channels, String> {
+    let mut readings = Readings::default();
+    readings.add(levels, showing, samples, room)?;
+    readings.solve(levels, room)
 }
 
 const SENSOR_MINUS_HOST_NS: i64 = 77_000_000_000;
@@ -110,8 +121,6 @@ fn block_of(sample: SensorSample, scale: f64) -> Block {
 
 /// `fades` is a share of the projector's light that is lost from the beginning to the end.
 fn bench(codes: u32, fades: f64) -> Bench {
-    let levels = rgb(codes);
-    let raster = Raster::new(64, 48).unwrap();
     let optics = ProjectorOptics::along_z([0.0, 0.0, 1.2], 100.0, 64, 48);
     let config = SensorWandConfig {
         droop: 0.04,
@@ -121,6 +130,13 @@ fn bench(codes: u32, fades: f64) -> Bench {
         leak: 0.002,
         ..SensorWandConfig::new(optics)
     };
+    show(rgb(codes), &config, |share| 1.0 - fades * share)
+}
+
+/// Shows levels once. `scale` is the projector's light by the share of the time that has passed.
+fn show(levels: Levels, config: &SensorWandConfig, scale: impl Fn(f64) -> f64) -> Bench {
+    let config = config.clone();
+    let raster = Raster::new(64, 48).unwrap();
     let motion = Motion::still(Pose::IDENTITY).unwrap();
     let mut wand = SensorWand::new(config.clone(), motion, raster).unwrap();
     let mut source = PatternPainter::new(Arc::new(levels.clone()), raster);
@@ -160,14 +176,15 @@ fn bench(codes: u32, fades: f64) -> Bench {
             schedule: PlaneSchedule::rgb24(),
             planes: Arc::clone(planes),
         };
-        let scale = 1.0 - fades * (slot - first) as f64 / slots as f64;
+        let scale = scale((slot - first) as f64 / slots as f64);
         wand.shine(&shown, &mut |s| blocks.push(block_of(s, scale)));
         lit.push((slot, HostTime(from)));
     }
     let ambient = steady(&blocks[..dark], 100.0).unwrap();
     let timed = |block| Timed { block, sensor_minus_host_ns: Some(SENSOR_MINUS_HOST_NS) };
     let samples = blocks.drain(dark..).map(timed).collect();
-    Bench { levels, timing, lit, samples, room: Room { flicker_hz: 100.0, ambient }, config }
+    let showing = Showing::of(&lit, rate()).unwrap();
+    Bench { levels, showing, lit, samples, room: Room { flicker_hz: 100.0, ambient }, config }
 }
 
 /// Light of a code over that of 255, in closed form.
@@ -182,8 +199,8 @@ fn truth(config: &SensorWandConfig, code: u32) -> f64 {
 #[test]
 fn curves_are_those_of_the_mock() {
     let bench = bench(8, 0.0);
-    let Bench { levels, timing, lit, samples, room, config } = &bench;
-    let got = solve(levels, timing, lit, samples, *room).unwrap();
+    let Bench { levels, showing, lit, samples, room, config } = &bench;
+    let got = solve(levels, showing, samples, *room).unwrap();
     for (channel, colour) in config.colours.into_iter().enumerate() {
         assert!((got.intensity[channel] - colour).abs() < 3e-3, "{:?}", got.intensity);
         for i in 1..=8u32 {
@@ -201,9 +218,22 @@ fn curves_are_those_of_the_mock() {
     assert!((got.ambient * white / config.ambient - 1.0).abs() < 0.02, "{}", got.ambient);
     // Samples that were lost leave levels out, which is said.
     let half = &samples[..samples.len() / 2];
-    assert!(solve(levels, timing, lit, half, *room).unwrap_err().contains("were not seen whole"));
-    assert!(solve(levels, timing, &lit[..lit.len() / 2], samples, *room).unwrap_err().contains("not seen"));
-    assert!(solve(levels, timing, lit, &[], *room).is_err());
+    assert!(solve(levels, showing, half, *room).unwrap_err().contains("were not seen whole"));
+    let cut = Showing::of(&lit[..lit.len() / 2], rate()).unwrap();
+    assert!(solve(levels, &cut, samples, *room).unwrap_err().contains("not seen"));
+    // What the first half lacks is read in a second pass, in which the light is weaker.
+    let mut readings = Readings::default();
+    readings.add(levels, showing, half, *room).unwrap();
+    let rest = levels.missing(&readings).unwrap().unwrap();
+    assert_eq!(rest.count() + readings.count(), levels.count());
+    let again = show(rest, config, |_| 0.8);
+    readings.add(&again.levels, &again.showing, &again.samples, *room).unwrap();
+    assert!(levels.missing(&readings).unwrap().is_none());
+    let twice = readings.solve(levels, *room).unwrap();
+    for (a, b) in twice.intensity.iter().zip(&got.intensity) {
+        assert!((a - b).abs() < 2e-3, "{:?} {:?}", twice.intensity, got.intensity);
+    }
+    assert!(solve(levels, showing, &[], *room).is_err());
 }
 
 /// Light of code 255 over that of planes without droop.
@@ -214,7 +244,7 @@ fn truth_white(config: &SensorWandConfig) -> f64 {
 #[test]
 fn a_light_that_fades_slowly_is_divided_out_and_a_sudden_change_is_named() {
     let mut bench = bench(4, 0.2);
-    let got = solve(&bench.levels, &bench.timing, &bench.lit, &bench.samples, bench.room).unwrap();
+    let got = solve(&bench.levels, &bench.showing, &bench.samples, bench.room).unwrap();
     let (last, first) = (got.intensity[2], got.intensity[0]);
     // Blue came last, when a fifth of the light was gone.
     assert!((last - 0.25).abs() < 4e-3 && (first - 0.35).abs() < 4e-3, "{:?}", got.intensity);
@@ -222,6 +252,6 @@ fn a_light_that_fades_slowly_is_divided_out_and_a_sudden_change_is_named() {
     for timed in &mut bench.samples[half..] {
         timed.block.levels.iter_mut().for_each(|l| *l *= 0.7);
     }
-    let told = solve(&bench.levels, &bench.timing, &bench.lit, &bench.samples, bench.room).unwrap_err();
+    let told = solve(&bench.levels, &bench.showing, &bench.samples, bench.room).unwrap_err();
     assert!(told.contains("changes by") || told.contains("changed by"), "{told}");
 }

@@ -2,11 +2,13 @@
 //! sweep of it.
 
 use super::dialogue::Dialogue;
-use super::levels::{self, Levels, Room};
-use super::recorder::{timing_of, wait_until_up, while_stamped, Port, Recorder, Timed};
+use super::levels::{Levels, Readings, Room};
+use super::pace::{Pace, Paced};
+use super::recorder::{wait_until_up, while_stamped, Port, Recorder, Timed};
 use super::results::Results;
+use super::showing::Showing;
 use dpm_calibration::file::LightSection;
-use dpm_calibration::light::{flat_field, steady, Channels, FlatField, LightModel};
+use dpm_calibration::light::{flat_field, steady, Channels, FlatField, LightModel, Steady};
 use dpm_calibration::sensor::{Block, Brightness};
 use dpm_common::clock::MonotonicClock;
 use dpm_common::files::write_atomically;
@@ -29,23 +31,70 @@ fn refused(error: impl std::fmt::Display) -> Failure {
     Failure::new(FailureKind::BadInput, error.to_string())
 }
 
-/// Shows the levels, reads the sensor at rest, and gives curves and brightness of the channels. `flicker_hz` is twice the
-/// frequency of the mains.
+/// What has been read so far, so that a measurement may go on at another rate.
+#[derive(Clone, Debug, Default)]
+pub struct Progress {
+    readings: Readings,
+    ambient: Option<Steady>,
+}
+
+/// Shows the levels that `progress` lacks, reads the sensor at rest, and gives curves and brightness of the channels once it
+/// has all. `flicker_hz` is twice the frequency of the mains.
 ///
 /// # Errors
 /// A device fails (exit code 3); planes, limits or readings of which no response comes (2, with what to do).
 pub fn measure(
     config: &RigConfig,
-    port: &Port,
-    flicker_hz: f64,
+    (port, flicker_hz, codes): (&Port, f64, u32),
+    progress: &mut Progress,
     monitor: &Arc<RunMonitor>,
-) -> Result<Channels, Failure> {
-    let levels = Arc::new(levels_of(config)?);
+) -> Result<Paced<Option<Channels>>, Failure> {
+    let all = levels_of(config, codes)?;
+    let Some(levels) = all.missing(&progress.readings).map_err(refused)?.map(Arc::new) else {
+        return Err(refused("no level is missing"));
+    };
     let clock = MonotonicClock::new(0);
     let stopped = Arc::clone(monitor);
     let dialogue = Dialogue::start(move || stopped.stop_requested())?;
     let recorder = Recorder::start(port, clock)?;
     recorder.wait_until_mapped(monitor)?;
+    let ambient = match progress.ambient {
+        Some(ambient) => ambient,
+        None => *progress.ambient.insert(room_light(&levels, &recorder, flicker_hz, &dialogue)?),
+    };
+    let seconds = levels.seconds();
+    let read = || {
+        wait_until_up(monitor)?;
+        if let Some(carried_hz) = Pace::of(config, monitor).try_out()? {
+            return Ok(Paced::TooFast { carried_hz });
+        }
+        watch(&levels, &recorder, &dialogue, (Pace::of(config, monitor), monitor))
+    };
+    let (watched, lights) = while_stamped(config, levels.clone(), (clock, seconds), monitor, read)?;
+    watched.and_then(|samples| {
+        let showing = Showing::of(&lights, config.projector.frame_rate)?;
+        let room = Room { flicker_hz, ambient };
+        let before = progress.readings.count();
+        progress.readings.add(&levels, &showing, &samples, room).map_err(refused)?;
+        let missing = all.count() - progress.readings.count();
+        if missing > 0 && progress.readings.count() > before {
+            dialogue.tell(&format!(
+                "{missing} of {} levels were not seen whole; they are shown again.",
+                all.count()
+            ));
+            return Ok(None);
+        }
+        progress.readings.solve(&all, room).map(Some).map_err(refused)
+    })
+}
+
+/// Reads the room while the projector is dark.
+fn room_light(
+    levels: &Levels,
+    recorder: &Recorder,
+    flicker_hz: f64,
+    dialogue: &Dialogue,
+) -> Result<Steady, Failure> {
     dialogue.tell(&format!(
         "Put the wand down in the beam, near the middle of the picture, so that its sensor looks at the lens. Nobody may\n\
          move it or walk through the light for {:.0} s. The projector is still dark: the light of the room is read first.",
@@ -55,23 +104,14 @@ pub fn measure(
     recorder.take();
     std::thread::sleep(DARK);
     let dark: Vec<Block> = recorder.take().into_iter().map(|timed| timed.block).collect();
-    let ambient = steady(&dark, flicker_hz).map_err(refused)?;
-    let shown = Arc::clone(&levels);
-    let seconds = levels.seconds();
-    let read = || {
-        wait_until_up(monitor)?;
-        watch(&levels, &recorder, &dialogue, monitor)
-    };
-    let (samples, lights) = while_stamped(config, shown, (clock, seconds), monitor, read)?;
-    let timing = timing_of(&lights)?;
-    levels::solve(&levels, &timing, &lights, &samples, Room { flicker_hz, ambient }).map_err(refused)
+    steady(&dark, flicker_hz).map_err(refused)
 }
 
 /// The levels for the rig's planes, within its limits.
-fn levels_of(config: &RigConfig) -> Result<Levels, Failure> {
+fn levels_of(config: &RigConfig, codes: u32) -> Result<Levels, Failure> {
     let (projector, safety) = (&config.projector, &config.safety);
     let limit = u8::try_from(safety.flashes_per_second.min(255)).ok().filter(|&n| n > 0);
-    let levels = Levels::new(&projector.schedule(), projector.frame_rate, limit, levels::CODES);
+    let levels = Levels::new(&projector.schedule(), projector.frame_rate, limit, codes);
     let levels = levels.map_err(refused)?;
     let limits = &safety.limits;
     if limits.full_white_s > 0.0 && limits.full_white_s < levels.hold_s() {
@@ -98,8 +138,8 @@ fn watch(
     levels: &Levels,
     recorder: &Recorder,
     dialogue: &Dialogue,
-    monitor: &RunMonitor,
-) -> Result<Vec<Timed>, Failure> {
+    (mut pace, monitor): (Pace<'_>, &RunMonitor),
+) -> Result<Paced<Vec<Timed>>, Failure> {
     recorder.take();
     let (begin, mut told) = (Instant::now(), 0);
     while begin.elapsed().as_secs_f64() < levels.seconds() {
@@ -107,6 +147,9 @@ fn watch(
             return Err(refused("the measurement was interrupted; run the same command again"));
         }
         std::thread::sleep(Duration::from_millis(50));
+        if let Some(carried_hz) = pace.look()? {
+            return Ok(Paced::TooFast { carried_hz });
+        }
         // Full white comes up within two levels.
         let (_, saturated) = recorder.counts();
         if saturated > 0 {
@@ -121,7 +164,7 @@ fn watch(
             dialogue.tell(&format!("{:3} of {:.0} s", 10 * tens, levels.seconds()));
         }
     }
-    Ok(recorder.take())
+    Ok(Paced::Done(recorder.take()))
 }
 
 /// Writes the brightness along a sweep: column, row, distance in metres, direction to the lens in the wand's body, level.
@@ -171,33 +214,34 @@ pub enum FlatSource {
 }
 
 /// Puts curves and flat field into the results, and says what there is to say of them.
-///
-/// # Errors
-/// The sweep does not tell the flat field.
-pub fn keep(
-    results: &mut Results,
-    config: &RigConfig,
-    channels: Channels,
-    source: FlatSource,
-) -> Result<String, Failure> {
+pub fn keep(results: &mut Results, config: &RigConfig, channels: Channels, source: FlatSource) -> String {
     let raster = config.projector.raster();
     let same_raster = |s: &&LightSection| s.size == [raster.width(), raster.height()];
     let former =
         || results.file.light.as_ref().filter(same_raster).and_then(LightSection::model).map(|m| m.flat);
-    let (flat, told) = match source {
+    let measured = match source {
         FlatSource::Sweep(sweep, looks) => {
-            let flat = flat_field(raster, &sweep, looks).map_err(refused)?;
-            let told = format!("flat field of {} frames, {}", sweep.len(), of_corners(&flat));
+            Some(flat_field(raster, &sweep, looks).map(|flat| (flat, sweep.len())))
+        }
+        FlatSource::Former => None,
+    };
+    let (flat, told) = match (measured, former()) {
+        (Some(Ok((flat, frames))), _) => {
+            let told = format!("flat field of {frames} frames, {}", of_corners(&flat));
             (flat, told)
         }
-        FlatSource::Former => match former() {
-            Some(flat) => (flat, "flat field kept from the calibration file".to_owned()),
-            None => {
-                let told = "flat field taken as even: run `dpm calibrate projector --sensor` first, or give --sweep 30, \
-                            to measure it";
-                (FlatField::even(raster), told.to_owned())
-            }
-        },
+        // The levels are good all the same, and took a minute.
+        (Some(Err(why)), former) => {
+            let kept = if former.is_some() { "kept as it was" } else { "taken as even" };
+            let told = format!("flat field {kept}, since the sweep does not tell it: {why}");
+            (former.unwrap_or_else(|| FlatField::even(raster)), told)
+        }
+        (None, Some(flat)) => (flat, "flat field kept from the calibration file".to_owned()),
+        (None, None) => {
+            let told = "flat field taken as even: run `dpm calibrate projector --sensor` first, or give --sweep 30, to \
+                        measure it";
+            (FlatField::even(raster), told.to_owned())
+        }
     };
     let shares: Vec<String> = channels.intensity.iter().map(|i| format!("{:.1} %", 100.0 * i)).collect();
     let halves: Vec<String> = (0..channels.intensity.len())
@@ -216,7 +260,7 @@ pub fn keep(
     let provenance =
         results.provenance(config, "", data, "levels between references of full white, by frame");
     results.file.light = Some(LightSection::new(&LightModel { channels, flat }, provenance));
-    Ok(format!("{light}\n{told}"))
+    format!("{light}\n{told}")
 }
 
 /// The darkest and the brightest of the corners.

@@ -2,85 +2,27 @@
 
 use super::aim::Aim;
 use super::dialogue::Dialogue;
+use super::lines::Lines;
 use super::poses::{held, Poses};
 use super::results::Results;
 use dpm_calibration::file::ProjectorSection;
 use dpm_calibration::projector::{Options, Session, Sight, Solved, Volume};
-use dpm_common::files::write_atomically;
 use dpm_device::planes::Raster;
-use dpm_device::regular_file;
 use dpm_rig::config::RigConfig;
 use dpm_rig::failure::{Failure, FailureKind};
 use glam::{DVec2, DVec3};
-use std::io::Write;
-use std::path::{Path, PathBuf};
+use std::path::Path;
 
-/// Largest file of points that is read.
-const MAX_BYTES: u64 = 1 << 20;
 /// The working volume reaches this far beyond the points on every side, as a share of their extent.
 const BEYOND: f64 = 0.1;
 
-/// Points that were aimed at, in a file that outlives an interruption.
-pub struct Points {
-    path: PathBuf,
-    sights: Vec<Sight>,
-}
+/// Points that were aimed at, in a file that outlives an interruption: metres in the world, pixels.
+pub type Points = Lines<5>;
 
-impl Points {
-    /// Those of an interrupted run, or none.
-    ///
-    /// # Errors
-    /// The file is there and cannot be read.
-    pub fn resume(path: PathBuf) -> Result<Self, Failure> {
-        let bad = |e: String| {
-            let told = format!("{}: {e}; delete it to begin anew", path.display());
-            Failure::new(FailureKind::BadInput, told)
-        };
-        let mut sights = Vec::new();
-        if path.exists() {
-            let text = regular_file::read_text(&path, MAX_BYTES).map_err(|e| bad(e.to_string()))?;
-            for (number, line) in text.lines().enumerate().filter(|(_, l)| !l.trim().is_empty()) {
-                let numbers: Vec<f64> = line.split_whitespace().filter_map(|w| w.parse().ok()).collect();
-                let [x, y, z, column, row] = numbers[..] else {
-                    return Err(bad(format!("line {} is not five numbers", number + 1)));
-                };
-                sights.push(Sight::at_rest(DVec3::new(x, y, z), DVec2::new(column, row)));
-            }
-        }
-        Ok(Self { path, sights })
-    }
-
-    /// The points.
-    pub fn sights(&self) -> &[Sight] {
-        &self.sights
-    }
-
-    fn push(&mut self, sight: Sight) -> Result<(), Failure> {
-        self.sights.push(sight);
-        self.write()
-    }
-
-    fn pop(&mut self) -> Result<(), Failure> {
-        self.sights.pop();
-        self.write()
-    }
-
-    /// Places in metres and pixels, a line for each point.
-    fn write(&self) -> Result<(), Failure> {
-        write_atomically(&self.path, |out| {
-            self.sights.iter().try_for_each(|s| {
-                let (w, p) = (s.world, s.pixel);
-                writeln!(out, "{:?} {:?} {:?} {:?} {:?}", w.x, w.y, w.z, p.x, p.y)
-            })
-        })
-        .map_err(|e| Failure::new(FailureKind::BadInput, format!("{}: {e}", self.path.display())))
-    }
-
-    /// Deletes the file: the result has been written.
-    pub fn forget(self) {
-        // A file that stays would only be offered again.
-        let _ = std::fs::remove_file(&self.path);
-    }
+fn sights(points: &Points) -> Vec<Sight> {
+    let sight =
+        |[x, y, z, column, row]: &[f64; 5]| Sight::at_rest(DVec3::new(*x, *y, *z), DVec2::new(*column, *row));
+    points.lines().iter().map(sight).collect()
 }
 
 /// A session with the points so far, over a volume around them.
@@ -109,12 +51,12 @@ pub fn aim_by_hand(
         "Hold the tip of the wand into the middle of each cross and press Enter. Use at least 12 points, near and far: their\n\
          distances from the projector should differ by a quarter or more. u: take the last point back; d: done.",
     );
-    if !points.sights.is_empty() {
-        let (n, path) = (points.sights.len(), points.path.display());
+    if !points.lines().is_empty() {
+        let (n, path) = (points.lines().len(), points.path().display());
         dialogue.tell(&format!("Going on with {n} points of {path}; delete that file to begin anew."));
     }
     loop {
-        let session = session(raster, options, points.sights());
+        let session = session(raster, options, &sights(points));
         let next = session.next_point();
         let pixel = pixel_of(raster, next.pixel);
         aim.show(pixel);
@@ -122,7 +64,7 @@ pub fn aim_by_hand(
             .world
             .map_or(String::new(), |w| format!(", about at ({:.2}, {:.2}, {:.2}) m", w.x, w.y, w.z));
         let [x, y] = pixel;
-        let question = format!("point {}: cross at pixel ({x}, {y}){near}:", points.sights.len() + 1);
+        let question = format!("point {}: cross at pixel ({x}, {y}){near}:", points.lines().len() + 1);
         match dialogue.ask(&question)?.as_str() {
             "u" | "U" => points.pop()?,
             "d" | "D" => match session.solve() {
@@ -135,8 +77,8 @@ pub fn aim_by_hand(
             "" => match held(tip, &poses.hold().swap_remove(0)) {
                 Ok(place) => {
                     let centre = DVec2::new(f64::from(x) + 0.5, f64::from(y) + 0.5);
-                    points.push(Sight::at_rest(place, centre))?;
-                    dialogue.tell(&self::session(raster, options, points.sights()).advice());
+                    points.push([place.x, place.y, place.z, centre.x, centre.y])?;
+                    dialogue.tell(&self::session(raster, options, &sights(points)).advice());
                 }
                 Err(why) => dialogue.tell(&why),
             },
@@ -156,10 +98,9 @@ pub fn told_of(solved: &Solved) -> String {
     let (p, at) = (&solved.predicted, solved.predicted.worst);
     let used = solved.inliers.iter().filter(|i| **i).count();
     let mut told = format!(
-        "predicted error {:.2} px (99th percentile over the volume of the points), largest {:.2} px at ({:.2}, {:.2}, {:.2}) m;\n\
+        "predicted error {:.2} px (99th percentile over the volume of the points); least certain at ({:.2}, {:.2}, {:.2}) m;\n\
          residual {:.2} px rms of {used} of {} points",
         p.p99_px,
-        p.worst_px,
         at.x,
         at.y,
         at.z,
@@ -174,12 +115,13 @@ pub fn told_of(solved: &Solved) -> String {
 }
 
 /// Puts a solution into the results.
-pub fn keep(results: &mut Results, config: &RigConfig, solved: &Solved) {
+pub fn keep(results: &mut Results, config: &RigConfig, solved: &Solved, bias_m: f64) {
     let raster = config.projector.raster();
     let data = format!("{} points aimed at by hand", solved.inliers.len());
     let provenance = results.provenance(config, "", data, "least squares over lens and pose");
     let (p99, rms) = (solved.predicted.p99_px, solved.rms_px);
-    results.file.projector = Some(ProjectorSection::new(raster, &solved.model, p99, rms, provenance));
+    let section = ProjectorSection::new(raster, &solved.model, p99, rms, provenance);
+    results.file.projector = Some(section.assuming(&solved.predicted, bias_m));
 }
 
 /// Solves a file of points that others measured: `x y z column row` a line, metres and pixels.
@@ -188,25 +130,5 @@ pub fn keep(results: &mut Results, config: &RigConfig, solved: &Solved) {
 /// The file cannot be read, or its points do not make a projector.
 pub fn solve_file(path: &Path, raster: Raster, options: Options) -> Result<Solved, Failure> {
     let points = Points::resume(path.to_path_buf())?;
-    session(raster, options, points.sights()).solve().map_err(|e| Failure::new(FailureKind::BadInput, e))
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    #[test]
-    fn points_outlive_an_interruption() {
-        let path = std::env::temp_dir().join(format!("dpm-points-{}", std::process::id()));
-        let _ = std::fs::remove_file(&path);
-        let mut points = Points::resume(path.clone()).unwrap();
-        let sight = |i: f64| Sight::at_rest(DVec3::new(0.1 * i, 1.0 / 3.0, -i), DVec2::new(i + 0.5, 7.5));
-        (0..4).for_each(|i| points.push(sight(f64::from(i))).unwrap());
-        points.pop().unwrap();
-        let again = Points::resume(path.clone()).unwrap();
-        assert_eq!(again.sights(), &[sight(0.0), sight(1.0), sight(2.0)]);
-        std::fs::write(&path, "1 2 3 4\n").unwrap();
-        assert!(Points::resume(path.clone()).err().unwrap().message.contains("line 1"));
-        std::fs::remove_file(path).unwrap();
-    }
+    session(raster, options, &sights(&points)).solve().map_err(|e| Failure::new(FailureKind::BadInput, e))
 }

@@ -1,7 +1,7 @@
 //! The light sensor while the projector shows something: its samples on the host's clock, and when frames were lit.
 
 use super::shown::while_shown;
-use dpm_calibration::sensor::{Block, Timing};
+use dpm_calibration::sensor::Block;
 use dpm_common::clock::{Clock, MonotonicClock};
 use dpm_device::sensor::client::{SensorClient, SensorConfig};
 use dpm_device::time::HostTime;
@@ -22,8 +22,6 @@ const BLOCK: u16 = 250;
 const MOST_SAMPLES: usize = 60_000_000;
 /// How long the projector and the sensor may take until both work.
 const READY_WITHIN: Duration = Duration::from_secs(10);
-/// Slots whose light falls later than the others say by more than this, nanoseconds, are left out of the timing.
-const LATE_NS: f64 = 100_000.0;
 
 /// Where the sensor is.
 #[derive(Clone, Debug)]
@@ -203,63 +201,5 @@ impl Drop for Recorder {
         if let Some(thread) = self.thread.take() {
             let _ = thread.join();
         }
-    }
-}
-
-/// When the slots begin, by a line through the first photons of all lit frames. Frames whose light came late are left out.
-///
-/// # Errors
-/// Too few frames were lit.
-pub fn timing_of(lights: &[(u64, HostTime)]) -> Result<Timing, Failure> {
-    let few = || {
-        let told = format!(
-            "only {} frames were lit; is the link fast enough? `dpm link-test` measures it",
-            lights.len()
-        );
-        Failure::new(FailureKind::Device, told)
-    };
-    let mut used: Vec<(f64, f64)> = Vec::with_capacity(lights.len());
-    let Some(&(slot_0, at_0)) = lights.first() else { return Err(few()) };
-    used.extend(lights.iter().map(|(slot, at)| (*slot as f64 - slot_0 as f64, at.ns_since(at_0) as f64)));
-    let mut line = (0.0, 0.0);
-    for _ in 0..3 {
-        if used.len() < 100 {
-            return Err(few());
-        }
-        line = line_through(&used);
-        used.retain(|(x, y)| (y - line.0 - line.1 * x).abs() < LATE_NS);
-    }
-    let frame_zero_ns = at_0.0 + (line.0 - line.1 * slot_0 as f64).round() as i64;
-    Ok(Timing { frame_zero_ns, frame_ns: line.1 })
-}
-
-/// Offset and slope by least squares.
-fn line_through(points: &[(f64, f64)]) -> (f64, f64) {
-    let n = points.len() as f64;
-    let (mx, my) = points.iter().fold((0.0, 0.0), |(a, b), (x, y)| (a + x / n, b + y / n));
-    let (mut xx, mut xy) = (0.0, 0.0);
-    for (x, y) in points {
-        xx += (x - mx) * (x - mx);
-        xy += (x - mx) * (y - my);
-    }
-    let slope = if xx > 0.0 { xy / xx } else { 0.0 };
-    (my - slope * mx, slope)
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    #[test]
-    fn timing_is_the_line_of_the_frames_that_came_in_time() {
-        let frame_ns = 1_055_966.2;
-        let at = |slot: u64| HostTime(5_000_000_000 + (slot as f64 * frame_ns) as i64);
-        let mut lights: Vec<(u64, HostTime)> =
-            (1000..9000).filter(|s| s % 7 != 0).map(|s| (s, at(s))).collect();
-        lights[100].1 = lights[100].1.plus_ns(900_000);
-        let timing = timing_of(&lights).unwrap();
-        assert!((timing.frame_ns - frame_ns).abs() < 1e-3, "{}", timing.frame_ns);
-        assert!((timing.instant(5000, 0.0).0 - at(5000).0).abs() < 300);
-        assert!(timing_of(&lights[..50]).is_err());
     }
 }

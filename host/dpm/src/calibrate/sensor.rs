@@ -2,14 +2,17 @@
 //! lens, pose, tip and latency are solved afterwards.
 
 use super::dialogue::Dialogue;
+use super::pace::{Pace, Paced};
 use super::poses::Poses;
-use super::recorder::{timing_of, wait_until_up, while_stamped, Lights, Port, Recorder};
+use super::recorder::{wait_until_up, while_stamped, Port, Recorder};
 use super::results::Results;
+use super::showing::Showing;
 use dpm_calibration::file::{LatencySection, ProjectorSection, WandSection};
 use dpm_calibration::model::ProjectorModel;
+use dpm_calibration::pivot::trace;
 use dpm_calibration::projector::{Known, Priors, Volume};
 use dpm_calibration::sensor::{
-    decode, solve, solve_latency, Block, Code, Decoded, Latency, Settings, Solution, PLANES,
+    decode, solve, solve_latency, Block, Code, Coverage, Decoded, Latency, Settings, Solution, PLANES,
 };
 use dpm_calibration::trajectory::{Stamped, Trajectory};
 use dpm_common::clock::MonotonicClock;
@@ -19,15 +22,46 @@ use dpm_rig::failure::{Failure, FailureKind};
 use dpm_rig::pack::source::{Canvas, PatternSource};
 use dpm_rig::telemetry::monitor::RunMonitor;
 use glam::DVec3;
+use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
-/// Shows the sensor's code. Only the bit of identity differs from frame to frame, so there are two pictures.
-struct CodeSource(Code);
+/// Shows the sensor's code. Only the bit of identity differs from frame to frame, so there are two pictures; they are drawn
+/// before there is light, since drawing takes longer than a frame.
+struct CodeSource {
+    code: Code,
+    pictures: [Box<[u8]>; 2],
+}
+
+impl CodeSource {
+    fn new(code: Code) -> Self {
+        let pictures = [false, true].map(|identity| {
+            // Any frame with this bit of identity.
+            let frame = (0..64).find(|f| code.identity(*f) == identity).unwrap_or(0);
+            planes_of(&code, frame)
+        });
+        Self { code, pictures }
+    }
+}
+
+/// The planes of a frame, one after the other.
+fn planes_of(code: &Code, frame: u64) -> Box<[u8]> {
+    let raster = code.raster();
+    let (row_bytes, plane_bytes) = (raster.row_bytes(), raster.plane_bytes());
+    let mut bytes = vec![0; PLANES * plane_bytes];
+    for (plane, bytes) in bytes.chunks_exact_mut(plane_bytes).enumerate() {
+        for (y, row) in (0..).zip(bytes.chunks_exact_mut(row_bytes)) {
+            for x in (0..raster.width()).filter(|x| code.lit(frame, plane, *x, y)) {
+                row[x as usize / 8] |= 0x80 >> (x % 8);
+            }
+        }
+    }
+    bytes.into()
+}
 
 impl PatternSource for CodeSource {
     fn picture(&self, _: u64, slot: u64) -> u64 {
-        u64::from(self.0.identity(slot))
+        u64::from(self.code.identity(slot))
     }
 
     fn schedule(&self) -> Option<PlaneSchedule> {
@@ -35,18 +69,9 @@ impl PatternSource for CodeSource {
     }
 
     fn draw(&self, picture: u64, canvas: &mut Canvas<'_>) {
-        let raster = canvas.raster();
-        // Any frame with this bit of identity.
-        let frame = (0..64).find(|f| u64::from(self.0.identity(*f)) == picture).unwrap_or(0);
-        let (row_bytes, plane_bytes) = (raster.row_bytes(), raster.plane_bytes());
-        let bytes = canvas.planes().bytes_mut();
-        for (plane, bytes) in bytes.chunks_exact_mut(plane_bytes).take(PLANES).enumerate() {
-            for (y, row) in (0..).zip(bytes.chunks_exact_mut(row_bytes)) {
-                row.fill(0);
-                for x in (0..raster.width()).filter(|x| self.0.lit(frame, plane, *x, y)) {
-                    row[x as usize / 8] |= 0x80 >> (x % 8);
-                }
-            }
+        let planes = canvas.planes().bytes_mut();
+        for (to, from) in planes.iter_mut().zip(&self.pictures[(picture & 1) as usize]) {
+            *to = *from;
         }
     }
 }
@@ -64,6 +89,10 @@ pub struct Setup {
     pub aperture_m: f64,
     /// What is known of the projector's place.
     pub known: Known,
+    /// Frames a second of the rig file: at a lower rate the motion takes longer.
+    pub rate_hz: f64,
+    /// The operator has begun to move: what is repeated at another rate is not asked for again.
+    pub has_begun: Arc<AtomicBool>,
 }
 
 /// Everything that was recorded while the wand moved.
@@ -71,8 +100,10 @@ struct Recording {
     blocks: Vec<Block>,
     sensor_minus_host_ns: i64,
     poses: Vec<Stamped>,
-    lights: Lights,
 }
+
+/// Frames of a sweep that are worth solving: fewer tell the projector badly, however long they took.
+const FRAMES: f64 = 1200.0;
 
 /// What was recorded, ready for a solver.
 struct Sweep {
@@ -91,9 +122,9 @@ pub fn calibrate(
     setup: &Setup,
     tip: (DVec3, f64),
     monitor: &Arc<RunMonitor>,
-) -> Result<Solution, Failure> {
-    let sweep = sweep(config, setup, tip, monitor)?;
-    solve(&sweep.code, &sweep.decoded, &sweep.path, &sweep.settings).map_err(refused)
+) -> Result<Paced<Solution>, Failure> {
+    sweep(config, setup, tip, monitor)?
+        .and_then(|s| solve(&s.code, &s.decoded, &s.path, &s.settings).map_err(refused))
 }
 
 /// Shows the code, records, and finds the latency of the projector `model`, which is known.
@@ -106,9 +137,9 @@ pub fn latency(
     tip: (DVec3, f64),
     model: &ProjectorModel,
     monitor: &Arc<RunMonitor>,
-) -> Result<Latency, Failure> {
-    let sweep = sweep(config, setup, tip, monitor)?;
-    solve_latency(&sweep.code, &sweep.decoded, &sweep.path, &sweep.settings, model).map_err(refused)
+) -> Result<Paced<Latency>, Failure> {
+    sweep(config, setup, tip, monitor)?
+        .and_then(|s| solve_latency(&s.code, &s.decoded, &s.path, &s.settings, model).map_err(refused))
 }
 
 fn refused(error: impl std::fmt::Display) -> Failure {
@@ -120,27 +151,28 @@ fn sweep(
     setup: &Setup,
     (tip, tip_sigma_m): (DVec3, f64),
     monitor: &Arc<RunMonitor>,
-) -> Result<Sweep, Failure> {
+) -> Result<Paced<Sweep>, Failure> {
     let raster = config.projector.raster();
     let code = Code::new(raster).map_err(refused)?;
-    let recording = record(config, setup, &code, monitor)?;
-    let timing = timing_of(&recording.lights)?;
-    let decoded =
-        decode(&code, &timing, &recording.blocks, recording.sensor_minus_host_ns).map_err(refused)?;
-    let path = Trajectory::new(&recording.poses);
-    let tips = recording.poses.iter().map(|p| p.place(tip));
-    let volume = Volume::around(tips).ok_or_else(|| refused("the wand was not tracked"))?;
-    let settings = Settings {
-        timing,
-        tip,
-        tip_sigma_m,
-        aperture_m: setup.aperture_m,
-        priors: Priors::many_points(raster),
-        known: setup.known,
-        volume,
-        seed: 1,
-    };
-    Ok(Sweep { code, decoded, path, settings })
+    record(config, setup, &code, monitor)?.and_then(|(recording, showing)| {
+        let (offset_ns, timing) = (recording.sensor_minus_host_ns, showing.timing);
+        let shown = |slot| showing.made_for(slot);
+        let decoded = decode(&code, &timing, &recording.blocks, offset_ns, &shown).map_err(refused)?;
+        let path = Trajectory::new(&recording.poses);
+        let tips = recording.poses.iter().map(|p| p.place(tip));
+        let volume = Volume::around(tips).ok_or_else(|| refused("the wand was not tracked"))?;
+        let settings = Settings {
+            timing,
+            tip,
+            tip_sigma_m,
+            aperture_m: setup.aperture_m,
+            priors: Priors::many_points(raster),
+            known: setup.known,
+            volume,
+            seed: 1,
+        };
+        Ok(Sweep { code: code.clone(), decoded, path, settings })
+    })
 }
 
 fn record(
@@ -148,70 +180,113 @@ fn record(
     setup: &Setup,
     code: &Code,
     monitor: &Arc<RunMonitor>,
-) -> Result<Recording, Failure> {
+) -> Result<Paced<(Recording, Showing)>, Failure> {
     let clock = MonotonicClock::new(0);
     let stopped = Arc::clone(monitor);
     let dialogue = Dialogue::start(move || stopped.stop_requested())?;
     let poses = Poses::start(config, std::slice::from_ref(&setup.wand), clock)?;
     let recorder = Recorder::start(&setup.port, clock)?;
     poses.wait_until_seen()?;
-    let source = Arc::new(CodeSource(code.clone()));
+    let source = Arc::new(CodeSource::new(code.clone()));
+    let rate = config.projector.frame_rate;
+    let frames = FRAMES.min(setup.seconds * setup.rate_hz);
+    let seconds = setup.seconds.max(frames / rate.hz());
     let moved = || {
         wait_until_up(monitor)?;
         recorder.wait_until_mapped(monitor)?;
-        dialogue.tell(&format!(
-            "Move the wand through the whole beam for {:.0} s, sensor towards the projector, near and far, at 0.2 to 0.8 m/s,\n\
-             and turn it a little all the time.",
-            setup.seconds
-        ));
-        dialogue.ask("Press Enter to begin.")?;
+        if let Some(carried_hz) = Pace::of(config, monitor).try_out()? {
+            return Ok(Paced::TooFast { carried_hz });
+        }
+        if setup.has_begun.swap(true, Ordering::Relaxed) {
+            dialogue.tell(&format!("Go on moving for {seconds:.0} s."));
+        } else {
+            dialogue.tell(&format!(
+                "Move the wand through the whole beam for {seconds:.0} s, sensor towards the projector, near and far, at \
+                 0.2 to 0.8 m/s,\nand turn it a little all the time."
+            ));
+            dialogue.ask("Press Enter to begin.")?;
+        }
         poses.take();
         recorder.take();
-        let path = follow(setup.seconds, &poses, &recorder, &dialogue, monitor);
-        let blocks = recorder.take().into_iter().map(|timed| timed.block).collect();
-        Ok((blocks, recorder.sensor_minus_host_ns()?, path))
+        let pace = Pace::of(config, monitor);
+        let sweeping = Sweeping { poses: &poses, recorder: &recorder, dialogue: &dialogue, code };
+        sweeping.follow(seconds, 1e9 / rate.hz(), pace, monitor)?.and_then(|(blocks, poses)| {
+            let sensor_minus_host_ns = recorder.sensor_minus_host_ns()?;
+            Ok(Recording { blocks, sensor_minus_host_ns, poses })
+        })
     };
-    let ((blocks, sensor_minus_host_ns, poses), lights) =
-        while_stamped(config, source, (clock, setup.seconds), monitor, moved)?;
-    Ok(Recording { blocks, sensor_minus_host_ns, poses, lights })
+    let (recording, lights) = while_stamped(config, source, (clock, seconds), monitor, moved)?;
+    recording.and_then(|recording| Ok((recording, Showing::of(&lights, rate)?)))
 }
 
-/// Collects poses for `seconds`, and says every five how it goes.
-fn follow(
-    seconds: f64,
-    poses: &Poses,
-    recorder: &Recorder,
-    dialogue: &Dialogue,
-    monitor: &RunMonitor,
-) -> Vec<Stamped> {
-    let (begin, mut told) = (Instant::now(), 0);
-    let mut path = Vec::new();
-    while begin.elapsed().as_secs_f64() < seconds && !monitor.stop_requested() {
-        std::thread::sleep(Duration::from_millis(50));
-        path.extend(poses.take().into_iter().flatten());
-        let fives = begin.elapsed().as_secs() / 5;
-        if fives > told {
-            told = fives;
-            let (samples, clipped) = recorder.counts();
-            let clipped = match clipped {
-                0 => String::new(),
-                n => format!("; {n} blocks are saturated: turn the sensor's gain down"),
-            };
-            dialogue.tell(&format!("{:3} s: {samples} samples, {} poses{clipped}", 5 * fives, path.len()));
+/// Samples and poses.
+type Collected = (Vec<Block>, Vec<Stamped>);
+
+/// What a sweep goes on with.
+struct Sweeping<'a> {
+    poses: &'a Poses,
+    recorder: &'a Recorder,
+    dialogue: &'a Dialogue,
+    code: &'a Code,
+}
+
+impl Sweeping<'_> {
+    /// Collects samples and poses for `seconds`, and says every five how it goes and where to go next.
+    fn follow(
+        &self,
+        seconds: f64,
+        frame_ns: f64,
+        mut pace: Pace<'_>,
+        monitor: &RunMonitor,
+    ) -> Result<Paced<Collected>, Failure> {
+        let (begin, mut told) = (Instant::now(), 0);
+        let (mut path, mut blocks) = (Vec::new(), Vec::new());
+        let mut coverage = Coverage::new(self.code.clone());
+        while begin.elapsed().as_secs_f64() < seconds {
+            if monitor.stop_requested() {
+                return Err(refused("the measurement was interrupted; run the same command again"));
+            }
+            std::thread::sleep(Duration::from_millis(50));
+            if let Some(carried_hz) = pace.look()? {
+                return Ok(Paced::TooFast { carried_hz });
+            }
+            path.extend(self.poses.take().into_iter().flatten());
+            let fives = begin.elapsed().as_secs() / 5;
+            if fives > told {
+                told = fives;
+                let (_, clipped) = self.recorder.counts();
+                let fresh = self.recorder.take();
+                let new = blocks.len();
+                blocks.extend(fresh.into_iter().map(|timed| timed.block));
+                let next = match coverage.add(frame_ns, &blocks[new..]) {
+                    _ if clipped > 0 => {
+                        format!("{clipped} blocks are saturated: turn the sensor's gain down")
+                    }
+                    Ok(_) => coverage.advice(),
+                    Err(why) => why.to_string(),
+                };
+                self.dialogue.tell(&format!("{:3} of {seconds:.0} s: {next}", 5 * fives));
+            }
         }
+        path.extend(self.poses.take().into_iter().flatten());
+        blocks.extend(self.recorder.take().into_iter().map(|timed| timed.block));
+        Ok(Paced::Done((blocks, path)))
     }
-    path
 }
 
 /// What the operator is told of a solution.
 pub fn told_of(s: &Solution) -> String {
     let (p, [x, y, z]) = (&s.predicted, s.tip.to_array().map(|v| 1e3 * v));
+    let at = p.worst;
     format!(
-        "predicted error {:.3} px (99th percentile over the volume of the motion, for a tracker without bias), largest {:.3} px;\n\
+        "predicted error {:.3} px (99th percentile over the volume of the motion, for a tracker without bias);\n\
+         it is least certain at ({:.2}, {:.2}, {:.2}) m: to make it better, run this again and move there, too;\n\
          residual {:.3} px rms of {} frames; sensor at ({x:.2}, {y:.2}, {z:.2}) mm in the wand's body;\n\
          latency {:.3} ms, known to {:.3} ms",
         p.p99_px,
-        p.worst_px,
+        at.x,
+        at.y,
+        at.z,
         s.rms_px,
         s.frames,
         1e-6 * s.latency_ns as f64,
@@ -220,7 +295,7 @@ pub fn told_of(s: &Solution) -> String {
 }
 
 /// Puts a solution into the results: projector, tip and latency.
-pub fn keep(results: &mut Results, config: &RigConfig, wand: &str, s: &Solution) {
+pub fn keep(results: &mut Results, config: &RigConfig, (wand, bias_m): (&str, f64), s: &Solution) {
     let data = format!("{} frames of a light sensor on \"{wand}\"", s.frames);
     let of = |device: &str| {
         results.provenance(
@@ -232,11 +307,14 @@ pub fn keep(results: &mut Results, config: &RigConfig, wand: &str, s: &Solution)
     };
     let (projector, tip, latency) = (of(""), of(wand), of(""));
     let raster = config.projector.raster();
-    let section = ProjectorSection::new(raster, &s.model, s.predicted.p99_px, s.rms_px, projector);
-    let variance = s.tip_covariance.x_axis.x + s.tip_covariance.y_axis.y + s.tip_covariance.z_axis.z;
+    let section = ProjectorSection::new(raster, &s.model, s.predicted.p99_px, s.rms_px, projector)
+        .assuming(&s.predicted, bias_m);
     results.file.projector = Some(section);
-    results.file.wand =
-        Some(WandSection { tip: s.tip.to_array(), tip_sigma_m: variance.sqrt(), provenance: tip });
+    results.file.wand = Some(WandSection {
+        tip: s.tip.to_array(),
+        tip_sigma_m: trace(&s.tip_covariance).sqrt(),
+        provenance: tip,
+    });
     results.file.latency = Some(LatencySection {
         latency_us: 1e-3 * s.latency_ns as f64,
         sigma_us: 1e-3 * s.latency_sigma_ns,
@@ -275,7 +353,7 @@ mod tests {
     fn the_planes_are_those_of_the_code() {
         let raster = Raster::new(100, 60).unwrap();
         let code = Code::new(raster).unwrap();
-        let source = Arc::new(CodeSource(code.clone()));
+        let source = Arc::new(CodeSource::new(code.clone()));
         let mut planes = BitPlaneFrame::new(raster, PlaneSchedule::equal24());
         let mut painter = PatternPainter::new(source.clone(), raster);
         for slot in [0, 1, 2, 3, 5, 8] {

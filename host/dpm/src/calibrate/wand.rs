@@ -4,7 +4,7 @@ use super::dialogue::Dialogue;
 use super::poses::Poses;
 use super::results::Results;
 use dpm_calibration::file::WandSection;
-use dpm_calibration::pivot::Pivot;
+use dpm_calibration::pivot::{trace, Pivot};
 use dpm_common::clock::MonotonicClock;
 use dpm_rig::config::RigConfig;
 use dpm_rig::failure::{Failure, FailureKind};
@@ -64,7 +64,7 @@ pub fn calibrate(
         }
     }
     let tip = pivot.solve().map_err(|e| Failure::new(FailureKind::BadInput, e))?;
-    let sigma = (tip.covariance.x_axis.x + tip.covariance.y_axis.y + tip.covariance.z_axis.z).sqrt();
+    let sigma = trace(&tip.covariance).sqrt();
     let data = format!("{seen} poses of \"{name}\" in {seconds:.0} s");
     results.file.wand = Some(WandSection {
         tip: tip.tip.to_array(),

@@ -342,11 +342,6 @@ pub fn gray(number: u32) -> u32 {
     number ^ number >> 1
 }
 
-/// The number that a Gray code stands for.
-pub fn number_of_gray(code: u32) -> u32 {
-    [1, 2, 4, 8, 16].into_iter().fold(code, |number, shift| number ^ number >> shift)
-}
-
 /// The bit whose block of a counter the pixel lies in, and whether it is the left one of the pair. `None` in the gaps
 /// between blocks, which are an eighth of a block wide, and at the edges.
 fn block(raster: Raster, x: u32, y: u32) -> Option<(u32, bool)> {

@@ -15,6 +15,11 @@ fn raster(width: u32, height: u32) -> Raster {
     Raster::new(width, height).expect("a raster")
 }
 
+/// The number that a Gray code stands for.
+fn number_of_gray(code: u32) -> u32 {
+    [1, 2, 4, 8, 16].into_iter().fold(code, |number, shift| number ^ number >> shift)
+}
+
 fn rate() -> FrameRate {
     FrameRate::new(947, 1).expect("a rate")
 }

@@ -1,15 +1,16 @@
 //! `dpm calibrate light` and `dpm calibrate latency`: what a light sensor tells once the projector is known.
 
-use super::{numbers, seconds, tip_and_sigma, Common, SensorArgs};
+use super::{at_a_rate_that_is_carried, numbers, seconds, tip_and_sigma, Common, SensorArgs};
 use crate::calibrate::light::{self, FlatSource};
 use crate::calibrate::results::Results;
 use crate::calibrate::sensor;
-use crate::cli::watch::{print, watch_quietly};
+use crate::cli::watch::print;
 use dpm_calibration::projector::Known;
 use dpm_calibration::sensor::Brightness;
 use dpm_rig::config::RigConfig;
 use dpm_rig::failure::{Failure, FailureKind};
 use glam::DVec3;
+use std::sync::{Arc, Mutex, PoisonError};
 
 #[derive(clap::Args, Clone, Debug)]
 pub(super) struct LightArgs {
@@ -27,6 +28,9 @@ pub(super) struct LightArgs {
     /// Direction into which a flat sensor looks, in the wand's body frame; default: a round diffuser, which has none
     #[arg(long, value_name = "X,Y,Z", value_parser = direction, allow_hyphen_values = true)]
     looks: Option<DVec3>,
+    /// Codes of each channel; fewer take less time
+    #[arg(long, value_name = "N", default_value_t = 32, value_parser = clap::value_parser!(u32).range(4..=255))]
+    codes: u32,
     /// Frequency of the mains, hertz
     #[arg(long, value_name = "HZ", default_value_t = 50, value_parser = clap::value_parser!(u8).range(50..=60))]
     mains: u8,
@@ -59,19 +63,29 @@ impl LightArgs {
             None => light::load_sweep(&results.sweep())?,
         };
         let (port, flicker_hz) = (self.sensor_args.port(&self.sensor), 2.0 * f64::from(self.mains));
-        let channels = watch_quietly(config.clone(), move |config, monitor| {
-            light::measure(config, &port, flicker_hz, monitor)
-        })?;
+        let codes = self.codes;
+        let progress = Arc::new(Mutex::new(light::Progress::default()));
+        let mut paced = config.clone();
+        let channels = loop {
+            let (port, progress) = (port.clone(), Arc::clone(&progress));
+            let pass = at_a_rate_that_is_carried(&mut paced, move |config, monitor| {
+                let mut progress = progress.lock().unwrap_or_else(PoisonError::into_inner);
+                light::measure(config, (&port, flicker_hz, codes), &mut progress, monitor)
+            })?;
+            if let Some(channels) = pass {
+                break channels;
+            }
+        };
         let source = sweep.map_or(FlatSource::Former, |sweep| FlatSource::Sweep(sweep, self.looks));
-        let told = light::keep(&mut results, &config, channels, source)?;
+        let told = light::keep(&mut results, &config, channels, source);
         print(&format!("{told}\n{}\n", results.save(&config)?));
         Ok(())
     }
 
     fn sweep(&self, config: &RigConfig, results: &Results, seconds: f64) -> Result<Vec<Brightness>, Failure> {
         let tip = tip_and_sigma(results)?;
-        let setup = self.sensor_args.setup(&self.sensor, &self.common, seconds, Known::default());
-        let solution = watch_quietly(config.clone(), move |config, monitor| {
+        let setup = self.sensor_args.setup(&self.sensor, (&self.common, config), seconds, Known::default());
+        let solution = at_a_rate_that_is_carried(&mut config.clone(), move |config, monitor| {
             sensor::calibrate(config, &setup, tip, monitor)
         })?;
         light::save_sweep(&results.sweep(), &solution.brightness)?;
@@ -100,8 +114,9 @@ impl LatencyArgs {
             bad("the projector's lens has more than five coefficients; run `dpm calibrate projector`")
         })?;
         let tip = tip_and_sigma(&results)?;
-        let setup = self.sensor_args.setup(&self.sensor, &self.common, self.seconds, Known::default());
-        let latency = watch_quietly(config.clone(), move |config, monitor| {
+        let setup =
+            self.sensor_args.setup(&self.sensor, (&self.common, &config), self.seconds, Known::default());
+        let latency = at_a_rate_that_is_carried(&mut config.clone(), move |config, monitor| {
             sensor::latency(config, &setup, tip, &model, monitor)
         })?;
         sensor::keep_latency(&mut results, &config, &self.common.wand, &latency);

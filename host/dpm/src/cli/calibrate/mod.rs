@@ -5,8 +5,9 @@ mod light;
 mod projector;
 
 use super::rig_args::RigArgs;
-use super::watch::print;
+use super::watch::{print, watch_quietly};
 use crate::calibrate::dialogue::Dialogue;
+use crate::calibrate::pace::{slower, Paced};
 use crate::calibrate::recorder::Port;
 use crate::calibrate::results::Results;
 use crate::calibrate::{body, sensor, wand};
@@ -16,12 +17,14 @@ use dpm_calibration::rehearsal::{rehearse_with, Bias};
 use dpm_rig::config::RigConfig;
 use dpm_rig::failure::{Failure, FailureKind};
 use dpm_rig::rig::Rig;
+use dpm_rig::telemetry::monitor::RunMonitor;
 use dpm_rig::telemetry::report::to_json;
 use dpm_scene::camera_files::{export, Form};
 use glam::DVec3;
 use light::{LatencyArgs, LightArgs};
 use projector::ProjectorArgs;
 use std::path::{Path, PathBuf};
+use std::sync::Arc;
 
 /// Flags of `dpm calibrate`.
 #[derive(clap::Args, Clone, Debug)]
@@ -88,13 +91,21 @@ impl SensorArgs {
         Port { path: path.to_owned(), baud: self.sensor_baud, gain: self.gain }
     }
 
-    fn setup(&self, path: &str, common: &Common, seconds: f64, known: Known) -> sensor::Setup {
+    fn setup(
+        &self,
+        path: &str,
+        (common, config): (&Common, &RigConfig),
+        seconds: f64,
+        known: Known,
+    ) -> sensor::Setup {
         sensor::Setup {
             port: self.port(path),
             wand: common.wand.clone(),
             seconds,
             aperture_m: 1e-3 * self.aperture,
             known,
+            rate_hz: config.projector.frame_rate.hz(),
+            has_begun: Arc::default(),
         }
     }
 }
@@ -165,6 +176,9 @@ enum BiasWord {
     Standing,
 }
 
+/// A picture may stay for this long without another one, milliseconds.
+const PICTURE_MS: u32 = 500;
+
 /// Bias of the tracker in rehearsals that have one, metres along an axis.
 const BIAS_M: f64 = 5e-5;
 
@@ -210,8 +224,36 @@ impl Common {
         let mut config = args.rig_at_rest(Some(&self.rig))?;
         // A pattern runs until it is stopped.
         (config.run.frames, config.run.seconds) = (0, 0.0);
+        // Its pictures do not follow a body, so none is too old; one that is late must not leave a gap in the light, since
+        // gaps are flashes.
+        config.safety.predict_ms.get_or_insert(PICTURE_MS);
         let results = Results::open(self.file.as_deref(), &self.rig, &config)?;
         Ok((config, results))
+    }
+}
+
+/// Runs `measure` beside the watch over signals and orders, at ever lower rates until the link carries its frames;
+/// `config` keeps the rate.
+///
+/// # Errors
+/// That of `measure`, or no rate is low enough (exit code 3).
+fn at_a_rate_that_is_carried<T: Send + 'static>(
+    config: &mut RigConfig,
+    measure: impl Fn(&RigConfig, &Arc<RunMonitor>) -> Result<Paced<T>, Failure> + Clone + Send + 'static,
+) -> Result<T, Failure> {
+    loop {
+        let once = measure.clone();
+        match watch_quietly(config.clone(), move |config, monitor| once(config, monitor))? {
+            Paced::Done(result) => return Ok(result),
+            Paced::TooFast { carried_hz } => {
+                let before = config.projector.frame_rate.hz();
+                *config = slower(config, carried_hz)?;
+                print(&format!(
+                    "only {carried_hz:.0} of {before:.0} frames/s reach the projector in time; trying {:.0}\n",
+                    config.projector.frame_rate.hz()
+                ));
+            }
+        }
     }
 }
 
@@ -256,7 +298,7 @@ pub(super) fn execute(args: &CalibrateArgs) -> Result<(), Failure> {
             let ways = body::Ways { wander_s: args.wander, tip_radius_m: 1e-3 * args.tip_radius };
             let dialogue = Dialogue::start(|| false)?;
             let told = body::calibrate(&config, &scene, wand, &args.body, ways, &mut results, &dialogue)?;
-            print(&format!("{told}\n{}\n", results.save(&config)?));
+            print(&format!("{told}\n"));
             Ok(())
         }
         What::Check(args) => check(args),
@@ -302,12 +344,15 @@ fn rehearse(args: &RehearseArgs) -> Result<(), Failure> {
     print(&format!(
         "{} truths drawn, lens, pose, tip, bodies, latency, light\n\
          error of the light {:.3} px median, {:.3} px 99th percentile; worst draw {:.3} px 99th percentile\n\
+         on bodies that move at 1 m/s, beyond what their prediction adds: {:.3} px median, {:.3} px 99th percentile\n\
          predicted 99th percentile covers {:.0} % of the draws and is {:.1} times the true one\n\
          latency within {:.1} us, levels within {:.2} %\n",
         r.draws,
         r.error_px.p50,
         r.error_px.p99,
         r.worst_draw_p99_px,
+        r.moving_px.p50,
+        r.moving_px.p99,
         100.0 * r.covered,
         r.predicted_over_true,
         r.latency_error_us.max,

@@ -1,6 +1,6 @@
 //! `dpm calibrate projector`: by hand, from a file of points, or by the wand's light sensor.
 
-use super::{seconds, tip_and_sigma, tip_of, Common, SensorArgs};
+use super::{at_a_rate_that_is_carried, seconds, tip_and_sigma, tip_of, Common, SensorArgs};
 use crate::calibrate::aim::Aim;
 use crate::calibrate::dialogue::Dialogue;
 use crate::calibrate::poses::Poses;
@@ -30,6 +30,9 @@ pub(super) struct ProjectorArgs {
     /// Direction of the world that points up (x, y or z); catches exchanged axes of a projector that stands upright
     #[arg(long, value_name = "AXIS", value_parser = axis)]
     up: Option<DVec3>,
+    /// Bias of the tracker to reckon with, millimetres along an axis: what no mean removes. The predicted error grows by it
+    #[arg(long, value_name = "MM", default_value_t = 0.0, value_parser = super::zero_or_millimetres)]
+    bias: f64,
     /// Serial port of the wand's light sensor: move the wand through coded light in place of aiming by hand
     #[arg(long, value_name = "PORT", conflicts_with = "points")]
     sensor: Option<String>,
@@ -68,7 +71,7 @@ impl ProjectorArgs {
         let options = Options { known, ..Options::by_hand(raster) };
         match (&self.sensor, &self.points) {
             (Some(port), _) => self.by_sensor(port, known, &config, results),
-            (None, Some(path)) => told(results, &config, &solve_file(path, raster, options)?),
+            (None, Some(path)) => self.told(results, &config, &solve_file(path, raster, options)?),
             (None, None) => self.by_hand(options, &config, results),
         }
     }
@@ -84,7 +87,7 @@ impl ProjectorArgs {
                 Ok((solved, points))
             })
         })?;
-        told(results, config, &solved)?;
+        self.told(results, config, &solved)?;
         // Not before the result is written: until then the points are all there is.
         points.forget();
         Ok(())
@@ -98,23 +101,38 @@ impl ProjectorArgs {
         mut results: Results,
     ) -> Result<(), Failure> {
         let tip = tip_and_sigma(&results)?;
-        let setup = self.sensor_args.setup(port, &self.common, self.seconds, known);
-        let solution = watch_quietly(config.clone(), move |config, monitor| {
+        let setup = self.sensor_args.setup(port, (&self.common, config), self.seconds, known);
+        let solution = at_a_rate_that_is_carried(&mut config.clone(), move |config, monitor| {
             sensor::calibrate(config, &setup, tip, monitor)
         })?;
-        sensor::keep(&mut results, config, &self.common.wand, &solution);
+        sensor::keep(&mut results, config, (&self.common.wand, 1e-3 * self.bias), &solution);
         // `dpm calibrate light` makes the flat field of it.
         light::save_sweep(&results.sweep(), &solution.brightness)?;
-        print(&format!("{}\n{}\n", sensor::told_of(&solution), results.save(config)?));
+        let told = format!("{}{}", sensor::told_of(&solution), self.told_of_bias(&results));
+        print(&format!("{told}\n{}\n", results.save(config)?));
         Ok(())
     }
-}
 
-/// Writes a projector and says how good it is.
-fn told(mut results: Results, config: &RigConfig, solved: &Solved) -> Result<(), Failure> {
-    keep(&mut results, config, solved);
-    print(&format!("{}\n{}\n", told_of(solved), results.save(config)?));
-    Ok(())
+    /// Writes a projector and says how good it is.
+    fn told(&self, mut results: Results, config: &RigConfig, solved: &Solved) -> Result<(), Failure> {
+        keep(&mut results, config, solved, 1e-3 * self.bias);
+        let told = format!("{}{}", told_of(solved), self.told_of_bias(&results));
+        print(&format!("{told}\n{}\n", results.save(config)?));
+        Ok(())
+    }
+
+    /// What a bias of the tracker makes of the prediction.
+    fn told_of_bias(&self, results: &Results) -> String {
+        match &results.file.projector {
+            Some(p) if self.bias > 0.0 => {
+                format!(
+                    "\nwith a tracker bias of {} mm: predicted error {:.3} px",
+                    self.bias, p.predicted_p99_px
+                )
+            }
+            _ => String::new(),
+        }
+    }
 }
 
 /// Shows the pictures of `source` while `work` talks to the operator.
