@@ -58,7 +58,7 @@ fn a_program_knows_its_commit_wherever_it_lies() {
 
 #[test]
 fn bad_usage_ends_with_2() {
-    for args in [&["frobnicate"][..], &["doctor", "--frob"], &["doctor", "surplus"], &[]] {
+    for args in [&["frobnicate"][..], &["doctor", "--frob"], &["doctor", "rig.toml", "surplus"], &[]] {
         let output = dpm(args, &[]);
         assert_eq!(code(&output), 2, "{args:?}: {}", err(&output));
         assert!(err(&output).contains("Usage"), "{args:?}: {}", err(&output));

@@ -96,7 +96,7 @@ pub(crate) const fn source_bit(plane: PlaneSpec) -> u32 {
 }
 
 /// For each plane of `schedule` the bit of a pixel's word that it shows. The words are code values; for planes of equal
-/// light they are what [`halftone`] makes of code values, in which each plane of a channel has a bit of its own.
+/// light they are what [`halftone()`] makes of code values, in which each plane of a channel has a bit of its own.
 pub fn source_bits(schedule: &PlaneSchedule) -> [u8; MAX_PLANES] {
     let mut bits = [0; MAX_PLANES];
     let mut before = [0u8; 4];
@@ -156,7 +156,7 @@ impl Shown {
     }
 }
 
-/// Code values `0x00BBGGRR` (for planes of equal light the words that [`halftone`] makes of them), row after row, into the planes of `frame`; bits 24 to 31 are ignored, padding bits become 0.
+/// Code values `0x00BBGGRR` (for planes of equal light the words that [`halftone()`] makes of them), row after row, into the planes of `frame`; bits 24 to 31 are ignored, padding bits become 0.
 /// A `kernel` that this CPU cannot run is replaced by [`Kernel::best`].
 ///
 /// # Panics
