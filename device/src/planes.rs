@@ -152,7 +152,8 @@ impl PlaneSchedule {
     /// 24 planes of equal light: red, green, blue eight times, each at 16 / 255 of full, which is 128 of 255 if all are on.
     pub fn equal_rgb24() -> Self {
         let channels = [Channel::Red, Channel::Green, Channel::Blue];
-        let planes: [PlaneSpec; 24] = std::array::from_fn(|i| PlaneSpec { channel: channels[i % 3], bit: 4 });
+        let planes: [PlaneSpec; 24] =
+            core::array::from_fn(|i| PlaneSpec { channel: channels[i % 3], bit: 4 });
         Self::with_repeats(&planes).expect("128 of 255 in each channel")
     }
 
@@ -208,7 +209,7 @@ impl PlaneSchedule {
     pub fn rgb24_in(bits: [u8; 8]) -> Option<Self> {
         let channels = [Channel::Red, Channel::Green, Channel::Blue];
         let planes: [PlaneSpec; 24] =
-            std::array::from_fn(|i| PlaneSpec { channel: channels[i % 3], bit: bits[i / 3] });
+            core::array::from_fn(|i| PlaneSpec { channel: channels[i % 3], bit: bits[i / 3] });
         Self::new(&planes)
     }
 
