@@ -70,7 +70,8 @@ impl FrameTiming {
         if unit_us * f64::from(smallest) < f64::from(shortest_us) {
             let unit = (f64::from(shortest_us) / f64::from(smallest)).ceil();
             let most_hz = 1e6 * (1.0 - SPARE) / (unit * units + dark_us);
-            let left_us = ((frame_us - dark_us) / units * f64::from(smallest)).max(0.0);
+            // Picture times are whole microseconds.
+            let left_us = (unit_us * f64::from(smallest)).max(0.0);
             return Err(Misfit::TooFast { left_us, most_hz });
         }
         let of = |bit: u8| unit_us as i64 * if weights == Weights::Binary { 1 << bit } else { 1 };
