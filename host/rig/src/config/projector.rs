@@ -100,9 +100,15 @@ impl ProjectorConfig {
         })
     }
 
-    /// True for a projector that shows the code value of a pixel for the whole frame, not its bits one after the other.
-    pub fn holds_code_values(&self) -> bool {
-        matches!(&self.backend, ProjectorBackend::Display(display) if display.encoding == DisplayEncoding::Rgb8)
+    /// True for a projector whose full light is the same from the first photon of a frame to the last: a display that is
+    /// given code values and holds them, or an ALP that shows each bit for as long as it weighs. Others show the planes
+    /// for equal times, with the light of their bits.
+    pub fn lights_evenly(&self) -> bool {
+        match &self.backend {
+            ProjectorBackend::Display(display) => display.encoding == DisplayEncoding::Rgb8,
+            ProjectorBackend::Alp(alp) => alp.weights == AlpWeights::Binary,
+            _ => false,
+        }
     }
 
     /// Light of a mirror that is on in all planes, as a code value of which 255 is full light. It is less where planes of

@@ -11,7 +11,7 @@ use crate::light::recorder::LightNote;
 use crate::light::registration::RegistrationMeter;
 use crate::plan::dark::DarkCause;
 use crate::plan::frame::FrameId;
-use crate::plan::light_centre::{centre_for, lights_of_planes};
+use crate::plan::light_centre::{light_centre_ns, lights_of_frame};
 use crate::rig::Rig;
 use crate::telemetry::flight::FlightRecorder;
 use crate::telemetry::interval::Interval;
@@ -462,8 +462,7 @@ impl Collector {
                 let Some(mut record) = self.pending.pop_front() else { return };
                 let last_photon_at = note.event.last_photon_at;
                 let exposure_ns = last_photon_at.ns_since(begin);
-                let centre_at =
-                    begin.plus_ns(centre_for(&self.rig.config.projector, &self.rig.schedule, exposure_ns));
+                let centre_at = begin.plus_ns(light_centre_ns(&self.rig, exposure_ns));
                 record.timeline.lit_at = Some(begin);
                 record.timeline.centre_at = Some(centre_at);
                 record.timeline.last_photon_at = Some(last_photon_at);
@@ -555,7 +554,7 @@ impl Collector {
             truths.clear();
         }
         self.truths.resize_with(record.tracked_poses.len(), Vec::new);
-        for (middle_ns, weight) in lights_of_planes(&self.rig.schedule, last.ns_since(lit_at)) {
+        for (middle_ns, weight) in lights_of_frame(&self.rig, last.ns_since(lit_at)) {
             let Some(poses) = self.rig.true_poses(lit_at.plus_ns(middle_ns).0) else { return };
             self.truths.iter_mut().zip(poses).for_each(|(truths, pose)| truths.push((pose, weight)));
         }

@@ -2,7 +2,7 @@
 //! off.
 
 use super::dark::DarkCause;
-use super::light_centre::centre_for;
+use super::light_centre::light_centre_ns;
 use super::link_time::LinkTime;
 use crate::rig::{affine, Rig};
 use crate::tracks::TrackSnapshot;
@@ -119,8 +119,7 @@ impl FramePlan {
         self.dark_from = slots.dark_from(slot, stride, predict_ns - late_ns);
         self.due_at = slots.host_of_slot(slot);
         let exposure_ns = slots.host_of_slot(slot + 1).ns_since(self.due_at);
-        let centre =
-            self.due_at.plus_ns(centre_for(&rig.config.projector, &rig.schedule, exposure_ns) + late_ns);
+        let centre = self.due_at.plus_ns(light_centre_ns(rig, exposure_ns) + late_ns);
         self.place_bodies(rig, snapshot, inputs, centre);
         rig.scene_poses(&self.tracked_poses, &mut self.scene_poses);
         (self.eye, self.gaze) = rig.observer.eye_and_gaze(&self.tracked_poses);
