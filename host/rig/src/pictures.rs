@@ -158,6 +158,7 @@ fn integrate(
         gaze: other,
         widen_deg: 0.0,
         poses: &poses,
+        sweep: None,
         lost: &[],
     };
     renderer.submit(&mut slot, &inputs)?;

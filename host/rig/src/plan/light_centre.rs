@@ -4,8 +4,12 @@
 //! bits come first, most of the light is over long before the middle of the exposure. An eye that follows a body sees
 //! the picture where the centre of the light puts it.
 
+use crate::config::{PlanePoses, PlaneTiming};
 use crate::rig::Rig;
 use dpm_device::planes::{PlaneSchedule, PlaneSpec};
+use dpm_render::pack::source_bits;
+use dpm_render::warp::plane_groups;
+use dpm_shaders::structs::PlaneGroup;
 
 /// Time from the first photon to the centre of the light of a frame of `rig` that is lit for `exposure_ns` >= 0, in
 /// nanoseconds. Rounded down; 0 for a negative exposure.
@@ -13,53 +17,104 @@ use dpm_device::planes::{PlaneSchedule, PlaneSpec};
 /// The function assumes white, with every bit of every channel set. The actual code value shifts the centre of each
 /// pixel.
 pub(crate) fn light_centre_ns(rig: &Rig, exposure_ns: i64) -> i64 {
-    centre_ns(&rig.schedule, rig.config.projector.lights_evenly(), exposure_ns)
+    Lights::of(rig).centre_ns(exposure_ns)
 }
 
-/// The mean of the middles of the planes, which share `exposure_ns` equally, each weighted with its light.
-fn centre_ns(schedule: &PlaneSchedule, is_even: bool, exposure_ns: i64) -> i64 {
-    let (mut weights, mut moments) = (0i128, 0i128);
-    for (i, plane) in schedule.planes().iter().enumerate() {
-        let weight = i128::from(light_of(*plane, is_even));
-        weights += weight;
-        moments += halves_of(i) * weight;
-    }
-    // A schedule has at most 32 planes of at most 2^31, so neither sum nor their product with the exposure overflows.
-    // A schedule has at least one plane, so the weights are positive.
-    let halves = 2 * schedule.len() as i128;
-    (i128::from(exposure_ns.max(0)) * moments / (halves * weights)) as i64
-}
-
-/// Light of a plane that lasts as long as every other one: 1 where the light of a frame `is_even`, else `2^bit`.
-const fn light_of(plane: PlaneSpec, is_even: bool) -> u32 {
-    if is_even {
-        1
-    } else {
-        1 << plane.bit
-    }
-}
-
-/// The middle of plane `i` lies so many half planes after the first photon.
-const fn halves_of(i: usize) -> i128 {
-    2 * i as i128 + 1
-}
-
-/// The light of a frame of `rig` over its exposure, in as many equal parts as it has planes: the time from the first
-/// photon to the middle of each in nanoseconds, rounded down, and its light.
+/// The light of each plane of a frame of `rig`: the time from the first photon to the middle of the plane in nanoseconds,
+/// rounded down, and the light of a mirror that is on, in units of the lowest bit. Where code values are held for the
+/// whole frame, it is shared out over as many equal parts.
 pub(crate) fn lights_of_frame(rig: &Rig, exposure_ns: i64) -> impl Iterator<Item = (i64, f64)> + '_ {
-    lights(&rig.schedule, rig.config.projector.lights_evenly(), exposure_ns)
+    let lights = Lights::of(rig);
+    let whole = lights.whole();
+    let middle = move |(_, halves)| (i128::from(exposure_ns.max(0)) * halves / (2 * whole)) as i64;
+    lights.planes().map(move |plane| (middle(plane), f64::from(lights.light_of(plane.0))))
 }
 
-fn lights(
-    schedule: &PlaneSchedule,
-    is_even: bool,
-    exposure_ns: i64,
-) -> impl Iterator<Item = (i64, f64)> + '_ {
-    let halves = 2 * schedule.len() as i128;
-    schedule.planes().iter().enumerate().map(move |(i, plane)| {
-        let middle = i128::from(exposure_ns.max(0)) * halves_of(i) / halves;
-        (middle as i64, f64::from(light_of(*plane, is_even)))
-    })
+/// True if planes are shown where the bodies are at their own instants.
+pub(crate) fn planes_follow(rig: &Rig) -> bool {
+    rig.config.projector.plane_poses == PlanePoses::Own && Lights::of(rig).timing != PlaneTiming::Held
+}
+
+/// For each plane of a frame of `rig` the time from the frame's instant, which is the centre of its light, to the instant
+/// for which the plane shows the bodies, as a share of the exposure.
+pub(crate) fn instants_of_planes(rig: &Rig) -> Vec<f64> {
+    let groups = groups_that_follow(rig);
+    let bits = source_bits(&rig.schedule);
+    let of = |bit: &u8| groups.iter().find(|g| g.mask >> bit & 1 == 1).map_or(0, |g| g.instant);
+    bits[..rig.schedule.len()].iter().map(|bit| f64::from(of(bit)) / 65536.0).collect()
+}
+
+/// The groups of planes of `rig` that follow the bodies, each at its own instant; none if all planes show the bodies at
+/// the centre of the light.
+pub(crate) fn groups_that_follow(rig: &Rig) -> Vec<PlaneGroup> {
+    if !planes_follow(rig) {
+        return Vec::new();
+    }
+    let lights = Lights::of(rig);
+    let [moments, light] = lights.moments();
+    let centre = moments as f64 / light as f64;
+    let instants: Vec<f64> =
+        lights.planes().map(|(_, halves)| (halves as f64 - centre) / (2 * lights.whole()) as f64).collect();
+    plane_groups(lights.schedule, &instants)
+}
+
+/// When the planes of a frame are lit, and how much light they give.
+#[derive(Clone, Copy)]
+struct Lights<'a> {
+    schedule: &'a PlaneSchedule,
+    timing: PlaneTiming,
+}
+
+impl<'a> Lights<'a> {
+    fn of(rig: &'a Rig) -> Self {
+        Self { schedule: &rig.schedule, timing: rig.config.projector.plane_timing() }
+    }
+
+    /// How long a plane lasts, in units that all planes share.
+    fn length_of(self, plane: PlaneSpec) -> i128 {
+        match self.timing {
+            PlaneTiming::ByWeight => 1 << plane.bit,
+            PlaneTiming::Equal | PlaneTiming::Held => 1,
+        }
+    }
+
+    /// The light of a plane.
+    fn light_of(self, plane: PlaneSpec) -> u32 {
+        match self.timing {
+            PlaneTiming::ByWeight | PlaneTiming::Equal => 1 << plane.bit,
+            PlaneTiming::Held => 1,
+        }
+    }
+
+    /// How long the frame lasts, in the units of [`Self::length_of`].
+    fn whole(self) -> i128 {
+        self.schedule.planes().iter().map(|plane| self.length_of(*plane)).sum()
+    }
+
+    /// Every plane with twice the time from the first photon to its middle, in the units of [`Self::length_of`].
+    fn planes(self) -> impl Iterator<Item = (PlaneSpec, i128)> + 'a {
+        self.schedule.planes().iter().scan(0, move |begin, plane| {
+            let length = self.length_of(*plane);
+            let halves = 2 * *begin + length;
+            *begin += length;
+            Some((*plane, halves))
+        })
+    }
+
+    /// Sum of the planes' middles, as [`Self::planes`] gives them, each weighted with its light; and sum of the light.
+    fn moments(self) -> [i128; 2] {
+        self.planes().fold([0, 0], |[moments, light], (plane, halves)| {
+            let of = i128::from(self.light_of(plane));
+            [moments + of * halves, light + of]
+        })
+    }
+
+    /// As [`light_centre_ns`].
+    fn centre_ns(self, exposure_ns: i64) -> i64 {
+        // A schedule has 1 to 32 planes of bits below 8, so nothing here overflows, and the light is positive.
+        let [moments, light] = self.moments();
+        (i128::from(exposure_ns.max(0)) * moments / (2 * self.whole() * light)) as i64
+    }
 }
 
 #[cfg(test)]
@@ -69,43 +124,48 @@ mod tests {
 
     const SLOT: i64 = 1_055_966;
 
-    #[test]
-    fn the_order_of_rgb24_has_its_centre_at_194_us() {
-        assert_eq!((centre_ns(&PlaneSchedule::rgb24(), false, SLOT) + 500) / 1000, 194);
+    fn centre_ns(schedule: &PlaneSchedule, timing: PlaneTiming, exposure_ns: i64) -> i64 {
+        Lights { schedule, timing }.centre_ns(exposure_ns)
     }
 
     #[test]
-    fn the_centre_is_the_mean_of_the_planes_lights() {
+    fn the_order_of_rgb24_has_its_centre_at_194_us() {
+        assert_eq!((centre_ns(&PlaneSchedule::rgb24(), PlaneTiming::Equal, SLOT) + 500) / 1000, 194);
+    }
+
+    /// Light that is the same from the first photon to the last has its centre in the middle, whatever the planes.
+    #[test]
+    fn even_light_has_its_centre_in_the_middle() {
         for schedule in [PlaneSchedule::rgb24(), PlaneSchedule::mono8(), PlaneSchedule::equal24()] {
-            for is_even in [false, true] {
-                let (mut sum, mut weights) = (0.0, 0.0);
-                for (middle, weight) in lights(&schedule, is_even, SLOT) {
-                    sum += middle as f64 * weight;
-                    weights += weight;
-                }
-                assert!((sum / weights - centre_ns(&schedule, is_even, SLOT) as f64).abs() <= 1.0);
+            for timing in [PlaneTiming::ByWeight, PlaneTiming::Held] {
+                assert_eq!(centre_ns(&schedule, timing, SLOT), SLOT / 2);
             }
         }
     }
 
-    /// A display that holds code values, and an ALP that shows each bit for as long as it weighs.
+    /// The middles of planes that last as long as they weigh: the first of `7 6 5 ...` takes half of the exposure.
     #[test]
-    fn even_light_has_its_centre_in_the_middle_whatever_the_order() {
-        for schedule in [PlaneSchedule::rgb24(), PlaneSchedule::mono8()] {
-            assert_eq!(centre_ns(&schedule, true, SLOT), SLOT / 2);
+    fn planes_follow_one_another_without_gaps() {
+        let lights = Lights { schedule: &PlaneSchedule::mono8(), timing: PlaneTiming::ByWeight };
+        let mut end = 0;
+        for (plane, halves) in lights.planes() {
+            assert_eq!(halves - end, 1 << plane.bit);
+            end = halves + (1 << plane.bit);
         }
+        assert_eq!(end, 2 * lights.whole());
     }
 
     /// The centres of a schedule and of its mirror image lie at equal distances from the middle. With equal weights
     /// the centre is the middle. Every centre lies inside the exposure.
     #[test]
     fn centres_obey_the_symmetry_of_the_order() {
+        let timing = PlaneTiming::Equal;
         for schedule in [PlaneSchedule::rgb24(), PlaneSchedule::mono8()] {
             let mut planes = schedule.planes().to_vec();
             planes.reverse();
             let mirrored = PlaneSchedule::new(&planes).unwrap();
             for exposure in [0, 1, 7, SLOT, 1_000_000_000_000] {
-                let (a, b) = (centre_ns(&schedule, false, exposure), centre_ns(&mirrored, false, exposure));
+                let (a, b) = (centre_ns(&schedule, timing, exposure), centre_ns(&mirrored, timing, exposure));
                 // Each value is rounded down by less than 1 ns.
                 assert!((exposure - 1..=exposure).contains(&(a + b)), "{a} + {b} of {exposure}");
                 assert!((0..=exposure).contains(&a));
@@ -113,7 +173,7 @@ mod tests {
         }
         let equal =
             [Channel::Red, Channel::Green, Channel::Blue].map(|channel| PlaneSpec { channel, bit: 3 });
-        assert_eq!(centre_ns(&PlaneSchedule::new(&equal).unwrap(), false, 600), 300);
-        assert_eq!(centre_ns(&PlaneSchedule::mono8(), false, -5), 0);
+        assert_eq!(centre_ns(&PlaneSchedule::new(&equal).unwrap(), timing, 600), 300);
+        assert_eq!(centre_ns(&PlaneSchedule::mono8(), timing, -5), 0);
     }
 }
