@@ -53,9 +53,9 @@ Moved moved_at(uint m, ivec2 pixel) {
 // The place of mover `m` that is at `pixel` at `instant`. False if none is. `own` is what moves at `pixel` itself.
 bool find(uint m, ivec2 pixel, int instant, Moved own, out ivec2 at, out uint depth) {
     uint owner = OWNER_STILL + 1u + m;
-    // The point's own motion is that of a neighbour, or of the point that is here now.
-    Moved near = moved_at(m, nearest_pixel(source(pixel, start_of(m, pixel), instant)));
-    if (owner_of(near) != owner) near = own;
+    // The point's motion is that of the point that is here now, or of what is about where it comes from.
+    Moved near = own;
+    if (owner_of(near) != owner) near = moved_at(m, nearest_pixel(source(pixel, start_of(m, pixel), instant)));
     at = source(pixel, motion_of(near), instant);
     Moved there = NOTHING;
     if (owner_of(near) == owner) there = moved_at(m, nearest_pixel(at));

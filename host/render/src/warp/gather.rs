@@ -83,9 +83,10 @@ impl Drawn<'_> {
                 continue;
             }
             let of_mover = |at| self.moved_at(mover, nearest(at)).filter(|m| owner_of(m) == number);
-            // The point's own motion is that of a neighbour, or of the point that is here now.
-            let near = of_mover(source(pixel, start_of(mover, pixel), instant));
-            let Some(near) = near.or((owner == number).then_some(own)) else { continue };
+            // The point's motion is that of the point that is here now, or of what is about where it comes from.
+            let here = (owner == number).then_some(own);
+            let near = here.or_else(|| of_mover(source(pixel, start_of(mover, pixel), instant)));
+            let Some(near) = near else { continue };
             let at = source(pixel, motion_of(near), instant);
             let Some(there) = of_mover(at) else { continue };
             if depth_of(there) < closest {

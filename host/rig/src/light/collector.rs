@@ -6,12 +6,11 @@ use crate::frame::job::{Fate, FrameNote};
 use crate::frame::slots::OrderedDark;
 use crate::frame::{FrameTimeline, Stage, STAGES};
 use crate::light::dark_bodies::DarkBodies;
+use crate::light::measures::{histogram, RegistrationMeasures};
 use crate::light::placement::Placement;
+use crate::light::record::FrameRecord;
 use crate::light::recorder::LightNote;
-use crate::light::registration::{PlaneLight, RegistrationMeter};
-use crate::plan::dark::DarkCause;
-use crate::plan::frame::FrameId;
-use crate::plan::light_centre::{instants_of_planes, light_centre_ns, lights_of_frame};
+use crate::plan::light_centre::light_centre_ns;
 use crate::rig::Rig;
 use crate::telemetry::flight::FlightRecorder;
 use crate::telemetry::interval::Interval;
@@ -27,7 +26,6 @@ use dpm_device::link::frame_newer;
 use dpm_device::time::HostTime;
 use dpm_handoff::channel::Receiver;
 use dpm_render::PASSES;
-use glam::{DAffine3, DVec3};
 use hdrhistogram::Histogram;
 use std::collections::VecDeque;
 use std::sync::Arc;
@@ -35,48 +33,6 @@ use std::sync::Arc;
 /// Sent frames that may wait for their light. Beyond this number the oldest count as never lit, once no unread light
 /// is left.
 const MAX_PENDING: usize = 256;
-/// Every so many frames are followed plane by plane.
-const FOLLOWED_EVERY: u64 = 16;
-
-/// The record of one lit frame, kept for pictures.
-#[derive(Clone, Debug)]
-pub struct FrameRecord {
-    /// Which frame.
-    pub id: FrameId,
-    /// Its slot.
-    pub slot: u64,
-    /// Its stamps.
-    pub timeline: FrameTimeline,
-    /// world-from-body of the tracked bodies for which it was drawn.
-    pub tracked_poses: Vec<DAffine3>,
-    /// The same at the first photon and at the last; empty if all planes were drawn for one instant.
-    pub swept_poses: [Vec<DAffine3>; 2],
-    /// world-from-body of the tracked bodies without prediction.
-    pub sampled_poses: Vec<DAffine3>,
-    /// Per tracked body: why no light fell on it; `None` if light fell on it.
-    pub dark: Vec<Option<DarkCause>>,
-    /// The eye in world coordinates.
-    pub eye: DVec3,
-    /// Hash of its code values.
-    pub code_hash: u64,
-    /// GPU time of each pass, nanoseconds.
-    pub pass_ns: [u64; PASSES.len()],
-}
-
-impl FrameRecord {
-    /// world-from-body for which the tracked body `i` was drawn in the planes of an instant, told as a share of the
-    /// exposure from the frame's own.
-    fn pose_at(&self, i: usize, instant: f64) -> DAffine3 {
-        let pose = self.tracked_poses[i];
-        let [Some(first), Some(last)] = [0, 1].map(|end: usize| self.swept_poses[end].get(i)) else {
-            return pose;
-        };
-        DAffine3 {
-            matrix3: pose.matrix3 + (last.matrix3 - first.matrix3) * instant,
-            translation: pose.translation + (last.translation - first.translation) * instant,
-        }
-    }
-}
 
 /// The inputs of the collector.
 pub(crate) struct Inbox {
@@ -91,7 +47,7 @@ pub(crate) struct Collector {
     rig: Arc<Rig>,
     /// Light of a frame that the link has not yet reported as sent.
     held: Option<LightNote>,
-    meter: RegistrationMeter,
+    registration: RegistrationMeasures,
     placement: Placement,
     pending: VecDeque<FrameRecord>,
     /// The last lit frames, oldest first.
@@ -137,20 +93,8 @@ pub(crate) struct Collector {
     standstills: Option<Arc<SeenStandstills>>,
     /// What the operator should know about the files of the flight recorder.
     flights_told: Option<String>,
-    registration: Histogram<u64>,
-    /// The same for frames that were lit in their own slot.
-    registration_in_time: Histogram<u64>,
-    /// What an eye sees that follows a point, of some frames: how far the light lies from it, and how far it is spread.
-    followed: [Histogram<u64>; 2],
-    /// Per tracked body: the light of each plane of a frame.
-    planes: Vec<Vec<PlaneLight>>,
-    /// Per tracked body: the planes of a frame follow it.
-    follows: Vec<bool>,
-    /// Per plane: when the bodies are where it shows them, as a share of the exposure from the frame's instant.
-    instants: Vec<f64>,
     /// True beginning of a slot, as observed by the mock in this process, minus the host's estimate.
     clock_error: SignedHistogram,
-    unpredicted: Histogram<u64>,
     stages: Vec<Histogram<u64>>,
     passes: Vec<Histogram<u64>>,
     rays: u64,
@@ -166,17 +110,9 @@ pub(crate) struct Collector {
 /// much more.
 const MAX_TRACED: usize = 30_000;
 
-/// Registration is counted in millionths of a pixel.
-const PER_PIXEL: f64 = 1e6;
-
-fn histogram() -> Histogram<u64> {
-    Histogram::new_with_bounds(1, 1_000_000_000_000, 3).expect("bounds and digits are in range")
-}
-
 impl Collector {
     /// Keeps the last `keep` lit frames. `verify`: compares hashes of code values and light.
     pub(crate) fn new(rig: Arc<Rig>, keep: usize, verify: bool) -> Self {
-        let meter = RegistrationMeter::new(&rig);
         let measured = rig.config.real_time.pace == Pace::Real;
         // A tenth of a run of known length, but enough frames for a 99th percentile.
         let frames = rig.config.run.frames.max(rig.config.slots_to_run());
@@ -187,7 +123,7 @@ impl Collector {
             Profiler::new(rig.rate(), measured, batch_frames).with_mocks(is_mock_tracker, is_mock_projector);
         let lead_ns = i64::from(rig.config.real_time.stage_costs_us.total()) * 1000;
         let trace_frames = if rig.config.output.trace { MAX_TRACED } else { 0 };
-        let instants = instants_of_planes(&rig);
+        let registration = RegistrationMeasures::new(rig.clone());
         Self {
             placement: Placement::new(rig.bodies.len()),
             dark_bodies: DarkBodies::new(rig.bodies.len()),
@@ -195,7 +131,7 @@ impl Collector {
             slots: SlotLedger::new(rig.rate(), lead_ns),
             rig,
             held: None,
-            meter,
+            registration,
             pending: VecDeque::new(),
             recent: VecDeque::new(),
             keep,
@@ -221,14 +157,7 @@ impl Collector {
             flights: None,
             standstills: None,
             flights_told: None,
-            registration: histogram(),
-            registration_in_time: histogram(),
-            followed: [histogram(), histogram()],
-            planes: Vec::new(),
-            follows: Vec::new(),
-            instants,
             clock_error: SignedHistogram::new(1_000_000_000),
-            unpredicted: histogram(),
             stages: STAGES.iter().map(|_| histogram()).collect(),
             passes: PASSES.iter().map(|_| histogram()).collect(),
             rays: 0,
@@ -420,7 +349,7 @@ impl Collector {
             &self.rig.camera,
             &job.plan.sampled_poses,
             &job.plan.seen,
-            self.meter.points(),
+            self.registration.points(),
         );
         let sent = job.is_sent();
         let refused = !sent && !matches!(job.fate, Fate::Overtaken | Fate::Stopped);
@@ -504,10 +433,7 @@ impl Collector {
                 if self.verify && note.hash != record.code_hash {
                     self.light_mismatches += 1;
                 }
-                self.measure_registration(&record, late);
-                if record.id.0.is_multiple_of(FOLLOWED_EVERY) {
-                    self.follow(&record);
-                }
+                self.registration.lit(&record, late, self.prepared);
                 self.measure_clock(note, &record);
                 // If no light fell on any body, there is no interval from motion to light.
                 let is_dark = self.is_dark(&record);
@@ -548,74 +474,8 @@ impl Collector {
         }
     }
 
-    /// Measures, on the lit bodies, where the light of each point fell and where the point was at the centre of
-    /// that light.
-    fn measure_registration(&mut self, record: &FrameRecord, late: bool) {
-        let Some(at) = record.timeline.centre_at else { return };
-        let Some(truth) = self.rig.true_poses(at.0) else { return };
-        let counted = |px: f64| (px * PER_PIXEL).round() as u64;
-        for (i, truth) in truth.iter().enumerate() {
-            if !self.prepared && record.dark.get(i).copied().flatten().is_some() {
-                continue;
-            }
-            for px in self.meter.errors(i, &record.tracked_poses[i], truth) {
-                self.registration.saturating_record(counted(px));
-                if !late {
-                    self.registration_in_time.saturating_record(counted(px));
-                }
-            }
-            for px in self.meter.errors(i, &record.sampled_poses[i], truth) {
-                self.unpredicted.saturating_record(counted(px));
-            }
-        }
-    }
-
-    /// Measures where the light of each plane fell on the lit bodies, as seen by an eye that follows them.
-    fn follow(&mut self, record: &FrameRecord) {
-        let FrameTimeline { lit_at: Some(lit_at), last_photon_at: Some(last), .. } = record.timeline else {
-            return;
-        };
-        for planes in &mut self.planes {
-            planes.clear();
-        }
-        self.planes.resize_with(record.tracked_poses.len(), Vec::new);
-        let reach = self.instants.iter().fold(0.0f64, |reach, instant| reach.max(instant.abs()));
-        let follows = |i: usize| {
-            let [first, last] = &record.swept_poses;
-            first.get(i).zip(last.get(i)).is_some_and(|(a, b)| self.meter.is_followed(i, a, b, reach))
-        };
-        self.follows.clear();
-        self.follows.extend((0..record.tracked_poses.len()).map(follows));
-        let lights = lights_of_frame(&self.rig, last.ns_since(lit_at));
-        for ((middle_ns, light), instant) in lights.zip(&self.instants) {
-            let Some(poses) = self.rig.true_poses(lit_at.plus_ns(middle_ns).0) else { return };
-            for (i, (planes, truth)) in self.planes.iter_mut().zip(poses).enumerate() {
-                let instant = if self.follows[i] { *instant } else { 0.0 };
-                planes.push(PlaneLight { shown: record.pose_at(i, instant), truth, light });
-            }
-        }
-        let counted = |px: f64| (px * PER_PIXEL).round() as u64;
-        for (i, planes) in self.planes.iter().enumerate() {
-            if record.dark.get(i).copied().flatten().is_some() {
-                continue;
-            }
-            for seen in self.meter.followed(i, planes) {
-                self.followed[0].saturating_record(counted(seen.offset_px));
-                self.followed[1].saturating_record(counted(seen.smear_px));
-            }
-        }
-    }
-
     /// Writes the measurements of the run into a report.
     pub(crate) fn fill(&self, report: &mut Report) {
-        let spread = |h: &Histogram<u64>, unit: f64| {
-            (!h.is_empty()).then(|| Spread {
-                p50: h.value_at_quantile(0.5) as f64 / unit,
-                p99: h.value_at_quantile(0.99) as f64 / unit,
-                p999: h.value_at_quantile(0.999) as f64 / unit,
-                max: h.max() as f64 / unit,
-            })
-        };
         let slots = self.slots.counts();
         report.slots = slots.wanted();
         report.missed_slots = slots.missed_total();
@@ -631,13 +491,8 @@ impl Collector {
         report.frames_late = self.late;
         report.frames_repeated = self.repeated;
         report.frames_too_old = self.too_old;
-        report.registration_error_px = spread(&self.registration, PER_PIXEL);
-        report.registration_error_in_time_px = spread(&self.registration_in_time, PER_PIXEL);
-        [report.followed_offset_px, report.followed_smear_px] =
-            self.followed.each_ref().map(|seen| spread(seen, PER_PIXEL));
+        self.registration.fill(report);
         report.clock_error_ms = Latency::of(&self.clock_error, false);
-        report.registration_error_unpredicted_px = spread(&self.unpredicted, PER_PIXEL);
-        report.registration_error_at = report.registration_error_px.map(|_| "light centre");
         let latency = |interval| Latency::of(self.profiler.histogram(interval), !self.profiler.is_measured());
         report.motion_to_first_photon_ms = latency(Interval::MotionToFirstPhoton);
         report.motion_to_light_centre_ms = latency(Interval::MotionToCentre);
@@ -648,7 +503,7 @@ impl Collector {
         let passes = PASSES.iter().map(|p| format!("gpu {p}")).zip(&self.passes);
         report.stages_ms = stages
             .chain(passes)
-            .filter_map(|(stage, h)| spread(h, 1e6).map(|ms| StageTime { stage, ms }))
+            .filter_map(|(stage, h)| Spread::of_histogram(h, 1e6).map(|ms| StageTime { stage, ms }))
             .collect();
         report.mrays_per_s = (self.gpu_ns > 0).then(|| self.rays as f64 / self.gpu_ns as f64 * 1e3);
         report.clipped =
@@ -673,6 +528,7 @@ impl Collector {
 
 #[cfg(test)]
 mod tests {
+    use crate::plan::frame::FrameId;
     use super::*;
     use crate::config::{Overrides, RigConfig};
     use dpm_device::light::LightEvent;
