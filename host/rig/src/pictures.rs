@@ -77,7 +77,12 @@ pub fn pictures(
     let now = &window.frames[window.frames.len() - 1].1;
     let (eye, _) = rig.observer.eye_and_gaze(now);
     // The pictures need only the surfaces, so the simplest method is enough.
-    let settings = |lens| RendererSettings { method: Method::full(1), lens, ..renderer_settings(rig) };
+    let settings = |lens| RendererSettings {
+        method: Method::full(1),
+        lens,
+        plane_groups: Vec::new(),
+        ..renderer_settings(rig)
+    };
     let mut renderer = Renderer::new(gpu, &rig.scene, settings(renderer_settings(rig).lens))?;
     let light = integrate(rig, &mut renderer, &rig.camera, eye, now, &window, |_, drive| drive)?;
     let Some(viewer_camera) = viewer_camera(rig, eye, now) else {

@@ -528,9 +528,9 @@ impl Collector {
 
 #[cfg(test)]
 mod tests {
-    use crate::plan::frame::FrameId;
     use super::*;
     use crate::config::{Overrides, RigConfig};
+    use crate::plan::frame::FrameId;
     use dpm_device::light::LightEvent;
     use dpm_device::link::SendOutcome;
     use dpm_device::planes::Raster;
