@@ -61,7 +61,7 @@ impl Drawn<'_> {
         let mut word = self.at(pixel).word;
         for group in groups {
             let there = self.place_at(pixel, group.instant).map_or(0, |place| self.word_at(place));
-            word = word & !group.mask | there & group.mask;
+            word = (word & !group.mask) | (there & group.mask);
         }
         word
     }
@@ -116,11 +116,11 @@ impl Drawn<'_> {
             let [x, y] = [0, 1].map(|c| if step[c] == 1 { part[c] } else { 64 - part[c] });
             if let Some(there) = self.moved_at(mover, pixel).filter(|m| owner_of(m) == owner) {
                 weights += x * y;
-                (0..3).for_each(|c| sums[c] += x * y * (there.word >> (8 * c) & 0xff));
+                (0..3).for_each(|c| sums[c] += x * y * ((there.word >> (8 * c)) & 0xff));
             }
         }
         // The nearest of the four shows the body, so the weights are positive.
-        let code = |c: usize| (sums[c] + weights / 2) / weights << (8 * c);
+        let code = |c: usize| ((sums[c] + weights / 2) / weights) << (8 * c);
         code(0) | code(1) | code(2)
     }
 
