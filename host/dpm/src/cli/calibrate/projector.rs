@@ -38,9 +38,9 @@ pub(super) struct ProjectorArgs {
     sensor: Option<String>,
     #[command(flatten)]
     sensor_args: SensorArgs,
-    /// Seconds of motion with the sensor
-    #[arg(long, value_name = "S", default_value_t = 30.0, value_parser = seconds, requires = "sensor")]
-    seconds: f64,
+    /// Seconds of motion with the sensor; default: 30, or 75 where frames and their inverse are shown
+    #[arg(long, value_name = "S", value_parser = seconds, requires = "sensor")]
+    seconds: Option<f64>,
     /// Show nothing and ask for nothing: solve the points of a file, "x y z column row" a line, metres and pixels
     #[arg(long, value_name = "FILE")]
     points: Option<PathBuf>,
@@ -101,7 +101,9 @@ impl ProjectorArgs {
         mut results: Results,
     ) -> Result<(), Failure> {
         let tip = tip_and_sigma(&results)?;
-        let setup = self.sensor_args.setup(port, (&self.common, config), self.seconds, known);
+        let usual = if self.sensor_args.is_held(config) { 75.0 } else { 30.0 };
+        let seconds = self.seconds.unwrap_or(usual);
+        let setup = self.sensor_args.setup(port, (&self.common, config), seconds, known);
         let solution = at_a_rate_that_is_carried(&mut config.clone(), move |config, monitor| {
             sensor::calibrate(config, &setup, tip, monitor)
         })?;
