@@ -10,7 +10,7 @@ mod solve;
 mod uncertainty;
 
 pub(crate) use fit::spread_of;
-pub use fit::Priors;
+pub use fit::{LensTerms, Priors};
 use fit::{fit, Fit};
 pub use refusal::Refusal;
 pub(crate) use solve::{check_result, look_for_motion};

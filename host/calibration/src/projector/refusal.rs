@@ -98,6 +98,12 @@ pub enum Refusal {
     /// The lens of the solution folds inside the raster.
     #[error("projector: the lens that fits cannot be inverted over the raster: points are missing near its border, or some are wrong; add points in the corners")]
     LensFolds,
+    /// More of the lens was asked for than the data tell.
+    #[error("projector: the points do not tell {name} of the lens: take a simpler --lens, or add points all over the picture, in its corners above all")]
+    LensUndetermined {
+        /// The coefficient.
+        name: &'static str,
+    },
     /// The light would be too uncertain.
     #[error("projector: the light would be uncertain by {p99_px:.1} px (99th percentile over the volume), at most {most_px} px are accepted; add points at ({x:.2}, {y:.2}, {z:.2}) m")]
     Uncertain {

@@ -15,7 +15,7 @@ use glam::{DQuat, DVec2, DVec3};
 pub struct Solved {
     /// Lens and pose.
     pub model: ProjectorModel,
-    /// Covariance of its fifteen numbers.
+    /// Covariance of its numbers.
     pub covariance: Vec<Vec<f64>>,
     /// The error that the light may have over the volume.
     pub predicted: Predicted,
@@ -278,6 +278,9 @@ fn judge_uncertainty(
     let inflate = squares / (degrees + 10.0) / options.aim_px.powi(2);
     let covariance: Vec<Vec<f64>> =
         fitted.covariance.iter().map(|row| row.iter().map(|v| v * inflate).collect()).collect();
+    if let Some(name) = options.priors.undetermined(&covariance) {
+        return Err(Refusal::LensUndetermined { name });
+    }
     let predicted = predict(&fitted.model, &covariance, &volume.points(&fitted.model, raster));
     if predicted.p99_px > MOST_UNCERTAIN_PX {
         let DVec3 { x, y, z } = predicted.worst;

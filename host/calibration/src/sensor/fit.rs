@@ -61,7 +61,7 @@ pub struct Brightness {
 pub struct Solution {
     /// Lens and pose.
     pub model: ProjectorModel,
-    /// Covariance of the model's fifteen numbers.
+    /// Covariance of the model's numbers.
     pub covariance: Vec<Vec<f64>>,
     /// The error that the light may have over the volume, if the tracker has no bias.
     pub predicted: Predicted,
@@ -188,7 +188,9 @@ impl<'a> Problem<'a> {
         is_held: bool,
     ) -> Self {
         let limits = Limits { latency_s: MOST_LATENCY_S, latency_sigma_us: MOST_LATENCY_SIGMA_US };
-        Self { raster, limits, path, settings, tip_sigma: settings.tip_sigma_m.max(1e-4), is_held }
+        let inside = settings.priors.free();
+        let free = std::array::from_fn(|i| !is_held && inside.get(i).copied().unwrap_or(true));
+        Self { raster, limits, path, settings, tip_sigma: settings.tip_sigma_m.max(1e-4), free }
     }
 }
 
@@ -317,8 +319,15 @@ pub(super) fn finish<M: Measured>(
     }
     let of_tip = |i: usize| DVec3::from_array(std::array::from_fn(|j| covariance[TIP + i][TIP + j]));
     let points = settings.volume.points(&state.model, problem.raster);
+    let of_both = |i: usize, j: usize| match problem.free[i] && problem.free[j] {
+        true => covariance[i][j],
+        false => 0.0,
+    };
     let model_covariance: Vec<Vec<f64>> =
-        covariance[..PARAMETERS].iter().map(|row| row[..PARAMETERS].to_vec()).collect();
+        (0..PARAMETERS).map(|i| (0..PARAMETERS).map(|j| of_both(i, j)).collect()).collect();
+    if let Some(name) = settings.priors.undetermined(&model_covariance) {
+        return Err(Refusal::LensUndetermined { name }.into());
+    }
     Ok(Solution {
         model: state.model,
         predicted: predict(&state.model, &model_covariance, &points),

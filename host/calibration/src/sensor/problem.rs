@@ -9,7 +9,7 @@ use crate::trajectory::Trajectory;
 use dpm_device::planes::Raster;
 use glam::{DVec2, DVec3};
 
-// The unknowns after the fifteen of the projector.
+// The unknowns after those of the projector.
 pub(super) const TIP: usize = PARAMETERS;
 pub(super) const LATENCY: usize = TIP + 3;
 pub(super) const DRIFT: usize = LATENCY + 1;
@@ -125,8 +125,8 @@ pub(super) struct Problem<'a> {
     pub path: &'a Trajectory,
     pub settings: &'a Settings,
     pub tip_sigma: f64,
-    /// Lens and pose stay what they are.
-    pub is_held: bool,
+    /// Which of the projector's numbers are solved for: none if lens and pose are known.
+    pub free: [bool; PARAMETERS],
 }
 
 impl Problem<'_> {
@@ -141,8 +141,8 @@ impl Problem<'_> {
         let mut rows = [[0.0; UNKNOWNS]; 2];
         let mut moving = DVec2::ZERO;
         for k in 0..2 {
-            if !self.is_held {
-                rows[k][..PARAMETERS].copy_from_slice(&at.by_parameters[k]);
+            for (i, row) in rows[k][..PARAMETERS].iter_mut().enumerate().filter(|(i, _)| self.free[*i]) {
+                *row = at.by_parameters[k][i];
             }
             rows[k][TIP..LATENCY].copy_from_slice(&(to_body * at.by_point[k]).to_array());
             moving[k] = at.by_point[k].dot(velocity);
@@ -154,11 +154,11 @@ impl Problem<'_> {
     }
 
     pub(super) fn expect(&self, s: &State, all: &mut Equations) {
-        match self.is_held {
-            // What is held has no equation: one that says nothing keeps the matrix regular.
-            true => (0..PARAMETERS).for_each(|i| all.expect(i, 0.0, 1.0)),
-            false => self.settings.priors.apply(&s.model, all),
+        if self.free[0] {
+            self.settings.priors.apply(&s.model, all);
         }
+        // What is held has no equation: one that says nothing keeps the matrix regular.
+        (0..PARAMETERS).filter(|i| !self.free[*i]).for_each(|i| all.expect(i, 0.0, 1.0));
         (0..3).for_each(|i| all.expect(TIP + i, s.tip[i] - self.settings.tip[i], self.tip_sigma));
         all.expect(LATENCY, s.latency_s, 0.1);
         all.expect(DRIFT, s.drift, 1e-4);

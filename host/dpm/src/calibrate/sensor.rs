@@ -11,7 +11,7 @@ use super::showing::Showing;
 use dpm_calibration::file::{LatencySection, ProjectorSection, WandSection};
 use dpm_calibration::model::ProjectorModel;
 use dpm_calibration::pivot::trace;
-use dpm_calibration::projector::{Known, Priors, Volume};
+use dpm_calibration::projector::{Known, LensTerms, Priors, Volume};
 use dpm_calibration::sensor::{
     decode, decode_pairs, places_rested, solve, solve_latency, solve_latency_of_pairs, solve_pairs, Block, Code,
     Coverage, Decoded, DecodedPairs, InverseCode, Latency, Mapped, Settings, Solution, Timing, FEWEST_PLACES,
@@ -40,6 +40,8 @@ pub struct Setup {
     pub aperture_m: f64,
     /// What is known of the projector's place.
     pub known: Known,
+    /// Which numbers of the lens are solved for.
+    pub lens: LensTerms,
     /// Frames a second of the rig file: at a lower rate the motion takes longer.
     pub rate_hz: f64,
     /// Frames and their inverse are shown, in place of coded planes.
@@ -131,7 +133,7 @@ fn sweep(
             tip,
             tip_sigma_m,
             aperture_m: setup.aperture_m,
-            priors: Priors::many_points(raster),
+            priors: Priors::many_points(raster).with_lens(setup.lens),
             known: setup.known,
             volume,
             seed: 1,

@@ -12,7 +12,7 @@ use crate::calibrate::recorder::Port;
 use crate::calibrate::results::Results;
 use crate::calibrate::{body, sensor, wand};
 use check::{check, nudge, CheckArgs, NudgeArgs};
-use dpm_calibration::projector::Known;
+use dpm_calibration::projector::{Known, LensTerms};
 use dpm_calibration::rehearsal::{rehearse_with, Bias};
 use dpm_rig::config::RigConfig;
 use dpm_rig::failure::{Failure, FailureKind};
@@ -121,6 +121,7 @@ impl SensorArgs {
             seconds,
             aperture_m: 1e-3 * self.aperture,
             known,
+            lens: LensTerms::Brown,
             rate_hz: config.projector.frame_rate.hz(),
             is_held: self.is_held(config),
             has_begun: Arc::default(),
