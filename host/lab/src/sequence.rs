@@ -326,6 +326,7 @@ pub fn draw(
             gaze,
             widen_deg: 0.0,
             poses,
+            sweep: None,
             lost: &[],
         },
     )?;

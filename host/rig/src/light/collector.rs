@@ -8,10 +8,10 @@ use crate::frame::{FrameTimeline, Stage, STAGES};
 use crate::light::dark_bodies::DarkBodies;
 use crate::light::placement::Placement;
 use crate::light::recorder::LightNote;
-use crate::light::registration::RegistrationMeter;
+use crate::light::registration::{PlaneLight, RegistrationMeter};
 use crate::plan::dark::DarkCause;
 use crate::plan::frame::FrameId;
-use crate::plan::light_centre::{centre_for, lights_of_planes};
+use crate::plan::light_centre::{instants_of_planes, light_centre_ns, lights_of_frame};
 use crate::rig::Rig;
 use crate::telemetry::flight::FlightRecorder;
 use crate::telemetry::interval::Interval;
@@ -49,7 +49,9 @@ pub struct FrameRecord {
     pub timeline: FrameTimeline,
     /// world-from-body of the tracked bodies for which it was drawn.
     pub tracked_poses: Vec<DAffine3>,
-    /// The same without prediction.
+    /// The same at the first photon and at the last; empty if all planes were drawn for one instant.
+    pub swept_poses: [Vec<DAffine3>; 2],
+    /// world-from-body of the tracked bodies without prediction.
     pub sampled_poses: Vec<DAffine3>,
     /// Per tracked body: why no light fell on it; `None` if light fell on it.
     pub dark: Vec<Option<DarkCause>>,
@@ -59,6 +61,21 @@ pub struct FrameRecord {
     pub code_hash: u64,
     /// GPU time of each pass, nanoseconds.
     pub pass_ns: [u64; PASSES.len()],
+}
+
+impl FrameRecord {
+    /// world-from-body for which the tracked body `i` was drawn in the planes of an instant, told as a share of the
+    /// exposure from the frame's own.
+    fn pose_at(&self, i: usize, instant: f64) -> DAffine3 {
+        let pose = self.tracked_poses[i];
+        let [Some(first), Some(last)] = [0, 1].map(|end: usize| self.swept_poses[end].get(i)) else {
+            return pose;
+        };
+        DAffine3 {
+            matrix3: pose.matrix3 + (last.matrix3 - first.matrix3) * instant,
+            translation: pose.translation + (last.translation - first.translation) * instant,
+        }
+    }
 }
 
 /// The inputs of the collector.
@@ -125,8 +142,12 @@ pub(crate) struct Collector {
     registration_in_time: Histogram<u64>,
     /// What an eye sees that follows a point, of some frames: how far the light lies from it, and how far it is spread.
     followed: [Histogram<u64>; 2],
-    /// The true poses at each plane of a frame.
-    truths: Vec<Vec<(DAffine3, f64)>>,
+    /// Per tracked body: the light of each plane of a frame.
+    planes: Vec<Vec<PlaneLight>>,
+    /// Per tracked body: the planes of a frame follow it.
+    follows: Vec<bool>,
+    /// Per plane: when the bodies are where it shows them, as a share of the exposure from the frame's instant.
+    instants: Vec<f64>,
     /// True beginning of a slot, as observed by the mock in this process, minus the host's estimate.
     clock_error: SignedHistogram,
     unpredicted: Histogram<u64>,
@@ -166,6 +187,7 @@ impl Collector {
             Profiler::new(rig.rate(), measured, batch_frames).with_mocks(is_mock_tracker, is_mock_projector);
         let lead_ns = i64::from(rig.config.real_time.stage_costs_us.total()) * 1000;
         let trace_frames = if rig.config.output.trace { MAX_TRACED } else { 0 };
+        let instants = instants_of_planes(&rig);
         Self {
             placement: Placement::new(rig.bodies.len()),
             dark_bodies: DarkBodies::new(rig.bodies.len()),
@@ -202,7 +224,9 @@ impl Collector {
             registration: histogram(),
             registration_in_time: histogram(),
             followed: [histogram(), histogram()],
-            truths: Vec::new(),
+            planes: Vec::new(),
+            follows: Vec::new(),
+            instants,
             clock_error: SignedHistogram::new(1_000_000_000),
             unpredicted: histogram(),
             stages: STAGES.iter().map(|_| histogram()).collect(),
@@ -412,6 +436,7 @@ impl Collector {
                 slot: job.plan.slot,
                 timeline: job.timeline,
                 tracked_poses: job.plan.tracked_poses.clone(),
+                swept_poses: job.plan.swept_poses.clone(),
                 sampled_poses: job.plan.sampled_poses.clone(),
                 dark: job.plan.dark.clone(),
                 eye: job.plan.eye,
@@ -462,8 +487,7 @@ impl Collector {
                 let Some(mut record) = self.pending.pop_front() else { return };
                 let last_photon_at = note.event.last_photon_at;
                 let exposure_ns = last_photon_at.ns_since(begin);
-                let centre_at =
-                    begin.plus_ns(centre_for(&self.rig.config.projector, &self.rig.schedule, exposure_ns));
+                let centre_at = begin.plus_ns(light_centre_ns(&self.rig, exposure_ns));
                 record.timeline.lit_at = Some(begin);
                 record.timeline.centre_at = Some(centre_at);
                 record.timeline.last_photon_at = Some(last_photon_at);
@@ -551,20 +575,31 @@ impl Collector {
         let FrameTimeline { lit_at: Some(lit_at), last_photon_at: Some(last), .. } = record.timeline else {
             return;
         };
-        for truths in &mut self.truths {
-            truths.clear();
+        for planes in &mut self.planes {
+            planes.clear();
         }
-        self.truths.resize_with(record.tracked_poses.len(), Vec::new);
-        for (middle_ns, weight) in lights_of_planes(&self.rig.schedule, last.ns_since(lit_at)) {
+        self.planes.resize_with(record.tracked_poses.len(), Vec::new);
+        let reach = self.instants.iter().fold(0.0f64, |reach, instant| reach.max(instant.abs()));
+        let follows = |i: usize| {
+            let [first, last] = &record.swept_poses;
+            first.get(i).zip(last.get(i)).is_some_and(|(a, b)| self.meter.is_followed(i, a, b, reach))
+        };
+        self.follows.clear();
+        self.follows.extend((0..record.tracked_poses.len()).map(follows));
+        let lights = lights_of_frame(&self.rig, last.ns_since(lit_at));
+        for ((middle_ns, light), instant) in lights.zip(&self.instants) {
             let Some(poses) = self.rig.true_poses(lit_at.plus_ns(middle_ns).0) else { return };
-            self.truths.iter_mut().zip(poses).for_each(|(truths, pose)| truths.push((pose, weight)));
+            for (i, (planes, truth)) in self.planes.iter_mut().zip(poses).enumerate() {
+                let instant = if self.follows[i] { *instant } else { 0.0 };
+                planes.push(PlaneLight { shown: record.pose_at(i, instant), truth, light });
+            }
         }
         let counted = |px: f64| (px * PER_PIXEL).round() as u64;
-        for (i, truths) in self.truths.iter().enumerate() {
+        for (i, planes) in self.planes.iter().enumerate() {
             if record.dark.get(i).copied().flatten().is_some() {
                 continue;
             }
-            for seen in self.meter.followed(i, &record.tracked_poses[i], truths) {
+            for seen in self.meter.followed(i, planes) {
                 self.followed[0].saturating_record(counted(seen.offset_px));
                 self.followed[1].saturating_record(counted(seen.smear_px));
             }
