@@ -22,9 +22,7 @@ impl Seen {
         self.mirrors.clear();
         let [u, v] = centre;
         let outside = |at: f64, count: u32| !(-radius..=f64::from(count) + radius).contains(&at);
-        if !(0.0..=MAX_RADIUS).contains(&radius)
-            || outside(u, raster.width())
-            || outside(v, raster.height())
+        if !(0.0..=MAX_RADIUS).contains(&radius) || outside(u, raster.width()) || outside(v, raster.height())
         {
             return;
         }

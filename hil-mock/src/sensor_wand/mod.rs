@@ -12,13 +12,13 @@ mod optics;
 use crate::hand::Hand;
 use crate::motion::Motion;
 use crate::projector::Shown;
+use aperture::Seen;
 use dpm_device::planes::{Channel, PlaneSpec, Raster};
 use dpm_device::pose::Pose;
 use dpm_device::rng::Draws;
 use dpm_device::sensor::wire::LevelBits;
 use dpm_device::time::HostTime;
 pub use optics::ProjectorOptics;
-use aperture::Seen;
 use optics::{dot, length, minus, place, rotate};
 use std::sync::Arc;
 

@@ -316,6 +316,16 @@ pub(super) fn run(arguments: &SensorWandArguments) -> Result<(), Box<dyn Error>>
         return Err(format!("--light-lag-ms {}: must be 0 to 1000", arguments.light_lag_ms).into());
     }
     let lag_ns = (1e6 * arguments.light_lag_ms) as i64;
-    let mut beside = Wand { wand, queue, line, tracker, path, clock: clock.clone(), orders, lag_ns, coming: VecDeque::new() };
+    let mut beside = Wand {
+        wand,
+        queue,
+        line,
+        tracker,
+        path,
+        clock: clock.clone(),
+        orders,
+        lag_ns,
+        coming: VecDeque::new(),
+    };
     run_beside(&arguments.projector, SHOWN_KEPT, clock, &mut beside)
 }

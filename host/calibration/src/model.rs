@@ -247,8 +247,7 @@ pub(crate) mod tests {
         .unwrap();
         camera.fy *= 1.01;
         camera.cy += 100.0;
-        let lens =
-            [-0.12, 0.07, 0.001, -0.0015, 0.01, 0.05, -0.03, 0.02, 0.002, -0.001, 0.0015, 0.003];
+        let lens = [-0.12, 0.07, 0.001, -0.0015, 0.01, 0.05, -0.03, 0.02, 0.002, -0.001, 0.0015, 0.003];
         ProjectorModel::from_camera(&camera, lens, DVec3::new(0.1, 0.0, 0.2))
     }
 
@@ -297,10 +296,8 @@ pub(crate) mod tests {
         let raster = Raster::new(1024, 768).unwrap();
         example().camera(raster).unwrap();
         // The radius r (1 + k1 r^2) turns back at r = 1 / sqrt(-3 k1); the far corner lies at about 0.53.
-        let folded = ProjectorModel {
-            lens: std::array::from_fn(|i| if i == 0 { -2.0 } else { 0.0 }),
-            ..example()
-        };
+        let folded =
+            ProjectorModel { lens: std::array::from_fn(|i| if i == 0 { -2.0 } else { 0.0 }), ..example() };
         assert!(matches!(folded.camera(raster), Err(ProjectorError::Lens(_))));
     }
 }

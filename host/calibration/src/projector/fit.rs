@@ -30,10 +30,6 @@ const FREE: f64 = f64::INFINITY;
 /// Numbers of Brown's lens, and of the rational one.
 const BROWN: usize = 5;
 const RATIONAL: usize = 8;
-/// A number is told by the data if its deviation falls below this share of what was expected.
-const LEARNT: f64 = 0.5;
-/// Names of those beyond Brown's.
-const NAMES: [&str; LENS - BROWN] = ["k4", "k5", "k6", "s1", "s2", "s3", "s4"];
 
 /// Which numbers of a lens are left to the data.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
@@ -55,11 +51,7 @@ fn brown(sigmas: [f64; BROWN]) -> [[f64; 2]; LENS] {
 impl Priors {
     /// For a dozen points: focal lengths, centre, k1 and k2 are free, the rest is expected to be small.
     pub fn few_points(raster: Raster) -> Self {
-        Self {
-            aspect: [0.0, 0.02],
-            lens: brown([0.5, 0.5, 1e-3, 1e-3, 0.02]),
-            ..Self::many_points(raster)
-        }
+        Self { aspect: [0.0, 0.02], lens: brown([0.5, 0.5, 1e-3, 1e-3, 0.02]), ..Self::many_points(raster) }
     }
 
     /// For thousands of points: everything is free, within what lenses can be at all.
@@ -76,6 +68,7 @@ impl Priors {
 
     /// With more of the lens's numbers left to the data than Brown's five.
     pub fn with_lens(mut self, terms: LensTerms) -> Self {
+        self.lens[BROWN..].fill([0.0; 2]);
         if terms != LensTerms::Brown {
             self.lens[BROWN..RATIONAL].fill([0.0, 1.0]);
         }
@@ -85,12 +78,9 @@ impl Priors {
         self
     }
 
-    /// The first number beyond Brown's five that the data do not tell: it is known hardly better than before.
-    pub(crate) fn undetermined(&self, covariance: &[Vec<f64>]) -> Option<&'static str> {
-        (BROWN..LENS)
-            .filter(|i| self.lens[*i][1] > 0.0)
-            .find(|i| covariance[4 + i][4 + i].sqrt() > LEARNT * self.lens[*i][1])
-            .map(|i| NAMES[i - BROWN])
+    /// Whether more than Brown's five are left to the data.
+    pub(crate) fn is_beyond_brown(&self) -> bool {
+        self.lens[BROWN..].iter().any(|k| k[1] > 0.0)
     }
 
     /// A lens of which everything is known: only the pose is left.

@@ -16,7 +16,9 @@ use super::Timing;
 use crate::dense::inverse_spd;
 use crate::least_squares::{descend, Equations};
 use crate::model::{ProjectorModel, PARAMETERS};
-use crate::projector::{check_result, predict, Known, Predicted, Priors, Refusal, Volume};
+use crate::projector::{
+    check_result, check_terms, predict, Known, LensTerms, Predicted, Priors, Refusal, Volume,
+};
 use crate::trajectory::Trajectory;
 use dpm_device::planes::Raster;
 use glam::{DMat3, DVec2, DVec3};
@@ -161,7 +163,34 @@ pub fn solve(
     let fixes: Vec<Fix> = seen.iter().map(|s| s.fix).collect();
     let start = start(&problem, &fixes)?;
     let fitted = refine(&problem, start, &seen, &FINEST)?;
-    finish(&problem, &fitted, &seen)
+    finish_told(&problem, &fitted, &seen, &FINEST)
+}
+
+/// As [`finish`], for a lens whose terms the data must tell.
+pub(super) fn finish_told<M: Measured>(
+    problem: &Problem,
+    fitted: &Fitted,
+    seen: &[M],
+    stages: &[(f64, bool)],
+) -> Result<Solution, SensorError> {
+    let solution = finish(problem, fitted, seen)?;
+    if problem.settings.priors.is_beyond_brown() {
+        let priors = problem.settings.priors.with_lens(LensTerms::Brown);
+        let settings = Settings { priors, ..*problem.settings };
+        let brown = Problem {
+            limits: problem.limits,
+            ..Problem::new(problem.raster, (problem.path, &settings), false)
+        };
+        let mut begun = fitted.state;
+        begun.model = ProjectorModel::from_camera(
+            &begun.model.pinhole(problem.raster).map_err(|_| Refusal::LensFolds)?,
+            [0.0; 5],
+            begun.model.origin,
+        );
+        let simple = refine(&brown, begun, seen, stages).ok().map(|f| f.state.model);
+        check_terms(problem.raster, &solution.model, simple, &solution.predicted, &settings.volume)?;
+    }
+    Ok(solution)
 }
 
 /// The planes of frames, and when their levels were.
@@ -325,9 +354,6 @@ pub(super) fn finish<M: Measured>(
     };
     let model_covariance: Vec<Vec<f64>> =
         (0..PARAMETERS).map(|i| (0..PARAMETERS).map(|j| of_both(i, j)).collect()).collect();
-    if let Some(name) = settings.priors.undetermined(&model_covariance) {
-        return Err(Refusal::LensUndetermined { name }.into());
-    }
     Ok(Solution {
         model: state.model,
         predicted: predict(&state.model, &model_covariance, &points),

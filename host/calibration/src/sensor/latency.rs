@@ -2,9 +2,7 @@
 
 use super::code::Code;
 use super::decode::Decoded;
-use super::fit::{
-    enough, planes_of, refine, sandwich, Fitted, Scores, SensorError, Settings, FINEST,
-};
+use super::fit::{enough, planes_of, refine, sandwich, Fitted, Scores, SensorError, Settings, FINEST};
 use super::problem::{Fix, Measured, Problem, State, LATENCY, UNKNOWNS};
 use super::start::{from_bits, miss, prepare, MOST_START_PX};
 use crate::least_squares::Equations;

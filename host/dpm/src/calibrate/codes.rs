@@ -113,10 +113,10 @@ impl PatternSource for InverseSource {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use std::sync::Arc;
     use dpm_device::planes::Raster;
     use dpm_render::pack::{BitPlaneFrame, Kernel};
     use dpm_rig::pack::source::PatternPainter;
+    use std::sync::Arc;
 
     #[test]
     fn the_planes_are_those_of_the_code() {

@@ -74,12 +74,7 @@ impl Levels {
     ///
     /// # Errors
     /// Planes of which no level can be measured, or a limit that no hold keeps; one sentence.
-    pub fn new(
-        schedule: &PlaneSchedule,
-        rate: FrameRate,
-        field: Field,
-        codes: u32,
-    ) -> Result<Self, String> {
+    pub fn new(schedule: &PlaneSchedule, rate: FrameRate, field: Field, codes: u32) -> Result<Self, String> {
         let has = |channel| schedule.planes().iter().any(|p| p.channel == channel);
         let colours = [Channel::Red, Channel::Green, Channel::Blue].map(has);
         let channels = match (has(Channel::White), colours) {
@@ -115,12 +110,7 @@ impl Levels {
     ///
     /// # Errors
     /// Too few samples, or a sensor on the border of two tiles; one sentence with what to do.
-    pub fn is_on_complement(
-        &self,
-        showing: &Showing,
-        samples: &[Timed],
-        room: Room,
-    ) -> Result<bool, String> {
+    pub fn is_on_complement(&self, showing: &Showing, samples: &[Timed], room: Room) -> Result<bool, String> {
         let mut levels = [None; 2];
         for (run, frames) in by_run(self, showing, samples) {
             if frames.len() >= LEAST_FRAMES {
@@ -132,9 +122,11 @@ impl Levels {
             return Err("too few frames were seen; look at `dpm link-test` and at the sensor's cable".into());
         };
         if white.min(black) > MOST_DARK * white.max(black) {
-            return Err("the sensor sees both of two neighbouring tiles, or no light at all: move it by a few \
+            return Err(
+                "the sensor sees both of two neighbouring tiles, or no light at all: move it by a few \
                         centimetres within the picture"
-                .into());
+                    .into(),
+            );
         }
         Ok(black > white)
     }

@@ -13,8 +13,9 @@ use dpm_calibration::model::ProjectorModel;
 use dpm_calibration::pivot::trace;
 use dpm_calibration::projector::{Known, LensTerms, Priors, Volume};
 use dpm_calibration::sensor::{
-    decode, decode_pairs, places_rested, solve, solve_latency, solve_latency_of_pairs, solve_pairs, Block, Code,
-    Coverage, Decoded, DecodedPairs, InverseCode, Latency, Mapped, Settings, Solution, Timing, FEWEST_PLACES,
+    decode, decode_pairs, places_rested, solve, solve_latency, solve_latency_of_pairs, solve_pairs, Block,
+    Code, Coverage, Decoded, DecodedPairs, InverseCode, Latency, Mapped, Settings, Solution, Timing,
+    FEWEST_PLACES,
 };
 use dpm_calibration::trajectory::{Stamped, Trajectory};
 use dpm_common::clock::MonotonicClock;

@@ -48,6 +48,15 @@ pub struct RunOptions {
 
 impl Default for RunOptions {
     fn default() -> Self {
-        Self { frames: 0, slots: 0, keep_frames: 0, keep_records: 0, verify: true, in_flight: 4, tells_slow: true, stall: None }
+        Self {
+            frames: 0,
+            slots: 0,
+            keep_frames: 0,
+            keep_records: 0,
+            verify: true,
+            in_flight: 4,
+            tells_slow: true,
+            stall: None,
+        }
     }
 }

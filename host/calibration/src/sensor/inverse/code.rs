@@ -139,7 +139,8 @@ impl InverseCode {
     /// The middle of the pixels whose bits are `is_lit`, one for each number of stripes.
     pub(super) fn pixel(&self, is_lit: &[bool]) -> DVec2 {
         let (mut stripe, mut last, mut finest) = ([0u32; 2], [0u32; 2], [1u32; 2]);
-        let mut bits: Vec<(Stripe, bool)> = self.stripes.iter().copied().zip(is_lit.iter().copied()).collect();
+        let mut bits: Vec<(Stripe, bool)> =
+            self.stripes.iter().copied().zip(is_lit.iter().copied()).collect();
         bits.sort_by_key(|(s, _)| (s.exchanged_from.is_some(), std::cmp::Reverse(s.width)));
         let mut half = [false; 2];
         for (Stripe { axis, width, exchanged_from }, is_lit) in bits {

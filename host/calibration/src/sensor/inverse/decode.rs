@@ -43,7 +43,8 @@ pub struct Pair {
 impl Pair {
     /// The mean level.
     pub fn level(&self) -> f64 {
-        let (sum, count) = self.levels.iter().flatten().fold((0.0, 0.0), |(s, n), level| (s + level, n + 1.0));
+        let (sum, count) =
+            self.levels.iter().flatten().fold((0.0, 0.0), |(s, n), level| (s + level, n + 1.0));
         sum / f64::max(count, 1.0)
     }
 }
@@ -95,14 +96,7 @@ pub fn decode_pairs(
     let raw: Vec<(Shown, [Option<f64>; TICKS])> =
         pairs.iter().map(|p| (*p, search.differences(p, lag_ns, ticks))).collect();
     let (levels, dropped) = levels(code, &record, &raw);
-    Ok(DecodedPairs {
-        pairs: levels,
-        dropped,
-        lag_ns,
-        identity_percent,
-        ticks,
-        frame_ns: timing.frame_ns,
-    })
+    Ok(DecodedPairs { pairs: levels, dropped, lag_ns, identity_percent, ticks, frame_ns: timing.frame_ns })
 }
 
 /// The pairs of which both frames were shown, with the first slot of each.
@@ -198,11 +192,7 @@ impl Search<'_> {
 }
 
 /// Differences into levels: over the light of the instant within a frame, and over the contrast around the pair.
-fn levels(
-    code: &InverseCode,
-    record: &Record,
-    raw: &[(Shown, [Option<f64>; TICKS])],
-) -> (Vec<Pair>, usize) {
+fn levels(code: &InverseCode, record: &Record, raw: &[(Shown, [Option<f64>; TICKS])]) -> (Vec<Pair>, usize) {
     let is_wide = |pair: u64| code.is_wide(&code.stripe(code.index(pair)));
     let wide: Vec<&(Shown, [Option<f64>; TICKS])> = raw.iter().filter(|(s, _)| is_wide(s.pair)).collect();
     let size = |i: usize| {

@@ -3,7 +3,7 @@
 //! Where the wand was held still for a round of the code, its bits name a pixel: enough to start. Then the levels of all
 //! pairs are fitted, those in motion too, each frame at its own instant: the latency comes from them.
 
-use super::super::fit::{finish, refine, Scores, SensorError, Settings, Solution};
+use super::super::fit::{finish_told, refine, Scores, SensorError, Settings, Solution};
 use super::super::latency::{self, Latency};
 use super::super::problem::{Fix, Limits, Measured, Problem, State, Tally, RADIUS, UNKNOWNS};
 use super::super::start::{is_inside, start, thin};
@@ -113,7 +113,7 @@ pub fn solve_pairs(
     }
     let begun = with_latency(&problem, start(&problem, &fixes)?, &seen);
     let fitted = refine(&problem, begun, &seen, &stages(code))?;
-    finish(&problem, &fitted, &seen)
+    finish_told(&problem, &fitted, &seen, &stages(code))
 }
 
 /// Finds the latency of a projector that is known.
