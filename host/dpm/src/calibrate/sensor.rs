@@ -70,7 +70,7 @@ struct Sweep {
 
 /// A code, and what the sensor saw of it.
 enum SeenCode {
-    Planes(Code, Decoded),
+    Planes(Box<Code>, Decoded),
     Frames(InverseCode, DecodedPairs),
 }
 
@@ -164,7 +164,7 @@ fn sweep(
         let blocks: Vec<Block> = recording.blocks.into_iter().map(|timed| timed.block).collect();
         let decoded = decode(&code, &timing, &blocks, offset_ns, &shown).map_err(refused)?;
         let settings = settings(timing, &recording.poses)?;
-        let seen = SeenCode::Planes(code.clone(), decoded);
+        let seen = SeenCode::Planes(Box::new(code.clone()), decoded);
         Ok(Sweep { seen, path: Trajectory::new(&recording.poses), settings })
     })
 }

@@ -249,5 +249,5 @@ fn between(all: &[(u64, f64)], pair: u64, most: u64) -> Option<f64> {
     }
     let (a, first) = *all.get(after.checked_sub(1)?)?;
     let share = (pair - a) as f64 / (b - a) as f64;
-    (b - a <= most).then(|| first + share * (last - first))
+    (b - a <= most).then_some(first + share * (last - first))
 }

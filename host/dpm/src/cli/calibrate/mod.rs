@@ -14,7 +14,7 @@ use crate::calibrate::{body, sensor, wand};
 use check::{check, nudge, CheckArgs, NudgeArgs};
 use dpm_calibration::projector::{Known, LensTerms};
 use dpm_calibration::rehearsal::{rehearse_with, Bias};
-use dpm_rig::config::RigConfig;
+use dpm_rig::config::{PlaneTiming, RigConfig};
 use dpm_rig::failure::{Failure, FailureKind};
 use dpm_rig::rig::Rig;
 use dpm_rig::telemetry::monitor::RunMonitor;
@@ -101,7 +101,8 @@ enum CodeWord {
 impl SensorArgs {
     /// Whether frames and their inverse are shown.
     fn is_held(&self, config: &RigConfig) -> bool {
-        self.code.map_or(config.projector.holds_code_values(), |code| code == CodeWord::Frames)
+        let has_equal_planes = config.projector.plane_timing() == PlaneTiming::Equal;
+        self.code.map_or(!has_equal_planes, |code| code == CodeWord::Frames)
     }
 
     fn port(&self, path: &str) -> Port {
