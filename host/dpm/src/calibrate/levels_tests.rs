@@ -270,7 +270,7 @@ fn levels_in_tiles_are_those_of_the_mock_wherever_the_sensor_lies() {
     };
     // A tile has 8 x 8 pixels of 10.8 mm; in the middle of the raster four of them meet.
     assert!(probe(&at(0.0, 0.0)).unwrap_err().contains("neighbouring tiles"));
-    let (one, other) = (at(0.043, 0.043), at(-0.043, 0.043));
+    let (one, other) = (at(-0.043, 0.043), at(0.043, 0.043));
     assert_eq!([probe(&one), probe(&other)], [Ok(true), Ok(false)]);
     let levels = Levels::new(&schedule, rate(), Field::Tiles { is_exchanged: true }, 4).unwrap();
     let source = Arc::new(levels.clone());
