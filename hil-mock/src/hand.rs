@@ -20,6 +20,13 @@ const PIVOT_RAD: f64 = 0.5;
 /// Turns about two axes while the wand is turned about its tip, hertz.
 const PIVOT_HZ: [f64; 2] = [0.31, 0.47];
 
+/// From place to place while places are visited, nanoseconds; the rest of the time at each the tip is held still.
+const VISIT_NS: i64 = 3_000_000_000;
+/// On the way from one to the next, nanoseconds.
+const GO_NS: i64 = 1_000_000_000;
+/// The box in which the places lie, metres: its middle and its sides.
+const VISITED_M: [[f64; 3]; 2] = [[0.0, 0.0, 0.12], [0.4, 0.3, 0.3]];
+
 /// What a hand may be told.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub enum Order {
@@ -27,6 +34,8 @@ pub enum Order {
     Wander,
     /// Hold the tip at a point of the world, metres.
     Tip([f64; 3]),
+    /// Hold the tip still for two seconds at one place after another, near and far, and go slowly between them.
+    Visit,
     /// Turn the wand about its tip, which stays at a point of the world, metres.
     Pivot([f64; 3]),
 }
@@ -87,20 +96,58 @@ impl Hand {
     fn doing(&self, stretch: &Stretch, t_ns: i64) -> Pose {
         let (place, turn) = match stretch.order {
             Order::Wander => return self.wander.pose_at(t_ns),
-            Order::Tip(place) => {
-                // The golden angle: no two directions are near each other.
-                let (sin, cos) = libm::sincos(2.399_963 * f64::from(stretch.number));
-                (place, from_rotation_vector([TILT_RAD * cos, TILT_RAD * sin, 0.0]))
-            }
+            Order::Visit => return self.visiting(t_ns - stretch.since_ns),
+            Order::Tip(place) => (place, tilt(TILT_RAD, stretch.number)),
             Order::Pivot(place) => {
                 let seconds = 1e-9 * (t_ns - stretch.since_ns) as f64;
                 let [a, b] = PIVOT_HZ.map(|hz| libm::sin(std::f64::consts::TAU * hz * seconds));
                 (place, from_rotation_vector([PIVOT_RAD * a, PIVOT_RAD * b, 0.4 * PIVOT_RAD * a * b]))
             }
         };
+        self.holding(place, turn)
+    }
+
+    /// The wand with its tip at a place.
+    fn holding(&self, place: [f64; 3], turn: [f64; 4]) -> Pose {
         let arm = scale(rotate(turn, self.tip), -1.0);
         Pose { position_m: add(place, arm), rotation_xyzw: turn }
     }
+
+    /// Where it is some time after it was told to visit places.
+    fn visiting(&self, since_ns: i64) -> Pose {
+        let at = |number: i64| {
+            let [middle, sides] = VISITED_M;
+            let shares = [2, 3, 5].map(|base| van_der_corput(number.max(0) as u64 + 1, base) - 0.5);
+            let place = std::array::from_fn(|i| middle[i] + sides[i] * shares[i]);
+            // Upright to twice as far tilted as for a touch: how the tip lies in the wand shows in the difference.
+            let far = 2.0 * TILT_RAD * van_der_corput(number.max(0) as u64 + 1, 7);
+            self.holding(place, tilt(far, number.max(0) as u32))
+        };
+        let (number, within_ns) = (since_ns.div_euclid(VISIT_NS), since_ns.rem_euclid(VISIT_NS));
+        let share = (within_ns as f64 / GO_NS as f64).min(1.0);
+        match number {
+            // The way to the first place is that from where it was.
+            ..=0 => at(0),
+            _ => between(&at(number - 1), &at(number), share * share * (3.0 - 2.0 * share)),
+        }
+    }
+}
+
+/// A tilt that differs from number to number, by the golden angle: no two directions are near each other.
+fn tilt(far_rad: f64, number: u32) -> [f64; 4] {
+    let (sin, cos) = libm::sincos(2.399_963 * f64::from(number));
+    from_rotation_vector([far_rad * cos, far_rad * sin, 0.0])
+}
+
+/// The digits of a number in a base, mirrored at the point: 0 to 1, evenly spread over any stretch of numbers.
+fn van_der_corput(mut number: u64, base: u64) -> f64 {
+    let (mut value, mut digit) = (0.0, 1.0);
+    while number > 0 {
+        digit /= base as f64;
+        value += digit * (number % base) as f64;
+        number /= base;
+    }
+    value
 }
 
 /// The pose at a share of the way from one to another.
@@ -169,6 +216,27 @@ mod tests {
             assert!((norm - 1.0).abs() < 1e-12);
         }
         assert_eq!(hand.pose_at(12_000 * ms), wander.pose_at(12_000 * ms));
+    }
+
+    #[test]
+    fn places_are_visited_near_and_far_and_rested_at() {
+        let hand = Hand::new(Motion::still(Pose::IDENTITY).unwrap(), TIP);
+        hand.tell(0, Order::Visit);
+        let tip = |ms: i64| tip_of(&hand.pose_at(ms * 1_000_000));
+        let mut places: Vec<[f64; 3]> = Vec::new();
+        for number in 0..20 {
+            let at = tip(3000 * number + 1000);
+            for ms in (1000..3000).step_by(100) {
+                assert!(apart(tip(3000 * number + ms), at) < 1e-9);
+            }
+            assert!(places.iter().all(|p| apart(*p, at) > 0.02), "{number}");
+            places.push(at);
+        }
+        for axis in 0..3 {
+            let reach = |f: fn(f64, f64) -> f64| places.iter().map(|p| p[axis]).fold(f64::NAN, f);
+            assert!(reach(f64::max) - reach(f64::min) > 0.8 * VISITED_M[1][axis]);
+        }
+        assert!((0..60_000).step_by(5).all(|ms| apart(tip(ms), tip(ms + 5)) < 5e-3), "1 m/s at most");
     }
 
     #[test]

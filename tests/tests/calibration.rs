@@ -274,7 +274,11 @@ fn points(deep: bool) -> String {
 #[test]
 fn points_become_a_projector_that_the_rig_uses_and_flat_ones_are_refused() {
     let folder = Folder::new("points");
-    folder.write("rig.toml", "[projector]\nframe_rate = \"60\"\n");
+    // The rig file names the calibration file that will come.
+    folder
+        .write("rig.toml", "[projector]\nframe_rate = \"60\"\n[calibration]\nfile = \"calibration.toml\"\n");
+    let none = folder.dpm(&["calibrate", "export", "rig.toml", "out.yml"]);
+    assert_eq!(none.status.code(), Some(2), "there is nothing to export: {}", text(&none));
     folder.write("points.txt", &points(true));
     folder.write("flat.txt", &points(false));
     let flat = folder.dpm(&["calibrate", "projector", "rig.toml", "--points", "flat.txt"]);
@@ -284,8 +288,6 @@ fn points_become_a_projector_that_the_rig_uses_and_flat_ones_are_refused() {
     assert!(solved.status.success(), "{}", text(&solved));
     let again = folder.dpm(&["calibrate", "projector", "rig.toml", "--points", "points.txt"]);
     assert!(text(&again).contains("calibration.toml.1.old"), "the old file is kept: {}", text(&again));
-    folder
-        .write("rig.toml", "[projector]\nframe_rate = \"60\"\n[calibration]\nfile = \"calibration.toml\"\n");
     let exported = folder.dpm(&["calibrate", "export", "rig.toml", "out.yml"]);
     assert!(exported.status.success(), "{}", text(&exported));
     let camera = folder.calibration().projector.unwrap().camera().unwrap();

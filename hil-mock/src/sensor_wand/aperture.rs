@@ -8,50 +8,78 @@ const LINES: usize = 8;
 /// Largest radius, pixels: an aperture that is as large as the picture measures nothing.
 pub(super) const MAX_RADIUS: f64 = 1024.0;
 
-/// The share, 0 to 1, of a disc of `radius` pixels around `centre` (in pixels from the upper left corner) on which `plane` is lit.
-/// What lies outside the raster is dark. Each line's chord is cut exactly at the borders of pixels; a disc of less than
-/// a tenth of a pixel is a point.
-pub(super) fn covered(raster: Raster, plane: &[u8], centre: [f64; 2], radius: f64) -> f64 {
-    let [u, v] = centre;
-    let is_lit = |x: i64, y: i64| {
-        let inside =
-            (0..i64::from(raster.width())).contains(&x) && (0..i64::from(raster.height())).contains(&y);
-        inside && plane[y as usize * raster.row_bytes() + x as usize / 8] << (x % 8) & 0x80 != 0
-    };
-    let outside = |at: f64, count: u32| !(-radius..=f64::from(count) + radius).contains(&at);
-    if !(0.0..=MAX_RADIUS).contains(&radius) || outside(u, raster.width()) || outside(v, raster.height()) {
-        return 0.0;
-    }
-    if radius < 0.1 {
-        return f64::from(u8::from(is_lit(u.floor() as i64, v.floor() as i64)));
-    }
-    let (mut area, mut lit) = (0.0, 0.0);
-    for y in (v - radius).floor() as i64..=(v + radius).floor() as i64 {
-        for line in 0..LINES {
-            let at = y as f64 + (line as f64 + 0.5) / LINES as f64 - v;
-            let half = (radius * radius - at * at).max(0.0).sqrt();
-            let (from, to) = (u - half, u + half);
-            area += to - from;
-            let mut x = from;
-            while x < to {
-                let next = (x.floor() + 1.0).min(to);
-                if is_lit(x.floor() as i64, y) {
-                    lit += next - x;
+/// The mirrors that a round aperture sees, each with its share of the aperture. What lies outside the raster is dark. Each
+/// line's chord is cut exactly at the borders of pixels; a disc of less than a tenth of a pixel is a point.
+#[derive(Clone, Debug, Default)]
+pub(super) struct Seen {
+    /// Byte of a plane, bit of it, and share.
+    mirrors: Vec<(usize, u8, f64)>,
+}
+
+impl Seen {
+    /// Looks through a disc of `radius` pixels around `centre` (in pixels from the upper left corner).
+    pub(super) fn look(&mut self, raster: Raster, centre: [f64; 2], radius: f64) {
+        self.mirrors.clear();
+        let [u, v] = centre;
+        let outside = |at: f64, count: u32| !(-radius..=f64::from(count) + radius).contains(&at);
+        if !(0.0..=MAX_RADIUS).contains(&radius) || outside(u, raster.width()) || outside(v, raster.height())
+        {
+            return;
+        }
+        if radius < 0.1 {
+            self.add(raster, u.floor() as i64, v.floor() as i64, 1.0);
+            return;
+        }
+        let mut area = 0.0;
+        for y in (v - radius).floor() as i64..=(v + radius).floor() as i64 {
+            // Half chords of the lines of this row.
+            let mut half = [0.0; LINES];
+            for (line, half) in half.iter_mut().enumerate() {
+                let at = y as f64 + (line as f64 + 0.5) / LINES as f64 - v;
+                *half = (radius * radius - at * at).max(0.0).sqrt();
+                area += 2.0 * *half;
+            }
+            let widest = half.iter().copied().fold(0.0, f64::max);
+            for x in (u - widest).floor() as i64..=(u + widest).floor() as i64 {
+                let (low, high) = (x as f64, (x + 1) as f64);
+                let part = |h: &f64| (high.min(u + h) - low.max(u - h)).max(0.0);
+                let lit: f64 = half.iter().map(part).sum();
+                if lit > 0.0 {
+                    self.add(raster, x, y, lit);
                 }
-                x = next;
             }
         }
+        if area > 0.0 {
+            self.mirrors.iter_mut().for_each(|(_, _, share)| *share /= area);
+        } else {
+            self.add(raster, u.floor() as i64, v.floor() as i64, 1.0);
+        }
     }
-    if area > 0.0 {
-        lit / area
-    } else {
-        f64::from(u8::from(is_lit(u.floor() as i64, v.floor() as i64)))
+
+    fn add(&mut self, raster: Raster, x: i64, y: i64, share: f64) {
+        if (0..i64::from(raster.width())).contains(&x) && (0..i64::from(raster.height())).contains(&y) {
+            let byte = y as usize * raster.row_bytes() + x as usize / 8;
+            self.mirrors.push((byte, 0x80 >> (x % 8), share));
+        }
+    }
+
+    /// The share, 0 to 1, of the aperture on which `plane` is lit.
+    pub(super) fn lit(&self, plane: &[u8]) -> f64 {
+        self.mirrors.iter().filter(|(byte, bit, _)| plane[*byte] & bit != 0).map(|(_, _, share)| share).sum()
     }
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    fn covered(raster: Raster, plane: &[u8], centre: [f64; 2], radius: f64) -> f64 {
+        let mut seen = Seen::default();
+        // What was seen before plays no part.
+        seen.look(raster, [3.0, 2.0], 2.0);
+        seen.look(raster, centre, radius);
+        seen.lit(plane)
+    }
 
     fn plane(raster: Raster, lit: impl Fn(u32, u32) -> bool) -> Vec<u8> {
         let mut plane = vec![0; raster.plane_bytes()];

@@ -12,6 +12,7 @@ mod optics;
 use crate::hand::Hand;
 use crate::motion::Motion;
 use crate::projector::Shown;
+use aperture::Seen;
 use dpm_device::planes::{Channel, PlaneSpec, Raster};
 use dpm_device::pose::Pose;
 use dpm_device::rng::Draws;
@@ -58,6 +59,9 @@ pub struct SensorWandConfig {
     pub flicker_hz: f64,
     /// Standard deviation of a sample as a share of the converter's range.
     pub noise: f64,
+    /// The projector shows the code value of each pixel for the whole frame, as a display does, in place of its planes one
+    /// after the other.
+    pub is_held: bool,
     /// Light of a dark mirror as a share of that of a lit one.
     pub leak: f64,
     /// Share of its light that the LED loses in planes of bit 7, as LEDs do at high currents; planes of lower bits lose
@@ -94,6 +98,7 @@ impl SensorWandConfig {
             flicker: 0.3,
             flicker_hz: 100.0,
             noise: 0.0033,
+            is_held: false,
             leak: 0.001,
             droop: 0.0,
             vignetting: 0.15,
@@ -246,7 +251,7 @@ impl SensorWand {
 
     /// Samples without light of the projector, up to `until`.
     pub fn dark(&mut self, until: HostTime, sink: &mut dyn FnMut(SensorSample)) {
-        self.converter.advance(&self.scene, until.0 as f64, &|_| 0.0, sink);
+        self.converter.advance(&self.scene, until.0 as f64, &mut |_| 0.0, sink);
     }
 
     /// Samples of a lit slot; between the last one and this it was dark.
@@ -258,12 +263,19 @@ impl SensorWand {
         if end <= from || shown.planes.len() != plane_bytes * specs.len() {
             return;
         }
-        let plane_ns = (end - from) as f64 / specs.len() as f64;
+        let planes: Vec<(PlaneSpec, &[u8])> =
+            specs.iter().copied().zip(shown.planes.chunks_exact(plane_bytes)).collect();
         let last = (shown.event.last_photon_at.0 as f64).min(end as f64);
-        for (k, (spec, plane)) in specs.iter().zip(shown.planes.chunks_exact(plane_bytes)).enumerate() {
-            let until = (from as f64 + (k + 1) as f64 * plane_ns).min(last);
-            let light = |t_ns: f64| self.scene.projected(*spec, plane, t_ns as i64);
-            self.converter.advance(&self.scene, until, &light, sink);
+        let mut seen = Seen::default();
+        // All planes at once for the whole frame, or each for its share of it.
+        let at_once = if self.scene.config.is_held { planes.len() } else { 1 };
+        let share = if self.scene.config.is_held { 1.0 / planes.len() as f64 } else { 1.0 };
+        let steps = planes.len() / at_once.max(1);
+        let step_ns = (end - from) as f64 / steps.max(1) as f64;
+        for (k, lit) in planes.chunks(at_once.max(1)).enumerate() {
+            let until = (from as f64 + (k + 1) as f64 * step_ns).min(last);
+            let mut light = |t_ns: f64| share * self.scene.projected(lit, t_ns as i64, &mut seen);
+            self.converter.advance(&self.scene, until, &mut light, sink);
         }
     }
 }
@@ -275,7 +287,7 @@ impl Converter {
         &mut self,
         scene: &Scene,
         until_ns: f64,
-        light: &dyn Fn(f64) -> f64,
+        light: &mut dyn FnMut(f64) -> f64,
         sink: &mut dyn FnMut(SensorSample),
     ) {
         loop {
@@ -296,7 +308,7 @@ impl Converter {
     }
 
     /// The amplifier follows the light with one time constant until `until_ns`.
-    fn settle(&mut self, c: &SensorWandConfig, until_ns: f64, light: &dyn Fn(f64) -> f64) {
+    fn settle(&mut self, c: &SensorWandConfig, until_ns: f64, light: &mut dyn FnMut(f64) -> f64) {
         let span_ns = until_ns - self.at_ns;
         if span_ns <= 0.0 {
             return;
@@ -328,8 +340,8 @@ impl Scene {
         number as f64 * f64::from(self.period_ticks()) / self.ticks_per_ns()
     }
 
-    /// The light of one plane on the sensor at an instant, as a share of the converter's range.
-    fn projected(&self, spec: PlaneSpec, plane: &[u8], t_ns: i64) -> f64 {
+    /// The light of planes that are shown at once on the sensor at an instant, as a share of the converter's range.
+    fn projected(&self, planes: &[(PlaneSpec, &[u8])], t_ns: i64, seen: &mut Seen) -> f64 {
         let (c, raster) = (&self.config, self.raster);
         let index = t_ns.max(0) / c.obstruction_ns;
         if self.draws.stream(2).happens(index as u64, c.obstructed) {
@@ -346,19 +358,22 @@ impl Scene {
             return 0.0;
         }
         let depth = -c.optics.inward(sensor)[2];
-        let radius_px = c.aperture_m / 2.0 * c.optics.focal_px[0] / depth;
-        let lit = aperture::covered(raster, plane, pixel, radius_px);
-        let colour = match spec.channel {
-            Channel::White => 1.0,
-            channel => c.colours[channel as usize],
+        seen.look(raster, pixel, c.aperture_m / 2.0 * c.optics.focal_px[0] / depth);
+        let light = |(spec, plane): &(PlaneSpec, &[u8])| {
+            let lit = seen.lit(plane);
+            let colour = match spec.channel {
+                Channel::White => 1.0,
+                channel => c.colours[channel as usize],
+            };
+            let current = f64::from(1u32 << spec.bit);
+            let led = colour * current / 255.0 * (1.0 - c.droop * current / 128.0);
+            led * (lit + c.leak * (1.0 - lit))
         };
-        let current = f64::from(1u32 << spec.bit);
-        let led = colour * current / 255.0 * (1.0 - c.droop * current / 128.0);
+        let light: f64 = planes.iter().map(light).sum();
         let off_x = pixel[0] / f64::from(raster.width()) - 0.5;
         let off_y = pixel[1] / f64::from(raster.height()) - 0.5;
         let flat = (1.0 - c.vignetting * 2.0 * (off_x * off_x + off_y * off_y)).max(0.0);
-        let share = lit + c.leak * (1.0 - lit);
-        c.responsivity * led * share * flat * facing / (distance * distance)
+        c.responsivity * light * flat * facing / (distance * distance)
     }
 }
 

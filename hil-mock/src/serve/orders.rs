@@ -17,7 +17,7 @@ const WAITING: usize = 64;
 const LEAD_NS: i64 = 5_000_000;
 /// What the lines may say.
 const HELP: &str =
-    "orders: wander; tip X Y Z; pivot X Y Z; touch BODY X Y Z (in the body's space); dot [BODY] X Y Z (into \
+    "orders: wander; visit; tip X Y Z; pivot X Y Z; touch BODY X Y Z (in the body's space); dot [BODY] X Y Z (into \
                     the middle of the light, as far away as this point); metres";
 
 /// A line.
@@ -41,6 +41,7 @@ fn line_of(text: &str) -> Option<Line> {
     };
     match order {
         "wander" if words.is_empty() => Some(Line::To(Order::Wander)),
+        "visit" if words.is_empty() => Some(Line::To(Order::Visit)),
         "tip" => Some(Line::To(Order::Tip(place(&words)?))),
         "pivot" => Some(Line::To(Order::Pivot(place(&words)?))),
         "dot" if words.len() == 3 => Some(Line::Dot(None, place(&words)?)),
@@ -107,6 +108,7 @@ impl Orders {
                     self.hand.tell(now.plus_ns(LEAD_NS).0, order);
                     let told = match order {
                         Order::Wander => "the wand wanders".to_owned(),
+                        Order::Visit => "the wand rests at one place after another".to_owned(),
                         Order::Tip([x, y, z]) => format!("the tip is at {x:.5} {y:.5} {z:.5}"),
                         Order::Pivot([x, y, z]) => {
                             format!("the wand turns about its tip at {x:.5} {y:.5} {z:.5}")

@@ -17,6 +17,7 @@ use hil_mock::sensor_wand::{ProjectorOptics, SensorWand, SensorWandConfig};
 use hil_mock::serial_server::pseudo_terminal;
 use hil_mock::tracker::{MockTrackerConfig, SampleSource};
 use hil_mock::usb_plug::{monotonic_clock, Clock};
+use std::collections::VecDeque;
 use std::error::Error;
 use std::net::{Ipv4Addr, SocketAddrV4};
 use std::sync::Arc;
@@ -87,6 +88,12 @@ pub(crate) struct SensorWandArguments {
     /// Share of its light that the projector's LED loses in planes of bit 7; half as much for each lower bit
     #[arg(long, default_value_t = 0.0)]
     droop: f64,
+    /// Show each pixel's code value for the whole frame, as a display does, in place of planes one after the other
+    #[arg(long)]
+    held: bool,
+    /// How much later its light falls than the projector reports, as a display's does, milliseconds
+    #[arg(long, default_value_t = 0.0)]
+    light_lag_ms: f64,
     /// Light of the room as a share of the converter's range
     #[arg(long, default_value_t = 0.05)]
     ambient: f64,
@@ -169,6 +176,7 @@ impl SensorWandArguments {
             noise: self.noise,
             responsivity: self.responsivity,
             droop: self.droop,
+            is_held: self.held,
             ambient: self.ambient,
             flicker: self.flicker,
             obstructed: self.obstructed,
@@ -224,6 +232,31 @@ struct Wand {
     path: String,
     clock: Clock,
     orders: Option<Orders>,
+    lag_ns: i64,
+    /// Light that has not fallen yet.
+    coming: VecDeque<Shown>,
+}
+
+impl Wand {
+    /// Of the light that is reported up to an instant: what has fallen by then, and up to when.
+    fn fallen(&mut self, shown: &[Shown], until: HostTime) -> (Vec<Shown>, HostTime) {
+        if self.lag_ns == 0 {
+            return (shown.to_vec(), until);
+        }
+        let later = |at: HostTime| at.plus_ns(self.lag_ns);
+        self.coming.extend(shown.iter().map(|shown| {
+            let mut shown = shown.clone();
+            shown.event.first_photon_at = later(shown.event.first_photon_at);
+            shown.event.last_photon_at = later(shown.event.last_photon_at);
+            shown.planes_end_at = later(shown.planes_end_at);
+            shown
+        }));
+        let whole = self.coming.partition_point(|shown| shown.planes_end_at <= until);
+        let fallen = self.coming.drain(..whole).collect();
+        // The next one may have begun.
+        let dark_until = self.coming.front().map_or(until, |next| until.min(next.event.first_photon_at));
+        (fallen, dark_until)
+    }
 }
 
 impl Beside for Wand {
@@ -234,8 +267,9 @@ impl Beside for Wand {
         if !self.tracker.is_running() {
             return Err("the NatNet server's socket failed".into());
         }
+        let (fallen, until) = self.fallen(&shown, until);
         self.queue.fill(&mut self.wand, |wand, sink| {
-            shown.iter().for_each(|shown| wand.shine(shown, sink));
+            fallen.iter().for_each(|shown| wand.shine(shown, sink));
             wand.dark(until, sink);
         });
         if let Some(orders) = &mut self.orders {
@@ -278,6 +312,20 @@ pub(super) fn run(arguments: &SensorWandArguments) -> Result<(), Box<dyn Error>>
         Orders::start(hand, optics, width, arguments.bodies.clone()).map_err(Box::<dyn Error>::from)
     };
     let orders = hand.map(start).transpose()?;
-    let mut beside = Wand { wand, queue, line, tracker, path, clock: clock.clone(), orders };
+    if !(0.0..=1000.0).contains(&arguments.light_lag_ms) {
+        return Err(format!("--light-lag-ms {}: must be 0 to 1000", arguments.light_lag_ms).into());
+    }
+    let lag_ns = (1e6 * arguments.light_lag_ms) as i64;
+    let mut beside = Wand {
+        wand,
+        queue,
+        line,
+        tracker,
+        path,
+        clock: clock.clone(),
+        orders,
+        lag_ns,
+        coming: VecDeque::new(),
+    };
     run_beside(&arguments.projector, SHOWN_KEPT, clock, &mut beside)
 }

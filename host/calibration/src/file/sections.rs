@@ -1,7 +1,7 @@
 //! The sections of a calibration file, what may stand in them, and how they become the types of the solvers.
 
 use crate::light::{Channels, FlatField, LightModel, CURVE_POINTS};
-use crate::model::ProjectorModel;
+use crate::model::{ProjectorModel, LENS};
 use crate::projector::Predicted;
 use dpm_device::planes::Raster;
 use dpm_scene::geometry::lens::Lens;
@@ -117,7 +117,7 @@ impl ProjectorSection {
             size: [raster.width(), raster.height()],
             focal: model.focal.to_array(),
             centre: model.centre.to_array(),
-            lens: model.lens.to_vec(),
+            lens: model.lens_numbers().to_vec(),
             world_from_projector: Pose::new(&model.world_from_projector()),
             predicted_p99_px,
             assumed_bias_m: 0.0,
@@ -146,9 +146,9 @@ impl ProjectorSection {
             .with_lens(Lens::opencv(&self.lens)?)
     }
 
-    /// As the solvers vary it, to begin from: `None` for a lens of more than five coefficients.
+    /// As the solvers vary it, to begin from: `None` for a lens of more than twelve coefficients.
     pub fn model(&self) -> Option<ProjectorModel> {
-        let mut lens = [0.0; 5];
+        let mut lens = [0.0; LENS];
         lens.get_mut(..self.lens.len())?.copy_from_slice(&self.lens);
         Some(ProjectorModel::from_camera(&self.camera().ok()?, lens, DVec3::ZERO))
     }

@@ -3,7 +3,7 @@
 use super::{middle, Sight};
 use crate::dense::{inverse_spd, svd};
 use crate::least_squares::{descend, huber, Equations};
-use crate::model::{ProjectorModel, INTRINSICS, PARAMETERS};
+use crate::model::{ProjectorModel, INTRINSICS, LENS, PARAMETERS};
 use dpm_device::planes::Raster;
 use glam::DVec2;
 
@@ -22,20 +22,36 @@ pub struct Priors {
     pub cx: [f64; 2],
     /// The same, down.
     pub cy: [f64; 2],
-    /// k1, k2, p1, p2, k3.
-    pub lens: [[f64; 2]; 5],
+    /// k1, k2, p1, p2, k3, k4, k5, k6, s1, s2, s3, s4.
+    pub lens: [[f64; 2]; LENS],
 }
 
 const FREE: f64 = f64::INFINITY;
+/// Numbers of Brown's lens, and of the rational one.
+const BROWN: usize = 5;
+const RATIONAL: usize = 8;
+
+/// Which numbers of a lens are left to the data.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub enum LensTerms {
+    /// k1, k2, p1, p2, k3.
+    #[default]
+    Brown,
+    /// k4, k5, k6, too: for wide angles.
+    Rational,
+    /// s1 to s4, too: for lenses that are tilted.
+    ThinPrism,
+}
+
+/// Brown's five by their deviations, the others held at 0.
+fn brown(sigmas: [f64; BROWN]) -> [[f64; 2]; LENS] {
+    std::array::from_fn(|i| [0.0, sigmas.get(i).copied().unwrap_or(0.0)])
+}
 
 impl Priors {
     /// For a dozen points: focal lengths, centre, k1 and k2 are free, the rest is expected to be small.
     pub fn few_points(raster: Raster) -> Self {
-        Self {
-            aspect: [0.0, 0.02],
-            lens: [[0.0, 0.5], [0.0, 0.5], [0.0, 1e-3], [0.0, 1e-3], [0.0, 0.02]],
-            ..Self::many_points(raster)
-        }
+        Self { aspect: [0.0, 0.02], lens: brown([0.5, 0.5, 1e-3, 1e-3, 0.02]), ..Self::many_points(raster) }
     }
 
     /// For thousands of points: everything is free, within what lenses can be at all.
@@ -46,8 +62,25 @@ impl Priors {
             // A lens shift moves the axis by half a picture and more, mostly up or down.
             cx: [0.5 * w, w],
             cy: [0.5 * h, 2.0 * h],
-            lens: [[0.0, 1.0], [0.0, 2.0], [0.0, 0.02], [0.0, 0.02], [0.0, 5.0]],
+            lens: brown([1.0, 2.0, 0.02, 0.02, 5.0]),
         }
+    }
+
+    /// With more of the lens's numbers left to the data than Brown's five.
+    pub fn with_lens(mut self, terms: LensTerms) -> Self {
+        self.lens[BROWN..].fill([0.0; 2]);
+        if terms != LensTerms::Brown {
+            self.lens[BROWN..RATIONAL].fill([0.0, 1.0]);
+        }
+        if terms == LensTerms::ThinPrism {
+            self.lens[RATIONAL..].fill([0.0, 0.02]);
+        }
+        self
+    }
+
+    /// Whether more than Brown's five are left to the data.
+    pub(crate) fn is_beyond_brown(&self) -> bool {
+        self.lens[BROWN..].iter().any(|k| k[1] > 0.0)
     }
 
     /// A lens of which everything is known: only the pose is left.
@@ -70,7 +103,7 @@ impl Priors {
         expect(1, (model.focal.y / model.focal.x).ln(), self.aspect);
         expect(2, model.centre.x, self.cx);
         expect(3, model.centre.y, self.cy);
-        (0..5).for_each(|i| expect(4 + i, model.lens[i], self.lens[i]));
+        (0..LENS).for_each(|i| expect(4 + i, model.lens[i], self.lens[i]));
     }
 
     /// Which of the numbers of the inside are not held.
@@ -78,7 +111,7 @@ impl Priors {
         let mut free = [true; INTRINSICS];
         let held = |p: [f64; 2]| p[1] == 0.0;
         (free[1], free[2], free[3]) = (!held(self.aspect), !held(self.cx), !held(self.cy));
-        (0..5).for_each(|i| free[4 + i] = !held(self.lens[i]));
+        (0..LENS).for_each(|i| free[4 + i] = !held(self.lens[i]));
         free
     }
 }

@@ -10,10 +10,10 @@ mod solve;
 mod uncertainty;
 
 pub(crate) use fit::spread_of;
-pub use fit::Priors;
 use fit::{fit, Fit};
+pub use fit::{LensTerms, Priors};
 pub use refusal::Refusal;
-pub(crate) use solve::{check_result, look_for_motion};
+pub(crate) use solve::{check_result, check_terms, look_for_motion};
 pub use solve::{relocate, solve, Solved};
 pub(crate) use uncertainty::percentile;
 pub use uncertainty::{predict, Predicted, Volume};

@@ -98,6 +98,14 @@ pub enum Refusal {
     /// The lens of the solution folds inside the raster.
     #[error("projector: the lens that fits cannot be inverted over the raster: points are missing near its border, or some are wrong; add points in the corners")]
     LensFolds,
+    /// More of the lens was asked for than the data tell.
+    #[error("projector: the points do not tell more of the lens than k1, k2, p1, p2, k3: further terms move the light by {moved_px:.3} px, and it is uncertain by {p99_px:.3} px; take --lens brown, or add points all over the picture, in its corners above all")]
+    LensUndetermined {
+        /// 99th percentile over the volume, pixels.
+        moved_px: f64,
+        /// What the light is uncertain by, pixels.
+        p99_px: f64,
+    },
     /// The light would be too uncertain.
     #[error("projector: the light would be uncertain by {p99_px:.1} px (99th percentile over the volume), at most {most_px} px are accepted; add points at ({x:.2}, {y:.2}, {z:.2}) m")]
     Uncertain {

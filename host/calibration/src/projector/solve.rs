@@ -3,7 +3,7 @@
 use super::fit::{Task, OFFSET};
 use super::refusal::{check_distance, check_up};
 use super::uncertainty::{percentile, predict, Predicted, Volume};
-use super::{fit, middle, misses, spread_of, Fit, Known, Options, Priors, Refusal, Sight};
+use super::{fit, middle, misses, spread_of, Fit, Known, LensTerms, Options, Priors, Refusal, Sight};
 use crate::model::{ProjectorModel, INTRINSICS};
 use crate::pinhole::{calibrate, CalibrationError, CalibrationOptions, Pair};
 use dpm_common::so3::so3_log;
@@ -15,7 +15,7 @@ use glam::{DQuat, DVec2, DVec3};
 pub struct Solved {
     /// Lens and pose.
     pub model: ProjectorModel,
-    /// Covariance of its fifteen numbers.
+    /// Covariance of its numbers.
     pub covariance: Vec<Vec<f64>>,
     /// The error that the light may have over the volume.
     pub predicted: Predicted,
@@ -70,6 +70,10 @@ pub fn solve(
         }
         Err(e) => return Err(e.into()),
     };
+    let (start, consensus) = match options.priors.is_beyond_brown() {
+        true => near_brown(raster, &start, sights, consensus, &task)?,
+        false => (start, consensus),
+    };
     let (fitted, inliers) = fit_inliers(&start, sights, consensus, &task)?;
     let outliers = inliers.iter().filter(|i| !**i).count();
     if outliers >= 4 || fitted.rms_px > 3.0 * options.aim_px {
@@ -77,7 +81,32 @@ pub fn solve(
             return Err(moved);
         }
     }
-    judge(raster, sights, &fitted, inliers, options, volume, moving)
+    let solved = judge(raster, sights, &fitted, inliers.clone(), options, volume, moving)?;
+    if options.priors.is_beyond_brown() {
+        let priors = options.priors.with_lens(LensTerms::Brown);
+        let used: Vec<Sight> = sights.iter().zip(&inliers).filter(|(_, i)| **i).map(|(s, _)| *s).collect();
+        let simple = fit(&start, &used, &Task { priors: &priors, ..task });
+        check_terms(raster, &solved.model, simple.map(|f| f.model), &solved.predicted, volume)?;
+    }
+    Ok(solved)
+}
+
+/// Refuses more terms of a lens than the data tell: if they move the light by less than it is uncertain, they are noise.
+pub(crate) fn check_terms(
+    raster: Raster,
+    model: &ProjectorModel,
+    simple: Option<ProjectorModel>,
+    predicted: &Predicted,
+    volume: &Volume,
+) -> Result<(), Refusal> {
+    let Some(simple) = simple else { return Ok(()) };
+    let points = volume.points(model, raster);
+    let moves = points.iter().filter_map(|p| Some((model.project(*p)? - simple.project(*p)?).length()));
+    let moved_px = percentile(moves.collect(), 0.99);
+    if moved_px > predicted.p99_px {
+        return Ok(());
+    }
+    Err(Refusal::LensUndetermined { moved_px, p99_px: predicted.p99_px })
 }
 
 /// Finds the place of a projector whose lens is known, after a bump: from five points or more.
@@ -142,6 +171,27 @@ fn start(
     let free = CalibrationOptions { inlier_px: None, ..options };
     let found = calibrate(raster, &pairs, if pairs.len() > 7 { &options } else { &free })?;
     Ok((ProjectorModel::from_camera(&found.camera, [0.0; 5], middle(sights)), found.inliers))
+}
+
+/// Brown's lens through the points, and which of them are near it: from the middle alone, which is all that agrees with a
+/// pinhole, more terms would lead astray.
+fn near_brown(
+    raster: Raster,
+    start: &ProjectorModel,
+    sights: &[Sight],
+    consensus: Vec<bool>,
+    task: &Task,
+) -> Result<(ProjectorModel, Vec<bool>), Refusal> {
+    let priors = task.priors.with_lens(LensTerms::Brown);
+    let mut model = *start;
+    let mut inliers = consensus;
+    for share in [0.015, 0.01] {
+        let wide = Task { priors: &priors, sigma_px: share / 3.0 * f64::from(raster.width()), ..*task };
+        model = fit_inliers(&model, sights, inliers, &wide)?.0.model;
+        let off = misses(&model, 0.0, sights);
+        inliers = off.iter().map(|m| *m <= share * f64::from(raster.width())).collect();
+    }
+    Ok((model, inliers))
 }
 
 /// Fits, leaves out what is far off, and fits again.

@@ -30,7 +30,7 @@ fn truth(seed: u64) -> ProjectorModel {
 /// Points of the raster at changing depth, aimed at with an error.
 fn aimed(model: &ProjectorModel, n: u64, aim_px: f64, seed: u64) -> Vec<Sight> {
     let d = Draws::new(seed).stream(5);
-    let camera = ProjectorModel { lens: [0.0; 5], ..*model }.pinhole(raster()).unwrap();
+    let camera = ProjectorModel { lens: [0.0; crate::model::LENS], ..*model }.pinhole(raster()).unwrap();
     (0..n)
         .map(|i| {
             // Eight directions around the picture and its middle, at three depths in turn.
@@ -290,4 +290,38 @@ fn the_next_point_makes_it_better() {
     let after = session.solve().unwrap().predicted;
     assert!(after.worst_px < 0.7 * before.worst_px, "{} {}", before.worst_px, after.worst_px);
     assert!(session.advice().contains("aim there next"));
+}
+
+/// A wide angle: the corners lie at 1.1 times the focal length.
+fn wide() -> ProjectorModel {
+    let from = DVec3::new(0.1, 0.05, 0.8);
+    let mut camera = ProjectorCamera::look_at(raster(), from, DVec3::ZERO, DVec3::Y, 0.6).unwrap();
+    (camera.fx, camera.fy) = (560.0, 561.0);
+    let lens = [0.12, 0.05, 5e-4, -3e-4, 0.01, 0.16, 0.06, 0.01, 2e-3, -1e-3, -1.5e-3, 5e-4];
+    ProjectorModel::from_camera(&camera, lens, DVec3::ZERO)
+}
+
+fn with_lens(terms: LensTerms, sights: &[Sight]) -> Result<Solved, Refusal> {
+    let priors = Priors::many_points(raster()).with_lens(terms);
+    let options = Options { priors, aim_px: 0.1, ..Options::by_hand(raster()) };
+    solve(raster(), sights, &options, &Volume { low: DVec3::splat(-0.2), high: DVec3::splat(0.2) })
+}
+
+#[test]
+fn a_tilted_lens_needs_terms_that_a_narrow_one_does_not_tell() {
+    let truth = wide();
+    let sights = aimed(&truth, 1500, 0.05, 1);
+    let p99 = |solved: &Solved| p99_in_hull(&solved.model, &truth, &sights);
+    let prism = with_lens(LensTerms::ThinPrism, &sights).unwrap();
+    let brown = with_lens(LensTerms::Brown, &sights).unwrap();
+    println!("{} px with all terms, {} px with five", p99(&prism), p99(&brown));
+    assert!(p99(&prism) < 0.03 && p99(&brown) > 0.1);
+    assert_eq!((prism.model.lens_numbers().len(), brown.model.lens_numbers().len()), (12, 5));
+    // A narrow picture does not tell a quotient from a polynomial.
+    let narrow = super::tests::truth(1);
+    for terms in [LensTerms::Rational, LensTerms::ThinPrism] {
+        let told = with_lens(terms, &aimed(&narrow, 400, 0.05, 1)).unwrap_err();
+        assert!(matches!(told, Refusal::LensUndetermined { .. }), "{told}");
+        assert!(told.to_string().contains("--lens"), "{told}");
+    }
 }

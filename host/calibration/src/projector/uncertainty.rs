@@ -66,7 +66,7 @@ impl Volume {
 /// Calibrations that are drawn from the covariance.
 const DRAWS: u64 = 400;
 
-/// The error over `points` of a projector whose fifteen numbers have the given covariance, and whose points in the
+/// The error over `points` of a projector whose numbers have the given covariance, and whose points in the
 /// world are known to `point_m` along each axis (0 where they are exact).
 pub fn predict(model: &ProjectorModel, covariance: &[Vec<f64>], points: &[DVec3]) -> Predicted {
     let n = PARAMETERS;
@@ -106,7 +106,7 @@ pub fn predict(model: &ProjectorModel, covariance: &[Vec<f64>], points: &[DVec3]
     Predicted { typical_px, p99_px, worst, worst_px }
 }
 
-/// A lower triangle whose square is the covariance of the fifteen numbers. Numbers that are held have no variance, so
+/// A lower triangle whose square is the covariance of the numbers. Numbers that are held have no variance, so
 /// a trace of each diagonal is added.
 fn root(covariance: &[Vec<f64>]) -> Option<Vec<Vec<f64>>> {
     let scale: Vec<f64> = (0..PARAMETERS).map(|i| covariance[i][i].sqrt()).collect();

@@ -135,7 +135,7 @@ impl Code {
 }
 
 /// One period of x^15 + x^14 + 1, packed.
-fn identity() -> Arc<[u64]> {
+pub(super) fn identity() -> Arc<[u64]> {
     let mut words = vec![0u64; IDENTITY_PERIOD.div_ceil(64) as usize];
     let mut state: u32 = 1;
     for i in 0..IDENTITY_PERIOD {

@@ -10,14 +10,17 @@
 
 use super::code::{Code, PLANES};
 use super::decode::Decoded;
-use super::problem::{Problem, Seen, Sighting, State, LATENCY, TIP, UNKNOWNS};
+use super::problem::{Fix, Limits, Measured, Planes, Problem, Seen, State, Tally, LATENCY, TIP, UNKNOWNS};
 use super::start::{prepare, start, thin, why_no_fit};
 use super::Timing;
 use crate::dense::inverse_spd;
 use crate::least_squares::{descend, Equations};
 use crate::model::{ProjectorModel, PARAMETERS};
-use crate::projector::{check_result, predict, Known, Predicted, Priors, Refusal, Volume};
+use crate::projector::{
+    check_result, check_terms, predict, Known, LensTerms, Predicted, Priors, Refusal, Volume,
+};
 use crate::trajectory::Trajectory;
+use dpm_device::planes::Raster;
 use glam::{DMat3, DVec2, DVec3};
 use thiserror::Error;
 
@@ -60,7 +63,7 @@ pub struct Brightness {
 pub struct Solution {
     /// Lens and pose.
     pub model: ProjectorModel,
-    /// Covariance of the model's fifteen numbers.
+    /// Covariance of the model's numbers.
     pub covariance: Vec<Vec<f64>>,
     /// The error that the light may have over the volume, if the tracker has no bias.
     pub predicted: Predicted,
@@ -90,16 +93,26 @@ pub struct Solution {
 #[derive(Clone, Debug, PartialEq, Error)]
 pub enum SensorError {
     /// Too few frames with a pose.
-    #[error("sensor: {frames} frames have light and a pose of the wand, {FEWEST} are needed; move the wand through the picture for {seconds:.0} s more")]
+    #[error("sensor: {frames} frames have light and a pose of the wand, {need} are needed; move the wand through the picture for {seconds:.0} s more")]
     TooFew {
         /// Frames there are.
         frames: usize,
+        /// Frames that are needed.
+        need: usize,
         /// Seconds that are missing.
         seconds: f64,
     },
     /// The points do not make a projector.
     #[error(transparent)]
     Projector(#[from] Refusal),
+    /// The wand was not held still often enough.
+    #[error("sensor: the wand was held still at {places} places for long enough, {need} are needed: rest for two seconds at each of twenty places, near and far, and go slowly from one to the next")]
+    TooFewPlaces {
+        /// Places there are.
+        places: usize,
+        /// Places that are needed.
+        need: usize,
+    },
     /// The latency is at its bound.
     #[error("sensor: the latency comes out as {ms:.1} ms, at its bound; look at the clocks of tracker and projector")]
     LatencyAtBound {
@@ -130,7 +143,7 @@ pub enum SensorError {
 pub(super) const FEWEST: usize = 500;
 /// Beyond this an offset is no latency, seconds.
 pub(super) const MOST_LATENCY_S: f64 = 0.05;
-pub(super) const MOST_LATENCY_SIGMA_US: f64 = 100.0;
+const MOST_LATENCY_SIGMA_US: f64 = 100.0;
 /// Blocks over which scores are summed, seconds.
 pub(super) const BLOCK_S: f64 = 0.1;
 
@@ -144,29 +157,70 @@ pub fn solve(
     path: &Trajectory,
     settings: &Settings,
 ) -> Result<Solution, SensorError> {
-    let (problem, seen) = set_up(code, decoded, (path, settings), false)?;
-    let start = start(&problem, &seen)?;
-    let (state, equations, rms_level) = refine(&problem, start, &seen)?;
-    finish(&problem, &state, &equations, &seen, rms_level)
+    let planes = planes_of(code, decoded, settings);
+    let problem = Problem::new(code.raster(), (path, settings), false);
+    let seen = enough(prepare(&planes, decoded, path, settings), settings)?;
+    let fixes: Vec<Fix> = seen.iter().map(|s| s.fix).collect();
+    let start = start(&problem, &fixes)?;
+    let fitted = refine(&problem, start, &seen, &FINEST)?;
+    finish_told(&problem, &fitted, &seen, &FINEST)
 }
 
-/// The frames that can be used and what they are fitted with. `is_held`: lens and pose stay what they are.
-pub(super) fn set_up<'a>(
-    code: &'a Code,
-    decoded: &Decoded,
-    (path, settings): (&'a Trajectory, &'a Settings),
-    is_held: bool,
-) -> Result<(Problem<'a>, Vec<Seen>), SensorError> {
-    let seen = prepare(code, decoded, path, settings);
-    if seen.len() < FEWEST {
-        let seconds = (2 * FEWEST - seen.len()) as f64 * 1e-9 * settings.timing.frame_ns;
-        return Err(SensorError::TooFew { frames: seen.len(), seconds: seconds.max(1.0) });
+/// As [`finish`], for a lens whose terms the data must tell.
+pub(super) fn finish_told<M: Measured>(
+    problem: &Problem,
+    fitted: &Fitted,
+    seen: &[M],
+    stages: &[(f64, bool)],
+) -> Result<Solution, SensorError> {
+    let solution = finish(problem, fitted, seen)?;
+    if problem.settings.priors.is_beyond_brown() {
+        let priors = problem.settings.priors.with_lens(LensTerms::Brown);
+        let settings = Settings { priors, ..*problem.settings };
+        let brown = Problem {
+            limits: problem.limits,
+            ..Problem::new(problem.raster, (problem.path, &settings), false)
+        };
+        let mut begun = fitted.state;
+        begun.model = ProjectorModel::from_camera(
+            &begun.model.pinhole(problem.raster).map_err(|_| Refusal::LensFolds)?,
+            [0.0; 5],
+            begun.model.origin,
+        );
+        let simple = refine(&brown, begun, seen, stages).ok().map(|f| f.state.model);
+        check_terms(problem.raster, &solution.model, simple, &solution.predicted, &settings.volume)?;
     }
-    // Time of a level within its plane, less that of the frame's middle.
+    Ok(solution)
+}
+
+/// The planes of frames, and when their levels were.
+pub(super) fn planes_of<'a>(code: &'a Code, decoded: &Decoded, settings: &Settings) -> Planes<'a> {
     let plane_s = 1e-9 * settings.timing.frame_ns / PLANES as f64;
     let times = std::array::from_fn(|p| (p as f64 + decoded.centre - (PLANES / 2) as f64) * plane_s);
-    let tip_sigma = settings.tip_sigma_m.max(1e-4);
-    Ok((Problem { code, path, settings, times, tip_sigma, is_held }, seen))
+    Planes { code, times }
+}
+
+/// The frames, if they are enough.
+pub(super) fn enough<'a>(seen: Vec<Seen<'a>>, settings: &Settings) -> Result<Vec<Seen<'a>>, SensorError> {
+    if seen.len() < FEWEST {
+        let seconds = (2 * FEWEST - seen.len()) as f64 * 1e-9 * settings.timing.frame_ns;
+        return Err(SensorError::TooFew { frames: seen.len(), need: FEWEST, seconds: seconds.max(1.0) });
+    }
+    Ok(seen)
+}
+
+impl<'a> Problem<'a> {
+    /// `is_held`: lens and pose stay what they are.
+    pub(super) fn new(
+        raster: Raster,
+        (path, settings): (&'a Trajectory, &'a Settings),
+        is_held: bool,
+    ) -> Self {
+        let limits = Limits { latency_s: MOST_LATENCY_S, latency_sigma_us: MOST_LATENCY_SIGMA_US };
+        let inside = settings.priors.free();
+        let free = std::array::from_fn(|i| !is_held && inside.get(i).copied().unwrap_or(true));
+        Self { raster, limits, path, settings, tip_sigma: settings.tip_sigma_m.max(1e-4), free }
+    }
 }
 
 /// Scores summed by block of time, and how far each frame alone would move its pixel.
@@ -178,17 +232,15 @@ pub(super) struct Scores {
 }
 
 impl Scores {
-    /// Adds a frame that is seen at `at`.
-    pub(super) fn add(&mut self, problem: &Problem, at: &Sighting, frame: &Seen, sigma: f64) {
-        let sums = problem.frame(at, frame, sigma, 0.0);
-        let block = (frame.from_middle_s / BLOCK_S).floor() as i64;
-        let score = sums.score(at);
+    /// Adds a measurement.
+    pub(super) fn add(&mut self, from_middle_s: f64, tally: &Tally) {
+        let block = (from_middle_s / BLOCK_S).floor() as i64;
         match self.by_block.last_mut().filter(|(b, _)| *b == block) {
-            Some((_, sum)) => sum.iter_mut().zip(&score).for_each(|(a, b)| *a += b),
-            None => self.by_block.push((block, score)),
+            Some((_, sum)) => sum.iter_mut().zip(&tally.score).for_each(|(a, b)| *a += b),
+            None => self.by_block.push((block, tally.score)),
         }
-        for k in (0..2).filter(|k| sums.gg[*k] > 1.0) {
-            self.squares_px += (sums.gr[k] / sums.gg[k]).powi(2);
+        for k in (0..2).filter(|k| tally.gg[*k] > 1.0) {
+            self.squares_px += (tally.gr[k] / tally.gg[k]).powi(2);
             self.count += 1.0;
         }
     }
@@ -199,55 +251,74 @@ impl Scores {
     }
 }
 
+/// A state with its equations, and the root mean square of the levels' residuals.
+pub(super) struct Fitted {
+    pub state: State,
+    pub equations: Equations,
+    pub rms_level: f64,
+}
+
+impl Fitted {
+    /// The deviation of a level that the weights are made of.
+    pub(super) fn sigma(&self) -> f64 {
+        self.rms_level.clamp(0.005, 0.15)
+    }
+}
+
+/// The narrowest stripes of each stage of a fit, and whether all measurements take part in it.
+pub(super) const FINEST: [(f64, bool); 4] = [(8.0, false), (3.0, false), (0.0, false), (0.0, true)];
+
 /// Fits the levels: wide stripes first, since a start that is wrong by a stripe would lock to the wrong one.
-pub(super) fn refine(
+pub(super) fn refine<M: Measured>(
     problem: &Problem,
     start: State,
-    seen: &[Seen],
-) -> Result<(State, Equations, f64), SensorError> {
-    let few: Vec<Seen> = thin(seen, 3000).map(Seen::copy).collect();
+    seen: &[M],
+    stages: &[(f64, bool)],
+) -> Result<Fitted, SensorError> {
+    let few: Vec<&M> = thin(seen, 3000).collect();
+    let every: Vec<&M> = seen.iter().collect();
     let mut state = start;
     let mut sigma = 0.15;
     let failed = Refusal::NotConverged { rms_px: f64::INFINITY };
     let mut last = None;
-    for (finest, all) in [(8.0, false), (3.0, false), (0.0, false), (0.0, true)] {
-        let frames = if all { seen } else { &few };
+    for (finest, all) in stages {
+        let (frames, how) = (if *all { &every } else { &few }, (sigma, *finest));
         let found = descend(
             state,
             30,
-            |s: &State| problem.of_levels(s, frames, sigma, finest),
-            |s: &State| problem.cost_of_levels(s, frames, sigma, finest),
+            |s: &State| problem.of_levels(s, frames, how),
+            |s: &State| problem.cost_of_levels(s, frames, how),
             |s: &State, d: &[f64]| s.step(d),
         )
         .ok_or(failed.clone())?;
         state = found.state;
         // The deviation of the levels on the slopes of stripes is what the next weights are made of.
-        let each = frames.iter().filter_map(|f| Some(problem.frame(&problem.sight(&state, f)?, f, 1.0, 0.0)));
-        let (squares, count) = each.fold((0.0, 0.0), |a, s| (a.0 + s.rr, a.1 + s.count));
+        let each = frames.iter().filter_map(|f| f.tally(problem, &state, 1.0, 0.0, None));
+        let (squares, count) = each.fold((0.0, 0.0), |a, t| (a.0 + t.squares, a.1 + t.count));
         let rms = (squares / f64::max(count, 1.0)).sqrt();
         sigma = rms.clamp(0.005, 0.15);
         last = Some((found.equations, rms));
     }
-    let (equations, rms) = last.ok_or(failed)?;
-    Ok((state, equations, rms))
+    let (equations, rms_level) = last.ok_or(failed)?;
+    Ok(Fitted { state, equations, rms_level })
 }
 
-fn finish(
+/// A fit into what is told of it.
+pub(super) fn finish<M: Measured>(
     problem: &Problem,
-    state: &State,
-    equations: &Equations,
-    seen: &[Seen],
-    rms_level: f64,
+    fitted: &Fitted,
+    seen: &[M],
 ) -> Result<Solution, SensorError> {
-    let settings = problem.settings;
-    let sigma = rms_level.clamp(0.005, 0.15);
+    let (settings, state, equations) = (problem.settings, &fitted.state, &fitted.equations);
     let (mut scores, mut brightness, mut depths) = (Scores::default(), Vec::new(), Vec::new());
     let position = state.model.position();
-    for frame in seen {
-        let Some(at) = problem.sight(state, frame) else { continue };
-        scores.add(problem, &at, frame, sigma);
-        let shift = (1e9 * (state.latency_s + state.drift * frame.from_middle_s)) as i64;
-        let Some(pose) = problem.path.at(frame.instant.0 + shift, 0.0) else { continue };
+    for one in seen {
+        let Some(tally) = one.tally(problem, state, fitted.sigma(), 0.0, None) else { continue };
+        let fix = one.fix();
+        let Some(at) = problem.sight(state, fix) else { continue };
+        scores.add(fix.from_middle_s, &tally);
+        let shift = (1e9 * (state.latency_s + state.drift * fix.from_middle_s)) as i64;
+        let Some(pose) = problem.path.at(fix.instant.0 + shift, 0.0) else { continue };
         let tip = pose.position + pose.rotation * state.tip;
         depths.push(state.model.local(tip).z);
         let away = position - tip;
@@ -255,29 +326,34 @@ fn finish(
             pixel: at.pixel,
             distance_m: away.length(),
             towards: pose.rotation.conjugate() * away.normalize_or_zero(),
-            level: frame.contrast,
+            level: one.contrast(),
         });
     }
     let rms_px = scores.rms_px();
     if rms_px > 2.5 {
-        return Err(why_no_fit(problem, seen, state, rms_px));
+        let fixes: Vec<Fix> = seen.iter().map(|s| *s.fix()).collect();
+        return Err(why_no_fit(problem, &fixes, state, rms_px));
     }
-    check_result(problem.code.raster(), &state.model, &depths, &settings.known)?;
+    check_result(problem.raster, &state.model, &depths, &settings.known)?;
     let mut expected = Equations::new(UNKNOWNS);
     problem.expect(state, &mut expected);
     let covariance =
         sandwich(equations, &expected, &scores.by_block).ok_or(Refusal::NotConverged { rms_px })?;
-    if state.latency_s.abs() > 0.9 * MOST_LATENCY_S {
+    if state.latency_s.abs() > 0.9 * problem.limits.latency_s {
         return Err(SensorError::LatencyAtBound { ms: 1e3 * state.latency_s });
     }
     let latency_sigma_ns = 1e9 * covariance[LATENCY][LATENCY].sqrt();
-    if latency_sigma_ns > 1e3 * MOST_LATENCY_SIGMA_US {
+    if latency_sigma_ns > 1e3 * problem.limits.latency_sigma_us {
         return Err(SensorError::LatencyUncertain { us: 1e-3 * latency_sigma_ns });
     }
     let of_tip = |i: usize| DVec3::from_array(std::array::from_fn(|j| covariance[TIP + i][TIP + j]));
-    let points = settings.volume.points(&state.model, problem.code.raster());
+    let points = settings.volume.points(&state.model, problem.raster);
+    let of_both = |i: usize, j: usize| match problem.free[i] && problem.free[j] {
+        true => covariance[i][j],
+        false => 0.0,
+    };
     let model_covariance: Vec<Vec<f64>> =
-        covariance[..PARAMETERS].iter().map(|row| row[..PARAMETERS].to_vec()).collect();
+        (0..PARAMETERS).map(|i| (0..PARAMETERS).map(|j| of_both(i, j)).collect()).collect();
     Ok(Solution {
         model: state.model,
         predicted: predict(&state.model, &model_covariance, &points),
@@ -289,7 +365,7 @@ fn finish(
         drift_ppm: 1e6 * state.drift,
         aperture_m: 2.0 * state.radius_m,
         frames: brightness.len(),
-        rms_level,
+        rms_level: fitted.rms_level,
         rms_px,
         brightness,
     })

@@ -2,11 +2,9 @@
 
 use super::code::Code;
 use super::decode::Decoded;
-use super::fit::{
-    refine, sandwich, set_up, Scores, SensorError, Settings, MOST_LATENCY_S, MOST_LATENCY_SIGMA_US,
-};
-use super::problem::{Problem, Seen, State, LATENCY, UNKNOWNS};
-use super::start::{from_bits, miss, MOST_START_PX};
+use super::fit::{enough, planes_of, refine, sandwich, Fitted, Scores, SensorError, Settings, FINEST};
+use super::problem::{Fix, Measured, Problem, State, LATENCY, UNKNOWNS};
+use super::start::{from_bits, miss, prepare, MOST_START_PX};
 use crate::least_squares::Equations;
 use crate::model::ProjectorModel;
 use crate::trajectory::Trajectory;
@@ -42,43 +40,44 @@ pub fn solve_latency(
     settings: &Settings,
     model: &ProjectorModel,
 ) -> Result<Latency, SensorError> {
-    let (problem, seen) = set_up(code, decoded, (path, settings), true)?;
-    let start = start(&problem, &seen, model)?;
-    let (state, equations, rms_level) = refine(&problem, start, &seen)?;
-    finish(&problem, &state, &equations, &seen, rms_level)
+    let planes = planes_of(code, decoded, settings);
+    let problem = Problem::new(code.raster(), (path, settings), true);
+    let seen = enough(prepare(&planes, decoded, path, settings), settings)?;
+    let fixes: Vec<Fix> = seen.iter().map(|s| s.fix).collect();
+    let start = start(&problem, &fixes, model)?;
+    let fitted = refine(&problem, start, &seen, &FINEST)?;
+    finish(&problem, &fitted, &seen)
 }
 
 /// Tip and latency from the pixels of the bits, good to a pixel.
-fn start(problem: &Problem, seen: &[Seen], model: &ProjectorModel) -> Result<State, SensorError> {
+fn start(problem: &Problem, seen: &[Fix], model: &ProjectorModel) -> Result<State, SensorError> {
     let (state, px) = from_bits(problem, seen, *model)?;
     // Written so that no sighting at all, which is NaN, is refused too.
     if px <= MOST_START_PX {
         return Ok(state);
     }
-    Err(bound(&state).unwrap_or(SensorError::OtherProjector { px }))
+    Err(bound(problem, &state).unwrap_or(SensorError::OtherProjector { px }))
 }
 
-fn bound(state: &State) -> Option<SensorError> {
-    let is_at = state.latency_s.abs() > 0.9 * MOST_LATENCY_S;
+fn bound(problem: &Problem, state: &State) -> Option<SensorError> {
+    let is_at = state.latency_s.abs() > 0.9 * problem.limits.latency_s;
     is_at.then_some(SensorError::LatencyAtBound { ms: 1e3 * state.latency_s })
 }
 
-fn finish(
+pub(super) fn finish<M: Measured>(
     problem: &Problem,
-    state: &State,
-    equations: &Equations,
-    seen: &[Seen],
-    rms_level: f64,
+    fitted: &Fitted,
+    seen: &[M],
 ) -> Result<Latency, SensorError> {
-    let sigma = rms_level.clamp(0.005, 0.15);
+    let (state, equations) = (&fitted.state, &fitted.equations);
     let (mut scores, mut frames) = (Scores::default(), 0);
-    for frame in seen {
-        let Some(at) = problem.sight(state, frame) else { continue };
+    for one in seen {
+        let Some(tally) = one.tally(problem, state, fitted.sigma(), 0.0, None) else { continue };
         frames += 1;
-        scores.add(problem, &at, frame, sigma);
+        scores.add(one.fix().from_middle_s, &tally);
     }
     let rms_px = scores.rms_px();
-    if let Some(at_bound) = bound(state) {
+    if let Some(at_bound) = bound(problem, state) {
         return Err(at_bound);
     }
     if rms_px > MOST_PX {
@@ -87,15 +86,16 @@ fn finish(
     // A tip that moves further than it can be wrong makes up for a projector that is elsewhere.
     let before = problem.settings.tip;
     if (state.tip - before).abs().max_element() > MOST_TIP_SIGMAS * problem.tip_sigma {
-        let px = miss(problem, &State { tip: before, ..*state }, seen);
+        let fixes: Vec<Fix> = seen.iter().map(|s| *s.fix()).collect();
+        let px = miss(problem, &State { tip: before, ..*state }, &fixes);
         return Err(SensorError::OtherProjector { px });
     }
     let mut expected = Equations::new(UNKNOWNS);
     problem.expect(state, &mut expected);
-    let short = SensorError::TooFew { frames, seconds: 5.0 };
+    let short = SensorError::TooFew { frames, need: 2 * frames, seconds: 5.0 };
     let covariance = sandwich(equations, &expected, &scores.by_block).ok_or(short)?;
     let sigma_ns = 1e9 * covariance[LATENCY][LATENCY].sqrt();
-    if sigma_ns > 1e3 * MOST_LATENCY_SIGMA_US {
+    if sigma_ns > 1e3 * problem.limits.latency_sigma_us {
         return Err(SensorError::LatencyUncertain { us: 1e-3 * sigma_ns });
     }
     Ok(Latency { latency_ns: (1e9 * state.latency_s).round() as i64, sigma_ns, frames, rms_px })

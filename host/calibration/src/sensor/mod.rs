@@ -9,6 +9,7 @@ mod code;
 mod coverage;
 mod decode;
 mod fit;
+mod inverse;
 mod latency;
 mod lock;
 mod problem;
@@ -19,6 +20,10 @@ pub use code::{Code, CodeError, Role, PLANES};
 pub use coverage::Coverage;
 pub use decode::{decode, DecodeError, Decoded, Frame};
 pub use fit::{solve, Brightness, SensorError, Settings, Solution};
+pub use inverse::{
+    decode_pairs, places_rested, solve_latency_of_pairs, solve_pairs, DecodedPairs, InverseCode, Mapped,
+    Pair, Stripe, FEWEST_PLACES,
+};
 pub use latency::{solve_latency, Latency};
 pub use lock::{Block, Lock};
 

@@ -6,25 +6,75 @@ use super::stripes::stripes;
 use crate::least_squares::{huber, Equations};
 use crate::model::{ProjectorModel, PARAMETERS};
 use crate::trajectory::Trajectory;
+use dpm_device::planes::Raster;
 use glam::{DVec2, DVec3};
 
-// The unknowns after the fifteen of the projector.
+// The unknowns after those of the projector.
 pub(super) const TIP: usize = PARAMETERS;
 pub(super) const LATENCY: usize = TIP + 3;
 pub(super) const DRIFT: usize = LATENCY + 1;
 pub(super) const RADIUS: usize = DRIFT + 1;
 pub(super) const UNKNOWNS: usize = RADIUS + 1;
 
-/// A frame prepared for the fit.
-pub(super) struct Seen {
-    /// Instant of the frame's middle plane by the host's clock, and its distance from the middle of all, seconds.
+/// A moment in which the tip was seen.
+#[derive(Clone, Copy, Debug)]
+pub(super) struct Fix {
+    /// The instant by the host's clock, and its distance from the middle of all, seconds.
     pub instant: (i64, f64),
     pub from_middle_s: f64,
+    /// The pixel of the bits, good to a few.
+    pub pixel: DVec2,
+}
+
+/// What the planes of a frame show, and when.
+pub(super) struct Planes<'a> {
+    pub code: &'a Code,
+    /// Time of a level within its plane, less that of the frame's middle, seconds, by plane.
+    pub times: [f64; PLANES],
+}
+
+/// A frame prepared for the fit.
+pub(super) struct Seen<'a> {
+    pub planes: &'a Planes<'a>,
+    /// The instant is that of the frame's middle plane.
+    pub fix: Fix,
     /// Levels of the coded planes over the contrast, 0 to 1.
     pub levels: [f64; PLANES],
     pub contrast: f64,
-    /// The pixel of the bits.
-    pub pixel: DVec2,
+}
+
+/// A measurement that is fitted.
+pub(super) trait Measured {
+    /// The moment that stands for it.
+    fn fix(&self) -> &Fix;
+
+    /// Full light less darkness, in the sensor's unit.
+    fn contrast(&self) -> f64;
+
+    /// How well it agrees with a state; `None` if the state does not see the tip. Stripes narrower than `finest` pixels are
+    /// left out. Its equations are added to `all`.
+    fn tally(
+        &self,
+        problem: &Problem,
+        state: &State,
+        sigma: f64,
+        finest: f64,
+        all: Option<&mut Equations>,
+    ) -> Option<Tally>;
+}
+
+/// What a measurement says of a state.
+pub(super) struct Tally {
+    /// Half the sum of Huber's losses.
+    pub loss: f64,
+    /// Squares of the residuals, and their number.
+    pub squares: f64,
+    pub count: f64,
+    /// Squares of the slopes by place along each axis, and their products with the residuals.
+    pub gg: [f64; 2],
+    pub gr: [f64; 2],
+    /// Minus the derivative of the cost.
+    pub score: [f64; UNKNOWNS],
 }
 
 #[derive(Clone, Copy, Debug)]
@@ -60,19 +110,27 @@ pub(super) struct Sighting {
     pub rows: [[f64; UNKNOWNS]; 2],
 }
 
+/// What a latency may be.
+#[derive(Clone, Copy)]
+pub(super) struct Limits {
+    /// Beyond this an offset is no latency, seconds.
+    pub latency_s: f64,
+    /// Beyond this standard deviation the motion does not show it, microseconds.
+    pub latency_sigma_us: f64,
+}
+
 pub(super) struct Problem<'a> {
-    pub code: &'a Code,
+    pub raster: Raster,
+    pub limits: Limits,
     pub path: &'a Trajectory,
     pub settings: &'a Settings,
-    /// Time of a level within its plane, less that of the frame's middle, seconds, by plane.
-    pub times: [f64; PLANES],
     pub tip_sigma: f64,
-    /// Lens and pose stay what they are.
-    pub is_held: bool,
+    /// Which of the projector's numbers are solved for: none if lens and pose are known.
+    pub free: [bool; PARAMETERS],
 }
 
 impl Problem<'_> {
-    pub(super) fn sight(&self, s: &State, seen: &Seen) -> Option<Sighting> {
+    pub(super) fn sight(&self, s: &State, seen: &Fix) -> Option<Sighting> {
         let shift = 1e9 * (s.latency_s + s.drift * seen.from_middle_s) + seen.instant.1;
         let pose =
             self.path.at(seen.instant.0.saturating_add(shift.floor() as i64), shift - shift.floor())?;
@@ -83,8 +141,8 @@ impl Problem<'_> {
         let mut rows = [[0.0; UNKNOWNS]; 2];
         let mut moving = DVec2::ZERO;
         for k in 0..2 {
-            if !self.is_held {
-                rows[k][..PARAMETERS].copy_from_slice(&at.by_parameters[k]);
+            for (i, row) in rows[k][..PARAMETERS].iter_mut().enumerate().filter(|(i, _)| self.free[*i]) {
+                *row = at.by_parameters[k][i];
             }
             rows[k][TIP..LATENCY].copy_from_slice(&(to_body * at.by_point[k]).to_array());
             moving[k] = at.by_point[k].dot(velocity);
@@ -96,11 +154,11 @@ impl Problem<'_> {
     }
 
     pub(super) fn expect(&self, s: &State, all: &mut Equations) {
-        match self.is_held {
-            // What is held has no equation: one that says nothing keeps the matrix regular.
-            true => (0..PARAMETERS).for_each(|i| all.expect(i, 0.0, 1.0)),
-            false => self.settings.priors.apply(&s.model, all),
+        if self.free[0] {
+            self.settings.priors.apply(&s.model, all);
         }
+        // What is held has no equation: one that says nothing keeps the matrix regular.
+        (0..PARAMETERS).filter(|i| !self.free[*i]).for_each(|i| all.expect(i, 0.0, 1.0));
         (0..3).for_each(|i| all.expect(TIP + i, s.tip[i] - self.settings.tip[i], self.tip_sigma));
         all.expect(LATENCY, s.latency_s, 0.1);
         all.expect(DRIFT, s.drift, 1e-4);
@@ -108,9 +166,9 @@ impl Problem<'_> {
     }
 
     /// Equations from the pixels of the bits.
-    pub(super) fn of_bits(&self, s: &State, frames: &[Seen], sigma_px: f64) -> Option<Equations> {
+    pub(super) fn of_bits(&self, s: &State, fixes: &[Fix], sigma_px: f64) -> Option<Equations> {
         let mut all = Equations::new(UNKNOWNS);
-        for seen in frames {
+        for seen in fixes {
             let Some(at) = self.sight(s, seen) else { continue };
             let r = (at.pixel - seen.pixel) / sigma_px;
             let (weight, loss) = huber(r.length(), 2.0);
@@ -121,11 +179,81 @@ impl Problem<'_> {
         all.cost.is_finite().then_some(all)
     }
 
-    /// Residuals of a frame's levels: summed products of slopes and residuals.
-    pub(super) fn frame(&self, at: &Sighting, seen: &Seen, sigma: f64, finest: f64) -> Sums {
+    /// Equations from levels.
+    pub(super) fn of_levels<M: Measured>(&self, s: &State, all: &[M], how: (f64, f64)) -> Option<Equations> {
+        let mut equations = Equations::new(UNKNOWNS);
+        for one in all {
+            if let Some(tally) = one.tally(self, s, how.0, how.1, Some(&mut equations)) {
+                equations.cost += tally.loss;
+            }
+        }
+        self.expect(s, &mut equations);
+        equations.cost.is_finite().then_some(equations)
+    }
+
+    /// Their cost alone.
+    pub(super) fn cost_of_levels<M: Measured>(&self, s: &State, all: &[M], how: (f64, f64)) -> f64 {
+        let losses = all.iter().filter_map(|m| Some(m.tally(self, s, how.0, how.1, None)?.loss));
+        let mut priors = Equations::new(UNKNOWNS);
+        self.expect(s, &mut priors);
+        losses.sum::<f64>() + priors.cost
+    }
+}
+
+impl<M: Measured> Measured for &M {
+    fn fix(&self) -> &Fix {
+        M::fix(self)
+    }
+
+    fn contrast(&self) -> f64 {
+        M::contrast(self)
+    }
+
+    fn tally(
+        &self,
+        problem: &Problem,
+        state: &State,
+        sigma: f64,
+        finest: f64,
+        all: Option<&mut Equations>,
+    ) -> Option<Tally> {
+        M::tally(self, problem, state, sigma, finest, all)
+    }
+}
+
+impl Measured for Seen<'_> {
+    fn fix(&self) -> &Fix {
+        &self.fix
+    }
+
+    fn contrast(&self) -> f64 {
+        self.contrast
+    }
+
+    fn tally(
+        &self,
+        problem: &Problem,
+        state: &State,
+        sigma: f64,
+        finest: f64,
+        all: Option<&mut Equations>,
+    ) -> Option<Tally> {
+        let at = problem.sight(state, &self.fix)?;
+        let sums = self.sums(&at, sigma, finest);
+        if let Some(all) = all {
+            sums.add_to(&at, all);
+        }
+        let Sums { loss, rr, count, gg, gr, .. } = sums;
+        Some(Tally { loss, squares: rr, count, gg, gr, score: sums.score(&at) })
+    }
+}
+
+impl Seen<'_> {
+    /// Residuals of the levels: summed products of slopes and residuals.
+    fn sums(&self, at: &Sighting, sigma: f64, finest: f64) -> Sums {
         let mut sums = Sums::default();
         for plane in 2..PLANES - 2 {
-            let (axis, width) = match self.code.role(plane) {
+            let (axis, width) = match self.planes.code.role(plane) {
                 Role::Column { width } => (0, f64::from(width)),
                 Role::Row { width } => (1, f64::from(width)),
                 _ => continue,
@@ -133,9 +261,9 @@ impl Problem<'_> {
             if width < finest {
                 continue;
             }
-            let place = at.pixel[axis] + at.velocity[axis] * self.times[plane];
+            let place = at.pixel[axis] + at.velocity[axis] * self.planes.times[plane];
             let share = stripes(width, place, at.radius);
-            let r = (share.share - seen.levels[plane]) / sigma;
+            let r = (share.share - self.levels[plane]) / sigma;
             let (weight, loss) = huber(r.abs(), 2.0);
             let (g, h) = (share.by_place / sigma, share.by_radius * at.radius / sigma);
             sums.loss += loss;
@@ -149,44 +277,24 @@ impl Problem<'_> {
         }
         sums
     }
-
-    pub(super) fn of_levels(&self, s: &State, frames: &[Seen], sigma: f64, finest: f64) -> Option<Equations> {
-        let mut all = Equations::new(UNKNOWNS);
-        for seen in frames {
-            let Some(at) = self.sight(s, seen) else { continue };
-            let sums = self.frame(&at, seen, sigma, finest);
-            all.cost += sums.loss;
-            sums.add_to(&at, &mut all);
-        }
-        self.expect(s, &mut all);
-        all.cost.is_finite().then_some(all)
-    }
-
-    pub(super) fn cost_of_levels(&self, s: &State, frames: &[Seen], sigma: f64, finest: f64) -> f64 {
-        let losses =
-            frames.iter().filter_map(|f| Some(self.frame(&self.sight(s, f)?, f, sigma, finest).loss));
-        let mut priors = Equations::new(UNKNOWNS);
-        self.expect(s, &mut priors);
-        losses.sum::<f64>() + priors.cost
-    }
 }
 
 /// Sums over the planes of a frame: `g` by place along each axis, `h` by the logarithm of the radius, `r` residuals.
 #[derive(Default)]
-pub(super) struct Sums {
-    pub loss: f64,
-    pub gg: [f64; 2],
-    pub gh: [f64; 2],
-    pub hh: f64,
-    pub gr: [f64; 2],
-    pub hr: f64,
-    pub rr: f64,
-    pub count: f64,
+struct Sums {
+    loss: f64,
+    gg: [f64; 2],
+    gh: [f64; 2],
+    hh: f64,
+    gr: [f64; 2],
+    hr: f64,
+    rr: f64,
+    count: f64,
 }
 
 impl Sums {
     /// All planes of one axis share their derivatives, so a frame costs two rows instead of twenty.
-    pub(super) fn add_to(&self, at: &Sighting, all: &mut Equations) {
+    fn add_to(&self, at: &Sighting, all: &mut Equations) {
         let mut left = self.hh;
         let mut of_radius = self.hr;
         for k in 0..2 {
@@ -209,16 +317,10 @@ impl Sums {
     }
 
     /// Minus the derivative of the cost.
-    pub(super) fn score(&self, at: &Sighting) -> [f64; UNKNOWNS] {
+    fn score(&self, at: &Sighting) -> [f64; UNKNOWNS] {
         let mut score: [f64; UNKNOWNS] =
             std::array::from_fn(|i| -(at.rows[0][i] * self.gr[0] + at.rows[1][i] * self.gr[1]));
         score[RADIUS] -= self.hr;
         score
-    }
-}
-
-impl Seen {
-    pub(super) fn copy(&self) -> Self {
-        Self { ..*self }
     }
 }

@@ -3,36 +3,53 @@
 use super::code::{Code, Role, PLANES};
 use super::decode::{Decoded, Frame};
 use super::fit::{SensorError, Settings, MOST_LATENCY_S};
-use super::problem::{Problem, Seen, State};
+use super::problem::{Fix, Planes, Problem, Seen, State};
 use crate::least_squares::descend;
 use crate::model::ProjectorModel;
 use crate::pinhole::{calibrate, CalibrationError, CalibrationOptions, Pair};
 use crate::projector::{look_for_motion, percentile, spread_of, Options, Refusal, Sight};
 use crate::trajectory::Trajectory;
+use dpm_device::planes::Raster;
 use glam::{DVec2, DVec3};
 
 /// Frames nearer than this to the raster's border, pixels, see only a part of the stripes.
 const BORDER_PX: f64 = 10.0;
 
 /// Frames with a pose, away from the raster's border, with their levels over the contrast and the pixel of the bits.
-pub(super) fn prepare(code: &Code, decoded: &Decoded, path: &Trajectory, settings: &Settings) -> Vec<Seen> {
+pub(super) fn prepare<'a>(
+    planes: &'a Planes<'a>,
+    decoded: &Decoded,
+    path: &Trajectory,
+    settings: &Settings,
+) -> Vec<Seen<'a>> {
     let Some((first, last)) = path.span_ns() else { return Vec::new() };
     let middle_ns = first / 2 + last / 2;
-    let size = DVec2::new(f64::from(code.raster().width()), f64::from(code.raster().height()));
     let seen = |frame: &Frame| {
         let instant = settings.timing.instant(frame.number, (PLANES / 2) as f64);
         let levels = over_contrast(frame);
-        let pixel = pixel_of_bits(code, &levels);
-        let inside = pixel.cmpge(DVec2::splat(BORDER_PX)).all() && pixel.cmple(size - BORDER_PX).all();
+        let pixel = pixel_of_bits(planes.code, &levels);
         let from_middle_s = 1e-9 * instant.0.saturating_sub(middle_ns) as f64;
-        inside.then(|| Seen { instant, from_middle_s, levels, contrast: frame.contrast(), pixel })
+        let fix = Fix { instant, from_middle_s, pixel };
+        is_inside(planes.code.raster(), pixel).then(|| Seen {
+            planes,
+            fix,
+            levels,
+            contrast: frame.contrast(),
+        })
     };
     // Whatever the latency is, there must be a pose.
     let reach = (1e9 * MOST_LATENCY_S) as i64;
     let known = |s: &Seen| {
-        s.instant.0 - reach > first && s.instant.0 + reach < last && path.at(s.instant.0, 0.0).is_some()
+        let at = s.fix.instant.0;
+        at - reach > first && at + reach < last && path.at(at, 0.0).is_some()
     };
     decoded.frames.iter().filter_map(seen).filter(known).collect()
+}
+
+/// Whether all stripes around a pixel lie on the raster.
+pub(super) fn is_inside(raster: Raster, pixel: DVec2) -> bool {
+    let size = DVec2::new(f64::from(raster.width()), f64::from(raster.height()));
+    pixel.cmpge(DVec2::splat(BORDER_PX)).all() && pixel.cmple(size - BORDER_PX).all()
 }
 
 /// Levels of the planes, 0 for darkness and 1 for full light.
@@ -66,13 +83,13 @@ fn pixel_of_bits(code: &Code, levels: &[f64; PLANES]) -> DVec2 {
 }
 
 /// Every n-th frame, so that about `most` are left.
-pub(super) fn thin(seen: &[Seen], most: usize) -> impl Iterator<Item = &Seen> {
+pub(super) fn thin<T>(seen: &[T], most: usize) -> impl Iterator<Item = &T> {
     seen.iter().step_by(seen.len().div_ceil(most).max(1))
 }
 
 /// Points of the wand and the pixels of their bits, for poses that are stamped `offset_ns` later than the light.
-fn sights(problem: &Problem, seen: &[Seen], most: usize, offset_ns: i64) -> Vec<Sight> {
-    let place = |s: &Seen| {
+fn sights(problem: &Problem, seen: &[Fix], most: usize, offset_ns: i64) -> Vec<Sight> {
+    let place = |s: &Fix| {
         let pose = problem.path.at(s.instant.0.saturating_add(offset_ns), 0.0)?;
         Some(pose.position + pose.rotation * problem.settings.tip)
     };
@@ -84,8 +101,8 @@ fn pairs(sights: &[Sight]) -> Vec<Pair> {
 }
 
 /// A pinhole from the pixels of the bits, with the tip of the pivot and no latency.
-fn pinhole(problem: &Problem, seen: &[Seen]) -> Result<ProjectorModel, SensorError> {
-    let raster = problem.code.raster();
+fn pinhole(problem: &Problem, seen: &[Fix]) -> Result<ProjectorModel, SensorError> {
+    let raster = problem.raster;
     let sights = sights(problem, seen, 120, 0);
     let [_, second, third] = spread_of(&sights);
     if third < 0.05 * second {
@@ -104,8 +121,8 @@ fn pinhole(problem: &Problem, seen: &[Seen]) -> Result<ProjectorModel, SensorErr
 }
 
 /// Why pairs have no consensus: a mirror, a motion between them, or clocks that are far apart.
-fn why_no_pinhole(problem: &Problem, seen: &[Seen], pairs: &[Pair], e: CalibrationError) -> SensorError {
-    let raster = problem.code.raster();
+fn why_no_pinhole(problem: &Problem, seen: &[Fix], pairs: &[Pair], e: CalibrationError) -> SensorError {
+    let raster = problem.raster;
     let options = CalibrationOptions { inlier_px: Some(0.03 * f64::from(raster.width())), seed: 1 };
     let mirrored: Vec<Pair> =
         pairs.iter().map(|p| Pair { world: p.world * DVec3::new(-1.0, 1.0, 1.0), ..*p }).collect();
@@ -116,8 +133,8 @@ fn why_no_pinhole(problem: &Problem, seen: &[Seen], pairs: &[Pair], e: Calibrati
 }
 
 /// Whether poses that are some tens of milliseconds off, up to a second, explain the data.
-fn late(problem: &Problem, seen: &[Seen]) -> Option<SensorError> {
-    let raster = problem.code.raster();
+fn late(problem: &Problem, seen: &[Fix]) -> Option<SensorError> {
+    let raster = problem.raster;
     let all = CalibrationOptions { inlier_px: None, seed: 1 };
     let rms = |ms: i64| {
         let sights = sights(problem, seen, 60, ms * 1_000_000);
@@ -130,9 +147,9 @@ fn late(problem: &Problem, seen: &[Seen]) -> Option<SensorError> {
 }
 
 /// Why levels do not fit: something moved during the sweep, or a reason that is not known.
-pub(super) fn why_no_fit(problem: &Problem, seen: &[Seen], state: &State, px: f64) -> SensorError {
+pub(super) fn why_no_fit(problem: &Problem, seen: &[Fix], state: &State, px: f64) -> SensorError {
     let sights = sights(problem, seen, 80, (1e9 * state.latency_s) as i64);
-    let raster = problem.code.raster();
+    let raster = problem.raster;
     let options = Options { aim_px: 1.0, ..Options::by_hand(raster) };
     match look_for_motion(raster, &sights, &options) {
         Some(moved) => moved.into(),
@@ -141,7 +158,7 @@ pub(super) fn why_no_fit(problem: &Problem, seen: &[Seen], state: &State, px: f6
 }
 
 /// A state that is good to a pixel: from the pixels of the bits, with tip and latency free.
-pub(super) fn start(problem: &Problem, seen: &[Seen]) -> Result<State, SensorError> {
+pub(super) fn start(problem: &Problem, seen: &[Fix]) -> Result<State, SensorError> {
     let (state, px) = from_bits(problem, seen, pinhole(problem, seen)?)?;
     if px > MOST_START_PX {
         return Err(why_no_fit(problem, seen, &state, px));
@@ -158,13 +175,13 @@ pub(super) const MOST_START_PX: f64 = 6.0;
 /// that is left, pixels.
 pub(super) fn from_bits(
     problem: &Problem,
-    seen: &[Seen],
+    seen: &[Fix],
     model: ProjectorModel,
 ) -> Result<(State, f64), SensorError> {
     let settings = problem.settings;
     let radius_m = 0.5 * settings.aperture_m;
     let mut state = State { model, tip: settings.tip, latency_s: 0.0, drift: 0.0, radius_m };
-    let few: Vec<Seen> = thin(seen, FEW).map(Seen::copy).collect();
+    let few: Vec<Fix> = thin(seen, FEW).copied().collect();
     for sigma_px in [6.0, 1.5] {
         let equations = |s: &State| problem.of_bits(s, &few, sigma_px);
         let cost = |s: &State| equations(s).map_or(f64::INFINITY, |e| e.cost);
@@ -176,7 +193,7 @@ pub(super) fn from_bits(
 }
 
 /// The median distance between the pixels of the bits and where a state sees them.
-pub(super) fn miss(problem: &Problem, state: &State, seen: &[Seen]) -> f64 {
-    let one = |s: &Seen| problem.sight(state, s).map(|at| (at.pixel - s.pixel).length());
+pub(super) fn miss(problem: &Problem, state: &State, seen: &[Fix]) -> f64 {
+    let one = |s: &Fix| problem.sight(state, s).map(|at| (at.pixel - s.pixel).length());
     percentile(seen.iter().filter_map(one).collect(), 0.5)
 }

@@ -30,6 +30,26 @@ const LEAST_FRAMES: usize = 24;
 /// References before and after a level agree within this share.
 const MOST_DRIFT: f64 = 0.03;
 
+/// How a level is shown.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Field {
+    /// On the whole raster, for as long as a limit of flashes a second demands; `None` for no limit.
+    Full(Option<u8>),
+    /// On every other one of 8 x 6 tiles, and its complement on those between, so that the light of the whole picture never
+    /// changes. A display is shown levels like this: its light comes some frames late, too.
+    Tiles {
+        /// On those tiles that have their complement otherwise.
+        is_exchanged: bool,
+    },
+}
+
+/// Columns and rows of tiles.
+const TILES: [u32; 2] = [8, 6];
+/// At both ends of a level of tiles so much is left out, seconds: displays are late by up to a quarter of a second.
+const TILES_MARGIN_S: f64 = 0.3;
+/// The dark tile's light is less than this share of the lit one's.
+const MOST_DARK: f64 = 0.25;
+
 /// What a step shows: the code of each of red, green and blue.
 #[derive(Clone, Copy, Debug, PartialEq)]
 struct Step {
@@ -45,22 +65,16 @@ pub struct Levels {
     channels: usize,
     schedule: PlaneSchedule,
     rate: FrameRate,
-    flashes: Option<u8>,
+    field: Field,
     mean: f64,
 }
 
 impl Levels {
-    /// Levels for the planes of a projector: white alone, or red, green and blue, `codes` of each. They are held for as long
-    /// as the limit of `flashes` a second demands (`None` for no limit).
+    /// Levels for the planes of a projector: white alone, or red, green and blue, `codes` of each.
     ///
     /// # Errors
     /// Planes of which no level can be measured, or a limit that no hold keeps; one sentence.
-    pub fn new(
-        schedule: &PlaneSchedule,
-        rate: FrameRate,
-        flashes: Option<u8>,
-        codes: u32,
-    ) -> Result<Self, String> {
+    pub fn new(schedule: &PlaneSchedule, rate: FrameRate, field: Field, codes: u32) -> Result<Self, String> {
         let has = |channel| schedule.planes().iter().any(|p| p.channel == channel);
         let colours = [Channel::Red, Channel::Green, Channel::Blue].map(has);
         let channels = match (has(Channel::White), colours) {
@@ -80,7 +94,41 @@ impl Levels {
                 Step { what: Next::Code { channel, code: f64::from(value) / 255.0 }, code }
             }));
         }
-        Self::of(levels, channels, schedule, rate, flashes)
+        Self::of(levels, channels, schedule, rate, field)
+    }
+
+    /// White and black alone, by which a sensor among tiles is told on which it lies.
+    ///
+    /// # Errors
+    /// As [`Levels::new`].
+    pub fn two(schedule: &PlaneSchedule, rate: FrameRate) -> Result<Self, String> {
+        let field = Field::Tiles { is_exchanged: false };
+        Self::of(vec![Step { what: Next::Black, code: 0 }], 1, schedule, rate, field)
+    }
+
+    /// Whether the sensor lies on a tile of the complement, from samples of [`Levels::two`].
+    ///
+    /// # Errors
+    /// Too few samples, or a sensor on the border of two tiles; one sentence with what to do.
+    pub fn is_on_complement(&self, showing: &Showing, samples: &[Timed], room: Room) -> Result<bool, String> {
+        let mut levels = [None; 2];
+        for (run, frames) in by_run(self, showing, samples) {
+            if frames.len() >= LEAST_FRAMES {
+                let reading = steady(&frames, room.flicker_hz).map_err(|e| e.to_string())?;
+                levels[self.step_of(run) % 2] = Some(reading.level - room.ambient.level);
+            }
+        }
+        let [Some(white), Some(black)] = levels else {
+            return Err("too few frames were seen; look at `dpm link-test` and at the sensor's cable".into());
+        };
+        if white.min(black) > MOST_DARK * white.max(black) {
+            return Err(
+                "the sensor sees both of two neighbouring tiles, or no light at all: move it by a few \
+                        centimetres within the picture"
+                    .into(),
+            );
+        }
+        Ok(black > white)
     }
 
     fn of(
@@ -88,16 +136,24 @@ impl Levels {
         channels: usize,
         schedule: &PlaneSchedule,
         rate: FrameRate,
-        flashes: Option<u8>,
+        field: Field,
     ) -> Result<Self, String> {
         let reference = Step { what: Next::White, code: WHITE };
         let steps: Vec<Step> = levels.into_iter().flat_map(|level| [reference, level]).collect();
-        let light: Vec<u32> = steps.iter().map(|s| luminance(schedule, s.code)).collect();
+        let whole = |code: u32| match field {
+            Field::Full(_) => luminance(schedule, code),
+            // Both kinds of tiles cover the same part of the raster, but for a row or a column of pixels.
+            Field::Tiles { .. } => (luminance(schedule, code) + luminance(schedule, WHITE - code)) / 2,
+        };
+        let light: Vec<u32> = steps.iter().map(|s| whole(s.code)).collect();
         let mean = light.iter().map(|l| f64::from(*l)).sum::<f64>()
             / (light.len().max(1) as f64 * f64::from(FULL_LUMINANCE));
         let slots = |s: f64| (s * rate.hz()).ceil() as u64;
         let mut hold = slots(HOLD_S).max(HOLD_FRAMES);
-        if let Some(limit) = flashes {
+        if let Field::Tiles { .. } = field {
+            hold += 2 * slots(TILES_MARGIN_S);
+        }
+        if let Field::Full(Some(limit)) = field {
             while flashes_too_often(&light, hold, rate, limit) {
                 hold += hold / 10;
                 if hold > slots(LONGEST_HOLD_S).max(2 * HOLD_FRAMES) {
@@ -109,7 +165,7 @@ impl Levels {
             // The second that the limiter looks at may begin anywhere, and so may the levels.
             hold += hold / 8;
         }
-        Ok(Self { steps, hold, channels, schedule: *schedule, rate, flashes, mean })
+        Ok(Self { steps, hold, channels, schedule: *schedule, rate, field, mean })
     }
 
     /// Those of the levels that `readings` lacks; `None` if it has all.
@@ -122,7 +178,7 @@ impl Levels {
         if levels.is_empty() {
             return Ok(None);
         }
-        Self::of(levels, self.channels, &self.schedule, self.rate, self.flashes).map(Some)
+        Self::of(levels, self.channels, &self.schedule, self.rate, self.field).map(Some)
     }
 
     fn levels(&self) -> impl Iterator<Item = &Step> {
@@ -132,6 +188,14 @@ impl Levels {
     /// Time for which every level is shown at least once, whenever it begins, seconds.
     pub fn seconds(&self) -> f64 {
         (self.steps.len() as u64 + 2) as f64 * self.hold as f64 / self.rate.hz()
+    }
+
+    /// Longest time for which all mirrors are lit, seconds.
+    pub fn full_white_s(&self) -> f64 {
+        match self.field {
+            Field::Full(_) => self.hold_s(),
+            Field::Tiles { .. } => 0.0,
+        }
     }
 
     /// Time for which a level stands, seconds.
@@ -166,7 +230,21 @@ impl PatternSource for Levels {
 
     fn draw(&self, picture: u64, canvas: &mut Canvas<'_>) {
         let code = self.steps[picture as usize % self.steps.len()].code;
-        canvas.codes(|codes| codes.fill(code));
+        let raster = canvas.raster();
+        let Field::Tiles { is_exchanged } = self.field else {
+            return canvas.codes(|codes| codes.fill(code));
+        };
+        let complement = WHITE - code;
+        let (even, odd) = if is_exchanged { (complement, code) } else { (code, complement) };
+        canvas.codes(|codes| {
+            for (y, row) in (0..).zip(codes.chunks_exact_mut(raster.width() as usize)) {
+                let of_row = y * TILES[1] / raster.height();
+                for (x, pixel) in (0..).zip(row) {
+                    let tile = x * TILES[0] / raster.width() + of_row;
+                    *pixel = if tile.is_multiple_of(2) { even } else { odd };
+                }
+            }
+        });
     }
 }
 
@@ -289,7 +367,11 @@ impl Readings {
 /// whole frames only are looked at.
 fn by_run(levels: &Levels, showing: &Showing, samples: &[Timed]) -> BTreeMap<u64, Vec<Block>> {
     let timing = &showing.timing;
-    let margin = (MARGIN_S * levels.rate.hz()).ceil().max(2.0) as u64;
+    let margin_s = match levels.field {
+        Field::Full(_) => MARGIN_S,
+        Field::Tiles { .. } => TILES_MARGIN_S,
+    };
+    let margin = (margin_s * levels.rate.hz()).ceil().max(2.0) as u64;
     let is_inside = |slot: &u64| {
         let in_run = (margin..levels.hold.saturating_sub(margin)).contains(&(slot % levels.hold));
         // A frame that came late may show the level before.

@@ -19,7 +19,7 @@ fn rate() -> FrameRate {
 }
 
 fn rgb(codes: u32) -> Levels {
-    Levels::new(&PlaneSchedule::rgb24(), rate(), Some(3), codes).unwrap()
+    Levels::new(&PlaneSchedule::rgb24(), rate(), Field::Full(Some(3)), codes).unwrap()
 }
 
 /// The code value of each pixel, from the planes.
@@ -68,7 +68,7 @@ fn the_limit_of_flashes_is_kept_by_the_limiter_itself() {
     let schedule = PlaneSchedule::rgb24();
     let mut holds = Vec::new();
     for limit in [None, Some(3), Some(2), Some(1)] {
-        let levels = Levels::new(&schedule, rate(), limit, CODES).unwrap();
+        let levels = Levels::new(&schedule, rate(), Field::Full(limit), CODES).unwrap();
         holds.push(levels.hold);
         let Some(limit) = limit else { continue };
         let mut limiter = FlashLimiter::new(rate(), limit);
@@ -88,8 +88,8 @@ fn planes_without_channels_are_refused_by_name() {
     use dpm_device::planes::PlaneSpec;
     let spec = |channel| PlaneSpec { channel, bit: 7 };
     let mixed = PlaneSchedule::new(&[spec(Channel::Red), spec(Channel::White)]).unwrap();
-    assert!(Levels::new(&mixed, rate(), None, 4).unwrap_err().contains("neither red"));
-    assert_eq!(Levels::new(&PlaneSchedule::mono8(), rate(), None, 4).unwrap().channels, 1);
+    assert!(Levels::new(&mixed, rate(), Field::Full(None), 4).unwrap_err().contains("neither red"));
+    assert_eq!(Levels::new(&PlaneSchedule::mono8(), rate(), Field::Full(None), 4).unwrap().channels, 1);
 }
 
 /// What the mock's sensor samples while the levels are shown once and a bit, from a slot that begins anywhere.
@@ -119,18 +119,21 @@ fn block_of(sample: SensorSample, scale: f64) -> Block {
     Block { start_ns, interval_ns: 1e4, levels: vec![level] }
 }
 
-/// `fades` is a share of the projector's light that is lost from the beginning to the end.
-fn bench(codes: u32, fades: f64) -> Bench {
+fn bench_config() -> SensorWandConfig {
     let optics = ProjectorOptics::along_z([0.0, 0.0, 1.2], 100.0, 64, 48);
-    let config = SensorWandConfig {
+    SensorWandConfig {
         droop: 0.04,
         responsivity: 2.0,
         start_ticks: 0,
         clock_ppm: 0.0,
         leak: 0.002,
         ..SensorWandConfig::new(optics)
-    };
-    show(rgb(codes), &config, |share| 1.0 - fades * share)
+    }
+}
+
+/// `fades` is a share of the projector's light that is lost from the beginning to the end.
+fn bench(codes: u32, fades: f64) -> Bench {
+    show(rgb(codes), &bench_config(), |share| 1.0 - fades * share)
 }
 
 /// Shows levels once. `scale` is the projector's light by the share of the time that has passed.
@@ -254,4 +257,36 @@ fn a_light_that_fades_slowly_is_divided_out_and_a_sudden_change_is_named() {
     }
     let told = solve(&bench.levels, &bench.showing, &bench.samples, bench.room).unwrap_err();
     assert!(told.contains("changes by") || told.contains("changed by"), "{told}");
+}
+
+/// The light of the whole never changes among tiles, and each tile's level is that of the full field.
+#[test]
+fn levels_in_tiles_are_those_of_the_mock_wherever_the_sensor_lies() {
+    let schedule = PlaneSchedule::rgb24();
+    let at = |x: f64, y: f64| SensorWandConfig { tip_m: [x, y, 0.12], ..bench_config() };
+    let probe = |config: &SensorWandConfig| {
+        let bench = show(Levels::two(&schedule, rate()).unwrap(), config, |_| 1.0);
+        bench.levels.is_on_complement(&bench.showing, &bench.samples, bench.room)
+    };
+    // A tile has 8 x 8 pixels of 10.8 mm; in the middle of the raster four of them meet.
+    assert!(probe(&at(0.0, 0.0)).unwrap_err().contains("neighbouring tiles"));
+    let (one, other) = (at(-0.043, 0.043), at(0.043, 0.043));
+    assert_eq!([probe(&one), probe(&other)], [Ok(true), Ok(false)]);
+    let levels = Levels::new(&schedule, rate(), Field::Tiles { is_exchanged: true }, 4).unwrap();
+    let source = Arc::new(levels.clone());
+    let raster = Raster::new(64, 48).unwrap();
+    let mut painter = PatternPainter::new(source, raster);
+    let mut planes = BitPlaneFrame::new(raster, schedule);
+    for picture in 0..levels.steps.len() as u64 {
+        painter.draw(Kernel::Scalar, picture, &mut planes);
+        assert_eq!(mean_luminance(raster, &schedule, planes.bytes()), FULL_LUMINANCE / 2, "{picture}");
+    }
+    let Bench { levels, showing, samples, room, config, .. } = &show(levels, &one, |_| 1.0);
+    let got = solve(levels, showing, samples, *room).unwrap();
+    for (channel, colour) in config.colours.into_iter().enumerate() {
+        assert!((got.intensity[channel] - colour).abs() < 3e-3, "{:?}", got.intensity);
+        let half = got.level(channel, 128.0 / 255.0) / got.level(channel, 1.0);
+        assert!((half - truth(config, 128)).abs() < 5e-3, "channel {channel}: {half}");
+    }
+    assert_eq!(levels.full_white_s(), 0.0);
 }

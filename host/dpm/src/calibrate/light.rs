@@ -2,7 +2,7 @@
 //! sweep of it.
 
 use super::dialogue::Dialogue;
-use super::levels::{Levels, Readings, Room};
+use super::levels::{Field, Levels, Readings, Room};
 use super::pace::{Pace, Paced};
 use super::recorder::{wait_until_up, while_stamped, Port, Recorder, Timed};
 use super::results::Results;
@@ -36,31 +36,52 @@ fn refused(error: impl std::fmt::Display) -> Failure {
 pub struct Progress {
     readings: Readings,
     ambient: Option<Steady>,
+    /// Among tiles: whether the sensor lies on one of the complement.
+    is_on_complement: Option<bool>,
+}
+
+/// How light is measured.
+#[derive(Clone, Debug)]
+pub struct Ways {
+    /// The sensor.
+    pub port: Port,
+    /// Twice the frequency of the mains, hertz.
+    pub flicker_hz: f64,
+    /// Codes of each channel.
+    pub codes: u32,
+    /// Levels are shown in tiles, as for displays.
+    pub in_tiles: bool,
 }
 
 /// Shows the levels that `progress` lacks, reads the sensor at rest, and gives curves and brightness of the channels once it
-/// has all. `flicker_hz` is twice the frequency of the mains.
+/// has all.
 ///
 /// # Errors
 /// A device fails (exit code 3); planes, limits or readings of which no response comes (2, with what to do).
 pub fn measure(
     config: &RigConfig,
-    (port, flicker_hz, codes): (&Port, f64, u32),
+    ways: &Ways,
     progress: &mut Progress,
     monitor: &Arc<RunMonitor>,
 ) -> Result<Paced<Option<Channels>>, Failure> {
-    let all = levels_of(config, codes)?;
+    let flicker_hz = ways.flicker_hz;
+    let all = levels_of(config, ways, progress.is_on_complement)?;
     let Some(levels) = all.missing(&progress.readings).map_err(refused)?.map(Arc::new) else {
         return Err(refused("no level is missing"));
     };
     let clock = MonotonicClock::new(0);
     let stopped = Arc::clone(monitor);
     let dialogue = Dialogue::start(move || stopped.stop_requested())?;
-    let recorder = Recorder::start(port, clock)?;
+    let recorder = Recorder::start(&ways.port, clock)?;
     recorder.wait_until_mapped(monitor)?;
     let ambient = match progress.ambient {
         Some(ambient) => ambient,
-        None => *progress.ambient.insert(room_light(&levels, &recorder, flicker_hz, &dialogue)?),
+        None => {
+            // Among tiles these levels only tell where the sensor lies.
+            let rest = if ways.in_tiles { levels_of(config, ways, Some(false))?.seconds() } else { 0.0 };
+            let seconds = levels.seconds() + rest;
+            *progress.ambient.insert(room_light(seconds, &recorder, flicker_hz, &dialogue)?)
+        }
     };
     let seconds = levels.seconds();
     let read = || {
@@ -74,6 +95,11 @@ pub fn measure(
     watched.and_then(|samples| {
         let showing = Showing::of(&lights, config.projector.frame_rate)?;
         let room = Room { flicker_hz, ambient };
+        if ways.in_tiles && progress.is_on_complement.is_none() {
+            let is_on = levels.is_on_complement(&showing, &samples, room).map_err(refused)?;
+            progress.is_on_complement = Some(is_on);
+            return Ok(None);
+        }
         let before = progress.readings.count();
         progress.readings.add(&levels, &showing, &samples, room).map_err(refused)?;
         let missing = all.count() - progress.readings.count();
@@ -90,15 +116,15 @@ pub fn measure(
 
 /// Reads the room while the projector is dark.
 fn room_light(
-    levels: &Levels,
+    seconds: f64,
     recorder: &Recorder,
     flicker_hz: f64,
     dialogue: &Dialogue,
 ) -> Result<Steady, Failure> {
     dialogue.tell(&format!(
         "Put the wand down in the beam, near the middle of the picture, so that its sensor looks at the lens. Nobody may\n\
-         move it or walk through the light for {:.0} s. The projector is still dark: the light of the room is read first.",
-        levels.seconds()
+         move it or walk through the light for {seconds:.0} s. The projector is still dark: the light of the room is read \
+         first."
     ));
     dialogue.ask("Press Enter to begin.")?;
     recorder.take();
@@ -108,13 +134,18 @@ fn room_light(
 }
 
 /// The levels for the rig's planes, within its limits.
-fn levels_of(config: &RigConfig, codes: u32) -> Result<Levels, Failure> {
+fn levels_of(config: &RigConfig, ways: &Ways, is_on_complement: Option<bool>) -> Result<Levels, Failure> {
     let (projector, safety) = (&config.projector, &config.safety);
     let limit = u8::try_from(safety.flashes_per_second.min(255)).ok().filter(|&n| n > 0);
-    let levels = Levels::new(&projector.schedule(), projector.frame_rate, limit, codes);
+    let (schedule, rate) = (projector.schedule(), projector.frame_rate);
+    let levels = match (ways.in_tiles, is_on_complement) {
+        (false, _) => Levels::new(&schedule, rate, Field::Full(limit), ways.codes),
+        (true, None) => Levels::two(&schedule, rate),
+        (true, Some(is_exchanged)) => Levels::new(&schedule, rate, Field::Tiles { is_exchanged }, ways.codes),
+    };
     let levels = levels.map_err(refused)?;
     let limits = &safety.limits;
-    if limits.full_white_s > 0.0 && limits.full_white_s < levels.hold_s() {
+    if limits.full_white_s > 0.0 && limits.full_white_s < levels.full_white_s() {
         return Err(refused(format!(
             "safety.limits.full_white_s = {} is shorter than the {:.2} s for which full white must stand as a reference; \
              raise it for this measurement with --set",

@@ -4,6 +4,7 @@
 pub mod aim;
 pub mod body;
 pub mod check;
+mod codes;
 pub mod dialogue;
 pub mod levels;
 pub mod light;

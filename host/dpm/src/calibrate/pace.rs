@@ -1,7 +1,7 @@
 //! Whether link and machine carry the frames that a measurement shows, and the rate at which they would.
 
 use dpm_device::time::FrameRate;
-use dpm_rig::config::RigConfig;
+use dpm_rig::config::{ProjectorBackend, RigConfig};
 use dpm_rig::failure::{Failure, FailureKind};
 use dpm_rig::telemetry::monitor::{ProjectorHealth, RunMonitor};
 use std::collections::VecDeque;
@@ -114,6 +114,14 @@ impl<'a> Pace<'a> {
 /// There is none (exit code 3).
 pub fn slower(config: &RigConfig, carried_hz: f64) -> Result<RigConfig, Failure> {
     let hz = (ROOM * carried_hz) as u32;
+    if let ProjectorBackend::Display(_) = config.projector.backend {
+        let told = format!(
+            "only {carried_hz:.1} of {:.0} frames/s reached the display in time; end other programs, or take a mode with \
+             fewer pixels or frames",
+            config.projector.frame_rate.hz()
+        );
+        return Err(Failure::new(FailureKind::Device, told));
+    }
     let rate = FrameRate::new(hz, 1).filter(|_| hz >= SLOWEST_HZ).ok_or_else(|| {
         let told = format!(
             "only {carried_hz:.1} of {:.0} frames/s reached the projector, and a measurement needs {SLOWEST_HZ}: is the \
@@ -147,6 +155,13 @@ mod tests {
         let few = (3100..5000).step_by(50).find_map(|ms| at(ms, 90)).unwrap();
         assert!((10.0..18.0).contains(&few), "{few}");
         assert_eq!((5000..8000).step_by(50).filter_map(|ms| at(ms, 90)).last(), Some(0.0));
+    }
+
+    #[test]
+    fn a_display_keeps_the_rate_of_its_mode() {
+        let mut config = RigConfig::default();
+        config.projector.backend = ProjectorBackend::Display(Default::default());
+        assert!(slower(&config, 30.0).unwrap_err().message.contains("mode"));
     }
 
     #[test]

@@ -1,80 +1,32 @@
 //! `dpm calibrate projector --sensor`: the wand's light sensor is moved through coded planes while everything is recorded;
 //! lens, pose, tip and latency are solved afterwards.
 
+use super::codes::{CodeSource, InverseSource};
 use super::dialogue::Dialogue;
 use super::pace::{Pace, Paced};
 use super::poses::Poses;
-use super::recorder::{wait_until_up, while_stamped, Port, Recorder};
+use super::recorder::{wait_until_up, while_stamped, Port, Recorder, Timed};
 use super::results::Results;
 use super::showing::Showing;
 use dpm_calibration::file::{LatencySection, ProjectorSection, WandSection};
 use dpm_calibration::model::ProjectorModel;
 use dpm_calibration::pivot::trace;
-use dpm_calibration::projector::{Known, Priors, Volume};
+use dpm_calibration::projector::{Known, LensTerms, Priors, Volume};
 use dpm_calibration::sensor::{
-    decode, solve, solve_latency, Block, Code, Coverage, Decoded, Latency, Settings, Solution, PLANES,
+    decode, decode_pairs, places_rested, solve, solve_latency, solve_latency_of_pairs, solve_pairs, Block,
+    Code, Coverage, Decoded, DecodedPairs, InverseCode, Latency, Mapped, Settings, Solution, Timing,
+    FEWEST_PLACES,
 };
 use dpm_calibration::trajectory::{Stamped, Trajectory};
 use dpm_common::clock::MonotonicClock;
-use dpm_device::planes::PlaneSchedule;
 use dpm_rig::config::RigConfig;
 use dpm_rig::failure::{Failure, FailureKind};
-use dpm_rig::pack::source::{Canvas, PatternSource};
+use dpm_rig::pack::source::PatternSource;
 use dpm_rig::telemetry::monitor::RunMonitor;
 use glam::DVec3;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::Arc;
 use std::time::{Duration, Instant};
-
-/// Shows the sensor's code. Only the bit of identity differs from frame to frame, so there are two pictures; they are drawn
-/// before there is light, since drawing takes longer than a frame.
-struct CodeSource {
-    code: Code,
-    pictures: [Box<[u8]>; 2],
-}
-
-impl CodeSource {
-    fn new(code: Code) -> Self {
-        let pictures = [false, true].map(|identity| {
-            // Any frame with this bit of identity.
-            let frame = (0..64).find(|f| code.identity(*f) == identity).unwrap_or(0);
-            planes_of(&code, frame)
-        });
-        Self { code, pictures }
-    }
-}
-
-/// The planes of a frame, one after the other.
-fn planes_of(code: &Code, frame: u64) -> Box<[u8]> {
-    let raster = code.raster();
-    let (row_bytes, plane_bytes) = (raster.row_bytes(), raster.plane_bytes());
-    let mut bytes = vec![0; PLANES * plane_bytes];
-    for (plane, bytes) in bytes.chunks_exact_mut(plane_bytes).enumerate() {
-        for (y, row) in (0..).zip(bytes.chunks_exact_mut(row_bytes)) {
-            for x in (0..raster.width()).filter(|x| code.lit(frame, plane, *x, y)) {
-                row[x as usize / 8] |= 0x80 >> (x % 8);
-            }
-        }
-    }
-    bytes.into()
-}
-
-impl PatternSource for CodeSource {
-    fn picture(&self, _: u64, slot: u64) -> u64 {
-        u64::from(self.code.identity(slot))
-    }
-
-    fn schedule(&self) -> Option<PlaneSchedule> {
-        Some(PlaneSchedule::equal24())
-    }
-
-    fn draw(&self, picture: u64, canvas: &mut Canvas<'_>) {
-        let planes = canvas.planes().bytes_mut();
-        for (to, from) in planes.iter_mut().zip(&self.pictures[(picture & 1) as usize]) {
-            *to = *from;
-        }
-    }
-}
 
 /// What is measured with.
 #[derive(Clone, Debug)]
@@ -89,15 +41,19 @@ pub struct Setup {
     pub aperture_m: f64,
     /// What is known of the projector's place.
     pub known: Known,
+    /// Which numbers of the lens are solved for.
+    pub lens: LensTerms,
     /// Frames a second of the rig file: at a lower rate the motion takes longer.
     pub rate_hz: f64,
+    /// Frames and their inverse are shown, in place of coded planes.
+    pub is_held: bool,
     /// The operator has begun to move: what is repeated at another rate is not asked for again.
     pub has_begun: Arc<AtomicBool>,
 }
 
 /// Everything that was recorded while the wand moved.
 struct Recording {
-    blocks: Vec<Block>,
+    blocks: Vec<Timed>,
     sensor_minus_host_ns: i64,
     poses: Vec<Stamped>,
 }
@@ -107,10 +63,15 @@ const FRAMES: f64 = 1200.0;
 
 /// What was recorded, ready for a solver.
 struct Sweep {
-    code: Code,
-    decoded: Decoded,
+    seen: SeenCode,
     path: Trajectory,
     settings: Settings,
+}
+
+/// A code, and what the sensor saw of it.
+enum SeenCode {
+    Planes(Box<Code>, Decoded),
+    Frames(InverseCode, DecodedPairs),
 }
 
 /// Shows the code, records, and solves. `tip` comes from `dpm calibrate wand`.
@@ -123,8 +84,13 @@ pub fn calibrate(
     tip: (DVec3, f64),
     monitor: &Arc<RunMonitor>,
 ) -> Result<Paced<Solution>, Failure> {
-    sweep(config, setup, tip, monitor)?
-        .and_then(|s| solve(&s.code, &s.decoded, &s.path, &s.settings).map_err(refused))
+    sweep(config, setup, tip, monitor)?.and_then(|s| {
+        let solved = match &s.seen {
+            SeenCode::Planes(code, decoded) => solve(code, decoded, &s.path, &s.settings),
+            SeenCode::Frames(code, decoded) => solve_pairs(code, decoded, &s.path, &s.settings),
+        };
+        solved.map_err(refused)
+    })
 }
 
 /// Shows the code, records, and finds the latency of the projector `model`, which is known.
@@ -138,8 +104,15 @@ pub fn latency(
     model: &ProjectorModel,
     monitor: &Arc<RunMonitor>,
 ) -> Result<Paced<Latency>, Failure> {
-    sweep(config, setup, tip, monitor)?
-        .and_then(|s| solve_latency(&s.code, &s.decoded, &s.path, &s.settings, model).map_err(refused))
+    sweep(config, setup, tip, monitor)?.and_then(|s| {
+        let solved = match &s.seen {
+            SeenCode::Planes(code, decoded) => solve_latency(code, decoded, &s.path, &s.settings, model),
+            SeenCode::Frames(code, decoded) => {
+                solve_latency_of_pairs(code, decoded, &s.path, &s.settings, model)
+            }
+        };
+        solved.map_err(refused)
+    })
 }
 
 fn refused(error: impl std::fmt::Display) -> Failure {
@@ -153,32 +126,53 @@ fn sweep(
     monitor: &Arc<RunMonitor>,
 ) -> Result<Paced<Sweep>, Failure> {
     let raster = config.projector.raster();
-    let code = Code::new(raster).map_err(refused)?;
-    record(config, setup, &code, monitor)?.and_then(|(recording, showing)| {
-        let (offset_ns, timing) = (recording.sensor_minus_host_ns, showing.timing);
-        let shown = |slot| showing.made_for(slot);
-        let decoded = decode(&code, &timing, &recording.blocks, offset_ns, &shown).map_err(refused)?;
-        let path = Trajectory::new(&recording.poses);
-        let tips = recording.poses.iter().map(|p| p.place(tip));
+    let settings = |timing: Timing, poses: &[Stamped]| {
+        let tips = poses.iter().map(|p| p.place(tip));
         let volume = Volume::around(tips).ok_or_else(|| refused("the wand was not tracked"))?;
-        let settings = Settings {
+        Ok::<_, Failure>(Settings {
             timing,
             tip,
             tip_sigma_m,
             aperture_m: setup.aperture_m,
-            priors: Priors::many_points(raster),
+            priors: Priors::many_points(raster).with_lens(setup.lens),
             known: setup.known,
             volume,
             seed: 1,
-        };
-        Ok(Sweep { code: code.clone(), decoded, path, settings })
+        })
+    };
+    if setup.is_held {
+        let code = InverseCode::new(raster);
+        let guide = Guide::Rests { hold_s: code.hold_s(1e9 / config.projector.frame_rate.hz()), tip };
+        let source = Arc::new(InverseSource::new(code.clone()));
+        return record(config, setup, (source, guide), monitor)?.and_then(|(recording, showing)| {
+            let blocks = recording.blocks.into_iter();
+            let mapped: Vec<Mapped> =
+                blocks.filter_map(|t| Some((t.block, t.sensor_minus_host_ns?))).collect();
+            let shown = |slot| showing.made_for(slot);
+            let decoded = decode_pairs(&code, &showing.timing, &mapped, &shown).map_err(refused)?;
+            let settings = settings(showing.timing, &recording.poses)?;
+            let seen = SeenCode::Frames(code.clone(), decoded);
+            Ok(Sweep { seen, path: Trajectory::new(&recording.poses), settings })
+        });
+    }
+    let code = Code::new(raster).map_err(refused)?;
+    let guide = Guide::Coverage(Box::new(Coverage::new(code.clone())));
+    let source = Arc::new(CodeSource::new(code.clone()));
+    record(config, setup, (source, guide), monitor)?.and_then(|(recording, showing)| {
+        let (offset_ns, timing) = (recording.sensor_minus_host_ns, showing.timing);
+        let shown = |slot| showing.made_for(slot);
+        let blocks: Vec<Block> = recording.blocks.into_iter().map(|timed| timed.block).collect();
+        let decoded = decode(&code, &timing, &blocks, offset_ns, &shown).map_err(refused)?;
+        let settings = settings(timing, &recording.poses)?;
+        let seen = SeenCode::Planes(Box::new(code.clone()), decoded);
+        Ok(Sweep { seen, path: Trajectory::new(&recording.poses), settings })
     })
 }
 
 fn record(
     config: &RigConfig,
     setup: &Setup,
-    code: &Code,
+    (source, guide): (Arc<dyn PatternSource>, Guide),
     monitor: &Arc<RunMonitor>,
 ) -> Result<Paced<(Recording, Showing)>, Failure> {
     let clock = MonotonicClock::new(0);
@@ -187,7 +181,6 @@ fn record(
     let poses = Poses::start(config, std::slice::from_ref(&setup.wand), clock)?;
     let recorder = Recorder::start(&setup.port, clock)?;
     poses.wait_until_seen()?;
-    let source = Arc::new(CodeSource::new(code.clone()));
     let rate = config.projector.frame_rate;
     let frames = FRAMES.min(setup.seconds * setup.rate_hz);
     let seconds = setup.seconds.max(frames / rate.hz());
@@ -198,19 +191,16 @@ fn record(
             return Ok(Paced::TooFast { carried_hz });
         }
         if setup.has_begun.swap(true, Ordering::Relaxed) {
-            dialogue.tell(&format!("Go on moving for {seconds:.0} s."));
+            dialogue.tell(&format!("Go on for {seconds:.0} s."));
         } else {
-            dialogue.tell(&format!(
-                "Move the wand through the whole beam for {seconds:.0} s, sensor towards the projector, near and far, at \
-                 0.2 to 0.8 m/s,\nand turn it a little all the time."
-            ));
+            dialogue.tell(&guide.task(seconds));
             dialogue.ask("Press Enter to begin.")?;
         }
         poses.take();
         recorder.take();
         let pace = Pace::of(config, monitor);
-        let sweeping = Sweeping { poses: &poses, recorder: &recorder, dialogue: &dialogue, code };
-        sweeping.follow(seconds, 1e9 / rate.hz(), pace, monitor)?.and_then(|(blocks, poses)| {
+        let sweeping = Sweeping { poses: &poses, recorder: &recorder, dialogue: &dialogue };
+        sweeping.follow((seconds, 1e9 / rate.hz()), guide, pace, monitor)?.and_then(|(blocks, poses)| {
             let sensor_minus_host_ns = recorder.sensor_minus_host_ns()?;
             Ok(Recording { blocks, sensor_minus_host_ns, poses })
         })
@@ -219,29 +209,68 @@ fn record(
     recording.and_then(|recording| Ok((recording, Showing::of(&lights, rate)?)))
 }
 
+/// What the operator is told while the wand moves.
+enum Guide {
+    /// How much of the raster was seen.
+    Coverage(Box<Coverage>),
+    /// At how many places the wand was held still for so long, where its tip is in its body.
+    Rests { hold_s: f64, tip: DVec3 },
+}
+
+impl Guide {
+    fn task(&self, seconds: f64) -> String {
+        match self {
+            Self::Coverage(_) => format!(
+                "Move the wand through the whole beam for {seconds:.0} s, sensor towards the projector, near and far, at \
+                 0.2 to 0.8 m/s,\nand turn it a little all the time."
+            ),
+            Self::Rests { hold_s, .. } => format!(
+                "For {seconds:.0} s, hold the wand still for {:.1} s at one place of the beam after another, sensor towards \
+                 the projector, near and far\nand tilted differently at each, and go slowly from one to the next. \
+                 {FEWEST_PLACES} places are needed, twenty are good.",
+                hold_s + 0.5
+            ),
+        }
+    }
+
+    /// What is next, from new samples and all poses.
+    fn next(&mut self, frame_ns: f64, fresh: &[Timed], poses: &[Stamped]) -> String {
+        match self {
+            Self::Coverage(coverage) => {
+                let fresh: Vec<Block> = fresh.iter().map(|timed| timed.block.clone()).collect();
+                match coverage.add(frame_ns, &fresh) {
+                    Ok(_) => coverage.advice(),
+                    Err(why) => why.to_string(),
+                }
+            }
+            Self::Rests { hold_s, tip } => {
+                format!("held still at {} places", places_rested(poses, *tip, *hold_s))
+            }
+        }
+    }
+}
+
 /// Samples and poses.
-type Collected = (Vec<Block>, Vec<Stamped>);
+type Collected = (Vec<Timed>, Vec<Stamped>);
 
 /// What a sweep goes on with.
 struct Sweeping<'a> {
     poses: &'a Poses,
     recorder: &'a Recorder,
     dialogue: &'a Dialogue,
-    code: &'a Code,
 }
 
 impl Sweeping<'_> {
-    /// Collects samples and poses for `seconds`, and says every five how it goes and where to go next.
+    /// Collects samples and poses for some seconds, and says every five how it goes and what is next.
     fn follow(
         &self,
-        seconds: f64,
-        frame_ns: f64,
+        (seconds, frame_ns): (f64, f64),
+        mut guide: Guide,
         mut pace: Pace<'_>,
         monitor: &RunMonitor,
     ) -> Result<Paced<Collected>, Failure> {
         let (begin, mut told) = (Instant::now(), 0);
         let (mut path, mut blocks) = (Vec::new(), Vec::new());
-        let mut coverage = Coverage::new(self.code.clone());
         while begin.elapsed().as_secs_f64() < seconds {
             if monitor.stop_requested() {
                 return Err(refused("the measurement was interrupted; run the same command again"));
@@ -256,20 +285,16 @@ impl Sweeping<'_> {
                 told = fives;
                 let (_, clipped) = self.recorder.counts();
                 let fresh = self.recorder.take();
-                let new = blocks.len();
-                blocks.extend(fresh.into_iter().map(|timed| timed.block));
-                let next = match coverage.add(frame_ns, &blocks[new..]) {
-                    _ if clipped > 0 => {
-                        format!("{clipped} blocks are saturated: turn the sensor's gain down")
-                    }
-                    Ok(_) => coverage.advice(),
-                    Err(why) => why.to_string(),
+                let next = match clipped {
+                    0 => guide.next(frame_ns, &fresh, &path),
+                    _ => format!("{clipped} blocks are saturated: turn the sensor's gain down"),
                 };
+                blocks.extend(fresh);
                 self.dialogue.tell(&format!("{:3} of {seconds:.0} s: {next}", 5 * fives));
             }
         }
         path.extend(self.poses.take().into_iter().flatten());
-        blocks.extend(self.recorder.take().into_iter().map(|timed| timed.block));
+        blocks.extend(self.recorder.take());
         Ok(Paced::Done((blocks, path)))
     }
 }
@@ -340,35 +365,4 @@ pub fn keep_latency(results: &mut Results, config: &RigConfig, wand: &str, l: &L
     let provenance = results.provenance(config, "", data, method);
     let (latency_us, sigma_us) = (1e-3 * l.latency_ns as f64, 1e-3 * l.sigma_ns);
     results.file.latency = Some(LatencySection { latency_us, sigma_us, provenance });
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-    use dpm_device::planes::Raster;
-    use dpm_render::pack::{BitPlaneFrame, Kernel};
-    use dpm_rig::pack::source::PatternPainter;
-
-    #[test]
-    fn the_planes_are_those_of_the_code() {
-        let raster = Raster::new(100, 60).unwrap();
-        let code = Code::new(raster).unwrap();
-        let source = Arc::new(CodeSource::new(code.clone()));
-        let mut planes = BitPlaneFrame::new(raster, PlaneSchedule::equal24());
-        let mut painter = PatternPainter::new(source.clone(), raster);
-        for slot in [0, 1, 2, 3, 5, 8] {
-            painter.draw(Kernel::Scalar, source.picture(7, slot), &mut planes);
-            for plane in 0..PLANES {
-                for (x, y) in [(0, 0), (99, 59), (31, 7), (64, 33), (50, 50)] {
-                    let byte = planes.plane(plane)[y as usize * raster.row_bytes() + x as usize / 8];
-                    let lit = byte >> (7 - x % 8) & 1 == 1;
-                    assert_eq!(
-                        lit,
-                        code.lit(slot, plane, x, y),
-                        "slot {slot}, plane {plane}, pixel {x}, {y}"
-                    );
-                }
-            }
-        }
-    }
 }

@@ -120,6 +120,14 @@ impl RigArgs {
         self.rig_for(path, Purpose { at_rest: true, ..Purpose::default() })
     }
 
+    /// The same for a command that measures what the calibration file will hold.
+    ///
+    /// # Errors
+    /// As [`RigArgs::rig`].
+    pub(super) fn rig_to_calibrate(&self, path: &Path) -> Result<RigConfig, Failure> {
+        self.rig_for(Some(path), Purpose { at_rest: true, calibrates: true, ..Purpose::default() })
+    }
+
     /// Reads the rig file `path` for a command that uses nothing but its projector, until it is stopped: the end of a
     /// run in the file does not matter, and what the scene and the tracker are does not either. `at_rest`: nothing
     /// runs.

@@ -507,14 +507,15 @@ fn calibration(p: &ProjectorConfig, reader: &mut Reader) {
 }
 
 /// Makes the paths of input files relative to `base`, the rig file's folder, and refuses missing files.
-pub(super) fn resolve_files(rig: &mut RigConfig, base: &Path, reader: &mut Reader) {
-    let mut input = |path: &mut PathBuf, key: &str| {
+pub(super) fn resolve_files(rig: &mut RigConfig, base: &Path, purpose: Purpose, reader: &mut Reader) {
+    let mut input = |path: &mut PathBuf, key: &str, is_made: bool| {
         // A path from a flag or a variable is relative to the working directory.
         if path.is_relative() && matches!(reader.origin_of(key), super::Origin::File { .. }) {
             *path = base.join(&*path);
         }
         let problem = match regular_file::open(path) {
             Ok(_) => return,
+            Err(e) if is_made && e.kind() == std::io::ErrorKind::NotFound => return,
             Err(e) => format!("{}: {e}", path.display()),
         };
         let in_file = matches!(reader.origin_of(key), super::Origin::File { .. });
@@ -522,27 +523,28 @@ pub(super) fn resolve_files(rig: &mut RigConfig, base: &Path, reader: &mut Reade
         refuse(reader, &[key], problem, remedy.into());
     };
     if let Some(file) = &mut rig.scene.file {
-        input(file, "scene.file");
+        input(file, "scene.file", false);
     }
     if let Some(file) = &mut rig.projector.calibration {
-        input(file, "projector.calibration");
+        input(file, "projector.calibration", false);
     }
     if let Some(file) = &mut rig.calibration.file {
-        input(file, "calibration.file");
+        input(file, "calibration.file", purpose.calibrates);
     }
     if let Some(file) = &mut rig.projector.flat_field {
-        input(file, "projector.flat_field");
+        input(file, "projector.flat_field", false);
     }
     if let ResponseConfig::Table(table) = &mut rig.projector.response {
-        input(&mut table.file, "projector.response.file");
+        input(&mut table.file, "projector.response.file", false);
     }
     if let EnvironmentConfig::Image(image) = &mut rig.scene.environment {
-        input(&mut image.file, "scene.environment.file");
+        input(&mut image.file, "scene.environment.file", false);
     }
     if let TrackerConfig::Replay(replay) = &mut rig.tracker {
-        input(&mut replay.file, "tracker.file");
+        input(&mut replay.file, "tracker.file", false);
     }
-    if reader.errors.is_empty() {
+    let is_there = rig.calibration.file.as_ref().is_some_and(|file| file.exists());
+    if reader.errors.is_empty() && (is_there || !purpose.calibrates) {
         super::calibration::check(rig, reader);
     }
 }

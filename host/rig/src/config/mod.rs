@@ -129,6 +129,8 @@ pub struct Purpose {
     pub at_rest: bool,
     /// Only the projector is used; see [`RigConfig::keep_projector`].
     pub projector_only: bool,
+    /// What is measured goes into the calibration file, which need not exist yet.
+    pub calibrates: bool,
 }
 
 impl RigConfig {
@@ -278,7 +280,7 @@ impl RigConfig {
                 rig.keep_projector();
             }
             check::check(&rig, purpose, &mut reader);
-            check::resolve_files(&mut rig, base, &mut reader);
+            check::resolve_files(&mut rig, base, purpose, &mut reader);
         }
         if reader.errors.is_empty() {
             Ok(rig)

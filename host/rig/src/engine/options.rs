@@ -40,12 +40,23 @@ pub struct RunOptions {
     pub verify: bool,
     /// Frames in flight at once.
     pub in_flight: usize,
+    /// Tell the operator if frames are rendered more slowly than slots come.
+    pub tells_slow: bool,
     /// A stage that stalls once.
     pub stall: Option<Stall>,
 }
 
 impl Default for RunOptions {
     fn default() -> Self {
-        Self { frames: 0, slots: 0, keep_frames: 0, keep_records: 0, verify: true, in_flight: 4, stall: None }
+        Self {
+            frames: 0,
+            slots: 0,
+            keep_frames: 0,
+            keep_records: 0,
+            verify: true,
+            in_flight: 4,
+            tells_slow: true,
+            stall: None,
+        }
     }
 }

@@ -231,7 +231,7 @@ impl Supervision {
     fn tell_if_slow(&mut self) {
         let stride = self.facts.stride_milli.load(Ordering::Relaxed);
         let is_slow = stride >= SLOW_MILLI;
-        if is_slow == self.told_slow {
+        if is_slow == self.told_slow || !self.facts.options.tells_slow {
             return;
         }
         self.told_slow = is_slow;

@@ -68,6 +68,8 @@ pub fn run_pattern(
         }
         _ => rig,
     };
+    // Nothing renders: a slow link tells of itself by what it carries.
+    let options = RunOptions { tells_slow: false, ..options };
     run_from(rig, &Origin::Pattern(source, clock), options, monitor)
 }
 

@@ -1,7 +1,7 @@
 //! `dpm calibrate light` and `dpm calibrate latency`: what a light sensor tells once the projector is known.
 
 use super::{at_a_rate_that_is_carried, numbers, seconds, tip_and_sigma, Common, SensorArgs};
-use crate::calibrate::light::{self, FlatSource};
+use crate::calibrate::light::{self, FlatSource, Ways};
 use crate::calibrate::results::Results;
 use crate::calibrate::sensor;
 use crate::cli::watch::print;
@@ -62,15 +62,19 @@ impl LightArgs {
             Some(seconds) => Some(self.sweep(&config, &results, seconds)?),
             None => light::load_sweep(&results.sweep())?,
         };
-        let (port, flicker_hz) = (self.sensor_args.port(&self.sensor), 2.0 * f64::from(self.mains));
-        let codes = self.codes;
+        let ways = Ways {
+            port: self.sensor_args.port(&self.sensor),
+            flicker_hz: 2.0 * f64::from(self.mains),
+            codes: self.codes,
+            in_tiles: self.sensor_args.is_held(&config),
+        };
         let progress = Arc::new(Mutex::new(light::Progress::default()));
         let mut paced = config.clone();
         let channels = loop {
-            let (port, progress) = (port.clone(), Arc::clone(&progress));
+            let (ways, progress) = (ways.clone(), Arc::clone(&progress));
             let pass = at_a_rate_that_is_carried(&mut paced, move |config, monitor| {
                 let mut progress = progress.lock().unwrap_or_else(PoisonError::into_inner);
-                light::measure(config, (&port, flicker_hz, codes), &mut progress, monitor)
+                light::measure(config, &ways, &mut progress, monitor)
             })?;
             if let Some(channels) = pass {
                 break channels;
@@ -111,7 +115,7 @@ impl LatencyArgs {
             )));
         }
         let model = section.model().ok_or_else(|| {
-            bad("the projector's lens has more than five coefficients; run `dpm calibrate projector`")
+            bad("the projector's lens has more than twelve coefficients; run `dpm calibrate projector`")
         })?;
         let tip = tip_and_sigma(&results)?;
         let setup =

@@ -12,9 +12,9 @@ use crate::calibrate::recorder::Port;
 use crate::calibrate::results::Results;
 use crate::calibrate::{body, sensor, wand};
 use check::{check, nudge, CheckArgs, NudgeArgs};
-use dpm_calibration::projector::Known;
+use dpm_calibration::projector::{Known, LensTerms};
 use dpm_calibration::rehearsal::{rehearse_with, Bias};
-use dpm_rig::config::RigConfig;
+use dpm_rig::config::{PlaneTiming, RigConfig};
 use dpm_rig::failure::{Failure, FailureKind};
 use dpm_rig::rig::Rig;
 use dpm_rig::telemetry::monitor::RunMonitor;
@@ -81,12 +81,30 @@ struct SensorArgs {
     /// Gain setting of the sensor
     #[arg(long, value_name = "N", default_value_t = 0)]
     gain: u8,
+    /// What is shown: coded planes, or frames and their inverse, for which the wand is held still at one place after another;
+    /// default: frames on a display that is given code values, else planes
+    #[arg(long, value_enum)]
+    code: Option<CodeWord>,
     /// Diameter of the sensor's aperture, millimetres
     #[arg(long, value_name = "MM", default_value_t = 3.0, value_parser = millimetres)]
     aperture: f64,
 }
 
+#[derive(Clone, Copy, Debug, PartialEq, clap::ValueEnum)]
+enum CodeWord {
+    /// 24 binary planes of equal light a frame
+    Planes,
+    /// One black and white picture a frame
+    Frames,
+}
+
 impl SensorArgs {
+    /// Whether frames and their inverse are shown.
+    fn is_held(&self, config: &RigConfig) -> bool {
+        let has_equal_planes = config.projector.plane_timing() == PlaneTiming::Equal;
+        self.code.map_or(!has_equal_planes, |code| code == CodeWord::Frames)
+    }
+
     fn port(&self, path: &str) -> Port {
         Port { path: path.to_owned(), baud: self.sensor_baud, gain: self.gain }
     }
@@ -104,7 +122,9 @@ impl SensorArgs {
             seconds,
             aperture_m: 1e-3 * self.aperture,
             known,
+            lens: LensTerms::Brown,
             rate_hz: config.projector.frame_rate.hz(),
+            is_held: self.is_held(config),
             has_begun: Arc::default(),
         }
     }
@@ -221,13 +241,15 @@ impl Common {
     /// The rig file, of which tracker and projector are used, and its calibration file.
     fn open(&self) -> Result<(RigConfig, Results), Failure> {
         let args = RigArgs { set: self.set.clone(), ..RigArgs::default() };
-        let mut config = args.rig_at_rest(Some(&self.rig))?;
+        let mut config = args.rig_to_calibrate(&self.rig)?;
         // A pattern runs until it is stopped.
         (config.run.frames, config.run.seconds) = (0, 0.0);
         // Its pictures do not follow a body, so none is too old; one that is late must not leave a gap in the light, since
         // gaps are flashes.
         config.safety.predict_ms.get_or_insert(PICTURE_MS);
         let results = Results::open(self.file.as_deref(), &self.rig, &config)?;
+        // One that this command will make has nothing to say yet.
+        config.calibration.file = config.calibration.file.filter(|file| file.exists());
         Ok((config, results))
     }
 }

@@ -9,7 +9,7 @@ use crate::calibrate::results::Results;
 use crate::calibrate::shown::while_shown;
 use crate::calibrate::{light, sensor};
 use crate::cli::watch::{print, watch_quietly};
-use dpm_calibration::projector::{Known, Options, Solved};
+use dpm_calibration::projector::{Known, LensTerms, Options, Solved};
 use dpm_common::clock::MonotonicClock;
 use dpm_rig::config::RigConfig;
 use dpm_rig::failure::Failure;
@@ -30,6 +30,10 @@ pub(super) struct ProjectorArgs {
     /// Direction of the world that points up (x, y or z); catches exchanged axes of a projector that stands upright
     #[arg(long, value_name = "AXIS", value_parser = axis)]
     up: Option<DVec3>,
+    /// Numbers of the lens that are solved for; more of them need points all over the picture, and are refused where the
+    /// points do not tell them
+    #[arg(long, value_enum, default_value = "brown")]
+    lens: LensWord,
     /// Bias of the tracker to reckon with, millimetres along an axis: what no mean removes. The predicted error grows by it
     #[arg(long, value_name = "MM", default_value_t = 0.0, value_parser = super::zero_or_millimetres)]
     bias: f64,
@@ -38,12 +42,32 @@ pub(super) struct ProjectorArgs {
     sensor: Option<String>,
     #[command(flatten)]
     sensor_args: SensorArgs,
-    /// Seconds of motion with the sensor
-    #[arg(long, value_name = "S", default_value_t = 30.0, value_parser = seconds, requires = "sensor")]
-    seconds: f64,
+    /// Seconds of motion with the sensor; default: 30, or 75 where frames and their inverse are shown
+    #[arg(long, value_name = "S", value_parser = seconds, requires = "sensor")]
+    seconds: Option<f64>,
     /// Show nothing and ask for nothing: solve the points of a file, "x y z column row" a line, metres and pixels
     #[arg(long, value_name = "FILE")]
     points: Option<PathBuf>,
+}
+
+#[derive(Clone, Copy, Debug, clap::ValueEnum)]
+enum LensWord {
+    /// k1, k2, p1, p2, k3
+    Brown,
+    /// k4, k5, k6, too: for wide angles
+    Rational,
+    /// s1, s2, s3, s4, too: for lenses that are tilted
+    ThinPrism,
+}
+
+impl LensWord {
+    fn terms(self) -> LensTerms {
+        match self {
+            Self::Brown => LensTerms::Brown,
+            Self::Rational => LensTerms::Rational,
+            Self::ThinPrism => LensTerms::ThinPrism,
+        }
+    }
 }
 
 fn metres(text: &str) -> Result<f64, String> {
@@ -68,7 +92,8 @@ impl ProjectorArgs {
         let (config, results) = self.common.open()?;
         let raster = config.projector.raster();
         let known = Known { distance_m: self.distance, up: self.up };
-        let options = Options { known, ..Options::by_hand(raster) };
+        let by_hand = Options::by_hand(raster);
+        let options = Options { known, priors: by_hand.priors.with_lens(self.lens.terms()), ..by_hand };
         match (&self.sensor, &self.points) {
             (Some(port), _) => self.by_sensor(port, known, &config, results),
             (None, Some(path)) => self.told(results, &config, &solve_file(path, raster, options)?),
@@ -101,7 +126,11 @@ impl ProjectorArgs {
         mut results: Results,
     ) -> Result<(), Failure> {
         let tip = tip_and_sigma(&results)?;
-        let setup = self.sensor_args.setup(port, (&self.common, config), self.seconds, known);
+        let usual = if self.sensor_args.is_held(config) { 75.0 } else { 30.0 };
+        let seconds = self.seconds.unwrap_or(usual);
+        let lens = self.lens.terms();
+        let setup = self.sensor_args.setup(port, (&self.common, config), seconds, known);
+        let setup = sensor::Setup { lens, ..setup };
         let solution = at_a_rate_that_is_carried(&mut config.clone(), move |config, monitor| {
             sensor::calibrate(config, &setup, tip, monitor)
         })?;

@@ -1,0 +1,253 @@
+//! Samples into pairs: which frames they are, and how much of each was lit, at several instants of a frame.
+//!
+//! A display's light comes some frames after the instant that its driver tells, and nobody knows how many. The lag is
+//! found from the light: at the right one, pairs with the same stripes have differences of the same sign from round to
+//! round, once each is taken with the sign of its identity; at any other lag, half of them do.
+
+use super::super::decode::DecodeError;
+use super::super::Timing;
+use super::code::InverseCode;
+use super::record::{Mapped, Record};
+use crate::projector::percentile;
+
+/// Most instants of a frame at which light is compared.
+pub(super) const TICKS: usize = 8;
+/// A frame has an instant for each of so many nanoseconds.
+const TICK_NS: f64 = 2e6;
+/// Lags that are tried, nanoseconds: a display may be a quarter of a second late.
+const LAGS_NS: [f64; 2] = [-40e6, 300e6];
+/// Share of an instant's time at either end that is left out: clocks are known to a tenth of a millisecond.
+const GUARD: f64 = 0.1;
+/// Light of an instant of the frame counts if it reaches this share of the brightest one's.
+const LEAST_LIGHT: f64 = 0.25;
+/// A pair counts when its contrast reaches this share of the usual one.
+const LEAST_CONTRAST: f64 = 0.15;
+/// A level is not more than so far outside 0 to 1.
+const MOST_BEYOND: f64 = 0.25;
+/// Fewest pairs.
+const FEWEST: usize = 60;
+
+/// A pair as the sensor saw it.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Pair {
+    /// Its number.
+    pub number: u64,
+    /// When the frame with the stripes began, and the one with the inverse, by the host's clock less the lag.
+    pub begins_ns: [i64; 2],
+    /// Share of the stripes' light at each instant, the mean of both frames: 0 to 1. `None` where there is no light.
+    pub levels: [Option<f64>; TICKS],
+    /// Stripes less inverse where all is lit, in the sensor's unit.
+    pub contrast: f64,
+}
+
+impl Pair {
+    /// The mean level.
+    pub fn level(&self) -> f64 {
+        let (sum, count) =
+            self.levels.iter().flatten().fold((0.0, 0.0), |(s, n), level| (s + level, n + 1.0));
+        sum / f64::max(count, 1.0)
+    }
+}
+
+/// What the samples say.
+#[derive(Clone, Debug)]
+pub struct DecodedPairs {
+    /// Pairs that are whole and lit, in order.
+    pub pairs: Vec<Pair>,
+    /// Pairs during which the sensor was covered, or outside the picture.
+    pub dropped: usize,
+    /// How much later than told the light came, nanoseconds.
+    pub lag_ns: f64,
+    /// Pairs of a hundred whose sign agrees with that of their stripes in the next round.
+    pub identity_percent: f64,
+    /// Instants of a frame.
+    pub ticks: usize,
+    /// Length of a frame, nanoseconds.
+    pub frame_ns: f64,
+}
+
+/// When the two frames of a pair began by the projector's report, nanoseconds after the first sample.
+#[derive(Clone, Copy)]
+struct Shown {
+    pair: u64,
+    begins_ns: [f64; 2],
+}
+
+/// Decodes a recording. `shown` tells which frame's picture each slot showed: the slot's own, unless that frame was late or
+/// never came.
+///
+/// # Errors
+/// [`DecodeError::NoSamples`], [`DecodeError::NotFinite`], [`DecodeError::NoLight`], and [`DecodeError::NoIdentity`] where
+/// the samples are not those of the code.
+pub fn decode_pairs(
+    code: &InverseCode,
+    timing: &Timing,
+    blocks: &[Mapped],
+    shown: &dyn Fn(u64) -> u64,
+) -> Result<DecodedPairs, DecodeError> {
+    if let Some(bad) = blocks.iter().position(|(b, _)| !b.levels.iter().all(|l| l.is_finite())) {
+        return Err(DecodeError::NotFinite(bad));
+    }
+    let record = Record::new(blocks).ok_or(DecodeError::NoSamples)?;
+    let pairs = shown_pairs(timing, &record, shown);
+    let search = Search { code, record: &record, pairs: &pairs, frame_ns: timing.frame_ns };
+    let (lag_ns, identity_percent) = search.lag()?;
+    let ticks = ((timing.frame_ns / TICK_NS).round() as usize).clamp(2, TICKS);
+    let raw: Vec<(Shown, [Option<f64>; TICKS])> =
+        pairs.iter().map(|p| (*p, search.differences(p, lag_ns, ticks))).collect();
+    let (levels, dropped) = levels(code, &record, &raw);
+    Ok(DecodedPairs { pairs: levels, dropped, lag_ns, identity_percent, ticks, frame_ns: timing.frame_ns })
+}
+
+/// The pairs of which both frames were shown, with the first slot of each.
+fn shown_pairs(timing: &Timing, record: &Record, shown: &dyn Fn(u64) -> u64) -> Vec<Shown> {
+    let begin = (record.base_ns.saturating_sub(timing.frame_zero_ns)) as f64;
+    let slot = |ns: f64| ((begin + ns) / timing.frame_ns).max(0.0) as u64;
+    let slots = slot(-LAGS_NS[1])..slot(record.length_ns() - LAGS_NS[0]);
+    let mut before = None;
+    let fresh: Vec<(u64, u64)> = slots
+        .filter_map(|slot| {
+            let frame = shown(slot);
+            (before.replace(frame) != Some(frame)).then_some((frame, slot))
+        })
+        .collect();
+    let of_slot = |slot: u64| slot as f64 * timing.frame_ns - begin;
+    let pair = |w: &[(u64, u64)]| {
+        let [(first, a), (second, b)] = [w[0], w[1]];
+        (first % 2 == 0 && second == first + 1 && b - a <= 4)
+            .then(|| Shown { pair: first / 2, begins_ns: [of_slot(a), of_slot(b)] })
+    };
+    fresh.windows(2).filter_map(pair).collect()
+}
+
+struct Search<'a> {
+    code: &'a InverseCode,
+    record: &'a Record,
+    pairs: &'a [Shown],
+    frame_ns: f64,
+}
+
+impl Search<'_> {
+    /// First frame less second one, with the sign of the identity: stripes less inverse.
+    fn difference(&self, pair: &Shown, from_ns: f64, until_ns: f64) -> Option<f64> {
+        let [a, b] = pair.begins_ns.map(|begin| self.record.mean(begin + from_ns, begin + until_ns));
+        let difference = a? - b?;
+        Some(if self.code.is_inverse(2 * pair.pair) { -difference } else { difference })
+    }
+
+    /// Sum over pairs of the product of their differences in one round and in the next, and the sum of its sizes.
+    fn agreement(&self, lag_ns: f64) -> (f64, f64) {
+        let all: Vec<Option<f64>> =
+            self.pairs.iter().map(|p| self.difference(p, lag_ns, lag_ns + self.frame_ns)).collect();
+        let round = self.code.pairs() as u64;
+        let mut next = 0;
+        let mut sums = (0.0, 0.0);
+        for (pair, now) in self.pairs.iter().zip(&all) {
+            while self.pairs.get(next).is_some_and(|p| p.pair < pair.pair + round) {
+                next += 1;
+            }
+            let is_same = self.pairs.get(next).is_some_and(|p| p.pair == pair.pair + round);
+            let later = all.get(next).copied().flatten().filter(|_| is_same);
+            if let Some(product) = now.zip(later).map(|(a, b)| a * b) {
+                sums = (sums.0 + product, sums.1 + product.abs());
+            }
+        }
+        sums
+    }
+
+    /// The lag, and the agreement at it, percent.
+    fn lag(&self) -> Result<(f64, f64), DecodeError> {
+        let best = |from: f64, until: f64, step: f64| {
+            let count = ((until - from) / step) as usize + 1;
+            let all = (0..count).map(|i| from + i as f64 * step);
+            let scored = all.map(|lag| (self.agreement(lag).0, lag));
+            scored.max_by(|a, b| a.0.total_cmp(&b.0)).map_or(0.0, |(_, lag)| lag)
+        };
+        let coarse = self.frame_ns / 6.0;
+        let mut lag = best(LAGS_NS[0], LAGS_NS[1], coarse);
+        let mut step = coarse;
+        while step > 1e5 {
+            (lag, step) = (best(lag - step, lag + step, 0.25 * step), 0.25 * step);
+        }
+        let (sum, size) = self.agreement(lag);
+        if size <= 0.0 {
+            return Err(DecodeError::NoLight);
+        }
+        let percent = 50.0 + 50.0 * sum / size;
+        if self.pairs.len() < FEWEST || percent < 80.0 {
+            return Err(DecodeError::NoIdentity { percent });
+        }
+        Ok((lag, percent))
+    }
+
+    /// Stripes less inverse at each instant of the frame.
+    fn differences(&self, pair: &Shown, lag_ns: f64, ticks: usize) -> [Option<f64>; TICKS] {
+        let tick = self.frame_ns / ticks as f64;
+        std::array::from_fn(|i| {
+            let begin = lag_ns + i as f64 * tick;
+            let seen = || self.difference(pair, begin + GUARD * tick, begin + (1.0 - GUARD) * tick);
+            (i < ticks).then(seen).flatten()
+        })
+    }
+}
+
+/// Differences into levels: over the light of the instant within a frame, and over the contrast around the pair.
+fn levels(code: &InverseCode, record: &Record, raw: &[(Shown, [Option<f64>; TICKS])]) -> (Vec<Pair>, usize) {
+    let is_wide = |pair: u64| code.is_wide(&code.stripe(code.index(pair)));
+    let wide: Vec<&(Shown, [Option<f64>; TICKS])> = raw.iter().filter(|(s, _)| is_wide(s.pair)).collect();
+    let size = |i: usize| {
+        let all = wide.iter().filter_map(|(_, d)| d[i].map(f64::abs));
+        percentile(all.collect(), 0.7)
+    };
+    let sizes: [f64; TICKS] = std::array::from_fn(size);
+    let brightest = sizes.iter().copied().fold(1e-12, f64::max);
+    let light = sizes.map(|s| (s >= LEAST_LIGHT * brightest).then_some(s / brightest));
+    let over_light = |d: &[Option<f64>; TICKS]| -> [Option<f64>; TICKS] {
+        std::array::from_fn(|i| Some(d[i]? / light[i]?))
+    };
+    let contrasts: Vec<(u64, f64)> = wide
+        .iter()
+        .map(|(s, d)| (s.pair, percentile(over_light(d).iter().flatten().map(|v| v.abs()).collect(), 0.5)))
+        .collect();
+    let contrasts = without_strays(&contrasts);
+    let around = |pair: u64| between(&contrasts, pair, code.pairs() as u64);
+    let usual = percentile(contrasts.iter().map(|(_, c)| *c).collect(), 0.5);
+    let pair = |(shown, d): &(Shown, [Option<f64>; TICKS])| {
+        let contrast = around(shown.pair)?;
+        if contrast <= LEAST_CONTRAST * usual {
+            return None;
+        }
+        let levels = over_light(d).map(|v| Some(0.5 + 0.5 * v? / contrast));
+        let is_sound = |level: &f64| (-MOST_BEYOND..=1.0 + MOST_BEYOND).contains(level);
+        if !levels.iter().flatten().all(is_sound) || levels.iter().flatten().next().is_none() {
+            return None;
+        }
+        let mut begins_ns = shown.begins_ns.map(|b| record.base_ns.saturating_add(b.round() as i64));
+        if code.is_inverse(2 * shown.pair) {
+            begins_ns.swap(0, 1);
+        }
+        Some(Pair { number: shown.pair, begins_ns, levels, contrast })
+    };
+    let pairs: Vec<Pair> = raw.iter().filter_map(pair).collect();
+    let dropped = raw.len() - pairs.len();
+    (pairs, dropped)
+}
+
+/// Each number, or the median of its neighbours and itself: a sensor that is covered for a moment, or that crosses the
+/// border of a wide stripe, must not dim the pairs around.
+fn without_strays(all: &[(u64, f64)]) -> Vec<(u64, f64)> {
+    let middle = |w: &[(u64, f64)]| (w[1].0, percentile(w.iter().map(|(_, c)| *c).collect(), 0.5));
+    all.windows(3).map(middle).collect()
+}
+
+/// The contrast at a pair, on the line between those before and after it; `None` where these are further apart than `most`.
+fn between(all: &[(u64, f64)], pair: u64, most: u64) -> Option<f64> {
+    let after = all.partition_point(|(p, _)| *p < pair);
+    let (b, last) = *all.get(after)?;
+    if b == pair {
+        return Some(last);
+    }
+    let (a, first) = *all.get(after.checked_sub(1)?)?;
+    let share = (pair - a) as f64 / (b - a) as f64;
+    (b - a <= most).then_some(first + share * (last - first))
+}

@@ -1,0 +1,223 @@
+//! Calibration of a projector that holds a picture for a whole frame, as displays do: the code whose pictures are followed
+//! by their inverse, against the mock's photodiode.
+
+use dpm_calibration::projector::{Known, Priors, Volume};
+use dpm_calibration::sensor::{
+    decode_pairs, solve_latency_of_pairs, solve_pairs, Block, DecodeError, DecodedPairs, InverseCode, Mapped,
+    SensorError, Settings, Solution, Timing,
+};
+use dpm_calibration::trajectory::{Stamped, Trajectory};
+use dpm_common::so3::so3_exp;
+use dpm_device::light::{LightEvent, LightKind};
+use dpm_device::planes::{Channel, PlaneSchedule, PlaneSpec, Raster};
+use dpm_device::pose::Pose;
+use dpm_device::rng::Draws;
+use dpm_device::time::{DeviceTicks, HostTime};
+use glam::{DQuat, DVec3};
+use hil_mock::hand::{Hand, Order};
+use hil_mock::motion::Motion;
+use hil_mock::projector::Shown;
+use hil_mock::sensor_wand::{ProjectorOptics, SensorWand, SensorWandConfig};
+use std::sync::Arc;
+
+/// The mock's tip.
+const TIP: [f64; 3] = [0.01, -0.005, 0.12];
+/// Samples a second: a display needs no more.
+const SAMPLES: u32 = 20_000;
+
+/// A display-like projector, with what only the mock knows.
+#[derive(Clone, Copy)]
+struct Rig {
+    raster: Raster,
+    frame_ns: f64,
+    optics: ProjectorOptics,
+    /// How much later the light falls than the display says, and a pose is stamped than it was taken, nanoseconds.
+    light_lag_ns: i64,
+    tracker_latency_ns: i64,
+    seed: u64,
+}
+
+impl Rig {
+    fn new(width: u32, height: u32, hz: f64, seed: u64) -> Self {
+        let straight = ProjectorOptics::along_z([0.05, 0.1, 1.4], 1.75 * f64::from(width), width, height);
+        let optics = ProjectorOptics { brown: [-0.06, 0.02, 0.0005, -0.0003, 0.0], ..straight };
+        let raster = Raster::new(width, height).unwrap();
+        let (light_lag_ns, tracker_latency_ns) = (43_700_000, 5_300_000);
+        Self { raster, frame_ns: 1e9 / hz, optics, light_lag_ns, tracker_latency_ns, seed }
+    }
+
+    fn timing(&self) -> Timing {
+        Timing { frame_zero_ns: 1_000_000_123, frame_ns: self.frame_ns }
+    }
+
+    /// Samples on the sensor's clock, each block with the difference of the clocks, and poses of a hand that rests at one
+    /// place after another.
+    fn record(&self, code: &InverseCode, hand: &Arc<Hand>, seconds: f64) -> (Vec<Mapped>, Vec<Stamped>) {
+        let config = SensorWandConfig {
+            seed: self.seed,
+            tip_m: TIP,
+            samples_per_second: SAMPLES,
+            is_held: true,
+            obstructed: 0.0,
+            ..SensorWandConfig::new(self.optics)
+        };
+        let still = Motion::still(Pose::IDENTITY).unwrap();
+        let mut wand = SensorWand::new(config, still, self.raster).unwrap().held_by(hand.clone());
+        // Full white fills two thirds of the converter's range.
+        wand.set_gain(0.25);
+        let schedule = PlaneSchedule::new(&[PlaneSpec { channel: Channel::White, bit: 7 }]).unwrap();
+        let pictures: Vec<[Arc<[u8]>; 2]> =
+            (0..code.pairs()).map(|i| [false, true].map(|inverse| self.picture(code, i, inverse))).collect();
+        let mut samples = Vec::new();
+        let timing = self.timing();
+        for slot in 0..(1e9 * seconds / self.frame_ns) as u64 {
+            let at = |frames: f64| HostTime(timing.instant(slot, 24.0 * frames).0 + self.light_lag_ns);
+            let event = LightEvent {
+                slot,
+                frame: Some(slot as u32),
+                kind: LightKind::Lit,
+                lit_at: DeviceTicks(0),
+                first_photon_at: at(0.0),
+                last_photon_at: at(1.0),
+            };
+            let picture = &pictures[code.index(slot / 2)][usize::from(code.is_inverse(slot))];
+            let shown = Shown { event, planes_end_at: at(1.0), schedule, planes: picture.clone() };
+            wand.shine(&shown, &mut |sample| samples.push(sample));
+        }
+        let mut blocks = Vec::new();
+        for part in samples.chunks(250) {
+            let levels = part.iter().map(|s| f32::from(s.level)).collect();
+            // The sensor counts microseconds; an echo tells its clock to 50 us.
+            let start_ns = part[0].ticks as i64 * 1000;
+            let truly = wand.sampled_at_ns(part[0].number) as i64;
+            let echo_ns = (50e3 * Draws::new(self.seed).stream(3).normal(part[0].number)) as i64;
+            let interval_ns = 1e9 / f64::from(SAMPLES);
+            blocks.push((Block { start_ns, interval_ns, levels }, start_ns - truly + echo_ns));
+        }
+        (blocks, self.poses(hand, seconds))
+    }
+
+    fn picture(&self, code: &InverseCode, index: usize, inverse: bool) -> Arc<[u8]> {
+        let (stripe, row_bytes) = (code.stripe(index), self.raster.row_bytes());
+        let mut planes = vec![0u8; self.raster.plane_bytes()];
+        for y in 0..self.raster.height() {
+            for x in (0..self.raster.width()).filter(|x| stripe.lit(*x, y) != inverse) {
+                planes[y as usize * row_bytes + x as usize / 8] |= 0x80 >> (x % 8);
+            }
+        }
+        planes.into()
+    }
+
+    fn poses(&self, hand: &Hand, seconds: f64) -> Vec<Stamped> {
+        let draws = Draws::new(self.seed).stream(9);
+        let normal = |i: u64| DVec3::from_array(draws.normal3(i));
+        (0..(240.0 * (seconds + 3.0)) as u64)
+            .map(|i| {
+                let at = (i as f64 * 1e9 / 240.0) as i64;
+                let pose = hand.pose_at(at);
+                let turn = DQuat::from_array(pose.rotation_xyzw);
+                Stamped {
+                    stamp_ns: at + self.tracker_latency_ns,
+                    position: DVec3::from_array(pose.position_m) + 1e-4 * normal(2 * i),
+                    rotation: so3_exp(0.05f64.to_radians() * normal(2 * i + 1)) * turn,
+                }
+            })
+            .collect()
+    }
+
+    fn settings(&self) -> Settings {
+        Settings {
+            timing: self.timing(),
+            // As a pivot finds it.
+            tip: DVec3::from_array(TIP) + DVec3::new(1e-4, -5e-5, 1e-4),
+            tip_sigma_m: 1e-4,
+            aperture_m: 2.5e-3,
+            priors: Priors::many_points(self.raster),
+            known: Known::default(),
+            volume: Volume { low: DVec3::new(-0.2, -0.15, -0.03), high: DVec3::new(0.2, 0.15, 0.27) },
+            seed: 1,
+        }
+    }
+
+    /// Median and 99th percentile of the distance of light from where it belongs, pixels.
+    fn errors(&self, solution: &Solution) -> [f64; 2] {
+        let volume = self.settings().volume;
+        let mut errors: Vec<f64> = (0..1000u32)
+            .map(|i| {
+                let share = |k: u32| f64::from(i / k % 10) / 9.0;
+                let world =
+                    volume.low + DVec3::new(share(1), share(10), share(100)) * (volume.high - volume.low);
+                let should = self.optics.pixel_of(world.to_array()).unwrap();
+                let is = solution.model.project(world).unwrap();
+                (is.x - should[0]).hypot(is.y - should[1])
+            })
+            .collect();
+        errors.sort_by(f64::total_cmp);
+        [errors[500], errors[989]]
+    }
+}
+
+fn visiting() -> Arc<Hand> {
+    let hand = Hand::new(Motion::still(Pose::IDENTITY).unwrap(), TIP);
+    hand.tell(0, Order::Visit);
+    Arc::new(hand)
+}
+
+fn decoded(rig: &Rig, code: &InverseCode, blocks: &[Mapped]) -> Result<DecodedPairs, DecodeError> {
+    decode_pairs(code, &rig.timing(), blocks, &|slot| slot)
+}
+
+/// The last word is what a display of this size and rate reaches with a tracker's noise of 0.1 mm and 0.05 degrees.
+#[test]
+fn a_display_is_found_from_pictures_and_their_inverse() {
+    for (width, height, hz, seconds) in [(1024, 768, 60.0, 60.0), (960, 540, 120.0, 36.0)] {
+        let rig = Rig::new(width, height, hz, 3);
+        let code = InverseCode::new(rig.raster);
+        let (blocks, poses) = rig.record(&code, &visiting(), seconds);
+        let decoded = decoded(&rig, &code, &blocks).unwrap();
+        let late = (decoded.lag_ns - rig.light_lag_ns as f64).abs();
+        assert!(late < 1e5, "the display's lag is off by {late} ns");
+        let path = Trajectory::new(&poses);
+        let solution = solve_pairs(&code, &decoded, &path, &rig.settings()).unwrap();
+        let [p50, p99] = rig.errors(&solution);
+        let predicted = solution.predicted.p99_px;
+        let both_ns = rig.light_lag_ns + rig.tracker_latency_ns;
+        let late_us = 1e-3 * (solution.latency_ns - both_ns) as f64;
+        println!(
+            "{width} x {height} at {hz} Hz: {p50:.3} px median, {p99:.3} px 99th percentile, {predicted:.3} px \
+             predicted; latency off by {late_us:.0} us, rms {:.3} px",
+            solution.rms_px
+        );
+        assert!(p99 < predicted && predicted < 1.5, "{p99} px, predicted {predicted} px");
+        assert!(late_us.abs() < 200.0 && solution.latency_sigma_ns < 2e5, "{late_us} us");
+        let known = solve_latency_of_pairs(&code, &decoded, &path, &rig.settings(), &solution.model).unwrap();
+        assert!((known.latency_ns - solution.latency_ns).abs() < 100_000, "{known:?}");
+        // A projector that was moved is not taken for a latency.
+        let mut moved = solution.model;
+        moved.centre.x += 25.0;
+        let told = solve_latency_of_pairs(&code, &decoded, &path, &rig.settings(), &moved).unwrap_err();
+        assert!(matches!(told, SensorError::OtherProjector { .. }), "{told}");
+    }
+}
+
+#[test]
+fn what_is_no_code_and_a_hand_that_never_rests_are_refused_by_name() {
+    let rig = Rig::new(256, 192, 60.0, 5);
+    let code = InverseCode::new(rig.raster);
+    let (blocks, poses) = rig.record(&code, &visiting(), 20.0);
+    let seen = decoded(&rig, &code, &blocks).unwrap();
+    let few = solve_pairs(&code, &seen, &Trajectory::new(&poses), &rig.settings()).unwrap_err();
+    assert!(matches!(few, SensorError::TooFewPlaces { places: 4..=7, .. }), "{few}");
+    // Clocks that are a second apart, another raster's code, darkness, no samples.
+    let far: Vec<Mapped> = blocks.iter().map(|(b, offset)| (b.clone(), offset + 1_000_000_000)).collect();
+    let other = InverseCode::new(Raster::new(1920, 1080).unwrap());
+    for told in [decoded(&rig, &code, &far), decoded(&rig, &other, &blocks)] {
+        assert!(matches!(told, Err(DecodeError::NoIdentity { .. })), "{told:?}");
+    }
+    let dark: Vec<Mapped> = blocks
+        .iter()
+        .map(|(b, offset)| (Block { levels: vec![0.25; b.levels.len()], ..b.clone() }, *offset))
+        .collect();
+    assert_eq!(decoded(&rig, &code, &dark).unwrap_err(), DecodeError::NoLight);
+    assert_eq!(decoded(&rig, &code, &[]).unwrap_err(), DecodeError::NoSamples);
+}
