@@ -27,6 +27,7 @@ pub mod method;
 mod optics;
 pub mod pack;
 mod passes;
+mod plan;
 pub mod rate_table;
 mod renderer;
 mod resources;
@@ -38,6 +39,7 @@ mod slot;
 pub mod tiles;
 
 pub use passes::PASSES;
+pub use plan::{Program, RendererPlan};
 pub use renderer::Renderer;
 pub use scene_data::Keep;
 pub use settings::{FrameInputs, Output, RenderError, RendererSettings};

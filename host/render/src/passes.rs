@@ -17,6 +17,8 @@ pub(super) struct Pass {
     pub when: fn(&RendererSettings, Keep) -> bool,
     /// How many workgroups run.
     pub grid: Grid,
+    /// Its rays walk through the scene.
+    pub walks: bool,
 }
 
 /// The shader of a pass.
@@ -69,6 +71,7 @@ pub(super) const TABLE: [Pass; 10] = [
         }),
         when: |_, _| true,
         grid: Grid::Tiles,
+        walks: true,
     },
     Pass {
         name: "reproject",
@@ -86,6 +89,7 @@ pub(super) const TABLE: [Pass; 10] = [
         },
         when: |s, _| s.method.needs_history(),
         grid: Grid::Tiles,
+        walks: false,
     },
     Pass {
         name: "rate map",
@@ -96,6 +100,7 @@ pub(super) const TABLE: [Pass; 10] = [
         }),
         when: |s, keep| s.method.needs_rates() || keep.rate_map && s.method.needs_history(),
         grid: Grid::Rates,
+        walks: false,
     },
     Pass {
         name: "schedule",
@@ -113,6 +118,7 @@ pub(super) const TABLE: [Pass; 10] = [
         },
         when: |_, _| true,
         grid: Grid::Tiles,
+        walks: false,
     },
     Pass {
         name: "trace",
@@ -123,6 +129,7 @@ pub(super) const TABLE: [Pass; 10] = [
         }),
         when: |_, _| true,
         grid: Grid::Work,
+        walks: true,
     },
     Pass {
         name: "accumulate",
@@ -140,6 +147,7 @@ pub(super) const TABLE: [Pass; 10] = [
         },
         when: |s, _| s.method.needs_history(),
         grid: Grid::Tiles,
+        walks: false,
     },
     Pass {
         name: "spatial",
@@ -157,6 +165,7 @@ pub(super) const TABLE: [Pass; 10] = [
         },
         when: |s, _| s.method.needs_spatial(),
         grid: Grid::Tiles,
+        walks: false,
     },
     Pass {
         name: "compensate",
@@ -167,6 +176,7 @@ pub(super) const TABLE: [Pass; 10] = [
         }),
         when: |_, _| true,
         grid: Grid::Tiles,
+        walks: false,
     },
     Pass {
         name: "halftone",
@@ -177,12 +187,14 @@ pub(super) const TABLE: [Pass; 10] = [
         }),
         when: |s, _| s.halftone.is_some(),
         grid: Grid::Tiles,
+        walks: false,
     },
     Pass {
         name: "pack",
         code: Code::OfAll(Kernel { shader: |_| shaders::PACK, reads: &["B_CODES"], writes: &["B_PLANES"] }),
         when: |s, _| s.output.schedule().is_some(),
         grid: Grid::Planes,
+        walks: false,
     },
 ];
 

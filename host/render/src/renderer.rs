@@ -6,15 +6,14 @@ use super::last_frame::{LastFrame, Turn};
 use super::memory::SharedBuffers;
 use super::optics::OpticsLayout;
 use super::passes::{Grid, PASSES, TABLE};
+use super::plan::{Pipelines, RendererPlan};
 use super::resources::Resources;
 use super::scene_data::{world_bounds, Keep, SceneData};
 use super::scene_gpu::SceneGpu;
 use super::settings::{FrameInputs, RenderError, RendererSettings};
 use super::slot::FrameSlot;
 use super::tiles::TileList;
-use crate::gpu::{
-    BindingKind, BindingSet, BindingTable, CommandList, ComputePipeline, FrameFence, Gpu, GpuError, Recorder,
-};
+use crate::gpu::{BindingSet, CommandList, FrameFence, Gpu, GpuError, Recorder};
 use crate::pack;
 use bytemuck::Zeroable;
 use dpm_scene::Scene;
@@ -47,16 +46,6 @@ pub struct Renderer {
     tile_list: TileList,
     optics: OpticsLayout,
     pub(super) gpu: Arc<Gpu>,
-}
-
-/// What a renderer is made from, without a device. It is kept so that the renderer can be made again on another device without preparing the
-/// scene again. Cheap to clone.
-#[derive(Clone)]
-pub struct RendererPlan {
-    data: Arc<SceneData>,
-    settings: RendererSettings,
-    keep: Keep,
-    tracked: Vec<Option<u16>>,
 }
 
 /// `tracked`: for each body of the scene the tracked body that carries it.
@@ -93,9 +82,7 @@ impl Renderer {
         settings: RendererSettings,
         keep: Keep,
     ) -> Result<Self, RenderError> {
-        let data = Arc::new(SceneData::build(scene)?);
-        let tracked = scene.bodies.iter().map(|b| b.tracked).collect();
-        Self::from_plan(gpu, &RendererPlan { data, settings, keep, tracked })
+        Self::from_plan(gpu, &RendererPlan::new(scene, settings, keep)?)
     }
 
     /// What this renderer was made from.
@@ -115,37 +102,9 @@ impl Renderer {
     pub fn from_plan(gpu: &Arc<Gpu>, plan: &RendererPlan) -> Result<Self, RenderError> {
         let RendererPlan { data, settings, keep, tracked } = plan.clone();
         let shared = SharedBuffers::new(gpu, &settings)?;
-        let texel = gpu.summary().software && !keep.storage_tables;
-        let scene_gpu = SceneGpu::new(gpu, &data, texel)?;
-        let mut needs = data.needs.with(keep.needs);
-        needs.clamp |= settings.clamp_indirect.is_some();
-        if settings.leave_nothing_out {
-            needs = needs.everything();
-        }
-        use BindingKind::{Storage, Texel};
-        // The second bindings of a buffer, as texels, are bound only for shaders that read tables so, because devices bind a limited number.
-        let kinds: Vec<_> = gpu_structs::BINDINGS
-            .iter()
-            .filter(|(name, _)| texel || !name.ends_with("_ROWS"))
-            .map(|&(name, binding)| {
-                let rows = texel && gpu_structs::TEXEL_BINDINGS.contains(&name);
-                (binding, if rows { Texel } else { Storage })
-            })
-            .collect();
-        let table = BindingTable::new(gpu, &kinds)?;
-        let mut constants = needs.constants();
-        constants.extend(settings.method.constants());
+        let scene_gpu = SceneGpu::new(gpu, &data, plan.reads_texels(gpu))?;
         let optics = OpticsLayout::new(settings.raster, &settings.drive, settings.lens.as_ref());
-        constants.extend(optics.constants());
-        let pipelines = (TABLE.iter())
-            .map(|pass| {
-                let wanted = (pass.when)(&settings, keep);
-                let constants = pass.constants(&constants, &settings);
-                wanted
-                    .then(|| ComputePipeline::new(&table, pass.shader(&settings.method, texel), &constants))
-                    .transpose()
-            })
-            .collect::<Result<Vec<_>, _>>()?;
+        let Pipelines { table, each: pipelines } = plan.pipelines(gpu)?;
         let decides_rates =
             TABLE.iter().zip(&pipelines).any(|(pass, p)| pass.grid == Grid::Rates && p.is_some());
         let last = LastFrame::none(tracked.len());

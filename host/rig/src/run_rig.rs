@@ -152,6 +152,7 @@ pub fn open_gpu(config: &RigConfig) -> Result<Arc<Gpu>, Failure> {
     let options = GpuOptions {
         validation: std::env::var_os("DPM_VALIDATION").is_some(),
         device: config.render.gpu.clone(),
+        ..GpuOptions::default()
     };
     Gpu::open(&options).map_err(|e| Failure::new(FailureKind::NoGpu, e))
 }

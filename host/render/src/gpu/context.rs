@@ -22,6 +22,9 @@ pub struct GpuOptions {
     pub validation: bool,
     /// Part of the name of the device to use; `None`: the fastest kind there is.
     pub device: Option<String>,
+    /// The driver keeps what its compiler made of each pipeline, for [`super::ComputePipeline::executables`]. Devices whose driver cannot are
+    /// refused.
+    pub statistics: bool,
 }
 
 /// A device as `dpm doctor` lists it.
@@ -98,6 +101,8 @@ pub struct Gpu {
     name: Arc<str>,
     pub(super) id: DeviceId,
     pub(super) options: GpuOptions,
+    /// Calls that ask what the compiler made of a pipeline, if the options asked for them.
+    pub(super) statistics: Option<khr::pipeline_executable_properties::Device>,
     instance: ManuallyDrop<Instance>,
     /// One of [`State`].
     state: AtomicU8,
@@ -430,10 +435,19 @@ impl Gpu {
             .queue_family_index(queue_family)
             .queue_priorities(&priorities)];
         let mut vulkan12 = vk::PhysicalDeviceVulkan12Features::default().scalar_block_layout(true);
-        let info = vk::DeviceCreateInfo::default().queue_create_infos(&queues).push_next(&mut vulkan12);
+        let mut info = vk::DeviceCreateInfo::default().queue_create_infos(&queues).push_next(&mut vulkan12);
+        let mut executable = vk::PhysicalDevicePipelineExecutablePropertiesFeaturesKHR::default()
+            .pipeline_executable_info(true);
+        let extensions = [khr::pipeline_executable_properties::NAME.as_ptr()];
+        if options.statistics {
+            info = info.enabled_extension_names(&extensions).push_next(&mut executable);
+        }
         // SAFETY: `info` and what it points to live until the call returns.
         let device = unsafe { instance.create_device(physical, &info, None) }
             .map_err(|e| GpuError::from_result(e, "opening the Vulkan device", &name, summary.memory_mib))?;
+        let statistics = options
+            .statistics
+            .then(|| khr::pipeline_executable_properties::Device::new(&instance.handle, &device));
         // SAFETY: family and index were asked for above.
         let queue = unsafe { device.get_device_queue(queue_family, 0) };
         // SAFETY: plain queries.
@@ -454,6 +468,7 @@ impl Gpu {
             name,
             id,
             options: options.clone(),
+            statistics,
             instance: ManuallyDrop::new(instance),
             state: AtomicU8::new(State::Well as u8),
             held_bytes: AtomicU64::new(0),

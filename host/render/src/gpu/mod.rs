@@ -16,6 +16,7 @@ mod error;
 mod loss;
 mod pipeline;
 mod reopen;
+mod statistics;
 mod turn;
 
 pub use buffer::{Buffer, MemoryKind};
@@ -25,3 +26,4 @@ pub use context::{memory_given_up, validation_messages, DeviceSummary, Gpu, GpuO
 pub use error::{GpuError, MemoryPool};
 pub use loss::{AfterLoss, LossBudget};
 pub use pipeline::{BindingKind, BindingSet, BindingTable, ComputePipeline};
+pub use statistics::Executable;

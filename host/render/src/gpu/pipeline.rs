@@ -33,7 +33,7 @@ pub struct BindingTable {
     layout: vk::DescriptorSetLayout,
     pipeline_layout: vk::PipelineLayout,
     bindings: Vec<(u32, BindingKind)>,
-    gpu: Arc<Gpu>,
+    pub(super) gpu: Arc<Gpu>,
 }
 
 impl BindingTable {
@@ -154,7 +154,7 @@ impl Drop for BindingSet {
 pub struct ComputePipeline {
     pub(super) pipeline: vk::Pipeline,
     pub(super) layout: vk::PipelineLayout,
-    table: Arc<BindingTable>,
+    pub(super) table: Arc<BindingTable>,
 }
 
 impl ComputePipeline {
@@ -194,7 +194,14 @@ impl ComputePipeline {
                 .module(module)
                 .name(&name)
                 .specialization_info(&specialization);
-            let info = [vk::ComputePipelineCreateInfo::default().stage(stage).layout(table.pipeline_layout)];
+            let flags = match gpu.statistics {
+                Some(_) => vk::PipelineCreateFlags::CAPTURE_STATISTICS_KHR,
+                None => vk::PipelineCreateFlags::empty(),
+            };
+            let info = [vk::ComputePipelineCreateInfo::default()
+                .flags(flags)
+                .stage(stage)
+                .layout(table.pipeline_layout)];
             let result = gpu.device.create_compute_pipelines(vk::PipelineCache::null(), &info, None);
             gpu.device.destroy_shader_module(module, None);
             let pipeline = result.map_err(|(_, e)| e).on(gpu, "compiling a compute pipeline")?[0];
