@@ -38,7 +38,8 @@ mod settings;
 mod slot;
 pub mod tiles;
 
-pub use passes::PASSES;
+pub use memory::least_memory_bytes;
+pub use passes::{traffic, Traffic, PASSES};
 pub use plan::{Program, RendererPlan};
 pub use renderer::Renderer;
 pub use scene_data::Keep;

@@ -4,9 +4,9 @@ use super::optics::OpticsLayout;
 use super::passes::TABLE;
 use super::scene_data::{Keep, SceneData, SceneDataError};
 use super::settings::RendererSettings;
-use crate::gpu::{BindingKind, BindingTable, ComputePipeline, Executable, Gpu, GpuError};
+use crate::gpu::{shared_bindings, BindingTable, ComputePipeline, Executable, Gpu, GpuError};
 use dpm_scene::Scene;
-use dpm_shaders::structs as gpu_structs;
+use dpm_shaders::specialization as ids;
 use dpm_shaders::Shader;
 use std::sync::Arc;
 
@@ -67,6 +67,8 @@ impl RendererPlan {
         let mut constants = needs.constants();
         constants.extend(self.settings.method.constants());
         constants.extend(optics.constants());
+        // A level's group waits while the next level is open, so the deepest one never does.
+        constants.push((ids::WALK_STACK, self.data.levels.saturating_sub(1).max(1)));
         constants
     }
 
@@ -91,7 +93,7 @@ impl RendererPlan {
     /// The GPU's own.
     pub(super) fn pipelines(&self, gpu: &Arc<Gpu>) -> Result<Pipelines, GpuError> {
         let texel = self.reads_texels(gpu);
-        let table = BindingTable::new(gpu, &bindings(texel))?;
+        let table = BindingTable::new(gpu, &shared_bindings(texel))?;
         let compiled = |p: Program| ComputePipeline::new(&table, p.shader, &p.constants);
         let each = self.wanted(texel).map(|program| program.map(compiled).transpose());
         let each = each.collect::<Result<_, _>>()?;
@@ -109,7 +111,7 @@ impl RendererPlan {
     /// # Errors
     /// The GPU's own.
     pub fn compile(&self, gpu: &Arc<Gpu>) -> Result<Vec<(Program, Vec<Executable>)>, GpuError> {
-        let table = BindingTable::new(gpu, &bindings(false))?;
+        let table = BindingTable::new(gpu, &shared_bindings(false))?;
         let programs = self.programs().into_iter();
         programs
             .map(|p| {
@@ -118,16 +120,4 @@ impl RendererPlan {
             })
             .collect()
     }
-}
-
-/// The bindings that all shaders share. The second bindings of a buffer, as texels, are bound only for shaders that read tables so, because devices
-/// bind a limited number.
-pub(super) fn bindings(texel: bool) -> Vec<(u32, BindingKind)> {
-    (gpu_structs::BINDINGS.iter())
-        .filter(|(name, _)| texel || !name.ends_with("_ROWS"))
-        .map(|&(name, binding)| {
-            let rows = texel && gpu_structs::TEXEL_BINDINGS.contains(&name);
-            (binding, if rows { BindingKind::Texel } else { BindingKind::Storage })
-        })
-        .collect()
 }

@@ -182,6 +182,9 @@ impl Renderer {
         let (resources, raster) = (&self.resources, self.settings.raster);
         r.clear(&b.counters);
         r.copy(&resources.shared.schedule_start, &b.schedule, size_of::<Schedule>());
+        for latched in [&b.frame, &b.instances] {
+            r.copy(&latched.host, &latched.device, latched.len_bytes);
+        }
         r.barrier();
         r.stamp();
         for (pass, pipeline) in TABLE.iter().zip(&resources.pipelines) {
@@ -261,12 +264,12 @@ impl Renderer {
         let tile_count = slot.tile_list.write(left, bytemuck::cast_slice_mut(slot.buffers.tiles.bytes_mut()));
         let rate_tiles = if decides_rates { tile_count } else { 0 };
         slot.buffers.arguments.write(&[[tile_count * 4, 1u32, 1, 0], [rate_tiles, 1, 1, 0]]);
-        let instances = slot.buffers.instances.bytes_mut().chunks_exact_mut(size_of::<Instance>());
+        let instances = slot.buffers.instances.host.bytes_mut().chunks_exact_mut(size_of::<Instance>());
         for (i, to) in instances.take(inputs.poses.len()).enumerate() {
             to.copy_from_slice(bytemuck::bytes_of(&self.instance(i, inputs)));
         }
         let frame = self.frame_constants(inputs, &turn, (tile_count, slot.tile_list.tiles_x()));
-        slot.buffers.frame.write(&[frame]);
+        slot.buffers.frame.host.write(&[frame]);
         slot.parity = 1 - self.last.parity;
         slot.lists[slot.parity].submit(&mut slot.fence)?;
         if decides_rates {

@@ -7,5 +7,6 @@
 pub mod cases;
 pub mod laws;
 pub mod page;
+pub mod rehearsal;
 pub mod table;
 pub mod targets;

@@ -47,6 +47,18 @@ pub const ALL: &[Target] = &[
     nvidia("ga102, NVK 25.0", "Ampere (RTX 3080)", &[("NOUVEAU_CHIPSET", "172")]),
 ];
 
+/// The driver over a kernel that does nothing, for rehearsals: nothing is drawn, but everything that the host does is real.
+pub const DRY_RUN: Target = Target {
+    name: "navi21, no-op kernel",
+    gpu: "RDNA2 (RX 6800)",
+    release: "backports",
+    driver: RADV,
+    shim: "libamdgpu_noop_drm_shim.so",
+    environment: &[("AMDGPU_GPU_ID", "navi21")],
+    current: true,
+    maker: Maker::Amd,
+};
+
 type Environment = &'static [(&'static str, &'static str)];
 
 const fn amd(
@@ -114,6 +126,7 @@ impl Target {
             .env("VK_ICD_FILENAMES", &manifest)
             .env("NVK_I_WANT_A_BROKEN_VULKAN_DRIVER", "1")
             .env("MESA_SHADER_CACHE_DISABLE", "true")
+            .env("VK_LAYER_PATH", release.join("usr/share/vulkan/explicit_layer.d"))
             .envs(self.environment.iter().copied());
         Ok(command)
     }

@@ -4,7 +4,7 @@ use super::buffer::Buffer;
 use super::context::{Gpu, On as _};
 use super::error::GpuError;
 use ash::vk;
-use dpm_shaders::Shader;
+use dpm_shaders::{structs, Shader};
 use std::sync::Arc;
 
 /// What a binding holds.
@@ -26,6 +26,18 @@ impl BindingKind {
             Self::Texel => vk::DescriptorType::STORAGE_TEXEL_BUFFER,
         }
     }
+}
+
+/// The bindings that all shaders share, with their kinds. The second bindings of a buffer, as texels, are bound only for shaders that read tables so
+/// (`texel`), because devices bind a limited number.
+pub fn shared_bindings(texel: bool) -> Vec<(u32, BindingKind)> {
+    (structs::BINDINGS.iter())
+        .filter(|(name, _)| texel || !name.ends_with("_ROWS"))
+        .map(|&(name, binding)| {
+            let rows = texel && structs::TEXEL_BINDINGS.contains(&name);
+            (binding, if rows { BindingKind::Texel } else { BindingKind::Storage })
+        })
+        .collect()
 }
 
 /// The layout of set 0: the kind of each binding.

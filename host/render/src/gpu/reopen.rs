@@ -1,7 +1,8 @@
 //! After a loss: opens the same device again, or another one.
 
 use super::commands::run_now;
-use super::context::{DeviceId, Gpu};
+use super::context::Gpu;
+use super::devices::DeviceId;
 use super::error::GpuError;
 use crossbeam::channel::bounded;
 use std::sync::Arc;
