@@ -37,6 +37,7 @@ mod scene_needs;
 mod settings;
 mod slot;
 pub mod tiles;
+pub mod warp;
 
 pub use memory::least_memory_bytes;
 pub use passes::{traffic, Traffic, PASSES};
