@@ -8,6 +8,7 @@ use dpm_rig::config::RenderMethod;
 use dpm_rig::pipeline::renderer_settings;
 use dpm_tests::gpu::with_gpu;
 use dpm_tests::rigs::demo_rig;
+use std::path::PathBuf;
 use std::process::Command;
 
 /// Lanes of a subgroup, and the width of vectors in bits that gives them.
@@ -54,7 +55,8 @@ fn frames_of_this_width() {
 
 /// What a process with vectors of this width drew: lanes of its subgroups, and code values.
 fn drawn(bits: u32) -> (u32, Vec<Vec<u32>>) {
-    let cache = std::env::temp_dir().join(format!("dpm-mesa-cache-{bits}"));
+    let caches = std::env::var_os("MESA_SHADER_CACHE_DIR").map_or_else(std::env::temp_dir, PathBuf::from);
+    let cache = caches.join(format!("vectors-of-{bits}"));
     let program = std::env::current_exe().expect("the path of this test");
     let out = Command::new(program)
         .args(["--exact", "frames_of_this_width", "--ignored", "--nocapture"])

@@ -23,6 +23,7 @@ fn each_kind_of_wrong_memory_is_named() {
 fn a_host_that_takes_too_much_of_a_slot_is_named_by_its_method() {
     let share = |method: &str, plan: f64, readable: f64| Share {
         method: method.into(),
+        runs: 1,
         frames: 1000,
         missed: 0,
         plan_ms: [0.0, plan],

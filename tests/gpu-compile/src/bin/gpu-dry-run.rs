@@ -90,10 +90,10 @@ fn all(arguments: &Arguments) -> Result<(), String> {
         println!("{}", serde_json::json!({ "seen": seen, "shares": shares }));
     } else {
         println!("{}", seen.join("\n"));
-        println!("\n| method | frames | slots missed | latch to submission, ms (p50, p99) | submission to readable, ms (p50, p99) |");
-        println!("|---|---:|---:|---:|---:|");
-        for Share { method, frames, missed, plan_ms: [p, pp], readable_ms: [r, rr] } in &shares {
-            println!("| {method} | {frames} | {missed} | {p:.3}, {pp:.3} | {r:.3}, {rr:.3} |");
+        println!("\n| method | runs | frames | slots missed | latch to submission, ms (p50, p99) | submission to readable, ms (p50, p99) |");
+        println!("|---|---:|---:|---:|---:|---:|");
+        for Share { method, runs, frames, missed, plan_ms: [p, pp], readable_ms: [r, rr] } in &shares {
+            println!("| {method} | {runs} | {frames} | {missed} | {p:.3}, {pp:.3} | {r:.3}, {rr:.3} |");
         }
     }
     match too_large(&shares) {
