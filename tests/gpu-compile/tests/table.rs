@@ -1,9 +1,12 @@
 //! The committed table belongs to the shaders of this tree, is complete, and keeps its laws.
 
-use gpu_compile::table::{inputs, Table};
+use gpu_compile::table::{inputs, Row, Table};
 use gpu_compile::targets::{Maker, Target, ALL};
 use gpu_compile::{cases, laws, page};
 use std::path::Path;
+
+/// Makes a row worse.
+type Change = fn(&mut Row);
 
 const REMEDY: &str = "run ./x gpu-compile --record";
 
@@ -29,9 +32,8 @@ fn every_pipeline_has_one_row_for_every_target() {
     let table = committed();
     for input in &table.inputs {
         for target in ALL {
-            let same = |r: &&gpu_compile::table::Row| {
-                (&r.case, &r.pass, r.target.as_str()) == (&input.case, &input.pass, target.name)
-            };
+            let same =
+                |r: &&Row| (&r.case, &r.pass, r.target.as_str()) == (&input.case, &input.pass, target.name);
             let rows: Vec<_> = table.passes.iter().filter(same).collect();
             assert_eq!(rows.len(), 1, "{} of {} on {}", input.pass, input.case, target.name);
             assert_eq!(rows[0].current, target.current);
@@ -50,12 +52,11 @@ fn on_current_amd_drivers_nothing_spills_and_enough_waves_fit() {
 #[test]
 fn every_broken_law_is_seen() {
     let good = committed();
-    let row = |table: &mut Table, pass: &str, change: fn(&mut gpu_compile::table::Row)| {
-        let amd =
-            |r: &&mut gpu_compile::table::Row| r.target.starts_with("navi31, RADV 25") && r.pass == pass;
+    let row = |table: &mut Table, pass: &str, change: Change| {
+        let amd = |r: &&mut Row| r.target.starts_with("navi31, RADV 25") && r.pass == pass;
         change(table.passes.iter_mut().find(amd).expect("such a row"));
     };
-    let changes: [(&str, fn(&mut gpu_compile::table::Row)); 4] = [
+    let changes: [(&str, Change); 4] = [
         ("trace", |r| r.spills = 1),
         ("compensate", |r| r.scratch = 4),
         ("primary", |r| r.waves = Some(laws::WAVES_OF_WALKS - 1)),
@@ -70,9 +71,7 @@ fn every_broken_law_is_seen() {
     }
     // A driver that is no more current may spill as much as it did, and not one register more.
     let mut bad = good.clone();
-    let old = |r: &&mut gpu_compile::table::Row| {
-        Target::named(&r.target).is_some_and(|t| t.maker == Maker::Amd && !t.current)
-    };
+    let old = |r: &&mut Row| Target::named(&r.target).is_some_and(|t| t.maker == Maker::Amd && !t.current);
     bad.passes.iter_mut().find(old).expect("an old driver").spills += 1;
     assert_eq!((laws::broken(&bad).len(), laws::worse(&bad, &good).len()), (0, 1));
 }
