@@ -139,6 +139,8 @@ layout(constant_id = 25) const uint PLANE_OF_BITS_12 = 4294967295u;
 layout(constant_id = 26) const uint PLANE_OF_BITS_16 = 4294967295u;
 // The same for bits 20 to 23.
 layout(constant_id = 27) const uint PLANE_OF_BITS_20 = 4294967295u;
+// On GPUs: groups of nodes that may wait while a ray walks through a body, at most one for each level of the deepest tree.
+layout(constant_id = 28) const uint WALK_STACK = 24u;
 
 struct Frame {
     vec3 projector_position;

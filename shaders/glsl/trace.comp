@@ -32,6 +32,22 @@ Sampler begin_sampler(WorkItem item, uvec2 pixel) {
     return rng;
 }
 
+// The first vertex of the paths of a pixel.
+Point first_point(Surface surface) {
+    Hit hit = Hit(surface.id, surface.barycentric, abs(surface.distance));
+    uint instance = instance_of(hit.id);
+    vec3 p = transform_point(instance_at(instance).world_from_object, object_position(instance, triangle_of(hit.id), hit.barycentric));
+    bool camera_is_eye = (frame.flags & FRAME_CAMERA_IS_EYE) != 0u;
+    return shading_point(hit, normalize((camera_is_eye ? frame.projector_position : frame.eye_position) - p));
+}
+
+// Software Vulkan computes it once. On a GPU it would live across every walk, in two dozen registers, so it is computed again for each sample.
+#ifdef TEXEL_TABLES
+#define FIRST_POINT first
+#else
+#define FIRST_POINT first_point(surface_at(item.pixel))
+#endif
+
 void main() {
     // This is read while all lanes are active. There is at least one item, because otherwise no workgroup is dispatched.
     uint items = schedule.items;
@@ -44,14 +60,9 @@ void main() {
         radiance_out[item.pixel] = vec4(environment_radiance(pixel_direction(pixel)), 1.0);
         return;
     }
-    Hit hit;
-    hit.id = surface.id;
-    hit.barycentric = surface.barycentric;
-    hit.t = abs(surface.distance);
-    bool camera_is_eye = (frame.flags & FRAME_CAMERA_IS_EYE) != 0u;
-    vec3 p = transform_point(instance_at(instance_of(hit.id)).world_from_object, object_position(instance_of(hit.id), triangle_of(hit.id), hit.barycentric));
-    vec3 toward = normalize((camera_is_eye ? frame.projector_position : frame.eye_position) - p);
-    Point first = shading_point(hit, toward);
+#ifdef TEXEL_TABLES
+    Point first = first_point(surface);
+#endif
     Sampler rng = begin_sampler(item, pixel);
     vec3 sum = vec3(0.0);
     float sum_squares = 0.0;
@@ -59,10 +70,13 @@ void main() {
     bool dpm = (frame.flags & FRAME_DPM) != 0u, exact = false;
     uint rays = 0u;
     // A lane whose path ends begins its next sample at once, while the paths of its neighbours continue.
-    Path path = begin_path(first);
+    Path path;
+    bool begins = true;
     uint left = item.spp;
     do {
-        if (!advance_path(path, rng, rays)) {
+        if (begins) path = begin_path(FIRST_POINT);
+        begins = !advance_path(path, rng, rays);
+        if (begins) {
             // A sample that is not finite is dropped.
             bool valid = finite3(path.radiance);
             vec3 l = valid ? path.radiance : vec3(0.0);
@@ -74,7 +88,6 @@ void main() {
             rng.index++;
             exact = dpm && path.exact;
             left = exact ? 0u : left - 1u;
-            path = begin_path(first);
         }
     } while (left > 0u);
     radiance_out[item.pixel] = vec4(count > 0u ? sum / float(count) : vec3(0.0), float(count));

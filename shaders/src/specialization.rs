@@ -106,4 +106,6 @@ specialization_constants! {
     PLANE_OF_BITS_16: uint = 0xffff_ffff;
     /// The same for bits 20 to 23.
     PLANE_OF_BITS_20: uint = 0xffff_ffff;
+    /// On GPUs: groups of nodes that may wait while a ray walks through a body, at most one for each level of the deepest tree.
+    WALK_STACK: uint = 24;
 }

@@ -14,7 +14,7 @@ use std::sync::Arc;
 /// # Panics
 /// There is no Vulkan driver (the message has the advice of `dpm doctor`), or validation reported something.
 pub fn with_gpu(test: impl FnOnce(&Arc<Gpu>)) {
-    let gpu = Gpu::open(&GpuOptions { validation: true, device: None })
+    let gpu = Gpu::open(&GpuOptions { validation: true, ..GpuOptions::default() })
         .unwrap_or_else(|e| panic!("this test needs Vulkan: {e}"));
     test(&gpu);
     drop(gpu);

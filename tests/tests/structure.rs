@@ -134,7 +134,7 @@ const LOCKS: [(&str, &str); 5] = [
     ("device/src/dlpc900/driver.rs", "a projector that takes no frames of this path"),
     ("host/handoff/src/path.rs", "the lock that counts"),
     ("host/common/src/realtime/standstill.rs", "control threads and the collector"),
-    ("host/render/src/gpu/context.rs", "messages of the validation layer, which no rig loads"),
+    ("host/render/src/gpu/instance.rs", "messages of the validation layer, which no rig loads"),
     ("host/rig/src/control/orders.rs", "threads that serve clients"),
 ];
 

@@ -4,7 +4,7 @@ use super::plan_savings::{changed, compare, flipped, keeping, Saving, Side};
 use dpm_render::method::{Method, SamplerKind};
 use dpm_render::scene_data::{SceneData, SceneNeeds};
 use dpm_render::warp::LEAST_MOTION_PX;
-use dpm_render::{Keep, RenderError};
+use dpm_render::{traffic, Keep, Output, RenderError, RendererSettings, Traffic};
 use dpm_rig::config::{EffectsConfig, PlanePoses, RenderConfig, RenderMethod, RigConfig};
 use dpm_rig::failure::{Failure, FailureKind};
 use dpm_rig::pipeline::{renderer_settings, PipelineError};
@@ -41,6 +41,8 @@ pub struct PlanReport {
     pub entries: Vec<PlanEntry>,
     /// All of the scene's parts that are left out, at once; only when measured.
     pub together: Option<Saving>,
+    /// Bytes that each pass moves for a pixel, where the GPU packs.
+    pub traffic: Vec<Traffic>,
     /// What differs from a run on the rig.
     pub warnings: Vec<String>,
 }
@@ -287,7 +289,9 @@ pub fn scene_plan(config: &RigConfig, measure: bool) -> Result<PlanReport, Failu
     let unswitched = RenderConfig { effects: EffectsConfig::default(), ..config.render.clone() };
     entries.extend(method_entries(&method, &unswitched.to_method(), word));
     entries.extend(rig_entries(&rig));
-    let mut report = PlanReport { method: word.to_owned(), entries, together: None, warnings };
+    let packs = RendererSettings { output: Output::Planes(rig.schedule), ..renderer_settings(&rig) };
+    let traffic = traffic(&packs, Keep::default());
+    let mut report = PlanReport { method: word.to_owned(), entries, together: None, traffic, warnings };
     let Some(gpu) = gpu else { return Ok(report) };
     let (own, lean) = (renderer_settings(&rig), Keep::default());
     let mine = Side { scene: &rig.scene, settings: &own, keep: lean };

@@ -4,7 +4,7 @@ use super::fill::fill;
 use super::memory::{BytesPerPixel, SharedBuffers};
 use super::scene_gpu::{table_buffer, SceneGpu};
 use super::settings::{Output, RendererSettings};
-use crate::gpu::{Buffer, Gpu, GpuError, MemoryKind};
+use crate::gpu::{Buffer, Gpu, GpuError, MemoryKind, Place};
 use crate::pack;
 use bytemuck::Zeroable;
 use dpm_shaders::structs::{Counters, Frame, Guide, Instance, Mover, Schedule, Surface, NO_HIT};
@@ -12,8 +12,10 @@ use std::sync::Arc;
 
 /// The buffers of one frame in flight.
 pub(super) struct FrameBuffers {
-    pub frame: Buffer,
-    pub instances: Buffer,
+    /// What the host writes in every frame, and the copies that the shaders read. Every ray reads the poses, so they have to lie in the GPU's own
+    /// memory: the host's lies behind a bus.
+    pub frame: Latched,
+    pub instances: Latched,
     pub arguments: Buffer,
     pub tiles: Buffer,
     pub counters: Buffer,
@@ -45,6 +47,13 @@ pub(super) struct FrameBuffers {
     pub movers: Buffer,
 }
 
+/// A buffer that the host writes, with its copy for the shaders. The frame's first commands make the copy.
+pub(super) struct Latched {
+    pub host: Buffer,
+    pub device: Buffer,
+    pub len_bytes: usize,
+}
+
 /// Copies for debugging.
 pub(super) struct DebugBuffers {
     pub shown: Buffer,
@@ -74,6 +83,10 @@ impl FrameBuffers {
         let pixels = settings.raster.pixel_count();
         let size = |what, bytes, kind| Buffer::new(gpu, what, bytes, kind);
         let table = |what, bytes, kind| table_buffer(gpu, what, bytes, kind);
+        let latched = |what, len_bytes| -> Result<Latched, GpuError> {
+            let host = size(what, len_bytes, Upload)?;
+            Ok(Latched { host, device: table(what, len_bytes, Device)?, len_bytes })
+        };
         let each = BytesPerPixel::of(&settings.method).and_planes_follow(!settings.plane_groups.is_empty());
         // A buffer that the method does not need is bound all the same, but is as small as possible.
         let with = |what, each: usize| table(what, (pixels * each).max(16), Device);
@@ -84,8 +97,8 @@ impl FrameBuffers {
             Output::Codes | Output::Both(_) => Some(size("code values", pixels * each.codes, Readback)?),
         };
         Ok(Self {
-            frame: size("frame uniforms", size_of::<Frame>(), Upload)?,
-            instances: table("instances", size_of::<Instance>() * bodies.max(1), Upload)?,
+            frame: latched("frame uniforms", size_of::<Frame>())?,
+            instances: latched("instances", size_of::<Instance>() * bodies.max(1))?,
             arguments: size("dispatch arguments", 48, Upload)?,
             tiles: size("tile list", tiles * 4, Upload)?,
             counters: size("counters", size_of::<Counters>(), Device)?,
@@ -136,6 +149,31 @@ impl FrameBuffers {
         }
     }
 
+    /// Where each buffer lies: those of the shaders' bindings, and those that the host reads.
+    pub(super) fn places(&self) -> Vec<(&'static str, Place)> {
+        let of_shaders = [
+            ("frame uniforms", &self.frame.device),
+            ("instances", &self.instances.device),
+            ("counters", &self.counters),
+            ("surfaces", &self.surfaces),
+            ("radiance", &self.radiance),
+            ("guides", &self.guides),
+            ("schedule", &self.schedule),
+            ("work list", &self.work),
+            ("filtered radiance", &self.filtered),
+            ("shown radiance", &self.filtered_shown),
+            ("code values", &self.codes),
+            ("bit planes", &self.planes),
+        ];
+        let of_host = [
+            ("counters of the host", Some(&self.counters_host)),
+            ("code values of the host", self.codes_host.as_ref()),
+            ("bit planes of the host", self.planes_host.as_ref()),
+        ];
+        let of_host = of_host.into_iter().filter_map(|(name, buffer)| Some((name, buffer?)));
+        of_shaders.into_iter().chain(of_host).map(|(name, buffer)| (name, buffer.place())).collect()
+    }
+
     /// The buffer of the binding `name`, in frames that write the history buffer `parity`.
     pub(super) fn of<'a>(
         &'a self,
@@ -145,8 +183,8 @@ impl FrameBuffers {
         (shared, scene): (&'a SharedBuffers, &'a SceneGpu),
     ) -> &'a Buffer {
         match name {
-            "B_FRAME" => &self.frame,
-            "B_INSTANCES" => &self.instances,
+            "B_FRAME" => &self.frame.device,
+            "B_INSTANCES" => &self.instances.device,
             "B_NODES" => &scene.nodes,
             "B_TRIANGLES" => &scene.triangles,
             "B_TRIANGLE_REFS" => &scene.refs,

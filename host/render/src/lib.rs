@@ -27,6 +27,7 @@ pub mod method;
 mod optics;
 pub mod pack;
 mod passes;
+mod plan;
 pub mod rate_table;
 mod renderer;
 mod resources;
@@ -38,7 +39,9 @@ mod slot;
 pub mod tiles;
 pub mod warp;
 
-pub use passes::PASSES;
+pub use memory::least_memory_bytes;
+pub use passes::{traffic, Traffic, PASSES};
+pub use plan::{Program, RendererPlan};
 pub use renderer::Renderer;
 pub use scene_data::Keep;
 pub use settings::{FrameInputs, Output, RenderError, RendererSettings};

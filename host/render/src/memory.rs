@@ -57,6 +57,32 @@ impl BytesPerPixel {
         }
     }
 
+    /// Bytes a pixel on the GPU of a run with so many frames in flight.
+    fn on_device(&self, slots: usize) -> usize {
+        let of_slot =
+            self.guides + self.surfaces + self.radiance + self.filtered + self.shown + self.work + self.codes;
+        2 * self.history + slots * of_slot
+    }
+
+    /// Bytes a pixel of the buffer of a binding; 0 if it does not grow with the raster. `None`: the bit planes, whose number the projector decides.
+    pub(super) fn of_buffer(&self, binding: &str) -> Option<f64> {
+        Some(match binding {
+            "B_SURFACES" => self.surfaces,
+            "B_GUIDES" => self.guides,
+            "B_HISTORY" | "B_FORMER" => self.history,
+            "B_RADIANCE" => self.radiance,
+            "B_FILTERED" => self.filtered,
+            // The picture that is shown: that of the last pass that the method has.
+            "B_SHOWN" if self.shown > 0 => self.shown,
+            "B_SHOWN" => self.radiance,
+            "B_WORK" => self.work,
+            "B_CODES" => self.codes,
+            "B_MOTION" => self.motion,
+            "B_PLANES" => return None,
+            _ => 0,
+        } as f64)
+    }
+
     /// The same with what planes need that follow the bodies, if they do.
     pub(crate) fn and_planes_follow(self, follow: bool) -> Self {
         Self { motion: if follow { size_of::<Moved>() } else { 0 }, ..self }
@@ -80,6 +106,11 @@ impl BytesPerPixel {
         .max_by_key(|b| b.1)
         .unwrap_or(("code", 0))
     }
+}
+
+/// Memory on the GPU that a run with so many frames in flight takes at least, bytes: the buffers that grow with the raster, without the scene.
+pub fn least_memory_bytes(raster: Raster, method: &Method, slots: usize) -> u64 {
+    (raster.pixel_count() * BytesPerPixel::of(method).on_device(slots)) as u64
 }
 
 /// Refuses a raster that `method` cannot trace on a device that binds buffers of at most `limit` bytes.

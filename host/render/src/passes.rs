@@ -1,5 +1,6 @@
 //! The passes of a frame, one row each: what runs, when, over what, and the buffers that it reads and writes.
 
+use super::memory::BytesPerPixel;
 use super::method::Method;
 use super::scene_data::Keep;
 use super::settings::RendererSettings;
@@ -17,6 +18,8 @@ pub(super) struct Pass {
     pub when: fn(&RendererSettings, Keep) -> bool,
     /// How many workgroups run.
     pub grid: Grid,
+    /// Its rays walk through the scene.
+    pub walks: bool,
 }
 
 /// The shader of a pass.
@@ -38,10 +41,8 @@ pub(super) struct Kernel {
     pub shader: fn(bool) -> Shader,
     /// Buffers that an earlier pass of this frame, or the frame before, has written and that this shader reads. Inputs that no pass writes
     /// are not listed: the frame's constants, the tiles, the scene, the noise and the table of rates.
-    #[cfg_attr(not(test), allow(dead_code))]
     pub reads: &'static [&'static str],
     /// Buffers that this shader writes.
-    #[cfg_attr(not(test), allow(dead_code))]
     pub writes: &'static [&'static str],
 }
 
@@ -71,6 +72,7 @@ pub(super) const TABLE: [Pass; 12] = [
         }),
         when: |_, _| true,
         grid: Grid::Tiles,
+        walks: true,
     },
     Pass {
         name: "reproject",
@@ -88,6 +90,7 @@ pub(super) const TABLE: [Pass; 12] = [
         },
         when: |s, _| s.method.needs_history(),
         grid: Grid::Tiles,
+        walks: false,
     },
     Pass {
         name: "rate map",
@@ -98,6 +101,7 @@ pub(super) const TABLE: [Pass; 12] = [
         }),
         when: |s, keep| s.method.needs_rates() || keep.rate_map && s.method.needs_history(),
         grid: Grid::Rates,
+        walks: false,
     },
     Pass {
         name: "schedule",
@@ -115,6 +119,7 @@ pub(super) const TABLE: [Pass; 12] = [
         },
         when: |_, _| true,
         grid: Grid::Tiles,
+        walks: false,
     },
     Pass {
         name: "trace",
@@ -125,6 +130,7 @@ pub(super) const TABLE: [Pass; 12] = [
         }),
         when: |_, _| true,
         grid: Grid::Work,
+        walks: true,
     },
     Pass {
         name: "accumulate",
@@ -142,6 +148,7 @@ pub(super) const TABLE: [Pass; 12] = [
         },
         when: |s, _| s.method.needs_history(),
         grid: Grid::Tiles,
+        walks: false,
     },
     Pass {
         name: "spatial",
@@ -159,6 +166,7 @@ pub(super) const TABLE: [Pass; 12] = [
         },
         when: |s, _| s.method.needs_spatial(),
         grid: Grid::Tiles,
+        walks: false,
     },
     Pass {
         name: "compensate",
@@ -169,6 +177,7 @@ pub(super) const TABLE: [Pass; 12] = [
         }),
         when: |_, _| true,
         grid: Grid::Tiles,
+        walks: false,
     },
     Pass {
         name: "halftone",
@@ -179,6 +188,7 @@ pub(super) const TABLE: [Pass; 12] = [
         }),
         when: |s, _| s.halftone.is_some(),
         grid: Grid::Tiles,
+        walks: false,
     },
     Pass {
         name: "motion",
@@ -189,6 +199,7 @@ pub(super) const TABLE: [Pass; 12] = [
         }),
         when: |s, _| !s.plane_groups.is_empty(),
         grid: Grid::Moving,
+        walks: false,
     },
     Pass {
         name: "warp",
@@ -199,12 +210,14 @@ pub(super) const TABLE: [Pass; 12] = [
         }),
         when: |s, _| !s.plane_groups.is_empty(),
         grid: Grid::Moving,
+        walks: false,
     },
     Pass {
         name: "pack",
         code: Code::OfAll(Kernel { shader: |_| shaders::PACK, reads: &["B_CODES"], writes: &["B_PLANES"] }),
         when: |s, _| s.output.schedule().is_some(),
         grid: Grid::Planes,
+        walks: false,
     },
 ];
 
@@ -252,6 +265,33 @@ impl Pass {
             }
         }
     }
+}
+
+/// Bytes that a pass moves between memory and shaders for each pixel that it works on: every buffer that it touches, once, by the whole element.
+/// A driver may read less of an element, and a cache may serve what was touched before.
+#[derive(Clone, Copy, Debug, PartialEq, serde::Serialize)]
+pub struct Traffic {
+    /// Name of the pass.
+    pub pass: &'static str,
+    /// Bytes read.
+    pub read: f64,
+    /// Bytes written.
+    pub written: f64,
+}
+
+/// What each recorded pass moves for each pixel, in the order in which they run. What the whole frame has one of (constants, poses, scene, tables) is not
+/// counted.
+pub fn traffic(settings: &RendererSettings, keep: Keep) -> Vec<Traffic> {
+    let each = BytesPerPixel::of(&settings.method).and_planes_follow(!settings.plane_groups.is_empty());
+    let planes = settings.output.schedule().map_or(0.0, |schedule| schedule.planes().len() as f64 / 8.0);
+    let bytes = |names: &[&str]| names.iter().map(|name| each.of_buffer(name).unwrap_or(planes)).sum();
+    let recorded = TABLE.iter().filter(|pass| (pass.when)(settings, keep));
+    recorded
+        .map(|pass| {
+            let kernel = pass.code.kernel(settings.method.dpm);
+            Traffic { pass: pass.name, read: bytes(kernel.reads), written: bytes(kernel.writes) }
+        })
+        .collect()
 }
 
 #[cfg(test)]
@@ -397,5 +437,56 @@ mod tests {
         let mut all: Vec<_> = shaders::ALL.iter().map(|shader| shader.name).collect();
         all.sort_unstable();
         assert_eq!(found, all);
+    }
+
+    /// The demo's settings by a method, with 24 planes made on the GPU.
+    fn settings_of(method: Method) -> RendererSettings {
+        let raster = dpm_device::planes::Raster::new(64, 48).expect("a small raster");
+        RendererSettings {
+            raster,
+            depth: 3,
+            seed: 1,
+            clamp_indirect: None,
+            drive: crate::drive::Drive::even(1.0),
+            lens: None,
+            camera_is_eye: false,
+            leave_nothing_out: false,
+            method,
+            halftone: None,
+            plane_groups: Vec::new(),
+            output: crate::Output::Planes(dpm_device::planes::PlaneSchedule::rgb24()),
+        }
+    }
+
+    /// A table of the bandwidth that a frame takes. It may only fall: whoever makes an element larger sees here what that costs in every pass.
+    #[test]
+    fn a_pixel_moves_no_more_bytes_than_it_did() {
+        let dpm = Method {
+            dpm: true,
+            temporal: true,
+            spatial: true,
+            rate_map: true,
+            sampler: crate::method::SamplerKind::Continued,
+            ..Method::full(2)
+        };
+        let moved = |method| -> Vec<(&str, f64)> {
+            let all = traffic(&settings_of(method), Keep::default());
+            all.iter().map(|t| (t.pass, t.read + t.written)).collect()
+        };
+        let expected = [
+            ("primary", 112.0),
+            ("reproject", 192.0),
+            ("schedule", 104.0),
+            ("trace", 120.0),
+            ("accumulate", 240.0),
+            ("spatial", 144.0),
+            ("compensate", 36.0),
+            ("pack", 7.0),
+        ];
+        assert_eq!(moved(dpm), expected);
+        // Without a history nothing but the surface, the work list, the radiance and the code values moves.
+        let expected =
+            [("primary", 16.0), ("schedule", 40.0), ("trace", 40.0), ("compensate", 36.0), ("pack", 7.0)];
+        assert_eq!(moved(Method::full(2)), expected);
     }
 }

@@ -6,6 +6,7 @@ use super::last_frame::{LastFrame, Turn};
 use super::memory::SharedBuffers;
 use super::optics::OpticsLayout;
 use super::passes::{Grid, PASSES, TABLE};
+use super::plan::{Pipelines, RendererPlan};
 use super::resources::Resources;
 use super::scene_data::{rows, world_bounds, Keep, SceneData};
 use super::scene_gpu::SceneGpu;
@@ -13,9 +14,7 @@ use super::settings::{FrameInputs, RenderError, RendererSettings};
 use super::slot::FrameSlot;
 use super::tiles::TileList;
 use super::warp::Movers;
-use crate::gpu::{
-    BindingKind, BindingSet, BindingTable, CommandList, ComputePipeline, FrameFence, Gpu, GpuError, Recorder,
-};
+use crate::gpu::{BindingSet, CommandList, FrameFence, Gpu, GpuError, Recorder};
 use crate::pack;
 use bytemuck::Zeroable;
 use dpm_scene::Scene;
@@ -54,16 +53,6 @@ pub struct Renderer {
     pub(super) gpu: Arc<Gpu>,
 }
 
-/// What a renderer is made from, without a device. It is kept so that the renderer can be made again on another device without preparing the
-/// scene again. Cheap to clone.
-#[derive(Clone)]
-pub struct RendererPlan {
-    data: Arc<SceneData>,
-    settings: RendererSettings,
-    keep: Keep,
-    tracked: Vec<Option<u16>>,
-}
-
 /// `tracked`: for each body of the scene the tracked body that carries it.
 fn is_lost(tracked: &[Option<u16>], body: usize, lost: &[bool]) -> bool {
     tracked[body].is_some_and(|t| lost.get(usize::from(t)).copied().unwrap_or(false))
@@ -88,9 +77,7 @@ impl Renderer {
         settings: RendererSettings,
         keep: Keep,
     ) -> Result<Self, RenderError> {
-        let data = Arc::new(SceneData::build(scene)?);
-        let tracked = scene.bodies.iter().map(|b| b.tracked).collect();
-        Self::from_plan(gpu, &RendererPlan { data, settings, keep, tracked })
+        Self::from_plan(gpu, &RendererPlan::new(scene, settings, keep)?)
     }
 
     /// What this renderer was made from.
@@ -110,37 +97,9 @@ impl Renderer {
     pub fn from_plan(gpu: &Arc<Gpu>, plan: &RendererPlan) -> Result<Self, RenderError> {
         let RendererPlan { data, settings, keep, tracked } = plan.clone();
         let shared = SharedBuffers::new(gpu, &settings)?;
-        let texel = gpu.summary().software && !keep.storage_tables;
-        let scene_gpu = SceneGpu::new(gpu, &data, texel)?;
-        let mut needs = data.needs.with(keep.needs);
-        needs.clamp |= settings.clamp_indirect.is_some();
-        if settings.leave_nothing_out {
-            needs = needs.everything();
-        }
-        use BindingKind::{Storage, Texel};
-        // The second bindings of a buffer, as texels, are bound only for shaders that read tables so, because devices bind a limited number.
-        let kinds: Vec<_> = gpu_structs::BINDINGS
-            .iter()
-            .filter(|(name, _)| texel || !name.ends_with("_ROWS"))
-            .map(|&(name, binding)| {
-                let rows = texel && gpu_structs::TEXEL_BINDINGS.contains(&name);
-                (binding, if rows { Texel } else { Storage })
-            })
-            .collect();
-        let table = BindingTable::new(gpu, &kinds)?;
-        let mut constants = needs.constants();
-        constants.extend(settings.method.constants());
+        let scene_gpu = SceneGpu::new(gpu, &data, plan.reads_texels(gpu))?;
         let optics = OpticsLayout::new(settings.raster, &settings.drive, settings.lens.as_ref());
-        constants.extend(optics.constants());
-        let pipelines = (TABLE.iter())
-            .map(|pass| {
-                let wanted = (pass.when)(&settings, keep);
-                let constants = pass.constants(&constants, &settings);
-                wanted
-                    .then(|| ComputePipeline::new(&table, pass.shader(&settings.method, texel), &constants))
-                    .transpose()
-            })
-            .collect::<Result<Vec<_>, _>>()?;
+        let Pipelines { table, each: pipelines } = plan.pipelines(gpu)?;
         let decides_rates =
             TABLE.iter().zip(&pipelines).any(|(pass, p)| pass.grid == Grid::Rates && p.is_some());
         let last = LastFrame::none(tracked.len());
@@ -225,6 +184,9 @@ impl Renderer {
         let (resources, raster) = (&self.resources, self.settings.raster);
         r.clear(&b.counters);
         r.copy(&resources.shared.schedule_start, &b.schedule, size_of::<Schedule>());
+        for latched in [&b.frame, &b.instances] {
+            r.copy(&latched.host, &latched.device, latched.len_bytes);
+        }
         r.barrier();
         r.stamp();
         for (pass, pipeline) in TABLE.iter().zip(&resources.pipelines) {
@@ -312,12 +274,12 @@ impl Renderer {
         let rate_tiles = if decides_rates { tile_count } else { 0 };
         let groups = [tile_count * 4, rate_tiles, moving_tiles * 4];
         slot.buffers.arguments.write(&groups.map(|groups| [groups, 1u32, 1, 0]));
-        let instances = slot.buffers.instances.bytes_mut().chunks_exact_mut(size_of::<Instance>());
+        let instances = slot.buffers.instances.host.bytes_mut().chunks_exact_mut(size_of::<Instance>());
         for (i, to) in instances.take(inputs.poses.len()).enumerate() {
             to.copy_from_slice(bytemuck::bytes_of(&self.instance(i, inputs)));
         }
         let frame = self.frame_constants(inputs, &turn, (tile_count, slot.tile_list.tiles_x()));
-        slot.buffers.frame.write(&[frame]);
+        slot.buffers.frame.host.write(&[frame]);
         slot.parity = 1 - self.last.parity;
         slot.lists[slot.parity].submit(&mut slot.fence)?;
         if decides_rates {

@@ -108,6 +108,8 @@ pub struct SceneData {
     pub albedo: Vec<AlbedoCell>,
     /// What the scene needs.
     pub needs: SceneNeeds,
+    /// Levels of nodes of the deepest body.
+    pub levels: u32,
 }
 
 /// What is kept although nothing needs it. This measures what leaving it out saves. No pixel may change.
@@ -314,6 +316,7 @@ impl SceneData {
         }));
         self.add_triangles(scene, index, mesh, &bvh, vertex_base, powers);
         self.nodes.extend_from_slice(&bvh.nodes);
+        self.levels = self.levels.max(bvh.levels() as u32);
         Ok(())
     }
 

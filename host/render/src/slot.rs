@@ -4,7 +4,7 @@ use super::frame_buffers::FrameBuffers;
 use super::passes::PASSES;
 use super::resources::Resources;
 use super::tiles::TileList;
-use crate::gpu::{BindingSet, CommandList, FrameFence, GpuError};
+use crate::gpu::{BindingSet, CommandList, FrameFence, GpuError, Place};
 use dpm_device::planes::Raster;
 use dpm_shaders::structs::{Counters, Guide, History, Moved, Surface};
 use std::sync::Arc;
@@ -75,6 +75,11 @@ impl FrameSlot {
             }
         }
         cost
+    }
+
+    /// Where its buffers lie: by name those that the shaders use, then those "of the host", which it reads.
+    pub fn places(&self) -> Vec<(&'static str, Place)> {
+        self.buffers.places()
     }
 
     /// Code values 0x00BBGGRR, row by row. Empty if the renderer's output is planes only. Valid after [`FrameSlot::wait`].

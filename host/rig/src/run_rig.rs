@@ -12,7 +12,7 @@ use crate::tracks::SourceError;
 use dpm_common::files::{check_folder, write_atomically};
 use dpm_device::planes::Raster;
 use dpm_render::gpu::{validation_messages, Gpu, GpuError, GpuOptions};
-use dpm_render::RenderError;
+use dpm_render::{least_memory_bytes, RenderError};
 use glam::Vec3;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
@@ -144,6 +144,9 @@ pub fn check_output_folder(dir: &Path) -> Result<(), Failure> {
         .map_err(|e| Failure::new(FailureKind::BadInput, format!("{e}; choose another folder with --out")))
 }
 
+/// Frames that are in flight at least.
+const FEWEST_SLOTS: usize = 2;
+
 /// Opens the GPU that the rig file names.
 ///
 /// # Errors
@@ -152,6 +155,8 @@ pub fn open_gpu(config: &RigConfig) -> Result<Arc<Gpu>, Failure> {
     let options = GpuOptions {
         validation: std::env::var_os("DPM_VALIDATION").is_some(),
         device: config.render.gpu.clone(),
+        memory_bytes: least_memory_bytes(config.projector.raster(), &config.render.to_method(), FEWEST_SLOTS),
+        ..GpuOptions::default()
     };
     Gpu::open(&options).map_err(|e| Failure::new(FailureKind::NoGpu, e))
 }

@@ -637,6 +637,40 @@ unsafe extern "system" fn cmd_dispatch_indirect(
 }
 
 /// # Safety
+/// As `vkCmdPipelineBarrier`.
+unsafe extern "system" fn cmd_pipeline_barrier(
+    list: vk::CommandBuffer,
+    before: vk::PipelineStageFlags,
+    after: vk::PipelineStageFlags,
+    flags: vk::DependencyFlags,
+    memory_count: u32,
+    memory: *const vk::MemoryBarrier<'_>,
+    buffer_count: u32,
+    buffers: *const vk::BufferMemoryBarrier<'_>,
+    image_count: u32,
+    images: *const vk::ImageMemoryBarrier<'_>,
+) {
+    if arrive(&[Call::Barrier]).is_some() {
+        return;
+    }
+    // SAFETY: the caller's.
+    unsafe {
+        (device(list).fns.cmd_pipeline_barrier)(
+            list,
+            before,
+            after,
+            flags,
+            memory_count,
+            memory,
+            buffer_count,
+            buffers,
+            image_count,
+            images,
+        );
+    }
+}
+
+/// # Safety
 /// As `vkBeginCommandBuffer`.
 unsafe extern "system" fn begin_command_buffer(
     list: vk::CommandBuffer,
@@ -791,6 +825,7 @@ fn own(name: &CStr) -> vk::PFN_vkVoidFunction {
         b"vkGetQueryPoolResults" => get_query_pool_results: PFN_vkGetQueryPoolResults,
         b"vkGetDeviceQueue" => get_device_queue: PFN_vkGetDeviceQueue,
         b"vkCmdDispatchIndirect" => cmd_dispatch_indirect: PFN_vkCmdDispatchIndirect,
+        b"vkCmdPipelineBarrier" => cmd_pipeline_barrier: PFN_vkCmdPipelineBarrier,
         b"vkBeginCommandBuffer" => begin_command_buffer: PFN_vkBeginCommandBuffer,
         b"vkEndCommandBuffer" => end_command_buffer: PFN_vkEndCommandBuffer,
         b"vkCreateBuffer" => create_buffer: PFN_vkCreateBuffer,

@@ -19,12 +19,14 @@
 //! | `submit-block` | `submit` `frame` | the call itself returns `ms` milliseconds late; without `ms` never |
 //! | `late` | `submit` `frame` | the fence is signalled no earlier than `ms` milliseconds after the submission |
 //! | `poison` | `submit` `frame` | before the submission runs, every buffer of exactly `bytes` bytes is filled with floats that are not numbers |
+//! | `skip` | `barrier` | the barrier is not recorded; the validation layer below sees what that breaks |
 //! | `oom-device`, `oom-host`, `init-failed` | `create` `instance` `device` `memory` `buffer` `pipeline` `submit` `frame` `wait` | the call answers with that error and does nothing |
 //!
 //! | call | what is counted |
 //! |---|---|
 //! | `submit` | `vkQueueSubmit` |
 //! | `frame` | those of them whose command buffers hold an indirect dispatch: frames, not uploads |
+//! | `barrier` | `vkCmdPipelineBarrier` |
 //! | `wait`, `status` | `vkWaitForFences`, `vkGetFenceStatus` |
 //! | `instance`, `device` | `vkCreateInstance`, `vkCreateDevice` |
 //! | `memory`, `buffer`, `pipeline` | `vkAllocateMemory`, `vkCreateBuffer`, `vkCreateComputePipelines` |

@@ -26,13 +26,15 @@ pub enum Call {
     Wait,
     /// `vkGetFenceStatus`.
     Status,
+    /// `vkCmdPipelineBarrier`.
+    Barrier,
     /// `vkQueueSubmit` on a device that was lost before: no plan can name it, but it is counted.
     SubmitAfterLoss,
 }
 
 impl Call {
     /// All of them.
-    pub const ALL: [Self; 11] = [
+    pub const ALL: [Self; 12] = [
         Self::Instance,
         Self::Device,
         Self::Memory,
@@ -43,6 +45,7 @@ impl Call {
         Self::Frame,
         Self::Wait,
         Self::Status,
+        Self::Barrier,
         Self::SubmitAfterLoss,
     ];
 
@@ -59,6 +62,7 @@ impl Call {
             Self::Frame => "frame",
             Self::Wait => "wait",
             Self::Status => "status",
+            Self::Barrier => "barrier",
             Self::SubmitAfterLoss => "submit-after-loss",
         }
     }
@@ -81,17 +85,20 @@ pub enum Kind {
     Late,
     /// Buffers are filled with floats that are not numbers.
     Poison,
+    /// The call does nothing.
+    Skip,
     /// The call answers so and does nothing.
     Fail(vk::Result),
 }
 
 impl Kind {
-    const ALL: [Self; 8] = [
+    const ALL: [Self; 9] = [
         Self::Lost,
         Self::Hang,
         Self::Block,
         Self::Late,
         Self::Poison,
+        Self::Skip,
         Self::Fail(vk::Result::ERROR_OUT_OF_DEVICE_MEMORY),
         Self::Fail(vk::Result::ERROR_OUT_OF_HOST_MEMORY),
         Self::Fail(vk::Result::ERROR_INITIALIZATION_FAILED),
@@ -105,6 +112,7 @@ impl Kind {
             Self::Block => "submit-block",
             Self::Late => "late",
             Self::Poison => "poison",
+            Self::Skip => "skip",
             Self::Fail(vk::Result::ERROR_OUT_OF_DEVICE_MEMORY) => "oom-device",
             Self::Fail(vk::Result::ERROR_OUT_OF_HOST_MEMORY) => "oom-host",
             Self::Fail(_) => "init-failed",
@@ -115,7 +123,8 @@ impl Kind {
         match self {
             Self::Lost => call.is_submission() || matches!(call, Call::Wait | Call::Status),
             Self::Hang | Self::Block | Self::Late | Self::Poison => call.is_submission(),
-            Self::Fail(_) => !matches!(call, Call::Status | Call::SubmitAfterLoss),
+            Self::Skip => matches!(call, Call::Barrier),
+            Self::Fail(_) => !matches!(call, Call::Status | Call::Barrier | Call::SubmitAfterLoss),
         }
     }
 }
@@ -297,6 +306,8 @@ mod tests {
             "late@wait=1,ms=1",
             "oom-host@memory=1,gpu=1",
             "poison@frame=1",
+            "skip@frame=1",
+            "lost@barrier=1",
             "submit-hang@frame=1,bytes=3",
             "submit-hang@frame=1,s=3",
             "lost@frame=1; nonsense",

@@ -128,7 +128,9 @@ fn vulkan(findings: &mut Vec<Finding>) -> bool {
                 let advice = "runs at virtual pace with a small raster; install your GPU vendor's driver for real time";
                 (State::Warning, advice.to_string())
             }
-            None => (State::Ok, String::new()),
+            None => {
+                device.advice.clone().map_or((State::Ok, String::new()), |advice| (State::Warning, advice))
+            }
         };
         findings.push(Finding::new(&format!("Vulkan device {i}"), state, found, remedy));
     }

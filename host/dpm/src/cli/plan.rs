@@ -4,6 +4,7 @@ use super::rig_args::RigArgs;
 use super::watch::{check_out, print, write_out};
 use dpm_lab::plan_savings::Saving;
 use dpm_lab::scene_plan::scene_plan;
+use dpm_render::Traffic;
 use dpm_rig::failure::Failure;
 use dpm_rig::telemetry::report::to_json;
 use std::path::PathBuf;
@@ -45,6 +46,14 @@ fn saved(s: &Saving) -> String {
     format!("{:.2} ms instead of {:.2} ms: {cost}; {same}", s.without_ms, s.with_ms)
 }
 
+/// One line about the bandwidth that a frame takes on a GPU.
+fn moved(traffic: &[Traffic]) -> String {
+    let bytes = |t: &Traffic| t.read + t.written;
+    let each: Vec<_> = traffic.iter().map(|t| format!("{} {}", t.pass, bytes(t))).collect();
+    let sum: f64 = traffic.iter().map(bytes).sum();
+    format!("bytes a listed pixel moves on a GPU: {} in all ({})\n", sum, each.join(", "))
+}
+
 /// Prints the plan.
 ///
 /// # Errors
@@ -75,6 +84,7 @@ pub(super) fn execute(args: &PlanArgs) -> Result<(), Failure> {
     if let Some(s) = &report.together {
         text += &format!("all that is left out and can be put back, together: {}\n", saved(s));
     }
+    text += &moved(&report.traffic);
     print(&text);
     write_out(args.flags.out.as_deref(), "plan.json", &report)
 }

@@ -12,7 +12,8 @@ pub(crate) type Device = Result<Arc<Gpu>, String>;
 
 /// The first usable device, software included; with `DPM_VALIDATION` set, under the validation layer.
 pub fn open() -> Device {
-    let options = GpuOptions { validation: std::env::var_os("DPM_VALIDATION").is_some(), device: None };
+    let options =
+        GpuOptions { validation: std::env::var_os("DPM_VALIDATION").is_some(), ..GpuOptions::default() };
     Gpu::open(&options).map_err(|e| e.to_string())
 }
 

@@ -7,6 +7,9 @@ use bytemuck::Pod;
 use std::ptr::NonNull;
 use std::sync::Arc;
 
+/// Largest buffer of [`MemoryKind::Upload`] that goes to the GPU's own memory, bytes.
+const MOST_UPLOAD_ON_DEVICE: u64 = 65_536;
+
 /// Where a buffer lives and who touches it.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum MemoryKind {
@@ -18,6 +21,17 @@ pub enum MemoryKind {
     Readback,
 }
 
+/// Where a buffer's memory lies.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct Place {
+    /// In the GPU's own memory.
+    pub on_device: bool,
+    /// The host can write and read it.
+    pub host_visible: bool,
+    /// The host reads it through its caches.
+    pub host_cached: bool,
+}
+
 /// A buffer with its own memory. Mapped kinds are coherent: no flushes.
 pub struct Buffer {
     pub(super) handle: vk::Buffer,
@@ -27,6 +41,7 @@ pub struct Buffer {
     len_bytes: usize,
     /// What was allocated, alignment included.
     held_bytes: u64,
+    properties: vk::MemoryPropertyFlags,
     gpu: Arc<Gpu>,
 }
 
@@ -157,17 +172,26 @@ impl Buffer {
         unsafe {
             let handle = gpu.device.create_buffer(&info, None).on(gpu, "creating a buffer")?;
             let needs = gpu.device.get_buffer_memory_requirements(handle);
-            let memory = match gpu.takes(needs.size).and_then(|()| Self::allocate(gpu, what, needs, kind)) {
-                Ok(memory) => memory,
-                Err(e) => {
-                    gpu.device.destroy_buffer(handle, None);
-                    return Err(e);
-                }
-            };
+            let (memory, properties) =
+                match gpu.takes(needs.size).and_then(|()| Self::allocate(gpu, what, needs, kind)) {
+                    Ok(memory) => memory,
+                    Err(e) => {
+                        gpu.device.destroy_buffer(handle, None);
+                        return Err(e);
+                    }
+                };
             gpu.holds(needs.size, 0);
             let held_bytes = needs.size;
-            let mut buffer =
-                Self { handle, view: None, memory, mapped: None, len_bytes, held_bytes, gpu: gpu.clone() };
+            let mut buffer = Self {
+                handle,
+                view: None,
+                memory,
+                mapped: None,
+                len_bytes,
+                held_bytes,
+                properties,
+                gpu: gpu.clone(),
+            };
             gpu.device.bind_buffer_memory(handle, memory, 0).on(gpu, "binding buffer memory")?;
             if kind != MemoryKind::Device {
                 let pointer = gpu
@@ -186,12 +210,15 @@ impl Buffer {
         what: &str,
         needs: vk::MemoryRequirements,
         kind: MemoryKind,
-    ) -> Result<vk::DeviceMemory, GpuError> {
+    ) -> Result<(vk::DeviceMemory, vk::MemoryPropertyFlags), GpuError> {
         use vk::MemoryPropertyFlags as P;
         let coherent = P::HOST_VISIBLE | P::HOST_COHERENT;
+        let on_device = coherent | P::DEVICE_LOCAL;
         let wishes: &[P] = match kind {
             MemoryKind::Device => &[P::DEVICE_LOCAL, P::empty()],
-            // Host memory, which the GPU reads across the bus. The newest poses are a few hundred bytes.
+            // What a frame needs is small and goes to the GPU's own memory where the host can write to it. The rest goes to the host's, which the
+            // GPU reads across the bus: that part of the GPU's memory may be small, too.
+            MemoryKind::Upload if needs.size <= MOST_UPLOAD_ON_DEVICE => &[on_device, coherent],
             MemoryKind::Upload => &[coherent],
             MemoryKind::Readback => &[
                 P::from_raw(P::HOST_VISIBLE.as_raw() | P::HOST_COHERENT.as_raw() | P::HOST_CACHED.as_raw()),
@@ -209,7 +236,7 @@ impl Buffer {
                     vk::MemoryAllocateInfo::default().allocation_size(needs.size).memory_type_index(i as u32);
                 // SAFETY: valid allocate info; freed in Buffer's Drop.
                 match unsafe { gpu.device.allocate_memory(&info, None) } {
-                    Ok(memory) => return Ok(memory),
+                    Ok(memory) => return Ok((memory, t.property_flags)),
                     Err(e) => last = e,
                 }
             }
@@ -226,6 +253,17 @@ impl Buffer {
             needed_mib: Some(needs.size.div_ceil(1 << 20)),
             heap_mib: gpu.heap_mib(),
         })
+    }
+
+    /// Where its memory lies.
+    pub fn place(&self) -> Place {
+        use vk::MemoryPropertyFlags as P;
+        let has = |flag| self.properties.contains(flag);
+        Place {
+            on_device: has(P::DEVICE_LOCAL),
+            host_visible: has(P::HOST_VISIBLE),
+            host_cached: has(P::HOST_CACHED),
+        }
     }
 
     /// The mapped bytes. The GPU must not be writing them: wait for the frame's fence first.

@@ -346,7 +346,7 @@ mod tests {
 
     #[test]
     fn a_device_that_is_waited_for_no_longer_keeps_its_memory() {
-        let gpu = Gpu::open(&GpuOptions { validation: false, device: None }).expect("a Vulkan device");
+        let gpu = Gpu::open(&GpuOptions::default()).expect("a Vulkan device");
         let mut buffer = Buffer::new(&gpu, "kept", LEN, MemoryKind::Upload).expect("memory");
         buffer.bytes_mut().fill(7);
         let first = buffer.bytes_mut().as_ptr();

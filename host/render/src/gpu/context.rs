@@ -1,13 +1,15 @@
 //! Picks a device and opens it.
 
 use super::address_space;
+use super::devices::{candidates, compute_family, usable, Candidate, DeviceId, DeviceSummary};
 use super::error::GpuError;
+use super::instance::{create_instance, Instance};
 use super::turn::{Held, Turn};
-use ash::{ext, khr, vk};
-use std::ffi::{c_void, CStr, CString};
+use ash::{khr, vk};
+use std::ffi::CString;
 use std::mem::ManuallyDrop;
 use std::sync::atomic::{AtomicU64, AtomicU8, Ordering};
-use std::sync::{Arc, Mutex};
+use std::sync::Arc;
 use std::time::{Duration, Instant};
 
 /// How long to wait for the copies of a first start, nanoseconds. A slow machine may be busy with other things.
@@ -22,62 +24,11 @@ pub struct GpuOptions {
     pub validation: bool,
     /// Part of the name of the device to use; `None`: the fastest kind there is.
     pub device: Option<String>,
-}
-
-/// A device as `dpm doctor` lists it.
-#[derive(Clone, Debug)]
-pub struct DeviceSummary {
-    /// The driver's name for it.
-    pub name: String,
-    /// Driver name and version text.
-    pub driver: String,
-    /// Vulkan version.
-    pub api_version: String,
-    /// Runs on the CPU.
-    pub software: bool,
-    /// Why dpm cannot use it, if so.
-    pub refused: Option<String>,
-    /// Ray queries are there.
-    pub ray_query: bool,
-    /// Device-local memory in MiB.
-    pub memory_mib: u64,
-    /// Nanoseconds per time-stamp tick; 0: no time stamps.
-    pub timestamp_period_ns: f32,
-    /// Lanes in a subgroup.
-    pub subgroup_size: u32,
-}
-
-static VALIDATION_COUNT: AtomicU64 = AtomicU64::new(0);
-static VALIDATION_TEXT: Mutex<Vec<String>> = Mutex::new(Vec::new());
-
-/// Number of validation messages (warnings and errors) in this process so far, and the first few of them.
-pub fn validation_messages() -> (u64, Vec<String>) {
-    let text = VALIDATION_TEXT.lock().map(|t| t.clone()).unwrap_or_default();
-    (VALIDATION_COUNT.load(Ordering::Relaxed), text)
-}
-
-/// # Safety
-/// Called by the validation layer with a valid message for the duration of the call.
-unsafe extern "system" fn on_message(
-    _severity: vk::DebugUtilsMessageSeverityFlagsEXT,
-    _kind: vk::DebugUtilsMessageTypeFlagsEXT,
-    data: *const vk::DebugUtilsMessengerCallbackDataEXT<'_>,
-    _user: *mut c_void,
-) -> vk::Bool32 {
-    // SAFETY: the layer passes a valid structure; the message may be null.
-    let text = unsafe {
-        data.as_ref()
-            .filter(|d| !d.p_message.is_null())
-            .map(|d| CStr::from_ptr(d.p_message).to_string_lossy().into_owned())
-    };
-    if let Some(text) = text {
-        if VALIDATION_COUNT.fetch_add(1, Ordering::Relaxed) < 16 {
-            if let Ok(mut all) = VALIDATION_TEXT.lock() {
-                all.push(text);
-            }
-        }
-    }
-    vk::FALSE
+    /// The driver keeps what its compiler made of each pipeline, for [`super::ComputePipeline::executables`]. Devices whose driver cannot are
+    /// refused.
+    pub statistics: bool,
+    /// Memory that the frames take, bytes: devices with less are refused. 0: not known. Software Vulkan uses the machine's.
+    pub memory_bytes: u64,
 }
 
 /// An open device. Shared by everything made from it; closed when the last of them is gone.
@@ -98,6 +49,8 @@ pub struct Gpu {
     name: Arc<str>,
     pub(super) id: DeviceId,
     pub(super) options: GpuOptions,
+    /// Calls that ask what the compiler made of a pipeline, if the options asked for them.
+    pub(super) statistics: Option<khr::pipeline_executable_properties::Device>,
     instance: ManuallyDrop<Instance>,
     /// One of [`State`].
     state: AtomicU8,
@@ -119,15 +72,6 @@ enum State {
     Lost,
     /// It did not finish in time, and may still use everything that it was given.
     GivenUp,
-}
-
-/// Identifies a device in several lists of the same machine.
-#[derive(Clone, Debug, PartialEq, Eq)]
-pub(super) struct DeviceId {
-    uuid: [u8; vk::UUID_SIZE],
-    name: String,
-    /// Several devices may agree in all of this (software Vulkan). This is the place among them, in the order of the list.
-    twin: usize,
 }
 
 impl std::fmt::Debug for Gpu {
@@ -156,215 +100,35 @@ pub fn memory_given_up() -> MemoryGivenUp {
     }
 }
 
-/// An instance with its messenger and the loader, destroyed in this order.
-struct Instance {
-    debug: Option<(ext::debug_utils::Instance, vk::DebugUtilsMessengerEXT)>,
-    handle: ash::Instance,
-    _entry: ash::Entry,
-}
-
-impl std::ops::Deref for Instance {
-    type Target = ash::Instance;
-
-    fn deref(&self) -> &ash::Instance {
-        &self.handle
-    }
-}
-
-impl Drop for Instance {
-    fn drop(&mut self) {
-        // SAFETY: devices made from it are gone (`Gpu` closes its own first), and the loader outlives this call.
-        unsafe {
-            if let Some((loader, messenger)) = &self.debug {
-                loader.destroy_debug_utils_messenger(*messenger, None);
-            }
-            self.handle.destroy_instance(None);
-        }
-    }
-}
-
-fn load() -> Result<ash::Entry, GpuError> {
-    // SAFETY: loading libvulkan runs its initialisers; it is the system's loader.
-    unsafe { ash::Entry::load() }.map_err(|e| GpuError::NoLoader(e.to_string()))
-}
-
-fn version_text(v: u32) -> String {
-    format!("{}.{}.{}", vk::api_version_major(v), vk::api_version_minor(v), vk::api_version_patch(v))
-}
-
-/// The error of a call that does not concern a device yet.
-fn without_device(operation: &'static str) -> impl Fn(vk::Result) -> GpuError {
-    move |result| GpuError::from_result(result, operation, &"the Vulkan loader".into(), 0)
-}
-
-fn create_instance(validation: bool) -> Result<Instance, GpuError> {
-    let entry = load()?;
-    let application =
-        vk::ApplicationInfo::default().application_name(c"dpm").api_version(vk::make_api_version(0, 1, 2, 0));
-    let layer = c"VK_LAYER_KHRONOS_validation";
-    // SAFETY: plain enumeration.
-    let layers = unsafe { entry.enumerate_instance_layer_properties() }.unwrap_or_default();
-    let have_layer = layers.iter().any(|l| l.layer_name_as_c_str() == Ok(layer));
-    let validate = validation && have_layer;
-    if validation && !have_layer {
-        tracing::warn!(
-            "validation asked for, but the layer is not installed (apt-get install vulkan-validationlayers)"
-        );
-    }
-    let layer_names = if validate { vec![layer.as_ptr()] } else { vec![] };
-    let extensions = if validate { vec![ext::debug_utils::NAME.as_ptr()] } else { vec![] };
-    let enable = [vk::ValidationFeatureEnableEXT::SYNCHRONIZATION_VALIDATION];
-    let mut features = vk::ValidationFeaturesEXT::default().enabled_validation_features(&enable);
-    let mut info = vk::InstanceCreateInfo::default()
-        .application_info(&application)
-        .enabled_layer_names(&layer_names)
-        .enabled_extension_names(&extensions);
-    if validate {
-        info = info.push_next(&mut features);
+/// Creates the device with its queue. Returns it with the queue's family and the most that buffers may take of the address space.
+fn create(
+    instance: &ash::Instance,
+    physical: vk::PhysicalDevice,
+    summary: &DeviceSummary,
+    options: &GpuOptions,
+) -> Result<(ash::Device, u32, Option<u64>), GpuError> {
+    let name: Arc<str> = summary.name.as_str().into();
+    let most_bytes =
+        if summary.software { address_space::for_buffers().map_err(|e| e.on(&name))? } else { None };
+    let queue_family = compute_family(instance, physical).ok_or_else(|| GpuError::NoDevice {
+        found: summary.name.clone(),
+        needed: "a compute queue".into(),
+    })?;
+    let priorities = [1.0];
+    let queues =
+        [vk::DeviceQueueCreateInfo::default().queue_family_index(queue_family).queue_priorities(&priorities)];
+    let mut vulkan12 = vk::PhysicalDeviceVulkan12Features::default().scalar_block_layout(true);
+    let mut info = vk::DeviceCreateInfo::default().queue_create_infos(&queues).push_next(&mut vulkan12);
+    let mut executable =
+        vk::PhysicalDevicePipelineExecutablePropertiesFeaturesKHR::default().pipeline_executable_info(true);
+    let extensions = [khr::pipeline_executable_properties::NAME.as_ptr()];
+    if options.statistics {
+        info = info.enabled_extension_names(&extensions).push_next(&mut executable);
     }
     // SAFETY: `info` and what it points to live until the call returns.
-    let handle = unsafe { entry.create_instance(&info, None) }.map_err(|e| match e {
-        vk::Result::ERROR_INCOMPATIBLE_DRIVER => GpuError::NoDriver(format!("{e:?}")),
-        result => without_device("creating the Vulkan instance")(result),
-    })?;
-    let mut instance = Instance { debug: None, handle, _entry: entry };
-    if validate {
-        let loader = ext::debug_utils::Instance::new(&instance._entry, &instance.handle);
-        let info = vk::DebugUtilsMessengerCreateInfoEXT::default()
-            .message_severity(
-                vk::DebugUtilsMessageSeverityFlagsEXT::ERROR | vk::DebugUtilsMessageSeverityFlagsEXT::WARNING,
-            )
-            .message_type(
-                vk::DebugUtilsMessageTypeFlagsEXT::VALIDATION
-                    | vk::DebugUtilsMessageTypeFlagsEXT::PERFORMANCE,
-            )
-            .pfn_user_callback(Some(on_message));
-        // SAFETY: the callback is a plain function that outlives the instance.
-        let messenger = unsafe { loader.create_debug_utils_messenger(&info, None) }
-            .map_err(without_device("creating the debug messenger"))?;
-        instance.debug = Some((loader, messenger));
-    }
-    Ok(instance)
-}
-
-/// Features that every shader relies on.
-fn missing_features(instance: &ash::Instance, physical: vk::PhysicalDevice) -> Option<String> {
-    let mut scalar = vk::PhysicalDeviceScalarBlockLayoutFeatures::default();
-    let mut features = vk::PhysicalDeviceFeatures2::default().push_next(&mut scalar);
-    // SAFETY: `features` chains valid structures.
-    unsafe { instance.get_physical_device_features2(physical, &mut features) };
-    // SAFETY: plain query.
-    let props = unsafe { instance.get_physical_device_properties(physical) };
-    let mut missing = Vec::new();
-    if props.api_version < vk::make_api_version(0, 1, 2, 0) {
-        missing.push(format!("Vulkan 1.2 (has {})", version_text(props.api_version)));
-    }
-    if scalar.scalar_block_layout == 0 {
-        missing.push("scalarBlockLayout".to_owned());
-    }
-    if compute_family(instance, physical).is_none() {
-        missing.push("a compute queue".to_owned());
-    }
-    (!missing.is_empty()).then(|| format!("lacks {}", missing.join(", ")))
-}
-
-fn compute_family(instance: &ash::Instance, physical: vk::PhysicalDevice) -> Option<u32> {
-    // SAFETY: plain query.
-    let families = unsafe { instance.get_physical_device_queue_family_properties(physical) };
-    let compute = |f: &vk::QueueFamilyProperties| f.queue_flags.contains(vk::QueueFlags::COMPUTE);
-    // A queue family without graphics does not share its time with a desktop.
-    families
-        .iter()
-        .position(|f| {
-            compute(f) && !f.queue_flags.contains(vk::QueueFlags::GRAPHICS) && f.timestamp_valid_bits > 0
-        })
-        .or_else(|| families.iter().position(compute))
-        .map(|i| i as u32)
-}
-
-/// Describes a device, with its identity.
-fn summarise(instance: &ash::Instance, physical: vk::PhysicalDevice) -> (DeviceSummary, [u8; vk::UUID_SIZE]) {
-    let mut driver = vk::PhysicalDeviceDriverProperties::default();
-    let mut subgroup = vk::PhysicalDeviceSubgroupProperties::default();
-    let mut id = vk::PhysicalDeviceIDProperties::default();
-    let mut props = vk::PhysicalDeviceProperties2::default()
-        .push_next(&mut driver)
-        .push_next(&mut subgroup)
-        .push_next(&mut id);
-    // SAFETY: `props` chains valid structures; the rest are plain queries.
-    unsafe { instance.get_physical_device_properties2(physical, &mut props) };
-    let base = props.properties;
-    // SAFETY: plain query.
-    let memory = unsafe { instance.get_physical_device_memory_properties(physical) };
-    // SAFETY: plain query.
-    let extensions = unsafe { instance.enumerate_device_extension_properties(physical) }.unwrap_or_default();
-    let text = |r: Result<&CStr, _>| r.map(|c: &CStr| c.to_string_lossy().into_owned()).unwrap_or_default();
-    let summary = DeviceSummary {
-        name: text(base.device_name_as_c_str().map_err(|_| ())),
-        driver: format!(
-            "{} {}",
-            text(driver.driver_name_as_c_str().map_err(|_| ())),
-            text(driver.driver_info_as_c_str().map_err(|_| ()))
-        ),
-        api_version: version_text(base.api_version),
-        software: base.device_type == vk::PhysicalDeviceType::CPU,
-        refused: missing_features(instance, physical),
-        ray_query: extensions.iter().any(|e| e.extension_name_as_c_str() == Ok(khr::ray_query::NAME)),
-        memory_mib: memory.memory_heaps[..memory.memory_heap_count as usize]
-            .iter()
-            .filter(|h| h.flags.contains(vk::MemoryHeapFlags::DEVICE_LOCAL))
-            .map(|h| h.size >> 20)
-            .max()
-            .unwrap_or(0),
-        timestamp_period_ns: if base.limits.timestamp_compute_and_graphics != 0 {
-            base.limits.timestamp_period
-        } else {
-            0.0
-        },
-        subgroup_size: subgroup.subgroup_size,
-    };
-    (summary, id.device_uuid)
-}
-
-/// A device of the loader's list.
-struct Candidate {
-    physical: vk::PhysicalDevice,
-    summary: DeviceSummary,
-    id: DeviceId,
-}
-
-/// The loader's list.
-fn candidates(instance: &ash::Instance) -> Result<Vec<Candidate>, GpuError> {
-    // SAFETY: plain enumeration.
-    let all =
-        unsafe { instance.enumerate_physical_devices() }.map_err(without_device("listing Vulkan devices"))?;
-    let mut found: Vec<Candidate> = Vec::with_capacity(all.len());
-    for physical in all {
-        let (summary, uuid) = summarise(instance, physical);
-        let same = |c: &&Candidate| (c.id.uuid, &c.id.name) == (uuid, &summary.name);
-        let twin = found.iter().filter(same).count();
-        let id = DeviceId { uuid, name: summary.name.clone(), twin };
-        found.push(Candidate { physical, summary, id });
-    }
-    Ok(found)
-}
-
-/// The devices that the options allow, best first: discrete before integrated before virtual before software.
-fn usable(instance: &ash::Instance, mut all: Vec<Candidate>, options: &GpuOptions) -> Vec<Candidate> {
-    all.retain(|c| {
-        c.summary.refused.is_none()
-            && options.device.as_ref().is_none_or(|wish| c.summary.name.contains(wish.as_str()))
-    });
-    all.sort_by_key(|c| {
-        // SAFETY: plain query.
-        match unsafe { instance.get_physical_device_properties(c.physical) }.device_type {
-            vk::PhysicalDeviceType::DISCRETE_GPU => 0,
-            vk::PhysicalDeviceType::INTEGRATED_GPU => 1,
-            vk::PhysicalDeviceType::VIRTUAL_GPU => 2,
-            _ => 3,
-        }
-    });
-    all
+    let device = unsafe { instance.create_device(physical, &info, None) }
+        .map_err(|e| GpuError::from_result(e, "opening the Vulkan device", &name, summary.memory_mib))?;
+    Ok((device, queue_family, most_bytes))
 }
 
 impl Gpu {
@@ -374,7 +138,7 @@ impl Gpu {
     /// [`GpuError::NoLoader`], [`GpuError::NoDriver`].
     pub fn list() -> Result<Vec<DeviceSummary>, GpuError> {
         let instance = create_instance(false)?;
-        Ok(candidates(&instance)?.into_iter().map(|c| c.summary).collect())
+        Ok(candidates(&instance, &GpuOptions::default())?.into_iter().map(|c| c.summary).collect())
     }
 
     /// Opens a device: discrete before integrated before software, or the one whose name contains `options.device`.
@@ -389,7 +153,7 @@ impl Gpu {
     /// The devices that the options allow, best first.
     pub(super) fn ranked(options: &GpuOptions) -> Result<Vec<DeviceId>, GpuError> {
         let instance = create_instance(options.validation)?;
-        let all = candidates(&instance)?;
+        let all = candidates(&instance, options)?;
         Ok(usable(&instance, all, options).into_iter().map(|c| c.id).collect())
     }
 
@@ -400,7 +164,7 @@ impl Gpu {
         setup_wait_ns: u64,
     ) -> Result<Arc<Self>, GpuError> {
         let instance = create_instance(options.validation)?;
-        let candidates = candidates(&instance)?;
+        let candidates = candidates(&instance, options)?;
         let found = candidates
             .iter()
             .map(|c| format!("{} ({})", c.summary.name, c.summary.refused.as_deref().unwrap_or("usable")))
@@ -409,57 +173,53 @@ impl Gpu {
         let found = if found.is_empty() { "none".to_owned() } else { found };
         let mut usable = usable(&instance, candidates, options);
         usable.retain(|c| only.is_none_or(|id| c.id == *id));
-        let Some(Candidate { physical, summary, id }) = usable.into_iter().next() else {
-            let name = options
-                .device
-                .as_ref()
-                .map_or(String::new(), |d| format!(" and a name that contains \"{d}\""));
-            let which = only.map_or(String::new(), |id| format!(", the very {} that was lost", id.name));
-            return Err(GpuError::NoDevice {
-                found,
-                needed: format!("Vulkan 1.2 with scalarBlockLayout{name}{which}"),
-            });
-        };
-        let name: Arc<str> = summary.name.as_str().into();
-        let most_bytes =
-            if summary.software { address_space::for_buffers().map_err(|e| e.on(&name))? } else { None };
-        let queue_family = compute_family(&instance, physical)
-            .ok_or_else(|| GpuError::NoDevice { found, needed: "a compute queue".into() })?;
-        let priorities = [1.0];
-        let queues = [vk::DeviceQueueCreateInfo::default()
-            .queue_family_index(queue_family)
-            .queue_priorities(&priorities)];
-        let mut vulkan12 = vk::PhysicalDeviceVulkan12Features::default().scalar_block_layout(true);
-        let info = vk::DeviceCreateInfo::default().queue_create_infos(&queues).push_next(&mut vulkan12);
-        // SAFETY: `info` and what it points to live until the call returns.
-        let device = unsafe { instance.create_device(physical, &info, None) }
-            .map_err(|e| GpuError::from_result(e, "opening the Vulkan device", &name, summary.memory_mib))?;
-        // SAFETY: family and index were asked for above.
-        let queue = unsafe { device.get_device_queue(queue_family, 0) };
-        // SAFETY: plain queries.
-        let (memory, limits) = unsafe {
-            (
-                instance.get_physical_device_memory_properties(physical),
-                instance.get_physical_device_properties(physical).limits,
-            )
-        };
-        Ok(Arc::new(Self {
-            device,
-            queue,
-            turn: Turn::default(),
-            queue_family,
-            memory,
-            limits,
-            summary,
-            name,
-            id,
-            options: options.clone(),
-            instance: ManuallyDrop::new(instance),
-            state: AtomicU8::new(State::Well as u8),
-            held_bytes: AtomicU64::new(0),
-            most_bytes,
-            setup_wait_ns,
-        }))
+        let mut first_error = None;
+        for Candidate { physical, summary, id } in usable {
+            let name: Arc<str> = summary.name.as_str().into();
+            let (device, queue_family, most_bytes) = match create(&instance, physical, &summary, options) {
+                Ok(created) => created,
+                Err(error) => {
+                    tracing::warn!("{name} is passed over: {error}");
+                    first_error.get_or_insert(error);
+                    continue;
+                }
+            };
+            let statistics = options
+                .statistics
+                .then(|| khr::pipeline_executable_properties::Device::new(&instance.handle, &device));
+            // SAFETY: the device was created with one queue of this family.
+            let queue = unsafe { device.get_device_queue(queue_family, 0) };
+            // SAFETY: plain queries.
+            let (memory, limits) = unsafe {
+                (
+                    instance.get_physical_device_memory_properties(physical),
+                    instance.get_physical_device_properties(physical).limits,
+                )
+            };
+            return Ok(Arc::new(Self {
+                device,
+                queue,
+                turn: Turn::default(),
+                queue_family,
+                memory,
+                limits,
+                summary,
+                name,
+                id,
+                options: options.clone(),
+                statistics,
+                instance: ManuallyDrop::new(instance),
+                state: AtomicU8::new(State::Well as u8),
+                held_bytes: AtomicU64::new(0),
+                most_bytes,
+                setup_wait_ns,
+            }));
+        }
+        let name =
+            options.device.as_ref().map_or(String::new(), |d| format!(" and a name that contains \"{d}\""));
+        let which = only.map_or(String::new(), |id| format!(", the very {} that was lost", id.name));
+        let needed = format!("Vulkan 1.2 with scalarBlockLayout{name}{which}");
+        Err(first_error.unwrap_or(GpuError::NoDevice { found, needed }))
     }
 
     /// Describes this device.

@@ -154,6 +154,11 @@ fn needs(needed_mib: Option<u64>, heap_mib: u64) -> String {
 
 impl GpuError {
     /// What `result` means.
+    /// The error of a call that does not concern a device yet.
+    pub(super) fn without_device(operation: &'static str) -> impl Fn(vk::Result) -> Self {
+        move |result| Self::from_result(result, operation, &"the Vulkan loader".into(), 0)
+    }
+
     pub(super) fn from_result(
         result: vk::Result,
         operation: &'static str,

@@ -4,7 +4,7 @@ use super::buffer::Buffer;
 use super::context::{Gpu, On as _};
 use super::error::GpuError;
 use ash::vk;
-use dpm_shaders::Shader;
+use dpm_shaders::{structs, Shader};
 use std::sync::Arc;
 
 /// What a binding holds.
@@ -28,12 +28,24 @@ impl BindingKind {
     }
 }
 
+/// The bindings that all shaders share, with their kinds. The second bindings of a buffer, as texels, are bound only for shaders that read tables so
+/// (`texel`), because devices bind a limited number.
+pub fn shared_bindings(texel: bool) -> Vec<(u32, BindingKind)> {
+    (structs::BINDINGS.iter())
+        .filter(|(name, _)| texel || !name.ends_with("_ROWS"))
+        .map(|&(name, binding)| {
+            let rows = texel && structs::TEXEL_BINDINGS.contains(&name);
+            (binding, if rows { BindingKind::Texel } else { BindingKind::Storage })
+        })
+        .collect()
+}
+
 /// The layout of set 0: the kind of each binding.
 pub struct BindingTable {
     layout: vk::DescriptorSetLayout,
     pipeline_layout: vk::PipelineLayout,
     bindings: Vec<(u32, BindingKind)>,
-    gpu: Arc<Gpu>,
+    pub(super) gpu: Arc<Gpu>,
 }
 
 impl BindingTable {
@@ -154,7 +166,7 @@ impl Drop for BindingSet {
 pub struct ComputePipeline {
     pub(super) pipeline: vk::Pipeline,
     pub(super) layout: vk::PipelineLayout,
-    table: Arc<BindingTable>,
+    pub(super) table: Arc<BindingTable>,
 }
 
 impl ComputePipeline {
@@ -194,7 +206,14 @@ impl ComputePipeline {
                 .module(module)
                 .name(&name)
                 .specialization_info(&specialization);
-            let info = [vk::ComputePipelineCreateInfo::default().stage(stage).layout(table.pipeline_layout)];
+            let flags = match gpu.statistics {
+                Some(_) => vk::PipelineCreateFlags::CAPTURE_STATISTICS_KHR,
+                None => vk::PipelineCreateFlags::empty(),
+            };
+            let info = [vk::ComputePipelineCreateInfo::default()
+                .flags(flags)
+                .stage(stage)
+                .layout(table.pipeline_layout)];
             let result = gpu.device.create_compute_pipelines(vk::PipelineCache::null(), &info, None);
             gpu.device.destroy_shader_module(module, None);
             let pipeline = result.map_err(|(_, e)| e).on(gpu, "compiling a compute pipeline")?[0];

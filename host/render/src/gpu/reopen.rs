@@ -1,7 +1,8 @@
 //! After a loss: opens the same device again, or another one.
 
 use super::commands::run_now;
-use super::context::{DeviceId, Gpu};
+use super::context::Gpu;
+use super::devices::DeviceId;
 use super::error::GpuError;
 use crossbeam::channel::bounded;
 use std::sync::Arc;
@@ -116,7 +117,7 @@ mod tests {
     /// Found in use, R12. Without any fault a device can be left and opened anew: what a caller does that sees a stage hang.
     #[test]
     fn a_device_that_was_left_is_refused_and_the_one_in_its_place_works() {
-        let options = GpuOptions { validation: false, device: None };
+        let options = GpuOptions::default();
         let first = Gpu::open(&options).expect("a Vulkan device");
         assert!(!first.is_lost());
         let second = first.reopen().expect("the device comes back");

@@ -74,7 +74,7 @@ impl BodyBvh {
     }
 
     /// Levels of nodes, the root's included; 0 of an empty tree.
-    pub(crate) fn levels(&self) -> usize {
+    pub fn levels(&self) -> usize {
         let mut level: Vec<u32> = if self.nodes.is_empty() { vec![] } else { vec![0] };
         let mut levels = 0;
         while !level.is_empty() {
@@ -174,7 +174,7 @@ mod tests {
 
     #[test]
     fn the_shader_has_the_stack_that_is_counted_on() {
-        let text = include_str!("../../../../shaders/glsl/bvh.glsl");
+        let text = include_str!("../../../../shaders/glsl/walk_software.glsl");
         assert!(text.contains(&format!("const uint STACK_SIZE = {TRAVERSAL_STACK}u;")));
     }
 

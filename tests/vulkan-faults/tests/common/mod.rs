@@ -26,7 +26,7 @@ pub(crate) fn layer(plan: &str) -> Session {
 }
 
 pub(crate) fn options() -> GpuOptions {
-    GpuOptions { validation: true, device: None }
+    GpuOptions { validation: true, ..GpuOptions::default() }
 }
 
 /// Validation looks at everything that goes through the layer.

@@ -1,0 +1,123 @@
+//! What a renderer is made from, without a device, and the pipelines that this becomes on one.
+
+use super::optics::OpticsLayout;
+use super::passes::TABLE;
+use super::scene_data::{Keep, SceneData, SceneDataError};
+use super::settings::RendererSettings;
+use crate::gpu::{shared_bindings, BindingTable, ComputePipeline, Executable, Gpu, GpuError};
+use dpm_scene::Scene;
+use dpm_shaders::specialization as ids;
+use dpm_shaders::Shader;
+use std::sync::Arc;
+
+/// What a renderer is made from, without a device. It is kept so that the renderer can be made again on another device without preparing the
+/// scene again. Cheap to clone.
+#[derive(Clone)]
+pub struct RendererPlan {
+    pub(super) data: Arc<SceneData>,
+    pub(super) settings: RendererSettings,
+    pub(super) keep: Keep,
+    /// For each body of the scene the tracked body that carries it.
+    pub(super) tracked: Vec<Option<u16>>,
+}
+
+/// The program of a pass, as a driver is given it.
+#[derive(Clone, Debug)]
+pub struct Program {
+    /// Name of the pass in reports, as in [`crate::PASSES`].
+    pub pass: &'static str,
+    /// Whether its rays walk through the scene.
+    pub walks: bool,
+    /// The shader that the method runs in this pass.
+    pub shader: Shader,
+    /// Specialization constants, each as id and value.
+    pub constants: Vec<(u32, u32)>,
+}
+
+/// The pipelines of a plan on a device.
+pub(super) struct Pipelines {
+    pub table: Arc<BindingTable>,
+    /// One for each row of [`TABLE`]; `None`: the method does not need the pass.
+    pub each: Vec<Option<ComputePipeline>>,
+}
+
+impl RendererPlan {
+    /// A plan to draw `scene` with these settings, and with all of `keep`, whether the rig needs it or not.
+    ///
+    /// # Errors
+    /// The scene is too large for the tables of the shaders.
+    pub fn new(scene: &Scene, settings: RendererSettings, keep: Keep) -> Result<Self, SceneDataError> {
+        let data = Arc::new(SceneData::build(scene)?);
+        let tracked = scene.bodies.iter().map(|b| b.tracked).collect();
+        Ok(Self { data, settings, keep, tracked })
+    }
+
+    /// Whether shaders read tables through texel buffers on this device, as software Vulkan should.
+    pub(super) fn reads_texels(&self, gpu: &Gpu) -> bool {
+        gpu.summary().software && !self.keep.storage_tables
+    }
+
+    /// Specialization constants of all passes that read the scene, each as id and value.
+    fn constants(&self, optics: &OpticsLayout) -> Vec<(u32, u32)> {
+        let mut needs = self.data.needs.with(self.keep.needs);
+        needs.clamp |= self.settings.clamp_indirect.is_some();
+        if self.settings.leave_nothing_out {
+            needs = needs.everything();
+        }
+        let mut constants = needs.constants();
+        constants.extend(self.settings.method.constants());
+        constants.extend(optics.constants());
+        // A level's group waits while the next level is open, so the deepest one never does.
+        constants.push((ids::WALK_STACK, self.data.levels.saturating_sub(1).max(1)));
+        constants
+    }
+
+    /// The programs of the passes that the plan needs; `None` for the others. `texel`: they read tables through texel buffers.
+    fn wanted(&self, texel: bool) -> impl Iterator<Item = Option<Program>> + '_ {
+        let settings = &self.settings;
+        let optics = OpticsLayout::new(settings.raster, &settings.drive, settings.lens.as_ref());
+        let shared = self.constants(&optics);
+        TABLE.iter().map(move |pass| {
+            (pass.when)(settings, self.keep).then(|| Program {
+                pass: pass.name,
+                walks: pass.walks,
+                shader: pass.shader(&settings.method, texel),
+                constants: pass.constants(&shared, settings),
+            })
+        })
+    }
+
+    /// Compiles the passes that the plan needs. Nothing is sent to the device.
+    ///
+    /// # Errors
+    /// The GPU's own.
+    pub(super) fn pipelines(&self, gpu: &Arc<Gpu>) -> Result<Pipelines, GpuError> {
+        let texel = self.reads_texels(gpu);
+        let table = BindingTable::new(gpu, &shared_bindings(texel))?;
+        let compiled = |p: Program| ComputePipeline::new(&table, p.shader, &p.constants);
+        let each = self.wanted(texel).map(|program| program.map(compiled).transpose());
+        let each = each.collect::<Result<_, _>>()?;
+        Ok(Pipelines { table, each })
+    }
+
+    /// The programs that a GPU is given for this plan, in the order in which they run.
+    pub fn programs(&self) -> Vec<Program> {
+        self.wanted(false).flatten().collect()
+    }
+
+    /// What the device's driver makes of each of [`RendererPlan::programs`], if it was opened with [`crate::gpu::GpuOptions::statistics`]. Nothing is sent
+    /// to the device, so its driver may be one that only compiles.
+    ///
+    /// # Errors
+    /// The GPU's own.
+    pub fn compile(&self, gpu: &Arc<Gpu>) -> Result<Vec<(Program, Vec<Executable>)>, GpuError> {
+        let table = BindingTable::new(gpu, &shared_bindings(false))?;
+        let programs = self.programs().into_iter();
+        programs
+            .map(|p| {
+                let made = ComputePipeline::new(&table, p.shader, &p.constants)?.executables()?;
+                Ok((p, made))
+            })
+            .collect()
+    }
+}

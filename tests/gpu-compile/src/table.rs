@@ -1,0 +1,167 @@
+//! What compilers made of the passes, as rows: measured, written, read.
+
+use crate::cases::Case;
+use crate::targets::Target;
+use dpm_render::gpu::{Executable, Gpu, GpuOptions};
+use dpm_render::Program;
+use serde::{Deserialize, Serialize};
+use std::fmt::Write as _;
+
+/// What one compiler made of one pass.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+pub struct Row {
+    /// Scene, and method unless it is `dpm`.
+    pub case: String,
+    /// Name of the pass.
+    pub pass: String,
+    /// Name of the target.
+    pub target: String,
+    /// Vector registers a lane.
+    pub registers: u32,
+    /// Registers that were spilled: to memory, and scalar ones to lanes of vector registers. NVK does not count them: they show in `scratch`.
+    pub spills: u32,
+    /// Memory for spilled registers and arrays: bytes a lane on NVIDIA, bytes a wave on AMD.
+    pub scratch: u32,
+    /// Waves of 32 lanes that a SIMD holds, as RADV counts them; `None`: the driver does not say.
+    pub waves: Option<u32>,
+    /// Lanes of a subgroup.
+    pub subgroup: u32,
+    /// Instructions.
+    pub instructions: u32,
+    /// Size of the program.
+    pub code_bytes: u32,
+    /// Whether rays walk through the scene in this pass.
+    pub walks: bool,
+    /// Whether the driver is a current one.
+    pub current: bool,
+}
+
+/// What a driver was given: a pass with its shader and constants, as one number.
+#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
+pub struct Input {
+    /// As in [`Row`].
+    pub case: String,
+    /// As in [`Row`].
+    pub pass: String,
+    /// FNV-1a of the SPIR-V and the constants.
+    pub digest: String,
+}
+
+/// The table.
+#[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
+pub struct Table {
+    /// What the drivers were given.
+    pub inputs: Vec<Input>,
+    /// Name and version of the driver of each target, as it says itself.
+    pub drivers: Vec<(String, String)>,
+    /// What they made of it.
+    pub passes: Vec<Row>,
+}
+
+/// The digests of all programs of a case.
+pub fn inputs(case: &Case) -> Vec<Input> {
+    let digest = |program: &Program| {
+        let constants: Vec<u8> = program
+            .constants
+            .iter()
+            .flat_map(|(id, value)| [id.to_le_bytes(), value.to_le_bytes()].concat())
+            .collect();
+        let parts = [("spirv", program.shader.spirv), ("constants", &constants)];
+        format!("{:016x}", dpm_shaders::generate::source_hash(parts.into_iter()))
+    };
+    let input = |p: &Program| Input { case: case.name.clone(), pass: p.pass.into(), digest: digest(p) };
+    case.plan.programs().iter().map(input).collect()
+}
+
+/// The first of these statistics that the driver has.
+fn first(made: &[Executable], names: &[&str]) -> Option<u32> {
+    let value = |name: &&str| made.iter().filter_map(|m| m.get(name)).reduce(f64::max);
+    names.iter().find_map(value).map(|v| v as u32)
+}
+
+fn row(case: &str, target: &Target, program: &Program, made: &[Executable]) -> Result<Row, String> {
+    let need = |names: &[&str]| {
+        let have: Vec<_> = made.iter().flat_map(|m| m.statistics.iter().map(|s| s.0.as_str())).collect();
+        first(made, names)
+            .ok_or_else(|| format!("{}: the driver says none of {names:?}, but {have:?}", target.name))
+    };
+    Ok(Row {
+        case: case.to_owned(),
+        pass: program.pass.to_owned(),
+        target: target.name.to_owned(),
+        registers: need(&["VGPRs", "Number of GPRs"])?,
+        spills: first(made, &["Spilled VGPRs"]).unwrap_or(0) + first(made, &["Spilled SGPRs"]).unwrap_or(0),
+        scratch: need(&["Scratch size", "SLM Size", "SLM size"])?,
+        waves: first(made, &["Subgroups per SIMD", "Max Waves"]),
+        subgroup: made.iter().map(|m| m.subgroup_size).max().unwrap_or(0),
+        instructions: need(&["Instructions", "Instruction count", "Instruction Count"])?,
+        code_bytes: need(&["Code size", "Code Size"])?,
+        walks: program.walks,
+        current: target.current,
+    })
+}
+
+/// Compiles every pipeline of all cases on the device that this process sees, as `target`. Returns the driver's own name with the rows.
+///
+/// # Errors
+/// The driver refuses something or does not say what it made.
+pub fn compile(cases: &[Case], target: &Target) -> Result<(String, Vec<Row>), String> {
+    let options = GpuOptions { statistics: true, ..GpuOptions::default() };
+    let gpu = Gpu::open(&options).map_err(|e| e.to_string())?;
+    let mut rows = Vec::new();
+    for case in cases {
+        for (program, made) in case.plan.compile(&gpu).map_err(|e| e.to_string())? {
+            rows.push(row(&case.name, target, &program, &made)?);
+        }
+    }
+    let summary = gpu.summary();
+    Ok((format!("{}, {}", summary.name, summary.driver.trim()), rows))
+}
+
+impl Table {
+    /// One line for each pass and driver: the worst of all cases.
+    pub fn markdown(&self) -> String {
+        let mut text = String::from(
+            "| pass | target | registers | spills | scratch, bytes | waves of 32 | instructions | code, KiB |\n\
+             |---|---|---:|---:|---:|---:|---:|---:|\n",
+        );
+        let mut seen = Vec::new();
+        for row in &self.passes {
+            let key = (&row.pass, &row.target);
+            if seen.contains(&key) {
+                continue;
+            }
+            seen.push(key);
+            let same = || self.passes.iter().filter(|r| (&r.pass, &r.target) == key);
+            let most = |of: fn(&Row) -> u32| same().map(of).max().unwrap_or(0);
+            let waves = same().filter_map(|r| r.waves).min().map_or("-".to_owned(), |w| w.to_string());
+            let _ = writeln!(
+                text,
+                "| {} | {} | {} | {} | {} | {waves} | {} | {:.1} |",
+                row.pass,
+                row.target,
+                most(|r| r.registers),
+                most(|r| r.spills),
+                most(|r| r.scratch),
+                most(|r| r.instructions),
+                f64::from(most(|r| r.code_bytes)) / 1024.0
+            );
+        }
+        text
+    }
+
+    /// The table as the committed file: one row a line.
+    pub fn json(&self) -> String {
+        let line = |value: serde_json::Value| value.to_string();
+        let rows = |all: Vec<String>| all.join(",\n    ");
+        let inputs = self.inputs.iter().map(|i| line(serde_json::json!(i))).collect();
+        let drivers = self.drivers.iter().map(|d| line(serde_json::json!(d))).collect();
+        let passes = self.passes.iter().map(|p| line(serde_json::json!(p))).collect();
+        format!(
+            "{{\n  \"inputs\": [\n    {}\n  ],\n  \"drivers\": [\n    {}\n  ],\n  \"passes\": [\n    {}\n  ]\n}}\n",
+            rows(inputs),
+            rows(drivers),
+            rows(passes)
+        )
+    }
+}

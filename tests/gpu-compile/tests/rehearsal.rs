@@ -1,0 +1,37 @@
+//! What the dry run judges, fed with faults.
+
+use dpm_render::gpu::Place;
+use gpu_compile::rehearsal::{misplaced, too_large, Share, MOST_OF_A_SLOT_MS};
+
+#[test]
+fn each_kind_of_wrong_memory_is_named() {
+    let good = Place { on_device: true, host_visible: false, host_cached: false };
+    let host = Place { on_device: false, host_visible: true, host_cached: true };
+    let all = [("instances", good), ("counters of the host", host)];
+    assert!(misplaced(&all).is_empty());
+    for (name, place, fault) in [
+        ("instances", host, "across the bus"),
+        ("counters of the host", good, "cannot read"),
+        ("counters of the host", Place { host_cached: false, ..host }, "without its caches"),
+    ] {
+        let wrong = misplaced(&[all[0], (name, place), all[1]]);
+        assert!(wrong.len() == 1 && wrong[0].contains(name) && wrong[0].contains(fault), "{wrong:?}");
+    }
+}
+
+#[test]
+fn a_host_that_takes_too_much_of_a_slot_is_named_by_its_method() {
+    let share = |method: &str, plan: f64, readable: f64| Share {
+        method: method.into(),
+        runs: 1,
+        frames: 1000,
+        missed: 0,
+        plan_ms: [0.0, plan],
+        readable_ms: [0.0, readable],
+    };
+    let half = MOST_OF_A_SLOT_MS / 2.0;
+    let all = [share("full", half, half), share("dpm", half, half * 1.01), share("paper", f64::NAN, half)];
+    let over = too_large(&all);
+    assert_eq!(over.len(), 2, "{over:?}");
+    assert!(over[0].starts_with("dpm:") && over[1].starts_with("paper:"), "{over:?}");
+}
