@@ -3,6 +3,7 @@
 
 pub(crate) mod collector;
 mod dark_bodies;
+mod live_view;
 mod placement;
 pub mod recorder;
 pub mod registration;
