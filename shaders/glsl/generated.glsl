@@ -37,6 +37,8 @@
 #define LENS_BROWN 1u
 #define LENS_FISHEYE 2u
 #define RESPONSE_CODES 256u
+#define OWNER_NONE 0u
+#define OWNER_STILL 1u
 #define SAMPLER_INDEPENDENT 0u
 #define SAMPLER_BLUE_NOISE 1u
 #define SAMPLER_CONTINUED 2u
@@ -74,6 +76,9 @@
 #define B_FILTERED_ROWS 30u
 #define B_FORMER 31u
 #define B_OPTICS 32u
+#define B_MOTION 33u
+#define B_MOVERS 34u
+#define B_PLANE_GROUPS 35u
 // Sobol dimensions 1 to 3 of the lowest 16 bits of an index, without branch or table look-up.
 #define SOBOL_123(i) uvec3((uint(bitfieldExtract(int(i), 0, 1)) & 2147483648u) ^ (uint(bitfieldExtract(int(i), 1, 1)) & 3221225472u) ^ (uint(bitfieldExtract(int(i), 2, 1)) & 2684354560u) ^ (uint(bitfieldExtract(int(i), 3, 1)) & 4026531840u) ^ (uint(bitfieldExtract(int(i), 4, 1)) & 2281701376u) ^ (uint(bitfieldExtract(int(i), 5, 1)) & 3422552064u) ^ (uint(bitfieldExtract(int(i), 6, 1)) & 2852126720u) ^ (uint(bitfieldExtract(int(i), 7, 1)) & 4278190080u) ^ (uint(bitfieldExtract(int(i), 8, 1)) & 2155872256u) ^ (uint(bitfieldExtract(int(i), 9, 1)) & 3233808384u) ^ (uint(bitfieldExtract(int(i), 10, 1)) & 2694840320u) ^ (uint(bitfieldExtract(int(i), 11, 1)) & 4042260480u) ^ (uint(bitfieldExtract(int(i), 12, 1)) & 2290614272u) ^ (uint(bitfieldExtract(int(i), 13, 1)) & 3435921408u) ^ (uint(bitfieldExtract(int(i), 14, 1)) & 2863267840u) ^ (uint(bitfieldExtract(int(i), 15, 1)) & 4294901760u), (uint(bitfieldExtract(int(i), 0, 1)) & 2147483648u) ^ (uint(bitfieldExtract(int(i), 1, 1)) & 3221225472u) ^ (uint(bitfieldExtract(int(i), 2, 1)) & 1610612736u) ^ (uint(bitfieldExtract(int(i), 3, 1)) & 2415919104u) ^ (uint(bitfieldExtract(int(i), 4, 1)) & 3892314112u) ^ (uint(bitfieldExtract(int(i), 5, 1)) & 1543503872u) ^ (uint(bitfieldExtract(int(i), 6, 1)) & 2382364672u) ^ (uint(bitfieldExtract(int(i), 7, 1)) & 3305111552u) ^ (uint(bitfieldExtract(int(i), 8, 1)) & 1753219072u) ^ (uint(bitfieldExtract(int(i), 9, 1)) & 2629828608u) ^ (uint(bitfieldExtract(int(i), 10, 1)) & 3999268864u) ^ (uint(bitfieldExtract(int(i), 11, 1)) & 1435500544u) ^ (uint(bitfieldExtract(int(i), 12, 1)) & 2154299392u) ^ (uint(bitfieldExtract(int(i), 13, 1)) & 3231449088u) ^ (uint(bitfieldExtract(int(i), 14, 1)) & 1626210304u) ^ (uint(bitfieldExtract(int(i), 15, 1)) & 2421489664u), (uint(bitfieldExtract(int(i), 0, 1)) & 2147483648u) ^ (uint(bitfieldExtract(int(i), 1, 1)) & 3221225472u) ^ (uint(bitfieldExtract(int(i), 2, 1)) & 536870912u) ^ (uint(bitfieldExtract(int(i), 3, 1)) & 1342177280u) ^ (uint(bitfieldExtract(int(i), 4, 1)) & 4160749568u) ^ (uint(bitfieldExtract(int(i), 5, 1)) & 1946157056u) ^ (uint(bitfieldExtract(int(i), 6, 1)) & 2717908992u) ^ (uint(bitfieldExtract(int(i), 7, 1)) & 2466250752u) ^ (uint(bitfieldExtract(int(i), 8, 1)) & 3632267264u) ^ (uint(bitfieldExtract(int(i), 9, 1)) & 624951296u) ^ (uint(bitfieldExtract(int(i), 10, 1)) & 1507852288u) ^ (uint(bitfieldExtract(int(i), 11, 1)) & 3872391168u) ^ (uint(bitfieldExtract(int(i), 12, 1)) & 2013790208u) ^ (uint(bitfieldExtract(int(i), 13, 1)) & 3020685312u) ^ (uint(bitfieldExtract(int(i), 14, 1)) & 2181169152u) ^ (uint(bitfieldExtract(int(i), 15, 1)) & 3271884800u))
 
@@ -116,22 +121,24 @@ layout(constant_id = 16) const bool HAS_FLAT_FIELD = false;
 layout(constant_id = 17) const uint HALFTONE_PLANES = 8u;
 // They are white, and show the green code value.
 layout(constant_id = 18) const bool HALFTONE_WHITE = false;
+// Planes that follow are taken from whole words, which are halftones and no code values.
+layout(constant_id = 19) const bool WARP_WHOLE_WORDS = false;
 // Width of the bit planes, pixels.
-layout(constant_id = 19) const uint PLANE_WIDTH = 1u;
+layout(constant_id = 20) const uint PLANE_WIDTH = 1u;
 // Height of the bit planes, pixels.
-layout(constant_id = 20) const uint PLANE_HEIGHT = 1u;
+layout(constant_id = 21) const uint PLANE_HEIGHT = 1u;
 // Which planes show bits 0 to 3 of a code value, a byte each from the lowest on; 255: none does.
-layout(constant_id = 21) const uint PLANE_OF_BITS_0 = 4294967295u;
+layout(constant_id = 22) const uint PLANE_OF_BITS_0 = 4294967295u;
 // The same for bits 4 to 7.
-layout(constant_id = 22) const uint PLANE_OF_BITS_4 = 4294967295u;
+layout(constant_id = 23) const uint PLANE_OF_BITS_4 = 4294967295u;
 // The same for bits 8 to 11.
-layout(constant_id = 23) const uint PLANE_OF_BITS_8 = 4294967295u;
+layout(constant_id = 24) const uint PLANE_OF_BITS_8 = 4294967295u;
 // The same for bits 12 to 15.
-layout(constant_id = 24) const uint PLANE_OF_BITS_12 = 4294967295u;
+layout(constant_id = 25) const uint PLANE_OF_BITS_12 = 4294967295u;
 // The same for bits 16 to 19.
-layout(constant_id = 25) const uint PLANE_OF_BITS_16 = 4294967295u;
+layout(constant_id = 26) const uint PLANE_OF_BITS_16 = 4294967295u;
 // The same for bits 20 to 23.
-layout(constant_id = 26) const uint PLANE_OF_BITS_20 = 4294967295u;
+layout(constant_id = 27) const uint PLANE_OF_BITS_20 = 4294967295u;
 
 struct Frame {
     vec3 projector_position;
@@ -175,6 +182,28 @@ struct Frame {
     float lens_limit;
     uint rays_at;
     uint flat_field_at;
+    uint mover_count;
+    uint group_count;
+};
+
+struct Mover {
+    vec4 motion_from_object[3];
+    ivec2 lower;
+    ivec2 upper;
+    ivec2 centre;
+    ivec2 start;
+    ivec4 slope;
+};
+
+struct Moved {
+    uint word;
+    uint motion;
+    uint owner_and_depth;
+};
+
+struct PlaneGroup {
+    uint mask;
+    int instant;
 };
 
 struct Guide {
@@ -229,7 +258,7 @@ struct Instance {
     uint flags;
     uint body;
     float extent;
-    uint reserved;
+    uint mover;
     vec3 drive_gain;
     uint reserved_too;
 };

@@ -46,7 +46,7 @@ Instance instance_at(uint i) {
         instance_table[i].flags,
         instance_table[i].body,
         instance_table[i].extent,
-        instance_table[i].reserved,
+        instance_table[i].mover,
         instance_table[i].drive_gain,
         instance_table[i].reserved_too);
 }

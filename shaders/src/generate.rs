@@ -39,6 +39,8 @@ glsl_types! {
     f32 => "float", 1 by "uintBitsToFloat";
     u32 => "uint", 1 by "";
     i32 => "int", 1 by "int";
+    [i32; 2] => "ivec2", 2 by "int";
+    [i32; 4] => "ivec4", 4 by "int";
     [f32; 2] => "vec2", 2 by "uintBitsToFloat";
     [f32; 3] => "vec3", 3 by "uintBitsToFloat";
     [f32; 4] => "vec4", 4 by "uintBitsToFloat";

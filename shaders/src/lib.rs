@@ -100,6 +100,10 @@ table_shaders! {
     COMPENSATE = "compensate";
     /// Code values into halftones, for planes of equal light.
     HALFTONE = "halftone";
+    /// How far the surface of each pixel moves while the planes last.
+    MOTION = "motion";
+    /// Planes taken from the pixels whose surfaces are at their mirrors at their instants.
+    WARP = "warp";
 }
 
 /// Code values into bit planes.

@@ -88,6 +88,8 @@ specialization_constants! {
     HALFTONE_PLANES: uint = 8;
     /// They are white, and show the green code value.
     HALFTONE_WHITE: bool = false;
+    /// Planes that follow are taken from whole words, which are halftones and no code values.
+    WARP_WHOLE_WORDS: bool = false;
     /// Width of the bit planes, pixels.
     PLANE_WIDTH: uint = 1;
     /// Height of the bit planes, pixels.

@@ -77,6 +77,9 @@ const BLOCKS: &[(&str, &str, usize)] = &[
     ("B_FILTERED", "Filtered", size_of::<structs::Filtered>()),
     ("B_SCHEDULE", "Schedule", size_of::<structs::Schedule>()),
     ("B_WORK", "WorkItem", size_of::<structs::WorkItem>()),
+    ("B_MOTION", "Moved", size_of::<structs::Moved>()),
+    ("B_MOVERS", "Mover", size_of::<structs::Mover>()),
+    ("B_PLANE_GROUPS", "PlaneGroup", size_of::<structs::PlaneGroup>()),
 ];
 
 fn offsets_of(name: &str) -> Vec<usize> {

@@ -134,6 +134,45 @@ gpu_structs! {
         rays_at: u32,
         /// First element of the flat field, three numbers a pixel, in the table of optics.
         flat_field_at: u32,
+        /// Bodies in the table of movers.
+        mover_count: u32,
+        /// Groups of planes that follow the bodies.
+        group_count: u32,
+    }
+
+    /// A body that moves while the planes of a frame last. Motions are those of the whole exposure.
+    struct Mover {
+        /// How far a point of the body moves, world space, from its place in object space.
+        motion_from_object: Rows,
+        /// First column and row of the pixels on which its light can fall.
+        lower: [i32; 2],
+        /// The column and the row after the last.
+        upper: [i32; 2],
+        /// The pixel to which `start` belongs.
+        centre: [i32; 2],
+        /// About how far the body moves there, 1/64 pixel to the right and down.
+        start: [i32; 2],
+        /// By how much more it moves at the next pixel, in 2^-12 of that: to the right with x and with y, then down with x and with y.
+        slope: [i32; 4],
+    }
+
+    /// What was drawn at a pixel, and how it moves while the planes of the frame last.
+    struct Moved {
+        /// The word whose bits the planes show.
+        word: u32,
+        /// Motion on the raster during the whole exposure, 1/64 pixel: to the right in the low half, down in the high half.
+        motion: u32,
+        /// The owner in the high 8 bits: `OWNER_NONE`, `OWNER_STILL`, or `OWNER_STILL` plus the number of a mover, from 1 on. Distance from the
+        /// projector in the low 24, in steps that grow with it.
+        owner_and_depth: u32,
+    }
+
+    /// Planes that are shown with the bodies at one instant.
+    struct PlaneGroup {
+        /// The bits of a pixel's word that they show.
+        mask: u32,
+        /// Time from the frame's instant to theirs, in 2^-16 of the exposure.
+        instant: i32,
     }
 
     /// What is known of a pixel without noise.
@@ -231,8 +270,8 @@ gpu_structs! {
         body: u32,
         /// Largest magnitude among object coordinates, for ray offsets.
         extent: f32,
-        /// 0.
-        reserved: u32,
+        /// 0 if the body is shown as it was drawn, else the number of its mover, from 1 on.
+        mover: u32,
         /// drive = radiance * this * l_P^2 / cos, per channel: pi * exposure * white / (albedo * max_intensity).
         drive_gain: [f32; 3],
         /// 0.
@@ -425,6 +464,8 @@ pub const CONSTANTS: &[(&str, u32)] = &[
     ("LENS_BROWN", LENS_BROWN),
     ("LENS_FISHEYE", LENS_FISHEYE),
     ("RESPONSE_CODES", RESPONSE_CODES),
+    ("OWNER_NONE", OWNER_NONE),
+    ("OWNER_STILL", OWNER_STILL),
     ("SAMPLER_INDEPENDENT", SAMPLER_INDEPENDENT),
     ("SAMPLER_BLUE_NOISE", SAMPLER_BLUE_NOISE),
     ("SAMPLER_CONTINUED", SAMPLER_CONTINUED),
@@ -505,6 +546,10 @@ pub const LENS_FISHEYE: u32 = 2;
 /// Code values of a channel: the table of optics begins with so many thresholds for each of three channels if the light is not proportional
 /// to the code value.
 pub const RESPONSE_CODES: u32 = 256;
+/// Nothing is at the pixel.
+pub const OWNER_NONE: u32 = 0;
+/// What is at the pixel stays where it was drawn. The owners after it are the movers, in their order.
+pub const OWNER_STILL: u32 = 1;
 /// Random numbers are independent for every path.
 pub const SAMPLER_INDEPENDENT: u32 = 0;
 /// One point set a frame, shifted at every pixel by blue noise.
@@ -598,6 +643,9 @@ pub const BINDINGS: &[(&str, u32)] = &[
     ("B_FILTERED_ROWS", 30),
     ("B_FORMER", 31),
     ("B_OPTICS", 32),
+    ("B_MOTION", 33),
+    ("B_MOVERS", 34),
+    ("B_PLANE_GROUPS", 35),
 ];
 
 impl Surface {

@@ -42,6 +42,7 @@ fn wider_zones_are_the_zones_of_a_rig_file_with_wider_angles() {
                 gaze,
                 widen_deg,
                 poses: &poses,
+                sweep: None,
                 lost: &[],
             };
             renderer.submit(&mut slot, &inputs).unwrap();

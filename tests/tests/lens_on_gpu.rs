@@ -70,6 +70,7 @@ fn draw(
             gaze: DVec3::ZERO,
             widen_deg: 0.0,
             poses: &[*pose],
+            sweep: None,
             lost: &[],
         };
         renderer.submit(&mut slot, &inputs).unwrap();

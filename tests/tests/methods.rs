@@ -170,6 +170,7 @@ fn what_a_frame_shows_does_not_depend_on_the_slot_that_draws_it() {
                 gaze,
                 widen_deg: 0.0,
                 poses: &poses,
+                sweep: None,
                 lost: &[],
             };
             let slot = &mut slots[order(k)];

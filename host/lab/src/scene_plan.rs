@@ -3,13 +3,14 @@
 use super::plan_savings::{changed, compare, flipped, keeping, Saving, Side};
 use dpm_render::method::{Method, SamplerKind};
 use dpm_render::scene_data::{SceneData, SceneNeeds};
+use dpm_render::warp::LEAST_MOTION_PX;
 use dpm_render::{Keep, RenderError};
-use dpm_rig::config::{EffectsConfig, RenderConfig, RenderMethod, RigConfig};
+use dpm_rig::config::{EffectsConfig, PlanePoses, RenderConfig, RenderMethod, RigConfig};
 use dpm_rig::failure::{Failure, FailureKind};
 use dpm_rig::pipeline::{renderer_settings, PipelineError};
 use dpm_rig::rig::Rig;
 use dpm_rig::run_rig::{open_gpu, traced_raster};
-use dpm_scene::{Environment, Material, Scene};
+use dpm_scene::{Body, Environment, Material, Scene};
 use serde::Serialize;
 
 /// One part that not every rig needs.
@@ -220,7 +221,47 @@ fn rig_entries(rig: &Rig) -> Vec<PlanEntry> {
             "projector.planes = 8, one colour",
             "plane not sent; radiance still has three channels",
         ),
+        planes_that_follow(rig),
     ]
+}
+
+/// Whether planes are shown where the bodies are at their own instants, and from which speed on.
+fn planes_that_follow(rig: &Rig) -> PlanEntry {
+    let projector = &rig.config.projector;
+    let switched_off = projector.plane_poses == PlanePoses::Frame;
+    let groups = renderer_settings(rig).plane_groups;
+    let reach = groups.iter().map(|g| g.instant.unsigned_abs()).max().unwrap_or(0);
+    let seconds = f64::from(reach) / 65536.0 * rig.rate().slot_len_ns(0) as f64 * 1e-9;
+    let tracked = rig.scene.bodies.iter().filter(|b| b.tracked.is_some() && b.projected);
+    let to_body = |b: &Body| b.world_from_body_rest.translation.distance(rig.camera.position());
+    let nearest = tracked.map(to_body).fold(f64::INFINITY, f64::min);
+    // Pixels that the nearest body moves at 1 m/s between the frame's instant and that of the farthest group.
+    let moved = rig.camera.fx * seconds / nearest.max(1e-3);
+    let why = if switched_off {
+        "projector.plane_poses = \"frame\"".to_owned()
+    } else if groups.is_empty() {
+        "the display holds code values and has no planes".to_owned()
+    } else if moved == 0.0 {
+        "no body is tracked".to_owned()
+    } else {
+        format!(
+            "{} groups of planes; for bodies at {:.2} m/s or more, and {:.0} pixels around a body at 1 m/s",
+            groups.len(),
+            LEAST_MOTION_PX / moved,
+            moved.ceil() + 1.0
+        )
+    };
+    let needed = !switched_off && moved > 0.0;
+    let how = "passes not recorded; empty, decided per frame, while no body moves by a quarter of a pixel";
+    PlanEntry {
+        feature: "planes that follow",
+        needed,
+        left_out: !needed,
+        switched_off,
+        why,
+        how,
+        saving: None,
+    }
 }
 
 fn gpu_failure(error: impl Into<RenderError>) -> Failure {
@@ -365,6 +406,24 @@ mod tests {
         );
         assert!(on.needed && on.why == "render.effects.spatial_filter on", "{on:?}");
         assert!(plan(&[]).entries.iter().all(|e| !e.switched_off));
+    }
+
+    /// Two pixels in a frame at 1 m/s, of which 0.82 are after the centre of the light: from 0.17 m/s on.
+    #[test]
+    fn planes_that_follow_are_needed_where_planes_and_tracked_bodies_are() {
+        let entry = |flags: &[&str]| {
+            plan(flags)
+                .entries
+                .into_iter()
+                .find(|e| e.feature == "planes that follow")
+                .expect("in every plan")
+        };
+        let own = entry(&[]);
+        assert!(own.needed && own.why.starts_with("8 groups of planes; for bodies at 0.1"), "{own:?}");
+        let off = entry(&["projector.plane_poses=\"frame\""]);
+        assert!(off.left_out && off.switched_off && off.why.contains("plane_poses"), "{off:?}");
+        let equal = entry(&["projector.weights=\"equal\""]);
+        assert!(equal.needed && equal.why.starts_with("24 groups"), "{equal:?}");
     }
 
     #[test]

@@ -125,6 +125,7 @@ impl Theatre {
     fn build(rig: Arc<Rig>, gpu: Arc<Gpu>, span: Span, frozen: bool) -> Result<Self, RenderError> {
         let settings = RendererSettings {
             method: Method { temporal: true, ..Method::full(1) },
+            plane_groups: Vec::new(),
             ..renderer_settings(&rig)
         };
         let mut renderer = Renderer::new(&gpu, &rig.scene, settings)?;
@@ -176,7 +177,12 @@ impl Theatre {
         each: &mut dyn FnMut(u32, &FrameSlot),
     ) -> Result<Seen, RenderError> {
         let rig = &self.rig;
-        let settings = RendererSettings { method: method.clone(), seed, ..renderer_settings(rig) };
+        let settings = RendererSettings {
+            method: method.clone(),
+            seed,
+            plane_groups: Vec::new(),
+            ..renderer_settings(rig)
+        };
         let mut renderer = Renderer::new(&self.gpu, &rig.scene, settings)?;
         let mut slot = renderer.create_slot(true)?;
         let mut seen = Seen { frames: Vec::new(), rays: 0, samples: 0, costs: Vec::new() };
@@ -326,6 +332,7 @@ pub fn draw(
             gaze,
             widen_deg: 0.0,
             poses,
+            sweep: None,
             lost: &[],
         },
     )?;

@@ -7,7 +7,7 @@ use super::settings::{Output, RendererSettings};
 use crate::gpu::{Buffer, Gpu, GpuError, MemoryKind};
 use crate::pack;
 use bytemuck::Zeroable;
-use dpm_shaders::structs::{Counters, Frame, Guide, Instance, Schedule, Surface, NO_HIT};
+use dpm_shaders::structs::{Counters, Frame, Guide, Instance, Mover, Schedule, Surface, NO_HIT};
 use std::sync::Arc;
 
 /// The buffers of one frame in flight.
@@ -39,6 +39,10 @@ pub(super) struct FrameBuffers {
     pub debug_host: Option<DebugBuffers>,
     /// Sizes of the buffers that grow with the raster.
     pub each: BytesPerPixel,
+    /// What was drawn, from which planes that follow are taken, and how it moves while the planes last.
+    pub motion: Buffer,
+    /// The bodies that move while the planes last.
+    pub movers: Buffer,
 }
 
 /// Copies for debugging.
@@ -51,6 +55,8 @@ pub(super) struct DebugBuffers {
     pub prior: Option<Buffer>,
     pub traced: Buffer,
     pub rates: Buffer,
+    /// `None` unless planes follow.
+    pub motion: Option<Buffer>,
 }
 
 impl FrameBuffers {
@@ -68,7 +74,7 @@ impl FrameBuffers {
         let pixels = settings.raster.pixel_count();
         let size = |what, bytes, kind| Buffer::new(gpu, what, bytes, kind);
         let table = |what, bytes, kind| table_buffer(gpu, what, bytes, kind);
-        let each = BytesPerPixel::of(&settings.method);
+        let each = BytesPerPixel::of(&settings.method).and_planes_follow(!settings.plane_groups.is_empty());
         // A buffer that the method does not need is bound all the same, but is as small as possible.
         let with = |what, each: usize| table(what, (pixels * each).max(16), Device);
         let packed = settings.output.schedule();
@@ -80,7 +86,7 @@ impl FrameBuffers {
         Ok(Self {
             frame: size("frame uniforms", size_of::<Frame>(), Upload)?,
             instances: table("instances", size_of::<Instance>() * bodies.max(1), Upload)?,
-            arguments: size("dispatch arguments", 32, Upload)?,
+            arguments: size("dispatch arguments", 48, Upload)?,
             tiles: size("tile list", tiles * 4, Upload)?,
             counters: size("counters", size_of::<Counters>(), Device)?,
             counters_host: size("counters", size_of::<Counters>(), Readback)?,
@@ -96,6 +102,8 @@ impl FrameBuffers {
             work: size("work list", pixels * each.work, Device)?,
             filtered: with("filtered radiance", each.filtered)?,
             filtered_shown: with("shown radiance", each.shown)?,
+            motion: with("motion of surfaces", each.motion)?,
+            movers: size("movers", size_of::<Mover>() * bodies.max(1), Upload)?,
             debug_host: debug.then(|| DebugBuffers::new(gpu, pixels, tiles, each)).transpose()?,
             each,
         })
@@ -166,6 +174,9 @@ impl FrameBuffers {
             "B_FILTERED" | "B_FILTERED_ROWS" => &self.filtered,
             "B_SHOWN" => self.shown(settings),
             "B_PLANES" => &self.planes,
+            "B_MOTION" => &self.motion,
+            "B_MOVERS" => &self.movers,
+            "B_PLANE_GROUPS" => &shared.plane_groups,
             other => unreachable!("binding {other} has no buffer"),
         }
     }
@@ -183,6 +194,7 @@ impl DebugBuffers {
             prior: kept("prior history", each.history)?,
             traced: size("radiance", pixels * each.radiance)?,
             rates: size("shading rates", tiles * 4)?,
+            motion: kept("motion of surfaces", each.motion)?,
         })
     }
 }

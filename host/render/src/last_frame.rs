@@ -144,6 +144,7 @@ mod tests {
             gaze: DVec3::ZERO,
             widen_deg: 0.0,
             poses: &[DAffine3::IDENTITY],
+            sweep: None,
             lost: &[],
         };
         let mut last = LastFrame::none(1);
@@ -183,6 +184,7 @@ mod tests {
                 gaze: DVec3::ZERO,
                 widen_deg: 0.0,
                 poses: &[],
+                sweep: None,
                 lost: &[],
             };
             last.becomes(&inputs, 0, std::iter::empty());

@@ -36,6 +36,7 @@ mod scene_needs;
 mod settings;
 mod slot;
 pub mod tiles;
+pub mod warp;
 
 pub use passes::PASSES;
 pub use renderer::Renderer;

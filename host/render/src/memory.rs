@@ -12,7 +12,9 @@ use super::tiles::TILE;
 use crate::gpu::{Buffer, Gpu, GpuError, MemoryKind};
 use bytemuck::Zeroable;
 use dpm_device::planes::Raster;
-use dpm_shaders::structs::{Filtered, Guide, History, Schedule, Surface, WorkItem, NO_FRAME};
+use dpm_shaders::structs::{
+    Filtered, Guide, History, Moved, PlaneGroup, Schedule, Surface, WorkItem, NO_FRAME,
+};
 use std::sync::Arc;
 
 /// Bytes a pixel of every buffer that grows with the raster; 0 if the method does not need the buffer.
@@ -34,6 +36,8 @@ pub(super) struct BytesPerPixel {
     pub work: usize,
     /// Code values.
     pub codes: usize,
+    /// What was drawn and how it moves, for planes that follow; 0 if they do not.
+    pub motion: usize,
 }
 
 impl BytesPerPixel {
@@ -49,7 +53,13 @@ impl BytesPerPixel {
             shown: when(method.needs_spatial(), size_of::<[f32; 4]>()),
             work: size_of::<WorkItem>(),
             codes: size_of::<u32>(),
+            motion: 0,
         }
+    }
+
+    /// The same with what planes need that follow the bodies, if they do.
+    pub(crate) fn and_planes_follow(self, follow: bool) -> Self {
+        Self { motion: if follow { size_of::<Moved>() } else { 0 }, ..self }
     }
 
     /// Name and bytes a pixel of the largest buffer.
@@ -109,6 +119,8 @@ pub(super) struct SharedBuffers {
     pub noise: Buffer,
     /// Response, flat field and rays of the projector's pixels.
     pub optics: Buffer,
+    /// Groups of planes that follow the bodies.
+    pub plane_groups: Buffer,
     /// The schedule at the start of a frame.
     pub schedule_start: Buffer,
 }
@@ -140,6 +152,10 @@ impl SharedBuffers {
                 &optics.table(&settings.drive, settings.lens.as_ref()),
             )?,
             noise: Buffer::from_slice(gpu, "blue noise", blue_noise::MASK)?,
+            plane_groups: match &settings.plane_groups[..] {
+                [] => Buffer::from_slice(gpu, "plane groups", &[PlaneGroup::zeroed()])?,
+                groups => Buffer::from_slice(gpu, "plane groups", groups)?,
+            },
             schedule_start: Buffer::from_slice(gpu, "schedule", &[start])?,
         })
     }

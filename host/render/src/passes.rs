@@ -5,7 +5,7 @@ use super::scene_data::Keep;
 use super::settings::RendererSettings;
 use crate::pack;
 use dpm_shaders as shaders;
-use dpm_shaders::Shader;
+use dpm_shaders::{specialization as ids, Shader};
 
 /// One pass of a frame.
 pub(super) struct Pass {
@@ -52,6 +52,8 @@ pub(super) enum Grid {
     Tiles,
     /// One for each listed tile, in frames that decide rates.
     Rates,
+    /// Four for each listed tile on which the light of a moving body can fall.
+    Moving,
     /// As many as the pass `schedule` asked for.
     Work,
     /// All of the bit planes.
@@ -59,7 +61,7 @@ pub(super) enum Grid {
 }
 
 /// Every pass, in the order in which they run. Between two of them lies a barrier.
-pub(super) const TABLE: [Pass; 10] = [
+pub(super) const TABLE: [Pass; 12] = [
     Pass {
         name: "primary",
         code: Code::OfAll(Kernel {
@@ -179,6 +181,26 @@ pub(super) const TABLE: [Pass; 10] = [
         grid: Grid::Tiles,
     },
     Pass {
+        name: "motion",
+        code: Code::OfAll(Kernel {
+            shader: |texel| shaders::MOTION.reading(texel),
+            reads: &["B_SURFACES", "B_CODES"],
+            writes: &["B_MOTION"],
+        }),
+        when: |s, _| !s.plane_groups.is_empty(),
+        grid: Grid::Moving,
+    },
+    Pass {
+        name: "warp",
+        code: Code::OfAll(Kernel {
+            shader: |texel| shaders::WARP.reading(texel),
+            reads: &["B_MOTION"],
+            writes: &["B_CODES"],
+        }),
+        when: |s, _| !s.plane_groups.is_empty(),
+        grid: Grid::Moving,
+    },
+    Pass {
         name: "pack",
         code: Code::OfAll(Kernel { shader: |_| shaders::PACK, reads: &["B_CODES"], writes: &["B_PLANES"] }),
         when: |s, _| s.output.schedule().is_some(),
@@ -225,7 +247,8 @@ impl Pass {
             (Grid::Planes, Some(schedule)) => pack::gpu::constants(settings.raster, schedule).to_vec(),
             _ => {
                 let halftone = settings.halftone.into_iter().flat_map(pack::Halftone::constants);
-                shared.iter().copied().chain(halftone).collect()
+                let whole_words = (ids::WARP_WHOLE_WORDS, u32::from(settings.halftone.is_some()));
+                shared.iter().copied().chain(halftone).chain([whole_words]).collect()
             }
         }
     }
@@ -238,7 +261,7 @@ mod tests {
     use std::collections::{BTreeSet, HashMap};
 
     /// Buffers that no pass writes. The host fills them, at the start or before a frame.
-    const INPUTS: [&str; 16] = [
+    const INPUTS: [&str; 18] = [
         "B_FRAME",
         "B_INSTANCES",
         "B_NODES",
@@ -255,6 +278,8 @@ mod tests {
         "B_RATE_TABLE",
         "B_NOISE",
         "B_OPTICS",
+        "B_MOVERS",
+        "B_PLANE_GROUPS",
     ];
 
     /// Names of the buffers that a shader loads from and stores to, as its SPIR-V says: every pointer is followed back to the variable that it

@@ -7,25 +7,28 @@ use super::memory::SharedBuffers;
 use super::optics::OpticsLayout;
 use super::passes::{Grid, PASSES, TABLE};
 use super::resources::Resources;
-use super::scene_data::{world_bounds, Keep, SceneData};
+use super::scene_data::{rows, world_bounds, Keep, SceneData};
 use super::scene_gpu::SceneGpu;
 use super::settings::{FrameInputs, RenderError, RendererSettings};
 use super::slot::FrameSlot;
 use super::tiles::TileList;
+use super::warp::Movers;
 use crate::gpu::{
     BindingKind, BindingSet, BindingTable, CommandList, ComputePipeline, FrameFence, Gpu, GpuError, Recorder,
 };
 use crate::pack;
 use bytemuck::Zeroable;
 use dpm_scene::Scene;
-use dpm_shaders::structs::{self as gpu_structs, Counters, Frame, Instance, Rows, Schedule, Surface};
+use dpm_shaders::structs::{self as gpu_structs, Counters, Frame, Instance, Mover, Schedule, Surface};
 use glam::{DAffine3, Vec3};
 use std::ops::Range;
 use std::sync::Arc;
 
-/// Byte offsets in the dispatch arguments: of four workgroups a tile, and of one workgroup a tile in frames that decide rates.
+/// Byte offsets in the dispatch arguments: of four workgroups a tile, of one workgroup a tile in frames that decide rates, and of four workgroups a
+/// tile in which something moves.
 const PER_TILE_QUARTER: u64 = 0;
 const PER_TILE_RATES: u64 = 16;
+const PER_MOVING_QUARTER: u64 = 32;
 /// After this pass the history is what it is before the frame's samples.
 const REPROJECT: &str = "reproject";
 
@@ -45,6 +48,8 @@ pub struct Renderer {
     rated: Vec<bool>,
     /// Copied into every slot.
     tile_list: TileList,
+    /// The bodies that move while the planes of a frame last.
+    movers: Movers,
     optics: OpticsLayout,
     pub(super) gpu: Arc<Gpu>,
 }
@@ -62,16 +67,6 @@ pub struct RendererPlan {
 /// `tracked`: for each body of the scene the tracked body that carries it.
 fn is_lost(tracked: &[Option<u16>], body: usize, lost: &[bool]) -> bool {
     tracked[body].is_some_and(|t| lost.get(usize::from(t)).copied().unwrap_or(false))
-}
-
-fn rows(m: &DAffine3) -> Rows {
-    let r = m.matrix3.transpose();
-    let t = m.translation;
-    [
-        [r.x_axis.x as f32, r.x_axis.y as f32, r.x_axis.z as f32, t.x as f32],
-        [r.y_axis.x as f32, r.y_axis.y as f32, r.y_axis.z as f32, t.y as f32],
-        [r.z_axis.x as f32, r.z_axis.y as f32, r.z_axis.z as f32, t.z as f32],
-    ]
 }
 
 impl Renderer {
@@ -151,6 +146,7 @@ impl Renderer {
         let last = LastFrame::none(tracked.len());
         let tile_list = TileList::new(settings.raster, settings.lens.as_ref());
         let rated = vec![false; tile_list.len()];
+        let movers = Movers::new(data.bodies.len(), &settings.plane_groups);
         Ok(Self {
             resources: Arc::new(Resources { pipelines, table, shared, scene: scene_gpu }),
             data,
@@ -161,6 +157,7 @@ impl Renderer {
             last,
             rated,
             tile_list,
+            movers,
             optics,
             gpu: gpu.clone(),
         })
@@ -177,6 +174,11 @@ impl Renderer {
     pub fn corners(&self, surface: &Surface) -> [u32; 3] {
         let body = &self.data.bodies[(surface.id >> 24) as usize];
         self.data.refs[(body.triangle_offset + (surface.id & 0x00ff_ffff)) as usize].vertices
+    }
+
+    /// The bodies that moved while the planes of the last frame were lit.
+    pub fn movers(&self) -> &[Mover] {
+        self.movers.movers()
     }
 
     /// Memory and commands for one frame in flight. With `debug` the host can also read radiance and surfaces.
@@ -231,6 +233,7 @@ impl Renderer {
                     Grid::Tiles => r.dispatch_indirect(pipeline, set, &b.arguments, PER_TILE_QUARTER),
                     Grid::Rates => r.dispatch_indirect(pipeline, set, &b.arguments, PER_TILE_RATES),
                     Grid::Work => r.dispatch_indirect(pipeline, set, &b.schedule, 0),
+                    Grid::Moving => r.dispatch_indirect(pipeline, set, &b.arguments, PER_MOVING_QUARTER),
                     Grid::Planes => r.dispatch(pipeline, set, pack::gpu::workgroups(raster)),
                 }
                 r.barrier();
@@ -266,6 +269,9 @@ impl Renderer {
             }
             r.copy(&b.radiance, &d.traced, pixels * b.each.radiance);
             r.copy(&shared.rates, &d.rates, tiles * 4);
+            if let Some(to) = &d.motion {
+                r.copy(&b.motion, to, pixels * b.each.motion);
+            }
         }
         r.barrier_to_host();
         r.stamp();
@@ -292,6 +298,8 @@ impl Renderer {
                 gpu_structs::INSTANCE_PROJECTED,
             );
         }
+        self.movers.find(inputs.camera, &self.data.bodies, inputs.poses, inputs.sweep, &mut slot.tile_list);
+        slot.buffers.movers.write(self.movers.movers());
         let turn = self.last.turn_of(inputs.frame);
         // A tile has four workgroups of 8 x 8 pixels, and one workgroup in the pass that decides rates, which runs in every second frame that is
         // drawn. The checkerboard uses the same count of frames, so that both of its halves are traced at one rate.
@@ -299,9 +307,11 @@ impl Renderer {
         // A tile that is left loses its rate, whichever slot is used. Otherwise a body that comes back to the tile would find an old rate in one
         // slot and none in another, and a run could not be repeated.
         let left = if decides_rates { &self.rated[..] } else { &[] };
-        let tile_count = slot.tile_list.write(left, bytemuck::cast_slice_mut(slot.buffers.tiles.bytes_mut()));
+        let out = bytemuck::cast_slice_mut(slot.buffers.tiles.bytes_mut());
+        let (tile_count, moving_tiles) = slot.tile_list.write(left, out);
         let rate_tiles = if decides_rates { tile_count } else { 0 };
-        slot.buffers.arguments.write(&[[tile_count * 4, 1u32, 1, 0], [rate_tiles, 1, 1, 0]]);
+        let groups = [tile_count * 4, rate_tiles, moving_tiles * 4];
+        slot.buffers.arguments.write(&groups.map(|groups| [groups, 1u32, 1, 0]));
         let instances = slot.buffers.instances.bytes_mut().chunks_exact_mut(size_of::<Instance>());
         for (i, to) in instances.take(inputs.poses.len()).enumerate() {
             to.copy_from_slice(bytemuck::bytes_of(&self.instance(i, inputs)));
@@ -368,7 +378,7 @@ impl Renderer {
             },
             body: i as u32,
             extent: body.extent,
-            reserved: 0,
+            mover: self.movers.number_of(i),
             drive_gain: self.settings.drive.gain_of(i),
             reserved_too: 0,
         }
@@ -433,6 +443,8 @@ impl Renderer {
             pixel_size: (1.0 / c.fx) as f32,
             drawn: turn.drawn,
             first_sample: turn.first_sample,
+            mover_count: self.movers.movers().len() as u32,
+            group_count: self.settings.plane_groups.len() as u32,
             ..Frame::zeroed()
         };
         self.optics.describe(c, &mut frame);

@@ -46,6 +46,17 @@ fn albedo_cells(table: &AlbedoTable) -> Vec<AlbedoCell> {
     cells
 }
 
+/// The rows of an affine map for the shaders.
+pub(crate) fn rows(m: &DAffine3) -> dpm_shaders::structs::Rows {
+    let r = m.matrix3.transpose();
+    let t = m.translation;
+    [
+        [r.x_axis.x as f32, r.x_axis.y as f32, r.x_axis.z as f32, t.x as f32],
+        [r.y_axis.x as f32, r.y_axis.y as f32, r.y_axis.z as f32, t.y as f32],
+        [r.z_axis.x as f32, r.z_axis.y as f32, r.z_axis.z as f32, t.z as f32],
+    ]
+}
+
 #[cfg(test)]
 impl BodyData {
     /// A box of 20 cm about its origin that the projector lights.

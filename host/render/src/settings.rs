@@ -5,8 +5,10 @@ use super::method::Method;
 use super::scene_data::SceneDataError;
 use crate::gpu::GpuError;
 use crate::pack::Halftone;
+use crate::warp::Sweep;
 use dpm_device::planes::{PlaneSchedule, Raster};
 use dpm_scene::geometry::projector::ProjectorCamera;
+use dpm_shaders::structs::PlaneGroup;
 use glam::{DAffine3, DVec3};
 
 /// What does not change while a renderer lives.
@@ -32,6 +34,8 @@ pub struct RendererSettings {
     pub method: Method,
     /// The planes give equal light: code values are made into halftones. `None`: grey comes from the planes' light.
     pub halftone: Option<Halftone>,
+    /// Groups of bit planes that are shown where the bodies are at their own instants; empty: all planes show what was drawn for the frame's instant.
+    pub plane_groups: Vec<PlaneGroup>,
     /// What the host reads back.
     pub output: Output,
 }
@@ -76,6 +80,8 @@ pub struct FrameInputs<'a> {
     pub widen_deg: f32,
     /// world-from-body of every body of the scene, at the time at which the frame is shown.
     pub poses: &'a [DAffine3],
+    /// How the bodies move while the planes last; `None`: they stand still.
+    pub sweep: Option<Sweep<'a>>,
     /// For each tracked body whether it is lost, so that no light falls on it. Bodies beyond the end are not lost.
     pub lost: &'a [bool],
 }

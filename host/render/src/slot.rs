@@ -6,7 +6,7 @@ use super::resources::Resources;
 use super::tiles::TileList;
 use crate::gpu::{BindingSet, CommandList, FrameFence, GpuError};
 use dpm_device::planes::Raster;
-use dpm_shaders::structs::{Counters, Guide, History, Surface};
+use dpm_shaders::structs::{Counters, Guide, History, Moved, Surface};
 use std::sync::Arc;
 
 /// What a frame cost.
@@ -128,6 +128,13 @@ impl FrameSlot {
     /// Mean of the samples of each pixel in this frame, and their number as the fourth value. Only with `debug` at creation.
     pub fn traced(&self) -> Option<&[[f32; 4]]> {
         self.buffers.debug_host.as_ref().map(|d| d.traced.read(self.raster.pixel_count()))
+    }
+
+    /// How the surface of each pixel moves while the planes last, as [`crate::warp::gather`] reads it; of use only in tiles on which the light of
+    /// a moving body can fall. Only with `debug` at creation, and if planes follow.
+    pub fn motions(&self) -> Option<&[Moved]> {
+        let motion = self.buffers.debug_host.as_ref()?.motion.as_ref()?;
+        Some(motion.read(self.raster.pixel_count()))
     }
 
     /// Shading rate of every tile: log2 of the coarse pixel's sides in bits 0..1 and 2..3. Only with `debug` at creation.

@@ -19,12 +19,42 @@ pub(crate) struct TileList {
     order: Vec<u32>,
     active: Vec<bool>,
     previous: Vec<bool>,
+    /// Tiles on which the light of a moving body can fall.
+    moving: Vec<bool>,
     /// With a lens: bounds of the straight rays of each tile.
     straight: Option<Arc<Vec<Bounds>>>,
 }
 
 /// A rectangle: lower and upper corner.
 type Bounds = (DVec2, DVec2);
+
+/// A rectangle of whole tiles of the raster, in pixels: first column and row, and those after the last.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(crate) struct PixelRect {
+    pub lower: [i32; 2],
+    pub upper: [i32; 2],
+}
+
+impl PixelRect {
+    /// The smallest rectangle that holds both.
+    pub(crate) fn with(self, other: Self) -> Self {
+        let both = |a: [i32; 2], b: [i32; 2], pick: fn(i32, i32) -> i32| [pick(a[0], b[0]), pick(a[1], b[1])];
+        Self {
+            lower: both(self.lower, other.lower, i32::min),
+            upper: both(self.upper, other.upper, i32::max),
+        }
+    }
+}
+
+/// Where the box of a body may be seen.
+enum Reach {
+    /// It is behind the projector.
+    Nowhere,
+    /// It is partly behind the projector, so it has no bounds on the raster.
+    Everywhere,
+    /// Its straight rays lie in these bounds.
+    Within(Bounds),
+}
 
 impl TileList {
     /// A list for a raster. `lens`: the projector, if its lens bends rays.
@@ -41,7 +71,15 @@ impl TileList {
             let of = |tile: usize| straight_bounds(camera, tile as u32 % tiles_x, tile as u32 / tiles_x);
             Arc::new((0..n).map(of).collect())
         });
-        Self { tiles_x, tiles_y, order, active: vec![false; n], previous: vec![false; n], straight }
+        Self {
+            tiles_x,
+            tiles_y,
+            order,
+            active: vec![false; n],
+            previous: vec![false; n],
+            moving: vec![false; n],
+            straight,
+        }
     }
 
     /// Number of tiles of the raster.
@@ -64,6 +102,7 @@ impl TileList {
     ) {
         std::mem::swap(&mut self.active, &mut self.previous);
         self.active.fill(false);
+        self.moving.fill(false);
         for (body, pose) in bodies.iter().zip(poses) {
             if body.flags & INSTANCE_EMPTY == 0 && body.flags & flags_mask == flags_mask {
                 self.mark(camera, body, pose);
@@ -75,44 +114,90 @@ impl TileList {
     pub(crate) fn fill(&mut self) {
         std::mem::swap(&mut self.active, &mut self.previous);
         self.active.fill(true);
+        self.moving.fill(false);
+    }
+
+    /// Marks tiles as active on which the light of a moving body can fall.
+    pub(crate) fn mark_moving(&mut self, area: PixelRect) {
+        let tiles = |c: usize| {
+            area.lower[c] as usize / TILE as usize..(area.upper[c] as usize).div_ceil(TILE as usize)
+        };
+        for y in tiles(1) {
+            for x in tiles(0) {
+                let tile = y * self.tiles_x as usize + x;
+                (self.active[tile], self.moving[tile]) = (true, true);
+            }
+        }
+    }
+
+    /// The pixels of the smallest rectangle of whole tiles that holds a body at `pose` and `margin` pixels around it. `None`: it is not on the raster.
+    pub(crate) fn pixels_of(
+        &self,
+        camera: &ProjectorCamera,
+        body: &BodyData,
+        pose: &DAffine3,
+        margin: f64,
+    ) -> Option<PixelRect> {
+        let raster = [camera.raster.width(), camera.raster.height()].map(|n| n as i32);
+        let all = PixelRect { lower: [0; 2], upper: raster };
+        let (from, to) = match reach(camera, body, pose) {
+            Reach::Nowhere => return None,
+            Reach::Everywhere => return Some(all),
+            Reach::Within(bounds) => bounds,
+        };
+        let tiles = match &self.straight {
+            // Where a lens compresses the picture, a pixel is more of the straight rays than at its centre.
+            Some(straight) => {
+                let margin = DVec2::splat(2.0 * margin / camera.fx.min(camera.fy));
+                let touched = |(tile, bounds): (usize, &Bounds)| {
+                    let at = [tile % self.tiles_x as usize, tile / self.tiles_x as usize].map(|t| t as i32);
+                    overlap((from - margin, to + margin), *bounds)
+                        .then_some(PixelRect { lower: at, upper: at.map(|t| t + 1) })
+                };
+                straight.iter().enumerate().filter_map(touched).reduce(PixelRect::with)?
+            }
+            None => {
+                let pixels = (camera.pixel_of_bent(from) - margin, camera.pixel_of_bent(to) + margin);
+                let [x, y] = self.tile_ranges(pixels);
+                PixelRect { lower: [x.0, y.0], upper: [x.1, y.1] }
+            }
+        };
+        let pixels = |t: i32, c: usize| (t * TILE as i32).min(raster[c]);
+        let area = PixelRect {
+            lower: [pixels(tiles.lower[0], 0), pixels(tiles.lower[1], 1)],
+            upper: [pixels(tiles.upper[0], 0), pixels(tiles.upper[1], 1)],
+        };
+        (area.lower[0] < area.upper[0] && area.lower[1] < area.upper[1]).then_some(area)
+    }
+
+    /// First tile and the one after the last, in x and in y, that hold the pixels between two corners; empty outside of the raster.
+    fn tile_ranges(&self, (from, to): Bounds) -> [(i32, i32); 2] {
+        let tile = |v: f64, n: u32| (v / f64::from(TILE)).floor().clamp(-1.0, f64::from(n)) as i32;
+        let range = |from: f64, to: f64, n: u32| {
+            let (first, last) = (tile(from, n).max(0), tile(to, n).min(n as i32 - 1));
+            (first, (last + 1).max(first))
+        };
+        [range(from.x, to.x, self.tiles_x), range(from.y, to.y, self.tiles_y)]
     }
 
     fn mark(&mut self, camera: &ProjectorCamera, body: &BodyData, pose: &DAffine3) {
-        let (lower, upper) = (body.bounds_min.as_dvec3(), body.bounds_max.as_dvec3());
-        let (mut from, mut to) = (DVec2::INFINITY, DVec2::NEG_INFINITY);
-        for p in corners(lower, upper) {
-            match camera.straight_of_world(pose.transform_point3(p)) {
-                Some(straight) => {
-                    from = from.min(straight);
-                    to = to.max(straight);
-                }
-                // A box that is partly behind the projector has no bounds on the raster.
-                None => {
-                    let (world_lower, world_upper) = world_bounds(pose, body.bounds_min, body.bounds_max);
-                    if !behind(camera, world_lower, world_upper) {
-                        self.active.fill(true);
-                    }
-                    return;
-                }
-            }
-        }
+        let (from, to) = match reach(camera, body, pose) {
+            Reach::Nowhere => return,
+            Reach::Everywhere => return self.active.fill(true),
+            Reach::Within(bounds) => bounds,
+        };
         // Lines are straight before the lens, so there the box lies between its corners. Behind a lens it may bulge.
         if let Some(straight) = &self.straight {
-            for (active, (lower, upper)) in self.active.iter_mut().zip(straight.iter()) {
-                *active |= from.cmple(*upper).all() && to.cmpge(*lower).all();
+            for (active, bounds) in self.active.iter_mut().zip(straight.iter()) {
+                *active |= overlap((from, to), *bounds);
             }
             return;
         }
-        let (from, to) = (camera.pixel_of_bent(from), camera.pixel_of_bent(to));
-        let clamp = |v: f64, n: u32| (v / f64::from(TILE)).floor().clamp(-1.0, f64::from(n)) as i64;
         // One pixel of margin for rounding.
-        let x0 = clamp(from.x - 1.0, self.tiles_x).max(0);
-        let x1 = clamp(to.x + 1.0, self.tiles_x).min(i64::from(self.tiles_x) - 1);
-        let y0 = clamp(from.y - 1.0, self.tiles_y).max(0);
-        let y1 = clamp(to.y + 1.0, self.tiles_y).min(i64::from(self.tiles_y) - 1);
-        for y in y0..=y1 {
-            for x in x0..=x1 {
-                self.active[(y * i64::from(self.tiles_x) + x) as usize] = true;
+        let [x, y] = self.tile_ranges((camera.pixel_of_bent(from) - 1.0, camera.pixel_of_bent(to) + 1.0));
+        for y in y.0..y.1 {
+            for x in x.0..x.1 {
+                self.active[y as usize * self.tiles_x as usize + x as usize] = true;
             }
         }
     }
@@ -123,17 +208,23 @@ impl TileList {
     }
 
     /// Writes to `out` the tiles that are active now, those that were active at the last update, which must be cleared, and those that are `wanted`.
-    /// Returns their number. `wanted` may be empty.
-    pub(crate) fn write(&self, wanted: &[bool], out: &mut [u32]) -> u32 {
+    /// Returns their number, and how many of them are tiles of moving bodies, which come first. `wanted` may be empty.
+    pub(crate) fn write(&self, wanted: &[bool], out: &mut [u32]) -> (u32, u32) {
         let mut n = 0;
-        for &tile in &self.order {
-            let at = tile as usize;
-            if self.active[at] || self.previous[at] || wanted.get(at) == Some(&true) {
-                out[n] = tile;
-                n += 1;
+        let mut list = |take: &dyn Fn(usize) -> bool| {
+            for &tile in &self.order {
+                if take(tile as usize) {
+                    out[n as usize] = tile;
+                    n += 1;
+                }
             }
-        }
-        n as u32
+            n
+        };
+        let moving = list(&|at| self.moving[at]);
+        let all = list(&|at| {
+            !self.moving[at] && (self.active[at] || self.previous[at] || wanted.get(at) == Some(&true))
+        });
+        (all, moving)
     }
 }
 
@@ -157,6 +248,25 @@ fn straight_bounds(camera: &ProjectorCamera, tile_x: u32, tile_y: u32) -> Bounds
         }
     }
     (lower, upper)
+}
+
+/// Where the box of a body at `pose` may be seen.
+fn reach(camera: &ProjectorCamera, body: &BodyData, pose: &DAffine3) -> Reach {
+    let (mut from, mut to) = (DVec2::INFINITY, DVec2::NEG_INFINITY);
+    for p in corners(body.bounds_min.as_dvec3(), body.bounds_max.as_dvec3()) {
+        let Some(straight) = camera.straight_of_world(pose.transform_point3(p)) else {
+            let (lower, upper) = world_bounds(pose, body.bounds_min, body.bounds_max);
+            return if behind(camera, lower, upper) { Reach::Nowhere } else { Reach::Everywhere };
+        };
+        from = from.min(straight);
+        to = to.max(straight);
+    }
+    Reach::Within((from, to))
+}
+
+/// Whether two rectangles have a point in common.
+fn overlap(a: Bounds, b: Bounds) -> bool {
+    a.0.cmple(b.1).all() && a.1.cmpge(b.0).all()
 }
 
 /// The whole box is behind the projector.
@@ -194,7 +304,7 @@ mod tests {
         let mut list = TileList::new(raster, None);
         list.update(&camera, &[body], &[pose], 1);
         let mut tiles = vec![0; list.len()];
-        let n = list.write(&[], &mut tiles) as usize;
+        let n = list.write(&[], &mut tiles).0 as usize;
         assert!(n > 4 && n < list.len(), "{n} of {}", list.len());
         for i in 0..1000 {
             let h = |k: u32| f64::from((i * k) % 997) / 997.0 * 0.2 - 0.1;
@@ -206,11 +316,11 @@ mod tests {
         }
         // After the body has left, its tiles are listed once more, to be cleared, and then no more.
         list.update(&camera, &[], &[], 1);
-        assert_eq!(list.write(&[], &mut tiles) as usize, n);
+        assert_eq!(list.write(&[], &mut tiles).0 as usize, n);
         list.update(&camera, &[], &[], 1);
-        assert_eq!(list.write(&[], &mut tiles), 0);
+        assert_eq!(list.write(&[], &mut tiles), (0, 0));
         let mut wanted = vec![false; list.len()];
         wanted[5] = true;
-        assert_eq!((list.write(&wanted, &mut tiles), tiles[0]), (1, 5));
+        assert_eq!((list.write(&wanted, &mut tiles), tiles[0]), ((1, 0), 5));
     }
 }

@@ -8,7 +8,7 @@
 use crate::light::recorder::LightFrame;
 use crate::light::FrameRecord;
 use crate::pipeline::renderer_settings;
-use crate::plan::light_centre::centre_ns;
+use crate::plan::light_centre::light_centre_ns;
 use crate::rig::Rig;
 use dpm_device::planes::Raster;
 use dpm_render::drive::Drive;
@@ -37,7 +37,7 @@ struct Window<'a> {
 /// The frames of `light` whose poses are known. With the mock tracker they are the true poses. With a real tracker
 /// they are the poses that each frame was drawn for: measured, then predicted.
 fn window<'a>(rig: &Rig, light: &'a [LightFrame], records: &[FrameRecord]) -> Window<'a> {
-    let to_centre = centre_ns(&rig.schedule, rig.rate().slot_len_ns(0));
+    let to_centre = light_centre_ns(rig, rig.rate().slot_len_ns(0));
     let drawn_for = |f: &LightFrame| {
         let record = records.iter().find(|r| r.id.0 as u32 == f.frame)?;
         Some(record.tracked_poses.clone())
@@ -77,7 +77,12 @@ pub fn pictures(
     let now = &window.frames[window.frames.len() - 1].1;
     let (eye, _) = rig.observer.eye_and_gaze(now);
     // The pictures need only the surfaces, so the simplest method is enough.
-    let settings = |lens| RendererSettings { method: Method::full(1), lens, ..renderer_settings(rig) };
+    let settings = |lens| RendererSettings {
+        method: Method::full(1),
+        lens,
+        plane_groups: Vec::new(),
+        ..renderer_settings(rig)
+    };
     let mut renderer = Renderer::new(gpu, &rig.scene, settings(renderer_settings(rig).lens))?;
     let light = integrate(rig, &mut renderer, &rig.camera, eye, now, &window, |_, drive| drive)?;
     let Some(viewer_camera) = viewer_camera(rig, eye, now) else {
@@ -158,6 +163,7 @@ fn integrate(
         gaze: other,
         widen_deg: 0.0,
         poses: &poses,
+        sweep: None,
         lost: &[],
     };
     renderer.submit(&mut slot, &inputs)?;

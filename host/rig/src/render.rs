@@ -29,6 +29,7 @@ pub(crate) fn submit(
             gaze: plan.gaze,
             widen_deg: plan.widen_deg,
             poses: &plan.scene_poses,
+            sweep: plan.sweep(),
             lost: &plan.lost,
         },
     )

@@ -20,6 +20,8 @@ const WITH_TABLES: &[&str] = &[
     "spatial_disk",
     "compensate",
     "halftone",
+    "motion",
+    "warp",
 ];
 
 /// Output stem, source, extra defines.

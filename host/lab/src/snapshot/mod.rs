@@ -146,7 +146,7 @@ pub fn snapshot(
     // What surfaces are like is of interest out of the light too.
     let keep = Keep { every_pixel: true, ..Keep::default() };
     // The views show code values, whatever the planes make of them.
-    let settings = RendererSettings { halftone: None, ..renderer_settings(&rig) };
+    let settings = RendererSettings { halftone: None, plane_groups: Vec::new(), ..renderer_settings(&rig) };
     let mut renderer = Renderer::keeping(&gpu, &rig.scene, settings, keep).map_err(gpu_failure)?;
     let mut slot = renderer.create_slot(true).map_err(gpu_failure)?;
     let wanted: Vec<_> =

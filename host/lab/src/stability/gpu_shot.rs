@@ -98,6 +98,7 @@ impl<'a> Shot<'a> {
             leave_nothing_out: self.leave_nothing_out,
             method: self.method.clone().unwrap_or_else(|| Method::full(self.spp)),
             halftone: None,
+            plane_groups: Vec::new(),
             output: Output::Codes,
         }
     }
@@ -157,6 +158,7 @@ impl<'a> Shot<'a> {
                 gaze: self.gaze.unwrap_or(eye),
                 widen_deg: 0.0,
                 poses: &poses,
+                sweep: None,
                 lost: &self.lost,
             };
             renderer.submit(&mut slot, &inputs).expect("submit");

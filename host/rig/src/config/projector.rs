@@ -39,6 +39,10 @@ section! {
         /// the middle of the frame, which smears a moving picture by a quarter less. Has no effect on planes of equal
         /// weights.
         plane_order: BitOrder = BitOrder::default(), "", Any;
+        /// The instant for which each bit plane shows the bodies. "own": the planes of each bit (each plane, if all give equal
+        /// light) are shown where the bodies are while these planes are lit, so that a moving picture is not smeared.
+        /// "frame": all planes show the bodies at the centre of the frame's light, which saves two passes where bodies move.
+        plane_poses: PlanePoses = PlanePoses::Own, "", Any;
         /// Position of the projector's lens in the world. Measure it, or give `calibration` instead.
         position: [f64; 3] = [0.0, 0.35, 1.1], "m", Within(-1e6, 1e6);
         /// The point in the world that the centre of the raster shows.
@@ -100,9 +104,15 @@ impl ProjectorConfig {
         })
     }
 
-    /// True for a projector that shows the code value of a pixel for the whole frame, not its bits one after the other.
-    pub fn holds_code_values(&self) -> bool {
-        matches!(&self.backend, ProjectorBackend::Display(display) if display.encoding == DisplayEncoding::Rgb8)
+    /// How the light of a frame is shared out over its exposure.
+    pub fn plane_timing(&self) -> PlaneTiming {
+        match &self.backend {
+            ProjectorBackend::Display(display) if display.encoding == DisplayEncoding::Rgb8 => {
+                PlaneTiming::Held
+            }
+            ProjectorBackend::Alp(alp) if alp.weights == AlpWeights::Binary => PlaneTiming::ByWeight,
+            _ => PlaneTiming::Equal,
+        }
     }
 
     /// Light of a mirror that is on in all planes, as a code value of which 255 is full light. It is less where planes of
@@ -426,6 +436,27 @@ impl CalibrationCameraConfig {
     pub fn to_affine(&self) -> Option<DAffine3> {
         let (position, rotation_deg, rotation) = (self.position, self.rotation_deg, self.rotation);
         PoseConfig { position, rotation_deg, rotation }.to_affine()
+    }
+}
+
+/// How the light of a frame is shared out over its exposure.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum PlaneTiming {
+    /// Every plane is lit equally long, with the light of its bit.
+    Equal,
+    /// Every plane is lit for as long as its bit weighs, always with the same light: an ALP with `weights = "binary"`.
+    ByWeight,
+    /// There are no planes: code values are shown for the whole frame, by a display that is given them.
+    Held,
+}
+
+words! {
+    /// The instant for which each bit plane shows the bodies.
+    pub enum PlanePoses {
+        /// Its own.
+        Own = "own",
+        /// The centre of the frame's light.
+        Frame = "frame",
     }
 }
 

@@ -662,9 +662,20 @@ fn the_light_of_a_display_is_later_than_its_slots() {
     assert_eq!((display.encoding, display.commit_us), (DisplayEncoding::Rgb8, None));
     // 16 ms, 8 ms, and half of a sixtieth of a second.
     assert_eq!(rig.projector.light_delay_ns(), 24_000_000 + 8_333_333);
-    assert!(rig.projector.holds_code_values());
+    assert!(rig.projector.plane_timing() == PlaneTiming::Held);
+    let alp = RigConfig::parse(
+        "rigs/alp.toml",
+        include_str!("../../../../rigs/alp.toml"),
+        Path::new(""),
+        &Overrides { variables: vec![], flags: vec![] },
+    )
+    .unwrap_or_else(|e| panic!("{e}"));
+    assert_eq!(alp.projector.plane_timing(), PlaneTiming::ByWeight);
     let usb = parsed(&["projector.backend={kind=\"usb\"}"]).unwrap_or_else(|e| panic!("{e}"));
-    assert_eq!(usb.projector.light_delay_ns(), 16_000_000);
+    assert_eq!(
+        (usb.projector.light_delay_ns(), usb.projector.plane_timing()),
+        (16_000_000, PlaneTiming::Equal)
+    );
     for (key, names) in [
         ("projector.backend.mode=\"1920\"", "projector.backend.mode"),
         ("projector.backend={kind=\"display\",encoding=\"planes24\"}", "projector.planes = 24"),

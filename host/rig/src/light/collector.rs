@@ -7,12 +7,11 @@ use crate::frame::slots::OrderedDark;
 use crate::frame::{FrameTimeline, Stage, STAGES};
 use crate::light::dark_bodies::DarkBodies;
 use crate::light::live_view::bodies_of;
+use crate::light::measures::{histogram, RegistrationMeasures};
 use crate::light::placement::Placement;
+use crate::light::record::FrameRecord;
 use crate::light::recorder::LightNote;
-use crate::light::registration::RegistrationMeter;
-use crate::plan::dark::DarkCause;
-use crate::plan::frame::FrameId;
-use crate::plan::light_centre::{centre_for, lights_of_planes};
+use crate::plan::light_centre::light_centre_ns;
 use crate::rig::Rig;
 use crate::telemetry::flight::FlightRecorder;
 use crate::telemetry::interval::Interval;
@@ -29,7 +28,6 @@ use dpm_device::link::frame_newer;
 use dpm_device::time::HostTime;
 use dpm_handoff::channel::Receiver;
 use dpm_render::PASSES;
-use glam::{DAffine3, DVec3};
 use hdrhistogram::Histogram;
 use std::collections::VecDeque;
 use std::sync::Arc;
@@ -37,31 +35,6 @@ use std::sync::Arc;
 /// Sent frames that may wait for their light. Beyond this number the oldest count as never lit, once no unread light
 /// is left.
 const MAX_PENDING: usize = 256;
-/// Every so many frames are followed plane by plane.
-const FOLLOWED_EVERY: u64 = 16;
-
-/// The record of one lit frame, kept for pictures.
-#[derive(Clone, Debug)]
-pub struct FrameRecord {
-    /// Which frame.
-    pub id: FrameId,
-    /// Its slot.
-    pub slot: u64,
-    /// Its stamps.
-    pub timeline: FrameTimeline,
-    /// world-from-body of the tracked bodies for which it was drawn.
-    pub tracked_poses: Vec<DAffine3>,
-    /// The same without prediction.
-    pub sampled_poses: Vec<DAffine3>,
-    /// Per tracked body: why no light fell on it; `None` if light fell on it.
-    pub dark: Vec<Option<DarkCause>>,
-    /// The eye in world coordinates.
-    pub eye: DVec3,
-    /// Hash of its code values.
-    pub code_hash: u64,
-    /// GPU time of each pass, nanoseconds.
-    pub pass_ns: [u64; PASSES.len()],
-}
 
 /// The inputs of the collector.
 pub(crate) struct Inbox {
@@ -76,7 +49,7 @@ pub(crate) struct Collector {
     pub(super) rig: Arc<Rig>,
     /// Light of a frame that the link has not yet reported as sent.
     held: Option<LightNote>,
-    meter: RegistrationMeter,
+    registration: RegistrationMeasures,
     placement: Placement,
     pending: VecDeque<FrameRecord>,
     /// The last lit frames, oldest first.
@@ -122,16 +95,8 @@ pub(crate) struct Collector {
     standstills: Option<Arc<SeenStandstills>>,
     /// What the operator should know about the files of the flight recorder.
     flights_told: Option<String>,
-    registration: Histogram<u64>,
-    /// The same for frames that were lit in their own slot.
-    registration_in_time: Histogram<u64>,
-    /// What an eye sees that follows a point, of some frames: how far the light lies from it, and how far it is spread.
-    followed: [Histogram<u64>; 2],
-    /// The true poses at each plane of a frame.
-    truths: Vec<Vec<(DAffine3, f64)>>,
     /// True beginning of a slot, as observed by the mock in this process, minus the host's estimate.
     clock_error: SignedHistogram,
-    unpredicted: Histogram<u64>,
     stages: Vec<Histogram<u64>>,
     passes: Vec<Histogram<u64>>,
     pub(super) rays: u64,
@@ -149,17 +114,9 @@ pub(crate) struct Collector {
 /// much more.
 const MAX_TRACED: usize = 30_000;
 
-/// Registration is counted in millionths of a pixel.
-const PER_PIXEL: f64 = 1e6;
-
-fn histogram() -> Histogram<u64> {
-    Histogram::new_with_bounds(1, 1_000_000_000_000, 3).expect("bounds and digits are in range")
-}
-
 impl Collector {
     /// Keeps the last `keep` lit frames. `verify`: compares hashes of code values and light.
     pub(crate) fn new(rig: Arc<Rig>, keep: usize, verify: bool) -> Self {
-        let meter = RegistrationMeter::new(&rig);
         let measured = rig.config.real_time.pace == Pace::Real;
         // A tenth of a run of known length, but enough frames for a 99th percentile.
         let frames = rig.config.run.frames.max(rig.config.slots_to_run());
@@ -171,6 +128,7 @@ impl Collector {
         let lead_ns = i64::from(rig.config.real_time.stage_costs_us.total()) * 1000;
         let newest_live = (LiveFrame::default(), bodies_of(&rig));
         let trace_frames = if rig.config.output.trace { MAX_TRACED } else { 0 };
+        let registration = RegistrationMeasures::new(rig.clone());
         Self {
             placement: Placement::new(rig.bodies.len()),
             dark_bodies: DarkBodies::new(rig.bodies.len()),
@@ -178,7 +136,7 @@ impl Collector {
             slots: SlotLedger::new(rig.rate(), lead_ns),
             rig,
             held: None,
-            meter,
+            registration,
             pending: VecDeque::new(),
             recent: VecDeque::new(),
             keep,
@@ -204,12 +162,7 @@ impl Collector {
             flights: None,
             standstills: None,
             flights_told: None,
-            registration: histogram(),
-            registration_in_time: histogram(),
-            followed: [histogram(), histogram()],
-            truths: Vec::new(),
             clock_error: SignedHistogram::new(1_000_000_000),
-            unpredicted: histogram(),
             stages: STAGES.iter().map(|_| histogram()).collect(),
             passes: PASSES.iter().map(|_| histogram()).collect(),
             rays: 0,
@@ -408,7 +361,7 @@ impl Collector {
             &self.rig.camera,
             &job.plan.sampled_poses,
             &job.plan.seen,
-            self.meter.points(),
+            self.registration.points(),
         );
         let sent = job.is_sent();
         let refused = !sent && !matches!(job.fate, Fate::Overtaken | Fate::Stopped);
@@ -424,6 +377,7 @@ impl Collector {
                 slot: job.plan.slot,
                 timeline: job.timeline,
                 tracked_poses: job.plan.tracked_poses.clone(),
+                swept_poses: job.plan.swept_poses.clone(),
                 sampled_poses: job.plan.sampled_poses.clone(),
                 dark: job.plan.dark.clone(),
                 eye: job.plan.eye,
@@ -474,8 +428,7 @@ impl Collector {
                 let Some(mut record) = self.pending.pop_front() else { return };
                 let last_photon_at = note.event.last_photon_at;
                 let exposure_ns = last_photon_at.ns_since(begin);
-                let centre_at =
-                    begin.plus_ns(centre_for(&self.rig.config.projector, &self.rig.schedule, exposure_ns));
+                let centre_at = begin.plus_ns(light_centre_ns(&self.rig, exposure_ns));
                 record.timeline.lit_at = Some(begin);
                 record.timeline.centre_at = Some(centre_at);
                 record.timeline.last_photon_at = Some(last_photon_at);
@@ -492,10 +445,7 @@ impl Collector {
                 if self.verify && note.hash != record.code_hash {
                     self.light_mismatches += 1;
                 }
-                self.measure_registration(&record, late);
-                if record.id.0.is_multiple_of(FOLLOWED_EVERY) {
-                    self.follow(&record);
-                }
+                self.registration.lit(&record, late, self.prepared);
                 self.measure_clock(note, &record);
                 // If no light fell on any body, there is no interval from motion to light.
                 let is_dark = self.is_dark(&record);
@@ -536,63 +486,8 @@ impl Collector {
         }
     }
 
-    /// Measures, on the lit bodies, where the light of each point fell and where the point was at the centre of
-    /// that light.
-    fn measure_registration(&mut self, record: &FrameRecord, late: bool) {
-        let Some(at) = record.timeline.centre_at else { return };
-        let Some(truth) = self.rig.true_poses(at.0) else { return };
-        let counted = |px: f64| (px * PER_PIXEL).round() as u64;
-        for (i, truth) in truth.iter().enumerate() {
-            if !self.prepared && record.dark.get(i).copied().flatten().is_some() {
-                continue;
-            }
-            for px in self.meter.errors(i, &record.tracked_poses[i], truth) {
-                self.registration.saturating_record(counted(px));
-                if !late {
-                    self.registration_in_time.saturating_record(counted(px));
-                }
-            }
-            for px in self.meter.errors(i, &record.sampled_poses[i], truth) {
-                self.unpredicted.saturating_record(counted(px));
-            }
-        }
-    }
-
-    /// Measures where the light of each plane fell on the lit bodies, as seen by an eye that follows them.
-    fn follow(&mut self, record: &FrameRecord) {
-        let FrameTimeline { lit_at: Some(lit_at), last_photon_at: Some(last), .. } = record.timeline else {
-            return;
-        };
-        for truths in &mut self.truths {
-            truths.clear();
-        }
-        self.truths.resize_with(record.tracked_poses.len(), Vec::new);
-        for (middle_ns, weight) in lights_of_planes(&self.rig.schedule, last.ns_since(lit_at)) {
-            let Some(poses) = self.rig.true_poses(lit_at.plus_ns(middle_ns).0) else { return };
-            self.truths.iter_mut().zip(poses).for_each(|(truths, pose)| truths.push((pose, weight)));
-        }
-        let counted = |px: f64| (px * PER_PIXEL).round() as u64;
-        for (i, truths) in self.truths.iter().enumerate() {
-            if record.dark.get(i).copied().flatten().is_some() {
-                continue;
-            }
-            for seen in self.meter.followed(i, &record.tracked_poses[i], truths) {
-                self.followed[0].saturating_record(counted(seen.offset_px));
-                self.followed[1].saturating_record(counted(seen.smear_px));
-            }
-        }
-    }
-
     /// Writes the measurements of the run into a report.
     pub(crate) fn fill(&self, report: &mut Report) {
-        let spread = |h: &Histogram<u64>, unit: f64| {
-            (!h.is_empty()).then(|| Spread {
-                p50: h.value_at_quantile(0.5) as f64 / unit,
-                p99: h.value_at_quantile(0.99) as f64 / unit,
-                p999: h.value_at_quantile(0.999) as f64 / unit,
-                max: h.max() as f64 / unit,
-            })
-        };
         let slots = self.slots.counts();
         report.slots = slots.wanted();
         report.missed_slots = slots.missed_total();
@@ -608,13 +503,8 @@ impl Collector {
         report.frames_late = self.late;
         report.frames_repeated = self.repeated;
         report.frames_too_old = self.too_old;
-        report.registration_error_px = spread(&self.registration, PER_PIXEL);
-        report.registration_error_in_time_px = spread(&self.registration_in_time, PER_PIXEL);
-        [report.followed_offset_px, report.followed_smear_px] =
-            self.followed.each_ref().map(|seen| spread(seen, PER_PIXEL));
+        self.registration.fill(report);
         report.clock_error_ms = Latency::of(&self.clock_error, false);
-        report.registration_error_unpredicted_px = spread(&self.unpredicted, PER_PIXEL);
-        report.registration_error_at = report.registration_error_px.map(|_| "light centre");
         let latency = |interval| Latency::of(self.profiler.histogram(interval), !self.profiler.is_measured());
         report.motion_to_first_photon_ms = latency(Interval::MotionToFirstPhoton);
         report.motion_to_light_centre_ms = latency(Interval::MotionToCentre);
@@ -625,7 +515,7 @@ impl Collector {
         let passes = PASSES.iter().map(|p| format!("gpu {p}")).zip(&self.passes);
         report.stages_ms = stages
             .chain(passes)
-            .filter_map(|(stage, h)| spread(h, 1e6).map(|ms| StageTime { stage, ms }))
+            .filter_map(|(stage, h)| Spread::of_histogram(h, 1e6).map(|ms| StageTime { stage, ms }))
             .collect();
         report.mrays_per_s = (self.gpu_ns > 0).then(|| self.rays as f64 / self.gpu_ns as f64 * 1e3);
         report.clipped =
@@ -652,6 +542,7 @@ impl Collector {
 mod tests {
     use super::*;
     use crate::config::{Overrides, RigConfig};
+    use crate::plan::frame::FrameId;
     use dpm_device::light::LightEvent;
     use dpm_device::link::SendOutcome;
     use dpm_device::planes::Raster;

@@ -4,9 +4,11 @@
 pub(crate) mod collector;
 mod dark_bodies;
 mod live_view;
+mod measures;
 mod placement;
+mod record;
 pub mod recorder;
 pub mod registration;
 pub(crate) mod status;
 
-pub use collector::FrameRecord;
+pub use record::FrameRecord;

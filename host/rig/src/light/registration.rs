@@ -2,6 +2,7 @@
 //! the projector.
 
 use crate::rig::Rig;
+use dpm_render::warp::LEAST_MOTION_PX;
 use dpm_scene::geometry::projector::ProjectorCamera;
 use glam::{DAffine3, DVec2, DVec3};
 
@@ -18,6 +19,17 @@ pub(crate) struct Followed {
     pub offset_px: f64,
     /// Root mean square distance of the light from its mean.
     pub smear_px: f64,
+}
+
+/// The light of one plane on one body.
+#[derive(Clone, Copy, Debug)]
+pub(crate) struct PlaneLight {
+    /// world-from-body for which the plane was drawn.
+    pub shown: DAffine3,
+    /// world-from-body at the middle of the plane.
+    pub truth: DAffine3,
+    /// Light of a mirror that is on, in any unit.
+    pub light: f64,
 }
 
 /// Points spread over the tracked bodies of a rig.
@@ -53,23 +65,31 @@ impl RegistrationMeter {
         })
     }
 
-    /// For some points of the tracked body `body`, which the planes all show where `used` places it: where their light
-    /// fell. `truths` gives the true world-from-body pose at the middle of each plane, and the plane's intensity.
+    /// True if a point of the tracked body `body` moves so far from the world-from-body pose `first` to `last` that planes
+    /// follow it, whose instants lie at most `reach` of that time from the frame's.
+    pub(crate) fn is_followed(&self, body: usize, first: &DAffine3, last: &DAffine3, reach: f64) -> bool {
+        let points = self.points.get(body).map_or(&[][..], Vec::as_slice);
+        points.iter().step_by(FOLLOWED_EVERY).any(|p| {
+            let at = |pose: &DAffine3| self.camera.project(pose.transform_point3(*p));
+            at(first).zip(at(last)).is_some_and(|(a, b)| (b - a).length() * reach >= LEAST_MOTION_PX)
+        })
+    }
+
+    /// For some points of the tracked body `body`: where the light of `planes` fell.
     pub(crate) fn followed<'a>(
         &'a self,
         body: usize,
-        used: &'a DAffine3,
-        truths: &'a [(DAffine3, f64)],
+        planes: &'a [PlaneLight],
     ) -> impl Iterator<Item = Followed> + 'a {
         let points = self.points.get(body).map_or(&[][..], Vec::as_slice);
         points.iter().step_by(FOLLOWED_EVERY).filter_map(move |p| {
-            let shown = self.camera.project(used.transform_point3(*p))?;
+            let at = |pose: &DAffine3| self.camera.project(pose.transform_point3(*p));
             let (mut weights, mut sum, mut squares) = (0.0, DVec2::ZERO, 0.0);
-            for (truth, weight) in truths {
-                let off = shown - self.camera.project(truth.transform_point3(*p))?;
-                weights += weight;
-                sum += off * *weight;
-                squares += off.length_squared() * weight;
+            for plane in planes {
+                let off = at(&plane.shown)? - at(&plane.truth)?;
+                weights += plane.light;
+                sum += off * plane.light;
+                squares += off.length_squared() * plane.light;
             }
             let mean = sum / weights;
             let smear_px = (squares / weights - mean.length_squared()).max(0.0).sqrt();

@@ -1,7 +1,7 @@
 //! The results of a run.
 
-use crate::light::collector::FrameRecord;
 use crate::light::recorder::LightFrame;
+use crate::light::FrameRecord;
 use crate::telemetry::profile::Profiler;
 use crate::telemetry::report::Report;
 use crate::telemetry::slots::SlotCounts;

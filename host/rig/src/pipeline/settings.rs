@@ -5,6 +5,7 @@ use crate::config::Packer;
 use crate::engine::facts::RECEIPT_NS;
 use crate::plan::budget::{BudgetConfig, BudgetController};
 use crate::plan::lead::LeadEstimator;
+use crate::plan::light_centre::groups_that_follow;
 use crate::rig::Rig;
 use dpm_device::link::HostLink;
 use dpm_render::gpu::Gpu;
@@ -64,6 +65,7 @@ pub fn renderer_settings(rig: &Rig) -> RendererSettings {
         leave_nothing_out: false,
         method: r.to_method(),
         halftone: Halftone::of(&rig.schedule),
+        plane_groups: groups_that_follow(rig),
         output: Output::Codes,
     }
 }

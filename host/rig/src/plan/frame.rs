@@ -2,11 +2,12 @@
 //! off.
 
 use super::dark::DarkCause;
-use super::light_centre::centre_for;
+use super::light_centre::{light_centre_ns, planes_follow};
 use super::link_time::LinkTime;
 use crate::rig::{affine, Rig};
 use crate::tracks::TrackSnapshot;
 use dpm_device::time::{DeviceTicks, HostTime};
+use dpm_render::warp::Sweep;
 use dpm_tracking::{Freshness, TrackState};
 use glam::{DAffine3, DVec3};
 
@@ -47,8 +48,13 @@ pub(crate) struct FramePlan {
     pub dark: Vec<Option<DarkCause>>,
     /// Per tracked body: no light falls on it.
     pub lost: Vec<bool>,
+    /// Per tracked body: predicted world-from-mesh at the first photon and at the last; empty if all planes show the
+    /// bodies at one instant.
+    pub swept_poses: [Vec<DAffine3>; 2],
     /// Per body of the scene: world-from-body.
     pub scene_poses: Vec<DAffine3>,
+    /// The same for `swept_poses`.
+    pub swept_scene: [Vec<DAffine3>; 2],
     /// The eye in world coordinates, metres.
     pub eye: DVec3,
     /// The gaze point in world coordinates, metres.
@@ -99,7 +105,9 @@ impl FramePlan {
             seen: Vec::with_capacity(bodies),
             dark: Vec::with_capacity(bodies),
             lost: Vec::with_capacity(bodies),
+            swept_poses: [(); 2].map(|()| Vec::with_capacity(bodies)),
             scene_poses: Vec::with_capacity(rig.scene.bodies.len()),
+            swept_scene: [(); 2].map(|()| Vec::with_capacity(rig.scene.bodies.len())),
             eye: DVec3::ZERO,
             gaze: DVec3::ZERO,
             widen_deg: 0.0,
@@ -119,10 +127,11 @@ impl FramePlan {
         self.dark_from = slots.dark_from(slot, stride, predict_ns - late_ns);
         self.due_at = slots.host_of_slot(slot);
         let exposure_ns = slots.host_of_slot(slot + 1).ns_since(self.due_at);
-        let centre =
-            self.due_at.plus_ns(centre_for(&rig.config.projector, &rig.schedule, exposure_ns) + late_ns);
+        let centre = self.due_at.plus_ns(light_centre_ns(rig, exposure_ns) + late_ns);
         self.place_bodies(rig, snapshot, inputs, centre);
         rig.scene_poses(&self.tracked_poses, &mut self.scene_poses);
+        let first = self.due_at.plus_ns(late_ns);
+        self.sweep_bodies(rig, snapshot, [first, first.plus_ns(exposure_ns)]);
         (self.eye, self.gaze) = rig.observer.eye_and_gaze(&self.tracked_poses);
         self.widen_deg = rig.observer.gaze_body().map_or(0.0, |body| {
             let track = snapshot.tracks.get(body).copied().flatten();
@@ -181,6 +190,38 @@ impl FramePlan {
         }
         self.is_lit = oldest[0].is_some();
         (self.captured_at, self.received_at) = oldest[0].or(oldest[1]).unwrap_or((self.due_at, self.due_at));
+    }
+
+    /// For every body: where it will be at the instants `ends`. Bodies whose poses are not predicted stand still.
+    fn sweep_bodies(&mut self, rig: &Rig, snapshot: &TrackSnapshot, ends: [HostTime; 2]) {
+        for (swept, scene) in self.swept_poses.iter_mut().zip(&mut self.swept_scene) {
+            swept.clear();
+            scene.clear();
+        }
+        if !planes_follow(rig) || !rig.config.prediction.on {
+            return;
+        }
+        for (end, (swept, scene)) in
+            ends.into_iter().zip(self.swept_poses.iter_mut().zip(&mut self.swept_scene))
+        {
+            for (i, body) in rig.bodies.iter().enumerate() {
+                let track = snapshot.tracks.get(i).copied().flatten();
+                swept.push(match track {
+                    Some((state, _)) => {
+                        let state = TrackState { lost_after_ns: self.predict_ns, ..state };
+                        affine(&state.predict(end).pose) * body.mesh_to_body
+                    }
+                    None => affine(&body.rest),
+                });
+            }
+            rig.scene_poses(swept, scene);
+        }
+    }
+
+    /// How the bodies of the scene move while the planes are lit; `None` if all planes show them at one instant.
+    pub(crate) fn sweep(&self) -> Option<Sweep<'_>> {
+        let [first, last] = &self.swept_scene;
+        (!first.is_empty()).then_some(Sweep { first, last })
     }
 
     /// The capture time of the newest sample, oldest among the lit bodies; `None` when all bodies are dark, because a

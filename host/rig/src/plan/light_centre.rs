@@ -4,90 +4,168 @@
 //! bits come first, most of the light is over long before the middle of the exposure. An eye that follows a body sees
 //! the picture where the centre of the light puts it.
 
-use crate::config::ProjectorConfig;
-use dpm_device::planes::PlaneSchedule;
+use crate::config::{PlanePoses, PlaneTiming};
+use crate::rig::Rig;
+use dpm_device::planes::{PlaneSchedule, PlaneSpec};
+use dpm_render::pack::source_bits;
+use dpm_render::warp::plane_groups;
+use dpm_shaders::structs::PlaneGroup;
 
-/// Time from the first photon to the centre of the light of a frame whose planes share `exposure_ns` >= 0 equally, in
-/// nanoseconds. It is the mean of the middles of the planes, each weighted with its intensity `2^bit`. Rounded down;
-/// 0 for a negative exposure.
+/// Time from the first photon to the centre of the light of a frame of `rig` that is lit for `exposure_ns` >= 0, in
+/// nanoseconds. Rounded down; 0 for a negative exposure.
 ///
 /// The function assumes white, with every bit of every channel set. The actual code value shifts the centre of each
 /// pixel.
-pub(crate) fn centre_ns(schedule: &PlaneSchedule, exposure_ns: i64) -> i64 {
-    let (mut weights, mut moments) = (0i128, 0i128);
-    for (i, plane) in schedule.planes().iter().enumerate() {
-        let weight = 1i128 << plane.bit;
-        weights += weight;
-        moments += weight * halves_of(i);
+pub(crate) fn light_centre_ns(rig: &Rig, exposure_ns: i64) -> i64 {
+    Lights::of(rig).centre_ns(exposure_ns)
+}
+
+/// The light of each plane of a frame of `rig`: the time from the first photon to the middle of the plane in nanoseconds,
+/// rounded down, and the light of a mirror that is on, in units of the lowest bit. Where code values are held for the
+/// whole frame, it is shared out over as many equal parts.
+pub(crate) fn lights_of_frame(rig: &Rig, exposure_ns: i64) -> impl Iterator<Item = (i64, f64)> + '_ {
+    let lights = Lights::of(rig);
+    let whole = lights.whole();
+    let middle = move |(_, halves)| (i128::from(exposure_ns.max(0)) * halves / (2 * whole)) as i64;
+    lights.planes().map(move |plane| (middle(plane), f64::from(lights.light_of(plane.0))))
+}
+
+/// True if planes are shown where the bodies are at their own instants.
+pub(crate) fn planes_follow(rig: &Rig) -> bool {
+    rig.config.projector.plane_poses == PlanePoses::Own && Lights::of(rig).timing != PlaneTiming::Held
+}
+
+/// For each plane of a frame of `rig` the time from the frame's instant, which is the centre of its light, to the instant
+/// for which the plane shows the bodies, as a share of the exposure.
+pub(crate) fn instants_of_planes(rig: &Rig) -> Vec<f64> {
+    let groups = groups_that_follow(rig);
+    let bits = source_bits(&rig.schedule);
+    let of = |bit: &u8| groups.iter().find(|g| g.mask >> bit & 1 == 1).map_or(0, |g| g.instant);
+    bits[..rig.schedule.len()].iter().map(|bit| f64::from(of(bit)) / 65536.0).collect()
+}
+
+/// The groups of planes of `rig` that follow the bodies, each at its own instant; none if all planes show the bodies at
+/// the centre of the light.
+pub(crate) fn groups_that_follow(rig: &Rig) -> Vec<PlaneGroup> {
+    if !planes_follow(rig) {
+        return Vec::new();
     }
-    let halves = 2 * schedule.len() as i128;
-    // There is at least one plane of weight 1 or more, so the divisor is above 0 and the quotient lies inside the
-    // exposure.
-    (i128::from(exposure_ns.max(0)) * moments / (halves * weights)) as i64
+    let lights = Lights::of(rig);
+    let [moments, light] = lights.moments();
+    let centre = moments as f64 / light as f64;
+    let instants: Vec<f64> =
+        lights.planes().map(|(_, halves)| (halves as f64 - centre) / (2 * lights.whole()) as f64).collect();
+    plane_groups(lights.schedule, &instants)
 }
 
-/// The same for the projector of a rig file. A display that is given code values shows all bits at once, for the whole
-/// frame.
-pub(crate) fn centre_for(projector: &ProjectorConfig, schedule: &PlaneSchedule, exposure_ns: i64) -> i64 {
-    if projector.holds_code_values() {
-        exposure_ns.max(0) / 2
-    } else {
-        centre_ns(schedule, exposure_ns)
+/// When the planes of a frame are lit, and how much light they give.
+#[derive(Clone, Copy)]
+struct Lights<'a> {
+    schedule: &'a PlaneSchedule,
+    timing: PlaneTiming,
+}
+
+impl<'a> Lights<'a> {
+    fn of(rig: &'a Rig) -> Self {
+        Self { schedule: &rig.schedule, timing: rig.config.projector.plane_timing() }
     }
-}
 
-/// The middle of plane `i` lies so many half planes after the first photon.
-const fn halves_of(i: usize) -> i128 {
-    2 * i as i128 + 1
-}
+    /// How long a plane lasts, in units that all planes share.
+    fn length_of(self, plane: PlaneSpec) -> i128 {
+        match self.timing {
+            PlaneTiming::ByWeight => 1 << plane.bit,
+            PlaneTiming::Equal | PlaneTiming::Held => 1,
+        }
+    }
 
-/// The light of each plane: the time from the first photon to its middle in nanoseconds, rounded down, and its intensity
-/// `2^bit`. The planes share `exposure_ns` equally.
-pub(crate) fn lights_of_planes(
-    schedule: &PlaneSchedule,
-    exposure_ns: i64,
-) -> impl Iterator<Item = (i64, f64)> + '_ {
-    let halves = 2 * schedule.len() as i128;
-    schedule.planes().iter().enumerate().map(move |(i, plane)| {
-        let middle = i128::from(exposure_ns.max(0)) * halves_of(i) / halves;
-        (middle as i64, f64::from(1u32 << plane.bit))
-    })
+    /// The light of a plane.
+    fn light_of(self, plane: PlaneSpec) -> u32 {
+        match self.timing {
+            PlaneTiming::ByWeight | PlaneTiming::Equal => 1 << plane.bit,
+            PlaneTiming::Held => 1,
+        }
+    }
+
+    /// How long the frame lasts, in the units of [`Self::length_of`].
+    fn whole(self) -> i128 {
+        self.schedule.planes().iter().map(|plane| self.length_of(*plane)).sum()
+    }
+
+    /// Every plane with twice the time from the first photon to its middle, in the units of [`Self::length_of`].
+    fn planes(self) -> impl Iterator<Item = (PlaneSpec, i128)> + 'a {
+        self.schedule.planes().iter().scan(0, move |begin, plane| {
+            let length = self.length_of(*plane);
+            let halves = 2 * *begin + length;
+            *begin += length;
+            Some((*plane, halves))
+        })
+    }
+
+    /// Sum of the planes' middles, as [`Self::planes`] gives them, each weighted with its light; and sum of the light.
+    fn moments(self) -> [i128; 2] {
+        self.planes().fold([0, 0], |[moments, light], (plane, halves)| {
+            let of = i128::from(self.light_of(plane));
+            [moments + of * halves, light + of]
+        })
+    }
+
+    /// As [`light_centre_ns`].
+    fn centre_ns(self, exposure_ns: i64) -> i64 {
+        // A schedule has 1 to 32 planes of bits below 8, so nothing here overflows, and the light is positive.
+        let [moments, light] = self.moments();
+        (i128::from(exposure_ns.max(0)) * moments / (2 * self.whole() * light)) as i64
+    }
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
-    use dpm_device::planes::{Channel, PlaneSpec};
+    use dpm_device::planes::Channel;
 
     const SLOT: i64 = 1_055_966;
 
-    #[test]
-    fn the_order_of_rgb24_has_its_centre_at_194_us() {
-        assert_eq!((centre_ns(&PlaneSchedule::rgb24(), SLOT) + 500) / 1000, 194);
+    fn centre_ns(schedule: &PlaneSchedule, timing: PlaneTiming, exposure_ns: i64) -> i64 {
+        Lights { schedule, timing }.centre_ns(exposure_ns)
     }
 
     #[test]
-    fn the_centre_is_the_mean_of_the_planes_lights() {
+    fn the_order_of_rgb24_has_its_centre_at_194_us() {
+        assert_eq!((centre_ns(&PlaneSchedule::rgb24(), PlaneTiming::Equal, SLOT) + 500) / 1000, 194);
+    }
+
+    /// Light that is the same from the first photon to the last has its centre in the middle, whatever the planes.
+    #[test]
+    fn even_light_has_its_centre_in_the_middle() {
         for schedule in [PlaneSchedule::rgb24(), PlaneSchedule::mono8(), PlaneSchedule::equal24()] {
-            let (mut sum, mut weights) = (0.0, 0.0);
-            for (middle, weight) in lights_of_planes(&schedule, SLOT) {
-                sum += middle as f64 * weight;
-                weights += weight;
+            for timing in [PlaneTiming::ByWeight, PlaneTiming::Held] {
+                assert_eq!(centre_ns(&schedule, timing, SLOT), SLOT / 2);
             }
-            assert!((sum / weights - centre_ns(&schedule, SLOT) as f64).abs() <= 1.0);
         }
+    }
+
+    /// The middles of planes that last as long as they weigh: the first of `7 6 5 ...` takes half of the exposure.
+    #[test]
+    fn planes_follow_one_another_without_gaps() {
+        let lights = Lights { schedule: &PlaneSchedule::mono8(), timing: PlaneTiming::ByWeight };
+        let mut end = 0;
+        for (plane, halves) in lights.planes() {
+            assert_eq!(halves - end, 1 << plane.bit);
+            end = halves + (1 << plane.bit);
+        }
+        assert_eq!(end, 2 * lights.whole());
     }
 
     /// The centres of a schedule and of its mirror image lie at equal distances from the middle. With equal weights
     /// the centre is the middle. Every centre lies inside the exposure.
     #[test]
     fn centres_obey_the_symmetry_of_the_order() {
+        let timing = PlaneTiming::Equal;
         for schedule in [PlaneSchedule::rgb24(), PlaneSchedule::mono8()] {
             let mut planes = schedule.planes().to_vec();
             planes.reverse();
             let mirrored = PlaneSchedule::new(&planes).unwrap();
             for exposure in [0, 1, 7, SLOT, 1_000_000_000_000] {
-                let (a, b) = (centre_ns(&schedule, exposure), centre_ns(&mirrored, exposure));
+                let (a, b) = (centre_ns(&schedule, timing, exposure), centre_ns(&mirrored, timing, exposure));
                 // Each value is rounded down by less than 1 ns.
                 assert!((exposure - 1..=exposure).contains(&(a + b)), "{a} + {b} of {exposure}");
                 assert!((0..=exposure).contains(&a));
@@ -95,7 +173,7 @@ mod tests {
         }
         let equal =
             [Channel::Red, Channel::Green, Channel::Blue].map(|channel| PlaneSpec { channel, bit: 3 });
-        assert_eq!(centre_ns(&PlaneSchedule::new(&equal).unwrap(), 600), 300);
-        assert_eq!(centre_ns(&PlaneSchedule::mono8(), -5), 0);
+        assert_eq!(centre_ns(&PlaneSchedule::new(&equal).unwrap(), timing, 600), 300);
+        assert_eq!(centre_ns(&PlaneSchedule::mono8(), timing, -5), 0);
     }
 }

@@ -4,6 +4,7 @@ use super::projector::ProjectorReport;
 use super::signed::SignedHistogram;
 use crate::failure::{Failure, FailureKind};
 use crate::plan::dark::DarkCause;
+use hdrhistogram::Histogram;
 use serde::ser::{Serialize, SerializeMap, Serializer};
 use std::collections::BTreeMap;
 use std::path::PathBuf;
@@ -22,6 +23,16 @@ pub struct Spread {
 }
 
 impl Spread {
+    /// Percentiles of what a histogram holds, divided by `unit`. `None` if it is empty.
+    pub(crate) fn of_histogram(h: &Histogram<u64>, unit: f64) -> Option<Self> {
+        (!h.is_empty()).then(|| Self {
+            p50: h.value_at_quantile(0.5) as f64 / unit,
+            p99: h.value_at_quantile(0.99) as f64 / unit,
+            p999: h.value_at_quantile(0.999) as f64 / unit,
+            max: h.max() as f64 / unit,
+        })
+    }
+
     /// Percentiles of `values`, which are reordered. Values that are not finite are left out. `None` if none remain.
     #[cfg(test)]
     pub(crate) fn of(values: &mut Vec<f64>) -> Option<Self> {

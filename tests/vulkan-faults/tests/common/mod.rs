@@ -92,6 +92,7 @@ pub(crate) fn submit(renderer: &mut Renderer, slot: &mut FrameSlot, frame: u32) 
         gaze,
         widen_deg: 0.0,
         poses: &poses,
+        sweep: None,
         lost: &[],
     };
     renderer.submit(slot, &inputs)

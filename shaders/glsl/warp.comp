@@ -1,0 +1,119 @@
+// Planes that follow the bodies: each group of bits is taken from the pixel whose surface is at this mirror at the group's instant. Equals the CPU's
+// `Drawn::word` bit for bit.
+#version 460
+#extension GL_GOOGLE_include_directive : require
+#extension GL_EXT_scalar_block_layout : require
+#include "scene.glsl"
+
+layout(local_size_x = 8, local_size_y = 8) in;
+
+layout(set = 0, binding = B_TILES, scalar) readonly buffer Tiles { uint tiles[]; };
+layout(set = 0, binding = B_MOTION, scalar) readonly buffer Motions { Moved motions[]; };
+layout(set = 0, binding = B_MOVERS, scalar) readonly buffer Movers { Mover movers[]; };
+layout(set = 0, binding = B_PLANE_GROUPS, scalar) readonly buffer PlaneGroups { PlaneGroup groups[]; };
+layout(set = 0, binding = B_CODES, scalar) writeonly buffer Codes { uint codes[]; };
+
+const uint NO_MOVER = 0xffffffffu;
+
+uint index_of(ivec2 pixel) { return uint(pixel.y) * frame.width + uint(pixel.x); }
+
+uint owner_of(Moved moved) { return moved.owner_and_depth >> 24u; }
+
+uint depth_of(Moved moved) { return moved.owner_and_depth & 0xffffffu; }
+
+ivec2 motion_of(Moved moved) { return ivec2(bitfieldExtract(int(moved.motion), 0, 16), bitfieldExtract(int(moved.motion), 16, 16)); }
+
+// The place that a point comes from which reaches the middle of `pixel` at `instant` and moves by `motion` during the exposure, in 1/64 pixel. The
+// centre of a pixel is a multiple of 64.
+ivec2 source(ivec2 pixel, ivec2 motion, int instant) { return (pixel << 6) - ((motion * instant + 32768) >> 16); }
+
+// The pixel in which a place is.
+ivec2 nearest_pixel(ivec2 at) { return (at + 32) >> 6; }
+
+// Whether the light of a mover can fall on a pixel.
+bool within(uint m, ivec2 pixel) { return all(greaterThanEqual(pixel, movers[m].lower)) && all(lessThan(pixel, movers[m].upper)); }
+
+// How a mover moves at a pixel, about.
+ivec2 start_of(uint m, ivec2 pixel) {
+    ivec2 from = pixel - movers[m].centre;
+    ivec4 slope = movers[m].slope;
+    return clamp(movers[m].start + ((slope.xz * from.x + slope.yw * from.y) >> 12), ivec2(-32767), ivec2(32767));
+}
+
+// Nothing is there.
+const Moved NOTHING = Moved(0u, 0u, 0u);
+
+// What is at a pixel in the area of mover `m`.
+Moved moved_at(uint m, ivec2 pixel) {
+    if (!within(m, pixel)) return NOTHING;
+    uint index = index_of(pixel);
+    return Moved(motions[index].word, motions[index].motion, motions[index].owner_and_depth);
+}
+
+// The place of mover `m` that is at `pixel` at `instant`. False if none is. `own` is what moves at `pixel` itself.
+bool find(uint m, ivec2 pixel, int instant, Moved own, out ivec2 at, out uint depth) {
+    uint owner = OWNER_STILL + 1u + m;
+    // The point's motion is that of the point that is here now, or of what is about where it comes from.
+    Moved near = own;
+    if (owner_of(near) != owner) near = moved_at(m, nearest_pixel(source(pixel, start_of(m, pixel), instant)));
+    at = source(pixel, motion_of(near), instant);
+    Moved there = NOTHING;
+    if (owner_of(near) == owner) there = moved_at(m, nearest_pixel(at));
+    depth = depth_of(there);
+    return owner_of(there) == owner;
+}
+
+// The word of mover `m` at a place. Halftones are taken whole; code values are between those of the pixels around the place that show the body.
+uint word_of(uint m, ivec2 at) {
+    if (WARP_WHOLE_WORDS) return motions[index_of(nearest_pixel(at))].word;
+    uvec2 part = uvec2(at & 63);
+    uint weights = 0u;
+    uvec3 sums = uvec3(0u);
+    for (uint tap = 0u; tap < 4u; tap++) {
+        uvec2 step_ = uvec2(tap & 1u, tap >> 1u);
+        uvec2 weight2 = mix(64u - part, part, equal(step_, uvec2(1u)));
+        ivec2 pixel = (at >> 6) + ivec2(step_);
+        Moved there = moved_at(m, pixel);
+        uint weight = owner_of(there) == OWNER_STILL + 1u + m ? weight2.x * weight2.y : 0u;
+        weights += weight;
+        sums += weight * uvec3(there.word & 255u, (there.word >> 8u) & 255u, (there.word >> 16u) & 255u);
+    }
+    // The nearest of the four shows the body, so the weights are positive.
+    uvec3 code = (sums + weights / 2u) / max(weights, 1u);
+    return code.r | (code.g << 8u) | (code.b << 16u);
+}
+
+// The bits that the mirror `pixel` shows at `instant`.
+uint word_at(ivec2 pixel, int instant, Moved own) {
+    uint owner = owner_of(own), closest = 0xffffffffu, mover = NO_MOVER;
+    if (owner == OWNER_STILL) closest = depth_of(own);
+    ivec2 place;
+    for (uint m = 0u; m < frame.mover_count; m++) {
+        ivec2 at;
+        uint depth;
+        if (within(m, pixel) && find(m, pixel, instant, own, at, depth) && depth < closest) {
+            closest = depth;
+            mover = m;
+            place = at;
+        }
+    }
+    if (mover != NO_MOVER) return word_of(mover, place);
+    if (owner <= OWNER_STILL) return owner == OWNER_STILL ? own.word : 0u;
+    // A body has left this mirror and uncovers what was hidden. What is seen behind its edge goes on here.
+    Moved behind = moved_at(owner - OWNER_STILL - 1u, nearest_pixel(source(pixel, motion_of(own), instant)));
+    return owner_of(behind) == OWNER_NONE ? 0u : behind.word;
+}
+
+void main() {
+    uvec2 at;
+    if (!tile_pixel(tiles[gl_WorkGroupID.x >> 2u], at)) return;
+    ivec2 pixel = ivec2(at);
+    uint index = index_of(pixel);
+    Moved own = Moved(motions[index].word, motions[index].motion, motions[index].owner_and_depth);
+    uint word = own.word;
+    for (uint g = 0u; g < frame.group_count; g++) {
+        uint mask = groups[g].mask;
+        word = (word & ~mask) | (word_at(pixel, groups[g].instant, own) & mask);
+    }
+    codes[index] = word;
+}
