@@ -3,6 +3,7 @@
 pub mod calibrate;
 pub mod cli;
 mod dlpc900;
+mod notify;
 mod pattern_dlpc900;
 mod rest_dlpc900;
 mod run_dlpc900;

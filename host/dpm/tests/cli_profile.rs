@@ -228,8 +228,7 @@ fn what_is_no_profile_is_refused_with_its_name() {
     assert_eq!(code(&dpm(&["profile", "--compare", &report, &report], &[])), 2);
     let output = dpm(&["profile", "--compare", "/nonexistent/a.json", &text], &[]);
     assert!(err(&output).contains("/nonexistent/a.json: cannot read it: No such file"), "{}", err(&output));
-    let output =
-        dpm(&["profile", "--no-render", "--prometheus", "nowhere", "--out", folder.text()], &NO_DRIVER);
+    let output = dpm(&["profile", "--no-render", "--page=nowhere", "--out", folder.text()], &NO_DRIVER);
     assert_eq!(code(&output), 2);
-    assert!(err(&output).contains("--prometheus nowhere"), "{}", err(&output));
+    assert!(err(&output).contains("page.listen"), "{}", err(&output));
 }

@@ -219,7 +219,7 @@ impl Rig {
     }
 
     /// Albedo of the real surface of a body of the scene.
-    pub(crate) fn albedo_of(&self, body: usize) -> [f64; 3] {
+    pub fn albedo_of(&self, body: usize) -> [f64; 3] {
         albedo_of(&self.config, self.scene.bodies.get(body).and_then(|b| b.tracked))
     }
 

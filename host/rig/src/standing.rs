@@ -131,6 +131,8 @@ pub enum By {
         /// As reported by the kernel.
         uid: u32,
     },
+    /// The live page; whoever holds its token.
+    Page,
     /// A key on the terminal of the run.
     Key,
     /// A signal.
@@ -143,6 +145,7 @@ impl fmt::Display for By {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         match self {
             Self::Socket { uid } => write!(f, "user {} over the control socket", user_name(*uid)),
+            Self::Page => write!(f, "the live page"),
             Self::Key => write!(f, "a key"),
             Self::Signal => write!(f, "a signal"),
             Self::Projector => write!(f, "the projector, which had it latched"),

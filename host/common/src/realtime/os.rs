@@ -257,10 +257,17 @@ fn read_of_thread<'a>(id: i32, name: &str, text: &'a mut [u8]) -> Option<&'a str
     std::str::from_utf8(&text[..n]).ok()
 }
 
-/// Nanoseconds of processor time the calling thread has used.
-#[cfg(test)]
+/// Makes the calling thread give way to others under the normal scheduler: `by` is 1 to 19, the steps of nice(2).
+/// Without an effect if it is refused, which no kernel does.
 #[cfg(target_os = "linux")]
-pub(crate) fn thread_cpu_ns() -> i64 {
+pub fn give_way(by: i32) {
+    // SAFETY: setpriority takes plain numbers; 0 is the calling thread on Linux.
+    unsafe { libc::setpriority(libc::PRIO_PROCESS, 0, by.clamp(1, 19)) };
+}
+
+/// Nanoseconds of processor time the calling thread has used.
+#[cfg(target_os = "linux")]
+pub fn thread_cpu_ns() -> i64 {
     let mut t = libc::timespec { tv_sec: 0, tv_nsec: 0 };
     // SAFETY: `t` is written during the call only.
     unsafe { libc::clock_gettime(libc::CLOCK_THREAD_CPUTIME_ID, &mut t) };
@@ -311,12 +318,14 @@ mod elsewhere {
     pub(crate) fn slice_ns() -> u64 {
         0
     }
+    /// No effect.
+    pub fn give_way(_by: i32) {}
     /// Unknown.
     pub(crate) fn allowed_core_list() -> Vec<u32> {
         Vec::new()
     }
     /// Unknown.
-    pub(crate) fn thread_cpu_ns() -> i64 {
+    pub fn thread_cpu_ns() -> i64 {
         0
     }
     /// Unknown.

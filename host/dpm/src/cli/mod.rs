@@ -11,6 +11,7 @@ mod error_experiments;
 mod error_files;
 mod keys;
 mod link_test;
+mod live_page;
 mod order;
 mod os;
 mod pattern;

@@ -204,16 +204,12 @@ pub(super) fn execute(args: &PatternArgs) -> Result<(), Failure> {
     refuse_flashes(&rig, &show)?;
     if let ProjectorBackend::Dlpc900(backend) = &rig.projector.backend {
         let device = backend.device.clone();
-        let report = watch(
-            rig,
-            |_| {},
-            move |rig, monitor| {
-                let guard = Guard::start(device.as_deref());
-                let result = run_pattern_dlpc900(rig, &show, monitor);
-                guard.dismiss();
-                result
-            },
-        )?;
+        let report = watch(rig, move |rig, monitor| {
+            let guard = Guard::start(device.as_deref());
+            let result = run_pattern_dlpc900(rig, &show, monitor);
+            guard.dismiss();
+            result
+        })?;
         print(&if args.json { to_json(&report) + "\n" } else { report.to_table() });
         return Ok(());
     }

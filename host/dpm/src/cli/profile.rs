@@ -1,13 +1,12 @@
 //! `dpm profile`: where the time between motion and light goes, and whether it improved.
 
 use super::rig_args::RigArgs;
+use super::run::PageArgs;
 use super::watch::{print, watch};
 use dpm_device::regular_file;
 use dpm_lab::profile::compare::{compare, failed_gates, to_table};
 use dpm_lab::profile::profile_rig;
-use dpm_lab::profile::prometheus::{page, PageServer};
 use dpm_rig::failure::{Ended, Failure, FailureKind};
-use dpm_rig::telemetry::monitor::RunCounts;
 use dpm_rig::telemetry::profile::ProfileReport;
 use std::path::{Path, PathBuf};
 
@@ -32,12 +31,11 @@ pub(crate) struct ProfileArgs {
     /// Print the report as one JSON object
     #[arg(long)]
     json: bool,
-    /// Serve the figures for Prometheus during the run, for example on 127.0.0.1:9473
-    #[arg(long, value_name = "ADDR")]
-    prometheus: Option<String>,
+    #[command(flatten)]
+    page: PageArgs,
     /// Compare two profile.json files instead of running: shows what improved or got worse, and whether beyond the
     /// noise. Exit code 1 if the share of missed slots or late frames grew by more than the noise
-    #[arg(long, num_args = 2, value_names = ["A.json", "B.json"], conflicts_with_all = ["rig", "no_render", "prometheus"])]
+    #[arg(long, num_args = 2, value_names = ["A.json", "B.json"], conflicts_with_all = ["rig", "no_render", "page"])]
     compare: Vec<PathBuf>,
 }
 
@@ -61,7 +59,7 @@ pub(super) fn execute(args: &ProfileArgs) -> Result<(), Failure> {
         }
         return Ok(());
     }
-    let mut flags = args.flags.clone();
+    let mut flags = args.page.with(&args.flags);
     // Inserted first, so that an explicit --set overrides it.
     flags.set.splice(0..0, ["output.images=false".into(), "output.trace=true".into()]);
     flags.pace.get_or_insert_with(|| "real".into());
@@ -70,39 +68,9 @@ pub(super) fn execute(args: &ProfileArgs) -> Result<(), Failure> {
         flags.seconds.get_or_insert(SECONDS);
     }
     let rig = flags.rig(args.rig.as_deref())?;
-    let server = match &args.prometheus {
-        Some(address) => Some(PageServer::start(address.as_str()).map_err(|e| {
-            let told = format!(
-                "--prometheus {address}: cannot listen there: {e}; give an address of this machine and a free port, for example 127.0.0.1:9947"
-            );
-            Failure::new(FailureKind::BadInput, told)
-        })?),
-        None => None,
-    };
     let prepared = args.no_render;
-    let Ended { report: profile, failure } = watch(
-        rig,
-        |counts| {
-            if let Some(server) = &server {
-                server.show(page(counts, None));
-            }
-        },
-        move |rig, monitor| profile_rig(rig, prepared, monitor),
-    )?;
-    if let Some(server) = &server {
-        let r = &profile.report;
-        let counts = RunCounts {
-            frames_planned: r.frames_lit + r.frames_dark + r.frames_dropped + r.frames_withheld,
-            frames_lit: r.frames_lit,
-            frames_dark: r.frames_dark,
-            frames_dropped: r.frames_dropped,
-            frames_withheld: r.frames_withheld,
-            frames_late: r.frames_late,
-            slots: r.slots,
-            slots_missed: r.missed_slots,
-        };
-        server.show(page(&counts, Some(&profile.profile)));
-    }
+    let Ended { report: profile, failure } =
+        watch(rig, move |rig, monitor| profile_rig(rig, prepared, monitor))?;
     print(&if args.json { profile.to_json() + "\n" } else { profile.to_table() });
     if profile.frames_torn.unwrap_or(0) + profile.frames_reordered > 0 {
         let told = format!(

@@ -4,7 +4,7 @@ use super::dlpc900::Guard;
 use super::rig_args::RigArgs;
 use super::watch::{check_out, print, run_and_report, watch, write_out};
 use crate::run_dlpc900::run_dlpc900;
-use dpm_rig::config::ProjectorBackend;
+use dpm_rig::config::{ProjectorBackend, DEFAULT_PAGE};
 use dpm_rig::failure::Failure;
 use dpm_rig::run_rig::run_rig;
 use dpm_rig::telemetry::report::to_json;
@@ -18,6 +18,8 @@ pub(crate) struct RunArgs {
     rig: PathBuf,
     #[command(flatten)]
     flags: RigArgs,
+    #[command(flatten)]
+    page: PageArgs,
     /// Print the report as one JSON object
     #[arg(long)]
     json: bool,
@@ -28,9 +30,29 @@ pub(crate) struct RunArgs {
 pub(crate) struct DemoArgs {
     #[command(flatten)]
     flags: RigArgs,
+    #[command(flatten)]
+    page: PageArgs,
     /// Print the report as one JSON object
     #[arg(long)]
     json: bool,
+}
+
+/// The flag of the live page.
+#[derive(clap::Args, Clone, Debug)]
+pub(super) struct PageArgs {
+    /// Serve the live page, and metrics, at this address of this machine; 127.0.0.1:8947 if none is given
+    #[arg(long, value_name = "ADDRESS", num_args = 0..=1, require_equals = true, default_missing_value = DEFAULT_PAGE)]
+    page: Option<String>,
+}
+
+impl PageArgs {
+    /// The rig's flags with this one.
+    pub(super) fn with(&self, flags: &RigArgs) -> RigArgs {
+        let mut flags = flags.clone();
+        // Before `--set`, which overrides it.
+        flags.set.splice(0..0, self.page.iter().map(|address| format!("page.listen={address:?}")));
+        flags
+    }
 }
 
 /// Runs a rig file.
@@ -38,7 +60,7 @@ pub(crate) struct DemoArgs {
 /// # Errors
 /// Bad rig file, scene or device.
 pub(crate) fn execute(args: &RunArgs) -> Result<(), Failure> {
-    start(Some(&args.rig), &args.flags, args.json)
+    start(Some(&args.rig), &args.page.with(&args.flags), args.json)
 }
 
 /// Runs the built-in demo.
@@ -46,7 +68,7 @@ pub(crate) fn execute(args: &RunArgs) -> Result<(), Failure> {
 /// # Errors
 /// Bad flags, scene or device.
 pub(crate) fn execute_demo(args: &DemoArgs) -> Result<(), Failure> {
-    start(None, &args.flags, args.json)
+    start(None, &args.page.with(&args.flags), args.json)
 }
 
 fn start(path: Option<&Path>, flags: &RigArgs, json: bool) -> Result<(), Failure> {
@@ -54,18 +76,14 @@ fn start(path: Option<&Path>, flags: &RigArgs, json: bool) -> Result<(), Failure
     if let ProjectorBackend::Dlpc900(backend) = &rig.projector.backend {
         check_out(flags.out.as_deref())?;
         let device = backend.device.clone();
-        let report = watch(
-            rig,
-            |_| {},
-            move |rig, monitor| {
-                // Started only when this instance has the controller's lock. A panic ends without a message to the
-                // guard, like a SIGKILL.
-                let guard = Guard::start(device.as_deref());
-                let result = run_dlpc900(rig, monitor);
-                guard.dismiss();
-                result
-            },
-        )?;
+        let report = watch(rig, move |rig, monitor| {
+            // Started only when this instance has the controller's lock. A panic ends without a message to the
+            // guard, like a SIGKILL.
+            let guard = Guard::start(device.as_deref());
+            let result = run_dlpc900(rig, monitor);
+            guard.dismiss();
+            result
+        })?;
         print(&if json { to_json(&report) + "\n" } else { report.to_table() });
         return write_out(flags.out.as_deref(), "report.json", &report);
     }

@@ -2,11 +2,13 @@
 //! stream or the terminal is stopped, that thread waits and the run continues.
 
 use crossbeam::channel::{bounded, Receiver, RecvTimeoutError, Sender};
+use dpm_page::notes::Notes;
 use dpm_rig::failure::{Failure, FailureKind};
 use dpm_rig::telemetry::monitor::{ProjectorHealth, RunCounts};
 use indicatif::{ProgressBar, ProgressDrawTarget, ProgressStyle};
 use std::collections::VecDeque;
 use std::io::{IsTerminal, Write};
+use std::sync::Arc;
 use std::thread::JoinHandle;
 use std::time::{Duration, Instant};
 
@@ -26,16 +28,24 @@ enum Word {
 /// Writes notes without ever waiting.
 pub(super) struct Teller {
     words: Option<Sender<Word>>,
+    /// The last notes, for those who look later.
+    kept: Arc<Notes>,
     over: Receiver<()>,
     thread: Option<JoinHandle<()>>,
 }
 
 impl Teller {
     /// For a run of `total` frames, or else `seconds` of time; 0 means without an end. A quiet one writes notes only.
+    /// Without a terminal, progress is written once in `every`, if at all.
     ///
     /// # Errors
     /// No thread can be started (exit code 3).
-    pub(super) fn start(total: u64, seconds: f64, is_quiet: bool) -> Result<Self, Failure> {
+    pub(super) fn start(
+        total: u64,
+        seconds: f64,
+        every: Option<Duration>,
+        is_quiet: bool,
+    ) -> Result<Self, Failure> {
         let (words, heard) = bounded(WAITING);
         let (ended, over) = bounded::<()>(1);
         let thread = std::thread::Builder::new()
@@ -43,7 +53,7 @@ impl Teller {
             .spawn(move || {
                 // Dropped at the end of the thread, whatever ends it.
                 let _ended = ended;
-                let mut progress = Progress::new(total, seconds);
+                let mut progress = Progress::new(total, seconds, every);
                 let mut last = (ProjectorHealth::Connecting, RunCounts::default());
                 while let Ok(word) = heard.recv() {
                     match word {
@@ -60,11 +70,22 @@ impl Teller {
                 }
             })
             .map_err(|e| Failure::new(FailureKind::Device, format!("cannot start a thread: {e}")))?;
-        Ok(Self { words: Some(words), over, thread: Some(thread) })
+        Ok(Self { words: Some(words), kept: Arc::default(), over, thread: Some(thread) })
     }
 
-    /// Writes `text` as one line.
+    /// The notes so far.
+    pub(super) fn kept(&self) -> Arc<Notes> {
+        self.kept.clone()
+    }
+
+    /// Writes `text` as one line, and keeps it for those who look later.
     pub(super) fn note(&self, text: &str) {
+        self.kept.add(text);
+        self.whisper(text);
+    }
+
+    /// Writes `text` as one line and keeps it nowhere.
+    pub(super) fn whisper(&self, text: &str) {
         if let Some(words) = &self.words {
             let _ = words.try_send(Word::Note(text.to_owned()));
         }
@@ -150,7 +171,7 @@ fn told(health: ProjectorHealth, counts: &RunCounts, total: u64, rate: f64) -> S
 
 enum Shown {
     Bar(ProgressBar),
-    Lines { next: Duration },
+    Lines { next: Duration, every: Option<Duration> },
 }
 
 struct Progress {
@@ -167,7 +188,7 @@ struct Progress {
 
 impl Progress {
     /// For `total` frames, or else `seconds` of time; 0 means without an end.
-    fn new(total: u64, seconds: f64) -> Self {
+    fn new(total: u64, seconds: f64, every: Option<Duration>) -> Self {
         let timed = total == 0 && seconds > 0.0;
         let shown = if std::io::stderr().is_terminal() {
             let bar = match total {
@@ -180,7 +201,7 @@ impl Progress {
             bar.set_style(ProgressStyle::with_template(template).expect("the template is a constant"));
             Shown::Bar(bar)
         } else {
-            Shown::Lines { next: Duration::from_secs(1) }
+            Shown::Lines { next: every.unwrap_or_default(), every }
         };
         let rate = Rate { seen: VecDeque::new() };
         Self { started: Instant::now(), total, seconds, began: None, rate, shown }
@@ -216,11 +237,11 @@ impl Progress {
                 bar.set_message(told(health, &counts, self.total, rate));
                 bar.tick();
             }
-            Shown::Lines { next } => {
-                if elapsed >= *next {
-                    // After a pause of this thread the next line follows a second later, not a burst of lines at
-                    // once.
-                    *next = elapsed + Duration::from_secs(1);
+            Shown::Lines { next, every } => {
+                if let Some(every) = every.filter(|_| elapsed >= *next) {
+                    // After a pause of this thread the next line follows at its usual distance, not a burst of lines
+                    // at once.
+                    *next = elapsed + every;
                     let line = serde_json::json!({
                         "elapsed_s": (elapsed.as_secs_f64() * 1e3).round() / 1e3,
                         "projector": health.word().to_lowercase(),

@@ -6,7 +6,9 @@
 //! that writes.
 
 use super::keys::Keys;
+use super::live_page;
 use super::tell::{Teller, SHOWN_EVERY};
+use crate::notify::Notifier;
 use crate::signals;
 use crossbeam::channel::{unbounded, Receiver, RecvTimeoutError};
 use dpm_common::files::{write_atomically, InstanceLock, LockError};
@@ -22,12 +24,12 @@ use dpm_rig::interlock::Interlock;
 use dpm_rig::order::Order;
 use dpm_rig::run_rig::{cannot_write, check_output_folder};
 use dpm_rig::standing::{state_folder, By, Identity, OrderFile, Stands};
-use dpm_rig::telemetry::monitor::{ProjectorHealth, RunCounts, RunMonitor};
+use dpm_rig::telemetry::monitor::{ProjectorHealth, RunMonitor};
 use dpm_rig::telemetry::report::{to_json, Report};
 use std::io::Write;
 use std::path::Path;
 use std::sync::Arc;
-use std::time::Duration;
+use std::time::{Duration, Instant};
 
 /// How often to check keys, signals and the projector's state.
 const TICK: Duration = Duration::from_millis(5);
@@ -46,7 +48,7 @@ pub(crate) fn run_and_report(
     json: bool,
     run: impl FnOnce(&RigConfig, &Arc<RunMonitor>) -> Result<Ended<Report>, Failure> + Send + 'static,
 ) -> Result<(), Failure> {
-    let Ended { report, failure } = watch(rig, |_| {}, run)?;
+    let Ended { report, failure } = watch(rig, run)?;
     print(&if json { report.to_json() + "\n" } else { report.to_table() });
     failure.map_or(Ok(()), Err)?;
     report.check_lit()
@@ -75,17 +77,16 @@ pub(super) fn check_out(out: Option<&Path>) -> Result<(), Failure> {
     out.map_or(Ok(()), check_output_folder)
 }
 
-/// Runs `run` on a thread of its own. Meanwhile this thread shows its progress on the standard error stream, passes
-/// it to `show`, and turns signals into an orderly stop.
+/// Runs `run` on a thread of its own. Meanwhile this thread shows its progress on the standard error stream, and
+/// turns signals into an orderly stop.
 ///
 /// # Errors
 /// The error of `run`; a device or output folder that another instance uses; a panic in the run.
 pub(super) fn watch<T: Send + 'static>(
     rig: RigConfig,
-    show: impl Fn(&RunCounts),
     run: impl FnOnce(&RigConfig, &Arc<RunMonitor>) -> Result<T, Failure> + Send + 'static,
 ) -> Result<T, Failure> {
-    watch_with(rig, Keys::new(), false, show, run)
+    watch_with(rig, Keys::new(), false, run)
 }
 
 /// The same for a run that talks to the operator itself: keys are not read, and no progress is shown.
@@ -96,14 +97,13 @@ pub(super) fn watch_quietly<T: Send + 'static>(
     rig: RigConfig,
     run: impl FnOnce(&RigConfig, &Arc<RunMonitor>) -> Result<T, Failure> + Send + 'static,
 ) -> Result<T, Failure> {
-    watch_with(rig, None, true, |_| {}, run)
+    watch_with(rig, None, true, run)
 }
 
 fn watch_with<T: Send + 'static>(
     rig: RigConfig,
     keys: Option<Keys>,
     is_quiet: bool,
-    show: impl Fn(&RunCounts),
     run: impl FnOnce(&RigConfig, &Arc<RunMonitor>) -> Result<T, Failure> + Send + 'static,
 ) -> Result<T, Failure> {
     let locks = take_locks(&rig)?;
@@ -114,9 +114,10 @@ fn watch_with<T: Send + 'static>(
     if let Some(interlock) = Interlock::of_config(&rig.safety.interlock, keys.is_some())? {
         monitor.set_interlock(interlock);
     }
-    let mut teller = Teller::start(rig.run.frames, rig.run.seconds, is_quiet)?;
+    let mut teller = Teller::start(rig.run.frames, rig.run.seconds, rig.output.log_every(), is_quiet)?;
     // Before the run begins, so that it comes up dark if an order stands.
     let orders = Arc::new(stand_by(&rig, &monitor, &teller)?);
+    let shown = rig.clone();
     let (done, finished) = unbounded();
     let worker = {
         let monitor = Arc::clone(&monitor);
@@ -134,6 +135,7 @@ fn watch_with<T: Send + 'static>(
         teller.note(&format!("safety.interlock: light only while {}; it is {now}", interlock.what()));
     }
     let (control, status) = open_control(&locks.runtime, &monitor, &orders, &mut teller, keys.is_some());
+    let page = live_page::open(&shown, &monitor, &orders, &teller);
     let mut watcher = Watcher {
         monitor: &monitor,
         orders: &orders,
@@ -143,8 +145,9 @@ fn watch_with<T: Send + 'static>(
         health: ProjectorHealth::Connecting,
         tracker_told: false,
         signal_told: false,
+        notifier: Notifier::from_environment(),
     };
-    let result = watcher.until_finished(&finished, &show)?;
+    let result = watcher.until_finished(&finished)?;
     // A panic was already turned into the error above.
     let _ = worker.join();
     let result = match result {
@@ -159,7 +162,7 @@ fn watch_with<T: Send + 'static>(
         // A client that waits for a dark that came with the end sees it.
         status.say(monitor.projector(), orders.kept());
     }
-    drop(control);
+    drop((control, page));
     if let Some(orders) = Arc::into_inner(orders) {
         orders.end(result.is_ok());
     }
@@ -204,6 +207,7 @@ struct Watcher<'a> {
     health: ProjectorHealth,
     tracker_told: bool,
     signal_told: bool,
+    notifier: Notifier,
 }
 
 impl Watcher<'_> {
@@ -214,7 +218,6 @@ impl Watcher<'_> {
     fn until_finished<T>(
         &mut self,
         finished: &Receiver<Result<T, Failure>>,
-        show: &impl Fn(&RunCounts),
     ) -> Result<Result<T, Failure>, Failure> {
         let mut ticks = 0u32;
         loop {
@@ -235,11 +238,10 @@ impl Watcher<'_> {
                 return Err(Failure::new(FailureKind::Device, why));
             }
             self.tell_changes();
+            self.notify();
             ticks = ticks.wrapping_add(1);
             if ticks.is_multiple_of(TICKS_SHOWN) {
-                let counts = self.monitor.counts();
-                self.teller.tick(self.health, counts);
-                show(&counts);
+                self.teller.tick(self.health, self.monitor.counts());
             }
         }
     }
@@ -258,8 +260,30 @@ impl Watcher<'_> {
         if let Some(signal) = signals::received().filter(|_| !self.signal_told) {
             self.signal_told = true;
             self.monitor.request_stop();
+            self.notifier.stopping();
             self.teller.note(&format!("{signal}: stopping"));
         }
+    }
+
+    /// What systemd wants to know.
+    fn notify(&mut self) {
+        let now = Instant::now();
+        // From then on the rig answers to orders and makes frames, whether or not light is permitted.
+        if !matches!(self.health, ProjectorHealth::Connecting) {
+            self.notifier.ready();
+        }
+        self.notifier.alive(now);
+        let (health, monitor) = (self.health, self.monitor);
+        self.notifier.status(now, || {
+            let c = monitor.counts();
+            format!(
+                "{}; {} frames lit, {} of {} slots missed",
+                health.word(),
+                c.frames_lit,
+                c.slots_missed,
+                c.slots
+            )
+        });
     }
 
     /// What is new of the projector and the tracker.

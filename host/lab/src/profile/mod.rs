@@ -2,7 +2,6 @@
 
 pub mod compare;
 pub mod plots;
-pub mod prometheus;
 mod v2log;
 
 use self::plots::percentiles;

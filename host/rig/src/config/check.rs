@@ -49,6 +49,7 @@ pub(super) fn check(rig: &RigConfig, purpose: Purpose, reader: &mut Reader) {
     addresses(rig, reader);
     transforms(rig, reader);
     super::safety::check(rig, reader);
+    super::page::check(rig, reader);
 }
 
 fn transforms(rig: &RigConfig, reader: &mut Reader) {

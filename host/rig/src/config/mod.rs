@@ -7,6 +7,7 @@
 mod calibration;
 mod check;
 mod method;
+mod page;
 mod prediction;
 mod projector;
 mod run;
@@ -22,6 +23,7 @@ pub(crate) use check::MAX_TRACKED;
 pub(crate) use dpm_common::keys::read::KeyDoc;
 pub(crate) use dpm_common::keys::source::VARIABLE_PREFIX;
 pub use dpm_common::keys::{ConfigError, ConfigErrors, Origin};
+pub use page::{PageConfig, DEFAULT_PAGE};
 pub use projector::*;
 pub use run::*;
 pub use safety::{
@@ -69,6 +71,8 @@ section! {
         output: OutputConfig = OutputConfig::default(), "", Any;
         /// What happens when something fails.
         safety: SafetyConfig = SafetyConfig::default(), "", Any;
+        /// What an operator sees in a browser.
+        page: PageConfig = PageConfig::default(), "", Any;
     }
 }
 

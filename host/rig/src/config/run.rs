@@ -5,6 +5,7 @@ use dpm_common::keys::read::{Any, NotEmpty, Within};
 use dpm_common::{section, words};
 use dpm_device::planes::Raster;
 use std::path::PathBuf;
+use std::time::Duration;
 
 section! {
     /// How radiance is computed.
@@ -236,9 +237,19 @@ section! {
         /// Record what every stage did around each missed slot, from two seconds before it: a trace `flight-NN.json`
         /// and a page `flight-NN.txt` in `dir`, 32 of each at most. Frames are recorded beside their path.
         flight_recorder: bool = false, "", Any;
+        /// How often a run without a terminal writes its progress as one line of JSON to the standard error stream; 0 is
+        /// never. Notes are always written.
+        log_every_s: f64 = 1.0, "s", Within(0.0, 86_400.0);
         /// Time over which the images integrate light, as an eye does; at least one frame. If left out, it is 33 ms
         /// or one frame, whichever is longer.
         light_window_ms: Option<f64> = None, "ms", Within(0.01, 10_000.0);
+    }
+}
+
+impl OutputConfig {
+    /// How often progress is written without a terminal; `None` for never.
+    pub fn log_every(&self) -> Option<Duration> {
+        (self.log_every_s > 0.0).then(|| Duration::from_secs_f64(self.log_every_s))
     }
 }
 

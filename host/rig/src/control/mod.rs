@@ -7,6 +7,7 @@
 //! after half a second, the line says so. If the first line does not come, BLACK and SAFE are sent as a signal, which
 //! needs no thread of the rig except its link's. The file `run-PID.state` then shows the result.
 
+pub mod answer;
 pub mod client;
 pub mod orders;
 pub mod server;
@@ -86,7 +87,7 @@ fn state_name(pid: u32) -> String {
 
 /// True when the projector is in the state that `order` asks for. Latched faults and the end of a run are as dark as
 /// BLACK.
-pub(crate) fn is_obeyed(order: Order, health: ProjectorHealth) -> bool {
+pub fn is_obeyed(order: Order, health: ProjectorHealth) -> bool {
     use ProjectorHealth as H;
     match order {
         Order::Black => matches!(health, H::Black | H::Faulted(_) | H::Stopped),

@@ -1,7 +1,8 @@
 //! The rig's end of the control socket: one thread, which waits for no client.
 
-use super::orders::{Kept, Orders, Ticket};
-use super::{is_obeyed, rig_name, socket_name, HEARD, MAX_WORD};
+use super::answer::answer_to;
+use super::orders::{Orders, Ticket};
+use super::{rig_name, socket_name, HEARD, MAX_WORD};
 use crate::order::Order;
 use crate::standing::By;
 use crate::telemetry::monitor::RunMonitor;
@@ -20,10 +21,6 @@ use std::time::{Duration, Instant};
 
 /// A client that has not sent its order by then is disconnected.
 const PATIENCE: Duration = Duration::from_millis(200);
-/// How long an answer waits for the projector to obey.
-const OBEYED_WITHIN: Duration = Duration::from_millis(500);
-/// How long an answer waits for the disk.
-const KEPT_WITHIN: Duration = Duration::from_millis(1000);
 /// Maximum number of clients. For one more, the oldest client that has sent nothing is disconnected.
 const CLIENTS: usize = 64;
 /// Number of clients accepted before reading what they sent.
@@ -199,53 +196,13 @@ impl Desk {
         let Self { clients, orders, monitor, .. } = self;
         clients.retain_mut(|client| {
             let Some((order, ticket)) = client.given else { return true };
-            let Some(text) = answer_to(order, ticket, client.since.elapsed(), monitor, orders) else {
+            let Some(answer) = answer_to(order, ticket, client.since.elapsed(), monitor, orders) else {
                 return true;
             };
-            let _ = writeln!(client.stream, "{text}");
+            let _ = writeln!(client.stream, "{}", answer.text);
             false
         });
     }
-}
-
-/// The last line for an order that was given `ago`; `None` while a better one is possible.
-fn answer_to(
-    order: Order,
-    ticket: Ticket,
-    ago: Duration,
-    monitor: &RunMonitor,
-    orders: &Orders,
-) -> Option<String> {
-    let health = monitor.projector();
-    let is_done = is_obeyed(order, health);
-    let kept = orders.outcome(ticket);
-    if let (Order::Arm, Some(Kept::Not(why))) = (order, &kept) {
-        return Some(format!("not armed: the standing order cannot be removed: {why}; projector {health}"));
-    }
-    let hope = if is_done { kept.is_none() && ago < KEPT_WITHIN } else { ago < OBEYED_WITHIN };
-    if hope {
-        return None;
-    }
-    let done = match (is_done, order) {
-        (true, _) => "ok",
-        // The link repeats it until the projector confirms.
-        (false, _) => "not yet",
-    };
-    let on_disk = match kept {
-        Some(Kept::In(path)) => format!("; kept in {}", path.display()),
-        Some(Kept::Forgotten) => String::new(),
-        Some(Kept::Nowhere) if order == Order::Arm => String::new(),
-        Some(Kept::Nowhere) => "; not kept over a restart (a mock without a state folder)".into(),
-        Some(Kept::Not(why)) => {
-            return Some(format!("{done}, but NOT kept over a restart: {why}; projector {health}"))
-        }
-        None => {
-            return Some(format!(
-                "{done}, but NOT kept over a restart yet: the disk is slow; projector {health}"
-            ))
-        }
-    };
-    Some(format!("{done}: projector {health}{on_disk}"))
 }
 
 /// Whether user `client` may give orders to a rig of user `me`.

@@ -98,7 +98,7 @@ fn every_order_is_obeyed_and_bad_clients_cost_nothing() {
         let names = ["built-in demo", crate::control::rig_name()];
         assert!(names.contains(&&*told.answers[0].rig), "{told:?}");
         assert_eq!(told.answers[0].text.contains("; kept in "), order != Order::Arm, "{told:?}");
-        assert!(super::is_obeyed(order, rig.monitor.projector()));
+        assert!(crate::control::is_obeyed(order, rig.monitor.projector()));
     }
     let mut told = String::new();
     nonsense.read_to_string(&mut told).unwrap();

@@ -12,6 +12,7 @@ use crate::light::status::StatusLight;
 use crate::order::Order;
 use crate::plan::frame::FramePlan;
 use crate::plan::link_time::LinkTime;
+use crate::telemetry::link_gauges::{Carried, LinkGauges};
 use crate::telemetry::monitor::{ProjectorHealth, RunMonitor};
 use crate::telemetry::projector::ProjectorReport;
 use dpm_device::clock_map::ClockMap;
@@ -136,6 +137,7 @@ impl LinkKeeper {
         if let (Some(reports), Some(status)) = (&mut self.reports, link.status().filter(|_| self.is_timed)) {
             reports.observe(status, &self.time);
         }
+        monitor.link().tell(&self.carried(link));
         monitor.set_projector(if self.allowed {
             health(link, self.standing)
         } else {
@@ -169,17 +171,23 @@ impl LinkKeeper {
 
     /// What the link carried.
     pub(crate) fn report(&self, link: &HostLink, name: &str) -> ProjectorReport {
+        let gauges = LinkGauges::default();
+        gauges.tell(&self.carried(link));
+        gauges.report(name)
+    }
+
+    /// What the link has carried so far.
+    fn carried(&self, link: &HostLink) -> Carried {
         let c = link.counters();
-        ProjectorReport {
-            name: name.to_owned(),
+        Carried {
             sessions: c.sessions,
             rearmed: self.rearmed,
-            sent_mb: c.bytes_sent as f64 / 1e6,
+            bytes_sent: c.bytes_sent,
             planes: [c.planes_raw, c.planes_coded, c.planes_kept],
             not_sent: [c.not_streaming, c.no_credit, c.link_busy, c.link_lost, c.flash_limit, c.light_limit],
             device: self.reports.as_ref().map(StatusLight::counts),
             clock_bound_ns: self.clock_bound_ns,
-            travel_ms: self.reports.as_ref().map(|r| r.travel_ns() as f64 / 1e6),
+            travel_ns: self.reports.as_ref().map(StatusLight::travel_ns),
         }
     }
 

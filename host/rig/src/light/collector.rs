@@ -6,6 +6,7 @@ use crate::frame::job::{Fate, FrameNote};
 use crate::frame::slots::OrderedDark;
 use crate::frame::{FrameTimeline, Stage, STAGES};
 use crate::light::dark_bodies::DarkBodies;
+use crate::light::live_view::bodies_of;
 use crate::light::measures::{histogram, RegistrationMeasures};
 use crate::light::placement::Placement;
 use crate::light::record::FrameRecord;
@@ -14,6 +15,7 @@ use crate::plan::light_centre::light_centre_ns;
 use crate::rig::Rig;
 use crate::telemetry::flight::FlightRecorder;
 use crate::telemetry::interval::Interval;
+use crate::telemetry::live::{LiveBody, LiveFrame};
 use crate::telemetry::monitor::RunMonitor;
 use crate::telemetry::profile::{missed_by_cause, ordered_dark, Profiler};
 use crate::telemetry::report::{Latency, Report, Spread, StageTime};
@@ -44,7 +46,7 @@ pub(crate) struct Inbox {
 
 /// Counts and distributions of a run.
 pub(crate) struct Collector {
-    rig: Arc<Rig>,
+    pub(super) rig: Arc<Rig>,
     /// Light of a frame that the link has not yet reported as sent.
     held: Option<LightNote>,
     registration: RegistrationMeasures,
@@ -97,13 +99,15 @@ pub(crate) struct Collector {
     clock_error: SignedHistogram,
     stages: Vec<Histogram<u64>>,
     passes: Vec<Histogram<u64>>,
-    rays: u64,
-    samples: u64,
+    pub(super) rays: u64,
+    pub(super) samples: u64,
     gpu_ns: u64,
     lit_values: u64,
     clipped_values: u64,
     nan_values: u64,
     invalid_samples: u64,
+    /// The newest finished frame.
+    pub(super) newest_live: (LiveFrame, Vec<LiveBody>),
 }
 
 /// Number of frames in a trace, the last ones of a run: half a minute at 947 fps, about 60 MB. Viewers cannot handle
@@ -122,6 +126,7 @@ impl Collector {
         let profiler =
             Profiler::new(rig.rate(), measured, batch_frames).with_mocks(is_mock_tracker, is_mock_projector);
         let lead_ns = i64::from(rig.config.real_time.stage_costs_us.total()) * 1000;
+        let newest_live = (LiveFrame::default(), bodies_of(&rig));
         let trace_frames = if rig.config.output.trace { MAX_TRACED } else { 0 };
         let registration = RegistrationMeasures::new(rig.clone());
         Self {
@@ -167,6 +172,7 @@ impl Collector {
             clipped_values: 0,
             nan_values: 0,
             invalid_samples: 0,
+            newest_live,
         }
     }
 
@@ -203,6 +209,8 @@ impl Collector {
         if let Some(flights) = self.flights.take() {
             self.flights_told = flights.finish(self.standstills.as_deref());
         }
+        monitor.set_slots(counts.wanted(), counts.missed_total());
+        self.tell_live(monitor, true);
         counts
     }
 
@@ -255,6 +263,9 @@ impl Collector {
         self.record_misses(monitor);
         let slots = self.slots.counts();
         monitor.set_slots(slots.wanted(), slots.missed_total());
+        if monitor.live().wants_snapshot() {
+            self.tell_live(monitor, false);
+        }
         over
     }
 
@@ -319,6 +330,7 @@ impl Collector {
 
     fn finished(&mut self, job: &FrameNote, monitor: &RunMonitor) {
         self.newest = Some(job.plan.id.0 as u32);
+        self.look_at(job, monitor.live());
         if let Some(flights) = &mut self.flights {
             flights.frame(job);
         }

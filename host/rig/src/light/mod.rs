@@ -3,6 +3,7 @@
 
 pub(crate) mod collector;
 mod dark_bodies;
+mod live_view;
 mod measures;
 mod placement;
 mod record;

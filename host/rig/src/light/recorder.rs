@@ -6,12 +6,15 @@
 use crate::frame::job::hash_codes;
 use crate::mock::{EmulatedProjector, MockProjector, Served};
 use crate::pack::prepared::is_whole;
+use crate::telemetry::live::SeenLight;
+use crate::telemetry::monitor::RunMonitor;
 use dpm_common::clock::Stopwatch;
 use dpm_device::light::{LightEvent, LightKind};
 use dpm_device::planes::PlaneSchedule;
 use dpm_device::time::HostTime;
 use dpm_handoff::channel::Sender;
 use std::collections::VecDeque;
+use std::sync::Arc;
 
 /// What the projector did in one slot.
 #[derive(Clone, Copy, Debug)]
@@ -52,6 +55,10 @@ pub(crate) struct LightRecorder {
     frames: VecDeque<LightFrame>,
     /// Hash over all light in order.
     light_hash: u64,
+    /// When the first photon of the frame on the mirrors left.
+    lit_at: HostTime,
+    /// Those who look at the light while the run goes on.
+    observer: Option<Arc<RunMonitor>>,
 }
 
 impl LightRecorder {
@@ -72,7 +79,14 @@ impl LightRecorder {
             marks,
             frames: VecDeque::with_capacity(keep + 1),
             light_hash: 0,
+            lit_at: HostTime(0),
+            observer: None,
         }
+    }
+
+    /// Shows the light to those who ask for it through `monitor`.
+    pub(crate) fn seen_by(self, monitor: &Arc<RunMonitor>) -> Self {
+        Self { observer: Some(monitor.clone()), ..self }
     }
 
     /// Advances the mock to `now`, one slot at a time, and records all light.
@@ -86,6 +100,9 @@ impl LightRecorder {
         let watch = Stopwatch::start();
         mock.advance_to(now);
         self.drain(mock.projector(), watch);
+        if let Some(monitor) = &self.observer {
+            monitor.live().show_light(|light| show(mock.projector(), self.lit_at, light));
+        }
     }
 
     fn drain(&mut self, mock: &mut MockProjector, watch: Stopwatch) {
@@ -100,6 +117,9 @@ impl LightRecorder {
                     }
                     keep(&mut self.frames, self.keep, &event, light);
                 }
+            }
+            if event.kind == LightKind::Lit {
+                self.lit_at = event.first_photon_at;
             }
             let torn = event.kind == LightKind::Lit && self.is_torn(mock, event.frame);
             let note = LightNote { event, hash, torn, wall_ns: watch.elapsed_ns(), unseen: 0 };
@@ -130,6 +150,15 @@ impl LightRecorder {
     pub(crate) fn into_frames(self) -> Vec<LightFrame> {
         self.frames.into()
     }
+}
+
+/// Copies what is on the mirrors now.
+fn show(mock: &MockProjector, lit_at: HostTime, light: &mut SeenLight) {
+    let lit = mock.lit_generation().and(mock.lit_planes());
+    light.frame = lit.and(mock.lit_frame());
+    light.first_photon_at = lit_at;
+    light.planes.clear();
+    light.planes.extend_from_slice(lit.unwrap_or(&[]));
 }
 
 /// Keeps a copy of `light`. When `limit` frames are kept, the oldest frame's memory is reused.

@@ -69,7 +69,7 @@ pub(super) fn run_at_real_pace(
     let standstill =
         StandstillMonitor::start(Arc::new(clock.sleeping()), STANDSTILL_NS, rights.highest_priority()).ok();
     let watch = Stopwatch::start();
-    let mut far = open_far_end(rig, lights_in, options, origin.is_marked(), clock, &rights)?;
+    let mut far = open_far_end(rig, lights_in, options, origin.is_marked(), clock, &rights, monitor)?;
     let (link, time) = bring_up(rig, far.medium.as_mut(), monitor, &mut || {
         clock.wait_until(clock.now().plus_ns(CONNECT_STEP_NS))
     })?;
@@ -178,11 +178,13 @@ fn open_far_end(
     marked: bool,
     clock: MonotonicClock,
     rights: &Arc<Rights>,
+    monitor: &Arc<RunMonitor>,
 ) -> Result<FarEnd, PipelineError> {
     let (config, raster) = (&rig.config, rig.camera.raster);
     let backend = &config.projector.backend;
     if let ProjectorBackend::Mock(mock) = backend {
         let (mock, recorder) = mock_projector(rig, mock, lights, options, marked, clock.now())?;
+        let recorder = recorder.seen_by(monitor);
         let frame_bytes = projector::frame_bytes(raster, rig.schedule.len());
         let (host_end, device_end) = threaded(frame_bytes, CABLE_BUFFERS, policy(rig));
         let rights = rights.clone();

@@ -79,6 +79,7 @@ fn run_from(
     options: RunOptions,
     monitor: &Arc<RunMonitor>,
 ) -> Result<RunOutcome, PipelineError> {
+    monitor.live().set_rig(&rig);
     let ran = match rig.config.real_time.pace {
         // Hashing every frame costs a millisecond at full size, which only virtual pace can afford.
         Pace::Real => run_at_real_pace(&rig, origin, RunOptions { verify: false, ..options }, monitor),

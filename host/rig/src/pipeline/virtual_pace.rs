@@ -83,7 +83,7 @@ pub(super) fn run_at_virtual_pace(
         track_ns: i64::from(rig.config.real_time.stage_costs_us.track) * 1000,
         latest: latest(TrackSnapshot::empty(rig.bodies.len())),
         cable,
-        recorder,
+        recorder: recorder.seen_by(monitor),
         free,
         notes: RefCell::new((0..frames).map(|_| Box::new(FrameNote::new(rig))).collect()),
         under_way: VecDeque::with_capacity(frames),

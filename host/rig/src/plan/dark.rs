@@ -18,7 +18,7 @@ impl DarkCause {
     pub(crate) const ALL: [Self; 3] = [Self::NeverSeen, Self::Silent, Self::BeyondHorizon];
 
     /// The name in reports.
-    pub(crate) const fn name(self) -> &'static str {
+    pub const fn name(self) -> &'static str {
         match self {
             Self::NeverSeen => "never_seen",
             Self::Silent => "silent",
@@ -27,7 +27,7 @@ impl DarkCause {
     }
 
     /// What the operator reads after the name of the body.
-    pub(crate) const fn told(self) -> &'static str {
+    pub const fn told(self) -> &'static str {
         match self {
             Self::NeverSeen => "the tracker has never seen it",
             Self::Silent => "the tracker has not reported it for longer than safety.predict_ms",

@@ -2,11 +2,14 @@
 
 pub(crate) mod flight;
 mod flight_page;
+pub mod histogram_steps;
 pub mod interval;
+pub(crate) mod link_gauges;
+pub mod live;
 pub mod monitor;
 mod ordered;
 pub mod profile;
-pub(crate) mod projector;
+pub mod projector;
 pub mod report;
 mod report_table;
 pub mod signed;

@@ -1,7 +1,10 @@
 //! Counters that a running pipeline maintains and an observing thread reads, and in the other direction the
 //! operator's requests: a stop, and orders for the projector.
 
+use super::link_gauges::LinkGauges;
+use super::live::Live;
 use super::ordered::DarkLog;
+use super::projector::ProjectorReport;
 use crate::interlock::Interlock;
 use crate::order::Order;
 use dpm_common::stopping;
@@ -74,6 +77,19 @@ impl ProjectorHealth {
 }
 
 impl ProjectorHealth {
+    /// One state for every word that [`ProjectorHealth::word`] says.
+    pub const WORDS: [Self; 9] = [
+        Self::Connecting,
+        Self::Up,
+        Self::Lost,
+        Self::Faulted(0),
+        Self::Black,
+        Self::Frozen,
+        Self::Stopped,
+        Self::InterlockOpen,
+        Self::Resting(LimitReached::Mean),
+    ];
+
     /// The state as one word of at most ten letters. It is in capitals if the picture does not move although frames
     /// are made.
     pub const fn word(self) -> &'static str {
@@ -148,6 +164,10 @@ pub struct RunMonitor {
     /// The collector's messages for the operator. Neither the threads of the frame path nor those that make orders
     /// take this lock.
     notes: Lock<Notes>,
+    /// What the link carries: written by its thread.
+    link: LinkGauges,
+    /// What observers see of the run.
+    live: Live,
 }
 
 #[derive(Debug, Default)]
@@ -301,6 +321,21 @@ impl RunMonitor {
         self.gave_up.get().map(String::as_str)
     }
 
+    /// What the link carries: written by its thread.
+    pub(crate) fn link(&self) -> &LinkGauges {
+        &self.link
+    }
+
+    /// What the link has carried so far, and what the projector has counted.
+    pub fn carried(&self) -> ProjectorReport {
+        self.link.report(self.live.rig().map_or("", |rig| rig.config.projector.backend.word()))
+    }
+
+    /// What observers see of the run while it goes on.
+    pub fn live(&self) -> &Live {
+        &self.live
+    }
+
     /// Counts a planned frame.
     pub fn count_planned(&self) {
         self.frames_planned.fetch_add(1, Ordering::Relaxed);
@@ -312,7 +347,7 @@ impl RunMonitor {
     }
 
     /// Sends the operator a message. Not for the frame path: it takes a lock.
-    pub(crate) fn note(&self, text: String) {
+    pub fn note(&self, text: String) {
         let mut notes = self.notes.lock().unwrap_or_else(PoisonError::into_inner);
         if notes.waiting.len() < NOTES {
             notes.waiting.push_back(text);
@@ -466,6 +501,7 @@ mod tests {
             assert_eq!(monitor.projector(), health);
         }
         assert!(all.iter().all(|h| h.word().len() <= 10));
+        assert!(all.iter().all(|h| H::WORDS.iter().filter(|w| w.word() == h.word()).count() == 1));
         assert!(H::Faulted(faults::LAMP).to_string().contains("lamp"));
     }
 }

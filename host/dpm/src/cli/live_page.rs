@@ -1,0 +1,53 @@
+//! Opens the live page of a run, and tells the operator where it is.
+
+use super::tell::Teller;
+use dpm_page::token::Token;
+use dpm_page::{Page, Settings};
+use dpm_rig::config::RigConfig;
+use dpm_rig::control::orders::Orders;
+use dpm_rig::standing::state_folder;
+use dpm_rig::telemetry::monitor::RunMonitor;
+use std::io::IsTerminal;
+use std::path::PathBuf;
+use std::sync::Arc;
+
+/// Opens the page if the rig wants one. Without it the run goes on.
+pub(super) fn open(
+    rig: &RigConfig,
+    monitor: &Arc<RunMonitor>,
+    orders: &Arc<Orders>,
+    teller: &Teller,
+) -> Option<Page> {
+    let address = rig.page.address()?;
+    let token = token();
+    let settings = Settings {
+        address,
+        hosts: rig.page.hosts.clone(),
+        token: token.as_ref().ok().map(|(token, _)| token.clone()),
+    };
+    let page = match Page::serve(settings, monitor.clone(), orders.clone(), teller.kept()) {
+        Ok(page) => page,
+        Err(e) => {
+            teller.note(&format!("no page: {e}"));
+            return None;
+        }
+    };
+    let link = format!("http://{}/", page.address());
+    match token {
+        // A log is read by more people than a terminal.
+        Ok((token, _)) if std::io::stderr().is_terminal() => {
+            teller.whisper(&format!("page: {link}#token={}", token.as_str()));
+        }
+        Ok((_, path)) => {
+            teller.note(&format!("page: {link}; orders need the token in {}", path.display()));
+        }
+        Err(why) => teller.note(&format!("page: {link}, without orders: {why}")),
+    }
+    Some(page)
+}
+
+/// The token that is kept in the state folder, and its file; or why there is none.
+fn token() -> Result<(Token, PathBuf), String> {
+    let folder = state_folder().ok_or("there is no state folder; name one by DPM_STATE_DIR")?;
+    Token::kept_in(&folder).map_err(|e| e.to_string())
+}

@@ -1,0 +1,154 @@
+//! The live page in a real browser: it shows the rig, its buttons and keys act on the mock's light, and it comes back
+//! when the rig does.
+//!
+//! Without a Chromium this is ignored, and says so. `./x test` installs one.
+
+mod browser;
+mod cli_common;
+
+use browser::{installed, Browser, PATIENCE};
+use cli_common::{own_folder, start_with};
+use std::net::TcpListener;
+use std::path::{Path, PathBuf};
+use std::time::{Duration, Instant};
+
+const NAME: &str = "the_page_shows_the_rig_obeys_its_operator_and_comes_back";
+
+fn main() {
+    // The lines of the standard harness, which `./x test` counts.
+    let wanted =
+        std::env::args().skip(1).filter(|a| !a.starts_with('-')).all(|filter| NAME.contains(&filter));
+    if std::env::args().any(|a| a == "--list") {
+        println!("{NAME}: test");
+        return;
+    }
+    let program = installed();
+    let (ran, ignored) = match (&program, wanted) {
+        (Some(program), true) => {
+            the_page_shows_the_rig_obeys_its_operator_and_comes_back(program);
+            println!("test {NAME} ... ok");
+            (1, 0)
+        }
+        (None, true) => {
+            println!("test {NAME} ... ignored, no Chromium is installed (Debian: apt-get install chromium)");
+            (0, 1)
+        }
+        (_, false) => (0, 0),
+    };
+    println!("\ntest result: ok. {ran} passed; 0 failed; {ignored} ignored; 0 measured; 0 filtered out");
+}
+
+/// A rig on software Vulkan, with its page at `address`.
+fn rig(address: &str) -> cli_common::Running {
+    let page = format!("--page={address}");
+    let args = ["demo", "--raster", "160x120", "--pace", "real", "--set", "run.frames=0", "--set"];
+    start_with(&[args.as_slice(), &["output.images=false", &page]].concat(), &[])
+}
+
+/// The mean brightness of the picture of the light, 0 to 255, as the browser draws it.
+const BRIGHTNESS: &str = "(async () => {
+    const image = document.getElementById('light');
+    if (image.hidden || !image.src) return -1;
+    await image.decode();
+    const canvas = document.createElement('canvas');
+    [canvas.width, canvas.height] = [image.naturalWidth, image.naturalHeight];
+    const context = canvas.getContext('2d');
+    context.drawImage(image, 0, 0);
+    const all = context.getImageData(0, 0, canvas.width, canvas.height).data;
+    let sum = 0;
+    for (let k = 0; k < all.length; k += 4) sum += all[k] + all[k + 1] + all[k + 2];
+    return sum / (all.length / 4 * 3);
+})()";
+
+fn wait_for_light(browser: &mut Browser, what: &str, is: impl Fn(f64) -> bool) {
+    let begin = Instant::now();
+    loop {
+        let mean = browser.value(BRIGHTNESS).as_f64().unwrap();
+        if is(mean) {
+            return;
+        }
+        assert!(begin.elapsed() < PATIENCE, "no {what}: the light is {mean}");
+        std::thread::sleep(Duration::from_millis(100));
+    }
+}
+
+/// What must hold of the page at any size.
+fn check_layout(browser: &mut Browser, width: u32) {
+    let wide = browser.value("document.documentElement.scrollWidth").as_f64().unwrap();
+    assert!(wide <= f64::from(width), "{wide} of {width}: something sticks out sideways");
+    for id in ["black", "freeze", "safe", "arm"] {
+        let r = browser.value(&format!("document.getElementById('{id}').getBoundingClientRect().toJSON()"));
+        let of = |key: &str| r[key].as_f64().unwrap();
+        assert!(of("height") >= 44.0 && of("width") >= 44.0, "{id} is too small for a finger: {r}");
+        assert!(of("left") >= 0.0 && of("right") <= f64::from(width), "{id}: {r}");
+    }
+    let state = browser.value("parseFloat(getComputedStyle(document.getElementById('state')).fontSize)");
+    assert!(state.as_f64().unwrap() >= 32.0, "the state cannot be read from two metres: {state}");
+}
+
+fn the_page_shows_the_rig_obeys_its_operator_and_comes_back(program: &Path) {
+    // A free port that stays the same over the restart.
+    let address = TcpListener::bind("127.0.0.1:0").unwrap().local_addr().unwrap().to_string();
+    let pictures = PathBuf::from(env!("CARGO_TARGET_TMPDIR")).join("page");
+    std::fs::create_dir_all(&pictures).unwrap();
+    let mut first = rig(&address);
+    first.wait_for_line(PATIENCE, |line| {
+        assert!(!line.contains("token="), "a log is no place for the token: {line}");
+        line.contains("page: http")
+    });
+    let token = std::fs::read_to_string(own_folder("state").join("page.token")).unwrap();
+    let link = format!("http://{address}/#token={}", token.trim());
+    let mut browser = Browser::open(program, &own_folder("browser"), &link);
+    browser.screen(1280, 900, false);
+    browser.wait("state", "document.getElementById('state').textContent === 'UP'");
+    assert_eq!(browser.value("location.hash"), "", "the token stays in the address");
+    browser.wait("buttons", "!document.getElementById('black').disabled");
+    wait_for_light(&mut browser, "light", |mean| mean > 1.0);
+    browser.wait("bodies", "document.querySelectorAll('#bodies tr').length === 2");
+    browser.wait("latency", "parseFloat(document.getElementById('p50').textContent) > 0");
+    browser.wait("picture of the observer", "!document.getElementById('viewer').hidden");
+    check_layout(&mut browser, 1280);
+    browser.picture(&pictures.join("desktop.png"), false);
+
+    // A click and a key, each answered after the light had obeyed.
+    browser.click("black");
+    browser.wait(
+        "answer",
+        "document.getElementById('answer').textContent.startsWith('BLACK: ok: projector black')",
+    );
+    browser.wait("state", "document.getElementById('state').textContent === 'BLACK'");
+    wait_for_light(&mut browser, "dark", |mean| mean == 0.0);
+    browser.picture(&pictures.join("desktop-black.png"), false);
+    browser.press("a");
+    browser
+        .wait("answer", "document.getElementById('answer').textContent.startsWith('ARM: ok: projector up')");
+    wait_for_light(&mut browser, "light again", |mean| mean > 1.0);
+
+    // A phone.
+    browser.screen(390, 844, true);
+    browser.wait("narrow page", "innerWidth === 390");
+    check_layout(&mut browser, 390);
+    browser.picture(&pictures.join("phone.png"), false);
+    browser.picture(&pictures.join("phone-whole.png"), true);
+    browser.click("safe");
+    browser.wait("answer", "document.getElementById('answer').textContent.startsWith('SAFE: ok: ')");
+    browser.wait("state", "document.getElementById('state').textContent === 'SAFE'");
+    wait_for_light(&mut browser, "dark", |mean| mean == 0.0);
+    assert_eq!(browser.complaints, Vec::<String>::new());
+
+    // The rig dies and comes back. SAFE stands, and the same page arms it.
+    drop(first);
+    browser.wait("word that the rig is gone", "document.body.classList.contains('stale')");
+    assert_eq!(browser.value("document.getElementById('state').textContent"), "NO CONTACT");
+    browser.picture(&pictures.join("phone-gone.png"), false);
+    let mut second = rig(&address);
+    second.wait_for_line(PATIENCE, |line| line.contains("page: http"));
+    browser.wait("return", "!document.body.classList.contains('stale')");
+    browser.wait("state", "document.getElementById('state').textContent === 'SAFE'");
+    browser.wait("buttons", "!document.getElementById('arm').disabled");
+    browser.click("arm");
+    browser
+        .wait("answer", "document.getElementById('answer').textContent.startsWith('ARM: ok: projector up')");
+    wait_for_light(&mut browser, "light of the second run", |mean| mean > 1.0);
+    drop(second);
+}

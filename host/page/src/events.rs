@@ -1,0 +1,104 @@
+//! The rig's events for one viewer, as server-sent events: the state four times a second, figures when there are new
+//! ones, notes, and pictures. What a slow viewer has no room for is never made.
+
+use crate::shared::Viewer;
+use crate::state::State;
+use base64::prelude::{Engine, BASE64_STANDARD};
+use dpm_rig::telemetry::live::LiveSnapshot;
+use hyper::body::Bytes;
+use std::future::Future;
+use std::pin::Pin;
+use std::sync::Arc;
+use std::task::{Context, Poll};
+use std::time::Duration;
+use tokio::time::{sleep, Instant, Sleep};
+
+/// The shortest time between two events: ten pictures a second.
+const TICK: Duration = Duration::from_millis(100);
+/// The state is sent with every so many ticks.
+const STATE_EVERY: u32 = 2;
+
+/// What one viewer still has to be told.
+pub(crate) struct Events {
+    viewer: Viewer,
+    next: Pin<Box<Sleep>>,
+    ticks: u32,
+    notes_from: u64,
+    figures: Option<Arc<LiveSnapshot>>,
+    pictures: u64,
+}
+
+impl Events {
+    pub(crate) fn new(viewer: Viewer) -> Self {
+        Self {
+            viewer,
+            next: Box::pin(sleep(Duration::ZERO)),
+            ticks: 0,
+            notes_from: 0,
+            figures: None,
+            pictures: 0,
+        }
+    }
+
+    /// The next events; pending until there are any.
+    pub(crate) fn poll_next(&mut self, cx: &mut Context<'_>) -> Poll<Bytes> {
+        loop {
+            if self.next.as_mut().poll(cx).is_pending() {
+                return Poll::Pending;
+            }
+            self.next.as_mut().reset(Instant::now() + TICK);
+            let text = self.due();
+            if !text.is_empty() {
+                return Poll::Ready(text.into());
+            }
+        }
+    }
+
+    fn due(&mut self) -> String {
+        let shared = self.viewer.0.clone();
+        shared.monitor.live().look();
+        let mut text = String::new();
+        if self.ticks == 0 {
+            // A browser that lost the rig asks again every half second.
+            text += "retry: 500\n\n";
+        }
+        if self.ticks.is_multiple_of(STATE_EVERY) {
+            let state = State::of(&shared);
+            event(&mut text, "state", &state.now);
+            let is_new = state.figures.as_ref().map(Arc::as_ptr) != self.figures.as_ref().map(Arc::as_ptr);
+            if is_new || self.ticks == 0 {
+                event(&mut text, "figures", &state.to_json().figures);
+                self.figures = state.figures;
+            }
+            let notes = shared.notes.since(self.notes_from);
+            if let Some(last) = notes.last() {
+                self.notes_from = last.number + 1;
+                event(&mut text, "notes", &notes);
+            }
+        }
+        self.ticks = self.ticks.wrapping_add(1).max(1);
+        shared.pictures.look();
+        let pictures = shared.pictures.newest();
+        if pictures.number != self.pictures {
+            self.pictures = pictures.number;
+            let of = |png: &Option<Vec<u8>>| png.as_ref().map(|bytes| BASE64_STANDARD.encode(bytes));
+            let told = serde_json::json!({
+                "light": of(&pictures.light),
+                "viewer": of(&pictures.viewer),
+                "told": pictures.told,
+                "per_s": pictures.per_s,
+            });
+            event(&mut text, "pictures", &told);
+        }
+        text
+    }
+}
+
+fn event(text: &mut String, name: &str, data: &impl serde::Serialize) {
+    // JSON on one line has no line feed inside.
+    if let Ok(data) = serde_json::to_string(data) {
+        for part in ["event: ", name, "\ndata: ", &data, "\n\n"] {
+            *text += part;
+        }
+    }
+}

@@ -1,0 +1,176 @@
+//! Who may ask: the checks of a request before anything is done for it.
+//!
+//! A browser runs scripts of other sites on this machine. The header `Host` tells a page that was reached under a
+//! foreign name (DNS rebinding), `Origin` and `Sec-Fetch-Site` tell a request that another site caused.
+
+use crate::token::Token;
+use hyper::header::{HeaderMap, HeaderName, HeaderValue, HOST, ORIGIN};
+use std::net::SocketAddr;
+
+/// The header that carries the token of an order.
+pub const TOKEN: HeaderName = HeaderName::from_static("x-dpm-token");
+const FETCH_SITE: HeaderName = HeaderName::from_static("sec-fetch-site");
+
+/// What a request is refused for.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub(crate) struct Refused {
+    /// The HTTP status.
+    pub status: u16,
+    /// What to tell.
+    pub told: String,
+}
+
+fn refused(status: u16, told: impl Into<String>) -> Refused {
+    Refused { status, told: told.into() }
+}
+
+/// The names under which the page may be asked for.
+#[derive(Clone, Debug)]
+pub(crate) struct Guard {
+    hosts: Vec<String>,
+    origins: Vec<String>,
+    token: Option<Token>,
+}
+
+impl Guard {
+    /// For a page at `address` that a proxy serves as `names`. Without a token there are no orders.
+    pub(crate) fn new(address: SocketAddr, names: &[String], token: Option<Token>) -> Self {
+        let port = address.port();
+        let mut hosts = vec![address.to_string(), format!("localhost:{port}")];
+        if port == 80 {
+            hosts.extend([address.ip().to_string(), "localhost".into()]);
+        }
+        let mut origins: Vec<String> = hosts.iter().map(|host| format!("http://{host}")).collect();
+        // Beyond this machine there is TLS only.
+        origins.extend(names.iter().map(|name| format!("https://{}", name.to_ascii_lowercase())));
+        hosts.extend(names.iter().map(|name| name.to_ascii_lowercase()));
+        Self { hosts, origins, token }
+    }
+
+    /// Any request: it was sent to this page by name, and not by another site.
+    pub(crate) fn check(&self, headers: &HeaderMap) -> Result<(), Refused> {
+        match single(headers, &HOST) {
+            Some(host) if self.hosts.iter().any(|h| h.eq_ignore_ascii_case(host)) => {}
+            _ => {
+                return Err(refused(
+                    421,
+                    format!(
+                        "this page answers to {} only; add a proxy's name to page.hosts",
+                        self.hosts.join(", ")
+                    ),
+                ))
+            }
+        }
+        if headers.contains_key(FETCH_SITE)
+            && !single(headers, &FETCH_SITE).is_some_and(|site| ["same-origin", "none"].contains(&site))
+        {
+            return Err(refused(403, "refused: another site asks"));
+        }
+        if headers.contains_key(ORIGIN)
+            && !single(headers, &ORIGIN)
+                .is_some_and(|origin| self.origins.iter().any(|o| o.eq_ignore_ascii_case(origin)))
+        {
+            return Err(refused(403, "refused: another site asks"));
+        }
+        Ok(())
+    }
+
+    /// An order: it knows the token.
+    pub(crate) fn check_token(&self, headers: &HeaderMap) -> Result<(), Refused> {
+        let Some(token) = &self.token else {
+            return Err(refused(503, "this page gives no orders, because it has no token; use `dpm black`"));
+        };
+        let told = headers.get_all(TOKEN).iter().collect::<Vec<&HeaderValue>>();
+        match told.as_slice() {
+            [told] if token.is(told.as_bytes()) => Ok(()),
+            [] => Err(refused(401, "no token: open the page by the link that the rig has printed")),
+            _ => Err(refused(403, "wrong token: open the page by the link that the rig has printed")),
+        }
+    }
+}
+
+/// The value of a header that occurs exactly once.
+fn single<'a>(headers: &'a HeaderMap, name: &HeaderName) -> Option<&'a str> {
+    let mut all = headers.get_all(name).iter();
+    let first = all.next()?;
+    if all.next().is_some() {
+        return None;
+    }
+    first.to_str().ok()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn headers(all: &[(&str, &str)]) -> HeaderMap {
+        let mut map = HeaderMap::new();
+        for (name, value) in all {
+            let name: HeaderName = name.parse().unwrap();
+            map.append(name, value.parse().unwrap());
+        }
+        map
+    }
+
+    fn guard() -> Guard {
+        Guard::new("127.0.0.1:8947".parse().unwrap(), &["Rig.example.org".into()], Some(token()))
+    }
+
+    fn token() -> Token {
+        static TOKEN: std::sync::OnceLock<Token> = std::sync::OnceLock::new();
+        TOKEN.get_or_init(|| Token::random().unwrap()).clone()
+    }
+
+    #[test]
+    fn only_the_pages_own_names_are_answered() {
+        for good in ["127.0.0.1:8947", "localhost:8947", "LOCALHOST:8947", "rig.example.org"] {
+            assert_eq!(guard().check(&headers(&[("host", good)])), Ok(()), "{good}");
+        }
+        for bad in ["evil.example:8947", "127.0.0.1", "localhost", "127.0.0.1:80", "", "rig.example.org:443"]
+        {
+            let told = guard().check(&headers(&[("host", bad)])).unwrap_err();
+            assert_eq!(told.status, 421, "{bad}");
+        }
+        assert!(guard().check(&headers(&[])).is_err());
+        let two = [("host", "127.0.0.1:8947"), ("host", "127.0.0.1:8947")];
+        assert!(guard().check(&headers(&two)).is_err());
+    }
+
+    #[test]
+    fn another_site_is_refused_whatever_it_says() {
+        let host = ("host", "127.0.0.1:8947");
+        for good in ["http://127.0.0.1:8947", "http://localhost:8947", "https://rig.example.org"] {
+            assert_eq!(guard().check(&headers(&[host, ("origin", good)])), Ok(()), "{good}");
+        }
+        for bad in [
+            "null",
+            "",
+            "https://evil.example",
+            "http://127.0.0.1:80",
+            "https://127.0.0.1:8947",
+            "http://rig.example.org",
+            "http://localhost:8947.evil.example",
+        ] {
+            assert!(guard().check(&headers(&[host, ("origin", bad)])).is_err(), "{bad}");
+        }
+        for (site, may) in
+            [("same-origin", true), ("none", true), ("cross-site", false), ("same-site", false)]
+        {
+            assert_eq!(guard().check(&headers(&[host, ("sec-fetch-site", site)])).is_ok(), may, "{site}");
+        }
+    }
+
+    #[test]
+    fn an_order_needs_exactly_one_right_token() {
+        let token = token();
+        let told = |all: &[(&str, &str)]| guard().check_token(&headers(all)).map_err(|r| r.status);
+        assert_eq!(told(&[("x-dpm-token", token.as_str())]), Ok(()));
+        assert_eq!(told(&[]), Err(401));
+        assert_eq!(told(&[("x-dpm-token", "")]), Err(403));
+        assert_eq!(told(&[("x-dpm-token", &token.as_str()[1..])]), Err(403));
+        assert_eq!(told(&[("x-dpm-token", token.as_str()), ("x-dpm-token", token.as_str())]), Err(403));
+        let none = Guard::new("127.0.0.1:1".parse().unwrap(), &[], None);
+        let right = headers(&[("x-dpm-token", token.as_str())]);
+        assert_eq!(none.check_token(&right).unwrap_err().status, 503);
+    }
+}

@@ -1,0 +1,23 @@
+//! The live page of a running rig.
+//!
+//! A small HTTP server on an address of this machine shows what the rig does, takes the orders BLACK, FREEZE, SAFE and
+//! ARM from whoever knows a token, and tells its figures to Prometheus. `docs/PAGE.md` describes it for operators.
+//!
+//! It runs on threads of its own. From the run it takes what [`dpm_rig::telemetry::monitor::RunMonitor`] shows to
+//! every observer, and it gives orders as the control socket does, through [`dpm_rig::control::orders::Orders`].
+
+mod connections;
+mod events;
+mod guard;
+pub mod metrics;
+pub mod notes;
+mod orders;
+mod pictures;
+mod routes;
+mod server;
+mod shared;
+mod state;
+pub mod token;
+
+pub use guard::TOKEN;
+pub use server::{Page, PageError, Settings};

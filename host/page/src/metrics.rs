@@ -1,0 +1,244 @@
+//! The rig's figures in the text format of Prometheus, version 0.0.4.
+//!
+//! Counters are those of the report of a run, and are taken from one snapshot, so they agree with each other.
+
+use crate::state::State;
+use dpm_rig::control::rig_name;
+use dpm_rig::order::Order;
+use dpm_rig::telemetry::histogram_steps::UPPER_NS;
+use dpm_rig::telemetry::live::LiveSnapshot;
+use dpm_rig::telemetry::monitor::ProjectorHealth;
+use dpm_rig::telemetry::projector::{DeviceCounts, ProjectorReport};
+use std::fmt::Write;
+
+/// A metric: its name, its type, and what it is.
+pub type Family = (&'static str, &'static str, &'static str);
+
+macro_rules! families {
+    ($($constant:ident = $name:literal, $kind:literal, $help:literal;)*) => {
+        $(const $constant: Family = ($name, $kind, $help);)*
+        /// Every metric, in the order in which they are told.
+        pub const FAMILIES: &[Family] = &[$($constant),*];
+    };
+}
+
+families! {
+    INFO = "dpm_info", "gauge", "1; the labels name the program, the rig and its parts";
+    UP_SECONDS = "dpm_up_seconds", "gauge", "Seconds since the page began";
+    PROJECTOR_STATE = "dpm_projector_state", "gauge", "1 for the state that the projector is in, 0 for the others";
+    STANDING = "dpm_order_standing", "gauge", "1 for the order that stands and is kept over restarts, 0 for the others";
+    INTERLOCK = "dpm_interlock_closed", "gauge", "1 while the interlock permits light; absent without an interlock";
+    PLANNED = "dpm_frames_planned_total", "counter", "Frames planned";
+    FRAMES = "dpm_frames_total", "counter", "Frames whose fate is known: lit, dark on every body, dropped, or not wanted";
+    LATE = "dpm_frames_late_total", "counter", "Frames lit after the slot that they were planned for";
+    REPEATED = "dpm_frames_repeated_total", "counter", "Slots in which the previous frame was shown again";
+    TOO_OLD = "dpm_frames_too_old_total", "counter", "Frames not sent because their poses would have been too old";
+    SLOTS = "dpm_slots_total", "counter", "Slots in which a frame of their own was wanted";
+    MISSED = "dpm_slots_missed_total", "counter", "Of these, slots without one, by cause";
+    ORDERED = "dpm_slots_ordered_dark_total", "counter", "Slots in which no new picture was wanted, by reason";
+    BODY_LIT = "dpm_body_lit", "gauge", "1 while light falls on the body";
+    BODY_DARK = "dpm_body_dark_frames_total", "counter", "Lit frames in which the body was dark, by cause";
+    INTERVAL = "dpm_interval_seconds", "histogram", "Time between two stamps of a frame (docs/LATENCY.md); negative times count in the lowest bucket";
+    SAMPLE_AGE = "dpm_sample_age_seconds", "gauge", "Age of the oldest sample among the lit bodies when the newest frame was due";
+    PREDICT = "dpm_prediction_seconds", "gauge", "The longest time for which prediction may extend a track";
+    BUDGET = "dpm_samples_per_pixel", "gauge", "Average samples per pixel that the newest frame was given";
+    SAMPLES = "dpm_samples_total", "counter", "Samples taken";
+    RAYS = "dpm_rays_total", "counter", "Rays traced";
+    REGISTRATION = "dpm_registration_error_pixels", "gauge", "Distance of light from its place in projector pixels; only with a mock tracker";
+    SESSIONS = "dpm_link_sessions_total", "counter", "Sessions opened with the projector";
+    REARMED = "dpm_link_rearmed_total", "counter", "Times that light came back after the watchdog or damaged packets";
+    SENT = "dpm_link_sent_bytes_total", "counter", "Bytes handed to the medium";
+    PLANES = "dpm_link_planes_total", "counter", "Planes by how they were sent: raw, coded, or not because nothing had changed";
+    NOT_SENT = "dpm_link_not_sent_total", "counter", "Frames not sent, by reason";
+    DEVICE = "dpm_device_total", "counter", "What a projector outside this process has counted: frames, slots and packets";
+    VIEWERS = "dpm_page_viewers", "gauge", "Viewers of the live page";
+}
+
+/// The text: every metric with its help and type.
+pub(crate) fn text(state: &State) -> String {
+    let mut out = Out { text: String::with_capacity(16 << 10), family: "" };
+    rig(&mut out, state);
+    match &state.figures {
+        Some(figures) => run(&mut out, figures),
+        None => counted(&mut out, state),
+    }
+    link(&mut out, &state.carried);
+    out.family(VIEWERS).value(&[], state.now.viewers as f64);
+    out.text
+}
+
+fn rig(out: &mut Out, state: &State) {
+    let now = &state.now;
+    let report = state.figures.as_ref().map(|f| &f.report);
+    let labels = [
+        ("version", env!("CARGO_PKG_VERSION")),
+        ("commit", dpm_common::commit::get()),
+        ("rig", rig_name()),
+        ("method", report.map_or("", |r| r.method)),
+        ("pace", report.map_or("", |r| r.pace)),
+        ("medium", &state.carried.name),
+    ];
+    out.family(INFO).value(&labels, 1.0);
+    out.family(UP_SECONDS).value(&[], now.up_s);
+    out.family(PROJECTOR_STATE);
+    for health in ProjectorHealth::WORDS {
+        let word = health.word().to_ascii_lowercase();
+        out.value(&[("state", &word)], f64::from(health.word() == state.health.word()));
+    }
+    out.family(STANDING);
+    for (order, word) in Order::ALL.iter().filter(|(order, _)| *order != Order::Arm) {
+        out.value(&[("order", word)], f64::from(now.standing == Some(order.word())));
+    }
+    out.family(INTERLOCK);
+    if let Some((_, is_closed)) = &now.interlock {
+        out.value(&[], f64::from(*is_closed));
+    }
+}
+
+/// What is known of a run without a collector, or before its first figures.
+fn counted(out: &mut Out, state: &State) {
+    let c = &state.now.counts;
+    out.family(PLANNED).value(&[], c.frames_planned as f64);
+    frames(out, [c.frames_lit, c.frames_dark, c.frames_dropped, c.frames_withheld]);
+    out.family(LATE).value(&[], c.frames_late as f64);
+    out.family(SLOTS).value(&[], c.slots as f64);
+}
+
+fn frames(out: &mut Out, counts: [u64; 4]) {
+    out.family(FRAMES);
+    for (fate, n) in ["lit", "dark", "dropped", "withheld"].into_iter().zip(counts) {
+        out.value(&[("fate", fate)], n as f64);
+    }
+}
+
+fn run(out: &mut Out, figures: &LiveSnapshot) {
+    let r = &figures.report;
+    out.family(PLANNED).value(&[], figures.planned as f64);
+    frames(out, [r.frames_lit, r.frames_dark, r.frames_dropped, r.frames_withheld]);
+    out.family(LATE).value(&[], r.frames_late as f64);
+    out.family(REPEATED).value(&[], r.frames_repeated as f64);
+    out.family(TOO_OLD).value(&[], r.frames_too_old as f64);
+    out.family(SLOTS).value(&[], r.slots as f64);
+    for (family, label, counts) in
+        [(MISSED, "cause", &r.missed_by_cause), (ORDERED, "reason", &r.ordered_dark)]
+    {
+        out.family(family);
+        for (name, n) in counts {
+            out.value(&[(label, name)], *n as f64);
+        }
+    }
+    out.family(BODY_LIT);
+    for body in &figures.bodies {
+        out.value(&[("body", &body.name)], f64::from(body.dark.is_none()));
+    }
+    out.family(BODY_DARK);
+    for d in &r.dark_by_body {
+        for (cause, n) in
+            [("never_seen", d.never_seen), ("silent", d.silent), ("beyond_horizon", d.beyond_horizon)]
+        {
+            out.value(&[("body", &d.body), ("cause", cause)], n as f64);
+        }
+    }
+    intervals(out, figures);
+    let seconds = |ns: i64| ns as f64 * 1e-9;
+    out.family(SAMPLE_AGE);
+    if let Some(age_ns) = figures.frame.sample_age_ns {
+        out.value(&[], seconds(age_ns));
+    }
+    out.family(PREDICT).value(&[], seconds(figures.frame.predict_ns));
+    out.family(BUDGET).value(&[], figures.frame.budget_spp);
+    out.family(SAMPLES).value(&[], figures.samples as f64);
+    out.family(RAYS).value(&[], figures.rays as f64);
+    out.family(REGISTRATION);
+    if let Some(spread) = r.registration_error_px {
+        for (quantile, px) in
+            [("0.5", spread.p50), ("0.99", spread.p99), ("0.999", spread.p999), ("1", spread.max)]
+        {
+            out.value(&[("quantile", quantile)], px);
+        }
+    }
+}
+
+fn intervals(out: &mut Out, figures: &LiveSnapshot) {
+    out.family(INTERVAL);
+    for interval in &figures.intervals {
+        let label = ("interval", interval.name);
+        for (upper, up_to) in UPPER_NS.iter().zip(interval.steps.up_to) {
+            let le = (*upper as f64 / 1e9).to_string();
+            out.line("_bucket", &[label, ("le", &le)], up_to as f64);
+        }
+        let count = interval.steps.count as f64;
+        out.line("_bucket", &[label, ("le", "+Inf")], count);
+        out.line("_sum", &[label], interval.steps.sum_ns * 1e-9);
+        out.line("_count", &[label], count);
+    }
+}
+
+fn link(out: &mut Out, c: &ProjectorReport) {
+    out.family(SESSIONS).value(&[], c.sessions as f64);
+    out.family(REARMED).value(&[], c.rearmed as f64);
+    out.family(SENT).value(&[], (c.sent_mb * 1e6).round());
+    out.family(PLANES);
+    for (form, n) in ["raw", "coded", "kept"].into_iter().zip(c.planes) {
+        out.value(&[("form", form)], n as f64);
+    }
+    out.family(NOT_SENT);
+    let reasons =
+        ["link_not_up", "no_buffer", "medium_busy", "medium_lost", "limit_on_flashes", "limits_on_light"];
+    for (reason, n) in reasons.into_iter().zip(c.not_sent) {
+        out.value(&[("reason", reason)], n as f64);
+    }
+    out.family(DEVICE);
+    let Some(d) = c.device else { return };
+    let DeviceCounts { lit, lit_unseen, repeated, blank, incomplete, .. } = d;
+    let DeviceCounts { too_late, superseded, refused, damaged_packets, .. } = d;
+    for (what, n) in [
+        ("lit", lit),
+        ("lit_unseen", lit_unseen),
+        ("repeated", repeated),
+        ("blank", blank),
+        ("incomplete", incomplete),
+        ("too_late", too_late),
+        ("superseded", superseded),
+        ("refused", refused),
+        ("damaged_packets", damaged_packets),
+    ] {
+        out.value(&[("what", what)], n as f64);
+    }
+}
+
+/// Text in the making. Values belong to the family that was begun last.
+struct Out {
+    text: String,
+    family: &'static str,
+}
+
+impl Out {
+    fn family(&mut self, (name, kind, help): Family) -> &mut Self {
+        let _ = writeln!(self.text, "# HELP {name} {help}\n# TYPE {name} {kind}");
+        self.family = name;
+        self
+    }
+
+    fn value(&mut self, labels: &[(&str, &str)], value: f64) {
+        self.line("", labels, value);
+    }
+
+    /// A value of the family's part `suffix`.
+    fn line(&mut self, suffix: &str, labels: &[(&str, &str)], value: f64) {
+        self.text += self.family;
+        self.text += suffix;
+        for (k, (label, text)) in labels.iter().enumerate() {
+            let _ = write!(self.text, "{}{label}=\"{}\"", if k == 0 { "{" } else { "," }, escaped(text));
+        }
+        if !labels.is_empty() {
+            self.text.push('}');
+        }
+        let _ = writeln!(self.text, " {value}");
+    }
+}
+
+/// A label's value as the format wants it.
+fn escaped(text: &str) -> String {
+    text.replace('\\', "\\\\").replace('"', "\\\"").replace('\n', "\\n")
+}

@@ -1,0 +1,135 @@
+//! A body's mesh with few triangles, for small pictures.
+
+use dpm_scene::TriangleMesh;
+use glam::{DVec3, Vec3};
+use std::collections::HashMap;
+
+/// Cells along the longest side of a mesh: about half a pixel of the picture where the body fills it.
+const CELLS: f32 = 96.0;
+
+/// Positions and normals in the body's space, metres, and triangles.
+#[derive(Clone, Debug, Default)]
+pub(super) struct CoarseMesh {
+    pub positions: Vec<Vec3>,
+    pub normals: Vec<Vec3>,
+    pub triangles: Vec<[u32; 3]>,
+    /// A sphere around all of it.
+    pub centre: DVec3,
+    pub radius_m: f64,
+}
+
+impl CoarseMesh {
+    /// Merges the vertices of `mesh` that share a cell of a grid.
+    pub(super) fn of(mesh: &TriangleMesh) -> Self {
+        let (mut lower, mut upper) = (Vec3::INFINITY, Vec3::NEG_INFINITY);
+        for p in &mesh.positions {
+            lower = lower.min(*p);
+            upper = upper.max(*p);
+        }
+        if !lower.is_finite() {
+            return Self::default();
+        }
+        let side = ((upper - lower).max_element() / CELLS).max(f32::MIN_POSITIVE);
+        let mut cells: HashMap<[i32; 3], u32> = HashMap::new();
+        let mut sums: Vec<(Vec3, Vec3, f32)> = Vec::new();
+        let cell_of: Vec<u32> = mesh
+            .positions
+            .iter()
+            .zip(&mesh.normals)
+            .map(|(p, n)| {
+                let at = ((*p - lower) / side).floor();
+                let cell = *cells.entry([at.x as i32, at.y as i32, at.z as i32]).or_insert_with(|| {
+                    sums.push((Vec3::ZERO, Vec3::ZERO, 0.0));
+                    sums.len() as u32 - 1
+                });
+                let sum = &mut sums[cell as usize];
+                *sum = (sum.0 + *p, sum.1 + *n, sum.2 + 1.0);
+                cell
+            })
+            .collect();
+        let mut triangles: Vec<[u32; 3]> = mesh
+            .triangles
+            .iter()
+            .map(|t| t.map(|v| cell_of[v as usize]))
+            .filter(|[a, b, c]| a != b && b != c && c != a)
+            .map(|[a, b, c]| {
+                if a < b && a < c {
+                    [a, b, c]
+                } else if b < c {
+                    [b, c, a]
+                } else {
+                    [c, a, b]
+                }
+            })
+            .collect();
+        triangles.sort_unstable();
+        triangles.dedup();
+        let centre = (lower + upper).as_dvec3() * 0.5;
+        Self {
+            positions: sums.iter().map(|(p, _, n)| *p / *n).collect(),
+            normals: sums.iter().map(|(_, n, _)| n.normalize_or(Vec3::Y)).collect(),
+            triangles,
+            centre,
+            radius_m: f64::from((upper - lower).length()) * 0.5,
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// A sphere of `rings` rings and twice as many sectors.
+    fn sphere(rings: u32) -> TriangleMesh {
+        let mut mesh = TriangleMesh::default();
+        let sectors = 2 * rings;
+        for r in 0..=rings {
+            for s in 0..sectors {
+                let (theta, phi) = (
+                    std::f32::consts::PI * r as f32 / rings as f32,
+                    std::f32::consts::TAU * s as f32 / sectors as f32,
+                );
+                let p = Vec3::new(theta.sin() * phi.cos(), theta.cos(), theta.sin() * phi.sin());
+                mesh.positions.push(p);
+                mesh.normals.push(p);
+            }
+        }
+        for r in 0..rings {
+            for s in 0..sectors {
+                let at = |r: u32, s: u32| r * sectors + s % sectors;
+                mesh.triangles.push([at(r, s), at(r, s + 1), at(r + 1, s)]);
+                mesh.triangles.push([at(r + 1, s), at(r, s + 1), at(r + 1, s + 1)]);
+            }
+        }
+        mesh
+    }
+
+    #[test]
+    fn a_fine_mesh_becomes_coarse_and_stays_where_it_was() {
+        let fine = sphere(400);
+        let coarse = CoarseMesh::of(&fine);
+        // A surface of six squares of cells holds at most a few vertices a cell.
+        assert!(coarse.triangles.len() < 8 * 6 * (CELLS * CELLS) as usize / 4, "{}", coarse.triangles.len());
+        assert!(coarse.triangles.len() < fine.triangles.len() / 2);
+        assert!(coarse.positions.iter().all(|p| (p.length() - 1.0).abs() < 2.0 / CELLS));
+        assert!(coarse.positions.iter().zip(&coarse.normals).all(|(p, n)| p.normalize().dot(*n) > 0.99));
+        let area = |positions: &[Vec3], t: &[[u32; 3]]| -> f32 {
+            let of = |t: &[u32; 3]| {
+                let [a, b, c] = t.map(|v| positions[v as usize]);
+                (b - a).cross(c - a).length() * 0.5
+            };
+            t.iter().map(of).sum()
+        };
+        let (was, is) = (area(&fine.positions, &fine.triangles), area(&coarse.positions, &coarse.triangles));
+        assert!((is / was - 1.0).abs() < 0.1, "{is} of {was}");
+    }
+
+    #[test]
+    fn a_coarse_mesh_is_kept_and_an_empty_one_is_no_fault() {
+        let few = sphere(4);
+        let mesh = CoarseMesh::of(&few);
+        assert!((mesh.radius_m - 3f64.sqrt()).abs() < 1e-3 && mesh.centre.length() < 1e-6);
+        let empty = CoarseMesh::of(&TriangleMesh::default());
+        assert!(empty.triangles.is_empty() && empty.radius_m == 0.0);
+    }
+}

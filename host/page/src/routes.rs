@@ -1,0 +1,212 @@
+//! From a request to its answer.
+
+use crate::connections::{Connection, Doing};
+use crate::events::Events;
+use crate::guard::Refused;
+use crate::metrics;
+use crate::orders;
+use crate::shared::Shared;
+use crate::state::State;
+use base64::prelude::{Engine, BASE64_STANDARD};
+use dpm_rig::order::Order;
+use hyper::body::{Body, Bytes, Frame, Incoming, SizeHint};
+use hyper::header::{self, HeaderName, HeaderValue};
+use hyper::{Method, Request, Response, StatusCode};
+use std::convert::Infallible;
+use std::pin::Pin;
+use std::sync::Arc;
+use std::task::{Context, Poll};
+use std::time::Duration;
+
+/// The page. Its script and style are marked with a number that is drawn for each answer.
+const PAGE: &str = include_str!("page.html");
+/// What stands for that number in the page.
+const NONCE: &str = "{{nonce}}";
+/// How long the metrics wait for fresh figures.
+const FRESH_WITHIN: Duration = Duration::from_millis(60);
+
+/// The body of an answer.
+pub(crate) enum Answer {
+    /// All of it.
+    Whole(Option<Bytes>),
+    /// The rig's events, without end.
+    Events(Box<Events>),
+}
+
+impl Body for Answer {
+    type Data = Bytes;
+    type Error = Infallible;
+
+    fn poll_frame(
+        self: Pin<&mut Self>,
+        cx: &mut Context<'_>,
+    ) -> Poll<Option<Result<Frame<Bytes>, Infallible>>> {
+        match self.get_mut() {
+            Self::Whole(bytes) => Poll::Ready(bytes.take().map(|bytes| Ok(Frame::data(bytes)))),
+            Self::Events(events) => events.poll_next(cx).map(|bytes| Some(Ok(Frame::data(bytes)))),
+        }
+    }
+
+    fn is_end_stream(&self) -> bool {
+        matches!(self, Self::Whole(None))
+    }
+
+    fn size_hint(&self) -> SizeHint {
+        match self {
+            Self::Whole(bytes) => SizeHint::with_exact(bytes.as_ref().map_or(0, |b| b.len() as u64)),
+            Self::Events(_) => SizeHint::default(),
+        }
+    }
+}
+
+fn whole(status: StatusCode, kind: &'static str, text: impl Into<Bytes>) -> Response<Answer> {
+    let mut response = Response::new(Answer::Whole(Some(text.into())));
+    *response.status_mut() = status;
+    response.headers_mut().insert(header::CONTENT_TYPE, HeaderValue::from_static(kind));
+    response
+}
+
+fn plain(status: StatusCode, text: impl Into<String>) -> Response<Answer> {
+    whole(status, "text/plain; charset=utf-8", text.into() + "\n")
+}
+
+fn json(status: StatusCode, value: &impl serde::Serialize) -> Response<Answer> {
+    whole(status, "application/json", serde_json::to_string(value).unwrap_or_default())
+}
+
+fn refusal(refused: Refused) -> Response<Answer> {
+    plain(StatusCode::from_u16(refused.status).unwrap_or(StatusCode::FORBIDDEN), refused.told)
+}
+
+/// Answers a request.
+///
+/// # Errors
+/// Never; a client that went away ends this future.
+pub(crate) async fn answer(
+    request: Request<Incoming>,
+    connection: Arc<Connection>,
+    shared: Arc<Shared>,
+) -> Result<Response<Answer>, Infallible> {
+    connection.now_does(Doing::Asks);
+    let mut response = match shared.guard.check(request.headers()) {
+        Err(refused) => {
+            tokio::time::sleep(shared.pace()).await;
+            refusal(refused)
+        }
+        Ok(()) => route(&request, &connection, &shared).await,
+    };
+    if !matches!(response.body(), Answer::Events(_)) {
+        connection.now_does(Doing::Nothing);
+    }
+    // No answer needs the body of its request. One that has a body ends the connection, so that nobody has to read it.
+    if !request.body().is_end_stream() {
+        response.headers_mut().insert(header::CONNECTION, HeaderValue::from_static("close"));
+    }
+    for (name, value) in [
+        (header::CACHE_CONTROL, "no-store"),
+        (header::X_CONTENT_TYPE_OPTIONS, "nosniff"),
+        (header::REFERRER_POLICY, "no-referrer"),
+        (header::X_FRAME_OPTIONS, "DENY"),
+        (HeaderName::from_static("cross-origin-resource-policy"), "same-origin"),
+        (HeaderName::from_static("cross-origin-opener-policy"), "same-origin"),
+    ] {
+        response.headers_mut().insert(name, HeaderValue::from_static(value));
+    }
+    Ok(response)
+}
+
+async fn route(
+    request: &Request<Incoming>,
+    connection: &Arc<Connection>,
+    shared: &Arc<Shared>,
+) -> Response<Answer> {
+    let path = request.uri().path();
+    if let Some(word) = path.strip_prefix("/api/orders/") {
+        return order(request, word, connection, shared).await;
+    }
+    tokio::time::sleep(shared.pace()).await;
+    if request.method() != Method::GET {
+        return plain(StatusCode::METHOD_NOT_ALLOWED, "only GET, and POST for orders");
+    }
+    match path {
+        "/" => page(),
+        "/metrics" => {
+            let text = metrics::text(&fresh(shared).await);
+            whole(StatusCode::OK, "text/plain; version=0.0.4; charset=utf-8", text)
+        }
+        "/api/state" => json(StatusCode::OK, &fresh(shared).await.to_json()),
+        "/api/token" => match shared.guard.check_token(request.headers()) {
+            Ok(()) => plain(StatusCode::OK, "ok"),
+            Err(refused) => refusal(refused),
+        },
+        "/api/events" => match shared.viewer() {
+            Some(viewer) => {
+                connection.now_does(Doing::Views);
+                let mut response = Response::new(Answer::Events(Box::new(Events::new(viewer))));
+                let kind = HeaderValue::from_static("text/event-stream");
+                response.headers_mut().insert(header::CONTENT_TYPE, kind);
+                response
+            }
+            None => {
+                plain(StatusCode::SERVICE_UNAVAILABLE, "too many viewers: close another page of this rig")
+            }
+        },
+        "/favicon.ico" => plain(StatusCode::NOT_FOUND, "none"),
+        _ => plain(StatusCode::NOT_FOUND, "there is /, /metrics, /api/state and /api/events"),
+    }
+}
+
+async fn order(
+    request: &Request<Incoming>,
+    word: &str,
+    connection: &Arc<Connection>,
+    shared: &Arc<Shared>,
+) -> Response<Answer> {
+    if let Err(refused) = shared.guard.check_token(request.headers()) {
+        tokio::time::sleep(shared.pace()).await;
+        return refusal(refused);
+    }
+    if request.method() != Method::POST {
+        return plain(StatusCode::METHOD_NOT_ALLOWED, "an order is a POST");
+    }
+    let Some((order, _)) = Order::ALL.into_iter().find(|(_, known)| *known == word) else {
+        let known: Vec<_> = Order::ALL.iter().map(|(_, word)| *word).collect();
+        return plain(StatusCode::NOT_FOUND, format!("unknown order; known: {}", known.join(", ")));
+    };
+    connection.now_does(Doing::Orders);
+    json(StatusCode::OK, &orders::give(order, shared).await)
+}
+
+/// The state with figures that were made for this request, if they come at once.
+async fn fresh(shared: &Arc<Shared>) -> State {
+    let live = shared.monitor.live();
+    let before = live.snapshot();
+    live.look();
+    let begin = tokio::time::Instant::now();
+    while begin.elapsed() < FRESH_WITHIN {
+        let now = live.snapshot();
+        let is_new = now.as_ref().map(Arc::as_ptr) != before.as_ref().map(Arc::as_ptr);
+        if is_new || now.is_some_and(|s| s.is_final) {
+            break;
+        }
+        tokio::time::sleep(Duration::from_millis(2)).await;
+    }
+    State::of(shared)
+}
+
+fn page() -> Response<Answer> {
+    let mut bytes = [0u8; 16];
+    if getrandom::fill(&mut bytes).is_err() {
+        return plain(StatusCode::SERVICE_UNAVAILABLE, "the operating system gave no random bytes");
+    }
+    let nonce = BASE64_STANDARD.encode(bytes);
+    let policy = format!(
+        "default-src 'none'; script-src 'nonce-{nonce}'; style-src 'nonce-{nonce}'; img-src data:; connect-src 'self'; \
+         base-uri 'none'; form-action 'none'; frame-ancestors 'none'"
+    );
+    let mut response = whole(StatusCode::OK, "text/html; charset=utf-8", PAGE.replace(NONCE, &nonce));
+    if let Ok(policy) = HeaderValue::from_str(&policy) {
+        response.headers_mut().insert(header::CONTENT_SECURITY_POLICY, policy);
+    }
+    response
+}

@@ -1,0 +1,152 @@
+//! What the page shows, as JSON.
+
+use crate::shared::Shared;
+use dpm_device::link::faults;
+use dpm_rig::control::rig_name;
+use dpm_rig::telemetry::histogram_steps::UPPER_NS;
+use dpm_rig::telemetry::live::LiveSnapshot;
+use dpm_rig::telemetry::monitor::{ProjectorHealth, RunCounts};
+use dpm_rig::telemetry::projector::ProjectorReport;
+use serde_json::{json, Value};
+use std::sync::Arc;
+
+/// What changes from one moment to the next.
+#[derive(Clone, Debug, serde::Serialize)]
+pub(crate) struct Now {
+    /// The process.
+    pub pid: u32,
+    /// Seconds since the page began.
+    pub up_s: f64,
+    /// The projector's state as a word, and as a sentence.
+    pub projector: &'static str,
+    pub told: String,
+    /// Light may come out of the projector.
+    pub is_light: bool,
+    /// The order that stands and is kept over restarts.
+    pub standing: Option<&'static str>,
+    /// On what light depends, and whether it is permitted.
+    pub interlock: Option<(String, bool)>,
+    /// What the tracker says of bodies that it has not seen.
+    pub tracker: Option<String>,
+    /// The run is asked to end.
+    pub is_stopping: bool,
+    pub counts: RunCounts,
+    /// Viewers of this page.
+    pub viewers: usize,
+}
+
+/// The state at one moment.
+pub(crate) struct State {
+    pub now: Now,
+    pub health: ProjectorHealth,
+    /// The collector's figures; `None` before the first ones.
+    pub figures: Option<Arc<LiveSnapshot>>,
+    /// What the link has carried.
+    pub carried: ProjectorReport,
+    setup: Value,
+}
+
+/// The state as it is sent.
+#[derive(serde::Serialize)]
+pub(crate) struct StateJson<'a> {
+    pub now: &'a Now,
+    pub figures: Value,
+}
+
+impl State {
+    pub(crate) fn of(shared: &Shared) -> Self {
+        let monitor = &shared.monitor;
+        let health = monitor.projector();
+        let now = Now {
+            pid: std::process::id(),
+            up_s: (shared.began.elapsed().as_secs_f64() * 1e3).round() / 1e3,
+            projector: match health {
+                // What the operator has ordered is no fault to them.
+                ProjectorHealth::Faulted(faults::HOST_SAFE) => "SAFE",
+                health => health.word(),
+            },
+            told: health.to_string(),
+            is_light: matches!(health, ProjectorHealth::Up | ProjectorHealth::Frozen),
+            standing: shared.orders.kept().map(|order| order.word()),
+            interlock: monitor.interlock().map(|i| (i.what().to_owned(), i.is_closed())),
+            tracker: monitor.tracker().map(str::to_owned),
+            is_stopping: monitor.stop_requested(),
+            counts: monitor.counts(),
+            viewers: shared.viewers(),
+        };
+        let figures = monitor.live().snapshot();
+        Self { now, health, figures, carried: monitor.carried(), setup: setup(shared) }
+    }
+
+    pub(crate) fn to_json(&self) -> StateJson<'_> {
+        let mut figures = self.figures.as_ref().map_or(json!({}), |f| told_of(f));
+        figures["setup"] = self.setup.clone();
+        figures["link"] = json!(self.carried);
+        StateJson { now: &self.now, figures }
+    }
+}
+
+/// What stays the same for the whole run.
+fn setup(shared: &Shared) -> Value {
+    let mut all = json!({
+        "rig": rig_name(),
+        "version": env!("CARGO_PKG_VERSION"),
+        "commit": dpm_common::commit::get(),
+        "bounds_ms": UPPER_NS.map(|ns| ns as f64 / 1e6).as_slice(),
+    });
+    if let Some(rig) = shared.monitor.live().rig() {
+        let config = &rig.config;
+        all["projector"] = json!(config.projector.backend.word());
+        all["tracker"] = json!(config.tracker.word());
+        all["spp"] = json!(config.render.spp);
+        all["exposure"] = json!(config.render.exposure);
+        all["frames"] = json!(config.run.frames);
+        all["seconds"] = json!(config.run.seconds);
+    }
+    all
+}
+
+fn told_of(f: &LiveSnapshot) -> Value {
+    let report = &f.report;
+    let bodies: Vec<Value> = f
+        .bodies
+        .iter()
+        .zip(&report.dark_by_body)
+        .map(|(body, dark)| {
+            json!({
+                "name": body.name,
+                "seen": body.seen,
+                "dark": body.dark.map(|cause| cause.name()),
+                "told": body.dark.map(|cause| cause.told()),
+                "at_m": body.at_m,
+                "dark_frames": dark,
+            })
+        })
+        .collect();
+    let intervals: Vec<Value> = f
+        .intervals
+        .iter()
+        .map(|i| {
+            json!({
+                "name": i.name,
+                "modelled": i.modelled,
+                "count": i.steps.count,
+                "up_to": i.steps.up_to.as_slice(),
+            })
+        })
+        .collect();
+    json!({
+        "report": report,
+        "is_final": f.is_final,
+        "bodies": bodies,
+        "intervals": intervals,
+        "frame": {
+            "id": f.frame.id,
+            "sample_age_ms": f.frame.sample_age_ns.map(|ns| ns as f64 / 1e6),
+            "budget_spp": f.frame.budget_spp,
+            "predict_ms": f.frame.predict_ns as f64 / 1e6,
+        },
+        "rays": f.rays,
+        "samples": f.samples,
+    })
+}
