@@ -61,6 +61,10 @@ fn the_manual_lists_every_metric_as_it_is() {
 fn counters_equal_the_report_and_histograms_add_up() {
     let mut rig = Running::start("metrics");
     rig.order("black");
+    let dark = "dpm_slots_ordered_dark_total{reason=\"black\"}";
+    rig.wait("a dark slot", || {
+        parse(&rig.ask("GET", "/metrics", &[]).body).get(dark).is_some_and(|n| *n > 0.0)
+    });
     rig.order("arm");
     let during = parse(&rig.ask("GET", "/metrics", &[]).body);
     let before = rig.monitor.counts().frames_lit;
