@@ -310,7 +310,8 @@ impl HostLink {
         }
         self.state = match (self.state, status.state) {
             (L::Configuring, D::Configured | D::Armed) => L::Ready,
-            (L::Arming, D::Armed) => L::Streaming,
+            // Before ARM was sent, "armed" is what the device was before the order that ARM takes back.
+            (L::Arming, D::Armed) if self.requested_at != NEVER => L::Streaming,
             (L::Streaming | L::Ready, D::Faulted) => L::Faulted,
             // Latched faults hide whether the device is configured, so CONFIG must have been sent before an ARM can
             // follow it.

@@ -44,7 +44,7 @@ pub(super) struct FrameBuffers {
     /// What was drawn, from which planes that follow are taken, and how it moves while the planes last.
     pub motion: Buffer,
     /// The bodies that move while the planes last.
-    pub movers: Buffer,
+    pub movers: Latched,
 }
 
 /// A buffer that the host writes, with its copy for the shaders. The frame's first commands make the copy.
@@ -116,7 +116,7 @@ impl FrameBuffers {
             filtered: with("filtered radiance", each.filtered)?,
             filtered_shown: with("shown radiance", each.shown)?,
             motion: with("motion of surfaces", each.motion)?,
-            movers: size("movers", size_of::<Mover>() * bodies.max(1), Upload)?,
+            movers: latched("movers", size_of::<Mover>() * bodies.max(1))?,
             debug_host: debug.then(|| DebugBuffers::new(gpu, pixels, tiles, each)).transpose()?,
             each,
         })
@@ -154,6 +154,7 @@ impl FrameBuffers {
         let of_shaders = [
             ("frame uniforms", &self.frame.device),
             ("instances", &self.instances.device),
+            ("movers", &self.movers.device),
             ("counters", &self.counters),
             ("surfaces", &self.surfaces),
             ("radiance", &self.radiance),
@@ -213,7 +214,7 @@ impl FrameBuffers {
             "B_SHOWN" => self.shown(settings),
             "B_PLANES" => &self.planes,
             "B_MOTION" => &self.motion,
-            "B_MOVERS" => &self.movers,
+            "B_MOVERS" => &self.movers.device,
             "B_PLANE_GROUPS" => &shared.plane_groups,
             other => unreachable!("binding {other} has no buffer"),
         }

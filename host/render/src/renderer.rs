@@ -184,7 +184,7 @@ impl Renderer {
         let (resources, raster) = (&self.resources, self.settings.raster);
         r.clear(&b.counters);
         r.copy(&resources.shared.schedule_start, &b.schedule, size_of::<Schedule>());
-        for latched in [&b.frame, &b.instances] {
+        for latched in [&b.frame, &b.instances, &b.movers] {
             r.copy(&latched.host, &latched.device, latched.len_bytes);
         }
         r.barrier();
@@ -261,7 +261,7 @@ impl Renderer {
             );
         }
         self.movers.find(inputs.camera, &self.data.bodies, inputs.poses, inputs.sweep, &mut slot.tile_list);
-        slot.buffers.movers.write(self.movers.movers());
+        slot.buffers.movers.host.write(self.movers.movers());
         let turn = self.last.turn_of(inputs.frame);
         // A tile has four workgroups of 8 x 8 pixels, and one workgroup in the pass that decides rates, which runs in every second frame that is
         // drawn. The checkerboard uses the same count of frames, so that both of its halves are traced at one rate.

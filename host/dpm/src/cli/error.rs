@@ -8,10 +8,13 @@ use dpm_common::files::check_folder;
 use dpm_device::planes::Raster;
 use dpm_lab::error::figure3::Figure3Group;
 use dpm_lab::error::plan::Setting;
+use dpm_lab::error::planes::{markdown, Card, MOTIONS};
 use dpm_lab::error::runs::{ErrorOptions, Extent, GroupResult};
 use dpm_lab::error::table::TableGroup;
 use dpm_render::gpu::Gpu;
+use dpm_rig::config::{Overrides, RigConfig};
 use dpm_rig::failure::{Failure, FailureKind};
+use dpm_rig::pipeline::PipelineError;
 use dpm_rig::rig::Rig;
 use dpm_rig::run_rig::open_gpu;
 use dpm_rig::telemetry::report::to_json;
@@ -23,7 +26,7 @@ use std::sync::Arc;
 #[command(args_conflicts_with_subcommands = true, subcommand_negates_reqs = true)]
 pub(crate) struct ErrorArgs {
     #[command(subcommand)]
-    merge: Option<ErrorCommand>,
+    command: Option<ErrorCommand>,
     /// The rig file
     #[arg(value_name = "RIG.toml", required = true)]
     rig: Option<PathBuf>,
@@ -91,6 +94,12 @@ enum ErrorCommand {
         #[arg(long)]
         json: bool,
     },
+    /// What an eye sees of a moving texture, plane by plane: motion times what the planes are drawn for
+    Planes {
+        /// Print one JSON object
+        #[arg(long)]
+        json: bool,
+    },
 }
 
 /// Measures what is not measured yet and writes tables and curves.
@@ -98,8 +107,10 @@ enum ErrorCommand {
 /// # Errors
 /// Bad rig or flags, no GPU, a folder that cannot be written.
 pub(super) fn execute(args: &ErrorArgs) -> Result<(), Failure> {
-    if let Some(ErrorCommand::Merge { out, json }) = &args.merge {
-        return merge(out, *json);
+    match &args.command {
+        Some(ErrorCommand::Merge { out, json }) => return merge(out, *json),
+        Some(ErrorCommand::Planes { json }) => return planes(*json),
+        None => {}
     }
     args.flags.refuse("dpm error", &["--frames", "--seconds", "--no-prediction"])?;
     let budgets = match (&args.budgets[..], args.quick) {
@@ -112,6 +123,20 @@ pub(super) fn execute(args: &ErrorArgs) -> Result<(), Failure> {
         Some(Preset::Table) => run::<TableGroup>(args, &Setting::of_table()),
         None => run::<GroupResult>(args, &Setting::at_budgets(&budgets)),
     }
+}
+
+/// Orders of the bits that `dpm error planes` compares.
+const ORDERS: [[u8; 8]; 2] = [[7, 6, 5, 4, 3, 2, 1, 0], [0, 2, 4, 6, 7, 5, 3, 1]];
+
+/// Measures every motion with every order of the planes.
+fn planes(json: bool) -> Result<(), Failure> {
+    let config = RigConfig::demo(&Overrides::default())?;
+    let failed = |e| Failure::from(PipelineError::from(e));
+    let card = Card::new(&open_gpu(&config)?).map_err(failed)?;
+    let of = |order: &[u8; 8]| MOTIONS.iter().map(|motion| card.measure(motion, *order)).collect::<Vec<_>>();
+    let rows = ORDERS.iter().flat_map(of).collect::<Result<Vec<_>, _>>().map_err(failed)?;
+    print(&if json { to_json(&serde_json::json!({ "planes": rows })) + "\n" } else { markdown(&rows) });
+    Ok(())
 }
 
 /// Where groups and reports lie.

@@ -4,6 +4,7 @@ pub mod export;
 pub mod figure3;
 mod parts;
 pub mod plan;
+pub mod planes;
 pub mod plot;
 pub mod reference;
 pub mod report;

@@ -1,0 +1,311 @@
+//! What an eye sees of a moving texture, plane by plane: motion times remedy.
+//!
+//! A card that glows by itself, so that no sample is left to chance, moves before the projector for the 31 frames of
+//! 33 ms. Every plane of a frame is lit at its own instant, and the eye follows the card or rests. The error of the light
+//! is compared for three ways to draw the planes: all for the middle of the exposure, all for the centre of their light,
+//! and each group of them for its own instant.
+
+use super::runs::EYE_FRAMES;
+use dpm_device::planes::{PlaneSchedule, Raster};
+use dpm_render::drive::Drive;
+use dpm_render::gpu::{Gpu, GpuError};
+use dpm_render::method::Method;
+use dpm_render::pack::source_bits;
+use dpm_render::warp::{plane_groups, Sweep};
+use dpm_render::{FrameInputs, FrameSlot, Output, RenderError, Renderer, RendererSettings};
+use dpm_scene::geometry::projector::ProjectorCamera;
+use dpm_scene::{shapes, Material, Scene};
+use dpm_shaders::structs::PlaneGroup;
+use glam::{DAffine3, DMat3, DQuat, DVec2, DVec3, Vec3};
+use serde::{Deserialize, Serialize};
+use std::sync::Arc;
+
+const WIDTH: u32 = 320;
+const HEIGHT: u32 = 240;
+/// One frame at 947 frames/s, seconds.
+const EXPOSURE_S: f64 = 1.0 / 947.0;
+/// Side of the part of the picture that the eye looks at, and its first column and row, pixels.
+const LOOK: usize = 64;
+const LOOK_FROM: DVec2 = DVec2::new(128.0, 88.0);
+/// Places in each direction at which a pixel is looked at.
+const FINER: usize = 4;
+/// Longest wait for a frame of this size.
+const TIMEOUT_NS: u64 = 60_000_000_000;
+
+/// How the card moves: its velocity, m/s, and its angular velocity, rad/s.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct CardMotion {
+    /// What it is called in the table.
+    pub name: &'static str,
+    velocity: DVec3,
+    turn: DVec3,
+}
+
+impl CardMotion {
+    const fn of(name: &'static str, speed: f64, turn: DVec3) -> Self {
+        // Not along a row or a column, so that all places within a pixel are passed.
+        Self { name, velocity: DVec3::new(0.92 * speed, 0.39 * speed, 0.0), turn }
+    }
+
+    /// Where the card is, seconds after it was at rest in the middle of the picture.
+    fn pose_at(&self, t: f64) -> DAffine3 {
+        DAffine3::from_rotation_translation(DQuat::from_scaled_axis(self.turn * t), self.velocity * t)
+    }
+}
+
+/// The motions of the table.
+pub const MOTIONS: [CardMotion; 7] = [
+    CardMotion::of("at rest", 0.0, DVec3::ZERO),
+    CardMotion::of("0.25 m/s", 0.25, DVec3::ZERO),
+    CardMotion::of("0.5 m/s", 0.5, DVec3::ZERO),
+    CardMotion::of("1 m/s", 1.0, DVec3::ZERO),
+    CardMotion::of("2 m/s", 2.0, DVec3::ZERO),
+    CardMotion::of("4 m/s", 4.0, DVec3::ZERO),
+    CardMotion::of("1 m/s, turning at 4 rad/s", 1.0, DVec3::new(0.0, 0.0, 4.0)),
+];
+
+/// Errors of one motion and one order of the planes: root of the mean square over the pixels, full light is 1.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+pub struct PlanesRow {
+    /// How the card moves.
+    pub motion: String,
+    /// The bits in the order in which they are lit.
+    pub order: [u8; 8],
+    /// An eye that follows the card.
+    pub follows: Remedies,
+    /// An eye that rests.
+    pub rests: Remedies,
+}
+
+/// The errors by what the planes are drawn for.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Serialize, Deserialize)]
+pub struct Remedies {
+    /// All for the middle of the exposure.
+    pub middle: f64,
+    /// All for the centre of their light.
+    pub centre: f64,
+    /// Each group for its own instant.
+    pub own: f64,
+}
+
+/// A card before a part of 320 x 240 mirrors of a projector of 1024 x 768: one mirror is 0.58 mm.
+pub struct Card {
+    gpu: Arc<Gpu>,
+    scene: Scene,
+    camera: ProjectorCamera,
+    /// Red code values at rest, from [`FINER`] times as many mirrors in each direction.
+    texture: Vec<u32>,
+}
+
+/// Words that the planes of a frame show, and the map from a place of the picture at rest to where it is at the middle of
+/// each plane.
+type LitFrame = (Vec<u32>, Vec<DMat3>);
+
+impl Card {
+    /// Draws the card at rest.
+    ///
+    /// # Errors
+    /// The renderer's.
+    ///
+    /// # Panics
+    /// Never: the raster and the projector are given.
+    pub fn new(gpu: &Arc<Gpu>) -> Result<Self, RenderError> {
+        let mut scene = Scene::default();
+        let glow = shapes::use_texture(&mut scene, shapes::noise_texture(40, 5, 5, 255, false));
+        let card = shapes::quad(Vec3::new(-0.15, -0.15, 0.0), Vec3::X * 0.3, Vec3::Y * 0.3);
+        shapes::add(
+            &mut scene,
+            card,
+            Material { emissive_texture: glow, ..shapes::emitter(Vec3::splat(0.7)) },
+        );
+        let raster = Raster::new(WIDTH, HEIGHT).expect("a small raster");
+        let angle = 2.0 * (f64::from(WIDTH) / 2.0 * 0.58e-3 / 1.1).atan();
+        let camera = ProjectorCamera::look_at(raster, DVec3::Z * 1.1, DVec3::ZERO, DVec3::Y, angle)
+            .expect("a projector before the card");
+        let mut card = Self { gpu: gpu.clone(), scene, camera, texture: Vec::new() };
+        let finer = Raster::new(WIDTH * FINER as u32, HEIGHT * FINER as u32).expect("a small raster");
+        let fine = card.camera.at_raster(finer);
+        let mut frames = card.frames(&fine, &[])?;
+        card.texture = frames.draw(DAffine3::IDENTITY, None)?;
+        Ok(card)
+    }
+
+    /// Measures one motion with one order of the bits.
+    ///
+    /// # Errors
+    /// The renderer's.
+    ///
+    /// # Panics
+    /// When `order` does not name each bit once.
+    pub fn measure(&self, motion: &CardMotion, order: [u8; 8]) -> Result<PlanesRow, RenderError> {
+        let schedule = PlaneSchedule::rgb24_in(order).expect("each bit once");
+        let (mut follows, mut rests) = (Remedies::default(), Remedies::default());
+        let centre = centre_of(&schedule);
+        for (aim, own) in [(0.5, false), (centre, false), (centre, true)] {
+            let frames = self.lit_frames(&schedule, motion, aim, own)?;
+            for (remedies, eye_follows) in [(&mut follows, true), (&mut rests, false)] {
+                let error = self.error_of_light(&frames, &schedule, eye_follows);
+                match (own, aim == centre) {
+                    (true, _) => remedies.own = error,
+                    (false, true) => remedies.centre = error,
+                    (false, false) => remedies.middle = error,
+                }
+            }
+        }
+        Ok(PlanesRow { motion: motion.name.into(), order, follows, rests })
+    }
+
+    fn frames(&self, camera: &ProjectorCamera, groups: &[PlaneGroup]) -> Result<Frames, RenderError> {
+        let settings = RendererSettings {
+            raster: camera.raster,
+            depth: 2,
+            seed: 1,
+            clamp_indirect: None,
+            drive: Drive::even(1.0),
+            lens: None,
+            camera_is_eye: false,
+            leave_nothing_out: false,
+            method: Method::full(1),
+            halftone: None,
+            plane_groups: groups.to_vec(),
+            output: Output::Codes,
+        };
+        let renderer = Renderer::new(&self.gpu, &self.scene, settings)?;
+        let slot = renderer.create_slot(false)?;
+        Ok(Frames { renderer, slot, camera: *camera })
+    }
+
+    /// The frames of 33 ms, drawn for the instant `aim` of their exposures; `own`: planes follow.
+    fn lit_frames(
+        &self,
+        schedule: &PlaneSchedule,
+        motion: &CardMotion,
+        aim: f64,
+        own: bool,
+    ) -> Result<Vec<LitFrame>, RenderError> {
+        let middles: Vec<f64> = (0..schedule.len()).map(|i| middle_of(schedule, i)).collect();
+        let instants: Vec<f64> = middles.iter().map(|middle| middle - aim).collect();
+        let groups = if own { plane_groups(schedule, &instants) } else { Vec::new() };
+        let mut frames = self.frames(&self.camera, &groups)?;
+        let at_rest = self.picture_of(&DAffine3::IDENTITY).inverse();
+        (0..EYE_FRAMES as i32)
+            .map(|k| {
+                // The card is in the middle of the picture in the middle of the run, so that it stays on the raster.
+                let begin = f64::from(k - EYE_FRAMES as i32 / 2) * EXPOSURE_S;
+                let pose = |share: f64| motion.pose_at(begin + share * EXPOSURE_S);
+                let codes = frames.draw(pose(aim), Some([pose(0.0), pose(1.0)]))?;
+                let moved = |middle: &f64| self.picture_of(&pose(*middle)) * at_rest;
+                Ok((codes, middles.iter().map(moved).collect()))
+            })
+            .collect()
+    }
+
+    /// From places on the card to places in the picture, both homogeneous.
+    fn picture_of(&self, pose: &DAffine3) -> DMat3 {
+        let c = &self.camera;
+        let of = |x: f64, y: f64| {
+            let q = c.to_projector_space(pose.transform_point3(DVec3::new(x, y, 0.0)));
+            DVec3::new(c.fx * q.x - c.cx * q.z, -c.fy * q.y - c.cy * q.z, -q.z)
+        };
+        let origin = of(0.0, 0.0);
+        DMat3::from_cols(of(1.0, 0.0) - origin, of(0.0, 1.0) - origin, origin)
+    }
+
+    /// By how much the red light that an eye sees differs from that of the texture. In every plane a mirror shows the bit
+    /// of some code value; the texture is that of the place on the card that is at the middle of this mirror.
+    fn error_of_light(&self, frames: &[LitFrame], schedule: &PlaneSchedule, follows: bool) -> f64 {
+        let bits = source_bits(schedule);
+        let mut off = vec![0.0; LOOK * LOOK];
+        for (words, moved) in frames {
+            for i in (0..schedule.len()).filter(|i| bits[*i] < 8) {
+                let back = moved[i].inverse();
+                let light = f64::from(1u32 << schedule.planes()[i].bit);
+                for fine in 0..LOOK * FINER * LOOK * FINER {
+                    let (x, y) = (fine % (LOOK * FINER), fine / (LOOK * FINER));
+                    let place = DVec2::new(x as f64 + 0.5, y as f64 + 0.5) / FINER as f64 + LOOK_FROM;
+                    let mirror = if follows { mapped(&moved[i], place) } else { place }.floor();
+                    let word = words[mirror.y as usize * WIDTH as usize + mirror.x as usize];
+                    let texture = self.texture_at(mapped(&back, mirror + 0.5)) / 8.0;
+                    off[y / FINER * LOOK + x / FINER] += f64::from(word >> bits[i] & 1) * light - texture;
+                }
+            }
+        }
+        let whole = (FINER * FINER * frames.len()) as f64 * 255.0;
+        (off.iter().map(|e| (e / whole).powi(2)).sum::<f64>() / off.len() as f64).sqrt()
+    }
+
+    /// The red code value of a place of the picture at rest.
+    fn texture_at(&self, place: DVec2) -> f64 {
+        let at = place * FINER as f64 - 0.5;
+        let (from, part) = (at.floor(), at - at.floor());
+        let code = |dx: usize, dy: usize| {
+            let row = (from.y as usize + dy) * WIDTH as usize * FINER;
+            f64::from(self.texture[row + from.x as usize + dx] & 0xff)
+        };
+        let row = |dy: usize| code(0, dy) * (1.0 - part.x) + code(1, dy) * part.x;
+        row(0) * (1.0 - part.y) + row(1) * part.y
+    }
+}
+
+/// A renderer of the card.
+struct Frames {
+    renderer: Renderer,
+    slot: FrameSlot,
+    camera: ProjectorCamera,
+}
+
+impl Frames {
+    /// Code values of the card at `pose`, which moves from the first to the last pose of `sweep`.
+    fn draw(&mut self, pose: DAffine3, sweep: Option<[DAffine3; 2]>) -> Result<Vec<u32>, GpuError> {
+        let ends = sweep.map(|ends| ends.map(|end| [end]));
+        let inputs = FrameInputs {
+            frame: 0,
+            spp: 1,
+            budget_spp: 1.0,
+            camera: &self.camera,
+            eye: self.camera.position(),
+            gaze: DVec3::ZERO,
+            widen_deg: 0.0,
+            poses: &[pose],
+            sweep: ends.as_ref().map(|[first, last]| Sweep { first, last }),
+            lost: &[],
+        };
+        self.renderer.submit(&mut self.slot, &inputs)?;
+        self.slot.wait(TIMEOUT_NS)?;
+        Ok(self.slot.codes().to_vec())
+    }
+}
+
+/// A place of the picture through a homogeneous map.
+fn mapped(map: &DMat3, place: DVec2) -> DVec2 {
+    let p = *map * place.extend(1.0);
+    p.truncate() / p.z
+}
+
+/// The middle of a plane, in exposures from the first photon on.
+fn middle_of(schedule: &PlaneSchedule, plane: usize) -> f64 {
+    (plane as f64 + 0.5) / schedule.len() as f64
+}
+
+/// The centre of the light of a frame, in exposures from the first photon on.
+fn centre_of(schedule: &PlaneSchedule) -> f64 {
+    let light = |i: usize| f64::from(1u32 << schedule.planes()[i].bit);
+    let all: f64 = (0..schedule.len()).map(light).sum();
+    (0..schedule.len()).map(|i| middle_of(schedule, i) * light(i)).sum::<f64>() / all
+}
+
+/// The rows as a Markdown table.
+pub fn markdown(rows: &[PlanesRow]) -> String {
+    let mut out = String::from(
+        "| motion | order of the bits | eye | all for mid-exposure | all for the light's centre | each for its own instant |\n\
+         |---|---|---|---:|---:|---:|\n",
+    );
+    for row in rows {
+        let order = row.order.map(|bit| bit.to_string()).join(" ");
+        for (eye, errors) in [("follows", row.follows), ("rests", row.rests)] {
+            let Remedies { middle, centre, own } = errors;
+            out += &format!("| {} | {order} | {eye} | {middle:.4} | {centre:.4} | {own:.4} |\n", row.motion);
+        }
+    }
+    out
+}
