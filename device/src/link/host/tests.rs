@@ -277,6 +277,19 @@ fn an_order_to_be_dark_goes_first_once_and_is_not_replaced_by_a_weaker_one() {
     assert_eq!(script.sent.last(), Some(&MessageType::Black));
 }
 
+/// ARM right after BLACK, before a status has told of BLACK: what the device was before is no answer to ARM.
+#[test]
+fn arm_is_sent_although_the_device_was_armed_before_it_was_made_dark() {
+    let (mut link, mut script) = streaming();
+    let at = HostTime(1_000_000);
+    link.command(at, Verb::Black, &mut script).unwrap();
+    link.arm(0);
+    script.sent.clear();
+    link.poll(at.plus_ns(1_000_000), &mut script).unwrap();
+    link.poll(at.plus_ns(2_000_000), &mut script).unwrap();
+    assert!(script.sent.contains(&MessageType::Arm), "{:?}", script.sent);
+}
+
 #[test]
 fn full_frame_numbers_come_back_from_their_low_half() {
     for newest in [5u64, 1 << 32, (7 << 32) + 3] {
