@@ -2,10 +2,10 @@
 //! as an eye sees their light that follows the body.
 
 use dpm_device::planes::{PlaneSchedule, Raster};
-use dpm_lab::error::planes::{Card, MOTIONS};
+use dpm_lab::error::planes::{centre_of, middle_of, Card, MOTIONS};
 use dpm_lab::stability::gpu_shot::Shot;
 use dpm_render::gpu::Gpu;
-use dpm_render::warp::gather::{motion_of, owner_of, Drawn};
+use dpm_render::warp::gather::{motion_of, owner_of, within, Drawn};
 use dpm_render::warp::{plane_groups, Sweep};
 use dpm_render::{FrameInputs, Renderer, RendererSettings};
 use dpm_scene::geometry::lens::Lens;
@@ -45,18 +45,6 @@ fn cards() -> Scene {
         );
     }
     scene
-}
-
-/// The middle of a plane, in exposures from the first photon on.
-fn middle_of(schedule: &PlaneSchedule, plane: usize) -> f64 {
-    (plane as f64 + 0.5) / schedule.len() as f64
-}
-
-/// The centre of the light of a frame, in exposures from the first photon on.
-fn centre_of(schedule: &PlaneSchedule) -> f64 {
-    let light = |i: usize| f64::from(1u32 << schedule.planes()[i].bit);
-    let all: f64 = (0..schedule.len()).map(light).sum();
-    (0..schedule.len()).map(|i| middle_of(schedule, i) * light(i)).sum::<f64>() / all
 }
 
 /// The groups of the planes of a frame, and the middles of the planes from its light's centre on, in exposures.
@@ -159,10 +147,7 @@ fn planes_of_gpu_and_cpu_are_the_same_bits() {
                 let mut changed = 0;
                 for i in 0..raster.pixel_count() {
                     let pixel = [(i as u32 % WIDTH) as i32, (i as u32 / WIDTH) as i32];
-                    let moves = shown
-                        .movers
-                        .iter()
-                        .any(|m| (0..2).all(|c| pixel[c] >= m.lower[c] && pixel[c] < m.upper[c]));
+                    let moves = shown.movers.iter().any(|m| within(m, pixel));
                     let expected = if moves { drawn.word(pixel, &groups) } else { still.codes[i] };
                     assert_eq!(shown.codes[i], expected, "{name}, {fast} times as fast, at {pixel:?}");
                     changed += u32::from(expected != still.codes[i]);
@@ -220,8 +205,7 @@ fn every_plane_shows_the_bodies_at_its_own_instant() {
             let (mut worst_motion, mut worst_place, mut count) = (0.0f64, 0.0f64, 0);
             for i in 0..raster.pixel_count() {
                 let pixel = [(i as u32 % WIDTH) as i32, (i as u32 / WIDTH) as i32];
-                let within = |m: &Mover| (0..2).all(|c| pixel[c] >= m.lower[c] && pixel[c] < m.upper[c]);
-                if !shown.movers.iter().any(within) {
+                if !shown.movers.iter().any(|m| within(m, pixel)) {
                     continue;
                 }
                 let owner = owner_of(&shown.motions[i]);
@@ -270,9 +254,7 @@ fn silhouettes_are_those_of_the_instant() {
         let shown = draw(&mut renderer, &camera, &now, Some((&first, &last)));
         let drawn =
             Drawn { raster: camera.raster, pixels: &shown.motions, movers: &shown.movers, are_codes: true };
-        let inside = |pixel: [i32; 2]| {
-            shown.movers.iter().any(|m| (0..2).all(|c| pixel[c] >= m.lower[c] && pixel[c] < m.upper[c]))
-        };
+        let inside = |pixel: [i32; 2]| shown.movers.iter().any(|m| within(m, pixel));
         let (mut apart, mut before, mut edge) = (0, 0, 0);
         for group in &groups {
             let share = f64::from(group.instant) / 65536.0;

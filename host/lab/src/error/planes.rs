@@ -282,13 +282,13 @@ fn mapped(map: &DMat3, place: DVec2) -> DVec2 {
     p.truncate() / p.z
 }
 
-/// The middle of a plane, in exposures from the first photon on.
-fn middle_of(schedule: &PlaneSchedule, plane: usize) -> f64 {
+/// The middle of a plane of a frame whose planes last equally long, in exposures from the first photon on.
+pub fn middle_of(schedule: &PlaneSchedule, plane: usize) -> f64 {
     (plane as f64 + 0.5) / schedule.len() as f64
 }
 
-/// The centre of the light of a frame, in exposures from the first photon on.
-fn centre_of(schedule: &PlaneSchedule) -> f64 {
+/// The centre of the light of such a frame, in exposures from the first photon on.
+pub fn centre_of(schedule: &PlaneSchedule) -> f64 {
     let light = |i: usize| f64::from(1u32 << schedule.planes()[i].bit);
     let all: f64 = (0..schedule.len()).map(light).sum();
     (0..schedule.len()).map(|i| middle_of(schedule, i) * light(i)).sum::<f64>() / all

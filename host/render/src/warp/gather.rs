@@ -139,7 +139,7 @@ impl Drawn<'_> {
 }
 
 /// True in the area in which the light of `mover` can fall.
-fn within(mover: &Mover, pixel: [i32; 2]) -> bool {
+pub fn within(mover: &Mover, pixel: [i32; 2]) -> bool {
     (0..2).all(|c| pixel[c] >= mover.lower[c] && pixel[c] < mover.upper[c])
 }
 
