@@ -22,8 +22,9 @@ use drm::control::{
 };
 use drm::{ClientCapability, Device, DriverCapability};
 
-use crate::kms::{Connector, Domain, Flip, Kms, KmsError, Owner, Picture, Pixels, Property, Setup};
+use crate::kms::{Connector, Domain, Kms, Owner, Property, Setup};
 use crate::mode::Timing;
+use crate::scan_out::{DisplayError, Flip, Picture, Pixels, ScanOut};
 
 /// How long another program may need to let go of the displays.
 const MASTER_PATIENCE: Duration = Duration::from_millis(1500);
@@ -76,10 +77,10 @@ pub struct Card {
     output: Option<Output>,
 }
 
-fn call(doing: &'static str) -> impl Fn(io::Error) -> KmsError {
+fn call(doing: &'static str) -> impl Fn(io::Error) -> DisplayError {
     move |source| match source.raw_os_error() {
-        Some(libc::ENODEV | libc::ENXIO) => KmsError::Gone,
-        _ => KmsError::Call { doing, source },
+        Some(libc::ENODEV | libc::ENXIO) => DisplayError::Gone,
+        _ => DisplayError::Call { doing, source },
     }
 }
 
@@ -103,7 +104,7 @@ pub fn cards() -> Vec<PathBuf> {
 ///
 /// # Errors
 /// No such card; or as [`Card::open`].
-pub fn open_for(card: Option<&Path>, connector: Option<&str>) -> Result<Box<dyn Kms>, KmsError> {
+pub fn open_for(card: Option<&Path>, connector: Option<&str>) -> Result<Box<dyn Kms>, DisplayError> {
     if let Some(path) = card {
         return Ok(Box::new(Card::open(path)?));
     }
@@ -122,7 +123,7 @@ pub fn open_for(card: Option<&Path>, connector: Option<&str>) -> Result<Box<dyn 
             Err(e) => first_error = first_error.or(Some(e)),
         }
     }
-    Err(first_error.unwrap_or_else(|| KmsError::NoCard("/dev/dri/card*".into())))
+    Err(first_error.unwrap_or_else(|| DisplayError::NoCard("/dev/dri/card*".into())))
 }
 
 impl Card {
@@ -131,7 +132,7 @@ impl Card {
     /// # Errors
     /// No such card, no right to open it, another program that drives its displays, or a driver without atomic mode
     /// setting or monotonic stamps.
-    pub fn open(path: &Path) -> Result<Self, KmsError> {
+    pub fn open(path: &Path) -> Result<Self, DisplayError> {
         let limit = Instant::now() + MASTER_PATIENCE;
         loop {
             // Whoever opens a card that nobody drives may drive it; without special rights only then.
@@ -140,7 +141,7 @@ impl Card {
                 return Ok(card);
             }
             if Instant::now() >= limit {
-                return Err(KmsError::InUse(card.name()));
+                return Err(DisplayError::InUse(card.name()));
             }
             drop(card);
             std::thread::sleep(STEP.saturating_mul(20));
@@ -151,7 +152,7 @@ impl Card {
     ///
     /// # Errors
     /// As [`Card::open`], except for another program.
-    pub fn look(path: &Path) -> Result<Self, KmsError> {
+    pub fn look(path: &Path) -> Result<Self, DisplayError> {
         let name = path.display().to_string();
         let file = OpenOptions::new()
             .read(true)
@@ -159,12 +160,12 @@ impl Card {
             .custom_flags(libc::O_NONBLOCK | libc::O_CLOEXEC)
             .open(path)
             .map_err(|e| match e.kind() {
-                io::ErrorKind::NotFound => KmsError::NoCard(name.clone()),
-                io::ErrorKind::PermissionDenied => KmsError::Denied(name.clone()),
-                _ => KmsError::Call { doing: "open the graphics card", source: e },
+                io::ErrorKind::NotFound => DisplayError::NoCard(name.clone()),
+                io::ErrorKind::PermissionDenied => DisplayError::Denied(name.clone()),
+                _ => DisplayError::Call { doing: "open the graphics card", source: e },
             })?;
         let node = Node(file.into());
-        let unsuitable = |what: &str| KmsError::Unsuitable { card: name.clone(), what: what.into() };
+        let unsuitable = |what: &str| DisplayError::Unsuitable { card: name.clone(), what: what.into() };
         let atomic = node.set_client_capability(ClientCapability::UniversalPlanes, true);
         if atomic.and_then(|()| node.set_client_capability(ClientCapability::Atomic, true)).is_err() {
             return Err(unsuitable(
@@ -189,7 +190,7 @@ impl Card {
     }
 
     /// What drives `connector`: its present CRTC or the first possible one, and a primary plane for it.
-    fn route(&self, info: &connector::Info) -> Result<Option<Route>, KmsError> {
+    fn route(&self, info: &connector::Info) -> Result<Option<Route>, DisplayError> {
         let resources = self.node.resource_handles().map_err(call("list the card's resources"))?;
         let mut crtcs = Vec::new();
         for encoder in info.current_encoder().into_iter().chain(info.encoders().iter().copied()) {
@@ -250,7 +251,7 @@ impl Card {
         }
     }
 
-    fn memory(&self, (width, height): (u32, u32)) -> Result<Memory, KmsError> {
+    fn memory(&self, (width, height): (u32, u32)) -> Result<Memory, DisplayError> {
         let made = call("make a picture in the display's memory");
         let buffer = self.node.create_dumb_buffer((width, height), DrmFourcc::Xrgb8888, 32).map_err(&made)?;
         let framebuffer = self.node.add_framebuffer(&buffer, 24, 32).map_err(&made)?;
@@ -278,7 +279,7 @@ impl Card {
         setup: &Setup,
         mode_blob: u64,
         black: framebuffer::Handle,
-    ) -> Result<AtomicModeReq, KmsError> {
+    ) -> Result<AtomicModeReq, DisplayError> {
         let mut request = AtomicModeReq::new();
         let (width, height) = setup.timing.size();
         let (width, height) = (u64::from(width), u64::from(height));
@@ -324,19 +325,19 @@ impl Card {
         object: T,
         name: &str,
         value: u64,
-    ) -> Result<(), KmsError> {
+    ) -> Result<(), DisplayError> {
         let Some((handle, ..)) = self.property(object, name) else {
             let what = format!("its driver has no property {name:?}; use another card or a newer kernel");
-            return Err(KmsError::Unsuitable { card: self.name(), what });
+            return Err(DisplayError::Unsuitable { card: self.name(), what });
         };
         request.add_raw_property(object.into(), handle, value);
         Ok(())
     }
 
-    fn find(&self, name: &str) -> Result<connector::Info, KmsError> {
+    fn find(&self, name: &str) -> Result<connector::Info, DisplayError> {
         let resources = self.node.resource_handles().map_err(call("list the card's resources"))?;
         let all = resources.connectors().iter().filter_map(|c| self.node.get_connector(*c, false).ok());
-        all.into_iter().find(|info| info.to_string() == name).ok_or(KmsError::Gone)
+        all.into_iter().find(|info| info.to_string() == name).ok_or(DisplayError::Gone)
     }
 
     fn show(
@@ -344,12 +345,14 @@ impl Card {
         crtc: crtc::Handle,
         picture: framebuffer::Handle,
         flags: PageFlipFlags,
-    ) -> Result<(), KmsError> {
+    ) -> Result<(), DisplayError> {
         self.node.page_flip(crtc, picture, flags, None).map_err(|e| match e.raw_os_error() {
-            Some(libc::EBUSY) => KmsError::Busy,
+            Some(libc::EBUSY) => DisplayError::Busy,
             // What is gone is refused in several ways.
-            Some(libc::ENODEV | libc::ENXIO | libc::EINVAL | libc::EACCES | libc::EPERM) => KmsError::Gone,
-            _ => KmsError::Call { doing: "hand over a picture", source: e },
+            Some(libc::ENODEV | libc::ENXIO | libc::EINVAL | libc::EACCES | libc::EPERM) => {
+                DisplayError::Gone
+            }
+            _ => DisplayError::Call { doing: "hand over a picture", source: e },
         })
     }
 }
@@ -391,7 +394,7 @@ impl Kms for Card {
         self.path.display().to_string()
     }
 
-    fn connectors(&mut self) -> Result<Vec<Connector>, KmsError> {
+    fn connectors(&mut self) -> Result<Vec<Connector>, DisplayError> {
         let resources = self.node.resource_handles().map_err(call("list the card's resources"))?;
         let mut all = Vec::new();
         for handle in resources.connectors() {
@@ -416,10 +419,10 @@ impl Kms for Card {
         Ok(all)
     }
 
-    fn start(&mut self, setup: &Setup) -> Result<(), KmsError> {
+    fn start(&mut self, setup: &Setup) -> Result<(), DisplayError> {
         self.release();
         let info = self.find(&setup.connector)?;
-        let route = self.route(&info)?.ok_or_else(|| KmsError::Unsuitable {
+        let route = self.route(&info)?.ok_or_else(|| DisplayError::Unsuitable {
             card: self.name(),
             what: format!(
                 "{} has no free CRTC with a primary plane; unplug another display",
@@ -444,7 +447,9 @@ impl Kms for Card {
             .map_err(call("set the mode with these properties (the driver refuses them together)"))?;
         self.node.atomic_commit(AtomicCommitFlags::ALLOW_MODESET, request).map_err(call("set the mode"))
     }
+}
 
+impl ScanOut for Card {
     fn pixels(&mut self, frame: usize) -> Pixels<'_> {
         let output = self.output.as_mut().expect("started");
         let memory = &mut output.pictures[1 + frame];
@@ -452,8 +457,8 @@ impl Kms for Card {
         Pixels { bytes: &mut memory.map, pitch }
     }
 
-    fn flip(&mut self, picture: Picture) -> Result<(), KmsError> {
-        let output = self.output.as_ref().ok_or(KmsError::Gone)?;
+    fn flip(&mut self, picture: Picture) -> Result<(), DisplayError> {
+        let output = self.output.as_ref().ok_or(DisplayError::Gone)?;
         let index = match picture {
             Picture::Black => 0,
             Picture::Frame(frame) => 1 + frame,
@@ -475,15 +480,12 @@ impl Kms for Card {
         }
     }
 
-    fn is_connected(&mut self) -> bool {
-        let Some(status) = self.output.as_ref().and_then(|output| output.status.as_ref()) else {
-            return true;
-        };
+    fn lost(&mut self) -> Option<DisplayError> {
+        let status = self.output.as_ref().and_then(|output| output.status.as_ref())?;
         let mut word = [0; 16];
-        match status.read_at(&mut word, 0) {
-            Ok(n) => !word[..n].starts_with(b"disconnected"),
-            Err(_) => false,
-        }
+        let is_connected =
+            matches!(status.read_at(&mut word, 0), Ok(n) if !word[..n].starts_with(b"disconnected"));
+        (!is_connected).then_some(DisplayError::Gone)
     }
 
     fn now_ns(&self) -> i64 {
@@ -494,7 +496,7 @@ impl Kms for Card {
     fn blacken(&mut self) {
         let Some(output) = self.output.as_ref() else { return };
         let limit = Instant::now() + BLACK_PATIENCE;
-        while let Err(KmsError::Busy) =
+        while let Err(DisplayError::Busy) =
             self.show(output.route.crtc, output.pictures[0].framebuffer, PageFlipFlags::empty())
         {
             if Instant::now() >= limit {
@@ -525,15 +527,15 @@ impl Drop for Card {
     }
 }
 
-/// The guardian's side of [`Kms::guarded`]: shows the picture `black` on `crtc` with the descriptor that it was started
+/// The guardian's side of [`ScanOut::guarded`]: shows the picture `black` on `crtc` with the descriptor that it was started
 /// with, and keeps it there until another program drives the displays, for `hold` at most. The end of the last program that
 /// holds a card gives its displays back to the console.
 ///
 /// # Errors
 /// The kernel does not take the picture.
-pub fn show_black(descriptor: OwnedFd, crtc: u32, black: u32, hold: Duration) -> Result<(), KmsError> {
+pub fn show_black(descriptor: OwnedFd, crtc: u32, black: u32, hold: Duration) -> Result<(), DisplayError> {
     let node = Node(descriptor);
-    let handle = |n: u32| std::num::NonZeroU32::new(n).ok_or(KmsError::Gone);
+    let handle = |n: u32| std::num::NonZeroU32::new(n).ok_or(DisplayError::Gone);
     let (crtc, black) = (crtc::Handle::from(handle(crtc)?), framebuffer::Handle::from(handle(black)?));
     let limit = Instant::now() + BLACK_PATIENCE.saturating_mul(10);
     loop {

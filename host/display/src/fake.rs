@@ -9,8 +9,9 @@ use std::sync::Arc;
 use dpm_device::time::HostClock;
 use dpm_handoff::path::Lock;
 
-use crate::kms::{Connector, Domain, Flip, Kms, KmsError, Owner, Picture, Pixels, Property, Setup};
+use crate::kms::{Connector, Domain, Kms, Owner, Property, Setup};
 use crate::mode::Timing;
+use crate::scan_out::{DisplayError, Flip, Picture, Pixels, ScanOut};
 
 /// One scanned frame.
 #[derive(Clone, Debug, PartialEq, Eq)]
@@ -186,7 +187,7 @@ impl Kms for FakeKms {
         "fake card".into()
     }
 
-    fn connectors(&mut self) -> Result<Vec<Connector>, KmsError> {
+    fn connectors(&mut self) -> Result<Vec<Connector>, DisplayError> {
         Ok(self.with(|s| {
             let mut all = s.connectors.clone();
             if !s.is_plugged {
@@ -199,13 +200,13 @@ impl Kms for FakeKms {
         }))
     }
 
-    fn start(&mut self, setup: &Setup) -> Result<(), KmsError> {
+    fn start(&mut self, setup: &Setup) -> Result<(), DisplayError> {
         if self.with(|s| !s.is_plugged) {
-            return Err(KmsError::Gone);
+            return Err(DisplayError::Gone);
         }
         if self.with(|s| s.refuses) {
             let source = std::io::Error::from_raw_os_error(libc::EINVAL);
-            return Err(KmsError::Call { doing: "set the mode", source });
+            return Err(DisplayError::Call { doing: "set the mode", source });
         }
         let (width, height) = setup.timing.size();
         self.pitch = 4 * width as usize + PADDING;
@@ -220,7 +221,9 @@ impl Kms for FakeKms {
         });
         Ok(())
     }
+}
 
+impl ScanOut for FakeKms {
     fn pixels(&mut self, frame: usize) -> Pixels<'_> {
         self.scan();
         if [Some(self.front), self.waiting].contains(&Some(Picture::Frame(frame))) {
@@ -229,14 +232,14 @@ impl Kms for FakeKms {
         Pixels { bytes: &mut self.buffers[frame], pitch: self.pitch }
     }
 
-    fn flip(&mut self, picture: Picture) -> Result<(), KmsError> {
+    fn flip(&mut self, picture: Picture) -> Result<(), DisplayError> {
         self.scan();
         if self.with(|s| !s.is_plugged) {
-            return Err(KmsError::Gone);
+            return Err(DisplayError::Gone);
         }
         // The kernel is busy until its event was made, not until it was read.
         if self.waiting.is_some() {
-            return Err(KmsError::Busy);
+            return Err(DisplayError::Busy);
         }
         self.waiting = Some(picture);
         Ok(())
@@ -247,8 +250,8 @@ impl Kms for FakeKms {
         self.taken.drain(..).for_each(sink);
     }
 
-    fn is_connected(&mut self) -> bool {
-        self.with(|s| s.is_plugged)
+    fn lost(&mut self) -> Option<DisplayError> {
+        self.with(|s| (!s.is_plugged).then_some(DisplayError::Gone))
     }
 
     fn now_ns(&self) -> i64 {

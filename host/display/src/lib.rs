@@ -4,7 +4,8 @@
 //! A display is the firmware of [`dpm_device::projector`] with the vertical blanks as its clock: one slot of the link is one
 //! blank. [`mode`] says what a mode is, [`set_up`] chooses connector, mode and properties or says why not, [`encoding`] puts
 //! planes into pixels, [`pacer`] follows the blanks, [`panel`] is the state machine, and [`transport`] its thread at the end
-//! of an in-process cable. [`kms`] is what is asked of the kernel, [`card`] the kernel, [`fake`] the one of tests.
+//! of an in-process cable. [`scan_out`] is what a panel asks of what shows its pictures, [`kms`] what is asked of the kernel
+//! besides, [`card`] the kernel, [`fake`] the one of tests, and [`window`] a window for a desk without a projector.
 //!
 //! **Nothing of this has run on real hardware yet.**
 
@@ -15,5 +16,7 @@ pub mod kms;
 pub mod mode;
 pub mod pacer;
 pub mod panel;
+pub mod scan_out;
 pub mod set_up;
 pub mod transport;
+pub mod window;

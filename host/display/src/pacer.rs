@@ -27,7 +27,7 @@ pub enum NoPace {
     NoCount,
     /// Other than the mode's.
     #[error(
-        "the display runs at {measured:.3} frames/s although its mode says {nominal:.3}: variable refresh, or a driver that does not stamp"
+        "the display runs at {measured:.3} frames/s although its mode or the rig file says {nominal:.3}: variable refresh, or a driver that does not stamp"
     )]
     OtherRate {
         /// As measured.

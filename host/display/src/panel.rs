@@ -14,9 +14,8 @@ use dpm_device::transport::{Lane, LinkDevice};
 use dpm_handoff::path::Lock;
 
 use crate::encoding::PixelMap;
-use crate::kms::{Flip, Kms, KmsError, Picture};
 use crate::pacer::{Pacer, LEARNED};
-use crate::set_up::Plan;
+use crate::scan_out::{DisplayError, Flip, Picture, ScanOut};
 
 /// A picture that was not taken for this long means that the display gives no blanks any more, nanoseconds.
 const LOST_AFTER_NS: i64 = 500_000_000;
@@ -58,15 +57,30 @@ struct InFlight {
     since: HostTime,
 }
 
+/// What a panel has to know of its display and its link.
+#[derive(Clone, Copy, Debug)]
+pub struct PanelSettings {
+    /// Mirrors, which are pixels here.
+    pub raster: Raster,
+    /// Planes of a frame.
+    pub planes: usize,
+    /// Where the planes go in a pixel.
+    pub map: PixelMap,
+    /// Vertical blanks a second.
+    pub rate: FrameRate,
+    /// From the choice of a frame to its first pixel, nanoseconds.
+    pub lead_ns: i64,
+}
+
 /// A projector whose panel is a display.
-pub struct Panel<K: Kms> {
-    kms: K,
+pub struct Panel<S: ScanOut> {
+    out: S,
     firmware: ProjectorFirmware,
     map: PixelMap,
     raster: Raster,
     rate: FrameRate,
     lead_ns: i64,
-    /// What is added to the kernel's time to get the rig's.
+    /// What is added to the time of the display's stamps to get the rig's.
     offset_ns: i64,
     /// `None` while the blanks are learned.
     pacer: Option<Pacer>,
@@ -86,23 +100,15 @@ pub struct Panel<K: Kms> {
     is_lost: bool,
 }
 
-impl<K: Kms> Panel<K> {
-    /// The panel behind `kms`, which has been started by `plan` and shows black. `clock` is the rig's. It allocates
-    /// everything here.
-    pub fn new(
-        kms: K,
-        plan: &Plan,
-        raster: Raster,
-        planes: usize,
-        serial: u64,
-        clock: &dyn HostClock,
-    ) -> Self {
-        let rate = plan.setup.timing.rate().expect("the plan was checked");
+impl<S: ScanOut> Panel<S> {
+    /// The panel in front of `out`, which shows black. `clock` is the rig's. It allocates everything here.
+    pub fn new(out: S, settings: PanelSettings, serial: u64, clock: &dyn HostClock) -> Self {
+        let PanelSettings { raster, planes, map, rate, lead_ns } = settings;
         // The two clocks run alike. Of some readings, the closest pair tells how far they are apart.
         let pairs = (0..8).map(|_| {
             let before = clock.now();
-            let kernel = kms.now_ns();
-            (clock.now().ns_since(before), before.0 - kernel)
+            let own = out.now_ns();
+            (clock.now().ns_since(before), before.0 - own)
         });
         let (width, low) = pairs.min().unwrap_or((0, 0));
         let now = clock.now();
@@ -117,12 +123,12 @@ impl<K: Kms> Panel<K> {
             ..FirmwareConfig::new(raster)
         };
         Self {
-            kms,
+            out,
             firmware: ProjectorFirmware::new(config),
-            map: plan.map,
+            map,
             raster,
             rate,
-            lead_ns: plan.lead_ns,
+            lead_ns,
             offset_ns: low + width / 2,
             pacer: None,
             learned: Vec::with_capacity(LEARNED),
@@ -148,9 +154,9 @@ impl<K: Kms> Panel<K> {
         &self.firmware
     }
 
-    /// The kernel's side.
-    pub fn kms(&mut self) -> &mut K {
-        &mut self.kms
+    /// What shows the pictures.
+    pub fn out(&mut self) -> &mut S {
+        &mut self.out
     }
 
     /// The clock that follows the blanks; `None` while they are learned.
@@ -203,14 +209,14 @@ impl<K: Kms> Panel<K> {
         if let Ok(mut lost) = self.counts.lost.lock() {
             *lost = why;
         }
-        self.kms.blacken();
+        self.out.blacken();
     }
 
     fn look_at_connector(&mut self, now: HostTime) {
         if now >= self.connector_at {
             self.connector_at = now.plus_ns(CONNECTOR_NS);
-            if !self.kms.is_connected() {
-                self.lose(KmsError::Gone.to_string());
+            if let Some(why) = self.out.lost() {
+                self.lose(why.to_string());
             }
         }
     }
@@ -219,7 +225,7 @@ impl<K: Kms> Panel<K> {
     fn take_flips(&mut self, now: HostTime) -> Option<Flip> {
         let mut flips = [Flip { sequence: 0, at_ns: 0 }; FLIPS];
         let mut n = 0;
-        self.kms.flips(&mut |flip| {
+        self.out.flips(&mut |flip| {
             if n < FLIPS {
                 flips[n] = flip;
                 n += 1;
@@ -313,14 +319,14 @@ impl<K: Kms> Panel<K> {
         }
         let back = usize::from(self.front == Picture::Frame(0));
         let Some(planes) = self.firmware.lit_planes() else { return Picture::Black };
-        let pixels = self.kms.pixels(back);
+        let pixels = self.out.pixels(back);
         self.map.write(self.raster, planes, pixels.bytes, pixels.pitch);
         self.holds[back] = Some(frame);
         Picture::Frame(back)
     }
 
     fn hand_over(&mut self, now: HostTime, picture: Picture, for_blank: Option<u64>) {
-        match self.kms.flip(picture) {
+        match self.out.flip(picture) {
             Ok(()) => {
                 self.in_flight = Some(InFlight { picture, for_blank, since: now });
                 self.firmware.panel_busy(true);
@@ -330,7 +336,7 @@ impl<K: Kms> Panel<K> {
                 };
             }
             // The kernel is busy with something else than a picture of ours. The next slot tries again.
-            Err(KmsError::Busy) => {
+            Err(DisplayError::Busy) => {
                 self.firmware.panel_busy(true);
                 self.is_refused = true;
                 self.look_at = now.plus_ns(LOOK_NS);
@@ -343,7 +349,7 @@ impl<K: Kms> Panel<K> {
     }
 }
 
-impl<K: Kms> LinkDevice for Panel<K> {
+impl<S: ScanOut> LinkDevice for Panel<S> {
     fn receive(&mut self, now: HostTime, lane: Lane, bytes: &[u8]) {
         self.advance(now);
         if self.pacer.is_some() && !self.is_lost {
@@ -371,9 +377,9 @@ impl<K: Kms> LinkDevice for Panel<K> {
 }
 
 /// Black on every way out of the thread, a panic's too.
-impl<K: Kms> Drop for Panel<K> {
+impl<S: ScanOut> Drop for Panel<S> {
     fn drop(&mut self) {
-        self.kms.blacken();
+        self.out.blacken();
         if let Ok(mut lost) = self.counts.lost.lock() {
             if lost.is_empty() {
                 *lost = "scan-out has ended".into();

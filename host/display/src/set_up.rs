@@ -6,6 +6,7 @@ use dpm_device::time::FrameRate;
 use crate::encoding::{Encoding, PixelMap};
 use crate::kms::{Connector, Domain, Owner, Property, Setup};
 use crate::mode::{written, ModeWish, Timing};
+use crate::panel::PanelSettings;
 
 /// What a rig file says of its display.
 #[derive(Clone, Debug)]
@@ -34,10 +35,8 @@ pub struct DisplaySettings {
 pub struct Plan {
     /// What the kernel is told.
     pub setup: Setup,
-    /// Where the planes go.
-    pub map: PixelMap,
-    /// From the choice of a frame to its first pixel, nanoseconds.
-    pub lead_ns: i64,
+    /// What the panel has to know.
+    pub panel: PanelSettings,
     /// What the operator should know.
     pub warnings: Vec<String>,
 }
@@ -119,7 +118,8 @@ pub fn plan(connectors: &[Connector], settings: &DisplaySettings) -> Result<Plan
     let mut warnings = Vec::new();
     let properties = properties(connector, settings, &mut warnings)?;
     let setup = Setup { connector: connector.name.clone(), timing, properties };
-    Ok(Plan { setup, map, lead_ns, warnings })
+    let (raster, planes) = (settings.raster, settings.schedule.len());
+    Ok(Plan { setup, panel: PanelSettings { raster, planes, map, rate: settings.rate, lead_ns }, warnings })
 }
 
 fn connector<'a>(all: &'a [Connector], wish: Option<&str>) -> Result<&'a Connector, Refusal> {

@@ -16,9 +16,10 @@ use dpm_device::transport::inproc::{threaded, DeviceEnd, HostEnd};
 use dpm_device::transport::{Lane, SendError, Transport, TransportError};
 use dpm_handoff::wake::WaitPolicy;
 
-use crate::kms::{Kms, KmsError};
-use crate::panel::{DisplayCounts, Panel};
-use crate::set_up::{plan, DisplaySettings, Plan};
+use crate::kms::Kms;
+use crate::panel::{DisplayCounts, Panel, PanelSettings};
+use crate::scan_out::{DisplayError, ScanOut};
+use crate::set_up::{plan, DisplaySettings};
 
 /// Buffers of the cable: one is being filled, one is being read, one is spare.
 const CABLE_BUFFERS: usize = 3;
@@ -27,8 +28,41 @@ const REST_NS: i64 = 100_000_000;
 /// How long the panel's thread may need to end. Afterwards it is left behind; the process's end ends it.
 const END_WITHIN: Duration = Duration::from_millis(500);
 
-/// Opens the card anew.
-pub type Opener = Arc<dyn Fn() -> Result<Box<dyn Kms>, KmsError> + Send + Sync>;
+/// What shows pictures and shows black now, and what a panel must know of it.
+pub struct Shown {
+    /// What shows pictures.
+    pub out: Box<dyn ScanOut>,
+    /// What the panel has to know.
+    pub panel: PanelSettings,
+    /// Its name in messages.
+    pub name: String,
+    /// What the operator should know.
+    pub warnings: Vec<String>,
+}
+
+/// Opens a display, sets it up, and shows black. It may take seconds.
+pub type Opener = Arc<dyn Fn() -> Result<Shown, TransportError> + Send + Sync>;
+
+/// The opener of a display on a graphics card that `card` opens, set up as `settings` say.
+pub fn on_card(
+    card: impl Fn() -> Result<Box<dyn Kms>, DisplayError> + Send + Sync + 'static,
+    settings: DisplaySettings,
+) -> Opener {
+    Arc::new(move || {
+        let device = || match &settings.connector {
+            Some(connector) => format!("display {connector}"),
+            None => "display".into(),
+        };
+        let failed = |e: DisplayError| e.of(device());
+        let mut kms = card().map_err(failed)?;
+        let connectors = kms.connectors().map_err(failed)?;
+        let refused = |why: String| TransportError::Unsuitable { device: device(), why };
+        let plan = plan(&connectors, &settings).map_err(|e| refused(e.0))?;
+        kms.start(&plan.setup).map_err(failed)?;
+        let name = format!("display {} ({})", plan.setup.connector, plan.setup.timing);
+        Ok(Shown { out: kms, panel: plan.panel, name, warnings: plan.warnings })
+    })
+}
 
 /// How the program starts the guardian of a display: the command without the display's own arguments.
 static GUARDIAN: OnceLock<Vec<OsString>> = OnceLock::new();
@@ -39,10 +73,9 @@ pub fn set_guardian(command: Vec<OsString>) {
     let _ = GUARDIAN.set(command);
 }
 
-/// A card whose display shows black, and what was chosen for it.
+/// A display that shows black, with its guardian.
 struct Opened {
-    kms: Box<dyn Kms>,
-    plan: Plan,
+    shown: Shown,
     guardian: Option<Guardian>,
 }
 
@@ -57,7 +90,6 @@ struct Line {
 /// A display at the end of a link.
 pub struct DisplayTransport {
     opener: Opener,
-    settings: DisplaySettings,
     policy: WaitPolicy,
     priority: u32,
     name: String,
@@ -68,31 +100,23 @@ pub struct DisplayTransport {
     warnings: Vec<String>,
 }
 
-fn open(opener: &Opener, settings: &DisplaySettings) -> Result<Opened, TransportError> {
-    let device = || format!("display {}", settings.connector.as_deref().unwrap_or(""));
-    let refused = |why: String| TransportError::Unsuitable { device: device().trim_end().into(), why };
-    let of_kms = |e: KmsError| match e {
-        KmsError::Gone => TransportError::Unplugged { device: device() },
-        e => refused(e.to_string()),
-    };
-    let mut kms = opener().map_err(of_kms)?;
-    let connectors = kms.connectors().map_err(of_kms)?;
-    let mut plan = plan(&connectors, settings).map_err(|e| refused(e.0))?;
-    kms.start(&plan.setup).map_err(of_kms)?;
-    let guardian = match guardian(kms.as_ref()) {
+fn open(opener: &Opener) -> Result<Opened, TransportError> {
+    let mut shown = opener()?;
+    let guardian = match guardian(shown.out.as_ref()) {
         Ok(guardian) => guardian,
         Err(e) => {
-            plan.warnings
+            shown
+                .warnings
                 .push(format!("cannot start the process that shows black if this run is killed: {e}"));
             None
         }
     };
-    Ok(Opened { kms, plan, guardian })
+    Ok(Opened { shown, guardian })
 }
 
-fn guardian(kms: &dyn Kms) -> std::io::Result<Option<Guardian>> {
+fn guardian(out: &dyn ScanOut) -> std::io::Result<Option<Guardian>> {
     let (Some((program, first)), Some((descriptor, arguments))) =
-        (GUARDIAN.get().and_then(|command| command.split_first()), kms.guarded())
+        (GUARDIAN.get().and_then(|command| command.split_first()), out.guarded())
     else {
         return Ok(None);
     };
@@ -102,22 +126,16 @@ fn guardian(kms: &dyn Kms) -> std::io::Result<Option<Guardian>> {
 }
 
 impl DisplayTransport {
-    /// Opens the card by `opener`, sets the mode, and shows black. Its thread starts with the rig's clock; it rests by
-    /// `policy`, under SCHED_FIFO at `priority` unless that is 0.
+    /// Opens a display by `opener`, which shows black then. Its thread starts with the rig's clock; it rests by `policy`,
+    /// under SCHED_FIFO at `priority` unless that is 0.
     ///
     /// # Errors
-    /// The display is not there, or cannot be used as `settings` say: what is wrong, and what to do.
-    pub fn open(
-        opener: Opener,
-        settings: DisplaySettings,
-        policy: WaitPolicy,
-        priority: u32,
-    ) -> Result<Self, TransportError> {
-        let opened = open(&opener, &settings)?;
-        let name = format!("display {} ({})", opened.plan.setup.connector, opened.plan.setup.timing);
-        let warnings = opened.plan.warnings.clone();
+    /// The display is not there, or cannot be used as it was asked for: what is wrong, and what to do.
+    pub fn open(opener: Opener, policy: WaitPolicy, priority: u32) -> Result<Self, TransportError> {
+        let opened = open(&opener)?;
+        let (name, warnings) = (opened.shown.name.clone(), opened.shown.warnings.clone());
         let (opened, clock, line, opening) = (Some(opened), None, None, None);
-        Ok(Self { opener, settings, policy, priority, name, clock, opened, line, opening, warnings })
+        Ok(Self { opener, policy, priority, name, clock, opened, line, opening, warnings })
     }
 
     /// What the operator should know.
@@ -132,17 +150,16 @@ impl DisplayTransport {
 
     /// Starts the thread of a panel that was opened.
     fn run(&mut self, now: HostTime) {
-        let Some(Opened { kms, plan, guardian }) = self.opened.take() else { return };
+        let Some(Opened { shown, guardian }) = self.opened.take() else { return };
         let clock = self.clock.get_or_insert_with(|| {
             // Nobody gave a clock: the caller's time goes on from here.
             let start = Instant::now();
             Arc::new(move || now.plus_ns(i64::try_from(start.elapsed().as_nanos()).unwrap_or(i64::MAX)))
         });
-        let settings = &self.settings;
-        let planes = settings.schedule.len();
-        let frame_bytes = packet_bytes(settings.raster.plane_bytes()) * planes + packet_bytes(COMMIT_BYTES);
+        let plane_bytes = packet_bytes(shown.panel.raster.plane_bytes());
+        let frame_bytes = plane_bytes * shown.panel.planes + packet_bytes(COMMIT_BYTES);
         let (host, device) = threaded(frame_bytes, CABLE_BUFFERS, self.policy);
-        let panel = Panel::new(kms, &plan, settings.raster, planes, 0, clock.as_ref());
+        let panel = Panel::new(shown.out, shown.panel, 0, clock.as_ref());
         let counts = panel.counts();
         let (clock, priority) = (clock.clone(), self.priority);
         let thread = std::thread::Builder::new().name("dpm-display".into()).spawn(move || {
@@ -160,7 +177,7 @@ impl DisplayTransport {
     fn lost(&self) -> TransportError {
         let device = self.name.clone();
         match self.line.as_ref().and_then(|line| line.counts.lost()) {
-            Some(why) if why != KmsError::Gone.to_string() => TransportError::Unsuitable { device, why },
+            Some(why) if why != DisplayError::Gone.to_string() => TransportError::Unsuitable { device, why },
             _ => TransportError::Unplugged { device },
         }
     }
@@ -183,7 +200,7 @@ impl DisplayTransport {
 }
 
 /// Runs `panel` until the host's end of `cable` is dropped or the display is lost. Every way out is black.
-fn serve(mut panel: Panel<Box<dyn Kms>>, mut cable: DeviceEnd, clock: &dyn HostClock) {
+fn serve(mut panel: Panel<Box<dyn ScanOut>>, mut cable: DeviceEnd, clock: &dyn HostClock) {
     while cable.serve(|| clock.now(), &mut panel) && !panel.is_lost() {
         panel.advance(clock.now());
         let limit = clock.now().plus_ns(REST_NS);
@@ -239,9 +256,9 @@ impl Transport for DisplayTransport {
         // Setting a mode takes a second on some displays: a thread of its own does it.
         let Some(opening) = &self.opening else {
             let (done, opening) = channel();
-            let (opener, settings) = (self.opener.clone(), self.settings.clone());
+            let opener = self.opener.clone();
             let started = std::thread::Builder::new().name("dpm-display-open".into()).spawn(move || {
-                let _ = done.send(open(&opener, &settings));
+                let _ = done.send(open(&opener));
             });
             if started.is_ok() {
                 self.opening = Some(opening);
@@ -270,8 +287,8 @@ impl Transport for DisplayTransport {
 impl Drop for DisplayTransport {
     fn drop(&mut self) {
         self.end();
-        if let Some(Opened { mut kms, guardian, .. }) = self.opened.take() {
-            kms.blacken();
+        if let Some(Opened { mut shown, guardian }) = self.opened.take() {
+            shown.out.blacken();
             if let Some(guardian) = guardian {
                 guardian.dismiss();
             }

@@ -39,7 +39,7 @@ fn everything_that_keeps_bits_exact_is_set() {
     assert_eq!(set(Owner::Crtc, "CTM"), None, "the driver has none");
     assert!(plan.warnings.is_empty(), "{:?}", plan.warnings);
     // 3 ms, and half of the blank of 6 ms.
-    assert_eq!(plan.lead_ns, 6_000_000);
+    assert_eq!(plan.panel.lead_ns, 6_000_000);
 }
 
 #[test]

@@ -23,10 +23,10 @@ use dpm_device::time::{HostClock, HostTime};
 use dpm_device::transport::Transport;
 use dpm_display::card::{cards, open_for, show_black, Card};
 use dpm_display::encoding::{Encoding, PixelMap};
-use dpm_display::kms::KmsError;
 use dpm_display::mode::{ModeWish, Timing};
+use dpm_display::scan_out::DisplayError;
 use dpm_display::set_up::DisplaySettings;
-use dpm_display::transport::{set_guardian, DisplayTransport};
+use dpm_display::transport::{on_card, set_guardian, DisplayTransport};
 use dpm_handoff::wake::WaitPolicy;
 
 /// Small, because the machine is emulated: 160 x 120 at 60 frames/s.
@@ -83,8 +83,8 @@ fn settings(encoding: Encoding) -> DisplaySettings {
 fn open(encoding: Encoding) -> (DisplayTransport, Arc<dyn HostClock>) {
     let start = Instant::now();
     let clock: Arc<dyn HostClock> = Arc::new(move || HostTime(start.elapsed().as_nanos() as i64));
-    let opener = Arc::new(|| open_for(None, Some("Virtual-1")));
-    let mut display = DisplayTransport::open(opener, settings(encoding), WaitPolicy::Park, 0).expect("vkms");
+    let opener = on_card(|| open_for(None, Some("Virtual-1")), settings(encoding));
+    let mut display = DisplayTransport::open(opener, WaitPolicy::Park, 0).expect("vkms");
     display.set_clock(clock.clone());
     (display, clock)
 }
@@ -205,16 +205,13 @@ fn refusals() {
     let paths = cards();
     println!("  cards: {paths:?}");
     let mine = Card::open(&paths[0]).expect("a card that nobody drives");
-    assert!(matches!(Card::open(&paths[0]), Err(KmsError::InUse(_))), "one program at a time");
+    assert!(matches!(Card::open(&paths[0]), Err(DisplayError::InUse(_))), "one program at a time");
     drop(mine);
-    let opener = Arc::new(|| open_for(None, Some("Virtual-1")));
     let refused = |change: &dyn Fn(&mut DisplaySettings)| {
         let mut settings = settings(Encoding::Planes24);
         change(&mut settings);
-        DisplayTransport::open(opener.clone(), settings, WaitPolicy::Park, 0)
-            .err()
-            .expect("refused")
-            .to_string()
+        let opener = on_card(|| open_for(None, Some("Virtual-1")), settings);
+        DisplayTransport::open(opener, WaitPolicy::Park, 0).err().expect("refused").to_string()
     };
     let told = refused(&|s| s.mode = "1024x768@200".parse().unwrap());
     println!("  {told}");
@@ -223,7 +220,7 @@ fn refusals() {
     assert!(told.contains("projector.width = 160"), "{told}");
     assert!(refused(&|s| s.connector = Some("DP-1".into())).contains("Virtual-1"));
     let nowhere = Card::open(Path::new("/dev/dri/card9"));
-    assert!(matches!(nowhere, Err(KmsError::NoCard(_))));
+    assert!(matches!(nowhere, Err(DisplayError::NoCard(_))));
 }
 
 fn bits() {

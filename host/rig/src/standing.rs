@@ -52,6 +52,7 @@ impl Identity {
                 let name = or_any(&display.connector);
                 (format!("display {name}"), "display".into(), display.connector.clone())
             }
+            ProjectorBackend::Window(_) => ("window".into(), "window".into(), None),
             ProjectorBackend::Alp(alp) => {
                 let number = Some(alp.device_number).filter(|n| *n > 0).map(|n| n.to_string());
                 (format!("ALP {}", or_any(&number)), "ALP".into(), number)

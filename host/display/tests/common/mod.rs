@@ -3,12 +3,13 @@
 
 use std::sync::atomic::{AtomicI64, Ordering};
 use std::sync::Arc;
+use std::time::{Duration, Instant};
 
 use dpm_device::link::{Epoch, HostLink, LightLimits, LinkSettings, LinkState, SendOutcome, Underrun};
 use dpm_device::planes::{PlaneSchedule, Raster};
 use dpm_device::projector::light_of_planes;
 use dpm_device::rng::Draws;
-use dpm_device::time::{DeviceTicks, FrameRate, HostTime};
+use dpm_device::time::{DeviceTicks, FrameRate, HostClock, HostTime};
 use dpm_device::transport::inproc::Direct;
 use dpm_display::encoding::Encoding;
 use dpm_display::fake::{display, FakeKms, FakeState, Shared};
@@ -16,6 +17,7 @@ use dpm_display::kms::Kms;
 use dpm_display::mode::{ModeWish, Timing};
 use dpm_display::panel::Panel;
 use dpm_display::set_up::{plan, DisplaySettings};
+use dpm_display::transport::DisplayTransport;
 use dpm_handoff::path::Lock;
 
 /// 70 x 16 at 60 Hz: 70 columns are a run of 64 and one that ends within a byte.
@@ -112,6 +114,47 @@ pub fn link_settings() -> LinkSettings {
     }
 }
 
+/// How long anything may take on a busy machine.
+pub const PATIENCE: Duration = Duration::from_secs(20);
+
+/// Polls, arms, and sends a frame for every slot, until `done`.
+pub fn run(
+    link: &mut HostLink,
+    display: &mut DisplayTransport,
+    clock: &dyn HostClock,
+    mut done: impl FnMut(&HostLink) -> bool,
+) {
+    let limit = Instant::now() + PATIENCE;
+    let mut next = 0;
+    while !done(link) {
+        assert!(Instant::now() < limit, "still {:?}, {:?}", link.state(), display.counts().map(|c| c.lost()));
+        match link.poll(clock.now(), display) {
+            Ok(LinkState::Ready) => link.arm(0),
+            Ok(LinkState::Faulted) => link.arm(u32::MAX),
+            Ok(LinkState::Streaming) => {
+                // The slot is taken from what the display told last.
+                let slots = link.slots().unwrap();
+                let slot = link.status().and_then(|s| slots.slot_at(s.now)).map_or(0, |slot| slot + 3);
+                if slot > next {
+                    next = slot;
+                    let (target, dark_from) = (slots.start(slot), slots.dark_from(slot, 1_000_000_000));
+                    let sent = link.send_frame(clock.now(), slot, target, dark_from, &planes(slot), display);
+                    assert!(!matches!(sent, SendOutcome::Sent) || target < dark_from);
+                }
+            }
+            Ok(LinkState::Lost | LinkState::Closed) | Err(_) if link.state() == LinkState::Closed => {
+                link.connect()
+            }
+            _ => {}
+        }
+        std::thread::sleep(Duration::from_millis(1));
+    }
+}
+
+pub fn lit(link: &HostLink) -> u32 {
+    link.status().map_or(0, |s| s.frames_lit)
+}
+
 impl Rig {
     pub fn new(encoding: Encoding, change: impl FnOnce(&mut FakeState)) -> Self {
         let shared = shared();
@@ -122,7 +165,7 @@ impl Rig {
         let mut kms = FakeKms::new(shared.clone(), clock.clone());
         let plan = plan(&kms.connectors().unwrap(), &settings(encoding)).unwrap();
         kms.start(&plan.setup).unwrap();
-        let panel = Panel::new(kms, &plan, raster(), 24, 1, clock.as_ref());
+        let panel = Panel::new(kms, plan.panel, 1, clock.as_ref());
         let mut link = HostLink::new(link_settings());
         link.connect();
         Self { link, cable: Direct::new(panel), shared, now, encoding, sent: Vec::new(), last_slot: 0 }

@@ -114,7 +114,7 @@ impl<'a> Pace<'a> {
 /// There is none (exit code 3).
 pub fn slower(config: &RigConfig, carried_hz: f64) -> Result<RigConfig, Failure> {
     let hz = (ROOM * carried_hz) as u32;
-    if let ProjectorBackend::Display(_) = config.projector.backend {
+    if let ProjectorBackend::Display(_) | ProjectorBackend::Window(_) = config.projector.backend {
         let told = format!(
             "only {carried_hz:.1} of {:.0} frames/s reached the display in time; end other programs, or take a mode with \
              fewer pixels or frames",

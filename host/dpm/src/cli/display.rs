@@ -4,8 +4,9 @@ use super::watch::print;
 use crate::signals;
 use dpm_common::guardian;
 use dpm_display::card::{cards, show_black, Card};
-use dpm_display::kms::{Connector, Kms, KmsError};
+use dpm_display::kms::{Connector, Kms};
 use dpm_display::mode::written;
+use dpm_display::scan_out::DisplayError;
 use dpm_rig::failure::{Failure, FailureKind};
 use std::ffi::OsString;
 use std::io::Write;
@@ -78,7 +79,7 @@ pub(super) struct Seen {
     /// Another program drives its displays.
     pub(super) is_in_use: bool,
     /// Its connectors.
-    pub(super) connectors: Result<Vec<Connector>, KmsError>,
+    pub(super) connectors: Result<Vec<Connector>, DisplayError>,
 }
 
 /// All graphics cards of this machine.
@@ -160,7 +161,7 @@ mod tests {
         let gone = Seen {
             path: "/dev/dri/card0".into(),
             is_in_use: false,
-            connectors: Err(KmsError::Denied("x".into())),
+            connectors: Err(DisplayError::Denied("x".into())),
         };
         assert!(listed(&[gone]).contains("video"));
     }

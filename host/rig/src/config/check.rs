@@ -223,6 +223,17 @@ fn projector(rig: &RigConfig, reader: &mut Reader) {
             );
         }
     }
+    if matches!(p.backend, ProjectorBackend::Window(_)) && p.weights == PlaneWeights::Equal {
+        contradict(
+            reader,
+            &[
+                ("projector.weights", format!("{:?}", p.weights.word())),
+                ("projector.backend.kind", format!("{:?}", p.backend.word())),
+            ],
+            "a window shows code values, whose bits have binary weights",
+            "leave `projector.weights` out".into(),
+        );
+    }
     if let ProjectorBackend::Alp(alp) = &p.backend {
         check_alp(p, alp, reader);
     }

@@ -110,6 +110,7 @@ impl ProjectorConfig {
             ProjectorBackend::Display(display) if display.encoding == DisplayEncoding::Rgb8 => {
                 PlaneTiming::Held
             }
+            ProjectorBackend::Window(_) => PlaneTiming::Held,
             ProjectorBackend::Alp(alp) if alp.weights == AlpWeights::Binary => PlaneTiming::ByWeight,
             _ => PlaneTiming::Equal,
         }
@@ -119,24 +120,23 @@ impl ProjectorConfig {
     /// equal light are lit by LEDs that are dimmed for the bits of a code value.
     pub fn full_light(&self) -> u32 {
         match &self.backend {
-            ProjectorBackend::Display(_) | ProjectorBackend::Alp(_) => 255,
+            ProjectorBackend::Display(_) | ProjectorBackend::Window(_) | ProjectorBackend::Alp(_) => 255,
             _ => self.schedule().full_light(),
         }
     }
 
     /// From the start of a slot on the projector's clock to the light of its frame, nanoseconds: `latency_us`, and for a
-    /// display the time until the vertical blank and until the middle row.
+    /// display or a window the time until the vertical blank and until the middle row.
     pub fn light_delay_ns(&self) -> i64 {
-        let own_ns = match &self.backend {
-            // The blank comes `commit_us` and half of the time without rows later, the middle row half of the rows after it:
-            // together half a frame, whatever the mode.
-            ProjectorBackend::Display(display) => {
-                let frame_ns = self.frame_rate.slot_len_ns(0);
-                display.commit_ns(frame_ns) + frame_ns / 2
-            }
-            _ => 0,
+        let frame_ns = self.frame_rate.slot_len_ns(0);
+        let commit_ns = match &self.backend {
+            ProjectorBackend::Display(display) => display.commit_ns(frame_ns),
+            ProjectorBackend::Window(window) => window.commit_ns(frame_ns),
+            _ => return i64::from(self.latency_us) * 1000,
         };
-        i64::from(self.latency_us) * 1000 + own_ns
+        // The blank comes `commit_us` and half of the time without rows later, the middle row half of the rows after it:
+        // together half a frame, whatever the mode.
+        i64::from(self.latency_us) * 1000 + commit_ns + frame_ns / 2
     }
 
     /// The planes of a frame in the order in which they are shown.
@@ -215,6 +215,8 @@ kinds! {
         Dlpc900(Dlpc900Config) = "dlpc900",
         /// a display: any projector or monitor on HDMI or DisplayPort.
         Display(DisplayConfig) = "display",
+        /// a window on the desktop, for a desk without a projector.
+        Window(WindowConfig) = "window",
     }
     default Mock
 }
@@ -350,6 +352,29 @@ impl DisplayConfig {
     /// `frame_ns`: time of a frame.
     pub fn commit_ns(&self, frame_ns: i64) -> i64 {
         self.commit_us.map_or((frame_ns / 2).min(8_000_000), |us| i64::from(us) * 1000)
+    }
+}
+
+section! {
+    /// A window on the desktop of this machine, for previews and for a desk without a projector. docs/DISPLAY.md says what it
+    /// is good for. Closing it ends the run.
+    pub struct WindowConfig {
+        /// The monitor that the window fills, by the name that a start lists, for example "HDMI-1". `projector.width` and
+        /// `height` must be the monitor's, and `frame_rate` within one percent of its rate. An ordinary window of `width` x
+        /// `height` pixels if left out.
+        monitor: Option<String> = None, "", NotEmpty;
+        /// The X server, for example ":0"; the one of the environment variable DISPLAY if left out.
+        server: Option<String> = None, "", NotEmpty;
+        /// How long before its vertical blank a frame is chosen and sent to the X server. Three quarters of a frame if left
+        /// out: some servers count a blank from half a frame before it on.
+        commit_us: Option<u32> = None, "us", Within(100, 35_000);
+    }
+}
+
+impl WindowConfig {
+    /// From the choice of a frame to its vertical blank, nanoseconds; `frame_ns`: time of a frame.
+    pub fn commit_ns(&self, frame_ns: i64) -> i64 {
+        self.commit_us.map_or(frame_ns / 4 * 3, |us| i64::from(us) * 1000)
     }
 }
 

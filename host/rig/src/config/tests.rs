@@ -671,6 +671,16 @@ fn the_light_of_a_display_is_later_than_its_slots() {
     )
     .unwrap_or_else(|e| panic!("{e}"));
     assert_eq!(alp.projector.plane_timing(), PlaneTiming::ByWeight);
+    let window = RigConfig::parse(
+        "rigs/window.toml",
+        include_str!("../../../../rigs/window.toml"),
+        Path::new(""),
+        &Overrides { variables: vec![], flags: vec![] },
+    )
+    .unwrap_or_else(|e| panic!("{e}"));
+    // Three quarters of a sixtieth of a second, and half of it.
+    assert_eq!(window.projector.light_delay_ns(), 16_666_667 / 4 * 3 + 8_333_333);
+    assert!(window.projector.plane_timing() == PlaneTiming::Held);
     let usb = parsed(&["projector.backend={kind=\"usb\"}"]).unwrap_or_else(|e| panic!("{e}"));
     assert_eq!(
         (usb.projector.light_delay_ns(), usb.projector.plane_timing()),
@@ -680,6 +690,7 @@ fn the_light_of_a_display_is_later_than_its_slots() {
         ("projector.backend.mode=\"1920\"", "projector.backend.mode"),
         ("projector.backend={kind=\"display\",encoding=\"planes24\"}", "projector.planes = 24"),
         ("projector.weights=\"equal\"", "projector.weights"),
+        ("projector={backend={kind=\"window\"},weights=\"equal\"}", "a window shows code values"),
         ("projector.backend.commit_us=1", "projector.backend.commit_us"),
         ("real_time.pace=\"virtual\"", "runs on its own clock"),
     ] {

@@ -2,7 +2,7 @@
 
 use crate::config::{
     AlpConfig, AlpWeights, Compaction, DisplayConfig, DisplayEncoding, Pace, ProjectorBackend,
-    ResponseConfig, RigConfig,
+    ResponseConfig, RigConfig, WindowConfig,
 };
 use crate::engine::connect::ConnectError;
 use dpm_device::alp::{AlpSettings, AlpTransport, Showing};
@@ -16,7 +16,8 @@ use dpm_display::card::open_for;
 use dpm_display::encoding::Encoding;
 use dpm_display::mode::ModeWish;
 use dpm_display::set_up::DisplaySettings;
-use dpm_display::transport::DisplayTransport;
+use dpm_display::transport::{on_card, DisplayTransport, Opener};
+use dpm_display::window::{interrupt_program, WindowSettings};
 use dpm_handoff::wake::WaitPolicy;
 use dpm_render::pack::Halftone;
 use std::sync::Arc;
@@ -86,6 +87,7 @@ pub fn open(
             Some(Medium { transport, warnings: Vec::new() })
         }
         ProjectorBackend::Display(display) => Some(open_display(config, display, raster).map_err(failed)?),
+        ProjectorBackend::Window(window) => Some(open_window(config, window, raster).map_err(failed)?),
         ProjectorBackend::Alp(alp) => Some(open_alp(config, alp, frame_bytes, surroundings)?),
         ProjectorBackend::Mock(_) | ProjectorBackend::Dlpc900(_) => None,
     })
@@ -124,23 +126,50 @@ fn open_display(
 ) -> Result<Medium, TransportError> {
     let settings = display_settings(config, display, raster)?;
     let (card, connector) = (display.card.clone(), display.connector.clone());
-    let opener = Arc::new(move || open_for(card.as_deref(), connector.as_deref()));
+    let opener = on_card(move || open_for(card.as_deref(), connector.as_deref()), settings);
+    let mut medium = open_panel(config, opener)?;
+    medium
+        .warnings
+        .push("a display as projector has not been tried on real hardware yet (docs/DISPLAY.md)".into());
+    if display.encoding == DisplayEncoding::Rgb8 {
+        medium.warnings.extend(linear_code_values(config));
+    }
+    Ok(medium)
+}
+
+fn open_window(config: &RigConfig, window: &WindowConfig, raster: Raster) -> Result<Medium, TransportError> {
+    let projector = &config.projector;
+    let settings = WindowSettings {
+        server: window.server.clone(),
+        monitor: window.monitor.clone(),
+        commit_ns: window.commit_ns(projector.frame_rate.slot_len_ns(0)),
+        raster,
+        schedule: projector.schedule(),
+        rate: projector.frame_rate,
+    };
+    let mut medium = open_panel(config, dpm_display::window::opener(settings, interrupt_program))?;
+    medium.warnings.extend(linear_code_values(config));
+    Ok(medium)
+}
+
+/// A panel in this process behind what `opener` opens.
+fn open_panel(config: &RigConfig, opener: Opener) -> Result<Medium, TransportError> {
     // Blanks are milliseconds apart: no thread needs to spin for them. The panel stands for another machine, so no stage may
     // delay it.
     let priority = config.real_time.priority;
     let above = if priority > 0 { (priority + 1).min(99) } else { 0 };
-    let transport = DisplayTransport::open(opener, settings, WaitPolicy::Park, above)?;
-    let mut warnings = transport.warnings().to_vec();
-    warnings.push("a display as projector has not been tried on real hardware yet (docs/DISPLAY.md)".into());
-    let is_linear = matches!(config.projector.response, ResponseConfig::Linear(_));
-    if display.encoding == DisplayEncoding::Rgb8 && is_linear {
-        warnings.push(
-            "projector.response is \"linear\", which no display's code values are: grey will be too bright; write \
-             response = { kind = \"srgb\" }, or measure it"
-                .into(),
-        );
-    }
+    let transport = DisplayTransport::open(opener, WaitPolicy::Park, above)?;
+    let warnings = transport.warnings().to_vec();
     Ok(Medium { transport: Box::new(transport), warnings })
+}
+
+/// What to tell of code values that are said to be linear.
+fn linear_code_values(config: &RigConfig) -> Option<String> {
+    matches!(config.projector.response, ResponseConfig::Linear(_)).then(|| {
+        "projector.response is \"linear\", which no display's code values are: grey will be too bright; write \
+         response = { kind = \"srgb\" }, or measure it"
+            .into()
+    })
 }
 
 fn open_alp(
@@ -188,10 +217,11 @@ pub(crate) fn codecs(backend: &ProjectorBackend) -> u32 {
         ProjectorBackend::Mock(c) => &c.compaction,
         ProjectorBackend::Usb(c) => &c.compaction,
         ProjectorBackend::Serial(c) => &c.compaction,
-        // The firmware of a display and of an ALP runs in this process: nothing is saved by compacting.
-        ProjectorBackend::Dlpc900(_) | ProjectorBackend::Display(_) | ProjectorBackend::Alp(_) => {
-            return Codec::Raw.mask()
-        }
+        // The firmware of a display, a window and an ALP runs in this process: nothing is saved by compacting.
+        ProjectorBackend::Dlpc900(_)
+        | ProjectorBackend::Display(_)
+        | ProjectorBackend::Window(_)
+        | ProjectorBackend::Alp(_) => return Codec::Raw.mask(),
     };
     match compaction {
         Compaction::Auto => Codec::ALL,
@@ -219,7 +249,7 @@ pub fn link_settings(config: &RigConfig, raster: Raster) -> LinkSettings {
         late_slots: if config.real_time.pace == Pace::Virtual { 0 } else { 255 },
         // The slots of a display are its vertical blanks, which its clock counts from 0.
         epoch: match config.projector.backend {
-            ProjectorBackend::Display(_) => Epoch::At(DeviceTicks(0)),
+            ProjectorBackend::Display(_) | ProjectorBackend::Window(_) => Epoch::At(DeviceTicks(0)),
             _ => Epoch::AfterHello(EPOCH_NS),
         },
         codecs: codecs(&config.projector.backend),
