@@ -6,6 +6,7 @@ use std::ffi::OsString;
 use std::os::fd::OwnedFd;
 use std::sync::Arc;
 
+use dpm_device::rng::Draws;
 use dpm_device::time::HostClock;
 use dpm_handoff::path::Lock;
 
@@ -35,6 +36,8 @@ pub struct FakeState {
     pub missed: BTreeSet<u32>,
     /// By how much its crystal is fast, parts in a million.
     pub ppm: i64,
+    /// By how much stamps are late at most, nanoseconds: an X server on a busy machine.
+    pub jitter_ns: i64,
     /// Blanks are not counted.
     pub counts_none: bool,
     /// Blanks stop.
@@ -108,6 +111,7 @@ pub fn display(modes: &[Timing]) -> FakeState {
         is_plugged: true,
         missed: BTreeSet::new(),
         ppm: 0,
+        jitter_ns: 0,
         counts_none: false,
         is_stuck: false,
         refuses: false,
@@ -157,12 +161,14 @@ impl FakeKms {
         }
         while self.blank_ns(self.next, ppm) <= now {
             let at_ns = self.blank_ns(self.next, ppm);
-            let (missed, counts_none) =
-                self.with(|s| (s.missed.contains(&FIRST.wrapping_add(self.next as u32)), s.counts_none));
+            let (missed, counts_none, jitter_ns) = self.with(|s| {
+                (s.missed.contains(&FIRST.wrapping_add(self.next as u32)), s.counts_none, s.jitter_ns)
+            });
+            let late_ns = (Draws::new(1).unit(self.next) * jitter_ns as f64) as i64;
             let sequence = if counts_none { 0 } else { FIRST.wrapping_add(self.next as u32) };
             if let Some(picture) = self.waiting.take_if(|_| !missed) {
                 self.front = picture;
-                self.taken.push(Flip { sequence, at_ns: at_ns + OFFSET_NS });
+                self.taken.push(Flip { sequence, at_ns: at_ns + late_ns + OFFSET_NS });
             }
             let width = 4 * timing.size().0 as usize;
             let pixels = match self.front {

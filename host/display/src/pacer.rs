@@ -12,6 +12,9 @@ use dpm_device::time::{DeviceTicks, FrameRate, HostTime};
 pub const TICK_HZ: u32 = 1_000_000_000;
 /// Pictures from which the phase of the blanks is learned at the start.
 pub const LEARNED: usize = 6;
+/// Pictures after which a rate that is not the mode's is believed. Stamps that come late, as those of an X server on a busy
+/// machine, spoil a rate that is measured over few of them.
+pub const MOST_LEARNED: usize = 60;
 /// A crystal that is further off than this is none, parts in a billion.
 const MOST_SKEW_PPB: i64 = 5_000_000;
 /// The phase is corrected within this many blanks.

@@ -14,7 +14,7 @@ use dpm_device::transport::{Lane, LinkDevice};
 use dpm_handoff::path::Lock;
 
 use crate::encoding::PixelMap;
-use crate::pacer::{Pacer, LEARNED};
+use crate::pacer::{NoPace, Pacer, LEARNED, MOST_LEARNED};
 use crate::scan_out::{DisplayError, Flip, Picture, ScanOut};
 
 /// A picture that was not taken for this long means that the display gives no blanks any more, nanoseconds.
@@ -131,7 +131,7 @@ impl<S: ScanOut> Panel<S> {
             lead_ns,
             offset_ns: low + width / 2,
             pacer: None,
-            learned: Vec::with_capacity(LEARNED),
+            learned: Vec::with_capacity(MOST_LEARNED),
             next: 0,
             in_flight: None,
             is_refused: false,
@@ -269,6 +269,9 @@ impl<S: ScanOut> Panel<S> {
 
     /// Shows black until the phase of the blanks is known.
     fn learn(&mut self, now: HostTime) {
+        if self.in_flight.is_some() {
+            return;
+        }
         if self.learned.len() >= LEARNED {
             match Pacer::learn(self.rate, self.lead_ns, &self.learned) {
                 Ok(pacer) => {
@@ -277,14 +280,13 @@ impl<S: ScanOut> Panel<S> {
                     self.next = 1;
                     self.pacer = Some(pacer);
                     self.counts.is_paced.store(true, Ordering::Release);
+                    return;
                 }
-                Err(e) => self.lose(e.to_string()),
+                Err(NoPace::OtherRate { .. }) if self.learned.len() < MOST_LEARNED => {}
+                Err(e) => return self.lose(e.to_string()),
             }
-            return;
         }
-        if self.in_flight.is_none() {
-            self.hand_over(now, Picture::Black, None);
-        }
+        self.hand_over(now, Picture::Black, None);
     }
 
     /// Chooses the pictures of all slots that have begun. Only that of the newest can still be shown.

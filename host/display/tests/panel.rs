@@ -7,7 +7,9 @@ use std::sync::atomic::Ordering;
 
 use common::{with, Rig};
 use dpm_device::link::{faults, LinkState, Verb};
+use dpm_device::time::{FrameRate, HostTime};
 use dpm_display::encoding::Encoding;
+use dpm_display::pacer::{NoPace, Pacer};
 
 const BOTH: [Encoding; 2] = [Encoding::Rgb8, Encoding::Planes24];
 
@@ -179,8 +181,21 @@ fn a_lost_display_is_told_and_dark() {
 
     // Half a percent off is a crystal; five percent is another rate.
     let mut rig = Rig::new(Encoding::Rgb8, |s| s.ppm = 50_000);
-    rig.pass(300_000_000);
+    rig.pass(1_300_000_000);
     assert!(rig.cable.device().counts().lost().unwrap().contains("variable refresh"));
+}
+
+/// Stamps that come late by up to a third of a frame spoil the rate of the first blanks, not the start.
+#[test]
+fn stamps_that_jitter_are_learned_from_more_blanks() {
+    let rate = FrameRate::new(60, 1).unwrap();
+    let first: Vec<_> = (0..6u32).map(|k| (k, HostTime(i64::from(k) * 16_666_667))).collect();
+    let late = first.iter().map(|(k, at)| (*k, at.plus_ns(if *k == 5 { 5_000_000 } else { 0 })));
+    assert!(matches!(Pacer::learn(rate, 0, &late.collect::<Vec<_>>()), Err(NoPace::OtherRate { .. })));
+    let mut rig = Rig::new(Encoding::Rgb8, |s| s.jitter_ns = 5_000_000);
+    rig.stream();
+    rig.send(30);
+    assert!(!rig.cable.device().is_lost());
 }
 
 /// The host's map of the projector's clock is that of the blanks: what STATUS calls the start of a slot is so much before the
