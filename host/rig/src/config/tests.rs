@@ -648,6 +648,27 @@ fn the_manual_is_up_to_date() {
     );
 }
 
+/// Every template is a rig file without errors, and a page names it.
+#[test]
+fn every_template_is_a_rig() {
+    let root = Path::new(env!("CARGO_MANIFEST_DIR")).join("../..");
+    let page = std::fs::read_to_string(root.join("docs/PROJECTORS.md")).unwrap();
+    let mut kinds = Vec::new();
+    for entry in std::fs::read_dir(root.join("rigs")).unwrap() {
+        let path = entry.unwrap().path();
+        let name = format!("rigs/{}", path.file_name().unwrap().to_string_lossy());
+        let text = std::fs::read_to_string(&path).unwrap();
+        let overrides = Overrides { variables: vec![], flags: vec![] };
+        let rig =
+            RigConfig::parse(&name, &text, &root.join("rigs"), &overrides).unwrap_or_else(|e| panic!("{e}"));
+        assert!(page.contains(&format!("](../{name})")), "docs/PROJECTORS.md does not name {name}");
+        kinds.push(rig.projector.backend.word());
+    }
+    for kind in ["mock", "usb", "alp", "dlpc900", "display", "window"] {
+        assert!(kinds.contains(&kind), "no template for {kind}: {kinds:?}");
+    }
+}
+
 /// The template of a display is a rig, and its light is later than its slots: by the time until the blank and until the
 /// middle row, and by the projector's own latency.
 #[test]
