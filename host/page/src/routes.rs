@@ -5,6 +5,7 @@ use crate::events::Events;
 use crate::guard::Refused;
 use crate::metrics;
 use crate::orders;
+use crate::parameters;
 use crate::shared::Shared;
 use crate::state::State;
 use base64::prelude::{Engine, BASE64_STANDARD};
@@ -124,9 +125,12 @@ async fn route(
     if let Some(word) = path.strip_prefix("/api/orders/") {
         return order(request, word, connection, shared).await;
     }
+    if let Some(word) = path.strip_prefix("/api/parameters/") {
+        return change(request, word, shared).await;
+    }
     tokio::time::sleep(shared.pace()).await;
     if request.method() != Method::GET {
-        return plain(StatusCode::METHOD_NOT_ALLOWED, "only GET, and POST for orders");
+        return plain(StatusCode::METHOD_NOT_ALLOWED, "only GET, and POST for orders and parameters");
     }
     match path {
         "/" => page(),
@@ -135,6 +139,7 @@ async fn route(
             whole(StatusCode::OK, "text/plain; version=0.0.4; charset=utf-8", text)
         }
         "/api/state" => json(StatusCode::OK, &fresh(shared).await.to_json()),
+        "/api/parameters" => json(StatusCode::OK, &shared.monitor.parameters().shown()),
         "/api/token" => match shared.guard.check_token(request.headers()) {
             Ok(()) => plain(StatusCode::OK, "ok"),
             Err(refused) => refusal(refused),
@@ -152,7 +157,7 @@ async fn route(
             }
         },
         "/favicon.ico" => plain(StatusCode::NOT_FOUND, "none"),
-        _ => plain(StatusCode::NOT_FOUND, "there is /, /metrics, /api/state and /api/events"),
+        _ => plain(StatusCode::NOT_FOUND, "there is /, /metrics, /api/state, /api/parameters and /api/events"),
     }
 }
 
@@ -175,6 +180,28 @@ async fn order(
     };
     connection.now_does(Doing::Orders);
     json(StatusCode::OK, &orders::give(order, shared).await)
+}
+
+/// A change of the parameters. It knows the token as an order does, but it waits its turn as every other request.
+async fn change(request: &Request<Incoming>, word: &str, shared: &Arc<Shared>) -> Response<Answer> {
+    tokio::time::sleep(shared.pace()).await;
+    if let Err(refused) = shared.guard.check_token(request.headers()) {
+        return refusal(refused);
+    }
+    if request.method() != Method::POST {
+        return plain(StatusCode::METHOD_NOT_ALLOWED, "a change is a POST");
+    }
+    let Some(asked) = parameters::asked(word, request.uri().query().unwrap_or_default()) else {
+        return plain(StatusCode::NOT_FOUND, "there is set, undo and save");
+    };
+    let done = match &asked {
+        Ok(command) => parameters::give(command, shared).await,
+        Err(refused) => Err(refused.clone()),
+    };
+    match done {
+        Ok(answered) => json(StatusCode::OK, &answered),
+        Err(refused) => plain(StatusCode::BAD_REQUEST, format!("refused: {refused}")),
+    }
 }
 
 /// The state with figures that were made for this request, if they come at once.

@@ -99,7 +99,6 @@ fn setup(shared: &Shared) -> Value {
         all["projector"] = json!(config.projector.backend.word());
         all["tracker"] = json!(config.tracker.word());
         all["spp"] = json!(config.render.spp);
-        all["exposure"] = json!(config.render.exposure);
         all["frames"] = json!(config.run.frames);
         all["seconds"] = json!(config.run.seconds);
     }

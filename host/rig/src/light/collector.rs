@@ -381,6 +381,7 @@ impl Collector {
                 sampled_poses: job.plan.sampled_poses.clone(),
                 dark: job.plan.dark.clone(),
                 eye: job.plan.eye,
+                parameters: job.plan.parameters,
                 code_hash: job.code_hash,
                 pass_ns: cost.pass_ns,
             });

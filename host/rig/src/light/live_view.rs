@@ -27,6 +27,7 @@ impl Collector {
             id: plan.id.0,
             sample_age_ns: plan.oldest_captured_at().map(|at| plan.due_at.ns_since(at)),
             budget_spp: plan.budget_milli as f64 / 1e3,
+            parameters: plan.parameters,
             predict_ns: plan.predict_ns,
         };
         let states = plan.seen.iter().zip(&plan.dark).zip(&plan.tracked_poses);

@@ -57,6 +57,8 @@ pub struct LiveFrame {
     pub sample_age_ns: Option<i64>,
     /// Average samples per pixel.
     pub budget_spp: f64,
+    /// Which version of the operator's parameters it uses.
+    pub parameters: u64,
     /// The longest time for which prediction may extend a body's track, nanoseconds.
     pub predict_ns: i64,
 }
