@@ -50,7 +50,8 @@ fn motions(path: &Path, rig: &Rig, kept: &ToKeep) -> Result<Option<Results>, Str
     }
     if !kept.bodies.is_empty() && matches!(rig.config.tracker, TrackerConfig::Mock(_)) {
         return Err(
-            "the mock tracker reports the mesh itself, so no motion of a body can be kept; set it back to 0".into()
+            "the mock tracker reports the mesh itself, so no motion of a body can be kept; set it back to 0"
+                .into(),
         );
     }
     let mut results = Results::open(None, path, &rig.config).map_err(|e| e.to_string())?;

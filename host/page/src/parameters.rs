@@ -81,13 +81,25 @@ mod tests {
 
     #[test]
     fn a_query_names_a_parameter_whatever_its_letters() {
-        let set = |name: &str, numbers: &[f64]| Ok(Command::Set { name: name.into(), numbers: numbers.into() });
+        let set =
+            |name: &str, numbers: &[f64]| Ok(Command::Set { name: name.into(), numbers: numbers.into() });
         assert_eq!(asked("set", "name=exposure&value=1.5"), Some(set("exposure", &[1.5])));
-        assert_eq!(asked("set", "value=1%2C-2,3&name=body.my%20h%C3%A4re"), Some(set("body.my häre", &[1.0, -2.0, 3.0])));
+        assert_eq!(
+            asked("set", "value=1%2C-2,3&name=body.my%20h%C3%A4re"),
+            Some(set("body.my häre", &[1.0, -2.0, 3.0]))
+        );
         assert_eq!(asked("set", "name=gaze&value="), Some(set("gaze", &[])));
         assert_eq!(asked("undo", ""), Some(Ok(Command::Undo)));
         assert_eq!(asked("arm", ""), None);
-        for bad in ["", "name=a", "value=1", "name=%zz&value=1", "name=%e4&value=1", "name=a&value=x", "name=a%2&value=1"] {
+        for bad in [
+            "",
+            "name=a",
+            "value=1",
+            "name=%zz&value=1",
+            "name=%e4&value=1",
+            "name=a&value=x",
+            "name=a%2&value=1",
+        ] {
             assert!(asked("set", bad).unwrap().is_err(), "{bad}");
         }
         assert!(asked("set", &format!("name={}&value=1", "a".repeat(MAX_QUERY))).unwrap().is_err());

@@ -9,7 +9,9 @@ use crate::parameters;
 use crate::shared::Shared;
 use crate::state::State;
 use base64::prelude::{Engine, BASE64_STANDARD};
+use dpm_device::regular_file;
 use dpm_rig::order::Order;
+use dpm_rig::telemetry::flight::page_path;
 use hyper::body::{Body, Bytes, Frame, Incoming, SizeHint};
 use hyper::header::{self, HeaderName, HeaderValue};
 use hyper::{Method, Request, Response, StatusCode};
@@ -23,6 +25,8 @@ use std::time::Duration;
 const PAGE: &str = include_str!("page.html");
 /// What stands for that number in the page.
 const NONCE: &str = "{{nonce}}";
+/// Longest page of a flight, bytes.
+const MAX_FLIGHT_BYTES: u64 = 1 << 20;
 /// How long the metrics wait for fresh figures.
 const FRESH_WITHIN: Duration = Duration::from_millis(60);
 
@@ -156,8 +160,11 @@ async fn route(
                 plain(StatusCode::SERVICE_UNAVAILABLE, "too many viewers: close another page of this rig")
             }
         },
+        _ if path.starts_with("/api/flights/") => flight(path, shared).await,
         "/favicon.ico" => plain(StatusCode::NOT_FOUND, "none"),
-        _ => plain(StatusCode::NOT_FOUND, "there is /, /metrics, /api/state, /api/parameters and /api/events"),
+        _ => {
+            plain(StatusCode::NOT_FOUND, "there is /, /metrics, /api/state, /api/parameters and /api/events")
+        }
     }
 }
 
@@ -201,6 +208,22 @@ async fn change(request: &Request<Incoming>, word: &str, shared: &Arc<Shared>) -
     match done {
         Ok(answered) => json(StatusCode::OK, &answered),
         Err(refused) => plain(StatusCode::BAD_REQUEST, format!("refused: {refused}")),
+    }
+}
+
+/// The page of the flight recorder about a flight.
+async fn flight(path: &str, shared: &Arc<Shared>) -> Response<Answer> {
+    let number = path.rsplit('/').next().and_then(|number| number.parse().ok());
+    let rig = shared.monitor.live().rig().filter(|rig| rig.config.output.flight_recorder);
+    let Some(file) = rig.zip(number).and_then(|(rig, number)| page_path(&rig.config.output.dir, number))
+    else {
+        return plain(StatusCode::NOT_FOUND, "there is no such flight; output.flight_recorder records them");
+    };
+    // The disk may be slow, and an order must not wait for it.
+    let read = tokio::task::spawn_blocking(move || regular_file::read_text(&file, MAX_FLIGHT_BYTES));
+    match read.await {
+        Ok(Ok(text)) => whole(StatusCode::OK, "text/plain; charset=utf-8", text),
+        _ => plain(StatusCode::NOT_FOUND, "this flight was not written, or not yet"),
     }
 }
 

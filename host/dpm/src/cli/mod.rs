@@ -14,6 +14,7 @@ mod link_test;
 mod live_page;
 mod order;
 mod os;
+mod osc;
 mod pattern;
 mod plan;
 mod profile;

@@ -2,8 +2,8 @@
 
 use super::dlpc900::Guard;
 use super::rig_args::RigArgs;
-use crate::keep_parameters;
 use super::watch::{check_out, print, run_and_report, watch, write_out};
+use crate::keep_parameters;
 use crate::run_dlpc900::run_dlpc900;
 use dpm_rig::config::{ProjectorBackend, DEFAULT_PAGE};
 use dpm_rig::failure::Failure;

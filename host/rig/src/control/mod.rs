@@ -13,6 +13,7 @@ pub mod answer;
 pub mod change;
 pub mod client;
 pub mod orders;
+pub mod osc;
 pub mod server;
 pub mod status_file;
 

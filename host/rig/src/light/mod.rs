@@ -5,10 +5,12 @@ pub(crate) mod collector;
 mod dark_bodies;
 mod live_view;
 mod measures;
+mod miss_log;
 mod placement;
 mod record;
 pub mod recorder;
 pub mod registration;
 pub(crate) mod status;
 
+pub use miss_log::MissRun;
 pub use record::FrameRecord;

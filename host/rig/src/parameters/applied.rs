@@ -62,11 +62,13 @@ pub(super) fn middles(rig: &Rig) -> Vec<DVec3> {
         .map(|i| {
             let all = rig.scene.bodies.iter().filter(|b| b.tracked.map(usize::from) == Some(i));
             let points = all.flat_map(|b| b.mesh.positions.iter().map(|p| p.as_dvec3()));
-            let (low, high) = points.fold(
-                (DVec3::INFINITY, DVec3::NEG_INFINITY),
-                |(low, high), p| (low.min(p), high.max(p)),
-            );
-            if low.is_finite() && high.is_finite() { (low + high) * 0.5 } else { DVec3::ZERO }
+            let (low, high) = points
+                .fold((DVec3::INFINITY, DVec3::NEG_INFINITY), |(low, high), p| (low.min(p), high.max(p)));
+            if low.is_finite() && high.is_finite() {
+                (low + high) * 0.5
+            } else {
+                DVec3::ZERO
+            }
         })
         .collect()
 }

@@ -131,8 +131,7 @@ impl ParameterDesk {
             None => {
                 let (rig, saved) = (rig.clone(), values.clone());
                 let (before, last) = (VecDeque::new(), None);
-                *place =
-                    Some(State { rig, middles, values, saved, version, before, last, to_planning });
+                *place = Some(State { rig, middles, values, saved, version, before, last, to_planning });
             }
         }
         reader
@@ -207,9 +206,8 @@ impl ParameterDesk {
         if values == s.values {
             return Ok((s.version, told, false));
         }
-        let is_step = !s.last.is_some_and(|(last, at)| {
-            last == parameter && now_ns.saturating_sub(at) < ONE_STEP_NS
-        });
+        let is_step =
+            !s.last.is_some_and(|(last, at)| last == parameter && now_ns.saturating_sub(at) < ONE_STEP_NS);
         if is_step {
             if s.before.len() >= MOST_KEPT {
                 s.before.pop_front();

@@ -184,7 +184,9 @@ impl Parameter {
             Self::Exposure => "factor of all radiance before it becomes light",
             Self::Samples => "samples per pixel; with method dpm their largest average",
             Self::Budget => "largest average of samples per pixel",
-            Self::Gaze => "the point that the observer looks at, world coordinates; without numbers as in the rig file",
+            Self::Gaze => {
+                "the point that the observer looks at, world coordinates; without numbers as in the rig file"
+            }
             Self::Projector => "moves the projector along and about its own axes",
             Self::Body(_) => "moves the mesh in its tracked body along and about its own axes",
         }
@@ -219,7 +221,9 @@ impl Parameter {
             Self::Samples if !is_dpm && render.effects_on().spp_by_angle => {
                 Some("the method takes its samples by the angle from the gaze (render.paper.zone_spp)")
             }
-            Self::Budget if !is_dpm => Some("only method dpm shares a budget out; samples is the one to change"),
+            Self::Budget if !is_dpm => {
+                Some("only method dpm shares a budget out; samples is the one to change")
+            }
             _ => None,
         }
     }
@@ -241,12 +245,7 @@ impl Parameter {
 }
 
 /// Three numbers of the same range on both sides of zero.
-fn axes(
-    labels: [&'static str; 3],
-    unit: &'static str,
-    far: f64,
-    step: f64,
-) -> impl Iterator<Item = Field> {
+fn axes(labels: [&'static str; 3], unit: &'static str, far: f64, step: f64) -> impl Iterator<Item = Field> {
     labels.into_iter().map(move |label| Field { label, unit, low: -far, high: far, step })
 }
 

@@ -33,9 +33,15 @@ fn without_a_change_planning_has_the_rigs_own_bits() {
     assert_eq!(first.brighter.to_bits(), 1.0f32.to_bits());
     assert_eq!((first.camera, first.gaze), (rig.camera, None));
     for (body, place) in rig.bodies.iter().zip(&first.mesh_to_body) {
-        assert_eq!(body.mesh_to_body.to_cols_array().map(f64::to_bits), place.to_cols_array().map(f64::to_bits));
+        assert_eq!(
+            body.mesh_to_body.to_cols_array().map(f64::to_bits),
+            place.to_cols_array().map(f64::to_bits)
+        );
     }
-    assert_eq!((first.samples, first.most_milli), (rig.config.render.spp, 1000 * u64::from(rig.config.render.spp)));
+    assert_eq!(
+        (first.samples, first.most_milli),
+        (rig.config.render.spp, 1000 * u64::from(rig.config.render.spp))
+    );
 }
 
 #[test]
@@ -211,10 +217,7 @@ fn only_what_the_files_do_not_say_is_saved_and_a_value_taken_back_is_saved_again
         ("kind", Setting::Text("point".into())),
         ("point", Setting::Point([0.0, 0.0, 1.0])),
     ]);
-    assert_eq!(
-        all[0].keys,
-        [(["render", "exposure"], Setting::Number(2.0)), (["observer", "gaze"], point)]
-    );
+    assert_eq!(all[0].keys, [(["render", "exposure"], Setting::Number(2.0)), (["observer", "gaze"], point)]);
     assert!(all[0].projector.is_some());
     // The gaze of the rig file comes back, and the projector to where it was.
     let tracked = Setting::Table(vec![

@@ -224,13 +224,7 @@ impl FramePlan {
     }
 
     /// For every body: where it will be at the instants `ends`. Bodies whose poses are not predicted stand still.
-    fn sweep_bodies(
-        &mut self,
-        rig: &Rig,
-        snapshot: &TrackSnapshot,
-        applied: &Applied,
-        ends: [HostTime; 2],
-    ) {
+    fn sweep_bodies(&mut self, rig: &Rig, snapshot: &TrackSnapshot, applied: &Applied, ends: [HostTime; 2]) {
         for (swept, scene) in self.swept_poses.iter_mut().zip(&mut self.swept_scene) {
             swept.clear();
             scene.clear();

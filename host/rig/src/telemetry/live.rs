@@ -6,6 +6,7 @@
 
 use super::histogram_steps::Steps;
 use super::report::Report;
+use crate::light::MissRun;
 use crate::plan::dark::DarkCause;
 use crate::rig::Rig;
 use dpm_common::unix::monotonic_ns;
@@ -61,6 +62,8 @@ pub struct LiveFrame {
     pub parameters: u64,
     /// The longest time for which prediction may extend a body's track, nanoseconds.
     pub predict_ns: i64,
+    /// When its slot begins.
+    pub due_at: HostTime,
 }
 
 /// The collector's figures at one moment.
@@ -82,6 +85,10 @@ pub struct LiveSnapshot {
     pub rays: u64,
     /// Samples taken.
     pub samples: u64,
+    /// The last missed slots, newest first.
+    pub misses: Vec<MissRun>,
+    /// Flights that the flight recorder has written; `None` if it is off.
+    pub flights: Option<u64>,
 }
 
 /// What a frame was drawn for.

@@ -1,6 +1,6 @@
 //! Telemetry of a run, read by threads that are not on the frame path.
 
-pub(crate) mod flight;
+pub mod flight;
 mod flight_page;
 pub mod histogram_steps;
 pub mod interval;
