@@ -2,7 +2,7 @@
 //! uses it or the disk has it.
 
 use crate::shared::Shared;
-use dpm_rig::parameters::desk;
+use dpm_rig::control::parameters;
 use dpm_rig::parameters::{Command, Refused};
 use std::time::{Duration, Instant};
 
@@ -66,7 +66,7 @@ fn decoded(text: &str) -> Option<String> {
 /// It was refused.
 pub(crate) async fn give(command: &Command, shared: &Shared) -> Result<Answered, Refused> {
     let begin = Instant::now();
-    let sent = desk::give(&shared.monitor, command, "page")?;
+    let sent = parameters::give(&shared.monitor, command, "page")?;
     loop {
         if let Some(answer) = sent.answer(begin.elapsed(), shared.monitor.parameters()) {
             return Ok(Answered { done: answer.is_done, text: answer.text });

@@ -14,6 +14,7 @@ pub mod change;
 pub mod client;
 pub mod orders;
 pub mod osc;
+pub mod parameters;
 pub mod server;
 pub mod status_file;
 

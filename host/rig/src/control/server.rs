@@ -2,9 +2,10 @@
 
 use super::answer::answer_to;
 use super::orders::{Orders, Ticket};
+use super::parameters::{self, Sent};
 use super::{rig_name, socket_name, Asked, HEARD, MAX_WORD};
 use crate::order::Order;
-use crate::parameters::{desk, Command, Sent};
+use crate::parameters::Command;
 use crate::standing::By;
 use crate::telemetry::monitor::RunMonitor;
 use dpm_common::folder::{Folder, FolderError};
@@ -228,7 +229,7 @@ impl Client {
 
     /// Gives a command about the parameters. False if it was refused, of which the client is told.
     fn change(&mut self, command: &Command, monitor: &Arc<RunMonitor>) -> bool {
-        match desk::give(monitor, command, &format!("user {}", user_name(self.uid))) {
+        match parameters::give(monitor, command, &format!("user {}", user_name(self.uid))) {
             Ok(sent) => {
                 self.given = Some(Given::Change(sent));
                 true

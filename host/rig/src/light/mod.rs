@@ -5,12 +5,10 @@ pub(crate) mod collector;
 mod dark_bodies;
 mod live_view;
 mod measures;
-mod miss_log;
 mod placement;
 mod record;
 pub mod recorder;
 pub mod registration;
 pub(crate) mod status;
 
-pub use miss_log::MissRun;
 pub use record::FrameRecord;

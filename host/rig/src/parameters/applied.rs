@@ -57,7 +57,7 @@ fn nudged(start: DAffine3, centre: DVec3, nudge: &Nudge) -> DAffine3 {
 }
 
 /// The middle of every tracked body's mesh: of the box around its points, in the mesh's space, metres.
-pub(super) fn middles(rig: &Rig) -> Vec<DVec3> {
+pub(crate) fn middles(rig: &Rig) -> Vec<DVec3> {
     (0..rig.bodies.len())
         .map(|i| {
             let all = rig.scene.bodies.iter().filter(|b| b.tracked.map(usize::from) == Some(i));

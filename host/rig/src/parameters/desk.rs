@@ -2,12 +2,9 @@
 //! newest version from a hand-off that neither locks nor waits.
 
 use super::applied::{middles, Applied};
-use super::sent::{Saving, Sent, Writing};
-use super::{told_of, Command, Parameter, Refused, Values};
+use super::{told_of, Parameter, Refused, Values};
 use crate::config::GazeConfig;
 use crate::rig::Rig;
-use crate::telemetry::monitor::RunMonitor;
-use dpm_common::unix::monotonic_ns;
 use dpm_handoff::latest::{latest, Publisher, Reader};
 use dpm_handoff::path::Lock;
 use glam::{DAffine3, DVec3};
@@ -71,6 +68,7 @@ pub struct ParameterDesk {
     used: AtomicU64,
     used_since: AtomicU64,
     saver: OnceLock<Saver>,
+    /// Files are being written.
     is_saving: AtomicBool,
     /// The run draws no scene.
     is_closed: AtomicBool,
@@ -166,6 +164,21 @@ impl ParameterDesk {
         (state.is_some() && !self.is_closed.load(Ordering::Relaxed)).then_some(state)
     }
 
+    /// How values are kept; `None` if this run knows no files.
+    pub(crate) fn saver(&self) -> Option<&Saver> {
+        self.saver.get()
+    }
+
+    /// Begins to write files. False while they are being written already.
+    pub(crate) fn begin_saving(&self) -> bool {
+        !self.is_saving.swap(true, Ordering::AcqRel)
+    }
+
+    /// The files are written, or not.
+    pub(crate) fn end_saving(&self) {
+        self.is_saving.store(false, Ordering::Release);
+    }
+
     /// All values; `None` if this run has none.
     pub fn shown(&self) -> Option<AllShown> {
         let state = self.open()?;
@@ -196,7 +209,12 @@ impl ParameterDesk {
     }
 
     /// Changes a parameter at `now_ns`. Returns the version, what has changed, and whether undo takes it back by itself.
-    fn set(&self, name: &str, numbers: &[f64], now_ns: u64) -> Result<(u64, String, bool), Refused> {
+    pub(crate) fn set(
+        &self,
+        name: &str,
+        numbers: &[f64],
+        now_ns: u64,
+    ) -> Result<(u64, String, bool), Refused> {
         let mut state = self.open().ok_or(Refused::NoRun)?;
         let s = state.as_mut().ok_or(Refused::NoRun)?;
         let parameter = Parameter::named(name, &s.rig)?;
@@ -220,7 +238,7 @@ impl ParameterDesk {
     }
 
     /// Takes the last step back.
-    fn undo(&self) -> Result<(u64, String), Refused> {
+    pub(crate) fn undo(&self) -> Result<(u64, String), Refused> {
         let mut state = self.open().ok_or(Refused::NoRun)?;
         let s = state.as_mut().ok_or(Refused::NoRun)?;
         let values = s.before.pop_back().ok_or(Refused::NothingToUndo)?;
@@ -231,7 +249,7 @@ impl ParameterDesk {
     }
 
     /// What the files do not say yet.
-    fn to_keep(&self) -> Result<(Arc<Rig>, Values, ToKeep), Refused> {
+    pub(crate) fn to_keep(&self) -> Result<(Arc<Rig>, Values, ToKeep), Refused> {
         let state = self.open().ok_or(Refused::NoRun)?;
         let s = state.as_ref().ok_or(Refused::NoRun)?;
         let (now, saved) = (&s.values, &s.saved);
@@ -261,7 +279,7 @@ impl ParameterDesk {
     }
 
     /// The files say `values` now.
-    fn kept(&self, values: Values) {
+    pub(crate) fn kept(&self, values: Values) {
         if let Some(s) = self.state().as_mut() {
             s.saved = values;
         }
@@ -288,89 +306,4 @@ fn gaze(point: Option<[f64; 3]>, rig: &Rig) -> Setting {
         (GazeConfig::Straight(_), None) => return Setting::Table(vec![kind("straight")]),
     };
     Setting::Table(vec![kind("point"), ("point", Setting::Point(point))])
-}
-
-/// Does what `command` says to the run of `monitor`. `by` says who asks, for the notes.
-///
-/// # Errors
-/// The command was refused, and nothing has changed.
-pub fn give(monitor: &Arc<RunMonitor>, command: &Command, by: &str) -> Result<Sent, Refused> {
-    let desk = monitor.parameters();
-    match command {
-        Command::Set { name, numbers } => {
-            let (version, told, is_step) = desk.set(name, numbers, monotonic_ns())?;
-            if is_step {
-                monitor.note(format!("{by}: {told}"));
-            }
-            Ok(Sent::Changed { version, told })
-        }
-        Command::Undo => {
-            let (version, told) = desk.undo()?;
-            monitor.note(format!("{by}: undo: {told}"));
-            Ok(Sent::Changed { version, told })
-        }
-        Command::Save => save(monitor, by),
-        Command::List => {
-            let shown = desk.shown().ok_or(Refused::NoRun)?;
-            Ok(Sent::Told(list(&shown)))
-        }
-    }
-}
-
-/// Starts a thread that writes the files: neither a client nor an order waits for the disk.
-fn save(monitor: &Arc<RunMonitor>, by: &str) -> Result<Sent, Refused> {
-    let desk = monitor.parameters();
-    let not = |why: &str| Refused::NotSaved(why.to_owned());
-    let (rig, values, keep) = desk.to_keep()?;
-    if desk.saver.get().is_none() {
-        return Err(not("this run knows no rig file to write to"));
-    }
-    if keep == ToKeep::default() {
-        return Ok(Sent::Told("ok: nothing has changed since the files were read or written".into()));
-    }
-    if desk.is_saving.swap(true, Ordering::AcqRel) {
-        return Err(not("the files are being written; save again in a moment"));
-    }
-    let writing: Writing = Arc::default();
-    let (result, by, monitor) = (writing.clone(), by.to_owned(), monitor.clone());
-    let started = std::thread::Builder::new().name("dpm-save".into()).spawn({
-        let monitor = monitor.clone();
-        move || {
-            let desk = monitor.parameters();
-            let done = desk.saver.get().map_or(Err("no rig file".into()), |saver| saver(&rig, &keep));
-            if done.is_ok() {
-                desk.kept(values);
-            }
-            monitor.note(match &done {
-                Ok(told) => format!("{by}: saved: {told}"),
-                Err(why) => format!("{by}: NOT saved: {why}"),
-            });
-            desk.is_saving.store(false, Ordering::Release);
-            let _ = result.set(done);
-        }
-    });
-    if let Err(e) = started {
-        monitor.parameters().is_saving.store(false, Ordering::Release);
-        return Err(not(&format!("no thread can be started: {e}")));
-    }
-    Ok(Sent::Saving(Saving(writing)))
-}
-
-/// All values, a line each.
-fn list(shown: &AllShown) -> String {
-    let line = |p: &Shown| {
-        let range = match p.fields.as_slice() {
-            [one] => format!("{} to {} {}", one.low, one.high, one.unit).trim_end().to_owned(),
-            all => all.iter().map(|f| format!("{} {}", f.label, f.unit)).collect::<Vec<_>>().join(", "),
-        };
-        let began = if p.numbers == p.began_with {
-            String::new()
-        } else {
-            format!("; began with {}", told_of(&p.began_with))
-        };
-        format!("{} = {}  ({range}{began}): {}", p.name, told_of(&p.numbers), p.told)
-    };
-    let mut text: String = shown.all.iter().map(|p| line(p) + "\n").collect();
-    text += if shown.is_unsaved { "not saved" } else { "as the files say" };
-    text
 }

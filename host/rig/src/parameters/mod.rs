@@ -8,11 +8,9 @@
 pub mod applied;
 pub mod command;
 pub mod desk;
-mod sent;
 
 pub use command::Command;
 pub use desk::{ParameterDesk, Saver};
-pub use sent::Sent;
 
 use crate::config::RenderMethod;
 use crate::rig::Rig;

@@ -5,8 +5,8 @@
 //! has no part in it.
 
 use super::histogram_steps::Steps;
+use super::miss_log::MissRun;
 use super::report::Report;
-use crate::light::MissRun;
 use crate::plan::dark::DarkCause;
 use crate::rig::Rig;
 use dpm_common::unix::monotonic_ns;

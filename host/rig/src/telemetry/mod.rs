@@ -6,6 +6,7 @@ pub mod histogram_steps;
 pub mod interval;
 pub(crate) mod link_gauges;
 pub mod live;
+pub mod miss_log;
 pub mod monitor;
 mod ordered;
 pub mod profile;

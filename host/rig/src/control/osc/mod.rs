@@ -8,8 +8,9 @@ pub mod decode;
 
 use super::answer::answer_to;
 use super::orders::{Orders, Ticket};
+use super::parameters;
 use crate::order::Order;
-use crate::parameters::{desk, Command};
+use crate::parameters::Command;
 use crate::standing::By;
 use crate::telemetry::monitor::RunMonitor;
 use decode::{decode, Heard};
@@ -161,7 +162,7 @@ impl Ear {
                 Ok(Heard::Nothing) => continue,
                 Ok(Heard::Set { name, numbers }) => {
                     let command = Command::Set { name, numbers };
-                    desk::give(&self.monitor, &command, &format!("osc {ip}")).map_err(|e| e.to_string())
+                    parameters::give(&self.monitor, &command, &format!("osc {ip}")).map_err(|e| e.to_string())
                 }
                 Err(wrong) => Err(wrong.to_string()),
             };

@@ -22,15 +22,15 @@ pub struct MissRun {
 
 /// The newest runs, oldest first. It is allocated once.
 #[derive(Clone, Debug)]
-pub(super) struct MissLog(VecDeque<MissRun>);
+pub(crate) struct MissLog(VecDeque<MissRun>);
 
 impl MissLog {
-    pub(super) fn new() -> Self {
+    pub(crate) fn new() -> Self {
         Self(VecDeque::with_capacity(KEPT))
     }
 
     /// `slot`, which began at `begin`, was missed.
-    pub(super) fn add(&mut self, slot: u64, begin: HostTime, cause: MissCause) {
+    pub(crate) fn add(&mut self, slot: u64, begin: HostTime, cause: MissCause) {
         let cause = cause.name();
         if let Some(last) = self.0.back_mut().filter(|l| l.cause == cause && l.slot + l.count == slot) {
             last.count += 1;
@@ -43,7 +43,7 @@ impl MissLog {
     }
 
     /// The newest first.
-    pub(super) fn newest(&self) -> Vec<MissRun> {
+    pub(crate) fn newest(&self) -> Vec<MissRun> {
         self.0.iter().rev().copied().collect()
     }
 }
