@@ -82,6 +82,7 @@ impl Browser {
             this.call(domain, json!({}));
         }
         this.call("Page.navigate", json!({ "url": url }));
+        this.wait("page", "location.protocol !== 'about:' && document.readyState === 'complete'");
         this
     }
 
