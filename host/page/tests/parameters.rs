@@ -58,7 +58,7 @@ fn nonsense_is_refused_and_changes_nothing() {
     for (path, status, word) in [
         ("/api/parameters/set?name=exposure&value=NaN", 400, "NaN is not allowed"),
         ("/api/parameters/set?name=exposure&value=1e99", 400, "must be 0.000001 to 1000000"),
-        ("/api/parameters/set?name=exposure&value=", 400, "takes 1 numbers"),
+        ("/api/parameters/set?name=exposure&value=", 400, "takes one number"),
         ("/api/parameters/set?name=brightness&value=1", 400, "there are: exposure"),
         ("/api/parameters/set?name=%ff&value=1", 400, "write ?name"),
         ("/api/parameters/set", 400, "write ?name"),

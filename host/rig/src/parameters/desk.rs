@@ -233,7 +233,7 @@ impl ParameterDesk {
             s.before.push_back(s.values.clone());
         }
         s.last = Some((parameter, now_ns));
-        s.become_(values);
+        s.take_over(values);
         Ok((s.version, told, is_step))
     }
 
@@ -244,7 +244,7 @@ impl ParameterDesk {
         let values = s.before.pop_back().ok_or(Refused::NothingToUndo)?;
         let told = values.changes_since(&s.values, &s.rig);
         s.last = None;
-        s.become_(values);
+        s.take_over(values);
         Ok((s.version, if told.is_empty() { "nothing has changed".into() } else { told }))
     }
 
@@ -287,7 +287,7 @@ impl ParameterDesk {
 }
 
 impl State {
-    fn become_(&mut self, values: Values) {
+    fn take_over(&mut self, values: Values) {
         self.version += 1;
         self.to_planning.publish(Applied::new(self.version, &values, &self.rig, &self.middles));
         self.values = values;

@@ -99,7 +99,7 @@ pub enum Refused {
         why: &'static str,
     },
     /// Too many or too few numbers.
-    #[error("{name} takes {wanted} numbers, not {given}")]
+    #[error("{name} takes {wanted}, not {given}")]
     Count {
         /// Its name.
         name: String,
@@ -340,9 +340,9 @@ fn check(parameter: Parameter, numbers: &[f64], rig: &Rig) -> Result<(), Refused
     let is_none_meant = parameter == Parameter::Gaze && numbers.is_empty();
     if !is_none_meant && numbers.len() != fields.len() {
         let wanted = match fields.len() {
-            1 => "1",
-            3 => "3 (or none)",
-            _ => "6",
+            1 => "one number",
+            3 => "three numbers or none",
+            _ => "six numbers",
         };
         return Err(Refused::Count { name, wanted, given: numbers.len() });
     }
