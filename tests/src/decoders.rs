@@ -24,7 +24,7 @@ use dpm_device::tracker::record::{Recording, SAMPLE_BYTES};
 use dpm_device::tracker::serial::wire::SerialMessage;
 use dpm_device::tracker::vrpn::wire as vrpn;
 use dpm_rig::config::{Overrides, RigConfig};
-use dpm_rig::control::osc::decode::{self as osc, Heard};
+use dpm_rig::control::osc::decode as osc;
 use dpm_rig::control::{server, status_file, Asked};
 use dpm_rig::order::Order;
 use dpm_rig::parameters::command::{Command, MAX_LINE};
@@ -368,8 +368,8 @@ impl Write for Client<'_> {
 
 /// What other processes say of a projector: an order on the control socket, a state file, and the file of a standing
 /// order. An order is one of the four words and nothing else, however it is split, and a command about the parameters
-/// is what its line says; whatever a standing order's file
-/// holds, it stands for darkness, and for SAFE unless it is whole.
+/// is what its line says; whatever a standing order's file holds, it stands for darkness, and for SAFE unless it is
+/// whole.
 pub fn control_words(bytes: &[u8]) {
     for piece in [1, 3, 16] {
         let mut client = Client { rest: bytes, piece, is_dry: false, told: 0 };
@@ -381,7 +381,7 @@ pub fn control_words(bytes: &[u8]) {
                 Err(_) => break None,
             }
         };
-        assert!(word.len() <= MAX_LINE && client.told <= 300);
+        assert!(word.len() <= MAX_LINE && client.told <= 1000);
         let line =
             bytes[..bytes.len().min(MAX_LINE)].split_inclusive(|b| *b == b'\n').next().unwrap_or_default();
         // A word is read by pieces, and what came with its line feed is part of it.
@@ -414,8 +414,8 @@ pub fn osc_datagram(bytes: &[u8]) {
         (all, end.is_ok())
     };
     let _ = osc::decode(bytes, &mut |one| {
-        assert_ne!(one, Ok(Heard::Order(Order::Arm)));
-        if let Ok(Heard::Set { name, numbers }) = one {
+        assert_ne!(one, Ok(osc::Heard::Order(Order::Arm)));
+        if let Ok(osc::Heard::Set { name, numbers }) = one {
             assert!(numbers.len() <= osc::MOST_NUMBERS && name.len() <= bytes.len());
         }
     });

@@ -68,7 +68,7 @@ impl Command {
 
 /// Numbers that commas separate; none in an empty text.
 fn numbers_of(name: &str, text: &str) -> Result<Vec<f64>, Refused> {
-    let text = text.trim();
+    let (text, name) = (text.trim(), name.chars().take(80).collect::<String>());
     if text.is_empty() {
         return Ok(Vec::new());
     }

@@ -42,7 +42,7 @@ pub enum Wrong {
     #[error("ARM is never taken over OSC; use `dpm arm`, the page or a key")]
     Arm,
     /// An argument is no number.
-    #[error("{0}: an argument is no number")]
+    #[error("address {0:?}: an argument is no number")]
     NoNumber(String),
 }
 
