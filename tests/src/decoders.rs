@@ -24,8 +24,10 @@ use dpm_device::tracker::record::{Recording, SAMPLE_BYTES};
 use dpm_device::tracker::serial::wire::SerialMessage;
 use dpm_device::tracker::vrpn::wire as vrpn;
 use dpm_rig::config::{Overrides, RigConfig};
-use dpm_rig::control::{server, status_file};
+use dpm_rig::control::osc::decode as osc;
+use dpm_rig::control::{server, status_file, Asked};
 use dpm_rig::order::Order;
+use dpm_rig::parameters::command::{Command, MAX_LINE};
 use dpm_rig::standing;
 use dpm_scene::camera_files::{self, Form, LengthUnit, LensKind, ReadOptions, StorageError};
 use hil_mock::faults::FaultPlan;
@@ -37,7 +39,7 @@ use std::path::Path;
 pub type Entry = fn(&[u8]);
 
 /// Every entry with the name of its fuzz target, which is also the name of its folder of seeds.
-pub const ALL: [(&str, Entry); 33] = [
+pub const ALL: [(&str, Entry); 34] = [
     ("link_stream", link_stream),
     ("link_rle", link_rle),
     ("cobs_stream", cobs_stream),
@@ -52,6 +54,7 @@ pub const ALL: [(&str, Entry); 33] = [
     ("usbip_stream", usbip_stream),
     ("clock_map", clock_map),
     ("control_words", control_words),
+    ("osc_datagram", osc_datagram),
     ("settings", settings),
     ("projector", link::projector),
     ("projector_hello", link::projector_hello),
@@ -364,8 +367,9 @@ impl Write for Client<'_> {
 }
 
 /// What other processes say of a projector: an order on the control socket, a state file, and the file of a standing
-/// order. An order is one of the four words and nothing else, however it is split; whatever a standing order's file
-/// holds, it stands for darkness, and for SAFE unless it is whole.
+/// order. An order is one of the four words and nothing else, however it is split, and a command about the parameters
+/// is what its line says; whatever a standing order's file holds, it stands for darkness, and for SAFE unless it is
+/// whole.
 pub fn control_words(bytes: &[u8]) {
     for piece in [1, 3, 16] {
         let mut client = Client { rest: bytes, piece, is_dry: false, told: 0 };
@@ -377,10 +381,17 @@ pub fn control_words(bytes: &[u8]) {
                 Err(_) => break None,
             }
         };
-        assert!(word.len() <= 16 && client.told <= 200);
-        let line = bytes[..bytes.len().min(16)].split_inclusive(|b| *b == b'\n').next().unwrap_or_default();
+        assert!(word.len() <= MAX_LINE && client.told <= 1000);
+        let line =
+            bytes[..bytes.len().min(MAX_LINE)].split_inclusive(|b| *b == b'\n').next().unwrap_or_default();
         // A word is read by pieces, and what came with its line feed is part of it.
-        if let Some(order) = order {
+        if let Some(Asked::Parameters(command)) = &order {
+            let again = Command::parse(&command.line());
+            assert!(
+                matches!(&again, Ok(Some(back)) if format!("{back:?}") == format!("{command:?}")),
+                "{again:?}"
+            );
+        } else if let Some(Asked::Order(order)) = order {
             assert!(word.starts_with(order.word().as_bytes()), "{order:?} from {word:?}");
         } else if let Some(exact) = Order::ALL.iter().find(|(_, w)| line == format!("{w}\n").as_bytes()) {
             assert!(bytes.len() > line.len(), "{} was not heard", exact.1);
@@ -393,6 +404,29 @@ pub fn control_words(bytes: &[u8]) {
     assert!(matches!(stands.order, Order::Black | Order::Safe), "{stands:?}");
     assert!(stands.order == Order::Safe || bytes.trim_ascii().ends_with(b"}"), "{stands:?}");
     assert!(!stands.told.contains('\n') || stands.told.starts_with("counts as SAFE"));
+}
+
+/// A datagram of OSC: it gives messages or a fault, never ARM, and the same messages inside a bundle.
+pub fn osc_datagram(bytes: &[u8]) {
+    let heard = |bytes: &[u8]| {
+        let mut all = Vec::new();
+        let end = osc::decode(bytes, &mut |one| all.push(format!("{one:?}")));
+        (all, end.is_ok())
+    };
+    let _ = osc::decode(bytes, &mut |one| {
+        assert_ne!(one, Ok(osc::Heard::Order(Order::Arm)));
+        if let Ok(osc::Heard::Set { name, numbers }) = one {
+            assert!(numbers.len() <= osc::MOST_NUMBERS && name.len() <= bytes.len());
+        }
+    });
+    let plain = heard(bytes);
+    let is_bundle = bytes.starts_with(b"#bundle\0");
+    if bytes.len().is_multiple_of(4) && !bytes.is_empty() && !is_bundle {
+        let mut inside = b"#bundle\0\0\0\0\0\0\0\0\x01".to_vec();
+        inside.extend((bytes.len() as u32).to_be_bytes());
+        inside.extend(bytes);
+        assert_eq!(heard(&inside), plain);
+    }
 }
 
 /// The map of a device's clock: stamps of any device give instants in order and a bound that is none below 0, and where

@@ -166,6 +166,25 @@ fn words() -> Vec<(&'static str, &'static str, Vec<u8>)> {
     for (name, word) in [("black", "black\n"), ("arm", "arm\r\n"), ("long", "frozen-frozen-frozen\n")] {
         seeds.push(("control_words", name, word.into()));
     }
+    for (name, line) in [
+        ("set", "set exposure=1.5\n"),
+        ("set-body", "set body.bunny=1,-2.5,0,0,0,1e-3\n"),
+        ("set-none", "set gaze=\n"),
+        ("set-wrong", "set a=x\n"),
+        ("undo", "undo\n"),
+    ] {
+        seeds.push(("control_words", name, line.into()));
+    }
+    for (name, bytes) in [
+        ("black", &b"/dpm/black\0\0,\0\0\0"[..]),
+        ("released", b"/dpm/safe\0\0\0,f\0\0\0\0\0\0"),
+        ("arm", b"/dpm/arm\0\0\0\0"),
+        ("exposure", b"/dpm/exposure\0\0\0,f\0\0\x3f\xc0\0\0"),
+        ("mixed", b"/dpm/gaze\0\0\0,idhTs\0\0\0\0\0\x01\x40\0\0\0\0\0\0\0\0\0\0\0\0\0\0\x02a\0\0\0"),
+        ("bundle", b"#bundle\0\0\0\0\0\0\0\0\x01\0\0\0\x0c/dpm/freeze\0\0\0\0\x0c/dpm/arm\0\0\0\0"),
+    ] {
+        seeds.push(("osc_datagram", name, bytes.into()));
+    }
     let line = "00000000000000000007 0000000000000000 none  \n";
     seeds.push(("control_words", "state", format!("{line}{line}heard /etc/dpm/rig.toml\n").into()));
     let order = r#"{"version":1,"order":"freeze","at":"2026-01-01T00:00:00Z","by":"a key","process":7,"projector":"x"}"#;

@@ -7,10 +7,14 @@
 mod frame_law;
 
 use dpm_handoff::path::{self, Lock, Place};
+use dpm_rig::control::parameters;
+use dpm_rig::parameters::Command;
 use dpm_rig::pipeline::{run_prepared, RunOptions};
 use dpm_rig::telemetry::monitor::RunMonitor;
 use dpm_tests::rigs::demo_rig;
+use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::Arc;
+use std::time::Duration;
 
 /// Several rigs in parallel, so that the test takes seconds: a panel of eight planes can show 2800 frames per second.
 const RIGS: u64 = 4;
@@ -28,7 +32,15 @@ fn a_hundred_thousand_frames_only_wait_and_wake() {
                     let rig = demo_rig(32, 16, &settings);
                     let monitor = Arc::new(RunMonitor::default());
                     let options = RunOptions { frames: FRAMES, ..RunOptions::default() };
-                    let outcome = run_prepared(rig, options, &monitor).unwrap_or_else(|e| panic!("{e}"));
+                    let is_over = AtomicBool::new(false);
+                    let (outcome, changes) = std::thread::scope(|scope| {
+                        // Meanwhile an operator draws a slider.
+                        let slider = scope.spawn(|| draw_a_slider(&monitor, &is_over));
+                        let outcome = run_prepared(rig, options, &monitor).unwrap_or_else(|e| panic!("{e}"));
+                        is_over.store(true, Ordering::Relaxed);
+                        (outcome, slider.join().expect("it only asks"))
+                    });
+                    assert!(changes > 100, "{changes} changes");
                     assert_eq!((outcome.frames_torn, outcome.frames_reordered), (0, 0));
                     assert!(outcome.report.frames_lit > FRAMES / 50, "{} lit", outcome.report.frames_lit);
                     monitor.counts().frames_planned
@@ -40,6 +52,20 @@ fn a_hundred_thousand_frames_only_wait_and_wake() {
     assert_eq!(planned, RIGS * FRAMES);
     frame_law::seen().check(&[], &[]);
     what_breaks_the_law_is_seen();
+}
+
+/// Changes the exposure every few milliseconds until `is_over`. Returns how many changes planning has used.
+fn draw_a_slider(monitor: &Arc<RunMonitor>, is_over: &AtomicBool) -> u64 {
+    for k in 0u32.. {
+        if is_over.load(Ordering::Relaxed) {
+            break;
+        }
+        let numbers = vec![1.0 + f64::from(k % 100) * 1e-2];
+        // Refused until the first frame is planned.
+        let _ = parameters::give(monitor, &Command::Set { name: "exposure".into(), numbers }, "test");
+        std::thread::sleep(Duration::from_millis(3));
+    }
+    monitor.parameters().shown().map_or(0, |shown| shown.used)
 }
 
 /// The watch itself: an allocation, a lock and a system call of our own on the frame path, each planted here, fail the

@@ -38,6 +38,7 @@ fn wider_zones_are_the_zones_of_a_rig_file_with_wider_angles() {
                 spp: 1,
                 budget_spp: 1.0,
                 camera: &rig.camera,
+                brighter: 1.0,
                 eye,
                 gaze,
                 widen_deg,

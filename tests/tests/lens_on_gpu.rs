@@ -66,6 +66,7 @@ fn draw(
             spp: 1,
             budget_spp: 1.0,
             camera,
+            brighter: 1.0,
             eye: camera.position() + DVec3::X * 0.1,
             gaze: DVec3::ZERO,
             widen_deg: 0.0,

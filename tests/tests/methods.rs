@@ -166,6 +166,7 @@ fn what_a_frame_shows_does_not_depend_on_the_slot_that_draws_it() {
                 spp: 2,
                 budget_spp: 2.0,
                 camera: &camera,
+                brighter: 1.0,
                 eye,
                 gaze,
                 widen_deg: 0.0,

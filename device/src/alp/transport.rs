@@ -1,6 +1,7 @@
 //! The cable to an ALP whose firmware runs in this process: a thread that opens the device, serves the link, and frees the device.
 
 use std::path::PathBuf;
+use std::sync::atomic::{AtomicI32, Ordering};
 use std::sync::{Arc, OnceLock};
 use std::thread::JoinHandle;
 use std::time::{Duration, Instant};
@@ -96,7 +97,12 @@ struct Service {
     opened: Receiver<Opened>,
     /// Why it ended.
     ended: Arc<OnceLock<AlpError>>,
+    /// The hottest sensor, thousandths of a degree Celsius; [`UNKNOWN`] before it was looked at.
+    heat: Arc<AtomicI32>,
 }
+
+/// No sensor was looked at, or there is none.
+const UNKNOWN: i32 = i32::MIN;
 
 /// The link to an ALP. Dropping it makes the device dark and frees it.
 pub struct AlpTransport {
@@ -135,7 +141,8 @@ impl AlpTransport {
     fn start(&mut self) {
         let (tell, opened) = bounded(1);
         let ended = Arc::new(OnceLock::new());
-        let (settings, why) = (self.settings.clone(), ended.clone());
+        let heat = Arc::new(AtomicI32::new(UNKNOWN));
+        let (settings, why, seen) = (self.settings.clone(), ended.clone(), heat.clone());
         let serve = move || {
             (settings.enter)();
             match open_device(&settings) {
@@ -145,7 +152,7 @@ impl AlpTransport {
                 Ok((mut projector, welcome)) => {
                     let (host, device) = threaded(settings.frame_bytes, CABLE_BUFFERS, settings.wait);
                     if tell.send(Ok((host, welcome))).is_ok() {
-                        serve_cable(&mut projector, device, settings.clock.as_ref());
+                        serve_cable(&mut projector, device, settings.clock.as_ref(), &seen);
                     }
                     if let Some(error) = projector.error() {
                         let _ = why.set(error.clone());
@@ -154,7 +161,7 @@ impl AlpTransport {
             }
         };
         let thread = std::thread::Builder::new().name("dpm-alp".into()).spawn(serve);
-        self.service = thread.ok().map(|thread| Service { thread, opened, ended });
+        self.service = thread.ok().map(|thread| Service { thread, opened, ended, heat });
     }
 
     /// Takes what the thread has opened, within `limit`.
@@ -203,10 +210,12 @@ fn open_device(settings: &AlpSettings) -> Result<(AlpProjector, AlpWelcome), Alp
     Ok((projector, AlpWelcome { facts, bytes_per_s, start_ns, start_uncertainty_ns, frames }))
 }
 
-/// Serves the cable until the host's end is dropped, or the device fails.
-fn serve_cable(projector: &mut AlpProjector, mut cable: DeviceEnd, clock: &dyn HostClock) {
+/// Serves the cable until the host's end is dropped, or the device fails. Writes the device's temperature to `heat`.
+fn serve_cable(projector: &mut AlpProjector, mut cable: DeviceEnd, clock: &dyn HostClock, heat: &AtomicI32) {
     while cable.serve(|| clock.now(), projector) && projector.error().is_none() {
         projector.advance_to(clock.now());
+        let highest = projector.temperatures().highest().map_or(UNKNOWN, |c| (c * 1e3) as i32);
+        heat.store(highest, Ordering::Relaxed);
         let limit = clock.now().plus_ns(REST_NS);
         cable.rest(projector.next_due().map_or(limit, |due| due.min(limit)), || clock.now());
     }
@@ -253,6 +262,11 @@ impl Transport for AlpTransport {
 
     fn name(&self) -> &str {
         &self.name
+    }
+
+    fn milli_celsius(&self) -> Option<i32> {
+        let heat = self.service.as_ref()?.heat.load(Ordering::Relaxed);
+        (heat != UNKNOWN).then_some(heat)
     }
 }
 

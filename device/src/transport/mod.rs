@@ -131,6 +131,12 @@ pub trait Transport: Send {
         true
     }
 
+    /// The temperature of the device's hottest sensor, thousandths of a degree Celsius, when it was last looked at; `None`
+    /// for a device that tells none. Never waits.
+    fn milli_celsius(&self) -> Option<i32> {
+        None
+    }
+
     /// Sets the clock that every `now` of this medium's calls comes from, so that the medium can stamp arrivals between
     /// polls. Without a clock it stamps with the `now` of the poll. A medium that needs no clock ignores it; a second
     /// clock is ignored.

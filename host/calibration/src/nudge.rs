@@ -1,6 +1,6 @@
 //! Small motions by hand, each of which can be taken back.
 
-use dpm_common::so3::so3_log;
+use dpm_common::so3::{so3_exp, so3_log};
 use glam::{DAffine3, DQuat, DVec3};
 
 /// Angle of one turn, degrees.
@@ -117,6 +117,13 @@ impl Nudges {
     }
 }
 
+/// `start` after a motion along and about its own axes: `centre`, a point of the frame it starts from, moves by `by_m`
+/// metres, and the frame turns about it by the rotation vector `turn_rad`. [`Nudges::offset`] tells such a motion.
+pub fn moved(start: &DAffine3, centre: DVec3, by_m: DVec3, turn_rad: DVec3) -> DAffine3 {
+    let rotation = so3_exp(turn_rad);
+    *start * DAffine3::from_rotation_translation(rotation, centre + by_m - rotation * centre)
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -134,6 +141,15 @@ mod tests {
                 Order::Save | Order::Quit => panic!("{order:?}"),
             }
         }
+    }
+
+    #[test]
+    fn a_motion_that_was_told_gives_the_same_place() {
+        let centre = DVec3::new(0.05, 0.1, -0.02);
+        let mut nudges = Nudges::new(start(), centre, 2e-3);
+        type_in(&mut nudges, "xxx Y aab CC x");
+        let (by, turn) = nudges.offset();
+        assert!(moved(&start(), centre, by, turn).abs_diff_eq(nudges.now(), 1e-12));
     }
 
     #[test]

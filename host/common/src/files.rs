@@ -1,9 +1,13 @@
 //! Writes files atomically: after a power failure a file has either its old or its new content.
 
 use crate::folder::{open_own_file, Folder, FolderError};
+use dpm_device::regular_file;
 use std::fs::{self, File};
 use std::io::{self, BufWriter, Read, Seek, Write};
 use std::path::{Path, PathBuf};
+
+/// Most old files of one name that are kept.
+const MOST_KEPT: u32 = 10_000;
 
 /// Replaces `path` by the output of `write`. It writes a temporary file beside it, flushes it to the disk, renames it
 /// over `path`, and flushes the folder too. A reader sees the old or the new content, never a part. Missing folders are
@@ -55,6 +59,38 @@ fn create_new(path: &Path) -> io::Result<File> {
         }
         result => result,
     }
+}
+
+/// Gives a file of at most `max_bytes` a second name `NAME.1.old`, `NAME.2.old` and so on, under which it stays when the
+/// first one is replaced. Returns the second name; `None` if there is no such file.
+///
+/// # Errors
+/// Those of the file system; the file is not a regular one, or too many old ones lie beside it.
+pub fn keep_old(path: &Path, max_bytes: u64) -> io::Result<Option<PathBuf>> {
+    match fs::symlink_metadata(path) {
+        Err(e) if e.kind() == io::ErrorKind::NotFound => return Ok(None),
+        Err(e) => return Err(e),
+        Ok(m) if !m.is_file() => {
+            return Err(io::Error::new(io::ErrorKind::InvalidInput, "is not a regular file; remove it"));
+        }
+        Ok(_) => {}
+    }
+    let name = path.file_name().map(|n| n.to_string_lossy().into_owned()).unwrap_or_default();
+    for number in 1..=MOST_KEPT {
+        let old = path.with_file_name(format!("{name}.{number}.old"));
+        match fs::hard_link(path, &old) {
+            Ok(()) => return Ok(Some(old)),
+            Err(e) if e.kind() == io::ErrorKind::AlreadyExists => {}
+            // File systems without second names, such as FAT.
+            Err(_) if !old.exists() => {
+                let bytes = regular_file::read(path, max_bytes)?;
+                write_atomically(&old, |w| w.write_all(&bytes))?;
+                return Ok(Some(old));
+            }
+            Err(e) => return Err(e),
+        }
+    }
+    Err(io::Error::other(format!("{MOST_KEPT} old files lie beside it; remove some")))
 }
 
 fn write_and_rename(

@@ -3,6 +3,7 @@
 pub mod calibrate;
 pub mod cli;
 mod dlpc900;
+mod keep_parameters;
 mod notify;
 mod pattern_dlpc900;
 mod rest_dlpc900;

@@ -86,6 +86,39 @@ fn check_layout(browser: &mut Browser, width: u32) {
     assert!(state.as_f64().unwrap() >= 32.0, "the state cannot be read from two metres: {state}");
 }
 
+/// Exposure by the keyboard alone: the picture follows, keys of orders act inside the field, and undo takes it back.
+fn change_exposure(browser: &mut Browser) {
+    let field = "document.getElementById('field-exposure-0')";
+    let told = "document.getElementById('changed').textContent";
+    browser.wait("parameters", &format!("{field}.value === '1' && !{field}.disabled"));
+    let before = browser.value(BRIGHTNESS).as_f64().unwrap();
+    browser.value(&format!("{field}.focus(), {field}.select()"));
+    browser.type_in("0.1");
+    browser.press("Enter");
+    browser.wait("answer", &format!("{told}.startsWith('ok: exposure is 0.1, from frame ')"));
+    browser.wait("use", "document.getElementById('used').textContent === 'in use, not saved'");
+    wait_for_light(browser, "darker light", |mean| mean > 0.0 && mean < 0.5 * before);
+    browser.press("b");
+    browser.wait("state", "document.getElementById('state').textContent === 'BLACK'");
+    browser.press("a");
+    browser.wait("state", "document.getElementById('state').textContent === 'UP'");
+    browser.value("document.getElementById('save').click()");
+    browser.wait("refusal", &format!("{told}.includes('has no rig file')"));
+    browser.press("u");
+    browser.wait(
+        "undo",
+        &format!("{told}.startsWith('ok: exposure is 1, from frame ') && {field}.value === '1'"),
+    );
+    wait_for_light(browser, "light as before", |mean| mean > 0.7 * before);
+    // The slider, by its keys.
+    browser.value("document.getElementById('slide-exposure-0').focus()");
+    browser.press("ArrowRight");
+    browser.wait("slider", &format!("Number({field}.value) > 1 && {told}.includes('from frame')"));
+    browser.press("u");
+    browser.wait("undo", &format!("{field}.value === '1'"));
+    browser.value("document.activeElement.blur()");
+}
+
 fn the_page_shows_the_rig_obeys_its_operator_and_comes_back(program: &Path) {
     // A free port that stays the same over the restart.
     let address = TcpListener::bind("127.0.0.1:0").unwrap().local_addr().unwrap().to_string();
@@ -123,6 +156,9 @@ fn the_page_shows_the_rig_obeys_its_operator_and_comes_back(program: &Path) {
     browser
         .wait("answer", "document.getElementById('answer').textContent.startsWith('ARM: ok: projector up')");
     wait_for_light(&mut browser, "light again", |mean| mean > 1.0);
+
+    change_exposure(&mut browser);
+    browser.picture(&pictures.join("desktop-whole.png"), true);
 
     // A phone.
     browser.screen(390, 844, true);

@@ -328,6 +328,7 @@ pub fn draw(
             spp,
             budget_spp,
             camera: &rig.camera,
+            brighter: 1.0,
             eye,
             gaze,
             widen_deg: 0.0,

@@ -25,6 +25,8 @@ pub(crate) struct Events {
     ticks: u32,
     notes_from: u64,
     figures: Option<Arc<LiveSnapshot>>,
+    /// Of the parameters that were told last.
+    parameters: Option<[u64; 3]>,
     pictures: u64,
 }
 
@@ -36,6 +38,7 @@ impl Events {
             ticks: 0,
             notes_from: 0,
             figures: None,
+            parameters: None,
             pictures: 0,
         }
     }
@@ -69,6 +72,11 @@ impl Events {
             if is_new || self.ticks == 0 {
                 event(&mut text, "figures", &state.to_json().figures);
                 self.figures = state.figures;
+            }
+            let mark = shared.monitor.parameters().mark();
+            if mark != self.parameters || self.ticks == 0 {
+                self.parameters = mark;
+                event(&mut text, "parameters", &shared.monitor.parameters().shown());
             }
             let notes = shared.notes.since(self.notes_from);
             if let Some(last) = notes.last() {

@@ -12,6 +12,7 @@ mod guard;
 pub mod metrics;
 pub mod notes;
 mod orders;
+mod parameters;
 mod pictures;
 mod routes;
 mod server;

@@ -51,6 +51,7 @@ families! {
     PLANES = "dpm_link_planes_total", "counter", "Planes by how they were sent: raw, coded, or not because nothing had changed";
     NOT_SENT = "dpm_link_not_sent_total", "counter", "Frames not sent, by reason";
     DEVICE = "dpm_device_total", "counter", "What a projector outside this process has counted: frames, slots and packets";
+    CELSIUS = "dpm_device_celsius", "gauge", "Temperature of the projector's hottest sensor; absent where the device tells none";
     VIEWERS = "dpm_page_viewers", "gauge", "Viewers of the live page";
 }
 
@@ -63,6 +64,10 @@ pub(crate) fn text(state: &State) -> String {
         None => counted(&mut out, state),
     }
     link(&mut out, &state.carried);
+    out.family(CELSIUS);
+    if let Some(celsius) = state.carried.celsius {
+        out.value(&[], celsius);
+    }
     out.family(VIEWERS).value(&[], state.now.viewers as f64);
     out.text
 }

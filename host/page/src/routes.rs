@@ -5,10 +5,13 @@ use crate::events::Events;
 use crate::guard::Refused;
 use crate::metrics;
 use crate::orders;
+use crate::parameters;
 use crate::shared::Shared;
 use crate::state::State;
 use base64::prelude::{Engine, BASE64_STANDARD};
+use dpm_device::regular_file;
 use dpm_rig::order::Order;
+use dpm_rig::telemetry::flight::page_path;
 use hyper::body::{Body, Bytes, Frame, Incoming, SizeHint};
 use hyper::header::{self, HeaderName, HeaderValue};
 use hyper::{Method, Request, Response, StatusCode};
@@ -22,6 +25,8 @@ use std::time::Duration;
 const PAGE: &str = include_str!("page.html");
 /// What stands for that number in the page.
 const NONCE: &str = "{{nonce}}";
+/// Longest page of a flight, bytes.
+const MAX_FLIGHT_BYTES: u64 = 1 << 20;
 /// How long the metrics wait for fresh figures.
 const FRESH_WITHIN: Duration = Duration::from_millis(60);
 
@@ -124,9 +129,12 @@ async fn route(
     if let Some(word) = path.strip_prefix("/api/orders/") {
         return order(request, word, connection, shared).await;
     }
+    if let Some(word) = path.strip_prefix("/api/parameters/") {
+        return change(request, word, shared).await;
+    }
     tokio::time::sleep(shared.pace()).await;
     if request.method() != Method::GET {
-        return plain(StatusCode::METHOD_NOT_ALLOWED, "only GET, and POST for orders");
+        return plain(StatusCode::METHOD_NOT_ALLOWED, "only GET, and POST for orders and parameters");
     }
     match path {
         "/" => page(),
@@ -135,6 +143,7 @@ async fn route(
             whole(StatusCode::OK, "text/plain; version=0.0.4; charset=utf-8", text)
         }
         "/api/state" => json(StatusCode::OK, &fresh(shared).await.to_json()),
+        "/api/parameters" => json(StatusCode::OK, &shared.monitor.parameters().shown()),
         "/api/token" => match shared.guard.check_token(request.headers()) {
             Ok(()) => plain(StatusCode::OK, "ok"),
             Err(refused) => refusal(refused),
@@ -151,8 +160,11 @@ async fn route(
                 plain(StatusCode::SERVICE_UNAVAILABLE, "too many viewers: close another page of this rig")
             }
         },
+        _ if path.starts_with("/api/flights/") => flight(path, shared).await,
         "/favicon.ico" => plain(StatusCode::NOT_FOUND, "none"),
-        _ => plain(StatusCode::NOT_FOUND, "there is /, /metrics, /api/state and /api/events"),
+        _ => {
+            plain(StatusCode::NOT_FOUND, "there is /, /metrics, /api/state, /api/parameters and /api/events")
+        }
     }
 }
 
@@ -175,6 +187,44 @@ async fn order(
     };
     connection.now_does(Doing::Orders);
     json(StatusCode::OK, &orders::give(order, shared).await)
+}
+
+/// A change of the parameters. It knows the token as an order does, but it waits its turn as every other request.
+async fn change(request: &Request<Incoming>, word: &str, shared: &Arc<Shared>) -> Response<Answer> {
+    tokio::time::sleep(shared.pace()).await;
+    if let Err(refused) = shared.guard.check_token(request.headers()) {
+        return refusal(refused);
+    }
+    if request.method() != Method::POST {
+        return plain(StatusCode::METHOD_NOT_ALLOWED, "a change is a POST");
+    }
+    let Some(asked) = parameters::asked(word, request.uri().query().unwrap_or_default()) else {
+        return plain(StatusCode::NOT_FOUND, "there is set, undo and save");
+    };
+    let done = match &asked {
+        Ok(command) => parameters::give(command, shared).await,
+        Err(refused) => Err(refused.clone()),
+    };
+    match done {
+        Ok(answered) => json(StatusCode::OK, &answered),
+        Err(refused) => plain(StatusCode::BAD_REQUEST, format!("refused: {refused}")),
+    }
+}
+
+/// The page of the flight recorder about a flight.
+async fn flight(path: &str, shared: &Arc<Shared>) -> Response<Answer> {
+    let number = path.rsplit('/').next().and_then(|number| number.parse().ok());
+    let rig = shared.monitor.live().rig().filter(|rig| rig.config.output.flight_recorder);
+    let Some(file) = rig.zip(number).and_then(|(rig, number)| page_path(&rig.config.output.dir, number))
+    else {
+        return plain(StatusCode::NOT_FOUND, "there is no such flight; output.flight_recorder records them");
+    };
+    // The disk may be slow, and an order must not wait for it.
+    let read = tokio::task::spawn_blocking(move || regular_file::read_text(&file, MAX_FLIGHT_BYTES));
+    match read.await {
+        Ok(Ok(text)) => whole(StatusCode::OK, "text/plain; charset=utf-8", text),
+        _ => plain(StatusCode::NOT_FOUND, "this flight was not written, or not yet"),
+    }
 }
 
 /// The state with figures that were made for this request, if they come at once.

@@ -99,7 +99,6 @@ fn setup(shared: &Shared) -> Value {
         all["projector"] = json!(config.projector.backend.word());
         all["tracker"] = json!(config.tracker.word());
         all["spp"] = json!(config.render.spp);
-        all["exposure"] = json!(config.render.exposure);
         all["frames"] = json!(config.run.frames);
         all["seconds"] = json!(config.run.seconds);
     }
@@ -135,6 +134,14 @@ fn told_of(f: &LiveSnapshot) -> Value {
             })
         })
         .collect();
+    let misses: Vec<Value> = f
+        .misses
+        .iter()
+        .map(|m| {
+            let ago_ns = f.frame.due_at.ns_since(m.begin).max(0);
+            json!({ "slot": m.slot, "count": m.count, "cause": m.cause, "ago_s": ago_ns as f64 / 1e9 })
+        })
+        .collect();
     json!({
         "report": report,
         "is_final": f.is_final,
@@ -142,10 +149,13 @@ fn told_of(f: &LiveSnapshot) -> Value {
         "intervals": intervals,
         "frame": {
             "id": f.frame.id,
+            "parameters": f.frame.parameters,
             "sample_age_ms": f.frame.sample_age_ns.map(|ns| ns as f64 / 1e6),
             "budget_spp": f.frame.budget_spp,
             "predict_ms": f.frame.predict_ns as f64 / 1e6,
         },
+        "misses": misses,
+        "flights": f.flights,
         "rays": f.rays,
         "samples": f.samples,
     })

@@ -341,7 +341,7 @@ impl Renderer {
             body: i as u32,
             extent: body.extent,
             mover: self.movers.number_of(i),
-            drive_gain: self.settings.drive.gain_of(i),
+            drive_gain: self.settings.drive.gain_of(i).map(|gain| gain * inputs.brighter),
             reserved_too: 0,
         }
     }

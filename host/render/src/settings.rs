@@ -72,6 +72,8 @@ pub struct FrameInputs<'a> {
     pub budget_spp: f32,
     /// The projector.
     pub camera: &'a ProjectorCamera,
+    /// Factor of the gain of [`RendererSettings::drive`]; 1 leaves it as it is.
+    pub brighter: f32,
     /// Position of the eye, world space.
     pub eye: DVec3,
     /// Gaze point, world space.

@@ -40,6 +40,7 @@ pub mod light;
 mod mock;
 pub mod order;
 pub mod pack;
+pub mod parameters;
 pub mod pattern;
 pub mod pictures;
 pub mod pipeline;

@@ -159,6 +159,7 @@ fn integrate(
         spp: 1,
         budget_spp: 1.0,
         camera,
+        brighter: 1.0,
         eye: other,
         gaze: other,
         widen_deg: 0.0,

@@ -15,16 +15,16 @@ use dpm_render::{FrameInputs, FrameSlot, Renderer};
 pub(crate) fn submit(
     plan: &FramePlan,
     slot: &mut FrameSlot,
-    rig: &Rig,
     renderer: &mut Renderer,
 ) -> Result<(), GpuError> {
     renderer.submit(
         slot,
         &FrameInputs {
             frame: plan.id.0 as u32,
-            spp: rig.config.render.spp,
+            spp: plan.samples,
             budget_spp: plan.budget_milli as f32 * 1e-3,
-            camera: &rig.camera,
+            camera: &plan.camera,
+            brighter: plan.brighter,
             eye: plan.eye,
             gaze: plan.gaze,
             widen_deg: plan.widen_deg,
@@ -52,7 +52,7 @@ pub(crate) fn warm_up(
     rig.scene_poses(&plan.tracked_poses, &mut plan.scene_poses);
     (plan.eye, plan.gaze) = rig.observer.eye_and_gaze(&plan.tracked_poses);
     plan.budget_milli = u64::from(rig.config.render.spp) * 1000;
-    submit(&plan, slot, rig, renderer)?;
+    submit(&plan, slot, renderer)?;
     slot.wait(timeout_ns).map(|_| watch.elapsed_ns() as i64)
 }
 

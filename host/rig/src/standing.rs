@@ -12,6 +12,7 @@ use dpm_common::folder::{Folder, FolderError, Owner};
 use dpm_common::unix::{user, user_name};
 use std::fmt;
 use std::io;
+use std::net::IpAddr;
 use std::path::{Path, PathBuf};
 use std::time::{SystemTime, UNIX_EPOCH};
 
@@ -134,6 +135,11 @@ pub enum By {
     },
     /// The live page; whoever holds its token.
     Page,
+    /// A datagram of Open Sound Control.
+    Osc {
+        /// Its sender, as it says.
+        from: IpAddr,
+    },
     /// A key on the terminal of the run.
     Key,
     /// A signal.
@@ -147,6 +153,7 @@ impl fmt::Display for By {
         match self {
             Self::Socket { uid } => write!(f, "user {} over the control socket", user_name(*uid)),
             Self::Page => write!(f, "the live page"),
+            Self::Osc { from } => write!(f, "OSC from {from}"),
             Self::Key => write!(f, "a key"),
             Self::Signal => write!(f, "a signal"),
             Self::Projector => write!(f, "the projector, which had it latched"),

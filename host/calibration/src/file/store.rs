@@ -1,17 +1,14 @@
 //! Calibration files on the disk.
 
 use super::{CalibrationFile, Wrong};
-use dpm_common::files::write_atomically;
+use dpm_common::files::{keep_old, write_atomically};
 use dpm_device::regular_file;
-use std::fs;
 use std::io::{self, Write};
 use std::path::{Path, PathBuf};
 use thiserror::Error;
 
 /// Largest accepted file.
 pub const MAX_BYTES: u64 = 4 << 20;
-/// Old files that are kept.
-const MOST_KEPT: u32 = 10_000;
 
 /// Why a file cannot be read or written.
 #[derive(Debug, Error)]
@@ -74,7 +71,7 @@ pub fn save(file: &CalibrationFile, path: &Path) -> Result<Option<PathBuf>, File
     file.check().map_err(|wrong| FileError::Wrong { path: path.into(), wrong })?;
     let text =
         toml::to_string(file).map_err(|e| FileError::Syntax { path: path.into(), message: e.to_string() })?;
-    let kept = keep(path).map_err(io)?;
+    let kept = keep_old(path, MAX_BYTES).map_err(io)?;
     write_atomically(path, |w| {
         w.write_all(
             b"# Written by dpm calibrate. Lengths in metres, pixels from the raster's upper left corner.\n",
@@ -83,32 +80,4 @@ pub fn save(file: &CalibrationFile, path: &Path) -> Result<Option<PathBuf>, File
     })
     .map_err(io)?;
     Ok(kept)
-}
-
-/// Gives the file a second name, under which it stays when the first one is replaced.
-fn keep(path: &Path) -> io::Result<Option<PathBuf>> {
-    match fs::symlink_metadata(path) {
-        Err(e) if e.kind() == io::ErrorKind::NotFound => return Ok(None),
-        Err(e) => return Err(e),
-        Ok(m) if !m.is_file() => {
-            return Err(io::Error::new(io::ErrorKind::InvalidInput, "is not a regular file; remove it"));
-        }
-        Ok(_) => {}
-    }
-    let name = path.file_name().map(|n| n.to_string_lossy().into_owned()).unwrap_or_default();
-    for number in 1..=MOST_KEPT {
-        let old = path.with_file_name(format!("{name}.{number}.old"));
-        match fs::hard_link(path, &old) {
-            Ok(()) => return Ok(Some(old)),
-            Err(e) if e.kind() == io::ErrorKind::AlreadyExists => {}
-            // File systems without second names, such as FAT.
-            Err(_) if !old.exists() => {
-                let bytes = regular_file::read(path, MAX_BYTES)?;
-                write_atomically(&old, |w| w.write_all(&bytes))?;
-                return Ok(Some(old));
-            }
-            Err(e) => return Err(e),
-        }
-    }
-    Err(io::Error::other(format!("{MOST_KEPT} old files lie beside it; remove some")))
 }

@@ -14,6 +14,7 @@ mod link_test;
 mod live_page;
 mod order;
 mod os;
+mod osc;
 mod pattern;
 mod plan;
 mod profile;
@@ -21,6 +22,7 @@ mod progress;
 mod record;
 mod rig_args;
 pub mod run;
+mod set;
 mod snapshot;
 mod stability;
 mod tell;
@@ -78,6 +80,11 @@ enum Command {
     /// several rigs run, select one with --pid.
     #[command(visible_alias = "resume")]
     Arm(order::OrderArgs),
+    /// Show or change the parameters of a running rig: exposure, samples, gaze, motions of projector and bodies
+    ///
+    /// A change is used from one frame on, and the answer names the frame. --undo takes the last change back, and --save
+    /// writes the values into the rig file and the calibration file for the next run.
+    Set(set::SetArgs),
     /// Show a pattern on a rig's projector, for aiming, focusing and calibrating, or write it as PNG files
     Pattern(pattern::PatternArgs),
     /// Measure what a rig needs to know: wand, projector, bodies, latency, light
@@ -150,6 +157,7 @@ fn dispatch(command: &Command) -> Result<(), Failure> {
         Command::Freeze(args) => order::execute(args, Order::Freeze),
         Command::Safe(args) => order::execute(args, Order::Safe),
         Command::Arm(args) => order::execute(args, Order::Arm),
+        Command::Set(args) => set::execute(args),
         Command::Pattern(args) => pattern::execute(args),
         Command::Calibrate(args) => calibrate::execute(args),
         Command::Record(args) => record::execute(args),

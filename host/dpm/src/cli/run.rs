@@ -3,6 +3,7 @@
 use super::dlpc900::Guard;
 use super::rig_args::RigArgs;
 use super::watch::{check_out, print, run_and_report, watch, write_out};
+use crate::keep_parameters;
 use crate::run_dlpc900::run_dlpc900;
 use dpm_rig::config::{ProjectorBackend, DEFAULT_PAGE};
 use dpm_rig::failure::Failure;
@@ -87,5 +88,9 @@ fn start(path: Option<&Path>, flags: &RigArgs, json: bool) -> Result<(), Failure
         print(&if json { to_json(&report) + "\n" } else { report.to_table() });
         return write_out(flags.out.as_deref(), "report.json", &report);
     }
-    run_and_report(rig, json, run_rig)
+    let saver = path.map_or_else(keep_parameters::no_file, |path| keep_parameters::saver(path.into()));
+    run_and_report(rig, json, move |rig, monitor| {
+        monitor.parameters().set_saver(saver);
+        run_rig(rig, monitor)
+    })
 }

@@ -7,6 +7,7 @@
 
 use super::keys::Keys;
 use super::live_page;
+use super::osc;
 use super::tell::{Teller, SHOWN_EVERY};
 use crate::notify::Notifier;
 use crate::signals;
@@ -136,6 +137,7 @@ fn watch_with<T: Send + 'static>(
     }
     let (control, status) = open_control(&locks.runtime, &monitor, &orders, &mut teller, keys.is_some());
     let page = live_page::open(&shown, &monitor, &orders, &teller);
+    let osc = osc::open(&shown, &monitor, &orders, &teller);
     let mut watcher = Watcher {
         monitor: &monitor,
         orders: &orders,
@@ -162,7 +164,7 @@ fn watch_with<T: Send + 'static>(
         // A client that waits for a dark that came with the end sees it.
         status.say(monitor.projector(), orders.kept());
     }
-    drop((control, page));
+    drop((control, page, osc));
     if let Some(orders) = Arc::into_inner(orders) {
         orders.end(result.is_ok());
     }

@@ -82,6 +82,7 @@ impl Browser {
             this.call(domain, json!({}));
         }
         this.call("Page.navigate", json!({ "url": url }));
+        this.wait("page", "location.protocol !== 'about:' && document.readyState === 'complete'");
         this
     }
 
@@ -164,9 +165,22 @@ impl Browser {
         }
     }
 
-    /// Presses and releases a letter's key.
+    /// Types a text into what has the focus.
+    pub(crate) fn type_in(&mut self, text: &str) {
+        self.call("Input.insertText", json!({ "text": text }));
+    }
+
+    /// Presses and releases a key: a letter's, or one that has a name.
     pub(crate) fn press(&mut self, key: &str) {
-        let down = json!({ "type": "keyDown", "key": key, "text": key });
+        let down = match key {
+            "Enter" => {
+                json!({ "type": "keyDown", "key": key, "code": key, "text": "\r", "windowsVirtualKeyCode": 13 })
+            }
+            "ArrowRight" => {
+                json!({ "type": "keyDown", "key": key, "code": key, "windowsVirtualKeyCode": 39 })
+            }
+            letter => json!({ "type": "keyDown", "key": letter, "text": letter }),
+        };
         self.call("Input.dispatchKeyEvent", down);
         self.call("Input.dispatchKeyEvent", json!({ "type": "keyUp", "key": key }));
     }

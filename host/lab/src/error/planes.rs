@@ -263,6 +263,7 @@ impl Frames {
             spp: 1,
             budget_spp: 1.0,
             camera: &self.camera,
+            brighter: 1.0,
             eye: self.camera.position(),
             gaze: DVec3::ZERO,
             widen_deg: 0.0,

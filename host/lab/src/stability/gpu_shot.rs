@@ -154,6 +154,7 @@ impl<'a> Shot<'a> {
                 spp: self.spp,
                 budget_spp: self.spp as f32,
                 camera: &self.camera,
+                brighter: 1.0,
                 eye,
                 gaze: self.gaze.unwrap_or(eye),
                 widen_deg: 0.0,

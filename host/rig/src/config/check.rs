@@ -50,6 +50,7 @@ pub(super) fn check(rig: &RigConfig, purpose: Purpose, reader: &mut Reader) {
     transforms(rig, reader);
     super::safety::check(rig, reader);
     super::page::check(rig, reader);
+    super::osc::check(rig, reader);
 }
 
 fn transforms(rig: &RigConfig, reader: &mut Reader) {

@@ -7,6 +7,7 @@
 mod calibration;
 mod check;
 mod method;
+mod osc;
 mod page;
 mod prediction;
 mod projector;
@@ -23,6 +24,7 @@ pub(crate) use check::MAX_TRACKED;
 pub(crate) use dpm_common::keys::read::KeyDoc;
 pub(crate) use dpm_common::keys::source::VARIABLE_PREFIX;
 pub use dpm_common::keys::{ConfigError, ConfigErrors, Origin};
+pub use osc::OscConfig;
 pub use page::{PageConfig, DEFAULT_PAGE};
 pub use projector::*;
 pub use run::*;
@@ -73,6 +75,8 @@ section! {
         safety: SafetyConfig = SafetyConfig::default(), "", Any;
         /// What an operator sees in a browser.
         page: PageConfig = PageConfig::default(), "", Any;
+        /// What other programs may change.
+        osc: OscConfig = OscConfig::default(), "", Any;
     }
 }
 

@@ -14,6 +14,8 @@ section! {
         method: RenderMethod = RenderMethod::Dpm, "", Any;
         /// Samples per pixel where no angle-dependent count applies.
         spp: u32 = 2, "samples/px", Within(1, 4096);
+        /// Largest average of samples per pixel in a run, with `method = "dpm"`. If left out, `spp` alone bounds it.
+        budget_spp: Option<f64> = None, "samples/px", Within(0.125, 4096.0);
         /// Closest-hit rays per path: 1 shows emission only, 2 direct light, 3 one bounce.
         depth: u32 = 3, "", Within(1, 64);
         /// Raster that is traced and projected instead of the projector's if only software Vulkan is available.

@@ -72,7 +72,7 @@ pub enum ControlError {
     },
 }
 
-fn list(folders: &[PathBuf]) -> String {
+pub(super) fn list(folders: &[PathBuf]) -> String {
     folders.iter().map(|f| f.display().to_string()).collect::<Vec<_>>().join(", ")
 }
 
@@ -109,7 +109,7 @@ pub struct Answer {
 
 /// Folders in which rigs may listen. If DPM_RUNTIME_DIR is set: only that one. Otherwise: this user's own folder, the
 /// service's, and those of other users, which root may use and which are reported to others.
-fn folders() -> Vec<PathBuf> {
+pub(super) fn folders() -> Vec<PathBuf> {
     let own = runtime_path();
     if std::env::var_os("DPM_RUNTIME_DIR").is_some_and(|dir| !dir.is_empty()) {
         return vec![own];
@@ -129,7 +129,7 @@ fn folders() -> Vec<PathBuf> {
 }
 
 /// Searches `folders` for rigs.
-fn search(folders: &[PathBuf]) -> Search {
+pub(super) fn search(folders: &[PathBuf]) -> Search {
     let mut found = Search::default();
     for path in folders {
         let folder = match Folder::open(path, Owner::OwnOrAnyForRoot) {
@@ -294,7 +294,7 @@ fn by_hand(order: Order, pid: u32) -> String {
 }
 
 /// Connects, and asks the kernel which process listens there.
-fn connect(place: &Place) -> io::Result<(UnixStream, Peer)> {
+pub(super) fn connect(place: &Place) -> io::Result<(UnixStream, Peer)> {
     let name = socket_name(place.pid);
     let stream = UnixStream::connect(place.folder.path_to(&name)).inspect_err(|e| {
         if e.kind() == io::ErrorKind::ConnectionRefused {

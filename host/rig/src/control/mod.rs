@@ -6,14 +6,20 @@
 //! when the projector has obeyed, and says how it is and what is kept over restarts; if the projector has not obeyed
 //! after half a second, the line says so. If the first line does not come, BLACK and SAFE are sent as a signal, which
 //! needs no thread of the rig except its link's. The file `run-PID.state` then shows the result.
+//!
+//! The same socket takes the commands of [`crate::parameters`], which have no signal and no first line.
 
 pub mod answer;
+pub mod change;
 pub mod client;
 pub mod orders;
+pub mod osc;
+pub mod parameters;
 pub mod server;
 pub mod status_file;
 
 use crate::order::Order;
+use crate::parameters::command::{Command, MAX_LINE};
 use crate::telemetry::monitor::ProjectorHealth;
 use dpm_common::folder::{Folder, FolderError, Owner};
 use dpm_common::unix::user;
@@ -22,10 +28,19 @@ use std::os::unix::fs::MetadataExt;
 use std::path::{Path, PathBuf};
 use std::sync::OnceLock;
 
-/// Longest order with its line feed.
-const MAX_WORD: usize = 16;
+/// Longest line that a client sends, with its line feed.
+const MAX_WORD: usize = MAX_LINE;
 /// First word of the line that confirms the arrival of an order.
 const HEARD: &str = "heard";
+
+/// What a client asks for.
+#[derive(Clone, Debug, PartialEq)]
+pub enum Asked {
+    /// An order.
+    Order(Order),
+    /// A look at the parameters, or a change of them.
+    Parameters(Command),
+}
 
 static RIG: OnceLock<String> = OnceLock::new();
 

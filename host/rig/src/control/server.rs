@@ -2,12 +2,14 @@
 
 use super::answer::answer_to;
 use super::orders::{Orders, Ticket};
-use super::{rig_name, socket_name, HEARD, MAX_WORD};
+use super::parameters::{self, Sent};
+use super::{rig_name, socket_name, Asked, HEARD, MAX_WORD};
 use crate::order::Order;
+use crate::parameters::Command;
 use crate::standing::By;
 use crate::telemetry::monitor::RunMonitor;
 use dpm_common::folder::{Folder, FolderError};
-use dpm_common::unix::{peer, user, wait_readable};
+use dpm_common::unix::{peer, user, user_name, wait_readable};
 use std::collections::VecDeque;
 use std::io::{self, Read, Write};
 use std::os::fd::AsRawFd;
@@ -88,8 +90,14 @@ struct Client {
     since: Instant,
     uid: u32,
     word: Vec<u8>,
-    /// Its order, once received.
-    given: Option<(Order, Ticket)>,
+    /// What it has asked for, once received.
+    given: Option<Given>,
+}
+
+/// What waits for its answer.
+enum Given {
+    Order(Order, Ticket),
+    Change(Sent),
 }
 
 struct Desk {
@@ -173,20 +181,21 @@ impl Desk {
 
     /// Reads what clients have sent, and gives their orders.
     fn listen(&mut self) {
-        let Self { clients, orders, .. } = self;
+        let Self { clients, orders, monitor, .. } = self;
         clients.retain_mut(|client| {
             if client.given.is_some() {
                 return true;
             }
             match client.read_word() {
                 Ok(None) => client.since.elapsed() < PATIENCE,
-                Ok(Some(order)) => {
+                Ok(Some(Asked::Order(order))) => {
                     let by = By::Socket { uid: client.uid };
-                    client.given = Some((order, orders.give(order, by)));
+                    client.given = Some(Given::Order(order, orders.give(order, by)));
                     // A client that has disconnected has given its order all the same.
                     let _ = writeln!(client.stream, "{HEARD} {}", rig_name());
                     true
                 }
+                Ok(Some(Asked::Parameters(command))) => client.change(&command, monitor),
                 Err(_) => false,
             }
         });
@@ -195,10 +204,13 @@ impl Desk {
     fn answer(&mut self) {
         let Self { clients, orders, monitor, .. } = self;
         clients.retain_mut(|client| {
-            let Some((order, ticket)) = client.given else { return true };
-            let Some(answer) = answer_to(order, ticket, client.since.elapsed(), monitor, orders) else {
-                return true;
+            let ago = client.since.elapsed();
+            let answer = match &client.given {
+                Some(Given::Order(order, ticket)) => answer_to(*order, *ticket, ago, monitor, orders),
+                Some(Given::Change(sent)) => sent.answer(ago, monitor.parameters()),
+                None => None,
             };
+            let Some(answer) = answer else { return true };
             let _ = writeln!(client.stream, "{}", answer.text);
             false
         });
@@ -211,17 +223,31 @@ fn may_give_orders(client: u32, me: u32) -> bool {
 }
 
 impl Client {
-    fn read_word(&mut self) -> io::Result<Option<Order>> {
+    fn read_word(&mut self) -> io::Result<Option<Asked>> {
         read_word(&mut self.stream, &mut self.word)
+    }
+
+    /// Gives a command about the parameters. False if it was refused, of which the client is told.
+    fn change(&mut self, command: &Command, monitor: &Arc<RunMonitor>) -> bool {
+        match parameters::give(monitor, command, &format!("user {}", user_name(self.uid))) {
+            Ok(sent) => {
+                self.given = Some(Given::Change(sent));
+                true
+            }
+            Err(refused) => {
+                let _ = writeln!(self.stream, "refused: {refused}");
+                false
+            }
+        }
     }
 }
 
-/// The order on `stream`, once it has arrived completely; `word` holds what has arrived before.
+/// What is asked for on `stream`, once it has arrived completely; `word` holds what has arrived before.
 ///
 /// # Errors
 /// The client disconnected, or sent something else (and is informed).
 #[doc(hidden)]
-pub fn read_word(stream: &mut (impl Read + Write), word: &mut Vec<u8>) -> io::Result<Option<Order>> {
+pub fn read_word(stream: &mut (impl Read + Write), word: &mut Vec<u8>) -> io::Result<Option<Asked>> {
     let mut bytes = [0u8; MAX_WORD];
     while word.len() < MAX_WORD && !word.contains(&b'\n') {
         let room = MAX_WORD - word.len();
@@ -234,13 +260,20 @@ pub fn read_word(stream: &mut (impl Read + Write), word: &mut Vec<u8>) -> io::Re
             Err(e) => return Err(e),
         }
     }
-    let order = std::str::from_utf8(word).ok().and_then(|w| Order::from_word(w.trim_end()));
-    if order.is_none() {
-        let known: Vec<_> = Order::ALL.iter().map(|(_, word)| *word).collect();
-        let _ = writeln!(stream, "unknown order; known: {}", known.join(", "));
-        return Err(io::ErrorKind::InvalidData.into());
+    let text = std::str::from_utf8(word).map_or("", str::trim_end);
+    if let Some(order) = Order::from_word(text) {
+        return Ok(Some(Asked::Order(order)));
     }
-    Ok(order)
+    let told = match Command::parse(text) {
+        Ok(Some(command)) => return Ok(Some(Asked::Parameters(command))),
+        Ok(None) => {
+            let known: Vec<_> = Order::ALL.iter().map(|(_, word)| *word).collect();
+            format!("unknown order; known: {}, set NAME=VALUE, undo, save, list", known.join(", "))
+        }
+        Err(refused) => format!("refused: {refused}"),
+    };
+    let _ = writeln!(stream, "{told}");
+    Err(io::ErrorKind::InvalidData.into())
 }
 
 #[cfg(test)]

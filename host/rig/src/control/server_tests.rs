@@ -1,10 +1,12 @@
 use super::*;
-use crate::config::{MockProjectorConfig, ProjectorBackend};
+use crate::config::{MockProjectorConfig, Overrides, ProjectorBackend, RigConfig};
+use crate::control::change::{self, ChangeError};
 use crate::control::client;
 use crate::standing::{Identity, OrderFile};
 use crate::telemetry::monitor::ProjectorHealth;
 use dpm_common::folder::Owner;
 use dpm_device::link::faults;
+use dpm_device::planes::Raster;
 
 /// Obeys orders as a link thread does.
 fn link(monitor: &Arc<RunMonitor>, stop: &Arc<AtomicBool>) -> JoinHandle<()> {
@@ -74,6 +76,34 @@ impl Drop for Rig {
         self.socket = None;
         let _ = std::fs::remove_dir_all(&self.dir);
     }
+}
+
+#[test]
+fn parameters_are_shown_changed_and_refused_over_the_socket() {
+    let rig = Rig::new("parameters");
+    let folders = [rig.dir.join("run")];
+    let ask = |line: &str| change::change_in(&folders, None, &Command::parse(line).unwrap().unwrap());
+    assert!(matches!(ask("list"), Err(ChangeError::Refused(told)) if told.contains("no parameters")));
+    let config = RigConfig::demo(&Overrides::default()).unwrap();
+    let scene = Arc::new(crate::rig::Rig::build(&config, Raster::new(8, 8)).unwrap());
+    let mut planning = rig.monitor.parameters().follow(&scene);
+    rig.monitor.parameters().uses(u64::MAX, 7);
+    assert_eq!(ask("set exposure=2.5").unwrap(), "ok: exposure is 2.5, from frame 7 on");
+    assert_eq!(planning.latest().0.brighter, 2.5);
+    let all = ask("list").unwrap();
+    assert!(
+        all.contains("exposure = 2.5") && all.contains("began with 1") && all.contains("body.bunny"),
+        "{all}"
+    );
+    assert!(matches!(ask("set exposure=0"), Err(ChangeError::Refused(told)) if told.contains("0.000001")));
+    assert!(matches!(ask("save"), Err(ChangeError::Refused(told)) if told.contains("no rig file")));
+    assert_eq!(ask("undo").unwrap(), "ok: exposure is 1, from frame 7 on");
+    assert!(matches!(ask("undo"), Err(ChangeError::Refused(_))));
+    // No order was given by all this, and one still arrives.
+    assert_eq!(rig.monitor.projector(), ProjectorHealth::Connecting);
+    assert!(rig.tell(Order::Black).unwrap().is_done());
+    let nobody = change::change_in(&folders, Some(1), &Command::List);
+    assert!(matches!(nobody, Err(ChangeError::NoRig { .. })));
 }
 
 #[test]

@@ -147,14 +147,14 @@ impl GpuPace {
 pub(crate) struct CrewFacts {
     /// The GPU.
     pub gpu: GpuPace,
-    /// Average samples per pixel, in thousandths.
+    /// Largest average of samples per pixel that the GPU's times allow, in thousandths; `u64::MAX` while nothing is
+    /// known of them.
     pub budget_milli: AtomicU64,
 }
 
 impl CrewFacts {
     /// For a crew that begins, on a GPU that took `frame_ns` for a frame while it was otherwise idle.
-    pub(crate) fn new(rig: &Rig, frame_ns: i64) -> Self {
-        let budget_milli = AtomicU64::new(u64::from(rig.config.render.spp) * 1000);
-        Self { gpu: GpuPace::new(frame_ns), budget_milli }
+    pub(crate) fn new(frame_ns: i64) -> Self {
+        Self { gpu: GpuPace::new(frame_ns), budget_milli: AtomicU64::new(u64::MAX) }
     }
 }

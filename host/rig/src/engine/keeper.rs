@@ -49,6 +49,8 @@ pub(crate) struct LinkKeeper {
     standing: Option<Verb>,
     rearmed_at: HostTime,
     rearmed: u64,
+    /// The device's hottest sensor, thousandths of a degree Celsius.
+    milli_celsius: Option<i32>,
     /// The interlock was closed at the last check.
     allowed: bool,
 }
@@ -69,6 +71,7 @@ impl LinkKeeper {
             standing: None,
             rearmed_at: HostTime(i64::MIN),
             rearmed: 0,
+            milli_celsius: None,
             allowed: true,
         }
     }
@@ -137,6 +140,7 @@ impl LinkKeeper {
         if let (Some(reports), Some(status)) = (&mut self.reports, link.status().filter(|_| self.is_timed)) {
             reports.observe(status, &self.time);
         }
+        self.milli_celsius = transport.milli_celsius();
         monitor.link().tell(&self.carried(link));
         monitor.set_projector(if self.allowed {
             health(link, self.standing)
@@ -188,6 +192,7 @@ impl LinkKeeper {
             device: self.reports.as_ref().map(StatusLight::counts),
             clock_bound_ns: self.clock_bound_ns,
             travel_ns: self.reports.as_ref().map(StatusLight::travel_ns),
+            milli_celsius: self.milli_celsius,
         }
     }
 

@@ -26,6 +26,11 @@ impl GpuTimes {
         Self { recent: [0; 64], count: 0, last_done_at: HostTime(i64::MIN) }
     }
 
+    /// The next frames may take as long as those of a GPU that is not warm.
+    fn forget(&mut self) {
+        self.count = 0;
+    }
+
     /// Records that the GPU finished a frame. Returns the time that it spent on this frame alone.
     fn finished(&mut self, submitted_at: HostTime, done_at: HostTime) -> i64 {
         let took = done_at.ns_since(submitted_at);
@@ -52,18 +57,26 @@ pub(crate) struct PackStage {
     times: GpuTimes,
     budget: Option<BudgetController>,
     late_in_a_row: usize,
+    /// Samples that the last frame might take, by each of the two bounds.
+    allowed: [u64; 2],
 }
 
 impl PackStage {
     /// For a crew. `budget`: `None` if every frame gets the rays that the rig file asks for.
     pub(crate) fn new(facts: Arc<Facts>, crew: Arc<CrewFacts>, budget: Option<BudgetController>) -> Self {
-        let this = Self { facts, crew, times: GpuTimes::new(), budget, late_in_a_row: 0 };
+        let this = Self { facts, crew, times: GpuTimes::new(), budget, late_in_a_row: 0, allowed: [0; 2] };
         this.wait_is_over();
         this
     }
 
-    /// From `now` on packing waits for the GPU to finish a frame. Returns how long it may take, nanoseconds.
-    pub(crate) fn wait_from(&self, now: HostTime) -> u64 {
+    /// From `now` on packing waits for the GPU to finish the frame of `note`. Returns how long it may take, nanoseconds.
+    pub(crate) fn wait_from(&mut self, note: &FrameNote, now: HostTime) -> u64 {
+        let allowed = [u64::from(note.plan.samples), note.plan.most_milli];
+        if (0..2).any(|i| allowed[i] > self.allowed[i]) {
+            // The operator asks for more: the times so far say nothing about such frames.
+            self.times.forget();
+        }
+        self.allowed = allowed;
         self.facts.gpu_since_ns.store(now.0, Ordering::Relaxed);
         self.times.limit_ns()
     }
@@ -77,6 +90,7 @@ impl PackStage {
     pub(crate) fn rendered(&mut self, note: &FrameNote, now: HostTime) {
         self.crew.gpu.finish(self.times.finished(note.timeline.submitted_at, now));
         if let (Some(controller), Some(gpu_ns)) = (&mut self.budget, note.gpu_ns()) {
+            controller.within(note.plan.most_milli);
             controller.measured(note.plan.budget_milli, gpu_ns);
             self.crew.budget_milli.store(controller.rays(), Ordering::Relaxed);
         }
@@ -123,6 +137,12 @@ mod tests {
             assert!(i == 0 || alone == 40_000_000, "{alone}");
         }
         assert_eq!(times.limit_ns(), 320_000_000);
+        times.forget();
+        assert_eq!(times.limit_ns(), 2_000_000_000, "more samples are asked for");
+        for i in 0..16 {
+            times.finished(at(1700 + 10 * i), at(1701 + 10 * i));
+        }
+        assert_eq!(times.limit_ns(), 320_000_000, "warm again");
         times.finished(at(5000), at(9000));
         assert_eq!(times.limit_ns(), 2_000_000_000, "never longer than two seconds");
         for i in 0..64 {

@@ -4,11 +4,13 @@ use super::facts::{CrewFacts, Facts};
 use super::pace::{modelled_ns, Pace};
 use crate::frame::job::{Fate, FrameNote};
 use crate::frame::FrameTimeline;
+use crate::parameters::applied::Applied;
 use crate::plan::frame::PlanInputs;
 use crate::plan::horizon::Horizon;
 use crate::plan::link_time::LinkTime;
 use crate::tracks::TrackSnapshot;
 use dpm_device::time::HostTime;
+use dpm_handoff::latest::Reader;
 use std::marker::PhantomData;
 use std::sync::atomic::Ordering;
 use std::sync::Arc;
@@ -39,6 +41,10 @@ pub(crate) struct PlanStage<P> {
     facts: Arc<Facts>,
     crew: Arc<CrewFacts>,
     horizon: Horizon,
+    /// What the operator may change while the run goes on.
+    parameters: Reader<Applied>,
+    /// The newest version of them that was used; `None` before the first frame.
+    used: Option<u64>,
     slot_ns: i64,
     next_slot: u64,
     last_slot: Option<u64>,
@@ -58,7 +64,9 @@ impl<P: Pace> PlanStage<P> {
         }
         let horizon = Horizon::of_rig(&facts.rig.config);
         let slot_ns = facts.rig.rate().slot_len_ns(0);
-        Self { facts, crew, horizon, slot_ns, next_slot, last_slot: None, pace: PhantomData }
+        let parameters = facts.monitor.parameters().follow(&facts.rig);
+        let (used, last_slot) = (None, None);
+        Self { facts, crew, horizon, parameters, used, slot_ns, next_slot, last_slot, pace: PhantomData }
     }
 
     /// True when everything that the run was asked for is planned.
@@ -114,14 +122,21 @@ impl<P: Pace> PlanStage<P> {
     ) {
         let predict_ns = self.horizon.predict_ns(latch.lead_ns, snapshot.latency_ns);
         self.facts.predict_ns.store(predict_ns, Ordering::Relaxed);
+        let stride = self.stride(latch.slot);
+        let applied = self.parameters.latest().0;
+        if self.used != Some(applied.version) {
+            self.used = Some(applied.version);
+            self.facts.monitor.parameters().uses(applied.version, latch.id);
+        }
         let inputs = PlanInputs {
             slots: time,
             id: latch.id,
             slot: latch.slot,
-            stride: self.stride(latch.slot),
+            stride,
             predict_ns,
             fresh_ns: self.horizon.fresh_ns(snapshot.latency_ns),
-            budget_milli: self.crew.budget_milli.load(Ordering::Relaxed),
+            budget_milli: self.crew.budget_milli.load(Ordering::Relaxed).min(applied.most_milli),
+            applied,
             now,
         };
         note.plan.fill(&self.facts.rig, snapshot, &inputs);

@@ -69,7 +69,7 @@ fn bench(flags: &[&str], options: RunOptions) -> Bench {
     let lead = LeadEstimator::new(slot_ns, 3 * MS, slot_ns / 2, 2 * slot_ns);
     let facts = Arc::new(Facts::new(rig.clone(), monitor, options, &lead, now));
     let keeper = LinkKeeper::new(time, &link, None);
-    let crew = Arc::new(CrewFacts::new(&rig, 0));
+    let crew = Arc::new(CrewFacts::new(0));
     Bench { facts, crew, link: Some((link, keeper)), cable, lead, time, now, slot_ns }
 }
 
@@ -300,19 +300,20 @@ fn a_crew_in_trouble_is_made_anew_three_times_a_minute_and_the_fourth_ends_the_r
 fn a_frame_that_stays_on_the_gpu_for_a_second_is_told_once() {
     let bench = bench(&[], RunOptions::default());
     let mut mind = supervision(&bench.facts);
-    let crew = Arc::new(CrewFacts::new(&bench.facts.rig, 0));
-    let stage = PackStage::new(bench.facts.clone(), crew, None);
+    let crew = Arc::new(CrewFacts::new(0));
+    let mut stage = PackStage::new(bench.facts.clone(), crew, None);
+    let note = FrameNote::new(&bench.facts.rig);
     let (link, collector) = (Pulse::new("link"), Pulse::new("collector"));
     let mut told = |now_ms: i64| {
         mind.watch(&link, &collector, HostTime(now_ms * MS), 2 * MS);
         bench.facts.monitor.take_notes().iter().filter(|note| note.contains("the GPU has worked")).count()
     };
     assert_eq!(told(90_000), 0, "nothing was submitted");
-    stage.wait_from(HostTime(100_000 * MS));
+    stage.wait_from(&note, HostTime(100_000 * MS));
     assert_eq!((told(100_999), told(101_000), told(101_002), told(101_900)), (0, 1, 0, 0));
     stage.wait_is_over();
     assert_eq!(told(200_000), 0, "it was finished");
-    stage.wait_from(HostTime(300_000 * MS));
+    stage.wait_from(&note, HostTime(300_000 * MS));
     assert_eq!(told(301_500), 1, "the next one is another matter");
 }
 

@@ -16,6 +16,7 @@ use crate::rig::Rig;
 use crate::telemetry::flight::FlightRecorder;
 use crate::telemetry::interval::Interval;
 use crate::telemetry::live::{LiveBody, LiveFrame};
+use crate::telemetry::miss_log::MissLog;
 use crate::telemetry::monitor::RunMonitor;
 use crate::telemetry::profile::{missed_by_cause, ordered_dark, Profiler};
 use crate::telemetry::report::{Latency, Report, Spread, StageTime};
@@ -91,7 +92,8 @@ pub(crate) struct Collector {
     pub traced: VecDeque<TracedFrame>,
     trace_frames: usize,
     /// `None` unless the rig file asks for it.
-    flights: Option<FlightRecorder>,
+    pub(super) flights: Option<FlightRecorder>,
+    pub(super) misses: MissLog,
     standstills: Option<Arc<SeenStandstills>>,
     /// What the operator should know about the files of the flight recorder.
     flights_told: Option<String>,
@@ -160,6 +162,7 @@ impl Collector {
             traced: VecDeque::new(),
             trace_frames,
             flights: None,
+            misses: MissLog::new(),
             standstills: None,
             flights_told: None,
             clock_error: SignedHistogram::new(1_000_000_000),
@@ -184,13 +187,11 @@ impl Collector {
             self.slots.excuse_by(seen.clone());
         }
         self.standstills = standstills;
+        self.slots.keep_misses();
         let output = &self.rig.config.output;
         if output.flight_recorder {
             match FlightRecorder::new(self.rig.rate().slot_len_ns(0), &output.dir) {
-                Ok(recorder) => {
-                    self.flights = Some(recorder);
-                    self.slots.keep_misses();
-                }
+                Ok(recorder) => self.flights = Some(recorder),
                 Err(e) => self.flights_told = Some(format!("output.flight_recorder: not started: {e}")),
             }
         }
@@ -214,13 +215,17 @@ impl Collector {
         counts
     }
 
-    /// Passes the misses that were found to the flight recorder.
+    /// Passes the misses that were found to those who look at them.
     fn record_misses(&mut self, monitor: &RunMonitor) {
-        let Some(flights) = &mut self.flights else { return };
         while let Some((slot, begin, cause)) = self.slots.next_miss() {
-            flights.missed(slot, begin, cause);
+            self.misses.add(slot, begin, cause);
+            if let Some(flights) = &mut self.flights {
+                flights.missed(slot, begin, cause);
+            }
         }
-        flights.look(monitor, self.standstills.as_deref());
+        if let Some(flights) = &mut self.flights {
+            flights.look(monitor, self.standstills.as_deref());
+        }
     }
 
     /// Reads the frames that the link has finished with, and their light, as far as both have arrived. Returns the
@@ -381,6 +386,7 @@ impl Collector {
                 sampled_poses: job.plan.sampled_poses.clone(),
                 dark: job.plan.dark.clone(),
                 eye: job.plan.eye,
+                parameters: job.plan.parameters,
                 code_hash: job.code_hash,
                 pass_ns: cost.pass_ns,
             });

@@ -3,6 +3,7 @@
 use super::collector::Collector;
 use crate::frame::job::FrameNote;
 use crate::rig::Rig;
+use crate::telemetry::flight::FlightRecorder;
 use crate::telemetry::histogram_steps::Steps;
 use crate::telemetry::interval::Interval;
 use crate::telemetry::live::{Live, LiveBody, LiveFrame, LiveInterval, LiveSnapshot};
@@ -27,7 +28,9 @@ impl Collector {
             id: plan.id.0,
             sample_age_ns: plan.oldest_captured_at().map(|at| plan.due_at.ns_since(at)),
             budget_spp: plan.budget_milli as f64 / 1e3,
+            parameters: plan.parameters,
             predict_ns: plan.predict_ns,
+            due_at: plan.due_at,
         };
         let states = plan.seen.iter().zip(&plan.dark).zip(&plan.tracked_poses);
         for (body, ((seen, dark), pose)) in bodies.iter_mut().zip(states) {
@@ -66,6 +69,8 @@ impl Collector {
             planned: monitor.counts().frames_planned,
             rays: self.rays,
             samples: self.samples,
+            misses: self.misses.newest(),
+            flights: self.flights.as_ref().map(FlightRecorder::flights),
         });
     }
 }

@@ -25,6 +25,8 @@ pub struct FrameRecord {
     pub dark: Vec<Option<DarkCause>>,
     /// The eye in world coordinates.
     pub eye: DVec3,
+    /// Which version of the operator's parameters it was drawn with; 0 is the rig file's.
+    pub parameters: u64,
     /// Hash of its code values.
     pub code_hash: u64,
     /// GPU time of each pass, nanoseconds.

@@ -115,7 +115,7 @@ impl Crew {
         let CrewParts { tracking, renderer, pictures, kernel, budget, memory, frame_ns } = parts;
         let rig = &shared.facts.rig;
         let policy = policy(rig);
-        let facts = Arc::new(CrewFacts::new(rig, frame_ns));
+        let facts = Arc::new(CrewFacts::new(frame_ns));
         let stage = PackStage::new(shared.facts.clone(), facts.clone(), budget);
         // There is room for all of them: no stage ever finds the next one's channel full.
         let jobs = memory.len();

@@ -80,6 +80,9 @@ fn run_from(
     monitor: &Arc<RunMonitor>,
 ) -> Result<RunOutcome, PipelineError> {
     monitor.live().set_rig(&rig);
+    if matches!(origin, Origin::Pattern(..)) {
+        monitor.parameters().close();
+    }
     let ran = match rig.config.real_time.pace {
         // Hashing every frame costs a millisecond at full size, which only virtual pace can afford.
         Pace::Real => run_at_real_pace(&rig, origin, RunOptions { verify: false, ..options }, monitor),

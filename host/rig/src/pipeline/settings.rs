@@ -3,7 +3,7 @@
 
 use crate::config::Packer;
 use crate::engine::facts::RECEIPT_NS;
-use crate::plan::budget::{BudgetConfig, BudgetController};
+use crate::plan::budget::{BudgetConfig, BudgetController, FEWEST_OF_MOST};
 use crate::plan::lead::LeadEstimator;
 use crate::plan::light_centre::groups_that_follow;
 use crate::rig::Rig;
@@ -44,7 +44,7 @@ pub(super) fn budget_controller(rig: &Rig) -> Option<BudgetController> {
         slot_ns: rig.rate().slot_len_ns(0),
         aim: 0.8,
         limit: 0.92,
-        min_rays: (full / 8).max(1),
+        min_rays: (full / FEWEST_OF_MOST).max(1),
         max_rays: full.max(1),
         initial_rays: full,
     };

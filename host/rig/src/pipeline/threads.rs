@@ -269,7 +269,7 @@ impl<'a> PlanDesk<'a> {
         self.stage.plan(&latch, &mut job.note, &time, snapshot, now);
         job.note.timeline.wall_ns[Stage::Plan as usize] = watch.elapsed_ns();
         if let (Some(renderer), Some(slot)) = (renderer, job.memory.gpu.as_mut()) {
-            if let Err(source) = crate::render::submit(&job.note.plan, slot, &shared.facts.rig, renderer) {
+            if let Err(source) = crate::render::submit(&job.note.plan, slot, renderer) {
                 crew.fail(PipelineError::Gpu { frame: id, source });
                 return None;
             }
@@ -316,7 +316,8 @@ pub(super) fn pack_thread(
         let frame = job.note.plan.id.0;
         enter_frame_path(frame >= WARM_UP_FRAMES);
         may_stall(facts, StallIn::Pack, frame);
-        if let Err(failure) = rendered(&mut job, stage.wait_from(clock.now()), alive) {
+        let limit_ns = stage.wait_from(&job.note, clock.now());
+        if let Err(failure) = rendered(&mut job, limit_ns, alive) {
             crew.fail(failure);
             break;
         }

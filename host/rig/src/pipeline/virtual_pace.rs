@@ -67,7 +67,7 @@ pub(super) fn run_at_virtual_pace(
     })?;
     let lead = lead_estimator(rig, &link, 0);
     let facts = Arc::new(Facts::new(rig.clone(), monitor.clone(), options, &lead, now));
-    let crew = Arc::new(CrewFacts::new(rig, 0));
+    let crew = Arc::new(CrewFacts::new(0));
     let keeper = LinkKeeper::new(time, &link, None);
     let (done, finished) = channel(NOTES, WaitPolicy::Park);
     let free: Vec<_> = std::mem::take(&mut parts.memory).into_iter().map(Box::new).collect();
@@ -215,7 +215,7 @@ impl World {
         self.plan.plan(&latch, &mut job.note, &self.time, snapshot, latch.at);
         job.note.timeline.wall_ns[Stage::Plan as usize] = watch.elapsed_ns();
         if let (Some(renderer), Some(slot)) = (&mut self.parts.renderer, job.memory.gpu.as_mut()) {
-            if let Err(source) = crate::render::submit(&job.note.plan, slot, &self.facts.rig, renderer) {
+            if let Err(source) = crate::render::submit(&job.note.plan, slot, renderer) {
                 self.abandon(job);
                 return Err(PipelineError::Gpu { frame: id, source });
             }

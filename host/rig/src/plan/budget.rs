@@ -7,6 +7,9 @@
 //! rises slowly because a slightly poorer frame is not visible, and because a loop whose gain may be wrong by 5 and
 //! whose delay may be 3 frames must be slow to be free of oscillation.
 
+/// The fewest rays of a frame, as a divisor of the most.
+pub const FEWEST_OF_MOST: u64 = 8;
+
 /// Settings of a [`BudgetController`]. Times are in nanoseconds.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct BudgetConfig {
@@ -101,6 +104,18 @@ impl BudgetController {
         (self.ln_rays.exp().round() as u64).clamp(self.config.min_rays, self.config.max_rays)
     }
 
+    /// From now on a frame gets at most `most` rays, and at least a share of them.
+    pub fn within(&mut self, most: u64) {
+        self.config.max_rays = most.max(1);
+        self.config.min_rays = (most / FEWEST_OF_MOST).max(1);
+        self.hold_bounds();
+    }
+
+    fn hold_bounds(&mut self) {
+        let (low, high) = ((self.config.min_rays as f64).ln(), (self.config.max_rays as f64).ln());
+        self.ln_rays = self.ln_rays.clamp(low, high);
+    }
+
     /// Takes the time of a finished frame and the rays that it had. Measurements may be late and out of order.
     /// Impossible times (0, negative) and frames of 0 rays are ignored and counted.
     pub fn measured(&mut self, rays: u64, frame_ns: i64) {
@@ -131,8 +146,7 @@ impl BudgetController {
             let foretold = error + ln_given - self.ln_rays;
             self.ln_rays += SLOW * foretold.clamp(-SLOW_CLAMP, SLOW_CLAMP);
         }
-        let (low, high) = ((self.config.min_rays as f64).ln(), (self.config.max_rays as f64).ln());
-        self.ln_rays = self.ln_rays.clamp(low, high);
+        self.hold_bounds();
     }
 
     /// True when the budget is at its minimum: if frames are still late, rays are not the reason.
@@ -267,6 +281,20 @@ mod tests {
                 prop_assert!((10..=100_000_000).contains(&controller.rays()));
             }
         }
+    }
+
+    #[test]
+    fn new_bounds_hold_at_once_and_leave_the_rest_to_the_times() {
+        let mut controller = BudgetController::new(config()).unwrap();
+        controller.within(4000);
+        assert_eq!(controller.rays(), 4000);
+        controller.measured(4000, 10 * SLOT as i64);
+        controller.measured(4000, 10 * SLOT as i64);
+        assert_eq!(controller.rays(), 500, "an eighth");
+        controller.within(8000);
+        assert_eq!(controller.rays(), 1000);
+        controller.measured(1000, SLOT as i64 / 2);
+        assert!((1001..1100).contains(&controller.rays()), "it rises slowly: {}", controller.rays());
     }
 
     #[test]

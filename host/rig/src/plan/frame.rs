@@ -4,10 +4,12 @@
 use super::dark::DarkCause;
 use super::light_centre::{light_centre_ns, planes_follow};
 use super::link_time::LinkTime;
+use crate::parameters::applied::Applied;
 use crate::rig::{affine, Rig};
 use crate::tracks::TrackSnapshot;
 use dpm_device::time::{DeviceTicks, HostTime};
 use dpm_render::warp::Sweep;
+use dpm_scene::geometry::projector::ProjectorCamera;
 use dpm_tracking::{Freshness, TrackState};
 use glam::{DAffine3, DVec3};
 
@@ -63,6 +65,16 @@ pub(crate) struct FramePlan {
     pub widen_deg: f32,
     /// Average samples per pixel, in thousandths.
     pub budget_milli: u64,
+    /// The same at most, whatever the GPU's times allow.
+    pub most_milli: u64,
+    /// Which version of the operator's parameters it uses.
+    pub parameters: u64,
+    /// Samples of a traced pixel, where neither the angle nor a budget decides them.
+    pub samples: u32,
+    /// By how much brighter than by the rig file its light is.
+    pub brighter: f32,
+    /// The projector for which it is drawn.
+    pub camera: ProjectorCamera,
 }
 
 /// Inputs of planning besides the newest tracks.
@@ -82,6 +94,8 @@ pub(crate) struct PlanInputs<'a> {
     pub fresh_ns: i64,
     /// Average samples per pixel, in thousandths.
     pub budget_milli: u64,
+    /// What the operator may change while the run goes on.
+    pub applied: &'a Applied,
     /// Now.
     pub now: HostTime,
 }
@@ -112,6 +126,11 @@ impl FramePlan {
             gaze: DVec3::ZERO,
             widen_deg: 0.0,
             budget_milli: 0,
+            most_milli: 0,
+            parameters: 0,
+            samples: rig.config.render.spp,
+            brighter: 1.0,
+            camera: rig.camera,
         }
     }
 
@@ -121,6 +140,7 @@ impl FramePlan {
         let &PlanInputs { slots, id, slot, stride, predict_ns, .. } = inputs;
         (self.id, self.slot) = (FrameId(id), slot);
         (self.predict_ns, self.budget_milli) = (predict_ns, inputs.budget_milli);
+        self.take(inputs.applied);
         self.target_at = slots.start(slot);
         // Light falls later than the projector's clock says by this much.
         let late_ns = rig.config.projector.light_delay_ns();
@@ -131,13 +151,23 @@ impl FramePlan {
         self.place_bodies(rig, snapshot, inputs, centre);
         rig.scene_poses(&self.tracked_poses, &mut self.scene_poses);
         let first = self.due_at.plus_ns(late_ns);
-        self.sweep_bodies(rig, snapshot, [first, first.plus_ns(exposure_ns)]);
+        self.sweep_bodies(rig, snapshot, inputs.applied, [first, first.plus_ns(exposure_ns)]);
         (self.eye, self.gaze) = rig.observer.eye_and_gaze(&self.tracked_poses);
         self.widen_deg = rig.observer.gaze_body().map_or(0.0, |body| {
             let track = snapshot.tracks.get(body).copied().flatten();
             let unseen_ns = track.map_or(i64::MAX, |(state, _)| centre.ns_since(state.captured_at));
             rig.observer.widening_deg(unseen_ns) as f32
         });
+        if let Some(point) = inputs.applied.gaze {
+            // A point that the operator names is never lost.
+            (self.gaze, self.widen_deg) = (point, 0.0);
+        }
+    }
+
+    /// Takes what the operator may change. Copies numbers, and allocates nothing.
+    fn take(&mut self, applied: &Applied) {
+        (self.parameters, self.most_milli) = (applied.version, applied.most_milli);
+        (self.samples, self.brighter, self.camera) = (applied.samples, applied.brighter, applied.camera);
     }
 
     /// For every tracked body: where it will be at `centre`, and whether light may fall on it there.
@@ -176,7 +206,8 @@ impl FramePlan {
                         *oldest = Some((state.captured_at, received_at));
                     }
                     let pose = if rig.config.prediction.on { used.pose } else { sampled.pose };
-                    (affine(&pose) * body.mesh_to_body, affine(&sampled.pose) * body.mesh_to_body, dark)
+                    let mesh_to_body = inputs.applied.mesh_to_body[i];
+                    (affine(&pose) * mesh_to_body, affine(&sampled.pose) * mesh_to_body, dark)
                 }
                 // The body was never seen, so nothing may be lit.
                 None => (affine(&body.rest), affine(&body.rest), Some(DarkCause::NeverSeen)),
@@ -193,7 +224,7 @@ impl FramePlan {
     }
 
     /// For every body: where it will be at the instants `ends`. Bodies whose poses are not predicted stand still.
-    fn sweep_bodies(&mut self, rig: &Rig, snapshot: &TrackSnapshot, ends: [HostTime; 2]) {
+    fn sweep_bodies(&mut self, rig: &Rig, snapshot: &TrackSnapshot, applied: &Applied, ends: [HostTime; 2]) {
         for (swept, scene) in self.swept_poses.iter_mut().zip(&mut self.swept_scene) {
             swept.clear();
             scene.clear();
@@ -209,7 +240,7 @@ impl FramePlan {
                 swept.push(match track {
                     Some((state, _)) => {
                         let state = TrackState { lost_after_ns: self.predict_ns, ..state };
-                        affine(&state.predict(end).pose) * body.mesh_to_body
+                        affine(&state.predict(end).pose) * applied.mesh_to_body[i]
                     }
                     None => affine(&body.rest),
                 });

@@ -239,6 +239,11 @@ impl FlightRecorder {
         }
     }
 
+    /// Flights of this run so far.
+    pub(crate) fn flights(&self) -> u64 {
+        self.flights
+    }
+
     /// The run is over. Returns what the operator should know.
     pub(crate) fn finish(mut self, standstills: Option<&SeenStandstills>) -> Option<String> {
         if let Some(open) = self.open.take() {
@@ -267,6 +272,11 @@ impl FlightRecorder {
             text
         })
     }
+}
+
+/// The page of flight `number` in `dir`, as text; `None` for a number that no file has.
+pub fn page_path(dir: &Path, number: u64) -> Option<PathBuf> {
+    (number < KEPT + NEWEST).then(|| path_of(dir, number, "txt"))
 }
 
 /// The file of a flight: the first ones are kept, and of all further ones the newest.

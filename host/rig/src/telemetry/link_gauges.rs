@@ -14,11 +14,13 @@ pub(crate) struct LinkGauges {
     device: [AtomicU64; 9],
     /// Bound of the clock's error and the learned travel, nanoseconds; [`NONE`] while there is none.
     times_ns: [Time; 2],
+    /// The device's hottest sensor, thousandths of a degree Celsius; [`NONE`] while there is none.
+    milli_celsius: Time,
     /// 1 once the projector has counted something.
     has_device: AtomicU64,
 }
 
-/// A time that is not known.
+/// A number that is not known.
 const NONE: i64 = i64::MIN;
 
 #[derive(Debug)]
@@ -49,6 +51,8 @@ pub(crate) struct Carried {
     pub clock_bound_ns: Option<i64>,
     /// Learned time from sent to light, nanoseconds.
     pub travel_ns: Option<i64>,
+    /// The device's hottest sensor, thousandths of a degree Celsius.
+    pub milli_celsius: Option<i32>,
 }
 
 impl LinkGauges {
@@ -76,6 +80,7 @@ impl LinkGauges {
         for (to, time) in self.times_ns.iter().zip([c.clock_bound_ns, c.travel_ns]) {
             to.0.store(time.unwrap_or(NONE), Ordering::Relaxed);
         }
+        self.milli_celsius.0.store(c.milli_celsius.map_or(NONE, i64::from), Ordering::Relaxed);
     }
 
     /// The figures as a report, with the name of the medium.
@@ -109,6 +114,9 @@ impl LinkGauges {
             device: (self.has_device.load(Ordering::Relaxed) != 0).then_some(device),
             clock_bound_ns,
             travel_ms: travel_ns.map(|ns| ns as f64 / 1e6),
+            celsius: Some(self.milli_celsius.0.load(Ordering::Relaxed))
+                .filter(|c| *c != NONE)
+                .map(|c| c as f64 / 1e3),
         }
     }
 }
@@ -121,7 +129,8 @@ mod tests {
     fn every_figure_comes_out_where_it_went_in() {
         let gauges = LinkGauges::default();
         let empty = gauges.report("x");
-        assert_eq!((empty.device, empty.clock_bound_ns, empty.travel_ms), (None, None, None));
+        assert_eq!((empty.device, empty.clock_bound_ns), (None, None));
+        assert_eq!((empty.travel_ms, empty.celsius), (None, None));
         let device = DeviceCounts {
             lit: 21,
             lit_unseen: 22,
@@ -142,6 +151,7 @@ mod tests {
             device: Some(device),
             clock_bound_ns: Some(-13),
             travel_ns: Some(14_000_000),
+            milli_celsius: Some(41_500),
         });
         let told = gauges.report("usb");
         assert_eq!(
@@ -156,6 +166,7 @@ mod tests {
                 device: Some(device),
                 clock_bound_ns: Some(-13),
                 travel_ms: Some(14.0),
+                celsius: Some(41.5),
             }
         );
     }

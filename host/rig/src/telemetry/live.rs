@@ -5,6 +5,7 @@
 //! has no part in it.
 
 use super::histogram_steps::Steps;
+use super::miss_log::MissRun;
 use super::report::Report;
 use crate::plan::dark::DarkCause;
 use crate::rig::Rig;
@@ -57,8 +58,12 @@ pub struct LiveFrame {
     pub sample_age_ns: Option<i64>,
     /// Average samples per pixel.
     pub budget_spp: f64,
+    /// Which version of the operator's parameters it uses.
+    pub parameters: u64,
     /// The longest time for which prediction may extend a body's track, nanoseconds.
     pub predict_ns: i64,
+    /// When its slot begins.
+    pub due_at: HostTime,
 }
 
 /// The collector's figures at one moment.
@@ -80,6 +85,10 @@ pub struct LiveSnapshot {
     pub rays: u64,
     /// Samples taken.
     pub samples: u64,
+    /// The last missed slots, newest first.
+    pub misses: Vec<MissRun>,
+    /// Flights that the flight recorder has written; `None` if it is off.
+    pub flights: Option<u64>,
 }
 
 /// What a frame was drawn for.

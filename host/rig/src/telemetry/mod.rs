@@ -1,11 +1,12 @@
 //! Telemetry of a run, read by threads that are not on the frame path.
 
-pub(crate) mod flight;
+pub mod flight;
 mod flight_page;
 pub mod histogram_steps;
 pub mod interval;
 pub(crate) mod link_gauges;
 pub mod live;
+pub mod miss_log;
 pub mod monitor;
 mod ordered;
 pub mod profile;

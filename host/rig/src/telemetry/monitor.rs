@@ -7,6 +7,7 @@ use super::ordered::DarkLog;
 use super::projector::ProjectorReport;
 use crate::interlock::Interlock;
 use crate::order::Order;
+use crate::parameters::ParameterDesk;
 use dpm_common::stopping;
 use dpm_device::link::{faults, LimitReached};
 use dpm_handoff::path::Lock;
@@ -168,6 +169,8 @@ pub struct RunMonitor {
     link: LinkGauges,
     /// What observers see of the run.
     live: Live,
+    /// What operators may change while it goes on.
+    parameters: ParameterDesk,
 }
 
 #[derive(Debug, Default)]
@@ -334,6 +337,11 @@ impl RunMonitor {
     /// What observers see of the run while it goes on.
     pub fn live(&self) -> &Live {
         &self.live
+    }
+
+    /// What operators may change while the run goes on.
+    pub fn parameters(&self) -> &ParameterDesk {
+        &self.parameters
     }
 
     /// Counts a planned frame.

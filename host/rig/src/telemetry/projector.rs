@@ -23,6 +23,8 @@ pub struct ProjectorReport {
     pub clock_bound_ns: Option<i64>,
     /// Learned time from sent to light, milliseconds; null for the mock in this process.
     pub travel_ms: Option<f64>,
+    /// The device's hottest sensor, degrees Celsius; null for a device that tells none.
+    pub celsius: Option<f64>,
 }
 
 /// What the projector counted over all sessions of a run.

@@ -88,6 +88,7 @@ pub(crate) fn submit(renderer: &mut Renderer, slot: &mut FrameSlot, frame: u32) 
         spp: 2,
         budget_spp: 2.0,
         camera: &rig.camera,
+        brighter: 1.0,
         eye,
         gaze,
         widen_deg: 0.0,

@@ -121,7 +121,7 @@ impl Crew {
         line: &mut Line,
         now: HostTime,
     ) -> Self {
-        let crew = Arc::new(CrewFacts::new(&facts.rig, parts.frame_ns));
+        let crew = Arc::new(CrewFacts::new(parts.frame_ns));
         let (publisher, reader) = latest(TrackSnapshot::empty(facts.rig.bodies.len()));
         let (times_in, mut times) = latest(time);
         line.stage.tell_times_to(times_in);
@@ -363,11 +363,11 @@ impl Crew {
     fn wait_for_gpu(&mut self, now: HostTime) {
         // While it waits it reports in time; so nothing is overdue.
         self.pulses[2].end();
-        if self.gpu.is_empty() {
+        let Some(on) = self.gpu.front() else {
             self.packing = Packing::Waits { until: None, limit_ns: 0 };
             return;
-        }
-        let limit_ns = self.pack.wait_from(now);
+        };
+        let limit_ns = self.pack.wait_from(&on.job.note, now);
         self.packing = Packing::Waits { until: Some(now.plus_ns(limit_ns as i64)), limit_ns };
     }
 

@@ -1,0 +1,141 @@
+//! Keeps the parameters of a run for the next one: numbers in the rig file, motions in the calibration file. The files
+//! that are replaced are kept beside the new ones.
+
+use crate::calibrate::nudge::{check_known, keep, Moved};
+use crate::calibrate::results::Results;
+use dpm_common::files::{keep_old, write_atomically};
+use dpm_device::regular_file;
+use dpm_rig::config::{Overrides, Purpose, RigConfig, TrackerConfig, MAX_FILE_BYTES};
+use dpm_rig::parameters::desk::{Saver, Setting, ToKeep};
+use dpm_rig::rig::Rig;
+use std::io::Write;
+use std::path::{Path, PathBuf};
+use toml::{Table, Value};
+
+/// Writes to the rig file at `path` and to its calibration file.
+pub(crate) fn saver(path: PathBuf) -> Saver {
+    Box::new(move |rig, kept| save(&path, rig, kept))
+}
+
+/// Saves for a run without a rig file.
+pub(crate) fn no_file() -> Saver {
+    Box::new(|_, _| {
+        Err("the built-in demo has no rig file; copy rigs/demo.toml and run that with `dpm run`".into())
+    })
+}
+
+/// Writes what is to be kept. Everything is checked before the first file is touched.
+fn save(path: &Path, rig: &Rig, kept: &ToKeep) -> Result<String, String> {
+    let results = motions(path, rig, kept)?;
+    let mut told = Vec::new();
+    if !kept.keys.is_empty() {
+        // A link leads to the file that is meant.
+        let path = path.canonicalize().map_err(|e| format!("{}: {e}", path.display()))?;
+        told.push(write_keys(&path, &kept.keys)?);
+    }
+    if let Some(results) = results {
+        let written = results.save(&rig.config).map_err(|e| {
+            let before = if told.is_empty() { String::new() } else { format!("{}; but ", told.join("; ")) };
+            format!("{before}{e}")
+        })?;
+        told.push(written.replace('\n', " "));
+    }
+    Ok(told.join("; "))
+}
+
+/// The calibration file with the motions of `kept`; `None` if there are none.
+fn motions(path: &Path, rig: &Rig, kept: &ToKeep) -> Result<Option<Results>, String> {
+    if kept.projector.is_none() && kept.bodies.is_empty() {
+        return Ok(None);
+    }
+    if !kept.bodies.is_empty() && matches!(rig.config.tracker, TrackerConfig::Mock(_)) {
+        return Err(
+            "the mock tracker reports the mesh itself, so no motion of a body can be kept; set it back to 0"
+                .into(),
+        );
+    }
+    let mut results = Results::open(None, path, &rig.config).map_err(|e| e.to_string())?;
+    let moved = kept.projector.iter().map(|motion| (Moved::Projector, motion));
+    let bodies = kept.bodies.iter().map(|(name, motion)| (Moved::Body(name.clone()), motion));
+    for (what, motion) in moved.chain(bodies) {
+        check_known(&results, &what).map_err(|e| e.to_string())?;
+        keep(&mut results, &rig.config, &what, motion);
+    }
+    Ok(Some(results))
+}
+
+fn write_keys(path: &Path, keys: &[([&'static str; 2], Setting)]) -> Result<String, String> {
+    let named = |e: &dyn std::fmt::Display| format!("{}: {e}", path.display());
+    let old = regular_file::read_text(path, MAX_FILE_BYTES).map_err(|e| named(&e))?;
+    let new = edited(&old, keys).map_err(|e| named(&e))?;
+    // A file that needs flags beside it is no worse than before.
+    let check = |text: &str| {
+        let purpose = Purpose { at_rest: true, ..Purpose::default() };
+        let base = path.parent().unwrap_or(Path::new(""));
+        RigConfig::parse_for(&path.display().to_string(), text, base, &Overrides::default(), purpose)
+    };
+    if let (Ok(_), Err(wrong)) = (check(&old), check(&new)) {
+        return Err(format!("the rig file would not be valid any more: {wrong}"));
+    }
+    let kept = keep_old(path, MAX_FILE_BYTES).map_err(|e| named(&e))?;
+    write_atomically(path, |file| file.write_all(new.as_bytes())).map_err(|e| e.to_string())?;
+    let beside = kept.map_or(String::new(), |old| format!(" (the one before is kept as {})", old.display()));
+    Ok(format!("written: {}{beside}", path.display()))
+}
+
+fn value_of(setting: &Setting) -> Value {
+    match setting {
+        Setting::Number(n) => Value::Float(*n),
+        Setting::Whole(n) => Value::Integer(*n),
+        Setting::Point(p) => Value::Array(p.map(Value::Float).to_vec()),
+        Setting::Text(text) => Value::String(text.clone()),
+        Setting::Table(all) => {
+            Value::Table(all.iter().map(|(key, v)| ((*key).to_owned(), value_of(v))).collect())
+        }
+    }
+}
+
+/// The text of a rig file with other values, and everything else as it was, comments included.
+///
+/// # Errors
+/// The file has a key in a form that is not changed here; the message says what to write.
+fn edited(text: &str, keys: &[([&'static str; 2], Setting)]) -> Result<String, String> {
+    let mut wanted: Table = text.parse().map_err(|e| format!("{e}"))?;
+    let mut now = text.to_owned();
+    for ([section, key], setting) in keys {
+        let value = value_of(setting);
+        let by_hand = || format!("write `{key} = {value}` under [{section}] by hand");
+        now = with(&now, section, key, &value).ok_or_else(by_hand)?;
+        let table = wanted.entry(*section).or_insert_with(|| Value::Table(Table::new()));
+        table.as_table_mut().ok_or_else(by_hand)?.insert((*key).to_owned(), value.clone());
+        // The text is edited, and its meaning is checked.
+        if now.parse::<Table>().ok().as_ref() != Some(&wanted) {
+            return Err(by_hand());
+        }
+    }
+    Ok(now)
+}
+
+/// The text with `key` of `section` replaced where it stands, or else below the section's heading, or else at the end.
+fn with(text: &str, section: &str, key: &str, value: &Value) -> Option<String> {
+    let parsed = toml::de::DeTable::parse(text).ok()?;
+    let table = parsed.get_ref().get(section).and_then(|s| s.get_ref().as_table());
+    if let Some(old) = table.and_then(|t| t.get(key)) {
+        let span = old.span();
+        return Some(format!("{}{value}{}", text.get(..span.start)?, text.get(span.end..)?));
+    }
+    let mut at = 0;
+    for line in text.split_inclusive('\n') {
+        at += line.len();
+        let heading = line.split('#').next().unwrap_or_default().trim();
+        if heading.strip_prefix('[').and_then(|h| h.strip_suffix(']')).map(str::trim) == Some(section) {
+            let feed = if line.ends_with('\n') { "" } else { "\n" };
+            return Some(format!("{}{feed}{key} = {value}\n{}", &text[..at], &text[at..]));
+        }
+    }
+    let feed = if text.is_empty() || text.ends_with('\n') { "" } else { "\n" };
+    Some(format!("{text}{feed}\n[{section}]\n{key} = {value}\n"))
+}
+
+#[cfg(test)]
+mod tests;

@@ -1,0 +1,107 @@
+//! A change of the parameters that came over HTTP: given as the control socket gives it, and answered when planning
+//! uses it or the disk has it.
+
+use crate::shared::Shared;
+use dpm_rig::control::parameters;
+use dpm_rig::parameters::{Command, Refused};
+use std::time::{Duration, Instant};
+
+/// How often to look whether a change is in use.
+const LOOK: Duration = Duration::from_millis(2);
+/// Longest query of a change, bytes.
+const MAX_QUERY: usize = 2048;
+
+/// What is answered to a change.
+#[derive(Debug, serde::Serialize)]
+pub(crate) struct Answered {
+    /// Planning uses it, or the disk has it.
+    pub done: bool,
+    /// One line for the operator.
+    pub text: String,
+}
+
+/// The command that a path below `/api/parameters/` and its query mean; `None` if there is none at this path.
+pub(crate) fn asked(word: &str, query: &str) -> Option<Result<Command, Refused>> {
+    match word {
+        "undo" => Some(Ok(Command::Undo)),
+        "save" => Some(Ok(Command::Save)),
+        "set" => Some(change(query)),
+        _ => None,
+    }
+}
+
+/// `name=NAME&value=NUMBERS`, percent-encoded.
+fn change(query: &str) -> Result<Command, Refused> {
+    let wrong = || Refused::Syntax("write ?name=exposure&value=1.5".into());
+    if query.len() > MAX_QUERY {
+        return Err(wrong());
+    }
+    let part = |key: &str| {
+        let found = query.split('&').find_map(|part| part.strip_prefix(key)?.strip_prefix('='));
+        found.and_then(decoded).ok_or_else(wrong)
+    };
+    Command::parse_change(&format!("{}={}", part("name")?, part("value")?))
+}
+
+/// Text without percent encoding; `None` if it is none.
+fn decoded(text: &str) -> Option<String> {
+    let mut bytes = Vec::with_capacity(text.len());
+    let mut rest = text.bytes();
+    while let Some(byte) = rest.next() {
+        bytes.push(match byte {
+            b'%' => {
+                let mut digit = || char::from(rest.next()?).to_digit(16);
+                (digit()? * 16 + digit()?) as u8
+            }
+            b'+' => b' ',
+            plain => plain,
+        });
+    }
+    String::from_utf8(bytes).ok()
+}
+
+/// Gives `command` and waits for its result, for two seconds at most.
+///
+/// # Errors
+/// It was refused.
+pub(crate) async fn give(command: &Command, shared: &Shared) -> Result<Answered, Refused> {
+    let begin = Instant::now();
+    let sent = parameters::give(&shared.monitor, command, "page")?;
+    loop {
+        if let Some(answer) = sent.answer(begin.elapsed(), shared.monitor.parameters()) {
+            return Ok(Answered { done: answer.is_done, text: answer.text });
+        }
+        tokio::time::sleep(LOOK).await;
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_query_names_a_parameter_whatever_its_letters() {
+        let set =
+            |name: &str, numbers: &[f64]| Ok(Command::Set { name: name.into(), numbers: numbers.into() });
+        assert_eq!(asked("set", "name=exposure&value=1.5"), Some(set("exposure", &[1.5])));
+        assert_eq!(
+            asked("set", "value=1%2C-2,3&name=body.my%20h%C3%A4re"),
+            Some(set("body.my häre", &[1.0, -2.0, 3.0]))
+        );
+        assert_eq!(asked("set", "name=gaze&value="), Some(set("gaze", &[])));
+        assert_eq!(asked("undo", ""), Some(Ok(Command::Undo)));
+        assert_eq!(asked("arm", ""), None);
+        for bad in [
+            "",
+            "name=a",
+            "value=1",
+            "name=%zz&value=1",
+            "name=%e4&value=1",
+            "name=a&value=x",
+            "name=a%2&value=1",
+        ] {
+            assert!(asked("set", bad).unwrap().is_err(), "{bad}");
+        }
+        assert!(asked("set", &format!("name={}&value=1", "a".repeat(MAX_QUERY))).unwrap().is_err());
+    }
+}

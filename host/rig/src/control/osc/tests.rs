@@ -1,0 +1,127 @@
+use super::*;
+use crate::config::{MockProjectorConfig, Overrides, ProjectorBackend, RigConfig};
+use crate::rig::Rig;
+use crate::standing::{Identity, OrderFile};
+use dpm_device::planes::Raster;
+
+struct Bench {
+    monitor: Arc<RunMonitor>,
+    osc: OscSocket,
+    to: UdpSocket,
+}
+
+impl Bench {
+    fn new(sender: &str) -> Self {
+        let config = RigConfig::demo(&Overrides::default()).unwrap();
+        let rig = Arc::new(Rig::build(&config, Raster::new(8, 8)).unwrap());
+        let monitor = Arc::new(RunMonitor::default());
+        let _ = monitor.parameters().follow(&rig);
+        let identity = Identity::of(&ProjectorBackend::Mock(MockProjectorConfig::default()));
+        let (file, _, _) = OrderFile::open(None, identity);
+        let orders = Arc::new(Orders::start(monitor.clone(), file, false, None).unwrap());
+        let osc = OscSocket::serve("127.0.0.1:0".parse().unwrap(), vec![], monitor.clone(), orders).unwrap();
+        let to = UdpSocket::bind((sender, 0)).unwrap();
+        to.connect(osc.address()).unwrap();
+        Self { monitor, osc, to }
+    }
+
+    fn send(&self, address: &str, numbers: &[f32]) {
+        let padded = |text: &str| {
+            let mut bytes = text.as_bytes().to_vec();
+            bytes.resize((bytes.len() / 4 + 1) * 4, 0);
+            bytes
+        };
+        let mut bytes = [padded(address), padded(&format!(",{}", "f".repeat(numbers.len())))].concat();
+        numbers.iter().for_each(|n| bytes.extend(n.to_be_bytes()));
+        self.to.send(&bytes).unwrap();
+    }
+
+    /// Waits until `is` says so.
+    fn wait(&self, what: &str, mut is: impl FnMut() -> bool) {
+        let begin = Instant::now();
+        while !is() {
+            assert!(begin.elapsed() < Duration::from_secs(20), "no {what}");
+            std::thread::sleep(Duration::from_millis(1));
+        }
+    }
+
+    fn exposure(&self) -> f64 {
+        self.monitor.parameters().shown().unwrap().all[0].numbers[0]
+    }
+}
+
+#[test]
+fn parameters_and_dark_orders_are_carried_out_and_arm_is_not() {
+    let bench = Bench::new("127.0.0.1");
+    bench.send("/dpm/exposure", &[1.25]);
+    bench.wait("exposure", || bench.exposure() == 1.25);
+    for (address, order) in
+        [("/dpm/freeze", Order::Freeze), ("/dpm/black", Order::Black), ("/dpm/safe", Order::Safe)]
+    {
+        bench.send(address, &[1.0]);
+        let mut taken = None;
+        bench.wait(address, || {
+            taken = taken.or(bench.monitor.take_order());
+            taken.is_some()
+        });
+        assert_eq!(taken, Some(order));
+    }
+    let mut notes = Vec::new();
+    bench.send("/dpm/arm", &[1.0]);
+    // A release of a button, and what follows it in order.
+    bench.send("/dpm/black", &[0.0]);
+    bench.send("/dpm/exposure", &[0.0]);
+    bench.wait("refusals", || {
+        notes.extend(bench.monitor.take_notes());
+        notes.iter().any(|n| n.contains("must be 0.000001"))
+    });
+    assert_eq!(bench.monitor.take_order(), None, "{notes:?}");
+    assert_eq!(bench.exposure(), 1.25);
+    assert!(notes.iter().any(|n| n.contains("exposure is 1.25")), "{notes:?}");
+    assert!(notes.iter().any(|n| n.contains("ARM is never") || n.contains("and 1 more")), "{notes:?}");
+}
+
+#[test]
+fn a_flood_of_anything_is_told_in_few_notes_and_black_still_arrives() {
+    let bench = Bench::new("127.0.0.1");
+    for k in 0..3000u32 {
+        let _ = bench.to.send(&k.to_be_bytes().repeat(k as usize % 100));
+    }
+    let mut notes = 0;
+    bench.wait("order", || {
+        bench.send("/dpm/black", &[]);
+        notes += bench.monitor.take_notes().iter().filter(|n| n.contains("refused")).count();
+        bench.monitor.take_order() == Some(Order::Black)
+    });
+    assert!(notes <= 21, "{notes} notes");
+}
+
+#[test]
+fn a_sender_that_is_not_listed_is_not_heard() {
+    let bench = Bench::new("127.0.0.1");
+    let mut ear = Ear {
+        socket: UdpSocket::bind("127.0.0.1:0").unwrap(),
+        from: vec!["192.0.2.7".parse().unwrap()],
+        monitor: bench.monitor.clone(),
+        orders: {
+            let identity = Identity::of(&ProjectorBackend::Mock(MockProjectorConfig::default()));
+            let (file, _, _) = OrderFile::open(None, identity);
+            Arc::new(Orders::start(bench.monitor.clone(), file, false, None).unwrap())
+        },
+        waiting: Vec::new(),
+        refused: Refusals::default(),
+    };
+    let black = b"/dpm/black\0\0,\0\0\0";
+    for (from, is_heard) in [
+        ("192.0.2.8:9", false),
+        ("[2001:db8::1]:9", false),
+        ("192.0.2.7:9", true),
+        ("[::ffff:192.0.2.7]:9", true),
+        ("127.0.0.9:9", true),
+    ] {
+        ear.hear(black, from.parse().unwrap());
+        assert_eq!(bench.monitor.take_order().is_some(), is_heard, "{from}");
+    }
+    assert_eq!(ear.refused.count, 2);
+    drop(bench.osc);
+}
