@@ -45,11 +45,12 @@ fn rig(address: &str) -> cli_common::Running {
     start_with(&[args.as_slice(), &["output.images=false", &page]].concat(), &[])
 }
 
-/// The mean brightness of the picture of the light, 0 to 255, as the browser draws it.
+/// The mean brightness of the picture of the light, 0 to 255, as the browser draws it; -1 if there is none, or the next
+/// one came while this one was read.
 const BRIGHTNESS: &str = "(async () => {
     const image = document.getElementById('light');
     if (image.hidden || !image.src) return -1;
-    await image.decode();
+    try { await image.decode(); } catch { return -1; }
     const canvas = document.createElement('canvas');
     [canvas.width, canvas.height] = [image.naturalWidth, image.naturalHeight];
     const context = canvas.getContext('2d');
@@ -60,12 +61,13 @@ const BRIGHTNESS: &str = "(async () => {
     return sum / (all.length / 4 * 3);
 })()";
 
-fn wait_for_light(browser: &mut Browser, what: &str, is: impl Fn(f64) -> bool) {
+/// Waits until the brightness is as `is` says, and returns it.
+fn wait_for_light(browser: &mut Browser, what: &str, is: impl Fn(f64) -> bool) -> f64 {
     let begin = Instant::now();
     loop {
         let mean = browser.value(BRIGHTNESS).as_f64().unwrap();
         if is(mean) {
-            return;
+            return mean;
         }
         assert!(begin.elapsed() < PATIENCE, "no {what}: the light is {mean}");
         std::thread::sleep(Duration::from_millis(100));
@@ -91,7 +93,7 @@ fn change_exposure(browser: &mut Browser) {
     let field = "document.getElementById('field-exposure-0')";
     let told = "document.getElementById('changed').textContent";
     browser.wait("parameters", &format!("{field}.value === '1' && !{field}.disabled"));
-    let before = browser.value(BRIGHTNESS).as_f64().unwrap();
+    let before = wait_for_light(browser, "light", |mean| mean > 1.0);
     browser.value(&format!("{field}.focus(), {field}.select()"));
     browser.type_in("0.1");
     browser.press("Enter");
