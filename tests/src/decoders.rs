@@ -73,6 +73,7 @@ pub const ALL: [(&str, Entry); 34] = [
     ("usbip_server", usb::usbip_server),
     ("gltf", crate::files::gltf),
     ("gltf_parts", crate::files::gltf_parts),
+    ("mesh", crate::files::mesh),
     ("environment", crate::files::environment),
 ];
 
