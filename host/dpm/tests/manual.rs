@@ -72,3 +72,32 @@ fn completions_name_every_command_in_every_packaged_shell() {
     let unknown = dpm(&["completions", "csh"], &[]);
     assert!(code(&unknown) == 2 && err(&unknown).contains("fish"), "{}", err(&unknown));
 }
+
+/// A service that is started again after a mistake in its rig file would go on for ever.
+#[test]
+fn a_bad_rig_file_ends_with_a_code_after_which_the_service_stays_down() {
+    let unit = include_str!("../../../packaging/dpm.service");
+    let value = |key: &str| {
+        let line = unit.lines().find_map(|line| line.strip_prefix(key)?.strip_prefix('='));
+        line.unwrap_or_else(|| panic!("{key} in the unit"))
+    };
+    let stays_down: Vec<i32> =
+        value("RestartPreventExitStatus").split(' ').map(|code| code.parse().expect("a number")).collect();
+    let words: Vec<&str> = value("ExecStart").split(' ').collect();
+    let ["/usr/bin/dpm", "run", "/etc/dpm/rig.toml"] = words[..] else { panic!("{words:?}") };
+    let folder = std::env::temp_dir().join(format!("dpm-bad-rig-{}", std::process::id()));
+    std::fs::create_dir_all(&folder).expect("a folder");
+    let rig = folder.join("rig.toml");
+    for text in [None, Some("nonsense = 1\n"), Some("[scene]\nfile = \"gone.glb\"\n"), Some("[[[")] {
+        if let Some(text) = text {
+            std::fs::write(&rig, text).expect("written");
+        }
+        let output = dpm(&["run", rig.to_str().expect("text")], &[]);
+        assert!(stays_down.contains(&code(&output)), "{text:?}: {} {}", code(&output), err(&output));
+    }
+    // Without a GPU, too.
+    let output =
+        dpm(&["run", concat!(env!("CARGO_MANIFEST_DIR"), "/../../rigs/mock.toml")], &cli_common::NO_DRIVER);
+    assert!(stays_down.contains(&code(&output)), "{} {}", code(&output), err(&output));
+    std::fs::remove_dir_all(&folder).expect("removed");
+}
