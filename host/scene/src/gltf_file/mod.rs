@@ -140,3 +140,25 @@ fn reduced(tree: &Value) -> Value {
     }
     Value::Object(top)
 }
+
+#[cfg(test)]
+mod tests {
+    use super::grouped;
+
+    #[test]
+    fn what_is_said_of_several_objects_is_said_once() {
+        let said = [
+            "material 0 'a': x is ignored",
+            "y",
+            "material 1: x is ignored",
+            "mesh 2: z",
+            "note: x is ignored",
+            "y",
+        ];
+        let told = grouped(said.map(String::from).into());
+        assert_eq!(
+            told,
+            ["material 0 'a' and 1 more: x is ignored", "y", "mesh 2: z", "note: x is ignored", "y"]
+        );
+    }
+}
