@@ -361,12 +361,7 @@ fn what_is_not_reproduced_is_said() {
         .set("/materials/0/extensions", json!({"KHR_materials_sheen": {}, "KHR_materials_unlit": {}}))
         .set("/animations", json!([{"channels": [], "samplers": []}]));
     let warnings = load(&glb).warnings.join("\n");
-    for words in [
-        "alphaMode BLEND",
-        "KHR_materials_sheen",
-        "KHR_materials_unlit",
-        "animations",
-    ] {
+    for words in ["alphaMode BLEND", "KHR_materials_sheen", "KHR_materials_unlit", "animations"] {
         assert!(warnings.contains(words), "{words} is missing in\n{warnings}");
     }
 }
